@@ -15,8 +15,6 @@ use shearq_render::figure::FigureError;
 use shearq_render::html::Section;
 use shearq_render::table::{Table, TableFormat};
 use shearq_render::terminal::fitted;
-use shearq_results::compare::Way;
-use shearq_results::score::OWN;
 use shearq_results::views::pages;
 use shearq_simulate::field::ShearSpectrum;
 use shearq_simulate::kinds::SETS;
@@ -316,7 +314,7 @@ pub(super) struct ScoreSettings {
     /// with the truth of all sets; `best` has the highest Q of each set, as on the leaderboard [default: 5 for
     /// catalogues by shearq, matched for others].
     #[arg(long, value_name = "WHICH", value_parser = parse_choice)]
-    convention: Option<Choice>,
+    pub(super) convention: Option<Choice>,
 }
 
 impl ScoreSettings {
@@ -325,25 +323,6 @@ impl ScoreSettings {
             DefinitionArgument::Leaderboard => Definition::Leaderboard,
             DefinitionArgument::Corrected => Definition::Corrected,
         }
-    }
-
-    /// How `compare` scores.
-    pub(super) fn way(&self) -> Way {
-        Way {
-            definition: self.definition(),
-            own: self.own_choice(),
-            foreign: self.choice(),
-        }
-    }
-
-    /// The given convention, or the default for other programs' catalogues.
-    pub(super) fn choice(&self) -> Choice {
-        self.convention.unwrap_or(Choice::Matched)
-    }
-
-    /// The given convention, or the default for catalogues by shearq.
-    pub(super) fn own_choice(&self) -> Choice {
-        self.convention.unwrap_or(OWN)
     }
 }
 

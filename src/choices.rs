@@ -5,7 +5,7 @@ use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use shearq_challenge::kind::RankBy;
 use shearq_files::table::FileFormat;
 use shearq_render::table::TableFormat;
-use shearq_results::groups::Grouping;
+use shearq_results::compare::Grouping;
 use shearq_results::submit::manifest::Contents;
 
 /// A type whose values are given by name on the command line.

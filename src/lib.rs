@@ -22,7 +22,6 @@ use commands::{
     merge, pack, quickstart, reproduce, run, score, select, show, simulate, study, submissions,
     unpack,
 };
-use shearq_dataset::listing::Files;
 use shearq_files::frames::panic_is_caught;
 use shearq_render::escape::visible;
 use shearq_render::figure::HeatMap;
@@ -268,8 +267,8 @@ fn tell(line: std::fmt::Arguments<'_>) {
 }
 
 /// Warns about files that look like data and are not read.
-fn tell_unread(files: &Files) {
-    for line in files.unread() {
+fn tell_unread(unread: Vec<String>) {
+    for line in unread {
         tell(format_args!("warning: {line}"));
     }
 }

@@ -8,8 +8,7 @@ use pyo3::types::PyDict;
 use shearq_dataset::truth::{Sign, word};
 use shearq_quantities::MeasuredRange;
 use shearq_quantities::units::{Degrees, Pixels};
-use shearq_results::views::metrics::FORMATS;
-use shearq_results::views::{diagnosis, rows};
+use shearq_results::views::diagnosis;
 use shearq_scoring::modes::Decomposer;
 use shearq_scoring::resample::{PairedSet, paired_difference};
 use shearq_scoring::{
@@ -24,9 +23,9 @@ use crate::errors::{in_python, of_scoring};
 /// Names, headings and meanings of the metrics.
 #[pyfunction]
 pub(crate) fn metrics() -> Vec<(&'static str, &'static str, &'static str)> {
-    let metrics = Metrics::ALL.iter().zip(FORMATS);
+    let metrics = Metrics::ALL.iter();
     metrics
-        .map(|(metric, format)| (metric.name, format.label, metric.meaning))
+        .map(|metric| (metric.name, metric.heading, metric.meaning))
         .collect()
 }
 
@@ -127,14 +126,11 @@ impl<'a> Rows<'a> {
     }
 }
 
-/// Rows that cannot be ellipticities.
+/// What to do about numbers that stand for a failed measurement: arrays have NaN for what is missing.
+const ADVICE: &str = "try drop_missing=True or set it to NaN";
+
 fn of_rows(fault: &str) -> PyErr {
-    // Arrays have NaN for what is missing.
-    let fault = fault.replace(
-        "name it as missing; otherwise set a largest |e|",
-        "set it to NaN",
-    );
-    PyValueError::new_err(format!("e1, e2: {}", in_python(&fault)))
+    PyValueError::new_err(format!("e1, e2: {fault}"))
 }
 
 /// Which values stand for a failed measurement of an ellipticity.
@@ -197,10 +193,10 @@ pub(crate) fn score<'py>(
                 counts.not_finite, counts.outside
             )));
         }
-        if let Some(fault) = rows::fault(&counts, &grid) {
+        if let Some(fault) = diagnosis::fault_of_rows(&counts, &grid, ADVICE) {
             return Err(of_rows(&fault));
         }
-        let mut warnings = rows::oddities(&counts, "e1, e2");
+        let mut warnings = diagnosis::oddities(&counts, "e1, e2");
         let by_modes = sign_by_modes(&grid, &standard).map_err(of_scoring)?;
         let refused = |fault: String| {
             PyValueError::new_err(format!("truth_g2: {}", in_python(&fault)))
@@ -343,7 +339,8 @@ pub(crate) fn spectrum<'py>(
             images.add(image).map_err(of_scoring)
         })?;
         // Any field has a spectrum, but not numbers for failures.
-        let failed = (counts.sentinels > 0).then(|| rows::fault(&counts, &grid));
+        let failed =
+            (counts.sentinels > 0).then(|| diagnosis::fault_of_rows(&counts, &grid, ADVICE));
         if let Some(fault) = failed.flatten() {
             return Err(of_rows(&fault));
         }

@@ -52,11 +52,9 @@ pub struct Bins {
     pub modes: [usize; BINS],
     /// Σ|ℓ| over each bin's modes.
     pub sum_l: [f64; BINS],
-    /// Bin of each mode in FFT order, `BINS` for none.
+    // Bin of each mode in FFT order, `BINS` for none.
     bin_of: Array2<u8>,
-    /// |ℓ| of each mode in FFT order.
     modulus: Array2<f64>,
-    /// From bandpower to C_ℓ in steradian.
     to_c_l: [f64; BINS],
     grid: Grid,
 }
@@ -150,7 +148,6 @@ impl Bins {
         bin.clamp(0.0, BINS as f64 - 1.0) as usize
     }
 
-    /// Side of the field in radians.
     fn side(&self) -> f64 {
         self.grid.side().0
     }
@@ -183,7 +180,6 @@ impl Bins {
         Ok(self.power_of(a, b))
     }
 
-    /// [`Bins::power`] without the check.
     pub(crate) fn power_of(&self, a: &Array2<Complex64>, b: &Array2<Complex64>) -> [f64; BINS] {
         let mut sums = [0.0; BINS];
         // The order of the original, so that sums round alike.
@@ -227,7 +223,7 @@ impl Bins {
         })
     }
 
-    /// Calls `call` with every scored mode (index in FFT order), its bin and its weight w in P_b = Σ w·Re(a b*).
+    // Calls `call` with every scored mode (index in FFT order), its bin and its weight w in P_b = Σ w·Re(a b*).
     pub(crate) fn each_scored(&self, mut call: impl FnMut((usize, usize), usize, f64)) {
         let n4 = (self.grid.n as f64).powi(4);
         for (at, &bin) in self.bin_of.indexed_iter() {
@@ -246,8 +242,8 @@ impl Bins {
         }
     }
 
-    /// Relative variance of the scored power of one field of white noise: 2 Σw²/(Σw)². Opposite modes are
-    /// conjugates, hence the 2.
+    // Relative variance of the scored power of one field of white noise: 2 Σw²/(Σw)². Opposite modes are
+    // conjugates, hence the 2.
     pub(crate) fn variance_of_white_power(&self) -> f64 {
         let (mut sum, mut squares) = (0.0, 0.0);
         self.each_scored(|_, _, w| {
@@ -257,7 +253,7 @@ impl Bins {
         2.0 * squares / (sum * sum)
     }
 
-    /// Plain sums over scored modes of Re(a·b*), each mode counting once.
+    // Plain sums over scored modes of Re(a·b*), each mode counting once.
     pub(crate) fn scored_product(&self, a: &Array2<Complex64>, b: &Array2<Complex64>) -> f64 {
         self.bin_of
             .indexed_iter()

@@ -1,12 +1,13 @@
-//! Ellipticities of the images of a set, summed on the grid.
+//! Ellipticities of the images of a set, summed on the grid, in groups for the jackknife.
 
-use ndarray::Array2;
+use ndarray::{Array2, ArrayView2};
 #[cfg(feature = "serde")]
 use serde::Serialize;
 use shearq_quantities::MeasuredRange;
 
 use crate::error::ScoringError;
-use crate::grid::Grid;
+use crate::grid::{Grid, check_shape};
+use crate::resample::MAX_GROUPS;
 
 /// One row of an ellipticity catalogue: FITS pixel position (1-based) and two components.
 ///
@@ -23,8 +24,8 @@ pub struct Row {
     pub e2: f64,
 }
 
-/// If more than one row in so many is absurd, the column is probably another quantity.
-const TOO_MANY: usize = 20;
+// If more than one row in so many is absurd, the column is probably another quantity.
+const MIN_ROWS_PER_ABSURD: usize = 20;
 
 /// How the rows of one or several catalogues were used, and how many are odd.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -113,7 +114,7 @@ impl RowCounts {
         }
         let rows = self.absurd;
         if let Some(first) = self.first_absurd
-            && TOO_MANY * rows > used
+            && MIN_ROWS_PER_ABSURD * rows > used
         {
             return Some(RowFault::Absurd { rows, used, first });
         }
@@ -194,7 +195,6 @@ impl FieldSum {
         counts
     }
 
-    /// Adds all of `other`, a sum on the same grid.
     pub(crate) fn merge(&mut self, other: &FieldSum) {
         self.e1 += &other.e1;
         self.e2 += &other.e2;
@@ -202,7 +202,7 @@ impl FieldSum {
         self.images += other.images;
     }
 
-    /// `self` without `part`, which must be one of the sums merged into it.
+    // `self` without `part`, which must be one of the sums merged into it.
     pub(crate) fn without(&self, part: &FieldSum) -> FieldSum {
         FieldSum {
             e1: &self.e1 - &part.e1,
@@ -233,15 +233,15 @@ pub enum TruthSign {
     Standard,
 }
 
-/// Largest difference of true shears that count as equal.
-const SAME_SHEAR: f64 = 1e-10;
+// Largest difference of true shears that count as equal.
+const MAX_ROUNDING_OF_SHEAR: f64 = 1e-10;
 
 impl TrueShear {
     /// The shear, if it is the same in all cells. Then only the zero mode has power.
     pub fn constant(&self) -> Option<[f64; 2]> {
         let value = |g: &Array2<f64>| {
             let first = *g.first()?;
-            let same = g.iter().all(|g| (g - first).abs() <= SAME_SHEAR);
+            let same = g.iter().all(|g| (g - first).abs() <= MAX_ROUNDING_OF_SHEAR);
             same.then_some(first)
         };
         Some([value(&self.g1)?, value(&self.g2)?])
@@ -316,6 +316,84 @@ impl TrueShear {
             });
         }
         Ok(truth)
+    }
+}
+
+/// Sums of a set's images, kept in up to [`MAX_GROUPS`] groups so that each can be left out.
+///
+/// Image `k` (counted from 0 in the order added) belongs to group `k mod MAX_GROUPS`. Two configurations
+/// measured on the same images are therefore grouped alike. Memory does not grow with the images.
+#[derive(Debug, Clone)]
+pub struct SetImages {
+    groups: Vec<FieldSum>,
+    total: FieldSum,
+}
+
+impl SetImages {
+    /// No images yet.
+    pub fn new(grid: &Grid) -> Self {
+        SetImages {
+            groups: Vec::new(),
+            total: FieldSum::new(grid),
+        }
+    }
+
+    /// Images given as e₁ and e₂ on the cells `[ix, iy]`. A galaxy counts as missing if one of its components
+    /// is not finite.
+    ///
+    /// # Errors
+    /// If the shape of an array differs from the grid.
+    pub fn of_arrays<'a>(
+        grid: &Grid,
+        images: impl IntoIterator<Item = [ArrayView2<'a, f64>; 2]>,
+    ) -> Result<Self, ScoringError> {
+        let mut all = SetImages::new(grid);
+        for [e1, e2] in images {
+            check_shape("e1 of an image", &e1, grid.n)?;
+            check_shape("e2 of an image", &e2, grid.n)?;
+            let mut sum = FieldSum::new(grid);
+            sum.images = 1;
+            for ((cell, &e1), &e2) in e1.indexed_iter().zip(&e2) {
+                if e1.is_finite() && e2.is_finite() {
+                    (sum.e1[cell], sum.e2[cell], sum.count[cell]) = (e1, e2, 1.0);
+                }
+            }
+            all.add(&sum)?;
+        }
+        Ok(all)
+    }
+
+    /// Adds one image.
+    ///
+    /// # Errors
+    /// If `image` is a sum of no image or of several, or if the shape of one of its arrays differs from the
+    /// grid.
+    pub fn add(&mut self, image: &FieldSum) -> Result<(), ScoringError> {
+        if image.images != 1 {
+            return Err(ScoringError::NotOneImage(image.images));
+        }
+        let side = self.total.e1.nrows();
+        check_shape("e1 of an image", &image.e1, side)?;
+        check_shape("e2 of an image", &image.e2, side)?;
+        check_shape("the count of an image", &image.count, side)?;
+        let group = self.total.images % MAX_GROUPS;
+        if group == self.groups.len() {
+            self.groups.push(image.clone());
+        } else {
+            self.groups[group].merge(image);
+        }
+        self.total.merge(image);
+        Ok(())
+    }
+
+    /// The sums of the groups.
+    pub fn groups(&self) -> &[FieldSum] {
+        &self.groups
+    }
+
+    /// The sum of all images.
+    pub fn total(&self) -> &FieldSum {
+        &self.total
     }
 }
 

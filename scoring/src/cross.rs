@@ -30,14 +30,13 @@ use ndarray::{Array2, Zip};
 use shearq_fourier::Complex64;
 
 use crate::bandpower::{BINS, Bins, Definition, SCORED};
-use crate::catalogue::FieldSum;
+use crate::catalogue::{FieldSum, SetImages};
 use crate::convention::Convention;
 use crate::error::ScoringError;
 use crate::grid::{Grid, check_shape};
-use crate::images::SetImages;
 use crate::modes::Decomposer;
 
-/// Fewest groups for a covariance. It is a difference; with fewer groups it is often negative.
+// Fewest groups for a covariance. It is a difference; with fewer groups it is often negative.
 const MIN_GROUPS: usize = 8;
 
 /// A spectrum from cross-spectra, with its covariance.
@@ -95,22 +94,21 @@ pub fn cross_spectrum(
     })
 }
 
-/// Two different groups, g < h.
+// Two different groups, g < h.
 struct Pair {
     g: usize,
     h: usize,
-    /// P_gh.
+    // P_gh.
     power: [f64; BINS],
 }
 
 impl Pair {
-    /// w_g w_h.
+    // w_g w_h.
     fn weight(&self, weights: &[f64]) -> f64 {
         weights[self.g] * weights[self.h]
     }
 }
 
-/// Weighted mean over pairs.
 fn mean(pairs: &[Pair], weights: &[f64]) -> [f64; BINS] {
     let total: f64 = pairs.iter().map(|pair| pair.weight(weights)).sum();
     std::array::from_fn(|b| {
@@ -121,11 +119,11 @@ fn mean(pairs: &[Pair], weights: &[f64]) -> [f64; BINS] {
     })
 }
 
-/// Inverse noise variances of the groups, normalised to a sum of one.
-///
-/// The noise power of a group is its power minus the mean over pairs, in the modes beyond the scored bins. Weights
-/// from the scored modes would correlate with their noise. If a noise power is not positive, the weights are the
-/// numbers of images.
+// Inverse noise variances of the groups, normalised to a sum of one.
+//
+// The noise power of a group is its power minus the mean over pairs, in the modes beyond the scored bins. Weights
+// from the scored modes would correlate with their noise. If a noise power is not positive, the weights are the
+// numbers of images.
 fn weights(own: &[[f64; BINS]], pairs: &[Pair], images: Vec<f64>) -> Vec<f64> {
     let beyond = |power: &[f64; BINS]| (SCORED.end..BINS).map(|b| power[b]).sum::<f64>();
     let common = beyond(&mean(pairs, &images));
@@ -139,7 +137,7 @@ fn weights(own: &[[f64; BINS]], pairs: &[Pair], images: Vec<f64>) -> Vec<f64> {
     weights.into_iter().map(|w| w / sum).collect()
 }
 
-/// Covariance of the weighted mean over pairs; formula in the module description.
+// Covariance of the weighted mean over pairs; formula in the module description.
 fn covariance(pairs: &[Pair], weights: &[f64], power: &[f64; BINS]) -> Option<[[f64; BINS]; BINS]> {
     let groups = weights.len() as f64;
     if weights.len() < MIN_GROUPS {
@@ -172,7 +170,6 @@ fn covariance(pairs: &[Pair], weights: &[f64], power: &[f64; BINS]) -> Option<[[
     Some(covariance.map(|row| row.map(|value| factor * value)))
 }
 
-/// Mean over the galaxies measured in each cell.
 fn mean_field(sum: &FieldSum, convention: Convention) -> Array2<Complex64> {
     let (mut e1, mut e2) = (sum.e1.clone(), sum.e2.clone());
     for e in [&mut e1, &mut e2] {

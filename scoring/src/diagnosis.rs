@@ -9,39 +9,38 @@ use ndarray::{Array2, Zip};
 use shearq_fourier::Complex64;
 
 use crate::bandpower::{Bins, SCORED};
-use crate::catalogue::{FieldSum, TrueShear, TruthSign};
+use crate::catalogue::{FieldSum, SetImages, TrueShear, TruthSign};
 use crate::convention::Convention;
 use crate::error::ScoringError;
 use crate::grid::{Grid, check_shape};
-use crate::images::SetImages;
 use crate::modes::{Decomposer, Modes};
-use crate::score::SetScorer;
-use crate::set_score::SetScore;
+use crate::score::{SetScore, SetScorer};
 
-/// Significance in standard deviations from which a finding is reported.
-const CLEAR: f64 = 5.0;
-/// Least gain in correlation with the truth for which another order is reported.
-const LEAST_GAIN: f64 = 0.02;
-/// Least shortfall of the correlation below the value that the noise allows. Errors common to all images of a
-/// set also lower the correlation, as a poor PSF correction does.
-const SHORTFALL: f64 = 0.3;
-/// |m| from which ellipticities are called biased, and its significance.
-const LARGE_BIAS: (f64, f64) = (0.1, 3.0);
-/// m from which a distortion is suspected: a distortion responds nearly twice as much as a shear.
-const OF_DISTORTION: f64 = 0.5;
-/// A shear field whose rms exceeds this is not weak lensing.
-const STRONG_SHEAR: f64 = 0.3;
-/// Chance that an image of a set is reported whose response differs by noise only. Over the 24 sets of the challenge
-/// this is at most 2 %, and less in fact, because the bound of the normal distribution below is not tight.
-const FALSE_ALARM: f64 = 1e-3;
-/// Least relative difference of an image's response from that of the others. Images of one set with other PSFs or
-/// noise respond differently too, in S/N 10 against 20 by 0.2; a wrong order, sign or type changes it by 1 or more.
-const LEAST_CHANGE: f64 = 0.4;
-/// Standard deviation of a normal distribution in median absolute deviations.
+// Significance in standard deviations from which a finding is reported.
+const MIN_SIGNIFICANCE_SIGMA: f64 = 5.0;
+// Least gain in correlation with the truth for which another order is reported.
+const MIN_CORRELATION_GAIN: f64 = 0.02;
+// Least shortfall of the correlation below the value that the noise allows. Errors common to all images of a
+// set also lower the correlation, as a poor PSF correction does.
+const MIN_CORRELATION_SHORTFALL: f64 = 0.3;
+// |m| from which ellipticities are called biased. Chosen by hand: Q of such ellipticities can still be high.
+const LARGE_M: f64 = 0.1;
+const LARGE_M_SIGMA: f64 = 3.0;
+// m from which a distortion is suspected: a distortion responds nearly twice as much as a shear.
+const MIN_M_OF_DISTORTION: f64 = 0.5;
+// A shear field whose rms exceeds this is not weak lensing.
+const MAX_WEAK_SHEAR_RMS: f64 = 0.3;
+// Chance that an image of a set is reported whose response differs by noise only. Over the 24 sets of the challenge
+// this is at most 2 %, and less in fact, because the bound of the normal distribution below is not tight.
+const FALSE_ALARM_PROBABILITY: f64 = 1e-3;
+// Least relative difference of an image's response from that of the others. Images of one set with other PSFs or
+// noise respond differently too, in S/N 10 against 20 by 0.2; a wrong order, sign or type changes it by 1 or more.
+const MIN_RELATIVE_SLOPE_CHANGE: f64 = 0.4;
+// Standard deviation of a normal distribution in median absolute deviations.
 const SIGMA_OF_MAD: f64 = 1.4826;
-/// Difference of the shares of B modes that determines the sign of g₂. A pure E-mode field has a share of 0 in
-/// the right sign and of about one half in the other.
-const SHARES_APART: f64 = 0.2;
+// Difference of the shares of B modes that determines the sign of g₂. A pure E-mode field has a share of 0 in
+// the right sign and of about one half in the other.
+const MIN_B_SHARE_DIFFERENCE: f64 = 0.2;
 
 /// A probable fault of a set's ellipticities, or of its true shear.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -181,7 +180,7 @@ impl ImageFaults {
     /// Images that follow the true shear differently from the others of the set, in order. Images of one ellipticity are
     /// not among them.
     ///
-    /// An image differs if its slope s is farther from the median s₀ than `LEAST_CHANGE` × |s₀| and than
+    /// An image differs if its slope s is farther from the median s₀ than `MIN_RELATIVE_SLOPE_CHANGE` × |s₀| and than
     /// √(2 ln(K/p)) σ for K images and a chance p of a false alarm, because 2Q(z) ≤ exp(−z²/2). σ contains the errors of s and
     /// s₀, or the scatter of all slopes if that is larger.
     pub fn odd(&self) -> Vec<OddResponse> {
@@ -200,11 +199,11 @@ impl ImageFaults {
         // The variance of a median is π/2 times that of a mean; of two slopes it is that of one.
         let error = median(of(|own| own.error), 0.0);
         let of_median = error * (0.5 * PI / (images - 1.0)).sqrt().min(1.0);
-        let clear = (2.0 * (images / FALSE_ALARM).ln()).sqrt();
+        let clear = (2.0 * (images / FALSE_ALARM_PROBABILITY).ln()).sqrt();
         let differs = |(place, own): &&(usize, ImageResponse)| {
             let sigma = own.error.hypot(of_median).max(scatter);
             let apart = (own.slope - slope).abs();
-            apart > LEAST_CHANGE * slope.abs()
+            apart > MIN_RELATIVE_SLOPE_CHANGE * slope.abs()
                 && apart > clear * sigma
                 && !self.constant.iter().any(|(constant, _)| constant == place)
         };
@@ -221,8 +220,8 @@ impl ImageFaults {
     }
 }
 
-/// The median; of the two middle values of an even number the one nearer to `expected`, so that two images of which one is
-/// wrong do not meet halfway.
+// The median; of the two middle values of an even number the one nearer to `expected`, so that two images of which one is
+// wrong do not meet halfway.
 fn median(values: impl Iterator<Item = f64>, expected: f64) -> f64 {
     let mut values: Vec<f64> = values.collect();
     values.sort_unstable_by(f64::total_cmp);
@@ -233,7 +232,6 @@ fn median(values: impl Iterator<Item = f64>, expected: f64) -> f64 {
     }
 }
 
-/// The ellipticity of all galaxies of an image, if it is the same.
 fn constant(image: &FieldSum) -> Option<[f64; 2]> {
     let mut values = image.e1.iter().zip(&image.e2).zip(&image.count);
     let mut values = values.by_ref().filter(|(_, count)| **count > 0.0);
@@ -258,7 +256,7 @@ impl SetScorer {
         self.check_images(images)?;
         let mut findings = Vec::new();
         let rms = self.truth().rms();
-        if rms > STRONG_SHEAR {
+        if rms > MAX_WEAK_SHEAR_RMS {
             findings.push(Fault::StrongTruth { rms });
         }
         if score.constant.is_some() {
@@ -324,14 +322,15 @@ impl SetScorer {
         })
     }
 
-    /// A fault of the order of rows or components, if there is one.
     fn misplaced(&self, sum: &FieldSum, score: &SetScore, convention: Convention) -> Option<Fault> {
         let correlation = score.conventions[convention.index()].correlation;
         if !correlation.is_finite() {
             return None;
         }
         let modes: usize = SCORED.map(|b| score.bins.modes[b]).sum();
-        let better = |with: f64| gain(correlation, with, modes) > CLEAR * CLEAR;
+        let better = |with: f64| {
+            gain(correlation, with, modes) > MIN_SIGNIFICANCE_SIGMA * MIN_SIGNIFICANCE_SIGMA
+        };
         let mut best: Option<(f64, Fault)> = None;
         let mut offer = |with: f64, finding: Fault| {
             if better(with) && best.as_ref().is_none_or(|(other, _)| with > *other) {
@@ -373,14 +372,14 @@ impl SetScorer {
             // A shortfall must exceed the scatter of chance correlations.
             let chance = 2.0 * score.matching.least_clear();
             let shortfall = allowed - correlation.max(0.0);
-            (shortfall > SHORTFALL.max(chance)).then_some(Fault::Uncorrelated {
+            (shortfall > MIN_CORRELATION_SHORTFALL.max(chance)).then_some(Fault::Uncorrelated {
                 correlation,
                 allowed,
             })
         })
     }
 
-    /// Correlations with the truth after moving the field back by one cell in each direction.
+    // Correlations with the truth after moving the field back by one cell in each direction.
     fn shifted(&self, sum: &FieldSum, convention: Convention) -> Vec<((i32, i32), f64)> {
         let (modes, truth) = self.both_modes(sum, convention);
         let bins = self.bins();
@@ -403,17 +402,16 @@ impl SetScorer {
     }
 }
 
-/// Twice the gain in the logarithm of the likelihood of `modes` modes with Gaussian noise of unknown variance,
-/// from the correlations with the truth before and after.
+// Twice the gain in the logarithm of the likelihood of `modes` modes with Gaussian noise of unknown variance,
+// from the correlations with the truth before and after.
 fn gain(before: f64, after: f64, modes: usize) -> f64 {
     let left = |r: f64| (1.0 - r.clamp(0.0, 1.0).powi(2)).max(f64::EPSILON);
-    match after > before + LEAST_GAIN {
+    match after > before + MIN_CORRELATION_GAIN {
         true => modes as f64 * (left(before) / left(after)).ln(),
         false => 0.0,
     }
 }
 
-/// The correlation with the truth that the measured noise allows, if it is known.
 fn allowed(score: &SetScore, convention: Convention) -> Option<f64> {
     let noise = score.noise.as_ref()?;
     if convention.class() != score.chosen.class() {
@@ -435,11 +433,10 @@ fn allowed(score: &SetScore, convention: Convention) -> Option<f64> {
 impl Fault {
     /// The finding about a multiplicative bias: as large as for a distortion, or large in either direction.
     pub fn of_bias(m: f64, error: f64) -> Option<Self> {
-        let (large, sigmas) = LARGE_BIAS;
-        if m - OF_DISTORTION > sigmas * error {
+        if m - MIN_M_OF_DISTORTION > LARGE_M_SIGMA * error {
             return Some(Fault::Distortion { m, error });
         }
-        (m.abs() - large > sigmas * error).then_some(Fault::Biased { m, error })
+        (m.abs() - LARGE_M > LARGE_M_SIGMA * error).then_some(Fault::Biased { m, error })
     }
 }
 
@@ -459,14 +456,14 @@ pub fn sign_by_modes(grid: &Grid, standard: &TrueShear) -> Result<Option<TruthSi
     let own = modes(standard);
     let [(e, b), (other_e, other_b)] = [powers(&own), powers(&modes(&standard.flipped()))];
     let difference = other_b / (other_e + other_b) - b / (e + b);
-    let found = sign_where(difference, SHARES_APART);
+    let found = sign_where(difference, MIN_B_SHARE_DIFFERENCE);
     // E and B of equal power: ln(E/B) of N modes has the variance 2/N (Fisher's z). Modes k and -k are conjugate, so
     // that N is half the participation number (Σ p)²/Σ p² of their powers p.
     let power = Zip::from(&own.e)
         .and(&own.b)
         .map_collect(|e, b| Complex64::from(e.norm_sqr() + b.norm_sqr()));
     let number = 0.5 * (e + b).powi(2) / bins.scored_product(&power, &power);
-    let clear = CLEAR * (2.0 / number).sqrt();
+    let clear = MIN_SIGNIFICANCE_SIGMA * (2.0 / number).sqrt();
     let ratio = match found {
         Some(TruthSign::Challenge) => other_e / other_b,
         _ => e / b,
@@ -487,11 +484,10 @@ pub fn sign_by_correlation(
     let product = |a: &Array2<f64>, b: &Array2<f64>| (a * b).sum();
     let (g, e) = (&standard.g2, &sum.e2);
     let correlation = product(g, e) / (product(g, g) * product(e, e)).sqrt();
-    let clear = CLEAR / (g.len() as f64).sqrt();
+    let clear = MIN_SIGNIFICANCE_SIGMA / (g.len() as f64).sqrt();
     Ok(sign_where(correlation, clear))
 }
 
-/// The standard sign if `value ≥ clear`, the challenge's sign if `value ≤ −clear`.
 fn sign_where(value: f64, clear: f64) -> Option<TruthSign> {
     if value >= clear {
         Some(TruthSign::Standard)
@@ -541,8 +537,8 @@ mod tests {
     #[test]
     fn a_better_order_must_be_clear() {
         assert_eq!(gain(0.98, 0.985, 700), 0.0);
-        assert!(gain(0.0, 0.1, 700) < CLEAR * CLEAR);
-        assert!(gain(0.49, 0.98, 700) > CLEAR * CLEAR);
-        assert!(gain(-0.5, 0.5, 700) > CLEAR * CLEAR);
+        assert!(gain(0.0, 0.1, 700) < MIN_SIGNIFICANCE_SIGMA * MIN_SIGNIFICANCE_SIGMA);
+        assert!(gain(0.49, 0.98, 700) > MIN_SIGNIFICANCE_SIGMA * MIN_SIGNIFICANCE_SIGMA);
+        assert!(gain(-0.5, 0.5, 700) > MIN_SIGNIFICANCE_SIGMA * MIN_SIGNIFICANCE_SIGMA);
     }
 }

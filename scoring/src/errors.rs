@@ -27,22 +27,21 @@ use crate::grid::Grid;
 use crate::modes::{Decomposer, Modes};
 use crate::quality::bias_weights;
 
-/// Minimum significance (σ) of A for a first-order error of √A.
-const CLEAR_A: f64 = 2.0;
-/// Number of rings of lowest |ℓ| that determine the power of the zero mode.
-const LOWEST: usize = 4;
+// Minimum significance (σ) of A for a first-order error of √A.
+const MIN_A_SIGMA: f64 = 2.0;
+// Number of rings of lowest |ℓ| that determine the power of the zero mode.
+const ZERO_MODE_RINGS: usize = 4;
 
-/// Scatter power of E and B modes in rings of |ℓ| as wide as the bins, Nyquist rows included.
+// Scatter power of E and B modes in rings of |ℓ| as wide as the bins, Nyquist rows included.
 pub(crate) struct Scatter {
     ring_of: Array2<u8>,
     e: [f64; BINS],
     b: [f64; BINS],
-    /// E and B-mode power of the lowest rings.
+    // E and B-mode power of the lowest rings.
     lowest: [f64; 2],
 }
 
 impl Scatter {
-    /// The scatter power of modes after subtracting the explained part.
     pub(crate) fn new(grid: &Grid, width: f64, unexplained: &Modes) -> Self {
         let mut ring_of = Array2::from_elem((grid.n, grid.n), BINS as u8);
         let (mut e, mut b, mut count) = ([0.0; BINS], [0.0; BINS], [0.0; BINS]);
@@ -60,7 +59,7 @@ impl Scatter {
                 count[ring] += 1.0;
             }
         }
-        let sum = |rings: &[f64; BINS]| rings[..LOWEST].iter().sum::<f64>();
+        let sum = |rings: &[f64; BINS]| rings[..ZERO_MODE_RINGS].iter().sum::<f64>();
         let lowest = [&e, &b].map(|power| sum(power) / sum(&count));
         for (ring, &count) in count.iter().enumerate() {
             if count > 0.0 {
@@ -76,7 +75,7 @@ impl Scatter {
         }
     }
 
-    /// The same for a truth without modes, which leaves E and B ambiguous. Only means are known then.
+    // The same for a truth without modes, which leaves E and B ambiguous. Only means are known then.
     pub(crate) fn of_one_kind(self) -> Self {
         Scatter {
             lowest: [0.5 * (self.lowest[0] + self.lowest[1]); 2],
@@ -84,7 +83,7 @@ impl Scatter {
         }
     }
 
-    /// (ν, ν_B) of a mode. For the zero mode both are the E-mode power of the lowest rings.
+    // (ν, ν_B) of a mode. For the zero mode both are the E-mode power of the lowest rings.
     fn at(&self, mode: (usize, usize)) -> (f64, f64) {
         match usize::from(self.ring_of[mode]) {
             BINS => (self.lowest[0], self.lowest[0]),
@@ -92,7 +91,7 @@ impl Scatter {
         }
     }
 
-    /// Variance of Σ_x u·e over cells for both components; `weights` u in the convention of the modes.
+    // Variance of Σ_x u·e over cells for both components; `weights` u in the convention of the modes.
     pub(crate) fn of_sums(&self, decomposer: &Decomposer, weights: [&Array2<f64>; 2]) -> [f64; 2] {
         let n4 = (decomposer.grid().cells() as f64).powi(2);
         std::array::from_fn(|component| {
@@ -111,7 +110,7 @@ impl Scatter {
         })
     }
 
-    /// Variance of m by cross-correlation with `truth`.
+    // Variance of m by cross-correlation with `truth`.
     pub(crate) fn of_cross(&self, bins: &Bins, truth: &Array2<Complex64>) -> f64 {
         let (mut noise, mut power) = (0.0, 0.0);
         bins.each_scored(|mode, _, _| {
@@ -122,8 +121,8 @@ impl Scatter {
         noise / (power * power)
     }
 
-    /// Variances of the scored bandpowers of E modes with the explained part `signal`; `own` is the factor of
-    /// ν².
+    // Variances of the scored bandpowers of E modes with the explained part `signal`; `own` is the factor of
+    // ν².
     pub(crate) fn of_power(
         &self,
         bins: &Bins,
@@ -138,8 +137,8 @@ impl Scatter {
         variance
     }
 
-    /// Standard error of Q of the bandpowers `ee` divided by `response`². The response was measured on the same
-    /// modes, so its error correlates all bandpowers.
+    // Standard error of Q of the bandpowers `ee` divided by `response`². The response was measured on the same
+    // modes, so its error correlates all bandpowers.
     pub(crate) fn of_calibrated_quality(
         &self,
         bins: &Bins,
@@ -176,7 +175,7 @@ impl Scatter {
         damped(q, variance.max(0.0).sqrt() / sigma_sys)
     }
 
-    /// Variances of the scored bandpowers of B modes, and of EB.
+    // Variances of the scored bandpowers of B modes, and of EB.
     pub(crate) fn of_null_tests(
         &self,
         bins: &Bins,
@@ -192,10 +191,10 @@ impl Scatter {
     }
 }
 
-/// Standard error of σ_sys, from the deviations `apart` of the scored bandpowers and their variances.
-///
-/// σ_sys is a sum of |P_b − P_b^true|. Each deviation x has an assumed mean of √max(0, x² − variance); its modulus
-/// scatters like a folded normal number.
+// Standard error of σ_sys, from the deviations `apart` of the scored bandpowers and their variances.
+//
+// σ_sys is a sum of |P_b − P_b^true|. Each deviation x has an assumed mean of √max(0, x² − variance); its modulus
+// scatters like a folded normal number.
 pub(crate) fn of_sigma_sys(bins: &Bins, apart: &[f64; BINS], variance: &[f64; BINS]) -> f64 {
     SCORED
         .map(|b| Folded::of(apart[b], variance[b]).variance * bins.dln_l[b].powi(2))
@@ -203,27 +202,25 @@ pub(crate) fn of_sigma_sys(bins: &Bins, apart: &[f64; BINS], variance: &[f64; BI
         .sqrt()
 }
 
-/// Standard error of Q ∝ 1/σ_sys to first order. It is damped if σ_sys is as small as its error: a σ_sys that is
-/// small by chance would make the error unbounded.
+// Standard error of Q ∝ 1/σ_sys to first order. It is damped if σ_sys is as small as its error: a σ_sys that is
+// small by chance would make the error unbounded.
 pub(crate) fn of_quality(bins: &Bins, q: f64, apart: &[f64; BINS], variance: &[f64; BINS]) -> f64 {
     let sigma_sys: f64 = SCORED.map(|b| apart[b].abs() * bins.dln_l[b]).sum();
     damped(q, of_sigma_sys(bins, apart, variance) / sigma_sys)
 }
 
-/// Standard error of Q for a relative error of σ_sys.
 fn damped(q: f64, relative: f64) -> f64 {
     q * relative / (1.0 + relative * relative)
 }
 
-/// |x| of a normal number x.
+// |x| of a normal number x.
 struct Folded {
     variance: f64,
-    /// Derivative of the mean of |x| with the mean of x, which multiplies covariances of x.
+    // Derivative of the mean of |x| with the mean of x, which multiplies covariances of x.
     gradient: f64,
 }
 
 impl Folded {
-    /// For a number of this variance with the value `found`.
     fn of(found: f64, variance: f64) -> Self {
         if variance <= 0.0 {
             return Folded {
@@ -243,7 +240,7 @@ impl Folded {
     }
 }
 
-/// Standard errors of M and A in units of C_ℓ, from the covariance of the bandpowers.
+// Standard errors of M and A in units of C_ℓ, from the covariance of the bandpowers.
 pub(crate) fn of_biases(
     bins: &Bins,
     truth: &[f64; BINS],
@@ -261,15 +258,15 @@ pub(crate) fn of_biases(
     (m.sqrt(), a.sqrt())
 }
 
-/// Standard error of √A in 10⁻⁴. Not a number if A is not significant.
+// Standard error of √A in 10⁻⁴. Not a number if A is not significant.
 pub(crate) fn of_sqrt_a(a: f64, error: f64) -> f64 {
-    match a.abs() >= CLEAR_A * error {
+    match a.abs() >= MIN_A_SIGMA * error {
         true => error / (2.0 * a.abs().sqrt()) * 1e4,
         false => f64::NAN,
     }
 }
 
-/// Standard error of the mean C_ℓ of the scored bins, in 10⁻⁹ steradian.
+// Standard error of the mean C_ℓ of the scored bins, in 10⁻⁹ steradian.
 pub(crate) fn of_mean_c_l(bins: &Bins, variance: &[f64; BINS]) -> f64 {
     let sum: f64 = SCORED.map(|b| variance[b] * bins.to_c_l(b).powi(2)).sum();
     sum.sqrt() / SCORED.len() as f64 * 1e9

@@ -9,11 +9,10 @@ use serde::{Deserialize, Serialize};
 use crate::error::ScoringError;
 use shearq_quantities::units::{Degrees, Multipole, Pixels, Radians};
 
-/// Offset that the original scoring program adds to both components of every wave vector, so that
-/// the zero mode has a direction. It determines which of the modes at exactly ℓ_min are counted.
+// Offset that the original scoring program adds to both components of every wave vector, so that
+// the zero mode has a direction. It determines which of the modes at exactly ℓ_min are counted.
 pub(crate) const MODE_OFFSET: f64 = 1e-10;
 
-/// Checks that an array has a value for every cell of a grid of `side` cells per side.
 pub(crate) fn check_shape<S: Data>(
     what: &'static str,
     array: &ArrayBase<S, Ix2>,
@@ -143,17 +142,17 @@ impl Grid {
         Multipole(self.l_min().0 * self.n as f64)
     }
 
-    /// Signed integer frequency of position `i` in centred order (0 is the most negative).
+    // Signed integer frequency of position `i` in centred order (0 is the most negative).
     pub(crate) fn frequency(&self, i: usize) -> i64 {
         i as i64 - (self.n / 2) as i64
     }
 
-    /// Place in FFT order of position `i` in centred order.
+    // Place in FFT order of position `i` in centred order.
     pub(crate) fn fft_index(&self, i: usize) -> usize {
         (i + self.n - self.n / 2) % self.n
     }
 
-    /// Component of the wave vector at centred position `i`, with the original's offset.
+    // Component of the wave vector at centred position `i`, with the original's offset.
     pub(crate) fn wave(&self, i: usize) -> f64 {
         self.l_min().0 * self.frequency(i) as f64 + MODE_OFFSET
     }

@@ -38,35 +38,29 @@ mod cross;
 mod diagnosis;
 mod error;
 mod errors;
-mod galaxies;
 mod grid;
-mod images;
-mod matching;
 mod metrics;
 pub mod modes;
 pub mod quality;
 pub mod resample;
 mod score;
-mod set_score;
 
 pub use bandpower::{BINS, Bins, Definition, SCORED};
-pub use catalogue::{FieldSum, OddRow, Row, RowCounts, RowFault, TrueShear, TruthSign};
-pub use convention::{Convention, ConventionClass};
+pub use catalogue::{FieldSum, OddRow, Row, RowCounts, RowFault, SetImages, TrueShear, TruthSign};
+pub use convention::{Convention, ConventionClass, ConventionMatch};
 pub use cross::{CrossSpectrum, cross_spectrum};
 pub use diagnosis::{
     Fault, ImageFaults, ImageResponse, OddResponse, sign_by_correlation, sign_by_modes,
 };
 pub use error::ScoringError;
 pub use grid::{Grid, cell_at, centre_of};
-pub use images::SetImages;
-pub use matching::ConventionMatch;
 pub use metrics::{Metric, Metrics};
 pub use ndarray;
 pub use quality::{Bias, BiasFits, Quality};
 pub use resample::MAX_GROUPS;
-pub use score::{Choice, Noise, Options, SetScorer, measured_bandpowers};
-pub use set_score::{
-    ConventionScore, MeanShear, SetScore, SpectrumCovariance, SpectrumScore, Unknown,
+pub use score::{
+    Choice, ConventionScore, MeanShear, Noise, Options, SetScore, SetScorer, SpectrumCovariance,
+    SpectrumScore, Unknown, measured_bandpowers,
 };
 pub use shearq_fourier::Complex64;
 

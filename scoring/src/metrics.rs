@@ -1,4 +1,5 @@
-//! The metrics of a scored set: the only place that declares their names and meanings.
+//! The metrics of a scored set. This is the only place that declares them: a new metric is one line in the list below
+//! and its value in `SetScorer::metrics`; columns of stores, tables, JSON and baselines follow from the list.
 
 #[cfg(feature = "serde")]
 use std::collections::BTreeMap;
@@ -6,18 +7,26 @@ use std::collections::BTreeMap;
 #[cfg(feature = "serde")]
 use serde::{Deserialize, Deserializer, Serialize};
 
-/// Name and meaning of a metric.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+/// What a metric is called, how it is printed, and where it is found.
+#[derive(Debug, Clone, Copy)]
 #[non_exhaustive]
 pub struct Metric {
     /// Name in files: columns, keys, conditions.
     pub name: &'static str,
+    /// Heading in tables, with the power of ten that the values are multiplied by.
+    pub heading: &'static str,
+    /// Decimals in tables, unless the error determines them.
+    pub decimals: usize,
+    /// Whether only wide tables contain it.
+    pub detail: bool,
     /// What it measures, in one sentence.
     pub meaning: &'static str,
+    /// Its value in a record of values, or its error in a record of errors.
+    pub value: fn(&Metrics) -> f64,
 }
 
 macro_rules! metrics {
-    ($($name:ident: $meaning:literal;)+) => {
+    ($($name:ident: $heading:literal, $decimals:literal, $detail:literal, $meaning:literal;)+) => {
         /// Metrics of one set or of a replicate of it, or their errors. Not a number if unknown.
         #[derive(Debug, Clone, Copy, PartialEq)]
         #[cfg_attr(feature = "serde", derive(Serialize))]
@@ -30,7 +39,11 @@ macro_rules! metrics {
             /// All metrics, in the order of [`Metrics::values`].
             pub const ALL: [Metric; [$($meaning),+].len()] = [$(Metric {
                 name: stringify!($name),
+                heading: $heading,
+                decimals: $decimals,
+                detail: $detail,
                 meaning: $meaning,
+                value: |metrics| metrics.$name,
             }),+];
 
             /// All values as an array.
@@ -47,30 +60,31 @@ macro_rules! metrics {
     };
 }
 
+// name: heading, decimals, only in wide tables, meaning.
 metrics! {
-    q: "Quality factor, 5·10⁻³/σ_sys.";
-    q_dn: "Quality factor after subtracting the power of the noise.";
-    q_calibrated: "Quality factor after dividing the spectrum by (1 + m)², with m by cross-correlation: noise and scale-dependent bias remain.";
-    m_half: "Multiplicative bias of the power spectrum, halved.";
-    sqrt_a: "Additive bias of the power spectrum: sign(A)·√|A| in 10⁻⁴, C_ℓ in steradian.";
-    m_cross: "Multiplicative bias by cross-correlation of E modes with the truth.";
-    galaxy_noise: "Noise of one galaxy's ellipticity per component, divided by the response 1 + m.";
-    m1: "Multiplicative bias of component 1, from the galaxies.";
-    m2: "Multiplicative bias of component 2, from the galaxies.";
-    c1: "Additive bias of component 1, from the galaxies.";
-    c2: "Additive bias of component 2, from the galaxies.";
-    b_power: "Mean C_ℓ of the B modes over bins 2 to 9, in 10⁻⁹ steradian.";
-    eb_power: "Mean C_ℓ of the EB cross-spectrum over bins 2 to 9, in 10⁻⁹ steradian.";
-    sigma_sys_1e4: "σ_sys, the mean distance of the bandpowers from the truth, in 10⁻⁴. Q is 5·10⁻³/σ_sys.";
+    q: "Q", 2, false, "Quality factor, 5·10⁻³/σ_sys.";
+    q_dn: "Q_dn", 2, false, "Quality factor after subtracting the power of the noise.";
+    q_calibrated: "Q cal.", 2, false, "Quality factor after dividing the spectrum by (1 + m)², with m by cross-correlation: noise and scale-dependent bias remain.";
+    m_half: "M/2", 4, false, "Multiplicative bias of the power spectrum, halved.";
+    sqrt_a: "√A×10⁴", 4, false, "Additive bias of the power spectrum: sign(A)·√|A| in 10⁻⁴, C_ℓ in steradian.";
+    m_cross: "m (cross)", 4, false, "Multiplicative bias by cross-correlation of E modes with the truth.";
+    galaxy_noise: "noise", 4, false, "Noise of one galaxy's ellipticity per component, divided by the response 1 + m.";
+    m1: "m1", 4, true, "Multiplicative bias of component 1, from the galaxies.";
+    m2: "m2", 4, true, "Multiplicative bias of component 2, from the galaxies.";
+    c1: "c1", 5, true, "Additive bias of component 1, from the galaxies.";
+    c2: "c2", 5, true, "Additive bias of component 2, from the galaxies.";
+    b_power: "B mode×10⁹", 3, true, "Mean C_ℓ of the B modes over bins 2 to 9, in 10⁻⁹ steradian.";
+    eb_power: "EB×10⁹", 3, true, "Mean C_ℓ of the EB cross-spectrum over bins 2 to 9, in 10⁻⁹ steradian.";
+    sigma_sys_1e4: "σ_sys×10⁴", 4, true, "σ_sys, the mean distance of the bandpowers from the truth, in 10⁻⁴. Q is 5·10⁻³/σ_sys.";
 }
 
 impl Metrics {
     /// The metric that every record contains. Older records lack metrics that were added later.
     pub const ALWAYS: &str = "q";
 
-    /// Index in [`Metrics::values`] of the metric called `name`.
-    pub fn place(name: &str) -> Option<usize> {
-        Self::ALL.iter().position(|metric| metric.name == name)
+    /// The metric called `name`.
+    pub fn named(name: &str) -> Option<Metric> {
+        Self::ALL.into_iter().find(|metric| metric.name == name)
     }
 
     /// No metric is known.
@@ -102,14 +116,9 @@ mod tests {
         let values: [f64; Metrics::ALL.len()] = std::array::from_fn(|k| k as f64);
         let metrics = Metrics::from_values(values);
         assert_eq!(metrics.values(), values);
-        for (name, field) in [
-            ("q", metrics.q),
-            ("m_cross", metrics.m_cross),
-            ("c2", metrics.c2),
-        ] {
-            assert_eq!(Metrics::place(name), Some(field as usize));
-        }
-        assert_eq!(Metrics::place("q_best"), None);
+        assert_eq!(Metrics::ALL.map(|metric| (metric.value)(&metrics)), values);
+        assert_eq!(Metrics::named("c2").unwrap().heading, "c2");
+        assert!(Metrics::named("q_best").is_none());
     }
 
     #[cfg(feature = "serde")]

@@ -71,7 +71,6 @@ impl Decomposer {
         Ok(self.modes_of(field))
     }
 
-    /// [`Decomposer::decompose`] without the check.
     pub(crate) fn modes_of(&self, mut field: Array2<Complex64>) -> Modes {
         self.transform(&mut field, &self.forward);
         field *= &self.kernel;
@@ -101,18 +100,17 @@ impl Decomposer {
         Ok(field)
     }
 
-    /// The plain FFT of a field on the grid.
     pub(crate) fn fft(&self, mut field: Array2<Complex64>) -> Array2<Complex64> {
         self.transform(&mut field, &self.forward);
         field
     }
 
-    /// K = exp(−2iφ) of a mode in FFT order; zero at the zero mode.
+    // K = exp(−2iφ) of a mode in FFT order; zero at the zero mode.
     pub(crate) fn kernel(&self, mode: (usize, usize)) -> Complex64 {
         self.kernel[mode]
     }
 
-    /// One-dimensional transforms along both axes, unscaled.
+    // One-dimensional transforms along both axes, unscaled.
     fn transform(&self, field: &mut Array2<Complex64>, fft: &Plan64) {
         for _ in 0..2 {
             let mut turned = field.t().as_standard_layout().into_owned();
@@ -124,7 +122,7 @@ impl Decomposer {
     }
 }
 
-/// K = conj(z)²/|z|² at centred position `(i, j)`; zero at the zero mode.
+// K = conj(z)²/|z|² at centred position `(i, j)`; zero at the zero mode.
 fn kernel_value(grid: &Grid, i: usize, j: usize) -> Complex64 {
     if grid.frequency(i) == 0 && grid.frequency(j) == 0 {
         return Complex64::ZERO;

@@ -1,11 +1,12 @@
-//! Q, M and A of bandpowers.
+//! Q, M and A of bandpowers, and m and c of the galaxies.
 
+use ndarray::Array2;
 #[cfg(feature = "serde")]
 use serde::Serialize;
 
 use crate::bandpower::{BINS, Bins, SCORED};
 
-/// Numerator of the quality factor (Kitching et al. 2012, eq. 1; GREAT10 handbook eq. 21).
+// Numerator of the quality factor (Kitching et al. 2012, eq. 1; GREAT10 handbook eq. 21).
 const Q_SCALE: f64 = 5e-3;
 
 /// A quality factor and its σ_sys.
@@ -94,7 +95,7 @@ pub fn bias(measured: &[f64; BINS], truth: &[f64; BINS], scale: impl Fn(usize) -
     }
 }
 
-/// The weights of each scored bin's C_b − C_b^true in M and in A.
+// The weights of each scored bin's C_b − C_b^true in M and in A.
 pub(crate) fn bias_weights(
     truth: &[f64; BINS],
     scale: impl Fn(usize) -> f64,
@@ -134,5 +135,47 @@ pub fn bias_fits(bins: &Bins, side: f64, measured: &[f64; BINS], truth: &[f64; B
         mode: bias(measured, truth, |b| cl(b) / (side * side)),
         cl: bias(measured, truth, cl),
         cl_over_2pi: bias(measured, truth, |b| cl(b) / (2.0 * std::f64::consts::PI)),
+    }
+}
+
+// Least squares of e = (1 + m)·g + c over all galaxies of a set, from the sums per cell.
+pub(crate) struct ShearBias {
+    /// Not a number if the true shear is the same everywhere; c is then the mean of e − g.
+    pub m: f64,
+    pub c: f64,
+    /// Sum per cell of the residuals of the fit.
+    pub residual: Array2<f64>,
+    /// Weights of the sums per cell in m.
+    pub of_m: Array2<f64>,
+    /// Weights of the sums per cell in c.
+    pub of_c: Array2<f64>,
+}
+
+impl ShearBias {
+    // Fits one component: its true shear `g`, and per cell the sum of its ellipticities and the number of
+    // galaxies.
+    pub(crate) fn new(g: &Array2<f64>, sum: Array2<f64>, count: &Array2<f64>) -> Self {
+        let galaxies = count.sum();
+        let mean = (g * count).sum() / galaxies;
+        let apart = g - mean;
+        let square = (&apart * &apart * count).sum();
+        let constant = g.iter().all(|value| *value == g[(0, 0)]);
+        let of_m = match constant {
+            true => Array2::zeros(g.dim()),
+            false => &apart / square,
+        };
+        let response = match constant {
+            true => 1.0,
+            false => (&of_m * &sum).sum(),
+        };
+        let of_c = of_m.mapv(|w| 1.0 / galaxies - w * mean);
+        let c = sum.sum() / galaxies - response * mean;
+        ShearBias {
+            m: if constant { f64::NAN } else { response - 1.0 },
+            c,
+            residual: &sum - &(g.mapv(|g| response * g + c) * count),
+            of_m,
+            of_c,
+        }
     }
 }

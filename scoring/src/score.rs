@@ -1,25 +1,25 @@
 //! Scores of one set in every convention: noise, biases, null tests and their errors.
 
 use ndarray::Array2;
+#[cfg(feature = "serde")]
+use serde::Serialize;
 use shearq_fourier::Complex64;
 
 use crate::bandpower::{BINS, Bins, Definition, SCORED};
-use crate::catalogue::{FieldSum, TrueShear};
-use crate::convention::{Convention, ConventionClass};
+use crate::catalogue::{FieldSum, SetImages, TrueShear};
+use crate::convention::{Convention, ConventionClass, ConventionMatch};
 use crate::error::ScoringError;
 use crate::errors::{self, Scatter};
-use crate::galaxies::ShearBias;
 use crate::grid::{Grid, check_shape};
-use crate::images::SetImages;
-use crate::matching::ConventionMatch;
 use crate::metrics::Metrics;
 use crate::modes::{Decomposer, Modes};
-use crate::quality::{bias_fits, calibrated_quality, quality, quality_error};
+use crate::quality::{
+    BiasFits, Quality, ShearBias, bias_fits, calibrated_quality, quality, quality_error,
+};
 use crate::resample::jackknife_error;
-use crate::set_score::{ConventionScore, MeanShear, SetScore, SpectrumCovariance, SpectrumScore};
 
-/// Minimum significance (σ) of the response before dividing by it.
-const CLEAR_RESPONSE: f64 = 3.0;
+// Minimum significance (σ) of the response before dividing by it.
+const MIN_RESPONSE_SIGMA: f64 = 3.0;
 
 /// How to choose the convention of the metrics.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -54,16 +54,173 @@ pub struct Options {
     pub choice: Choice,
 }
 
-/// Power and noise gain of the mean field of a group of images, or of all images.
+/// One convention's spectra and metrics.
+#[derive(Debug, Clone)]
+#[cfg_attr(feature = "serde", derive(Serialize))]
+#[non_exhaustive]
+pub struct ConventionScore {
+    /// The convention.
+    pub convention: Convention,
+    /// E-mode bandpowers.
+    pub ee: [f64; BINS],
+    /// B-mode bandpowers.
+    pub bb: [f64; BINS],
+    /// EB cross bandpowers; consistent with zero for a sound measurement.
+    pub eb: [f64; BINS],
+    /// Correlation of the E modes with the true ones over bins 2 to 9, −1 to 1.
+    pub correlation: f64,
+    /// Σ Re(E_t E*)/Σ|E_t|² − 1 over bins 2 to 9: the multiplicative bias of the shear by
+    /// cross-correlation with the truth.
+    pub m_cross: f64,
+    /// Q and σ_sys.
+    pub quality: Quality,
+    /// Q of the spectrum divided by (1 + m)², m by cross-correlation.
+    pub quality_calibrated: Quality,
+    /// Q after subtracting the noise power; `None` if the noise is unknown.
+    pub quality_dn: Option<Quality>,
+    pub(crate) noise_free: [f64; BINS],
+    /// M and A before subtracting the noise power.
+    pub fit: BiasFits,
+    /// M and A after subtracting the noise power; `None` if the noise is unknown.
+    pub fit_dn: Option<BiasFits>,
+}
+
+/// Mean ellipticity of a set with constant true shear, in the chosen convention. Such a set has no power to
+/// compare; its means are its metrics.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(Serialize))]
+#[non_exhaustive]
+pub struct MeanShear {
+    /// Mean ellipticity of the galaxies.
+    pub e: [f64; 2],
+    /// Standard error of the mean.
+    pub error: [f64; 2],
+    /// The true shear.
+    pub truth: [f64; 2],
+}
+
+/// Why a metric is not a number.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum Unknown {
+    /// The true shear, or the component that the metric needs, is the same everywhere.
+    ConstantTruth,
+    /// The noise is unknown: it was not given, and one image cannot determine it.
+    Noise,
+    /// The measured noise power is negative, by chance.
+    NegativeNoise,
+    /// The response is less than 3σ above zero.
+    Response,
+    /// The images have no ellipticities.
+    NoEllipticities,
+}
+
+/// The score of one set.
+#[derive(Debug, Clone)]
+#[non_exhaustive]
+pub struct SetScore {
+    /// The grid.
+    pub grid: Grid,
+    /// The bins of the definition used.
+    pub bins: Bins,
+    /// Images averaged over.
+    pub images: usize,
+    /// Bandpowers of the true shear's E modes.
+    pub true_ee: [f64; BINS],
+    /// Bandpowers of the true shear's B modes; nonzero if the sign of g₂ is wrong.
+    pub true_bb: [f64; BINS],
+    /// Standard errors of the scored E-mode bandpowers in the chosen convention, for a fixed truth. Not numbers in
+    /// other bins, or if unknown.
+    pub ee_error: [f64; BINS],
+    /// Noise bandpowers of the averaged E modes, if known.
+    pub noise: Option<[f64; BINS]>,
+    /// Noise variance per component, galaxy and image that corresponds to `noise`.
+    pub noise_variance: Option<f64>,
+    /// All eight conventions, in order.
+    pub conventions: Vec<ConventionScore>,
+    /// The convention with the highest Q.
+    pub best: Convention,
+    /// How well each convention correlates with the truth.
+    pub matching: ConventionMatch,
+    /// The convention of the metrics.
+    pub chosen: Convention,
+    /// Metrics in the chosen convention. [`SetScore::why_unknown`] explains NaN.
+    pub metrics: Metrics,
+    /// Standard errors of the metrics; not a number if unknown.
+    pub errors: Metrics,
+    /// The metrics with each group of images left out in turn; empty with fewer than two images.
+    pub replicates: Vec<Metrics>,
+    /// Means, if the true shear is the same everywhere. All metrics except c1 and c2 are then unknown.
+    pub constant: Option<MeanShear>,
+}
+
+impl SetScore {
+    /// The chosen convention's spectra.
+    pub fn spectra(&self) -> &ConventionScore {
+        &self.conventions[self.chosen.index()]
+    }
+
+    /// The reason if the metric called `name` is not a number.
+    pub fn why_unknown(&self, name: &str) -> Option<Unknown> {
+        let metric = Metrics::named(name)?;
+        if !(metric.value)(&self.metrics).is_nan() {
+            return None;
+        }
+        // c1 and c2 are means, so they need nothing but ellipticities.
+        Some(match name {
+            _ if self.metrics.c1.is_nan() => Unknown::NoEllipticities,
+            _ if self.constant.is_some() => Unknown::ConstantTruth,
+            "q_dn" => Unknown::Noise,
+            "galaxy_noise" if self.noise.is_none() => Unknown::Noise,
+            "galaxy_noise" if !self.metrics.q_calibrated.is_nan() => Unknown::NegativeNoise,
+            "q_calibrated" | "galaxy_noise" => Unknown::Response,
+            _ => Unknown::ConstantTruth,
+        })
+    }
+
+    /// Whether the convention with the highest Q is of another class than the chosen one. Its Q is then due to
+    /// a wrong convention, not to a good measurement.
+    pub fn wrong_convention_wins(&self) -> bool {
+        self.best.class() != self.chosen.class()
+    }
+
+    /// Q of zero shear: what an entry without images has. It exceeds the Q of measurements while their noise power exceeds
+    /// the power of the shear.
+    pub fn zero_quality(&self) -> Quality {
+        quality(&self.bins, &[0.0; BINS], &self.true_ee)
+    }
+
+    /// Share of B modes in the scored true power. It is about one half if the sign of g₂ is wrong.
+    pub fn true_b_share(&self) -> f64 {
+        let sum = |p: &[f64; BINS]| SCORED.map(|b| p[b]).sum::<f64>();
+        let (e, b) = (sum(&self.true_ee), sum(&self.true_bb));
+        b / (e + b)
+    }
+}
+
+/// Covariance of the eight scored bandpowers of a power spectrum.
+pub type SpectrumCovariance = [[f64; SCORED.end - SCORED.start]; SCORED.end - SCORED.start];
+
+/// The score of a power spectrum: Q, M/2, √A and σ_sys. Only catalogues have the other metrics.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
+pub struct SpectrumScore {
+    /// Metrics; not a number if only catalogues have them.
+    pub metrics: Metrics,
+    /// Standard errors of Q, M/2 and √A; not a number if the covariance is unknown.
+    pub errors: Metrics,
+    /// Q of zero shear, which an entry has without any image.
+    pub zero_q: f64,
+}
+
+// Power and noise gain of the mean field of a group of images, or of all images.
 #[derive(Debug, Clone, Copy)]
 struct MeanPower {
-    /// E-mode bandpowers in conventions of either class.
     power: [[f64; BINS]; 2],
-    /// Noise variance of the field per unit noise variance of a galaxy.
+    // Noise variance of the field per unit noise variance of a galaxy.
     gain: f64,
 }
 
-/// Noise bandpowers in conventions of either class.
 type NoisePower = [[f64; BINS]; 2];
 
 /// Scores catalogues and power spectra of one set against its true shear.
@@ -98,7 +255,6 @@ impl SetScorer {
         })
     }
 
-    /// Checks that there are images of this grid.
     pub(crate) fn check_images(&self, images: &SetImages) -> Result<(), ScoringError> {
         if images.total().images == 0 {
             return Err(ScoringError::NoImages);
@@ -137,7 +293,7 @@ impl SetScorer {
         let chosen_one = &conventions[chosen.index()];
         let (mut errors, ee_error) = self.errors(images, chosen_one, &metrics, &replicates);
         // Nothing can be divided by a response that is consistent with zero.
-        if 1.0 + metrics.m_cross < CLEAR_RESPONSE * errors.m_cross {
+        if 1.0 + metrics.m_cross < MIN_RESPONSE_SIGMA * errors.m_cross {
             for of in [&mut metrics, &mut errors] {
                 (of.q_calibrated, of.galaxy_noise) = (f64::NAN, f64::NAN);
             }
@@ -183,17 +339,15 @@ impl SetScorer {
         Ok(ConventionMatch::new(correlations, self.scored_modes()))
     }
 
-    /// The true shear.
     pub(crate) fn truth(&self) -> &TrueShear {
         &self.truth
     }
 
-    /// E and B modes of a field.
     pub(crate) fn modes_of(&self, field: Array2<Complex64>) -> Modes {
         self.decomposer.modes_of(field)
     }
 
-    /// Modes of the averaged field in a convention, and modes of the truth to compare them with.
+    // Modes of the averaged field in a convention, and modes of the truth to compare them with.
     pub(crate) fn both_modes(&self, sum: &FieldSum, convention: Convention) -> (Modes, Modes) {
         (
             self.modes(sum, convention),
@@ -201,7 +355,6 @@ impl SetScorer {
         )
     }
 
-    /// Correlation of the averaged field's E modes with the true ones over the scored bins, in a convention.
     pub(crate) fn correlation_of(&self, sum: &FieldSum, convention: Convention) -> f64 {
         let (modes, truth) = self.both_modes(sum, convention);
         self.correlation(&modes, &truth)
@@ -211,7 +364,6 @@ impl SetScorer {
         SCORED.map(|b| self.bins.modes[b]).sum()
     }
 
-    /// Correlation of E modes with the true ones over the scored bins.
     fn correlation(&self, modes: &Modes, truth: &Modes) -> f64 {
         let product = |a, b| self.bins.scored_product(a, b);
         let power = product(&truth.e, &truth.e) * product(&modes.e, &modes.e);
@@ -247,14 +399,22 @@ impl SetScorer {
         });
         let fit = bias_fits(&self.bins, self.grid.side().0, &measured, &truth);
         let (m, a) = errors::of_biases(&self.bins, &truth, &covariance);
+        let found = quality(&self.bins, &measured, &truth);
         Ok(SpectrumScore {
-            quality: quality(&self.bins, &measured, &truth),
-            zero_quality: quality(&self.bins, &[0.0; BINS], &truth),
-            quality_error: quality_error(&self.bins, &measured, &truth, &covariance),
-            m_half: fit.cl.m_half,
-            m_half_error: m / 2.0,
-            sqrt_a: fit.cl.sqrtA * 1e4,
-            sqrt_a_error: errors::of_sqrt_a(fit.cl.A, a),
+            metrics: Metrics {
+                q: found.q,
+                m_half: fit.cl.m_half,
+                sqrt_a: fit.cl.sqrtA * 1e4,
+                sigma_sys_1e4: found.sigma_sys * 1e4,
+                ..Metrics::unknown()
+            },
+            errors: Metrics {
+                q: quality_error(&self.bins, &measured, &truth, &covariance),
+                m_half: m / 2.0,
+                sqrt_a: errors::of_sqrt_a(fit.cl.A, a),
+                ..Metrics::unknown()
+            },
+            zero_q: quality(&self.bins, &[0.0; BINS], &truth).q,
         })
     }
 
@@ -274,19 +434,19 @@ impl SetScorer {
         &self.bins
     }
 
-    /// Modes of the averaged field in a convention.
-    ///
-    /// Leaderboard: sums divided by the number of images, so that missing galaxies count as zero.
-    /// Corrected: the same field, in which a cell has the weight w = count/images, rescaled by 1/⟨w²⟩^½. Its power
-    /// then equals the power of an unmasked field.
+    // Modes of the averaged field in a convention.
+    //
+    // Leaderboard: sums divided by the number of images, so that missing galaxies count as zero.
+    // Corrected: the same field, in which a cell has the weight w = count/images, rescaled by 1/⟨w²⟩^½. Its power
+    // then equals the power of an unmasked field.
     fn modes(&self, sum: &FieldSum, convention: Convention) -> Modes {
         let scale = self.rescaling(sum) / sum.images as f64;
         self.decomposer
             .modes_of(convention.field(&(&sum.e1 * scale), &(&sum.e2 * scale)))
     }
 
-    /// Modes of the true shear. In the corrected definition the shear has the weights of the galaxies, so that
-    /// missing galaxies do not appear as a bias.
+    // Modes of the true shear. In the corrected definition the shear has the weights of the galaxies, so that
+    // missing galaxies do not appear as a bias.
     fn true_modes(&self, sum: &FieldSum, convention: Convention) -> Modes {
         let standard = Convention::STANDARD;
         match self.options.definition {
@@ -307,7 +467,7 @@ impl SetScorer {
         }
     }
 
-    /// 1/⟨w²⟩^½ in the corrected definition, 1 on the leaderboard.
+    // 1/⟨w²⟩^½ in the corrected definition, 1 on the leaderboard.
     fn rescaling(&self, sum: &FieldSum) -> f64 {
         match self.options.definition {
             Definition::Leaderboard => 1.0,
@@ -322,8 +482,8 @@ impl SetScorer {
         }
     }
 
-    /// Noise variance of the averaged field per unit noise variance of a galaxy: 1/K on the leaderboard, and
-    /// ⟨w⟩/⟨w²⟩/K in the corrected definition, which rescales for gaps.
+    // Noise variance of the averaged field per unit noise variance of a galaxy: 1/K on the leaderboard, and
+    // ⟨w⟩/⟨w²⟩/K in the corrected definition, which rescales for gaps.
     fn noise_gain(&self, sum: &FieldSum) -> f64 {
         let images = sum.images as f64;
         match self.options.definition {
@@ -335,8 +495,8 @@ impl SetScorer {
         }
     }
 
-    /// E-mode bandpowers of a mean field in either class of conventions, and its noise gain. All conventions of
-    /// a class have the same scored bandpowers.
+    // E-mode bandpowers of a mean field in either class of conventions, and its noise gain. All conventions of
+    // a class have the same scored bandpowers.
     fn mean_power(&self, sum: &FieldSum) -> MeanPower {
         MeanPower {
             power: ConventionClass::BOTH.map(|class| {
@@ -347,11 +507,11 @@ impl SetScorer {
         }
     }
 
-    /// Noise bandpowers of the E modes of `sum`, which consists of `groups`. `None` if they cannot be determined.
-    ///
-    /// Measured: with noise gains r_g of the groups and r of all, ⟨P(E_g)⟩ = S + σ²⟨r_g⟩ and
-    /// P(Ē) = S + σ²r, so σ²r = r(⟨P(E_g)⟩ − P(Ē)) / (⟨r_g⟩ − r). This noise includes all E modes that change
-    /// from image to image. The classes differ: in the wrong class half of the intrinsic power is in E modes.
+    // Noise bandpowers of the E modes of `sum`, which consists of `groups`. `None` if they cannot be determined.
+    //
+    // Measured: with noise gains r_g of the groups and r of all, ⟨P(E_g)⟩ = S + σ²⟨r_g⟩ and
+    // P(Ē) = S + σ²r, so σ²r = r(⟨P(E_g)⟩ − P(Ē)) / (⟨r_g⟩ − r). This noise includes all E modes that change
+    // from image to image. The classes differ: in the wrong class half of the intrinsic power is in E modes.
     fn noise_power(&self, sum: &FieldSum, groups: &[MeanPower]) -> Option<NoisePower> {
         let gain = self.noise_gain(sum);
         match self.options.noise {
@@ -408,7 +568,6 @@ impl SetScorer {
         }
     }
 
-    /// The metrics with each group of images left out in turn; none with a single group.
     fn replicates(
         &self,
         images: &SetImages,
@@ -429,8 +588,8 @@ impl SetScorer {
         images.groups().iter().enumerate().map(without).collect()
     }
 
-    /// The metrics without one group of images; `others` are the remaining groups. If they are too few to measure
-    /// the noise, the noise of all images is scaled.
+    // The metrics without one group of images; `others` are the remaining groups. If they are too few to measure
+    // the noise, the noise of all images is scaled.
     fn replicate(
         &self,
         total: &FieldSum,
@@ -465,6 +624,7 @@ impl SetScorer {
             m_half: score.fit.cl.m_half,
             sqrt_a: score.fit.cl.sqrtA * 1e4,
             m_cross: score.m_cross,
+            // Divided by the response, so that shrinking all ellipticities does not lower it.
             galaxy_noise: self.noise_variance(sum, score).sqrt() / (1.0 + score.m_cross).abs(),
             m1: first.m,
             m2: second.m,
@@ -474,6 +634,7 @@ impl SetScorer {
             eb_power: mean_c_l(&score.eb),
             sigma_sys_1e4: score.quality.sigma_sys * 1e4,
         };
+        // A constant shear has power in the zero mode only, which no bin contains.
         match self.truth.constant() {
             None => own,
             Some(_) => Metrics {
@@ -484,8 +645,8 @@ impl SetScorer {
         }
     }
 
-    /// Noise variance of one galaxy per component: white noise of this variance has the power that was subtracted
-    /// from the scored bandpowers. Not a number if none was subtracted.
+    // Noise variance of one galaxy per component: white noise of this variance has the power that was subtracted
+    // from the scored bandpowers. Not a number if none was subtracted.
     fn noise_variance(&self, sum: &FieldSum, score: &ConventionScore) -> f64 {
         let unit = self.bins.white_noise(self.noise_gain(sum));
         let removed = SCORED
@@ -497,7 +658,6 @@ impl SetScorer {
         }
     }
 
-    /// m and c of both components, from the galaxies.
     fn biases(&self, sum: &FieldSum, convention: Convention) -> [ShearBias; 2] {
         let (s1, s2) = convention.signs();
         let count = convention.turn(&sum.count);
@@ -507,8 +667,8 @@ impl SetScorer {
         ]
     }
 
-    /// Standard errors of the metrics ([`crate::errors`]) and of the E-mode bandpowers. For c the jackknife error is
-    /// used if it is larger: only the jackknife includes shifts common to all galaxies of an image.
+    // Standard errors of the metrics (`crate::errors`) and of the E-mode bandpowers. For c the jackknife error is
+    // used if it is larger: only the jackknife includes shifts common to all galaxies of an image.
     fn errors(
         &self,
         images: &SetImages,
@@ -533,7 +693,6 @@ impl SetScorer {
         self.spectrum_errors(images, score, metrics, from_galaxies)
     }
 
-    /// Standard errors of m and c of both components, from the residuals of the galaxies.
     fn galaxy_errors(&self, sum: &FieldSum, convention: Convention) -> [(f64, f64); 2] {
         let images = sum.images as f64;
         let biases = self.biases(sum, convention);
@@ -555,7 +714,6 @@ impl SetScorer {
         [(m[0], c[0]), (m[1], c[1])]
     }
 
-    /// Standard errors of the metrics of spectra and of the E-mode bandpowers; other errors as in `others`.
     fn spectrum_errors(
         &self,
         images: &SetImages,
@@ -574,6 +732,7 @@ impl SetScorer {
         let q_dn = match score.quality_dn {
             None => f64::NAN,
             Some(_) => {
+                // The subtracted noise was measured on the same G groups, which raises the noise² term by G/(G − 1).
                 let own = match self.options.noise {
                     Noise::Given(_) => 1.0,
                     Noise::Measured => groups / (groups - 1.0),
@@ -583,6 +742,7 @@ impl SetScorer {
                 errors::of_quality(bins, metrics.q_dn, &apart, &variance)
             }
         };
+        // Noise of different modes is independent.
         let independent =
             std::array::from_fn(|i| std::array::from_fn(|j| if i == j { power[i] } else { 0.0 }));
         let (m, a) = errors::of_biases(bins, &true_ee, &independent);
@@ -623,7 +783,7 @@ impl SetScorer {
     }
 }
 
-/// The convention with the highest Q, the first of equals.
+// The convention with the highest Q, the first of equals.
 fn best_of(conventions: &[ConventionScore; 8]) -> Convention {
     conventions
         .iter()

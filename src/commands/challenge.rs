@@ -19,7 +19,7 @@ use shearq_dataset::layout::DataFolder;
 use shearq_dataset::layout::MAX_IMAGE;
 use shearq_files::FileError;
 use shearq_files::open::is_there;
-use shearq_results::submit::check::{Finding, Severity, check, check_sent};
+use shearq_results::submit::check::{Finding, Severity, check_sent};
 use shearq_results::submit::packed::{Sent, Submission};
 
 use super::check::report;
@@ -324,9 +324,9 @@ fn check_entry(arguments: &CheckArguments) -> anyhow::Result<()> {
     if is_there(entry) {
         inbox::refuse_links(entry)?;
     }
-    let Ok(sent) = Sent::open(entry) else {
-        // The error is one of the findings.
-        return report(&check(entry, &expected), entry, *json);
+    let sent = match Sent::open(entry) {
+        Ok(sent) => sent,
+        Err(error) => return report(&[Finding::unreadable(error)], entry, *json),
     };
     let mut findings = check_sent(&sent, &expected, &mut |_| {});
     // Unreadable entries are among the findings already.

@@ -15,7 +15,7 @@ use shearq_dataset::truth::grid_of_set;
 use shearq_files::table::{MAX_ROWS, read_truth};
 use shearq_results::score::COLUMNS;
 use shearq_results::submit::challenge::Kind;
-use shearq_results::submit::check::{Expected, Finding, Severity, check, check_sent};
+use shearq_results::submit::check::{Expected, Finding, Severity, check_sent};
 use shearq_results::submit::packed::Sent;
 
 /// Check a submission before you send it.
@@ -96,7 +96,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     )?;
     let mut truth = BTreeMap::new();
     if let Some(data) = &data {
-        tell_unread(&data.images(&[])?);
+        tell_unread(data.images(&[])?.unread());
         for set in sets {
             truth.insert(set, data.read_truth(set, &grid)?);
         }
@@ -109,10 +109,9 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         sets: Vec::new(),
         partial: false,
     };
-    let findings = match &sent {
-        Ok(sent) => check_sent(sent, &expected, &mut |_| {}),
-        // The error is one of the findings.
-        Err(_) => check(path, &expected),
+    let findings = match sent {
+        Ok(sent) => check_sent(&sent, &expected, &mut |_| {}),
+        Err(error) => vec![Finding::unreadable(error)],
     };
     report(&findings, path, *json)
 }

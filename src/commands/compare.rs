@@ -5,21 +5,22 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 
 use crate::arguments::{Printing, ReportFile, ScoreSettings, Threads};
-use crate::choices::named;
+use crate::choices;
 use crate::{print_heat_map, score};
 use shearq_dataset::run::Run;
 use shearq_render::figure::{Figure, HeatMap};
 use shearq_render::table::{Table, TableFormat};
-use shearq_results::compare::{Variant, by_name, chosen, score_all};
+use shearq_results::compare::{Group, Grouping, Order, chosen, score_all};
 use shearq_results::conditions::choose;
 use shearq_results::expression::Expression;
-use shearq_results::groups::{Group, Grouping, Order};
-use shearq_results::row::RunRecord;
+use shearq_results::record::RunRecord;
 use shearq_results::store;
-use shearq_results::submit::packed::PackedCatalogues;
-use shearq_results::views::comparison::{compare, compare_runs, notes_of_variants, q_heat_map};
+use shearq_results::submit::packed::is_packed;
+use shearq_results::views::comparison::{
+    compare, compare_runs, named, notes_of_variants, q_heat_map, verdict, verdict_on_runs,
+};
 use shearq_results::views::pages;
-use shearq_results::views::verdict::verdict;
+use shearq_scoring::Options;
 
 /// Compare the metrics of several configurations.
 ///
@@ -50,7 +51,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "FIELD[:desc]")]
     sort: Option<Order>,
     /// Average over groups of sets instead of all sets.
-    #[arg(long, value_parser = named::<Grouping>())]
+    #[arg(long, value_parser = choices::named::<Grouping>())]
     group_by: Option<Grouping>,
     /// Draw Q of each run and set to this file (.png or .svg).
     #[arg(long, value_name = "FILE")]
@@ -65,33 +66,29 @@ pub(crate) struct Arguments {
     threads: Threads,
 }
 
+/// A comparison to print.
+struct Comparison {
+    table: Table,
+    verdict: Option<String>,
+    map: HeatMap,
+}
+
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
-    let (table, map) = match &arguments.store {
+    let Comparison {
+        table,
+        verdict,
+        map,
+    } = match &arguments.store {
         Some(store) => stored(arguments, store)?,
-        None => {
-            let variants = score_all(
-                &arguments.measured,
-                &arguments.foreign,
-                arguments.data.as_deref(),
-                arguments.settings.way(),
-                arguments.threads.number(),
-            )?;
-            let variants = chosen(
-                variants,
-                arguments.condition.as_ref(),
-                arguments.sort.as_ref(),
-            )?;
-            (
-                folders(arguments, &variants)?,
-                q_heat_map(&by_name(&variants)),
-            )
-        }
+        None => folders(arguments)?,
     };
-    arguments.printing.print(&table)?;
+    let mut printed = table.clone();
+    printed.notes.extend(verdict.clone());
+    arguments.printing.print(&printed)?;
     if let Some(path) = &arguments.heat_map {
         map.save(path)?;
     }
-    let sections = || Ok(vec![pages::comparison(table, &map)?]);
+    let sections = || Ok(vec![pages::comparison(table, verdict, &map)?]);
     let title = "Comparison of configurations";
     arguments
         .report
@@ -106,7 +103,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
 fn made_by(arguments: &Arguments) -> anyhow::Result<Vec<(String, String)>> {
     let mut made_by = Vec::new();
     for folder in &arguments.measured {
-        if PackedCatalogues::is_packed(folder) {
+        if is_packed(folder) {
             made_by.push(("Input".to_owned(), folder.display().to_string()));
             continue;
         }
@@ -119,25 +116,47 @@ fn made_by(arguments: &Arguments) -> anyhow::Result<Vec<(String, String)>> {
 }
 
 /// Compares folders, or groups of their sets.
-fn folders(arguments: &Arguments, variants: &[Variant]) -> anyhow::Result<Table> {
-    if arguments.group_by.is_none() {
-        return Ok(compare(variants, arguments.settings.definition()));
-    }
-    let runs: Vec<RunRecord> = variants.iter().map(|variant| variant.run.clone()).collect();
-    let groups = Group::of(&runs, arguments.group_by, arguments.sort.as_ref())?;
-    let mut table = compare_runs(&runs, &groups, arguments.group_by);
-    table.title = "Comparison of configurations".into();
-    for line in notes_of_variants(variants) {
-        if !table.notes.contains(&line) {
-            table.notes.push(line);
+fn folders(arguments: &Arguments) -> anyhow::Result<Comparison> {
+    let order = arguments.sort.as_ref();
+    let options = Options {
+        definition: arguments.settings.definition(),
+        ..Options::default()
+    };
+    let variants = score_all(
+        &arguments.measured,
+        &arguments.foreign,
+        arguments.data.as_deref(),
+        arguments.settings.convention,
+        options,
+        arguments.threads.number(),
+    )?;
+    let variants = chosen(variants, arguments.condition.as_ref(), order)?;
+    let table = match arguments.group_by {
+        None => compare(&variants, options.definition),
+        Some(_) => {
+            let runs = variants.iter().map(|variant| variant.run.clone());
+            let runs: Vec<RunRecord> = runs.collect();
+            let groups = Group::of(&runs, arguments.group_by, order);
+            let mut table = compare_runs(&runs, &groups, arguments.group_by);
+            table.title = "Comparison of configurations".into();
+            for line in notes_of_variants(&variants) {
+                if !table.notes.contains(&line) {
+                    table.notes.push(line);
+                }
+            }
+            table
         }
-    }
-    table.notes.extend(verdict(&by_name(variants)));
-    Ok(table)
+    };
+    let named = named(&variants);
+    Ok(Comparison {
+        table,
+        verdict: verdict(&named),
+        map: q_heat_map(&named),
+    })
 }
 
 /// Compares the runs of a store.
-fn stored(arguments: &Arguments, path: &Path) -> anyhow::Result<(Table, HeatMap)> {
+fn stored(arguments: &Arguments, path: &Path) -> anyhow::Result<Comparison> {
     let (mut runs, notes) = store::read(path)?;
     if let Some(condition) = &arguments.condition {
         runs = choose(condition, runs)?;
@@ -151,13 +170,20 @@ fn stored(arguments: &Arguments, path: &Path) -> anyhow::Result<(Table, HeatMap)
             None => ". Try: shearq score --measured OUT --store DIR",
         }
     );
-    let order = arguments.sort.as_ref();
-    let groups = Group::of(&runs, arguments.group_by, order)?;
-    let mut table = compare_runs(&runs, &groups, arguments.group_by);
+    let (grouping, order) = (arguments.group_by, arguments.sort.as_ref());
+    let groups = Group::of(&runs, grouping, order);
+    let mut table = compare_runs(&runs, &groups, grouping);
     table.notes.extend(notes);
-    let rows: Vec<_> = Group::of(&runs, None, order)?
-        .into_iter()
-        .map(|run| (run.name(), run.sets))
-        .collect();
-    Ok((table, q_heat_map(&rows)))
+    let whole = Group::of(&runs, None, order);
+    let rows = whole
+        .iter()
+        .map(|group| (group.name(), group.run.sets.as_slice()));
+    Ok(Comparison {
+        table,
+        verdict: match grouping {
+            None => verdict_on_runs(&groups),
+            Some(_) => None,
+        },
+        map: q_heat_map(&rows.collect::<Vec<_>>()),
+    })
 }

@@ -63,7 +63,7 @@ impl Measuring {
     /// The images of this shard in a data folder.
     pub(super) fn images(&self, data: &DataFolder, sets: &[u32]) -> anyhow::Result<Vec<ImageId>> {
         let images = self.sharding.part(&images::of_folder(data, sets)?);
-        tell_unread(&data.images(sets)?);
+        tell_unread(data.images(sets)?.unread());
         Ok(images)
     }
 

@@ -87,7 +87,7 @@ fn merge_run(arguments: &Arguments, run: &Run) -> anyhow::Result<()> {
                 run.source
             );
             let images = images::of_folder(&data, sets)?;
-            tell_unread(&data.images(sets)?);
+            tell_unread(data.images(sets)?.unread());
             images
         }
     };

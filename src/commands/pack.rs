@@ -11,13 +11,13 @@ use crate::choices::named;
 use crate::progress::Bar;
 use crate::{count, tell, tell_unread};
 use shearq_dataset::run::{Run, open_data};
-use shearq_results::foreign::Foreign;
+use shearq_results::catalogues::Catalogues;
 use shearq_results::submit::archive::is_archive;
 use shearq_results::submit::manifest::{Contents, Entry};
-use shearq_results::submit::pack::{Origin, Packing};
+use shearq_results::submit::pack::Packing;
 
 /// Longest name of a method in bytes: a tar header has 100 for a file name.
-const MAX_METHOD: usize = 64;
+const MAX_METHOD_BYTES: usize = 64;
 
 /// Endings of unsupported archives.
 const OTHER_ARCHIVES: [&str; 7] = ["zip", "tar", "gz", "bz2", "xz", "zst", "7z"];
@@ -143,32 +143,31 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         "--out {}: unsupported archive (found .{ending}, expected a folder, .tar.gz or .tgz)",
         out.display()
     );
-    let run = measured.as_deref().map(Run::require).transpose()?;
-    let foreign = foreign.as_deref().map(Foreign::read).transpose()?;
-    let data = data.as_deref().map(open_data).transpose()?;
-    let (origin, name) = match (measured, &run, &foreign) {
-        (Some(folder), Some(run), _) => (Origin::Measured { folder, run }, &run.configuration.name),
-        (_, _, Some(foreign)) => {
-            let data = data.as_ref();
-            (Origin::Foreign { foreign, data }, &foreign.name)
-        }
+    let catalogues = match (measured, foreign) {
+        (Some(folder), _) => Catalogues::measured(&Run::require(folder)?, folder, &[])?,
+        (None, Some(path)) => Catalogues::foreign(path, &[])?,
         _ => anyhow::bail!("cannot find catalogues to pack. Try: --measured DIR or --foreign FILE"),
     };
-    let method = method.clone().unwrap_or_else(|| name.replace('/', "-"));
+    let data = data.as_deref().map(open_data).transpose()?;
+    let method = method
+        .clone()
+        .unwrap_or_else(|| catalogues.name.replace('/', "-"));
     anyhow::ensure!(
-        (1..=MAX_METHOD).contains(&method.len())
+        (1..=MAX_METHOD_BYTES).contains(&method.len())
             && !method.starts_with('.')
             && !method.contains(|c: char| "/\\:".contains(c) || c.is_whitespace() || is_control(c)),
-        "--method: unusable name (found `{method}`, expected 1 to {MAX_METHOD} bytes without `/`, `\\`, `:`, blanks and a leading `.`)"
+        "--method: unusable name (found `{method}`, expected 1 to {MAX_METHOD_BYTES} bytes without `/`, `\\`, `:`, blanks and a leading `.`)"
     );
     let packing = Packing {
-        origin,
+        catalogues: &catalogues,
+        data: data.as_ref(),
         method,
         contents: *kind,
         entry,
     };
-    tell_unread(&packing.origin.catalogues()?);
-    let mut bar = Bar::new("packing", packing.galaxies()?);
+    let galaxies = packing.galaxies()?;
+    tell_unread(catalogues.unread());
+    let mut bar = Bar::new("packing", galaxies);
     let files = packing.write(out, &mut bar)?;
     drop(bar);
     tell(format_args!(

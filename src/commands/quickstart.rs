@@ -6,7 +6,7 @@ use clap::Args;
 use shearq_scoring::Options;
 use shearq_submissions::Registry;
 
-use crate::arguments::{ScoreSettings, Threads};
+use crate::arguments::Threads;
 use crate::progress::{Bar, goes_on};
 use crate::{print, print_table, tell};
 use shearq_dataset::images;
@@ -14,12 +14,11 @@ use shearq_dataset::run::{Run, Source};
 use shearq_files::table::FileFormat;
 use shearq_pipeline::run::run_folder;
 use shearq_render::terminal::wrapped;
-use shearq_results::compare::{by_name, score_all};
+use shearq_results::compare::score_all;
 use shearq_results::score::{OWN, ScoredSet, score_folder};
-use shearq_results::views::comparison::{compact, compare, q_heat_map};
+use shearq_results::views::comparison::{compact, compare, named, q_heat_map, verdict};
 use shearq_results::views::pages;
 use shearq_results::views::scores::{per_set, verdict_line};
-use shearq_results::views::verdict::verdict;
 use shearq_simulate::set::SimulationSettings;
 
 /// Simulate a small data set, measure it with three configurations, and compare them.
@@ -85,8 +84,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         made_by.push((name.to_owned(), toml::to_string(&run.configuration)?));
         folders.push(folder);
     }
-    let way = ScoreSettings::default().way();
-    let mut variants = score_all(&folders, &[], None, way, threads)?;
+    let mut variants = score_all(&folders, &[], None, None, options, threads)?;
     for variant in &mut variants {
         // Published metrics are for 200 images per set.
         variant.published = None;
@@ -97,9 +95,10 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     if *wide {
         print_table(&full)?;
     }
-    let records = by_name(&variants);
-    let comparison = pages::comparison(full, &q_heat_map(&records))?;
-    if let Some(verdict) = verdict(&records) {
+    let rows = named(&variants);
+    let verdict = verdict(&rows);
+    let comparison = pages::comparison(full, verdict.clone(), &q_heat_map(&rows))?;
+    if let Some(verdict) = verdict {
         print(&format!("\n{}\n", wrapped(&verdict, Some(80))))?;
     }
     sections.insert(0, comparison);
@@ -115,9 +114,9 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
 /// Q of each set, as text.
 fn q_of(scored: &[ScoredSet]) -> String {
     let sets = scored.iter().map(|set| {
-        let number = set.set.unwrap_or_default();
-        let (q, error) = (set.score.metrics.q, set.score.errors.q);
-        format!("Q = {q:.1} ± {error:.1} in set {number}")
+        let record = &set.record;
+        let (q, error) = (record.metrics.q, record.errors.q);
+        format!("Q = {q:.1} ± {error:.1} in set {}", record.set)
     });
     sets.collect::<Vec<_>>().join(", ")
 }

@@ -16,8 +16,8 @@ use shearq_dataset::run::{Run, Source, open_data};
 use shearq_files::atomic;
 use shearq_pipeline::run::run_folder;
 use shearq_render::table::{Table, TableFormat};
-use shearq_results::row::Measured;
-use shearq_results::score::{OWN, ScoredSet, score_folder};
+use shearq_results::catalogues::Catalogues;
+use shearq_results::score::{OWN, ScoredSet, score_catalogues};
 use shearq_results::store;
 use shearq_results::views::pages;
 use shearq_results::views::scores::{bandpowers, per_set, verdict_line};
@@ -142,11 +142,11 @@ pub(super) fn score(
         choice: OWN,
         ..Options::default()
     };
-    let truth = run.source.data(out)?;
-    let scored = score_folder(&truth, out, run, sets, options, threads)?;
+    let data = run.source.data(out)?;
+    let catalogues = Catalogues::measured(run, out, sets)?;
+    let scored = score_catalogues(&data, &catalogues, sets, options, threads)?;
     if let Some(store) = store {
-        let made = Measured::run(run, &truth, out)?;
-        score::record(store, made, &scored, options)?;
+        score::record(store, &catalogues, &data, &scored, options)?;
     }
     let title = format!("Scores of {}", run.configuration.name);
     let mut table = per_set(&scored, &title, options.definition);

@@ -6,30 +6,28 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 use clap::{ArgGroup, Args};
 use shearq_quantities::units::{Degrees, Pixels};
-use shearq_scoring::{Grid, Noise, Options, SetScorer, SpectrumScore};
+use shearq_scoring::{Noise, Options, SetScorer};
 use shearq_submissions::EllipticityType;
 
 use crate::arguments::{
     Printing, ReportFile, ScoreSettings, SetList, SignArgument, Threads, positive,
 };
 use crate::{print, tell, tell_unread};
-use shearq_dataset::fingerprint;
 use shearq_dataset::layout::DataFolder;
 use shearq_dataset::run::kind_of;
-use shearq_dataset::run::{Run, Source, way};
+use shearq_dataset::run::{Run, Source};
 use shearq_dataset::truth::{ReadTruth, Reading, Sign, read_truth, reading_of};
-use shearq_pipeline::PipelineError;
 use shearq_render::table::TableFormat;
-use shearq_results::foreign::{Foreign, Screen, folder_of, plain_columns};
-use shearq_results::row::{Measured, RunRecord, SetRecord};
-use shearq_results::score::{COLUMNS, ScoredSet, score_files, score_folder, score_sets, unscored};
+use shearq_results::catalogues::Catalogues;
+use shearq_results::foreign::{Screen, folder_of, plain_columns};
+use shearq_results::record::{RunRecord, SetRecord};
+use shearq_results::score::{COLUMNS, ScoredSet, score_catalogues, score_files, unscored};
 use shearq_results::store;
 use shearq_results::submit::challenge::{Kind, read_bandpowers};
 use shearq_results::submit::manifest::Manifest;
-use shearq_results::submit::packed::{Packed, PackedCatalogues, Sent, Submission};
+use shearq_results::submit::packed::{Packed, Sent, Submission};
 use shearq_results::views::pages;
 use shearq_results::views::scores::{SetInput, one_set_json, per_set, spectra, verdict_line};
-use shearq_simulate::kinds::SetKind;
 
 /// Score ellipticities against a known shear field: Q, Q_dn, M/2, √A and more.
 ///
@@ -129,15 +127,9 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let options = Options {
         definition: arguments.settings.definition(),
         noise: arguments.noise_var.map_or(Noise::Measured, Noise::Given),
-        choice: match arguments.measured {
-            Some(_) => arguments.settings.own_choice(),
-            None => arguments.settings.choice(),
-        },
+        choice: arguments.settings.convention.unwrap_or_default(),
     };
     let data = arguments.data.as_ref().map(DataFolder::open).transpose()?;
-    if let (Some(path), Some(data)) = (&arguments.packed, &data) {
-        return packed(arguments, data, path, options);
-    }
     match (&arguments.truth, &arguments.spectra, data) {
         (Some(truth), Some(spectrum), _) => spectrum_file(arguments, truth, spectrum, options),
         (Some(truth), None, _) => files(arguments, truth, options),
@@ -145,81 +137,73 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         (None, Some(_), None) => {
             bail!("--spectra needs the true shear. Try: --data DIR, or --truth FILE")
         }
-        (None, None, data) => folder(arguments, data, options),
+        (None, None, data) => catalogues(arguments, data, options),
     }
 }
 
-fn folder(arguments: &Arguments, data: Option<DataFolder>, options: Options) -> anyhow::Result<()> {
+/// Scores the catalogues of a folder of results, of another program, or of a submission.
+fn catalogues(
+    arguments: &Arguments,
+    data: Option<DataFolder>,
+    options: Options,
+) -> anyhow::Result<()> {
     let store = arguments.store.as_deref();
     let _prepared = store.map(store::prepare).transpose()?;
     let sets = arguments.sets.as_ref().map_or(&[][..], |list| &list.0);
-    let threads = arguments.threads.number();
-    let (name, made_by, scored, unscored) = match (&arguments.measured, &arguments.foreign, data) {
-        (Some(measured), _, data) => {
-            let run = Run::require(measured)?;
-            let data = data.map_or_else(|| run.source.data(measured), Ok)?;
-            let scored = score_folder(&data, measured, &run, sets, options, threads)?;
-            if let Some(store) = &arguments.store {
-                let made = Measured::run(&run, &data, measured)?;
-                record_printable(arguments, store, made, &scored, options)?;
-            }
-            let unscored = unscored(&data, &scored, sets)?;
-            let made_by = made_by(&run, measured)?;
-            (run.configuration.name, made_by, scored, unscored)
+    let (catalogues, data) = match (&arguments.measured, &arguments.foreign, data) {
+        (Some(folder), _, data) => {
+            let run = Run::require(folder)?;
+            let data = data.map_or_else(|| run.source.data(folder), Ok)?;
+            (Catalogues::measured(&run, folder, sets)?, data)
         }
         (None, Some(path), Some(data)) => {
-            let foreign = Foreign::read(path)?;
-            let read = |grid: &Grid, path: &Path| foreign.sum(grid, path);
-            let files = foreign.catalogues(sets)?;
+            let catalogues = Catalogues::foreign(path, sets)?;
             anyhow::ensure!(
-                !files.serve_all_sets() || !sets.is_empty(),
+                !catalogues.serve_all_sets() || !sets.is_empty(),
                 "{}: cannot determine the sets, because `catalogues` contains no {{set}}. Try: --sets 1",
                 path.display()
             );
-            tell_unread(&files);
-            let catalogues = |set| files.of_set(set);
-            let scored = score_sets(&data, sets, catalogues, &read, options, threads)
-                .with_context(|| path.display().to_string())?;
-            if let Some(store) = &arguments.store {
-                let made = Measured {
-                    name: &foreign.name,
-                    settings: shearq_files::open::read_to_string(
-                        path,
-                        shearq_files::open::SETTINGS,
-                    )
-                    .with_context(|| path.display().to_string())?,
-                    source: &Source::folder(&data, folder_of(path))?,
-                    data: &data,
-                };
-                record_printable(arguments, store, made, &scored, options)?;
-            }
-            let unscored = unscored(&data, &scored, sets)?;
-            let made_by = [("Catalogues", path.as_path()), ("Data", data.root())]
-                .map(|(what, path)| (what.to_owned(), path.display().to_string()));
-            (foreign.name.clone(), made_by.into(), scored, unscored)
+            tell_unread(catalogues.unread());
+            (catalogues, data)
         }
-        (None, _, _) => bail!("--foreign needs the true shear. Try: --data DIR"),
+        (None, None, Some(data)) => {
+            let path = arguments.packed.as_deref();
+            let path = path.context("--packed: expected a folder or an archive")?;
+            let sent = Sent::open(path)?;
+            let submission = Submission::read(&sent)?;
+            if let Packed::Spectra(_) = submission.packed {
+                return packed_spectra(arguments, &data, &sent, submission, options);
+            }
+            (Catalogues::packed(sent, submission, &data)?, data)
+        }
+        (None, _, None) => bail!("--foreign needs the true shear. Try: --data DIR"),
     };
+    let options = Options {
+        choice: arguments.settings.convention.unwrap_or(catalogues.choice()),
+        ..options
+    };
+    let threads = arguments.threads.number();
+    let scored = score_catalogues(&data, &catalogues, sets, options, threads)?;
+    let name = &catalogues.name;
     let title = format!("Scores of {name}");
     let mut table = per_set(&scored, &title, options.definition);
-    table.notes.extend(unscored);
-    table.notes.extend(verdict_line(&name, &scored));
+    table.notes.extend(unscored(&data, &scored, sets)?);
+    table.notes.extend(verdict_line(name, &scored));
+    if let Some(store) = store {
+        // A command that fails to print records nothing.
+        arguments.printing.check(&table)?;
+        record(store, &catalogues, &data, &scored, options)?;
+    }
     arguments.printing.print(&table)?;
-    let sections = || Ok(vec![pages::scores(&name, &scored, table)?]);
-    arguments.report.save(&title, sections, || Ok(made_by))
-}
-
-/// Records scores after checking that they can be printed, so that a failing command records nothing.
-fn record_printable(
-    arguments: &Arguments,
-    store: &Path,
-    measured: Measured<'_>,
-    scored: &[ScoredSet],
-    options: Options,
-) -> anyhow::Result<()> {
-    let table = per_set(scored, "", options.definition);
-    arguments.printing.check(&table)?;
-    record(store, measured, scored, options)
+    let sections = || Ok(vec![pages::scores(name, &scored, table)?]);
+    arguments
+        .report
+        .save(&title, sections, || match catalogues.run() {
+            Some(run) => made_by(run, &catalogues.path),
+            None => Ok([("Catalogues", &*catalogues.path), ("Data", data.root())]
+                .map(|(what, path)| (what.to_owned(), path.display().to_string()))
+                .into()),
+        })
 }
 
 /// Source and settings of a run, for reports.
@@ -234,32 +218,43 @@ pub(super) fn made_by(run: &Run, out: &Path) -> anyhow::Result<Vec<(String, Stri
     ])
 }
 
-/// Records a scored run in a results store and prints the file name.
+/// Records scores in a results store and prints the file name.
 pub(super) fn record(
     store: &Path,
-    measured: Measured<'_>,
+    catalogues: &Catalogues,
+    data: &DataFolder,
     scored: &[ScoredSet],
     options: Options,
 ) -> anyhow::Result<()> {
-    let path = store::write(store, &RunRecord::new(measured, scored, options)?)?;
+    let sets = scored.iter().map(|set| set.record.clone()).collect();
+    let Catalogues { name, settings, .. } = catalogues;
+    let run = RunRecord::new(name, settings, String::new(), options, sets);
+    write_record(store, run, &catalogues.source(data)?, data)
+}
+
+fn write_record(
+    store: &Path,
+    run: RunRecord,
+    source: &Source,
+    data: &DataFolder,
+) -> anyhow::Result<()> {
+    let path = store::write(store, &run.with_fingerprints(source, data)?)?;
     tell(format_args!("recorded in {}", path.display()));
     Ok(())
 }
 
-/// Scores a submission.
-fn packed(
+/// Scores the power spectra of a submission.
+fn packed_spectra(
     arguments: &Arguments,
     data: &DataFolder,
-    path: &Path,
+    sent: &Sent,
+    submission: Submission,
     options: Options,
 ) -> anyhow::Result<()> {
-    let _prepared = arguments.store.as_deref().map(store::prepare).transpose()?;
-    let sent = Sent::open(path)?;
-    let submission = Submission::read(&sent)?;
-    let Packed::Spectra(files) = submission.packed else {
-        let catalogues = PackedCatalogues::new(sent, submission)?;
-        return packed_catalogues(arguments, data, path, &catalogues, options);
+    let Packed::Spectra(files) = &submission.packed else {
+        return Ok(());
     };
+    let path = sent.as_given(sent.path());
     anyhow::ensure!(
         arguments.noise_var.is_none(),
         "--noise-var applies to catalogues only; {} contains power spectra. Try: without --noise-var",
@@ -270,114 +265,17 @@ fn packed(
         error.downcast().map_or_else(|other| other, named)
     };
     let manifest = submission.manifest.as_ref();
-    let scored = score_spectra(arguments, data, files, manifest, path, options).map_err(named)?;
-    print_spectra(arguments, &scored, |set| kind_of(data, set), path, options)?;
+    let spectra =
+        score_spectra(arguments, data, files.clone(), manifest, &path, options).map_err(named)?;
+    spectra.print(arguments, &path, options)?;
     let Some(store) = &arguments.store else {
         return Ok(());
     };
-    let made = packed_made_by(&submission.method, manifest, path, data)?;
-    let source = Source::folder(data, folder_of(path))?;
-    let mut sets = Vec::new();
-    for (set, score) in &scored {
-        let Some(set) = *set else { continue };
-        // The images that the spectrum was made from are not recorded.
-        let print = fingerprint::of_set(&source, data, set, &[])?;
-        let simulated = kind_of(data, set).is_some();
-        sets.push(SetRecord::of_spectrum(
-            set,
-            simulated,
-            score,
-            Vec::new(),
-            print,
-        ));
-    }
-    let run = RunRecord::of_records(made.measured(&source, data), sets, options)?;
-    let path = store::write(store, &run)?;
-    tell(format_args!("recorded in {}", path.display()));
-    Ok(())
-}
-
-/// Name and settings of a submission, for a store.
-struct PackedBy {
-    name: String,
-    settings: String,
-}
-
-impl PackedBy {
-    fn measured<'a>(&'a self, source: &'a Source, data: &'a DataFolder) -> Measured<'a> {
-        Measured {
-            name: &self.name,
-            settings: self.settings.clone(),
-            source,
-            data,
-        }
-    }
-}
-
-fn packed_made_by(
-    method: &str,
-    manifest: Option<&Manifest>,
-    path: &Path,
-    data: &DataFolder,
-) -> anyhow::Result<PackedBy> {
-    let run = manifest.and_then(|manifest| manifest.run.as_ref());
-    Ok(PackedBy {
-        name: method.to_owned(),
-        settings: match run {
-            Some(run) => toml::to_string(&run.configuration)?,
-            // The path from the data to the submission distinguishes methods of one name.
-            None => way(data.root(), path)?.display().to_string(),
-        },
-    })
-}
-
-/// Scores the catalogues of a submission.
-fn packed_catalogues(
-    arguments: &Arguments,
-    data: &DataFolder,
-    path: &Path,
-    catalogues: &PackedCatalogues,
-    options: Options,
-) -> anyhow::Result<()> {
-    let sets = arguments.sets.as_ref().map_or(&[][..], |list| &list.0);
-    let options = Options {
-        choice: match catalogues.is_own() {
-            true => arguments.settings.own_choice(),
-            false => arguments.settings.choice(),
-        },
-        ..options
-    };
-    let read = |grid: &Grid, path: &Path| catalogues.sum(grid, path);
-    let threads = arguments.threads.number();
-    let of_set = |set| catalogues.of_set(set);
-    let mut scored =
-        score_sets(data, sets, of_set, &read, options, threads).map_err(|error| match error {
-            PipelineError::File(error) => catalogues.sent.named(error).into(),
-            other => other,
-        })?;
-    for set in &mut scored {
-        set.odd_images
-            .renamed(|path| catalogues.sent.as_given(path));
-    }
-    if let Some(store) = &arguments.store {
-        let manifest = catalogues.manifest.as_ref();
-        let made = packed_made_by(&catalogues.method, manifest, path, data)?;
-        let source = Source::folder(data, folder_of(path))?;
-        record_printable(
-            arguments,
-            store,
-            made.measured(&source, data),
-            &scored,
-            options,
-        )?;
-    }
-    let title = format!("Scores of {}", catalogues.method);
-    let mut table = per_set(&scored, &title, options.definition);
-    table.notes.extend(unscored(data, &scored, sets)?);
-    table
-        .notes
-        .extend(verdict_line(&catalogues.method, &scored));
-    arguments.printing.print(&table)
+    let settings = submission.settings(&path, data)?;
+    // The images that the spectra were made from are not recorded, so that differences cannot be paired.
+    let sets = spectra.records;
+    let run = RunRecord::new(&submission.method, &settings, String::new(), options, sets);
+    write_record(store, run, &Source::folder(data, folder_of(&path))?, data)
 }
 
 /// Scores the power spectra of a folder, one file per set.
@@ -408,14 +306,48 @@ fn spectrum_folder(
         folder.display()
     );
     let manifest = Manifest::read(folder)?;
-    let scored = score_spectra(arguments, data, files, manifest.as_ref(), folder, options)?;
-    print_spectra(
-        arguments,
-        &scored,
-        |set| kind_of(data, set),
-        folder,
-        options,
-    )
+    let spectra = score_spectra(arguments, data, files, manifest.as_ref(), folder, options)?;
+    spectra.print(arguments, folder, options)
+}
+
+/// Scored power spectra.
+#[derive(Default)]
+struct Spectra {
+    records: Vec<SetRecord>,
+    /// Q of zero shear in each set.
+    zero_q: Vec<f64>,
+}
+
+impl Spectra {
+    /// Scores the power spectrum of a set (0 for a plain file).
+    fn add(
+        &mut self,
+        set: u32,
+        simulated: bool,
+        truth: ReadTruth,
+        path: &Path,
+        manifest: Option<&Manifest>,
+        options: Options,
+    ) -> anyhow::Result<()> {
+        let ReadTruth { grid, shear, .. } = truth;
+        let powers = read_bandpowers(path, &grid)?;
+        let covariance = manifest.and_then(|manifest| {
+            let name = path.file_name()?.to_str()?;
+            manifest.covariances.get(name)
+        });
+        let score = SetScorer::new(grid, shear, options)?.score_spectrum(&powers, covariance)?;
+        self.zero_q.push(score.zero_q);
+        let record = SetRecord::of_spectrum(set, simulated, Vec::new(), &score);
+        self.records.push(record);
+        Ok(())
+    }
+
+    fn print(&self, arguments: &Arguments, path: &Path, options: Options) -> anyhow::Result<()> {
+        let title = format!("Scores of the power spectra of {}", path.display());
+        let zero = &self.zero_q;
+        let table = spectra(&self.records, zero, &title, options.definition);
+        arguments.printing.print(&table)
+    }
 }
 
 /// Scores the power spectra `files` by set, of the submission at `place`.
@@ -426,20 +358,20 @@ fn score_spectra(
     manifest: Option<&Manifest>,
     place: &Path,
     options: Options,
-) -> anyhow::Result<Vec<(Option<u32>, SpectrumScore)>> {
+) -> anyhow::Result<Spectra> {
     if let Some(wanted) = &arguments.sets {
         if let Some(set) = wanted.0.iter().find(|set| !files.contains_key(set)) {
             bail!("{}: found no spectrum of set {set}", place.display());
         }
         files.retain(|set, _| wanted.0.contains(set));
     }
-    let mut scored = Vec::new();
-    for (set, path) in &files {
-        let truth = read_truth(&data.truth(*set), &reading_of(data, *set)?)?;
-        let score = score_spectrum(truth, path, manifest, options)?;
-        scored.push((Some(*set), score));
+    let mut spectra = Spectra::default();
+    for (&set, path) in &files {
+        let truth = read_truth(&data.truth(set), &reading_of(data, set)?)?;
+        let simulated = kind_of(data, set).is_some();
+        spectra.add(set, simulated, truth, path, manifest, options)?;
     }
-    Ok(scored)
+    Ok(spectra)
 }
 
 fn spectrum_file(
@@ -456,39 +388,12 @@ fn spectrum_file(
     }
     let manifest = Manifest::read(folder_of(spectrum))?;
     let line = truth.sign.and_then(Sign::line);
-    let score = score_spectrum(truth, spectrum, manifest.as_ref(), options)?;
+    let mut spectra = Spectra::default();
+    spectra.add(0, false, truth, spectrum, manifest.as_ref(), options)?;
     if let Some(line) = line {
         tell(format_args!("{line}"));
     }
-    let scored = [(None, score)];
-    print_spectra(arguments, &scored, |_| None, spectrum, options)
-}
-
-fn score_spectrum(
-    truth: ReadTruth,
-    path: &Path,
-    manifest: Option<&Manifest>,
-    options: Options,
-) -> anyhow::Result<SpectrumScore> {
-    let ReadTruth { grid, shear, .. } = truth;
-    let powers = read_bandpowers(path, &grid)?;
-    let covariance = manifest.and_then(|manifest| {
-        let name = path.file_name()?.to_str()?;
-        manifest.covariances.get(name)
-    });
-    Ok(SetScorer::new(grid, shear, options)?.score_spectrum(&powers, covariance)?)
-}
-
-fn print_spectra(
-    arguments: &Arguments,
-    scored: &[(Option<u32>, SpectrumScore)],
-    kind_of: impl Fn(u32) -> Option<SetKind>,
-    path: &Path,
-    options: Options,
-) -> anyhow::Result<()> {
-    let title = format!("Scores of the power spectra of {}", path.display());
-    let table = spectra(scored, kind_of, &title, options.definition);
-    arguments.printing.print(&table)
+    spectra.print(arguments, spectrum, options)
 }
 
 /// How to read the file of `--truth`.

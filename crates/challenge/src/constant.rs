@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use shearq_results::row::SetRecord;
+use shearq_results::record::SetRecord;
 use shearq_scoring::TrueShear;
 
 /// Fewest sets for m and c of a component: two for the line, and one that the line does not pass through by

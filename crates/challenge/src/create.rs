@@ -16,8 +16,7 @@ use shearq_pipeline::engine::Quiet;
 use shearq_pipeline::simulate::{simulate_blind, simulator};
 use shearq_pipeline::{PipelineError, Progress};
 use shearq_quantities::units::{Degrees, Pixels};
-use shearq_results::row::SetRecord;
-use shearq_results::score::{Basis, OddImages, ScoredSet};
+use shearq_results::record::SetRecord;
 use shearq_results::submit::manifest::Contents;
 use shearq_scoring::{Choice, Convention, Options, RowCounts, SetImages, SetScorer, TrueShear};
 use shearq_simulate::field::ShearSpectrum;
@@ -423,18 +422,8 @@ fn expected_scores(
             *error /= images.sqrt();
         }
         zero += score.zero_quality().q / data.sets.len() as f64;
-        let scored_set = ScoredSet {
-            set: Some(set),
-            kind: None,
-            images: vec![1],
-            score,
-            rows: RowCounts::default(),
-            basis: Basis::Given,
-            sign: None,
-            findings: Vec::new(),
-            odd_images: OddImages::default(),
-        };
-        scored.push(SetRecord::new(set, &scored_set, String::new()));
+        let rows = RowCounts::default();
+        scored.push(SetRecord::new(set, false, vec![1], &score, &rows));
     }
     Ok((scored, zero))
 }

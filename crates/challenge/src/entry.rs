@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
-use shearq_results::row::SetRecord;
+use shearq_results::record::SetRecord;
 use shearq_results::submit::manifest::Contents;
 
 /// A scored entry, as the store keeps it with its scores.

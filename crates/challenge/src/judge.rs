@@ -12,8 +12,7 @@ use shearq_dataset::run::Source;
 use shearq_dataset::run::kind_of;
 use shearq_files::{FileError, names_of};
 use shearq_pipeline::{PipelineError, Progress, engine};
-use shearq_results::row::{RunRecord, SetRecord, definition_word};
-use shearq_results::score::{Basis, OddImages, ScoredSet};
+use shearq_results::record::{RunRecord, SetRecord, definition_word};
 use shearq_results::store;
 use shearq_results::submit::challenge::read_bandpowers;
 use shearq_results::submit::check::{CheckedSet, Severity, check_sent};
@@ -171,7 +170,7 @@ impl Judge {
             let zero = truth
                 .scorer
                 .score_spectrum(&[0.0; SCORED.end - SCORED.start], None);
-            zero.map_or(f64::NAN, |score| score.zero_quality.q)
+            zero.map_or(f64::NAN, |score| score.zero_q)
         };
         let sum: f64 = self.truths.values().map(q).sum();
         Some(sum / self.truths.len() as f64)
@@ -624,13 +623,11 @@ impl Judge {
                 .map_err(|error| FileError::new(path, error))?;
             let truth_powers = truth.scorer.true_bandpowers();
             all.push((truth_powers[SCORED].to_vec(), powers));
-            sets.push(SetRecord::of_spectrum(
-                set,
-                truth.kind.is_some(),
-                &score,
-                (1..=self.challenge.data.images).collect(),
-                truth.print.clone(),
-            ));
+            let images = (1..=self.challenge.data.images).collect();
+            sets.push(SetRecord {
+                data: truth.print.clone(),
+                ..SetRecord::of_spectrum(set, truth.kind.is_some(), images, &score)
+            });
         }
         Ok((sets, all))
     }
@@ -667,18 +664,10 @@ impl Judge {
         if let Some(reason) = wrong_order {
             return Err(format!("set {set}: {reason}"));
         }
-        let scored = ScoredSet {
-            set: Some(*set),
-            kind: truth.kind,
-            images: numbers.to_vec(),
-            score,
-            rows: *rows,
-            basis: Basis::Given,
-            sign: None,
-            findings: Vec::new(),
-            odd_images: OddImages::default(),
-        };
-        Ok(Some(SetRecord::new(*set, &scored, truth.print.clone())))
+        let simulated = truth.kind.is_some();
+        let record = SetRecord::new(*set, simulated, numbers.to_vec(), &score, rows);
+        let data = truth.print.clone();
+        Ok(Some(SetRecord { data, ..record }))
     }
 }
 

@@ -3,7 +3,7 @@
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use shearq_dataset::layout::Layout;
 use shearq_results::compare::Paired;
-use shearq_results::row::{SetRecord, mean_metric};
+use shearq_results::record::{SetRecord, mean};
 use shearq_results::submit::manifest::Contents;
 use shearq_scoring::Definition;
 
@@ -114,17 +114,17 @@ impl RankBy {
 
     /// Value and standard error over all sets. `constant` has the true shears of sets with one shear each.
     pub fn of(self, sets: &[SetRecord], constant: Option<&ConstantShears>) -> (f64, f64) {
-        let mean = |name: &str| mean_metric(sets, name);
+        let mean = |metric| mean(sets, metric);
         match self {
-            RankBy::Q | RankBy::QCorrected => mean("q"),
-            RankBy::QCalibrated => mean("q_calibrated"),
+            RankBy::Q | RankBy::QCorrected => mean(|metrics| metrics.q),
+            RankBy::QCalibrated => mean(|metrics| metrics.q_calibrated),
             RankBy::M => {
                 let (response, error) = response(sets, constant);
                 ((response - 1.0).abs(), error)
             }
             RankBy::C => {
                 let (c1, c2) = match constant {
-                    None => (mean("c1"), mean("c2")),
+                    None => (mean(|metrics| metrics.c1), mean(|metrics| metrics.c2)),
                     Some(shears) => {
                         let [(_, c1), (_, c2)] = shears.biases(sets);
                         (c1, c2)
@@ -137,7 +137,7 @@ impl RankBy {
                 (modulus / response, error / response)
             }
             RankBy::Qc => constant.map_or((f64::NAN, f64::NAN), |shears| shears.q_c(sets)),
-            RankBy::Noise => mean("galaxy_noise"),
+            RankBy::Noise => mean(|metrics| metrics.galaxy_noise),
         }
     }
 
@@ -166,7 +166,7 @@ impl RankBy {
 pub fn response(sets: &[SetRecord], constant: Option<&ConstantShears>) -> (f64, f64) {
     match constant {
         None => {
-            let (m, error) = mean_metric(sets, "m_cross");
+            let (m, error) = mean(sets, |metrics| metrics.m_cross);
             (1.0 + m, error)
         }
         Some(shears) => {

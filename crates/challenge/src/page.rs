@@ -9,7 +9,6 @@ use shearq_render::page::PageError;
 use shearq_render::table::{Cell, Heading, Table, TableFormat};
 use shearq_results::submit::manifest::Contents;
 use shearq_results::views::comparison::q_heat_map;
-use shearq_results::views::metrics::metric_cell;
 
 use crate::constant::ConstantShears;
 use crate::copies::NearCopy;
@@ -257,7 +256,7 @@ impl View<'_> {
 
     /// Q of zero shear on boards of other metrics, too: whoever reads Q elsewhere must see it.
     fn zero_note(&self) -> Option<String> {
-        let q = metric_cell("q", rounded(self.zero_shear?, 1), f64::NAN)
+        let q = Cell::with_error(rounded(self.zero_shear?, 1), Some(f64::NAN), 2)
             .digits()?
             .0;
         let unknown = self.metric().of_zero_shear(1.0).is_nan();
@@ -277,7 +276,7 @@ impl View<'_> {
             spectra,
             without,
         } = self.expected_of_metric()?;
-        let cell = |value: f64| metric_cell("q", rounded(value, 0), f64::NAN).digits();
+        let cell = |value: f64| Cell::with_error(rounded(value, 0), Some(f64::NAN), 2).digits();
         let (catalogues, spectra) = (cell(*catalogues)?.0, cell(*spectra)?.0);
         let without = match without.as_slice() {
             [] => String::new(),
@@ -456,7 +455,7 @@ impl View<'_> {
             .map(|standing| {
                 let info = standing.best.info();
                 let name = format!("{}: {}", info.team, info.method);
-                (name, standing.best.entry.sets.clone())
+                (name, standing.best.entry.sets.as_slice())
             })
             .collect();
         let mut map = q_heat_map(&rows);

@@ -242,7 +242,7 @@ pub(crate) mod tests {
     use super::*;
     use crate::kind::GREAT10;
     use crate::terms::{Data, Rules};
-    use shearq_results::row::SetRecord;
+    use shearq_results::record::SetRecord;
     use shearq_results::submit::manifest::Contents;
     use shearq_scoring::Metrics;
 

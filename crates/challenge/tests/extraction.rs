@@ -10,7 +10,7 @@ use rand_distr::{Distribution, Normal};
 use shearq_challenge::constant::ConstantShears;
 use shearq_challenge::create::{SCATTER, TEMPLATE_GAIN};
 use shearq_pipeline::simulate::simulator;
-use shearq_results::row::SetRecord;
+use shearq_results::record::SetRecord;
 use shearq_scoring::modes::{Decomposer, Modes};
 use shearq_scoring::{
     Bins, Choice, Complex64, Convention, Definition, FieldSum, Grid, Metrics, Options, SCORED,
@@ -33,7 +33,7 @@ fn extracted(digits: usize, sets: usize) -> f64 {
     // A bound that the attacker knows: twice the largest power.
     let high = 2.0 * SCORED.map(|b| truth[b]).fold(0.0, f64::max);
     let sigma_of = |powers: &[f64]| {
-        let q = scorer.score_spectrum(powers, None).unwrap().quality.q;
+        let q = scorer.score_spectrum(powers, None).unwrap().metrics.q;
         // The other sets contribute the same number to each mean.
         let others = 100.0 * (sets - 1) as f64;
         let mean = (q + others) / sets as f64;
@@ -94,7 +94,7 @@ fn template_gain(scatter: f64) -> f64 {
     let secrets = 60;
     let gains = (0..secrets).map(|k| {
         let scorer = blind(k, scatter);
-        let q = |powers: &[f64]| scorer.score_spectrum(powers, None).unwrap().quality.q;
+        let q = |powers: &[f64]| scorer.score_spectrum(powers, None).unwrap().metrics.q;
         let zero = q(&[0.0; 8]);
         let dln_l = &scorer.bins().dln_l[SCORED];
         let total: f64 = template.iter().zip(dln_l).map(|(p, d)| p * d).sum();

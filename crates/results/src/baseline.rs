@@ -4,40 +4,42 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
-use shearq_submissions::{Configuration, checked_name};
-
-use shearq_dataset::run::Source;
+use shearq_dataset::fingerprint;
+use shearq_dataset::images::{self, ImageId};
+use shearq_dataset::layout::DataFolder;
+use shearq_dataset::record::differences;
+use shearq_dataset::relative::shortened;
+use shearq_dataset::run::{Run, Source};
+use shearq_files::atomic::Scratch;
+use shearq_files::table::{self, FileFormat, MAX_ROWS};
 use shearq_files::{FileError, atomic};
+use shearq_pipeline::PipelineError;
+use shearq_pipeline::engine::{self, Progress};
+use shearq_pipeline::measure::measure_folder;
+use shearq_pipeline::run::run_folder;
+use shearq_scoring::{Metric, Metrics, Options};
+use shearq_submissions::{Configuration, ConfigurationError, Registry, checked_name};
+use thiserror::Error;
 
-mod measured;
-mod moved;
+use crate::record::SetRecord;
+use crate::score::{OWN, score_folder};
 
-pub use measured::{Wanted, measure, metrics_of};
-pub use moved::{BaselineError, Checked, Settings, SettingsError, Shift, check};
-
-/// A baseline.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Baseline {
-    /// Version of shearq that measured it.
     pub version: String,
     /// Number of sets of all configurations, to detect a truncated file. Older files have none.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub sets_held: Option<usize>,
-    /// Source of the galaxies.
     pub source: Source,
-    /// Changes of the baseline, oldest first.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub history: Vec<Change>,
-    /// The measured configurations.
     pub submissions: Vec<BaselineConfiguration>,
 }
 
-/// One configuration of a baseline.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct BaselineConfiguration {
-    /// Name of the configuration.
     #[serde(deserialize_with = "checked_name")]
     pub name: String,
     /// Configuration file, relative to the folder of the baseline. `None` for a named or unknown configuration.
@@ -45,15 +47,10 @@ pub struct BaselineConfiguration {
     pub file: Option<PathBuf>,
     /// All settings as a TOML table, so that settings of other versions can be compared.
     pub settings: toml::Table,
-    /// Sets in ascending order.
     pub sets: Vec<BaselineSet>,
 }
 
 impl BaselineConfiguration {
-    /// A measured configuration, with its `file` if known.
-    ///
-    /// # Errors
-    /// If the settings cannot be written as TOML.
     pub fn new(
         configuration: &Configuration,
         file: Option<PathBuf>,
@@ -68,17 +65,12 @@ impl BaselineConfiguration {
     }
 }
 
-/// One set of a configuration.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct BaselineSet {
-    /// Set number.
     pub set: u32,
-    /// Fingerprint of its data.
     pub data: String,
-    /// Numbers of the images.
     pub images: Vec<u32>,
-    /// Galaxies in their catalogues.
     pub galaxies: u64,
     /// Number of these galaxies without an ellipticity.
     pub flagged: u64,
@@ -86,20 +78,15 @@ pub struct BaselineSet {
     pub metrics: BTreeMap<String, [f64; 2]>,
 }
 
-/// A change of a baseline.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Change {
-    /// Reason of the change.
     pub reason: String,
-    /// Version of shearq before the change.
     pub from_version: String,
-    /// Moved metrics and settings, one line each.
     pub moved: Vec<String>,
 }
 
 impl Baseline {
-    /// A baseline measured by this version.
     pub fn new(
         source: Source,
         history: Vec<Change>,
@@ -114,15 +101,10 @@ impl Baseline {
         }
     }
 
-    /// The file of the baseline `name` in `folder`.
     pub fn path(folder: &Path, name: &str) -> PathBuf {
         folder.join(format!("{name}.{ENDING}"))
     }
 
-    /// Names of the baselines in `folder`, in order.
-    ///
-    /// # Errors
-    /// If the folder cannot be read.
     pub fn names(folder: &Path) -> Result<Vec<String>, FileError> {
         let entries = std::fs::read_dir(folder)
             .and_then(Iterator::collect::<std::io::Result<Vec<_>>>)
@@ -137,10 +119,6 @@ impl Baseline {
         Ok(names)
     }
 
-    /// Reads a baseline.
-    ///
-    /// # Errors
-    /// If the file cannot be read or is invalid.
     pub fn read(path: &Path) -> Result<Self, FileError> {
         let text = shearq_files::open::read_to_string(path, shearq_files::open::SETTINGS)
             .map_err(FileError::doing(path, "cannot read the baseline"))?;
@@ -167,10 +145,6 @@ impl Baseline {
         Ok(baseline)
     }
 
-    /// Writes a new baseline.
-    ///
-    /// # Errors
-    /// If the file exists or cannot be written.
     pub fn create(&self, path: &Path) -> Result<(), FileError> {
         atomic::sweep_beside(path);
         if atomic::write_if_absent(path, self.text(path)?.as_bytes())? {
@@ -180,9 +154,6 @@ impl Baseline {
     }
 
     /// Replaces `earlier`, which was read from the same file before measuring.
-    ///
-    /// # Errors
-    /// If the file has changed since, or cannot be written.
     pub fn replace(&self, path: &Path, earlier: &Baseline) -> Result<(), FileError> {
         atomic::sweep_beside(path);
         // Other processes wait here until the file is replaced, if the file system has locks.
@@ -201,7 +172,6 @@ impl Baseline {
         atomic::write(path, self.text(path)?.as_bytes())
     }
 
-    /// The error for a new baseline whose file exists.
     pub fn exists(path: &Path) -> FileError {
         let name = path.file_stem().unwrap_or_default().to_string_lossy();
         FileError::new(
@@ -223,8 +193,423 @@ fn sets_of(submissions: &[BaselineConfiguration]) -> impl Iterator<Item = &Basel
         .flat_map(|configuration| &configuration.sets)
 }
 
-/// Ending of file names.
 const ENDING: &str = "toml";
+
+// Names in the file of the scatter of e1 and of e2: it notices changes that Q averages out.
+const SCATTER: [&str; 2] = ["scatter_e1", "scatter_e2"];
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Wanted {
+    pub set: u32,
+    /// Number of images, counted from image 1.
+    pub images: u32,
+}
+
+/// Measures a configuration into a temporary folder and returns its metrics. Paths of `source` are relative to the
+/// folder `beside`.
+pub fn measure(
+    source: &Source,
+    beside: &Path,
+    configuration: &Configuration,
+    wanted: &[Wanted],
+    threads: usize,
+    progress: &mut dyn Progress,
+) -> Result<Vec<BaselineSet>, PipelineError> {
+    let folder = Scratch::new()?;
+    let out = folder.path();
+    let data = match source {
+        // Messages must not name the temporary folder.
+        Source::Folder { .. } => Some(source.data(beside)?),
+        Source::Simulated(_) => None,
+    };
+    let source = source.moved(beside, out)?;
+    let run = Run::new(source, configuration.clone(), FileFormat::default());
+    match (&run.source, &data) {
+        (Source::Simulated(settings), _) => {
+            let images: Vec<ImageId> = wanted
+                .iter()
+                .flat_map(|w| images::of_simulation(&[w.set], w.images))
+                .collect();
+            run_folder(&run, *settings, &images, out, threads, progress)?;
+        }
+        (Source::Folder { .. }, None) => {}
+        (Source::Folder { .. }, Some(data)) => {
+            let sets: Vec<u32> = wanted.iter().map(|w| w.set).collect();
+            let asked = |id: &ImageId| {
+                let mut of_set = wanted.iter().filter(|w| w.set == id.set);
+                of_set.any(|w| id.image <= w.images)
+            };
+            let mut images = images::of_folder(data, &sets)?;
+            images.retain(asked);
+            measure_folder(&run, data, out, &images, threads, progress)?;
+        }
+    }
+    let data = match data {
+        Some(data) => data,
+        None => run.source.data(out)?,
+    };
+    metrics_of(&run, &data, out, threads)
+}
+
+pub fn metrics_of(
+    run: &Run,
+    data: &DataFolder,
+    out: &Path,
+    threads: usize,
+) -> Result<Vec<BaselineSet>, PipelineError> {
+    let options = Options {
+        choice: OWN,
+        ..Options::default()
+    };
+    let scored = score_folder(data, out, run, &[], options, threads)?;
+    scored
+        .iter()
+        .map(|scored| {
+            let SetRecord {
+                set,
+                images,
+                galaxies,
+                flagged,
+                metrics,
+                errors,
+                ..
+            } = scored.record.clone();
+            let mut all: BTreeMap<String, [f64; 2]> = Metrics::ALL
+                .into_iter()
+                .map(|Metric { name, value, .. }| {
+                    (name.to_owned(), [value(&metrics), value(&errors)])
+                })
+                .collect();
+            for (name, value) in SCATTER.iter().zip(scatter(run, out, set, threads)?) {
+                all.insert((*name).to_owned(), value);
+            }
+            Ok(BaselineSet {
+                set,
+                data: fingerprint::of_set(&run.source, data, set, &images)?,
+                images,
+                galaxies,
+                flagged,
+                metrics: all,
+            })
+        })
+        .collect()
+}
+
+// Rms of e1 and e2 over the measured galaxies of a set, each with its standard error rms/√(2N).
+fn scatter(
+    run: &Run,
+    out: &Path,
+    set: u32,
+    threads: usize,
+) -> Result<[[f64; 2]; 2], PipelineError> {
+    let catalogues = run.catalogues(out, &[set])?.of_set(set);
+    let (mut squares, mut count) = ([0.0; 2], 0.0_f64);
+    engine::ordered(
+        threads.min(catalogues.len()).max(1),
+        |feeder| {
+            for (_, path) in catalogues {
+                if !feeder.push(path) {
+                    break;
+                }
+            }
+            Ok(())
+        },
+        || (),
+        |(), path| {
+            let table = table::read(&path, Some(&["e1", "e2"]), MAX_ROWS)?;
+            let (e1, e2) = (
+                table::numbers(&table, "e1", &path)?,
+                table::numbers(&table, "e2", &path)?,
+            );
+            let mut sums = ([0.0; 2], 0.0);
+            for (e1, e2) in e1.iter().zip(e2.iter()) {
+                if e1.is_finite() && e2.is_finite() {
+                    sums.0[0] += e1 * e1;
+                    sums.0[1] += e2 * e2;
+                    sums.1 += 1.0;
+                }
+            }
+            Ok(sums)
+        },
+        |(more, galaxies): ([f64; 2], f64)| {
+            squares[0] += more[0];
+            squares[1] += more[1];
+            count += galaxies;
+            Ok(())
+        },
+    )?;
+    Ok(squares.map(|sum| {
+        let rms = (sum / count).sqrt();
+        [rms, rms / (2.0 * count).sqrt()]
+    }))
+}
+
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum BaselineError {
+    #[error(transparent)]
+    Configuration(#[from] ConfigurationError),
+    #[error("{}: cannot find the configuration file of the baseline. Try: shearq baseline check --stored", path.display())]
+    NoFile { path: PathBuf },
+    // A value of the wrong type, an unknown key, or a value that TOML or JSON does not have.
+    #[error("settings of {configuration}")]
+    Settings {
+        configuration: String,
+        source: Box<dyn std::error::Error + Send + Sync>,
+    },
+    #[error(transparent)]
+    Pipeline(#[from] PipelineError),
+    #[error("set {set} could not be measured again (found no such set in the data)")]
+    NoSet { set: u32 },
+}
+
+fn settings_error<E: Into<Box<dyn std::error::Error + Send + Sync>>>(
+    configuration: &str,
+) -> impl Fn(E) -> BaselineError {
+    move |source| BaselineError::Settings {
+        configuration: configuration.to_owned(),
+        source: source.into(),
+    }
+}
+
+const CHECKED: [&str; 5] = ["q", "m_half", "sqrt_a", SCATTER[0], SCATTER[1]];
+
+/// Accepted relative shift of a metric on the same data. It detects a changed digit of Q in a table.
+///
+/// The network works in f32, and instruction sets round its sums differently. On the project's baseline, metrics
+/// with and without fused multiply-add (AVX2, AVX-512) differ by less than 2e-6, and by less than 1e-5 standard
+/// errors. That is a fiftieth of the tolerance.
+pub const TOLERANCE: f64 = 1e-4;
+
+/// Accepted shift in standard errors on the same data, for metrics near zero.
+pub const TOLERANCE_SIGMA: f64 = 1e-3;
+
+#[derive(Debug, Clone, PartialEq)]
+pub struct Shift {
+    pub set: u32,
+    pub metric: &'static str,
+    pub before: [f64; 2],
+    pub now: [f64; 2],
+    /// The difference over its error: the error of the baseline on the same data, of both metrics on other data.
+    pub sigma: f64,
+    pub moved: bool,
+}
+
+/// The shifts of the checked metrics of a set.
+///
+/// On the same data a metric may shift by rounding: by [`TOLERANCE`] of itself or [`TOLERANCE_SIGMA`] of its error,
+/// whichever is larger. On other data it may shift by `sigmas` standard errors of the difference.
+pub fn shifts(before: &BaselineSet, now: &BaselineSet, sigmas: f64) -> Vec<Shift> {
+    let same_data = before.data == now.data && before.images == now.images;
+    CHECKED
+        .iter()
+        .map(|&metric| {
+            let get = |set: &BaselineSet| set.metrics.get(metric).copied();
+            let (old, new) = (
+                get(before).unwrap_or([f64::NAN; 2]),
+                get(now).unwrap_or([f64::NAN; 2]),
+            );
+            let difference = new[0] - old[0];
+            // On the same data both values have the same noise.
+            let error = if same_data {
+                old[1]
+            } else {
+                old[1].hypot(new[1])
+            };
+            let allowed = if same_data {
+                // `max` ignores an unknown error.
+                (TOLERANCE_SIGMA * error).max(TOLERANCE * old[0].abs())
+            } else {
+                sigmas * error
+            };
+            // Without an error, other data cannot show a shift. A lost metric is a shift.
+            let unknown = !same_data && error.is_nan() && difference.is_finite();
+            let within = unknown || difference.abs() <= allowed;
+            let neither = old[0].is_nan() && new[0].is_nan();
+            Shift {
+                set: before.set,
+                metric,
+                before: old,
+                now: new,
+                sigma: difference / error,
+                moved: !neither && !within,
+            }
+        })
+        .collect()
+}
+
+// Changed settings of a baseline as `key: before ≠ now`, and settings that the baseline does not have.
+fn settings_moved(
+    before: &BaselineConfiguration,
+    now: &Configuration,
+) -> Result<(Vec<String>, Vec<String>), BaselineError> {
+    let mut current = toml::Table::try_from(now).map_err(settings_error(&before.name))?;
+    let mut earlier = before.settings.clone();
+    // A description does not change results.
+    for table in [&mut current, &mut earlier] {
+        table.remove("description");
+    }
+    let filled = with_defaults(current.clone(), &earlier);
+    let compare =
+        |a: &toml::Table, b: &toml::Table| differences(a, b).map_err(settings_error(&before.name));
+    Ok((compare(&filled, &current)?, compare(&earlier, &filled)?))
+}
+
+#[derive(Debug, Clone, PartialEq)]
+pub struct Checked {
+    pub baseline: String,
+    pub configuration: String,
+    pub shifts: Vec<Shift>,
+    /// Changed settings, as `key: before ≠ now`.
+    pub settings: Vec<String>,
+    pub notes: Vec<String>,
+    /// Whether stored settings were used although the configuration may have changed.
+    pub stored: bool,
+}
+
+impl Checked {
+    pub fn failed(&self) -> bool {
+        !self.settings.is_empty() || self.shifts.iter().any(|shift| shift.moved)
+    }
+
+    pub fn moved(&self) -> Vec<String> {
+        let settings = self
+            .settings
+            .iter()
+            .map(|line| format!("{}: setting {line}", self.configuration));
+        let metrics = self.shifts.iter().filter(|shift| shift.moved).map(|shift| {
+            format!(
+                "{} set {}: {} from {} to {}, {:+.2} σ",
+                self.configuration,
+                shift.set,
+                shift.metric,
+                shift.before[0],
+                shift.now[0],
+                shift.sigma
+            )
+        });
+        settings.chain(metrics).collect()
+    }
+}
+
+// The configuration that provides the defaults for the method of `settings`.
+fn base_of(settings: &toml::Table) -> &'static str {
+    match settings.get("method").and_then(toml::Value::as_str) {
+        Some("linear") => "48/linear/star",
+        _ => "paper",
+    }
+}
+
+/// The settings to measure a baseline with. Named configurations always have their present settings.
+#[derive(Debug, Clone, Copy)]
+pub enum Settings<'a> {
+    /// The settings in the configuration files; their paths are relative to this folder.
+    Files(&'a Path),
+    Stored,
+}
+
+// The settings to measure a configuration of a baseline with, and whether stored settings replace an unknown file.
+// A key that stored settings lack has its default.
+fn settings_now(
+    before: &BaselineConfiguration,
+    registry: &Registry,
+    settings: Settings<'_>,
+) -> Result<(Configuration, bool), BaselineError> {
+    if let (Settings::Files(folder), Some(file)) = (settings, &before.file) {
+        let path = shortened(folder.join(file));
+        // The registry could know a plain name.
+        let path = Path::new(".").join(path);
+        if !path.is_file() {
+            return Err(BaselineError::NoFile { path });
+        }
+        return Ok((registry.get(&path.to_string_lossy())?.configuration, false));
+    }
+    if before.file.is_none() && registry.names().contains(&before.name) {
+        return Ok((registry.get(&before.name)?.configuration, false));
+    }
+    let base = registry.get(base_of(&before.settings))?.configuration;
+    let base = toml::Table::try_from(&base).map_err(settings_error(&before.name))?;
+    let configuration: Result<Configuration, toml::de::Error> =
+        with_defaults(base, &before.settings).try_into();
+    Ok((
+        configuration.map_err(settings_error(&before.name))?,
+        matches!(settings, Settings::Files(_)),
+    ))
+}
+
+// `settings`, with the `defaults` of keys that they lack.
+fn with_defaults(mut defaults: toml::Table, settings: &toml::Table) -> toml::Table {
+    for (key, value) in settings {
+        match (defaults.get_mut(key), value) {
+            (Some(toml::Value::Table(section)), toml::Value::Table(own)) => {
+                section.extend(own.clone());
+            }
+            _ => {
+                defaults.insert(key.clone(), value.clone());
+            }
+        }
+    }
+    defaults
+}
+
+/// Measures the configurations of the baseline `name` again with `measure`, and compares.
+/// Returns the checks and the configurations with their present settings and metrics.
+pub fn check(
+    name: &str,
+    baseline: &Baseline,
+    sigmas: f64,
+    settings: Settings<'_>,
+    mut measure: impl FnMut(&Configuration, &[Wanted]) -> Result<Vec<BaselineSet>, PipelineError>,
+) -> Result<(Vec<Checked>, Vec<BaselineConfiguration>), BaselineError> {
+    let registry = Registry::embedded()?;
+    let (mut checks, mut configurations) = (Vec::new(), Vec::new());
+    for before in &baseline.submissions {
+        // Present settings: a check is to notice changes of settings, too.
+        let (configuration, stored) = settings_now(before, &registry, settings)?;
+        let (settings, new) = settings_moved(before, &configuration)?;
+        let mut check = Checked {
+            baseline: name.to_owned(),
+            configuration: before.name.clone(),
+            shifts: Vec::new(),
+            settings,
+            notes: new
+                .iter()
+                .map(|line| format!("a setting is new: {line}"))
+                .collect(),
+            stored,
+        };
+        let wanted: Vec<Wanted> = before
+            .sets
+            .iter()
+            .map(|set| Wanted {
+                set: set.set,
+                images: set.images.len() as u32,
+            })
+            .collect();
+        let sets = measure(&configuration, &wanted)?;
+        for old in &before.sets {
+            let Some(now) = sets.iter().find(|now| now.set == old.set) else {
+                return Err(BaselineError::NoSet { set: old.set });
+            };
+            if now.data != old.data || now.images != old.images {
+                check.notes.push(format!(
+                    "the data of set {} are not the baseline's ({} images then, {} now). Metrics may differ by {sigmas} σ",
+                    old.set,
+                    old.images.len(),
+                    now.images.len(),
+                ));
+            }
+            check.shifts.extend(shifts(old, now, sigmas));
+        }
+        let file = before.file.clone();
+        configurations.push(
+            BaselineConfiguration::new(&configuration, file, sets)
+                .map_err(settings_error(&before.name))?,
+        );
+        checks.push(check);
+    }
+    Ok((checks, configurations))
+}
 
 #[cfg(test)]
 mod tests {
@@ -248,5 +633,40 @@ mod tests {
             "{message}"
         );
         assert_eq!(Baseline::read(&path).unwrap(), of(2));
+    }
+
+    fn set(data: &str, q: f64) -> BaselineSet {
+        let metrics = CHECKED.map(|name| (name.to_owned(), [q, 2.0]));
+        BaselineSet {
+            set: 1,
+            data: data.into(),
+            images: vec![1, 2],
+            galaxies: 10,
+            flagged: 0,
+            metrics: metrics.into(),
+        }
+    }
+
+    #[test]
+    fn the_same_data_allow_rounding_and_other_data_noise() {
+        let before = set("a", 80.0);
+        let moved = |now: &BaselineSet| shifts(&before, now, 3.0)[0].moved;
+        assert!(!moved(&set("a", 80.0 * (1.0 + 0.9 * TOLERANCE))));
+        assert!(moved(&set("a", 80.0 * (1.0 - 1.1 * TOLERANCE))));
+        // 3 σ of the difference of two metrics with errors of 2 is 8.5.
+        assert!(!moved(&set("b", 88.0)) && moved(&set("b", 89.0)));
+        assert!(moved(&set("a", f64::NAN)) && moved(&set("b", f64::NAN)));
+        let mut unsure = set("b", 1e9);
+        for value in unsure.metrics.values_mut() {
+            value[1] = f64::NAN;
+        }
+        assert!(!moved(&unsure));
+    }
+
+    #[test]
+    fn a_metric_near_zero_may_shift_by_a_share_of_its_error() {
+        let before = set("a", 0.0);
+        let moved = |q: f64| shifts(&before, &set("a", q), 3.0)[0].moved;
+        assert!(!moved(1.9 * TOLERANCE_SIGMA) && moved(2.1 * TOLERANCE_SIGMA));
     }
 }

@@ -1,59 +1,52 @@
-//! Compares scores: common sets, means over sets, and paired differences.
+//! Compares scores: methods on their common sets, recorded runs and groups of their sets, and paired differences.
 
-use std::borrow::Borrow;
+use std::cmp::Ordering;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
+use std::str::FromStr;
 
-use shearq_scoring::resample::{PairedDifference, PairedSet, paired_difference};
-use shearq_scoring::{Choice, Definition, FieldSum, Grid, Options, RowCounts};
-use shearq_submissions::{Published, Registry};
-
-use super::conditions::{ChoiceError, choose};
-use super::expression::Expression;
-use super::foreign::Foreign;
-use super::groups::Order;
-use super::row::{RunRecord, SetRecord, choice_word, definition_word};
-use super::score::{Catalogues, ScoredSet, own_catalogue, score_variants, unscored};
-use super::submit::packed::PackedCatalogues;
 use shearq_dataset::layout::DataFolder;
 use shearq_dataset::layout::MAX_SET;
-use shearq_dataset::listing::Files;
 use shearq_dataset::run::{Run, Source};
 use shearq_files::FileError;
 use shearq_pipeline::{PipelineError, inputs};
+use shearq_render::table::Cell;
+use shearq_scoring::resample::{PairedDifference, PairedSet, paired_difference};
+use shearq_scoring::{Choice, Metrics, Options};
+use shearq_submissions::{Published, Registry};
 
-/// One variant in a comparison: a folder, or another program's catalogues.
+use crate::catalogues::Catalogues;
+use crate::conditions::{ChoiceError, choose};
+use crate::expression::Expression;
+use crate::record::{Column, RunRecord, SetRecord, columns_named};
+use crate::score::{ScoredSet, score_variants, unscored};
+use crate::submit::packed::{Sent, Submission, is_packed};
+
+/// A method in a comparison.
 #[derive(Debug, Clone)]
 pub struct Variant {
-    /// Name of the configuration or program.
+    /// Name of the configuration or program, with the path if several have the name.
     pub name: String,
-    /// Published metrics.
     pub published: Option<Published>,
-    /// The sets that all variants have, in ascending order.
-    pub sets: Vec<ScoredSet>,
+    /// The sets that all variants have and that meet the conditions.
+    pub run: RunRecord,
+    scored: Vec<ScoredSet>,
     /// Warnings about images and files that were not scored.
     pub unscored: Vec<String>,
-    /// Its record, as in a results store.
-    pub run: RunRecord,
 }
 
 impl Variant {
-    /// Records of its sets.
-    pub fn records(&self) -> Vec<SetRecord> {
-        self.run.sets.clone()
+    /// The scores of the compared sets.
+    pub fn scored(&self) -> Vec<ScoredSet> {
+        let compared = |scored: &&ScoredSet| {
+            let mut sets = self.run.sets.iter();
+            sets.any(|own| own.set == scored.record.set)
+        };
+        self.scored.iter().filter(compared).cloned().collect()
     }
 }
 
-/// Records of sets that are scored against one truth, whose data need no fingerprint.
-fn records(sets: &[ScoredSet]) -> Vec<SetRecord> {
-    let record = |scored: &ScoredSet| Some(SetRecord::new(scored.set?, scored, String::new()));
-    sets.iter().filter_map(record).collect()
-}
-
-/// The variants and sets that meet the conditions, in the given order.
-///
-/// # Errors
-/// If a condition has an unknown column, or no set meets the conditions.
+/// The variants and their common sets that meet the conditions, in the given order.
 pub fn chosen(
     variants: Vec<Variant>,
     condition: Option<&Expression>,
@@ -61,235 +54,129 @@ pub fn chosen(
 ) -> Result<Vec<Variant>, ChoiceError> {
     let mut kept = Vec::new();
     for mut variant in variants {
+        let mut runs = vec![variant.run];
         if let Some(condition) = condition {
-            let left = choose(condition, vec![variant.run])?;
-            let Some(run) = left.into_iter().next() else {
-                continue;
-            };
-            let holds = |set: &ScoredSet| run.sets.iter().any(|own| Some(own.set) == set.set);
-            variant.sets.retain(holds);
-            variant.run = run;
+            runs = choose(condition, runs)?;
         }
-        kept.push(variant);
+        if let Some(run) = runs.pop() {
+            variant.run = run;
+            kept.push(variant);
+        }
     }
     if kept.is_empty() {
         return Err(ChoiceError::NoSet);
     }
-    let sets: Vec<Vec<SetRecord>> = kept.iter().map(Variant::records).collect();
-    if common_sets(&sets).is_empty() {
+    if keep_common_sets(kept.iter_mut().map(|variant| &mut variant.run)) == 0 {
         return Err(ChoiceError::NoCommonSet);
     }
     if let Some(order) = order {
-        kept.sort_by(|a, b| order.compare(&a.run, &b.run));
+        let key = |variant: &Variant| order.key(&Group::whole(&variant.run));
+        kept.sort_by(|a, b| in_order(&key(a), &key(b), order.descending));
     }
     Ok(kept)
 }
 
-/// Names of variants with the records of their sets.
-pub fn by_name(variants: &[Variant]) -> Vec<(String, Vec<SetRecord>)> {
-    let named = |variant: &Variant| (variant.name.clone(), variant.records());
-    variants.iter().map(named).collect()
+/// Removes sets that not all runs have, and returns the number of the others.
+pub fn keep_common_sets<'a>(runs: impl Iterator<Item = &'a mut RunRecord>) -> usize {
+    let mut runs: Vec<&mut RunRecord> = runs.collect();
+    let sets = runs
+        .iter()
+        .map(|run| run.sets.iter().map(|set| set.set).collect());
+    let common = sets.reduce(|all: BTreeSet<u32>, more| &all & &more);
+    let common = common.unwrap_or_default();
+    for run in &mut runs {
+        run.sets.retain(|set| common.contains(&set.set));
+    }
+    common.len()
 }
 
-/// A variant before it is scored.
-struct Entrant<'a> {
-    name: String,
-    /// Folder, archive or file.
-    path: PathBuf,
-    published: Option<Published>,
-    catalogues: Origin<'a>,
-    settings: String,
-}
-
-/// Where the catalogues of a variant come from.
-enum Origin<'a> {
-    /// A folder that shearq measured.
-    Measured(Files),
-    /// Another program.
-    Foreign(&'a Foreign, Files),
-    /// A submission.
-    Packed(Box<PackedCatalogues>),
-}
-
-impl Origin<'_> {
-    fn of_set(&self, set: u32) -> Vec<(u32, PathBuf)> {
-        match self {
-            Origin::Measured(files) | Origin::Foreign(_, files) => files.of_set(set),
-            Origin::Packed(packed) => packed.of_set(set),
-        }
-    }
-
-    fn sets(&self) -> Vec<u32> {
-        match self {
-            Origin::Measured(files) | Origin::Foreign(_, files) => files.sets(),
-            Origin::Packed(packed) => packed.sets(),
-        }
-    }
-
-    /// Whether one pattern without a set number serves all sets.
-    fn serve_all_sets(&self) -> bool {
-        match self {
-            Origin::Measured(files) | Origin::Foreign(_, files) => files.serve_all_sets(),
-            Origin::Packed(_) => false,
-        }
-    }
-
-    fn unread(&self) -> Vec<String> {
-        match self {
-            Origin::Measured(files) | Origin::Foreign(_, files) => files.unread(),
-            Origin::Packed(_) => Vec::new(),
-        }
-    }
-
-    fn sum(&self, grid: &Grid, path: &Path) -> Result<(FieldSum, RowCounts), FileError> {
-        match self {
-            Origin::Measured(_) => own_catalogue(grid, path),
-            Origin::Foreign(foreign, _) => foreign.sum(grid, path),
-            Origin::Packed(packed) => packed.sum(grid, path),
-        }
-    }
-
-    fn choice(&self, way: Way) -> Choice {
-        match self {
-            Origin::Measured(_) => way.own,
-            Origin::Packed(packed) if packed.is_own() => way.own,
-            Origin::Foreign(..) | Origin::Packed(_) => way.foreign,
-        }
-    }
-}
-
-/// How variants are scored.
-#[derive(Debug, Clone, Copy)]
-pub struct Way {
-    /// Bandpower definition.
-    pub definition: Definition,
-    /// Convention of what shearq measured.
-    pub own: Choice,
-    /// Convention of other programs' catalogues.
-    pub foreign: Choice,
-}
-
-/// Scores results folders, and other programs' catalogues described by the files `foreign`, on their common sets.
-/// The truth is in `data`, or in the data that the first folder was measured from.
-///
-/// # Errors
-/// If a file cannot be read, the folders have several sources, or no set is common.
+/// Scores folders of results and submissions, and other programs' catalogues with the descriptions `foreign`, on their
+/// common sets. `choice` replaces the usual convention of each. The truth is in `data`, or in the data that the first
+/// folder was measured from.
 pub fn score_all(
     folders: &[PathBuf],
     foreign: &[PathBuf],
     data: Option<&Path>,
-    way: Way,
+    choice: Option<Choice>,
+    options: Options,
     threads: usize,
 ) -> Result<Vec<Variant>, PipelineError> {
-    let files = foreign;
-    let foreign: Vec<Foreign> = files
-        .iter()
-        .map(|path| Foreign::read(path))
-        .collect::<Result<_, _>>()?;
+    let described = foreign.iter().map(|path| Catalogues::foreign(path, &[]));
+    let described = described.collect::<Result<Vec<_>, _>>()?;
     let mut data = data.map(DataFolder::open).transpose()?;
-    let mut entrants = own_entrants(folders, &mut data, threads)?;
-    let data = data.ok_or_else(|| {
-        PipelineError::Request("--foreign needs the true shear. Try: --data DIR".into())
-    })?;
-    for (path, foreign) in files.iter().zip(&foreign) {
-        entrants.push(Entrant {
-            name: foreign.name.clone(),
-            path: path.clone(),
-            published: None,
-            catalogues: Origin::Foreign(foreign, foreign.catalogues(&[])?),
-            settings: foreign.pattern().display().to_string(),
+    let mut all = given_catalogues(folders, &mut data, threads)?;
+    all.extend(described);
+    let request = |message: String| Err(PipelineError::Request(message));
+    let Some(data) = data else {
+        return request("--foreign needs the true shear. Try: --data DIR".into());
+    };
+    if all.iter().all(Catalogues::serve_all_sets) {
+        return request("cannot determine the sets, because no `catalogues` contains {set}. Try: add {set} to the pattern".into());
+    }
+    if let Some(empty) = all.iter().find(|catalogues| catalogues.sets().is_empty()) {
+        return request(format!("{}: there is no catalogue to score", empty.name));
+    }
+    let common = |set: u32| all.iter().all(|own| !own.of_set(set).is_empty());
+    if !(1..=MAX_SET).any(common) {
+        return request("the catalogues have no set in common".into());
+    }
+    let variants = all.iter().map(|own| (own, choice.unwrap_or(own.choice())));
+    let variants: Vec<(&Catalogues, Choice)> = variants.collect();
+    let scored = score_variants(&data, &variants, &[], options, threads)?;
+    let registry =
+        Registry::embedded().map_err(|error| PipelineError::Request(error.to_string()))?;
+    let mut found = Vec::new();
+    for (&(catalogues, choice), scored) in variants.iter().zip(scored) {
+        let sets: Vec<SetRecord> = scored.iter().map(|set| set.record.clone()).collect();
+        let numbers: Vec<u32> = sets.iter().map(|set| set.set).collect();
+        let unread = catalogues.unread().into_iter();
+        let mut warnings: Vec<String> = unread.map(|line| format!("warning: {line}.")).collect();
+        warnings.extend(unscored(&data, &scored, &numbers)?);
+        let name = &catalogues.name;
+        found.push(Variant {
+            // Runs of one name may have other settings or versions.
+            name: match all.iter().filter(|other| other.name == *name).count() {
+                1 => name.clone(),
+                _ => format!("{name} ({})", catalogues.path.display()),
+            },
+            // Published metrics belong to the built-in settings, not to a file with their name.
+            published: catalogues.run().and_then(|run| {
+                let entry = registry.get(&run.configuration.name).ok()?;
+                (entry.configuration == run.configuration).then_some(entry.published)?
+            }),
+            run: RunRecord::new(
+                name,
+                &catalogues.settings,
+                data.root().display().to_string(),
+                Options { choice, ..options },
+                sets,
+            ),
+            scored,
+            unscored: warnings,
         });
     }
-    if entrants.iter().all(|e| e.catalogues.serve_all_sets()) {
-        let message = "cannot determine the sets, because no `catalogues` contains {set}. Try: add {set} to the pattern";
-        return Err(PipelineError::Request(message.into()));
-    }
-    if let Some(entrant) = entrants.iter().find(|e| e.catalogues.sets().is_empty()) {
-        let message = format!("{}: there is no catalogue to score", entrant.name);
-        return Err(PipelineError::Request(message));
-    }
-    let common = |set: u32| {
-        entrants
-            .iter()
-            .all(|e| !e.catalogues.of_set(set).is_empty())
-    };
-    if !(1..=MAX_SET).any(common) {
-        let message = "the catalogues have no set in common".into();
-        return Err(PipelineError::Request(message));
-    }
-    let readers: Vec<_> = entrants
-        .iter()
-        .map(|entrant| |grid: &Grid, path: &Path| entrant.catalogues.sum(grid, path))
-        .collect();
-    let of_set: Vec<_> = entrants
-        .iter()
-        .map(|entrant| |set: u32| entrant.catalogues.of_set(set))
-        .collect();
-    let catalogues: Vec<Catalogues<'_>> = entrants
-        .iter()
-        .zip(of_set.iter().zip(&readers))
-        .map(|(entrant, (of_set, read))| Catalogues {
-            of_set,
-            read,
-            choice: entrant.catalogues.choice(way),
-        })
-        .collect();
-    let options = Options {
-        definition: way.definition,
-        ..Options::default()
-    };
-    let scored = score_variants(&data, &catalogues, &[], options, threads)?;
-    entrants
-        .iter()
-        .zip(scored)
-        .map(|(entrant, sets)| {
-            let numbers: Vec<u32> = sets.iter().filter_map(|set| set.set).collect();
-            let run = RunRecord {
-                configuration: entrant.name.clone(),
-                version: shearq_dataset::VERSION.into(),
-                settings: entrant.settings.clone(),
-                source: data.root().display().to_string(),
-                definition: definition_word(way.definition).into(),
-                choice: choice_word(entrant.catalogues.choice(way)),
-                noise: "measured".into(),
-                sets: records(&sets),
-            };
-            let alike = entrants.iter().filter(|own| own.name == entrant.name);
-            Ok(Variant {
-                // Runs of one name may have other settings or versions.
-                name: match alike.count() {
-                    1 => entrant.name.clone(),
-                    _ => format!("{} ({})", entrant.name, entrant.path.display()),
-                },
-                published: entrant.published,
-                unscored: {
-                    let unread = entrant.catalogues.unread().into_iter();
-                    let mut lines: Vec<String> =
-                        unread.map(|line| format!("warning: {line}.")).collect();
-                    lines.extend(unscored(&data, &sets, &numbers)?);
-                    lines
-                },
-                sets,
-                run,
-            })
-        })
-        .collect()
+    Ok(found)
 }
 
-/// The folders that shearq measured. `data` becomes the data of the first, if it is `None`.
-fn own_entrants(
+// The catalogues of folders and submissions. `data` becomes the data of the first folder, if it is `None`.
+fn given_catalogues(
     folders: &[PathBuf],
     data: &mut Option<DataFolder>,
     threads: usize,
-) -> Result<Vec<Entrant<'static>>, PipelineError> {
-    let registry =
-        Registry::embedded().map_err(|error| PipelineError::Request(error.to_string()))?;
+) -> Result<Vec<Catalogues>, PipelineError> {
     let given = data.is_some();
     let mut first: Option<(&Path, Source)> = None;
-    let mut entrants = Vec::new();
+    let mut found = Vec::new();
     for folder in folders {
-        if PackedCatalogues::is_packed(folder) {
-            entrants.push(packed_entrant(folder, given)?);
+        if is_packed(folder) {
+            // Its files do not lead to the data.
+            let Some(data) = data.as_ref().filter(|_| given) else {
+                let message = "a submission needs the true shear. Try: --data DIR";
+                return Err(FileError::new(folder, message).into());
+            };
+            let sent = Sent::open(folder)?;
+            let submission = Submission::read(&sent)?;
+            found.push(Catalogues::packed(sent, submission, data)?);
             continue;
         }
         let run = Run::require(folder)?;
@@ -303,77 +190,183 @@ fn own_entrants(
                 return Err(FileError::new(folder, message).into());
             }
         }
-        if data.is_none() {
-            let hinted = |FileError { path, message, .. }| {
-                let place = folder.display();
-                let hint = format!("{message} (the data folder of {place}; --data gives another)");
-                FileError::new(path, hint)
-            };
-            *data = Some(run.source.data(folder).map_err(hinted)?);
-        }
-        if let Some(data) = data {
-            inputs::verify(data, folder, &run, &[], threads)?;
-        }
-        entrants.push(Entrant {
-            path: folder.clone(),
-            // Published metrics belong to the built-in settings, not to a file with their name.
-            published: registry
-                .get(&run.configuration.name)
-                .ok()
-                .filter(|entry| entry.configuration == run.configuration)
-                .and_then(|entry| entry.published),
-            name: run.configuration.name.clone(),
-            catalogues: Origin::Measured(run.catalogues(folder, &[])?),
-            settings: toml::to_string(&run.configuration).map_err(FileError::doing(
-                folder,
-                "cannot write the settings as TOML",
-            ))?,
-        });
+        let data = match data {
+            Some(data) => data,
+            None => data.insert(run.source.data(folder).map_err(
+                |FileError { path, message, .. }| {
+                    let place = folder.display();
+                    let hint =
+                        format!("{message} (the data folder of {place}; --data gives another)");
+                    FileError::new(path, hint)
+                },
+            )?),
+        };
+        // Catalogues of other images than those of the truth would have a low Q without any warning.
+        inputs::verify(data, folder, &run, &[], threads)?;
+        found.push(Catalogues::measured(&run, folder, &[])?);
     }
-    Ok(entrants)
+    Ok(found)
 }
 
-/// A submission. Its files do not lead to the data, so these must be `given`.
-fn packed_entrant(path: &Path, given: bool) -> Result<Entrant<'static>, PipelineError> {
-    if !given {
-        let message = "a submission needs the true shear. Try: --data DIR";
-        return Err(FileError::new(path, message).into());
-    }
-    let packed = PackedCatalogues::open(path)?;
-    let run = packed
-        .manifest
-        .as_ref()
-        .and_then(|manifest| manifest.run.as_ref());
-    let settings = run.map(|run| toml::to_string(&run.configuration));
-    let settings = settings.unwrap_or_else(|| Ok(path.display().to_string()));
-    Ok(Entrant {
-        path: path.to_owned(),
-        name: packed.method.clone(),
-        published: None,
-        settings: settings.map_err(FileError::doing(path, "cannot write the settings as TOML"))?,
-        catalogues: Origin::Packed(Box::new(packed)),
-    })
+/// By which column the sets of a run are grouped.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Grouping {
+    Set,
+    /// The kinds of the paper's Table 2.
+    SetKind,
+    Psf,
+    Snr,
+    Size,
 }
 
-/// Sets that all variants have.
-pub fn common_sets(all: &[Vec<SetRecord>]) -> BTreeSet<u32> {
-    all.iter()
-        .map(|sets| sets.iter().map(|set| set.set).collect())
-        .reduce(|all: BTreeSet<u32>, more| &all & &more)
-        .unwrap_or_default()
+impl Grouping {
+    pub fn name(self) -> &'static str {
+        match self {
+            Grouping::Set => "set",
+            Grouping::SetKind => "set_kind",
+            Grouping::Psf => "psf",
+            Grouping::Snr => "snr",
+            Grouping::Size => "size",
+        }
+    }
+
+    pub fn column(self) -> Option<Column> {
+        columns_named(&[self.name()]).pop()
+    }
+}
+
+/// Field and direction of sorting: `q:desc`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Order {
+    field: String,
+    descending: bool,
+}
+
+// Fields other than metrics to sort by. `group` is the column of the `Grouping`.
+const SORTED: [&str; 5] = ["submission", "run", "version", "group", "images"];
+
+impl FromStr for Order {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let (field, descending) = match text.split_once(':') {
+            None => (text, false),
+            Some((field, "asc")) => (field, false),
+            Some((field, "desc")) => (field, true),
+            Some((_, other)) => {
+                return Err(format!(
+                    "unknown order (found `{other}`, expected `asc` or `desc`)"
+                ));
+            }
+        };
+        if !SORTED.contains(&field) && Metrics::named(field).is_none() {
+            return Err(format!(
+                "cannot sort by `{field}`; expected one of {}, {}",
+                SORTED.join(", "),
+                Metrics::ALL.map(|metric| metric.name).join(", ")
+            ));
+        }
+        Ok(Order {
+            field: field.to_owned(),
+            descending,
+        })
+    }
+}
+
+impl Order {
+    fn key(&self, group: &Group) -> Cell {
+        match columns_named(&[&self.field]).first() {
+            Some(column) => column.cell(&group.run, &group.run.sets),
+            None => group.value.clone(),
+        }
+    }
+}
+
+/// A run, or those of its sets that have one value in the column of a [`Grouping`].
+#[derive(Debug, Clone)]
+pub struct Group {
+    pub run: RunRecord,
+    /// Empty without a grouping.
+    pub value: Cell,
+}
+
+impl Group {
+    fn whole(run: &RunRecord) -> Self {
+        Group {
+            run: run.clone(),
+            value: Cell::Empty,
+        }
+    }
+
+    /// The groups of runs. Groups of equal value are adjacent and sorted by `order`.
+    pub fn of(runs: &[RunRecord], grouping: Option<Grouping>, order: Option<&Order>) -> Vec<Self> {
+        let column = grouping.and_then(Grouping::column);
+        let mut groups: Vec<Group> = Vec::new();
+        for run in runs {
+            let first = groups.len();
+            for set in &run.sets {
+                let value = column.map_or(Cell::Empty, |column| {
+                    column.cell(run, std::slice::from_ref(set))
+                });
+                match groups[first..].iter_mut().find(|own| own.value == value) {
+                    Some(group) => group.run.sets.push(set.clone()),
+                    None => groups.push(Group {
+                        run: RunRecord {
+                            sets: vec![set.clone()],
+                            ..run.clone()
+                        },
+                        value,
+                    }),
+                }
+            }
+        }
+        let by_value = Order {
+            field: "group".into(),
+            descending: order.is_some_and(|order| order.field == "group" && order.descending),
+        };
+        // The second sort is stable, so that it keeps the order within a group.
+        for order in order.into_iter().chain([&by_value]) {
+            groups.sort_by(|a, b| in_order(&order.key(a), &order.key(b), order.descending));
+        }
+        groups
+    }
+
+    /// The first digits of the run's id, enough to distinguish the runs of a store.
+    pub fn id(&self) -> String {
+        self.run.id().chars().take(8).collect()
+    }
+
+    pub fn name(&self) -> String {
+        format!("{} {}", self.run.configuration, self.id())
+    }
+}
+
+// Compares two cells of a column. NaN comes last in both directions.
+fn in_order(a: &Cell, b: &Cell, descending: bool) -> Ordering {
+    let order = match (a, b) {
+        (Cell::Text(a), Cell::Text(b)) => a.cmp(b),
+        (Cell::Number { value: a, .. }, Cell::Number { value: b, .. }) => {
+            if a.is_nan() || b.is_nan() {
+                return a.is_nan().cmp(&b.is_nan());
+            }
+            a.total_cmp(b)
+        }
+        _ => Ordering::Equal,
+    };
+    match descending {
+        true => order.reverse(),
+        false => order,
+    }
 }
 
 /// A metric with jackknife replicates, so that differences can be paired.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Paired {
-    /// Q.
     Q,
-    /// Calibrated Q.
     Calibrated,
 }
 
 impl Paired {
-    /// Value of a set, and the values with each group of images left out.
     fn of(self, set: &SetRecord) -> (f64, &[f64]) {
         match self {
             Paired::Q => (set.metrics.q, &set.q_replicates),
@@ -382,36 +375,55 @@ impl Paired {
     }
 }
 
-/// Paired difference of a metric, `second` minus `first`. `None` if sets, data or images differ, or if a convention
-/// is uncertain.
-pub fn difference<R: Borrow<SetRecord>>(
+/// Paired difference of a metric, `second` minus `first`. `None` if sets, data or images differ, or if a convention is
+/// uncertain: a wrong convention changes Q by more than methods do.
+pub fn difference(
     metric: Paired,
-    first: &[R],
-    second: &[R],
+    first: &[SetRecord],
+    second: &[SetRecord],
 ) -> Option<PairedDifference> {
-    let pairs = || {
-        let sets = first.iter().zip(second);
-        sets.map(|(a, b)| (a.borrow(), b.borrow()))
-    };
-    let same = |(a, b): (&SetRecord, &SetRecord)| {
+    let mut pairs = Vec::new();
+    for (a, b) in first.iter().zip(second) {
+        // Replicates of other images do not share their noise.
         let known = a.convention_known && b.convention_known;
-        known && a.set == b.set && a.data == b.data && a.images == b.images
-    };
-    if first.len() != second.len() || !pairs().all(same) {
-        return None;
+        if !(known && a.set == b.set && a.data == b.data && a.images == b.images) {
+            return None;
+        }
+        let ((first, first_replicates), (second, second_replicates)) = (metric.of(a), metric.of(b));
+        pairs.push(PairedSet {
+            images: a.images.len(),
+            first,
+            first_replicates,
+            second,
+            second_replicates,
+        });
     }
-    let pairs: Vec<PairedSet<'_>> = pairs()
-        .map(|(a, b)| {
-            let ((first, first_replicates), (second, second_replicates)) =
-                (metric.of(a), metric.of(b));
-            PairedSet {
-                images: a.images.len(),
-                first,
-                first_replicates,
-                second,
-                second_replicates,
-            }
-        })
-        .collect();
-    paired_difference(&pairs)
+    (first.len() == second.len()).then(|| paired_difference(&pairs))?
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn orders_are_checked() {
+        assert!("q:desc".parse::<Order>().unwrap().descending);
+        assert!("q:down".parse::<Order>().is_err() && "colour".parse::<Order>().is_err());
+    }
+
+    #[test]
+    fn nan_comes_last_in_both_directions() {
+        let (one, two, none) = (1.0, 2.0, f64::NAN);
+        for (a, b, descending, expected) in [
+            (one, two, false, Ordering::Less),
+            (one, two, true, Ordering::Greater),
+            (none, two, false, Ordering::Greater),
+            (none, two, true, Ordering::Greater),
+            (one, none, true, Ordering::Less),
+            (none, none, true, Ordering::Equal),
+        ] {
+            let found = in_order(&Cell::number(a, 0), &Cell::number(b, 0), descending);
+            assert_eq!(found, expected, "{a} {b} {descending}");
+        }
+    }
 }

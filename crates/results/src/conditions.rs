@@ -5,7 +5,7 @@ use shearq_files::frames::{TableError, reals};
 use thiserror::Error;
 
 use super::expression::{Expression, Operand, fits};
-use super::row::{RunRecord, table_of};
+use super::record::{RunRecord, frame_of};
 
 /// Why sets cannot be chosen.
 #[derive(Debug, Error)]
@@ -36,7 +36,7 @@ pub fn choose(
     condition: &Expression,
     mut runs: Vec<RunRecord>,
 ) -> Result<Vec<RunRecord>, ChoiceError> {
-    let table = table_of(&runs)?;
+    let table = frame_of(&runs)?;
     let operands = condition.operands().iter();
     let values: Vec<Vec<f64>> = operands
         .map(|operand| values(&table, operand))

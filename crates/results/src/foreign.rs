@@ -7,7 +7,7 @@ use shearq_quantities::{Distortion, MeasuredRange, Shear};
 use shearq_scoring::{FieldSum, Grid, Row, RowCounts};
 use shearq_submissions::{EllipticityType, checked_name};
 
-use crate::views::rows::fault as odd_rows;
+use crate::views::diagnosis::{ADVICE_ON_SENTINELS, fault_of_rows};
 use shearq_dataset::layout::read_rows;
 use shearq_dataset::layout::{IMAGE_PLACEHOLDERS, check_pattern};
 use shearq_dataset::listing::{self, Files};
@@ -269,7 +269,7 @@ pub fn sum_foreign(
 ) -> Result<(FieldSum, RowCounts), FileError> {
     let mut sum = FieldSum::new(grid);
     let counts = sum.add_image(grid, rows);
-    match odd_rows(&counts, grid) {
+    match fault_of_rows(&counts, grid, ADVICE_ON_SENTINELS) {
         Some(fault) => Err(FileError::new(path, fault)),
         None => Ok((sum, counts)),
     }

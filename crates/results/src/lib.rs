@@ -1,12 +1,13 @@
 //! From catalogues to scores, comparisons and submissions to challenges.
 //!
-//! * [`score`] scores catalogues against a true shear field; [`foreign`] reads other programs' catalogues.
+//! * [`catalogues`] are those of one method: of shearq, of another program ([`foreign`]), or of a submission. [`score`]
+//!   scores them against a true shear field.
 //! * [`bias`] estimates m and c of catalogues of any program.
 //! * [`select`] applies cuts and weights to catalogues without a bias; [`expression`] reads formulas of columns.
 //! * [`mean`] averages catalogues to one shear per set.
 //! * [`star_noise`] adds the noise of stars to the error of a mean shear.
-//! * [`row`] is the record of a scored set, and [`store`] keeps records in Parquet files.
-//! * [`conditions`] and [`groups`] choose and group records; [`compare`] compares configurations.
+//! * [`record`] is the record of a scored set with the list of its columns, and [`store`] keeps records in Parquet files.
+//! * [`conditions`] choose records; [`compare`] groups and compares them.
 //! * [`baseline`] compares metrics with stored metrics.
 //! * [`submit`] packs and checks a submission to a challenge.
 //! * [`views`] makes tables, plots and pages.
@@ -14,13 +15,13 @@
 
 pub mod baseline;
 pub mod bias;
+pub mod catalogues;
 pub mod compare;
 pub mod conditions;
 pub mod expression;
 pub mod foreign;
-pub mod groups;
 pub mod mean;
-pub mod row;
+pub mod record;
 pub mod score;
 pub mod select;
 pub mod star_noise;

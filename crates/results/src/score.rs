@@ -3,12 +3,6 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use shearq_scoring::resample::mean_over_sets;
-use shearq_scoring::{
-    Choice, Convention, ConventionMatch, Fault, FieldSum, Grid, ImageFaults, Metrics, OddResponse,
-    Options, RowCounts, SetImages, SetScore, SetScorer, TruthSign, sign_by_correlation,
-};
-
 use shearq_dataset::layout::MAX_SET;
 use shearq_dataset::layout::{DataFolder, read_rows};
 use shearq_dataset::run::Run;
@@ -17,7 +11,13 @@ use shearq_dataset::truth::{ReadTruth, Reading, Sign, read_truth, reading_of};
 use shearq_files::FileError;
 use shearq_files::table::most_rows;
 use shearq_pipeline::{PipelineError, engine, inputs};
-use shearq_simulate::kinds::SetKind;
+use shearq_scoring::{
+    Choice, Convention, ConventionMatch, Fault, FieldSum, Grid, ImageFaults, OddResponse, Options,
+    RowCounts, ScoringError, SetImages, SetScore, SetScorer, TruthSign, sign_by_correlation,
+};
+
+use crate::catalogues::Catalogues;
+use crate::record::SetRecord;
 
 /// The scored columns of catalogues by shearq.
 pub const COLUMNS: [&str; 4] = ["x", "y", "e1", "e2"];
@@ -25,129 +25,39 @@ pub const COLUMNS: [&str; 4] = ["x", "y", "e1", "e2"];
 /// The convention of catalogues by shearq, which is the standard one by construction.
 pub const OWN: Choice = Choice::Insist(Convention::STANDARD);
 
-/// The score of one set, and how the rows of its catalogues were used.
+/// A scored set: its record, and what only its notes and plots need.
 #[derive(Debug, Clone)]
 pub struct ScoredSet {
-    /// Set number; `None` for plain files.
-    pub set: Option<u32>,
-    /// Kind of set, if the data were simulated.
-    pub kind: Option<SetKind>,
-    /// Numbers of the scored images.
-    pub images: Vec<u32>,
-    /// The score.
+    pub record: SetRecord,
     pub score: SetScore,
-    /// Numbers of used, missing and unusable rows.
     pub rows: RowCounts,
-    /// How the convention was chosen.
     pub basis: Basis,
     /// The sign of the true g2 and how it was determined; `None` in data folders, which state it.
     pub sign: Option<Sign>,
-    /// Probable faults of the ellipticities or the truth.
     pub findings: Vec<Fault>,
-    /// Probable faults of single images.
     pub odd_images: OddImages,
 }
 
-/// Catalogues of a set with faults that the sum over images does not show.
-#[derive(Debug, Clone, Default, PartialEq)]
-pub struct OddImages {
-    /// Pairs of catalogues with equal ellipticities: the copy, and the first.
-    pub copies: Vec<(PathBuf, PathBuf)>,
-    /// Catalogues whose galaxies all have one ellipticity, and this ellipticity.
-    pub constant: Vec<(PathBuf, [f64; 2])>,
-    /// Catalogues that follow the true shear differently from the others of the set.
-    pub responses: Vec<(PathBuf, OddResponse)>,
-}
-
-impl OddImages {
-    /// Odd images by name; the images of `faults` were added in the order of `paths`.
-    pub fn new(faults: &ImageFaults, paths: &[PathBuf]) -> Self {
-        OddImages {
-            copies: faults
-                .copies
-                .iter()
-                .map(|(copy, first)| (paths[*copy].clone(), paths[*first].clone()))
-                .collect(),
-            constant: faults
-                .constant
-                .iter()
-                .map(|(place, e)| (paths[*place].clone(), *e))
-                .collect(),
-            responses: faults
-                .odd()
-                .into_iter()
-                .map(|odd| (paths[odd.place].clone(), odd))
-                .collect(),
-        }
-    }
-
-    /// Renames the files, for example of an unpacked archive.
-    pub fn renamed(&mut self, name: impl Fn(&Path) -> PathBuf) {
-        for (copy, first) in &mut self.copies {
-            (*copy, *first) = (name(copy), name(first));
-        }
-        let constant = self.constant.iter_mut().map(|(path, _)| path);
-        let responses = self.responses.iter_mut().map(|(path, _)| path);
-        for path in constant.chain(responses) {
-            *path = name(path);
-        }
+impl ScoredSet {
+    /// `None` for plain files.
+    pub fn number(&self) -> Option<u32> {
+        (self.record.set > 0).then_some(self.record.set)
     }
 }
 
-/// The convention in which faults are looked for.
-fn convention_of_faults(score: &SetScore, choice: Choice) -> Convention {
-    match choice {
-        // The convention with the highest Q may be wrong.
-        Choice::Best => score.matching.convention(),
-        Choice::Matched | Choice::Insist(_) => score.chosen,
-    }
-}
-
-/// Scores the catalogues of a set with their probable faults. The convention of `scorer` may be known only afterwards;
-/// images are then read again, so that each can be compared with the truth in it.
-fn score_added(
-    scorer: &SetScorer,
-    added: &mut Added,
-    files: (&[PathBuf], ReadImage<'_>),
-    choice: Choice,
-    threads: usize,
-) -> Result<(SetScore, Vec<Fault>), PipelineError> {
-    let unnumbered = |source| PipelineError::Scoring { set: None, source };
-    let score = scorer.score(&added.images).map_err(unnumbered)?;
-    let convention = convention_of_faults(&score, choice);
-    if !added.compared && files.0.len() > 1 {
-        let grid = score.grid;
-        let compared = Some((scorer, convention));
-        added.odd_images = add_up(&grid, files.0, files.1, compared, threads)?.odd_images;
-    }
-    let faults = scorer.diagnose(&added.images, &score, convention);
-    Ok((score, faults.map_err(unnumbered)?))
-}
-
-/// The same error with the number of a set.
-fn of_set(error: PipelineError, set: u32) -> PipelineError {
-    match error {
-        PipelineError::Scoring { set: None, source } => PipelineError::Scoring {
-            set: Some(set),
-            source,
-        },
-        other => other,
-    }
-}
-
-/// How the convention of the metrics was chosen. It is the same for all sets of a variant.
+/// How the convention of the metrics was chosen. It is the same for all sets of a method.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Basis {
-    /// It was given, or the catalogues are by shearq.
+    /// By the user, or because the catalogues are by shearq.
     Given,
-    /// It was matched to the truth of all sets together.
+    /// By the truth of all sets together.
     Matched(ConventionMatch),
-    /// The highest Q of each set, as on the leaderboard.
+    /// By the highest Q of each set, as on the leaderboard.
     HighestQ,
 }
 
 impl Basis {
-    /// Whether the convention is certain, so that differences from other variants are meaningful.
+    /// Whether the convention is certain, so that differences from other methods are meaningful.
     pub fn is_known(&self) -> bool {
         match self {
             Basis::Given => true,
@@ -157,24 +67,160 @@ impl Basis {
     }
 }
 
+/// Catalogues of a set with faults that the sum over images does not show.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct OddImages {
+    /// Pairs of catalogues with equal ellipticities: the copy, and the first.
+    pub copies: Vec<(PathBuf, PathBuf)>,
+    /// Catalogues whose galaxies all have one ellipticity.
+    pub constant: Vec<(PathBuf, [f64; 2])>,
+    /// Catalogues that follow the true shear differently from the others of the set.
+    pub responses: Vec<(PathBuf, OddResponse)>,
+}
+
+impl OddImages {
+    /// The images of `faults` were added in the order of `names`.
+    pub fn new(faults: &ImageFaults, names: &[PathBuf]) -> Self {
+        let name = |place: usize| names[place].clone();
+        let (copies, constant) = (faults.copies.iter(), faults.constant.iter());
+        let responses = faults.odd().into_iter();
+        OddImages {
+            copies: copies
+                .map(|&(copy, first)| (name(copy), name(first)))
+                .collect(),
+            constant: constant.map(|&(place, e)| (name(place), e)).collect(),
+            responses: responses.map(|odd| (name(odd.place), odd)).collect(),
+        }
+    }
+}
+
 /// Reads one catalogue onto the grid.
 pub type ReadImage<'a> =
     &'a (dyn Fn(&Grid, &Path) -> Result<(FieldSum, RowCounts), FileError> + Sync);
 
 /// A [`ReadImage`] for catalogues by shearq.
-///
-/// # Errors
-/// If the catalogue cannot be read.
 pub fn own_catalogue(grid: &Grid, path: &Path) -> Result<(FieldSum, RowCounts), FileError> {
     let mut sum = FieldSum::new(grid);
     let counts = sum.add_image(grid, read_rows(path, &COLUMNS, most_rows(grid.cells()))?);
     Ok((sum, counts))
 }
 
+struct SetFiles<'a> {
+    // `None` for plain files.
+    set: Option<u32>,
+    simulated: bool,
+    images: Vec<u32>,
+    paths: Vec<PathBuf>,
+    // Their names in messages: members of an archive, not of the folder that it was unpacked to.
+    names: Vec<PathBuf>,
+    read: ReadImage<'a>,
+    threads: usize,
+}
+
+struct Added {
+    images: SetImages,
+    rows: RowCounts,
+    odd_images: OddImages,
+    compared: bool,
+}
+
+impl SetFiles<'_> {
+    fn wrong(&self) -> impl Fn(ScoringError) -> PipelineError + use<> {
+        let set = self.set;
+        move |source| PipelineError::Scoring { set, source }
+    }
+
+    // Reads catalogues in parallel and adds them in order, so that results do not depend on threads. Each is compared
+    // with the true shear of `compared` in its convention.
+    fn add_up(
+        &self,
+        grid: &Grid,
+        compared: Option<(&SetScorer, Convention)>,
+    ) -> Result<Added, PipelineError> {
+        let mut faults = ImageFaults::default();
+        let mut images = SetImages::new(grid);
+        let mut rows = RowCounts::default();
+        engine::ordered(
+            // More threads than catalogues have nothing to do.
+            self.threads.min(self.paths.len()).max(1),
+            |feeder| {
+                for path in &self.paths {
+                    if !feeder.push(path.clone()) {
+                        break;
+                    }
+                }
+                Ok(())
+            },
+            || (),
+            |(), path: PathBuf| {
+                let (sum, rows) = (self.read)(grid, &path)?;
+                let response = compared.and_then(|(scorer, own)| scorer.response(&sum, own));
+                Ok((sum, rows, response))
+            },
+            |(sum, more, response)| {
+                faults.add(&sum);
+                faults.add_response(response);
+                images.add(&sum).map_err(self.wrong())?;
+                rows += more;
+                Ok(())
+            },
+        )?;
+        if let (0, Some(first)) = (rows.used, self.names.first()) {
+            let message = nothing_used(&rows, self.names.len(), grid);
+            return Err(FileError::new(first, message).into());
+        }
+        Ok(Added {
+            images,
+            rows,
+            odd_images: OddImages::new(&faults, &self.names),
+            compared: compared.is_some(),
+        })
+    }
+
+    // Scores the added catalogues and looks for probable faults. `matched` has the convention of all sets together, if
+    // it was matched.
+    fn score(
+        &self,
+        scorer: &SetScorer,
+        mut added: Added,
+        choice: Choice,
+        matched: Option<ConventionMatch>,
+    ) -> Result<ScoredSet, PipelineError> {
+        let score = scorer.score(&added.images).map_err(self.wrong())?;
+        let basis = match (matched, choice) {
+            (Some(matching), _) => Basis::Matched(matching),
+            (None, Choice::Matched) => Basis::Matched(score.matching),
+            (None, Choice::Best) => Basis::HighestQ,
+            (None, Choice::Insist(_)) => Basis::Given,
+        };
+        // The convention with the highest Q may be wrong, so that faults are sought in the matched one.
+        let convention = match choice {
+            Choice::Best => score.matching.convention(),
+            Choice::Matched | Choice::Insist(_) => score.chosen,
+        };
+        // If the convention was unknown, single images are compared with the truth in a second pass. Keeping all images
+        // of a set would need gigabytes.
+        if !added.compared && self.paths.len() > 1 {
+            let compared = Some((scorer, convention));
+            added.odd_images = self.add_up(&score.grid, compared)?.odd_images;
+        }
+        let findings = scorer.diagnose(&added.images, &score, convention);
+        let (set, images) = (self.set.unwrap_or(0), self.images.clone());
+        let mut record = SetRecord::new(set, self.simulated, images, &score, &added.rows);
+        record.convention_known = basis.is_known();
+        Ok(ScoredSet {
+            record,
+            findings: findings.map_err(self.wrong())?,
+            score,
+            rows: added.rows,
+            basis,
+            sign: None,
+            odd_images: added.odd_images,
+        })
+    }
+}
+
 /// Scores one set from a truth file and one catalogue per image.
-///
-/// # Errors
-/// If a file cannot be read, the truth does not fill a square grid, or no row is on the grid.
 pub fn score_files(
     truth: &Path,
     catalogues: &[PathBuf],
@@ -188,12 +234,20 @@ pub fn score_files(
         mut shear,
         sign,
     } = read_truth(truth, reading)?;
-    let scoring = |source| PipelineError::Scoring { set: None, source };
-    let mut added = add_up(&grid, catalogues, read, None, threads)?;
+    let files = SetFiles {
+        set: None,
+        simulated: false,
+        images: (1..=catalogues.len() as u32).collect(),
+        paths: catalogues.to_vec(),
+        names: catalogues.to_vec(),
+        read,
+        threads,
+    };
+    let added = files.add_up(&grid, None)?;
     let sign = match sign {
         Some(sign) => sign,
         None => {
-            let found = sign_by_correlation(&shear, added.images.total()).map_err(scoring)?;
+            let found = sign_by_correlation(&shear, added.images.total()).map_err(files.wrong())?;
             let sign = Sign::of_catalogues(found).map_err(|fault| FileError::new(truth, fault))?;
             if sign.of == TruthSign::Challenge {
                 shear = shear.flipped();
@@ -201,88 +255,14 @@ pub fn score_files(
             sign
         }
     };
-    let scorer = SetScorer::new(grid, shear, options).map_err(scoring)?;
-    let files = (catalogues, read);
-    let (score, findings) = score_added(&scorer, &mut added, files, options.choice, threads)?;
+    let scorer = SetScorer::new(grid, shear, options).map_err(files.wrong())?;
+    let scored = files.score(&scorer, added, options.choice, None)?;
     Ok(ScoredSet {
-        set: None,
-        kind: None,
-        findings,
-        odd_images: added.odd_images,
         sign: Some(sign),
-        images: (1..=catalogues.len() as u32).collect(),
-        basis: match options.choice {
-            Choice::Matched => Basis::Matched(score.matching),
-            Choice::Best => Basis::HighestQ,
-            Choice::Insist(_) => Basis::Given,
-        },
-        score,
-        rows: added.rows,
+        ..scored
     })
 }
 
-/// Sum of the catalogues of a set.
-struct Added {
-    images: SetImages,
-    rows: RowCounts,
-    odd_images: OddImages,
-    /// Whether each image was compared with the true shear.
-    compared: bool,
-}
-
-/// Reads catalogues in parallel and sums them in order. Each is compared with the true shear of `compared` in its
-/// convention.
-fn add_up(
-    grid: &Grid,
-    catalogues: &[PathBuf],
-    read: ReadImage<'_>,
-    compared: Option<(&SetScorer, Convention)>,
-    threads: usize,
-) -> Result<Added, PipelineError> {
-    let mut faults = ImageFaults::default();
-    let mut images = SetImages::new(grid);
-    let mut counts = RowCounts::default();
-    engine::ordered(
-        // More threads than catalogues have nothing to do.
-        threads.min(catalogues.len()).max(1),
-        |feeder| {
-            for path in catalogues {
-                if !feeder.push(path.clone()) {
-                    break;
-                }
-            }
-            Ok(())
-        },
-        || (),
-        |(), path: PathBuf| {
-            let (sum, counts) = read(grid, &path)?;
-            let response = compared.and_then(|(scorer, own)| scorer.response(&sum, own));
-            Ok((sum, counts, response))
-        },
-        |(sum, more, response)| {
-            faults.add(&sum);
-            faults.add_response(response);
-            images
-                .add(&sum)
-                .map_err(|source| PipelineError::Scoring { set: None, source })?;
-            counts += more;
-            Ok(())
-        },
-    )?;
-    if counts.used == 0
-        && let Some(first) = catalogues.first()
-    {
-        return Err(FileError::new(first, nothing_used(&counts, catalogues.len(), grid)).into());
-    }
-    Ok(Added {
-        images,
-        rows: counts,
-        odd_images: OddImages::new(&faults, catalogues),
-        compared: compared.is_some(),
-    })
-}
-
-/// The error if no row of `files` catalogues can be scored.
 fn nothing_used(counts: &RowCounts, files: usize, grid: &Grid) -> String {
     let (n, stamp) = (grid.n, grid.stamp.0);
     if counts.outside > counts.not_finite {
@@ -300,173 +280,117 @@ fn nothing_used(counts: &RowCounts, files: usize, grid: &Grid) -> String {
     format!("found no galaxy in {files} catalogue(s); expected a row per galaxy")
 }
 
-/// Catalogues of one variant.
-pub struct Catalogues<'a> {
-    /// The existing catalogues of a set, with their image numbers.
-    pub of_set: &'a dyn Fn(u32) -> Vec<(u32, PathBuf)>,
-    /// Reads one catalogue.
-    pub read: ReadImage<'a>,
-    /// Convention to score in; [`Choice::Matched`] uses one convention for all sets.
-    pub choice: Choice,
-}
-
-impl std::fmt::Debug for Catalogues<'_> {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Catalogues").finish_non_exhaustive()
-    }
-}
-
-/// A set to score, and its catalogues of every variant.
-type SetFiles = (u32, Vec<Vec<(u32, PathBuf)>>);
-
-/// Scores several variants on sets of a data folder: on `sets`, or if it is empty, on all sets with catalogues of every
-/// variant. The convention of `options` is replaced by the choice of each variant.
-///
-/// # Errors
-/// If files are absent or damaged, or a set of `sets` has no catalogues.
+/// Scores several methods on sets of a data folder: on `sets`, or if it is empty, on all sets with catalogues of every
+/// method. Each is scored in its own choice of a convention. [`Choice::Matched`] uses one convention for all sets.
 pub fn score_variants(
     data: &DataFolder,
-    variants: &[Catalogues<'_>],
+    variants: &[(&Catalogues, Choice)],
     sets: &[u32],
     options: Options,
     threads: usize,
 ) -> Result<Vec<Vec<ScoredSet>>, PipelineError> {
     let sets = sets_to_score(variants, sets)?;
-    let mut scored = Vec::new();
-    for (k, variant) in variants.iter().enumerate() {
-        let basis = match variant.choice {
-            Choice::Matched => Basis::Matched(match_over_sets(data, &sets, k, variant, threads)?),
-            Choice::Best => Basis::HighestQ,
-            Choice::Insist(_) => Basis::Given,
-        };
-        let options = Options {
-            choice: match basis {
-                Basis::Matched(matching) => Choice::Insist(matching.convention()),
-                Basis::Given | Basis::HighestQ => variant.choice,
-            },
-            ..options
-        };
-        let mut own = Vec::new();
-        for (set, files) in &sets {
-            let paths: Vec<PathBuf> = files[k].iter().map(|file| file.1.clone()).collect();
-            let (scorer, mut added) = prepare(data, *set, &paths, variant.read, options, threads)?;
-            let files_of_set = (paths.as_slice(), variant.read);
-            let (score, findings) =
-                score_added(&scorer, &mut added, files_of_set, options.choice, threads)
-                    .map_err(|error| of_set(error, *set))?;
-            own.push(ScoredSet {
-                set: Some(*set),
-                kind: kind_of(data, *set),
-                images: files[k].iter().map(|file| file.0).collect(),
-                findings,
-                odd_images: added.odd_images,
-                score,
-                rows: added.rows,
-                basis,
-                sign: None,
-            });
+    let score = |&(catalogues, choice): &(&Catalogues, Choice)| {
+        score_sets(data, catalogues, choice, &sets, options, threads)
+    };
+    variants.iter().map(score).collect()
+}
+
+fn score_sets(
+    data: &DataFolder,
+    catalogues: &Catalogues,
+    choice: Choice,
+    sets: &[u32],
+    options: Options,
+    threads: usize,
+) -> Result<Vec<ScoredSet>, PipelineError> {
+    let read = |grid: &Grid, path: &Path| catalogues.sum(grid, path);
+    let files = |set: u32| {
+        let (images, paths): (Vec<u32>, Vec<PathBuf>) = catalogues.of_set(set).into_iter().unzip();
+        SetFiles {
+            set: Some(set),
+            simulated: kind_of(data, set).is_some(),
+            images,
+            names: paths.iter().map(|path| catalogues.as_given(path)).collect(),
+            paths,
+            read: &read,
+            threads,
         }
-        scored.push(own);
+    };
+    let scorer = |files: &SetFiles<'_>, set: u32, options| -> Result<_, PipelineError> {
+        let ReadTruth { grid, shear, .. } = read_truth(&data.truth(set), &reading_of(data, set)?)?;
+        let scorer = SetScorer::new(grid, shear, options).map_err(files.wrong())?;
+        Ok((grid, scorer))
+    };
+    let mut options = Options { choice, ..options };
+    let mut matched = None;
+    if choice == Choice::Matched {
+        let mut all = ConventionMatch::default();
+        for &set in sets {
+            let files = files(set);
+            let (grid, scorer) = scorer(&files, set, Options::default())?;
+            let images = files.add_up(&grid, None)?.images;
+            all.merge(&scorer.match_convention(&images).map_err(files.wrong())?);
+        }
+        // One convention for all sets: noisy sets would choose others by chance.
+        matched = Some(all);
+        options.choice = Choice::Insist(all.convention());
+    }
+    let mut scored = Vec::new();
+    for &set in sets {
+        let files = files(set);
+        let (grid, scorer) = scorer(&files, set, options)?;
+        let compared = match options.choice {
+            Choice::Insist(convention) => Some((&scorer, convention)),
+            Choice::Matched | Choice::Best => None,
+        };
+        let added = files.add_up(&grid, compared)?;
+        scored.push(files.score(&scorer, added, options.choice, matched)?);
     }
     Ok(scored)
 }
 
-/// The sets with catalogues of every variant.
 fn sets_to_score(
-    variants: &[Catalogues<'_>],
+    variants: &[(&Catalogues, Choice)],
     wanted: &[u32],
-) -> Result<Vec<SetFiles>, PipelineError> {
-    let mut sets = Vec::new();
-    for set in 1..=MAX_SET {
-        if !wanted.is_empty() && !wanted.contains(&set) {
-            continue;
+) -> Result<Vec<u32>, PipelineError> {
+    let complete = |set: &u32| variants.iter().all(|v| !v.0.of_set(*set).is_empty());
+    let lacking = || wanted.iter().find(|set| !complete(set));
+    let message = match lacking() {
+        Some(set) => format!("found no catalogue of set {set} to score"),
+        None => {
+            let asked = |set: &u32| wanted.is_empty() || wanted.contains(set);
+            let sets: Vec<u32> = (1..=MAX_SET).filter(asked).filter(complete).collect();
+            if !sets.is_empty() {
+                return Ok(sets);
+            }
+            "found no catalogue to score".into()
         }
-        let files = variants.iter().map(|v| (v.of_set)(set));
-        let files: Vec<_> = files.take_while(|files| !files.is_empty()).collect();
-        if files.len() == variants.len() {
-            sets.push((set, files));
-        } else if wanted.contains(&set) {
-            let message = format!("found no catalogue of set {set} to score");
-            return Err(PipelineError::Request(message));
-        }
-    }
-    if sets.is_empty() {
-        let message = "found no catalogue to score".into();
-        return Err(PipelineError::Request(message));
-    }
-    Ok(sets)
-}
-
-/// How well each convention of the `k`-th variant agrees with the truth of all sets.
-fn match_over_sets(
-    data: &DataFolder,
-    sets: &[SetFiles],
-    k: usize,
-    variant: &Catalogues<'_>,
-    threads: usize,
-) -> Result<ConventionMatch, PipelineError> {
-    let mut all = ConventionMatch::default();
-    for (set, files) in sets {
-        let paths: Vec<PathBuf> = files[k].iter().map(|file| file.1.clone()).collect();
-        let options = Options::default();
-        let (scorer, added) = prepare(data, *set, &paths, variant.read, options, threads)?;
-        let found = scorer.match_convention(&added.images);
-        all.merge(&found.map_err(|source| PipelineError::Scoring {
-            set: Some(*set),
-            source,
-        })?);
-    }
-    Ok(all)
-}
-
-/// Scorer and summed catalogues of a set.
-fn prepare(
-    data: &DataFolder,
-    set: u32,
-    files: &[PathBuf],
-    read: ReadImage<'_>,
-    options: Options,
-    threads: usize,
-) -> Result<(SetScorer, Added), PipelineError> {
-    let ReadTruth { grid, shear, .. } = read_truth(&data.truth(set), &reading_of(data, set)?)?;
-    let scorer = SetScorer::new(grid, shear, options).map_err(|source| PipelineError::Scoring {
-        set: Some(set),
-        source,
-    })?;
-    let compared = match options.choice {
-        Choice::Insist(convention) => Some((&scorer, convention)),
-        Choice::Matched | Choice::Best => None,
     };
-    let added = add_up(&grid, files, read, compared, threads)?;
-    Ok((scorer, added))
+    Err(PipelineError::Request(message))
 }
 
-/// Scores sets of a data folder from catalogues found by `catalogues`: `sets`, or if it is empty, all sets with
-/// catalogues.
-///
-/// # Errors
-/// As [`score_variants`].
-pub fn score_sets(
+/// Scores `sets` of one method, or all sets with catalogues if it is empty.
+pub fn score_catalogues(
     data: &DataFolder,
+    catalogues: &Catalogues,
     sets: &[u32],
-    catalogues: impl Fn(u32) -> Vec<(u32, PathBuf)>,
-    read: ReadImage<'_>,
     options: Options,
     threads: usize,
 ) -> Result<Vec<ScoredSet>, PipelineError> {
-    let variant = Catalogues {
-        of_set: &catalogues,
-        read,
-        choice: options.choice,
-    };
-    let scored = score_variants(data, &[variant], sets, options, threads)?;
+    if let Some(run) = catalogues.run() {
+        inputs::verify(data, &catalogues.path, run, sets, threads)?;
+    }
+    let variant = [(catalogues, options.choice)];
+    let scored = score_variants(data, &variant, sets, options, threads);
+    let scored = scored.map_err(|error| match error {
+        PipelineError::Request(message) => FileError::new(&catalogues.path, message).into(),
+        other => other,
+    })?;
     Ok(scored.into_iter().flatten().collect())
 }
 
-/// Scores `sets` of a results folder, or all if it is empty, against the truth of `data`.
-///
-/// # Errors
-/// As [`score_sets`].
+/// Scores `sets` of a folder of results, or all if it is empty, against the truth of `data`.
 pub fn score_folder(
     data: &DataFolder,
     out: &Path,
@@ -475,36 +399,22 @@ pub fn score_folder(
     options: Options,
     threads: usize,
 ) -> Result<Vec<ScoredSet>, PipelineError> {
-    inputs::verify(data, out, run, sets, threads)?;
-    let files = run.catalogues(out, sets)?;
-    let catalogues = |set| files.of_set(set);
-    score_sets(data, sets, catalogues, &own_catalogue, options, threads).map_err(
-        |error| match error {
-            PipelineError::Request(message) => FileError::new(out, message).into(),
-            other => other,
-        },
-    )
+    let catalogues = Catalogues::measured(run, out, sets)?;
+    score_catalogues(data, &catalogues, sets, options, threads)
 }
 
 /// Warnings about images of `data` that were not scored, in `sets` (in all if empty).
-///
-/// # Errors
-/// If the folders of the data cannot be listed.
 pub fn unscored(
     data: &DataFolder,
     scored: &[ScoredSet],
     sets: &[u32],
 ) -> Result<Vec<String>, FileError> {
-    let numbered = scored
-        .iter()
-        .filter_map(|scored| Some((scored.set?, scored.images.as_slice())));
-    without_catalogue(data, &numbered.collect(), sets)
+    let records = scored.iter().map(|scored| &scored.record);
+    let images = records.map(|record| (record.set, record.images.as_slice()));
+    without_catalogue(data, &images.collect(), sets)
 }
 
 /// Warnings about images without a catalogue; `used` has the images with a catalogue by set.
-///
-/// # Errors
-/// As [`unscored`].
 pub fn without_catalogue(
     data: &DataFolder,
     used: &BTreeMap<u32, &[u32]>,
@@ -536,19 +446,4 @@ pub fn without_catalogue(
         ));
     }
     Ok(lines)
-}
-
-/// Means of the metrics over sets, and their errors.
-pub fn means(scored: &[ScoredSet]) -> (Metrics, Metrics) {
-    let columns: [(f64, f64); Metrics::ALL.len()] = std::array::from_fn(|k| {
-        let pairs: Vec<(f64, f64)> = scored
-            .iter()
-            .map(|s| (s.score.metrics.values()[k], s.score.errors.values()[k]))
-            .collect();
-        mean_over_sets(&pairs)
-    });
-    (
-        Metrics::from_values(columns.map(|c| c.0)),
-        Metrics::from_values(columns.map(|c| c.1)),
-    )
 }

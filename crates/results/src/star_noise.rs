@@ -12,18 +12,15 @@ use shearq_files::frames::polars::DataFrame;
 use shearq_files::table::{self, FileFormat};
 use shearq_pipeline::measure::PSF_NOISE;
 
-/// Largest effect on m or c that metadata can state: a star without any signal has 5.5.
-const MOST: f64 = 10.0;
+// Largest effect on m or c that metadata can state: a star without any signal has 5.5.
+const MAX_STAR_EFFECT: f64 = 10.0;
 
-/// Key of the program that wrote a catalogue, and how its text begins in catalogues of shearq.
+// Key of the program that wrote a catalogue, and how its text begins in catalogues of shearq.
 const CREATOR: (&str, &str) = ("creator", "shearq ");
-/// Columns that Python's catalogues have instead: a number for the star, and the scatter of m and of c.
+// Columns that Python's catalogues have instead: a number for the star, and the scatter of m and of c.
 const COLUMNS: [&str; 3] = ["psf_id", "psf_m", "psf_c"];
 
-/// The noise of the star of a catalogue of any program; `None` unless shearq wrote it and states the noise.
-///
-/// # Errors
-/// If the metadata cannot be read.
+// The noise of the star of a catalogue of any program; `None` unless shearq wrote it and states the noise.
 pub(crate) fn of_any(path: &Path, format: FileFormat) -> Result<Option<StarNoise>, FileError> {
     let (key, start) = CREATOR;
     let keys = [key, PSF_NOISE, PSF].map(str::to_owned);
@@ -34,8 +31,8 @@ pub(crate) fn of_any(path: &Path, format: FileFormat) -> Result<Option<StarNoise
     }
 }
 
-/// The noise of the star of a table in memory; `None` if it has no such columns, no noise, or galaxies behind several
-/// stars.
+// The noise of the star of a table in memory; `None` if it has no such columns, no noise, or galaxies behind several
+// stars.
 pub(crate) fn of_table(table: &DataFrame, name: &Path) -> Option<StarNoise> {
     let [star, m, c] = COLUMNS.map(|column| {
         let values = table::numbers(table, column, name).ok()?;
@@ -43,7 +40,10 @@ pub(crate) fn of_table(table: &DataFrame, name: &Path) -> Option<StarNoise> {
         values.iter().all(|value| *value == first).then_some(first)
     });
     let (star, m, c) = (star?, m?, c?);
-    let known = [m, c].iter().all(|effect| (0.0..=MOST).contains(effect)) && m > 0.0;
+    let known = [m, c]
+        .iter()
+        .all(|effect| (0.0..=MAX_STAR_EFFECT).contains(effect))
+        && m > 0.0;
     known.then(|| StarNoise {
         star: format!("{star:.0}"),
         m,
@@ -51,10 +51,7 @@ pub(crate) fn of_table(table: &DataFrame, name: &Path) -> Option<StarNoise> {
     })
 }
 
-/// The noise of the star of a catalogue of shearq; `None` if the catalogue does not state it.
-///
-/// # Errors
-/// If the metadata cannot be read.
+// The noise of the star of a catalogue of shearq; `None` if the catalogue does not state it.
 pub(crate) fn of_catalogue(
     path: &Path,
     format: FileFormat,
@@ -63,7 +60,7 @@ pub(crate) fn of_catalogue(
     stated(path, table::read_metadata(path, format, keys.iter())?)
 }
 
-/// The noise that metadata state, of a star that is named by its fingerprint or, without one, as the catalogue.
+// The noise that metadata state, of a star that is named by its fingerprint or, without one, as the catalogue.
 fn stated(path: &Path, mut metadata: Metadata) -> Result<Option<StarNoise>, FileError> {
     let Some(text) = metadata.get(PSF_NOISE) else {
         return Ok(None);
@@ -74,15 +71,21 @@ fn stated(path: &Path, mut metadata: Metadata) -> Result<Option<StarNoise>, File
     Ok(Some(StarNoise { star, m, c }))
 }
 
-/// The scatter of m and c by the noise of a star, as the metadata state it.
+// The scatter of m and c by the noise of a star, as the metadata state it.
 fn effect(path: &Path, text: &str) -> Result<[f64; 2], FileError> {
     let numbers: Option<Vec<f64>> = text.split(' ').map(|word| word.parse().ok()).collect();
     match numbers.as_deref() {
-        Some(&[m, c]) if [m, c].iter().all(|value| (0.0..=MOST).contains(value)) => Ok([m, c]),
+        Some(&[m, c])
+            if [m, c]
+                .iter()
+                .all(|value| (0.0..=MAX_STAR_EFFECT).contains(value)) =>
+        {
+            Ok([m, c])
+        }
         _ => Err(FileError::new(
             path,
             format!(
-                "the metadata `{PSF_NOISE}` are {text:?} (expected the scatter of m and of c, two numbers from 0 to {MOST} such as 2.3e-2 1.2e-2)"
+                "the metadata `{PSF_NOISE}` are {text:?} (expected the scatter of m and of c, two numbers from 0 to {MAX_STAR_EFFECT} such as 2.3e-2 1.2e-2)"
             ),
         )),
     }
@@ -91,11 +94,9 @@ fn effect(path: &Path, text: &str) -> Result<[f64; 2], FileError> {
 /// The noise of stars in a mean shear. Images with the same star have the same error.
 #[derive(Debug, Default)]
 pub struct Stars {
-    /// By star: sums of responses, which are the shares in the mean, times the scatter of m and of c.
+    // By star: sums of responses, which are the shares in the mean, times the scatter of m and of c.
     effects: BTreeMap<String, [[f64; 2]; 2]>,
-    /// Sum of the responses of all images.
     responses: [f64; 2],
-    /// Images whose catalogue states the effect of the noise.
     stated: usize,
 }
 
@@ -117,12 +118,10 @@ impl Stars {
         }
     }
 
-    /// Number of images whose star has a known noise.
     pub fn stated(&self) -> usize {
         self.stated
     }
 
-    /// Errors of the mean `shear` by the noise.
     pub fn errors(&self, shear: [f64; 2]) -> [f64; 2] {
         [0, 1].map(|k| {
             let variances = self.effects.values().map(|[m, c]| {

@@ -9,15 +9,15 @@ use std::path::{Path, PathBuf};
 
 use shearq_files::frames::{Metadata, TableError, parquet_metadata, read_parquet, write_parquet};
 
-use super::row::{RunRecord, table_of};
+use super::record::{RunRecord, frame_of, run_of_frame};
 use shearq_dataset::fingerprint;
 use shearq_files::parquet::bare;
 use shearq_files::{FileError, atomic};
 
-/// Key and value in the footer that identify the files of a store.
+// Key and value in the footer that identify the files of a store.
 const SCHEMA: (&str, &str) = ("schema", "shearq results store 1");
 
-/// Most sets of one run: ten times the highest number in file names.
+// Most sets of one run: ten times the highest number in file names.
 const MAX_SETS: usize = 100_000;
 
 /// A store's folder. A new folder that stays empty is removed.
@@ -35,9 +35,6 @@ impl Drop for Prepared {
 }
 
 /// Makes the folder of a store before a long run, which would otherwise fail at its end.
-///
-/// # Errors
-/// If it cannot be made.
 pub fn prepare(store: &Path) -> Result<Prepared, FileError> {
     let absent = !store.exists();
     std::fs::create_dir_all(store)
@@ -46,22 +43,19 @@ pub fn prepare(store: &Path) -> Result<Prepared, FileError> {
     Ok(Prepared(absent.then(|| store.to_owned())))
 }
 
-/// Records a run and returns its file.
-///
-/// # Errors
-/// If the file cannot be written.
 pub fn write(store: &Path, run: &RunRecord) -> Result<PathBuf, FileError> {
     let failed = |error: TableError| bare(store, &error);
     let metadata = Metadata::from([(SCHEMA.0.to_owned(), SCHEMA.1.to_owned())]);
-    let table = table_of(std::slice::from_ref(run)).map_err(failed)?;
+    let table = frame_of(std::slice::from_ref(run)).map_err(failed)?;
     let mut bytes = Vec::new();
     write_parquet(&mut bytes, &table, &metadata).map_err(failed)?;
+    // The name contains a hash of the content: processes that write at the same time do not collide, and recording a run
+    // twice has no effect.
     let path = store.join(file_name(run, &bytes));
     atomic::write(&path, &bytes)?;
     Ok(path)
 }
 
-/// Name of the file with the content `bytes`.
 fn file_name(run: &RunRecord, bytes: &[u8]) -> String {
     let words: Vec<&str> = run
         .configuration
@@ -72,7 +66,6 @@ fn file_name(run: &RunRecord, bytes: &[u8]) -> String {
     format!("{}-{}-{print}.parquet", words.join("-"), run.id())
 }
 
-/// Reads the run of one file.
 fn read_run(path: &Path) -> Result<RunRecord, FileError> {
     let failed = |error: TableError| bare(path, &error);
     let table = read_parquet(path, None, MAX_SETS).map_err(failed)?;
@@ -100,13 +93,10 @@ fn read_run(path: &Path) -> Result<RunRecord, FileError> {
         );
         return Err(FileError::new(path, message));
     }
-    RunRecord::from_table(&table, path)
+    run_of_frame(&table, path)
 }
 
 /// The run of each file of a store, in order of the names.
-///
-/// # Errors
-/// If the folder does not exist, or a Parquet file in it does not belong to a store.
 pub fn files(store: &Path) -> Result<Vec<(PathBuf, RunRecord)>, FileError> {
     let entries = std::fs::read_dir(store)
         .and_then(Iterator::collect::<std::io::Result<Vec<_>>>)
@@ -121,6 +111,7 @@ pub fn files(store: &Path) -> Result<Vec<(PathBuf, RunRecord)>, FileError> {
             !hidden && path.extension().is_some_and(|ending| ending == "parquet")
         })
         .collect();
+    // Folders are listed in any order, but warnings and tables must not depend on it.
     paths.sort();
     paths
         .into_iter()
@@ -131,9 +122,6 @@ pub fn files(store: &Path) -> Result<Vec<(PathBuf, RunRecord)>, FileError> {
 /// All runs of a store, sorted by configuration and id, and warnings about them.
 ///
 /// If several files contain one set of one run, the set with most images is used.
-///
-/// # Errors
-/// As [`files`].
 pub fn read(store: &Path) -> Result<(Vec<RunRecord>, Vec<String>), FileError> {
     let mut runs: BTreeMap<(String, String), RunRecord> = BTreeMap::new();
     let mut notes = Vec::new();
@@ -148,12 +136,12 @@ pub fn read(store: &Path) -> Result<(Vec<RunRecord>, Vec<String>), FileError> {
     Ok((runs.into_values().collect(), notes))
 }
 
-/// Adds the sets of another file of one run.
 fn merge(run: &mut RunRecord, more: RunRecord, path: &Path, notes: &mut Vec<String>) {
     for set in more.sets {
         match run.sets.iter_mut().find(|own| own.set == set.set) {
             None => run.sets.push(set),
             Some(own) => {
+                // A set scored before all of its images were measured is replaced by the complete one.
                 if own.images.len() == set.images.len() {
                     notes.push(format!(
                         "warning: {} repeats set {} of another file with other results on as many images; the other file is used.",
@@ -172,7 +160,7 @@ fn merge(run: &mut RunRecord, more: RunRecord, path: &Path, notes: &mut Vec<Stri
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::row::SetRecord;
+    use crate::record::SetRecord;
     use shearq_scoring::Metrics;
 
     fn run(configuration: &str, sets: &[(u32, u32, f64)]) -> RunRecord {

@@ -19,8 +19,8 @@ use shearq_pipeline::PipelineError;
 use shearq_pipeline::engine::Progress;
 use shearq_pipeline::run::{measurers, run_set};
 use shearq_pipeline::simulate::simulator;
-use shearq_results::row::SetRecord;
-use shearq_results::score::{Basis, OWN, OddImages, ScoredSet};
+use shearq_results::record::SetRecord;
+use shearq_results::score::OWN;
 use shearq_simulate::kinds::SetKind;
 use shearq_simulate::set::{STAMP, SimulationSettings};
 
@@ -163,7 +163,8 @@ pub fn run_sets(
 
 /// The score of one distinct configuration on one set.
 struct MeasuredSet {
-    scored: ScoredSet,
+    score: SetScore,
+    record: SetRecord,
     spectrum: Option<(f64, Option<f64>)>,
     response: Response,
 }
@@ -213,17 +214,12 @@ fn measure_set(
         let score = scorer.score(sum).map_err(scoring)?;
         Ok(MeasuredSet {
             spectrum: spectrum_quality(&score, sum),
-            scored: ScoredSet {
-                set: Some(set),
-                kind: SetKind::of(set),
-                images: images.clone(),
-                score,
-                rows: *rows,
-                basis: Basis::Given,
-                sign: None,
-                findings: Vec::new(),
-                odd_images: OddImages::default(),
+            record: {
+                // The settings of the plan identify simulated data, so there is no fingerprint.
+                let simulated = SetKind::of(set).is_some();
+                SetRecord::new(set, simulated, images.clone(), &score, rows)
             },
+            score,
             response: regression.response(),
         })
     };
@@ -234,15 +230,14 @@ fn measure_set(
 fn set_result(plan: &Plan, set: u32, measured: &[MeasuredSet], place: &[usize]) -> SetResult {
     let result = |(configuration, &at): (&Configuration, &usize)| {
         let MeasuredSet {
-            scored,
+            score,
+            record,
             spectrum,
             response,
         } = &measured[at];
-        let score = &scored.score;
         ConfigurationResult {
             configuration: configuration.name.clone(),
-            // The settings of the plan identify simulated data, so there is no fingerprint.
-            score: SetRecord::new(set, scored, String::new()),
+            score: record.clone(),
             convention_matched: score.matching.best().number(),
             ee: score.spectra().ee,
             ee_error: score.ee_error,
@@ -251,7 +246,7 @@ fn set_result(plan: &Plan, set: u32, measured: &[MeasuredSet], place: &[usize]) 
             response: *response,
         }
     };
-    let first = &measured[place[0]].scored.score;
+    let first = &measured[place[0]].score;
     SetResult {
         set,
         images: plan.images,

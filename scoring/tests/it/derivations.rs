@@ -274,13 +274,13 @@ fn a_spectrum_submission_is_scored_with_the_errors_of_its_covariance() {
     let mut measured = [0.0; BINS];
     measured[SCORED].copy_from_slice(&powers);
     close(
-        found.quality.q,
+        found.metrics.q,
         quality(bins, &measured, &true_power).q,
         "Q",
     );
     let fit = |measured: &[f64; BINS]| bias_fits(bins, grid.side().0, measured, &true_power).cl;
-    close(found.m_half, fit(&measured).M / 2.0, "M/2");
-    close(found.sqrt_a, fit(&measured).sqrtA * 1e4, "sqrt A");
+    close(found.metrics.m_half, fit(&measured).M / 2.0, "M/2");
+    close(found.metrics.sqrt_a, fit(&measured).sqrtA * 1e4, "sqrt A");
     // M, A and (all deviations being positive) σ_sys are linear: their gradients by differences of 1.
     let gradient = |of: &dyn Fn(&[f64; BINS]) -> f64| -> Vec<f64> {
         let step = |b: usize| {
@@ -301,23 +301,23 @@ fn a_spectrum_submission_is_scored_with_the_errors_of_its_covariance() {
     let near = |found: f64, expected: f64| {
         assert!((found / expected - 1.0).abs() < 1e-6, "{found} {expected}");
     };
-    near(found.m_half_error, error(&of_m) / 2.0);
+    near(found.errors.m_half, error(&of_m) / 2.0);
     let a = fit(&measured).A;
     if a.abs() >= 2.0 * error(&of_a) {
         near(
-            found.sqrt_a_error,
+            found.errors.sqrt_a,
             error(&of_a) / (2.0 * a.abs().sqrt()) * 1e4,
         );
     } else {
-        assert!(found.sqrt_a_error.is_nan());
+        assert!(found.errors.sqrt_a.is_nan());
     }
     let of_sigma = gradient(&|p| quality(bins, p, &true_power).sigma_sys);
     near(
-        found.quality_error,
-        found.quality.q * error(&of_sigma) / found.quality.sigma_sys,
+        found.errors.q,
+        found.metrics.q * error(&of_sigma) / (1e-4 * found.metrics.sigma_sys_1e4),
     );
     let unknown = scorer.score_spectrum(&powers, None).unwrap();
-    assert!(unknown.quality_error.is_nan() && unknown.m_half_error.is_nan());
+    assert!(unknown.errors.q.is_nan() && unknown.errors.m_half.is_nan());
     assert!(scorer.score_spectrum(&powers[1..], None).is_err());
 }
 

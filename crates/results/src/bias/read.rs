@@ -14,7 +14,7 @@ use shearq_quantities::{Distortion, MeasuredRange};
 use crate::expression::{Expression, Operand};
 use crate::select::{READ, Weighted, require_responses};
 use crate::star_noise;
-use crate::views::rows::shown;
+use crate::views::diagnosis::shown;
 
 use super::Input;
 use super::columns::{Columns, Names, Preset, Role, SHEARED, Shapes};

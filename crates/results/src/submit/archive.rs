@@ -15,26 +15,24 @@ use shearq_files::FileError;
 use shearq_files::atomic::{PartFile, PartFolder, sweep_beside};
 use shearq_files::open::{is_there, open};
 
-/// Largest accepted manifest in bytes: about 200 per file, with room for covariances.
-const MAX_MANIFEST: u64 = 1 << 26;
+// Largest accepted manifest in bytes: about 200 per file, with room for covariances.
+const MAX_MANIFEST_BYTES: u64 = 1 << 26;
 
-/// Largest accepted compression ratio beyond the first [`FREE`] bytes. ASCII numbers reach 3, blank catalogues
-/// about 100.
+// Largest accepted compression ratio beyond the first [`FREE_BYTES`] bytes. ASCII numbers reach 3, blank catalogues
+// about 100.
 const MAX_RATIO: u64 = 300;
-/// Unpacked bytes that any archive may have.
-const FREE: u64 = 1 << 24;
-/// Bytes counted per file in addition to its content, about its cost on disk.
-const FILE: u64 = 1 << 12;
-/// Most files, including the manifest: more than 8,000 images in each of 24 sets.
+// Unpacked bytes that any archive may have.
+const FREE_BYTES: u64 = 1 << 24;
+// Bytes counted per file in addition to its content, about its cost on disk.
+const BYTES_PER_FILE: u64 = 1 << 12;
+// Most files, including the manifest: more than 8,000 images in each of 24 sets.
 pub const MAX_FILES: u64 = 200_000;
 
-/// Whether a path has the ending of an archive.
 pub fn is_archive(path: &Path) -> bool {
     let name = path.to_string_lossy();
     name.ends_with(".tar.gz") || name.ends_with(".tgz")
 }
 
-/// Writes an archive.
 pub struct ArchiveWriter {
     builder: Builder<GzEncoder<BufWriter<File>>>,
     part: PartFile,
@@ -47,10 +45,6 @@ impl std::fmt::Debug for ArchiveWriter {
 }
 
 impl ArchiveWriter {
-    /// Starts a new archive.
-    ///
-    /// # Errors
-    /// If the file exists or cannot be made.
     pub fn create(path: &Path) -> Result<Self, FileError> {
         if is_there(path) {
             return Err(exists(path));
@@ -68,10 +62,6 @@ impl ArchiveWriter {
         })
     }
 
-    /// Adds a file.
-    ///
-    /// # Errors
-    /// If it cannot be written.
     pub fn add(&mut self, name: &str, bytes: &[u8]) -> Result<(), FileError> {
         let mut header = Header::new_gnu();
         header.set_size(bytes.len() as u64);
@@ -84,10 +74,6 @@ impl ArchiveWriter {
             .map_err(cannot_write(self.part.target()))
     }
 
-    /// Closes the archive and gives it its name.
-    ///
-    /// # Errors
-    /// If it cannot be written.
     pub fn finish(self) -> Result<(), FileError> {
         let ArchiveWriter { builder, part } = self;
         builder
@@ -110,27 +96,21 @@ fn exists(path: &Path) -> FileError {
     )
 }
 
-/// gzip's code for an unknown system.
+// gzip's code for an unknown system.
 const UNKNOWN_SYSTEM: u8 = 255;
 
 fn cannot_write(path: &Path) -> impl FnOnce(std::io::Error) -> FileError {
     FileError::doing(path, "cannot write the archive")
 }
 
-/// Content of an archive.
 #[derive(Debug, Clone)]
 pub struct Unpacked {
-    /// Manifest, if there is one.
     pub manifest: Option<Manifest>,
-    /// The other files by name.
     pub files: BTreeMap<String, FileSum>,
 }
 
 impl Unpacked {
     /// Compares the files with the manifest, which must exist if it is `required`.
-    ///
-    /// # Errors
-    /// If they disagree, or the manifest does not exist.
     pub fn verify(&self, archive: &Path, required: bool) -> Result<(), FileError> {
         let faults = match &self.manifest {
             Some(manifest) => manifest.faults(&self.files),
@@ -155,9 +135,6 @@ impl Unpacked {
 
 /// Unpacks the archive at `path` into the new folder `out`. After an error no folder remains. The manifest must exist if
 /// it is `required`.
-///
-/// # Errors
-/// As [`read`] and [`Unpacked::verify`], and if `out` exists or cannot be written.
 pub fn unpack(path: &Path, out: &Path, required: bool) -> Result<Unpacked, FileError> {
     let part = PartFolder::new(out)?;
     // Read completely before any file is written.
@@ -169,13 +146,10 @@ pub fn unpack(path: &Path, out: &Path, required: bool) -> Result<Unpacked, FileE
 }
 
 /// Reads a whole archive and writes its files to the folder `into`, if given.
-///
-/// # Errors
-/// If it is damaged or too large, contains anything but plain files without folders, or repeats a name.
 pub fn read(path: &Path, into: Option<&Path>) -> Result<Unpacked, FileError> {
     let cannot_read = || FileError::doing::<std::io::Error>(path, "cannot read the archive");
     let file = open(path).map_err(cannot_read())?;
-    let most = FREE + MAX_RATIO * file.metadata().map_err(cannot_read())?.len();
+    let most = FREE_BYTES + MAX_RATIO * file.metadata().map_err(cannot_read())?.len();
     let mut files = 0;
     let mut archive = Archive::new(Bounded {
         decoder: GzDecoder::new(BufReader::new(file)),
@@ -216,7 +190,7 @@ pub fn read(path: &Path, into: Option<&Path>) -> Result<Unpacked, FileError> {
             return Err(FileError::new(path, message));
         }
         files += 1;
-        if files > MAX_FILES.min(most / FILE) {
+        if files > MAX_FILES.min(most / BYTES_PER_FILE) {
             let message = format!("too many files (found more than {})", files - 1);
             return Err(FileError::new(path, message));
         }
@@ -231,9 +205,9 @@ pub fn read(path: &Path, into: Option<&Path>) -> Result<Unpacked, FileError> {
                 )
             }
         };
-        if name == MANIFEST_FILE && entry.size() > MAX_MANIFEST {
+        if name == MANIFEST_FILE && entry.size() > MAX_MANIFEST_BYTES {
             let message = format!(
-                "{MANIFEST_FILE} is too large (found {} bytes, expected at most {MAX_MANIFEST})",
+                "{MANIFEST_FILE} is too large (found {} bytes, expected at most {MAX_MANIFEST_BYTES})",
                 entry.size()
             );
             return Err(FileError::new(path, message));
@@ -261,12 +235,9 @@ pub fn read(path: &Path, into: Option<&Path>) -> Result<Unpacked, FileError> {
     Ok(unpacked)
 }
 
-/// The unpacked bytes of an archive, up to a limit.
 struct Bounded {
     decoder: GzDecoder<BufReader<File>>,
-    /// Bytes read.
     read: u64,
-    /// Most bytes read.
     most: u64,
 }
 
@@ -286,7 +257,7 @@ impl Read for Bounded {
     }
 }
 
-/// Checks that only blank blocks and the checksum of gzip follow the last file.
+// Checks that only blank blocks and the checksum of gzip follow the last file.
 fn check_end(mut archive: Bounded) -> std::io::Result<()> {
     let wrong = |what| Err(std::io::Error::new(std::io::ErrorKind::InvalidData, what));
     let mut buffer = [0; 4096];
@@ -305,7 +276,6 @@ fn check_end(mut archive: Bounded) -> std::io::Result<()> {
     Ok(())
 }
 
-/// Whether a name is a plain file name on any system.
 fn is_plain_name(name: &str) -> bool {
     !name.is_empty()
         && !name.starts_with('.')

@@ -12,48 +12,35 @@ use shearq_scoring::{
     cross_spectrum, measured_bandpowers,
 };
 
+use super::manifest::Contents;
 use shearq_dataset::layout::{MAX_IMAGE, MAX_SET};
 use shearq_files::FileError;
 use shearq_files::table;
 
-/// One line of a power-spectrum file.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SpectrumLine {
-    /// Number of the bin, 2 to 9.
     pub index: u32,
-    /// Multipole of the bin.
     pub l: f64,
-    /// ℓ²C_ℓ/2π.
     pub power: f64,
 }
 
-/// The kind of a file, from its name.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Kind {
-    /// Catalogue of an image.
     Catalogue {
-        /// Set number.
         set: u32,
-        /// Image number.
         image: u32,
-        /// Method's name.
         method: String,
     },
-    /// Power spectrum of a set.
     Spectrum {
-        /// Set number.
         set: u32,
-        /// Method's name.
         method: String,
     },
 }
 
 impl Kind {
-    /// Text of the error for an unknown name.
     pub const EXPECTED: &str =
         "neither g10_v1_objs_{set}_{image}.{method}.dat nor {method}_set{set}.dat";
 
-    /// Recognises the challenge's file names.
     pub fn of(path: &Path) -> Option<Self> {
         let name = path.file_name()?.to_str()?.strip_suffix(".dat")?;
         if let Some(rest) = name.strip_prefix("g10_v1_objs_") {
@@ -72,7 +59,6 @@ impl Kind {
         })
     }
 
-    /// The file name.
     pub fn file_name(&self) -> String {
         match self {
             Kind::Catalogue { set, image, method } => {
@@ -82,7 +68,6 @@ impl Kind {
         }
     }
 
-    /// Set number.
     pub fn set(&self) -> u32 {
         match self {
             Kind::Catalogue { set, .. } | Kind::Spectrum { set, .. } => *set,
@@ -90,7 +75,6 @@ impl Kind {
     }
 }
 
-/// A number without signs or leading zeros, 1 to `most`.
 fn number(text: &str, most: u32) -> Option<u32> {
     if text.starts_with('0') || !text.bytes().all(|b| b.is_ascii_digit()) {
         return None;
@@ -110,30 +94,18 @@ pub fn catalogue_text(rows: &[Row]) -> String {
     text
 }
 
-/// How a set's catalogues become a power spectrum.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Spectrum {
-    /// Spectrum of the ellipticities averaged over the images, with their noise.
-    Averaged,
-    /// From cross-spectra between groups of images.
-    Cross,
-}
-
 /// The power spectrum of a set in the challenge's format, and the covariance of its bandpowers, if known.
-///
-/// # Errors
-/// If a cross-spectrum has only one image.
 pub fn spectrum_text(
     grid: &Grid,
     images: &SetImages,
-    spectrum: Spectrum,
+    contents: Contents,
 ) -> Result<(String, Option<SpectrumCovariance>), ScoringError> {
     let standard = Convention::STANDARD;
-    let (bins, power, covariance) = match spectrum {
-        Spectrum::Averaged => measured_bandpowers(grid, images.total(), standard)
-            .map(|(bins, power)| (bins, power, None))?,
-        Spectrum::Cross => cross_spectrum(grid, images, standard)
+    let (bins, power, covariance) = match contents {
+        Contents::CrossSpectra => cross_spectrum(grid, images, standard)
             .map(|cross| (cross.bins, cross.power, cross.covariance))?,
+        _ => measured_bandpowers(grid, images.total(), standard)
+            .map(|(bins, power)| (bins, power, None))?,
     };
     let text = SCORED
         .map(|b| format!("{} {:.6} {:.12e}\n", b + 1, bins.l[b], power[b]))
@@ -145,9 +117,6 @@ pub fn spectrum_text(
 }
 
 /// Reads a power-spectrum file without checking it; [`super::check`] checks it.
-///
-/// # Errors
-/// If it cannot be read.
 pub fn read_spectrum(path: &Path) -> Result<Vec<SpectrumLine>, FileError> {
     let table = table::read_text(path, &["index", "l", "power"])?;
     let column = |name: &str| table::numbers(&table, name, path);
@@ -186,9 +155,6 @@ pub fn wrong_multipoles<'a>(
 }
 
 /// The eight bandpowers of a power-spectrum file for galaxies on `grid`, in order.
-///
-/// # Errors
-/// If the file cannot be read, its bins are not 2 to 9, or the multipoles belong to another grid.
 pub fn read_bandpowers(path: &Path, grid: &Grid) -> Result<Vec<f64>, FileError> {
     let lines = read_spectrum(path)?;
     let bins = Bins::new(grid, Definition::Leaderboard);

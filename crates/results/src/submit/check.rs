@@ -12,15 +12,14 @@ use super::challenge::{Kind, SpectrumLine, read_spectrum, wrong_multipoles};
 use super::manifest::{Contents, FileSum, Manifest};
 use super::packed::Sent;
 use crate::score::COLUMNS;
-use crate::views::diagnosis::{odd_response, words};
-use crate::views::rows::fault as odd_rows;
+use crate::views::diagnosis::{ADVICE_ON_SENTINELS, fault_of_rows, odd_response, words};
 use shearq_dataset::layout::read_rows;
+use shearq_files::FileError;
 use shearq_files::table::most_rows;
 
-/// Each catalogue is read as one image on the expected grid.
+// Each catalogue is read as one image on the expected grid.
 const ONE_IMAGE: &str = "one image on the expected grid";
 
-/// How bad a finding is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, serde::Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Severity {
@@ -30,29 +29,21 @@ pub enum Severity {
     Error,
 }
 
-/// A problem of a file or folder.
 #[derive(Debug, Clone, PartialEq, serde::Serialize)]
 pub struct Finding {
-    /// File or folder.
     pub path: PathBuf,
-    /// Severity of the problem.
     pub severity: Severity,
-    /// Short name of the check.
     pub check: &'static str,
-    /// Problem, with what was found and expected.
     pub message: String,
 }
 
-/// Expected properties of the files.
 #[derive(Debug, Clone)]
 pub struct Expected {
-    /// Grid of the galaxies.
     pub grid: Grid,
     /// True shear by set, if known, to check conventions and type of ellipticity.
     pub truth: BTreeMap<u32, TrueShear>,
     /// True shear that findings must not reveal: only images that do not follow it as the others do are told, to `done`.
     pub secret_truth: BTreeMap<u32, TrueShear>,
-    /// Number of images of every set, if known.
     pub images: Option<u32>,
     /// Sets that a submission must contain; it must contain no other sets. Empty if unknown.
     pub sets: Vec<u32>,
@@ -60,33 +51,28 @@ pub struct Expected {
     pub partial: bool,
 }
 
-/// Largest accepted distance of a position from the centre of its cell, in cells.
+// Largest accepted distance of a position from the centre of its cell, in cells.
 const POSITION_TOLERANCE: f64 = 0.01;
 
-/// The catalogues of a set after their check.
 #[derive(Debug)]
 pub struct CheckedSet<'a> {
-    /// Set number.
     pub set: u32,
-    /// Sums of the images.
     pub images: &'a SetImages,
-    /// Image numbers, in order.
     pub numbers: &'a [u32],
-    /// How the rows were used.
     pub rows: RowCounts,
     /// Image numbers of those that follow the true shear differently from the others.
     pub odd: Vec<u32>,
 }
 
-/// Checks a file, or all files of a folder or an archive.
-pub fn check(path: &Path, expected: &Expected) -> Vec<Finding> {
-    match Sent::open(path) {
-        Err(error) => {
-            let mut report = Report::default();
-            report.error(&error.path, "readable", error.message);
-            report.findings
+impl Finding {
+    /// The finding about a submission that cannot be opened.
+    pub fn unreadable(error: FileError) -> Self {
+        Finding {
+            path: error.path,
+            severity: Severity::Error,
+            check: "readable",
+            message: error.message,
         }
-        Ok(sent) => check_sent(&sent, expected, &mut |_| {}),
     }
 }
 
@@ -164,7 +150,7 @@ fn check_files(
             let Some((sum, counts)) = check_catalogue(file, expected, &mut report) else {
                 continue;
             };
-            let files = files.get_or_insert_with(|| SetFiles::new(expected, set, file));
+            let files = files.get_or_insert_with(|| SetFiles::new(expected, set));
             files.add(&sum, counts, image, file);
         }
         if let Some(mut files) = files {
@@ -186,14 +172,14 @@ fn check_files(
     report.findings
 }
 
-/// Checks a catalogue whose name contains no set. A `single` file belongs to the only set.
+// Checks a catalogue whose name contains no set. A `single` file belongs to the only set.
 fn check_unnamed(file: &Path, single: bool, expected: &Expected, report: &mut Report) {
     let Some((sum, counts)) = check_catalogue(file, expected, report) else {
         return;
     };
     if single && expected.truth.len() == 1 {
         for set in expected.truth.keys() {
-            let mut entry = SetFiles::new(expected, *set, file);
+            let mut entry = SetFiles::new(expected, *set);
             entry.add(&sum, counts, 1, file);
             check_against_truth(*set, &entry, expected, report);
         }
@@ -203,7 +189,6 @@ fn check_unnamed(file: &Path, single: bool, expected: &Expected, report: &mut Re
     }
 }
 
-/// Sets that are absent or unknown.
 fn check_sets(path: &Path, found: &BTreeSet<u32>, expected: &Expected, report: &mut Report) {
     if expected.sets.is_empty() {
         for set in expected.truth.keys().filter(|set| !found.contains(set)) {
@@ -235,7 +220,6 @@ fn check_sets(path: &Path, found: &BTreeSet<u32>, expected: &Expected, report: &
     }
 }
 
-/// The kind of a file. An unknown name is an error, for a `single` file a warning.
 fn check_name(file: &Path, single: bool, report: &mut Report) -> Option<Kind> {
     let kind = Kind::of(file);
     if kind.is_none() {
@@ -249,20 +233,17 @@ fn check_name(file: &Path, single: bool, report: &mut Report) -> Option<Kind> {
     kind
 }
 
-/// Catalogues of a set.
 struct SetFiles {
-    /// With the true shear of the set, if it is known.
     scorer: Option<SetScorer>,
     images: SetImages,
     faults: ImageFaults,
     paths: Vec<PathBuf>,
     numbers: Vec<u32>,
     rows: RowCounts,
-    first: PathBuf,
 }
 
 impl SetFiles {
-    fn new(expected: &Expected, set: u32, first: &Path) -> Self {
+    fn new(expected: &Expected, set: u32) -> Self {
         let open = expected.truth.get(&set);
         let truth = open.or_else(|| expected.secret_truth.get(&set));
         let options = Options {
@@ -277,7 +258,6 @@ impl SetFiles {
             paths: Vec::new(),
             numbers: Vec::new(),
             rows: RowCounts::default(),
-            first: first.to_owned(),
         }
     }
 
@@ -317,7 +297,6 @@ impl Report {
     }
 }
 
-/// Compares the files of a folder with its manifest, if it has one.
 fn check_manifest(folder: &Path, files: &[PathBuf], report: &mut Report) {
     let manifest = match Manifest::read(folder) {
         Ok(Some(manifest)) => manifest,
@@ -344,13 +323,13 @@ fn check_manifest(folder: &Path, files: &[PathBuf], report: &mut Report) {
     }
 }
 
-/// Whether a file with an unknown name is a spectrum: its lines have three numbers.
+// Whether a file with an unknown name is a spectrum: its lines have three numbers.
 fn looks_like_spectrum(path: &Path) -> bool {
     read_spectrum(path).is_ok_and(|lines| !lines.is_empty() && lines.len() <= 20)
 }
 
-/// Checks the rows of a catalogue. Returns their sum on the grid and how they were used, or `None` if the file is not
-/// readable.
+// Checks the rows of a catalogue. Returns their sum on the grid and how they were used, or `None` if the file is not
+// readable.
 fn check_catalogue(
     path: &Path,
     expected: &Expected,
@@ -367,62 +346,80 @@ fn check_catalogue(
     let cells = grid.cells();
     let mut sum = FieldSum::new(grid);
     let counts = sum.add_image(grid, rows.iter().copied());
-    if let Some(fault) = odd_rows(&counts, grid) {
+    if let Some(fault) = fault_of_rows(&counts, grid, ADVICE_ON_SENTINELS) {
         report.error(path, "values", fault);
     }
-    if counts.excess > 0 {
-        let message = format!(
+    // Chosen by hand: a few galaxies fail in any measurement.
+    let more_than = |count: usize, share: usize, of: usize| match count * share > of {
+        true => Severity::Error,
+        false => Severity::Warning,
+    };
+    let mut add = |count: usize, severity, check, message: String| {
+        if count > 0 {
+            report.add(path, severity, check, message);
+        }
+    };
+    let error = Severity::Error;
+    add(
+        counts.excess,
+        error,
+        "excess",
+        format!(
             "too many rows (found {}, expected at most {cells}); the rest is ignored",
             rows.len()
-        );
-        report.error(path, "excess", message);
-    }
-    if counts.outside > 0 {
-        report.error(
-            path,
-            "outside",
-            format!(
-                "{} rows are outside the {1} × {1} grid",
-                counts.outside, grid.n
+        ),
+    );
+    add(
+        counts.outside,
+        error,
+        "outside",
+        format!(
+            "{} rows are outside the {1} × {1} grid",
+            counts.outside, grid.n
+        ),
+    );
+    add(
+        counts.missing,
+        more_than(counts.missing, 10, cells),
+        "missing",
+        match counts.missing == cells {
+            true => "no galaxy is on the grid".into(),
+            false => format!(
+                "{} of {cells} galaxies are missing; each counts as zero",
+                counts.missing
             ),
-        );
-    }
-    if counts.missing == cells {
-        report.error(path, "missing", "no galaxy is on the grid".into());
-    } else if counts.missing > 0 {
-        let message = format!(
-            "{} of {cells} galaxies are missing; each counts as zero",
-            counts.missing
-        );
-        if counts.missing * 10 > cells {
-            report.error(path, "missing", message);
-        } else {
-            report.warn(path, "missing", message);
-        }
-    }
-    if counts.repeated > 0 {
-        let message = format!(
+        },
+    );
+    add(
+        counts.repeated,
+        error,
+        "duplicates",
+        format!(
             "{} rows repeat a galaxy; the scoring adds their ellipticities",
             counts.repeated
-        );
-        report.error(path, "duplicates", message);
-    }
-    check_positions(path, &rows, grid, report);
-    if counts.not_finite > 0 {
-        report.error(
-            path,
-            "not-finite",
-            format!("{} ellipticities are not finite numbers", counts.not_finite),
-        );
-    }
-    if counts.above_one > 0 {
-        let message = format!("{} galaxies have |e| > 1", counts.above_one);
-        if counts.above_one * 20 > rows.len() {
-            report.error(path, "range", message);
-        } else {
-            report.warn(path, "range", message);
-        }
-    }
+        ),
+    );
+    let (off_centre, [dx, dy]) = off_centre(&rows, grid);
+    add(
+        off_centre,
+        Severity::Warning,
+        "positions",
+        format!(
+            "{off_centre} positions are not at the centres of their cells (mean offset {dx:+.2}, {dy:+.2} px); expected 1-based FITS pixels of the stamp centre"
+        ),
+    );
+    add(
+        counts.not_finite,
+        error,
+        "not-finite",
+        format!("{} ellipticities are not finite numbers", counts.not_finite),
+    );
+    add(
+        counts.above_one,
+        more_than(counts.above_one, 20, rows.len()),
+        "range",
+        format!("{} galaxies have |e| > 1", counts.above_one),
+    );
     if counts.used > 0 && sum.e1.iter().chain(&sum.e2).all(|e| *e == 0.0) {
         report.error(path, "constant", "all ellipticities are zero".into());
     } else if counts.used > 1 {
@@ -438,9 +435,9 @@ fn check_catalogue(
     Some((sum, counts))
 }
 
-/// Positions that are not at the centres of their cells.
-fn check_positions(path: &Path, rows: &[Row], grid: &Grid, report: &mut Report) {
-    let (mut off_centre, mut offset) = (0, (0.0, 0.0));
+// Number of positions that are not at the centres of their cells, and their mean offset.
+fn off_centre(rows: &[Row], grid: &Grid) -> (usize, [f64; 2]) {
+    let (mut count, mut offset) = (0, [0.0; 2]);
     for Row { x, y, .. } in rows {
         let Some((ix, iy)) = grid.cell(*x, *y) else {
             continue;
@@ -448,23 +445,13 @@ fn check_positions(path: &Path, rows: &[Row], grid: &Grid, report: &mut Report) 
         let centre = grid.centre(ix, iy);
         let (dx, dy) = (x - centre.0, y - centre.1);
         if dx.abs().max(dy.abs()) > POSITION_TOLERANCE * grid.stamp.0 {
-            off_centre += 1;
-            offset = (offset.0 + dx, offset.1 + dy);
+            count += 1;
+            offset = [offset[0] + dx, offset[1] + dy];
         }
     }
-    if off_centre > 0 {
-        let (dx, dy) = (
-            offset.0 / f64::from(off_centre),
-            offset.1 / f64::from(off_centre),
-        );
-        let message = format!(
-            "{off_centre} positions are not at the centres of their cells (mean offset {dx:+.2}, {dy:+.2} px); expected 1-based FITS pixels of the stamp centre"
-        );
-        report.warn(path, "positions", message);
-    }
+    (count, offset.map(|sum| sum / count as f64))
 }
 
-/// Catalogues with the ellipticities of another image of their set.
 fn check_copies(files: &SetFiles, report: &mut Report) {
     for (copy, first) in &files.faults.copies {
         let message = format!(
@@ -475,7 +462,6 @@ fn check_copies(files: &SetFiles, report: &mut Report) {
     }
 }
 
-/// Catalogues that follow the true shear differently from the others of their set.
 fn check_responses(set: u32, files: &SetFiles, expected: &Expected, report: &mut Report) {
     if !expected.truth.contains_key(&set) {
         return;
@@ -486,7 +472,7 @@ fn check_responses(set: u32, files: &SetFiles, expected: &Expected, report: &mut
     }
 }
 
-/// The name of a file without its folder, which may be temporary.
+// The name of a file without its folder, which may be temporary.
 fn name_of(path: &Path) -> String {
     path.file_name()
         .unwrap_or_default()
@@ -494,7 +480,6 @@ fn name_of(path: &Path) -> String {
         .into_owned()
 }
 
-/// Missing images of a set, and image numbers above the expected number.
 fn check_images(
     set: u32,
     files: &mut SetFiles,
@@ -530,16 +515,18 @@ fn check_images(
     }
 }
 
-/// Conventions and type of ellipticity, if the truth is known.
 fn check_against_truth(set: u32, files: &SetFiles, expected: &Expected, report: &mut Report) {
     let SetFiles {
         scorer: Some(scorer),
         images,
         faults,
-        first: path,
+        paths,
         ..
     } = files
     else {
+        return;
+    };
+    let Some(path) = paths.first() else {
         return;
     };
     let absent = images.total().count.iter().all(|count| *count == 0.0);
@@ -582,7 +569,6 @@ fn check_against_truth(set: u32, files: &SetFiles, expected: &Expected, report: 
     }
 }
 
-/// Bins, multipoles, powers and unit of a power spectrum.
 fn check_spectrum(path: &Path, kind: Option<&Kind>, expected: &Expected, report: &mut Report) {
     let lines = match read_spectrum(path) {
         Ok(lines) => lines,
@@ -652,7 +638,6 @@ mod tests {
     use super::*;
     use shearq_quantities::units::{Degrees, Pixels};
 
-    /// Names of the checks that a catalogue of 8 × 8 galaxies fails.
     fn failed(edit: impl Fn(&mut Vec<[f64; 4]>)) -> Vec<&'static str> {
         let centre = |k: usize| 24.5 + 48.0 * k as f64;
         let e = |k: usize| 0.01 * (k as f64 - 31.5) / 32.0;
@@ -672,7 +657,7 @@ mod tests {
             sets: Vec::new(),
             partial: false,
         };
-        let findings = check(&path, &expected);
+        let findings = check_sent(&Sent::open(&path).unwrap(), &expected, &mut |_| {});
         findings.iter().map(|finding| finding.check).collect()
     }
 

@@ -16,14 +16,11 @@ use shearq_dataset::record::read_record;
 use shearq_dataset::run::Run;
 use shearq_files::{FileError, open};
 
-/// File name of the manifest.
 pub const MANIFEST_FILE: &str = "manifest.json";
 
-/// Content of the files of a submission.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Contents {
-    /// Ellipticity catalogues.
     #[default]
     Catalogues,
     /// Power spectra of the ellipticities averaged over the images, noise included.
@@ -39,14 +36,11 @@ impl Contents {
     }
 }
 
-/// Who submits what to which challenge.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Entry {
-    /// Name of the challenge.
     #[serde(deserialize_with = "checked_name")]
     pub challenge: String,
-    /// Name of the team.
     #[serde(deserialize_with = "checked_name")]
     pub team: String,
     /// One line about the entry; may be empty.
@@ -57,7 +51,7 @@ pub struct Entry {
     pub contact: String,
 }
 
-/// For `#[serde(deserialize_with)]`: reads a name that may be empty.
+// For `#[serde(deserialize_with)]`: reads a name that may be empty.
 fn checked_line<'de, D: Deserializer<'de>>(deserializer: D) -> Result<String, D::Error> {
     let line = String::deserialize(deserializer)?;
     match line.is_empty() {
@@ -66,23 +60,17 @@ fn checked_line<'de, D: Deserializer<'de>>(deserializer: D) -> Result<String, D:
     }
 }
 
-/// The manifest of a submission.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Manifest {
-    /// Version of shearq that packed it.
     pub version: String,
     /// Name of the method in file names.
     #[serde(deserialize_with = "checked_name")]
     pub method: String,
-    /// Content of the files.
     pub contents: Contents,
-    /// Team and challenge, if they were specified.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub entry: Option<Entry>,
-    /// Source, settings and version of the measurement.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub run: Option<Run>,
-    /// Description of another program's catalogues.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub foreign: Option<Foreign>,
     /// The files by name, without the manifest.
@@ -92,20 +80,14 @@ pub struct Manifest {
     pub covariances: BTreeMap<String, SpectrumCovariance>,
 }
 
-/// Size and checksum of a file.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FileSum {
-    /// Number of bytes.
     pub bytes: u64,
     /// SHA-256 in hexadecimal digits.
     pub sha256: String,
 }
 
 impl FileSum {
-    /// Copies `from` to `to` and returns size and checksum.
-    ///
-    /// # Errors
-    /// If reading or writing fails.
     pub fn copying(from: &mut impl Read, to: &mut impl Write) -> std::io::Result<Self> {
         let mut hasher = Sha256::new();
         let mut bytes = 0;
@@ -127,10 +109,6 @@ impl FileSum {
         })
     }
 
-    /// Size and checksum of a file.
-    ///
-    /// # Errors
-    /// If it cannot be read.
     pub fn of(path: &Path) -> Result<Self, FileError> {
         open::open(path)
             .and_then(|mut file| FileSum::copying(&mut file, &mut std::io::sink()))
@@ -140,9 +118,6 @@ impl FileSum {
 
 impl Manifest {
     /// Reads the manifest of a folder; `None` if there is none.
-    ///
-    /// # Errors
-    /// If it exists and cannot be read.
     pub fn read(folder: &Path) -> Result<Option<Self>, FileError> {
         read_record(&folder.join(MANIFEST_FILE))
     }

@@ -5,19 +5,16 @@ use std::path::{Path, PathBuf};
 
 use shearq_quantities::units::Degrees;
 use shearq_scoring::{
-    Convention, ConventionMatch, FieldSum, Grid, Options, Row, SetImages, SetScorer,
-    SpectrumCovariance,
+    Convention, ConventionMatch, FieldSum, Grid, Options, SetImages, SetScorer, SpectrumCovariance,
 };
 
 use super::archive::{ArchiveWriter, MAX_FILES, is_archive};
-use super::challenge::{Kind, Spectrum, catalogue_text, spectrum_text};
+use super::challenge::{Kind, catalogue_text, spectrum_text};
 use super::manifest::{Contents, Entry, FileSum, MANIFEST_FILE, Manifest};
+use crate::catalogues::Catalogues;
 use crate::foreign::Foreign;
-use crate::score::COLUMNS;
-use shearq_dataset::layout::{DataFolder, read_rows};
-use shearq_dataset::listing::Files;
+use shearq_dataset::layout::DataFolder;
 use shearq_dataset::record::record_text;
-use shearq_dataset::run::Run;
 use shearq_dataset::{grid, truth};
 use shearq_files::FileError;
 use shearq_files::atomic::PartFolder;
@@ -25,135 +22,75 @@ use shearq_files::open::is_there;
 use shearq_files::table::{MAX_ROWS, most_rows};
 use shearq_pipeline::Progress;
 
-/// The catalogues to pack.
-#[derive(Debug, Clone, Copy)]
-pub enum Origin<'a> {
-    /// A folder that shearq measured.
-    Measured {
-        /// The folder.
-        folder: &'a Path,
-        /// The record of the folder.
-        run: &'a Run,
-    },
-    /// Catalogues of another program.
-    Foreign {
-        /// The description of the catalogues.
-        foreign: &'a Foreign,
-        /// The data that they were measured from, for the grid of spectra.
-        data: Option<&'a DataFolder>,
-    },
+#[derive(Debug, Clone)]
+pub struct Packing<'a> {
+    pub catalogues: &'a Catalogues,
+    /// The data that another program's catalogues were measured from, for the grid of spectra.
+    pub data: Option<&'a DataFolder>,
+    /// Name of the method in file names.
+    pub method: String,
+    pub contents: Contents,
+    pub entry: Option<Entry>,
 }
 
-impl Origin<'_> {
-    /// The existing catalogues.
-    ///
-    /// # Errors
-    /// If a folder cannot be listed, or the pattern of the names contains no set.
-    pub fn catalogues(&self) -> Result<Files, FileError> {
-        match self {
-            Origin::Measured { folder, run } => run.catalogues(folder, &[]),
-            Origin::Foreign { foreign, .. } => {
-                let files = foreign.catalogues(&[])?;
-                if files.serve_all_sets() {
-                    let message = "the pattern of the catalogues contains no {set}, which the names of packed files need";
-                    return Err(FileError::new(foreign.pattern(), message));
-                }
-                Ok(files)
-            }
+impl Packing<'_> {
+    /// Number of galaxies to pack, estimated from the first catalogue for progress bars.
+    pub fn galaxies(&self) -> Result<u64, FileError> {
+        let own = self.catalogues;
+        let place = || own.description().map_or(own.path.clone(), Foreign::pattern);
+        if own.serve_all_sets() {
+            let message = "the pattern of the catalogues contains no {set}, which the names of packed files need";
+            return Err(FileError::new(place(), message));
         }
+        let mut all = own.sets().into_iter().flat_map(|set| own.of_set(set));
+        let Some((_, first)) = all.next() else {
+            return Err(FileError::new(place(), "found no catalogue to pack"));
+        };
+        let rows = own.rows(&first, MAX_ROWS)?.len();
+        Ok(((1 + all.count()) * rows) as u64)
     }
 
-    fn rows(&self, path: &Path, most: usize) -> Result<Vec<Row>, FileError> {
-        match self {
-            Origin::Measured { .. } => read_rows(path, &COLUMNS, most),
-            Origin::Foreign { foreign, .. } => foreign.rows(path, most),
-        }
-    }
-
-    /// How well each convention agrees with the true shear of a set, for another program's catalogues if the truth is
-    /// known.
+    // How well each convention agrees with the true shear of a set, for another program's catalogues if the truth is
+    // known.
     fn matching(
         &self,
         set: u32,
         images: &SetImages,
         grid: &Grid,
     ) -> Result<ConventionMatch, FileError> {
-        match self {
-            Origin::Foreign {
-                data: Some(data), ..
-            } if is_there(&data.truth(set)) => {
-                let truth = data.read_truth(set, grid)?;
-                let scorer = SetScorer::new(*grid, truth, Options::default())
-                    .map_err(|error| FileError::new(data.truth(set), error))?;
-                scorer
-                    .match_convention(images)
-                    .map_err(|error| FileError::new(data.truth(set), error))
-            }
-            _ => Ok(ConventionMatch::default()),
-        }
+        let Some(data) = self.data.filter(|data| is_there(&data.truth(set))) else {
+            return Ok(ConventionMatch::default());
+        };
+        let truth = data.read_truth(set, grid)?;
+        SetScorer::new(*grid, truth, Options::default())
+            .and_then(|scorer| scorer.match_convention(images))
+            .map_err(|error| FileError::new(data.truth(set), error))
     }
 
-    /// Grid of a set with the catalogue `catalogue`.
     fn grid(&self, set: u32, catalogue: &Path) -> Result<Grid, FileError> {
-        match self {
-            Origin::Measured { run, .. } => {
+        match (self.catalogues.run(), self.data) {
+            (Some(run), _) => {
                 let field = Degrees(run.source.layout().field_degrees);
-                grid::of_catalogue(catalogue, &self.rows(catalogue, MAX_ROWS)?, field)
+                let rows = self.catalogues.rows(catalogue, MAX_ROWS)?;
+                grid::of_catalogue(catalogue, &rows, field)
             }
-            Origin::Foreign {
-                data: Some(data), ..
-            } => truth::grid_of_set(data, set),
-            Origin::Foreign { data: None, .. } => {
+            (None, Some(data)) => truth::grid_of_set(data, set),
+            (None, None) => {
                 let message = "cannot determine the grid of the spectra. Try: --data DIR";
                 Err(FileError::new(catalogue, message))
             }
         }
     }
-}
-
-/// What to pack, and how.
-#[derive(Debug, Clone)]
-pub struct Packing<'a> {
-    /// Catalogues to pack.
-    pub origin: Origin<'a>,
-    /// Name of the method in file names.
-    pub method: String,
-    /// Content of the files.
-    pub contents: Contents,
-    /// Team and challenge, if they are to be recorded.
-    pub entry: Option<Entry>,
-}
-
-impl Packing<'_> {
-    /// Number of galaxies to pack, estimated from the first catalogue for progress bars.
-    ///
-    /// # Errors
-    /// If there is no catalogue, or it cannot be read.
-    pub fn galaxies(&self) -> Result<u64, FileError> {
-        let files = self.origin.catalogues()?;
-        let mut all = files.sets().into_iter().flat_map(|set| files.of_set(set));
-        let Some((_, first)) = all.next() else {
-            let place = match &self.origin {
-                Origin::Measured { folder, .. } => folder.to_path_buf(),
-                Origin::Foreign { foreign, .. } => foreign.pattern(),
-            };
-            return Err(FileError::new(place, "found no catalogue to pack"));
-        };
-        let rows = self.origin.rows(&first, MAX_ROWS)?.len();
-        Ok(((1 + all.count()) * rows) as u64)
-    }
 
     /// Writes the files and their manifest to `out`: an archive, by its ending, or a new folder. After an error nothing
     /// remains. The same catalogues give the same bytes. Returns the number of files without the manifest.
-    ///
-    /// # Errors
-    /// If a catalogue cannot be read, or `out` cannot be written.
     pub fn write(&self, out: &Path, progress: &mut dyn Progress) -> Result<usize, FileError> {
-        let found = self.origin.catalogues()?;
+        let found = self.catalogues;
         let per_set = |set| match self.contents {
             Contents::Catalogues => found.of_set(set).len(),
             Contents::Spectra | Contents::CrossSpectra => 1,
         };
+        // Checked first, because catalogues of a whole challenge take minutes to pack.
         check_number(found.sets().into_iter().map(per_set).sum(), out)?;
         let mut destination = Destination::create(out)?;
         let mut files = BTreeMap::new();
@@ -170,15 +107,10 @@ impl Packing<'_> {
         for set in found.sets() {
             let catalogues = found.of_set(set);
             let method = self.method.clone();
-            let spectrum = match self.contents {
-                Contents::Catalogues => None,
-                Contents::Spectra => Some(Spectrum::Averaged),
-                Contents::CrossSpectra => Some(Spectrum::Cross),
-            };
-            if let Some(spectrum) = spectrum {
+            if self.contents.is_spectra() {
                 let kind = Kind::Spectrum { set, method };
                 let (text, covariance) =
-                    self.spectrum(set, &catalogues, spectrum, &mut matching, progress)?;
+                    self.spectrum(set, &catalogues, &mut matching, progress)?;
                 if let Some(covariance) = covariance {
                     covariances.insert(kind.file_name(), covariance);
                 }
@@ -187,7 +119,7 @@ impl Packing<'_> {
             }
             for (image, path) in catalogues {
                 let method = method.clone();
-                let rows = self.origin.rows(&path, MAX_ROWS)?;
+                let rows = self.catalogues.rows(&path, MAX_ROWS)?;
                 add(
                     Kind::Catalogue { set, image, method },
                     catalogue_text(&rows),
@@ -195,29 +127,26 @@ impl Packing<'_> {
                 progress.advance(rows.len() as u64);
             }
         }
-        if let (true, Origin::Foreign { foreign, .. }) = (matching.is_clear(), &self.origin)
+        // A spectrum does not contain the convention, so that a wrong one could not be found by the organiser.
+        if let (true, Some(foreign)) = (matching.is_clear(), found.description())
             && matching.convention() != Convention::STANDARD
         {
-            let found = matching.convention();
+            let wrong = matching.convention();
             let message = format!(
                 "the catalogues are in convention {} ({}), judged by the true shear; spectra need convention 5. Try: exchange `x` and `y`, or set `e2_sign`, in the description",
-                found.number(),
-                found.describe()
+                wrong.number(),
+                wrong.describe()
             );
             return Err(FileError::new(foreign.pattern(), message));
         }
         let count = files.len();
-        let (run, foreign) = match self.origin {
-            Origin::Measured { run, .. } => (Some(run.clone()), None),
-            Origin::Foreign { foreign, .. } => (None, Some(foreign.clone())),
-        };
         let manifest = Manifest {
             version: shearq_dataset::VERSION.into(),
             method: self.method.clone(),
             contents: self.contents,
             entry: self.entry.clone(),
-            run,
-            foreign,
+            run: found.run().cloned(),
+            foreign: found.description().cloned(),
             files,
             covariances,
         };
@@ -230,17 +159,16 @@ impl Packing<'_> {
         &self,
         set: u32,
         catalogues: &[(u32, PathBuf)],
-        spectrum: Spectrum,
         matching: &mut ConventionMatch,
         progress: &mut dyn Progress,
     ) -> Result<(String, Option<SpectrumCovariance>), FileError> {
         let first = &catalogues[0].1;
-        let grid = self.origin.grid(set, first)?;
+        let grid = self.grid(set, first)?;
         let mut images = SetImages::new(&grid);
         let mut used = 0;
         for (_, path) in catalogues {
             let mut sum = FieldSum::new(&grid);
-            let rows = self.origin.rows(path, most_rows(grid.cells()))?;
+            let rows = self.catalogues.rows(path, most_rows(grid.cells()))?;
             progress.advance(rows.len() as u64);
             used += sum.add_image(&grid, rows).used;
             images
@@ -251,12 +179,12 @@ impl Packing<'_> {
             let message = "no catalogue of the set has an ellipticity on the grid";
             return Err(FileError::new(first, message));
         }
-        matching.merge(&self.origin.matching(set, &images, &grid)?);
-        spectrum_text(&grid, &images, spectrum).map_err(|error| FileError::new(first, error))
+        matching.merge(&self.matching(set, &images, &grid)?);
+        spectrum_text(&grid, &images, self.contents).map_err(|error| FileError::new(first, error))
     }
 }
 
-/// Refuses more files than `check` and `unpack` read. The manifest is one more file.
+// Refuses more files than `check` and `unpack` read. The manifest is one more file.
 fn check_number(files: usize, out: &Path) -> Result<(), FileError> {
     if (files as u64) < MAX_FILES {
         return Ok(());
@@ -266,7 +194,6 @@ fn check_number(files: usize, out: &Path) -> Result<(), FileError> {
     Err(FileError::new(out, message))
 }
 
-/// Where packed files are written.
 enum Destination {
     Folder(PartFolder),
     Archive(Box<ArchiveWriter>),

@@ -6,12 +6,11 @@ use std::path::{Path, PathBuf};
 use super::archive::{self, Unpacked, is_archive};
 use super::challenge::Kind;
 use super::manifest::{FileSum, MANIFEST_FILE, Manifest};
-use crate::foreign::{Screen, plain_columns};
-use crate::score::{COLUMNS, own_catalogue};
+use shearq_dataset::layout::DataFolder;
+use shearq_dataset::run::{Run, way};
 use shearq_files::FileError;
 use shearq_files::atomic::Scratch;
 use shearq_files::open::is_there;
-use shearq_scoring::{FieldSum, Grid, RowCounts};
 
 /// A given folder or file, or the temporary folder of an unpacked archive.
 #[derive(Debug)]
@@ -23,9 +22,6 @@ pub struct Sent {
 
 impl Sent {
     /// Opens a submission, and unpacks it if it has the ending of an archive.
-    ///
-    /// # Errors
-    /// If it cannot be unpacked.
     pub fn open(given: &Path) -> Result<Self, FileError> {
         let given = given.to_owned();
         if !is_archive(&given) {
@@ -58,15 +54,11 @@ impl Sent {
         }
     }
 
-    /// The error with the name [`Sent::as_given`].
     pub fn named(&self, error: FileError) -> FileError {
         FileError::new(self.as_given(&error.path), error.message)
     }
 
     /// The files without the manifest and hidden files, or the given file.
-    ///
-    /// # Errors
-    /// If the folder cannot be listed, or the file does not exist.
     pub fn files(&self) -> std::io::Result<Vec<PathBuf>> {
         if !self.path.is_dir() {
             std::fs::metadata(&self.path)?;
@@ -87,7 +79,6 @@ impl Sent {
     }
 }
 
-/// Content of a submission.
 #[derive(Debug, Clone)]
 pub enum Packed {
     /// Catalogues by set and image.
@@ -96,22 +87,23 @@ pub enum Packed {
     Spectra(BTreeMap<u32, PathBuf>),
 }
 
-/// A submission of one method.
 #[derive(Debug, Clone)]
 pub struct Submission {
-    /// Name of the method.
     pub method: String,
-    /// Files of the submission.
     pub packed: Packed,
-    /// Manifest, if there is one.
     pub manifest: Option<Manifest>,
 }
 
 impl Submission {
-    /// Reads the files of `sent`.
-    ///
-    /// # Errors
-    /// If files disagree with the manifest, or have several kinds or methods.
+    /// What distinguishes methods of one name: the configuration as TOML, or the path from the data to the submission.
+    pub fn settings(&self, path: &Path, data: &DataFolder) -> Result<String, FileError> {
+        let run = self.manifest.as_ref().and_then(|own| own.run.as_ref());
+        match run {
+            Some(run) => settings_of(run, path),
+            None => Ok(way(data.root(), path)?.display().to_string()),
+        }
+    }
+
     pub fn read(sent: &Sent) -> Result<Self, FileError> {
         let whole = |message: String| FileError::new(&sent.given, message);
         if !sent.path.is_dir() {
@@ -172,93 +164,16 @@ impl Submission {
     }
 }
 
-/// The catalogues of a submission, ready to be scored.
-#[derive(Debug)]
-pub struct PackedCatalogues {
-    /// The open folder or archive.
-    pub sent: Sent,
-    /// Name of the method.
-    pub method: String,
-    /// Manifest, if there is one.
-    pub manifest: Option<Manifest>,
-    files: BTreeMap<u32, BTreeMap<u32, PathBuf>>,
+pub fn settings_of(run: &Run, path: &Path) -> Result<String, FileError> {
+    toml::to_string(&run.configuration)
+        .map_err(FileError::doing(path, "cannot write the settings as TOML"))
 }
 
-impl PackedCatalogues {
-    /// Whether a path is an archive, or a folder that `pack` wrote.
-    pub fn is_packed(path: &Path) -> bool {
-        is_archive(path) || is_there(&path.join(MANIFEST_FILE))
-    }
-
-    /// Opens an archive or folder of catalogues.
-    ///
-    /// # Errors
-    /// As [`Sent::open`] and [`Submission::read`], and if it contains power spectra.
-    pub fn open(path: &Path) -> Result<Self, FileError> {
-        let sent = Sent::open(path)?;
-        let submission = Submission::read(&sent)?;
-        PackedCatalogues::new(sent, submission)
-    }
-
-    /// The catalogues of a submission that was read from `sent`.
-    ///
-    /// # Errors
-    /// If it contains power spectra.
-    pub fn new(sent: Sent, submission: Submission) -> Result<Self, FileError> {
-        let Submission {
-            method,
-            packed,
-            manifest,
-        } = submission;
-        match packed {
-            Packed::Catalogues(files) => Ok(PackedCatalogues {
-                sent,
-                method,
-                manifest,
-                files,
-            }),
-            Packed::Spectra(_) => {
-                let message = format!(
-                    "this submission contains power spectra; expected catalogues. Try: shearq score --packed {} --data DIR --store DIR",
-                    sent.given.display()
-                );
-                Err(FileError::new(&sent.given, message))
-            }
-        }
-    }
-
-    /// The catalogues of a set, by image number.
-    pub fn of_set(&self, set: u32) -> Vec<(u32, PathBuf)> {
-        let images = self.files.get(&set).into_iter().flatten();
-        images.map(|(image, path)| (*image, path.clone())).collect()
-    }
-
-    /// Sets with catalogues, in order.
-    pub fn sets(&self) -> Vec<u32> {
-        self.files.keys().copied().collect()
-    }
-
-    /// Whether shearq measured the catalogues, so that their convention is the standard one.
-    pub fn is_own(&self) -> bool {
-        self.manifest
-            .as_ref()
-            .is_some_and(|manifest| manifest.run.is_some())
-    }
-
-    /// Reads one of the catalogues.
-    ///
-    /// # Errors
-    /// If it cannot be read, or the values are no ellipticities.
-    pub fn sum(&self, grid: &Grid, path: &Path) -> Result<(FieldSum, RowCounts), FileError> {
-        let sum = match self.is_own() {
-            true => own_catalogue(grid, path),
-            false => plain_columns(COLUMNS, Screen::default())(grid, path),
-        };
-        sum.map_err(|error| self.sent.named(error))
-    }
+/// Whether a path is an archive, or a folder that `pack` wrote.
+pub fn is_packed(path: &Path) -> bool {
+    is_archive(path) || is_there(&path.join(MANIFEST_FILE))
 }
 
-/// The manifest of a submission, if it has one, after comparing the files with it.
 fn verified(sent: &Sent, files: &[PathBuf]) -> Result<Option<Manifest>, FileError> {
     let Some(manifest) = Manifest::read(&sent.path)? else {
         return Ok(None);

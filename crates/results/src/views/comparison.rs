@@ -1,91 +1,94 @@
-//! Tables of configurations and recorded runs: mean metrics, differences in Q and calibrated Q, and Q per set.
+//! Tables of methods and recorded runs: mean metrics, differences in Q and calibrated Q, Q per set, and the verdict.
 
-use std::borrow::Borrow;
 use std::collections::BTreeSet;
 
 use ndarray::Array2;
-use shearq_files::frames::polars::AnyValue;
+use shearq_render::figure::{ColourMap, HeatMap};
+use shearq_render::table::{Cell, Heading, Table};
 use shearq_scoring::resample::PairedDifference;
 use shearq_scoring::{Definition, Fault, Metrics};
 use shearq_submissions::Published;
 
-use crate::compare::{Paired, Variant, by_name, common_sets, difference};
-use crate::groups::{Group, Grouping};
-use crate::row::mean_metric;
-use crate::row::{RunRecord, SetRecord};
+use crate::compare::{Group, Grouping, Paired, Variant, difference, keep_common_sets};
+use crate::record::{RunRecord, SetRecord, columns_named, mean};
 use crate::views::diagnosis::of_sets;
-use crate::views::metrics::{metric_cell, metric_heading};
 use crate::views::scores::{best_is_another, definition_note, notes, zero_shear_note};
-use crate::views::verdict::verdict;
-use shearq_render::figure::{ColourMap, HeatMap};
-use shearq_render::table::{Cell, Heading, Table};
 
-/// The cell with the mean of the metric called `name` over sets.
-fn mean_cell(sets: &[&SetRecord], name: &str) -> Cell {
-    let (value, error) = mean_metric(sets, name);
-    metric_cell(name, value, error)
-}
+/// A method or run with its sets.
+pub type Named<'a> = (String, &'a [SetRecord]);
 
-/// Heading of the leaderboard's Q, a detail if it equals Q.
-fn leaderboard_heading<'a>(sets: impl Iterator<Item = &'a SetRecord>) -> Heading {
-    let differs = sets
-        .into_iter()
-        .any(|set| best_is_another(set.q_leaderboard, set.metrics.q));
-    Heading {
-        detail: !differs,
-        ..Heading::new("q_leaderboard", "Q leaderboard")
-    }
-}
-
-/// The cell with the mean of the leaderboard's Q over sets.
-fn leaderboard_cell(sets: &[&SetRecord]) -> Cell {
-    let sum: f64 = sets.iter().map(|set| set.q_leaderboard).sum();
-    Cell::number(sum / sets.len() as f64, 2)
-}
-
-/// Differences in Q and calibrated Q from the first variant; `None` for the first variant.
-type Differences = Option<[Option<PairedDifference>; 2]>;
-
-/// Differences in Q and calibrated Q, `sets` minus `first`.
-fn differences<R: Borrow<SetRecord>>(first: &[R], sets: &[R]) -> [Option<PairedDifference>; 2] {
-    [Paired::Q, Paired::Calibrated].map(|metric| difference(metric, first, sets))
-}
-
-/// Headings of Q and calibrated Q, each with difference and significance.
-fn q_headings() -> [Heading; 6] {
-    [
-        metric_heading("q"),
-        Heading::new("q_difference", "ΔQ to first"),
-        Heading::new("sigma", "in σ"),
-        metric_heading("q_calibrated"),
-        Heading::new("q_calibrated_difference", "ΔQ cal."),
-        Heading::new("q_calibrated_sigma", "in σ"),
-    ]
-}
-
-/// Cells of Q and calibrated Q, each with difference and significance.
-fn q_cells(sets: &[&SetRecord], differences: Differences) -> Vec<Cell> {
-    let differences = differences.unwrap_or_default();
-    let of = |(name, found): (&str, Option<PairedDifference>)| {
-        [
-            mean_cell(sets, name),
-            Cell::with_error(
-                found.map_or(f64::NAN, |d| d.difference),
-                found.map(|d| d.error),
-                2,
-            ),
-            Cell::number(found.map_or(f64::NAN, |d| d.sigma()), 1),
-        ]
-    };
-    ["q", "q_calibrated"]
-        .into_iter()
-        .zip(differences)
-        .flat_map(of)
+pub fn named(variants: &[Variant]) -> Vec<Named<'_>> {
+    let named = |variant: &'_ Variant| variant.name.clone();
+    variants
+        .iter()
+        .map(|variant| (named(variant), variant.run.sets.as_slice()))
         .collect()
 }
 
-/// Why differences are absent for the variants `names`.
-fn unpaired_note(names: &[&str]) -> Option<String> {
+// The columns of a row that follow Q and calibrated Q.
+const METRICS: [&str; 6] = [
+    "galaxy_noise",
+    "m_cross",
+    "q_leaderboard",
+    "q_dn",
+    "m_half",
+    "sqrt_a",
+];
+
+// Headings of Q and calibrated Q, each with difference and significance, and of `METRICS`.
+fn metric_headings<'a>(mut sets: impl Iterator<Item = &'a SetRecord>) -> Vec<Heading> {
+    let mut headings = Vec::new();
+    for (name, difference, label, sigma) in [
+        ("q", "q_difference", "ΔQ to first", "sigma"),
+        (
+            "q_calibrated",
+            "q_calibrated_difference",
+            "ΔQ cal.",
+            "q_calibrated_sigma",
+        ),
+    ] {
+        headings.extend(columns_named(&[name]).iter().map(|own| own.heading()));
+        headings.push(Heading::new(difference, label));
+        headings.push(Heading::new(sigma, "in σ"));
+    }
+    // Equal to Q if the leaderboard uses the same class of conventions.
+    let differs = sets.any(|set| best_is_another(set.q_leaderboard, set.metrics.q));
+    headings.extend(columns_named(&METRICS).iter().map(|own| Heading {
+        detail: own.name == "q_leaderboard" && !differs,
+        ..own.heading()
+    }));
+    headings
+}
+
+type Differences = [Option<PairedDifference>; 2];
+
+fn differences(first: &RunRecord, run: &RunRecord) -> Differences {
+    // Bandpowers of two definitions differ by more than methods do.
+    match first.definition == run.definition {
+        true => {
+            [Paired::Q, Paired::Calibrated].map(|metric| difference(metric, &first.sets, &run.sets))
+        }
+        false => [None; 2],
+    }
+}
+
+fn metric_cells(run: &RunRecord, differences: Differences) -> Vec<Cell> {
+    let cells = |names: &[&str]| -> Vec<Cell> {
+        let columns = columns_named(names);
+        columns.iter().map(|own| own.cell(run, &run.sets)).collect()
+    };
+    let mut row = Vec::new();
+    for (name, found) in ["q", "q_calibrated"].into_iter().zip(differences) {
+        row.extend(cells(&[name]));
+        let (value, error) = (found.map(|d| d.difference), found.map(|d| d.error));
+        row.push(Cell::with_error(value.unwrap_or(f64::NAN), error, 2));
+        row.push(Cell::number(found.map_or(f64::NAN, |d| d.sigma()), 1));
+    }
+    row.extend(cells(&METRICS));
+    row
+}
+
+fn unpaired_note(names: &[String]) -> Option<String> {
     (!names.is_empty()).then(|| {
         format!(
             "No difference for {}: differences need equal images, one definition and certain conventions.",
@@ -94,70 +97,50 @@ fn unpaired_note(names: &[&str]) -> Option<String> {
     })
 }
 
-/// Variants side by side: means over their common sets, differences in Q from the first variant, paired over equal
-/// images, and published metrics.
+/// Methods side by side: means over their common sets, differences in Q from the first method, paired over equal images,
+/// and published metrics.
 pub fn compare(variants: &[Variant], definition: Definition) -> Table {
-    let records: Vec<Vec<SetRecord>> = variants.iter().map(Variant::records).collect();
-    let common = common_sets(&records);
     let mut headings = vec![Heading::new("submission", "Configuration")];
-    headings.extend(q_headings());
+    headings.extend(metric_headings(
+        variants.iter().flat_map(|variant| &variant.run.sets),
+    ));
     headings.extend([
-        metric_heading("galaxy_noise"),
-        metric_heading("m_cross"),
-        leaderboard_heading(records.iter().flatten()),
-        metric_heading("q_dn"),
-        metric_heading("m_half"),
-        metric_heading("sqrt_a"),
         Heading::new("q_published", "Q publ."),
         Heading::new("m_half_published", "M/2 publ."),
         Heading::new("sqrt_a_published", "√A publ."),
     ]);
-    let shown: Vec<&str> = headings.iter().map(|heading| heading.key).collect();
-    let others = || {
-        Metrics::ALL
-            .iter()
-            .filter(|metric| !shown.contains(&metric.name))
-    };
-    let mut headings = headings.clone();
-    headings.extend(others().map(|metric| metric_heading(metric.name).detail()));
-    let mut rows = Vec::new();
-    let mut unpaired = Vec::new();
-    let mut first: Option<Vec<&SetRecord>> = None;
-    for (variant, records) in variants.iter().zip(&records) {
-        let sets: Vec<&SetRecord> = records
-            .iter()
-            .filter(|set| common.contains(&set.set))
-            .collect();
-        let differences = first.as_ref().map(|first| differences(first, &sets));
-        if matches!(differences, Some([None, _])) {
-            unpaired.push(variant.name.as_str());
+    let mut others = Metrics::ALL.map(|metric| metric.name).to_vec();
+    others.retain(|name| headings.iter().all(|heading| heading.key != *name));
+    let others = columns_named(&others);
+    headings.extend(others.iter().map(|own| own.heading().detail()));
+    let (mut rows, mut unpaired) = (Vec::new(), Vec::new());
+    for (k, variant) in variants.iter().enumerate() {
+        let run = &variant.run;
+        let differences = match k {
+            0 => [None; 2],
+            _ => differences(&variants[0].run, run),
+        };
+        if k > 0 && differences[0].is_none() {
+            unpaired.push(variant.name.clone());
         }
         let published = |value: fn(&Published) -> f64, decimals: usize| {
             Cell::number(variant.published.as_ref().map_or(f64::NAN, value), decimals)
         };
         let mut row = vec![Cell::text(&variant.name)];
-        row.extend(q_cells(&sets, differences));
+        row.extend(metric_cells(run, differences));
         row.extend([
-            mean_cell(&sets, "galaxy_noise"),
-            mean_cell(&sets, "m_cross"),
-            leaderboard_cell(&sets),
-            mean_cell(&sets, "q_dn"),
-            mean_cell(&sets, "m_half"),
-            mean_cell(&sets, "sqrt_a"),
             published(|p| p.q, 2),
             published(|p| p.m_half, 4),
             published(|p| p.sqrt_a, 4),
         ]);
-        row.extend(others().map(|metric| mean_cell(&sets, metric.name)));
+        row.extend(others.iter().map(|own| own.cell(run, &run.sets)));
         rows.push(row);
-        first.get_or_insert(sets);
     }
-    let images: usize = first.iter().flatten().map(|set| set.images.len()).sum();
-    let list: Vec<String> = common.iter().map(u32::to_string).collect();
+    let (sets, images) = sets_and_images(variants);
     let mut lines = vec![
-        match list.as_slice() {
-            [one] => format!("Set {one}; {images} images."),
-            _ => format!("Means over sets {}; {images} images in all.", list.join(", ")),
+        match sets.contains(',') {
+            false => format!("Set {sets}; {images} images."),
+            true => format!("Means over sets {sets}; {images} images in all."),
         },
         definition_note(definition),
         "ΔQ, ΔQ cal.: difference from the first row on the same images, with a jackknife error if each set has eight images or more.".into(),
@@ -167,7 +150,6 @@ pub fn compare(variants: &[Variant], definition: Definition) -> Table {
     }
     lines.extend(unpaired_note(&unpaired));
     lines.extend(notes_of_variants(variants));
-    lines.extend(verdict(&by_name(variants)));
     Table {
         title: "Comparison of configurations".into(),
         headings,
@@ -176,14 +158,24 @@ pub fn compare(variants: &[Variant], definition: Definition) -> Table {
     }
 }
 
+fn sets_and_images(variants: &[Variant]) -> (String, usize) {
+    let sets = variants.first().map_or(&[][..], |first| &first.run.sets);
+    let list: Vec<String> = sets.iter().map(|set| set.set.to_string()).collect();
+    (
+        list.join(", "),
+        sets.iter().map(|set| set.images.len()).sum(),
+    )
+}
+
 /// Notes on the sets of each variant. A note on several variants appears once, with their names.
 pub fn notes_of_variants(variants: &[Variant]) -> Vec<String> {
     let mut found: Vec<(String, Vec<&str>)> = Vec::new();
     for variant in variants {
-        for line in notes(&variant.sets).iter().chain(&variant.unscored) {
-            match found.iter_mut().find(|(known, _)| known == line) {
+        let lines = notes(&variant.scored()).into_iter();
+        for line in lines.chain(variant.unscored.iter().cloned()) {
+            match found.iter_mut().find(|(known, _)| *known == line) {
                 Some((_, names)) => names.push(&variant.name),
-                None => found.push((line.clone(), vec![&variant.name])),
+                None => found.push((line, vec![&variant.name])),
             }
         }
     }
@@ -195,142 +187,86 @@ pub fn notes_of_variants(variants: &[Variant]) -> Vec<String> {
     shown.collect()
 }
 
-/// The metrics that decide between variants: Q, calibrated Q, m and noise, as means over their common sets.
+/// The metrics that decide between methods: Q, calibrated Q, m and noise, as means over their common sets.
 pub fn compact(variants: &[Variant]) -> Table {
-    const METRICS: [&str; 4] = ["q", "q_calibrated", "m_cross", "galaxy_noise"];
-    let records: Vec<Vec<SetRecord>> = variants.iter().map(Variant::records).collect();
-    let common = common_sets(&records);
-    let mut headings = vec![Heading::new("submission", "Configuration")];
-    headings.extend(METRICS.map(metric_heading));
-    let rows = variants.iter().zip(&records).map(|(variant, records)| {
-        let sets: Vec<&SetRecord> = records
+    let columns = columns_named(&["submission", "q", "q_calibrated", "m_cross", "galaxy_noise"]);
+    let rows = variants.iter().map(|Variant { run, .. }| {
+        columns
             .iter()
-            .filter(|set| common.contains(&set.set))
-            .collect();
-        let mut row = vec![Cell::text(&variant.name)];
-        row.extend(METRICS.map(|name| mean_cell(&sets, name)));
-        row
+            .map(|own| own.cell(run, &run.sets))
+            .collect::<Vec<_>>()
     });
-    let list: Vec<String> = common.iter().map(u32::to_string).collect();
-    let images: usize = records
-        .first()
-        .into_iter()
-        .flatten()
-        .map(|set| set.images.len())
-        .sum();
+    let (sets, images) = sets_and_images(variants);
+    let mut notes = vec![
+        format!("Means over the simulated sets {sets}; {images} images. ± is a standard error."),
+        "Q: the challenge's score. Q cal.: Q after division by the response.".into(),
+        "m: multiplicative bias. noise: scatter per galaxy and component.".into(),
+    ];
+    let q = |variant: &Variant| mean(&variant.run.sets, |metrics| metrics.q).0;
+    let best = variants.iter().max_by(|a, b| q(a).total_cmp(&q(b)));
+    notes.extend(best.and_then(|best| zero_shear_note(&best.scored())));
     Table {
         title: "Comparison of configurations".into(),
-        headings,
+        headings: columns.iter().map(|own| own.heading()).collect(),
         rows: rows.collect(),
-        notes: vec![
-            format!(
-                "Means over the simulated sets {}; {images} images. ± is a standard error.",
-                list.join(", ")
-            ),
-            "Q: the challenge's score. Q cal.: Q after division by the response.".into(),
-            "m: multiplicative bias. noise: scatter per galaxy and component.".into(),
-        ]
-        .into_iter()
-        .chain(highest_q(variants).and_then(|best| zero_shear_note(&best.sets)))
-        .collect(),
+        notes,
     }
 }
 
-/// The variant with the highest mean Q.
-fn highest_q(variants: &[Variant]) -> Option<&Variant> {
-    let q = |variant: &Variant| mean_metric(&variant.records(), "q").0;
-    variants.iter().max_by(|a, b| q(a).total_cmp(&q(b)))
-}
-
-/// Runs side by side: means over sets or groups of sets, and the difference in Q from the first row, or the first row
-/// of the group, on the same images.
-pub fn compare_runs(runs: &[RunRecord], groups: &[Group<'_>], grouping: Option<Grouping>) -> Table {
+/// Runs side by side: means over sets or groups of sets, and the difference in Q from the first row, or the first row of
+/// the group, on the same images.
+pub fn compare_runs(runs: &[RunRecord], groups: &[Group], grouping: Option<Grouping>) -> Table {
     let mut headings = vec![
         Heading::new("submission", "Configuration"),
         Heading::new("run", "Run"),
         Heading::new("version", "Version").detail(),
     ];
-    headings.extend(grouping.map(|grouping| {
-        let label = match grouping {
-            Grouping::Set => "Set",
-            Grouping::SetKind => "Kind",
-            Grouping::Psf => "PSF",
-            Grouping::Snr => "S/N",
-            Grouping::Size => "Size",
-        };
-        Heading::new(grouping.column(), label)
-    }));
+    let column = grouping.and_then(Grouping::column);
+    headings.extend(column.map(|column| column.heading()));
     headings.extend([
         Heading::new("sets", "Sets"),
         Heading::new("images", "Images"),
     ]);
-    headings.extend(q_headings());
-    headings.extend([
-        metric_heading("galaxy_noise"),
-        metric_heading("m_cross"),
-        leaderboard_heading(groups.iter().flat_map(|group| group.sets.iter().copied())),
-        metric_heading("q_dn"),
-        metric_heading("m_half"),
-        metric_heading("sqrt_a"),
-    ]);
+    headings.extend(metric_headings(
+        groups.iter().flat_map(|group| &group.run.sets),
+    ));
     let mut rows = Vec::new();
-    let mut unpaired = Vec::new();
+    let mut unpaired: Vec<String> = Vec::new();
     for (k, group) in groups.iter().enumerate() {
+        let (run, id) = (&group.run, group.id());
         let first = groups[..k].iter().find(|other| other.value == group.value);
-        let differences = first.map(|first| match first.run.definition == group.run.definition {
-            true => differences(&first.sets, &group.sets),
-            false => [None; 2],
-        });
-        if matches!(differences, Some([None, _])) && !unpaired.contains(&group.id.as_str()) {
-            unpaired.push(group.id.as_str());
+        let differences = first.map(|first| differences(&first.run, run));
+        if matches!(differences, Some([None, _])) && !unpaired.contains(&id) {
+            unpaired.push(id.clone());
         }
         let mut row = vec![
-            Cell::text(&group.run.configuration),
-            Cell::text(&group.id),
-            Cell::text(&group.run.version),
+            Cell::text(&run.configuration),
+            Cell::text(id),
+            Cell::text(&run.version),
         ];
-        row.extend(group.value.clone().map(|value| match value {
-            AnyValue::Int64(number) => Cell::number(number as f64, 0),
-            words => Cell::text(words.get_str().unwrap_or_default()),
-        }));
-        row.extend([
-            Cell::text(ranges(&group.sets)),
-            Cell::number(group.images() as f64, 0),
-        ]);
-        row.extend(q_cells(&group.sets, differences));
-        row.extend([
-            mean_cell(&group.sets, "galaxy_noise"),
-            mean_cell(&group.sets, "m_cross"),
-            leaderboard_cell(&group.sets),
-            mean_cell(&group.sets, "q_dn"),
-            mean_cell(&group.sets, "m_half"),
-            mean_cell(&group.sets, "sqrt_a"),
-        ]);
+        row.extend(column.map(|_| group.value.clone()));
+        let images: usize = run.sets.iter().map(|set| set.images.len()).sum();
+        row.push(Cell::text(ranges(&run.sets)));
+        row.push(Cell::number(images as f64, 0));
+        row.extend(metric_cells(run, differences.unwrap_or_default()));
         rows.push(row);
     }
     Table {
         title: "Recorded runs".into(),
         headings,
         rows,
-        notes: run_notes(runs, groups, grouping, &unpaired),
+        notes: run_notes(runs, grouping, &unpaired),
     }
 }
 
-fn run_notes(
-    runs: &[RunRecord],
-    groups: &[Group<'_>],
-    grouping: Option<Grouping>,
-    unpaired: &[&str],
-) -> Vec<String> {
-    let ways: BTreeSet<String> = runs
-        .iter()
-        .map(|run| {
-            format!(
-                "{} definition, {} convention, noise {}",
-                run.definition, run.choice, run.noise
-            )
-        })
-        .collect();
+fn run_notes(runs: &[RunRecord], grouping: Option<Grouping>, unpaired: &[String]) -> Vec<String> {
+    let way = |run: &RunRecord| {
+        format!(
+            "{} definition, {} convention, noise {}",
+            run.definition, run.choice, run.noise
+        )
+    };
+    let ways: BTreeSet<String> = runs.iter().map(way).collect();
     let several = ways.len() > 1;
     let ways: Vec<String> = ways.into_iter().collect();
     let mut notes = vec![format!(
@@ -344,47 +280,22 @@ fn run_notes(
         notes.push("warning: the runs were scored in different ways and cannot be compared. Try: --where definition=… or choice=…".into());
     }
     notes.extend(unpaired_note(unpaired));
-    for run in runs {
-        notes.extend(bias_note(run));
-    }
-    if grouping.is_none() {
-        let runs: Vec<(String, Vec<SetRecord>)> = groups
-            .iter()
-            .map(|group| {
-                (
-                    group.name(),
-                    group.sets.iter().map(|&set| set.clone()).collect(),
-                )
-            })
-            .collect();
-        let sets: Vec<Vec<SetRecord>> = runs.iter().map(|(_, sets)| sets.clone()).collect();
-        let common = common_sets(&sets);
-        let of_common = |(name, mut sets): (String, Vec<SetRecord>)| {
-            sets.retain(|set| common.contains(&set.set));
-            (name, sets)
-        };
-        let runs: Vec<_> = runs.into_iter().map(of_common).collect();
-        notes.extend(verdict(&runs));
-    }
+    notes.extend(runs.iter().filter_map(bias_note));
     notes
 }
 
-/// A warning about sets of a recorded run with a large multiplicative bias.
 fn bias_note(run: &RunRecord) -> Option<String> {
-    let findings: Vec<(Option<u32>, Vec<Fault>)> = run
-        .sets
-        .iter()
-        .map(|set| {
-            let finding = Fault::of_bias(set.metrics.m_cross, set.errors.m_cross);
-            (Some(set.set), finding.into_iter().collect())
-        })
-        .collect();
+    let findings = run.sets.iter().map(|set| {
+        let finding = Fault::of_bias(set.metrics.m_cross, set.errors.m_cross);
+        (Some(set.set), finding.into_iter().collect::<Vec<Fault>>())
+    });
+    let findings: Vec<_> = findings.collect();
     let lines = of_sets(findings.iter().map(|(set, found)| (*set, found.as_slice())));
     (!lines.is_empty()).then(|| format!("{}: {}", run.configuration, lines.join(" ")))
 }
 
-/// Sets as `1-3,7`.
-fn ranges(sets: &[&SetRecord]) -> String {
+// Sets as `1-3,7`.
+fn ranges(sets: &[SetRecord]) -> String {
     let texts = sets.chunk_by(|a, b| a.set + 1 == b.set).map(|run| {
         let (first, last) = (run[0].set, run[run.len() - 1].set);
         match first == last {
@@ -395,35 +306,198 @@ fn ranges(sets: &[&SetRecord]) -> String {
     texts.collect::<Vec<_>>().join(",")
 }
 
-/// Q of each set (column) and variant or run (row), with means in the last column.
-pub fn q_heat_map<R: Borrow<SetRecord>>(variants: &[(String, Vec<R>)]) -> HeatMap {
-    let sets: BTreeSet<u32> = variants
-        .iter()
-        .flat_map(|(_, sets)| sets.iter().map(|set| set.borrow().set))
-        .collect();
+/// Q of each set (column) and method or run (row), with means in the last column.
+pub fn q_heat_map(rows: &[Named<'_>]) -> HeatMap {
+    let sets = rows.iter().flat_map(|(_, sets)| sets.iter());
+    let sets: BTreeSet<u32> = sets.map(|set| set.set).collect();
     let mut columns: Vec<String> = sets.iter().map(u32::to_string).collect();
     columns.push("mean".into());
-    let mut values = Array2::from_elem((variants.len(), columns.len()), f64::NAN);
-    for (mut row, (_, own)) in values.rows_mut().into_iter().zip(variants) {
+    let mut values = Array2::from_elem((rows.len(), columns.len()), f64::NAN);
+    for (mut row, (_, own)) in values.rows_mut().into_iter().zip(rows) {
         for (value, set) in row.iter_mut().zip(&sets) {
-            *value = own
-                .iter()
-                .map(Borrow::borrow)
-                .find(|own| own.set == *set)
-                .map_or(f64::NAN, |own| own.metrics.q);
+            let found = own.iter().find(|own| own.set == *set);
+            *value = found.map_or(f64::NAN, |own| own.metrics.q);
         }
-        row[sets.len()] = mean_metric(own, "q").0;
+        row[sets.len()] = mean(own, |metrics| metrics.q).0;
     }
     let most = values.iter().copied().fold(f64::NAN, f64::max);
     HeatMap {
         title: "Quality factor per set".into(),
         row_label: "configuration".into(),
         column_label: "set".into(),
-        rows: variants.iter().map(|(name, _)| name.clone()).collect(),
+        rows: rows.iter().map(|(name, _)| name.clone()).collect(),
         columns,
         values,
         decimals: if most < 10.0 { 2 } else { 1 },
         value_label: "Q".into(),
         map: ColourMap::Viridis,
+    }
+}
+
+/// The verdict on recorded runs, from the sets that all of them have.
+pub fn verdict_on_runs(groups: &[Group]) -> Option<String> {
+    let mut groups = groups.to_vec();
+    keep_common_sets(groups.iter_mut().map(|group| &mut group.run));
+    let named = groups
+        .iter()
+        .map(|group| (group.name(), group.run.sets.as_slice()));
+    verdict(&named.collect::<Vec<_>>())
+}
+
+// Chosen by hand: with few methods, a difference of 3σ by chance is rare enough for an advice.
+const CLEAR_SIGMA: f64 = 3.0;
+// Chosen by hand. More sets would fill lines.
+const MAX_SETS_LISTED: usize = 3;
+
+/// Which method to use, with the decisive metrics; for a single method, its metrics. `None` for a single method with an
+/// unknown response.
+pub fn verdict(methods: &[Named<'_>]) -> Option<String> {
+    let calibrated = |sets: &[SetRecord]| mean(sets, |metrics| metrics.q_calibrated).0;
+    let known = methods
+        .iter()
+        .enumerate()
+        .filter(|(_, (_, sets))| !sets.is_empty() && calibrated(sets).is_finite());
+    let best = known.max_by(|a, b| calibrated(a.1.1).total_cmp(&calibrated(b.1.1)));
+    let Some((place, (name, sets))) = best else {
+        return (methods.len() > 1).then(|| "Not enough data to rank the configurations.".into());
+    };
+    let shown = |metric: fn(&Metrics) -> f64, decimals: usize| {
+        let (value, error) = mean(sets, metric);
+        Cell::with_error(value, Some(error), decimals).in_words()
+    };
+    let rivals: Vec<&Named<'_>> = methods[..place]
+        .iter()
+        .chain(&methods[place + 1..])
+        .collect();
+    let (mut lower, mut equal, mut raised) = (String::new(), Vec::new(), Vec::new());
+    for (other, others) in rivals {
+        let lead = difference(Paired::Calibrated, others, sets);
+        if let Some(lead) = lead {
+            let by = Cell::with_error(lead.difference, Some(lead.error), 1).in_words();
+            lower += &match lower.is_empty() {
+                true => format!("; {other} is lower by {by}"),
+                false => format!(", {other} by {by}"),
+            };
+        }
+        // A method without a calibrated Q is not distinguished either.
+        if !lead.is_some_and(|lead| lead.sigma() >= CLEAR_SIGMA) {
+            equal.push(other.as_str());
+        }
+        // A method that loses shear and noise alike raises Q while noise dominates it.
+        let of = |metric| mean(others, metric).0;
+        if of(|metrics| metrics.q) > mean(sets, |metrics| metrics.q).0
+            && of(|metrics| metrics.m_cross) < 0.0
+        {
+            raised.push(other.as_str());
+        }
+    }
+    let lead = match (methods.len(), equal.is_empty()) {
+        (1, _) => name.clone(),
+        (_, true) => format!("Use {name}"),
+        (_, false) => format!(
+            "{name} has the highest Q calibrated, but these images do not distinguish it from {}",
+            equal.join(" and ")
+        ),
+    };
+    let warning = match raised.is_empty() {
+        true => String::new(),
+        false => format!(
+            " Q itself is higher for {}, which lose shear and noise alike (m below zero). Real analyses cannot use this.",
+            raised.join(" and ")
+        ),
+    };
+    let noise = match sets.len() {
+        1 => shown(|metrics| metrics.galaxy_noise, 3),
+        2..=MAX_SETS_LISTED => {
+            let noise = sets.iter().map(|set| {
+                let error = Some(set.errors.galaxy_noise);
+                let noise = Cell::with_error(set.metrics.galaxy_noise, error, 3).in_words();
+                format!("{noise} in set {}", set.set)
+            });
+            noise.collect::<Vec<_>>().join(" and ")
+        }
+        many => format!(
+            "{} (mean of {many} sets)",
+            shown(|metrics| metrics.galaxy_noise, 3)
+        ),
+    };
+    Some(format!(
+        "{lead}: m = {}, noise per galaxy after calibration {noise}, and Q calibrated = {}{lower}.{warning}",
+        shown(|metrics| metrics.m_cross, 2),
+        shown(|metrics| metrics.q_calibrated, 1),
+    ))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A method with one set of eight images, whose calibrated Q scatters as `replicates`.
+    fn method(name: &str, q: f64, calibrated: f64, replicates: [f64; 8]) -> (String, SetRecord) {
+        let with = |q, q_calibrated, m_cross| {
+            let mut metrics = Metrics::unknown();
+            (metrics.q, metrics.q_calibrated, metrics.m_cross) = (q, q_calibrated, m_cross);
+            metrics
+        };
+        let record = SetRecord {
+            set: 2,
+            simulated: true,
+            data: String::new(),
+            images: (1..=8).collect(),
+            galaxies: 8,
+            flagged: 0,
+            metrics: with(q, calibrated, -0.3),
+            errors: with(0.1, 2.0, 0.01),
+            q_replicates: vec![q; 8],
+            q_calibrated_replicates: replicates.map(|off| calibrated + off).to_vec(),
+            q_leaderboard: q,
+            convention: 5,
+            convention_known: true,
+            convention_leaderboard: 5,
+        };
+        (name.into(), record)
+    }
+
+    fn verdict_on(methods: &[(String, SetRecord)]) -> Option<String> {
+        let named = methods
+            .iter()
+            .map(|(name, set)| (name.clone(), std::slice::from_ref(set)));
+        verdict(&named.collect::<Vec<_>>())
+    }
+
+    #[test]
+    fn the_best_method_is_named_if_it_is_distinguished() {
+        let common = [0.5, -0.5, 0.5, -0.5, 0.5, -0.5, 0.5, -0.5];
+        let replicates = [0.7, -0.7, 0.3, -0.3, 0.7, -0.7, 0.3, -0.3];
+        let better = method("b", 10.0, 25.0, replicates);
+        // Common noise cancels: the error of the difference is √(7/8 · Σ 0.2²) = 0.53, although each error is 2.
+        let clear = verdict_on(&[method("a", 12.0, 20.0, common), better.clone()]).unwrap();
+        assert!(clear.starts_with("Use b: m = -0.300 ± 0.010"), "{clear}");
+        assert!(
+            clear.contains("Q calibrated = 25.0 ± 2.0; a is lower by 5.00 ± 0.53."),
+            "{clear}"
+        );
+        assert!(
+            clear.contains("Q itself is higher for a, which lose shear"),
+            "{clear}"
+        );
+        let tied = verdict_on(&[method("a", 9.0, 24.0, common), better.clone()]).unwrap();
+        let start =
+            "b has the highest Q calibrated, but these images do not distinguish it from a: m";
+        assert!(
+            tied.starts_with(start) && !tied.contains("itself"),
+            "{tied}"
+        );
+        let unknown = verdict_on(&[method("a", 9.0, f64::NAN, common), better]).unwrap();
+        assert!(
+            unknown.contains("do not distinguish it from a"),
+            "{unknown}"
+        );
+        let blank = || method("a", 9.0, f64::NAN, common);
+        let none = verdict_on(&[blank(), blank()]).unwrap();
+        assert_eq!(none, "Not enough data to rank the configurations.");
+        assert_eq!(verdict_on(&[blank()]), None);
+        let alone = verdict_on(&[method("a", 9.0, 24.0, common)]).unwrap();
+        assert!(alone.starts_with("a: m = -0.300 ± 0.010, noise"), "{alone}");
     }
 }

@@ -3,7 +3,6 @@
 use quick_junit::{NonSuccessKind, Report, TestCase, TestCaseStatus, TestSuite};
 use shearq_render::escape::visible;
 
-/// One check.
 pub(super) struct Case<'a> {
     pub class: String,
     pub name: &'a str,
@@ -11,7 +10,6 @@ pub(super) struct Case<'a> {
     pub failure: Option<(String, Option<String>)>,
 }
 
-/// A document of suites with their names.
 pub(super) fn document<'a>(suites: impl IntoIterator<Item = (&'a str, Vec<Case<'a>>)>) -> String {
     let mut report = Report::new("shearq");
     for (name, cases) in suites {

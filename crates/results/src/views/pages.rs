@@ -4,17 +4,12 @@ use std::path::Path;
 
 use crate::score::ScoredSet;
 use crate::views::spectrum;
-use crate::views::verdict::take_verdict;
 use shearq_bias::QUANTITIES;
 use shearq_render::figure::{Band, FigureError, HeatMap, LinePlot, PanelGrid, Series, Style};
 use shearq_render::html::{Block, Picture, Report, Section};
 use shearq_render::table::{Cell, Table};
 use shearq_scoring::Metrics;
 
-/// Scores of one configuration with its spectra and the true spectra.
-///
-/// # Errors
-/// As [`Picture::draw`].
 pub fn scores(name: &str, scored: &[ScoredSet], table: Table) -> Result<Section, FigureError> {
     let mut blocks = vec![Block::Table(table)];
     let with_power: Vec<&ScoredSet> = scored
@@ -33,13 +28,13 @@ pub fn scores(name: &str, scored: &[ScoredSet], table: Table) -> Result<Section,
     Ok(Section::new(name, format!("Scores of {name}"), blocks))
 }
 
-/// Several configurations side by side.
-///
-/// # Errors
-/// As [`Picture::draw`].
-pub fn comparison(mut table: Table, map: &HeatMap) -> Result<Section, FigureError> {
+pub fn comparison(
+    table: Table,
+    verdict: Option<String>,
+    map: &HeatMap,
+) -> Result<Section, FigureError> {
     let mut blocks = Vec::new();
-    if let Some(verdict) = take_verdict(&mut table.notes) {
+    if let Some(verdict) = verdict {
         blocks.push(Block::Text(verdict));
         if let Some(first) = table.headings.first() {
             let keys = [
@@ -72,10 +67,6 @@ pub fn comparison(mut table: Table, map: &HeatMap) -> Result<Section, FigureErro
     Ok(Section::new("comparison", "Comparison", blocks))
 }
 
-/// Writes a page of sections with a list of `settings`.
-///
-/// # Errors
-/// If it cannot be written.
 pub fn save(
     path: &Path,
     title: &str,
@@ -97,7 +88,6 @@ pub fn save(
     .save(path)
 }
 
-/// Meanings of the columns of tables, by their keys.
 fn glossary() -> Vec<(String, String)> {
     let metrics = Metrics::ALL.map(|metric| (metric.name, metric.meaning));
     let estimates = QUANTITIES.map(|quantity| (quantity.key, quantity.meaning));
@@ -154,7 +144,12 @@ fn spectra(name: &str, scored: &[&ScoredSet]) -> PanelGrid {
             &score.spectra().ee,
             &score.ee_error,
         ];
-        spectrum::panel(set.set, set.kind, powers, score.noise.as_ref())
+        spectrum::panel(
+            set.number(),
+            set.record.kind(),
+            powers,
+            score.noise.as_ref(),
+        )
     };
     PanelGrid {
         title: format!("Shear power of {name}"),
@@ -163,11 +158,10 @@ fn spectra(name: &str, scored: &[&ScoredSet]) -> PanelGrid {
     }
 }
 
-/// Requirement of future surveys on |m| in units of 10⁻³, as in the table of a study.
+// Requirement of future surveys on |m| in units of 10⁻³, as in the table of a study.
 const REQUIREMENT: f64 = 2.0;
-/// Colour of requirements and bounds.
 const REQUIREMENT_COLOUR: usize = 6;
-/// Largest plotted m, if any m is smaller.
+// Largest plotted m, if any m is smaller.
 const LARGEST_M: f64 = 20.0;
 
 /// Plots of a study: scatter over the bound, biases and Q, with requirements and bounds. `table` has one row per set
@@ -293,7 +287,6 @@ pub fn contest(table: &Table) -> PanelGrid {
     }
 }
 
-/// A column of the table as a plot, one row per point; `None` if no row has a value.
 fn metric_plot(table: &Table, key: &str) -> Option<LinePlot> {
     let k = table.place(key)?;
     let (mut names, mut values, mut errors) = (Vec::new(), Vec::new(), Vec::new());

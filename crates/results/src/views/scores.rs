@@ -3,37 +3,28 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use serde_json::{Value, json};
-use shearq_scoring::resample::mean_over_sets;
-use shearq_scoring::{
-    BINS, Bias, BiasFits, ConventionClass, ConventionScore, Definition, Fault, SetScore,
-    SpectrumScore,
-};
-
-use crate::row::SetRecord;
-use crate::score::{Basis, ScoredSet, means};
-use crate::views::diagnosis;
-use crate::views::metrics::{FORMATS, metric_cells, metric_heading};
-use crate::views::rows::oddities;
-use crate::views::spectrum;
-use crate::views::verdict::verdict;
 use shearq_dataset::truth::Sign;
 use shearq_render::table::{Cell, Heading, Table};
-use shearq_simulate::kinds::SetKind;
+use shearq_scoring::{
+    BINS, Bias, BiasFits, ConventionClass, ConventionScore, Definition, Fault, Metrics, SetScore,
+};
 
-/// Name of a kind of set in tables.
-fn kind_label(kind: Option<SetKind>) -> String {
-    kind.map_or_else(String::new, |kind| kind.image.label().to_owned())
+use crate::record::{SetRecord, definition_word, mean, metric_cell};
+use crate::score::{Basis, ScoredSet};
+use crate::views::comparison::verdict;
+use crate::views::{diagnosis, spectrum};
+
+fn kind_cell(record: &SetRecord) -> Cell {
+    Cell::text(record.kind().map_or("", |kind| kind.image.label()))
 }
 
-/// Explains kinds, if there are any.
-fn kinds_note(mut kinds: impl Iterator<Item = Option<SetKind>>) -> &'static str {
-    match kinds.any(|kind| kind.is_some()) {
+fn kinds_note(records: &[SetRecord]) -> &'static str {
+    match records.iter().any(|record| record.kind().is_some()) {
         true => " Kinds: as the GREAT10 sets with these numbers.",
         false => "",
     }
 }
 
-/// One line that explains the metrics.
 pub(super) fn definition_note(definition: Definition) -> String {
     let definition = match definition {
         Definition::Leaderboard => "leaderboard definition (the arithmetic of the challenge)",
@@ -44,7 +35,6 @@ pub(super) fn definition_note(definition: Definition) -> String {
     )
 }
 
-/// The convention of the metrics, and how it was chosen.
 pub fn convention_note(scored: &[ScoredSet]) -> String {
     let Some(first) = scored.first() else {
         return String::new();
@@ -81,16 +71,10 @@ pub fn notes(scored: &[ScoredSet]) -> Vec<String> {
         .collect();
     signs.dedup();
     lines.extend(signs);
-    for ScoredSet {
-        set,
-        score,
-        rows,
-        odd_images,
-        ..
-    } in scored
-    {
-        let odd = diagnosis::odd_images(odd_images).into_iter();
-        lines.extend(odd.map(|odd| format!("{}{odd}.", diagnosis::prefix(*set))));
+    for own in scored {
+        let (set, score) = (own.number(), &own.score);
+        let odd = diagnosis::odd_images(&own.odd_images).into_iter();
+        lines.extend(odd.map(|odd| format!("{}{odd}.", diagnosis::prefix(set))));
         let name = set.map_or_else(|| "this set".to_owned(), |set| format!("set {set}"));
         if let Some(mean) = &score.constant {
             lines.push(format!(
@@ -116,10 +100,10 @@ pub fn notes(scored: &[ScoredSet]) -> Vec<String> {
                 100.0 * score.true_b_share()
             ));
         }
-        lines.extend(oddities(rows, &name));
+        lines.extend(diagnosis::oddities(&own.rows, &name));
     }
     lines.extend(diagnosis::of_sets(
-        scored.iter().map(|set| (set.set, believable(set))),
+        scored.iter().map(|set| (set.number(), believable(set))),
     ));
     lines.extend(zero_shear_note(scored));
     let blank = |set: &&ScoredSet| {
@@ -128,7 +112,7 @@ pub fn notes(scored: &[ScoredSet]) -> Vec<String> {
     let blank: Vec<String> = scored
         .iter()
         .filter(blank)
-        .filter_map(|set| Some(set.set?.to_string()))
+        .filter_map(|set| Some(set.number()?.to_string()))
         .collect();
     if !blank.is_empty() {
         lines.push(format!(
@@ -139,7 +123,7 @@ pub fn notes(scored: &[ScoredSet]) -> Vec<String> {
     lines
 }
 
-/// Q of zero shear, which is above that of a measurement while noise dominates.
+// Q of zero shear, which is above that of a measurement while noise dominates.
 pub(super) fn zero_shear_note(scored: &[ScoredSet]) -> Option<String> {
     let varying = || scored.iter().filter(|set| set.score.constant.is_none());
     let count = varying().count() as f64;
@@ -150,7 +134,6 @@ pub(super) fn zero_shear_note(scored: &[ScoredSet]) -> Option<String> {
     )
 }
 
-/// The note for mean Q of zero shear and of a measurement.
 fn zero_shear_line(zero: f64, own: f64) -> Option<String> {
     let verdict = match zero > own {
         true => ", above this Q: noise dominates Q. Compare Q cal., m and noise",
@@ -160,8 +143,8 @@ fn zero_shear_line(zero: f64, own: f64) -> Option<String> {
         .then(|| format!("note: without any image, zero shear has Q = {zero:.2}{verdict}."))
 }
 
-/// Findings of a set that odd images do not explain. Copies appear to have no noise, and constant ellipticities no
-/// response.
+// Findings of a set that odd images do not explain. Copies appear to have no noise, and constant ellipticities no
+// response.
 fn believable(set: &ScoredSet) -> &[Fault] {
     let odd = &set.odd_images;
     match set.findings.as_slice() {
@@ -171,16 +154,17 @@ fn believable(set: &ScoredSet) -> &[Fault] {
     }
 }
 
-/// The verdict on the configuration called `name`, if its metrics are known.
 pub fn verdict_line(name: &str, scored: &[ScoredSet]) -> Option<String> {
-    let record = |set: &ScoredSet| SetRecord::new(set.set.unwrap_or(0), set, String::new());
     let with_power = scored.iter().filter(|set| set.score.constant.is_none());
-    verdict(&[(name.to_owned(), with_power.map(record).collect())])
+    let records: Vec<SetRecord> = with_power.map(|set| set.record.clone()).collect();
+    verdict(&[(name.to_owned(), &records)])
 }
 
-/// The first cell of a set's row.
-fn set_cell(set: Option<u32>) -> Cell {
-    Cell::text(set.map_or_else(|| "–".into(), |set| format!("{set:02}")))
+fn set_cell(record: &SetRecord) -> Cell {
+    match record.set {
+        0 => Cell::text("–"),
+        set => Cell::text(format!("{set:02}")),
+    }
 }
 
 /// Metrics per set, with a row of means for several sets.
@@ -188,50 +172,46 @@ pub fn per_set(scored: &[ScoredSet], title: &str, definition: Definition) -> Tab
     if scored.iter().all(|set| set.score.constant.is_some()) {
         return constant_shear(scored, title);
     }
+    let records: Vec<SetRecord> = scored.iter().map(|set| set.record.clone()).collect();
     let mut headings = vec![
         Heading::new("set", "Set"),
         Heading::new("kind", "Kind"),
         Heading::new("images", "Images").detail(),
     ];
-    headings.extend(FORMATS.iter().map(|metric| Heading {
+    let metrics = Metrics::ALL.iter();
+    headings.extend(metrics.map(|metric| Heading {
         detail: metric.detail,
-        ..metric_heading(metric.name)
+        ..Heading::new(metric.name, metric.heading)
     }));
     headings.push(Heading::new("convention", "Conv.").detail());
-    let apart = scored
+    let apart = records
         .iter()
-        .any(|set| best_is_another(q_leaderboard(&set.score), set.score.metrics.q));
+        .any(|set| best_is_another(set.q_leaderboard, set.metrics.q));
     headings.push(Heading {
         detail: !apart,
         ..Heading::new("q_leaderboard", "Q leaderboard")
     });
-    let mut rows = Vec::new();
-    for ScoredSet {
-        set, kind, score, ..
-    } in scored
-    {
-        let mut row = vec![
-            set_cell(*set),
-            Cell::text(kind_label(*kind)),
-            Cell::number(score.images as f64, 0),
-        ];
-        row.extend(metric_cells(&score.metrics, &score.errors));
-        row.push(Cell::text(score.chosen.number().to_string()));
-        row.push(Cell::number(q_leaderboard(score), 2));
-        rows.push(row);
-    }
-    if scored.len() > 1 {
-        let (mean, errors) = means(scored);
-        let mut row = vec![
-            Cell::text("mean"),
-            Cell::Empty,
-            Cell::number(scored.iter().map(|s| s.score.images as f64).sum(), 0),
-        ];
-        row.extend(metric_cells(&mean, &errors));
-        row.push(Cell::Empty);
-        let best: f64 = scored.iter().map(|s| q_leaderboard(&s.score)).sum();
-        row.push(Cell::number(best / scored.len() as f64, 2));
-        rows.push(row);
+    let row = |names: [Cell; 2], sets: &[SetRecord], convention: Cell| {
+        let images: usize = sets.iter().map(|set| set.images.len()).sum();
+        let best: f64 = sets.iter().map(|set| set.q_leaderboard).sum();
+        let mut row = names.to_vec();
+        row.push(Cell::number(images as f64, 0));
+        row.extend(Metrics::ALL.map(|metric| metric_cell(metric, sets)));
+        row.push(convention);
+        row.push(Cell::number(best / sets.len() as f64, 2));
+        row
+    };
+    let mut rows: Vec<Vec<Cell>> = records
+        .iter()
+        .map(|record| {
+            let names = [set_cell(record), kind_cell(record)];
+            let convention = Cell::text(record.convention.to_string());
+            row(names, std::slice::from_ref(record), convention)
+        })
+        .collect();
+    if records.len() > 1 {
+        let names = [Cell::text("mean"), Cell::Empty];
+        rows.push(row(names, &records, Cell::Empty));
     }
     let counts: BTreeSet<usize> = scored.iter().map(|set| set.score.images).collect();
     let counts: Vec<String> = counts.iter().map(usize::to_string).collect();
@@ -239,7 +219,7 @@ pub fn per_set(scored: &[ScoredSet], title: &str, definition: Definition) -> Tab
         format!(
             "Images per set: {}.{}",
             counts.join(", "),
-            kinds_note(scored.iter().map(|set| set.kind))
+            kinds_note(&records)
         ),
         definition_note(definition),
     ];
@@ -252,21 +232,12 @@ pub fn per_set(scored: &[ScoredSet], title: &str, definition: Definition) -> Tab
     }
 }
 
-/// Whether the leaderboard's Q has another class of conventions than the metrics. Within a class Q differs by
-/// rounding only, at most 1e-7.
+// Whether the leaderboard's Q has another class of conventions than the metrics. Within a class Q differs by
+// rounding only, at most 1e-7.
 pub(super) fn best_is_another(q_leaderboard: f64, q: f64) -> bool {
     (q_leaderboard / q - 1.0).abs() > 1e-6
 }
 
-/// Q of the best of the eight conventions; NaN if the truth has no power.
-fn q_leaderboard(score: &SetScore) -> f64 {
-    match score.constant {
-        None => score.conventions[score.best.index()].quality.q,
-        Some(_) => f64::NAN,
-    }
-}
-
-/// Mean ellipticities of sets with constant true shear.
 fn constant_shear(scored: &[ScoredSet], title: &str) -> Table {
     let headings = [
         ("set", "Set"),
@@ -283,7 +254,7 @@ fn constant_shear(scored: &[ScoredSet], title: &str) -> Table {
         let mean = score.constant?;
         let shear = |value, error| Cell::with_error(value, Some(error), 5);
         Some(vec![
-            set_cell(scored.set),
+            set_cell(&scored.record),
             Cell::number(score.images as f64, 0),
             shear(mean.e[0], mean.error[0]),
             shear(mean.e[1], mean.error[1]),
@@ -301,91 +272,58 @@ fn constant_shear(scored: &[ScoredSet], title: &str) -> Table {
     }
 }
 
-/// Metrics of power spectra, with a row per set and a row of means. `kind_of` returns the kind of a set.
+/// Metrics of power spectra, with a row per set and a row of means. `zero_q` has Q of zero shear of each set.
 pub fn spectra(
-    scored: &[(Option<u32>, SpectrumScore)],
-    kind_of: impl Fn(u32) -> Option<SetKind>,
+    records: &[SetRecord],
+    zero_q: &[f64],
     title: &str,
     definition: Definition,
 ) -> Table {
-    let headings = vec![
-        Heading::new("set", "Set"),
-        Heading::new("kind", "Kind"),
-        Heading::new("q", "Q"),
-        Heading::new("sigma_sys_1e4", "σ_sys×10⁴"),
-        Heading::new("m_half", "M/2"),
-        Heading::new("sqrt_a", "√A×10⁴"),
-    ];
-    let metrics = |score: &SpectrumScore| {
-        [
-            (score.quality.q, score.quality_error),
-            (score.quality.sigma_sys * 1e4, f64::NAN),
-            (score.m_half, score.m_half_error),
-            (score.sqrt_a, score.sqrt_a_error),
-        ]
+    let metrics = ["q", "sigma_sys_1e4", "m_half", "sqrt_a"].map(Metrics::named);
+    let mut headings = vec![Heading::new("set", "Set"), Heading::new("kind", "Kind")];
+    let metrics = || metrics.into_iter().flatten();
+    headings.extend(metrics().map(|metric| Heading::new(metric.name, metric.heading)));
+    let row = |names: [Cell; 2], sets: &[SetRecord]| {
+        let mut row = names.to_vec();
+        row.extend(metrics().map(|metric| metric_cell(metric, sets)));
+        row
     };
-    let cells = |metrics: [(f64, f64); 4]| {
-        let decimals = [2, 4, 4, 4];
-        let pairs = metrics.into_iter().zip(decimals);
-        pairs.map(|((value, error), decimals)| Cell::with_error(value, Some(error), decimals))
-    };
-    let mut rows: Vec<Vec<Cell>> = scored
+    let mut rows: Vec<Vec<Cell>> = records
         .iter()
-        .map(|(set, score)| {
-            let kind = set.and_then(&kind_of);
-            let mut row = vec![set_cell(*set), Cell::text(kind_label(kind))];
-            row.extend(cells(metrics(score)));
-            row
-        })
+        .map(|set| row([set_cell(set), kind_cell(set)], std::slice::from_ref(set)))
         .collect();
-    if scored.len() > 1 {
-        let mean = |k: usize| {
-            let all: Vec<(f64, f64)> = scored.iter().map(|s| metrics(&s.1)[k]).collect();
-            mean_over_sets(&all)
-        };
-        let mut row = vec![Cell::text("mean"), Cell::Empty];
-        row.extend(cells(std::array::from_fn(mean)));
-        rows.push(row);
+    if records.len() > 1 {
+        rows.push(row([Cell::text("mean"), Cell::Empty], records));
     }
-    let definition = match definition {
-        Definition::Leaderboard => "leaderboard",
-        Definition::Corrected => "corrected",
-    };
-    let errors = match scored.iter().all(|s| s.1.quality_error.is_nan()) {
+    let errors = match records.iter().all(|set| set.errors.q.is_nan()) {
         true => "No errors, because no covariance of the bandpowers is known.",
         false => "Errors: from the covariance in the manifest, to first order.",
     };
-    let count = scored.len() as f64;
-    let mean = |q: fn(&SpectrumScore) -> f64| {
-        scored.iter().map(|(_, score)| q(score)).sum::<f64>() / count
-    };
-    let zero = zero_shear_line(
-        mean(|score| score.zero_quality.q),
-        mean(|score| score.quality.q),
-    );
+    let zero = zero_q.iter().sum::<f64>() / zero_q.len() as f64;
+    let mut notes = vec![format!(
+        "Metrics: {} definition. {errors} √A in 10⁻⁴ for C_ℓ in steradian.{}",
+        definition_word(definition),
+        kinds_note(records)
+    )];
+    notes.extend(zero_shear_line(zero, mean(records, |metrics| metrics.q).0));
     Table {
         title: title.to_owned(),
         headings,
         rows,
-        notes: vec![format!(
-            "Metrics: {definition} definition. {errors} √A in 10⁻⁴ for C_ℓ in steradian.{}",
-            kinds_note(scored.iter().map(|(set, _)| set.and_then(&kind_of)))
-        )]
-        .into_iter()
-        .chain(zero)
-        .collect(),
+        notes,
     }
 }
 
-/// True and measured bandpowers of every set.
 pub fn bandpowers(scored: &[ScoredSet]) -> Table {
     let power = |value: f64| Cell::number(value * 1e6, 4);
     let mut rows = Vec::new();
-    for ScoredSet { set, score, .. } in scored {
+    for own in scored {
+        let score = &own.score;
         let measured = score.spectra();
         for b in spectrum::bins(&score.bins.l) {
             rows.push(vec![
-                set.map_or(Cell::Empty, |set| Cell::number(f64::from(set), 0)),
+                own.number()
+                    .map_or(Cell::Empty, |set| Cell::number(f64::from(set), 0)),
                 Cell::number(b as f64 + 1.0, 0),
                 Cell::number(score.bins.l[b], 1),
                 power(score.true_ee[b]),
@@ -448,7 +386,7 @@ fn class_json(score: &SetScore, representative: &ConventionScore, class: Convent
     object
 }
 
-/// Keys of [`one_set_json`] that are undefined for a constant true shear.
+// Keys of [`one_set_json`] that are undefined for a constant true shear.
 const OF_TRUE_POWER: [&str; 15] = [
     "Q",
     "sigma_sys",
@@ -467,16 +405,11 @@ const OF_TRUE_POWER: [&str; 15] = [
     "classes",
 ];
 
-/// Description of the input in one set's JSON.
 #[derive(Debug, Clone)]
 pub struct SetInput {
-    /// Name of the case.
     pub case: String,
-    /// Truth file as given.
     pub truth: String,
-    /// Catalogues as given.
     pub catalogues: Vec<String>,
-    /// Bandpower definition.
     pub definition: Definition,
 }
 

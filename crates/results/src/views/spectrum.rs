@@ -5,7 +5,7 @@ use shearq_scoring::{BINS, SCORED};
 use shearq_render::figure::{LinePlot, Series, Style};
 use shearq_simulate::kinds::SetKind;
 
-/// Share of the highest power below which true power is rounding.
+// Share of the highest power below which true power is rounding.
 const ROUNDING: f64 = 1e-12;
 
 /// E-mode bandpowers of a set: (multipoles, truth, measured, standard errors).

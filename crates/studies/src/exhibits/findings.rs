@@ -9,6 +9,7 @@ use crate::reproduce::SetResult;
 use shearq_render::table::{Cell, Heading, Table};
 use shearq_results::compare::{Paired, difference};
 use shearq_simulate::kinds::{ImageType, SetKind};
+use std::slice::from_ref;
 
 /// A qualitative statement of the paper and the result of the simulation.
 #[derive(Debug, Clone, PartialEq)]
@@ -25,7 +26,8 @@ pub struct Finding {
 fn q_difference(results: &[SetResult], first: usize, second: usize) -> Option<(f64, f64, f64)> {
     let of_set = |set: &SetResult| {
         let [a, b] = [first, second].map(|configuration| &set.results[configuration].score);
-        difference(Paired::Q, &[a], &[b]).map(|paired| (paired.difference, paired.error))
+        difference(Paired::Q, from_ref(a), from_ref(b))
+            .map(|paired| (paired.difference, paired.error))
     };
     let differences = results.iter().map(of_set).collect::<Option<Vec<_>>>()?;
     let (difference, error) = weighted(results, &differences);

@@ -1,0 +1,570 @@
+//! The record of a scored set, with the one list of its columns: stores are written, conditions met, groups formed and
+//! tables printed by it. docs/files-stores.md describes the columns.
+
+use std::path::Path;
+
+use serde::{Deserialize, Serialize};
+use shearq_dataset::fingerprint::{self, Fingerprint};
+use shearq_dataset::layout::DataFolder;
+use shearq_dataset::record::nan_for_null;
+use shearq_dataset::run::Source;
+use shearq_files::FileError;
+use shearq_files::frames::TableError;
+use shearq_files::frames::polars::{Column as FrameColumn, DataFrame};
+use shearq_files::table::MAX_ROWS;
+use shearq_pipeline::PipelineError;
+use shearq_render::table::{Cell, Heading};
+use shearq_scoring::resample::mean_over_sets;
+use shearq_scoring::{
+    Choice, Convention, Definition, Metric, Metrics, Noise, Options, RowCounts, SetScore,
+    SpectrumScore,
+};
+use shearq_simulate::kinds::SetKind;
+use shearq_submissions::check_name;
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct SetRecord {
+    /// 0 for plain files, which have no number.
+    pub set: u32,
+    /// Whether the set was simulated; its number then gives its kind.
+    #[serde(default = "yes")]
+    pub simulated: bool,
+    /// [`fingerprint::of_set`], empty unless the record is stored.
+    pub data: String,
+    pub images: Vec<u32>,
+    pub galaxies: u64,
+    /// Galaxies without an ellipticity.
+    pub flagged: u64,
+    /// Metrics of the chosen convention.
+    pub metrics: Metrics,
+    pub errors: Metrics,
+    /// Q with each group of images left out in turn, for paired differences.
+    pub q_replicates: Vec<f64>,
+    #[serde(deserialize_with = "nan_for_null")]
+    pub q_calibrated_replicates: Vec<f64>,
+    /// The highest Q of the eight conventions.
+    #[serde(deserialize_with = "nan_for_null")]
+    pub q_leaderboard: f64,
+    pub convention: u8,
+    /// Whether the convention was given or clearly matched to the truth. Differences from other records are
+    /// meaningless otherwise.
+    pub convention_known: bool,
+    pub convention_leaderboard: u8,
+}
+
+fn yes() -> bool {
+    true
+}
+
+impl SetRecord {
+    pub fn kind(&self) -> Option<SetKind> {
+        SetKind::of(self.set).filter(|_| self.simulated)
+    }
+
+    /// The record of the set `set` of these images, in the standard convention and without a fingerprint of its data.
+    pub fn new(
+        set: u32,
+        simulated: bool,
+        images: Vec<u32>,
+        score: &SetScore,
+        rows: &RowCounts,
+    ) -> Self {
+        SetRecord {
+            set,
+            simulated,
+            data: String::new(),
+            images,
+            galaxies: (rows.used + rows.not_finite) as u64,
+            flagged: rows.not_finite as u64,
+            metrics: score.metrics,
+            errors: score.errors,
+            q_replicates: score.replicates.iter().map(|r| r.q).collect(),
+            q_calibrated_replicates: score.replicates.iter().map(|r| r.q_calibrated).collect(),
+            // Without true power, Q of every convention is a measure of noise.
+            q_leaderboard: match score.constant {
+                None => score.conventions[score.best.index()].quality.q,
+                Some(_) => f64::NAN,
+            },
+            convention: score.chosen.number(),
+            convention_known: true,
+            convention_leaderboard: score.best.number(),
+        }
+    }
+
+    pub fn of_spectrum(set: u32, simulated: bool, images: Vec<u32>, score: &SpectrumScore) -> Self {
+        let standard = Convention::STANDARD.number();
+        SetRecord {
+            set,
+            simulated,
+            data: String::new(),
+            images,
+            galaxies: 0,
+            flagged: 0,
+            metrics: score.metrics,
+            errors: score.errors,
+            q_replicates: Vec::new(),
+            q_calibrated_replicates: Vec::new(),
+            q_leaderboard: score.metrics.q,
+            convention: standard,
+            convention_known: true,
+            convention_leaderboard: standard,
+        }
+    }
+}
+
+/// The sets of one configuration, scored in one way.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RunRecord {
+    /// Name of the configuration, or of another program's catalogues.
+    pub configuration: String,
+    pub version: String,
+    /// TOML, or where the catalogues are.
+    pub settings: String,
+    /// Settings of the simulation as JSON, or the fingerprint of a data folder.
+    pub source: String,
+    pub definition: String,
+    /// `matched`, `best` or the number of a convention.
+    pub choice: String,
+    /// `measured`, or the given noise variance.
+    pub noise: String,
+    /// In ascending order.
+    pub sets: Vec<SetRecord>,
+}
+
+pub fn definition_word(definition: Definition) -> &'static str {
+    match definition {
+        Definition::Leaderboard => "leaderboard",
+        Definition::Corrected => "corrected",
+    }
+}
+
+impl RunRecord {
+    pub fn new(
+        configuration: &str,
+        settings: &str,
+        source: String,
+        options: Options,
+        sets: Vec<SetRecord>,
+    ) -> Self {
+        RunRecord {
+            configuration: configuration.to_owned(),
+            version: shearq_dataset::VERSION.into(),
+            settings: settings.to_owned(),
+            source,
+            definition: definition_word(options.definition).into(),
+            choice: match options.choice {
+                Choice::Matched => "matched".into(),
+                Choice::Best => "best".into(),
+                Choice::Insist(convention) => convention.number().to_string(),
+            },
+            noise: match options.noise {
+                Noise::Measured => "measured".into(),
+                Noise::Given(variance) => variance.to_string(),
+            },
+            sets,
+        }
+    }
+
+    /// The record with fingerprints of its data, by which a store recognises results that can be paired. They are
+    /// hashes of all truths and images, which only a store is worth.
+    pub fn with_fingerprints(
+        mut self,
+        source: &Source,
+        data: &DataFolder,
+    ) -> Result<Self, PipelineError> {
+        self.source = match source {
+            Source::Simulated(settings) => serde_json::to_string(settings)
+                .map_err(FileError::doing(data.root(), "cannot store the settings"))?,
+            Source::Folder { .. } => fingerprint::of_source(source, data)?,
+        };
+        for set in &mut self.sets {
+            set.data = fingerprint::of_set(source, data, set.set, &set.images)?;
+        }
+        Ok(self)
+    }
+
+    /// Fingerprint of version, settings, data and way of scoring, but not of sets and images: shards of a run share it.
+    pub fn id(&self) -> String {
+        let RunRecord {
+            configuration,
+            version,
+            settings,
+            source,
+            definition,
+            choice,
+            noise,
+            sets: _,
+        } = self;
+        let mut print = Fingerprint::default();
+        for part in [
+            configuration,
+            version,
+            settings,
+            source,
+            definition,
+            choice,
+            noise,
+        ] {
+            print.add(part);
+        }
+        print.finish()
+    }
+}
+
+/// A column of a store, and of the tables that are printed from records.
+#[derive(Debug, Clone, Copy)]
+pub struct Column {
+    pub name: &'static str,
+    heading: &'static str,
+    value: Value,
+}
+
+// The type of a column. It determines how a cell shows several sets.
+#[derive(Debug, Clone, Copy)]
+enum Value {
+    /// The text of the first set.
+    Text(fn(&RunRecord, &SetRecord) -> String),
+    /// The sum.
+    Count(fn(&SetRecord) -> u64),
+    /// The mean.
+    Real(fn(&SetRecord) -> f64),
+    /// The mean with its error.
+    Metric(Metric),
+}
+
+const fn text(
+    name: &'static str,
+    heading: &'static str,
+    value: fn(&RunRecord, &SetRecord) -> String,
+) -> Column {
+    let value = Value::Text(value);
+    Column {
+        name,
+        heading,
+        value,
+    }
+}
+
+const fn count(name: &'static str, heading: &'static str, value: fn(&SetRecord) -> u64) -> Column {
+    let value = Value::Count(value);
+    Column {
+        name,
+        heading,
+        value,
+    }
+}
+
+fn kind(set: &SetRecord, label: fn(&SetKind) -> &'static str) -> String {
+    set.kind().as_ref().map_or("", label).to_owned()
+}
+
+const BEFORE_METRICS: [Column; 20] = [
+    text("run", "Run", |run, _| run.id()),
+    text("submission", "Configuration", |run, _| {
+        run.configuration.clone()
+    }),
+    text("version", "Version", |run, _| run.version.clone()),
+    text("settings", "Settings", |run, _| run.settings.clone()),
+    text("source", "Source", |run, _| run.source.clone()),
+    text("definition", "Definition", |run, _| run.definition.clone()),
+    text("choice", "Choice", |run, _| run.choice.clone()),
+    text("noise", "Noise", |run, _| run.noise.clone()),
+    count("set", "Set", |set| set.set.into()),
+    text("set_kind", "Kind", |_, set| kind(set, |k| k.image.label())),
+    text("psf", "PSF", |_, set| kind(set, |k| k.psf.label())),
+    text("psf_profile", "PSF profile", |_, set| {
+        kind(set, |k| k.image.psf_profile())
+    }),
+    text("ellipticity", "Ellipticity", |_, set| {
+        kind(set, |k| k.ellipticity.label())
+    }),
+    text("snr", "S/N", |_, set| kind(set, |k| k.image.snr_class())),
+    text("size", "Size", |_, set| kind(set, |k| k.image.size_class())),
+    text("data", "Data", |_, set| set.data.clone()),
+    count("images", "Images", |set| set.images.len() as u64),
+    text("image_numbers", "Image numbers", |_, set| list(&set.images)),
+    count("galaxies", "Galaxies", |set| set.galaxies),
+    count("flagged", "Flagged", |set| set.flagged),
+];
+
+const AFTER_METRICS: [Column; 6] = [
+    Column {
+        name: "q_leaderboard",
+        heading: "Q leaderboard",
+        value: Value::Real(|set| set.q_leaderboard),
+    },
+    count("convention", "Conv.", |set| set.convention.into()),
+    count("convention_known", "Conv. known", |set| {
+        set.convention_known.into()
+    }),
+    count("convention_leaderboard", "Conv. leaderboard", |set| {
+        set.convention_leaderboard.into()
+    }),
+    text("q_replicates", "Q replicates", |_, set| {
+        list(&set.q_replicates)
+    }),
+    text("q_calibrated_replicates", "Q cal. replicates", |_, set| {
+        list(&set.q_calibrated_replicates)
+    }),
+];
+
+pub fn columns() -> impl Iterator<Item = Column> {
+    let metrics = Metrics::ALL.into_iter().map(|metric| Column {
+        name: metric.name,
+        heading: metric.heading,
+        value: Value::Metric(metric),
+    });
+    BEFORE_METRICS
+        .into_iter()
+        .chain(metrics)
+        .chain(AFTER_METRICS)
+}
+
+/// The columns called `names`, in this order.
+pub fn columns_named(names: &[&str]) -> Vec<Column> {
+    let named = |name: &&str| columns().find(|column| column.name == *name);
+    names.iter().filter_map(named).collect()
+}
+
+// The mean of a text or a convention over sets has no meaning, so that such columns are printed for single sets and for
+// groups in which they are equal.
+impl Column {
+    pub fn heading(&self) -> Heading {
+        Heading::new(self.name, self.heading)
+    }
+
+    /// The cell of some sets of `run`.
+    pub fn cell(&self, run: &RunRecord, sets: &[SetRecord]) -> Cell {
+        let count = sets.len() as f64;
+        match self.value {
+            Value::Text(value) => match sets.first() {
+                Some(set) => Cell::text(value(run, set)),
+                None => Cell::Empty,
+            },
+            Value::Count(value) => Cell::number(sets.iter().map(value).sum::<u64>() as f64, 0),
+            Value::Real(value) => Cell::number(sets.iter().map(value).sum::<f64>() / count, 2),
+            Value::Metric(metric) => metric_cell(metric, sets),
+        }
+    }
+}
+
+/// The mean of a metric over sets, with its error.
+pub fn metric_cell(metric: Metric, sets: &[SetRecord]) -> Cell {
+    let (value, error) = mean(sets, metric.value);
+    Cell::with_error(value, Some(error), metric.decimals)
+}
+
+/// Mean of a metric over sets, and its error.
+pub fn mean(sets: &[SetRecord], metric: fn(&Metrics) -> f64) -> (f64, f64) {
+    let pairs: Vec<(f64, f64)> = sets
+        .iter()
+        .map(|set| (metric(&set.metrics), metric(&set.errors)))
+        .collect();
+    mean_over_sets(&pairs)
+}
+
+/// The frame of a store: a row per set of each run. A metric has a second column with its error.
+pub fn frame_of(runs: &[RunRecord]) -> Result<DataFrame, TableError> {
+    let sets = runs
+        .iter()
+        .flat_map(|run| run.sets.iter().map(move |set| (run, set)));
+    let real = |name: &str, value: &dyn Fn(&SetRecord) -> f64| {
+        let values: Vec<f64> = sets.clone().map(|(_, set)| value(set)).collect();
+        FrameColumn::new(name.into(), values)
+    };
+    let mut frame = Vec::new();
+    for Column { name, value, .. } in columns() {
+        match value {
+            Value::Text(value) => {
+                let texts: Vec<String> = sets.clone().map(|(run, set)| value(run, set)).collect();
+                frame.push(FrameColumn::new(name.into(), texts));
+            }
+            Value::Count(value) => {
+                let counts: Vec<i64> = sets.clone().map(|(_, set)| value(set) as i64).collect();
+                frame.push(FrameColumn::new(name.into(), counts));
+            }
+            Value::Real(value) => frame.push(real(name, &value)),
+            Value::Metric(Metric { value, .. }) => {
+                frame.push(real(name, &|set| value(&set.metrics)));
+                frame.push(real(&format!("{name}_error"), &|set| value(&set.errors)));
+            }
+        }
+    }
+    shearq_files::frames::frame(frame)
+}
+
+// Numbers as a JSON list with all digits. JSON has no NaN, so that numbers that are not finite become null.
+fn list<T: ToString + Copy + Into<f64>>(numbers: &[T]) -> String {
+    let text = |number: &T| match (*number).into().is_finite() {
+        true => number.to_string(),
+        false => "null".into(),
+    };
+    let texts: Vec<String> = numbers.iter().map(text).collect();
+    format!("[{}]", texts.join(","))
+}
+
+/// The run whose sets are the rows of the frame of a file.
+pub fn run_of_frame(frame: &DataFrame, path: &Path) -> Result<RunRecord, FileError> {
+    let rows = Rows { path, frame };
+    let text = |name| rows.text(name, 0).map(str::to_owned);
+    let configuration = text("submission")?;
+    check_name(&configuration).map_err(|error| FileError::new(path, error.to_string()))?;
+    let run = RunRecord {
+        configuration,
+        version: text("version")?,
+        settings: text("settings")?,
+        source: text("source")?,
+        definition: text("definition")?,
+        choice: text("choice")?,
+        noise: text("noise")?,
+        sets: (0..frame.height())
+            .map(|row| rows.set(row))
+            .collect::<Result<_, _>>()?,
+    };
+    // The settings determine the id, so that an edited setting is noticed.
+    let id = run.id();
+    for row in 0..frame.height() {
+        let found = rows.text("run", row)?;
+        if found != id {
+            let message = format!(
+                "row {}: `run` disagrees with the other columns (found {found}, expected {id}). Was the file edited?",
+                row + 1
+            );
+            return Err(FileError::new(path, message));
+        }
+    }
+    Ok(run)
+}
+
+// Rows of a file. Every value is checked, because other programs write Parquet, too.
+struct Rows<'a> {
+    path: &'a Path,
+    frame: &'a DataFrame,
+}
+
+impl Rows<'_> {
+    fn found<T>(
+        &self,
+        name: &str,
+        row: usize,
+        expected: &str,
+        value: impl FnOnce(&FrameColumn) -> Option<T>,
+    ) -> Result<T, FileError> {
+        let column = self.frame.column(name).ok();
+        column.and_then(value).ok_or_else(|| {
+            let message = format!("row {}: column `{name}`: expected a {expected}", row + 1);
+            FileError::new(self.path, message)
+        })
+    }
+
+    fn text(&self, name: &str, row: usize) -> Result<&str, FileError> {
+        let column = self.frame.column(name).ok();
+        let text = column.and_then(|column| column.str().ok()?.get(row));
+        self.found(name, row, "text", |_| text)
+    }
+
+    fn real(&self, name: &str, row: usize) -> Result<f64, FileError> {
+        self.found(name, row, "real number", |column| {
+            column.f64().ok()?.get(row)
+        })
+    }
+
+    fn count<T: TryFrom<i64>>(&self, name: &str, row: usize) -> Result<T, FileError> {
+        self.found(name, row, "number in the range of counts", |column| {
+            T::try_from(column.i64().ok()?.get(row)?).ok()
+        })
+    }
+
+    // A count that would overflow sums if it were larger than any data have.
+    fn at_most(&self, name: &str, row: usize, most: u64) -> Result<u64, FileError> {
+        match self.count::<u64>(name, row)? {
+            found if found <= most => Ok(found),
+            found => {
+                let message = format!(
+                    "row {}: column `{name}` is {found}; expected at most {most}",
+                    row + 1
+                );
+                Err(FileError::new(self.path, message))
+            }
+        }
+    }
+
+    fn list<T>(&self, name: &str, row: usize) -> Result<Vec<T>, FileError>
+    where
+        Vec<T>: serde::de::DeserializeOwned,
+    {
+        let text = self.text(name, row)?;
+        self.found(name, row, "list of numbers", |_| {
+            serde_json::from_str(text).ok()
+        })
+    }
+
+    fn reals(&self, name: &str, row: usize) -> Result<Vec<f64>, FileError> {
+        let numbers = self.list::<Option<f64>>(name, row)?;
+        Ok(numbers.into_iter().map(|x| x.unwrap_or(f64::NAN)).collect())
+    }
+
+    fn metrics(&self, ending: &str, row: usize) -> Result<Metrics, FileError> {
+        let mut values = [f64::NAN; Metrics::ALL.len()];
+        for (value, Metric { name, .. }) in values.iter_mut().zip(Metrics::ALL) {
+            let column = format!("{name}{ending}");
+            // Files of earlier versions lack metrics that were added later.
+            if name == Metrics::ALWAYS || self.frame.column(&column).is_ok() {
+                *value = self.real(&column, row)?;
+            }
+        }
+        Ok(Metrics::from_values(values))
+    }
+
+    fn set(&self, row: usize) -> Result<SetRecord, FileError> {
+        let images: Vec<u32> = self.list("image_numbers", row)?;
+        self.at_most("images", row, images.len() as u64)?;
+        let galaxies = self.at_most("galaxies", row, images.len() as u64 * MAX_ROWS as u64)?;
+        let kind = self.text("set_kind", row);
+        Ok(SetRecord {
+            set: self.count("set", row)?,
+            simulated: kind.is_ok_and(|kind| !kind.is_empty()),
+            data: self.text("data", row)?.to_owned(),
+            images,
+            galaxies,
+            flagged: self.at_most("flagged", row, galaxies)?,
+            metrics: self.metrics("", row)?,
+            errors: self.metrics("_error", row)?,
+            q_replicates: self.reals("q_replicates", row)?,
+            q_calibrated_replicates: self.reals("q_calibrated_replicates", row)?,
+            q_leaderboard: self.real("q_leaderboard", row)?,
+            convention: self.count("convention", row)?,
+            convention_known: self.count::<u8>("convention_known", row)? > 0,
+            convention_leaderboard: self.count("convention_leaderboard", row)?,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn unknown_numbers_are_read_back_from_json() {
+        let record = SetRecord {
+            set: 20,
+            simulated: true,
+            data: String::new(),
+            images: vec![1],
+            galaxies: 64,
+            flagged: 0,
+            metrics: Metrics::unknown(),
+            errors: Metrics::unknown(),
+            q_replicates: Vec::new(),
+            q_calibrated_replicates: vec![f64::NAN],
+            q_leaderboard: f64::NAN,
+            convention: 5,
+            convention_known: true,
+            convention_leaderboard: 5,
+        };
+        let text = serde_json::to_string(&record).unwrap();
+        let read: SetRecord = serde_json::from_str(&text).unwrap();
+        assert!(read.q_leaderboard.is_nan() && read.q_calibrated_replicates[0].is_nan());
+        assert_eq!((read.set, read.images), (20, vec![1]));
+    }
+}
