@@ -7,11 +7,11 @@ use ndarray::ArrayView2;
 use shearq_benches::{configuration, stamp};
 use shearq_measure::Measurer;
 use shearq_measure::parts::{
-    AdaptiveMoments, Autocorrelation, Network, Rule, Spectral, Step, WaveletWiener,
+    AdaptiveMoments, ClippedAcf, Network, Rule, Spectral, Step, WaveletWiener,
 };
 use shearq_quantities::Shear;
 use shearq_quantities::{FunctionalPsf, PsfProfile};
-use shearq_submissions::{Clipping, Kept, Start};
+use shearq_submissions::{Clipping, Kept, Method, PsfScale, Start};
 
 fn moffat(size: usize) -> ndarray::Array2<f64> {
     let profile = PsfProfile::Moffat { beta: 3.0 };
@@ -22,8 +22,11 @@ fn moffat(size: usize) -> ndarray::Array2<f64> {
 fn network(c: &mut Criterion) {
     let mut group = c.benchmark_group("network_10_iterations");
     for n in [11, 19, 23, 29, 48] {
-        let mut network = Network::<f32>::plan(n, 15, 1e-4).expect("a valid size");
-        network.set_psf(moffat(15).view()).expect("a valid PSF");
+        let mut network = Network::plan(n, 15, 1e-4).expect("a valid size");
+        let psf = moffat(15);
+        network
+            .set_psf(psf.view(), PsfScale::Sum)
+            .expect("a valid PSF");
         let rule = Rule {
             step: Step::Adaptive(0.25),
             unit: 1e-3,
@@ -42,13 +45,16 @@ fn network(c: &mut Criterion) {
 }
 
 fn autocorrelation(c: &mut Criterion) {
+    let configuration = configuration("23/raw/star");
+    let Method::Network(settings) = &configuration.method else {
+        panic!("23/raw/star is a network");
+    };
     let mut group = c.benchmark_group("autocorrelation");
     for n in [11, 19, 23, 29, 48] {
-        let plan = Autocorrelation::new(n);
-        let mut scratch = plan.scratch();
-        let (data, mut out) = (stamp(n), vec![0.0; plan.len()]);
+        let plan = ClippedAcf::new(n, &settings.shape);
+        let (data, mut scratch) = (stamp(n), plan.scratch());
         group.bench_function(BenchmarkId::from_parameter(n), |b| {
-            b.iter(|| plan.compute(black_box(&data), &mut scratch, &mut out));
+            b.iter(|| plan.autocorrelate(black_box(&data), &mut scratch));
         });
     }
     group.finish();
@@ -82,6 +88,7 @@ fn linear(c: &mut Criterion) {
         let plan = Spectral::new(n, n, settings).expect("valid sizes");
         let white = plan.noise(&shearq_measure::StampNoise::white(1.0));
         let (mut psf, mut scratch, mut lags) = (plan.psf(), plan.scratch(), plan.lags());
+        let mut turned = plan.lags().acf;
         let moffat = moffat(n);
         group.bench_function(BenchmarkId::new("take a PSF", n), |b| {
             b.iter(|| plan.set_psf(black_box(moffat.view()), &white, &mut scratch, &mut psf));
@@ -93,7 +100,7 @@ fn linear(c: &mut Criterion) {
             b.iter(|| plan.autocorrelate(&psf, black_box(&data), 1.0, &mut scratch, &mut lags));
         });
         group.bench_function(BenchmarkId::new("field of noise", n), |b| {
-            b.iter(|| plan.noise_field(&psf, black_box(1), &mut scratch, &mut lags));
+            b.iter(|| plan.noise_field(&psf, black_box(1), &mut scratch, &mut lags, &mut turned));
         });
     }
     let reach = 10;

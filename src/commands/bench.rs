@@ -127,7 +127,6 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         &speed::sizes_figure(&costs),
         "Cost against stamp size.",
     )?;
-    output.table("operator-forms", &speed::operator_forms(settings)?)?;
     output.section(
         "Convergence",
         "Energy of the network with and without momentum.",

@@ -44,7 +44,6 @@ mod denoise;
 mod error;
 mod examine;
 mod extent;
-mod fft;
 mod measurement;
 mod measurer;
 mod method;
@@ -59,6 +58,7 @@ mod shape;
 mod sheared;
 mod sky;
 mod surroundings;
+mod transform;
 mod warning;
 
 pub use calibration::{MeanShear, MeanShearError, ShearSum, calibrate};

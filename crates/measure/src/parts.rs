@@ -2,12 +2,10 @@
 //! sizes planned.
 
 pub use crate::deconvolve::{
-    Lags, Matrices, ModeNoise, Network, NetworkScratch, Rule, Spectral, SpectralPsf,
-    SpectralScratch, Step, Wide, convolve, psf_factor,
+    Lags, ModeNoise, Network, NetworkScratch, Rule, Spectral, SpectralPsf, SpectralScratch, Step,
+    convolve, psf_factor,
 };
 pub use crate::denoise::{DenoiseScratch, WaveletWiener, border_noise, frame};
-pub use crate::fft::{FftScratch, StampFft};
 pub use crate::shape::{
-    AcfScratch, AdaptiveMoments, AdaptiveScratch, AdaptiveShape, Autocorrelation, ClippedAcf,
-    ClippedAcfScratch, ClippedMoments, Moments,
+    AdaptiveMoments, AdaptiveScratch, AdaptiveShape, ClippedAcf, ClippedAcfScratch, Moments,
 };

@@ -21,7 +21,6 @@ pub mod product;
 mod psf;
 pub mod radial;
 mod range;
-pub mod real;
 pub mod statistics;
 pub mod units;
 

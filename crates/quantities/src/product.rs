@@ -3,8 +3,6 @@
 
 use multiversion::multiversion;
 
-use crate::real::Real;
-
 /// Columns that are summed side by side.
 pub const LANES: usize = 16;
 /// Multiple of the rows of a product.
@@ -12,16 +10,16 @@ pub const ROWS: usize = 8;
 
 /// A part of a matrix in row-major order.
 #[derive(Debug, Clone, Copy)]
-pub struct Matrix<'a, T = f32> {
+pub struct Matrix<'a> {
     /// The numbers, from the first of the part.
-    pub values: &'a [T],
+    pub values: &'a [f32],
     /// Numbers between the beginnings of two rows.
     pub stride: usize,
 }
 
-impl<'a, T> Matrix<'a, T> {
+impl<'a> Matrix<'a> {
     /// Rows of `stride` numbers.
-    pub fn new(values: &'a [T], stride: usize) -> Self {
+    pub fn new(values: &'a [f32], stride: usize) -> Self {
         Matrix { values, stride }
     }
 }
@@ -35,40 +33,40 @@ impl<'a, T> Matrix<'a, T> {
 pub fn multiply(left: Matrix<'_>, right: Matrix<'_>, inner: usize, out: &mut [f32], width: usize) {
     // As many rows at a time as there are registers for.
     multiversion::target::match_target! {
-        "x86_64+avx512f" => product::<_, ROWS, true>(left, right, inner, out, width),
-        "x86_64+fma" => product::<_, 4, true>(left, right, inner, out, width),
-        "aarch64" => product::<_, 4, true>(left, right, inner, out, width),
-        _ => product::<_, 4, false>(left, right, inner, out, width),
+        "x86_64+avx512f" => product::<ROWS, true>(left, right, inner, out, width),
+        "x86_64+fma" => product::<4, true>(left, right, inner, out, width),
+        "aarch64" => product::<4, true>(left, right, inner, out, width),
+        _ => product::<4, false>(left, right, inner, out, width),
     }
 }
 
-/// The product as [`multiply`] defines it, `R` rows at a time, for callers that are compiled for an instruction set
-/// themselves.
+/// The product as [`multiply`] defines it, `R` rows at a time: public so that tests compare all of its forms on any processor.
+#[doc(hidden)]
 #[inline(always)]
-pub fn product<T: Real, const R: usize, const FUSED: bool>(
-    left: Matrix<'_, T>,
-    right: Matrix<'_, T>,
+pub fn product<const R: usize, const FUSED: bool>(
+    left: Matrix<'_>,
+    right: Matrix<'_>,
     inner: usize,
-    out: &mut [T],
+    out: &mut [f32],
     width: usize,
 ) {
     debug_assert!(width.is_multiple_of(LANES) && out.len().is_multiple_of(ROWS * width));
     match left.stride {
-        16 => bands::<T, R, 16, FUSED>(left, right, inner, out, width),
-        32 => bands::<T, R, 32, FUSED>(left, right, inner, out, width),
-        48 => bands::<T, R, 48, FUSED>(left, right, inner, out, width),
-        64 => bands::<T, R, 64, FUSED>(left, right, inner, out, width),
-        _ => bands::<T, R, 0, FUSED>(left, right, inner, out, width),
+        16 => bands::<R, 16, FUSED>(left, right, inner, out, width),
+        32 => bands::<R, 32, FUSED>(left, right, inner, out, width),
+        48 => bands::<R, 48, FUSED>(left, right, inner, out, width),
+        64 => bands::<R, 64, FUSED>(left, right, inner, out, width),
+        _ => bands::<R, 0, FUSED>(left, right, inner, out, width),
     }
 }
 
 /// The product for a stride of `S`, or for any if it is zero, [`LANES`] columns at a time.
 #[inline(always)]
-fn bands<T: Real, const R: usize, const S: usize, const FUSED: bool>(
-    left: Matrix<'_, T>,
-    right: Matrix<'_, T>,
+fn bands<const R: usize, const S: usize, const FUSED: bool>(
+    left: Matrix<'_>,
+    right: Matrix<'_>,
     inner: usize,
-    out: &mut [T],
+    out: &mut [f32],
     width: usize,
 ) {
     let stride = if S == 0 { left.stride } else { S };
@@ -82,17 +80,17 @@ fn bands<T: Real, const R: usize, const S: usize, const FUSED: bool>(
         let out = &mut out[to..][..R * width];
         (to, from) = (to + R * width, from + R * stride);
         for column in (0..width).step_by(LANES) {
-            let mut sums = [[T::ZERO; LANES]; R];
+            let mut sums = [[0.0f32; LANES]; R];
             for i in 0..inner {
                 // A copy, which stays in a register for all rows.
-                let line: [T; LANES] = *right.values[i * right.stride + column..]
+                let line: [f32; LANES] = *right.values[i * right.stride + column..]
                     .first_chunk()
                     .expect("LANES columns");
                 // Written out: of a loop, the compiler would make vectors across rows.
                 macro_rules! rows {
                     ($($k:literal)*) => {$(
                         if $k < R {
-                            add::<T, FUSED>(&mut sums[$k], rows[$k * stride + i], &line);
+                            add::<FUSED>(&mut sums[$k], rows[$k * stride + i], &line);
                         }
                     )*};
                 }
@@ -106,9 +104,13 @@ fn bands<T: Real, const R: usize, const S: usize, const FUSED: bool>(
 }
 
 #[inline(always)]
-fn add<T: Real, const FUSED: bool>(sums: &mut [T; LANES], factor: T, line: &[T; LANES]) {
+fn add<const FUSED: bool>(sums: &mut [f32; LANES], factor: f32, line: &[f32; LANES]) {
     for (sum, value) in sums.iter_mut().zip(line) {
-        *sum = sum.add_product::<FUSED>(factor, *value);
+        *sum = if FUSED {
+            factor.mul_add(*value, *sum)
+        } else {
+            *sum + factor * value
+        };
     }
 }
 

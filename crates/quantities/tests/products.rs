@@ -43,9 +43,9 @@ fn products_are_plain_sums_for_all_sizes_and_strides_and_dirty_results() {
         let right = Matrix::new(&b, width + more);
         let mut all = vec![vec![f32::NAN; rows * width]; 4];
         multiply(left, right, inner, &mut all[0], width);
-        product::<_, ROWS, true>(left, right, inner, &mut all[1], width);
-        product::<_, 4, true>(left, right, inner, &mut all[2], width);
-        product::<_, 4, false>(left, right, inner, &mut all[3], width);
+        product::<ROWS, true>(left, right, inner, &mut all[1], width);
+        product::<4, true>(left, right, inner, &mut all[2], width);
+        product::<4, false>(left, right, inner, &mut all[3], width);
         // The number of rows at a time does not matter.
         assert_eq!(all[1], all[2]);
         if fuses() {

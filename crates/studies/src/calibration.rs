@@ -20,7 +20,7 @@ use shearq_measure::parts::{
 };
 use shearq_quantities::{Distortion, Shear};
 use shearq_quantities::{FunctionalPsf, PsfProfile};
-use shearq_submissions::{Configuration, NetworkDeconvolution, Update};
+use shearq_submissions::{Configuration, NetworkDeconvolution, PsfScale, Update};
 
 use super::speed::network_of;
 use shearq_pipeline::PipelineError;
@@ -240,15 +240,15 @@ struct LambdaStudy {
     n: usize,
     p: usize,
     settings: NetworkDeconvolution,
-    networks: Vec<Network<f32>>,
-    ctr_network: Network<f32>,
+    networks: Vec<Network>,
+    ctr_network: Network,
     acf: ClippedAcf,
 }
 
 struct LambdaScratch {
-    networks: Vec<Network<f32>>,
-    ctr_network: Network<f32>,
-    buffers: NetworkScratch<f32>,
+    networks: Vec<Network>,
+    ctr_network: Network,
+    buffers: NetworkScratch,
     acf_scratch: ClippedAcfScratch,
     out: Vec<f32>,
 }
@@ -309,7 +309,7 @@ impl LambdaStudy {
             .iter_mut()
             .chain([&mut scratch.ctr_network])
         {
-            network.set_psf(galaxy.psf.view())?;
+            network.set_psf(galaxy.psf.view(), PsfScale::Sum)?;
         }
         for (rule, update) in UPDATES.into_iter().enumerate() {
             for (s, snr) in SNR_DB.into_iter().enumerate() {
@@ -383,7 +383,7 @@ impl LambdaStudy {
 
     fn run(
         &self,
-        network: &Network<f32>,
+        network: &Network,
         update: Update,
         galaxy: &Synthetic,
         stamp: &[f32],

@@ -40,8 +40,8 @@ pub fn convergence(
     let (n, p) = (configuration.stamp.size, configuration.psf.size);
     let deconvolution = &network_of(configuration)?.deconvolution;
     let lambda = deconvolution.printed_lambda(deconvolution.lambda);
-    let mut network = Network::<f32>::plan(n, p, lambda)?;
-    network.set_scaled_psf(inputs.psf(p).view(), deconvolution.psf_scale)?;
+    let mut network = Network::plan(n, p, lambda)?;
+    network.set_psf(inputs.psf(p).view(), deconvolution.psf_scale)?;
     let mut scratch = network.scratch();
     let mut out = vec![0.0; n * n];
     let galaxies: Vec<(Vec<f32>, Rule, f64)> = inputs

@@ -9,18 +9,14 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 use shearq_measure::parts::{
-    AdaptiveMoments, ClippedAcf, Matrices, Network, Rule, Spectral, StampFft, Step, WaveletWiener,
-    border_noise,
+    AdaptiveMoments, ClippedAcf, Network, Rule, Spectral, WaveletWiener, border_noise,
 };
 use shearq_measure::{ImageNoise, Measurer, StampNoise, Worker};
 use shearq_quantities::statistics::median;
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_scoring::{Options, TruthSign};
 use shearq_submissions::limits::{MAX_PSF, WINDOWS};
-use shearq_submissions::{
-    Clipping, Configuration, Kept, LinearMethod, Method, NetworkMethod, NoiseSource, PsfCut, Start,
-    Update,
-};
+use shearq_submissions::{Configuration, LinearMethod, Method, NetworkMethod, NoiseSource, PsfCut};
 
 use shearq_files::frames::frame;
 use shearq_files::frames::polars::Column;
@@ -301,8 +297,8 @@ fn network_stages(
 ) -> Result<Vec<String>, PipelineError> {
     let settings = &method.deconvolution;
     let lambda = settings.printed_lambda(settings.lambda);
-    let mut network = Network::<f32>::plan(n, psf.nrows(), lambda)?;
-    let factor = network.set_scaled_psf(psf, settings.psf_scale)?;
+    let mut network = Network::plan(n, psf.nrows(), lambda)?;
+    network.set_psf(psf, settings.psf_scale)?;
     let mut scratch = network.scratch();
     let mut out = vec![0.0; n * n];
     let rules: Vec<Option<Rule>> = cut
@@ -323,43 +319,24 @@ fn network_stages(
     });
     rows.push(("deconvolve", network_time));
     let shape = ClippedAcf::new(n, &method.shape);
-    let acf = shape.autocorrelation();
-    let mut acf_scratch = acf.scratch();
-    let mut lags = vec![0.0; acf.len()];
+    let mut shape_scratch = shape.scratch();
     rows.push((
         "autocorrelation",
         time(|k| {
-            let _ = acf.compute(black_box(&cut[k]), &mut acf_scratch, &mut lags);
+            let _ = shape.autocorrelate(black_box(&cut[k]), &mut shape_scratch);
         }),
     ));
-    acf.compute(&out, &mut acf_scratch, &mut lags)?;
+    shape.autocorrelate(&out, &mut shape_scratch)?;
     let light = out.iter().map(|&v| f64::from(v)).sum();
-    let moments = shape.moments();
     rows.push((
         "moments",
         time(|_| {
-            let _ = black_box(moments.measure(black_box(&lags), light));
+            let _ = black_box(shape.moments(black_box(shape_scratch.acf()), light));
         }),
     ));
-    let mut notes = vec![format!(
+    Ok(vec![format!(
         "The network made {iterations} iterations of the last galaxy."
-    )];
-    // The reference's matrices take n⁴ numbers.
-    if n <= 32 && settings.update != Update::Constant {
-        let scaled = psf.mapv(|value| value * factor);
-        let matrices = Matrices::new(n, scaled.view(), lambda);
-        let data: Vec<f64> = cut[0].iter().map(|&v| f64::from(v)).collect();
-        if let (Some(rule), Ok(view)) = (&rules[0], ArrayView2::from_shape((n, n), &data)) {
-            let start = Instant::now();
-            black_box(matrices.deconvolve(rule, view)?);
-            let plain = start.elapsed().as_secs_f64() * 1e6;
-            notes.push(format!(
-                "The plain reference (dense matrices, f64) takes {plain:.0} µs for the deconvolution, {:.0} times as long.",
-                plain / network_time
-            ));
-        }
-    }
-    Ok(notes)
+    )])
 }
 
 /// Stages of the linear network.
@@ -392,79 +369,6 @@ fn linear_stages(
         }),
     ));
     Ok(())
-}
-
-/// Cost of one application of H by dense products, as the network does it, and by fast transforms, against
-/// the sizes of stamp and PSF.
-///
-/// # Errors
-/// If a size is invalid.
-pub fn operator_forms(settings: SimulationSettings) -> Result<Table, PipelineError> {
-    let inputs = Inputs::new(settings)?;
-    let mut rows = Vec::new();
-    for (n, p) in [
-        (19, 15),
-        (23, 15),
-        (29, 15),
-        (29, 21),
-        (48, 15),
-        (48, 25),
-        (48, 48),
-    ] {
-        let psf = inputs.psf(p);
-        let cut = inputs.cuts(n);
-        let mut network = Network::<f32>::plan(n, p, 0.0)?;
-        network.set_psf(psf.view())?;
-        let mut scratch = network.scratch();
-        let mut out = vec![0.0; n * n];
-        let mut of = |max_iterations: usize| {
-            let rule = Rule {
-                step: Step::Adaptive(1.0),
-                unit: 1e-6,
-                max_iterations,
-                start: Start::ClippedData,
-                clipping: Clipping::BeforeTest,
-                kept: Kept::Lowest,
-            };
-            time(|k| {
-                let _ = black_box(network.deconvolve(&rule, &cut[k], &mut scratch, &mut out));
-            })
-        };
-        // An iteration applies H and its transpose.
-        let products = (of(11) - of(1)) / 20.0;
-        let fft = StampFft::new(n + p - 1);
-        let (mut spectrum, mut buffers) = (fft.spectrum(), fft.scratch());
-        let kernel = spectrum.clone();
-        let transforms = time(|k| {
-            let rows = cut[k].chunks_exact(n).map(|row| row.iter().copied());
-            fft.rows(rows, &mut buffers, &mut spectrum);
-            fft.columns(&mut buffers, &mut spectrum);
-            for (value, factor) in spectrum.iter_mut().zip(&kernel) {
-                *value *= factor;
-            }
-            fft.columns_back(&mut buffers, &mut spectrum);
-            for y in 0..n {
-                black_box(fft.row_back(&spectrum, y, &mut buffers));
-            }
-        });
-        rows.push(vec![
-            Cell::number(n as f64, 0),
-            Cell::number(p as f64, 0),
-            Cell::number(products, 2),
-            Cell::number(transforms, 2),
-        ]);
-    }
-    Ok(Table {
-        title: "One application of the convolution H".into(),
-        headings: vec![
-            Heading::new("stamp", "Stamp [px]"),
-            Heading::new("psf", "PSF [px]"),
-            Heading::new("products_microseconds", "by products [µs]"),
-            Heading::new("fft_microseconds", "by FFT [µs]"),
-        ],
-        rows,
-        notes: vec!["The time by products is half of an iteration, with thresholds, clipping and energy. The FFT form does not include them.".into()],
-    })
 }
 
 fn centre(stamp: &[f32], n: usize) -> Vec<f32> {

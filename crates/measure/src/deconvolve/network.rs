@@ -1,87 +1,324 @@
-//! The working network: planned once per stamp and PSF size, run per galaxy.
+//! The Hopfield network of Nurbaeva et al. (2015, A&A 577, A104), Sects. 2.1 to 3.1.
+//!
+//! The network's state v is the deconvolved stamp. It lowers the energy (Eq. 7)
+//!
+//! ```text
+//! E(v) = ½ vᵀ(W + λG)v − Qᵀv,   W = HᵀH,  G = DᵀD,  Q = Hᵀu₀            (Eq. 8)
+//! ```
+//!
+//! where H is the convolution with the PSF under a zero boundary and D the high-pass of Sun (2000).
+//! One iteration takes the negative gradient f = Q − (W + λG)v (Eq. 11), changes the neurons whose
+//! |f_i| exceeds the threshold TH_i = ½|W_ii + λG_ii| (Eqs. 6 and 9), and clips at zero (Eq. 12).
+//! It stops when there is no neuron to update, when the energy no longer falls, or after M
+//! iterations.
+//!
+//! Stamps are row-major, rows along y. A PSF of side p has its centre at pixel c = p/2 (integer
+//! division) on both axes: `(Hv)[y, x] = Σ h[j, i]·v[y − (j − c), x − (i − c)]`, pixels outside the
+//! stamp counting as zero. The matrices, which have n⁴ numbers, are never formed; the tests compare with them.
 
-use ndarray::ArrayView2;
-use shearq_submissions::{Kept, PsfScale, Start};
+use multiversion::multiversion;
+use ndarray::{Array2, ArrayView2};
+use shearq_quantities::product::LANES;
+use shearq_submissions::limits::MAX_PSF;
+use shearq_submissions::{
+    BrightnessUnit, Clipping, Kept, NetworkDeconvolution, PsfScale, Start, StepScale, Update,
+};
 
-use super::descent::{Descent, Stop};
-use super::kernel::{Buffers, Wide};
-use super::operator::Operator;
-use super::rule::Rule;
 use crate::error::{MeasureError, length};
-use crate::pixel::check_psf;
+use crate::pixel::{check_psf, check_sizes};
+use crate::transform::{Plane, Spectrum, ToModes, ToPixels, TransformScratch};
+
+/// High-pass kernel D of the regularisation; its elements sum to zero.
+// Nurbaeva et al., Sect. 3.1.
+pub(super) const SUN_KERNEL: [[f64; 3]; 3] = [
+    [0.007, 0.010, 0.007],
+    [0.010, -0.068, 0.010],
+    [0.007, 0.010, 0.007],
+];
+
+/// The transform of D, which is real.
+pub(super) fn high_pass(kx: f64, ky: f64) -> f64 {
+    let (cx, cy) = (kx.cos(), ky.cos());
+    SUN_KERNEL[1][1]
+        + 2.0 * SUN_KERNEL[1][0] * cx
+        + 2.0 * SUN_KERNEL[0][1] * cy
+        + 4.0 * SUN_KERNEL[0][0] * cx * cy
+}
+
+/// How far an updated neuron moves.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Step {
+    /// Δv_i = c·|f_i| (Eq. 10), c without unit.
+    Adaptive(f64),
+    /// The same with momentum.
+    Accelerated(f64),
+    /// Δv_i in image units (Eq. 6).
+    Constant(f64),
+}
+
+/// The updating rule for one stamp.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Rule {
+    /// Size of an update.
+    pub step: Step,
+    /// One unit of brightness in image units: thresholds are TH_i times this.
+    pub unit: f64,
+    /// M.
+    pub max_iterations: usize,
+    /// First state.
+    pub start: Start,
+    /// When negative neurons are set to zero.
+    pub clipping: Clipping,
+    /// Which state is kept where the energy rises.
+    pub kept: Kept,
+}
+
+impl Rule {
+    /// The rule for a stamp whose brightest pixel is `peak` and whose noise is `sigma`, both in
+    /// image units. `None` where the unit of brightness would not be positive, so that the stamp
+    /// cannot be measured with these settings.
+    pub fn new(settings: &NetworkDeconvolution, peak: f64, sigma: f64) -> Option<Self> {
+        let unit = match settings.brightness_unit {
+            BrightnessUnit::Image => 1.0,
+            BrightnessUnit::Noise => sigma,
+            BrightnessUnit::Peak => peak,
+        } / settings.unit_divisor;
+        if !(unit.is_finite() && unit > 0.0) {
+            return None;
+        }
+        let c = match settings.step_scale {
+            StepScale::Fixed => settings.step,
+            StepScale::Peak => settings.step * peak / unit,
+        };
+        let step = match settings.update {
+            Update::Adaptive => Step::Adaptive(c),
+            Update::Accelerated => Step::Accelerated(c),
+            Update::Constant => Step::Constant(settings.constant_step * unit),
+        };
+        Some(Rule {
+            step,
+            unit,
+            max_iterations: settings.max_iterations,
+            start: settings.start,
+            clipping: settings.clipping,
+            kept: settings.kept,
+        })
+    }
+
+    // What an update clips at.
+    fn floor(&self) -> f32 {
+        match self.clipping {
+            Clipping::BeforeTest => 0.0,
+            Clipping::AfterTest | Clipping::Never => f32::NEG_INFINITY,
+        }
+    }
+}
+
+/// Why the network stopped.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Stop {
+    /// No neuron exceeds its threshold.
+    Stable,
+    /// The next state would not have had a lower energy; which one is kept is a setting.
+    EnergyRise,
+    /// M iterations were made.
+    MaxIterations,
+}
+
+impl Stop {
+    /// Code in catalogues: 0 stable, 1 energy rise, 2 most iterations.
+    pub fn code(self) -> u32 {
+        match self {
+            Stop::Stable => 0,
+            Stop::EnergyRise => 1,
+            Stop::MaxIterations => 2,
+        }
+    }
+}
+
+/// How the network went down in energy.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Descent {
+    /// Iterations whose state was accepted, or kept at the end.
+    pub iterations: u32,
+    /// Why it stopped.
+    pub stop: Stop,
+    /// E of the first state, in squared image units.
+    pub first_energy: f64,
+    /// E of the state returned.
+    pub energy: f64,
+    /// Neurons above their threshold in the last iteration looked at.
+    pub updated: u32,
+}
 
 /// A network for one stamp size, PSF size and λ, holding one PSF at a time.
 ///
 /// Running it needs a [`NetworkScratch`] of the caller and allocates nothing. The network itself is
 /// not changed by a run, so one can serve many threads.
 #[derive(Debug, Clone)]
-pub struct Network<T> {
-    operator: Operator<T>,
-}
-
-/// Buffers for one thread's runs. Their content between runs does not matter.
-#[derive(Debug, Clone)]
-pub struct NetworkScratch<T> {
+pub struct Network {
     n: usize,
     p: usize,
-    buffers: Buffers<T>,
+    lambda: f32,
+    to_modes: ToModes,
+    to_pixels: ToPixels,
+    /// From a PSF with as many pixels before its centre as after it.
+    psf_to_modes: ToModes,
+    /// Modes of the PSF, and of the PSF turned by 180°, for Hᵀ.
+    transfer: Spectrum,
+    transfer_transposed: Spectrum,
+    centred_psf: Vec<f32>,
+    psf_scratch: TransformScratch,
+    /// TH_i for a unit of brightness of one (Eq. 9), and infinite behind the image: the state has to stay zero there.
+    thresholds: Vec<f32>,
 }
 
-impl<T: Wide> Network<T> {
+/// Buffers for one thread's runs. Images are row-major, with zeros behind them that fill the last lanes. The zeros around
+/// `lines_of_d` stay, too. All else may have any value between runs.
+#[derive(Debug, Clone)]
+pub struct NetworkScratch {
+    n: usize,
+    p: usize,
+    /// Accepted state.
+    state: Vec<f32>,
+    /// Candidate state.
+    next: Vec<f32>,
+    /// State after an accelerated update, before its momentum; and the same one iteration before.
+    moved: Vec<f32>,
+    last: Vec<f32>,
+    /// u₀ − Hv.
+    residual: Vec<f32>,
+    /// Dv.
+    rough: Vec<f32>,
+    /// u₀.
+    data: Vec<f32>,
+    /// Hv.
+    convolved: Vec<f32>,
+    /// Hᵀ(u₀ − Hv), and then f.
+    gradient: Vec<f32>,
+    /// D(Dv).
+    rough_twice: Vec<f32>,
+    /// Sums along x for D, with a row of zeros before and after.
+    lines_of_d: Vec<f32>,
+    transform: TransformScratch,
+    modes: Spectrum,
+}
+
+impl Network {
     /// Plans for n×n stamps and p×p PSFs; the PSF is zero until [`Network::set_psf`].
     ///
     /// # Errors
     /// If a size is out of range.
     pub fn plan(n: usize, p: usize, lambda: f64) -> Result<Self, MeasureError> {
+        check_sizes(n, p)?;
+        // Light that wraps around has to end before the stamp begins again. An odd period has no mode but zero that is its own
+        // opposite.
+        let plane = Plane::with_all_modes((n + p / 2) | 1);
+        let psf_to_modes = ToModes::new(2 * (p / 2) + 1, &plane, false);
         Ok(Network {
-            operator: Operator::new(n, p, lambda)?,
+            n,
+            p,
+            lambda: lambda as f32,
+            to_modes: ToModes::new(n, &plane, false),
+            to_pixels: ToPixels::new(n, &plane),
+            transfer: plane.spectrum(),
+            transfer_transposed: plane.spectrum(),
+            centred_psf: vec![0.0; psf_to_modes.side() * psf_to_modes.side()],
+            psf_scratch: psf_to_modes.scratch(),
+            psf_to_modes,
+            thresholds: vec![f32::INFINITY; padded(n)],
         })
     }
 
-    /// Takes a PSF; it is used as it is, so it should sum to one.
-    ///
-    /// # Errors
-    /// If its size is not the planned one or a pixel is not finite.
-    pub fn set_psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<(), MeasureError> {
-        check_psf(psf, self.operator.p)?;
-        T::set_psf(&mut self.operator, psf, 1.0);
-        Ok(())
-    }
-
-    /// Takes a PSF of sum one, scaled. Returns the factor on it, which is also that from the network's
+    /// Takes a PSF of sum one, scaled; allocates nothing. Returns the factor on it, which is also that from the network's
     /// states to the light of the galaxy.
     ///
     /// # Errors
-    /// As [`Network::set_psf`], and if no pixel is positive.
-    pub fn set_scaled_psf(
+    /// If its size is not the planned one, a pixel is not finite, or a peak of one is asked for and no pixel is positive.
+    pub fn set_psf(
         &mut self,
         psf: ArrayView2<'_, f64>,
         scale: PsfScale,
     ) -> Result<f64, MeasureError> {
+        check_psf(psf, self.p)?;
         let factor = psf_factor(psf, scale)?;
-        check_psf(psf, self.operator.p)?;
-        T::set_psf(&mut self.operator, psf, factor);
+        // One of even side has no pixels in the last row and column.
+        let side = self.psf_to_modes.side();
+        for (to, row) in self.centred_psf.chunks_exact_mut(side).zip(psf.rows()) {
+            for (to, value) in to.iter_mut().zip(row) {
+                *to = (*value * factor) as f32;
+            }
+        }
+        let modes = &mut self.transfer;
+        self.psf_to_modes
+            .transform(&self.centred_psf, &mut self.psf_scratch, modes);
+        let modes = &mut self.transfer_transposed;
+        modes.copy_from(&self.transfer);
+        // Turned by 180°, what is odd along one axis changes its sign.
+        let [_, cs, sc, _] = modes.quarters_mut();
+        for value in cs.iter_mut().chain(sc) {
+            *value = -*value;
+        }
+        self.set_thresholds(psf, factor * factor);
         Ok(factor)
+    }
+
+    // TH_i = ½|W_ii + λG_ii| (Eq. 9): W_ii is the sum of h² over the part of the PSF that falls inside the
+    // stamp when centred on pixel i, times `square`, and G_ii the same for d.
+    fn set_thresholds(&mut self, psf: ArrayView2<'_, f64>, square: f64) {
+        let Network { n, p, .. } = *self;
+        // Sums over all rectangles from the corner, so that any window costs four look-ups.
+        let mut sums = [0.0; (MAX_PSF + 1) * (MAX_PSF + 1)];
+        let stride = p + 1;
+        for y in 0..p {
+            let mut row = 0.0;
+            for x in 0..p {
+                row += psf[(y, x)] * psf[(y, x)];
+                sums[(y + 1) * stride + x + 1] = sums[y * stride + x + 1] + row;
+            }
+        }
+        // Kernel rows j with 0 ≤ y + j − c < n.
+        let window = |at: usize, side: usize| {
+            let c = side / 2;
+            (c.saturating_sub(at), side.min(n + c - at))
+        };
+        for y in 0..n {
+            let ((j0, j1), (dj0, dj1)) = (window(y, p), window(y, 3));
+            for x in 0..n {
+                let ((i0, i1), (di0, di1)) = (window(x, p), window(x, 3));
+                let at = |j: usize, i: usize| sums[j * stride + i];
+                let w = square * (at(j1, i1) - at(j0, i1) - at(j1, i0) + at(j0, i0));
+                let rows = SUN_KERNEL[dj0..dj1].iter();
+                let g: f64 = rows.flat_map(|row| &row[di0..di1]).map(|d| d * d).sum();
+                self.thresholds[y * n + x] = (0.5 * (w + f64::from(self.lambda) * g).abs()) as f32;
+            }
+        }
     }
 
     /// Stamp side n.
     pub fn stamp_size(&self) -> usize {
-        self.operator.n
-    }
-
-    /// Thresholds TH_i (Eq. 9) for a unit of brightness of one, row-major.
-    pub fn thresholds(&self) -> &[T] {
-        let Operator { n, thresholds, .. } = &self.operator;
-        &thresholds[..n * n]
+        self.n
     }
 
     /// Buffers that fit this network.
-    pub fn scratch(&self) -> NetworkScratch<T> {
-        let Operator { n, p, .. } = self.operator;
+    pub fn scratch(&self) -> NetworkScratch {
+        let image = vec![0.0; padded(self.n)];
         NetworkScratch {
-            n,
-            p,
-            buffers: Buffers::new(&self.operator),
+            n: self.n,
+            p: self.p,
+            state: image.clone(),
+            next: image.clone(),
+            moved: image.clone(),
+            last: image.clone(),
+            residual: image.clone(),
+            rough: image.clone(),
+            data: image.clone(),
+            convolved: image.clone(),
+            gradient: image.clone(),
+            rough_twice: image,
+            lines_of_d: vec![0.0; self.n * (self.n + 2)],
+            transform: self.to_pixels.scratch(),
+            modes: self.transfer.clone(),
         }
     }
 
@@ -92,110 +329,178 @@ impl<T: Wide> Network<T> {
     pub fn deconvolve(
         &self,
         rule: &Rule,
-        u0: &[T],
-        scratch: &mut NetworkScratch<T>,
-        out: &mut [T],
+        u0: &[f32],
+        scratch: &mut NetworkScratch,
+        out: &mut [f32],
     ) -> Result<Descent, MeasureError> {
-        self.check(u0, scratch, out)?;
-        let n = self.operator.n;
-        let b = &mut scratch.buffers;
-        Self::start(n, rule, u0, b);
-        let descent = T::descend(&self.operator, rule, b);
-        out.copy_from_slice(&b.state[..n * n]);
-        Ok(descent)
+        self.trace(rule, u0, scratch, out, |_, _| {})
     }
 
-    /// Like [`Network::deconvolve`], one iteration at a time, showing `observe` the state before and
-    /// after each, row-major. The last one shown may be an update that raised the energy and is not
-    /// kept. For studies: it allocates, repeats part of the work, and an accelerated update loses its
-    /// momentum in each.
+    /// Like [`Network::deconvolve`], showing `observe` the state before and after each iteration, row-major. The last one
+    /// shown may be an update that raised the energy and is not kept.
     ///
     /// # Errors
     /// As [`Network::deconvolve`].
     pub fn trace(
         &self,
         rule: &Rule,
-        u0: &[T],
-        scratch: &mut NetworkScratch<T>,
-        out: &mut [T],
-        mut observe: impl FnMut(&[T], &[T]),
+        u0: &[f32],
+        scratch: &mut NetworkScratch,
+        out: &mut [f32],
+        observe: impl FnMut(&[f32], &[f32]),
     ) -> Result<Descent, MeasureError> {
-        self.check(u0, scratch, out)?;
-        let n = self.operator.n;
-        let b = &mut scratch.buffers;
-        Self::start(n, rule, u0, b);
-        let one = Rule {
-            max_iterations: 1,
-            ..*rule
-        };
-        let image = |padded: &[T]| padded[..n * n].to_vec();
-        let none = Rule {
-            max_iterations: 0,
-            ..*rule
-        };
-        let mut total = Descent {
-            iterations: 0,
-            ..T::descend(&self.operator, &none, b)
-        };
-        for _ in 0..rule.max_iterations {
-            let before = image(&b.state);
-            let descent = T::descend(&self.operator, &one, b);
-            match descent.stop {
-                Stop::Stable => {}
-                Stop::EnergyRise if rule.kept == Kept::Lowest => observe(&before, &image(&b.next)),
-                Stop::EnergyRise | Stop::MaxIterations => observe(&before, &image(&b.state)),
-            }
-            total = Descent {
-                iterations: total.iterations + descent.iterations,
-                first_energy: total.first_energy,
-                ..descent
-            };
-            if descent.stop != Stop::MaxIterations {
-                break;
-            }
-        }
-        out.copy_from_slice(&b.state[..n * n]);
-        Ok(total)
+        self.start(rule, u0, scratch, out)?;
+        let descent = self.descend(rule, scratch, observe);
+        out.copy_from_slice(&scratch.state[..out.len()]);
+        Ok(descent)
     }
 
-    /// Checks the sizes of a run.
-    fn check(&self, u0: &[T], scratch: &NetworkScratch<T>, out: &[T]) -> Result<(), MeasureError> {
-        let Operator { n, p, .. } = self.operator;
-        length("a stamp", u0.len(), n * n)?;
-        length("a deconvolved stamp", out.len(), n * n)?;
-        if (scratch.n, scratch.p) == (n, p) {
-            return Ok(());
+    // Checks the sizes of a run, takes the stamp and sets the first state.
+    fn start(
+        &self,
+        rule: &Rule,
+        u0: &[f32],
+        scratch: &mut NetworkScratch,
+        out: &[f32],
+    ) -> Result<(), MeasureError> {
+        let pixels = self.n * self.n;
+        length("a stamp", u0.len(), pixels)?;
+        length("a deconvolved stamp", out.len(), pixels)?;
+        if (scratch.n, scratch.p) != (self.n, self.p) {
+            let of = |n, p| format!("{n} × {n} pixels and a PSF of {p} × {p}");
+            return Err(MeasureError::Shape {
+                what: "buffers for a network",
+                found: of(scratch.n, scratch.p),
+                expected: of(self.n, self.p),
+            });
         }
-        Err(MeasureError::Shape {
-            what: "buffers for a network",
-            found: format!(
-                "{0} × {0} pixels and a PSF of {1} × {1}",
-                scratch.n, scratch.p
-            ),
-            expected: format!("{n} × {n} and {p} × {p}"),
-        })
-    }
-
-    /// Takes the stamp and sets the first state.
-    fn start(n: usize, rule: &Rule, u0: &[T], b: &mut Buffers<T>) {
-        let flat = match rule.start {
-            Start::Flat => {
-                let mean = u0.iter().map(|u| u.to_f64()).sum::<f64>() / (n * n) as f64;
-                T::from_f64(mean.max(0.0))
-            }
-            Start::Data | Start::ClippedData | Start::Zero => T::ZERO,
-        };
-        b.data[..n * n].copy_from_slice(u0);
-        let state = &mut b.state[..n * n];
+        scratch.data[..pixels].copy_from_slice(u0);
+        let state = &mut scratch.state[..pixels];
         match rule.start {
             Start::Data => state.copy_from_slice(u0),
             Start::ClippedData => {
                 for (v, &u) in state.iter_mut().zip(u0) {
-                    *v = if u > T::ZERO { u } else { T::ZERO };
+                    *v = if u > 0.0 { u } else { 0.0 };
                 }
             }
-            Start::Flat | Start::Zero => state.fill(flat),
+            Start::Flat => {
+                let mean = u0.iter().map(|&u| f64::from(u)).sum::<f64>() / pixels as f64;
+                state.fill(mean.max(0.0) as f32);
+            }
+            Start::Zero => state.fill(0.0),
         }
+        Ok(())
+    }
+
+    // Runs the network from `b.state` on `b.data`; the result is left in `b.state`. Costs are compared instead of energies (Eq. 7),
+    // which are small differences of large terms.
+    fn descend(
+        &self,
+        rule: &Rule,
+        b: &mut NetworkScratch,
+        mut observe: impl FnMut(&[f32], &[f32]),
+    ) -> Descent {
+        let pixels = self.n * self.n;
+        let constant = 0.5 * sum_of_squares(&b.data);
+        let accelerated = matches!(rule.step, Step::Accelerated(_));
+        if accelerated {
+            b.last.copy_from_slice(&b.state);
+        }
+        b.next.copy_from_slice(&b.state);
+        let mut cost = self.cost(b);
+        let mut descent = Descent {
+            iterations: 0,
+            stop: Stop::MaxIterations,
+            first_energy: cost - constant,
+            energy: cost - constant,
+            updated: 0,
+        };
+        let mut momentum = 1.0;
+        while (descent.iterations as usize) < rule.max_iterations {
+            descent.updated = self.update(rule, b);
+            if descent.updated == 0 {
+                descent.stop = Stop::Stable;
+                break;
+            }
+            let extrapolated = accelerated && extrapolate(rule, b, &mut momentum);
+            let mut next = self.cost(b);
+            // NaN does not fall.
+            let mut falls = next < cost;
+            if extrapolated && !falls {
+                // Momentum went too far: the update itself is left.
+                momentum = 1.0;
+                b.next.copy_from_slice(&b.moved);
+                next = self.cost(b);
+                falls = next < cost;
+            }
+            if falls && rule.clipping == Clipping::AfterTest && clip(&mut b.next) {
+                next = self.cost(b);
+            }
+            observe(&b.state[..pixels], &b.next[..pixels]);
+            if falls || rule.kept == Kept::Last {
+                std::mem::swap(&mut b.state, &mut b.next);
+                std::mem::swap(&mut b.last, &mut b.moved);
+                cost = next;
+                descent.energy = cost - constant;
+                descent.iterations += 1;
+            }
+            if !falls {
+                descent.stop = Stop::EnergyRise;
+                break;
+            }
+        }
+        descent
+    }
+
+    // Residual and roughness of the candidate; returns J(v) = ½‖u₀ − Hv‖² + ½λ‖Dv‖² (Eq. 4), which is the
+    // energy E plus the constant ½‖u₀‖² but has no cancellation in it.
+    fn cost(&self, b: &mut NetworkScratch) -> f64 {
+        self.convolve(
+            &self.transfer,
+            &b.next,
+            &mut b.transform,
+            &mut b.modes,
+            &mut b.convolved,
+        );
+        let misfit = misfit(&b.data, &b.convolved, &mut b.residual);
+        if self.lambda <= 0.0 {
+            return 0.5 * misfit;
+        }
+        roughen(&b.next, self.n, &mut b.lines_of_d, &mut b.rough);
+        0.5 * misfit + 0.5 * f64::from(self.lambda) * sum_of_squares(&b.rough)
+    }
+
+    fn convolve(
+        &self,
+        transfer: &Spectrum,
+        image: &[f32],
+        transform: &mut TransformScratch,
+        modes: &mut Spectrum,
+        out: &mut [f32],
+    ) {
+        self.to_modes.transform(image, transform, modes);
+        modes.multiply(transfer);
+        self.to_pixels.transform(modes, transform, out);
+    }
+
+    // Takes f = Hᵀ(u₀ − Hv) − λD(Dv) (Eq. 11; D is symmetric), updates every neuron beyond its
+    // threshold (Eq. 6) and clips at zero (Eq. 12) where that comes first; returns how many were beyond.
+    fn update(&self, rule: &Rule, b: &mut NetworkScratch) -> u32 {
+        let transposed = &self.transfer_transposed;
+        self.convolve(
+            transposed,
+            &b.residual,
+            &mut b.transform,
+            &mut b.modes,
+            &mut b.gradient,
+        );
+        if self.lambda > 0.0 {
+            roughen(&b.rough, self.n, &mut b.lines_of_d, &mut b.rough_twice);
+            for (f, rough) in b.gradient.iter_mut().zip(&b.rough_twice) {
+                *f -= self.lambda * rough;
+            }
+        }
+        update_neurons(rule, &b.state, &b.gradient, &self.thresholds, &mut b.next)
     }
 }
 
@@ -217,482 +522,161 @@ pub fn psf_factor(psf: ArrayView2<'_, f64>, scale: PsfScale) -> Result<f64, Meas
     }
 }
 
-#[cfg(test)]
-mod tests {
-    use ndarray::{Array2, ArrayView2};
-    use rand::{RngExt, SeedableRng};
-    use rand_chacha::ChaCha8Rng;
-    use shearq_submissions::{Clipping, Start};
+/// The convolution Hv of a square image, zero outside it, by plain sums. For studies, pictures and tests.
+pub fn convolve(image: ArrayView2<'_, f64>, kernel: ArrayView2<'_, f64>) -> Array2<f64> {
+    let (cy, cx) = (kernel.nrows() / 2, kernel.ncols() / 2);
+    Array2::from_shape_fn(image.dim(), |(y, x)| {
+        let mut sum = 0.0;
+        for ((j, i), &value) in kernel.indexed_iter() {
+            let at = ((y + cy).wrapping_sub(j), (x + cx).wrapping_sub(i));
+            sum += value * image.get(at).copied().unwrap_or(0.0);
+        }
+        sum
+    })
+}
 
-    use super::*;
-    use crate::deconvolve::reference::Matrices;
-    use crate::deconvolve::rule::Step;
-    use shearq_quantities::product::{ROWS, fuses};
+// Whole lanes: no loop over pixels has a remainder.
+fn padded(n: usize) -> usize {
+    (n * n).next_multiple_of(LANES)
+}
 
-    fn random(rng: &mut ChaCha8Rng, n: usize) -> Array2<f64> {
-        Array2::from_shape_fn((n, n), |_| rng.random_range(-1.0..1.0))
+#[inline(always)]
+fn lanes<T>(image: &[T]) -> impl Iterator<Item = &[T; LANES]> {
+    image.as_chunks().0.iter()
+}
+
+// Sums of squares are in double precision: near the minimum the cost falls by 10⁻⁷ of itself in an iteration, and rounding
+// would end the descent.
+
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn sum_of_squares(values: &[f32]) -> f64 {
+    let mut sums = [0.0; LANES];
+    for values in lanes(values) {
+        for l in 0..LANES {
+            let value = f64::from(values[l]);
+            sums[l] += value * value;
+        }
     }
+    sums.iter().sum()
+}
 
-    /// A lopsided PSF of sum one: an asymmetric blob and noise, so that a turned or transposed
-    /// operator shows.
-    fn psf(rng: &mut ChaCha8Rng, p: usize) -> Array2<f64> {
-        let centre = p as f64 / 2.0;
-        let blob = Array2::from_shape_fn((p, p), |(y, x)| {
-            let (dy, dx) = (y as f64 - centre, x as f64 - centre + 0.7);
-            (-(dx * dx + 0.6 * dy * dy + 0.5 * dx * dy) / 4.0).exp()
-        });
-        let psf = blob + random(rng, p).mapv(|v| 0.01 * v.abs());
-        let sum = psf.sum();
-        psf / sum
+// Writes u₀ − Hv and returns its square.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn misfit(data: &[f32], convolved: &[f32], residual: &mut [f32]) -> f64 {
+    let mut sums = [0.0; LANES];
+    let values = lanes(data).zip(lanes(convolved));
+    for (to, (data, convolved)) in residual.as_chunks_mut().0.iter_mut().zip(values) {
+        let mut out = [0.0f32; LANES];
+        for l in 0..LANES {
+            out[l] = data[l] - convolved[l];
+            sums[l] += f64::from(out[l]) * f64::from(out[l]);
+        }
+        *to = out;
     }
+    sums.iter().sum()
+}
 
-    /// A galaxy-like stamp with noise of σ = 1.
-    fn stamp(rng: &mut ChaCha8Rng, n: usize) -> Array2<f64> {
-        let centre = (n as f64 - 1.0) / 2.0 + 0.3;
-        random(rng, n) * 1.7
-            + Array2::from_shape_fn((n, n), |(y, x)| {
-                let (dy, dx) = (y as f64 - centre, x as f64 - centre);
-                6.0 * (-(dx * dx + dy * dy - 0.6 * dx * dy) / 12.0).exp()
-            })
-    }
-
-    struct Case {
-        n: usize,
-        p: usize,
-        lambda: f64,
-        rule: Rule,
-    }
-
-    fn run<T: Wide>(
-        case: &Case,
-        psf: ArrayView2<'_, f64>,
-        u0: &Array2<f64>,
-    ) -> (Vec<f64>, Descent) {
-        let mut network = Network::<T>::plan(case.n, case.p, case.lambda).unwrap();
-        network.set_psf(psf).unwrap();
-        let mut scratch = network.scratch();
-        let mut out = vec![T::ZERO; case.n * case.n];
-        let data: Vec<T> = u0.iter().map(|&v| T::from_f64(v)).collect();
-        // First runs on other data, and on none, leave their traces in the scratch.
-        let missing = vec![T::from_f64(f64::NAN); data.len()];
-        let rule = Rule {
-            start: Start::Data,
-            ..case.rule
-        };
-        network
-            .deconvolve(&rule, &missing, &mut scratch, &mut out)
-            .unwrap();
-        let dirt: Vec<T> = data
-            .iter()
-            .rev()
-            .map(|v| T::from_f64(9.0 * v.to_f64()))
-            .collect();
-        network
-            .deconvolve(&case.rule, &dirt, &mut scratch, &mut out)
-            .unwrap();
-        let descent = network
-            .deconvolve(&case.rule, &data, &mut scratch, &mut out)
-            .unwrap();
-        (out.iter().map(|v| v.to_f64()).collect(), descent)
-    }
-
-    fn largest(a: &[f64], b: &Array2<f64>) -> f64 {
-        a.iter()
-            .zip(b)
-            .map(|(x, y)| (x - y).abs())
-            .fold(0.0, f64::max)
-    }
-
-    #[test]
-    fn matches_the_matrices_over_sizes_updates_and_regularisation() {
-        let mut rng = ChaCha8Rng::seed_from_u64(1);
-        let sizes = [
-            (3, 2),
-            (4, 48),
-            (5, 3),
-            (5, 4),
-            (5, 15),
-            (7, 25),
-            (11, 5),
-            (14, 6),
-            (16, 15),
-            (17, 16),
-            (19, 15),
-            (23, 15),
-            (23, 25),
-            (29, 15),
-            (32, 8),
-            (33, 21),
-            (48, 15),
-            (48, 25),
-        ];
-        for (k, (n, p)) in sizes.into_iter().enumerate() {
-            let psf = psf(&mut rng, p);
-            let u0 = stamp(&mut rng, n);
-            let lambdas = if n > 30 {
-                vec![0.3]
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn update_neurons(
+    rule: &Rule,
+    state: &[f32],
+    gradient: &[f32],
+    thresholds: &[f32],
+    next: &mut [f32],
+) -> u32 {
+    let (unit, floor) = (rule.unit as f32, rule.floor());
+    let (adaptive, step) = match rule.step {
+        Step::Adaptive(c) | Step::Accelerated(c) => (true, c as f32),
+        Step::Constant(delta) => (false, delta as f32),
+    };
+    let mut updated = [0; LANES];
+    let values = lanes(state).zip(lanes(gradient)).zip(lanes(thresholds));
+    for (to, ((from, f), thresholds)) in next.as_chunks_mut().0.iter_mut().zip(values) {
+        let mut out = [0.0f32; LANES];
+        for l in 0..LANES {
+            let beyond = f[l].abs() > thresholds[l] * unit;
+            let change = if adaptive {
+                step * f[l]
             } else {
-                vec![0.0, 1e-4, 1.0]
+                step.copysign(f[l])
             };
-            for lambda in lambdas {
-                let matrices = Matrices::new(n, psf.view(), lambda);
-                for (j, step) in [
-                    Step::Adaptive(0.9),
-                    Step::Adaptive(0.05),
-                    Step::Constant(0.03),
-                    Step::Accelerated(0.8),
-                    Step::Adaptive(0.9),
-                    Step::Constant(0.4),
-                    Step::Adaptive(3.0),
-                    Step::Accelerated(0.8),
-                    Step::Accelerated(3.0),
-                ]
-                .into_iter()
-                .enumerate()
-                {
-                    let start = [Start::ClippedData, Start::Flat, Start::Zero, Start::Data][k % 4];
-                    // The first four are the paper's; all readings come with each of the others.
-                    let clipping = match (j < 4, (j + k) % 3) {
-                        (true, _) | (_, 0) => Clipping::BeforeTest,
-                        (_, 1) => Clipping::AfterTest,
-                        _ => Clipping::Never,
-                    };
-                    let kept = [Kept::Lowest, Kept::Last][usize::from(j >= 4) * (k % 2)];
-                    let rule = Rule {
-                        step,
-                        unit: 0.03,
-                        max_iterations: 12,
-                        start,
-                        clipping,
-                        kept,
-                    };
-                    let case = Case { n, p, lambda, rule };
-                    let (expected, reference) = matrices.deconvolve(&rule, u0.view()).unwrap();
-                    let (found, descent) = run::<f64>(&case, psf.view(), &u0);
-                    let label = format!("n {n}, p {p}, λ {lambda}, {rule:?}");
-                    assert_eq!(descent.iterations, reference.iterations, "{label}");
-                    assert_eq!(descent.stop, reference.stop, "{label}");
-                    assert_eq!(descent.updated, reference.updated, "{label}");
-                    // Same operations in another order: f64 rounding of sums of 10³ terms of
-                    // order ten, carried through twelve steps.
-                    assert!(largest(&found, &expected) < 1e-11, "{label}");
-                    let scale = reference.energy.abs().max(1.0);
-                    assert!(
-                        (descent.energy - reference.energy).abs() < 1e-10 * scale,
-                        "{label}"
-                    );
-                    assert!((descent.first_energy - reference.first_energy).abs() < 1e-10 * scale);
-                }
-            }
+            let value = if beyond { from[l] + change } else { from[l] };
+            out[l] = if value > floor { value } else { floor };
+            updated[l] += u32::from(beyond);
+        }
+        *to = out;
+    }
+    updated.iter().sum()
+}
+
+// Sets negative neurons of the candidate to zero (Eq. 12); returns whether there were any.
+fn clip(next: &mut [f32]) -> bool {
+    let mut negative = false;
+    for value in next {
+        let below = *value < 0.0;
+        negative |= below;
+        *value = if below { 0.0 } else { *value };
+    }
+    negative
+}
+
+// Adds momentum to an update from `b.state` to `b.next`: `b.moved` takes the update and `b.next` goes
+// on beyond it, in the direction from the update before. `momentum` is Nesterov's t; it starts anew
+// where the direction points uphill (O'Donoghue & Candès 2015, gradient scheme). Returns whether
+// there was any momentum.
+fn extrapolate(rule: &Rule, b: &mut NetworkScratch, momentum: &mut f64) -> bool {
+    b.moved.copy_from_slice(&b.next);
+    if points_uphill(&b.state, &b.moved, &b.last) {
+        *momentum = 1.0;
+    }
+    let next = 0.5 * (1.0 + (1.0 + 4.0 * *momentum * *momentum).sqrt());
+    let beta = ((*momentum - 1.0) / next) as f32;
+    *momentum = next;
+    let floor = rule.floor();
+    for ((to, moved), last) in b.next.iter_mut().zip(&b.moved).zip(&b.last) {
+        let value = moved + beta * (moved - last);
+        *to = if value > floor { value } else { floor };
+    }
+    beta > 0.0
+}
+
+// Whether (from − moved)·(moved − last) > 0.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn points_uphill(from: &[f32], moved: &[f32], last: &[f32]) -> bool {
+    let mut sums = [0.0; LANES];
+    for ((from, moved), last) in lanes(from).zip(lanes(moved)).zip(lanes(last)) {
+        for l in 0..LANES {
+            sums[l] += f64::from((from[l] - moved[l]) * (moved[l] - last[l]));
         }
     }
+    sums.iter().sum::<f64>() > 0.0
+}
 
-    #[test]
-    fn thresholds_are_half_the_diagonal_of_the_weights() {
-        let mut rng = ChaCha8Rng::seed_from_u64(2);
-        for (n, p) in [(5, 9), (12, 4), (13, 7)] {
-            let psf = psf(&mut rng, p);
-            let matrices = Matrices::new(n, psf.view(), 0.7);
-            let mut network = Network::<f64>::plan(n, p, 0.7).unwrap();
-            network.set_psf(psf.view()).unwrap();
-            for (a, b) in network.thresholds().iter().zip(matrices.thresholds()) {
-                assert!((a - b).abs() < 1e-14);
-            }
-        }
+// Writes D times a row-major image of `n`×`n` pixels, zero outside, to `out`. The kernel is a·uuᵀ less a part of its
+// middle element, with u = (1, r, 1): sums along x, and then along y. `lines` has `n` zeros, room for the image, and
+// `n` zeros.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn roughen(image: &[f32], n: usize, lines: &mut [f32], out: &mut [f32]) {
+    let corner = SUN_KERNEL[0][0];
+    let ratio = SUN_KERNEL[0][1] / corner;
+    let middle = SUN_KERNEL[1][1] - corner * ratio * ratio;
+    let [corner, ratio, middle] = [corner, ratio, middle].map(|value| value as f32);
+    let (image, out) = (&image[..n * n], &mut out[..n * n]);
+    let inner = &mut lines[n..][..n * n];
+    for (out, three) in inner[1..].iter_mut().zip(image.windows(3)) {
+        *out = three[0] + three[2] + ratio * three[1];
     }
-
-    #[test]
-    fn single_precision_stays_within_its_rounding() {
-        // Without thresholds (a vanishing unit) no decision can flip, and the difference is the
-        // rounding of f32 (6e-8) over sums of a few hundred terms of order ten, times the steps.
-        let mut rng = ChaCha8Rng::seed_from_u64(3);
-        for (n, p) in [(19, 15), (23, 15), (29, 15), (48, 25)] {
-            let psf = psf(&mut rng, p);
-            let u0 = stamp(&mut rng, n);
-            let rule = Rule {
-                step: Step::Adaptive(0.9),
-                unit: 1e-30,
-                max_iterations: 20,
-                start: Start::ClippedData,
-                clipping: Clipping::BeforeTest,
-                kept: Kept::Lowest,
-            };
-            let case = Case {
-                n,
-                p,
-                lambda: 1e-4,
-                rule,
-            };
-            let (double, a) = run::<f64>(&case, psf.view(), &u0);
-            let (single, b) = run::<f32>(&case, psf.view(), &u0);
-            assert_eq!((a.iterations, a.stop), (b.iterations, b.stop));
-            let peak = double.iter().copied().fold(0.0, f64::max);
-            let mut apart = double.iter().zip(&single).map(|(x, y)| (x - y).abs());
-            let most = 3e-6 * peak;
-            assert!(apart.all(|d| d < most), "n {n}: beyond {most}");
-        }
+    // Pixels at the ends of rows have one neighbour.
+    for (out, row) in inner.chunks_exact_mut(n).zip(image.chunks_exact(n)) {
+        out[0] = row[1] + ratio * row[0];
+        out[n - 1] = row[n - 2] + ratio * row[n - 1];
     }
-
-    #[test]
-    fn every_stop_occurs_and_is_reported() {
-        let mut rng = ChaCha8Rng::seed_from_u64(4);
-        let psf = psf(&mut rng, 7);
-        let u0 = stamp(&mut rng, 15);
-        let descent = |step, unit, max_iterations| {
-            let rule = Rule {
-                step,
-                unit,
-                max_iterations,
-                start: Start::ClippedData,
-                clipping: Clipping::BeforeTest,
-                kept: Kept::Lowest,
-            };
-            run::<f32>(
-                &Case {
-                    n: 15,
-                    p: 7,
-                    lambda: 0.0,
-                    rule,
-                },
-                psf.view(),
-                &u0,
-            )
-            .1
-        };
-        let all = descent(Step::Adaptive(0.5), 0.01, 5);
-        assert_eq!((all.stop, all.iterations), (Stop::MaxIterations, 5));
-        assert!(all.energy < all.first_energy);
-        // A unit so large that no gradient reaches its threshold.
-        let stable = descent(Step::Adaptive(0.5), 1e6, 50);
-        assert_eq!(
-            (stable.stop, stable.iterations, stable.updated),
-            (Stop::Stable, 0, 0)
-        );
-        // A step beyond the stability limit of 2 over the largest eigenvalue.
-        let rise = descent(Step::Adaptive(50.0), 0.01, 50);
-        assert_eq!(rise.stop, Stop::EnergyRise);
-        assert!(rise.energy <= rise.first_energy);
-    }
-
-    #[test]
-    fn fused_and_unfused_products_agree_and_the_number_of_rows_at_a_time_does_not_matter() {
-        let mut rng = ChaCha8Rng::seed_from_u64(5);
-        for (n, p) in [(5, 15), (11, 4), (19, 15), (23, 15), (33, 3), (64, 48)] {
-            let psf = psf(&mut rng, p);
-            let u0: Vec<f32> = stamp(&mut rng, n).iter().map(|&v| v as f32).collect();
-            for (step, lambda) in [
-                (Step::Adaptive(0.9), 1e-4),
-                (Step::Adaptive(0.5), 0.0),
-                (Step::Accelerated(0.9), 1e-4),
-                (Step::Constant(0.02), 0.3),
-            ] {
-                // A vanishing unit: no neuron is near its threshold, where rounding would decide.
-                let rule = Rule {
-                    step,
-                    unit: 1e-30,
-                    max_iterations: 10,
-                    start: Start::ClippedData,
-                    clipping: Clipping::BeforeTest,
-                    kept: Kept::Lowest,
-                };
-                let mut network = Network::<f32>::plan(n, p, lambda).unwrap();
-                network.set_psf(psf.view()).unwrap();
-                let mut scratch = network.scratch();
-                let kernels: [Kernel; 3] =
-                    [run_in::<4, false>, run_in::<4, true>, run_in::<ROWS, true>];
-                let [plain, four, eight] = kernels.map(|kernel| {
-                    let b = &mut scratch.buffers;
-                    Network::start(n, &rule, &u0, b);
-                    let descent = kernel(&network.operator, &rule, b);
-                    (b.state.clone(), descent)
-                });
-                assert_eq!(four, eight);
-                if fuses() {
-                    let mut out = vec![f32::NAN; n * n];
-                    let found = network.deconvolve(&rule, &u0, &mut scratch, &mut out);
-                    assert_eq!((&out[..], found.unwrap()), (&four.0[..n * n], four.1));
-                }
-                assert_eq!(plain.1.iterations, four.1.iterations);
-                // Fused and unfused products differ by f32 rounding; a constant step is taken
-                // the other way where that decides on a gradient's sign.
-                let apart = |(a, b): &(&f32, &f32)| (*a - *b).abs() > 1e-4;
-                let flipped = four.0.iter().zip(&plain.0).filter(apart).count();
-                let most = match step {
-                    Step::Adaptive(_) | Step::Accelerated(_) => 0,
-                    Step::Constant(_) => 1 + n * n / 200,
-                };
-                let label = format!("n {n}, p {p}, {step:?}, λ {lambda}");
-                assert!(flipped <= most, "{label}: {flipped}");
-            }
-        }
-    }
-
-    type Kernel = fn(&Operator<f32>, &Rule, &mut Buffers<f32>) -> Descent;
-
-    fn run_in<const R: usize, const FUSED: bool>(
-        operator: &Operator<f32>,
-        rule: &Rule,
-        b: &mut Buffers<f32>,
-    ) -> Descent {
-        crate::deconvolve::kernel::run::<f32, R, FUSED>(operator, rule, b)
-    }
-
-    #[test]
-    fn momentum_reaches_a_lower_energy_in_as_many_iterations() {
-        let mut rng = ChaCha8Rng::seed_from_u64(7);
-        let psf = psf(&mut rng, 15);
-        let u0 = stamp(&mut rng, 23);
-        let energy = |step, max_iterations| {
-            let rule = Rule {
-                step,
-                unit: 1e-3,
-                max_iterations,
-                start: Start::ClippedData,
-                clipping: Clipping::BeforeTest,
-                kept: Kept::Lowest,
-            };
-            let case = Case {
-                n: 23,
-                p: 15,
-                lambda: 1e-4,
-                rule,
-            };
-            run::<f64>(&case, psf.view(), &u0).1.energy
-        };
-        let (plain, fast) = (Step::Adaptive(1.0), Step::Accelerated(1.0));
-        assert!(energy(fast, 15) < energy(plain, 40));
-        // And both go to the same minimum: where the plain one is after 3000 iterations.
-        let (slow, quick) = (energy(plain, 3000), energy(fast, 300));
-        assert!((slow - quick).abs() < 1e-3 * slow.abs(), "{slow} {quick}");
-    }
-
-    #[test]
-    fn a_trace_shows_every_iteration_of_the_same_run() {
-        let mut rng = ChaCha8Rng::seed_from_u64(6);
-        let psf = psf(&mut rng, 7);
-        let u0: Vec<f64> = stamp(&mut rng, 15).iter().copied().collect();
-        let mut network = Network::<f64>::plan(15, 7, 0.0).unwrap();
-        network.set_psf(psf.view()).unwrap();
-        let mut scratch = network.scratch();
-        for (step, unit, clipping, kept) in [
-            (0.5, 0.01, Clipping::BeforeTest, Kept::Lowest),
-            (0.5, 1.0, Clipping::BeforeTest, Kept::Lowest),
-            (50.0, 0.01, Clipping::BeforeTest, Kept::Lowest),
-            (50.0, 0.01, Clipping::BeforeTest, Kept::Last),
-            (0.5, 0.01, Clipping::AfterTest, Kept::Last),
-            (2.6, 0.01, Clipping::Never, Kept::Last),
-        ] {
-            let rule = Rule {
-                step: Step::Adaptive(step),
-                unit,
-                max_iterations: 30,
-                start: Start::ClippedData,
-                clipping,
-                kept,
-            };
-            let (mut whole, mut traced) = (vec![0.0; 225], vec![0.0; 225]);
-            let expected = network
-                .deconvolve(&rule, &u0, &mut scratch, &mut whole)
-                .unwrap();
-            let mut shown = 0;
-            let found = network
-                .trace(&rule, &u0, &mut scratch, &mut traced, |before, after| {
-                    shown += 1;
-                    assert_ne!(before, after);
-                })
-                .unwrap();
-            assert_eq!(found, expected);
-            assert_eq!(whole, traced);
-            let left = expected.stop == Stop::EnergyRise && kept == Kept::Lowest;
-            let attempted = u32::from(left);
-            assert_eq!(shown, expected.iterations + attempted);
-        }
-    }
-
-    #[test]
-    fn a_psf_of_peak_one_is_a_larger_unit_and_step() {
-        // H/p: with states p times as large, thresholds 1/p² and c p² give the same run.
-        let mut rng = ChaCha8Rng::seed_from_u64(8);
-        let psf = psf(&mut rng, 7);
-        let u0: Vec<f64> = stamp(&mut rng, 15).iter().copied().collect();
-        let mut network = Network::<f64>::plan(15, 7, 0.0).unwrap();
-        let factor = network.set_scaled_psf(psf.view(), PsfScale::Peak).unwrap();
-        let peak = psf.iter().copied().fold(0.0, f64::max);
-        assert!((factor * peak - 1.0).abs() < 1e-15);
-        let run = |network: &Network<f64>, step, unit| {
-            let rule = Rule {
-                step: Step::Adaptive(step),
-                unit,
-                max_iterations: 9,
-                start: Start::Zero,
-                clipping: Clipping::BeforeTest,
-                kept: Kept::Lowest,
-            };
-            let mut out = vec![0.0; 225];
-            let descent = network
-                .deconvolve(&rule, &u0, &mut network.scratch(), &mut out)
-                .unwrap();
-            (out, descent)
-        };
-        let (scaled, a) = run(&network, 0.8 * peak * peak, 0.1 * peak);
-        let factor_of_sum = network.set_scaled_psf(psf.view(), PsfScale::Sum);
-        assert_eq!(factor_of_sum.unwrap(), 1.0);
-        let (plain, b) = run(&network, 0.8, 0.1);
-        assert_eq!(
-            (a.iterations, a.stop, a.updated),
-            (b.iterations, b.stop, b.updated)
-        );
-        for (a, b) in scaled.iter().zip(&plain) {
-            assert!((a * factor - b).abs() < 1e-12);
-        }
-        let dark = Array2::zeros((7, 7));
-        assert!(network.set_scaled_psf(dark.view(), PsfScale::Peak).is_err());
-    }
-
-    #[test]
-    fn unusable_psfs_are_refused() {
-        let mut network = Network::<f32>::plan(15, 5, 0.0).unwrap();
-        assert!(network.set_psf(Array2::zeros((5, 7)).view()).is_err());
-        let mut psf = Array2::from_elem((5, 5), 0.04);
-        psf[(1, 2)] = f64::NAN;
-        for scale in [PsfScale::Sum, PsfScale::Peak] {
-            let other = Array2::from_elem((5, 7), 0.04);
-            assert!(network.set_scaled_psf(other.view(), scale).is_err());
-            for found in [
-                network.set_psf(psf.view()),
-                network.set_scaled_psf(psf.view(), scale).map(|_| ()),
-            ] {
-                let message = found.unwrap_err().to_string();
-                assert!(message.contains("(3, 2)"), "{message}");
-            }
-        }
-        assert!(Network::<f32>::plan(2, 5, 0.0).is_err());
-        assert!(Network::<f32>::plan(15, 49, 0.0).is_err());
-    }
-
-    #[test]
-    fn wrong_sizes_are_refused_with_what_was_expected() {
-        let network = Network::<f32>::plan(15, 5, 0.0).unwrap();
-        let other = Network::<f32>::plan(23, 5, 0.0).unwrap();
-        let rule = Rule {
-            step: Step::Adaptive(0.5),
-            unit: 1.0,
-            max_iterations: 1,
-            start: Start::Zero,
-            clipping: Clipping::BeforeTest,
-            kept: Kept::Lowest,
-        };
-        let run = |pixels: usize, room: usize, of: &Network<f32>| {
-            let (u0, mut out) = (vec![1.0; pixels], vec![0.0; room]);
-            let run = network.deconvolve(&rule, &u0, &mut of.scratch(), &mut out);
-            run.map_err(|error| error.to_string())
-        };
-        assert!(run(225, 225, &network).is_ok());
-        let expected = Err("a stamp of 224 values; expected 225".to_owned());
-        assert_eq!(run(224, 225, &network), expected);
-        assert!(run(225, 226, &network).is_err());
-        assert!(run(225, 225, &other).unwrap_err().contains("23 × 23"));
-        let wider = Network::<f32>::plan(15, 7, 0.0).unwrap();
-        assert!(run(225, 225, &wider).unwrap_err().contains("7 × 7"));
+    let above_and_below = lines[..n * n].iter().zip(&lines[2 * n..]);
+    let values = lines[n..].iter().zip(above_and_below).zip(image);
+    for (out, ((line, (above, below)), pixel)) in out.iter_mut().zip(values) {
+        *out = corner * (above + below + ratio * line) + middle * pixel;
     }
 }
+
+#[cfg(test)]
+mod tests;

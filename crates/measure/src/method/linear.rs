@@ -340,7 +340,7 @@ struct PlanWorker {
     shape: Option<AdaptiveShape>,
     /// A field of noise, and its difference to the field behind a PSF turned by 90 degrees.
     field: Lags,
-    turned: Lags,
+    turned: Vec<f32>,
     acf_with_field: Vec<f32>,
     values: AdaptiveScratch,
 }
@@ -359,7 +359,7 @@ impl PlanWorker {
             lags: plan.spectral.lags(),
             shape: None,
             field: plan.spectral.lags(),
-            turned: plan.spectral.lags(),
+            turned: plan.spectral.lags().acf,
             acf_with_field: plan.spectral.lags().acf,
             values: plan.moments.scratch(),
             plan,
@@ -444,10 +444,9 @@ impl PlanWorker {
     /// The response to sheared noise; `None` if the galaxy cannot be measured with the field.
     fn noise_field(&mut self, seed: u64, noise: f32) -> Option<NoiseField> {
         let plan = &*self.plan;
+        let (field, turned) = (&mut self.field, &mut self.turned);
         plan.spectral
-            .noise_field(&self.psf, seed, &mut self.buffers, &mut self.field);
-        plan.spectral
-            .turned_field(&self.psf, seed, &mut self.buffers, &mut self.turned);
+            .noise_field(&self.psf, seed, &mut self.buffers, field, turned);
         let step = NOISE_FIELD_LEVEL * noise;
         let [divisor, floor] = self.regularisation.map(|term| term * noise * noise);
         let mut side = |step: f32| {
@@ -460,10 +459,10 @@ impl PlanWorker {
             let response = Self::response(plan, &shape, &self.field, &mut self.values);
             let turned = plan
                 .moments
-                .response(&shape, &self.turned.acf, &mut self.values);
+                .response(&shape, &self.turned, &mut self.values);
             let typical = plan.regularisation.typical_square;
             let breadth = plan.breadth.measure(acf, floor, typical);
-            let changes = [&self.field.shear1, &self.field.shear2, &self.turned.acf];
+            let changes = [&self.field.shear1, &self.field.shear2, &self.turned];
             let square = changes.map(|change| f64::from(plan.breadth.response(&breadth, change)));
             Some(((shape.distortion, response), turned, square))
         };
@@ -526,17 +525,24 @@ impl PlanWorker {
         found
     }
 
-    fn images(&self, cut: &[f32], psf: ArrayView2<'_, f64>) -> Images {
+    fn images(&mut self, cut: &[f32], psf: ArrayView2<'_, f64>) -> Images {
         let LinearPlan {
             spectral, moments, ..
         } = &*self.plan;
+        // A convolution takes pixel p/2 for the centre of the PSF, half a pixel beyond the middle of an even one.
+        let shift = if psf.nrows().is_multiple_of(2) {
+            0.5
+        } else {
+            0.0
+        };
+        let deconvolved = spectral.deconvolved(&self.psf, cut, shift, &mut self.buffers);
         let acf = whole_lags(&self.lags.acf, spectral.reach());
         let lag = |place: usize| (place as f64 - spectral.reach() as f64) * spectral.spacing();
         let weight = self.shape.map(|shape| {
             Array2::from_shape_fn(acf.dim(), |(y, x)| moments.weight(&shape, lag(x), lag(y)))
         });
         Images {
-            deconvolved: image(&spectral.deconvolved(psf, cut), spectral.stamp_size()),
+            deconvolved: image(&deconvolved, spectral.stamp_size()),
             acf,
             weight,
             spacing: spectral.spacing(),

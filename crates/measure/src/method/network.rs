@@ -12,7 +12,7 @@ use crate::shape::{ClippedAcf, ClippedAcfScratch};
 
 pub(crate) struct NetworkPlan {
     settings: NetworkDeconvolution,
-    network: Network<f32>,
+    network: Network,
     acf: ClippedAcf,
 }
 
@@ -29,8 +29,8 @@ impl NetworkPlan {
 
 pub(super) struct NetworkWorker {
     plan: Arc<NetworkPlan>,
-    network: Network<f32>,
-    buffers: NetworkScratch<f32>,
+    network: Network,
+    buffers: NetworkScratch,
     /// Flux of a state per sum of its pixels: a scaled PSF does not have a sum of one.
     light: f64,
     acf_buffers: ClippedAcfScratch,
@@ -54,7 +54,7 @@ impl NetworkWorker {
 impl CutWorker for NetworkWorker {
     fn set_psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<(), MeasureError> {
         let scale = self.plan.settings.psf_scale;
-        self.light = self.network.set_scaled_psf(psf, scale)?;
+        self.light = self.network.set_psf(psf, scale)?;
         Ok(())
     }
 
@@ -91,7 +91,7 @@ impl CutWorker for NetworkWorker {
         let n = self.network.stamp_size();
         Images {
             deconvolved: image(&self.deconvolved, n),
-            acf: whole_lags(self.acf_buffers.lags(), n - 1),
+            acf: whole_lags(self.acf_buffers.acf(), self.plan.acf.reach()),
             weight: None,
             spacing: 1.0,
         }

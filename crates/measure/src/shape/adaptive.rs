@@ -16,21 +16,25 @@
 
 use multiversion::multiversion;
 use shearq_quantities::Distortion;
+use shearq_quantities::product::LANES;
 
 use crate::measurement::Flag;
 
-/// Most Newton steps. See docs/constants.md.
-const MAX_STEPS: usize = 30;
-/// Largest |χ| of a weight. See docs/constants.md.
-const MAX_MODULUS: f32 = 0.98;
-/// Longest Newton step in χ. See docs/constants.md.
-const MAX_STEP: f32 = 0.3;
-/// Change of χ at which the iteration ends. See docs/constants.md.
-const CONVERGED: f32 = 3e-6;
-/// Least determinant of 1 − ∂m/∂χ; near zero the moments follow the weight. See docs/constants.md.
+/// Most Newton steps.
+// Chosen by hand.
+const MAX_NEWTON_STEPS: usize = 30;
+/// Largest |χ| of a weight.
+// Chosen by hand.
+const MAX_WEIGHT_MODULUS: f32 = 0.98;
+/// Longest Newton step in χ.
+// Chosen by hand.
+const MAX_NEWTON_STEP: f32 = 0.3;
+/// Change of χ at which the iteration ends.
+// Resolution of sums of a few hundred single-precision terms.
+const CONVERGED_STEP: f32 = 3e-6;
+/// Least determinant of 1 − ∂m/∂χ; near zero the moments follow the weight.
+// Chosen by hand.
 const LEAST_DETERMINANT: f32 = 1e-3;
-/// Lags that are summed side by side. See docs/constants.md.
-const LANES: usize = 16;
 
 /// Moments for one size of weight.
 #[derive(Debug, Clone)]
@@ -138,7 +142,7 @@ impl AdaptiveMoments {
         debug_assert_eq!(acf.len(), self.lags);
         self.gather(acf, &mut scratch.values);
         let mut chi = [0.0f32; 2];
-        for _ in 0..MAX_STEPS {
+        for _ in 0..MAX_NEWTON_STEPS {
             let s = self.sums(scratch, chi);
             let [extent, n1, n2, ..] = s;
             let t = extent + softening;
@@ -165,7 +169,7 @@ impl AdaptiveMoments {
                 inverse[1][0] * rest[0] + inverse[1][1] * rest[1],
             ];
             let length = step[0].hypot(step[1]);
-            if length < CONVERGED {
+            if length < CONVERGED_STEP {
                 return Ok(AdaptiveShape {
                     distortion: Distortion::new(f64::from(chi[0]), f64::from(chi[1])),
                     chi,
@@ -173,12 +177,12 @@ impl AdaptiveMoments {
                     inverse,
                 });
             }
-            let short = (MAX_STEP / length).min(1.0);
+            let short = (MAX_NEWTON_STEP / length).min(1.0);
             step = step.map(|s| s * short);
             chi = [chi[0] + step[0], chi[1] + step[1]];
             let modulus = chi[0].hypot(chi[1]);
-            if modulus > MAX_MODULUS {
-                chi = chi.map(|e| e * MAX_MODULUS / modulus);
+            if modulus > MAX_WEIGHT_MODULUS {
+                chi = chi.map(|e| e * MAX_WEIGHT_MODULUS / modulus);
             }
         }
         Err(Flag::NoExtent)
@@ -268,7 +272,7 @@ impl AdaptiveMoments {
         (1.0 + q).powf(-1.5)
     }
 
-    /// Takes the lags within the circle.
+    // Takes the lags within the circle.
     fn gather(&self, acf: &[f32], values: &mut [f32]) {
         let mut to = 0;
         for &(first, count) in &self.runs {
@@ -278,14 +282,14 @@ impl AdaptiveMoments {
         values[to..].fill(0.0);
     }
 
-    /// Makes sure that the weights are those that `shape` was found with: it may not be the one that was found last.
+    // Makes sure that the weights are those that `shape` was found with: it may not be the one that was found last.
     fn weigh(&self, shape: &AdaptiveShape, scratch: &mut AdaptiveScratch) {
         if scratch.chi != shape.chi {
             self.sums(scratch, shape.chi);
         }
     }
 
-    /// Sums over the values that were taken; leaves their weights.
+    // Sums over the values that were taken; leaves their weights.
     fn sums(&self, scratch: &mut AdaptiveScratch, chi: [f32; 2]) -> WeightedSums {
         let [a, b, c] = &self.bases;
         let AdaptiveScratch {
@@ -297,13 +301,13 @@ impl AdaptiveMoments {
         weighted_sums(values, &self.area, [a, b, c], chi, self.scale(chi), weights)
     }
 
-    /// 1/(√(1 − |χ|²) r²).
+    // 1/(√(1 − |χ|²) r²).
     fn scale(&self, chi: [f32; 2]) -> f32 {
         let rest = 1.0 - chi[0] * chi[0] - chi[1] * chi[1];
         1.0 / (rest.sqrt() * self.square)
     }
 
-    /// ∂m_i/∂χ_j of the moments' ellipticity m, whose divisor is `t`, with that of the weight.
+    // ∂m_i/∂χ_j of the moments' ellipticity m, whose divisor is `t`, with that of the weight.
     fn derivative(
         &self,
         s: &WeightedSums,
@@ -369,7 +373,7 @@ fn weighted_sums(
     lanes.map(|lane| lane.iter().sum())
 }
 
-/// The first three of them, with weights that are known.
+// The first three of them, with weights that are known.
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 fn plain_sums(values: &[f32], weights: &[f32], bases: [&[f32]; 3]) -> [f32; 3] {
     let mut lanes = [[0.0f32; LANES]; 3];
@@ -445,7 +449,7 @@ mod tests {
     }
 
     #[test]
-    fn the_distortion_of_a_gaussian_is_found_with_its_sign_whatever_its_size() {
+    fn the_distortion_of_a_gaussian_is_found_with_its_sign() {
         for (spacing, scale) in [(1.0, 2.0), (1.5, 3.0)] {
             let moments = AdaptiveMoments::new(scale, spacing, REACH);
             let mut scratch = moments.scratch();

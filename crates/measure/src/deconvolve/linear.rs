@@ -1,0 +1,1349 @@
+//! The linear network in closed form, and the autocorrelation of what it makes of a stamp.
+//!
+//! Without thresholds (Nurbaeva et al. 2015, Eq. 9) and clipping (Eq. 12), the adaptive update v ← v + c·f (Eqs. 10 and 11)
+//! from v = 0 is linear. On a plane without boundary each Fourier mode evolves alone, and after M iterations
+//!
+//! ```text
+//! v̂ = [1 − (1 − c w)^M] · conj(p)/w · û,    w = |p|² + λ d²,
+//! ```
+//!
+//! with p and d the transforms of the PSF and of Sun's kernel. What the shape is measured on is v
+//! convolved with Γ: a round Gaussian of σ that falls to zero towards |k| = [`TARGET_CUT`]/σ. No mode enters that
+//! the PSF has destroyed, and what remains of the PSF is round. (A sharp cut would bring noise from afar.)
+//!
+//! The result is multiplied by a round Gaussian window, which keeps out most of the noise, before its
+//! autocorrelation is taken. (A window on the stamp itself would cut into the PSF, and what was then
+//! deconvolved would have the opposite of its ellipticity.) Noise of level σ and power σ²S adds to the mean of the power of
+//! each mode what the window brings there of σ²SΓ²[…]²|p|²/w², which is subtracted. So few modes remain that lags are sampled
+//! on a coarse grid.
+//!
+//! # Response to shear
+//!
+//! A shear γ₁ of the galaxy (before the PSF) changes the transform s = û/p of the whole stamp by
+//! (k_x ∂_x − k_y ∂_y)s, γ₂ by (k_y ∂_x + k_x ∂_y)s (∂ with respect to k). ∂û is the transform of
+//! −i·x times the stamp, so that the change of the autocorrelation with shear follows from the stamp
+//! itself: metacalibration (Huff & Mandelbaum 2017) in the limit of a small shear. The change is
+//! worked out on the whole stamp and windowed then: a shear moves the galaxy and not the window, nor the edges of the stamp
+//! ([`Edges`]).
+
+use multiversion::multiversion;
+use ndarray::ArrayView2;
+use shearq_fourier::Complex64;
+use shearq_quantities::product::{LANES, Matrix, ROWS, multiply};
+use shearq_submissions::LinearDeconvolution;
+
+use super::network::high_pass;
+use crate::error::MeasureError;
+use crate::noise::StampNoise;
+use crate::pixel::copy_row;
+use crate::pixel::{check_psf, check_sizes};
+use crate::transform::{
+    LagsScratch, Modes, Plane, Spectrum, ToLags, ToModes, TransformScratch, even_parities,
+    four_lanes, lanes, store, table,
+};
+
+/// Margin around a stamp, so that the deconvolved stamp does not wrap around.
+// Chosen by hand.
+const MARGIN_PX: usize = 8;
+/// Period of the plane in multiples of this.
+// Layout: sizes whose rows fill vectors.
+const PERIOD_STEP_PX: usize = 16;
+/// Largest wave number of the target Γ, times its σ.
+// Chosen by hand: Γ is 0.09 there, and noise outweighs the galaxy beyond it.
+const TARGET_CUT: f64 = 2.2;
+/// Share of the largest wave number at which the taper of Γ begins.
+// Chosen by hand.
+const TAPER_START: f64 = 0.75;
+/// Value of the window at the middle of an edge above which the edge correction is applied.
+// Chosen by hand. Below it |m| stays under 10⁻³ for the largest galaxies, and a tenth of the time is saved.
+const LEAST_EDGE_WINDOW: f64 = 0.02;
+/// Largest lag of the autocorrelation in σ of the window.
+// Chosen by hand: the window's autocorrelation is a fifth there.
+const LARGEST_LAG: f64 = 2.5;
+/// Lags per sample of a grid that samples the kept modes, along an axis, at least.
+// Chosen by hand. Lags are closer together than the modes would need because the autocorrelation is multiplied by a weight with
+// structure of its own: sums over sparser lags depend on whether a galaxy lies along the grid or across it.
+const LAGS_PER_SAMPLE: f64 = 1.5;
+/// Least power of the PSF's transform; modes below it are left out as pure noise.
+// Below 10⁻³, the least power in the simulated sets, and within single precision.
+const LEAST_PSF_POWER: f32 = 1e-7;
+
+/// The linear network for one stamp size.
+#[derive(Debug, Clone)]
+pub struct Spectral {
+    step: f32,
+    iterations: i32,
+    plane: Plane,
+    stamp: ToModes,
+    psf: ToModes,
+    /// λ d² of each mode.
+    rough: Vec<f32>,
+    /// Γ of each mode.
+    target: Vec<f32>,
+    /// k_x and k_y of each mode, in radians per pixel.
+    waves: [Vec<f32>; 2],
+    /// For how many modes of the plane each stands. One without k_y is stored twice, and counts half each time.
+    counts: Vec<f32>,
+    /// Place of each mode turned by 90 degrees, or of its opposite.
+    turned: Vec<u32>,
+    window_sigma: f64,
+    window: Smoothing,
+    window_spectrum: Spectrum,
+    /// What windowed noise of a power becomes, in units of σ².
+    leak: Smoothing,
+    edges: Edges,
+    to_lags: ToLags,
+    reach: usize,
+    lag_spacing: f64,
+    /// Scale of the autocorrelation for modes in the largest circle of those kept, zero outside; of a quarter.
+    scale: Vec<f32>,
+    /// Share of the noise under the window that the stamp contains.
+    inside: f32,
+}
+
+/// Buffers for one thread. Their content between calls does not matter, but for the stamp that
+/// [`Spectral::noise_field`] looks at.
+#[derive(Debug, Clone)]
+pub struct SpectralScratch {
+    of_stamp: TransformScratch,
+    of_psf: TransformScratch,
+    /// Spectra mode by mode, before the window.
+    changes: [Modes; 3],
+    /// v̂ of a stamp and its changes with the components of shear, behind the window; or other changes.
+    windowed: [Spectrum; 3],
+    psf_image: Vec<f32>,
+    /// v̂ of the stamp behind the window.
+    stamp: Spectrum,
+    /// Real spectra, mode by mode.
+    real: [Vec<f32>; 2],
+    /// A real even spectrum by parity.
+    even: Vec<f32>,
+    /// A quarter on its way through the window.
+    quarter: Vec<f32>,
+    /// Where the window is, (x, y) in pixels from the middle of the stamp, and the phases that move this place to the origin.
+    centre: [f32; 2],
+    phases: Modes,
+    edges: EdgesScratch,
+    lags: LagsScratch,
+}
+
+/// Autocorrelations on lags dy = 0…R, dx = −R…R, in steps of [`Spectral::spacing`]:
+/// `[dy·(2R+1) + dx + R]`.
+#[derive(Debug, Clone)]
+pub struct Lags {
+    /// Of the result.
+    pub acf: Vec<f32>,
+    /// Its derivative with respect to a shear γ₁ of the galaxy.
+    pub shear1: Vec<f32>,
+    /// Its derivative with respect to γ₂.
+    pub shear2: Vec<f32>,
+    /// Sum of the windowed result, and its derivatives with respect to γ₁ and γ₂.
+    pub flux: [f32; 3],
+}
+
+/// Noise as the linear network uses it: of level one, and white but for its power.
+#[derive(Debug, Clone)]
+pub struct ModeNoise {
+    /// Power S of each mode; one for white noise.
+    power: Vec<f32>,
+    /// ½(k_x ∂_x − k_y ∂_y) ln S and ½(k_y ∂_x + k_x ∂_y) ln S: what a shear adds to a mode of noise, in units
+    /// of it and in the mean.
+    tilts: [Vec<f32>; 2],
+}
+
+/// A PSF as the linear network uses it.
+#[derive(Debug, Clone)]
+pub struct SpectralPsf {
+    /// v̂/û.
+    restore: Modes,
+    /// (k_x ∂_x − k_y ∂_y)p/p and (k_y ∂_x + k_x ∂_y)p/p.
+    tilts: [Modes; 2],
+    /// |p|²/S of each mode: the square of what a point of flux one is there, in units of the noise.
+    clarity: Vec<f32>,
+    /// What a field of noise of σ = 1 becomes of one that is white: v̂/û times √S.
+    field: Modes,
+    /// Change of a mode of the field with the components of shear, in units of it and in the mean.
+    field_tilts: [Vec<f32>; 2],
+    /// What the field would be with the PSF turned by 90 degrees, less what it is, in units of it.
+    turned: Vec<f32>,
+    /// Mean power of windowed noise, in units of σ², by parity.
+    floor: Vec<f32>,
+    /// Mean of −Re(conj(v̂)·δv̂) of windowed noise, in units of σ², by parity.
+    noise_tilts: [Vec<f32>; 2],
+    /// Power of noise of σ = 1 before the window, of each mode and the modes that it stands for. It is multiplied by the change
+    /// with γ₁, by the change with γ₂, by the difference to noise behind the PSF turned by 90 degrees, and by one; by parity.
+    powers: [Vec<f32>; 4],
+}
+
+impl SpectralPsf {
+    /// |p|²/S of each mode, S being the power of the noise.
+    pub fn clarity(&self) -> &[f32] {
+        &self.clarity
+    }
+
+    /// Standard deviation of [`Lags::flux`] in noise of σ = 1.
+    pub fn flux_error(&self) -> f32 {
+        self.floor[0].sqrt()
+    }
+}
+
+/// Weights of the lags whose sum with an autocorrelation's change is the change of a quantity.
+#[derive(Debug, Clone)]
+pub(crate) struct Gradients {
+    /// Of two quantities; laid out as `Lags`, of both lags that each place stands for.
+    pub(crate) pair: [Vec<f32>; 2],
+    /// Of a third one, as its spectrum by parity.
+    pub(crate) third: Vec<f32>,
+}
+
+/// Means of a product for four kinds of noise: its change with γ₁, its change with γ₂, what it lacks to be that
+/// behind a PSF turned by 90 degrees, and the noise itself.
+pub(crate) type Kinds = [f32; 4];
+
+impl Spectral {
+    /// Plans for n×n stamps and p×p PSFs.
+    ///
+    /// # Errors
+    /// Where a size is out of range.
+    pub fn new(n: usize, p: usize, settings: &LinearDeconvolution) -> Result<Self, MeasureError> {
+        check_sizes(n, p)?;
+        let (sigma, window_sigma) = (settings.target_sigma, settings.window_sigma);
+        // Below the stamp's own Nyquist frequency, π.
+        let cut = (TARGET_CUT / sigma).min(3.0);
+        let period = (n + MARGIN_PX).max(p).next_multiple_of(PERIOD_STEP_PX);
+        let samples = (cut * period as f64 / std::f64::consts::PI).ceil() as usize + 2;
+        let samples = smooth_length(samples).min(period);
+        let plane = Plane::new(period, samples / 2 - 1);
+        let lags = smooth_length((LAGS_PER_SAMPLE * samples as f64).ceil() as usize);
+        let lag_spacing = period as f64 / lags as f64;
+        let reach = (LARGEST_LAG * window_sigma / lag_spacing) as usize;
+        let reach = reach.clamp(1, lags / 2 - 1);
+
+        let indices = || (0..2 * plane.quarter()).map(|at| plane.indices(at));
+        let waves: Vec<[f64; 2]> = indices()
+            .map(|(x, y, below)| {
+                [
+                    plane.wave(x),
+                    if below { -1.0 } else { 1.0 } * plane.wave(y),
+                ]
+            })
+            .collect();
+        let kept = |x: usize, y: usize| x.max(y) <= plane.modes;
+        let counts = indices().map(|(x, y, _)| match (kept(x, y), y) {
+            (false, _) => 0.0,
+            (true, 0) => 0.5 * plane.count(x) as f32,
+            (true, _) => plane.count(x) as f32,
+        });
+        // (k_x, k_y) becomes (k_y, −k_x), and (k_x, −k_y) the opposite of (k_y, k_x).
+        let turned = indices().enumerate().map(|(at, (x, y, below))| {
+            let place = if kept(x, y) {
+                plane.place(y, x, !below)
+            } else {
+                at
+            };
+            place as u32
+        });
+        let target = waves.iter().map(|&[kx, ky]| {
+            let square = kx * kx + ky * ky;
+            (taper(square.sqrt() / cut) * (-0.5 * sigma * sigma * square).exp()) as f32
+        });
+        let rough = waves
+            .iter()
+            .map(|&[kx, ky]| (settings.lambda * high_pass(kx, ky).powi(2)) as f32);
+        let circle = plane.wave(plane.modes) * (1.0 + 1e-12);
+        let size = period as f64;
+        let scale = waves[..plane.quarter()].iter().map(|&[kx, ky]| {
+            if kx.hypot(ky) <= circle {
+                1.0 / (size * size) as f32
+            } else {
+                0.0
+            }
+        });
+        let window = window_modes(window_sigma, &plane);
+        let inside = inside(n, window_sigma);
+        let mut window_spectrum = plane.spectrum();
+        let [cc, ..] = window_spectrum.quarters_mut();
+        let side = plane.modes + 1;
+        cc.copy_from_slice(&table([side, side], [plane.rows, plane.width], |y, x| {
+            window[x] * window[y]
+        }));
+        Ok(Spectral {
+            step: settings.step as f32,
+            iterations: i32::try_from(settings.max_iterations).unwrap_or(i32::MAX),
+            stamp: ToModes::new(n, &plane, true),
+            psf: ToModes::new(p, &plane, true),
+            rough: rough.collect(),
+            target: target.collect(),
+            counts: counts.collect(),
+            turned: turned.collect(),
+            scale: scale.collect(),
+            waves: [0, 1].map(|axis| waves.iter().map(|k| k[axis] as f32).collect()),
+            window_sigma,
+            window: Smoothing::new(|distance| window[distance], &plane),
+            window_spectrum,
+            leak: Smoothing::new(|distance| inside * size * window[distance].powi(2), &plane),
+            edges: Edges::new(n, &plane),
+            to_lags: ToLags::new(reach, lags, &plane, 1.0),
+            reach,
+            lag_spacing,
+            inside: (inside * inside) as f32,
+            plane,
+        })
+    }
+
+    /// Stamp side n.
+    pub fn stamp_size(&self) -> usize {
+        self.stamp.side()
+    }
+
+    /// Largest lag, in steps of [`Spectral::spacing`].
+    pub fn reach(&self) -> usize {
+        self.reach
+    }
+
+    /// Pixels between lags.
+    pub fn spacing(&self) -> f64 {
+        self.lag_spacing
+    }
+
+    /// Buffers that fit this plan.
+    pub fn scratch(&self) -> SpectralScratch {
+        let p = self.psf.side();
+        let zeros = |quarters: usize| vec![0.0; quarters * self.plane.quarter()];
+        SpectralScratch {
+            of_stamp: self.stamp.scratch(),
+            of_psf: self.psf.scratch(),
+            changes: [(); 3].map(|()| self.plane.mode_by_mode()),
+            windowed: [(); 3].map(|()| self.plane.spectrum()),
+            psf_image: vec![0.0; p * p],
+            stamp: self.plane.spectrum(),
+            real: [zeros(2), zeros(2)],
+            even: zeros(2),
+            quarter: zeros(1),
+            centre: [0.0; 2],
+            phases: self.plane.mode_by_mode(),
+            edges: self.edges.scratch(),
+            lags: self.to_lags.scratch(),
+        }
+    }
+
+    /// Room for the lags.
+    pub fn lags(&self) -> Lags {
+        let lags = vec![0.0; self.to_lags.len()];
+        Lags {
+            acf: lags.clone(),
+            shear1: lags.clone(),
+            shear2: lags,
+            flux: [0.0; 3],
+        }
+    }
+
+    /// A PSF of zeros.
+    pub fn psf(&self) -> SpectralPsf {
+        let zeros = || vec![0.0; self.target.len()];
+        SpectralPsf {
+            restore: self.plane.mode_by_mode(),
+            tilts: [(); 2].map(|()| self.plane.mode_by_mode()),
+            clarity: zeros(),
+            field: self.plane.mode_by_mode(),
+            field_tilts: [zeros(), zeros()],
+            turned: zeros(),
+            floor: zeros(),
+            noise_tilts: [zeros(), zeros()],
+            powers: [zeros(), zeros(), zeros(), zeros()],
+        }
+    }
+
+    /// Noise of level one with the correlation of `noise`.
+    pub fn noise(&self, noise: &StampNoise) -> ModeNoise {
+        let waves = self.waves[0].iter().zip(&self.waves[1]);
+        let modes: Vec<[f32; 3]> = waves
+            .map(|(&kx, &ky)| {
+                let (power, slopes) = noise.power([kx, ky].map(f64::from));
+                let [first, second] = slopes.map(|slope| (0.5 * slope / power) as f32);
+                [power as f32, first, second]
+            })
+            .collect();
+        let column = |k: usize| modes.iter().map(|mode| mode[k]).collect();
+        ModeNoise {
+            power: column(0),
+            tilts: [column(1), column(2)],
+        }
+    }
+
+    /// Room for gradients.
+    pub(crate) fn gradients(&self) -> Gradients {
+        Gradients {
+            pair: [self.lags().acf, self.lags().acf],
+            third: vec![0.0; self.target.len()],
+        }
+    }
+
+    /// |g|² of each mode over the plane's area in px², of a round Gaussian galaxy of flux one with a mean square of `extent`
+    /// px² per axis, times the number of modes that it stands for. The sum of this times |p|² is that of the squared pixels
+    /// of the galaxy behind p.
+    pub fn light(&self, extent: f64) -> Vec<f32> {
+        let area = (self.plane.period * self.plane.period) as f64;
+        let [kx, ky] = &self.waves;
+        let squares = kx.iter().zip(ky).map(|(x, y)| x * x + y * y);
+        let modes = squares.zip(&self.counts);
+        let light = modes.map(|(square, &count)| {
+            (f64::from(count) / area * (-f64::from(square) * extent).exp()) as f32
+        });
+        light.collect()
+    }
+
+    /// Takes a PSF, for images with `noise`; it is used as it is, so it should sum to one and be centred on the middle of its
+    /// stamp, (p − 1)/2 on both axes: the window is where deconvolution leaves the galaxy.
+    ///
+    /// # Errors
+    /// Where its size is not the planned one or a pixel is not finite.
+    pub fn set_psf(
+        &self,
+        psf: ArrayView2<'_, f64>,
+        noise: &ModeNoise,
+        scratch: &mut SpectralScratch,
+        out: &mut SpectralPsf,
+    ) -> Result<(), MeasureError> {
+        let (p, side) = (self.psf.side(), psf.nrows());
+        // Zero around a smaller one.
+        let fits = side < p && (p - side).is_multiple_of(2);
+        check_psf(psf, if fits { side } else { p })?;
+        let first = (p - side) / 2;
+        let SpectralScratch {
+            of_psf,
+            windowed: spectra,
+            changes,
+            psf_image: image,
+            real: [power, modes],
+            even,
+            quarter,
+            ..
+        } = scratch;
+        image.fill(0.0);
+        let rows = image.chunks_exact_mut(p).skip(first);
+        for (row, from) in rows.zip(psf.into_outer_iter()) {
+            copy_row(from, &mut row[first..]);
+        }
+        self.psf.transform_moments(image, of_psf, spectra);
+        for (modes, spectrum) in changes.iter_mut().zip(&*spectra) {
+            modes.take_spectrum(spectrum);
+        }
+        take_psf(self, noise, changes, power, out);
+
+        roots(power, modes);
+        let amplitudes = modes.iter().zip(&self.turned);
+        for (out, (here, &there)) in out.turned.iter_mut().zip(amplitudes) {
+            let there = modes[there as usize];
+            *out = if *here > 0.0 { there / here - 1.0 } else { 0.0 };
+        }
+        let mut spread = |modes: &[f32], out: &mut [f32]| {
+            even_parities(modes, out);
+            self.leak.apply_even(out, quarter);
+        };
+        spread(power, &mut out.floor);
+        for (out, tilts) in out.noise_tilts.iter_mut().zip(&out.field_tilts) {
+            negative_products(tilts, power, modes);
+            spread(modes, out);
+        }
+        let area = (self.plane.period * self.plane.period) as f32 * self.inside;
+        modes.fill(1.0);
+        let kinds = [&out.field_tilts[0], &out.field_tilts[1], &out.turned, modes];
+        for (out, kind) in out.powers.iter_mut().zip(kinds) {
+            weighted(kind, power, &self.counts, area, even);
+            even_parities(even, out);
+        }
+        Ok(())
+    }
+
+    /// Puts the window at `centre`, (x, y) in pixels from the middle of the stamp, for the stamps that follow.
+    /// Their shear is about this place: the window is where the galaxy is, sheared or not.
+    pub fn place_window(&self, centre: [f32; 2], scratch: &mut SpectralScratch) {
+        if scratch.centre == centre {
+            return;
+        }
+        scratch.centre = centre;
+        if centre == [0.0; 2] {
+            // In the middle phases are not used.
+            return;
+        }
+        let Modes { re, im } = &mut scratch.phases;
+        let [kx, ky] = &self.waves;
+        let width = self.plane.width;
+        let rows = re.chunks_exact_mut(width).zip(im.chunks_exact_mut(width));
+        for ((re, im), ky) in rows.zip(ky.chunks_exact(width)) {
+            // In double precision: a row has one phase along y, and steps of one phase along x.
+            let turn = |k: f32, by: f32| Complex64::cis(f64::from(k) * f64::from(by));
+            let mut phase = turn(ky[0], centre[1]);
+            let step = turn(kx[1], centre[0]);
+            for (re, im) in re.iter_mut().zip(im) {
+                (*re, *im) = (phase.re as f32, phase.im as f32);
+                phase *= step;
+            }
+        }
+    }
+
+    /// Deconvolves a row-major `stamp` with noise of level `noise` and writes the
+    /// autocorrelation with its derivatives.
+    pub fn autocorrelate(
+        &self,
+        psf: &SpectralPsf,
+        stamp: &[f32],
+        noise: f32,
+        scratch: &mut SpectralScratch,
+        out: &mut Lags,
+    ) {
+        self.deconvolve(psf, stamp, scratch);
+        let SpectralScratch {
+            windowed: [v, first, second],
+            stamp,
+            even,
+            lags,
+            ..
+        } = scratch;
+        stamp.copy_from(v);
+        out.flux = [&*v, first, second].map(Spectrum::sum);
+        let variance = noise * noise;
+        v.power(even);
+        subtract_noise(even, &self.scale, &psf.floor, variance);
+        self.to_lags.lags(even, lags, &mut out.acf);
+        let sheared = [(first, &mut out.shear1), (second, &mut out.shear2)];
+        for ((changed, out), mean) in sheared.into_iter().zip(&psf.noise_tilts) {
+            change_of_power(v, changed, &self.scale, mean, variance, even);
+            self.to_lags.lags(even, lags, out);
+        }
+    }
+
+    // v̂ of a stamp and its changes with the components of shear, windowed, to `scratch.windowed`.
+    fn deconvolve(&self, psf: &SpectralPsf, stamp: &[f32], scratch: &mut SpectralScratch) {
+        let SpectralScratch {
+            of_stamp,
+            changes: [moved, edges1, edges2],
+            windowed,
+            quarter,
+            centre,
+            phases,
+            edges,
+            ..
+        } = scratch;
+        self.stamp.transform_moments(stamp, of_stamp, windowed);
+        let centre = *centre;
+        let at_edges = self.sees_edges(centre);
+        if at_edges {
+            let transform = (&self.stamp, of_stamp);
+            self.edges
+                .take(stamp, centre, transform, edges, [edges1, edges2]);
+        }
+        let off_middle = centre != [0.0; 2];
+        if off_middle {
+            moved.copy_from(&psf.restore);
+            multiply_modes(moved, phases);
+        }
+        let with = Restoration {
+            restore: if off_middle { moved } else { &psf.restore },
+            tilts: &psf.tilts,
+            waves: &self.waves,
+            centre,
+            edges: at_edges.then_some([edges1, edges2]),
+        };
+        restore(windowed, &with);
+        for spectrum in windowed {
+            self.window.apply(spectrum, quarter);
+        }
+    }
+
+    // Whether a window at `centre` contains light at the edges.
+    fn sees_edges(&self, centre: [f32; 2]) -> bool {
+        let off = centre.into_iter().map(f32::abs).fold(0.0, f32::max);
+        let away = (self.stamp_size() as f64 / 2.0 - f64::from(off)) / self.window_sigma;
+        (-0.5 * away * away).exp() > LEAST_EDGE_WINDOW
+    }
+
+    /// The deconvolved stamp itself, convolved with Γ and windowed, for pictures. It is moved by `shift` pixels along both axes.
+    pub fn deconvolved(
+        &self,
+        psf: &SpectralPsf,
+        stamp: &[f32],
+        shift: f64,
+        scratch: &mut SpectralScratch,
+    ) -> Vec<f32> {
+        let SpectralScratch {
+            of_stamp,
+            changes: [v, ..],
+            windowed: [spectrum, ..],
+            centre,
+            ..
+        } = scratch;
+        self.stamp.transform(stamp, of_stamp, spectrum);
+        v.take_spectrum(spectrum);
+        multiply_modes(v, &psf.restore);
+        let n = self.stamp_size();
+        let from_middle = |at: usize| at as f64 - (n as f64 - 1.0) / 2.0;
+        let area = (self.plane.period * self.plane.period) as f64;
+        let width = self.plane.width;
+        let pixel = |at: usize| {
+            let (x, y) = (from_middle(at % n), from_middle(at / n));
+            let mut sum = 0.0;
+            for first in (0..v.re.len()).step_by(width) {
+                let mut phase = Complex64::cis(f64::from(self.waves[1][first]) * (y - shift));
+                let step = Complex64::cis(f64::from(self.waves[0][1]) * (x - shift));
+                for mode in first..first + width {
+                    let v = Complex64::new(f64::from(v.re[mode]), f64::from(v.im[mode]));
+                    sum += f64::from(self.counts[mode]) * (v * phase).re;
+                    phase *= step;
+                }
+            }
+            let square = (x - f64::from(centre[0])).powi(2) + (y - f64::from(centre[1])).powi(2);
+            let window = (-0.5 * square / self.window_sigma.powi(2)).exp();
+            (sum / area * window) as f32
+        };
+        (0..n * n).map(pixel).collect()
+    }
+
+    /// Writes how the autocorrelation of the stamp last given changes with a field of noise of σ = 1
+    /// that is added to it, and with what a shear makes of that field: in `acf` the one, in `shear1` and
+    /// `shear2` the other. In `turned`, how it would change further, were the PSF behind the field turned by 90 degrees.
+    ///
+    /// Of the change of noise under shear only the symmetric part is taken, −Re(tilt) of each mode (and what
+    /// the slope of its own power adds): the rest moves pixels about, and its mean is zero. Modes have random signs.
+    pub fn noise_field(
+        &self,
+        psf: &SpectralPsf,
+        seed: u64,
+        scratch: &mut SpectralScratch,
+        out: &mut Lags,
+        turned: &mut [f32],
+    ) {
+        let [field, first, second] = &mut scratch.changes;
+        self.random_signs(seed, field);
+        multiply_modes(field, &psf.field);
+        scale_into(first, field, &psf.field_tilts[0]);
+        scale_into(second, field, &psf.field_tilts[1]);
+        let outs = [&mut out.acf[..], &mut out.shear1, &mut out.shear2];
+        for (which, out) in outs.into_iter().enumerate() {
+            self.apply_window(which, scratch);
+            self.take_change(which, scratch, out);
+        }
+        let [field, lack, _] = &mut scratch.changes;
+        scale_into(lack, field, &psf.turned);
+        self.apply_window(1, scratch);
+        self.take_change(1, scratch, turned);
+    }
+
+    // Multiplies the image of a spectrum of `scratch.changes` by the window, which is at its origin, to `scratch.windowed`.
+    fn apply_window(&self, which: usize, scratch: &mut SpectralScratch) {
+        let windowed = &mut scratch.windowed[which];
+        windowed.take_modes(&scratch.changes[which]);
+        self.window.apply(windowed, &mut scratch.quarter);
+    }
+
+    // Writes how the autocorrelation of the stamp last given changes with a change of v̂ in `scratch.windowed`.
+    fn take_change(&self, which: usize, scratch: &mut SpectralScratch, out: &mut [f32]) {
+        let SpectralScratch {
+            windowed,
+            stamp,
+            real: [nothing, _],
+            even,
+            lags,
+            ..
+        } = scratch;
+        nothing.fill(0.0);
+        change_of_power(stamp, &windowed[which], &self.scale, nothing, 0.0, even);
+        self.to_lags.lags(even, lags, out);
+    }
+
+    // The half spectrum of a real field with the power of white noise of σ = 1 in each mode and random
+    // signs of real and imaginary parts.
+    fn random_signs(&self, seed: u64, out: &mut Modes) {
+        let size = self.plane.period as f32 * std::f32::consts::FRAC_1_SQRT_2;
+        let quarter = self.plane.quarter();
+        let (above_re, below_re) = out.re.split_at_mut(quarter);
+        let (above_im, below_im) = out.im.split_at_mut(quarter);
+        let mut state = seed;
+        for at in (0..quarter).step_by(LANES) {
+            // Four bits for each of sixteen places.
+            let bits = split_mix(&mut state);
+            let parts = [&mut *above_re, above_im, below_re, below_im];
+            for (part, out) in parts.into_iter().enumerate() {
+                let bits = bits >> (part * LANES);
+                for (lane, value) in out[at..][..LANES].iter_mut().enumerate() {
+                    *value = if bits >> lane & 1 == 0 { size } else { -size };
+                }
+            }
+        }
+        // Modes without k_y are stored twice. Those without k_x are conjugate to their opposites.
+        let width = self.plane.width;
+        below_re[..width].copy_from_slice(&above_re[..width]);
+        below_im[..width].copy_from_slice(&above_im[..width]);
+        for at in (0..quarter).step_by(width) {
+            below_re[at] = above_re[at];
+            below_im[at] = -above_im[at];
+        }
+        for half in [above_re, below_re] {
+            half[0] *= std::f32::consts::SQRT_2;
+        }
+        (above_im[0], below_im[0]) = (0.0, 0.0);
+    }
+
+    /// The spectrum of weights of the lags, for [`Gradients::third`].
+    pub(crate) fn spectrum_of(&self, weights: &[f32], scratch: &mut SpectralScratch) -> Vec<f32> {
+        let mut spectrum = scratch.even.clone();
+        self.to_lags
+            .spectrum(weights, &mut scratch.lags, &mut spectrum);
+        spectrum
+    }
+
+    /// Mean products of the changes with noise of σ = 1 of four quantities of the stamp last given: the three of
+    /// `gradients`, and `Lags::flux`. Of each pair in the order 00, 01, 02, 03, 11, 12, 13, 22, 23, 33.
+    ///
+    /// A quantity a that depends on the windowed result changes with noise n by a′(n) = Σ_k conj(h_a)·n̂, where n̂ is the
+    /// deconvolved noise before the window and h_a the gradient of a, taken through the window. Modes of noise are
+    /// independent, so that the mean of a′(n)·b′(tn), with each mode of the second times t, is Σ_k |n̂|² t conj(h_a)·h_b: no
+    /// field of noise is drawn.
+    pub(crate) fn products(
+        &self,
+        psf: &SpectralPsf,
+        gradients: &Gradients,
+        scratch: &mut SpectralScratch,
+    ) -> [Kinds; 10] {
+        let SpectralScratch {
+            windowed,
+            stamp,
+            even,
+            quarter,
+            lags,
+            ..
+        } = scratch;
+        let [first, second, third] = &mut *windowed;
+        for (weights, out) in gradients.pair.iter().zip([first, second]) {
+            self.to_lags.spectrum(weights, lags, even);
+            twice_scaled(stamp, even, &self.scale, out);
+        }
+        twice_scaled(stamp, &gradients.third, &self.scale, third);
+        for gradient in &mut *windowed {
+            self.window.apply(gradient, quarter);
+        }
+        let [first, second, third] = windowed;
+        // The flux is the sum under the window.
+        let gradients = [first, second, third, &self.window_spectrum];
+        let mut found = [[0.0; 4]; 10];
+        let pairs = (0..4).flat_map(|a| (a..4).map(move |b| [a, b]));
+        for (found, [a, b]) in found.iter_mut().zip(pairs) {
+            *found = sums_of_products(gradients[a], gradients[b], &psf.powers);
+        }
+        found
+    }
+}
+
+// The smallest even number of at least `least` with no prime factor above 5. Dense products need none; it stays because other
+// grids of modes and lags would change results.
+fn smooth_length(least: usize) -> usize {
+    let smooth = |size: &usize| {
+        let mut rest = *size;
+        for prime in [2, 3, 5] {
+            while rest.is_multiple_of(prime) {
+                rest /= prime;
+            }
+        }
+        rest == 1 && size.is_multiple_of(2)
+    };
+    (least..).find(smooth).unwrap_or(least)
+}
+
+// Fall of Γ towards its largest wave number, at 1: a quarter of a cosine, squared.
+fn taper(k: f64) -> f64 {
+    if k >= 1.0 {
+        // The cosine would be 10⁻¹⁶, which makes modes of denormal numbers, and these take long.
+        return 0.0;
+    }
+    let place = ((k - TAPER_START) / (1.0 - TAPER_START)).max(0.0);
+    (std::f64::consts::FRAC_PI_2 * place).cos().powi(2)
+}
+
+// Share of a squared window along an axis that n pixels hold: beyond is no noise.
+fn inside(n: usize, sigma: f64) -> f64 {
+    let share = |from: i32, to: i32| {
+        let middle = (n as f64 - 1.0) / 2.0;
+        let squares = (from..to).map(|at| (-((f64::from(at) - middle) / sigma).powi(2)).exp());
+        squares.sum::<f64>()
+    };
+    let side = n as i32;
+    share(0, side) / share(-side, 2 * side)
+}
+
+// Transform of a Gaussian window of `sigma` px along an axis, over the plane's period, at modes 0, 1, … 2·`modes`.
+fn window_modes(sigma: f64, plane: &Plane) -> Vec<f64> {
+    let period = plane.period as f64;
+    let places = (0..plane.period).map(|at| at as f64 - (plane.period / 2) as f64);
+    let window: Vec<[f64; 2]> = places
+        .map(|x| [x, (-0.5 * (x / sigma).powi(2)).exp() / period])
+        .collect();
+    let mode = |j: usize| {
+        let terms = window.iter();
+        terms.map(|[x, w]| w * (plane.wave(j) * x).cos()).sum()
+    };
+    (0..=2 * plane.modes).map(mode).collect()
+}
+
+/// What multiplying an image by a function that is the product of an even one of x and the same one of y does to its modes:
+/// a convolution along both axes.
+#[derive(Debug, Clone)]
+struct Smoothing {
+    modes: usize,
+    width: usize,
+    /// For cosines and for sines along y: a row for each mode that results.
+    down: [Vec<f32>; 2],
+    /// The same along x: a column for each mode that results.
+    across: [Vec<f32>; 2],
+}
+
+impl Smoothing {
+    // A convolution along each axis with `kernel`, by the distance of modes.
+    fn new(kernel: impl Fn(usize) -> f64, plane: &Plane) -> Self {
+        // What mode q, with its opposite for cosines and less it for sines, adds to mode k.
+        let added = |k: usize, q: usize, sign: f64| {
+            if q == 0 {
+                0.5 * (1.0 + sign) * kernel(k)
+            } else {
+                kernel(k.abs_diff(q)) + sign * kernel(k + q)
+            }
+        };
+        let used = [plane.modes + 1; 2];
+        let stored = [plane.rows, plane.width];
+        Smoothing {
+            modes: plane.modes + 1,
+            width: plane.width,
+            down: [1.0, -1.0].map(|sign| table(used, stored, |k, q| added(k, q, sign))),
+            across: [1.0, -1.0].map(|sign| table(used, stored, |q, k| added(k, q, sign))),
+        }
+    }
+
+    // Convolves a spectrum. The content of `scratch`, as large as a quarter, does not matter.
+    fn apply(&self, spectrum: &mut Spectrum, scratch: &mut [f32]) {
+        for (part, quarter) in spectrum.quarters_mut().into_iter().enumerate() {
+            self.quarter(quarter, [part / 2, part % 2], scratch);
+        }
+    }
+
+    // The same for a real even spectrum: cc and ss.
+    fn apply_even(&self, spectrum: &mut [f32], scratch: &mut [f32]) {
+        let (cc, ss) = spectrum.split_at_mut(spectrum.len() / 2);
+        self.quarter(cc, [0, 0], scratch);
+        self.quarter(ss, [1, 1], scratch);
+    }
+
+    // The same for a quarter of cosines (0) or sines (1) along x and y.
+    fn quarter(&self, quarter: &mut [f32], [x, y]: [usize; 2], scratch: &mut [f32]) {
+        let (modes, width) = (self.modes, self.width);
+        let (down, across) = (&self.down[y], &self.across[x]);
+        let from = Matrix::new(quarter, width);
+        multiply(Matrix::new(down, width), from, modes, scratch, width);
+        let across = Matrix::new(across, width);
+        multiply(Matrix::new(scratch, width), across, modes, quarter, width);
+    }
+}
+
+/// The light that a shear takes across the edges of a stamp.
+///
+/// A shear γ moves light by v per γ, v = (x, −y) for γ₁ and (y, x) for γ₂, so that an image I changes by −v·∇I = −∇·(vI). What
+/// the transform of the stamp gives is the change of TI, T being one on the stamp and zero beyond: −∇·(vTI), as if
+/// the edges went with the light. They stay:
+///
+/// ```text
+/// −T ∇·(vI) = −∇·(vTI) + I v·∇T.
+/// ```
+///
+/// The last term is on the edges alone, half a pixel beyond the middles of the last pixels. It matters where a wide window
+/// contains a large galaxy's light there.
+#[derive(Debug, Clone)]
+struct Edges {
+    n: usize,
+    rows: usize,
+    width: usize,
+    /// cos and sin of half a stamp for each frequency along an axis: the phase at the first edge. That at the last is its
+    /// conjugate.
+    phase: [Vec<f32>; 2],
+}
+
+/// Buffers for one thread. Their content between calls does not matter.
+#[derive(Debug, Clone)]
+struct EdgesScratch {
+    /// Left and right edge, the same times y, lower and upper edge, and the same times x.
+    lines: Vec<f32>,
+    /// Of each of them and each frequency along it, real and imaginary part.
+    re: Vec<f32>,
+    im: Vec<f32>,
+}
+
+impl Edges {
+    fn new(n: usize, plane: &Plane) -> Self {
+        let phase = [f64::cos, f64::sin].map(|wave| {
+            let half = |_, k| wave(plane.wave(k) * n as f64 / 2.0);
+            table([1, plane.modes + 1], [1, plane.width], half)
+        });
+        Edges {
+            n,
+            rows: plane.rows,
+            width: plane.width,
+            phase,
+        }
+    }
+
+    fn scratch(&self) -> EdgesScratch {
+        EdgesScratch {
+            lines: vec![0.0; ROWS * self.n],
+            re: vec![0.0; ROWS * self.width],
+            im: vec![0.0; ROWS * self.width],
+        }
+    }
+
+    // Writes what edges of `stamp` add to its changes with γ₁ and γ₂ about `centre`, (x, y) in pixels from the middle.
+    fn take(
+        &self,
+        stamp: &[f32],
+        [x0, y0]: [f32; 2],
+        (to_modes, transform): (&ToModes, &mut TransformScratch),
+        scratch: &mut EdgesScratch,
+        changes: [&mut Modes; 2],
+    ) {
+        let (n, width) = (self.n, self.width);
+        let middle = (n as f32 - 1.0) / 2.0;
+        // What v·∇T is on either edge, beside the place along it.
+        let half = n as f32 / 2.0;
+        let factors = [
+            [-(half + x0), -(half - x0)],
+            [1.0, -1.0],
+            [half + y0, half - y0],
+            [1.0, -1.0],
+        ];
+        let EdgesScratch { lines, re, im } = scratch;
+        for at in 0..n {
+            // Half a pixel outwards, along a straight line.
+            let edge = |first: usize, step: usize| {
+                let beyond = |a: usize, b: usize| 1.5 * stamp[a] - 0.5 * stamp[b];
+                let last = first + (n - 1) * step;
+                [beyond(first, first + step), beyond(last, last - step)]
+            };
+            let (side, level) = (edge(at * n, 1), edge(at, n));
+            let place = at as f32 - middle;
+            let values = [
+                side,
+                side.map(|value| value * (place - y0)),
+                level,
+                level.map(|value| value * (place - x0)),
+            ];
+            for (line, (values, factors)) in values.iter().zip(factors).enumerate() {
+                for edge in 0..2 {
+                    lines[(2 * line + edge) * n + at] = values[edge] * factors[edge];
+                }
+            }
+        }
+        to_modes.transform_lines(lines, transform, [re, im]);
+        let line = |k: usize| [&re[k * width..][..width], &im[k * width..][..width]];
+        for (which, Modes { re, im }) in changes.into_iter().enumerate() {
+            let sides = [line(2 * which), line(2 * which + 1)];
+            let levels = [line(2 * which + 4), line(2 * which + 5)];
+            re.fill(0.0);
+            im.fill(0.0);
+            let rows = re.chunks_exact_mut(width).zip(im.chunks_exact_mut(width));
+            for (row, (re, im)) in rows.enumerate() {
+                // Real lines have conjugate transforms at opposite frequencies: those of the rows below.
+                let (y, sign) = if row < self.rows {
+                    (row, 1.0)
+                } else {
+                    (row - self.rows, -1.0)
+                };
+                let sides = sides.map(|[re, im]| [re[y], sign * im[y]]);
+                let [cos, sin] = &self.phase;
+                add_edges([re, im], sides, [cos, sin], levels, [cos[y], sign * sin[y]]);
+            }
+        }
+    }
+}
+
+// Adds the edges to a row of modes: the first and the last edge across, of phases `across`, and the first and the last edge
+// along it, of phase `down`. The last edge has the conjugate phase of the first one.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn add_edges(
+    [re, im]: [&mut [f32]; 2],
+    [first, last]: [[f32; 2]; 2],
+    across: [&[f32]; 2],
+    levels: [[&[f32]; 2]; 2],
+    down: [f32; 2],
+) {
+    let [[first_re, first_im], [last_re, last_im]] = levels;
+    // a·exp(iφ) + b·exp(−iφ) = (a + b) cos φ + i(a − b) sin φ.
+    let (sum, difference) = (
+        [first[0] + last[0], first[1] + last[1]],
+        [first[0] - last[0], first[1] - last[1]],
+    );
+    for x in 0..re.len() {
+        let (cos, sin) = (across[0][x], across[1][x]);
+        let levels_sum = [first_re[x] + last_re[x], first_im[x] + last_im[x]];
+        let levels_difference = [first_re[x] - last_re[x], first_im[x] - last_im[x]];
+        re[x] += sum[0] * cos - difference[1] * sin + levels_sum[0] * down[0]
+            - levels_difference[1] * down[1];
+        im[x] += sum[1] * cos
+            + difference[0] * sin
+            + levels_sum[1] * down[0]
+            + levels_difference[0] * down[1];
+    }
+}
+
+/// What the modes of a stamp are restored with.
+struct Restoration<'a> {
+    /// v̂/û.
+    restore: &'a Modes,
+    /// Changes of the PSF with the components of shear, in units of it.
+    tilts: &'a [Modes; 2],
+    waves: &'a [Vec<f32>; 2],
+    /// Origin of the shear, (x, y) in pixels from the middle of the stamp.
+    centre: [f32; 2],
+    /// What the edges of the stamp add to the changes of û.
+    edges: Option<[&'a Modes; 2]>,
+}
+
+// Replaces the transforms of a stamp and of it times x and y by v̂ and its changes, before the window: v̂/û times û, times
+// p·(k_x ∂_x − k_y ∂_y)(û/p), and times p·(k_y ∂_x + k_x ∂_y)(û/p).
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn restore(spectra: &mut [Spectrum; 3], with: &Restoration<'_>) {
+    let quarter = spectra[0].0.len() / 4;
+    let mut above = [[[0.0f32; LANES]; 2]; 3];
+    let mut below = above;
+    for at in (0..quarter).step_by(LANES) {
+        {
+            let [u, x, y] = &*spectra;
+            let u = four_lanes(u.quarters(), at);
+            let x = four_lanes(x.quarters(), at);
+            let y = four_lanes(y.quarters(), at);
+            restore_half(u, x, y, (at, -1.0), with, &mut above);
+            restore_half(u, x, y, (quarter + at, 1.0), with, &mut below);
+        }
+        for k in 0..3 {
+            let ([above_re, above_im], [below_re, below_im]) = (&above[k], &below[k]);
+            let mut out = [[0.0f32; LANES]; 4];
+            for l in 0..LANES {
+                out[0][l] = 0.5 * (below_re[l] + above_re[l]);
+                out[1][l] = 0.5 * (above_im[l] - below_im[l]);
+                out[2][l] = 0.5 * (above_im[l] + below_im[l]);
+                out[3][l] = 0.5 * (below_re[l] - above_re[l]);
+            }
+            store(spectra[k].quarters_mut(), at, out);
+        }
+    }
+}
+
+// The same for modes from place `at` on of all, with the sign of ss in their real part.
+#[inline(always)]
+fn restore_half(
+    u: [&[f32; LANES]; 4],
+    x: [&[f32; LANES]; 4],
+    y: [&[f32; LANES]; 4],
+    (at, sign): (usize, f32),
+    with: &Restoration<'_>,
+    out: &mut [[[f32; LANES]; 2]; 3],
+) {
+    let zeros = [0.0f32; LANES];
+    let complex = |modes: &'_ Modes| [*lanes(&modes.re, at), *lanes(&modes.im, at)];
+    let [edge1, edge2] = match with.edges {
+        Some([first, second]) => [complex(first), complex(second)],
+        None => [[zeros; 2]; 2],
+    };
+    let [tilt1, tilt2] = [complex(&with.tilts[0]), complex(&with.tilts[1])];
+    let (restore, [x0, y0]) = (complex(with.restore), with.centre);
+    let (kx, ky) = (lanes(&with.waves[0], at), lanes(&with.waves[1], at));
+    let [[u_re, u_im], [first_re, first_im], [second_re, second_im]] = out;
+    for l in 0..LANES {
+        let (ur, ui) = (u[0][l] + sign * u[3][l], u[2][l] - sign * u[1][l]);
+        let (xr, xi) = (
+            x[0][l] + sign * x[3][l] - x0 * ur,
+            x[2][l] - sign * x[1][l] - x0 * ui,
+        );
+        let (yr, yi) = (
+            y[0][l] + sign * y[3][l] - y0 * ur,
+            y[2][l] - sign * y[1][l] - y0 * ui,
+        );
+        let [[plus_re, plus_im], [cross_re, cross_im]] = sheared([xr, xi], [yr, yi], kx[l], ky[l]);
+        let of_psf = |tilt: &[[f32; LANES]; 2]| {
+            let (re, im) = (tilt[0][l], tilt[1][l]);
+            (re * ur - im * ui, re * ui + im * ur)
+        };
+        let (one, two) = (of_psf(&tilt1), of_psf(&tilt2));
+        let (ar, ai) = (plus_re + edge1[0][l] - one.0, plus_im + edge1[1][l] - one.1);
+        let (br, bi) = (
+            cross_re + edge2[0][l] - two.0,
+            cross_im + edge2[1][l] - two.1,
+        );
+        let (re, im) = (restore[0][l], restore[1][l]);
+        (u_re[l], u_im[l]) = (ur * re - ui * im, ur * im + ui * re);
+        (first_re[l], first_im[l]) = (ar * re - ai * im, ar * im + ai * re);
+        (second_re[l], second_im[l]) = (br * re - bi * im, br * im + bi * re);
+    }
+}
+
+// (k_x ∂_x − k_y ∂_y) and (k_y ∂_x + k_x ∂_y) of a transform, from the transforms of its image times x and y: ∂ of it is
+// −i x̂. Numbers are real and imaginary part.
+#[inline(always)]
+fn sheared(x: [f32; 2], y: [f32; 2], kx: f32, ky: f32) -> [[f32; 2]; 2] {
+    [
+        [x[1] * kx - y[1] * ky, y[0] * ky - x[0] * kx],
+        [x[1] * ky + y[1] * kx, -(x[0] * ky + y[0] * kx)],
+    ]
+}
+
+// Writes what follows for each mode from the transforms of a PSF and of it times x and y; and the power of noise of σ = 1
+// before the window.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn take_psf(
+    plan: &Spectral,
+    noise: &ModeNoise,
+    [p, x, y]: &[Modes; 3],
+    powers: &mut [f32],
+    out: &mut SpectralPsf,
+) {
+    for at in (0..powers.len()).step_by(LANES) {
+        let (p_re, p_im) = (lanes(&p.re, at), lanes(&p.im, at));
+        let (x_re, x_im) = (lanes(&x.re, at), lanes(&x.im, at));
+        let (y_re, y_im) = (lanes(&y.re, at), lanes(&y.im, at));
+        let (kx, ky) = (lanes(&plan.waves[0], at), lanes(&plan.waves[1], at));
+        let (rough, target) = (lanes(&plan.rough, at), lanes(&plan.target, at));
+        let noise_power = lanes(&noise.power, at);
+        let noise_tilts = [lanes(&noise.tilts[0], at), lanes(&noise.tilts[1], at)];
+        let mut squares = [0.0f32; LANES];
+        for l in 0..LANES {
+            squares[l] = p_re[l] * p_re[l] + p_im[l] * p_im[l];
+        }
+        let amplitudes = amplitudes(&squares, rough, target, plan.step, plan.iterations);
+        let [mut restore, mut field, mut first, mut second] = [[[0.0f32; LANES]; 2]; 4];
+        let mut field_tilts = [[0.0f32; LANES]; 2];
+        let [mut clarity, mut power] = [[0.0f32; LANES]; 2];
+        for l in 0..LANES {
+            let inverse = if squares[l] < LEAST_PSF_POWER {
+                0.0
+            } else {
+                1.0 / squares[l]
+            };
+            // Times conj(p)/|p|².
+            let (re, im) = (p_re[l], -p_im[l]);
+            let [[ar, ai], [br, bi]] =
+                sheared([x_re[l], x_im[l]], [y_re[l], y_im[l]], kx[l], ky[l]);
+            (first[0][l], first[1][l]) =
+                ((ar * re - ai * im) * inverse, (ar * im + ai * re) * inverse);
+            (second[0][l], second[1][l]) =
+                ((br * re - bi * im) * inverse, (br * im + bi * re) * inverse);
+            let root = noise_power[l].sqrt();
+            (restore[0][l], restore[1][l]) = (re * amplitudes[l], im * amplitudes[l]);
+            (field[0][l], field[1][l]) = (restore[0][l] * root, restore[1][l] * root);
+            power[l] = field[0][l] * field[0][l] + field[1][l] * field[1][l];
+            clarity[l] = squares[l] / noise_power[l];
+            field_tilts[0][l] = noise_tilts[0][l] - first[0][l];
+            field_tilts[1][l] = noise_tilts[1][l] - second[0][l];
+        }
+        let [tilt1, tilt2] = &mut out.tilts;
+        for (modes, values) in [
+            (&mut out.restore, restore),
+            (&mut out.field, field),
+            (tilt1, first),
+            (tilt2, second),
+        ] {
+            store([&mut modes.re[..], &mut modes.im[..]], at, values);
+        }
+        let [tilt1, tilt2] = &mut out.field_tilts;
+        store([&mut tilt1[..], &mut tilt2[..]], at, field_tilts);
+        store([&mut out.clarity[..], &mut *powers], at, [clarity, power]);
+    }
+}
+
+// Γ[1 − (1 − c w)^M]/w of modes with |p|² = `powers`; zero where the PSF leaves nothing.
+#[inline(always)]
+fn amplitudes(
+    powers: &[f32; LANES],
+    rough: &[f32; LANES],
+    target: &[f32; LANES],
+    step: f32,
+    iterations: i32,
+) -> [f32; LANES] {
+    let mut base = [0.0f64; LANES];
+    let mut power_of_base = [1.0f64; LANES];
+    for l in 0..LANES {
+        base[l] = f64::from(1.0 - step * (powers[l] + rough[l]));
+        // A positive (1 − c w)^M below exp(−40) is nothing in single precision, and would make denormal numbers on the way.
+        let nothing = base[l] > 0.0 && (1.0 - base[l]) * f64::from(iterations) > 40.0;
+        base[l] = if nothing { 0.0 } else { base[l] };
+    }
+    // By repeated squares, for all lanes at a time.
+    let mut exponent = iterations;
+    while exponent > 0 {
+        if exponent & 1 == 1 {
+            for l in 0..LANES {
+                power_of_base[l] *= base[l];
+            }
+        }
+        for base in &mut base {
+            *base *= *base;
+        }
+        exponent >>= 1;
+    }
+    let mut out = [0.0f32; LANES];
+    for l in 0..LANES {
+        // Without signal a mode is noise alone, whatever λ makes of it.
+        out[l] = if powers[l] < LEAST_PSF_POWER || target[l] == 0.0 {
+            0.0
+        } else {
+            target[l] * (1.0 - power_of_base[l]) as f32 / (powers[l] + rough[l])
+        };
+    }
+    out
+}
+
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn roots(values: &[f32], out: &mut [f32]) {
+    for (out, value) in out.iter_mut().zip(values) {
+        *out = value.sqrt();
+    }
+}
+
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn negative_products(a: &[f32], b: &[f32], out: &mut [f32]) {
+    for (out, (a, b)) in out.iter_mut().zip(a.iter().zip(b)) {
+        *out = -a * b;
+    }
+}
+
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn weighted(kind: &[f32], power: &[f32], counts: &[f32], area: f32, out: &mut [f32]) {
+    let modes = kind.iter().zip(power).zip(counts);
+    for (out, ((kind, power), count)) in out.iter_mut().zip(modes) {
+        *out = count * area * power * kind;
+    }
+}
+
+// Multiplies complex modes.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn multiply_modes(modes: &mut Modes, by: &Modes) {
+    let modes = modes.re.iter_mut().zip(&mut modes.im);
+    for ((re, im), (a, b)) in modes.zip(by.re.iter().zip(&by.im)) {
+        (*re, *im) = (*re * a - *im * b, *re * b + *im * a);
+    }
+}
+
+// Writes real numbers times complex modes.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn scale_into(out: &mut Modes, modes: &Modes, factors: &[f32]) {
+    for (out, values) in [(&mut out.re, &modes.re), (&mut out.im, &modes.im)] {
+        for (out, (value, factor)) in out.iter_mut().zip(values.iter().zip(factors)) {
+            *out = value * factor;
+        }
+    }
+}
+
+// Replaces |v̂|² by scale·(|v̂|² − variance·floor).
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn subtract_noise(power: &mut [f32], scale: &[f32], floor: &[f32], variance: f32) {
+    let halves = power.chunks_exact_mut(scale.len());
+    for (power, floor) in halves.zip(floor.chunks_exact(scale.len())) {
+        for (power, (scale, floor)) in power.iter_mut().zip(scale.iter().zip(floor)) {
+            *power = scale * (*power - variance * floor);
+        }
+    }
+}
+
+// Writes 2·scale·(Re(conj(v̂)·δv̂) + variance·mean).
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn change_of_power(
+    v: &Spectrum,
+    change: &Spectrum,
+    scale: &[f32],
+    mean: &[f32],
+    variance: f32,
+    out: &mut [f32],
+) {
+    let quarter = scale.len();
+    let (v, change) = (v.quarters(), change.quarters());
+    let (mean_even, mean_odd) = mean.split_at(quarter);
+    let (even, odd) = out.split_at_mut(quarter);
+    for at in (0..quarter).step_by(LANES) {
+        let (v, change) = (four_lanes(v, at), four_lanes(change, at));
+        let (mean_even, mean_odd) = (lanes(mean_even, at), lanes(mean_odd, at));
+        let scale = lanes(scale, at);
+        let mut out = [[0.0f32; LANES]; 2];
+        for l in 0..LANES {
+            let twice = 2.0 * scale[l];
+            out[0][l] = twice * (even_of_product(v, change, l) + variance * mean_even[l]);
+            out[1][l] = twice * (odd_of_product(v, change, l) + variance * mean_odd[l]);
+        }
+        store([&mut *even, &mut *odd], at, out);
+    }
+}
+
+// Writes v̂ times 2·scale and a real even spectrum.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn twice_scaled(v: &Spectrum, real: &[f32], scale: &[f32], out: &mut Spectrum) {
+    let (even, odd) = real.split_at(scale.len());
+    for at in (0..scale.len()).step_by(LANES) {
+        let [cc, cs, sc, ss] = four_lanes(v.quarters(), at);
+        let (even, odd, scale) = (lanes(even, at), lanes(odd, at), lanes(scale, at));
+        let mut products = [[0.0f32; LANES]; 4];
+        for l in 0..LANES {
+            let (even, odd) = (2.0 * scale[l] * even[l], 2.0 * scale[l] * odd[l]);
+            products[0][l] = cc[l] * even + ss[l] * odd;
+            products[1][l] = cs[l] * even - sc[l] * odd;
+            products[2][l] = sc[l] * even - cs[l] * odd;
+            products[3][l] = cc[l] * odd + ss[l] * even;
+        }
+        store(out.quarters_mut(), at, products);
+    }
+}
+
+// Sums over the plane of Re(conj(a)·b) times each of four real even spectra.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn sums_of_products(a: &Spectrum, b: &Spectrum, kinds: &[Vec<f32>; 4]) -> Kinds {
+    let (a, b) = (a.quarters(), b.quarters());
+    let quarter = a[0].len();
+    let [mut first, mut second, mut third, mut fourth] = [[0.0f32; LANES]; 4];
+    for at in (0..quarter).step_by(LANES) {
+        let (a, b) = (four_lanes(a, at), four_lanes(b, at));
+        let kind = |k: usize| (lanes(&kinds[k], at), lanes(&kinds[k], quarter + at));
+        let kinds = [kind(0), kind(1), kind(2), kind(3)];
+        for l in 0..LANES {
+            let (even, odd) = (even_of_product(a, b, l), odd_of_product(a, b, l));
+            first[l] += even * kinds[0].0[l] + odd * kinds[0].1[l];
+            second[l] += even * kinds[1].0[l] + odd * kinds[1].1[l];
+            third[l] += even * kinds[2].0[l] + odd * kinds[2].1[l];
+            fourth[l] += even * kinds[3].0[l] + odd * kinds[3].1[l];
+        }
+    }
+    // Of modes above and below: (e − o)(E − O) + (e + o)(E + O).
+    [first, second, third, fourth].map(|lanes| 2.0 * lanes.iter().sum::<f32>())
+}
+
+// The part cc of Re(conj(a)·b) of modes.
+#[inline(always)]
+fn even_of_product(a: [&[f32; LANES]; 4], b: [&[f32; LANES]; 4], l: usize) -> f32 {
+    let ([acc, acs, asc, ass], [bcc, bcs, bsc, bss]) = (a, b);
+    (acc[l] * bcc[l] + ass[l] * bss[l]) + (asc[l] * bsc[l] + acs[l] * bcs[l])
+}
+
+// The part ss of it.
+#[inline(always)]
+fn odd_of_product(a: [&[f32; LANES]; 4], b: [&[f32; LANES]; 4], l: usize) -> f32 {
+    let ([acc, acs, asc, ass], [bcc, bcs, bsc, bss]) = (a, b);
+    (acc[l] * bss[l] + ass[l] * bcc[l]) - (asc[l] * bcs[l] + acs[l] * bsc[l])
+}
+
+/// The next number between 0 and 1 of the SplitMix64 sequence.
+pub(crate) fn uniform(state: &mut u64) -> f64 {
+    (split_mix(state) >> 11) as f64 / (1u64 << 53) as f64
+}
+
+// The next number of the SplitMix64 sequence.
+fn split_mix(state: &mut u64) -> u64 {
+    *state = state.wrapping_add(0x9e37_79b9_7f4a_7c15);
+    let mut z = *state;
+    z = (z ^ (z >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+    z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+    z ^ (z >> 31)
+}
+
+#[cfg(test)]
+mod tests;
