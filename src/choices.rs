@@ -2,9 +2,11 @@
 
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 
+use shearq_bias::Design;
 use shearq_challenge::kind::RankBy;
 use shearq_files::table::FileFormat;
 use shearq_render::table::TableFormat;
+use shearq_results::bias::columns::Shapes;
 use shearq_results::compare::Grouping;
 use shearq_results::submit::manifest::Contents;
 
@@ -24,6 +26,12 @@ pub(crate) fn named<T: Named>() -> impl TypedValueParser<Value = T> {
         let found = T::ALL.iter().find(|(_, name, _)| *name == given);
         found.unwrap_or(&T::ALL[0]).0
     })
+}
+
+/// The name of a value on the command line.
+pub(crate) fn name_of<T: Named + PartialEq>(value: T) -> &'static str {
+    let found = T::ALL.iter().find(|(own, _, _)| *own == value);
+    found.map_or("", |(_, name, _)| name)
 }
 
 macro_rules! choices {
@@ -52,6 +60,19 @@ choices! {
         Psf: "psf", "Fixed or variable PSF";
         Snr: "snr", "Class of S/N";
         Size: "size", "Class of galaxy sizes";
+    }
+    Design {
+        Single: "single", "One true shear";
+        Pairs: "pairs", "+γ and −γ of the same galaxies";
+        Arms: "arms", "Several pairs, such as ±g1 and ±g2";
+        Fields: "fields", "One true shear per catalogue";
+        Galaxies: "galaxies", "Shears that vary within catalogues";
+        Rotated: "rotated", "Galaxies rotated by 90 degrees, in neighbouring rows or catalogues";
+    }
+    Shapes {
+        Shear: "shear", "(1 − q)/(1 + q) for an axis ratio q";
+        Converted: "distortion", "(1 − q²)/(1 + q²) for an axis ratio q, each converted to a shear";
+        Responsivity: "responsivity", "The same, but the mean is divided by the responsivity 2(1 − e_rms²), as surveys do";
     }
     RankBy {
         Q: "q", "Q with the arithmetic of GREAT10's leaderboard";

@@ -1,6 +1,6 @@
 //! Multiplicative and additive bias of catalogues.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use numpy::PyReadonlyArray1;
 use pyo3::exceptions::{PyFileNotFoundError, PyTypeError, PyValueError};
@@ -9,6 +9,7 @@ use shearq_bias::{Design, Errors};
 use shearq_dataset::truth::word;
 use shearq_files::frames::frame;
 use shearq_files::frames::polars::Column;
+use shearq_files::table::Place;
 use shearq_render::table::TableFormat;
 use shearq_results::bias::columns::{Names, Shapes};
 use shearq_results::bias::folders::expand;
@@ -34,10 +35,17 @@ pub(crate) fn sign_of(name: &str) -> PyResult<TruthSign> {
 }
 
 fn of_bias(error: BiasFailure) -> PyErr {
-    let message = in_python(&error.to_string());
-    match message.contains("No such file or directory") {
-        true => PyFileNotFoundError::new_err(message),
-        false => PyValueError::new_err(message),
+    PyValueError::new_err(in_python(&error.to_string()))
+}
+
+/// Refuses a file that does not exist; `FILE[TABLE]` is a table of a file.
+fn require(path: &Path) -> PyResult<()> {
+    match Place::of(path).path.exists() {
+        true => Ok(()),
+        false => Err(PyFileNotFoundError::new_err(format!(
+            "{}: there is no file of this name",
+            path.display()
+        ))),
     }
 }
 
@@ -153,7 +161,7 @@ impl BiasSums {
             }
             let mut json = table.json();
             // The label of an axis.
-            json["binned"] = result.binned.as_str().into();
+            json["binned"] = result.about.binned.as_str().into();
             Ok((json.to_string(), table.narrow().render(TableFormat::Table)))
         })
         .map_err(of_bias)
@@ -186,7 +194,7 @@ pub(crate) fn bias_sums(
     for text in &columns {
         names
             .add(text)
-            .map_err(|fault| PyValueError::new_err(in_python(&fault)))?;
+            .map_err(|fault| PyValueError::new_err(in_python(&fault.to_string())))?;
     }
     let bins = match bins {
         None => None,
@@ -219,6 +227,7 @@ pub(crate) fn bias_sums(
                 .collect(),
         ),
         Some(GivenTruth::File(path)) => {
+            require(&path)?;
             let (truth, own) =
                 Truth::read(&path, specified).map_err(|error| of_bias(error.into()))?;
             sign = own;
@@ -230,6 +239,7 @@ pub(crate) fn bias_sums(
         match given {
             Given::Table(name, columns) => inputs.push(table_of(&name, columns)?),
             Given::Path(path) => {
+                require(&path)?;
                 let (found, known) = expand(&[path], truth).map_err(of_bias)?;
                 inputs.extend(found);
                 truth = known;

@@ -3,13 +3,14 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
-use clap::builder::PossibleValue;
-use clap::{Args, ValueEnum};
+use clap::Args;
 use shearq_bias::{Design, Errors};
 
 use crate::arguments::{Printing, ReportFile, SignArgument, positive};
+use crate::choices::{name_of, named};
 use crate::{Findings, tell};
 use shearq_dataset::images::Shard;
+use shearq_dataset::truth::word;
 use shearq_files::{atomic, open};
 use shearq_render::figure::{Figure, PictureFormat};
 use shearq_results::bias::columns::{Names, Shapes, role_names};
@@ -66,8 +67,8 @@ pub(crate) struct Arguments {
     )]
     columns: Vec<String>,
     /// Type of the ellipticities [default: responsivity for columns of HSM that are distortions, else shear].
-    #[arg(long, value_enum, conflicts_with = "merge")]
-    ellipticity: Option<TypeArgument>,
+    #[arg(long, value_parser = named::<Shapes>(), conflicts_with = "merge")]
+    ellipticity: Option<Shapes>,
     /// Sign of the true g2 [default: as the file of --truth states; else, for x, y, g1, g2, the sign in which the shear is
     /// an E-mode field; else the sign that e2 follows; required if these are unclear. Shears of options, of columns of
     /// the catalogues and of tables with the column catalogue: standard].
@@ -86,8 +87,8 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "FORMULA", conflicts_with_all = ["merge", "against", "ellipticity", "step"])]
     weight: Option<String>,
     /// How catalogues belong together [default: recognised from the true shears].
-    #[arg(long, value_enum, conflicts_with = "merge")]
-    design: Option<DesignArgument>,
+    #[arg(long, value_parser = named::<Design>(), conflicts_with = "merge")]
+    design: Option<Design>,
     /// Independent units for errors: `rows`, `catalogues` or a column, such as `seed` [default: a column pair, seed or
     /// patch; else groups of catalogues if there are 20 or more; else rows].
     #[arg(long, value_name = "UNIT", conflicts_with = "merge")]
@@ -137,57 +138,6 @@ fn columns_help() -> String {
         "Names of columns, such as `e1=g_1,e2=g_2,w=weight` or `e1=g1,e2=g2,e1_1p=g1_1p,e1_1m=g1_1m,e2_2p=g2_2p,e2_2m=g2_2m`; `ROLE=none` ignores a column that would be recognised. Roles: {}",
         role_names()
     )
-}
-
-/// Type of ellipticities on the command line.
-#[derive(Debug, Clone, Copy, ValueEnum)]
-enum TypeArgument {
-    /// (1 − q)/(1 + q) for an axis ratio q.
-    Shear,
-    /// (1 − q²)/(1 + q²) for an axis ratio q, each converted to a shear.
-    Distortion,
-    /// The same, but the mean is divided by the responsivity 2(1 − e_rms²), as surveys do.
-    Responsivity,
-}
-
-impl From<TypeArgument> for Shapes {
-    fn from(given: TypeArgument) -> Self {
-        match given {
-            TypeArgument::Shear => Shapes::Shear,
-            TypeArgument::Distortion => Shapes::Converted,
-            TypeArgument::Responsivity => Shapes::Responsivity,
-        }
-    }
-}
-
-/// Designs on the command line.
-#[derive(Debug, Clone, Copy, ValueEnum)]
-enum DesignArgument {
-    /// One true shear.
-    Single,
-    /// +γ and −γ of the same galaxies.
-    Pairs,
-    /// Several pairs, such as ±g1 and ±g2.
-    Arms,
-    /// One true shear per catalogue.
-    Fields,
-    /// Shears that vary within catalogues.
-    Galaxies,
-    /// Galaxies rotated by 90 degrees, in neighbouring rows or catalogues.
-    Rotated,
-}
-
-impl From<DesignArgument> for Design {
-    fn from(design: DesignArgument) -> Self {
-        match design {
-            DesignArgument::Single => Design::Single,
-            DesignArgument::Pairs => Design::Pairs,
-            DesignArgument::Arms => Design::Arms,
-            DesignArgument::Fields => Design::Fields,
-            DesignArgument::Galaxies => Design::Galaxies,
-            DesignArgument::Rotated => Design::Rotated,
-        }
-    }
 }
 
 /// Parses `EXPRESSION:N` or `EXPRESSION:EDGE,EDGE,...`.
@@ -319,13 +269,6 @@ fn made_by(arguments: &Arguments) -> Vec<(String, String)> {
             made_by.push((name.into(), text.clone()));
         }
     }
-    let design = arguments
-        .design
-        .and_then(|design| design.to_possible_value());
-    let ellipticity = arguments
-        .ellipticity
-        .and_then(|own| own.to_possible_value());
-    let shown = |value: Option<PossibleValue>| value.map(|value| value.get_name().to_owned());
     let bins = arguments.bins.as_ref().map(|bins| {
         let edges = match &bins.edges {
             Edges::Equal(count) => format!("{count} with equally many galaxies"),
@@ -344,16 +287,20 @@ fn made_by(arguments: &Arguments) -> Vec<(String, String)> {
         })
         .collect();
     let options = [
-        ("Design", shown(design)),
+        (
+            "Design",
+            arguments.design.map(|own| name_of(own).to_owned()),
+        ),
         ("Units", arguments.units.clone()),
-        ("Ellipticities", shown(ellipticity)),
+        (
+            "Ellipticities",
+            arguments.ellipticity.map(|own| name_of(own).to_owned()),
+        ),
         (
             "Sign of the true g2",
-            shown(
-                arguments
-                    .truth_sign
-                    .and_then(|sign| sign.to_possible_value()),
-            ),
+            arguments
+                .truth_sign
+                .map(|sign| word(sign.into()).to_owned()),
         ),
         ("Bins", bins),
         (
@@ -382,7 +329,7 @@ fn made_by(arguments: &Arguments) -> Vec<(String, String)> {
 fn of_catalogues(arguments: &Arguments, catalogues: &[PathBuf]) -> anyhow::Result<Summed> {
     let mut names = Names::default();
     for text in &arguments.columns {
-        names.add(text).map_err(anyhow::Error::msg)?;
+        names.add(text)?;
     }
     let specified = arguments.truth_sign.map(Into::into);
     let mut sign = TrueSign::or_standard(specified);
@@ -427,11 +374,11 @@ fn of_catalogues(arguments: &Arguments, catalogues: &[PathBuf]) -> anyhow::Resul
         catalogues,
         names,
         truth,
-        shapes: arguments.ellipticity.map(Shapes::from),
+        shapes: arguments.ellipticity,
         sign,
         bins: arguments.bins.clone(),
         selection,
-        design: arguments.design.map(Design::from),
+        design: arguments.design,
         units: match arguments.units.as_deref() {
             None => Units::Recognised,
             Some("rows") => Units::Rows,

@@ -14,8 +14,8 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 use shearq_bias::{
-    BiasError, Catalogue, Design, Errors, Estimate, Grouping, Layout, Missing, Range, UnitSums,
-    difference, group,
+    BiasError, Catalogue, Design, Errors, Estimate, Grouping, Layout, Range, UnitSums, difference,
+    group,
 };
 use shearq_dataset::layout::stated_sign;
 use shearq_dataset::truth::{Sign, SignBasis, word};
@@ -129,44 +129,42 @@ pub struct Request {
     pub step: f64,
 }
 
-/// Sums of catalogues.
+/// What sums of catalogues are sums of.
 #[derive(Debug, Clone, Serialize, Deserialize)]
-pub struct Summed {
+pub struct About {
     version: String,
-    sums: UnitSums,
-    catalogues: Vec<Catalogue>,
-    program: String,
+    pub catalogues: Vec<Catalogue>,
+    /// The program that wrote them.
+    pub program: String,
     truth: bool,
     /// Whether responses were read, or the type of the ellipticities was given.
     response: bool,
-    /// Whether rows have a response in a column.
-    #[serde(default)]
-    response_column: bool,
+    /// Whether rows have a response that `--columns R11=none` leaves out.
+    pub response_column: bool,
     /// Whether units are named by identifiers.
     matched: bool,
-    #[serde(default)]
-    unit_column: Option<String>,
+    /// A column that is not used and looks like independent units.
+    pub unit_column: Option<String>,
     design: Option<Design>,
     by_key: Option<bool>,
-    /// Text of the binned expression.
-    binned: String,
+    /// What the bins are bins of.
+    pub binned: String,
     edges: Vec<f64>,
-    /// Measured columns in `--where` or `--bins`.
-    measured: Vec<String>,
-    /// Which rows count, and their weights, in words of the options.
-    selection: Option<String>,
-    /// Which columns are used as what, and which look as if they should be.
-    #[serde(default)]
-    columns: Vec<String>,
+    /// Columns of `--where` or `--bins` without sheared versions: m contains how shear changes this choice.
+    pub measured: Vec<String>,
+    /// The texts of the options that select and weight rows, such as `where: snr > 10`.
+    pub selection: Option<String>,
+    /// Which columns are used as what, and which look as if they should be, a line each.
+    pub columns: Vec<String>,
     /// The sign of the true g2; `None` if the truth needs none.
-    #[serde(default)]
-    sign: Option<Sign>,
+    pub sign: Option<Sign>,
 }
 
-/// Sums whose units are joined.
-struct Grouped {
-    grouping: Grouping,
-    design: Design,
+/// Sums of catalogues.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub struct Summed {
+    sums: UnitSums,
+    about: About,
 }
 
 /// Estimates of one bin.
@@ -184,38 +182,10 @@ pub struct BinResult {
 pub struct BiasResult {
     /// All galaxies first, then each bin.
     pub bins: Vec<BinResult>,
-    /// What the bins are bins of.
-    pub binned: String,
-    /// The design.
     pub design: Design,
-    /// What a unit is.
-    pub unit: &'static str,
-    /// Whether errors are wrong, because rows of catalogues do not correspond.
-    pub misaligned: bool,
-    /// The correlation of ellipticities under opposite shears, if it shows that rows of catalogues are different galaxies.
-    pub uncorrelated: Option<f64>,
-    /// Catalogues that are absent beside others with the same galaxies.
-    pub missing: Vec<Missing>,
-    /// A shear and the numbers of catalogues under it and under the opposite one, if they do not pair.
-    pub unpaired: Option<([f64; 2], [usize; 2])>,
-    /// A column that is not used and looks like independent units.
-    pub unit_column: Option<String>,
-    /// Whether rows have a response that `--columns R11=none` leaves out.
-    pub has_response_column: bool,
-    /// Stars whose noise is in the errors, because several units have galaxies behind them.
-    pub noisy_stars: usize,
-    /// The catalogues.
-    pub catalogues: Vec<Catalogue>,
-    /// The program that wrote them.
-    pub program: String,
-    /// Columns of `--where` or `--bins` without sheared versions: m contains how shear changes this choice.
-    pub measured: Vec<String>,
-    /// The texts of the options that select and weight rows, such as `where: snr > 10`.
-    pub selection: Option<String>,
-    /// Which columns are used as what, and which look as if they should be, a line each.
-    pub columns: Vec<String>,
-    /// The sign of the true g2; `None` if the truth needs none.
-    pub sign: Option<Sign>,
+    /// The units of the errors, and what is wrong with them.
+    pub grouping: Grouping,
+    pub about: About,
 }
 
 impl BiasResult {
@@ -296,9 +266,8 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
     let (sums, catalogues) = add_up(request, &reading, &all, (layout, &edges), part)?;
     let named_unit = matches!(request.units, Units::Column(_))
         || request.units == Units::Recognised && first.columns.of(Role::Unit).is_some();
-    let mut summed = Summed {
+    let about = About {
         version: env!("CARGO_PKG_VERSION").into(),
-        sums,
         catalogues,
         program: first.columns.program().into(),
         truth,
@@ -322,15 +291,16 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
         columns: described,
         sign,
     };
+    let mut summed = Summed { sums, about };
     if let TrueSign::OfCatalogues(truth) = &request.sign {
         let sign = summed.sign_of_catalogues(truth)?;
         if sign.of == TruthSign::Challenge {
             reading.flip_g2 = true;
-            let (layout, edges) = (summed.sums.layout(), &summed.edges);
+            let (layout, edges) = (summed.sums.layout(), &summed.about.edges);
             let found = add_up(request, &reading, &all, (layout, edges), part)?;
-            (summed.sums, summed.catalogues) = found;
+            (summed.sums, summed.about.catalogues) = found;
         }
-        summed.sign = Some(sign);
+        summed.about.sign = Some(sign);
     }
     Ok(summed)
 }
@@ -539,8 +509,8 @@ impl Summed {
     /// # Errors
     /// If their parts contradict each other.
     pub fn checked(mut self) -> Result<Self, BiasFailure> {
-        let bins = self.edges.len().max(1);
-        let mut sums = UnitSums::new(self.sums.layout(), bins, self.catalogues.len());
+        let bins = self.about.edges.len().max(1);
+        let mut sums = UnitSums::new(self.sums.layout(), bins, self.about.catalogues.len());
         sums.merge(self.sums)?;
         self.sums = sums;
         Ok(self)
@@ -555,10 +525,10 @@ impl Summed {
         let names = |all: &[Catalogue]| -> Vec<String> {
             all.iter().map(|catalogue| catalogue.name.clone()).collect()
         };
-        if names(&self.catalogues) != names(&other.catalogues) {
+        if names(&self.about.catalogues) != names(&other.about.catalogues) {
             return unlike("different lists of catalogues");
         }
-        for (own, more) in self.catalogues.iter_mut().zip(other.catalogues) {
+        for (own, more) in self.about.catalogues.iter_mut().zip(other.about.catalogues) {
             match (own.rows, more.rows) {
                 (0, _) => *own = more,
                 (_, 0) => {}
@@ -579,29 +549,42 @@ impl Summed {
     /// If options or columns differ.
     pub fn append(&mut self, other: Summed) -> Result<(), BiasFailure> {
         self.check_options(&other)?;
-        self.catalogues.extend(other.catalogues);
+        self.about.catalogues.extend(other.about.catalogues);
         Ok(self.sums.append(other.sums)?)
     }
 
     /// Catalogues without rows, because their shards are absent.
     pub fn absent(&self) -> Vec<&str> {
-        let empty = self.catalogues.iter().filter(|own| own.rows == 0);
+        let empty = self.about.catalogues.iter().filter(|own| own.rows == 0);
         empty.map(|own| own.name.as_str()).collect()
     }
 
     /// Refuses sums of other options.
     fn check_options(&self, other: &Summed) -> Result<(), BiasFailure> {
-        if self.version != other.version {
+        if self.about.version != other.about.version {
             return unlike("different versions");
         }
-        if (&self.binned, &self.edges, &self.selection)
-            != (&other.binned, &other.edges, &other.selection)
-            || (self.truth, self.matched, self.design, self.by_key)
-                != (other.truth, other.matched, other.design, other.by_key)
+        if (&self.about.binned, &self.about.edges, &self.about.selection)
+            != (
+                &other.about.binned,
+                &other.about.edges,
+                &other.about.selection,
+            )
+            || (
+                self.about.truth,
+                self.about.matched,
+                self.about.design,
+                self.about.by_key,
+            ) != (
+                other.about.truth,
+                other.about.matched,
+                other.about.design,
+                other.about.by_key,
+            )
         {
             return unlike("different options");
         }
-        if self.sign.map(|sign| sign.of) != other.sign.map(|sign| sign.of) {
+        if self.about.sign.map(|sign| sign.of) != other.about.sign.map(|sign| sign.of) {
             return unlike("different signs of g2");
         }
         Ok(())
@@ -613,61 +596,56 @@ impl Summed {
     /// If no galaxy counts, an ellipticity is constant, the mean response is too close to zero, or the ellipticities do
     /// not follow the true shear.
     pub fn result(&self, errors: Errors) -> Result<BiasResult, BiasFailure> {
-        let Grouped { grouping, design } = self.grouped()?;
-        let all = grouping.all_bins().estimate(0, self.truth, errors);
+        let (design, grouping) = self.grouped()?;
+        let all = grouping.all_bins().estimate(0, self.about.truth, errors);
         let all = all.map_err(|error| match error {
             // All rows have the same patch or tile.
-            BiasError::FewUnits { .. } if self.by_key == Some(true) => {
+            BiasError::FewUnits { .. } if self.about.by_key == Some(true) => {
                 BiasFailure::Data(format!("{error}. Try: --units rows"))
             }
             error => error.into(),
         })?;
         self.check_slopes(&all)?;
-        let mut bins = vec![BinResult {
-            edges: None,
-            estimate: Ok(all),
-        }];
-        for (bin, edges) in self.edges.windows(2).enumerate() {
-            bins.push(BinResult {
-                edges: Some([edges[0], edges[1]]),
-                estimate: grouping.estimate(bin, self.truth, errors),
-            });
-        }
         Ok(BiasResult {
-            bins,
-            binned: self.binned.clone(),
+            bins: self.bins(all, |bin| grouping.estimate(bin, self.about.truth, errors)),
             design,
-            unit: grouping.unit,
-            misaligned: grouping.misaligned,
-            uncorrelated: grouping.uncorrelated,
-            missing: grouping.missing,
-            unpaired: grouping.unpaired,
-            unit_column: self.unit_column.clone(),
-            has_response_column: self.response_column,
-            noisy_stars: grouping.stars.len(),
-            catalogues: self.catalogues.clone(),
-            program: self.program.clone(),
-            measured: self.measured.clone(),
-            selection: self.selection.clone(),
-            columns: self.columns.clone(),
-            sign: self.sign,
+            grouping,
+            about: self.about.clone(),
         })
     }
 
+    fn bins(
+        &self,
+        all: Estimate,
+        estimate: impl Fn(usize) -> Result<Estimate, BiasError>,
+    ) -> Vec<BinResult> {
+        let all = BinResult {
+            edges: None,
+            estimate: Ok(all),
+        };
+        let bins = self.about.edges.windows(2).enumerate();
+        let bins = bins.map(|(bin, edges)| BinResult {
+            edges: Some([edges[0], edges[1]]),
+            estimate: estimate(bin),
+        });
+        [all].into_iter().chain(bins).collect()
+    }
+
     /// Units and design, if the values are usable.
-    fn grouped(&self) -> Result<Grouped, BiasFailure> {
+    fn grouped(&self) -> Result<(Design, Grouping), BiasFailure> {
         self.check_values()?;
         let design = self
+            .about
             .design
-            .unwrap_or_else(|| Design::of(&self.catalogues, self.truth));
+            .unwrap_or_else(|| Design::of(&self.about.catalogues, self.about.truth));
         let grouping = group(
             self.sums.clone(),
-            &self.catalogues,
+            &self.about.catalogues,
             design,
-            self.by_key,
-            self.matched,
+            self.about.by_key,
+            self.about.matched,
         );
-        Ok(Grouped { grouping, design })
+        Ok((design, grouping))
     }
 
     /// Differences of the estimates from `other`, of another program on the same galaxies, with paired errors.
@@ -675,13 +653,15 @@ impl Summed {
     /// # Errors
     /// As [`Summed::result`], or if the options or the designs differ.
     pub fn difference(&self, other: &Summed) -> Result<BiasResult, BiasFailure> {
-        if (&self.binned, &self.edges, self.truth) != (&other.binned, &other.edges, other.truth) {
+        if (&self.about.binned, &self.about.edges, self.about.truth)
+            != (&other.about.binned, &other.about.edges, other.about.truth)
+        {
             return Err(BiasFailure::Data(
                 "the catalogues cannot be compared: truth or bins differ. Try: bins with edges"
                     .into(),
             ));
         }
-        if let (Some(own), Some(theirs)) = (self.sign, other.sign)
+        if let (Some(own), Some(theirs)) = (self.about.sign, other.about.sign)
             && own.of != theirs.of
         {
             return Err(BiasFailure::Data(format!(
@@ -690,56 +670,51 @@ impl Summed {
                 word(theirs.of)
             )));
         }
-        let (own, theirs) = (self.grouped()?, other.grouped()?);
-        let units = [own.grouping.unit, theirs.grouping.unit];
-        if own.design != theirs.design || units[0] != units[1] {
+        let ((design, own), (their_design, theirs)) = (self.grouped()?, other.grouped()?);
+        if (design, own.unit) != (their_design, theirs.unit) {
             return Err(BiasFailure::Data(format!(
                 "the catalogues cannot be compared (found {} with {} and {} with {}, expected the same design and units). Try: --design and --units",
-                own.design.name(),
-                units[0],
-                theirs.design.name(),
-                units[1]
+                design.name(),
+                own.unit,
+                their_design.name(),
+                theirs.unit
             )));
         }
-        let (a, b) = (&own.grouping.sums, &theirs.grouping.sums);
-        let mut bins = vec![BinResult {
-            edges: None,
-            estimate: Ok(difference(&a.all_bins(), &b.all_bins(), 0, self.truth)?),
-        }];
-        for (bin, edges) in self.edges.windows(2).enumerate() {
-            bins.push(BinResult {
-                edges: Some([edges[0], edges[1]]),
-                estimate: difference(a, b, bin, self.truth),
-            });
-        }
+        let (a, b, truth) = (&own.sums, &theirs.sums, self.about.truth);
+        let all = difference(&a.all_bins(), &b.all_bins(), 0, truth)?;
+        let bins = self.bins(all, |bin| difference(a, b, bin, truth));
+        let about = About {
+            program: format!("{} minus {}", self.about.program, other.about.program),
+            measured: Vec::new(),
+            ..self.about.clone()
+        };
+        // What both have in common is not in the errors: the noise of stars, and galaxies that both leave out.
+        let grouping = Grouping {
+            misaligned: own.misaligned || theirs.misaligned,
+            uncorrelated: None,
+            stars: Vec::new(),
+            ..own
+        };
         Ok(BiasResult {
             bins,
-            binned: self.binned.clone(),
-            design: own.design,
-            unit: units[0],
-            misaligned: own.grouping.misaligned || theirs.grouping.misaligned,
-            uncorrelated: None,
-            missing: own.grouping.missing,
-            unpaired: own.grouping.unpaired,
-            unit_column: self.unit_column.clone(),
-            has_response_column: self.response_column,
-            noisy_stars: 0,
-            catalogues: self.catalogues.clone(),
-            program: format!("{} minus {}", self.program, other.program),
-            measured: Vec::new(),
-            selection: self.selection.clone(),
-            columns: self.columns.clone(),
-            sign: self.sign,
+            design,
+            grouping,
+            about,
         })
     }
 
     fn check_slopes(&self, all: &Estimate) -> Result<(), BiasFailure> {
-        check_slopes(all, self.response, ratio(&self.catalogues), self.sign)
+        check_slopes(
+            all,
+            self.about.response,
+            ratio(&self.about.catalogues),
+            self.about.sign,
+        )
     }
 
     /// The sign of g2 in the file `truth` that e2 follows, from sums for the standard sign.
     fn sign_of_catalogues(&self, truth: &Path) -> Result<Sign, BiasFailure> {
-        let mut used = self.catalogues.iter().filter(|own| own.rows > 0);
+        let mut used = self.about.catalogues.iter().filter(|own| own.rows > 0);
         if used.all(|own| own.shear[1].constant() == Some(0.0)) {
             return Ok(Sign::ZERO);
         }
@@ -748,7 +723,7 @@ impl Summed {
             sign.map_err(|fault| FileError::new(truth, fault).into())
         };
         // A shard may be too small for an estimate that all catalogues have.
-        let estimate = self.grouped().and_then(|Grouped { grouping, .. }| {
+        let estimate = self.grouped().and_then(|(_, grouping)| {
             Ok(grouping.all_bins().estimate(0, true, Errors::Jackknife)?)
         });
         let all = match estimate {
@@ -773,7 +748,7 @@ impl Summed {
 
     /// Refuses catalogues without usable rows, and constant ellipticities.
     fn check_values(&self) -> Result<(), BiasFailure> {
-        let total = |of: fn(&Catalogue) -> u64| self.catalogues.iter().map(of).sum::<u64>();
+        let total = |of: fn(&Catalogue) -> u64| self.about.catalogues.iter().map(of).sum::<u64>();
         let rows = total(|c| c.rows);
         let (flagged, unweighted) = (total(|c| c.flagged), total(|c| c.unweighted));
         let (unselected, missing) = (total(|c| c.unselected), total(|c| c.missing));
@@ -786,7 +761,7 @@ impl Summed {
             )));
         }
         for k in 0..2 {
-            let ranges = self.catalogues.iter().filter(|c| c.rows > 0);
+            let ranges = self.about.catalogues.iter().filter(|c| c.rows > 0);
             let (low, high) = ranges.fold((f64::MAX, f64::MIN), |(low, high), c| {
                 let own = c.ellipticity[k];
                 (low.min(own.low), high.max(own.high))

@@ -3,7 +3,10 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use shearq_bias::VERSIONS;
 use shearq_files::{FileError, names_of};
+
+use crate::expression::fits;
 
 /// How ellipticities become shears.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -20,376 +23,160 @@ pub enum Shapes {
 /// What a column is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Role {
-    /// Ellipticity.
     E1,
-    /// Ellipticity.
     E2,
-    /// Weight.
     Weight,
     /// Response of e1 to g1.
     R11,
-    /// Response of e2 to g2.
     R22,
     /// Response of e1 to g2.
     R12,
-    /// Response of e2 to g1.
     R21,
-    /// What e1 was divided by.
-    Divisor1,
-    /// What e2 was divided by.
-    Divisor2,
-    /// Derivative of the weight with g1.
+    /// Derivatives of the weight with g1 and g2.
     Dw1,
-    /// Derivative of the weight with g2.
     Dw2,
     /// Standard deviation of each component of the distortions of galaxies without measurement noise.
     RmsE,
     /// Measurement noise of each component of a distortion.
     SigmaE,
-    /// Shear of rows that have no distortion, in GalSim's tables of HSM.
+    /// Shears of rows that have no distortion, in GalSim's tables of HSM.
     KsbE1,
-    /// The same of component 2.
     KsbE2,
     /// Zero for good rows.
     Flag,
     /// True shear.
     G1,
-    /// True shear.
     G2,
-    /// Ellipticity of the PSF.
     Psf1,
-    /// Ellipticity of the PSF.
     Psf2,
-    /// Size of the PSF.
     PsfSize,
-    /// Identifier of the galaxy.
     Id,
+    /// What e1 and e2 were divided by.
+    Divisor1,
+    Divisor2,
     /// Position in pixels.
     X,
-    /// Position in pixels.
     Y,
     /// Independent unit.
     Unit,
-    /// Name of the version: noshear, 1p, 1m, 2p, 2m.
+    /// Name of the sheared catalogue of a row: noshear, 1p, 1m, 2p, 2m.
     Version,
-    /// e1 under an artificial shear of +g1.
-    E1p,
-    /// e1 under an artificial shear of −g1.
-    E1m,
-    /// e2 under an artificial shear of +g2.
-    E2p,
-    /// e2 under an artificial shear of −g2.
-    E2m,
-    /// e1 under an artificial shear of +g2.
-    E1Of2p,
-    /// e1 under an artificial shear of −g2.
-    E1Of2m,
-    /// e2 under an artificial shear of +g1.
-    E2Of1p,
-    /// e2 under an artificial shear of −g1.
-    E2Of1m,
 }
 
-/// The roles with their names in `--columns`, and names of columns that are recognised in any case, the first first.
-const ROLES: [(Role, &str, &[&str]); 34] = [
-    (
-        Role::E1,
-        "e1",
-        &[
-            "e1",
-            "e_1",
-            "e1_noshear",
-            "g1_noshear",
-            "g[0]",
-            "ngmix_ell_noshear[0]",
-            "wmom_g_1",
-            "wmom_g1",
-            "gauss_g1",
-            "pgauss_g1",
-            "gauss_g_1",
-            "pgauss_g_1",
-            "mdet_g_1",
-            "mcal_g_1",
-            "fpfs_e1",
-            "fpfs1_e1",
-            "regauss_e1",
-            "corrected_e1",
-            "ext_shapehsm_hsmshaperegauss_e1",
-            "corrected_g1",
-        ],
-    ),
-    (
-        Role::E2,
-        "e2",
-        &[
-            "e2",
-            "e_2",
-            "e2_noshear",
-            "g2_noshear",
-            "g[1]",
-            "ngmix_ell_noshear[1]",
-            "wmom_g_2",
-            "wmom_g2",
-            "gauss_g2",
-            "pgauss_g2",
-            "gauss_g_2",
-            "pgauss_g_2",
-            "mdet_g_2",
-            "mcal_g_2",
-            "fpfs_e2",
-            "fpfs1_e2",
-            "regauss_e2",
-            "corrected_e2",
-            "ext_shapehsm_hsmshaperegauss_e2",
-            "corrected_g2",
-        ],
-    ),
-    (
-        Role::Weight,
-        "w",
-        &[
-            "w",
-            "weight",
-            "weights",
-            "wt",
-            "shear_weight",
-            "wdet",
-            "wsel",
-            "fpfs_w",
-        ],
-    ),
-    (
-        Role::R11,
-        "R11",
-        &[
-            "r11",
-            "de1_dg1",
-            "e1_g1",
-            "fpfs_de1_dg1",
-            "fpfs1_de1_dg1",
-            "r_11",
-            "mcal_r11",
-        ],
-    ),
-    (
-        Role::R22,
-        "R22",
-        &[
-            "r22",
-            "de2_dg2",
-            "e2_g2",
-            "fpfs_de2_dg2",
-            "fpfs1_de2_dg2",
-            "r_22",
-            "mcal_r22",
-        ],
-    ),
-    (
-        Role::R12,
-        "R12",
-        &[
-            "r12",
-            "de1_dg2",
-            "e1_g2",
-            "fpfs_de1_dg2",
-            "fpfs1_de1_dg2",
-            "r_12",
-            "mcal_r12",
-        ],
-    ),
-    (
-        Role::R21,
-        "R21",
-        &[
-            "r21",
-            "de2_dg1",
-            "e2_g1",
-            "fpfs_de2_dg1",
-            "fpfs1_de2_dg1",
-            "r_21",
-            "mcal_r21",
-        ],
-    ),
-    (
-        Role::Dw1,
-        "dw1",
-        &[
-            "dw_dg1",
-            "w_g1",
-            "dweight_dg1",
-            "dwdet_dg1",
-            "wdet_g1",
-            "dwsel_dg1",
-            "wsel_g1",
-            "fpfs_dw_dg1",
-            "weight_dg1",
-        ],
-    ),
-    (
-        Role::Dw2,
-        "dw2",
-        &[
-            "dw_dg2",
-            "w_g2",
-            "dweight_dg2",
-            "dwdet_dg2",
-            "wdet_g2",
-            "dwsel_dg2",
-            "wsel_g2",
-            "fpfs_dw_dg2",
-            "weight_dg2",
-        ],
-    ),
-    (Role::RmsE, "rms_e", &["rms_e"]),
-    (Role::SigmaE, "sigma_e", &["sigma_e"]),
-    (Role::KsbE1, "ksb_e1", &["corrected_g1"]),
-    (Role::KsbE2, "ksb_e2", &["corrected_g2"]),
-    (
-        Role::Flag,
-        "flag",
-        &[
-            "flag",
-            "flags",
-            "flags_select",
-            "wmom_flags",
-            "mdet_flags",
-            "ext_shapehsm_hsmshaperegauss_flag",
-            "error_flag",
-        ],
-    ),
-    (
-        Role::G1,
-        "g1",
-        &["g1", "g1_true", "true_g1", "g1_truth", "gamma1", "shear1"],
-    ),
-    (
-        Role::G2,
-        "g2",
-        &["g2", "g2_true", "true_g2", "g2_truth", "gamma2", "shear2"],
-    ),
-    (
-        Role::Psf1,
-        "psf_e1",
-        &[
-            "psf_e1",
-            "e1_psf",
-            "psf_g1",
-            "g1_psf",
-            "psf_g_1",
-            "psfrec_g_1",
-        ],
-    ),
-    (
-        Role::Psf2,
-        "psf_e2",
-        &[
-            "psf_e2",
-            "e2_psf",
-            "psf_g2",
-            "g2_psf",
-            "psf_g_2",
-            "psfrec_g_2",
-        ],
-    ),
-    (
-        Role::PsfSize,
-        "psf_size",
-        &[
-            "psf_size",
-            "psf_t",
-            "t_psf",
-            "psf_fwhm",
-            "psf_sigma",
-            "psfrec_t",
-        ],
-    ),
-    (
-        Role::Id,
-        "id",
-        &[
-            "id",
-            "galaxy_id",
-            "gal_id",
-            "object_id",
-            "objectid",
-            "coadd_object_id",
-            "coadd_objects_id",
-            "source_id",
-            "number",
-        ],
-    ),
-    (Role::Divisor1, "divisor1", &["divisor1"]),
-    (Role::Divisor2, "divisor2", &["divisor2"]),
-    (Role::X, "x", &["x", "x_image", "xwin_image", "x_pix"]),
-    (Role::Y, "y", &["y", "y_image", "ywin_image", "y_pix"]),
-    (Role::Unit, "unit", &["pair", "pair_id", "seed", "patch"]),
-    (
-        Role::Version,
-        "version",
-        &[
-            "mdet_step",
-            "metastep",
-            "shear_type",
-            "metacal_step",
-            "shear",
-        ],
-    ),
-    (Role::E1p, "e1_1p", &["e1_1p", "g1_1p", "ngmix_ell_1p[0]"]),
-    (Role::E1m, "e1_1m", &["e1_1m", "g1_1m", "ngmix_ell_1m[0]"]),
-    (Role::E2p, "e2_2p", &["e2_2p", "g2_2p", "ngmix_ell_2p[1]"]),
-    (Role::E2m, "e2_2m", &["e2_2m", "g2_2m", "ngmix_ell_2m[1]"]),
-    (
-        Role::E1Of2p,
-        "e1_2p",
-        &["e1_2p", "g1_2p", "ngmix_ell_2p[0]"],
-    ),
-    (
-        Role::E1Of2m,
-        "e1_2m",
-        &["e1_2m", "g1_2m", "ngmix_ell_2m[0]"],
-    ),
-    (
-        Role::E2Of1p,
-        "e2_1p",
-        &["e2_1p", "g2_1p", "ngmix_ell_1p[1]"],
-    ),
-    (
-        Role::E2Of1m,
-        "e2_1m",
-        &["e2_1m", "g2_1m", "ngmix_ell_1m[1]"],
-    ),
+/// A role in one catalogue: 0 is the one without artificial shear, k the k-th of [`VERSIONS`].
+pub(super) type Key = (Role, usize);
+
+/// Catalogues: the one without artificial shear and [`VERSIONS`].
+pub(super) const CATALOGUES: usize = 1 + VERSIONS.len();
+pub(super) const ROLES: usize = TABLE.len();
+
+// In the order of `Role`s: the role, its name in --columns, the role without which it is incomplete, and the names of
+// columns that are recognised in any case, the preferred one first.
+#[rustfmt::skip]
+const TABLE: [(Role, &str, Option<Role>, &str); 26] = [
+    (Role::E1, "e1", Some(Role::E2), "e1 e_1 e1_noshear g1_noshear g[0] ngmix_ell_noshear[0] wmom_g_1 wmom_g1 gauss_g1 \
+        pgauss_g1 gauss_g_1 pgauss_g_1 mdet_g_1 mcal_g_1 fpfs_e1 fpfs1_e1 regauss_e1 corrected_e1 \
+        ext_shapehsm_hsmshaperegauss_e1 corrected_g1"),
+    (Role::E2, "e2", Some(Role::E1), "e2 e_2 e2_noshear g2_noshear g[1] ngmix_ell_noshear[1] wmom_g_2 wmom_g2 gauss_g2 \
+        pgauss_g2 gauss_g_2 pgauss_g_2 mdet_g_2 mcal_g_2 fpfs_e2 fpfs1_e2 regauss_e2 corrected_e2 \
+        ext_shapehsm_hsmshaperegauss_e2 corrected_g2"),
+    (Role::Weight, "w", None, "w weight weights wt shear_weight wdet wsel fpfs_w"),
+    (Role::R11, "R11", Some(Role::R22), "r11 de1_dg1 e1_g1 fpfs_de1_dg1 fpfs1_de1_dg1 r_11 mcal_r11"),
+    (Role::R22, "R22", Some(Role::R11), "r22 de2_dg2 e2_g2 fpfs_de2_dg2 fpfs1_de2_dg2 r_22 mcal_r22"),
+    (Role::R12, "R12", Some(Role::R21), "r12 de1_dg2 e1_g2 fpfs_de1_dg2 fpfs1_de1_dg2 r_12 mcal_r12"),
+    (Role::R21, "R21", Some(Role::R12), "r21 de2_dg1 e2_g1 fpfs_de2_dg1 fpfs1_de2_dg1 r_21 mcal_r21"),
+    (Role::Dw1, "dw1", Some(Role::Dw2), "dw_dg1 w_g1 dweight_dg1 dwdet_dg1 wdet_g1 dwsel_dg1 wsel_g1 fpfs_dw_dg1 weight_dg1"),
+    (Role::Dw2, "dw2", Some(Role::Dw1), "dw_dg2 w_g2 dweight_dg2 dwdet_dg2 wdet_g2 dwsel_dg2 wsel_g2 fpfs_dw_dg2 weight_dg2"),
+    (Role::RmsE, "rms_e", None, "rms_e"),
+    (Role::SigmaE, "sigma_e", None, "sigma_e"),
+    (Role::KsbE1, "ksb_e1", Some(Role::KsbE2), "corrected_g1"),
+    (Role::KsbE2, "ksb_e2", Some(Role::KsbE1), "corrected_g2"),
+    (Role::Flag, "flag", None, "flag flags flags_select wmom_flags mdet_flags ext_shapehsm_hsmshaperegauss_flag error_flag"),
+    (Role::G1, "g1", Some(Role::G2), "g1 g1_true true_g1 g1_truth gamma1 shear1"),
+    (Role::G2, "g2", Some(Role::G1), "g2 g2_true true_g2 g2_truth gamma2 shear2"),
+    (Role::Psf1, "psf_e1", None, "psf_e1 e1_psf psf_g1 g1_psf psf_g_1 psfrec_g_1"),
+    (Role::Psf2, "psf_e2", None, "psf_e2 e2_psf psf_g2 g2_psf psf_g_2 psfrec_g_2"),
+    (Role::PsfSize, "psf_size", None, "psf_size psf_t t_psf psf_fwhm psf_sigma psfrec_t"),
+    (Role::Id, "id", None, "id galaxy_id gal_id object_id objectid coadd_object_id coadd_objects_id source_id number"),
+    (Role::Divisor1, "divisor1", Some(Role::Divisor2), "divisor1"),
+    (Role::Divisor2, "divisor2", Some(Role::Divisor1), "divisor2"),
+    (Role::X, "x", None, "x x_image xwin_image x_pix"),
+    (Role::Y, "y", None, "y y_image ywin_image y_pix"),
+    (Role::Unit, "unit", None, "pair pair_id seed patch"),
+    (Role::Version, "version", None, "mdet_step metastep shear_type metacal_step shear"),
 ];
 
-/// Roles of the responses of a component to the other one. Without those to the own component they are of no use.
-const OTHER_RESPONSES: [(Role, Role); 6] = [
-    (Role::R12, Role::R11),
-    (Role::R21, Role::R22),
-    (Role::E1Of2p, Role::E1p),
-    (Role::E1Of2m, Role::E1p),
-    (Role::E2Of1p, Role::E2p),
-    (Role::E2Of1m, Role::E2p),
+/// Ellipticities under artificial shears: of the own component, then of the other one.
+const SHEARED: [Key; 8] = [
+    (Role::E1, 1),
+    (Role::E1, 2),
+    (Role::E2, 3),
+    (Role::E2, 4),
+    (Role::E1, 3),
+    (Role::E1, 4),
+    (Role::E2, 1),
+    (Role::E2, 2),
 ];
 
-/// Pairs of columns that need each other.
-const PAIRS: [(Role, Role); 11] = [
-    (Role::Divisor1, Role::Divisor2),
-    (Role::E1, Role::E2),
-    (Role::R11, Role::R22),
-    (Role::Dw1, Role::Dw2),
-    (Role::G1, Role::G2),
-    (Role::E1p, Role::E1m),
-    (Role::E2p, Role::E2m),
-    (Role::R12, Role::R21),
-    (Role::KsbE1, Role::KsbE2),
-    (Role::E1Of2p, Role::E1Of2m),
-    (Role::E2Of1p, Role::E2Of1m),
-];
+/// All columns that `--columns` can name, in its order.
+fn keys() -> impl Iterator<Item = Key> {
+    TABLE.iter().map(|row| (row.0, 0)).chain(SHEARED)
+}
 
-/// Ellipticities of sheared versions: of the own component, and of the other one.
-pub(super) const SHEARED: [[Role; 4]; 2] = [
-    [Role::E1p, Role::E1m, Role::E2p, Role::E2m],
-    [Role::E1Of2p, Role::E1Of2m, Role::E2Of1p, Role::E2Of1m],
-];
+/// The name of a column in `--columns`, such as `e1_2p`.
+fn name_of((role, catalogue): Key) -> String {
+    let name = TABLE[role as usize].1;
+    match catalogue.checked_sub(1) {
+        None => name.to_owned(),
+        Some(version) => format!("{name}_{}", VERSIONS[version].0),
+    }
+}
+
+/// The names of all roles.
+pub fn role_names() -> String {
+    keys().map(name_of).collect::<Vec<_>>().join(", ")
+}
+
+fn named(name: &str) -> Option<Key> {
+    keys().find(|key| name_of(*key) == name)
+}
+
+/// Names of columns of a role, in small letters.
+pub(super) fn names_of_role(role: Role) -> impl Iterator<Item = &'static str> {
+    TABLE[role as usize].3.split_whitespace()
+}
+
+fn recognised((role, catalogue): Key) -> Vec<String> {
+    let Some(version) = catalogue.checked_sub(1) else {
+        return names_of_role(role).map(str::to_owned).collect();
+    };
+    let (version, k) = (VERSIONS[version].0, role as usize);
+    vec![
+        format!("e{}_{version}", k + 1),
+        format!("g{}_{version}", k + 1),
+        format!("ngmix_ell_{version}[{k}]"),
+    ]
+}
+
+/// The column without which this one is incomplete: the other component, or the opposite artificial shear.
+fn partner((role, catalogue): Key) -> Option<Key> {
+    match catalogue {
+        0 => TABLE[role as usize].2.map(|partner| (partner, 0)),
+        1 | 3 => Some((role, catalogue + 1)),
+        _ => Some((role, catalogue - 1)),
+    }
+}
+
+/// For a response of a component to the other one, the response to the own one, without which it is of no use.
+fn diagonal(key: Key) -> Option<Key> {
+    match key {
+        (Role::R12, _) => Some((Role::R11, 0)),
+        (Role::R21, _) => Some((Role::R22, 0)),
+        (Role::E1, 3 | 4) => Some((Role::E1, 1)),
+        (Role::E2, 1 | 2) => Some((Role::E2, 3)),
+        _ => None,
+    }
+}
 
 /// Names of ellipticities that are distortions.
 const DISTORTIONS: [&str; 3] = [
@@ -404,7 +191,6 @@ struct Survey {
     /// The columns by role, in any case. Those of e1 and e2 and those with a plus identify the catalogue; others may be
     /// absent. `none` for a role that has no column although a general name is there.
     columns: &'static str,
-    /// Whether ellipticities are distortions.
     distortion: bool,
 }
 
@@ -416,8 +202,8 @@ const fn survey(name: &'static str, columns: &'static str) -> Survey {
     }
 }
 
-/// Regauss of HSC and LSST: distortions. Their columns of a calibration of the shear bias (`derived_shear_bias_m`, `_c1`,
-/// `_c2`) have no role, because m and c are to be found before it.
+// Regauss of HSC and LSST. Their columns of a calibration of the shear bias (`derived_shear_bias_m`, `_c1`, `_c2`) have no
+// role, because m and c are to be found before it.
 const fn distortions(name: &'static str, columns: &'static str) -> Survey {
     Survey {
         name,
@@ -426,7 +212,7 @@ const fn distortions(name: &'static str, columns: &'static str) -> Survey {
     }
 }
 
-/// From the column lists in tests/data/columns. The first that fits is used.
+// From the column lists in tests/data/columns. The first that fits is used.
 const SURVEYS: [Survey; 22] = [
     survey(
         "KiDS, internal",
@@ -523,68 +309,41 @@ const SURVEYS: [Survey; 22] = [
 
 impl Survey {
     /// Each column with its role, and whether the catalogue must have it.
-    fn parts(&self) -> impl Iterator<Item = (Option<&'static str>, &'static str, bool)> {
+    fn parts(&self) -> impl Iterator<Item = (Option<Key>, &'static str, bool)> {
         self.columns.split(' ').map(|part| {
-            let required = part.strip_prefix('+');
-            let (role, column) = match required.unwrap_or(part).split_once('=') {
-                Some((role, column)) => (Some(role), column),
-                None => (None, required.unwrap_or(part)),
+            let (required, part) = match part.strip_prefix('+') {
+                Some(part) => (true, part),
+                None => (false, part),
             };
-            let shape = matches!(role, Some("e1" | "e2"));
-            (role, column, required.is_some() || shape)
+            let (role, column) = part.split_once('=').unwrap_or(("", part));
+            (
+                named(role),
+                column,
+                required || ["e1", "e2"].contains(&role),
+            )
         })
     }
 
-    /// The column of a role.
-    fn of(&self, key: &str) -> Option<&'static str> {
+    fn of(&self, key: Key) -> Option<&'static str> {
         let mut parts = self.parts();
-        parts.find_map(|(role, column, _)| (role == Some(key)).then_some(column))
+        parts.find_map(|(own, column, _)| (own == Some(key)).then_some(column))
     }
 
     /// Whether the catalogue with the columns `found` is this one. Given names of e1 and e2 must be those of this one.
-    fn fits(&self, found: &[String], names: &Names) -> bool {
+    fn is_of(&self, found: &[String], names: &Names) -> bool {
         let there = |column: &str| found.iter().any(|own| own.eq_ignore_ascii_case(column));
-        self.parts().all(|(role, column, required)| {
-            let given = role.and_then(|role| names.0.get(role));
-            match given {
-                Some(given) if matches!(role, Some("e1" | "e2")) => {
-                    given.eq_ignore_ascii_case(column)
-                }
-                Some(_) => true,
-                None => !required || there(column),
+        self.parts().all(|(key, column, required)| {
+            match (key, key.and_then(|key| names.0.get(&key))) {
+                (Some((Role::E1 | Role::E2, 0)), Some(given)) => given.eq_ignore_ascii_case(column),
+                (_, Some(_)) => true,
+                (_, None) => !required || there(column),
             }
         })
     }
 }
 
-/// Adds sheared versions by the names of e1 and e2: `foo_g1_1p` belongs to `foo_g1` or `foo_g1_noshear`.
-fn find_sheared(roles: &mut BTreeMap<Role, String>, found: &[String], names: &Names) {
-    let of = |shape: Role, sheared: [Role; 4], suffixes: [&str; 4]| {
-        let name = roles.get(&shape)?.to_ascii_lowercase();
-        let base = name.strip_suffix("_noshear").unwrap_or(&name).to_owned();
-        let mut all = Vec::new();
-        for (role, suffix) in sheared.into_iter().zip(suffixes) {
-            let wanted = format!("{base}_{suffix}");
-            let column = found.iter().find(|own| own.eq_ignore_ascii_case(&wanted))?;
-            all.push((role, column.clone()));
-        }
-        Some(all)
-    };
-    let [[p1, m1, p2, m2], [p12, m12, p21, m21]] = SHEARED;
-    let suffixes = ["1p", "1m", "2p", "2m"];
-    let all = [
-        of(Role::E1, [p1, m1, p12, m12], suffixes),
-        of(Role::E2, [p21, m21, p2, m2], suffixes),
-    ];
-    for (role, column) in all.into_iter().flatten().flatten() {
-        if !names.0.contains_key(key_of(role)) {
-            roles.entry(role).or_insert(column);
-        }
-    }
-}
-
-/// Columns that say which rows count, and whether those of value 1 do. Rows of the overlap of tiles are there twice; of
-/// blends that were not separated, and of stars, the shapes are not those of a galaxy.
+// Columns that say which rows count, and whether those of value 1 do. Rows of the overlap of tiles are there twice; of
+// blends that were not separated, and of stars, the shapes are not those of a galaxy.
 const CHOICES: [(&str, bool); 7] = [
     ("is_primary", true),
     ("is_inner", true),
@@ -595,159 +354,119 @@ const CHOICES: [(&str, bool); 7] = [
     ("refextendedness", true),
 ];
 
-/// Columns of flags. A row counts if all are zero: DES has the failures in `flags` and the cuts in `flags_select`, and
-/// metadetection one flag per kind of shape.
-fn find_flags(
-    path: &Path,
-    found: &[String],
-    names: &Names,
-    survey: Option<&Survey>,
-    e1: Option<&String>,
-) -> Result<Vec<String>, FileError> {
-    match names.0.get("flag") {
-        None => {}
-        Some(none) if none == "none" => return Ok(Vec::new()),
-        Some(given) if found.contains(given) => return Ok(vec![given.clone()]),
-        Some(given) => {
-            let flags = given.split('+').map(str::to_owned);
-            let known = |name: String| match found.contains(&name) {
-                true => Ok(name),
-                false => Err(FileError::no_column(path, &name, found)),
-            };
-            return flags.map(known).collect();
-        }
-    }
-    let own = |name: &str| {
-        let mut found = found.iter();
-        found.find(|own| own.eq_ignore_ascii_case(name) && names.role_of(own).is_none())
-    };
-    let mut flags: Vec<String> = Vec::new();
-    let first = match survey.and_then(|survey| survey.of("flag")) {
-        Some(known) => own(known),
-        None => names_of_role(Role::Flag).iter().find_map(|name| own(name)),
-    };
-    let e1 = e1.map_or_else(String::new, |e1| e1.to_ascii_lowercase());
-    let e1 = e1.strip_suffix("_noshear").unwrap_or(&e1);
-    let mut endings = ["_g_1", "_g1", "_g[0]", "_e_1", "_e1", "_e[0]"].into_iter();
-    let kind = endings.find_map(|ending| e1.strip_suffix(ending));
-    let of_kind = |ending: &str| own(&format!("{}_{ending}", kind?));
-    let by_cuts = own("flags_select");
-    let failures = own("flags").filter(|_| by_cuts.is_some());
-    let of_ngmix = own("ngmix_mcal_flags").filter(|_| e1.starts_with("ngmix"));
-    let of_kind = [of_kind("flags"), of_kind("flag"), of_ngmix];
-    let all = [first, failures, by_cuts].into_iter().chain(of_kind);
-    for name in all.flatten() {
-        if !flags.contains(name) {
-            flags.push(name.clone());
-        }
-    }
-    Ok(flags)
+/// What a name in small letters suggests that a column is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Look {
+    Choice,
+    Derivative,
+    Sheared,
+    Calibration,
+    Weight,
+    Flag,
+    Response,
+    Noise,
 }
 
-/// What the name of a column suggests that it is.
-fn suggested(name: &str) -> Option<&'static str> {
+// The first that fits counts: `w_1p` is a weight of a sheared catalogue.
+const LOOKS: [(Look, &str); 7] = [
+    (Look::Derivative, "*_dg1 *_dg2"),
+    (Look::Sheared, "*_1p *_1m *_2p *_2m"),
+    (Look::Calibration, "*shear_bias*"),
+    (Look::Weight, "w wt wt_a w_* *weight *weight_a"),
+    (Look::Flag, "*flag* *mask*"),
+    (
+        Look::Response,
+        "r11 r12 r21 r22 r_11 r_12 r_21 r_22 *_g11 *_g12 *_g21 *_g22 *_r11 *_r12 *_r21 *_r22 *response*",
+    ),
+    (Look::Noise, "*rms_e* *sigma_e* *regauss_sigma* *shape_err*"),
+];
+
+fn look(name: &str) -> Option<Look> {
     let name = name.to_ascii_lowercase();
     if CHOICES.iter().any(|(known, _)| *known == name) {
-        return Some("a choice");
+        return Some(Look::Choice);
     }
-    let has = |parts: &[&str]| parts.iter().any(|part| name.contains(part));
-    let ends = |parts: &[&str]| parts.iter().any(|part| name.ends_with(part));
-    if ends(&["_dg1", "_dg2"]) {
-        return Some("a derivative");
-    }
-    if ends(&["_1p", "_1m", "_2p", "_2m"]) {
-        return Some("a sheared version");
-    }
-    if has(&["shear_bias"]) {
-        return Some("a calibration");
-    }
-    if is_weight(&name) {
-        return Some("a weight");
-    }
-    if has(&["flag", "mask"]) {
-        return Some("a flag");
-    }
-    let response = ["r11", "r12", "r21", "r22", "r_11", "r_12", "r_21", "r_22"];
-    if response.contains(&name.as_str())
-        || ends(&[
-            "_g11", "_g12", "_g21", "_g22", "_r11", "_r12", "_r21", "_r22",
-        ])
-        || has(&["response"])
-    {
-        return Some("a response");
-    }
-    if has(&["rms_e", "sigma_e", "regauss_sigma", "shape_err"]) {
-        return Some("noise of shapes");
-    }
-    None
+    let mut looks = LOOKS.iter();
+    let found = looks.find(|(_, patterns)| fits_any(patterns, &name));
+    found.map(|(look, _)| *look)
 }
 
-/// Whether a name in small letters is that of a weight.
-fn is_weight(name: &str) -> bool {
-    let name = name.strip_suffix("_a").unwrap_or(name);
-    name == "w" || name == "wt" || name.starts_with("w_") || name.ends_with("weight")
+/// Whether a text has one of several patterns with blanks between them.
+pub(super) fn fits_any(patterns: &str, text: &str) -> bool {
+    patterns.split(' ').any(|pattern| fits(pattern, text))
 }
 
-/// Names for roles that were given: a column, or `none`.
+fn same_name<'a>(found: &'a [String], name: &str) -> Option<&'a String> {
+    found.iter().find(|own| own.eq_ignore_ascii_case(name))
+}
+
+/// The name of a column without the name of the unsheared catalogue.
+pub(super) fn base(name: &str) -> &str {
+    name.strip_suffix("_noshear").unwrap_or(name)
+}
+
+/// Columns that were given for roles, or `none`.
 #[derive(Debug, Clone, Default)]
-pub struct Names(BTreeMap<&'static str, String>);
+pub struct Names(BTreeMap<Key, String>);
 
-/// The names of all roles.
-pub fn role_names() -> String {
-    ROLES.map(|(_, name, _)| name).join(", ")
+/// Why `--columns` cannot be used.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum NameError {
+    #[error("--columns: found `{0}`, expected ROLE=COLUMN with a role of {known}", known = role_names())]
+    Syntax(String),
+    #[error("--columns: unknown role (found `{0}`, expected one of {known})", known = role_names())]
+    Role(String),
+    #[error("--columns: {0} is given twice")]
+    Twice(String),
 }
+
+// Roles that one column may have together: a scalar response of both components, and identifiers of units.
+const SHARED: [[Role; 2]; 3] = [
+    [Role::R11, Role::R22],
+    [Role::Divisor1, Role::Divisor2],
+    [Role::Id, Role::Unit],
+];
 
 impl Names {
     /// Adds `ROLE=COLUMN`.
     ///
     /// # Errors
     /// If there is no such role.
-    pub fn add(&mut self, text: &str) -> Result<(), String> {
-        let known = role_names;
-        let given = text
-            .split_once('=')
-            .filter(|(_, column)| !column.is_empty());
-        let Some((role, column)) = given else {
-            return Err(format!(
-                "--columns: found `{text}`, expected ROLE=COLUMN with a role of {}",
-                known()
-            ));
+    pub fn add(&mut self, text: &str) -> Result<(), NameError> {
+        let (role, column) = match text.split_once('=') {
+            Some((role, column)) if !column.is_empty() => (role, column),
+            _ => return Err(NameError::Syntax(text.to_owned())),
         };
-        let Some((_, name, _)) = ROLES.iter().find(|(_, name, _)| *name == role) else {
-            return Err(format!(
-                "--columns: unknown role (found `{role}`, expected one of {})",
-                known()
-            ));
-        };
-        if self.0.insert(name, column.to_owned()).is_some() {
-            return Err(format!("--columns: {role} is given twice"));
+        let key = named(role).ok_or_else(|| NameError::Role(role.to_owned()))?;
+        match self.0.insert(key, column.to_owned()) {
+            Some(_) => Err(NameError::Twice(role.to_owned())),
+            None => Ok(()),
         }
-        Ok(())
     }
 
-    /// Whether the responses of each component to the other one are not to be used, in columns or by sheared versions.
-    pub fn decline_matrix(&self) -> bool {
-        ["R12", "R21"]
-            .iter()
-            .any(|role| self.0.get(role).is_some_and(|own| own == "none"))
+    /// Whether the responses of each component to the other one are not to be used, in columns or by sheared catalogues.
+    pub(super) fn decline_matrix(&self) -> bool {
+        let mut roles = [Role::R12, Role::R21].into_iter();
+        roles.any(|role| self.0.get(&(role, 0)).is_some_and(|own| own == "none"))
     }
 
-    /// The role for which a column is given.
-    pub fn role_of(&self, column: &str) -> Option<&'static str> {
+    fn key_of(&self, column: &str) -> Option<Key> {
         let mut given = self.0.iter();
-        given.find_map(|(role, own)| (own == column && own != "none").then_some(*role))
+        given.find_map(|(key, own)| (own == column && own != "none").then_some(*key))
     }
 
-    /// Whether a role has a column by option.
-    pub fn is_given(&self, role: &str) -> bool {
-        self.0.contains_key(role)
+    /// Whether a role has a column, or none, by option.
+    pub(super) fn is_given(&self, role: Role) -> bool {
+        self.0.contains_key(&(role, 0))
     }
 
     /// Refuses a column with two roles: measured shears that are also the true ones have m = 0.
     fn check_single_roles(&self, path: &Path) -> Result<(), FileError> {
-        for (role, column) in &self.0 {
-            let first = self.role_of(column).unwrap_or(role);
-            if first != *role && !SHARED.contains(&[first, role]) {
+        for (key, column) in &self.0 {
+            let first = self.key_of(column).unwrap_or(*key);
+            if first != *key && !SHARED.contains(&[first.0, key.0]) {
+                let (first, role) = (name_of(first), name_of(*key));
                 return Err(FileError::new(
                     path,
                     format!(
@@ -760,36 +479,25 @@ impl Names {
     }
 
     /// Refuses columns with names of true shears that are given as something else, if nothing else states the true shear.
-    ///
-    /// # Errors
-    /// If there are such columns and `--columns` contains no g1.
-    pub fn check_true_shear(&self, path: &Path) -> Result<(), FileError> {
-        if self.0.contains_key("g1") || self.0.contains_key("g2") {
+    pub(super) fn check_true_shear(&self, path: &Path) -> Result<(), FileError> {
+        if self.is_given(Role::G1) || self.is_given(Role::G2) {
             return Ok(());
         }
-        let names = ROLES
-            .iter()
-            .filter(|(role, _, _)| matches!(role, Role::G1 | Role::G2));
-        let mut names = names.flat_map(|(_, _, names)| names.iter().copied());
-        let taken = |name: &&str| {
-            let mut given = self.0.values();
-            given.any(|own| own.eq_ignore_ascii_case(name))
-        };
-        match names.find(taken) {
-            None => Ok(()),
-            Some(name) => Err(FileError::new(
-                path,
-                format!(
-                    "`{name}` is given as {}, so the true shear is unknown. Try: --truth FILE, --columns g1=NAME,g2=NAME, or g1=none,g2=none for c alone",
-                    self.role_of(name).unwrap_or("another role")
-                ),
-            )),
+        for name in [Role::G1, Role::G2].into_iter().flat_map(names_of_role) {
+            let mut given = self.0.iter();
+            if let Some((key, _)) = given.find(|(_, own)| own.eq_ignore_ascii_case(name)) {
+                return Err(FileError::new(
+                    path,
+                    format!(
+                        "`{name}` is given as {}, so the true shear is unknown. Try: --truth FILE, --columns g1=NAME,g2=NAME, or g1=none,g2=none for c alone",
+                        name_of(*key)
+                    ),
+                ));
+            }
         }
+        Ok(())
     }
 }
-
-/// Roles that one column may have together: a scalar response of both components, and identifiers of units.
-const SHARED: [[&str; 2]; 3] = [["R11", "R22"], ["divisor1", "divisor2"], ["id", "unit"]];
 
 /// Which program wrote a catalogue, recognised by its columns.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -811,23 +519,23 @@ pub enum Preset {
 }
 
 impl Preset {
-    fn of_roles(roles: &BTreeMap<Role, String>, is_hsm: bool) -> Self {
-        if roles.contains_key(&Role::Version) {
+    fn of_columns(columns: &BTreeMap<Key, String>, is_hsm: bool) -> Self {
+        let have = |key| columns.contains_key(&key);
+        if have((Role::Version, 0)) {
             Preset::Metadetect
-        } else if roles.contains_key(&Role::Divisor1) && roles.contains_key(&Role::R11) {
+        } else if have((Role::Divisor1, 0)) && have((Role::R11, 0)) {
             Preset::Shearq
-        } else if roles.contains_key(&Role::E1p) && roles.contains_key(&Role::E2p) {
+        } else if have((Role::E1, 1)) && have((Role::E2, 3)) {
             Preset::Metacal
         } else if is_hsm {
             Preset::Hsm
-        } else if roles.contains_key(&Role::Dw1) {
+        } else if have((Role::Dw1, 0)) {
             Preset::Anacal
         } else {
             Preset::Plain
         }
     }
 
-    /// Its name.
     pub fn name(self) -> &'static str {
         match self {
             Preset::Plain => "plain columns",
@@ -844,8 +552,7 @@ impl Preset {
 /// The columns of a catalogue by role.
 #[derive(Debug, Clone)]
 pub struct Columns {
-    roles: BTreeMap<Role, String>,
-    /// The program.
+    columns: BTreeMap<Key, String>,
     pub preset: Preset,
     /// The public catalogue or the output of a program that its columns are known from.
     survey: Option<&'static str>,
@@ -853,13 +560,13 @@ pub struct Columns {
     pub distortion: bool,
     /// A column that looks like a weight, if none has this role and it was not declined.
     pub doubtful_weight: Option<String>,
-    /// Columns that look like a weight, flag, response, derivative or sheared version and have no role.
+    /// Columns that look like a weight, flag, response, derivative or sheared catalogue and have no role.
     unused: Vec<String>,
     /// All columns of flags; the first is that of the role.
     pub flags: Vec<String>,
     /// Columns of [`CHOICES`], with whether rows of value 1 count.
     pub choices: Vec<(String, bool)>,
-    /// Columns that may hold names of versions, if no column has this role and it was not declined.
+    /// Columns that may hold names of sheared catalogues, if no column has this role and it was not declined.
     pub steps: Vec<String>,
 }
 
@@ -871,54 +578,49 @@ impl Columns {
     /// is absent.
     pub fn find(path: &Path, found: &[String], names: &Names) -> Result<Self, FileError> {
         names.check_single_roles(path)?;
-        let mut roles = BTreeMap::new();
-        let survey = SURVEYS.iter().find(|survey| survey.fits(found, names));
-        for (role, key, candidates) in ROLES {
-            if role == Role::Flag {
-                continue;
-            }
-            let by_survey = survey.and_then(|survey| survey.of(key));
-            // A column called g1 that is given as e1 is not the true shear, too.
-            let own = |name: &str| {
-                let vector = in_vector(name);
-                let is_named = |own: &&String| {
-                    own.eq_ignore_ascii_case(name)
-                        || vector
-                            .as_ref()
-                            .is_some_and(|name| own.eq_ignore_ascii_case(name))
-                };
-                found
-                    .iter()
-                    .filter(is_named)
-                    .find(|own| names.role_of(own).is_none())
+        let survey = SURVEYS.iter().find(|survey| survey.is_of(found, names));
+        // A column called g1 that is given as e1 is not the true shear, too.
+        let free = |name: &str| {
+            let vector = in_vector(name);
+            let is_named = |own: &&String| {
+                own.eq_ignore_ascii_case(name)
+                    || vector
+                        .as_ref()
+                        .is_some_and(|name| own.eq_ignore_ascii_case(name))
             };
-            let column = match (names.0.get(key), by_survey) {
+            let mut all = found.iter().filter(is_named);
+            all.find(|own| names.key_of(own).is_none())
+        };
+        let mut columns = BTreeMap::new();
+        for key in keys().filter(|(role, _)| *role != Role::Flag) {
+            let column = match (names.0.get(&key), survey.and_then(|survey| survey.of(key))) {
                 (Some(none), _) if none == "none" => None,
                 (Some(given), _) if found.contains(given) => Some(given),
                 (Some(given), _) => return Err(FileError::no_column(path, given, found)),
-                (None, Some(known)) => own(known),
-                (None, None) => candidates.iter().find_map(|name| own(name)),
+                (None, Some(known)) => free(known),
+                (None, None) => recognised(key).iter().find_map(|name| free(name)),
             };
-            if let Some(column) = column {
-                roles.insert(role, column.clone());
+            columns.extend(column.map(|column| (key, column.clone())));
+        }
+        let name_of_e1 = |columns: &BTreeMap<Key, String>| {
+            columns
+                .get(&(Role::E1, 0))
+                .map(|e1| e1.to_ascii_lowercase())
+        };
+        // HSM has both in one table: shears of KSB, and distortions of all other methods.
+        if name_of_e1(&columns).is_none_or(|e1| e1 != "corrected_e1") {
+            columns.retain(|(role, _), _| ![Role::KsbE1, Role::KsbE2].contains(role));
+        }
+        let flags = find_flags(path, found, names, survey, name_of_e1(&columns))?;
+        columns.extend(flags.first().map(|first| ((Role::Flag, 0), first.clone())));
+        find_sheared(&mut columns, found, names);
+        for (key, own) in keys().filter_map(|key| Some((key, diagonal(key)?))) {
+            if names.decline_matrix() || !columns.contains_key(&own) {
+                columns.remove(&key);
             }
         }
-        let shape = roles.get(&Role::E1).map(|e1| e1.to_ascii_lowercase());
-        if shape.is_none_or(|e1| e1 != "corrected_e1") {
-            for role in [Role::KsbE1, Role::KsbE2] {
-                roles.remove(&role);
-            }
-        }
-        let flags = find_flags(path, found, names, survey, roles.get(&Role::E1))?;
-        roles.extend(flags.first().map(|first| (Role::Flag, first.clone())));
-        find_sheared(&mut roles, found, names);
-        let diagonal = names.decline_matrix();
-        for (other, own) in OTHER_RESPONSES {
-            if diagonal || !roles.contains_key(&own) {
-                roles.remove(&other);
-            }
-        }
-        if !roles.contains_key(&Role::E1) && !roles.contains_key(&Role::E2) {
+        let Some(e1) = name_of_e1(&columns).or_else(|| Some(columns.get(&(Role::E2, 0))?.clone()))
+        else {
             return Err(FileError::new(
                 path,
                 format!(
@@ -926,28 +628,25 @@ impl Columns {
                     names_of(found)
                 ),
             ));
-        }
-        for (a, b) in PAIRS {
-            for (there, absent) in [(a, b), (b, a)] {
-                if let (Some(column), false) = (roles.get(&there), roles.contains_key(&absent)) {
-                    let key = key_of(absent);
-                    return Err(FileError::new(
-                        path,
-                        format!(
-                            "there is a column `{column}` but none for {key} (found {}). Try: --columns {key}=NAME, or {}=none",
-                            names_of(found),
-                            key_of(there)
-                        ),
-                    ));
-                }
+        };
+        for (key, column) in &columns {
+            let absent = partner(*key).filter(|partner| !columns.contains_key(partner));
+            if let Some(absent) = absent.map(name_of) {
+                return Err(FileError::new(
+                    path,
+                    format!(
+                        "there is a column `{column}` but none for {absent} (found {}). Try: --columns {absent}=NAME, or {}=none",
+                        names_of(found),
+                        name_of(*key)
+                    ),
+                ));
             }
         }
-        let e1 = roles[&Role::E1].to_ascii_lowercase();
         let distortion =
             DISTORTIONS.contains(&e1.as_str()) || survey.is_some_and(|survey| survey.distortion);
-        let preset = Preset::of_roles(&roles, distortion || e1 == "corrected_g1");
+        let preset = Preset::of_columns(&columns, distortion || e1 == "corrected_g1");
         let mut columns = Columns {
-            roles,
+            columns,
             preset,
             survey: survey.map(|survey| survey.name),
             distortion,
@@ -957,42 +656,45 @@ impl Columns {
             choices: Vec::new(),
             steps: Vec::new(),
         };
-        if preset == Preset::Metacal && !names.0.contains_key("e1") {
+        if preset == Preset::Metacal && !names.is_given(Role::E1) {
             columns.take_unsheared(found);
         }
-        columns.find_unused(found, names);
+        // All columns of shearq are known.
+        if preset != Preset::Shearq {
+            columns.find_unused(found, names);
+        }
         Ok(columns)
     }
 
-    /// Notes columns without a role whose names suggest one. All columns of shearq are known.
+    /// Notes columns without a role whose names suggest one.
     fn find_unused(&mut self, found: &[String], names: &Names) {
-        if self.preset == Preset::Shearq {
-            return;
-        }
-        let taken = self.roles.values().chain(&self.flags).cloned();
-        let taken: Vec<String> = taken.collect();
-        let unused = || found.iter().filter(|name| !taken.contains(name));
-        let choice = |name: &String| {
+        let taken = |name: &String| {
+            self.columns
+                .values()
+                .chain(&self.flags)
+                .any(|own| own == name)
+        };
+        let unused: Vec<&String> = found.iter().filter(|name| !taken(name)).collect();
+        let all = |wanted: &dyn Fn(&str) -> bool| -> Vec<String> {
+            let unused = unused.iter().filter(|name| wanted(name));
+            unused.map(|name| (*name).clone()).collect()
+        };
+        let choices = unused.iter().filter_map(|name| {
             let mut known = CHOICES.iter();
             let known = known.find(|(known, _)| known.eq_ignore_ascii_case(name))?;
-            Some((name.clone(), known.1))
-        };
-        self.choices = unused().filter_map(choice).collect();
-        if self.of(Role::Version).is_none() && !names.0.contains_key("version") {
-            let is_step = |name: &&String| {
-                let name = name.to_ascii_lowercase();
-                name.contains("step") || name.contains("shear_type") || name == "shear"
-            };
-            self.steps = unused().filter(is_step).cloned().collect();
+            Some(((*name).clone(), known.1))
+        });
+        let choices = choices.collect();
+        if self.of(Role::Version).is_none() && !names.is_given(Role::Version) {
+            self.steps =
+                all(&|name| fits_any("*step* *shear_type* shear", &name.to_ascii_lowercase()));
         }
-        if self.of(Role::Weight).is_none() && !names.0.contains_key("w") {
-            let mut weights = unused().filter(|name| suggested(name) == Some("a weight"));
-            self.doubtful_weight = weights.next().cloned();
+        if self.of(Role::Weight).is_none() && !names.is_given(Role::Weight) {
+            let weights = all(&|name| look(name) == Some(Look::Weight));
+            self.doubtful_weight = weights.into_iter().next();
         }
-        self.unused = unused()
-            .filter(|name| suggested(name).is_some())
-            .cloned()
-            .collect();
+        self.unused = all(&|name| look(name).is_some());
+        self.choices = choices;
     }
 
     /// The public catalogue or the program that wrote it.
@@ -1001,13 +703,11 @@ impl Columns {
     }
 
     /// Each column that is used, as in `--columns`. Roles that are not `read` are left out.
-    pub fn used(&self, read: impl Fn(Role) -> bool) -> String {
-        let named = ROLES.iter().filter_map(|(role, key, _)| {
-            let column = self.of(*role).filter(|_| read(*role))?;
-            Some(match role {
-                Role::Flag => format!("{key}={}", self.flags.join("+")),
-                _ => format!("{key}={column}"),
-            })
+    pub(super) fn used(&self, read: impl Fn(Role) -> bool) -> String {
+        let used = keys().filter(|key| read(key.0) && self.columns.contains_key(key));
+        let named = used.map(|key| match key.0 {
+            Role::Flag => format!("flag={}", self.flags.join("+")),
+            _ => format!("{}={}", name_of(key), self.columns[&key]),
         });
         named.collect::<Vec<_>>().join(", ")
     }
@@ -1016,8 +716,10 @@ impl Columns {
     pub fn unused(&self, read: &[String]) -> Option<String> {
         let unused = self.unused.iter().filter(|name| !read.contains(name));
         let unused: Vec<&String> = unused.collect();
-        let calibrates = |name: &&&String| suggested(name) == Some("a calibration");
-        let calibration = match unused.iter().find(calibrates) {
+        let mut calibrations = unused
+            .iter()
+            .filter(|name| look(name) == Some(Look::Calibration));
+        let calibration = match calibrations.next() {
             Some(name) => format!(" m and c are those before the calibration by `{name}`."),
             None => String::new(),
         };
@@ -1029,63 +731,126 @@ impl Columns {
         })
     }
 
-    /// Of a catalogue of shearq with sheared versions, takes these versions if a selection requires them, and otherwise the
+    /// Of a catalogue of shearq with sheared catalogues, takes these if a selection requires them, and otherwise the
     /// columns without them, which have less noise.
-    pub fn choose_versions(&mut self, found: &[String], required: bool) {
-        if self.preset != Preset::Shearq || !self.roles.contains_key(&Role::E1p) {
+    pub(super) fn choose_versions(&mut self, found: &[String], required: bool) {
+        if self.preset != Preset::Shearq || self.of_sheared((Role::E1, 1)).is_none() {
             return;
         }
         if required {
             self.preset = Preset::Versions;
             self.take_unsheared(found);
         } else {
-            for role in SHEARED.into_iter().flatten() {
-                self.roles.remove(&role);
-            }
+            self.columns.retain(|(_, catalogue), _| *catalogue == 0);
         }
     }
 
-    /// Takes the ellipticity of the unsheared version if there is one: other columns may have less noise than versions.
+    /// Takes the ellipticity of the unsheared catalogue if there is one: other columns may have less noise.
     fn take_unsheared(&mut self, found: &[String]) {
         for (role, name) in [(Role::E1, "e1_noshear"), (Role::E2, "e2_noshear")] {
             if found.iter().any(|own| own == name) {
-                self.roles.insert(role, name.to_owned());
+                self.columns.insert((role, 0), name.to_owned());
             }
         }
     }
 
-    /// The column of a role.
-    pub fn of(&self, role: Role) -> Option<&str> {
-        self.roles.get(&role).map(String::as_str)
+    pub(super) fn of(&self, role: Role) -> Option<&str> {
+        self.of_sheared((role, 0))
+    }
+
+    pub(super) fn of_sheared(&self, key: Key) -> Option<&str> {
+        self.columns.get(&key).map(String::as_str)
     }
 
     /// Whether all of some roles have columns.
-    pub fn have(&self, roles: &[Role]) -> bool {
-        roles.iter().all(|role| self.roles.contains_key(role))
+    pub(super) fn have(&self, roles: &[Role]) -> bool {
+        roles.iter().all(|role| self.of(*role).is_some())
     }
 
-    /// All columns.
-    pub fn all(&self) -> impl Iterator<Item = (Role, &str)> {
-        self.roles.iter().map(|(role, name)| (*role, name.as_str()))
+    /// Whether the ellipticities of each component under shears of the other one are there.
+    pub(super) fn have_other_sheared(&self) -> bool {
+        SHEARED[4..]
+            .iter()
+            .all(|key| self.columns.contains_key(key))
+    }
+
+    pub(super) fn all(&self) -> impl Iterator<Item = (Key, &str)> {
+        self.columns.iter().map(|(key, name)| (*key, name.as_str()))
     }
 }
 
-/// Names of columns of a role, in any case.
-pub(super) fn names_of_role(role: Role) -> &'static [&'static str] {
-    let found = ROLES.iter().find(|(other, _, _)| *other == role);
-    found.map_or(&[], |(_, _, names)| names)
+/// Adds sheared catalogues by the names of e1 and e2: `foo_g1_1p` belongs to `foo_g1` or `foo_g1_noshear`.
+fn find_sheared(columns: &mut BTreeMap<Key, String>, found: &[String], names: &Names) {
+    for role in [Role::E1, Role::E2] {
+        let Some(name) = columns.get(&(role, 0)).map(|own| own.to_ascii_lowercase()) else {
+            continue;
+        };
+        let own = |version: &str| same_name(found, &format!("{}_{version}", base(&name)));
+        let sheared: Option<Vec<&String>> =
+            VERSIONS.iter().map(|(version, _)| own(version)).collect();
+        for (catalogue, column) in (1..).zip(sheared.into_iter().flatten()) {
+            if !names.0.contains_key(&(role, catalogue)) {
+                columns
+                    .entry((role, catalogue))
+                    .or_insert_with(|| column.clone());
+            }
+        }
+    }
+}
+
+/// Columns of flags. A row counts if all are zero: DES has the failures in `flags` and the cuts in `flags_select`, and
+/// metadetection one flag per kind of shape.
+fn find_flags(
+    path: &Path,
+    found: &[String],
+    names: &Names,
+    survey: Option<&Survey>,
+    e1: Option<String>,
+) -> Result<Vec<String>, FileError> {
+    match names.0.get(&(Role::Flag, 0)) {
+        None => {}
+        Some(none) if none == "none" => return Ok(Vec::new()),
+        Some(given) if found.contains(given) => return Ok(vec![given.clone()]),
+        Some(given) => {
+            let known = |name: &str| match found.iter().find(|own| *own == name) {
+                Some(own) => Ok(own.clone()),
+                None => Err(FileError::no_column(path, name, found)),
+            };
+            return given.split('+').map(known).collect();
+        }
+    }
+    let own = |name: &str| same_name(found, name).filter(|own| names.key_of(own).is_none());
+    let first = match survey.and_then(|survey| survey.of((Role::Flag, 0))) {
+        Some(known) => own(known),
+        None => names_of_role(Role::Flag).find_map(own),
+    };
+    let e1 = e1.unwrap_or_default();
+    let e1 = base(&e1);
+    let mut endings = ["_g_1", "_g1", "_g[0]", "_e_1", "_e1", "_e[0]"].into_iter();
+    let kind = endings.find_map(|ending| e1.strip_suffix(ending));
+    let of_kind = |ending: &str| own(&format!("{}_{ending}", kind?));
+    let cuts = own("flags_select");
+    let all = [
+        first,
+        own("flags").filter(|_| cuts.is_some()),
+        cuts,
+        of_kind("flags"),
+        of_kind("flag"),
+        own("ngmix_mcal_flags").filter(|_| e1.starts_with("ngmix")),
+    ];
+    let mut flags: Vec<String> = Vec::new();
+    for name in all.into_iter().flatten() {
+        if !flags.contains(name) {
+            flags.push(name.clone());
+        }
+    }
+    Ok(flags)
 }
 
 /// The name of a component of a vector, `g[0]` for `g_1`.
 fn in_vector(name: &str) -> Option<String> {
     let first = name.strip_suffix("_1").map(|vector| format!("{vector}[0]"));
     first.or_else(|| name.strip_suffix("_2").map(|vector| format!("{vector}[1]")))
-}
-
-/// Name of a role in `--columns`.
-fn key_of(role: Role) -> &'static str {
-    let found = ROLES.iter().find(|(other, _, _)| *other == role);
-    found.map_or("", |(_, key, _)| key)
 }
 
 #[cfg(test)]
@@ -1096,7 +861,7 @@ mod tests {
         let columns: Vec<String> = columns.split(' ').map(str::to_owned).collect();
         let mut names = Names::default();
         for text in given {
-            names.add(text)?;
+            names.add(text).map_err(|error| error.to_string())?;
         }
         Columns::find(Path::new("c.fits"), &columns, &names).map_err(|error| error.to_string())
     }
@@ -1131,7 +896,7 @@ mod tests {
             let all: Vec<String> = names.split(' ').map(str::to_owned).collect();
             own.choose_versions(&all, required);
             assert_eq!((own.preset, own.of(Role::E1)), (preset, Some(e1)));
-            assert_eq!(own.of(Role::E1p), plus);
+            assert_eq!(own.of_sheared((Role::E1, 1)), plus);
         }
         let given = found("a b R11 R22", &["e1=a", "e2=b", "R11=none", "R22=none"]).unwrap();
         assert_eq!((given.of(Role::E1), given.of(Role::R11)), (Some("a"), None));
@@ -1173,6 +938,7 @@ mod tests {
             assert!(error.contains(expected), "{error}");
         }
     }
+
     /// Column lists of public catalogues as their documentation has them, a name per line, with the columns that must be used.
     #[test]
     fn public_catalogues_are_read_by_their_published_columns() {

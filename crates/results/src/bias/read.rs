@@ -11,13 +11,15 @@ use shearq_files::table::{self, FileFormat, Place};
 use shearq_measure::{Observables, Selection};
 use shearq_quantities::{Distortion, MeasuredRange};
 
-use crate::expression::{Expression, Operand};
+use crate::expression::{Expression, Operand, fits};
 use crate::select::{READ, Weighted, require_responses};
 use crate::star_noise;
 use crate::views::diagnosis::shown;
 
 use super::Input;
-use super::columns::{Columns, Names, Preset, Role, SHEARED, Shapes};
+use super::columns::{
+    CATALOGUES, Columns, Key, Names, Preset, ROLES, Role, Shapes, base, fits_any,
+};
 use super::identity;
 use super::positions::{self, Positions};
 use super::truth::Truth;
@@ -33,7 +35,6 @@ pub(super) struct Reading {
     pub(super) select: Option<Expression>,
     /// Cuts and weights whose response to shear is known.
     pub(super) selection: Option<Selection>,
-    /// What the bins are bins of.
     pub(super) binned: Option<Expression>,
     pub(super) drop_missing: bool,
     /// Artificial shear of metacalibration.
@@ -44,43 +45,62 @@ pub(super) struct Reading {
     pub(super) unit: Option<String>,
 }
 
-/// Versions of a catalogue: the unsheared one and [`VERSIONS`].
-const COUNT: usize = 1 + VERSIONS.len();
+impl Reading {
+    fn expressions(&self) -> impl Iterator<Item = &Expression> + Clone {
+        [&self.select, &self.binned].into_iter().flatten()
+    }
 
-/// Columns of surveys and simulations that look like independent units. They are suggested, not used: a field or seed may
-/// also be the same in all rows.
-const UNITS: [&str; 18] = [
-    "tile",
-    "tile_id",
-    "tileid",
-    "tilename",
-    "tile_name",
-    "field",
-    "field_id",
-    "patch",
-    "patch_id",
-    "seed",
-    "tract",
-    "pointing",
-    "exposure",
-    "exp_id",
-    "ccd",
-    "chip",
-    "healpix",
-    "realisation",
-];
+    /// Whether the column of a role is not needed.
+    fn skips(&self, role: Role) -> bool {
+        match role {
+            Role::G1 | Role::G2 => !matches!(self.truth, Truth::Columns),
+            Role::X | Role::Y => !matches!(self.truth, Truth::Positions(_) | Truth::Data(_)),
+            _ => false,
+        }
+    }
+}
+
+// Columns of surveys and simulations that look like independent units. They are suggested, not used: a field or seed may
+// also be the same in all rows.
+const UNITS: &str = "tile tile_id tileid tilename tile_name field field_id patch patch_id seed tract pointing exposure \
+    exp_id ccd chip healpix realisation";
+
+// Columns that shear does not change, by their names in small letters.
+const FIXED: &str = "*psf* *tile* *field* *patch* *seed* *true* *truth* *image* *ccd* *exp* *airmass* *seeing* *depth* \
+    *zbin* *z_bin* *primary* *inner* ra dec x y z number row alpha delta set";
 
 /// A row that counts.
 pub(super) struct Item {
     /// Unit.
     pub(super) key: u64,
-    /// The version of the row; `None` without artificial shear.
+    /// The artificial shear of the row; `None` without one.
     pub(super) version: Option<usize>,
     pub(super) row: Row,
-    /// The binned quantity in the row, and under each version that has it; NaN if the row is not selected.
-    pub(super) binned: [f64; COUNT],
-    /// Its weight under each version.
+    /// The binned quantity in each catalogue that has it; infinity if the row is not selected.
+    pub(super) binned: [f64; CATALOGUES],
+    /// Its weight in each sheared catalogue.
     pub(super) weights: [f64; VERSIONS.len()],
+}
+
+/// What is read of a row for one catalogue, as places in [`Source::wanted`].
+#[derive(Default)]
+struct Places {
+    roles: [Option<usize>; ROLES],
+    /// A row counts if all are zero.
+    flags: Vec<usize>,
+    /// The operands of the expressions; `None` if this catalogue lacks one.
+    select: Option<Vec<usize>>,
+    binned: Option<Vec<usize>>,
+}
+
+impl Places {
+    fn of(&self, role: Role) -> Option<usize> {
+        self.roles[role as usize]
+    }
+
+    fn pair(&self, [a, b]: [Role; 2]) -> Option<[usize; 2]> {
+        Some([self.of(a)?, self.of(b)?])
+    }
 }
 
 /// A table of a catalogue with its columns.
@@ -88,32 +108,30 @@ pub(super) struct Source {
     place: Place,
     /// The table, if it is in memory.
     frame: Option<DataFrame>,
-    /// The version of all rows, if a FITS file has one table per version.
+    /// The artificial shear of all rows, if a FITS file has one table per sheared catalogue.
     version: Option<Option<usize>>,
     pub(super) columns: Columns,
     /// A column without a role that looks like independent units.
     pub(super) unit_column: Option<String>,
-    /// Names of all columns that are read.
-    wanted: Vec<String>,
-    /// Places of the columns of expressions among them: of the rows, and under each version.
-    selected: Vec<Option<Vec<usize>>>,
-    binned: Vec<Option<Vec<usize>>>,
-    /// Columns of expressions that may change with shear and have no sheared versions.
+    /// All that is read.
+    wanted: Vec<Operand>,
+    /// Without artificial shear, and for each one.
+    places: [Places; CATALOGUES],
+    /// Columns of expressions that may change with shear and have no sheared columns.
     unanswered: Vec<String>,
-    /// Places of the flags, and of flags and weights under each version, from which the response of the choice and of the
-    /// weights follows.
-    flags: Vec<usize>,
-    flag_versions: Option<[Vec<usize>; VERSIONS.len()]>,
-    weight_versions: Option<[usize; VERSIONS.len()]>,
-    /// Places of flags of failed measurements of versions.
+    /// Whether flags and weights of the sheared catalogues give the response of the choice and of the weights.
+    sheared_flags: bool,
+    sheared_weight: bool,
+    /// Flags of failed measurements of sheared catalogues.
     failed_versions: Vec<usize>,
-    /// Places of columns that say which rows count and are not used, with whether rows of value 1 do.
+    doubtful_weight: Option<usize>,
+    /// Columns that say which rows count and are not used, with whether rows of value 1 do.
     choices: Vec<(usize, bool)>,
 }
 
-/// Whether a choice among the galaxies of a catalogue can have a response from columns of its versions.
+/// Whether a choice among the galaxies of a catalogue can have a response from its sheared columns.
 fn answers(columns: &Columns) -> bool {
-    // Catalogues with responses of galaxies often have only the selected quantities in sheared versions.
+    // Catalogues with responses of galaxies often have only the selected quantities in sheared columns.
     match columns.preset {
         Preset::Metacal | Preset::Versions => true,
         Preset::Shearq | Preset::Anacal | Preset::Metadetect => false,
@@ -122,20 +140,18 @@ fn answers(columns: &Columns) -> bool {
 }
 
 impl Source {
-    /// Whether the selection is also known for each sheared version, so that its response follows.
+    /// Whether the selection is also known in each sheared catalogue, so that its response follows.
     pub(super) fn selects_versions(&self, reading: &Reading) -> bool {
-        let all = |places: &[Option<Vec<usize>>]| places.iter().all(Option::is_some);
-        let chosen = reading.select.is_some() || reading.binned.is_some();
+        let chosen = reading.expressions().next().is_some();
         answers(&self.columns)
-            && (chosen || self.flag_versions.is_some() || self.weight_versions.is_some())
-            && all(&self.selected)
-            && all(&self.binned)
+            && (chosen || self.sheared_flags || self.sheared_weight)
+            && (self.places.iter()).all(|own| own.select.is_some() && own.binned.is_some())
     }
 
     /// Columns of `--where` and `--bins` by which shear changes the choice of galaxies, without a response of the choice.
     pub(super) fn unanswered(&self) -> &[String] {
         match self.has_version_rows() {
-            // Each version is chosen by its own columns.
+            // Each sheared catalogue is chosen by its own columns.
             true => &[],
             false => &self.unanswered,
         }
@@ -151,28 +167,30 @@ impl Source {
 
     /// What is used as what, and what is not used.
     pub(super) fn described(&self, reading: &Reading) -> Vec<String> {
+        let responsivity = self.shapes(reading) == Shapes::Responsivity;
         let read = |role: Role| match role {
             Role::Unit => self.unit(reading).is_some(),
             Role::R12 | Role::R21 => self.has_matrix(reading),
-            Role::RmsE | Role::SigmaE => self.shapes(reading) == Shapes::Responsivity,
-            role => !is_skipped(role, reading),
+            Role::RmsE | Role::SigmaE => responsivity,
+            role => !reading.skips(role),
         };
         let mut lines = vec![format!("Used: {}.", self.columns.used(read))];
         let doubtful = self.columns.doubtful_weight.as_ref();
-        let read = self.wanted.iter().filter(|name| Some(*name) != doubtful);
-        let read: Vec<String> = read.cloned().collect();
+        let read = self.wanted.iter().map(|own| own.column.clone());
+        let read: Vec<String> = read.filter(|name| Some(name) != doubtful).collect();
         lines.extend(self.columns.unused(&read));
-        let flags = self.flag_versions.as_ref().map(|own| own[0].clone());
-        let weight = self.weight_versions.map(|own| own[0]);
-        let versions = flags.into_iter().flatten().chain(weight);
-        let versions: Vec<&str> = versions.map(|place| self.wanted[place].as_str()).collect();
-        if !versions.is_empty() {
+        let first = &self.places[1];
+        let flags = first.flags.iter().copied().filter(|_| self.sheared_flags);
+        let weight = first.of(Role::Weight).filter(|_| self.sheared_weight);
+        let sheared = flags.chain(weight);
+        let sheared: Vec<&str> = sheared.map(|place| self.name(place)).collect();
+        if !sheared.is_empty() {
             lines.push(format!(
                 "Response of the choice and the weights: from {} and the other versions.",
-                versions.join(", ")
+                sheared.join(", ")
             ));
         }
-        if self.shapes(reading) == Shapes::Responsivity {
+        if responsivity {
             let rms = match (self.columns.of(Role::RmsE), self.columns.of(Role::SigmaE)) {
                 (Some(rms), _) => format!("e_rms from {rms}"),
                 (None, Some(sigma)) => format!("e_rms² = ⟨χ²⟩/2 − {sigma}²"),
@@ -192,7 +210,11 @@ impl Source {
         &self.place.path
     }
 
-    /// Whether rows belong to versions.
+    fn name(&self, place: usize) -> &str {
+        &self.wanted[place].column
+    }
+
+    /// Whether rows belong to sheared catalogues.
     pub(super) fn has_version_rows(&self) -> bool {
         self.version.is_some() || self.columns.of(Role::Version).is_some()
     }
@@ -200,7 +222,7 @@ impl Source {
     /// Whether the responses of each component to the other one are known.
     pub(super) fn has_matrix(&self, reading: &Reading) -> bool {
         let of_rows = match self.columns.preset {
-            Preset::Metacal | Preset::Versions => self.columns.have(&SHEARED[1]),
+            Preset::Metacal | Preset::Versions => self.columns.have_other_sheared(),
             _ => self.columns.have(&[Role::R12, Role::R21]),
         };
         let found = of_rows || reading.selection.is_some() || self.has_version_rows();
@@ -218,31 +240,35 @@ impl Source {
         reading: &Reading,
         mut take: impl FnMut(DataFrame) -> Result<(), FileError>,
     ) -> Result<(), FileError> {
-        let wanted: Vec<&str> = self.wanted.iter().map(String::as_str).collect();
-        match &self.frame {
-            Some(frame) => take(frame.clone()),
-            None => table::read_parts(&self.place, &wanted, &self.texts(reading), take),
+        if let Some(frame) = &self.frame {
+            return take(frame.clone());
         }
+        let mut names: Vec<&str> = Vec::new();
+        for Operand { column, .. } in &self.wanted {
+            if !names.contains(&column.as_str()) {
+                names.push(column);
+            }
+        }
+        let texts = names
+            .iter()
+            .copied()
+            .filter(|name| self.is_text(reading, name));
+        table::read_parts(&self.place, &names, &texts.collect::<Vec<_>>(), take)
     }
 
-    /// Columns of identifiers and versions, which may be texts.
-    fn texts<'a>(&'a self, reading: &'a Reading) -> Vec<&'a str> {
-        let roles = [Role::Id, Role::Version].map(|role| self.columns.of(role));
-        let steps = self.columns.steps.iter().map(String::as_str);
-        let named = roles
-            .into_iter()
-            .flatten()
-            .chain(self.unit(reading))
-            .chain(steps);
-        // Expressions need numbers.
-        let selected = self.selected.iter().chain(&self.binned).flatten().flatten();
-        let expressions: Vec<usize> = selected.copied().collect();
-        named
-            .filter(|name| {
-                let place = self.wanted.iter().position(|own| own == name);
-                place.is_some_and(|place| !expressions.contains(&place))
-            })
-            .collect()
+    /// Whether a column may be a text: identifiers, names of sheared catalogues, and what is compared with a pattern.
+    fn is_text(&self, reading: &Reading, name: &str) -> bool {
+        let mut operands = reading.expressions().flat_map(Expression::operands);
+        let compared = operands.find(|own| own.column == name || own.column == base(name));
+        match compared {
+            Some(operand) => operand.pattern.is_some(),
+            None => {
+                let roles = [Role::Id, Role::Version].map(|role| self.columns.of(role));
+                roles.contains(&Some(name))
+                    || self.unit(reading) == Some(name)
+                    || self.columns.steps.iter().any(|step| step == name)
+            }
+        }
     }
 
     /// Column that names the unit.
@@ -285,7 +311,7 @@ pub(super) fn sources(input: &Input, reading: &Reading) -> Result<Vec<Source>, F
             tables.push(source(place, Some(version), &list.names, reading)?);
         }
     }
-    if tables.len() == COUNT {
+    if tables.len() == CATALOGUES {
         return Ok(tables);
     }
     let lists = || {
@@ -344,8 +370,7 @@ fn unanswered(
     columns: &Columns,
     has_versions: impl Fn(&str) -> bool,
 ) -> Vec<String> {
-    let expressions = [&reading.select, &reading.binned].into_iter().flatten();
-    let names = expressions.flat_map(Expression::columns);
+    let names = reading.expressions().flat_map(Expression::columns);
     let names: BTreeSet<&str> = names
         .filter(|name| match columns.preset {
             Preset::Shearq => is_measured(name),
@@ -355,99 +380,138 @@ fn unanswered(
     names.into_iter().map(str::to_owned).collect()
 }
 
-/// Columns of sheared versions by their names.
-struct Sheared<'a> {
+/// The columns that are read of a table with these names, each once.
+struct Wanted<'a> {
+    path: &'a Path,
     names: &'a [String],
     columns: &'a Columns,
+    all: Vec<Operand>,
 }
 
-impl<'a> Sheared<'a> {
-    fn of(&self, name: &str, version: &str) -> Option<String> {
+/// The places of all catalogues, and whether flags and weights of sheared ones are there.
+struct Placed {
+    places: [Places; CATALOGUES],
+    sheared_flags: bool,
+    sheared_weight: bool,
+}
+
+impl Wanted<'_> {
+    /// The place of a column among those that are read; `None` if the table does not have it.
+    fn add(&mut self, name: &str, pattern: Option<&String>) -> Option<usize> {
+        if !self.names.iter().any(|own| own == name) {
+            return None;
+        }
+        let operand = Operand {
+            column: name.to_owned(),
+            pattern: pattern.cloned(),
+        };
+        let known = self.all.iter().position(|own| *own == operand);
+        Some(known.unwrap_or_else(|| {
+            self.all.push(operand);
+            self.all.len() - 1
+        }))
+    }
+
+    /// The same for a column that must be there.
+    fn require(&mut self, name: &str) -> Result<usize, FileError> {
+        let found = self.add(name, None);
+        found.ok_or_else(|| FileError::no_column(self.path, name, self.names))
+    }
+
+    /// The column of a sheared catalogue, in any case.
+    fn sheared(&self, name: &str, version: &str) -> Option<String> {
         let wanted = format!("{}_{version}", base(name));
         let mut names = self.names.iter();
         names.find(|own| own.eq_ignore_ascii_case(&wanted)).cloned()
     }
 
-    fn has_all(&self, name: &str) -> bool {
+    fn has_sheared(&self, name: &str) -> bool {
         let mut versions = VERSIONS.iter();
-        answers(self.columns) && versions.all(|(version, _)| self.of(name, version).is_some())
+        answers(self.columns) && versions.all(|(version, _)| self.sheared(name, version).is_some())
     }
 
-    /// Other flags of metacalibration with versions are those of failed measurements.
+    /// Whether a flag is a cut in all catalogues. Other flags of metacalibration with sheared ones are those of failed
+    /// measurements.
     fn is_cut(&self, name: &str) -> bool {
         let by_name = name.to_ascii_lowercase().contains("select");
-        (by_name || self.columns.preset != Preset::Metacal) && self.has_all(name)
+        (by_name || self.columns.preset != Preset::Metacal) && self.has_sheared(name)
     }
 
-    /// Without versions, a flag is the same in all.
-    fn of_flag(&self, name: &str, version: &str) -> String {
-        let sheared = Some(name).filter(|name| self.is_cut(name));
-        let sheared = sheared.and_then(|name| self.of(name, version));
-        sheared.unwrap_or_else(|| name.to_owned())
-    }
-
-    fn failures(&self) -> impl Iterator<Item = &'a String> + use<'a> {
-        let metacal = self.columns.preset == Preset::Metacal;
-        self.names.iter().filter(move |name| {
-            let name = name.to_ascii_lowercase();
-            let is_flag = name.contains("flag") && !name.contains("select");
-            metacal && is_flag && version_of(&name).is_some()
+    /// The places of roles, flags and expressions. A column without sheared ones is the same in all catalogues if
+    /// `by_versions`, or if flags or weights have sheared ones.
+    fn places(&mut self, reading: &Reading, by_versions: bool) -> Result<Placed, FileError> {
+        let columns = self.columns;
+        let mut places: [Places; CATALOGUES] = Default::default();
+        for ((role, catalogue), name) in columns.all() {
+            if role != Role::Unit && !reading.skips(role) {
+                places[catalogue].roles[role as usize] = self.add(name, None);
+            }
+        }
+        let cuts = columns.flags.iter().any(|name| self.is_cut(name));
+        let weight = columns
+            .of(Role::Weight)
+            .filter(|name| self.has_sheared(name));
+        let by_versions = by_versions || cuts || weight.is_some();
+        let selected = self.expression(reading.select.as_ref(), by_versions)?;
+        let binned = self.expression(reading.binned.as_ref(), by_versions)?;
+        let known = selected.iter().chain(&binned).all(Option::is_some);
+        for (own, (selected, binned)) in places.iter_mut().zip(selected.into_iter().zip(binned)) {
+            (own.select, own.binned) = (selected, binned);
+        }
+        let weight = weight.filter(|_| known);
+        for (catalogue, own) in places.iter_mut().enumerate() {
+            let version = catalogue.checked_sub(1).map(|version| VERSIONS[version].0);
+            for flag in &columns.flags {
+                let sheared = version.filter(|_| known && self.is_cut(flag));
+                let sheared = sheared.and_then(|version| self.sheared(flag, version));
+                own.flags
+                    .push(self.require(sheared.as_ref().unwrap_or(flag))?);
+            }
+            if let (Some(name), Some(version)) = (weight, version) {
+                let sheared = self.sheared(name, version);
+                own.roles[Role::Weight as usize] = sheared.and_then(|name| self.add(&name, None));
+            }
+        }
+        Ok(Placed {
+            places,
+            sheared_flags: cuts && known,
+            sheared_weight: weight.is_some(),
         })
     }
-}
 
-/// The columns of roles that are read, each once.
-fn wanted_columns(columns: &Columns, reading: &Reading) -> Vec<String> {
-    let read = columns
-        .all()
-        .filter(|(role, _)| *role != Role::Unit && !is_skipped(*role, reading));
-    let mut wanted: Vec<String> = Vec::new();
-    for (_, name) in read {
-        if !wanted.iter().any(|own| own == name) {
-            wanted.push(name.to_owned());
+    /// The operands of an expression in each catalogue that has them.
+    fn expression(
+        &mut self,
+        expression: Option<&Expression>,
+        by_versions: bool,
+    ) -> Result<Vec<Option<Vec<usize>>>, FileError> {
+        let Some(expression) = expression else {
+            return Ok(vec![Some(Vec::new()); CATALOGUES]);
+        };
+        let mut own = Vec::new();
+        for Operand { column, pattern } in expression.operands() {
+            // Sheared catalogues of shearq have noise that other columns do not have.
+            let plain = format!("{column}_noshear");
+            let [first, second] = match self.columns.preset {
+                Preset::Versions => [&plain, column],
+                _ => [column, &plain],
+            };
+            let found = self.add(first, pattern.as_ref());
+            let found = found.or_else(|| self.add(second, pattern.as_ref()));
+            own.push(found.ok_or_else(|| FileError::no_column(self.path, column, self.names))?);
         }
+        let mut all = vec![Some(own)];
+        for (version, _) in VERSIONS {
+            // A column without sheared ones is the same in all, if there are sheared columns of another one.
+            let operands = expression.operands().iter();
+            let sheared = operands.map(|Operand { column, pattern }| {
+                let own = self.add(&format!("{}_{version}", base(column)), pattern.as_ref());
+                own.or_else(|| self.add(column, pattern.as_ref()).filter(|_| by_versions))
+            });
+            all.push(sheared.collect());
+        }
+        Ok(all)
     }
-    wanted.extend(
-        columns
-            .doubtful_weight
-            .iter()
-            .chain(&columns.steps)
-            .cloned(),
-    );
-    wanted
-}
-
-/// Places of the columns of an expression, plainly and under each shear, if they are there; the name of a column that is not.
-fn expression_places<'e>(
-    expression: Option<&'e Expression>,
-    preset: Preset,
-    by_versions: bool,
-    place_of: &mut impl FnMut(&str) -> Option<usize>,
-) -> Result<Vec<Option<Vec<usize>>>, &'e str> {
-    let Some(expression) = expression else {
-        return Ok(vec![Some(Vec::new()); COUNT]);
-    };
-    let mut own = Vec::new();
-    for name in expression.columns() {
-        // Versions of shearq have noise that other columns do not have.
-        let plain = format!("{name}_noshear");
-        let [first, second] = match preset {
-            Preset::Versions => [plain.as_str(), name],
-            _ => [name, plain.as_str()],
-        };
-        let found = place_of(first).or_else(|| place_of(second));
-        own.push(found.ok_or(name)?);
-    }
-    let mut all = vec![Some(own)];
-    for (version, _) in VERSIONS {
-        // A column without versions is the same in all, if there are versions of another one.
-        let mut sheared = |name: &str| {
-            let own = place_of(&format!("{}_{version}", base(name)));
-            own.or_else(|| place_of(name).filter(|_| by_versions))
-        };
-        all.push(expression.columns().map(&mut sheared).collect());
-    }
-    Ok(all)
 }
 
 fn source(
@@ -456,160 +520,101 @@ fn source(
     names: &[String],
     reading: &Reading,
 ) -> Result<Source, FileError> {
-    let mut columns = Columns::find(&place.path, names, &reading.names)?;
+    let path = &place.path;
+    let mut columns = Columns::find(path, names, &reading.names)?;
     if matches!(reading.truth, Truth::Columns) && !columns.have(&[Role::G1]) {
-        reading.names.check_true_shear(&place.path)?;
+        reading.names.check_true_shear(path)?;
     }
     let has_versions = |name: &str| names.contains(&format!("{}_1p", base(name)));
-    let expressions = [&reading.select, &reading.binned].into_iter().flatten();
-    let mut named = expressions.clone().flat_map(Expression::columns);
-    refuse_texts(&place.path, expressions.clone())?;
+    let mut named = reading.expressions().flat_map(Expression::columns);
     // Also if one of them is named.
-    let by_versions = named
-        .clone()
-        .any(|name| has_versions(name) || version_of(name).is_some());
+    let by_versions = (named.clone()).any(|name| has_versions(name) || version_of(name).is_some());
     columns.choose_versions(names, by_versions && reading.selection.is_none());
     if columns.preset == Preset::Versions {
-        check_named(&place.path, named.clone(), has_versions)?;
+        check_named(path, named.clone(), has_versions)?;
     }
-    if columns.have(&[Role::E1p]) && named.any(has_versions) {
-        check_step(&place.path, reading.step)?;
+    if columns.of_sheared((Role::E1, 1)).is_some() && named.any(has_versions) {
+        check_step(path, reading.step)?;
     }
-    let mut wanted = wanted_columns(&columns, reading);
-    let sheared = Sheared {
+    let mut wanted = Wanted {
+        path,
         names,
         columns: &columns,
+        all: Vec::new(),
     };
-    let flags: Vec<&str> = columns.flags.iter().map(String::as_str).collect();
-    let cuts = flags.iter().any(|name| sheared.is_cut(name));
-    let sheared_weight = columns
-        .of(Role::Weight)
-        .filter(|name| sheared.has_all(name));
-    let by_versions = by_versions || cuts || sheared_weight.is_some();
+    let Placed {
+        places,
+        sheared_flags,
+        sheared_weight,
+    } = wanted.places(reading, by_versions)?;
+    let doubtful_weight = columns.doubtful_weight.as_ref();
+    let doubtful_weight = doubtful_weight.and_then(|name| wanted.add(name, None));
+    for name in &columns.steps {
+        wanted.require(name)?;
+    }
     let unanswered = unanswered(reading, &columns, has_versions);
-    let mut place_of = |name: &str| -> Option<usize> {
-        if !names.iter().any(|own| own == name) {
-            return None;
-        }
-        let known = wanted.iter().position(|own| own == name);
-        Some(known.unwrap_or_else(|| {
-            wanted.push(name.to_owned());
-            wanted.len() - 1
-        }))
-    };
-    let mut places = |expression: &Option<Expression>| {
-        expression_places(
-            expression.as_ref(),
-            columns.preset,
-            by_versions,
-            &mut place_of,
-        )
-        .map_err(|name| FileError::no_column(&place.path, name, names))
-    };
-    let (selected, binned) = (places(&reading.select)?, places(&reading.binned)?);
-    let known = selected.iter().chain(&binned).all(Option::is_some);
-    let mut certain = |name: &str| place_of(name).unwrap_or_default();
-    let flag_places = flags.iter().map(|name| certain(name)).collect();
-    let flag_versions = (cuts && known).then(|| {
-        VERSIONS.map(|(version, _)| {
-            let of = |name: &&str| certain(&sheared.of_flag(name, version));
-            flags.iter().map(of).collect()
-        })
-    });
-    let weight_versions = sheared_weight.filter(|_| known).map(|name| {
-        VERSIONS.map(|(version, _)| certain(&sheared.of(name, version).unwrap_or_default()))
-    });
-    let failed_versions = sheared.failures().map(|name| certain(name)).collect();
-    let chosen: Vec<&str> = expressions.flat_map(Expression::columns).collect();
-    let choices = columns.choices.iter();
-    let choices = choices.filter(|(name, _)| !chosen.contains(&name.as_str()));
-    let choices = choices.map(|(name, good)| (certain(name), *good)).collect();
-    if reading.selection.is_some() {
-        require_responses(&place.path, names.iter().map(String::as_str))?;
-        for name in READ.iter().chain(&Observables::COLUMNS) {
-            place_of(name).ok_or_else(|| FileError::no_column(&place.path, name, names))?;
+    let mut failed_versions = Vec::new();
+    for name in names.iter().filter(|_| columns.preset == Preset::Metacal) {
+        let small = name.to_ascii_lowercase();
+        let is_flag = small.contains("flag") && !small.contains("select");
+        if is_flag && version_of(&small).is_some() {
+            failed_versions.push(wanted.require(name)?);
         }
     }
-    let like_unit = |name: &&String| UNITS.contains(&name.to_ascii_lowercase().as_str());
-    let mut source = Source {
+    let mut choices = Vec::new();
+    for (name, good) in &columns.choices {
+        if !reading
+            .expressions()
+            .flat_map(Expression::columns)
+            .any(|own| own == name)
+        {
+            choices.push((wanted.require(name)?, *good));
+        }
+    }
+    if reading.selection.is_some() {
+        require_responses(path, names.iter().map(String::as_str))?;
+        for name in READ.iter().chain(&Observables::COLUMNS) {
+            wanted.require(name)?;
+        }
+    }
+    let like_unit = |name: &&String| fits_any(UNITS, &name.to_ascii_lowercase());
+    let unit_column = names.iter().find(like_unit).cloned();
+    let unit = match &reading.unit {
+        Some(name) => Some(name.as_str()).filter(|name| !name.is_empty()),
+        None => columns.of(Role::Unit),
+    };
+    if let Some(unit) = unit {
+        wanted.require(unit)?;
+    }
+    let wanted = wanted.all;
+    Ok(Source {
         place,
         frame: None,
         version,
-        unit_column: names.iter().find(like_unit).cloned(),
         columns,
-        wanted: Vec::new(),
-        selected,
-        binned,
+        unit_column,
+        wanted,
+        places,
         unanswered,
-        flags: flag_places,
-        flag_versions,
-        weight_versions,
+        sheared_flags,
+        sheared_weight,
         failed_versions,
+        doubtful_weight,
         choices,
-    };
-    if let Some(unit) = source.unit(reading) {
-        if !names.iter().any(|own| own == unit) {
-            return Err(FileError::no_column(&source.place.path, unit, names));
-        }
-        if !wanted.iter().any(|own| own == unit) {
-            wanted.push(unit.to_owned());
-        }
-    }
-    source.wanted = wanted;
-    Ok(source)
-}
-
-fn refuse_texts<'a>(
-    path: &Path,
-    expressions: impl Iterator<Item = &'a Expression>,
-) -> Result<(), FileError> {
-    let mut operands = expressions.flat_map(Expression::operands);
-    match operands.find(|own| own.pattern.is_some()) {
-        None => Ok(()),
-        Some(Operand { column, .. }) => Err(FileError::new(
-            path,
-            format!("column `{column}` cannot be compared with a text (expected a number)"),
-        )),
-    }
-}
-
-/// Whether the column of a role is not needed.
-fn is_skipped(role: Role, reading: &Reading) -> bool {
-    match role {
-        Role::G1 | Role::G2 => !matches!(reading.truth, Truth::Columns),
-        Role::X | Role::Y => !matches!(reading.truth, Truth::Positions(_) | Truth::Data(_)),
-        _ => false,
-    }
+    })
 }
 
 /// Whether shear does not change a column, judged by its role and name.
 fn is_fixed(name: &str, columns: &Columns) -> bool {
     use Role::{Flag, G1, G2, Id, Psf1, Psf2, PsfSize, Unit, X, Y};
     let roles = [G1, G2, Id, Psf1, Psf2, PsfSize, Unit, X, Y, Flag];
-    let by_role = roles.iter().any(|role| columns.of(*role) == Some(name));
-    let name = name.to_ascii_lowercase();
-    let parts = [
-        "psf", "tile", "field", "patch", "seed", "true", "truth", "image", "ccd", "exp", "airmass",
-        "seeing", "depth", "zbin", "z_bin", "primary", "inner",
-    ];
-    by_role
-        || columns
-            .flags
-            .iter()
-            .any(|flag| flag.eq_ignore_ascii_case(&name))
-        || parts.iter().any(|part| name.contains(part))
-        || [
-            "ra", "dec", "x", "y", "z", "number", "row", "alpha", "delta", "set",
-        ]
-        .contains(&name.as_str())
+    let mut flags = columns.flags.iter();
+    roles.iter().any(|role| columns.of(*role) == Some(name))
+        || flags.any(|flag| flag.eq_ignore_ascii_case(name))
+        || fits_any(FIXED, &name.to_ascii_lowercase())
 }
 
-/// The name of a column without the name of the unsheared version.
-fn base(name: &str) -> &str {
-    name.strip_suffix("_noshear").unwrap_or(name)
-}
-
-/// The name of a column of one sheared version, without the name of the version.
+/// The name of a column of one sheared catalogue, without the name of the shear.
 fn version_of(name: &str) -> Option<&str> {
     let mut versions = VERSIONS.iter();
     versions.find_map(|(version, _)| name.strip_suffix(version)?.strip_suffix('_'))
@@ -692,7 +697,7 @@ pub(super) fn rows(
         };
     }
     // Rows of each version so far.
-    let mut counts = [0u64; COUNT];
+    let mut counts = [0u64; CATALOGUES];
     let mut shared = Shared::default();
     for source in sources {
         let (mut first, mut ranges) = (0, None::<Ranges>);
@@ -758,7 +763,7 @@ impl Shared {
         let stride = part.rows.div_ceil(SEARCHED).max(1);
         let mut seen = HashSet::new();
         for at in (0..part.rows).step_by(stride) {
-            let e = part.pair(part.places.e, at);
+            let e = part.pair(part.e, at);
             if e.iter().all(|e| e.is_finite()) && !seen.insert(Self::key(e)) {
                 self.ellipticities.entry(Self::key(e)).or_default();
             }
@@ -768,25 +773,21 @@ impl Shared {
     }
 
     fn look_in_columns(&mut self, part: &Part<'_>, stride: usize) {
-        let places = &part.places;
         if self.columns.is_empty() {
             let own = [Preset::Shearq, Preset::Versions].contains(&part.source.columns.preset);
-            let measured = [
-                Some(places.e).filter(|_| places.ksb.is_none()),
-                places.response,
-            ];
-            let sheared = [places.sheared, places.other_sheared]
-                .into_iter()
-                .flatten()
-                .flatten();
-            let measured = measured.into_iter().flatten().chain(sheared);
-            let no_rms = part.shapes == Shapes::Responsivity && places.rms_e.is_none();
-            let sigma = places.sigma_e.filter(|_| no_rms);
+            let places = &part.source.places[0];
+            let ksb = places.pair(KSB).is_some();
+            let measured = [Some(part.e).filter(|_| !ksb), places.pair(RESPONSE)];
+            let sheared = [part.sheared(OWN), part.sheared(OTHER)];
+            let measured = measured.into_iter().flatten();
+            let measured = measured.chain(sheared.into_iter().flatten().flatten());
+            let no_rms = part.shapes == Shapes::Responsivity && places.of(Role::RmsE).is_none();
+            let sigma = places.of(Role::SigmaE).filter(|_| no_rms);
             let measured = measured
                 .flatten()
                 .chain(sigma)
                 .map(|column| (column, false));
-            let derivatives = places.derivative.into_iter().flatten();
+            let derivatives = places.pair(DERIVATIVE).into_iter().flatten();
             let all = measured.chain(derivatives.map(|column| (column, true)));
             self.columns = all
                 .filter(|_| !own)
@@ -833,9 +834,9 @@ impl Shared {
         let Some((rows, (column, good))) = found.next() else {
             return Ok(());
         };
-        let name = &source.wanted[*column];
+        let name = source.name(*column);
         let choice = match good {
-            true => name.clone(),
+            true => name.to_owned(),
             false => format!("not({name})"),
         };
         Err(FileError::new(
@@ -853,9 +854,7 @@ impl Shared {
     }
 
     fn add(&mut self, part: &Part<'_>, at: usize) {
-        let Places {
-            e, response, psf, ..
-        } = part.places;
+        let places = &part.source.places[0];
         self.used += 1;
         let choices = &part.source.choices;
         self.excluded.resize(choices.len(), 0);
@@ -872,10 +871,12 @@ impl Shared {
         }
         let is_zero =
             |columns: Option<[usize; 2]>| columns.is_some_and(|own| part.pair(own, at) == [0.0; 2]);
-        self.no_response += u64::from(is_zero(response));
-        self.no_psf += u64::from(is_zero(psf));
+        self.no_response += u64::from(is_zero(places.pair(RESPONSE)));
+        self.no_psf += u64::from(is_zero(places.pair(PSF)));
         if !self.ellipticities.is_empty()
-            && let Some(count) = self.ellipticities.get_mut(&Self::key(part.pair(e, at)))
+            && let Some(count) = self
+                .ellipticities
+                .get_mut(&Self::key(part.pair(part.e, at)))
         {
             *count += 1;
         }
@@ -908,11 +909,11 @@ impl Shared {
         };
         let mut found: Vec<Repeated> = all.into_iter().filter_map(repeated).collect();
         for own in &self.columns {
-            let name = &source.wanted[own.column];
-            let known = found.iter().any(|pair| pair.columns.contains(name));
+            let name = source.name(own.column).to_owned();
+            let known = found.iter().any(|pair| pair.columns.contains(&name));
             if let Some((value, rows)) = self.standing_out(own).filter(|_| !known) {
                 found.push(Repeated {
-                    columns: [name.clone(), name.clone()],
+                    columns: [name.clone(), name],
                     values: [value; 2],
                     rows,
                 });
@@ -921,6 +922,21 @@ impl Shared {
         found
     }
 }
+
+const PSF: [Role; 2] = [Role::Psf1, Role::Psf2];
+const RESPONSE: [Role; 2] = [Role::R11, Role::R22];
+const OTHER_RESPONSE: [Role; 2] = [Role::R12, Role::R21];
+const DERIVATIVE: [Role; 2] = [Role::Dw1, Role::Dw2];
+const KSB: [Role; 2] = [Role::KsbE1, Role::KsbE2];
+/// Ellipticities under positive and negative artificial shears of the same component, and of the other one.
+const OWN: [[Key; 2]; 2] = [
+    [(Role::E1, 1), (Role::E1, 2)],
+    [(Role::E2, 3), (Role::E2, 4)],
+];
+const OTHER: [[Key; 2]; 2] = [
+    [(Role::E1, 3), (Role::E1, 4)],
+    [(Role::E2, 1), (Role::E2, 2)],
+];
 
 /// Ranges of the measured quantities of a catalogue.
 #[derive(Clone, Copy, Default)]
@@ -944,8 +960,8 @@ struct Part<'a> {
     columns: Vec<Cow<'a, [f64]>>,
     /// The rows after a selection.
     weighted: Option<Weighted>,
-    /// Places of the columns of roles.
-    places: Places,
+    /// The columns of the ellipticity.
+    e: [usize; 2],
     versions: Option<Vec<Option<usize>>>,
     frame: &'a DataFrame,
     /// Keys of the identifiers of galaxies and of units.
@@ -997,84 +1013,27 @@ impl<'a> OfRows<'a> {
             )
         };
         if let Some(positions) = truth.positions(path)? {
-            let position = places.position;
+            let position = places.pair([Role::X, Role::Y]);
             let position = position.ok_or_else(|| absent("positions", "x=NAME,y=NAME"))?;
             return Ok(OfRows::Positions(positions, position));
         }
         if let Truth::Galaxies(galaxies) = truth {
-            places.id.ok_or_else(|| absent("identifier", "id=NAME"))?;
+            let id = places.of(Role::Id);
+            id.ok_or_else(|| absent("identifier", "id=NAME"))?;
             return Ok(OfRows::Identifiers(galaxies));
         }
-        Ok(match (truth.of_catalogue(path), places.shear) {
-            (Some(shear), _) => OfRows::Constant(shear),
-            (None, Some(columns)) => OfRows::Columns(columns),
-            (None, None) => OfRows::Nowhere,
-        })
+        Ok(
+            match (truth.of_catalogue(path), places.pair([Role::G1, Role::G2])) {
+                (Some(shear), _) => OfRows::Constant(shear),
+                (None, Some(columns)) => OfRows::Columns(columns),
+                (None, None) => OfRows::Nowhere,
+            },
+        )
     }
 
     /// Whether a row may be absent from the truth.
     fn may_lack_rows(self) -> bool {
         matches!(self, OfRows::Identifiers(..) | OfRows::Positions(..))
-    }
-}
-
-/// Place of the column of each role.
-#[derive(Default)]
-struct Places {
-    e: [usize; 2],
-    weight: Option<usize>,
-    response: Option<[usize; 2]>,
-    divisor: Option<[usize; 2]>,
-    derivative: Option<[usize; 2]>,
-    shear: Option<[usize; 2]>,
-    position: Option<[usize; 2]>,
-    psf: Option<[usize; 2]>,
-    psf_size: Option<usize>,
-    id: Option<usize>,
-    sheared: Option<[[usize; 2]; 2]>,
-    /// R12 and R21, and ellipticities under shears of the other component.
-    other_response: Option<[usize; 2]>,
-    other_sheared: Option<[[usize; 2]; 2]>,
-    rms_e: Option<usize>,
-    sigma_e: Option<usize>,
-    /// Shears of rows without a distortion.
-    ksb: Option<[usize; 2]>,
-    doubtful_weight: Option<usize>,
-}
-
-impl Places {
-    fn of(source: &Source) -> Self {
-        let place = |role| {
-            let name = source.columns.of(role)?;
-            source.wanted.iter().position(|own| own == name)
-        };
-        let pair = |a, b| Some([place(a)?, place(b)?]);
-        let sheared = |[one_p, one_m, two_p, two_m]: [Role; 4]| {
-            Some([pair(one_p, one_m)?, pair(two_p, two_m)?])
-        };
-        Places {
-            e: pair(Role::E1, Role::E2).unwrap_or_default(),
-            weight: place(Role::Weight),
-            response: pair(Role::R11, Role::R22),
-            divisor: pair(Role::Divisor1, Role::Divisor2),
-            derivative: pair(Role::Dw1, Role::Dw2),
-            shear: pair(Role::G1, Role::G2),
-            position: pair(Role::X, Role::Y),
-            psf: pair(Role::Psf1, Role::Psf2),
-            psf_size: place(Role::PsfSize),
-            id: place(Role::Id),
-            sheared: sheared(SHEARED[0]),
-            other_response: pair(Role::R12, Role::R21),
-            other_sheared: sheared(SHEARED[1]),
-            rms_e: place(Role::RmsE),
-            sigma_e: place(Role::SigmaE),
-            ksb: pair(Role::KsbE1, Role::KsbE2),
-            doubtful_weight: source
-                .columns
-                .doubtful_weight
-                .as_ref()
-                .and_then(|name| source.wanted.iter().position(|own| own == name)),
-        }
     }
 }
 
@@ -1093,15 +1052,15 @@ impl<'a> Part<'a> {
         catalogue: &Path,
     ) -> Result<Self, FileError> {
         let path = &source.place.path;
-        let places = Places::of(source);
-        let truth = OfRows::new(catalogue, &places, &reading.truth)?;
+        let places = &source.places[0];
+        let truth = OfRows::new(catalogue, places, &reading.truth)?;
         let version = source.columns.of(Role::Version);
-        let texts = source.texts(reading);
         let mut columns = Vec::new();
-        for name in &source.wanted {
-            columns.push(match texts.contains(&name.as_str()) {
-                true => Cow::Borrowed(&[][..]),
-                false => table::numbers(frame, name, path)?,
+        for Operand { column, pattern } in &source.wanted {
+            columns.push(match pattern {
+                Some(pattern) => Cow::Owned(compared(frame, column, pattern, path)?),
+                None if source.is_text(reading, column) => Cow::Borrowed(&[][..]),
+                None => table::numbers(frame, column, path)?,
             });
         }
         check_steps(frame, &source.columns, path)?;
@@ -1122,7 +1081,7 @@ impl<'a> Part<'a> {
             reading,
             rows: frame.height(),
             columns,
-            places,
+            e: places.pair([Role::E1, Role::E2]).unwrap_or_default(),
             versions,
             frame,
             ids,
@@ -1132,13 +1091,24 @@ impl<'a> Part<'a> {
         })
     }
 
+    fn places(&self) -> &Places {
+        &self.source.places[0]
+    }
+
+    /// The columns of ellipticities under artificial shears, if all are there.
+    fn sheared(&self, keys: [[Key; 2]; 2]) -> Option<[[usize; 2]; 2]> {
+        let place = |(role, catalogue): Key| self.source.places[catalogue].of(role);
+        let pair = |[plus, minus]: [Key; 2]| Some([place(plus)?, place(minus)?]);
+        Some([pair(keys[0])?, pair(keys[1])?])
+    }
+
     fn value(&self, column: usize, at: usize) -> f64 {
         self.columns[column][at]
     }
 
     /// The ranges of the quantities in these rows.
     fn ranges(&self) -> Ranges {
-        let places = &self.places;
+        let places = self.places();
         let of = |columns: &[usize]| {
             let stride = (columns.len() * self.rows).div_ceil(SAMPLED).max(1);
             let values = columns
@@ -1151,98 +1121,90 @@ impl<'a> Part<'a> {
             None => MeasuredRange::ELLIPTICITY,
         };
         // Ellipticities with a response may have any unit.
+        let response = places.pair(RESPONSE);
         let any_unit =
-            places.response.is_some() || places.sheared.is_some() || self.source.has_version_rows();
+            response.is_some() || self.sheared(OWN).is_some() || self.source.has_version_rows();
         Ranges {
-            e: pair(Some(places.e).filter(|_| any_unit)),
-            response: pair(places.response),
-            derivative: pair(places.derivative),
-            psf_size: pair(places.psf_size.map(|size| [size; 2])),
+            e: pair(Some(self.e).filter(|_| any_unit)),
+            response: pair(response),
+            derivative: pair(places.pair(DERIVATIVE)),
+            psf_size: pair(places.of(Role::PsfSize).map(|size| [size; 2])),
         }
     }
 
     /// The columns of the ellipticity of a row. GalSim's HSM writes −10 into those that its method does not determine.
     fn shape_columns(&self, at: usize) -> [usize; 2] {
-        match (self.places.ksb, self.pair(self.places.e, at)) {
+        match (self.places().pair(KSB), self.pair(self.e, at)) {
             (Some(ksb), [-10.0, -10.0]) => ksb,
-            _ => self.places.e,
+            _ => self.e,
         }
     }
 
     /// A number of a row that stands for a failed measurement: its column and what was expected.
     fn failure(&self, at: usize) -> Option<(usize, &'static str)> {
-        let (places, ranges) = (&self.places, &self.ranges);
+        let (places, ranges) = (self.places(), &self.ranges);
+        let value = |column: usize| self.value(column, at);
         let outside = |columns: Option<[usize; 2]>, range: MeasuredRange| {
             let mut columns = columns.into_iter().flatten();
-            columns.find(|column| range.excludes(self.value(*column, at)))
+            columns.find(|column| range.excludes(value(*column)))
         };
-        let e = || {
-            let sheared = [places.sheared, places.other_sheared];
-            let mut all = std::iter::once(self.shape_columns(at))
-                .chain(sheared.into_iter().flatten().flatten());
-            all.find_map(|columns| outside(Some(columns), ranges.e))
-        };
-        let no_psf = || {
-            let mut columns = places.psf.into_iter().flatten();
-            columns.find(|column| self.value(*column, at).abs() >= 1.0)
-        };
-        let no_size = || {
-            let size = places.psf_size?;
-            let value = self.value(size, at);
-            (value <= 0.0 || ranges.psf_size.excludes(value)).then_some(size)
-        };
-        let named = |found: Option<usize>, what| found.map(|column| (column, what));
-        let noise = |place: Option<usize>, most_wrong: f64| {
-            let place = place.filter(|_| self.shapes == Shapes::Responsivity)?;
-            let value = self.value(place, at);
-            let wrong = value <= most_wrong || MeasuredRange::ELLIPTICITY.excludes(value);
-            wrong.then_some(place)
-        };
+        let sheared = [self.sheared(OWN), self.sheared(OTHER)];
+        let mut shapes =
+            std::iter::once(self.shape_columns(at)).chain(sheared.into_iter().flatten().flatten());
         // Distortions are below 1 and so is their scatter. Without noise, sigma is zero.
-        let rms = noise(places.rms_e, 0.0).or_else(|| {
-            places
-                .rms_e
-                .filter(|_| self.shapes == Shapes::Responsivity)
-                .filter(|rms| self.value(*rms, at) > 1.0)
-        });
-        let sigma = noise(
-            places.sigma_e.filter(|_| places.rms_e.is_none()),
-            -f64::MIN_POSITIVE,
-        );
-        let failed_version = || {
-            let mut flags = self.source.failed_versions.iter().copied();
-            flags.find(|flag| self.value(*flag, at) != 0.0)
-        };
-        let version_weight = || {
-            let mut weights = self.source.weight_versions.into_iter().flatten();
-            weights.find(|weight| {
-                let weight = self.value(*weight, at);
-                weight.is_nan() || weight >= HUGE
-            })
-        };
-        named(e(), "an ellipticity")
-            .or_else(|| named(rms, "a standard deviation, above 0 and at most 1"))
-            .or_else(|| named(sigma, "a standard deviation of noise"))
-            .or_else(|| named(failed_version(), "0, as for a version that was measured"))
-            .or_else(|| named(version_weight(), "a weight"))
-            .or_else(|| named(outside(places.response, ranges.response), "a response"))
+        let responsivity = self.shapes == Shapes::Responsivity;
+        let rms = places.of(Role::RmsE).filter(|_| responsivity);
+        let sigma = places
+            .of(Role::SigmaE)
+            .filter(|_| responsivity && rms.is_none());
+        let wrong = |value: f64| MeasuredRange::ELLIPTICITY.excludes(value);
+        let failed_rms =
+            |rms: &usize| value(*rms) <= 0.0 || value(*rms) > 1.0 || wrong(value(*rms));
+        let failed_sigma = |sigma: &usize| value(*sigma) < 0.0 || wrong(value(*sigma));
+        let sheared_weights = (self.source.places[1..].iter())
+            .filter_map(|own| own.of(Role::Weight).filter(|_| self.source.sheared_weight));
+        let size = places.of(Role::PsfSize);
+        let found = shapes
+            .find_map(|columns| outside(Some(columns), ranges.e))
+            .map(|column| (column, "an ellipticity"));
+        found
             .or_else(|| {
-                named(
-                    outside(places.other_response, ranges.response),
-                    "a response",
-                )
+                let expected = "a standard deviation, above 0 and at most 1";
+                Some((rms.filter(failed_rms)?, expected))
+            })
+            .or_else(|| Some((sigma.filter(failed_sigma)?, "a standard deviation of noise")))
+            .or_else(|| {
+                let mut flags = self.source.failed_versions.iter().copied();
+                let failed = flags.find(|flag| value(*flag) != 0.0)?;
+                Some((failed, "0, as for a version that was measured"))
             })
             .or_else(|| {
-                named(
-                    outside(places.derivative, ranges.derivative),
-                    "a derivative",
-                )
+                let mut weights = sheared_weights;
+                let is_none = |own: &usize| value(*own).is_nan() || value(*own) >= HUGE;
+                Some((weights.find(is_none)?, "a weight"))
             })
-            .or_else(|| named(no_psf(), "an ellipticity of a PSF, below 1"))
-            .or_else(|| named(no_size(), "a size of a PSF, above 0"))
             .or_else(|| {
-                let huge = |weight: &usize| self.value(*weight, at) >= HUGE;
-                named(places.weight.filter(huge), "a weight")
+                let own = outside(places.pair(RESPONSE), ranges.response);
+                let other = || outside(places.pair(OTHER_RESPONSE), ranges.response);
+                Some((own.or_else(other)?, "a response"))
+            })
+            .or_else(|| {
+                let found = outside(places.pair(DERIVATIVE), ranges.derivative);
+                Some((found?, "a derivative"))
+            })
+            .or_else(|| {
+                let mut psf = places.pair(PSF).into_iter().flatten();
+                let round = psf.find(|column| value(*column).abs() >= 1.0);
+                Some((round?, "an ellipticity of a PSF, below 1"))
+            })
+            .or_else(|| {
+                let failed =
+                    |own: &usize| value(*own) <= 0.0 || ranges.psf_size.excludes(value(*own));
+                Some((size.filter(failed)?, "a size of a PSF, above 0"))
+            })
+            .or_else(|| {
+                let weight = places.of(Role::Weight);
+                Some((weight.filter(|own| value(*own) >= HUGE)?, "a weight"))
             })
     }
 
@@ -1252,8 +1214,8 @@ impl<'a> Part<'a> {
 
     /// A column that looks like a weight, is not used, and would leave out this row.
     fn unused_weight(&self, at: usize) -> Option<(&str, f64)> {
-        let value = self.value(self.places.doubtful_weight?, at);
-        let name = self.source.columns.doubtful_weight.as_deref()?;
+        let place = self.source.doubtful_weight?;
+        let (name, value) = (self.source.name(place), self.value(place, at));
         (value.is_nan() || value <= 0.0).then_some((name, value))
     }
 
@@ -1264,13 +1226,13 @@ impl<'a> Part<'a> {
         weight: f64,
         binned: f64,
     ) -> Result<Result<Row, LeftOut>, String> {
-        let places = &self.places;
+        let places = self.places();
         if let Some((column, expected)) = self.failure(at) {
             if self.reading.drop_missing {
                 return Ok(Err(LeftOut::Failed));
             }
-            let [p1, p2] = places.psf.unwrap_or([usize::MAX; 2]);
-            let of_psf = [Some(p1), Some(p2), places.psf_size].contains(&Some(column));
+            let of_psf = [Role::Psf1, Role::Psf2, Role::PsfSize].map(|role| places.of(role));
+            let of_psf = of_psf.contains(&Some(column));
             let all_equal = || {
                 let value = self.value(column, at);
                 self.columns[column].iter().all(|other| *other == value)
@@ -1281,15 +1243,17 @@ impl<'a> Part<'a> {
             };
             return Err(format!(
                 "column `{}` is {} in a row without a flag, which stands for a failed measurement (expected {expected}). Try: {remedy}",
-                self.source.wanted[column],
+                self.source.name(column),
                 shown(self.value(column, at))
             ));
         }
         let Some(Shape { e, slope, cross }) = self.shape(at, weight) else {
             return Ok(Err(LeftOut::AboveOne));
         };
-        let psf = places.psf.map_or([0.0; 2], |psf| self.pair(psf, at));
-        let psf_size = places.psf_size.map_or(1.0, |size| self.value(size, at));
+        let psf = places.pair(PSF).map_or([0.0; 2], |psf| self.pair(psf, at));
+        let psf_size = places
+            .of(Role::PsfSize)
+            .map_or(1.0, |size| self.value(size, at));
         let expression = if binned.is_nan() { f64::NAN } else { 0.0 };
         let checked = [
             ("e1", e[0]),
@@ -1319,26 +1283,26 @@ impl<'a> Part<'a> {
         }
     }
 
-    /// Weights of a row in the versions, and which of them it belongs to: a version may choose a row that is left out without
-    /// shear.
+    /// Weights of a row in the sheared catalogues, and which of them it belongs to: one may choose a row that is left out
+    /// without shear.
     fn versions_of(
         &self,
         at: usize,
-        flagged: bool,
         weight: f64,
-    ) -> (Option<[f64; VERSIONS.len()]>, [bool; VERSIONS.len()]) {
-        let source = self.source;
-        let is_set = |flags: &[usize]| flags.iter().any(|flag| self.value(*flag, at) != 0.0);
-        let weights = source.weight_versions;
-        let weights = weights.map(|own| own.map(|place| self.value(place, at)));
-        let counts = std::array::from_fn(|version| {
-            let flagged = match &source.flag_versions {
-                Some(flags) => is_set(&flags[version]),
-                None => flagged,
+    ) -> ([f64; VERSIONS.len()], [bool; VERSIONS.len()]) {
+        let all = std::array::from_fn(|version| {
+            let own = &self.source.places[version + 1];
+            let weight = match own.of(Role::Weight).filter(|_| self.source.sheared_weight) {
+                Some(place) => self.value(place, at),
+                None => weight,
             };
-            !flagged && weighs(weights.map_or(weight, |own| own[version]))
+            (weight, !self.is_flagged(own, at) && weighs(weight))
         });
-        (weights, counts)
+        (all.map(|own| own.0), all.map(|own| own.1))
+    }
+
+    fn is_flagged(&self, places: &Places, at: usize) -> bool {
+        places.flags.iter().any(|flag| self.value(*flag, at) != 0.0)
     }
 
     /// Gives a row to `take` if it counts. `number` counts rows of the table from 0.
@@ -1346,11 +1310,11 @@ impl<'a> Part<'a> {
         &self,
         at: usize,
         number: usize,
-        counts: &mut [u64; COUNT],
+        counts: &mut [u64; CATALOGUES],
         about: &mut Catalogue,
         take: &mut impl FnMut(&Item) -> Result<(), FileError>,
     ) -> Result<(), FileError> {
-        let places = &self.places;
+        let places = self.places();
         let version = match (&self.versions, self.source.version) {
             (Some(versions), _) => versions[at],
             (None, version) => version.flatten(),
@@ -1359,11 +1323,12 @@ impl<'a> Part<'a> {
         let index = *count;
         *count += 1;
         let own = version.is_none();
-        let source = self.source;
-        let flagged = (source.flags.iter()).any(|flag| self.value(*flag, at) != 0.0);
-        let weight = places.weight.map_or(1.0, |weight| self.value(weight, at));
+        let flagged = self.is_flagged(places, at);
+        let weight = places
+            .of(Role::Weight)
+            .map_or(1.0, |weight| self.value(weight, at));
         let counted = !flagged && weighs(weight);
-        let (of_versions, in_versions) = self.versions_of(at, flagged, weight);
+        let (of_versions, in_versions) = self.versions_of(at, weight);
         if !counted {
             let count = match flagged {
                 true => &mut about.flagged,
@@ -1433,7 +1398,10 @@ impl<'a> Part<'a> {
         take(&Item {
             key: self.key(at, index),
             version,
-            weights: of_versions.unwrap_or([row.weight; VERSIONS.len()]),
+            weights: match self.source.sheared_weight {
+                true => of_versions,
+                false => [row.weight; VERSIONS.len()],
+            },
             row,
             binned,
         })
@@ -1441,7 +1409,7 @@ impl<'a> Part<'a> {
 
     /// The ellipticity, and the derivatives of the weighted ellipticity with shear.
     fn shape(&self, at: usize, weight: f64) -> Option<Shape> {
-        let places = &self.places;
+        let places = self.places();
         if let Some(weighted) = &self.weighted {
             // Both are of the weighted ellipticity.
             return Some(Shape {
@@ -1452,7 +1420,7 @@ impl<'a> Part<'a> {
         }
         let columns = self.shape_columns(at);
         let mut e = self.pair(columns, at);
-        match if columns == places.e {
+        match if columns == self.e {
             self.shapes
         } else {
             Shapes::Shear
@@ -1464,7 +1432,7 @@ impl<'a> Part<'a> {
             Shapes::Shear | Shapes::Converted => {}
             Shapes::Responsivity => {
                 let value = |place: Option<usize>| place.map(|place| self.value(place, at));
-                let square = match (value(places.rms_e), value(places.sigma_e)) {
+                let square = match (value(places.of(Role::RmsE)), value(places.of(Role::SigmaE))) {
                     (Some(rms), _) => rms * rms,
                     (None, sigma) => {
                         0.5 * (e[0] * e[0] + e[1] * e[1]) - sigma.map_or(0.0, |sigma| sigma * sigma)
@@ -1497,19 +1465,25 @@ impl<'a> Part<'a> {
                 ratio => ratio,
             })
         };
-        let response = match (places.sheared, places.response, places.divisor) {
-            (Some(sheared), ..) => differences(sheared),
-            (None, Some(response), Some(divisor)) => divided(response, divisor, 1.0),
-            (None, Some(response), None) => self.pair(response, at),
-            (None, None, _) => [1.0; 2],
+        let divisor = places.pair([Role::Divisor1, Role::Divisor2]);
+        let of = |columns: Option<[usize; 2]>, without: f64| match (columns, divisor) {
+            (None, _) => [without; 2],
+            (Some(response), Some(divisor)) => divided(response, divisor, without),
+            (Some(response), None) => self.pair(response, at),
         };
-        let other = match (places.sheared, places.other_response, places.divisor) {
-            (Some(_), ..) => places.other_sheared.map_or([0.0; 2], differences),
-            (None, Some(response), Some(divisor)) => divided(response, divisor, 0.0),
-            (None, Some(response), None) => self.pair(response, at),
-            (None, None, _) => [0.0; 2],
+        let (response, other) = match self.sheared(OWN) {
+            Some(own) => (
+                differences(own),
+                self.sheared(OTHER).map_or([0.0; 2], differences),
+            ),
+            None => (
+                of(places.pair(RESPONSE), 1.0),
+                of(places.pair(OTHER_RESPONSE), 0.0),
+            ),
         };
-        let derivative = places.derivative.map_or([0.0; 2], |d| self.pair(d, at));
+        let derivative = places
+            .pair(DERIVATIVE)
+            .map_or([0.0; 2], |d| self.pair(d, at));
         Some(Shape {
             e,
             slope: [0, 1].map(|k| weight * response[k] + e[k] * derivative[k]),
@@ -1519,9 +1493,9 @@ impl<'a> Part<'a> {
 
     /// The binned quantity in the row, and under each version. Infinity if the row is not selected; NaN if a number is
     /// missing.
-    fn binned(&self, at: usize) -> [f64; COUNT] {
+    fn binned(&self, at: usize) -> [f64; CATALOGUES] {
         if self.reading.select.is_none() && self.reading.binned.is_none() {
-            return [0.0; COUNT];
+            return [0.0; CATALOGUES];
         }
         let of = |expression: &Option<Expression>, places: &Option<Vec<usize>>, without: f64| match (
             expression, places,
@@ -1531,11 +1505,12 @@ impl<'a> Part<'a> {
             (Some(_), None) => f64::INFINITY,
         };
         std::array::from_fn(|version| {
-            let selected = of(&self.reading.select, &self.source.selected[version], 1.0);
+            let places = &self.source.places[version];
+            let selected = of(&self.reading.select, &places.select, 1.0);
             if selected == 0.0 || selected.is_infinite() {
                 return f64::INFINITY;
             }
-            let binned = of(&self.reading.binned, &self.source.binned[version], 0.0);
+            let binned = of(&self.reading.binned, &places.binned, 0.0);
             if selected.is_nan() { f64::NAN } else { binned }
         })
     }
@@ -1565,6 +1540,28 @@ impl<'a> Part<'a> {
             _ => index >> u32::from(self.reading.neighbours),
         }
     }
+}
+
+/// Whether a text column has a pattern, as 1 and 0.
+fn compared(
+    frame: &DataFrame,
+    name: &str,
+    pattern: &str,
+    path: &Path,
+) -> Result<Vec<f64>, FileError> {
+    let texts = frame.column(name).ok().and_then(|column| column.str().ok());
+    let Some(texts) = texts else {
+        return Err(FileError::new(
+            path,
+            format!(
+                "column `{name}` contains no texts (found a comparison with '{pattern}', expected a number)"
+            ),
+        ));
+    };
+    let compared = texts
+        .iter()
+        .map(|text| f64::from(u8::from(fits(pattern, text.unwrap_or_default()))));
+    Ok(compared.collect())
 }
 
 /// The version of a name, `None` for that without shear: `ns` in metadetection of LSST, `00` in TXPipe.
@@ -1603,7 +1600,7 @@ fn recognised_cuts<'a>(
     source: &'a Source,
     reading: &Reading,
 ) -> impl Iterator<Item = &'a String> + use<'a> {
-    let given = reading.names.is_given("flag");
+    let given = reading.names.is_given(Role::Flag);
     let flags = source.columns.flags.iter().filter(move |_| !given);
     flags.filter(|name| name.to_ascii_lowercase().contains("select"))
 }

@@ -87,7 +87,7 @@ impl Truth {
         let unclear = Some(TrueSign::OfCatalogues(path.to_owned()));
         let shears = named("g1").zip(named("g2"));
         let positions = named("x").zip(named("y"));
-        let other = || names_of_role(Role::Id).iter().find_map(|name| named(name));
+        let other = || names_of_role(Role::Id).find_map(named);
         let id = named("id").or_else(|| other().filter(|_| positions.is_none()));
         if let (Some(_), None, Some(_)) = (shears, id, positions) {
             let positions = Positions::read(path, TruthSign::Standard)?;

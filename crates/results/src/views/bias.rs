@@ -1,8 +1,8 @@
 //! Shear bias as tables, plots, verdicts and JUnit.
 
 use shearq_bias::{
-    Catalogue, Design, Estimate, Measured, QUANTITIES, REQUIREMENTS, Repeated, Verdict, student_t,
-    verdict,
+    Catalogue, Design, Estimate, Measured, QUANTITIES, Quantity, REQUIREMENTS, Repeated, Verdict,
+    student_t, verdict,
 };
 use shearq_dataset::truth::Sign;
 use shearq_render::figure::{Band, FigureError, LinePlot, PanelGrid, Series, Style};
@@ -11,7 +11,7 @@ use shearq_render::table::{Cell, Heading, Table};
 
 use super::diagnosis::shown;
 use super::junit::{Case, document};
-use crate::bias::BiasResult;
+use crate::bias::{BiasResult, BinResult};
 
 /// Units above which Student's t differs from a normal distribution by less than 5 %.
 const MANY_UNITS: usize = 30;
@@ -19,66 +19,91 @@ const MANY_UNITS: usize = 30;
 /// Quantities of the narrow table.
 const MAIN: [&str; 4] = ["m1", "m2", "c1", "c2"];
 
+/// A column of the table: its key, heading, whether only the wide table has it, and its cell of a bin.
+type BinColumn = (
+    &'static str,
+    &'static str,
+    bool,
+    fn(&BiasResult, &BinResult) -> Cell,
+);
+
+// The quantities of the estimate follow.
+const COLUMNS: [BinColumn; 6] = [
+    ("bin", "Bin", false, |result, bin| {
+        Cell::text(label(result, bin.edges))
+    }),
+    ("n", "Galaxies", false, |_, bin| {
+        count(bin, |found| found.galaxies as f64)
+    }),
+    ("low", "From", true, |_, bin| {
+        Cell::number(bin.edges.map_or(f64::NAN, |e| e[0]), 4)
+    }),
+    ("high", "To", true, |_, bin| {
+        Cell::number(bin.edges.map_or(f64::NAN, |e| e[1]), 4)
+    }),
+    ("n_effective", "Effective", true, |_, bin| {
+        count(bin, |found| found.effective)
+    }),
+    ("units", "Units", true, |_, bin| {
+        count(bin, |found| found.units as f64)
+    }),
+];
+
+fn count(bin: &BinResult, of: fn(&Estimate) -> f64) -> Cell {
+    Cell::number(bin.estimate.as_ref().map_or(0.0, of), 0)
+}
+
 /// Estimates of all galaxies and of each bin, one row each, with the verdict as notes.
 pub fn bias_table(result: &BiasResult) -> Table {
-    let mut headings = vec![
-        Heading::new("bin", "Bin"),
-        Heading::new("n", "Galaxies"),
-        Heading::new("low", "From").detail(),
-        Heading::new("high", "To").detail(),
-        Heading::new("n_effective", "Effective").detail(),
-        Heading::new("units", "Units").detail(),
-    ];
-    let estimates: Vec<&Estimate> = result
-        .bins
+    let estimates = || {
+        result
+            .bins
+            .iter()
+            .filter_map(|bin| bin.estimate.as_ref().ok())
+    };
+    let known = |key: &str| estimates().any(|found| found.value(key).is_some());
+    let main = MAIN
         .iter()
-        .filter_map(|bin| bin.estimate.as_ref().ok())
-        .collect();
-    let known = |key: &str| estimates.iter().any(|found| found.value(key).is_some());
-    let details = QUANTITIES.iter().map(|quantity| quantity.key);
-    let details = details.filter(|key| !MAIN.contains(key) && known(key));
-    let keys: Vec<&'static str> = MAIN.into_iter().chain(details).collect();
-    for key in &keys {
-        let found = QUANTITIES.iter().find(|quantity| quantity.key == *key);
-        let heading = Heading::new(key, found.map_or(*key, |quantity| quantity.label));
-        let main = MAIN.contains(key) || *key == "alpha";
-        headings.push(if main { heading } else { heading.detail() });
-    }
+        .filter_map(|key| QUANTITIES.iter().find(|own| own.key == *key));
+    let details = QUANTITIES
+        .iter()
+        .filter(|own| !MAIN.contains(&own.key) && known(own.key));
+    let quantities: Vec<&Quantity> = main.chain(details).collect();
+    let heading = |key, label, detail: bool| match Heading::new(key, label) {
+        heading if detail => heading.detail(),
+        heading => heading,
+    };
+    let headings = COLUMNS
+        .iter()
+        .map(|(key, label, detail, _)| heading(key, *label, *detail));
+    let of_quantities = quantities.iter().map(|own| {
+        let detail = !MAIN.contains(&own.key) && own.key != "alpha";
+        heading(own.key, own.label, detail)
+    });
     let mut notes = notes(result);
-    let mut rows = Vec::new();
-    for bin in &result.bins {
-        let label = bin
-            .edges
-            .map_or("all".to_owned(), |edges| label(result, edges));
-        let [low, high] = bin.edges.unwrap_or([f64::NAN; 2]);
-        let found = bin.estimate.as_ref().ok();
+    let rows = result.bins.iter().map(|bin| {
         if let Err(error) = &bin.estimate {
-            notes.push(format!("No estimate of {label}: {error}."));
+            notes.push(format!(
+                "No estimate of {}: {error}.",
+                label(result, bin.edges)
+            ));
         }
-        let count = |of: fn(&Estimate) -> f64| Cell::number(found.map_or(0.0, of), 0);
-        let mut row = vec![
-            Cell::text(label),
-            count(|found| found.galaxies as f64),
-            Cell::number(low, 4),
-            Cell::number(high, 4),
-            count(|found| found.effective),
-            count(|found| found.units as f64),
-        ];
-        row.extend(keys.iter().map(|key| {
-            let value = found.and_then(|found| found.value(key));
-            let unknown = Measured {
-                value: f64::NAN,
-                error: f64::NAN,
-            };
-            let Measured { value, error } = value.unwrap_or(unknown);
+        let cells = COLUMNS.iter().map(|(.., cell)| cell(result, bin));
+        let quantity = |own: &&Quantity| {
+            let found = bin
+                .estimate
+                .as_ref()
+                .ok()
+                .and_then(|found| found.value(own.key));
+            let (value, error) = found.map_or((f64::NAN, f64::NAN), |own| (own.value, own.error));
             Cell::with_error(value, Some(error), 6)
-        }));
-        rows.push(row);
-    }
+        };
+        cells.chain(quantities.iter().map(quantity)).collect()
+    });
     Table {
         title: "Shear bias".into(),
-        headings,
-        rows,
+        headings: headings.chain(of_quantities).collect(),
+        rows: rows.collect(),
         notes,
     }
 }
@@ -115,7 +140,7 @@ pub fn compared_table(first: &BiasResult, second: &BiasResult, difference: &Bias
     let [(_, mut table), _, _] = tables;
     table.notes.push(format!(
         "Difference: {}, with errors from leaving out the same units of both.",
-        difference.program
+        difference.about.program
     ));
     Table {
         headings,
@@ -125,23 +150,26 @@ pub fn compared_table(first: &BiasResult, second: &BiasResult, difference: &Bias
 }
 
 /// A bin in words.
-fn label(result: &BiasResult, [low, high]: [f64; 2]) -> String {
+fn label(result: &BiasResult, edges: Option<[f64; 2]>) -> String {
+    let Some([low, high]) = edges else {
+        return "all".into();
+    };
     // Four significant digits.
     let edge = |edge: f64| {
         let rounded = format!("{edge:.3e}").parse::<f64>();
         rounded.unwrap_or(edge).to_string()
     };
     match (low == f64::MIN, high == f64::MAX) {
-        (true, _) => format!("{} below {}", result.binned, edge(high)),
-        (false, true) => format!("{} from {}", result.binned, edge(low)),
-        _ => format!("{} {} to {}", result.binned, edge(low), edge(high)),
+        (true, _) => format!("{} below {}", result.about.binned, edge(high)),
+        (false, true) => format!("{} from {}", result.about.binned, edge(low)),
+        _ => format!("{} {} to {}", result.about.binned, edge(low), edge(high)),
     }
 }
 
 /// A warning if galaxies were selected or binned by what was measured on them.
 pub fn chosen_by_measurement(result: &BiasResult) -> Option<String> {
-    let column = result.measured.first()?;
-    let remedy = match result.program.starts_with("shearq") {
+    let column = result.about.measured.first()?;
+    let remedy = match result.about.program.starts_with("shearq") {
         true => {
             "--where 'step(snr, THRESHOLD)' for cuts by snr, flux or size, or catalogues with shape.sheared_step".into()
         }
@@ -163,7 +191,7 @@ fn implausible(result: &BiasResult, all: &Estimate) -> Option<String> {
     let large = |m: &Measured| m.value.abs() > IMPLAUSIBLE + CLEAR * m.error;
     let mut found = ["m1", "m2"].into_iter();
     let (name, m) = found.find_map(|name| Some((name, all.value(name).filter(large)?)))?;
-    let divided = match result.has_response_column {
+    let divided = match result.about.response_column {
         true => {
             " Ellipticities that are divided by their response already have a response of one. Try: --columns R11=none,R22=none"
         }
@@ -204,19 +232,20 @@ pub fn of_design(result: &BiasResult) -> Vec<String> {
             alpha.value, alpha.error
         ));
     }
-    let units = match &result.unit_column {
+    let units = match &result.about.unit_column {
         Some(column) => format!("--units {column}"),
         None => "--columns id=NAME with identifiers, or --units COLUMN".into(),
     };
     let shown = |[g1, g2]: [f64; 2]| format!("({g1}, {g2})");
-    if !result.missing.is_empty() {
+    if !result.grouping.missing.is_empty() {
         let missing = result
+            .grouping
             .missing
             .iter()
             .take(MOST_MISSING)
             .map(|missing| format!("g = {} beside {}", shown(missing.shear), missing.beside));
         let missing: Vec<String> = missing.collect();
-        let more = match result.missing.len().saturating_sub(MOST_MISSING) {
+        let more = match result.grouping.missing.len().saturating_sub(MOST_MISSING) {
             0 => String::new(),
             more => format!(", and {more} more"),
         };
@@ -225,18 +254,18 @@ pub fn of_design(result: &BiasResult) -> Vec<String> {
             missing.join(", ")
         ));
     }
-    if let Some((shear, [own, opposite])) = result.unpaired {
+    if let Some((shear, [own, opposite])) = result.grouping.unpaired {
         lines.push(format!(
             "the catalogues of opposite shears do not pair (found {own} with g = {} and {opposite} with minus g, and no names that state which belong together), so that each is a unit. If they contain the same galaxies, the error of m is too large, and that of c too small by up to √2. Try: {units}",
             shown(shear)
         ));
     }
     let wrong = "the error of m is too large, and that of c too small by up to √2";
-    match result.uncorrelated {
+    match result.grouping.uncorrelated {
         Some(correlation) => lines.push(format!(
             "rows of catalogues with opposite shears are different galaxies (their ellipticities correlate by {correlation:.2}). If both catalogues contain the same galaxies in another order, {wrong}. Try: {units}"
         )),
-        None if result.misaligned => lines.push(format!(
+        None if result.grouping.misaligned => lines.push(format!(
             "the catalogues of different shears have different numbers of rows. If their rows do not correspond, {wrong}. Try: {units}"
         )),
         None => {}
@@ -257,20 +286,23 @@ fn notes(result: &BiasResult) -> Vec<String> {
             "Design: {} ({}). Columns: {}.",
             result.design.name(),
             result.design.meaning(),
-            result.program
+            result.about.program
         ),
-        format!("Errors are from {} units: {}.", all.units, result.unit),
+        format!(
+            "Errors are from {} units: {}.",
+            all.units, result.grouping.unit
+        ),
     ];
-    notes.extend(result.columns.iter().cloned());
-    notes.extend(result.sign.and_then(Sign::line));
-    match result.noisy_stars {
+    notes.extend(result.about.columns.iter().cloned());
+    notes.extend(result.about.sign.and_then(Sign::line));
+    match result.grouping.stars.len() {
         0 => {}
         1 => notes.push("They include the noise of a star that several units share.".into()),
         count => notes.push(format!(
             "They include the noise of {count} stars that several units share."
         )),
     }
-    if let Some(selection) = &result.selection {
+    if let Some(selection) = &result.about.selection {
         notes.push(format!("Selection: {selection}."));
     }
     if all.units < MANY_UNITS {
@@ -282,7 +314,7 @@ fn notes(result: &BiasResult) -> Vec<String> {
     }
     notes.extend(implausible(result, all));
     notes.extend(of_design(result).iter().map(|line| sentence(line)));
-    let total = |of: fn(&Catalogue) -> u64| result.catalogues.iter().map(of).sum::<u64>();
+    let total = |of: fn(&Catalogue) -> u64| result.about.catalogues.iter().map(of).sum::<u64>();
     for (count, what) in [
         (total(|c| c.flagged), "with a flag"),
         (total(|c| c.unweighted), "with a weight of zero or less"),
@@ -306,7 +338,7 @@ fn notes(result: &BiasResult) -> Vec<String> {
             "More than half of the rows have a flag, which is not 0. If good rows have it, try: --columns flag=none --where NAME".into(),
         );
     }
-    notes.extend(repeated(&result.catalogues));
+    notes.extend(repeated(&result.about.catalogues));
     notes.extend(chosen_by_measurement(result));
     for (k, assumes) in (1..).zip(all.assumes_no_c) {
         if assumes {
@@ -615,7 +647,7 @@ pub fn bias_plot(result: &BiasResult) -> PanelGrid {
                 'm' => "Multiplicative bias".into(),
                 _ => "Additive bias".into(),
             },
-            x_label: result.binned.clone(),
+            x_label: result.about.binned.clone(),
             x_names: names,
             y_label: of.into(),
             bands: vec![Band {
