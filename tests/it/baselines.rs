@@ -8,7 +8,7 @@ use serde_json::Value;
 use crate::support::{fail, run_simulated, shearq, succeed, text};
 
 #[test]
-fn the_named_submissions_have_not_moved_from_the_projects_baselines() {
+fn named_configurations_keep_their_baselines() {
     let folder = Path::new("submissions/baselines");
     for name in ["named", "linear", "printed"] {
         let output = shearq(&["baseline", "check", name, "--folder", text(folder)]);
@@ -22,7 +22,7 @@ fn the_named_submissions_have_not_moved_from_the_projects_baselines() {
 }
 
 #[test]
-fn a_changed_digit_and_a_changed_setting_are_seen_and_an_update_keeps_the_reason() {
+fn changed_digits_and_settings_of_a_baseline_are_noticed() {
     let root = tempfile::tempdir().unwrap();
     let at = |name: &str| root.path().join(name);
     let own = at("own.toml");
@@ -171,7 +171,7 @@ fn of_two_that_record_one_baseline_one_fails() {
 }
 
 #[test]
-fn settings_of_a_baseline_are_checked_like_those_of_a_submission() {
+fn settings_of_a_baseline_are_checked_like_any_others() {
     let root = tempfile::tempdir().unwrap();
     let at = |name: &str| root.path().join(name);
     let (own, out, folder) = (at("own.toml"), at("out"), at("baselines"));
@@ -310,7 +310,7 @@ fn a_baseline_of_a_data_folder_has_the_images_asked_for() {
 }
 
 #[test]
-fn a_check_reads_the_configuration_file_unless_it_is_to_use_what_is_stored() {
+fn a_check_reads_the_file_unless_it_uses_the_stored_settings() {
     let root = tempfile::tempdir().unwrap();
     let at = |name: &str| root.path().join(name);
     let (own, folder) = (at("own.toml"), at("baselines"));

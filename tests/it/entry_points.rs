@@ -130,228 +130,118 @@ enum Expected {
 
 use Expected::{Refused, Silent, Warning, WhenMeasured};
 
-struct Case {
-    name: &'static str,
-    spoil: fn(&mut Data),
-    expected: Expected,
+/// What is done to the data, its name in the table, and what an entry point must do.
+const CASES: &str = "
+none                | none                             | silent: good data
+sky 0.5             | sky 0.5σ                         | warning: the stamps contain sky
+sky -0.5            | sky −0.5σ                        | warning: the stamps contain sky
+sky 3               | sky 3σ                           | warning: the stamps contain sky
+sky -3              | sky −3σ                          | warning: the stamps contain sky
+sky 100             | sky 100σ                         | warning: the stamps contain sky
+slope 0.01          | sky gradient 0.01 σ/px           | warning: the sky has a gradient
+slope 0.02          | sky gradient 0.02 σ/px           | warning: the sky has a gradient
+slope 0.05          | sky gradient 0.05 σ/px           | warning: the sky has a gradient
+psf background 0.01 | PSF + 1 % of its peak            | warning: the PSF contains a background
+psf scale 0.5       | PSF sampled 0.5 times as finely  | silent: larger galaxies behind this PSF look alike
+psf scale 1.1       | PSF sampled 1.1 times too finely | silent: smaller galaxies behind this PSF look alike (m = +0.13)
+psf scale 1.5       | PSF sampled 1.5 times too finely | measured: the PSF is nearly as broad as the galaxies
+psf scale 2         | PSF sampled 2 times too finely   | refused: the PSF is broader than the galaxies
+psf offset 0.4      | PSF 0.4 px off centre            | silent: half a pixel does not change shapes
+psf offset 1.5      | PSF 1.5 px off centre            | warning: the star is off the centre of its stamp
+psf offset 3        | PSF 3 px off centre              | warning: the star is off the centre of its stamp
+psf snr 20          | PSF noise, S/N 20                | warning: the PSF is noisy
+psf snr 50          | PSF noise, S/N 50                | warning: the PSF is noisy
+psf snr 100         | PSF noise, S/N 100               | warning: the PSF is noisy
+psf pixel           | PSF is a single pixel            | warning: the PSF is narrower than the pixels can show
+psf swap            | PSF with x and y swapped         | silent: a PSF of other ellipticity looks alike
+move 1 1            | galaxies 1 px off centre         | warning: the galaxies are off the centre of their stamps
+move 2 0            | galaxies 2 px off centre         | warning: the galaxies are off the centre of their stamps
+move 0 4            | galaxies 4 px off centre         | warning: the galaxies are off the centre of their stamps
+move 8 0            | galaxies 8 px off centre         | warning: the galaxies are off the centre of their stamps
+scatter             | galaxies scattered by 5 px       | warning: the galaxies are scattered over their stamps
+scale -1            | negative galaxies                | warning: galaxies are darker than their surroundings
+depths              | stamps of two depths             | warning: the noise differs between stamps
+correlated          | noise correlated over 6 px       | warning: the noise is correlated over more than 3 px
+copies 32           | 32 of 576 stamps are copies      | warning: stamps are copies of each other
+copies 576          | all stamps are copies            | warning: stamps are copies of each other
+scale 0             | blank stamps                     | warning: the stamps are blank
+scale 1e20          | pixel values × 1e20              | refused: pixel values are out of range
+scale 1e-22         | pixel values × 1e-22             | refused: pixel values are out of range
+noise 2             | stated noise twice too large     | measured: disagrees with the ";
+
+/// The lines of `CASES`.
+fn cases() -> impl Iterator<Item = (&'static str, &'static str, Expected)> {
+    CASES.lines().skip(1).map(|line| {
+        let mut cells = line.split('|').map(str::trim_start);
+        let [what, name, expected] = [(); 3].map(|()| cells.next().unwrap());
+        let (kind, words) = expected.split_once(": ").unwrap();
+        let expected = match kind {
+            "silent" => Silent(words),
+            "warning" => Warning(words),
+            "measured" => WhenMeasured(words),
+            _ => Refused(words),
+        };
+        (what.trim_end(), name.trim_end(), expected)
+    })
 }
 
-const fn case(name: &'static str, spoil: fn(&mut Data), expected: Expected) -> Case {
-    Case {
-        name,
-        spoil,
-        expected,
+impl Data {
+    /// Spoils the data in the way of a line of `CASES`.
+    fn spoil(&mut self, what: &str) {
+        let words: Vec<&str> = what.split(' ').collect();
+        let number = |text: &str| text.parse::<f64>().unwrap();
+        match words[..] {
+            ["none"] => {}
+            ["sky", level] => self.stamps += number(level) as f32,
+            ["slope", slope] => add_gradient(self, number(slope) as f32),
+            ["psf", "background", share] => {
+                let peak = self.star.iter().copied().fold(0.0, f32::max);
+                self.star += number(share) as f32 * peak;
+            }
+            ["psf", "scale", scale] => draw_star(self, number(scale), 0.0),
+            ["psf", "offset", offset] => draw_star(self, 1.0, number(offset)),
+            ["psf", "snr", snr] => add_star_noise(self, number(snr) as f32),
+            ["psf", "pixel"] => {
+                self.star.fill(0.0);
+                self.star[(STAMP / 2, STAMP / 2)] = 1.0;
+            }
+            ["psf", "swap"] => self.star = self.star.t().to_owned(),
+            ["move", dx, dy] => {
+                self.stamps = moved(&self.stamps, number(dx) as usize, number(dy) as usize);
+            }
+            ["scatter"] => {
+                let good = self.stamps.clone();
+                for (k, mut stamp) in self.stamps.outer_iter_mut().enumerate() {
+                    let (dx, dy) = ([0, 5, 43][k % 3], [0, 5, 43][k / 3 % 3]);
+                    let one = good.slice(s![k..=k, .., ..]).to_owned();
+                    stamp.assign(&moved(&one, dx, dy).slice(s![0, .., ..]));
+                }
+            }
+            ["scale", "0"] => self.stamps.fill(0.0),
+            ["scale", factor] => self.stamps *= number(factor) as f32,
+            ["depths"] => {
+                let noise = normal(self.stamps.dim(), 4);
+                let mut half = self.stamps.slice_mut(s![GRID * GRID / 2.., .., ..]);
+                half.scaled_add(0.9, &noise.slice(s![GRID * GRID / 2.., .., ..]));
+            }
+            ["correlated"] => {
+                let noise = summed(&normal(self.stamps.dim(), 5), 6);
+                self.stamps.scaled_add(2.0, &noise);
+            }
+            ["copies", "32"] => {
+                let first = self.stamps.slice(s![..32, .., ..]).to_owned();
+                self.stamps.slice_mut(s![64..96, .., ..]).assign(&first);
+            }
+            ["copies", _] => {
+                let first = self.stamps.slice(s![0, .., ..]).to_owned();
+                let mut stamps = self.stamps.outer_iter_mut();
+                stamps.by_ref().for_each(|mut stamp| stamp.assign(&first));
+            }
+            ["noise", noise] => self.noise = Some(number(noise)),
+            _ => panic!("{what}"),
+        }
     }
 }
-
-const CASES: [Case; 36] = [
-    case("none", |_| {}, Silent("good data")),
-    case(
-        "sky 0.5σ",
-        |d| d.stamps += 0.5,
-        Warning("the stamps contain sky"),
-    ),
-    case(
-        "sky −0.5σ",
-        |d| d.stamps -= 0.5,
-        Warning("the stamps contain sky"),
-    ),
-    case(
-        "sky 3σ",
-        |d| d.stamps += 3.0,
-        Warning("the stamps contain sky"),
-    ),
-    case(
-        "sky −3σ",
-        |d| d.stamps -= 3.0,
-        Warning("the stamps contain sky"),
-    ),
-    case(
-        "sky 100σ",
-        |d| d.stamps += 100.0,
-        Warning("the stamps contain sky"),
-    ),
-    case(
-        "sky gradient 0.01 σ/px",
-        |d| add_gradient(d, 0.01),
-        Warning("the sky has a gradient"),
-    ),
-    case(
-        "sky gradient 0.02 σ/px",
-        |d| add_gradient(d, 0.02),
-        Warning("the sky has a gradient"),
-    ),
-    case(
-        "sky gradient 0.05 σ/px",
-        |d| add_gradient(d, 0.05),
-        Warning("the sky has a gradient"),
-    ),
-    case(
-        "PSF + 1 % of its peak",
-        |d| {
-            let peak = d.star.iter().copied().fold(0.0, f32::max);
-            d.star += 0.01 * peak;
-        },
-        Warning("the PSF contains a background"),
-    ),
-    case(
-        "PSF sampled 0.5 times as finely",
-        |d| draw_star(d, 0.5, 0.0),
-        Silent("larger galaxies behind this PSF look alike"),
-    ),
-    case(
-        "PSF sampled 1.1 times too finely",
-        |d| draw_star(d, 1.1, 0.0),
-        Silent("smaller galaxies behind this PSF look alike (m = +0.13)"),
-    ),
-    case(
-        "PSF sampled 1.5 times too finely",
-        |d| draw_star(d, 1.5, 0.0),
-        WhenMeasured("the PSF is nearly as broad as the galaxies"),
-    ),
-    case(
-        "PSF sampled 2 times too finely",
-        |d| draw_star(d, 2.0, 0.0),
-        Refused("the PSF is broader than the galaxies"),
-    ),
-    case(
-        "PSF 0.4 px off centre",
-        |d| draw_star(d, 1.0, 0.4),
-        Silent("half a pixel does not change shapes"),
-    ),
-    case(
-        "PSF 1.5 px off centre",
-        |d| draw_star(d, 1.0, 1.5),
-        Warning("the star is off the centre of its stamp"),
-    ),
-    case(
-        "PSF 3 px off centre",
-        |d| draw_star(d, 1.0, 3.0),
-        Warning("the star is off the centre of its stamp"),
-    ),
-    case(
-        "PSF noise, S/N 20",
-        |d| add_star_noise(d, 20.0),
-        Warning("the PSF is noisy"),
-    ),
-    case(
-        "PSF noise, S/N 50",
-        |d| add_star_noise(d, 50.0),
-        Warning("the PSF is noisy"),
-    ),
-    case(
-        "PSF noise, S/N 100",
-        |d| add_star_noise(d, 100.0),
-        Warning("the PSF is noisy"),
-    ),
-    case(
-        "PSF is a single pixel",
-        |d| {
-            d.star.fill(0.0);
-            d.star[(STAMP / 2, STAMP / 2)] = 1.0;
-        },
-        Warning("the PSF is narrower than the pixels can show"),
-    ),
-    case(
-        "PSF with x and y swapped",
-        |d| d.star = d.star.t().to_owned(),
-        Silent("a PSF of other ellipticity looks alike"),
-    ),
-    case(
-        "galaxies 1 px off centre",
-        |d| d.stamps = moved(&d.stamps, 1, 1),
-        Warning("the galaxies are off the centre of their stamps"),
-    ),
-    case(
-        "galaxies 2 px off centre",
-        |d| d.stamps = moved(&d.stamps, 2, 0),
-        Warning("the galaxies are off the centre of their stamps"),
-    ),
-    case(
-        "galaxies 4 px off centre",
-        |d| d.stamps = moved(&d.stamps, 0, 4),
-        Warning("the galaxies are off the centre of their stamps"),
-    ),
-    case(
-        "galaxies 8 px off centre",
-        |d| d.stamps = moved(&d.stamps, 8, 0),
-        Warning("the galaxies are off the centre of their stamps"),
-    ),
-    case(
-        "galaxies scattered by 5 px",
-        |d| {
-            let good = d.stamps.clone();
-            for (k, mut stamp) in d.stamps.outer_iter_mut().enumerate() {
-                let (dx, dy) = ([0, 5, 43][k % 3], [0, 5, 43][k / 3 % 3]);
-                let one = good.slice(s![k..=k, .., ..]).to_owned();
-                stamp.assign(&moved(&one, dx, dy).slice(s![0, .., ..]));
-            }
-        },
-        Warning("the galaxies are scattered over their stamps"),
-    ),
-    case(
-        "negative galaxies",
-        |d| d.stamps.mapv_inplace(|v| -v),
-        Warning("galaxies are darker than their surroundings"),
-    ),
-    case(
-        "stamps of two depths",
-        |d| {
-            let noise = normal(d.stamps.dim(), 4);
-            let half = d.stamps.dim().0 / 2;
-            d.stamps
-                .slice_mut(s![half.., .., ..])
-                .scaled_add(0.9, &noise.slice(s![half.., .., ..]));
-        },
-        Warning("the noise differs between stamps"),
-    ),
-    case(
-        "noise correlated over 6 px",
-        |d| {
-            let noise = summed(&normal(d.stamps.dim(), 5), 6);
-            d.stamps.scaled_add(2.0, &noise);
-        },
-        Warning("the noise is correlated over more than 3 px"),
-    ),
-    case(
-        "32 of 576 stamps are copies",
-        |d| {
-            let first = d.stamps.slice(s![..32, .., ..]).to_owned();
-            d.stamps.slice_mut(s![64..96, .., ..]).assign(&first);
-        },
-        Warning("stamps are copies of each other"),
-    ),
-    case(
-        "all stamps are copies",
-        |d| {
-            let first = d.stamps.slice(s![0, .., ..]).to_owned();
-            for mut stamp in d.stamps.outer_iter_mut() {
-                stamp.assign(&first);
-            }
-        },
-        Warning("stamps are copies of each other"),
-    ),
-    case(
-        "blank stamps",
-        |d| d.stamps.fill(0.0),
-        Warning("the stamps are blank"),
-    ),
-    case(
-        "pixel values × 1e20",
-        |d| d.stamps *= 1e20,
-        Refused("pixel values are out of range"),
-    ),
-    case(
-        "pixel values × 1e-22",
-        |d| d.stamps *= 1e-22,
-        Refused("pixel values are out of range"),
-    ),
-    case(
-        "stated noise twice too large",
-        |d| d.noise = Some(2.0),
-        WhenMeasured("disagrees with the "),
-    ),
-];
 
 /// What an entry point said.
 #[derive(Default)]
@@ -553,9 +443,9 @@ fn every_entry_point_reports_wrong_data() {
         "| data set | batch | gather | measure | run | Python |\n|---|---|---|---|---|---|\n"
             .to_owned();
     let mut wrong = Vec::new();
-    for case in &CASES {
+    for (what, name, expected) in cases() {
         let mut data = good.clone();
-        (case.spoil)(&mut data);
+        data.spoil(what);
         folder.write(&data);
         let found = [
             Some(batch(&data)),
@@ -565,16 +455,16 @@ fn every_entry_point_reports_wrong_data() {
             python.as_ref().map(|python| folder.python(python, &data)),
         ];
         let cells = found.each_ref().map(|found| match found {
-            Some(found) => found.cell(case.expected),
+            Some(found) => found.cell(expected),
             None => "–".to_owned(),
         });
-        table += &format!("| {} | {} |\n", case.name, cells.join(" | "));
+        table += &format!("| {name} | {} |\n", cells.join(" | "));
         let entries = ["batch", "gather", "measure", "run", "Python"];
         for (entry, found) in entries.iter().zip(&found) {
             if let Some(found) = found
-                && !found.fits(case.expected, *entry == "gather")
+                && !found.fits(expected, *entry == "gather")
             {
-                wrong.push(format!("{}, {entry}: {:?}", case.name, found.messages));
+                wrong.push(format!("{name}, {entry}: {:?}", found.messages));
             }
         }
     }

@@ -293,187 +293,7 @@ fn several_stars_of_one_psf_are_averaged() {
 }
 
 #[test]
-fn what_cannot_be_gathered_is_named() {
-    let root = tempfile::tempdir().unwrap();
-    let at = |name: &str| root.path().join(name);
-    let stamps = vec![vec![1.0f32; 48 * 48]; 3];
-    fs::write(at("three.fits"), cube(&stamps, 48)).unwrap();
-    fs::write(at("two.fits"), cube(&stamps[..2], 48)).unwrap();
-    fs::write(at("psf.fits"), cube(&[vec![1.0; 400]], 20)).unwrap();
-    let wide = fits_image(-32, &[48, 40], &[], &floats(&stamps[0][..48 * 40]));
-    fs::write(at("wide.fits"), wide).unwrap();
-    fs::write(
-        at("four.fits"),
-        fits_image(-32, &[2, 2, 2, 2], &[], &[0; 64]),
-    )
-    .unwrap();
-    let short = cube(&stamps, 48);
-    fs::write(at("short.fits"), &short[..short.len() - 5760]).unwrap();
-    fs::write(at("empty.fits"), fits_image(8, &[], &[], &[])).unwrap();
-    fs::write(at("nowhere.csv"), "x,y\n1,2\n3,nan\n").unwrap();
-    fs::write(at("none.csv"), "x,y\n").unwrap();
-    let gather = |from: &[&str], psf: &str| {
-        let (psf, out) = (at(psf), at("data"));
-        let rest = ["--psf", text(&psf), "--out", text(&out)];
-        let message = fail(&[&["gather"][..], from, &rest].concat());
-        assert!(!out.join("set01/galaxies-001.fits").exists());
-        message
-    };
-    for (stamps, psf, expected) in [
-        (
-            "three.fits",
-            "two.fits",
-            "two.fits: there are 2 PSFs; expected one, or one for each of the 3",
-        ),
-        (
-            "three.fits",
-            "wide.fits",
-            "wide.fits: image 1, plane 1: the stamp is 48 × 40",
-        ),
-        ("wide.fits", "psf.fits", "--exposure with --positions"),
-        ("four.fits", "psf.fits", "has 4 dimensions"),
-        (
-            "short.fits",
-            "psf.fits",
-            "short.fits: the file is truncated",
-        ),
-        ("empty.fits", "psf.fits", "there is no image in this file"),
-        ("absent.fits", "psf.fits", "absent.fits"),
-    ] {
-        let stamps = at(stamps);
-        let message = gather(&["--stamps", text(&stamps)], psf);
-        assert!(message.contains(expected), "{message}");
-    }
-    let exposure = at("wide.fits");
-    for (positions, expected) in [
-        ("nowhere.csv", "row 2: the position is (3, NaN)"),
-        ("none.csv", "none.csv"),
-        ("absent.csv", "absent.csv"),
-    ] {
-        let positions = at(positions);
-        let from = [
-            "--exposure",
-            text(&exposure),
-            "--positions",
-            text(&positions),
-        ];
-        let message = gather(&from, "psf.fits");
-        assert!(message.contains(expected), "{message}");
-    }
-    // What reaches beyond an exposure is kept and said; a background in a star is noticed.
-    fs::write(at("edge.csv"), "x,y\n24.5,20.5\n2,2\n").unwrap();
-    let (positions, psf, out) = (at("edge.csv"), at("psf.fits"), at("data"));
-    let from = [
-        "--exposure",
-        text(&exposure),
-        "--positions",
-        text(&positions),
-    ];
-    let rest = ["--size", "20", "--psf", text(&psf), "--out", text(&out)];
-    let done = shearq(&[&["gather"][..], &from, &rest].concat());
-    let said = String::from_utf8(done.stderr).unwrap();
-    assert!(said.contains("1 stamp with missing pixels"), "{said}");
-    assert!(said.contains("the PSF contains a background"), "{said}");
-}
-
-#[test]
-fn a_gathered_image_goes_where_the_layout_says_and_is_of_one_run() {
-    let root = tempfile::tempdir().unwrap();
-    let at = |name: &str| root.path().join(name);
-    let stamps = vec![vec![1.0f32; 48 * 48]; 3];
-    fs::write(at("three.fits"), cube(&stamps, 48)).unwrap();
-    let mut star = vec![0.0f32; 400];
-    star[210] = 1.0;
-    fs::write(at("psf.fits"), cube(&[star], 20)).unwrap();
-    fs::write(
-        at("psf.csv"),
-        "x,y,profile,beta,fwhm,e1,e2\n0,0,moffat,3,3,0,0\n",
-    )
-    .unwrap();
-    let (three, psf, formula, out) = (at("three.fits"), at("psf.fits"), at("psf.csv"), at("data"));
-    fs::create_dir(&out).unwrap();
-    fs::write(
-        out.join("layout.toml"),
-        "galaxies = \"g-{set}-{image}.fits\"\npsf_star = \"p-{set}-{image}.fits\"\n",
-    )
-    .unwrap();
-    // What a stopped run leaves in the folder is removed by the next.
-    fs::write(out.join(".g-1-1.fits.0123456789abcdef.part"), "half").unwrap();
-    let gather = ["gather", "--stamps", text(&three), "--out", text(&out)];
-    let absent = at("absent.fits");
-    fail(&[&gather[..], &["--psf", text(&absent)]].concat());
-    assert!(!out.join("set01").exists());
-    succeed(&[&gather[..], &["--psf", text(&psf)]].concat());
-    let mut names: Vec<_> = fs::read_dir(&out)
-        .unwrap()
-        .map(|entry| entry.unwrap().file_name().into_string().unwrap())
-        .collect();
-    names.sort();
-    assert_eq!(names, ["g-1-1.fits", "layout.toml", "p-1-1.fits", "set01"]);
-    let record = fs::read_to_string(out.join("set01/stamps-001.json")).unwrap();
-    assert!(
-        record.contains("three.fits") && record.contains("psf.fits") && record.contains("version")
-    );
-    // Without the image, which comes last, all of it is what a stopped run has left.
-    let image = fs::read(out.join("g-1-1.fits")).unwrap();
-    for psf in [&formula, &psf] {
-        fs::remove_file(out.join("g-1-1.fits")).unwrap();
-        succeed(&[&gather[..], &["--psf", text(psf)]].concat());
-        assert_eq!(fs::read(out.join("g-1-1.fits")).unwrap(), image);
-    }
-    assert!(!out.join("set01/psf-001.csv").exists());
-    // A PSF of either form that is there belongs to another image.
-    fs::remove_file(out.join("g-1-1.fits")).unwrap();
-    fs::remove_file(out.join("set01/stamps-001.csv")).unwrap();
-    for psf in [&psf, &formula] {
-        let message = fail(&[&gather[..], &["--psf", text(psf)]].concat());
-        assert!(
-            message.contains("p-1-1.fits: the file is there already"),
-            "{message}"
-        );
-    }
-    assert!(!out.join("set01/psf-001.csv").exists());
-}
-
-#[test]
-fn sky_and_noise_that_is_another_are_told_where_they_are_seen() {
-    let small = Small::new("2");
-    let set = small.at("data/set02");
-    let mut galaxies = stamps_of(&set.join("galaxies-001.fits"), 48);
-    fs::write(small.at("dark.fits"), cube(&galaxies, 48)).unwrap();
-    galaxies
-        .iter_mut()
-        .flatten()
-        .for_each(|value| *value += 20.0);
-    fs::write(small.at("bright.fits"), cube(&galaxies, 48)).unwrap();
-    let psf = set.join("psf-001.fits");
-    let said = |stamps: &str| {
-        let (stamps, out) = (small.at(&format!("{stamps}.fits")), small.at(stamps));
-        let gather = ["gather", "--stamps", text(&stamps), "--psf", text(&psf)];
-        let rest = ["--noise", "5", "--out", text(&out)];
-        let done = shearq(&[&gather[..], &rest].concat());
-        assert!(done.status.success());
-        String::from_utf8(done.stderr).unwrap()
-    };
-    let dark = said("dark");
-    assert!(
-        dark.contains("the given noise disagrees with the noise of the stamps (found 5.0000"),
-        "{dark}"
-    );
-    assert!(!dark.contains("sky"), "{dark}");
-    assert!(said("bright").contains("the stamps contain sky"));
-    let (data, out) = (small.at("dark"), small.at("out"));
-    let measure = ["measure", "--submission", LINEAR, "--data", text(&data)];
-    let done = shearq(&[&measure[..], &["--out", text(&out)]].concat());
-    let said = String::from_utf8(done.stderr).unwrap();
-    assert!(
-        said.contains("NOISESIG disagrees with the measured noise (found 5.0000"),
-        "{said}"
-    );
-}
-
-#[test]
-fn noise_that_is_told_to_be_white_and_is_not_and_padding_are_told() {
+fn correlated_noise_treated_as_white_and_padding_are_named() {
     let small = Small::new("2");
     let set = small.at("data/set02");
     let galaxies = stamps_of(&set.join("galaxies-001.fits"), 48);
@@ -528,26 +348,6 @@ fn noise_that_is_told_to_be_white_and_is_not_and_padding_are_told() {
         !well && said.contains("expected two or more complete borders"),
         "{said}"
     );
-}
-
-#[test]
-fn a_tilde_is_a_letter_of_a_name() {
-    let root = tempfile::tempdir().unwrap();
-    let run = |arguments: &[&str]| {
-        let done = std::process::Command::new(env!("CARGO_BIN_EXE_shearq"))
-            .args(arguments)
-            .current_dir(root.path())
-            .output()
-            .unwrap();
-        let said = String::from_utf8_lossy(&done.stderr).into_owned();
-        assert!(done.status.success(), "{arguments:?}: {said}");
-    };
-    let simulate = ["simulate", "--sets", "2", "--images", "1", "--grid", "8"];
-    run(&[&simulate[..], &["--out", "~sim"]].concat());
-    let measure = ["measure", "--submission", LINEAR, "--data", "~sim"];
-    let rest = ["--out", "~out", "--catalogue-format", "fits"];
-    run(&[&measure[..], &rest].concat());
-    run(&["mean", "--measured", "~out"]);
 }
 
 /// Pixels of the stamps that were gathered, of which those that are missing are NaN.
@@ -710,7 +510,7 @@ fn compressed_cubes_are_read_plane_by_plane() {
 }
 
 #[test]
-fn a_psf_with_other_pixels_or_wider_than_the_galaxies_is_reported() {
+fn psfs_of_other_pixels_or_wider_than_galaxies_are_reported() {
     let small = Small::new("2");
     let set = small.at("data/set02");
     let galaxies = stamps_of(&set.join("galaxies-001.fits"), 48);

@@ -1,8 +1,10 @@
 //! Commands of the pages of `tests/cases` that make or show what no text can hold: images and tables of FITS.
 //!
 //! * `image FROM TO WHAT...`: an image of the pixels of another. WHAT is applied in order: `size=WxH` or other axes,
-//!   `pad=SIDE` (zeros around it), `cube=STAMP,SIDE` (the central pixels of a mosaic's stamps), `scale=F`, `add=F`, `shift=X,Y`, `pixel=X,Y,F` (from 1), `number=SIDE` (of the
-//!   square of pixels from 0), `bitpix=N`, or a card such as `STAMP=48`.
+//!   `pad=SIDE` (zeros around it), `cube=STAMP,SIDE` (the central pixels of the stamps of a mosaic), `copy=STAMP` (the first
+//!   stamp everywhere), `number=SIDE` (of the square of pixels from 0), `shift=X,Y`, `scale=F`, `add=F`, `background=F` (of
+//!   the peak), `slope=STAMP,F` (light per pixel along x of each stamp), `snr=F` (adds noise), `pixel=X,Y,F` (from 1),
+//!   `bitpix=N`, or a card such as `STAMP=48`.
 //! * `card FROM TO KEY=VALUE`: a copy with another value of a key. `card FROM TO KEY CARD`: a copy with any card in the
 //!   place of the last one of this key; `"` stands for `'`.
 //! * `tables TO NAME=CSV...`: a file of tables, each from a CSV of numbers.
@@ -109,6 +111,32 @@ fn image(from: &Path, what: &[&str]) -> Vec<u8> {
                     padded[(first + k / width) * side + first + k % width] = *pixel;
                 }
                 (pixels, sides) = (padded, vec![side; 2]);
+            }
+            "slope" => {
+                let [side, slope] = numbers(value);
+                for (k, pixel) in pixels.iter_mut().enumerate() {
+                    *pixel += (slope * ((k % sides[0]) as f64 % side - (side - 1.0) / 2.0)) as f32;
+                }
+            }
+            "copy" => {
+                let (side, width) = (value.parse::<usize>().unwrap(), sides[0]);
+                let place = |k: usize| k / width % side * width + k % width % side;
+                pixels = (0..pixels.len()).map(|k| pixels[place(k)]).collect();
+            }
+            "background" => {
+                let peak = pixels.iter().copied().fold(0.0, f32::max);
+                let light = value.parse::<f32>().unwrap() * peak;
+                pixels.iter_mut().for_each(|pixel| *pixel += light);
+            }
+            "snr" => {
+                let power = pixels.iter().map(|v| v * v).sum::<f32>().sqrt();
+                let rms = power / value.parse::<f32>().unwrap();
+                // Uniform numbers of variance one.
+                let mut state = 1u32;
+                for pixel in &mut pixels {
+                    state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+                    *pixel += rms * 12f32.sqrt() * ((state >> 8) as f32 / (1 << 24) as f32 - 0.5);
+                }
             }
             "number" => {
                 let (side, width) = (value.parse::<usize>().unwrap(), sides[0]);

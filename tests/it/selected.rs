@@ -19,7 +19,7 @@ fn mean(small: &Small, folder: &str, more: &[&str]) -> (f64, f64) {
 }
 
 #[test]
-fn selected_folders_have_the_means_of_the_option_and_can_be_scored() {
+fn selected_folders_have_the_means_of_where_and_are_scored() {
     let small = Small::new("2");
     small.measure(&LINEAR);
     let (data, out, chosen) = (small.at("data"), small.at("out"), small.at("chosen"));

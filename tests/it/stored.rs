@@ -67,7 +67,7 @@ fn files(store: &Path) -> Vec<(PathBuf, Vec<u8>)> {
 }
 
 #[test]
-fn a_store_gives_the_same_figures_as_the_folders_however_it_was_filled() {
+fn a_store_gives_the_figures_of_the_folders() {
     let recorded = Recorded::new();
     let before = files(&recorded.at("store"));
     assert_eq!(before.len(), 2);

@@ -179,7 +179,7 @@ fn galaxies(g: f64, names: &str, values: impl Fn(usize) -> String) -> String {
 }
 
 #[test]
-fn cuts_that_are_true_for_good_rows_and_constant_patches_are_refused() {
+fn cuts_of_good_rows_and_constant_patches_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let select = |id: usize| u8::from(!id.is_multiple_of(5)).to_string();
     let [plus, minus] = pair(folder.path(), "cut", |g| {
