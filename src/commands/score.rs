@@ -183,7 +183,12 @@ fn catalogues(
         ..options
     };
     let threads = arguments.threads.number();
-    let scored = score_catalogues(&data, &catalogues, sets, options, threads)?;
+    let scored = score_catalogues(&data, &catalogues, sets, options, threads);
+    let scored = match catalogues.description() {
+        // What is wrong with a catalogue may be wrong in its description.
+        Some(_) => scored.with_context(|| catalogues.path.display().to_string())?,
+        None => scored?,
+    };
     let name = &catalogues.name;
     let title = format!("Scores of {name}");
     let mut table = per_set(&scored, &title, options.definition);

@@ -384,7 +384,9 @@ pub fn score_catalogues(
     let variant = [(catalogues, options.choice)];
     let scored = score_variants(data, &variant, sets, options, threads);
     let scored = scored.map_err(|error| match error {
-        PipelineError::Request(message) => FileError::new(&catalogues.path, message).into(),
+        PipelineError::Request(message) if catalogues.run().is_some() => {
+            FileError::new(&catalogues.path, message).into()
+        }
         other => other,
     })?;
     Ok(scored.into_iter().flatten().collect())
