@@ -155,7 +155,7 @@ fn measured<'a>(
 /// A star for all galaxies.
 fn star_for_all<'a>(measurer: &Measurer, star: ArrayView2<'_, f64>) -> PyResult<AllPsfs<'a>> {
     let cut = measurer.configuration().psf_cut();
-    let found = shearq_measure::star(star, cut).map_err(of_measuring)?;
+    let found = shearq_measure::Star::cut(star, cut).map_err(of_measuring)?;
     Ok(AllPsfs::Shared {
         psf: found.psf.into_shared(),
         moved: found.moved,

@@ -8,14 +8,13 @@ use ndarray::ArrayView2;
 use shearq_quantities::statistics::{OF_MEDIAN, median, scatter};
 use shearq_submissions::PsfCut;
 
+use crate::centroid::galaxy_centroid;
 use crate::error::MeasureError;
-use crate::extent::{Core, core_sums};
 use crate::pixel::{self, PEAKS, Pixel, highest};
-use crate::psf::Star;
-use crate::psf::examine::{self, PsfLook};
-use crate::psfs::Psfs;
-use crate::sky::{Cells, INNER, Subtraction, disc, inner};
-use crate::surroundings::centre;
+use crate::psf::quality::{self, PsfQuality};
+use crate::psf::{Psfs, Star};
+use crate::second_moments::{CoreSize, core_sums};
+use crate::sky::{INNER_AREA, INNER_RADIUS, SkyCells, SkySubtraction, inner_light};
 use crate::warning::{Estimate, Warning};
 
 // Largest side in px of the corner blocks in which the sky is measured. Chosen by hand.
@@ -65,10 +64,10 @@ struct Look {
     pairs: [f64; 3],
     /// Centroid from the expected place.
     place: [f64; 2],
-    /// Light within `INNER`, without sky.
+    /// Light within `INNER_RADIUS`, without sky.
     flux: f64,
     peak: f64,
-    /// Sums under the narrow weight of [`Core`].
+    /// Sums under the narrow weight of [`CoreSize`].
     core: [f64; 2],
     /// Equal for equal stamps.
     trace: u64,
@@ -82,11 +81,11 @@ pub struct Examination {
     pixels: Vec<f32>,
     looks: Vec<Look>,
     blank: usize,
-    psfs: Vec<PsfLook>,
+    psfs: Vec<PsfQuality>,
     /// Whether each PSF is that of one galaxy.
     each: bool,
-    cells: Cells,
-    subtraction: Subtraction,
+    cells: SkyCells,
+    subtraction: SkySubtraction,
 }
 
 /// A block's mean, variance about its plane, and sums over pairs.
@@ -108,13 +107,13 @@ impl Examination {
             blank: 0,
             psfs: Vec::new(),
             each: false,
-            cells: Cells::new(full),
-            subtraction: Subtraction::Nothing,
+            cells: SkyCells::new(full),
+            subtraction: SkySubtraction::Nothing,
         }
     }
 
     /// The same for stamps from which this is subtracted before they are measured.
-    pub(crate) fn without(self, subtraction: Subtraction) -> Self {
+    pub(crate) fn without(self, subtraction: SkySubtraction) -> Self {
         Examination {
             subtraction,
             ..self
@@ -129,7 +128,7 @@ impl Examination {
 
     /// Examines the PSF of all galaxies, of sum one, which was `moved` by so many pixels to be in the middle.
     pub fn add_psf(&mut self, psf: ArrayView2<'_, f64>, moved: Option<[f64; 2]>) {
-        self.psfs.extend(PsfLook::of(psf, moved));
+        self.psfs.extend(PsfQuality::from_psf(psf, moved));
     }
 
     /// Examines a PSF of all galaxies, or up to `most` PSFs of one galaxy each, as a configuration cuts them. PSFs that
@@ -173,7 +172,7 @@ impl Examination {
             self.blank += 1;
             return Ok(());
         }
-        if self.subtraction != Subtraction::Nothing {
+        if self.subtraction != SkySubtraction::Nothing {
             self.subtraction.apply(&mut self.pixels, &mut self.cells);
         }
         let (edge, middle) = (n - self.block, (n - self.block) / 2);
@@ -225,10 +224,10 @@ impl Examination {
                 0.0
             };
         }
-        let found = centre(&self.pixels, n);
+        let found = galaxy_centroid(&self.pixels, n);
         self.looks.push(Look {
             place: [0, 1].map(|k| f64::from(found[k]) - place[k]),
-            flux: inner(&self.pixels, n),
+            flux: inner_light(&self.pixels, n),
             core: core_sums(
                 |x, y| f64::from(self.pixels[y * n + x]),
                 [n; 2],
@@ -264,7 +263,7 @@ impl Examination {
             found.push(Warning::Brightness { peak });
         }
         let Estimate { value: noise, .. } = self.noise();
-        let flux = self.median(|look| look.flux, noise * INNER);
+        let flux = self.median(|look| look.flux, noise * INNER_RADIUS);
         // An offset needs light to be measured.
         let lit = flux.is_significant();
         let Estimate { value: flux, .. } = flux;
@@ -297,7 +296,7 @@ impl Examination {
     /// galaxies. `None` if each galaxy has a PSF of its own, or no PSF was examined.
     pub fn psf_noise(&self) -> Option<[f64; 2]> {
         let look = self.psfs.first().filter(|_| !self.each)?;
-        Some(look.effect_of_noise())
+        Some(look.noise_bias())
     }
 
     /// A warning if `given` is not the noise of the stamps.
@@ -315,12 +314,12 @@ impl Examination {
         Estimate { value, error }
     }
 
-    fn psfs(&self, galaxies: Option<Core>) -> Vec<Warning> {
-        examine::warnings(&self.psfs, !self.each, galaxies)
+    fn psfs(&self, galaxies: Option<CoreSize>) -> Vec<Warning> {
+        quality::warnings(&self.psfs, !self.each, galaxies)
     }
 
     /// How broad the core of the galaxies is, with the PSF.
-    fn core(&self) -> Option<Core> {
+    fn core(&self) -> Option<CoreSize> {
         let mut lights: Vec<f64> = self.looks.iter().map(|look| look.core[0].abs()).collect();
         let most = MAX_LIGHT * median(&mut lights).filter(|_| lights.len() >= MIN_GALAXIES_CORE)?;
         let sums = || {
@@ -333,7 +332,7 @@ impl Examination {
         let light: f64 = sums().map(|core| core[0]).sum();
         let q = 0.5 * sums().map(|core| core[1]).sum::<f64>() / light;
         let rest = sums().map(|core| (0.5 * core[1] - q * core[0]).powi(2));
-        Core::of(q, rest.sum::<f64>().sqrt() / light.abs())
+        CoreSize::from_weighted(q, rest.sum::<f64>().sqrt() / light.abs())
     }
 
     fn sky(&self, noise: f64, flux: f64) -> Option<Warning> {
@@ -341,19 +340,19 @@ impl Examination {
         // The median of four corners is about the mean of two.
         let corner = self.median(|look| look.corner, noise / (2.0 * pixels).sqrt());
         let side = self.median(|look| look.side, 0.0);
-        Warning::of_sky(corner, side.value, noise, disc() / flux.abs())
+        Warning::of_sky(corner, side.value, noise, INNER_AREA / flux.abs())
     }
 
     /// What was found and subtracted.
     fn subtracted(&self, noise: f64, flux: f64) -> Vec<Warning> {
-        let Subtraction::Plane(sky) = self.subtraction else {
+        let SkySubtraction::Plane(sky) = self.subtraction else {
             return Vec::new();
         };
         let level = (sky.level != 0.0).then(|| Warning::Sky {
             level: sky.level,
             error: sky.level_error,
             noise,
-            share: sky.level * disc() / flux.abs(),
+            share: sky.level * INNER_AREA / flux.abs(),
             subtracted: true,
         });
         let gradient = (sky.slope != [0.0; 2]).then_some(Warning::Gradient {
@@ -369,7 +368,7 @@ impl Examination {
         let edge = (self.full - self.block) as f64;
         let floor = noise / (self.block as f64 * edge);
         let slope = [0, 1].map(|k| self.median(|look| look.slope[k], floor));
-        Warning::of_gradient(slope, noise, INNER * disc() / flux.abs())
+        Warning::of_gradient(slope, noise, INNER_RADIUS * INNER_AREA / flux.abs())
     }
 
     fn places(&self) -> Option<Warning> {
@@ -633,7 +632,7 @@ mod tests {
             slope: [0.01, 0.0],
             slope_error: 0.001,
         };
-        let subtracted = examination.clone().without(Subtraction::Plane(sky));
+        let subtracted = examination.clone().without(SkySubtraction::Plane(sky));
         for warning in [examination.warnings(), subtracted.warnings()].concat() {
             let text = warning.to_string();
             assert!(!text.contains("inf") && !text.contains("NaN"), "{text}");
@@ -658,12 +657,12 @@ mod tests {
 
     #[test]
     fn the_noise_of_a_star_has_one_effect_on_all_galaxies_or_none() {
-        // Checks of ±σ, which second differences see as noise.
+        // Checks, which fourth differences see as noise.
         let star = Array2::from_shape_fn((N, N), |(y, x)| {
             let noise = if (x / 2 + y / 3) % 2 == 0 {
-                1e-4
+                2e-4
             } else {
-                -1e-4
+                -2e-4
             };
             f64::from(stamp(0.0, [0.0; 2], [0.0; 2])[(y, x)]) / 565.5 + noise
         });

@@ -38,26 +38,28 @@
 
 #![warn(missing_docs, clippy::missing_errors_doc)]
 
+mod asymmetry;
 mod calibration;
+mod centroid;
 mod deconvolve;
 mod denoise;
 mod error;
 mod examine;
-mod extent;
 mod measurement;
 mod measurer;
 mod method;
+mod missing_pixels;
+mod neighbours;
 mod noise;
 pub mod parts;
 mod pixel;
 mod psf;
-mod psfs;
+mod second_moments;
 mod selection;
 mod session;
 mod shape;
 mod sheared;
 mod sky;
-mod surroundings;
 mod transform;
 mod warning;
 
@@ -71,8 +73,7 @@ pub use method::AdaptedSettings;
 pub use ndarray;
 pub use noise::{StampNoise, Survey};
 pub use pixel::{Pixel, Pixels};
-pub use psf::{Star, average_stars, star, star_psf};
-pub use psfs::Psfs;
+pub use psf::{Psfs, Star, average_stars};
 pub use selection::{Cut, Quantity, Selected, Selection};
 pub use session::{
     ArraySource, Batch, KnownNoise, Lazy, LazyStamps, MeasuredImage, MeasuredRow, OneThread,

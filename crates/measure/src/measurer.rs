@@ -14,12 +14,11 @@ use crate::denoise::{DenoiseScratch, WaveletWiener, border_noise};
 use crate::error::MeasureError;
 use crate::measurement::{Flag, Measurement};
 use crate::method::{AdaptedSettings, CutWorker, Images, MethodPlan};
+use crate::missing_pixels::MissingPixels;
 use crate::noise::{NoisePlan, StampNoise, Survey};
 use crate::pixel::{self, PEAKS, Pixel, all_finite, highest, is_level};
-use crate::psf::{CommonProfile, StarLooker, cut_start, star_psf};
-use crate::psfs::Psfs;
-use crate::sky::{Cells, Subtraction};
-use crate::surroundings::Missing;
+use crate::psf::{Psfs, ResidualProfiles, Star, StarSurvey, cut_start};
+use crate::sky::{SkyCells, SkySubtraction};
 
 /// The plan of a measurement, for one configuration and one size of stamps. Measuring does not change it, so it serves
 /// all threads. Each thread has a [`Worker`]. Clones share the plan.
@@ -107,15 +106,15 @@ impl Measurer {
     }
 
     /// The sky that is subtracted from stamps of an image with this survey.
-    pub(crate) fn subtraction(&self, survey: Option<&Survey>) -> Subtraction {
+    pub(crate) fn subtraction(&self, survey: Option<&Survey>) -> SkySubtraction {
         let sky = survey.and_then(|survey| survey.sky);
-        Subtraction::of(self.0.configuration.noise.sky(), sky)
+        SkySubtraction::of(self.0.configuration.noise.sky(), sky)
     }
 
     /// Buffers to examine the stars of an image with one per galaxy; `None` if the configuration uses stars as they are.
-    pub(crate) fn star_looker(&self) -> Option<StarLooker> {
+    pub(crate) fn star_survey(&self) -> Option<StarSurvey> {
         self.0.configuration.linear()?;
-        Some(StarLooker::new(self.0.configuration.psf_cut(), self.full()))
+        Some(StarSurvey::new(self.0.configuration.psf_cut(), self.full()))
     }
 
     /// Buffers for one thread.
@@ -128,9 +127,9 @@ impl Measurer {
             full: vec![0.0; plan.full * plan.full],
             cut: vec![0.0; n * n],
             border: Vec::with_capacity(plan.full * plan.full),
-            missing: Missing::new(n),
-            cells: Cells::new(plan.full),
-            subtraction: Subtraction::Nothing,
+            missing: MissingPixels::new(n),
+            cells: SkyCells::new(plan.full),
+            subtraction: SkySubtraction::Nothing,
         }
     }
 
@@ -157,7 +156,7 @@ impl Measurer {
             }
             _ => {}
         }
-        let psf = star_psf(psf, self.configuration().psf_cut())?;
+        let Star { psf, .. } = Star::cut(psf, self.configuration().psf_cut())?;
         let mut worker = self.worker();
         let mut image = worker.image(noise.map_or(ImageNoise::Unknown, ImageNoise::Level));
         let found = image.psf(psf.view())?.measure(stamp)?;
@@ -214,9 +213,9 @@ pub struct Worker {
     /// Cut stamp.
     cut: Vec<f32>,
     border: Vec<f32>,
-    missing: Missing,
-    cells: Cells,
-    subtraction: Subtraction,
+    missing: MissingPixels,
+    cells: SkyCells,
+    subtraction: SkySubtraction,
 }
 
 /// A worker for the galaxies of one image.
@@ -261,14 +260,14 @@ impl Worker {
     pub(crate) fn image_with_stars(
         &mut self,
         noise: ImageNoise<'_>,
-        stars: Option<&Arc<CommonProfile>>,
+        stars: Option<&Arc<ResidualProfiles>>,
     ) -> ImageWorker<'_> {
         let (white, survey) = (StampNoise::white(1.0), noise.survey());
         self.subtraction = self.measurer.subtraction(survey);
         let correlated = survey
             .map(|survey| &survey.noise)
             .filter(|noise| noise.is_correlated());
-        let extent = survey.and_then(|survey| survey.extent);
+        let extent = survey.and_then(|survey| survey.mean_square_radius);
         let of_modes = correlated.unwrap_or(&white);
         self.method.set_image(of_modes, extent, stars);
         ImageWorker {
@@ -300,7 +299,7 @@ impl Worker {
         if self.full.iter().all(|v| *v == self.full[0]) {
             return Ok(Measurement::flagged(Flag::NoScale));
         }
-        if self.subtraction != Subtraction::Nothing {
+        if self.subtraction != SkySubtraction::Nothing {
             self.subtraction.apply(&mut self.full, &mut self.cells);
         }
         let noise = match plan.configuration.noise {
@@ -322,7 +321,7 @@ impl Worker {
                 row.copy_from_slice(&self.full[from..from + n]);
             }
         }
-        if !whole && !self.missing.mend(&mut self.cut, n) {
+        if !whole && !self.missing.fill(&mut self.cut, n) {
             return Ok(Measurement::flagged(Flag::NotFinite));
         }
         let no_scale = Measurement {
@@ -357,7 +356,7 @@ impl ImageWorker<'_> {
     }
 
     /// Prepares for galaxies with this PSF: centred, of sum one, and with the pixels that
-    /// [`star_psf`](crate::star_psf) cuts for [`Configuration::psf_cut`].
+    /// [`Star::cut`](crate::Star::cut) cuts for [`Configuration::psf_cut`].
     ///
     /// # Errors
     /// If the PSF has another size, or a pixel that is not finite.

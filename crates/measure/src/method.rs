@@ -15,7 +15,7 @@ use crate::deconvolve::Descent;
 use crate::error::MeasureError;
 use crate::measurement::{Coupling, Flag, Flags, Measurement, Observables, ResponseMatrix};
 use crate::noise::StampNoise;
-use crate::psf::CommonProfile;
+use crate::psf::ResidualProfiles;
 use crate::sheared::{NoiseProducts, ShearSettings, ShearedCatalogues, sheared};
 
 /// A method, planned for one size of cut stamps.
@@ -56,7 +56,7 @@ pub(crate) trait CutWorker: Send {
         &mut self,
         _noise: &StampNoise,
         _galaxy_variance: Option<f64>,
-        _stars: Option<&Arc<CommonProfile>>,
+        _stars: Option<&Arc<ResidualProfiles>>,
     ) {
     }
 

@@ -21,8 +21,7 @@ use crate::measurement::Measurement;
 use crate::measurer::{ImageNoise, ImageWorker, Measurer, Steps, Worker};
 use crate::noise::{NoisePlan, NoiseSurvey, Survey};
 use crate::pixel::{Pixel, Pixels, is_level};
-use crate::psf::{CommonProfile, Star, StarSurvey};
-use crate::psfs::Psfs;
+use crate::psf::{Psfs, ResidualProfiles, Star};
 use crate::warning::Warning;
 
 // In pixels along each axis. Chosen by hand.
@@ -252,7 +251,7 @@ pub struct Session<'n> {
     rows: StampRows,
     noise: KnownNoise<'n>,
     survey: Option<Arc<Survey>>,
-    stars: Option<Arc<CommonProfile>>,
+    stars: Option<Arc<ResidualProfiles>>,
     examined: Vec<usize>,
     /// Median of the positive levels of the examined stamps, if each stamp has its own.
     typical_level: Option<f64>,
@@ -725,7 +724,7 @@ fn survey_noise<'a, S: StampSource<'a>>(
     if let Some(again) = survey.without_sky() {
         survey = pass(again)?;
     }
-    Ok(survey.shared()?)
+    Ok(survey.result()?.map(Arc::new))
 }
 
 fn add_stamps<T: Pixel>(
@@ -737,42 +736,40 @@ fn add_stamps<T: Pixel>(
     stamps.outer_iter().try_for_each(|stamp| survey.add(stamp))
 }
 
-/// What noisy stars, one per galaxy, have in common. `None` if there is one PSF for all galaxies, a formula, no noise, or
+/// The residual profiles of noisy stars, one per galaxy. `None` if there is one PSF for all galaxies, a formula, no noise, or
 /// the configuration uses stars as they are.
 fn survey_stars<'a, S: StampSource<'a>>(
     measurer: &Measurer,
     source: &mut S,
     chosen: &[usize],
     threads: &impl Threads,
-) -> Result<Option<Arc<CommonProfile>>, S::Error> {
-    if measurer.star_looker().is_none() {
+) -> Result<Option<Arc<ResidualProfiles>>, S::Error> {
+    let Some(mut survey) = measurer.star_survey() else {
         return Ok(None);
-    }
-    let mut survey = StarSurvey::default();
+    };
     let rows = source.rows();
     scan(
         (rows, chosen, threads),
         |row| source.psfs(row),
         |psfs, range| {
-            let (Psfs::Stars(_), Some(mut looker)) = (&**psfs, measurer.star_looker()) else {
-                return Ok(Vec::new());
+            let (Psfs::Stars(_), Some(mut part)) = (&**psfs, measurer.star_survey()) else {
+                return Ok(None);
             };
-            Ok(range.map(|at| looker.look(psfs, at)).collect())
+            range.for_each(|at| part.add(psfs, at));
+            Ok(Some(part))
         },
-        |looks| {
-            if looks.is_empty() {
+        |part| {
+            let Some(part) = part else {
                 return Ok(ControlFlow::Break(()));
-            }
-            for look in looks {
-                survey.add(look);
-                if survey.is_over() {
-                    return Ok(ControlFlow::Break(()));
-                }
-            }
-            Ok(ControlFlow::Continue(()))
+            };
+            survey.join(part);
+            Ok(match survey.is_over() {
+                true => ControlFlow::Break(()),
+                false => ControlFlow::Continue(()),
+            })
         },
     )?;
-    Ok(survey.common())
+    Ok(survey.residual_profiles())
 }
 
 /// Reads `chosen` rows, as many at a time as there are threads, looks at parts of them, and takes what was found in the

@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use ndarray::{ArcArray2, Array2, ArrayView2, Ix3};
 use shearq_measure::{
     Batch, KnownNoise, Lazy, LazyStamps, Measurement, Measurer, OneThread, Pixels, Psfs, Session,
-    StampRows, StampSource, Steps, Threads, Worker, star_psf,
+    StampRows, StampSource, Star, Steps, Threads, Worker,
 };
 use shearq_quantities::Shear;
 use shearq_submissions::{Configuration, PsfForm};
@@ -49,7 +49,7 @@ impl<'s> SimulatedSource<'s> {
                 let star = simulate::star(psf, STAMP);
                 let psf = ArrayView2::from_shape((STAMP, STAMP), &star)
                     .ok()
-                    .and_then(|star| star_psf(star, cut).ok());
+                    .and_then(|star| Some(Star::cut(star, cut).ok()?.psf));
                 // A simulated star without noise can always be cut.
                 psf.unwrap_or_else(|| {
                     Array2::zeros((configuration.psf.size, configuration.psf.size))

@@ -345,14 +345,14 @@ fn main() -> Result<(), Box<dyn Error>> {
         let (stamps, _) = drawing.central(Profile::drawn(&mut rng), at)?;
         stamp.assign(&(&stamps[0][0] + &noise(&mut rng)));
     }
-    let star =
-        shearq_measure::star_psf(psf.stamp(SIDE).view(), measurer.configuration().psf_cut())?;
-    let psfs = Psfs::prepared(star.view());
+    let cut = measurer.configuration().psf_cut();
+    let star = shearq_measure::Star::cut(psf.stamp(SIDE).view(), cut)?;
+    let psfs = Psfs::prepared(star.psf.view());
     let mut source = ArraySource::new(&measurer, survey.view(), &psfs)?;
     let session = Session::open(&measurer, &mut source, KnownNoise::Stated(1.0), &OneThread)?;
     let mut worker = measurer.worker();
     let mut image = session.image(&mut worker);
-    let mut worker = image.psf(star.view())?;
+    let mut worker = image.psf(star.psf.view())?;
 
     for _ in 0..scenes {
         let at = place(&mut rng);

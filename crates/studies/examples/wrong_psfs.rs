@@ -14,8 +14,8 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 use shearq_measure::{
-    ArraySource, Examination, FunctionalPsf, KnownNoise, Measurer, OneThread, Psfs, Session,
-    Warning, star_psf,
+    ArraySource, Examination, FunctionalPsf, KnownNoise, Measurer, OneThread, Psfs, Session, Star,
+    Warning,
 };
 use shearq_quantities::Shear;
 use shearq_simulate::kinds::SetKind;
@@ -70,7 +70,7 @@ fn measured(
     galaxies: &Galaxies,
     star: &Array2<f64>,
 ) -> Result<[f64; 5], Box<dyn Error>> {
-    let psf = star_psf(star.view(), measurer.configuration().psf_cut())?;
+    let Star { psf, .. } = Star::cut(star.view(), measurer.configuration().psf_cut())?;
     measured_with(measurer, galaxies, &Psfs::prepared(psf.view()))
 }
 

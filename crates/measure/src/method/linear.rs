@@ -26,19 +26,19 @@ use shearq_submissions::{LinearDeconvolution, LinearMethod, Neighbours, PsfCut};
 use super::{
     AdaptedSettings, CutWorker, Found, FoundObservables, Images, NoiseField, image, whole_lags,
 };
+use crate::centroid::{galaxy_centroid, window_centre};
 use crate::deconvolve::{
     Descent, Gradients, Lags, ModeNoise, Spectral, SpectralPsf, SpectralScratch, Stop, uniform,
 };
 use crate::error::MeasureError;
-use crate::extent::Moments;
 use crate::measurement::ResponseMatrix;
+use crate::neighbours::NeighbourRemover;
 use crate::noise::StampNoise;
 use crate::pixel::hash;
-use crate::psf::shrink::Shrinker;
-use crate::psf::{CommonProfile, breadth};
+use crate::psf::{ResidualProfiles, StarDenoiser, width};
+use crate::second_moments::WeightedMoments;
 use crate::shape::{AdaptiveMoments, AdaptiveScratch, AdaptiveShape, Breadth};
 use crate::sheared::ShearSettings;
-use crate::surroundings::{Surroundings, centre, followed};
 
 // With 4 instead, errors of the mean shear with and without cuts change by less than 0.06 %: `simulate --sets 4
 // --images 4 --grid 100 --seed 5`, then `mean --where`. Sheared catalogues need the noise of every galaxy.
@@ -207,7 +207,7 @@ impl LinearFamily {
             n,
             cut,
             configured: Arc::new(LinearPlan::new(method, n, cut.size, variance)?),
-            others: breadth::STEPS.map(|_| Default::default()).collect(),
+            others: width::STEPS.map(|_| Default::default()).collect(),
         })
     }
 
@@ -221,7 +221,7 @@ impl LinearFamily {
             return Ok(Arc::clone(&self.configured));
         }
         let (step, window) = index;
-        let place = &self.others[(step - breadth::STEPS.start()) as usize][window];
+        let place = &self.others[(step - width::STEPS.start()) as usize][window];
         if let Some(plan) = place.get() {
             return Ok(Arc::clone(plan));
         }
@@ -229,7 +229,7 @@ impl LinearFamily {
         let target = &mut method.deconvolution.target_sigma;
         // A configured target beyond the bounds is kept.
         let (least, most) = (MIN_TARGET / *target, MAX_TARGET / *target);
-        let factor = breadth::factor(step).clamp(least.min(1.0), most.max(1.0));
+        let factor = width::scale_factor(step).clamp(least.min(1.0), most.max(1.0));
         *target *= factor;
         method.shape.weight_scale *= factor;
         let variance = Self::variance(&method, window);
@@ -245,8 +245,8 @@ impl LinearFamily {
             workers: vec![(CONFIGURED, PlanWorker::new(Arc::clone(&self.configured)))],
             current: 0,
             galaxy_variance: None,
-            moments: Moments::default(),
-            shrinker: Shrinker::default(),
+            moments: WeightedMoments::default(),
+            denoiser: StarDenoiser::default(),
             noise: StampNoise::white(1.0),
             family: Arc::clone(self),
         }
@@ -261,8 +261,8 @@ pub(super) struct LinearWorker {
     current: usize,
     noise: StampNoise,
     galaxy_variance: Option<f64>,
-    moments: Moments,
-    shrinker: Shrinker,
+    moments: WeightedMoments,
+    denoiser: StarDenoiser,
 }
 
 impl CutWorker for LinearWorker {
@@ -270,9 +270,9 @@ impl CutWorker for LinearWorker {
         &mut self,
         noise: &StampNoise,
         galaxy_variance: Option<f64>,
-        stars: Option<&Arc<CommonProfile>>,
+        stars: Option<&Arc<ResidualProfiles>>,
     ) {
-        self.shrinker.set_common(stars);
+        self.denoiser.set_residual_profiles(stars);
         self.galaxy_variance = galaxy_variance;
         // The noise of each mode takes as long as several galaxies, and rows of an image share it.
         if self.noise != *noise {
@@ -291,11 +291,11 @@ impl CutWorker for LinearWorker {
             let expected = format!("{parity} number a side, {least} to {size}");
             return Err(MeasureError::square("a PSF stamp", psf.dim(), expected));
         }
-        let psf = self.shrinker.shrunk(psf);
+        let psf = self.denoiser.denoised(psf);
         let settings = &self.family.method.deconvolution;
         let (reference, variance) = (settings.reference_extent, self.galaxy_variance);
         let window = window_index(variance, psf, reference, &mut self.moments);
-        let index = (breadth::step(psf, settings.reference_area), window);
+        let index = (width::step(psf, settings.reference_area), window);
         let known = self.workers.iter().position(|(of, _)| *of == index);
         self.current = if let Some(known) = known {
             known
@@ -329,7 +329,7 @@ struct PlanWorker {
     /// Amplitude of the noise at wavenumber zero in units of white noise: the noise of sums over many pixels.
     low_k_noise: f32,
     /// None if neighbours are kept.
-    surroundings: Option<Surroundings>,
+    neighbours: Option<NeighbourRemover>,
     psf: SpectralPsf,
     /// Terms of [`Regularisation::behind`].
     regularisation: [f32; 2],
@@ -347,11 +347,11 @@ struct PlanWorker {
 
 impl PlanWorker {
     fn new(plan: Arc<LinearPlan>) -> Self {
-        let surroundings = || Surroundings::new(plan.spectral.stamp_size());
+        let neighbours = || NeighbourRemover::new(plan.spectral.stamp_size());
         PlanWorker {
             noise: plan.spectral.noise(&StampNoise::white(1.0)),
             low_k_noise: 1.0,
-            surroundings: plan.removes_neighbours.then(surroundings),
+            neighbours: plan.removes_neighbours.then(neighbours),
             psf: plan.spectral.psf(),
             regularisation: [0.0; 2],
             gradients: plan.spectral.gradients(),
@@ -478,17 +478,17 @@ impl PlanWorker {
     fn measure(&mut self, stamp: &[f32], noise: f64) -> Found {
         let plan = Arc::clone(&self.plan);
         let sigma = noise as f32;
-        let place = centre(stamp, plan.spectral.stamp_size());
-        let surroundings = self.surroundings.as_mut();
-        let cleared = surroundings.map_or(Ok(false), |surroundings| {
-            surroundings.clear(stamp, place, self.low_k_noise * sigma)
+        let place = galaxy_centroid(stamp, plan.spectral.stamp_size());
+        let neighbours = self.neighbours.as_mut();
+        let cleared = neighbours.map_or(Ok(false), |neighbours| {
+            neighbours.remove(stamp, place, self.low_k_noise * sigma)
         });
-        let cut = match &self.surroundings {
-            Some(surroundings) if cleared == Ok(true) => &surroundings.filled,
+        let cut = match &self.neighbours {
+            Some(neighbours) if cleared == Ok(true) => &neighbours.cleaned,
             _ => stamp,
         };
         let (buffers, lags) = (&mut self.buffers, &mut self.lags);
-        plan.spectral.place_window(followed(place), buffers);
+        plan.spectral.place_window(window_centre(place), buffers);
         plan.spectral
             .autocorrelate(&self.psf, cut, sigma, buffers, lags);
         let divisor = self.regularisation[0] * sigma * sigma;
@@ -556,12 +556,12 @@ fn window_index(
     seen: Option<f64>,
     psf: ArrayView2<'_, f64>,
     reference: f64,
-    moments: &mut Moments,
+    moments: &mut WeightedMoments,
 ) -> usize {
     let (Some(seen), true) = (seen, reference > 0.0) else {
         return CONFIGURED_WINDOW;
     };
-    let Some(psf) = moments.of_psf(psf) else {
+    let Some(psf) = moments.psf_mean_square(psf) else {
         return CONFIGURED_WINDOW;
     };
     // A point source has no positive ratio, and gets the narrowest window.
@@ -629,7 +629,7 @@ mod tests {
     #[test]
     fn windows_follow_the_galaxies_without_their_psf() {
         assert_eq!(WINDOW_STEPS.count(), WINDOW_COUNT);
-        let mut moments = Moments::default();
+        let mut moments = WeightedMoments::default();
         // A variance of 3 px².
         let psf = Array2::from_shape_fn((32, 32), |(y, x)| {
             let (x, y) = (x as f64 - 15.5, y as f64 - 15.5);
@@ -735,7 +735,7 @@ mod tests {
         let mut radius = |extent: Option<f64>| {
             let survey = Survey {
                 noise: StampNoise::white(0.1),
-                extent,
+                mean_square_radius: extent,
                 sky: None,
             };
             let survey = Arc::new(survey);
@@ -808,7 +808,7 @@ mod tests {
         let half_snr = 15.0;
         let mut workers =
             [half_snr, 0.0].map(|snr| Measurer::new(&wide_psf(snr), 48).unwrap().worker());
-        let mut moments = Moments::default();
+        let mut moments = WeightedMoments::default();
         for (fwhm, window) in [
             (2.4, CONFIGURED_WINDOW),
             (3.4, CONFIGURED_WINDOW),
@@ -821,12 +821,12 @@ mod tests {
             let extent = galaxy_variance(8.8, 8.0, window);
             let stamp = stamp(extent, (fwhm / 2.354_82_f64).powi(2) + 1.0 / 12.0);
             let light = stamp.iter().map(|&v| f64::from(v).powi(2)).sum::<f64>();
-            let seen = extent + moments.of_psf(psf.view()).unwrap();
+            let seen = extent + moments.psf_mean_square(psf.view()).unwrap();
             // ν²/(ν² + ν₀²).
             for (snr, share) in [(half_snr, 0.5), (2.0 * half_snr, 0.8)] {
                 let survey = Arc::new(Survey {
                     noise: StampNoise::white(light.sqrt() / snr),
-                    extent: Some(seen),
+                    mean_square_radius: Some(seen),
                     sky: None,
                 });
                 let [soft, hard] = workers.each_mut().map(|worker| {

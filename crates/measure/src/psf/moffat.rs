@@ -1,49 +1,53 @@
-//! An elliptical Moffat profile that fits a star.
+//! The elliptical Moffat profile that fits a star best.
 //!
-//! I = A (1 + κ s)^(−1/κ), with s a quadratic form about the star's place: a Gaussian of A exp(−s) for κ → 0, and a Moffat
-//! profile of β = 1/κ. Gauss and Newton's steps, damped after Levenberg.
+//! I = A (1 + κ s)^(−1/κ) + A w (1 + s/6)^(−3/2), with s a quadratic form about the star's centre: a Gaussian of A exp(−s)
+//! for κ → 0, and a Moffat profile of β = 1/κ, with a wing. The fit takes Gauss–Newton steps with Levenberg's damping.
 
 use multiversion::multiversion;
 use ndarray::{ArrayView2, ArrayViewMut2};
 use shearq_quantities::linear::cholesky;
 
-/// Parameters: amplitude, place, width, the two ellipticities and κ.
-pub(super) const PARAMETERS: usize = 8;
-/// κ = 1/β that is expected of a star, and its standard deviation. See docs/constants.md.
-const EXPECTED: [f64; 2] = [0.25, 0.2];
-/// Bounds of κ. See docs/constants.md.
-const BOUNDS: [f64; 2] = [-0.2, 0.7];
-/// Amplitude of the wing that is expected, in units of the core's, and its standard deviation. See
-/// docs/constants.md.
-const WING: [f64; 2] = [0.002, 0.006];
-/// Square of the scale of the wing in units of the core's. See docs/constants.md.
-const BROAD: f32 = 6.0;
-/// Half the side of the square of the fit, in units of the Gaussian σ of the star's area. See docs/constants.md.
-const REACH: f64 = 8.0;
-/// Most steps of a fit. See docs/constants.md.
-const STEPS: usize = 12;
-/// Change of χ² by a step, at which the fit ends. See docs/constants.md.
-const SMALL: f64 = 1e-2;
-/// Pixels that are summed side by side. See docs/constants.md.
-const LANES: usize = 8;
-/// Base of the power of a profile with κ < 0 at which it ends.
-const LEAST_BASE: f32 = 1e-6;
+/// Amplitude, centre (x, y), logarithm of the width w of s = r²/w², two ellipticities, κ and the wing.
+const PARAMETERS: usize = 8; // Counts them.
+const KAPPA: usize = 6; // Place of κ among the parameters.
+const WING: usize = 7; // Place of the wing's amplitude, in units of the core's.
 
-/// An elliptical Moffat profile.
+// κ = 1/β that is expected of a star, and its standard deviation.
+// β = 3 to 4.8 of Moffat and Kolmogorov profiles. Loose: a star of S/N 50 determines κ to about 0.06.
+const KAPPA_PRIOR: [f64; 2] = [0.25, 0.2];
+// Below zero the core ends, as in an Airy disc. Chosen by hand.
+const KAPPA_BOUNDS: [f64; 2] = [-0.2, 0.7];
+// Amplitude of the wing that is expected, and its standard deviation.
+// About 2 % and 7 % of the light. Chosen by hand for Moffat, Kolmogorov and Airy profiles.
+const WING_PRIOR: [f64; 2] = [0.002, 0.006];
+// Square of the scale of the wing in units of the core's.
+// Chosen by hand.
+const WING_SQUARE: f32 = 6.0;
+// Half the side of the square of the fit, in units of the Gaussian σ of the star's area.
+// 15 px for a FWHM of 3.4 px. Chosen by hand.
+const FIT_HALF_SIDE: f64 = 8.0;
+// Chosen by hand.
+const MAX_STEPS: usize = 12;
+// Change of χ² at which the fit ends.
+// A tenth of the error of a parameter, and above the rounding of single precision.
+const CONVERGED_CHI2: f64 = 1e-2;
+// One vector of AVX2.
+const LANES: usize = 8;
+// Base of the power at which a profile with κ < 0 ends.
+// Within single precision.
+const MIN_BASE: f32 = 1e-6;
+
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Moffat {
-    /// Amplitude; place (x, y) in pixels from the first; logarithm of the width of s = r²/w²; ellipticities; κ.
     values: [f64; PARAMETERS],
 }
 
-/// Sums of products over pixels in each lane, in units of the amplitude.
+/// Sums over pixels in each lane, in units of the amplitude: of the squared residual, of derivatives with the residual, and
+/// of derivatives with each other up to the diagonal.
 #[derive(Clone, Copy)]
 struct Products {
-    /// Of what is left, squared.
     square: [f32; LANES],
-    /// Of derivatives with what is left.
     gradient: [[f32; LANES]; PARAMETERS],
-    /// Of derivatives with each other, up to the diagonal.
     curvature: [[[f32; LANES]; PARAMETERS]; PARAMETERS],
 }
 
@@ -55,61 +59,62 @@ impl Products {
     };
 }
 
-/// Sums for a step: of squares, and their derivatives.
-struct Sums {
-    square: f64,
+/// χ² with the priors, and its derivatives.
+struct ChiSquare {
+    value: f64,
     gradient: [f64; PARAMETERS],
     curvature: [[f64; PARAMETERS]; PARAMETERS],
 }
 
 impl Moffat {
-    /// The profile that fits a star at `place` with a noise-equivalent area of `area` px² and noise `sigma` best; `None`
-    /// if there is none.
+    /// Fits a star near `centre` with a noise-equivalent area of `area` px² and noise `sigma`; `None` if the fit diverges.
     pub(super) fn fit(
         star: ArrayView2<'_, f64>,
-        place: [f64; 2],
+        centre: [f64; 2],
         area: f64,
         sigma: f64,
     ) -> Option<Moffat> {
         // A Gaussian of mean square σ² has an area of 4πσ², and s = r²/(2σ²).
         let mean_square = area / (4.0 * std::f64::consts::PI);
-        let reach = REACH * mean_square.sqrt();
+        let half_side = FIT_HALF_SIDE * mean_square.sqrt();
         let width = 0.5 * (2.0 * mean_square).ln();
         let sum = star.sum();
         let mut at = Moffat {
             values: [
                 sum / (2.0 * std::f64::consts::PI * mean_square),
-                place[0],
-                place[1],
+                centre[0],
+                centre[1],
                 width,
                 0.0,
                 0.0,
-                EXPECTED[0],
+                KAPPA_PRIOR[0],
                 0.0,
             ],
         };
-        let mut sums = at.sums(star, place, reach, sigma);
+        let mut chi2 = at.chi_square(star, centre, half_side, sigma);
         let mut damping = 1e-3;
-        for _ in 0..STEPS {
-            let step = solve(&sums, damping)?;
+        for _ in 0..MAX_STEPS {
+            let step = damped_step(&chi2, damping)?;
             let mut next = at;
             for (value, step) in next.values.iter_mut().zip(step) {
                 *value += step;
             }
-            next.values[6] = next.values[6].clamp(BOUNDS[0], BOUNDS[1]);
-            if next.values[6].abs() < 1e-3 {
-                next.values[6] = 1e-3;
+            let kappa = &mut next.values[KAPPA];
+            *kappa = kappa.clamp(KAPPA_BOUNDS[0], KAPPA_BOUNDS[1]);
+            // The power is not defined at κ = 0, where the profile is a Gaussian to rounding.
+            if kappa.abs() < 1e-3 {
+                *kappa = 1e-3;
             }
-            let round = next.values[4].hypot(next.values[5]);
-            let near = (next.values[1] - place[0]).hypot(next.values[2] - place[1]);
-            let usable = round < 0.9 && near < 4.0 && (next.values[3] - width).abs() < 1.5;
-            let found = usable.then(|| next.sums(star, place, reach, sigma));
+            let ellipticity = next.values[4].hypot(next.values[5]);
+            let moved = (next.values[1] - centre[0]).hypot(next.values[2] - centre[1]);
+            let is_star = ellipticity < 0.9 && moved < 4.0 && (next.values[3] - width).abs() < 1.5;
+            let found = is_star.then(|| next.chi_square(star, centre, half_side, sigma));
             match found {
-                Some(found) if found.square <= sums.square => {
-                    let gain = sums.square - found.square;
-                    (at, sums) = (next, found);
+                Some(found) if found.value <= chi2.value => {
+                    let gain = chi2.value - found.value;
+                    (at, chi2) = (next, found);
                     damping *= 0.1;
-                    if gain < SMALL {
+                    if gain < CONVERGED_CHI2 {
                         return (at.values[0] > 0.0).then_some(at);
                     }
                 }
@@ -119,9 +124,13 @@ impl Moffat {
         (at.values[0] > 0.0 && at.values.iter().all(|value| value.is_finite())).then_some(at)
     }
 
-    /// Its amplitude.
     pub(super) fn amplitude(&self) -> f64 {
         self.values[0]
+    }
+
+    /// (x, y) in pixels from the first.
+    pub(super) fn centre(&self) -> [f64; 2] {
+        [self.values[1], self.values[2]]
     }
 
     /// The form s at (x, y) in pixels from the first.
@@ -135,17 +144,11 @@ impl Moffat {
         }
     }
 
-    /// Its place (x, y) in pixels from the first.
-    pub(super) fn place(&self) -> [f64; 2] {
-        [self.values[1], self.values[2]]
-    }
-
-    /// Mean σ of the Gaussian that it is in the middle.
+    /// Mean σ of the Gaussian that the profile is at its centre.
     pub(super) fn sigma(&self) -> f64 {
         self.values[3].exp() * std::f64::consts::FRAC_1_SQRT_2
     }
 
-    /// Draws it at the centres of pixels.
     pub(super) fn draw(&self, mut to: ArrayViewMut2<'_, f64>) {
         let (n, single) = (to.ncols(), self.single());
         for (y, mut row) in to.rows_mut().into_iter().enumerate() {
@@ -158,22 +161,29 @@ impl Moffat {
         }
     }
 
+    /// In single precision, with the scale 1/w² in place of the logarithm of the width.
     fn single(&self) -> [f32; PARAMETERS] {
         let mut single = self.values.map(|value| value as f32);
         single[3] = (-2.0 * self.values[3]).exp() as f32;
         single
     }
 
-    fn sums(&self, star: ArrayView2<'_, f64>, middle: [f64; 2], reach: f64, sigma: f64) -> Sums {
+    fn chi_square(
+        &self,
+        star: ArrayView2<'_, f64>,
+        centre: [f64; 2],
+        half_side: f64,
+        sigma: f64,
+    ) -> ChiSquare {
         let range = |at: f64, side: usize| {
-            let first = (at - reach).ceil().max(0.0) as usize;
-            let last = ((at + reach).floor().max(0.0) as usize + 1).min(side);
+            let first = (at - half_side).ceil().max(0.0) as usize;
+            let last = ((at + half_side).floor().max(0.0) as usize + 1).min(side);
             first.min(last)..last
         };
         let single = self.single();
         let mut products = Products::ZERO;
-        let columns = range(middle[0], star.ncols());
-        for y in range(middle[1], star.nrows()) {
+        let columns = range(centre[0], star.ncols());
+        for y in range(centre[1], star.nrows()) {
             for x in columns.clone().step_by(LANES) {
                 let (mut values, mut weights) = ([0.0; LANES], [0.0; LANES]);
                 for lane in 0..LANES.min(columns.end - x) {
@@ -193,30 +203,27 @@ impl Moffat {
             let sum: f64 = lanes.into_iter().map(f64::from).sum();
             sum * (self.values[0] / sigma).powi(2)
         };
-        let mut sums = Sums {
-            square: total(products.square),
+        let mut chi2 = ChiSquare {
+            value: total(products.square),
             gradient: products.gradient.map(total),
             curvature: [[0.0; PARAMETERS]; PARAMETERS],
         };
         // The derivative with the amplitude is in units of it.
         let unit = |i: usize| if i == 0 { 1.0 / self.values[0] } else { 1.0 };
         for i in 0..PARAMETERS {
-            sums.gradient[i] *= unit(i);
+            chi2.gradient[i] *= unit(i);
             for j in 0..=i {
-                sums.curvature[i][j] = total(products.curvature[i][j]) * unit(i) * unit(j);
-                sums.curvature[j][i] = sums.curvature[i][j];
+                chi2.curvature[i][j] = total(products.curvature[i][j]) * unit(i) * unit(j);
+                chi2.curvature[j][i] = chi2.curvature[i][j];
             }
         }
-        let [kappa, wing] = [self.values[6], self.values[7]];
-        for (i, off, error) in [
-            (6, kappa - EXPECTED[0], EXPECTED[1]),
-            (7, wing - WING[0], WING[1]),
-        ] {
-            sums.square += (off / error).powi(2);
-            sums.gradient[i] -= off / (error * error);
-            sums.curvature[i][i] += 1.0 / (error * error);
+        for (i, [mean, error]) in [(KAPPA, KAPPA_PRIOR), (WING, WING_PRIOR)] {
+            let off = self.values[i] - mean;
+            chi2.value += (off / error).powi(2);
+            chi2.gradient[i] -= off / (error * error);
+            chi2.curvature[i][i] += 1.0 / (error * error);
         }
-        sums
+        chi2
     }
 }
 
@@ -236,7 +243,7 @@ fn drawn(single: &[f32; PARAMETERS], x: f32, y: f32) -> [f32; LANES] {
     values
 }
 
-/// Adds the products of a step for pixels from `at` on: of `values` in units of the amplitude.
+/// Adds the products of pixels from `at` on, whose `values` are in units of the amplitude.
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 fn add(
     single: &[f32; PARAMETERS],
@@ -249,7 +256,7 @@ fn add(
     let dy = at[1] - y0;
     let inverse = 1.0 / kappa;
     let mut by = [[0.0f32; LANES]; PARAMETERS];
-    let mut left = [0.0f32; LANES];
+    let mut residual = [0.0f32; LANES];
     for lane in 0..LANES {
         let dx = at[0] + lane as f32 - x0;
         let (across, along) = (dx * dx - dy * dy, 2.0 * dx * dy);
@@ -257,7 +264,7 @@ fn add(
         let base = 1.0 + kappa * s;
         let (core, log) = core(base, inverse);
         let (tail, tail_slope) = tail(s);
-        let core_slope = -core / base.max(LEAST_BASE);
+        let core_slope = -core / base.max(MIN_BASE);
         let slope = core_slope + wing * tail_slope;
         let weight = weights[lane];
         let mean = core * pixel(base, s, kappa, scale);
@@ -269,41 +276,41 @@ fn add(
         by[5][lane] = weight * -slope * scale * along;
         by[6][lane] = weight * (core * log * inverse + s * core_slope) * inverse;
         by[7][lane] = weight * tail;
-        left[lane] = weight * (values[lane] - mean - wing * tail);
+        residual[lane] = weight * (values[lane] - mean - wing * tail);
     }
     let take = |sum: &mut [f32; LANES], a: &[f32; LANES], b: &[f32; LANES]| {
         for lane in 0..LANES {
             sum[lane] += a[lane] * b[lane];
         }
     };
-    take(&mut sums.square, &left, &left);
+    take(&mut sums.square, &residual, &residual);
     for i in 0..PARAMETERS {
-        take(&mut sums.gradient[i], &by[i], &left);
+        take(&mut sums.gradient[i], &by[i], &residual);
         for j in 0..=i {
             take(&mut sums.curvature[i][j], &by[i], &by[j]);
         }
     }
 }
 
-/// The wing of a core of scale one, and its derivative with s.
+/// The wing and its derivative with s.
 #[inline(always)]
 fn tail(s: f32) -> (f32, f32) {
-    let base = 1.0 + s / BROAD;
+    let base = 1.0 + s / WING_SQUARE;
     let value = 1.0 / (base * base.sqrt());
-    (value, -1.5 * value / (base * BROAD))
+    (value, -1.5 * value / (base * WING_SQUARE))
 }
 
 /// Mean of a core over a pixel in units of its value in the middle: 1 + ∇²f/(24 f), of a round one.
 #[inline(always)]
 fn pixel(base: f32, s: f32, kappa: f32, scale: f32) -> f32 {
-    let inverse = 1.0 / base.max(LEAST_BASE);
+    let inverse = 1.0 / base.max(MIN_BASE);
     1.0 + scale / 6.0 * inverse * (s * (1.0 + kappa) * inverse - 1.0)
 }
 
 /// base^(−1/κ) and the natural logarithm of base, which for κ < 0 ends at zero.
 #[inline(always)]
 fn core(base: f32, inverse: f32) -> (f32, f32) {
-    let bits = base.max(LEAST_BASE).to_bits() as i32;
+    let bits = base.max(MIN_BASE).to_bits() as i32;
     // A power of two times a number between √½ and √2.
     let exponent = (bits - 0x3f35_04f3) >> 23;
     let rest = f32::from_bits((bits - (exponent << 23)) as u32);
@@ -321,13 +328,12 @@ fn core(base: f32, inverse: f32) -> (f32, f32) {
     (power * series, log)
 }
 
-/// The step that lowers the sum of squares, by Cholesky's decomposition.
-fn solve(sums: &Sums, damping: f64) -> Option<[f64; PARAMETERS]> {
-    let mut curvature = sums.curvature;
+fn damped_step(chi2: &ChiSquare, damping: f64) -> Option<[f64; PARAMETERS]> {
+    let mut curvature = chi2.curvature;
     for (i, row) in curvature.iter_mut().enumerate() {
         row[i] *= 1.0 + damping;
     }
-    let mut step = sums.gradient;
+    let mut step = chi2.gradient;
     let positive = |pivot: f64| (pivot > 0.0 && pivot.is_finite()).then_some(pivot);
     cholesky(&mut curvature, &mut step, PARAMETERS, positive)?;
     Some(step)

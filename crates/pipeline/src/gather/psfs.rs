@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use ndarray::{ArrayView2, ArrayView3};
 use shearq_files::FileError;
 use shearq_files::atomic;
-use shearq_measure::{EXAMINED_PSFS, Examination, Psfs, Star, Warning, average_stars, star};
+use shearq_measure::{EXAMINED_PSFS, Examination, Psfs, Star, Warning, average_stars};
 use shearq_submissions::PsfCut;
 use shearq_submissions::limits::LEAST_PSF;
 
@@ -90,7 +90,7 @@ pub(super) fn gather_psfs(
             dark += 1;
         }
         if let Ok(stamp) = ArrayView2::from_shape((side, side), &pixels)
-            && let Ok(Star { psf, moved }) = star(stamp, examined_cut(side))
+            && let Ok(Star { psf, moved }) = Star::cut(stamp, examined_cut(side))
         {
             examination.add_psf(psf.view(), moved);
         }

@@ -5,7 +5,7 @@ use std::path::Path;
 use ndarray::{ArcArray2, ArrayView2};
 use shearq_files::FileError;
 use shearq_files::fits::ImageReader;
-use shearq_measure::{FunctionalPsf, Psfs, Star, star};
+use shearq_measure::{FunctionalPsf, Psfs, Star};
 use shearq_submissions::{Configuration, PsfCut, PsfForm};
 
 use super::stamps::{check_strip, read_row, stated_image};
@@ -158,7 +158,7 @@ fn open_stars(path: &Path, cut: PsfCut, mosaic: &Mosaic) -> Result<OpenPsfs, Fil
     let pixels = image.read_rows(height)?;
     let stamp = ArrayView2::from_shape((height, width), &pixels)
         .map_err(|error| FileError::new(path, error))?;
-    let Star { psf, moved } = star(stamp, cut).map_err(|error| FileError::new(path, error))?;
+    let Star { psf, moved } = Star::cut(stamp, cut).map_err(|error| FileError::new(path, error))?;
     Ok(OpenPsfs {
         source: PsfSource::Shared(psf.into_shared()),
         moved,

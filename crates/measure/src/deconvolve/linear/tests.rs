@@ -417,7 +417,7 @@ fn of_summed(rng: &mut ChaCha8Rng) -> StampNoise {
         let stamp = Array2::from_shape_vec((48, 48), summed(48, rng)).unwrap();
         survey.add(stamp.view()).unwrap();
     }
-    survey.noise().unwrap()
+    survey.result().unwrap().unwrap().noise
 }
 
 #[test]

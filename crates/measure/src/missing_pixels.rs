@@ -1,98 +1,97 @@
 //! Pixels that are missing: bad ones, cosmic rays, another object's, or those beyond the edge of an exposure.
 //!
-//! They get the light of the opposite ones, which a galaxy that looks the same turned by 180 degrees has there, sheared or
+//! They get the light of the opposite ones, which a galaxy that looks the same rotated by 180 degrees has there, sheared or
 //! not. Noise that is repeated like this adds to the autocorrelation at the lag between the two, so that near the galaxy
 //! only few may be missing.
 
-use super::centre::centre;
-use super::contrast::{opposite, turn};
+use crate::asymmetry::{opposite, rotation_sum};
+use crate::centroid::galaxy_centroid;
 
-/// Largest share of a stamp that may be missing. See docs/constants.md.
-const MOST: f32 = 0.25;
-/// Largest share of a stamp that may be missing together with the opposite pixels. See
-/// docs/constants.md.
-const MOST_TWICE: f32 = 0.02;
-/// Radius around the galaxy's centre with stricter limits. See docs/constants.md.
-const INSIDE: f32 = 12.0;
-/// Most missing pixels within that radius. See docs/constants.md.
-const MOST_INSIDE: usize = 24;
-/// Neighbouring pixels that must be present where a pixel and its opposite are missing. See
-/// docs/constants.md.
-const LEAST_AROUND: usize = 7;
+// Of the pixels of a stamp. Chosen by hand.
+const MAX_SHARE: f32 = 0.25;
+// Of the pixels of a stamp, if the opposite ones are missing too. Chosen by hand.
+const MAX_SHARE_OF_PAIRS: f32 = 0.02;
+// In pixels around the galaxy's centre, with stricter limits. Chosen by hand.
+const INNER_RADIUS: f32 = 12.0;
+// Missing pixels within that radius. Chosen by hand.
+const MAX_INNER: usize = 24;
+// Of the eight around a pixel whose opposite is missing too. Chosen by hand.
+const MIN_ADJACENT: usize = 7;
 
-/// The pixels of a stamp that are missing, and what they are given.
+/// Fills missing pixels, with buffers for one thread.
 #[derive(Debug, Clone, Default)]
-pub(crate) struct Missing {
+pub(crate) struct MissingPixels {
     places: Vec<usize>,
     lights: Vec<f32>,
 }
 
-impl Missing {
-    /// Room for stamps of `n` pixels a side.
+impl MissingPixels {
+    /// For stamps of up to `n` pixels a side without allocation.
     pub(crate) fn new(n: usize) -> Self {
-        Missing {
+        MissingPixels {
             places: Vec::with_capacity(n * n),
             lights: Vec::with_capacity(n * n),
         }
     }
 
-    /// Fills the pixels of a stamp of `n` pixels a side that are not finite. False where too many are, or a hole is on
-    /// both sides of the galaxy's centre.
-    pub(crate) fn mend(&mut self, stamp: &mut [f32], n: usize) -> bool {
+    /// Fills the pixels of a stamp of `n` pixels a side that are not finite. False if too many are, or a hole is on both
+    /// sides of the galaxy's centre.
+    pub(crate) fn fill(&mut self, stamp: &mut [f32], n: usize) -> bool {
         self.places.clear();
-        let all = stamp.iter().enumerate();
-        let missing = all.filter(|(_, value)| !value.is_finite());
+        let pixels = stamp.iter().enumerate();
+        let missing = pixels.filter(|(_, value)| !value.is_finite());
         self.places.extend(missing.map(|(at, _)| at));
-        if self.places.len() as f32 > MOST * stamp.len() as f32 {
+        if self.places.len() as f32 > MAX_SHARE * stamp.len() as f32 {
             return false;
         }
-        // The centre is found on a stamp that is filled about its middle.
-        self.fill(stamp, n, [0.0; 2]);
-        let found = centre(stamp, n);
+        // The centroid needs all pixels: first filled about the stamp's centre, then about the galaxy's.
+        self.fill_about(stamp, n, [0.0; 2]);
+        let centroid = galaxy_centroid(stamp, n);
         for &at in &self.places {
             stamp[at] = f32::NAN;
         }
-        let near = |at: &&usize| is_near(**at, n, found);
-        self.fill(stamp, n, found) && self.places.iter().filter(near).count() <= MOST_INSIDE
+        let inner = self.places.iter().filter(|at| is_inner(**at, n, centroid));
+        let is_known = inner.count() <= MAX_INNER;
+        self.fill_about(stamp, n, centroid) && is_known
     }
 
-    /// Gives missing pixels the light of the opposite ones, or where that is missing too the mean of those around, or
-    /// none. False where that is so near the centre, or of many.
-    fn fill(&mut self, stamp: &mut [f32], n: usize, centre: [f32; 2]) -> bool {
-        let turn = turn(centre, n);
-        let (mut whole, mut dark) = (true, 0);
+    /// Gives missing pixels the light of the opposite ones, or if that is missing too the mean of the adjacent ones, or
+    /// zero. False if that happens near the centre, or to many.
+    fn fill_about(&mut self, stamp: &mut [f32], n: usize, centroid: [f32; 2]) -> bool {
+        let rotation = rotation_sum(centroid, n);
+        let (mut is_known, mut dark) = (true, 0);
         self.lights.clear();
         for &at in &self.places {
-            let other = opposite(stamp, n, turn, [at % n, at / n]);
+            let other = opposite(stamp, n, rotation, [at % n, at / n]);
             let light = other.filter(|light| light.is_finite());
-            let light = light.or_else(|| around(stamp, n, at));
+            let light = light.or_else(|| adjacent_mean(stamp, n, at));
             if light.is_none() {
                 // An opposite that is off the stamp is so far out that there is no light.
                 dark += usize::from(other.is_some());
-                whole &= !is_near(at, n, centre);
+                is_known &= !is_inner(at, n, centroid);
             }
             self.lights.push(light.unwrap_or(0.0));
         }
+        // Only now, so that no pixel is filled from one that was filled.
         for (&at, &light) in self.places.iter().zip(&self.lights) {
             stamp[at] = light;
         }
-        whole && dark as f32 <= MOST_TWICE * stamp.len() as f32
+        is_known && dark as f32 <= MAX_SHARE_OF_PAIRS * stamp.len() as f32
     }
 }
 
-fn is_near(at: usize, n: usize, centre: [f32; 2]) -> bool {
+fn is_inner(at: usize, n: usize, centroid: [f32; 2]) -> bool {
     let place = |at: usize, c: f32| at as f32 - (n as f32 - 1.0) / 2.0 - c;
-    place(at % n, centre[0]).hypot(place(at / n, centre[1])) < INSIDE
+    place(at % n, centroid[0]).hypot(place(at / n, centroid[1])) < INNER_RADIUS
 }
 
-/// The mean of the pixels around one, if enough are there.
-fn around(stamp: &[f32], n: usize, at: usize) -> Option<f32> {
+fn adjacent_mean(stamp: &[f32], n: usize, at: usize) -> Option<f32> {
     let (x, y) = (at % n, at / n);
     let side = |at: usize| at.saturating_sub(1)..(at + 2).min(n);
     let square = side(y).flat_map(|y| side(x).map(move |x| stamp[y * n + x]));
     let there = square.filter(|light| light.is_finite());
     let (sum, count) = there.fold((0.0, 0), |(sum, count), light| (sum + light, count + 1));
-    (count >= LEAST_AROUND).then(|| sum / count as f32)
+    (count >= MIN_ADJACENT).then(|| sum / count as f32)
 }
 
 #[cfg(test)]
@@ -116,9 +115,9 @@ mod tests {
             stamp[y * N + x] = f32::NAN;
         }
         // What was found before does not matter.
-        let mut dirty = Missing::new(N);
-        dirty.mend(&mut [f32::INFINITY; 49], 7);
-        dirty.mend(&mut stamp, N).then_some(stamp)
+        let mut dirty = MissingPixels::new(N);
+        dirty.fill(&mut [f32::INFINITY; 49], 7);
+        dirty.fill(&mut stamp, N).then_some(stamp)
     }
 
     #[test]
@@ -142,7 +141,7 @@ mod tests {
     }
 
     #[test]
-    fn holes_that_hide_the_galaxy_are_told() {
+    fn holes_that_hide_the_galaxy_are_refused() {
         // Opposite patches near the centre at (24, 23), and away from it; of single pixels the mean of those around.
         let patches = |dx: usize| {
             let patch = (0..9).map(move |k| (24 + dx + k % 3, 19 + k / 3));
