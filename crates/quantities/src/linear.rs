@@ -8,7 +8,7 @@
 /// Only the lower triangle of `matrix` is used. The root replaces it, and the solution replaces `right`.
 ///
 /// `pivot` receives the square of each diagonal element of the root and returns the square to use. If it returns `None`,
-/// the equations are not soluble: the result is `None`, and `matrix` and `right` are of no use.
+/// the equations are not soluble: the result is `None`, and `matrix` and `right` hold intermediate numbers.
 #[inline]
 pub fn cholesky<const N: usize>(
     matrix: &mut [[f64; N]; N],
@@ -36,7 +36,7 @@ pub fn cholesky<const N: usize>(
     Some(())
 }
 
-/// The equation that eliminates the next unknown, among the equations that are left.
+/// Which of the remaining equations eliminates the next unknown.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Pivots {
     /// The equation with the largest coefficient of this unknown: for any matrix.
@@ -87,7 +87,7 @@ pub fn substitute<R: AsRef<[f64]>>(rows: &[R], out: &mut [f64]) {
     }
 }
 
-/// Sweeps over a matrix. Convergence is quadratic at the end, and half as many reach the width of f64 for a dozen rows.
+// Convergence is quadratic at the end, and half as many sweeps reach the width of f64 for a dozen rows.
 const SWEEPS: usize = 12;
 
 /// Diagonalises a symmetric matrix by Jacobi's rotations. The eigenvalues replace its diagonal, in no order. Row k of the result is
@@ -141,7 +141,7 @@ mod tests {
     }
 
     #[test]
-    fn the_root_of_a_matrix_solves_its_equations_from_the_lower_triangle() {
+    fn cholesky_uses_the_lower_triangle() {
         let (mut matrix, mut right) = (MATRIX, product(&MATRIX));
         for (i, row) in matrix.iter_mut().enumerate() {
             row[i + 1..].fill(f64::NAN);
@@ -178,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn elimination_solves_any_matrix_and_exchanges_rows_if_asked() {
+    fn elimination_solves_any_matrix_if_rows_are_exchanged() {
         // Without exchange the first pivot is zero.
         let matrix = [[0.0, 2.0, 1.0], [1.0, -1.0, 0.5], [3.0, 0.5, -2.0]];
         let right = product(&matrix);
@@ -193,10 +193,12 @@ mod tests {
         substitute(&exchanged, &mut found);
         close(&found, &SOLUTION);
         assert!(!eliminate(&mut rows.clone(), Pivots::InOrder, 1e-9));
+        let mut dependent = [[1.0, 2.0, 1.0], [2.0, 4.0, 2.0]];
+        assert!(!eliminate(&mut dependent, Pivots::Largest, 1e-9));
     }
 
     #[test]
-    fn the_last_pivot_in_order_is_one_over_the_variance_of_the_last_unknown() {
+    fn the_last_pivot_in_order_is_an_inverse_variance() {
         let mut rows = MATRIX.map(|[a, b, c]| [a, b, c, 0.0]);
         assert!(eliminate(&mut rows, Pivots::InOrder, 1e-9));
         let (mut matrix, mut right) = (MATRIX, [0.0, 0.0, 1.0]);
@@ -222,11 +224,5 @@ mod tests {
                 }
             }
         }
-    }
-
-    #[test]
-    fn equations_that_depend_on_each_other_are_not_soluble() {
-        let mut rows = [[1.0, 2.0, 1.0], [2.0, 4.0, 2.0]];
-        assert!(!eliminate(&mut rows, Pivots::Largest, 1e-9));
     }
 }

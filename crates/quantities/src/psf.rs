@@ -17,8 +17,8 @@ use self::pixels::Pixels;
 use crate::Shear;
 use crate::radial::{QuadraticForm, RadialTable, composite_rule};
 
-/// λ/r0 in units of the FWHM, times k0·r0/λ: the wavenumber scale k0 of a Kolmogorov profile in
-/// radians per FWHM. Both factors are those of GalSim's `Kolmogorov`.
+// λ/r0 in units of the FWHM, times k0·r0/λ: the wavenumber scale k0 of a Kolmogorov profile in radians per FWHM. Both
+// factors are those of GalSim's `Kolmogorov`.
 const KOLMOGOROV_K0: f64 = 2.992934 * 0.975_863_429_9;
 
 /// Kolmogorov surface brightness of unit flux against (r/FWHM)², per FWHM².
@@ -135,7 +135,7 @@ impl FunctionalPsf {
     /// Fills `out` (rows are y, columns x) with the light that falls into each pixel, for a PSF
     /// centred at (`centre_x`, `centre_y`), 0-based pixel-centre coordinates.
     ///
-    /// The mean of a 48 × 48 stamp's corner of the four central pixels is (23.5, 23.5). Nothing is
+    /// The centre of a 48 × 48 stamp is (23.5, 23.5). Nothing is
     /// renormalised: the sum falls short of 1 by the light outside. Pixels near the centre are
     /// integrated in real space by a Gauss–Legendre rule as long as the profile's sharpness there
     /// asks for. The light of the others follows from the profile in the middles of pixels. Errors
@@ -157,31 +157,21 @@ impl FunctionalPsf {
     /// The `size` × `size` central pixels of a star like this on a stamp of `side` × `side` pixels, normalised to a
     /// sum of one.
     ///
-    /// With `side` that of the galaxies, galaxy and PSF are off the middle of what is cut of them by the same: half
-    /// a pixel where one side is even and the other odd. What is left of the galaxy is on a pixel then, and
-    /// is where a star's stamp of that side would leave it.
+    /// With `side` that of the galaxies, galaxy and PSF are equally far off the centre of their cuts: half a pixel if one
+    /// side is even and the other odd. That is where a star on a stamp of that side would be.
     pub fn stamp_beside(&self, size: usize, side: usize) -> Array2<f64> {
         let mut stamp = Array2::zeros((size, size));
         self.stamp_into(side, stamp.view_mut());
         stamp
     }
 
-    /// The same in place of what a square stamp holds.
+    /// The same, drawn over a square stamp.
     pub fn stamp_into(&self, side: usize, mut stamp: ArrayViewMut2<f64>) {
         let size = stamp.nrows();
         let off = if side % 2 == size % 2 { 0.0 } else { 0.5 };
         let centre = (size as f64 - 1.0) / 2.0 + off;
         self.draw_into(centre, centre, stamp.view_mut());
         stamp *= 1.0 / stamp.sum();
-    }
-
-    /// The same for a PSF that may have been assembled with values that [`FunctionalPsf::new`] refuses.
-    ///
-    /// # Errors
-    /// As [`FunctionalPsf::new`].
-    pub fn checked_stamp(&self, size: usize, side: usize) -> Result<Array2<f64>, ProfileError> {
-        let checked = FunctionalPsf::new(self.profile, self.fwhm, self.shape)?;
-        Ok(checked.stamp_beside(size, side))
     }
 
     fn pixels<P: RoundProfile>(&self, profile: P) -> Pixels<P> {
@@ -240,7 +230,7 @@ struct MoffatBrightness {
     per_scale2: f64,
     centre: f64,
     beta: f64,
-    /// β where it is a small whole number: products are faster than a power.
+    /// β if it is a small whole number: products are faster than a power.
     whole: Option<u32>,
 }
 
@@ -258,7 +248,7 @@ impl RoundProfile for MoffatBrightness {
     #[inline(always)]
     fn at_each(&self, radii2: &mut [f64]) {
         if self.whole == Some(3) {
-            // The usual exponent, without a decision for each value.
+            // The exponent of the simulated sets, without a decision for each value.
             for value in radii2 {
                 let base = 1.0 + *value * self.per_scale2;
                 *value = self.centre / (base * base * base);
@@ -271,8 +261,8 @@ impl RoundProfile for MoffatBrightness {
     }
 
     fn core_in_fwhm(&self) -> f64 {
-        // With β the singularity recedes, but the power of the growth towards it rises: what is
-        // left is close to a Gaussian, which half a FWHM describes.
+        // With β the singularity recedes, but the power of the growth towards it rises: the limit is a Gaussian, which
+        // half a FWHM describes.
         moffat_scale(self.beta).min(1.0)
     }
 }
@@ -536,7 +526,7 @@ mod tests {
             }
             println!("{set}: {worst:.2e} of the peak, {worst_scaled:.2e} at equal sums");
             // Their stamps sum to 1, ours fall short of it by the light outside the stamp: 0.3 %
-            // for Kolmogorov wings. What is left is GalSim's FFT: it drops the Moffat's light
+            // for Kolmogorov wings. The rest is GalSim's FFT: it drops the Moffat's light
             // beyond k = π (2e-4), and its grid folds the Kolmogorov's wings (5e-5).
             // tests/it/galsim_galaxies.rs repeats both and comes within 1e-5.
             assert!(
@@ -580,7 +570,7 @@ mod tests {
     }
 
     #[test]
-    fn width_flux_and_orientation_are_as_asked() {
+    fn profiles_have_their_width_flux_and_orientation() {
         for profile in [
             MOFFAT,
             PsfProfile::Moffat { beta: 2.2 },
@@ -626,7 +616,7 @@ mod tests {
     }
 
     #[test]
-    fn kolmogorov_brightness_joins_its_wings_and_transforms_back() {
+    fn kolmogorov_brightness_joins_its_wings() {
         let rule = composite_rule(0.0, 2.16, 64, 16)
             .into_iter()
             .map(|(t, w)| (t.powi(3), w * 3.0 * t.powi(5) * (-t.powi(5)).exp()))

@@ -5,19 +5,19 @@
 
 use crate::Shear;
 
-/// Sub-intervals to each doubling of the table's argument.
+// Intervals to each doubling of the table's argument.
 const STEPS_PER_OCTAVE: usize = 1 << STEP_BITS;
 const STEP_BITS: u32 = 5;
 const OCTAVES: usize = 32;
 const INTERVALS: usize = STEPS_PER_OCTAVE * OCTAVES;
 
-/// The same for the table in single precision.
+// In single precision.
 const SINGLE_STEPS_PER_OCTAVE: usize = 1 << SINGLE_STEP_BITS;
 const SINGLE_STEP_BITS: u32 = 9;
 const SINGLE_INTERVALS: usize = SINGLE_STEPS_PER_OCTAVE * OCTAVES;
 
-/// A node of the single-precision table is the value in units of [`VALUE`], and below it in [`FALL_BITS`] bits how much
-/// less the next node is, in halves of it.
+// A node of the single-precision table is the value in units of VALUE, and below it in FALL_BITS bits how much less the next
+// node is, in halves of it.
 const FALL_BITS: u32 = 12;
 const VALUE: f32 = 1.0 / ((1 << (32 - FALL_BITS)) - 1) as f32;
 
@@ -122,7 +122,7 @@ impl RadialTable {
     }
 }
 
-/// The single-precision face of a [`RadialTable`].
+/// A [`RadialTable`] in single precision.
 #[derive(Debug, Clone, Copy)]
 pub struct SingleTable<'a> {
     per_unit: f32,
@@ -266,7 +266,7 @@ mod tests {
     }
 
     #[test]
-    fn gauss_legendre_integrates_polynomials_of_degree_2n_minus_1() {
+    fn gauss_legendre_integrates_polynomials() {
         for n in 1..=20 {
             let rule = gauss_legendre(n);
             for degree in 0..2 * n {

@@ -11,15 +11,15 @@ pub struct MeasuredRange {
     any: f64,
 }
 
-/// Whole numbers that are so many times the typical modulus stand for a failure: −10 among ellipticities of 0.1 to 0.5, which
-/// is HSM's. The whole numbers 0 and ±1 are values of honest catalogues, such as weights, responses and round galaxies.
+// Whole numbers that are so many times the typical modulus stand for a failure: −10 among ellipticities of 0.1 to 0.5, which
+// is HSM's. The whole numbers 0 and ±1 are values of honest catalogues, such as weights, responses and round galaxies.
 const WHOLE: f64 = 10.0;
-/// Of a Cauchy distribution, one in 16 000 values exceeds the median by this factor.
+// Of a Cauchy distribution, one in 16 000 values exceeds the median by this factor.
 const OUTLIER: f64 = 1e4;
-/// The same for quantities in other units, such as an ellipticity times the flux, which itself spans a factor of 10⁴, and
-/// derivatives of smooth cuts, which are exponentially small for most galaxies.
+// The same for quantities in other units, such as an ellipticity times the flux, which itself spans a factor of 10⁴, and
+// derivatives of smooth cuts, which are exponentially small for most galaxies.
 const OUTLIER_IN_OTHER_UNITS: f64 = 1e12;
-/// Single-precision numbers from 2²³ on are all whole.
+// Single-precision numbers from 2²³ on are all whole.
 const FRACTIONS_END: f64 = 8_388_608.0;
 
 impl Default for MeasuredRange {
@@ -64,7 +64,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn numbers_for_failures_are_excluded_and_outliers_are_not() {
+    fn failures_are_excluded_and_outliers_are_not() {
         let own = MeasuredRange::ELLIPTICITY;
         for failure in [-10.0, -99.0, 99.0, -9999.0, 1e20, -1e20, 1e30, f64::MAX] {
             assert!(own.excludes(failure), "{failure}");

@@ -1,6 +1,7 @@
 //! Means, scatters and medians.
 
-/// Mean and scatter of numbers that come one by one, in a way that keeps the digits which a large mean would cost.
+/// Mean and standard deviation of numbers that come one by one (Welford 1962). Sums of squares would lose the digits that a
+/// large mean costs.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct RunningMean {
     count: usize,
@@ -9,7 +10,7 @@ pub struct RunningMean {
 }
 
 impl RunningMean {
-    /// Takes one more.
+    /// Adds a number.
     pub fn add(&mut self, value: f64) {
         self.count += 1;
         let off = value - self.mean;
@@ -17,12 +18,12 @@ impl RunningMean {
         self.squares += off * (value - self.mean);
     }
 
-    /// How many there are.
+    /// The number of numbers.
     pub fn count(&self) -> usize {
         self.count
     }
 
-    /// Their mean; not a number of none.
+    /// Their mean; NaN without numbers.
     pub fn mean(&self) -> f64 {
         match self.count {
             0 => f64::NAN,
@@ -30,7 +31,7 @@ impl RunningMean {
         }
     }
 
-    /// Their standard deviation, unbiased in its square; not a number of fewer than two.
+    /// Their standard deviation, unbiased in its square; NaN of fewer than two.
     pub fn deviation(&self) -> f64 {
         match self.count {
             0 | 1 => f64::NAN,
@@ -46,47 +47,24 @@ pub const SCATTER: f32 = FROM_MODULI as f32;
 /// Standard error of a median in units of the standard error of the mean: √(π/2).
 pub const OF_MEDIAN: f64 = 1.253_314;
 
-/// `f32` or `f64`.
-pub trait Number: Copy + private::Sealed {}
-
-impl Number for f32 {}
-impl Number for f64 {}
-
-mod private {
-    use std::cmp::Ordering;
-
-    pub trait Sealed {
-        fn compare(&self, other: &Self) -> Ordering;
-    }
-
-    impl Sealed for f32 {
-        fn compare(&self, other: &Self) -> Ordering {
-            self.total_cmp(other)
-        }
-    }
-
-    impl Sealed for f64 {
-        fn compare(&self, other: &Self) -> Ordering {
-            self.total_cmp(other)
-        }
-    }
-}
-
-/// The lower median of finite values; reorders them. `None` of none.
-pub fn median<T: Number>(values: &mut [T]) -> Option<T> {
+/// The lower median of finite values; reorders them. `None` without values.
+pub fn median<T: Copy + Into<f64>>(values: &mut [T]) -> Option<T> {
     let middle = values.len().checked_sub(1)? / 2;
-    Some(*values.select_nth_unstable_by(middle, T::compare).1)
+    Some(ranked(values, middle))
 }
 
-/// The upper median of finite values; reorders them. `None` of none.
-pub fn upper_median<T: Number>(values: &mut [T]) -> Option<T> {
-    let middle = values.len() / 2;
-    let middle = (middle < values.len()).then_some(middle)?;
-    Some(*values.select_nth_unstable_by(middle, T::compare).1)
+/// The upper median of finite values; reorders them. `None` without values.
+pub fn upper_median<T: Copy + Into<f64>>(values: &mut [T]) -> Option<T> {
+    (!values.is_empty()).then(|| ranked(values, values.len() / 2))
+}
+
+fn ranked<T: Copy + Into<f64>>(values: &mut [T], rank: usize) -> T {
+    let by_value = |a: &T, b: &T| Into::<f64>::into(*a).total_cmp(&(*b).into());
+    *values.select_nth_unstable_by(rank, by_value).1
 }
 
 /// The lower median of finite values and their standard deviation, from the median of their distances to it. Reorders the
-/// values. `None` of none.
+/// values. `None` without values.
 pub fn scatter(values: &mut [f64]) -> Option<(f64, f64)> {
     let middle = median(values)?;
     let mut moduli: Vec<f64> = values.iter().map(|value| (value - middle).abs()).collect();
@@ -98,7 +76,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_running_mean_is_that_of_all_and_keeps_its_digits() {
+    fn a_running_mean_keeps_its_digits() {
         let mut running = RunningMean::default();
         assert!(running.mean().is_nan() && running.deviation().is_nan());
         for value in [1.0, 2.0, 6.0] {
@@ -120,7 +98,7 @@ mod tests {
     }
 
     #[test]
-    fn the_scatter_is_that_of_gaussian_numbers_about_their_median() {
+    fn the_scatter_is_that_of_gaussian_numbers() {
         // Moduli 0, 1, 1, 2, 95, of which 1 is the median.
         let found = scatter(&mut [5.0, 4.0, 6.0, 7.0, 100.0]);
         assert_eq!(found, Some((6.0, FROM_MODULI)));

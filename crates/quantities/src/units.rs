@@ -1,5 +1,4 @@
-//! Angles, pixels and multipoles as types of their own, so that a number of one kind cannot stand
-//! where another is meant.
+//! Angles, pixels and multipoles as types, so that they cannot be confused.
 
 #[cfg(feature = "serde")]
 use serde::{Deserialize, Serialize};
