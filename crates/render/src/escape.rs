@@ -24,8 +24,8 @@ pub fn visible(text: &str) -> Cow<'_, str> {
     Cow::Owned(safe)
 }
 
-/// The same on one line.
-pub(super) fn line(text: &str) -> String {
+/// On one line: a line break in the name of a file could forge a message.
+pub fn line(text: &str) -> String {
     visible(text).replace(['\n', '\t'], " ")
 }
 
@@ -46,86 +46,72 @@ pub(super) fn csv(text: &str) -> String {
     format!("{}{text}", formula_mark(text))
 }
 
-/// What a character becomes in LaTeX.
-enum Latex {
-    Text(Cow<'static, str>),
-    Math(Cow<'static, str>),
-    Superscript(char),
-}
-
 /// Text in a line or a cell of LaTeX.
 pub(super) fn latex(text: &str) -> String {
     let text = line(text);
-    let mut characters = text.chars();
+    let mut characters = text.chars().peekable();
     let mut safe = String::new();
-    // What is open: mathematics, and a superscript in it.
+    // What the text ends with: mathematics, and a superscript in it.
     let (mut math, mut raised) = (false, false);
     while let Some(c) = characters.next() {
-        let token = latex_token(c, &mut characters);
-        if raised && !matches!(token, Latex::Superscript(_)) {
-            safe.push('}');
-            raised = false;
-        }
-        if math == matches!(token, Latex::Text(_)) {
+        let plain = || c.to_string();
+        let (is_math, is_raised, token) = match c {
+            '\\' => (false, false, "\\textbackslash{}".into()),
+            '~' => (false, false, "\\textasciitilde{}".into()),
+            '^' => (false, false, "\\textasciicircum{}".into()),
+            '_' | '%' | '&' | '#' | '$' | '{' | '}' => (false, false, format!("\\{c}")),
+            // After the end of a row these would be taken for its options.
+            '[' | ']' | '*' => (false, false, format!("{{{c}}}")),
+            '<' | '>' | '|' => (true, false, plain()),
+            // The root covers the one letter that follows.
+            '√' => match characters.next_if(char::is_ascii_alphanumeric) {
+                Some(letter) => (true, false, format!("\\sqrt{{{letter}}}")),
+                None => (true, false, "\\surd".into()),
+            },
+            '²' => (true, true, "2".into()),
+            '³' => (true, true, "3".into()),
+            '⁴' => (true, true, "4".into()),
+            '⁻' => (true, true, "-".into()),
+            _ => match SYMBOLS.iter().find(|(symbol, _)| *symbol == c) {
+                Some((_, command)) => (true, false, (*command).to_owned()),
+                None => (false, false, plain()),
+            },
+        };
+        // Neighbours share their dollars and superscripts: `$x$$y$` and `^{1}^{2}` are errors or display mathematics.
+        let (closing, opening) = match (raised, is_raised) {
+            (true, false) => ("}", ""),
+            (false, true) => ("", "^{"),
+            _ => ("", ""),
+        };
+        safe += closing;
+        if math != is_math {
             safe.push('$');
-            math = !math;
         }
-        match token {
-            Latex::Text(words) | Latex::Math(words) => safe.push_str(&words),
-            Latex::Superscript(c) => {
-                if !raised {
-                    safe.push_str("^{");
-                    raised = true;
-                }
-                safe.push(c);
-            }
-        }
+        safe += opening;
+        safe += &token;
+        (math, raised) = (is_math, is_raised);
     }
-    if raised {
-        safe.push('}');
-    }
-    if math {
-        safe.push('$');
-    }
-    safe
+    let end = match (math, raised) {
+        (true, true) => "}$",
+        (true, false) => "$",
+        (false, _) => "",
+    };
+    safe + end
 }
 
-fn latex_token(c: char, rest: &mut std::str::Chars<'_>) -> Latex {
-    let text = |words| Latex::Text(Cow::Borrowed(words));
-    let math = |words| Latex::Math(Cow::Borrowed(words));
-    match c {
-        '\\' => text("\\textbackslash{}"),
-        '~' => text("\\textasciitilde{}"),
-        '^' => text("\\textasciicircum{}"),
-        '_' | '%' | '&' | '#' | '$' | '{' | '}' => Latex::Text(format!("\\{c}").into()),
-        // After the end of a row these would be taken for its options.
-        '[' | ']' | '*' => Latex::Text(format!("{{{c}}}").into()),
-        '<' | '>' | '|' => Latex::Math(c.to_string().into()),
-        // Of the one letter that follows.
-        '√' => match rest.clone().next().filter(char::is_ascii_alphanumeric) {
-            Some(letter) => {
-                rest.next();
-                Latex::Math(format!("\\sqrt{{{letter}}}").into())
-            }
-            None => math("\\surd"),
-        },
-        'Δ' => math("\\Delta"),
-        'λ' => math("\\lambda"),
-        'µ' | 'μ' => math("\\mu"),
-        'ℓ' => math("\\ell"),
-        'χ' => math("\\chi"),
-        'ε' => math("\\varepsilon"),
-        'σ' => math("\\sigma"),
-        '±' => math("\\pm"),
-        '×' => math("\\times"),
-        '−' => math("-"),
-        '²' => Latex::Superscript('2'),
-        '³' => Latex::Superscript('3'),
-        '⁴' => Latex::Superscript('4'),
-        '⁻' => Latex::Superscript('-'),
-        other => Latex::Text(other.to_string().into()),
-    }
-}
+const SYMBOLS: [(char, &str); 11] = [
+    ('Δ', "\\Delta"),
+    ('λ', "\\lambda"),
+    ('µ', "\\mu"),
+    ('μ', "\\mu"),
+    ('ℓ', "\\ell"),
+    ('χ', "\\chi"),
+    ('ε', "\\varepsilon"),
+    ('σ', "\\sigma"),
+    ('±', "\\pm"),
+    ('×', "\\times"),
+    ('−', "-"),
+];
 
 #[cfg(test)]
 mod tests {
@@ -136,7 +122,7 @@ mod tests {
     use crate::html::{Block, Report, Section};
     use crate::table::{Cell, Heading, Table, TableFormat};
 
-    /// Names that do something in one format or another.
+    // Names that do something in one format or another.
     const NASTY: [&str; 24] = [
         "back\\slash \\input{/etc/passwd}",
         "\\",
@@ -183,7 +169,7 @@ mod tests {
         names
     }
 
-    /// Number of `what` that no backslash stands before.
+    // Number of `what` that no backslash stands before.
     fn bare(text: &str, what: char) -> usize {
         let mut escaped = false;
         let mut count = 0;

@@ -42,77 +42,51 @@ pub use heat::HeatMap;
 pub use image::{ImageGrid, ImagePanel, ImageRow, Stretch};
 pub use plot::{Band, LinePlot, PanelGrid, Series, Style};
 
-/// The em of a figure's title, in points.
+// The em of a figure's title, in points.
 const TITLE_SIZE: f64 = 15.0;
-/// The em of labels of axes, panels and legends, in points.
+// The em of labels of axes, panels and legends, in points.
 const LABEL_SIZE: f64 = 12.5;
-/// The em of numbers at ticks, in points.
+// The em of numbers at ticks, in points.
 const TICK_SIZE: f64 = 11.0;
-/// The space between a figure's parts and around it, in points.
+// The space between a figure's parts and around it, in points.
 const MARGIN: f64 = 12.0;
-/// Width of axes and frames, in points.
+// Width of axes and frames, in points.
 const LINE: f64 = 1.0;
 
-/// Axes and their labels.
 const INK: RGBColor = RGBColor(38, 38, 38);
 
-/// Coordinates per point. `plotters` has whole coordinates; at four per point they are finer than a pixel of any screen.
+// Coordinates per point. `plotters` has whole coordinates; at four per point they are finer than a pixel of any screen.
 const UNITS: f64 = 4.0;
-/// Coordinates per side of a pixel of a PNG, which thus has 144 pixels per inch. `plotters` does not smooth the edges of
-/// lines, the mean over four coordinates does.
+// Coordinates per side of a pixel of a PNG, which thus has 144 pixels per inch. `plotters` does not smooth the edges of
+// lines, the mean over four coordinates does.
 const UNITS_PER_PIXEL: usize = 2;
-/// The largest figure in square points. A PNG takes 60 bytes per square point while it is drawn.
+// The largest figure in square points. A PNG takes 60 bytes per square point while it is drawn.
 const LARGEST: f64 = 5e6;
 
-/// Why a figure could not be drawn or written.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum FigureError {
-    /// The file's extension names no format.
     #[error("{}: found {found} as the figure's format; expected the extension `.png` or `.svg`", path.display())]
-    Extension {
-        /// The file.
-        path: PathBuf,
-        /// Its extension, or that it has none.
-        found: String,
-    },
-    /// The file could not be written.
+    Extension { path: PathBuf, found: String },
     #[error(transparent)]
     File(#[from] FileError),
-    /// Two lists that belong together differ in length.
     #[error("figure `{figure}`, {place}: found {found} {what}, expected {expected}")]
     Lengths {
-        /// The figure's title.
         figure: String,
-        /// The series, group or panel.
         place: String,
-        /// What is counted.
         what: &'static str,
-        /// How many there are.
         found: usize,
-        /// How many there must be.
         expected: usize,
     },
-    /// The figure has too many parts to draw into one picture.
     #[error(
         "the figure would be {width:.0} × {height:.0} points, expected at most {LARGEST:.0} \
          square points: put fewer panels into it"
     )]
-    TooLarge {
-        /// In points.
-        width: f64,
-        /// In points.
-        height: f64,
-    },
-    /// The pixels could not be drawn.
+    TooLarge { width: f64, height: f64 },
     #[error("cannot draw the figure: {detail}")]
-    Drawing {
-        /// Why.
-        detail: String,
-    },
+    Drawing { detail: String },
 }
 
-/// A format of picture files.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum PictureFormat {
     /// Pixels, two per point.
@@ -141,20 +115,20 @@ impl PictureFormat {
 
 /// A picture that can be drawn. Values that are not finite, or not positive on a logarithmic axis, are left out.
 pub trait Figure {
-    /// Width and height in points.
+    // Width and height in points.
     fn size(&self) -> (f64, f64);
 
-    /// The contents of a picture file. The same figure gives the same bytes.
-    ///
-    /// # Errors
-    /// [`FigureError::Lengths`], [`FigureError::TooLarge`] and [`FigureError::Drawing`].
+    // The contents of a picture file. The same figure gives the same bytes.
+    //
+    // # Errors
+    // `FigureError::Lengths`, `FigureError::TooLarge` and `FigureError::Drawing`.
     fn render(&self, format: PictureFormat) -> Result<Vec<u8>, FigureError>;
 
-    /// Writes the figure to `path`, as PNG or SVG by its extension; a file that is there is replaced
-    /// at once or, on failure, not at all.
-    ///
-    /// # Errors
-    /// Those of [`PictureFormat::of`] and [`Figure::render`], and [`FigureError::File`].
+    // Writes the figure to `path`, as PNG or SVG by its extension; a file that is there is replaced
+    // at once or, on failure, not at all.
+    //
+    // # Errors
+    // Those of `PictureFormat::of` and `Figure::render`, and `FigureError::File`.
     fn save(&self, path: impl AsRef<Path>) -> Result<(), FigureError>
     where
         Self: Sized,
@@ -165,12 +139,12 @@ pub trait Figure {
     }
 }
 
-/// Where a figure is drawn, in [`UNITS`] from its upper left corner.
+// Where a figure is drawn, in `UNITS` from its upper left corner.
 type Canvas<B> = DrawingArea<B, Shift>;
 type Drawn<B> = Result<(), DrawingAreaErrorKind<<B as DrawingBackend>::ErrorType>>;
 
-/// What a kind of figure consists of; the two formats are common to all. A trait beside [`Figure`], because `dyn Figure`
-/// could not have a function that is generic in the backend.
+// What a kind of figure consists of; the two formats are common to all. A trait beside `Figure`, because `dyn Figure`
+// could not have a function that is generic in the backend.
 trait Drawing {
     fn check(&self) -> Result<(), FigureError>;
     fn extent(&self) -> (f64, f64);
@@ -228,7 +202,7 @@ fn failed(error: impl std::fmt::Display) -> FigureError {
     }
 }
 
-/// A PNG file of rows of `width` coordinates.
+// A PNG file of rows of `width` coordinates.
 fn png(rgb: &[u8], width: usize) -> Result<Vec<u8>, png::EncodingError> {
     const SIDE: usize = UNITS_PER_PIXEL;
     let across = width / SIDE;
@@ -254,23 +228,21 @@ fn png(rgb: &[u8], width: usize) -> Result<Vec<u8>, png::EncodingError> {
     Ok(file)
 }
 
-/// Coordinates of a length in points.
 fn units(points: f64) -> i32 {
     (points * UNITS).round() as i32
 }
 
-/// The place of a point.
 fn place((x, y): (f64, f64)) -> (i32, i32) {
     (units(x), units(y))
 }
 
-/// In a PNG, `plotters` writes texts that are centred upwards with their baseline so many em below the place, and 0.27 em
-/// in an SVG.
+// In a PNG, `plotters` writes texts that are centred upwards with their baseline so many em below the place, and 0.27 em
+// in an SVG.
 const CENTRE_TO_BASELINE: f64 = 0.12;
-/// Half the height of digits and capitals above that, in em.
+// Half the height of digits and capitals above that, in em.
 const TO_CENTRE: f64 = 0.36 - CENTRE_TO_BASELINE;
 
-/// Which part of a text stands at its place.
+// Which part of a text stands at its place.
 const LEFT: Pos = pos(HPos::Left, VPos::Center);
 const RIGHT: Pos = pos(HPos::Right, VPos::Center);
 const MIDDLE: Pos = pos(HPos::Center, VPos::Center);
@@ -279,7 +251,6 @@ const fn pos(h_pos: HPos, v_pos: VPos) -> Pos {
     Pos { h_pos, v_pos }
 }
 
-/// A style of text with an em of `size` points.
 fn font(size: f64) -> TextStyle<'static> {
     const FAMILY: &str = "sans-serif";
     // Shipped, so that figures are the same on machines without fonts, and with ℓ, γ, σ and superscripts. An SVG file
@@ -293,18 +264,16 @@ fn font(size: f64) -> TextStyle<'static> {
     TextStyle::from((FAMILY, 1.2 * size * UNITS).into_font()).color(&INK)
 }
 
-/// Width of a text in points.
 fn text_width(text: &str, size: f64) -> f64 {
     let size = font(size).font.box_size(&escape::line(text));
     f64::from(size.map_or(0, |size| size.0)) / UNITS
 }
 
-/// Width of the widest text in points.
 fn widest<'a>(texts: impl Iterator<Item = &'a str>, size: f64) -> f64 {
     texts.map(|text| text_width(text, size)).fold(0.0, f64::max)
 }
 
-/// Writes a text with the middle of its digits at the height of `at`.
+// Writes a text with the middle of its digits at the height of `at`.
 fn write<B: DrawingBackend>(
     canvas: &Canvas<B>,
     text: &str,
@@ -316,7 +285,7 @@ fn write<B: DrawingBackend>(
     write_in(canvas, text, &font(size).pos(anchor), at)
 }
 
-/// The same upwards.
+// The same upwards.
 fn write_upwards<B: DrawingBackend>(
     canvas: &Canvas<B>,
     text: &str,
@@ -341,7 +310,6 @@ fn write_in<B: DrawingBackend>(
     }
 }
 
-/// A line through places in coordinates.
 fn line<B: DrawingBackend>(
     canvas: &Canvas<B>,
     through: Vec<(i32, i32)>,
@@ -352,7 +320,6 @@ fn line<B: DrawingBackend>(
     canvas.draw(&PathElement::new(through, style))
 }
 
-/// The outline of a rectangle.
 fn frame<B: DrawingBackend>(
     canvas: &Canvas<B>,
     corner: (f64, f64),
@@ -364,7 +331,7 @@ fn frame<B: DrawingBackend>(
     line(canvas, vec![(x1, y0), (x1, y1), (x0, y1)], INK, LINE)
 }
 
-/// Height of a text with the space beside it; zero for an empty text.
+// Height of a text with the space beside it; zero for an empty text.
 fn room(text: &str, size: f64) -> f64 {
     match text {
         "" => 0.0,

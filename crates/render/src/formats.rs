@@ -81,9 +81,6 @@ impl Table {
 
     /// The table as columns of numbers or words, those of errors beside their values: what CSV has,
     /// for other formats.
-    ///
-    /// # Errors
-    /// If two headings have the same key.
     pub fn columns(&self) -> Result<DataFrame, TableError> {
         let mut columns = Vec::new();
         for (k, heading) in self.headings.iter().enumerate() {
@@ -148,39 +145,32 @@ impl Table {
 
     /// Title, rows as objects, and notes.
     pub fn json(&self) -> Value {
-        let rows: Vec<Value> = self
-            .rows
-            .iter()
-            .map(|row| {
-                let mut object = Map::new();
-                for (heading, cell) in self.headings.iter().zip(row) {
-                    match cell {
-                        Cell::Empty => {
-                            object.insert(heading.key.into(), Value::Null);
-                        }
-                        Cell::Text(words) => {
-                            object.insert(heading.key.into(), json!(words));
-                        }
-                        Cell::Number {
-                            value,
-                            error,
-                            decimals,
-                        } => {
-                            object.insert(heading.key.into(), exact(*value, *decimals));
-                            if let Some(error) = error {
-                                object.insert(format!("{}_error", heading.key), json!(error));
-                            }
-                        }
-                    }
+        let object = |row: &Vec<Cell>| {
+            let mut object = Map::new();
+            for (heading, cell) in self.headings.iter().zip(row) {
+                let value = match cell {
+                    Cell::Empty => Value::Null,
+                    Cell::Text(words) => json!(words),
+                    Cell::Number {
+                        value, decimals, ..
+                    } => exact(*value, *decimals),
+                };
+                object.insert(heading.key.into(), value);
+                if let Cell::Number {
+                    error: Some(error), ..
+                } = cell
+                {
+                    object.insert(format!("{}_error", heading.key), json!(error));
                 }
-                Value::Object(object)
-            })
-            .collect();
+            }
+            Value::Object(object)
+        };
+        let rows: Vec<Value> = self.rows.iter().map(object).collect();
         json!({ "title": self.title, "rows": rows, "notes": self.notes })
     }
 }
 
-/// A number as JSON: counts without a decimal point.
+// A number as JSON: counts without a decimal point.
 fn exact(value: f64, decimals: usize) -> Value {
     const EXACT: f64 = 9_007_199_254_740_992.0;
     if decimals == 0 && value.fract() == 0.0 && value.abs() < EXACT {

@@ -14,7 +14,7 @@ pub mod page;
 pub mod table;
 pub mod terminal;
 
-/// The examples of README.md.
+// The examples of README.md.
 #[cfg(doctest)]
 #[doc = include_str!("../README.md")]
 struct Readme;

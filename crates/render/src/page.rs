@@ -11,32 +11,23 @@ use crate::figure::{Figure, FigureError};
 use crate::html::{Block, Picture, Report, Section};
 use crate::table::{Table, TableFormat};
 
-/// What can keep a page from being written.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum PageError {
-    /// A figure.
     #[error(transparent)]
     Figure(#[from] FigureError),
-    /// A file.
     #[error(transparent)]
     File(#[from] FileError),
-    /// Data that make no table.
     #[error(transparent)]
     Data(#[from] TableError),
 }
 
-/// The report on its way, and the files beside it.
+/// The report on its way. Figures and data are written at once, so that a stopped command leaves those that are done.
+#[derive(Debug)]
 pub struct Page<'a> {
     out: &'a Path,
     made_by: BTreeMap<String, String>,
     report: Report,
-}
-
-impl std::fmt::Debug for Page<'_> {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Page").finish_non_exhaustive()
-    }
 }
 
 impl<'a> Page<'a> {
@@ -62,43 +53,32 @@ impl<'a> Page<'a> {
 
     /// Begins a section with a paragraph; a bracket at the end of the heading stays out of its link.
     pub fn section(&mut self, heading: &str, text: &str) {
-        let id = heading.split(" (").next().unwrap_or(heading).to_owned();
-        let blocks = vec![Block::Text(text.to_owned())];
-        self.report
-            .sections
-            .push(Section::new(&id, heading, blocks));
+        let id = heading.split(" (").next().unwrap_or(heading);
+        let section = Section::new(id, heading, vec![Block::Text(text.to_owned())]);
+        self.report.sections.push(section);
     }
 
     fn add(&mut self, block: Block) {
         if let Some(section) = self.report.sections.last_mut() {
-            section.blocks.push(block);
+            section.push(block);
         }
     }
 
     /// Draws a figure as PNG and SVG and shows it.
-    ///
-    /// # Errors
-    /// Where it cannot be drawn or written.
     pub fn figure(
         &mut self,
         name: &str,
         figure: &impl Figure,
         caption: &str,
     ) -> Result<(), PageError> {
-        let mut picture = Picture::draw(figure, name, caption)?;
         for ending in ["png", "svg"] {
-            let path = format!("figures/{name}.{ending}");
-            figure.save(self.out.join(&path))?;
-            picture = picture.link(ending.to_uppercase(), &path);
+            figure.save(self.out.join(format!("figures/{name}.{ending}")))?;
         }
-        self.add(Block::Figure(picture));
+        self.add(Block::Figure(Picture::draw(figure, name, caption)?));
         Ok(())
     }
 
     /// Writes a table's data and shows it.
-    ///
-    /// # Errors
-    /// Where they cannot be written.
     pub fn table(&mut self, name: &str, exhibit: &Table) -> Result<(), PageError> {
         self.data(name, exhibit)?;
         self.add(Block::Table(exhibit.clone()));
@@ -106,9 +86,6 @@ impl<'a> Page<'a> {
     }
 
     /// Writes a table's data beside the report.
-    ///
-    /// # Errors
-    /// Where they cannot be written.
     pub fn data(&self, name: &str, exhibit: &Table) -> Result<(), PageError> {
         let text = exhibit.render(TableFormat::Csv);
         atomic::write(self.out.join(format!("data/{name}.csv")), text.as_bytes())?;
@@ -119,11 +96,7 @@ impl<'a> Page<'a> {
     }
 
     /// Writes the report.
-    ///
-    /// # Errors
-    /// Where it cannot be written.
     pub fn save(self) -> Result<(), PageError> {
-        self.report.save(self.out.join("report.html"))?;
-        Ok(())
+        Ok(self.report.save(self.out.join("report.html"))?)
     }
 }

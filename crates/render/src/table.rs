@@ -1,47 +1,36 @@
 //! Tables: columns, rows of cells, and notes.
 
-/// How to print a table.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum TableFormat {
-    /// For reading on a terminal.
     #[default]
     Table,
-    /// Machine-readable, full precision.
     Json,
     /// Comma-separated, full precision, value and error in columns of their own; words that a spreadsheet
     /// would take for a formula have an apostrophe in front.
     Csv,
-    /// Markdown.
     Markdown,
-    /// A LaTeX tabular.
     Latex,
 }
 
-/// One cell.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Cell {
     /// Nothing, in a column of words or of numbers.
     Empty,
-    /// Words.
     Text(String),
     /// A number, perhaps with an error, to be printed with so many decimals.
     Number {
-        /// The value; not a number is printed as a dash.
+        // The value; not a number is printed as a dash.
         value: f64,
-        /// Its standard error.
         error: Option<f64>,
-        /// Decimals printed for people.
         decimals: usize,
     },
 }
 
 impl Cell {
-    /// A cell of words.
     pub fn text(words: impl Into<String>) -> Self {
         Cell::Text(words.into())
     }
 
-    /// A number without error.
     pub fn number(value: f64, decimals: usize) -> Self {
         Cell::Number {
             value,
@@ -50,7 +39,6 @@ impl Cell {
         }
     }
 
-    /// A number with an error.
     pub fn with_error(value: f64, error: Option<f64>, decimals: usize) -> Self {
         Cell::Number {
             value,
@@ -116,13 +104,13 @@ impl Cell {
     }
 }
 
-/// Most decimals that the error of a number can require.
+// Most decimals that the error of a number can require.
 const MOST_DECIMALS: usize = 12;
 
-/// Significant digits of a number with an unknown error.
+// Significant digits of a number with an unknown error.
 const UNSURE: i32 = 3;
 
-/// Decimals that give `error` two significant digits; `otherwise` for an error of zero.
+// Decimals that give `error` two significant digits; `otherwise` for an error of zero.
 fn decimals_of(error: f64, otherwise: usize) -> usize {
     match error > 0.0 {
         true => decimals_for(error, 2),
@@ -130,7 +118,7 @@ fn decimals_of(error: f64, otherwise: usize) -> usize {
     }
 }
 
-/// Decimals that give a number so many significant `digits`.
+// Decimals that give a number so many significant `digits`.
 fn decimals_for(number: f64, digits: i32) -> usize {
     // Rounding can lengthen a number: 0.0996 is 0.10.
     let before = usize::try_from(digits - 1).unwrap_or(0);
@@ -145,19 +133,15 @@ fn decimals_for(number: f64, digits: i32) -> usize {
     usize::try_from(decimals).unwrap_or(0).min(MOST_DECIMALS)
 }
 
-/// A column: its key for programs and its heading for people.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Heading {
-    /// Key in CSV and JSON.
     pub key: &'static str,
-    /// Heading elsewhere.
     pub label: String,
     /// Left out of tables for people unless they are to be wide; CSV and JSON have every column.
     pub detail: bool,
 }
 
 impl Heading {
-    /// A heading.
     pub fn new(key: &'static str, label: impl Into<String>) -> Self {
         Heading {
             key,
@@ -175,20 +159,40 @@ impl Heading {
     }
 }
 
-/// A table with a title and notes.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Table {
-    /// One line above.
     pub title: String,
-    /// Columns.
     pub headings: Vec<Heading>,
-    /// Cells, row by row.
     pub rows: Vec<Vec<Cell>>,
-    /// Lines below.
     pub notes: Vec<String>,
 }
 
 impl Table {
+    /// A table without columns yet.
+    pub fn titled(title: impl Into<String>) -> Self {
+        Table {
+            title: title.into(),
+            ..Table::default()
+        }
+    }
+
+    /// Adds a column with the cell of each of `rows`, the same for all columns, and returns its place. Heading and cells
+    /// stand together in the code, so that none can be put under the heading of another column.
+    pub fn column<R>(
+        &mut self,
+        key: &'static str,
+        label: impl Into<String>,
+        rows: &[R],
+        cell: impl Fn(&R) -> Cell,
+    ) -> usize {
+        self.headings.push(Heading::new(key, label));
+        self.rows.resize(rows.len(), Vec::new());
+        for (cells, row) in self.rows.iter_mut().zip(rows) {
+            cells.push(cell(row));
+        }
+        self.headings.len() - 1
+    }
+
     /// The table without columns that have no value in any row.
     pub(crate) fn without_empty_columns(&self) -> Self {
         let has_value = |k: usize| {
@@ -202,7 +206,7 @@ impl Table {
         self.picked(&places.collect::<Vec<_>>())
     }
 
-    /// The columns at `places`, in that order.
+    // The columns at `places`, in that order.
     fn picked(&self, places: &[usize]) -> Self {
         let row = |row: &Vec<Cell>| {
             places
@@ -218,7 +222,6 @@ impl Table {
         }
     }
 
-    /// The table without its columns of detail.
     pub fn narrow(&self) -> Self {
         let all = 0..self.headings.len();
         self.picked(
@@ -227,7 +230,7 @@ impl Table {
         )
     }
 
-    /// Number of columns that name the rows: those before the first column of numbers, except set numbers.
+    // Number of columns that name the rows: those before the first column of numbers, except set numbers.
     fn names(&self) -> usize {
         let number = |k: &usize| {
             if self.headings[*k].key == "set" {
@@ -263,7 +266,6 @@ impl Table {
         Ok(self.picked(&places))
     }
 
-    /// Place of the column called `key`.
     pub fn place(&self, key: &str) -> Option<usize> {
         self.headings.iter().position(|heading| heading.key == key)
     }

@@ -8,12 +8,12 @@ use unicode_width::UnicodeWidthStr;
 use crate::escape;
 use crate::table::{Cell, Table};
 
-/// Blanks after a column's contents: one of its own, and one between columns.
+// Blanks after a column's contents: one of its own, and one between columns.
 const PADDING: usize = 2;
-/// Words longer than this may be broken.
+// Words longer than this may be broken.
 const LONGEST_WORD: usize = 16;
 
-/// Contents of a column: its heading and its cells as printed.
+// Contents of a column: its heading and its cells as printed.
 struct Column {
     heading: String,
     cells: Vec<String>,
@@ -37,7 +37,7 @@ impl Column {
         }
     }
 
-    /// The least width: numbers stay whole, words are broken only where they are very long.
+    // The least width: numbers stay whole, words are broken only where they are very long.
     fn least(&self) -> usize {
         let words = |text: &str| {
             let longest = text.split_whitespace().map(UnicodeWidthStr::width).max();
@@ -98,7 +98,6 @@ pub fn fitted(table: &Table, width: Option<usize>) -> String {
     text
 }
 
-/// Columns side by side.
 fn block(columns: &[&Column], width: usize) -> String {
     let mut table = comfy_table::Table::new();
     table

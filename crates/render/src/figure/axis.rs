@@ -14,11 +14,9 @@ pub(super) struct Axis {
     pub high: f64,
     log: bool,
     pub ticks: Ticks,
-    /// Ticks without labels.
     pub minor: Vec<f64>,
 }
 
-/// How values are laid along an axis.
 #[derive(Clone, Copy, PartialEq)]
 pub(super) enum Scale<'a> {
     Linear,
@@ -139,7 +137,6 @@ impl ValueFormatter<f64> for &Axis {
     }
 }
 
-/// The range of places with some space around them.
 fn padded(places: impl Iterator<Item = f64>, log: bool) -> (f64, f64) {
     let (low, high) = places.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), at| {
         (low.min(at), high.max(at))
@@ -158,11 +155,10 @@ fn padded(places: impl Iterator<Item = f64>, log: bool) -> (f64, f64) {
     (low - space, high + space)
 }
 
-/// Where a tick is, and its label.
 type Tick = (f64, String);
 type Ticks = Vec<Tick>;
 
-/// Round ticks, as many as fit up to nine and no nearer than `least`.
+// Round ticks, as many as fit up to nine and no nearer than `least`.
 fn linear_ticks(low: f64, high: f64, least: f64, fits: &dyn Fn(&[Tick]) -> bool) -> Ticks {
     let exponent = low.abs().max(high.abs()).log10().floor() as i32;
     // Up to 99999 and down to two zeros after the point, numbers read well without an exponent.
@@ -191,7 +187,7 @@ fn linear_ticks(low: f64, high: f64, least: f64, fits: &dyn Fn(&[Tick]) -> bool)
         .unwrap_or_default()
 }
 
-/// The smallest of 1, 2, 5 × 10ⁿ that is not below `step`.
+// The smallest of 1, 2, 5 × 10ⁿ that is not below `step`.
 fn round_step(step: f64) -> f64 {
     let decade = 10_f64.powf(step.log10().floor());
     let within = [1.0, 2.0, 5.0].into_iter();
@@ -199,8 +195,8 @@ fn round_step(step: f64) -> f64 {
     large_enough.next().unwrap_or(10.0) * decade
 }
 
-/// Ticks of 1, 2, 5 × 10ⁿ from 10^`low` to 10^`high`, fewer where they do not fit, with the other multiples as minor
-/// ticks. Where no two of them fit, those of a linear axis.
+// Ticks of 1, 2, 5 × 10ⁿ from 10^`low` to 10^`high`, fewer where they do not fit, with the other multiples as minor
+// ticks. Where no two of them fit, those of a linear axis.
 fn log_ticks(low: f64, high: f64, fits: &dyn Fn(&[Tick]) -> bool) -> (Ticks, Vec<f64>) {
     let decades = low.floor() as i32..=high.ceil() as i32;
     let places = |factors: RangeInclusive<i32>, stride: i32| {
@@ -288,7 +284,6 @@ pub(super) fn short(value: f64) -> String {
     format!("{mantissa}×{}", power_of_ten(exponent))
 }
 
-/// "10⁻⁴".
 fn power_of_ten(exponent: i32) -> String {
     let raised = exponent
         .to_string()

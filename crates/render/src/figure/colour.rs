@@ -7,8 +7,8 @@ pub(super) const MISSING: RGBColor = RGBColor(214, 196, 168);
 /// Ranges of values and lines of reference.
 pub(super) const GREY: RGBColor = RGBColor(110, 110, 110);
 
-/// The Okabe–Ito palette, told apart by colour-blind readers, with the strong colours first, and grey instead of its
-/// yellow, which is hardly visible on white.
+// The Okabe–Ito palette, told apart by colour-blind readers, with the strong colours first, and grey instead of its
+// yellow, which is hardly visible on white.
 const PALETTE: [RGBColor; 8] = [
     RGBColor(0, 114, 178),
     RGBColor(213, 94, 0),
@@ -25,7 +25,6 @@ pub(super) fn series_colour(index: usize) -> RGBColor {
     PALETTE[index % PALETTE.len()]
 }
 
-/// How numbers become colours.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum ColourMap {
     /// From dark violet over green to yellow, with even steps of lightness.

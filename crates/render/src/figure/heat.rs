@@ -8,26 +8,22 @@ use plotters::style::{Color, RGBColor};
 use super::axis::plain;
 use super::colour::{ColourMap, position, text_on};
 use super::{
-    Canvas, Drawing, Drawn, FigureError, LABEL_SIZE, LEFT, MARGIN, MIDDLE, RIGHT, TICK_SIZE,
-    TITLE_SIZE, TO_CENTRE, font, place, room, text_width, widest, write, write_in, write_upwards,
+    Canvas, Drawing, Drawn, FigureError, LABEL_SIZE, MARGIN, MIDDLE, RIGHT, TICK_SIZE, TITLE_SIZE,
+    TO_CENTRE, font, place, room, text_width, widest, write, write_in,
 };
 
-/// Height of a row, in points, and the white line between cells.
+// Height of a row, in points, and the white line between cells.
 const ROW: f64 = 26.0;
 const SEAM: f64 = 0.5;
 
 /// A matrix of values with names of rows and columns, the first row on top.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct HeatMap {
-    /// Above the table.
     pub title: String,
     /// What the rows are, above their names.
     pub row_label: String,
-    /// What the columns are.
     pub column_label: String,
-    /// One name per row.
     pub rows: Vec<String>,
-    /// One name per column.
     pub columns: Vec<String>,
     /// The values (row, column); those that are not finite are drawn as missing.
     pub values: Array2<f64>,
@@ -35,24 +31,18 @@ pub struct HeatMap {
     pub decimals: usize,
     /// What the values are, in the title.
     pub value_label: String,
-    /// The colours; a diverging map is centred on zero.
     pub map: ColourMap,
 }
 
-/// Sizes of a heat map, in points.
 struct Sizes {
     cell: f64,
-    /// Space of the names of columns, which run upwards if they are long.
-    names: f64,
-    upright: bool,
-    /// Left and upper edge of the cells, and the width of all.
+    // Left and upper edge of the cells, and the width of all.
     left: f64,
     top: f64,
     width: f64,
 }
 
 impl HeatMap {
-    /// The title with what the values are.
     fn heading(&self) -> String {
         match self.value_label.as_str() {
             "" => self.title.clone(),
@@ -60,7 +50,6 @@ impl HeatMap {
         }
     }
 
-    /// The words and the colour of a cell.
     fn cell(&self, value: f64) -> (String, RGBColor) {
         let words = match value.is_finite() {
             true => plain(value, self.decimals.min(12)),
@@ -108,18 +97,14 @@ impl HeatMap {
             .collect();
         let value = widest(values.iter().map(String::as_str), TICK_SIZE);
         let name = widest(self.columns.iter().map(String::as_str), TICK_SIZE);
-        let upright = name > 2.0 * value.max(24.0);
-        let names = if upright { name } else { TICK_SIZE };
-        let cell = if upright { value } else { value.max(name) } + 16.0;
+        let cell = value.max(name) + 16.0;
         let rows = widest(self.rows.iter().map(String::as_str), TICK_SIZE);
         let rows = rows.max(text_width(&self.row_label, LABEL_SIZE));
         let heads = room(&self.title, TITLE_SIZE) + room(&self.column_label, LABEL_SIZE);
         Sizes {
             cell,
-            names,
-            upright,
             left: MARGIN + rows + 8.0,
-            top: MARGIN + heads + names + 8.0,
+            top: MARGIN + heads + TICK_SIZE + 8.0,
             width: cell * self.columns.len() as f64,
         }
     }
@@ -175,10 +160,7 @@ impl Drawing for HeatMap {
         for (k, name) in self.columns.iter().enumerate() {
             let x = sizes.left + (k as f64 + 0.5) * sizes.cell;
             let y = sizes.top - 6.0;
-            match sizes.upright {
-                true => write_upwards(canvas, name, TICK_SIZE, LEFT, (x, y))?,
-                false => write(canvas, name, TICK_SIZE, MIDDLE, (x, y - 0.5 * sizes.names))?,
-            }
+            write(canvas, name, TICK_SIZE, MIDDLE, (x, y - 0.5 * TICK_SIZE))?;
         }
         for (row, name) in self.rows.iter().enumerate() {
             let y = sizes.top + row as f64 * ROW;

@@ -12,21 +12,19 @@ use super::{
     frame, place, room, text_width, write, write_upwards,
 };
 
-/// The em of the numbers at colour bars.
+// The em of the numbers at colour bars.
 const NUMBER_SIZE: f64 = 9.5;
-/// Height of a colour bar, its distance from the image, and the height of both with the numbers.
+// Height of a colour bar, its distance from the image, and the height of both with the numbers.
 const BAR: f64 = 7.0;
 const BAR_GAP: f64 = 5.0;
 const BAR_ROOM: f64 = 30.0;
-/// The longer side of an image, in points.
+// The longer side of an image, in points.
 const SIDE: f64 = 144.0;
-/// From panel to panel.
 const GAP: f64 = 18.0;
 
 /// How values between the ends of the scale are spread over the colours.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Stretch {
-    /// Evenly.
     #[default]
     Linear,
     /// By asinh, which shows faint wings beside a bright centre: evenly up to a tenth of the scale,
@@ -34,39 +32,30 @@ pub enum Stretch {
     Asinh,
 }
 
-/// One image with its own colour scale.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct ImagePanel {
-    /// Above the image.
     pub title: String,
     /// The values (row, column), with row 0 at the bottom; NaN marks masked pixels.
     pub image: Array2<f64>,
-    /// The colours; a diverging map is centred on zero.
     pub map: ColourMap,
-    /// How values are spread over the colours.
     pub stretch: Stretch,
 }
 
-/// Images side by side.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct ImageRow {
-    /// Beside the row.
     pub label: String,
-    /// The images, from left to right.
     pub panels: Vec<ImagePanel>,
 }
 
 /// Rows of images, such as the steps from a stamp to its autocorrelation for several galaxies.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct ImageGrid {
-    /// Above all rows.
     pub title: String,
-    /// The rows, from the top.
     pub rows: Vec<ImageRow>,
 }
 
 impl ImageGrid {
-    /// The space of the labels of rows, and the width of all panels.
+    // The space of the labels of rows, and the width of all panels.
     fn widths(&self) -> (f64, f64) {
         let most = self.rows.iter().map(|row| row.panels.len()).max();
         let labelled = self.rows.iter().any(|row| !row.label.is_empty());
@@ -110,7 +99,7 @@ impl Drawing for ImageGrid {
     }
 }
 
-/// Draws one image into a square, with its title above and its colour bar below.
+// Draws one image into a square, with its title above and its colour bar below.
 fn draw_panel<B: DrawingBackend>(
     canvas: &Canvas<B>,
     panel: &ImagePanel,

@@ -12,55 +12,47 @@ use super::{
     TITLE_SIZE, TO_CENTRE, font, frame, line, place, room, text_width, units, widest, write,
 };
 
-/// Width of curves and of error bars, and radius of points, in points.
+// Width of curves and of error bars, and radius of points, in points.
 const CURVE: f64 = 1.75;
 const ERROR: f64 = 1.0;
 const POINT: f64 = 3.0;
-/// Half the width of the cap of an error bar.
+// Half the width of the cap of an error bar.
 const CAP: f64 = 2.5;
-/// Length of ticks and of minor ticks.
+// Length of ticks and of minor ticks.
 const TICK: f64 = 4.0;
 const MINOR: f64 = 2.5;
-/// Height of a row of a legend, and the width of a sample in it with and without space.
+// Height of a row of a legend, and the width of a sample in it with and without space.
 const ENTRY: f64 = 18.0;
 const SAMPLE: f64 = 24.0;
 const SAMPLE_ROOM: f64 = 30.0;
-/// Opacity and least width of bands.
+// Opacity and least width of bands.
 const BAND: f64 = 0.3;
 const THINNEST: f64 = 3.0;
 const GRID: RGBColor = RGBColor(228, 228, 228);
 
-/// How a series is drawn.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Style {
-    /// A line through the points.
     #[default]
     Line,
     /// A disc, square or triangle at each point, by its colour, without a line.
     Points,
-    /// A dashed line through the points.
     Dashed,
 }
 
-/// One curve or set of points.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Series {
     /// Its name in the legend; without one it does not appear there.
     pub label: String,
-    /// Where the points are across.
     pub x: Vec<f64>,
-    /// Where they are up, as many as in `x`.
     pub y: Vec<f64>,
     /// Half the length of an error bar at each point, as many as in `x`.
     pub y_err: Option<Vec<f64>>,
-    /// Line or points.
     pub style: Style,
     /// Which colour of the palette of eight; the last is grey.
     pub colour: usize,
 }
 
 impl Series {
-    /// A series without error bars.
     pub fn new(label: &str, x: Vec<f64>, y: Vec<f64>, style: Style, colour: usize) -> Self {
         Self {
             label: label.into(),
@@ -96,7 +88,7 @@ impl Series {
         Ok(())
     }
 
-    /// The ends of the error bar at a point; the point itself if it has no error.
+    // The ends of the error bar at a point; the point itself if it has no error.
     fn bar(&self, point: usize) -> (f64, f64) {
         let errors = self.y_err.as_ref();
         let half = errors.map_or(0.0, |errors| errors[point].abs());
@@ -108,43 +100,33 @@ impl Series {
 /// A range of y over the whole width, such as that which a requirement allows.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Band {
-    /// Its name in the legend.
     pub label: String,
-    /// Its lower end.
     pub low: f64,
-    /// Its upper end.
     pub high: f64,
 }
 
-/// Series over common axes.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct LinePlot {
-    /// Above the plot.
     pub title: String,
-    /// Below the horizontal axis, with the unit.
     pub x_label: String,
-    /// Beside the vertical axis, with the unit.
     pub y_label: String,
-    /// Whether the horizontal axis is logarithmic.
     pub x_log: bool,
     /// Whether the horizontal axis is of whole numbers, as those of sets.
     pub x_whole: bool,
     /// Names at x = 0, 1, … instead of numbers. They stand below each other, and x runs down and y across, so that
     /// long names are read without turning the head.
     pub x_names: Vec<String>,
-    /// Whether the vertical axis is logarithmic.
     pub y_log: bool,
     /// The ends of the horizontal axis; from the data if there are none.
     pub x_range: Option<(f64, f64)>,
     /// The ends of the vertical axis; from the data if there are none.
     pub y_range: Option<(f64, f64)>,
-    /// Ranges behind the series.
     pub bands: Vec<Band>,
     /// What is drawn, the last on top.
     pub series: Vec<Series>,
 }
 
-/// What stands for a series in a legend.
+// What stands for a series in a legend.
 #[derive(PartialEq, Clone, Copy)]
 enum Sample {
     Series(Style, usize),
@@ -156,12 +138,12 @@ impl LinePlot {
         !self.x_names.is_empty()
     }
 
-    /// What belongs to x and to y as what belongs across and upwards, and back.
+    // What belongs to x and to y as what belongs across and upwards, and back.
     fn turned<T>(&self, [x, y]: [T; 2]) -> [T; 2] {
         if self.is_turned() { [y, x] } else { [x, y] }
     }
 
-    /// The points that can be shown, and where each is in its series.
+    // The points that can be shown, and where each is in its series.
     fn points(&self) -> impl Iterator<Item = (&Series, usize)> {
         let all = self.series.iter();
         let all = all.flat_map(|series| (0..series.x.len()).map(move |i| (series, i)));
@@ -172,7 +154,7 @@ impl LinePlot {
         shown(series.x[i], self.x_log) && shown(series.y[i], self.y_log)
     }
 
-    /// The axes across and upwards of a frame of this size.
+    // The axes across and upwards of a frame of this size.
     fn axes(&self, (width, height): (f64, f64)) -> [Axis; 2] {
         let x = self.points().map(|(series, i)| series.x[i]);
         let y = self.points().flat_map(|(series, i)| {
@@ -198,7 +180,6 @@ impl LinePlot {
         ])
     }
 
-    /// The labels across and upwards.
     fn labels(&self) -> [&str; 2] {
         self.turned([&self.x_label, &self.y_label])
     }
@@ -213,7 +194,7 @@ impl LinePlot {
         series.chain(bands)
     }
 
-    /// Draws axes and series into a frame of this size. `labels` across and upwards take the room given, as numbers do.
+    // Draws axes and series into a frame of this size. `labels` across and upwards take the room given, as numbers do.
     fn draw_in<B: DrawingBackend>(
         &self,
         canvas: &Canvas<B>,
@@ -293,7 +274,6 @@ impl LinePlot {
     }
 }
 
-/// An error bar with caps.
 fn draw_error<B: DrawingBackend>(
     canvas: &Canvas<B>,
     ends: [(i32, i32); 2],
@@ -315,7 +295,7 @@ fn draw_error<B: DrawingBackend>(
     Ok(())
 }
 
-/// Points, or the lines through those that follow each other.
+// Points, or the lines through those that follow each other.
 fn draw_series<B: DrawingBackend>(
     canvas: &Canvas<B>,
     points: &[Option<(i32, i32)>],
@@ -378,11 +358,8 @@ impl Drawing for LinePlot {
 /// row only.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct PanelGrid {
-    /// Above all plots.
     pub title: String,
-    /// How many plots are in a row.
     pub columns: usize,
-    /// The plots, by rows.
     pub plots: Vec<LinePlot>,
 }
 
@@ -399,18 +376,15 @@ impl From<&LinePlot> for PanelGrid {
     }
 }
 
-/// Sizes of a [`PanelGrid`], in points.
 struct Layout<'a> {
     columns: usize,
     frame: (f64, f64),
-    /// Space of the numbers below and beside a frame, and of its labels.
+    // Space of the numbers below and beside a frame, and of its labels.
     numbers: [f64; 2],
     labels: [f64; 2],
-    /// Whether all plots have the same label across, upwards.
+    // Whether all plots have the same label across, upwards.
     common: [bool; 2],
-    /// From frame to frame.
     step: (f64, f64),
-    /// Corner of the first frame.
     first: (f64, f64),
     extent: (f64, f64),
     legend: Vec<Vec<(&'a str, Sample)>>,
@@ -478,7 +452,7 @@ impl PanelGrid {
         }
     }
 
-    /// The entries that have a label, each once, in as many rows as `width` asks for.
+    // The entries that have a label, each once, in as many rows as `width` asks for.
     fn legend(&self, width: f64) -> Vec<Vec<(&str, Sample)>> {
         let mut entries: Vec<(&str, Sample)> = Vec::new();
         for entry in self.plots.iter().flat_map(LinePlot::legend) {
@@ -501,7 +475,7 @@ impl PanelGrid {
     }
 }
 
-/// Width of an entry of a legend with the space after it.
+// Width of an entry of a legend with the space after it.
 fn entry_width(label: &str) -> f64 {
     SAMPLE_ROOM + text_width(label, LABEL_SIZE) + 1.5 * MARGIN
 }

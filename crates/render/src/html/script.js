@@ -94,19 +94,7 @@
     place.querySelector(".tools").prepend(field, count);
   };
 
-  // A table that is wider than its place has its errors below the values.
-  const stackable = (table) => {
-    const place = table.closest(".scroll");
-    const check = () => {
-      table.classList.remove("stacked");
-      table.classList.toggle("stacked", place.scrollWidth > place.clientWidth);
-    };
-    addEventListener("resize", check);
-    check();
-    return check;
-  };
-
-  const foldable = (table, changed) => {
+  const foldable = (table) => {
     if (!table.querySelector("th.detail")) return;
     const button = document.createElement("button");
     button.type = "button";
@@ -114,30 +102,10 @@
       table.classList.toggle("narrow", narrow);
       button.textContent = narrow ? "All columns" : "Fewer columns";
       button.setAttribute("aria-expanded", String(!narrow));
-      changed();
     };
     fold(true);
     button.addEventListener("click", () => fold(!table.classList.contains("narrow")));
     table.closest(".table").querySelector(".tools").append(button);
-  };
-
-  // Figures that a narrow screen shrinks can be had in full, to be scrolled.
-  const enlargeable = (figure) => {
-    const plate = figure.querySelector(".plate");
-    const image = plate.querySelector("img");
-    const button = document.createElement("button");
-    button.type = "button";
-    const enlarge = (full) => {
-      plate.classList.toggle("full", full);
-      button.textContent = full ? "Fit to screen" : "Full size";
-    };
-    enlarge(false);
-    button.addEventListener("click", () => enlarge(!plate.classList.contains("full")));
-    figure.querySelector(".tools").append(button);
-    const natural = Number(image.getAttribute("width")) || image.naturalWidth;
-    const check = () => figure.classList.toggle("shrunk", plate.clientWidth < natural);
-    addEventListener("resize", check);
-    check();
   };
 
   // Marks the section at the top of the window in the contents.
@@ -169,9 +137,8 @@
     for (const table of document.querySelectorAll("main table")) {
       sortable(table);
       filterable(table);
-      foldable(table, stackable(table));
+      foldable(table);
     }
-    document.querySelectorAll("main figure").forEach(enlargeable);
     contents();
   });
 })();
