@@ -19,6 +19,7 @@ use shearq_results::views::pages;
 use shearq_simulate::field::ShearSpectrum;
 use shearq_simulate::kinds::SETS;
 use shearq_simulate::set::SimulationSettings;
+use shearq_submissions::{Configuration, Registry};
 
 /// A list of sets such as `1,2,7-9` or `all`.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -68,7 +69,6 @@ impl std::fmt::Display for SetList {
 }
 
 impl SetList {
-    /// The sets, if all of them can be simulated.
     pub(super) fn simulated(&self) -> anyhow::Result<&[u32]> {
         if let Some(set) = self.0.iter().find(|&&set| set > SETS) {
             anyhow::bail!(
@@ -98,12 +98,10 @@ impl Printing {
         self.form.format
     }
 
-    /// Whether only some metrics are printed.
     pub(super) fn chooses(&self) -> bool {
         !self.metrics.is_empty()
     }
 
-    /// The table with the chosen metrics only.
     fn chosen(&self, table: &Table) -> anyhow::Result<Table> {
         table.chosen(&self.metrics).map_err(|unknown| {
             let known = table.metrics().join(", ");
@@ -118,32 +116,26 @@ impl Printing {
         self.chosen(table).map(|_| ())
     }
 
-    /// Prints a table.
-    ///
-    /// # Errors
-    /// If a chosen metric is not a column of the table.
+    /// Prints a table with the chosen columns. CSV and JSON have all of them, because programs read these.
     pub(super) fn print(&self, table: &Table) -> anyhow::Result<()> {
-        if self.chooses() {
-            let chosen = self.chosen(table)?;
-            return match (self.form.format, self.wide) {
-                (TableFormat::Table, true) => print(&fitted(&chosen, None)),
-                _ => self.form.print(&chosen),
-            };
-        }
+        let for_people = !matches!(self.form.format, TableFormat::Csv | TableFormat::Json);
+        let mut shown = match (self.chooses(), self.wide || !for_people) {
+            (true, _) => self.chosen(table)?,
+            (false, true) => table.clone(),
+            (false, false) => table.narrow(),
+        };
         match (self.form.format, self.wide) {
-            (TableFormat::Table, true) => print(&fitted(table, None)),
-            (TableFormat::Table, false) => {
-                let mut narrow = table.narrow();
+            (TableFormat::Table, true) => print(&fitted(&shown, None)),
+            (TableFormat::Table, false) if !self.chooses() => {
                 let details = table.headings.iter().filter(|heading| heading.detail);
                 let details: Vec<&str> = details.map(|heading| heading.label.as_str()).collect();
                 if !details.is_empty() {
                     let note = format!("More with --wide: {}", details.join(", "));
-                    narrow.notes.push(note);
+                    shown.notes.push(note);
                 }
-                self.form.print(&narrow)
+                self.form.print(&shown)
             }
-            (TableFormat::Markdown | TableFormat::Latex, false) => self.form.print(&table.narrow()),
-            _ => self.form.print(table),
+            _ => self.form.print(&shown),
         }
     }
 }
@@ -157,12 +149,10 @@ pub(super) struct ReportFile {
 }
 
 impl ReportFile {
-    /// Whether a page is wanted.
     pub(super) fn is_wanted(&self) -> bool {
         self.path.is_some()
     }
 
-    /// Writes the page if it is wanted.
     pub(super) fn save(
         &self,
         title: &str,
@@ -199,9 +189,7 @@ impl Form {
     }
 }
 
-/// Default number of galaxies per side of a simulated image.
 const GRID: u16 = 100;
-/// Default seed of a simulation.
 const SEED: u64 = 1;
 
 /// Settings of simulated data.
@@ -271,7 +259,6 @@ pub(super) struct Sharding {
 }
 
 impl Sharding {
-    /// The images of this shard.
     pub(super) fn part(&self, all: &[ImageId]) -> Vec<ImageId> {
         self.shard.unwrap_or(Shard::WHOLE).part(all)
     }
@@ -294,22 +281,12 @@ impl Threads {
     }
 }
 
-/// Bandpower definition on the command line.
-#[derive(Debug, Clone, Copy, Default, ValueEnum)]
-enum DefinitionArgument {
-    /// The arithmetic of the challenge.
-    #[default]
-    Leaderboard,
-    /// Azimuthal averages over fixed bins.
-    Corrected,
-}
-
 /// How to score.
 #[derive(Debug, Clone, Default, Args)]
 pub(super) struct ScoreSettings {
     /// Definition of bandpowers and Q.
-    #[arg(long, value_enum, default_value_t)]
-    definition: DefinitionArgument,
+    #[arg(long, value_parser = named::<Definition>(), default_value = "leaderboard")]
+    definition: Definition,
     /// Convention of signs and axes: 1 to 8 (5 is the standard one), `matched` or `best`. `matched` correlates best
     /// with the truth of all sets; `best` has the highest Q of each set, as on the leaderboard [default: 5 for
     /// catalogues by shearq, matched for others].
@@ -319,14 +296,20 @@ pub(super) struct ScoreSettings {
 
 impl ScoreSettings {
     pub(super) fn definition(&self) -> Definition {
-        match self.definition {
-            DefinitionArgument::Leaderboard => Definition::Leaderboard,
-            DefinitionArgument::Corrected => Definition::Corrected,
-        }
+        self.definition
     }
 }
 
-/// Refuses a configuration that is given twice.
+/// The configurations of `--submission`, each given once.
+pub(super) fn configurations(names: &[String]) -> anyhow::Result<Vec<Configuration>> {
+    given_once(names)?;
+    let registry = Registry::embedded()?;
+    let configurations = names.iter().map(|name| registry.get(name));
+    configurations
+        .map(|found| Ok(found?.configuration))
+        .collect()
+}
+
 pub(super) fn given_once(submissions: &[String]) -> anyhow::Result<()> {
     for (k, name) in submissions.iter().enumerate() {
         anyhow::ensure!(

@@ -9,10 +9,11 @@ use shearq_render::table::TableFormat;
 use shearq_results::bias::columns::Shapes;
 use shearq_results::compare::Grouping;
 use shearq_results::submit::manifest::Contents;
+use shearq_scoring::Definition;
 
 /// A type whose values are given by name on the command line.
 pub(crate) trait Named: Copy + Send + Sync + 'static {
-    /// Each value with its name and its line of `--help`.
+    // Each value with its name and its line of `--help`.
     const ALL: &[(Self, &str, &str)];
 }
 
@@ -53,6 +54,10 @@ choices! {
         Csv: "csv", "Comma-separated, full precision, values and errors in separate columns. An apostrophe protects text that spreadsheets would execute as a formula";
         Markdown: "markdown", "Markdown";
         Latex: "latex", "A LaTeX tabular";
+    }
+    Definition {
+        Leaderboard: "leaderboard", "The arithmetic of the challenge";
+        Corrected: "corrected", "Azimuthal averages over fixed bins";
     }
     Grouping {
         Set: "set", "Each set alone";

@@ -133,11 +133,9 @@ enum Command {
     Manual(help_files::Manual),
 }
 
-/// Exit code of success.
+// Exit codes of success, of an error or of findings, and of wrong usage.
 const DONE: u8 = 0;
-/// Exit code of an error, or of findings.
 const FAILED: u8 = 1;
-/// Exit code of wrong usage.
 const MISUSED: u8 = 2;
 
 /// Runs the command that this process was started with.
@@ -160,8 +158,8 @@ pub fn silence_caught_panics() {
     }));
 }
 
-/// Turns writing beyond a file size limit (`ulimit -f`) into an ordinary error. By default the signal ends the
-/// process without a message and leaves files half written.
+// Turns writing beyond a file size limit (`ulimit -f`) into an ordinary error. By default the signal ends the
+// process without a message and leaves files half written.
 fn fail_at_size_limits() {
     #[cfg(unix)]
     // SAFETY: ignoring a signal runs none of our code, and no other thread has been started.
@@ -213,7 +211,7 @@ pub fn run_with(arguments: impl IntoIterator<Item = OsString>) -> u8 {
     }
 }
 
-/// An error with its causes. A cause that the error itself mentions is not repeated.
+// An error with its causes. A cause that the error itself mentions is not repeated.
 fn causes(error: &anyhow::Error) -> String {
     let mut text = String::new();
     for cause in error.chain() {
@@ -228,7 +226,7 @@ fn causes(error: &anyhow::Error) -> String {
     text
 }
 
-/// Prints help, the version, or the error in the arguments.
+// Prints help, the version, or the error in the arguments.
 fn usage(message: &clap::Error) -> u8 {
     match written(|| message.print()) {
         Ok(()) => u8::try_from(message.exit_code()).unwrap_or(MISUSED),
@@ -244,8 +242,8 @@ fn usage(message: &clap::Error) -> u8 {
 #[error("there are findings")]
 struct Findings;
 
-/// Prints a heat map on a terminal; prints nothing if the output goes to a file or another program.
-/// `NO_COLOR` and terminals without colours are respected.
+// Prints a heat map on a terminal; prints nothing if the output goes to a file or another program.
+// `NO_COLOR` and terminals without colours are respected.
 fn print_heat_map(map: HeatMap) -> anyhow::Result<()> {
     use std::io::IsTerminal;
     if !std::io::stdout().is_terminal() {
@@ -260,26 +258,33 @@ fn print_heat_map(map: HeatMap) -> anyhow::Result<()> {
     write(&format!("\n{}", map.terminal(coloured)))
 }
 
-/// Prints a line on standard error. A closed pipe is not an error.
+// Prints a line on standard error. If that is closed, there is nobody to be told.
 fn tell(line: std::fmt::Arguments<'_>) {
     use std::io::Write;
     let _ = writeln!(std::io::stderr(), "{}", visible(&line.to_string()));
 }
 
-/// Warns about files that look like data and are not read.
+// Warns about files that look like data and are not read.
 fn tell_unread(unread: Vec<String>) {
     for line in unread {
         tell(format_args!("warning: {line}"));
     }
 }
 
-/// A number with its noun, in the plural unless it is 1.
+// What made a report: this version, and `settings` by name.
+fn made_by<const N: usize>(settings: [(&str, String); N]) -> Vec<(String, String)> {
+    let version = ("Version", format!("shearq {}", shearq_dataset::VERSION));
+    let all = std::iter::once(version).chain(settings);
+    all.map(|(name, value)| (name.to_owned(), value)).collect()
+}
+
+// A number with its noun, in the plural unless it is 1.
 fn count(number: usize, thing: &str) -> String {
     let ending = if number == 1 { "" } else { "s" };
     format!("{number} {thing}{ending}")
 }
 
-/// Columns of the terminal; `COLUMNS` or 80 if the output goes elsewhere.
+// Columns of the terminal; `COLUMNS` or 80 if the output goes elsewhere.
 fn width() -> usize {
     let stated = || std::env::var("COLUMNS").ok()?.parse().ok();
     let terminal = terminal_size::terminal_size_of(std::io::stdout());
@@ -290,23 +295,21 @@ fn width() -> usize {
         .unwrap_or(80)
 }
 
-/// Prints a table within the terminal's width.
 fn print_table(table: &Table) -> anyhow::Result<()> {
     print(&fitted(table, Some(width())))
 }
 
-/// Prints results to standard output, with control characters escaped. A closed pipe is not an error.
+// Prints results to standard output, with control characters escaped. A closed pipe is not an error.
 fn print(text: &str) -> anyhow::Result<()> {
     write(&visible(text))
 }
 
-/// Prints text to standard output unchanged.
 fn write(text: &str) -> anyhow::Result<()> {
     use std::io::Write;
     written(|| std::io::stdout().write_all(text.as_bytes()))
 }
 
-/// Writes to standard output and flushes it, so that a failed write is reported.
+// Writes to standard output and flushes it, so that a failed write is reported.
 fn written(write: impl FnOnce() -> std::io::Result<()>) -> anyhow::Result<()> {
     use std::io::Write;
     match write().and_then(|()| std::io::stdout().flush()) {
@@ -323,7 +326,7 @@ mod tests {
 
     use super::*;
 
-    /// The words of a shell's line, without quotes and redirections.
+    // The words of a shell's line, without quotes and redirections.
     fn words(line: &str) -> Vec<String> {
         // Quoted text is one word; what follows a redirection is none.
         let mut words = Vec::new();
@@ -341,7 +344,7 @@ mod tests {
         words
     }
 
-    /// The commands in the documents, except those with shell variables. A backslash joins two lines.
+    // The commands in the documents, except those with shell variables. A backslash joins two lines.
     fn documented() -> Vec<(String, String)> {
         let mut found = Vec::new();
         let mut pages = vec!["README.md".into(), "CONTRIBUTING.md".into()];

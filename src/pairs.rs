@@ -4,8 +4,8 @@ use clap::{Arg, Command, CommandFactory};
 
 use crate::Cli;
 
-/// The ways to use each command, and the options that each way uses. Two options without a common way must be
-/// refused.
+// The ways to use each command, and the options that each way uses. Two options without a common way must be
+// refused.
 const WAYS: [(&str, &[&str]); 32] = [
     ("quickstart", &["out threads wide"]),
     (
@@ -103,10 +103,7 @@ const WAYS: [(&str, &[&str]); 32] = [
         "study",
         &["submission sets images pairs grid seed amplitude tilt out format threads"],
     ),
-    (
-        "bench",
-        &["submission catalogues galaxies out format threads"],
-    ),
+    ("bench", &["submission catalogues format threads"]),
     ("submissions list", &["format"]),
     ("submissions show", &["NAME|FILE"]),
     ("submissions init", &["FILE method"]),
@@ -128,10 +125,10 @@ const WAYS: [(&str, &[&str]); 32] = [
     ("challenge help", &[]),
 ];
 
-/// Commands whose pairs are not compared.
+// Commands whose pairs are not compared.
 const NAMES_ONLY: [&str; 2] = ["baseline record", "baseline check"];
 
-/// Pairs that the command refuses when it runs.
+// Pairs that the command refuses when it runs.
 const REFUSED_WHEN_RUN: [(&str, &str, &str); 6] = [
     ("run", "data", "grid"),
     ("run", "data", "seed"),
@@ -141,7 +138,7 @@ const REFUSED_WHEN_RUN: [(&str, &str, &str); 6] = [
     ("run", "shard", "report"),
 ];
 
-/// The name of an option on the command line.
+// The name of an option on the command line.
 fn name(argument: &Arg) -> String {
     let value = || {
         let names = argument.get_value_names().unwrap_or_default();
@@ -151,7 +148,7 @@ fn name(argument: &Arg) -> String {
     name.unwrap_or_else(|| argument.get_id().to_string().to_uppercase())
 }
 
-/// Whether clap refuses two options together.
+// Whether clap refuses two options together.
 fn refused(command: &Command, a: &Arg, b: &Arg) -> bool {
     let names = |a: &Arg, b: &Arg| {
         let others = command.get_arg_conflicts_with(a);
@@ -167,7 +164,7 @@ fn refused(command: &Command, a: &Arg, b: &Arg) -> bool {
     names(a, b) || names(b, a) || exclusive
 }
 
-/// Compares a command, or its subcommands, with the table.
+// Compares a command, or its subcommands, with the table.
 fn compare(path: &str, command: &Command, wrong: &mut Vec<String>) {
     if command.has_subcommands() {
         for inner in command.get_subcommands() {

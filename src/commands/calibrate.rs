@@ -8,10 +8,9 @@ use shearq_submissions::Registry;
 
 use crate::arguments::{Form, Threads};
 use crate::progress::Bar;
-use crate::tell;
+use crate::{made_by, tell};
 use shearq_render::page::Page;
-use shearq_studies::calibration::calibrate;
-use shearq_studies::exhibits;
+use shearq_studies::calibration::{best_table, calibrate, curves_table, figures};
 
 /// Find the regularisation parameter λ of a configuration, as in Sect. 4 of the paper.
 ///
@@ -60,25 +59,18 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         &mut bar,
     )?;
     drop(bar);
-    let table = exhibits::calibration_table(&curves, &submission);
+    let table = best_table(&curves, &submission);
     if let Some(out) = &arguments.out {
-        let made_by = vec![
-            (
-                "Version".into(),
-                format!("shearq {}", shearq_dataset::VERSION),
-            ),
-            ("Seed".into(), arguments.seed.to_string()),
-            (
-                "Data".into(),
-                format!("{} synthetic galaxies", arguments.galaxies),
-            ),
-            ("Settings".into(), toml::to_string(&submission)?),
-        ];
+        let made_by = made_by([
+            ("Seed", arguments.seed.to_string()),
+            ("Data", format!("{} synthetic galaxies", arguments.galaxies)),
+            ("Settings", toml::to_string(&submission)?),
+        ]);
         let title = format!("Calibration of λ for {}", submission.name);
         let mut page = Page::new(out, &title, "Simulated data", made_by);
         page.section("Curves", "Figs 4 to 7 of the paper.");
-        exhibits::calibration_figures(&mut page, &curves)?;
-        page.data("curves", &exhibits::curves_table(&curves))?;
+        figures(&mut page, &curves)?;
+        page.data("curves", &curves_table(&curves))?;
         page.section("λ", "The best λ at each S/N, and the chosen λ.");
         page.table("lambda", &table)?;
         page.save()?;

@@ -8,14 +8,14 @@ use shearq_submissions::{Configuration, Published, Registry};
 
 use crate::arguments::{SetList, Threads, given_once};
 use crate::progress::{Bar, goes_on};
-use crate::{print, print_table, tell};
+use crate::{made_by, print, print_table, tell};
 use shearq_dataset::layout::MAX_IMAGE;
 use shearq_pipeline::run::{measurers, simulated_steps};
 use shearq_pipeline::simulate::simulator;
 use shearq_render::page::Page;
 use shearq_results::views::steps::{steps_figure, steps_row};
 use shearq_simulate::set::SimulationSettings;
-use shearq_studies::calibration::calibrate;
+use shearq_studies::calibration::{self, calibrate};
 use shearq_studies::exhibits;
 use shearq_studies::reproduce::{Plan, SetResult, Study, run_sets};
 
@@ -87,28 +87,16 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let curves = calibrate(&base, *galaxies, *seed, threads, &mut bar)?;
     drop(bar);
 
-    let settings = vec![
-        (
-            "Version".into(),
-            format!("shearq {}", shearq_dataset::VERSION),
-        ),
-        ("Seed".into(), seed.to_string()),
-        (
-            "Data".into(),
-            format!(
-                "simulated: {} sets, {images} images of {grid} × {grid} galaxies",
-                sets.len()
-            ),
-        ),
-        (
-            "Calibration".into(),
-            format!("{galaxies} synthetic galaxies"),
-        ),
-        (
-            "Settings of the calibration".into(),
-            toml::to_string(&base)?,
-        ),
-    ];
+    let data = format!(
+        "simulated: {} sets, {images} images of {grid} × {grid} galaxies",
+        sets.len()
+    );
+    let settings = made_by([
+        ("Seed", seed.to_string()),
+        ("Data", data),
+        ("Calibration", format!("{galaxies} synthetic galaxies")),
+        ("Settings of the calibration", toml::to_string(&base)?),
+    ]);
     study.check()?;
     let mut page = Page::new(
         out,
@@ -118,30 +106,20 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     );
     let table_one = exhibits::table_one(&results, &submissions);
     let names: Vec<String> = names(&submissions);
-    let findings = exhibits::findings_table(&exhibits::findings(&results, &names));
-    let calibration = exhibits::calibration_table(&curves, &base);
-    let of_lambda = exhibits::findings_table(&exhibits::lambda_findings(&curves));
+    let calibration = calibration::best_table(&curves, &base);
     method(&mut page, &plan)?;
     page.section("Calibration of λ (Sect. 4)", SECT_FOUR);
-    exhibits::calibration_figures(&mut page, &curves)?;
+    calibration::figures(&mut page, &curves)?;
     page.table("calibration", &calibration)?;
-    page.table("findings-lambda", &of_lambda)?;
-    page.data("fig5-7-lambda", &exhibits::curves_table(&curves))?;
+    page.data("fig5-7-lambda", &calibration::curves_table(&curves))?;
     page.section("Configurations (Sect. 5)", SECT_FIVE);
     page.table("table1", &table_one)?;
-    // A few configurations or sets may allow no finding.
-    let findings = (!findings.rows.is_empty()).then_some(findings);
-    if let Some(findings) = &findings {
-        page.table("findings", findings)?;
-    }
     sect_five(&mut page, &results, &names)?;
     study.check()?;
     page.save()?;
     print_table(&table_one)?;
-    for table in findings.iter().chain([&of_lambda, &calibration]) {
-        print("\n")?;
-        print_table(table)?;
-    }
+    print("\n")?;
+    print_table(&calibration)?;
     tell(format_args!(
         "wrote report, figures and data to {}",
         out.display()
@@ -153,7 +131,7 @@ const SECT_THREE: &str = "The network deconvolves a stamp. The ellipticity is me
 const SECT_FOUR: &str = "Exponential galaxies are convolved with a Moffat PSF each and have white noise of 10, 20 or 40 dB. Both updating rules deconvolve them with λ from 10⁻⁶ to 10⁶. All data are simulated.";
 const SECT_FIVE: &str = "Configurations of Table 1 on sets of Table 2. The images are simulated, not the challenge's. Unpublished properties are chosen here: distributions of S/N and size, PSF fields and shear spectra. Metrics are for the standard convention and the leaderboard definition. Errors come from the part of the ellipticities that the truth does not explain.";
 
-/// The configurations of Table 1 with these names, in its order; all if `wanted` is empty.
+// The configurations of Table 1 with these names, in its order; all if `wanted` is empty.
 fn of_table_one(
     registry: &Registry,
     wanted: &[String],
@@ -170,7 +148,7 @@ fn of_table_one(
     Ok(all.into_iter().filter(|(s, _)| chosen(&s.name)).collect())
 }
 
-/// Fig. 3: the steps of one galaxy at S/N 10, 20 and 40.
+// Fig. 3: the steps of one galaxy at S/N 10, 20 and 40.
 fn method(page: &mut Page<'_>, plan: &Plan) -> anyhow::Result<()> {
     page.section("The method (Sect. 3)", SECT_THREE);
     let name = "23/raw/star";
@@ -197,7 +175,7 @@ fn names(submissions: &[(Configuration, Published)]) -> Vec<String> {
     submissions.iter().map(|(s, _)| s.name.clone()).collect()
 }
 
-/// Figs 8 to 11 and their tables.
+// Figs 8 to 11 and their tables.
 fn sect_five(page: &mut Page<'_>, results: &[SetResult], names: &[String]) -> anyhow::Result<()> {
     let images = results.first().map_or(0, |set| set.images);
     page.figure(
@@ -209,38 +187,23 @@ fn sect_five(page: &mut Page<'_>, results: &[SetResult], names: &[String]) -> an
     if let (Some(raw), Some(den)) = (place("23/raw/star"), place("23/den/star")) {
         let both = [(raw, "23/raw/star"), (den, "23/den/star")];
         page.table("denoising", &exhibits::denoising_table(results, &both))?;
-    }
-    if let (Some(raw), Some(den)) = (place("23/raw/star"), place("23/den/star")) {
         page.figure(
             "fig9-power-spectra",
             &exhibits::power_spectra(results, den, "23/den/star"),
             &format!("As Fig. 9 of the paper: true and measured shear power spectra of 23/den/star. The measured spectra contain the noise of {images} images."),
         )?;
-        page.data(
-            "fig9-power-spectra",
-            &exhibits::power_spectra_table(results, den),
-        )?;
-        let both = [(raw, "23/raw/star"), (den, "23/den/star")];
+        let spectra = exhibits::power_spectra_table(results, den);
+        page.data("fig9-power-spectra", &spectra)?;
+        let title = "Multiplicative bias per set";
         page.figure(
             "fig10-multiplicative",
-            &exhibits::bias_per_set(
-                results,
-                &both,
-                |f| f.m_half,
-                "Multiplicative bias per set",
-                "M/2",
-            ),
+            &exhibits::bias_per_set(results, &both, |f| f.m_half, title, "M/2"),
             "As Fig. 10 of the paper: multiplicative bias per set.",
         )?;
+        let title = "Additive bias per set";
         page.figure(
             "fig11-additive",
-            &exhibits::bias_per_set(
-                results,
-                &both,
-                |f| f.sqrt_a,
-                "Additive bias per set",
-                "√A × 10⁴",
-            ),
+            &exhibits::bias_per_set(results, &both, |f| f.sqrt_a, title, "√A × 10⁴"),
             "As Fig. 11 of the paper: additive bias per set.",
         )?;
     }

@@ -3,11 +3,10 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use shearq_submissions::{Configuration, Registry};
 
-use crate::arguments::{Form, SetList, SimulationArguments, Threads, given_once};
-use crate::print;
+use crate::arguments::{Form, SetList, SimulationArguments, Threads, configurations};
 use crate::progress::{Bar, goes_on};
+use crate::{made_by, print};
 use shearq_dataset::layout::MAX_IMAGE;
 use shearq_render::page::Page;
 use shearq_render::table::TableFormat;
@@ -64,12 +63,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         threads,
     } = arguments;
     let sets = sets.simulated()?;
-    given_once(submission)?;
-    let registry = Registry::embedded()?;
-    let submissions = submission
-        .iter()
-        .map(|name| Ok(registry.get(name)?.configuration))
-        .collect::<anyhow::Result<Vec<Configuration>>>()?;
+    let submissions = configurations(submission)?;
     let plan = Plan {
         version: shearq_dataset::VERSION.into(),
         simulation: simulation.settings()?,
@@ -86,21 +80,15 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let biases = bias_sets(&study, sets, *pairs, threads, &mut bar)?;
     drop(bar);
     let table = contest_table(&plan, &results, &biases)?;
-    let mut made_by = vec![
-        (
-            "Version".into(),
-            format!("shearq {}", shearq_dataset::VERSION),
-        ),
-        ("Seed".into(), plan.simulation.seed.to_string()),
-        (
-            "Data".into(),
-            format!(
-                "simulated: {images} images of {0} × {0} galaxies per set, {pairs} for biases",
-                plan.simulation.grid
-            ),
-        ),
-        ("Simulation".into(), toml::to_string(&plan.simulation)?),
-    ];
+    let data = format!(
+        "simulated: {images} images of {0} × {0} galaxies per set, {pairs} for biases",
+        plan.simulation.grid
+    );
+    let mut made_by = made_by([
+        ("Seed", plan.simulation.seed.to_string()),
+        ("Data", data),
+        ("Simulation", toml::to_string(&plan.simulation)?),
+    ]);
     for submission in &plan.submissions {
         made_by.push((submission.name.clone(), toml::to_string(submission)?));
     }

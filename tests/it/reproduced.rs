@@ -8,13 +8,15 @@ use rand_distr::{Distribution, StandardNormal};
 use shearq_pipeline::Quiet;
 use shearq_pipeline::run::measurers;
 use shearq_pipeline::simulate::simulator;
+use shearq_results::compare::{Paired, difference};
 use shearq_results::score::OWN;
 use shearq_scoring::{Metrics, Options, SetImages, SetScorer};
 use shearq_simulate::kinds::shares;
 use shearq_simulate::set::SimulationSettings;
+use shearq_studies::Finding;
 use shearq_studies::bias::biases;
-use shearq_studies::calibration::{LOG_LAMBDA, PAPER_LAMBDA, calibrate};
-use shearq_studies::exhibits::{Finding, findings, lambda_findings};
+use shearq_studies::calibration::{self, LOG_LAMBDA, PAPER_LAMBDA, calibrate};
+use shearq_studies::exhibits::findings;
 use shearq_studies::reproduce::{Plan, SetResult, Study, run_sets};
 use shearq_submissions::{Configuration, PsfForm, Registry};
 
@@ -29,18 +31,41 @@ fn submissions(names: &[&str]) -> Vec<Configuration> {
         .collect()
 }
 
-/// Whether the finding that begins with `paper` agrees.
-fn agrees(findings: &[Finding], paper: &str) -> bool {
-    let finding = findings.iter().find(|f| f.paper.starts_with(paper));
-    let finding = finding.unwrap_or_else(|| panic!("no finding `{paper}`"));
-    eprintln!("{paper}: {}", finding.here);
-    finding.agrees == Some(true)
+/// Mean gain in Q from one configuration to another on the same images, relative to the first, and its error.
+fn q_gain(results: &[SetResult], first: usize, second: usize) -> (f64, f64) {
+    let sets: Vec<u32> = results.iter().map(|set| set.set).collect();
+    let (mut mean, mut gain, mut variance) = (0.0, 0.0, 0.0);
+    for (set, share) in results.iter().zip(shares(&sets)) {
+        let [a, b] = [first, second].map(|k| &set.results[k].score);
+        let paired = difference(Paired::Q, &[a], &[b]).unwrap();
+        mean += share * a.metrics.q;
+        gain += share * paired.difference;
+        variance += (share * paired.error).powi(2);
+    }
+    (gain / mean, variance.sqrt() / mean)
 }
 
-fn assert_agree(findings: &[Finding], papers: &[&str]) {
-    for paper in papers {
-        assert!(agrees(findings, paper), "{paper}");
+/// Asserts the paper's statements on pairs of configurations: denoising improves Q, and both forms of PSF give the same.
+fn assert_denoising_improves_q(results: &[SetResult], names: &[String]) {
+    for psf in ["star", "func"] {
+        let [raw, den] = ["raw", "den"].map(|data| place(names, &format!("23/{data}/{psf}")));
+        let (gain, error) = q_gain(results, raw, den);
+        assert!(gain > 2.0 * error, "{psf}: {gain} ± {error}");
     }
+    let [functional, star] = ["23/den/func", "23/den/star"].map(|name| place(names, name));
+    assert!(q_gain(results, functional, star).0.abs() < 0.05);
+}
+
+/// Asserts that Q of 23/den/star is lower in a set than in the fiducial set 2, by two standard errors.
+fn assert_poor_q(results: &[SetResult], names: &[String], poor: u32) {
+    let q = |wanted: u32| {
+        let set = results.iter().find(|set| set.set == wanted).unwrap();
+        let score = &set.results[place(names, "23/den/star")].score;
+        (score.metrics.q, score.errors.q)
+    };
+    let (fiducial, poor) = (q(2), q(poor));
+    let error = fiducial.1.hypot(poor.1);
+    assert!(fiducial.0 - poor.0 > 2.0 * error, "{fiducial:?} {poor:?}");
 }
 
 fn place(names: &[String], name: &str) -> usize {
@@ -173,16 +198,8 @@ fn submissions_compare_as_the_paper_found() {
     let submissions = published.into_iter().map(|(s, _)| s).collect();
     // Fiducial, low S/N and high S/N: 2,048 galaxies each.
     let (results, names) = on_sets(submissions, &[2, 5, 8]);
-    let found = findings(&results, &names);
-    assert_agree(
-        &found,
-        &[
-            "Denoising improves Q (star PSF)",
-            "Denoising improves Q (functional PSF)",
-            "Star and functional PSF",
-            "Q is poor at low S/N",
-        ],
-    );
+    assert_denoising_improves_q(&results, &names);
+    assert_poor_q(&results, &names, 5);
     // The simulator's stars are drawn from the functional PSFs: with both centred alike nothing but the light beyond
     // the star's stamp tells them apart.
     let (star, functional) = (place(&names, "23/den/star"), place(&names, "23/den/func"));
@@ -210,17 +227,9 @@ fn printed_submissions_compare_as_the_paper_found() {
     // Fiducial, low S/N, high S/N, small galaxies: 2,048 galaxies each. The differences are many
     // times their errors: denoising 30 %, S/N and size factors of two, PSF form below 1 %.
     let (results, names) = on_sets(printed, &[2, 5, 8, 14]);
-    let found = findings(&results, &names);
-    assert_agree(
-        &found,
-        &[
-            "Denoising improves Q (star PSF)",
-            "Denoising improves Q (functional PSF)",
-            "Star and functional PSF",
-            "Q is poor at low S/N",
-            "Q is poor for small galaxies",
-        ],
-    );
+    assert_denoising_improves_q(&results, &names);
+    assert_poor_q(&results, &names, 5);
+    assert_poor_q(&results, &names, 14);
     // Denoising lowers the scatter of calibrated ellipticities at S/N 10, 20 and 40: by 15 to 25 %,
     // with errors of 1.3 % each.
     let (raw, den) = (place(&names, "23/raw/star"), place(&names, "23/den/star"));
@@ -239,35 +248,49 @@ fn updates_compare_as_the_paper_found() {
         calibrate(submission, 40, 3, 2, &mut Quiet).unwrap()
     };
     let (adopted, printed) = (of("paper"), of("as-printed/paper"));
-    let found = lambda_findings(&adopted);
-    assert_agree(
-        &found,
-        &[
-            "CTR is highest at λ = 10^−3.5",
-            "1/RMSD of the adaptive update is the better one for λ ≤ 10⁻⁴",
-        ],
-    );
-    let found = lambda_findings(&printed);
-    assert_agree(
-        &found,
-        &[
-            "Whatever the S/N, the adaptive update has the higher CTR",
-            "dSNR is higher for higher S/N and decreases with λ",
-            "1/RMSD of the adaptive update is the better one for λ ≤ 10⁻⁴",
-        ],
-    );
-    assert!(!agrees(&found, "CTR is highest at λ = 10^−3.5"));
     let [weak, strong] = [PAPER_LAMBDA, LOG_LAMBDA.len() - 1];
+    // CTR is highest at λ = 10^−3.5 at each S/N, but not as printed.
+    let ctr_is_highest = |curve: &Vec<LambdaSums>| {
+        let ctr = |k: usize| curve[k].ctr().0;
+        (0..curve.len()).all(|k| LOG_LAMBDA[k] == -3.5 || ctr(k) < ctr(weak + 1))
+    };
+    assert!(adopted.over_lambda[0].iter().all(ctr_is_highest));
+    assert!(!printed.over_lambda[0].iter().all(ctr_is_highest));
+    // 1/RMSD of the adaptive update is the better one for λ ≤ 10⁻⁴, whatever the S/N.
+    for curves in [&adopted, &printed] {
+        let [adaptive, constant] = [&curves.over_lambda[0], &curves.over_lambda[1]];
+        for (adaptive, constant) in adaptive.iter().zip(constant) {
+            for k in 0..=weak {
+                assert!(adaptive[k].inverse_rmsd().0 >= constant[k].inverse_rmsd().0);
+            }
+        }
+    }
+    // As printed, the adaptive update has the higher CTR at each S/N, and dSNR rises with S/N and decreases with λ.
+    let [adaptive, constant] = [&printed.over_snr[0], &printed.over_snr[1]];
+    for (adaptive, constant) in adaptive.iter().zip(constant) {
+        assert!(adaptive.ctr().0 > constant.ctr().0);
+    }
+    let dsnr = |k: usize| {
+        printed.over_lambda[0]
+            .iter()
+            .map(move |c| c[k].mean_dsnr().0)
+    };
+    assert!(dsnr(weak).is_sorted_by(|a, b| a < b));
+    assert!(
+        dsnr(strong)
+            .zip(dsnr(weak))
+            .all(|(strong, weak)| strong < weak)
+    );
     for curve in &adopted.over_lambda[0] {
         // By two decibels and more, each known to a few tenths.
-        assert!(curve[strong].mean_dsnr() < curve[weak].mean_dsnr() - 1.0);
+        assert!(curve[strong].mean_dsnr().0 < curve[weak].mean_dsnr().0 - 1.0);
     }
     // The mean over S/N; λ has steps of half a decade.
-    let highest = |curves: &shearq_studies::calibration::Curves| {
+    let highest = |curves: &Curves| {
         let mean = |k: usize| {
             curves.over_lambda[0]
                 .iter()
-                .map(|c| c[k].ctr())
+                .map(|c| c[k].ctr().0)
                 .sum::<f64>()
         };
         let best = (0..LOG_LAMBDA.len()).max_by(|a, b| mean(*a).total_cmp(&mean(*b)));

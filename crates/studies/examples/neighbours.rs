@@ -23,11 +23,11 @@ use shearq_render::figure::{Figure, LinePlot, PanelGrid, PictureFormat, Series, 
 use shearq_simulate::galaxy::Galaxy;
 use shearq_simulate::render::{RenderScratch, Renderer};
 
-/// Pixels on a side of a stamp.
+// Pixels on a side of a stamp.
 const SIDE: usize = 48;
-/// Shear of each component, of either sign.
+// Shear of each component, of either sign.
 const SHEAR: f64 = 0.02;
-/// Distances of the neighbour in pixels.
+// Distances of the neighbour in pixels.
 const DISTANCES: [[f64; 2]; 6] = [
     [5.0, 7.0],
     [7.0, 10.0],
@@ -36,16 +36,15 @@ const DISTANCES: [[f64; 2]; 6] = [
     [16.0, 20.0],
     [20.0, 24.0],
 ];
-/// Fluxes of the neighbour in units of the galaxy's.
+// Fluxes of the neighbour in units of the galaxy's.
 const RATIOS: [[f64; 2]; 2] = [[0.3, 1.0], [1.0, 3.0]];
-/// Ends of the axis of m in the figure, in 10⁻³.
+// Ends of the axis of m in the figure, in 10⁻³.
 const SHOWN: (f64, f64) = (-100.0, 100.0);
-/// Largest error of m that the figure shows.
+// Largest error of m that the figure shows.
 const MOST_ERROR: f64 = 0.05;
-/// Groups of scenes that the errors come from.
+// Groups of scenes that the errors come from.
 const GROUPS: usize = 20;
 
-/// A profile of the population.
 #[derive(Clone, Copy)]
 struct Profile {
     shape: Shear,
@@ -65,7 +64,7 @@ impl Profile {
         }
     }
 
-    /// With a flux of 1, turned by 90 degrees or not, and sheared.
+    // With a flux of 1, turned by 90 degrees or not, and sheared.
     fn galaxy(self, turned: bool, shear: f64) -> Result<Galaxy, Box<dyn Error>> {
         let side = if turned { -1.0 } else { 1.0 };
         let shape = Shear::new(side * self.shape.e1, side * self.shape.e2);
@@ -77,12 +76,11 @@ impl Profile {
     }
 }
 
-/// Draws stamps.
 struct Drawing<'a> {
     renderer: Renderer,
     psf: TransformedPsf<'a>,
     scratch: RenderScratch,
-    /// S/N of the galaxies, in noise of level 1.
+    // S/N of the galaxies, in noise of level 1.
     snr: f64,
 }
 
@@ -96,7 +94,7 @@ impl Drawing<'_> {
         Array2::from_shape_vec((SIDE, SIDE), out).expect("as long as a stamp")
     }
 
-    /// A galaxy at `place`: `[turned][sign of the shear]`, and its flux.
+    // A galaxy at `place`: `[turned][sign of the shear]`, and its flux.
     fn central(
         &mut self,
         profile: Profile,
@@ -111,7 +109,6 @@ impl Drawing<'_> {
         Ok((stamps, flux))
     }
 
-    /// All versions of a galaxy.
     fn all(
         &mut self,
         place: impl Fn(bool, f64) -> [f64; 2],
@@ -129,10 +126,9 @@ impl Drawing<'_> {
     }
 }
 
-/// Stamps `[turned][sign of the shear]`.
+// Stamps `[turned][sign of the shear]`.
 type Stamps = [[Array2<f32>; 2]; 2];
 
-/// Where a neighbour is.
 #[derive(Clone, Copy)]
 struct Away {
     distance: f64,
@@ -140,7 +136,7 @@ struct Away {
 }
 
 impl Away {
-    /// Its place if the galaxy is at `galaxy`, turned by 90 degrees or not, under a shear about the galaxy.
+    // Its place if the galaxy is at `galaxy`, turned by 90 degrees or not, under a shear about the galaxy.
     fn place(self, galaxy: [f64; 2], turned: bool, shear: f64) -> [f64; 2] {
         let angle = self.angle + if turned { PI / 2.0 } else { 0.0 };
         let [x, y] = [self.distance * angle.cos(), self.distance * angle.sin()];
@@ -149,30 +145,27 @@ impl Away {
     }
 }
 
-/// A scene's versions `[sign of the shear][version]`.
+// A scene's versions `[sign of the shear][version]`.
 type Scene = [[Measurement; 4]; 2];
 
-/// What was measured of one kind of scene.
 #[derive(Default, Clone)]
 struct Bin {
     scenes: Vec<Scene>,
 }
 
-/// What is printed of a bin: m less that of the same galaxies without a neighbour, and shares.
+// What is printed of a bin: m less that of the same galaxies without a neighbour, and shares.
 struct Row {
-    /// Of scenes of which all versions can be measured.
+    // Of scenes of which all versions can be measured.
     m: [f64; 2],
     m_error: [f64; 2],
-    /// Of versions that can be measured, each for itself.
+    // Of versions that can be measured, each for itself.
     single: [f64; 2],
     single_error: [f64; 2],
-    /// Scatter that noise makes of one component.
-    noise: f64,
-    /// Share of versions with a flag under the positive and the negative shear.
+    // Share of versions with a flag under the positive and the negative shear.
     flagged: [f64; 2],
 }
 
-/// Sums of one component over scenes.
+// Sums of one component over scenes.
 #[derive(Clone, Copy, Default)]
 struct Sums {
     e: [f64; 2],
@@ -208,7 +201,7 @@ impl Sums {
     }
 }
 
-/// m of one component less that without a neighbour, and its error: a jackknife over groups of scenes.
+// m of one component less that without a neighbour, and its error: a jackknife over groups of scenes.
 fn bias(bin: &Bin, alone: &Bin, k: usize, whole: bool) -> (f64, f64) {
     let mut groups = [[Sums::default(); 2]; GROUPS];
     for (at, (scene, without)) in bin.scenes.iter().zip(&alone.scenes).enumerate() {
@@ -238,19 +231,6 @@ impl Bin {
     fn row(&self, alone: &Bin) -> Row {
         let all = |whole: bool| [0, 1].map(|k| bias(self, alone, k, whole));
         let (whole, single) = (all(true), all(false));
-        let good: Vec<_> = self.scenes.iter().flatten().collect();
-        let (mut squares, mut responses, mut count) = (0.0, 0.0, 0.0);
-        for versions in &good {
-            // Versions 2k and 2k + 1 have noise of both signs.
-            for pair in versions.chunks(2) {
-                if let ([a, b], true) = (pair, pair.iter().all(|g| g.flags.is_empty())) {
-                    squares += ((a.e1 - b.e1) / 2.0).powi(2) + ((a.e2 - b.e2) / 2.0).powi(2);
-                    let response = |g: &Measurement| g.response.map_or(f64::NAN, |r| r[0][0]);
-                    responses += (response(a) + response(b)) / 2.0;
-                    count += 1.0;
-                }
-            }
-        }
         let flagged = [0, 1].map(|side| {
             let versions = self.scenes.iter().flat_map(|scene| &scene[side]);
             let bad = versions.filter(|g| !g.flags.is_empty()).count();
@@ -261,13 +241,11 @@ impl Bin {
             m_error: whole.map(|m| m.1),
             single: single.map(|m| m.0),
             single_error: single.map(|m| m.1),
-            noise: (squares / count / 2.0f64).sqrt() / (responses / count),
             flagged,
         }
     }
 }
 
-/// A scene in all versions.
 fn measured(
     worker: &mut PsfWorker<'_>,
     galaxy: &Stamps,
@@ -299,10 +277,9 @@ fn print(case: &str, row: &Row) {
         format!("{m1:+.1}, {m2:+.1} ± {:.1}", 1e3 * error[0].max(error[1]))
     };
     println!(
-        "| {case} | {} | {} | {:.3} | {:.2} %, {:.2} % |",
+        "| {case} | {} | {} | {:.2} %, {:.2} % |",
         milli(row.m, row.m_error),
         milli(row.single, row.single_error),
-        row.noise,
         100.0 * row.flagged[0],
         100.0 * row.flagged[1],
     );
@@ -384,9 +361,9 @@ fn main() -> Result<(), Box<dyn Error>> {
     }
 
     println!(
-        "| neighbour at (px) | sheared | flux ratio | m1, m2 (10⁻³) | m1, m2 (10⁻³), versions alone | noise | flagged |"
+        "| neighbour at (px) | sheared | flux ratio | m1, m2 (10⁻³) | m1, m2 (10⁻³), versions alone | flagged |"
     );
-    println!("|---|---|---|---|---|---|---|");
+    println!("|---|---|---|---|---|---|");
     print("none | | ", &bins[0].row(&bins[0]));
     let rows: Vec<Row> = bins[1..].iter().map(|bin| bin.row(&bins[0])).collect();
     let mut rest = rows.iter();
@@ -407,7 +384,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// m against distance, for galaxies sheared alone and with the neighbour.
+// m against distance, for galaxies sheared alone and with the neighbour.
 fn plots(rows: &[Row]) -> PanelGrid {
     let plot = |sheared: usize, title: &str| {
         let of_ratio = |ratio: usize| {

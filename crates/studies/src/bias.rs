@@ -29,7 +29,6 @@ use shearq_pipeline::simulate::place;
 use shearq_simulate::render::RenderScratch;
 use shearq_simulate::set::{ImageFields, STAMP, SetSimulator, Version};
 
-/// Shear of each component.
 pub const SHEAR: f64 = 0.02;
 
 /// Biases of a configuration on one kind of set.
@@ -42,25 +41,22 @@ pub struct ShearBias {
     /// Multiplicative bias per component.
     #[serde(deserialize_with = "nan_for_null")]
     pub m: [f64; 2],
-    /// Standard errors.
     #[serde(deserialize_with = "nan_for_null")]
     pub m_error: [f64; 2],
     /// Additive bias per component.
     #[serde(deserialize_with = "nan_for_null")]
     pub c: [f64; 2],
-    /// Standard errors.
     #[serde(deserialize_with = "nan_for_null")]
     pub c_error: [f64; 2],
     /// Additive bias along the ellipticity of the PSF, divided by this ellipticity; NaN for round PSFs.
     #[serde(deserialize_with = "nan_for_null")]
     pub leakage: f64,
-    /// Standard error of the leakage.
     #[serde(deserialize_with = "nan_for_null")]
     pub leakage_error: f64,
 }
 
-/// The versions of a galaxy: signs of its intrinsic ellipticity, of both components of shear, and of its
-/// noise.
+// The versions of a galaxy: signs of its intrinsic ellipticity, of both components of shear, and of its
+// noise.
 const VERSIONS: [(f64, [f64; 2], f32); 8] = [
     (1.0, [1.0, 1.0], 1.0),
     (1.0, [-1.0, -1.0], 1.0),
@@ -71,10 +67,8 @@ const VERSIONS: [(f64, [f64; 2], f32); 8] = [
     (-1.0, [1.0, -1.0], -1.0),
     (-1.0, [-1.0, 1.0], -1.0),
 ];
+
 /// Biases of each measurer on the galaxies of `images` of a set.
-///
-/// # Errors
-/// If threads cannot be started.
 pub fn biases(
     set: &SetSimulator,
     images: &[u32],
@@ -130,8 +124,7 @@ pub fn biases(
         |row: Vec<BiasSums>| {
             progress.advance(n as u64);
             for (sums, more) in sums.iter_mut().zip(row) {
-                sums.merge(more)
-                    .map_err(|error| PipelineError::Request(error.to_string()))?;
+                sums.merge(more).expect("all sums have one layout");
             }
             Ok(())
         },
@@ -139,7 +132,7 @@ pub fn biases(
     Ok(sums.into_iter().map(BiasSums::bias).collect())
 }
 
-/// A strip of stamps of one version of a row's galaxies.
+// A strip of stamps of one version of a row's galaxies.
 fn draw(
     set: &SetSimulator,
     fields: &ImageFields,
@@ -165,16 +158,15 @@ fn draw(
     strip
 }
 
-/// Sums over galaxies.
 #[derive(Debug, Clone)]
 struct BiasSums {
     galaxies: u64,
     dropped: u64,
-    /// Of all versions of each galaxy, which is a unit.
+    // Of all versions of each galaxy, which is a unit.
     units: UnitSums,
-    /// The mean ellipticity of all versions along the PSF, per ellipticity of the PSF.
+    // The mean ellipticity of all versions along the PSF, per ellipticity of the PSF.
     leakage: UnitSums,
-    /// Whether ellipticities are divided by the mean response.
+    // Whether ellipticities are divided by the mean response.
     calibrated: bool,
 }
 
@@ -190,7 +182,7 @@ impl BiasSums {
         }
     }
 
-    /// Adds galaxy `key` of an image.
+    // Adds galaxy `key` of an image.
     fn add(
         &mut self,
         (image, key): (u32, u64),
@@ -236,7 +228,7 @@ impl BiasSums {
         self.leakage.merge(other.leakage)
     }
 
-    /// The biases; NaN without an estimate.
+    // The biases; NaN without an estimate.
     fn bias(self) -> ShearBias {
         let found = estimate(&self.units, 0, true, Errors::Jackknife).ok();
         let leakage = estimate(&self.leakage, 0, false, Errors::Jackknife).ok();

@@ -1,4 +1,4 @@
-//! Calibration of the regularisation parameter λ on synthetic galaxies (Sect. 4).
+//! Calibration of the regularisation parameter λ on synthetic galaxies: Sect. 4 of the paper, its Figs 4 to 7.
 //!
 //! A galaxy is an exponential (Sérsic n = 1) profile u on a stamp; the observed stamp is
 //! u₀ = Hu + n with a Moffat PSF (β = 3) of the galaxy's own and white noise of
@@ -18,27 +18,30 @@ use rand_distr::{Distribution, StandardNormal};
 use shearq_measure::parts::{
     ClippedAcf, ClippedAcfScratch, Network, NetworkScratch, Rule, convolve, psf_factor,
 };
-use shearq_quantities::{Distortion, Shear};
-use shearq_quantities::{FunctionalPsf, PsfProfile};
-use shearq_submissions::{Configuration, NetworkDeconvolution, PsfScale, Update};
-
-use super::speed::network_of;
 use shearq_pipeline::PipelineError;
 use shearq_pipeline::engine::{self, Progress};
+use shearq_quantities::{Distortion, FunctionalPsf, PsfProfile, Shear};
+use shearq_render::figure::{LinePlot, PanelGrid, Series, Style};
+use shearq_render::page::{Page, PageError};
+use shearq_render::table::{Cell, Table};
 use shearq_simulate::galaxy::{Component, Sersic};
+use shearq_submissions::{Configuration, NetworkDeconvolution, PsfScale, Update};
 
-/// S/N in dB of the curves.
-pub const SNR_DB: [f64; 3] = [10.0, 20.0, 40.0];
 /// log₁₀ λ of the curves: −6 to 6 in halves.
 pub const LOG_LAMBDA: [f64; 25] = log_lambda();
 /// Place of the paper's choice among them, λ = 10⁻⁴.
 pub const PAPER_LAMBDA: usize = 4;
-/// S/N in dB of the CTR curve at the λ of the paper's Fig. 4.
-pub const CTR_SNR_DB: [f64; 7] = [10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0];
-/// log₁₀ of that λ.
-pub const CTR_LOG_LAMBDA: f64 = -3.5;
-/// Both rules, in the order of [`Curves`].
-pub const UPDATES: [Update; 2] = [Update::Adaptive, Update::Constant];
+// Place of λ = 10^−3.5, at which the paper's Fig. 4 shows CTR against S/N.
+const FIG_4_LAMBDA: usize = 5;
+// S/N in dB of the curves over λ.
+const SNR_DB: [f64; 3] = [10.0, 20.0, 40.0];
+// S/N in dB of the curve at `FIG_4_LAMBDA`.
+const FIG_4_SNR_DB: [f64; 7] = [10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0];
+// Both rules with their names, in the order of `Curves`.
+const UPDATES: [(Update, &str); 2] = [
+    (Update::Adaptive, "adaptive"),
+    (Update::Constant, "constant"),
+];
 
 const fn log_lambda() -> [f64; 25] {
     let mut values = [0.0; 25];
@@ -53,152 +56,126 @@ const fn log_lambda() -> [f64; 25] {
 /// Sums over galaxies at one S/N, rule and λ.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct LambdaSums {
-    /// Transitions that brought a neuron nearer to the truth.
-    pub correct: u64,
-    /// All transitions.
-    pub transitions: u64,
-    /// Sums over galaxies of the squares of their correct transitions and of all their transitions, and of the
-    /// product of both, for the error of CTR.
-    pub transition_squares: [f64; 3],
-    /// Σ dSNR in dB.
-    pub dsnr: f64,
-    /// Σ dSNR², for its error.
-    pub dsnr_square: f64,
-    /// Galaxies.
-    pub galaxies: u64,
-    /// Σ |e − e*|².
-    pub deviation: f64,
-    /// Σ |e − e*|⁴, for the error of the RMSD.
-    pub deviation_square: f64,
-    /// Galaxies with a shape.
-    pub measured: u64,
-    /// Accepted iterations.
-    pub iterations: u64,
+    // Transitions that brought a neuron nearer to the truth.
+    correct: u64,
+    transitions: u64,
+    // Sums over galaxies of (correct)², (all)² and correct·all transitions, for the error of CTR.
+    transition_squares: [f64; 3],
+    // Σ dSNR in dB and Σ dSNR².
+    dsnr: [f64; 2],
+    galaxies: u64,
+    // Σ |e − e*|² and Σ |e − e*|⁴ of the galaxies with a shape.
+    deviation: [f64; 2],
+    measured: u64,
+    iterations: u64,
 }
+
+// A value and its standard error.
+type Measured = (f64, f64);
 
 impl LambdaSums {
     fn add(&mut self, other: &LambdaSums) {
         self.correct += other.correct;
         self.transitions += other.transitions;
-        for (sum, more) in self
-            .transition_squares
-            .iter_mut()
-            .zip(other.transition_squares)
-        {
-            *sum += more;
-        }
-        self.dsnr += other.dsnr;
-        self.dsnr_square += other.dsnr_square;
         self.galaxies += other.galaxies;
-        self.deviation += other.deviation;
-        self.deviation_square += other.deviation_square;
         self.measured += other.measured;
         self.iterations += other.iterations;
+        let sums = [
+            &mut self.transition_squares[..],
+            &mut self.dsnr,
+            &mut self.deviation,
+        ];
+        let more = [&other.transition_squares[..], &other.dsnr, &other.deviation];
+        for (sum, more) in sums.into_iter().flatten().zip(more.into_iter().flatten()) {
+            *sum += more;
+        }
     }
 
-    /// CTR; not a number without transitions.
-    pub fn ctr(&self) -> f64 {
-        self.correct as f64 / self.transitions as f64
-    }
-
-    /// Standard error of CTR, which is a ratio of sums over galaxies: pixels of one galaxy go together.
-    pub fn ctr_error(&self) -> f64 {
-        let ctr = self.ctr();
+    /// CTR. NaN without transitions.
+    pub fn ctr(&self) -> Measured {
+        let ctr = self.correct as f64 / self.transitions as f64;
+        // The error of a ratio of sums over galaxies, not over pixels: those of one galaxy go together.
         let [correct, all, both] = self.transition_squares;
         let square = correct - 2.0 * ctr * both + ctr * ctr * all;
-        square.max(0.0).sqrt() / self.transitions as f64
+        (ctr, square.max(0.0).sqrt() / self.transitions as f64)
     }
 
     /// Mean dSNR in dB.
-    pub fn mean_dsnr(&self) -> f64 {
-        self.dsnr / self.galaxies as f64
-    }
-
-    /// Standard error of the mean dSNR, from its scatter.
-    pub fn mean_dsnr_error(&self) -> f64 {
-        let (n, mean) = (self.galaxies as f64, self.mean_dsnr());
-        ((self.dsnr_square / n - mean * mean).max(0.0) / n).sqrt()
+    pub fn mean_dsnr(&self) -> Measured {
+        let n = self.galaxies as f64;
+        let mean = self.dsnr[0] / n;
+        (mean, ((self.dsnr[1] / n - mean * mean).max(0.0) / n).sqrt())
     }
 
     /// 1/RMSD.
-    pub fn inverse_rmsd(&self) -> f64 {
-        (2.0 * self.measured as f64 / self.deviation).sqrt()
-    }
-
-    /// Standard error of 1/RMSD, from the scatter of |e − e*|².
-    pub fn inverse_rmsd_error(&self) -> f64 {
+    pub fn inverse_rmsd(&self) -> Measured {
         let n = self.measured as f64;
-        let mean = self.deviation / n;
-        let variance = (self.deviation_square / n - mean * mean) / n;
-        0.5 * self.inverse_rmsd() * variance.sqrt() / mean
+        let mean = self.deviation[0] / n;
+        let variance = (self.deviation[1] / n - mean * mean) / n;
+        let value = (2.0 * n / self.deviation[0]).sqrt();
+        (value, 0.5 * value * variance.sqrt() / mean)
     }
 }
 
-/// The curves of Sect. 4.
 #[derive(Debug, Clone)]
 pub struct Curves {
-    /// `[rule][S/N of SNR_DB][λ of LOG_LAMBDA]`.
+    /// `[rule][S/N][λ of LOG_LAMBDA]`; the first rule is the adaptive one.
     pub over_lambda: Vec<Vec<Vec<LambdaSums>>>,
-    /// `[rule][S/N of CTR_SNR_DB]` at [`CTR_LOG_LAMBDA`].
+    /// `[rule][S/N of Fig. 4]`.
     pub over_snr: Vec<Vec<LambdaSums>>,
-    /// Galaxies.
-    pub galaxies: u64,
+    galaxies: u64,
 }
 
 impl Curves {
     fn new() -> Self {
         Curves {
             over_lambda: vec![vec![vec![LambdaSums::default(); LOG_LAMBDA.len()]; SNR_DB.len()]; 2],
-            over_snr: vec![vec![LambdaSums::default(); CTR_SNR_DB.len()]; 2],
+            over_snr: vec![vec![LambdaSums::default(); FIG_4_SNR_DB.len()]; 2],
             galaxies: 0,
         }
     }
 
     fn add(&mut self, other: &Curves) {
         let mine = self.over_lambda.iter_mut().flatten().flatten();
-        for (sum, more) in mine.zip(other.over_lambda.iter().flatten().flatten()) {
-            sum.add(more);
-        }
-        let mine = self.over_snr.iter_mut().flatten();
-        for (sum, more) in mine.zip(other.over_snr.iter().flatten()) {
+        let mine = mine.chain(self.over_snr.iter_mut().flatten());
+        let more = other.over_lambda.iter().flatten().flatten();
+        for (sum, more) in mine.zip(more.chain(other.over_snr.iter().flatten())) {
             sum.add(more);
         }
         self.galaxies += other.galaxies;
     }
 
-    /// The λ this study would choose for a rule: among the λ whose 1/RMSD, averaged over the three
-    /// S/N relative to the best at each, is within two standard errors of the highest, the largest,
-    /// which regularises most at no cost.
-    pub fn best_log_lambda(&self, rule: usize) -> f64 {
-        let relative = |k: usize| -> (f64, f64) {
+    // The λ that this study chooses for a rule.
+    fn best_log_lambda(&self, rule: usize) -> f64 {
+        // The S/N count alike: each curve is relative to its own best value.
+        let relative = |k: usize| -> Measured {
             let (mut value, mut variance) = (0.0, 0.0);
             for curve in &self.over_lambda[rule] {
                 let best = curve
                     .iter()
-                    .map(LambdaSums::inverse_rmsd)
+                    .map(|at| at.inverse_rmsd().0)
                     .fold(0.0, f64::max);
-                value += curve[k].inverse_rmsd() / best / SNR_DB.len() as f64;
-                variance += (curve[k].inverse_rmsd_error() / best / SNR_DB.len() as f64).powi(2);
+                let (own, error) = curve[k].inverse_rmsd();
+                value += own / best / SNR_DB.len() as f64;
+                variance += (error / best / SNR_DB.len() as f64).powi(2);
             }
             (value, variance.sqrt())
         };
-        let all: Vec<(f64, f64)> = (0..LOG_LAMBDA.len()).map(relative).collect();
+        let all: Vec<Measured> = (0..LOG_LAMBDA.len()).map(relative).collect();
         let best = all.iter().map(|v| v.0).fold(0.0, f64::max);
-        (0..LOG_LAMBDA.len())
-            .rev()
-            .find(|&k| all[k].0 + 2.0 * all[k].1 >= best)
-            .map_or(f64::NAN, |k| LOG_LAMBDA[k])
+        // Of those within two standard errors of the best, the largest regularises most at no cost.
+        let near = (0..LOG_LAMBDA.len()).rfind(|&k| all[k].0 + 2.0 * all[k].1 >= best);
+        near.map_or(f64::NAN, |k| LOG_LAMBDA[k])
     }
 }
 
-/// Galaxies worked on together.
+// Galaxies per unit of work. Each is deconvolved 150 times.
 const CHUNK: u64 = 8;
 
-/// Runs the study with the settings of `submission` (stamp and PSF size, step, start, M, unit, ACF
-/// share), both rules in turn, on `galaxies` galaxies.
+/// Deconvolves synthetic galaxies with the settings of a configuration, by both rules.
 ///
 /// # Errors
-/// Where the submission's sizes cannot be worked with.
+/// If the configuration has the linear method or invalid sizes.
 pub fn calibrate(
     configuration: &Configuration,
     galaxies: u64,
@@ -235,97 +212,92 @@ pub fn calibrate(
     Ok(curves)
 }
 
-/// Everything planned for one submission.
 struct LambdaStudy {
     n: usize,
-    p: usize,
+    psf_size: usize,
     settings: NetworkDeconvolution,
     networks: Vec<Network>,
-    ctr_network: Network,
     acf: ClippedAcf,
 }
 
-struct LambdaScratch {
+struct Scratch {
     networks: Vec<Network>,
-    ctr_network: Network,
-    buffers: NetworkScratch,
-    acf_scratch: ClippedAcfScratch,
+    buffers: Buffers,
+}
+
+struct Buffers {
+    network: NetworkScratch,
+    acf: ClippedAcfScratch,
     out: Vec<f32>,
 }
 
-/// One synthetic galaxy.
 struct Synthetic {
     original: Vec<f32>,
     convolved: Vec<f64>,
-    /// Of the sum or peak that the submission asks for.
+    // Of the sum or peak that the configuration asks for.
     psf: Array2<f64>,
     shape: Distortion,
-    /// White noise of unit variance.
     noise: Vec<f64>,
 }
 
 impl LambdaStudy {
     fn new(configuration: &Configuration) -> Result<Self, PipelineError> {
-        let (n, p) = (configuration.stamp.size, configuration.psf.size);
-        let method = network_of(configuration)?;
+        let (n, psf_size) = (configuration.stamp.size, configuration.psf.size);
+        let method = configuration.network().ok_or_else(|| {
+            PipelineError::Request(format!(
+                "configuration {} has method = \"linear\"; expected \"network\"",
+                configuration.name
+            ))
+        })?;
         let settings = method.deconvolution.clone();
-        let plan = |log: f64| Network::plan(n, p, settings.printed_lambda(10f64.powf(log)));
-        let networks = LOG_LAMBDA
-            .iter()
-            .map(|log| plan(*log))
-            .collect::<Result<_, _>>()?;
+        let plan =
+            |log: &f64| Network::plan(n, psf_size, settings.printed_lambda(10f64.powf(*log)));
         Ok(LambdaStudy {
-            networks,
-            ctr_network: plan(CTR_LOG_LAMBDA)?,
+            networks: LOG_LAMBDA.iter().map(plan).collect::<Result<_, _>>()?,
             acf: ClippedAcf::new(n, &method.shape),
             settings,
             n,
-            p,
+            psf_size,
         })
     }
 
-    fn scratch(&self) -> LambdaScratch {
-        let n = self.n;
-        LambdaScratch {
+    fn scratch(&self) -> Scratch {
+        Scratch {
             networks: self.networks.clone(),
-            ctr_network: self.ctr_network.clone(),
-            buffers: self.ctr_network.scratch(),
-            acf_scratch: self.acf.scratch(),
-            out: vec![0.0; n * n],
+            buffers: Buffers {
+                network: self.networks[0].scratch(),
+                acf: self.acf.scratch(),
+                out: vec![0.0; self.n * self.n],
+            },
         }
     }
 
-    /// Adds one galaxy to all curves.
     fn galaxy(
         &self,
         seed: u64,
         number: u64,
-        scratch: &mut LambdaScratch,
+        Scratch { networks, buffers }: &mut Scratch,
         curves: &mut Curves,
     ) -> Result<(), PipelineError> {
         let galaxy = self.draw(seed, number)?;
-        for network in scratch
-            .networks
-            .iter_mut()
-            .chain([&mut scratch.ctr_network])
-        {
+        for network in networks.iter_mut() {
             network.set_psf(galaxy.psf.view(), PsfScale::Sum)?;
         }
-        for (rule, update) in UPDATES.into_iter().enumerate() {
-            for (s, snr) in SNR_DB.into_iter().enumerate() {
-                let (stamp, sigma) = observe(&galaxy, snr);
-                for k in 0..LOG_LAMBDA.len() {
-                    let networks = std::mem::take(&mut scratch.networks);
-                    let sums = self.run(&networks[k], update, &galaxy, &stamp, sigma, scratch);
-                    scratch.networks = networks;
-                    curves.over_lambda[rule][s][k].add(&sums?);
+        for (rule, (update, _)) in UPDATES.into_iter().enumerate() {
+            let settings = NetworkDeconvolution {
+                update,
+                ..self.settings.clone()
+            };
+            for (sums, snr) in curves.over_lambda[rule].iter_mut().zip(SNR_DB) {
+                let observed = observe(&galaxy, snr);
+                for (sum, network) in sums.iter_mut().zip(&*networks) {
+                    sum.add(&self.run(network, &settings, &galaxy, &observed, buffers)?);
                 }
             }
-            for (s, snr) in CTR_SNR_DB.into_iter().enumerate() {
-                let (stamp, sigma) = observe(&galaxy, snr);
-                let network = scratch.ctr_network.clone();
-                let sums = self.run(&network, update, &galaxy, &stamp, sigma, scratch)?;
-                curves.over_snr[rule][s].add(&sums);
+            let network = &networks[FIG_4_LAMBDA];
+            for (sum, snr) in curves.over_snr[rule].iter_mut().zip(FIG_4_SNR_DB) {
+                let observed = observe(&galaxy, snr);
+                sum.add(&self.run(network, &settings, &galaxy, &observed, buffers)?);
             }
         }
         curves.galaxies += 1;
@@ -335,6 +307,7 @@ impl LambdaStudy {
     fn draw(&self, seed: u64, number: u64) -> Result<Synthetic, PipelineError> {
         let n = self.n;
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        // A stream for each galaxy, so that the number of threads does not matter.
         rng.set_stream(number);
         let mut normal = |scale: f64| -> f64 {
             let draw: f64 = StandardNormal.sample(&mut rng);
@@ -344,6 +317,7 @@ impl LambdaStudy {
         let modulus = e1.hypot(e2);
         let cap = (0.6 / modulus).min(1.0);
         let shape = Shear::new(e1 * cap, e2 * cap);
+        // The same noise at each S/N and λ, so that curves differ by λ and S/N alone.
         let noise = (0..n * n).map(|_| normal(1.0)).collect();
         let galaxy = Component {
             profile: Sersic::Exponential,
@@ -357,11 +331,11 @@ impl LambdaStudy {
         let psf_shape = Shear::new(rng.random_range(-0.05..0.05), rng.random_range(-0.05..0.05));
         let psf = FunctionalPsf::new(PsfProfile::Moffat { beta: 3.0 }, fwhm, psf_shape)
             .expect("the PSFs drawn here are within range");
-        let psf = psf.stamp(self.p);
+        let psf = psf.stamp(self.psf_size);
         // u₀ = Hu for the H that deconvolves, so that states compare with u.
         let factor = psf_factor(psf.view(), self.settings.psf_scale)?;
         let psf = psf.mapv(|value| value * factor);
-        // Mean over 4 × 4 points of each pixel.
+        // Mean over 4 × 4 points of each pixel, because an exponential profile has a cusp.
         let centre = (n as f64 - 1.0) / 2.0;
         let original = Array2::from_shape_fn((n, n), |(y, x)| {
             let (y, x) = (y as f64 - centre, x as f64 - centre);
@@ -384,87 +358,261 @@ impl LambdaStudy {
     fn run(
         &self,
         network: &Network,
-        update: Update,
+        settings: &NetworkDeconvolution,
         galaxy: &Synthetic,
-        stamp: &[f32],
-        sigma: f64,
-        scratch: &mut LambdaScratch,
+        (stamp, sigma): &(Vec<f32>, f64),
+        buffers: &mut Buffers,
     ) -> Result<LambdaSums, PipelineError> {
-        let settings = NetworkDeconvolution {
-            update,
-            ..self.settings.clone()
-        };
         let mut sums = LambdaSums {
             galaxies: 1,
             ..LambdaSums::default()
         };
         let peak = stamp.iter().copied().fold(0.0f32, f32::max);
-        let Some(rule) = Rule::new(&settings, f64::from(peak), sigma) else {
+        let Some(rule) = Rule::new(settings, f64::from(peak), *sigma) else {
             return Ok(sums);
         };
         let original = &galaxy.original;
         let (mut correct, mut transitions) = (0, 0);
-        let descent = network.trace(
-            &rule,
-            stamp,
-            &mut scratch.buffers,
-            &mut scratch.out,
-            |before, after| {
-                for ((b, a), u) in before.iter().zip(after).zip(original) {
-                    if a != b {
-                        transitions += 1;
-                        correct += u64::from((a - u).abs() < (b - u).abs());
-                    }
+        let count = |before: &[f32], after: &[f32]| {
+            for ((b, a), u) in before.iter().zip(after).zip(original) {
+                if a != b {
+                    transitions += 1;
+                    correct += u64::from((a - u).abs() < (b - u).abs());
                 }
-            },
-        )?;
+            }
+        };
+        let descent = network.trace(&rule, stamp, &mut buffers.network, &mut buffers.out, count)?;
         (sums.correct, sums.transitions) = (correct, transitions);
         let [c, t] = [correct as f64, transitions as f64];
         sums.transition_squares = [c * c, t * t, c * t];
         sums.iterations = u64::from(descent.iterations);
         let distance = |image: &[f32]| -> f64 {
-            image
-                .iter()
-                .zip(original)
-                .map(|(v, u)| f64::from(v - u).powi(2))
-                .sum()
+            let pixels = image.iter().zip(original);
+            pixels.map(|(v, u)| f64::from(v - u).powi(2)).sum()
         };
-        sums.dsnr = 10.0 * (distance(stamp) / distance(&scratch.out)).log10();
-        sums.dsnr_square = sums.dsnr * sums.dsnr;
-        let light = scratch.out.iter().map(|&v| f64::from(v)).sum();
+        let dsnr = 10.0 * (distance(stamp) / distance(&buffers.out)).log10();
+        sums.dsnr = [dsnr, dsnr * dsnr];
+        let light = buffers.out.iter().map(|&v| f64::from(v)).sum();
         let shape = self
             .acf
-            .measure(&scratch.out, light, &mut scratch.acf_scratch)?
+            .measure(&buffers.out, light, &mut buffers.acf)?
             .and_then(|moments| moments.distortion());
         if let Ok(Distortion { e1, e2 }) = shape {
             let deviation = (e1 - galaxy.shape.e1).powi(2) + (e2 - galaxy.shape.e2).powi(2);
-            sums.deviation = deviation;
-            sums.deviation_square = deviation * deviation;
+            sums.deviation = [deviation, deviation * deviation];
             sums.measured = 1;
         }
         Ok(sums)
     }
 }
 
-/// The observed stamp at a S/N in dB, and its noise level.
+// The observed stamp at a S/N in dB, and its noise level.
 fn observe(galaxy: &Synthetic, snr_db: f64) -> (Vec<f32>, f64) {
     let image = &galaxy.convolved;
     let count = image.len() as f64;
     let mean = image.iter().sum::<f64>() / count;
     let variance = image.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / count;
     let sigma = (variance / 10f64.powf(snr_db / 10.0)).sqrt();
-    let stamp = image
-        .iter()
-        .zip(&galaxy.noise)
-        .map(|(v, n)| (v + sigma * n) as f32)
-        .collect();
+    let stamp = image.iter().zip(&galaxy.noise);
+    let stamp = stamp.map(|(v, n)| (v + sigma * n) as f32).collect();
     (stamp, sigma)
+}
+
+fn curve(
+    label: &str,
+    x: Vec<f64>,
+    sums: &[LambdaSums],
+    value: fn(&LambdaSums) -> Measured,
+    (style, colour): (Style, usize),
+) -> Series {
+    let (y, errors) = sums.iter().map(value).unzip();
+    Series::new(label, x, y, style, colour).with_errors(errors)
+}
+
+// Series of both rules, the adaptive one dashed as in the paper.
+fn both_rules<'a>(
+    x: &[f64],
+    sums: impl Fn(usize) -> &'a [LambdaSums],
+    value: fn(&LambdaSums) -> Measured,
+) -> Vec<Series> {
+    let series = UPDATES.iter().enumerate().map(|(rule, (_, name))| {
+        let style = if rule == 0 {
+            Style::Dashed
+        } else {
+            Style::Line
+        };
+        curve(name, x.to_vec(), sums(rule), value, (style, rule))
+    });
+    series.collect()
+}
+
+/// Draws Figs 4 to 7.
+pub fn figures(page: &mut Page<'_>, curves: &Curves) -> Result<(), PageError> {
+    let lambda = LOG_LAMBDA.map(|log| 10f64.powf(log));
+    page.figure(
+        "fig4-ctr-snr",
+        &LinePlot {
+            title: "Correct transition rate, λ = 10⁻³·⁵".into(),
+            x_label: "SNR [dB]".into(),
+            y_label: "CTR".into(),
+            series: both_rules(&FIG_4_SNR_DB, |rule| &curves.over_snr[rule], LambdaSums::ctr),
+            ..LinePlot::default()
+        },
+        "As Fig. 4 of the paper: correct transition rate against S/N for the adaptive and the constant update.",
+    )?;
+    let adaptive = |title: &str, y_label: &str, value: fn(&LambdaSums) -> Measured| {
+        let series = SNR_DB.iter().zip(&curves.over_lambda[0]).enumerate();
+        let series = series.map(|(k, (snr, sums))| {
+            let label = format!("SNR {snr} dB");
+            curve(&label, lambda.to_vec(), sums, value, (Style::Line, k))
+        });
+        LinePlot {
+            title: title.into(),
+            x_label: "λ".into(),
+            y_label: y_label.into(),
+            x_log: true,
+            series: series.collect(),
+            ..LinePlot::default()
+        }
+    };
+    page.figure(
+        "fig5-ctr-lambda",
+        &adaptive("Correct transition rate", "CTR", LambdaSums::ctr),
+        "As Fig. 5 of the paper: correct transition rate against λ, adaptive update.",
+    )?;
+    page.figure(
+        "fig6-dsnr-lambda",
+        &adaptive(
+            "Discriminative signal-to-noise ratio",
+            "dSNR [dB]",
+            LambdaSums::mean_dsnr,
+        ),
+        "As Fig. 6 of the paper: discriminative signal-to-noise ratio against λ, adaptive update.",
+    )?;
+    let panel = |(s, snr): (usize, &f64)| LinePlot {
+        title: format!("SNR {snr} dB"),
+        x_label: "λ".into(),
+        y_label: "1/RMSD".into(),
+        x_log: true,
+        series: both_rules(
+            &lambda,
+            |rule| &curves.over_lambda[rule][s],
+            LambdaSums::inverse_rmsd,
+        ),
+        ..LinePlot::default()
+    };
+    page.figure(
+        "fig7-rmsd-lambda",
+        &PanelGrid {
+            title: "Accuracy of the ellipticities".into(),
+            columns: 3,
+            plots: SNR_DB.iter().enumerate().map(panel).collect(),
+        },
+        "As Fig. 7 of the paper: 1/RMSD of the ellipticities against λ for both updates.",
+    )
+}
+
+fn measured((value, error): Measured, decimals: usize) -> Cell {
+    Cell::with_error(value, Some(error), decimals)
+}
+
+// A curve over λ with its rule and S/N.
+type NamedCurve<'a> = (&'static str, f64, &'a [LambdaSums]);
+
+fn named_curves(curves: &Curves) -> Vec<NamedCurve<'_>> {
+    let mut named: Vec<NamedCurve<'_>> = Vec::new();
+    for ((_, name), of_rule) in UPDATES.iter().zip(&curves.over_lambda) {
+        named.extend(
+            SNR_DB
+                .iter()
+                .zip(of_rule)
+                .map(|(snr, curve)| (*name, *snr, &curve[..])),
+        );
+    }
+    named
+}
+
+/// All curves over λ as one table: the data of Figs 5 to 7.
+pub fn curves_table(curves: &Curves) -> Table {
+    let mut rows = Vec::new();
+    for (rule, snr, curve) in named_curves(curves) {
+        let points = LOG_LAMBDA.iter().zip(curve);
+        rows.extend(points.map(|(log, sums)| (rule, snr, *log, sums)));
+    }
+    let title = format!("Calibration of λ on {} synthetic galaxies", curves.galaxies);
+    let mut table = Table::titled(title);
+    table.column("update", "Update", &rows, |row| Cell::text(row.0));
+    table.column("snr_db", "SNR [dB]", &rows, |row| Cell::number(row.1, 0));
+    table.column("log10_lambda", "log λ", &rows, |row| {
+        Cell::number(row.2, 1)
+    });
+    table.column("ctr", "CTR", &rows, |row| measured(row.3.ctr(), 4));
+    table.column("dsnr_db", "dSNR [dB]", &rows, |row| {
+        measured(row.3.mean_dsnr(), 3)
+    });
+    table.column("inverse_rmsd", "1/RMSD", &rows, |row| {
+        measured(row.3.inverse_rmsd(), 3)
+    });
+    table.column("iterations", "Iterations", &rows, |row| {
+        Cell::number(row.3.iterations as f64 / row.3.galaxies as f64, 1)
+    });
+    table
+}
+
+fn place_of_best(curve: &[LambdaSums], value: fn(&LambdaSums) -> Measured) -> usize {
+    let at = |k: usize| value(&curve[k]).0;
+    let best = (0..curve.len()).max_by(|a, b| at(*a).total_cmp(&at(*b)));
+    best.unwrap_or(0)
+}
+
+/// The best λ at each S/N and the values at 10⁻⁴.
+pub fn best_table(curves: &Curves, configuration: &Configuration) -> Table {
+    let rows = named_curves(curves);
+    let best = |curve: &[LambdaSums]| place_of_best(curve, LambdaSums::inverse_rmsd);
+    let mut table = Table::titled(format!(
+        "Calibration of λ for {} on {} synthetic galaxies",
+        configuration.name, curves.galaxies
+    ));
+    table.column("update", "Update", &rows, |row| Cell::text(row.0));
+    table.column("snr_db", "SNR [dB]", &rows, |row| Cell::number(row.1, 0));
+    table.column("best_log10_lambda", "best log λ", &rows, |row| {
+        Cell::number(LOG_LAMBDA[best(row.2)], 1)
+    });
+    table.column("inverse_rmsd_best", "1/RMSD there", &rows, |row| {
+        measured(row.2[best(row.2)].inverse_rmsd(), 3)
+    });
+    table.column("inverse_rmsd", "1/RMSD at 10⁻⁴", &rows, |row| {
+        measured(row.2[PAPER_LAMBDA].inverse_rmsd(), 3)
+    });
+    table.column("ctr", "CTR at 10⁻⁴", &rows, |row| {
+        measured(row.2[PAPER_LAMBDA].ctr(), 4)
+    });
+    table.column("dsnr_db", "dSNR at 10⁻⁴ [dB]", &rows, |row| {
+        measured(row.2[PAPER_LAMBDA].mean_dsnr(), 2)
+    });
+    let chosen = UPDATES.iter().enumerate().map(|(rule, (_, name))| {
+        format!(
+            "10^{:.1} for the {name} update",
+            curves.best_log_lambda(rule)
+        )
+    });
+    table.notes = vec![format!(
+        "λ chosen (the largest within two standard errors of the best 1/RMSD over all S/N): {}. The paper suggests 10^-4.",
+        chosen.collect::<Vec<_>>().join(", ")
+    )];
+    let last = LOG_LAMBDA.len() - 1;
+    if rows.iter().any(|row| [0, last].contains(&best(row.2))) {
+        table.notes.push(format!(
+            "warning: a best λ is at the edge of the range, 10^{} to 10^{}; the true optimum may lie beyond.",
+            LOG_LAMBDA[0], LOG_LAMBDA[last]
+        ));
+    }
+    table
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-
     #[test]
     fn errors_are_those_of_ratios_and_means_over_galaxies() {
         let mut sums = LambdaSums::default();
@@ -475,16 +623,15 @@ mod tests {
                 correct,
                 transitions: all,
                 transition_squares: [c * c, t * t, c * t],
-                dsnr,
-                dsnr_square: dsnr * dsnr,
+                dsnr: [dsnr, dsnr * dsnr],
                 galaxies: 1,
                 ..LambdaSums::default()
             });
         }
         // 4/6, from which they are (1 − 4/3) and (3 − 8/3) off.
         let expected = (2.0f64 / 9.0).sqrt() / 6.0;
-        assert!((sums.ctr_error() - expected).abs() < 1e-12);
-        assert_eq!(sums.mean_dsnr(), 4.0);
-        assert!((sums.mean_dsnr_error() - 0.5f64.sqrt()).abs() < 1e-12);
+        assert!((sums.ctr().1 - expected).abs() < 1e-12);
+        assert_eq!(sums.mean_dsnr().0, 4.0);
+        assert!((sums.mean_dsnr().1 - 0.5f64.sqrt()).abs() < 1e-12);
     }
 }

@@ -2,28 +2,26 @@
 
 use serde::{Deserialize, Serialize};
 use shearq_scoring::resample::mean_over_sets;
-use shearq_submissions::Configuration;
 
 use super::bias::{ShearBias, biases};
 use super::bound::{cramer_rao, ensemble_bound, expected_q};
 use super::reproduce::{ConfigurationResult, Plan, SetResult, Study};
+use super::response::Response;
 use super::speed;
 use shearq_dataset::record::read_record;
 use shearq_pipeline::PipelineError;
 use shearq_pipeline::engine::Progress;
 use shearq_pipeline::run::measurers;
 use shearq_pipeline::simulate::simulator;
-use shearq_render::table::{Cell, Heading, Table};
+use shearq_render::table::{Cell, Table};
 use shearq_simulate::kinds::SetKind;
 
 /// Biases of all configurations on one set, and the bound on their scatter.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SetBiases {
-    /// Set number.
     pub set: u32,
     /// Cramér–Rao bound on the scatter of ε per component, if there is one.
     pub bound: Option<f64>,
-    /// Standard error of the bound.
     pub bound_error: Option<f64>,
     /// Bound on the scatter of shears from elliptical galaxies with the best weights, if there is one.
     pub ensemble_bound: Option<f64>,
@@ -36,9 +34,6 @@ pub struct SetBiases {
 
 /// Measures biases on the galaxies of `images` images of each set. The result of each set is written as soon as it
 /// is known; existing results are read.
-///
-/// # Errors
-/// If a file cannot be written or read, or if the folder was removed meanwhile.
 pub fn bias_sets(
     study: &Study<'_>,
     sets: &[u32],
@@ -72,7 +67,8 @@ pub fn bias_sets(
                 .map_err(|source| PipelineError::Scoring {
                     set: Some(set),
                     source,
-                })?,
+                })?
+                .map(|expected| expected.spectra),
             biases: biases(&simulator, &numbers, &measurers, threads, progress)?,
         };
         study.keep(&path, &result)?;
@@ -82,158 +78,169 @@ pub fn bias_sets(
     Ok(found)
 }
 
+enum Row<'a> {
+    Set(&'a SetResult, &'a SetBiases, usize),
+    /// The mean over sets of one configuration.
+    Mean(usize),
+}
+
+// A cell of a configuration on a set.
+type CellOf<'a> = &'a dyn Fn(&Response, &SetBiases, &ShearBias) -> Cell;
+
 /// A row for each configuration on each set, and means over sets if there are several.
-///
-/// # Errors
-/// If the sizes of a configuration are invalid.
 pub fn contest_table(
     plan: &Plan,
     results: &[SetResult],
     biases: &[SetBiases],
 ) -> Result<Table, PipelineError> {
-    let costs = plan
-        .submissions
-        .iter()
-        .map(|configuration| speed::whole(configuration, plan.simulation))
-        .collect::<Result<Vec<f64>, _>>()?;
-    let mut rows = Vec::new();
+    let costs = plan.submissions.iter();
+    let costs = costs.map(|configuration| speed::whole(configuration, plan.simulation));
+    let costs = costs.collect::<Result<Vec<f64>, _>>()?;
+    let configurations = 0..plan.submissions.len();
+    let mut rows: Vec<Row<'_>> = Vec::new();
     for (result, bias) in results.iter().zip(biases) {
-        for (k, configuration) in plan.submissions.iter().enumerate() {
-            rows.push(row(result, bias, k, configuration, costs[k]));
-        }
+        rows.extend(configurations.clone().map(|k| Row::Set(result, bias, k)));
     }
     if results.len() > 1 {
-        let limits: Vec<f64> = biases.iter().filter_map(|b| b.expected_q).collect();
-        let limit = limits.iter().sum::<f64>() / limits.len() as f64;
-        for (k, configuration) in plan.submissions.iter().enumerate() {
-            let mean = |value: &dyn Fn(&ConfigurationResult) -> (f64, f64), decimals: usize| {
-                let all: Vec<_> = results.iter().map(|r| value(&r.results[k])).collect();
-                let (mean, error) = mean_over_sets(&all);
-                Cell::with_error(mean, Some(error), decimals)
-            };
-            let mut row = vec![
-                Cell::text("mean"),
-                Cell::Empty,
-                Cell::text(&configuration.name),
-            ];
-            row.extend((0..11).map(|_| Cell::Empty));
-            row.push(mean(&|r| (r.score.metrics.q, r.score.errors.q), 1));
-            row.push(mean(&spectrum, 0));
-            row.push(Cell::number(limit, 0));
-            row.push(Cell::number(costs[k], 0));
-            rows.push(row);
-        }
+        rows.extend(configurations.map(Row::Mean));
     }
-    let headings = [
-        ("set", "Set"),
-        ("kind", "Kind"),
-        ("submission", "Configuration"),
-        ("scatter", "scatter"),
-        ("scatter_over_bound", "/ bound"),
-        ("scatter_over_ensemble", "/ ensemble"),
-        ("total", "total"),
-        ("total_over_bound", "/ bound"),
-        ("m1", "m1×10³"),
-        ("m2", "m2×10³"),
-        ("c1", "c1×10⁴"),
-        ("c2", "c2×10⁴"),
-        ("leakage", "PSF leakage"),
-        ("unmeasured", "unmeasured"),
-        ("q", "Q catalogue"),
-        ("q_spectrum", "Q spectrum"),
-        ("q_limit", "expected Q"),
-        ("microseconds", "µs"),
+    let place = |row: &Row<'_>| match row {
+        Row::Set(.., k) | Row::Mean(k) => *k,
+    };
+    let mut table =
+        Table::titled("Configurations compared with each other and the bound (simulated data)");
+    table.column("set", "Set", &rows, |row| match row {
+        Row::Set(result, ..) => Cell::text(format!("{:02}", result.set)),
+        Row::Mean(_) => Cell::text("mean"),
+    });
+    table.column("kind", "Kind", &rows, |row| match row {
+        Row::Set(result, ..) => {
+            Cell::text(SetKind::of(result.set).map_or("", |kind| kind.image.label()))
+        }
+        Row::Mean(_) => Cell::Empty,
+    });
+    table.column("submission", "Configuration", &rows, |row| {
+        Cell::text(&plan.submissions[place(row)].name)
+    });
+    let shapes = |table: &mut Table, key, label: &str, cell: CellOf<'_>| {
+        table.column(key, label, &rows, |row| match row {
+            Row::Set(result, bias, k) => cell(&result.results[*k].response, bias, &bias.biases[*k]),
+            Row::Mean(_) => Cell::Empty,
+        });
+    };
+    shapes(&mut table, "scatter", "scatter", &|own, _, _| {
+        Cell::with_error(own.rms_scatter(), Some(own.rms_scatter_error()), 5)
+    });
+    shapes(
+        &mut table,
+        "scatter_over_bound",
+        "/ bound",
+        &|own, set, _| {
+            let (scatter, error) = (own.rms_scatter(), own.rms_scatter_error());
+            let bound = set.bound.unwrap_or(f64::NAN);
+            let relative = (error / scatter).hypot(set.bound_error.unwrap_or(f64::NAN) / bound);
+            Cell::with_error(scatter / bound, Some(scatter / bound * relative), 3)
+        },
+    );
+    shapes(
+        &mut table,
+        "scatter_over_ensemble",
+        "/ ensemble",
+        &|own, set, _| {
+            Cell::number(
+                own.rms_scatter() / set.ensemble_bound.unwrap_or(f64::NAN),
+                3,
+            )
+        },
+    );
+    shapes(&mut table, "total", "total", &|own, _, _| {
+        Cell::number(own.rms_total(), 4)
+    });
+    shapes(&mut table, "total_over_bound", "/ bound", &|own, set, _| {
+        let (total, scatter) = (own.rms_total(), own.rms_scatter());
+        let bound = set.bound.unwrap_or(f64::NAN);
+        // Intrinsic shapes are the rest of the total, whatever the noise.
+        Cell::number(
+            total / (total * total - scatter * scatter + bound * bound).sqrt(),
+            4,
+        )
+    });
+    for (key, k) in [("m1", 0), ("m2", 1)] {
+        shapes(&mut table, key, &format!("{key}×10³"), &|_, _, bias| {
+            Cell::with_error(bias.m[k] * 1e3, Some(bias.m_error[k] * 1e3), 1)
+        });
+    }
+    for (key, k) in [("c1", 0), ("c2", 1)] {
+        shapes(&mut table, key, &format!("{key}×10⁴"), &|_, _, bias| {
+            Cell::with_error(bias.c[k] * 1e4, Some(bias.c_error[k] * 1e4), 1)
+        });
+    }
+    shapes(&mut table, "leakage", "PSF leakage", &|_, _, bias| {
+        Cell::with_error(bias.leakage, Some(bias.leakage_error), 3)
+    });
+    shapes(&mut table, "unmeasured", "unmeasured", &|own, _, bias| {
+        Cell::number((own.flagged + bias.dropped) as f64, 0)
+    });
+    let mut quality = |key, label, value: fn(&ConfigurationResult) -> (f64, f64), decimals| {
+        table.column(key, label, &rows, |row| {
+            let (value, error) = match row {
+                Row::Set(result, _, k) => value(&result.results[*k]),
+                Row::Mean(k) => {
+                    let all: Vec<_> = results.iter().map(|r| value(&r.results[*k])).collect();
+                    mean_over_sets(&all)
+                }
+            };
+            Cell::with_error(value, Some(error), decimals)
+        });
+    };
+    quality(
+        "q",
+        "Q catalogue",
+        |own| (own.score.metrics.q, own.score.errors.q),
+        1,
+    );
+    quality("q_spectrum", "Q spectrum", spectrum, 0);
+    table.column("q_limit", "expected Q", &rows, |row| match row {
+        Row::Set(_, bias, _) => Cell::number(bias.expected_q.unwrap_or(f64::NAN), 0),
+        Row::Mean(_) => {
+            let known: Vec<f64> = biases.iter().filter_map(|bias| bias.expected_q).collect();
+            Cell::number(known.iter().sum::<f64>() / known.len() as f64, 0)
+        }
+    });
+    table.column("microseconds", "µs", &rows, |row| {
+        Cell::number(costs[place(row)], 0)
+    });
+    table.notes = vec![
+        "Scatter of ε per component after division by its response, and its ratio to the Cramér–Rao bound of a sample of the galaxies, were they round. Ensemble: the bound on shears from the same galaxies with their ellipticities, of unknown flux and size, with the best weights. Offset bulges have no bound. Total: the scatter with intrinsic shapes, and its ratio to that with noise at the bound. If S/N differ, galaxies of low S/N count less, and the scatter can be below the bound.".into(),
+        "m and c: from galaxies drawn with shears of ± 0.02, intrinsic ellipticities ± e and noise of either sign. Leakage: c along the ellipticity of the PSF. Unmeasured: galaxies without ellipticity; they are left out.".into(),
+        "Q of the catalogues, and of cross-spectra between groups of images, which noise does not bias; leaderboard definition, standard convention. Expected Q: mean Q of a perfect method with noise at the bound.".into(),
     ];
-    Ok(Table {
-        title: "Configurations compared with each other and the bound (simulated data)".into(),
-        headings: headings.map(|(key, label)| Heading::new(key, label)).into(),
-        rows,
-        notes: vec![
-            "Scatter of ε per component after division by its response, and its ratio to the Cramér–Rao bound of a sample of the galaxies, were they round. Ensemble: the bound on shears from the same galaxies with their ellipticities, of unknown flux and size, with the best weights. Offset bulges have no bound. Total: the scatter with intrinsic shapes, and its ratio to that with noise at the bound. If S/N differ, galaxies of low S/N count less, and the scatter can be below the bound.".into(),
-            "m and c: from galaxies drawn with shears of ± 0.02, intrinsic ellipticities ± e and noise of either sign. Leakage: c along the ellipticity of the PSF. Unmeasured: galaxies without ellipticity; they are left out.".into(),
-            "Q of the catalogues, and of cross-spectra between groups of images, which noise does not bias; leaderboard definition, standard convention. Expected Q: mean Q of a perfect method with noise at the bound.".into(),
-        ],
-    })
+    Ok(table)
 }
 
 /// The table in two parts: scatter and biases; Q and cost.
 pub fn contest_parts(table: &Table) -> [Table; 2] {
-    let (biases, quality) = table.notes.split_at(2);
-    let shapes = [
-        "set",
-        "kind",
-        "submission",
-        "scatter",
-        "scatter_over_bound",
-        "scatter_over_ensemble",
-        "total",
-        "total_over_bound",
-        "m1",
-        "m2",
-        "c1",
-        "c2",
-        "leakage",
-        "unmeasured",
-    ];
-    let spectra = [
-        "set",
-        "kind",
-        "submission",
-        "q",
-        "q_spectrum",
-        "q_limit",
-        "microseconds",
-    ];
+    let keys: Vec<&str> = table.headings.iter().map(|heading| heading.key).collect();
+    let (names, metrics) = keys.split_at(3);
+    let quality = table.place("q").map_or(0, |place| place - names.len());
+    let (shapes, spectra) = metrics.split_at(quality);
+    let (of_shapes, of_spectra) = table.notes.split_at(2);
     [
-        table.part(&shapes, "Scatter and biases (simulated data)", biases),
-        table.part(&spectra, "Quality and cost (simulated data)", quality),
+        table.part(
+            &[names, shapes].concat(),
+            "Scatter and biases (simulated data)",
+            of_shapes,
+        ),
+        table.part(
+            &[names, spectra].concat(),
+            "Quality and cost (simulated data)",
+            of_spectra,
+        ),
     ]
 }
 
-fn row(
-    result: &SetResult,
-    bias: &SetBiases,
-    k: usize,
-    configuration: &Configuration,
-    cost: f64,
-) -> Vec<Cell> {
-    let (own, biases) = (&result.results[k], &bias.biases[k]);
-    let scaled = |value: f64, error: f64, scale: f64| {
-        Cell::with_error(value * scale, Some(error * scale), 1)
-    };
-    let (scatter, scatter_error) = (own.response.rms_scatter(), own.response.rms_scatter_error());
-    let bound = bias.bound.unwrap_or(f64::NAN);
-    let relative = (scatter_error / scatter).hypot(bias.bound_error.unwrap_or(f64::NAN) / bound);
-    let (q_spectrum, q_spectrum_error) = spectrum(own);
-    let total = own.response.rms_total();
-    // Of intrinsic shapes, which are the rest of the total, and noise at the bound.
-    let total_bound = (total * total - scatter * scatter + bound * bound).sqrt();
-    vec![
-        Cell::text(format!("{:02}", result.set)),
-        Cell::text(SetKind::of(result.set).map_or("", |kind| kind.image.label())),
-        Cell::text(&configuration.name),
-        Cell::with_error(scatter, Some(scatter_error), 5),
-        Cell::with_error(scatter / bound, Some(scatter / bound * relative), 3),
-        Cell::number(scatter / bias.ensemble_bound.unwrap_or(f64::NAN), 3),
-        Cell::number(total, 4),
-        Cell::number(total / total_bound, 4),
-        scaled(biases.m[0], biases.m_error[0], 1e3),
-        scaled(biases.m[1], biases.m_error[1], 1e3),
-        scaled(biases.c[0], biases.c_error[0], 1e4),
-        scaled(biases.c[1], biases.c_error[1], 1e4),
-        Cell::with_error(biases.leakage, Some(biases.leakage_error), 3),
-        Cell::number((own.response.flagged + biases.dropped) as f64, 0),
-        Cell::with_error(own.score.metrics.q, Some(own.score.errors.q), 1),
-        Cell::with_error(q_spectrum, Some(q_spectrum_error), 0),
-        Cell::number(bias.expected_q.unwrap_or(f64::NAN), 0),
-        Cell::number(cost, 0),
-    ]
-}
-
-/// Q of a configuration's cross-spectrum and its error.
+// Q of a configuration's cross-spectrum and its error.
 fn spectrum(result: &ConfigurationResult) -> (f64, f64) {
-    (
-        result.q_spectrum.unwrap_or(f64::NAN),
-        result.q_spectrum_error.unwrap_or(f64::NAN),
-    )
+    let known = |value: Option<f64>| value.unwrap_or(f64::NAN);
+    (known(result.q_spectrum), known(result.q_spectrum_error))
 }

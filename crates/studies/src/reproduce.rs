@@ -24,14 +24,10 @@ use shearq_results::score::OWN;
 use shearq_simulate::kinds::SetKind;
 use shearq_simulate::set::{STAMP, SimulationSettings};
 
-/// The settings of a study.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Plan {
-    /// Version of shearq.
     pub version: String,
-    /// Simulated data.
     pub simulation: SimulationSettings,
-    /// Images per set.
     pub images: u32,
     /// All settings of the configurations.
     pub submissions: Vec<Configuration>,
@@ -40,18 +36,12 @@ pub struct Plan {
 /// A folder of results that belongs to a plan for as long as this value exists.
 #[derive(Debug)]
 pub struct Study<'a> {
-    /// The plan.
     pub plan: &'a Plan,
-    /// The folder.
     pub folder: &'a Path,
     claim: Claim,
 }
 
 impl<'a> Study<'a> {
-    /// Claims `folder` for `plan`.
-    ///
-    /// # Errors
-    /// If the folder contains results of another plan, or cannot be written to.
     pub fn open(plan: &'a Plan, folder: &'a Path) -> Result<Self, FileError> {
         Ok(Study {
             plan,
@@ -61,9 +51,6 @@ impl<'a> Study<'a> {
     }
 
     /// Checks that the folder is still the claimed one.
-    ///
-    /// # Errors
-    /// If it was removed or replaced.
     pub fn check(&self) -> Result<(), FileError> {
         self.claim.check()
     }
@@ -84,10 +71,8 @@ impl<'a> Study<'a> {
     }
 }
 
-/// One configuration on one set.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ConfigurationResult {
-    /// Name of the configuration.
     #[serde(deserialize_with = "checked_name")]
     #[serde(rename = "submission")]
     pub configuration: String,
@@ -96,7 +81,6 @@ pub struct ConfigurationResult {
     pub score: SetRecord,
     /// Number of the convention that correlates best with the truth.
     pub convention_matched: u8,
-    /// E-mode bandpowers.
     pub ee: [f64; BINS],
     /// Standard errors of the bandpowers for a fixed truth; not numbers outside the scored bins.
     #[serde(deserialize_with = "nan_for_null")]
@@ -105,35 +89,25 @@ pub struct ConfigurationResult {
     pub q_spectrum: Option<f64>,
     /// Standard error of this Q; `None` with fewer than eight images.
     pub q_spectrum_error: Option<f64>,
-    /// Regression of the ellipticities on the true ones.
     pub response: Response,
 }
 
-/// All configurations on one set.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SetResult {
-    /// Set number.
     pub set: u32,
-    /// Images.
     pub images: u32,
-    /// Multipole of each bin.
     pub l: [f64; BINS],
-    /// Bandpowers of the true shear.
     pub true_ee: [f64; BINS],
     /// One per configuration, in the order of the plan.
     pub results: Vec<ConfigurationResult>,
 }
 
-/// The file of a set's result.
 fn result_path(folder: &Path, set: u32) -> PathBuf {
     folder.join(format!("sets/set{set:02}.json"))
 }
 
 /// Runs the configurations of the study on `sets`. The result of each set is written as soon as it is known;
 /// existing results are read.
-///
-/// # Errors
-/// If a file cannot be written or read, or if the folder was removed meanwhile.
 pub fn run_sets(
     study: &Study<'_>,
     sets: &[u32],
@@ -161,7 +135,6 @@ pub fn run_sets(
     Ok(results)
 }
 
-/// The score of one distinct configuration on one set.
 struct MeasuredSet {
     score: SetScore,
     record: SetRecord,
@@ -169,7 +142,7 @@ struct MeasuredSet {
     response: Response,
 }
 
-/// Simulates the images of a set, measures them with all measurers and scores the results.
+// Simulates the images of a set, measures them with all measurers and scores the results.
 fn measure_set(
     plan: &Plan,
     set: u32,
@@ -226,7 +199,7 @@ fn measure_set(
     sums.iter().zip(&regressions).map(score).collect()
 }
 
-/// The record of a set. `place` has the index in `measured` of each configuration of the plan.
+// The record of a set. `place` has the index in `measured` of each configuration of the plan.
 fn set_result(plan: &Plan, set: u32, measured: &[MeasuredSet], place: &[usize]) -> SetResult {
     let result = |(configuration, &at): (&Configuration, &usize)| {
         let MeasuredSet {
@@ -256,7 +229,7 @@ fn set_result(plan: &Plan, set: u32, measured: &[MeasuredSet], place: &[usize]) 
     }
 }
 
-/// Q of the cross-spectrum of `images`, with its error if it is known.
+// Q of the cross-spectrum of `images`, with its error if it is known.
 fn spectrum_quality(score: &SetScore, images: &SetImages) -> Option<(f64, Option<f64>)> {
     let cross = cross_spectrum(&score.grid, images, Convention::STANDARD).ok()?;
     let truth = &score.true_ee;
@@ -267,7 +240,7 @@ fn spectrum_quality(score: &SetScore, images: &SetImages) -> Option<(f64, Option
     Some((quality(&cross.bins, &cross.power, truth).q, error))
 }
 
-/// The configurations without repetition, and the index among them of each given one.
+// The configurations without repetition, and the index among them of each given one.
 fn distinct(submissions: &[Configuration]) -> (Vec<Configuration>, Vec<usize>) {
     let mut kept: Vec<Configuration> = Vec::new();
     let mut place = Vec::new();
@@ -287,7 +260,7 @@ fn distinct(submissions: &[Configuration]) -> (Vec<Configuration>, Vec<usize>) {
     (kept, place)
 }
 
-/// The measurements of one image on the grid, and how the rows were used. Flagged galaxies count as missing.
+// The measurements of one image on the grid, and how the rows were used. Flagged galaxies count as missing.
 fn field_sum(grid: &Grid, galaxies: &[Measurement]) -> (FieldSum, RowCounts) {
     let mut sum = FieldSum::new(grid);
     let mosaic = Mosaic::square(grid.n, STAMP);
@@ -321,7 +294,7 @@ mod tests {
         }
     }
 
-    /// Removes the folder as soon as the set is measured.
+    // Removes the folder as soon as the set is measured.
     struct Remover<'a>(&'a Path);
 
     impl Progress for Remover<'_> {

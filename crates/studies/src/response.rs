@@ -15,7 +15,6 @@ pub struct Regression {
     components: [PairSums; 2],
 }
 
-/// Sums over galaxies of one component.
 #[derive(Debug, Clone, Copy, Default)]
 struct PairSums {
     t: f64,
@@ -25,23 +24,19 @@ struct PairSums {
     ee: f64,
 }
 
-/// The result of a regression.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Response {
-    /// Galaxies used.
     pub galaxies: u64,
     /// Galaxies left out because they are flagged.
     pub flagged: u64,
     /// Slope of the reported ellipticity against the true shear-type one, per component.
     #[serde(deserialize_with = "nan_for_null")]
     pub slope: [f64; 2],
-    /// Standard errors of the slopes.
     #[serde(deserialize_with = "nan_for_null")]
     pub slope_error: [f64; 2],
     /// Reported ellipticity of a round galaxy.
     #[serde(deserialize_with = "nan_for_null")]
     pub offset: [f64; 2],
-    /// Standard errors of the offsets.
     #[serde(deserialize_with = "nan_for_null")]
     pub offset_error: [f64; 2],
     /// Standard deviation of the ellipticity about the line, divided by the slope: the scatter of a
@@ -53,13 +48,11 @@ pub struct Response {
     pub total: [f64; 2],
 }
 
-/// Root mean square over the components.
 fn rms(values: [f64; 2]) -> f64 {
     (values.iter().map(|v| v * v).sum::<f64>() / 2.0).sqrt()
 }
 
 impl Regression {
-    /// Adds galaxies.
     pub fn add<'a>(&mut self, galaxies: impl Iterator<Item = (Shear, &'a Measurement)>) {
         for (truth, measured) in galaxies {
             if !measured.flags.is_empty() {
@@ -152,7 +145,7 @@ mod tests {
         assert_eq!(serde_json::to_string(&read).unwrap(), text);
     }
 
-    /// A galaxy without flags.
+    // A galaxy without flags.
     fn measured(e1: f64, e2: f64) -> Measurement {
         let mut galaxy = Measurement::flagged(Flags::NONE);
         (galaxy.e1, galaxy.e2) = (e1, e2);

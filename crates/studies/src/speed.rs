@@ -1,56 +1,50 @@
 //! Speed on the user's machine: stages of a measurement, stamp sizes, threads, scoring.
 
 use std::hint::black_box;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use ndarray::{Array2, ArrayView2};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
+use shearq_dataset::truth::Reading;
+use shearq_files::FileError;
+use shearq_files::atomic::{self, Scratch};
+use shearq_files::frames::frame;
+use shearq_files::frames::polars::Column;
+use shearq_files::table::{self, FileFormat};
 use shearq_measure::parts::{
     AdaptiveMoments, ClippedAcf, Network, Rule, Spectral, WaveletWiener, border_noise,
 };
 use shearq_measure::{ImageNoise, Measurer, StampNoise, Worker};
-use shearq_quantities::statistics::median;
-use shearq_quantities::units::{Degrees, Pixels};
-use shearq_scoring::{Options, TruthSign};
-use shearq_submissions::limits::{MAX_PSF, WINDOWS};
-use shearq_submissions::{Configuration, LinearMethod, Method, NetworkMethod, NoiseSource, PsfCut};
-
-use shearq_files::frames::frame;
-use shearq_files::frames::polars::Column;
-
-use shearq_dataset::truth::Reading;
-use shearq_files::FileError;
-use shearq_files::atomic::{self, Scratch};
-use shearq_files::table::{self, FileFormat};
 use shearq_pipeline::PipelineError;
 use shearq_pipeline::engine::Quiet;
 use shearq_pipeline::run::{measurers, run_set};
 use shearq_pipeline::simulate::simulator;
-use shearq_render::figure::{LinePlot, Series, Style};
-use shearq_render::table::{Cell, Heading, Table};
+use shearq_quantities::statistics::median;
+use shearq_quantities::units::{Degrees, Pixels};
+use shearq_render::table::{Cell, Table};
 use shearq_results::foreign::{Screen, plain_columns};
 use shearq_results::score::{COLUMNS, score_files};
+use shearq_scoring::{Options, TruthSign};
 use shearq_simulate::render::RenderScratch;
 use shearq_simulate::set::{NOISE_SIGMA, STAMP, SetSimulator, SimulationSettings};
+use shearq_submissions::limits::{MAX_PSF, WINDOWS};
+use shearq_submissions::{Configuration, LinearMethod, Method, NetworkMethod, NoiseSource, PsfCut};
 
-mod amounts;
-
-pub use amounts::{Amounts, amounts};
-
-/// Number of different galaxies per timing, so that branches are not predictable.
+// Number of different galaxies per timing, so that branches are not predictable.
 const SAMPLE: usize = 64;
-/// Runs of which a time is the median.
+// Runs of which a time is the median: other work on the machine disturbs single runs.
 const RUNS: usize = 5;
-/// Longest time per timing.
+// Longest time per timing.
 const BUDGET: Duration = Duration::from_millis(400);
-/// Stamp sizes of the table of costs.
-pub const SIZES: [usize; 10] = [11, 15, 19, 23, 29, 33, 39, 48, 56, 64];
+// Stamp sizes of the table of costs.
+const SIZES: [usize; 10] = [11, 15, 19, 23, 29, 33, 39, 48, 56, 64];
 
-/// Microseconds per call: the median of passes over `SAMPLE` galaxies, at least [`RUNS`], after a warm-up.
-pub(super) fn time(mut call: impl FnMut(usize)) -> f64 {
+// Microseconds per call: the median of passes over `SAMPLE` galaxies, at least `RUNS`, after a warm-up.
+fn time(mut call: impl FnMut(usize)) -> f64 {
+    // The first pass fills caches and grows buffers.
     for k in 0..SAMPLE {
         call(k);
     }
@@ -66,48 +60,32 @@ pub(super) fn time(mut call: impl FnMut(usize)) -> f64 {
     median(&mut passes).unwrap_or(f64::NAN)
 }
 
-/// Seconds of `run`.
-fn seconds(mut run: impl FnMut() -> Result<(), PipelineError>) -> Result<f64, PipelineError> {
-    let start = Instant::now();
-    run()?;
-    Ok(start.elapsed().as_secs_f64())
-}
-
-/// The same: the median of [`RUNS`].
 fn median_seconds(
     mut run: impl FnMut() -> Result<(), PipelineError>,
 ) -> Result<f64, PipelineError> {
-    let runs: Result<Vec<f64>, _> = (0..RUNS).map(|_| seconds(&mut run)).collect();
-    Ok(median(&mut runs?).unwrap_or(f64::NAN))
+    let mut seconds = || {
+        let start = Instant::now();
+        run().map(|()| start.elapsed().as_secs_f64())
+    };
+    let mut runs = (0..RUNS)
+        .map(|_| seconds())
+        .collect::<Result<Vec<f64>, _>>()?;
+    Ok(median(&mut runs).unwrap_or(f64::NAN))
 }
 
-/// A square stamp.
 fn view(stamp: &[f32]) -> ArrayView2<'_, f32> {
     let side = stamp.len().isqrt();
     ArrayView2::from_shape((side, side), stamp).expect("a square stamp")
 }
 
-/// Settings of a configuration's network.
-///
-/// # Errors
-/// If it has the linear method.
-pub(super) fn network_of(configuration: &Configuration) -> Result<&NetworkMethod, PipelineError> {
-    configuration.network().ok_or_else(|| {
-        PipelineError::Request(format!(
-            "configuration {} has method = \"linear\"; expected \"network\"",
-            configuration.name
-        ))
-    })
-}
-
-/// Stamps of the fiducial set, and its PSF at a size.
-pub(super) struct Inputs {
+// Stamps of the fiducial set, and its PSF at a size.
+struct Inputs {
     set: SetSimulator,
     stamps: Vec<Vec<f32>>,
 }
 
 impl Inputs {
-    pub(super) fn new(settings: SimulationSettings) -> Result<Self, PipelineError> {
+    fn new(settings: SimulationSettings) -> Result<Self, PipelineError> {
         let set = simulator(2, settings)?;
         let fields = set.image_fields(1);
         let mut scratch = RenderScratch::new();
@@ -122,12 +100,12 @@ impl Inputs {
         Ok(Inputs { set, stamps })
     }
 
-    pub(super) fn psf(&self, cut: impl Into<PsfCut>) -> Array2<f64> {
+    fn psf(&self, cut: impl Into<PsfCut>) -> Array2<f64> {
         let fields = self.set.image_fields(1);
         fields.psf.at(0, 0).stamp_beside(cut.into().size, STAMP)
     }
 
-    /// The stamps of at least `side` pixels a side: larger ones have noise around the set's stamps.
+    // The stamps of at least `side` pixels a side: larger ones have noise around the set's stamps.
     fn of_side(&self, side: usize) -> Vec<Vec<f32>> {
         let before = side.saturating_sub(STAMP) / 2;
         let mut rng = ChaCha8Rng::seed_from_u64(side as u64);
@@ -146,7 +124,7 @@ impl Inputs {
         self.stamps.iter().map(surrounded).collect()
     }
 
-    /// A worker, and the PSF for it.
+    // A worker, and the PSF for it.
     fn prepared(
         &self,
         configuration: &Configuration,
@@ -157,7 +135,7 @@ impl Inputs {
         Ok((measurer.worker(), psf))
     }
 
-    /// Microseconds of a whole measurement of a galaxy whose PSF is set.
+    // Microseconds of a whole measurement of a galaxy whose PSF is set.
     fn whole(&self, configuration: &Configuration) -> Result<f64, PipelineError> {
         let (mut worker, psf) = self.prepared(configuration)?;
         let stamps = self.of_side(configuration.stamp.size);
@@ -168,7 +146,7 @@ impl Inputs {
         }))
     }
 
-    /// Microseconds of setting a PSF.
+    // Microseconds of setting a PSF.
     fn taking_a_psf(&self, configuration: &Configuration) -> Result<f64, PipelineError> {
         let (mut worker, psf) = self.prepared(configuration)?;
         let mut image = worker.image(ImageNoise::Level(NOISE_SIGMA));
@@ -177,16 +155,12 @@ impl Inputs {
         }))
     }
 
-    /// The stamps, cut to n×n.
-    pub(super) fn cuts(&self, n: usize) -> Vec<Vec<f32>> {
+    fn cuts(&self, n: usize) -> Vec<Vec<f32>> {
         self.stamps.iter().map(|stamp| centre(stamp, n)).collect()
     }
 }
 
 /// Microseconds of a whole measurement of a galaxy whose PSF is set.
-///
-/// # Errors
-/// If the sizes of the configuration are invalid.
 pub fn whole(
     configuration: &Configuration,
     settings: SimulationSettings,
@@ -195,9 +169,6 @@ pub fn whole(
 }
 
 /// Cost of each stage of a measurement, and of simulating the galaxy.
-///
-/// # Errors
-/// If the sizes of the configuration are invalid.
 pub fn stages(
     configuration: &Configuration,
     settings: SimulationSettings,
@@ -210,7 +181,6 @@ pub fn stages(
     let mut render = RenderScratch::new();
     let mut stamp = vec![0.0; STAMP * STAMP];
     let mut rows: Vec<(&str, f64)> = Vec::new();
-    let before = rows.len();
     if let NoiseSource::Border { border: width } = configuration.noise {
         let mut border = Vec::new();
         rows.push((
@@ -244,7 +214,7 @@ pub fn stages(
         }
     }
     let whole = inputs.whole(configuration)?;
-    let stages: f64 = rows[before..].iter().map(|(_, time)| time).sum();
+    let stages: f64 = rows.iter().map(|(_, time)| time).sum();
     let rest = if linear {
         "sheared noise (one galaxy in eight) and the rest"
     } else {
@@ -264,30 +234,20 @@ pub fn stages(
             );
         }),
     ));
-    Ok(Table {
-        title: format!("Stages of {}", configuration.name),
-        headings: vec![
-            Heading::new("stage", "Stage"),
-            Heading::new("microseconds", "µs per galaxy"),
-            Heading::new("per_second", "galaxies per second"),
-        ],
-        rows: rows
-            .into_iter()
-            .map(|(stage, time)| {
-                // The rest is a difference, and may be less than its error.
-                let rate = if time > 0.0 { 1e6 / time } else { f64::NAN };
-                vec![
-                    Cell::text(stage),
-                    Cell::number(time, 1),
-                    Cell::number(rate, 0),
-                ]
-            })
-            .collect(),
-        notes,
-    })
+    let mut table = Table::titled(format!("Stages of {}", configuration.name));
+    table.column("stage", "Stage", &rows, |row| Cell::text(row.0));
+    table.column("microseconds", "µs per galaxy", &rows, |row| {
+        Cell::number(row.1, 1)
+    });
+    table.column("per_second", "galaxies per second", &rows, |row| {
+        // The rest is a difference, and may be less than its error.
+        Cell::number(if row.1 > 0.0 { 1e6 / row.1 } else { f64::NAN }, 0)
+    });
+    table.notes = notes;
+    Ok(table)
 }
 
-/// Stages of the network; returns notes.
+// Stages of the network; returns notes.
 fn network_stages(
     method: &NetworkMethod,
     n: usize,
@@ -339,7 +299,6 @@ fn network_stages(
     )])
 }
 
-/// Stages of the linear network.
 fn linear_stages(
     method: &LinearMethod,
     n: usize,
@@ -379,23 +338,37 @@ fn centre(stamp: &[f32], n: usize) -> Vec<f32> {
         .collect()
 }
 
-/// Cost of a whole measurement against stamp size, in µs over [`SIZES`].
-///
-/// # Errors
-/// If the sizes of the configuration are invalid.
+/// Cost of a whole measurement against stamp size.
 pub fn size_costs(
-    configuration: &Configuration,
+    configurations: &[Configuration],
     settings: SimulationSettings,
-) -> Result<Vec<f64>, PipelineError> {
+) -> Result<Table, PipelineError> {
     let inputs = Inputs::new(settings)?;
-    SIZES
-        .iter()
-        .map(|&n| inputs.whole(&sized(configuration, n)))
-        .collect()
+    let mut rows = Vec::new();
+    for configuration in configurations {
+        for n in SIZES {
+            let cost = inputs.whole(&sized(configuration, n))?;
+            rows.push((configuration.name.as_str(), n, cost));
+        }
+    }
+    let mut table = Table::titled("Cost against stamp size");
+    table.column("submission", "Configuration", &rows, |row| {
+        Cell::text(row.0)
+    });
+    table.column("stamp", "Stamp [px]", &rows, |row| {
+        Cell::number(row.1 as f64, 0)
+    });
+    table.column("microseconds", "µs per galaxy", &rows, |row| {
+        Cell::number(row.2, 1)
+    });
+    table.column("nanoseconds_per_pixel", "ns per pixel", &rows, |row| {
+        Cell::number(row.2 * 1e3 / (row.1 * row.1) as f64, 1)
+    });
+    Ok(table)
 }
 
-/// A configuration for stamps of `n` pixels a side. The linear method's window keeps its share of the stamp, and its PSF
-/// stamps are as large, up to the largest, because both must be odd or even.
+// A configuration for stamps of `n` pixels a side. The linear method's window keeps its share of the stamp, and its PSF
+// stamps are as large, up to the largest, because both must be odd or even.
 fn sized(configuration: &Configuration, n: usize) -> Configuration {
     let mut sized = configuration.clone();
     let share = n as f64 / sized.stamp.size as f64;
@@ -408,54 +381,7 @@ fn sized(configuration: &Configuration, n: usize) -> Configuration {
     sized
 }
 
-/// Costs against stamp size of several configurations as a table.
-pub fn sizes_table(costs: &[(&str, Vec<f64>)]) -> Table {
-    let mut rows = Vec::new();
-    for (name, costs) in costs {
-        for (n, cost) in SIZES.iter().zip(costs) {
-            rows.push(vec![
-                Cell::text(*name),
-                Cell::number(*n as f64, 0),
-                Cell::number(*cost, 1),
-                Cell::number(cost * 1e3 / (n * n) as f64, 1),
-            ]);
-        }
-    }
-    Table {
-        title: "Cost against stamp size".into(),
-        headings: vec![
-            Heading::new("submission", "Configuration"),
-            Heading::new("stamp", "Stamp [px]"),
-            Heading::new("microseconds", "µs per galaxy"),
-            Heading::new("nanoseconds_per_pixel", "ns per pixel"),
-        ],
-        rows,
-        notes: Vec::new(),
-    }
-}
-
-/// The same as a plot.
-pub fn sizes_figure(costs: &[(&str, Vec<f64>)]) -> LinePlot {
-    let sizes: Vec<f64> = SIZES.iter().map(|n| *n as f64).collect();
-    LinePlot {
-        title: "Cost against stamp size".into(),
-        x_label: "stamp [px]".into(),
-        y_label: "µs per galaxy".into(),
-        series: costs
-            .iter()
-            .enumerate()
-            .map(|(k, (name, costs))| {
-                Series::new(name, sizes.clone(), costs.clone(), Style::Line, k)
-            })
-            .collect(),
-        ..LinePlot::default()
-    }
-}
-
 /// Rate of simulating and measuring in memory against the number of threads.
-///
-/// # Errors
-/// If the sizes of the configuration are invalid, or if threads cannot be started.
 pub fn scaling(
     configuration: &Configuration,
     settings: SimulationSettings,
@@ -470,30 +396,22 @@ pub fn scaling(
             median_seconds(|| run_set(set, &[1], &measurers, threads, &mut Quiet, |_, _| Ok(())))?;
         Ok(galaxies / seconds)
     };
-    let one = rate(1)?;
-    let mut rows = vec![vec![
-        Cell::number(1.0, 0),
-        Cell::number(one, 0),
-        Cell::number(1.0, 2),
-    ]];
-    for count in 2..=threads {
-        let many = rate(count)?;
-        rows.push(vec![
-            Cell::number(count as f64, 0),
-            Cell::number(many, 0),
-            Cell::number(many / one, 2),
-        ]);
-    }
-    Ok(Table {
-        title: format!("Simulating and measuring {} in memory", configuration.name),
-        headings: vec![
-            Heading::new("threads", "Threads"),
-            Heading::new("per_second", "galaxies per second"),
-            Heading::new("speed_up", "speed-up"),
-        ],
-        rows,
-        notes: Vec::new(),
-    })
+    let rates = (1..=threads.max(1))
+        .map(|count| Ok((count, rate(count)?)))
+        .collect::<Result<Vec<_>, PipelineError>>()?;
+    let one = rates[0].1;
+    let name = &configuration.name;
+    let mut table = Table::titled(format!("Simulating and measuring {name} in memory"));
+    table.column("threads", "Threads", &rates, |rate| {
+        Cell::number(rate.0 as f64, 0)
+    });
+    table.column("per_second", "galaxies per second", &rates, |rate| {
+        Cell::number(rate.1, 0)
+    });
+    table.column("speed_up", "speed-up", &rates, |rate| {
+        Cell::number(rate.1 / one, 2)
+    });
+    Ok(table)
 }
 
 /// Rate of scoring a set of 10,000-row catalogues from each format, in a temporary folder.
@@ -526,49 +444,41 @@ pub fn scoring(images: usize, threads: usize) -> Result<Table, PipelineError> {
     let dat = ascii("", " ");
     let columns = [("x", &x), ("y", &y), ("e1", &e1), ("e2", &e2)];
     let columns = columns.map(|(name, values)| Column::new(name.into(), values));
-    let table = frame(columns.into()).map_err(|error| FileError::new(&truth, error.to_string()))?;
+    let columns =
+        frame(columns.into()).map_err(|error| FileError::new(&truth, error.to_string()))?;
     let mut rows = Vec::new();
-    for (format, ending) in [("Parquet", "parquet"), ("FITS", "fits"), ("ASCII", "dat")] {
-        let mut paths = Vec::new();
-        for k in 0..images {
-            let path = folder.path().join(format!("{k}.{ending}"));
-            match ending {
-                "dat" => atomic::write(&path, dat.as_bytes())?,
-                _ => {
-                    let kind = if ending == "fits" {
-                        FileFormat::Fits
-                    } else {
-                        FileFormat::Parquet
-                    };
-                    table::write(&path, kind, &table, &Default::default())?;
-                }
+    for (format, ending, kind) in [
+        ("Parquet", "parquet", Some(FileFormat::Parquet)),
+        ("FITS", "fits", Some(FileFormat::Fits)),
+        ("ASCII", "dat", None),
+    ] {
+        let path = |k: usize| folder.path().join(format!("{k}.{ending}"));
+        let paths: Vec<PathBuf> = (0..images).map(path).collect();
+        for path in &paths {
+            match kind {
+                Some(kind) => table::write(path, kind, &columns, &Default::default())?,
+                None => atomic::write(path, dat.as_bytes())?,
             }
-            paths.push(path);
         }
-        let seconds = score_seconds(&truth, &paths, threads)?;
-        rows.push(vec![
-            Cell::text(format),
-            Cell::number(seconds, 3),
-            Cell::number((images * side * side) as f64 / seconds / 1e6, 1),
-        ]);
+        rows.push((format, score_seconds(&truth, &paths, threads)?));
     }
-    Ok(Table {
-        title: format!("Scoring {images} catalogues of 10,000 rows, {threads} thread(s)"),
-        headings: vec![
-            Heading::new("format", "Format"),
-            Heading::new("seconds", "seconds"),
-            Heading::new("million_rows_per_second", "million rows per second"),
-        ],
-        rows,
-        notes: vec!["Reading, summing, spectra of eight conventions, jackknife.".into()],
-    })
+    let mut table = Table::titled(format!(
+        "Scoring {images} catalogues of 10,000 rows, {threads} thread(s)"
+    ));
+    table.column("format", "Format", &rows, |row| Cell::text(row.0));
+    table.column("seconds", "seconds", &rows, |row| Cell::number(row.1, 3));
+    let millions = (images * side * side) as f64 / 1e6;
+    table.column(
+        "million_rows_per_second",
+        "million rows per second",
+        &rows,
+        |row| Cell::number(millions / row.1, 1),
+    );
+    table.notes = vec!["Reading, summing, spectra of eight conventions, jackknife.".into()];
+    Ok(table)
 }
 
-fn score_seconds(
-    truth: &Path,
-    paths: &[std::path::PathBuf],
-    threads: usize,
-) -> Result<f64, PipelineError> {
+fn score_seconds(truth: &Path, paths: &[PathBuf], threads: usize) -> Result<f64, PipelineError> {
     let reading = Reading {
         field: Degrees(10.0),
         stamp: Pixels(48.0),
@@ -576,13 +486,9 @@ fn score_seconds(
     };
     median_seconds(|| {
         let read = plain_columns(COLUMNS, Screen::default());
+        let options = Options::default();
         black_box(score_files(
-            truth,
-            paths,
-            &reading,
-            &read,
-            Options::default(),
-            threads,
+            truth, paths, &reading, &read, options, threads,
         )?);
         Ok(())
     })
