@@ -46,7 +46,7 @@ impl Bar {
     }
 }
 
-/// Rate and remaining time after `done` galaxies in `seconds`.
+// Rate and remaining time after `done` galaxies in `seconds`.
 fn pace(done: u64, left: u64, seconds: f64) -> String {
     if done == 0 || seconds <= 0.0 {
         return String::new();
@@ -85,7 +85,7 @@ impl Drop for Bar {
     }
 }
 
-/// Whether the command of this process resumes.
+// Whether the command of this process resumes.
 static GOES_ON: AtomicBool = AtomicBool::new(false);
 
 /// States that the command of this process resumes when it is given again.
@@ -93,7 +93,7 @@ pub(super) fn goes_on() {
     GOES_ON.store(true, Ordering::Relaxed);
 }
 
-/// Exit code after Ctrl-C, as in shells.
+// Exit code after Ctrl-C, as in shells.
 const INTERRUPTED: i32 = 130;
 
 /// Ends the process at Ctrl-C and prints how to resume. At any moment, a file is complete or absent.

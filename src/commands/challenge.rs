@@ -7,10 +7,10 @@ use shearq_challenge::copies::near_copies;
 use shearq_challenge::create::{Folders, Plan, Simulation, of_images, simulated};
 use shearq_challenge::deadline::Deadline;
 use shearq_challenge::inbox;
-use shearq_challenge::judge::{Judge, one_line};
+use shearq_challenge::judge::Judge;
 use shearq_challenge::kind::{Kind, RankBy, kind};
 use shearq_challenge::organiser::Decisions;
-use shearq_challenge::page::{Disclosure, View};
+use shearq_challenge::page::View;
 use shearq_challenge::ranking;
 use shearq_challenge::seal::{BOARD_FILE, is_open_to_others, verify_public};
 use shearq_challenge::shapes::References;
@@ -19,6 +19,7 @@ use shearq_dataset::layout::DataFolder;
 use shearq_dataset::layout::MAX_IMAGE;
 use shearq_files::FileError;
 use shearq_files::open::is_there;
+use shearq_render::escape::line;
 use shearq_results::submit::check::{Finding, Severity, check_sent};
 use shearq_results::submit::packed::{Sent, Submission};
 
@@ -234,7 +235,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     }
 }
 
-/// Seeds below this can be found by trying all of them.
+// Seeds below this can be found by trying all of them.
 const LEAST_SEED: u64 = 1 << 40;
 
 fn new(arguments: &NewArguments) -> anyhow::Result<()> {
@@ -417,22 +418,20 @@ fn rank(arguments: &RankArguments) -> anyhow::Result<()> {
         copies: &copies,
         zero_shear: judge.zero_shear(),
         constant: judge.constant.as_ref(),
-        expected: judge.key.expected.as_ref(),
-        disclosure: Disclosure {
-            digits,
-            detail: arguments.detail,
-        },
+        digits,
+        detail: arguments.detail,
     };
     arguments.form.print(&view.table())?;
     for refused in &round.refused {
         tell(format_args!(
             "warning: {}: not scored: {}",
-            one_line(&refused.path),
+            line(&refused.path.to_string_lossy()),
             refused.reason
         ));
     }
     for (path, doubt) in &round.doubtful {
-        tell(format_args!("warning: {}: {doubt}", one_line(path)));
+        let path = line(&path.to_string_lossy());
+        tell(format_args!("warning: {path}: {doubt}"));
     }
     for (info, reason) in &board.excluded {
         tell(format_args!(

@@ -49,7 +49,7 @@ pub(crate) fn manual(arguments: &Manual) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Adds the pages of a command and its subcommands, each with its file name.
+// Adds the pages of a command and its subcommands, each with its file name.
 fn add_pages(name: &str, command: &Command, pages: &mut Vec<(String, Command)>) {
     // `man` finds a page by the name of its command.
     pages.push((format!("{name}.1"), command.clone().name(name.to_owned())));

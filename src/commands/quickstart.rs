@@ -111,7 +111,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Q of each set, as text.
+// Q of each set, as text.
 fn q_of(scored: &[ScoredSet]) -> String {
     let sets = scored.iter().map(|set| {
         let record = &set.record;

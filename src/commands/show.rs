@@ -121,7 +121,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The response of this galaxy to shear after `lead`, if the method provides it.
+// The response of this galaxy to shear after `lead`, if the method provides it.
 fn response(measured: &Measurement, lead: &str) -> String {
     match measured.response_diagonal() {
         [first, second] if first.is_finite() && second.is_finite() => {

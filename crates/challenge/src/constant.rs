@@ -5,15 +5,13 @@ use std::collections::BTreeMap;
 use shearq_results::record::SetRecord;
 use shearq_scoring::TrueShear;
 
-/// Fewest sets for m and c of a component: two for the line, and one that the line does not pass through by
-/// construction. A team that knows its mean ellipticities solves for one shear with three published values.
+// Fewest sets for m and c of a component: two for the line, and one that the line does not pass through by
+// construction. A team that knows its mean ellipticities solves for one shear with three published values.
 const MIN_SETS: usize = 3;
 
-/// The true shear of each set.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ConstantShears(BTreeMap<u32, [f64; 2]>);
 
-/// A number and its standard error.
 pub type Measured = (f64, f64);
 
 impl ConstantShears {
@@ -103,7 +101,6 @@ impl ConstantShears {
         ((m, error(&of_m)), (c, error(&of_c)))
     }
 
-    /// m and c of both components.
     pub fn biases(&self, sets: &[SetRecord]) -> [(Measured, Measured); 2] {
         [self.bias(sets, 0), self.bias(sets, 1)]
     }
@@ -137,7 +134,7 @@ mod tests {
         }
     }
 
-    /// Three shears of both signs.
+    // Three shears of both signs.
     const SHEARS: [[f64; 2]; 3] = [[0.02, -0.01], [-0.03, 0.01], [0.04, 0.03]];
 
     fn shears() -> ConstantShears {
@@ -145,7 +142,7 @@ mod tests {
         ConstantShears::of((1..).zip(&truths)).unwrap().unwrap()
     }
 
-    /// Sets with the biases m and c, and errors of 10⁻⁴ of each mean.
+    // Sets with the biases m and c, and errors of 10⁻⁴ of each mean.
     fn sets(m: [f64; 2], c: [f64; 2]) -> Vec<SetRecord> {
         let set = |(number, g): (u32, [f64; 2])| {
             let (mut metrics, mut errors) = (Metrics::unknown(), Metrics::unknown());

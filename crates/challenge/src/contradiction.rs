@@ -4,19 +4,17 @@
 use shearq_scoring::ndarray::Array2;
 use shearq_scoring::{FieldSum, TrueShear};
 
-/// A pair of numbers for each component.
 type Pair = [(f64, f64); 2];
 
-/// Largest slope of the measured on the true shear, or inverse. A reference measurement has an m of a few tenths at most,
-/// and a truth of twice or half the scale has a slope of 0.5 or 2.
+// Largest slope of the measured on the true shear, or inverse. A reference measurement has an m of a few tenths at most,
+// and a truth of twice or half the scale has a slope of 0.5 or 2.
 const LARGEST_SLOPE: f64 = 1.6;
-/// Slopes of a right truth.
+// Slopes of a right truth.
 const RANGE: std::ops::RangeInclusive<f64> = 1.0 / LARGEST_SLOPE..=LARGEST_SLOPE;
-/// Standard errors by which a slope must be out of range. With three slopes of each of 24 sets, chance reaches this in one
-/// of 400 challenges whose slopes are all at the limit, and in none whose slopes are near 1.
+// Standard errors by which a slope must be out of range. With three slopes of each of 24 sets, chance reaches this in one
+// of 400 challenges whose slopes are all at the limit, and in none whose slopes are near 1.
 const CLEAR: f64 = 4.0;
 
-/// The first image of a set.
 #[derive(Debug)]
 pub(crate) struct First {
     pub set: u32,
@@ -24,16 +22,15 @@ pub(crate) struct First {
     pub truth: TrueShear,
 }
 
-/// Sums of one component over the galaxies of an image.
+// Sums of one component over the galaxies of an image.
 #[derive(Clone, Copy)]
 struct Sums {
     cross: f64,
     square: f64,
-    /// Variance of a measured ellipticity around the line.
+    // Variance of a measured ellipticity around the line.
     scatter: f64,
 }
 
-/// Slope and its standard error.
 type Slope = (f64, f64);
 
 fn slope(parts: &[Sums]) -> Slope {
@@ -47,12 +44,12 @@ fn is_wrong((slope, error): Slope) -> bool {
     slope + CLEAR * error < *RANGE.start() || slope - CLEAR * error > *RANGE.end()
 }
 
-/// Whether a slope is in range and clearly above zero.
+// Whether a slope is in range and clearly above zero.
 fn is_right((slope, error): Slope) -> bool {
     slope > CLEAR * error && RANGE.contains(&slope)
 }
 
-/// Sums of a component. True and measured shear are relative to `zeros`, or to their means.
+// Sums of a component. True and measured shear are relative to `zeros`, or to their means.
 fn sums(
     e: &Array2<f64>,
     count: &Array2<f64>,
@@ -88,15 +85,15 @@ fn sums(
     }
 }
 
-/// A change of the true shear: signs of both components, and whether they are exchanged.
+// A change of the true shear: signs of both components, and whether they are exchanged.
 type Change = (f64, f64, bool);
 
-/// True and measured shear without bias, of both components.
+// True and measured shear without bias, of both components.
 type Zeros = Option<[(f64, f64); 2]>;
 
 const SAME: Change = (1.0, 1.0, false);
 
-/// What an organiser may have exchanged.
+// What an organiser may have exchanged.
 const CHANGES: [(Change, &str); 6] = [
     ((1.0, -1.0, false), "the sign of g2"),
     ((-1.0, 1.0, false), "the sign of g1"),
@@ -123,7 +120,7 @@ fn of_set(
     ]
 }
 
-/// Mean true and measured shear of both components of a set with one shear.
+// Mean true and measured shear of both components of a set with one shear.
 fn means(first: &First, (s1, s2, exchanged): Change) -> Option<[(f64, f64); 2]> {
     let [g1, g2] = first.truth.constant()?;
     let (g1, g2) = if exchanged { (g2, g1) } else { (g1, g2) };
@@ -132,7 +129,7 @@ fn means(first: &First, (s1, s2, exchanged): Change) -> Option<[(f64, f64); 2]> 
     Some([(s1 * g1, mean(e1)), (s2 * g2, mean(e2))])
 }
 
-/// What a single set with one shear is relative to: the median additive bias over sets, which one wrong set does not change.
+// What a single set with one shear is relative to: the median additive bias over sets, which one wrong set does not change.
 fn median_bias(firsts: &[First]) -> Zeros {
     let all: Option<Vec<_>> = firsts.iter().map(|first| means(first, SAME)).collect();
     let all = all.filter(|all| !all.is_empty())?;
@@ -144,7 +141,7 @@ fn median_bias(firsts: &[First]) -> Zeros {
     }))
 }
 
-/// Sums of several sets. Those with one shear each are relative to their common means.
+// Sums of several sets. Those with one shear each are relative to their common means.
 fn together(firsts: &[&First], change: Change) -> Vec<Sums> {
     let all: Option<Vec<_>> = firsts.iter().map(|first| means(first, change)).collect();
     let zeros = all.map(|all| {
@@ -230,13 +227,13 @@ mod tests {
 
     const SIDE: usize = 48;
 
-    /// Numbers between −1 and 1 that follow from their place.
+    // Numbers between −1 and 1 that follow from their place.
     fn number(place: usize) -> f64 {
         let value = (place as f64 * 12.9898 + 1.0).sin() * 43758.5453;
         2.0 * (value - value.floor()) - 1.0
     }
 
-    /// Measured and true shear of a set; all galaxies have one shear if it is `constant`.
+    // Measured and true shear of a set; all galaxies have one shear if it is `constant`.
     fn first(set: u32, constant: bool, scatter: f64) -> First {
         let grid = Grid::new(SIDE, Pixels(48.0), Degrees(10.0)).unwrap();
         let place = |k: usize, (i, j): (usize, usize)| match constant {

@@ -4,14 +4,14 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use shearq_scoring::FieldSum;
 
-use crate::entry::{Entry, EntryInfo};
+use crate::judge::{Entry, EntryInfo};
 
-/// Cells of a set whose mean shapes a store keeps. Two methods that share all galaxies differ by far more than the
-/// criterion in any dozen of them.
+// Cells of a set whose mean shapes a store keeps. Two methods that share all galaxies differ by far more than the
+// criterion in any dozen of them.
 const CELLS: usize = 32;
-/// Shapes are kept as multiples of this.
+// Shapes are kept as multiples of this.
 const STEP: f64 = 1e-7;
-/// Largest 1 - r of a near copy, with r the correlation of its shapes. Noise of a thousandth of the shapes has it.
+// Largest 1 - r of a near copy, with r the correlation of its shapes. Noise of a thousandth of the shapes has it.
 const DECORRELATION: f64 = 1e-6;
 
 /// Mean shapes of some cells, which spread over the field.
@@ -29,18 +29,14 @@ pub fn sketch(total: &FieldSum) -> Vec<i32> {
 /// An entry that is nearly an earlier one.
 #[derive(Debug, Clone)]
 pub struct NearCopy<'a> {
-    /// The later entry.
     pub entry: &'a EntryInfo,
-    /// The earlier entry.
     pub earlier: &'a EntryInfo,
-    /// Files with identical bytes.
     pub files: usize,
     /// 1 - r, with r the correlation of the shapes; NaN without common sets of catalogues.
     pub decorrelation: f64,
 }
 
 impl NearCopy<'_> {
-    /// What both entries share.
     pub fn reason(&self) -> String {
         let of = self.entry.files.len();
         format!(
@@ -50,7 +46,7 @@ impl NearCopy<'_> {
     }
 }
 
-/// Smallest 1 - r of the shapes of two entries in a common set: a copy may have another scale and shift in each set.
+// Smallest 1 - r of the shapes of two entries in a common set: a copy may have another scale and shift in each set.
 fn decorrelation(a: &EntryInfo, b: &EntryInfo) -> f64 {
     let of_set = |(set, shapes): (&String, &Vec<i32>)| {
         let (a, b) = (centred(shapes), centred(b.shapes.get(set)?));
@@ -62,7 +58,7 @@ fn decorrelation(a: &EntryInfo, b: &EntryInfo) -> f64 {
     a.shapes.iter().filter_map(of_set).fold(f64::NAN, f64::min)
 }
 
-/// Components relative to their means.
+// Components relative to their means.
 fn centred(shapes: &[i32]) -> Vec<f64> {
     let mean = |k: usize| {
         let own = shapes.iter().skip(k).step_by(2);

@@ -13,7 +13,7 @@ use shearq_files::fits::{ImageReader, ImageWriter, Value};
 use shearq_files::open::is_there;
 use shearq_files::{FileError, atomic};
 use shearq_pipeline::engine::Quiet;
-use shearq_pipeline::simulate::{simulate_blind, simulator};
+use shearq_pipeline::simulate::simulate_blind;
 use shearq_pipeline::{PipelineError, Progress};
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_results::record::SetRecord;
@@ -21,53 +21,38 @@ use shearq_results::submit::manifest::Contents;
 use shearq_scoring::{Choice, Convention, Options, RowCounts, SetImages, SetScorer, TrueShear};
 use shearq_simulate::field::ShearSpectrum;
 use shearq_simulate::set::{STAMP, SimulationSettings};
-use shearq_studies::bound::{cramer_rao, expected_qs};
 
 use crate::constant::ConstantShears;
 use crate::contradiction::{First, contradiction};
 use crate::deadline::Deadline;
+use crate::error::ChallengeError;
 use crate::judge::unscored;
 use crate::kind::{Kind, RankBy, response};
 use crate::readme;
-use crate::seal::{Expected, Key, close, names, seal_public, sums};
+use crate::seal::{Key, close, names, seal_public, sums};
 use crate::shapes::References;
 use crate::terms::{CHALLENGE_FILE, Challenge, Data, Rules};
 
-/// Name and rules of a new challenge.
 #[derive(Debug, Clone)]
 pub struct Plan {
-    /// Name of the challenge.
     pub name: String,
-    /// Version of the data.
     pub version: u32,
-    /// Kind of the challenge.
     pub kind: &'static Kind,
     /// Metric that ranks the entries; `None` for that of the kind, which depends on the true shear.
     pub metric: Option<RankBy>,
-    /// Whether power spectra are accepted, too.
     pub spectra: bool,
-    /// Address of the organiser; may be empty.
     pub contact: String,
-    /// Where the data and the rules are published; may be empty.
     pub address: String,
-    /// Most entries of a team.
     pub entries_per_team: Option<u32>,
-    /// First day or moment of entries.
     pub opens: Option<Deadline>,
-    /// Last day or moment of entries.
     pub closes: Option<Deadline>,
-    /// Whether entries may cover some sets only.
     pub partial: bool,
 }
 
-/// Settings of simulated images.
 #[derive(Debug, Clone)]
 pub struct Simulation {
-    /// Set numbers, in order.
     pub sets: Vec<u32>,
-    /// Images of each set.
     pub images: u32,
-    /// Galaxies per side of an image.
     pub grid: usize,
     /// Factor on the shear power; `None` to draw it from the seed.
     pub amplitude: Option<f64>,
@@ -77,18 +62,15 @@ pub struct Simulation {
     pub seed: Option<u64>,
 }
 
-/// The folders of a challenge.
 #[derive(Debug, Clone, Copy)]
 pub struct Folders<'a> {
-    /// Folder for participants.
     pub public: &'a Path,
-    /// Folder that must stay secret.
     pub private: &'a Path,
 }
 
-/// Range of the factor on the shear power that a seed determines.
+// Range of the factor on the shear power that a seed determines.
 const AMPLITUDES: (f64, f64) = (0.5, 2.0);
-/// Largest extra slope of the shear power that a seed determines.
+// Largest extra slope of the shear power that a seed determines.
 const TILT: f64 = 0.2;
 /// Factor s on bandpowers, log-uniform between 1/s and s. The best spectrum that can be had without images is the median,
 /// with σ_sys = (s − 1)/(s + 1) of that of zero shear: ⟨|x − 1|⟩/⟨x⟩ of a log-uniform x. With 4, no template exceeds 5/3 of
@@ -98,10 +80,10 @@ pub const SCATTER: f64 = 4.0;
 pub const TEMPLATE_GAIN: f64 = (SCATTER + 1.0) / (SCATTER - 1.0);
 /// Significance of the response that a method of ordinary noise must expect. Entries need 3; two more make a refusal by
 /// chance unlikely.
-const EXPECTED_RESPONSE: f64 = 5.0;
+pub(crate) const EXPECTED_RESPONSE: f64 = 5.0;
 
 impl Folders<'_> {
-    /// Checks that the public folder can become one of this challenge. Returns the key of an earlier, stopped command.
+    // Checks that the public folder can become one of this challenge. Returns the key of an earlier, stopped command.
     fn prepare(&self, plan: &Plan) -> Result<Option<Key>, FileError> {
         let Folders { public, private } = self;
         if is_there(&public.join(CHALLENGE_FILE)) {
@@ -161,7 +143,7 @@ pub fn seed_of(name: &str, version: u32, seed: u64) -> u64 {
         .fold(0, |seed, byte| seed << 8 | u64::from(*byte))
 }
 
-/// A number between 0 and 1 that a seed determines, for each purpose.
+// A number between 0 and 1 that a seed determines, for each purpose.
 fn drawn(seed: u64, purpose: &str) -> f64 {
     seed_of(purpose, 0, seed) as f64 / 2f64.powi(64)
 }
@@ -176,7 +158,7 @@ pub fn simulated(
     folders: Folders<'_>,
     threads: usize,
     progress: &mut dyn Progress,
-) -> Result<Challenge, PipelineError> {
+) -> Result<Challenge, ChallengeError> {
     let Simulation {
         sets,
         images,
@@ -187,8 +169,7 @@ pub fn simulated(
     } = simulation;
     plan.check()?;
     if *amplitude == Some(0.0) {
-        let message = "--amplitude 0: without shear, entries cannot be ranked (found 0, expected a positive number)";
-        return Err(PipelineError::Request(message.into()));
+        return Err(ChallengeError::NoShear);
     }
     let earlier = folders.prepare(plan)?;
     let kept = earlier
@@ -201,7 +182,7 @@ pub fn simulated(
         return Err(FileError::new(folders.private, message).into());
     }
     let seed: u64 = kept.or(*seed).unwrap_or_else(rand::random);
-    let mut key = earlier.unwrap_or_else(|| Key::new(&plan.name, plan.version, Some(seed)));
+    let key = earlier.unwrap_or_else(|| Key::new(&plan.name, plan.version, Some(seed)));
     let secret = seed_of(&plan.name, plan.version, seed);
     let (least, most) = AMPLITUDES;
     let settings = SimulationSettings {
@@ -213,9 +194,7 @@ pub fn simulated(
         },
         ..SimulationSettings::new(secret, *grid)
     };
-    settings
-        .validate()
-        .map_err(|error| PipelineError::Request(error.to_string()))?;
+    settings.validate()?;
     key.write(folders.private)?;
     let record = SimulationRecord {
         version: shearq_dataset::VERSION.into(),
@@ -238,41 +217,7 @@ pub fn simulated(
     let metric = rankable(plan, &data, &public, &private, false, threads, progress)?;
     let ids = images::of_simulation(sets, *images);
     simulate_blind(&record, &ids, &public, &private, threads, progress)?;
-    progress.note("computing the expected Q");
-    key.expected = expected(settings, sets, *images)?;
     finish(plan, metric, data, folders, key, threads)
-}
-
-/// Mean Q over sets of a perfect method with noise at the Cramér–Rao bound; `None` if it is unknown for all sets.
-fn expected(
-    settings: SimulationSettings,
-    sets: &[u32],
-    images: u32,
-) -> Result<Option<Expected>, PipelineError> {
-    let (mut catalogues, mut spectra, mut without) = (0.0, 0.0, Vec::new());
-    for &set in sets {
-        let simulator = simulator(set, settings)?;
-        // Without shear, no Q is defined.
-        match cramer_rao(&simulator).filter(|_| settings.spectrum.amplitude > 0.0) {
-            None => without.push(set),
-            Some((scatter, _)) => {
-                let q = expected_qs(&simulator, scatter, images).map_err(|source| {
-                    PipelineError::Scoring {
-                        set: Some(set),
-                        source,
-                    }
-                })?;
-                catalogues += q.catalogues;
-                spectra += q.spectra;
-            }
-        }
-    }
-    let count = (sets.len() - without.len()) as f64;
-    Ok((count > 0.0).then_some(Expected {
-        catalogues: catalogues / count,
-        spectra: spectra / count,
-        without,
-    }))
 }
 
 /// Writes a challenge of the images in `data`, which another program made. New headers are written, because the old headers
@@ -288,7 +233,7 @@ pub fn of_images(
     folders: Folders<'_>,
     threads: usize,
     progress: &mut dyn Progress,
-) -> Result<Challenge, PipelineError> {
+) -> Result<Challenge, ChallengeError> {
     plan.check()?;
     let about = about(data)?;
     let earlier = folders.prepare(plan)?;
@@ -339,28 +284,26 @@ pub fn of_images(
 }
 
 impl Plan {
-    /// Checks what does not depend on the data.
-    fn check(&self) -> Result<(), PipelineError> {
-        let refuse = |message: String| Err(PipelineError::Request(message));
+    // Checks what does not depend on the data.
+    fn check(&self) -> Result<(), ChallengeError> {
         if let (Some(opens), Some(closes)) = (&self.opens, &self.closes)
             && closes.last < opens.first
         {
-            return refuse(format!(
-                "--closes: the last day is before the first one (found {closes}, expected {opens} or later)"
-            ));
+            let (opens, closes) = (opens.clone(), closes.clone());
+            return Err(ChallengeError::ClosesFirst { opens, closes });
         }
         match self.metric.unwrap_or(self.kind.metric) {
-            metric if self.spectra && !metric.is_of_spectra() => refuse(format!(
-                "--spectra: {} is not defined for power spectra. Try: --metric q or q-corrected",
-                metric.label()
-            )),
+            metric if self.spectra && !metric.is_of_spectra() => {
+                let metric = metric.label();
+                Err(ChallengeError::NotOfSpectra { metric })
+            }
             _ => Ok(()),
         }
     }
 }
 
-/// Scores that entries with the noise of a reference measurement can expect, and the mean Q of zero shear. The noise of the
-/// first image of each set is scaled to all images. A true shear of `foreign` images that these contradict is an error.
+// Scores that entries with the noise of a reference measurement can expect, and the mean Q of zero shear. The noise of the
+// first image of each set is scaled to all images. A true shear of `foreign` images that these contradict is an error.
 fn expected_scores(
     data: &Data,
     public: &DataFolder,
@@ -368,7 +311,7 @@ fn expected_scores(
     metric: RankBy,
     foreign: bool,
     threads: usize,
-) -> Result<(Vec<SetRecord>, f64), PipelineError> {
+) -> Result<(Vec<SetRecord>, f64), ChallengeError> {
     let grid = data.grid().map_err(unscored)?;
     let first = data.sets.iter().map(|&set| ImageId { set, image: 1 });
     let first: Vec<ImageId> = first.collect();
@@ -385,9 +328,7 @@ fn expected_scores(
             })
             .collect();
         if let Some(message) = contradiction(&firsts) {
-            return Err(PipelineError::Request(format!(
-                "{message}. Try: the same command with the right true shear"
-            )));
+            return Err(ChallengeError::Contradiction(message));
         }
     }
     let images = f64::from(data.images);
@@ -428,7 +369,7 @@ fn expected_scores(
     Ok((scored, zero))
 }
 
-/// The metric of a challenge, if entries can be ranked by it.
+// The metric of a challenge, if entries can be ranked by it.
 fn rankable(
     plan: &Plan,
     data: &Data,
@@ -437,8 +378,7 @@ fn rankable(
     foreign: bool,
     threads: usize,
     progress: &mut dyn Progress,
-) -> Result<RankBy, PipelineError> {
-    let refuse = |message: String| Err(PipelineError::Request(message));
+) -> Result<RankBy, ChallengeError> {
     let grid = data.grid().map_err(unscored)?;
     let truths = data.sets.iter().map(|&set| {
         let truth = private.read_truth(set, &grid)?;
@@ -446,26 +386,23 @@ fn rankable(
     });
     let truths: Vec<(u32, TrueShear)> = truths.collect::<Result<_, PipelineError>>()?;
     let constant = ConstantShears::of(truths.iter().map(|(set, truth)| (*set, truth)))
-        .map_err(PipelineError::Request)?;
+        .map_err(ChallengeError::Shears)?;
     let metric = plan.metric.unwrap_or(match &constant {
         Some(_) => plan.kind.constant_metric,
         None => plan.kind.metric,
     });
+    let label = metric.label();
     if !metric.suits(constant.is_some()) {
-        let (kind, better) = match &constant {
-            Some(_) => ("is the same for all galaxies of a set", "qc, m or c"),
-            None => ("varies within the sets", "q-calibrated, m or c"),
-        };
-        return refuse(format!(
-            "the true shear {kind}, so {} is not defined. Try: --metric {better}",
-            metric.label()
-        ));
+        return Err(ChallengeError::Undefined {
+            metric: label,
+            constant: constant.is_some(),
+        });
     }
     if plan.spectra && data.sets.len() < 2 {
-        return refuse("--spectra: the response of power spectra follows from differences between sets (found 1 set, expected at least 2)".into());
+        return Err(ChallengeError::OneSpectrum);
     }
     if metric == RankBy::Noise && data.images < 2 {
-        return refuse("noise is measured between images (found 1 image per set, expected at least 2). Try: --images 8".into());
+        return Err(ChallengeError::OneImage);
     }
     progress.note("measuring the first images");
     let (scored, zero) = expected_scores(data, public, truths, metric, foreign, threads)?;
@@ -483,30 +420,31 @@ fn rankable(
                 [one] => format!("the response of set {}", one.set),
                 _ => "the response".into(),
             };
-            let more = (images * (error * EXPECTED_RESPONSE).powi(2)).ceil();
-            return refuse(format!(
-                "the data are too small to rank entries by {}: {of} is expected to be {:.1}σ from zero (expected at least {EXPECTED_RESPONSE}). Try: {more} images per set, or more galaxies per image",
-                metric.label(),
-                1.0 / error
-            ));
+            return Err(ChallengeError::SmallResponse {
+                metric: label,
+                of,
+                found: 1.0 / error,
+                images: (images * (error * EXPECTED_RESPONSE).powi(2)).ceil(),
+            });
         }
     }
     if matches!(metric, RankBy::Q | RankBy::QCorrected) {
-        let (q, _) = metric.of(&scored, None);
-        if q < TEMPLATE_GAIN * zero {
-            let more = (images * TEMPLATE_GAIN * zero / q).ceil();
-            return refuse(format!(
-                "the data are too small to rank entries by {}: a spectrum without images reaches {:.0}, a catalogue with the noise of these images about {q:.0}. Try: --metric q-calibrated, or {more} images per set",
-                metric.label(),
-                TEMPLATE_GAIN * zero
-            ));
+        let (catalogue, _) = metric.of(&scored, None);
+        let template = TEMPLATE_GAIN * zero;
+        if catalogue < template {
+            return Err(ChallengeError::BehindTemplate {
+                metric: label,
+                template,
+                catalogue,
+                images: (images * template / catalogue).ceil(),
+            });
         }
     }
     Ok(metric)
 }
 
-/// Sets, images and grid of a data folder, which must be the same for all sets.
-fn about(data: &DataFolder) -> Result<Data, PipelineError> {
+// Sets, images and grid of a data folder, which must be the same for all sets.
+fn about(data: &DataFolder) -> Result<Data, ChallengeError> {
     let ids = images::of_folder(data, &[])?;
     let mut about: Option<Data> = None;
     for of_set in ids.chunk_by(|a, b| a.set == b.set) {
@@ -538,7 +476,7 @@ fn about(data: &DataFolder) -> Result<Data, PipelineError> {
     about.ok_or_else(|| FileError::new(data.root(), "there are no galaxy images here").into())
 }
 
-/// Copies pixels and PSFs of an image under new headers.
+// Copies pixels and PSFs of an image under new headers.
 fn copy_image(
     data: &DataFolder,
     public: &DataFolder,
@@ -590,7 +528,7 @@ fn copy_pixels(
     writer.finish()
 }
 
-/// Writes description, layout and page for participants, and seals the public folder.
+// Writes description, layout and page for participants, and seals the public folder.
 fn finish(
     plan: &Plan,
     metric: RankBy,
@@ -598,7 +536,7 @@ fn finish(
     folders: Folders<'_>,
     mut key: Key,
     threads: usize,
-) -> Result<Challenge, PipelineError> {
+) -> Result<Challenge, ChallengeError> {
     let Plan {
         name,
         version,
@@ -655,7 +593,7 @@ fn finish(
     Ok(challenge)
 }
 
-/// The layout of the images, without names of truth files.
+// The layout of the images, without names of truth files.
 fn layout_text(kind: &Kind, data: &Data) -> String {
     let layout = (kind.layout)();
     format!(

@@ -80,7 +80,6 @@ impl<'de> Deserialize<'de> for Deadline {
     }
 }
 
-/// The current time in whole seconds.
 pub fn now() -> Timestamp {
     let now = Timestamp::now();
     Timestamp::from_second(now.as_second()).unwrap_or(now)

@@ -9,15 +9,15 @@ use shearq_results::submit::manifest::{Entry, FileSum, MANIFEST_FILE, Manifest};
 
 use crate::seal::sha256;
 
-/// Folders below a given folder that are searched.
+// Folders below a given folder that are searched.
 const DEPTH: usize = 3;
-/// Endings of archives that cannot be read.
+// Endings of archives that cannot be read.
 const OTHER_ARCHIVES: [&str; 7] = ["zip", "tar", "gz", "bz2", "xz", "zst", "7z"];
 
-/// Digits of a file's checksum that a store keeps. Two of a million files agree by chance once in 10⁷ challenges.
+// Digits of a file's checksum that a store keeps. Two of a million files agree by chance once in 10⁷ challenges.
 const FILE_DIGITS: usize = 16;
 
-/// How the names of files that are neither catalogues nor spectra start in the list of an entry's content.
+// How the names of files that are neither catalogues nor spectra start in the list of an entry's content.
 const OTHER_FILE: &str = "other ";
 
 /// An entry as it was found.
@@ -31,9 +31,6 @@ pub struct Sending {
 
 /// Finds archives and folders of catalogues or spectra below `paths`, in order of their names. In an inbox, the folder of
 /// an archive is the name of its team.
-///
-/// # Errors
-/// If a path does not exist or a folder cannot be listed.
 pub fn find(paths: &[PathBuf]) -> Result<Vec<Sending>, FileError> {
     let mut found = Vec::new();
     for path in paths {
@@ -134,9 +131,6 @@ pub fn refuse_links(entry: &Path) -> Result<(), FileError> {
 }
 
 /// SHA-256 of an archive, or of the list of a folder's files.
-///
-/// # Errors
-/// If it cannot be read, or contains a link.
 pub fn identify(path: &Path) -> Result<String, FileError> {
     refuse_links(path)?;
     Ok(match path.is_dir() {
@@ -145,7 +139,6 @@ pub fn identify(path: &Path) -> Result<String, FileError> {
     })
 }
 
-/// Names and checksums of the files of a folder.
 fn sums(folder: &Path) -> Result<Vec<(String, FileSum)>, FileError> {
     let mut paths: Vec<PathBuf> = std::fs::read_dir(folder)
         .and_then(|entries| entries.map(|entry| Ok(entry?.path())).collect())
@@ -168,7 +161,6 @@ fn list_of(sums: &[(String, FileSum)]) -> Vec<u8> {
     lines.collect::<String>().into_bytes()
 }
 
-/// Content of an entry.
 #[derive(Debug, Clone)]
 pub struct Content {
     /// SHA-256 of sets, images and checksums of all files but the manifest. It depends neither on the name of the method nor on the

@@ -12,6 +12,7 @@ use shearq_dataset::run::Source;
 use shearq_dataset::run::kind_of;
 use shearq_files::{FileError, names_of};
 use shearq_pipeline::{PipelineError, Progress, engine};
+use shearq_render::escape::line;
 use shearq_results::record::{RunRecord, SetRecord, definition_word};
 use shearq_results::store;
 use shearq_results::submit::challenge::read_bandpowers;
@@ -27,13 +28,40 @@ use shearq_submissions::check_name;
 use crate::constant::ConstantShears;
 use crate::copies::sketch;
 use crate::deadline::now;
-use crate::entry::{Entry, EntryInfo};
 use crate::inbox::{Content, Sending, content, identify};
 use crate::kind::response;
 use crate::receipt::Receipt;
 use crate::seal::{Key, verify, verify_public};
 use crate::shapes::References;
 use crate::terms::Challenge;
+
+/// What identifies a scored entry. The store keeps it with its scores, so the names are part of the format.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct EntryInfo {
+    pub challenge: String,
+    pub team: String,
+    pub method: String,
+    /// One line about the entry; may be empty.
+    pub title: String,
+    /// Address for questions; may be empty. The leaderboard does not show it.
+    pub contact: String,
+    /// Time of arrival: of the receipt, or of the first `rank` that scored the entry.
+    pub received: Timestamp,
+    /// Whether a receipt states the time.
+    pub receipt: bool,
+    pub file: String,
+    /// SHA-256 of the archive.
+    pub sha256: String,
+    /// SHA-256 of sets, images and files.
+    pub content: String,
+    /// First digits of the checksum of each file.
+    pub files: Vec<String>,
+    /// Some mean shapes of each set of catalogues ([`sketch`]).
+    pub shapes: BTreeMap<String, Vec<i32>>,
+    pub contents: Contents,
+    /// Whether it is a reference of the organiser, without a rank.
+    pub reference: bool,
+}
 
 impl EntryInfo {
     /// The first digits of the SHA-256, which name the entry.
@@ -42,10 +70,18 @@ impl EntryInfo {
     }
 }
 
-/// How the settings column of an entry starts, in contrast to those of runs.
+/// A scored entry of the store.
+#[derive(Debug, Clone)]
+pub struct Entry {
+    pub info: EntryInfo,
+    pub sets: Vec<SetRecord>,
+    /// Why the organiser withdrew it.
+    pub withdrawn: Option<String>,
+}
+
+// How the settings column of an entry starts, in contrast to those of runs.
 const STORED: &str = "[entry]\n";
 
-/// The settings column of an entry in a store.
 #[derive(Serialize, Deserialize)]
 struct Stored {
     entry: EntryInfo,
@@ -54,28 +90,20 @@ struct Stored {
 /// An entry that was not scored.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Refused {
-    /// The file.
     pub path: PathBuf,
-    /// Its team, if known.
     pub team: String,
-    /// Reason, with what was found and expected.
     pub reason: String,
 }
 
-/// Result of a round of judging.
 #[derive(Debug, Default)]
 pub struct Round {
-    /// Entries scored now.
     pub scored: usize,
-    /// Entries that were in the store already.
     pub known: usize,
-    /// Entries that were not scored.
     pub refused: Vec<Refused>,
     /// Scored entries with a probable fault, and the fault.
     pub doubtful: Vec<(PathBuf, String)>,
 }
 
-/// The true shear of a set.
 struct Truth {
     shear: TrueShear,
     scorer: SetScorer,
@@ -83,11 +111,8 @@ struct Truth {
     kind: Option<SetKind>,
 }
 
-/// Scores entries of one challenge.
 pub struct Judge {
-    /// The description of the challenge.
     pub challenge: Challenge,
-    /// Private record.
     pub key: Key,
     id: String,
     public: PathBuf,
@@ -103,7 +128,6 @@ impl std::fmt::Debug for Judge {
     }
 }
 
-/// An entry before it is scored.
 struct Candidate {
     sending: Sending,
     reference: bool,
@@ -111,7 +135,6 @@ struct Candidate {
     content: Content,
 }
 
-/// When an entry arrived.
 struct Arrival {
     sha256: String,
     received: Timestamp,
@@ -120,9 +143,6 @@ struct Arrival {
 
 impl Judge {
     /// Opens the public and the private folder of a challenge.
-    ///
-    /// # Errors
-    /// If they do not belong together, the truth was changed or cannot be read.
     pub fn open(public: &Path, private: &Path, threads: usize) -> Result<Self, PipelineError> {
         let challenge = Challenge::read(public)?;
         let (key, id) = verify(public, private, &challenge, threads)?;
@@ -280,7 +300,7 @@ impl Judge {
         Ok(round)
     }
 
-    /// When an entry arrived, without a receipt `now`.
+    // When an entry arrived, without a receipt `now`.
     fn arrival(&self, sending: &Sending, now: Timestamp) -> Result<Arrival, FileError> {
         let sha256 = identify(&sending.path)?;
         let receipt = Receipt::read(&self.key, &sending.path, &sha256)?;
@@ -323,7 +343,7 @@ impl Judge {
         }
     }
 
-    /// The entries that must be scored. Known entries are counted; unreadable entries and repeated archives are refused.
+    // The entries that must be scored. Known entries are counted; unreadable entries and repeated archives are refused.
     fn candidates(
         &self,
         sendings: &[(Sending, bool)],
@@ -422,7 +442,6 @@ impl Judge {
         Ok(candidates)
     }
 
-    /// Checks and scores one entry.
     fn judge(
         &self,
         candidate: Candidate,
@@ -440,16 +459,14 @@ impl Judge {
             team: team.clone(),
             reason,
         };
-        let scored = self
-            .score(&sending, content.entry.as_ref(), references)
-            .map_err(refuse)?;
-        let (title, contact) = content
-            .entry
-            .map_or_else(Default::default, |e| (e.title, e.contact));
-        let info = EntryInfo {
+        let stated = content.entry.as_ref();
+        let (title, contact) = stated.map_or_else(Default::default, |entry| {
+            (entry.title.clone(), entry.contact.clone())
+        });
+        let mut info = EntryInfo {
             challenge: self.challenge.name.clone(),
             team: team.clone(),
-            method: scored.method,
+            method: String::new(),
             title,
             contact,
             received: arrival.received,
@@ -458,10 +475,13 @@ impl Judge {
             sha256: arrival.sha256,
             content: content.sha256,
             files: content.files,
-            shapes: scored.shapes,
-            contents: scored.contents,
+            shapes: BTreeMap::new(),
+            contents: Contents::Catalogues,
             reference,
         };
+        let (sets, doubt) = self
+            .score(&sending, stated, references, &mut info)
+            .map_err(refuse)?;
         for name in [&info.team, &info.method] {
             check_name(name).map_err(|error| refuse(error.to_string()))?;
         }
@@ -476,19 +496,19 @@ impl Judge {
             definition: definition_word(self.challenge.rules.metric.definition()).into(),
             choice: Convention::STANDARD.number().to_string(),
             noise: "measured".into(),
-            sets: scored.sets,
+            sets,
         };
-        let doubt = scored.doubt.map(|doubt| (sending.path.clone(), doubt));
+        let doubt = doubt.map(|doubt| (sending.path.clone(), doubt));
         Ok((run, doubt))
     }
 
-    /// Scores the files of an entry, or gives the reason why not.
     fn score(
         &self,
         sending: &Sending,
         entry: Option<&Team>,
         references: &References,
-    ) -> Result<Scored, String> {
+        info: &mut EntryInfo,
+    ) -> Result<Scores, String> {
         let rules = &self.challenge.rules;
         if let Some(entry) = entry
             && entry.challenge != self.challenge.name
@@ -501,10 +521,9 @@ impl Judge {
         let plain = |error: FileError| reason_of(&error.path, &error.message, sending);
         let sent = Sent::open(&sending.path).map_err(plain)?;
         let submission = Submission::read(&sent).map_err(plain)?;
-        let contents = rules.accept(&submission)?;
-        let mut shapes = BTreeMap::new();
+        info.contents = rules.accept(&submission)?;
         let (mut sets, doubt) = match &submission.packed {
-            Packed::Catalogues(_) => self.catalogues(&sent, sending, references, &mut shapes)?,
+            Packed::Catalogues(_) => self.catalogues(&sent, sending, references, info)?,
             Packed::Spectra(files) => {
                 self.check(&sent, sending, references, &mut |_| {})?;
                 let manifest = submission.manifest.as_ref();
@@ -519,7 +538,7 @@ impl Judge {
             }
         };
         sets.sort_by_key(|set| set.set);
-        if contents == Contents::Catalogues {
+        if info.contents == Contents::Catalogues {
             let constant = self.constant.as_ref();
             // Without numbers, because they contain the correlation with the truth.
             let (value, error) = response(&sets, constant);
@@ -533,16 +552,11 @@ impl Judge {
                 ));
             }
         }
-        Ok(Scored {
-            method: submission.method,
-            contents,
-            sets,
-            doubt,
-            shapes,
-        })
+        info.method = submission.method;
+        Ok((sets, doubt))
     }
 
-    /// Checks the files of an entry. `done` gets each set of catalogues.
+    // Checks the files of an entry. `done` gets each set of catalogues.
     fn check(
         &self,
         sent: &Sent,
@@ -567,14 +581,14 @@ impl Judge {
         })
     }
 
-    /// Checks and scores the catalogues of an entry; also names images that do not follow the shear as the others do.
+    // Checks and scores the catalogues of an entry; also names images that do not follow the shear as the others do.
     fn catalogues(
         &self,
         sent: &Sent,
         sending: &Sending,
         references: &References,
-        shapes: &mut BTreeMap<String, Vec<i32>>,
-    ) -> Result<(Vec<SetRecord>, Option<String>), String> {
+        info: &mut EntryInfo,
+    ) -> Result<Scores, String> {
         let mut sets = Vec::new();
         let mut failed = None;
         let mut odd: Vec<String> = Vec::new();
@@ -587,7 +601,8 @@ impl Judge {
             );
             match self.score_set(&set) {
                 Ok(record) => {
-                    shapes.insert(of_set.to_string(), sketch(set.images.total()));
+                    info.shapes
+                        .insert(of_set.to_string(), sketch(set.images.total()));
                     sets.extend(record);
                 }
                 Err(reason) => failed = failed.take().or(Some(reason)),
@@ -603,7 +618,6 @@ impl Judge {
         failed.map_or(Ok((sets, doubt)), Err)
     }
 
-    /// Scores the power spectra of an entry.
     fn spectra(
         &self,
         files: &BTreeMap<u32, PathBuf>,
@@ -632,7 +646,7 @@ impl Judge {
         Ok((sets, all))
     }
 
-    /// The record of a set of catalogues. `None` if the set does not belong to the challenge.
+    // The record of a set of catalogues. `None` if the set does not belong to the challenge.
     fn score_set(&self, checked: &CheckedSet<'_>) -> Result<Option<SetRecord>, String> {
         let CheckedSet {
             set,
@@ -671,28 +685,21 @@ impl Judge {
     }
 }
 
-/// The scores of an entry.
-struct Scored {
-    method: String,
-    contents: Contents,
-    sets: Vec<SetRecord>,
-    doubt: Option<String>,
-    shapes: BTreeMap<String, Vec<i32>>,
-}
+// The scores of each set of an entry, and what is doubtful about it.
+type Scores = (Vec<SetRecord>, Option<String>);
 
-/// Significance that the response to the shear needs, as for Q cal.
+// Significance that the response to the shear needs, as for Q cal.
 const CLEAR_RESPONSE: f64 = 3.0;
 
-/// Whether a response is clearly above zero. An unknown error counts as small.
+// Whether a response is clearly above zero. An unknown error counts as small.
 fn is_measurable(response: f64, error: f64) -> bool {
     response > 0.0 && (error.is_nan() || response > CLEAR_RESPONSE * error)
 }
 
-/// True and sent bandpowers of a set.
 type Powers = (Vec<f64>, Vec<f64>);
 
-/// Slope of sent bandpowers on true ones over sets, and its standard error from the residuals. Each bandpower is divided by
-/// its true mean over sets: what all sets have in common can be had from own simulations, without images.
+// Slope of sent bandpowers on true ones over sets, and its standard error from the residuals. Each bandpower is divided by
+// its true mean over sets: what all sets have in common can be had from own simulations, without images.
 fn slope_over_sets(sets: &[Powers]) -> (f64, f64) {
     let bins = sets.first().map_or(0, |(truth, _)| truth.len());
     let count = sets.len() as f64;
@@ -722,15 +729,17 @@ pub(crate) fn unscored(source: ScoringError) -> PipelineError {
     PipelineError::Scoring { set: None, source }
 }
 
-/// A message without the path of the entry, which a list of entries has already.
+// A message without the path of the entry, which a list of entries has already.
 fn reason_of(path: &Path, message: &str, sending: &Sending) -> String {
     match path.strip_prefix(&sending.path) {
-        Ok(name) if !name.as_os_str().is_empty() => format!("{}: {message}", one_line(name)),
+        Ok(name) if !name.as_os_str().is_empty() => {
+            format!("{}: {message}", line(&name.to_string_lossy()))
+        }
         _ => message.to_owned(),
     }
 }
 
-/// Team of an entry: its folder in the inbox, or as its receipt or its manifest (`entry`) states, or the name of the file.
+// Team of an entry: its folder in the inbox, or as its receipt or its manifest (`entry`) states, or the name of the file.
 fn team_of(sending: &Sending, entry: Option<&Team>, receipt: Option<&Receipt>) -> String {
     let folder = sending.team.clone();
     folder
@@ -740,31 +749,16 @@ fn team_of(sending: &Sending, entry: Option<&Team>, receipt: Option<&Receipt>) -
 }
 
 fn file_name(path: &Path) -> String {
-    one_line(Path::new(path.file_name().unwrap_or_default()))
+    line(&path.file_name().unwrap_or_default().to_string_lossy())
 }
 
-/// A path with escaped control characters. A line break in the name of a file could forge a message.
-pub fn one_line(path: &Path) -> String {
-    let name = path.to_string_lossy();
-    let mut line = String::with_capacity(name.len());
-    for c in name.chars() {
-        match c.is_control() {
-            true => line.extend(c.escape_default()),
-            false => line.push(c),
-        }
-    }
-    line
-}
-
-/// The name of a file without the ending of an archive.
 fn stem(path: &Path) -> String {
     let name = file_name(path);
     let endings = [".tar.gz", ".tgz"];
     let stem = endings.iter().find_map(|ending| name.strip_suffix(ending));
-    stem.map_or_else(|| name.clone(), str::to_owned)
+    stem.unwrap_or(&name).to_owned()
 }
 
-/// The first 100 bytes of a name.
 fn short(name: &str) -> String {
     let end = (0..=name.len().min(shearq_submissions::MAX_NAME))
         .rev()
@@ -775,12 +769,6 @@ fn short(name: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn names_of_files_forge_no_messages() {
-        let name = one_line(Path::new("in/Ä\nwarning: \u{1b}[31m.dat"));
-        assert_eq!(name, "in/Ä\\nwarning: \\u{1b}[31m.dat");
-    }
 
     #[test]
     fn spectra_of_own_simulations_have_no_response() {

@@ -30,7 +30,6 @@ pub enum RankBy {
 }
 
 impl RankBy {
-    /// Definition of bandpowers that entries are scored with.
     pub fn definition(self) -> Definition {
         match self {
             RankBy::QCorrected => Definition::Corrected,
@@ -38,7 +37,6 @@ impl RankBy {
         }
     }
 
-    /// Heading in tables.
     pub fn label(self) -> &'static str {
         match self {
             RankBy::Q => "Q",
@@ -51,7 +49,6 @@ impl RankBy {
         }
     }
 
-    /// Meaning in one sentence.
     pub fn meaning(self) -> &'static str {
         match self {
             RankBy::Q => {
@@ -76,7 +73,6 @@ impl RankBy {
         }
     }
 
-    /// Whether a larger value is better.
     pub fn larger_is_better(self) -> bool {
         matches!(
             self,
@@ -93,7 +89,6 @@ impl RankBy {
         }
     }
 
-    /// Whether a power spectrum has this metric.
     pub fn is_of_spectra(self) -> bool {
         matches!(self, RankBy::Q | RankBy::QCorrected)
     }
@@ -181,9 +176,7 @@ pub fn response(sets: &[SetRecord], constant: Option<&ConstantShears>) -> (f64, 
 pub struct Kind {
     /// Name on the command line and in `challenge.toml`.
     pub name: &'static str,
-    /// Full name.
     pub title: &'static str,
-    /// Metric that ranks the entries.
     pub metric: RankBy,
     /// Metric that ranks the entries if each set has one shear.
     pub constant_metric: RankBy,
@@ -191,9 +184,7 @@ pub struct Kind {
     pub contents: &'static [Contents],
     /// Most entries of a team; `None` for any number.
     pub entries_per_team: Option<u32>,
-    /// Names of the files.
     pub layout: fn() -> Layout,
-    /// Conventions, as names and descriptions.
     pub conventions: &'static [(&'static str, &'static str)],
     /// Rules for participants, one sentence each.
     pub rules: &'static [&'static str],
@@ -230,10 +221,8 @@ pub static GREAT10: Kind = Kind {
     ],
 };
 
-/// All kinds.
 pub static KINDS: [&Kind; 1] = [&GREAT10];
 
-/// The kind called `name`.
 pub fn kind(name: &str) -> Option<&'static Kind> {
     KINDS.into_iter().find(|kind| kind.name == name)
 }

@@ -16,7 +16,7 @@ mod contradiction;
 pub mod copies;
 pub mod create;
 pub mod deadline;
-pub mod entry;
+pub mod error;
 pub mod inbox;
 pub mod judge;
 pub mod kind;
@@ -29,7 +29,7 @@ pub mod seal;
 pub mod shapes;
 pub mod terms;
 
-/// The examples of README.md.
+// The examples of README.md.
 #[cfg(doctest)]
 #[doc = include_str!("../README.md")]
 struct Readme;

@@ -6,19 +6,17 @@ use std::path::Path;
 use serde::Deserialize;
 use shearq_files::{FileError, open};
 
-use crate::entry::Entry;
+use crate::judge::Entry;
 use crate::seal::{BOARD_FILE, Key};
 
-/// Fewest digits of an SHA-256 that name an entry.
+// Fewest digits of an SHA-256 that name an entry.
 const LEAST_DIGITS: usize = 8;
 
-/// Decisions of the organiser.
 #[derive(Debug, Clone, Default, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Decisions {
     /// Whether teams without an alias have drawn names, and methods, titles and refused entries are not published.
     pub anonymous: bool,
-    /// Names that the board shows, by team.
     pub aliases: BTreeMap<String, String>,
     /// Reasons, by the first digits of the SHA-256 of the archive, or `DIGITS/TEAM` if several teams sent it.
     pub withdrawn: BTreeMap<String, String>,
@@ -26,9 +24,6 @@ pub struct Decisions {
 
 impl Decisions {
     /// Reads the decisions in a private folder; without a file there are none.
-    ///
-    /// # Errors
-    /// If the file cannot be read.
     pub fn read(private: &Path) -> Result<Self, FileError> {
         let path = private.join(BOARD_FILE);
         if !open::is_there(&path) {

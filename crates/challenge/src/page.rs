@@ -6,42 +6,25 @@ use shearq_files::{FileError, atomic};
 use shearq_render::figure::{Figure, FigureError, LinePlot, Series, Style};
 use shearq_render::html::{Block, Picture, Report, Section};
 use shearq_render::page::PageError;
-use shearq_render::table::{Cell, Heading, Table, TableFormat};
+use shearq_render::table::{Cell, Table, TableFormat};
 use shearq_results::submit::manifest::Contents;
 use shearq_results::views::comparison::q_heat_map;
 
 use crate::constant::ConstantShears;
 use crate::copies::NearCopy;
-use crate::entry::EntryInfo;
-use crate::judge::Refused;
+use crate::judge::{EntryInfo, Refused};
 use crate::kind::RankBy;
 use crate::ranking::{Board, Leaderboard, Standing, better, rounded};
 use crate::readme;
-use crate::seal::Expected;
 use crate::terms::Challenge;
 
-/// Most teams in the plot of entries; the palette has eight colours, and the expected Q needs two.
+// The palette has eight colours.
 const PLOTTED: usize = 6;
-/// Colours of the expected Q of catalogues and spectra.
-const EXPECTED_COLOURS: [usize; 2] = [6, 7];
 
-/// How much of the scores is published.
-#[derive(Debug, Clone, Copy)]
-pub struct Disclosure {
-    /// Decimals of the metric.
-    pub digits: usize,
-    /// Whether the metric of each set is shown.
-    pub detail: bool,
-}
-
-/// What a leaderboard shows.
 #[derive(Debug, Clone, Copy)]
 pub struct View<'a> {
-    /// The description of the challenge.
     pub challenge: &'a Challenge,
-    /// The ranked teams.
     pub board: &'a Leaderboard<'a>,
-    /// Entries that were not scored.
     pub refused: &'a [Refused],
     /// Mean Q of an entry of zeros; `None` for constant shears.
     pub zero_shear: Option<f64>,
@@ -49,16 +32,16 @@ pub struct View<'a> {
     pub constant: Option<&'a ConstantShears>,
     /// Entries that are nearly those of others.
     pub copies: &'a [NearCopy<'a>],
-    /// Q that a perfect method can expect, if known.
-    pub expected: Option<&'a Expected>,
-    /// How much is published.
-    pub disclosure: Disclosure,
+    /// Decimals of the metric. More of them reveal more of the true shear.
+    pub digits: usize,
+    /// Whether the metric of each set is shown.
+    pub detail: bool,
 }
 
-/// Name of the line of an entry without images. Teams may have this name, too, but they have a rank.
+// Name of the line of an entry without images. Teams may have this name, too, but they have a rank.
 const ZERO_SHEAR: &str = "zero shear";
 
-/// Names of the columns of a metric and its error.
+// Names of the columns of a metric and its error.
 fn key(metric: RankBy) -> (&'static str, &'static str) {
     match metric {
         RankBy::Q => ("q", "q_error"),
@@ -71,7 +54,24 @@ fn key(metric: RankBy) -> (&'static str, &'static str) {
     }
 }
 
-/// Kind of the files of an entry, in one word.
+// A line of a leaderboard.
+enum Line<'a> {
+    Standing(&'a Standing<'a>),
+    /// An entry of zeros, with its metric.
+    Zero(f64),
+}
+
+impl Line<'_> {
+    // The cell of a standing; an entry of zeros has the words `zero`.
+    fn cell(&self, zero: &str, cell: impl Fn(&Standing<'_>) -> Cell) -> Cell {
+        match self {
+            Line::Standing(standing) => cell(standing),
+            Line::Zero(_) if zero.is_empty() => Cell::Empty,
+            Line::Zero(_) => Cell::text(zero),
+        }
+    }
+}
+
 fn files(contents: Contents) -> &'static str {
     match contents {
         Contents::Catalogues => "catalogues",
@@ -79,7 +79,7 @@ fn files(contents: Contents) -> &'static str {
     }
 }
 
-/// The next larger number with so many decimals, so that no error becomes zero.
+// The next larger number with so many decimals, so that no error becomes zero.
 fn rounded_up(error: f64, digits: usize) -> f64 {
     let least = 0.5 * 10f64.powi(-(digits as i32));
     match error > 0.0 {
@@ -88,9 +88,9 @@ fn rounded_up(error: f64, digits: usize) -> f64 {
     }
 }
 
-/// A number with the decimals that its error determines, at most `most`, and their number. More decimals would tell how an
-/// entry with one known mode follows the true shear: over 10 such modes, the correlation of |m| with the truth was
-/// 0.9999998. `None` without an error.
+// A number with the decimals that its error determines, at most `most`, and their number. More decimals would tell how an
+// entry with one known mode follows the true shear: over 10 such modes, the correlation of |m| with the truth was
+// 0.9999998. `None` without an error.
 fn rounded_to_error(value: f64, error: f64, most: usize) -> Option<(f64, usize)> {
     let error = Some(error.abs()).filter(|error| error.is_normal())?;
     // Printing rounds 0.096 to 1e-1, so that it has one decimal.
@@ -100,12 +100,10 @@ fn rounded_to_error(value: f64, error: f64, most: usize) -> Option<(f64, usize)>
     Some((rounded(value / step, digits) * step, digits))
 }
 
-/// Time of arrival of an entry, in UTC.
 fn received(info: &EntryInfo) -> String {
     info.received.strftime("%Y-%m-%d %H:%M").to_string()
 }
 
-/// Title of an entry, with a mark for references.
 fn title(info: &EntryInfo) -> String {
     match (info.reference, info.title.is_empty()) {
         (true, true) => "reference".into(),
@@ -114,7 +112,7 @@ fn title(info: &EntryInfo) -> String {
     }
 }
 
-/// Shift of a team's points. First entries of equal quality would hide each other.
+// Shift of a team's points. First entries of equal quality would hide each other.
 fn aside(team: usize, teams: usize) -> f64 {
     0.6 * ((team as f64 + 0.5) / teams as f64 - 0.5)
 }
@@ -129,132 +127,119 @@ impl View<'_> {
         self.table_of(&[Board::Main, Board::Late, Board::Partial])
     }
 
-    /// The standings of some boards.
     fn table_of(&self, boards: &[Board]) -> Table {
-        let (metric, digits) = (self.metric(), self.disclosure.digits);
-        let all = self.challenge.data.sets.len();
-        let others: Vec<RankBy> = [RankBy::QCalibrated, RankBy::M, RankBy::C]
-            .into_iter()
-            .filter(|other| *other != metric && other.suits(self.constant.is_some()))
-            .collect();
-        let filled = |board: &Board| self.board.of(*board).next().is_some();
-        let named = boards
-            .iter()
-            .any(|board| *board != Board::Main && filled(board));
-        let row = |standing: &Standing<'_>| {
-            let info = standing.best.info();
-            let rank = standing
-                .rank
-                .map_or(Cell::Empty, |rank| Cell::number(rank as f64, 0));
-            let (value, error) = (standing.best.value, standing.best.error);
-            let mut row = vec![
-                rank,
-                Cell::text(&info.team),
-                Cell::text(&info.method),
-                Cell::text(title(info)),
-                Cell::text(files(info.contents)),
-                // One cell would give the error two digits, and the value as many decimals.
-                Cell::number(rounded(value, digits), digits),
-                Cell::number(rounded_up(error, digits), digits),
-            ];
-            row.extend(others.iter().map(|other| {
-                // No more decimals than the organiser's, where he chose fewer than the metric's.
-                let fewer = metric.decimals().saturating_sub(digits);
-                let digits = other.decimals().saturating_sub(fewer);
-                let (value, error) = other.of(&standing.best.entry.sets, self.constant);
-                match rounded_to_error(value, error, digits) {
-                    Some((value, digits)) => Cell::number(value, digits),
-                    None => Cell::Empty,
-                }
-            }));
-            row.extend([
-                Cell::text(received(info)),
-                Cell::number(standing.entries.len() as f64, 0),
-            ]);
-            if named {
-                row.push(Cell::text(match standing.board {
-                    Board::Main => "main".to_owned(),
-                    Board::Late => "late".to_owned(),
-                    Board::Partial => format!("{} of {all} sets", standing.best.entry.sets.len()),
-                }));
-            }
-            row
-        };
-        let mut notes = vec![metric.meaning().to_owned()];
-        notes.push("Each team is ranked by its best entry. Teams share a rank if their difference is below its error or not printed.".into());
-        notes.extend(self.zero_note());
-        notes.extend(self.expected_note());
-        let standings = || boards.iter().flat_map(|board| self.board.of(*board));
-        let mut rows: Vec<Vec<Cell>> = standings().map(row).collect();
+        let (metric, digits) = (self.metric(), self.digits);
+        let standings = boards.iter().flat_map(|board| self.board.of(*board));
+        let mut lines: Vec<Line<'_>> = standings.map(Line::Standing).collect();
         if boards.contains(&Board::Main) {
             let zero = metric.of_zero_shear(self.zero_shear.unwrap_or(f64::NAN));
-            let behind = |standing: &Standing<'_>| {
-                standing.board != Board::Main || better(metric, zero, standing.best.value)
+            let behind = |line: &Line<'_>| match line {
+                Line::Standing(standing) => {
+                    standing.board != Board::Main || better(metric, zero, standing.best.value)
+                }
+                Line::Zero(_) => true,
             };
-            let mut zeros = vec![Cell::Empty; 7 + others.len() + 2 + usize::from(named)];
-            zeros[1] = Cell::text(ZERO_SHEAR);
-            zeros[2] = Cell::text("no image");
-            zeros[3] = Cell::text("reference: an entry of zeros");
-            zeros[5] = Cell::number(rounded(zero, digits), digits);
-            rows.insert(standings().position(behind).unwrap_or(rows.len()), zeros);
+            let place = lines.iter().position(behind).unwrap_or(lines.len());
+            lines.insert(place, Line::Zero(zero));
         }
-        let mut headings = vec![
-            Heading::new("rank", "rank"),
-            Heading::new("team", "team"),
-            Heading::new("method", "method"),
-            Heading::new("title", "title"),
-            Heading::new("files", "files"),
-            Heading::new(key(metric).0, metric.label()),
-            Heading::new(key(metric).1, "± error"),
+        let mut table = Table::titled(format!("Leaderboard of {}", self.challenge.name));
+        table.column("rank", "rank", &lines, |line| {
+            let rank = |rank: usize| Cell::number(rank as f64, 0);
+            line.cell("", |standing| standing.rank.map_or(Cell::Empty, rank))
+        });
+        table.column("team", "team", &lines, |line| {
+            line.cell(ZERO_SHEAR, |standing| {
+                Cell::text(&standing.best.info().team)
+            })
+        });
+        table.column("method", "method", &lines, |line| {
+            line.cell("no image", |standing| {
+                Cell::text(&standing.best.info().method)
+            })
+        });
+        table.column("title", "title", &lines, |line| {
+            line.cell("reference: an entry of zeros", |standing| {
+                Cell::text(title(standing.best.info()))
+            })
+        });
+        table.column("files", "files", &lines, |line| {
+            line.cell("", |standing| {
+                Cell::text(files(standing.best.info().contents))
+            })
+        });
+        // One cell would give the error two digits, and the value as many decimals.
+        table.column(key(metric).0, metric.label(), &lines, |line| match line {
+            Line::Standing(standing) => Cell::number(rounded(standing.best.value, digits), digits),
+            Line::Zero(zero) => Cell::number(rounded(*zero, digits), digits),
+        });
+        table.column(key(metric).1, "± error", &lines, |line| {
+            line.cell("", |standing| {
+                Cell::number(rounded_up(standing.best.error, digits), digits)
+            })
+        });
+        let suits = |other: &RankBy| *other != metric && other.suits(self.constant.is_some());
+        let others = [RankBy::QCalibrated, RankBy::M, RankBy::C];
+        for other in others.into_iter().filter(suits) {
+            // No more decimals than the organiser's, where he chose fewer than the metric's.
+            let fewer = metric.decimals().saturating_sub(digits);
+            let most = other.decimals().saturating_sub(fewer);
+            table.column(key(other).0, other.label(), &lines, |line| {
+                line.cell("", |standing| {
+                    let (value, error) = other.of(&standing.best.entry.sets, self.constant);
+                    match rounded_to_error(value, error, most) {
+                        Some((value, digits)) => Cell::number(value, digits),
+                        None => Cell::Empty,
+                    }
+                })
+            });
+        }
+        table.column("received", "received (UTC)", &lines, |line| {
+            line.cell("", |standing| Cell::text(received(standing.best.info())))
+        });
+        table.column("entries", "entries", &lines, |line| {
+            line.cell("", |standing| {
+                Cell::number(standing.entries.len() as f64, 0)
+            })
+        });
+        let filled =
+            |board: &Board| *board != Board::Main && self.board.of(*board).next().is_some();
+        if boards.iter().any(filled) {
+            let all = self.challenge.data.sets.len();
+            table.column("board", "board", &lines, |line| {
+                line.cell("", |standing| {
+                    Cell::text(match standing.board {
+                        Board::Main => "main".to_owned(),
+                        Board::Late => "late".to_owned(),
+                        Board::Partial => {
+                            format!("{} of {all} sets", standing.best.entry.sets.len())
+                        }
+                    })
+                })
+            });
+        }
+        table.notes = vec![
+            metric.meaning().to_owned(),
+            "Each team is ranked by its best entry. Teams share a rank if their difference is below its error or not printed.".into(),
         ];
-        headings.extend(
-            others
-                .iter()
-                .map(|other| Heading::new(key(*other).0, other.label())),
-        );
-        headings.extend([
-            Heading::new("received", "received (UTC)"),
-            Heading::new("entries", "entries"),
-        ]);
-        if named {
-            headings.push(Heading::new("board", "board"));
-        }
-        Table {
-            title: format!("Leaderboard of {}", self.challenge.name),
-            headings,
-            rows,
-            notes,
-        }
+        table.notes.extend(self.zero_note());
+        table
     }
 
-    /// Entries that share files or shapes with an earlier one.
+    // Entries that share files or shapes with an earlier one.
     fn copies(&self) -> Table {
-        let row = |copy: &NearCopy<'_>| {
-            let name = |info: &EntryInfo| format!("{}: {}", info.team, info.method);
-            vec![
-                Cell::text(name(copy.entry)),
-                Cell::text(name(copy.earlier)),
-                Cell::text(copy.reason()),
-            ]
-        };
-        Table {
-            title: "Near copies".into(),
-            headings: vec![
-                Heading::new("entry", "entry"),
-                Heading::new("earlier", "earlier entry"),
-                Heading::new("reason", "reason"),
-            ],
-            rows: self.copies.iter().map(row).collect(),
-            notes: Vec::new(),
-        }
+        let name = |info: &EntryInfo| Cell::text(format!("{}: {}", info.team, info.method));
+        let mut table = Table::titled("Near copies");
+        table.column("entry", "entry", self.copies, |copy| name(copy.entry));
+        table.column("earlier", "earlier entry", self.copies, |copy| {
+            name(copy.earlier)
+        });
+        table.column("reason", "reason", self.copies, |copy| {
+            Cell::text(copy.reason())
+        });
+        table
     }
 
-    /// The expected Q, if the metric is Q.
-    fn expected_of_metric(&self) -> Option<&Expected> {
-        self.expected.filter(|_| self.metric() == RankBy::Q)
-    }
-
-    /// Q of zero shear on boards of other metrics, too: whoever reads Q elsewhere must see it.
+    // Q of zero shear on boards of other metrics, too: whoever reads Q elsewhere must see it.
     fn zero_note(&self) -> Option<String> {
         let q = Cell::with_error(rounded(self.zero_shear?, 1), Some(f64::NAN), 2)
             .digits()?
@@ -270,58 +255,26 @@ impl View<'_> {
         Some(format!("Zero shear has Q = {q} without images.{why}"))
     }
 
-    fn expected_note(&self) -> Option<String> {
-        let Expected {
-            catalogues,
-            spectra,
-            without,
-        } = self.expected_of_metric()?;
-        let cell = |value: f64| Cell::with_error(rounded(value, 0), Some(f64::NAN), 2).digits();
-        let (catalogues, spectra) = (cell(*catalogues)?.0, cell(*spectra)?.0);
-        let without = match without.as_slice() {
-            [] => String::new(),
-            sets => {
-                let sets: Vec<String> = sets.iter().map(u32::to_string).collect();
-                format!(" Sets {} are left out.", sets.join(", "))
-            }
-        };
-        Some(format!(
-            "Expected Q of a perfect method with the smallest possible noise: {catalogues} for catalogues, {spectra} for power spectra without noise power.{without}"
-        ))
-    }
-
-    /// Entries that were not scored or do not count.
-    pub fn failures(&self) -> Table {
+    // Entries that were not scored or do not count.
+    fn failures(&self) -> Table {
         let refused = self.refused.iter().map(|refused| {
             let name = refused.path.file_name().unwrap_or_default();
-            vec![
-                Cell::text(name.to_string_lossy()),
-                Cell::text(&refused.team),
-                Cell::text(&refused.reason),
-            ]
+            let name = name.to_string_lossy().into_owned();
+            (name, refused.team.as_str(), refused.reason.as_str())
         });
-        let excluded = self.board.excluded.iter().map(|(info, reason)| {
-            vec![
-                Cell::text(&info.method),
-                Cell::text(&info.team),
-                Cell::text(reason),
-            ]
-        });
-        Table {
-            title: "Entries without a rank".into(),
-            headings: vec![
-                Heading::new("entry", "entry"),
-                Heading::new("team", "team"),
-                Heading::new("reason", "reason"),
-            ],
-            rows: refused.chain(excluded).collect(),
-            notes: Vec::new(),
-        }
+        let excluded = self.board.excluded.iter();
+        let excluded = excluded
+            .map(|(info, reason)| (info.method.clone(), info.team.as_str(), reason.as_str()));
+        let rows: Vec<(String, &str, &str)> = refused.chain(excluded).collect();
+        let mut table = Table::titled("Entries without a rank");
+        table.column("entry", "entry", &rows, |row| Cell::text(&row.0));
+        table.column("team", "team", &rows, |row| Cell::text(row.1));
+        table.column("reason", "reason", &rows, |row| Cell::text(row.2));
+        table
     }
 
-    /// The metric of each entry of the best teams.
     fn history(&self) -> LinePlot {
-        let digits = self.disclosure.digits;
+        let digits = self.digits;
         let metric = self.metric();
         let plotted: Vec<&Standing<'_>> = self
             .board
@@ -336,19 +289,6 @@ impl View<'_> {
             .max();
         let last = most.unwrap_or(1) as f64;
         let mut series = Vec::new();
-        if let Some(expected) = self.expected_of_metric() {
-            for (label, value, colour) in [
-                (
-                    "expected, catalogues",
-                    expected.catalogues,
-                    EXPECTED_COLOURS[0],
-                ),
-                ("expected, spectra", expected.spectra, EXPECTED_COLOURS[1]),
-            ] {
-                let (x, y) = (vec![0.5, last + 0.5], vec![rounded(value, 0); 2]);
-                series.push(Series::new(label, x, y, Style::Dashed, colour));
-            }
-        }
         for (colour, standing) in plotted.iter().enumerate() {
             let entries = &standing.entries;
             let aside = aside(colour, plotted.len());
@@ -374,11 +314,7 @@ impl View<'_> {
         }
     }
 
-    /// The page.
-    ///
-    /// # Errors
-    /// If a figure cannot be drawn.
-    pub fn report(&self) -> Result<Report, FigureError> {
+    fn report(&self) -> Result<Report, FigureError> {
         let mut blocks = vec![Block::Filtered(self.table_of(&[Board::Main]))];
         if !self.board.standings.is_empty() {
             let caption = format!(
@@ -389,8 +325,8 @@ impl View<'_> {
             blocks.push(Block::Figure(picture));
         }
         let mut sections = vec![Section::new("leaderboard", "Leaderboard", blocks)];
-        if self.disclosure.detail {
-            sections.push(self.detail()?);
+        if self.detail {
+            sections.push(self.every_set()?);
         }
         let of_board = |board, title: &str| Table {
             title: title.into(),
@@ -418,36 +354,32 @@ impl View<'_> {
             rules,
             ..
         } = self.challenge;
-        let mut settings = vec![
-            ("Version of the data".to_owned(), version.to_string()),
-            ("Kind".to_owned(), kind.title.to_owned()),
-            (
-                "Data".to_owned(),
-                format!(
-                    "{} sets of {} images with {2} × {2} galaxies",
-                    data.sets.len(),
-                    data.images,
-                    data.grid
-                ),
-            ),
-            ("Metric".to_owned(), rules.metric.label().to_owned()),
-            ("Decimals".to_owned(), self.disclosure.digits.to_string()),
+        let about_data = format!(
+            "{} sets of {} images with {2} × {2} galaxies",
+            data.sets.len(),
+            data.images,
+            data.grid
+        );
+        let settings = [
+            ("Version of the data", version.to_string()),
+            ("Kind", kind.title.to_owned()),
+            ("Data", about_data),
+            ("Metric", rules.metric.label().to_owned()),
+            ("Decimals", self.digits.to_string()),
+            ("Program", format!("shearq {}", shearq_dataset::VERSION)),
         ];
-        settings.push((
-            "Program".to_owned(),
-            format!("shearq {}", shearq_dataset::VERSION),
-        ));
         Ok(Report {
             title: name.clone(),
             subtitle: format!("{}: leaderboard", kind.title),
             sections,
-            settings,
+            settings: settings
+                .map(|(name, value)| (name.to_owned(), value))
+                .into(),
             ..Report::default()
         })
     }
 
-    /// Q of each set.
-    fn detail(&self) -> Result<Section, FigureError> {
+    fn every_set(&self) -> Result<Section, FigureError> {
         let rows: Vec<_> = self
             .board
             .standings
@@ -460,7 +392,7 @@ impl View<'_> {
             .collect();
         let mut map = q_heat_map(&rows);
         map.row_label = "entry".into();
-        map.decimals = map.decimals.min(self.disclosure.digits);
+        map.decimals = map.decimals.min(self.digits);
         let caption =
             "Q of each set. Metrics of single sets reveal more of the true shear than their mean.";
         let picture = Picture::draw(&map as &dyn Figure, "q-per-set", caption)?;
@@ -472,9 +404,6 @@ impl View<'_> {
     }
 
     /// Writes the page to `path`, and the table as CSV and JSON with the same name.
-    ///
-    /// # Errors
-    /// If a figure cannot be drawn or a file cannot be written.
     pub fn save(&self, path: &Path) -> Result<(), PageError> {
         let table = self.table();
         self.report()?.save(path)?;

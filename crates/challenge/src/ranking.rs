@@ -6,25 +6,21 @@ use shearq_results::compare::difference;
 
 use crate::constant::ConstantShears;
 use crate::deadline::Deadline;
-use crate::entry::{Entry, EntryInfo};
+use crate::judge::{Entry, EntryInfo};
 use crate::kind::RankBy;
 use crate::terms::Challenge;
 
-/// An entry with its metric.
 #[derive(Debug, Clone)]
 pub struct Result<'a> {
-    /// The entry.
     pub entry: &'a Entry,
     /// Number of the entry of its team, from 1.
     pub number: usize,
-    /// Mean metric over sets.
     pub value: f64,
     /// Its standard error; not a number if unknown.
     pub error: f64,
 }
 
 impl Result<'_> {
-    /// Team, method and time.
     pub fn info(&self) -> &EntryInfo {
         &self.entry.info
     }
@@ -33,17 +29,14 @@ impl Result<'_> {
 /// A team, or a reference of the organiser.
 #[derive(Debug, Clone)]
 pub struct Standing<'a> {
-    /// The table it belongs to.
     pub board: Board,
     /// Rank of a team, from 1. References and partial entries have none.
     pub rank: Option<usize>,
-    /// The best entry.
     pub best: Result<'a>,
     /// All entries that count, in order of arrival.
     pub entries: Vec<Result<'a>>,
 }
 
-/// A table of standings.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Board {
     /// Entries in time that cover all sets, and references.
@@ -54,7 +47,6 @@ pub enum Board {
     Partial,
 }
 
-/// The ranked teams.
 #[derive(Debug, Default)]
 pub struct Leaderboard<'a> {
     /// Teams and references, the best first, board by board.
@@ -64,7 +56,6 @@ pub struct Leaderboard<'a> {
 }
 
 impl<'a> Leaderboard<'a> {
-    /// Standings of one board.
     pub fn of(&self, board: Board) -> impl Iterator<Item = &Standing<'a>> {
         let own = move |standing: &&Standing<'a>| standing.board == board;
         self.standings.iter().filter(own)
@@ -183,7 +174,7 @@ pub fn rank<'a>(
     leaderboard
 }
 
-/// Ranks the standings of a board, which are in order of their values.
+// Ranks the standings of a board, which are in order of their values.
 fn number(standings: &mut [Standing<'_>], metric: RankBy, digits: usize) {
     let mut leader: Option<(usize, Result<'_>)> = None;
     let mut printed = None;
@@ -207,7 +198,6 @@ fn number(standings: &mut [Standing<'_>], metric: RankBy, digits: usize) {
     }
 }
 
-/// The nearest number with so many decimals.
 pub(crate) fn rounded(value: f64, digits: usize) -> f64 {
     // Printing rounds exactly; a product with a power of ten does not.
     format!("{value:.digits$}").parse().unwrap_or(value)
@@ -220,12 +210,12 @@ pub(crate) fn better(metric: RankBy, a: f64, b: f64) -> bool {
     }
 }
 
-/// Whether `other` is behind `best` by less than the error of the difference.
-///
-/// This error is the smallest of three. The jackknife of the paired difference over the same images is right if both entries
-/// respond to the images alike; for an entry with shapes in one of eight images, whose Q was
-/// 171.8 ± 20.7, it exceeded the lead of 154 over 17.9 ± 1.7. The quadratic sum of both errors neglects common noise, so it is an upper limit. In that sum, the error of
-/// `other` counts at most as much as that of `best`: otherwise an entry with much noise would share every rank.
+// Whether `other` is behind `best` by less than the error of the difference.
+//
+// This error is the smallest of three. The jackknife of the paired difference over the same images is right if both entries
+// respond to the images alike; for an entry with shapes in one of eight images, whose Q was
+// 171.8 ± 20.7, it exceeded the lead of 154 over 17.9 ± 1.7. The quadratic sum of both errors neglects common noise, so it is an upper limit. In that sum, the error of
+// `other` counts at most as much as that of `best`: otherwise an entry with much noise would share every rank.
 fn equal(metric: RankBy, best: &Result<'_>, other: &Result<'_>) -> bool {
     let gap = other.value - best.value;
     let apart = best.error.hypot(other.error.min(best.error));
@@ -292,7 +282,7 @@ pub(crate) mod tests {
         }
     }
 
-    /// A challenge of one set, with two entries per team until the last second of a day.
+    // A challenge of one set, with two entries per team until the last second of a day.
     fn challenge() -> Challenge {
         Challenge {
             name: "c".into(),
@@ -320,7 +310,7 @@ pub(crate) mod tests {
         }
     }
 
-    /// Board, rank and team of each standing.
+    // Board, rank and team of each standing.
     fn found(leaderboard: &Leaderboard<'_>) -> Vec<(Board, Option<usize>, String)> {
         let of = |s: &Standing<'_>| (s.board, s.rank, s.best.info().team.clone());
         leaderboard.standings.iter().map(of).collect()

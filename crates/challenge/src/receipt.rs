@@ -12,15 +12,11 @@ use shearq_files::{FileError, atomic, open};
 
 use crate::seal::Key;
 
-/// Arrival of an entry.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Receipt {
-    /// Name of the challenge.
     pub challenge: String,
-    /// Name of the team.
     pub team: String,
-    /// Time of arrival.
     pub received: Timestamp,
     /// SHA-256 of the archive, or of the list of a folder's files.
     pub sha256: String,
@@ -29,7 +25,6 @@ pub struct Receipt {
 }
 
 impl Receipt {
-    /// Signs the arrival of an entry.
     pub fn sign(key: &Key, team: &str, received: Timestamp, sha256: &str) -> Self {
         let mut receipt = Receipt {
             challenge: key.name.clone(),
@@ -56,7 +51,6 @@ impl Receipt {
         )
     }
 
-    /// The file of the receipt, beside the entry.
     pub fn path(entry: &Path) -> PathBuf {
         let mut name = entry.file_name().unwrap_or_default().to_owned();
         name.push(".receipt.toml");
@@ -64,9 +58,6 @@ impl Receipt {
     }
 
     /// Reads the receipt of an entry; `None` if there is none.
-    ///
-    /// # Errors
-    /// If it cannot be read, belongs to other content, or was not signed with this key.
     pub fn read(key: &Key, entry: &Path, sha256: &str) -> Result<Option<Self>, FileError> {
         let path = Receipt::path(entry);
         refuse_link(&path)?;
@@ -92,9 +83,6 @@ impl Receipt {
     }
 
     /// Writes the receipt beside the entry and returns its path.
-    ///
-    /// # Errors
-    /// If it cannot be written.
     pub fn write(&self, entry: &Path) -> Result<PathBuf, FileError> {
         let path = Receipt::path(entry);
         refuse_link(&path)?;
@@ -105,7 +93,7 @@ impl Receipt {
     }
 }
 
-/// A link in an inbox may name any file of the organiser's system.
+// A link in an inbox may name any file of the organiser's system.
 fn refuse_link(path: &Path) -> Result<(), FileError> {
     match path.is_symlink() {
         true => Err(FileError::new(path, "this is a link; expected a file")),
@@ -164,10 +152,8 @@ mod tests {
     #[test]
     fn signatures_are_hmac_sha256() {
         // RFC 4231 has no text with NUL bytes; the value is Python's hmac.new(b"k", b"shearq\0p\0a\0", "sha256").
-        let key = Key {
-            secret: "k".into(),
-            ..Key::new("pilot", 1, None)
-        };
+        let mut key = Key::new("pilot", 1, None);
+        key.secret = "k".into();
         let expected = "d991599aeae2e087af36c4ebc918d97b5352b998917f29a2ecba5cbabb577abd";
         assert_eq!(key.sign("p", &["a"]), expected);
     }

@@ -8,6 +8,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use hmac::{Hmac, KeyInit, Mac};
+use serde::de::IgnoredAny;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use shearq_dataset::fingerprint::hex;
@@ -21,19 +22,15 @@ use crate::terms::{CHALLENGE_FILE, Challenge};
 pub const SUMS_FILE: &str = "SHA256SUMS";
 /// The organiser's decisions in the private folder. They may change, so the seal does not cover them.
 pub const BOARD_FILE: &str = "board.toml";
-/// The private record.
 pub const KEY_FILE: &str = "key.toml";
 
 /// SHA-256 of files by their names below a folder, with `/` between folders.
 pub type Sums = BTreeMap<String, String>;
 
-/// The private record of a challenge.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Key {
-    /// Name of the challenge.
     pub name: String,
-    /// Version of the challenge.
     pub version: u32,
     /// Seed as text, because TOML has no 64-bit unsigned numbers; absent for images of another simulator.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -43,29 +40,15 @@ pub struct Key {
     /// SHA-256 of [`SUMS_FILE`] in the public folder; absent until that folder is complete.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub public: Option<String>,
-    /// Q that a perfect method can expect, if it is known.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub expected: Option<Expected>,
+    // Keys of version 0.2 and earlier have it, and it is not used any more.
+    #[serde(default, skip_serializing)]
+    expected: IgnoredAny,
     /// Checksums of the other private files.
     #[serde(default)]
     pub files: Sums,
 }
 
-/// Mean Q over sets of a perfect method with the smallest possible noise.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Expected {
-    /// Of catalogues, whose noise adds to the power.
-    pub catalogues: f64,
-    /// Of power spectra without the mean power of the noise.
-    pub spectra: f64,
-    /// Sets that are left out, because the smallest possible noise is unknown.
-    #[serde(default)]
-    pub without: Vec<u32>,
-}
-
 impl Key {
-    /// A key with a new secret.
     pub fn new(name: &str, version: u32, seed: Option<u64>) -> Self {
         Key {
             name: name.into(),
@@ -73,15 +56,12 @@ impl Key {
             seed: seed.map(|seed| seed.to_string()),
             secret: hex(&rand::random::<[u8; 32]>()),
             public: None,
-            expected: None,
+            expected: IgnoredAny,
             files: Sums::new(),
         }
     }
 
     /// Reads the record of a private folder; `None` if there is none.
-    ///
-    /// # Errors
-    /// If it cannot be read.
     pub fn read(private: &Path) -> Result<Option<Self>, FileError> {
         let path = private.join(KEY_FILE);
         if !open::is_there(&path) {
@@ -95,9 +75,6 @@ impl Key {
     }
 
     /// Writes the record.
-    ///
-    /// # Errors
-    /// If it cannot be written.
     pub fn write(&self, private: &Path) -> Result<(), FileError> {
         let path = private.join(KEY_FILE);
         let text =
@@ -111,6 +88,7 @@ impl Key {
         let mut mac = Hmac::<Sha256>::new_from_slice(self.secret.as_bytes())
             .expect("HMAC takes keys of any length");
         for part in [&["shearq", purpose][..], parts].concat() {
+            // A zero byte after each part, so that no two lists of parts are the same bytes.
             mac.update(part.as_bytes());
             mac.update(&[0]);
         }
@@ -123,15 +101,11 @@ impl Key {
     }
 }
 
-/// SHA-256 of some bytes, in hexadecimal digits.
 pub fn sha256(bytes: &[u8]) -> String {
     hex(&Sha256::digest(bytes))
 }
 
 /// Gives the private folder and its files to their owner alone. Does nothing on systems without file modes.
-///
-/// # Errors
-/// If a mode cannot be set.
 pub fn close(path: &Path) -> Result<(), FileError> {
     let folder = path.is_dir();
     #[cfg(unix)]
@@ -219,7 +193,6 @@ pub(crate) fn sums(
     Ok(sums)
 }
 
-/// Checksums in the format of `sha256sum`.
 fn sums_text(sums: &Sums) -> String {
     sums.iter()
         .map(|(name, sum)| format!("{sum}  {name}\n"))
@@ -227,9 +200,6 @@ fn sums_text(sums: &Sums) -> String {
 }
 
 /// Writes the checksums of all files below `public` and returns the SHA-256 of their list.
-///
-/// # Errors
-/// If a file cannot be read, or the list cannot be written.
 pub fn seal_public(public: &Path, threads: usize) -> Result<String, PipelineError> {
     let text = sums_text(&sums(public, names(public)?, threads)?);
     atomic::write(public.join(SUMS_FILE), text.as_bytes())?;
@@ -248,7 +218,7 @@ fn read_sums(public: &Path) -> Result<(Sums, String), FileError> {
     Ok((sums, sha256(&bytes)))
 }
 
-/// Compares files below `folder` with their checksums in `list`.
+// Compares files below `folder` with their checksums in `list`.
 fn unchanged(
     folder: &Path,
     names: Vec<String>,
@@ -269,9 +239,6 @@ fn unchanged(
 }
 
 /// Checks the public files that are there against [`SUMS_FILE`]. A participant may have downloaded some sets only.
-///
-/// # Errors
-/// If a file was changed, with its name.
 pub fn verify_public(public: &Path, threads: usize) -> Result<(), PipelineError> {
     let (expected, _) = read_sums(public)?;
     let is_there = |name: &&String| open::is_there(&public.join(name));

@@ -20,40 +20,37 @@ use shearq_scoring::ndarray::Array2;
 use shearq_scoring::{Convention, FieldSum, Grid};
 use shearq_submissions::Registry;
 
-/// Configuration of the reference measurement.
 const REFERENCE: &str = "48/linear/star";
-/// Required difference of two correlations, in standard deviations of chance correlations.
+// Required difference of two correlations, in standard deviations of chance correlations.
 const CLEAR: f64 = 5.0;
-/// Slope on the reference above which ellipticities are probably distortions, which are nearly twice as large. It is the
-/// geometric mean of 1 and 2.
+// Slope on the reference above which ellipticities are probably distortions, which are nearly twice as large. It is the
+// geometric mean of 1 and 2.
 const SLOPE: f64 = std::f64::consts::SQRT_2;
-/// Largest ratio of an image's slope to the median slope of its set, or inverse. A method has one response for all images of
-/// a set; the noise of the slope is 1/√(2·64) = 9 % on the smallest grid.
+// Largest ratio of an image's slope to the median slope of its set, or inverse. A method has one response for all images of
+// a set; the noise of the slope is 1/√(2·64) = 9 % on the smallest grid.
 const SLOPE_RATIO: f64 = 2.0;
 
-/// What is wrong with the shapes of an image.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Fault {
     /// Another convention of signs and axes agrees better.
     Convention(Convention),
-    /// The components are in the other order.
     Swapped,
     /// No convention agrees.
     Unrelated,
     /// Twice as large as shear-type ellipticities.
     Distortion {
-        /// Slope on the reference.
+        // Slope on the reference.
         slope: f64,
     },
     /// Larger or smaller than the shapes of the other images.
     Scale {
-        /// Ratio to the median of the set.
+        // Ratio to the median of the set.
         ratio: f64,
     },
 }
 
 impl Fault {
-    /// Whether both are reported in one line.
+    // Whether both are reported in one line.
     fn is_like(&self, other: &Self) -> bool {
         match (self, other) {
             (Fault::Convention(a), Fault::Convention(b)) => a == b,
@@ -72,7 +69,7 @@ fn shapes_of(sum: &FieldSum) -> Shapes {
     })
 }
 
-/// Compares the galaxies of an image with a reference measurement of it. Returns the slope on the reference, too.
+// Compares the galaxies of an image with a reference measurement of it. Returns the slope on the reference, too.
 fn compare(reference: &Shapes, sent: &FieldSum) -> (Option<Fault>, f64) {
     let swapped = FieldSum {
         e1: sent.e2.clone(),
@@ -110,7 +107,6 @@ fn compare(reference: &Shapes, sent: &FieldSum) -> (Option<Fault>, f64) {
     (fault, own.slope())
 }
 
-/// Sums over the galaxies of two fields.
 struct Product {
     cross: f64,
     reference: f64,
@@ -126,13 +122,13 @@ impl Product {
         }
     }
 
-    /// Slope of the sent ellipticities on the reference. Both have the noise of one image.
+    // Slope of the sent ellipticities on the reference. Both have the noise of one image.
     fn slope(&self) -> f64 {
         self.cross / self.reference
     }
 }
 
-/// Sums over the galaxies that both have, with the sent field in a convention.
+// Sums over the galaxies that both have, with the sent field in a convention.
 fn product(reference: &Shapes, sent: &FieldSum, convention: Convention) -> Product {
     let (s1, s2) = convention.signs();
     let mut sums = Product {
@@ -159,7 +155,6 @@ fn product(reference: &Shapes, sent: &FieldSum, convention: Convention) -> Produ
     sums
 }
 
-/// Reference measurements of images.
 #[derive(Debug)]
 pub struct References {
     grid: Grid,
@@ -188,7 +183,7 @@ impl References {
         let folder = Scratch::new()?;
         let configuration = Registry::embedded()
             .and_then(|registry| registry.get(REFERENCE))
-            .map_err(|error| PipelineError::Request(error.to_string()))?
+            .expect("a test reads all configurations of the program")
             .configuration;
         let source = Source::folder(data, folder.path())?;
         let run = Run::new(source, configuration, FileFormat::Parquet);
@@ -202,9 +197,6 @@ impl References {
     }
 
     /// The images of `sets` that the public folder `data` contains.
-    ///
-    /// # Errors
-    /// If the folder cannot be listed.
     pub fn ids(data: &DataFolder, sets: &[u32]) -> Result<Vec<ImageId>, FileError> {
         let files = data.images(sets)?;
         let of_set = |set: &u32| {
@@ -215,7 +207,6 @@ impl References {
         Ok(sets.iter().flat_map(of_set).collect())
     }
 
-    /// Whether there was no image to measure.
     pub fn is_empty(&self) -> bool {
         self.images.is_empty()
     }
@@ -237,7 +228,6 @@ impl References {
         Some(sum)
     }
 
-    /// A catalogue on the grid.
     fn read(&self, path: &Path) -> Result<FieldSum, FileError> {
         let rows = read_rows(path, &COLUMNS, most_rows(self.grid.cells()))?;
         let mut sum = FieldSum::new(&self.grid);
@@ -278,7 +268,7 @@ impl References {
     }
 }
 
-/// Faults of the images of a set, with the numbers of their images.
+// Faults of the images of a set, with the numbers of their images.
 fn faults(mut compared: Vec<(u32, Option<Fault>, f64)>) -> Vec<(Fault, Vec<u32>)> {
     // Images with a fault have no slope to compare with.
     let sound = |fault: &Option<Fault>| matches!(fault, None | Some(Fault::Distortion { .. }));
@@ -305,7 +295,6 @@ fn faults(mut compared: Vec<(u32, Option<Fault>, f64)>) -> Vec<(Fault, Vec<u32>)
     found
 }
 
-/// Numbers as `1-3,7`.
 fn ranges(numbers: &[u32]) -> String {
     let texts = numbers.chunk_by(|a, b| a + 1 == *b).map(|run| match run {
         [one] => one.to_string(),
@@ -314,7 +303,7 @@ fn ranges(numbers: &[u32]) -> String {
     texts.collect::<Vec<_>>().join(",")
 }
 
-/// A fault of `images` in words. `file` is the first of them.
+// A fault of `images` in words. `file` is the first of them.
 fn finding(fault: Fault, images: &[u32], sent: &Sent, file: &Path) -> Finding {
     let (severity, check, message) = match fault {
         Fault::Convention(convention) => (
@@ -368,7 +357,7 @@ mod tests {
     use super::*;
     use shearq_quantities::units::{Degrees, Pixels};
 
-    /// Ellipticities that are neither symmetric nor of one sign, in the order that `edit` gives them.
+    // Ellipticities that are neither symmetric nor of one sign, in the order that `edit` gives them.
     fn field(edit: impl Fn(f64, f64) -> (f64, f64)) -> FieldSum {
         let n = 16;
         let grid = Grid::new(n, Pixels(48.0), Degrees(10.0)).unwrap();

@@ -23,49 +23,36 @@ pub const CHALLENGE_FILE: &str = "challenge.toml";
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Challenge {
-    /// Name; entries state it.
     #[serde(deserialize_with = "checked_name")]
     pub name: String,
-    /// Version of the data.
     pub version: u32,
-    /// Kind of challenge.
     #[serde(deserialize_with = "by_name")]
     pub kind: &'static Kind,
-    /// Address of the organiser; may be empty.
     #[serde(default)]
     pub contact: String,
-    /// Where the data and the rules are published; may be empty.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub address: String,
     /// [`Key::seal`](crate::seal::Key::seal) of the private files; empty until they are complete.
     #[serde(default)]
     pub seal: String,
-    /// What the data are.
     pub data: Data,
-    /// Conventions, by name.
     pub conventions: BTreeMap<String, String>,
-    /// How entries are ranked.
     pub rules: Rules,
 }
 
-/// Sets, images and grid of a challenge.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Data {
-    /// Set numbers.
     pub sets: Vec<u32>,
     /// Images of each set, numbered from 1.
     pub images: u32,
-    /// Galaxies per side of an image.
     pub grid: usize,
-    /// Pixels per side of a stamp.
     pub stamp: usize,
     /// Side of the field in degrees.
     pub field_degrees: f64,
 }
 
 impl Data {
-    /// Galaxies in all images.
     pub fn galaxies(&self) -> u64 {
         self.sets.len() as u64 * u64::from(self.images) * (self.grid as u64).pow(2)
     }
@@ -83,21 +70,15 @@ impl Data {
     }
 }
 
-/// Rules of a challenge.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Rules {
-    /// Metric that ranks the entries.
     pub metric: RankBy,
-    /// Accepted files.
     pub contents: Vec<Contents>,
-    /// Most entries of a team.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub entries_per_team: Option<u32>,
-    /// First day or moment of entries.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub opens: Option<Deadline>,
-    /// Last day or moment of entries.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub closes: Option<Deadline>,
     /// Whether entries may cover some sets only. They have no rank.
@@ -175,9 +156,6 @@ impl Challenge {
     }
 
     /// Properties that an entry must have.
-    ///
-    /// # Errors
-    /// If the grid is out of range.
     pub fn expected(&self) -> Result<Expected, FileError> {
         let Data { sets, images, .. } = &self.data;
         let grid = self.data.grid();
@@ -191,7 +169,6 @@ impl Challenge {
         })
     }
 
-    /// Checks every value against its range.
     fn check(&self) -> Result<(), String> {
         let Data { sets, images, .. } = &self.data;
         if sets.is_empty() || !sets.is_sorted_by(|a, b| a < b) || *images == 0 {
@@ -204,9 +181,6 @@ impl Challenge {
     }
 
     /// The text of the file.
-    ///
-    /// # Errors
-    /// If it cannot be written as TOML.
     pub fn text(&self, path: &Path) -> Result<String, FileError> {
         toml::to_string(self).map_err(FileError::doing(path, "cannot write the description"))
     }

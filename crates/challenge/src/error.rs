@@ -1,0 +1,75 @@
+//! Why a challenge cannot be made.
+
+use shearq_files::FileError;
+use shearq_pipeline::PipelineError;
+use thiserror::Error;
+
+use crate::create::EXPECTED_RESPONSE;
+use crate::deadline::Deadline;
+
+/// Failure to make a challenge: a file or a measurement, or data and rules by which entries could not be ranked.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum ChallengeError {
+    #[error(transparent)]
+    Pipeline(#[from] PipelineError),
+    #[error(transparent)]
+    Simulation(#[from] shearq_simulate::set::SettingsError),
+    #[error(
+        "--amplitude 0: without shear, entries cannot be ranked (found 0, expected a positive number)"
+    )]
+    NoShear,
+    #[error(
+        "--closes: the last day is before the first one (found {closes}, expected {opens} or later)"
+    )]
+    ClosesFirst { opens: Deadline, closes: Deadline },
+    #[error("--spectra: {metric} is not defined for power spectra. Try: --metric q or q-corrected")]
+    NotOfSpectra { metric: &'static str },
+    #[error(
+        "--spectra: the response of power spectra follows from differences between sets (found 1 set, expected at least 2)"
+    )]
+    OneSpectrum,
+    #[error("the true shear {}, so {metric} is not defined. Try: --metric {}",
+        if *constant { "is the same for all galaxies of a set" } else { "varies within the sets" },
+        if *constant { "qc, m or c" } else { "q-calibrated, m or c" }
+    )]
+    Undefined {
+        metric: &'static str,
+        constant: bool,
+    },
+    /// The true shears of sets with one shear each do not determine m and c.
+    #[error("{0}")]
+    Shears(String),
+    #[error(
+        "noise is measured between images (found 1 image per set, expected at least 2). Try: --images 8"
+    )]
+    OneImage,
+    /// The images contradict the true shear.
+    #[error("{0}. Try: the same command with the right true shear")]
+    Contradiction(String),
+    #[error(
+        "the data are too small to rank entries by {metric}: {of} is expected to be {found:.1}σ from zero (expected at least {EXPECTED_RESPONSE}). Try: {images} images per set, or more galaxies per image"
+    )]
+    SmallResponse {
+        metric: &'static str,
+        of: String,
+        found: f64,
+        // Images that would do.
+        images: f64,
+    },
+    #[error(
+        "the data are too small to rank entries by {metric}: a spectrum without images reaches {template:.0}, a catalogue with the noise of these images about {catalogue:.0}. Try: --metric q-calibrated, or {images} images per set"
+    )]
+    BehindTemplate {
+        metric: &'static str,
+        template: f64,
+        catalogue: f64,
+        images: f64,
+    },
+}
+
+impl From<FileError> for ChallengeError {
+    fn from(error: FileError) -> Self {
+        ChallengeError::Pipeline(error.into())
+    }
+}
