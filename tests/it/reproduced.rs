@@ -13,10 +13,8 @@ use shearq_results::score::OWN;
 use shearq_scoring::{Metrics, Options, SetImages, SetScorer};
 use shearq_simulate::kinds::shares;
 use shearq_simulate::set::SimulationSettings;
-use shearq_studies::Finding;
 use shearq_studies::bias::biases;
-use shearq_studies::calibration::{self, LOG_LAMBDA, PAPER_LAMBDA, calibrate};
-use shearq_studies::exhibits::findings;
+use shearq_studies::calibration::{Curves, LOG_LAMBDA, LambdaSums, PAPER_LAMBDA, calibrate};
 use shearq_studies::reproduce::{Plan, SetResult, Study, run_sets};
 use shearq_submissions::{Configuration, PsfForm, Registry};
 
