@@ -88,6 +88,7 @@ enum Row<'a> {
 type CellOf<'a> = &'a dyn Fn(&Response, &SetBiases, &ShearBias) -> Cell;
 
 /// A row for each configuration on each set, and means over sets if there are several.
+#[allow(clippy::too_many_lines, reason = "one column after the other")]
 pub fn contest_table(
     plan: &Plan,
     results: &[SetResult],

@@ -16,6 +16,16 @@ const PUBLISHED_IMAGES: u32 = 200;
 
 type Metric = fn(&Metrics) -> f64;
 
+// Keys of our, the published and the distance column, label, unit, our and the published metric, and its decimals.
+type Beside = (
+    [&'static str; 3],
+    &'static str,
+    &'static str,
+    Metric,
+    fn(&Published) -> f64,
+    usize,
+);
+
 fn over_sets(results: &[SetResult], place: usize, metric: Metric) -> Vec<(f64, f64)> {
     let score = |set: &SetResult| {
         let score = &set.results[place].score;
@@ -73,7 +83,7 @@ pub fn table_one(results: &[SetResult], submissions: &[(Configuration, Published
     ];
     let mean =
         |place: usize, metric, decimals| measured(mean_of_24(results, place, metric), decimals);
-    let beside: [(_, _, _, Metric, fn(&Published) -> f64, _); 3] = [
+    let beside: [Beside; 3] = [
         (
             ["m_half", "m_half_published", "m_half_apart"],
             "M/2",
