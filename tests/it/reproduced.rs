@@ -34,9 +34,9 @@ fn q_gain(results: &[SetResult], first: usize, second: usize) -> (f64, f64) {
     let sets: Vec<u32> = results.iter().map(|set| set.set).collect();
     let (mut mean, mut gain, mut variance) = (0.0, 0.0, 0.0);
     for (set, share) in results.iter().zip(shares(&sets)) {
-        let [a, b] = [first, second].map(|k| &set.results[k].score);
-        let paired = difference(Paired::Q, &[a], &[b]).unwrap();
-        mean += share * a.metrics.q;
+        let [a, b] = [first, second].map(|k| std::slice::from_ref(&set.results[k].score));
+        let paired = difference(Paired::Q, a, b).unwrap();
+        mean += share * a[0].metrics.q;
         gain += share * paired.difference;
         variance += (share * paired.error).powi(2);
     }
