@@ -13,7 +13,7 @@ use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 use shearq_measure::{
-    ArraySource, FunctionalPsf, KnownNoise, Measurer, OneThread, Psfs, Session, star_psf,
+    ArraySource, FunctionalPsf, KnownNoise, Measurer, OneThread, Psfs, Session, Star,
 };
 use shearq_quantities::Shear;
 use shearq_simulate::kinds::SetKind;
@@ -68,7 +68,7 @@ fn biases(
     galaxies: &Galaxies,
     star: &Array2<f64>,
 ) -> Result<[f64; 4], Box<dyn Error>> {
-    let psf = star_psf(star.view(), measurer.configuration().psf_cut())?;
+    let Star { psf, .. } = Star::cut(star.view(), measurer.configuration().psf_cut())?;
     let psfs = &Psfs::prepared(psf.view());
     let side = |stamps: ArrayView3<'_, f32>| -> Result<_, Box<dyn Error>> {
         let mut source = ArraySource::new(measurer, stamps, psfs)?;

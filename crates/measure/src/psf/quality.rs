@@ -49,7 +49,7 @@ const IMPOSSIBLE_CORE_RATIO: f64 = 1.02;
 // Chosen by hand.
 const MIN_SHARE: f64 = 0.1;
 // Standard deviations of m and of c by the noise of one star, times its S/N, below S/N 500.
-// cargo run --release -p shearq-studies --example wrong_psfs -- noise 2 16 40 (seeds 0 to 39): m 2.2 to 2.4, c 1.16 to
+// cargo run --release -p shearq-studies --example star_noise -- 2 16 40 (seeds 0 to 39): m 2.2 to 2.4, c 1.16 to
 // 1.20 at S/N 50 to 500.
 const BIAS_TIMES_SNR: [f64; 2] = [2.3, 1.2];
 // The same for a star that is not denoised.
