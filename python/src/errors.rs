@@ -10,7 +10,7 @@ use shearq_submissions::ConfigurationError;
 /// Errors about stamps, PSFs, the noise or the configuration.
 pub(crate) fn of_measuring(error: MeasureError) -> PyErr {
     let argument = match error {
-        MeasureError::Configuration(error) => return of_submission(error),
+        MeasureError::Configuration(error) => return of_configuration(error),
         MeasureError::Memory(_) => return PyMemoryError::new_err(error.to_string()),
         MeasureError::Noise(_) | MeasureError::NoBorders { .. } => "noise",
         MeasureError::Data(Warning::Brightness { .. }) => "stamps",
@@ -25,7 +25,7 @@ pub(crate) fn of_measuring(error: MeasureError) -> PyErr {
 }
 
 /// Errors about the name or the settings of a configuration.
-pub(crate) fn of_submission(error: ConfigurationError) -> PyErr {
+pub(crate) fn of_configuration(error: ConfigurationError) -> PyErr {
     let message = format!("submission: {error}");
     match error {
         ConfigurationError::Unknown { .. } => PyKeyError::new_err(message),

@@ -6,7 +6,7 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use shearq_submissions::{EllipticityType, Entry, NoiseSource, PsfForm, Published, Registry};
 
-use crate::errors::of_submission;
+use crate::errors::of_configuration;
 
 /// What a text of settings is called where it does not name itself.
 const OWN: &str = "own";
@@ -14,7 +14,7 @@ const OWN: &str = "own";
 /// Settings as JSON, what they extend, and Q, M/2 and √A·10⁴ as published.
 type Parts = (String, Option<String>, Option<(f64, f64, f64)>);
 
-/// Settings of a submission, resolved.
+/// Settings of a configuration, resolved.
 #[pyclass(frozen)]
 pub(crate) struct Configuration {
     pub(crate) entry: Entry,
@@ -22,26 +22,26 @@ pub(crate) struct Configuration {
 
 #[pymethods]
 impl Configuration {
-    /// The submission of a name or a file.
+    /// The configuration of a name or a file.
     #[staticmethod]
     fn named(name: &str) -> PyResult<Self> {
         let entry = Registry::embedded().and_then(|registry| registry.get(name));
         Ok(Configuration {
-            entry: entry.map_err(of_submission)?,
+            entry: entry.map_err(of_configuration)?,
         })
     }
 
-    /// The submission of settings as TOML.
+    /// The configuration of settings as TOML.
     #[staticmethod]
     fn text(text: &str) -> PyResult<Self> {
         let entry =
             Registry::embedded().and_then(|registry| registry.get_text(Path::new(OWN), text));
         Ok(Configuration {
-            entry: entry.map_err(of_submission)?,
+            entry: entry.map_err(of_configuration)?,
         })
     }
 
-    /// The submission of settings as JSON.
+    /// The configuration of settings as JSON.
     #[staticmethod]
     fn json(text: &str) -> PyResult<Self> {
         let wrong = |error: String| {
@@ -53,16 +53,16 @@ impl Configuration {
         Self::text(&text)
     }
 
-    /// The submission of which `parts` are the parts.
+    /// The configuration of which `parts` are the parts.
     #[staticmethod]
     fn restored(parts: Parts) -> PyResult<Self> {
         let (settings, extends, published) = parts;
-        let submission: shearq_submissions::Configuration = serde_json::from_str(&settings)
+        let configuration: shearq_submissions::Configuration = serde_json::from_str(&settings)
             .map_err(|error| PyValueError::new_err(format!("submission: {error}")))?;
         let published = published.map(|(q, m_half, sqrt_a)| Published { q, m_half, sqrt_a });
         Ok(Configuration {
             entry: Entry {
-                configuration: submission,
+                configuration,
                 published,
                 extends,
             },
@@ -119,8 +119,8 @@ impl Configuration {
     /// Pixels a side of the piece of a stamp, and of a PSF stamp, that are used.
     #[getter]
     fn sizes(&self) -> (usize, usize) {
-        let submission = &self.entry.configuration;
-        (submission.stamp.size, submission.psf.size)
+        let configuration = &self.entry.configuration;
+        (configuration.stamp.size, configuration.psf.size)
     }
 
     /// Whether it takes PSFs by their formula.
@@ -145,9 +145,9 @@ impl Configuration {
     }
 }
 
-/// Names of the embedded submissions.
+/// Names of the embedded configurations.
 #[pyfunction]
 pub(crate) fn names() -> PyResult<Vec<String>> {
-    let registry = Registry::embedded().map_err(of_submission)?;
+    let registry = Registry::embedded().map_err(of_configuration)?;
     Ok(registry.names().to_vec())
 }

@@ -17,6 +17,62 @@ pub struct OutOfRange {
     pub expected: &'static str,
 }
 
+/// What is wrong with a setting. Keys are written as in `denoise.levels`.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+#[non_exhaustive]
+pub enum SettingError {
+    /// A key that no method has.
+    #[error("there is no setting `{key}`; expected {expected}")]
+    UnknownKey {
+        /// The key.
+        key: String,
+        /// The keys that its section has.
+        expected: String,
+    },
+    /// A value of another type, or a word that is none of the accepted ones.
+    #[error("`{key}` is {found}; {expected}")]
+    Value {
+        /// The key.
+        key: String,
+        /// The value, as the file has it.
+        found: String,
+        /// What the reader says about it, with what it expected.
+        expected: String,
+    },
+    /// A key that no file of the chain sets.
+    #[error(
+        "the key `{key}` is set neither here nor in what it extends; start from `extends = \"paper\"` or `extends = \"48/linear/star\"`"
+    )]
+    Missing {
+        /// The key.
+        key: String,
+    },
+    /// A key that the method does not use.
+    #[error("`{key}` is not used when {reason}; remove it")]
+    Unused {
+        /// The key.
+        key: String,
+        /// The setting that turns it off.
+        reason: String,
+    },
+    /// A value that is out of range.
+    #[error(transparent)]
+    OutOfRange(#[from] OutOfRange),
+}
+
+impl SettingError {
+    /// The key that is wrong.
+    pub fn key(&self) -> &str {
+        match self {
+            SettingError::UnknownKey { key, .. }
+            | SettingError::Value { key, .. }
+            | SettingError::Missing { key }
+            | SettingError::Unused { key, .. } => key,
+            SettingError::OutOfRange(error) => error.key,
+        }
+    }
+}
+
 /// A fault in the name or file of a configuration.
 #[derive(Debug, Error)]
 #[non_exhaustive]
@@ -39,9 +95,9 @@ pub enum ConfigurationError {
         /// Why not.
         source: std::io::Error,
     },
-    /// Not TOML, an unknown key, or a value of the wrong type.
+    /// Not TOML, or too long for settings.
     #[error("in the configuration file {path}: {message}")]
-    Parse {
+    Syntax {
         /// The file.
         path: PathBuf,
         /// Line, column and what was expected.
@@ -54,16 +110,6 @@ pub enum ConfigurationError {
         path: PathBuf,
         /// The names followed.
         chain: String,
-    },
-    /// A key that no file of the chain sets.
-    #[error(
-        "{path}: the key `{key}` is set neither here nor in what it extends; start from `extends = \"paper\"` or `extends = \"48/linear/star\"`"
-    )]
-    Missing {
-        /// The file that was given.
-        path: PathBuf,
-        /// The key.
-        key: &'static str,
     },
     /// A name that cannot be one.
     #[error("the name is {found}; expected {expected}")]
@@ -83,27 +129,17 @@ pub enum ConfigurationError {
         /// The first setting that differs.
         difference: String,
     },
-    /// A value of a file that is out of range.
-    #[error("{path}: {error}")]
-    Range {
+    /// A setting of a file that is wrong.
+    #[error("{path}: {}{error}", line.map_or_else(String::new, |line| format!("line {line}: ")))]
+    Setting {
         /// The file that was given.
         path: PathBuf,
-        /// The key, its value and the accepted range.
-        error: OutOfRange,
+        /// The line, if this file sets the key.
+        line: Option<usize>,
+        /// What is wrong with it.
+        error: SettingError,
     },
     /// A value set in code that is out of range.
     #[error(transparent)]
-    Setting(#[from] OutOfRange),
-    /// A key that the method does not use.
-    #[error("{path}: line {line}: `{key}` is not used when {reason}; remove it")]
-    Dead {
-        /// The file.
-        path: PathBuf,
-        /// The line of the key.
-        line: usize,
-        /// The key.
-        key: String,
-        /// The setting that turns it off.
-        reason: String,
-    },
+    OutOfRange(#[from] OutOfRange),
 }

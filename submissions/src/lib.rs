@@ -1,4 +1,4 @@
-//! Named submission configurations: the settings of a method, in TOML files that inherit from each other.
+//! Named configurations: the settings of a method, in TOML files that inherit from each other.
 //!
 //! A [`Configuration`] has all settings of its method. The [`Registry`] has the configurations of the paper's Table 1
 //! and the linear ones. A file works wherever a name does, and `extends` a name or another file. An error names file and
@@ -6,25 +6,19 @@
 #![forbid(unsafe_code)]
 
 mod error;
-mod file;
-pub mod limits;
 mod name;
 mod registry;
 mod settings;
-mod template;
-mod validate;
 
-pub use error::{ConfigurationError, OutOfRange};
-pub use file::Published;
+pub use error::{ConfigurationError, OutOfRange, SettingError};
 pub use name::{MAX_NAME, check_name, checked_name, is_control};
-pub use registry::{Entry, Registry};
+pub use registry::{Entry, Published, Registry, Template};
 pub use settings::{
     AcfKind, Background, BrightnessUnit, Calibration, ClippedShape, Clipping, Configuration,
     Denoise, EllipticityType, Kept, LinearDeconvolution, LinearMethod, Method, Neighbours,
     NetworkDeconvolution, NetworkMethod, NoiseSource, Psf, PsfCut, PsfForm, PsfScale, ShareOf,
-    SkySource, Stamp, Start, StepScale, Update, Wavelet, WeightedShape,
+    SkySource, Stamp, Start, StepScale, Update, Wavelet, WeightedShape, limits,
 };
-pub use template::Template;
 
 /// The examples of README.md.
 #[cfg(doctest)]

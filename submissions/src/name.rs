@@ -1,4 +1,4 @@
-//! Names of submissions and methods: they end up in tables, figures, file names and on terminals, and
+//! Names of configurations and methods: they end up in tables, figures, file names and on terminals, and
 //! often come from files of others.
 
 use serde::{Deserialize, Deserializer};

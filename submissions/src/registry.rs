@@ -1,79 +1,74 @@
-//! Finding submissions by name or file, and resolving what they inherit.
+//! Finding configurations by name or file, and resolving what they inherit: the tables of a chain of files are merged key
+//! by key, and read once.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
+use std::sync::LazyLock;
 
-use crate::error::ConfigurationError;
-use crate::file::{File, Published, dead_keys, read};
-use crate::settings::{Configuration, PartialConfiguration};
+use serde::{Deserialize, Serialize};
+use toml::de::DeTable;
+use toml::{Table, Value};
 
-/// The commented configuration that the submissions with the network rest on.
-pub(crate) const NETWORK: &str = include_str!("../named/paper.toml");
-/// The same of those with the linear method.
-pub(crate) const LINEAR: &str = include_str!("../named/48-linear-star.toml");
+use crate::error::{ConfigurationError, SettingError};
+use crate::settings::Configuration;
+
+/// The commented file of the configurations with the network, and that of those with the linear method. Together they have
+/// every key of both methods.
+const NETWORK: &str = include_str!("../named/paper.toml");
+const LINEAR: &str = include_str!("../named/48-linear-star.toml");
+
+macro_rules! embedded {
+    ($($file:literal,)*) => {
+        [$(($file, include_str!(concat!("../named/", $file)))),*]
+    };
+}
 
 /// The embedded files, in the order of the paper's Table 1, then those it does not have.
-const EMBEDDED: [(&str, &str); 14] = [
-    ("paper.toml", NETWORK),
-    (
-        "subm-19-den-star.toml",
-        include_str!("../named/subm-19-den-star.toml"),
-    ),
-    (
-        "subm-23-den-func.toml",
-        include_str!("../named/subm-23-den-func.toml"),
-    ),
-    (
-        "23-den-func.toml",
-        include_str!("../named/23-den-func.toml"),
-    ),
-    (
-        "23-den-star.toml",
-        include_str!("../named/23-den-star.toml"),
-    ),
-    (
-        "23-raw-func.toml",
-        include_str!("../named/23-raw-func.toml"),
-    ),
-    (
-        "23-raw-star.toml",
-        include_str!("../named/23-raw-star.toml"),
-    ),
-    (
-        "29-den-func.toml",
-        include_str!("../named/29-den-func.toml"),
-    ),
-    ("48-linear-star.toml", LINEAR),
-    (
-        "48-linear-func.toml",
-        include_str!("../named/48-linear-func.toml"),
-    ),
-    (
-        "as-printed-paper.toml",
-        include_str!("../named/as-printed-paper.toml"),
-    ),
-    (
-        "as-printed-23-raw-star.toml",
-        include_str!("../named/as-printed-23-raw-star.toml"),
-    ),
-    (
-        "as-printed-23-den-star.toml",
-        include_str!("../named/as-printed-23-den-star.toml"),
-    ),
-    (
-        "as-printed-29-den-func.toml",
-        include_str!("../named/as-printed-29-den-func.toml"),
-    ),
+const EMBEDDED: [(&str, &str); 14] = embedded![
+    "paper.toml",
+    "subm-19-den-star.toml",
+    "subm-23-den-func.toml",
+    "23-den-func.toml",
+    "23-den-star.toml",
+    "23-raw-func.toml",
+    "23-raw-star.toml",
+    "29-den-func.toml",
+    "48-linear-star.toml",
+    "48-linear-func.toml",
+    "as-printed-paper.toml",
+    "as-printed-23-raw-star.toml",
+    "as-printed-23-den-star.toml",
+    "as-printed-29-den-func.toml",
 ];
 
 /// Those that others rest on, which are not listed.
 const BASES: [&str; 2] = ["paper", "as-printed/paper"];
 
-/// Longest chain of `extends` followed.
-const MAX_DEPTH: usize = 16;
+/// Longest chain of `extends` that is followed.
+// Chosen by hand.
+const MAX_CHAIN: usize = 16;
 
-/// A resolved submission and what was published for it.
+/// Most bytes of a file, a thousand times those of all settings.
+const MAX_FILE_BYTES: u64 = 1 << 20;
+
+/// The path that errors about a text without a file name.
+const TEXT: &str = "settings";
+
+/// Figures published for a submission.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Published {
+    /// Quality factor Q.
+    pub q: f64,
+    /// Multiplicative bias M/2.
+    pub m_half: f64,
+    /// Additive bias √A in units of 10⁻⁴.
+    pub sqrt_a: f64,
+}
+
+/// A resolved configuration and what was published for it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Entry {
     /// All settings.
@@ -84,11 +79,243 @@ pub struct Entry {
     pub extends: Option<String>,
 }
 
-/// The embedded submissions, by name.
+/// The keys of a file that are no settings, and are not inherited.
+#[derive(Debug, Clone, Deserialize)]
+struct Head {
+    name: Option<String>,
+    description: Option<String>,
+    extends: Option<String>,
+    published: Option<Published>,
+}
+
+/// One file of a chain.
+#[derive(Debug, Clone)]
+struct File {
+    path: PathBuf,
+    head: Head,
+    settings: Table,
+    /// Text of a user's own file. Embedded ones hold values in stand-by for those who extend them, so that their unused
+    /// keys are no faults.
+    text: Option<String>,
+}
+
+impl File {
+    fn parse(path: &Path, text: &str) -> Result<Self, ConfigurationError> {
+        let syntax = |error: toml::de::Error| ConfigurationError::Syntax {
+            path: path.to_owned(),
+            message: error.to_string().trim_end().to_owned(),
+        };
+        let mut settings: Table = toml::from_str(text).map_err(syntax)?;
+        for key in ["name", "description", "extends", "published"] {
+            settings.remove(key);
+        }
+        Ok(File {
+            path: path.to_owned(),
+            head: toml::from_str(text).map_err(syntax)?,
+            settings,
+            text: None,
+        })
+    }
+
+    fn own(path: &Path, text: String) -> Result<Self, ConfigurationError> {
+        let file = File::parse(path, &text)?;
+        let text = Some(text);
+        Ok(File { text, ..file })
+    }
+
+    /// The name a file gives itself, or its own name without the ending.
+    fn name(&self) -> String {
+        let stem = || self.path.file_stem().unwrap_or_default();
+        let own = self.head.name.clone();
+        own.unwrap_or_else(|| stem().to_string_lossy().into_owned())
+    }
+
+    fn fault(&self, error: SettingError) -> ConfigurationError {
+        let text = self.text.as_deref();
+        ConfigurationError::Setting {
+            path: self.path.clone(),
+            line: text.and_then(|text| line_of(text, error.key())),
+            error,
+        }
+    }
+}
+
+/// The line of a text that sets `key`, such as `denoise.levels`.
+fn line_of(text: &str, key: &str) -> Option<usize> {
+    let file = DeTable::parse(text).ok()?;
+    let (section, inner) = key.split_once('.').unwrap_or((key, ""));
+    let (name, value) = file
+        .get_ref()
+        .iter()
+        .find(|(k, _)| k.get_ref() == section)?;
+    let inner = value.get_ref().as_table().and_then(|keys| {
+        let mut keys = keys.keys();
+        keys.find(|name| name.get_ref() == inner)
+    });
+    let start = inner.unwrap_or(name).span().start;
+    Some(1 + text[..start].matches('\n').count())
+}
+
+/// `own` over `base`, key by key in each section.
+fn merge(mut base: Table, own: &Table) -> Table {
+    for (key, value) in own {
+        let merged = match (base.remove(key), value) {
+            (Some(Value::Table(base)), Value::Table(own)) => Value::Table(merge(base, own)),
+            _ => value.clone(),
+        };
+        base.insert(key.clone(), merged);
+    }
+    base
+}
+
+/// Every key that a method has, with a value that is valid for the linear method.
+static KNOWN: LazyLock<Table> = LazyLock::new(|| {
+    // A test reads the embedded files.
+    let settings = |text| File::parse(Path::new(TEXT), text).map(|file| file.settings);
+    let network = settings(NETWORK).unwrap_or_default();
+    merge(network, &settings(LINEAR).unwrap_or_default())
+});
+
+/// The keys of `table`, those of sections as `section.key`, with their values.
+fn leaves(table: &Table) -> Vec<(String, &Value)> {
+    let mut found = Vec::new();
+    for (name, value) in table {
+        match value {
+            Value::Table(section) => {
+                let key = |(key, value)| (format!("{name}.{key}"), value);
+                found.extend(section.iter().map(key));
+            }
+            value => found.push((name.clone(), value)),
+        }
+    }
+    found
+}
+
+fn get<'t>(table: &'t Table, key: &str) -> Option<&'t Value> {
+    match key.split_once('.') {
+        Some((section, key)) => table.get(section)?.get(key),
+        None => table.get(key),
+    }
+}
+
+fn check_keys(settings: &Table) -> Result<(), SettingError> {
+    let listed = |table: &Table| table.keys().cloned().collect::<Vec<_>>().join(", ");
+    for (key, value) in settings {
+        let unknown = |key: String, of: &Table| SettingError::UnknownKey {
+            key,
+            expected: listed(of),
+        };
+        match (KNOWN.get(key), value) {
+            (None, _) => return Err(unknown(key.clone(), &KNOWN)),
+            (Some(Value::Table(known)), Value::Table(keys)) => {
+                if let Some(inner) = keys.keys().find(|inner| !known.contains_key(*inner)) {
+                    return Err(unknown(format!("{key}.{inner}"), known));
+                }
+            }
+            (Some(Value::Table(known)), value) => {
+                return Err(SettingError::Value {
+                    key: key.clone(),
+                    found: value.to_string(),
+                    expected: format!("expected a section with {}", listed(known)),
+                });
+            }
+            _ => {}
+        }
+    }
+    Ok(())
+}
+
+/// The configuration of a merged table with its name and description.
+pub(crate) fn configuration_of(mut table: Table) -> Result<Configuration, SettingError> {
+    let mut own = Table::new();
+    for key in ["name", "description"] {
+        let missing = || SettingError::Missing { key: key.into() };
+        own.insert(key.into(), table.remove(key).ok_or_else(missing)?);
+    }
+    // Figures and bases of stored entries are no settings.
+    table.remove("published");
+    table.remove("extends");
+    check_keys(&table)?;
+    let over = |base: Table, settings: &Table| {
+        Configuration::from_table(merge(merge(base, settings), &own))
+    };
+    // Over all keys that there are, none is missing, so that only a value can be wrong.
+    let configuration =
+        over(KNOWN.clone(), &table).map_err(|error| wrong_value(&own, &table, error))?;
+    if over(Table::new(), &table).is_err() {
+        let used = Table::try_from(&configuration).unwrap_or_default();
+        // Without its method, nothing says which keys are missing.
+        let keys = leaves(&used).into_iter().map(|(key, _)| key);
+        let mut keys = std::iter::once("method".to_owned()).chain(keys);
+        let missing = keys.find(|key| get(&table, key).is_none() && get(&own, key).is_none());
+        let key = missing.unwrap_or_default();
+        return Err(SettingError::Missing { key });
+    }
+    configuration.validate()?;
+    Ok(configuration)
+}
+
+/// The value that the reader refused with `error`. An error out of a section that serde buffers, as it does for `flatten`
+/// and tags, has no place, so that each value is tried alone among valid ones.
+fn wrong_value(own: &Table, settings: &Table, error: toml::de::Error) -> SettingError {
+    let tags = ["method", "noise.source", "denoise.method"];
+    let mut tried = merge(KNOWN.clone(), own);
+    let mut keys = leaves(settings);
+    // The keys that say which others are read come first.
+    keys.sort_by_key(|(key, _)| !tags.contains(&key.as_str()));
+    let wrong = |key: String, value: &Value, error: &toml::de::Error| SettingError::Value {
+        key,
+        found: value.to_string(),
+        expected: error.message().to_owned(),
+    };
+    for (key, value) in keys {
+        let alone = match key.split_once('.') {
+            Some((section, inner)) => {
+                let inner = Table::from_iter([(inner.to_owned(), value.clone())]);
+                Table::from_iter([(section.to_owned(), Value::Table(inner))])
+            }
+            None => Table::from_iter([(key.clone(), value.clone())]),
+        };
+        tried = merge(tried, &alone);
+        if let Err(error) = Configuration::from_table(tried.clone()) {
+            return wrong(key, value, &error);
+        }
+    }
+    let (key, value) = own
+        .iter()
+        .next()
+        .map_or(("", &Value::Boolean(false)), |(k, v)| (k, v));
+    wrong(key.to_owned(), value, &error)
+}
+
+/// The keys of a file that `configuration` does not use, with the setting that turns them off.
+fn unused_keys(settings: &Table, configuration: &Configuration) -> Vec<(String, String)> {
+    let used = Table::try_from(configuration).unwrap_or_default();
+    let reason = |key: &str| {
+        // A section that the method has may be turned off by one of its own keys.
+        let switch = match key.split_once('.') {
+            Some(("noise", _)) => "noise.source".to_owned(),
+            Some((section, _)) => format!("{section}.method"),
+            None => "method".to_owned(),
+        };
+        match get(&used, &switch) {
+            Some(value) => format!("{switch} = {value}"),
+            None => format!("method = {}", used["method"]),
+        }
+    };
+    let keys = leaves(settings).into_iter().map(|(key, _)| key);
+    let unused = keys.filter(|key| get(&used, key).is_none());
+    unused
+        .map(|key| (reason(&key), key))
+        .map(|(reason, key)| (key, reason))
+        .collect()
+}
+
+/// The embedded configurations, by name.
 #[derive(Debug)]
 pub struct Registry {
     names: Vec<String>,
-    files: BTreeMap<String, (PathBuf, File)>,
+    files: BTreeMap<String, File>,
 }
 
 impl Registry {
@@ -102,23 +329,22 @@ impl Registry {
             files: BTreeMap::new(),
         };
         for (file_name, text) in EMBEDDED {
-            let path = Path::new("submissions/named").join(file_name);
-            let file = File::parse(&path, text)?;
-            let name = own_name(&file, &path);
+            let file = File::parse(&Path::new("submissions/named").join(file_name), text)?;
+            let name = file.name();
             if !BASES.contains(&name.as_str()) {
                 registry.names.push(name.clone());
             }
-            registry.files.insert(name, (path, file));
+            registry.files.insert(name, file);
         }
         Ok(registry)
     }
 
-    /// Names of the embedded submissions, in the order of the paper's Table 1, then those it does not have.
+    /// Names of the embedded configurations, in the order of the paper's Table 1, then those it does not have.
     pub fn names(&self) -> &[String] {
         &self.names
     }
 
-    /// The submissions of the paper's Table 1 with their published figures, in its order.
+    /// The configurations of the paper's Table 1 with their published figures, in its order.
     ///
     /// # Errors
     /// As [`Registry::get`].
@@ -126,129 +352,107 @@ impl Registry {
         let mut found = Vec::new();
         for name in &self.names {
             let entry = self.get(name)?;
-            found.extend(
-                entry
-                    .published
-                    .map(|figures| (entry.configuration, figures)),
-            );
+            let published = entry.published;
+            found.extend(published.map(|figures| (entry.configuration, figures)));
         }
         Ok(found)
     }
 
-    /// The submission of this name, or in this file.
+    /// The configuration of this name, or in this file.
     ///
     /// A name wins over a file; a path with `./` in front is always a file.
     ///
     /// # Errors
     /// Where there is no such name or file, or it or what it extends is not valid.
     pub fn get(&self, name_or_path: &str) -> Result<Entry, ConfigurationError> {
-        let link = self.find(name_or_path, None)?;
-        let file = link.text.is_some().then(|| link.path.clone());
-        let entry = self.entry(link, name_or_path)?;
-        match file {
-            Some(path) => self.distinct(path, entry),
-            None => Ok(entry),
+        let file = self.find(name_or_path, None)?;
+        let entry = self.entry(&file, name_or_path)?;
+        if file.text.is_some() {
+            self.check_distinct(&file.path, &entry.configuration)?;
         }
+        Ok(entry)
     }
 
     /// Refuses a file with the name of a known configuration and other settings: tables and stores would show two methods
     /// of one name.
-    fn distinct(&self, path: PathBuf, entry: Entry) -> Result<Entry, ConfigurationError> {
-        let own = &entry.configuration;
+    fn check_distinct(&self, path: &Path, own: &Configuration) -> Result<(), ConfigurationError> {
         if !self.files.contains_key(&own.name) {
-            return Ok(entry);
+            return Ok(());
         }
         let known = self.get(&own.name)?.configuration;
-        let table = |configuration| toml::Table::try_from(configuration).unwrap_or_default();
+        let table = |configuration| Table::try_from(configuration).unwrap_or_default();
         match difference(&table(own), &table(&known)) {
-            None => Ok(entry),
+            None => Ok(()),
             Some(difference) => Err(ConfigurationError::Taken {
-                path,
+                path: path.to_owned(),
                 name: own.name.clone(),
                 difference,
             }),
         }
     }
 
-    /// The submission of a settings file with this text. Errors speak of it as `path`, after which it is named
+    /// The configuration of a settings file with this text. Errors speak of it as `path`, after which it is named
     /// where it does not name itself, and relative to which it finds files that it extends.
     ///
     /// # Errors
     /// Where the text, or what it extends, is not valid.
     pub fn get_text(&self, path: &Path, text: &str) -> Result<Entry, ConfigurationError> {
-        let link = Link {
-            file: File::parse(path, text)?,
-            path: path.to_owned(),
-            text: Some(text.to_owned()),
-        };
-        self.entry(link, &path.to_string_lossy())
+        let file = File::own(path, text.to_owned())?;
+        self.entry(&file, &path.to_string_lossy())
     }
 
     /// What a file, called `asked`, resolves to.
-    fn entry(&self, link: Link, asked: &str) -> Result<Entry, ConfigurationError> {
-        let (published, extends) = (link.file.published, link.file.extends.clone());
-        let (path, name) = (link.path.clone(), own_name(&link.file, &link.path));
-        let description = link.file.description.clone().unwrap_or_default();
-        let settings = self.resolve(link, &mut vec![asked.to_owned()])?;
-        let configuration =
-            settings
-                .complete(name, description)
-                .map_err(|key| ConfigurationError::Missing {
-                    path: path.clone(),
-                    key,
-                })?;
-        configuration
-            .validate()
-            .map_err(|error| ConfigurationError::Range { path, error })?;
+    fn entry(&self, file: &File, asked: &str) -> Result<Entry, ConfigurationError> {
+        let settings = self.resolve(file, &mut vec![asked.to_owned()])?;
+        let configuration = read(file, &settings).map_err(|error| file.fault(error))?;
         Ok(Entry {
             configuration,
-            published,
-            extends,
+            published: file.head.published,
+            extends: file.head.extends.clone(),
         })
     }
 
     /// The settings of a file over those of what it extends. Its own keys have to be of use.
-    fn resolve(
-        &self,
-        link: Link,
-        chain: &mut Vec<String>,
-    ) -> Result<PartialConfiguration, ConfigurationError> {
-        let Link { path, file, text } = link;
-        let base = match file.extends.clone() {
-            None => PartialConfiguration::default(),
+    fn resolve(&self, file: &File, chain: &mut Vec<String>) -> Result<Table, ConfigurationError> {
+        let path = &file.path;
+        let base = match &file.head.extends {
+            None => Table::new(),
             Some(parent) => {
-                let again = chain.contains(&parent);
+                let again = chain.contains(parent);
                 chain.push(parent.clone());
-                if again || chain.len() > MAX_DEPTH {
-                    let chain = chain.join(" → ");
-                    return Err(ConfigurationError::Cycle { path, chain });
+                if again || chain.len() > MAX_CHAIN {
+                    return Err(ConfigurationError::Cycle {
+                        path: path.clone(),
+                        chain: chain.join(" → "),
+                    });
                 }
-                self.resolve(self.find(&parent, Some(&path))?, chain)?
+                self.resolve(&self.find(parent, Some(path))?, chain)?
             }
         };
-        let settings = file.settings().over(base);
-        if let Some(text) = text
-            && let Ok(configuration) = settings.complete(String::new(), String::new())
-            && let Some(dead) = dead_keys(&text, &configuration).into_iter().next()
-        {
-            return Err(ConfigurationError::Dead {
-                path,
-                line: dead.line,
-                key: dead.key,
-                reason: dead.reason,
-            });
+        let settings = merge(base, &file.settings);
+        if file.text.is_none() {
+            return Ok(settings);
+        }
+        match read(file, &settings) {
+            Ok(configuration) => {
+                if let Some((key, reason)) = unused_keys(&file.settings, &configuration)
+                    .into_iter()
+                    .next()
+                {
+                    return Err(file.fault(SettingError::Unused { key, reason }));
+                }
+            }
+            // Those who extend this file may set what is missing, and change what does not fit together.
+            Err(SettingError::Missing { .. } | SettingError::OutOfRange(_)) => {}
+            Err(error) => return Err(file.fault(error)),
         }
         Ok(settings)
     }
 
     /// The file of a name or path; paths are relative to the file `from` that names them.
-    fn find(&self, name: &str, from: Option<&Path>) -> Result<Link, ConfigurationError> {
-        if let Some((path, file)) = self.files.get(name) {
-            return Ok(Link {
-                path: path.clone(),
-                file: file.clone(),
-                text: None,
-            });
+    fn find(&self, name: &str, from: Option<&Path>) -> Result<File, ConfigurationError> {
+        if let Some(file) = self.files.get(name) {
+            return Ok(file.clone());
         }
         let path = match from.and_then(Path::parent) {
             Some(folder) => folder.join(name),
@@ -261,17 +465,37 @@ impl Registry {
                 known: self.names.join(", "),
             });
         }
-        let text = read(&path)?;
-        Ok(Link {
-            file: File::parse(&path, &text)?,
-            path,
-            text: Some(text),
-        })
+        File::own(&path, read_text(&path)?)
     }
 }
 
-/// The path that errors about a text without a file name.
-const TEXT: &str = "settings";
+/// The configuration of `settings`, with the name and description of `file`.
+fn read(file: &File, settings: &Table) -> Result<Configuration, SettingError> {
+    let description = file.head.description.clone().unwrap_or_default();
+    let mut all = settings.clone();
+    all.insert("name".into(), file.name().into());
+    all.insert("description".into(), description.into());
+    configuration_of(all)
+}
+
+fn read_text(path: &Path) -> Result<String, ConfigurationError> {
+    let mut text = String::new();
+    std::fs::File::open(path)
+        .and_then(|file| file.take(MAX_FILE_BYTES + 1).read_to_string(&mut text))
+        .map_err(|source| ConfigurationError::Read {
+            path: path.to_owned(),
+            source,
+        })?;
+    if text.len() as u64 > MAX_FILE_BYTES {
+        return Err(ConfigurationError::Syntax {
+            path: path.to_owned(),
+            message: format!(
+                "it has more than {MAX_FILE_BYTES} bytes, the most that settings may have"
+            ),
+        });
+    }
+    Ok(text)
+}
 
 impl FromStr for Configuration {
     type Err = ConfigurationError;
@@ -284,20 +508,45 @@ impl FromStr for Configuration {
     }
 }
 
-/// One file of a chain.
-struct Link {
-    path: PathBuf,
-    file: File,
-    /// Text of a user's own file. Embedded ones hold values in stand-by for those who extend them.
-    text: Option<String>,
+/// A method to start a file of one's own with.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Template {
+    /// The Hopfield network of the paper.
+    Network,
+    /// The linear network in closed form.
+    Linear,
 }
 
-/// The name a file gives itself, or its own name without the ending.
-fn own_name(file: &File, path: &Path) -> String {
-    file.name.clone().unwrap_or_else(|| {
-        path.file_stem()
-            .map_or_else(String::new, |s| s.to_string_lossy().into_owned())
-    })
+impl Template {
+    /// A file with all settings of the method, each with its meaning, to be changed or thinned out. Those
+    /// that another setting turns off are comments.
+    ///
+    /// # Errors
+    /// Where the embedded configurations are not valid, which a test rules out.
+    pub fn text(self) -> Result<String, ConfigurationError> {
+        let (base, text) = match self {
+            Template::Network => ("paper", NETWORK),
+            Template::Linear => ("48/linear/star", LINEAR),
+        };
+        let registry = Registry::embedded()?;
+        let configuration = registry.get(base)?.configuration;
+        let unused = unused_keys(&registry.files[base].settings, &configuration);
+        let lines = unused.iter().filter_map(|(key, _)| line_of(text, key));
+        let unused: BTreeSet<usize> = lines.collect();
+        let mut own = String::new();
+        for (number, line) in (1..).zip(text.lines()) {
+            if line.starts_with("name =") {
+                own.push_str(&format!("extends = \"{base}\"\n"));
+            } else if line.starts_with("description =") {
+                own.push_str("description = \"my own variant\"\n");
+            } else if unused.contains(&number) {
+                own.push_str(&format!("# {line}\n"));
+            } else {
+                own.push_str(&format!("{line}\n"));
+            }
+        }
+        Ok(own)
+    }
 }
 
 /// The first setting that differs, in words. A description changes no result.
@@ -335,7 +584,7 @@ mod tests {
     }
 
     #[test]
-    fn every_embedded_submission_resolves_and_keeps_its_published_figures() {
+    fn embedded_files_resolve_and_keep_their_published_figures() {
         let registry = Registry::embedded().unwrap();
         assert_eq!(registry.names().len(), EMBEDDED.len() - BASES.len());
         assert_eq!(registry.published().unwrap().len(), 7);
@@ -459,7 +708,7 @@ mod tests {
         let wrong = "extends = \"48/linear/star\"\n[deconvolution]\nwindow_sigma = -6\n";
         let error = wrong.parse::<Configuration>().unwrap_err();
         assert!(
-            matches!(&error, ConfigurationError::Range { error, .. } if error.key == "deconvolution.window_sigma"),
+            matches!(&error, ConfigurationError::Setting { error, .. } if error.key() == "deconvolution.window_sigma"),
             "{error}"
         );
     }
@@ -545,7 +794,10 @@ mod tests {
         let child = "extends = \"dead.toml\"\n[stamp]\nsize = 29\n";
         assert!(message("child.toml", child).contains("dead.toml: line 3"));
         let missing = message("d.toml", "[stamp]\nsize = 23\n");
-        assert!(missing.contains("psf.form"), "{missing}");
+        assert!(
+            missing.contains("the key `method` is set neither"),
+            "{missing}"
+        );
         let cycle = message("e.toml", "extends = \"e.toml\"\n");
         assert!(cycle.contains("circle"), "{cycle}");
         let nobody = message("f.toml", "extends = \"23/raw/stars\"\n");
@@ -589,8 +841,37 @@ mod tests {
         let own = write(folder.path(), "own.toml", text);
         let message = registry.get(&own).unwrap_err().to_string();
         assert!(
-            message.contains("`deconvolution.target_sigma` is set"),
+            message.contains("`deconvolution.reference_area` is set"),
             "{message}"
         );
+    }
+
+    #[test]
+    fn a_template_resolves_to_its_base_and_sets_all_that_applies() {
+        let folder = tempfile::tempdir().unwrap();
+        let registry = Registry::embedded().unwrap();
+        for (template, base) in [
+            (Template::Network, "paper"),
+            (Template::Linear, "48/linear/star"),
+        ] {
+            let text = template.text().unwrap();
+            let path = folder.path().join("own.toml");
+            std::fs::write(&path, &text).unwrap();
+            let own = registry.get(path.to_str().unwrap()).unwrap().configuration;
+            let base = registry.get(base).unwrap().configuration;
+            assert_eq!((&own.stamp, &own.psf), (&base.stamp, &base.psf));
+            assert_eq!((&own.noise, &own.method), (&base.noise, &base.method));
+            let all = toml::Table::try_from(&own).unwrap();
+            for (section, keys) in all.iter().filter_map(|(s, t)| Some((s, t.as_table()?))) {
+                let (_, rest) = text.split_once(&format!("[{section}]\n")).unwrap();
+                let of_section = rest.split("\n[").next().unwrap();
+                for key in keys.keys() {
+                    let set = of_section
+                        .lines()
+                        .any(|l| l.starts_with(&format!("{key} =")));
+                    assert!(set, "{section}.{key}");
+                }
+            }
+        }
     }
 }

@@ -1,79 +1,106 @@
-//! The settings of a submission, section by section.
-//!
-//! A section of a file may hold any key of any method, or none: it is partial. The complete sections, as
-//! a measurement takes them, hold what their method uses and no more. One macro writes how these are made
-//! of those, so that a key cannot be forgotten in one.
+//! The settings of a configuration, section by section. Each is declared here once: its key, its type, its meaning and
+//! its range.
 
-use serde::{Deserialize, Serialize};
+use std::ops::RangeInclusive;
 
-use crate::limits::LEAST_PSF;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use toml::Table;
 
-/// Declares a section as one file of an inheritance chain gives it.
-macro_rules! partial {
-    ($name:ident { $($field:ident: $type:ty,)* }) => {
-        #[derive(Debug, Clone, Default, Deserialize)]
-        #[serde(deny_unknown_fields)]
-        pub(crate) struct $name {
-            $($field: Option<$type>,)*
-        }
+use crate::error::OutOfRange;
+use crate::name::{EXPECTED, check_name, shown};
+use crate::registry::configuration_of;
 
-        impl $name {
-            /// `self` where it says something, `base` elsewhere.
-            fn over(self, base: Self) -> Self {
-                $name { $($field: self.$field.or(base.$field),)* }
-            }
-        }
-    };
+/// Limits that the arithmetic of the measurement sets to settings.
+pub mod limits {
+    use std::ops::RangeInclusive;
+
+    /// Largest side of what is cut of a stamp, in pixels.
+    pub const MAX_CUT: usize = 64;
+    /// Largest side of a PSF stamp, in pixels.
+    pub const MAX_PSF: usize = 48;
+    /// Pixels a side of the smallest PSF stamps that the linear method takes where its settings ask for more.
+    // Smaller ones lose too much of the wings: of a Moffat profile of FWHM 3.4 px, m changes by 0.002 at 20 px and by
+    // 0.01 at 16 px.
+    pub const LEAST_PSF: usize = 32;
+    /// Narrowest target of the linear method, in pixels.
+    // Chosen by hand, as is the broadest.
+    pub const MIN_TARGET: f64 = 1.0;
+    /// Broadest target of the linear method, in pixels.
+    pub const MAX_TARGET: f64 = 6.0;
+    /// Windows of the linear method: σ in pixels.
+    pub const WINDOWS: RangeInclusive<f64> = 2.0..=16.0;
+    /// Largest eigenvalue of G = DᵀD, D being Sun's high-pass (Sect. 3.1), rounded up: the square of the kernel's
+    /// transform where that is largest.
+    pub const MAX_ROUGHNESS: f64 = 0.0093;
+}
+use limits::{LEAST_PSF, MAX_CUT, MAX_PSF, MAX_ROUGHNESS, MAX_TARGET, MIN_TARGET, WINDOWS};
+
+/// The fault of `key` unless its value is `good`. Ranges contain neither NaN nor infinity.
+fn need(
+    good: bool,
+    key: &'static str,
+    found: impl Serialize,
+    expected: &'static str,
+) -> Result<(), OutOfRange> {
+    if good {
+        return Ok(());
+    }
+    // As a settings file has it.
+    let found = toml::Value::try_from(found).map_or_else(|e| e.to_string(), |v| v.to_string());
+    Err(OutOfRange {
+        key,
+        found,
+        expected,
+    })
 }
 
-/// Declares a complete section, and how it is made of a partial one: of those of its keys that it uses.
-macro_rules! section {
-    ($(#[$doc:meta])* $name:ident, $partial:ident, $key:literal {
-        $($(#[$field_doc:meta])* $field:ident: $type:ty,)*
-    }) => {
-        $(#[$doc])*
-        #[derive(Debug, Clone, PartialEq, Serialize)]
-        pub struct $name {
-            $($(#[$field_doc])* pub $field: $type,)*
-        }
-
-        impl $name {
-            /// The complete section, or the key that nothing in the chain sets.
-            fn of(partial: &$partial) -> Result<Self, &'static str> {
-                Ok($name {
-                    $($field: partial.$field.ok_or(concat!($key, ".", stringify!($field)))?,)*
-                })
-            }
-        }
-    };
+fn positive(key: &'static str, found: f64) -> Result<(), OutOfRange> {
+    let good = found > 0.0 && found.is_finite();
+    need(good, key, found, "a positive number")
 }
 
-partial! { PartialStamp { size: usize, } }
+/// Zero turns these settings off.
+fn zero_or(
+    range: RangeInclusive<f64>,
+    key: &'static str,
+    found: f64,
+    expected: &'static str,
+) -> Result<(), OutOfRange> {
+    need(found == 0.0 || range.contains(&found), key, found, expected)
+}
 
-section! {
-    /// The piece of the postage stamp that is worked on.
-    Stamp, PartialStamp, "stamp" {
-        /// Pixels a side, cut around the stamp's centre; 5 to 64.
-        size: usize,
+/// The piece of the postage stamp that is worked on.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Stamp {
+    /// Pixels a side, cut around the stamp's centre; 5 to 64.
+    pub size: usize,
+}
+
+impl Stamp {
+    fn validate(&self) -> Result<(), OutOfRange> {
+        let good = (5..=MAX_CUT).contains(&self.size);
+        need(good, "stamp.size", self.size, "5 to 64 pixels")
     }
 }
 
-partial! { PartialPsf { form: PsfForm, size: usize, } }
-
-section! {
-    /// The PSF used to deconvolve.
-    Psf, PartialPsf, "psf" {
-        /// From star stamps or from the functional form.
-        form: PsfForm,
-        /// Pixels a side of the PSF stamp; 3 to 48. With the linear method stamps may have fewer, from 32 on.
-        size: usize,
-    }
+/// The PSF used to deconvolve.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Psf {
+    /// From star stamps or from the functional form.
+    pub form: PsfForm,
+    /// Pixels a side of the PSF stamp; 3 to 48. With the linear method stamps may have fewer, from 32 on.
+    pub size: usize,
 }
 
-partial! { PartialNoise { source: Source, border: usize, correlation: usize, sky: SkySource, } }
+impl Psf {
+    fn validate(&self) -> Result<(), OutOfRange> {
+        let good = (3..=MAX_PSF).contains(&self.size);
+        need(good, "psf.size", self.size, "3 to 48 pixels")
+    }
+}
 
 /// Where the noise of a stamp is known from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(tag = "source", rename_all = "kebab-case")]
 pub enum NoiseSource {
     /// Median absolute deviation of the frame at the edge of each stamp.
@@ -88,29 +115,22 @@ pub enum NoiseSource {
         /// Largest distance in pixels, along each axis, of pixels that may be correlated; 0 for white noise.
         correlation: usize,
         /// From where the sky that is subtracted is known.
+        #[serde(default)]
         sky: SkySource,
     },
 }
 
 /// What is subtracted from stamps before they are measured.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum SkySource {
     /// A plane that all stamps of the image have in common, if it is significant and matters.
+    #[default]
     Image,
     /// A plane per stamp, fitted to the stamp's own border.
     Stamp,
     /// Nothing.
     None,
-}
-
-/// [`NoiseSource`] as a file names it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-enum Source {
-    Border,
-    Header,
-    Image,
 }
 
 impl NoiseSource {
@@ -122,31 +142,23 @@ impl NoiseSource {
         }
     }
 
-    fn of(partial: &PartialNoise) -> Result<Self, &'static str> {
-        Ok(match partial.source.ok_or("noise.source")? {
-            Source::Border => NoiseSource::Border {
-                border: partial.border.ok_or("noise.border")?,
-            },
-            Source::Header => NoiseSource::Header,
-            Source::Image => NoiseSource::Image {
-                correlation: partial.correlation.ok_or("noise.correlation")?,
-                sky: partial.sky.unwrap_or(SkySource::Image),
-            },
-        })
-    }
-}
-
-partial! {
-    PartialDenoise {
-        method: Filter,
-        levels: usize,
-        window: usize,
-        strength: f64,
+    fn validate(&self) -> Result<(), OutOfRange> {
+        match *self {
+            NoiseSource::Border { border } => {
+                let good = (1..=16).contains(&border);
+                need(good, "noise.border", border, "1 to 16 pixels")
+            }
+            NoiseSource::Header => Ok(()),
+            NoiseSource::Image { correlation, .. } => {
+                let good = correlation <= 4;
+                need(good, "noise.correlation", correlation, "0 to 4 pixels")
+            }
+        }
     }
 }
 
 /// Denoising of the full stamp before it is cut.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "method", rename_all = "kebab-case")]
 pub enum Denoise {
     /// Raw data.
@@ -155,89 +167,69 @@ pub enum Denoise {
     WaveletWiener(Wavelet),
 }
 
-/// [`Denoise`] as a file names it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-enum Filter {
-    None,
-    WaveletWiener,
+/// Settings of the Wiener filter of wavelet coefficients.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Wavelet {
+    /// Wavelet scales, each twice as coarse as the one before; 1 to 4.
+    pub levels: usize,
+    /// Half width in pixels of the window over which a coefficient's signal power is estimated.
+    pub window: usize,
+    /// Multiple of the noise variance that is subtracted from that power; 1 is the Wiener filter.
+    pub strength: f64,
 }
 
-section! {
-    /// Settings of the Wiener filter of wavelet coefficients.
-    Wavelet, PartialDenoise, "denoise" {
-        /// Wavelet scales, each twice as coarse as the one before; 1 to 4.
-        levels: usize,
-        /// Half width in pixels of the window over which a coefficient's signal power is estimated.
-        window: usize,
-        /// Multiple of the noise variance that is subtracted from that power; 1 is the Wiener filter.
-        strength: f64,
+impl Wavelet {
+    fn validate(&self) -> Result<(), OutOfRange> {
+        let good = (1..=4).contains(&self.levels);
+        need(good, "denoise.levels", self.levels, "1 to 4")?;
+        let good = self.window <= 8;
+        need(good, "denoise.window", self.window, "0 to 8 pixels")?;
+        positive("denoise.strength", self.strength)
     }
 }
 
-impl Denoise {
-    fn of(partial: &PartialDenoise) -> Result<Self, &'static str> {
-        Ok(match partial.method.ok_or("denoise.method")? {
-            Filter::None => Denoise::None,
-            Filter::WaveletWiener => Denoise::WaveletWiener(Wavelet::of(partial)?),
-        })
-    }
+/// Checks the settings that both methods have.
+fn validate_rule(step: f64, lambda: f64, max_iterations: usize) -> Result<(), OutOfRange> {
+    positive("deconvolution.step", step)?;
+    let good = lambda >= 0.0 && lambda.is_finite();
+    let expected = "zero or a positive number";
+    need(good, "deconvolution.lambda", lambda, expected)?;
+    let good = (1..=100_000).contains(&max_iterations);
+    let key = "deconvolution.max_iterations";
+    need(good, key, max_iterations, "1 to 100000")
 }
 
-partial! {
-    PartialDeconvolution {
-        update: Update,
-        step: f64,
-        step_scale: StepScale,
-        constant_step: f64,
-        lambda: f64,
-        max_iterations: usize,
-        start: Start,
-        clipping: Clipping,
-        kept: Kept,
-        brightness_unit: BrightnessUnit,
-        unit_divisor: f64,
-        psf_scale: PsfScale,
-        high_pass_divisor: f64,
-        target_sigma: f64,
-        window_sigma: f64,
-        reference_extent: f64,
-        reference_area: f64,
-    }
-}
-
-section! {
-    /// The Hopfield network.
-    NetworkDeconvolution, PartialDeconvolution, "deconvolution" {
-        /// How much a neuron changes when it is updated.
-        update: Update,
-        /// Step c of the adaptive rule (Eq. 10), as `step_scale` reads it.
-        step: f64,
-        /// What `step` is a multiple of.
-        step_scale: StepScale,
-        /// Change of a neuron under the constant rule, in units of brightness. The calibration of λ
-        /// works with both rules.
-        constant_step: f64,
-        /// Tikhonov parameter λ.
-        lambda: f64,
-        /// Most iterations M.
-        max_iterations: usize,
-        /// State of the neurons before the first iteration.
-        start: Start,
-        /// When negative neurons are set to zero (Eq. 12).
-        clipping: Clipping,
-        /// Which state is kept where the energy rises.
-        kept: Kept,
-        /// What one unit of brightness is, to which the thresholds (Eq. 9) refer.
-        brightness_unit: BrightnessUnit,
-        /// The unit is `brightness_unit` divided by this.
-        unit_divisor: f64,
-        /// What the PSF is divided by before H is made of it.
-        psf_scale: PsfScale,
-        /// Divisor of the high-pass kernel d (Sect. 3.1), printed as 100. λ acts through G = DᵀD, so that
-        /// a divisor of 1 moves its axis by 10⁴.
-        high_pass_divisor: f64,
-    }
+/// The Hopfield network.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct NetworkDeconvolution {
+    /// How much a neuron changes when it is updated.
+    pub update: Update,
+    /// Step c of the adaptive rule (Eq. 10), as `step_scale` reads it.
+    pub step: f64,
+    /// What `step` is a multiple of.
+    pub step_scale: StepScale,
+    /// Change of a neuron under the constant rule, in units of brightness. The calibration of λ
+    /// works with both rules.
+    pub constant_step: f64,
+    /// Tikhonov parameter λ.
+    pub lambda: f64,
+    /// Most iterations M.
+    pub max_iterations: usize,
+    /// State of the neurons before the first iteration.
+    pub start: Start,
+    /// When negative neurons are set to zero (Eq. 12).
+    pub clipping: Clipping,
+    /// Which state is kept where the energy rises.
+    pub kept: Kept,
+    /// What one unit of brightness is, to which the thresholds (Eq. 9) refer.
+    pub brightness_unit: BrightnessUnit,
+    /// The unit is `brightness_unit` divided by this.
+    pub unit_divisor: f64,
+    /// What the PSF is divided by before H is made of it.
+    pub psf_scale: PsfScale,
+    /// Divisor of the high-pass kernel d (Sect. 3.1), printed as 100. λ acts through G = DᵀD, so that
+    /// a divisor of 1 moves its axis by 10⁴.
+    pub high_pass_divisor: f64,
 }
 
 impl NetworkDeconvolution {
@@ -245,86 +237,126 @@ impl NetworkDeconvolution {
     pub fn printed_lambda(&self, lambda: f64) -> f64 {
         lambda * (PRINTED_DIVISOR / self.high_pass_divisor).powi(2)
     }
+
+    fn validate(&self) -> Result<(), OutOfRange> {
+        validate_rule(self.step, self.lambda, self.max_iterations)?;
+        positive("deconvolution.constant_step", self.constant_step)?;
+        positive("deconvolution.unit_divisor", self.unit_divisor)?;
+        let (key, divisor) = ("deconvolution.high_pass_divisor", self.high_pass_divisor);
+        let good = (1e-3..=1e6).contains(&divisor);
+        need(good, key, divisor, "0.001 to 1e6")?;
+        // Momentum goes on from a state of its own, which nothing would clip.
+        need(
+            !(self.clipping == Clipping::AfterTest && self.update == Update::Accelerated),
+            "deconvolution.clipping",
+            self.clipping,
+            "\"before-test\" or \"never\" with update = \"accelerated\"",
+        )
+    }
 }
 
 /// Divisor of d as Sect. 3.1 prints it.
 const PRINTED_DIVISOR: f64 = 100.0;
 
-section! {
-    /// The linear network: the adaptive rule without thresholds (Eq. 9) and clipping (Eq. 12), from zero
-    /// and on a plane without boundary, all M iterations in closed form.
-    LinearDeconvolution, PartialDeconvolution, "deconvolution" {
-        /// Step c of the adaptive rule (Eq. 10).
-        step: f64,
-        /// Tikhonov parameter λ.
-        lambda: f64,
-        /// Iterations M.
-        max_iterations: usize,
-        /// σ in pixels of the round Gaussian with which the result is convolved before its shape is
-        /// measured.
-        target_sigma: f64,
-        /// σ in pixels of the round Gaussian window by which the result is multiplied.
-        window_sigma: f64,
-        /// Mean square per axis of the galaxies' radii, in px² and without the PSF's, that the window is for. Where it is
-        /// measured with the noise, those of images with broader or narrower galaxies are wider or narrower; zero for
-        /// the same window on all.
-        reference_extent: f64,
-        /// Noise-equivalent area 1/Σp² in px² of the PSF that lengths are for. For a broader one target and weight are
-        /// longer; for one below half of it they are shorter. Zero for the same with all PSFs.
-        reference_area: f64,
+/// The linear network: the adaptive rule without thresholds (Eq. 9) and clipping (Eq. 12), from zero
+/// and on a plane without boundary, all M iterations in closed form.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct LinearDeconvolution {
+    /// Step c of the adaptive rule (Eq. 10).
+    pub step: f64,
+    /// Tikhonov parameter λ.
+    pub lambda: f64,
+    /// Iterations M.
+    pub max_iterations: usize,
+    /// σ in pixels of the round Gaussian with which the result is convolved before its shape is
+    /// measured.
+    pub target_sigma: f64,
+    /// σ in pixels of the round Gaussian window by which the result is multiplied.
+    pub window_sigma: f64,
+    /// Mean square per axis of the galaxies' radii, in px² and without the PSF's, that the window is for. Where it is
+    /// measured with the noise, those of images with broader or narrower galaxies are wider or narrower; zero for
+    /// the same window on all.
+    pub reference_extent: f64,
+    /// Noise-equivalent area 1/Σp² in px² of the PSF that lengths are for. For a broader one target and weight are
+    /// longer; for one below half of it they are shorter. Zero for the same with all PSFs.
+    pub reference_area: f64,
+}
+
+impl LinearDeconvolution {
+    fn validate(&self) -> Result<(), OutOfRange> {
+        validate_rule(self.step, self.lambda, self.max_iterations)?;
+        let (key, target) = ("deconvolution.target_sigma", self.target_sigma);
+        let good = (MIN_TARGET..=MAX_TARGET).contains(&target);
+        need(good, key, target, "1 to 6 pixels")?;
+        let (key, window) = ("deconvolution.window_sigma", self.window_sigma);
+        need(WINDOWS.contains(&window), key, window, "2 to 16 pixels")?;
+        let (key, extent) = ("deconvolution.reference_extent", self.reference_extent);
+        zero_or(0.1..=1e3, key, extent, "0, or 0.1 to 1000 px²")?;
+        let (key, area) = ("deconvolution.reference_area", self.reference_area);
+        zero_or(1.0..=1e4, key, area, "0, or 1 to 10000 px²")?;
+        // The largest eigenvalue of W is 1 for a PSF of sum one.
+        need(
+            self.step * (1.0 + MAX_ROUGHNESS * self.lambda) < 2.0,
+            "deconvolution.step",
+            self.step,
+            "step·(1 + 0.0093 lambda) below 2 with the linear method, which diverges beyond",
+        )
     }
 }
 
-partial! {
-    PartialShape {
-        acf: AcfKind,
-        background: Background,
-        acf_share: f64,
-        share_of: ShareOf,
-        weight_scale: f64,
-        half_snr: f64,
-        sheared_step: f64,
-        neighbours: Neighbours,
-        ellipticity: EllipticityType,
-        calibration: Calibration,
+/// Shape from the autocorrelation of the deconvolved stamp, clipped at a radius (Sect. 3.2).
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ClippedShape {
+    /// What the autocorrelation takes to lie outside the stamp.
+    pub acf: AcfKind,
+    /// What is subtracted before the light is counted.
+    pub background: Background,
+    /// Share of the ACF's light inside the radius at which it is clipped; above 0, at most 1.
+    pub acf_share: f64,
+    /// What it is a share of.
+    pub share_of: ShareOf,
+    /// Which ellipticity the catalogue reports as e1, e2.
+    pub ellipticity: EllipticityType,
+}
+
+impl ClippedShape {
+    fn validate(&self) -> Result<(), OutOfRange> {
+        let good = self.acf_share > 0.0 && self.acf_share <= 1.0;
+        let expected = "above 0 and at most 1";
+        need(good, "shape.acf_share", self.acf_share, expected)
     }
 }
 
-section! {
-    /// Shape from the autocorrelation of the deconvolved stamp, clipped at a radius (Sect. 3.2).
-    ClippedShape, PartialShape, "shape" {
-        /// What the autocorrelation takes to lie outside the stamp.
-        acf: AcfKind,
-        /// What is subtracted before the light is counted.
-        background: Background,
-        /// Share of the ACF's light inside the radius at which it is clipped; above 0, at most 1.
-        acf_share: f64,
-        /// What it is a share of.
-        share_of: ShareOf,
-        /// Which ellipticity the catalogue reports as e1, e2.
-        ellipticity: EllipticityType,
-    }
+/// Shape from the autocorrelation of the deconvolved stamp, under a Moffat weight of the galaxy's own
+/// ellipticity.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct WeightedShape {
+    /// Scale in pixels of the Moffat weight.
+    pub weight_scale: f64,
+    /// S/N at which a galaxy counts half, that of the best filter for a round galaxy of `reference_extent`: what is
+    /// added to the weighted integral of x² + y² by which the moments are divided halves the ellipticity of such a
+    /// galaxy, so that those of low S/N count less, as their noise asks. Zero for all alike.
+    pub half_snr: f64,
+    /// Shear of sheared versions of ellipticity, S/N, flux and size (`1p`, `1m`, `2p`, `2m`), which catalogues then have in
+    /// addition. Zero for none.
+    pub sheared_step: f64,
+    /// What is done about neighbours.
+    pub neighbours: Neighbours,
+    /// Which ellipticity the catalogue reports as e1, e2.
+    pub ellipticity: EllipticityType,
+    /// What ellipticities are divided by.
+    pub calibration: Calibration,
 }
 
-section! {
-    /// Shape from the autocorrelation of the deconvolved stamp, under a Moffat weight of the galaxy's own
-    /// ellipticity.
-    WeightedShape, PartialShape, "shape" {
-        /// Scale in pixels of the Moffat weight.
-        weight_scale: f64,
-        /// S/N at which a galaxy counts half, that of the best filter for a round galaxy of `reference_extent`: what is
-        /// added to the weighted integral of x² + y² by which the moments are divided halves the ellipticity of such a
-        /// galaxy, so that those of low S/N count less, as their noise asks. Zero for all alike.
-        half_snr: f64,
-        /// Shear of sheared versions of ellipticity, S/N, flux and size (`1p`, `1m`, `2p`, `2m`), which catalogues then have in
-        /// addition. Zero for none.
-        sheared_step: f64,
-        /// What is done about neighbours.
-        neighbours: Neighbours,
-        /// Which ellipticity the catalogue reports as e1, e2.
-        ellipticity: EllipticityType,
-        /// What ellipticities are divided by.
-        calibration: Calibration,
+impl WeightedShape {
+    fn validate(&self) -> Result<(), OutOfRange> {
+        let (scale, half) = (self.weight_scale, self.half_snr);
+        let good = (0.5..=10.0).contains(&scale);
+        need(good, "shape.weight_scale", scale, "0.5 to 10 pixels")?;
+        let good = (0.0..=1e3).contains(&half);
+        need(good, "shape.half_snr", half, "0 to 1000")?;
+        let (key, step) = ("shape.sheared_step", self.sheared_step);
+        zero_or(1e-3..=0.05, key, step, "0, or 0.001 to 0.05")
     }
 }
 
@@ -485,9 +517,10 @@ pub enum EllipticityType {
     Shear,
 }
 
-/// Every setting of a submission, resolved: those that its method uses and no others. Wherever they are read
+/// Every setting of a configuration, resolved: those that its method uses and no others. Wherever they are read
 /// from, they are checked against their ranges.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(remote = "Self")]
 pub struct Configuration {
     /// Name, as tables print it.
     pub name: String,
@@ -505,7 +538,7 @@ pub struct Configuration {
 }
 
 /// A method with its settings.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(tag = "method", rename_all = "kebab-case")]
 pub enum Method {
     /// The Hopfield network of the paper.
@@ -514,16 +547,8 @@ pub enum Method {
     Linear(LinearMethod),
 }
 
-/// [`Method`] as a file names it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub(crate) enum MethodName {
-    Network,
-    Linear,
-}
-
 /// Settings of the network.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct NetworkMethod {
     /// Denoising.
     pub denoise: Denoise,
@@ -534,12 +559,93 @@ pub struct NetworkMethod {
 }
 
 /// Settings of the linear network.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct LinearMethod {
     /// Deconvolution.
     pub deconvolution: LinearDeconvolution,
     /// Shape measurement.
     pub shape: WeightedShape,
+}
+
+impl LinearMethod {
+    /// Checks the settings for stamps of `n` pixels a side and PSFs of `p`.
+    fn validate(&self, n: usize, p: usize) -> Result<(), OutOfRange> {
+        self.deconvolution.validate()?;
+        self.shape.validate()?;
+        // Lags are up to 0.95 target_sigma apart; of a sharper weight their sums depend on where they lie.
+        let scale = self.shape.weight_scale;
+        need(
+            scale >= self.deconvolution.target_sigma,
+            "shape.weight_scale",
+            scale,
+            "at least deconvolution.target_sigma",
+        )?;
+        need(
+            n % 2 == p % 2,
+            "psf.size",
+            p,
+            "even with an even stamp.size and odd with an odd one, with the linear method, whose window is centred on the stamp",
+        )?;
+        // A wider one sees a galaxy that is beyond the stamp, and what wraps around.
+        let window = self.deconvolution.window_sigma;
+        need(
+            4.0 * window <= n as f64,
+            "deconvolution.window_sigma",
+            window,
+            "at most a quarter of stamp.size with the linear method",
+        )
+    }
+}
+
+impl Serialize for Configuration {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        // The derived one.
+        Configuration::serialize(self, serializer)
+    }
+}
+
+// Stored configurations, of JSON or TOML. They are read through a table, like files, so that a key that no method has is
+// refused: serde's `deny_unknown_fields` excludes `flatten`, with which a method's sections lie beside the others.
+impl<'de> Deserialize<'de> for Configuration {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        configuration_of(Table::deserialize(deserializer)?).map_err(serde::de::Error::custom)
+    }
+}
+
+impl Configuration {
+    /// The derived reader, which ignores what the method does not use.
+    pub(crate) fn from_table(table: Table) -> Result<Self, toml::de::Error> {
+        Configuration::deserialize(table)
+    }
+
+    /// Checks every setting against its range, and against the settings that it must agree with.
+    ///
+    /// Files are checked when they are read. A configuration that is made or changed in code is checked here.
+    ///
+    /// # Errors
+    /// The first setting that is out of range.
+    pub fn validate(&self) -> Result<(), OutOfRange> {
+        if check_name(&self.name).is_err() {
+            return Err(OutOfRange {
+                key: "name",
+                found: shown(&self.name),
+                expected: EXPECTED,
+            });
+        }
+        self.stamp.validate()?;
+        self.psf.validate()?;
+        self.noise.validate()?;
+        match &self.method {
+            Method::Network(network) => {
+                if let Denoise::WaveletWiener(wavelet) = &network.denoise {
+                    wavelet.validate()?;
+                }
+                network.deconvolution.validate()?;
+                network.shape.validate()
+            }
+            Method::Linear(linear) => linear.validate(self.stamp.size, self.psf.size),
+        }
+    }
 }
 
 /// How much of a PSF is cut around its middle.
@@ -618,57 +724,5 @@ impl Configuration {
             Method::Network(_) => Calibration::None,
             Method::Linear(linear) => linear.shape.calibration,
         }
-    }
-}
-
-/// The sections of one file, none of which must be complete.
-#[derive(Debug, Clone, Default)]
-pub(crate) struct PartialConfiguration {
-    pub(crate) method: Option<MethodName>,
-    pub(crate) stamp: PartialStamp,
-    pub(crate) psf: PartialPsf,
-    pub(crate) noise: PartialNoise,
-    pub(crate) denoise: PartialDenoise,
-    pub(crate) deconvolution: PartialDeconvolution,
-    pub(crate) shape: PartialShape,
-}
-
-impl PartialConfiguration {
-    pub(crate) fn over(self, base: Self) -> Self {
-        PartialConfiguration {
-            method: self.method.or(base.method),
-            stamp: self.stamp.over(base.stamp),
-            psf: self.psf.over(base.psf),
-            noise: self.noise.over(base.noise),
-            denoise: self.denoise.over(base.denoise),
-            deconvolution: self.deconvolution.over(base.deconvolution),
-            shape: self.shape.over(base.shape),
-        }
-    }
-
-    /// All settings of the method, or the key that nothing in the chain sets.
-    pub(crate) fn complete(
-        &self,
-        name: String,
-        description: String,
-    ) -> Result<Configuration, &'static str> {
-        Ok(Configuration {
-            name,
-            description,
-            stamp: Stamp::of(&self.stamp)?,
-            psf: Psf::of(&self.psf)?,
-            noise: NoiseSource::of(&self.noise)?,
-            method: match self.method.ok_or("method")? {
-                MethodName::Network => Method::Network(NetworkMethod {
-                    denoise: Denoise::of(&self.denoise)?,
-                    deconvolution: NetworkDeconvolution::of(&self.deconvolution)?,
-                    shape: ClippedShape::of(&self.shape)?,
-                }),
-                MethodName::Linear => Method::Linear(LinearMethod {
-                    deconvolution: LinearDeconvolution::of(&self.deconvolution)?,
-                    shape: WeightedShape::of(&self.shape)?,
-                }),
-            },
-        })
     }
 }

@@ -201,9 +201,14 @@ fn settings_of_a_baseline_are_checked_like_any_others() {
             "denoise",
             "strength",
             (-1.0).into(),
-            "`denoise.strength` is -1; expected a positive number",
+            "`denoise.strength` is -1.0; expected a positive number",
         ),
-        ("denoise", "levles", 2.into(), "unknown field `levles`"),
+        (
+            "denoise",
+            "levles",
+            2.into(),
+            "there is no setting `denoise.levles`",
+        ),
         ("shape", "acf_share", 2.0.into(), "`shape.acf_share` is 2"),
     ] {
         let mut edited: toml::Table = sound.parse().unwrap();
