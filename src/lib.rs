@@ -22,7 +22,7 @@ use commands::{
     merge, pack, quickstart, reproduce, run, score, select, show, simulate, study, submissions,
     unpack,
 };
-use shearq_files::frames::panic_is_caught;
+use shearq_files::parquet::panic_is_caught;
 use shearq_render::escape::visible;
 use shearq_render::figure::HeatMap;
 use shearq_render::table::Table;

@@ -5,8 +5,9 @@ use std::fs;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
+use shearq_files::frames::Metadata;
 use shearq_files::frames::polars::df;
-use shearq_files::frames::{Metadata, read_parquet, write_parquet};
+use shearq_files::parquet;
 
 use crate::support::{PACKED, Small, fits_image, floats, pixels_of, shearq, text};
 
@@ -18,23 +19,12 @@ fn damaged_tiles_are_refused_before_they_are_unpacked() {
     let first = "data/set02/galaxies-001.fits";
     for name in PACKED {
         let whole = fs::read(format!("tests/data/{name}.fits")).unwrap();
-        let key = |name: &str| {
-            let name = format!("{name:<8}= ");
-            let cards = whole.chunks_exact(80).skip(36);
-            let card = cards
-                .clone()
-                .find(|c| c.starts_with(name.as_bytes()))
-                .unwrap();
-            let value = String::from_utf8_lossy(&card[10..30]).trim().to_owned();
-            value.parse::<usize>().unwrap()
-        };
         let table = 2 * 2880
             + 2880
                 * whole[2 * 2880..]
                     .chunks_exact(2880)
                     .position(|b| b[0] == 0)
                     .unwrap();
-        let heap = table + key("NAXIS1") * key("NAXIS2");
         let length = u32::from_be_bytes(whole[table..table + 4].try_into().unwrap());
         let spoil = |change: &dyn Fn(&mut Vec<u8>)| {
             let mut bytes = whole.clone();
@@ -52,14 +42,6 @@ fn damaged_tiles_are_refused_before_they_are_unpacked() {
         spoil(&size(0));
         spoil(&size(1_000_000_000));
         spoil(&|b| b[table + 4..table + 8].copy_from_slice(&2_000_000_000u32.to_be_bytes()));
-        if name.starts_with("hcompress") {
-            // The side that the pixels themselves tell.
-            spoil(&|b| b[heap + 4] = 0xff);
-            spoil(&|b| b[heap + 22..heap + 25].fill(0xff));
-        }
-        if name == "plio" {
-            spoil(&|b| b[heap + 6..heap + 10].fill(0x7f));
-        }
     }
 }
 
@@ -213,8 +195,8 @@ fn footers_of_parquet_files_are_bounded() {
     let path = folder.path().join("long.parquet");
     let frame = df!("x" => [1.0]).unwrap();
     let metadata = Metadata::from([("a".to_owned(), "x".repeat(1 << 24))]);
-    write_parquet(fs::File::create(&path).unwrap(), &frame, &metadata).unwrap();
-    let error = read_parquet(&path, None, 1).unwrap_err().to_string();
+    parquet::write(fs::File::create(&path).unwrap(), &frame, &metadata).unwrap();
+    let error = parquet::read(&path, None, 1).unwrap_err().to_string();
     assert!(error.contains("long.parquet"), "{error}");
     assert!(error.contains("expected at most 16777216"), "{error}");
 }

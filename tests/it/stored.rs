@@ -221,13 +221,13 @@ fn numbers_that_no_catalogues_have_are_refused() {
 
     let recorded = Recorded::new();
     let path = files(&recorded.at("store"))[0].0.clone();
-    let metadata = shearq_files::frames::parquet_metadata(&path).unwrap();
+    let metadata = shearq_files::parquet::metadata(&path).unwrap();
     for (column, most) in [
         ("images", "at most 3"),
         ("galaxies", "at most"),
         ("flagged", "at most"),
     ] {
-        let mut table = shearq_files::frames::read_parquet(&path, None, 1_000).unwrap();
+        let mut table = shearq_files::parquet::read(&path, None, 1_000).unwrap();
         let values = vec![1_i64 << 62; table.height()];
         table
             .with_column(Column::new(column.into(), values))
@@ -236,7 +236,7 @@ fn numbers_that_no_catalogues_have_are_refused() {
         let _ = fs::remove_dir_all(&other);
         fs::create_dir(&other).unwrap();
         let file = fs::File::create(other.join("edited.parquet")).unwrap();
-        shearq_files::frames::write_parquet(file, &table, &metadata).unwrap();
+        shearq_files::parquet::write(file, &table, &metadata).unwrap();
         let message = fail(&["compare", "--store", text(&other)]);
         let expected = format!("row 1: column `{column}` is 4611686018427387904; expected {most}");
         assert!(message.contains(&expected), "{message}");

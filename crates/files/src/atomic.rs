@@ -4,127 +4,91 @@
 //! killed one: [`remove_leftovers`] in a folder that one process uses alone, [`sweep`] elsewhere. A lock marks the files
 //! of a running process.
 
-use std::fs;
-use std::io::{ErrorKind, Write};
+use std::ffi::OsString;
+use std::fs::{self, Permissions};
+use std::io::{self, ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
-use tempfile::{TempDir, TempPath};
+use tempfile::{Builder, NamedTempFile, TempDir};
 
 use crate::error::FileError;
 
-/// A file that is being written under a temporary name in the same folder. [`PartFile::finish`] renames it. If it is
-/// dropped before, it is removed.
+/// A file that is being written under a temporary name in the same folder, and locked. [`PartFile::finish`] renames it. If
+/// it is dropped before, it is removed.
 ///
 /// The temporary names differ, so that several processes can write the same file. The last one determines the content.
 #[derive(Debug)]
 pub struct PartFile {
-    part: PathBuf,
+    part: NamedTempFile,
     target: PathBuf,
-    finished: bool,
-    /// The file with a lock, on systems with locks.
-    _held: fs::File,
 }
 
 impl PartFile {
     /// Creates the folder and the file, which is open for writing.
-    ///
-    /// # Errors
-    /// If either cannot be created.
     pub fn create(target: impl AsRef<Path>) -> Result<(Self, fs::File), FileError> {
         let target = regular(target.as_ref())?;
-        let (part, held) = held(&target, "cannot write the file", |part| {
-            fs::File::create_new(part)
-        })?;
-        let file = held
-            .try_clone()
-            .map_err(FileError::doing(&target, "cannot write the file"))?;
-        let part = PartFile {
-            part,
-            target,
-            finished: false,
-            _held: held,
-        };
-        Ok((part, file))
+        let cannot = || FileError::doing(&target, "cannot write the file");
+        let (names, folder) = names_for(&target)?;
+        let part = held(NamedTempFile::path, || {
+            let mut builder = names.builder();
+            // tempfile's own files can be read by their user alone.
+            let part = builder.permissions(usual(0o666)).tempfile_in(&folder)?;
+            // File systems without locks have none that could be taken by others.
+            let _ = part.as_file().lock();
+            Ok(part)
+        });
+        let part = part.map_err(cannot())?;
+        let file = part.as_file().try_clone().map_err(cannot())?;
+        Ok((PartFile { part, target }, file))
     }
 
-    /// The temporary name.
     pub fn path(&self) -> &Path {
-        &self.part
+        self.part.path()
     }
 
-    /// The final name.
     pub fn target(&self) -> &Path {
         &self.target
     }
 
     /// Gives the file its name. The content is on disk before the name, and the name before any file that is written
     /// later.
-    ///
-    /// # Errors
-    /// If it cannot be flushed to disk or renamed.
-    pub fn finish(mut self) -> Result<(), FileError> {
-        self.flush()
-            .and_then(|()| fs::rename(&self.part, &self.target))
-            .map_err(FileError::doing(&self.target, "cannot write the file"))?;
-        self.finished = true;
-        sync_names(&self.target).map_err(FileError::doing(&self.target, "cannot write the file"))
+    pub fn finish(self) -> Result<(), FileError> {
+        let PartFile { part, target } = self;
+        part.as_file()
+            .sync_data()
+            .and_then(|()| Ok(part.persist(&target).map(drop)?))
+            .and_then(|()| sync_names(&target))
+            .map_err(FileError::doing(&target, "cannot write the file"))
     }
 
     /// Gives the file its name unless another file has it. Returns whether it was renamed.
-    ///
-    /// # Errors
-    /// If it cannot be flushed to disk or named.
-    pub fn finish_if_absent(mut self) -> Result<bool, FileError> {
-        let named = self.flush().and_then(|()| {
-            let part = TempPath::try_from_path(&self.part)?;
-            part.persist_noclobber(&self.target).map_err(|failure| {
-                // Only removing the temporary file can fail, which does not matter to the caller.
-                let _ = failure.path.keep();
-                failure.error
-            })
-        });
-        match named {
-            Ok(()) => {
-                self.finished = true;
-                sync_names(&self.target)
-                    .map_err(FileError::doing(&self.target, "cannot write the file"))?;
-                Ok(true)
-            }
-            Err(_) if self.target.exists() => Ok(false),
+    pub fn finish_if_absent(self) -> Result<bool, FileError> {
+        let PartFile { part, target } = self;
+        let cannot = || FileError::doing(&target, "cannot write the file");
+        part.as_file().sync_data().map_err(cannot())?;
+        match part.persist_noclobber(&target) {
+            Ok(_) => sync_names(&target).map_err(cannot()).map(|()| true),
+            Err(_) if target.exists() => Ok(false),
             // Some file systems cannot name a file only if there is none. Then the last one wins.
-            Err(_) => self.finish().map(|()| true),
-        }
-    }
-
-    fn flush(&self) -> std::io::Result<()> {
-        fs::File::open(&self.part).and_then(|file| file.sync_data())
-    }
-}
-
-impl Drop for PartFile {
-    fn drop(&mut self) {
-        if !self.finished {
-            // Nothing more can be done about a leftover here; the next run removes it.
-            let _ = fs::remove_file(&self.part);
+            Err(failure) => {
+                let part = failure.file;
+                PartFile { part, target }.finish().map(|()| true)
+            }
         }
     }
 }
 
-/// A folder on its way, like a [`PartFile`].
 #[derive(Debug)]
 pub struct PartFolder {
-    part: PathBuf,
+    part: TempDir,
+    path: PathBuf,
     target: PathBuf,
-    finished: bool,
-    /// The folder with a lock, on systems with locks.
-    _held: fs::File,
+    _lock: fs::File,
 }
 
 impl PartFolder {
-    /// Creates the folder under a temporary name, and removes leftovers of killed processes next to it.
-    ///
-    /// # Errors
-    /// If it cannot be created, or `target` exists and is no empty folder.
+    /// Creates the folder under a temporary name, and removes leftovers of killed processes next to it. `target` may be an
+    /// empty folder, but no other.
     pub fn new(target: impl AsRef<Path>) -> Result<Self, FileError> {
         let target = target.as_ref().to_owned();
         if target.exists() && !(target.is_dir() && list(&target)?.is_empty()) {
@@ -132,122 +96,104 @@ impl PartFolder {
             return Err(FileError::new(&target, message));
         }
         sweep_beside(&target);
-        let (part, held) = held(&target, "cannot make the folder", |part| {
-            fs::create_dir(part)?;
-            fs::File::open(part)
-        })?;
+        let (names, folder) = names_for(&target)?;
+        let made = held_folder(&names, &folder, usual(0o777));
+        let (part, lock) = made.map_err(FileError::doing(&target, "cannot make the folder"))?;
+        // tempfile makes an absolute path, which messages would show.
+        let path = folder.join(part.path().file_name().unwrap_or_default());
         Ok(PartFolder {
             part,
+            path,
             target,
-            finished: false,
-            _held: held,
+            _lock: lock,
         })
     }
 
-    /// The temporary name, for the files.
     pub fn path(&self) -> &Path {
-        &self.part
+        &self.path
     }
 
     /// Gives the folder its name, its files being on disk.
-    ///
-    /// # Errors
-    /// If a file cannot be flushed or the folder cannot be renamed.
     pub fn finish(mut self) -> Result<(), FileError> {
-        for path in list(&self.part)? {
+        for path in list(self.path())? {
             fs::File::open(&path)
                 .and_then(|file| file.sync_data())
                 .map_err(FileError::doing(&self.target, "cannot write the files"))?;
         }
-        fs::rename(&self.part, &self.target)
+        fs::rename(self.path(), &self.target)
             .and_then(|()| sync_names(&self.target))
             .map_err(FileError::doing(&self.target, "cannot make the folder"))?;
-        self.finished = true;
+        self.part.disable_cleanup(true);
         Ok(())
     }
 }
 
-impl Drop for PartFolder {
-    fn drop(&mut self) {
-        if !self.finished {
-            let _ = fs::remove_dir_all(&self.part);
-        }
-    }
-}
-
-/// A folder among the system's temporary ones that is removed when dropped. If the process is killed, the next
-/// temporary folder removes it.
+/// A folder among the system's temporary ones that is removed when dropped, and that no other user can look into. If the
+/// process is killed, the next temporary folder removes it.
 #[derive(Debug)]
 pub struct Scratch {
     folder: TempDir,
-    _held: fs::File,
+    _lock: fs::File,
 }
 
 impl Scratch {
-    /// Makes an empty folder that no other user can look into.
-    ///
-    /// # Errors
-    /// If it cannot be created.
     pub fn new() -> Result<Self, FileError> {
         let temporary = std::env::temp_dir();
         sweep(&temporary);
-        let mut folder = None;
-        let (_, held) = held(
-            &temporary.join("shearq"),
-            "cannot make a temporary folder",
-            |part| {
-                let made = tempfile::Builder::new()
-                    .rand_bytes(0)
-                    .prefix(part.file_name().unwrap_or_default())
-                    .tempdir_in(&temporary)?;
-                let file = fs::File::open(made.path());
-                folder = Some(made);
-                file
-            },
-        )?;
-        let folder = folder.ok_or_else(|| FileError::new(&temporary, "no temporary folder"))?;
+        let made = held_folder(&Names::of("shearq".as_ref()), &temporary, usual(0o700));
+        let doing = "cannot make a temporary folder";
+        let (folder, lock) = made.map_err(FileError::doing(&temporary, doing))?;
         Ok(Scratch {
             folder,
-            _held: held,
+            _lock: lock,
         })
     }
 
-    /// Its path.
     pub fn path(&self) -> &Path {
         self.folder.path()
     }
 }
 
-/// Most attempts to make a temporary file or folder. A single attempt fails once in thousands.
+// Most attempts to make a temporary file or folder. A single attempt fails once in thousands.
 const ATTEMPTS: u32 = 100;
 
-/// Makes a file or folder under a temporary name for `target` by `make`, and locks it.
-fn held(
-    target: &Path,
-    doing: &'static str,
-    mut make: impl FnMut(&Path) -> std::io::Result<fs::File>,
-) -> Result<(PathBuf, fs::File), FileError> {
+/// Makes a file or folder, and locks it, by `make`.
+fn held<T>(path: impl Fn(&T) -> &Path, mut make: impl FnMut() -> io::Result<T>) -> io::Result<T> {
     let mut attempts = 0;
     loop {
-        let part = part_of(target)?;
-        let file = match make(&part) {
+        match make() {
             // Before it was opened, another thread or process may have taken it for a leftover.
             Err(error) if error.kind() == ErrorKind::NotFound && attempts < ATTEMPTS => {
                 attempts += 1;
-                continue;
             }
-            made => made.map_err(FileError::doing(target, doing))?,
-        };
-        // File systems without locks have none that could be taken by others.
-        let _ = file.lock();
-        // Before it was locked, another process may have taken it for a leftover.
-        if part.exists() {
-            return Ok((part, file));
+            // Or before it was locked.
+            Ok(made) if !path(&made).exists() => {}
+            made => return made,
         }
     }
 }
 
-/// The file that `target` names, which may be a link to it and need not be there.
+fn held_folder(names: &Names, folder: &Path, mode: Permissions) -> io::Result<(TempDir, fs::File)> {
+    held(
+        |made: &(TempDir, fs::File)| made.0.path(),
+        || {
+            let part = names
+                .builder()
+                .permissions(mode.clone())
+                .tempdir_in(folder)?;
+            let lock = fs::File::open(part.path())?;
+            let _ = lock.lock();
+            Ok((part, lock))
+        },
+    )
+}
+
+/// These permissions, of which the system takes what its `umask` says.
+fn usual(mode: u32) -> Permissions {
+    std::os::unix::fs::PermissionsExt::from_mode(mode)
+}
+
+// The file that `target` names, which may be a link to it and need not be there.
 fn regular(target: &Path) -> Result<PathBuf, FileError> {
     match fs::metadata(target) {
         Ok(about) if !(about.is_file() || about.is_dir()) => {
@@ -261,27 +207,48 @@ fn regular(target: &Path) -> Result<PathBuf, FileError> {
     }
 }
 
-/// A temporary name for `target` in its folder, which is made.
-fn part_of(target: &Path) -> Result<PathBuf, FileError> {
+// Ending of temporary names, and the number of random letters and digits before it.
+const PART: &str = ".part";
+const RANDOM: usize = 16;
+
+struct Names {
+    start: OsString,
+}
+
+impl Names {
+    fn of(name: &std::ffi::OsStr) -> Self {
+        let mut start = OsString::from(".");
+        start.push(name);
+        start.push(".");
+        Names { start }
+    }
+
+    fn builder(&self) -> Builder<'_, '_> {
+        let mut builder = Builder::new();
+        builder.prefix(&self.start).suffix(PART).rand_bytes(RANDOM);
+        builder
+    }
+}
+
+/// Temporary names for `target`, and its folder, which is made.
+fn names_for(target: &Path) -> Result<(Names, PathBuf), FileError> {
     let name = target
         .file_name()
         .ok_or_else(|| FileError::new(target, "this is not the name of a file"))?;
-    let folder = target.parent().unwrap_or(Path::new(""));
-    if !folder.as_os_str().is_empty() {
-        fs::create_dir_all(folder).map_err(FileError::doing(folder, "cannot make the folder"))?;
-    }
-    let own: u64 = rand::random();
-    Ok(folder.join(format!(".{}.{own:016x}{PART}", name.to_string_lossy())))
+    let folder = folder_of(target);
+    fs::create_dir_all(folder).map_err(FileError::doing(folder, "cannot make the folder"))?;
+    Ok((Names::of(name), folder.to_owned()))
 }
 
-/// Ending of temporary names.
-const PART: &str = ".part";
+fn folder_of(target: &Path) -> &Path {
+    match target.parent() {
+        Some(folder) if !folder.as_os_str().is_empty() => folder,
+        _ => Path::new("."),
+    }
+}
 
 /// Removes the temporary files that killed processes left in `folder` and the folders in it. No other
 /// process may be writing there.
-///
-/// # Errors
-/// If a folder cannot be listed or a leftover cannot be removed.
 pub fn remove_leftovers(folder: &Path) -> Result<(), FileError> {
     for path in list(folder)? {
         if path.is_dir() {
@@ -299,7 +266,6 @@ fn list(folder: &Path) -> Result<Vec<PathBuf>, FileError> {
         .map_err(FileError::doing(folder, "cannot list the folder"))
 }
 
-/// Removes a file with a temporary name.
 fn remove_part(path: &Path) -> Result<(), FileError> {
     if !(is_part(path) && path.is_file()) {
         return Ok(());
@@ -311,13 +277,15 @@ fn remove_part(path: &Path) -> Result<(), FileError> {
     }
 }
 
-/// Whether a name is one that [`part_of`] gives.
+/// Whether a name is a temporary one. Other programs end their names in `.part`, too.
 fn is_part(path: &Path) -> bool {
     let name = path.file_name().unwrap_or_default().to_string_lossy();
     let own = name
         .strip_prefix('.')
         .and_then(|name| name.strip_suffix(PART)?.rsplit_once('.'));
-    own.is_some_and(|(_, own)| own.len() == 16 && own.bytes().all(|b| b.is_ascii_hexdigit()))
+    own.is_some_and(|(_, own)| {
+        own.len() == RANDOM && own.bytes().all(|b| b.is_ascii_alphanumeric())
+    })
 }
 
 /// Removes the temporary files and folders in `folder` that no running process has locked. Files without a known state
@@ -342,23 +310,14 @@ pub fn sweep(folder: &Path) {
     }
 }
 
-/// The same in the folder of `target`.
 pub fn sweep_beside(target: &Path) {
-    match target.parent() {
-        Some(folder) if !folder.as_os_str().is_empty() => sweep(folder),
-        _ => sweep(Path::new(".")),
-    }
+    sweep(folder_of(target));
 }
 
-/// Flushes the names in the folder of `file` to disk, so that even a power failure cannot keep later
-/// results without the record that was written before them.
-#[cfg(unix)]
-fn sync_names(file: &Path) -> std::io::Result<()> {
-    let folder = match file.parent() {
-        Some(folder) if !folder.as_os_str().is_empty() => folder,
-        _ => Path::new("."),
-    };
-    let folder = match fs::File::open(folder) {
+// Flushes the names in the folder of `file` to disk, so that even a power failure cannot keep later
+// results without the record that was written before them.
+fn sync_names(file: &Path) -> io::Result<()> {
+    let folder = match fs::File::open(folder_of(file)) {
         // A folder that may be written to but not read.
         Err(error) if error.kind() == ErrorKind::PermissionDenied => return Ok(()),
         folder => folder?,
@@ -370,24 +329,12 @@ fn sync_names(file: &Path) -> std::io::Result<()> {
     }
 }
 
-/// On other systems a folder cannot be opened as a file.
-#[cfg(not(unix))]
-fn sync_names(_file: &Path) -> std::io::Result<()> {
-    Ok(())
-}
-
 /// Writes `bytes` to `target`, whole or not at all.
-///
-/// # Errors
-/// If the file cannot be written.
 pub fn write(target: impl AsRef<Path>, bytes: &[u8]) -> Result<(), FileError> {
     written(target, bytes)?.finish()
 }
 
 /// Like [`write()`], but does not replace an existing `target`. Returns whether it was written.
-///
-/// # Errors
-/// If the file cannot be written.
 pub fn write_if_absent(target: impl AsRef<Path>, bytes: &[u8]) -> Result<bool, FileError> {
     written(target, bytes)?.finish_if_absent()
 }

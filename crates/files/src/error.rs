@@ -9,7 +9,6 @@ use thiserror::Error;
 #[derive(Debug, Error)]
 #[error("{}: {message}", path.display())]
 pub struct FileError {
-    /// The file.
     pub path: PathBuf,
     /// Place, found value, expected value.
     pub message: String,
@@ -17,24 +16,23 @@ pub struct FileError {
     pub no_column: bool,
 }
 
-/// Most names of columns that a message lists.
-const SHOWN: usize = 40;
+// Most names of columns that a message lists.
+const MAX_NAMES: usize = 40;
 
-/// Most characters of a message, which may quote contents of a file.
-const LONGEST: usize = 4000;
+// Most characters of a message, which may quote contents of a file.
+const MAX_MESSAGE_CHARS: usize = 4000;
 
 /// Names of columns as a message lists them.
 pub fn names_of(names: &[impl AsRef<str>]) -> String {
-    let shown: Vec<&str> = names.iter().take(SHOWN).map(AsRef::as_ref).collect();
-    let more = if names.len() > SHOWN { ", …" } else { "" };
+    let shown: Vec<&str> = names.iter().take(MAX_NAMES).map(AsRef::as_ref).collect();
+    let more = if names.len() > MAX_NAMES { ", …" } else { "" };
     shown.join(", ") + more
 }
 
 impl FileError {
-    /// About `path`, saying `message`.
     pub fn new(path: impl AsRef<Path>, message: impl Display) -> Self {
         let mut message = message.to_string();
-        if let Some((end, _)) = message.char_indices().nth(LONGEST) {
+        if let Some((end, _)) = message.char_indices().nth(MAX_MESSAGE_CHARS) {
             message.truncate(end);
             message.push('…');
         }

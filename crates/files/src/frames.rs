@@ -1,40 +1,108 @@
-//! polars' frames of named columns, in Parquet files.
-//!
-//! [`frame`] makes a frame from columns. [`write_parquet`] writes it with text metadata. [`read_parquet`] reads all or
-//! some columns of a file that may be damaged. [`parquet_columns`] and [`parquet_metadata`] read only the footer.
-//!
-//! ```
-//! use shearq_files::frames::polars::Column;
-//! use shearq_files::frames::{Metadata, frame, parquet_metadata, read_parquet, reals, write_parquet};
-//!
-//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
-//! let galaxies = frame(vec![
-//!     Column::new("id".into(), [1_i64, 2]),
-//!     Column::new("g1".into(), [0.02, f64::NAN]),
-//! ])?;
-//! let metadata = Metadata::from([("branch".into(), "constant".into())]);
-//! # let folder = tempfile::tempdir()?;
-//! # let path = folder.path().join("shear.parquet");
-//! write_parquet(std::fs::File::create(&path)?, &galaxies, &metadata)?;
-//!
-//! let shear = read_parquet(&path, Some(&["g1"]), 1_000)?;
-//! assert_eq!(shear.height(), 2);
-//! assert_eq!(reals(shear.column("g1")?).unwrap()[0], 0.02);
-//! assert_eq!(parquet_metadata(&path)?["branch"], "constant");
-//! # Ok(())
-//! # }
-//! ```
+//! polars' frames of named columns, with text metadata.
 
-mod attributes;
-mod error;
-mod frame;
-mod parquet;
+use std::borrow::Cow;
+use std::collections::{BTreeMap, BTreeSet};
 
-/// The data frames in use.
-pub use ::polars::prelude as polars;
-pub use error::TableError;
-pub use frame::{Metadata, element_name, element_of, frame, reals};
-pub use parquet::{
-    panic_is_caught, parquet_columns, parquet_metadata, read_parquet, read_parquet_groups,
-    write_parquet,
+use ::polars::prelude::{
+    ChunkedArray, Column, DataFrame, DataType, PolarsError, PolarsNumericType,
 };
+
+pub use ::polars::prelude as polars;
+
+/// Why columns make no frame, or a frame no file.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum TableError {
+    #[error("column `{name}` is named twice; expected every name once")]
+    DuplicateColumn { name: String },
+    #[error(
+        "column `{column}` has {found} rows; expected {expected}, as in the first column `{first}`"
+    )]
+    UnequalLengths {
+        column: String,
+        found: usize,
+        first: String,
+        expected: usize,
+    },
+    #[error("cannot make a table: {0}")]
+    Invalid(PolarsError),
+    #[error("metadata key `{key}` is reserved for the file's own schema; use another")]
+    ReservedKey { key: String },
+    #[error("cannot write the Parquet table: {0}")]
+    Write(PolarsError),
+}
+
+/// Text by name, which a file contains in addition to its columns.
+pub type Metadata = BTreeMap<String, String>;
+
+pub fn frame(columns: Vec<Column>) -> Result<DataFrame, TableError> {
+    let mut seen = BTreeSet::new();
+    for column in &columns {
+        let name = column.name().to_string();
+        let (first, expected) = (columns[0].name(), columns[0].len());
+        if column.len() != expected {
+            return Err(TableError::UnequalLengths {
+                column: name,
+                found: column.len(),
+                first: first.to_string(),
+                expected,
+            });
+        }
+        if !seen.insert(name.clone()) {
+            return Err(TableError::DuplicateColumn { name });
+        }
+    }
+    DataFrame::new_infer_height(columns).map_err(TableError::Invalid)
+}
+
+/// The values of a column of numbers as 64-bit floats; `None` for another column. A missing value is NaN, true is 1 and
+/// false 0. Integers beyond ±2⁵³ are rounded. 64-bit floats in one piece are borrowed, not copied.
+pub fn reals(column: &Column) -> Option<Cow<'_, [f64]>> {
+    let series = column.as_materialized_series();
+    if let Ok(all) = series.f64()
+        && let Ok(whole) = all.cont_slice()
+    {
+        return Some(Cow::Borrowed(whole));
+    }
+    let values = match series.dtype() {
+        DataType::Float64 => series.f64().ok().map(|all| list(all, |v| v)),
+        DataType::Float32 => series.f32().ok().map(|all| list(all, f64::from)),
+        DataType::Int64 => series.i64().ok().map(|all| list(all, |v| v as f64)),
+        DataType::UInt64 => series.u64().ok().map(|all| list(all, |v| v as f64)),
+        DataType::Int32 => series.i32().ok().map(|all| list(all, f64::from)),
+        DataType::UInt32 => series.u32().ok().map(|all| list(all, f64::from)),
+        DataType::Boolean => series.bool().ok().map(|all| {
+            let value = |flag: Option<bool>| flag.map_or(f64::NAN, f64::from);
+            all.iter().map(value).collect()
+        }),
+        _ => None,
+    };
+    values.map(Cow::Owned)
+}
+
+/// The name of the number at `place` of the vectors in a column.
+pub fn element_name(column: &str, place: impl std::fmt::Display) -> String {
+    format!("{column}[{place}]")
+}
+
+/// The column and the place that [`element_name`] named.
+pub fn element_of(name: &str) -> Option<(&str, usize)> {
+    let (column, place) = name.strip_suffix(']')?.rsplit_once('[')?;
+    Some((column, place.parse().ok()?))
+}
+
+fn list<T>(chunks: &ChunkedArray<T>, convert: impl Fn(T::Native) -> f64) -> Vec<f64>
+where
+    T: PolarsNumericType,
+{
+    let mut values = Vec::with_capacity(chunks.len());
+    for chunk in chunks.downcast_iter() {
+        if chunk.validity().is_none() {
+            values.extend(chunk.values().iter().map(|&value| convert(value)));
+        } else {
+            let value = |value: Option<&T::Native>| value.map_or(f64::NAN, |&value| convert(value));
+            values.extend(chunk.iter().map(value));
+        }
+    }
+    values
+}

@@ -8,7 +8,6 @@ pub mod atomic;
 mod error;
 pub mod fits;
 pub mod frames;
-mod limits;
 pub mod open;
 pub mod parquet;
 pub mod table;

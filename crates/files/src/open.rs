@@ -12,9 +12,6 @@ pub const DATA: u64 = 1 << 27;
 pub const SETTINGS: u64 = 1 << 22;
 
 /// Opens a regular file, or a link to one.
-///
-/// # Errors
-/// If it cannot be opened or is not a regular file.
 pub fn open(path: &Path) -> std::io::Result<File> {
     // Checked before, because opening a pipe waits and opening a device may act. Checked after, because the name may
     // have changed its file.
@@ -31,9 +28,6 @@ pub fn is_there(path: &Path) -> bool {
 }
 
 /// All bytes of a file.
-///
-/// # Errors
-/// As [`open`], and if there are more than `most` bytes.
 pub fn read(path: &Path, most: u64) -> std::io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
     open(path)?.take(most + 1).read_to_end(&mut bytes)?;
@@ -45,10 +39,6 @@ pub fn read(path: &Path, most: u64) -> std::io::Result<Vec<u8>> {
     Ok(bytes)
 }
 
-/// All of a file as text.
-///
-/// # Errors
-/// As [`read`], and if it is not UTF-8.
 pub fn read_to_string(path: &Path, most: u64) -> std::io::Result<String> {
     String::from_utf8(read(path, most)?).map_err(|error| {
         let message = format!("byte {} is not UTF-8", error.utf8_error().valid_up_to() + 1);

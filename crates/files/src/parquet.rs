@@ -1,84 +1,718 @@
-//! Parquet tables of numbers.
+//! Parquet files.
+//!
+//! Writing uses polars' frame writer. Reading uses polars' footer parser and column decoder, but reads the bytes itself:
+//!
+//! * Only the wanted column chunks are read.
+//! * Files are not memory-mapped: a mapped file that shrinks kills the process.
+//! * No second thread pool starts.
+//! * 8- and 16-bit integers decode into wider ones without polars' features for them.
 
+use std::cell::Cell;
+use std::collections::{BTreeMap, BTreeSet};
+use std::fs::File;
+use std::io::{Cursor, Read, Seek, SeekFrom, Write};
+use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 
-use crate::frames::polars::DataFrame;
-use crate::frames::{self as tables, Metadata};
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
+use polars::prelude::{
+    ArrowDataType, ArrowField, ChunkFillNullValue, ChunkedArray, Column, CompatLevel, DataFrame,
+    DataType, FileMetadataRef, IntoSeries, KeyValueMetadata, NamedFrom, ParquetCompression,
+    ParquetReader, ParquetWriter, PolarsError, PolarsNumericType, PolarsResult, SchemaExt,
+    SerReader, Series, StatisticsOptions,
+};
+use polars_arrow::io::ipc::write::{default_ipc_fields, schema_to_bytes};
+use polars_parquet::parquet::page::CompressedPage;
+use polars_parquet::read::{
+    BasicDecompressor, ColumnChunkMetadata, PageReader, column_iter_to_arrays,
+};
+use serde_json::{Map, Value, json};
 
-use crate::atomic;
 use crate::error::FileError;
+use crate::frames::{Metadata, TableError, element_name, element_of, frame, reals};
+use crate::open;
 
-/// Reads columns of numbers, at most `most_rows` rows: the columns `wanted`, or all.
-pub(super) fn read(
+// Longest vector whose numbers are columns with names of their own.
+const MAX_VECTOR: usize = 8;
+// The key under which Parquet files keep the Arrow schema.
+const SCHEMA_KEY: &str = "ARROW:schema";
+
+// Most values read of all columns of a file of fewer bytes than that; a larger one may have one for each byte.
+const FREE_VALUES: u64 = 1 << 22;
+// Most bytes of a page for each of its values if they are numbers: twice the widest, for dictionaries and gaps.
+const VALUE_BYTES: u64 = 16;
+// Most bytes that the pages of a column chunk, and all texts of a file, may unpack to beyond
+// `INFLATION` times the file's own.
+const FREE_BYTES: u64 = 1 << 26;
+// Most bytes of a footer: names, metadata, and some hundred bytes for each chunk of a column.
+const MAX_FOOTER: u32 = 1 << 24;
+// Most bytes for one of the file's in a large file.
+const INFLATION: u64 = 8;
+
+/// Writes `frame` as a Parquet file with `metadata` into `writer`.
+///
+/// Equal frames give equal bytes. The metadata becomes the file's key-value metadata, in the order
+/// of the keys, and is repeated in the Arrow schema, where pandas and astropy read it. The data are not compressed: measured shears and sizes are noise in most of their
+/// bits, so that compression gains a few per cent of space and costs up to half of the reading
+/// speed. Repeated values still become small, by dictionaries.
+///
+/// The file must be opened (and, to be replaced at once or not at all, renamed) by the caller.
+pub fn write<W: Write>(
+    writer: W,
+    frame: &DataFrame,
+    metadata: &Metadata,
+) -> Result<(), TableError> {
+    if metadata.contains_key(SCHEMA_KEY) {
+        return Err(TableError::ReservedKey {
+            key: SCHEMA_KEY.into(),
+        });
+    }
+    let pairs = metadata.iter();
+    let mut pairs: Vec<_> = pairs
+        .map(|(key, value)| (key.clone(), value.clone()))
+        .collect();
+    if !metadata.is_empty() {
+        pairs.push((SCHEMA_KEY.into(), arrow_schema(frame, metadata)));
+    }
+    ParquetWriter::new(writer)
+        .with_compression(ParquetCompression::Uncompressed)
+        // Nothing selects rows by minima and maxima, which cost a pass over the values.
+        .with_statistics(StatisticsOptions {
+            null_count: true,
+            ..StatisticsOptions::empty()
+        })
+        .with_key_value_metadata(Some(KeyValueMetadata::from_static(pairs)))
+        .set_parallel(false)
+        .finish(&mut frame.clone())
+        .map(drop)
+        .map_err(TableError::Write)
+}
+
+// Key of what becomes `DataFrame.attrs` in pandas.
+const PANDAS: &str = "PANDAS_ATTRS";
+// Key of what becomes `Table.meta` in astropy: YAML, of which JSON is a part.
+const ASTROPY: &str = "table_meta_yaml";
+// What precedes the length of a message of Arrow.
+const ARROW_START: [u8; 4] = [0xff; 4];
+
+/// The value of the key `ARROW:schema` for a table with `metadata`, which pyarrow, pandas and astropy read from there.
+fn arrow_schema(table: &DataFrame, metadata: &Metadata) -> String {
+    let pairs = metadata.iter();
+    let pairs: Map<String, Value> = pairs.map(|(k, v)| (k.clone(), json!(v))).collect();
+    let columns = table.columns().iter().map(|column| {
+        let kind = match column.dtype() {
+            DataType::Float64 => "float64",
+            DataType::Int64 => "int64",
+            _ => "string",
+        };
+        json!({"name": column.name().as_str(), "datatype": kind})
+    });
+    let columns: Vec<Value> = columns.collect();
+    let astropy = json!({"datatype": columns, "meta": pairs}).to_string();
+    let mut all: BTreeMap<_, _> = metadata
+        .iter()
+        .map(|(key, value)| (key.as_str().into(), value.as_str().into()))
+        .collect();
+    all.insert(ASTROPY.into(), astropy.into());
+    all.insert(PANDAS.into(), Value::Object(pairs).to_string().into());
+    let schema = table.schema().to_arrow(CompatLevel::newest());
+    let bytes = schema_to_bytes(
+        &schema,
+        &default_ipc_fields(schema.iter_values()),
+        Some(&all),
+    );
+    let length = (bytes.len() as u32).to_le_bytes();
+    STANDARD.encode([&ARROW_START[..], &length, &bytes].concat())
+}
+
+/// Reads the Parquet file at `path`: all columns in file order, or those in `wanted`, in that order.
+///
+/// Small integers become 32-bit ones, and text with a dictionary plain text. Missing values in float
+/// columns become NaN. Columns that are not wanted may be of any type. It runs on the calling thread
+/// alone, so that a caller with many files reads them in parallel. A file of more than `most_rows` rows is refused before
+/// memory is taken for them: repeated values take next to nothing in a file.
+pub fn read(
+    path: impl AsRef<Path>,
+    wanted: Option<&[&str]>,
+    most_rows: usize,
+) -> Result<DataFrame, FileError> {
+    let path = path.as_ref();
+    let mut source = Source::open(path)?;
+    let wanted_all = |fields: &[ArrowField]| fields.iter().cloned().map(Wanted::whole).collect();
+    let fields = match wanted {
+        None => wanted_all(&source.fields),
+        Some(names) => source.pick(names)?,
+    };
+    source.check_rows(most_rows)?;
+    if wanted.is_none() {
+        source.check_values(fields.len())?;
+    }
+    let columns = fields.iter().map(|field| source.read_column(field));
+    let columns = columns.collect::<Result<_, FileError>>()?;
+    frame(columns).map_err(|error| FileError::new(path, error))
+}
+
+/// The same of columns of numbers: columns of text are left out, and refused if they are wanted.
+pub(crate) fn read_numbers(
     path: &Path,
     wanted: Option<&[&str]>,
     most_rows: usize,
 ) -> Result<DataFrame, FileError> {
-    let mut table =
-        tables::read_parquet(path, wanted, most_rows).map_err(|error| bare(path, &error))?;
-    let texts: Vec<String> = table
-        .columns()
-        .iter()
-        .filter(|column| column.dtype().is_string())
-        .map(|column| column.name().to_string())
-        .collect();
+    let table = read(path, wanted, most_rows)?;
+    let columns = table.columns().iter();
+    let texts = columns.filter(|column| column.dtype().is_string());
+    let texts: Vec<String> = texts.map(|column| column.name().to_string()).collect();
     if let (Some(name), Some(_)) = (texts.first(), wanted) {
         let message = format!("column `{name}` holds text; expected numbers");
         return Err(FileError::new(path, message));
     }
-    table = table.drop_many(texts);
-    Ok(table)
+    Ok(table.drop_many(texts))
 }
 
-/// Reads columns of numbers or text by row groups.
-pub(super) fn read_groups(
+/// Reads the columns `wanted` by row groups of at most `most_rows` rows, and gives each group to `take`.
+pub(crate) fn read_groups(
     path: &Path,
     wanted: &[&str],
     most_rows: usize,
     mut take: impl FnMut(DataFrame) -> Result<(), FileError>,
 ) -> Result<(), FileError> {
-    enum Failure {
-        Read(tables::TableError),
-        Taken(FileError),
+    let mut source = Source::open(path)?;
+    let fields = source.pick(wanted)?;
+    let fields: Vec<Wanted> = fields
+        .iter()
+        .map(|field| source.decoded(field))
+        .collect::<Result<_, FileError>>()?;
+    source.check_rows(usize::MAX)?;
+    for number in 0..source.footer.row_groups.len() {
+        let rows = source.footer.row_groups[number].num_rows();
+        if rows > most_rows {
+            let detail = format!("found a row group of {rows} rows, expected at most {most_rows}");
+            return Err(damaged(path, detail));
+        }
+        let column = |field| with_missing(path, source.read_chunk(field, number)?);
+        let columns = fields.iter().map(column);
+        let columns = columns.collect::<Result<_, FileError>>()?;
+        take(frame(columns).map_err(|error| FileError::new(path, error))?)?;
     }
-    impl From<tables::TableError> for Failure {
-        fn from(error: tables::TableError) -> Self {
-            Failure::Read(error)
+    Ok(())
+}
+
+/// The names of the columns, in file order, from the footer alone.
+pub fn columns(path: impl AsRef<Path>) -> Result<Vec<String>, FileError> {
+    Ok(Source::open(path.as_ref())?.names())
+}
+
+pub fn metadata(path: impl AsRef<Path>) -> Result<Metadata, FileError> {
+    let source = Source::open(path.as_ref())?;
+    let pairs = source.footer.key_value_metadata().iter().flatten();
+    // Arrow's schema repeats them.
+    let own = pairs.filter(|pair| pair.key != SCHEMA_KEY);
+    Ok(own
+        .map(|pair| (pair.key.clone(), pair.value.clone().unwrap_or_default()))
+        .collect())
+}
+
+fn damaged(path: &Path, detail: impl std::fmt::Display) -> FileError {
+    let message = format!("not a readable Parquet file, or damaged: {detail}");
+    FileError::new(path, message)
+}
+
+/// A column, or the numbers at one place of a column of vectors.
+struct Wanted {
+    field: ArrowField,
+    element: Option<usize>,
+}
+
+impl Wanted {
+    fn whole(field: ArrowField) -> Self {
+        Wanted {
+            field,
+            element: None,
         }
     }
-    let take = |group| take(group).map_err(Failure::Taken);
-    tables::read_parquet_groups(path, wanted, most_rows, take).map_err(|failure| match failure {
-        Failure::Read(error) => bare(path, &error),
-        Failure::Taken(error) => error,
+
+    fn taken(&self, vectors: Series) -> Result<Series, String> {
+        let Some(place) = self.element else {
+            return Ok(vectors);
+        };
+        let mut numbers = Vec::with_capacity(vectors.len());
+        for chunk in vectors
+            .list()
+            .map_err(|error| error.to_string())?
+            .downcast_iter()
+        {
+            let inner = Series::try_from((self.field.name.clone(), chunk.values().clone()));
+            let inner = Column::from(inner.map_err(|error| error.to_string())?);
+            let inner = reals(&inner).ok_or("found vectors of no numbers")?;
+            for row in 0..chunk.len() {
+                let (start, end) = chunk.offsets().start_end(row);
+                let missing = chunk.validity().is_some_and(|valid| !valid.get_bit(row));
+                if start + place >= end && !missing {
+                    let length = end - start;
+                    return Err(format!(
+                        "found a vector of {length} numbers, expected more than {place}"
+                    ));
+                }
+                numbers.push(if missing {
+                    f64::NAN
+                } else {
+                    inner[start + place]
+                });
+            }
+        }
+        let name = element_name(&self.field.name, place);
+        Ok(Series::new(name.into(), numbers))
+    }
+}
+
+/// The names under which a column is read: `g[0]` and `g[1]` of vectors of two.
+fn names_in(field: &ArrowField) -> Vec<String> {
+    let length = match &field.dtype {
+        ArrowDataType::FixedSizeList(_, length) => (*length).min(MAX_VECTOR),
+        ArrowDataType::List(_) | ArrowDataType::LargeList(_) => 2,
+        _ => 0,
+    };
+    match decoded_vector(&field.dtype) {
+        Some(_) => (0..length).map(|k| element_name(&field.name, k)).collect(),
+        None => vec![field.name.to_string()],
+    }
+}
+
+struct Source<'a> {
+    path: &'a Path,
+    file: File,
+    /// In bytes.
+    length: u64,
+    footer: FileMetadataRef,
+    fields: Vec<ArrowField>,
+    /// Bytes of text that may still be read.
+    text_left: u64,
+}
+
+impl<'a> Source<'a> {
+    fn open(path: &'a Path) -> Result<Self, FileError> {
+        let cannot = || FileError::doing(path, "cannot read the file");
+        let mut file = open::open(path).map_err(cannot())?;
+        let length = file.metadata().map_err(cannot())?.len();
+        check_footer(&mut file, length).map_err(|detail| damaged(path, detail))?;
+        let (footer, fields) = guarded(path, "footer", || {
+            let mut reader = ParquetReader::new(&mut file);
+            let fields = reader.schema()?.iter_values().cloned().collect();
+            Ok((reader.get_metadata()?.clone(), fields))
+        })?;
+        Ok(Self {
+            path,
+            file,
+            length,
+            footer,
+            fields,
+            text_left: unpacked_bytes(length),
+        })
+    }
+
+    // Checks the number of rows before memory is taken for them.
+    fn check_rows(&self, most: usize) -> Result<(), FileError> {
+        let groups = self.footer.row_groups.iter();
+        let rows = groups.fold(0, |rows: usize, group| {
+            rows.saturating_add(group.num_rows())
+        });
+        if rows != self.footer.num_rows {
+            return Err(damaged(
+                self.path,
+                format!(
+                    "found row groups of {rows} rows, expected {} as in the footer",
+                    self.footer.num_rows
+                ),
+            ));
+        }
+        if rows > most {
+            let message = format!("found {rows} rows, expected at most {most}");
+            return Err(FileError::new(self.path, message));
+        }
+        Ok(())
+    }
+
+    /// Checks that a file of this size can contain this number of columns.
+    fn check_values(&self, columns: usize) -> Result<(), FileError> {
+        let rows = self.footer.num_rows;
+        let values = (rows as u64).saturating_mul(columns as u64);
+        let most = FREE_VALUES.max(self.length);
+        if values > most {
+            return Err(damaged(
+                self.path,
+                format!(
+                    "found {rows} rows of {columns} columns, expected at most {most} values in a file of this size"
+                ),
+            ));
+        }
+        Ok(())
+    }
+
+    fn names(&self) -> Vec<String> {
+        self.fields.iter().flat_map(names_in).collect()
+    }
+
+    fn pick(&self, names: &[&str]) -> Result<Vec<Wanted>, FileError> {
+        let mut seen = BTreeSet::new();
+        names
+            .iter()
+            .map(|&name| {
+                if !seen.insert(name) {
+                    let error = TableError::DuplicateColumn { name: name.into() };
+                    return Err(FileError::new(self.path, error));
+                }
+                let called = |name| self.fields.iter().find(move |field| field.name == name);
+                let whole = || called(name).cloned().map(Wanted::whole);
+                let element = || {
+                    let (column, place) = element_of(name)?;
+                    let field = called(column).filter(|field| names_in(field).len() > place)?;
+                    decoded_vector(&field.dtype)?;
+                    Some(Wanted {
+                        field: field.clone(),
+                        element: Some(place),
+                    })
+                };
+                whole()
+                    .or_else(element)
+                    .ok_or_else(|| FileError::no_column(self.path, name, &self.names()))
+            })
+            .collect()
+    }
+
+    fn read_column(&mut self, wanted: &Wanted) -> Result<Column, FileError> {
+        let wanted = self.decoded(wanted)?;
+        let field = &wanted.field;
+        let mut column = match wanted.element {
+            None => Series::new_empty(field.name.clone(), &DataType::from_arrow_field(field)),
+            Some(place) => {
+                let name = element_name(&field.name, place);
+                Series::new_empty(name.into(), &DataType::Float64)
+            }
+        };
+        for number in 0..self.footer.row_groups.len() {
+            let series = self.read_chunk(&wanted, number)?;
+            column = match number {
+                0 => series,
+                _ => {
+                    let joined = column.append(&series);
+                    joined.map_err(|error| {
+                        let name = field.name.as_str();
+                        damaged(
+                            self.path,
+                            format!("column `{name}`, row group {number}: {error}"),
+                        )
+                    })?;
+                    column
+                }
+            };
+        }
+        // In one piece, so that readers borrow the values instead of copying them.
+        with_missing(self.path, column.rechunk())
+    }
+
+    fn decoded(&self, wanted: &Wanted) -> Result<Wanted, FileError> {
+        let Wanted { field, element } = wanted;
+        let decoded = match element {
+            Some(_) => decoded_vector(&field.dtype),
+            None => decoded_type(&field.dtype),
+        };
+        let decoded = decoded.ok_or_else(|| {
+            let message = format!(
+                "column `{}` has type {:?}; expected integers of at most 64 bits, 32- or 64-bit floats, booleans or text",
+                field.name, field.dtype
+            );
+            FileError::new(self.path, message)
+        })?;
+        Ok(Wanted {
+            field: ArrowField::new(field.name.clone(), decoded, field.is_nullable),
+            element: *element,
+        })
+    }
+
+    /// The rows of a decoded column in one row group.
+    fn read_chunk(&mut self, wanted: &Wanted, number: usize) -> Result<Series, FileError> {
+        let field = &wanted.field;
+        let (path, name) = (self.path, field.name.as_str());
+        let footer = self.footer.clone();
+        let group = &footer.row_groups[number];
+        let place = format!("column `{name}`, row group {number}");
+        let damaged = |detail: String| damaged(path, format!("{place}: {detail}"));
+        let found = group
+            .columns_under_root_iter(name)
+            .map(|mut all| (all.len(), all.next()));
+        let Some((1, Some(chunk))) = found else {
+            return Err(damaged("found no single column chunk".into()));
+        };
+        let values = usize::try_from(chunk.num_values()).unwrap_or(usize::MAX);
+        let most_values = match wanted.element {
+            None => group.num_rows(),
+            Some(_) => group.num_rows().saturating_mul(MAX_VECTOR),
+        };
+        if values > most_values || values < most_values && wanted.element.is_none() {
+            return Err(damaged(format!(
+                "found {} values, expected {most_values} as the row group has {} rows",
+                chunk.num_values(),
+                group.num_rows()
+            )));
+        }
+        let start = chunk
+            .dictionary_page_offset()
+            .unwrap_or(chunk.data_page_offset());
+        let bytes = self
+            .read_bytes(start, chunk.compressed_size())
+            .map_err(damaged)?;
+        let most = unpacked_bytes(self.length).max(number_bytes(&field.dtype, most_values));
+        let series = guarded(path, &place, || decode(chunk, bytes, field, most))?;
+        if series.len() != group.num_rows() {
+            return Err(damaged(format!(
+                "found {} rows, expected {}",
+                series.len(),
+                group.num_rows()
+            )));
+        }
+        let left = self.text_left.checked_sub(text_bytes(&series));
+        self.text_left = left.ok_or_else(|| damaged("found too much text".into()))?;
+        wanted.taken(series).map_err(damaged)
+    }
+
+    // The bytes from `start`, as many as `size`, after checking that the file has them.
+    fn read_bytes(&mut self, start: i64, size: i64) -> Result<Vec<u8>, String> {
+        let range = u64::try_from(start).ok().zip(u64::try_from(size).ok());
+        let Some((start, size)) = range.filter(|(start, size)| {
+            start
+                .checked_add(*size)
+                .is_some_and(|end| end <= self.length)
+        }) else {
+            return Err(format!(
+                "found bytes from {start}, {size} of them, expected a part of the file's {} bytes",
+                self.length
+            ));
+        };
+        let size = usize::try_from(size).map_err(|error| error.to_string())?;
+        let mut bytes = vec![0; size];
+        self.file
+            .seek(SeekFrom::Start(start))
+            .and_then(|_| self.file.read_exact(&mut bytes))
+            .map_err(|error| error.to_string())?;
+        Ok(bytes)
+    }
+}
+
+// Checks the length of a footer, because parsing needs several times as much memory. The last eight bytes of a file are
+// this length and a mark.
+fn check_footer(file: &mut File, length: u64) -> Result<(), String> {
+    let mut end = [0; 8];
+    if length >= 8 {
+        file.seek(SeekFrom::Start(length - 8))
+            .and_then(|_| file.read_exact(&mut end))
+            .map_err(|error| error.to_string())?;
+    }
+    let [a, b, c, d, mark @ ..] = end;
+    let found = u32::from_le_bytes([a, b, c, d]);
+    // The reader reports a file without the mark.
+    match &mark == b"PAR1" && found > MAX_FOOTER {
+        true => Err(format!(
+            "found a footer of {found} bytes, expected at most {MAX_FOOTER}"
+        )),
+        false => Ok(()),
+    }
+}
+
+// The values in one column chunk of a file, as the type in `field`.
+fn decode(
+    chunk: &ColumnChunkMetadata,
+    bytes: Vec<u8>,
+    field: &ArrowField,
+    most: u64,
+) -> PolarsResult<Series> {
+    let wrong = |what: String| PolarsError::ComputeError(what.into());
+    let length = bytes.len();
+    let dictionary = unpacked_size_of_first_page(&bytes);
+    // Cloning it shares the bytes.
+    let source = Cursor::new(bytes.into());
+    let pages = || PageReader::new(source.clone(), chunk, Vec::new(), length);
+    // The decoder makes room for as many values as a page claims, a negative count being taken for
+    // a huge one, and for as many bytes; a failed allocation ends the process: add the claims up first.
+    let (mut claimed, mut unpacked) = (0_usize, 0_u64);
+    for page in pages() {
+        let size = match page? {
+            CompressedPage::Data(page) => {
+                claimed = claimed.saturating_add(page.num_values());
+                if page.header().encoding().0 == DELTA_BYTE_ARRAY {
+                    return Err(wrong("found texts without their common beginnings (DELTA_BYTE_ARRAY), expected whole ones".into()));
+                }
+                page.uncompressed_size() as u64
+            }
+            CompressedPage::Dict(_) => dictionary.unwrap_or(u64::MAX),
+        };
+        unpacked = unpacked.saturating_add(size);
+    }
+    if i64::try_from(claimed) != Ok(chunk.num_values()) {
+        let expected = chunk.num_values();
+        return Err(wrong(format!(
+            "found pages with {claimed} values, expected {expected} as in the footer"
+        )));
+    }
+    if unpacked > most {
+        return Err(wrong(format!(
+            "found pages that unpack to {unpacked} bytes, expected at most {most} in a file of this size"
+        )));
+    }
+    let (arrays, _) = column_iter_to_arrays(
+        vec![BasicDecompressor::new(pages(), Vec::new())],
+        vec![&chunk.descriptor().descriptor.primitive_type],
+        field.clone(),
+        None,
+    )?;
+    Series::try_from((field, arrays))
+}
+
+// Number of the encoding in which a text repeats the beginning of the one before, so that a few bytes
+// stand for any number.
+const DELTA_BYTE_ARRAY: i32 = 7;
+
+/// Most bytes that a part of a file of `length` bytes may unpack to.
+fn unpacked_bytes(length: u64) -> u64 {
+    length.saturating_mul(INFLATION).max(FREE_BYTES)
+}
+
+/// Most bytes that the pages of `rows` values of this type may unpack to, whatever the size of the file. Of text, whose
+/// values have any length, none.
+fn number_bytes(decoded: &ArrowDataType, rows: usize) -> u64 {
+    match decoded {
+        ArrowDataType::Utf8View => 0,
+        _ => (rows as u64).saturating_mul(VALUE_BYTES),
+    }
+}
+
+/// Bytes of the texts of a column.
+fn text_bytes(series: &Series) -> u64 {
+    let texts = series.str().ok();
+    texts.map_or(0, |texts| {
+        texts.iter().flatten().map(|text| text.len() as u64).sum()
     })
 }
 
-/// The names of the columns.
-pub(super) fn columns(path: &Path) -> Result<Vec<String>, FileError> {
-    tables::parquet_columns(path).map_err(|error| bare(path, &error))
+// Unpacked size of the first page of a column chunk; `None` if it cannot be determined. polars' reader does not expose
+// the size of a dictionary page.
+//
+// The header of a page is a list of fields in Thrift's compact form. Each is a byte with its number and type, and a
+// value. The first is the type of the page, the second its unpacked size.
+fn unpacked_size_of_first_page(bytes: &[u8]) -> Option<u64> {
+    const NEXT_FIELD_OF_32_BITS: u8 = 0x15;
+    let mut rest = bytes.iter();
+    let mut field = || {
+        if rest.next() != Some(&NEXT_FIELD_OF_32_BITS) {
+            return None;
+        }
+        // Seven bits a byte, the lowest first; the lowest of all is the sign.
+        let mut number = 0;
+        for shift in (0..35).step_by(7) {
+            let byte = *rest.next()?;
+            number |= u64::from(byte & 0x7f) << shift;
+            if byte < 0x80 {
+                return (number & 1 == 0).then_some(number >> 1);
+            }
+        }
+        None
+    };
+    field()?;
+    field()
 }
 
-/// The metadata in the footer.
-pub(super) fn metadata(path: &Path) -> Result<Metadata, FileError> {
-    tables::parquet_metadata(path).map_err(|error| bare(path, &error))
+// Runs a part of polars on the contents of a file.
+//
+// Its decoders return errors for most damage, but index out of range or overflow on some; that
+// must not take a long run down, so such a panic becomes an error too.
+fn guarded<T>(
+    path: &Path,
+    place: &str,
+    run: impl FnOnce() -> PolarsResult<T>,
+) -> Result<T, FileError> {
+    let detail = match caught(run) {
+        Ok(Ok(value)) => return Ok(value),
+        Ok(Err(error)) => error.to_string(),
+        Err(_) => "the contents contradict themselves".into(),
+    };
+    Err(damaged(path, format!("{place}: {detail}")))
 }
 
-/// Writes the table with its metadata in the footer.
-pub(super) fn write(path: &Path, table: &DataFrame, metadata: &Metadata) -> Result<(), FileError> {
-    let mut bytes = Vec::new();
-    tables::write_parquet(&mut bytes, table, metadata).map_err(|error| bare(path, &error))?;
-    atomic::write(path, &bytes)
+thread_local! {
+    // Whether a panic on this thread is caught and reported as an error.
+    static CAUGHT: Cell<bool> = const { Cell::new(false) };
 }
 
-/// The crate's errors name the file already; keep the name once.
-pub fn bare(path: &Path, error: &tables::TableError) -> FileError {
-    if let tables::TableError::MissingColumn {
-        wanted, present, ..
-    } = error
-    {
-        return FileError::no_column(path, wanted, present);
+/// Whether a panic on this thread is caught and reported as an error.
+///
+/// The hook that prints the messages of panics belongs to the whole process, so a program and no library replaces it.
+/// A program whose hook is silent if this is true prints one error for a damaged file and no message of a panic.
+pub fn panic_is_caught() -> bool {
+    CAUGHT.get()
+}
+
+fn caught<T>(run: impl FnOnce() -> T) -> std::thread::Result<T> {
+    let outer = CAUGHT.replace(true);
+    let result = catch_unwind(AssertUnwindSafe(run));
+    CAUGHT.set(outer);
+    result
+}
+
+// The type into which a column of type `declared` is decoded; `None` if it is not supported.
+fn decoded_type(declared: &ArrowDataType) -> Option<ArrowDataType> {
+    use ArrowDataType as Type;
+    match declared {
+        Type::Int8 | Type::Int16 | Type::Int32 => Some(Type::Int32),
+        Type::UInt8 | Type::UInt16 | Type::UInt32 => Some(Type::UInt32),
+        Type::Boolean
+        | Type::Int64
+        | Type::UInt64
+        | Type::Float32
+        | Type::Float64
+        | Type::Utf8View => Some(declared.clone()),
+        // Text with few different values, as data frames in Python like to write it.
+        Type::Dictionary(_, value, _) => {
+            matches!(**value, Type::Utf8 | Type::LargeUtf8 | Type::Utf8View)
+                .then_some(Type::Utf8View)
+        }
+        _ => None,
     }
-    let message = error.to_string();
-    let prefix = format!("{}: ", path.display());
-    FileError::new(path, message.strip_prefix(&prefix).unwrap_or(&message))
+}
+
+// The type into which a column of vectors of numbers is decoded; `None` if it has no vectors. Lists of a fixed length are
+// stored like others.
+fn decoded_vector(declared: &ArrowDataType) -> Option<ArrowDataType> {
+    use ArrowDataType as Type;
+    match declared {
+        Type::List(inner) | Type::LargeList(inner) | Type::FixedSizeList(inner, _) => {
+            let number = matches!(inner.dtype, Type::Float32 | Type::Float64);
+            number.then(|| Type::LargeList(inner.clone()))
+        }
+        _ => None,
+    }
+}
+
+/// The column, in which missing floats are NaN.
+fn with_missing(path: &Path, column: Series) -> Result<Column, FileError> {
+    let name = column.name().to_string();
+    let filled = match (column.null_count(), column.dtype()) {
+        (0, _) => return Ok(column.into()),
+        (_, DataType::Float64) => filled(column.f64(), f64::NAN),
+        (_, DataType::Float32) => filled(column.f32(), f32::NAN),
+        (count, _) => {
+            let message = format!(
+                "column `{name}` has {count} missing value(s); only float columns may have any (they become NaN)"
+            );
+            return Err(FileError::new(path, message));
+        }
+    };
+    filled.map_err(|error| damaged(path, format!("column `{name}`: {error}")))
+}
+
+fn filled<T>(values: PolarsResult<&ChunkedArray<T>>, missing: T::Native) -> PolarsResult<Column>
+where
+    T: PolarsNumericType,
+    ChunkedArray<T>: ChunkFillNullValue<T::Native> + IntoSeries,
+{
+    Ok(values?.fill_null_with_values(missing)?.into_series().into())
 }

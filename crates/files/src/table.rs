@@ -20,13 +20,15 @@ use crate::frames::{Metadata, frame, reals};
 use crate::error::FileError;
 use crate::open::{is_there, open};
 
-pub use crate::limits::MAX_ROWS;
-use crate::{fits, parquet, text};
+use crate::{atomic, fits, parquet, text};
+
+/// Most rows of a table that may fill the largest grid, of 4000 × 4000 cells.
+pub const MAX_ROWS: usize = 4000 * 4000;
+/// Most pixels per side of an image.
+// Chosen by hand. A damaged header cannot ask for memory beyond it.
+pub(crate) const MAX_SIDE: usize = 200_000;
 
 /// A column of numbers of the table of `path`; missing ones are NaN.
-///
-/// # Errors
-/// If it is absent.
 pub fn numbers<'t>(
     table: &'t DataFrame,
     name: &str,
@@ -39,16 +41,13 @@ pub fn numbers<'t>(
     })
 }
 
-/// File format of a table.
 #[derive(
     Debug, Clone, Copy, Default, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize,
 )]
 #[serde(rename_all = "lowercase")]
 pub enum FileFormat {
-    /// Parquet.
     #[default]
     Parquet,
-    /// FITS binary table.
     Fits,
 }
 
@@ -62,7 +61,6 @@ impl FileFormat {
         }
     }
 
-    /// Ending of file names.
     pub fn extension(self) -> &'static str {
         match self {
             FileFormat::Parquet => "parquet",
@@ -71,7 +69,6 @@ impl FileFormat {
     }
 }
 
-/// Format of a file by its ending.
 enum Ending {
     Parquet,
     Fits,
@@ -91,8 +88,8 @@ impl Ending {
         }
     }
 
-    /// Format of a file by its first bytes: SExtractor writes FITS into `.cat` and `.ldac`. A file that cannot be opened
-    /// is reported when it is read.
+    // Format of a file by its first bytes: SExtractor writes FITS into `.cat` and `.ldac`. A file that cannot be opened
+    // is reported when it is read.
     fn of_content(path: &Path) -> Self {
         let mut start = [0; 9];
         let read = open(path).and_then(|mut file| file.read_exact(&mut start));
@@ -103,7 +100,7 @@ impl Ending {
     }
 }
 
-/// Rows that a catalogue may have in addition to the cells of its grid.
+// Rows that a catalogue may have in addition to the cells of its grid.
 const SPARE_ROWS: usize = 1 << 18;
 
 /// Most rows that a catalogue of galaxies on a grid of `cells` may have: more than are scored, so that it can be
@@ -112,10 +109,8 @@ pub fn most_rows(cells: usize) -> usize {
     cells + SPARE_ROWS
 }
 
-/// A file, and which of its tables is meant.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Place {
-    /// The file.
     pub path: PathBuf,
     /// Name (EXTNAME) or number (the first extension is 1) of a table of a FITS file.
     pub table: Option<String>,
@@ -142,9 +137,6 @@ impl Place {
     }
 
     /// The place that `FILE[TABLE]` names, or `table` of this file if it is given.
-    ///
-    /// # Errors
-    /// If both name a table.
     pub fn with_table(path: &Path, table: Option<&str>) -> Result<Self, FileError> {
         let mut place = Place::of(path);
         if let Some(name) = table
@@ -181,10 +173,8 @@ pub struct Columns {
     pub unnamed: Vec<String>,
 }
 
-/// Names of columns.
 #[derive(Debug, Clone)]
 pub struct Named {
-    /// The columns.
     pub names: Vec<String>,
     /// The table of a FITS file that has them: its number, and how it is shown.
     pub table: Option<(usize, String)>,
@@ -193,9 +183,6 @@ pub struct Named {
 }
 
 /// The columns that the table of a file has, of one table if `place` names it.
-///
-/// # Errors
-/// If the file cannot be read.
 pub fn columns(place: &Place) -> Result<Columns, FileError> {
     place.check()?;
     let path = &place.path;
@@ -239,9 +226,6 @@ pub fn columns(place: &Place) -> Result<Columns, FileError> {
 
 /// Reads the columns `wanted` (all, if `None`) as real numbers; the format follows from the ending. A
 /// table of text or in Parquet has at most `most_rows`. Columns of a text table without names have numbers, from 1.
-///
-/// # Errors
-/// If the file cannot be read, or lacks a column.
 pub fn read(
     path: &Path,
     wanted: Option<&[&str]>,
@@ -250,10 +234,6 @@ pub fn read(
     read_from(&Place::of(path), wanted, most_rows)
 }
 
-/// The same of a place.
-///
-/// # Errors
-/// As [`read`].
 pub fn read_from(
     place: &Place,
     wanted: Option<&[&str]>,
@@ -276,24 +256,20 @@ pub fn read_from(
         most_rows,
     };
     match Ending::of(path) {
-        Ending::Parquet => parquet::read(path, wanted, most_rows),
+        Ending::Parquet => parquet::read_numbers(path, wanted, most_rows),
         Ending::Fits => fits::read_table(path, wanted, place.table.as_deref()),
         Ending::Text => text::read(path, &request),
     }
 }
 
-/// Columns of a truth file.
 pub const TRUTH_COLUMNS: [&str; 4] = ["x", "y", "g1", "g2"];
 
-/// Rows of a FITS table that are read at a time.
-const PART: usize = 1 << 17;
+// Rows of a FITS table that are read at a time.
+const ROWS_PER_PART: usize = 1 << 17;
 
 /// Reads the columns `wanted` in parts, and gives each part to `take`: row groups of a Parquet file, a fixed number of
 /// rows of a FITS table, and all of a text table. So a table may have any number of rows. Columns of text are read too, of a
 /// text table those in `identities`; 64-bit integers keep all digits.
-///
-/// # Errors
-/// As [`read`], and those of `take`.
 pub fn read_parts(
     place: &Place,
     wanted: &[&str],
@@ -304,7 +280,9 @@ pub fn read_parts(
     let path = &place.path;
     match Ending::of(path) {
         Ending::Parquet => parquet::read_groups(path, wanted, MAX_ROWS, take),
-        Ending::Fits => fits::read_table_parts(path, wanted, place.table.as_deref(), PART, take),
+        Ending::Fits => {
+            fits::read_table_parts(path, wanted, place.table.as_deref(), ROWS_PER_PART, take)
+        }
         Ending::Text => {
             let request = text::Request {
                 wanted: Some(wanted),
@@ -318,9 +296,6 @@ pub fn read_parts(
 }
 
 /// Reads a truth file's x, y, g1, g2, of at most `most_rows`.
-///
-/// # Errors
-/// If the file cannot be read, lacks a column, or cannot have one row per cell of a square grid.
 pub fn read_truth(path: &Path, most_rows: usize) -> Result<DataFrame, FileError> {
     match Ending::of(path) {
         Ending::Text => read_text(path, &TRUTH_COLUMNS),
@@ -329,17 +304,17 @@ pub fn read_truth(path: &Path, most_rows: usize) -> Result<DataFrame, FileError>
     }
 }
 
-/// A truth file in Parquet. A small file may repeat one row millions of times, so that the positions are checked before
-/// the shears are decoded.
+// A truth file in Parquet. A small file may repeat one row millions of times, so that the positions are checked before
+// the shears are decoded.
 fn parquet_truth(path: &Path, most_rows: usize) -> Result<DataFrame, FileError> {
     let [x, y, shears @ ..] = TRUTH_COLUMNS;
     let mut columns = Vec::with_capacity(TRUTH_COLUMNS.len());
     for position in [x, y] {
-        let table = parquet::read(path, Some(&[position]), most_rows)?;
+        let table = parquet::read_numbers(path, Some(&[position]), most_rows)?;
         check_positions(path, position, &numbers(&table, position, path)?)?;
         columns.extend_from_slice(table.columns());
     }
-    let table = parquet::read(path, Some(&shears), most_rows)?;
+    let table = parquet::read_numbers(path, Some(&shears), most_rows)?;
     columns.extend_from_slice(table.columns());
     frame(columns).map_err(|error| FileError::new(path, error))
 }
@@ -369,9 +344,6 @@ fn check_positions(path: &Path, name: &str, values: &[f64]) -> Result<(), FileEr
 }
 
 /// Reads an ASCII or CSV table. `names` are the columns of a table without a header.
-///
-/// # Errors
-/// If the file cannot be read.
 pub fn read_text(path: &Path, names: &[&str]) -> Result<DataFrame, FileError> {
     let request = text::Request {
         wanted: Some(names),
@@ -384,9 +356,6 @@ pub fn read_text(path: &Path, names: &[&str]) -> Result<DataFrame, FileError> {
 
 /// The value of `key` that a table of any format states: in a comment `# key: value ...` before the first row of
 /// a text table, in the header of a FITS table, or in the metadata of a Parquet file.
-///
-/// # Errors
-/// If the file cannot be read.
 pub fn stated(path: &Path, key: &str) -> Result<Option<String>, FileError> {
     let format = match Ending::of(path) {
         Ending::Text => {
@@ -415,9 +384,6 @@ pub fn kept(metadata: &Metadata, format: FileFormat) -> Metadata {
 }
 
 /// The values of `keys` that a table written by [`write()`] carries, those that it has.
-///
-/// # Errors
-/// If the file cannot be read.
 pub fn read_metadata<'a>(
     path: &Path,
     format: FileFormat,
@@ -447,7 +413,7 @@ fn escaped(text: &str) -> String {
         .collect()
 }
 
-/// The text that [`escaped`] made this of. Other texts stay as they are.
+// The text that `escaped` made this of. Other texts stay as they are.
 fn unescaped(text: &str) -> String {
     let (mut plain, mut rest) = (String::with_capacity(text.len()), text);
     while let Some((before, after)) = rest.split_once('\\') {
@@ -467,9 +433,6 @@ fn unescaped(text: &str) -> String {
 }
 
 /// Writes `table` in this `format`, with the part of `metadata` that is [`kept`].
-///
-/// # Errors
-/// If the file cannot be written.
 pub fn write(
     path: &Path,
     format: FileFormat,
@@ -477,7 +440,12 @@ pub fn write(
     metadata: &Metadata,
 ) -> Result<(), FileError> {
     match format {
-        FileFormat::Parquet => parquet::write(path, table, metadata),
+        FileFormat::Parquet => {
+            let mut bytes = Vec::new();
+            parquet::write(&mut bytes, table, metadata)
+                .map_err(|error| FileError::new(path, error))?;
+            atomic::write(path, &bytes)
+        }
         FileFormat::Fits => {
             let keys: Vec<(String, fits::Value)> = kept(metadata, format)
                 .into_iter()

@@ -16,16 +16,16 @@ use crate::open;
 /// Columns of an ASCII table without a header: the challenge's catalogue.
 pub(super) const CHALLENGE_COLUMNS: [&str; 4] = ["x", "y", "e1", "e2"];
 
-/// Most bytes of a row with the comments before it, and of all that stands before the first row.
-const MAX_RECORD: usize = 1 << 20;
-/// Most rows of a file of fewer bytes than that; a larger one may have one for each byte. Numbers do not
-/// compress further, and zeros are no catalogue.
+// Most bytes of a row with the comments before it, and of all that stands before the first row.
+const MAX_RECORD_BYTES: usize = 1 << 20;
+// Most rows of a file of fewer bytes than that; a larger one may have one for each byte. Numbers do not
+// compress further, and zeros are no catalogue.
 const FREE_ROWS: usize = 1 << 20;
-/// Bytes read at a time.
-const BUFFER: usize = 1 << 15;
-/// Most characters of a damaged field that a message shows.
-const SHOWN: usize = 40;
-/// First bytes of gzip-compressed files.
+// Bytes read at a time.
+const BUFFER_BYTES: usize = 1 << 15;
+// Most characters of a damaged field that a message shows.
+const MAX_FIELD_CHARS: usize = 40;
+// First bytes of gzip-compressed files.
 const GZIP: [u8; 2] = [0x1f, 0x8b];
 
 /// Start of a cell of CSV that keeps a spreadsheet from interpreting `text` as a formula.
@@ -36,7 +36,6 @@ pub fn formula_mark(text: &str) -> &'static str {
     }
 }
 
-/// The requested part of a table.
 pub(super) struct Request<'a> {
     /// Columns to read; all, with NaN for what is not a number, if `None`.
     pub(super) wanted: Option<&'a [&'a str]>,
@@ -45,7 +44,6 @@ pub(super) struct Request<'a> {
     pub(super) identities: &'a [&'a str],
     /// Names of the columns of a table without a header.
     pub(super) default_names: &'a [&'a str],
-    /// Most rows.
     pub(super) most_rows: usize,
 }
 
@@ -79,14 +77,9 @@ pub(super) struct Columns {
     pub(super) names: Option<Vec<String>>,
     /// Comments with as many words as the first row has fields: each may be a header.
     pub(super) comments: Vec<Vec<String>>,
-    /// Fields of the first row.
     pub(super) fields: Vec<String>,
 }
 
-/// The columns of a table.
-///
-/// # Errors
-/// If the file cannot be read or is no text table.
 pub(super) fn columns(path: &Path) -> Result<Columns, FileError> {
     let head = Head::read(&mut Input::open(path)?, path)?;
     let separator = Separator::of(head.header.as_deref(), head.first.as_deref());
@@ -114,7 +107,6 @@ pub(super) fn comments(path: &Path) -> Result<Vec<String>, FileError> {
     Ok(Head::read(&mut Input::open(path)?, path)?.comments)
 }
 
-/// The text of a file from some place on.
 struct Input {
     text: BufReader<Metered>,
     /// Bytes that may still be taken from the file for the present row.
@@ -131,7 +123,7 @@ impl Read for Metered {
     fn read(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
         if self.left.get() == 0 {
             let message =
-                format!("a row with what stands before it has more than {MAX_RECORD} bytes");
+                format!("a row with what stands before it has more than {MAX_RECORD_BYTES} bytes");
             return Err(std::io::Error::new(ErrorKind::InvalidData, message));
         }
         let most = buffer.len().min(self.left.get());
@@ -148,25 +140,24 @@ fn cannot_read<E: std::fmt::Display>(path: &Path) -> impl FnOnce(E) -> FileError
 impl Input {
     fn open(path: &Path) -> Result<Self, FileError> {
         let file = open::open(path).map_err(cannot_read(path))?;
-        let mut file = BufReader::with_capacity(BUFFER, file);
+        let mut file = BufReader::with_capacity(BUFFER_BYTES, file);
         let start = file.fill_buf().map_err(cannot_read(path))?;
         let file: Box<dyn Read> = if start.starts_with(&GZIP) {
             Box::new(MultiGzDecoder::new(file))
         } else {
             Box::new(file)
         };
-        let left = Rc::new(Cell::new(MAX_RECORD));
+        let left = Rc::new(Cell::new(MAX_RECORD_BYTES));
         let metered = Metered {
             file,
             left: Rc::clone(&left),
         };
         Ok(Input {
-            text: BufReader::with_capacity(BUFFER, metered),
+            text: BufReader::with_capacity(BUFFER_BYTES, metered),
             left,
         })
     }
 
-    /// Reads all rows. The first one is in `head`.
     fn read_rows(
         self,
         head: Head,
@@ -188,7 +179,7 @@ impl Input {
 
 type Rest = Chain<Cursor<Vec<u8>>, BufReader<Metered>>;
 
-/// Rows of fields between `delimiter`s, after `before` lines.
+// Rows of fields between `delimiter`s, after `before` lines.
 fn read_delimited(
     text: Rest,
     delimiter: u8,
@@ -202,7 +193,7 @@ fn read_delimited(
     let (end, after): (&[u8], u64) = if crlf { (b"\r\n", 0) } else { (b"\n", 1) };
     let mut reader = delimited(delimiter).from_reader(text.chain(end));
     let mut record = StringRecord::new();
-    left.set(MAX_RECORD);
+    left.set(MAX_RECORD_BYTES);
     loop {
         let read = reader.read_record(&mut record);
         let line = before + reader.position().line() - after;
@@ -223,11 +214,11 @@ fn read_delimited(
             continue;
         }
         rows.add(line, record.iter())?;
-        left.set(MAX_RECORD);
+        left.set(MAX_RECORD_BYTES);
     }
 }
 
-/// Rows of fields between blanks, after `before` lines.
+// Rows of fields between blanks, after `before` lines.
 fn read_blanks(
     mut text: Rest,
     left: &Cell<usize>,
@@ -236,7 +227,10 @@ fn read_blanks(
 ) -> Result<(), FileError> {
     let (mut bytes, mut number) = (Vec::new(), before);
     loop {
-        let part = text.by_ref().take(BUFFER as u64).read_to_end(&mut bytes);
+        let part = text
+            .by_ref()
+            .take(BUFFER_BYTES as u64)
+            .read_to_end(&mut bytes);
         let last = part.map_err(cannot_read(rows.path))? == 0;
         let end = match bytes.iter().rposition(|byte| *byte == b'\n') {
             _ if last => bytes.len(),
@@ -267,18 +261,18 @@ fn read_blanks(
         }
         bytes.drain(..end);
         if rows.rows > rows_before {
-            left.set(MAX_RECORD);
+            left.set(MAX_RECORD_BYTES);
         }
     }
 }
 
-/// Text formats that are no text tables: the start of their first line, and their name.
+// Text formats that are no text tables: the start of their first line, and their name.
 const OTHER_FORMATS: [(&str, &str); 2] = [
     ("<?xml", "XML, such as a VOTable"),
     ("<VOTABLE", "a VOTable"),
 ];
 
-/// The first bytes of HDF5.
+// The first bytes of HDF5.
 const HDF5: [u8; 8] = *b"\x89HDF\r\n\x1a\n";
 
 /// Refuses a first line of another format.
@@ -327,7 +321,6 @@ fn quoted_blanks(line: &str) -> impl Iterator<Item = &str> {
     })
 }
 
-/// How delimited text is read.
 fn delimited(delimiter: u8) -> ReaderBuilder {
     let mut builder = ReaderBuilder::new();
     builder
@@ -335,22 +328,19 @@ fn delimited(delimiter: u8) -> ReaderBuilder {
         .has_headers(false)
         .flexible(true)
         .comment(Some(b'#'))
-        .buffer_capacity(BUFFER);
+        .buffer_capacity(BUFFER_BYTES);
     builder
 }
 
-/// Separator of the fields of a row.
 #[derive(Clone, Copy)]
 enum Separator {
-    /// One byte.
     Byte(u8),
-    /// Any number of blanks.
     Blanks,
 }
 
 impl Separator {
-    /// The separator of a table with these lines: one that divides both into as many fields, or else any that divides the
-    /// row.
+    // The separator of a table with these lines: one that divides both into as many fields, or else any that divides the
+    // row.
     fn of(header: Option<&str>, row: Option<&str>) -> Self {
         let Some(row) = row.or(header) else {
             return Separator::Blanks;
@@ -375,7 +365,6 @@ impl Separator {
         best.or(found.first()).copied().unwrap_or(Separator::Blanks)
     }
 
-    /// Fields of one line.
     fn split(self, line: &str) -> Vec<String> {
         match self {
             Separator::Blanks => quoted_blanks(line.trim()).map(str::to_owned).collect(),
@@ -392,7 +381,6 @@ impl Separator {
     }
 }
 
-/// All up to the first row.
 #[derive(Default)]
 struct Head {
     comments: Vec<String>,
@@ -440,14 +428,13 @@ impl Head {
         }
     }
 
-    /// Fields of the first row.
     fn fields(&self, separator: Separator) -> Vec<String> {
         let first = self.first.as_ref();
         first.map_or_else(Vec::new, |line| separator.split(line))
     }
 
-    /// Names of the columns by SExtractor's comments, `# NUMBER NAME description [unit]`, if there are some. The columns
-    /// of an array have one comment, for the first of them: the second one is called `NAME_1`.
+    // Names of the columns by SExtractor's comments, `# NUMBER NAME description [unit]`, if there are some. The columns
+    // of an array have one comment, for the first of them: the second one is called `NAME_1`.
     fn sextractor_names(&self, fields: &[String]) -> Option<Vec<String>> {
         let mut names: Vec<String> = Vec::new();
         let mut named: (usize, &str) = (0, "");
@@ -483,9 +470,6 @@ impl Head {
     }
 
     /// Names of the columns: those that the file gives, numbers, or the default ones.
-    ///
-    /// # Errors
-    /// If the file gives no names and has more columns than there are default names.
     fn names(
         &self,
         path: &Path,
@@ -526,14 +510,14 @@ impl Head {
     }
 }
 
-/// Whether a line is one of names: its first field that is not empty is not a number.
+// Whether a line is one of names: its first field that is not empty is not a number.
 fn names_something(line: &str) -> bool {
     split_names(line)
         .first()
         .is_some_and(|field| field.parse::<f64>().is_err())
 }
 
-/// Names in a line, between any separators, quoted or not.
+// Names in a line, between any separators, quoted or not.
 fn split_names(line: &str) -> Vec<String> {
     line.split([';', ',', ' ', '\t'])
         .map(|name| name.trim().trim_matches('"'))
@@ -546,21 +530,18 @@ fn owned(names: &[&str]) -> Vec<String> {
     names.iter().map(|&name| name.to_owned()).collect()
 }
 
-/// Columns being filled.
 struct Rows<'a> {
     path: &'a Path,
     names: &'a [String],
     /// Whether a field that is no number is an error.
     strict: bool,
     most: usize,
-    /// Of the columns read, by place in the row.
     slots: Vec<Option<usize>>,
     places: Vec<usize>,
     columns: Vec<Values>,
     rows: usize,
 }
 
-/// Values of a column.
 enum Values {
     Numbers(Vec<f64>),
     /// Numbers, and texts from the first one that a float does not contain.
@@ -569,7 +550,6 @@ enum Values {
 }
 
 impl Values {
-    /// Adds a field; whether it fits.
     fn add(&mut self, field: &str) -> bool {
         let exact = |value: &f64| value.abs() <= FLOAT_INTEGERS;
         match self {
@@ -592,7 +572,7 @@ impl Values {
     }
 }
 
-/// Integers up to 2⁵³ are 64-bit floats.
+// Integers up to 2⁵³ are 64-bit floats.
 const FLOAT_INTEGERS: f64 = 9_007_199_254_740_992.0;
 
 impl<'a> Rows<'a> {
@@ -628,7 +608,6 @@ impl<'a> Rows<'a> {
         })
     }
 
-    /// Adds the row in a line.
     fn add<'f>(
         &mut self,
         line: u64,
@@ -660,7 +639,7 @@ impl<'a> Rows<'a> {
 
     #[cold]
     fn not_a_number(&self, line: u64, column: usize, field: &str) -> FileError {
-        let field: String = field.trim().chars().take(SHOWN).collect();
+        let field: String = field.trim().chars().take(MAX_FIELD_CHARS).collect();
         let name = &self.names[column];
         let message = format!("line {line}: `{field}` in column `{name}` is not a number");
         FileError::new(self.path, message)

@@ -5,7 +5,8 @@ use std::path::Path;
 
 use shearq_files::fits::ImageReader;
 use shearq_files::frames::polars::{Column, DataFrame};
-use shearq_files::frames::{Metadata, frame, write_parquet};
+use shearq_files::frames::{Metadata, frame};
+use shearq_files::parquet;
 use shearq_files::table::{MAX_ROWS, read_truth};
 
 /// Bytes in use beyond those before `work`, at most, and what it returns.
@@ -25,7 +26,7 @@ fn peak<T>(work: impl FnOnce() -> T) -> (u64, T) {
 
 fn write(path: &Path, table: &DataFrame) {
     let mut bytes = Vec::new();
-    write_parquet(&mut bytes, table, &Metadata::new()).expect("written");
+    parquet::write(&mut bytes, table, &Metadata::new()).expect("written");
     fs::write(path, bytes).expect("written");
 }
 

@@ -7,11 +7,11 @@ use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
 use std::path::{Path, PathBuf};
 
-use shearq_files::frames::{Metadata, TableError, parquet_metadata, read_parquet, write_parquet};
+use shearq_files::frames::{Metadata, TableError};
+use shearq_files::parquet;
 
 use super::record::{RunRecord, frame_of, run_of_frame};
 use shearq_dataset::fingerprint;
-use shearq_files::parquet::bare;
 use shearq_files::{FileError, atomic};
 
 // Key and value in the footer that identify the files of a store.
@@ -44,11 +44,11 @@ pub fn prepare(store: &Path) -> Result<Prepared, FileError> {
 }
 
 pub fn write(store: &Path, run: &RunRecord) -> Result<PathBuf, FileError> {
-    let failed = |error: TableError| bare(store, &error);
+    let failed = |error: TableError| FileError::new(store, error);
     let metadata = Metadata::from([(SCHEMA.0.to_owned(), SCHEMA.1.to_owned())]);
     let table = frame_of(std::slice::from_ref(run)).map_err(failed)?;
     let mut bytes = Vec::new();
-    write_parquet(&mut bytes, &table, &metadata).map_err(failed)?;
+    parquet::write(&mut bytes, &table, &metadata).map_err(failed)?;
     // The name contains a hash of the content: processes that write at the same time do not collide, and recording a run
     // twice has no effect.
     let path = store.join(file_name(run, &bytes));
@@ -67,9 +67,8 @@ fn file_name(run: &RunRecord, bytes: &[u8]) -> String {
 }
 
 fn read_run(path: &Path) -> Result<RunRecord, FileError> {
-    let failed = |error: TableError| bare(path, &error);
-    let table = read_parquet(path, None, MAX_SETS).map_err(failed)?;
-    let metadata = parquet_metadata(path).map_err(failed)?;
+    let table = parquet::read(path, None, MAX_SETS)?;
+    let metadata = parquet::metadata(path)?;
     let found = metadata.get(SCHEMA.0).map(String::as_str);
     if found != Some(SCHEMA.1) {
         let message = format!(

@@ -7,25 +7,25 @@ use std::ops::RangeInclusive;
 
 use fitsio::sys;
 
-use super::cfitsio::{lock, plain};
+use super::file::{lock, plain};
 use super::source::Source;
 use crate::error::FileError;
 
-/// Bytes of a header card.
+// Bytes of a header card.
 const CARD: usize = 80;
-/// Bytes of a block of a file.
+// Bytes of a block of a file.
 const BLOCK: usize = 2880;
-/// Most bytes of a header: fifty thousand cards.
-const MOST: u64 = 1 << 22;
-/// Longest value that cfitsio has room for.
+// Most bytes of a header: fifty thousand cards.
+const MAX_HEADER_BYTES: u64 = 1 << 22;
+// Longest value that cfitsio has room for.
 const LONGEST_VALUE: usize = 70;
-/// Longest comment that cfitsio has room for.
+// Longest comment that cfitsio has room for.
 const LONGEST_COMMENT: usize = 72;
-/// Number of columns of a table. cfitsio allocates and fills 160 bytes per column while it opens the header.
+// Number of columns of a table. cfitsio allocates and fills 160 bytes per column while it opens the header.
 const COLUMNS: &str = "TFIELDS";
-/// Most columns of a table in the FITS standard 4.0, section 7.
-const MOST_COLUMNS: usize = 999;
-/// Keys that are kept: the number of columns, and the description of a compressed image; `#` stands for a number.
+// Most columns of a table in the FITS standard 4.0, section 7.
+const MAX_COLUMNS: usize = 999;
+// Keys that are kept: the number of columns, and the description of a compressed image; `#` stands for a number.
 const KEYS: [&str; 11] = [
     COLUMNS, "ZIMAGE", "ZCMPTYPE", "ZBITPIX", "ZNAXIS", "ZNAXIS#", "ZTILE#", "ZVAL#", "ZNAME#",
     "ZQUANTIZ", "ZDITHER0",
@@ -36,9 +36,6 @@ pub struct Cards(BTreeMap<String, String>);
 
 impl Cards {
     /// Reads the header that starts at byte `start` of the file; `None` if the file ends there.
-    ///
-    /// # Errors
-    /// If the header has no end, a card that is too long for cfitsio, one of these keys twice, or too many columns.
     pub fn read(source: &mut Source, start: u64) -> Result<Option<Self>, FileError> {
         let mut cards = BTreeMap::new();
         let mut at = start;
@@ -47,7 +44,7 @@ impl Cards {
             if block.is_empty() && at == start {
                 return Ok(None);
             }
-            if block.len() < BLOCK || at - start >= MOST {
+            if block.len() < BLOCK || at - start >= MAX_HEADER_BYTES {
                 let read = at - start + block.len() as u64;
                 let message = format!(
                     "cannot open the file: the header from byte {start} has no END in {read} bytes"
@@ -58,7 +55,7 @@ impl Cards {
                 if card.starts_with(b"END     ") {
                     let cards = Cards(cards);
                     cards
-                        .number(COLUMNS, 0..=MOST_COLUMNS)
+                        .number(COLUMNS, 0..=MAX_COLUMNS)
                         .map_err(|message| FileError::new(source.path(), message))?;
                     return Ok(Some(cards));
                 }
@@ -89,9 +86,6 @@ impl Cards {
     }
 
     /// The whole number of a key, which must be in a range; `None` if the key is absent.
-    ///
-    /// # Errors
-    /// If the value is not such a number.
     pub fn number(&self, key: &str, range: RangeInclusive<usize>) -> Result<Option<usize>, String> {
         let Some(value) = self.0.get(key) else {
             return Ok(None);
@@ -104,7 +98,6 @@ impl Cards {
     }
 }
 
-/// Name of a card, in capitals, and its value.
 fn parse(card: &[u8]) -> Result<(String, String), String> {
     let mut text = [0 as c_char; CARD + 1];
     for (to, from) in text.iter_mut().zip(card) {

@@ -1,15 +1,15 @@
 //! An open FITS file. Values that cfitsio does not check are checked before its functions are called.
 
-use std::ffi::{CStr, CString, c_int};
+use std::ffi::{CStr, CString, c_char, c_int};
 use std::path::Path;
 use std::ptr;
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use fitsio::sys;
 
 use super::cards::Cards;
-use super::cfitsio::{describe, lock};
 use super::source::Source;
-use super::tiling::Tiling;
+use super::tiles::Tiling;
 use crate::error::FileError;
 
 // Numbers of cfitsio's interface, from its fitsio.h.
@@ -17,21 +17,66 @@ const READONLY: c_int = 0;
 const IMAGE_HDU: c_int = 0;
 const KEY_NO_EXIST: c_int = 202;
 const VALUE_UNDEFINED: c_int = 204;
-/// Bytes of a block of a file.
+// Bytes of a block of a file.
 const BLOCK: u64 = 2880;
 
-/// A function of cfitsio that reads values of a column of bytes or of 16-bit integers.
-type ReadColumn<T> = unsafe extern "C" fn(
-    *mut sys::fitsfile,
-    c_int,
-    sys::LONGLONG,
-    sys::LONGLONG,
-    sys::LONGLONG,
-    T,
-    *mut T,
-    *mut c_int,
-    *mut c_int,
-) -> c_int;
+/// A type of values of columns, with its code in cfitsio's interface.
+pub trait ColumnValue: Copy + Default {
+    const CODE: c_int;
+}
+
+/// Logical values are characters: 1, 0, or the one that stands for missing values.
+impl ColumnValue for c_char {
+    const CODE: c_int = 14;
+}
+
+impl ColumnValue for u8 {
+    const CODE: c_int = 11;
+}
+
+impl ColumnValue for f64 {
+    const CODE: c_int = 82;
+}
+
+impl ColumnValue for i64 {
+    const CODE: c_int = 81;
+}
+
+impl ColumnValue for u64 {
+    const CODE: c_int = 80;
+}
+
+static CFITSIO: Mutex<()> = Mutex::new(());
+
+/// The lock around every cfitsio call. A panic elsewhere does not damage the state of cfitsio.
+pub fn lock() -> MutexGuard<'static, ()> {
+    CFITSIO.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+pub fn plain(buffer: &[c_char]) -> String {
+    let bytes: Vec<u8> = buffer
+        .iter()
+        .take_while(|c| **c != 0)
+        .map(|c| c.to_ne_bytes()[0])
+        .collect();
+    String::from_utf8_lossy(&bytes).trim().to_owned()
+}
+
+/// cfitsio's words for a status, followed by the messages on its stack, which this empties. The first message is
+/// the closest to the cause.
+fn describe(status: c_int) -> String {
+    // FLEN_STATUS is 31, FLEN_ERRMSG 81.
+    let mut text = [0 as c_char; 81];
+    // SAFETY: the buffer has room for cfitsio's longest text.
+    unsafe { sys::ffgerr(status, text.as_mut_ptr()) };
+    let mut words = format!("cfitsio error {status}: {}", plain(&text));
+    // SAFETY: as above.
+    while unsafe { sys::ffgmsg(text.as_mut_ptr()) } != 0 {
+        let message = plain(&text).replace(char::is_control, " ");
+        words.push_str(&format!("; {message}"));
+    }
+    words
+}
 
 /// An open file, closed under the lock.
 pub struct File {
@@ -39,7 +84,6 @@ pub struct File {
     source: Source,
     /// Bytes of the file when cfitsio opened it.
     seen: u64,
-    /// Number of the current header, from 1.
     place: c_int,
     /// How the current image is compressed; `None` for an uncompressed one.
     tiling: Option<Tiling>,
@@ -63,7 +107,7 @@ impl File {
         Ok(file)
     }
 
-    /// Opens the file in cfitsio, again if it has grown, and goes to the current header.
+    // Opens the file in cfitsio, again if it has grown, and goes to the current header.
     fn reopen(&mut self) -> Result<(), FileError> {
         let name = self.source.name()?;
         self.seen = self.source.size(0)?;
@@ -85,7 +129,7 @@ impl File {
         Err(FileError::new(self.source.path(), message))
     }
 
-    /// Closes the file if it is open. The caller has the lock.
+    // Closes the file if it is open. The caller has the lock.
     fn close(&mut self) {
         if !self.raw.is_null() {
             let mut status = 0;
@@ -112,15 +156,11 @@ impl File {
         Err(self.fault(format!("{}: {}", doing(), describe(status))))
     }
 
-    /// An error about this file.
     pub fn fault(&self, message: String) -> FileError {
         FileError::new(self.source.path(), message)
     }
 
     /// Goes to the next header. Returns whether there is one.
-    ///
-    /// # Errors
-    /// If the header is damaged.
     pub fn next(&mut self) -> Result<bool, FileError> {
         let start = self.extent()?[1];
         let Some(cards) = Cards::read(&mut self.source, start)? else {
@@ -143,9 +183,6 @@ impl File {
     }
 
     /// Goes to the header of an extension that was reached before; the first is 1.
-    ///
-    /// # Errors
-    /// If it cannot be read.
     pub fn go_to(&mut self, extension: usize) -> Result<(), FileError> {
         self.place = c_int::try_from(extension + 1).unwrap_or(c_int::MAX);
         self.tiling = None;
@@ -163,7 +200,6 @@ impl File {
         usize::try_from(self.place - 1).unwrap_or(0)
     }
 
-    /// The file's path.
     pub fn path(&self) -> &Path {
         self.source.path()
     }
@@ -358,33 +394,39 @@ impl File {
         Ok(length)
     }
 
-    /// The first values of an array of bytes.
+    /// The first bytes of the array in a column and a row, from 1.
     pub fn array(&self, column: c_int, row: usize, length: usize) -> Result<Vec<u8>, FileError> {
-        self.values(sys::ffgcvb, column, row, length)
+        let doing = || format!("cannot read the pixels of tile {row}");
+        self.values(doing, column, row, length, 0)
     }
 
-    /// The first values of an array of 16-bit integers.
-    pub fn words(&self, column: c_int, row: usize, length: usize) -> Result<Vec<i16>, FileError> {
-        self.values(sys::ffgcvi, column, row, length)
-    }
-
-    fn values<T: Copy + Default>(
+    /// As many values of a column as `count`, from the first one of `row`, which is counted from 1. Missing ones are
+    /// `missing`; cfitsio does not look for them if this is zero.
+    pub fn values<T: ColumnValue>(
         &self,
-        read: ReadColumn<T>,
+        doing: impl FnOnce() -> String,
         column: c_int,
         row: usize,
-        length: usize,
+        count: usize,
+        mut missing: T,
     ) -> Result<Vec<T>, FileError> {
-        let mut values = vec![T::default(); length];
-        let (row, length, mut missing) = (row as i64, length as i64, 0);
-        self.call(
-            || format!("cannot read the pixels of tile {row}"),
-            // SAFETY: the file is open, and there is room for the requested values.
-            |raw, status| unsafe {
-                let (none, to) = (T::default(), values.as_mut_ptr());
-                read(raw, column, row, 1, length, none, to, &mut missing, status);
-            },
-        )?;
+        let mut values = vec![T::default(); count];
+        let mut some_missing = 0;
+        // SAFETY: the file is open, there is room for the requested values, and they have the type of the code.
+        self.call(doing, |raw, status| unsafe {
+            sys::ffgcv(
+                raw,
+                T::CODE,
+                column,
+                row as i64,
+                1,
+                count as i64,
+                ptr::from_mut(&mut missing).cast(),
+                values.as_mut_ptr().cast(),
+                &mut some_missing,
+                status,
+            );
+        })?;
         Ok(values)
     }
 }

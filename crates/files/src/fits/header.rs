@@ -2,27 +2,22 @@
 
 /// Bytes of a block: headers and data each fill whole ones.
 pub const BLOCK: usize = 2880;
-/// Characters of a card.
 const CARD: usize = 80;
-/// Most characters of a text between its quotes.
+// Most characters of a text between its quotes.
 const LONGEST_TEXT: usize = 68;
-/// Fewest characters of a text between its quotes.
+// Fewest characters of a text between its quotes.
 const SHORTEST_TEXT: usize = 8;
-/// Significant digits that distinguish any two numbers.
+// Significant digits that distinguish any two numbers.
 const DIGITS: i32 = 17;
 
-/// A header value to write.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Value {
-    /// Whole number.
     Int(i64),
-    /// Real number.
     Real(f64),
     /// Text of printable ASCII characters. A long one continues on CONTINUE cards.
     Text(String),
 }
 
-/// A header in the making.
 #[derive(Debug, Default)]
 pub struct Header(String);
 
@@ -48,10 +43,6 @@ impl Header {
         header
     }
 
-    /// Adds a key with its value.
-    ///
-    /// # Errors
-    /// If the standard does not allow the key or the value.
     pub fn add(&mut self, key: &str, value: &Value) -> Result<(), String> {
         let allowed = |c: char| matches!(c, 'A'..='Z' | '0'..='9' | '-' | '_');
         if !(1..=8).contains(&key.len()) || !key.chars().all(allowed) {
@@ -72,10 +63,6 @@ impl Header {
         Ok(())
     }
 
-    /// Adds a text with a comment.
-    ///
-    /// # Errors
-    /// If the text has other characters than printable ASCII.
     pub fn text(&mut self, key: &str, value: &str, comment: &str) -> Result<(), String> {
         if let Some(other) = value.chars().find(|c| !matches!(c, ' '..='~')) {
             return Err(format!(
@@ -103,7 +90,6 @@ impl Header {
         Ok(())
     }
 
-    /// Adds a whole number with a comment.
     pub fn count(&mut self, key: &str, value: impl ToString, comment: &str) {
         self.fixed(key, &value.to_string(), comment);
     }
@@ -120,7 +106,7 @@ impl Header {
         self.fixed(key, "T", comment);
     }
 
-    /// A value in fixed format: it ends in column 30 if it has room.
+    // A value in fixed format: it ends in column 30 if it has room.
     fn fixed(&mut self, key: &str, value: &str, comment: &str) {
         let comment = if comment.is_empty() {
             String::new()
@@ -135,7 +121,7 @@ impl Header {
     }
 }
 
-/// A text with its quotes doubled, in pieces that each fit on a card. All but the last leave room for `&`.
+// A text with its quotes doubled, in pieces that each fit on a card. All but the last leave room for `&`.
 fn pieces(text: &str) -> Vec<String> {
     let mut pieces = vec![String::new()];
     let mut letters = text.chars().peekable();
@@ -155,7 +141,7 @@ fn pieces(text: &str) -> Vec<String> {
     pieces
 }
 
-/// A finite number with [`DIGITS`] digits, without zeros at the end: `0.5`, `3.` or `1.0E-12`.
+// A finite number with `DIGITS` digits, without zeros at the end: `0.5`, `3.` or `1.0E-12`.
 fn real(value: f64) -> String {
     let scientific = format!("{:.*e}", DIGITS as usize - 1, value);
     let (mantissa, exponent) = scientific.split_once('e').unwrap_or((&scientific, "0"));

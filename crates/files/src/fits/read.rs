@@ -8,40 +8,36 @@ use std::ptr;
 
 use fitsio::sys;
 
-use super::cfitsio::plain;
-use super::file::File;
+use super::file::{ColumnValue, File, plain};
 use super::tiles::Tiles;
 use crate::error::{FileError, names_of};
 use crate::frames::element_name;
 use crate::frames::polars::{Column, DataFrame};
-use crate::limits::{MAX_ROWS, MAX_SIDE};
+use crate::table::{MAX_ROWS, MAX_SIDE};
 
-/// Most numbers read from a table that has fewer bytes than that on disk.
+// Most numbers read from a table that has fewer bytes than that on disk.
 const FREE_NUMBERS: u64 = 1 << 22;
 
 // Numbers of cfitsio's interface, from its fitsio.h.
 const TLOGICAL: c_int = 14;
 const TFLOAT: c_int = 42;
 const TDOUBLE: c_int = 82;
-/// Type codes of columns that `ffgcvd` reads as one number a row: TBYTE, TSBYTE, TUSHORT, TSHORT,
-/// TUINT, TINT, TULONG, TLONG, TFLOAT, TULONGLONG, TLONGLONG, TDOUBLE.
+// Type codes of columns that `ffgcvd` reads as one number a row: TBYTE, TSBYTE, TUSHORT, TSHORT,
+// TUINT, TINT, TULONG, TLONG, TFLOAT, TULONGLONG, TLONGLONG, TDOUBLE.
 const NUMBERS: [c_int; 12] = [11, 12, 20, 21, 30, 31, 40, 41, 42, 80, 81, 82];
-/// Longest vector whose numbers are columns with names of their own; longer ones are stamps.
+// Longest vector whose numbers are columns with names of their own; longer ones are stamps.
 const MAX_VECTOR: i64 = 8;
 const TSTRING: c_int = 16;
 const TLONGLONG: c_int = 81;
-/// The offset by which FITS stores unsigned 64-bit integers as signed ones.
+// The offset by which FITS stores unsigned 64-bit integers as signed ones.
 const UNSIGNED: f64 = 9_223_372_036_854_775_808.0;
 
-/// Pixels of this value are missing: SExtractor writes it, in single precision.
+// Pixels of this value are missing: SExtractor writes it, in single precision.
 const MISSING: f32 = -1e30;
 
-/// A number that pixels are read as.
 pub trait Pixel: Copy + Default + Into<f64> {
-    /// Its code in cfitsio's interface.
     #[doc(hidden)]
     const CODE: c_int;
-    /// The value of missing pixels.
     #[doc(hidden)]
     const MISSING: Self;
 }
@@ -75,15 +71,12 @@ impl std::fmt::Debug for ImageReader {
     }
 }
 
-/// How the pixels of an image are stored.
 enum Pixels {
     /// Uncompressed, with this number of bytes per pixel.
     Plain(u64),
-    /// Compressed in tiles.
     Tiles(Tiles),
 }
 
-/// Dimensions that an image may have.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Dimensions {
     Two,
@@ -93,9 +86,6 @@ enum Dimensions {
 impl ImageReader {
     /// Opens the first image of a file: the primary image, or the first extension if the primary header has no
     /// image (as fpack writes it).
-    ///
-    /// # Errors
-    /// If the file cannot be read, has no two-dimensional image of an accepted size, or is truncated.
     pub fn open(path: impl AsRef<Path>) -> Result<Self, FileError> {
         let mut file = File::open(path.as_ref(), "image")?;
         let mut place = "primary";
@@ -112,9 +102,6 @@ impl ImageReader {
 
     /// Opens the first image or cube of a file. [`ImageReader::next_stack`] opens the others. The rows of all planes
     /// of a cube follow each other, as in one image.
-    ///
-    /// # Errors
-    /// If the file cannot be read, has no image, has one with other dimensions or of no accepted size, or is truncated.
     pub fn open_stack(path: impl AsRef<Path>) -> Result<Self, FileError> {
         let path = path.as_ref();
         let file = File::open(path, "image")?;
@@ -126,9 +113,6 @@ impl ImageReader {
     }
 
     /// The next image or cube of the file, `None` after the last. Tables are passed over.
-    ///
-    /// # Errors
-    /// As [`ImageReader::open_stack`].
     pub fn next_stack(self) -> Result<Option<Self>, FileError> {
         ImageReader::after(self.file)
     }
@@ -142,7 +126,6 @@ impl ImageReader {
         Ok(None)
     }
 
-    /// The image that `file` is at.
     fn here(mut file: File, place: &str, dimensions: Dimensions) -> Result<Self, FileError> {
         // cfitsio leaves out those that are no numbers.
         for key in ["BSCALE", "BZERO"] {
@@ -206,12 +189,10 @@ impl ImageReader {
         self.file.text("EXTNAME")
     }
 
-    /// Columns.
     pub fn width(&self) -> usize {
         self.width
     }
 
-    /// Rows, of one plane of a cube.
     pub fn height(&self) -> usize {
         self.height
     }
@@ -221,15 +202,11 @@ impl ImageReader {
         self.planes
     }
 
-    /// Rows of all planes.
     fn rows(&self) -> usize {
         self.height * self.planes
     }
 
     /// A numeric header value; `None` if absent.
-    ///
-    /// # Errors
-    /// If the value is not a number.
     pub fn number(&self, key: &str) -> Result<Option<f64>, FileError> {
         self.file.number(key)
     }
@@ -239,29 +216,21 @@ impl ImageReader {
         self.file.text(key)
     }
 
-    /// Goes back to the first row.
     pub fn rewind(&mut self) {
         self.next_row = 0;
     }
 
-    /// Skips the next `rows` rows.
     pub fn skip_rows(&mut self, rows: usize) {
         self.next_row = (self.next_row + rows).min(self.rows());
     }
 
     /// The next `rows` rows, or fewer at the end of the image. Pixels that are not finite, −1e30, or, in an
     /// image of integers, have the value of its key BLANK, are NaN.
-    ///
-    /// # Errors
-    /// If the pixels cannot be read, as in a damaged file.
     pub fn read_rows(&mut self, rows: usize) -> Result<Vec<f32>, FileError> {
         self.read_rows_as(rows)
     }
 
     /// The same in another precision: masks of more than 24 bits do not fit into `f32`.
-    ///
-    /// # Errors
-    /// As [`ImageReader::read_rows`].
     pub fn read_rows_as<P: Pixel>(&mut self, rows: usize) -> Result<Vec<P>, FileError> {
         let first = self.next_row;
         let last = (first + rows).min(self.rows());
@@ -277,9 +246,6 @@ impl ImageReader {
 
     /// A square of `side` × `side` pixels, row-major. Its lower left pixel is at column `x` and row `y` of the image, both
     /// from 0. Pixels outside the image are NaN.
-    ///
-    /// # Errors
-    /// As [`ImageReader::read_rows`].
     pub fn read_square<P: Pixel>(
         &mut self,
         x: i64,
@@ -311,7 +277,7 @@ impl ImageReader {
         }
     }
 
-    /// Reads as many pixels as there is room for, from the one at `first`, from 0.
+    // Reads as many pixels as there is room for, from the one at `first`, from 0.
     fn fill<P: Pixel>(&mut self, first: usize, pixels: &mut [P]) -> Result<(), FileError> {
         // cfitsio always writes to the second.
         let (mut blank, mut some_blank) = (P::MISSING, 0);
@@ -343,7 +309,6 @@ impl ImageReader {
     }
 }
 
-/// A column of a table, by its number from 1.
 #[derive(Clone)]
 struct Description {
     number: c_int,
@@ -369,7 +334,6 @@ impl Description {
         }
     }
 
-    /// The column of a name of [`Description::names`].
     fn named(&self, name: &str) -> Option<Self> {
         let element = self.names().iter().position(|own| own == name)?;
         Some(Description {
@@ -380,19 +344,15 @@ impl Description {
     }
 }
 
-/// A table of a file.
 #[derive(Debug, Clone)]
 pub struct TableHead {
-    /// Number of its extension, from 1.
     pub number: usize,
     /// Its name, EXTNAME; empty if it has none.
     pub name: String,
-    /// Names of its columns.
     pub columns: Vec<String>,
 }
 
 impl TableHead {
-    /// The table that `file` is at.
     fn here(file: &File) -> Result<Self, FileError> {
         let mut columns = Vec::new();
         for number in 1..=column_count(file)? {
@@ -405,7 +365,6 @@ impl TableHead {
         })
     }
 
-    /// Its number and name, as messages list it.
     pub fn shown(&self) -> String {
         match self.name.as_str() {
             "" => self.number.to_string(),
@@ -413,7 +372,6 @@ impl TableHead {
         }
     }
 
-    /// Whether it has this name or number.
     pub fn is_called(&self, name: &str) -> bool {
         match name.parse::<usize>() {
             Ok(number) => self.number == number,
@@ -421,22 +379,18 @@ impl TableHead {
         }
     }
 
-    /// Whether it contains the header of an image, as in FITS_LDAC.
+    // Whether it contains the header of an image, as in FITS_LDAC.
     fn is_image_head(&self) -> bool {
         self.name.eq_ignore_ascii_case("LDAC_IMHEAD")
     }
 }
 
-/// Tables as messages list them.
 fn list_of(tables: &[TableHead]) -> String {
     let shown: Vec<String> = tables.iter().map(TableHead::shown).collect();
     names_of(&shown)
 }
 
 /// The tables of a file, in order; if `table` is a name or a number, those that have it.
-///
-/// # Errors
-/// If the file cannot be read or has no such table.
 pub fn tables(path: &Path, table: Option<&str>) -> Result<Vec<TableHead>, FileError> {
     let mut file = File::open(path, "table")?;
     let all = all_tables(&mut file)?;
@@ -473,8 +427,8 @@ fn all_tables(file: &mut File) -> Result<Vec<TableHead>, FileError> {
     Ok(found)
 }
 
-/// Goes to the table of a file that is meant: the one that `table` names or numbers; otherwise the one that has all of
-/// the columns `wanted`; otherwise the first.
+// Goes to the table of a file that is meant: the one that `table` names or numbers; otherwise the one that has all of
+// the columns `wanted`; otherwise the first.
 fn go_to_table(
     file: &mut File,
     wanted: Option<&[&str]>,
@@ -523,9 +477,6 @@ fn go_to_table(
 
 /// Columns of a table of a file: the columns `wanted`, or all columns of numbers. `table` is the name (EXTNAME) or number
 /// (the first extension is 1) of the table. Without it, the table with the wanted columns is read, or else the first.
-///
-/// # Errors
-/// If the file cannot be read, has no such table or several, or lacks a column.
 pub fn read_table(
     path: &Path,
     wanted: Option<&[&str]>,
@@ -550,9 +501,6 @@ pub fn read_table(
 
 /// Reads the columns `wanted` of a table, as [`read_table`], in parts of at most `most_rows`, and gives each to `take`.
 /// Columns of text are read too, and 64-bit integers as such.
-///
-/// # Errors
-/// As [`read_table`], and those of `take`.
 pub fn read_table_parts(
     path: &Path,
     wanted: &[&str],
@@ -602,7 +550,7 @@ fn choose_columns(
     Ok(chosen)
 }
 
-/// Some rows of columns, counted from 0. If `exact`, 64-bit integers stay such.
+// Some rows of columns, counted from 0. If `exact`, 64-bit integers stay such.
 fn read_part(
     file: &File,
     columns: &[Description],
@@ -621,9 +569,6 @@ fn read_part(
 }
 
 /// Text values of `keys` in the header of a file's first extension. Absent keys are left out.
-///
-/// # Errors
-/// If the file cannot be read or has no extension.
 pub fn read_table_keys<'a>(
     path: &Path,
     keys: impl Iterator<Item = &'a String>,
@@ -692,7 +637,7 @@ fn describe_column(file: &File, number: c_int) -> Result<Description, FileError>
     })
 }
 
-/// Refuses a column if its scale is zero, or if its scale or offset is not finite.
+// Refuses a column if its scale is zero, or if its scale or offset is not finite.
 fn check_scale(file: &File, number: c_int, name: &str) -> Result<(), FileError> {
     for (key, zero) in [("TSCAL", false), ("TZERO", true)] {
         let key = format!("{key}{number}");
@@ -707,60 +652,36 @@ fn check_scale(file: &File, number: c_int, name: &str) -> Result<(), FileError> 
     Ok(())
 }
 
-/// Rows of a column as real numbers; missing ones are NaN, true is 1 and false 0. Of a vector, the numbers of one place.
+// All values of some rows of a column, as many for each as it repeats them.
+fn values_of<T: ColumnValue>(
+    file: &File,
+    description: &Description,
+    rows: &Range<usize>,
+    missing: T,
+) -> Result<Vec<T>, FileError> {
+    let count = rows.len() * description.repeat.max(1) as usize;
+    let doing = || format!("cannot read column `{}`", description.name);
+    file.values(doing, description.number, rows.start + 1, count, missing)
+}
+
+// Rows of a column as real numbers; missing ones are NaN, true is 1 and false 0. Of a vector, the numbers of one place.
 fn read_column(
     file: &File,
     description: &Description,
     rows: &Range<usize>,
 ) -> Result<Column, FileError> {
-    let first = rows.start as i64 + 1;
     let repeat = description.repeat.max(1);
-    let count = rows.len() as i64 * repeat;
-    let doing = || format!("cannot read column `{}`", description.name);
-    let mut some_missing = 0;
     let values = if description.kind == TLOGICAL {
         // Neither true nor false is missing.
-        let missing = 2;
-        let mut values = vec![0 as c_char; count as usize];
-        // SAFETY: the file is open, and there is room for all the values.
-        file.call(doing, |raw, status| unsafe {
-            sys::ffgcvl(
-                raw,
-                description.number,
-                first,
-                1,
-                count,
-                missing,
-                values.as_mut_ptr(),
-                &mut some_missing,
-                status,
-            );
-        })?;
-        let real = |value: c_char| {
-            if value == missing {
-                f64::NAN
-            } else {
-                f64::from(value)
-            }
+        const MISSING: c_char = 2;
+        let real = |value: c_char| match value {
+            MISSING => f64::NAN,
+            value => f64::from(value),
         };
+        let values = values_of(file, description, rows, MISSING)?;
         values.into_iter().map(real).collect()
     } else {
-        let mut values = vec![0.0; count as usize];
-        // SAFETY: the file is open, and there is room for all the values.
-        file.call(doing, |raw, status| unsafe {
-            sys::ffgcvd(
-                raw,
-                description.number,
-                first,
-                1,
-                count,
-                f64::NAN,
-                values.as_mut_ptr(),
-                &mut some_missing,
-                status,
-            );
-        })?;
-        values
+        values_of(file, description, rows, f64::NAN)?
     };
     let own: Vec<f64> = match repeat {
         1 => values,
@@ -772,7 +693,7 @@ fn read_column(
     Ok(Column::new(description.name.as_str().into(), own))
 }
 
-/// Rows of a column of 64-bit integers as such, if it has neither a scale nor missing values.
+// Rows of a column of 64-bit integers as such, if it has neither a scale nor missing values.
 fn read_integers(
     file: &File,
     description: &Description,
@@ -785,50 +706,17 @@ fn read_integers(
     if !plain {
         return read_column(file, description, rows);
     }
-    let (first, count) = (rows.start as i64 + 1, rows.len() as i64);
-    let doing = || format!("cannot read column `{}`", description.name);
     let name = description.name.as_str().into();
-    let mut some_missing = 0;
-    if zero == UNSIGNED {
-        let mut values = vec![0_u64; rows.len()];
-        // SAFETY: the file is open, and there is room for all the rows.
-        file.call(doing, |raw, status| unsafe {
-            sys::ffgcvujj(
-                raw,
-                number,
-                first,
-                1,
-                count,
-                0,
-                values.as_mut_ptr().cast(),
-                &mut some_missing,
-                status,
-            );
-        })?;
-        return Ok(Column::new(name, values));
-    }
-    let mut values = vec![0_i64; rows.len()];
-    // SAFETY: the file is open, and there is room for all the rows.
-    file.call(doing, |raw, status| unsafe {
-        sys::ffgcvjj(
-            raw,
-            number,
-            first,
-            1,
-            count,
-            0,
-            values.as_mut_ptr().cast(),
-            &mut some_missing,
-            status,
-        );
-    })?;
-    Ok(Column::new(name, values))
+    Ok(match zero == UNSIGNED {
+        true => Column::new(name, values_of(file, description, rows, 0_u64)?),
+        false => Column::new(name, values_of(file, description, rows, 0_i64)?),
+    })
 }
 
-/// Most bytes of a text.
+// Most bytes of a text.
 const MAX_TEXT: i64 = 1 << 10;
 
-/// Rows of a column of text, without blanks at the end.
+// Rows of a column of text, without blanks at the end.
 fn read_texts(
     file: &File,
     description: &Description,

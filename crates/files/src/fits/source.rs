@@ -13,22 +13,18 @@ use flate2::bufread::MultiGzDecoder;
 use crate::error::FileError;
 use crate::open::open;
 
-/// Most bytes that a gzip file may unpack to: ten images of the challenge.
-const MOST_UNPACKED: u64 = 1 << 30;
-/// Bytes that are unpacked at a time, at least.
-const STEP: u64 = 1 << 23;
+// Most bytes that a gzip file may unpack to: ten images of the challenge.
+const MAX_UNPACKED_BYTES: u64 = 1 << 30;
+// Bytes that are unpacked at a time, at least.
+const UNPACK_STEP_BYTES: u64 = 1 << 23;
 
-/// An open FITS file.
 pub struct Source {
-    /// Its name in errors.
     path: PathBuf,
-    /// The plain file that cfitsio reads.
     file: File,
     /// Bytes in it.
     size: u64,
     /// Bytes on disk.
     disk: u64,
-    /// The part that is not yet unpacked.
     packed: Option<MultiGzDecoder<BufReader<File>>>,
 }
 
@@ -70,7 +66,6 @@ impl Source {
         Err(FileError::new(path, message))
     }
 
-    /// The name under which cfitsio opens it.
     pub fn name(&self) -> Result<CString, FileError> {
         let name = match self.packed {
             None => literal(self.path.as_os_str().as_encoded_bytes()),
@@ -79,7 +74,6 @@ impl Source {
         CString::new(name).map_err(FileError::doing(&self.path, "cannot open the file"))
     }
 
-    /// Its name in errors.
     pub fn path(&self) -> &Path {
         &self.path
     }
@@ -89,18 +83,17 @@ impl Source {
         self.disk
     }
 
-    /// Whether it is a gzip file.
     pub fn is_packed(&self) -> bool {
         self.packed.is_some()
     }
 
     /// Checks that a gzip file may have so many bytes.
     pub fn allow(&self, wanted: u64) -> Result<(), FileError> {
-        if wanted <= MOST_UNPACKED {
+        if wanted <= MAX_UNPACKED_BYTES {
             return Ok(());
         }
         let message = format!(
-            "its header asks for {wanted} bytes; expected at most {MOST_UNPACKED} in a gzip file: unpack it first"
+            "its header asks for {wanted} bytes; expected at most {MAX_UNPACKED_BYTES} in a gzip file: unpack it first"
         );
         Err(FileError::new(&self.path, message))
     }
@@ -114,7 +107,7 @@ impl Source {
         let Some(packed) = &mut self.packed else {
             return Ok(self.size);
         };
-        let more = (wanted - self.size).max(STEP);
+        let more = (wanted - self.size).max(UNPACK_STEP_BYTES);
         self.size += self
             .file
             .seek(SeekFrom::Start(self.size))
@@ -134,21 +127,17 @@ impl Source {
         Ok(bytes)
     }
 
-    /// Reads a gzip file to its checksum.
-    ///
-    /// # Errors
-    /// If it is truncated, damaged, or much longer than the part that was read.
     pub fn check_end(&mut self) -> Result<(), FileError> {
         let Some(packed) = &mut self.packed else {
             return Ok(());
         };
-        let rest = std::io::copy(&mut packed.take(MOST_UNPACKED), &mut std::io::sink())
+        let rest = std::io::copy(&mut packed.take(MAX_UNPACKED_BYTES), &mut std::io::sink())
             .map_err(FileError::doing(&self.path, "cannot unpack the gzip file"))?;
-        if rest < MOST_UNPACKED {
+        if rest < MAX_UNPACKED_BYTES {
             return Ok(());
         }
         let message =
-            format!("more than {MOST_UNPACKED} bytes follow what was read of the gzip file");
+            format!("more than {MAX_UNPACKED_BYTES} bytes follow what was read of the gzip file");
         Err(FileError::new(&self.path, message))
     }
 
@@ -163,7 +152,7 @@ fn open_file_name(file: &File) -> Vec<u8> {
     format!("/dev/fd/{}", file.as_raw_fd()).into_bytes()
 }
 
-/// A name that cfitsio does not change. cfitsio replaces a tilde at the start by a home folder.
+// A name that cfitsio does not change. cfitsio replaces a tilde at the start by a home folder.
 fn literal(name: &[u8]) -> Vec<u8> {
     let here: &[u8] = if name.starts_with(b"~") { b"./" } else { b"" };
     [here, name].concat()

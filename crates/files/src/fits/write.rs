@@ -11,17 +11,15 @@ use super::header::{BLOCK, Header, Value};
 use crate::atomic::{self, PartFile};
 use crate::error::FileError;
 
-/// Most columns of a table (FITS standard 4.0, section 7).
+// Most columns of a table (FITS standard 4.0, section 7).
 const MOST_COLUMNS: usize = 999;
 
-/// An image being written.
 pub struct ImageWriter {
     file: File,
     part: PartFile,
     width: usize,
     height: usize,
     next_row: usize,
-    /// Rows as they stand in the file.
     bytes: Vec<u8>,
 }
 
@@ -33,9 +31,6 @@ impl std::fmt::Debug for ImageWriter {
 
 impl ImageWriter {
     /// Starts an image of 32-bit floats.
-    ///
-    /// # Errors
-    /// If the file cannot be created.
     pub fn create(
         path: impl AsRef<Path>,
         width: usize,
@@ -58,10 +53,6 @@ impl ImageWriter {
         Ok(writer)
     }
 
-    /// Writes the next rows.
-    ///
-    /// # Errors
-    /// If they cannot be written, or are not whole rows of this image.
     pub fn write_rows(&mut self, pixels: &[f32]) -> Result<(), FileError> {
         let rows = pixels.len() / self.width;
         if rows * self.width != pixels.len() || self.next_row + rows > self.height {
@@ -81,18 +72,11 @@ impl ImageWriter {
         Ok(())
     }
 
-    /// Closes the file and gives it its name.
-    ///
-    /// # Errors
-    /// If rows are missing or the file cannot be written.
     pub fn finish(self) -> Result<(), FileError> {
         self.closed()?.finish()
     }
 
     /// Like [`ImageWriter::finish`], but does not replace an existing file. Returns whether the file was written.
-    ///
-    /// # Errors
-    /// As [`ImageWriter::finish`].
     pub fn finish_if_absent(self) -> Result<bool, FileError> {
         self.closed()?.finish_if_absent()
     }
@@ -126,7 +110,7 @@ impl ImageWriter {
     }
 }
 
-/// The error for a file `path` that cannot be written.
+// The error for a file `path` that cannot be written.
 fn cannot(path: &Path) -> impl Fn(String) -> FileError {
     move |error| FileError::new(path, format!("cannot write the file: {error}"))
 }
@@ -141,7 +125,6 @@ fn image_header(sides: [usize; 2], keys: &[(&str, Value)]) -> Result<Vec<u8>, St
     Ok(header.blocks())
 }
 
-/// Values of a column in the types that are written.
 enum Values {
     Real(Vec<f64>),
     Whole(Vec<i64>),
@@ -176,7 +159,7 @@ impl Values {
         }
     }
 
-    /// Appends the value of a row as it stands in the file: big-endian numbers, texts with spaces at their end.
+    // Appends the value of a row as it stands in the file: big-endian numbers, texts with spaces at their end.
     fn append(&self, row: usize, bytes: &mut Vec<u8>) {
         match self {
             Values::Real(values) => bytes.extend(values[row].to_be_bytes()),
@@ -191,9 +174,6 @@ impl Values {
 }
 
 /// Writes `table` as the only binary table of a file, with `header` keys of at most eight characters.
-///
-/// # Errors
-/// If the file cannot be written.
 pub fn write_table(
     path: &Path,
     table: &DataFrame,
@@ -272,7 +252,7 @@ fn table_header(
     Ok(header.blocks())
 }
 
-/// Refuses names that cfitsio does not treat as plain: those with `[...]`, `(...)`, a leading `!` or `-`, or a trailing `+n`.
+// Refuses names that cfitsio does not treat as plain: those with `[...]`, `(...)`, a leading `!` or `-`, or a trailing `+n`.
 fn plain_name(path: &Path) -> Result<(), FileError> {
     let Some(name) = path.to_str() else {
         return Err(FileError::new(path, "FITS file names must be UTF-8"));

@@ -152,8 +152,8 @@ fn compressed_tables_stream_and_are_bounded() {
             .unwrap_err()
             .contains("line 11: expected at most 10 rows")
     );
-    let long = vec![b' '; 2 * MAX_RECORD];
-    let zeros = vec![0; 2 * MAX_RECORD];
+    let long = vec![b' '; 2 * MAX_RECORD_BYTES];
+    let zeros = vec![0; 2 * MAX_RECORD_BYTES];
     for start in [
         "",
         "#",
