@@ -8,6 +8,9 @@ dist=${1:?usage: .ci/release/tag.sh DIST [--tag]}
 version=$(sed -n 's/^version = "\(.*\)"/\1/p' Cargo.toml | head -1)
 fail() { echo "error: $*" >&2; exit 1; }
 
+# The other crates have `publish = false`.
+published=(-p shearq-quantities -p shearq-fourier -p shearq-submissions -p shearq-bias -p shearq-scoring -p shearq-measure)
+
 [ -z "$(git status --porcelain)" ] || fail "uncommitted changes. Try: git stash"
 git rev-parse -q --verify "refs/tags/v$version" > /dev/null && fail "the tag v$version exists. Try: a new version in Cargo.toml"
 grep -q "^version: $version\$" CITATION.cff || fail "CITATION.cff: expected version: $version"
@@ -15,9 +18,9 @@ grep -q "^## .*$version" CHANGELOG.md || fail "CHANGELOG.md: expected a section 
 
 bash .ci/run
 cargo test --release -- --ignored
-cargo package --workspace --locked --exclude shearq-python --exclude shearq-benches
+cargo package --locked "${published[@]}"
 bash .ci/release/archive.sh "$dist"
 if [ "${2:-}" = --tag ]; then
     git tag -a "v$version" -m "shearq $version"
-    echo "Publish by: git push origin v$version && cargo publish --workspace --exclude shearq-python --exclude shearq-benches"
+    echo "Publish by: git push origin v$version && cargo publish ${published[*]}"
 fi

@@ -3,32 +3,37 @@
 //! A small file is read completely. A large image is sampled: its length, its beginning, and blocks spread evenly over the
 //! rest. This detects another image, noise or scale, and any changed region above a 64th of the file. It does not detect
 //! a change between the blocks, such as of a few stamps.
+//!
+//! The fingerprints of its image, PSF and true shear are stored with a catalogue, and compared when it is used.
 
+use std::collections::BTreeMap;
 use std::io::{Read, Seek, SeekFrom};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use sha2::{Digest, Sha256};
 
+use crate::images::ImageId;
 use crate::layout::DataFolder;
-use crate::run::Source;
+use crate::run::{Run, Source};
 use shearq_files::FileError;
-use shearq_files::open;
+use shearq_files::open::{self, is_there};
+use shearq_files::table::read_metadata;
+use shearq_submissions::PsfForm;
 
-/// Bytes of the longest file that is read completely.
-const WHOLE: u64 = 1 << 20;
-/// Bytes at the beginning of a longer file: its headers.
-const HEAD: u64 = 16 * 1024;
-/// Sampled blocks of the rest.
+// Bytes of the longest file that is read completely.
+const MAX_WHOLE_BYTES: u64 = 1 << 20;
+// Bytes at the beginning of a longer file: its headers.
+const HEAD_BYTES: u64 = 16 * 1024;
+// Sampled blocks of the rest.
 const BLOCKS: u64 = 64;
-/// Bytes of a block: what a system reads at once.
-const BLOCK: u64 = 4096;
+// Bytes of a block: what a system reads at once.
+const BLOCK_BYTES: u64 = 4096;
 
 /// A SHA-256 of several parts with their lengths.
 #[derive(Debug, Default)]
 pub struct Fingerprint(Sha256);
 
 impl Fingerprint {
-    /// Adds a part.
     pub fn add(&mut self, part: impl AsRef<[u8]>) {
         let part = part.as_ref();
         self.0.update((part.len() as u64).to_le_bytes());
@@ -54,18 +59,11 @@ pub fn of_bytes(bytes: &[u8]) -> String {
     print.finish()
 }
 
-/// Fingerprint of a file as a whole.
-///
-/// # Errors
-/// If it cannot be read.
 pub fn of_file(path: &Path) -> Result<String, FileError> {
     Ok(of_bytes(&read(path)?))
 }
 
 /// Fingerprint of an image or its PSF: a sample if the file is large.
-///
-/// # Errors
-/// If it cannot be read.
 pub fn of_image(path: &Path) -> Result<String, FileError> {
     sample(path).map_err(FileError::doing(path, "cannot open the file"))
 }
@@ -82,25 +80,22 @@ fn sample(path: &Path) -> std::io::Result<String> {
         print.add(&part);
         std::io::Result::Ok(())
     };
-    if length <= WHOLE {
-        add(&mut file, WHOLE)?;
+    if length <= MAX_WHOLE_BYTES {
+        add(&mut file, MAX_WHOLE_BYTES)?;
         return Ok(print.finish());
     }
-    add(&mut file, HEAD)?;
+    add(&mut file, HEAD_BYTES)?;
     // The last block ends with the file.
-    let room = length - HEAD - BLOCK;
+    let room = length - HEAD_BYTES - BLOCK_BYTES;
     for block in 1..=BLOCKS {
-        let start = HEAD + (u128::from(room) * u128::from(block) / u128::from(BLOCKS)) as u64;
+        let start = HEAD_BYTES + (u128::from(room) * u128::from(block) / u128::from(BLOCKS)) as u64;
         file.seek(SeekFrom::Start(start))?;
-        add(&mut file, BLOCK)?;
+        add(&mut file, BLOCK_BYTES)?;
     }
     Ok(print.finish())
 }
 
 /// Fingerprint of one set: its true shear, the settings of its simulation, and the existing files of `images`.
-///
-/// # Errors
-/// If a file cannot be read.
 pub fn of_set(
     source: &Source,
     data: &DataFolder,
@@ -114,7 +109,7 @@ pub fn of_set(
     print.add(read(&data.truth(set))?);
     for &image in images {
         let path = data.galaxies(set, image);
-        if open::is_there(&path) {
+        if is_there(&path) {
             print.add(image.to_le_bytes());
             print.add(of_image(&path)?);
         }
@@ -123,9 +118,6 @@ pub fn of_set(
 }
 
 /// Fingerprint of all data of a source: the settings of a simulation, or the true shear of every set of a folder.
-///
-/// # Errors
-/// If a file cannot be read.
 pub fn of_source(source: &Source, data: &DataFolder) -> Result<String, FileError> {
     let mut print = Fingerprint::default();
     match source {
@@ -146,6 +138,85 @@ pub fn of_source(source: &Source, data: &DataFolder) -> Result<String, FileError
 
 fn read(path: &Path) -> Result<Vec<u8>, FileError> {
     open::read(path, open::DATA).map_err(FileError::doing(path, "cannot read the file"))
+}
+
+const GALAXIES: &str = "galaxies";
+pub const PSF: &str = "psf";
+const TRUTH: &str = "truth";
+pub const PRINTS: [&str; 3] = [GALAXIES, PSF, TRUTH];
+
+/// The files that a run measures, if they are there. A simulated run has none.
+#[derive(Debug)]
+pub struct Inputs<'a> {
+    run: &'a Run,
+    data: &'a DataFolder,
+    truths: BTreeMap<u32, String>,
+}
+
+impl<'a> Inputs<'a> {
+    pub fn new(run: &'a Run, data: &'a DataFolder, images: &[ImageId]) -> Result<Self, FileError> {
+        let mut truths = BTreeMap::new();
+        if let Source::Folder { .. } = run.source {
+            for of_set in images.chunk_by(|a, b| a.set == b.set) {
+                let path = data.truth(of_set[0].set);
+                if is_there(&path) {
+                    truths.insert(of_set[0].set, of_file(&path)?);
+                }
+            }
+        }
+        Ok(Inputs { run, data, truths })
+    }
+
+    fn files(&self, id: ImageId) -> BTreeMap<&'static str, PathBuf> {
+        let psf = match self.run.configuration.psf.form {
+            PsfForm::Star => self.data.psf_star(id.set, id.image),
+            PsfForm::Functional => self.data.psf_functional(id.set, id.image),
+        };
+        BTreeMap::from([
+            (GALAXIES, self.data.galaxies(id.set, id.image)),
+            (PSF, psf),
+            (TRUTH, self.data.truth(id.set)),
+        ])
+    }
+
+    /// The fingerprints of an image's files, by their keys.
+    pub fn prints(&self, id: ImageId) -> Result<BTreeMap<String, String>, FileError> {
+        let mut prints = BTreeMap::new();
+        if let Source::Simulated(_) = self.run.source {
+            return Ok(prints);
+        }
+        for (key, path) in self.files(id) {
+            let print = match key {
+                TRUTH => self.truths.get(&id.set).cloned(),
+                _ if is_there(&path) => Some(of_image(&path)?),
+                _ => None,
+            };
+            prints.extend(print.map(|print| (key.to_owned(), print)));
+        }
+        Ok(prints)
+    }
+
+    /// Checks that the catalogue of an image in `out` was measured from the present files.
+    pub fn verify_image(&self, out: &Path, id: ImageId) -> Result<(), FileError> {
+        let catalogue = self.run.catalogue(out, id.set, id.image);
+        let now = self.prints(id)?;
+        if now.is_empty() {
+            return Ok(());
+        }
+        let kept = read_metadata(&catalogue, self.run.format, now.keys())?;
+        for (key, path) in self.files(id) {
+            if let (Some(now), Some(kept)) = (now.get(key), kept.get(key))
+                && now != kept
+            {
+                let message = format!(
+                    "the file has changed since {} was measured (found the fingerprint {now}, expected {kept}). Try: measure again into another folder",
+                    catalogue.display()
+                );
+                return Err(FileError::new(path, message));
+            }
+        }
+        Ok(())
+    }
 }
 
 #[cfg(test)]
@@ -179,7 +250,7 @@ mod tests {
         }
         assert_ne!(print(&large[..large.len() - 1]), whole);
         let mut between_blocks = large.clone();
-        between_blocks[(HEAD + BLOCK) as usize] ^= 1;
+        between_blocks[(HEAD_BYTES + BLOCK_BYTES) as usize] ^= 1;
         assert_eq!(print(&between_blocks), whole);
     }
 }

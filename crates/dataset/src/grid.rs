@@ -11,18 +11,12 @@ use shearq_files::FileError;
 use shearq_files::fits::ImageReader;
 
 /// Pixels a side of a stamp of an image: STAMP in its header, or else `stamp` in the layout.
-///
-/// # Errors
-/// If STAMP is not a whole number of pixels.
 fn stamp_of_image(data: &DataFolder, path: &Path, image: &ImageReader) -> Result<usize, FileError> {
     Ok(whole(image, path, "STAMP", MAX_STAMP)?.unwrap_or(data.layout().stamp))
 }
 
 /// The stamps of an image: n × n if its header has NGRID = n, NSTAMPS along the rows if it has that, otherwise as many as
 /// fit.
-///
-/// # Errors
-/// If the image is not made of whole stamps, in the number that its header states.
 pub fn of_image(data: &DataFolder, path: &Path, image: &ImageReader) -> Result<Mosaic, FileError> {
     let stamp = stamp_of_image(data, path, image)?;
     let (width, height) = (image.width(), image.height());
@@ -54,10 +48,6 @@ pub fn of_image(data: &DataFolder, path: &Path, image: &ImageReader) -> Result<M
     Ok(mosaic)
 }
 
-/// The grid of the stamps of an image, for scoring.
-///
-/// # Errors
-/// If there are not as many stamps in a row as rows, or too few or many.
 fn square(data: &DataFolder, path: &Path, mosaic: &Mosaic) -> Result<Grid, FileError> {
     let (n, rows) = (mosaic.columns, mosaic.rows());
     if mosaic.galaxies != n * n {
@@ -72,9 +62,6 @@ fn square(data: &DataFolder, path: &Path, mosaic: &Mosaic) -> Result<Grid, FileE
 }
 
 /// Pixels a side of the stamps of a set: of its first image, or of the layout if there is no image.
-///
-/// # Errors
-/// If that image cannot be read.
 pub fn stamp_of_set(data: &DataFolder, set: u32) -> Result<usize, FileError> {
     match data.images(&[set])?.of_set(set).first() {
         Some((_, path)) => stamp_of_image(data, path, &ImageReader::open(path)?),
@@ -83,9 +70,6 @@ pub fn stamp_of_set(data: &DataFolder, set: u32) -> Result<usize, FileError> {
 }
 
 /// Grid of a set's first image, `None` where there is none.
-///
-/// # Errors
-/// If it cannot be read.
 pub(crate) fn of_first_image(data: &DataFolder, set: u32) -> Result<Option<Grid>, FileError> {
     let images = data.images(&[set])?.of_set(set);
     let first = images.first().map(|(_, path)| {
@@ -96,9 +80,6 @@ pub(crate) fn of_first_image(data: &DataFolder, set: u32) -> Result<Option<Grid>
 }
 
 /// Grid of a catalogue of shearq, which has a row for every cell at its centre.
-///
-/// # Errors
-/// If `rows`, in order, do not fill a grid.
 pub fn of_catalogue(path: &Path, rows: &[Row], field: Degrees) -> Result<Grid, FileError> {
     let n = side(path, rows.len())?;
     let whole = |cell: &Row| (cell.x == cell.y).then_some(2.0 * cell.x - 1.0);
@@ -121,9 +102,6 @@ pub fn of_catalogue(path: &Path, rows: &[Row], field: Degrees) -> Result<Grid, F
 }
 
 /// Side of the grid of a file with one row per cell.
-///
-/// # Errors
-/// If the number of rows is no square.
 pub fn side(path: &Path, rows: usize) -> Result<usize, FileError> {
     Grid::side_of(rows).ok_or_else(|| {
         let message = format!("{rows} rows; expected the square of the grid's side");
@@ -132,9 +110,6 @@ pub fn side(path: &Path, rows: usize) -> Result<usize, FileError> {
 }
 
 /// A header value that counts something, `None` where absent.
-///
-/// # Errors
-/// If it is no whole number from 1 to `most`.
 pub fn whole(
     image: &ImageReader,
     path: &Path,

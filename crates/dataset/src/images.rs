@@ -6,19 +6,13 @@ use crate::layout::{DataFolder, fill};
 use crate::listing::{self, Files};
 use shearq_files::FileError;
 
-/// One image of a data folder or a simulation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ImageId {
-    /// Set number.
     pub set: u32,
-    /// Image number.
     pub image: u32,
 }
 
 /// Images of `sets` of a data folder (of all its sets if empty), in order.
-///
-/// # Errors
-/// If a set has no image, or the folder none at all, or a folder cannot be listed.
 pub fn of_folder(data: &DataFolder, sets: &[u32]) -> Result<Vec<ImageId>, FileError> {
     let files = data.images(sets)?;
     let mut found = Vec::new();
@@ -45,7 +39,7 @@ pub fn of_folder(data: &DataFolder, sets: &[u32]) -> Result<Vec<ImageId>, FileEr
     Ok(found)
 }
 
-/// Advice for a folder without images: rename a file, or use the folder above.
+// Advice for a folder without images: rename a file, or use the folder above.
 fn advice(data: &DataFolder, files: &Files) -> String {
     if let Some(line) = files.unread().first() {
         return format!(". {line}");
@@ -70,17 +64,13 @@ pub fn of_simulation(sets: &[u32], images: u32) -> Vec<ImageId> {
 /// the numbers of images differ by at most one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Shard {
-    /// Number of this shard, from 1.
     number: u32,
-    /// Number of shards.
     of: u32,
 }
 
 impl Shard {
-    /// All the work in one shard.
     pub const WHOLE: Shard = Shard { number: 1, of: 1 };
 
-    /// The images of this shard, out of all.
     pub fn part(&self, all: &[ImageId]) -> Vec<ImageId> {
         all.iter()
             .enumerate()
@@ -97,12 +87,10 @@ impl Shard {
         }
     }
 
-    /// Number of shards.
     pub fn of(&self) -> u32 {
         self.of
     }
 
-    /// Number of this shard, from 1.
     pub fn number(&self) -> u32 {
         self.number
     }

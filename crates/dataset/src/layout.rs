@@ -17,7 +17,7 @@ pub const MAX_STAMP: usize = 1024;
 /// Name of the layout file inside a data folder.
 pub const LAYOUT_FILE: &str = "layout.toml";
 
-/// Name of the table of stamps of a gathered image.
+// Name of the table of stamps of a gathered image.
 const STAMPS: &str = "set{set:02}/stamps-{image:03}.csv";
 
 /// File-name patterns and conventions of a data folder. `{set}` and `{image}` stand for plain numbers, `{set:02}` and
@@ -25,17 +25,11 @@ const STAMPS: &str = "set{set:02}/stamps-{image:03}.csv";
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(remote = "Self", deny_unknown_fields, default)]
 pub struct Layout {
-    /// Galaxy images.
     pub galaxies: String,
-    /// Star stamps.
     pub psf_star: String,
-    /// Functional PSFs.
     pub psf_functional: String,
-    /// True shear.
     pub truth: String,
-    /// Intrinsic and observed ellipticities.
     pub intrinsic: String,
-    /// Sign of g2 in the truth files.
     pub truth_sign: TruthSign,
     /// Side of the field in degrees.
     pub field_degrees: f64,
@@ -112,7 +106,6 @@ impl Layout {
     }
 }
 
-/// A data folder with its layout.
 #[derive(Debug, Clone)]
 pub struct DataFolder {
     root: PathBuf,
@@ -121,9 +114,6 @@ pub struct DataFolder {
 
 impl DataFolder {
     /// Opens a folder, with the layout of its `layout.toml` or the default one.
-    ///
-    /// # Errors
-    /// If the folder does not exist or its layout file is not valid.
     pub fn open(root: impl AsRef<Path>) -> Result<Self, FileError> {
         let root = root.as_ref().to_owned();
         if !root.is_dir() {
@@ -143,7 +133,6 @@ impl DataFolder {
         Ok(DataFolder { root, layout })
     }
 
-    /// A folder to be written in the default layout.
     pub fn new(root: impl AsRef<Path>) -> Self {
         DataFolder {
             root: root.as_ref().to_owned(),
@@ -151,12 +140,10 @@ impl DataFolder {
         }
     }
 
-    /// The folder.
     pub fn root(&self) -> &Path {
         &self.root
     }
 
-    /// The layout.
     pub fn layout(&self) -> &Layout {
         &self.layout
     }
@@ -166,7 +153,6 @@ impl DataFolder {
         self.image(&self.layout.galaxies, set, image)
     }
 
-    /// The star stamps of an image.
     pub fn psf_star(&self, set: u32, image: u32) -> PathBuf {
         self.image(&self.layout.psf_star, set, image)
     }
@@ -185,31 +171,24 @@ impl DataFolder {
             .unwrap_or(plain)
     }
 
-    /// The PSF parameters of an image.
     pub fn psf_functional(&self, set: u32, image: u32) -> PathBuf {
         self.root
             .join(fill(&self.layout.psf_functional, set, image))
     }
 
-    /// The table of stamps of a gathered image.
     pub fn stamps(&self, set: u32, image: u32) -> PathBuf {
         self.root.join(fill(STAMPS, set, image))
     }
 
-    /// The true shear of a set.
     pub fn truth(&self, set: u32) -> PathBuf {
         self.root.join(fill(&self.layout.truth, set, 0))
     }
 
-    /// The intrinsic ellipticities of an image.
     pub fn intrinsic(&self, set: u32, image: u32) -> PathBuf {
         self.root.join(fill(&self.layout.intrinsic, set, image))
     }
 
     /// The galaxy images of `sets` (of all if empty) that are there.
-    ///
-    /// # Errors
-    /// If a folder cannot be listed.
     pub fn images(&self, sets: &[u32]) -> Result<Files, FileError> {
         let pattern = &self.layout.galaxies;
         listing::find(&self.root, pattern, endings(pattern), sets)
@@ -233,9 +212,6 @@ impl DataFolder {
     }
 
     /// Sets that have a file of true shear. If one file serves all sets, these are the sets that have images.
-    ///
-    /// # Errors
-    /// If a folder cannot be listed.
     pub fn sets_with_truth(&self) -> Result<Vec<u32>, FileError> {
         let [plain, padded] = IMAGE_PLACEHOLDERS;
         let pattern = &self.layout.truth.replace(padded, "000").replace(plain, "0");
@@ -246,10 +222,6 @@ impl DataFolder {
         Ok(truths.sets())
     }
 
-    /// True shear of a set on `grid`.
-    ///
-    /// # Errors
-    /// If the file cannot be read or does not cover the grid.
     pub fn read_truth(&self, set: u32, grid: &Grid) -> Result<TrueShear, FileError> {
         let path = self.truth(set);
         truth_is_there(&path)?;
@@ -260,9 +232,6 @@ impl DataFolder {
     }
 
     /// Sign of g2 in the truth of a set: the one that the file states, or else the layout's.
-    ///
-    /// # Errors
-    /// If the file cannot be read, or states the standard sign and the layout the challenge's.
     pub fn truth_sign(&self, set: u32) -> Result<TruthSign, FileError> {
         let (path, layout) = (self.truth(set), self.layout.truth_sign);
         match stated_sign(&path)? {
@@ -277,10 +246,6 @@ impl DataFolder {
     }
 }
 
-/// Checks that there is a truth file.
-///
-/// # Errors
-/// If there is none; the message names the command for data without a true shear.
 pub fn truth_is_there(path: &Path) -> Result<(), FileError> {
     if is_there(path) {
         return Ok(());
@@ -301,9 +266,6 @@ fn endings(pattern: &str) -> &'static [&'static str] {
 pub const SIGN_KEY: &str = "g2sign";
 
 /// The sign of g2, if a truth file states it.
-///
-/// # Errors
-/// If the file cannot be read, or states another word.
 pub fn stated_sign(path: &Path) -> Result<Option<TruthSign>, FileError> {
     match table::stated(path, SIGN_KEY)?.as_deref() {
         None => Ok(None),
@@ -318,9 +280,6 @@ pub fn stated_sign(path: &Path) -> Result<Option<TruthSign>, FileError> {
 
 /// Rows (x, y, g1, g2) of the table of a truth file. Each row is made when it is needed: all rows of the largest grid
 /// are 512 MB.
-///
-/// # Errors
-/// If a column does not contain numbers.
 pub fn truth_rows<'t>(
     path: &Path,
     table: &'t DataFrame,
@@ -329,9 +288,6 @@ pub fn truth_rows<'t>(
 }
 
 /// Rows of a catalogue, at most `most`, from four named columns.
-///
-/// # Errors
-/// If the file cannot be read or a column is absent.
 pub fn read_rows(path: &Path, names: &[&str; 4], most: usize) -> Result<Vec<Row>, FileError> {
     let hint = "`score --columns` (names, or numbers such as 2,3,4,5) or a description (--foreign) names others";
     let table =
@@ -355,18 +311,13 @@ fn rows_of<'t>(
     }))
 }
 
-/// Highest set number.
 pub const MAX_SET: u32 = 9_999;
-/// Highest image number.
 pub const MAX_IMAGE: u32 = 999_999;
 
-/// Placeholders for the number of a set.
 pub(crate) const SET_PLACEHOLDERS: [&str; 2] = ["{set}", "{set:02}"];
-/// Placeholders for the number of an image.
 pub const IMAGE_PLACEHOLDERS: [&str; 2] = ["{image}", "{image:03}"];
 pub(crate) const PLACEHOLDERS: [[&str; 2]; 2] = [SET_PLACEHOLDERS, IMAGE_PLACEHOLDERS];
 
-/// Replaces the placeholders of a pattern by numbers.
 pub fn fill(pattern: &str, set: u32, image: u32) -> String {
     let [[set_plain, set_padded], [image_plain, image_padded]] = PLACEHOLDERS;
     pattern
@@ -377,9 +328,6 @@ pub fn fill(pattern: &str, set: u32, image: u32) -> String {
 }
 
 /// Checks that the pattern of `key` has a placeholder of each kind in `needed`, and no other braces.
-///
-/// # Errors
-/// The message says what is wrong with the pattern.
 pub fn check_pattern(key: &str, pattern: &str, needed: &[[&str; 2]]) -> Result<(), String> {
     for one_of in needed {
         if !one_of.iter().any(|name| pattern.contains(name)) {

@@ -6,17 +6,14 @@
 pub mod fingerprint;
 pub mod grid;
 pub mod images;
-pub mod inputs;
 pub mod layout;
 pub mod listing;
 pub mod mosaic;
 pub mod psf_table;
 pub mod record;
-pub mod relative;
 pub mod run;
 pub mod truth;
 
-/// Version of this package, as outputs carry it.
 pub const VERSION: &str = env!("CARGO_PKG_VERSION");
 
 /// The examples of README.md.

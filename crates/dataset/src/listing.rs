@@ -19,18 +19,16 @@ pub struct Files {
     unread: BTreeMap<Reason, Unread>,
 }
 
-/// Why something that looks like a file of data is not read.
+// Why something that looks like a file of data is not read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum Reason {
     /// The name of a file does not follow the pattern.
     File,
-    /// The name of a folder does not.
     Folder,
     /// Another file has the same numbers.
     Second,
 }
 
-/// Things that are not read for one reason.
 #[derive(Debug)]
 struct Unread {
     first: PathBuf,
@@ -42,12 +40,10 @@ struct Unread {
 #[derive(Debug)]
 struct Found {
     path: PathBuf,
-    /// Rank of its ending.
     rank: usize,
 }
 
 impl Files {
-    /// The files of a set, by image number.
     pub fn of_set(&self, set: u32) -> Vec<(u32, PathBuf)> {
         let files = self.by_set.get(&Some(set)).or(self.by_set.get(&None));
         let files = files.into_iter().flatten();
@@ -56,7 +52,6 @@ impl Files {
             .collect()
     }
 
-    /// Sets that have a file, in order.
     pub fn sets(&self) -> Vec<u32> {
         if self.serve_all_sets() {
             return (1..=MAX_SET).collect();
@@ -64,12 +59,10 @@ impl Files {
         self.by_set.keys().copied().flatten().collect()
     }
 
-    /// Whether there is none.
     pub fn is_empty(&self) -> bool {
         self.by_set.is_empty()
     }
 
-    /// Whether a set has a file.
     pub fn has(&self, set: u32) -> bool {
         self.serve_all_sets() || self.by_set.contains_key(&Some(set))
     }
@@ -119,14 +112,12 @@ impl Files {
     }
 }
 
-/// Numbers in a name.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 struct Numbers {
     set: Option<u32>,
     image: Option<u32>,
 }
 
-/// A search for files.
 struct Search<'a> {
     /// Endings that a file's name may have beyond the pattern's.
     endings: &'a [&'a str],
@@ -140,9 +131,6 @@ struct Search<'a> {
 ///
 /// Anything with such a name counts as a file, so that unreadable files are reported later. Files of a pattern without an
 /// image number have number 0.
-///
-/// # Errors
-/// If a folder cannot be listed.
 pub fn find(
     root: &Path,
     pattern: &str,
@@ -160,7 +148,6 @@ pub fn find(
 }
 
 impl Search<'_> {
-    /// Follows the rest of a pattern from `folder` on.
     fn walk(
         &mut self,
         folder: &Path,
@@ -265,7 +252,7 @@ impl Files {
     }
 }
 
-/// The name that a pattern has with the numbers in `runs` of digits; the pattern's form if they do not fit it.
+// The name that a pattern has with the numbers in `runs` of digits; the pattern's form if they do not fit it.
 fn expected(pattern: &[Piece<'_>], runs: &[&str]) -> String {
     let places = |piece: &&Piece<'_>| match piece {
         Piece::Text(text) => digits(text).len(),
@@ -299,14 +286,13 @@ fn expected(pattern: &[Piece<'_>], runs: &[&str]) -> String {
     name
 }
 
-/// Runs of digits in a name.
 fn digits(name: &str) -> Vec<&str> {
     let runs = name.split(|c: char| !c.is_ascii_digit());
     runs.filter(|run| !run.is_empty()).collect()
 }
 
-/// A name without the parts that people write differently: case, separators, numbers, and the endings of FITS and
-/// compressed files.
+// A name without the parts that people write differently: case, separators, numbers, and the endings of FITS and
+// compressed files.
 fn shape(name: &str) -> String {
     let mut name = name.to_ascii_lowercase();
     for ending in [".gz", ".fz", ".bz2", ".xz", ".z", ".zip"] {
@@ -334,25 +320,22 @@ fn shape(name: &str) -> String {
     shape
 }
 
-/// Most names of a folder that a message lists.
-const SHOWN: usize = 4;
+// Most names of a folder that a message lists.
+const MAX_LISTED: usize = 4;
 
 /// The first names in a folder as a message lists them.
-///
-/// # Errors
-/// If it cannot be listed.
 pub fn sample(folder: &Path) -> Result<String, FileError> {
     let names = names(folder)?;
-    let list = names.iter().take(SHOWN).map(String::as_str);
+    let list = names.iter().take(MAX_LISTED).map(String::as_str);
     let list = list.collect::<Vec<_>>().join(", ");
-    Ok(match names.len().checked_sub(SHOWN) {
+    Ok(match names.len().checked_sub(MAX_LISTED) {
         None if names.is_empty() => "an empty folder".into(),
         None | Some(0) => list,
         Some(more) => format!("{list} and {more} more"),
     })
 }
 
-/// Names in a folder that are UTF-8, in order, none if it does not exist.
+// Names in a folder that are UTF-8, in order, none if it does not exist.
 fn names(folder: &Path) -> Result<Vec<String>, FileError> {
     let place = match folder.as_os_str().is_empty() {
         true => Path::new("."),
@@ -379,14 +362,13 @@ fn names(folder: &Path) -> Result<Vec<String>, FileError> {
     Ok(names)
 }
 
-/// A part of the pattern of a name.
 #[derive(Debug, Clone, Copy)]
 enum Piece<'a> {
     Text(&'a str),
     Number { of_set: bool, padded: bool },
 }
 
-/// Parts of a pattern of one name. A name that is not UTF-8 has no numbers.
+// Parts of a pattern of one name. A name that is not UTF-8 has no numbers.
 fn pieces(pattern: &OsStr) -> Vec<Piece<'_>> {
     let Some(mut rest) = pattern.to_str() else {
         return Vec::new();

@@ -11,12 +11,10 @@ pub struct Mosaic {
     pub columns: usize,
     /// All stamps, at least 1.
     pub galaxies: usize,
-    /// Pixels a side of a stamp.
     pub stamp: usize,
 }
 
 impl Mosaic {
-    /// n × n stamps.
     pub fn square(n: usize, stamp: usize) -> Self {
         Mosaic {
             columns: n,
@@ -34,12 +32,10 @@ impl Mosaic {
         }
     }
 
-    /// Rows of stamps.
     pub fn rows(&self) -> usize {
         self.galaxies.div_ceil(self.columns)
     }
 
-    /// Stamps of row `iy`, from 0.
     pub fn of_row(&self, iy: usize) -> usize {
         self.galaxies
             .saturating_sub(iy * self.columns)

@@ -9,9 +9,6 @@ use shearq_files::FileError;
 use shearq_files::atomic;
 
 /// Reads any record; `None` where there is none.
-///
-/// # Errors
-/// If it exists and cannot be read.
 pub fn read_record<R: DeserializeOwned>(path: &Path) -> Result<Option<R>, FileError> {
     let text = match shearq_files::open::read_to_string(path, shearq_files::open::SETTINGS) {
         Ok(text) => text,
@@ -29,17 +26,11 @@ pub fn read_record<R: DeserializeOwned>(path: &Path) -> Result<Option<R>, FileEr
 }
 
 /// Writes any record as indented JSON.
-///
-/// # Errors
-/// If it cannot be written.
 pub fn write_record(path: &Path, record: &impl Serialize) -> Result<(), FileError> {
     atomic::write(path, record_text(path, record)?.as_bytes())
 }
 
 /// Any record as indented JSON, for a file at `path`.
-///
-/// # Errors
-/// If it cannot be written as JSON.
 pub fn record_text(path: &Path, record: &impl Serialize) -> Result<String, FileError> {
     let mut text = serde_json::to_string_pretty(record)
         .map_err(FileError::doing(path, "cannot write the record"))?;
@@ -49,7 +40,6 @@ pub fn record_text(path: &Path, record: &impl Serialize) -> Result<String, FileE
 
 /// Numbers of records that may be NaN, which is null in JSON.
 pub trait Numbers: Sized {
-    /// The form in JSON.
     type Form: DeserializeOwned;
     /// The numbers, with NaN for null.
     fn from_form(form: Self::Form) -> Self;
@@ -80,9 +70,6 @@ where
 }
 
 /// For `#[serde(deserialize_with)]`: reads null as NaN.
-///
-/// # Errors
-/// If there is anything but numbers and null.
 pub fn nan_for_null<'de, D: Deserializer<'de>, N: Numbers>(deserializer: D) -> Result<N, D::Error> {
     N::Form::deserialize(deserializer).map(N::from_form)
 }
@@ -99,9 +86,6 @@ pub struct Claim {
 
 impl Claim {
     /// Checks that the record of the folder has not been removed or replaced.
-    ///
-    /// # Errors
-    /// If it is not.
     pub fn check(&self) -> Result<(), FileError> {
         if self.is_there() {
             return Ok(());
@@ -126,16 +110,13 @@ impl Claim {
         (held.dev(), held.ino()) == (found.dev(), found.ino())
     }
 
-    /// Elsewhere an open file cannot be removed.
+    // Elsewhere an open file cannot be removed.
     #[cfg(not(unix))]
     fn is_there(&self) -> bool {
         self.path.exists()
     }
 
     /// Checks the folder at the end of the work, and that all `results` are there.
-    ///
-    /// # Errors
-    /// If one of them is not.
     pub fn check_results(
         &self,
         results: impl IntoIterator<Item = PathBuf>,
@@ -153,9 +134,6 @@ impl Claim {
 
 /// Claims the folder of `path` for `record`. Writes the record if there is none, and refuses a folder with a different
 /// record. Leftovers of killed processes are removed if no other process is at work.
-///
-/// # Errors
-/// If the folder belongs to other settings, or the record cannot be read or written.
 pub fn claim<R: Serialize + DeserializeOwned>(path: &Path, record: &R) -> Result<Claim, FileError> {
     let mut earlier: Option<R> = read_record(path)?;
     if earlier.is_none() {
@@ -189,10 +167,8 @@ pub fn claim<R: Serialize + DeserializeOwned>(path: &Path, record: &R) -> Result
     })
 }
 
-/// Most differences that a message lists.
-const SHOWN: usize = 6;
-/// Most characters of one of them.
-const LONGEST: usize = 160;
+const MAX_DIFFERENCES: usize = 6;
+const MAX_DIFFERENCE_CHARS: usize = 160;
 
 /// The differences that explain most, in this order, and the number of the others.
 fn most_important(mut differences: Vec<String>) -> Vec<String> {
@@ -218,10 +194,10 @@ fn most_important(mut differences: Vec<String>) -> Vec<String> {
         };
         FIRST.iter().position(of).unwrap_or(FIRST.len())
     });
-    let more = differences.len().saturating_sub(SHOWN);
-    differences.truncate(SHOWN);
+    let more = differences.len().saturating_sub(MAX_DIFFERENCES);
+    differences.truncate(MAX_DIFFERENCES);
     for line in &mut differences {
-        if let Some((end, _)) = line.char_indices().nth(LONGEST) {
+        if let Some((end, _)) = line.char_indices().nth(MAX_DIFFERENCE_CHARS) {
             line.truncate(end);
             line.push('…');
         }
@@ -232,16 +208,13 @@ fn most_important(mut differences: Vec<String>) -> Vec<String> {
     differences
 }
 
-/// Opens a record so that it can be locked. Over NFS an exclusive lock requires write permission.
+// Opens a record so that it can be locked. Over NFS an exclusive lock requires write permission.
 fn open_to_lock(path: &Path) -> std::io::Result<File> {
     let writable = File::options().read(true).write(true).open(path);
     writable.or_else(|_| File::open(path))
 }
 
 /// Differences of two records, as `key: first ≠ second`; a missing value is null.
-///
-/// # Errors
-/// If a record cannot be written as JSON.
 pub fn differences(
     first: &impl Serialize,
     second: &impl Serialize,
@@ -289,7 +262,6 @@ fn compare(key: &str, a: &serde_json::Value, b: &serde_json::Value, found: &mut 
     }
 }
 
-/// The names of objects that all have one.
 fn names(values: &[serde_json::Value]) -> Option<Vec<&str>> {
     values
         .iter()
@@ -331,10 +303,10 @@ mod tests {
         lines.push("submission.name: \"a\" ≠ \"b\"".into());
         lines.push("version: \"1\" ≠ \"2\"".into());
         let shown = most_important(lines);
-        assert_eq!(shown.len(), SHOWN + 1);
+        assert_eq!(shown.len(), MAX_DIFFERENCES + 1);
         assert!(shown[0].starts_with("version") && shown[1].starts_with("submission.name"));
         assert_eq!(shown[2], "submission.a.k0: 1 ≠ 2");
-        assert_eq!(shown[SHOWN], "and 31 more");
+        assert_eq!(shown[MAX_DIFFERENCES], "and 31 more");
         assert_eq!(
             most_important(vec!["images: 1 ≠ 2".into()]),
             ["images: 1 ≠ 2"]

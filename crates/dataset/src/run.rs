@@ -1,6 +1,6 @@
 //! The record of a folder of results: `run.json`, written before the first result.
 
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 use shearq_submissions::Configuration;
@@ -8,25 +8,20 @@ use shearq_submissions::Configuration;
 use crate::layout::{DataFolder, Layout, fill};
 use crate::listing::{self, Files};
 use crate::record::read_record;
-use crate::relative;
 use shearq_files::FileError;
 use shearq_files::open::is_there;
 use shearq_files::table::FileFormat;
 use shearq_simulate::kinds::SetKind;
 use shearq_simulate::set::SimulationSettings;
 
-/// Name of the record in a folder of results.
 pub const RUN_FILE: &str = "run.json";
 
-/// The source of the galaxies of a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Source {
-    /// Images of a data folder.
     Folder {
         /// The folder, relative to the folder of the record.
         path: PathBuf,
-        /// Its layout.
         layout: Layout,
     },
     /// Simulated and measured in memory. The true shear lies beside the catalogues.
@@ -35,9 +30,6 @@ pub enum Source {
 
 impl Source {
     /// A data folder, for a record in the folder `beside`.
-    ///
-    /// # Errors
-    /// If the way from one to the other is not known.
     pub fn folder(data: &DataFolder, beside: &Path) -> Result<Self, FileError> {
         Ok(Source::Folder {
             path: way(beside, data.root())?,
@@ -46,9 +38,6 @@ impl Source {
     }
 
     /// The same source, of a record in the folder `from`, for one in the folder `to`.
-    ///
-    /// # Errors
-    /// If the way from one to the other is not known.
     pub fn moved(&self, from: &Path, to: &Path) -> Result<Self, FileError> {
         Ok(match self {
             Source::Folder { path, layout } => Source::Folder {
@@ -68,25 +57,17 @@ impl Source {
     }
 
     /// The data folder with the true shear, for a run in the folder `measured`.
-    ///
-    /// # Errors
-    /// If the data folder no longer exists.
     pub fn data(&self, measured: &Path) -> Result<DataFolder, FileError> {
         match self {
-            Source::Folder { path, .. } => {
-                DataFolder::open(relative::shortened(measured.join(path)))
-            }
+            Source::Folder { path, .. } => DataFolder::open(shortened(measured.join(path))),
             Source::Simulated(_) => DataFolder::open(measured),
         }
     }
 }
 
 /// The relative path from the folder of a record to a data folder or a file.
-///
-/// # Errors
-/// If the current folder cannot be determined.
 pub fn way(from: &Path, to: &Path) -> Result<PathBuf, FileError> {
-    relative::from(from, to).map_err(FileError::doing(to, "cannot determine where the folder is"))
+    relative(from, to).map_err(FileError::doing(to, "cannot determine where the folder is"))
 }
 
 impl std::fmt::Display for Source {
@@ -98,17 +79,12 @@ impl std::fmt::Display for Source {
     }
 }
 
-/// Settings of a measurement, stored with its catalogues.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Run {
-    /// Version of shearq.
     pub version: String,
-    /// Source of the galaxies.
     pub source: Source,
-    /// The configuration.
     #[serde(rename = "submission")]
     pub configuration: Configuration,
-    /// File format of the catalogues.
     pub format: FileFormat,
     /// Cuts and weights that were applied to the catalogues, if any.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -117,14 +93,10 @@ pub struct Run {
 
 impl Run {
     /// Reads the record of a folder; `None` where there is none.
-    ///
-    /// # Errors
-    /// If it exists and cannot be read.
     pub fn read(folder: &Path) -> Result<Option<Self>, FileError> {
         read_record(&folder.join(RUN_FILE))
     }
 
-    /// A run of this version.
     pub fn new(source: Source, configuration: Configuration, format: FileFormat) -> Self {
         Run {
             version: crate::VERSION.into(),
@@ -136,9 +108,6 @@ impl Run {
     }
 
     /// Reads the record of a folder that must be one of catalogues.
-    ///
-    /// # Errors
-    /// If there is none, or it cannot be read.
     pub fn require(folder: &Path) -> Result<Self, FileError> {
         const EXPECTED: &str = "a folder of catalogues that `shearq measure` or `shearq run` wrote";
         check_folder(folder, EXPECTED)?;
@@ -156,15 +125,11 @@ impl Run {
         Err(FileError::new(folder, message))
     }
 
-    /// The catalogue of an image.
     pub fn catalogue(&self, folder: &Path, set: u32, image: u32) -> PathBuf {
         folder.join(fill(&self.pattern(), set, image))
     }
 
     /// The catalogues of `sets` (of all if empty) that are there.
-    ///
-    /// # Errors
-    /// If a folder cannot be listed.
     pub fn catalogues(&self, folder: &Path, sets: &[u32]) -> Result<Files, FileError> {
         listing::find(folder, &self.pattern(), &[""], sets)
     }
@@ -176,9 +141,6 @@ impl Run {
 }
 
 /// Checks that `folder` is a folder. `expected` describes it in the error.
-///
-/// # Errors
-/// If there is nothing of this name, or a file.
 pub fn check_folder(folder: &Path, expected: &str) -> Result<(), FileError> {
     let found = if folder.is_dir() {
         return Ok(());
@@ -194,9 +156,6 @@ pub fn check_folder(folder: &Path, expected: &str) -> Result<(), FileError> {
 }
 
 /// Opens the data folder that a command is to read images from.
-///
-/// # Errors
-/// As [`DataFolder::open`], and if the folder contains catalogues instead of images.
 pub fn open_data(folder: &Path) -> Result<DataFolder, FileError> {
     let data = DataFolder::open(folder)?;
     let Some(run) = Run::read(folder).ok().flatten() else {
@@ -208,7 +167,7 @@ pub fn open_data(folder: &Path) -> Result<DataFolder, FileError> {
     }
     let advice = match &run.source {
         Source::Folder { path, .. } => {
-            let data = relative::shortened(folder.join(path));
+            let data = shortened(folder.join(path));
             format!(". Try: --data {}", data.display())
         }
         Source::Simulated(_) => {
@@ -224,12 +183,9 @@ pub fn open_data(folder: &Path) -> Result<DataFolder, FileError> {
 /// Name of the record in a simulated data folder.
 pub const SIMULATION_FILE: &str = "simulation.json";
 
-/// Settings of a simulation, stored with its data.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SimulationRecord {
-    /// Version of shearq.
     pub version: String,
-    /// The settings.
     pub settings: SimulationSettings,
 }
 
@@ -243,5 +199,110 @@ pub fn kind_of(data: &DataFolder, set: u32) -> Option<SetKind> {
         SetKind::of(set)
     } else {
         None
+    }
+}
+
+// `path` relative to `folder` if possible, otherwise absolute. Both may be relative to the current folder, and need not
+// exist.
+fn relative(folder: &Path, path: &Path) -> std::io::Result<PathBuf> {
+    let (folder, path) = (resolve(folder)?, resolve(path)?);
+    let shared = folder
+        .components()
+        .zip(path.components())
+        .take_while(|(a, b)| a == b)
+        .count();
+    if shared == 0 {
+        return Ok(path);
+    }
+    let up = folder
+        .components()
+        .skip(shared)
+        .map(|_| Component::ParentDir);
+    let path: PathBuf = up.chain(path.components().skip(shared)).collect();
+    Ok(match path.as_os_str().is_empty() {
+        true => ".".into(),
+        false => path,
+    })
+}
+
+/// `path` without the `folder/..` in it, if that is the same folder: a short name for messages.
+pub fn shortened(path: PathBuf) -> PathBuf {
+    let mut short = PathBuf::new();
+    for part in path.components() {
+        match (part, short.components().next_back()) {
+            (Component::ParentDir, Some(Component::Normal(_))) => {
+                short.pop();
+            }
+            (part, _) => short.push(part),
+        }
+    }
+    if short.as_os_str().is_empty() {
+        short.push(".");
+    }
+    // Behind a link, `..` leads elsewhere.
+    match (resolve(&short), resolve(&path)) {
+        (Ok(one), Ok(other)) if one == other => short,
+        _ => path,
+    }
+}
+
+// An absolute path without links, as far as it exists, and without `.` and `..`.
+fn resolve(path: &Path) -> std::io::Result<PathBuf> {
+    let path = std::path::absolute(path)?;
+    for there in path.ancestors() {
+        let (Ok(mut resolved), Ok(rest)) = (there.canonicalize(), path.strip_prefix(there)) else {
+            continue;
+        };
+        for part in rest.components() {
+            match part {
+                Component::ParentDir => {
+                    resolved.pop();
+                }
+                part => resolved.push(part),
+            }
+        }
+        return Ok(resolved);
+    }
+    Ok(path)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_path_is_shortened_unless_a_link_leads_elsewhere() {
+        let root = tempfile::tempdir().unwrap();
+        let at = |name: &str| root.path().join(name);
+        std::fs::create_dir_all(at("out/deep")).unwrap();
+        std::fs::create_dir_all(at("data")).unwrap();
+        assert_eq!(shortened(at("out/deep/../../data")), at("data"));
+        assert_eq!(shortened("src/..".into()), Path::new("."));
+        assert_eq!(shortened("../..".into()), Path::new("../.."));
+        #[cfg(unix)]
+        {
+            std::os::unix::fs::symlink(at("out/deep"), at("link")).unwrap();
+            std::fs::create_dir_all(at("out/data")).unwrap();
+            assert_eq!(shortened(at("link/../data")), at("link/../data"));
+        }
+    }
+
+    #[test]
+    fn a_path_is_the_same_however_it_was_given() {
+        let root = tempfile::tempdir().unwrap();
+        let at = |name: &str| root.path().join(name);
+        std::fs::create_dir_all(at("data/deep")).unwrap();
+        let between = |folder: &str, path: &str| relative(&at(folder), &at(path)).unwrap();
+        for same in ["data", "data/", "./data", "data/deep/..", "new/../data"] {
+            assert_eq!(between("out", same), Path::new("../data"), "{same}");
+            assert_eq!(between("new/out/", same), Path::new("../../data"), "{same}");
+        }
+        assert_eq!(between("data", "data"), Path::new("."));
+        assert_eq!(between("data", "data/deep"), Path::new("deep"));
+        #[cfg(unix)]
+        {
+            std::os::unix::fs::symlink(at("data"), at("link")).unwrap();
+            assert_eq!(between("out", "link"), Path::new("../data"));
+        }
     }
 }

@@ -11,12 +11,10 @@ use crate::layout::{DataFolder, SIGN_KEY, stated_sign, truth_is_there, truth_row
 use shearq_files::table::{self, MAX_ROWS};
 use shearq_files::{FileError, atomic};
 
-/// How a truth file is to be read.
 #[derive(Debug, Clone, Copy)]
 pub struct Reading {
     /// Side of the field in degrees.
     pub field: Degrees,
-    /// Pixels a side of a cell.
     pub stamp: Pixels,
     /// Sign of g2 in the truth, if it was specified. A file that states the other sign is refused.
     pub sign: Option<TruthSign>,
@@ -41,14 +39,11 @@ pub enum SignBasis {
 /// user ([`Sign::of_truth`]), from the E modes of the true shear, and from the catalogues ([`Sign::of_catalogues`]).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Sign {
-    /// The sign.
     pub of: TruthSign,
-    /// How it was determined.
     pub basis: SignBasis,
 }
 
 impl Sign {
-    /// The sign of g2 that are all zero.
     pub const ZERO: Sign = Sign {
         of: TruthSign::Standard,
         basis: SignBasis::Zero,
@@ -56,9 +51,6 @@ impl Sign {
 
     /// The sign that the file states, that the user specified, or in which the shear is an E-mode field; `None` if only
     /// catalogues can determine it.
-    ///
-    /// # Errors
-    /// If the file states another sign than the user.
     pub fn of_truth(
         stated: Option<TruthSign>,
         specified: Option<TruthSign>,
@@ -82,10 +74,7 @@ impl Sign {
         Ok(Some(Sign { of, basis }))
     }
 
-    /// The sign that the catalogues determine.
-    ///
-    /// # Errors
-    /// If they do not: there is no default, because a wrong sign turns a bias of 0 into one of -2.
+    // There is no default, because a wrong sign turns a bias of 0 into one of -2.
     pub fn of_catalogues(found: Option<TruthSign>) -> Result<Self, String> {
         let basis = SignBasis::Catalogues;
         found.map(|of| Sign { of, basis }).ok_or_else(|| {
@@ -111,7 +100,6 @@ impl Sign {
     }
 }
 
-/// The name of a sign in files and options.
 pub fn word(sign: TruthSign) -> &'static str {
     match sign {
         TruthSign::Standard => "standard",
@@ -141,10 +129,8 @@ pub fn sign_on_any_grid(rows: &[Row]) -> Option<TruthSign> {
     sign_by_modes(&grid, &standard).ok()?
 }
 
-/// A true shear on its grid.
 #[derive(Debug, Clone)]
 pub struct ReadTruth {
-    /// The grid.
     pub grid: Grid,
     /// The shear, in the standard sign if `sign` is known, else as in the file.
     pub shear: TrueShear,
@@ -153,9 +139,6 @@ pub struct ReadTruth {
 }
 
 /// The true shear of a file on its grid, whose side is the square root of the number of rows.
-///
-/// # Errors
-/// If the file cannot be read, does not fill a square grid, or states another sign of g2 than `reading`.
 pub fn read_truth(truth: &Path, reading: &Reading) -> Result<ReadTruth, FileError> {
     let table = table::read_truth(truth, MAX_ROWS)?;
     let rows = truth_rows(truth, &table)?;
@@ -178,34 +161,20 @@ pub fn read_truth(truth: &Path, reading: &Reading) -> Result<ReadTruth, FileErro
 }
 
 /// Writes a true shear in the standard sign.
-///
-/// # Errors
-/// If the file cannot be written.
 pub fn write_truth(path: &Path, grid: &Grid, truth: &TrueShear) -> Result<(), FileError> {
-    // A comment has one field, and no quotes.
-    let mut text = csv::WriterBuilder::new()
-        .flexible(true)
-        .quote_style(csv::QuoteStyle::Never)
-        .from_writer(Vec::new());
-    // Writing to memory cannot fail.
-    let _ = text.write_record(["x", "y", "g1", "g2"]);
     // The comment follows the header, so that readers that skip one line or a `#` read the columns.
-    let sign = format!("# {SIGN_KEY}: standard (g2 > 0 is a stretch along x = y)");
-    let _ = text.write_record([sign]);
+    let mut text = format!("x,y,g1,g2\n# {SIGN_KEY}: standard (g2 > 0 is a stretch along x = y)\n");
     for iy in 0..grid.n {
         for ix in 0..grid.n {
             let (x, y) = grid.centre(ix, iy);
             let (g1, g2) = (truth.g1[(ix, iy)], truth.g2[(ix, iy)]);
-            let _ = text.write_record([x, y, g1, g2].map(|number| number.to_string()));
+            text.push_str(&format!("{x},{y},{g1},{g2}\n"));
         }
     }
-    atomic::write(path, &text.into_inner().unwrap_or_default())
+    atomic::write(path, text.as_bytes())
 }
 
 /// How the truth of a set of a data folder is to be read.
-///
-/// # Errors
-/// If there is no truth, or the set's first image cannot be read.
 pub fn reading_of(data: &DataFolder, set: u32) -> Result<Reading, FileError> {
     truth_is_there(&data.truth(set))?;
     Ok(Reading {
@@ -216,9 +185,6 @@ pub fn reading_of(data: &DataFolder, set: u32) -> Result<Reading, FileError> {
 }
 
 /// Grid of a set, from its first image, or from its true shear if there is no image.
-///
-/// # Errors
-/// If neither can be read.
 pub fn grid_of_set(data: &DataFolder, set: u32) -> Result<Grid, FileError> {
     match grid::of_first_image(data, set)? {
         Some(grid) => Ok(grid),

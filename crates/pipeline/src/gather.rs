@@ -3,7 +3,6 @@
 
 mod positions;
 mod psfs;
-mod rows;
 mod source;
 mod stamps;
 
@@ -16,10 +15,9 @@ use shearq_measure::{Examination, Warning};
 use self::positions::Positions;
 pub use self::positions::Table;
 use self::psfs::{GatheredPsfs, gather_psfs};
-use self::rows::already;
 pub use self::source::{Content, Files};
 use self::source::{Exposure, Images, shown};
-use self::stamps::StampWriter;
+use self::stamps::{StampWriter, already};
 use super::PipelineError;
 use super::measure::check_strip;
 use crate::wcs::Wcs;
@@ -31,54 +29,43 @@ use shearq_files::atomic;
 use shearq_files::open::is_there;
 use shearq_files::table;
 
-/// Most stamps of one image: one per galaxy of the largest grid.
+// Most stamps of one image: one per galaxy of the largest grid.
 const MAX_STAMPS: usize = table::MAX_ROWS;
-/// Least pixels a side of a single stamp that looks like a mosaic or an exposure: four times the default stamp.
-const LARGE: usize = 192;
-/// Advice for stamps that are not square.
+// Least pixels a side of a single stamp that looks like a mosaic or an exposure: four times the default stamp.
+const LARGE_STAMP_PX: usize = 192;
 const SQUARE: &str =
     "--square crop, which takes the central square; --square pad, which adds missing pixels; or ";
-/// Advice for a mosaic or an exposure.
 const MOSAIC: &str = "--exposure with --positions, which cuts stamps out of an exposure. A mosaic is read as DATA/set01/galaxies-001.fits, with `stamp = SIDE` in DATA/layout.toml";
-/// Largest difference of an offset from a whole pixel.
-const HALF: f64 = 0.5;
+// Largest difference of an offset from a whole pixel.
+const MAX_OFFSET_PX: f64 = 0.5;
 
-/// Where stamps come from.
 #[derive(Debug, Clone, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Stamps<'a> {
     /// FITS files, each with one stamp, a cube of them, or several extensions with either. Stamps smaller than the largest get
     /// missing pixels around them.
     Files(Files<'a>),
-    /// Squares of an exposure around positions.
     Cutouts {
-        /// The exposure: the first image of one file.
         exposure: Files<'a>,
         /// Table with the positions, in FITS pixels: the centre of the first one is at 1.
         positions: Table<'a>,
         /// Coordinate of the centre of the first pixel in the table, 0 or 1.
         first_pixel: u8,
-        /// Pixels a side of a stamp.
         side: usize,
     },
 }
 
-/// A gathered image.
 #[derive(Debug)]
 pub struct Gathered {
-    /// How the stamps lie in the image.
     pub mosaic: Mosaic,
     /// Stamps with pixels that are beyond the exposure, masked, or not finite in their file.
     pub incomplete: usize,
-    /// Notes and warnings, one per line.
     pub messages: Vec<String>,
 }
 
-/// How stamps become squares.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Square {
-    /// By their central square.
     Crop,
     /// By missing pixels around them. PSFs, which may not lack pixels, are cropped.
     Pad,
@@ -87,7 +74,6 @@ pub enum Square {
 /// Masks, whose pixels are bad if they are not zero or have a bit that is asked for.
 #[derive(Debug, Clone, Copy, Serialize)]
 pub struct Masks<'a> {
-    /// Their files.
     #[serde(flatten)]
     pub files: Files<'a>,
     /// Sum of the powers of two of the bits.
@@ -95,23 +81,18 @@ pub struct Masks<'a> {
     pub bits: Option<u64>,
 }
 
-/// The sources of an image.
 #[derive(Debug, Clone, Serialize)]
 pub struct Gathering<'a> {
-    /// Its stamps.
     pub stamps: Stamps<'a>,
     /// What stamps and PSFs of files that are not square become; without it they are refused.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub square: Option<Square>,
-    /// Masks with the sizes of the stamps or the exposure.
     pub masks: Option<Masks<'a>>,
     /// One PSF, one per stamp, or stars to average.
     pub psfs: Files<'a>,
-    /// The image's NOISESIG.
     pub noise: Option<f64>,
 }
 
-/// Record of the sources, stored with the image.
 #[derive(Serialize)]
 struct Record<'a> {
     version: &'a str,
@@ -123,9 +104,6 @@ struct Record<'a> {
 ///
 /// Writes the table of stamps, the record of the sources, the PSFs, and last the image. Leftovers of a stopped process
 /// are replaced. Other processes that gather into the same folder wait.
-///
-/// # Errors
-/// If a file cannot be read, the image is there already, or stamps, masks and PSFs do not fit together.
 pub fn gather(
     data: &DataFolder,
     id: ImageId,
@@ -208,9 +186,6 @@ fn gather_alone(
 }
 
 /// Removes the PSFs that a stopped process left.
-///
-/// # Errors
-/// If the image is there already, or PSFs that were not gathered.
 fn remove_leftovers(data: &DataFolder, id: ImageId) -> Result<(), FileError> {
     let target = data.galaxies(id.set, id.image);
     if is_there(&target) {
@@ -231,7 +206,7 @@ fn remove_leftovers(data: &DataFolder, id: ImageId) -> Result<(), FileError> {
     Ok(())
 }
 
-/// The stamps of an image before they are read.
+// The stamps of an image before they are read.
 struct Plan {
     /// Positions on the exposure in FITS pixels, if stamps are cut out.
     positions: Vec<(f64, f64)>,
@@ -240,8 +215,6 @@ struct Plan {
 }
 
 impl Plan {
-    /// # Errors
-    /// If stamps or positions cannot be read or used.
     fn of(stamps: &Stamps<'_>, square: Option<Square>) -> Result<Self, FileError> {
         match stamps {
             Stamps::Files(files) => Plan::of_files(*files, square),
@@ -257,7 +230,7 @@ impl Plan {
     fn of_files(files: Files<'_>, square: Option<Square>) -> Result<Self, FileError> {
         let (stack, mut messages) = Stack::of(files, square)?;
         let side = stack.side;
-        if stack.count == 1 && side >= LARGE {
+        if stack.count == 1 && side >= LARGE_STAMP_PX {
             messages.push(format!(
                 "warning: {}: the only stamp is {side} × {side} px, which looks like a mosaic of stamps or an exposure. Try: {MOSAIC}",
                 files.paths[0].display()
@@ -298,20 +271,13 @@ impl Plan {
     }
 }
 
-/// Stamps of one size in files.
 struct Stack {
     count: usize,
-    /// Pixels a side.
     side: usize,
-    /// Of the first image.
     wcs: Wcs,
 }
 
 impl Stack {
-    /// The stamps with notes and warnings.
-    ///
-    /// # Errors
-    /// If a file cannot be read, stamps are not square and may not be made so, or PSFs are of several sizes.
     fn of(files: Files<'_>, square: Option<Square>) -> Result<(Self, Vec<String>), FileError> {
         let (mut count, mut first, mut messages) = (0usize, None, Vec::new());
         let mut sides = [0; 2];
@@ -320,7 +286,9 @@ impl Stack {
             let (width, height) = (image.width(), image.height());
             if width.max(height) > MAX_STAMP || width != height && square.is_none() {
                 let advice = match files.content {
-                    Content::Sky if width.max(height) < LARGE => format!(". Try: {SQUARE}{MOSAIC}"),
+                    Content::Sky if width.max(height) < LARGE_STAMP_PX => {
+                        format!(". Try: {SQUARE}{MOSAIC}")
+                    }
                     Content::Sky => format!(". Try: {MOSAIC}"),
                     Content::Psf if width.max(height) <= MAX_STAMP => {
                         ". Try: --square crop, which takes the central square".to_owned()
@@ -370,10 +338,7 @@ impl Stack {
     }
 }
 
-/// A warning if the PSF is too broad for the galaxies.
-///
-/// # Errors
-/// If the PSF is broader than the galaxies, so that they cannot be measured.
+// A warning if the PSF is too broad for the galaxies.
 fn width(galaxies: &Examination, psfs: &GatheredPsfs) -> Result<Option<Warning>, FileError> {
     let mut both = galaxies.clone();
     both.join(&psfs.examination);
@@ -384,7 +349,7 @@ fn width(galaxies: &Examination, psfs: &GatheredPsfs) -> Result<Option<Warning>,
     }
 }
 
-/// Advice if positions are counted from another first pixel than specified.
+// Advice if positions are counted from another first pixel than specified.
 fn one_pixel_off(stamps: &Stamps<'_>, warning: &Warning) -> Option<String> {
     let (Stamps::Cutouts { first_pixel, .. }, Warning::OffCentre { offset, .. }) =
         (stamps, warning)
@@ -393,6 +358,8 @@ fn one_pixel_off(stamps: &Stamps<'_>, warning: &Warning) -> Option<String> {
     };
     let other = 1 - first_pixel.min(&1);
     let expected = f64::from(*first_pixel) - f64::from(other);
-    let off = offset.iter().all(|found| (found - expected).abs() < HALF);
+    let off = offset
+        .iter()
+        .all(|found| (found - expected).abs() < MAX_OFFSET_PX);
     off.then(|| format!(". Are the positions counted from {other}? Try: --first-pixel {other}"))
 }

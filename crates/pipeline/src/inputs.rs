@@ -2,8 +2,8 @@
 
 use std::path::Path;
 
+use shearq_dataset::fingerprint::Inputs;
 use shearq_dataset::images::ImageId;
-use shearq_dataset::inputs::Inputs;
 use shearq_dataset::layout::{DataFolder, LAYOUT_FILE, Layout};
 use shearq_dataset::run::{Run, Source};
 use shearq_files::FileError;
@@ -12,9 +12,6 @@ use super::PipelineError;
 use super::engine;
 
 /// Checks that the catalogues of `images` in `out` were measured from the present files.
-///
-/// # Errors
-/// If a file has changed or cannot be read; the error names the first.
 pub(crate) fn verify_images(
     inputs: &Inputs<'_>,
     out: &Path,
@@ -39,9 +36,6 @@ pub(crate) fn verify_images(
 
 /// Checks that every catalogue of `sets` (of all if empty) in a results folder was measured from the present files in
 /// `data`.
-///
-/// # Errors
-/// If a file has changed; the error names the first.
 pub fn verify(
     data: &DataFolder,
     out: &Path,

@@ -4,23 +4,22 @@
 use shearq_files::fits::{ImageReader, Value};
 use shearq_measure::{PixelFrame, Warning};
 
-/// Keys with the pixel scale in arcseconds: of surveys, and of GalSim.
+// Keys with the pixel scale in arcseconds: of surveys, and of GalSim.
 const SCALES: [&str; 2] = ["PIXSCALE", "GS_SCALE"];
-/// Keys of the matrix from pixels to the sky, in the unit CUNIT1.
+// Keys of the matrix from pixels to the sky, in the unit CUNIT1.
 const MATRIX: [&str; 4] = ["CD1_1", "CD1_2", "CD2_1", "CD2_2"];
-/// The same without the steps.
 const STEPLESS: [&str; 4] = ["PC1_1", "PC1_2", "PC2_1", "PC2_2"];
 const STEPS: [&str; 2] = ["CDELT1", "CDELT2"];
-/// Rotation of the second axis in degrees, before there was a matrix (Calabretta & Greisen 2002, A&A 395, 1077, eq. 189).
+// Rotation of the second axis in degrees, before there was a matrix (Calabretta & Greisen 2002, A&A 395, 1077, eq. 189).
 const ROTATION: &str = "CROTA2";
-/// Plausible scales in arcseconds. Headers without a sky have scales such as 1 degree per pixel.
+// Plausible scales in arcseconds. Headers without a sky have scales such as 1 degree per pixel.
 const PLAUSIBLE: std::ops::RangeInclusive<f64> = 1e-3..=60.0;
-/// Least relative difference of scales, and least shear between the pixels of the PSF and of the galaxies, that is reported: a
-/// difference of 1 % changes m by about 0.01.
+// Least relative difference of scales, and least shear between the pixels of the PSF and of the galaxies, that is reported: a
+// difference of 1 % changes m by about 0.01.
 const LEAST_DIFFERENCE: f64 = 0.01;
-/// Least rotation in degrees that is reported: it changes m by −2 sin² 1° = −6e-4, and adds 3.5 % of g2 to g1.
+// Least rotation in degrees that is reported: it changes m by −2 sin² 1° = −6e-4, and adds 3.5 % of g2 to g1.
 const LEAST_ROTATION: f64 = 1.0;
-/// Least shear of the pixels that is reported, as it adds to c.
+// Least shear of the pixels that is reported, as it adds to c.
 const LEAST_SHEAR: f64 = 1e-3;
 
 /// What a header states of the pixels on the sky.

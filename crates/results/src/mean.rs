@@ -259,7 +259,7 @@ impl Rows {
 
 #[cfg(test)]
 mod tests {
-    use shearq_dataset::inputs::PSF;
+    use shearq_dataset::fingerprint::PSF;
     use shearq_files::frames::frame;
     use shearq_files::frames::polars::Column;
     use shearq_pipeline::measure::PSF_NOISE;

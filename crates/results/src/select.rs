@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use shearq_dataset::inputs::PRINTS;
+use shearq_dataset::fingerprint::PRINTS;
 use shearq_dataset::record::claim;
 use shearq_dataset::run::{RUN_FILE, Run, Source};
 use shearq_files::frames::frame;

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 pub use shearq_bias::StarNoise;
-use shearq_dataset::inputs::PSF;
+use shearq_dataset::fingerprint::PSF;
 use shearq_files::FileError;
 use shearq_files::frames::Metadata;
 use shearq_files::frames::polars::DataFrame;

@@ -7,7 +7,7 @@ use shearq_files::FileError;
 use shearq_files::names_of;
 use shearq_files::table::{self, Columns, MAX_ROWS, Named, Place};
 
-/// Names of columns of positions in pixels counted from 1, the best first, in any case.
+// Names of columns of positions in pixels counted from 1, the best first, in any case.
 const KNOWN: [[&str; 2]; 6] = [
     ["x", "y"],
     ["xwin_image", "ywin_image"],
@@ -16,7 +16,7 @@ const KNOWN: [[&str; 2]; 6] = [
     ["x_image_dbl", "y_image_dbl"],
     ["xpsf_image", "ypsf_image"],
 ];
-/// Names of coordinates on the sky, in any case.
+// Names of coordinates on the sky, in any case.
 const SKY: [&str; 6] = [
     "ra",
     "ra_deg",
@@ -25,10 +25,9 @@ const SKY: [&str; 6] = [
     "alpha_sky",
     "right_ascension",
 ];
-/// Distance in pixels below which two positions have the same galaxy: stamps are cut to half a pixel.
-const SAME: f64 = 0.5;
+// Distance in pixels below which two positions have the same galaxy: stamps are cut to half a pixel.
+const SAME_GALAXY_PX: f64 = 0.5;
 
-/// A table of positions.
 #[derive(Debug, Clone, Copy, serde::Serialize)]
 pub struct Table<'a> {
     /// The file, with `[TABLE]` behind its name if one of its tables is meant.
@@ -42,17 +41,13 @@ pub struct Table<'a> {
 
 /// Positions in FITS pixels: the centre of the first is at 1.
 pub(super) struct Positions {
-    /// The file.
     place: Place,
-    /// x and y, in the order of the table.
     pub(super) all: Vec<(f64, f64)>,
     /// Which columns they are, if the user did not name them.
     pub(super) note: Option<String>,
 }
 
 impl Positions {
-    /// # Errors
-    /// If the table cannot be read, its columns are not clear, or a value is no position.
     pub(super) fn read(table: Table<'_>) -> Result<Self, FileError> {
         let mut place = Place::with_table(table.path, table.table)?;
         let columns = table::columns(&place)?;
@@ -93,9 +88,6 @@ impl Positions {
     }
 
     /// Warnings about the positions on an exposure of this size.
-    ///
-    /// # Errors
-    /// If no position is on the exposure, or they are degrees on the sky.
     pub(super) fn examine(
         &self,
         exposure: &Path,
@@ -125,7 +117,7 @@ impl Positions {
             let what = match beyond == count {
                 true => format!("all {count} positions are outside the exposure"),
                 false => format!(
-                    "{repeated} of {count} positions are within {SAME} px of an earlier one"
+                    "{repeated} of {count} positions are within {SAME_GALAXY_PX} px of an earlier one"
                 ),
             };
             let message = format!(
@@ -144,7 +136,7 @@ impl Positions {
         if let Some((earlier, later)) = first {
             let (x, y) = self.all[later];
             doubts.push(format!(
-                "warning: {}: {repeated} of {count} positions are within {SAME} px of an earlier one (the first is row {} at ({x}, {y}), like row {}). Each row counts as a galaxy. Try: remove duplicates",
+                "warning: {}: {repeated} of {count} positions are within {SAME_GALAXY_PX} px of an earlier one (the first is row {} at ({x}, {y}), like row {}). Each row counts as a galaxy. Try: remove duplicates",
                 path.display(),
                 later + 1,
                 earlier + 1
@@ -155,9 +147,9 @@ impl Positions {
 
     /// The number of positions near an earlier one, and the first such pair.
     fn repeated(&self) -> (usize, Option<(usize, usize)>) {
-        // Two positions in one cell are nearer than SAME. So a cell has at most one that is no repetition, and others
+        // Two positions in one cell are nearer than SAME_GALAXY_PX. So a cell has at most one that is no repetition, and others
         // of it lie at most two cells away.
-        let side = SAME / std::f64::consts::SQRT_2;
+        let side = SAME_GALAXY_PX / std::f64::consts::SQRT_2;
         let mut kept: HashMap<(i64, i64), usize> = HashMap::with_capacity(self.all.len());
         let (mut count, mut first) = (0, None);
         for (k, &(x, y)) in self.all.iter().enumerate() {
@@ -166,7 +158,7 @@ impl Positions {
             let mut others = near.filter_map(|(dx, dy)| kept.get(&(cell.0 + dx, cell.1 + dy)));
             let same = others.find(|&&other| {
                 let (ox, oy) = self.all[other];
-                (x - ox).hypot(y - oy) <= SAME
+                (x - ox).hypot(y - oy) <= SAME_GALAXY_PX
             });
             match same.copied() {
                 Some(other) => {
@@ -182,7 +174,6 @@ impl Positions {
     }
 }
 
-/// The columns that the user names.
 fn given(place: &Place, columns: &Columns, names: [&str; 2]) -> Result<[String; 2], FileError> {
     let owned = names.map(str::to_owned);
     let numbers = names.iter().all(|name| name.parse::<usize>().is_ok());
@@ -266,7 +257,6 @@ fn known(place: &mut Place, columns: &Columns) -> Result<[String; 2], FileError>
     ))
 }
 
-/// The best pair of known names.
 fn pair(names: &[String]) -> Option<[String; 2]> {
     let find = |wanted: &str| {
         names

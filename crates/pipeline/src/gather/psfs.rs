@@ -9,9 +9,8 @@ use shearq_measure::{EXAMINED_PSFS, Examination, Psfs, Star, Warning, average_st
 use shearq_submissions::PsfCut;
 use shearq_submissions::limits::LEAST_PSF;
 
-use super::rows::{Rows, first};
 use super::source::{Files, Planes};
-use super::stamps::central;
+use super::stamps::{Rows, central, first};
 use super::{Square, Stack};
 use crate::wcs::Wcs;
 use shearq_dataset::images::ImageId;
@@ -19,30 +18,25 @@ use shearq_dataset::layout::DataFolder;
 use shearq_dataset::mosaic::Mosaic;
 use shearq_dataset::psf_table;
 
-/// Pixels a side of a PSF that are examined: as many as configurations use.
+// Pixels a side of a PSF that are examined: as many as configurations use.
 const EXAMINED_SIDE: usize = 48;
-/// Most stars a side of an image that is examined for several. GREAT3 has three.
-const MOST_STARS: usize = 10;
-/// Least pixels a side of such a star.
-const LEAST_CELL: usize = 16;
-/// Most pixels of stars that are averaged. All of them are in memory.
-const MOST_AVERAGED: usize = 1 << 24;
+// Most stars a side of an image that is examined for several. GREAT3 has three.
+const MAX_GRID_STARS: usize = 10;
+// Least pixels a side of such a star.
+const MIN_STAR_CELL_PX: usize = 16;
+// Most pixels of stars that are averaged. All of them are in memory.
+const MAX_AVERAGED_PIXELS: usize = 1 << 24;
 
 /// The PSFs of an image, not yet written.
 pub(super) struct GatheredPsfs {
     pub(super) file: PsfFile,
     pub(super) examination: Examination,
-    /// Notes and warnings.
     pub(super) messages: Vec<String>,
     pub(super) wcs: Wcs,
-    /// The first file of PSFs, for messages.
     pub(super) first: PathBuf,
 }
 
 /// Reads the PSFs of an image: functional PSFs of a table, or stars.
-///
-/// # Errors
-/// If they cannot be read, or their number does not fit the galaxies.
 pub(super) fn gather_psfs(
     data: &DataFolder,
     id: ImageId,
@@ -121,7 +115,7 @@ fn small(path: &Path, side: usize) -> Option<String> {
     })
 }
 
-/// A warning about an image that is a grid of stars, as those of GREAT3.
+// A warning about an image that is a grid of stars, as those of GREAT3.
 fn several_stars(path: &Path, pixels: &[f32], side: usize) -> Option<String> {
     let brightest = |n: usize| {
         let cell = side / n;
@@ -145,7 +139,8 @@ fn several_stars(path: &Path, pixels: &[f32], side: usize) -> Option<String> {
         };
         found.iter().all(star)
     };
-    let mut grids = (2..=MOST_STARS).filter(|n| side.is_multiple_of(*n) && side / n >= LEAST_CELL);
+    let mut grids =
+        (2..=MAX_GRID_STARS).filter(|n| side.is_multiple_of(*n) && side / n >= MIN_STAR_CELL_PX);
     let n = grids.find(is_grid)?;
     let (shown, cell, stars) = (path.display(), side / n, n * n);
     Some(format!(
@@ -196,7 +191,7 @@ fn functional(path: PathBuf, table: &Path, mosaic: &Mosaic) -> Result<GatheredPs
     })
 }
 
-/// The average of several stars, as the PSF of all galaxies.
+// The average of several stars, as the PSF of all galaxies.
 fn averaged(
     path: &Path,
     files: Files<'_>,
@@ -205,9 +200,9 @@ fn averaged(
 ) -> Result<GatheredPsfs, FileError> {
     let first = &files.paths[0];
     let pixels = count * side * side;
-    if pixels > MOST_AVERAGED {
+    if pixels > MAX_AVERAGED_PIXELS {
         let message = format!(
-            "there are {count} stars of {side} × {side} pixels to average ({pixels} pixels, expected at most {MOST_AVERAGED}). Try: fewer stars"
+            "there are {count} stars of {side} × {side} pixels to average ({pixels} pixels, expected at most {MAX_AVERAGED_PIXELS}). Try: fewer stars"
         );
         return Err(FileError::new(first, message));
     }
@@ -247,7 +242,6 @@ fn named(examination: &Examination, path: &Path) -> Vec<String> {
     found.iter().map(line).collect()
 }
 
-/// PSFs that are about to be written.
 pub(super) enum PsfFile {
     Stars(Box<Rows>),
     Table(PathBuf, String),

@@ -9,7 +9,7 @@ use shearq_files::fits::{ImageReader, Pixel};
 
 use crate::wcs::Wcs;
 
-/// Names of images that accompany an image of the sky. They are refused unless they are chosen.
+// Names of images that accompany an image of the sky. They are refused unless they are chosen.
 const COMPANIONS: [&str; 15] = [
     "PSF",
     "ERR",
@@ -45,17 +45,13 @@ pub struct Files<'a> {
     pub paths: &'a [PathBuf],
     /// Name of the images (EXTNAME, in any case); all images if `None`.
     pub extension: Option<&'a str>,
-    /// Their content.
     #[serde(skip)]
     pub content: Content,
 }
 
-/// Content of images.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Content {
-    /// Galaxies.
     Sky,
-    /// PSFs.
     Psf,
     /// Masks: not zero for a bad pixel.
     Mask,
@@ -74,7 +70,6 @@ impl Content {
         }
     }
 
-    /// The option that names such images.
     fn option(self) -> &'static str {
         match self {
             Content::Sky => "--extension",
@@ -84,15 +79,11 @@ impl Content {
     }
 }
 
-/// The origin of a stamp.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Origin<'a> {
     pub(super) file: &'a Path,
-    /// Image of the file, from 1.
     pub(super) image: usize,
-    /// Plane of the image, from 1.
     pub(super) plane: usize,
-    /// Position of its galaxy.
     pub(super) position: Option<(f64, f64)>,
 }
 
@@ -103,13 +94,10 @@ impl Origin<'_> {
     }
 }
 
-/// The images of files, in order.
 pub(super) struct Images<'a> {
     files: Files<'a>,
-    /// Number of files begun.
     begun: usize,
     now: Option<ImageReader>,
-    /// Image of the file at hand, from 1.
     number: usize,
     /// Names of the images that were skipped, and whether one was not.
     others: Vec<String>,
@@ -129,9 +117,6 @@ impl<'a> Images<'a> {
     }
 
     /// The next image; `None` after the last.
-    ///
-    /// # Errors
-    /// If a file cannot be read, has no image of the chosen name, or without a choice has an image of other content.
     pub(super) fn next(&mut self) -> Result<Option<(Origin<'a>, &mut ImageReader)>, FileError> {
         loop {
             if let Some(image) = self.now.take() {
@@ -191,7 +176,6 @@ impl<'a> Images<'a> {
 /// The planes of the images of files, in order: stamps.
 pub(super) struct Planes<'a> {
     images: Images<'a>,
-    /// The current image and its remaining planes.
     origin: Option<Origin<'a>>,
     left: usize,
 }
@@ -205,16 +189,12 @@ impl<'a> Planes<'a> {
         }
     }
 
-    /// Columns and rows of the current image.
     pub(super) fn sides(&self) -> [usize; 2] {
         let now = self.images.now.as_ref();
         now.map_or([0; 2], |image| [image.width(), image.height()])
     }
 
     /// The next one with its pixels, `None` after the last.
-    ///
-    /// # Errors
-    /// As [`Images::next`], and if its pixels cannot be read.
     pub(super) fn next<P: Pixel>(&mut self) -> Result<Option<(Origin<'a>, Vec<P>)>, FileError> {
         let origin = match self.origin {
             Some(origin) if self.left > 0 => Origin {
@@ -246,8 +226,6 @@ pub(super) struct Exposure<'a> {
 }
 
 impl<'a> Exposure<'a> {
-    /// # Errors
-    /// As [`Images::next`], and if the image is a cube.
     pub(super) fn open(files: Files<'a>) -> Result<Self, FileError> {
         if let Some(more) = files.paths.get(1) {
             return Err(FileError::new(
@@ -278,7 +256,6 @@ impl<'a> Exposure<'a> {
         self.images.now.as_mut().ok_or_else(none)
     }
 
-    /// Columns and rows.
     pub(super) fn sides(&mut self) -> Result<[usize; 2], FileError> {
         let reader = self.reader()?;
         Ok([reader.width(), reader.height()])

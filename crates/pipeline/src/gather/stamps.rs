@@ -1,21 +1,19 @@
 //! The stamps of a gathered image, and the table of their origins.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use ndarray::ArrayView2;
 use serde::{Serialize, Serializer};
-use shearq_files::FileError;
-use shearq_files::fits::Value;
+use shearq_files::fits::{ImageWriter, Value};
 use shearq_files::text::formula_mark;
+use shearq_files::{FileError, atomic};
 use shearq_measure::{Examination, examined_rows};
 
-use super::rows::Rows;
 use super::source::{Exposure, Files, Origin, Planes, off_middle};
 use super::{Gathering, Masks, Stamps};
 use crate::wcs::Wcs;
 use shearq_dataset::mosaic::Mosaic;
 
-/// A row of the table of stamps.
 #[derive(Serialize)]
 struct Place<'a> {
     x: f64,
@@ -28,7 +26,7 @@ struct Place<'a> {
     position_y: Option<f64>,
 }
 
-/// Writes a path as a cell of CSV, without formulas.
+// Writes a path as a cell of CSV, without formulas.
 fn cell<S: Serializer>(path: &Path, serializer: S) -> Result<S::Ok, S::Error> {
     let path = path.display().to_string();
     serializer.collect_str(&format_args!("{}{path}", formula_mark(&path)))
@@ -38,16 +36,12 @@ fn cell<S: Serializer>(path: &Path, serializer: S) -> Result<S::Ok, S::Error> {
 pub(super) struct StampWriter {
     pub(super) image: Rows,
     pub(super) examination: Examination,
-    /// Stamps with missing pixels.
     pub(super) incomplete: usize,
-    /// Rows of stamps that are examined.
     examined: Vec<usize>,
     places: csv::Writer<Vec<u8>>,
 }
 
 impl StampWriter {
-    /// # Errors
-    /// If the image cannot be created.
     pub(super) fn create(
         target: &Path,
         mosaic: Mosaic,
@@ -66,10 +60,6 @@ impl StampWriter {
         })
     }
 
-    /// Copies all stamps from their files.
-    ///
-    /// # Errors
-    /// If a file cannot be read, or masks do not fit the stamps.
     pub(super) fn copy(
         &mut self,
         gathering: &Gathering<'_>,
@@ -174,9 +164,6 @@ impl StampWriter {
     }
 
     /// The table of stamps as text, for a file at `path`. Nothing can be added after it.
-    ///
-    /// # Errors
-    /// If it cannot be completed.
     pub(super) fn places(&mut self, path: &Path) -> Result<Vec<u8>, FileError> {
         let empty = csv::Writer::from_writer(Vec::new());
         let places = std::mem::replace(&mut self.places, empty).into_inner();
@@ -184,7 +171,6 @@ impl StampWriter {
     }
 }
 
-/// Refuses an image that is its own mask.
 fn another(mask: &Origin<'_>, image: &Origin<'_>) -> Result<(), FileError> {
     if (mask.file, mask.image) == (image.file, image.image) {
         let message = "the mask is the image itself; expected another (--mask-extension)";
@@ -193,7 +179,7 @@ fn another(mask: &Origin<'_>, image: &Origin<'_>) -> Result<(), FileError> {
     Ok(())
 }
 
-/// Makes the pixels of a stamp missing whose `mask` is not zero, or has one of these bits.
+// Makes the pixels of a stamp missing whose `mask` is not zero, or has one of these bits.
 fn lose(pixels: &mut [f32], mask: &[f64], bits: Option<u64>) -> Result<(), String> {
     for (pixel, mask) in pixels.iter_mut().zip(mask) {
         let bad = match bits {
@@ -234,4 +220,76 @@ pub(super) fn central(pixels: Vec<f32>, [columns, rows]: [usize; 2], side: usize
         }
     }
     square
+}
+
+/// A mosaic that is written a row of stamps at a time.
+pub(super) struct Rows {
+    path: PathBuf,
+    writer: ImageWriter,
+    pub(super) mosaic: Mosaic,
+    pub(super) next: usize,
+    pixels: Vec<f32>,
+}
+
+impl Rows {
+    pub(super) fn create(
+        path: &Path,
+        mosaic: Mosaic,
+        more: &[(&str, Value)],
+    ) -> Result<Self, FileError> {
+        let Mosaic {
+            columns,
+            galaxies,
+            stamp,
+        } = mosaic;
+        let mut keys = vec![
+            ("STAMP", Value::Int(stamp as i64)),
+            ("NSTAMPS", Value::Int(galaxies as i64)),
+        ];
+        keys.extend_from_slice(more);
+        atomic::sweep_beside(path);
+        Ok(Rows {
+            path: path.to_owned(),
+            writer: ImageWriter::create(path, columns * stamp, mosaic.rows() * stamp, &keys)?,
+            pixels: vec![0.0; columns * stamp * stamp],
+            mosaic,
+            next: 0,
+        })
+    }
+
+    pub(super) fn add(&mut self, stamp: &[f32]) -> Result<(), FileError> {
+        let Mosaic {
+            columns,
+            stamp: side,
+            galaxies,
+        } = self.mosaic;
+        let start = self.next % columns * side;
+        let lines = self.pixels.chunks_exact_mut(columns * side);
+        for (line, from) in lines.zip(stamp.chunks_exact(side)) {
+            line[start..start + side].copy_from_slice(from);
+        }
+        self.next += 1;
+        if self.next.is_multiple_of(columns) || self.next == galaxies {
+            self.writer.write_rows(&self.pixels)?;
+            self.pixels.fill(0.0);
+        }
+        Ok(())
+    }
+
+    pub(super) fn finish(self) -> Result<(), FileError> {
+        first(self.writer.finish_if_absent()?, self.path)
+    }
+}
+
+pub(super) fn already(path: PathBuf) -> FileError {
+    let message = "the file is there already. Try: another number with --set and --image";
+    FileError::new(path, message)
+}
+
+/// An error if the file was not `named`, because there is one at `path`.
+pub(super) fn first(named: bool, path: PathBuf) -> Result<(), FileError> {
+    match named {
+        true => Ok(()),
+        false => Err(already(path)),
+    }
 }
