@@ -7,7 +7,7 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use shearq_pipeline::engine;
-use shearq_pipeline::simulate::{simulator, star};
+use shearq_pipeline::simulate::simulator;
 use shearq_quantities::Shear;
 use shearq_quantities::{FunctionalPsf, PsfProfile};
 use shearq_simulate::field::ShearSpectrum;
@@ -141,7 +141,11 @@ fn draw(set: &SetSimulator, fields: &ImageFields, iy: usize, scratch: &mut Rende
     };
     Drawn {
         pixels,
-        stars: psfs.iter().flat_map(|psf| star(psf, STAMP)).collect(),
+        stars: psfs
+            .iter()
+            .flat_map(|psf| psf.stamp(STAMP))
+            .map(|light| light as f32)
+            .collect(),
         formulas: psfs.iter().map(formula).collect(),
         observed,
     }

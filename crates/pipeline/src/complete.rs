@@ -21,23 +21,17 @@ use shearq_files::fits::ImageReader;
 use shearq_files::table::{self, kept, most_rows, read_metadata};
 use shearq_simulate::set::STAMP;
 
-/// A folder of results to be checked.
 #[derive(Debug)]
 pub enum Results<'a> {
     /// Catalogues in `out` of a run on `data`, with the true shear in `data`.
     Catalogues {
-        /// Record of the folder.
         run: &'a Run,
         /// The data that were measured; for a simulated run, `out`.
         data: &'a DataFolder,
-        /// The folder.
         out: &'a Path,
     },
-    /// Simulated data.
     Images {
-        /// Record of the folder.
         record: &'a SimulationRecord,
-        /// The folder.
         data: &'a DataFolder,
     },
 }
@@ -45,11 +39,9 @@ pub enum Results<'a> {
 /// An image whose results are missing or wrong.
 #[derive(Debug)]
 pub struct Fault {
-    /// The image.
     pub id: ImageId,
     /// Its place in the list of all images, from 0.
     pub position: usize,
-    /// The error.
     pub error: FileError,
     /// The file whose absence makes the image be measured again.
     pub result: PathBuf,
@@ -63,9 +55,6 @@ impl Results<'_> {
     }
 
     /// All faults of the results of `images`, in order.
-    ///
-    /// # Errors
-    /// If threads cannot be started.
     pub fn faults(
         &self,
         images: &[ImageId],

@@ -15,24 +15,20 @@ use shearq_measure::Threads;
 
 use super::PipelineError;
 
-/// Items read, in work or waiting to be written, per worker.
+// Items read, in work or waiting to be written, per worker. Chosen by hand.
 const IN_FLIGHT: usize = 4;
 
 /// Receives the progress of the work, from the thread that writes.
 pub trait Progress {
-    /// `galaxies` more are done.
     fn advance(&mut self, galaxies: u64);
     /// `galaxies` more were done before.
     fn skip(&mut self, galaxies: u64) {
         self.advance(galaxies);
     }
-    /// A line about the current work.
     fn note(&mut self, line: &str);
-    /// A warning.
     fn warn(&mut self, line: &str);
 }
 
-/// Discards all progress.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Quiet;
 
@@ -48,7 +44,6 @@ pub struct Feeder<'a, I> {
     items: SyncSender<(u64, I)>,
     permits: &'a Receiver<()>,
     next: u64,
-    /// Threads for work before items are handed over.
     ahead: &'a Pool,
 }
 
@@ -63,7 +58,6 @@ impl<I> Feeder<'_, I> {
         self.items.send((self.next - 1, item)).is_ok()
     }
 
-    /// Threads for work before items are handed over.
     pub fn ahead(&self) -> &Pool {
         self.ahead
     }
@@ -75,9 +69,6 @@ pub struct Pool(ThreadPool);
 
 impl Pool {
     /// `threads`, or one per core for 0.
-    ///
-    /// # Errors
-    /// If threads cannot be started.
     pub fn new(threads: usize) -> Result<Self, PipelineError> {
         let pool = ThreadPoolBuilder::new().num_threads(threads).build()?;
         Ok(Pool(pool))
@@ -99,9 +90,6 @@ type Done<O> = Result<Result<O, PipelineError>, Box<dyn Any + Send>>;
 
 /// Runs `read` on one thread, `work` on `threads` workers with one scratch each, and `write` on the calling thread in
 /// the order of reading.
-///
-/// # Errors
-/// The first error of any part. Earlier results stay written.
 ///
 /// # Panics
 /// If a part panics.
@@ -172,7 +160,6 @@ where
     })
 }
 
-/// Writes results in order as they come.
 fn collect<O>(
     results: &Receiver<(u64, Done<O>)>,
     permits: &SyncSender<()>,

@@ -11,7 +11,6 @@ pub mod inputs;
 pub mod measure;
 pub mod run;
 pub mod simulate;
-mod warned;
 mod wcs;
 
 pub use engine::{Progress, Quiet};

@@ -4,9 +4,7 @@
 //! measures the images of a data folder, and writes a catalogue when all rows of an image are measured.
 
 mod catalogue;
-mod psfs;
 mod source;
-mod stamps;
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -20,8 +18,7 @@ pub use self::catalogue::{
 };
 pub(crate) use self::catalogue::{Catalogues, metadata};
 pub use self::source::ImageSource;
-pub(crate) use self::source::open_galaxies;
-pub(crate) use self::stamps::check_strip;
+pub(crate) use self::source::{check_strip, open_galaxies};
 use crate::PipelineError;
 use crate::engine::{self, Feeder, Progress};
 use crate::inputs::verify_images;
@@ -31,12 +28,9 @@ use shearq_dataset::layout::DataFolder;
 use shearq_dataset::mosaic::Mosaic;
 use shearq_dataset::run::Run;
 
-/// What the catalogue of an image contains beside its galaxies.
 #[derive(Debug, Clone)]
 pub struct ImageHead {
-    /// The image.
     pub id: ImageId,
-    /// How its stamps lie.
     pub mosaic: Mosaic,
     /// Warnings about all images of the run, which were examined on this image.
     pub run_warnings: Vec<Warning>,
@@ -47,26 +41,23 @@ pub struct ImageHead {
 /// A row of stamps of an image, to be measured by each of several measurers.
 #[derive(Debug)]
 pub struct ImageRow<'n, H> {
-    /// What the caller knows the image by.
+    /// Identifies the image to the caller.
     pub head: Arc<H>,
     /// One per measurer.
     pub jobs: Vec<RowJob<'n>>,
 }
 
-/// What happened in [`measure_images`].
+/// Progress of [`measure_images`].
 #[derive(Debug)]
 pub enum Measured<'a, H> {
-    /// So many galaxies of a row were measured.
+    /// A row was measured, with so many galaxies.
     Galaxies(usize),
     /// All rows of an image were measured, and calibrated by each measurer.
     Image(&'a H, Vec<Batch>),
 }
 
-/// Measures the rows that `read` hands over, image by image and in order, by each of `measurers`. `done` is told on the
-/// calling thread.
-///
-/// # Errors
-/// As `read` and `done`, or if a row cannot be measured.
+/// Measures the rows that `read` hands over, image by image and in order, by each of `measurers`. `done` runs on the calling
+/// thread.
 pub fn measure_images<'n, H: Send + Sync>(
     threads: usize,
     measurers: &[Measurer],
@@ -105,7 +96,6 @@ pub fn measure_images<'n, H: Send + Sync>(
     )
 }
 
-/// The measurement of images of a data folder.
 #[derive(Debug)]
 pub struct FolderMeasurement<'a> {
     run: &'a Run,
@@ -119,9 +109,6 @@ pub struct FolderMeasurement<'a> {
 impl<'a> FolderMeasurement<'a> {
     /// Plans the measurement of `images` of the run's data into catalogues in `out`. Catalogues of the same settings
     /// that are there already are kept. Only [`FolderMeasurement::measure`] writes.
-    ///
-    /// # Errors
-    /// If the first image or its PSF cannot be used.
     pub fn open(
         run: &'a Run,
         data: &'a DataFolder,
@@ -149,9 +136,6 @@ impl<'a> FolderMeasurement<'a> {
     }
 
     /// Measures the images and writes their catalogues.
-    ///
-    /// # Errors
-    /// If the folder contains results of other settings, data are absent or damaged, or a catalogue cannot be written.
     pub fn measure(
         self,
         threads: usize,
@@ -185,7 +169,6 @@ impl<'a> FolderMeasurement<'a> {
         catalogues.finish(progress)
     }
 
-    /// Reads the rows of the images in `todo`.
     fn read(
         &self,
         todo: &[ImageId],
@@ -230,10 +213,6 @@ impl<'a> FolderMeasurement<'a> {
     }
 }
 
-/// Measures `images` of the run's data into catalogues in `out`: a [`FolderMeasurement`] from beginning to end.
-///
-/// # Errors
-/// As [`FolderMeasurement::open`] and [`FolderMeasurement::measure`].
 pub fn measure_folder(
     run: &Run,
     data: &DataFolder,

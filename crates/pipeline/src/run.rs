@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use ndarray::{ArcArray2, Array2, ArrayView2, Ix3};
+use ndarray::{ArcArray2, Ix3};
 use shearq_measure::{
     Batch, KnownNoise, Lazy, LazyStamps, Measurement, Measurer, OneThread, Pixels, Psfs, Session,
     StampRows, StampSource, Star, Steps, Threads, Worker,
@@ -31,32 +31,37 @@ pub struct SimulatedSource<'s> {
     set: &'s SetSimulator,
     fields: Arc<ImageFields>,
     form: PsfForm,
-    /// The PSF of all galaxies, if there is one.
     shared: Option<ArcArray2<f64>>,
     /// Rows that are measured by several measurers, or were drawn for a survey and will be measured.
     drawn: Arc<Mutex<BTreeMap<usize, LazyStamps<'s>>>>,
 }
 
 impl<'s> SimulatedSource<'s> {
-    fn psf_of_all(fields: &ImageFields, configuration: &Configuration) -> Option<ArcArray2<f64>> {
-        let PsfField::One(psf) = &fields.psf else {
-            return None;
-        };
-        let cut = configuration.psf_cut();
-        let psf = match configuration.psf.form {
-            PsfForm::Functional => psf.stamp_beside(cut.size, STAMP),
-            PsfForm::Star => {
-                let star = simulate::star(psf, STAMP);
-                let psf = ArrayView2::from_shape((STAMP, STAMP), &star)
-                    .ok()
-                    .and_then(|star| Some(Star::cut(star, cut).ok()?.psf));
-                // A simulated star without noise can always be cut.
-                psf.unwrap_or_else(|| {
-                    Array2::zeros((configuration.psf.size, configuration.psf.size))
-                })
+    fn new(
+        set: &'s SetSimulator,
+        fields: &Arc<ImageFields>,
+        configuration: &Configuration,
+        drawn: &Arc<Mutex<BTreeMap<usize, LazyStamps<'s>>>>,
+    ) -> Result<Self, PipelineError> {
+        let form = configuration.psf.form;
+        let shared = match &fields.psf {
+            PsfField::PerGalaxy(_) => None,
+            PsfField::One(psf) => {
+                let cut = configuration.psf_cut();
+                let psf = match form {
+                    PsfForm::Functional => psf.stamp_beside(cut.size, STAMP),
+                    PsfForm::Star => Star::cut(fields.psf.star(0, 0).view(), cut)?.psf,
+                };
+                Some(psf.into_shared())
             }
         };
-        Some(psf.into_shared())
+        Ok(SimulatedSource {
+            set,
+            fields: Arc::clone(fields),
+            form,
+            shared,
+            drawn: Arc::clone(drawn),
+        })
     }
 
     /// The PSFs of a row in the form that the configuration uses.
@@ -71,10 +76,7 @@ impl<'s> SimulatedSource<'s> {
                 PsfForm::Functional => {
                     Psfs::functional((0..n).map(|ix| *fields.psf.at(ix, row)).collect::<Vec<_>>())
                 }
-                PsfForm::Star => {
-                    let stars = simulate::draw_stars(set, &fields, row);
-                    Psfs::Stars(Pixels::strip(stars, n, STAMP).expect("as many pixels as drawn"))
-                }
+                PsfForm::Star => Psfs::Stars(stamps(set.draw_stars(&fields, row), n)),
             }
         })
     }
@@ -92,12 +94,18 @@ impl<'s> StampSource<'s> for SimulatedSource<'s> {
     }
 
     fn stamps(&mut self, row: usize) -> Result<LazyStamps<'s>, PipelineError> {
+        thread_local! {
+            // The value of a `Lazy` is made in any thread. Rows of an image often share the transfer function of their PSF,
+            // which is kept here.
+            static SCRATCH: RefCell<RenderScratch> = RefCell::default();
+        }
         let (set, fields) = (self.set, Arc::clone(&self.fields));
         let mut drawn = self.drawn.lock().unwrap_or_else(PoisonError::into_inner);
-        let stamps = drawn
-            .entry(row)
-            .or_insert_with(|| Lazy::new(move || draw(set, &fields, row)));
-        Ok(stamps.clone())
+        let lazy = drawn.entry(row).or_insert_with(|| {
+            let draw = move |scratch: &mut RenderScratch| set.draw_row(&fields, row, scratch);
+            Lazy::new(move || stamps(SCRATCH.with_borrow_mut(draw), set.grid().n))
+        });
+        Ok(lazy.clone())
     }
 
     fn psfs(&mut self, row: usize) -> Result<Lazy<'s, Psfs<'s>>, PipelineError> {
@@ -105,31 +113,19 @@ impl<'s> StampSource<'s> for SimulatedSource<'s> {
     }
 }
 
-/// Draws a row of stamps.
-fn draw<'s>(set: &SetSimulator, fields: &ImageFields, row: usize) -> Pixels<'s, Ix3> {
-    thread_local! {
-        /// Rows of an image often share the transfer function of their PSF, which is kept here.
-        static SCRATCH: RefCell<RenderScratch> = RefCell::default();
-    }
-    let pixels =
-        SCRATCH.with_borrow_mut(|scratch| simulate::draw_stamps(set, fields, row, scratch));
-    Pixels::strip(pixels, set.grid().n, STAMP).expect("as many pixels as drawn")
+fn stamps<'s>(strip: Vec<f32>, n: usize) -> Pixels<'s, Ix3> {
+    Pixels::strip(strip, n, STAMP).expect("as many pixels as drawn")
 }
 
 /// A simulated image that is being measured by several measurers.
 #[derive(Debug)]
 pub struct SimulatedSessions<'s> {
-    /// The image's fields of PSF and ellipticity.
     pub fields: Arc<ImageFields>,
-    /// The sessions of the measurers, with their sources.
     sessions: Vec<(Arc<Session<'s>>, SimulatedSource<'s>)>,
 }
 
 impl<'s> SimulatedSessions<'s> {
     /// Opens a session of each measurer. Rows that are surveyed are drawn once.
-    ///
-    /// # Errors
-    /// If a measurer is for stamps of another size.
     pub fn new(
         set: &'s SetSimulator,
         image: u32,
@@ -138,13 +134,8 @@ impl<'s> SimulatedSessions<'s> {
     ) -> Result<Self, PipelineError> {
         let (fields, drawn) = (Arc::new(set.image_fields(image)), Arc::default());
         let sessions = measurers.iter().map(|measurer| {
-            let mut source = SimulatedSource {
-                set,
-                fields: Arc::clone(&fields),
-                form: measurer.configuration().psf.form,
-                shared: SimulatedSource::psf_of_all(&fields, measurer.configuration()),
-                drawn: Arc::clone(&drawn),
-            };
+            let configuration = measurer.configuration();
+            let mut source = SimulatedSource::new(set, &fields, configuration, &drawn)?;
             let noise = KnownNoise::Stated(NOISE_SIGMA);
             let session = Session::open(measurer, &mut source, noise, threads)?;
             Ok((Arc::new(session), source))
@@ -171,9 +162,6 @@ impl<'s> SimulatedSessions<'s> {
     }
 
     /// Measures a strip of stamps in the place of a row, before calibration.
-    ///
-    /// # Errors
-    /// If the stamps have other sizes than planned.
     pub fn measure(
         &self,
         workers: &mut [Worker],
@@ -191,9 +179,6 @@ impl<'s> SimulatedSessions<'s> {
 }
 
 /// Plans the measurement of simulated stamps by each of `configurations`.
-///
-/// # Errors
-/// If the sizes of a configuration cannot be used.
 pub fn measurers(configurations: &[Configuration]) -> Result<Vec<Measurer>, PipelineError> {
     configurations
         .iter()
@@ -204,9 +189,6 @@ pub fn measurers(configurations: &[Configuration]) -> Result<Vec<Measurer>, Pipe
 /// Simulates `images`, which are in the order of their sets, and measures them by the run's configuration. Writes
 /// catalogues to `out`, with the true shear. No image is stored. Catalogues of the same settings that are
 /// there already are kept.
-///
-/// # Errors
-/// If a set does not exist, the folder contains results of other settings, or a file cannot be written.
 pub fn run_folder(
     run: &Run,
     settings: SimulationSettings,
@@ -249,10 +231,8 @@ pub fn run_folder(
     catalogues.finish(progress)
 }
 
-/// A simulated image, measured.
 #[derive(Debug)]
 pub struct SimulatedImage<'a> {
-    /// Its number.
     pub image: u32,
     /// True ellipticities of the galaxies as lensed, row by row.
     pub observed: &'a [Shear],
@@ -264,9 +244,6 @@ pub struct SimulatedImage<'a> {
 ///
 /// The galaxies are equal to the galaxies of `simulate` with the same settings, and the measurements to the results of
 /// `measure`.
-///
-/// # Errors
-/// As `done`, or if threads cannot be started.
 pub fn run_set(
     set: &SetSimulator,
     images: &[u32],
@@ -310,9 +287,6 @@ pub fn run_set(
 }
 
 /// The steps of measuring galaxy `(ix, iy)` of a simulated image; `None` if it could not be measured.
-///
-/// # Errors
-/// If the measurer is for stamps of another size.
 pub fn simulated_steps(
     set: &SetSimulator,
     measurer: &Measurer,

@@ -8,7 +8,7 @@ use shearq_fourier::Complex64;
 use shearq_scoring::modes::{Decomposer, Modes};
 use shearq_scoring::{BINS, Grid};
 
-/// ℓ²C_ℓ/2π of the fiducial ΛCDM shear, sources at z ≈ 1: the table that GREAT3 used.
+// ℓ and ℓ²C_ℓ/2π of the fiducial ΛCDM shear, sources at z ≈ 1: the table that GREAT3 used.
 const FIDUCIAL: [(f64, f64); 12] = [
     (36.0, 3.56e-6),
     (60.0, 5.80e-6),
@@ -24,16 +24,14 @@ const FIDUCIAL: [(f64, f64); 12] = [
     (5000.0, 7.71e-5),
 ];
 
-/// Multipole at which the tilt turns.
+// Multipole whose power a tilt leaves unchanged. Chosen by hand.
 const PIVOT: f64 = 1000.0;
 
 /// The shear power spectrum of a set: the fiducial one times amplitude·(ℓ/1000)^tilt, and in each bandpower of the scoring
 /// times a random factor.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct ShearSpectrum {
-    /// Factor on the power.
     pub amplitude: f64,
-    /// Extra slope of the power.
     pub tilt: f64,
     /// Largest factor s on a bandpower. Each set and bandpower has its own factor, log-uniform between 1/s and s, so
     /// that neither other sets nor other simulations predict it. 1 for the same smooth spectrum in all sets.
@@ -74,25 +72,19 @@ impl ShearSpectrum {
         power * self.amplitude * (l / PIVOT).powf(self.tilt) * 2.0 * std::f64::consts::PI / (l * l)
     }
 
-    /// Random factors on the bandpowers of a set.
     pub(crate) fn factors(&self, rng: &mut impl RngExt) -> [f64; BINS] {
         let range = self.scatter.ln();
         std::array::from_fn(|_| (range * (2.0 * rng.random::<f64>() - 1.0)).exp())
     }
 }
 
-/// Which modes a random field has.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Content {
-    /// Lensing-like.
     EOnly,
-    /// As GREAT10's intrinsic ellipticities.
     BOnly,
-    /// Both, of equal power.
     Both,
 }
 
-/// Fields here are made on the grid of the decomposer.
 const SAME_GRID: &str = "a field on the grid of the decomposer";
 
 /// A Gaussian random field with power C_ℓ = `spectrum(ℓ)` in steradian in each of the modes of

@@ -16,8 +16,7 @@ pub const EXPONENTIAL_HALF_LIGHT: f64 = 1.678_346_990_016_660_7;
 /// b of a de Vaucouleurs profile exp(−b (r/r_e)^{1/4}): half the light of Γ(8) lies below b.
 pub const DE_VAUCOULEURS_B: f64 = 7.669_249_442_500_804;
 
-/// Γ(8).
-const GAMMA_8: f64 = 5040.0;
+const GAMMA_8: f64 = 5040.0; // Γ(8) = 7!
 
 static DE_VAUCOULEURS: LazyLock<RadialTable> = LazyLock::new(|| {
     let rule = composite_rule(0.0, 1.0, 16, 16);
@@ -45,7 +44,6 @@ impl Sersic {
         }
     }
 
-    /// Replaces squared wavenumbers by the transform there, as [`Sersic::fourier`].
     #[inline(always)]
     pub(crate) fn fourier_each(self, values: &mut [f64]) {
         match self {
@@ -114,39 +112,29 @@ fn de_vaucouleurs_fourier(rule: &[(f64, f64)], k: f64) -> f64 {
     16.0 * de_vaucouleurs_centre() * sum * end
 }
 
-/// A component or galaxy that cannot be.
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
 #[non_exhaustive]
 pub enum GalaxyError {
-    /// The radius is zero, negative or not a number.
     #[error("a half-light radius must be a positive number of pixels, not {0}")]
     Radius(f64),
-    /// The flux is negative or not a number.
     #[error("a component's flux must be a number, zero or more, not {0}")]
     Flux(f64),
-    /// A bulge fraction is a share of the flux.
     #[error("the bulge's share of the flux must lie between 0 and 1, not {0}")]
     BulgeFraction(f64),
-    /// A position that is not a number.
     #[error("a component's offset must be finite, not ({0}, {1})")]
     Offset(f64, f64),
-    /// An ellipticity of modulus 1 or more is not an ellipse.
     #[error("a component's ellipticity ({}, {}) must have a modulus below 1", .0.e1, .0.e2)]
     Shape(Shear),
-    /// Galaxies have a fixed number of places for components.
     #[error("a galaxy has 1 or 2 components, not {0}")]
     Count(usize),
 }
 
-/// One elliptical component.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Component {
-    /// Radial form.
     pub profile: Sersic,
     /// Radius of the circle that holds half the light before the shear, in pixels. The shear keeps
     /// areas, so this is the circularised half-light radius.
     pub half_light_radius: f64,
-    /// Total flux, out to infinity.
     pub flux: f64,
     /// Offset from the galaxy's centre along x, in pixels.
     pub dx: f64,
@@ -209,13 +197,8 @@ pub struct Galaxy {
 }
 
 impl Galaxy {
-    /// Places for components.
     pub const MAX_COMPONENTS: usize = 2;
 
-    /// A galaxy of the given components.
-    ///
-    /// # Errors
-    /// When there are none or too many, or one of them has an impossible value.
     pub fn new(components: &[Component]) -> Result<Self, GalaxyError> {
         let count = components.len();
         if count == 0 || count > Self::MAX_COMPONENTS {
@@ -236,9 +219,6 @@ impl Galaxy {
     ///
     /// The bulge holds `bulge_fraction` of `flux`; a share of 0 or 1 leaves out the other
     /// component. Radii are circularised half-light radii in pixels.
-    ///
-    /// # Errors
-    /// When the share is not within 0 to 1, or another value is impossible.
     pub fn bulge_and_disc(
         flux: f64,
         bulge_fraction: f64,
@@ -268,10 +248,6 @@ impl Galaxy {
         }
     }
 
-    /// The same galaxy with every de Vaucouleurs component moved by (`dx`, `dy`) pixels.
-    ///
-    /// # Errors
-    /// When the offset is not finite.
     pub fn with_bulge_offset(mut self, dx: f64, dy: f64) -> Result<Self, GalaxyError> {
         for component in &mut self.components[..self.count] {
             if component.profile == Sersic::DeVaucouleurs {
@@ -283,10 +259,6 @@ impl Galaxy {
         Ok(self)
     }
 
-    /// The same galaxy with all fluxes multiplied by `factor`.
-    ///
-    /// # Errors
-    /// When that makes a flux negative or not a number.
     pub fn scaled(mut self, factor: f64) -> Result<Self, GalaxyError> {
         for component in &mut self.components[..self.count] {
             component.flux *= factor;
@@ -295,12 +267,10 @@ impl Galaxy {
         Ok(self)
     }
 
-    /// The components.
     pub fn components(&self) -> &[Component] {
         &self.components[..self.count]
     }
 
-    /// Total flux.
     pub fn flux(&self) -> f64 {
         self.components().iter().map(|c| c.flux).sum()
     }

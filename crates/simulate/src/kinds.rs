@@ -2,24 +2,18 @@
 
 use serde::Serialize;
 
-/// Highest set number.
 pub const SETS: u32 = 24;
 
-/// The class of S/N or size that most sets have.
 const FIDUCIAL: &str = "fiducial";
 
-/// Whether a field is the same for all images of a set.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Variability {
-    /// The same in every image.
     Fixed,
-    /// Different from image to image.
     Variable,
 }
 
 impl Variability {
-    /// In one word.
     pub fn label(self) -> &'static str {
         match self {
             Variability::Fixed => "fixed",
@@ -28,29 +22,20 @@ impl Variability {
     }
 }
 
-/// What the galaxies and the PSF of a set are like.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum ImageType {
     /// S/N 20, bulge and disc of fiducial size, Moffat PSF.
     Fiducial,
-    /// S/N 10.
     LowSnr,
-    /// S/N 40.
     HighSnr,
-    /// A distribution of S/N.
     SmoothSnr,
-    /// Small galaxies.
     SmallGalaxy,
-    /// Large galaxies.
     LargeGalaxy,
-    /// A distribution of sizes.
     SmoothGalaxy,
     /// Kolmogorov PSF with turbulence.
     Kolmogorov,
-    /// Uniform distribution of bulge fractions.
     UniformBulge,
-    /// Bulge offset from the disc.
     OffsetBulge,
 }
 
@@ -100,16 +85,13 @@ impl ImageType {
     }
 }
 
-/// One row of Table 2.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 pub struct SetKind {
-    /// Set number, 1 to 24.
     pub set: u32,
     /// PSF field over the images.
     pub psf: Variability,
     /// Intrinsic ellipticity field over the images.
     pub ellipticity: Variability,
-    /// Galaxies and PSF.
     pub image: ImageType,
 }
 

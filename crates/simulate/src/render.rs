@@ -27,18 +27,19 @@ use self::lines::{
     unfold_rows,
 };
 
-/// Wavenumbers are dropped where galaxy × PSF × pixel is below this share of the flux. The image loses
-/// about 1/(2π) ∫ k |F| dk over them; in a PSF's exponential tail near k = 3.5 that is a fifth of it,
-/// against a peak pixel of some 2e-2 of the flux.
+// Wavenumbers are dropped where galaxy × PSF × pixel is below this share of the flux. The image loses about
+// 1/(2π) ∫ k |F| dk over them; in a PSF's exponential tail near k = 3.5 that is a fifth of it, against a peak pixel of some
+// 2e-2 of the flux.
 const SPECTRUM_TOLERANCE: f64 = 6e-6;
 
-/// Light that may fold into the nearest corner of the stamp, relative to the galaxy's peak.
+// Light that may fold into the nearest corner of the stamp, relative to the galaxy's peak. Chosen by hand, below the 1e-4 of the
+// peak that `render` promises.
 const FOLDING_TOLERANCE: f64 = 3e-5;
 
-/// The largest wavenumber in units of π. It is reached only by PSFs with a FWHM near one pixel.
+// In units of π. Only PSFs with a FWHM near one pixel reach it.
 const MAX_ORDER: usize = 3;
 
-/// Smallest periods tried, in thirds of the stamp's size, or of 16 px if it is smaller.
+// Periods tried, smallest first, in thirds of the stamp's size, or of 16 px if it is smaller. Chosen by hand.
 const PERIODS_IN_THIRDS: [usize; 7] = [5, 6, 7, 8, 10, 12, 24];
 
 /// Draws galaxies on square stamps of one size.
@@ -64,7 +65,7 @@ struct Grid {
     rows: usize,
     /// Half of the stamp, padded to lanes of a product.
     width: usize,
-    /// What a wave is multiplied by if its wavenumber changes by 2π. Positions in the stamp are half pixels from the
+    /// Factor of a wave if its wavenumber changes by 2π. Positions in the stamp are half pixels from the
     /// middle if its side is even.
     turn: f32,
     /// cos(2πjd/N) at distances d from the middle, and the same of sines. Rows are d, and are padded to lanes.
@@ -89,12 +90,11 @@ pub struct RenderScratch {
     /// The same for all ky, which are rows, with wavenumbers beyond π added onto those within.
     sums: Vec<f32>,
     differences: Vec<f32>,
-    /// Even and odd parts of what is transformed.
+    /// Even and odd parts of the transformed rows.
     even: Vec<f32>,
     odd: Vec<f32>,
-    /// Real and imaginary parts of what is transformed along y; rows are y.
+    /// Real and imaginary parts after the transform along y; rows are y.
     along_y: [Vec<f32>; 2],
-    /// For each period.
     transfers: Vec<Transfer>,
     phases: Phases,
 }
@@ -108,7 +108,6 @@ impl std::fmt::Debug for RenderScratch {
 /// PSF × pixel, of the PSF that was used last: galaxies of an image often share it.
 #[derive(Default)]
 struct Transfer {
-    /// The PSF and the period.
     of: Option<(FunctionalPsf, usize)>,
     /// Wavenumbers along an axis. Lines of kx are at ky from 0, and after them at ky from 0 downwards.
     count: usize,
@@ -118,7 +117,7 @@ struct Transfer {
 }
 
 impl Transfer {
-    /// Forgets the PSF unless it is `psf` with a period of `size`, and `count` wavenumbers have room.
+    /// Drops the cached PSF unless it is `psf` with a period of `size`, and `count` wavenumbers have room.
     fn prepare(&mut self, psf: &TransformedPsf<'_>, size: usize, count: usize) {
         let of = Some((psf.functional(), size));
         if self.of == of && count <= self.count {
@@ -161,7 +160,6 @@ struct Phases {
 }
 
 impl RenderScratch {
-    /// Empty; the first use takes the memory.
     pub fn new() -> Self {
         Self::default()
     }
@@ -182,7 +180,6 @@ impl Renderer {
         }
     }
 
-    /// Pixels on a side.
     pub fn stamp(&self) -> usize {
         self.stamp
     }
@@ -394,7 +391,7 @@ impl Grid {
         }
     }
 
-    /// The image from what [`Grid::fill`] left.
+    /// Transforms the modes of [`Grid::fill`] to the image.
     fn transform(&self, stamp: usize, modes: usize, scratch: &mut RenderScratch, out: &mut [f32]) {
         let RenderScratch {
             sums,

@@ -25,33 +25,32 @@ use super::noise::add_noise;
 use super::render::{RenderScratch, Renderer};
 use super::signal::power;
 
-/// A setting of a simulation out of its range.
 #[derive(Debug, thiserror::Error)]
 #[error("{0}")]
 pub struct SettingsError(String);
 
-/// Pixels a side of a postage stamp.
+// Pixels a side of a postage stamp, as in GREAT10.
 pub const STAMP: usize = 48;
 /// Noise per pixel; images are scaled so that it is one.
 pub const NOISE_SIGMA: f64 = 1.0;
-/// Standard deviation of the intrinsic ellipticities per component, by default.
+// Per component, by default. Chosen by hand: GREAT10 did not publish it.
 const INTRINSIC_SIGMA: f64 = 0.14;
-/// Intrinsic ellipticities are scaled back to this modulus.
+// Larger intrinsic ellipticities are scaled back to this modulus. Chosen by hand.
 const MAX_INTRINSIC: f64 = 0.7;
-/// Shears beyond this are not weak, and with intrinsic shapes could exceed 1.
+// Beyond it shears are not weak, and with intrinsic shapes ellipticities could exceed 1.
 const MAX_SHEAR: f64 = 0.5;
-/// FWHM of every PSF in pixels.
+// In pixels, of every PSF. Chosen by hand.
 const FWHM: f64 = 3.4;
-/// Range of S/N in the "smooth" sets, around which the distribution is cut.
+// Range of S/N in the "smooth" sets. Chosen by hand.
 const SNR_RANGE: (f64, f64) = (10.0, 80.0);
 
-/// Galaxies a side that a simulated image may have.
+// Galaxies a side: scoring needs 8 or more, and an image of 400² stamps has 1.5 GB.
 const SIDES: RangeInclusive<usize> = 8..=400;
 
-/// Tilts of a spectrum: beyond these all power lies in one mode or none.
+// Beyond these tilts all power lies in one mode or none.
 const TILTS: RangeInclusive<f64> = -20.0..=20.0;
 
-/// Factors on bandpowers: beyond these, most sets have all power in one bandpower.
+// Factors on bandpowers: beyond these, most sets have all power in one bandpower.
 const SCATTERS: RangeInclusive<f64> = 1.0..=100.0;
 
 /// What a simulation is made from, beside the sets and images asked for. Wherever it is read from, it is
@@ -59,11 +58,8 @@ const SCATTERS: RangeInclusive<f64> = 1.0..=100.0;
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(remote = "Self", deny_unknown_fields)]
 pub struct SimulationSettings {
-    /// Seed of all random streams.
     pub seed: u64,
-    /// Galaxies a side.
     pub grid: usize,
-    /// Shear power spectrum.
     pub spectrum: ShearSpectrum,
     /// Standard deviation of each component of the intrinsic ellipticities (shear-type).
     pub intrinsic_sigma: f64,
@@ -77,21 +73,19 @@ pub struct SimulationSettings {
 
 impl Serialize for SimulationSettings {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        // The derived one.
+        // The derived function: `remote` makes it one of the type, so that deserialization can validate.
         SimulationSettings::serialize(self, serializer)
     }
 }
 
 impl<'de> Deserialize<'de> for SimulationSettings {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        // The derived one.
         let settings = SimulationSettings::deserialize(deserializer)?;
         settings.validate().map_err(serde::de::Error::custom)?;
         Ok(settings)
     }
 }
 
-/// What a random stream is for.
 #[derive(Clone, Copy)]
 enum Purpose {
     Shear = 1,
@@ -101,11 +95,10 @@ enum Purpose {
     Bandpowers = 5,
 }
 
-/// Image number in a key that stands for the whole set.
+// Image number in the key of streams that the whole set shares; images count from 1.
 const WHOLE_SET: u32 = 0;
 
 impl SimulationSettings {
-    /// The defaults with a seed and a number of galaxies a side.
     pub fn new(seed: u64, grid: usize) -> Self {
         SimulationSettings {
             seed,
@@ -117,10 +110,6 @@ impl SimulationSettings {
         }
     }
 
-    /// Checks every value against its range.
-    ///
-    /// # Errors
-    /// What was found and what was expected.
     pub fn validate(&self) -> Result<(), SettingsError> {
         let &SimulationSettings {
             seed: _,
@@ -184,26 +173,27 @@ impl SimulationSettings {
     }
 }
 
-/// The PSF of an image.
 #[derive(Debug, Clone)]
 pub enum PsfField {
-    /// One for all galaxies.
     One(FunctionalPsf),
     /// One per galaxy, `[ix, iy]`.
     PerGalaxy(Array2<FunctionalPsf>),
 }
 
 impl PsfField {
-    /// The PSF of cell `(ix, iy)`.
     pub fn at(&self, ix: usize, iy: usize) -> &FunctionalPsf {
         match self {
             PsfField::One(psf) => psf,
             PsfField::PerGalaxy(field) => &field[(ix, iy)],
         }
     }
+
+    /// The PSF of cell `(ix, iy)` as a star without noise, of sum one.
+    pub fn star(&self, ix: usize, iy: usize) -> Array2<f32> {
+        self.at(ix, iy).stamp(STAMP).mapv(|value| value as f32)
+    }
 }
 
-/// A set, ready to simulate its images.
 pub struct SetSimulator {
     kind: SetKind,
     settings: SimulationSettings,
@@ -220,26 +210,21 @@ impl std::fmt::Debug for SetSimulator {
     }
 }
 
-/// One galaxy as it might have been.
+/// Properties of a galaxy that a study varies while all random numbers stay the same.
 #[derive(Debug, Clone, Copy)]
 pub struct Version {
-    /// Ellipticity before lensing.
     pub intrinsic: Shear,
-    /// The shear on it.
     pub shear: Shear,
     /// Factor of its radii. Its flux stays the same.
     pub size: f64,
-    /// Factor of its noise.
     pub noise: f32,
 }
 
 /// What is common to all galaxies of one image.
 pub struct ImageFields {
-    /// Image number, from 1.
     pub image: u32,
     /// Unlensed shear-type ellipticities, `[ix, iy]`.
     pub intrinsic: Array2<Complex64>,
-    /// PSFs.
     pub psf: PsfField,
 }
 
@@ -251,9 +236,6 @@ impl std::fmt::Debug for ImageFields {
 
 impl SetSimulator {
     /// Draws the fields that the whole set shares.
-    ///
-    /// # Errors
-    /// Where the grid is out of range or the spectrum so high that the shear is not weak.
     pub fn new(
         kind: SetKind,
         settings: SimulationSettings,
@@ -273,7 +255,7 @@ impl SetSimulator {
             }
         };
         let strongest = shear.iter().map(|g| g.norm()).fold(0.0, f64::max);
-        // What is not a number is not weak either.
+        // NaN passes the first comparison.
         if strongest > MAX_SHEAR || shear.iter().any(|g| !g.norm().is_finite()) {
             return Err(shearq_scoring::ScoringError::StrongShear {
                 found: strongest,
@@ -292,17 +274,14 @@ impl SetSimulator {
         })
     }
 
-    /// The set's kind.
     pub fn kind(&self) -> SetKind {
         self.kind
     }
 
-    /// The grid of galaxies.
     pub fn grid(&self) -> Grid {
         self.grid
     }
 
-    /// True shear, shared by all images.
     pub fn truth(&self) -> TrueShear {
         TrueShear {
             g1: self.shear.mapv(|g| g.re),
@@ -310,7 +289,6 @@ impl SetSimulator {
         }
     }
 
-    /// True shear of cell `(ix, iy)`.
     pub fn shear_at(&self, ix: usize, iy: usize) -> Shear {
         let g = self.shear[(ix, iy)];
         Shear::new(g.re, g.im)
@@ -454,6 +432,44 @@ impl SetSimulator {
         let scale = (snr * NOISE_SIGMA / power(&unlensed, &psf).sqrt()) as f32;
         let sigma = version.noise * NOISE_SIGMA as f32;
         add_noise(&mut rng, scale, sigma, out);
+    }
+
+    /// Draws a row of galaxies with noise: stamps side by side, row-major.
+    pub fn draw_row(
+        &self,
+        fields: &ImageFields,
+        iy: usize,
+        scratch: &mut RenderScratch,
+    ) -> Vec<f32> {
+        self.strip(|ix, stamp| {
+            self.draw(fields, ix, iy, scratch, stamp);
+        })
+    }
+
+    /// Draws the stars of a row of galaxies in the same layout.
+    pub fn draw_stars(&self, fields: &ImageFields, iy: usize) -> Vec<f32> {
+        self.strip(|ix, stamp| {
+            let star = fields.psf.star(ix, iy);
+            stamp
+                .iter_mut()
+                .zip(&star)
+                .for_each(|(to, light)| *to = *light);
+        })
+    }
+
+    /// A strip of the stamps that `draw` fills, for each column of the grid.
+    pub fn strip(&self, mut draw: impl FnMut(usize, &mut [f32])) -> Vec<f32> {
+        let n = self.grid.n;
+        let mut strip = vec![0.0; n * STAMP * STAMP];
+        let mut stamp = vec![0.0; STAMP * STAMP];
+        for ix in 0..n {
+            draw(ix, &mut stamp);
+            let lines = strip.chunks_exact_mut(n * STAMP);
+            for (line, pixels) in lines.zip(stamp.chunks_exact(STAMP)) {
+                line[ix * STAMP..][..STAMP].copy_from_slice(pixels);
+            }
+        }
+        strip
     }
 
     /// Ellipticity of galaxy `(ix, iy)` after lensing.

@@ -10,17 +10,15 @@ use shearq_quantities::{Shear, TransformedPsf};
 use super::galaxy::{Component, Galaxy, Sersic};
 use super::render::sinc;
 
-/// Directions over a quarter of a turn. Equal steps are exact but for terms that only ellipticities of 0.7 have.
+// Directions over a quarter of a turn. Equal steps are exact but for terms that only ellipticities of 0.7 have.
 const QUARTER: usize = 10;
-/// Directions over half a turn.
 const HALF: usize = 2 * QUARTER;
 
-/// The end of the integral in radians per pixel: beyond it the square of a 3 px PSF's transform is below 10⁻¹².
+// In radians per pixel: beyond it the square of a 3 px PSF's transform is below 10⁻¹².
 const END: f64 = 2.0 * PI;
 
 /// A node of the integral over the moduli of wavenumbers.
 struct Ring {
-    /// Radians per pixel.
     k: f64,
     /// k dk, the square of a pixel's transform in the mean over directions, and the factor before the integral.
     weight: f64,
@@ -61,7 +59,7 @@ static RINGS: LazyLock<Vec<Ring>> = LazyLock::new(|| {
 /// ∫ I² d²x, I being the light of `galaxy` per px² behind pixels and a round PSF of the width of `psf`: the sum of
 /// squared pixels of a stamp that holds all of it.
 ///
-/// A galaxy cannot know how it lies to the PSF. Behind an elliptical one the sum is larger along its axis than across,
+/// The S/N of a galaxy must not depend on its orientation to the PSF. Behind an elliptical PSF the sum is larger along its axis than across,
 /// and fluxes chosen by it would make galaxies along the PSF fainter: a method that weights by flux would seem to leak
 /// the PSF's ellipticity.
 ///
@@ -78,7 +76,8 @@ pub fn power(galaxy: &Galaxy, psf: &TransformedPsf<'_>) -> f64 {
         rings.sum()
     };
     if components.iter().all(alike) {
-        // All is symmetric about one axis. Turned onto x, which changes nothing, it repeats after a quarter.
+        // Light that is symmetric about one axis repeats after a quarter of a turn if this axis is x. Rotating it there does not
+        // change the sum behind a round PSF.
         let shape = Shear::new(first.shape.modulus(), 0.0);
         let along = |c: &Component| Component { shape, ..*c }.form();
         let lights = lights(components, along);
@@ -89,7 +88,6 @@ pub fn power(galaxy: &Galaxy, psf: &TransformedPsf<'_>) -> f64 {
     }
 }
 
-/// A component in wavenumbers.
 struct Light {
     profile: Sersic,
     flux: f64,

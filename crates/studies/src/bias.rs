@@ -25,9 +25,8 @@ use shearq_dataset::record::nan_for_null;
 use shearq_pipeline::PipelineError;
 use shearq_pipeline::engine::{self, Progress};
 use shearq_pipeline::run::SimulatedSessions;
-use shearq_pipeline::simulate::place;
 use shearq_simulate::render::RenderScratch;
-use shearq_simulate::set::{ImageFields, STAMP, SetSimulator, Version};
+use shearq_simulate::set::{ImageFields, SetSimulator, Version};
 
 pub const SHEAR: f64 = 0.02;
 
@@ -140,22 +139,17 @@ fn draw(
     (intrinsic, signs, noise): (f64, [f64; 2], f32),
     scratch: &mut RenderScratch,
 ) -> Vec<f32> {
-    let n = set.grid().n;
-    let gamma = Shear::new(signs[0] * SHEAR, signs[1] * SHEAR);
-    let mut strip = vec![0.0; n * STAMP * STAMP];
-    let mut stamp = vec![0.0; STAMP * STAMP];
-    for ix in 0..n {
+    let shear = Shear::new(signs[0] * SHEAR, signs[1] * SHEAR);
+    set.strip(|ix, stamp| {
         let e = fields.intrinsic[(ix, iy)] * intrinsic;
         let version = Version {
             intrinsic: Shear::new(e.re, e.im),
-            shear: gamma,
+            shear,
             size: 1.0,
             noise,
         };
-        set.draw_as(fields, (ix, iy), version, scratch, &mut stamp);
-        place(&stamp, STAMP, ix, n, &mut strip);
-    }
-    strip
+        set.draw_as(fields, (ix, iy), version, scratch, stamp);
+    })
 }
 
 #[derive(Debug, Clone)]

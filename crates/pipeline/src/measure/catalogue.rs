@@ -15,22 +15,18 @@ use shearq_submissions::{Configuration, EllipticityType};
 use super::ImageHead;
 use crate::PipelineError;
 use crate::engine::Progress;
-use crate::warned::Warned;
 use shearq_dataset::images::ImageId;
 use shearq_dataset::record::{Claim, claim};
 use shearq_dataset::run::{RUN_FILE, Run};
 
-/// How a column follows from a measurement.
+/// The value of a column.
 #[derive(Debug, Clone, Copy)]
 pub enum Value {
-    /// A real number.
     Real(fn(&Measurement) -> f64),
-    /// A whole number.
     Whole(fn(&Measurement) -> i32),
 }
 
-/// The columns of catalogues after the position, in order. The command line and Python use the same. [`more_columns`] gives the
-/// columns that follow.
+/// The columns of catalogues after the position, in order, for the command line and Python. [`more_columns`] follow.
 pub const COLUMNS: [(&str, Value); 18] = [
     ("e1", Value::Real(|g| g.e1)),
     ("e2", Value::Real(|g| g.e2)),
@@ -68,8 +64,8 @@ pub const COLUMNS: [(&str, Value); 18] = [
     ("divisor2", Value::Real(|g| divisor(g)[1])),
 ];
 
-/// Columns of catalogues after [`COLUMNS`]. Those of linear configurations are the S/N, and the [`Observables`] that are not among
-/// these; then sheared versions, if the configuration asks for them. NaN for galaxies that could not be measured.
+/// Columns of catalogues after [`COLUMNS`]. Linear configurations have the S/N and the other [`Observables`]; then sheared
+/// catalogues, if the configuration requests them. NaN for galaxies that could not be measured.
 pub fn more_columns(
     configuration: &Configuration,
     galaxies: &[Measurement],
@@ -80,10 +76,9 @@ pub fn more_columns(
     let found = || galaxies.iter().map(|galaxy| galaxy.observables.as_ref());
     let snr = found().map(|found| found.map_or(f64::NAN, Observables::snr));
     let mut columns = vec![("snr".to_owned(), snr.collect())];
-    let nothing = [f64::NAN; Observables::COLUMNS.len()];
-    let rows: Vec<_> = found()
-        .map(|found| found.map_or(nothing, Observables::to_array))
-        .collect();
+    let missing = [f64::NAN; Observables::COLUMNS.len()];
+    let rows = found().map(|found| found.map_or(missing, Observables::to_array));
+    let rows: Vec<_> = rows.collect();
     for (at, name) in Observables::COLUMNS.into_iter().enumerate() {
         if !COLUMNS.iter().any(|(known, _)| *known == name) {
             columns.push((name.to_owned(), rows.iter().map(|row| row[at]).collect()));
@@ -104,17 +99,14 @@ pub fn more_columns(
     columns
 }
 
-/// Mean responses by which the ellipticity was divided; NaN if it was not.
 fn divisor(galaxy: &Measurement) -> [f64; 2] {
     galaxy.divisor.unwrap_or([f64::NAN; 2])
 }
 
-/// Response of component `i` to component `j` of shear; NaN if there is none.
 fn response(galaxy: &Measurement, i: usize, j: usize) -> f64 {
     galaxy.response.map_or(f64::NAN, |response| response[i][j])
 }
 
-/// Key of the metadata with the warnings of an image.
 const WARNINGS: &str = "warnings";
 /// Key of the metadata with the effect of the noise of an image's star on its mean shear: the standard deviations of m and c.
 /// A FITS key has eight characters.
@@ -128,9 +120,6 @@ pub const KEYS: [&str; 9] = [
 ];
 
 /// The pixel axes of a catalogue's image; `None` if they are the sky's, or unknown.
-///
-/// # Errors
-/// If the metadata cannot be read.
 pub fn stated_frame(path: &Path, format: FileFormat) -> Result<Option<PixelFrame>, FileError> {
     let keys = [FRAME.to_owned()];
     let metadata = table::read_metadata(path, format, keys.iter())?;
@@ -155,10 +144,6 @@ pub fn stated_frame(path: &Path, format: FileFormat) -> Result<Option<PixelFrame
     }
 }
 
-/// Catalogue of one image.
-///
-/// # Errors
-/// If polars cannot make the table.
 fn catalogue(
     head: &ImageHead,
     galaxies: &[Measurement],
@@ -182,10 +167,7 @@ fn catalogue(
     frame(columns)
 }
 
-/// What made the catalogue of an image from files with the fingerprints `prints`.
-///
-/// # Errors
-/// If the settings cannot be written as TOML.
+/// The origin of the catalogue of an image from files with the fingerprints `prints`.
 pub(crate) fn metadata(
     run: &Run,
     id: ImageId,
@@ -214,9 +196,6 @@ pub(crate) fn metadata(
 }
 
 /// A warning with the most frequent reason if the catalogues of the results folder `out` have galaxies and all are flagged.
-///
-/// # Errors
-/// If a catalogue cannot be read.
 pub fn all_flagged(run: &Run, out: &Path) -> Result<Option<Warning>, FileError> {
     let files = run.catalogues(out, &[])?;
     let mut summary = Summary::default();
@@ -231,12 +210,11 @@ pub fn all_flagged(run: &Run, out: &Path) -> Result<Option<Warning>, FileError> 
             }
         }
     }
-    // Also with a value that has no bits.
+    // A catalogue of another program may have values without a flag of ours.
     summary.flagged = summary.galaxies;
     Ok(summary.all_flagged())
 }
 
-/// Counts of a measurement.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Summary {
     /// Images measured now.
@@ -266,13 +244,11 @@ impl Summary {
         (galaxies > 0 && flagged == galaxies).then_some(all)
     }
 
-    /// Counts one image.
     fn count(&mut self, galaxies: &[Measurement]) {
         self.images += 1;
         galaxies.iter().for_each(|galaxy| self.add(galaxy.flags));
     }
 
-    /// Counts a galaxy.
     fn add(&mut self, flags: Flags) {
         self.galaxies += 1;
         self.flagged += u64::from(!flags.is_empty());
@@ -282,7 +258,7 @@ impl Summary {
     }
 }
 
-/// The images without a catalogue, and the images with one.
+/// The images without a catalogue, and those with one.
 pub(super) fn to_do(run: &Run, out: &Path, images: &[ImageId]) -> (Vec<ImageId>, Vec<ImageId>) {
     images
         .iter()
@@ -295,9 +271,7 @@ pub(crate) struct Catalogues<'a> {
     out: &'a Path,
     images: &'a [ImageId],
     claim: Claim,
-    /// Images without a catalogue.
     pub(crate) todo: Vec<ImageId>,
-    /// Images that have a catalogue.
     pub(crate) done: Vec<ImageId>,
     summary: Summary,
     warned: Warned,
@@ -305,9 +279,6 @@ pub(crate) struct Catalogues<'a> {
 
 impl<'a> Catalogues<'a> {
     /// Claims the folder `out` for the catalogues of `images`.
-    ///
-    /// # Errors
-    /// If the folder contains results of other settings.
     pub(crate) fn claim(
         run: &'a Run,
         out: &'a Path,
@@ -332,9 +303,6 @@ impl<'a> Catalogues<'a> {
     }
 
     /// Shows the warnings of an image, and writes its catalogue.
-    ///
-    /// # Errors
-    /// If a warning is fatal, or the catalogue cannot be written.
     pub(crate) fn add(
         &mut self,
         head: &ImageHead,
@@ -382,13 +350,61 @@ impl<'a> Catalogues<'a> {
     }
 
     /// Checks that all catalogues are there, and counts the warnings that were not shown.
-    ///
-    /// # Errors
-    /// If a catalogue was removed.
     pub(crate) fn finish(self, progress: &mut dyn Progress) -> Result<Summary, PipelineError> {
         let path = |id: &ImageId| -> PathBuf { self.run.catalogue(self.out, id.set, id.image) };
         self.claim.check_results(self.images.iter().map(path))?;
         self.warned.finish(progress);
         Ok(self.summary)
+    }
+}
+
+/// Kinds of warnings that were shown, and the number of further images with each: many images often share a fault, and a line
+/// for each image would hide the others.
+#[derive(Debug, Default)]
+struct Warned {
+    kinds: BTreeMap<&'static str, usize>,
+}
+
+impl Warned {
+    /// Shows the first warning of each kind, and counts images with others.
+    fn add<'w>(
+        &mut self,
+        id: ImageId,
+        warnings: impl IntoIterator<Item = &'w Warning>,
+        progress: &mut dyn Progress,
+    ) -> Result<(), PipelineError> {
+        for warning in warnings {
+            if warning.is_fatal() {
+                let ImageId { set, image } = id;
+                return Err(PipelineError::Request(format!(
+                    "set {set:02} image {image:03}: {warning}"
+                )));
+            }
+            match self.kinds.get_mut(warning.kind()) {
+                Some(more) => *more += 1,
+                None => {
+                    self.kinds.insert(warning.kind(), 0);
+                    let ImageId { set, image } = id;
+                    progress.warn(&format!(
+                        "warning: set {set:02} image {image:03}: {warning}"
+                    ));
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Shows how many more images have each kind of warning that was shown.
+    fn finish(self, progress: &mut dyn Progress) {
+        for (kind, more) in self.kinds.iter().filter(|(_, more)| **more > 0) {
+            let images = if *more == 1 {
+                "image has"
+            } else {
+                "images have"
+            };
+            progress.warn(&format!(
+                "warning: {more} more {images} the warning \"{kind}\""
+            ));
+        }
     }
 }

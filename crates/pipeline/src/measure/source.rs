@@ -1,23 +1,27 @@
 //! Images of a data folder as sources of stamps.
 
 use std::fmt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
+use ndarray::{ArcArray2, ArrayView2, Ix3};
 use shearq_files::FileError;
 use shearq_files::fits::ImageReader;
 use shearq_measure::{
-    KnownNoise, Lazy, LazyStamps, Measurer, Psfs, Session, StampRows, StampSource, Threads, Warning,
+    FunctionalPsf, KnownNoise, Lazy, LazyStamps, Measurer, Pixels, Psfs, Session, StampRows,
+    StampSource, Star, Threads, Warning,
 };
-use shearq_submissions::{Configuration, NoiseSource};
+use shearq_submissions::{Configuration, NoiseSource, PsfCut, PsfForm};
 
-use super::psfs::{OpenPsfs, PsfSource, open_psf};
-use super::stamps::{check_strip, read_row, stated_image};
 use crate::PipelineError;
 use crate::wcs::Wcs;
-use shearq_dataset::grid;
+use shearq_dataset::grid::{self, whole};
 use shearq_dataset::images::ImageId;
-use shearq_dataset::layout::DataFolder;
+use shearq_dataset::layout::{DataFolder, MAX_STAMP};
 use shearq_dataset::mosaic::Mosaic;
+use shearq_dataset::psf_table;
+
+// Several rows are in memory at a time: at most 64 MB of pixels each. Chosen by hand.
+const MAX_ROW_PIXELS: usize = 1 << 24;
 
 /// An open image with its PSFs.
 pub struct ImageSource {
@@ -40,9 +44,6 @@ impl fmt::Debug for ImageSource {
 
 impl ImageSource {
     /// Opens an image and its PSFs.
-    ///
-    /// # Errors
-    /// If a file is absent, damaged or does not fit the configuration.
     pub fn open(
         data: &DataFolder,
         id: ImageId,
@@ -72,13 +73,13 @@ impl ImageSource {
             source: psfs,
             moved,
             wcs: psf_wcs,
-            stated: of_psf,
-        } = open_psf(data, id, configuration, &mosaic)?;
+            stated: stated_by_psf,
+        } = open_psfs(data, id, configuration, &mosaic)?;
         let mut warnings: Vec<Warning> = moved.map(Warning::of_moved).into_iter().collect();
         let wcs = Wcs::of_header(&image);
         warnings.extend(Wcs::disagreements(&psf_wcs, &wcs));
         warnings.extend(wcs.frame());
-        for (of, stated) in [("galaxies", stated_image(&image)), ("PSF", of_psf)] {
+        for (of, stated) in [("galaxies", stated_image(&image)), ("PSF", stated_by_psf)] {
             let expected = [id.set, id.image];
             let other = stated.filter(|stated| *stated != expected);
             warnings.extend(other.map(|stated| Warning::OtherImage {
@@ -97,15 +98,11 @@ impl ImageSource {
         })
     }
 
-    /// How the stamps lie.
     pub fn mosaic(&self) -> Mosaic {
         self.mosaic
     }
 
     /// The session of the image, for a measurer of the configuration that the image was opened for.
-    ///
-    /// # Errors
-    /// If stamps or stars cannot be read, or stamps have no border of noise.
     pub fn session(
         &mut self,
         measurer: &Measurer,
@@ -116,9 +113,6 @@ impl ImageSource {
     }
 
     /// A warning if noise is correlated that the configuration treats as white.
-    ///
-    /// # Errors
-    /// As [`ImageSource::session`].
     pub(super) fn correlated_noise(
         &mut self,
         session: &Session<'static>,
@@ -128,7 +122,6 @@ impl ImageSource {
         found.map_err(|error| self.named(error))
     }
 
-    /// The error with the name of the image.
     fn named(&self, error: PipelineError) -> PipelineError {
         match error {
             PipelineError::Measure(error) => FileError::new(&self.path, error).into(),
@@ -160,7 +153,7 @@ impl StampSource<'static> for ImageSource {
     }
 }
 
-/// Why stamps of `stamp` pixels a side cannot be measured, with the lines of a configuration that measures them.
+/// The message for stamps that are too small, with the lines of a configuration that measures them.
 fn too_small(stamp: usize, configuration: &Configuration) -> String {
     let Configuration { name, .. } = configuration;
     let needed = configuration.stamp.size;
@@ -190,4 +183,175 @@ pub(crate) fn open_galaxies(
     let mosaic = grid::of_image(data, &path, &image)?;
     check_strip(&path, mosaic.columns, mosaic.stamp)?;
     Ok((image, mosaic))
+}
+
+enum PsfSource {
+    Shared(ArcArray2<f64>),
+    Stars {
+        image: Box<ImageReader>,
+        side: usize,
+    },
+    Functional(Vec<FunctionalPsf>),
+}
+
+impl PsfSource {
+    fn row(&mut self, mosaic: Mosaic, row: usize) -> Result<Psfs<'static>, PipelineError> {
+        Ok(match self {
+            PsfSource::Shared(psf) => Psfs::Prepared(psf.clone()),
+            PsfSource::Stars { image, side } => Psfs::Stars(read_row(image, mosaic, *side, row)?),
+            PsfSource::Functional(field) => {
+                let first = row * mosaic.columns;
+                Psfs::functional(field[first..first + mosaic.of_row(row)].to_vec())
+            }
+        })
+    }
+}
+
+struct OpenPsfs {
+    source: PsfSource,
+    /// Offset of the star for all galaxies in pixels, if it was moved to the centre of its stamp.
+    moved: Option<[f64; 2]>,
+    wcs: Wcs,
+    /// Set and image that the header states.
+    stated: Option<[u32; 2]>,
+}
+
+fn open_psfs(
+    data: &DataFolder,
+    id: ImageId,
+    configuration: &Configuration,
+    mosaic: &Mosaic,
+) -> Result<OpenPsfs, FileError> {
+    let cut = configuration.psf_cut();
+    match configuration.psf.form {
+        PsfForm::Functional => {
+            let path = data.psf_functional(id.set, id.image);
+            Ok(OpenPsfs {
+                source: open_functional(&path, cut, mosaic)?,
+                moved: None,
+                wcs: Wcs::default(),
+                stated: None,
+            })
+        }
+        PsfForm::Star => open_stars(&data.psf_star(id.set, id.image), cut, mosaic),
+    }
+}
+
+fn open_functional(path: &Path, cut: PsfCut, mosaic: &Mosaic) -> Result<PsfSource, FileError> {
+    let rows = psf_table::read(path, mosaic)?;
+    if let Some(wide) = rows.iter().find(|psf| psf.fwhm > cut.size as f64) {
+        let message = format!(
+            "a PSF has a FWHM of {} px; expected at most the {} pixels a side of the configuration's PSF stamp",
+            wide.fwhm, cut.size
+        );
+        return Err(FileError::new(path, message));
+    }
+    let [psf] = rows.as_slice() else {
+        return Ok(PsfSource::Functional(rows));
+    };
+    let stamp = psf.stamp_beside(cut.size, mosaic.stamp);
+    if stamp.iter().any(|value| !value.is_finite()) {
+        let message = format!(
+            "a PSF with a FWHM of {} px has no light on its stamp; expected a width of about a pixel or more",
+            psf.fwhm
+        );
+        return Err(FileError::new(path, message));
+    }
+    Ok(PsfSource::Shared(stamp.into_shared()))
+}
+
+fn open_stars(path: &Path, cut: PsfCut, mosaic: &Mosaic) -> Result<OpenPsfs, FileError> {
+    let least = cut.least;
+    let mut image = ImageReader::open(path)?;
+    let (wcs, stated) = (Wcs::of_header(&image), stated_image(&image));
+    let (width, height) = (image.width(), image.height());
+    let (columns, rows) = (mosaic.columns, mosaic.rows());
+    let side = match whole(&image, path, "STAMP", MAX_STAMP)? {
+        Some(side) => side,
+        // One star is never as large as a mosaic of the smallest PSF stamps that could be used.
+        None if width >= columns * least
+            && width.is_multiple_of(columns)
+            && height == rows * (width / columns) =>
+        {
+            width / columns
+        }
+        None => width,
+    };
+    if side < least {
+        let message = format!(
+            "the PSF stamp has {side} pixels a side; the configuration requires {least}. Try: larger PSF stamps, or psf.size = {side} in a settings file"
+        );
+        return Err(FileError::new(path, message));
+    }
+    let stars = whole(&image, path, "NSTAMPS", columns * rows)?;
+    if let Some(stars) = stars.filter(|stars| *stars != 1 && *stars != mosaic.galaxies) {
+        let message = format!(
+            "the header key NSTAMPS is {stars}; expected 1, or {}, one per galaxy",
+            mosaic.galaxies
+        );
+        return Err(FileError::new(path, message));
+    }
+    let one = (width, height) == (side, side);
+    if mosaic.galaxies > 1 && (width, height) == (columns * side, rows * side) {
+        check_strip(path, columns, side)?;
+        let image = Box::new(image);
+        return Ok(OpenPsfs {
+            source: PsfSource::Stars { image, side },
+            moved: None,
+            wcs,
+            stated,
+        });
+    }
+    if !one || side > MAX_STAMP {
+        let message = format!(
+            "the star image is {width} × {height} pixels; expected one stamp, or {columns} × {rows} stamps, one per galaxy, of {0} × {0} pixels",
+            side.min(MAX_STAMP)
+        );
+        return Err(FileError::new(path, message));
+    }
+    let pixels = image.read_rows(height)?;
+    let stamp = ArrayView2::from_shape((height, width), &pixels)
+        .map_err(|error| FileError::new(path, error))?;
+    let Star { psf, moved } = Star::cut(stamp, cut).map_err(|error| FileError::new(path, error))?;
+    Ok(OpenPsfs {
+        source: PsfSource::Shared(psf.into_shared()),
+        moved,
+        wcs,
+        stated,
+    })
+}
+
+/// Reads a row of stamps of `side` pixels; the last row may be shorter.
+fn read_row(
+    image: &mut ImageReader,
+    mosaic: Mosaic,
+    side: usize,
+    row: usize,
+) -> Result<Pixels<'static, Ix3>, PipelineError> {
+    image.rewind();
+    image.skip_rows(row * side);
+    let stamps = Pixels::strip(image.read_rows(side)?, mosaic.columns, side)?;
+    Ok(stamps.into_slice(0..mosaic.of_row(row)))
+}
+
+/// Checks that a row of `n` stamps of `side` pixels a side fits into memory.
+pub(crate) fn check_strip(path: &Path, n: usize, side: usize) -> Result<(), FileError> {
+    let pixels = n * side * side;
+    if pixels <= MAX_ROW_PIXELS {
+        return Ok(());
+    }
+    let message = format!(
+        "a row of {n} stamps of {side} pixels a side has {pixels} pixels; expected at most {MAX_ROW_PIXELS}"
+    );
+    Err(FileError::new(path, message))
+}
+
+/// Set and image that the header of a simulated image states. Headers of other programs may have one of these keys with
+/// another meaning, so that both must be whole numbers.
+fn stated_image(image: &ImageReader) -> Option<[u32; 2]> {
+    let whole = |key: &str| {
+        let value = image.number(key).ok().flatten()?;
+        (value.fract() == 0.0 && value >= 1.0).then_some(value as u32)
+    };
+    Some([whole("SET")?, whole("IMAGE")?])
 }
