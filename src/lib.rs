@@ -327,21 +327,22 @@ mod tests {
     use super::*;
 
     // The words of a shell's line, without quotes and redirections.
+    // As a shell splits a line: quoted text is one word, and a redirection ends the command.
     fn words(line: &str) -> Vec<String> {
-        // Quoted text is one word; what follows a redirection is none.
-        let mut words = Vec::new();
-        for (part, text) in line.split('\'').enumerate() {
-            if part % 2 == 1 {
-                words.push(text.to_owned());
-                continue;
-            }
-            let plain = text.split(" > ").next().unwrap_or(text);
-            words.extend(plain.split_whitespace().map(str::to_owned));
-            if plain.len() < text.len() {
-                break;
+        let (mut words, mut word, mut quote) = (Vec::new(), None::<String>, None);
+        for c in line.chars() {
+            match quote {
+                Some(open) if c == open => quote = None,
+                None if c == '\'' || c == '"' => {
+                    quote = Some(c);
+                    word.get_or_insert_default();
+                }
+                None if c.is_whitespace() => words.extend(word.take()),
+                _ => word.get_or_insert_default().push(c),
             }
         }
-        words
+        words.extend(word);
+        words.into_iter().take_while(|word| word != ">").collect()
     }
 
     // The commands in the documents, except those with shell variables. A backslash joins two lines.
