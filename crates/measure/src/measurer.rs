@@ -55,7 +55,7 @@ impl Measurer {
         let n = configuration.stamp.size;
         if full < n {
             let expected = format!(
-                "at least {n} × {n}, as submission {} needs",
+                "at least {n} × {n}, as configuration {} needs",
                 configuration.name
             );
             return Err(MeasureError::square("stamps", (full, full), expected));

@@ -802,15 +802,15 @@ fn scan<R: Send + Sync, L: Send, E: Send>(
 }
 
 impl Measurer {
-    /// Measures stamps, one each along the first axis, of one noise level, and calibrates their
-    /// ellipticities by their mean response, as the submission asks. A noise level that is given is that of white
-    /// noise; where none is, a submission that asks for it measures the noise on the stamps. Several thousand galaxies tell the
-    /// response to a per cent.
+    /// Measures stamps `[galaxy, y, x]` and divides their ellipticities by the mean response, if the configuration sets it.
+    /// `noise` is σ of white noise; without it, a configuration with `noise.source = "border"` measures the noise on the
+    /// stamps. Several thousand galaxies determine the response to 1 %.
+    ///
+    /// A galaxy with pixels that are not finite (under a linear method: too many), or with a PSF of its own that cannot be
+    /// used, is flagged.
     ///
     /// # Errors
-    /// Where sizes or numbers do not fit, the noise level is not one, or a PSF for all cannot be used. A
-    /// galaxy with pixels that are not finite (under a linear method: too many), or with a PSF of its own that cannot be
-    /// used, is flagged.
+    /// If shapes do not match, `noise` is not a positive number, or the PSF of all stamps cannot be used.
     pub fn batch<T: Pixel>(
         &self,
         stamps: ArrayView3<'_, T>,

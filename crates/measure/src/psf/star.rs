@@ -64,7 +64,7 @@ fn cut_around_star<P: Pixel>(stamp: ArrayView2<'_, P>, cut: PsfCut) -> Result<St
     let (rows, columns) = stamp.dim();
     let size = cut.least;
     let (Some(y0), Some(x0)) = (cut_start(rows, size), cut_start(columns, size)) else {
-        let expected = format!("at least {size} × {size}, as the submission needs");
+        let expected = format!("at least {size} × {size}, as the configuration needs");
         return Err(MeasureError::square("a PSF stamp", stamp.dim(), expected));
     };
     let brightest = brightest_pixel(stamp)?;

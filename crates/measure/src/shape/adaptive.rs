@@ -68,7 +68,7 @@ pub struct AdaptiveShape {
     pub distortion: Distortion,
     /// Ellipticity of the weight, which is χ.
     chi: [f32; 2],
-    /// Weighted integral of x² + y², softened.
+    /// Weighted integral of x² + y², regularised.
     trace: f32,
     /// (1 − ∂m/∂χ)⁻¹.
     inverse: [[f32; 2]; 2],
@@ -126,7 +126,7 @@ impl AdaptiveMoments {
 
     /// Finds χ of `acf`, laid out as `deconvolve::Lags`.
     ///
-    /// `softening`, in px⁴ times the unit of `acf`, is added to the integral of x² + y² by which the
+    /// `regularisation`, in px⁴ times the unit of `acf`, is added to the integral of x² + y² by which the
     /// moments are divided. Of an autocorrelation that is all noise that integral is anything; with a
     /// few times its noise added, χ is smaller and less noisy.
     ///
@@ -136,7 +136,7 @@ impl AdaptiveMoments {
     pub fn measure(
         &self,
         acf: &[f32],
-        softening: f32,
+        regularisation: f32,
         scratch: &mut AdaptiveScratch,
     ) -> Result<AdaptiveShape, Flag> {
         debug_assert_eq!(acf.len(), self.lags);
@@ -145,7 +145,7 @@ impl AdaptiveMoments {
         for _ in 0..MAX_NEWTON_STEPS {
             let s = self.sums(scratch, chi);
             let [extent, n1, n2, ..] = s;
-            let t = extent + softening;
+            let t = extent + regularisation;
             if !(t > 0.0 && t.is_finite()) {
                 return Err(Flag::NoExtent);
             }
@@ -188,10 +188,10 @@ impl AdaptiveMoments {
         Err(Flag::NoExtent)
     }
 
-    /// The softening that halves what a small distortion of the round `acf` does to χ₁ (and, but for 2 %, to χ₂: the grid is square).
+    /// The regularisation that halves what a small distortion of the round `acf` does to χ₁ (and, but for 2 %, to χ₂: the grid is square).
     ///
     /// The weight follows the galaxy: with m = aχ′ + bχ the moments of a galaxy of distortion χ′ under a weight of χ,
-    /// χ = aχ′/(1 − b) is aχ′T/((1 − b)T + s) after softening by s.
+    /// χ = aχ′/(1 − b) is aχ′T/((1 − b)T + s) after regularisation by s.
     pub fn halving(&self, acf: &[f32]) -> f32 {
         let mut scratch = self.scratch();
         self.gather(acf, &mut scratch.values);
@@ -490,7 +490,7 @@ mod tests {
     }
 
     #[test]
-    fn softening_shrinks_the_distortion_and_does_not_turn_it() {
+    fn regularisation_shrinks_the_distortion_and_keeps_its_angle() {
         let moments = moments(1.5);
         let mut scratch = moments.scratch();
         let acf = gaussian(1.0, 16.0, 0.3, -0.4);
@@ -514,8 +514,8 @@ mod tests {
             let halving = moments.halving(&gaussian(1.0, variance, 0.0, 0.0));
             for (e1, e2, tolerance) in [(0.01, 0.0, 1e-3), (0.0, 0.01, 0.02)] {
                 let acf = gaussian(1.0, variance, e1, e2);
-                let [hard, soft] = [0.0, halving].map(|softening| {
-                    let shape = moments.measure(&acf, softening, &mut scratch).unwrap();
+                let [hard, soft] = [0.0, halving].map(|regularisation| {
+                    let shape = moments.measure(&acf, regularisation, &mut scratch).unwrap();
                     shape.distortion.e1 + shape.distortion.e2
                 });
                 // Of second order in the distortion, and the grid of lags.
@@ -530,12 +530,12 @@ mod tests {
         let mut scratch = moments.scratch();
         let acf = gaussian(1.0, 20.0, 0.3, -0.2);
         let other = gaussian(1.0, 14.0, -0.1, 0.4);
-        for softening in [0.0, 20.0] {
-            let shape = moments.measure(&acf, softening, &mut scratch).unwrap();
+        for regularisation in [0.0, 20.0] {
+            let shape = moments.measure(&acf, regularisation, &mut scratch).unwrap();
             let response = moments.response(&shape, &other, &mut scratch);
             let mut moved = |h: f32| {
                 let acf: Vec<f32> = acf.iter().zip(&other).map(|(a, o)| a + h * o).collect();
-                let shape = moments.measure(&acf, softening, &mut scratch);
+                let shape = moments.measure(&acf, regularisation, &mut scratch);
                 shape.unwrap().distortion
             };
             let (plus, minus) = (moved(0.01), moved(-0.01));

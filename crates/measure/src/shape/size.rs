@@ -82,12 +82,12 @@ impl Breadth {
         sums(lags, zero, two)
     }
 
-    /// T of an autocorrelation, with `softening` and the typical T.
-    pub(crate) fn measure(&self, acf: &[f32], softening: f32, typical: f32) -> FoundBreadth {
+    /// T of an autocorrelation, with `regularisation` and the typical T.
+    pub(crate) fn measure(&self, acf: &[f32], regularisation: f32, typical: f32) -> FoundBreadth {
         let [zero, two] = self.sums(acf);
-        let divisor = zero + softening;
+        let divisor = zero + regularisation;
         FoundBreadth {
-            square: (two + softening * typical) / divisor,
+            square: (two + regularisation * typical) / divisor,
             divisor,
         }
     }
