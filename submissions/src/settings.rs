@@ -273,12 +273,11 @@ pub struct LinearDeconvolution {
     pub target_sigma: f64,
     /// σ in pixels of the round Gaussian window by which the result is multiplied.
     pub window_sigma: f64,
-    /// Mean square per axis of the galaxies' radii, in px² and without the PSF's, that the window is for. Where it is
-    /// measured with the noise, those of images with broader or narrower galaxies are wider or narrower; zero for
-    /// the same window on all.
+    /// Variance per axis in px² of the galaxies' light, without the PSF's, for which `window_sigma` holds. If it is
+    /// measured on the images, the window scales with it; zero keeps one window for all.
     pub reference_extent: f64,
-    /// Noise-equivalent area 1/Σp² in px² of the PSF that lengths are for. For a broader one target and weight are
-    /// longer; for one below half of it they are shorter. Zero for the same with all PSFs.
+    /// Noise-equivalent area 1/Σp² in px² of the PSF for which `target_sigma` and `weight_scale` hold. They grow with broader
+    /// PSFs, and shrink with PSFs below half of that area. Zero keeps them for all PSFs.
     pub reference_area: f64,
 }
 
@@ -333,12 +332,11 @@ impl ClippedShape {
 pub struct WeightedShape {
     /// Scale in pixels of the Moffat weight.
     pub weight_scale: f64,
-    /// S/N at which a galaxy counts half, that of the best filter for a round galaxy of `reference_extent`: what is
-    /// added to the weighted integral of x² + y² by which the moments are divided halves the ellipticity of such a
-    /// galaxy, so that those of low S/N count less, as their noise asks. Zero for all alike.
+    /// Matched-filter S/N ν₀ of a round galaxy of `reference_extent` at which the regularisation of the ellipticity halves
+    /// it: e is weighted by ν²/(ν² + ν₀²), because noisier galaxies deserve less weight. Zero for no regularisation.
     pub half_snr: f64,
-    /// Shear of sheared versions of ellipticity, S/N, flux and size (`1p`, `1m`, `2p`, `2m`), which catalogues then have in
-    /// addition. Zero for none.
+    /// Shear of the sheared catalogues (`1p`, `1m`, `2p`, `2m`): further columns of ellipticity, S/N, flux and size. Zero
+    /// for none.
     pub sheared_step: f64,
     /// What is done about neighbours.
     pub neighbours: Neighbours,
