@@ -364,7 +364,7 @@ fn expected_scores(
         }
         zero += score.zero_quality().q / data.sets.len() as f64;
         let rows = RowCounts::default();
-        scored.push(SetRecord::new(set, false, vec![1], &score, &rows));
+        scored.push(SetRecord::new(set, false, vec![1], &score, &rows, true));
     }
     Ok((scored, zero))
 }

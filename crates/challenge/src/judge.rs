@@ -679,7 +679,7 @@ impl Judge {
             return Err(format!("set {set}: {reason}"));
         }
         let simulated = truth.kind.is_some();
-        let record = SetRecord::new(*set, simulated, numbers.to_vec(), &score, rows);
+        let record = SetRecord::new(*set, simulated, numbers.to_vec(), &score, rows, true);
         let data = truth.print.clone();
         Ok(Some(SetRecord { data, ..record }))
     }

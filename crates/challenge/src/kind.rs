@@ -197,7 +197,7 @@ pub static GREAT10: Kind = Kind {
     // Q itself is the challenge's, but entries without images win it while noise dominates, and so do shrunk shapes.
     metric: RankBy::QCalibrated,
     constant_metric: RankBy::Qc,
-    // Q of a spectrum can be tuned without images, entry by entry (tests/extraction.rs).
+    // Q of a spectrum can be tuned without images, entry by entry (crates/challenge/tests/extraction.rs).
     contents: &[Contents::Catalogues],
     // Published values determine the truth entry by entry (docs/run-a-challenge.md).
     entries_per_team: Some(10),

@@ -86,7 +86,7 @@ pub struct Rules {
     pub partial: bool,
 }
 
-/// Entries that determine m and c of both components: one, and a shift and a stretch of each (tests/extraction.rs).
+/// Entries that determine m and c of both components: one, and a shift and a stretch of each (crates/challenge/tests/extraction.rs).
 pub const TUNING_ENTRIES: u32 = 5;
 
 impl Rules {

@@ -61,13 +61,14 @@ impl SetRecord {
         SetKind::of(self.set).filter(|_| self.simulated)
     }
 
-    /// The record of the set `set` of these images, in the standard convention and without a fingerprint of its data.
+    /// The record of these images in the convention that `score` chose, without a fingerprint of its data.
     pub fn new(
         set: u32,
         simulated: bool,
         images: Vec<u32>,
         score: &SetScore,
         rows: &RowCounts,
+        convention_known: bool,
     ) -> Self {
         SetRecord {
             set,
@@ -86,7 +87,7 @@ impl SetRecord {
                 Some(_) => f64::NAN,
             },
             convention: score.chosen.number(),
-            convention_known: true,
+            convention_known,
             convention_leaderboard: score.best.number(),
         }
     }
@@ -520,10 +521,9 @@ impl Rows<'_> {
         let images: Vec<u32> = self.list("image_numbers", row)?;
         self.at_most("images", row, images.len() as u64)?;
         let galaxies = self.at_most("galaxies", row, images.len() as u64 * MAX_ROWS as u64)?;
-        let kind = self.text("set_kind", row);
         Ok(SetRecord {
             set: self.count("set", row)?,
-            simulated: kind.is_ok_and(|kind| !kind.is_empty()),
+            simulated: !self.text("set_kind", row)?.is_empty(),
             data: self.text("data", row)?.to_owned(),
             images,
             galaxies,

@@ -206,8 +206,8 @@ impl SetFiles<'_> {
         }
         let findings = scorer.diagnose(&added.images, &score, convention);
         let (set, images) = (self.set.unwrap_or(0), self.images.clone());
-        let mut record = SetRecord::new(set, self.simulated, images, &score, &added.rows);
-        record.convention_known = basis.is_known();
+        let known = basis.is_known();
+        let record = SetRecord::new(set, self.simulated, images, &score, &added.rows, known);
         Ok(ScoredSet {
             record,
             findings: findings.map_err(self.wrong())?,

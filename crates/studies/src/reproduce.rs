@@ -190,7 +190,7 @@ fn measure_set(
             record: {
                 // The settings of the plan identify simulated data, so there is no fingerprint.
                 let simulated = SetKind::of(set).is_some();
-                SetRecord::new(set, simulated, images.clone(), &score, rows)
+                SetRecord::new(set, simulated, images.clone(), &score, rows, true)
             },
             score,
             response: regression.response(),

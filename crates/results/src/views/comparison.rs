@@ -277,7 +277,7 @@ fn run_notes(runs: &[RunRecord], grouping: Option<Grouping>, unpaired: &[String]
         notes.push("ΔQ, ΔQ cal.: difference from the first row of the group.".into());
     }
     if several {
-        notes.push("warning: the runs were scored in different ways and cannot be compared. Try: --where definition=… or choice=…".into());
+        notes.push("warning: the runs were scored in different ways and cannot be compared. Try: --where \"definition == 'leaderboard'\" or \"choice == 'matched'\"".into());
     }
     notes.extend(unpaired_note(unpaired));
     notes.extend(runs.iter().filter_map(bias_note));
