@@ -14,7 +14,7 @@ pub struct OutOfRange {
     /// The value, as a settings file would have it.
     pub found: String,
     /// The accepted range.
-    pub expected: &'static str,
+    pub expected: String,
 }
 
 /// What is wrong with a setting. Keys are written as in `denoise.levels`.

@@ -1,6 +1,7 @@
 //! The settings of a configuration, section by section. Each is declared here once: its key, its type, its meaning and
 //! its range.
 
+use std::fmt::Display;
 use std::ops::RangeInclusive;
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
@@ -21,7 +22,7 @@ pub mod limits {
     /// Pixels a side of the smallest PSF stamps that the linear method takes where its settings ask for more.
     // Smaller ones lose too much of the wings: of a Moffat profile of FWHM 3.4 px, m changes by 0.002 at 20 px and by
     // 0.01 at 16 px.
-    pub const LEAST_PSF: usize = 32;
+    pub const MIN_PSF: usize = 32;
     /// Narrowest target of the linear method, in pixels.
     // Chosen by hand, as is the broadest.
     pub const MIN_TARGET: f64 = 1.0;
@@ -33,14 +34,14 @@ pub mod limits {
     /// transform where that is largest.
     pub const MAX_ROUGHNESS: f64 = 0.0093;
 }
-use limits::{LEAST_PSF, MAX_CUT, MAX_PSF, MAX_ROUGHNESS, MAX_TARGET, MIN_TARGET, WINDOWS};
+use limits::{MAX_CUT, MAX_PSF, MAX_ROUGHNESS, MAX_TARGET, MIN_PSF, MIN_TARGET, WINDOWS};
 
-/// The fault of `key` unless its value is `good`. Ranges contain neither NaN nor infinity.
-fn need(
+/// The fault of `key` unless its value is `good`. Comparisons are false for NaN, so that it is never good.
+fn require(
     good: bool,
     key: &'static str,
     found: impl Serialize,
-    expected: &'static str,
+    expected: impl Into<String>,
 ) -> Result<(), OutOfRange> {
     if good {
         return Ok(());
@@ -50,23 +51,35 @@ fn need(
     Err(OutOfRange {
         key,
         found,
-        expected,
+        expected: expected.into(),
     })
+}
+
+fn within<T: PartialOrd + Display + Serialize>(
+    key: &'static str,
+    found: T,
+    range: RangeInclusive<T>,
+    unit: &str,
+) -> Result<(), OutOfRange> {
+    let expected = format!("{} to {}{unit}", range.start(), range.end());
+    require(range.contains(&found), key, found, expected)
+}
+
+// Zero turns these settings off.
+fn zero_or_within(
+    key: &'static str,
+    found: f64,
+    range: RangeInclusive<f64>,
+    unit: &str,
+) -> Result<(), OutOfRange> {
+    let good = found == 0.0 || range.contains(&found);
+    let expected = format!("0, or {} to {}{unit}", range.start(), range.end());
+    require(good, key, found, expected)
 }
 
 fn positive(key: &'static str, found: f64) -> Result<(), OutOfRange> {
     let good = found > 0.0 && found.is_finite();
-    need(good, key, found, "a positive number")
-}
-
-/// Zero turns these settings off.
-fn zero_or(
-    range: RangeInclusive<f64>,
-    key: &'static str,
-    found: f64,
-    expected: &'static str,
-) -> Result<(), OutOfRange> {
-    need(found == 0.0 || range.contains(&found), key, found, expected)
+    require(good, key, found, "a positive number")
 }
 
 /// The piece of the postage stamp that is worked on.
@@ -78,8 +91,7 @@ pub struct Stamp {
 
 impl Stamp {
     fn validate(&self) -> Result<(), OutOfRange> {
-        let good = (5..=MAX_CUT).contains(&self.size);
-        need(good, "stamp.size", self.size, "5 to 64 pixels")
+        within("stamp.size", self.size, 5..=MAX_CUT, " pixels")
     }
 }
 
@@ -94,8 +106,7 @@ pub struct Psf {
 
 impl Psf {
     fn validate(&self) -> Result<(), OutOfRange> {
-        let good = (3..=MAX_PSF).contains(&self.size);
-        need(good, "psf.size", self.size, "3 to 48 pixels")
+        within("psf.size", self.size, 3..=MAX_PSF, " pixels")
     }
 }
 
@@ -144,14 +155,10 @@ impl NoiseSource {
 
     fn validate(&self) -> Result<(), OutOfRange> {
         match *self {
-            NoiseSource::Border { border } => {
-                let good = (1..=16).contains(&border);
-                need(good, "noise.border", border, "1 to 16 pixels")
-            }
+            NoiseSource::Border { border } => within("noise.border", border, 1..=16, " pixels"),
             NoiseSource::Header => Ok(()),
             NoiseSource::Image { correlation, .. } => {
-                let good = correlation <= 4;
-                need(good, "noise.correlation", correlation, "0 to 4 pixels")
+                within("noise.correlation", correlation, 0..=4, " pixels")
             }
         }
     }
@@ -180,10 +187,8 @@ pub struct Wavelet {
 
 impl Wavelet {
     fn validate(&self) -> Result<(), OutOfRange> {
-        let good = (1..=4).contains(&self.levels);
-        need(good, "denoise.levels", self.levels, "1 to 4")?;
-        let good = self.window <= 8;
-        need(good, "denoise.window", self.window, "0 to 8 pixels")?;
+        within("denoise.levels", self.levels, 1..=4, "")?;
+        within("denoise.window", self.window, 0..=8, " pixels")?;
         positive("denoise.strength", self.strength)
     }
 }
@@ -193,10 +198,9 @@ fn validate_rule(step: f64, lambda: f64, max_iterations: usize) -> Result<(), Ou
     positive("deconvolution.step", step)?;
     let good = lambda >= 0.0 && lambda.is_finite();
     let expected = "zero or a positive number";
-    need(good, "deconvolution.lambda", lambda, expected)?;
-    let good = (1..=100_000).contains(&max_iterations);
+    require(good, "deconvolution.lambda", lambda, expected)?;
     let key = "deconvolution.max_iterations";
-    need(good, key, max_iterations, "1 to 100000")
+    within(key, max_iterations, 1..=100_000, "")
 }
 
 /// The Hopfield network.
@@ -243,10 +247,9 @@ impl NetworkDeconvolution {
         positive("deconvolution.constant_step", self.constant_step)?;
         positive("deconvolution.unit_divisor", self.unit_divisor)?;
         let (key, divisor) = ("deconvolution.high_pass_divisor", self.high_pass_divisor);
-        let good = (1e-3..=1e6).contains(&divisor);
-        need(good, key, divisor, "0.001 to 1e6")?;
+        within(key, divisor, 1e-3..=1e6, "")?;
         // Momentum goes on from a state of its own, which nothing would clip.
-        need(
+        require(
             !(self.clipping == Clipping::AfterTest && self.update == Update::Accelerated),
             "deconvolution.clipping",
             self.clipping,
@@ -285,16 +288,15 @@ impl LinearDeconvolution {
     fn validate(&self) -> Result<(), OutOfRange> {
         validate_rule(self.step, self.lambda, self.max_iterations)?;
         let (key, target) = ("deconvolution.target_sigma", self.target_sigma);
-        let good = (MIN_TARGET..=MAX_TARGET).contains(&target);
-        need(good, key, target, "1 to 6 pixels")?;
+        within(key, target, MIN_TARGET..=MAX_TARGET, " pixels")?;
         let (key, window) = ("deconvolution.window_sigma", self.window_sigma);
-        need(WINDOWS.contains(&window), key, window, "2 to 16 pixels")?;
+        within(key, window, WINDOWS, " pixels")?;
         let (key, extent) = ("deconvolution.reference_extent", self.reference_extent);
-        zero_or(0.1..=1e3, key, extent, "0, or 0.1 to 1000 px²")?;
+        zero_or_within(key, extent, 0.1..=1e3, " px²")?;
         let (key, area) = ("deconvolution.reference_area", self.reference_area);
-        zero_or(1.0..=1e4, key, area, "0, or 1 to 10000 px²")?;
+        zero_or_within(key, area, 1.0..=1e4, " px²")?;
         // The largest eigenvalue of W is 1 for a PSF of sum one.
-        need(
+        require(
             self.step * (1.0 + MAX_ROUGHNESS * self.lambda) < 2.0,
             "deconvolution.step",
             self.step,
@@ -322,7 +324,7 @@ impl ClippedShape {
     fn validate(&self) -> Result<(), OutOfRange> {
         let good = self.acf_share > 0.0 && self.acf_share <= 1.0;
         let expected = "above 0 and at most 1";
-        need(good, "shape.acf_share", self.acf_share, expected)
+        require(good, "shape.acf_share", self.acf_share, expected)
     }
 }
 
@@ -349,12 +351,10 @@ pub struct WeightedShape {
 impl WeightedShape {
     fn validate(&self) -> Result<(), OutOfRange> {
         let (scale, half) = (self.weight_scale, self.half_snr);
-        let good = (0.5..=10.0).contains(&scale);
-        need(good, "shape.weight_scale", scale, "0.5 to 10 pixels")?;
-        let good = (0.0..=1e3).contains(&half);
-        need(good, "shape.half_snr", half, "0 to 1000")?;
+        within("shape.weight_scale", scale, 0.5..=10.0, " pixels")?;
+        within("shape.half_snr", half, 0.0..=1e3, "")?;
         let (key, step) = ("shape.sheared_step", self.sheared_step);
-        zero_or(1e-3..=0.05, key, step, "0, or 0.001 to 0.05")
+        zero_or_within(key, step, 1e-3..=0.05, "")
     }
 }
 
@@ -572,13 +572,13 @@ impl LinearMethod {
         self.shape.validate()?;
         // Lags are up to 0.95 target_sigma apart; of a sharper weight their sums depend on where they lie.
         let scale = self.shape.weight_scale;
-        need(
+        require(
             scale >= self.deconvolution.target_sigma,
             "shape.weight_scale",
             scale,
             "at least deconvolution.target_sigma",
         )?;
-        need(
+        require(
             n % 2 == p % 2,
             "psf.size",
             p,
@@ -586,7 +586,7 @@ impl LinearMethod {
         )?;
         // A wider one sees a galaxy that is beyond the stamp, and what wraps around.
         let window = self.deconvolution.window_sigma;
-        need(
+        require(
             4.0 * window <= n as f64,
             "deconvolution.window_sigma",
             window,
@@ -627,7 +627,7 @@ impl Configuration {
             return Err(OutOfRange {
                 key: "name",
                 found: shown(&self.name),
-                expected: EXPECTED,
+                expected: EXPECTED.into(),
             });
         }
         self.stamp.validate()?;
@@ -676,7 +676,7 @@ impl Configuration {
         if self.linear().is_none() {
             return size.into();
         }
-        let least = size.min(LEAST_PSF);
+        let least = size.min(MIN_PSF);
         PsfCut {
             size,
             least: least - (size - least) % 2,

@@ -5,6 +5,7 @@
 use std::fmt;
 
 use shearq_submissions::Configuration;
+use shearq_submissions::limits::MIN_PSF;
 use thiserror::Error;
 
 use crate::measurement::{Flag, Measurement};
@@ -281,7 +282,7 @@ pub enum Warning {
     },
     /// The configuration uses so little of the PSF that its wings are missing.
     #[error(
-        "psf.size is {size} (expected {LEAST_PSF_SIZE} or more). The wings of the PSF that are cut off bias m, by about 0.002 at 20 px and 0.01 at 16 px for a FWHM of 3.4 px. Try: psf.size = {LEAST_PSF_SIZE}"
+        "psf.size is {size} (expected {MIN_PSF} or more). The wings of the PSF that are cut off bias m, by about 0.002 at 20 px and 0.01 at 16 px for a FWHM of 3.4 px. Try: psf.size = {MIN_PSF}"
     )]
     PsfSize {
         /// Pixels a side that are used.
@@ -359,9 +360,6 @@ impl Estimate {
     }
 }
 
-// Side of a PSF stamp below which wings are missing. Moffat, FWHM 3.4 px: m changes by 0.002 at 20 px and 0.01 at 16 px.
-// Command and seed were not kept.
-const LEAST_PSF_SIZE: usize = 32;
 // Light of the sky within 8 px, in units of the galaxy's. A share of 0.48 changes m by −0.006 (fiducial), −0.013 (large) and −0.011
 // (S/N 10); the threshold keeps |Δm| below 5·10⁻³. Command and seed were not kept.
 const SKY_SHARE: f64 = 0.15;
@@ -388,7 +386,7 @@ impl Warning {
     /// A warning if the configuration uses too little of the PSF.
     pub(crate) fn of_settings(configuration: &Configuration) -> Option<Warning> {
         let size = configuration.psf.size;
-        let cut = configuration.linear().is_some() && size < LEAST_PSF_SIZE;
+        let cut = configuration.linear().is_some() && size < MIN_PSF;
         cut.then_some(Warning::PsfSize { size })
     }
 

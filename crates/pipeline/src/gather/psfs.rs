@@ -7,7 +7,7 @@ use shearq_files::FileError;
 use shearq_files::atomic;
 use shearq_measure::{EXAMINED_PSFS, Examination, Psfs, Star, Warning, average_stars};
 use shearq_submissions::PsfCut;
-use shearq_submissions::limits::LEAST_PSF;
+use shearq_submissions::limits::MIN_PSF;
 
 use super::source::{Files, Planes};
 use super::stamps::{Rows, central, first};
@@ -108,9 +108,9 @@ pub(super) fn gather_psfs(
 /// A warning about PSF stamps that named configurations refuse.
 fn small(path: &Path, side: usize) -> Option<String> {
     let shown = path.display();
-    (side < LEAST_PSF).then(|| {
+    (side < MIN_PSF).then(|| {
         format!(
-            "warning: {shown}: the PSF stamps are {side} × {side} px (expected {LEAST_PSF} × {LEAST_PSF} or more, which configurations of 48 px require). Try: larger PSF stamps; or, if no light is beyond them, --submission own.toml with the file own.toml of these lines:\n  extends = \"48/linear/star\"\n  psf.size = {side}"
+            "warning: {shown}: the PSF stamps are {side} × {side} px (expected {MIN_PSF} × {MIN_PSF} or more, which configurations of 48 px require). Try: larger PSF stamps; or, if no light is beyond them, --submission own.toml with the file own.toml of these lines:\n  extends = \"48/linear/star\"\n  psf.size = {side}"
         )
     })
 }
