@@ -70,12 +70,12 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     given_once(submission)?;
     let sets = sets.simulated()?;
     let registry = Registry::embedded()?;
-    let submissions = of_table_one(&registry, submission)?;
+    let configurations = of_table_one(&registry, submission)?;
     let plan = Plan {
         version: shearq_dataset::VERSION.into(),
         simulation: SimulationSettings::new(*seed, usize::from(*grid)),
         images: *images,
-        submissions: submissions.iter().map(|(s, _)| s.clone()).collect(),
+        configurations: configurations.iter().map(|(s, _)| s.clone()).collect(),
     };
     let total = sets.len() as u64 * u64::from(*images) * u64::from(*grid).pow(2);
     let mut bar = Bar::new("simulating and measuring", total);
@@ -104,8 +104,8 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         "Figures and tables of Nurbaeva et al. from simulated data",
         settings,
     );
-    let table_one = exhibits::table_one(&results, &submissions);
-    let names: Vec<String> = names(&submissions);
+    let table_one = exhibits::table_one(&results, &configurations);
+    let names: Vec<String> = names(&configurations);
     let calibration = calibration::best_table(&curves, &base);
     method(&mut page, &plan)?;
     page.section("Calibration of λ (Sect. 4)", SECT_FOUR);
@@ -152,7 +152,7 @@ fn of_table_one(
 fn method(page: &mut Page<'_>, plan: &Plan) -> anyhow::Result<()> {
     page.section("The method (Sect. 3)", SECT_THREE);
     let name = "23/raw/star";
-    let Some(submission) = plan.submissions.iter().find(|s| s.name == name) else {
+    let Some(submission) = plan.configurations.iter().find(|s| s.name == name) else {
         return Ok(());
     };
     let mut rows = Vec::new();
@@ -171,8 +171,8 @@ fn method(page: &mut Page<'_>, plan: &Plan) -> anyhow::Result<()> {
     Ok(())
 }
 
-fn names(submissions: &[(Configuration, Published)]) -> Vec<String> {
-    submissions.iter().map(|(s, _)| s.name.clone()).collect()
+fn names(configurations: &[(Configuration, Published)]) -> Vec<String> {
+    configurations.iter().map(|(s, _)| s.name.clone()).collect()
 }
 
 // Figs 8 to 11 and their tables.

@@ -63,12 +63,12 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         threads,
     } = arguments;
     let sets = sets.simulated()?;
-    let submissions = configurations(submission)?;
+    let configurations = configurations(submission)?;
     let plan = Plan {
         version: shearq_dataset::VERSION.into(),
         simulation: simulation.settings()?,
         images: *images,
-        submissions,
+        configurations,
     };
     let study = Study::open(&plan, out)?;
     let threads = threads.number();
@@ -89,8 +89,8 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         ("Data", data),
         ("Simulation", toml::to_string(&plan.simulation)?),
     ]);
-    for submission in &plan.submissions {
-        made_by.push((submission.name.clone(), toml::to_string(submission)?));
+    for configuration in &plan.configurations {
+        made_by.push((configuration.name.clone(), toml::to_string(configuration)?));
     }
     study.check()?;
     let mut page = Page::new(out, "Configurations compared", "Simulated data", made_by);

@@ -1,4 +1,4 @@
-//! The paper's statements on small simulated sets: those that the named submissions fulfil, and where what is
+//! The paper's statements on small simulated sets: those that the named configurations fulfil, and where what is
 //! printed, read by the letter, misses them.
 
 use ndarray::Array2;
@@ -21,7 +21,7 @@ use shearq_submissions::{Configuration, PsfForm, Registry};
 /// A set of each kind.
 const KINDS: [u32; 10] = [2, 5, 8, 11, 14, 16, 18, 20, 22, 24];
 
-fn submissions(names: &[&str]) -> Vec<Configuration> {
+fn configurations(names: &[&str]) -> Vec<Configuration> {
     let registry = Registry::embedded().unwrap();
     names
         .iter()
@@ -85,7 +85,7 @@ fn at_full_size(set: u32, follows: &Follows) -> Metrics {
     let (groups, sigma) = (8, (follows.variance / 25.0).sqrt());
     let images: Vec<[Array2<f64>; 2]> = (0..groups)
         .map(|group| {
-            // The same noise for all submissions.
+            // The same noise for all configurations.
             let mut rng = ChaCha8Rng::seed_from_u64(u64::from(100 * set) + group);
             let mut draw = |k: usize| {
                 Array2::from_shape_fn((grid.n, grid.n), |(ix, iy)| {
@@ -114,11 +114,11 @@ fn table_one(names: &[&str], grid: usize) -> Vec<[f64; 2]> {
         version: "test".into(),
         simulation: SimulationSettings::new(6, 2 * grid),
         images: 1,
-        submissions: submissions(names),
+        configurations: configurations(names),
     };
     let folder = tempfile::tempdir().unwrap();
     let study = Study::open(&plan, folder.path()).unwrap();
-    let measurers = measurers(&plan.submissions).unwrap();
+    let measurers = measurers(&plan.configurations).unwrap();
     let mut means = vec![[0.0; 2]; names.len()];
     for (set, share) in KINDS.into_iter().zip(shares(&KINDS)) {
         let results = run_sets(&study, &[set], 2, &mut Quiet).unwrap();
@@ -175,14 +175,14 @@ fn table_one_comes_out_at_full_size() {
     assert_eq!(fulfils(found[2], found[3]), [false; 5]);
 }
 
-/// `submissions` on `sets`, eight images of 256 galaxies each, so that differences of Q have errors.
-fn on_sets(submissions: Vec<Configuration>, sets: &[u32]) -> (Vec<SetResult>, Vec<String>) {
-    let names = submissions.iter().map(|s| s.name.clone()).collect();
+/// `configurations` on `sets`, eight images of 256 galaxies each, so that differences of Q have errors.
+fn on_sets(configurations: Vec<Configuration>, sets: &[u32]) -> (Vec<SetResult>, Vec<String>) {
+    let names = configurations.iter().map(|s| s.name.clone()).collect();
     let plan = Plan {
         version: "test".into(),
         simulation: SimulationSettings::new(5, 16),
         images: 8,
-        submissions,
+        configurations,
     };
     let folder = tempfile::tempdir().unwrap();
     let study = Study::open(&plan, folder.path()).unwrap();
@@ -193,9 +193,9 @@ fn on_sets(submissions: Vec<Configuration>, sets: &[u32]) -> (Vec<SetResult>, Ve
 #[test]
 fn submissions_compare_as_the_paper_found() {
     let published = Registry::embedded().unwrap().published().unwrap();
-    let submissions = published.into_iter().map(|(s, _)| s).collect();
+    let configurations = published.into_iter().map(|(s, _)| s).collect();
     // Fiducial, low S/N and high S/N: 2,048 galaxies each.
-    let (results, names) = on_sets(submissions, &[2, 5, 8]);
+    let (results, names) = on_sets(configurations, &[2, 5, 8]);
     assert_denoising_improves_q(&results, &names);
     assert_poor_q(&results, &names, 5);
     // The simulator's stars are drawn from the functional PSFs: with both centred alike nothing but the light beyond
@@ -216,7 +216,7 @@ fn printed_submissions_compare_as_the_paper_found() {
         ("den", "as-printed/23/den/star"),
     ] {
         for (psf, form) in [("star", PsfForm::Star), ("func", PsfForm::Functional)] {
-            let mut submission = submissions(&[name]).remove(0);
+            let mut submission = configurations(&[name]).remove(0);
             submission.name = format!("23/{data}/{psf}");
             submission.psf.form = form;
             printed.push(submission);
@@ -242,7 +242,7 @@ fn printed_submissions_compare_as_the_paper_found() {
 fn updates_compare_as_the_paper_found() {
     let of = |name: &str| {
         // CTR rests on 10⁴ transitions a galaxy; 1/RMSD of both rules on the same galaxies.
-        let submission = &submissions(&[name])[0];
+        let submission = &configurations(&[name])[0];
         calibrate(submission, 40, 3, 2, &mut Quiet).unwrap()
     };
     let (adopted, printed) = (of("paper"), of("as-printed/paper"));

@@ -259,8 +259,8 @@ mod tests {
     fn calibrated_ellipticities_recover_shear() {
         let registry = Registry::embedded().unwrap();
         let names = ["48/linear/star", "as-printed/23/raw/star"];
-        let submissions = names.map(|name| registry.get(name).unwrap().configuration);
-        let measurers = measurers(&submissions).unwrap();
+        let configurations = names.map(|name| registry.get(name).unwrap().configuration);
+        let measurers = measurers(&configurations).unwrap();
         let simulator = simulator(2, SimulationSettings::new(19, 32)).unwrap();
         let found = biases(&simulator, &[1], &measurers, 2, &mut Quiet).unwrap();
         let (calibrated, raw) = (&found[0], &found[1]);

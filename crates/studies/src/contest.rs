@@ -42,7 +42,7 @@ pub fn bias_sets(
     progress: &mut dyn Progress,
 ) -> Result<Vec<SetBiases>, PipelineError> {
     let &Study { plan, folder, .. } = study;
-    let measurers = measurers(&plan.submissions)?;
+    let measurers = measurers(&plan.configurations)?;
     let numbers: Vec<u32> = (1..=images).collect();
     let path = |set: u32| folder.join(format!("bias/set{set:02}-{images}.json"));
     let mut found = Vec::new();
@@ -94,10 +94,10 @@ pub fn contest_table(
     results: &[SetResult],
     biases: &[SetBiases],
 ) -> Result<Table, PipelineError> {
-    let costs = plan.submissions.iter();
+    let costs = plan.configurations.iter();
     let costs = costs.map(|configuration| speed::whole(configuration, plan.simulation));
     let costs = costs.collect::<Result<Vec<f64>, _>>()?;
-    let configurations = 0..plan.submissions.len();
+    let configurations = 0..plan.configurations.len();
     let mut rows: Vec<Row<'_>> = Vec::new();
     for (result, bias) in results.iter().zip(biases) {
         rows.extend(configurations.clone().map(|k| Row::Set(result, bias, k)));
@@ -121,7 +121,7 @@ pub fn contest_table(
         Row::Mean(_) => Cell::Empty,
     });
     table.column("submission", "Configuration", &rows, |row| {
-        Cell::text(&plan.submissions[place(row)].name)
+        Cell::text(&plan.configurations[place(row)].name)
     });
     let shapes = |table: &mut Table, key, label: &str, cell: CellOf<'_>| {
         table.column(key, label, &rows, |row| match row {

@@ -59,10 +59,10 @@ fn kind_of(set: u32) -> &'static str {
 }
 
 /// Table 1: our metrics beside the published ones.
-pub fn table_one(results: &[SetResult], submissions: &[(Configuration, Published)]) -> Table {
+pub fn table_one(results: &[SetResult], configurations: &[(Configuration, Published)]) -> Table {
     // With fewer images, noise alone would put our metrics many errors from the published ones.
     let as_published = results.iter().all(|set| set.images == PUBLISHED_IMAGES);
-    let rows: Vec<_> = submissions.iter().enumerate().collect();
+    let rows: Vec<_> = configurations.iter().enumerate().collect();
     let yes = |yes: bool| Cell::text(if yes { "Y" } else { "N" });
     let mut table = Table::titled("Table 1: configurations over all sets (simulated data)");
     table.column("method", "Method", &rows, |(_, (own, _))| {

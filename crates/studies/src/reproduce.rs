@@ -30,7 +30,7 @@ pub struct Plan {
     pub simulation: SimulationSettings,
     pub images: u32,
     /// All settings of the configurations.
-    pub submissions: Vec<Configuration>,
+    pub configurations: Vec<Configuration>,
 }
 
 /// A folder of results that belongs to a plan for as long as this value exists.
@@ -116,7 +116,7 @@ pub fn run_sets(
 ) -> Result<Vec<SetResult>, PipelineError> {
     let &Study { plan, folder, .. } = study;
     // Configurations that differ only in name are measured once.
-    let (distinct, place) = distinct(&plan.submissions);
+    let (distinct, place) = distinct(&plan.configurations);
     let measurers = measurers(&distinct)?;
     let mut results = Vec::new();
     for &set in sets {
@@ -225,7 +225,7 @@ fn set_result(plan: &Plan, set: u32, measured: &[MeasuredSet], place: &[usize]) 
         images: plan.images,
         l: first.bins.l,
         true_ee: first.true_ee,
-        results: plan.submissions.iter().zip(place).map(result).collect(),
+        results: plan.configurations.iter().zip(place).map(result).collect(),
     }
 }
 
@@ -241,10 +241,10 @@ fn spectrum_quality(score: &SetScore, images: &SetImages) -> Option<(f64, Option
 }
 
 // The configurations without repetition, and the index among them of each given one.
-fn distinct(submissions: &[Configuration]) -> (Vec<Configuration>, Vec<usize>) {
+fn distinct(configurations: &[Configuration]) -> (Vec<Configuration>, Vec<usize>) {
     let mut kept: Vec<Configuration> = Vec::new();
     let mut place = Vec::new();
-    for configuration in submissions {
+    for configuration in configurations {
         let same = |other: &Configuration| {
             Configuration {
                 name: other.name.clone(),
@@ -290,7 +290,7 @@ mod tests {
             version: "test".into(),
             simulation: SimulationSettings::new(5, 12),
             images: 2,
-            submissions: names.iter().map(configuration).collect(),
+            configurations: names.iter().map(configuration).collect(),
         }
     }
 
