@@ -3,7 +3,8 @@
 use shearq_quantities::linear::{self, Pivots, substitute};
 
 use crate::sums::{
-    COUNT, Component, Layout, MOST, ONE, OTHER, OWN, PSF, PSF_SIZE, SIZE, SQUARE, WEIGHT,
+    COUNT, Component, Layout, MAX_TERMS, ONE, OTHER, OWN, PSF, PSF_SIZE, SQUARE, WEIGHT,
+    WEIGHTED_PSF_SIZE,
 };
 
 /// Places of the estimates in a list. The first eight are m and c of the components 1, 2, + and ×.
@@ -135,7 +136,7 @@ impl Plan {
                 }
                 // One unknown is a ratio.
                 (false, Known::OnlyM | Known::OnlyC) => {
-                    let mut x = [0.0; MOST];
+                    let mut x = [0.0; MAX_TERMS];
                     x[0] = of.with_e[terms[0]] / of.slope(terms[0], terms[0], own);
                     Some(x)
                 }
@@ -180,7 +181,8 @@ impl Plan {
         }
         if self.size_leakage {
             // Change of the leakage with a relative change of the size.
-            found[SIZE_LEAKAGE] = self.joint(sums, &[PSF, PSF_SIZE]) * sums[SIZE] / sums[WEIGHT];
+            found[SIZE_LEAKAGE] =
+                self.joint(sums, &[PSF, PSF_SIZE]) * sums[WEIGHTED_PSF_SIZE] / sums[WEIGHT];
         }
         found
     }
@@ -219,7 +221,7 @@ pub(crate) fn count(sums: &[f64]) -> f64 {
     sums[COUNT]
 }
 
-type Solution = [f64; MOST];
+type Solution = [f64; MAX_TERMS];
 
 /// Solves Σ_t x_t Σ w R z_s z_t = Σ w e z_s over the given terms; `None` if the terms are not independent.
 fn solve(of: &Component<'_>, terms: &[usize], extra: f64) -> Option<Solution> {
@@ -234,8 +236,8 @@ fn last_of(of: &Component<'_>, terms: &[usize], extra: f64) -> Option<(f64, f64)
 /// Gaussian elimination of a symmetric matrix without exchange of rows, after scaling its diagonal to ±1.
 fn eliminate(of: &Component<'_>, terms: &[usize], extra: f64) -> Option<(Solution, f64)> {
     let n = terms.len();
-    let mut a = [[0.0; MOST + 1]; MOST];
-    let mut scale = [0.0; MOST];
+    let mut a = [[0.0; MAX_TERMS + 1]; MAX_TERMS];
+    let mut scale = [0.0; MAX_TERMS];
     for (i, &s) in terms.iter().enumerate() {
         scale[i] = of.slope(s, s, extra).abs().sqrt();
         if !(scale[i] > 0.0 && scale[i].is_finite()) {
@@ -252,7 +254,7 @@ fn eliminate(of: &Component<'_>, terms: &[usize], extra: f64) -> Option<(Solutio
     if !linear::eliminate(a, Pivots::InOrder, SMALLEST) {
         return None;
     }
-    let mut x = [0.0; MOST];
+    let mut x = [0.0; MAX_TERMS];
     substitute(a, &mut x);
     let pivot = a[n - 1][n - 1] * scale[n - 1] * scale[n - 1];
     for (x, scale) in x.iter_mut().zip(scale).take(n) {
@@ -285,14 +287,14 @@ fn solve_both(
         }
     };
     let n = terms.len() + others.len();
-    let mut scale = [0.0; 2 * MOST];
+    let mut scale = [0.0; 2 * MAX_TERMS];
     for (scale, unknown) in scale.iter_mut().zip(unknowns()) {
         *scale = slope(unknown, unknown).abs().sqrt();
         if !(*scale > 0.0 && scale.is_finite()) {
             return None;
         }
     }
-    let mut rows = [[0.0; 2 * MOST + 1]; 2 * MOST];
+    let mut rows = [[0.0; 2 * MAX_TERMS + 1]; 2 * MAX_TERMS];
     for ((row, equation), own) in rows.iter_mut().zip(unknowns()).zip(scale) {
         for ((value, unknown), other) in row.iter_mut().zip(unknowns()).zip(scale) {
             *value = slope(equation, unknown) / (own * other);
@@ -302,7 +304,7 @@ fn solve_both(
     if !linear::eliminate(&mut rows[..n], Pivots::Largest, SMALLEST) {
         return None;
     }
-    let mut x = [0.0; 2 * MOST];
+    let mut x = [0.0; 2 * MAX_TERMS];
     substitute(&rows[..n], &mut x);
     Some(std::array::from_fn(|at| match at < terms.len() {
         true => x[at] / scale[at],

@@ -43,7 +43,7 @@ pub use design::{Catalogue, Design, Grouping, Missing, Range, Repeated, group};
 pub use error::BiasError;
 pub use estimate::{Errors, Estimate, Measured, QUANTITIES, Quantity, difference, estimate};
 pub use stars::{Behind, StarNoise};
-pub use sums::{Layout, Row, VERSIONS, Version};
+pub use sums::{Layout, Row, SHEARED_CATALOGUES, ShearedCatalogue};
 pub use units::UnitSums;
 pub use verdict::{REQUIREMENTS, Requirement, Verdict, student_t, verdict};
 

@@ -21,25 +21,25 @@ pub struct Row {
     pub psf_size: f64,
 }
 
-/// A version of an artificially sheared image: component and sign of the shear.
+/// A sheared catalogue (1p, 1m, 2p or 2m): component and sign of the shear that was added to the images.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Version {
+pub struct ShearedCatalogue {
     /// Component, 0 or 1.
     pub component: usize,
     /// Whether the shear is positive.
     pub plus: bool,
 }
 
-/// The sheared versions with their names: 1p, 1m, 2p, 2m.
-pub const VERSIONS: [(&str, Version); 4] = [
+/// The sheared catalogues by name.
+pub const SHEARED_CATALOGUES: [(&str, ShearedCatalogue); 4] = [
     ("1p", version(0, true)),
     ("1m", version(0, false)),
     ("2p", version(1, true)),
     ("2m", version(1, false)),
 ];
 
-const fn version(component: usize, plus: bool) -> Version {
-    Version { component, plus }
+const fn version(component: usize, plus: bool) -> ShearedCatalogue {
+    ShearedCatalogue { component, plus }
 }
 
 /// Terms z of the fit: a constant, the same and the other component of shear, the square of the shear.
@@ -50,17 +50,16 @@ pub(crate) const SQUARE: usize = 3;
 /// The PSF's ellipticity, and its product with the PSF's size.
 pub(crate) const PSF: usize = 4;
 pub(crate) const PSF_SIZE: usize = 5;
-/// Most terms.
-pub(crate) const MOST: usize = 6;
+pub(crate) const MAX_TERMS: usize = 6;
 
 /// Places of the first sums: galaxies, weights, squared weights, weights times PSF size.
 pub(crate) const COUNT: usize = 0;
 pub(crate) const WEIGHT: usize = 1;
 pub(crate) const WEIGHT2: usize = 2;
-pub(crate) const SIZE: usize = 3;
+pub(crate) const WEIGHTED_PSF_SIZE: usize = 3;
 /// Then per version: weights times ellipticity, weights.
 const VERSION: usize = 4;
-const HEAD: usize = VERSION + 2 * VERSIONS.len();
+const HEAD: usize = VERSION + 2 * SHEARED_CATALOGUES.len();
 
 /// Which sums there are.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -76,7 +75,7 @@ pub struct Layout {
 
 impl Layout {
     pub(crate) fn terms(self) -> usize {
-        if self.psf { MOST } else { PSF }
+        if self.psf { MAX_TERMS } else { PSF }
     }
 
     /// Components: 1, 2, and along and across the PSF.
@@ -103,7 +102,7 @@ impl Layout {
     /// Per version, weights times the ellipticity in the component that this version does not shear.
     fn of_other_components(self) -> usize {
         if self.matrix && self.versions {
-            VERSIONS.len()
+            SHEARED_CATALOGUES.len()
         } else {
             0
         }
@@ -132,7 +131,7 @@ impl Layout {
         sums[COUNT] += 1.0;
         sums[WEIGHT] += row.weight;
         sums[WEIGHT2] += row.weight * row.weight;
-        sums[SIZE] += row.weight * row.psf_size;
+        sums[WEIGHTED_PSF_SIZE] += row.weight * row.psf_size;
         let [r11, r22] = row.slope;
         let [r12, r21] = if self.matrix { row.cross } else { [0.0; 2] };
         let [p1, p2] = row.psf;
@@ -178,7 +177,7 @@ impl Layout {
         row: &Row,
         (e, slopes, g, psf): ([f64; 2], [[f64; 2]; 2], [f64; 2], [f64; 2]),
     ) {
-        let terms = |k: usize| -> [f64; MOST] {
+        let terms = |k: usize| -> [f64; MAX_TERMS] {
             let (g, other, p) = (g[k], g[1 - k], psf[k]);
             [1.0, g, other, g * g, p, p * row.psf_size]
         };
@@ -209,7 +208,7 @@ impl Layout {
         }
     }
 
-    fn component(self, sums: &mut [f64], e: f64, slope: f64, weight: f64, z: &[f64; MOST]) {
+    fn component(self, sums: &mut [f64], e: f64, slope: f64, weight: f64, z: &[f64; MAX_TERMS]) {
         let n = self.terms();
         let (with_e, matrices) = sums.split_at_mut(n);
         let (with_slope, with_weight) = matrices.split_at_mut(triangle(n));
@@ -236,7 +235,7 @@ impl Layout {
 
     /// Adds an ellipticity of a sheared version, or of a galaxy that this version selects.
     pub fn add_version(self, sums: &mut [f64], version: usize, e: [f64; 2], weight: f64) {
-        let (_, which) = VERSIONS[version];
+        let (_, which) = SHEARED_CATALOGUES[version];
         sums[VERSION + 2 * version] += weight * e[which.component];
         sums[VERSION + 2 * version + 1] += weight;
         if self.of_other_components() > 0 {

@@ -9,13 +9,13 @@ use crate::sums::{Layout, Row};
 
 /// Units that are kept, at least and at most, and per catalogue in between. A jackknife of 1000 units determines an
 /// error to 2 %.
-const FEWEST: usize = 2048;
-const PER_CATALOGUE: usize = 1024;
-const MOST: usize = 8192;
+const MIN_KEPT_UNITS: usize = 2048;
+const UNITS_PER_CATALOGUE: usize = 1024;
+const MAX_KEPT_UNITS: usize = 8192;
 
-/// Numbers that are kept, if that leaves at least [`FEW`] units: 64 MiB.
-const NUMBERS: usize = 1 << 23;
-const FEW: usize = 256;
+/// Numbers that are kept, if that leaves at least [`MIN_UNITS_OF_MANY_BINS`] units: 64 MiB.
+const MAX_KEPT_NUMBERS: usize = 1 << 23;
+const MIN_UNITS_OF_MANY_BINS: usize = 256;
 
 /// Sums per unit and bin.
 ///
@@ -68,7 +68,7 @@ impl UnitSums {
         layout.add(self.sums(catalogue, key, bin), row);
     }
 
-    /// Adds an ellipticity of the sheared version of number `version` in [`crate::VERSIONS`].
+    /// Adds an ellipticity of the sheared version of number `version` in [`crate::SHEARED_CATALOGUES`].
     ///
     /// # Panics
     /// If there is no such bin or version.
@@ -97,9 +97,9 @@ impl UnitSums {
 
     /// Most units.
     fn most(&self) -> usize {
-        let fit = NUMBERS / (self.bins * self.layout.len());
-        let most = (PER_CATALOGUE * self.catalogues).clamp(FEWEST, MOST);
-        most.min(fit.max(FEW))
+        let fit = MAX_KEPT_NUMBERS / (self.bins * self.layout.len());
+        let most = (UNITS_PER_CATALOGUE * self.catalogues).clamp(MIN_KEPT_UNITS, MAX_KEPT_UNITS);
+        most.min(fit.max(MIN_UNITS_OF_MANY_BINS))
     }
 
     fn place(&mut self, catalogue: u32, key: u64) -> usize {

@@ -357,7 +357,7 @@ fn the_response_of_a_selection_follows_from_sheared_versions() {
                 let slope = [0.8; 2];
                 direct.add(file, key, 0, &Row { slope, ..row });
             }
-            for (number, (_, version)) in shearq_bias::VERSIONS.iter().enumerate() {
+            for (number, (_, version)) in shearq_bias::SHEARED_CATALOGUES.iter().enumerate() {
                 let mut sheared = e;
                 sheared[version.component] += if version.plus { 0.008 } else { -0.008 };
                 if detected(sheared) {

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use shearq_bias::VERSIONS;
+use shearq_bias::SHEARED_CATALOGUES;
 use shearq_files::{FileError, names_of};
 
 use crate::expression::fits;
@@ -60,14 +60,14 @@ pub enum Role {
     /// Independent unit.
     Unit,
     /// Name of the sheared catalogue of a row: noshear, 1p, 1m, 2p, 2m.
-    Version,
+    ShearedCatalogue,
 }
 
-/// A role in one catalogue: 0 is the one without artificial shear, k the k-th of [`VERSIONS`].
+/// A role in one catalogue: 0 is the one without artificial shear, k the k-th of [`SHEARED_CATALOGUES`].
 pub(super) type Key = (Role, usize);
 
-/// Catalogues: the one without artificial shear and [`VERSIONS`].
-pub(super) const CATALOGUES: usize = 1 + VERSIONS.len();
+/// Catalogues: the one without artificial shear and [`SHEARED_CATALOGUES`].
+pub(super) const CATALOGUES: usize = 1 + SHEARED_CATALOGUES.len();
 pub(super) const ROLES: usize = TABLE.len();
 
 // In the order of `Role`s: the role, its name in --columns, the role without which it is incomplete, and the names of
@@ -103,7 +103,7 @@ const TABLE: [(Role, &str, Option<Role>, &str); 26] = [
     (Role::X, "x", None, "x x_image xwin_image x_pix"),
     (Role::Y, "y", None, "y y_image ywin_image y_pix"),
     (Role::Unit, "unit", None, "pair pair_id seed patch"),
-    (Role::Version, "version", None, "mdet_step metastep shear_type metacal_step shear"),
+    (Role::ShearedCatalogue, "version", None, "mdet_step metastep shear_type metacal_step shear"),
 ];
 
 /// Ellipticities under artificial shears: of the own component, then of the other one.
@@ -128,7 +128,7 @@ fn name_of((role, catalogue): Key) -> String {
     let name = TABLE[role as usize].1;
     match catalogue.checked_sub(1) {
         None => name.to_owned(),
-        Some(version) => format!("{name}_{}", VERSIONS[version].0),
+        Some(version) => format!("{name}_{}", SHEARED_CATALOGUES[version].0),
     }
 }
 
@@ -150,7 +150,7 @@ fn recognised((role, catalogue): Key) -> Vec<String> {
     let Some(version) = catalogue.checked_sub(1) else {
         return names_of_role(role).map(str::to_owned).collect();
     };
-    let (version, k) = (VERSIONS[version].0, role as usize);
+    let (version, k) = (SHEARED_CATALOGUES[version].0, role as usize);
     vec![
         format!("e{}_{version}", k + 1),
         format!("g{}_{version}", k + 1),
@@ -521,7 +521,7 @@ pub enum Preset {
 impl Preset {
     fn of_columns(columns: &BTreeMap<Key, String>, is_hsm: bool) -> Self {
         let have = |key| columns.contains_key(&key);
-        if have((Role::Version, 0)) {
+        if have((Role::ShearedCatalogue, 0)) {
             Preset::Metadetect
         } else if have((Role::Divisor1, 0)) && have((Role::R11, 0)) {
             Preset::Shearq
@@ -685,7 +685,7 @@ impl Columns {
             Some(((*name).clone(), known.1))
         });
         let choices = choices.collect();
-        if self.of(Role::Version).is_none() && !names.is_given(Role::Version) {
+        if self.of(Role::ShearedCatalogue).is_none() && !names.is_given(Role::ShearedCatalogue) {
             self.steps =
                 all(&|name| fits_any("*step* *shear_type* shear", &name.to_ascii_lowercase()));
         }
@@ -786,8 +786,10 @@ fn find_sheared(columns: &mut BTreeMap<Key, String>, found: &[String], names: &N
             continue;
         };
         let own = |version: &str| same_name(found, &format!("{}_{version}", base(&name)));
-        let sheared: Option<Vec<&String>> =
-            VERSIONS.iter().map(|(version, _)| own(version)).collect();
+        let sheared: Option<Vec<&String>> = SHEARED_CATALOGUES
+            .iter()
+            .map(|(version, _)| own(version))
+            .collect();
         for (catalogue, column) in (1..).zip(sheared.into_iter().flatten()) {
             if !names.0.contains_key(&(role, catalogue)) {
                 columns

@@ -4,7 +4,7 @@ use std::borrow::Cow;
 use std::collections::{BTreeSet, HashMap, HashSet};
 use std::path::Path;
 
-use shearq_bias::{Catalogue, Repeated, Row, VERSIONS};
+use shearq_bias::{Catalogue, Repeated, Row, SHEARED_CATALOGUES};
 use shearq_files::FileError;
 use shearq_files::frames::polars::{DataFrame, DataType};
 use shearq_files::table::{self, FileFormat, Place};
@@ -79,7 +79,7 @@ pub(super) struct Item {
     /// The binned quantity in each catalogue that has it; infinity if the row is not selected.
     pub(super) binned: [f64; CATALOGUES],
     /// Its weight in each sheared catalogue.
-    pub(super) weights: [f64; VERSIONS.len()],
+    pub(super) weights: [f64; SHEARED_CATALOGUES.len()],
 }
 
 /// What is read of a row for one catalogue, as places in [`Source::wanted`].
@@ -216,7 +216,7 @@ impl Source {
 
     /// Whether rows belong to sheared catalogues.
     pub(super) fn has_version_rows(&self) -> bool {
-        self.version.is_some() || self.columns.of(Role::Version).is_some()
+        self.version.is_some() || self.columns.of(Role::ShearedCatalogue).is_some()
     }
 
     /// Whether the responses of each component to the other one are known.
@@ -263,7 +263,7 @@ impl Source {
         match compared {
             Some(operand) => operand.pattern.is_some(),
             None => {
-                let roles = [Role::Id, Role::Version].map(|role| self.columns.of(role));
+                let roles = [Role::Id, Role::ShearedCatalogue].map(|role| self.columns.of(role));
                 roles.contains(&Some(name))
                     || self.unit(reading) == Some(name)
                     || self.columns.steps.iter().any(|step| step == name)
@@ -426,7 +426,7 @@ impl Wanted<'_> {
     }
 
     fn has_sheared(&self, name: &str) -> bool {
-        let mut versions = VERSIONS.iter();
+        let mut versions = SHEARED_CATALOGUES.iter();
         answers(self.columns) && versions.all(|(version, _)| self.sheared(name, version).is_some())
     }
 
@@ -460,7 +460,9 @@ impl Wanted<'_> {
         }
         let weight = weight.filter(|_| known);
         for (catalogue, own) in places.iter_mut().enumerate() {
-            let version = catalogue.checked_sub(1).map(|version| VERSIONS[version].0);
+            let version = catalogue
+                .checked_sub(1)
+                .map(|version| SHEARED_CATALOGUES[version].0);
             for flag in &columns.flags {
                 let sheared = version.filter(|_| known && self.is_cut(flag));
                 let sheared = sheared.and_then(|version| self.sheared(flag, version));
@@ -501,7 +503,7 @@ impl Wanted<'_> {
             own.push(found.ok_or_else(|| FileError::no_column(self.path, column, self.names))?);
         }
         let mut all = vec![Some(own)];
-        for (version, _) in VERSIONS {
+        for (version, _) in SHEARED_CATALOGUES {
             // A column without sheared ones is the same in all, if there are sheared columns of another one.
             let operands = expression.operands().iter();
             let sheared = operands.map(|Operand { column, pattern }| {
@@ -616,7 +618,7 @@ fn is_fixed(name: &str, columns: &Columns) -> bool {
 
 /// The name of a column of one sheared catalogue, without the name of the shear.
 fn version_of(name: &str) -> Option<&str> {
-    let mut versions = VERSIONS.iter();
+    let mut versions = SHEARED_CATALOGUES.iter();
     versions.find_map(|(version, _)| name.strip_suffix(version)?.strip_suffix('_'))
 }
 
@@ -1054,7 +1056,7 @@ impl<'a> Part<'a> {
         let path = &source.place.path;
         let places = &source.places[0];
         let truth = OfRows::new(catalogue, places, &reading.truth)?;
-        let version = source.columns.of(Role::Version);
+        let version = source.columns.of(Role::ShearedCatalogue);
         let mut columns = Vec::new();
         for Operand { column, pattern } in &source.wanted {
             columns.push(match pattern {
@@ -1289,7 +1291,10 @@ impl<'a> Part<'a> {
         &self,
         at: usize,
         weight: f64,
-    ) -> ([f64; VERSIONS.len()], [bool; VERSIONS.len()]) {
+    ) -> (
+        [f64; SHEARED_CATALOGUES.len()],
+        [bool; SHEARED_CATALOGUES.len()],
+    ) {
         let all = std::array::from_fn(|version| {
             let own = &self.source.places[version + 1];
             let weight = match own.of(Role::Weight).filter(|_| self.source.sheared_weight) {
@@ -1335,7 +1340,7 @@ impl<'a> Part<'a> {
                 false => &mut about.unweighted,
             };
             *count += u64::from(own);
-            if in_versions == [false; VERSIONS.len()] {
+            if in_versions == [false; SHEARED_CATALOGUES.len()] {
                 return Ok(());
             }
         }
@@ -1400,7 +1405,7 @@ impl<'a> Part<'a> {
             version,
             weights: match self.source.sheared_weight {
                 true => of_versions,
-                false => [row.weight; VERSIONS.len()],
+                false => [row.weight; SHEARED_CATALOGUES.len()],
             },
             row,
             binned,
@@ -1570,7 +1575,7 @@ fn version_named(name: &str) -> Option<Option<usize>> {
     if ["noshear", "ns", "00"].contains(&name.as_str()) {
         return Some(None);
     }
-    let mut versions = VERSIONS.iter();
+    let mut versions = SHEARED_CATALOGUES.iter();
     versions.position(|(known, _)| *known == name).map(Some)
 }
 
