@@ -10,10 +10,10 @@ type Pair = [(f64, f64); 2];
 // and a truth of twice or half the scale has a slope of 0.5 or 2.
 const LARGEST_SLOPE: f64 = 1.6;
 // Slopes of a right truth.
-const RANGE: std::ops::RangeInclusive<f64> = 1.0 / LARGEST_SLOPE..=LARGEST_SLOPE;
+const SLOPE_RANGE: std::ops::RangeInclusive<f64> = 1.0 / LARGEST_SLOPE..=LARGEST_SLOPE;
 // Standard errors by which a slope must be out of range. With three slopes of each of 24 sets, chance reaches this in one
 // of 400 challenges whose slopes are all at the limit, and in none whose slopes are near 1.
-const CLEAR: f64 = 4.0;
+const MIN_SLOPE_SIGNIFICANCE: f64 = 4.0;
 
 #[derive(Debug)]
 pub(crate) struct First {
@@ -41,12 +41,13 @@ fn slope(parts: &[Sums]) -> Slope {
 }
 
 fn is_wrong((slope, error): Slope) -> bool {
-    slope + CLEAR * error < *RANGE.start() || slope - CLEAR * error > *RANGE.end()
+    slope + MIN_SLOPE_SIGNIFICANCE * error < *SLOPE_RANGE.start()
+        || slope - MIN_SLOPE_SIGNIFICANCE * error > *SLOPE_RANGE.end()
 }
 
 // Whether a slope is in range and clearly above zero.
 fn is_right((slope, error): Slope) -> bool {
-    slope > CLEAR * error && RANGE.contains(&slope)
+    slope > MIN_SLOPE_SIGNIFICANCE * error && SLOPE_RANGE.contains(&slope)
 }
 
 // Sums of a component. True and measured shear are relative to `zeros`, or to their means.
@@ -175,7 +176,7 @@ pub(crate) fn contradiction(firsts: &[First]) -> Option<String> {
     // Each set alone may have too much noise to show what all have in common. Without sound sets, slopes are no numbers.
     let common = slopes(&together(&sound, SAME))
         .iter()
-        .any(|(slope, _)| !RANGE.contains(slope));
+        .any(|(slope, _)| !SLOPE_RANGE.contains(slope));
     let first = each.iter().position(Option::is_some);
     let (wrong_sets, (value, error)) = match (first, wrong(&together(&all, SAME))) {
         (_, Some(found)) if common => (firsts, found),
@@ -208,7 +209,7 @@ pub(crate) fn contradiction(firsts: &[First]) -> Option<String> {
         .filter(|(found, _)| is_right(*found) && clearness(*found) > clearness(own))
         .max_by(|a, b| clearness(a.0).total_cmp(&clearness(b.0)))
         .map_or_else(
-            || match own.0 > CLEAR * own.1 {
+            || match own.0 > MIN_SLOPE_SIGNIFICANCE * own.1 {
                 true => format!("the true shear may be {:.1} times too large", 1.0 / own.0),
                 false => "positions, rows or sets may be exchanged".into(),
             },

@@ -22,10 +22,10 @@ use shearq_submissions::Registry;
 
 const REFERENCE: &str = "48/linear/star";
 // Required difference of two correlations, in standard deviations of chance correlations.
-const CLEAR: f64 = 5.0;
+const MIN_CORRELATION_SIGNIFICANCE: f64 = 5.0;
 // Slope on the reference above which ellipticities are probably distortions, which are nearly twice as large. It is the
 // geometric mean of 1 and 2.
-const SLOPE: f64 = std::f64::consts::SQRT_2;
+const MIN_DISTORTION_SLOPE: f64 = std::f64::consts::SQRT_2;
 // Largest ratio of an image's slope to the median slope of its set, or inverse. A method has one response for all images of
 // a set; the noise of the slope is 1/√(2·64) = 9 % on the smallest grid.
 const SLOPE_RATIO: f64 = 2.0;
@@ -81,7 +81,7 @@ fn compare(reference: &Shapes, sent: &FieldSum) -> (Option<Fault>, f64) {
         return (None, f64::NAN);
     }
     // Each component of each galaxy is an independent number.
-    let chance = CLEAR / (2.0 * own.galaxies).sqrt();
+    let chance = MIN_CORRELATION_SIGNIFICANCE / (2.0 * own.galaxies).sqrt();
     let others = Convention::ALL
         .into_iter()
         .filter(|k| *k != Convention::STANDARD)
@@ -102,7 +102,7 @@ fn compare(reference: &Shapes, sent: &FieldSum) -> (Option<Fault>, f64) {
     let fault = match best {
         Some((other, fault)) if other > chance && other > correlation + chance => Some(fault),
         _ if correlation < chance => Some(Fault::Unrelated),
-        _ => (own.slope() > SLOPE).then(|| Fault::Distortion { slope: own.slope() }),
+        _ => (own.slope() > MIN_DISTORTION_SLOPE).then(|| Fault::Distortion { slope: own.slope() }),
     };
     (fault, own.slope())
 }

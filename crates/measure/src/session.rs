@@ -3,7 +3,7 @@
 //! A [`Session`] is opened on a [`StampSource`]. Opening surveys the image: the noise and the sky of its stamps, and the
 //! common profile of noisy stars. Rows are then read, measured in any thread, and collected in order by a
 //! [`MeasuredImage`], which calibrates them and checks the image. Files, simulations, [`Measurer::batch`] and Python all
-//! use it: while each of them had its own way, they differed in what they surveyed and reported.
+//! use it: while each of them had its own way, they differed in what they noise_plan and reported.
 
 use std::fmt;
 use std::ops::{ControlFlow, Deref, Range};
@@ -25,9 +25,9 @@ use crate::psf::{Psfs, ResidualProfiles, Star};
 use crate::warning::Warning;
 
 // In pixels along each axis. Chosen by hand.
-const WHITENESS_TEST_REACH: usize = 2;
+const WHITENESS_TEST_MAX_LAG: usize = 2;
 // Effect on m below which the noise of a star is not stated: rounding a star to single precision has this effect.
-const LEAST_PSF_NOISE: f64 = 1e-5;
+const MIN_STATED_PSF_NOISE_M: f64 = 1e-5;
 
 /// The noise of an image before it is measured, as far as it is known.
 #[derive(Debug, Clone, Copy, Default)]
@@ -150,7 +150,7 @@ impl Threads for OneThread {
 type Slices<'a, T, E> = Box<dyn FnMut(Range<usize>) -> Result<T, E> + Send + 'a>;
 
 /// Stamps and PSFs in arrays, in the arrangement nearest to a square: images of as many stamps have the same rows, so
-/// that the same stamps are surveyed and examined.
+/// that the same stamps are noise_plan and examined.
 pub struct ArraySource<'a, E = MeasureError> {
     count: usize,
     stamps: Slices<'a, Pixels<'a, Ix3>, E>,
@@ -202,8 +202,8 @@ impl<'a> ArraySource<'a> {
 }
 
 impl<'a, E> ArraySource<'a, E> {
-    /// Of `count` stamps, of which functions give some with their PSFs. The star for all galaxies was `moved` by so many
-    /// pixels to be in the middle.
+    /// A source of `count` stamps that two functions read by range, the pixels and their PSFs. `moved` is the offset in pixels
+    /// by which the star for all galaxies was moved to the centre of its stamp.
     pub fn from_fn(
         count: usize,
         stamps: impl FnMut(Range<usize>) -> Result<Pixels<'a, Ix3>, E> + Send + 'a,
@@ -366,7 +366,7 @@ impl<'n> Session<'n> {
             levels.retain(|level| *level > 0.0);
             session.typical_level = upper_median(&mut levels);
         }
-        if let Some(plan) = session.surveyed() {
+        if let Some(plan) = session.noise_plan() {
             session.survey = survey_noise(plan, source, threads)?;
             session.warnings.extend(match (&session.survey, noise) {
                 (None, _) => Some(Warning::NoNoise),
@@ -380,7 +380,7 @@ impl<'n> Session<'n> {
     }
 
     /// The plan by which the noise is measured on the stamps, if it is.
-    fn surveyed(&self) -> Option<&NoisePlan> {
+    fn noise_plan(&self) -> Option<&NoisePlan> {
         let plan = self.measurer.noise_plan().filter(|_| self.rows.count > 0);
         match self.noise {
             KnownNoise::Unknown | KnownNoise::Stated(_) => plan,
@@ -398,7 +398,7 @@ impl<'n> Session<'n> {
         let noise = match (&self.survey, self.noise) {
             (Some(survey), _) => ImageNoise::Survey(survey),
             (None, KnownNoise::Given(level)) => ImageNoise::Level(level),
-            (None, KnownNoise::Stated(level)) if self.surveyed().is_none() => {
+            (None, KnownNoise::Stated(level)) if self.noise_plan().is_none() => {
                 ImageNoise::Level(level)
             }
             (None, _) => ImageNoise::Unknown,
@@ -421,16 +421,16 @@ impl<'n> Session<'n> {
             NoiseSource::Image { correlation, .. } => correlation == 0,
             NoiseSource::Header | NoiseSource::Border { .. } => true,
         };
-        let blind = self.surveyed().is_some() && self.survey.is_none();
-        if configuration.linear().is_none() || !white || blind {
+        let survey_failed = self.noise_plan().is_some() && self.survey.is_none();
+        if configuration.linear().is_none() || !white || survey_failed {
             return Ok(None);
         }
-        // Small stamps have no border that could be surveyed.
-        let found = NoisePlan::new(self.measurer.full(), WHITENESS_TEST_REACH)
+        // Small stamps have no border that could be noise_plan.
+        let found = NoisePlan::new(self.measurer.full(), WHITENESS_TEST_MAX_LAG)
             .map_err(S::Error::from)
             .and_then(|plan| survey_noise(&plan, source, threads));
         let found = match found {
-            Err(error) if self.surveyed().is_some() => return Err(error),
+            Err(error) if self.noise_plan().is_some() => return Err(error),
             found => found.ok().flatten(),
         };
         Ok(found
@@ -659,7 +659,9 @@ impl MeasuredImage<'_> {
                 }
                 KnownNoise::Stated(_) | KnownNoise::Unknown => None,
             });
-            let effect = stamps.psf_noise().filter(|[m, _]| *m > LEAST_PSF_NOISE);
+            let effect = stamps
+                .psf_noise()
+                .filter(|[m, _]| *m > MIN_STATED_PSF_NOISE_M);
             psf_noise = effect.filter(|_| configuration.linear().is_some());
         }
         warnings.extend(Warning::of_galaxies(&galaxies));

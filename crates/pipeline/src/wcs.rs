@@ -5,11 +5,11 @@ use shearq_files::fits::{ImageReader, Value};
 use shearq_measure::{PixelFrame, Warning};
 
 // Keys with the pixel scale in arcseconds: of surveys, and of GalSim.
-const SCALES: [&str; 2] = ["PIXSCALE", "GS_SCALE"];
+const PIXEL_SCALE_KEYS: [&str; 2] = ["PIXSCALE", "GS_SCALE"];
 // Keys of the matrix from pixels to the sky, in the unit CUNIT1.
 const MATRIX: [&str; 4] = ["CD1_1", "CD1_2", "CD2_1", "CD2_2"];
 const STEPLESS: [&str; 4] = ["PC1_1", "PC1_2", "PC2_1", "PC2_2"];
-const STEPS: [&str; 2] = ["CDELT1", "CDELT2"];
+const CDELT_KEYS: [&str; 2] = ["CDELT1", "CDELT2"];
 // Rotation of the second axis in degrees, before there was a matrix (Calabretta & Greisen 2002, A&A 395, 1077, eq. 189).
 const ROTATION: &str = "CROTA2";
 // Plausible scales in arcseconds. Headers without a sky have scales such as 1 degree per pixel.
@@ -46,7 +46,7 @@ impl Wcs {
             "RAD" => 648_000.0 / std::f64::consts::PI,
             _ => 3600.0,
         };
-        let steps = STEPS.map(number);
+        let steps = CDELT_KEYS.map(number);
         let matrix = cd(MATRIX.map(number)).or_else(|| {
             let [x, y] = [steps[0]?, steps[1]?];
             let (sine, cosine) = number(ROTATION).unwrap_or(0.0).to_radians().sin_cos();
@@ -61,7 +61,7 @@ impl Wcs {
             })
         });
         let matrix = matrix.filter(|m| determinant(m).is_normal());
-        let stated = SCALES.into_iter().find_map(number);
+        let stated = PIXEL_SCALE_KEYS.into_iter().find_map(number);
         let scale = stated.or_else(|| Some(determinant(&matrix?).abs().sqrt() * unit));
         Wcs {
             scale: scale.filter(|scale| PLAUSIBLE.contains(scale)),

@@ -37,7 +37,7 @@ use crate::noise::StampNoise;
 use crate::pixel::hash;
 use crate::psf::{ResidualProfiles, StarDenoiser, width};
 use crate::second_moments::WeightedMoments;
-use crate::shape::{AdaptiveMoments, AdaptiveScratch, AdaptiveShape, Breadth};
+use crate::shape::{AdaptiveMoments, AdaptiveScratch, AdaptiveShape, SizeMoments};
 use crate::sheared::ShearSettings;
 
 // With 4 instead, errors of the mean shear with and without cuts change by less than 0.06 %: `simulate --sets 4
@@ -79,11 +79,11 @@ const WINDOW_COUNT: usize = CONFIGURED_WINDOW + 1 + WINDOW_STEPS.end().unsigned_
 struct Regularisation {
     /// Divisor of the moments at half of the response, for such a galaxy of flux one, times ν₀².
     moments: f32,
-    /// P₀ of [`Breadth`] for such a galaxy of flux one, times the square of [`HALF_SIZE_SNR`].
+    /// P₀ of [`SizeMoments`] for such a galaxy of flux one, times the square of [`HALF_SIZE_SNR`].
     size: f32,
     /// Power of such a galaxy in each mode, as `Spectral::light` returns it.
     galaxy: Vec<f32>,
-    /// T of [`Breadth`] for such a galaxy.
+    /// T of [`SizeMoments`] for such a galaxy.
     typical_square: f32,
 }
 
@@ -94,7 +94,7 @@ impl Regularisation {
         variance: f64,
         spectral: &Spectral,
         moments: &AdaptiveMoments,
-        breadth: &Breadth,
+        breadth: &SizeMoments,
     ) -> Self {
         let LinearDeconvolution {
             target_sigma,
@@ -139,8 +139,8 @@ struct LinearPlan {
     regularisation: Regularisation,
     spectral: Spectral,
     moments: AdaptiveMoments,
-    breadth: Breadth,
-    /// Gradients of P₀ and P₂ of [`Breadth`].
+    breadth: SizeMoments,
+    /// Gradients of P₀ and P₂ of [`SizeMoments`].
     size_gradients: [Vec<f32>; 2],
     removes_neighbours: bool,
     /// Factor that corrects the flux for the light beyond the window.
@@ -155,7 +155,7 @@ impl LinearPlan {
         let scale = method.shape.weight_scale;
         let moments = AdaptiveMoments::new(scale, spectral.spacing(), spectral.reach());
         let (target, window) = (settings.target_sigma, settings.window_sigma);
-        let breadth = Breadth::new(target, window, spectral.spacing(), spectral.reach());
+        let breadth = SizeMoments::new(target, window, spectral.spacing(), spectral.reach());
         let mut scratch = spectral.scratch();
         let gradients = breadth.gradients();
         let step = method.shape.sheared_step;
@@ -207,7 +207,7 @@ impl LinearFamily {
             n,
             cut,
             configured: Arc::new(LinearPlan::new(method, n, cut.size, variance)?),
-            others: width::STEPS.map(|_| Default::default()).collect(),
+            others: width::WIDTH_STEPS.map(|_| Default::default()).collect(),
         })
     }
 
@@ -221,7 +221,7 @@ impl LinearFamily {
             return Ok(Arc::clone(&self.configured));
         }
         let (step, window) = index;
-        let place = &self.others[(step - width::STEPS.start()) as usize][window];
+        let place = &self.others[(step - width::WIDTH_STEPS.start()) as usize][window];
         if let Some(plan) = place.get() {
             return Ok(Arc::clone(plan));
         }
@@ -414,7 +414,7 @@ impl PlanWorker {
                 .gradients(shape, &mut self.values, [first, second]);
             let [zero, two] = &plan.size_gradients;
             for ((third, zero), two) in self.gradients.third.iter_mut().zip(zero).zip(two) {
-                *third = Breadth::combine(&breadth, [*zero, *two]);
+                *third = SizeMoments::combine(&breadth, [*zero, *two]);
             }
             let found = plan
                 .spectral

@@ -26,24 +26,24 @@ pub(super) const QUADRANT: usize = (HALF_SIDE * HALF_SIDE).next_multiple_of(16);
 // Components of each parity: those of the largest variances.
 // With 12, three times as many Gaussian galaxies are flagged at S/N 50.
 pub(super) const COMPONENTS: usize = 16;
-// Of the space in which components are looked for: twice as many.
-const DIMENSIONS: usize = 32;
+// Directions among which the components are found: at least twice as many, so that the last components converge too.
+// Chosen by hand.
+const SEARCH_DIMENSIONS: usize = 32;
 /// The parities along x and y: whether odd.
 pub(super) const PARITIES: [[bool; 2]; 4] =
     [[false, false], [true, true], [true, false], [false, true]];
 /// The quadrants: whether x and y are negative.
 pub(super) const QUADRANT_SIGNS: [[bool; 2]; 4] =
     [[false, false], [true, false], [false, true], [true, true]];
-// σ of the Gaussian neighbour in cells: of a galaxy of the population behind its PSF.
-const NEIGHBOUR_SIGMA: f64 = 1.5;
-// Cells from the middle of the neighbour to its last one.
-// 2.7 σ.
+// σ in cells (of 2 px) of the Gaussian that stands for a neighbour: a galaxy of the population behind its PSF. Chosen by hand.
+const NEIGHBOUR_SIGMA_CELLS: f64 = 1.5;
+// Cells from the centre of the neighbour to its last one: 2.7 σ. Chosen by hand.
 pub(super) const NEIGHBOUR_HALF_SIDE: usize = 4;
 
-// Each is in the population twice. Shares of neighbours that are found change by 0.2 % up to 6,000.
-const GALAXIES: usize = 300;
+// Each is in the population twice. With 6,000 galaxies instead, the share of neighbours found changes by 0.2 %.
+const POPULATION_SIZE: usize = 300;
 // In pixels before the PSF: from unresolved ones to half-light radii of 10 px. Chosen by hand.
-const SCALES: [f64; 2] = [0.5, 8.0];
+const GALAXY_SCALES_PX: [f64; 2] = [0.5, 8.0];
 // At 0.8, four times as many galaxies with an ellipticity of 0.75 are flagged.
 const MAX_ELLIPTICITY: f64 = 0.9;
 // In pixels along an axis: half a pixel, and the error of the centre.
@@ -123,18 +123,18 @@ fn on_cells(at: i32, half: usize) -> bool {
 
 /// Light of a neighbour of flux 1 along one axis, this many cells from its middle.
 pub(super) fn neighbour_light(step: i32) -> f64 {
-    let offset = f64::from(step) / NEIGHBOUR_SIGMA;
-    (-0.5 * offset * offset).exp() / ((2.0 * PI).sqrt() * NEIGHBOUR_SIGMA)
+    let offset = f64::from(step) / NEIGHBOUR_SIGMA_CELLS;
+    (-0.5 * offset * offset).exp() / ((2.0 * PI).sqrt() * NEIGHBOUR_SIGMA_CELLS)
 }
 
 /// Each galaxy is there once more under exchanged axes.
 fn reference_population(half: usize) -> Vec<Folded> {
     let mut state = SEED;
     let mut within = move |[low, high]: [f64; 2]| low + (high - low) * uniform(&mut state);
-    let mut galaxies = Vec::with_capacity(2 * GALAXIES);
-    for _ in 0..GALAXIES {
+    let mut galaxies = Vec::with_capacity(2 * POPULATION_SIZE);
+    for _ in 0..POPULATION_SIZE {
         let galaxy = Galaxy {
-            scale: within(SCALES.map(f64::ln)).exp(),
+            scale: within(GALAXY_SCALES_PX.map(f64::ln)).exp(),
             // Uniform in the plane of both components.
             ellipticity: MAX_ELLIPTICITY * within([0.0, 1.0]).sqrt(),
             angle: within([0.0, PI]),
@@ -171,6 +171,8 @@ impl Galaxy {
         let along = 2 * half;
         let mut cells = vec![0.0; along * along];
         let bulge = self.bulge;
+        // Light of the Gaussians of GALAXY_SIGMAS: bulge, middle, disc, wings, and the single one. A stronger bulge takes from
+        // the disc. Chosen by hand.
         let core = 1.0 - self.gaussian;
         let lights = [
             core * 0.5 * bulge,
@@ -268,7 +270,7 @@ impl Components {
         }
         let count = basis.vectors.len();
         // The directions of those galaxies that the earlier directions explain the least.
-        while basis.vectors.len() < DIMENSIONS {
+        while basis.vectors.len() < SEARCH_DIMENSIONS {
             let sizes = rows.iter().map(|row| (dot(row, row), row));
             let Some((_, unexplained)) = sizes.max_by(|a, b| a.0.total_cmp(&b.0)) else {
                 break;
@@ -346,9 +348,9 @@ impl Basis {
         parity: usize,
         free: usize,
     ) -> ([Cells; COMPONENTS], [f64; COMPONENTS]) {
-        let mut products = [[0.0; DIMENSIONS]; DIMENSIONS];
+        let mut products = [[0.0; SEARCH_DIMENSIONS]; SEARCH_DIMENSIONS];
         for galaxy in galaxies {
-            let mut amplitudes = [0.0; DIMENSIONS];
+            let mut amplitudes = [0.0; SEARCH_DIMENSIONS];
             for (amplitude, vector) in amplitudes.iter_mut().zip(&self.vectors).skip(free) {
                 *amplitude = dot(&galaxy[parity], vector);
             }
@@ -367,7 +369,7 @@ impl Basis {
                 products[k][k]
             }
         };
-        let mut order: [usize; DIMENSIONS] = std::array::from_fn(|k| k);
+        let mut order: [usize; SEARCH_DIMENSIONS] = std::array::from_fn(|k| k);
         order.sort_by(|a, b| variance(*b).total_cmp(&variance(*a)));
         let vectors = std::array::from_fn(|k| {
             let mut sum = [0.0; HALF_SIDE * HALF_SIDE];

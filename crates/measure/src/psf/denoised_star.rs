@@ -14,7 +14,7 @@ use super::residual_profile::{ResidualProfiles, ResidualSums};
 use super::star::{psf_offset, sum_of_squares};
 use super::width::noise_equivalent_area;
 
-// S/N between which a star is used more and more as it is.
+// S/N between which the share of the raw star in the result grows from 0 to 1. The lower end is chosen by hand.
 // At 1000 the noise of one star changes m by 5·10⁻³.
 pub(super) const UNCHANGED_SNR: [f64; 2] = [500.0, 1000.0];
 // An obscured Airy disc of S/N 100 has no significant power above it. Chosen by hand.
@@ -24,12 +24,12 @@ const MAX_AZIMUTHAL_ORDER: usize = 8;
 // The fit determines centre and ellipticity, which have orders 1 and 2.
 const MAX_FITTED_ORDER: usize = 2;
 // Scale of the functions in units of the σ of the profile's core. Chosen by hand.
-const SCALE: f64 = 1.1;
+const HERMITE_SCALE: f64 = 1.1;
 // Side from which on the border is free of the star's light, in pixels.
 // As for the noise of galaxies.
 pub(super) const MIN_DENOISED_SIDE: usize = 24;
 // Smaller values of a function are far below the noise of a star. Chosen by hand.
-const NEGLIGIBLE: f64 = 1e-4;
+const MIN_FUNCTION_VALUE: f64 = 1e-4;
 // Of 1, −4, 6, −4, 1 on white noise, in units of a pixel's: 1 + 16 + 36 + 16 + 1.
 const DIFFERENCE_VARIANCE: f64 = 70.0;
 
@@ -59,7 +59,7 @@ impl StarDenoiser {
         self.residual_profiles = profiles.cloned();
     }
 
-    /// The star `psf` of sum one without most of its noise; as it is without noise, or if no profile fits.
+    /// The denoised star of sum one; `psf` unchanged if its noise is negligible or no profile fits.
     pub(crate) fn denoised<'a>(&'a mut self, psf: ArrayView2<'a, f64>) -> ArrayView2<'a, f64> {
         let Some(Fit {
             profile,
@@ -134,7 +134,8 @@ impl StarDenoiser {
     fn add_significant_residual(&mut self, psf: ArrayView2<'_, f64>, profile: &Moffat, sigma: f64) {
         let n = psf.nrows();
         // At least 1.7 px, so that pixels sample the highest order.
-        let scale = (SCALE * profile.sigma()).max(((2 * MAX_ORDER + 1) as f64).sqrt() / 3.0);
+        let scale =
+            (HERMITE_SCALE * profile.sigma()).max(((2 * MAX_ORDER + 1) as f64).sqrt() / 3.0);
         let StarDenoiser {
             star,
             functions: [of_x, of_y],
@@ -155,7 +156,7 @@ impl StarDenoiser {
             row.fill(0.0);
             for y in 0..n {
                 let weight = of_y[(k, y)];
-                if weight.abs() < NEGLIGIBLE {
+                if weight.abs() < MIN_FUNCTION_VALUE {
                     continue;
                 }
                 let lines = psf.row(y).into_iter().zip(star.row(y));

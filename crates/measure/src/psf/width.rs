@@ -9,7 +9,7 @@ use super::star::sum_of_squares;
 // Steps of 19 %. Chosen by hand.
 const STEPS_PER_DOUBLING: f64 = 4.0;
 /// Steps of lengths: 0.6 to 2.8 times as long.
-pub(crate) const STEPS: RangeInclusive<i32> = -3..=6;
+pub(crate) const WIDTH_STEPS: RangeInclusive<i32> = -3..=6;
 // Width of the border from which a star's noise is measured, in pixels.
 // Chosen by hand.
 const BORDER: usize = 2;
@@ -46,7 +46,7 @@ pub(crate) fn step(psf: ArrayView2<'_, f64>, reference: f64) -> i32 {
         steps.round()
     };
     // NaN becomes 0.
-    (whole as i32).clamp(*STEPS.start(), *STEPS.end())
+    (whole as i32).clamp(*WIDTH_STEPS.start(), *WIDTH_STEPS.end())
 }
 
 /// How much longer lengths are after so many steps.

@@ -30,7 +30,7 @@ const SMALLEST_SIZE: f64 = 0.1;
 
 /// Weights for one window and target.
 #[derive(Debug, Clone)]
-pub(crate) struct Breadth {
+pub(crate) struct SizeMoments {
     /// Of P₀ and P₂, laid out as `Lags`; of both lags that each place stands for.
     weights: [Vec<f32>; 2],
     target: f64,
@@ -51,7 +51,7 @@ pub(crate) struct FoundBreadth {
     divisor: f32,
 }
 
-impl Breadth {
+impl SizeMoments {
     /// For lags up to `reach` steps of `spacing` px, a target of `target` px and a window of `window` px.
     pub(crate) fn new(target: f64, window: f64, spacing: f64, reach: usize) -> Self {
         let tau = WEIGHT_SCALE * window;
@@ -67,7 +67,7 @@ impl Breadth {
                 weights[1].push((weight * square) as f32);
             }
         }
-        Breadth {
+        SizeMoments {
             weights,
             target,
             rest: 2.0 / (tau * tau) + 1.0 / (window * window),
@@ -188,7 +188,7 @@ mod tests {
 
     #[test]
     fn the_size_of_a_gaussian_is_its_standard_deviation() {
-        let breadth = Breadth::new(TARGET, WINDOW, SPACING, REACH);
+        let breadth = SizeMoments::new(TARGET, WINDOW, SPACING, REACH);
         for r in [1.0, 2.0, 3.0, 5.0, 8.0] {
             let found = breadth.measure(&acf(r), 0.0, 0.0);
             let [size, first, second] = breadth.size(f64::from(found.square));
@@ -213,7 +213,7 @@ mod tests {
 
     #[test]
     fn responses_are_differences_and_noise_has_the_typical_size() {
-        let breadth = Breadth::new(TARGET, WINDOW, SPACING, REACH);
+        let breadth = SizeMoments::new(TARGET, WINDOW, SPACING, REACH);
         let (galaxy, other) = (acf(2.0), acf(4.0));
         let found = breadth.measure(&galaxy, 3.0, 20.0);
         let step = 1e-3;
@@ -238,7 +238,7 @@ mod tests {
             rows.map(|(at, (w, v))| w * v * if at < width { 1.0 } else { 2.0 })
                 .sum()
         };
-        let combined = Breadth::combine(&found, [each(&zero), each(&two)]);
+        let combined = SizeMoments::combine(&found, [each(&zero), each(&two)]);
         assert!((combined / response - 1.0).abs() < 1e-4);
     }
 }

@@ -19,7 +19,7 @@ const BAR: f64 = 7.0;
 const BAR_GAP: f64 = 5.0;
 const BAR_ROOM: f64 = 30.0;
 // The longer side of an image, in points.
-const SIDE: f64 = 144.0;
+const IMAGE_SIDE_PX: f64 = 144.0;
 const GAP: f64 = 18.0;
 
 /// How values between the ends of the scale are spread over the colours.
@@ -60,7 +60,7 @@ impl ImageGrid {
         let most = self.rows.iter().map(|row| row.panels.len()).max();
         let labelled = self.rows.iter().any(|row| !row.label.is_empty());
         let label = if labelled { LABEL_SIZE + 8.0 } else { 0.0 };
-        let panels = (SIDE + GAP) * most.unwrap_or(0) as f64 - GAP;
+        let panels = (IMAGE_SIDE_PX + GAP) * most.unwrap_or(0) as f64 - GAP;
         (label, panels.max(text_width(&self.title, TITLE_SIZE)))
     }
 }
@@ -72,7 +72,7 @@ impl Drawing for ImageGrid {
 
     fn extent(&self) -> (f64, f64) {
         let (label, panels) = self.widths();
-        let row = LABEL_SIZE + 6.0 + SIDE + BAR_ROOM;
+        let row = LABEL_SIZE + 6.0 + IMAGE_SIDE_PX + BAR_ROOM;
         let rows = self.rows.len() as f64 * row;
         (
             2.0 * MARGIN + label + panels,
@@ -88,12 +88,16 @@ impl Drawing for ImageGrid {
         top += room(&self.title, TITLE_SIZE);
         for row in &self.rows {
             top += LABEL_SIZE + 6.0;
-            let beside = (MARGIN + 0.5 * LABEL_SIZE, top + 0.5 * SIDE);
+            let beside = (MARGIN + 0.5 * LABEL_SIZE, top + 0.5 * IMAGE_SIDE_PX);
             write_upwards(canvas, &row.label, LABEL_SIZE, MIDDLE, beside)?;
             for (k, panel) in row.panels.iter().enumerate() {
-                draw_panel(canvas, panel, (left + k as f64 * (SIDE + GAP), top))?;
+                draw_panel(
+                    canvas,
+                    panel,
+                    (left + k as f64 * (IMAGE_SIDE_PX + GAP), top),
+                )?;
             }
-            top += SIDE + BAR_ROOM;
+            top += IMAGE_SIDE_PX + BAR_ROOM;
         }
         Ok(())
     }
@@ -105,7 +109,7 @@ fn draw_panel<B: DrawingBackend>(
     panel: &ImagePanel,
     (left, top): (f64, f64),
 ) -> Drawn<B> {
-    let centre = left + 0.5 * SIDE;
+    let centre = left + 0.5 * IMAGE_SIDE_PX;
     write(
         canvas,
         &panel.title,
@@ -115,11 +119,18 @@ fn draw_panel<B: DrawingBackend>(
     )?;
     let (rows, columns) = panel.image.dim();
     if rows == 0 || columns == 0 {
-        return frame(canvas, (left, top), (left + SIDE, top + SIDE));
+        return frame(
+            canvas,
+            (left, top),
+            (left + IMAGE_SIDE_PX, top + IMAGE_SIDE_PX),
+        );
     }
-    let pixel = SIDE / rows.max(columns) as f64;
+    let pixel = IMAGE_SIDE_PX / rows.max(columns) as f64;
     let (width, height) = (pixel * columns as f64, pixel * rows as f64);
-    let (x, bottom) = (left + 0.5 * (SIDE - width), top + 0.5 * (SIDE + height));
+    let (x, bottom) = (
+        left + 0.5 * (IMAGE_SIDE_PX - width),
+        top + 0.5 * (IMAGE_SIDE_PX + height),
+    );
     let limits = panel.map.limits(panel.image.iter());
     for (row, values) in panel.image.rows().into_iter().enumerate() {
         let y = |row: usize| bottom - row as f64 * pixel;
@@ -145,17 +156,22 @@ fn draw_panel<B: DrawingBackend>(
     }
     frame(canvas, (x, bottom - height), (x + width, bottom))?;
 
-    let top = top + SIDE + BAR_GAP;
-    const STEPS: usize = 96;
-    for step in 0..STEPS {
-        let at = |step: usize| left + SIDE * step as f64 / STEPS as f64;
-        let colour = panel.map.colour((step as f64 + 0.5) / STEPS as f64);
+    let top = top + IMAGE_SIDE_PX + BAR_GAP;
+    const COLOUR_BAR_STEPS: usize = 96;
+    for step in 0..COLOUR_BAR_STEPS {
+        let at = |step: usize| left + IMAGE_SIDE_PX * step as f64 / COLOUR_BAR_STEPS as f64;
+        let colour = panel
+            .map
+            .colour((step as f64 + 0.5) / COLOUR_BAR_STEPS as f64);
         let corners = [place((at(step), top)), place((at(step + 1), top + BAR))];
         canvas.draw(&Rectangle::new(corners, colour.filled()))?;
     }
-    frame(canvas, (left, top), (left + SIDE, top + BAR))?;
+    frame(canvas, (left, top), (left + IMAGE_SIDE_PX, top + BAR))?;
     let below = top + BAR + 0.5 * NUMBER_SIZE + 4.0;
-    for (value, anchor, x) in [(limits.0, LEFT, left), (limits.1, RIGHT, left + SIDE)] {
+    for (value, anchor, x) in [
+        (limits.0, LEFT, left),
+        (limits.1, RIGHT, left + IMAGE_SIDE_PX),
+    ] {
         if value.is_finite() {
             // What is nothing beside the scale reads as zero.
             let none = value.abs() < 2e-3 * (limits.1 - limits.0);

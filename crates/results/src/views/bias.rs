@@ -184,11 +184,11 @@ pub fn chosen_by_measurement(result: &BiasResult) -> Option<String> {
 /// |m| above which catalogue and truth hardly belong together.
 const IMPLAUSIBLE: f64 = 0.3;
 /// The same in standard errors of m, added to it.
-const CLEAR: f64 = 5.0;
+const IMPLAUSIBLE_SIGNIFICANCE: f64 = 5.0;
 
 /// A warning if m is larger than a bias of shapes can be.
 fn implausible(result: &BiasResult, all: &Estimate) -> Option<String> {
-    let large = |m: &Measured| m.value.abs() > IMPLAUSIBLE + CLEAR * m.error;
+    let large = |m: &Measured| m.value.abs() > IMPLAUSIBLE + IMPLAUSIBLE_SIGNIFICANCE * m.error;
     let mut found = ["m1", "m2"].into_iter();
     let (name, m) = found.find_map(|name| Some((name, all.value(name).filter(large)?)))?;
     let divided = match result.about.response_column {
@@ -225,7 +225,7 @@ pub fn of_design(result: &BiasResult) -> Vec<String> {
         ));
     }
     if let Some(alpha) = all.value("alpha")
-        && alpha.value < OTHER_PSF.min(-CLEAR * alpha.error)
+        && alpha.value < OTHER_PSF.min(-IMPLAUSIBLE_SIGNIFICANCE * alpha.error)
     {
         lines.push(format!(
             "the ellipticities follow minus the ellipticity of the PSF (found α = {:.2} ± {:.2}, expected about 0): galaxies were probably corrected for the PSF of other galaxies. Try: check the order of the PSFs",
