@@ -8,6 +8,7 @@ use pyo3::types::PyDict;
 use shearq_dataset::truth::{Sign, word};
 use shearq_quantities::MeasuredRange;
 use shearq_quantities::units::{Degrees, Pixels};
+use shearq_results::foreign;
 use shearq_results::views::diagnosis;
 use shearq_scoring::modes::Decomposer;
 use shearq_scoring::resample::{PairedSet, paired_difference};
@@ -193,7 +194,7 @@ pub(crate) fn score<'py>(
                 counts.not_finite, counts.outside
             )));
         }
-        if let Some(fault) = diagnosis::fault_of_rows(&counts, &grid, ADVICE) {
+        if let Some(fault) = foreign::fault_of_rows(&counts, &grid, ADVICE) {
             return Err(of_rows(&fault));
         }
         let mut warnings = diagnosis::oddities(&counts, "e1, e2");
@@ -339,8 +340,7 @@ pub(crate) fn spectrum<'py>(
             images.add(image).map_err(of_scoring)
         })?;
         // Any field has a spectrum, but not numbers for failures.
-        let failed =
-            (counts.sentinels > 0).then(|| diagnosis::fault_of_rows(&counts, &grid, ADVICE));
+        let failed = (counts.sentinels > 0).then(|| foreign::fault_of_rows(&counts, &grid, ADVICE));
         if let Some(fault) = failed.flatten() {
             return Err(of_rows(&fault));
         }

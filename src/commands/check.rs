@@ -13,7 +13,7 @@ use shearq_dataset::layout::MAX_IMAGE;
 use shearq_dataset::layout::{DataFolder, Layout, read_rows};
 use shearq_dataset::truth::grid_of_set;
 use shearq_files::table::{MAX_ROWS, read_truth};
-use shearq_results::score::COLUMNS;
+use shearq_results::catalogues::COLUMNS;
 use shearq_results::submit::challenge::Kind;
 use shearq_results::submit::check::{Expected, Finding, Severity, check_sent};
 use shearq_results::submit::packed::Sent;

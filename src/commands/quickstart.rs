@@ -14,11 +14,13 @@ use shearq_dataset::run::{Run, Source};
 use shearq_files::table::FileFormat;
 use shearq_pipeline::run::run_folder;
 use shearq_render::terminal::wrapped;
+use shearq_results::catalogues::OWN;
 use shearq_results::compare::score_all;
-use shearq_results::score::{OWN, ScoredSet, score_folder};
+use shearq_results::score::{ScoredSet, score_folder};
+use shearq_results::views::comparison::verdict_line;
 use shearq_results::views::comparison::{compact, compare, named, q_heat_map, verdict};
 use shearq_results::views::pages;
-use shearq_results::views::scores::{per_set, verdict_line};
+use shearq_results::views::scores::per_set;
 use shearq_simulate::set::SimulationSettings;
 
 /// Simulate a small data set, measure it with three configurations, and compare them.

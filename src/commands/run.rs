@@ -17,10 +17,12 @@ use shearq_files::atomic;
 use shearq_pipeline::run::run_folder;
 use shearq_render::table::{Table, TableFormat};
 use shearq_results::catalogues::Catalogues;
-use shearq_results::score::{OWN, ScoredSet, score_catalogues};
+use shearq_results::catalogues::OWN;
+use shearq_results::score::{ScoredSet, score_catalogues};
 use shearq_results::store;
+use shearq_results::views::comparison::verdict_line;
 use shearq_results::views::pages;
-use shearq_results::views::scores::{bandpowers, per_set, verdict_line};
+use shearq_results::views::scores::{bandpowers, per_set};
 
 /// Measure and score in one step, on a data folder or on simulated sets.
 ///

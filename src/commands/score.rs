@@ -18,16 +18,18 @@ use shearq_dataset::run::kind_of;
 use shearq_dataset::run::{Run, Source};
 use shearq_dataset::truth::{ReadTruth, Reading, Sign, read_truth, reading_of};
 use shearq_render::table::TableFormat;
+use shearq_results::catalogues::COLUMNS;
 use shearq_results::catalogues::Catalogues;
 use shearq_results::foreign::{Screen, folder_of, plain_columns};
 use shearq_results::record::{RunRecord, SetRecord};
-use shearq_results::score::{COLUMNS, ScoredSet, score_catalogues, score_files, unscored};
+use shearq_results::score::{ScoredSet, score_catalogues, score_files, unscored};
 use shearq_results::store;
 use shearq_results::submit::challenge::{Kind, read_bandpowers};
 use shearq_results::submit::manifest::Manifest;
 use shearq_results::submit::packed::{Packed, Sent, Submission};
+use shearq_results::views::comparison::verdict_line;
 use shearq_results::views::pages;
-use shearq_results::views::scores::{SetInput, one_set_json, per_set, spectra, verdict_line};
+use shearq_results::views::scores::{SetInput, one_set_json, per_set, spectra};
 
 /// Score ellipticities against a known shear field: Q, Q_dn, M/2, √A and more.
 ///

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::sync::LazyLock;
 
-use serde::{Deserialize, Serialize};
+use serde::{Deserialize, Deserializer, Serialize};
 use toml::de::DeTable;
 use toml::{Table, Value};
 
@@ -225,8 +225,16 @@ fn check_keys(settings: &Table) -> Result<(), SettingError> {
     Ok(())
 }
 
+// Stored configurations, of JSON or TOML. They are read through a table, like files, so that a key that no method has is
+// refused: serde's `deny_unknown_fields` excludes `flatten`, with which a method's sections lie beside the others.
+impl<'de> Deserialize<'de> for Configuration {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        configuration_of(Table::deserialize(deserializer)?).map_err(serde::de::Error::custom)
+    }
+}
+
 /// The configuration of a merged table with its name and description.
-pub(crate) fn configuration_of(mut table: Table) -> Result<Configuration, SettingError> {
+fn configuration_of(mut table: Table) -> Result<Configuration, SettingError> {
     let mut own = Table::new();
     for key in ["name", "description"] {
         let missing = || SettingError::Missing { key: key.into() };

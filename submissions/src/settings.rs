@@ -4,12 +4,11 @@
 use std::fmt::Display;
 use std::ops::RangeInclusive;
 
-use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use serde::{Deserialize, Serialize, Serializer};
 use toml::Table;
 
 use crate::error::OutOfRange;
 use crate::name::{EXPECTED, check_name, shown};
-use crate::registry::configuration_of;
 
 /// Limits that the arithmetic of the measurement sets to settings.
 pub mod limits {
@@ -599,14 +598,6 @@ impl Serialize for Configuration {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         // The derived one.
         Configuration::serialize(self, serializer)
-    }
-}
-
-// Stored configurations, of JSON or TOML. They are read through a table, like files, so that a key that no method has is
-// refused: serde's `deny_unknown_fields` excludes `flatten`, with which a method's sections lie beside the others.
-impl<'de> Deserialize<'de> for Configuration {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
-        configuration_of(Table::deserialize(deserializer)?).map_err(serde::de::Error::custom)
     }
 }
 

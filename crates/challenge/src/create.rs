@@ -25,7 +25,7 @@ use shearq_simulate::set::{STAMP, SimulationSettings};
 use crate::constant::ConstantShears;
 use crate::contradiction::{First, contradiction};
 use crate::deadline::Deadline;
-use crate::error::ChallengeError;
+use crate::error::{ChallengeError, EXPECTED_RESPONSE};
 use crate::judge::unscored;
 use crate::kind::{Kind, RankBy, response};
 use crate::readme;
@@ -78,9 +78,6 @@ const TILT: f64 = 0.2;
 pub const SCATTER: f64 = 4.0;
 /// Q of the best template relative to the Q of zero shear.
 pub const TEMPLATE_GAIN: f64 = (SCATTER + 1.0) / (SCATTER - 1.0);
-/// Significance of the response that a method of ordinary noise must expect. Entries need 3; two more make a refusal by
-/// chance unlikely.
-pub(crate) const EXPECTED_RESPONSE: f64 = 5.0;
 
 impl Folders<'_> {
     // Checks that the public folder can become one of this challenge. Returns the key of an earlier, stopped command.

@@ -4,7 +4,9 @@ use shearq_files::FileError;
 use shearq_pipeline::PipelineError;
 use thiserror::Error;
 
-use crate::create::EXPECTED_RESPONSE;
+/// Significance of the response that a method of ordinary noise must expect. Entries need 3; two more make a refusal by
+/// chance unlikely.
+pub(crate) const EXPECTED_RESPONSE: f64 = 5.0;
 use crate::deadline::Deadline;
 
 /// Failure to make a challenge: a file or a measurement, or data and rules by which entries could not be ranked.

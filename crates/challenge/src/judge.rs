@@ -26,13 +26,13 @@ use shearq_simulate::kinds::SetKind;
 use shearq_submissions::check_name;
 
 use crate::constant::ConstantShears;
-use crate::copies::sketch;
 use crate::deadline::now;
 use crate::inbox::{Content, Sending, content, identify};
 use crate::kind::response;
 use crate::receipt::Receipt;
 use crate::seal::{Key, verify, verify_public};
 use crate::shapes::References;
+use crate::sketch::sketch;
 use crate::terms::Challenge;
 
 /// What identifies a scored entry. The store keeps it with its scores, so the names are part of the format.

@@ -27,6 +27,7 @@ mod readme;
 pub mod receipt;
 pub mod seal;
 pub mod shapes;
+mod sketch;
 pub mod terms;
 
 // The examples of README.md.

@@ -12,7 +12,7 @@ use shearq_files::atomic::Scratch;
 use shearq_files::table::{FileFormat, most_rows};
 use shearq_pipeline::measure::measure_folder;
 use shearq_pipeline::{PipelineError, Progress};
-use shearq_results::score::COLUMNS;
+use shearq_results::catalogues::COLUMNS;
 use shearq_results::submit::challenge::Kind;
 use shearq_results::submit::check::{Finding, Severity};
 use shearq_results::submit::packed::Sent;

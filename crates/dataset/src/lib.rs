@@ -9,6 +9,7 @@ pub mod images;
 pub mod layout;
 pub mod listing;
 pub mod mosaic;
+mod pattern;
 pub mod psf_table;
 pub mod record;
 pub mod run;

@@ -6,7 +6,7 @@ use std::fs;
 use std::io::ErrorKind;
 use std::path::{Component, Path, PathBuf};
 
-use crate::layout::{IMAGE_PLACEHOLDERS, MAX_IMAGE, MAX_SET, SET_PLACEHOLDERS, fill};
+use crate::pattern::{IMAGE_PLACEHOLDERS, MAX_IMAGE, MAX_SET, SET_PLACEHOLDERS, fill};
 use shearq_files::FileError;
 use shearq_files::open::is_there;
 

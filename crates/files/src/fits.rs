@@ -5,11 +5,13 @@
 //! gzip and tile-compressed (fpack) images are read like plain ones.
 
 mod cards;
+mod cfitsio;
 mod file;
 mod header;
 mod read;
 mod source;
 mod tiles;
+mod tiling;
 mod write;
 
 pub use header::Value;

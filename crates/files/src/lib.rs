@@ -15,6 +15,12 @@ pub mod text;
 
 pub use error::{FileError, names_of};
 
+/// Most rows of a table that may fill the largest grid, of 4000 × 4000 cells.
+pub const MAX_ROWS: usize = 4000 * 4000;
+/// Most pixels per side of an image.
+// Chosen by hand. A damaged header cannot ask for memory beyond it.
+pub(crate) const MAX_SIDE: usize = 200_000;
+
 /// The examples of README.md.
 #[cfg(doctest)]
 #[doc = include_str!("../README.md")]

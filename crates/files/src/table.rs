@@ -22,11 +22,7 @@ use crate::open::{is_there, open};
 
 use crate::{atomic, fits, parquet, text};
 
-/// Most rows of a table that may fill the largest grid, of 4000 × 4000 cells.
-pub const MAX_ROWS: usize = 4000 * 4000;
-/// Most pixels per side of an image.
-// Chosen by hand. A damaged header cannot ask for memory beyond it.
-pub(crate) const MAX_SIDE: usize = 200_000;
+pub use crate::MAX_ROWS;
 
 /// A column of numbers of the table of `path`; missing ones are NaN.
 pub fn numbers<'t>(

@@ -8,4 +8,4 @@ mod network;
 
 pub(crate) use linear::{Gradients, uniform};
 pub use linear::{Lags, ModeNoise, Spectral, SpectralPsf, SpectralScratch};
-pub use network::{Descent, Network, NetworkScratch, Rule, Step, Stop, convolve, psf_factor};
+pub use network::{Network, NetworkScratch, Rule, Step, convolve, psf_factor};

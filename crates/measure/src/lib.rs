@@ -64,10 +64,10 @@ mod transform;
 mod warning;
 
 pub use calibration::{MeanShear, MeanShearError, ShearSum, calibrate};
-pub use deconvolve::{Descent, Stop};
 pub use error::MeasureError;
 pub use examine::{EXAMINED_PSFS, Examination, examined_rows};
 pub use measurement::{Coupling, Flag, Flags, Measurement, Observables, ResponseMatrix};
+pub use measurement::{Descent, Stop};
 pub use measurer::{ImageNoise, ImageWorker, Measurer, PsfWorker, Steps, Worker};
 pub use method::AdaptedSettings;
 pub use ndarray;

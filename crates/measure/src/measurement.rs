@@ -4,11 +4,36 @@ use std::fmt;
 
 use thiserror::Error;
 
-use crate::deconvolve::Descent;
 use crate::sheared::ShearedCatalogues;
 
 /// Response ∂e_i/∂γ_j of an ellipticity to shear, as `[i][j]`: R11, R12 and R21, R22.
 pub type ResponseMatrix = [[f64; 2]; 2];
+
+/// Why the network stopped.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Stop {
+    /// No neuron exceeds its threshold.
+    Stable,
+    /// The next state would not have had a lower energy; which one is kept is a setting.
+    EnergyRise,
+    /// M iterations were made.
+    MaxIterations,
+}
+
+/// How the network went down in energy.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Descent {
+    /// Iterations whose state was accepted, or kept at the end.
+    pub iterations: u32,
+    /// Why it stopped.
+    pub stop: Stop,
+    /// E of the first state, in squared image units.
+    pub first_energy: f64,
+    /// E of the state returned.
+    pub energy: f64,
+    /// Neurons above their threshold in the last iteration looked at.
+    pub updated: u32,
+}
 
 /// The result of measuring one galaxy.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -11,8 +11,8 @@ use shearq_submissions::{Configuration, EllipticityType, Method};
 
 use self::linear::LinearFamily;
 use self::network::{NetworkPlan, NetworkWorker};
-use crate::deconvolve::Descent;
 use crate::error::MeasureError;
+use crate::measurement::Descent;
 use crate::measurement::{Coupling, Flag, Flags, Measurement, Observables, ResponseMatrix};
 use crate::noise::StampNoise;
 use crate::psf::ResidualProfiles;

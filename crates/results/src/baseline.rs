@@ -20,8 +20,9 @@ use shearq_scoring::{Metric, Metrics, Options};
 use shearq_submissions::{Configuration, ConfigurationError, Registry, checked_name};
 use thiserror::Error;
 
+use crate::catalogues::OWN;
 use crate::record::SetRecord;
-use crate::score::{OWN, score_folder};
+use crate::score::score_folder;
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]

@@ -8,11 +8,24 @@ use shearq_dataset::layout::{DataFolder, read_rows};
 use shearq_dataset::listing::Files;
 use shearq_dataset::run::{Run, Source};
 use shearq_files::FileError;
-use shearq_scoring::{Choice, FieldSum, Grid, Row, RowCounts};
+use shearq_files::table::most_rows;
+use shearq_scoring::{Choice, Convention, FieldSum, Grid, Row, RowCounts};
 
 use crate::foreign::{Foreign, Screen, folder_of, plain_columns};
-use crate::score::{COLUMNS, OWN, own_catalogue};
 use crate::submit::packed::{Packed, Sent, Submission, settings_of};
+
+/// The scored columns of catalogues by shearq.
+pub const COLUMNS: [&str; 4] = ["x", "y", "e1", "e2"];
+
+/// The convention of catalogues by shearq, which is the standard one by construction.
+pub const OWN: Choice = Choice::Insist(Convention::STANDARD);
+
+/// Reads catalogues by shearq.
+pub fn own_catalogue(grid: &Grid, path: &Path) -> Result<(FieldSum, RowCounts), FileError> {
+    let mut sum = FieldSum::new(grid);
+    let counts = sum.add_image(grid, read_rows(path, &COLUMNS, most_rows(grid.cells()))?);
+    Ok((sum, counts))
+}
 
 #[derive(Debug)]
 pub struct Catalogues {

@@ -4,10 +4,9 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Deserializer, Serialize};
 use shearq_quantities::{Distortion, MeasuredRange, Shear};
-use shearq_scoring::{FieldSum, Grid, Row, RowCounts};
+use shearq_scoring::{FieldSum, Grid, Row, RowCounts, RowFault};
 use shearq_submissions::{EllipticityType, checked_name};
 
-use crate::views::diagnosis::{ADVICE_ON_SENTINELS, fault_of_rows};
 use shearq_dataset::layout::read_rows;
 use shearq_dataset::layout::{IMAGE_PLACEHOLDERS, check_pattern};
 use shearq_dataset::listing::{self, Files};
@@ -283,6 +282,44 @@ pub fn plain_columns<'a>(
     move |grid, path| {
         let rows = read_rows(path, &columns, most_rows(grid.cells()))?;
         sum_foreign(grid, path, rows.into_iter().map(|row| screen.apply(row)))
+    }
+}
+
+/// What to do about numbers that stand for a failed measurement, on the command line.
+pub const ADVICE_ON_SENTINELS: &str =
+    "try --drop-missing or name it as missing; otherwise set a largest |e|";
+
+/// The reason not to score these rows, if there is one. `advice` on numbers that stand for a failed measurement depends
+/// on the caller: arrays have NaN instead of options.
+pub fn fault_of_rows(counts: &RowCounts, grid: &Grid, advice: &str) -> Option<String> {
+    let limit = RowCounts::ABSURD;
+    Some(match counts.fault()? {
+        RowFault::Sentinels {
+            rows,
+            first: (row, e1, e2),
+        } => format!(
+            "{rows} rows have a number that no measurement of an ellipticity gives, the first of them row {row} with ({}, {}): if it stands for \"not measured\", {advice}",
+            shown(e1),
+            shown(e2)
+        ),
+        RowFault::Absurd {
+            rows,
+            used,
+            first: (row, e1, e2),
+        } => format!(
+            "{rows} of {used} rows have |e| > {limit}, the first of them row {row} with ({e1}, {e2}); expected ellipticities, below 1. If these are outliers, set a largest |e|"
+        ),
+        RowFault::Repeated { rows, used } => format!(
+            "{rows} of {used} rows fall into cells that have a row already; expected positions in pixels, of {} px stamps on a {1} × {1} grid",
+            grid.stamp.0, grid.n
+        ),
+    })
+}
+
+pub fn shown(value: f64) -> String {
+    match value.abs() >= 1e7 {
+        true => format!("{value:e}"),
+        false => value.to_string(),
     }
 }
 

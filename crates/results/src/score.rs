@@ -3,13 +3,12 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use shearq_dataset::layout::DataFolder;
 use shearq_dataset::layout::MAX_SET;
-use shearq_dataset::layout::{DataFolder, read_rows};
 use shearq_dataset::run::Run;
 use shearq_dataset::run::kind_of;
 use shearq_dataset::truth::{ReadTruth, Reading, Sign, read_truth, reading_of};
 use shearq_files::FileError;
-use shearq_files::table::most_rows;
 use shearq_pipeline::{PipelineError, engine, inputs};
 use shearq_scoring::{
     Choice, Convention, ConventionMatch, Fault, FieldSum, Grid, ImageFaults, OddResponse, Options,
@@ -18,12 +17,6 @@ use shearq_scoring::{
 
 use crate::catalogues::Catalogues;
 use crate::record::SetRecord;
-
-/// The scored columns of catalogues by shearq.
-pub const COLUMNS: [&str; 4] = ["x", "y", "e1", "e2"];
-
-/// The convention of catalogues by shearq, which is the standard one by construction.
-pub const OWN: Choice = Choice::Insist(Convention::STANDARD);
 
 /// A scored set: its record, and what only its notes and plots need.
 #[derive(Debug, Clone)]
@@ -97,13 +90,6 @@ impl OddImages {
 /// Reads one catalogue onto the grid.
 pub type ReadImage<'a> =
     &'a (dyn Fn(&Grid, &Path) -> Result<(FieldSum, RowCounts), FileError> + Sync);
-
-/// A [`ReadImage`] for catalogues by shearq.
-pub fn own_catalogue(grid: &Grid, path: &Path) -> Result<(FieldSum, RowCounts), FileError> {
-    let mut sum = FieldSum::new(grid);
-    let counts = sum.add_image(grid, read_rows(path, &COLUMNS, most_rows(grid.cells()))?);
-    Ok((sum, counts))
-}
 
 struct SetFiles<'a> {
     // `None` for plain files.

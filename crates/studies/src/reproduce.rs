@@ -19,8 +19,8 @@ use shearq_pipeline::PipelineError;
 use shearq_pipeline::engine::Progress;
 use shearq_pipeline::run::{measurers, run_set};
 use shearq_pipeline::simulate::simulator;
+use shearq_results::catalogues::OWN;
 use shearq_results::record::SetRecord;
-use shearq_results::score::OWN;
 use shearq_simulate::kinds::SetKind;
 use shearq_simulate::set::{STAMP, SimulationSettings};
 

@@ -7,7 +7,7 @@ use std::ops::RangeInclusive;
 
 use fitsio::sys;
 
-use super::file::{lock, plain};
+use super::cfitsio::{lock, plain};
 use super::source::Source;
 use crate::error::FileError;
 

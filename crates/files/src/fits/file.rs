@@ -3,13 +3,13 @@
 use std::ffi::{CStr, CString, c_char, c_int};
 use std::path::Path;
 use std::ptr;
-use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use fitsio::sys;
 
 use super::cards::Cards;
+use super::cfitsio::{lock, plain};
 use super::source::Source;
-use super::tiles::Tiling;
+use super::tiling::Tiling;
 use crate::error::FileError;
 
 // Numbers of cfitsio's interface, from its fitsio.h.
@@ -44,22 +44,6 @@ impl ColumnValue for i64 {
 
 impl ColumnValue for u64 {
     const CODE: c_int = 80;
-}
-
-static CFITSIO: Mutex<()> = Mutex::new(());
-
-/// The lock around every cfitsio call. A panic elsewhere does not damage the state of cfitsio.
-pub fn lock() -> MutexGuard<'static, ()> {
-    CFITSIO.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
-pub fn plain(buffer: &[c_char]) -> String {
-    let bytes: Vec<u8> = buffer
-        .iter()
-        .take_while(|c| **c != 0)
-        .map(|c| c.to_ne_bytes()[0])
-        .collect();
-    String::from_utf8_lossy(&bytes).trim().to_owned()
 }
 
 /// cfitsio's words for a status, followed by the messages on its stack, which this empties. The first message is

@@ -8,12 +8,13 @@ use std::ptr;
 
 use fitsio::sys;
 
-use super::file::{ColumnValue, File, plain};
+use super::cfitsio::plain;
+use super::file::{ColumnValue, File};
 use super::tiles::Tiles;
 use crate::error::{FileError, names_of};
 use crate::frames::element_name;
 use crate::frames::polars::{Column, DataFrame};
-use crate::table::{MAX_ROWS, MAX_SIDE};
+use crate::{MAX_ROWS, MAX_SIDE};
 
 // Most numbers read from a table that has fewer bytes than that on disk.
 const FREE_NUMBERS: u64 = 1 << 22;

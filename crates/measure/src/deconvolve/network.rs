@@ -25,6 +25,7 @@ use shearq_submissions::{
 };
 
 use crate::error::{MeasureError, length};
+use crate::measurement::{Descent, Stop};
 use crate::pixel::{check_psf, check_sizes};
 use crate::transform::{Plane, Spectrum, ToModes, ToPixels, TransformScratch};
 
@@ -114,17 +115,6 @@ impl Rule {
     }
 }
 
-/// Why the network stopped.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-pub enum Stop {
-    /// No neuron exceeds its threshold.
-    Stable,
-    /// The next state would not have had a lower energy; which one is kept is a setting.
-    EnergyRise,
-    /// M iterations were made.
-    MaxIterations,
-}
-
 impl Stop {
     /// Code in catalogues: 0 stable, 1 energy rise, 2 most iterations.
     pub fn code(self) -> u32 {
@@ -134,21 +124,6 @@ impl Stop {
             Stop::MaxIterations => 2,
         }
     }
-}
-
-/// How the network went down in energy.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Descent {
-    /// Iterations whose state was accepted, or kept at the end.
-    pub iterations: u32,
-    /// Why it stopped.
-    pub stop: Stop,
-    /// E of the first state, in squared image units.
-    pub first_energy: f64,
-    /// E of the state returned.
-    pub energy: f64,
-    /// Neurons above their threshold in the last iteration looked at.
-    pub updated: u32,
 }
 
 /// A network for one stamp size, PSF size and λ, holding one PSF at a time.

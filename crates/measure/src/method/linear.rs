@@ -28,10 +28,10 @@ use super::{
 };
 use crate::centroid::{galaxy_centroid, window_centre};
 use crate::deconvolve::{
-    Descent, Gradients, Lags, ModeNoise, Spectral, SpectralPsf, SpectralScratch, Stop, uniform,
+    Gradients, Lags, ModeNoise, Spectral, SpectralPsf, SpectralScratch, uniform,
 };
 use crate::error::MeasureError;
-use crate::measurement::ResponseMatrix;
+use crate::measurement::{Descent, ResponseMatrix, Stop};
 use crate::neighbours::NeighbourRemover;
 use crate::noise::StampNoise;
 use crate::pixel::hash;

@@ -12,9 +12,9 @@ use shearq_measure::{Observables, Selection};
 use shearq_quantities::{Distortion, MeasuredRange};
 
 use crate::expression::{Expression, Operand, fits};
+use crate::foreign::shown;
 use crate::select::{READ, Weighted, require_responses};
 use crate::star_noise;
-use crate::views::diagnosis::shown;
 
 use super::Input;
 use super::columns::{

@@ -11,8 +11,9 @@ use shearq_scoring::{
 use super::challenge::{Kind, SpectrumLine, read_spectrum, wrong_multipoles};
 use super::manifest::{Contents, FileSum, Manifest};
 use super::packed::Sent;
-use crate::score::COLUMNS;
-use crate::views::diagnosis::{ADVICE_ON_SENTINELS, fault_of_rows, odd_response, words};
+use crate::catalogues::COLUMNS;
+use crate::foreign::{ADVICE_ON_SENTINELS, fault_of_rows};
+use crate::views::diagnosis::{odd_response, words};
 use shearq_dataset::layout::read_rows;
 use shearq_files::FileError;
 use shearq_files::table::most_rows;

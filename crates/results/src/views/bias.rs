@@ -9,9 +9,9 @@ use shearq_render::figure::{Band, FigureError, LinePlot, PanelGrid, Series, Styl
 use shearq_render::html::{Block, Picture, Section};
 use shearq_render::table::{Cell, Heading, Table};
 
-use super::diagnosis::shown;
 use super::junit::{Case, document};
 use crate::bias::{BiasResult, BinResult};
+use crate::foreign::shown;
 
 /// Units above which Student's t differs from a normal distribution by less than 5 %.
 const MANY_UNITS: usize = 30;

@@ -11,6 +11,7 @@ use shearq_submissions::Published;
 
 use crate::compare::{Group, Grouping, Paired, Variant, difference, keep_common_sets};
 use crate::record::{RunRecord, SetRecord, columns_named, mean};
+use crate::score::ScoredSet;
 use crate::views::diagnosis::of_sets;
 use crate::views::scores::{best_is_another, definition_note, notes, zero_shear_note};
 
@@ -342,6 +343,12 @@ pub fn verdict_on_runs(groups: &[Group]) -> Option<String> {
         .iter()
         .map(|group| (group.name(), group.run.sets.as_slice()));
     verdict(&named.collect::<Vec<_>>())
+}
+
+pub fn verdict_line(name: &str, scored: &[ScoredSet]) -> Option<String> {
+    let with_power = scored.iter().filter(|set| set.score.constant.is_none());
+    let records: Vec<SetRecord> = with_power.map(|set| set.record.clone()).collect();
+    verdict(&[(name.to_owned(), &records)])
 }
 
 // Chosen by hand: with few methods, a difference of 3σ by chance is rare enough for an advice.

@@ -2,47 +2,9 @@
 
 use std::path::PathBuf;
 
-use shearq_scoring::{Fault, Grid, ImageFaults, OddResponse, RowCounts, RowFault};
+use shearq_scoring::{Fault, ImageFaults, OddResponse, RowCounts};
 
 use crate::score::OddImages;
-
-/// What to do about numbers that stand for a failed measurement, on the command line.
-pub const ADVICE_ON_SENTINELS: &str =
-    "try --drop-missing or name it as missing; otherwise set a largest |e|";
-
-/// The reason not to score these rows, if there is one. `advice` on numbers that stand for a failed measurement depends
-/// on the caller: arrays have NaN instead of options.
-pub fn fault_of_rows(counts: &RowCounts, grid: &Grid, advice: &str) -> Option<String> {
-    let limit = RowCounts::ABSURD;
-    Some(match counts.fault()? {
-        RowFault::Sentinels {
-            rows,
-            first: (row, e1, e2),
-        } => format!(
-            "{rows} rows have a number that no measurement of an ellipticity gives, the first of them row {row} with ({}, {}): if it stands for \"not measured\", {advice}",
-            shown(e1),
-            shown(e2)
-        ),
-        RowFault::Absurd {
-            rows,
-            used,
-            first: (row, e1, e2),
-        } => format!(
-            "{rows} of {used} rows have |e| > {limit}, the first of them row {row} with ({e1}, {e2}); expected ellipticities, below 1. If these are outliers, set a largest |e|"
-        ),
-        RowFault::Repeated { rows, used } => format!(
-            "{rows} of {used} rows fall into cells that have a row already; expected positions in pixels, of {} px stamps on a {1} × {1} grid",
-            grid.stamp.0, grid.n
-        ),
-    })
-}
-
-pub fn shown(value: f64) -> String {
-    match value.abs() >= 1e7 {
-        true => format!("{value:e}"),
-        false => value.to_string(),
-    }
-}
 
 /// A line for each kind of odd row in the catalogues of `whose`: how many there are, and how they are scored.
 pub fn oddities(counts: &RowCounts, whose: &str) -> Vec<String> {
@@ -245,7 +207,10 @@ pub fn prefix(set: Option<u32>) -> String {
 
 #[cfg(test)]
 mod tests {
+    use shearq_scoring::Grid;
+
     use super::*;
+    use crate::foreign::fault_of_rows;
 
     #[test]
     fn a_fault_of_several_sets_is_one_line_with_advice() {

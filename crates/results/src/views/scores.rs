@@ -11,7 +11,6 @@ use shearq_scoring::{
 
 use crate::record::{SetRecord, definition_word, mean, metric_cell};
 use crate::score::{Basis, ScoredSet};
-use crate::views::comparison::verdict;
 use crate::views::{diagnosis, spectrum};
 
 fn kind_cell(record: &SetRecord) -> Cell {
@@ -152,12 +151,6 @@ fn believable(set: &ScoredSet) -> &[Fault] {
         [Fault::Biased { .. }] if !odd.constant.is_empty() => &[],
         all => all,
     }
-}
-
-pub fn verdict_line(name: &str, scored: &[ScoredSet]) -> Option<String> {
-    let with_power = scored.iter().filter(|set| set.score.constant.is_none());
-    let records: Vec<SetRecord> = with_power.map(|set| set.record.clone()).collect();
-    verdict(&[(name.to_owned(), &records)])
 }
 
 fn set_cell(record: &SetRecord) -> Cell {
