@@ -421,10 +421,12 @@ def test_errors_contain_the_noise_of_stars_that_galaxies_share(tmp_path):
         for variance, g in zip(added, plain):
             # m·g is a hundredth of it; variances of the shear are a hundred times larger.
             assert variance == pytest.approx((m * g) ** 2 + c_noise**2, rel=1e-9)
-    # Two stars halve it, up to the responses of their galaxies.
+    # Of two stars each adds a quarter, by its own noise, up to the responses of their galaxies.
     added, plain = more(shearq.concatenate([a, c]))
+    stars = [(rows["psf_m"][0], rows["psf_c"][0]) for rows in (a, c)]
     for variance, g in zip(added, plain):
-        assert variance == pytest.approx(((m * g) ** 2 + c_noise**2) / 2, rel=0.1)
+        expected = sum((m * g) ** 2 + c_noise**2 for m, c_noise in stars) / 4
+        assert variance == pytest.approx(expected, rel=0.1)
     both = shearq.mean_shear([a, c])
     assert both.g1_error == shearq.concatenate([a, c]).mean_shear().g1_error
     # A star for each galaxy, and a formula, have no noise that is shared.
