@@ -204,7 +204,8 @@ def scan(found, options):
                     elif any(not np.array_equal(a, b, equal_nan=True) for a, b in zip(base, other)):
                         rows.append(row | change(base, other))
             print(f"{constant.key}: {summary(constant.key, rows, True)}", flush=True)
-    return {"scanned": [constant.key for constant in tunable], "rows": rows}
+    scanned = [constant.key for constant in tunable]
+    return {"galaxies": options.galaxies, "seed": options.seed, "scanned": scanned, "rows": rows}
 
 
 def summary(key, rows, scanned):
@@ -250,7 +251,7 @@ def page(found, result, options):
         origin = c.origin.replace("|", "\\|") or "–"
         rows.append(f"| `{c.path}` `{c.name}` | `{c.value}` | {origin} | {effect} |")
     head = PAGE.format(
-        count=len(found), scanned=len(result["scanned"]), cases=len(SCANNED), galaxies=options.galaxies, seed=options.seed
+        count=len(found), scanned=len(result["scanned"]), cases=len(SCANNED), galaxies=result["galaxies"], seed=result["seed"]
     )
     options.page.write_text(head + "\n".join(rows) + "\n")
 
