@@ -35,7 +35,7 @@ pub enum ScoringError {
         side: usize,
     },
     /// The side of the field is out of range.
-    #[error("the field has {found} degrees per side; expected {least} to {most}")]
+    #[error("the field has {found:?} degrees per side; expected {least} to {most}")]
     Field {
         /// The side in degrees.
         found: f64,

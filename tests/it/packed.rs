@@ -150,7 +150,10 @@ fn a_submission_is_scored_as_it_is_sent() {
         refused(&archive_path, expected);
     }
     refused(&packed.at("absent"), "there is no such folder");
-    refused(&packed.file(1), "there is no such folder");
+    refused(
+        &packed.file(1),
+        "this is a file; expected a folder or an archive",
+    );
     fs::write(packed.file(1), good).unwrap();
     refused(&sent, "the files disagree with manifest.json");
 }

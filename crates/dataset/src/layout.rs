@@ -108,6 +108,21 @@ impl Layout {
     }
 }
 
+/// Checks that `folder` is a folder. `expected` describes it in the error.
+pub fn check_folder(folder: &Path, expected: &str) -> Result<(), FileError> {
+    let found = if folder.is_dir() {
+        return Ok(());
+    } else if folder.exists() {
+        "this is a file"
+    } else {
+        "there is no such folder"
+    };
+    Err(FileError::new(
+        folder,
+        format!("{found}; expected {expected}"),
+    ))
+}
+
 #[derive(Debug, Clone)]
 pub struct DataFolder {
     root: PathBuf,
@@ -118,12 +133,7 @@ impl DataFolder {
     /// Opens a folder, with the layout of its `layout.toml` or the default one.
     pub fn open(root: impl AsRef<Path>) -> Result<Self, FileError> {
         let root = root.as_ref().to_owned();
-        if !root.is_dir() {
-            return Err(FileError::new(
-                &root,
-                "there is no such folder; expected a data folder",
-            ));
-        }
+        check_folder(&root, "a data folder")?;
         let path = root.join(LAYOUT_FILE);
         let layout = if is_there(&path) {
             let text = open::read_to_string(&path, open::SETTINGS)

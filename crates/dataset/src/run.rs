@@ -5,7 +5,7 @@ use std::path::{Component, Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use shearq_submissions::Configuration;
 
-use crate::layout::{DataFolder, Layout, fill};
+use crate::layout::{DataFolder, Layout, check_folder, fill};
 use crate::listing::{self, Files};
 use crate::record::read_record;
 use shearq_files::FileError;
@@ -138,21 +138,6 @@ impl Run {
         let ending = self.format.extension();
         format!("set{{set:02}}/catalogue-{{image:03}}.{ending}")
     }
-}
-
-/// Checks that `folder` is a folder. `expected` describes it in the error.
-pub fn check_folder(folder: &Path, expected: &str) -> Result<(), FileError> {
-    let found = if folder.is_dir() {
-        return Ok(());
-    } else if folder.exists() {
-        "this is a file"
-    } else {
-        "there is no such folder"
-    };
-    Err(FileError::new(
-        folder,
-        format!("{found}; expected {expected}"),
-    ))
 }
 
 /// Opens the data folder that a command is to read images from.

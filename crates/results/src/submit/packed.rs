@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use super::archive::{self, Unpacked, is_archive};
 use super::challenge::Kind;
 use super::manifest::{FileSum, MANIFEST_FILE, Manifest};
-use shearq_dataset::layout::DataFolder;
+use shearq_dataset::layout::{DataFolder, check_folder};
 use shearq_dataset::run::{Run, way};
 use shearq_files::FileError;
 use shearq_files::atomic::Scratch;
@@ -106,11 +106,7 @@ impl Submission {
 
     pub fn read(sent: &Sent) -> Result<Self, FileError> {
         let whole = |message: String| FileError::new(&sent.given, message);
-        if !sent.path.is_dir() {
-            return Err(whole(
-                "there is no such folder; expected a folder or an archive (.tar.gz)".into(),
-            ));
-        }
+        check_folder(&sent.path, "a folder or an archive (.tar.gz)")?;
         let files = sent
             .files()
             .map_err(FileError::doing(&sent.given, "cannot list the folder"))?;
@@ -171,7 +167,8 @@ pub fn settings_of(run: &Run, path: &Path) -> Result<String, FileError> {
 
 /// Whether a path is an archive, or a folder that `pack` wrote.
 pub fn is_packed(path: &Path) -> bool {
-    is_archive(path) || is_there(&path.join(MANIFEST_FILE))
+    // Below a file, the system's answer is an error other than "not found", which counts as there.
+    is_archive(path) || (path.is_dir() && is_there(&path.join(MANIFEST_FILE)))
 }
 
 fn verified(sent: &Sent, files: &[PathBuf]) -> Result<Option<Manifest>, FileError> {

@@ -567,13 +567,20 @@ pub fn check(all: &Estimate, limits: &[Limit]) -> Vec<Checked> {
                 checks.push(unknown(&key));
                 continue;
             };
-            // An unknown error fails too.
+            // An unknown error fails, too: without it, a value cannot be distinguished from the limit.
             let passed = value.abs() - limit.sigma * error <= limit.limit;
-            checks.push(Checked {
-                text: format!(
+            let text = match error.is_nan() {
+                true => format!(
+                    "|{key}| cannot be compared with its limit, because its standard error is unknown (found {value:.2e}, expected at most {:e}). Try: more catalogues or galaxies",
+                    limit.limit
+                ),
+                false => format!(
                     "|{key}| exceeds its limit (found {value:.2e} ± {error:.1e}, expected at most {:e} within {} standard errors)",
                     limit.limit, limit.sigma
                 ),
+            };
+            checks.push(Checked {
+                text,
                 key,
                 failed: !passed,
             });

@@ -54,7 +54,7 @@ fn rows(count: usize) -> String {
 pub fn words(finding: &Fault) -> String {
     match *finding {
         Fault::StrongTruth { rms } => format!(
-            "the true shear is too strong for weak lensing (rms {rms:.3}, expected below 0.3). Is it in percent, or another quantity?"
+            "the true shear is too strong for weak lensing (rms {rms:.3}, expected below 0.3); it may be in percent, or another quantity"
         ),
         Fault::Convention {
             scored,
