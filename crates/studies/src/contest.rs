@@ -95,8 +95,9 @@ pub fn contest_table(
     biases: &[SetBiases],
 ) -> Result<Table, PipelineError> {
     let costs = plan.configurations.iter();
-    let costs = costs.map(|configuration| speed::whole(configuration, plan.simulation));
-    let costs = costs.collect::<Result<Vec<f64>, _>>()?;
+    let costs =
+        costs.map(|configuration| Ok(speed::costs(configuration, plan.simulation)?.measure));
+    let costs = costs.collect::<Result<Vec<f64>, PipelineError>>()?;
     let configurations = 0..plan.configurations.len();
     let mut rows: Vec<Row<'_>> = Vec::new();
     for (result, bias) in results.iter().zip(biases) {
