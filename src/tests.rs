@@ -1,8 +1,91 @@
-//! Every pair of options of a command is used or refused.
+//! The options that go together, and the commands of the documents.
 
-use clap::{Arg, Command, CommandFactory};
+use clap::{Arg, Command, CommandFactory, Parser};
 
-use crate::Cli;
+use crate::{Cli, causes};
+
+// As a shell splits a line: quoted text is one word, and a redirection ends the command.
+fn words(line: &str) -> Vec<String> {
+    let (mut words, mut word, mut quote) = (Vec::new(), None::<String>, None);
+    for c in line.chars() {
+        match quote {
+            Some(open) if c == open => quote = None,
+            None if c == '\'' || c == '"' => {
+                quote = Some(c);
+                word.get_or_insert_default();
+            }
+            None if c.is_whitespace() => words.extend(word.take()),
+            _ => word.get_or_insert_default().push(c),
+        }
+    }
+    words.extend(word);
+    words.into_iter().take_while(|word| word != ">").collect()
+}
+
+// The commands in the documents, except those with shell variables. A backslash joins two lines.
+fn documented() -> Vec<(String, String)> {
+    let mut found = Vec::new();
+    let mut pages = vec!["README.md".into(), "CONTRIBUTING.md".into()];
+    pages.extend(
+        std::fs::read_dir("docs")
+            .unwrap()
+            .map(|entry| entry.unwrap().path())
+            .filter(|path| path.extension().is_some_and(|ending| ending == "md")),
+    );
+    for page in pages {
+        let text = std::fs::read_to_string(&page).unwrap();
+        let text = text.replace("\\\n", " ");
+        let mut inside = false;
+        for line in text.lines() {
+            if line.starts_with("```") {
+                inside = !inside;
+            } else if inside && line.starts_with("shearq ") && !line.contains('$') {
+                found.push((page.display().to_string(), line.to_owned()));
+            }
+        }
+    }
+    found
+}
+
+#[test]
+fn causes_are_printed_once() {
+    let error = anyhow::anyhow!("no space")
+        .context("cannot write: no space")
+        .context("out.csv");
+    assert_eq!(causes(&error), "out.csv: cannot write: no space");
+    assert_eq!(causes(&anyhow::anyhow!("a").context("b")), "b: a");
+}
+
+#[test]
+fn documented_commands_parse() {
+    let commands = documented();
+    assert!(commands.len() > 20);
+    for (page, line) in commands {
+        let line = line.split(" #").next().unwrap_or(&line);
+        let parsed = Cli::try_parse_from(words(line));
+        assert!(parsed.is_ok(), "{page}: {line}: {}", parsed.unwrap_err());
+    }
+}
+
+#[test]
+fn every_command_has_examples_that_parse() {
+    for command in Cli::command().get_subcommands() {
+        let help = command
+            .get_after_help()
+            .map(ToString::to_string)
+            .unwrap_or_default();
+        let start = format!("  shearq {}", command.get_name());
+        let examples: Vec<&str> = help
+            .lines()
+            .filter(|line| line.starts_with(&start))
+            .collect();
+        assert!(!examples.is_empty(), "{}: {help}", command.get_name());
+        for example in examples {
+            let parsed = Cli::try_parse_from(words(example));
+            assert!(parsed.is_ok(), "{example}: {}", parsed.unwrap_err());
+        }
+    }
+}
 
 // The ways to use each command, and the options that each way uses. Two options without a common way must be
 // refused.
@@ -103,7 +186,7 @@ const WAYS: [(&str, &[&str]); 32] = [
         "study",
         &["submission sets images pairs grid seed amplitude tilt out format threads"],
     ),
-    ("bench", &["submission catalogues format threads"]),
+    ("bench", &["submission format threads"]),
     ("submissions list", &["format"]),
     ("submissions show", &["NAME|FILE"]),
     ("submissions init", &["FILE method"]),
