@@ -10,7 +10,7 @@ use crate::arguments::{Form, Threads};
 use crate::progress::Bar;
 use crate::{made_by, tell};
 use shearq_render::page::Page;
-use shearq_studies::calibration::{best_table, calibrate, curves_table, figures};
+use shearq_studies::calibration::{best_table, calibrate, figures};
 
 /// Find the regularisation parameter λ of a configuration, as in Sect. 4 of the paper.
 ///
@@ -70,7 +70,6 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         let mut page = Page::new(out, &title, "Simulated data", made_by);
         page.section("Curves", "Figs 4 to 7 of the paper.");
         figures(&mut page, &curves)?;
-        page.data("curves", &curves_table(&curves))?;
         page.section("λ", "The best λ at each S/N, and the chosen λ.");
         page.table("lambda", &table)?;
         page.save()?;

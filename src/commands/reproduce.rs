@@ -10,14 +10,11 @@ use crate::arguments::{SetList, Threads, given_once};
 use crate::progress::{Bar, goes_on};
 use crate::{made_by, print, print_table, tell};
 use shearq_dataset::layout::MAX_IMAGE;
-use shearq_pipeline::run::{measurers, simulated_steps};
-use shearq_pipeline::simulate::simulator;
 use shearq_render::page::Page;
-use shearq_results::views::steps::{steps_figure, steps_row};
 use shearq_simulate::set::SimulationSettings;
-use shearq_studies::calibration::{self, calibrate};
+use shearq_studies::calibration::{best_table, calibrate};
 use shearq_studies::exhibits;
-use shearq_studies::reproduce::{Plan, SetResult, Study, run_sets};
+use shearq_studies::reproduce::{Plan, Study, run_sets};
 
 /// Reproduce the figures and tables of the paper on simulated data.
 ///
@@ -60,22 +57,23 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         out,
         images,
         grid,
-        sets,
-        submission,
         galaxies,
         seed,
-        threads,
+        ..
     } = arguments;
-    let threads = threads.number();
-    given_once(submission)?;
-    let sets = sets.simulated()?;
+    let threads = arguments.threads.number();
+    let sets = arguments.sets.simulated()?;
     let registry = Registry::embedded()?;
-    let configurations = of_table_one(&registry, submission)?;
+    let configurations = of_table_one(&registry, &arguments.submission)?;
+    let names: Vec<String> = configurations
+        .iter()
+        .map(|(own, _)| own.name.clone())
+        .collect();
     let plan = Plan {
         version: shearq_dataset::VERSION.into(),
         simulation: SimulationSettings::new(*seed, usize::from(*grid)),
         images: *images,
-        configurations: configurations.iter().map(|(s, _)| s.clone()).collect(),
+        configurations: configurations.iter().map(|(own, _)| own.clone()).collect(),
     };
     let total = sets.len() as u64 * u64::from(*images) * u64::from(*grid).pow(2);
     let mut bar = Bar::new("simulating and measuring", total);
@@ -97,7 +95,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         ("Calibration", format!("{galaxies} synthetic galaxies")),
         ("Settings of the calibration", toml::to_string(&base)?),
     ]);
-    study.check()?;
+    study.claim.check()?;
     let mut page = Page::new(
         out,
         "Hopfield Neural Network deconvolution, reproduced",
@@ -105,17 +103,16 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         settings,
     );
     let table_one = exhibits::table_one(&results, &configurations);
-    let names: Vec<String> = names(&configurations);
-    let calibration = calibration::best_table(&curves, &base);
-    method(&mut page, &plan)?;
-    page.section("Calibration of λ (Sect. 4)", SECT_FOUR);
-    calibration::figures(&mut page, &curves)?;
-    page.table("calibration", &calibration)?;
-    page.data("fig5-7-lambda", &calibration::curves_table(&curves))?;
-    page.section("Configurations (Sect. 5)", SECT_FIVE);
-    page.table("table1", &table_one)?;
-    sect_five(&mut page, &results, &names)?;
-    study.check()?;
+    let calibration = best_table(&curves, &base);
+    exhibits::exhibits(
+        &mut page,
+        exhibits::steps(&plan)?,
+        (&curves, &calibration),
+        &table_one,
+        &results,
+        &names,
+    )?;
+    study.claim.check()?;
     page.save()?;
     print_table(&table_one)?;
     print("\n")?;
@@ -127,87 +124,20 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     Ok(())
 }
 
-const SECT_THREE: &str = "The network deconvolves a stamp. The ellipticity is measured on the autocorrelation (ACF) of the result, after subtracting the mean of its edge. The ACF is clipped at the radius that contains 89 % of the largest enclosed light.";
-const SECT_FOUR: &str = "Exponential galaxies are convolved with a Moffat PSF each and have white noise of 10, 20 or 40 dB. Both updating rules deconvolve them with λ from 10⁻⁶ to 10⁶. All data are simulated.";
-const SECT_FIVE: &str = "Configurations of Table 1 on sets of Table 2. The images are simulated, not the challenge's. Unpublished properties are chosen here: distributions of S/N and size, PSF fields and shear spectra. Metrics are for the standard convention and the leaderboard definition. Errors come from the part of the ellipticities that the truth does not explain.";
-
 // The configurations of Table 1 with these names, in its order; all if `wanted` is empty.
 fn of_table_one(
     registry: &Registry,
     wanted: &[String],
 ) -> anyhow::Result<Vec<(Configuration, Published)>> {
-    let all = registry.published()?;
-    let known = names(&all);
+    given_once(wanted)?;
+    let mut all = registry.published()?;
+    let known: Vec<String> = all.iter().map(|(own, _)| own.name.clone()).collect();
     if let Some(name) = wanted.iter().find(|name| !known.contains(name)) {
         bail!(
             "--submission: not in Table 1 (found {name}, expected one of {}). Try: shearq study --submission {name}",
             known.join(", ")
         );
     }
-    let chosen = |name: &String| wanted.is_empty() || wanted.contains(name);
-    Ok(all.into_iter().filter(|(s, _)| chosen(&s.name)).collect())
-}
-
-// Fig. 3: the steps of one galaxy at S/N 10, 20 and 40.
-fn method(page: &mut Page<'_>, plan: &Plan) -> anyhow::Result<()> {
-    page.section("The method (Sect. 3)", SECT_THREE);
-    let name = "23/raw/star";
-    let Some(submission) = plan.configurations.iter().find(|s| s.name == name) else {
-        return Ok(());
-    };
-    let mut rows = Vec::new();
-    for (set, snr) in [(5, 10), (2, 20), (8, 40)] {
-        let simulator = simulator(set, plan.simulation)?;
-        let measurer = &measurers(std::slice::from_ref(submission))?[0];
-        if let Some(steps) = simulated_steps(&simulator, measurer, 1, (1, 1))? {
-            rows.push(steps_row(&format!("S/N {snr}"), steps));
-        }
-    }
-    page.figure(
-        "fig3-steps",
-        &steps_figure(name, rows),
-        "As Fig. 3 of the paper: from a stamp to its clipped autocorrelation, for a galaxy at S/N 10, 20 and 40.",
-    )?;
-    Ok(())
-}
-
-fn names(configurations: &[(Configuration, Published)]) -> Vec<String> {
-    configurations.iter().map(|(s, _)| s.name.clone()).collect()
-}
-
-// Figs 8 to 11 and their tables.
-fn sect_five(page: &mut Page<'_>, results: &[SetResult], names: &[String]) -> anyhow::Result<()> {
-    let images = results.first().map_or(0, |set| set.images);
-    page.figure(
-        "fig8-q-per-set",
-        &exhibits::q_per_set(results, names),
-        "As Fig. 8 of the paper: quality factor per set and configuration.",
-    )?;
-    let place = |name: &str| names.iter().position(|n| n == name);
-    if let (Some(raw), Some(den)) = (place("23/raw/star"), place("23/den/star")) {
-        let both = [(raw, "23/raw/star"), (den, "23/den/star")];
-        page.table("denoising", &exhibits::denoising_table(results, &both))?;
-        page.figure(
-            "fig9-power-spectra",
-            &exhibits::power_spectra(results, den, "23/den/star"),
-            &format!("As Fig. 9 of the paper: true and measured shear power spectra of 23/den/star. The measured spectra contain the noise of {images} images."),
-        )?;
-        let spectra = exhibits::power_spectra_table(results, den);
-        page.data("fig9-power-spectra", &spectra)?;
-        let title = "Multiplicative bias per set";
-        page.figure(
-            "fig10-multiplicative",
-            &exhibits::bias_per_set(results, &both, |f| f.m_half, title, "M/2"),
-            "As Fig. 10 of the paper: multiplicative bias per set.",
-        )?;
-        let title = "Additive bias per set";
-        page.figure(
-            "fig11-additive",
-            &exhibits::bias_per_set(results, &both, |f| f.sqrt_a, title, "√A × 10⁴"),
-            "As Fig. 11 of the paper: additive bias per set.",
-        )?;
-    }
-    page.section("Every set", "The data of the figures per set.");
-    page.table("fig8-11-per-set", &exhibits::per_set_table(results))?;
-    Ok(())
+    all.retain(|(own, _)| wanted.is_empty() || wanted.contains(&own.name));
+    Ok(all)
 }

@@ -92,7 +92,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     for configuration in &plan.configurations {
         made_by.push((configuration.name.clone(), toml::to_string(configuration)?));
     }
-    study.check()?;
+    study.claim.check()?;
     let mut page = Page::new(out, "Configurations compared", "Simulated data", made_by);
     let [shapes, quality] = contest_parts(&table);
     page.section("Ellipticities", "Scatter and biases on every kind of set.");
@@ -105,7 +105,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     page.section("Spectra", "Quality on every kind of set, and cost.");
     page.table("quality", &quality)?;
     page.data("study", &table)?;
-    study.check()?;
+    study.claim.check()?;
     page.save()?;
     if matches!(form.format, TableFormat::Csv | TableFormat::Json) {
         return form.print(&table);

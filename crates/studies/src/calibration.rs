@@ -173,9 +173,6 @@ impl Curves {
 const CHUNK: u64 = 8;
 
 /// Deconvolves synthetic galaxies with the settings of a configuration, by both rules.
-///
-/// # Errors
-/// If the configuration has the linear method or invalid sizes.
 pub fn calibrate(
     configuration: &Configuration,
     galaxies: u64,
@@ -188,19 +185,14 @@ pub fn calibrate(
     engine::ordered(
         threads,
         |feeder| {
-            for first in (0..galaxies).step_by(CHUNK as usize) {
-                if !feeder.push(first..(first + CHUNK).min(galaxies)) {
-                    break;
-                }
-            }
+            let mut firsts = (0..galaxies).step_by(CHUNK as usize);
+            firsts.all(|first| feeder.push(first..(first + CHUNK).min(galaxies)));
             Ok(())
         },
-        || planned.scratch(),
-        |scratch, range: std::ops::Range<u64>| {
+        || planned.worker(),
+        |worker, mut range: std::ops::Range<u64>| {
             let mut curves = Curves::new();
-            for galaxy in range {
-                planned.galaxy(seed, galaxy, scratch, &mut curves)?;
-            }
+            range.try_for_each(|galaxy| planned.galaxy(seed, galaxy, worker, &mut curves))?;
             Ok(curves)
         },
         |more| {
@@ -220,13 +212,10 @@ struct LambdaStudy {
     acf: ClippedAcf,
 }
 
-struct Scratch {
+// A network for each λ, and scratch.
+struct Worker {
     networks: Vec<Network>,
-    buffers: Buffers,
-}
-
-struct Buffers {
-    network: NetworkScratch,
+    scratch: NetworkScratch,
     acf: ClippedAcfScratch,
     out: Vec<f32>,
 }
@@ -234,7 +223,7 @@ struct Buffers {
 struct Synthetic {
     original: Vec<f32>,
     convolved: Vec<f64>,
-    // Of the sum or peak that the configuration asks for.
+    // With the sum or peak of 1 that the configuration asks for.
     psf: Array2<f64>,
     shape: Distortion,
     noise: Vec<f64>,
@@ -261,14 +250,12 @@ impl LambdaStudy {
         })
     }
 
-    fn scratch(&self) -> Scratch {
-        Scratch {
+    fn worker(&self) -> Worker {
+        Worker {
             networks: self.networks.clone(),
-            buffers: Buffers {
-                network: self.networks[0].scratch(),
-                acf: self.acf.scratch(),
-                out: vec![0.0; self.n * self.n],
-            },
+            scratch: self.networks[0].scratch(),
+            acf: self.acf.scratch(),
+            out: vec![0.0; self.n * self.n],
         }
     }
 
@@ -276,11 +263,11 @@ impl LambdaStudy {
         &self,
         seed: u64,
         number: u64,
-        Scratch { networks, buffers }: &mut Scratch,
+        worker: &mut Worker,
         curves: &mut Curves,
     ) -> Result<(), PipelineError> {
         let galaxy = self.draw(seed, number)?;
-        for network in networks.iter_mut() {
+        for network in &mut worker.networks {
             network.set_psf(galaxy.psf.view(), PsfScale::Sum)?;
         }
         for (rule, (update, _)) in UPDATES.into_iter().enumerate() {
@@ -290,14 +277,13 @@ impl LambdaStudy {
             };
             for (sums, snr) in curves.over_lambda[rule].iter_mut().zip(SNR_DB) {
                 let observed = observe(&galaxy, snr);
-                for (sum, network) in sums.iter_mut().zip(&*networks) {
-                    sum.add(&self.run(network, &settings, &galaxy, &observed, buffers)?);
+                for (lambda, sum) in sums.iter_mut().enumerate() {
+                    sum.add(&self.run(worker, lambda, &settings, &galaxy, &observed)?);
                 }
             }
-            let network = &networks[FIG_4_LAMBDA];
             for (sum, snr) in curves.over_snr[rule].iter_mut().zip(FIG_4_SNR_DB) {
                 let observed = observe(&galaxy, snr);
-                sum.add(&self.run(network, &settings, &galaxy, &observed, buffers)?);
+                sum.add(&self.run(worker, FIG_4_LAMBDA, &settings, &galaxy, &observed)?);
             }
         }
         curves.galaxies += 1;
@@ -357,12 +343,18 @@ impl LambdaStudy {
 
     fn run(
         &self,
-        network: &Network,
+        worker: &mut Worker,
+        lambda: usize,
         settings: &NetworkDeconvolution,
         galaxy: &Synthetic,
         (stamp, sigma): &(Vec<f32>, f64),
-        buffers: &mut Buffers,
     ) -> Result<LambdaSums, PipelineError> {
+        let Worker {
+            networks,
+            scratch,
+            acf,
+            out,
+        } = worker;
         let mut sums = LambdaSums {
             galaxies: 1,
             ..LambdaSums::default()
@@ -381,7 +373,7 @@ impl LambdaStudy {
                 }
             }
         };
-        let descent = network.trace(&rule, stamp, &mut buffers.network, &mut buffers.out, count)?;
+        let descent = networks[lambda].trace(&rule, stamp, scratch, out, count)?;
         (sums.correct, sums.transitions) = (correct, transitions);
         let [c, t] = [correct as f64, transitions as f64];
         sums.transition_squares = [c * c, t * t, c * t];
@@ -390,12 +382,12 @@ impl LambdaStudy {
             let pixels = image.iter().zip(original);
             pixels.map(|(v, u)| f64::from(v - u).powi(2)).sum()
         };
-        let dsnr = 10.0 * (distance(stamp) / distance(&buffers.out)).log10();
+        let dsnr = 10.0 * (distance(stamp) / distance(out)).log10();
         sums.dsnr = [dsnr, dsnr * dsnr];
-        let light = buffers.out.iter().map(|&v| f64::from(v)).sum();
+        let light = out.iter().map(|&v| f64::from(v)).sum();
         let shape = self
             .acf
-            .measure(&buffers.out, light, &mut buffers.acf)?
+            .measure(out, light, acf)?
             .and_then(|moments| moments.distortion());
         if let Ok(Distortion { e1, e2 }) = shape {
             let deviation = (e1 - galaxy.shape.e1).powi(2) + (e2 - galaxy.shape.e2).powi(2);
@@ -435,18 +427,14 @@ fn both_rules<'a>(
     sums: impl Fn(usize) -> &'a [LambdaSums],
     value: fn(&LambdaSums) -> Measured,
 ) -> Vec<Series> {
-    let series = UPDATES.iter().enumerate().map(|(rule, (_, name))| {
-        let style = if rule == 0 {
-            Style::Dashed
-        } else {
-            Style::Line
-        };
+    let series = UPDATES.iter().zip([Style::Dashed, Style::Line]).enumerate();
+    let series = series.map(|(rule, ((_, name), style))| {
         curve(name, x.to_vec(), sums(rule), value, (style, rule))
     });
     series.collect()
 }
 
-/// Draws Figs 4 to 7.
+/// Draws Figs 4 to 7 and writes their data.
 pub fn figures(page: &mut Page<'_>, curves: &Curves) -> Result<(), PageError> {
     let lambda = LOG_LAMBDA.map(|log| 10f64.powf(log));
     page.figure(
@@ -509,31 +497,26 @@ pub fn figures(page: &mut Page<'_>, curves: &Curves) -> Result<(), PageError> {
             plots: SNR_DB.iter().enumerate().map(panel).collect(),
         },
         "As Fig. 7 of the paper: 1/RMSD of the ellipticities against λ for both updates.",
-    )
+    )?;
+    page.data("curves", &curves_table(curves))
 }
 
 fn measured((value, error): Measured, decimals: usize) -> Cell {
     Cell::with_error(value, Some(error), decimals)
 }
 
-// A curve over λ with its rule and S/N.
-type NamedCurve<'a> = (&'static str, f64, &'a [LambdaSums]);
-
-fn named_curves(curves: &Curves) -> Vec<NamedCurve<'_>> {
-    let mut named: Vec<NamedCurve<'_>> = Vec::new();
-    for ((_, name), of_rule) in UPDATES.iter().zip(&curves.over_lambda) {
-        named.extend(
-            SNR_DB
-                .iter()
-                .zip(of_rule)
-                .map(|(snr, curve)| (*name, *snr, &curve[..])),
-        );
-    }
-    named
+// The curves over λ with the names of their rules and their S/N.
+fn named_curves(curves: &Curves) -> Vec<(&'static str, f64, &[LambdaSums])> {
+    let rules = UPDATES.iter().zip(&curves.over_lambda);
+    let of_rule = rules.flat_map(|((_, name), of_rule)| {
+        let of_snr = SNR_DB.iter().zip(of_rule);
+        of_snr.map(|(snr, curve)| (*name, *snr, curve.as_slice()))
+    });
+    of_rule.collect()
 }
 
-/// All curves over λ as one table: the data of Figs 5 to 7.
-pub fn curves_table(curves: &Curves) -> Table {
+// All curves over λ as one table: the data of Figs 5 to 7.
+fn curves_table(curves: &Curves) -> Table {
     let mut rows = Vec::new();
     for (rule, snr, curve) in named_curves(curves) {
         let points = LOG_LAMBDA.iter().zip(curve);
@@ -559,16 +542,14 @@ pub fn curves_table(curves: &Curves) -> Table {
     table
 }
 
-fn place_of_best(curve: &[LambdaSums], value: fn(&LambdaSums) -> Measured) -> usize {
-    let at = |k: usize| value(&curve[k]).0;
-    let best = (0..curve.len()).max_by(|a, b| at(*a).total_cmp(&at(*b)));
-    best.unwrap_or(0)
-}
-
 /// The best λ at each S/N and the values at 10⁻⁴.
 pub fn best_table(curves: &Curves, configuration: &Configuration) -> Table {
     let rows = named_curves(curves);
-    let best = |curve: &[LambdaSums]| place_of_best(curve, LambdaSums::inverse_rmsd);
+    let best = |curve: &[LambdaSums]| {
+        let at = |k: &usize| curve[*k].inverse_rmsd().0;
+        let best = (0..curve.len()).max_by(|a, b| at(a).total_cmp(&at(b)));
+        best.unwrap_or(0)
+    };
     let mut table = Table::titled(format!(
         "Calibration of λ for {} on {} synthetic galaxies",
         configuration.name, curves.galaxies

@@ -4,11 +4,10 @@ use serde::{Deserialize, Serialize};
 use shearq_scoring::resample::mean_over_sets;
 
 use super::bias::{ShearBias, biases};
-use super::bound::{cramer_rao, ensemble_bound, expected_q};
+use super::bound::{cramer_rao, expected_q};
 use super::reproduce::{ConfigurationResult, Plan, SetResult, Study};
 use super::response::Response;
 use super::speed;
-use shearq_dataset::record::read_record;
 use shearq_pipeline::PipelineError;
 use shearq_pipeline::engine::Progress;
 use shearq_pipeline::run::measurers;
@@ -23,8 +22,6 @@ pub struct SetBiases {
     /// Cramér–Rao bound on the scatter of ε per component, if there is one.
     pub bound: Option<f64>,
     pub bound_error: Option<f64>,
-    /// Bound on the scatter of shears from elliptical galaxies with the best weights, if there is one.
-    pub ensemble_bound: Option<f64>,
     /// Expected Q for the images of the plan with a scatter at the bound.
     #[serde(rename = "limit")]
     pub expected_q: Option<f64>,
@@ -32,8 +29,7 @@ pub struct SetBiases {
     pub biases: Vec<ShearBias>,
 }
 
-/// Measures biases on the galaxies of `images` images of each set. The result of each set is written as soon as it
-/// is known; existing results are read.
+/// Measures biases on the galaxies of `images` images of each set.
 pub fn bias_sets(
     study: &Study<'_>,
     sets: &[u32],
@@ -41,41 +37,30 @@ pub fn bias_sets(
     threads: usize,
     progress: &mut dyn Progress,
 ) -> Result<Vec<SetBiases>, PipelineError> {
-    let &Study { plan, folder, .. } = study;
+    let plan = study.plan;
     let measurers = measurers(&plan.configurations)?;
     let numbers: Vec<u32> = (1..=images).collect();
-    let path = |set: u32| folder.join(format!("bias/set{set:02}-{images}.json"));
-    let mut found = Vec::new();
-    for &set in sets {
-        let path = path(set);
-        if let Some(result) = read_record::<SetBiases>(&path)? {
-            found.push(result);
-            progress.skip(u64::from(images) * (plan.simulation.grid as u64).pow(2));
-            continue;
-        }
+    let path = |set: u32| format!("bias/set{set:02}-{images}.json").into();
+    study.each_set(sets, images, path, progress, |set, progress| {
         let simulator = simulator(set, plan.simulation)?;
         progress.note(&format!("set {set:02}"));
+        let scoring = |source| PipelineError::Scoring {
+            set: Some(set),
+            source,
+        };
         let (bound, bound_error) = cramer_rao(&simulator).unzip();
-        let expected_q = bound.map(|bound| expected_q(&simulator, bound, plan.images));
-        let result = SetBiases {
+        let expected_q = match bound {
+            Some(bound) => Some(expected_q(&simulator, bound, plan.images).map_err(scoring)?),
+            None => None,
+        };
+        Ok(SetBiases {
             set,
             bound,
             bound_error,
-            ensemble_bound: ensemble_bound(&simulator).map(|(bound, _)| bound),
-            expected_q: expected_q
-                .transpose()
-                .map_err(|source| PipelineError::Scoring {
-                    set: Some(set),
-                    source,
-                })?
-                .map(|expected| expected.spectra),
+            expected_q,
             biases: biases(&simulator, &numbers, &measurers, threads, progress)?,
-        };
-        study.keep(&path, &result)?;
-        found.push(result);
-    }
-    study.check_results(sets.iter().map(|&set| path(set)))?;
-    Ok(found)
+        })
+    })
 }
 
 enum Row<'a> {
@@ -144,29 +129,6 @@ pub fn contest_table(
             Cell::with_error(scatter / bound, Some(scatter / bound * relative), 3)
         },
     );
-    shapes(
-        &mut table,
-        "scatter_over_ensemble",
-        "/ ensemble",
-        &|own, set, _| {
-            Cell::number(
-                own.rms_scatter() / set.ensemble_bound.unwrap_or(f64::NAN),
-                3,
-            )
-        },
-    );
-    shapes(&mut table, "total", "total", &|own, _, _| {
-        Cell::number(own.rms_total(), 4)
-    });
-    shapes(&mut table, "total_over_bound", "/ bound", &|own, set, _| {
-        let (total, scatter) = (own.rms_total(), own.rms_scatter());
-        let bound = set.bound.unwrap_or(f64::NAN);
-        // Intrinsic shapes are the rest of the total, whatever the noise.
-        Cell::number(
-            total / (total * total - scatter * scatter + bound * bound).sqrt(),
-            4,
-        )
-    });
     for (key, k) in [("m1", 0), ("m2", 1)] {
         shapes(&mut table, key, &format!("{key}×10³"), &|_, _, bias| {
             Cell::with_error(bias.m[k] * 1e3, Some(bias.m_error[k] * 1e3), 1)
@@ -213,7 +175,7 @@ pub fn contest_table(
         Cell::number(costs[place(row)], 0)
     });
     table.notes = vec![
-        "Scatter of ε per component after division by its response, and its ratio to the Cramér–Rao bound of a sample of the galaxies, were they round. Ensemble: the bound on shears from the same galaxies with their ellipticities, of unknown flux and size, with the best weights. Offset bulges have no bound. Total: the scatter with intrinsic shapes, and its ratio to that with noise at the bound. If S/N differ, galaxies of low S/N count less, and the scatter can be below the bound.".into(),
+        "Scatter of ε per component after division by its response, and its ratio to the Cramér–Rao bound of a sample of the galaxies, were they round. Offset bulges have no bound. If S/N differ, galaxies of low S/N count less, and the scatter can be below the bound.".into(),
         "m and c: from galaxies drawn with shears of ± 0.02, intrinsic ellipticities ± e and noise of either sign. Leakage: c along the ellipticity of the PSF. Unmeasured: galaxies without ellipticity; they are left out.".into(),
         "Q of the catalogues, and of cross-spectra between groups of images, which noise does not bias; leaderboard definition, standard convention. Expected Q: mean Q of a perfect method with noise at the bound.".into(),
     ];

@@ -1,162 +1,122 @@
-//! Sect. 5 of the paper from the results of its configurations: Table 1, Figs 8 to 11, and the effect of denoising on
-//! ellipticities.
+//! The page of `shearq reproduce`: Fig. 3, Table 1 and Figs 8 to 11 of the paper, and what denoising does to ellipticities.
 
-use shearq_render::figure::{ColourMap, HeatMap, LinePlot, PanelGrid, Series, Style};
+use ndarray::Array2;
+use shearq_pipeline::PipelineError;
+use shearq_pipeline::run::{measurers, simulated_steps};
+use shearq_pipeline::simulate::simulator;
+use shearq_render::figure::{ColourMap, HeatMap, ImageRow, LinePlot, PanelGrid, Series, Style};
+use shearq_render::page::{Page, PageError};
 use shearq_render::table::{Cell, Table};
 use shearq_results::views::spectrum;
+use shearq_results::views::steps::{steps_figure, steps_row};
 use shearq_scoring::Metrics;
 use shearq_simulate::kinds::{ImageType, SetKind, shares};
 use shearq_submissions::{Configuration, PsfForm, Published};
 
-use crate::reproduce::{ConfigurationResult, SetResult};
+use crate::calibration::{self, Curves};
+use crate::reproduce::{ConfigurationResult, Plan, SetResult};
 use crate::response::Response;
-
-// Images per set of the challenge. The published metrics contain the noise of so many images.
-const PUBLISHED_IMAGES: u32 = 200;
 
 type Metric = fn(&Metrics) -> f64;
 
-// Keys of our, the published and the distance column, label, unit, our and the published metric, and its decimals.
-type Beside = (
-    [&'static str; 3],
-    &'static str,
-    &'static str,
-    Metric,
-    fn(&Published) -> f64,
-    usize,
-);
+// The paper shows these two in Figs 3 and 9 to 11.
+const RAW: &str = "23/raw/star";
+const DENOISED: &str = "23/den/star";
+
+const SECT_THREE: &str = "The network deconvolves a stamp. The ellipticity is measured on the autocorrelation (ACF) of the result, after subtracting the mean of its edge. The ACF is clipped at the radius that contains 89 % of the largest enclosed light.";
+const SECT_FOUR: &str = "Exponential galaxies are convolved with a Moffat PSF each and have white noise of 10, 20 or 40 dB. Both updating rules deconvolve them with λ from 10⁻⁶ to 10⁶. All data are simulated.";
+const SECT_FIVE: &str = "Configurations of Table 1 on sets of Table 2. The images are simulated, not the challenge's. Unpublished properties are chosen here: distributions of S/N and size, PSF fields and shear spectra. Metrics are for the standard convention and the leaderboard definition. Errors come from the part of the ellipticities that the truth does not explain.";
+
+fn metric_of(result: &ConfigurationResult, metric: Metric) -> (f64, f64) {
+    let score = &result.score;
+    (metric(&score.metrics), metric(&score.errors))
+}
 
 fn over_sets(results: &[SetResult], place: usize, metric: Metric) -> Vec<(f64, f64)> {
-    let score = |set: &SetResult| {
-        let score = &set.results[place].score;
-        (metric(&score.metrics), metric(&score.errors))
-    };
-    results.iter().map(score).collect()
+    let of_set = |set: &SetResult| metric_of(&set.results[place], metric);
+    results.iter().map(of_set).collect()
 }
 
-// Mean of values with errors over the challenge's 24 sets.
-fn weighted(results: &[SetResult], values: &[(f64, f64)]) -> (f64, f64) {
-    let sets: Vec<u32> = results.iter().map(|set| set.set).collect();
-    // One simulated set may stand for several of the challenge, so that it counts as often as its kind does there.
-    let weighted = values.iter().zip(shares(&sets));
-    let (mean, variance) =
-        weighted.fold((0.0, 0.0), |(mean, variance), ((value, error), share)| {
-            (mean + share * value, variance + (share * error).powi(2))
-        });
-    (mean, variance.sqrt())
-}
-
+// Mean over the challenge's 24 sets, of which one simulated set stands for all of its kind.
 fn mean_of_24(results: &[SetResult], place: usize, metric: Metric) -> (f64, f64) {
-    weighted(results, &over_sets(results, place, metric))
+    let sets: Vec<u32> = results.iter().map(|set| set.set).collect();
+    let (mut mean, mut variance) = (0.0, 0.0);
+    for ((value, error), share) in over_sets(results, place, metric)
+        .into_iter()
+        .zip(shares(&sets))
+    {
+        mean += share * value;
+        variance += (share * error).powi(2);
+    }
+    (mean, variance.sqrt())
 }
 
 fn measured((value, error): (f64, f64), decimals: usize) -> Cell {
     Cell::with_error(value, Some(error), decimals)
 }
 
-fn kind_of(set: u32) -> &'static str {
-    SetKind::of(set).map_or("", |kind| kind.image.label())
-}
-
 /// Table 1: our metrics beside the published ones.
 pub fn table_one(results: &[SetResult], configurations: &[(Configuration, Published)]) -> Table {
-    // With fewer images, noise alone would put our metrics many errors from the published ones.
-    let as_published = results.iter().all(|set| set.images == PUBLISHED_IMAGES);
     let rows: Vec<_> = configurations.iter().enumerate().collect();
-    let yes = |yes: bool| Cell::text(if yes { "Y" } else { "N" });
     let mut table = Table::titled("Table 1: configurations over all sets (simulated data)");
-    table.column("method", "Method", &rows, |(_, (own, _))| {
-        Cell::text(&own.name)
+    let mut words = |key, label, detail, word: &dyn Fn(&Configuration) -> String| {
+        let place = table.column(key, label, &rows, |(_, (own, _))| Cell::text(word(own)));
+        table.headings[place].detail = detail;
+    };
+    words("method", "Method", false, &|own| own.name.clone());
+    words("size", "Size", true, &|own| {
+        format!("{0}×{0}", own.stamp.size)
     });
-    let size = |own: &Configuration| Cell::text(format!("{0}×{0}", own.stamp.size));
-    let details = [
-        table.column("size", "Size", &rows, |(_, (own, _))| size(own)),
-        table.column("denoised", "Den", &rows, |(_, (own, _))| {
-            yes(own.wavelet().is_some())
-        }),
-        table.column("psf", "PSF", &rows, |(_, (own, _))| {
-            Cell::text(match own.psf.form {
-                PsfForm::Star => "Star",
-                PsfForm::Functional => "Func",
-            })
-        }),
-    ];
-    let mean =
-        |place: usize, metric, decimals| measured(mean_of_24(results, place, metric), decimals);
-    let beside: [Beside; 3] = [
-        (
-            ["m_half", "m_half_published", "m_half_apart"],
-            "M/2",
-            "",
-            |f| f.m_half,
-            |p| p.m_half,
-            4,
-        ),
-        (
-            ["sqrt_a", "sqrt_a_published", "sqrt_a_apart"],
-            "√A",
-            "×10⁴",
-            |f| f.sqrt_a,
-            |p| p.sqrt_a,
-            4,
-        ),
-        (
-            ["q", "q_published", "q_apart"],
-            "Q",
-            "",
-            |f| f.q,
-            |p| p.q,
-            2,
-        ),
-    ];
-    let mut apart = Vec::new();
-    for ([own, publ, distance], label, unit, metric, value, decimals) in beside {
-        table.column(own, format!("{label}{unit}"), &rows, |(place, _)| {
-            mean(*place, metric, decimals)
+    words("denoised", "Den", true, &|own| match own.wavelet() {
+        Some(_) => "Y".into(),
+        None => "N".into(),
+    });
+    words("psf", "PSF", true, &|own| match own.psf.form {
+        PsfForm::Star => "Star".into(),
+        PsfForm::Functional => "Func".into(),
+    });
+    type InTable = Option<(&'static str, &'static str, fn(&Published) -> f64)>;
+    let mut metric = |key, label, metric: Metric, published: InTable, decimals| {
+        table.column(key, label, &rows, |(place, _)| {
+            measured(mean_of_24(results, *place, metric), decimals)
         });
-        table.column(publ, format!("{label} publ."), &rows, |(_, (_, publ))| {
-            Cell::number(value(publ), decimals)
-        });
-        let label = format!("{label} apart");
-        apart.push(table.column(distance, label, &rows, |(place, (_, publ))| {
-            // The paper gives no errors, so that ours alone are the unit.
-            let (mean, error) = mean_of_24(results, *place, metric);
-            match as_published {
-                true => Cell::number((mean - value(publ)) / error, 1),
-                false => Cell::Empty,
-            }
-        }));
-    }
-    table.column("q_calibrated", "Q calibrated", &rows, |(place, _)| {
-        mean(*place, |f| f.q_calibrated, 2)
-    });
-    table.column("q_dn", "Q_dn", &rows, |(place, _)| {
-        mean(*place, |f| f.q_dn, 1)
-    });
-    table.column("m_cross", "m (cross)", &rows, |(place, _)| {
-        mean(*place, |f| f.m_cross, 4)
-    });
-    let apart = apart.into_iter().filter(|_| !as_published);
-    for place in details.into_iter().chain(apart) {
-        table.headings[place].detail = true;
-    }
+        if let Some((key, label, value)) = published {
+            table.column(key, label, &rows, |(_, (_, published))| {
+                Cell::number(value(published), decimals)
+            });
+        }
+    };
+    let m_half: InTable = Some(("m_half_published", "M/2 publ.", |p| p.m_half));
+    metric("m_half", "M/2", |f| f.m_half, m_half, 4);
+    let sqrt_a: InTable = Some(("sqrt_a_published", "√A publ.", |p| p.sqrt_a));
+    metric("sqrt_a", "√A×10⁴", |f| f.sqrt_a, sqrt_a, 4);
+    metric(
+        "q",
+        "Q",
+        |f| f.q,
+        Some(("q_published", "Q publ.", |p| p.q)),
+        2,
+    );
+    metric("q_calibrated", "Q calibrated", |f| f.q_calibrated, None, 2);
+    metric("q_dn", "Q_dn", |f| f.q_dn, None, 1);
+    metric("m_cross", "m (cross)", |f| f.m_cross, None, 4);
     table.notes = vec![
         "Q calibrated: after dividing the bandpowers by (1 + m)², with m by cross-correlation with the truth; unknown if the response of a set is less than 3σ above zero.".into(),
-        format!("Apart: our metric minus the published one, in our standard errors, if sets have {PUBLISHED_IMAGES} images as in the challenge."),
         "Means over sets: each kind of image counts as often as among the challenge's 24 sets; absent kinds do not count.".into(),
         "Standard convention, leaderboard definition. Errors come from the part of the spectra that the truth does not explain. Published metrics refer to the challenge's images, 200 per set.".into(),
     ];
     table
 }
 
-/// Fig. 8: Q per set and configuration.
-pub fn q_per_set(results: &[SetResult], names: &[String]) -> HeatMap {
+// Fig. 8: Q per set and configuration.
+fn q_per_set(results: &[SetResult], names: &[String]) -> HeatMap {
     let mut columns: Vec<String> = results.iter().map(|set| set.set.to_string()).collect();
     columns.push("mean".into());
-    let values = ndarray::Array2::from_shape_fn((names.len(), columns.len()), |(place, k)| {
-        let over = over_sets(results, place, |f| f.q);
-        let mean = || mean_of_24(results, place, |f| f.q);
-        over.get(k).copied().unwrap_or_else(mean).0
+    let values = Array2::from_shape_fn((names.len(), columns.len()), |(place, k)| {
+        match results.get(k) {
+            Some(set) => set.results[place].score.metrics.q,
+            None => mean_of_24(results, place, |f| f.q).0,
+        }
     });
     HeatMap {
         title: "Quality factor per set".into(),
@@ -171,100 +131,93 @@ pub fn q_per_set(results: &[SetResult], names: &[String]) -> HeatMap {
     }
 }
 
-/// Metrics of every set and configuration: the data of Figs 8, 10 and 11.
-pub fn per_set_table(results: &[SetResult]) -> Table {
-    let rows: Vec<(u32, &ConfigurationResult)> = results
-        .iter()
-        .flat_map(|set| set.results.iter().map(|own| (set.set, own)))
-        .collect();
+// Metrics of every set and configuration: the data of Figs 8, 10 and 11.
+fn per_set_table(results: &[SetResult]) -> Table {
+    let of_set = |set: &'_ SetResult| -> Vec<_> {
+        let all = set.results.iter().cloned();
+        all.map(|own| (set.set, own)).collect()
+    };
+    let rows: Vec<(u32, ConfigurationResult)> = results.iter().flat_map(of_set).collect();
     let mut table = Table::titled("Every set and configuration");
-    table.column("set", "Set", &rows, |(set, _)| {
-        Cell::number(f64::from(*set), 0)
+    table.column("set", "Set", &rows, |row| Cell::number(f64::from(row.0), 0));
+    table.column("kind", "Kind", &rows, |row| {
+        Cell::text(SetKind::of(row.0).map_or("", |kind| kind.image.label()))
     });
-    table.column("kind", "Kind", &rows, |(set, _)| Cell::text(kind_of(*set)));
     table.column("submission", "Configuration", &rows, |(_, own)| {
         Cell::text(&own.configuration)
     });
-    let metric = |table: &mut Table, key, label: &str, metric: Metric, decimals| {
+    let mut metric = |key, label, metric: Metric, decimals| {
         table.column(key, label, &rows, |(_, own)| {
-            let score = &own.score;
-            measured((metric(&score.metrics), metric(&score.errors)), decimals)
+            measured(metric_of(own, metric), decimals)
         });
     };
-    metric(&mut table, "q", "Q", |f| f.q, 2);
-    table.column("q_leaderboard", "Q leaderboard", &rows, |(_, own)| {
-        Cell::number(own.score.q_leaderboard, 2)
-    });
-    metric(&mut table, "q_dn", "Q_dn", |f| f.q_dn, 1);
-    metric(&mut table, "m_half", "M/2", |f| f.m_half, 4);
-    metric(&mut table, "sqrt_a", "√A×10⁴", |f| f.sqrt_a, 4);
-    metric(&mut table, "m_cross", "m (cross)", |f| f.m_cross, 4);
+    metric("q", "Q", |f| f.q, 2);
+    metric("q_dn", "Q_dn", |f| f.q_dn, 1);
+    metric("m_half", "M/2", |f| f.m_half, 4);
+    metric("sqrt_a", "√A×10⁴", |f| f.sqrt_a, 4);
+    metric("m_cross", "m (cross)", |f| f.m_cross, 4);
+    metric("q_calibrated", "Q calibrated", |f| f.q_calibrated, 2);
     table.column("conventions", "Conv. matched/best", &rows, |(_, own)| {
         let best = own.score.convention_leaderboard;
         Cell::text(format!("{}/{best}", own.convention_matched))
     });
-    metric(
-        &mut table,
-        "q_calibrated",
-        "Q calibrated",
-        |f| f.q_calibrated,
-        2,
-    );
-    for (k, key, label) in [(0, "slope1", "slope e1"), (1, "slope2", "slope e2")] {
-        table.column(key, label, &rows, |(_, own)| {
-            measured((own.response.slope[k], own.response.slope_error[k]), 3)
-        });
-    }
-    table.column("scatter", "scatter / slope", &rows, |(_, own)| {
-        let response = &own.response;
-        measured((response.rms_scatter(), response.rms_scatter_error()), 4)
-    });
+    responses(&mut table, &rows, |(_, own)| vec![own.response]);
     table.column("flagged", "Flagged", &rows, |(_, own)| {
         Cell::number(own.response.flagged as f64, 0)
     });
     table
 }
 
-/// Fig. 9: true and measured shear power spectra, a panel per set.
-pub fn power_spectra(results: &[SetResult], place: usize, name: &str) -> PanelGrid {
+// Columns with the slope and scatter of ellipticities, which are means over the responses of a row.
+fn responses<R>(table: &mut Table, rows: &[R], of: impl Fn(&R) -> Vec<Response>) {
+    let mut mean = |key, label, value: &dyn Fn(&Response) -> (f64, f64), decimals| {
+        table.column(key, label, rows, |row| {
+            // Sets have the same number of galaxies, so that an unweighted mean is the best.
+            let all: Vec<(f64, f64)> = of(row).iter().map(value).collect();
+            let count = all.len() as f64;
+            let mean = all.iter().map(|(value, _)| value).sum::<f64>() / count;
+            let variance: f64 = all.iter().map(|(_, error)| error * error).sum();
+            measured((mean, variance.sqrt() / count), decimals)
+        });
+    };
+    mean("slope1", "slope e1", &|r| (r.slope[0], r.slope_error[0]), 3);
+    mean("slope2", "slope e2", &|r| (r.slope[1], r.slope_error[1]), 3);
+    let scatter = |r: &Response| (r.rms_scatter(), r.rms_scatter_error());
+    mean("scatter", "scatter / slope", &scatter, 4);
+}
+
+// Fig. 9: true and measured shear power spectra, a panel per set, and its data.
+fn power_spectra(results: &[SetResult], place: usize, name: &str) -> (PanelGrid, Table) {
     let panel = |set: &SetResult| {
         let own = &set.results[place];
         let powers = [&set.l, &set.true_ee, &own.ee, &own.ee_error];
         spectrum::panel(Some(set.set), SetKind::of(set.set), powers, None)
     };
-    PanelGrid {
+    let figure = PanelGrid {
         title: format!("Shear power spectra of {name}"),
         columns: 4,
         plots: results.iter().map(panel).collect(),
-    }
-}
-
-/// The data of Fig. 9.
-pub fn power_spectra_table(results: &[SetResult], place: usize) -> Table {
-    let rows: Vec<(&SetResult, usize)> = results
-        .iter()
-        .flat_map(|set| spectrum::bins(&set.l).map(move |b| (set, b)))
-        .collect();
-    let mut table = Table::titled("Shear power spectra");
-    table.column("set", "Set", &rows, |(set, _)| {
-        Cell::number(f64::from(set.set), 0)
-    });
-    table.column("bin", "Bin", &rows, |(_, b)| {
-        Cell::number(*b as f64 + 1.0, 0)
-    });
-    table.column("l", "ℓ", &rows, |(set, b)| Cell::number(set.l[*b], 1));
-    table.column("true", "true", &rows, |(set, b)| {
-        Cell::number(set.true_ee[*b], 9)
-    });
-    table.column("measured", "measured", &rows, |(set, b)| {
+    };
+    let bins = |set: &'_ SetResult| -> Vec<_> {
         let own = &set.results[place];
-        measured((own.ee[*b], own.ee_error[*b]), 9)
-    });
-    table
+        let bin = |b: usize| {
+            let measured = (own.ee[b], own.ee_error[b]);
+            (set.set, b + 1, set.l[b], set.true_ee[b], measured)
+        };
+        spectrum::bins(&set.l).map(bin).collect()
+    };
+    let rows: Vec<_> = results.iter().flat_map(bins).collect();
+    let mut table = Table::titled("Shear power spectra");
+    table.column("set", "Set", &rows, |row| Cell::number(f64::from(row.0), 0));
+    table.column("bin", "Bin", &rows, |row| Cell::number(row.1 as f64, 0));
+    table.column("l", "ℓ", &rows, |row| Cell::number(row.2, 1));
+    table.column("true", "true", &rows, |row| Cell::number(row.3, 9));
+    table.column("measured", "measured", &rows, |row| measured(row.4, 9));
+    (figure, table)
 }
 
-/// Figs 10 and 11: M/2 or √A per set for the configurations at `places`.
-pub fn bias_per_set(
+// Figs 10 and 11: M/2 or √A per set for the configurations at `places`.
+fn bias_per_set(
     results: &[SetResult],
     places: &[(usize, &str)],
     metric: Metric,
@@ -288,59 +241,104 @@ pub fn bias_per_set(
     }
 }
 
-/// Slope, scatter and offset of ellipticities at S/N 10, 20 and 40 with and without denoising: the
-/// means over the sets of these kinds for the configurations at `places`.
-pub fn denoising_table(results: &[SetResult], places: &[(usize, &str)]) -> Table {
-    let kinds = [
+// Means over the sets of S/N 10, 20 and 40 for the configurations at `places`.
+fn denoising_table(results: &[SetResult], places: &[(usize, &str)]) -> Table {
+    let mut rows: Vec<(f64, &str, Vec<Response>)> = Vec::new();
+    for (snr, kind) in [
         (10.0, ImageType::LowSnr),
         (20.0, ImageType::Fiducial),
         (40.0, ImageType::HighSnr),
-    ];
-    let mut rows: Vec<(f64, &str, Vec<Response>)> = Vec::new();
-    for (snr, kind) in kinds {
+    ] {
         for &(place, name) in places {
             let own = |set: &&SetResult| SetKind::of(set.set).is_some_and(|own| own.image == kind);
-            let responses = results.iter().filter(own);
-            let responses: Vec<_> = responses.map(|set| set.results[place].response).collect();
-            if !responses.is_empty() {
-                rows.push((snr, name, responses));
-            }
+            let of_kind = results.iter().filter(own);
+            rows.push((
+                snr,
+                name,
+                of_kind.map(|set| set.results[place].response).collect(),
+            ));
         }
     }
+    rows.retain(|(.., responses)| !responses.is_empty());
     let mut table = Table::titled("Ellipticities with and without denoising (simulated data)");
     table.column("snr", "S/N", &rows, |(snr, ..)| Cell::number(*snr, 0));
     table.column("submission", "Configuration", &rows, |(_, name, _)| {
         Cell::text(*name)
     });
-    let mut mean = |key, label, of: &dyn Fn(&Response) -> (f64, f64), decimals| {
-        table.column(key, label, &rows, |(_, _, responses)| {
-            // Sets have the same number of galaxies, so that an unweighted mean is the best.
-            let count = responses.len() as f64;
-            let all = responses.iter().map(of);
-            let (value, square) = all.fold((0.0, 0.0), |(value, square), (v, error)| {
-                (value + v, square + error * error)
-            });
-            measured((value / count, square.sqrt() / count), decimals)
-        });
-    };
-    mean("slope1", "slope e1", &|r| (r.slope[0], r.slope_error[0]), 3);
-    mean("slope2", "slope e2", &|r| (r.slope[1], r.slope_error[1]), 3);
-    let scatter = |r: &Response| (r.rms_scatter(), r.rms_scatter_error());
-    mean("scatter", "scatter / slope", &scatter, 4);
-    mean(
-        "offset1",
-        "offset e1",
-        &|r| (r.offset[0], r.offset_error[0]),
-        4,
-    );
-    mean(
-        "offset2",
-        "offset e2",
-        &|r| (r.offset[1], r.offset_error[1]),
-        4,
-    );
+    responses(&mut table, &rows, |(.., responses)| responses.clone());
     table.notes = vec![
         "Reported ellipticity against the true shear-type one of each galaxy; scatter per component about the line, divided by the slope.".into(),
     ];
     table
+}
+
+/// The steps of one galaxy at S/N 10, 20 and 40, as in Fig. 3, if the plan has the configuration of that figure.
+pub fn steps(plan: &Plan) -> Result<Vec<ImageRow>, PipelineError> {
+    let configuration = plan.configurations.iter().find(|own| own.name == RAW);
+    let measurers = measurers(configuration.map_or(&[][..], std::slice::from_ref))?;
+    let mut rows = Vec::new();
+    for measurer in &measurers {
+        for (set, snr) in [(5, 10), (2, 20), (8, 40)] {
+            let simulator = simulator(set, plan.simulation)?;
+            if let Some(steps) = simulated_steps(&simulator, measurer, 1, (1, 1))? {
+                rows.push(steps_row(&format!("S/N {snr}"), steps));
+            }
+        }
+    }
+    Ok(rows)
+}
+
+/// Sects 3 to 5: the steps of the method, the calibration of λ, Table 1 and Figs 4 to 11.
+pub fn exhibits(
+    page: &mut Page<'_>,
+    steps: Vec<ImageRow>,
+    (curves, calibration): (&Curves, &Table),
+    table_one: &Table,
+    results: &[SetResult],
+    names: &[String],
+) -> Result<(), PageError> {
+    page.section("The method (Sect. 3)", SECT_THREE);
+    if !steps.is_empty() {
+        page.figure(
+            "fig3-steps",
+            &steps_figure(RAW, steps),
+            "As Fig. 3 of the paper: from a stamp to its clipped autocorrelation, for a galaxy at S/N 10, 20 and 40.",
+        )?;
+    }
+    page.section("Calibration of λ (Sect. 4)", SECT_FOUR);
+    calibration::figures(page, curves)?;
+    page.table("calibration", calibration)?;
+    page.section("Configurations (Sect. 5)", SECT_FIVE);
+    page.table("table1", table_one)?;
+    page.figure(
+        "fig8-q-per-set",
+        &q_per_set(results, names),
+        "As Fig. 8 of the paper: quality factor per set and configuration.",
+    )?;
+    let [at_raw, at_den] = [RAW, DENOISED].map(|name| names.iter().position(|own| own == name));
+    if let (Some(at_raw), Some(at_den)) = (at_raw, at_den) {
+        let both = [(at_raw, RAW), (at_den, DENOISED)];
+        page.table("denoising", &denoising_table(results, &both))?;
+        let images = results.first().map_or(0, |set| set.images);
+        let (figure, table) = power_spectra(results, at_den, DENOISED);
+        let caption = format!(
+            "As Fig. 9 of the paper: true and measured shear power spectra of 23/den/star. The measured spectra contain the noise of {images} images."
+        );
+        page.figure("fig9-power-spectra", &figure, &caption)?;
+        page.data("fig9-power-spectra", &table)?;
+        let title = "Multiplicative bias per set";
+        page.figure(
+            "fig10-multiplicative",
+            &bias_per_set(results, &both, |f| f.m_half, title, "M/2"),
+            "As Fig. 10 of the paper: multiplicative bias per set.",
+        )?;
+        let title = "Additive bias per set";
+        page.figure(
+            "fig11-additive",
+            &bias_per_set(results, &both, |f| f.sqrt_a, title, "√A × 10⁴"),
+            "As Fig. 11 of the paper: additive bias per set.",
+        )?;
+    }
+    page.section("Every set", "The data of the figures per set.");
+    page.table("fig8-11-per-set", &per_set_table(results))
 }

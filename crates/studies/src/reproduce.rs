@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use shearq_scoring::quality::{quality, quality_error};
 use shearq_scoring::{
@@ -29,7 +30,6 @@ pub struct Plan {
     pub version: String,
     pub simulation: SimulationSettings,
     pub images: u32,
-    /// All settings of the configurations.
     pub configurations: Vec<Configuration>,
 }
 
@@ -38,7 +38,7 @@ pub struct Plan {
 pub struct Study<'a> {
     pub plan: &'a Plan,
     pub folder: &'a Path,
-    claim: Claim,
+    pub claim: Claim,
 }
 
 impl<'a> Study<'a> {
@@ -50,24 +50,33 @@ impl<'a> Study<'a> {
         })
     }
 
-    /// Checks that the folder is still the claimed one.
-    pub fn check(&self) -> Result<(), FileError> {
-        self.claim.check()
-    }
-
-    /// Writes a result to a path of the folder. Writing would create a removed folder again, without the earlier
-    /// results, so the folder is checked first.
-    pub(super) fn keep<R: Serialize>(&self, path: &Path, result: &R) -> Result<(), FileError> {
-        self.check()?;
-        write_record(path, result)
-    }
-
-    /// Checks that the folder is still the claimed one and contains all `results`.
-    pub(super) fn check_results(
+    // The result of each set, which is written to `path` as soon as it is known. Existing results, of `images` images, are
+    // read.
+    pub(super) fn each_set<R: Serialize + DeserializeOwned>(
         &self,
-        results: impl IntoIterator<Item = PathBuf>,
-    ) -> Result<(), FileError> {
-        self.claim.check_results(results)
+        sets: &[u32],
+        images: u32,
+        path: impl Fn(u32) -> PathBuf,
+        progress: &mut dyn Progress,
+        mut measure: impl FnMut(u32, &mut dyn Progress) -> Result<R, PipelineError>,
+    ) -> Result<Vec<R>, PipelineError> {
+        let path = |set: u32| self.folder.join(path(set));
+        let mut results = Vec::new();
+        for &set in sets {
+            if let Some(result) = read_record(&path(set))? {
+                progress.skip(u64::from(images) * (self.plan.simulation.grid as u64).pow(2));
+                results.push(result);
+                continue;
+            }
+            let result = measure(set, progress)?;
+            // Writing would make a removed folder again, without its earlier results.
+            self.claim.check()?;
+            write_record(&path(set), &result)?;
+            results.push(result);
+        }
+        self.claim
+            .check_results(sets.iter().map(|&set| path(set)))?;
+        Ok(results)
     }
 }
 
@@ -76,18 +85,18 @@ pub struct ConfigurationResult {
     #[serde(deserialize_with = "checked_name")]
     #[serde(rename = "submission")]
     pub configuration: String,
-    /// Its score in the standard convention, leaderboard definition.
+    /// Standard convention, leaderboard definition.
     #[serde(flatten)]
     pub score: SetRecord,
     /// Number of the convention that correlates best with the truth.
     pub convention_matched: u8,
     pub ee: [f64; BINS],
-    /// Standard errors of the bandpowers for a fixed truth; not numbers outside the scored bins.
+    /// Standard errors of the bandpowers for a fixed truth; NaN outside the scored bins.
     #[serde(deserialize_with = "nan_for_null")]
     pub ee_error: [f64; BINS],
     /// Q of the cross-spectrum of the images' groups, `None` for a single image.
     pub q_spectrum: Option<f64>,
-    /// Standard error of this Q; `None` with fewer than eight images.
+    /// `None` with fewer than eight images.
     pub q_spectrum_error: Option<f64>,
     pub response: Response,
 }
@@ -102,44 +111,27 @@ pub struct SetResult {
     pub results: Vec<ConfigurationResult>,
 }
 
-fn result_path(folder: &Path, set: u32) -> PathBuf {
-    folder.join(format!("sets/set{set:02}.json"))
-}
-
-/// Runs the configurations of the study on `sets`. The result of each set is written as soon as it is known;
-/// existing results are read.
+/// Runs the configurations of the study on `sets`.
 pub fn run_sets(
     study: &Study<'_>,
     sets: &[u32],
     threads: usize,
     progress: &mut dyn Progress,
 ) -> Result<Vec<SetResult>, PipelineError> {
-    let &Study { plan, folder, .. } = study;
-    // Configurations that differ only in name are measured once.
+    let plan = study.plan;
+    // The paper's Table 1 has two pairs of configurations that differ only in name.
     let (distinct, place) = distinct(&plan.configurations);
     let measurers = measurers(&distinct)?;
-    let mut results = Vec::new();
-    for &set in sets {
-        let path = result_path(folder, set);
-        if let Some(result) = read_record::<SetResult>(&path)? {
-            progress.skip(u64::from(plan.images) * (plan.simulation.grid as u64).pow(2));
-            results.push(result);
-            continue;
-        }
-        let measured = measure_set(plan, set, &measurers, threads, progress)?;
-        let result = set_result(plan, set, &measured, &place);
-        study.keep(&path, &result)?;
-        results.push(result);
-    }
-    study.check_results(sets.iter().map(|&set| result_path(folder, set)))?;
-    Ok(results)
-}
-
-struct MeasuredSet {
-    score: SetScore,
-    record: SetRecord,
-    spectrum: Option<(f64, Option<f64>)>,
-    response: Response,
+    let path = |set: u32| format!("sets/set{set:02}.json").into();
+    study.each_set(sets, plan.images, path, progress, |set, progress| {
+        let mut result = measure_set(plan, set, &measurers, threads, progress)?;
+        let named = |(configuration, &at): (&Configuration, &usize)| ConfigurationResult {
+            configuration: configuration.name.clone(),
+            ..result.results[at].clone()
+        };
+        result.results = plan.configurations.iter().zip(&place).map(named).collect();
+        Ok(result)
+    })
 }
 
 // Simulates the images of a set, measures them with all measurers and scores the results.
@@ -149,7 +141,7 @@ fn measure_set(
     measurers: &[Measurer],
     threads: usize,
     progress: &mut dyn Progress,
-) -> Result<Vec<MeasuredSet>, PipelineError> {
+) -> Result<SetResult, PipelineError> {
     let scoring = |source| PipelineError::Scoring {
         set: Some(set),
         source,
@@ -157,8 +149,12 @@ fn measure_set(
     let simulator = simulator(set, plan.simulation)?;
     let grid = simulator.grid();
     let images: Vec<u32> = (1..=plan.images).collect();
-    let mut sums = vec![(SetImages::new(&grid), RowCounts::default()); measurers.len()];
-    let mut regressions = vec![Regression::default(); measurers.len()];
+    let sums = (
+        SetImages::new(&grid),
+        RowCounts::default(),
+        Regression::default(),
+    );
+    let mut sums = vec![sums; measurers.len()];
     run_set(
         &simulator,
         &images,
@@ -166,8 +162,7 @@ fn measure_set(
         threads,
         progress,
         |image, _| {
-            let each = sums.iter_mut().zip(&mut regressions).zip(image.batches);
-            for (((sum, counts), regression), batch) in each {
+            for ((sum, counts, regression), batch) in sums.iter_mut().zip(image.batches) {
                 let (field, used) = field_sum(&grid, &batch.galaxies);
                 sum.add(&field).map_err(scoring)?;
                 *counts += used;
@@ -183,50 +178,31 @@ fn measure_set(
         ..Options::default()
     };
     let scorer = SetScorer::new(grid, simulator.truth(), options).map_err(scoring)?;
-    let score = |((sum, rows), regression): (&(SetImages, RowCounts), &Regression)| {
-        let score = scorer.score(sum).map_err(scoring)?;
-        Ok(MeasuredSet {
-            spectrum: spectrum_quality(&score, sum),
-            record: {
-                // The settings of the plan identify simulated data, so there is no fingerprint.
-                let simulated = SetKind::of(set).is_some();
-                SetRecord::new(set, simulated, images.clone(), &score, rows, true)
-            },
-            score,
-            response: regression.response(),
-        })
+    let mut result = SetResult {
+        set,
+        images: plan.images,
+        l: [0.0; BINS],
+        true_ee: [0.0; BINS],
+        results: Vec::new(),
     };
-    sums.iter().zip(&regressions).map(score).collect()
-}
-
-// The record of a set. `place` has the index in `measured` of each configuration of the plan.
-fn set_result(plan: &Plan, set: u32, measured: &[MeasuredSet], place: &[usize]) -> SetResult {
-    let result = |(configuration, &at): (&Configuration, &usize)| {
-        let MeasuredSet {
-            score,
-            record,
-            spectrum,
-            response,
-        } = &measured[at];
-        ConfigurationResult {
-            configuration: configuration.name.clone(),
-            score: record.clone(),
+    for (sum, rows, regression) in &sums {
+        let score = scorer.score(sum).map_err(scoring)?;
+        let (q_spectrum, q_spectrum_error) = spectrum_quality(&score, sum).unzip();
+        (result.l, result.true_ee) = (score.bins.l, score.true_ee);
+        // The settings of the plan identify simulated data, so there is no fingerprint.
+        let simulated = SetKind::of(set).is_some();
+        result.results.push(ConfigurationResult {
+            configuration: String::new(),
+            score: SetRecord::new(set, simulated, images.clone(), &score, rows, true),
             convention_matched: score.matching.best().number(),
             ee: score.spectra().ee,
             ee_error: score.ee_error,
-            q_spectrum: spectrum.map(|(q, _)| q),
-            q_spectrum_error: spectrum.and_then(|(_, error)| error),
-            response: *response,
-        }
-    };
-    let first = &measured[place[0]].score;
-    SetResult {
-        set,
-        images: plan.images,
-        l: first.bins.l,
-        true_ee: first.true_ee,
-        results: plan.configurations.iter().zip(place).map(result).collect(),
+            q_spectrum,
+            q_spectrum_error: q_spectrum_error.flatten(),
+            response: regression.response(),
+        });
     }
+    Ok(result)
 }
 
 // Q of the cross-spectrum of `images`, with its error if it is known.
@@ -313,11 +289,11 @@ mod tests {
         let folder = root.path().join("study");
         let plan = plan(&["23/raw/star"]);
         let study = Study::open(&plan, &folder).unwrap();
-        study.check().unwrap();
+        study.claim.check().unwrap();
         let error = run_sets(&study, &[2], 1, &mut Remover(&folder)).unwrap_err();
         let message = error.to_string();
         assert!(message.contains("removed or replaced"), "{message}");
-        assert!(study.check().is_err());
+        assert!(study.claim.check().is_err());
         assert!(!folder.exists());
     }
 
@@ -333,8 +309,9 @@ mod tests {
         let again = run_sets(&study, &[2], 1, &mut Quiet).unwrap();
         assert_eq!(text(&again), text(&first));
         // A result that is missing at the end is an error.
-        std::fs::remove_file(result_path(root.path(), 2)).unwrap();
-        assert!(study.check_results([result_path(root.path(), 2)]).is_err());
+        let path = root.path().join("sets/set02.json");
+        std::fs::remove_file(&path).unwrap();
+        assert!(study.claim.check_results([path]).is_err());
     }
 
     #[test]
