@@ -10,7 +10,7 @@ use indicatif::{
 };
 
 use crate::tell;
-use shearq_pipeline::Progress;
+use shearq_dataset::threads::Progress;
 
 /// Galaxies done, rate and time left.
 pub(super) struct Bar {

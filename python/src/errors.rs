@@ -43,7 +43,7 @@ pub(crate) fn of_pipeline(error: PipelineError) -> PyErr {
     match error {
         PipelineError::Measure(error) => of_measuring(error),
         PipelineError::Scoring { source, .. } => of_scoring(source),
-        PipelineError::Request(message) => PyValueError::new_err(message),
+        error @ PipelineError::NoSuchSet(_) => PyValueError::new_err(error.to_string()),
         other => PyRuntimeError::new_err(other.to_string()),
     }
 }

@@ -1,7 +1,7 @@
 //! shearq for Python: the module `shearq._shearq`, a thin layer above the crates that measure and score.
 //!
 //! The package in `python/shearq` checks types and shapes, and names the argument in its errors. Here, arrays become
-//! views and errors become exceptions. Only `shearq_pipeline::engine` starts threads, with the interpreter released.
+//! views and errors become exceptions. Only the pipeline and `dataset::threads` start threads, with the interpreter released.
 
 mod bias;
 mod command;

@@ -27,7 +27,7 @@ impl Failure {
     /// Keeps an exception, and returns the error that stops the engine.
     pub(crate) fn keep(&self, error: PyErr) -> PipelineError {
         *self.0.lock().unwrap_or_else(PoisonError::into_inner) = Some(error);
-        PipelineError::Request("the work was interrupted".into())
+        PipelineError::Interrupted
     }
 
     /// The result of the work, or the exception that stopped it.

@@ -9,16 +9,18 @@ use shearq_submissions::{Configuration, Registry};
 use crate::arguments::{Form, SetList, SimulationArguments, Threads, given_once, positive};
 use crate::progress::Bar;
 use crate::{print, tell};
+use shearq_dataset::images::{self, ImageId};
 use shearq_dataset::layout::MAX_IMAGE;
 use shearq_dataset::run::{Run, Source, open_data, way};
-use shearq_files::atomic;
-use shearq_pipeline::PipelineError;
+use shearq_files::atomic::{self, Scratch};
+use shearq_files::table::FileFormat;
+use shearq_pipeline::measure::measure_folder;
+use shearq_pipeline::run::run_folder;
 use shearq_render::table::TableFormat;
 use shearq_results::baseline::{
-    self, Baseline, BaselineConfiguration, BaselineSet, Change, Checked, Settings, Wanted, measure,
-    metrics_of,
+    self, Baseline, BaselineConfiguration, BaselineSet, Change, Checked, junit, metrics_of,
+    shift_table,
 };
-use shearq_results::views::baseline::{junit, shift_table};
 
 /// Store metrics as a baseline and check later whether they moved.
 ///
@@ -157,9 +159,8 @@ fn record(arguments: &RecordArguments) -> anyhow::Result<()> {
         None if arguments.simulate => {
             let images = arguments.images.unwrap_or(1);
             let sets = arguments.sets.as_ref().map_or(&[][..], |list| &list.0);
-            let wanted = sets.iter().map(|&set| Wanted { set, images }).collect();
             let source = Source::Simulated(arguments.simulation.settings()?);
-            of_source(arguments, source, wanted)?
+            of_source(arguments, source, &images::of_simulation(sets, images))?
         }
         None => {
             arguments.simulation.must_be_unused()?;
@@ -169,14 +170,9 @@ fn record(arguments: &RecordArguments) -> anyhow::Result<()> {
             arguments.simulation.must_be_unused()?;
             let data = open_data(data)?;
             let sets = arguments.sets.as_ref().map_or(&[][..], |list| &list.0);
-            let files = data.images(sets)?;
-            let there = |set| files.of_set(set).len() as u32;
-            let wanted = |set| Wanted {
-                set,
-                images: arguments.images.unwrap_or_else(|| there(set)),
-            };
-            let all = files.wanted(sets).into_iter().map(wanted).collect();
-            of_source(arguments, Source::folder(&data, folder)?, all)?
+            let mut images = images::of_folder(&data, sets)?;
+            images.retain(|id| arguments.images.is_none_or(|most| id.image <= most));
+            of_source(arguments, Source::folder(&data, folder)?, &images)?
         }
     };
     for set in configurations
@@ -199,13 +195,13 @@ fn record(arguments: &RecordArguments) -> anyhow::Result<()> {
 fn of_source(
     arguments: &RecordArguments,
     source: Source,
-    wanted: Vec<Wanted>,
+    images: &[ImageId],
 ) -> anyhow::Result<(Source, Vec<BaselineConfiguration>)> {
     let (folder, threads) = (&arguments.place.folder, arguments.threads.number());
     let configurations = chosen(&arguments.submission, folder)?
         .into_iter()
         .map(|(configuration, file)| {
-            let sets = measured(&source, folder, &configuration, &wanted, threads)?;
+            let sets = measured(&source, folder, &configuration, images, threads)?;
             Ok(BaselineConfiguration::new(&configuration, file, sets)?)
         })
         .collect::<anyhow::Result<_>>()?;
@@ -274,22 +270,43 @@ fn of_folders(
     ))
 }
 
-/// Measures with a progress bar.
+/// Measures a configuration into a temporary folder, with a progress bar, and returns its metrics. Paths of `source` are
+/// relative to the folder `beside`.
 fn measured(
     source: &Source,
     beside: &Path,
     configuration: &Configuration,
-    wanted: &[Wanted],
+    images: &[ImageId],
     threads: usize,
-) -> Result<Vec<BaselineSet>, PipelineError> {
-    let images: u64 = wanted.iter().map(|w| u64::from(w.images)).sum();
-    let side = match source {
-        Source::Simulated(settings) => settings.grid,
-        // An estimate for the bar: a folder's grid is unknown until its images are opened.
-        Source::Folder { .. } => 100,
+) -> anyhow::Result<Vec<BaselineSet>> {
+    let scratch = Scratch::new()?;
+    let out = scratch.path();
+    let run = Run::new(
+        source.moved(beside, out)?,
+        configuration.clone(),
+        FileFormat::default(),
+    );
+    let bar = |grid: usize| Bar::new("measuring", (images.len() * grid.pow(2)) as u64);
+    let data = match source {
+        Source::Simulated(settings) => {
+            let mut bar = bar(settings.grid);
+            run_folder(&run, *settings, images, out, threads, &mut bar)?;
+            run.source.data(out)?
+        }
+        Source::Folder { .. } => {
+            // By its own path, because messages must not name the temporary folder.
+            let data = source.data(beside)?;
+            let mut sets: Vec<u32> = images.iter().map(|id| id.set).collect();
+            sets.dedup();
+            // Other data may have fewer images.
+            let mut there = images::of_folder(&data, &sets)?;
+            there.retain(|id| images.contains(id));
+            // An estimate: the grid of a folder is unknown until its images are opened.
+            measure_folder(&run, &data, out, &there, threads, &mut bar(100))?;
+            data
+        }
     };
-    let mut bar = Bar::new("measuring", images * (side as u64).pow(2));
-    measure(source, beside, configuration, wanted, threads, &mut bar)
+    Ok(metrics_of(&run, &data, out, threads)?)
 }
 
 fn check(arguments: &CheckArguments) -> anyhow::Result<()> {
@@ -319,7 +336,10 @@ fn check(arguments: &CheckArguments) -> anyhow::Result<()> {
     } else {
         arguments.form.print(&table)?;
     }
-    let failed = checks.iter().filter(|check| check.failed()).count();
+    let failed = checks
+        .iter()
+        .filter(|check| !check.moved().is_empty())
+        .count();
     anyhow::ensure!(
         failed == 0 || arguments.update,
         "{failed} of {} configurations moved from their baseline",
@@ -337,15 +357,12 @@ fn check_one(arguments: &CheckArguments, name: &str, path: &Path) -> anyhow::Res
         None => baseline.source.clone(),
     };
     let threads = arguments.threads.number();
-    let measure = |configuration: &Configuration, wanted: &[Wanted]| {
-        measured(&source, beside, configuration, wanted, threads)
+    let measure = |configuration: &Configuration, images: &[ImageId]| {
+        measured(&source, beside, configuration, images, threads)
     };
-    let settings = match arguments.stored {
-        true => Settings::Stored,
-        false => Settings::Files(beside),
-    };
+    let files = (beside.as_path(), arguments.stored);
     let (checks, configurations) =
-        baseline::check(name, &baseline, arguments.sigma, settings, measure)
+        baseline::check(name, &baseline, arguments.sigma, files, measure)
             .with_context(|| path.display().to_string())?;
     for check in checks.iter().filter(|check| check.stored) {
         tell(format_args!(
@@ -368,7 +385,7 @@ fn check_one(arguments: &CheckArguments, name: &str, path: &Path) -> anyhow::Res
                 from_version: baseline.version.clone(),
                 moved,
             });
-            Baseline::new(source, history, configurations).replace(path, &baseline)?;
+            Baseline::new(source, history, configurations).replace(path)?;
             tell(format_args!("updated {}", path.display()));
         }
     }

@@ -6,9 +6,10 @@ use clap::Args;
 
 use crate::arguments::{Form, SetList, Threads};
 use crate::tell;
+use shearq_dataset::fingerprint;
 use shearq_dataset::run::{Run, Source};
+use shearq_dataset::threads::Pool;
 use shearq_measure::Warning;
-use shearq_pipeline::inputs;
 use shearq_results::mean::mean_shears;
 use shearq_results::score::without_catalogue;
 use shearq_results::select::smooth_selection;
@@ -64,7 +65,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         Source::Simulated(_) => None,
     };
     if let Some(data) = &data {
-        inputs::verify(data, measured, &run, sets, threads.number())?;
+        fingerprint::verify(data, measured, &run, sets, &Pool::new(threads.number())?)?;
     }
     let means = mean_shears(
         &run,

@@ -12,7 +12,7 @@ use crate::{print, tell};
 use shearq_dataset::images::ImageId;
 use shearq_dataset::mosaic::Mosaic;
 use shearq_dataset::run::open_data;
-use shearq_pipeline::engine::Pool;
+use shearq_dataset::threads::Pool;
 use shearq_pipeline::measure::ImageSource;
 use shearq_render::figure::{Figure, PictureFormat};
 use shearq_results::views::steps::{steps_figure, steps_row};

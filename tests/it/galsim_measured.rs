@@ -5,8 +5,8 @@ use std::path::Path;
 use shearq_dataset::images;
 use shearq_dataset::layout::DataFolder;
 use shearq_dataset::run::{Run, Source};
+use shearq_dataset::threads::Quiet;
 use shearq_files::table::{self, FileFormat};
-use shearq_pipeline::Quiet;
 use shearq_pipeline::measure::measure_folder;
 use shearq_submissions::{Calibration, Registry};
 

@@ -5,7 +5,7 @@ use ndarray::Array2;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
-use shearq_pipeline::Quiet;
+use shearq_dataset::threads::Quiet;
 use shearq_pipeline::run::measurers;
 use shearq_pipeline::simulate::simulator;
 use shearq_results::catalogues::OWN;

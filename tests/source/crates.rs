@@ -5,7 +5,7 @@ use std::fs;
 use std::path::Path;
 
 /// The crates from the lowest level up, with their folders. A crate uses crates of lower levels only.
-const LEVELS: [&[(&str, &str)]; 10] = [
+const LEVELS: [&[(&str, &str)]; 8] = [
     &[
         ("shearq-fourier", "crates/fourier"),
         ("shearq-quantities", "crates/quantities"),
@@ -22,10 +22,14 @@ const LEVELS: [&[(&str, &str)]; 10] = [
         ("shearq-render", "crates/render"),
     ],
     &[("shearq-dataset", "crates/dataset")],
-    &[("shearq-pipeline", "crates/pipeline")],
-    &[("shearq-results", "crates/results")],
-    &[("shearq-studies", "crates/studies")],
-    &[("shearq-challenge", "crates/challenge")],
+    &[
+        ("shearq-pipeline", "crates/pipeline"),
+        ("shearq-results", "crates/results"),
+    ],
+    &[
+        ("shearq-studies", "crates/studies"),
+        ("shearq-challenge", "crates/challenge"),
+    ],
     &[("shearq", ".")],
     &[("shearq-python", "python"), ("shearq-benches", "benches")],
 ];

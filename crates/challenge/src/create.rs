@@ -8,15 +8,16 @@ use shearq_dataset::layout::fill;
 use shearq_dataset::layout::{DataFolder, LAYOUT_FILE};
 use shearq_dataset::psf_table;
 use shearq_dataset::run::SimulationRecord;
+use shearq_dataset::threads::Progress;
+use shearq_dataset::threads::Quiet;
 use shearq_dataset::truth::{ReadTruth, Reading, grid_of_set, read_truth, reading_of, write_truth};
 use shearq_files::fits::{ImageReader, ImageWriter, Value};
 use shearq_files::open::is_there;
 use shearq_files::{FileError, atomic};
-use shearq_pipeline::engine::Quiet;
 use shearq_pipeline::simulate::simulate_blind;
-use shearq_pipeline::{PipelineError, Progress};
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_results::record::SetRecord;
+use shearq_results::score::ScoreError;
 use shearq_results::submit::manifest::Contents;
 use shearq_scoring::{Choice, Convention, Options, RowCounts, SetImages, SetScorer, TrueShear};
 use shearq_simulate::field::ShearSpectrum;
@@ -337,7 +338,7 @@ fn expected_scores(
             choice: Choice::Insist(Convention::STANDARD),
             ..Options::default()
         };
-        let wrong = |source| PipelineError::Scoring {
+        let wrong = |source| ScoreError::Scoring {
             set: Some(set),
             source,
         };
@@ -381,7 +382,7 @@ fn rankable(
         let truth = private.read_truth(set, &grid)?;
         Ok((set, truth))
     });
-    let truths: Vec<(u32, TrueShear)> = truths.collect::<Result<_, PipelineError>>()?;
+    let truths: Vec<(u32, TrueShear)> = truths.collect::<Result<_, ChallengeError>>()?;
     let constant = ConstantShears::of(truths.iter().map(|(set, truth)| (*set, truth)))
         .map_err(ChallengeError::Shears)?;
     let metric = plan.metric.unwrap_or(match &constant {

@@ -1,7 +1,9 @@
 //! Why a challenge cannot be made.
 
+use shearq_dataset::threads::ThreadError;
 use shearq_files::FileError;
 use shearq_pipeline::PipelineError;
+use shearq_results::score::ScoreError;
 use thiserror::Error;
 
 /// Significance of the response that a method of ordinary noise must expect. Entries need 3; two more make a refusal by
@@ -14,7 +16,14 @@ use crate::deadline::Deadline;
 #[non_exhaustive]
 pub enum ChallengeError {
     #[error(transparent)]
+    File(#[from] FileError),
+    #[error(transparent)]
+    Score(#[from] ScoreError),
+    /// Reference images that cannot be simulated or measured.
+    #[error(transparent)]
     Pipeline(#[from] PipelineError),
+    #[error(transparent)]
+    Threads(#[from] ThreadError),
     #[error(transparent)]
     Simulation(#[from] shearq_simulate::set::SettingsError),
     #[error(
@@ -68,10 +77,4 @@ pub enum ChallengeError {
         catalogue: f64,
         images: f64,
     },
-}
-
-impl From<FileError> for ChallengeError {
-    fn from(error: FileError) -> Self {
-        ChallengeError::Pipeline(error.into())
-    }
 }

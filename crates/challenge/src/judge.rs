@@ -10,10 +10,11 @@ use shearq_dataset::fingerprint;
 use shearq_dataset::layout::DataFolder;
 use shearq_dataset::run::Source;
 use shearq_dataset::run::kind_of;
+use shearq_dataset::threads::{Pool, Progress, Quiet};
 use shearq_files::{FileError, names_of};
-use shearq_pipeline::{PipelineError, Progress, engine};
 use shearq_render::escape::line;
 use shearq_results::record::{RunRecord, SetRecord, definition_word};
+use shearq_results::score::ScoreError;
 use shearq_results::store;
 use shearq_results::submit::challenge::read_bandpowers;
 use shearq_results::submit::check::{CheckedSet, Severity, check_sent};
@@ -27,6 +28,7 @@ use shearq_submissions::check_name;
 
 use crate::constant::ConstantShears;
 use crate::deadline::now;
+use crate::error::ChallengeError;
 use crate::inbox::{Content, Sending, content, identify};
 use crate::kind::response;
 use crate::receipt::Receipt;
@@ -143,7 +145,7 @@ struct Arrival {
 
 impl Judge {
     /// Opens the public and the private folder of a challenge.
-    pub fn open(public: &Path, private: &Path, threads: usize) -> Result<Self, PipelineError> {
+    pub fn open(public: &Path, private: &Path, threads: usize) -> Result<Self, ChallengeError> {
         let challenge = Challenge::read(public)?;
         let (key, id) = verify(public, private, &challenge, threads)?;
         let data = DataFolder::open(private)?;
@@ -257,7 +259,7 @@ impl Judge {
         store: &Path,
         threads: usize,
         progress: &mut dyn Progress,
-    ) -> Result<Round, PipelineError> {
+    ) -> Result<Round, ChallengeError> {
         let _prepared = store::prepare(store)?;
         let known = self.entries(store)?;
         let mut round = Round::default();
@@ -269,34 +271,19 @@ impl Judge {
         let public = DataFolder::open(&self.public)?;
         let sets = &self.challenge.data.sets;
         let ids = References::ids(&public, sets)?;
-        let references =
-            References::measure(&public, &ids, self.grid, threads, &mut engine::Quiet)?;
-        engine::ordered(
-            // Large entries take most of the time, so a few of them are in work at a time.
-            threads,
-            |feeder| {
-                for candidate in candidates {
-                    if !feeder.push(candidate) {
-                        break;
-                    }
+        let references = References::measure(&public, &ids, self.grid, threads, &mut Quiet)?;
+        let pool = Pool::new(threads)?;
+        for result in pool.in_order(candidates, |candidate| self.judge(candidate, &references)) {
+            progress.advance(self.challenge.data.galaxies());
+            match result {
+                Ok((run, doubts)) => {
+                    store::write(store, &run)?;
+                    round.doubtful.extend(doubts);
+                    round.scored += 1;
                 }
-                Ok(())
-            },
-            || (),
-            |(), candidate| Ok(self.judge(candidate, &references)),
-            |result| {
-                progress.advance(self.challenge.data.galaxies());
-                match result {
-                    Ok((run, doubts)) => {
-                        store::write(store, &run)?;
-                        round.doubtful.extend(doubts);
-                        round.scored += 1;
-                    }
-                    Err(refused) => round.refused.push(refused),
-                }
-                Ok(())
-            },
-        )?;
+                Err(refused) => round.refused.push(refused),
+            }
+        }
         Ok(round)
     }
 
@@ -350,7 +337,7 @@ impl Judge {
         known: &[Entry],
         threads: usize,
         round: &mut Round,
-    ) -> Result<Vec<Candidate>, PipelineError> {
+    ) -> Result<Vec<Candidate>, ChallengeError> {
         let now = now();
         let mut stored: BTreeMap<&str, Vec<&EntryInfo>> = BTreeMap::new();
         for Entry { info, .. } in known {
@@ -365,50 +352,38 @@ impl Judge {
                 .any(|info| info.team == team && order(info.received) <= order(arrival.received))
         };
         let mut identified = Vec::new();
-        engine::ordered(
-            threads,
-            |feeder| {
-                for (sending, reference) in sendings {
-                    if !feeder.push((sending.clone(), *reference)) {
-                        break;
-                    }
+        let pool = Pool::new(threads)?;
+        let read = pool.in_order(sendings, |(sending, reference)| {
+            let found = self.arrival(sending, now).and_then(|arrival| {
+                // Without a folder or a receipt, the manifest states the team.
+                let receipt = arrival.receipt.as_ref();
+                let team = sending
+                    .team
+                    .as_ref()
+                    .or(receipt.map(|receipt| &receipt.team));
+                let content = match team.is_some_and(|team| is_known(team, &arrival)) {
+                    true => None,
+                    false => Some(content(sending)?),
+                };
+                Ok((arrival, content))
+            });
+            (sending.clone(), *reference, found)
+        });
+        for (sending, reference, found) in read {
+            match found {
+                Ok((arrival, content)) => {
+                    identified.push((sending, reference, arrival, content));
                 }
-                Ok(())
-            },
-            || (),
-            |(), (sending, reference): (Sending, bool)| {
-                let found = self.arrival(&sending, now).and_then(|arrival| {
-                    // Without a folder or a receipt, the manifest states the team.
-                    let receipt = arrival.receipt.as_ref();
-                    let team = sending
-                        .team
-                        .as_ref()
-                        .or(receipt.map(|receipt| &receipt.team));
-                    let content = match team.is_some_and(|team| is_known(team, &arrival)) {
-                        true => None,
-                        false => Some(content(&sending)?),
-                    };
-                    Ok((arrival, content))
-                });
-                Ok((sending, reference, found))
-            },
-            |(sending, reference, found)| {
-                match found {
-                    Ok((arrival, content)) => {
-                        identified.push((sending, reference, arrival, content));
-                    }
-                    Err(error) => {
-                        let reason = reason_of(&error.path, &error.message, &sending);
-                        round.refused.push(Refused {
-                            team: team_of(&sending, None, None),
-                            path: sending.path,
-                            reason,
-                        });
-                    }
+                Err(error) => {
+                    let reason = reason_of(&error.path, &error.message, &sending);
+                    round.refused.push(Refused {
+                        team: team_of(&sending, None, None),
+                        path: sending.path,
+                        reason,
+                    });
                 }
-                Ok(())
-            },
-        )?;
+            }
+        }
         identified.sort_by(|a, b| (a.2.received, &a.0).cmp(&(b.2.received, &b.0)));
         let mut archives: BTreeMap<(String, String, bool), PathBuf> = BTreeMap::new();
         let mut candidates = Vec::new();
@@ -725,8 +700,8 @@ fn slope_over_sets(sets: &[Powers]) -> (f64, f64) {
     (slope, (residual.max(0.0) / (number - 2.0) / square).sqrt())
 }
 
-pub(crate) fn unscored(source: ScoringError) -> PipelineError {
-    PipelineError::Scoring { set: None, source }
+pub(crate) fn unscored(source: ScoringError) -> ChallengeError {
+    ChallengeError::Score(ScoreError::Scoring { set: None, source })
 }
 
 // A message without the path of the entry, which a list of entries has already.

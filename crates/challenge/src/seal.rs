@@ -12,10 +12,11 @@ use serde::de::IgnoredAny;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use shearq_dataset::fingerprint::hex;
+use shearq_dataset::threads::Pool;
 use shearq_files::{FileError, atomic, open};
-use shearq_pipeline::{PipelineError, engine};
 use shearq_results::submit::manifest::FileSum;
 
+use crate::error::ChallengeError;
 use crate::terms::{CHALLENGE_FILE, Challenge};
 
 /// Checksums of the public files, in the format of `sha256sum`.
@@ -168,29 +169,13 @@ pub(crate) fn sums(
     folder: &Path,
     names: Vec<String>,
     threads: usize,
-) -> Result<Sums, PipelineError> {
-    let mut sums = Sums::new();
-    engine::ordered(
-        threads,
-        |feeder| {
-            for name in names {
-                if !feeder.push(name) {
-                    break;
-                }
-            }
-            Ok(())
-        },
-        || (),
-        |(), name: String| {
-            let sum = FileSum::of(&folder.join(&name))?.sha256;
-            Ok((name, sum))
-        },
-        |(name, sum)| {
-            sums.insert(name, sum);
-            Ok(())
-        },
-    )?;
-    Ok(sums)
+) -> Result<Sums, ChallengeError> {
+    let pool = Pool::new(threads)?;
+    let sums = pool.in_order(names, |name| {
+        let sum = FileSum::of(&folder.join(&name))?.sha256;
+        Ok((name, sum))
+    });
+    sums.collect()
 }
 
 fn sums_text(sums: &Sums) -> String {
@@ -200,7 +185,7 @@ fn sums_text(sums: &Sums) -> String {
 }
 
 /// Writes the checksums of all files below `public` and returns the SHA-256 of their list.
-pub fn seal_public(public: &Path, threads: usize) -> Result<String, PipelineError> {
+pub fn seal_public(public: &Path, threads: usize) -> Result<String, ChallengeError> {
     let text = sums_text(&sums(public, names(public)?, threads)?);
     atomic::write(public.join(SUMS_FILE), text.as_bytes())?;
     Ok(sha256(text.as_bytes()))
@@ -225,7 +210,7 @@ fn unchanged(
     expected: &Sums,
     list: &str,
     threads: usize,
-) -> Result<(), PipelineError> {
+) -> Result<(), ChallengeError> {
     for (name, found) in sums(folder, names, threads)? {
         let expected = expected.get(&name).map_or("no such file", String::as_str);
         if found != expected {
@@ -239,7 +224,7 @@ fn unchanged(
 }
 
 /// Checks the public files that are there against [`SUMS_FILE`]. A participant may have downloaded some sets only.
-pub fn verify_public(public: &Path, threads: usize) -> Result<(), PipelineError> {
+pub fn verify_public(public: &Path, threads: usize) -> Result<(), ChallengeError> {
     let (expected, _) = read_sums(public)?;
     let is_there = |name: &&String| open::is_there(&public.join(name));
     let names = expected.keys().filter(is_there).cloned().collect();
@@ -256,7 +241,7 @@ pub fn verify(
     private: &Path,
     challenge: &Challenge,
     threads: usize,
-) -> Result<(Key, String), PipelineError> {
+) -> Result<(Key, String), ChallengeError> {
     let key = Key::read(private)?.ok_or_else(|| {
         let message = format!(
             "there is no {KEY_FILE}; expected the private folder that `shearq challenge new` wrote"

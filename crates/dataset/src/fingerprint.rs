@@ -13,8 +13,9 @@ use std::path::{Path, PathBuf};
 use sha2::{Digest, Sha256};
 
 use crate::images::ImageId;
-use crate::layout::DataFolder;
+use crate::layout::{DataFolder, LAYOUT_FILE, Layout};
 use crate::run::{Run, Source};
+use crate::threads::Pool;
 use shearq_files::FileError;
 use shearq_files::open::{self, is_there};
 use shearq_files::table::read_metadata;
@@ -196,8 +197,13 @@ impl<'a> Inputs<'a> {
         Ok(prints)
     }
 
-    /// Checks that the catalogue of an image in `out` was measured from the present files.
-    pub fn verify_image(&self, out: &Path, id: ImageId) -> Result<(), FileError> {
+    /// Checks that the catalogues of `images` in `out` were measured from the present files.
+    pub fn verify(&self, out: &Path, images: &[ImageId], pool: &Pool) -> Result<(), FileError> {
+        let mut found = pool.in_order(images, |id| self.verify_image(out, *id));
+        found.try_for_each(|checked| checked)
+    }
+
+    fn verify_image(&self, out: &Path, id: ImageId) -> Result<(), FileError> {
         let catalogue = self.run.catalogue(out, id.set, id.image);
         let now = self.prints(id)?;
         if now.is_empty() {
@@ -217,6 +223,35 @@ impl<'a> Inputs<'a> {
         }
         Ok(())
     }
+}
+
+/// Checks that every catalogue of `sets` (of all if empty) in the results folder `out` was measured from the present files
+/// in `data`.
+pub fn verify(
+    data: &DataFolder,
+    out: &Path,
+    run: &Run,
+    sets: &[u32],
+    pool: &Pool,
+) -> Result<(), FileError> {
+    if let Source::Folder { layout, .. } = &run.source {
+        let of = |layout: &Layout| (layout.field_degrees, layout.truth_sign);
+        let (then, now) = (of(layout), of(data.layout()));
+        if then != now {
+            let message = format!(
+                "field in degrees and sign of the truth are {now:?}; {} was measured with {then:?}",
+                out.display()
+            );
+            return Err(FileError::new(data.root().join(LAYOUT_FILE), message));
+        }
+    }
+    let files = run.catalogues(out, sets)?;
+    let of_set = |set| {
+        let images = files.of_set(set).into_iter();
+        images.map(move |(image, _)| ImageId { set, image })
+    };
+    let images: Vec<ImageId> = files.sets().into_iter().flat_map(of_set).collect();
+    Inputs::new(run, data, &images)?.verify(out, &images, pool)
 }
 
 #[cfg(test)]

@@ -1,6 +1,6 @@
 //! Data folders and folders of results: names and places of files, true shear, what made a result, and fingerprints.
 //!
-//! Nothing here measures or starts threads, so that scoring a catalogue needs no more than this.
+//! Scoring a catalogue needs no more than this. [`threads`] works on many files at a time; nothing here measures.
 #![forbid(unsafe_code)]
 
 pub mod fingerprint;
@@ -8,11 +8,13 @@ pub mod grid;
 pub mod images;
 pub mod layout;
 pub mod listing;
+pub mod metadata;
 pub mod mosaic;
 mod pattern;
 pub mod psf_table;
 pub mod record;
 pub mod run;
+pub mod threads;
 pub mod truth;
 
 pub const VERSION: &str = env!("CARGO_PKG_VERSION");

@@ -7,15 +7,14 @@ use shearq_quantities::units::{Degrees, Pixels};
 use shearq_scoring::Grid;
 
 use super::PipelineError;
-use super::engine::{self, Progress};
 use crate::measure::{metadata, open_galaxies};
 use shearq_dataset::fingerprint::Inputs;
 use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::DataFolder;
 use shearq_dataset::mosaic::Mosaic;
 use shearq_dataset::psf_table;
-use shearq_dataset::run::SimulationRecord;
-use shearq_dataset::run::{Run, Source};
+use shearq_dataset::run::{Run, SimulationRecord, Source};
+use shearq_dataset::threads::{Pool, Progress};
 use shearq_files::FileError;
 use shearq_files::fits::ImageReader;
 use shearq_files::table::{self, kept, most_rows, read_metadata};
@@ -66,44 +65,29 @@ impl Results<'_> {
             Results::Catalogues { run, data, .. } => Some(Inputs::new(run, data, images)?),
             Results::Images { .. } => None,
         };
-        engine::ordered(
-            threads,
-            |feeder| {
-                for position in 0..images.len() {
-                    if !feeder.push(position) {
-                        break;
-                    }
+        let pool = Pool::new(threads)?;
+        let checked = pool.in_order(0..images.len(), |position| {
+            let first = position == 0 || images[position - 1].set != images[position].set;
+            self.check(images[position], first, inputs.as_ref())
+        });
+        for (position, checked) in checked.enumerate() {
+            match checked {
+                Ok(cells) => progress.advance(cells as u64),
+                Err(error) => {
+                    let id = images[position];
+                    let result = self.result(id);
+                    faults.push(Fault {
+                        id,
+                        position,
+                        error: match error {
+                            PipelineError::File(error) => error,
+                            other => FileError::new(&result, other),
+                        },
+                        result,
+                    });
                 }
-                Ok(())
-            },
-            || (),
-            |(), position| {
-                let first = position == 0 || images[position - 1].set != images[position].set;
-                Ok((
-                    position,
-                    self.check(images[position], first, inputs.as_ref()),
-                ))
-            },
-            |(position, checked)| {
-                match checked {
-                    Ok(cells) => progress.advance(cells as u64),
-                    Err(error) => {
-                        let id = images[position];
-                        let result = self.result(id);
-                        faults.push(Fault {
-                            id,
-                            position,
-                            error: match error {
-                                PipelineError::File(error) => error,
-                                other => FileError::new(&result, other),
-                            },
-                            result,
-                        });
-                    }
-                }
-                Ok(())
-            },
-        )?;
+            }
+        }
         Ok(faults)
     }
 

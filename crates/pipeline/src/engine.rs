@@ -1,5 +1,8 @@
 //! Ordered, bounded, parallel mapping: one thread reads, a pool works, and the calling thread writes.
 //!
+//! Rows of an image share what the reader found in its whole image, so the reader runs ahead of the workers. Files that are
+//! independent of each other need [`shearq_dataset::threads`] only.
+//!
 //! Results reach the writer in the order of reading, for any number of threads. At most `IN_FLIGHT` items per worker
 //! exist at a time, so memory does not grow with the length of the work.
 
@@ -9,34 +12,12 @@ use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::sync::{Mutex, PoisonError};
 
-use rayon::iter::{IntoParallelIterator, ParallelIterator};
-use rayon::{ThreadPool, ThreadPoolBuilder};
-use shearq_measure::Threads;
+use shearq_dataset::threads::Pool;
 
 use super::PipelineError;
 
 // Items read, in work or waiting to be written, per worker. Chosen by hand.
 const IN_FLIGHT: usize = 4;
-
-/// Receives the progress of the work, from the thread that writes.
-pub trait Progress {
-    fn advance(&mut self, galaxies: u64);
-    /// `galaxies` more were done before.
-    fn skip(&mut self, galaxies: u64) {
-        self.advance(galaxies);
-    }
-    fn note(&mut self, line: &str);
-    fn warn(&mut self, line: &str);
-}
-
-#[derive(Debug, Clone, Copy, Default)]
-pub struct Quiet;
-
-impl Progress for Quiet {
-    fn advance(&mut self, _galaxies: u64) {}
-    fn note(&mut self, _line: &str) {}
-    fn warn(&mut self, _line: &str) {}
-}
 
 /// Hands items to the workers.
 #[derive(Debug)]
@@ -60,28 +41,6 @@ impl<I> Feeder<'_, I> {
 
     pub fn ahead(&self) -> &Pool {
         self.ahead
-    }
-}
-
-/// Threads for values that are mapped in order.
-#[derive(Debug)]
-pub struct Pool(ThreadPool);
-
-impl Pool {
-    /// `threads`, or one per core for 0.
-    pub fn new(threads: usize) -> Result<Self, PipelineError> {
-        let pool = ThreadPoolBuilder::new().num_threads(threads).build()?;
-        Ok(Pool(pool))
-    }
-}
-
-impl Threads for Pool {
-    fn count(&self) -> usize {
-        self.0.current_num_threads()
-    }
-
-    fn map<T: Send, R: Send>(&self, of: Vec<T>, map: impl Fn(T) -> R + Sync + Send) -> Vec<R> {
-        self.0.install(|| of.into_par_iter().map(map).collect())
     }
 }
 
@@ -184,6 +143,8 @@ fn collect<O>(
 
 #[cfg(test)]
 mod tests {
+    use shearq_measure::Threads;
+
     use super::*;
 
     #[test]
@@ -265,7 +226,7 @@ mod tests {
     #[test]
     fn an_error_anywhere_ends_the_work() {
         let fail = |at: &str| {
-            let error = || PipelineError::Request("stop".into());
+            let error = || PipelineError::Interrupted;
             let mut written = 0;
             let result = ordered(
                 2,

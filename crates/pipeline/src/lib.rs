@@ -7,18 +7,17 @@
 pub mod complete;
 pub mod engine;
 pub mod gather;
-pub mod inputs;
 pub mod measure;
 pub mod run;
 pub mod simulate;
 mod wcs;
 
-pub use engine::{Progress, Quiet};
-
-use shearq_measure::MeasureError;
-use thiserror::Error;
-
+use shearq_dataset::images::ImageId;
+use shearq_dataset::threads::ThreadError;
 use shearq_files::FileError;
+use shearq_measure::{MeasureError, Warning};
+use shearq_simulate::kinds::SETS;
+use thiserror::Error;
 
 /// What can stop the pipeline.
 #[derive(Debug, Error)]
@@ -38,10 +37,19 @@ pub enum PipelineError {
         /// Why it cannot be scored.
         source: shearq_scoring::ScoringError,
     },
-    /// A setting or request that cannot be met.
-    #[error("{0}")]
-    Request(String),
-    /// Threads that cannot be started.
-    #[error("cannot start the worker threads: {0}")]
-    Threads(#[from] rayon::ThreadPoolBuildError),
+    #[error("there is no set {0}; expected 1 to {SETS}")]
+    NoSuchSet(u32),
+    /// An image whose ellipticities would be wrong.
+    #[error("set {:02} image {:03}: {warning}", id.set, id.image)]
+    Fatal { id: ImageId, warning: Warning },
+    /// A method without the network that the work is about.
+    #[error("configuration {0} has method = \"linear\"; expected \"network\"")]
+    NoNetwork(String),
+    #[error("the settings cannot be stored: {0}")]
+    Settings(#[from] toml::ser::Error),
+    /// The caller stopped the work.
+    #[error("the work was interrupted")]
+    Interrupted,
+    #[error(transparent)]
+    Threads(#[from] ThreadError),
 }

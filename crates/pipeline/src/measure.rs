@@ -13,20 +13,18 @@ use std::sync::Arc;
 use shearq_files::FileError;
 use shearq_measure::{Batch, MeasuredImage, Measurer, RowJob, Warning};
 
-pub use self::catalogue::{
-    COLUMNS, KEYS, PSF_NOISE, Summary, Value, all_flagged, more_columns, stated_frame,
-};
+pub use self::catalogue::{COLUMNS, Summary, Value, all_flagged, more_columns};
 pub(crate) use self::catalogue::{Catalogues, metadata};
 pub use self::source::ImageSource;
 pub(crate) use self::source::{check_strip, open_galaxies};
 use crate::PipelineError;
-use crate::engine::{self, Feeder, Progress};
-use crate::inputs::verify_images;
+use crate::engine::{self, Feeder};
 use shearq_dataset::fingerprint::Inputs;
 use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::DataFolder;
 use shearq_dataset::mosaic::Mosaic;
 use shearq_dataset::run::Run;
+use shearq_dataset::threads::{Pool, Progress};
 
 #[derive(Debug, Clone)]
 pub struct ImageHead {
@@ -143,7 +141,7 @@ impl<'a> FolderMeasurement<'a> {
     ) -> Result<Summary, PipelineError> {
         let mut catalogues = Catalogues::claim(self.run, self.out, self.images)?;
         let inputs = Inputs::new(self.run, self.data, self.images)?;
-        verify_images(&inputs, self.out, &catalogues.done, threads)?;
+        inputs.verify(self.out, &catalogues.done, &Pool::new(threads)?)?;
         let Some((_, mosaic)) = self.todo else {
             return catalogues.finish(progress);
         };

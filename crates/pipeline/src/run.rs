@@ -13,13 +13,13 @@ use shearq_measure::{
 use shearq_quantities::Shear;
 use shearq_submissions::{Configuration, PsfForm};
 
-use super::engine::Progress;
 use super::measure::{Catalogues, ImageHead, ImageRow, Measured, Summary, measure_images};
 use super::{PipelineError, simulate};
 use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::DataFolder;
 use shearq_dataset::mosaic::Mosaic;
 use shearq_dataset::run::Run;
+use shearq_dataset::threads::Progress;
 use shearq_simulate::render::RenderScratch;
 use shearq_simulate::set::{
     ImageFields, NOISE_SIGMA, PsfField, STAMP, SetSimulator, SimulationSettings,

@@ -3,25 +3,24 @@
 use std::sync::Arc;
 
 use super::PipelineError;
-use super::engine::{self, Feeder, Progress};
+use super::engine::{self, Feeder};
 use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::DataFolder;
 use shearq_dataset::psf_table;
 use shearq_dataset::record::claim;
 use shearq_dataset::run::{SIMULATION_FILE, SimulationRecord};
+use shearq_dataset::threads::Progress;
 use shearq_dataset::truth;
 use shearq_files::atomic;
 use shearq_files::fits::{ImageWriter, Value};
-use shearq_simulate::kinds::{SETS, SetKind};
+use shearq_simulate::kinds::SetKind;
 use shearq_simulate::render::RenderScratch;
 use shearq_simulate::set::{
     ImageFields, NOISE_SIGMA, PsfField, STAMP, SetSimulator, SimulationSettings,
 };
 
 pub fn simulator(set: u32, settings: SimulationSettings) -> Result<SetSimulator, PipelineError> {
-    let kind = SetKind::of(set).ok_or_else(|| {
-        PipelineError::Request(format!("there is no set {set}; expected 1 to {SETS}"))
-    })?;
+    let kind = SetKind::of(set).ok_or(PipelineError::NoSuchSet(set))?;
     SetSimulator::new(kind, settings).map_err(|source| PipelineError::Scoring {
         set: Some(set),
         source,

@@ -1,28 +1,26 @@
-//! Baselines: stored metrics with their settings and data, in a TOML file to compare with.
+//! Baselines: accepted metrics with their settings and data, in a TOML file. A later measurement has to repeat them.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 use shearq_dataset::fingerprint;
-use shearq_dataset::images::{self, ImageId};
+use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::DataFolder;
 use shearq_dataset::record::differences;
 use shearq_dataset::run::{Run, Source, shortened};
-use shearq_files::atomic::Scratch;
-use shearq_files::table::{self, FileFormat, MAX_ROWS};
+use shearq_dataset::threads::Pool;
+use shearq_files::table::{self, MAX_ROWS};
 use shearq_files::{FileError, atomic};
-use shearq_pipeline::PipelineError;
-use shearq_pipeline::engine::{self, Progress};
-use shearq_pipeline::measure::measure_folder;
-use shearq_pipeline::run::run_folder;
+use shearq_render::table::{Cell, Heading, Table};
 use shearq_scoring::{Metric, Metrics, Options};
 use shearq_submissions::{Configuration, ConfigurationError, Registry, checked_name};
 use thiserror::Error;
 
 use crate::catalogues::OWN;
 use crate::record::SetRecord;
-use crate::score::score_folder;
+use crate::score::{ScoreError, score_folder};
+use crate::views::junit::{Case, document};
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -153,22 +151,9 @@ impl Baseline {
         Err(Baseline::exists(path))
     }
 
-    /// Replaces `earlier`, which was read from the same file before measuring.
-    pub fn replace(&self, path: &Path, earlier: &Baseline) -> Result<(), FileError> {
+    /// Replaces the file. It belongs under version control, which keeps the earlier one.
+    pub fn replace(&self, path: &Path) -> Result<(), FileError> {
         atomic::sweep_beside(path);
-        // Other processes wait here until the file is replaced, if the file system has locks.
-        let folder = path
-            .parent()
-            .and_then(|folder| std::fs::File::open(folder).ok());
-        let _ = folder.as_ref().map(std::fs::File::lock);
-        // Compared as text, because NaN equals NaN there.
-        if Baseline::read(path)?.text(path)? != earlier.text(path)? {
-            let name = path.file_stem().unwrap_or_default().to_string_lossy();
-            let message = format!(
-                "another process changed the baseline during this command; it was not updated. Try: shearq baseline check {name}"
-            );
-            return Err(FileError::new(path, message));
-        }
         atomic::write(path, self.text(path)?.as_bytes())
     }
 
@@ -198,65 +183,12 @@ const ENDING: &str = "toml";
 // Names in the file of the scatter of e1 and of e2: it notices changes that Q averages out.
 const SCATTER: [&str; 2] = ["scatter_e1", "scatter_e2"];
 
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Wanted {
-    pub set: u32,
-    /// Number of images, counted from image 1.
-    pub images: u32,
-}
-
-/// Measures a configuration into a temporary folder and returns its metrics. Paths of `source` are relative to the
-/// folder `beside`.
-pub fn measure(
-    source: &Source,
-    beside: &Path,
-    configuration: &Configuration,
-    wanted: &[Wanted],
-    threads: usize,
-    progress: &mut dyn Progress,
-) -> Result<Vec<BaselineSet>, PipelineError> {
-    let folder = Scratch::new()?;
-    let out = folder.path();
-    let data = match source {
-        // Messages must not name the temporary folder.
-        Source::Folder { .. } => Some(source.data(beside)?),
-        Source::Simulated(_) => None,
-    };
-    let source = source.moved(beside, out)?;
-    let run = Run::new(source, configuration.clone(), FileFormat::default());
-    match (&run.source, &data) {
-        (Source::Simulated(settings), _) => {
-            let images: Vec<ImageId> = wanted
-                .iter()
-                .flat_map(|w| images::of_simulation(&[w.set], w.images))
-                .collect();
-            run_folder(&run, *settings, &images, out, threads, progress)?;
-        }
-        (Source::Folder { .. }, None) => {}
-        (Source::Folder { .. }, Some(data)) => {
-            let sets: Vec<u32> = wanted.iter().map(|w| w.set).collect();
-            let asked = |id: &ImageId| {
-                let mut of_set = wanted.iter().filter(|w| w.set == id.set);
-                of_set.any(|w| id.image <= w.images)
-            };
-            let mut images = images::of_folder(data, &sets)?;
-            images.retain(asked);
-            measure_folder(&run, data, out, &images, threads, progress)?;
-        }
-    }
-    let data = match data {
-        Some(data) => data,
-        None => run.source.data(out)?,
-    };
-    metrics_of(&run, &data, out, threads)
-}
-
 pub fn metrics_of(
     run: &Run,
     data: &DataFolder,
     out: &Path,
     threads: usize,
-) -> Result<Vec<BaselineSet>, PipelineError> {
+) -> Result<Vec<BaselineSet>, ScoreError> {
     let options = Options {
         choice: OWN,
         ..Options::default()
@@ -296,48 +228,32 @@ pub fn metrics_of(
 }
 
 // Rms of e1 and e2 over the measured galaxies of a set, each with its standard error rms/√(2N).
-fn scatter(
-    run: &Run,
-    out: &Path,
-    set: u32,
-    threads: usize,
-) -> Result<[[f64; 2]; 2], PipelineError> {
+fn scatter(run: &Run, out: &Path, set: u32, threads: usize) -> Result<[[f64; 2]; 2], ScoreError> {
     let catalogues = run.catalogues(out, &[set])?.of_set(set);
+    let pool = Pool::new(threads)?;
+    let sums = pool.in_order(catalogues, |(_, path)| {
+        let table = table::read(&path, Some(&["e1", "e2"]), MAX_ROWS)?;
+        let (e1, e2) = (
+            table::numbers(&table, "e1", &path)?,
+            table::numbers(&table, "e2", &path)?,
+        );
+        let mut sums = ([0.0; 2], 0.0);
+        for (e1, e2) in e1.iter().zip(e2.iter()) {
+            if e1.is_finite() && e2.is_finite() {
+                sums.0[0] += e1 * e1;
+                sums.0[1] += e2 * e2;
+                sums.1 += 1.0;
+            }
+        }
+        Ok::<_, FileError>(sums)
+    });
     let (mut squares, mut count) = ([0.0; 2], 0.0_f64);
-    engine::ordered(
-        threads.min(catalogues.len()).max(1),
-        |feeder| {
-            for (_, path) in catalogues {
-                if !feeder.push(path) {
-                    break;
-                }
-            }
-            Ok(())
-        },
-        || (),
-        |(), path| {
-            let table = table::read(&path, Some(&["e1", "e2"]), MAX_ROWS)?;
-            let (e1, e2) = (
-                table::numbers(&table, "e1", &path)?,
-                table::numbers(&table, "e2", &path)?,
-            );
-            let mut sums = ([0.0; 2], 0.0);
-            for (e1, e2) in e1.iter().zip(e2.iter()) {
-                if e1.is_finite() && e2.is_finite() {
-                    sums.0[0] += e1 * e1;
-                    sums.0[1] += e2 * e2;
-                    sums.1 += 1.0;
-                }
-            }
-            Ok(sums)
-        },
-        |(more, galaxies): ([f64; 2], f64)| {
-            squares[0] += more[0];
-            squares[1] += more[1];
-            count += galaxies;
-            Ok(())
-        },
-    )?;
+    for image in sums {
+        let (more, galaxies) = image?;
+        squares[0] += more[0];
+        squares[1] += more[1];
+        count += galaxies;
+    }
     Ok(squares.map(|sum| {
         let rms = (sum / count).sqrt();
         [rms, rms / (2.0 * count).sqrt()]
@@ -357,8 +273,6 @@ pub enum BaselineError {
         configuration: String,
         source: Box<dyn std::error::Error + Send + Sync>,
     },
-    #[error(transparent)]
-    Pipeline(#[from] PipelineError),
     #[error("set {set} could not be measured again (found no such set in the data)")]
     NoSet { set: u32 },
 }
@@ -468,10 +382,7 @@ pub struct Checked {
 }
 
 impl Checked {
-    pub fn failed(&self) -> bool {
-        !self.settings.is_empty() || self.shifts.iter().any(|shift| shift.moved)
-    }
-
+    /// What moved by more than rounding or noise, a line each.
     pub fn moved(&self) -> Vec<String> {
         let settings = self
             .settings
@@ -492,31 +403,16 @@ impl Checked {
     }
 }
 
-// The configuration that provides the defaults for the method of `settings`.
-fn base_of(settings: &toml::Table) -> &'static str {
-    match settings.get("method").and_then(toml::Value::as_str) {
-        Some("linear") => "48/linear/star",
-        _ => "paper",
-    }
-}
-
-/// The settings to measure a baseline with. Named configurations always have their present settings.
-#[derive(Debug, Clone, Copy)]
-pub enum Settings<'a> {
-    /// The settings in the configuration files; their paths are relative to this folder.
-    Files(&'a Path),
-    Stored,
-}
-
-// The settings to measure a configuration of a baseline with, and whether stored settings replace an unknown file.
-// A key that stored settings lack has its default.
+// The settings to measure a configuration of a baseline with, and whether stored settings replace an unknown file. Files
+// lie relative to the folder `beside`. Present settings, so that a check notices changed ones.
 fn settings_now(
     before: &BaselineConfiguration,
     registry: &Registry,
-    settings: Settings<'_>,
+    beside: &Path,
+    stored: bool,
 ) -> Result<(Configuration, bool), BaselineError> {
-    if let (Settings::Files(folder), Some(file)) = (settings, &before.file) {
-        let path = shortened(folder.join(file));
+    if let (false, Some(file)) = (stored, &before.file) {
+        let path = shortened(beside.join(file));
         // The registry could know a plain name.
         let path = Path::new(".").join(path);
         if !path.is_file() {
@@ -527,14 +423,17 @@ fn settings_now(
     if before.file.is_none() && registry.names().contains(&before.name) {
         return Ok((registry.get(&before.name)?.configuration, false));
     }
-    let base = registry.get(base_of(&before.settings))?.configuration;
-    let base = toml::Table::try_from(&base).map_err(settings_error(&before.name))?;
-    let configuration: Result<Configuration, toml::de::Error> =
-        with_defaults(base, &before.settings).try_into();
-    Ok((
-        configuration.map_err(settings_error(&before.name))?,
-        matches!(settings, Settings::Files(_)),
-    ))
+    // Settings that were introduced after the baseline have the defaults of its method.
+    let base = match before.settings.get("method").and_then(toml::Value::as_str) {
+        Some("linear") => "48/linear/star",
+        _ => "paper",
+    };
+    let base = toml::Table::try_from(registry.get(base)?.configuration);
+    let base = base.map_err(settings_error(&before.name))?;
+    let configuration = with_defaults(base, &before.settings)
+        .try_into()
+        .map_err(settings_error::<toml::de::Error>(&before.name))?;
+    Ok((configuration, !stored))
 }
 
 // `settings`, with the `defaults` of keys that they lack.
@@ -552,44 +451,43 @@ fn with_defaults(mut defaults: toml::Table, settings: &toml::Table) -> toml::Tab
     defaults
 }
 
-/// Measures the configurations of the baseline `name` again with `measure`, and compares.
-/// Returns the checks and the configurations with their present settings and metrics.
-pub fn check(
+/// Measures the configurations of the baseline `name` again with `measure`, and compares. Configuration files lie relative
+/// to the folder `beside`; with `stored`, they are not read. Returns the checks and the configurations with their present
+/// settings and metrics.
+pub fn check<E: From<BaselineError>>(
     name: &str,
     baseline: &Baseline,
     sigmas: f64,
-    settings: Settings<'_>,
-    mut measure: impl FnMut(&Configuration, &[Wanted]) -> Result<Vec<BaselineSet>, PipelineError>,
-) -> Result<(Vec<Checked>, Vec<BaselineConfiguration>), BaselineError> {
-    let registry = Registry::embedded()?;
+    (beside, stored): (&Path, bool),
+    mut measure: impl FnMut(&Configuration, &[ImageId]) -> Result<Vec<BaselineSet>, E>,
+) -> Result<(Vec<Checked>, Vec<BaselineConfiguration>), E> {
+    let registry = Registry::embedded().map_err(BaselineError::from)?;
     let (mut checks, mut configurations) = (Vec::new(), Vec::new());
     for before in &baseline.submissions {
-        // Present settings: a check is to notice changes of settings, too.
-        let (configuration, stored) = settings_now(before, &registry, settings)?;
+        let (configuration, replaced) = settings_now(before, &registry, beside, stored)?;
         let (settings, new) = settings_moved(before, &configuration)?;
+        let notes = new
+            .iter()
+            .map(|line| format!("a setting is new: {line}"))
+            .collect();
         let mut check = Checked {
             baseline: name.to_owned(),
             configuration: before.name.clone(),
             shifts: Vec::new(),
             settings,
-            notes: new
-                .iter()
-                .map(|line| format!("a setting is new: {line}"))
-                .collect(),
-            stored,
+            notes,
+            stored: replaced,
         };
-        let wanted: Vec<Wanted> = before
-            .sets
-            .iter()
-            .map(|set| Wanted {
-                set: set.set,
-                images: set.images.len() as u32,
-            })
-            .collect();
-        let sets = measure(&configuration, &wanted)?;
+        let of_set = |old: &BaselineSet| {
+            let set = old.set;
+            let images = old.images.clone().into_iter();
+            images.map(move |image| ImageId { set, image })
+        };
+        let images: Vec<ImageId> = before.sets.iter().flat_map(of_set).collect();
+        let sets = measure(&configuration, &images)?;
         for old in &before.sets {
             let Some(now) = sets.iter().find(|now| now.set == old.set) else {
-                return Err(BaselineError::NoSet { set: old.set });
+                return Err(BaselineError::NoSet { set: old.set }.into());
             };
             if now.data != old.data || now.images != old.images {
                 check.notes.push(format!(
@@ -611,29 +509,86 @@ pub fn check(
     Ok((checks, configurations))
 }
 
+/// The metrics of all checks, or only the moved ones.
+pub fn shift_table(checks: &[Checked], all: bool) -> Table {
+    let headings = [
+        ("baseline", "Baseline"),
+        ("submission", "Configuration"),
+        ("set", "Set"),
+        ("metric", "Metric"),
+        ("before", "Before"),
+        ("now", "Now"),
+        ("difference", "Difference"),
+        ("sigma", "in σ"),
+        ("moved", "Moved"),
+    ];
+    let mut rows = Vec::new();
+    for check in checks {
+        for shift in check.shifts.iter().filter(|shift| all || shift.moved) {
+            let cell = |[value, error]: [f64; 2]| {
+                Cell::with_error(value, Some(error).filter(|e| e.is_finite()), 6)
+            };
+            rows.push(vec![
+                Cell::text(&check.baseline),
+                Cell::text(&check.configuration),
+                Cell::number(f64::from(shift.set), 0),
+                Cell::text(shift.metric),
+                cell(shift.before),
+                cell(shift.now),
+                Cell::number(shift.now[0] - shift.before[0], 6),
+                Cell::number(shift.sigma, 3),
+                Cell::text(if shift.moved { "yes" } else { "no" }),
+            ]);
+        }
+    }
+    let compared: usize = checks.iter().map(|check| check.shifts.len()).sum();
+    let moved = checks
+        .iter()
+        .flat_map(|check| &check.shifts)
+        .filter(|shift| shift.moved)
+        .count();
+    let mut notes = vec![format!(
+        "{moved} of {compared} metrics of {} configuration(s) moved by more than rounding or noise. In σ: difference over the standard error of the metric.",
+        checks.len()
+    )];
+    for check in checks {
+        let name = format!("{}, {}", check.baseline, check.configuration);
+        for line in &check.settings {
+            notes.push(format!("{name}: the setting changed: {line}"));
+        }
+        for line in &check.notes {
+            notes.push(format!("{name}: {line}"));
+        }
+    }
+    Table {
+        title: "Shifts from baselines".into(),
+        headings: headings.map(|(key, label)| Heading::new(key, label)).into(),
+        rows,
+        notes,
+    }
+}
+
+/// The checks as JUnit: a suite per baseline, a case per configuration.
+pub fn junit(checks: &[Checked]) -> String {
+    let suites = checks.chunk_by(|a, b| a.baseline == b.baseline);
+    document(suites.map(|suite| {
+        let baseline = suite[0].baseline.as_str();
+        let cases = suite.iter().map(|check| Case {
+            class: format!("baseline.{baseline}"),
+            name: &check.configuration,
+            failure: {
+                let lines = check.moved();
+                let failure = (format!("{} moved", lines.len()), Some(lines.join("\n")));
+                (!lines.is_empty()).then_some(failure)
+            },
+        });
+        (baseline, cases.collect())
+    }))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use shearq_simulate::set::SimulationSettings;
-
-    #[test]
-    fn the_second_of_two_replacements_is_refused() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = Baseline::path(folder.path(), "mine");
-        let of = |seed| {
-            let source = Source::Simulated(SimulationSettings::new(seed, 8));
-            Baseline::new(source, Vec::new(), Vec::new())
-        };
-        of(1).create(&path).unwrap();
-        let earlier = Baseline::read(&path).unwrap();
-        of(2).replace(&path, &earlier).unwrap();
-        let message = of(3).replace(&path, &earlier).unwrap_err().to_string();
-        assert!(
-            message.ends_with("mine.toml: another process changed the baseline during this command; it was not updated. Try: shearq baseline check mine"),
-            "{message}"
-        );
-        assert_eq!(Baseline::read(&path).unwrap(), of(2));
-    }
 
     fn set(data: &str, q: f64) -> BaselineSet {
         let metrics = CHECKED.map(|name| (name.to_owned(), [q, 2.0]));
@@ -668,5 +623,30 @@ mod tests {
         let before = set("a", 0.0);
         let moved = |q: f64| shifts(&before, &set("a", q), 3.0)[0].moved;
         assert!(!moved(1.9 * TOLERANCE_SIGMA) && moved(2.1 * TOLERANCE_SIGMA));
+    }
+
+    #[test]
+    fn junit_counts_failures_and_escapes_names() {
+        let shift = Shift {
+            set: 2,
+            metric: "q",
+            before: [80.0, 2.0],
+            now: [81.0, 2.0],
+            sigma: 0.5,
+            moved: true,
+        };
+        let check = |configuration: &str, shifts: Vec<Shift>| Checked {
+            baseline: "small".into(),
+            configuration: configuration.into(),
+            shifts,
+            settings: Vec::new(),
+            stored: false,
+            notes: Vec::new(),
+        };
+        let text = junit(&[check("a<b", vec![shift]), check("c", Vec::new())]);
+        let totals = "name=\"small\" tests=\"2\" skipped=\"0\" errors=\"0\" failures=\"1\"";
+        assert!(text.contains(totals), "{text}");
+        assert!(text.contains("name=\"a&lt;b\"") && text.contains("+0.50 σ"));
+        assert!(text.contains("name=\"c\" classname=\"baseline.small\"/>"));
     }
 }

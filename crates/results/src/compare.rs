@@ -5,11 +5,11 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
-use shearq_dataset::layout::DataFolder;
-use shearq_dataset::layout::MAX_SET;
+use shearq_dataset::fingerprint;
+use shearq_dataset::layout::{DataFolder, MAX_SET};
 use shearq_dataset::run::{Run, Source};
+use shearq_dataset::threads::Pool;
 use shearq_files::FileError;
-use shearq_pipeline::{PipelineError, inputs};
 use shearq_render::table::Cell;
 use shearq_scoring::resample::{PairedDifference, PairedSet, paired_difference};
 use shearq_scoring::{Choice, Metrics, Options};
@@ -19,7 +19,7 @@ use crate::catalogues::Catalogues;
 use crate::conditions::{ChoiceError, choose};
 use crate::expression::Expression;
 use crate::record::{Column, RunRecord, SetRecord, columns_named};
-use crate::score::{ScoredSet, score_variants, unscored};
+use crate::score::{ScoreError, ScoredSet, score_variants, unscored};
 use crate::submit::packed::{Sent, Submission, is_packed};
 
 /// A method in a comparison.
@@ -100,31 +100,27 @@ pub fn score_all(
     choice: Option<Choice>,
     options: Options,
     threads: usize,
-) -> Result<Vec<Variant>, PipelineError> {
+) -> Result<Vec<Variant>, ScoreError> {
     let described = foreign.iter().map(|path| Catalogues::foreign(path, &[]));
     let described = described.collect::<Result<Vec<_>, _>>()?;
     let mut data = data.map(DataFolder::open).transpose()?;
     let mut all = given_catalogues(folders, &mut data, threads)?;
     all.extend(described);
-    let request = |message: String| Err(PipelineError::Request(message));
-    let Some(data) = data else {
-        return request("--foreign needs the true shear. Try: --data DIR".into());
-    };
+    let data = data.ok_or(ScoreError::NoTruth)?;
     if all.iter().all(Catalogues::serve_all_sets) {
-        return request("cannot determine the sets, because no `catalogues` contains {set}. Try: add {set} to the pattern".into());
+        return Err(ScoreError::NoSetNumber);
     }
     if let Some(empty) = all.iter().find(|catalogues| catalogues.sets().is_empty()) {
-        return request(format!("{}: there is no catalogue to score", empty.name));
+        return Err(ScoreError::NoCatalogueOf(empty.name.clone()));
     }
     let common = |set: u32| all.iter().all(|own| !own.of_set(set).is_empty());
     if !(1..=MAX_SET).any(common) {
-        return request("the catalogues have no set in common".into());
+        return Err(ScoreError::NoCommonSet);
     }
     let variants = all.iter().map(|own| (own, choice.unwrap_or(own.choice())));
     let variants: Vec<(&Catalogues, Choice)> = variants.collect();
     let scored = score_variants(&data, &variants, &[], options, threads)?;
-    let registry =
-        Registry::embedded().map_err(|error| PipelineError::Request(error.to_string()))?;
+    let registry = Registry::embedded()?;
     let mut found = Vec::new();
     for (&(catalogues, choice), scored) in variants.iter().zip(scored) {
         let sets: Vec<SetRecord> = scored.iter().map(|set| set.record.clone()).collect();
@@ -163,7 +159,7 @@ fn given_catalogues(
     folders: &[PathBuf],
     data: &mut Option<DataFolder>,
     threads: usize,
-) -> Result<Vec<Catalogues>, PipelineError> {
+) -> Result<Vec<Catalogues>, ScoreError> {
     let given = data.is_some();
     let mut first: Option<(&Path, Source)> = None;
     let mut found = Vec::new();
@@ -202,7 +198,7 @@ fn given_catalogues(
             )?),
         };
         // Catalogues of other images than those of the truth would have a low Q without any warning.
-        inputs::verify(data, folder, &run, &[], threads)?;
+        fingerprint::verify(data, folder, &run, &[], &Pool::new(threads)?)?;
         found.push(Catalogues::measured(&run, folder, &[])?);
     }
     Ok(found)

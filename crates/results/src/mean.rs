@@ -3,13 +3,13 @@
 use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
+use shearq_dataset::metadata::stated_frame;
 use shearq_dataset::run::Run;
 use shearq_files::FileError;
 use shearq_files::table::{self, FileFormat};
 use shearq_measure::{
     Flag, Flags, MeanShear, PixelFrame, ResponseMatrix, Selection, ShearSum, Warning,
 };
-use shearq_pipeline::measure::stated_frame;
 use shearq_quantities::statistics::RunningMean;
 use shearq_submissions::Calibration;
 
@@ -260,9 +260,9 @@ impl Rows {
 #[cfg(test)]
 mod tests {
     use shearq_dataset::fingerprint::PSF;
+    use shearq_dataset::metadata::PSF_NOISE;
     use shearq_files::frames::frame;
     use shearq_files::frames::polars::Column;
-    use shearq_pipeline::measure::PSF_NOISE;
 
     use super::*;
 

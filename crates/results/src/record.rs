@@ -12,7 +12,6 @@ use shearq_files::FileError;
 use shearq_files::frames::TableError;
 use shearq_files::frames::polars::{Column as FrameColumn, DataFrame};
 use shearq_files::table::MAX_ROWS;
-use shearq_pipeline::PipelineError;
 use shearq_render::table::{Cell, Heading};
 use shearq_scoring::resample::mean_over_sets;
 use shearq_scoring::{
@@ -172,7 +171,7 @@ impl RunRecord {
         mut self,
         source: &Source,
         data: &DataFolder,
-    ) -> Result<Self, PipelineError> {
+    ) -> Result<Self, FileError> {
         self.source = match source {
             Source::Simulated(settings) => serde_json::to_string(settings)
                 .map_err(FileError::doing(data.root(), "cannot store the settings"))?,

@@ -3,20 +3,51 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use shearq_dataset::layout::DataFolder;
-use shearq_dataset::layout::MAX_SET;
-use shearq_dataset::run::Run;
-use shearq_dataset::run::kind_of;
+use shearq_dataset::fingerprint;
+use shearq_dataset::layout::{DataFolder, MAX_SET};
+use shearq_dataset::run::{Run, kind_of};
+use shearq_dataset::threads::{Pool, ThreadError};
 use shearq_dataset::truth::{ReadTruth, Reading, Sign, read_truth, reading_of};
 use shearq_files::FileError;
-use shearq_pipeline::{PipelineError, engine, inputs};
 use shearq_scoring::{
     Choice, Convention, ConventionMatch, Fault, FieldSum, Grid, ImageFaults, OddResponse, Options,
     RowCounts, ScoringError, SetImages, SetScore, SetScorer, TruthSign, sign_by_correlation,
 };
+use shearq_submissions::ConfigurationError;
+use thiserror::Error;
 
 use crate::catalogues::Catalogues;
 use crate::record::SetRecord;
+
+/// Why catalogues cannot be scored or compared.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum ScoreError {
+    #[error(transparent)]
+    File(#[from] FileError),
+    #[error("{}", set.map_or_else(|| "this set cannot be scored".into(), |set| format!("set {set}")))]
+    Scoring {
+        /// Number of the set, if it has one.
+        set: Option<u32>,
+        source: ScoringError,
+    },
+    #[error("found no catalogue{} to score", set.map(|set| format!(" of set {set}")).unwrap_or_default())]
+    NoCatalogue { set: Option<u32> },
+    #[error("{0}: there is no catalogue to score")]
+    NoCatalogueOf(String),
+    #[error("the catalogues have no set in common")]
+    NoCommonSet,
+    #[error(
+        "cannot determine the sets, because no `catalogues` contains {{set}}. Try: add {{set}} to the pattern"
+    )]
+    NoSetNumber,
+    #[error("--foreign needs the true shear. Try: --data DIR")]
+    NoTruth,
+    #[error(transparent)]
+    Configuration(#[from] ConfigurationError),
+    #[error(transparent)]
+    Threads(#[from] ThreadError),
+}
 
 /// A scored set: its record, and what only its notes and plots need.
 #[derive(Debug, Clone)]
@@ -100,7 +131,7 @@ struct SetFiles<'a> {
     // Their names in messages: members of an archive, not of the folder that it was unpacked to.
     names: Vec<PathBuf>,
     read: ReadImage<'a>,
-    threads: usize,
+    pool: &'a Pool,
 }
 
 struct Added {
@@ -111,9 +142,9 @@ struct Added {
 }
 
 impl SetFiles<'_> {
-    fn wrong(&self) -> impl Fn(ScoringError) -> PipelineError + use<> {
+    fn wrong(&self) -> impl Fn(ScoringError) -> ScoreError + use<> {
         let set = self.set;
-        move |source| PipelineError::Scoring { set, source }
+        move |source| ScoreError::Scoring { set, source }
     }
 
     // Reads catalogues in parallel and adds them in order, so that results do not depend on threads. Each is compared
@@ -122,35 +153,22 @@ impl SetFiles<'_> {
         &self,
         grid: &Grid,
         compared: Option<(&SetScorer, Convention)>,
-    ) -> Result<Added, PipelineError> {
+    ) -> Result<Added, ScoreError> {
         let mut faults = ImageFaults::default();
         let mut images = SetImages::new(grid);
         let mut rows = RowCounts::default();
-        engine::ordered(
-            // More threads than catalogues have nothing to do.
-            self.threads.min(self.paths.len()).max(1),
-            |feeder| {
-                for path in &self.paths {
-                    if !feeder.push(path.clone()) {
-                        break;
-                    }
-                }
-                Ok(())
-            },
-            || (),
-            |(), path: PathBuf| {
-                let (sum, rows) = (self.read)(grid, &path)?;
-                let response = compared.and_then(|(scorer, own)| scorer.response(&sum, own));
-                Ok((sum, rows, response))
-            },
-            |(sum, more, response)| {
-                faults.add(&sum);
-                faults.add_response(response);
-                images.add(&sum).map_err(self.wrong())?;
-                rows += more;
-                Ok(())
-            },
-        )?;
+        let read = self.pool.in_order(&self.paths, |path| {
+            let (sum, rows) = (self.read)(grid, path)?;
+            let response = compared.and_then(|(scorer, own)| scorer.response(&sum, own));
+            Ok::<_, FileError>((sum, rows, response))
+        });
+        for image in read {
+            let (sum, more, response) = image?;
+            faults.add(&sum);
+            faults.add_response(response);
+            images.add(&sum).map_err(self.wrong())?;
+            rows += more;
+        }
         if let (0, Some(first)) = (rows.used, self.names.first()) {
             let message = nothing_used(&rows, self.names.len(), grid);
             return Err(FileError::new(first, message).into());
@@ -171,7 +189,7 @@ impl SetFiles<'_> {
         mut added: Added,
         choice: Choice,
         matched: Option<ConventionMatch>,
-    ) -> Result<ScoredSet, PipelineError> {
+    ) -> Result<ScoredSet, ScoreError> {
         let score = scorer.score(&added.images).map_err(self.wrong())?;
         let basis = match (matched, choice) {
             (Some(matching), _) => Basis::Matched(matching),
@@ -214,7 +232,7 @@ pub fn score_files(
     read: ReadImage<'_>,
     options: Options,
     threads: usize,
-) -> Result<ScoredSet, PipelineError> {
+) -> Result<ScoredSet, ScoreError> {
     let ReadTruth {
         grid,
         mut shear,
@@ -227,7 +245,7 @@ pub fn score_files(
         paths: catalogues.to_vec(),
         names: catalogues.to_vec(),
         read,
-        threads,
+        pool: &Pool::new(threads)?,
     };
     let added = files.add_up(&grid, None)?;
     let sign = match sign {
@@ -274,10 +292,11 @@ pub fn score_variants(
     sets: &[u32],
     options: Options,
     threads: usize,
-) -> Result<Vec<Vec<ScoredSet>>, PipelineError> {
+) -> Result<Vec<Vec<ScoredSet>>, ScoreError> {
     let sets = sets_to_score(variants, sets)?;
+    let pool = Pool::new(threads)?;
     let score = |&(catalogues, choice): &(&Catalogues, Choice)| {
-        score_sets(data, catalogues, choice, &sets, options, threads)
+        score_sets(data, catalogues, choice, &sets, options, &pool)
     };
     variants.iter().map(score).collect()
 }
@@ -288,8 +307,8 @@ fn score_sets(
     choice: Choice,
     sets: &[u32],
     options: Options,
-    threads: usize,
-) -> Result<Vec<ScoredSet>, PipelineError> {
+    pool: &Pool,
+) -> Result<Vec<ScoredSet>, ScoreError> {
     let read = |grid: &Grid, path: &Path| catalogues.sum(grid, path);
     let files = |set: u32| {
         let (images, paths): (Vec<u32>, Vec<PathBuf>) = catalogues.of_set(set).into_iter().unzip();
@@ -300,10 +319,10 @@ fn score_sets(
             names: paths.iter().map(|path| catalogues.as_given(path)).collect(),
             paths,
             read: &read,
-            threads,
+            pool,
         }
     };
-    let scorer = |files: &SetFiles<'_>, set: u32, options| -> Result<_, PipelineError> {
+    let scorer = |files: &SetFiles<'_>, set: u32, options| -> Result<_, ScoreError> {
         let ReadTruth { grid, shear, .. } = read_truth(&data.truth(set), &reading_of(data, set)?)?;
         let scorer = SetScorer::new(grid, shear, options).map_err(files.wrong())?;
         Ok((grid, scorer))
@@ -339,21 +358,17 @@ fn score_sets(
 fn sets_to_score(
     variants: &[(&Catalogues, Choice)],
     wanted: &[u32],
-) -> Result<Vec<u32>, PipelineError> {
+) -> Result<Vec<u32>, ScoreError> {
     let complete = |set: &u32| variants.iter().all(|v| !v.0.of_set(*set).is_empty());
-    let lacking = || wanted.iter().find(|set| !complete(set));
-    let message = match lacking() {
-        Some(set) => format!("found no catalogue of set {set} to score"),
-        None => {
-            let asked = |set: &u32| wanted.is_empty() || wanted.contains(set);
-            let sets: Vec<u32> = (1..=MAX_SET).filter(asked).filter(complete).collect();
-            if !sets.is_empty() {
-                return Ok(sets);
-            }
-            "found no catalogue to score".into()
-        }
-    };
-    Err(PipelineError::Request(message))
+    if let Some(set) = wanted.iter().find(|set| !complete(set)) {
+        return Err(ScoreError::NoCatalogue { set: Some(*set) });
+    }
+    let asked = |set: &u32| wanted.is_empty() || wanted.contains(set);
+    let sets: Vec<u32> = (1..=MAX_SET).filter(asked).filter(complete).collect();
+    match sets.is_empty() {
+        true => Err(ScoreError::NoCatalogue { set: None }),
+        false => Ok(sets),
+    }
 }
 
 /// Scores `sets` of one method, or all sets with catalogues if it is empty.
@@ -363,15 +378,15 @@ pub fn score_catalogues(
     sets: &[u32],
     options: Options,
     threads: usize,
-) -> Result<Vec<ScoredSet>, PipelineError> {
+) -> Result<Vec<ScoredSet>, ScoreError> {
     if let Some(run) = catalogues.run() {
-        inputs::verify(data, &catalogues.path, run, sets, threads)?;
+        fingerprint::verify(data, &catalogues.path, run, sets, &Pool::new(threads)?)?;
     }
     let variant = [(catalogues, options.choice)];
     let scored = score_variants(data, &variant, sets, options, threads);
     let scored = scored.map_err(|error| match error {
-        PipelineError::Request(message) if catalogues.run().is_some() => {
-            FileError::new(&catalogues.path, message).into()
+        ScoreError::NoCatalogue { .. } if catalogues.run().is_some() => {
+            FileError::new(&catalogues.path, error).into()
         }
         other => other,
     })?;
@@ -386,7 +401,7 @@ pub fn score_folder(
     sets: &[u32],
     options: Options,
     threads: usize,
-) -> Result<Vec<ScoredSet>, PipelineError> {
+) -> Result<Vec<ScoredSet>, ScoreError> {
     let catalogues = Catalogues::measured(run, out, sets)?;
     score_catalogues(data, &catalogues, sets, options, threads)
 }

@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use shearq_dataset::fingerprint::PRINTS;
+use shearq_dataset::metadata::KEYS;
 use shearq_dataset::record::claim;
 use shearq_dataset::run::{RUN_FILE, Run, Source};
 use shearq_files::frames::frame;
@@ -10,7 +11,6 @@ use shearq_files::frames::polars::{Column, DataFrame};
 use shearq_files::table::Place;
 use shearq_files::{FileError, atomic, table};
 use shearq_measure::{Cut, Observables, Quantity, Selection, ShearedCatalogues};
-use shearq_pipeline::measure::KEYS;
 use thiserror::Error;
 
 use crate::expression::{Condition, Expression, ExpressionError, Step};

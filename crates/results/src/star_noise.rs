@@ -6,11 +6,11 @@ use std::path::Path;
 
 pub use shearq_bias::StarNoise;
 use shearq_dataset::fingerprint::PSF;
+use shearq_dataset::metadata::PSF_NOISE;
 use shearq_files::FileError;
 use shearq_files::frames::Metadata;
 use shearq_files::frames::polars::DataFrame;
 use shearq_files::table::{self, FileFormat};
-use shearq_pipeline::measure::PSF_NOISE;
 
 // Largest effect on m or c that metadata can state: a star without any signal has 5.5.
 const MAX_STAR_EFFECT: f64 = 10.0;

@@ -22,8 +22,9 @@ use shearq_quantities::Shear;
 use shearq_submissions::Calibration;
 
 use shearq_dataset::record::nan_for_null;
+use shearq_dataset::threads::Progress;
 use shearq_pipeline::PipelineError;
-use shearq_pipeline::engine::{self, Progress};
+use shearq_pipeline::engine;
 use shearq_pipeline::run::SimulatedSessions;
 use shearq_simulate::render::RenderScratch;
 use shearq_simulate::set::{ImageFields, SetSimulator, Version};
@@ -250,7 +251,7 @@ mod tests {
     use shearq_submissions::Registry;
 
     use super::*;
-    use shearq_pipeline::engine::Quiet;
+    use shearq_dataset::threads::Quiet;
     use shearq_pipeline::run::measurers;
     use shearq_pipeline::simulate::simulator;
     use shearq_simulate::set::SimulationSettings;

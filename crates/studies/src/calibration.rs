@@ -15,11 +15,12 @@ use ndarray::Array2;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
+use shearq_dataset::threads::Progress;
 use shearq_measure::parts::{
     ClippedAcf, ClippedAcfScratch, Network, NetworkScratch, Rule, convolve, psf_factor,
 };
 use shearq_pipeline::PipelineError;
-use shearq_pipeline::engine::{self, Progress};
+use shearq_pipeline::engine;
 use shearq_quantities::{Distortion, FunctionalPsf, PsfProfile, Shear};
 use shearq_render::figure::{LinePlot, PanelGrid, Series, Style};
 use shearq_render::page::{Page, PageError};
@@ -232,12 +233,9 @@ struct Synthetic {
 impl LambdaStudy {
     fn new(configuration: &Configuration) -> Result<Self, PipelineError> {
         let (n, psf_size) = (configuration.stamp.size, configuration.psf.size);
-        let method = configuration.network().ok_or_else(|| {
-            PipelineError::Request(format!(
-                "configuration {} has method = \"linear\"; expected \"network\"",
-                configuration.name
-            ))
-        })?;
+        let method = configuration
+            .network()
+            .ok_or_else(|| PipelineError::NoNetwork(configuration.name.clone()))?;
         let settings = method.deconvolution.clone();
         let plan =
             |log: &f64| Network::plan(n, psf_size, settings.printed_lambda(10f64.powf(*log)));

@@ -14,10 +14,10 @@ use shearq_submissions::{Configuration, checked_name};
 use super::response::{Regression, Response};
 use shearq_dataset::mosaic::Mosaic;
 use shearq_dataset::record::{Claim, claim, nan_for_null, read_record, write_record};
+use shearq_dataset::threads::Progress;
 use shearq_files::FileError;
 use shearq_measure::{Measurement, Measurer};
 use shearq_pipeline::PipelineError;
-use shearq_pipeline::engine::Progress;
 use shearq_pipeline::run::{measurers, run_set};
 use shearq_pipeline::simulate::simulator;
 use shearq_results::catalogues::OWN;
@@ -256,7 +256,7 @@ fn field_sum(grid: &Grid, galaxies: &[Measurement]) -> (FieldSum, RowCounts) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use shearq_pipeline::engine::Quiet;
+    use shearq_dataset::threads::Quiet;
     use shearq_submissions::Registry;
 
     fn plan(names: &[&str]) -> Plan {

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use ndarray::{Array2, ArrayView2};
+use shearq_dataset::threads::Quiet;
 use shearq_dataset::truth::Reading;
 use shearq_files::FileError;
 use shearq_files::atomic::{self, Scratch};
@@ -13,7 +14,6 @@ use shearq_files::frames::polars::Column;
 use shearq_files::table::{self, FileFormat};
 use shearq_measure::{ImageNoise, Measurer};
 use shearq_pipeline::PipelineError;
-use shearq_pipeline::engine::Quiet;
 use shearq_pipeline::run::{measurers, run_set};
 use shearq_pipeline::simulate::simulator;
 use shearq_quantities::statistics::median;
@@ -21,7 +21,7 @@ use shearq_quantities::units::{Degrees, Pixels};
 use shearq_render::table::{Cell, Table};
 use shearq_results::catalogues::COLUMNS;
 use shearq_results::foreign::{Screen, plain_columns};
-use shearq_results::score::score_files;
+use shearq_results::score::{ScoreError, score_files};
 use shearq_scoring::{Options, TruthSign};
 use shearq_simulate::render::RenderScratch;
 use shearq_simulate::set::{NOISE_SIGMA, STAMP, SimulationSettings};
@@ -40,9 +40,7 @@ const CATALOGUES: usize = 200;
 const SIDE: usize = 100;
 
 // Median time of `run`, after a first one that fills caches and grows buffers.
-fn median_seconds(
-    mut run: impl FnMut() -> Result<(), PipelineError>,
-) -> Result<f64, PipelineError> {
+fn median_seconds<E>(mut run: impl FnMut() -> Result<(), E>) -> Result<f64, E> {
     run()?;
     let begin = Instant::now();
     let mut seconds = Vec::new();
@@ -161,7 +159,7 @@ pub fn configurations(
 ///
 /// # Errors
 /// If the files cannot be written or read.
-pub fn scoring(threads: usize) -> Result<Table, PipelineError> {
+pub fn scoring(threads: usize) -> Result<Table, ScoreError> {
     let folder = Scratch::new()?;
     let cells = || 0..SIDE * SIDE;
     let position = |k: usize| (k as f64).mul_add(48.0, 24.5);
@@ -204,13 +202,9 @@ pub fn scoring(threads: usize) -> Result<Table, PipelineError> {
                 None => atomic::write(path, text.as_bytes())?,
             }
         }
-        let seconds = median_seconds(|| {
-            let options = Options::default();
-            black_box(score_files(
-                &truth, &paths, &reading, &read, options, threads,
-            )?);
-            Ok(())
-        })?;
+        let options = Options::default();
+        let score = || score_files(&truth, &paths, &reading, &read, options, threads);
+        let seconds = median_seconds(|| score().map(|scored| _ = black_box(scored)))?;
         rows.push((name, seconds));
     }
     let mut table = Table::titled(format!(

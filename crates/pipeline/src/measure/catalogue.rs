@@ -6,18 +6,17 @@ use std::path::{Path, PathBuf};
 use shearq_files::FileError;
 use shearq_files::frames::polars::{Column, DataFrame};
 use shearq_files::frames::{TableError, frame};
-use shearq_files::table::{self, FileFormat};
-use shearq_measure::{
-    Batch, Flag, Flags, Measurement, Observables, PixelFrame, ShearedCatalogues, Warning,
-};
+use shearq_files::table;
+use shearq_measure::{Batch, Flag, Flags, Measurement, Observables, ShearedCatalogues, Warning};
 use shearq_submissions::{Configuration, EllipticityType};
 
 use super::ImageHead;
 use crate::PipelineError;
-use crate::engine::Progress;
 use shearq_dataset::images::ImageId;
+use shearq_dataset::metadata::{PSF_NOISE, WARNINGS, frame_entry};
 use shearq_dataset::record::{Claim, claim};
 use shearq_dataset::run::{RUN_FILE, Run};
+use shearq_dataset::threads::Progress;
 
 /// The value of a column.
 #[derive(Debug, Clone, Copy)]
@@ -107,43 +106,6 @@ fn response(galaxy: &Measurement, i: usize, j: usize) -> f64 {
     galaxy.response.map_or(f64::NAN, |response| response[i][j])
 }
 
-const WARNINGS: &str = "warnings";
-/// Key of the metadata with the effect of the noise of an image's star on its mean shear: the standard deviations of m and c.
-/// A FITS key has eight characters.
-pub const PSF_NOISE: &str = "psfnoise";
-/// Key of the metadata with the pixel axes, if they are not the sky's: position angle of +y in degrees, parity (−1 for mirrored),
-/// and both components of the shear.
-const FRAME: &str = "frame";
-/// Keys of the metadata of catalogues, beside fingerprints.
-pub const KEYS: [&str; 9] = [
-    "creator", "submiss", "elltype", "set", "image", "settings", PSF_NOISE, WARNINGS, FRAME,
-];
-
-/// The pixel axes of a catalogue's image; `None` if they are the sky's, or unknown.
-pub fn stated_frame(path: &Path, format: FileFormat) -> Result<Option<PixelFrame>, FileError> {
-    let keys = [FRAME.to_owned()];
-    let metadata = table::read_metadata(path, format, keys.iter())?;
-    let Some(text) = metadata.get(FRAME) else {
-        return Ok(None);
-    };
-    let numbers: Option<Vec<f64>> = text.split(' ').map(|word| word.parse().ok()).collect();
-    match numbers.as_deref() {
-        Some(&[angle, parity, g1, g2]) if numbers.iter().flatten().all(|n| n.is_finite()) => {
-            Ok(Some(PixelFrame {
-                angle,
-                mirrored: parity < 0.0,
-                shear: [g1, g2],
-            }))
-        }
-        _ => {
-            let message = format!(
-                "the metadata `{FRAME}` are {text:?} (expected four numbers such as 90.00 -1 0.0100 0.0000)"
-            );
-            Err(FileError::new(path, message))
-        }
-    }
-}
-
 fn catalogue(
     head: &ImageHead,
     galaxies: &[Measurement],
@@ -177,9 +139,7 @@ pub(crate) fn metadata(
         EllipticityType::Distortion => "distortion",
         EllipticityType::Shear => "shear",
     };
-    let settings = toml::to_string(&run.configuration).map_err(|error| {
-        PipelineError::Request(format!("the settings cannot be stored: {error}"))
-    })?;
+    let settings = toml::to_string(&run.configuration)?;
     let mut all = prints;
     all.extend(
         [
@@ -325,14 +285,7 @@ impl<'a> Catalogues<'a> {
         }
         for warning in found {
             if let Warning::PixelFrame(frame) = warning {
-                let PixelFrame {
-                    angle,
-                    mirrored,
-                    shear: [g1, g2],
-                } = frame;
-                let parity = if *mirrored { -1 } else { 1 };
-                let text = format!("{angle:.2} {parity} {g1:.4} {g2:.4}");
-                metadata.insert(FRAME.into(), text);
+                metadata.extend([frame_entry(frame)]);
             }
         }
         if let Some([m, c]) = batch.psf_noise {
@@ -375,10 +328,8 @@ impl Warned {
     ) -> Result<(), PipelineError> {
         for warning in warnings {
             if warning.is_fatal() {
-                let ImageId { set, image } = id;
-                return Err(PipelineError::Request(format!(
-                    "set {set:02} image {image:03}: {warning}"
-                )));
+                let warning = warning.clone();
+                return Err(PipelineError::Fatal { id, warning });
             }
             match self.kinds.get_mut(warning.kind()) {
                 Some(more) => *more += 1,

@@ -15,12 +15,12 @@ use crate::catalogues::Catalogues;
 use crate::foreign::Foreign;
 use shearq_dataset::layout::DataFolder;
 use shearq_dataset::record::record_text;
+use shearq_dataset::threads::Progress;
 use shearq_dataset::{grid, truth};
 use shearq_files::FileError;
 use shearq_files::atomic::PartFolder;
 use shearq_files::open::is_there;
 use shearq_files::table::{MAX_ROWS, most_rows};
-use shearq_pipeline::Progress;
 
 #[derive(Debug, Clone)]
 pub struct Packing<'a> {

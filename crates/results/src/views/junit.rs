@@ -3,14 +3,14 @@
 use quick_junit::{NonSuccessKind, Report, TestCase, TestCaseStatus, TestSuite};
 use shearq_render::escape::visible;
 
-pub(super) struct Case<'a> {
+pub(crate) struct Case<'a> {
     pub class: String,
     pub name: &'a str,
     /// One line and, if there is more to say, details of a failure.
     pub failure: Option<(String, Option<String>)>,
 }
 
-pub(super) fn document<'a>(suites: impl IntoIterator<Item = (&'a str, Vec<Case<'a>>)>) -> String {
+pub(crate) fn document<'a>(suites: impl IntoIterator<Item = (&'a str, Vec<Case<'a>>)>) -> String {
     let mut report = Report::new("shearq");
     for (name, cases) in suites {
         let mut suite = TestSuite::new(visible(name));
