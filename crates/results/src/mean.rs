@@ -1,15 +1,12 @@
 //! Mean shears of sets, for fields of constant shear.
 
-use std::borrow::Cow;
 use std::path::{Path, PathBuf};
 
 use shearq_dataset::metadata::stated_frame;
 use shearq_dataset::run::Run;
 use shearq_files::FileError;
-use shearq_files::table::{self, FileFormat};
-use shearq_measure::{
-    Flag, Flags, MeanShear, PixelFrame, ResponseMatrix, Selection, ShearSum, Warning,
-};
+use shearq_files::table::FileFormat;
+use shearq_measure::{Flag, Flags, MeanShear, PixelFrame, Selection, ShearSum, Warning};
 use shearq_quantities::statistics::RunningMean;
 use shearq_submissions::Calibration;
 
@@ -126,26 +123,27 @@ fn mean_of(
             );
             return Err(FileError::new(path, message));
         }
-        let rows = match selection {
-            Some(selection) => Rows::selected(path, selection)?,
-            None => Rows::read(path, calibrated)?,
+        let (rows, bits) = match selection {
+            Some(selection) => Weighted::read(path, selection)?,
+            None => Weighted::unselected(path, calibrated)?,
         };
-        for &bits in &*rows.flags {
+        for &bits in &bits {
             for (count, flag) in flags.iter_mut().zip(Flag::ALL) {
                 *count += usize::from(Flags::from_bits(bits as u32).contains(flag));
             }
         }
         let mut share = [0.0; 2];
-        for row in 0..rows.flags.len() {
-            if !rows.is_good(row) {
+        for row in 0..bits.len() {
+            let e = [0, 1].map(|k| rows.e[k][row]);
+            if !e.iter().all(|e| e.is_finite()) {
                 flagged += 1;
                 continue;
             }
-            if rows.cut[row] {
+            if rows.weight[row] == 0.0 {
                 cut += 1;
                 continue;
             }
-            let (e, response) = (rows.e(row), rows.response(row));
+            let response = rows.matrix(row);
             sum.add(e, response, 1.0);
             for k in 0..2 {
                 moments[k].add(e[k]);
@@ -187,82 +185,13 @@ fn agree(a: Option<PixelFrame>, b: Option<PixelFrame>) -> bool {
     a.mirrored == b.mirrored && turned.abs() < 2.0 && g1.hypot(g2) < 0.01
 }
 
-/// The columns of a catalogue from which a mean shear follows.
-struct Rows {
-    /// Before calibration.
-    e: [Vec<f64>; 2],
-    flags: Vec<f64>,
-    /// R11 and R22, and R12 and R21, of configurations with a calibration.
-    response: Option<[[Vec<f64>; 2]; 2]>,
-    /// Whether a selection leaves the galaxy out.
-    cut: Vec<bool>,
-}
-
-impl Rows {
-    fn read(path: &Path, calibrated: bool) -> Result<Self, FileError> {
-        let mut names = vec!["e1", "e2", "flags"];
-        if calibrated {
-            names.extend(["R11", "R22", "R12", "R21", "divisor1", "divisor2"]);
-        }
-        let read = table::read(path, Some(&names), table::MAX_ROWS)?;
-        let column = |name| table::numbers(&read, name, path).map(Cow::into_owned);
-        let flags = column("flags")?;
-        let mut e = [column("e1")?, column("e2")?];
-        let mut response = None;
-        if calibrated {
-            response = Some([
-                [column("R11")?, column("R22")?],
-                [column("R12")?, column("R21")?],
-            ]);
-            for (e, name) in e.iter_mut().zip(["divisor1", "divisor2"]) {
-                for (e, divisor) in e.iter_mut().zip(column(name)?) {
-                    *e *= divisor;
-                }
-            }
-        }
-        Ok(Rows {
-            e,
-            cut: vec![false; flags.len()],
-            flags,
-            response,
-        })
-    }
-
-    /// The rows with the weights of a selection.
-    fn selected(path: &Path, selection: &Selection) -> Result<Self, FileError> {
-        let (weighted, flags) = Weighted::read(path, selection)?;
-        let cut = weighted.weight.iter().map(|weight| *weight == 0.0);
-        Ok(Rows {
-            cut: cut.collect(),
-            e: weighted.e,
-            flags,
-            response: Some([weighted.response, weighted.cross]),
-        })
-    }
-
-    fn e(&self, row: usize) -> [f64; 2] {
-        [0, 1].map(|k| self.e[k][row])
-    }
-
-    fn is_good(&self, row: usize) -> bool {
-        self.e(row).iter().all(|e| e.is_finite())
-    }
-
-    /// The unit matrix for ellipticities without calibration.
-    fn response(&self, row: usize) -> ResponseMatrix {
-        let Some([[r11, r22], [r12, r21]]) = &self.response else {
-            return [[1.0, 0.0], [0.0, 1.0]];
-        };
-        [[r11[row], r12[row]], [r21[row], r22[row]]]
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use shearq_dataset::fingerprint::PSF;
     use shearq_dataset::metadata::PSF_NOISE;
     use shearq_files::frames::frame;
     use shearq_files::frames::polars::Column;
+    use shearq_files::table;
 
     use super::*;
 

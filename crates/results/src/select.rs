@@ -1,5 +1,6 @@
 //! Cuts and weights on catalogues of linear configurations, with the response of the selection to shear.
 
+use std::borrow::Cow;
 use std::path::Path;
 
 use shearq_dataset::fingerprint::PRINTS;
@@ -10,7 +11,7 @@ use shearq_files::frames::frame;
 use shearq_files::frames::polars::{Column, DataFrame};
 use shearq_files::table::Place;
 use shearq_files::{FileError, atomic, table};
-use shearq_measure::{Cut, Observables, Quantity, Selection, ShearedCatalogues};
+use shearq_measure::{Cut, Observables, Quantity, ResponseMatrix, Selection, ShearedCatalogues};
 use thiserror::Error;
 
 use crate::expression::{Condition, Expression, ExpressionError, Step};
@@ -234,7 +235,7 @@ impl Weighted {
     pub fn of<'a>(
         path: &Path,
         selection: &Selection,
-        column: impl Fn(&str) -> Result<std::borrow::Cow<'a, [f64]>, FileError>,
+        column: impl Fn(&str) -> Result<Cow<'a, [f64]>, FileError>,
     ) -> Result<Self, FileError> {
         let all: Vec<_> = Observables::COLUMNS
             .iter()
@@ -310,6 +311,39 @@ impl Weighted {
         let read = table::read(path, Some(&wanted), table::MAX_ROWS)?;
         let flags = table::numbers(&read, "flags", path)?.into_owned();
         Ok((Weighted::of_table(path, selection, &read)?, flags))
+    }
+
+    /// The rows of a catalogue without a selection, with the flags: weights of one, and the responses of shears if the
+    /// ellipticities are not `calibrated`.
+    pub(crate) fn unselected(path: &Path, calibrated: bool) -> Result<(Self, Vec<f64>), FileError> {
+        let names = if calibrated { &READ[..] } else { &READ[..3] };
+        let read = table::read(path, Some(names), table::MAX_ROWS)?;
+        let column = |name: &str| table::numbers(&read, name, path).map(Cow::into_owned);
+        let pair = |[a, b]: [&str; 2]| Ok::<_, FileError>([column(a)?, column(b)?]);
+        let (flags, mut e) = (column("flags")?, pair(["e1", "e2"])?);
+        let all = |value: f64| vec![value; flags.len()];
+        let (mut response, mut cross) = ([all(1.0), all(1.0)], [all(0.0), all(0.0)]);
+        if calibrated {
+            (response, cross) = (pair(["R11", "R22"])?, pair(["R12", "R21"])?);
+            // Sums of ellipticities before calibration over sums of responses: a mean of ratios would weigh each galaxy by
+            // its response, which follows its noise.
+            for (e, divisors) in e.iter_mut().zip(pair(["divisor1", "divisor2"])?) {
+                e.iter_mut().zip(divisors).for_each(|(e, d)| *e *= d);
+            }
+        }
+        let weighted = Weighted {
+            e,
+            response,
+            cross,
+            weight: all(1.0),
+        };
+        Ok((weighted, flags))
+    }
+
+    /// The response of e1 and e2 of a row, by rows, to g1 and g2.
+    pub(crate) fn matrix(&self, row: usize) -> ResponseMatrix {
+        let ([r11, r22], [r12, r21]) = (&self.response, &self.cross);
+        [[r11[row], r12[row]], [r21[row], r22[row]]]
     }
 
     /// The mean responses, which have to be positive for a calibration.
