@@ -12,8 +12,7 @@ use shearq_files::frames::polars::Column;
 use shearq_files::table::Place;
 use shearq_render::table::TableFormat;
 use shearq_results::bias::columns::{Names, Shapes};
-use shearq_results::bias::folders::expand;
-use shearq_results::bias::truth::{TrueSign, Truth};
+use shearq_results::bias::truth::{TrueSign, Truth, expand};
 use shearq_results::bias::{
     BiasFailure, Binning, Edges, Input, MOST_BINS, Request, Summed, Units, sum,
 };

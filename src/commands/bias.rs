@@ -14,8 +14,7 @@ use shearq_dataset::truth::word;
 use shearq_files::{atomic, open};
 use shearq_render::figure::{Figure, PictureFormat};
 use shearq_results::bias::columns::{Names, Shapes, role_names};
-use shearq_results::bias::folders;
-use shearq_results::bias::truth::{TrueSign, Truth};
+use shearq_results::bias::truth::{TrueSign, Truth, expand};
 use shearq_results::bias::{Binning, Edges, MOST_BINS, Request, Summed, Units, sum};
 use shearq_results::expression::Expression;
 use shearq_results::select::selection;
@@ -369,7 +368,7 @@ fn of_catalogues(arguments: &Arguments, catalogues: &[PathBuf]) -> anyhow::Resul
             anyhow::bail!("{option}: cannot be used with step() in --where");
         }
     }
-    let (catalogues, truth) = folders::expand(catalogues, truth)?;
+    let (catalogues, truth) = expand(catalogues, truth)?;
     let request = Request {
         catalogues,
         names,

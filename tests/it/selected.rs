@@ -210,11 +210,11 @@ fn sheared_versions_give_the_response_of_any_selection() {
     for (select, expected) in [
         (
             "size_1p > 2.7",
-            "belongs to one sheared version (expected a column of all). Try: size",
+            "belongs to one sheared catalogue (expected a column of all). Try: size",
         ),
         (
             "size > 2.7 and R11 > 0",
-            "`R11`: it changes with shear, and has no sheared versions",
+            "`R11`: it changes with shear, and has no columns of sheared",
         ),
     ] {
         let refused = fail(

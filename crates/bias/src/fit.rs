@@ -66,7 +66,7 @@ impl Plan {
         for k in 0..layout.components() {
             let of = layout.of(sums, k);
             let extra = extra[k];
-            let zero = of.slope(OWN, OWN, extra) == 0.0;
+            let zero = of.response(OWN, OWN, extra) == 0.0;
             plan.known[k] = match (truth && !zero, solve(&of, &[ONE, OWN], extra)) {
                 (false, _) => Known::OnlyC,
                 (true, Some(_)) => Known::Both,
@@ -137,7 +137,7 @@ impl Plan {
                 // One unknown is a ratio.
                 (false, Known::OnlyM | Known::OnlyC) => {
                     let mut x = [0.0; MAX_TERMS];
-                    x[0] = of.with_e[terms[0]] / of.slope(terms[0], terms[0], own);
+                    x[0] = of.with_e[terms[0]] / of.response(terms[0], terms[0], own);
                     Some(x)
                 }
             };
@@ -152,9 +152,9 @@ impl Plan {
         }
         for k in 0..2 {
             let of = layout.of(sums, k);
-            found[RESPONSE[k]] = of.slope(ONE, ONE, extra.own[k]) / sums[WEIGHT];
+            found[RESPONSE[k]] = of.response(ONE, ONE, extra.own[k]) / sums[WEIGHT];
             if let Some(mixed) = layout.mixed(sums, k) {
-                found[OTHER_RESPONSE[k]] = mixed.slope(ONE, ONE, extra.other[k]) / sums[WEIGHT];
+                found[OTHER_RESPONSE[k]] = mixed.response(ONE, ONE, extra.other[k]) / sums[WEIGHT];
             }
             let last = |terms: &[usize], others: &[usize]| {
                 let solved = self.solve(sums, k, terms, others);
@@ -239,14 +239,14 @@ fn eliminate(of: &Component<'_>, terms: &[usize], extra: f64) -> Option<(Solutio
     let mut a = [[0.0; MAX_TERMS + 1]; MAX_TERMS];
     let mut scale = [0.0; MAX_TERMS];
     for (i, &s) in terms.iter().enumerate() {
-        scale[i] = of.slope(s, s, extra).abs().sqrt();
+        scale[i] = of.response(s, s, extra).abs().sqrt();
         if !(scale[i] > 0.0 && scale[i].is_finite()) {
             return None;
         }
     }
     for (i, &s) in terms.iter().enumerate() {
         for (j, &t) in terms.iter().enumerate() {
-            a[i][j] = of.slope(s, t, extra) / (scale[i] * scale[j]);
+            a[i][j] = of.response(s, t, extra) / (scale[i] * scale[j]);
         }
         a[i][n] = of.with_e[s] / scale[i];
     }
@@ -278,18 +278,18 @@ fn solve_both(
     };
     let [own, other] = [k, k ^ 1].map(|k| (k, layout.of(sums, k), layout.mixed(sums, k)));
     let of = |component: usize| if component == k { &own } else { &other };
-    let slope = |(a, s): (usize, usize), (b, t): (usize, usize)| {
+    let response = |(a, s): (usize, usize), (b, t): (usize, usize)| {
         let (_, alone, mixed) = of(a);
         match (a == b, mixed) {
-            (true, _) => alone.slope(s, t, extra.own[a]),
-            (false, Some(mixed)) => mixed.slope(s, t, extra.other[a]),
+            (true, _) => alone.response(s, t, extra.own[a]),
+            (false, Some(mixed)) => mixed.response(s, t, extra.other[a]),
             (false, None) => 0.0,
         }
     };
     let n = terms.len() + others.len();
     let mut scale = [0.0; 2 * MAX_TERMS];
     for (scale, unknown) in scale.iter_mut().zip(unknowns()) {
-        *scale = slope(unknown, unknown).abs().sqrt();
+        *scale = response(unknown, unknown).abs().sqrt();
         if !(*scale > 0.0 && scale.is_finite()) {
             return None;
         }
@@ -297,7 +297,7 @@ fn solve_both(
     let mut rows = [[0.0; 2 * MAX_TERMS + 1]; 2 * MAX_TERMS];
     for ((row, equation), own) in rows.iter_mut().zip(unknowns()).zip(scale) {
         for ((value, unknown), other) in row.iter_mut().zip(unknowns()).zip(scale) {
-            *value = slope(equation, unknown) / (own * other);
+            *value = response(equation, unknown) / (own * other);
         }
         row[n] = of(equation.0).1.with_e[equation.1] / own;
     }

@@ -1,27 +1,33 @@
 //! The sums of galaxies: a list of numbers per unit and bin. Lists add up.
+//!
+//! Each list has the sums Σ w e z and Σ w R z z of the terms z of the fit, from which all estimates follow, so that a
+//! jackknife leaves out a unit by one subtraction and needs no second reading of the rows.
 
 use serde::{Deserialize, Serialize};
 
-/// One galaxy.
+/// One galaxy of a catalogue.
+///
+/// Pairs are the components 1 and 2 in the axes of the catalogue; all components use the same axes.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Row {
-    /// Ellipticity.
+    /// Ellipticity (e1, e2) in any definition and unit that [`Row::response`] converts to a shear.
     pub e: [f64; 2],
-    /// Weight w.
+    /// Weight w, without unit. Rows of weight zero should not be added.
     pub weight: f64,
-    /// Derivatives of w e1 with g1 and of w e2 with g2: w R + e dw/dg.
-    pub slope: [f64; 2],
-    /// Derivatives of w e1 with g2 and of w e2 with g1, if [`Layout::matrix`].
-    pub cross: [f64; 2],
-    /// True shear.
+    /// Shear response of the *weighted* ellipticity, `response[i][j]` = d(w eᵢ)/dgⱼ = w Rᵢⱼ + eᵢ dw/dgⱼ. For an ellipticity
+    /// that is a shear estimate it is w times the unit matrix. The elements (0, 1) and (1, 0) are used if
+    /// [`Layout::matrix`].
+    pub response: [[f64; 2]; 2],
+    /// True reduced shear (g1, g2).
     pub g: [f64; 2],
-    /// Ellipticity of the PSF.
+    /// Ellipticity of the PSF, in the definition in which α is wanted.
     pub psf: [f64; 2],
-    /// Size of the PSF, in any unit.
+    /// Size of the PSF, in any unit: only its relative changes enter.
     pub psf_size: f64,
 }
 
-/// A sheared catalogue (1p, 1m, 2p or 2m): component and sign of the shear that was added to the images.
+/// A sheared catalogue of metacalibration (Sheldon & Huff 2017, ApJ 841, 24): component and sign of the shear that was
+/// added to the images before measuring.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ShearedCatalogue {
     /// Component, 0 or 1.
@@ -30,15 +36,16 @@ pub struct ShearedCatalogue {
     pub plus: bool,
 }
 
-/// The sheared catalogues by name.
+/// The sheared catalogues by their names in ngmix and metadetect: 1p, 1m, 2p and 2m. Indices of sheared catalogues in
+/// this crate are places in this list.
 pub const SHEARED_CATALOGUES: [(&str, ShearedCatalogue); 4] = [
-    ("1p", version(0, true)),
-    ("1m", version(0, false)),
-    ("2p", version(1, true)),
-    ("2m", version(1, false)),
+    ("1p", sheared(0, true)),
+    ("1m", sheared(0, false)),
+    ("2p", sheared(1, true)),
+    ("2m", sheared(1, false)),
 ];
 
-const fn version(component: usize, plus: bool) -> ShearedCatalogue {
+const fn sheared(component: usize, plus: bool) -> ShearedCatalogue {
     ShearedCatalogue { component, plus }
 }
 
@@ -57,18 +64,23 @@ pub(crate) const COUNT: usize = 0;
 pub(crate) const WEIGHT: usize = 1;
 pub(crate) const WEIGHT2: usize = 2;
 pub(crate) const WEIGHTED_PSF_SIZE: usize = 3;
-/// Then per version: weights times ellipticity, weights.
-const VERSION: usize = 4;
-const HEAD: usize = VERSION + 2 * SHEARED_CATALOGUES.len();
+/// Then per sheared catalogue: weights times ellipticity, weights.
+const SHEARED: usize = 4;
+const HEAD: usize = SHEARED + 2 * SHEARED_CATALOGUES.len();
 
-/// Which sums there are.
+/// Which sums are kept: those that the columns of the catalogues determine.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Layout {
-    /// Whether rows have the ellipticity of the PSF. Then there are also sums in the frame of the PSF.
+    /// Whether rows have the ellipticity of the PSF. Then there are also sums in the frame of the PSF, for m₊, m×, c₊, c×.
     pub psf: bool,
-    /// Whether a mean response from sheared versions adds to the responses of the rows.
-    pub versions: bool,
+    /// Whether sheared catalogues are summed with [`crate::UnitSums::add_sheared`]. The difference of their mean
+    /// ellipticities is added to the mean response of the rows: it is all of the response (metadetection), or that of the
+    /// selection R_S (metacalibration).
+    // The name in files of sums of shearq 0.2.
+    #[serde(rename = "versions")]
+    pub sheared: bool,
     /// Whether rows have the responses R12 of e1 to g2 and R21 of e2 to g1. Then both components are fitted together.
+    // Files of sums before the 2 × 2 response lack it.
     #[serde(default)]
     pub matrix: bool,
 }
@@ -78,15 +90,17 @@ impl Layout {
         if self.psf { MAX_TERMS } else { PSF }
     }
 
-    /// Components: 1, 2, and along and across the PSF.
+    // 1, 2, and along and across the PSF: GREAT3 (Mandelbaum et al. 2014, ApJS 212, 5) ranks by m₊ and c₊, because an
+    // incomplete correction of the PSF points along it and averages out in pixel axes if PSFs have random directions.
     pub(crate) fn components(self) -> usize {
         if self.psf { 4 } else { 2 }
     }
 
-    /// Sums w e z, then w R z z, then w z z if they are needed.
+    // Sums w e z, then w R z z, then w z z if there are sheared catalogues: their response is known as a mean only, and
+    // multiplies w z z after all rows are summed.
     fn of_component(self) -> usize {
         let n = self.terms();
-        n + triangle(n) * if self.versions { 2 } else { 1 }
+        n + triangle(n) * if self.sheared { 2 } else { 1 }
     }
 
     /// Numbers per unit and bin.
@@ -94,14 +108,14 @@ impl Layout {
         self.matrix_start() + self.of_other_components() + self.components() / 2 * self.of_pair()
     }
 
-    /// Where the sums of a response matrix start: after all others, so that layouts without it stay as they are.
+    // After all others, so that files of sums without a response matrix stay readable.
     fn matrix_start(self) -> usize {
         HEAD + self.components() * self.of_component()
     }
 
-    /// Per version, weights times the ellipticity in the component that this version does not shear.
+    /// Per sheared catalogue, weights times the ellipticity in the component that it does not shear.
     fn of_other_components(self) -> usize {
-        if self.matrix && self.versions {
+        if self.matrix && self.sheared {
             SHEARED_CATALOGUES.len()
         } else {
             0
@@ -111,7 +125,7 @@ impl Layout {
     /// Of a pair of components: sums w R12 z z', w R21 z' z, then w z z' if they are needed; none without a matrix.
     fn of_pair(self) -> usize {
         let n = self.terms();
-        match (self.matrix, self.versions) {
+        match (self.matrix, self.sheared) {
             (false, _) => 0,
             (true, false) => 2 * n * n,
             (true, true) => 3 * n * n,
@@ -123,24 +137,21 @@ impl Layout {
         false
     }
 
-    /// Adds a galaxy to the sums of its unit and bin.
+    /// Adds a galaxy to `sums`, the [`Layout::len`] numbers of its unit and bin.
     ///
     /// # Panics
-    /// If `sums` has not [`Layout::len`] numbers.
+    /// If `sums` has fewer numbers.
     pub fn add(self, sums: &mut [f64], row: &Row) {
         sums[COUNT] += 1.0;
         sums[WEIGHT] += row.weight;
         sums[WEIGHT2] += row.weight * row.weight;
         sums[WEIGHTED_PSF_SIZE] += row.weight * row.psf_size;
-        let [r11, r22] = row.slope;
-        let [r12, r21] = if self.matrix { row.cross } else { [0.0; 2] };
-        let [p1, p2] = row.psf;
-        self.add_pair(
-            sums,
-            0,
-            row,
-            (row.e, [[r11, r12], [r21, r22]], row.g, [p1, p2]),
-        );
+        let [[r11, mut r12], [mut r21, r22]] = row.response;
+        if !self.matrix {
+            [r12, r21] = [0.0; 2];
+        }
+        let response = [[r11, r12], [r21, r22]];
+        self.add_pair(sums, 0, row, (row.e, response, row.g, row.psf));
         if !self.psf {
             return;
         }
@@ -156,7 +167,7 @@ impl Layout {
         // U R Uᵀ with the rotation U. Without R12 and R21 the added zeros change no bit.
         let shared = cos * sin * (r12 + r21);
         let rest = cos * sin * (r22 - r11);
-        let slopes = [
+        let response = [
             [
                 r11 * cos * cos + r22 * sin * sin + shared,
                 r12 * cos * cos - r21 * sin * sin + rest,
@@ -166,7 +177,7 @@ impl Layout {
                 r11 * sin * sin + r22 * cos * cos - shared,
             ],
         ];
-        self.add_pair(sums, 1, row, (e, slopes, g, [modulus, 0.0]));
+        self.add_pair(sums, 1, row, (e, response, g, [modulus, 0.0]));
     }
 
     /// Adds a galaxy to the sums of the components 1 and 2 (pair 0), or of those along and across the PSF (pair 1).
@@ -175,7 +186,7 @@ impl Layout {
         sums: &mut [f64],
         pair: usize,
         row: &Row,
-        (e, slopes, g, psf): ([f64; 2], [[f64; 2]; 2], [f64; 2], [f64; 2]),
+        (e, response, g, psf): ([f64; 2], [[f64; 2]; 2], [f64; 2], [f64; 2]),
     ) {
         let terms = |k: usize| -> [f64; MAX_TERMS] {
             let (g, other, p) = (g[k], g[1 - k], psf[k]);
@@ -186,14 +197,14 @@ impl Layout {
         let start = HEAD + 2 * pair * length;
         let components = sums[start..].chunks_exact_mut(length);
         for (k, sums) in components.take(2).enumerate() {
-            self.component(sums, e[k], slopes[k][k], row.weight, &z[k]);
+            self.component(sums, e[k], response[k][k], row.weight, &z[k]);
         }
         let n = self.terms();
         let start = self.matrix_start() + self.of_other_components() + pair * self.of_pair();
         let mut matrices = sums[start..start + self.of_pair()].chunks_exact_mut(n * n);
         for (factor, [a, b]) in [
-            (slopes[0][1], [0, 1]),
-            (slopes[1][0], [1, 0]),
+            (response[0][1], [0, 1]),
+            (response[1][0], [1, 0]),
             (row.weight, [0, 1]),
         ] {
             let Some(sums) = matrices.next() else {
@@ -208,38 +219,39 @@ impl Layout {
         }
     }
 
-    fn component(self, sums: &mut [f64], e: f64, slope: f64, weight: f64, z: &[f64; MAX_TERMS]) {
+    fn component(self, sums: &mut [f64], e: f64, response: f64, weight: f64, z: &[f64; MAX_TERMS]) {
         let n = self.terms();
         let (with_e, matrices) = sums.split_at_mut(n);
-        let (with_slope, with_weight) = matrices.split_at_mut(triangle(n));
-        let mut at = 0;
-        for s in 0..n {
-            with_e[s] += weight * e * z[s];
-            let scaled = slope * z[s];
-            for z in &z[..=s] {
-                with_slope[at] += scaled * z;
-                at += 1;
-            }
+        for (sum, z) in with_e.iter_mut().zip(z) {
+            *sum += weight * e * z;
         }
-        if self.versions {
+        // Without sheared catalogues there is no second matrix.
+        for (matrix, factor) in matrices
+            .chunks_exact_mut(triangle(n))
+            .zip([response, weight])
+        {
             let mut at = 0;
             for s in 0..n {
-                let scaled = weight * z[s];
+                let scaled = factor * z[s];
                 for z in &z[..=s] {
-                    with_weight[at] += scaled * z;
+                    matrix[at] += scaled * z;
                     at += 1;
                 }
             }
         }
     }
 
-    /// Adds an ellipticity of a sheared version, or of a galaxy that this version selects.
-    pub fn add_version(self, sums: &mut [f64], version: usize, e: [f64; 2], weight: f64) {
-        let (_, which) = SHEARED_CATALOGUES[version];
-        sums[VERSION + 2 * version] += weight * e[which.component];
-        sums[VERSION + 2 * version + 1] += weight;
+    /// Adds the ellipticity of a galaxy to `sums` of the sheared catalogue at this place of [`SHEARED_CATALOGUES`]: one that
+    /// was measured on sheared images, or that of the unsheared image of a galaxy which the sheared catalogue selects.
+    ///
+    /// `e` is divided by twice the added shear h beforehand, so that differences of means are derivatives,
+    /// (⟨e⟩₊ − ⟨e⟩₋)/2h.
+    pub fn add_sheared(self, sums: &mut [f64], catalogue: usize, e: [f64; 2], weight: f64) {
+        let (_, which) = SHEARED_CATALOGUES[catalogue];
+        sums[SHEARED + 2 * catalogue] += weight * e[which.component];
+        sums[SHEARED + 2 * catalogue + 1] += weight;
         if self.of_other_components() > 0 {
-            sums[self.matrix_start() + version] += weight * e[1 - which.component];
+            sums[self.matrix_start() + catalogue] += weight * e[1 - which.component];
         }
     }
 
@@ -248,14 +260,16 @@ impl Layout {
         [0, 1].map(|k| self.of(sums, k).with_e[ONE] / sums[WEIGHT])
     }
 
-    /// Mean response from sheared versions; zero without them.
+    /// Mean response from sheared catalogues; zero without them.
     pub(crate) fn extra(self, sums: &[f64]) -> Extra {
-        if !self.versions {
+        if !self.sheared {
             return Extra::default();
         }
-        let mean = |version: usize, at: usize| sums[at] / sums[VERSION + 2 * version + 1];
+        // Each catalogue has its own sum of weights: it selects and weights other galaxies. Four catalogues are needed
+        // because a selection responds to each component, and a one-sided difference has an error of first order in h.
+        let mean = |catalogue: usize, at: usize| sums[at] / sums[SHEARED + 2 * catalogue + 1];
         let own = |k: usize| {
-            let of = |version: usize| mean(version, VERSION + 2 * version);
+            let of = |catalogue: usize| mean(catalogue, SHEARED + 2 * catalogue);
             of(2 * k) - of(2 * k + 1)
         };
         let [a, b] = [own(0), own(1)];
@@ -264,9 +278,9 @@ impl Layout {
             other: [0.0; 4],
         };
         if self.matrix {
-            // Versions of component 2 give the response of e1 to g2.
+            // The catalogues 2p and 2m give the response of e1 to g2.
             let other = |k: usize| {
-                let of = |version: usize| mean(version, self.matrix_start() + version);
+                let of = |catalogue: usize| mean(catalogue, self.matrix_start() + catalogue);
                 of(2 - 2 * k) - of(3 - 2 * k)
             };
             let [a, b] = [other(0), other(1)];
@@ -291,10 +305,11 @@ impl Layout {
             let start = HEAD + k * self.of_component();
             for (s, with_e) in sums[start..][..self.terms()].iter_mut().enumerate() {
                 let by = extra.own[k];
-                *with_e += m * of.slope(s, OWN, by) + c[k] * of.slope(s, ONE, by);
+                *with_e += m * of.response(s, OWN, by) + c[k] * of.response(s, ONE, by);
                 if let Some(mixed) = &mixed {
                     let (by, other) = (extra.other[k], k ^ 1);
-                    *with_e += m * mixed.slope(s, OWN, by) + c[other] * mixed.slope(s, ONE, by);
+                    *with_e +=
+                        m * mixed.response(s, OWN, by) + c[other] * mixed.response(s, ONE, by);
                 }
             }
         }
@@ -308,10 +323,10 @@ impl Layout {
         let n = self.terms();
         let (pair, transposed) = (component / 2, component % 2 == 1);
         let start = self.matrix_start() + self.of_other_components() + pair * self.of_pair();
-        let (slopes, weights) = sums[start..start + self.of_pair()].split_at(2 * n * n);
-        let (first, second) = slopes.split_at(n * n);
+        let (responses, weights) = sums[start..start + self.of_pair()].split_at(2 * n * n);
+        let (first, second) = responses.split_at(n * n);
         Some(Mixed {
-            with_slope: if transposed { second } else { first },
+            with_response: if transposed { second } else { first },
             with_weight: weights,
             terms: n,
             transposed,
@@ -324,17 +339,17 @@ impl Layout {
         let start = HEAD + component * self.of_component();
         let own = &sums[start..start + self.of_component()];
         let (with_e, matrices) = own.split_at(n);
-        let (with_slope, with_weight) = matrices.split_at(triangle(n));
+        let (with_response, with_weight) = matrices.split_at(triangle(n));
         Component {
             with_e,
-            with_slope,
+            with_response,
             with_weight,
         }
     }
 }
 
-/// Mean responses from sheared versions of the four components: to the own component of shear, and to the other one of the
-/// pair.
+/// Mean responses from sheared catalogues of the four components: to the own component of shear, and to the other one of
+/// the pair.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Extra {
     pub(crate) own: [f64; 4],
@@ -344,7 +359,7 @@ pub(crate) struct Extra {
 /// Sums of a component k and the other one j of its pair.
 pub(crate) struct Mixed<'a> {
     /// Σ w R_kj z_k z_j by rows.
-    with_slope: &'a [f64],
+    with_response: &'a [f64],
     /// Σ w z z of the first with the second component of the pair by rows, if there is such a sum.
     with_weight: &'a [f64],
     terms: usize,
@@ -354,14 +369,14 @@ pub(crate) struct Mixed<'a> {
 
 impl Mixed<'_> {
     /// Σ w (R_kj + extra) z_ks z_jt.
-    pub(crate) fn slope(&self, s: usize, t: usize, extra: f64) -> f64 {
+    pub(crate) fn response(&self, s: usize, t: usize, extra: f64) -> f64 {
         let at = if self.transposed {
             t * self.terms + s
         } else {
             s * self.terms + t
         };
         let more = self.with_weight.get(at).map_or(0.0, |w| extra * w);
-        self.with_slope[s * self.terms + t] + more
+        self.with_response[s * self.terms + t] + more
     }
 }
 
@@ -370,17 +385,17 @@ pub(crate) struct Component<'a> {
     /// Σ w e z.
     pub(crate) with_e: &'a [f64],
     /// Σ w R z z, the lower triangle by rows.
-    with_slope: &'a [f64],
+    with_response: &'a [f64],
     /// Σ w z z, if there is such a sum.
     with_weight: &'a [f64],
 }
 
 impl Component<'_> {
     /// Σ w (R + extra) z_s z_t.
-    pub(crate) fn slope(&self, s: usize, t: usize, extra: f64) -> f64 {
+    pub(crate) fn response(&self, s: usize, t: usize, extra: f64) -> f64 {
         let at = triangle(s.max(t)) + s.min(t);
         let more = self.with_weight.get(at).map_or(0.0, |w| extra * w);
-        self.with_slope[at] + more
+        self.with_response[at] + more
     }
 }
 

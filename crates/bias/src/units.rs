@@ -68,20 +68,21 @@ impl UnitSums {
         layout.add(self.sums(catalogue, key, bin), row);
     }
 
-    /// Adds an ellipticity of the sheared version of number `version` in [`crate::SHEARED_CATALOGUES`].
+    /// Adds the ellipticity `e`, divided by twice the added shear, and the weight of a galaxy in the sheared catalogue at the
+    /// place `sheared` of [`crate::SHEARED_CATALOGUES`]; see [`Layout::add_sheared`].
     ///
     /// # Panics
-    /// If there is no such bin or version.
-    pub fn add_version(
+    /// If there is no such bin or sheared catalogue.
+    pub fn add_sheared(
         &mut self,
         catalogue: u32,
         key: u64,
         bin: usize,
-        version: usize,
+        sheared: usize,
         (e, weight): ([f64; 2], f64),
     ) {
         let layout = self.layout;
-        layout.add_version(self.sums(catalogue, key, bin), version, e, weight);
+        layout.add_sheared(self.sums(catalogue, key, bin), sheared, e, weight);
     }
 
     /// The sums of a unit and bin.

@@ -22,36 +22,41 @@ enum Term {
 }
 use Term::{One, Other, Own, Psf, PsfSize, Square};
 
-/// Galaxies, and (e, weight) in each sheared version; e is already divided by twice the artificial shear.
+/// Galaxies, and (e, weight) in each sheared catalogue; e is already divided by twice the artificial shear.
 #[derive(Default)]
 struct Sample {
     rows: Vec<Row>,
-    versions: Vec<[([f64; 2], f64); 4]>,
+    sheared: Vec<[([f64; 2], f64); 4]>,
 }
 
 /// Arbitrary numbers: shears, PSFs, sizes, weights and responses are all different.
-fn sample(seed: u64, versions: bool, matrix: bool) -> Sample {
+fn sample(seed: u64, sheared: bool, matrix: bool) -> Sample {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut sample = Sample::default();
     for _ in 0..60 {
         let mut within = |low: f64, high: f64| rng.random_range(low..high);
         let weight = within(0.5, 2.0);
+        let e = [within(-0.4, 0.5), within(-0.3, 0.4)];
+        let mut response = [
+            [weight * within(0.2, 0.9), 0.0],
+            [0.0, weight * within(0.3, 1.1)],
+        ];
+        if matrix {
+            response[0][1] = weight * within(-0.2, 0.4);
+            response[1][0] = weight * within(-0.4, 0.1);
+        }
         sample.rows.push(Row {
-            e: [within(-0.4, 0.5), within(-0.3, 0.4)],
+            e,
             weight,
-            slope: [weight * within(0.2, 0.9), weight * within(0.3, 1.1)],
-            cross: match matrix {
-                true => [weight * within(-0.2, 0.4), weight * within(-0.4, 0.1)],
-                false => [0.0; 2],
-            },
+            response,
             g: [within(-0.06, 0.05), within(-0.04, 0.07)],
             psf: [within(-0.1, 0.2), within(-0.2, 0.1)],
             psf_size: within(1.0, 3.0),
         });
-        if versions {
+        if sheared {
             // Differences of 0.3 and 0.5, and of −0.1 and 0.2 in the other component.
             let mean = [[0.15, -0.05], [-0.15, 0.05], [0.1, 0.25], [-0.1, -0.25]];
-            sample.versions.push(mean.map(|mean| {
+            sample.sheared.push(mean.map(|mean| {
                 let e = mean.map(|mean| mean + within(-0.1, 0.1));
                 (e, within(0.5, 2.0))
             }));
@@ -66,22 +71,22 @@ impl Sample {
         for (key, row) in (0..).zip(&self.rows) {
             sums.add(0, key, 0, row);
         }
-        for (key, versions) in (0..).zip(&self.versions) {
-            for (version, (e, weight)) in versions.iter().enumerate() {
-                sums.add_version(0, key, 0, version, (*e, *weight));
+        for (key, sheared) in (0..).zip(&self.sheared) {
+            for (catalogue, (e, weight)) in sheared.iter().enumerate() {
+                sums.add_sheared(0, key, 0, catalogue, (*e, *weight));
             }
         }
         sums.by_key()
     }
 
-    /// ⟨e_i⟩ of the version of component j with positive shear, minus that with negative shear.
+    /// ⟨e_i⟩ of the catalogue with a positive shear of component j, minus that with negative shear.
     fn extra(&self) -> Matrix {
-        let mean = |version: usize, i: usize| {
-            let all = || self.versions.iter().map(|versions| versions[version]);
+        let mean = |catalogue: usize, i: usize| {
+            let all = || self.sheared.iter().map(|sheared| sheared[catalogue]);
             let weights: f64 = all().map(|(_, weight)| weight).sum();
             all().map(|(e, weight)| weight * e[i]).sum::<f64>() / weights
         };
-        if self.versions.is_empty() {
+        if self.sheared.is_empty() {
             return [[0.0; 2]; 2];
         }
         [0, 1].map(|i| [0, 1].map(|j| mean(2 * j, i) - mean(2 * j + 1, i)))
@@ -111,12 +116,11 @@ impl Sample {
             let turn = [[angle.cos(), angle.sin()], [-angle.sin(), angle.cos()]];
             let turned = |v: [f64; 2]| [0, 1].map(|i| turn[i][0] * v[0] + turn[i][1] * v[1]);
             let (e, g, psf) = (turned(row.e), turned(row.g), turned(row.psf));
-            let response = [[row.slope[0], row.cross[0]], [row.cross[1], row.slope[1]]];
             let mut slope = [[0.0; 2]; 2];
             for (i, j) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
                 slope[i][j] = row.weight * extra[i][j];
                 for (k, l) in [(0, 0), (0, 1), (1, 0), (1, 1)] {
-                    slope[i][j] += turn[i][k] * response[k][l] * turn[j][l];
+                    slope[i][j] += turn[i][k] * row.response[k][l] * turn[j][l];
                 }
             }
             let z = |(k, term): (usize, Term)| match term {
@@ -177,9 +181,9 @@ fn of(sums: &UnitSums, truth: bool) -> Estimate {
 
 fn layouts() -> impl Iterator<Item = Layout> {
     let all = [(false, false), (true, false), (false, true), (true, true)];
-    all.into_iter().map(|(versions, matrix)| Layout {
+    all.into_iter().map(|(sheared, matrix)| Layout {
         psf: true,
-        versions,
+        sheared,
         matrix,
     })
 }
@@ -190,7 +194,7 @@ const ROUNDING: f64 = 1e-9;
 #[test]
 fn every_estimate_solves_the_equations_of_the_crate() {
     for layout in layouts() {
-        let sample = sample(3, layout.versions, layout.matrix);
+        let sample = sample(3, layout.sheared, layout.matrix);
         let found = of(&sample.sums(layout), true);
         let check = |key: &str, expected: f64| {
             let value = found.value(key).unwrap().value;
@@ -238,11 +242,11 @@ fn every_estimate_solves_the_equations_of_the_crate() {
         );
         let mean = |of: fn(&Row) -> f64| sample.rows.iter().map(of).sum::<f64>() / weights;
         let extra = sample.extra();
-        check("r1", mean(|row| row.slope[0]) + extra[0][0]);
-        check("r2", mean(|row| row.slope[1]) + extra[1][1]);
+        check("r1", mean(|row| row.response[0][0]) + extra[0][0]);
+        check("r2", mean(|row| row.response[1][1]) + extra[1][1]);
         if layout.matrix {
-            check("r12", mean(|row| row.cross[0]) + extra[0][1]);
-            check("r21", mean(|row| row.cross[1]) + extra[1][0]);
+            check("r12", mean(|row| row.response[0][1]) + extra[0][1]);
+            check("r21", mean(|row| row.response[1][0]) + extra[1][0]);
         } else {
             assert!(found.value("r12").is_none());
         }
@@ -252,7 +256,7 @@ fn every_estimate_solves_the_equations_of_the_crate() {
 #[test]
 fn without_truth_or_with_one_shear_a_single_term_is_solved() {
     for layout in layouts() {
-        let mut sample = sample(5, layout.versions, layout.matrix);
+        let mut sample = sample(5, layout.sheared, layout.matrix);
         let solved = |sample: &Sample, terms| sample.solved([terms; 2], false, layout.matrix);
         let null = of(&sample.sums(layout), false);
         let leakage = [One, Psf];
@@ -283,7 +287,7 @@ fn without_truth_or_with_one_shear_a_single_term_is_solved() {
 #[test]
 fn equal_psfs_determine_no_leakage_and_equal_sizes_no_change_of_it() {
     for layout in layouts() {
-        let mut sample = sample(4, layout.versions, layout.matrix);
+        let mut sample = sample(4, layout.sheared, layout.matrix);
         for row in &mut sample.rows {
             row.psf_size = 2.0;
         }
@@ -303,21 +307,21 @@ fn equal_psfs_determine_no_leakage_and_equal_sizes_no_change_of_it() {
 
 /// Galaxies without noise, e = R s, with the shear s of each component from g and the PSF.
 fn exact(layout: Layout, shear: impl Fn(&Row) -> [f64; 2]) -> Sample {
-    let mut sample = sample(8, layout.versions, layout.matrix);
-    // Equal galaxies in each version, so that no unit changes the response from versions.
-    if let Some(first) = sample.versions.first().copied() {
-        sample.versions.fill(first);
+    let mut sample = sample(8, layout.sheared, layout.matrix);
+    // Equal galaxies in each sheared catalogue, so that no unit changes their response.
+    if let Some(first) = sample.sheared.first().copied() {
+        sample.sheared.fill(first);
     }
     let extra = sample.extra();
     for row in &mut sample.rows {
         let (w, [s1, s2]) = (row.weight, shear(row));
         let other = |k: usize| match layout.matrix {
-            true => row.cross[k] / w + extra[k][1 - k],
+            true => row.response[k][1 - k] / w + extra[k][1 - k],
             false => 0.0,
         };
         row.e = [
-            (row.slope[0] / w + extra[0][0]) * s1 + other(0) * s2,
-            other(1) * s1 + (row.slope[1] / w + extra[1][1]) * s2,
+            (row.response[0][0] / w + extra[0][0]) * s1 + other(0) * s2,
+            other(1) * s1 + (row.response[1][1] / w + extra[1][1]) * s2,
         ];
     }
     sample
@@ -388,8 +392,7 @@ fn equal_shears_of_both_components_have_no_bias_with_the_matrix() {
                 let row = Row {
                     e: [0.8 * g + 0.1 * g, 0.1 * g + 0.7 * g],
                     weight: w,
-                    slope: [0.8 * w, 0.7 * w],
-                    cross: [0.1 * w; 2],
+                    response: [[0.8 * w, 0.1 * w], [0.1 * w, 0.7 * w]],
                     g: [g; 2],
                     ..Row::default()
                 };
@@ -420,10 +423,10 @@ fn the_noise_of_a_star_changes_shear_before_the_response() {
                 sums.add(catalogue, key, 0, row);
             }
         }
-        for (key, versions) in (0..).zip(&sample.versions) {
-            for (version, (e, weight)) in versions.iter().enumerate() {
+        for (key, sheared) in (0..).zip(&sample.sheared) {
+            for (which, (e, weight)) in sheared.iter().enumerate() {
                 for catalogue in 0..2 {
-                    sums.add_version(catalogue, key, 0, version, (*e, *weight));
+                    sums.add_sheared(catalogue, key, 0, which, (*e, *weight));
                 }
             }
         }

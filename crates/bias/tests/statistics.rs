@@ -59,18 +59,17 @@ impl Galaxies {
                 (w, e.map(|e| -2.0 * e / (SCALE * SCALE) * w * w * 0.7))
             }
         };
-        let slope = [0, 1].map(|k| match self.weights {
+        let [r11, r22] = [0, 1].map(|k| match self.weights {
             Weights::OfShape => weight * response[k] + e[k] * derivative[k],
             _ => weight * response[k],
         });
         Row {
             e,
             weight,
-            slope,
+            response: [[r11, 0.0], [0.0, r22]],
             g,
             psf,
             psf_size: 1.0,
-            ..Row::default()
         }
     }
 }
@@ -329,11 +328,11 @@ fn a_weight_that_depends_on_shear_needs_its_derivative() {
     }
 }
 
-/// Ellipticities of a galaxy in five versions: without shear, and with artificial shears of ±0.01 per component.
+/// Ellipticities of a galaxy without added shear, and with shears of ±0.01 added to each component.
 #[test]
-fn the_response_of_a_selection_follows_from_sheared_versions() {
+fn sheared_catalogues_give_the_response_of_a_selection() {
     let layout = Layout {
-        versions: true,
+        sheared: true,
         ..Layout::default()
     };
     let mut rng = ChaCha8Rng::seed_from_u64(9);
@@ -354,15 +353,15 @@ fn the_response_of_a_selection_follows_from_sheared_versions() {
             };
             if detected(e) {
                 sums.add(file, key, 0, &row);
-                let slope = [0.8; 2];
-                direct.add(file, key, 0, &Row { slope, ..row });
+                let response = [[0.8, 0.0], [0.0, 0.8]];
+                direct.add(file, key, 0, &Row { response, ..row });
             }
-            for (number, (_, version)) in shearq_bias::SHEARED_CATALOGUES.iter().enumerate() {
+            for (number, (_, catalogue)) in shearq_bias::SHEARED_CATALOGUES.iter().enumerate() {
                 let mut sheared = e;
-                sheared[version.component] += if version.plus { 0.008 } else { -0.008 };
+                sheared[catalogue.component] += if catalogue.plus { 0.008 } else { -0.008 };
                 if detected(sheared) {
                     // The response is the difference over 0.02: scale here.
-                    sums.add_version(file, key, 0, number, (sheared.map(|e| e / 0.02), 1.0));
+                    sums.add_sheared(file, key, 0, number, (sheared.map(|e| e / 0.02), 1.0));
                 }
             }
         }
@@ -388,7 +387,7 @@ fn many_units_are_joined_and_shards_merge_to_the_same_sums() {
             let row = Row {
                 e,
                 weight: 1.0,
-                slope: [1.0; 2],
+                response: [[1.0, 0.0], [0.0, 1.0]],
                 g: [g; 2],
                 ..Row::default()
             };
@@ -424,13 +423,13 @@ fn without_galaxies_units_or_response_there_is_an_error() {
     let mut row = Row {
         e: [0.1, 0.2],
         weight: 1.0,
-        slope: [1.0; 2],
+        response: [[1.0, 0.0], [0.0, 1.0]],
         ..Row::default()
     };
     sums.add(0, 0, 0, &row);
     assert!(of(&sums).to_string().contains("found 1, expected 2"));
     for key in 1..100 {
-        row.slope = [if key % 2 == 0 { 1.0 } else { -1.0 }, 1.0];
+        row.response[0][0] = if key % 2 == 0 { 1.0 } else { -1.0 };
         sums.add(0, key, 0, &row);
     }
     assert!(of(&sums).to_string().contains("mean response R11"));
@@ -465,11 +464,10 @@ fn behind_stars(
             let row = Row {
                 e,
                 weight: 1.0,
-                slope: [response; 2],
+                response: [[response, 0.0], [0.0, response]],
                 g,
                 psf: [0.02, 0.01],
                 psf_size: 1.0,
-                ..Row::default()
             };
             sums.add(number as u32, key, 0, &row);
         }
@@ -554,7 +552,7 @@ fn the_part_that_a_jackknife_knows_of_a_star_is_exact() {
             let row = Row {
                 e: g.map(|g| 0.7 * g),
                 weight: 1.0,
-                slope: [0.7; 2],
+                response: [[0.7, 0.0], [0.0, 0.7]],
                 g,
                 ..Row::default()
             };

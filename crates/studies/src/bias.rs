@@ -190,14 +190,14 @@ impl BiasSums {
         }
         self.galaxies += 1;
         for ((_, signs, _), version) in VERSIONS.iter().zip(versions) {
-            let slope = match self.calibrated {
+            let [r11, r22] = match self.calibrated {
                 true => version.response_diagonal(),
                 false => [1.0; 2],
             };
             let row = Row {
                 e: [version.e1, version.e2],
                 weight: 1.0,
-                slope,
+                response: [[r11, 0.0], [0.0, r22]],
                 g: signs.map(|sign| sign * SHEAR),
                 ..Row::default()
             };
@@ -206,9 +206,9 @@ impl BiasSums {
             let p = [psf.e1, psf.e2];
             let along = Row {
                 e: [0, 1].map(|k| (p[0] * row.e[0] + p[1] * row.e[1]) * f64::from(1 - k)),
-                slope: [
-                    (slope[0] + slope[1]) / 2.0 * (p[0] * p[0] + p[1] * p[1]),
-                    1.0,
+                response: [
+                    [(r11 + r22) / 2.0 * (p[0] * p[0] + p[1] * p[1]), 0.0],
+                    [0.0, 1.0],
                 ],
                 ..row
             };

@@ -61,6 +61,16 @@ pub enum Role {
     Unit,
     /// Name of the sheared catalogue of a row: noshear, 1p, 1m, 2p, 2m.
     ShearedCatalogue,
+    // The roles below follow from options and from other columns, and have no name in --columns.
+    /// Operands of `--where`, and of `--bins`.
+    Condition,
+    Binned,
+    /// Columns of [`CHOICES`] that no condition names.
+    Choice,
+    /// Flags of failed measurements of sheared catalogues.
+    ShearedFailure,
+    /// Looks like a weight, and is not used.
+    DoubtfulWeight,
 }
 
 /// A role in one catalogue: 0 is the one without artificial shear, k the k-th of [`SHEARED_CATALOGUES`].
@@ -68,18 +78,29 @@ pub(super) type Key = (Role, usize);
 
 /// Catalogues: the one without artificial shear and [`SHEARED_CATALOGUES`].
 pub(super) const CATALOGUES: usize = 1 + SHEARED_CATALOGUES.len();
-pub(super) const ROLES: usize = TABLE.len();
+pub(super) const ROLES: usize = Role::DoubtfulWeight as usize + 1;
+
+/// The responses R11, R12, R21 and R22: of e1 and e2 by rows, to g1 and g2.
+pub(super) const RESPONSES: [[Role; 2]; 2] = [[Role::R11, Role::R12], [Role::R21, Role::R22]];
+
+/// The ellipticity component `of` in the catalogues with a positive and a negative artificial shear of the component
+/// `sheared`, whose difference is a response.
+pub(super) fn sheared_pair(of: usize, sheared: usize) -> [Key; 2] {
+    let role = [Role::E1, Role::E2][of];
+    [(role, 1 + 2 * sheared), (role, 2 + 2 * sheared)]
+}
 
 // In the order of `Role`s: the role, its name in --columns, the role without which it is incomplete, and the names of
-// columns that are recognised in any case, the preferred one first.
+// columns that are recognised in any case, the preferred one first. χ marks ellipticities that are distortions: GalSim's
+// and LSST's HSM documents e = (1 − q²)/(1 + q²) for all its methods but KSB.
 #[rustfmt::skip]
 const TABLE: [(Role, &str, Option<Role>, &str); 26] = [
     (Role::E1, "e1", Some(Role::E2), "e1 e_1 e1_noshear g1_noshear g[0] ngmix_ell_noshear[0] wmom_g_1 wmom_g1 gauss_g1 \
-        pgauss_g1 gauss_g_1 pgauss_g_1 mdet_g_1 mcal_g_1 fpfs_e1 fpfs1_e1 regauss_e1 corrected_e1 \
-        ext_shapehsm_hsmshaperegauss_e1 corrected_g1"),
+        pgauss_g1 gauss_g_1 pgauss_g_1 mdet_g_1 mcal_g_1 fpfs_e1 fpfs1_e1 χregauss_e1 χcorrected_e1 \
+        χext_shapehsm_hsmshaperegauss_e1 corrected_g1"),
     (Role::E2, "e2", Some(Role::E1), "e2 e_2 e2_noshear g2_noshear g[1] ngmix_ell_noshear[1] wmom_g_2 wmom_g2 gauss_g2 \
-        pgauss_g2 gauss_g_2 pgauss_g_2 mdet_g_2 mcal_g_2 fpfs_e2 fpfs1_e2 regauss_e2 corrected_e2 \
-        ext_shapehsm_hsmshaperegauss_e2 corrected_g2"),
+        pgauss_g2 gauss_g_2 pgauss_g_2 mdet_g_2 mcal_g_2 fpfs_e2 fpfs1_e2 χregauss_e2 χcorrected_e2 \
+        χext_shapehsm_hsmshaperegauss_e2 corrected_g2"),
     (Role::Weight, "w", None, "w weight weights wt shear_weight wdet wsel fpfs_w"),
     (Role::R11, "R11", Some(Role::R22), "r11 de1_dg1 e1_g1 fpfs_de1_dg1 fpfs1_de1_dg1 r_11 mcal_r11"),
     (Role::R22, "R22", Some(Role::R11), "r22 de2_dg2 e2_g2 fpfs_de2_dg2 fpfs1_de2_dg2 r_22 mcal_r22"),
@@ -106,21 +127,12 @@ const TABLE: [(Role, &str, Option<Role>, &str); 26] = [
     (Role::ShearedCatalogue, "version", None, "mdet_step metastep shear_type metacal_step shear"),
 ];
 
-/// Ellipticities under artificial shears: of the own component, then of the other one.
-const SHEARED: [Key; 8] = [
-    (Role::E1, 1),
-    (Role::E1, 2),
-    (Role::E2, 3),
-    (Role::E2, 4),
-    (Role::E1, 3),
-    (Role::E1, 4),
-    (Role::E2, 1),
-    (Role::E2, 2),
-];
-
-/// All columns that `--columns` can name, in its order.
+/// All columns that `--columns` can name, in its order: the roles, then ellipticities under artificial shears of the own
+/// component and of the other one.
 fn keys() -> impl Iterator<Item = Key> {
-    TABLE.iter().map(|row| (row.0, 0)).chain(SHEARED)
+    let pairs = [[0, 0], [1, 1], [0, 1], [1, 0]];
+    let sheared = pairs.into_iter().flat_map(|[of, by]| sheared_pair(of, by));
+    TABLE.iter().map(|row| (row.0, 0)).chain(sheared)
 }
 
 /// The name of a column in `--columns`, such as `e1_2p`.
@@ -128,11 +140,10 @@ fn name_of((role, catalogue): Key) -> String {
     let name = TABLE[role as usize].1;
     match catalogue.checked_sub(1) {
         None => name.to_owned(),
-        Some(version) => format!("{name}_{}", SHEARED_CATALOGUES[version].0),
+        Some(sheared) => format!("{name}_{}", SHEARED_CATALOGUES[sheared].0),
     }
 }
 
-/// The names of all roles.
 pub fn role_names() -> String {
     keys().map(name_of).collect::<Vec<_>>().join(", ")
 }
@@ -143,18 +154,19 @@ fn named(name: &str) -> Option<Key> {
 
 /// Names of columns of a role, in small letters.
 pub(super) fn names_of_role(role: Role) -> impl Iterator<Item = &'static str> {
-    TABLE[role as usize].3.split_whitespace()
+    let names = TABLE[role as usize].3.split_whitespace();
+    names.map(|name| name.trim_start_matches('χ'))
 }
 
 fn recognised((role, catalogue): Key) -> Vec<String> {
-    let Some(version) = catalogue.checked_sub(1) else {
+    let Some(sheared) = catalogue.checked_sub(1) else {
         return names_of_role(role).map(str::to_owned).collect();
     };
-    let (version, k) = (SHEARED_CATALOGUES[version].0, role as usize);
+    let (sheared, k) = (SHEARED_CATALOGUES[sheared].0, role as usize);
     vec![
-        format!("e{}_{version}", k + 1),
-        format!("g{}_{version}", k + 1),
-        format!("ngmix_ell_{version}[{k}]"),
+        format!("e{}_{sheared}", k + 1),
+        format!("g{}_{sheared}", k + 1),
+        format!("ngmix_ell_{sheared}[{k}]"),
     ]
 }
 
@@ -162,28 +174,27 @@ fn recognised((role, catalogue): Key) -> Vec<String> {
 fn partner((role, catalogue): Key) -> Option<Key> {
     match catalogue {
         0 => TABLE[role as usize].2.map(|partner| (partner, 0)),
-        1 | 3 => Some((role, catalogue + 1)),
-        _ => Some((role, catalogue - 1)),
+        // 1p and 1m, 2p and 2m: one of them alone gives no difference.
+        _ => Some((role, ((catalogue - 1) ^ 1) + 1)),
     }
 }
 
 /// For a response of a component to the other one, the response to the own one, without which it is of no use.
-fn diagonal(key: Key) -> Option<Key> {
-    match key {
-        (Role::R12, _) => Some((Role::R11, 0)),
-        (Role::R21, _) => Some((Role::R22, 0)),
-        (Role::E1, 3 | 4) => Some((Role::E1, 1)),
-        (Role::E2, 1 | 2) => Some((Role::E2, 3)),
+fn diagonal((role, catalogue): Key) -> Option<Key> {
+    match role {
+        Role::R12 => Some((Role::R11, 0)),
+        Role::R21 => Some((Role::R22, 0)),
+        Role::E1 if catalogue > 2 => Some(sheared_pair(0, 0)[0]),
+        Role::E2 if [1, 2].contains(&catalogue) => Some(sheared_pair(1, 1)[0]),
         _ => None,
     }
 }
 
-/// Names of ellipticities that are distortions.
-const DISTORTIONS: [&str; 3] = [
-    "regauss_e1",
-    "corrected_e1",
-    "ext_shapehsm_hsmshaperegauss_e1",
-];
+/// Whether the name of e1, in small letters, says that it is a distortion.
+fn is_distortion(e1: &str) -> bool {
+    let mut names = TABLE[Role::E1 as usize].3.split_whitespace();
+    names.any(|name| name.strip_prefix('χ') == Some(e1))
+}
 
 /// A public catalogue or a program's output, whose columns are known by its documentation.
 struct Survey {
@@ -354,6 +365,13 @@ const CHOICES: [(&str, bool); 7] = [
     ("refextendedness", true),
 ];
 
+/// Whether rows count that have 1 in a column of this name, rather than 0; `None` for a column that makes no choice.
+pub(super) fn chosen_value(name: &str) -> Option<bool> {
+    let mut known = CHOICES.iter();
+    let known = known.find(|(known, _)| known.eq_ignore_ascii_case(name))?;
+    Some(known.1)
+}
+
 /// What a name in small letters suggests that a column is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Look {
@@ -382,10 +400,10 @@ const LOOKS: [(Look, &str); 7] = [
 ];
 
 fn look(name: &str) -> Option<Look> {
-    let name = name.to_ascii_lowercase();
-    if CHOICES.iter().any(|(known, _)| *known == name) {
+    if chosen_value(name).is_some() {
         return Some(Look::Choice);
     }
+    let name = name.to_ascii_lowercase();
     let mut looks = LOOKS.iter();
     let found = looks.find(|(_, patterns)| fits_any(patterns, &name));
     found.map(|(look, _)| *look)
@@ -506,13 +524,13 @@ pub enum Preset {
     Plain,
     /// shearq: ellipticities are already divided by the divisors.
     Shearq,
-    /// shearq with sheared versions of all columns.
-    Versions,
+    /// shearq with sheared catalogues in columns, after `shape.sheared_step`.
+    Sheared,
     /// GalSim's or LSST's HSM.
     Hsm,
-    /// Metacalibration with columns per version.
+    /// Metacalibration, with a column per sheared catalogue.
     Metacal,
-    /// Metadetection: rows per version.
+    /// Metadetection, with rows or tables per sheared catalogue.
     Metadetect,
     /// AnaCal, with derivatives.
     Anacal,
@@ -540,7 +558,7 @@ impl Preset {
         match self {
             Preset::Plain => "plain columns",
             Preset::Shearq => "shearq",
-            Preset::Versions => "shearq, sheared versions",
+            Preset::Sheared => "shearq, sheared versions",
             Preset::Hsm => "HSM",
             Preset::Metacal => "ngmix metacal",
             Preset::Metadetect => "metadetect",
@@ -564,8 +582,7 @@ pub struct Columns {
     unused: Vec<String>,
     /// All columns of flags; the first is that of the role.
     pub flags: Vec<String>,
-    /// Columns of [`CHOICES`], with whether rows of value 1 count.
-    pub choices: Vec<(String, bool)>,
+    pub choices: Vec<String>,
     /// Columns that may hold names of sheared catalogues, if no column has this role and it was not declined.
     pub steps: Vec<String>,
 }
@@ -642,8 +659,7 @@ impl Columns {
                 ));
             }
         }
-        let distortion =
-            DISTORTIONS.contains(&e1.as_str()) || survey.is_some_and(|survey| survey.distortion);
+        let distortion = is_distortion(&e1) || survey.is_some_and(|survey| survey.distortion);
         let preset = Preset::of_columns(&columns, distortion || e1 == "corrected_g1");
         let mut columns = Columns {
             columns,
@@ -679,11 +695,9 @@ impl Columns {
             let unused = unused.iter().filter(|name| wanted(name));
             unused.map(|name| (*name).clone()).collect()
         };
-        let choices = unused.iter().filter_map(|name| {
-            let mut known = CHOICES.iter();
-            let known = known.find(|(known, _)| known.eq_ignore_ascii_case(name))?;
-            Some(((*name).clone(), known.1))
-        });
+        let choices = unused
+            .iter()
+            .filter_map(|name| chosen_value(name).map(|_| (*name).clone()));
         let choices = choices.collect();
         if self.of(Role::ShearedCatalogue).is_none() && !names.is_given(Role::ShearedCatalogue) {
             self.steps =
@@ -732,13 +746,13 @@ impl Columns {
     }
 
     /// Of a catalogue of shearq with sheared catalogues, takes these if a selection requires them, and otherwise the
-    /// columns without them, which have less noise.
-    pub(super) fn choose_versions(&mut self, found: &[String], required: bool) {
+    /// columns without them, which have less noise: an image that is sheared gets more noise, so that both have the same.
+    pub(super) fn choose_sheared(&mut self, found: &[String], required: bool) {
         if self.preset != Preset::Shearq || self.of_sheared((Role::E1, 1)).is_none() {
             return;
         }
         if required {
-            self.preset = Preset::Versions;
+            self.preset = Preset::Sheared;
             self.take_unsheared(found);
         } else {
             self.columns.retain(|(_, catalogue), _| *catalogue == 0);
@@ -769,9 +783,25 @@ impl Columns {
 
     /// Whether the ellipticities of each component under shears of the other one are there.
     pub(super) fn have_other_sheared(&self) -> bool {
-        SHEARED[4..]
-            .iter()
-            .all(|key| self.columns.contains_key(key))
+        let mut keys = [sheared_pair(0, 1), sheared_pair(1, 0)]
+            .into_iter()
+            .flatten();
+        keys.all(|key| self.columns.contains_key(&key))
+    }
+
+    /// Whether sheared columns of what galaxies are chosen and weighted by give the response of the choice.
+    pub(super) fn give_selection_response(&self) -> bool {
+        match self.preset {
+            Preset::Metacal | Preset::Sheared => true,
+            Preset::Shearq | Preset::Anacal | Preset::Metadetect => false,
+            // Catalogues with responses of galaxies often have only the selected quantities in sheared columns: DES Y1
+            // publishes R11 to R22 and `flags_select_1p`, but no sheared ellipticities.
+            Preset::Plain | Preset::Hsm => self.have(&[Role::R11]),
+        }
+    }
+
+    pub(super) fn is_of_shearq(&self) -> bool {
+        [Preset::Shearq, Preset::Sheared].contains(&self.preset)
     }
 
     pub(super) fn all(&self) -> impl Iterator<Item = (Key, &str)> {
@@ -785,10 +815,9 @@ fn find_sheared(columns: &mut BTreeMap<Key, String>, found: &[String], names: &N
         let Some(name) = columns.get(&(role, 0)).map(|own| own.to_ascii_lowercase()) else {
             continue;
         };
-        let own = |version: &str| same_name(found, &format!("{}_{version}", base(&name)));
         let sheared: Option<Vec<&String>> = SHEARED_CATALOGUES
             .iter()
-            .map(|(version, _)| own(version))
+            .map(|(sheared, _)| same_name(found, &format!("{}_{sheared}", base(&name))))
             .collect();
         for (catalogue, column) in (1..).zip(sheared.into_iter().flatten()) {
             if !names.0.contains_key(&(role, catalogue)) {
@@ -891,12 +920,12 @@ mod tests {
         let names =
             "e1 e2 flags R11 R22 divisor1 divisor2 e1_noshear e2_noshear e1_1p e1_1m e2_2p e2_2m";
         for (required, preset, e1, plus) in [
-            (true, Preset::Versions, "e1_noshear", Some("e1_1p")),
+            (true, Preset::Sheared, "e1_noshear", Some("e1_1p")),
             (false, Preset::Shearq, "e1", None),
         ] {
             let mut own = found(names, &[]).unwrap();
             let all: Vec<String> = names.split(' ').map(str::to_owned).collect();
-            own.choose_versions(&all, required);
+            own.choose_sheared(&all, required);
             assert_eq!((own.preset, own.of(Role::E1)), (preset, Some(e1)));
             assert_eq!(own.of_sheared((Role::E1, 1)), plus);
         }

@@ -5,45 +5,31 @@ use std::hash::{Hash, Hasher};
 use std::path::Path;
 
 use shearq_files::FileError;
-use shearq_files::frames::polars::{DataFrame, DataType};
+use shearq_files::frames::polars::DataFrame;
 use shearq_files::table;
 
 /// Integers that floats do not contain have other bits than the float with the same ones.
 const INTEGER: u64 = 0x5bd1_e995_9d1b_58d3;
 
 /// Keys of the identifiers in a column: equal for equal numbers of any type, and for a text that is such a number.
-///
-/// # Errors
-/// If there is no such column.
 pub(super) fn keys(frame: &DataFrame, name: &str, path: &Path) -> Result<Vec<u64>, FileError> {
-    let series = frame.column(name).map(|own| own.as_materialized_series());
-    match series.as_ref().map(|own| own.dtype()) {
-        Ok(DataType::String) => {
-            let texts = series.as_ref().ok().and_then(|own| own.str().ok());
-            let texts = texts.into_iter().flat_map(|texts| texts.iter());
-            Ok(texts
-                .map(|text| of_text(text.unwrap_or_default()))
-                .collect())
-        }
-        Ok(DataType::Int64) => {
-            let all = series.as_ref().ok().and_then(|own| own.i64().ok());
-            let all = all.into_iter().flat_map(|all| all.iter());
-            Ok(all
-                .map(|own| own.map_or(0, |own| of_integer(own.into())))
-                .collect())
-        }
-        Ok(DataType::UInt64) => {
-            let all = series.as_ref().ok().and_then(|own| own.u64().ok());
-            let all = all.into_iter().flat_map(|all| all.iter());
-            Ok(all
-                .map(|own| own.map_or(0, |own| of_integer(own.into())))
-                .collect())
-        }
-        _ => {
-            let numbers = table::numbers(frame, name, path)?;
-            Ok(numbers.iter().map(|own| hash(own.to_bits())).collect())
-        }
+    let column = frame.column(name).ok();
+    let series = column.map(|own| own.as_materialized_series());
+    // Floats would round the identifiers of Rubin, which are above 2⁵³.
+    if let Some(texts) = series.and_then(|own| own.str().ok()) {
+        let key = |text: Option<&str>| of_text(text.unwrap_or_default());
+        return Ok(texts.iter().map(key).collect());
     }
+    if let Some(integers) = series.and_then(|own| own.i64().ok()) {
+        let key = |own: Option<i64>| own.map_or(0, |own| of_integer(own.into()));
+        return Ok(integers.iter().map(key).collect());
+    }
+    if let Some(integers) = series.and_then(|own| own.u64().ok()) {
+        let key = |own: Option<u64>| own.map_or(0, |own| of_integer(own.into()));
+        return Ok(integers.iter().map(key).collect());
+    }
+    let numbers = table::numbers(frame, name, path)?;
+    Ok(numbers.iter().map(|own| hash(own.to_bits())).collect())
 }
 
 /// An identifier as messages show it.

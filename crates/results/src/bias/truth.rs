@@ -1,19 +1,21 @@
-//! The true shear of catalogues or galaxies.
+//! The true shear of catalogues or galaxies: of all, by catalogue, identifier or position, or of the data that folders of
+//! catalogues were measured on.
 
 use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use shearq_dataset::layout::stated_sign;
-use shearq_dataset::truth::{Sign, SignBasis};
-use shearq_files::FileError;
-use shearq_files::open::{SETTINGS, read_to_string};
-use shearq_files::table::{self, Place};
-use shearq_scoring::TruthSign;
+use shearq_dataset::run::{RUN_FILE, Run};
+use shearq_dataset::truth::{Sign, SignBasis, sign_on_any_grid};
+use shearq_files::open::{SETTINGS, is_there, read_to_string};
+use shearq_files::table::{self, MAX_ROWS, Place, TRUTH_COLUMNS};
+use shearq_files::{FileError, names_of};
+use shearq_scoring::{Row, TruthSign};
 
 use super::columns::{Role, names_of_role};
-use super::identity;
-use super::positions::{Positions, check};
+use super::source::Places;
+use super::{BiasFailure, Input, identity};
 
 /// Where the true shear comes from.
 #[derive(Debug, Clone, Default)]
@@ -61,10 +63,6 @@ const CATALOGUE: [&str; 3] = ["catalogue", "catalog", "file"];
 impl Truth {
     /// Reads a table of true shears: columns `catalogue g1 g2` (text), or `id g1 g2` or `x y g1 g2` in any format, with
     /// the sign of its g2. The shears themselves are as in the file.
-    ///
-    /// # Errors
-    /// If the file cannot be read or has other columns, names a catalogue or galaxy twice, or states another sign than
-    /// `specified`.
     pub fn read(path: &Path, specified: Option<TruthSign>) -> Result<(Self, TrueSign), FileError> {
         let place = Place::of(path);
         let columns = table::columns(&place)?;
@@ -100,7 +98,7 @@ impl Truth {
                 path,
                 format!(
                     "this is no table of true shears (found {}, expected the columns id, g1, g2 or x, y, g1, g2 or catalogue, g1, g2)",
-                    shearq_files::names_of(&found)
+                    names_of(&found)
                 ),
             ));
         };
@@ -130,9 +128,6 @@ impl Truth {
     }
 
     /// The same with the shear of each of `catalogues` by its path, if catalogues have a shear each.
-    ///
-    /// # Errors
-    /// If the table of catalogues does not contain one, or it is not clear which rows belong to which catalogues.
     pub(super) fn of_paths<'p>(
         &self,
         catalogues: impl IntoIterator<Item = &'p Path>,
@@ -155,32 +150,61 @@ impl Truth {
         }
         Ok(Truth::Catalogues(found))
     }
+}
 
-    /// The shear of a catalogue; `None` if it is not known, or depends on the galaxy.
-    pub(crate) fn of_catalogue(&self, path: &Path) -> Option<[f64; 2]> {
-        match self {
-            Truth::Constant(shear) => Some(*shear),
-            Truth::Catalogues(all) => all.get(&path.display().to_string()).copied(),
-            Truth::Columns | Truth::Galaxies(_) | Truth::Positions(_) | Truth::Data(_) => None,
-        }
-    }
+/// Where the true shears of the rows of one catalogue are.
+#[derive(Clone, Copy)]
+pub(super) enum OfRows<'a> {
+    /// Zero if there is none.
+    Constant([f64; 2]),
+    Identifiers(&'a HashMap<u64, [f64; 2]>),
+    /// By the position in two columns.
+    Positions(&'a Positions, [usize; 2]),
+    /// In two columns.
+    Columns([usize; 2]),
+}
 
-    /// The shears of a catalogue by position, if they are known so.
-    ///
-    /// # Errors
-    /// If they are known of other catalogues only.
-    pub(super) fn positions(&self, path: &Path) -> Result<Option<&Positions>, FileError> {
-        match self {
-            Truth::Positions(positions) => Ok(Some(positions)),
+impl<'a> OfRows<'a> {
+    pub(super) fn new(path: &Path, places: &Places, truth: &'a Truth) -> Result<Self, FileError> {
+        let absent = |what: &str, option: &str| {
+            let message = format!(
+                "the catalogue has no {what} to find the true shear with. Try: --columns {option}"
+            );
+            FileError::new(path, message)
+        };
+        let by_position = |positions| {
+            let columns = places.pair([Role::X, Role::Y]);
+            let columns = columns.ok_or_else(|| absent("positions", "x=NAME,y=NAME"))?;
+            Ok(OfRows::Positions(positions, columns))
+        };
+        match truth {
+            Truth::Constant(shear) => Ok(OfRows::Constant(*shear)),
+            Truth::Catalogues(all) => {
+                let shear = all.get(&path.display().to_string());
+                Ok(OfRows::Constant(shear.copied().unwrap_or_default()))
+            }
+            Truth::Galaxies(galaxies) => match places.of((Role::Id, 0)) {
+                Some(_) => Ok(OfRows::Identifiers(galaxies)),
+                None => Err(absent("identifier", "id=NAME")),
+            },
+            Truth::Positions(positions) => by_position(positions),
             Truth::Data(all) => match all.get(path) {
-                Some(positions) => Ok(Some(positions)),
+                Some(positions) => by_position(positions),
                 None => Err(FileError::new(
                     path,
                     "this catalogue has no known true shear, but the folders have one. Try: separate commands, or --truth FILE",
                 )),
             },
-            _ => Ok(None),
+            Truth::Columns => Ok(match places.pair([Role::G1, Role::G2]) {
+                Some(columns) => OfRows::Columns(columns),
+                None => OfRows::Constant([0.0; 2]),
+            }),
         }
+    }
+
+    /// Whether a row may be absent from the truth.
+    pub(super) fn may_lack_rows(self) -> bool {
+        matches!(self, OfRows::Identifiers(..) | OfRows::Positions(..))
     }
 }
 
@@ -213,7 +237,7 @@ fn row_of<'n>(
             path,
             format!(
                 "the table of true shears does not contain this catalogue (found {}; expected this path, the name of the file, or a folder of it)",
-                shearq_files::names_of(&all)
+                names_of(&all)
             ),
         )),
         [first, second, ..] => Err(FileError::new(
@@ -276,9 +300,245 @@ fn of_catalogues(path: &Path) -> Result<Truth, FileError> {
     Ok(Truth::Catalogues(all))
 }
 
+/// Largest distance of a galaxy from its place in the truth, in pixels: centroids of detections differ by less, and first
+/// pixels of 0 and of 1 by more.
+const RADIUS: f64 = 1.0;
+
+/// A place of the truth.
+#[derive(Debug, Clone, Copy)]
+struct Entry {
+    x: f64,
+    y: f64,
+    shear: [f64; 2],
+}
+
+impl Entry {
+    /// Square of side [`RADIUS`] that contains the place: row and column.
+    fn cell(&self) -> (i64, i64) {
+        (
+            (self.y / RADIUS).floor() as i64,
+            (self.x / RADIUS).floor() as i64,
+        )
+    }
+}
+
+/// True shears at positions.
+#[derive(Debug, Clone, Default)]
+pub struct Positions {
+    /// In the order of their cells.
+    entries: Vec<Entry>,
+}
+
+impl Positions {
+    /// Reads a table with the columns x, y (pixels), g1 and g2 of this sign.
+    pub fn read(path: &Path, sign: TruthSign) -> Result<Self, FileError> {
+        let place = Place::of(path);
+        let found = table::columns(&place)?;
+        let names = TRUTH_COLUMNS.map(|name| {
+            let mut all = found.named.iter().flat_map(|list| &list.names);
+            let own = all.find(|own| own.eq_ignore_ascii_case(name));
+            own.map_or(name, String::as_str)
+        });
+        let read = table::read_from(&place, Some(&names), MAX_ROWS)?;
+        let column = |k: usize| table::numbers(&read, names[k], path);
+        let [xs, ys, g1, g2] = [column(0)?, column(1)?, column(2)?, column(3)?];
+        let factor = match sign {
+            TruthSign::Standard => 1.0,
+            TruthSign::Challenge => -1.0,
+        };
+        let mut entries = Vec::with_capacity(xs.len());
+        for row in 0..xs.len() {
+            let fault = |fault: String| FileError::new(path, format!("row {}: {fault}", row + 1));
+            let (x, y) = (xs[row], ys[row]);
+            if !(x.is_finite() && y.is_finite()) {
+                return Err(fault(format!(
+                    "found the position {x}, {y}, expected numbers"
+                )));
+            }
+            let shear = [g1[row], factor * g2[row]];
+            check(shear).map_err(fault)?;
+            entries.push(Entry { x, y, shear });
+        }
+        entries.sort_by(|a, b| {
+            let places = || a.x.total_cmp(&b.x).then(a.y.total_cmp(&b.y));
+            a.cell().cmp(&b.cell()).then_with(places)
+        });
+        // A table of several images, or of several catalogues: the first shear would be used for all of them.
+        let contradictory = |pair: &&[Entry]| {
+            (pair[0].x, pair[0].y) == (pair[1].x, pair[1].y) && pair[0].shear != pair[1].shear
+        };
+        if let Some([a, b]) = entries.windows(2).find(contradictory) {
+            return Err(FileError::new(
+                path,
+                format!(
+                    "the position x = {}, y = {} has two true shears (found {:?} and {:?}, expected one). Try: a table per catalogue, or the columns id, g1, g2",
+                    a.x, a.y, a.shear, b.shear
+                ),
+            ));
+        }
+        Ok(Positions { entries })
+    }
+
+    /// The sign of g2 in which the shears are an E-mode field; `None` if they do not fill a square grid.
+    fn sign_by_modes(&self) -> Option<TruthSign> {
+        let rows = self.entries.iter().map(|entry| Row {
+            x: entry.x,
+            y: entry.y,
+            e1: entry.shear[0],
+            e2: entry.shear[1],
+        });
+        sign_on_any_grid(&rows.collect::<Vec<_>>())
+    }
+
+    /// The shear of the nearest place within [`RADIUS`].
+    pub(super) fn at(&self, [x, y]: [f64; 2]) -> Result<[f64; 2], String> {
+        let own = Entry {
+            x,
+            y,
+            shear: [0.0; 2],
+        };
+        let (row, column) = own.cell();
+        let mut nearest: Option<(f64, [f64; 2])> = None;
+        for row in row - 1..=row + 1 {
+            let first = self
+                .entries
+                .partition_point(|e| e.cell() < (row, column - 1));
+            let near = self.entries[first..].iter();
+            for entry in near.take_while(|e| e.cell() <= (row, column + 1)) {
+                let distance = (entry.x - x).hypot(entry.y - y);
+                if distance <= RADIUS && nearest.is_none_or(|(least, _)| distance < least) {
+                    nearest = Some((distance, entry.shear));
+                }
+            }
+        }
+        nearest.map(|(_, shear)| shear).ok_or_else(|| {
+            format!(
+                "the table of true shears has no galaxy within {RADIUS} pixel of x = {x}, y = {y}. Try: check whether positions begin with 0 or 1, or --drop-missing"
+            )
+        })
+    }
+}
+
+/// Refuses what is no shear.
+pub(super) fn check([g1, g2]: [f64; 2]) -> Result<(), String> {
+    // Without the square root: this is checked in every row.
+    if g1 * g1 + g2 * g2 < 1.0 {
+        return Ok(());
+    }
+    Err(format!(
+        "this is no shear (found g1 {g1} and g2 {g2}, expected a modulus below 1)"
+    ))
+}
+
+/// Replaces folders of results by their catalogues, in the order of sets and images. Unless `truth` states the true
+/// shear, it is read from the data folders, if they have one.
+pub fn expand(paths: &[PathBuf], truth: Truth) -> Result<(Vec<Input>, Truth), BiasFailure> {
+    let (mut truth, mut catalogues) = (truth, Vec::new());
+    let mut found = match &mut truth {
+        Truth::Data(found) => std::mem::take(found),
+        _ => BTreeMap::new(),
+    };
+    let mut without: Option<&Path> = None;
+    for path in paths {
+        if !path.is_dir() {
+            catalogues.push(path.clone().into());
+            continue;
+        }
+        let Some(run) = Run::read(path)? else {
+            let message = format!(
+                "this folder has no {RUN_FILE} (expected catalogues, or a folder that `measure` or `run` wrote). Try: {}/*",
+                path.display()
+            );
+            return Err(FileError::new(path, message).into());
+        };
+        let files = run.catalogues(path, &[])?;
+        if files.is_empty() {
+            return Err(FileError::new(path, "there is no catalogue in this folder").into());
+        }
+        for set in files.sets() {
+            let own: Vec<PathBuf> = files
+                .of_set(set)
+                .into_iter()
+                .map(|(_, file)| file)
+                .collect();
+            if matches!(truth, Truth::Columns | Truth::Data(_)) {
+                match of_data(&run, path, set)? {
+                    None => without = Some(path),
+                    Some(positions) => {
+                        let positions = Arc::new(positions);
+                        found.extend(own.iter().map(|file| (file.clone(), positions.clone())));
+                    }
+                }
+            }
+            catalogues.extend(own.into_iter().map(Input::from));
+        }
+    }
+    if found.is_empty() {
+        return Ok((catalogues, truth));
+    }
+    if let Some(path) = without {
+        let message = "its data have no true shear, but the data of other folders have one. Try: separate commands, or --truth FILE";
+        return Err(FileError::new(path, message).into());
+    }
+    Ok((catalogues, Truth::Data(found)))
+}
+
+/// The true shear of the data of a run; `None` if they have none.
+fn of_data(run: &Run, folder: &Path, set: u32) -> Result<Option<Positions>, FileError> {
+    let data = run.source.data(folder).map_err(|error| {
+        let message = format!(
+            "the data with the true shear are gone ({error}). Try: --truth FILE, or the catalogues themselves without a true shear"
+        );
+        FileError::new(folder, message)
+    })?;
+    let path = data.truth(set);
+    if !is_there(&path) {
+        return Ok(None);
+    }
+    Positions::read(&path, data.truth_sign(set)?).map(Some)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_nearest_place_within_a_pixel_is_found_across_cells() {
+        let places = [
+            (0.1, 0.1),
+            (0.9, 0.1),
+            (10.0, 10.0),
+            (-0.4, -0.4),
+            (10.0, 11.5),
+        ];
+        let mut entries: Vec<Entry> = places
+            .iter()
+            .enumerate()
+            .map(|(k, &(x, y))| Entry {
+                x,
+                y,
+                shear: [k as f64, 0.0],
+            })
+            .collect();
+        entries.sort_by_key(Entry::cell);
+        let found = Positions { entries };
+        for (position, expected) in [
+            ([0.1, 0.1], Some(0.0)),
+            ([0.6, 0.2], Some(1.0)),
+            ([-0.2, -0.2], Some(3.0)),
+            ([10.9, 10.2], Some(2.0)),
+            ([9.2, 9.5], Some(2.0)),
+            ([10.0, 10.8], Some(4.0)),
+            ([11.1, 10.0], None),
+            ([5.0, 5.0], None),
+        ] {
+            assert_eq!(
+                found.at(position).ok().map(|g| g[0]),
+                expected,
+                "{position:?}"
+            );
+        }
+    }
 
     /// The shears of catalogues by a table of names, or why they are not known.
     fn shears(table: &[(&str, f64)], catalogues: &[&str]) -> Result<Vec<f64>, String> {
@@ -286,10 +546,10 @@ mod tests {
         let truth = Truth::Catalogues(table.collect());
         let truth = truth.of_paths(catalogues.iter().map(Path::new));
         let truth = truth.map_err(|error| error.to_string())?;
-        let found = catalogues.iter().map(Path::new);
-        Ok(found
-            .map(|path| truth.of_catalogue(path).unwrap()[0])
-            .collect())
+        let Truth::Catalogues(all) = truth else {
+            panic!("{truth:?}");
+        };
+        Ok(catalogues.iter().map(|path| all[*path][0]).collect())
     }
 
     #[test]

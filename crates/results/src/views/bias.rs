@@ -314,18 +314,18 @@ fn notes(result: &BiasResult) -> Vec<String> {
     }
     notes.extend(implausible(result, all));
     notes.extend(of_design(result).iter().map(|line| sentence(line)));
-    let total = |of: fn(&Catalogue) -> u64| result.about.catalogues.iter().map(of).sum::<u64>();
+    let total = result.about.total();
     for (count, what) in [
-        (total(|c| c.flagged), "with a flag"),
-        (total(|c| c.unweighted), "with a weight of zero or less"),
-        (total(|c| c.unselected), "that --where excludes"),
-        (total(|c| c.missing), "with missing numbers"),
+        (total.flagged, "with a flag"),
+        (total.unweighted, "with a weight of zero or less"),
+        (total.unselected, "that --where excludes"),
+        (total.missing, "with missing numbers"),
         (
-            total(|c| c.failed),
+            total.failed,
             "with numbers that stand for failed measurements",
         ),
         (
-            total(|c| c.above_one),
+            total.above_one,
             "with a distortion above 1, which noise makes and to which no shear belongs",
         ),
     ] {
@@ -333,7 +333,7 @@ fn notes(result: &BiasResult) -> Vec<String> {
             notes.push(format!("Left out: {count} rows {what}."));
         }
     }
-    if 2 * total(|c| c.flagged) > total(|c| c.rows) {
+    if 2 * total.flagged > total.rows {
         notes.push(
             "More than half of the rows have a flag, which is not 0. If good rows have it, try: --columns flag=none --where NAME".into(),
         );

@@ -1,0 +1,627 @@
+//! Tables of a catalogue, and which of their columns are read as what.
+
+use std::collections::BTreeSet;
+use std::path::Path;
+
+use shearq_bias::{Design, SHEARED_CATALOGUES};
+use shearq_files::frames::polars::DataFrame;
+use shearq_files::table::{self, FileFormat, Place};
+use shearq_files::{FileError, names_of};
+use shearq_measure::{Observables, Selection};
+
+use crate::expression::{Expression, Operand};
+use crate::select::{READ, require_responses};
+
+use super::columns::{CATALOGUES, Columns, Key, Preset, ROLES, Role, Shapes, base, fits_any};
+use super::truth::Truth;
+use super::{Input, Request, Units};
+
+/// How catalogues are read: a request with the true shears of its catalogues.
+pub(super) struct Reading<'r> {
+    pub(super) request: &'r Request,
+    pub(super) truth: Truth,
+    /// Whether minus the true g2 is used.
+    pub(super) flip_g2: bool,
+}
+
+impl Reading<'_> {
+    pub(super) fn condition(&self) -> Option<&Expression> {
+        self.request.selection.as_ref()?.rows.as_ref()
+    }
+
+    /// Steps and weights, whose response is in columns of linear configurations.
+    pub(super) fn weights(&self) -> Option<&Selection> {
+        self.request.selection.as_ref()?.weights.as_ref()
+    }
+
+    pub(super) fn binned(&self) -> Option<&Expression> {
+        self.request.bins.as_ref().map(|bins| &bins.of)
+    }
+
+    /// The expressions that choose galaxies.
+    fn expressions(&self) -> impl Iterator<Item = (Role, &Expression)> + Clone {
+        let all = [
+            (Role::Condition, self.condition()),
+            (Role::Binned, self.binned()),
+        ];
+        all.into_iter().filter_map(|(role, own)| Some((role, own?)))
+    }
+
+    fn chosen_by(&self) -> impl Iterator<Item = &str> + Clone {
+        self.expressions().flat_map(|(_, own)| own.columns())
+    }
+
+    /// Whether two neighbouring rows form a unit.
+    pub(super) fn neighbours(&self) -> bool {
+        self.request.design == Some(Design::Rotated) && self.request.catalogues.len() == 1
+    }
+
+    /// Whether the column of a role is of no use for the true shear.
+    fn skips(&self, role: Role) -> bool {
+        match role {
+            Role::G1 | Role::G2 => !matches!(self.truth, Truth::Columns),
+            Role::X | Role::Y => !matches!(self.truth, Truth::Positions(_) | Truth::Data(_)),
+            _ => false,
+        }
+    }
+}
+
+// Columns of surveys and simulations that look like independent units. They are suggested, not used: a field or seed may
+// also be the same in all rows.
+const UNITS: &str = "tile tile_id tileid tilename tile_name field field_id patch patch_id seed tract pointing exposure \
+    exp_id ccd chip healpix realisation";
+
+// Columns that shear does not change, by their names in small letters. Any other column needs sheared catalogues if
+// galaxies are chosen by it: a cut at S/N 7 biases m by −0.1 (docs/limitations.md).
+const FIXED: &str = "*psf* *tile* *field* *patch* *seed* *true* *truth* *image* *ccd* *exp* *airmass* *seeing* *depth* \
+    *zbin* *z_bin* *primary* *inner* ra dec x y z number row alpha delta set";
+
+/// What is read of a row by sheared catalogue and role, as places in [`Source::wanted`].
+#[derive(Default)]
+pub(super) struct Places([[Vec<usize>; ROLES]; CATALOGUES]);
+
+impl Places {
+    pub(super) fn all(&self, (role, catalogue): Key) -> &[usize] {
+        &self.0[catalogue][role as usize]
+    }
+
+    pub(super) fn of(&self, key: Key) -> Option<usize> {
+        self.all(key).first().copied()
+    }
+
+    /// Of two roles in the catalogue without artificial shear, if both have a column.
+    pub(super) fn pair(&self, [a, b]: [Role; 2]) -> Option<[usize; 2]> {
+        Some([self.of((a, 0))?, self.of((b, 0))?])
+    }
+
+    fn set(&mut self, (role, catalogue): Key, places: Vec<usize>) {
+        self.0[catalogue][role as usize] = places;
+    }
+}
+
+/// A table of a catalogue with its columns.
+pub(super) struct Source {
+    pub(super) place: Place,
+    /// The table, if it is in memory.
+    pub(super) frame: Option<DataFrame>,
+    /// The catalogue of all rows, if a FITS file has one table per sheared catalogue.
+    pub(super) catalogue: Option<usize>,
+    pub(super) columns: Columns,
+    /// How ellipticities become shears.
+    pub(super) shapes: Shapes,
+    /// Column that names the unit of a row.
+    pub(super) unit: Option<String>,
+    /// A column without a role that looks like independent units.
+    pub(super) unit_column: Option<String>,
+    /// All that is read, each once.
+    pub(super) wanted: Vec<Operand>,
+    pub(super) places: Places,
+    /// Columns of expressions that shear changes by an unknown amount.
+    unanswered: Vec<String>,
+    /// Whether sheared catalogues have flags of their own, which then give the response of the choice.
+    sheared_flags: bool,
+    /// Whether each sheared catalogue chooses its own galaxies, so that the response of the choice follows.
+    pub(super) selects: bool,
+    declines_matrix: bool,
+    has_weights: bool,
+}
+
+impl Source {
+    /// Columns of `--where` and `--bins` by which shear changes the choice of galaxies, without a response of the choice.
+    pub(super) fn unanswered(&self) -> &[String] {
+        match self.has_sheared_rows() {
+            // Each sheared catalogue is chosen by its own columns.
+            true => &[],
+            false => &self.unanswered,
+        }
+    }
+
+    /// Which columns are used as what, and which are not used.
+    pub(super) fn described(&self, reading: &Reading<'_>) -> Vec<String> {
+        let responsivity = self.shapes == Shapes::Responsivity;
+        let read = |role: Role| match role {
+            Role::Unit => self.unit.is_some(),
+            Role::R12 | Role::R21 => self.has_matrix(),
+            Role::RmsE | Role::SigmaE => responsivity,
+            role => !reading.skips(role),
+        };
+        let mut lines = vec![format!("Used: {}.", self.columns.used(read))];
+        let doubtful = self.columns.doubtful_weight.as_ref();
+        let read = self.wanted.iter().map(|own| own.column.clone());
+        let read: Vec<String> = read.filter(|name| Some(name) != doubtful).collect();
+        lines.extend(self.columns.unused(&read));
+        let mut sheared = Vec::new();
+        if self.sheared_flags {
+            sheared.extend(self.places.all((Role::Flag, 1)));
+        }
+        sheared.extend(self.places.of((Role::Weight, 1)));
+        if !sheared.is_empty() {
+            let names: Vec<&str> = sheared.iter().map(|place| self.name(*place)).collect();
+            lines.push(format!(
+                "Response of the choice and the weights: from {} and the other versions.",
+                names.join(", ")
+            ));
+        }
+        if responsivity {
+            let rms = match (self.columns.of(Role::RmsE), self.columns.of(Role::SigmaE)) {
+                (Some(rms), _) => format!("e_rms from {rms}"),
+                (None, Some(sigma)) => format!("e_rms² = ⟨χ²⟩/2 − {sigma}²"),
+                (None, None) => {
+                    "e_rms² = ⟨χ²⟩/2, with the measurement noise. Try: --columns rms_e=NAME or sigma_e=NAME".into()
+                }
+            };
+            lines.push(format!(
+                "Shears from distortions: ⟨χ⟩/2ℛ with ℛ = 1 − ⟨w e_rms²⟩/⟨w⟩, {rms}. Moduli above 1 count. Try: --ellipticity distortion to convert each galaxy."
+            ));
+        }
+        lines
+    }
+
+    pub(super) fn name(&self, place: usize) -> &str {
+        &self.wanted[place].column
+    }
+
+    /// Whether rows or tables belong to sheared catalogues.
+    pub(super) fn has_sheared_rows(&self) -> bool {
+        self.catalogue.is_some() || self.columns.of(Role::ShearedCatalogue).is_some()
+    }
+
+    pub(super) fn has_response(&self) -> bool {
+        let by_columns = [Preset::Metacal, Preset::Sheared].contains(&self.columns.preset);
+        self.has_sheared_rows() || by_columns || self.columns.have(&[Role::R11])
+    }
+
+    /// Whether the responses of each component to the other one are known.
+    pub(super) fn has_matrix(&self) -> bool {
+        let of_rows = match self.columns.preset {
+            Preset::Metacal | Preset::Sheared => self.columns.have_other_sheared(),
+            _ => self.columns.have(&[Role::R12, Role::R21]),
+        };
+        (of_rows || self.has_weights || self.has_sheared_rows()) && !self.declines_matrix
+    }
+
+    pub(super) fn has_psf(&self) -> bool {
+        self.columns.have(&[Role::Psf1, Role::Psf2])
+    }
+
+    /// Gives the wanted columns to `take`, in parts.
+    pub(super) fn parts(
+        &self,
+        reading: &Reading<'_>,
+        mut take: impl FnMut(DataFrame) -> Result<(), FileError>,
+    ) -> Result<(), FileError> {
+        if let Some(frame) = &self.frame {
+            return take(frame.clone());
+        }
+        let names: BTreeSet<&str> = self.wanted.iter().map(|own| own.column.as_str()).collect();
+        let names: Vec<&str> = names.into_iter().collect();
+        let mut texts = names.clone();
+        texts.retain(|name| self.is_text(reading, name));
+        table::read_parts(&self.place, &names, &texts, take)
+    }
+
+    /// Whether a column may be a text: identifiers, names of sheared catalogues, and what is compared with a pattern.
+    pub(super) fn is_text(&self, reading: &Reading<'_>, name: &str) -> bool {
+        let mut operands = reading.expressions().flat_map(|(_, own)| own.operands());
+        match operands.find(|own| own.column == name || own.column == base(name)) {
+            Some(operand) => operand.pattern.is_some(),
+            None => {
+                let roles = [Role::Id, Role::ShearedCatalogue].map(|role| self.columns.of(role));
+                roles.contains(&Some(name))
+                    || self.unit.as_deref() == Some(name)
+                    || self.columns.steps.iter().any(|step| step == name)
+            }
+        }
+    }
+}
+
+/// Finds the tables of a catalogue and their columns.
+pub(super) fn sources(input: &Input, reading: &Reading<'_>) -> Result<Vec<Source>, FileError> {
+    let path = input.name.as_path();
+    if let Some(frame) = &input.frame {
+        let place = Place {
+            path: path.to_owned(),
+            table: None,
+        };
+        let names: Vec<String> = (frame.columns().iter())
+            .map(|own| own.name().to_string())
+            .collect();
+        let source = Source {
+            frame: Some(frame.clone()),
+            ..source(place, None, &names, reading)?
+        };
+        return Ok(vec![source]);
+    }
+    let place = Place::of(path);
+    let found = table::columns(&place)?;
+    let name = |shown: &str| shown.split('`').nth(1).unwrap_or_default().to_owned();
+    let table = |number: usize| Place {
+        path: place.path.clone(),
+        table: Some(number.to_string()),
+    };
+    // Metadetection of LSST writes a table per sheared catalogue.
+    if place.table.is_none() {
+        let mut tables = Vec::new();
+        for list in &found.named {
+            let Some((number, shown)) = &list.table else {
+                continue;
+            };
+            if let Some(catalogue) = catalogue_named(&name(shown)) {
+                let own = source(table(*number), Some(catalogue), &list.names, reading)?;
+                tables.push(own);
+            }
+        }
+        if tables.len() == CATALOGUES {
+            return Ok(tables);
+        }
+    }
+    let lists: Vec<_> = (found.named.iter())
+        .filter(|list| !list.doubtful || found.named.len() == 1)
+        .collect();
+    let names = &reading.request.names;
+    let good: Vec<_> = (lists.iter().copied())
+        .filter(|list| Columns::find(path, &list.names, names).is_ok())
+        .collect();
+    let tables: Vec<&str> = (good.iter())
+        .filter_map(|list| Some(list.table.as_ref()?.1.as_str()))
+        .collect();
+    if let [first, _, ..] = tables[..] {
+        // Tables of chips share a name.
+        let own = name(first);
+        let unique = !own.is_empty()
+            && own.parse::<u64>().is_err()
+            && tables.iter().filter(|other| name(other) == own).count() == 1;
+        let number = first.split(' ').next().unwrap_or_default();
+        return Err(FileError::new(
+            path,
+            format!(
+                "several tables have columns of ellipticities (found {}, expected one). Try: {}[{}]",
+                names_of(&tables),
+                path.display(),
+                if unique { &own } else { number }
+            ),
+        ));
+    }
+    let Some(list) = good.first().or(lists.first()) else {
+        return Err(FileError::new(
+            path,
+            format!(
+                "the columns have no names (found {} fields, expected a header such as `e1,e2`). Try: write a first line with names",
+                found.unnamed.len()
+            ),
+        ));
+    };
+    let own = match (&place.table, &list.table) {
+        (None, Some((number, _))) => table(*number),
+        _ => place,
+    };
+    Ok(vec![source(own, None, &list.names, reading)?])
+}
+
+/// The columns that are read of a table with these names, each once.
+struct Wanted<'a> {
+    path: &'a Path,
+    names: &'a [String],
+    columns: &'a Columns,
+    all: Vec<Operand>,
+}
+
+impl Wanted<'_> {
+    /// The place of a column among those that are read; `None` if the table does not have it.
+    fn add(&mut self, name: &str, pattern: Option<&String>) -> Option<usize> {
+        if !self.names.iter().any(|own| own == name) {
+            return None;
+        }
+        let operand = Operand {
+            column: name.to_owned(),
+            pattern: pattern.cloned(),
+        };
+        let known = self.all.iter().position(|own| *own == operand);
+        Some(known.unwrap_or_else(|| {
+            self.all.push(operand);
+            self.all.len() - 1
+        }))
+    }
+
+    fn require(&mut self, name: &str) -> Result<usize, FileError> {
+        let found = self.add(name, None);
+        found.ok_or_else(|| FileError::no_column(self.path, name, self.names))
+    }
+
+    /// The column of a sheared catalogue, in any case.
+    fn sheared(&self, name: &str, catalogue: usize) -> Option<String> {
+        let wanted = format!("{}_{}", base(name), SHEARED_CATALOGUES[catalogue - 1].0);
+        let mut names = self.names.iter();
+        names.find(|own| own.eq_ignore_ascii_case(&wanted)).cloned()
+    }
+
+    fn has_sheared(&self, name: &str) -> bool {
+        let mut catalogues = 1..CATALOGUES;
+        self.columns.give_selection_response()
+            && catalogues.all(|catalogue| self.sheared(name, catalogue).is_some())
+    }
+
+    /// Whether a flag is a cut in all catalogues. Other flags of metacalibration with sheared ones are those of failed
+    /// measurements.
+    fn is_cut(&self, name: &str) -> bool {
+        let by_name = name.to_ascii_lowercase().contains("select");
+        (by_name || self.columns.preset != Preset::Metacal) && self.has_sheared(name)
+    }
+
+    /// The places of roles, flags and expressions, whether each sheared catalogue has what the expressions require, and
+    /// whether it has flags of its own. A column without sheared ones is the same in all catalogues if `by_catalogue`, or
+    /// if flags or weights have sheared ones.
+    fn places(
+        &mut self,
+        reading: &Reading<'_>,
+        by_catalogue: bool,
+    ) -> Result<(Places, bool, bool), FileError> {
+        let columns = self.columns;
+        let mut places = Places::default();
+        for (key, name) in columns.all() {
+            // Units may be texts; a flag may have several columns.
+            if ![Role::Unit, Role::Flag].contains(&key.0) && !reading.skips(key.0) {
+                places.set(key, self.add(name, None).into_iter().collect());
+            }
+        }
+        let cuts = columns.flags.iter().any(|name| self.is_cut(name));
+        let weight = columns
+            .of(Role::Weight)
+            .filter(|name| self.has_sheared(name));
+        let by_catalogue = by_catalogue || cuts || weight.is_some();
+        let mut known = true;
+        for (role, expression) in reading.expressions() {
+            let operands = self.operands(expression, by_catalogue)?;
+            for (catalogue, own) in operands.into_iter().enumerate() {
+                known &= own.len() == expression.operands().len();
+                places.set((role, catalogue), own);
+            }
+        }
+        let weight = weight.filter(|_| known);
+        for catalogue in 0..CATALOGUES {
+            let mut flags = Vec::new();
+            for flag in &columns.flags {
+                let own = match catalogue > 0 && known && self.is_cut(flag) {
+                    true => self.sheared(flag, catalogue),
+                    false => None,
+                };
+                flags.push(self.require(own.as_ref().unwrap_or(flag))?);
+            }
+            places.set((Role::Flag, catalogue), flags);
+            if let Some(name) = weight.filter(|_| catalogue > 0) {
+                let own = self.sheared(name, catalogue);
+                let own = own.and_then(|name| self.add(&name, None));
+                places.set((Role::Weight, catalogue), own.into_iter().collect());
+            }
+        }
+        Ok((places, known, cuts && known))
+    }
+
+    /// The operands of an expression in each catalogue; none in a catalogue that lacks one. A column without sheared ones
+    /// is the same in all catalogues if another one has them (`by_catalogue`).
+    fn operands(
+        &mut self,
+        expression: &Expression,
+        by_catalogue: bool,
+    ) -> Result<Vec<Vec<usize>>, FileError> {
+        let mut all = vec![Vec::new()];
+        for Operand { column, pattern } in expression.operands() {
+            // Sheared catalogues of shearq have noise that other columns do not have.
+            let plain = format!("{column}_noshear");
+            let [first, second] = match self.columns.preset {
+                Preset::Sheared => [&plain, column],
+                _ => [column, &plain],
+            };
+            let found = self.add(first, pattern.as_ref());
+            let found = found.or_else(|| self.add(second, pattern.as_ref()));
+            all[0].push(found.ok_or_else(|| FileError::no_column(self.path, column, self.names))?);
+        }
+        for (name, _) in SHEARED_CATALOGUES {
+            let operands = expression.operands().iter();
+            let sheared = operands.map(|Operand { column, pattern }| {
+                let own = self.add(&format!("{}_{name}", base(column)), pattern.as_ref());
+                own.or_else(|| self.add(column, pattern.as_ref()).filter(|_| by_catalogue))
+            });
+            all.push(sheared.collect::<Option<_>>().unwrap_or_default());
+        }
+        Ok(all)
+    }
+}
+
+fn source(
+    place: Place,
+    catalogue: Option<usize>,
+    names: &[String],
+    reading: &Reading<'_>,
+) -> Result<Source, FileError> {
+    let path = &place.path;
+    let given = &reading.request.names;
+    let mut columns = Columns::find(path, names, given)?;
+    if matches!(reading.truth, Truth::Columns) && !columns.have(&[Role::G1]) {
+        given.check_true_shear(path)?;
+    }
+    let has_sheared = |name: &str| names.contains(&format!("{}_1p", base(name)));
+    let mut chosen_by = reading.chosen_by();
+    // Also if one of them is named.
+    let by_catalogue =
+        (chosen_by.clone()).any(|name| has_sheared(name) || unsheared_name(name).is_some());
+    columns.choose_sheared(names, by_catalogue && reading.weights().is_none());
+    if columns.preset == Preset::Sheared {
+        check_chosen(path, chosen_by.clone(), has_sheared)?;
+    }
+    if columns.of_sheared((Role::E1, 1)).is_some() && chosen_by.any(has_sheared) {
+        check_step(path, reading.request.step)?;
+    }
+    let mut wanted = Wanted {
+        path,
+        names,
+        columns: &columns,
+        all: Vec::new(),
+    };
+    let (mut places, known, sheared_flags) = wanted.places(reading, by_catalogue)?;
+    let doubtful = columns.doubtful_weight.as_ref();
+    let doubtful = doubtful.and_then(|name| wanted.add(name, None));
+    places.set((Role::DoubtfulWeight, 0), doubtful.into_iter().collect());
+    for name in &columns.steps {
+        wanted.require(name)?;
+    }
+    let mut failures = Vec::new();
+    for name in names.iter().filter(|_| columns.preset == Preset::Metacal) {
+        let small = name.to_ascii_lowercase();
+        let is_flag = small.contains("flag") && !small.contains("select");
+        if is_flag && unsheared_name(&small).is_some() {
+            failures.push(wanted.require(name)?);
+        }
+    }
+    places.set((Role::ShearedFailure, 0), failures);
+    let mut choices = Vec::new();
+    for name in &columns.choices {
+        if !reading.chosen_by().any(|own| own == name) {
+            choices.push(wanted.require(name)?);
+        }
+    }
+    places.set((Role::Choice, 0), choices);
+    if reading.weights().is_some() {
+        require_responses(path, names.iter().map(String::as_str))?;
+        for name in READ.iter().chain(&Observables::COLUMNS) {
+            wanted.require(name)?;
+        }
+    }
+    let unit = match &reading.request.units {
+        Units::Recognised => columns.of(Role::Unit),
+        Units::Column(name) => Some(name.as_str()).filter(|name| !name.is_empty()),
+        Units::Rows | Units::Catalogues => None,
+    };
+    if let Some(unit) = unit {
+        wanted.require(unit)?;
+    }
+    let unanswered: BTreeSet<&str> = reading
+        .chosen_by()
+        .filter(|name| match columns.preset {
+            Preset::Shearq => is_measured(name),
+            _ => !is_fixed(name, &columns) && !has_sheared(name),
+        })
+        .collect();
+    let mut like_unit = names.iter();
+    let like_unit = like_unit.find(|name| fits_any(UNITS, &name.to_ascii_lowercase()));
+    let sheared_weight = places.of((Role::Weight, 1)).is_some();
+    let chosen = reading.expressions().next().is_some() || sheared_flags || sheared_weight;
+    Ok(Source {
+        catalogue,
+        shapes: reading.request.shapes.unwrap_or(match columns.distortion {
+            true => Shapes::Responsivity,
+            false => Shapes::Shear,
+        }),
+        unit: unit.map(str::to_owned),
+        unit_column: like_unit.cloned(),
+        unanswered: unanswered.into_iter().map(str::to_owned).collect(),
+        sheared_flags,
+        selects: columns.give_selection_response() && chosen && known,
+        declines_matrix: given.decline_matrix(),
+        has_weights: reading.weights().is_some(),
+        wanted: wanted.all,
+        frame: None,
+        places,
+        place,
+        columns,
+    })
+}
+
+/// Whether shear does not change a column, judged by its role and name.
+fn is_fixed(name: &str, columns: &Columns) -> bool {
+    use Role::{Flag, G1, G2, Id, Psf1, Psf2, PsfSize, Unit, X, Y};
+    let roles = [G1, G2, Id, Psf1, Psf2, PsfSize, Unit, X, Y, Flag];
+    let mut flags = columns.flags.iter();
+    roles.iter().any(|role| columns.of(*role) == Some(name))
+        || flags.any(|flag| flag.eq_ignore_ascii_case(name))
+        || fits_any(FIXED, &name.to_ascii_lowercase())
+}
+
+/// The name of a column of one sheared catalogue, without the name of the shear.
+fn unsheared_name(name: &str) -> Option<&str> {
+    let mut names = SHEARED_CATALOGUES.iter();
+    names.find_map(|(sheared, _)| name.strip_suffix(sheared)?.strip_suffix('_'))
+}
+
+/// The catalogue of a name, 0 for that without shear: `ns` in metadetection of LSST, `00` in TXPipe.
+pub(super) fn catalogue_named(name: &str) -> Option<usize> {
+    let name = name.trim().to_ascii_lowercase();
+    if ["noshear", "ns", "00"].contains(&name.as_str()) {
+        return Some(0);
+    }
+    let mut sheared = SHEARED_CATALOGUES.iter();
+    sheared.position(|(known, _)| *known == name).map(|k| k + 1)
+}
+
+/// Whether a column of shearq's catalogues was measured on the galaxies.
+fn is_measured(name: &str) -> bool {
+    let known = Observables::COLUMNS.contains(&name) || READ.contains(&name);
+    (known || name == "snr" || name == "radius") && name != "flags"
+}
+
+/// Refuses to choose galaxies by columns of one sheared catalogue, or by measured ones without sheared columns.
+fn check_chosen<'a>(
+    path: &Path,
+    chosen_by: impl Iterator<Item = &'a str>,
+    has_sheared: impl Fn(&str) -> bool,
+) -> Result<(), FileError> {
+    for name in chosen_by {
+        if let Some(base) = unsheared_name(name).filter(|base| has_sheared(base)) {
+            return Err(FileError::new(
+                path,
+                format!(
+                    "`{name}` belongs to one sheared catalogue (expected a column of all). Try: {base}"
+                ),
+            ));
+        }
+        if is_measured(name) && !has_sheared(name) {
+            return Err(FileError::new(
+                path,
+                format!(
+                    "galaxies cannot be selected by `{name}`: it changes with shear, and has no columns of sheared catalogues (expected e1, e2, snr, flux or size)"
+                ),
+            ));
+        }
+    }
+    Ok(())
+}
+
+/// Checks that the sheared catalogues of shearq are for a shear of `step`, if the settings are there.
+fn check_step(path: &Path, step: f64) -> Result<(), FileError> {
+    let key = "settings".to_owned();
+    let stated = || {
+        let read = table::read_metadata(path, FileFormat::of(path)?, std::iter::once(&key));
+        let metadata = read.ok()?;
+        let settings: toml::Table = metadata.get(&key)?.parse().ok()?;
+        settings.get("shape")?.get("sheared_step")?.as_float()
+    };
+    match stated() {
+        Some(stated) if stated != step => Err(FileError::new(
+            path,
+            format!(
+                "the sheared catalogues are for another shear (found {stated}, expected {step}). Try: --step {stated}"
+            ),
+        )),
+        _ => Ok(()),
+    }
+}
