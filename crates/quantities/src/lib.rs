@@ -1,6 +1,7 @@
 //! Quantities of weak lensing as types, and the profiles that are made of them.
 //!
 //! * [`Shear`] and [`Distortion`]: the two definitions of ellipticity, which do not mix.
+//! * [`Jacobian`] and [`Frame`]: pixels on the sky, and the axes of ellipticities.
 //! * [`units`]: degrees, radians, pixels and multipoles.
 //! * [`FunctionalPsf`]: a Moffat or Kolmogorov PSF, integrated over pixels, with its transform.
 //! * [`radial`]: tables of radial profiles, elliptical radii and quadrature rules.
@@ -16,6 +17,7 @@
 #![cfg_attr(not(test), forbid(unsafe_code))] // ndarray's slicing in tests allows it
 
 mod ellipticity;
+mod jacobian;
 pub mod linear;
 pub mod product;
 mod psf;
@@ -25,6 +27,7 @@ pub mod statistics;
 pub mod units;
 
 pub use ellipticity::{Distortion, Shear};
+pub use jacobian::{Frame, Jacobian, JacobianError, Orientation, PixelShape, Spin2, UnknownFrame};
 pub use psf::{FunctionalPsf, ProfileError, PsfProfile, PsfTransform, TransformedPsf};
 pub use range::MeasuredRange;
 
