@@ -1,6 +1,6 @@
 //! What can be wrong with a request.
 
-use shearq_quantities::ProfileError;
+use shearq_quantities::{JacobianError, ProfileError};
 use shearq_submissions::ConfigurationError;
 use thiserror::Error;
 
@@ -66,6 +66,20 @@ pub enum MeasureError {
         rows: usize,
         /// Pixels of the stamp along x.
         columns: usize,
+    },
+    /// A Jacobian that maps no pixel to the sky.
+    #[error(transparent)]
+    Jacobian(#[from] JacobianError),
+    /// Pixels that are sheared more than the method can use.
+    #[error(
+        "pixels are sheared by {shear:.2e} on the sky; expected at most {most}, as the configuration requires. Try: {}",
+        if *most < 0.1 { "a linear configuration, such as 48/linear/star" } else { "resampled images" }
+    )]
+    ShearedPixels {
+        /// |g| of the shear that makes such pixels of squares.
+        shear: f64,
+        /// The largest that the method can use.
+        most: f64,
     },
     /// A PSF profile that does not exist.
     #[error(transparent)]

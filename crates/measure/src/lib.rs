@@ -32,7 +32,9 @@
 //!
 //! # Conventions
 //!
-//! Stamps are indexed `[y, x]`. e1 > 0 is elongation along +x, e2 > 0 along x = y. Noise is a standard deviation per
+//! Stamps are indexed `[y, x]`. e1 > 0 is elongation along +x, e2 > 0 along x = y. With Jacobians
+//! ([`StampSource::jacobians`]) shapes are measured on the sky: e1 > 0 is elongation east–west, e2 > 0 along north-west, and
+//! the target, window and weight of the linear method are round there. Noise is a standard deviation per
 //! pixel in image units. A request that cannot be met is a [`MeasureError`]. A galaxy that cannot be measured has
 //! [`Flags`] and no ellipticity.
 
@@ -80,7 +82,9 @@ pub use session::{
     RowJob, Session, StampRows, StampSource, Threads,
 };
 pub use sheared::{ShearedCatalogues, ShearedGalaxy};
-pub use shearq_quantities::{Distortion, FunctionalPsf, PsfProfile, Shear};
+pub use shearq_quantities::{
+    Distortion, Frame, FunctionalPsf, Jacobian, JacobianError, PsfProfile, Shear,
+};
 pub use shearq_submissions::{Configuration, ConfigurationError, PsfCut};
 pub use sky::Sky;
 pub use warning::{Of, PixelFrame, Warning};

@@ -7,6 +7,7 @@ use std::fmt;
 use std::sync::Arc;
 
 use ndarray::{Array2, ArrayView2, ArrayView3};
+use shearq_quantities::{Jacobian, PixelShape, Spin2};
 use shearq_submissions::{Configuration, ConfigurationError, NoiseSource, Registry};
 
 use crate::deconvolve::convolve;
@@ -19,6 +20,12 @@ use crate::noise::{NoisePlan, StampNoise, Survey};
 use crate::pixel::{self, PEAKS, Pixel, all_finite, highest, is_level};
 use crate::psf::{Psfs, ResidualProfiles, Star, StarSurvey, cut_start};
 use crate::sky::{SkyCells, SkySubtraction};
+
+// The longest spacing of pixels is then 1.22 times that of square ones, and the largest wave number of the sharpest target,
+// 2.2 per pixel, still below the Nyquist frequency. Chosen by hand: cameras are below 0.02.
+const MAX_PIXEL_SHEAR: f64 = 0.2;
+// The network works on pixels, so that a shear of pixels becomes an error of shears. Chosen by hand: a tenth of its own errors.
+const MAX_NETWORK_PIXEL_SHEAR: f64 = 1e-3;
 
 /// The plan of a measurement, for one configuration and one size of stamps. Measuring does not change it, so it serves
 /// all threads. Each thread has a [`Worker`]. Clones share the plan.
@@ -130,6 +137,7 @@ impl Measurer {
             missing: MissingPixels::new(n),
             cells: SkyCells::new(plan.full),
             subtraction: SkySubtraction::Nothing,
+            to_sky: None,
         }
     }
 
@@ -216,6 +224,8 @@ pub struct Worker {
     missing: MissingPixels,
     cells: SkyCells,
     subtraction: SkySubtraction,
+    /// What turns ellipticities to the frame of the sky, if they are measured there.
+    to_sky: Option<Spin2>,
 }
 
 /// A worker for the galaxies of one image.
@@ -270,6 +280,8 @@ impl Worker {
         let extent = survey.and_then(|survey| survey.mean_square_radius);
         let of_modes = correlated.unwrap_or(&white);
         self.method.set_image(of_modes, extent, stars);
+        self.to_sky = None;
+        self.method.set_pixel_shape(PixelShape::SQUARE);
         ImageWorker {
             worker: self,
             level: noise.level(),
@@ -331,9 +343,12 @@ impl Worker {
         if !PEAKS.contains(&highest(&self.cut)) || (noise.is_finite() && !is_level(noise)) {
             return Ok(no_scale);
         }
-        let Some(found) = self.method.measure(&self.cut, noise)? else {
+        let Some(mut found) = self.method.measure(&self.cut, noise)? else {
             return Ok(no_scale);
         };
+        if let Some(to_sky) = &self.to_sky {
+            found.turn(to_sky);
+        }
         Ok(found.measurement(plan.configuration.ellipticity(), noise))
     }
 
@@ -368,6 +383,32 @@ impl ImageWorker<'_> {
         })
     }
 
+    /// Sets the Jacobian of the galaxies and PSFs that follow, which are measured in the frame of the sky; with `None`, as
+    /// for a new image, in the frame of the pixels.
+    ///
+    /// # Errors
+    /// If pixels are sheared more than the method can use.
+    pub fn set_jacobian(&mut self, jacobian: Option<&Jacobian>) -> Result<(), MeasureError> {
+        let (to_sky, shape) = match jacobian {
+            Some(jacobian) => {
+                let (orientation, shape) = jacobian.factors();
+                (Some(orientation.spin2()), shape)
+            }
+            None => (None, PixelShape::SQUARE),
+        };
+        let most = match self.configuration().linear() {
+            Some(_) => MAX_PIXEL_SHEAR,
+            None => MAX_NETWORK_PIXEL_SHEAR,
+        };
+        let shear = shape.shear();
+        if shear > most {
+            return Err(MeasureError::ShearedPixels { shear, most });
+        }
+        self.worker.to_sky = to_sky;
+        self.worker.method.set_pixel_shape(shape);
+        Ok(())
+    }
+
     /// Measures stamps, one per galaxy along the first axis, without calibration, in the noise of the image.
     ///
     /// # Errors
@@ -378,40 +419,54 @@ impl ImageWorker<'_> {
         stamps: ArrayView3<'_, T>,
         psfs: &Psfs<'_>,
     ) -> Result<Vec<Measurement>, MeasureError> {
-        self.measure_in_noise(stamps, psfs, None)
+        self.measure_in_noise(stamps, psfs, None, None)
     }
 
-    /// The same for white noise with one level per stamp, if there are any.
+    /// The same for white noise with one level per stamp, and with one Jacobian per stamp, if there are any.
     pub(crate) fn measure_in_noise<T: Pixel>(
         &mut self,
         stamps: ArrayView3<'_, T>,
         psfs: &Psfs<'_>,
         levels: Option<&[f64]>,
+        jacobians: Option<&[Jacobian]>,
     ) -> Result<Vec<Measurement>, MeasureError> {
         let cut = self.configuration().psf_cut();
         let (count, full, _) = stamps.dim();
         let given = psfs.count();
-        match given {
-            Some(given) if given != count => {
-                return Err(MeasureError::Shape {
-                    what: "PSFs",
-                    found: format!("{given} galaxies"),
-                    expected: format!("{count}, one each"),
-                });
-            }
-            Some(_) => {}
-            None => self
-                .worker
-                .method
-                .set_psf(psfs.at(0, cut, full)?.psf.view())?,
+        if let Some(given) = given.filter(|given| *given != count) {
+            return Err(MeasureError::Shape {
+                what: "PSFs",
+                found: format!("{given} galaxies"),
+                expected: format!("{count}, one each"),
+            });
         }
+        let shared = match given {
+            Some(_) => None,
+            None => Some(psfs.at(0, cut, full)?.psf),
+        };
+        let mut last = None;
         let stamps = stamps.outer_iter().enumerate();
         let measured = stamps.map(|(k, stamp)| {
-            let mut set = || {
-                let psf = psfs.at(k, cut, full)?;
-                self.worker.method.set_psf(psf.psf.view())
+            let jacobian = jacobians.map(|each| &each[k]);
+            // Of a PSF for all galaxies, the transform depends on the Jacobian.
+            let new = last != Some(jacobian);
+            if new {
+                self.set_jacobian(jacobian)?;
+                last = Some(jacobian);
+            }
+            let usable_psf = match &shared {
+                Some(psf) => {
+                    if new {
+                        self.worker.method.set_psf(psf.view())?;
+                    }
+                    true
+                }
+                None => {
+                    let psf = psfs.at(k, cut, full);
+                    psf.and_then(|psf| self.worker.method.set_psf(psf.psf.view()))
+                        .is_ok()
+                }
             };
-            let usable_psf = given.is_none() || set().is_ok();
             let level = levels.map_or(self.level, |levels| levels[k]);
             self.worker.measure(stamp, level, usable_psf)
         });

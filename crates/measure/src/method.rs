@@ -6,7 +6,7 @@ mod network;
 use std::sync::Arc;
 
 use ndarray::{Array2, ArrayView2};
-use shearq_quantities::{Distortion, Shear};
+use shearq_quantities::{Distortion, PixelShape, Shear, Spin2};
 use shearq_submissions::{Configuration, EllipticityType, Method};
 
 use self::linear::LinearFamily;
@@ -59,6 +59,10 @@ pub(crate) trait CutWorker: Send {
         _stars: Option<&Arc<ResidualProfiles>>,
     ) {
     }
+
+    /// Sets the shape of the pixels of galaxies and PSFs that follow; a PSF is set after it. Results are in the coordinates
+    /// of [`PixelShape::map`]. A method that ignores it measures in pixels.
+    fn set_pixel_shape(&mut self, _shape: PixelShape) {}
 
     fn set_psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<(), MeasureError>;
 
@@ -157,6 +161,35 @@ fn image(values: &[f32], n: usize) -> Array2<f64> {
 }
 
 impl Found {
+    /// Turns everything that refers to components of shear. It comes before ellipticities of type ε and sums over
+    /// components, which are not linear in them or keep only some.
+    pub(crate) fn turn(&mut self, by: &Spin2) {
+        if let Ok(chi) = &mut self.distortion {
+            *chi = turned(by, *chi);
+        }
+        if let Some(response) = &mut self.response {
+            *response = by.turn_response(*response);
+        }
+        if let Some(field) = &mut self.noise_field {
+            for (chi, response) in &mut field.sides {
+                (*chi, *response) = (turned(by, *chi), by.turn_response(*response));
+            }
+            for change in &mut field.turned {
+                *change = by.turn(*change);
+            }
+            for [first, second, _] in &mut field.square {
+                [*first, *second] = by.turn([*first, *second]);
+            }
+        }
+        if let Some(found) = &mut self.observables {
+            found.flux_response = by.turn(found.flux_response);
+            found.square_response = by.turn(found.square_response);
+            if let Some(products) = &mut found.products {
+                turn_products(by, products);
+            }
+        }
+    }
+
     /// The measurement with an ellipticity of type `kind`, before calibration.
     pub(crate) fn measurement(&self, kind: EllipticityType, noise: f64) -> Measurement {
         let measured = Measurement {
@@ -333,6 +366,28 @@ impl Found {
     }
 }
 
+fn turned(by: &Spin2, Distortion { e1, e2 }: Distortion) -> Distortion {
+    let [e1, e2] = by.turn([e1, e2]);
+    Distortion::new(e1, e2)
+}
+
+/// Turns products of the changes of χ₁, χ₂, T and the flux: both components of χ, and both components of the shear that
+/// changes the noise.
+fn turn_products(by: &Spin2, products: &mut [[f64; 4]; 10]) {
+    for [first, second, ..] in products.iter_mut() {
+        [*first, *second] = by.turn([*first, *second]);
+    }
+    for kind in 0..4 {
+        let [chi11, chi12, size1, flux1, chi22, size2, flux2, ..] = products.map(|each| each[kind]);
+        let [[chi11, chi12], [_, chi22]] = by.turn_response([[chi11, chi12], [chi12, chi22]]);
+        let [[size1, size2], [flux1, flux2]] = [by.turn([size1, size2]), by.turn([flux1, flux2])];
+        let new = [chi11, chi12, size1, flux1, chi22, size2, flux2];
+        for (products, new) in products.iter_mut().zip(new) {
+            products[kind] = new;
+        }
+    }
+}
+
 /// The ellipticity of type `kind`; `None` if the distortion exceeds 1 and has no shear-type ellipticity.
 fn of_type(kind: EllipticityType, chi: Distortion) -> Option<[f64; 2]> {
     match kind {
@@ -357,5 +412,149 @@ fn response_of_type(kind: EllipticityType, chi: Distortion, r: ResponseMatrix) -
                 [0, 1].map(|j| own2 * r[1][j] + other * r[0][j]),
             ]
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use shearq_quantities::Jacobian;
+
+    use super::*;
+    use crate::measurement::Stop;
+
+    /// Numbers without a pattern, small enough for an ellipticity.
+    fn numbers(state: &mut f64) -> f64 {
+        *state = (*state * 78.233).sin();
+        0.3 * *state
+    }
+
+    fn found() -> Found {
+        let mut state = 0.37;
+        let mut next = || numbers(&mut state);
+        let mut pair = || [next(), next()];
+        let mut side = || {
+            let [e1, e2] = pair();
+            (Distortion::new(e1, e2), [pair(), pair()])
+        };
+        let (sides, (distortion, response)) = ([side(), side()], side());
+        let mut three = || [next(), next(), next()];
+        Found {
+            descent: Descent {
+                iterations: 1,
+                stop: Stop::Stable,
+                first_energy: 0.0,
+                energy: 0.0,
+                updated: 0,
+            },
+            distortion: Ok(distortion),
+            response: Some(response),
+            noise_field: Some(NoiseField {
+                sides,
+                turned: [[0.1, -0.05], [0.02, 0.04]],
+                square: [three(), three()],
+                weight: 0.7,
+            }),
+            observables: Some(FoundObservables {
+                flux: 10.0,
+                flux_error: 1.0,
+                flux_response: [0.3, -0.1],
+                square_response: [0.2, 0.5],
+                size: [2.0, 0.4, -0.1],
+                products: Some([[0.0; 4]; 10].map(|products| products.map(|_: f64| next()))),
+                sheared: Some(ShearSettings {
+                    step: 0.02,
+                    normals: [0.0; 4],
+                }),
+            }),
+            flux: 10.0,
+            radius: 1.0,
+            size: 2.0,
+        }
+    }
+
+    #[test]
+    fn turned_galaxies_turn_all_that_refers_to_shear() {
+        // A rotation by 90° changes the signs of spin-2 components and of nothing else; a reflection those of e2 and γ2.
+        let quarter = [[0.0, -1.0], [1.0, 0.0]];
+        let mirror = [[-1.0, 0.0], [0.0, 1.0]];
+        for kind in [EllipticityType::Distortion, EllipticityType::Shear] {
+            let plain = found().measurement(kind, 1.0);
+            for (matrix, signs) in [(quarter, [-1.0, -1.0]), (mirror, [1.0, -1.0])] {
+                let (orientation, _) = Jacobian::new(matrix).unwrap().factors();
+                let mut turned = found();
+                turned.turn(&orientation.spin2());
+                let turned = turned.measurement(kind, 1.0);
+                let expected = expected(&plain, signs);
+                assert_eq!(all(&turned).len(), expected.len());
+                for (at, (found, expected)) in all(&turned).iter().zip(&expected).enumerate() {
+                    assert!((found - expected).abs() < 1e-12, "{at}: {found} {expected}");
+                }
+            }
+            // A rotation by 45°, in two steps, exchanges components: e1 becomes e2, and what γ1 does is done by γ2.
+            let (sin, cos) = (std::f64::consts::PI / 8.0).sin_cos();
+            let (orientation, _) = Jacobian::new([[cos, -sin], [sin, cos]]).unwrap().factors();
+            let mut turned = found();
+            turned.turn(&orientation.spin2());
+            turned.turn(&orientation.spin2());
+            let turned = turned.measurement(kind, 1.0);
+            assert!((turned.e2 - plain.e1).abs() < 1e-12 && (turned.e1 + plain.e2).abs() < 1e-12);
+            let [one, two] = [&plain, &turned].map(|galaxy| galaxy.observables.unwrap());
+            let ([first, second], [second_turned, first_turned]) =
+                (one.coupling.shear, two.coupling.shear);
+            for k in 2..5 {
+                assert!((first_turned[k] - first[k]).abs() < 1e-12, "{k}");
+                assert!((second_turned[k] + second[k]).abs() < 1e-12, "{k}");
+            }
+            // Of e1 with γ1 and e2 with γ2, both signs change or none.
+            for k in 0..2 {
+                assert!((first_turned[k] - first[k]).abs() < 1e-12, "{k}");
+                assert!((second_turned[k] - second[k]).abs() < 1e-12, "{k}");
+            }
+        }
+    }
+
+    fn all(galaxy: &Measurement) -> Vec<f64> {
+        let [[r11, r12], [r21, r22]] = galaxy.response.unwrap();
+        let mut all = vec![galaxy.e1, galaxy.e2, r11, r12, r21, r22];
+        all.extend(galaxy.observables.unwrap().to_array());
+        for sheared in galaxy.sheared.unwrap().each {
+            all.extend([sheared.e1, sheared.e2, sheared.flux, sheared.size]);
+        }
+        all
+    }
+
+    /// The galaxy with other signs of spin-2 components.
+    fn expected(plain: &Measurement, [one, two]: [f64; 2]) -> Vec<f64> {
+        let mut galaxy = *plain;
+        (galaxy.e1, galaxy.e2) = (one * galaxy.e1, two * galaxy.e2);
+        let [[_, r12], [r21, _]] = galaxy.response.as_mut().unwrap();
+        (*r12, *r21) = (one * two * *r12, one * two * *r21);
+        let observables = galaxy.observables.as_mut().unwrap();
+        for response in [
+            &mut observables.flux_response,
+            &mut observables.size_response,
+        ] {
+            *response = [one * response[0], two * response[1]];
+        }
+        let Coupling { shear, turned } = &mut observables.coupling;
+        for (row, sign) in shear.iter_mut().zip([one, two]) {
+            row[2..].iter_mut().for_each(|value| *value *= sign);
+        }
+        for (value, sign) in turned.iter_mut().zip([one, one, two, two]) {
+            *value *= sign;
+        }
+        let sheared = galaxy.sheared.as_mut().unwrap();
+        // Catalogues noshear, 1p, 1m, 2p, 2m: a negative sign exchanges p and m.
+        let each = &mut sheared.each;
+        if one < 0.0 {
+            each.swap(1, 2);
+        }
+        if two < 0.0 {
+            each.swap(3, 4);
+        }
+        for sheared in each {
+            (sheared.e1, sheared.e2) = (one * sheared.e1, two * sheared.e2);
+        }
+        all(&galaxy)
     }
 }

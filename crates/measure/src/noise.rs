@@ -19,6 +19,7 @@ use std::sync::Arc;
 
 use multiversion::multiversion;
 use ndarray::{Array2, ArrayView2};
+use shearq_quantities::PixelShape;
 use shearq_quantities::linear::{Pivots, eliminate, substitute};
 use shearq_quantities::statistics::{SCATTER, median};
 use shearq_submissions::SkySource;
@@ -145,6 +146,11 @@ impl StampNoise {
         self.correlation[(dy * (2 * max_lag + 1) + dx + max_lag) as usize]
     }
 
+    /// Whether all wave vectors have the same power.
+    pub(crate) fn is_white(&self) -> bool {
+        self.max_lag == 0
+    }
+
     /// Whether pixels are correlated more than by chance: χ² exceeds its mean by five of its standard deviations.
     pub fn is_correlated(&self) -> bool {
         let (chi2, freedom) = self.chi2;
@@ -152,8 +158,9 @@ impl StampNoise {
     }
 
     /// Power at wave vector (kx, ky), in radians per pixel, in units of that of white noise of the same level, and its
-    /// derivatives (k_x ∂_x − k_y ∂_y) and (k_y ∂_x + k_x ∂_y), by which a shear of the image changes it.
-    pub(crate) fn power(&self, [kx, ky]: [f64; 2]) -> (f64, [f64; 2]) {
+    /// derivatives (k_x ∂_x − k_y ∂_y) and (k_y ∂_x + k_x ∂_y), by which a shear of the image changes it. With pixels that are
+    /// not square, in the coordinates of [`PixelShape::map`].
+    pub(crate) fn power(&self, [kx, ky]: [f64; 2], pixels: PixelShape) -> (f64, [f64; 2]) {
         let max_lag = self.max_lag as i32;
         let (mut power, mut slopes) = (1.0, [0.0; 2]);
         for dy in 0..=max_lag {
@@ -161,7 +168,7 @@ impl StampNoise {
                 if dy == 0 && dx <= 0 {
                     continue;
                 }
-                let (x, y) = (f64::from(dx), f64::from(dy));
+                let [x, y] = pixels.map([f64::from(dx), f64::from(dy)]);
                 let twice = 2.0 * self.correlation(dx, dy);
                 let (sin, cos) = (kx * x + ky * y).sin_cos();
                 power += twice * cos;

@@ -5,13 +5,14 @@
 //! [`MeasuredImage`], which calibrates them and checks the image. Files, simulations, [`Measurer::batch`] and Python all
 //! use it: while each of them had its own way, they differed in what they noise_plan and reported.
 
+use std::borrow::Cow;
 use std::fmt;
 use std::ops::{ControlFlow, Deref, Range};
 use std::sync::{Arc, LazyLock};
 
 use ndarray::{ArrayView3, Axis, Ix3, Slice};
-use shearq_quantities::columns_of;
 use shearq_quantities::statistics::upper_median;
+use shearq_quantities::{Frame, Jacobian, columns_of};
 use shearq_submissions::{Configuration, NoiseSource};
 
 use crate::calibration::calibrate;
@@ -92,6 +93,16 @@ pub trait StampSource<'a> {
     /// # Errors
     /// If they cannot be read.
     fn psfs(&mut self, row: usize) -> Result<Lazy<'a, Psfs<'a>>, Self::Error>;
+
+    /// The Jacobians of a row's stamps, one per galaxy, with which shapes are measured in the frame of the sky; `None`
+    /// if they are measured in the frame of the pixels. It is the same for all rows of an image. PSFs are on the pixels of
+    /// their stamps.
+    ///
+    /// # Errors
+    /// If they cannot be determined.
+    fn jacobians(&mut self, _row: usize) -> Result<Option<Vec<Jacobian>>, Self::Error> {
+        Ok(None)
+    }
 }
 
 /// A value that is made by the first thread that needs it: threads share the drawing of simulated galaxies, although one
@@ -156,6 +167,8 @@ pub struct ArraySource<'a, E = MeasureError> {
     stamps: Slices<'a, Pixels<'a, Ix3>, E>,
     psfs: Slices<'a, Psfs<'a>, E>,
     moved: Option<[f64; 2]>,
+    /// One for all stamps or one per stamp.
+    jacobians: Option<Cow<'a, [Jacobian]>>,
 }
 
 impl<E> fmt::Debug for ArraySource<'_, E> {
@@ -215,7 +228,24 @@ impl<'a, E> ArraySource<'a, E> {
             stamps: Box::new(stamps),
             psfs: Box::new(psfs),
             moved,
+            jacobians: None,
         }
+    }
+
+    /// The same stamps in the frame of the sky, with one Jacobian for all or one per stamp.
+    ///
+    /// # Errors
+    /// If there are another number of them.
+    pub fn with_jacobians(
+        mut self,
+        jacobians: impl Into<Cow<'a, [Jacobian]>>,
+    ) -> Result<Self, MeasureError> {
+        let jacobians = jacobians.into();
+        if jacobians.len() != 1 {
+            length("Jacobians", jacobians.len(), self.count)?;
+        }
+        self.jacobians = Some(jacobians);
+        Ok(self)
     }
 }
 
@@ -242,6 +272,14 @@ impl<'a, E: From<MeasureError> + Send> StampSource<'a> for ArraySource<'a, E> {
         let range = self.rows().stamps(row);
         Ok((self.psfs)(range)?.into())
     }
+
+    fn jacobians(&mut self, row: usize) -> Result<Option<Vec<Jacobian>>, E> {
+        let range = self.rows().stamps(row);
+        Ok(self.jacobians.as_deref().map(|all| match all {
+            [one] => vec![*one; range.len()],
+            each => each[range].to_vec(),
+        }))
+    }
 }
 
 /// One image between its survey and its last row. Threads share it.
@@ -249,6 +287,7 @@ impl<'a, E: From<MeasureError> + Send> StampSource<'a> for ArraySource<'a, E> {
 pub struct Session<'n> {
     measurer: Measurer,
     rows: StampRows,
+    frame: Frame,
     noise: KnownNoise<'n>,
     survey: Option<Arc<Survey>>,
     stars: Option<Arc<ResidualProfiles>>,
@@ -265,6 +304,7 @@ pub struct RowJob<'n> {
     row: usize,
     stamps: LazyStamps<'n>,
     psfs: Lazy<'n, Psfs<'n>>,
+    jacobians: Option<Vec<Jacobian>>,
 }
 
 /// The galaxies of a row before calibration.
@@ -305,6 +345,9 @@ pub struct Batch {
     /// Standard deviations of m and c of the image by the noise of the star that all of its galaxies share. `None` if
     /// each galaxy has its own PSF, the configuration is not linear, or the effect is negligible.
     pub psf_noise: Option<[f64; 2]>,
+    /// The frame of ellipticities and of everything that refers to components of shear. Lengths are in pixels; in the frame
+    /// of the sky, in sides of a square of a pixel's area.
+    pub frame: Frame,
 }
 
 impl Batch {
@@ -350,9 +393,14 @@ impl<'n> Session<'n> {
         let of_settings = Warning::of_settings(measurer.configuration());
         let warnings = of_settings.into_iter().chain(source.warnings()).collect();
         let stars = survey_stars(measurer, source, &examined, threads)?;
+        let frame = match rows.count {
+            0 => Frame::Pixel,
+            _ => source.jacobians(0)?.map_or(Frame::Pixel, |_| Frame::Sky),
+        };
         let mut session = Session {
             measurer: measurer.clone(),
             rows,
+            frame,
             noise,
             survey: None,
             stars,
@@ -391,6 +439,11 @@ impl<'n> Session<'n> {
     /// The rows of the image.
     pub fn rows(&self) -> StampRows {
         self.rows
+    }
+
+    /// The frame in which the shapes of this image are measured.
+    pub fn frame(&self) -> Frame {
+        self.frame
     }
 
     /// Prepares a worker for galaxies of this image.
@@ -454,23 +507,25 @@ impl<'n> Session<'n> {
             row,
             stamps: source.stamps(row)?,
             psfs: source.psfs(row)?,
+            jacobians: source.jacobians(row)?,
         })
     }
 
-    /// Measures the stamps of a row, before calibration.
+    /// Measures the stamps of a row, before calibration, with one Jacobian per stamp in the frame of the sky.
     ///
     /// # Errors
-    /// If sizes do not fit, or a PSF for all galaxies cannot be used.
+    /// If sizes or the frame do not fit, pixels are sheared too much, or a PSF for all galaxies cannot be used.
     pub fn measure(
         &self,
         worker: &mut Worker,
         row: usize,
         stamps: &Pixels<'_, Ix3>,
         psfs: &Psfs<'_>,
+        jacobians: Option<&[Jacobian]>,
     ) -> Result<MeasuredRow, MeasureError> {
         match stamps {
-            Pixels::Single(stamps) => self.measure_row(worker, row, stamps.view(), psfs),
-            Pixels::Double(stamps) => self.measure_row(worker, row, stamps.view(), psfs),
+            Pixels::Single(stamps) => self.measure_row(worker, row, stamps.view(), psfs, jacobians),
+            Pixels::Double(stamps) => self.measure_row(worker, row, stamps.view(), psfs, jacobians),
         }
     }
 
@@ -490,6 +545,8 @@ impl<'n> Session<'n> {
         let psf = psfs.at(k, cut, self.measurer.full())?.psf;
         let mut worker = self.measurer.worker();
         let mut image = self.image(&mut worker);
+        let jacobians = source.jacobians(row)?;
+        image.set_jacobian(jacobians.as_ref().and_then(|each| each.get(k)))?;
         let mut worker = image.psf(psf.view())?;
         Ok(match &*stamps {
             Pixels::Single(stamps) => {
@@ -507,13 +564,26 @@ impl<'n> Session<'n> {
         row: usize,
         stamps: ArrayView3<'_, T>,
         psfs: &Psfs<'_>,
+        jacobians: Option<&[Jacobian]>,
     ) -> Result<MeasuredRow, MeasureError> {
-        length("a row", stamps.len_of(Axis(0)), self.rows.stamps(row).len())?;
+        let count = self.rows.stamps(row).len();
+        length("a row", stamps.len_of(Axis(0)), count)?;
+        // Results of two frames must not become one image.
+        let on_sky = match self.frame {
+            Frame::Pixel => 0,
+            Frame::Sky => count,
+        };
+        length(
+            "Jacobians of a row",
+            jacobians.map_or(0, <[_]>::len),
+            on_sky,
+        )?;
         let levels = match self.noise {
             KnownNoise::GivenEach(levels) => Some(&levels[self.rows.stamps(row)]),
             KnownNoise::Unknown | KnownNoise::Stated(_) | KnownNoise::Given(_) => None,
         };
-        let galaxies = self.image(worker).measure_in_noise(stamps, psfs, levels)?;
+        let mut image = self.image(worker);
+        let galaxies = image.measure_in_noise(stamps, psfs, levels, jacobians)?;
         let examined = match self.examined.contains(&row) {
             true => Some(self.examine(row, stamps, psfs)?),
             false => None,
@@ -591,8 +661,9 @@ impl<'n> RowJob<'n> {
     /// # Errors
     /// As [`Session::measure`].
     pub fn measure(&self, worker: &mut Worker) -> Result<MeasuredRow, MeasureError> {
+        let jacobians = self.jacobians.as_deref();
         self.session
-            .measure(worker, self.row, &self.stamps, &self.psfs)
+            .measure(worker, self.row, &self.stamps, &self.psfs, jacobians)
     }
 
     /// The image of the row.
@@ -670,6 +741,7 @@ impl MeasuredImage<'_> {
             response,
             warnings,
             psf_noise,
+            frame: session.frame,
         }
     }
 }

@@ -11,10 +11,19 @@
 //! Places are measured from the middle of the image. Sums and differences of opposite pixels are even and odd about it, so that
 //! each of the four sums runs over a quarter of the pixels.
 //!
+//! Pixels that are not square on the sky lie on a skewed lattice, T(x, y) = (a x + b y, y/a). Modes stay where they are, and
+//!
+//! ```text
+//! Σ I exp(−i k·T(x, y)) = Σ_y exp(−i k_y y/a) [exp(−i k_x b y) Σ_x I exp(−i k_x a x)],
+//! ```
+//!
+//! so that the sums along the axes have other tables, and a phase for each row and k_x is between them.
+//!
 //! Each sum along an axis is a dense product. Both methods keep 16 to 48 modes along an axis; a transform of 23 px to 31 modes
 //! and back takes 0.9 µs so, and 5.4 µs with rustfft (`docs/speed.md`).
 
 use multiversion::multiversion;
+use shearq_quantities::PixelShape;
 use shearq_quantities::product::{LANES, Matrix, ROWS, multiply};
 
 /// Pixels that are folded side by side.
@@ -416,6 +425,66 @@ pub(crate) struct ToModes {
     across: [Vec<f32>; 2],
     /// By mode and place along y: cos and s, and with moments y·cos and y·s.
     down: Vec<Vec<f32>>,
+    /// What is between the sums if pixels are not square.
+    skew: Option<Box<Skew>>,
+}
+
+/// The phases k_x b y of a skewed lattice of pixels.
+#[derive(Debug, Clone)]
+struct Skew {
+    shape: PixelShape,
+    /// cos and sin by place along y and mode along x.
+    phases: [Vec<f32>; 2],
+    /// Waves on their way through a table, and their steps.
+    waves: Waves,
+}
+
+/// Numbers exp(iφ) that advance by steps, side by side.
+#[derive(Debug, Clone)]
+struct Waves {
+    at: [Vec<f64>; 2],
+    step: [Vec<f64>; 2],
+}
+
+impl Waves {
+    fn new(most: usize) -> Self {
+        let zeros = || [vec![0.0; most], vec![0.0; most]];
+        Waves {
+            at: zeros(),
+            step: zeros(),
+        }
+    }
+
+    // Starts `count` waves, of which number j is at j·`first` and advances by j·`step`; for `halves`, at (j + ½)·`first` and by
+    // (j + ½)·`step`.
+    fn start(&mut self, count: usize, halves: bool, first: f64, step: f64) {
+        for (out, angle) in [(&mut self.at, first), (&mut self.step, step)] {
+            let (by_im, by_re) = angle.sin_cos();
+            // In double precision a recurrence loses nothing that single precision shows.
+            let (mut im, mut re) = if halves {
+                (0.5 * angle).sin_cos()
+            } else {
+                (0.0, 1.0)
+            };
+            let [out_re, out_im] = out;
+            for (out_re, out_im) in out_re[..count].iter_mut().zip(&mut out_im[..count]) {
+                (*out_re, *out_im) = (re, im);
+                (re, im) = (re * by_re - im * by_im, re * by_im + im * by_re);
+            }
+        }
+    }
+}
+
+// Writes cos and −sin of waves, in single precision, and advances the waves.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn take_waves(waves: &mut Waves, cos: &mut [f32], s: &mut [f32]) {
+    let [re, im] = &mut waves.at;
+    let [by_re, by_im] = &waves.step;
+    let at = re.iter_mut().zip(im).zip(by_re.iter().zip(by_im));
+    for (((re, im), (by_re, by_im)), (cos, s)) in at.zip(cos.iter_mut().zip(s)) {
+        (*cos, *s) = (*re as f32, -*im as f32);
+        (*re, *im) = (*re * by_re - *im * by_im, *re * by_im + *im * by_re);
+    }
 }
 
 /// Buffers for one thread. Their content between calls does not matter, but for the zeros that fill up `folded`.
@@ -464,6 +533,72 @@ impl ToModes {
             columns,
             across,
             down,
+            skew: None,
+        }
+    }
+
+    /// Takes the tables for pixels of this shape. Nothing is allocated after the first time.
+    pub(crate) fn set_pixel_shape(&mut self, plane: &Plane, shape: PixelShape) {
+        let (folding, width, columns) = (self.folding, self.width, self.columns);
+        let Folding { half, stride, .. } = folding;
+        let modes = plane.modes + 1;
+        let Skew {
+            shape: of,
+            phases,
+            waves,
+        } = &mut **self.skew.get_or_insert_with(|| {
+            let phases = || vec![0.0; half * width];
+            Box::new(Skew {
+                shape,
+                phases: [phases(), phases()],
+                waves: Waves::new(half.max(modes)),
+            })
+        });
+        *of = shape;
+        let (unit, offset) = (plane.wave(1), folding.distance(0));
+        let PixelShape { stretch, skew } = shape;
+        // Waves are the modes, which advance from place to place.
+        waves.start(modes, false, unit * stretch * offset, unit * stretch);
+        let [even, odd] = &mut self.across;
+        let rows = even
+            .chunks_exact_mut(columns)
+            .zip(odd.chunks_exact_mut(columns));
+        for (place, (even, odd)) in rows.enumerate() {
+            take_waves(waves, &mut even[..modes], &mut odd[..modes]);
+            if columns > width {
+                let x = (stretch * folding.distance(place)) as f32;
+                for k in 0..modes {
+                    (even[width + k], odd[width + k]) = (x * odd[k], x * even[k]);
+                }
+            }
+            let share = folding.share(place) as f32;
+            even[..modes].iter_mut().for_each(|value| *value *= share);
+        }
+        waves.start(modes, false, unit * skew * offset, unit * skew);
+        let [cos, sin] = phases;
+        for (cos, sin) in cos.chunks_exact_mut(width).zip(sin.chunks_exact_mut(width)) {
+            take_waves(waves, &mut cos[..modes], &mut sin[..modes]);
+            sin.iter_mut().for_each(|sin| *sin = -*sin);
+        }
+        // Waves are the places, which advance from mode to mode.
+        waves.start(half, offset > 0.0, 0.0, unit / stretch);
+        let mut tables = self.down.iter_mut();
+        let mut rows = || tables.next().map(|table| table.chunks_exact_mut(stride));
+        let (Some(cos), Some(s)) = (rows(), rows()) else {
+            return;
+        };
+        let (mut y_cos, mut y_s) = (rows(), rows());
+        let middle = folding.share(0) as f32;
+        for (cos, s) in cos.zip(s).take(modes) {
+            take_waves(waves, &mut cos[..half], &mut s[..half]);
+            let moments = y_cos.as_mut().zip(y_s.as_mut());
+            if let Some((y_cos, y_s)) = moments.and_then(|(cos, s)| cos.next().zip(s.next())) {
+                for place in 0..half {
+                    let y = (folding.distance(place) / stretch) as f32;
+                    (y_cos[place], y_s[place]) = (y * cos[place], y * s[place]);
+                }
+            }
+            cos[0] *= middle;
         }
     }
 
@@ -489,13 +624,15 @@ impl ToModes {
         let TransformScratch { folded, lines } = scratch;
         fold(&self.folding, image, folded);
         self.across(folded, lines);
+        self.turn(lines);
         for (at, quarter) in out.quarters_mut().into_iter().enumerate() {
             let (x, y) = (at / 2, at % 2);
             self.down(y, [x, y, 0], lines, quarter);
         }
     }
 
-    /// The transforms of a row-major image, and of it times x and y from its middle.
+    /// The transforms of a row-major image, and of it times x and y from its middle, in the coordinates of
+    /// [`PixelShape::map`].
     pub(crate) fn transform_moments(
         &self,
         image: &[f32],
@@ -513,6 +650,35 @@ impl ToModes {
             let (x, y) = (at / 2, at % 2);
             self.down(y, [1 - x, y, 1], &scratch.lines, times_x);
             self.down(2 + y, [x, 1 - y, 0], &scratch.lines, times_y);
+            if let Some(skew) = &self.skew {
+                // Beyond the stretched x, a row is shifted by its skew.
+                let PixelShape { stretch, skew } = skew.shape;
+                add_scaled(times_y, (stretch * skew) as f32, times_x);
+            }
+        }
+    }
+
+    // Multiplies lines of sums along x by exp(−i k_x b y), if pixels are not square.
+    fn turn(&self, lines: &mut [f32]) {
+        let Some(skew) = &self.skew else { return };
+        let (width, columns) = (self.width, self.columns);
+        let [cos, sin] = &skew.phases;
+        let [even, even_odd, odd_even, odd] = four_parts(lines);
+        let mut parts = [even, even_odd, odd_even, odd].map(|part| part.chunks_exact_mut(columns));
+        for (cos, sin) in cos.chunks_exact(width).zip(sin.chunks_exact(width)) {
+            let [Some(ee), Some(eo), Some(oe), Some(oo)] = parts.each_mut().map(Iterator::next)
+            else {
+                return;
+            };
+            // Sums of pixels at opposite x are the real part C, differences the imaginary part S; even and odd along y
+            // C(±y) = ½(C_e ± C_o). A phase at opposite y is conjugate, so that it mixes C_e with S_o and C_o with S_e. Times x,
+            // sums are the imaginary part.
+            let ((ee, x_ee), (eo, x_eo)) = (ee.split_at_mut(width), eo.split_at_mut(width));
+            let ((oe, x_oe), (oo, x_oo)) = (oe.split_at_mut(width), oo.split_at_mut(width));
+            turn_pair(ee, oo, cos, sin);
+            turn_pair(eo, oe, cos, sin);
+            turn_pair(x_oe, x_eo, cos, sin);
+            turn_pair(x_oo, x_ee, cos, sin);
         }
     }
 
@@ -544,6 +710,39 @@ impl ToModes {
         multiply(table, lines, half, out, self.width);
     }
 
+    /// The transform of two edges of the stamp along y, whose values are `first` at x = −n/2 and `last` at x = n/2. `cos` and
+    /// `sin` are of the phase of each mode along x at the first edge.
+    pub(crate) fn transform_sides(
+        &self,
+        [first, last]: [&[f32]; 2],
+        [cos, sin]: [&[f32]; 2],
+        scratch: &mut TransformScratch,
+        out: &mut Spectrum,
+    ) {
+        let Folding { n, half, .. } = self.folding;
+        let (width, columns) = (self.width, self.columns);
+        let [ee, eo, oe, oo] = four_parts(&mut scratch.lines);
+        for place in 0..half {
+            let (upper, lower) = (n / 2 + place, half - 1 - place);
+            let folded = |side: &[f32]| [side[upper] + side[lower], side[upper] - side[lower]];
+            let ([first_even, first_odd], [last_even, last_odd]) = (folded(first), folded(last));
+            let row = place * columns..place * columns + width;
+            // a·exp(iφ) + b·exp(−iφ) = (a + b) cos φ + i(a − b) sin φ.
+            let waves = cos.iter().zip(sin);
+            let parts = ee[row.clone()].iter_mut().zip(&mut eo[row.clone()]);
+            let parts = parts.zip(oe[row.clone()].iter_mut().zip(&mut oo[row]));
+            for (((ee, eo), (oe, oo)), (cos, sin)) in parts.zip(waves) {
+                (*ee, *eo) = ((first_even + last_even) * cos, (first_odd + last_odd) * cos);
+                (*oe, *oo) = ((first_even - last_even) * sin, (first_odd - last_odd) * sin);
+            }
+        }
+        self.turn(&mut scratch.lines);
+        for (at, quarter) in out.quarters_mut().into_iter().enumerate() {
+            let (x, y) = (at / 2, at % 2);
+            self.down(y, [x, y, 0], &scratch.lines, quarter);
+        }
+    }
+
     /// Transforms of [`ROWS`] lines of n real numbers: real and imaginary parts, in rows of the plane's width.
     pub(crate) fn transform_lines(
         &self,
@@ -572,6 +771,22 @@ impl ToModes {
             );
             multiply(folded, table, half, out, self.width);
         }
+    }
+}
+
+// Replaces a real part a and an imaginary part b, of opposite parity along y, by those of them times exp(−iφ).
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn turn_pair(a: &mut [f32], b: &mut [f32], cos: &[f32], sin: &[f32]) {
+    let pairs = a.iter_mut().zip(b);
+    for ((a, b), (cos, sin)) in pairs.zip(cos.iter().zip(sin)) {
+        (*a, *b) = (cos * *a + sin * *b, cos * *b - sin * *a);
+    }
+}
+
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn add_scaled(values: &[f32], factor: f32, out: &mut [f32]) {
+    for (out, value) in out.iter_mut().zip(values) {
+        *out += factor * value;
     }
 }
 
@@ -869,45 +1084,59 @@ mod tests {
         }
     }
 
+    /// Compares an image's transform, and those of it times places, with plain sums over pixels. Returns the first.
+    fn compare_with_sums(
+        to_modes: &ToModes,
+        plane: &Plane,
+        image: &[f32],
+        shape: PixelShape,
+    ) -> Spectrum {
+        let n = to_modes.side();
+        let middle = (n as f64 - 1.0) / 2.0;
+        let mut scratch = to_modes.scratch();
+        scratch.lines.fill(f32::NAN);
+        let mut spectra = [(); 3].map(|()| plane.spectrum());
+        to_modes.transform_moments(image, &mut scratch, &mut spectra);
+        for (moment, spectrum) in spectra.iter().enumerate() {
+            let mut modes = plane.mode_by_mode();
+            modes.take_spectrum(spectrum);
+            let pixels: Vec<[f64; 3]> = (0..n * n)
+                .map(|at| {
+                    let place = shape.map([at % n, at / n].map(|x| x as f64 - middle));
+                    let factor = [1.0, place[0], place[1]][moment];
+                    [place[0], place[1], factor * f64::from(image[at])]
+                })
+                .collect();
+            let size: f64 = pixels.iter().map(|[.., v]| v.abs()).sum();
+            // A part of the modes, for time.
+            for (at, [kx, ky]) in kept(plane).step_by(7) {
+                let terms = pixels.iter();
+                let terms = terms.map(|[x, y, v]| Complex64::from_polar(*v, -(kx * x + ky * y)));
+                let plain: Complex64 = terms.sum();
+                let found = Complex64::new(f64::from(modes.re[at]), f64::from(modes.im[at]));
+                // Two sums of a few tens of terms, and waves in single precision.
+                assert!(
+                    (found - plain).norm() <= 2e-6 * size,
+                    "{n} {plane:?} {shape:?} {at}: {found} {plain}"
+                );
+            }
+        }
+        let [first, ..] = spectra;
+        first
+    }
+
     #[test]
     fn modes_are_plain_sums_and_give_the_image_back() {
         let mut rng = ChaCha8Rng::seed_from_u64(4);
         for n in [1, 2, 3, 8, 16, 23, 33, 48] {
             let image = numbers(&mut rng, n * n);
-            let middle = (n as f64 - 1.0) / 2.0;
             for (which, plane) in planes(n).into_iter().enumerate() {
                 let to_modes = ToModes::new(n, &plane, true);
-                let mut scratch = to_modes.scratch();
-                scratch.lines.fill(f32::NAN);
-                let mut spectra = [(); 3].map(|()| plane.spectrum());
-                to_modes.transform_moments(&image, &mut scratch, &mut spectra);
-                for (moment, spectrum) in spectra.iter().enumerate() {
-                    let mut modes = plane.mode_by_mode();
-                    modes.take_spectrum(spectrum);
-                    let pixels: Vec<[f64; 3]> = (0..n * n)
-                        .map(|at| {
-                            let place = [at % n, at / n].map(|x| x as f64 - middle);
-                            let factor = [1.0, place[0], place[1]][moment];
-                            [place[0], place[1], factor * f64::from(image[at])]
-                        })
-                        .collect();
-                    let size: f64 = pixels.iter().map(|[.., v]| v.abs()).sum();
-                    // A part of the modes, for time.
-                    for (at, [kx, ky]) in kept(&plane).step_by(7) {
-                        let terms = pixels.iter();
-                        let terms =
-                            terms.map(|[x, y, v]| Complex64::from_polar(*v, -(kx * x + ky * y)));
-                        let plain: Complex64 = terms.sum();
-                        let found =
-                            Complex64::new(f64::from(modes.re[at]), f64::from(modes.im[at]));
-                        // Two sums of a few tens of terms, and waves in single precision.
-                        assert!((found - plain).norm() <= 2e-6 * size, "{n} {which} {at}");
-                    }
-                }
+                let with = compare_with_sums(&to_modes, &plane, &image, PixelShape::SQUARE);
                 let plain = ToModes::new(n, &plane, false);
                 let mut alone = plane.spectrum();
                 plain.transform(&image, &mut plain.scratch(), &mut alone);
-                assert_eq!(alone.0, spectra[0].0);
+                assert_eq!(alone.0, with.0);
                 if plane.modes < plane.period / 2 {
                     continue;
                 }
@@ -917,6 +1146,28 @@ mod tests {
                 to_pixels.transform(&alone, &mut scratch, &mut found);
                 for (found, expected) in found.iter().zip(&image) {
                     assert!((found - expected).abs() < 3e-6, "{n} {which}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn modes_of_skewed_pixels_are_plain_sums() {
+        let mut rng = ChaCha8Rng::seed_from_u64(14);
+        for n in [1, 2, 3, 8, 16, 23, 33, 48] {
+            let image = numbers(&mut rng, n * n);
+            for plane in planes(n) {
+                // The same tables, one shape after the other.
+                let mut to_modes = ToModes::new(n, &plane, true);
+                let mut without = ToModes::new(n, &plane, false);
+                for (stretch, skew) in [(1.05, 0.08), (0.93, -0.06), (1.0, 0.2), (1.1, 0.0)] {
+                    let shape = PixelShape { stretch, skew };
+                    to_modes.set_pixel_shape(&plane, shape);
+                    let with = compare_with_sums(&to_modes, &plane, &image, shape);
+                    without.set_pixel_shape(&plane, shape);
+                    let mut alone = plane.spectrum();
+                    without.transform(&image, &mut without.scratch(), &mut alone);
+                    assert_eq!(alone.0, with.0);
                 }
             }
         }

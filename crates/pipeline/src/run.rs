@@ -172,7 +172,7 @@ impl<'s> SimulatedSessions<'s> {
         let each = self.sessions.iter().zip(workers);
         let measured = each.map(|((session, source), worker)| {
             let psfs = source.row_psfs(row);
-            Ok(session.measure(worker, row, &stamps, &psfs)?.galaxies)
+            Ok(session.measure(worker, row, &stamps, &psfs, None)?.galaxies)
         });
         measured.collect()
     }

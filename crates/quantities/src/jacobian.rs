@@ -174,6 +174,11 @@ impl PixelShape {
         [self.stretch * x + self.skew * y, y / self.stretch]
     }
 
+    /// The place or offset in pixels of one in the coordinates of the map.
+    pub fn pixel(&self, [x, y]: [f64; 2]) -> [f64; 2] {
+        [x / self.stretch - self.skew * y, self.stretch * y]
+    }
+
     /// |g| of the shear that makes such pixels of squares.
     pub fn shear(&self) -> f64 {
         // Singular values are exp(±η), the trace of T Tᵀ is 2 cosh 2η, and |g| = tanh η. The difference from 2 is formed without
@@ -227,6 +232,10 @@ mod tests {
             close(times(turn, transposed(turn)), [[1.0, 0.0], [0.0, 1.0]]);
             let map = transposed([shape.map([1.0, 0.0]), shape.map([0.0, 1.0])]);
             assert!(map[1][0] == 0.0 && map[0][0] > 0.0 && map[1][1] > 0.0);
+            close(
+                [shape.pixel(shape.map([3.0, -2.0])), [0.0; 2]],
+                [[3.0, -2.0], [0.0; 2]],
+            );
             let scale = jacobian.pixel_scale();
             let scaled = matrix.map(|row| row.map(|value| value / scale));
             close(times(turn, map), scaled);

@@ -25,10 +25,18 @@
 //! itself: metacalibration (Huff & Mandelbaum 2017) in the limit of a small shear. The change is
 //! worked out on the whole stamp and windowed then: a shear moves the galaxy and not the window, nor the edges of the stamp
 //! ([`Edges`]).
+//!
+//! # Sheared pixels
+//!
+//! On the sky, pixels may be sheared. Stamp and PSF are then transformed as what they are, samples on a skewed lattice
+//! ([`PixelShape::map`]), at the wave vectors of square pixels of their area. All that follows stays as it is: target, window,
+//! lags and shear are round in those coordinates. Ellipticities that were turned and sheared afterwards instead leave
+//! m = −0.004 for pixels that are sheared by 0.03.
 
 use multiversion::multiversion;
 use ndarray::ArrayView2;
 use shearq_fourier::Complex64;
+use shearq_quantities::PixelShape;
 use shearq_quantities::product::{LANES, Matrix, ROWS, multiply};
 use shearq_submissions::LinearDeconvolution;
 
@@ -120,6 +128,9 @@ pub struct SpectralScratch {
     even: Vec<f32>,
     /// A quarter on its way through the window.
     quarter: Vec<f32>,
+    /// The shape of pixels and, if they are not square, the transforms of stamps and of PSFs.
+    pixels: PixelShape,
+    skewed: Option<Box<[ToModes; 2]>>,
     /// Where the window is, (x, y) in pixels from the middle of the stamp, and the phases that move this place to the origin.
     centre: [f32; 2],
     phases: Modes,
@@ -320,9 +331,11 @@ impl Spectral {
             real: [zeros(2), zeros(2)],
             even: zeros(2),
             quarter: zeros(1),
+            pixels: PixelShape::SQUARE,
+            skewed: None,
             centre: [0.0; 2],
             phases: self.plane.mode_by_mode(),
-            edges: self.edges.scratch(),
+            edges: self.edges.scratch(&self.plane),
             lags: self.to_lags.scratch(),
         }
     }
@@ -356,10 +369,15 @@ impl Spectral {
 
     /// Noise of level one with the correlation of `noise`.
     pub fn noise(&self, noise: &StampNoise) -> ModeNoise {
+        self.noise_on(noise, PixelShape::SQUARE)
+    }
+
+    /// The same for pixels of this shape.
+    pub(crate) fn noise_on(&self, noise: &StampNoise, pixels: PixelShape) -> ModeNoise {
         let waves = self.waves[0].iter().zip(&self.waves[1]);
         let modes: Vec<[f32; 3]> = waves
             .map(|(&kx, &ky)| {
-                let (power, slopes) = noise.power([kx, ky].map(f64::from));
+                let (power, slopes) = noise.power([kx, ky].map(f64::from), pixels);
                 let [first, second] = slopes.map(|slope| (0.5 * slope / power) as f32);
                 [power as f32, first, second]
             })
@@ -393,6 +411,26 @@ impl Spectral {
         light.collect()
     }
 
+    /// Takes stamps and PSFs of such pixels from now on. Places and lengths are then in the coordinates of
+    /// [`PixelShape::map`].
+    pub(crate) fn set_pixel_shape(&self, shape: PixelShape, scratch: &mut SpectralScratch) {
+        let shape = if shape.is_square() {
+            PixelShape::SQUARE
+        } else {
+            shape
+        };
+        if scratch.pixels == shape {
+            return;
+        }
+        scratch.pixels = shape;
+        if shape != PixelShape::SQUARE {
+            let both = || Box::new([self.stamp.clone(), self.psf.clone()]);
+            for transform in &mut **scratch.skewed.get_or_insert_with(both) {
+                transform.set_pixel_shape(&self.plane, shape);
+            }
+        }
+    }
+
     /// Takes a PSF, for images with `noise`; it is used as it is, so it should sum to one and be centred on the middle of its
     /// stamp, (p − 1)/2 on both axes: the window is where deconvolution leaves the galaxy.
     ///
@@ -418,14 +456,20 @@ impl Spectral {
             real: [power, modes],
             even,
             quarter,
+            pixels,
+            skewed,
             ..
         } = scratch;
+        let to_modes = match skewed {
+            Some(skewed) if *pixels != PixelShape::SQUARE => &skewed[1],
+            _ => &self.psf,
+        };
         image.fill(0.0);
         let rows = image.chunks_exact_mut(p).skip(first);
         for (row, from) in rows.zip(psf.into_outer_iter()) {
             copy_row(from, &mut row[first..]);
         }
-        self.psf.transform_moments(image, of_psf, spectra);
+        to_modes.transform_moments(image, of_psf, spectra);
         for (modes, spectrum) in changes.iter_mut().zip(&*spectra) {
             modes.take_spectrum(spectrum);
         }
@@ -524,15 +568,28 @@ impl Spectral {
             centre,
             phases,
             edges,
+            pixels,
+            skewed,
             ..
         } = scratch;
-        self.stamp.transform_moments(stamp, of_stamp, windowed);
+        let skewed = skewed
+            .as_deref()
+            .filter(|_| *pixels != PixelShape::SQUARE)
+            .map(|[stamp, _]| stamp);
+        let to_modes = skewed.unwrap_or(&self.stamp);
+        to_modes.transform_moments(stamp, of_stamp, windowed);
         let centre = *centre;
-        let at_edges = self.sees_edges(centre);
+        let at_edges = self.sees_edges(centre, *pixels);
         if at_edges {
-            let transform = (&self.stamp, of_stamp);
-            self.edges
-                .take(stamp, centre, transform, edges, [edges1, edges2]);
+            let (transform, out) = ((to_modes, of_stamp), [&mut *edges1, edges2]);
+            match skewed {
+                None => self.edges.take(stamp, centre, transform, edges, out),
+                Some(_) => {
+                    let place = (centre, *pixels);
+                    self.edges
+                        .take_skewed(stamp, place, (transform, &self.plane), edges, out);
+                }
+            }
         }
         let off_middle = centre != [0.0; 2];
         if off_middle {
@@ -553,9 +610,18 @@ impl Spectral {
     }
 
     // Whether a window at `centre` contains light at the edges.
-    fn sees_edges(&self, centre: [f32; 2]) -> bool {
-        let off = centre.into_iter().map(f32::abs).fold(0.0, f32::max);
-        let away = (self.stamp_size() as f64 / 2.0 - f64::from(off)) / self.window_sigma;
+    fn sees_edges(&self, centre: [f32; 2], pixels: PixelShape) -> bool {
+        let half = self.stamp_size() as f64 / 2.0;
+        let away = if pixels == PixelShape::SQUARE {
+            let off = centre.into_iter().map(f32::abs).fold(0.0, f32::max);
+            (half - f64::from(off)) / self.window_sigma
+        } else {
+            // Distances from edges are those in pixels over the lengths of the gradients of x and y.
+            let PixelShape { stretch, skew } = pixels;
+            let [x, y] = pixels.pixel(centre.map(f64::from));
+            let (sides, levels) = ((1.0 / stretch).hypot(skew), stretch);
+            ((half - x.abs()) / sides).min((half - y.abs()) / levels) / self.window_sigma
+        };
         (-0.5 * away * away).exp() > LEAST_EDGE_WINDOW
     }
 
@@ -572,9 +638,15 @@ impl Spectral {
             changes: [v, ..],
             windowed: [spectrum, ..],
             centre,
+            pixels,
+            skewed,
             ..
         } = scratch;
-        self.stamp.transform(stamp, of_stamp, spectrum);
+        let to_modes = match skewed {
+            Some(skewed) if *pixels != PixelShape::SQUARE => &skewed[0],
+            _ => &self.stamp,
+        };
+        to_modes.transform(stamp, of_stamp, spectrum);
         v.take_spectrum(spectrum);
         multiply_modes(v, &psf.restore);
         let n = self.stamp_size();
@@ -582,11 +654,13 @@ impl Spectral {
         let area = (self.plane.period * self.plane.period) as f64;
         let width = self.plane.width;
         let pixel = |at: usize| {
-            let (x, y) = (from_middle(at % n), from_middle(at / n));
+            let [x, y] = [from_middle(at % n), from_middle(at / n)];
+            let [moved_x, moved_y] = pixels.map([x - shift, y - shift]);
+            let [x, y] = pixels.map([x, y]);
             let mut sum = 0.0;
             for first in (0..v.re.len()).step_by(width) {
-                let mut phase = Complex64::cis(f64::from(self.waves[1][first]) * (y - shift));
-                let step = Complex64::cis(f64::from(self.waves[0][1]) * (x - shift));
+                let mut phase = Complex64::cis(f64::from(self.waves[1][first]) * moved_y);
+                let step = Complex64::cis(f64::from(self.waves[0][1]) * moved_x);
                 for mode in first..first + width {
                     let v = Complex64::new(f64::from(v.re[mode]), f64::from(v.im[mode]));
                     sum += f64::from(self.counts[mode]) * (v * phase).re;
@@ -873,6 +947,9 @@ struct EdgesScratch {
     /// Of each of them and each frequency along it, real and imaginary part.
     re: Vec<f32>,
     im: Vec<f32>,
+    /// Of sheared pixels: the phase of each frequency along an axis at an edge, as cos and sin, and a spectrum.
+    waves: [Vec<f32>; 2],
+    spectrum: Spectrum,
 }
 
 impl Edges {
@@ -889,11 +966,109 @@ impl Edges {
         }
     }
 
-    fn scratch(&self) -> EdgesScratch {
+    fn scratch(&self, plane: &Plane) -> EdgesScratch {
         EdgesScratch {
             lines: vec![0.0; ROWS * self.n],
             re: vec![0.0; ROWS * self.width],
             im: vec![0.0; ROWS * self.width],
+            waves: [(); 2].map(|()| vec![0.0; self.width]),
+            spectrum: plane.spectrum(),
+        }
+    }
+
+    // The same for pixels of another shape, about a centre in its coordinates. In pixels, a shear moves light by
+    // v = T⁻¹ V T (x − c), V being the matrix of the shear.
+    fn take_skewed(
+        &self,
+        stamp: &[f32],
+        (centre, pixels): ([f32; 2], PixelShape),
+        ((to_modes, transform), plane): ((&ToModes, &mut TransformScratch), &Plane),
+        scratch: &mut EdgesScratch,
+        changes: [&mut Modes; 2],
+    ) {
+        let (n, width) = (self.n, self.width);
+        let (middle, half) = ((n as f32 - 1.0) / 2.0, n as f64 / 2.0);
+        let PixelShape { stretch, skew } = pixels;
+        let [x0, y0] = pixels.pixel(centre.map(f64::from)).map(|at| at as f32);
+        let shears = [
+            [[1.0, 2.0 * skew / stretch], [0.0, -1.0]],
+            [
+                [-stretch * skew, 1.0 / (stretch * stretch) - skew * skew],
+                [stretch * stretch, stretch * skew],
+            ],
+        ];
+        let EdgesScratch {
+            lines,
+            re,
+            im,
+            waves,
+            spectrum,
+        } = scratch;
+        // Lines of a shear: left and right, lower and upper edge.
+        for (which, shear) in shears.iter().enumerate() {
+            let [[xx, xy], [yx, yy]] = shear.map(|row| row.map(|value| value as f32));
+            for at in 0..n {
+                let edge = |first: usize, step: usize| {
+                    let beyond = |a: usize, b: usize| 1.5 * stamp[a] - 0.5 * stamp[b];
+                    let last = first + (n - 1) * step;
+                    [beyond(first, first + step), beyond(last, last - step)]
+                };
+                let ([left, right], [lower, upper]) = (edge(at * n, 1), edge(at, n));
+                let (half, place) = (half as f32, at as f32 - middle);
+                // v·∇T: light moves in at the first edge, and out at the last.
+                let values = [
+                    left * (xx * (-half - x0) + xy * (place - y0)),
+                    -right * (xx * (half - x0) + xy * (place - y0)),
+                    lower * (yx * (place - x0) + yy * (-half - y0)),
+                    -upper * (yx * (place - x0) + yy * (half - y0)),
+                ];
+                for (line, value) in values.into_iter().enumerate() {
+                    lines[(4 * which + line) * n + at] = value;
+                }
+            }
+        }
+        to_modes.transform_lines(lines, transform, [re, im]);
+        edge_phases(plane, half * skew, waves);
+        let edges = re.chunks_exact_mut(width).zip(im.chunks_exact_mut(width));
+        for (line, (re, im)) in edges.enumerate().filter(|(line, _)| line % 4 >= 2) {
+            let sign = if line % 2 == 0 { 1.0 } else { -1.0 };
+            let phases = waves[0].iter().zip(&waves[1]);
+            for ((re, im), (cos, sin)) in re.iter_mut().zip(im).zip(phases) {
+                let sin = sign * sin;
+                (*re, *im) = (*re * cos - *im * sin, *re * sin + *im * cos);
+            }
+        }
+        edge_phases(plane, half * stretch, waves);
+        let mut changes = changes;
+        for (which, change) in changes.iter_mut().enumerate() {
+            let line = |k: usize| &lines[(4 * which + k) * n..][..n];
+            let [cos, sin] = &*waves;
+            to_modes.transform_sides([line(0), line(1)], [cos, sin], transform, spectrum);
+            change.take_spectrum(spectrum);
+        }
+        edge_phases(plane, half / stretch, waves);
+        let line = |k: usize| [&re[k * width..][..width], &im[k * width..][..width]];
+        for (which, Modes { re, im }) in changes.into_iter().enumerate() {
+            let levels = [line(4 * which + 2), line(4 * which + 3)];
+            let rows = re.chunks_exact_mut(width).zip(im.chunks_exact_mut(width));
+            for (row, (re, im)) in rows.enumerate() {
+                let (y, sign) = if row < self.rows {
+                    (row, 1.0)
+                } else {
+                    (row - self.rows, -1.0)
+                };
+                let [cos, sin] = &*waves;
+                // Their phase along y has a place for each mode, and rows beyond the modes are not used.
+                let down = [cos, sin].map(|wave| wave.get(y).copied().unwrap_or_default());
+                let nothing = [[0.0; 2]; 2];
+                add_edges(
+                    [re, im],
+                    nothing,
+                    [cos, sin],
+                    levels,
+                    [down[0], sign * down[1]],
+                );
+            }
         }
     }
 
@@ -916,7 +1091,7 @@ impl Edges {
             [half + y0, half - y0],
             [1.0, -1.0],
         ];
-        let EdgesScratch { lines, re, im } = scratch;
+        let EdgesScratch { lines, re, im, .. } = scratch;
         for at in 0..n {
             // Half a pixel outwards, along a straight line.
             let edge = |first: usize, step: usize| {
@@ -958,6 +1133,14 @@ impl Edges {
                 add_edges([re, im], sides, [cos, sin], levels, [cos[y], sign * sin[y]]);
             }
         }
+    }
+}
+
+// Writes cos and sin of the phase of each mode along an axis at an edge, `distance` px from the middle.
+fn edge_phases(plane: &Plane, distance: f64, [cos, sin]: &mut [Vec<f32>; 2]) {
+    for k in 0..=plane.modes {
+        let (s, c) = (plane.wave(k) * distance).sin_cos();
+        (cos[k], sin[k]) = (c as f32, s as f32);
     }
 }
 

@@ -44,7 +44,7 @@ fn white_noise_has_its_level_and_no_correlation() {
         "{found:?}"
     );
     assert!(found.error() < 2e-3 && !found.is_correlated(), "{found:?}");
-    let (power, _) = found.power([0.5, -0.8]);
+    let (power, _) = found.power([0.5, -0.8], PixelShape::SQUARE);
     // 24 lags of 1/√400,000 each, both ways: 1.5 %.
     assert!((power - 1.0).abs() < 0.06, "{power}");
 }
@@ -180,7 +180,7 @@ fn noise_of_summed_pixels_has_their_power() {
     assert!((found.correlation(-1, 1) - 0.25).abs() < 0.01, "{found:?}");
     let wave = |kx: f64, ky: f64| (1.0 + kx.cos()) * (1.0 + ky.cos());
     for k in [[0.0, 0.0], [0.5, 0.3], [-1.0, 0.4], [0.9, -1.1]] {
-        let (power, slopes) = found.power(k);
+        let (power, slopes) = found.power(k, PixelShape::SQUARE);
         let expected = wave(k[0], k[1]);
         // As above with a million pixels, four times as much where the power is.
         assert!((power - expected).abs() < 0.12, "{k:?}: {power} {expected}");

@@ -50,11 +50,24 @@ fn psf(p: usize) -> Array2<f64> {
     psf / sum
 }
 
+/// Square pixels, and sheared ones with a skew of either sign.
+const PIXELS: [PixelShape; 3] = [
+    PixelShape::SQUARE,
+    PixelShape {
+        stretch: 1.06,
+        skew: 0.09,
+    },
+    PixelShape {
+        stretch: 0.95,
+        skew: -0.07,
+    },
+];
+
 /// An elliptical Gaussian galaxy off the stamp's middle under a shear about the middle, before the PSF.
-fn galaxy(n: usize, g1: f64, g2: f64) -> Array2<f64> {
+fn galaxy(n: usize, pixels: PixelShape, g1: f64, g2: f64) -> Array2<f64> {
     let middle = (n as f64 - 1.0) / 2.0;
     Array2::from_shape_fn((n, n), |(y, x)| {
-        let (y, x) = (y as f64 - middle, x as f64 - middle);
+        let [x, y] = pixels.map([x as f64 - middle, y as f64 - middle]);
         // Position before the shear, whose matrix is (1 + γ₁, γ₂; γ₂, 1 − γ₁), of determinant
         // one to first order.
         let (u, v) = ((1.0 - g1) * x - g2 * y, (1.0 + g1) * y - g2 * x);
@@ -65,7 +78,11 @@ fn galaxy(n: usize, g1: f64, g2: f64) -> Array2<f64> {
 
 /// The galaxy as it is observed: centred PSFs of odd sides leave it where it is.
 fn observed(n: usize, h: &Array2<f64>, g1: f64, g2: f64) -> Vec<f32> {
-    let image = convolve(galaxy(n, g1, g2).view(), h.view());
+    observed_on(n, h, PixelShape::SQUARE, g1, g2)
+}
+
+fn observed_on(n: usize, h: &Array2<f64>, pixels: PixelShape, g1: f64, g2: f64) -> Vec<f32> {
+    let image = convolve(galaxy(n, pixels, g1, g2).view(), h.view());
     image.iter().map(|&v| v as f32).collect()
 }
 
@@ -170,7 +187,7 @@ fn the_autocorrelation_equals_plain_sums_on_dirty_scratch() {
     for (n, p, iterations, lambda) in [(24, 11, 3, 0.0), (19, 8, 40, 1e-3), (13, 13, 1000, 0.0)] {
         let settings = settings(iterations, 1.5, n as f64 / 4.0, lambda);
         let h = psf(p);
-        let stamp = convolve(galaxy(n, 0.0, 0.0).view(), h.view());
+        let stamp = convolve(galaxy(n, PixelShape::SQUARE, 0.0, 0.0).view(), h.view());
         let plan = Spectral::new(n, p, &settings).unwrap();
         let (mut own, mut scratch, mut lags) = (plan.psf(), plan.scratch(), plan.lags());
         let data: Vec<f32> = stamp.iter().map(|&v| v as f32).collect();
@@ -200,9 +217,18 @@ fn pictures_show_the_stamp_whose_lags_are_measured() {
     let (n, p) = (33, 9);
     let settings = settings(1000, 1.5, 8.0, 0.0);
     let h = psf(p);
-    let (plan, own, mut scratch) = planned(n, &h, &settings);
+    for pixels in PIXELS {
+        pictured(n, &h, &settings, pixels);
+    }
+}
+
+fn pictured(n: usize, h: &Array2<f64>, settings: &LinearDeconvolution, pixels: PixelShape) {
+    let (plan, mut own, mut scratch) = planned(n, h, settings);
+    plan.set_pixel_shape(pixels, &mut scratch);
+    plan.set_psf(h.view(), &white(&plan), &mut scratch, &mut own)
+        .unwrap();
     let mut lags = plan.lags();
-    let data = observed(n, &h, 0.1, 0.0);
+    let data = observed_on(n, h, pixels, 0.1, 0.0);
     plan.autocorrelate(&own, &data, 0.0, &mut scratch, &mut lags);
     let picture = plan.deconvolved(&own, &data, 0.0, &mut scratch);
     let square: f64 = picture.iter().map(|v| f64::from(v * v)).sum();
@@ -214,12 +240,20 @@ fn pictures_show_the_stamp_whose_lags_are_measured() {
 #[test]
 fn the_response_is_that_of_a_sheared_galaxy() {
     // The window goes through the galaxy.
+    PIXELS.into_iter().for_each(the_response_on);
+}
+
+fn the_response_on(pixels: PixelShape) {
     let (n, p) = (40, 11);
     let h = psf(p);
-    let (plan, own, mut scratch) = planned(n, &h, &settings(1000, 1.5, 3.0, 0.0));
+    let (plan, mut own, mut scratch) = planned(n, &h, &settings(1000, 1.5, 3.0, 0.0));
+    plan.set_pixel_shape(pixels, &mut scratch);
+    plan.set_psf(h.view(), &white(&plan), &mut scratch, &mut own)
+        .unwrap();
     let mut lags_of = |g1: f64, g2: f64| {
         let mut lags = plan.lags();
-        plan.autocorrelate(&own, &observed(n, &h, g1, g2), 0.0, &mut scratch, &mut lags);
+        let stamp = observed_on(n, &h, pixels, g1, g2);
+        plan.autocorrelate(&own, &stamp, 0.0, &mut scratch, &mut lags);
         lags
     };
     let here = lags_of(0.0, 0.0);
@@ -240,12 +274,19 @@ fn the_response_is_that_of_a_sheared_galaxy() {
 }
 
 /// The stamp of a broad Gaussian galaxy under a shear about `centre`, with light beyond all edges: cut out of a wider field.
-fn broad(n: usize, h: &Array2<f64>, centre: [f64; 2], g1: f64, g2: f64) -> Vec<f32> {
+fn broad(
+    n: usize,
+    h: &Array2<f64>,
+    (pixels, centre): (PixelShape, [f64; 2]),
+    g1: f64,
+    g2: f64,
+) -> Vec<f32> {
     let beyond = 16;
     let side = n + 2 * beyond;
     let middle = (side as f64 - 1.0) / 2.0;
     let field = Array2::from_shape_fn((side, side), |(y, x)| {
-        let (x, y) = (x as f64 - middle - centre[0], y as f64 - middle - centre[1]);
+        let [x, y] = pixels.map([x as f64 - middle, y as f64 - middle]);
+        let (x, y) = (x - centre[0], y - centre[1]);
         let (u, v) = ((1.0 - g1) * x - g2 * y, (1.0 + g1) * y - g2 * x);
         let (u, v) = (u + 1.5, v - 1.0);
         (-(u * u / 140.0 + v * v / 100.0 + 0.3 * u * v / 110.0)).exp()
@@ -257,20 +298,23 @@ fn broad(n: usize, h: &Array2<f64>, centre: [f64; 2], g1: f64, g2: f64) -> Vec<f
 
 #[test]
 fn edges_stay_where_they_are_while_the_light_is_sheared() {
-    for (n, centre) in [(40, [0.0, 0.0]), (41, [0.0, 0.0]), (40, [2.5, -3.0])] {
+    let cases = [(40, [0.0, 0.0]), (41, [0.0, 0.0]), (40, [2.5, -3.0])];
+    let cases = PIXELS.map(|pixels| cases.map(|(n, centre)| (n, centre, pixels)));
+    for (n, centre, pixels) in cases.into_iter().flatten() {
         let h = psf(11);
         let plan = Spectral::new(n, 11, &settings(1000, 1.5, n as f64 / 4.0, 0.0)).unwrap();
         // A window that is told to be narrow does not look at the edges.
         let mut without = plan.clone();
         without.window_sigma = 1.0;
-        assert!(plan.sees_edges([0.0; 2]) && !without.sees_edges([0.0; 2]));
+        assert!(plan.sees_edges([0.0; 2], pixels) && !without.sees_edges([0.0; 2], pixels));
         let (mut own, mut scratch) = (plan.psf(), plan.scratch());
+        plan.set_pixel_shape(pixels, &mut scratch);
         plan.set_psf(h.view(), &white(&plan), &mut scratch, &mut own)
             .unwrap();
         plan.place_window(centre.map(|at| at as f32), &mut scratch);
         let mut lags_of = |plan: &Spectral, g1: f64, g2: f64| {
             let mut lags = plan.lags();
-            let stamp = broad(n, &h, centre, g1, g2);
+            let stamp = broad(n, &h, (pixels, centre), g1, g2);
             plan.autocorrelate(&own, &stamp, 0.0, &mut scratch, &mut lags);
             lags
         };
@@ -300,7 +344,10 @@ fn edges_stay_where_they_are_while_the_light_is_sheared() {
             };
             let [with, without] = [found, naive].map(|lags| apart(lags));
             // The light between the last pixels and the edge is not quite on a straight line.
-            assert!(with < 0.1 * without, "{n} {centre:?}: {with} {without}");
+            assert!(
+                with < 0.1 * without,
+                "{n} {centre:?} {pixels:?}: {with} {without}"
+            );
         }
     }
 }
@@ -424,9 +471,10 @@ fn of_summed(rng: &mut ChaCha8Rng) -> StampNoise {
 fn noise_is_subtracted_in_the_mean_from_lags_and_derivatives() {
     let mut rng = ChaCha8Rng::seed_from_u64(1);
     let correlated = of_summed(&mut rng);
-    for own in [StampNoise::white(1.0), correlated] {
-        subtracted_in_the_mean(&own, &mut rng);
+    for own in [&StampNoise::white(1.0), &correlated] {
+        subtracted_in_the_mean(own, PixelShape::SQUARE, &mut rng);
     }
+    subtracted_in_the_mean(&correlated, PIXELS[1], &mut rng);
 }
 
 #[test]
@@ -448,17 +496,14 @@ fn there_is_no_noise_beyond_the_edges_of_the_stamp() {
     assert!(means[0].abs() < 0.004 * means[1], "{means:?}");
 }
 
-fn subtracted_in_the_mean(own_noise: &StampNoise, rng: &mut ChaCha8Rng) {
+fn subtracted_in_the_mean(own_noise: &StampNoise, pixels: PixelShape, rng: &mut ChaCha8Rng) {
     let (n, p) = (32, 9);
     let plan = Spectral::new(n, p, &settings(1000, 1.5, 5.0, 1e-4)).unwrap();
     let (mut own, mut scratch, mut lags) = (plan.psf(), plan.scratch(), plan.lags());
-    plan.set_psf(
-        psf(p).view(),
-        &plan.noise(own_noise),
-        &mut scratch,
-        &mut own,
-    )
-    .unwrap();
+    plan.set_pixel_shape(pixels, &mut scratch);
+    let noise_of_modes = plan.noise_on(own_noise, pixels);
+    plan.set_psf(psf(p).view(), &noise_of_modes, &mut scratch, &mut own)
+        .unwrap();
     let count = 4000;
     let mut means = [(); 2].map(|()| [(); 3].map(|()| vec![0.0f64; lags.acf.len()]));
     for _ in 0..count {
@@ -493,19 +538,22 @@ fn subtracted_in_the_mean(own_noise: &StampNoise, rng: &mut ChaCha8Rng) {
 fn a_field_of_noise_changes_lags_as_noise_on_the_stamp_does() {
     let mut rng = ChaCha8Rng::seed_from_u64(2);
     let correlated = of_summed(&mut rng);
-    for own in [StampNoise::white(1.0), correlated] {
-        changed_as_by_noise(&own, &mut rng);
+    for own in [&StampNoise::white(1.0), &correlated] {
+        changed_as_by_noise(own, PixelShape::SQUARE, &mut rng);
     }
+    changed_as_by_noise(&correlated, PIXELS[2], &mut rng);
 }
 
-fn changed_as_by_noise(own_noise: &StampNoise, rng: &mut ChaCha8Rng) {
+fn changed_as_by_noise(own_noise: &StampNoise, pixels: PixelShape, rng: &mut ChaCha8Rng) {
     let (n, p) = (32, 9);
     let h = psf(p);
     let plan = Spectral::new(n, p, &settings(1000, 1.5, 5.0, 0.0)).unwrap();
     let (mut own, mut scratch) = (plan.psf(), plan.scratch());
-    plan.set_psf(h.view(), &plan.noise(own_noise), &mut scratch, &mut own)
+    plan.set_pixel_shape(pixels, &mut scratch);
+    let noise_of_modes = plan.noise_on(own_noise, pixels);
+    plan.set_psf(h.view(), &noise_of_modes, &mut scratch, &mut own)
         .unwrap();
-    let data = observed(n, &h, 0.0, 0.0);
+    let data = observed_on(n, &h, pixels, 0.0, 0.0);
     // Products of the change of a lag with itself and with the changes under sheared noise, summed
     // over lags: of both kinds of noise.
     let mut sums = [[0.0f64; 3]; 2];
