@@ -11,6 +11,7 @@ use shearq_dataset::layout::{MAX_IMAGE, MAX_SET};
 use shearq_pipeline::gather::{
     Content, Files, Gathered, Gathering, Masks, Square, Stamps, Table, gather,
 };
+use shearq_quantities::Frame;
 
 /// Gather your stamps and PSFs into a data folder for `measure`.
 ///
@@ -44,7 +45,8 @@ pub(crate) struct Arguments {
     /// Use only masks of this name [default files: the stamps or the exposure].
     #[arg(long, value_name = "NAME")]
     mask_extension: Option<String>,
-    /// Table of positions on the exposure: text, FITS or Parquet, in FITS pixels (the centre of the first pixel is 1).
+    /// Table of positions on the exposure: text, FITS or Parquet, in FITS pixels (the centre of the first pixel is 1), or in
+    /// degrees on the sky if the exposure has a WCS (TAN, TAN-SIP, TPV). Catalogues have its identities and places.
     /// `FILE[NAME]` and `FILE[NUMBER]` are tables of a FITS file.
     #[arg(
         long,
@@ -65,7 +67,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "0|1", default_value_t = 1, value_parser = clap::value_parser!(u8).range(0..=1), requires = "exposure", conflicts_with = "stamps")]
     first_pixel: u8,
     /// Columns of the positions: names, or numbers from 1 if the table has no names [default: x and y, names of SExtractor
-    /// such as X_IMAGE and Y_IMAGE, or the only two columns].
+    /// such as X_IMAGE and Y_IMAGE, ra and dec, or the only two columns].
     #[arg(
         long,
         value_name = "X,Y",
@@ -75,6 +77,27 @@ pub(crate) struct Arguments {
         conflicts_with = "stamps"
     )]
     columns: Option<Vec<String>>,
+    /// The columns are right ascension and declination in degrees, whatever their names.
+    #[arg(long, requires = "columns", conflicts_with = "stamps")]
+    degrees: bool,
+    /// Column of identities, integers or texts [default: id, object_id, source_id or NUMBER, if there is one].
+    #[arg(
+        long,
+        value_name = "NAME",
+        requires = "positions",
+        conflicts_with = "stamps"
+    )]
+    id: Option<String>,
+    /// Further columns of the positions for the catalogue, such as mag,z.
+    #[arg(
+        long,
+        value_name = "NAMES",
+        value_delimiter = ',',
+        num_args = 1,
+        requires = "positions",
+        conflicts_with = "stamps"
+    )]
+    carry: Vec<String>,
     /// Pixels a side of the stamps that are cut out.
     #[arg(long, value_name = "N", default_value_t = 48, value_parser = clap::value_parser!(u16).range(5..=1024), requires = "exposure", conflicts_with = "stamps")]
     size: u16,
@@ -89,6 +112,23 @@ pub(crate) struct Arguments {
     /// Use only PSFs of this name (EXTNAME).
     #[arg(long, value_name = "NAME")]
     psf_extension: Option<String>,
+    /// Maps of the variance of each pixel: of the stamps in the same order, or of the exposure. The noise of a galaxy is the median
+    /// of its stamp beyond a quarter of the side from the centre, where a map has none of the galaxy's own noise.
+    #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with_all = ["noise", "weight_map"])]
+    variance: Vec<PathBuf>,
+    /// Use only variance maps of this name [default files: the stamps or the exposure].
+    #[arg(long, value_name = "NAME", conflicts_with_all = ["noise", "weight_map"])]
+    variance_extension: Option<String>,
+    /// Maps of the inverse variance instead. Pixels of weight 0 are missing.
+    #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with_all = ["noise", "variance", "variance_extension"])]
+    weight_map: Vec<PathBuf>,
+    /// Use only weight maps of this name [default files: the stamps or the exposure].
+    #[arg(long, value_name = "NAME", conflicts_with_all = ["noise", "variance", "variance_extension"])]
+    weight_extension: Option<String>,
+    /// Axes of ellipticities: those of the sky, by the WCS of the galaxies, or of the pixels [default: sky if the WCS rotates,
+    /// mirrors or shears the pixels, else pixel].
+    #[arg(long, value_name = "pixel|sky")]
+    frame: Option<Frame>,
     /// Standard deviation of the noise per pixel, written to the header for configurations that do not measure it.
     #[arg(long, value_name = "SIGMA")]
     noise: Option<f64>,
@@ -103,6 +143,35 @@ pub(crate) struct Arguments {
     out: PathBuf,
 }
 
+/// Maps of the stamps or of the exposure, in files of their own or in those of the images; `None` if none are given.
+fn companion<'a>(
+    paths: &'a [PathBuf],
+    extension: Option<&'a String>,
+    content: Content,
+    images: &Files<'a>,
+) -> Option<Files<'a>> {
+    (!paths.is_empty() || extension.is_some()).then_some(Files {
+        paths: if paths.is_empty() {
+            images.paths
+        } else {
+            paths
+        },
+        extension: extension.map(String::as_str),
+        content,
+    })
+}
+
+fn two_columns(columns: Option<&[String]>) -> anyhow::Result<Option<[&str; 2]>> {
+    match columns {
+        None => Ok(None),
+        Some([x, y]) if !x.is_empty() && !y.is_empty() => Ok(Some([x, y])),
+        Some(columns) => anyhow::bail!(
+            "--columns is `{}`; expected two columns, as in `x,y` or `2,3`",
+            columns.join(",")
+        ),
+    }
+}
+
 fn gathering(arguments: &Arguments) -> anyhow::Result<Gathering<'_>> {
     let Arguments {
         stamps,
@@ -115,10 +184,18 @@ fn gathering(arguments: &Arguments) -> anyhow::Result<Gathering<'_>> {
         table,
         first_pixel,
         columns,
+        degrees,
+        id,
+        carry,
         size,
         square,
         psf,
         psf_extension,
+        variance,
+        variance_extension,
+        weight_map,
+        weight_extension,
+        frame,
         noise,
         set: _,
         image: _,
@@ -135,31 +212,30 @@ fn gathering(arguments: &Arguments) -> anyhow::Result<Gathering<'_>> {
         extension: extension.as_deref(),
         content: Content::Sky,
     };
-    let masks = Files {
-        paths: if mask.is_empty() { images.paths } else { mask },
-        extension: mask_extension.as_deref(),
-        content: Content::Mask,
-    };
-    let masked = !mask.is_empty() || mask_extension.is_some();
+    let masks = companion(mask, mask_extension.as_ref(), Content::Mask, &images);
     anyhow::ensure!(
-        masked || mask_bits.is_none(),
+        masks.is_some() || mask_bits.is_none(),
         "--mask-bits is given without a mask; expected --mask or --mask-extension"
     );
     let bits = mask_bits
         .as_ref()
         .map(|bits| bits.iter().fold(0, |all, bit| all | 1u64 << bit));
+    let variance = companion(
+        variance,
+        variance_extension.as_ref(),
+        Content::Variance,
+        &images,
+    );
+    let weight = companion(
+        weight_map,
+        weight_extension.as_ref(),
+        Content::Weight,
+        &images,
+    );
     let psfs = Files {
         paths: psf,
         extension: psf_extension.as_deref(),
         content: Content::Psf,
-    };
-    let columns = match columns.as_deref() {
-        None => None,
-        Some([x, y]) if !x.is_empty() && !y.is_empty() => Some([x.as_str(), y.as_str()]),
-        Some(columns) => anyhow::bail!(
-            "--columns is `{}`; expected two columns, as in `x,y` or `2,3`",
-            columns.join(",")
-        ),
     };
     let stamps = match positions {
         Some(path) => Stamps::Cutouts {
@@ -167,7 +243,10 @@ fn gathering(arguments: &Arguments) -> anyhow::Result<Gathering<'_>> {
             positions: Table {
                 path,
                 table: table.as_deref(),
-                columns,
+                columns: two_columns(columns.as_deref())?,
+                degrees: *degrees,
+                id: id.as_deref(),
+                carry,
             },
             first_pixel: *first_pixel,
             side: usize::from(*size),
@@ -180,9 +259,12 @@ fn gathering(arguments: &Arguments) -> anyhow::Result<Gathering<'_>> {
             "crop" => Square::Crop,
             _ => Square::Pad,
         }),
-        masks: masked.then_some(Masks { files: masks, bits }),
+        masks: masks.map(|files| Masks { files, bits }),
         psfs,
         noise: *noise,
+        variances: variance.or(weight),
+        gain: None,
+        frame: *frame,
     })
 }
 

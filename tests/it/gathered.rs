@@ -127,14 +127,35 @@ fn stamps_of_all_kinds_of_files_are_measured_alike() {
         let rest = ["--psf", text(psf), "--out", text(&data)];
         succeed(&[&["gather"][..], from, &rest].concat());
         assert_eq!(measured(&small, &data, "01"), expected, "{name}");
-        let table = fs::read_to_string(data.join("set01/stamps-001.csv")).unwrap();
-        assert_eq!(table.lines().count(), 65);
     }
-    let table = fs::read_to_string(at("files").join("set01/stamps-001.csv")).unwrap();
-    let third = format!("120.5,24.5,{},2,1,,", parts.display());
-    assert_eq!(table.lines().nth(3), Some(third.as_str()));
-    let table = fs::read_to_string(at("exposure").join("set01/stamps-001.csv")).unwrap();
-    assert!(table.lines().nth(1).unwrap().ends_with("1,1,24.9,24.1"));
+    // Stamps of an exposure have their places on it and the identities of the table; others have those of the image.
+    let catalogue = |name: &str, columns: &[&str]| {
+        let out = small.at("catalogue");
+        let _ = fs::remove_dir_all(&out);
+        let measure = ["measure", "--submission", LINEAR, "--out", text(&out)];
+        succeed(&[&measure[..], &["--data", text(&at(name))]].concat());
+        let path = out.join("set01/catalogue-001.parquet");
+        let table = shearq_files::parquet::read(&path, Some(columns), 64).unwrap();
+        let row = |k: usize| {
+            table
+                .columns()
+                .iter()
+                .map(move |c| c.get(k).unwrap().to_string())
+        };
+        [0, 2].map(|k| row(k).collect::<Vec<_>>().join(" "))
+    };
+    assert_eq!(catalogue("files", &["x", "y"]), ["24.5 24.5", "120.5 24.5"]);
+    let expected = ["0 24.9 24.1", "2 120.9 24.1"];
+    assert_eq!(catalogue("exposure", &["id", "x", "y"]), expected);
+    let stamps = at("files").join("set01/stamps-001.parquet");
+    let names = ["tile_x", "tile_y", "file", "image", "plane"];
+    let table = shearq_files::parquet::read(&stamps, Some(&names), 64).unwrap();
+    let third = format!("120.5 24.5 {:?} 2 1", text(&parts));
+    let values = table
+        .columns()
+        .iter()
+        .map(|c| c.get(2).unwrap().to_string());
+    assert_eq!(values.collect::<Vec<_>>().join(" "), third);
 
     // As many as do not fill a square, and one PSF by its parameters.
     fs::write(at("few.fits"), self::cube(&galaxies[..5], 48)).unwrap();
@@ -779,7 +800,9 @@ fn pixel_axes_that_are_not_the_skys_are_stated() {
     let message = fail(&["mean", "--measured", text(&out)]);
     let expected = "the pixel axes of image 2 are not those of image 1";
     assert!(message.contains(expected), "{message}");
-    let message = gather(&[sky], &on_camera.1, "1", "mixed");
+    let mixed = small.at("mixed");
+    let of = ["gather", "--stamps", sky, "--psf", text(&on_camera.1)];
+    let message = fail(&[&of[..], &["--out", text(&mixed)]].concat());
     let expected =
         "the PSF image and the galaxy image have pixel axes of different orientation or shear";
     assert!(message.contains(expected), "{message}");

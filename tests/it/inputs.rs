@@ -4,7 +4,7 @@
 //!   `pad=SIDE` (zeros around it), `cube=STAMP,SIDE` (the central pixels of the stamps of a mosaic), `copy=STAMP` (the first
 //!   stamp everywhere), `number=SIDE` (of the square of pixels from 0), `shift=X,Y`, `scale=F`, `add=F`, `background=F` (of
 //!   the peak), `slope=STAMP,F` (light per pixel along x of each stamp), `snr=F` (adds noise), `pixel=X,Y,F` (from 1),
-//!   `bitpix=N`, or a card such as `STAMP=48`.
+//!   `bitpix=N`, or a card such as `STAMP=48` or `CTYPE1="RA---TAN"`.
 //! * `card FROM TO KEY=VALUE`: a copy with another value of a key. `card FROM TO KEY CARD`: a copy with any card in the
 //!   place of the last one of this key; `"` stands for `'`.
 //! * `tables TO NAME=CSV...`: a file of tables, each from a CSV of numbers.
@@ -156,7 +156,7 @@ fn image(from: &Path, what: &[&str]) -> Vec<u8> {
                 pixels[(y as usize - 1) * sides[0] + x as usize - 1] = v as f32;
             }
             "bitpix" => bitpix = value.parse().unwrap(),
-            key => cards.push(format!("{key:<8}= {value:>20}")),
+            key => cards.push(format!("{key:<8}= {:>20}", value.replace('"', "'"))),
         }
     }
     let bytes = |pixel: &f32| match bitpix {

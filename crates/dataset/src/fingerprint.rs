@@ -144,7 +144,9 @@ fn read(path: &Path) -> Result<Vec<u8>, FileError> {
 const GALAXIES: &str = "galaxies";
 pub const PSF: &str = "psf";
 const TRUTH: &str = "truth";
-pub const PRINTS: [&str; 3] = [GALAXIES, PSF, TRUTH];
+// The table of gathered stamps, which has their noise and their pixels on the sky.
+const STAMPS: &str = "stamps";
+pub const PRINTS: [&str; 4] = [GALAXIES, PSF, STAMPS, TRUTH];
 
 /// The files that a run measures, if they are there. A simulated run has none.
 #[derive(Debug)]
@@ -176,6 +178,7 @@ impl<'a> Inputs<'a> {
         BTreeMap::from([
             (GALAXIES, self.data.galaxies(id.set, id.image)),
             (PSF, psf),
+            (STAMPS, self.data.stamps(id.set, id.image)),
             (TRUTH, self.data.truth(id.set)),
         ])
     }

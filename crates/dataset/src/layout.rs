@@ -20,7 +20,7 @@ pub const MAX_STAMP: usize = 1024;
 pub const LAYOUT_FILE: &str = "layout.toml";
 
 // Name of the table of stamps of a gathered image.
-const STAMPS: &str = "set{set:02}/stamps-{image:03}.csv";
+const STAMPS: &str = "set{set:02}/stamps-{image:03}.parquet";
 
 /// File-name patterns and conventions of a data folder. `{set}` and `{image}` stand for plain numbers, `{set:02}` and
 /// `{image:03}` for numbers with leading zeros. A layout is checked when it is read.

@@ -5,17 +5,29 @@ use std::path::Path;
 use shearq_files::FileError;
 use shearq_files::table::{self, FileFormat};
 use shearq_measure::PixelFrame;
+use shearq_quantities::Frame;
 
 pub const WARNINGS: &str = "warnings";
 /// Key of the effect of the noise of an image's star on its mean shear: the standard deviations of m and c.
 // A FITS key has eight characters.
 pub const PSF_NOISE: &str = "psfnoise";
-// Key of the pixel axes, if they are not the sky's: position angle of +y in degrees, parity (−1 for mirrored), and both
-// components of the shear.
-const FRAME: &str = "frame";
+/// Key of the frame of ellipticities: `sky`, or pixel axes that are not the sky's: position angle of +y in degrees, parity (−1
+/// for mirrored), and both components of the shear.
+pub const FRAME: &str = "frame";
+/// Key of the coordinate of the centre of the first pixel in x and y, of stamps of an exposure.
+pub const FIRST_PIXEL: &str = "xyfirst";
 /// All keys beside fingerprints.
-pub const KEYS: [&str; 9] = [
-    "creator", "submiss", "elltype", "set", "image", "settings", PSF_NOISE, WARNINGS, FRAME,
+pub const KEYS: [&str; 10] = [
+    "creator",
+    "submiss",
+    "elltype",
+    "set",
+    "image",
+    "settings",
+    PSF_NOISE,
+    WARNINGS,
+    FRAME,
+    FIRST_PIXEL,
 ];
 
 /// Key and value that state the pixel axes.
@@ -37,6 +49,9 @@ pub fn stated_frame(path: &Path, format: FileFormat) -> Result<Option<PixelFrame
     let Some(text) = metadata.get(FRAME) else {
         return Ok(None);
     };
+    if text.parse() == Ok(Frame::Sky) {
+        return Ok(None);
+    }
     let numbers: Option<Vec<f64>> = text.split(' ').map(|word| word.parse().ok()).collect();
     match numbers.as_deref() {
         Some(&[angle, parity, g1, g2]) if numbers.iter().flatten().all(|n| n.is_finite()) => {

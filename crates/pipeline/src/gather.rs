@@ -11,21 +11,24 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 use shearq_measure::{Examination, Warning};
+use shearq_quantities::{Frame, Jacobian};
 
 use self::positions::Positions;
 pub use self::positions::Table;
 use self::psfs::{GatheredPsfs, gather_psfs};
 pub use self::source::{Content, Files};
 use self::source::{Exposure, Images, shown};
-use self::stamps::{StampWriter, already};
+use self::stamps::{Origins, StampWriter, already};
 use super::PipelineError;
 use super::measure::check_strip;
-use crate::wcs::Wcs;
+use crate::stamp_table::{self, Head};
+use crate::wcs::{Matrix, Wcs, aligned};
 use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::{DataFolder, MAX_STAMP};
 use shearq_dataset::mosaic::Mosaic;
 use shearq_files::FileError;
 use shearq_files::atomic;
+use shearq_files::frames::polars::Column;
 use shearq_files::open::is_there;
 use shearq_files::table;
 
@@ -47,12 +50,22 @@ pub enum Stamps<'a> {
     Files(Files<'a>),
     Cutouts {
         exposure: Files<'a>,
-        /// Table with the positions, in FITS pixels: the centre of the first one is at 1.
+        /// Table with the positions, in pixels or in degrees on the sky.
         positions: Table<'a>,
         /// Coordinate of the centre of the first pixel in the table, 0 or 1.
         first_pixel: u8,
         side: usize,
     },
+}
+
+impl Stamps<'_> {
+    /// Coordinate of the centre of the first pixel in catalogues.
+    fn first_pixel(&self) -> u8 {
+        match self {
+            Stamps::Files(_) => 1,
+            Stamps::Cutouts { first_pixel, .. } => *first_pixel,
+        }
+    }
 }
 
 #[derive(Debug)]
@@ -91,6 +104,15 @@ pub struct Gathering<'a> {
     /// One PSF, one per stamp, or stars to average.
     pub psfs: Files<'a>,
     pub noise: Option<f64>,
+    /// Maps of the variance of pixels, or of its inverse.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub variances: Option<Files<'a>>,
+    /// Electrons per unit of the image, for the Poisson noise of galaxies.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub gain: Option<f64>,
+    /// The axes of ellipticities; the sky's if the WCS has other axes than the pixels, unless it is given.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub frame: Option<Frame>,
 }
 
 #[derive(Serialize)]
@@ -146,18 +168,26 @@ fn gather_alone(
     };
     let record = serde_json::to_string_pretty(&record)
         .map_err(FileError::doing(&which, "cannot write the record"))?;
-    let Plan {
-        positions,
-        stack,
-        mut messages,
-    } = Plan::of(&gathering.stamps, gathering.square)?;
-    let Stack { count, side, wcs } = stack;
+    let plan = Plan::of(&gathering.stamps, gathering.square)?;
+    let mut messages = plan.messages.clone();
+    let jacobians = plan.jacobians(gathering)?;
+    match &jacobians {
+        Some(jacobians) => messages.push(frame_line(jacobians)),
+        None => messages.extend(plan.stack.differs.clone()),
+    }
+    let &Stack {
+        count,
+        side,
+        ref wcs,
+        ..
+    } = &plan.stack;
     let mosaic = Mosaic::of(count, side);
     check_strip(&target, mosaic.columns, side)?;
     let psfs = gather_psfs(data, id, gathering.psfs, gathering.square, &mosaic)?;
     messages.extend_from_slice(&psfs.messages);
-    let mut writer = StampWriter::create(&target, mosaic, gathering.noise, &wcs)?;
-    writer.copy(gathering, &positions)?;
+    let of_psf = check_psf(&psfs, &plan, jacobians.as_deref())?;
+    let mut writer = StampWriter::create(&target, mosaic, gathering.noise, wcs)?;
+    writer.copy(gathering, plan.places())?;
     let mut warnings = writer.examination.warnings();
     warnings.extend(
         gathering
@@ -165,17 +195,25 @@ fn gather_alone(
             .and_then(|sigma| writer.examination.given_noise(sigma)),
     );
     warnings.extend(width(&writer.examination, &psfs)?);
-    warnings.extend(Wcs::disagreements(&psfs.wcs, &wcs));
-    warnings.extend(wcs.frame());
+    warnings.extend(of_psf);
+    if jacobians.is_none() {
+        warnings.extend(wcs.frame());
+    }
     let ImageId { set, image } = id;
     messages.extend(warnings.iter().map(|warning| {
         let hint = one_pixel_off(&gathering.stamps, warning).unwrap_or_default();
         format!("warning: set {set:02} image {image:03}: {warning}{hint}")
     }));
-    let (places, incomplete) = (writer.places(&which)?, writer.incomplete);
+    let head = Head {
+        frame: jacobians.as_ref().map_or(Frame::Pixel, |_| Frame::Sky),
+        first_pixel: gathering.stamps.first_pixel(),
+        gain: gathering.gain,
+    };
+    let incomplete = writer.incomplete;
+    let columns = plan.columns(head, &mosaic, &mut writer, jacobians.as_deref());
     let record = format!("{record}\n");
     atomic::write(which.with_extension("json"), record.as_bytes())?;
-    atomic::write(&which, &places)?;
+    stamp_table::table(&which, head, columns)?.write(&which)?;
     psfs.file.finish()?;
     writer.image.finish()?;
     Ok(Gathered {
@@ -208,8 +246,8 @@ fn remove_leftovers(data: &DataFolder, id: ImageId) -> Result<(), FileError> {
 
 // The stamps of an image before they are read.
 struct Plan {
-    /// Positions on the exposure in FITS pixels, if stamps are cut out.
-    positions: Vec<(f64, f64)>,
+    /// Where they are cut out of an exposure.
+    positions: Option<Positions>,
     stack: Stack,
     messages: Vec<String>,
 }
@@ -227,6 +265,104 @@ impl Plan {
         }
     }
 
+    fn places(&self) -> &[(f64, f64)] {
+        self.positions.as_ref().map_or(&[], |found| &found.all)
+    }
+
+    /// One Jacobian per stamp, if ellipticities are along the sky's axes.
+    fn jacobians(&self, gathering: &Gathering<'_>) -> Result<Option<Vec<Matrix>>, FileError> {
+        let files = match &gathering.stamps {
+            Stamps::Files(files)
+            | Stamps::Cutouts {
+                exposure: files, ..
+            } => files,
+        };
+        let fault = |message: String| Err(FileError::new(&files.paths[0], message));
+        if gathering.frame != Some(Frame::Sky) {
+            return Ok(None);
+        }
+        let all: Option<Vec<Matrix>> = match &self.positions {
+            Some(found) => {
+                let each = found
+                    .all
+                    .iter()
+                    .map(|&(x, y)| self.stack.wcs.jacobian([x, y]));
+                each.collect()
+            }
+            None => {
+                let each = self.stack.of_images.iter();
+                let each = each.flat_map(|&(count, jacobian)| std::iter::repeat_n(jacobian, count));
+                each.collect()
+            }
+        };
+        let Some(all) = all else {
+            return match gathering.frame {
+                Some(Frame::Sky) => fault("--frame is sky, and the header has no WCS (expected TAN, TAN-SIP, TPV or a linear one)".to_owned()),
+                _ => Ok(None),
+            };
+        };
+        let plain = all.iter().all(aligned);
+        if plain && gathering.frame.is_none() {
+            return Ok(None);
+        }
+        if let Some(kind) = self.stack.wcs.unread() {
+            return fault(format!(
+                "the WCS is {kind} (expected TAN, TAN-SIP, TPV or a linear one), so that the pixels on the sky are not known. Try: --frame pixel, for ellipticities along the pixel axes"
+            ));
+        }
+        for (row, jacobian) in all.iter().enumerate() {
+            if let Err(error) = Jacobian::new(*jacobian) {
+                let row = row + 1;
+                return fault(format!(
+                    "the WCS has no inverse at stamp {row}: {error}. Try: --frame pixel, or correct the header"
+                ));
+            }
+        }
+        Ok(Some(all))
+    }
+
+    /// The columns of the table of stamps.
+    fn columns(
+        self,
+        head: Head,
+        mosaic: &Mosaic,
+        writer: &mut StampWriter,
+        jacobians: Option<&[Matrix]>,
+    ) -> Vec<Column> {
+        let mut columns = Vec::new();
+        let real = |name: &str, values: Vec<f64>| Column::new(name.into(), values);
+        if let Some(found) = self.positions {
+            columns.extend(found.id);
+            let shift = f64::from(head.first_pixel) - 1.0;
+            let (x, y) = found
+                .all
+                .iter()
+                .map(|(x, y)| (x + shift, y + shift))
+                .unzip();
+            let places = [x, y].into_iter().chain(found.sky.into_iter().flatten());
+            let named = stamp_table::PLACE.into_iter().zip(places);
+            columns.extend(named.map(|(name, values)| real(name, values)));
+            columns.extend(found.carried);
+        }
+        if let Some(levels) = writer.levels.take() {
+            columns.push(real(stamp_table::NOISE, levels));
+        }
+        if let Some(all) = jacobians {
+            for (at, name) in stamp_table::JACOBIAN.into_iter().enumerate() {
+                columns.push(real(name, all.iter().map(|j| j[at / 2][at % 2]).collect()));
+            }
+        }
+        let tiles = (0..mosaic.galaxies).map(|place| mosaic.position(place));
+        let (tile_x, tile_y) = tiles.unzip();
+        let Origins { file, image, plane } = std::mem::take(&mut writer.origins);
+        let [x, y, of_file, of_image, of_plane] = stamp_table::ORIGIN;
+        columns.extend([real(x, tile_x), real(y, tile_y)]);
+        columns.push(Column::new(of_file.into(), file));
+        columns.push(Column::new(of_image.into(), image));
+        columns.push(Column::new(of_plane.into(), plane));
+        columns
+    }
+
     fn of_files(files: Files<'_>, square: Option<Square>) -> Result<Self, FileError> {
         let (stack, mut messages) = Stack::of(files, square)?;
         let side = stack.side;
@@ -237,7 +373,7 @@ impl Plan {
             ));
         }
         Ok(Plan {
-            positions: Vec::new(),
+            positions: None,
             stack,
             messages,
         })
@@ -249,23 +385,21 @@ impl Plan {
         first_pixel: u8,
         side: usize,
     ) -> Result<Self, FileError> {
-        // From here on the first pixel is 1.
-        let shift = 1.0 - f64::from(first_pixel);
-        let mut positions = Positions::read(positions)?;
-        for (x, y) in &mut positions.all {
-            (*x, *y) = (*x + shift, *y + shift);
-        }
         let path = &exposure.paths[0];
         let mut exposure = Exposure::open(exposure)?;
+        let wcs = exposure.wcs()?;
+        let positions = Positions::read(positions, path, &wcs, first_pixel)?;
         let mut messages: Vec<String> = positions.note.clone().into_iter().collect();
         messages.extend(positions.examine(path, exposure.sides()?)?);
         Ok(Plan {
             stack: Stack {
                 count: positions.all.len(),
                 side,
-                wcs: exposure.wcs()?,
+                wcs,
+                of_images: Vec::new(),
+                differs: None,
             },
-            positions: positions.all,
+            positions: Some(positions),
             messages,
         })
     }
@@ -274,12 +408,18 @@ impl Plan {
 struct Stack {
     count: usize,
     side: usize,
+    /// Of the first image.
     wcs: Wcs,
+    /// Jacobians of images with several stamps each, with the numbers of stamps.
+    of_images: Vec<(usize, Option<Matrix>)>,
+    /// A warning if the pixels of an image differ from those of the first.
+    differs: Option<String>,
 }
 
 impl Stack {
     fn of(files: Files<'_>, square: Option<Square>) -> Result<(Self, Vec<String>), FileError> {
         let (mut count, mut first, mut messages) = (0usize, None, Vec::new());
+        let (mut of_images, mut differs) = (Vec::new(), None);
         let mut sides = [0; 2];
         let mut images = Images::of(files);
         while let Some((origin, image)) = images.next()? {
@@ -293,7 +433,7 @@ impl Stack {
                     Content::Psf if width.max(height) <= MAX_STAMP => {
                         ". Try: --square crop, which takes the central square".to_owned()
                     }
-                    Content::Psf | Content::Mask => String::new(),
+                    _ => String::new(),
                 };
                 let message = format!(
                     "the stamp is {width} × {height} pixels; expected a square of at most {MAX_STAMP}{advice}"
@@ -305,7 +445,10 @@ impl Stack {
                 _ => width.min(height),
             };
             let wcs = Wcs::of_header(image);
-            let (expected, first_wcs) = *first.get_or_insert((side, wcs));
+            let centre = [width, height].map(|side| (side as f64 + 1.0) / 2.0);
+            of_images.push((image.planes(), wcs.jacobian(centre)));
+            let (expected, first_wcs) = &*first.get_or_insert_with(|| (side, wcs.clone()));
+            let expected = *expected;
             if side != expected && files.content == Content::Psf {
                 let message = format!(
                     "the stamp is {width} × {height} pixels; the first has {expected} × {expected}"
@@ -316,9 +459,9 @@ impl Stack {
                 [0, 0] => [side; 2],
                 [least, most] => [side.min(least), side.max(most)],
             };
-            if messages.is_empty() && Wcs::disagreements(&wcs, &first_wcs).next().is_some() {
+            if differs.is_none() && Wcs::disagreements(&wcs, first_wcs).next().is_some() {
                 let message = "the header states other pixel axes or another pixel scale than that of the first image, so that ellipticities are not along the same axes. Try: one orientation per image (--image)";
-                messages.push(format!("warning: {}", origin.fault(message)));
+                differs = Some(format!("warning: {}", origin.fault(message)));
             }
             count += image.planes();
             if count > MAX_STAMPS {
@@ -334,7 +477,41 @@ impl Stack {
                 files.paths[0].display()
             ));
         }
-        Ok((Stack { count, side, wcs }, messages))
+        let stack = Stack {
+            count,
+            side,
+            wcs,
+            of_images,
+            differs,
+        };
+        Ok((stack, messages))
+    }
+}
+
+/// States in which frame ellipticities are.
+fn frame_line(jacobians: &[Matrix]) -> String {
+    let pixels = Wcs::frame_of(&jacobians[0]);
+    format!(
+        "frame: sky (e1 > 0 along east–west, e2 > 0 along north-west). The WCS of the first stamp: {pixels}. --frame pixel keeps the pixel axes"
+    )
+}
+
+// Refuses a PSF of other pixels than the galaxies'.
+fn check_psf(
+    psfs: &GatheredPsfs,
+    plan: &Plan,
+    jacobians: Option<&[Matrix]>,
+) -> Result<Vec<Warning>, FileError> {
+    // The stars of a field have the pixels of its middle, from which distortions differ by less than what is refused.
+    let typical = jacobians.map(|all| Wcs::of_jacobian(all[all.len() / 2]));
+    let galaxies = typical.as_ref().unwrap_or(&plan.stack.wcs);
+    let warnings: Vec<Warning> = Wcs::disagreements(&psfs.wcs, galaxies).collect();
+    // A scale that a key states may be another's; axes are those of a matrix.
+    let refused =
+        |warning: &&Warning| jacobians.is_some() || matches!(warning, Warning::PsfFrame { .. });
+    match warnings.iter().find(refused) {
+        Some(warning) => Err(FileError::new(&psfs.first, warning)),
+        None => Ok(warnings),
     }
 }
 

@@ -10,6 +10,7 @@ pub mod gather;
 pub mod measure;
 pub mod run;
 pub mod simulate;
+mod stamp_table;
 mod wcs;
 
 use shearq_dataset::images::ImageId;

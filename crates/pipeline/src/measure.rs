@@ -19,6 +19,7 @@ pub use self::source::ImageSource;
 pub(crate) use self::source::{check_strip, open_galaxies};
 use crate::PipelineError;
 use crate::engine::{self, Feeder};
+use crate::stamp_table::StampTable;
 use shearq_dataset::fingerprint::Inputs;
 use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::DataFolder;
@@ -32,6 +33,8 @@ pub struct ImageHead {
     pub mosaic: Mosaic,
     /// Warnings about all images of the run, which were examined on this image.
     pub run_warnings: Vec<Warning>,
+    /// The table of the stamps if they were gathered.
+    pub(crate) table: Option<StampTable>,
     /// Fingerprints of the files that the image is measured from.
     pub prints: BTreeMap<String, String>,
 }
@@ -195,6 +198,7 @@ impl<'a> FolderMeasurement<'a> {
                 id,
                 mosaic,
                 run_warnings: correlated.into_iter().collect(),
+                table: source.take_table(),
                 prints,
             });
             for row in 0..mosaic.rows() {

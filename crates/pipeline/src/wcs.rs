@@ -17,40 +17,231 @@ const PLAUSIBLE: std::ops::RangeInclusive<f64> = 1e-3..=60.0;
 // Least relative difference of scales, and least shear between the pixels of the PSF and of the galaxies, that is reported: a
 // difference of 1 % changes m by about 0.01.
 const LEAST_DIFFERENCE: f64 = 0.01;
-// Least rotation in degrees that is reported: it changes m by −2 sin² 1° = −6e-4, and adds 3.5 % of g2 to g1.
+// Least rotation in degrees between the pixels of the PSF and of the galaxies that is reported.
 const LEAST_ROTATION: f64 = 1.0;
-// Least shear of the pixels that is reported, as it adds to c.
-const LEAST_SHEAR: f64 = 1e-3;
+// Rotation in degrees and shear of the pixels below which pixel axes count as the sky's. They change m by −2 sin² 0.01° and add
+// 4e-4 of g2 to g1, and 1e-4 to c: less than what calibrations reach.
+const ALIGNED_DEGREES: f64 = 0.01;
+const ALIGNED_SHEAR: f64 = 1e-4;
+// Largest order of SIP (Shupe et al. 2005, ASPC 347, 491): headers with more are damaged.
+const MAX_SIP_ORDER: i32 = 9;
+// Largest number of a coefficient PVi_m of TPV.
+const MAX_TPV: usize = 39;
+// Powers of x and y, or of r, of the coefficients of TPV for the first axis. The second axis has x and y exchanged
+// (https://fits.gsfc.nasa.gov/registry/tpvwcs/tpv.html).
+const TPV_ORDERS: i32 = 7;
+// Distortions are small, so that Newton's method needs some five steps.
+const MAX_STEPS: usize = 50;
+const INVERSE_ERROR_PX: f64 = 1e-9;
+
+pub(crate) type Matrix = [[f64; 2]; 2];
+
+const ARCSEC_PER_RADIAN: f64 = 648_000.0 / std::f64::consts::PI;
+
+/// Coefficients of a distortion of one axis.
+#[derive(Debug, Clone, PartialEq)]
+struct Polynomial {
+    /// Powers of x and y.
+    terms: Vec<([i32; 2], f64)>,
+    /// Odd powers of the distance from the origin.
+    radial: Vec<(i32, f64)>,
+}
+
+impl Polynomial {
+    /// The value and its derivatives.
+    fn at(&self, [x, y]: [f64; 2]) -> (f64, [f64; 2]) {
+        let (mut value, mut slope) = (0.0, [0.0; 2]);
+        for &([i, j], factor) in &self.terms {
+            let (xi, yj) = (x.powi(i), y.powi(j));
+            value += factor * xi * yj;
+            if i > 0 {
+                slope[0] += factor * f64::from(i) * x.powi(i - 1) * yj;
+            }
+            if j > 0 {
+                slope[1] += factor * f64::from(j) * xi * y.powi(j - 1);
+            }
+        }
+        let r = x.hypot(y);
+        for &(n, factor) in &self.radial {
+            value += factor * r.powi(n);
+            // The distance itself has no derivative at the origin, where its mean is zero.
+            if r > 0.0 {
+                let by_r = factor * f64::from(n) * r.powi(n - 2);
+                slope[0] += by_r * x;
+                slope[1] += by_r * y;
+            }
+        }
+        (value, slope)
+    }
+
+    fn both(axes: &[Self; 2], at: [f64; 2]) -> ([f64; 2], Matrix) {
+        let [first, second] = axes.each_ref().map(|axis| axis.at(at));
+        ([first.0, second.0], [first.1, second.1])
+    }
+}
+
+#[derive(Debug, Clone, PartialEq)]
+enum Projection {
+    /// A plane in arcseconds.
+    Plane,
+    /// The gnomonic one about a point, with the distortion of TPV or without.
+    Tangent {
+        ra: f64,
+        dec: f64,
+        /// Native longitude of the celestial pole in radians.
+        lonpole: f64,
+        tpv: Option<[Polynomial; 2]>,
+    },
+}
+
+/// The way from pixels to the sky (Greisen & Calabretta 2002, A&A 395, 1061; Calabretta & Greisen 2002, A&A 395, 1077). The CDS's
+/// crate `wcs` 0.4 has no TPV, leaves SIP untested and gives no derivative.
+#[derive(Debug, Clone, PartialEq)]
+struct Map {
+    /// The pixel of the reference point.
+    origin: [f64; 2],
+    sip: Option<[Polynomial; 2]>,
+    /// To arcseconds of a plane along west and north, or to degrees of longitude and latitude.
+    matrix: Matrix,
+    projection: Projection,
+}
+
+impl Map {
+    /// Coordinates on the projection plane, longitude first, and their derivatives by pixels.
+    fn plane(&self, at: [f64; 2]) -> ([f64; 2], Matrix) {
+        let mut offset = [0, 1].map(|k| at[k] - self.origin[k]);
+        let mut slope = self.matrix;
+        if let Some(sip) = &self.sip {
+            let (shift, mut by) = Polynomial::both(sip, offset);
+            offset = [0, 1].map(|k| offset[k] + shift[k]);
+            by[0][0] += 1.0;
+            by[1][1] += 1.0;
+            slope = product(&self.matrix, &by);
+        }
+        let place = apply(&self.matrix, offset);
+        match &self.projection {
+            Projection::Tangent { tpv: Some(tpv), .. } => {
+                let (place, by) = Polynomial::both(tpv, place);
+                (place, product(&by, &slope))
+            }
+            _ => (place, slope),
+        }
+    }
+
+    /// The pixel of coordinates on the projection plane; `None` where the distortion has no inverse.
+    fn pixel(&self, wanted: [f64; 2]) -> Option<[f64; 2]> {
+        let mut at = self.origin;
+        for _ in 0..MAX_STEPS {
+            let (place, slope) = self.plane(at);
+            let step = apply(&inverse(&slope)?, [0, 1].map(|k| wanted[k] - place[k]));
+            at = [0, 1].map(|k| at[k] + step[k]);
+            if step[0].hypot(step[1]) < INVERSE_ERROR_PX {
+                return Some(at);
+            }
+        }
+        None
+    }
+
+    /// Right ascension and declination in degrees, and the derivatives of (west, north) in arcseconds there.
+    fn sky(&self, at: [f64; 2]) -> (Option<[f64; 2]>, Matrix) {
+        let (place, slope) = self.plane(at);
+        let Projection::Tangent {
+            ra, dec, lonpole, ..
+        } = &self.projection
+        else {
+            return (None, slope);
+        };
+        let [centre, east, north] = tangent([*ra, *dec], *lonpole);
+        let [xi, eta] = place.map(f64::to_radians);
+        let point = [0, 1, 2].map(|k| centre[k] + xi * east[k] + eta * north[k]);
+        let length = dot(&point, &point).sqrt();
+        let there = [
+            point[1].atan2(point[0]).to_degrees().rem_euclid(360.0),
+            point[2].atan2(point[0].hypot(point[1])).to_degrees(),
+        ];
+        // A step on the tangent plane moves the direction by its part across it, which west and north of the place itself
+        // measure: towards the poles they turn against those of the reference point.
+        let [_, its_east, its_north] = tangent(there, std::f64::consts::PI);
+        let row = |axis: &[f64; 3]| [&east, &north].map(|by| dot(axis, by) / length);
+        let local = [row(&its_east).map(|value| -value), row(&its_north)];
+        let scale = ARCSEC_PER_RADIAN * 1f64.to_radians();
+        let jacobian = product(&local, &slope).map(|row| row.map(|value| value * scale));
+        (Some(there), jacobian)
+    }
+
+    /// The pixel of a place on the sky; `None` on its other half, and where the distortion has no inverse.
+    fn pixel_of(&self, sky: [f64; 2]) -> Option<[f64; 2]> {
+        let Projection::Tangent {
+            ra, dec, lonpole, ..
+        } = &self.projection
+        else {
+            return None;
+        };
+        let [centre, east, north] = tangent([*ra, *dec], *lonpole);
+        let [point, ..] = tangent(sky, std::f64::consts::PI);
+        let height = dot(&point, &centre);
+        if height.is_nan() || height <= 0.0 {
+            return None;
+        }
+        self.pixel([&east, &north].map(|axis| (dot(&point, axis) / height).to_degrees()))
+    }
+}
+
+/// Unit vectors to a place in degrees, and along the axes of the tangent plane there: east and north, if the pole is at π.
+fn tangent([ra, dec]: [f64; 2], lonpole: f64) -> [[f64; 3]; 3] {
+    let ((sin_ra, cos_ra), (sin_dec, cos_dec)) =
+        (ra.to_radians().sin_cos(), dec.to_radians().sin_cos());
+    let east = [-sin_ra, cos_ra, 0.0];
+    let north = [-sin_dec * cos_ra, -sin_dec * sin_ra, cos_dec];
+    // The direction to the pole has the native longitude φ, that is (sin φ, −cos φ) on the plane.
+    let (sine, cosine) = lonpole.sin_cos();
+    [
+        [cos_dec * cos_ra, cos_dec * sin_ra, sin_dec],
+        [0, 1, 2].map(|k| -cosine * east[k] + sine * north[k]),
+        [0, 1, 2].map(|k| -sine * east[k] - cosine * north[k]),
+    ]
+}
+
+fn dot(a: &[f64; 3], b: &[f64; 3]) -> f64 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
 
 /// What a header states of the pixels on the sky.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub(crate) struct Wcs {
     /// Arcseconds per pixel.
     scale: Option<f64>,
-    /// Derivatives of (u, v) by x (first column) and y in arcseconds, with u to the west and v to the north.
-    jacobian: Option<[[f64; 2]; 2]>,
+    map: Option<Map>,
+    /// CTYPE1 if it is a projection that is not read: only the matrix is used then.
+    unread: Option<String>,
 }
 
 impl Wcs {
     pub(crate) fn of_header(image: &ImageReader) -> Self {
         // A key that is no number is no scale.
-        let number = |key: &str| image.number(key).ok().flatten();
-        let text = |key: &str| image.text(key).trim().to_ascii_uppercase();
-        let kind = text("CTYPE1");
+        Wcs::of_keys(
+            |key| image.number(key).ok().flatten(),
+            |key| image.text(key).trim().to_ascii_uppercase(),
+        )
+    }
+
+    fn of_keys(number: impl Fn(&str) -> Option<f64>, text: impl Fn(&str) -> String) -> Self {
+        let kinds = ["CTYPE1", "CTYPE2"].map(&text);
+        let kind = kinds[0].as_str();
         // GalSim writes planes in arcseconds without a unit.
         let plane = kind == "LINEAR";
         let unit = match text("CUNIT1").as_str() {
             "ARCSEC" => 1.0,
             "" if plane && !text("GS_WCS").is_empty() => 1.0,
             "ARCMIN" => 60.0,
-            "RAD" => 648_000.0 / std::f64::consts::PI,
+            "RAD" => ARCSEC_PER_RADIAN,
             _ => 3600.0,
         };
-        let steps = CDELT_KEYS.map(number);
-        let matrix = cd(MATRIX.map(number)).or_else(|| {
+        let steps = CDELT_KEYS.map(&number);
+        let matrix = cd(MATRIX.map(&number)).or_else(|| {
             let [x, y] = [steps[0]?, steps[1]?];
             let (sine, cosine) = number(ROTATION).unwrap_or(0.0).to_radians().sin_cos();
-            let [xx, xy, yx, yy] = STEPLESS.map(number);
+            let [xx, xy, yx, yy] = STEPLESS.map(&number);
             Some(match [xx, xy, yx, yy].iter().any(Option::is_some) {
                 true => {
                     let [xx, yy] = [xx, yy].map(|value| value.unwrap_or(1.0));
@@ -61,32 +252,123 @@ impl Wcs {
             })
         });
         let matrix = matrix.filter(|m| determinant(m).is_normal());
-        let stated = PIXEL_SCALE_KEYS.into_iter().find_map(number);
-        let scale = stated.or_else(|| Some(determinant(&matrix?).abs().sqrt() * unit));
-        Wcs {
-            scale: scale.filter(|scale| PLAUSIBLE.contains(scale)),
-            jacobian: matrix.map(|matrix| {
-                let [first, second] = matrix.map(|row| row.map(|value| value * unit));
-                let west = |row: [f64; 2]| row.map(|value| -value);
-                if plane {
-                    [first, second]
-                } else if kind.starts_with("DEC") || kind.get(1..4) == Some("LAT") {
-                    [west(second), first]
-                } else if kind.starts_with("RA") || kind.get(1..4) == Some("LON") {
-                    [west(first), second]
-                } else if determinant(&matrix) < 0.0 {
-                    // Unnamed axes are right ascension and declination if one of them is reversed.
-                    [west(first), second]
-                } else {
-                    [first, second]
-                }
-            }),
+        let stated = PIXEL_SCALE_KEYS.into_iter().find_map(&number);
+        let plausible = |scale: &f64| PLAUSIBLE.contains(scale);
+        let of_matrix = matrix.map(|matrix| determinant(&matrix).abs().sqrt() * unit);
+        let scale = stated.or(of_matrix).filter(plausible);
+        let Some(matrix) = matrix else {
+            return Wcs {
+                scale,
+                ..Wcs::default()
+            };
+        };
+        let latitude_first = kind.starts_with("DEC") || kind.get(1..4) == Some("LAT");
+        let named = latitude_first || kind.starts_with("RA") || kind.get(1..4) == Some("LON");
+        let equatorial = kind.starts_with("DEC") || kind.starts_with("RA");
+        let longitude = usize::from(latitude_first);
+        let origin = ["CRPIX1", "CRPIX2"].map(|key| number(key).unwrap_or(0.0));
+        let in_unit = |matrix: Matrix, unit: f64| matrix.map(|row| row.map(|v| v * unit));
+        let projection = kind.get(5..8).unwrap_or_default();
+        let read = equatorial && ["TAN", "TPV"].contains(&projection);
+        if !read {
+            let [first, second] = in_unit(matrix, unit);
+            let west = |row: [f64; 2]| row.map(|value| -value);
+            let matrix = match (plane, latitude_first) {
+                (true, _) => [first, second],
+                (_, true) => [west(second), first],
+                // Unnamed axes are right ascension and declination if one of them is reversed.
+                _ if named || determinant(&matrix) < 0.0 => [west(first), second],
+                _ => [first, second],
+            };
+            return Wcs {
+                scale,
+                map: Some(Map {
+                    origin,
+                    sip: None,
+                    matrix,
+                    projection: Projection::Plane,
+                }),
+                unread: named.then(|| kind.to_owned()),
+            };
         }
+        let [first, second] = in_unit(matrix, unit / 3600.0);
+        let centre = ["CRVAL1", "CRVAL2"].map(|key| number(key).unwrap_or(0.0) * unit / 3600.0);
+        let (ra, dec) = (centre[longitude], centre[1 - longitude]);
+        let usual = if dec >= 90.0 { 0.0 } else { 180.0 };
+        let sip = kind
+            .ends_with("-SIP")
+            .then(|| ["A", "B"].map(|name| sip(name, &number)));
+        // SCAMP wrote distortions of TPV under the name TAN.
+        let latitude = 2 - longitude;
+        let scamp = (0..=MAX_TPV).any(|m| number(&format!("PV{latitude}_{m}")).is_some());
+        let tpv = projection == "TPV" || scamp;
+        Wcs {
+            scale,
+            map: Some(Map {
+                origin,
+                sip,
+                matrix: match latitude_first {
+                    true => [second, first],
+                    false => [first, second],
+                },
+                projection: Projection::Tangent {
+                    ra,
+                    dec,
+                    lonpole: number("LONPOLE").unwrap_or(usual).to_radians(),
+                    tpv: tpv.then(|| {
+                        [longitude, 1 - longitude]
+                            .map(|axis| tpv_of(axis, &number, axis == longitude))
+                    }),
+                },
+            }),
+            unread: None,
+        }
+    }
+
+    /// Derivatives of (u, v) by x (first column) and y in arcseconds at a pixel, with u to the west and v to the north.
+    pub(crate) fn jacobian(&self, at: [f64; 2]) -> Option<Matrix> {
+        Some(self.map.as_ref()?.sky(at).1)
+    }
+
+    /// The same at the reference point.
+    fn reference(&self) -> Option<Matrix> {
+        let map = self.map.as_ref()?;
+        Some(match map.projection {
+            Projection::Plane => map.matrix,
+            Projection::Tangent { .. } => {
+                let plain = Map {
+                    sip: None,
+                    ..map.clone()
+                };
+                plain.sky(map.origin).1
+            }
+        })
+    }
+
+    /// Whether pixels have places on the sky.
+    pub(crate) fn has_sky(&self) -> bool {
+        let projection = self.map.as_ref().map(|map| &map.projection);
+        matches!(projection, Some(Projection::Tangent { .. }))
+    }
+
+    /// Right ascension and declination of a pixel in degrees.
+    pub(crate) fn sky(&self, at: [f64; 2]) -> Option<[f64; 2]> {
+        self.map.as_ref()?.sky(at).0
+    }
+
+    /// The pixel of a right ascension and declination in degrees.
+    pub(crate) fn pixel(&self, sky: [f64; 2]) -> Option<[f64; 2]> {
+        self.map.as_ref()?.pixel_of(sky)
+    }
+
+    /// The projection of a header that is not read.
+    pub(crate) fn unread(&self) -> Option<&str> {
+        self.unread.as_deref()
     }
 
     /// Keys that state the same of an image of other stamps of these pixels, as GalSim writes and reads them.
     pub(crate) fn keys(&self) -> Vec<(&'static str, Value)> {
-        let Some([[xx, xy], [yx, yy]]) = self.jacobian else {
+        let Some([[xx, xy], [yx, yy]]) = self.reference() else {
             return Vec::new();
         };
         let text = |text: &str| Value::Text(text.into());
@@ -98,15 +380,29 @@ impl Wcs {
         keys
     }
 
+    /// A plane of these pixels.
+    pub(crate) fn of_jacobian(matrix: Matrix) -> Self {
+        Wcs {
+            scale: Some(determinant(&matrix).abs().sqrt()),
+            map: Some(Map {
+                origin: [0.0; 2],
+                sip: None,
+                matrix,
+                projection: Projection::Plane,
+            }),
+            unread: None,
+        }
+    }
+
+    /// The pixel axes against the sky's.
+    pub(crate) fn frame_of(jacobian: &Matrix) -> PixelFrame {
+        frame(jacobian)
+    }
+
     /// A warning if the ellipticities along these pixels are not along the sky's axes.
     pub(crate) fn frame(&self) -> Option<Warning> {
-        let frame = frame(&self.jacobian?);
-        // Ellipticities do not change by half a turn.
-        let turned = (frame.angle + 90.0).rem_euclid(180.0) - 90.0;
-        let differs = frame.mirrored
-            || turned.abs() > LEAST_ROTATION
-            || frame.shear[0].hypot(frame.shear[1]) > LEAST_SHEAR;
-        differs.then_some(Warning::PixelFrame(frame))
+        let jacobian = self.reference()?;
+        (!aligned(&jacobian)).then(|| Warning::PixelFrame(frame(&jacobian)))
     }
 
     /// Warnings if the PSF and the galaxies state different pixels.
@@ -117,12 +413,12 @@ impl Wcs {
             differs.then_some(Warning::PixelScale { psf, galaxies })
         };
         let frames = || {
-            let (psf, galaxies) = (psf.jacobian?, galaxies.jacobian?);
+            let (psf, galaxies) = (psf.reference()?, galaxies.reference()?);
             let PixelFrame {
                 angle,
                 mirrored,
                 shear: [g1, g2],
-            } = frame(&ratio(&psf, &galaxies));
+            } = frame(&product(&inverse(&psf)?, &galaxies));
             let differs =
                 mirrored || angle.abs() > LEAST_ROTATION || g1.hypot(g2) > LEAST_DIFFERENCE;
             differs.then(|| Warning::PsfFrame {
@@ -142,16 +438,70 @@ fn cd([xx, xy, yx, yy]: [Option<f64>; 4]) -> Option<[[f64; 2]; 2]> {
     Some([[xx, xy], [yx, yy]].map(|row| row.map(|value| value.unwrap_or(0.0))))
 }
 
-fn determinant([[a, b], [c, d]]: &[[f64; 2]; 2]) -> f64 {
-    a * d - b * c
+/// The coefficients of an axis of SIP, `A` or `B`, of offsets from the reference pixel.
+fn sip(name: &str, number: impl Fn(&str) -> Option<f64>) -> Polynomial {
+    let order = number(&format!("{name}_ORDER")).unwrap_or(0.0) as i32;
+    let order = order.min(MAX_SIP_ORDER);
+    let powers = (0..=order).flat_map(|i| (0..=order - i).map(move |j| [i, j]));
+    let terms = powers.filter_map(|[i, j]| Some(([i, j], number(&format!("{name}_{i}_{j}"))?)));
+    Polynomial {
+        terms: terms.collect(),
+        radial: Vec::new(),
+    }
 }
 
-/// The pixels of `galaxies` in units of those of `psf`.
-fn ratio(psf: &[[f64; 2]; 2], galaxies: &[[f64; 2]; 2]) -> [[f64; 2]; 2] {
-    let all = determinant(psf);
-    let [[a, b], [c, d]] = *psf;
-    let rows = [[d / all, -b / all], [-c / all, a / all]];
-    rows.map(|[x, y]| [0, 1].map(|k| x * galaxies[0][k] + y * galaxies[1][k]))
+/// The coefficients of an axis of TPV, from 0, in degrees, by longitude and latitude.
+fn tpv_of(axis: usize, number: impl Fn(&str) -> Option<f64>, longitude: bool) -> Polynomial {
+    let factor = |m: usize| number(&format!("PV{}_{m}", axis + 1));
+    let (mut terms, mut radial) = (Vec::new(), Vec::new());
+    let mut m = 0;
+    for order in 0..=TPV_ORDERS {
+        for j in 0..=order {
+            // Without it the coordinate itself.
+            let factor = factor(m).or((m == 1).then_some(1.0));
+            let powers = if longitude {
+                [order - j, j]
+            } else {
+                [j, order - j]
+            };
+            terms.extend(factor.map(|factor| (powers, factor)));
+            m += 1;
+        }
+        if order % 2 == 1 {
+            radial.extend(factor(m).map(|factor| (order, factor)));
+            m += 1;
+        }
+    }
+    Polynomial { terms, radial }
+}
+
+fn apply(matrix: &Matrix, [x, y]: [f64; 2]) -> [f64; 2] {
+    matrix.map(|row| row[0] * x + row[1] * y)
+}
+
+fn product(a: &Matrix, b: &Matrix) -> Matrix {
+    a.map(|row| [0, 1].map(|k| row[0] * b[0][k] + row[1] * b[1][k]))
+}
+
+fn inverse(matrix: &Matrix) -> Option<Matrix> {
+    let all = determinant(matrix);
+    let [[a, b], [c, d]] = *matrix;
+    all.is_normal()
+        .then(|| [[d / all, -b / all], [-c / all, a / all]])
+}
+
+/// Whether ellipticities along the pixel axes are ellipticities along the sky's.
+pub(crate) fn aligned(jacobian: &Matrix) -> bool {
+    let frame = frame(jacobian);
+    // Ellipticities do not change by half a turn.
+    let turned = (frame.angle + 90.0).rem_euclid(180.0) - 90.0;
+    !frame.mirrored
+        && turned.abs() <= ALIGNED_DEGREES
+        && frame.shear[0].hypot(frame.shear[1]) <= ALIGNED_SHEAR
+}
+
+fn determinant([[a, b], [c, d]]: &[[f64; 2]; 2]) -> f64 {
+    a * d - b * c
 }
 
 fn frame(jacobian: &[[f64; 2]; 2]) -> PixelFrame {
@@ -183,6 +533,48 @@ mod tests {
         writer.write_rows(&[0.0; 4]).unwrap();
         writer.finish().unwrap();
         Wcs::of_header(&ImageReader::open(&path).unwrap())
+    }
+
+    #[test]
+    fn places_and_derivatives_are_those_of_astropy() {
+        let (mut keys, mut checked) = (std::collections::HashMap::new(), 0);
+        let lines = include_str!("wcs/astropy.txt").lines();
+        for line in lines.filter(|line| !line.starts_with('#')) {
+            if line.starts_with('[') {
+                keys.clear();
+            } else if let Some((key, value)) = line.split_once(" = ") {
+                keys.insert(key, value);
+            } else if let Some(numbers) = line.strip_prefix("at ") {
+                let numbers: Vec<f64> = numbers.split(' ').map(|n| n.parse().unwrap()).collect();
+                let &[x, y, ra, dec, ux, uy, vx, vy] = &numbers[..] else {
+                    panic!("{line}");
+                };
+                let wcs = Wcs::of_keys(
+                    |key| keys.get(key)?.parse().ok(),
+                    |key| {
+                        keys.get(key)
+                            .map_or_else(String::new, |text| text.to_ascii_uppercase())
+                    },
+                );
+                let sky = wcs.sky([x, y]).unwrap();
+                // 1e-6 px are 6e-11 degrees.
+                let off = [(sky[0] - ra) * dec.to_radians().cos(), sky[1] - dec];
+                assert!(off[0].hypot(off[1]) < 2e-11, "{keys:?} {line}: {sky:?}");
+                let back = wcs.pixel([ra, dec]).unwrap();
+                assert!(
+                    (back[0] - x).hypot(back[1] - y) < 1e-6,
+                    "{keys:?} {line}: {back:?}"
+                );
+                let found = wcs.jacobian([x, y]).unwrap();
+                for (found, expected) in found.as_flattened().iter().zip([ux, uy, vx, vy]) {
+                    assert!((found - expected).abs() < 2e-8, "{keys:?} {line}: {found}");
+                }
+                checked += 1;
+            }
+        }
+        assert_eq!(checked, 36);
+        let wcs = sky([-1.0, 0.0, 0.0, 1.0]);
+        assert_eq!(wcs.pixel([180.0, 0.0]), None);
     }
 
     const DEGREES: f64 = 0.2 / 3600.0;
@@ -264,7 +656,7 @@ mod tests {
             assert_eq!(found, expected, "{matrix:?}");
         }
         let same = wcs(&sky([-cosine, sine, sine, cosine]).keys());
-        let turned = Warning::PixelFrame(frame(&same.jacobian.unwrap())).to_string();
+        let turned = Warning::PixelFrame(frame(&same.reference().unwrap())).to_string();
         assert!(
             turned.contains("+y at position angle 30.0°, not mirrored"),
             "{turned}"
@@ -289,7 +681,7 @@ mod tests {
     fn a_psf_of_other_pixels_is_reported() {
         let scale = |scale| Wcs {
             scale,
-            jacobian: None,
+            ..Wcs::default()
         };
         let kinds = |psf: &Wcs, galaxies: &Wcs| {
             let found = Wcs::disagreements(psf, galaxies);

@@ -4,8 +4,15 @@ use std::collections::HashMap;
 use std::path::Path;
 
 use shearq_files::FileError;
+use shearq_files::frames;
+use shearq_files::frames::polars::{Column, DataFrame, DataType};
 use shearq_files::names_of;
-use shearq_files::table::{self, Columns, MAX_ROWS, Named, Place};
+use shearq_files::table::{self, Columns, FileFormat, MAX_ROWS, Named, Place};
+use shearq_measure::{Observables, ShearedCatalogues};
+
+use crate::measure::COLUMNS;
+use crate::stamp_table;
+use crate::wcs::Wcs;
 
 // Names of columns of positions in pixels counted from 1, the best first, in any case.
 const KNOWN: [[&str; 2]; 6] = [
@@ -16,14 +23,16 @@ const KNOWN: [[&str; 2]; 6] = [
     ["x_image_dbl", "y_image_dbl"],
     ["xpsf_image", "ypsf_image"],
 ];
-// Names of coordinates on the sky, in any case.
-const SKY: [&str; 6] = [
-    "ra",
-    "ra_deg",
-    "alpha_j2000",
-    "alphawin_j2000",
-    "alpha_sky",
-    "right_ascension",
+// Names of columns of identities, in any case, the best first.
+const IDS: [&str; 4] = ["id", "object_id", "source_id", "number"];
+// Names of columns of right ascension and declination in degrees, in any case.
+const DEGREES: [[&str; 2]; 6] = [
+    ["ra", "dec"],
+    ["ra_deg", "dec_deg"],
+    ["alpha_j2000", "delta_j2000"],
+    ["alphawin_j2000", "deltawin_j2000"],
+    ["alpha_sky", "delta_sky"],
+    ["right_ascension", "declination"],
 ];
 // Distance in pixels below which two positions have the same galaxy: stamps are cut to half a pixel.
 const SAME_GALAXY_PX: f64 = 0.5;
@@ -35,56 +44,139 @@ pub struct Table<'a> {
     pub path: &'a Path,
     /// Name or number of the table of a FITS file.
     pub table: Option<&'a str>,
-    /// Names of the columns for x and y, or their numbers in a text table without names; without, known names.
+    /// Names of the columns for x and y, or for right ascension and declination, or their numbers in a text table without
+    /// names; without, known names.
     pub columns: Option<[&'a str; 2]>,
+    /// Whether the columns are right ascension and declination in degrees, whatever their names.
+    pub degrees: bool,
+    /// Name of the column of identities; without, a known name.
+    pub id: Option<&'a str>,
+    /// Names of further columns for the catalogue.
+    pub carry: &'a [String],
 }
 
-/// Positions in FITS pixels: the centre of the first is at 1.
+/// Positions on an exposure.
 pub(super) struct Positions {
     place: Place,
+    /// In FITS pixels: the centre of the first is at 1.
     pub(super) all: Vec<(f64, f64)>,
+    /// In degrees, if the table or the WCS has them.
+    pub(super) sky: Option<[Vec<f64>; 2]>,
+    /// Identities.
+    pub(super) id: Option<Column>,
+    /// Further columns.
+    pub(super) carried: Vec<Column>,
     /// Which columns they are, if the user did not name them.
     pub(super) note: Option<String>,
 }
 
 impl Positions {
-    pub(super) fn read(table: Table<'_>) -> Result<Self, FileError> {
+    /// Reads positions, whose first pixel is `first_pixel`, on an exposure with this WCS.
+    pub(super) fn read(
+        table: Table<'_>,
+        exposure: &Path,
+        wcs: &Wcs,
+        first_pixel: u8,
+    ) -> Result<Self, FileError> {
         let mut place = Place::with_table(table.path, table.table)?;
         let columns = table::columns(&place)?;
         let [x, y] = match table.columns {
             Some(names) => given(&place, &columns, names)?,
-            None => known(&mut place, &columns)?,
+            None => known(&mut place, &columns, wcs.has_sky())?,
         };
-        let read = table::read_from(&place, Some(&[&x, &y]), MAX_ROWS)
-            .map_err(|error| error.hint_of_columns("--columns X,Y names others"))?;
-        let of = |name| table::numbers(&read, name, &place.path);
-        let (xs, ys) = (of(&x)?, of(&y)?);
-        let all: Vec<_> = xs.iter().copied().zip(ys.iter().copied()).collect();
-        if all.is_empty() {
-            let message = "there is no position; expected one per row";
+        let names = names_in(&columns, &place, [&x, &y]);
+        let degrees = table.degrees || DEGREES.iter().any(|pair| is_pair(pair, [&x, &y]));
+        let sky = if degrees {
+            None
+        } else {
+            pair_of(&DEGREES, names)
+        };
+        let id = match table.id {
+            Some(id) => Some(id.to_owned()),
+            None => IDS.iter().find_map(|id| find(names, id)),
+        };
+        if x == y {
+            let message = format!("the column `{x}` is asked for twice");
             return Err(FileError::new(&place.path, message));
         }
+        if let Some(name) = table.carry.iter().find(|name| is_taken(name)) {
+            let message = format!(
+                "the column `{name}` cannot be carried, because catalogues have one of this name. Try: rename it in the table"
+            );
+            return Err(FileError::new(&place.path, message));
+        }
+        // An identity may be carried too.
+        let mut wanted: Vec<&str> = vec![&x, &y];
+        let texts: Vec<&str> = id.iter().chain(table.carry).map(String::as_str).collect();
+        let reals = sky.iter().flatten().map(String::as_str);
+        for name in reals.chain(texts.iter().copied()) {
+            if !wanted.contains(&name) {
+                wanted.push(name);
+            }
+        }
+        let texts: Vec<&str> = texts
+            .into_iter()
+            .filter(|name| *name != x && *name != y)
+            .collect();
+        let read = read_all(&place, &wanted, &texts)
+            .map_err(|error| error.hint_of_columns("--columns X,Y names others"))?;
+        let of = |name: &str| table::numbers(&read, name, &place.path);
+        let (xs, ys) = (of(&x)?, of(&y)?);
+        let given = xs.iter().copied().zip(ys.iter().copied());
+        let (all, sky) = match degrees {
+            true => {
+                let at = |(row, sky)| on_exposure(&place.path, row, sky, exposure, wcs);
+                let all = given.enumerate().map(at);
+                (
+                    all.collect::<Result<Vec<_>, _>>()?,
+                    Some([xs.to_vec(), ys.to_vec()]),
+                )
+            }
+            false => {
+                // From here on the first pixel is 1.
+                let shift = 1.0 - f64::from(first_pixel);
+                let all: Vec<_> = given.map(|(x, y)| (x + shift, y + shift)).collect();
+                let sky = match &sky {
+                    Some([ra, dec]) => Some([of(ra)?.to_vec(), of(dec)?.to_vec()]),
+                    None => {
+                        let at = all
+                            .iter()
+                            .map(|&(x, y)| wcs.sky([x, y]).map(|[ra, dec]| (ra, dec)));
+                        let both: Option<(Vec<f64>, Vec<f64>)> = at.collect();
+                        both.map(|(ra, dec)| [ra, dec])
+                    }
+                };
+                (all, sky)
+            }
+        };
         let most = f64::from(i32::MAX);
         let wrong = |(x, y): &(f64, f64)| !(x.abs() < most && y.abs() < most);
         if let Some(row) = all.iter().position(wrong) {
-            let (x, y) = all[row];
+            let (x, y) = (xs[row], ys[row]);
             let message = format!(
                 "row {}: the position is ({x}, {y}); expected pixels of the exposure",
                 row + 1
             );
             return Err(FileError::new(&place.path, message));
         }
-        let shown = format!(
-            "{}: positions from the columns {x} and {y}",
-            place.path.display()
-        );
-        let note = match (table.columns, place.table.as_deref()) {
-            (Some(_), _) => None,
-            (None, None) if (x.as_str(), y.as_str()) == ("x", "y") => None,
-            (None, None) => Some(shown),
-            (None, Some(table)) => Some(format!("{shown} of table {table}")),
+        let column = |name: &String| {
+            let column = read.column(name).cloned();
+            column.map_err(|error| FileError::new(&place.path, error))
         };
-        Ok(Positions { place, all, note })
+        let id = id
+            .as_ref()
+            .map(|id| identities(&place.path, column(id)?))
+            .transpose()?;
+        let carried = table.carry.iter().map(column).collect::<Result<_, _>>()?;
+        let note = table.columns.is_none().then(|| note(&place, [&x, &y]));
+        Ok(Positions {
+            place,
+            all,
+            sky,
+            id,
+            carried,
+            note: note.flatten(),
+        })
     }
 
     /// Warnings about the positions on an exposure of this size.
@@ -108,7 +200,7 @@ impl Positions {
         if beyond == count || degrees && count > 2 && 2 * repeated > count {
             let cause = match degrees {
                 true => {
-                    "Are these degrees (right ascension and declination)? Try: convert them to pixels with the WCS of the exposure"
+                    "Are these degrees (right ascension and declination)? Try: --degrees, which uses the WCS of the exposure"
                 }
                 false => {
                     "Are these positions of another image? Try: name the columns with --columns X,Y"
@@ -174,6 +266,41 @@ impl Positions {
     }
 }
 
+/// Which columns were found, unless they are plain x and y.
+fn note(place: &Place, names: [&String; 2]) -> Option<String> {
+    let [x, y] = names.map(String::as_str);
+    let shown = place.path.display();
+    let shown = format!("{shown}: positions from the columns {x} and {y}");
+    match place.table.as_deref() {
+        None => ((x, y) != ("x", "y")).then_some(shown),
+        Some(table) => Some(format!("{shown} of table {table}")),
+    }
+}
+
+/// The pixel of a place on the sky, of a row from 0.
+fn on_exposure(
+    path: &Path,
+    row: usize,
+    (ra, dec): (f64, f64),
+    exposure: &Path,
+    wcs: &Wcs,
+) -> Result<(f64, f64), FileError> {
+    if let Some([x, y]) = wcs.pixel([ra, dec]).filter(|_| dec.abs() <= 90.0) {
+        return Ok((x, y));
+    }
+    let (row, shown) = (row + 1, exposure.display());
+    let message = match wcs.has_sky() {
+        true => format!(
+            "row {row}: the WCS of {shown} does not reach ({ra}, {dec}); expected right ascension and declination in degrees near the exposure"
+        ),
+        false => format!(
+            "the positions are right ascensions and declinations, and the header of {shown} has no WCS for them (found {}; expected TAN, TAN-SIP or TPV). Try: columns in pixels, --columns X,Y",
+            wcs.unread().unwrap_or("none")
+        ),
+    };
+    Err(FileError::new(path, message))
+}
+
 fn given(place: &Place, columns: &Columns, names: [&str; 2]) -> Result<[String; 2], FileError> {
     let owned = names.map(str::to_owned);
     let numbers = names.iter().all(|name| name.parse::<usize>().is_ok());
@@ -195,13 +322,17 @@ fn given(place: &Place, columns: &Columns, names: [&str; 2]) -> Result<[String; 
     ))
 }
 
-/// The columns with known names, or the only two columns. Sets the table that has them.
-fn known(place: &mut Place, columns: &Columns) -> Result<[String; 2], FileError> {
-    let found: Vec<(&Named, [String; 2])> = columns
-        .named
-        .iter()
-        .filter_map(|named| Some((named, pair(&named.names)?)))
-        .collect();
+/// The columns with known names, or the only two columns: of pixels, or else `of_sky`. Sets the table that has them.
+fn known(place: &mut Place, columns: &Columns, of_sky: bool) -> Result<[String; 2], FileError> {
+    let pairs = |known: &[[&str; 2]; 6]| -> Vec<(&Named, [String; 2])> {
+        let named = columns.named.iter();
+        let found = named.filter_map(|named| Some((named, pair_of(known, &named.names)?)));
+        found.collect()
+    };
+    let mut found = pairs(&KNOWN);
+    if found.is_empty() && of_sky {
+        found = pairs(&DEGREES);
+    }
     match found.as_slice() {
         [(named, pair), others @ ..] if others.is_empty() || named.doubtful => {
             if let Some((number, _)) = &named.table {
@@ -227,9 +358,9 @@ fn known(place: &mut Place, columns: &Columns) -> Result<[String; 2], FileError>
     let all: Vec<&String> = columns.named.iter().flat_map(|n| &n.names).collect();
     let sky = all
         .iter()
-        .any(|name| SKY.iter().any(|sky| name.eq_ignore_ascii_case(sky)));
+        .any(|name| DEGREES.iter().any(|[ra, _]| name.eq_ignore_ascii_case(ra)));
     let degrees = match sky {
-        true => ". Coordinates on the sky have to be converted to pixels first",
+        true => ". Coordinates on the sky need an exposure with a WCS (TAN, TAN-SIP or TPV)",
         false => "",
     };
     let certain: Vec<&String> = columns
@@ -257,14 +388,124 @@ fn known(place: &mut Place, columns: &Columns) -> Result<[String; 2], FileError>
     ))
 }
 
-fn pair(names: &[String]) -> Option<[String; 2]> {
-    let find = |wanted: &str| {
-        names
-            .iter()
-            .find(|name| name.eq_ignore_ascii_case(wanted))
-            .cloned()
+/// The first of the `known` pairs of names that a table has.
+fn pair_of(known: &[[&str; 2]], names: &[String]) -> Option<[String; 2]> {
+    known
+        .iter()
+        .find_map(|[x, y]| Some([find(names, x)?, find(names, y)?]))
+}
+
+fn is_pair(known: &[&str; 2], names: [&String; 2]) -> bool {
+    let mut both = known.iter().zip(names);
+    both.all(|(known, name)| name.eq_ignore_ascii_case(known))
+}
+
+/// The name as the table spells it.
+fn find(names: &[String], wanted: &str) -> Option<String> {
+    let same = |name: &&String| name.eq_ignore_ascii_case(wanted);
+    names.iter().find(same).cloned()
+}
+
+/// The names of the table that has these columns.
+fn names_in<'c>(columns: &'c Columns, place: &Place, both: [&String; 2]) -> &'c [String] {
+    let meant = |named: &&Named| {
+        let table = named.table.as_ref().map(|(number, _)| number.to_string());
+        let has = both.iter().all(|name| named.names.contains(name));
+        has && (place.table.is_none() || columns.named.len() == 1 || place.table == table)
     };
-    KNOWN.iter().find_map(|[x, y]| Some([find(x)?, find(y)?]))
+    let found = columns.named.iter().find(meant);
+    found.map_or(&[], |named| &named.names)
+}
+
+/// Whether catalogues or the table of stamps have a column of this name; FITS does not distinguish cases.
+fn is_taken(name: &str) -> bool {
+    let measured = COLUMNS.iter().map(|(name, _)| *name);
+    let own = stamp_table::PLACE.into_iter().chain(stamp_table::JACOBIAN);
+    let own = own
+        .chain(stamp_table::ORIGIN)
+        .chain([stamp_table::ID, "snr"]);
+    let mut taken = measured.chain(Observables::COLUMNS).chain(own);
+    taken.any(|other| name.eq_ignore_ascii_case(other))
+        || ShearedCatalogues::columns().any(|other| name.eq_ignore_ascii_case(&other))
+}
+
+/// The columns `wanted`, of which `texts` keep texts and all digits of integers.
+fn read_all(place: &Place, wanted: &[&str], texts: &[&str]) -> Result<DataFrame, FileError> {
+    let mut all: Option<DataFrame> = None;
+    let mut rows = 0;
+    table::read_parts(place, wanted, texts, |part| {
+        rows += part.height();
+        if rows > MAX_ROWS {
+            let message = format!("there are {rows} rows or more; expected at most {MAX_ROWS}");
+            return Err(FileError::new(&place.path, message));
+        }
+        match &mut all {
+            None => all = Some(part),
+            Some(all) => {
+                let joined = all.vstack_mut_owned(part).map(drop);
+                joined.map_err(|error| FileError::new(&place.path, error))?;
+            }
+        }
+        Ok(())
+    })?;
+    all.filter(|all| all.height() > 0).ok_or_else(|| {
+        let message = "there is no position; expected one per row";
+        FileError::new(&place.path, message)
+    })
+}
+
+/// Identities as 64-bit integers or texts, each of one galaxy.
+fn identities(path: &Path, column: Column) -> Result<Column, FileError> {
+    let fault = |row: usize, what: String| {
+        let message = format!(
+            "row {}: {what}; expected one id per galaxy. Try: --id with another column, or remove duplicates",
+            row + 1
+        );
+        FileError::new(path, message)
+    };
+    let column = match column.dtype() {
+        // Of text tables, integers beyond 2⁵³ are texts.
+        DataType::String if FileFormat::of(path).is_none() => {
+            let texts = column.str().map_err(|error| FileError::new(path, error))?;
+            let whole = |text: Option<&str>| {
+                let number: i64 = text?.parse().ok()?;
+                (number.to_string() == text?).then_some(number)
+            };
+            let all: Option<Vec<i64>> = texts.iter().map(whole).collect();
+            all.map_or(column, |all| Column::new("id".into(), all))
+        }
+        DataType::String => column,
+        // Text tables have numbers.
+        _ => {
+            let whole = column.cast(&DataType::Int64);
+            let whole = whole.map_err(|error| FileError::new(path, error))?;
+            let (before, after) = (frames::reals(&column), frames::reals(&whole));
+            let (Some(before), Some(after)) = (before, after) else {
+                return Err(fault(0, format!("the id is a {}", column.dtype())));
+            };
+            let differs = |(a, b): (&f64, &f64)| a != b && !a.is_nan();
+            if let Some(row) = before.iter().zip(&*after).position(differs) {
+                let what = format!("the id {} is no 64-bit integer", before[row]);
+                return Err(fault(row, what));
+            }
+            whole
+        }
+    };
+    let mut seen = HashMap::new();
+    for row in 0..column.len() {
+        let value = column
+            .get(row)
+            .map_err(|error| FileError::new(path, error))?;
+        if value.is_null() {
+            return Err(fault(row, "the id is missing".to_owned()));
+        }
+        let value = value.str_value();
+        if let Some(earlier) = seen.insert(value.clone(), row) {
+            let what = format!("the id {value} is the one of row {} too", earlier + 1);
+            return Err(fault(row, what));
+        }
+    }
+    Ok(column.with_name("id".into()))
 }
 
 #[cfg(test)]
@@ -275,6 +516,9 @@ mod tests {
         Positions {
             place: Place::of(Path::new("p.csv")),
             all: all.to_vec(),
+            sky: None,
+            id: None,
+            carried: Vec::new(),
             note: None,
         }
     }

@@ -52,7 +52,13 @@ pub(super) fn gather_psfs(
         return functional(data.psf_functional(id.set, id.image), table, mosaic);
     }
     let (stack, mut messages) = Stack::of(files, square)?;
-    let Stack { count, side, wcs } = stack;
+    let &Stack {
+        count,
+        side,
+        ref wcs,
+        ..
+    } = &stack;
+    messages.extend(stack.differs.clone());
     messages.extend(small(&files.paths[0], side));
     let path = data.psf_star(id.set, id.image);
     // Stars of a field, not one star too few of one per galaxy.
@@ -100,7 +106,7 @@ pub(super) fn gather_psfs(
         file: PsfFile::Stars(Box::new(image)),
         examination,
         messages,
-        wcs,
+        wcs: wcs.clone(),
         first: files.paths[0].clone(),
     })
 }
@@ -195,7 +201,12 @@ fn functional(path: PathBuf, table: &Path, mosaic: &Mosaic) -> Result<GatheredPs
 fn averaged(
     path: &Path,
     files: Files<'_>,
-    &Stack { count, side, wcs }: &Stack,
+    &Stack {
+        count,
+        side,
+        ref wcs,
+        ..
+    }: &Stack,
     mut messages: Vec<String>,
 ) -> Result<GatheredPsfs, FileError> {
     let first = &files.paths[0];
@@ -208,7 +219,7 @@ fn averaged(
     }
     let mut all = Vec::with_capacity(pixels);
     let mut planes = Planes::of(files);
-    while let Some((_, pixels)) = planes.next()? {
+    while let Some((_, pixels)) = planes.next::<f32>()? {
         let pixels = central(pixels, planes.sides(), side);
         all.extend(pixels.iter().map(|&value| f64::from(value)));
     }
@@ -230,7 +241,7 @@ fn averaged(
         file: PsfFile::Stars(Box::new(image)),
         examination,
         messages,
-        wcs,
+        wcs: wcs.clone(),
         first: first.clone(),
     })
 }

@@ -55,6 +55,9 @@ pub enum Content {
     Psf,
     /// Masks: not zero for a bad pixel.
     Mask,
+    /// Variances of pixels, or their inverse: a weight.
+    Variance,
+    Weight,
 }
 
 impl Content {
@@ -66,15 +69,27 @@ impl Content {
         match self {
             Content::Sky => companion,
             Content::Psf => companion && !name.eq_ignore_ascii_case("PSF"),
-            Content::Mask => false,
+            Content::Mask | Content::Variance | Content::Weight => false,
         }
     }
 
-    fn option(self) -> &'static str {
+    pub(super) fn option(self) -> &'static str {
         match self {
             Content::Sky => "--extension",
             Content::Psf => "--psf-extension",
             Content::Mask => "--mask-extension",
+            Content::Variance => "--variance-extension",
+            Content::Weight => "--weight-extension",
+        }
+    }
+
+    pub(super) fn noun(self) -> &'static str {
+        match self {
+            Content::Sky => "stamp",
+            Content::Psf => "PSF",
+            Content::Mask => "mask",
+            Content::Variance => "variance map",
+            Content::Weight => "weight map",
         }
     }
 }
@@ -189,6 +204,10 @@ impl<'a> Planes<'a> {
         }
     }
 
+    pub(super) fn content(&self) -> Content {
+        self.images.files.content
+    }
+
     pub(super) fn sides(&self) -> [usize; 2] {
         let now = self.images.now.as_ref();
         now.map_or([0; 2], |image| [image.width(), image.height()])
@@ -256,6 +275,10 @@ impl<'a> Exposure<'a> {
         self.images.now.as_mut().ok_or_else(none)
     }
 
+    pub(super) fn content(&self) -> Content {
+        self.images.files.content
+    }
+
     pub(super) fn sides(&mut self) -> Result<[usize; 2], FileError> {
         let reader = self.reader()?;
         Ok([reader.width(), reader.height()])
@@ -270,8 +293,12 @@ impl<'a> Exposure<'a> {
         let (own, expected) = (self.sides()?, other.sides()?);
         if own != expected {
             let message = format!(
-                "the mask is {} × {} pixels; the exposure has {} × {}",
-                own[0], own[1], expected[0], expected[1]
+                "the {} is {} × {} pixels; the exposure has {} × {}",
+                self.images.files.content.noun(),
+                own[0],
+                own[1],
+                expected[0],
+                expected[1]
             );
             return Err(self.origin.fault(&message));
         }

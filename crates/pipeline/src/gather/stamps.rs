@@ -1,36 +1,17 @@
-//! The stamps of a gathered image, and the table of their origins.
+//! The stamps of a gathered image, with their masks and noise.
 
 use std::path::{Path, PathBuf};
 
 use ndarray::ArrayView2;
-use serde::{Serialize, Serializer};
-use shearq_files::fits::{ImageWriter, Value};
-use shearq_files::text::formula_mark;
+use shearq_files::fits::{ImageWriter, Pixel, Value};
 use shearq_files::{FileError, atomic};
 use shearq_measure::{Examination, examined_rows};
+use shearq_quantities::statistics::upper_median;
 
-use super::source::{Exposure, Files, Origin, Planes, off_middle};
-use super::{Gathering, Masks, Stamps};
+use super::source::{Content, Exposure, Files, Origin, Planes, off_middle};
+use super::{Gathering, Stamps};
 use crate::wcs::Wcs;
 use shearq_dataset::mosaic::Mosaic;
-
-#[derive(Serialize)]
-struct Place<'a> {
-    x: f64,
-    y: f64,
-    #[serde(serialize_with = "cell")]
-    file: &'a Path,
-    image: usize,
-    plane: usize,
-    position_x: Option<f64>,
-    position_y: Option<f64>,
-}
-
-// Writes a path as a cell of CSV, without formulas.
-fn cell<S: Serializer>(path: &Path, serializer: S) -> Result<S::Ok, S::Error> {
-    let path = path.display().to_string();
-    serializer.collect_str(&format_args!("{}{path}", formula_mark(&path)))
-}
 
 /// Writes stamps to the image, and examines some of them.
 pub(super) struct StampWriter {
@@ -38,7 +19,17 @@ pub(super) struct StampWriter {
     pub(super) examination: Examination,
     pub(super) incomplete: usize,
     examined: Vec<usize>,
-    places: csv::Writer<Vec<u8>>,
+    pub(super) origins: Origins,
+    /// Standard deviations of the noise at the galaxies, if a map gives them; NaN for stamps without a pixel.
+    pub(super) levels: Option<Vec<f64>>,
+}
+
+/// Where the stamps come from, one after the other.
+#[derive(Default)]
+pub(super) struct Origins {
+    pub(super) file: Vec<String>,
+    pub(super) image: Vec<i64>,
+    pub(super) plane: Vec<i64>,
 }
 
 impl StampWriter {
@@ -56,7 +47,8 @@ impl StampWriter {
             examination: Examination::new(mosaic.stamp, examined.len() * mosaic.columns),
             incomplete: 0,
             examined,
-            places: csv::Writer::from_writer(Vec::new()),
+            origins: Origins::default(),
+            levels: None,
         })
     }
 
@@ -65,65 +57,92 @@ impl StampWriter {
         gathering: &Gathering<'_>,
         positions: &[(f64, f64)],
     ) -> Result<(), FileError> {
+        self.levels = gathering.variances.map(|_| Vec::new());
         match gathering.stamps {
-            Stamps::Files(files) => self.copy_files(files, gathering.masks),
-            Stamps::Cutouts { exposure, .. } => {
-                self.copy_cutouts(exposure, gathering.masks, positions)
-            }
+            Stamps::Files(files) => self.copy_files(files, gathering),
+            Stamps::Cutouts { exposure, .. } => self.copy_cutouts(exposure, gathering, positions),
         }
     }
 
-    fn copy_files(&mut self, files: Files<'_>, masks: Option<Masks<'_>>) -> Result<(), FileError> {
+    fn copy_files(&mut self, files: Files<'_>, gathering: &Gathering<'_>) -> Result<(), FileError> {
         let side = self.image.mosaic.stamp;
         let mut planes = Planes::of(files);
-        let mut masks = masks.map(|masks| (Planes::of(masks.files), masks.bits));
+        let mut masks = gathering.masks.map(|masks| Planes::of(masks.files));
+        let mut maps = gathering.variances.map(Planes::of);
         while let Some((origin, mut pixels)) = planes.next::<f32>()? {
             let sides = planes.sides();
-            if let Some((masks, bits)) = &mut masks {
-                let Some((place, mask)) = masks.next::<f64>()? else {
-                    return Err(origin.fault("there is no mask for this stamp"));
+            let mut variances = None;
+            for companion in [&mut masks, &mut maps].into_iter().flatten() {
+                let content = companion.content();
+                let noun = content.noun();
+                let Some((place, values)) = companion.next::<f64>()? else {
+                    return Err(origin.fault(&format!("there is no {noun} for this stamp")));
                 };
-                if masks.sides() != sides {
-                    let [columns, rows] = masks.sides();
+                if companion.sides() != sides {
+                    let [columns, rows] = companion.sides();
                     let message = format!(
-                        "the mask is {columns} × {rows} pixels; its stamp has {} × {}",
+                        "the {noun} is {columns} × {rows} pixels; its stamp has {} × {}",
                         sides[0], sides[1]
                     );
                     return Err(place.fault(&message));
                 }
-                another(&place, &origin)?;
-                lose(&mut pixels, &mask, *bits).map_err(|fault| place.fault(&fault))?;
+                another(&place, &origin, content)?;
+                match content {
+                    Content::Mask => {
+                        let bits = gathering.masks.and_then(|masks| masks.bits);
+                        lose(&mut pixels, &values, bits).map_err(|fault| place.fault(&fault))?;
+                    }
+                    _ => variances = Some((place, content, values)),
+                }
+            }
+            if let Some((place, content, mut values)) = variances {
+                let read = variance(&mut pixels, &mut values, content);
+                read.map_err(|fault| place.fault(&fault))?;
+                let values = central(values, sides, side);
+                self.levels
+                    .get_or_insert_default()
+                    .push(level(&values, side));
             }
             self.add(&origin, &central(pixels, sides, side))?;
         }
-        let more = masks
-            .as_mut()
-            .map_or(Ok(None), |(masks, _)| masks.next::<f64>())?;
-        match more {
-            Some((place, _)) => Err(place.fault("there is no stamp for this mask")),
-            None => Ok(()),
+        for companion in [&mut masks, &mut maps].into_iter().flatten() {
+            if let Some((place, _)) = companion.next::<f64>()? {
+                let noun = companion.content().noun();
+                return Err(place.fault(&format!("there is no stamp for this {noun}")));
+            }
         }
+        Ok(())
     }
 
     fn copy_cutouts(
         &mut self,
         exposure: Files<'_>,
-        masks: Option<Masks<'_>>,
+        gathering: &Gathering<'_>,
         positions: &[(f64, f64)],
     ) -> Result<(), FileError> {
         let side = self.image.mosaic.stamp;
         let mut exposure = Exposure::open(exposure)?;
-        let bits = masks.and_then(|masks| masks.bits);
-        let mut masks = masks.map(|masks| Exposure::open(masks.files)).transpose()?;
-        if let Some(mask) = &mut masks {
-            mask.like(&mut exposure)?;
-            another(&mask.origin, &exposure.origin)?;
+        let bits = gathering.masks.and_then(|masks| masks.bits);
+        let masks = gathering.masks.map(|masks| Exposure::open(masks.files));
+        let maps = gathering.variances.map(Exposure::open);
+        let [mut masks, mut maps] = [masks.transpose()?, maps.transpose()?];
+        for companion in [&mut masks, &mut maps].into_iter().flatten() {
+            companion.like(&mut exposure)?;
+            another(&companion.origin, &exposure.origin, companion.content())?;
         }
         for &(x, y) in positions {
             let mut pixels = exposure.square::<f32>((x, y), side)?;
             if let Some(mask) = &mut masks {
                 let square = mask.square::<f64>((x, y), side)?;
                 lose(&mut pixels, &square, bits).map_err(|fault| mask.origin.fault(&fault))?;
+            }
+            if let Some(map) = &mut maps {
+                let mut values = map.square::<f64>((x, y), side)?;
+                variance(&mut pixels, &mut values, map.content())
+                    .map_err(|fault| map.origin.fault(&format!("stamp at ({x}, {y}): {fault}")))?;
+                self.levels
+                    .get_or_insert_default()
+                    .push(level(&values, side));
             }
             let origin = Origin {
                 position: Some((x, y)),
@@ -145,38 +164,78 @@ impl StampWriter {
             let examined = self.examination.add_at(stamp, place);
             examined.map_err(|error| FileError::new(origin.file, error))?;
         }
-        let (x, y) = mosaic.position(next);
-        let place = Place {
-            x,
-            y,
-            file: origin.file,
-            image: origin.image,
-            plane: origin.plane,
-            position_x: origin.position.map(|(x, _)| x),
-            position_y: origin.position.map(|(_, y)| y),
-        };
-        let written = self.places.serialize(place);
-        written.map_err(FileError::doing(
-            origin.file,
-            "cannot write the table of stamps",
-        ))?;
+        self.origins.file.push(origin.file.display().to_string());
+        self.origins.image.push(origin.image as i64);
+        self.origins.plane.push(origin.plane as i64);
         self.image.add(pixels)
-    }
-
-    /// The table of stamps as text, for a file at `path`. Nothing can be added after it.
-    pub(super) fn places(&mut self, path: &Path) -> Result<Vec<u8>, FileError> {
-        let empty = csv::Writer::from_writer(Vec::new());
-        let places = std::mem::replace(&mut self.places, empty).into_inner();
-        places.map_err(|error| FileError::new(path, error.to_string()))
     }
 }
 
-fn another(mask: &Origin<'_>, image: &Origin<'_>) -> Result<(), FileError> {
-    if (mask.file, mask.image) == (image.file, image.image) {
-        let message = "the mask is the image itself; expected another (--mask-extension)";
-        return Err(mask.fault(message));
+fn another(map: &Origin<'_>, image: &Origin<'_>, content: Content) -> Result<(), FileError> {
+    if (map.file, map.image) == (image.file, image.image) {
+        let (noun, option) = (content.noun(), content.option());
+        let message = format!("the {noun} is the image itself; expected another ({option})");
+        return Err(map.fault(&message));
     }
     Ok(())
+}
+
+/// Makes weights variances, and pixels missing that have no weight. Missing pixels may have any value.
+fn variance(pixels: &mut [f32], values: &mut [f64], content: Content) -> Result<(), String> {
+    for (pixel, value) in pixels.iter_mut().zip(values) {
+        let stated = *value;
+        if content == Content::Weight {
+            *value = 1.0 / stated;
+        }
+        // The weight 0, or an infinite variance, marks bad pixels in the maps of most surveys.
+        if *value == f64::INFINITY {
+            *pixel = f32::NAN;
+        }
+        if pixel.is_finite() && (value.is_nan() || *value <= 0.0) {
+            let what = match content {
+                Content::Weight => {
+                    "the weight is {stated}; expected a positive number, or 0 for a bad pixel"
+                }
+                _ => {
+                    "the variance is {stated}; expected a positive number, or infinity for a bad pixel"
+                }
+            };
+            return Err(what.replace("{stated}", &stated.to_string()));
+        }
+        if !pixel.is_finite() {
+            *value = f64::NAN;
+        }
+    }
+    Ok(())
+}
+
+/// The noise level at the galaxy of a stamp with these variances: the median over the pixels outside a circle around the centre.
+///
+/// Maps of many surveys contain the Poisson noise of the counts themselves. A level from pixels of the galaxy would then be high
+/// where its noise is positive, and what is subtracted would correlate with the data. Outside the circle the light of the galaxy
+/// and its noise have no part. As the galaxy is in the middle, it lies on the larger side of any straight border of two depths,
+/// of which the median takes the level, and a gradient cancels. The galaxy's own Poisson noise has to be added (gain).
+fn level(variances: &[f64], side: usize) -> f64 {
+    let middle = (side as f64 - 1.0) / 2.0;
+    // Chosen by hand: 12 px of 48, where most galaxies of a stamp of this size have no light.
+    let radius = side as f64 / 4.0;
+    let outside = |at: usize| {
+        let [x, y] = [at % side, at / side].map(|k| k as f64 - middle);
+        x.hypot(y) > radius
+    };
+    let finite = |at: &usize| variances[*at].is_finite();
+    let chosen = (0..variances.len())
+        .filter(finite)
+        .filter(|&at| outside(at));
+    let mut chosen: Vec<f64> = chosen.map(|at| variances[at]).collect();
+    if chosen.is_empty() {
+        chosen = variances
+            .iter()
+            .copied()
+            .filter(|v| v.is_finite())
+            .collect();
+    }
+    upper_median(&mut chosen).map_or(f64::NAN, f64::sqrt)
 }
 
 // Makes the pixels of a stamp missing whose `mask` is not zero, or has one of these bits.
@@ -203,12 +262,16 @@ fn lose(pixels: &mut [f32], mask: &[f64], bits: Option<u64>) -> Result<(), Strin
 
 /// The central `side` × `side` pixels of an image of some columns and rows; those beyond it are missing. Where the parities
 /// differ, the centre moves by half a pixel.
-pub(super) fn central(pixels: Vec<f32>, [columns, rows]: [usize; 2], side: usize) -> Vec<f32> {
+pub(super) fn central<P: Pixel>(
+    pixels: Vec<P>,
+    [columns, rows]: [usize; 2],
+    side: usize,
+) -> Vec<P> {
     if [columns, rows] == [side; 2] {
         return pixels;
     }
     let first = |there: usize| (there as i64 - side as i64).div_euclid(2);
-    let mut square = vec![f32::NAN; side * side];
+    let mut square = vec![P::MISSING; side * side];
     for (at, pixel) in square.iter_mut().enumerate() {
         let x = usize::try_from(first(columns) + (at % side) as i64);
         let y = usize::try_from(first(rows) + (at / side) as i64);

@@ -8,12 +8,13 @@ use shearq_files::frames::polars::{Column, DataFrame};
 use shearq_files::frames::{TableError, frame};
 use shearq_files::table;
 use shearq_measure::{Batch, Flag, Flags, Measurement, Observables, ShearedCatalogues, Warning};
+use shearq_quantities::Frame;
 use shearq_submissions::{Configuration, EllipticityType};
 
 use super::ImageHead;
 use crate::PipelineError;
 use shearq_dataset::images::ImageId;
-use shearq_dataset::metadata::{PSF_NOISE, WARNINGS, frame_entry};
+use shearq_dataset::metadata::{FIRST_PIXEL, FRAME, PSF_NOISE, WARNINGS, frame_entry};
 use shearq_dataset::record::{Claim, claim};
 use shearq_dataset::run::{RUN_FILE, Run};
 use shearq_dataset::threads::Progress;
@@ -111,9 +112,16 @@ fn catalogue(
     galaxies: &[Measurement],
     configuration: &Configuration,
 ) -> Result<DataFrame, TableError> {
-    let positions = (0..galaxies.len()).map(|place| head.mosaic.position(place));
-    let (x, y): (Vec<f64>, Vec<f64>) = positions.unzip();
-    let mut columns = vec![Column::new("x".into(), x), Column::new("y".into(), y)];
+    let (mut columns, carried) = match &head.table {
+        Some(table) => table.of_catalogue(),
+        None => Default::default(),
+    };
+    // Stamps that are not of an exposure have places in the image of the data folder.
+    if !columns.iter().any(|column| column.name() == "x") {
+        let positions = (0..galaxies.len()).map(|place| head.mosaic.position(place));
+        let (x, y): (Vec<f64>, Vec<f64>) = positions.unzip();
+        columns.extend([Column::new("x".into(), x), Column::new("y".into(), y)]);
+    }
     columns.extend(COLUMNS.iter().map(|(name, value)| match value {
         Value::Real(of) => {
             let values: Vec<f64> = galaxies.iter().map(of).collect();
@@ -126,6 +134,7 @@ fn catalogue(
     }));
     let more = more_columns(configuration, galaxies).into_iter();
     columns.extend(more.map(|(name, values)| Column::new(name.into(), values)));
+    columns.extend(carried);
     frame(columns)
 }
 
@@ -287,6 +296,12 @@ impl<'a> Catalogues<'a> {
             if let Warning::PixelFrame(frame) = warning {
                 metadata.extend([frame_entry(frame)]);
             }
+        }
+        if let Some(table) = &head.table {
+            if table.head.frame == Frame::Sky {
+                metadata.insert(FRAME.into(), Frame::Sky.to_string());
+            }
+            metadata.insert(FIRST_PIXEL.into(), table.head.first_pixel.to_string());
         }
         if let Some([m, c]) = batch.psf_noise {
             metadata.insert(PSF_NOISE.into(), format!("{m:.2e} {c:.2e}"));

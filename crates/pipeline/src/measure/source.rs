@@ -10,9 +10,11 @@ use shearq_measure::{
     FunctionalPsf, KnownNoise, Lazy, LazyStamps, Measurer, Pixels, Psfs, Session, StampRows,
     StampSource, Star, Threads, Warning,
 };
+use shearq_quantities::Jacobian;
 use shearq_submissions::{Configuration, NoiseSource, PsfCut, PsfForm};
 
 use crate::PipelineError;
+use crate::stamp_table::StampTable;
 use crate::wcs::Wcs;
 use shearq_dataset::grid::{self, whole};
 use shearq_dataset::images::ImageId;
@@ -30,6 +32,9 @@ pub struct ImageSource {
     image: ImageReader,
     psfs: PsfSource,
     noise: KnownNoise<'static>,
+    table: Option<StampTable>,
+    #[expect(dead_code, reason = "the next change measures with them")]
+    jacobians: Option<Vec<Jacobian>>,
     warnings: Vec<Warning>,
 }
 
@@ -76,9 +81,17 @@ impl ImageSource {
             stated: stated_by_psf,
         } = open_psfs(data, id, configuration, &mosaic)?;
         let mut warnings: Vec<Warning> = moved.map(Warning::of_moved).into_iter().collect();
+        let stamps = data.stamps(id.set, id.image);
+        let table = StampTable::read(&stamps, &mosaic)?;
+        let jacobians = match &table {
+            Some(table) => table.jacobians(&stamps)?,
+            None => None,
+        };
         let wcs = Wcs::of_header(&image);
         warnings.extend(Wcs::disagreements(&psf_wcs, &wcs));
-        warnings.extend(wcs.frame());
+        if jacobians.is_none() {
+            warnings.extend(wcs.frame());
+        }
         for (of, stated) in [("galaxies", stated_image(&image)), ("PSF", stated_by_psf)] {
             let expected = [id.set, id.image];
             let other = stated.filter(|stated| *stated != expected);
@@ -94,12 +107,19 @@ impl ImageSource {
             image,
             psfs,
             noise: stated.map_or(KnownNoise::Unknown, KnownNoise::Stated),
+            table,
+            jacobians,
             warnings,
         })
     }
 
     pub fn mosaic(&self) -> Mosaic {
         self.mosaic
+    }
+
+    /// The table of the stamps if they were gathered.
+    pub(super) fn take_table(&mut self) -> Option<StampTable> {
+        self.table.take()
     }
 
     /// The session of the image, for a measurer of the configuration that the image was opened for.
