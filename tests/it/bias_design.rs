@@ -8,9 +8,6 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 use serde_json::Value;
-use shearq_files::frames::frame;
-use shearq_files::frames::polars::{Column, NamedFrom, Series};
-use shearq_files::table::{self, FileFormat};
 
 use crate::support::{fail, shearq, succeed, text};
 
@@ -168,34 +165,6 @@ fn rows_in_another_order_are_said_to_change_the_errors() {
 }
 
 #[test]
-fn shears_in_single_precision_pair_with_double_precision() {
-    let folder = tempfile::tempdir().unwrap();
-    let g = [0.02, -0.015];
-    let opposite = g.map(|g: f64| -g);
-    let at = |name: &str| folder.path().join(name);
-    csv(
-        &at("minus.csv"),
-        &shapes(6, 500, opposite, 0.0),
-        &shear(opposite),
-    );
-    let rows = shapes(6, 500, g, 0.0);
-    let of = |k: usize| rows.iter().map(|row| row[k]).collect::<Vec<f64>>();
-    let single =
-        |name: &str, g: f64| Column::from(Series::new(name.into(), vec![g as f32; rows.len()]));
-    let columns = vec![
-        Column::new("e1".into(), of(0)),
-        Column::new("e2".into(), of(1)),
-        single("g1", g[0]),
-        single("g2", g[1]),
-    ];
-    let path = at("plus.parquet");
-    let columns = frame(columns).unwrap();
-    table::write(&path, FileFormat::Parquet, &columns, &Default::default()).unwrap();
-    let printed = succeed(&["bias", text(&path), text(&at("minus.csv"))]);
-    assert!(printed.contains("Design: pairs"), "{printed}");
-}
-
-#[test]
 fn causes_of_implausible_results_are_named() {
     let folder = tempfile::tempdir().unwrap();
     let at = |name: &str| folder.path().join(name);
@@ -278,47 +247,4 @@ fn causes_of_implausible_results_are_named() {
         error.contains("x = 1, y = 1 has two true shears"),
         "{error}"
     );
-}
-
-#[test]
-fn reports_of_bias_state_the_options() {
-    let folder = tempfile::tempdir().unwrap();
-    let at = |name: &str| folder.path().join(name);
-    for (name, g) in [("plus.csv", [0.02, 0.01]), ("minus.csv", [-0.02, -0.01])] {
-        csv(&at(name), &shapes(8, 500, g, 0.0), &shear(g));
-    }
-    let (plus, minus, report) = (at("plus.csv"), at("minus.csv"), at("r.html"));
-    succeed(&[
-        "bias",
-        text(&plus),
-        text(&minus),
-        "--design",
-        "pairs",
-        "--units",
-        "rows",
-        "--bins",
-        "e1:-1,0,1",
-        "--drop-missing",
-        "--ellipticity",
-        "shear",
-        "--step",
-        "0.02",
-        "--fail-above",
-        "m=9@2sigma",
-        "--report",
-        text(&report),
-    ]);
-    let page = fs::read_to_string(report).unwrap();
-    for part in [
-        "Design",
-        "pairs",
-        "Units",
-        "Ellipticities",
-        "e1: [-1.0, 0.0, 1.0]",
-        "missing numbers are left out",
-        "0.02",
-        "|m| ≤ 9e0 within 2 σ",
-    ] {
-        assert!(page.contains(part), "{part}");
-    }
 }

@@ -41,6 +41,5 @@ mod shards;
 mod stored;
 mod submitted;
 mod support;
-mod survey_tables;
 mod terminal;
 mod truth_sign;

@@ -378,37 +378,6 @@ fn galaxies_without_noise_give_the_bias_that_they_have() {
 }
 
 #[test]
-fn equal_shears_of_both_components_have_no_bias_with_the_matrix() {
-    // R12 = R21 = 0.1 adds 0.1/0.8 and 0.1/0.7 to m if only the diagonal is used.
-    let sums = |matrix: bool| {
-        let layout = Layout {
-            matrix,
-            ..Layout::default()
-        };
-        let mut sums = UnitSums::new(layout, 1, 2);
-        for (catalogue, g) in [(0, 0.02), (1, -0.02)] {
-            for key in 0..10 {
-                let w = 1.0 + key as f64;
-                let row = Row {
-                    e: [0.8 * g + 0.1 * g, 0.1 * g + 0.7 * g],
-                    weight: w,
-                    response: [[0.8 * w, 0.1 * w], [0.1 * w, 0.7 * w]],
-                    g: [g; 2],
-                    ..Row::default()
-                };
-                sums.add(catalogue, key, 0, &row);
-            }
-        }
-        sums.by_key()
-    };
-    let m = |matrix| ["m1", "m2"].map(|key| of(&sums(matrix), true).value(key).unwrap().value);
-    for (k, expected) in [0.1 / 0.8, 0.1 / 0.7].into_iter().enumerate() {
-        assert!(m(true)[k].abs() < 1e-14, "{:?}", m(true));
-        assert!((m(false)[k] - expected).abs() < 1e-14);
-    }
-}
-
-#[test]
 fn the_noise_of_a_star_changes_shear_before_the_response() {
     // One star for all galaxies: the errors are those of its m and c, whatever the response is.
     for layout in layouts() {
