@@ -258,9 +258,6 @@ pub struct BiasResult {
 
 impl BiasResult {
     /// The estimates of all galaxies.
-    ///
-    /// # Errors
-    /// If there are none.
     pub fn all(&self) -> Result<&Estimate, BiasError> {
         let first = self.bins.first().map(|bin| bin.estimate.as_ref());
         first
@@ -269,16 +266,14 @@ impl BiasResult {
     }
 }
 
-/// Most values from which the edges of bins with equally many galaxies are determined.
+// Values from which the edges of bins with equally many galaxies are determined, at most: 8 MB, and edges to 0.1 % of the
+// galaxies.
 const SAMPLE: usize = 1 << 20;
 
 /// Most bins.
 pub const MOST_BINS: usize = 100;
 
 /// Sums the catalogues of a request for which `part` holds, given their number.
-///
-/// # Errors
-/// If a catalogue cannot be read, lacks a column, or contains values that are not usable.
 pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, BiasFailure> {
     read::distinct(&request.catalogues)?;
     let paths = request.catalogues.iter().map(|input| input.name.as_path());
@@ -342,6 +337,7 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
         sign,
     };
     let mut summed = Summed { sums, about };
+    // The catalogues are read again rather than the sums changed: g2 enters them in products of all terms.
     if let TrueSign::OfCatalogues(truth) = &request.sign {
         let sign = summed.sign_of_catalogues(truth)?;
         if sign.of == TruthSign::Challenge {
@@ -355,7 +351,7 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
     Ok(summed)
 }
 
-/// The sums of the catalogues for whose numbers `part` holds.
+// The sums of the catalogues for whose numbers `part` holds.
 fn add_up(
     reading: &Reading<'_>,
     all: &[Vec<Source>],
@@ -391,8 +387,9 @@ fn add_up(
                 return;
             }
             if selects {
-                // The ellipticity without artificial shear, of the galaxies that each sheared catalogue selects and with
-                // its weights: the selection response of Sheldon & Huff (2017, equation 14).
+                // The ellipticity without artificial shear of the galaxies that each sheared catalogue selects, with its
+                // weights: the selection response R_S of Sheldon & Huff (2017, ApJ 841, 24). It needs all four catalogues,
+                // because a cut by S/N responds to both components.
                 for catalogue in 1..CATALOGUES {
                     if let Some(bin) = bin_of(edges, item.binned[catalogue]) {
                         add_sheared(bin, catalogue, item.weights[catalogue]);
@@ -407,7 +404,7 @@ fn add_up(
     Ok((sums, catalogues))
 }
 
-/// The sign of the true g2 that the user or files state; `None` if the truth needs no sign or the catalogues determine it.
+// The sign of the true g2 that the user or files state; `None` if the truth needs no sign or the catalogues determine it.
 fn known_sign(request: &Request, all: &[Vec<Source>]) -> Result<Option<Sign>, BiasFailure> {
     let specified = match &request.sign {
         TrueSign::Known(sign) => Some(*sign),
@@ -442,7 +439,7 @@ fn known_sign(request: &Request, all: &[Vec<Source>]) -> Result<Option<Sign>, Bi
     }
 }
 
-/// Refuses catalogues with other columns than the first one.
+// Refuses catalogues with other columns than the first one.
 fn check_columns(request: &Request, all: &[Vec<Source>]) -> Result<(), BiasFailure> {
     let kind = |source: &Source| {
         (
@@ -466,12 +463,11 @@ fn check_columns(request: &Request, all: &[Vec<Source>]) -> Result<(), BiasFailu
     Ok(())
 }
 
-/// Whether the true shear is known.
 fn known(truth: &Truth, source: &Source) -> bool {
     !matches!(truth, Truth::Columns) || source.columns.have(&[Role::G1, Role::G2])
 }
 
-/// The bin of a value; the last one is outside of all edges. `None` for a row that is not selected.
+// The bin of a value; the last one is outside of all edges. `None` for a row that is not selected.
 fn bin_of(edges: &[f64], value: f64) -> Option<usize> {
     if !value.is_finite() {
         return None;
@@ -487,7 +483,7 @@ fn bin_of(edges: &[f64], value: f64) -> Option<usize> {
     Some(if above == 0 { outside } else { above - 1 })
 }
 
-/// Edges of bins with equally many galaxies without artificial shear, from a sample of the catalogues.
+// Edges of bins with equally many galaxies without artificial shear, from a sample of the catalogues.
 fn equal_edges(
     reading: &Reading<'_>,
     all: &[Vec<Source>],
@@ -536,9 +532,6 @@ fn equal_edges(
 
 impl Summed {
     /// Checks sums that were read from a file.
-    ///
-    /// # Errors
-    /// If their parts contradict each other.
     pub fn checked(mut self) -> Result<Self, BiasFailure> {
         let bins = self.about.edges.len().max(1);
         let mut sums = UnitSums::new(self.sums.layout(), bins, self.about.catalogues.len());
@@ -548,9 +541,6 @@ impl Summed {
     }
 
     /// Adds the sums of other catalogues of the same list.
-    ///
-    /// # Errors
-    /// If the lists, options or columns differ, or a catalogue is in both.
     pub fn merge(&mut self, other: Summed) -> Result<(), BiasFailure> {
         self.check_options(&other)?;
         let names = |all: &[Catalogue]| -> Vec<String> {
@@ -570,9 +560,6 @@ impl Summed {
     }
 
     /// Adds the sums of other catalogues, which follow these.
-    ///
-    /// # Errors
-    /// If options or columns differ.
     pub fn append(&mut self, other: Summed) -> Result<(), BiasFailure> {
         self.check_options(&other)?;
         self.about.catalogues.extend(other.about.catalogues);
@@ -585,7 +572,6 @@ impl Summed {
         empty.map(|own| own.name.as_str()).collect()
     }
 
-    /// Refuses sums of other options.
     fn check_options(&self, other: &Summed) -> Result<(), BiasFailure> {
         if self.about.version != other.about.version {
             return Err(BiasFailure::Unlike("versions"));
@@ -617,10 +603,6 @@ impl Summed {
     }
 
     /// The estimates.
-    ///
-    /// # Errors
-    /// If no galaxy counts, an ellipticity is constant, the mean response is too close to zero, or the ellipticities do
-    /// not follow the true shear.
     pub fn result(&self, errors: Errors) -> Result<BiasResult, BiasFailure> {
         let (design, grouping) = self.grouped()?;
         let all = grouping.all_bins().estimate(0, self.about.truth, errors);
@@ -656,7 +638,6 @@ impl Summed {
         [all].into_iter().chain(bins).collect()
     }
 
-    /// Units and design, if the values are usable.
     fn grouped(&self) -> Result<(Design, Grouping), BiasFailure> {
         self.check_values()?;
         let design = self
@@ -674,9 +655,6 @@ impl Summed {
     }
 
     /// Differences of the estimates from `other`, of another program on the same galaxies, with paired errors.
-    ///
-    /// # Errors
-    /// As [`Summed::result`], or if the options or the designs differ.
     pub fn difference(&self, other: &Summed) -> Result<BiasResult, BiasFailure> {
         if (&self.about.binned, &self.about.edges, self.about.truth)
             != (&other.about.binned, &other.about.edges, other.about.truth)
@@ -725,7 +703,7 @@ impl Summed {
         )
     }
 
-    /// The sign of g2 in the file `truth` that e2 follows, from sums for the standard sign.
+    // The sign of g2 in the file `truth` that e2 follows, from sums for the standard sign.
     fn sign_of_catalogues(&self, truth: &Path) -> Result<Sign, BiasFailure> {
         let mut used = self.about.catalogues.iter().filter(|own| own.rows > 0);
         if used.all(|own| own.shear[1].constant() == Some(0.0)) {
@@ -759,7 +737,7 @@ impl Summed {
         undetermined(found)
     }
 
-    /// Refuses catalogues without usable rows, and constant ellipticities.
+    // Refuses catalogues without usable rows, and constant ellipticities.
     fn check_values(&self) -> Result<(), BiasFailure> {
         let total = self.about.total();
         let left_out = [total.flagged, total.unweighted, total.unselected];
@@ -787,11 +765,11 @@ impl Summed {
     }
 }
 
-/// Significance at which an implausible response is refused, and at which the response of e2 determines the sign of g2: one
-/// of 0 exceeds it by chance in 6 of 10⁷ cases.
+// Significance at which an implausible response is refused, and at which the response of e2 determines the sign of g2: one
+// of 0 exceeds it by chance in 6 of 10⁷ cases.
 const SIGNIFICANT: f64 = 5.0;
 
-/// g2/g1 of the true shears, if it is the same in all catalogues: e1 and e2 then respond to both components alike.
+// g2/g1 of the true shears, if it is the same in all catalogues: e1 and e2 then respond to both components alike.
 fn ratio(catalogues: &[Catalogue]) -> Option<f64> {
     let used = catalogues.iter().filter(|catalogue| catalogue.rows > 0);
     let ratios = used.map(|catalogue| {
@@ -806,10 +784,9 @@ fn ratio(catalogues: &[Catalogue]) -> Option<f64> {
         .then_some(first)
 }
 
-/// Largest relative difference of responses from those of exchanged components: a bias of the shapes. Chosen by hand.
+// Largest relative difference of responses from those of exchanged components: a bias of the shapes. Chosen by hand.
 const BIASED: f64 = 0.3;
 
-/// Whether e1 follows g2, and e2 follows g1.
 fn are_exchanged(all: &Estimate, ratio: Option<f64>) -> bool {
     let known = |key: &str| all.value(key).filter(|found| found.error.is_finite());
     let Some([m1, m2]) = known("m1").zip(known("m2")).map(<[_; 2]>::from) else {
@@ -834,7 +811,6 @@ fn are_exchanged(all: &Estimate, ratio: Option<f64>) -> bool {
     })
 }
 
-/// What to try if e2 follows minus the true g2.
 fn other_sign(sign: Option<Sign>) -> String {
     match sign {
         None
@@ -856,8 +832,8 @@ fn other_sign(sign: Option<Sign>) -> String {
     }
 }
 
-/// Refuses ellipticities that follow minus the true shear, or do not follow it, and distortions without responses. `ratio`
-/// is g2/g1 of the true shears, if it is constant.
+// Refuses ellipticities that follow minus the true shear, or do not follow it, and distortions without responses. `ratio`
+// is g2/g1 of the true shears, if it is constant.
 fn check_responses(
     all: &Estimate,
     has_response: bool,

@@ -73,18 +73,18 @@ pub enum Role {
     DoubtfulWeight,
 }
 
-/// A role in one catalogue: 0 is the one without artificial shear, k the k-th of [`SHEARED_CATALOGUES`].
+// A role in one catalogue: 0 is the one without artificial shear, k the k-th of [`SHEARED_CATALOGUES`].
 pub(super) type Key = (Role, usize);
 
-/// Catalogues: the one without artificial shear and [`SHEARED_CATALOGUES`].
+// Catalogues: the one without artificial shear and [`SHEARED_CATALOGUES`].
 pub(super) const CATALOGUES: usize = 1 + SHEARED_CATALOGUES.len();
 pub(super) const ROLES: usize = Role::DoubtfulWeight as usize + 1;
 
-/// The responses R11, R12, R21 and R22: of e1 and e2 by rows, to g1 and g2.
+// The responses R11, R12, R21 and R22: of e1 and e2 by rows, to g1 and g2.
 pub(super) const RESPONSES: [[Role; 2]; 2] = [[Role::R11, Role::R12], [Role::R21, Role::R22]];
 
-/// The ellipticity component `of` in the catalogues with a positive and a negative artificial shear of the component
-/// `sheared`, whose difference is a response.
+// The ellipticity component `of` in the catalogues with a positive and a negative artificial shear of the component
+// `sheared`, whose difference is a response.
 pub(super) fn sheared_pair(of: usize, sheared: usize) -> [Key; 2] {
     let role = [Role::E1, Role::E2][of];
     [(role, 1 + 2 * sheared), (role, 2 + 2 * sheared)]
@@ -127,15 +127,14 @@ const TABLE: [(Role, &str, Option<Role>, &str); 26] = [
     (Role::ShearedCatalogue, "version", None, "mdet_step metastep shear_type metacal_step shear"),
 ];
 
-/// All columns that `--columns` can name, in its order: the roles, then ellipticities under artificial shears of the own
-/// component and of the other one.
+// All columns that `--columns` can name, in its order: the roles, then ellipticities under artificial shears of the own
+// component and of the other one.
 fn keys() -> impl Iterator<Item = Key> {
     let pairs = [[0, 0], [1, 1], [0, 1], [1, 0]];
     let sheared = pairs.into_iter().flat_map(|[of, by]| sheared_pair(of, by));
     TABLE.iter().map(|row| (row.0, 0)).chain(sheared)
 }
 
-/// The name of a column in `--columns`, such as `e1_2p`.
 fn name_of((role, catalogue): Key) -> String {
     let name = TABLE[role as usize].1;
     match catalogue.checked_sub(1) {
@@ -152,7 +151,6 @@ fn named(name: &str) -> Option<Key> {
     keys().find(|key| name_of(*key) == name)
 }
 
-/// Names of columns of a role, in small letters.
 pub(super) fn names_of_role(role: Role) -> impl Iterator<Item = &'static str> {
     let names = TABLE[role as usize].3.split_whitespace();
     names.map(|name| name.trim_start_matches('χ'))
@@ -170,7 +168,7 @@ fn recognised((role, catalogue): Key) -> Vec<String> {
     ]
 }
 
-/// The column without which this one is incomplete: the other component, or the opposite artificial shear.
+// The column without which this one is incomplete: the other component, or the opposite artificial shear.
 fn partner((role, catalogue): Key) -> Option<Key> {
     match catalogue {
         0 => TABLE[role as usize].2.map(|partner| (partner, 0)),
@@ -179,7 +177,7 @@ fn partner((role, catalogue): Key) -> Option<Key> {
     }
 }
 
-/// For a response of a component to the other one, the response to the own one, without which it is of no use.
+// For a response of a component to the other one, the response to the own one, without which it is of no use.
 fn diagonal((role, catalogue): Key) -> Option<Key> {
     match role {
         Role::R12 => Some((Role::R11, 0)),
@@ -190,17 +188,17 @@ fn diagonal((role, catalogue): Key) -> Option<Key> {
     }
 }
 
-/// Whether the name of e1, in small letters, says that it is a distortion.
+// Whether the name of e1, in small letters, says that it is a distortion.
 fn is_distortion(e1: &str) -> bool {
     let mut names = TABLE[Role::E1 as usize].3.split_whitespace();
     names.any(|name| name.strip_prefix('χ') == Some(e1))
 }
 
-/// A public catalogue or a program's output, whose columns are known by its documentation.
+// A public catalogue or a program's output, whose columns are known by its documentation.
 struct Survey {
     name: &'static str,
-    /// The columns by role, in any case. Those of e1 and e2 and those with a plus identify the catalogue; others may be
-    /// absent. `none` for a role that has no column although a general name is there.
+    // The columns by role, in any case. Those of e1 and e2 and those with a plus identify the catalogue; others may be
+    // absent. `none` for a role that has no column although a general name is there.
     columns: &'static str,
     distortion: bool,
 }
@@ -319,7 +317,7 @@ const SURVEYS: [Survey; 22] = [
 ];
 
 impl Survey {
-    /// Each column with its role, and whether the catalogue must have it.
+    // Each column with its role, and whether the catalogue must have it.
     fn parts(&self) -> impl Iterator<Item = (Option<Key>, &'static str, bool)> {
         self.columns.split(' ').map(|part| {
             let (required, part) = match part.strip_prefix('+') {
@@ -340,7 +338,7 @@ impl Survey {
         parts.find_map(|(own, column, _)| (own == Some(key)).then_some(column))
     }
 
-    /// Whether the catalogue with the columns `found` is this one. Given names of e1 and e2 must be those of this one.
+    // Whether the catalogue with the columns `found` is this one. Given names of e1 and e2 must be those of this one.
     fn is_of(&self, found: &[String], names: &Names) -> bool {
         let there = |column: &str| found.iter().any(|own| own.eq_ignore_ascii_case(column));
         self.parts().all(|(key, column, required)| {
@@ -365,14 +363,14 @@ const CHOICES: [(&str, bool); 7] = [
     ("refextendedness", true),
 ];
 
-/// Whether rows count that have 1 in a column of this name, rather than 0; `None` for a column that makes no choice.
+// Whether rows count that have 1 in a column of this name, rather than 0; `None` for a column that makes no choice.
 pub(super) fn chosen_value(name: &str) -> Option<bool> {
     let mut known = CHOICES.iter();
     let known = known.find(|(known, _)| known.eq_ignore_ascii_case(name))?;
     Some(known.1)
 }
 
-/// What a name in small letters suggests that a column is.
+// What a name in small letters suggests that a column is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Look {
     Choice,
@@ -409,7 +407,7 @@ fn look(name: &str) -> Option<Look> {
     found.map(|(look, _)| *look)
 }
 
-/// Whether a text has one of several patterns with blanks between them.
+// Whether a text has one of several patterns with blanks between them.
 pub(super) fn fits_any(patterns: &str, text: &str) -> bool {
     patterns.split(' ').any(|pattern| fits(pattern, text))
 }
@@ -418,7 +416,7 @@ fn same_name<'a>(found: &'a [String], name: &str) -> Option<&'a String> {
     found.iter().find(|own| own.eq_ignore_ascii_case(name))
 }
 
-/// The name of a column without the name of the unsheared catalogue.
+// The name of a column without the name of the unsheared catalogue.
 pub(super) fn base(name: &str) -> &str {
     name.strip_suffix("_noshear").unwrap_or(name)
 }
@@ -440,6 +438,7 @@ pub enum NameError {
 }
 
 // Roles that one column may have together: a scalar response of both components, and identifiers of units.
+// Other columns with two roles compare a quantity with itself: `e1=g1` beside the true shear g1 gave m = 0.
 const SHARED: [[Role; 2]; 3] = [
     [Role::R11, Role::R22],
     [Role::Divisor1, Role::Divisor2],
@@ -448,9 +447,6 @@ const SHARED: [[Role; 2]; 3] = [
 
 impl Names {
     /// Adds `ROLE=COLUMN`.
-    ///
-    /// # Errors
-    /// If there is no such role.
     pub fn add(&mut self, text: &str) -> Result<(), NameError> {
         let (role, column) = match text.split_once('=') {
             Some((role, column)) if !column.is_empty() => (role, column),
@@ -463,7 +459,7 @@ impl Names {
         }
     }
 
-    /// Whether the responses of each component to the other one are not to be used, in columns or by sheared catalogues.
+    // Whether the responses of each component to the other one are not to be used, in columns or by sheared catalogues.
     pub(super) fn decline_matrix(&self) -> bool {
         let mut roles = [Role::R12, Role::R21].into_iter();
         roles.any(|role| self.0.get(&(role, 0)).is_some_and(|own| own == "none"))
@@ -474,12 +470,11 @@ impl Names {
         given.find_map(|(key, own)| (own == column && own != "none").then_some(*key))
     }
 
-    /// Whether a role has a column, or none, by option.
     pub(super) fn is_given(&self, role: Role) -> bool {
         self.0.contains_key(&(role, 0))
     }
 
-    /// Refuses a column with two roles: measured shears that are also the true ones have m = 0.
+    // Refuses a column with two roles: measured shears that are also the true ones have m = 0.
     fn check_single_roles(&self, path: &Path) -> Result<(), FileError> {
         for (key, column) in &self.0 {
             let first = self.key_of(column).unwrap_or(*key);
@@ -496,7 +491,7 @@ impl Names {
         Ok(())
     }
 
-    /// Refuses columns with names of true shears that are given as something else, if nothing else states the true shear.
+    // Refuses columns with names of true shears that are given as something else, if nothing else states the true shear.
     pub(super) fn check_true_shear(&self, path: &Path) -> Result<(), FileError> {
         if self.is_given(Role::G1) || self.is_given(Role::G2) {
             return Ok(());
@@ -589,10 +584,6 @@ pub struct Columns {
 
 impl Columns {
     /// Finds the columns of the catalogue `path`, which has the columns `found`.
-    ///
-    /// # Errors
-    /// If a given column is absent or has two roles, e1 or e2 cannot be found, or one of two columns that belong together
-    /// is absent.
     pub fn find(path: &Path, found: &[String], names: &Names) -> Result<Self, FileError> {
         names.check_single_roles(path)?;
         let survey = SURVEYS.iter().find(|survey| survey.is_of(found, names));
@@ -624,6 +615,7 @@ impl Columns {
                 .get(&(Role::E1, 0))
                 .map(|e1| e1.to_ascii_lowercase())
         };
+        // A role without its partner is refused below, so KSB's shears are forgotten without distortions.
         // HSM has both in one table: shears of KSB, and distortions of all other methods.
         if name_of_e1(&columns).is_none_or(|e1| e1 != "corrected_e1") {
             columns.retain(|(role, _), _| ![Role::KsbE1, Role::KsbE2].contains(role));
@@ -682,7 +674,6 @@ impl Columns {
         Ok(columns)
     }
 
-    /// Notes columns without a role whose names suggest one.
     fn find_unused(&mut self, found: &[String], names: &Names) {
         let taken = |name: &String| {
             self.columns
@@ -716,7 +707,7 @@ impl Columns {
         self.survey.unwrap_or(self.preset.name())
     }
 
-    /// Each column that is used, as in `--columns`. Roles that are not `read` are left out.
+    // Each column that is used, as in `--columns`. Roles that are not `read` are left out.
     pub(super) fn used(&self, read: impl Fn(Role) -> bool) -> String {
         let used = keys().filter(|key| read(key.0) && self.columns.contains_key(key));
         let named = used.map(|key| match key.0 {
@@ -745,8 +736,8 @@ impl Columns {
         })
     }
 
-    /// Of a catalogue of shearq with sheared catalogues, takes these if a selection requires them, and otherwise the
-    /// columns without them, which have less noise: an image that is sheared gets more noise, so that both have the same.
+    // Of a catalogue of shearq with sheared catalogues, takes these if a selection requires them, and otherwise the columns
+    // without them, which have less noise.
     pub(super) fn choose_sheared(&mut self, found: &[String], required: bool) {
         if self.preset != Preset::Shearq || self.of_sheared((Role::E1, 1)).is_none() {
             return;
@@ -759,7 +750,7 @@ impl Columns {
         }
     }
 
-    /// Takes the ellipticity of the unsheared catalogue if there is one: other columns may have less noise.
+    // Takes the ellipticity of the unsheared catalogue if there is one: other columns may have less noise.
     fn take_unsheared(&mut self, found: &[String]) {
         for (role, name) in [(Role::E1, "e1_noshear"), (Role::E2, "e2_noshear")] {
             if found.iter().any(|own| own == name) {
@@ -776,12 +767,11 @@ impl Columns {
         self.columns.get(&key).map(String::as_str)
     }
 
-    /// Whether all of some roles have columns.
     pub(super) fn have(&self, roles: &[Role]) -> bool {
         roles.iter().all(|role| self.of(*role).is_some())
     }
 
-    /// Whether the ellipticities of each component under shears of the other one are there.
+    // Whether the ellipticities of each component under shears of the other one are there.
     pub(super) fn have_other_sheared(&self) -> bool {
         let mut keys = [sheared_pair(0, 1), sheared_pair(1, 0)]
             .into_iter()
@@ -789,7 +779,7 @@ impl Columns {
         keys.all(|key| self.columns.contains_key(&key))
     }
 
-    /// Whether sheared columns of what galaxies are chosen and weighted by give the response of the choice.
+    // Whether sheared columns of what galaxies are chosen and weighted by give the response of the choice.
     pub(super) fn give_selection_response(&self) -> bool {
         match self.preset {
             Preset::Metacal | Preset::Sheared => true,
@@ -809,7 +799,7 @@ impl Columns {
     }
 }
 
-/// Adds sheared catalogues by the names of e1 and e2: `foo_g1_1p` belongs to `foo_g1` or `foo_g1_noshear`.
+// Adds sheared catalogues by the names of e1 and e2: `foo_g1_1p` belongs to `foo_g1` or `foo_g1_noshear`.
 fn find_sheared(columns: &mut BTreeMap<Key, String>, found: &[String], names: &Names) {
     for role in [Role::E1, Role::E2] {
         let Some(name) = columns.get(&(role, 0)).map(|own| own.to_ascii_lowercase()) else {
@@ -829,8 +819,8 @@ fn find_sheared(columns: &mut BTreeMap<Key, String>, found: &[String], names: &N
     }
 }
 
-/// Columns of flags. A row counts if all are zero: DES has the failures in `flags` and the cuts in `flags_select`, and
-/// metadetection one flag per kind of shape.
+// Columns of flags. A row counts if all are zero: DES has the failures in `flags` and the cuts in `flags_select`, and
+// metadetection one flag per kind of shape.
 fn find_flags(
     path: &Path,
     found: &[String],
@@ -851,6 +841,7 @@ fn find_flags(
         }
     }
     let own = |name: &str| same_name(found, name).filter(|own| names.key_of(own).is_none());
+    // A flag of the survey's list counts before general names: DES Y1 has `flags_select` beside `flags`.
     let first = match survey.and_then(|survey| survey.of((Role::Flag, 0))) {
         Some(known) => own(known),
         None => names_of_role(Role::Flag).find_map(own),
@@ -878,7 +869,7 @@ fn find_flags(
     Ok(flags)
 }
 
-/// The name of a component of a vector, `g[0]` for `g_1`.
+// The name of a component of a vector, `g[0]` for `g_1`.
 fn in_vector(name: &str) -> Option<String> {
     let first = name.strip_suffix("_1").map(|vector| format!("{vector}[0]"));
     first.or_else(|| name.strip_suffix("_2").map(|vector| format!("{vector}[1]")))
@@ -970,7 +961,7 @@ mod tests {
         }
     }
 
-    /// Column lists of public catalogues as their documentation has them, a name per line, with the columns that must be used.
+    // Column lists of public catalogues as their documentation has them, a name per line, with the columns that must be used.
     #[test]
     fn public_catalogues_are_read_by_their_published_columns() {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/data/columns");

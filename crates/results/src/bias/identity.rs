@@ -8,10 +8,10 @@ use shearq_files::FileError;
 use shearq_files::frames::polars::DataFrame;
 use shearq_files::table;
 
-/// Integers that floats do not contain have other bits than the float with the same ones.
+// Integers that floats do not contain have other bits than the float with the same ones.
 const INTEGER: u64 = 0x5bd1_e995_9d1b_58d3;
 
-/// Keys of the identifiers in a column: equal for equal numbers of any type, and for a text that is such a number.
+// Keys of the identifiers in a column: equal for equal numbers of any type, and for a text that is such a number.
 pub(super) fn keys(frame: &DataFrame, name: &str, path: &Path) -> Result<Vec<u64>, FileError> {
     let column = frame.column(name).ok();
     let series = column.map(|own| own.as_materialized_series());
@@ -32,19 +32,17 @@ pub(super) fn keys(frame: &DataFrame, name: &str, path: &Path) -> Result<Vec<u64
     Ok(numbers.iter().map(|own| hash(own.to_bits())).collect())
 }
 
-/// An identifier as messages show it.
-pub(super) fn shown(frame: &DataFrame, name: &str, at: usize) -> String {
-    let value = frame.column(name).and_then(|own| own.get(at));
-    value.map_or_else(
-        |_| String::new(),
-        |value| {
-            value
-                .to_string()
-                .trim_matches('"')
-                .trim_end_matches(".0")
-                .to_owned()
-        },
-    )
+// An identifier as messages show it.
+pub(super) fn text(frame: &DataFrame, name: &str, at: usize) -> String {
+    let column = frame.column(name).ok();
+    if let Some(texts) = column.and_then(|own| own.str().ok()) {
+        return texts.get(at).unwrap_or_default().to_owned();
+    }
+    let value = column.and_then(|own| own.get(at).ok());
+    // Integers may be floats in FITS tables.
+    value.map_or_else(String::new, |value| {
+        value.to_string().trim_end_matches(".0").to_owned()
+    })
 }
 
 fn of_integer(integer: i128) -> u64 {
@@ -56,7 +54,7 @@ fn of_integer(integer: i128) -> u64 {
 }
 
 fn of_text(text: &str) -> u64 {
-    // `007` is no number: it differs from `7`.
+    // `007` is no number: it differs from `7`. Texts of numbers have the keys of the numbers, because CSV has no types.
     if let Some(integer) = text
         .parse::<i128>()
         .ok()
@@ -76,7 +74,8 @@ fn of_text(text: &str) -> u64 {
     hasher.finish()
 }
 
-/// A number with evenly distributed bits (the finaliser of SplitMix64).
+// A number with evenly distributed bits (the finaliser of SplitMix64): units join neighbouring keys by their upper bits, and
+// 4000 identifiers from 10¹⁸ on were 32 units, with an error of m of 0.0207 instead of 0.029.
 fn hash(bits: u64) -> u64 {
     let mut bits = bits.wrapping_add(0x9e37_79b9_7f4a_7c15);
     bits = (bits ^ (bits >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);

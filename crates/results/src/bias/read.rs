@@ -23,19 +23,17 @@ use super::identity;
 use super::source::{Reading, Source, catalogue_named};
 use super::truth::{OfRows, check};
 
-/// A row that counts.
 pub(super) struct Item {
-    /// Unit.
     pub(super) key: u64,
-    /// The catalogue of the row: 0 without artificial shear.
+    // The catalogue of the row: 0 without artificial shear.
     pub(super) catalogue: usize,
     pub(super) row: Row,
-    /// The binned quantity in each catalogue that has it; infinity if the row is not selected.
+    // The binned quantity in each catalogue that has it; infinity if the row is not selected.
     pub(super) binned: [f64; CATALOGUES],
     pub(super) weights: [f64; CATALOGUES],
 }
 
-/// Reads the rows of a catalogue and gives those that count to `take`, with a description of the catalogue.
+// Reads the rows of a catalogue and gives those that count to `take`, with a description of the catalogue.
 pub(super) fn rows(
     path: &Path,
     reading: &Reading<'_>,
@@ -48,6 +46,7 @@ pub(super) fn rows(
     };
     if let Some(first) = sources.first().filter(|own| own.columns.is_of_shearq()) {
         let path = &first.place.path;
+        // Other programs may use the same key for something else.
         about.star = match (&first.frame, FileFormat::of(path)) {
             (Some(frame), _) => star_noise::of_table(frame, path),
             (None, Some(format)) => star_noise::of_any(path, format)?,
@@ -99,8 +98,8 @@ const HUGE: f64 = 1e20;
 // Values from which the range of a quantity is determined.
 const SAMPLED_VALUES: usize = 1 << 16;
 
-/// A test of a column for numbers that stand for failed measurements: HSM writes −10, ngmix −9999, SExtractor 1e30. One of
-/// them in 10⁴ rows changes m by more than the requirement of 2·10⁻³.
+// A test of a column for numbers that stand for failed measurements. HSM's −10 in one row of a hundred gave c = −0.096, and 1e30
+// m = 3.5·10¹², without a word.
 struct Check {
     column: usize,
     expected: &'static str,
@@ -108,32 +107,28 @@ struct Check {
     fails: fn(f64, MeasuredRange) -> bool,
 }
 
-/// Columns of some rows.
 struct Part<'a> {
     source: &'a Source,
     reading: &'a Reading<'a>,
     rows: usize,
     columns: Vec<Cow<'a, [f64]>>,
-    /// The rows after cuts by steps and weights.
     weighted: Option<Weighted>,
     e: [usize; 2],
     responses: [[Response; 2]; 2],
-    /// The catalogue of each row, if a column names it.
     catalogues: Option<Vec<usize>>,
     frame: &'a DataFrame,
-    /// Keys of the identifiers of galaxies and of units.
     ids: Option<Vec<u64>>,
     units: Option<Vec<u64>>,
     truth: OfRows<'a>,
 }
 
-/// Where an element of the response of an ellipticity comes from.
+// Where an element of the response of an ellipticity comes from.
 enum Response {
     Known(f64),
     Column(usize),
-    /// Over the divisor that the ellipticity was divided by; the number without a response, where both are NaN.
+    // Over the divisor that the ellipticity was divided by; the number without a response, where both are NaN.
     Divided(usize, usize, f64),
-    /// (e₊ − e₋)/2h of two sheared catalogues.
+    // (e₊ − e₋)/2h of two sheared catalogues.
     Difference([usize; 2]),
 }
 
@@ -142,13 +137,12 @@ fn weighs(weight: f64) -> bool {
     weight.is_nan() || weight > 0.0
 }
 
-/// Why a row without a flag does not count.
 enum LeftOut {
-    /// A number stands for a failed measurement.
+    // A number stands for a failed measurement.
     Failed,
-    /// A distortion above 1 has no shear.
+    // A distortion above 1 has no shear.
     AboveOne,
-    /// NaN or infinity.
+    // NaN or infinity.
     Missing,
 }
 
@@ -209,7 +203,6 @@ impl<'a> Part<'a> {
         self.source.places.pair(roles)
     }
 
-    /// The range of a quantity in some columns of these rows.
     fn range(&self, columns: &[usize]) -> MeasuredRange {
         let stride = (columns.len() * self.rows).div_ceil(SAMPLED_VALUES).max(1);
         let values = columns
@@ -218,7 +211,7 @@ impl<'a> Part<'a> {
         MeasuredRange::from_values(&values.collect::<Vec<_>>())
     }
 
-    /// The tests of each row, in the order in which a row that fails several is explained.
+    // The tests of each row, in the order in which a row that fails several is explained.
     fn checks(&self) -> Vec<Check> {
         let (source, mut checks) = (self.source, Vec::new());
         let mut add = |columns: &[usize], expected, range, fails| {
@@ -284,7 +277,7 @@ impl<'a> Part<'a> {
         checks
     }
 
-    /// The columns of the ellipticity of a row. GalSim's HSM writes −10 into those that its method does not determine.
+    // The columns of the ellipticity of a row. GalSim's HSM writes −10 into those that its method does not determine.
     fn shape_columns(&self, at: usize) -> [usize; 2] {
         match (self.roles(KSB), self.pair(self.e, at)) {
             (Some(ksb), [-10.0, -10.0]) => ksb,
@@ -292,7 +285,6 @@ impl<'a> Part<'a> {
         }
     }
 
-    /// The test that a row fails, and the column.
     fn failure<'c>(&self, at: usize, checks: &'c [Check]) -> Option<(usize, &'c Check)> {
         let shape = self.shape_columns(at);
         let column_of = |check: &Check| match self.e.iter().position(|e| *e == check.column) {
@@ -303,7 +295,7 @@ impl<'a> Part<'a> {
         checks.find(|(column, check)| (check.fails)(self.value(*column, at), check.range))
     }
 
-    /// What a row adds to the sums; `None` if it does not count. `number` counts rows of the table from 0.
+    // What a row adds to the sums; `None` if it does not count. `number` counts rows of the table from 0.
     fn row(
         &self,
         at: usize,
@@ -329,7 +321,7 @@ impl<'a> Part<'a> {
             let own = own.or_else(|| self.of(Role::Weight));
             own.map_or(1.0, |weight| self.value(weight, at))
         });
-        // A sheared catalogue may choose a row that is left out without shear.
+        // A sheared catalogue may choose a row that is left out without shear: these rows are the response of the selection.
         let counted: [bool; CATALOGUES] =
             std::array::from_fn(|catalogue| !flagged(catalogue) && weighs(weights[catalogue]));
         if !counted[0] {
@@ -350,6 +342,7 @@ impl<'a> Part<'a> {
                 "`{name}` looks like a weight but is not used, and is {value} here, so that this galaxy would count wrongly. Try: --columns w={name}, or w=none"
             )));
         }
+        // A step is zero far from its threshold, and its row then adds nothing to any sum.
         let weight = self.weighted.as_ref().map(|own| own.weight[at]);
         if weight.is_some_and(|weight| weight <= 0.0) {
             about.unselected += own;
@@ -359,6 +352,7 @@ impl<'a> Part<'a> {
         if counted[0] && binned[0].is_infinite() {
             about.unselected += own;
         }
+        // Infinity leaves a row out of a catalogue, as a condition that does not hold.
         for (bin, counted) in binned.iter_mut().zip(counted) {
             if !counted {
                 *bin = f64::INFINITY;
@@ -380,6 +374,7 @@ impl<'a> Part<'a> {
                 return Ok(None);
             }
         };
+        // After the cuts: a truth needs no shears of galaxies that do not count.
         row.g = match self.truth(at) {
             Err(_) if self.reading.request.drop_missing && self.truth.may_lack_rows() => {
                 about.missing += own;
@@ -406,14 +401,14 @@ impl<'a> Part<'a> {
         }))
     }
 
-    /// A column that looks like a weight, is not used, and would leave out this row.
+    // A column that looks like a weight, is not used, and would leave out this row.
     fn unused_weight(&self, at: usize) -> Option<(&str, f64)> {
         let place = self.of(Role::DoubtfulWeight)?;
         let (name, value) = (self.source.name(place), self.value(place, at));
         (value.is_nan() || value <= 0.0).then_some((name, value))
     }
 
-    /// A row without its true shear, or why it is left out.
+    // A row without its true shear, or why it is left out.
     fn measured(
         &self,
         at: usize,
@@ -429,6 +424,7 @@ impl<'a> Part<'a> {
             let value = self.value(column, at);
             let mut of_psf = [Role::Psf1, Role::Psf2, Role::PsfSize].into_iter();
             let of_psf = of_psf.any(|role| self.of(role) == Some(column));
+            // A PSF of 2 in all rows is another quantity, rather than a failure in each.
             let all_equal = || self.columns[column].iter().all(|other| *other == value);
             let remedy = match of_psf && all_equal() {
                 true => "--columns psf_e1=none,psf_e2=none,psf_size=none",
@@ -476,10 +472,10 @@ impl<'a> Part<'a> {
         }
     }
 
-    /// The ellipticity, and the response of the weighted ellipticity; `None` for a distortion without a shear.
+    // The ellipticity, and the response of the weighted ellipticity; `None` for a distortion without a shear.
     fn shape(&self, at: usize, weight: f64) -> Option<([f64; 2], [[f64; 2]; 2])> {
         if let Some(weighted) = &self.weighted {
-            // Sums multiply by the weight, which these ellipticities contain already.
+            // Sums multiply by the weight, which these ellipticities contain already, so it is divided out.
             let e = [0, 1].map(|k| weighted.e[k][at] / weight);
             return Some((e, weighted.matrix(at)));
         }
@@ -537,7 +533,7 @@ impl<'a> Part<'a> {
         }
     }
 
-    /// The binned quantity in each catalogue. Infinity if the row is not selected; NaN if a number is missing.
+    // The binned quantity in each catalogue. Infinity if the row is not selected; NaN if a number is missing.
     fn binned(&self, at: usize) -> [f64; CATALOGUES] {
         let (condition, binned) = (self.reading.condition(), self.reading.binned());
         if condition.is_none() && binned.is_none() {
@@ -568,7 +564,7 @@ impl<'a> Part<'a> {
                 let key = self.ids.as_ref().and_then(|ids| galaxies.get(&ids[at]));
                 key.copied().ok_or_else(|| {
                     let name = self.source.columns.of(Role::Id).unwrap_or_default();
-                    let id = identity::shown(self.frame, name, at);
+                    let id = identity::text(self.frame, name, at);
                     format!("the table of true shears does not contain the identifier {id}")
                 })
             }
@@ -577,7 +573,7 @@ impl<'a> Part<'a> {
         }
     }
 
-    /// The key of the unit of a row, the `index`-th of its catalogue.
+    // The key of the unit of a row, the `index`-th of its catalogue.
     fn key(&self, at: usize, index: u64) -> u64 {
         let neighbours = self.reading.neighbours();
         match (&self.units, &self.ids) {
@@ -588,7 +584,7 @@ impl<'a> Part<'a> {
     }
 }
 
-/// The columns of ellipticities under artificial shears of their own component, and of the other one, if all are there.
+// The columns of ellipticities under artificial shears of their own component, and of the other one, if all are there.
 fn sheared_columns(source: &Source) -> [Option<[[usize; 2]; 2]>; 2] {
     [[0, 1], [1, 0]].map(|by| {
         let pair = |of: usize| {
@@ -599,7 +595,7 @@ fn sheared_columns(source: &Source) -> [Option<[[usize; 2]; 2]>; 2] {
     })
 }
 
-/// Where R11, R12, R21 and R22 come from: sheared catalogues, else columns, else the ellipticities are shears already.
+// Where R11, R12, R21 and R22 come from: sheared catalogues, else columns, else the ellipticities are shears already.
 fn responses(source: &Source) -> [[Response; 2]; 2] {
     let [own, other] = sheared_columns(source);
     let divisors = source.places.pair([Role::Divisor1, Role::Divisor2]);
@@ -629,38 +625,36 @@ fn responses(source: &Source) -> [[Response; 2]; 2] {
     })
 }
 
-/// Rows of a part that are searched for ellipticities that occur several times.
+// Rows of a part that are searched for ellipticities that occur several times.
 const SEARCHED: usize = 4096;
 
-/// Numbers with few digits are shared by many rows, but the ten that most rows have are about equally frequent: around its
-/// maximum, a distribution is flat. One number that is so much more frequent than the tenth stands for something else.
+// Numbers with few digits are shared by many rows, but the ten that most rows have are about equally frequent: around its
+// maximum, a distribution is flat. One number that is so much more frequent than the tenth stands for something else.
 const FREQUENT: usize = 10;
 
-/// What is repeated, and when it is worth a line.
 #[derive(Clone, Copy, PartialEq)]
 enum Kind {
-    /// Pairs of ellipticities, if a row in a thousand has them: with two digits, 10⁴ galaxies share one in ten rows at most.
+    // Pairs of ellipticities, if a row in a thousand has them: with two digits, 10⁴ galaxies share one in ten rows at most.
     Ellipticities,
-    /// Zeros of both columns, if not all rows have them.
+    // Zeros of both columns, if not all rows have them.
     Zeros,
-    /// The number that stands out in one column, other than zero for derivatives: a smooth cut far away has none.
+    // The number that stands out in one column, other than zero for derivatives: a smooth cut far away has none.
     Number { or_zero: bool },
 }
 
-/// Numbers that several rows share exactly in two columns, or in one that is named twice.
+// Numbers that several rows share exactly in two columns, or in one that is named twice.
 struct Repeat {
     kind: Kind,
     columns: [usize; 2],
     counts: HashMap<[u64; 2], u64>,
-    /// Different numbers in the rows that were searched.
     different: usize,
 }
 
-/// Counts of repeated numbers: zeros and other plain numbers often stand for failures that no flag states.
+// Counts of repeated numbers: zeros and other plain numbers often stand for failures that no flag states.
 #[derive(Default)]
 struct Repeats {
     used: u64,
-    /// Rows that count although a column of [`Role::Choice`] excludes them.
+    // Rows that count although a column of [`Role::Choice`] excludes them.
     excluded: Vec<u64>,
     all: Vec<Repeat>,
 }
@@ -676,13 +670,13 @@ impl Repeat {
         }
     }
 
-    /// Zeros with either sign are equal.
+    // Zeros with either sign are equal.
     fn key(&self, part: &Part<'_>, at: usize) -> [u64; 2] {
         part.pair(self.columns, at)
             .map(|value| (value + 0.0).to_bits())
     }
 
-    /// Notes the numbers that a sample of rows repeats, which are then counted in all rows.
+    // Notes the numbers that a sample of rows repeats, which are then counted in all rows.
     fn look_for(&mut self, part: &Part<'_>) {
         let (searched, or_zero) = match self.kind {
             Kind::Zeros => return,
@@ -702,7 +696,7 @@ impl Repeat {
         self.different = self.different.max(seen.len());
     }
 
-    /// The numbers that most of the `used` rows share, if that is no coincidence.
+    // The numbers that most of the `used` rows share, if that is no coincidence.
     fn found(&self, used: u64) -> Option<([f64; 2], u64)> {
         let mut counts: Vec<(u64, [u64; 2])> = self.counts.iter().map(|(v, n)| (*n, *v)).collect();
         counts.sort_unstable_by(|a, b| b.cmp(a));
@@ -770,7 +764,7 @@ impl Repeats {
         }
     }
 
-    /// Refuses rows of which an unused column says that they do not count, if other rows do.
+    // Refuses rows of which an unused column says that they do not count, if other rows do.
     fn check_choices(&self, path: &Path, source: &Source) -> Result<(), FileError> {
         let found = self
             .excluded
@@ -813,7 +807,6 @@ impl Repeats {
     }
 }
 
-/// Whether a text column has a pattern, as 1 and 0.
 fn compared(
     frame: &DataFrame,
     name: &str,
@@ -844,8 +837,8 @@ fn is_sheared(text: Option<&str>) -> bool {
     text.and_then(catalogue_named).is_some_and(|own| own > 0)
 }
 
-/// Refuses a table whose rows belong to sheared catalogues, if no column has this role: its mean would be one of all of
-/// them.
+// Refuses a table whose rows belong to sheared catalogues, if no column has this role: its mean would be one of all of
+// them.
 fn check_steps(frame: &DataFrame, columns: &Columns, path: &Path) -> Result<(), FileError> {
     let mut steps = columns.steps.iter();
     match steps.find(|name| texts_of(frame, name).is_some_and(|mut texts| texts.any(is_sheared))) {
@@ -859,7 +852,6 @@ fn check_steps(frame: &DataFrame, columns: &Columns, path: &Path) -> Result<(), 
     }
 }
 
-/// Columns of cuts that are taken for flags by their names.
 fn recognised_cuts<'a>(
     source: &'a Source,
     reading: &Reading<'_>,
@@ -869,7 +861,7 @@ fn recognised_cuts<'a>(
     flags.filter(|name| name.to_ascii_lowercase().contains("select"))
 }
 
-/// Refuses a cut that excludes more than half of the rows: it may be true for selected rows.
+// Refuses a cut that excludes more than half of the rows: it may be true for selected rows.
 fn check_share(
     path: &Path,
     source: &Source,
@@ -891,7 +883,7 @@ fn check_share(
     }
 }
 
-/// Refuses a recognised flag that is true for selected rows.
+// Refuses a recognised flag that is true for selected rows.
 fn check_selected(
     frame: &DataFrame,
     source: &Source,
@@ -912,7 +904,7 @@ fn check_selected(
     }
 }
 
-/// The catalogues that a column of text names, 0 for the one without shear.
+// The catalogues that a column of text names, 0 for the one without shear.
 fn catalogues_of(frame: &DataFrame, name: &str, path: &Path) -> Result<Vec<usize>, FileError> {
     let fault = |found: &str, remedy: &str| {
         let expected = "noshear or ns, 1p, 1m, 2p or 2m";
@@ -942,7 +934,6 @@ fn catalogues_of(frame: &DataFrame, name: &str, path: &Path) -> Result<Vec<usize
     texts.map(known).collect()
 }
 
-/// Refuses a catalogue that is given twice.
 pub(super) fn distinct(inputs: &[Input]) -> Result<(), FileError> {
     let mut seen = HashSet::new();
     match inputs.iter().find(|input| !seen.insert(&input.name)) {

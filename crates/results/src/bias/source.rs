@@ -16,11 +16,10 @@ use super::columns::{CATALOGUES, Columns, Key, Preset, ROLES, Role, Shapes, base
 use super::truth::Truth;
 use super::{Input, Request, Units};
 
-/// How catalogues are read: a request with the true shears of its catalogues.
+// How catalogues are read: a request with the true shears of its catalogues.
 pub(super) struct Reading<'r> {
     pub(super) request: &'r Request,
     pub(super) truth: Truth,
-    /// Whether minus the true g2 is used.
     pub(super) flip_g2: bool,
 }
 
@@ -29,7 +28,6 @@ impl Reading<'_> {
         self.request.selection.as_ref()?.rows.as_ref()
     }
 
-    /// Steps and weights, whose response is in columns of linear configurations.
     pub(super) fn weights(&self) -> Option<&Selection> {
         self.request.selection.as_ref()?.weights.as_ref()
     }
@@ -38,7 +36,6 @@ impl Reading<'_> {
         self.request.bins.as_ref().map(|bins| &bins.of)
     }
 
-    /// The expressions that choose galaxies.
     fn expressions(&self) -> impl Iterator<Item = (Role, &Expression)> + Clone {
         let all = [
             (Role::Condition, self.condition()),
@@ -51,12 +48,12 @@ impl Reading<'_> {
         self.expressions().flat_map(|(_, own)| own.columns())
     }
 
-    /// Whether two neighbouring rows form a unit.
+    // Whether two neighbouring rows form a unit.
     pub(super) fn neighbours(&self) -> bool {
         self.request.design == Some(Design::Rotated) && self.request.catalogues.len() == 1
     }
 
-    /// Whether the column of a role is of no use for the true shear.
+    // Whether the column of a role is of no use for the true shear.
     fn skips(&self, role: Role) -> bool {
         match role {
             Role::G1 | Role::G2 => !matches!(self.truth, Truth::Columns),
@@ -76,7 +73,8 @@ const UNITS: &str = "tile tile_id tileid tilename tile_name field field_id patch
 const FIXED: &str = "*psf* *tile* *field* *patch* *seed* *true* *truth* *image* *ccd* *exp* *airmass* *seeing* *depth* \
     *zbin* *z_bin* *primary* *inner* ra dec x y z number row alpha delta set";
 
-/// What is read of a row by sheared catalogue and role, as places in [`Source::wanted`].
+// What is read of a row by sheared catalogue and role, as places in [`Source::wanted`]. A role may have several columns (flags,
+// operands), or in sheared catalogues the column without artificial shear.
 #[derive(Default)]
 pub(super) struct Places([[Vec<usize>; ROLES]; CATALOGUES]);
 
@@ -89,7 +87,7 @@ impl Places {
         self.all(key).first().copied()
     }
 
-    /// Of two roles in the catalogue without artificial shear, if both have a column.
+    // Of two roles in the catalogue without artificial shear, if both have a column.
     pub(super) fn pair(&self, [a, b]: [Role; 2]) -> Option<[usize; 2]> {
         Some([self.of((a, 0))?, self.of((b, 0))?])
     }
@@ -99,35 +97,31 @@ impl Places {
     }
 }
 
-/// A table of a catalogue with its columns.
 pub(super) struct Source {
     pub(super) place: Place,
-    /// The table, if it is in memory.
     pub(super) frame: Option<DataFrame>,
-    /// The catalogue of all rows, if a FITS file has one table per sheared catalogue.
+    // The catalogue of all rows, if a FITS file has one table per sheared catalogue.
     pub(super) catalogue: Option<usize>,
     pub(super) columns: Columns,
-    /// How ellipticities become shears.
     pub(super) shapes: Shapes,
-    /// Column that names the unit of a row.
     pub(super) unit: Option<String>,
-    /// A column without a role that looks like independent units.
+    // A column without a role that looks like independent units.
     pub(super) unit_column: Option<String>,
-    /// All that is read, each once.
+    // All that is read, each once.
     pub(super) wanted: Vec<Operand>,
     pub(super) places: Places,
-    /// Columns of expressions that shear changes by an unknown amount.
+    // Columns of expressions that shear changes by an unknown amount.
     unanswered: Vec<String>,
-    /// Whether sheared catalogues have flags of their own, which then give the response of the choice.
+    // Whether sheared catalogues have flags of their own, which then give the response of the choice.
     sheared_flags: bool,
-    /// Whether each sheared catalogue chooses its own galaxies, so that the response of the choice follows.
+    // Whether each sheared catalogue chooses its own galaxies, so that the response of the choice follows.
     pub(super) selects: bool,
     declines_matrix: bool,
     has_weights: bool,
 }
 
 impl Source {
-    /// Columns of `--where` and `--bins` by which shear changes the choice of galaxies, without a response of the choice.
+    // Columns of `--where` and `--bins` by which shear changes the choice of galaxies, without a response of the choice.
     pub(super) fn unanswered(&self) -> &[String] {
         match self.has_sheared_rows() {
             // Each sheared catalogue is chosen by its own columns.
@@ -136,7 +130,6 @@ impl Source {
         }
     }
 
-    /// Which columns are used as what, and which are not used.
     pub(super) fn described(&self, reading: &Reading<'_>) -> Vec<String> {
         let responsivity = self.shapes == Shapes::Responsivity;
         let read = |role: Role| match role {
@@ -181,7 +174,6 @@ impl Source {
         &self.wanted[place].column
     }
 
-    /// Whether rows or tables belong to sheared catalogues.
     pub(super) fn has_sheared_rows(&self) -> bool {
         self.catalogue.is_some() || self.columns.of(Role::ShearedCatalogue).is_some()
     }
@@ -191,7 +183,7 @@ impl Source {
         self.has_sheared_rows() || by_columns || self.columns.have(&[Role::R11])
     }
 
-    /// Whether the responses of each component to the other one are known.
+    // Whether the responses of each component to the other one are known.
     pub(super) fn has_matrix(&self) -> bool {
         let of_rows = match self.columns.preset {
             Preset::Metacal | Preset::Sheared => self.columns.have_other_sheared(),
@@ -204,7 +196,6 @@ impl Source {
         self.columns.have(&[Role::Psf1, Role::Psf2])
     }
 
-    /// Gives the wanted columns to `take`, in parts.
     pub(super) fn parts(
         &self,
         reading: &Reading<'_>,
@@ -220,7 +211,7 @@ impl Source {
         table::read_parts(&self.place, &names, &texts, take)
     }
 
-    /// Whether a column may be a text: identifiers, names of sheared catalogues, and what is compared with a pattern.
+    // Whether a column may be a text: identifiers, names of sheared catalogues, and what is compared with a pattern.
     pub(super) fn is_text(&self, reading: &Reading<'_>, name: &str) -> bool {
         let mut operands = reading.expressions().flat_map(|(_, own)| own.operands());
         match operands.find(|own| own.column == name || own.column == base(name)) {
@@ -235,7 +226,6 @@ impl Source {
     }
 }
 
-/// Finds the tables of a catalogue and their columns.
 pub(super) fn sources(input: &Input, reading: &Reading<'_>) -> Result<Vec<Source>, FileError> {
     let path = input.name.as_path();
     if let Some(frame) = &input.frame {
@@ -318,7 +308,7 @@ pub(super) fn sources(input: &Input, reading: &Reading<'_>) -> Result<Vec<Source
     Ok(vec![source(own, None, &list.names, reading)?])
 }
 
-/// The columns that are read of a table with these names, each once.
+// The columns that are read of a table with these names, each once.
 struct Wanted<'a> {
     path: &'a Path,
     names: &'a [String],
@@ -327,7 +317,6 @@ struct Wanted<'a> {
 }
 
 impl Wanted<'_> {
-    /// The place of a column among those that are read; `None` if the table does not have it.
     fn add(&mut self, name: &str, pattern: Option<&String>) -> Option<usize> {
         if !self.names.iter().any(|own| own == name) {
             return None;
@@ -348,7 +337,7 @@ impl Wanted<'_> {
         found.ok_or_else(|| FileError::no_column(self.path, name, self.names))
     }
 
-    /// The column of a sheared catalogue, in any case.
+    // The column of a sheared catalogue, in any case.
     fn sheared(&self, name: &str, catalogue: usize) -> Option<String> {
         let wanted = format!("{}_{}", base(name), SHEARED_CATALOGUES[catalogue - 1].0);
         let mut names = self.names.iter();
@@ -361,16 +350,16 @@ impl Wanted<'_> {
             && catalogues.all(|catalogue| self.sheared(name, catalogue).is_some())
     }
 
-    /// Whether a flag is a cut in all catalogues. Other flags of metacalibration with sheared ones are those of failed
-    /// measurements.
+    // Whether a flag is a cut in all catalogues: DES's `flags_select_1p` chooses the galaxies of 1p. Other flags of
+    // metacalibration with sheared ones are those of failed measurements.
     fn is_cut(&self, name: &str) -> bool {
         let by_name = name.to_ascii_lowercase().contains("select");
         (by_name || self.columns.preset != Preset::Metacal) && self.has_sheared(name)
     }
 
-    /// The places of roles, flags and expressions, whether each sheared catalogue has what the expressions require, and
-    /// whether it has flags of its own. A column without sheared ones is the same in all catalogues if `by_catalogue`, or
-    /// if flags or weights have sheared ones.
+    // The places of roles, flags and expressions, whether each sheared catalogue has what the expressions require, and
+    // whether it has flags of its own. A column without sheared ones is the same in all catalogues if `by_catalogue`, or
+    // if flags or weights have sheared ones.
     fn places(
         &mut self,
         reading: &Reading<'_>,
@@ -417,8 +406,8 @@ impl Wanted<'_> {
         Ok((places, known, cuts && known))
     }
 
-    /// The operands of an expression in each catalogue; none in a catalogue that lacks one. A column without sheared ones
-    /// is the same in all catalogues if another one has them (`by_catalogue`).
+    // The operands of an expression in each catalogue; none in a catalogue that lacks one. A column without sheared ones
+    // is the same in all catalogues if another one has them (`by_catalogue`).
     fn operands(
         &mut self,
         expression: &Expression,
@@ -469,6 +458,7 @@ fn source(
     if columns.preset == Preset::Sheared {
         check_chosen(path, chosen_by.clone(), has_sheared)?;
     }
+    // A step that is wrong by a factor is an m of that factor.
     if columns.of_sheared((Role::E1, 1)).is_some() && chosen_by.any(has_sheared) {
         check_step(path, reading.request.step)?;
     }
@@ -482,6 +472,7 @@ fn source(
     let doubtful = columns.doubtful_weight.as_ref();
     let doubtful = doubtful.and_then(|name| wanted.add(name, None));
     places.set((Role::DoubtfulWeight, 0), doubtful.into_iter().collect());
+    // To refuse them if they name sheared catalogues.
     for name in &columns.steps {
         wanted.require(name)?;
     }
@@ -547,7 +538,7 @@ fn source(
     })
 }
 
-/// Whether shear does not change a column, judged by its role and name.
+// Whether shear does not change a column, judged by its role and name.
 fn is_fixed(name: &str, columns: &Columns) -> bool {
     use Role::{Flag, G1, G2, Id, Psf1, Psf2, PsfSize, Unit, X, Y};
     let roles = [G1, G2, Id, Psf1, Psf2, PsfSize, Unit, X, Y, Flag];
@@ -557,13 +548,13 @@ fn is_fixed(name: &str, columns: &Columns) -> bool {
         || fits_any(FIXED, &name.to_ascii_lowercase())
 }
 
-/// The name of a column of one sheared catalogue, without the name of the shear.
+// The name of a column of one sheared catalogue, without the name of the shear.
 fn unsheared_name(name: &str) -> Option<&str> {
     let mut names = SHEARED_CATALOGUES.iter();
     names.find_map(|(sheared, _)| name.strip_suffix(sheared)?.strip_suffix('_'))
 }
 
-/// The catalogue of a name, 0 for that without shear: `ns` in metadetection of LSST, `00` in TXPipe.
+// The catalogue of a name, 0 for that without shear: `ns` in metadetection of LSST, `00` in TXPipe.
 pub(super) fn catalogue_named(name: &str) -> Option<usize> {
     let name = name.trim().to_ascii_lowercase();
     if ["noshear", "ns", "00"].contains(&name.as_str()) {
@@ -573,13 +564,13 @@ pub(super) fn catalogue_named(name: &str) -> Option<usize> {
     sheared.position(|(known, _)| *known == name).map(|k| k + 1)
 }
 
-/// Whether a column of shearq's catalogues was measured on the galaxies.
+// Whether a column of shearq's catalogues was measured on the galaxies.
 fn is_measured(name: &str) -> bool {
     let known = Observables::COLUMNS.contains(&name) || READ.contains(&name);
     (known || name == "snr" || name == "radius") && name != "flags"
 }
 
-/// Refuses to choose galaxies by columns of one sheared catalogue, or by measured ones without sheared columns.
+// Refuses to choose galaxies by columns of one sheared catalogue, or by measured ones without sheared columns.
 fn check_chosen<'a>(
     path: &Path,
     chosen_by: impl Iterator<Item = &'a str>,
@@ -606,7 +597,7 @@ fn check_chosen<'a>(
     Ok(())
 }
 
-/// Checks that the sheared catalogues of shearq are for a shear of `step`, if the settings are there.
+// Checks that the sheared catalogues of shearq are for a shear of `step`, if the settings are there.
 fn check_step(path: &Path, step: f64) -> Result<(), FileError> {
     let key = "settings".to_owned();
     let stated = || {

@@ -8,7 +8,7 @@ use std::sync::Arc;
 use shearq_dataset::layout::stated_sign;
 use shearq_dataset::run::{RUN_FILE, Run};
 use shearq_dataset::truth::{Sign, SignBasis, sign_on_any_grid};
-use shearq_files::open::{SETTINGS, is_there, read_to_string};
+use shearq_files::open::is_there;
 use shearq_files::table::{self, MAX_ROWS, Place, TRUTH_COLUMNS};
 use shearq_files::{FileError, names_of};
 use shearq_scoring::{Row, TruthSign};
@@ -57,7 +57,6 @@ impl TrueSign {
     }
 }
 
-/// Names of the column of catalogues in a table of true shears.
 const CATALOGUE: [&str; 3] = ["catalogue", "catalog", "file"];
 
 impl Truth {
@@ -79,20 +78,19 @@ impl Truth {
                 .find(|own| own.eq_ignore_ascii_case(name))
                 .map(String::as_str)
         };
-        if CATALOGUE.iter().any(|name| named(name).is_some()) {
-            return Ok((of_catalogues(path)?, sign(None, &|| None)?));
-        }
         let unclear = Some(TrueSign::OfCatalogues(path.to_owned()));
         let shears = named("g1").zip(named("g2"));
         let positions = named("x").zip(named("y"));
+        let catalogue = CATALOGUE.iter().find_map(|name| named(name));
         let other = || names_of_role(Role::Id).find_map(named);
         let id = named("id").or_else(|| other().filter(|_| positions.is_none()));
-        if let (Some(_), None, Some(_)) = (shears, id, positions) {
+        let key = catalogue.or(id);
+        if let (Some(_), None, Some(_)) = (shears, key, positions) {
             let positions = Positions::read(path, TruthSign::Standard)?;
             let sign = sign(unclear, &|| positions.sign_by_modes())?;
             return Ok((Truth::Positions(Arc::new(positions)), sign));
         }
-        let (Some((name1, name2)), Some(id)) = (shears, id) else {
+        let (Some((name1, name2)), Some(key)) = (shears, key) else {
             let found: Vec<&String> = columns.named.iter().flat_map(|list| &list.names).collect();
             return Err(FileError::new(
                 path,
@@ -102,32 +100,38 @@ impl Truth {
                 ),
             ));
         };
-        let mut galaxies = HashMap::new();
-        table::read_parts(&place, &[id, name1, name2], &[id], |part| {
+        let (mut galaxies, mut catalogues) = (HashMap::new(), BTreeMap::new());
+        table::read_parts(&place, &[key, name1, name2], &[key], |part| {
             let column = |name| table::numbers(&part, name, path);
             let (g1, g2) = (column(name1)?, column(name2)?);
-            for (row, key) in identity::keys(&part, id, path)?.into_iter().enumerate() {
+            let keys = identity::keys(&part, key, path)?;
+            for (row, hash) in keys.into_iter().enumerate() {
+                let fault =
+                    |fault: String| FileError::new(path, format!("row {}: {fault}", row + 1));
                 let shear = [g1[row], g2[row]];
-                check(shear)
-                    .map_err(|fault| FileError::new(path, format!("row {}: {fault}", row + 1)))?;
-                if galaxies.insert(key, shear).is_some() {
-                    let message = format!(
-                        "row {}: the identifier {} occurs twice",
-                        row + 1,
-                        identity::shown(&part, id, row)
-                    );
-                    return Err(FileError::new(path, message));
+                check(shear).map_err(fault)?;
+                // Names of catalogues are parts of paths, which hashes are not.
+                let name = || identity::text(&part, key, row);
+                let (earlier, what) = match catalogue {
+                    Some(_) => (catalogues.insert(name(), shear), "catalogue"),
+                    None => (galaxies.insert(hash, shear), "identifier"),
+                };
+                if earlier.is_some() {
+                    return Err(fault(format!("the {what} {} occurs twice", name())));
                 }
             }
             Ok(())
         })?;
-        Ok((
-            Truth::Galaxies(Arc::new(galaxies)),
-            sign(unclear, &|| None)?,
-        ))
+        Ok(match catalogue {
+            Some(_) => (Truth::Catalogues(catalogues), sign(None, &|| None)?),
+            None => (
+                Truth::Galaxies(Arc::new(galaxies)),
+                sign(unclear, &|| None)?,
+            ),
+        })
     }
 
-    /// The same with the shear of each of `catalogues` by its path, if catalogues have a shear each.
+    // The same with the shear of each of `catalogues` by its path, if catalogues have a shear each.
     pub(super) fn of_paths<'p>(
         &self,
         catalogues: impl IntoIterator<Item = &'p Path>,
@@ -152,15 +156,12 @@ impl Truth {
     }
 }
 
-/// Where the true shears of the rows of one catalogue are.
 #[derive(Clone, Copy)]
 pub(super) enum OfRows<'a> {
-    /// Zero if there is none.
+    // Zero if there is none.
     Constant([f64; 2]),
     Identifiers(&'a HashMap<u64, [f64; 2]>),
-    /// By the position in two columns.
     Positions(&'a Positions, [usize; 2]),
-    /// In two columns.
     Columns([usize; 2]),
 }
 
@@ -202,13 +203,12 @@ impl<'a> OfRows<'a> {
         }
     }
 
-    /// Whether a row may be absent from the truth.
     pub(super) fn may_lack_rows(self) -> bool {
         matches!(self, OfRows::Identifiers(..) | OfRows::Positions(..))
     }
 }
 
-/// The name among `names` that is the path of a catalogue, or the longest one that is a part of it.
+// The name among `names` that is the path of a catalogue, or the longest one that is a part of it.
 fn row_of<'n>(
     names: impl IntoIterator<Item = &'n String>,
     path: &Path,
@@ -249,62 +249,10 @@ fn row_of<'n>(
     }
 }
 
-/// A text table of catalogues with their shears.
-fn of_catalogues(path: &Path) -> Result<Truth, FileError> {
-    let text = read_to_string(path, SETTINGS)
-        .map_err(FileError::doing(path, "cannot read the true shears"))?;
-    let mut lines = text
-        .lines()
-        .enumerate()
-        .map(|(number, line)| (number + 1, line.trim()))
-        .filter(|(_, line)| !line.is_empty() && !line.starts_with('#'));
-    let fields = |line: &str| -> Vec<String> {
-        let split: Vec<&str> = match line.contains(',') {
-            true => line.split(',').collect(),
-            false => line.split_whitespace().collect(),
-        };
-        split
-            .iter()
-            .map(|field| field.trim().trim_matches('"').to_owned())
-            .collect()
-    };
-    let header = lines
-        .next()
-        .map(|(_, line)| fields(line))
-        .unwrap_or_default();
-    let place = |names: &[&str]| header.iter().position(|own| names.contains(&own.as_str()));
-    let (Some(name), Some(g1), Some(g2)) = (place(&CATALOGUE), place(&["g1"]), place(&["g2"]))
-    else {
-        return Err(FileError::new(
-            path,
-            "the first line does not name the columns (expected catalogue, g1, g2)",
-        ));
-    };
-    let mut all = BTreeMap::new();
-    for (number, line) in lines {
-        let fields = fields(line);
-        let fault = |fault: String| FileError::new(path, format!("line {number}: {fault}"));
-        let value = |column: usize| {
-            let field = fields.get(column).map_or("", String::as_str);
-            field
-                .parse::<f64>()
-                .map_err(|_| fault(format!("found `{field}`, expected a number")))
-        };
-        let shear = [value(g1)?, value(g2)?];
-        check(shear).map_err(&fault)?;
-        let name = fields.get(name).cloned().unwrap_or_default();
-        if all.insert(name.clone(), shear).is_some() {
-            return Err(fault(format!("the catalogue {name} occurs twice")));
-        }
-    }
-    Ok(Truth::Catalogues(all))
-}
-
-/// Largest distance of a galaxy from its place in the truth, in pixels: centroids of detections differ by less, and first
-/// pixels of 0 and of 1 by more.
+// Largest distance of a galaxy from its place in the truth, in pixels: centroids of detections differ by less, and first
+// pixels of 0 and of 1 by more.
 const RADIUS: f64 = 1.0;
 
-/// A place of the truth.
 #[derive(Debug, Clone, Copy)]
 struct Entry {
     x: f64,
@@ -313,7 +261,7 @@ struct Entry {
 }
 
 impl Entry {
-    /// Square of side [`RADIUS`] that contains the place: row and column.
+    // Square of side [`RADIUS`] that contains the place: row and column.
     fn cell(&self) -> (i64, i64) {
         (
             (self.y / RADIUS).floor() as i64,
@@ -359,6 +307,7 @@ impl Positions {
             check(shear).map_err(fault)?;
             entries.push(Entry { x, y, shear });
         }
+        // Sorted by cells, so that a nearest place is found by bisection in a table of any size.
         entries.sort_by(|a, b| {
             let places = || a.x.total_cmp(&b.x).then(a.y.total_cmp(&b.y));
             a.cell().cmp(&b.cell()).then_with(places)
@@ -379,7 +328,7 @@ impl Positions {
         Ok(Positions { entries })
     }
 
-    /// The sign of g2 in which the shears are an E-mode field; `None` if they do not fill a square grid.
+    // The sign of g2 in which the shears are an E-mode field; `None` if they do not fill a square grid.
     fn sign_by_modes(&self) -> Option<TruthSign> {
         let rows = self.entries.iter().map(|entry| Row {
             x: entry.x,
@@ -390,7 +339,7 @@ impl Positions {
         sign_on_any_grid(&rows.collect::<Vec<_>>())
     }
 
-    /// The shear of the nearest place within [`RADIUS`].
+    // The shear of the nearest place within [`RADIUS`].
     pub(super) fn at(&self, [x, y]: [f64; 2]) -> Result<[f64; 2], String> {
         let own = Entry {
             x,
@@ -419,7 +368,6 @@ impl Positions {
     }
 }
 
-/// Refuses what is no shear.
 pub(super) fn check([g1, g2]: [f64; 2]) -> Result<(), String> {
     // Without the square root: this is checked in every row.
     if g1 * g1 + g2 * g2 < 1.0 {
@@ -438,6 +386,7 @@ pub fn expand(paths: &[PathBuf], truth: Truth) -> Result<(Vec<Input>, Truth), Bi
         Truth::Data(found) => std::mem::take(found),
         _ => BTreeMap::new(),
     };
+    // One catalogue with a true shear and one without have no common bias.
     let mut without: Option<&Path> = None;
     for path in paths {
         if !path.is_dir() {
@@ -483,7 +432,6 @@ pub fn expand(paths: &[PathBuf], truth: Truth) -> Result<(Vec<Input>, Truth), Bi
     Ok((catalogues, Truth::Data(found)))
 }
 
-/// The true shear of the data of a run; `None` if they have none.
 fn of_data(run: &Run, folder: &Path, set: u32) -> Result<Option<Positions>, FileError> {
     let data = run.source.data(folder).map_err(|error| {
         let message = format!(
@@ -540,7 +488,7 @@ mod tests {
         }
     }
 
-    /// The shears of catalogues by a table of names, or why they are not known.
+    // The shears of catalogues by a table of names, or why they are not known.
     fn shears(table: &[(&str, f64)], catalogues: &[&str]) -> Result<Vec<f64>, String> {
         let table = table.iter().map(|(name, g)| ((*name).to_owned(), [*g; 2]));
         let truth = Truth::Catalogues(table.collect());

@@ -13,13 +13,12 @@ use super::junit::{Case, document};
 use crate::bias::{BiasResult, BinResult};
 use crate::foreign::shown;
 
-/// Units above which Student's t differs from a normal distribution by less than 5 %.
+// Units above which Student's t differs from a normal distribution by less than 5 %.
 const MANY_UNITS: usize = 30;
 
-/// Quantities of the narrow table.
 const MAIN: [&str; 4] = ["m1", "m2", "c1", "c2"];
 
-/// A column of the table: its key, heading, whether only the wide table has it, and its cell of a bin.
+// A column of the table: its key, heading, whether only the wide table has it, and its cell of a bin.
 type BinColumn = (
     &'static str,
     &'static str,
@@ -116,7 +115,7 @@ pub fn compared_table(first: &BiasResult, second: &BiasResult, difference: &Bias
         ("difference", difference),
     ];
     let tables = parts.map(|(name, result)| (name, bias_table(result)));
-    // The first table may lack columns that another has.
+    // The first table may lack columns that another has: responses of one program.
     let mut headings: Vec<Heading> = vec![Heading::new("of", "Of")];
     for heading in tables.iter().flat_map(|(_, table)| &table.headings) {
         if !headings.iter().any(|own| own.key == heading.key) {
@@ -149,7 +148,6 @@ pub fn compared_table(first: &BiasResult, second: &BiasResult, difference: &Bias
     }
 }
 
-/// A bin in words.
 fn label(result: &BiasResult, edges: Option<[f64; 2]>) -> String {
     let Some([low, high]) = edges else {
         return "all".into();
@@ -181,12 +179,11 @@ pub fn chosen_by_measurement(result: &BiasResult) -> Option<String> {
     ))
 }
 
-/// |m| above which catalogue and truth hardly belong together.
+// |m| above which catalogue and truth hardly belong together.
 const IMPLAUSIBLE: f64 = 0.3;
-/// The same in standard errors of m, added to it.
+// Chosen by hand: shape noise alone exceeds it in 6 of 10⁷ cases.
 const IMPLAUSIBLE_SIGNIFICANCE: f64 = 5.0;
 
-/// A warning if m is larger than a bias of shapes can be.
 fn implausible(result: &BiasResult, all: &Estimate) -> Option<String> {
     let large = |m: &Measured| m.value.abs() > IMPLAUSIBLE + IMPLAUSIBLE_SIGNIFICANCE * m.error;
     let mut found = ["m1", "m2"].into_iter();
@@ -203,11 +200,11 @@ fn implausible(result: &BiasResult, all: &Estimate) -> Option<String> {
     ))
 }
 
-/// Share of the rows below which the effective number shows that few weights dominate.
+// Share of the rows below which the effective number shows that few weights dominate.
 const FEW_EFFECTIVE: f64 = 0.05;
 
-/// α below which galaxies were corrected for other PSFs. With star stamps in reversed order, α is −0.6 to −0.9 in simulated
-/// sets 1, 7 and 19; with their own it is zero within 0.2.
+// α below which galaxies were corrected for other PSFs. With star stamps in reversed order, α is −0.6 to −0.9 in simulated
+// sets 1, 7 and 19; with their own it is zero within 0.2.
 const OTHER_PSF: f64 = -0.3;
 
 /// Warnings about weights, PSFs and about catalogues that do not pair.
@@ -273,10 +270,8 @@ pub fn of_design(result: &BiasResult) -> Vec<String> {
     lines
 }
 
-/// Most missing catalogues that are named.
 const MOST_MISSING: usize = 5;
 
-/// Design, units, rows that do not count, and verdicts.
 fn notes(result: &BiasResult) -> Vec<String> {
     let Ok(all) = result.all() else {
         return Vec::new();
@@ -356,7 +351,6 @@ fn notes(result: &BiasResult) -> Vec<String> {
     notes
 }
 
-/// A line as a sentence.
 fn sentence(line: &str) -> String {
     let mut letters = line.chars();
     let first = letters.next().into_iter().flat_map(char::to_uppercase);
@@ -364,7 +358,7 @@ fn sentence(line: &str) -> String {
     line + "."
 }
 
-/// Lines about numbers that several rows share exactly, such as zeros for failed measurements.
+// Lines about numbers that several rows share exactly, such as zeros for failed measurements.
 fn repeated(catalogues: &[Catalogue]) -> Vec<String> {
     let mut all: Vec<Repeated> = Vec::new();
     for own in catalogues.iter().flat_map(|own| &own.repeated) {
@@ -392,12 +386,10 @@ fn repeated(catalogues: &[Catalogue]) -> Vec<String> {
     all.iter().map(line).collect()
 }
 
-/// A quantity compared with the requirements that have one limit.
+// A quantity compared with the requirements that have one limit.
 struct Compared {
-    /// Surveys and challenges with this limit.
     names: Vec<&'static str>,
     sources: Vec<String>,
-    /// `m` or `c`.
     of: char,
     limit: f64,
     key: String,
@@ -405,7 +397,7 @@ struct Compared {
     verdict: Verdict,
 }
 
-/// Estimates against published requirements, at 95 % confidence.
+// Estimates against published requirements, at 95 % confidence.
 fn compared(all: &Estimate) -> Vec<Compared> {
     let mut found: Vec<Compared> = Vec::new();
     for requirement in REQUIREMENTS {
@@ -436,7 +428,7 @@ fn compared(all: &Estimate) -> Vec<Compared> {
     found
 }
 
-/// The comparison with requirements in words, a line per limit.
+// The comparison with requirements in words, a line per limit.
 fn verdicts(all: &Estimate) -> Vec<String> {
     let found = compared(all);
     let limits = found.chunk_by(|a, b| (a.of, a.limit) == (b.of, b.limit));
@@ -463,7 +455,7 @@ fn verdicts(all: &Estimate) -> Vec<String> {
     lines.collect()
 }
 
-/// The comparison with requirements, a row per quantity and limit.
+// The comparison with requirements, a row per quantity and limit.
 fn requirement_table(all: &Estimate) -> Table {
     let rows = compared(all).into_iter().map(|own| {
         let Measured { value, error } = own.measured;
@@ -677,12 +669,11 @@ pub fn bias_plot(result: &BiasResult) -> PanelGrid {
     }
 }
 
-/// Bins are shown, and all galaxies if there are no bins.
+// Bins are shown, and all galaxies if there are no bins.
 fn is_shown(result: &BiasResult, edges: Option<[f64; 2]>) -> bool {
     edges.is_some() || result.bins.len() == 1
 }
 
-/// Where a bin is on the axis.
 fn middle(edges: Option<[f64; 2]>) -> f64 {
     match edges {
         None => 0.0,
@@ -693,9 +684,6 @@ fn middle(edges: Option<[f64; 2]>) -> f64 {
 }
 
 /// The section of a report.
-///
-/// # Errors
-/// If the plot cannot be drawn.
 pub fn section(result: &BiasResult, table: Table) -> Result<Section, FigureError> {
     let caption = "m and c with standard errors. Grey: the tightest published requirement.";
     let picture = Picture::draw(&bias_plot(result), "bias", caption)?;
