@@ -38,7 +38,8 @@ impl Range {
     }
 }
 
-/// Numbers of two columns that many rows share exactly, such as zeros for failed measurements.
+/// Numbers of two columns, or of one that is named twice, that many rows share exactly, such as zeros for failed
+/// measurements. They are reported, not removed: only the user can decide whether they are measurements.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Repeated {
     /// The columns.
@@ -49,7 +50,8 @@ pub struct Repeated {
     pub rows: u64,
 }
 
-/// What is known of a catalogue.
+/// What is known of a catalogue: its rows, how many of them do not count and why, and its ranges. A row is counted in the
+/// first of these reasons that applies.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Catalogue {
     /// Its name.
@@ -73,9 +75,9 @@ pub struct Catalogue {
     /// Pairs of numbers that many rows share exactly.
     #[serde(default)]
     pub repeated: Vec<Repeated>,
-    /// True shears g1 and g2.
+    /// Range of the true shears g1 and g2 of the rows that count. Designs are recognised from it.
     pub shear: [Range; 2],
-    /// Ellipticities e1 and e2.
+    /// Range of the ellipticities e1 and e2 of the rows that count.
     pub ellipticity: [Range; 2],
     /// The noise of the star that is the PSF of all its galaxies, if it is known.
     #[serde(default)]
@@ -90,27 +92,29 @@ impl Catalogue {
     }
 }
 
-/// How catalogues belong together.
+/// How catalogues belong together: which test shears they have, and which of them contain the same galaxies. It determines
+/// the units of the errors; the estimator is the same for all designs.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum Design {
     /// Without true shear: only mean ellipticities and leakage follow.
     Null,
-    /// One true shear.
+    /// One true shear. m and c cannot be separated: m assumes that c is zero.
     Single,
-    /// Shears +γ and −γ of the same galaxies.
+    /// Paired shears +γ and −γ of the same galaxies, whose shapes cancel in m.
     Pairs,
-    /// Several pairs of shears, ±g1, ±g2 and possibly zero with other PSFs.
+    /// Several paired shears, ±g1, ±g2 and possibly zero with other PSFs.
     Arms,
-    /// Catalogues with a shear each.
+    /// Catalogues with a shear each, of different galaxies.
     Fields,
     /// Shears that vary within catalogues.
     Galaxies,
-    /// Galaxies that are rotated by 90 degrees, in neighbouring rows or catalogues.
+    /// Pairs of galaxies rotated by 90 degrees, in neighbouring rows or catalogues, whose shapes cancel in c, too (Nakajima &
+    /// Bernstein 2007, AJ 133, 1763).
     Rotated,
 }
 
 impl Design {
-    /// Name on the command line.
+    /// Name in options and output.
     pub fn name(self) -> &'static str {
         match self {
             Design::Null => "null",
@@ -123,7 +127,7 @@ impl Design {
         }
     }
 
-    /// What it is, in words.
+    /// The design in words.
     pub fn meaning(self) -> &'static str {
         match self {
             Design::Null => "no true shear",
@@ -136,7 +140,8 @@ impl Design {
         }
     }
 
-    /// Recognises a design from the true shears. Rotated pairs are not recognised.
+    /// Recognises a design from the true shears of `catalogues`, with `truth` whether these are known. Rotated pairs are not
+    /// recognised, because their true shears are those of single catalogues.
     pub fn of(catalogues: &[Catalogue], truth: bool) -> Self {
         let used = || catalogues.iter().filter(|catalogue| catalogue.rows > 0);
         if !truth {
@@ -164,10 +169,10 @@ impl Design {
     }
 }
 
-/// Largest relative difference of equal shears: single precision rounds by 6·10⁻⁸.
+// Largest relative difference of equal shears: single precision rounds by 6·10⁻⁸, and FITS tables in it did not pair with
+// tables of double precision.
 const ROUNDING: f64 = 1e-6;
 
-/// Whether two shears are equal, perhaps in single and in double precision.
 fn same(a: [f64; 2], b: [f64; 2]) -> bool {
     let modulus = a[0].hypot(a[1]).max(b[0].hypot(b[1]));
     (a[0] - b[0]).hypot(a[1] - b[1]) <= ROUNDING * modulus
@@ -184,7 +189,7 @@ fn kinds(shears: &[[f64; 2]]) -> Vec<[f64; 2]> {
     kinds
 }
 
-/// A catalogue that other ones with the same galaxies lack.
+/// A catalogue under one of the test shears that is absent, while those of the same galaxies under other shears are there.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Missing {
     /// One of the catalogues that are there.
@@ -193,7 +198,7 @@ pub struct Missing {
     pub shear: [f64; 2],
 }
 
-/// Units of the errors.
+/// Units of the errors, and what is wrong with them.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Grouping {
     /// The sums by unit.
@@ -228,13 +233,15 @@ impl Grouping {
     }
 }
 
-/// Fewest groups of catalogues that serve as units. Below, the same rows of all catalogues form a unit.
+// Fewest groups of catalogues that serve as units. Below, the same rows of all catalogues form a unit: a jackknife of 20 units
+// determines an error to 16 %. Chosen by hand.
 const FEWEST_GROUPS: usize = 20;
 
-/// Joins sums to units.
+/// Joins sums to the units of a design, which are as large as the galaxies that are not independent: the galaxy under all its
+/// shears, or all galaxies of catalogues with the same number.
 ///
-/// `by_key` forces units of the same keys in all catalogues, or of whole catalogues; `matched` states that keys are
-/// identifiers of galaxies rather than numbers of rows.
+/// `by_key` forces units of the same keys in all catalogues (`true`), or of whole catalogues; by default the latter if there
+/// are 20 groups or more. `matched` states that keys are identifiers of galaxies rather than numbers of rows.
 pub fn group(
     sums: UnitSums,
     catalogues: &[Catalogue],
@@ -298,14 +305,14 @@ pub fn group(
     }
 }
 
-/// Numbers from which a correlation is tested, and the correlation below which rows are other galaxies. The ellipticities of a
-/// galaxy under opposite shears have its shape in common: they correlate by 0.3 if noise is 1.5 times the shapes, which is
-/// three standard deviations of 400 numbers above the limit. A few rows before the first that is absent may correspond.
+// Numbers from which a correlation is tested, and the correlation below which rows are other galaxies. The ellipticities of a
+// galaxy under opposite shears have its shape in common: they correlate by 0.3 if noise is 1.5 times the shapes, which is
+// three standard deviations of 400 numbers above the limit. A few rows before the first that is absent may correspond.
 const ENOUGH_TO_CORRELATE: usize = 400;
 const LEAST_CORRELATION: f64 = 0.15;
 
-/// The correlation of the ellipticities of units under opposite shears, if there are enough units and it is too small for
-/// the same galaxies.
+// The correlation of the ellipticities of units under opposite shears, if there are enough units and it is too small for the
+// same galaxies: the error of m is then too large by up to √2, because the shapes do not cancel.
 fn correlation(sums: &UnitSums, catalogues: &[Catalogue], numbers: &[u32]) -> Option<f64> {
     let shears: Vec<Option<[f64; 2]>> = catalogues.iter().map(Catalogue::constant).collect();
     let opposite = |k: usize| {
@@ -336,7 +343,6 @@ fn correlation(sums: &UnitSums, catalogues: &[Catalogue], numbers: &[u32]) -> Op
     (count >= ENOUGH_TO_CORRELATE && found < LEAST_CORRELATION).then_some(found)
 }
 
-/// The catalogues that complete groups have and others lack.
 fn missing(catalogues: &[Catalogue], numbers: &[u32]) -> Vec<Missing> {
     let shears: Vec<[f64; 2]> = catalogues.iter().filter_map(Catalogue::constant).collect();
     if shears.len() < catalogues.len() {
@@ -363,7 +369,8 @@ fn missing(catalogues: &[Catalogue], numbers: &[u32]) -> Vec<Missing> {
     groups.into_values().flat_map(of_group).collect()
 }
 
-/// The first shear with an opposite one under which there are more or fewer catalogues, with both numbers.
+// The first shear with an opposite one under which there are more or fewer catalogues, with both numbers: a survey's
+// simulation in which tiles failed, rather than fields of random shears.
 fn unpaired(catalogues: &[Catalogue], design: Design) -> Option<([f64; 2], [usize; 2])> {
     if design != Design::Fields {
         return None;
@@ -375,7 +382,7 @@ fn unpaired(catalogues: &[Catalogue], design: Design) -> Option<([f64; 2], [usiz
     all.find(|(_, [own, opposite])| *opposite > 0 && own != opposite)
 }
 
-/// The words, numbers and signs of a name.
+// The words, numbers and signs of a name: `cat_g1+0.02_7` states its shear by a sign.
 fn parts(name: &str) -> Vec<&str> {
     let kind = |c: char| match c {
         c if c.is_ascii_digit() => 1,
@@ -398,9 +405,10 @@ fn parts(name: &str) -> Vec<&str> {
     parts
 }
 
-/// The group of each catalogue by the parts of its name that do not follow from its shear, such as `tile03` of
-/// `plus/tile03.fits` and `minus/tile03.fits`. `None` if names do not state it: they have different numbers of parts, those
-/// of one shear are not distinct, or less than half of the groups are complete.
+// The group of each catalogue by the parts of its name that do not follow from its shear, such as `tile03` of
+// `plus/tile03.fits` and `minus/tile03.fits`. `None` if names do not state it: they have different numbers of parts, those
+// of one shear are not distinct, or less than half of the groups are complete. Without names, four shears of 24 tiles of which
+// two were missing became 94 independent catalogues, and m = 0.043 ± 0.089 instead of ± 0.022.
 fn by_name(catalogues: &[Catalogue]) -> Option<Vec<u32>> {
     let shears: Vec<[f64; 2]> = catalogues
         .iter()
@@ -440,7 +448,7 @@ fn by_name(catalogues: &[Catalogue]) -> Option<Vec<u32>> {
     (2 * complete.count() >= groups.len()).then_some(numbers)
 }
 
-/// The group of each catalogue: by name, or else the k-th catalogues of each shear belong together.
+// The group of each catalogue: by name, or else the k-th catalogues of each shear belong together, as files are listed.
 fn numbers(catalogues: &[Catalogue], design: Design) -> Vec<u32> {
     if matches!(design, Design::Pairs | Design::Arms)
         && let Some(numbers) = by_name(catalogues)

@@ -2,20 +2,22 @@
 
 use thiserror::Error;
 
+use crate::sums::Layout;
+
 /// Why there is no estimate.
 #[derive(Debug, Clone, PartialEq, Error)]
 #[non_exhaustive]
 pub enum BiasError {
-    /// No row has a positive weight.
+    /// No row was added to the bin.
     #[error("no galaxy can be used (found 0 with a positive weight and without a flag)")]
     NoGalaxies,
-    /// Too few units for an error.
+    /// A jackknife or bootstrap over one unit has no scatter.
     #[error("there is no error without independent units (found {found}, expected 2 or more)")]
     FewUnits {
         /// Units with a galaxy.
         found: usize,
     },
-    /// The mean response is not significant.
+    /// The mean response is not positive by five standard errors. A ratio with such a divisor has no finite variance.
     #[error("{}", response(*component, *found, *error))]
     Response {
         /// Component, 1 or 2.
@@ -25,20 +27,40 @@ pub enum BiasError {
         /// Its standard error.
         error: f64,
     },
-    /// Sums that do not belong together.
-    #[error("the sums cannot be merged: {0}")]
-    Unlike(String),
+    /// Sums of other columns or bins do not add up.
+    #[error(
+        "the sums cannot be merged: other columns or bins (found {found:?} with {found_bins} bins, expected {expected:?} with {expected_bins})"
+    )]
+    Layouts {
+        /// Layout of the sums that were to be merged.
+        found: Layout,
+        /// Number of their bins.
+        found_bins: usize,
+        /// Layout of the sums that they were to be merged with.
+        expected: Layout,
+        /// Number of bins of those.
+        expected_bins: usize,
+    },
+    /// Sums of a damaged file.
+    #[error(
+        "the sums cannot be merged: a unit of another length (found {found} numbers, expected {expected})"
+    )]
+    Length {
+        /// Numbers of the unit.
+        found: usize,
+        /// Numbers by layout and bins.
+        expected: usize,
+    },
 }
 
-/// Smallest significance of the mean response.
-pub const MIN_SIGMA: f64 = 5.0;
+// Chosen by hand. The relative bias of a ratio is the square of the relative error of its divisor: 4 % at 5σ.
+pub(crate) const MIN_SIGMA: f64 = 5.0;
 
-/// Why a mean response cannot be divided by.
 fn response(component: usize, found: f64, error: f64) -> String {
     let expected = format!("expected more than {MIN_SIGMA} standard errors");
     if found < -MIN_SIGMA * error {
         return format!(
-            "the mean response R{component}{component} is negative (found {found:.4} ± {error:.4}, {expected}). Its sign is wrong, or the versions of positive and negative shear are exchanged. Try: minus R{component}{component}, or --columns with the other versions"
+            "the mean response R{component}{component} is negative (found {found:.4} ± {error:.4}, {expected}). Its sign is wrong, or the sheared catalogues of positive and negative shear are exchanged. Try: minus R{component}{component}, or exchange their columns"
         );
     }
     format!(

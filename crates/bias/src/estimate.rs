@@ -61,10 +61,10 @@ pub const QUANTITIES: [Quantity; ESTIMATES] = [
     quantity("r21", "⟨R21⟩", "mean response of e2 to g1"),
 ];
 
-/// How errors are determined.
+/// How errors are determined. Both are over units, so that they contain the correlation of galaxies within a unit.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Errors {
-    /// Leave out one unit at a time.
+    /// Leave out one unit at a time: σ² = (n − 1)/n Σ (θ₍ᵢ₎ − ⟨θ₍ᵢ₎⟩)² (Efron & Stein 1981, Annals of Statistics 9, 586).
     #[default]
     Jackknife,
     /// Draw units with replacement, so many times.
@@ -85,13 +85,13 @@ pub struct Measured {
     pub error: f64,
 }
 
-/// Estimates of a bin.
+/// Estimates of a bin: values and standard errors of [`QUANTITIES`].
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
 pub struct Estimate {
     /// Galaxies.
     pub galaxies: usize,
-    /// (Σ w)² / Σ w²: as many galaxies of equal weight have the same information.
+    /// Effective number of galaxies, (Σ w)² / Σ w² (Kish 1965): as many of equal weight have the same information.
     pub effective: f64,
     /// Units.
     pub units: usize,
@@ -110,10 +110,12 @@ impl Estimate {
     }
 }
 
-/// Estimates of the units of a bin, with a known true shear or not.
+/// Estimates of the units of a `bin`, with `truth` whether the true shears are known; without, only c, α and responses follow.
+/// Errors do not contain the noise of stars; see [`Grouping::estimate`].
 ///
 /// # Errors
-/// If no galaxy or only one unit was added, or a mean response has less than five standard errors.
+/// [`BiasError::NoGalaxies`] or [`BiasError::FewUnits`] if no galaxy or only one unit was added to the bin, and
+/// [`BiasError::Response`] if a mean response is below five standard errors.
 pub fn estimate(
     sums: &UnitSums,
     bin: usize,
@@ -133,7 +135,6 @@ impl Grouping {
     }
 }
 
-/// Estimates of a bin with errors that include the noise of `stars`.
 fn behind_stars(
     sums: &UnitSums,
     stars: &[Behind],
@@ -154,6 +155,8 @@ fn behind_stars(
     }
     let plan = Plan::new(sums.layout(), &total, truth);
     let values = plan.estimates(&total);
+    // The bins and terms that all units determine are estimated from each part of them: a unit that is left out changes
+    // values, not their meaning.
     let mut errors = match errors {
         Errors::Jackknife => jackknife(&plan, &total, &units),
         Errors::Bootstrap { draws, seed } => bootstrap(&plan, &units, draws, seed),
@@ -234,11 +237,11 @@ pub fn difference(
     })
 }
 
-/// What the noise of a star adds to the variances of the estimates `values` that follow from the sums `total` of `n` units.
-/// `units` are the sums of the galaxies behind the star.
-///
-/// If the noise changes an estimate by Σ aᵤ, of which the galaxies of unit u make aᵤ, then its variance is A² = (Σ aᵤ)². A
-/// jackknife contains n/(n − 1) (Σ aᵤ² − A²/n) of it.
+// What the noise of a star adds to the variances of the estimates `values` that follow from the sums `total` of `n` units.
+// `units` are the sums of the galaxies behind the star.
+//
+// If the noise changes an estimate by Σ aᵤ, of which the galaxies of unit u make aᵤ, then its variance is A² = (Σ aᵤ)². A
+// jackknife contains n/(n − 1) (Σ aᵤ² − A²/n) of it, which is subtracted so that a star counts once.
 fn variances(
     plan: &Plan,
     (total, values): (&[f64], &Estimates),
@@ -279,10 +282,10 @@ fn variances(
     more
 }
 
-/// Standard errors from leaving out each unit: (n − 1)/n Σ (θ − ⟨θ⟩)².
 fn jackknife(plan: &Plan, total: &[f64], units: &[&[f64]]) -> Estimates {
     let mut rest = vec![0.0; total.len()];
     let left_out = units.iter().map(|unit| {
+        // Subtracting one unit costs as much as adding it: n units need n estimates instead of n² sums.
         for ((rest, total), unit) in rest.iter_mut().zip(total).zip(*unit) {
             *rest = total - unit;
         }
@@ -292,8 +295,8 @@ fn jackknife(plan: &Plan, total: &[f64], units: &[&[f64]]) -> Estimates {
     squares(&left_out.collect::<Vec<_>>()).map(|sum| ((n - 1.0) / n * sum).sqrt())
 }
 
-/// Standard deviations over draws of as many units with replacement.
 fn bootstrap(plan: &Plan, units: &[&[f64]], draws: u32, seed: u64) -> Estimates {
+    // ChaCha has the same numbers on all platforms and in all versions of its crate.
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut total = vec![0.0; units[0].len()];
     let drawn = (0..draws).map(|_| {
@@ -307,8 +310,8 @@ fn bootstrap(plan: &Plan, units: &[&[f64]], draws: u32, seed: u64) -> Estimates 
     squares(&drawn).map(|sum| (sum / (f64::from(draws) - 1.0)).sqrt())
 }
 
-/// Sums of squared deviations from the mean.
 fn squares(all: &[Estimates]) -> Estimates {
+    // In two passes: the squares of m would lose digits if its error is 10⁻⁸.
     std::array::from_fn(|k| {
         let mean = all.iter().map(|values| values[k]).sum::<f64>() / all.len() as f64;
         all.iter().map(|values| (values[k] - mean).powi(2)).sum()

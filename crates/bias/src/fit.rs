@@ -24,8 +24,8 @@ pub(crate) const ESTIMATES: usize = 20;
 /// Estimates; NaN for those that the data do not determine.
 pub(crate) type Estimates = [f64; ESTIMATES];
 
-/// Smallest pivot of a scaled matrix that counts as different from zero. The sums of up to 10⁹ rows have rounding
-/// errors below 10⁻¹²; shears that differ by 0.1 % of their mean leave a pivot of 10⁻⁶.
+// Smallest pivot of a scaled matrix that counts as different from zero. The sums of up to 10⁹ rows have rounding errors below
+// 10⁻¹²; shears that differ by 0.1 % of their mean leave a pivot of 10⁻⁶.
 const SMALLEST: f64 = 1e-9;
 
 /// Which of m and c the true shears determine.
@@ -51,7 +51,7 @@ pub(crate) struct Plan {
 }
 
 impl Plan {
-    /// Of the sums of all units, with a known true shear or not.
+    // Of the sums of all units: parts of them, from which errors follow, have to be estimated with the same terms.
     pub(crate) fn new(layout: Layout, sums: &[f64], truth: bool) -> Self {
         let extra = layout.extra(sums).own;
         let mut plan = Plan {
@@ -66,6 +66,7 @@ impl Plan {
         for k in 0..layout.components() {
             let of = layout.of(sums, k);
             let extra = extra[k];
+            // One shear of zero determines c, and one other shear m if c is zero.
             let zero = of.response(OWN, OWN, extra) == 0.0;
             plan.known[k] = match (truth && !zero, solve(&of, &[ONE, OWN], extra)) {
                 (false, _) => Known::OnlyC,
@@ -89,7 +90,8 @@ impl Plan {
         plan
     }
 
-    /// The constant and, if m is determined, the shear, with more terms.
+    // The constant and, if m is determined, the shear, with more terms: PSFs that follow the shear would otherwise take a part
+    // of m as leakage.
     fn with(&self, k: usize, more: &[usize]) -> Vec<usize> {
         let mut terms = vec![ONE];
         if self.truth && self.known[k] == Known::Both {
@@ -99,7 +101,7 @@ impl Plan {
         terms
     }
 
-    /// The terms that determine m and c.
+    // Without the quadratic, cross and PSF terms, which would enlarge the errors of m and c: each of those is fitted on its own.
     fn main_terms(&self, k: usize) -> &'static [usize] {
         match self.known[k] {
             Known::Both => &[ONE, OWN],
@@ -196,7 +198,8 @@ impl Plan {
         self.estimates(&changed)
     }
 
-    /// The last of `more` terms, from both components: the mean weighted by what each component contributes.
+    // The last of `more` terms, from both components: the mean weighted by the pivots, the inverse variances for equal noise.
+    // Tangential and cross components entered at first, too, and α was 0.073 instead of 0.08.
     fn joint(&self, sums: &[f64], more: &[usize]) -> f64 {
         let (mut sum, mut weight) = (0.0, 0.0);
         for (k, extra) in self.layout.extra(sums).own.into_iter().take(2).enumerate() {
@@ -233,7 +236,8 @@ fn last_of(of: &Component<'_>, terms: &[usize], extra: f64) -> Option<(f64, f64)
     eliminate(of, terms, extra).map(|(x, pivot)| (x[terms.len() - 1], pivot))
 }
 
-/// Gaussian elimination of a symmetric matrix without exchange of rows, after scaling its diagonal to ±1.
+// Gaussian elimination of a symmetric matrix without exchange of rows, after scaling its diagonal to ±1: shears of 10⁻² have
+// squares of 10⁻⁸ of the constant's, and one threshold for pivots serves all terms.
 fn eliminate(of: &Component<'_>, terms: &[usize], extra: f64) -> Option<(Solution, f64)> {
     let n = terms.len();
     let mut a = [[0.0; MAX_TERMS + 1]; MAX_TERMS];
@@ -301,6 +305,7 @@ fn solve_both(
         }
         row[n] = of(equation.0).1.with_e[equation.1] / own;
     }
+    // With R12 and R21 the matrix is not symmetric, so that rows are exchanged.
     if !linear::eliminate(&mut rows[..n], Pivots::Largest, SMALLEST) {
         return None;
     }

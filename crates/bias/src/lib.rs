@@ -15,7 +15,8 @@
 //!
 //! in which R enters linearly (an instrumental-variable estimator with instruments z). For two catalogues under ±γ
 //! this is (⟨e⟩₊/⟨R⟩₊ − ⟨e⟩₋/⟨R⟩₋)/2γ − 1. Weights enter both sides. If the weight depends on the shear, w R is
-//! replaced by d(w e)/dg = w R + e dw/dg.
+//! replaced by d(w e)/dg = w R + e dw/dg. If galaxies are selected by measured quantities, the mean response R_S of the
+//! selection adds to R, from catalogues that were selected after shearing the images (Sheldon & Huff 2017, ApJ 841, 24).
 //!
 //! With R12 and R21 ([`Layout::matrix`]) e_k also contains R_kj times the shear that the fit gives to the other component j,
 //! and Σ_t x_jt Σ w R_kj z_ks z_jt adds to the left side. Both components are then solved together, so that for m and c

@@ -1,4 +1,6 @@
 //! Stars with noise. Each is the PSF of all galaxies of some catalogues, and changes their m and c alike.
+//!
+//! A jackknife over units that share a star does not see this error, because leaving out a unit does not change the star.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -11,9 +13,9 @@ use crate::units::UnitSums;
 pub struct StarNoise {
     /// What distinguishes the star from others.
     pub star: String,
-    /// Standard deviation of m by the noise, the same for both components.
+    /// Standard deviation of m by the noise of the star, the same for both components.
     pub m: f64,
-    /// Standard deviation of c by the noise, independent for each component.
+    /// Standard deviation of c by the noise of the star, independent for each component.
     pub c: f64,
 }
 
@@ -50,6 +52,7 @@ pub(crate) fn shared(
         if let Some(StarNoise { star, m, c }) = noise {
             let (catalogues, most) = stars.entry(star).or_default();
             catalogues.insert(catalogue);
+            // The larger of two statements about one star is the safe one.
             *most = [most[0].max(*m), most[1].max(*c)];
         }
     }

@@ -49,22 +49,22 @@ const fn sheared(component: usize, plus: bool) -> ShearedCatalogue {
     ShearedCatalogue { component, plus }
 }
 
-/// Terms z of the fit: a constant, the same and the other component of shear, the square of the shear.
+// Terms z of the fit: a constant, the same and the other component of shear, the square of the shear.
 pub(crate) const ONE: usize = 0;
 pub(crate) const OWN: usize = 1;
 pub(crate) const OTHER: usize = 2;
 pub(crate) const SQUARE: usize = 3;
-/// The PSF's ellipticity, and its product with the PSF's size.
+// The PSF's ellipticity, and its product with the PSF's size: leakage grows with the PSF relative to the galaxy.
 pub(crate) const PSF: usize = 4;
 pub(crate) const PSF_SIZE: usize = 5;
 pub(crate) const MAX_TERMS: usize = 6;
 
-/// Places of the first sums: galaxies, weights, squared weights, weights times PSF size.
+// Places of the first sums: galaxies, weights, squared weights, weights times PSF size.
 pub(crate) const COUNT: usize = 0;
 pub(crate) const WEIGHT: usize = 1;
 pub(crate) const WEIGHT2: usize = 2;
 pub(crate) const WEIGHTED_PSF_SIZE: usize = 3;
-/// Then per sheared catalogue: weights times ellipticity, weights.
+// Then per sheared catalogue: weights times ellipticity, weights.
 const SHEARED: usize = 4;
 const HEAD: usize = SHEARED + 2 * SHEARED_CATALOGUES.len();
 
@@ -113,7 +113,8 @@ impl Layout {
         HEAD + self.components() * self.of_component()
     }
 
-    /// Per sheared catalogue, weights times the ellipticity in the component that it does not shear.
+    // Per sheared catalogue, weights times the ellipticity in the component that it does not shear, for R12 and R21: with
+    // R = [[0.8, 0.1], [0.1, 0.7]] and g1 = g2, the diagonal alone gives m = 0.125 and 0.143 instead of 0.
     fn of_other_components(self) -> usize {
         if self.matrix && self.sheared {
             SHEARED_CATALOGUES.len()
@@ -122,7 +123,7 @@ impl Layout {
         }
     }
 
-    /// Of a pair of components: sums w R12 z z', w R21 z' z, then w z z' if they are needed; none without a matrix.
+    // Of a pair of components: sums w R12 z z', w R21 z' z, then w z z' if they are needed; none without a matrix.
     fn of_pair(self) -> usize {
         let n = self.terms();
         match (self.matrix, self.sheared) {
@@ -180,7 +181,7 @@ impl Layout {
         self.add_pair(sums, 1, row, (e, response, g, [modulus, 0.0]));
     }
 
-    /// Adds a galaxy to the sums of the components 1 and 2 (pair 0), or of those along and across the PSF (pair 1).
+    // To the sums of the components 1 and 2 (pair 0), or of those along and across the PSF (pair 1).
     fn add_pair(
         self,
         sums: &mut [f64],
@@ -290,8 +291,8 @@ impl Layout {
         extra
     }
 
-    /// Changes `sums` as if some of their galaxies, which have the sums `own`, had a larger m and c: e becomes
-    /// e + R (m g + c). R is the response of the row plus `extra`.
+    // Changes `sums` as if some of their galaxies, which have the sums `own`, had a larger m and c: e becomes e + R (m g + c),
+    // because a wrong PSF changes the shear before the response. R is the response of the row plus `extra`.
     pub(crate) fn shift(
         self,
         sums: &mut [f64],

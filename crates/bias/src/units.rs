@@ -7,36 +7,40 @@ use serde::{Deserialize, Serialize};
 use crate::error::BiasError;
 use crate::sums::{Layout, Row};
 
-/// Units that are kept, at least and at most, and per catalogue in between. A jackknife of 1000 units determines an
-/// error to 2 %.
+// Units that are kept, at least and at most, and per catalogue in between. A jackknife of 1000 units determines an error to
+// 1/√2000 = 2 %; more units only cost memory and time.
 const MIN_KEPT_UNITS: usize = 2048;
 const UNITS_PER_CATALOGUE: usize = 1024;
 const MAX_KEPT_UNITS: usize = 8192;
 
-/// Numbers that are kept, if that leaves at least [`MIN_UNITS_OF_MANY_BINS`] units: 64 MiB.
+// 64 MiB of numbers are kept, if that leaves at least 256 units, whose jackknife determines an error to 4 %.
 const MAX_KEPT_NUMBERS: usize = 1 << 23;
 const MIN_UNITS_OF_MANY_BINS: usize = 256;
 
-/// Sums per unit and bin.
+/// Sums per unit and bin, for any number of rows in bounded memory.
 ///
-/// A unit is named by its catalogue and a key: the number of a row, or the hash of an identifier. If there are too many
-/// units, neighbouring keys are joined, so the memory does not grow with the number of rows.
+/// A unit is a set of galaxies that is independent of others; errors follow from the scatter between units. It is named by
+/// the place of its catalogue in a list and a key: the number of a row, or the hash of an identifier. If there are more than
+/// 2048 to 8192 units, neighbouring keys are joined. Sums can be written by serde, and those of shards merge to the sums of
+/// all catalogues; the order of additions, and with it the last bits, then follows the order of the shards.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct UnitSums {
     layout: Layout,
     bins: usize,
     catalogues: usize,
-    /// Units have the same key after shifting it by so many bits.
+    // Units have the same key after shifting it by so many bits. Sums of shards with different shifts join at the larger
+    // one, so that a unit contains the same galaxies in all.
     shift: u32,
     units: Vec<((u32, u64), Vec<f64>)>,
     #[serde(skip)]
     places: HashMap<(u32, u64), usize>,
+    // Rows of one unit are neighbours in most files.
     #[serde(skip)]
     last: Option<((u32, u64), usize)>,
 }
 
 impl UnitSums {
-    /// No rows yet, for so many bins and catalogues.
+    /// Without rows yet, for a number of bins and catalogues.
     pub fn new(layout: Layout, bins: usize, catalogues: usize) -> Self {
         UnitSums {
             layout,
@@ -59,7 +63,7 @@ impl UnitSums {
         self.bins
     }
 
-    /// Adds a galaxy.
+    /// Adds a galaxy to the unit `key` of the `catalogue` of this number, in a bin from 0.
     ///
     /// # Panics
     /// If there is no such bin.
@@ -132,7 +136,8 @@ impl UnitSums {
         self.renamed(|(catalogue, key)| (catalogue, shifted(key, by)));
     }
 
-    /// Gives units other names, and joins those with the same name. The order follows the names.
+    // The order follows the names, not the hash map: sums of floating-point numbers depend on the order, and results must be
+    // the same on each run.
     fn renamed(&mut self, name: impl Fn((u32, u64)) -> (u32, u64)) {
         let mut joined: BTreeMap<(u32, u64), Vec<f64>> = BTreeMap::new();
         for (unit, sums) in self.units.drain(..) {
@@ -154,20 +159,22 @@ impl UnitSums {
     /// Adds the sums of other rows of the same catalogues.
     ///
     /// # Errors
-    /// If the sums differ in layout or bins.
+    /// [`BiasError::Layouts`] if the sums differ in layout or bins, [`BiasError::Length`] if they contradict themselves.
     pub fn merge(&mut self, mut other: UnitSums) -> Result<(), BiasError> {
         if (self.layout, self.bins) != (other.layout, other.bins) {
-            return Err(BiasError::Unlike(format!(
-                "other columns or bins (found {:?} with {} bins, expected {:?} with {})",
-                other.layout, other.bins, self.layout, self.bins
-            )));
+            return Err(BiasError::Layouts {
+                found: other.layout,
+                found_bins: other.bins,
+                expected: self.layout,
+                expected_bins: self.bins,
+            });
         }
         let length = self.bins * self.layout.len();
         if let Some((_, sums)) = other.units.iter().find(|(_, sums)| sums.len() != length) {
-            return Err(BiasError::Unlike(format!(
-                "a unit of another length (found {} numbers, expected {length})",
-                sums.len()
-            )));
+            return Err(BiasError::Length {
+                found: sums.len(),
+                expected: length,
+            });
         }
         let shift = self.shift.max(other.shift);
         self.catalogues = self.catalogues.max(other.catalogues);
@@ -182,10 +189,10 @@ impl UnitSums {
         Ok(())
     }
 
-    /// Adds the sums of other catalogues, which follow these.
+    /// Adds the sums of other catalogues, whose numbers follow those of these.
     ///
     /// # Errors
-    /// If the sums differ in layout or bins.
+    /// As [`UnitSums::merge`].
     pub fn append(&mut self, mut other: UnitSums) -> Result<(), BiasError> {
         let first = self.catalogues as u32;
         other.renamed(|(catalogue, key)| (catalogue + first, key));
@@ -193,7 +200,8 @@ impl UnitSums {
         self.merge(other)
     }
 
-    /// The same sums with a unit for each key, whatever the catalogue: the same row or identifier in all catalogues.
+    /// The same sums with a unit for each key, whatever the catalogue: the same row or identifier in all catalogues. The shape
+    /// of a galaxy under +γ and −γ is then left out together, and cancels in the error of m.
     pub fn by_key(mut self) -> Self {
         self.renamed(|(_, key)| (0, key));
         self
@@ -210,7 +218,6 @@ impl UnitSums {
         self.units.len()
     }
 
-    /// The sums of the catalogues that are `wanted`.
     pub(crate) fn of_catalogues(&self, wanted: impl Fn(u32) -> bool) -> Self {
         let all = self.units.iter();
         let units = all.filter(|((catalogue, _), _)| wanted(*catalogue));
@@ -222,7 +229,6 @@ impl UnitSums {
         }
     }
 
-    /// The mean ellipticities of units with the same key in two catalogues, over all bins.
     pub(crate) fn mean_pairs(&self, a: u32, b: u32) -> Vec<[[f64; 2]; 2]> {
         let length = self.layout.len();
         let mean = |unit: &[f64]| {
@@ -241,7 +247,7 @@ impl UnitSums {
         of(b).filter_map(pair).collect()
     }
 
-    /// The sums of each unit of a bin that has a galaxy.
+    // Units without a galaxy in the bin are no units of it: they would make the factor (n − 1)/n of the jackknife too large.
     pub(crate) fn of_bin(&self, bin: usize) -> Vec<&[f64]> {
         let length = self.layout.len();
         let of_bin = |sums: &'_ [f64]| bin * length..(bin + 1) * length.min(sums.len());
@@ -294,6 +300,7 @@ impl UnitSums {
 }
 
 fn shifted(key: u64, shift: u32) -> u64 {
+    // A shift by 64 bits or more overflows, and means one unit.
     key.checked_shr(shift).unwrap_or(0)
 }
 

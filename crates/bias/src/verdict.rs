@@ -2,7 +2,7 @@
 
 use crate::estimate::Measured;
 
-/// A published tolerance.
+/// A published tolerance of m or c.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Requirement {
     /// Survey or challenge.
@@ -57,8 +57,10 @@ pub enum Verdict {
     },
 }
 
-/// Compares a value of so many galaxies and units with a limit, at 95 % confidence.
+/// Compares a value of `galaxies` galaxies in `units` units with a `limit` of its modulus, at 95 % confidence of Student's t
+/// distribution with one degree of freedom less than units.
 pub fn verdict(measured: Measured, limit: f64, galaxies: usize, units: usize) -> Verdict {
+    // A value below the limit by less than its error does not meet a requirement: the whole interval has to.
     let half = student_t(0.975, units.saturating_sub(1)) * measured.error;
     let modulus = measured.value.abs();
     if modulus + half <= limit {
@@ -66,6 +68,7 @@ pub fn verdict(measured: Measured, limit: f64, galaxies: usize, units: usize) ->
     } else if modulus - half > limit {
         Verdict::NotMet
     } else {
+        // Errors fall with the root of the number of galaxies.
         let ratio = half / (limit - modulus).abs();
         Verdict::Undecided {
             galaxies: galaxies as f64 * ratio * ratio,
@@ -73,7 +76,8 @@ pub fn verdict(measured: Measured, limit: f64, galaxies: usize, units: usize) ->
     }
 }
 
-/// Quantile of Student's t distribution, for `probability` of 0.5 to 1.
+/// Quantile of Student's t distribution with so many degrees of freedom, for a `probability` of 0.5 to 1. Infinite without
+/// degrees of freedom.
 pub fn student_t(probability: f64, degrees: usize) -> f64 {
     if degrees == 0 {
         return f64::INFINITY;
