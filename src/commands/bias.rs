@@ -29,9 +29,9 @@ use shearq_results::views::bias::{
 /// R11 and R22, a flag, and the true shear g1 and g2. Columns of HSM, ngmix metacal, metadetect and AnaCal are
 /// recognised.
 ///
-/// The design is recognised from the true shears: pairs of +γ and −γ, arms, one shear per catalogue, or shears that vary
-/// within a catalogue. Errors are from a jackknife over independent units, and contain the noise of a star that several
-/// units share. The output names design and units.
+/// The design is recognised from the true shears: paired shears +γ and −γ, several such pairs, one shear per catalogue,
+/// or shears that vary within a catalogue. Errors are from a jackknife over independent units, and contain the noise of
+/// a star that several units share. The output names design and units.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
     /// Catalogues, all with the same columns, or folders that `measure` or `run` wrote. FILE[TABLE] is one table of a
@@ -240,34 +240,21 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     }
 }
 
-/// Inputs and options, for reports.
+// The report states what it was made by, so that it can be made again.
 fn made_by(arguments: &Arguments) -> Vec<(String, String)> {
+    let joined = |all: Vec<String>, between: &str| Some(all.join(between));
     let paths = |paths: &[PathBuf]| {
-        let shown: Vec<String> = paths
-            .iter()
-            .map(|path| path.display().to_string())
-            .collect();
-        shown.join("\n")
+        let shown = paths.iter().map(|path| path.display().to_string());
+        joined(shown.collect(), "\n")
     };
-    let mut made_by = vec![
-        ("Catalogues".to_owned(), paths(&arguments.catalogues)),
-        ("Sums".to_owned(), paths(&arguments.merge)),
-        ("Columns".to_owned(), arguments.columns.join(", ")),
-    ];
-    if let Some(truth) = &arguments.truth {
-        made_by.push(("True shear".into(), truth.display().to_string()));
-    }
-    if let Some((g1, g2)) = arguments.g1.zip(arguments.g2) {
-        made_by.push(("True shear".into(), format!("{g1}, {g2}")));
-    }
-    for (name, text) in [
-        ("Where", &arguments.condition),
-        ("Weight", &arguments.weight),
-    ] {
-        if let Some(text) = text {
-            made_by.push((name.into(), text.clone()));
-        }
-    }
+    let truth = arguments.truth.as_ref();
+    let constant = arguments.g1.zip(arguments.g2);
+    let truth = truth
+        .map(|path| path.display().to_string())
+        .or_else(|| constant.map(|(g1, g2)| format!("{g1}, {g2}")));
+    let sign = arguments
+        .truth_sign
+        .map(|sign| word(sign.into()).to_owned());
     let bins = arguments.bins.as_ref().map(|bins| {
         let edges = match &bins.edges {
             Edges::Equal(count) => format!("{count} with equally many galaxies"),
@@ -275,54 +262,43 @@ fn made_by(arguments: &Arguments) -> Vec<(String, String)> {
         };
         format!("{}: {edges}", bins.of.text())
     });
-    let yes = |given: bool| given.then(|| "yes".to_owned());
-    let limits = arguments.fail_above.iter();
-    let limits: Vec<String> = limits
-        .map(|limit| {
-            format!(
-                "|{}| ≤ {:e} within {} σ",
-                limit.of, limit.limit, limit.sigma
-            )
-        })
-        .collect();
-    let options = [
-        (
-            "Design",
-            arguments.design.map(|own| name_of(own).to_owned()),
-        ),
+    let limits = arguments
+        .fail_above
+        .iter()
+        .map(|Limit { of, limit, sigma }| format!("|{of}| ≤ {limit:e} within {sigma} σ"));
+    let bootstrap = arguments.bootstrap;
+    let bootstrap = bootstrap.map(|draws| format!("{draws} draws, seed {}", arguments.seed));
+    let made_by = [
+        ("Catalogues", paths(&arguments.catalogues)),
+        ("Sums", paths(&arguments.merge)),
+        ("Columns", joined(arguments.columns.clone(), ", ")),
+        ("True shear", truth),
+        ("Where", arguments.condition.clone()),
+        ("Weight", arguments.weight.clone()),
+        ("Design", arguments.design.map(|own| name_of(own).into())),
         ("Units", arguments.units.clone()),
         (
             "Ellipticities",
-            arguments.ellipticity.map(|own| name_of(own).to_owned()),
+            arguments.ellipticity.map(|own| name_of(own).into()),
         ),
-        (
-            "Sign of the true g2",
-            arguments
-                .truth_sign
-                .map(|sign| word(sign.into()).to_owned()),
-        ),
+        ("Sign of the true g2", sign),
         ("Bins", bins),
         (
             "Rows with missing numbers are left out",
-            yes(arguments.drop_missing),
+            arguments.drop_missing.then(|| "yes".into()),
         ),
         (
             "Step of metacalibration",
             arguments.step.map(|step| step.to_string()),
         ),
-        ("Limits", Some(limits.join(", "))),
+        ("Limits", joined(limits.collect(), ", ")),
+        ("Bootstrap", bootstrap),
     ];
-    made_by.extend(
-        options
-            .into_iter()
-            .filter_map(|(name, value)| Some((name.into(), value?))),
-    );
-    if let Some(draws) = arguments.bootstrap {
-        let seed = arguments.seed;
-        made_by.push(("Bootstrap".into(), format!("{draws} draws, seed {seed}")));
-    }
-    made_by.retain(|(_, value)| !value.is_empty());
-    made_by
+    let given = |(name, value): (&str, Option<String>)| {
+        let value = value.filter(|value| !value.is_empty())?;
+        Some((name.to_owned(), value))
+    };
+    made_by.into_iter().filter_map(given).collect()
 }
 
 fn of_catalogues(arguments: &Arguments, catalogues: &[PathBuf]) -> anyhow::Result<Summed> {
