@@ -3,18 +3,15 @@
 use std::path::PathBuf;
 
 use clap::{ArgGroup, Args, Subcommand};
-use shearq_challenge::copies::near_copies;
 use shearq_challenge::create::{Folders, Plan, Simulation, of_images, simulated};
-use shearq_challenge::deadline::Deadline;
 use shearq_challenge::inbox;
 use shearq_challenge::judge::Judge;
 use shearq_challenge::kind::{Kind, RankBy, kind};
-use shearq_challenge::organiser::Decisions;
 use shearq_challenge::page::View;
-use shearq_challenge::ranking;
+use shearq_challenge::ranking::{Decisions, near_copies, rank as ranked};
 use shearq_challenge::seal::{BOARD_FILE, is_open_to_others, verify_public};
 use shearq_challenge::shapes::References;
-use shearq_challenge::terms::{Challenge, TUNING_ENTRIES};
+use shearq_challenge::terms::{Challenge, Deadline, TUNING_ENTRIES};
 use shearq_dataset::layout::DataFolder;
 use shearq_dataset::layout::MAX_IMAGE;
 use shearq_files::FileError;
@@ -405,7 +402,7 @@ fn rank(arguments: &RankArguments) -> anyhow::Result<()> {
     let digits = arguments
         .digits
         .map_or(rules.metric.decimals(), usize::from);
-    let board = ranking::rank(&entries, &judge.challenge, judge.constant.as_ref(), digits);
+    let board = ranked(&entries, &judge.challenge, judge.constant.as_ref(), digits);
     let copies = near_copies(&entries);
     let view = View {
         challenge: &judge.challenge,

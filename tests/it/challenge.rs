@@ -11,8 +11,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde_json::Value;
 use shearq_challenge::create::seed_of;
-use shearq_challenge::receipt::Receipt;
-use shearq_challenge::seal::{Key, sha256};
+use shearq_challenge::seal::{Key, Receipt, sha256};
 
 use crate::support::{contents, fail, shearq, succeed, text};
 

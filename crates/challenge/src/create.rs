@@ -25,14 +25,13 @@ use shearq_simulate::set::{STAMP, SimulationSettings};
 
 use crate::constant::ConstantShears;
 use crate::contradiction::{First, contradiction};
-use crate::deadline::Deadline;
 use crate::error::{ChallengeError, EXPECTED_RESPONSE};
 use crate::judge::unscored;
 use crate::kind::{Kind, RankBy, response};
-use crate::readme;
+use crate::page::readme;
 use crate::seal::{Key, close, names, seal_public, sums};
 use crate::shapes::References;
-use crate::terms::{CHALLENGE_FILE, Challenge, Data, Rules};
+use crate::terms::{CHALLENGE_FILE, Challenge, Data, Deadline, Rules};
 
 #[derive(Debug, Clone)]
 pub struct Plan {
@@ -157,40 +156,35 @@ pub fn simulated(
     threads: usize,
     progress: &mut dyn Progress,
 ) -> Result<Challenge, ChallengeError> {
-    let Simulation {
-        sets,
-        images,
-        grid,
-        amplitude,
-        tilt,
-        seed,
-    } = simulation;
     plan.check()?;
-    if *amplitude == Some(0.0) {
+    if simulation.amplitude == Some(0.0) {
         return Err(ChallengeError::NoShear);
     }
     let earlier = folders.prepare(plan)?;
     let kept = earlier
         .as_ref()
         .and_then(|key| key.seed.as_ref()?.parse().ok());
-    if let (Some(kept), Some(seed)) = (kept, *seed)
+    if let (Some(kept), Some(seed)) = (kept, simulation.seed)
         && kept != seed
     {
         let message = "the key has another seed. Try: without --seed, or another folder";
         return Err(FileError::new(folders.private, message).into());
     }
-    let seed: u64 = kept.or(*seed).unwrap_or_else(rand::random);
+    let seed: u64 = kept.or(simulation.seed).unwrap_or_else(rand::random);
     let key = earlier.unwrap_or_else(|| Key::new(&plan.name, plan.version, Some(seed)));
     let secret = seed_of(&plan.name, plan.version, seed);
     let (least, most) = AMPLITUDES;
     let settings = SimulationSettings {
         spectrum: ShearSpectrum {
-            amplitude: amplitude
+            amplitude: simulation
+                .amplitude
                 .unwrap_or_else(|| least * (most / least).powf(drawn(secret, "amplitude"))),
-            tilt: tilt.unwrap_or_else(|| TILT * (2.0 * drawn(secret, "tilt") - 1.0)),
+            tilt: simulation
+                .tilt
+                .unwrap_or_else(|| TILT * (2.0 * drawn(secret, "tilt") - 1.0)),
             scatter: SCATTER,
         },
-        ..SimulationSettings::new(secret, *grid)
+        ..SimulationSettings::new(secret, simulation.grid)
     };
     settings.validate()?;
     key.write(folders.private)?;
@@ -203,17 +197,17 @@ pub fn simulated(
         DataFolder::new(folders.private),
     );
     let data = Data {
-        sets: sets.clone(),
-        images: *images,
-        grid: *grid,
+        sets: simulation.sets.clone(),
+        images: simulation.images,
+        grid: simulation.grid,
         stamp: STAMP,
         field_degrees: public.layout().field_degrees,
     };
     // One image of each set shows whether entries can be ranked, before hours of simulation.
-    let first = images::of_simulation(sets, 1);
+    let first = images::of_simulation(&data.sets, 1);
     simulate_blind(&record, &first, &public, &private, threads, progress)?;
     let metric = rankable(plan, &data, &public, &private, false, threads, progress)?;
-    let ids = images::of_simulation(sets, *images);
+    let ids = images::of_simulation(&data.sets, data.images);
     simulate_blind(&record, &ids, &public, &private, threads, progress)?;
     finish(plan, metric, data, folders, key, threads)
 }
@@ -535,42 +529,29 @@ fn finish(
     mut key: Key,
     threads: usize,
 ) -> Result<Challenge, ChallengeError> {
-    let Plan {
-        name,
-        version,
-        kind,
-        metric: _,
-        spectra,
-        contact,
-        address,
-        entries_per_team,
-        opens,
-        closes,
-        partial,
-    } = plan.clone();
+    let kind = plan.kind;
     let layout = layout_text(kind, &data);
+    let conventions = kind.conventions.iter();
     let mut challenge = Challenge {
-        name,
-        version,
+        name: plan.name.clone(),
+        version: plan.version,
         kind,
-        contact,
-        address,
+        contact: plan.contact.clone(),
+        address: plan.address.clone(),
         seal: String::new(),
-        conventions: kind
-            .conventions
-            .iter()
+        conventions: conventions
             .map(|(name, text)| ((*name).to_owned(), (*text).to_owned()))
             .collect(),
         rules: Rules {
             metric,
-            contents: match spectra {
+            contents: match plan.spectra {
                 true => [kind.contents, &[Contents::Spectra, Contents::CrossSpectra]].concat(),
                 false => kind.contents.to_vec(),
             },
-            entries_per_team,
-            opens,
-            closes,
-            partial,
+            entries_per_team: plan.entries_per_team,
+            opens: plan.opens.clone(),
+            closes: plan.closes.clone(),
+            partial: plan.partial,
         },
         data,
     };
@@ -579,10 +560,7 @@ fn finish(
     key.files = sums(private, names(private)?, threads)?;
     challenge.seal = key.seal();
     atomic::write(public.join(LAYOUT_FILE), layout.as_bytes())?;
-    atomic::write(
-        public.join("README.md"),
-        readme::text(&challenge).as_bytes(),
-    )?;
+    atomic::write(public.join("README.md"), readme(&challenge).as_bytes())?;
     let path = public.join(CHALLENGE_FILE);
     atomic::write(&path, challenge.text(&path)?.as_bytes())?;
     key.public = Some(seal_public(public, threads)?);

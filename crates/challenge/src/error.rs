@@ -6,10 +6,11 @@ use shearq_pipeline::PipelineError;
 use shearq_results::score::ScoreError;
 use thiserror::Error;
 
-/// Significance of the response that a method of ordinary noise must expect. Entries need 3; two more make a refusal by
-/// chance unlikely.
+use crate::terms::Deadline;
+
+// Significance of the response that a method of ordinary noise must expect. Entries need 3; two more make a refusal by
+// chance unlikely.
 pub(crate) const EXPECTED_RESPONSE: f64 = 5.0;
-use crate::deadline::Deadline;
 
 /// Failure to make a challenge: a file or a measurement, or data and rules by which entries could not be ranked.
 #[derive(Debug, Error)]

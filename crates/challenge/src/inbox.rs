@@ -7,7 +7,7 @@ use shearq_results::submit::archive::{self, is_archive};
 use shearq_results::submit::challenge::Kind;
 use shearq_results::submit::manifest::{Entry, FileSum, MANIFEST_FILE, Manifest};
 
-use crate::seal::sha256;
+use crate::seal::{entries, sha256};
 
 // Folders below a given folder that are searched.
 const DEPTH: usize = 3;
@@ -72,9 +72,7 @@ fn search(
         }
         return Ok(());
     }
-    let mut inside: Vec<PathBuf> = std::fs::read_dir(path)
-        .and_then(|entries| entries.map(|entry| Ok(entry?.path())).collect())
-        .map_err(FileError::doing(path, "cannot list the folder"))?;
+    let mut inside = entries(path)?;
     inside.sort();
     let of_entry = |path: &PathBuf| {
         Kind::of(path).is_some() || path.file_name().is_some_and(|name| name == MANIFEST_FILE)
@@ -117,9 +115,7 @@ fn search(
 pub fn refuse_links(entry: &Path) -> Result<(), FileError> {
     let mut paths = vec![entry.to_owned()];
     if entry.is_dir() {
-        let inside: std::io::Result<Vec<PathBuf>> = std::fs::read_dir(entry)
-            .and_then(|inside| inside.map(|file| Ok(file?.path())).collect());
-        paths.extend(inside.map_err(FileError::doing(entry, "cannot list the folder"))?);
+        paths.extend(entries(entry)?);
     }
     match paths.into_iter().find(|path| path.is_symlink()) {
         Some(link) => Err(FileError::new(
@@ -140,9 +136,7 @@ pub fn identify(path: &Path) -> Result<String, FileError> {
 }
 
 fn sums(folder: &Path) -> Result<Vec<(String, FileSum)>, FileError> {
-    let mut paths: Vec<PathBuf> = std::fs::read_dir(folder)
-        .and_then(|entries| entries.map(|entry| Ok(entry?.path())).collect())
-        .map_err(FileError::doing(folder, "cannot list the folder"))?;
+    let mut paths = entries(folder)?;
     paths.retain(|path| path.is_file());
     paths.sort();
     paths

@@ -8,8 +8,7 @@ use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use shearq_dataset::fingerprint;
 use shearq_dataset::layout::DataFolder;
-use shearq_dataset::run::Source;
-use shearq_dataset::run::kind_of;
+use shearq_dataset::run::{Source, kind_of};
 use shearq_dataset::threads::{Pool, Progress, Quiet};
 use shearq_files::{FileError, names_of};
 use shearq_render::escape::line;
@@ -23,19 +22,15 @@ use shearq_results::submit::packed::{Packed, Sent, Submission};
 use shearq_scoring::{
     Choice, Convention, Fault, Grid, Options, SCORED, ScoringError, SetScorer, TrueShear,
 };
-use shearq_simulate::kinds::SetKind;
 use shearq_submissions::check_name;
 
 use crate::constant::ConstantShears;
-use crate::deadline::now;
 use crate::error::ChallengeError;
 use crate::inbox::{Content, Sending, content, identify};
 use crate::kind::response;
-use crate::receipt::Receipt;
-use crate::seal::{Key, verify, verify_public};
-use crate::shapes::References;
-use crate::sketch::sketch;
-use crate::terms::Challenge;
+use crate::seal::{Key, Receipt, verify, verify_public};
+use crate::shapes::{References, sketch};
+use crate::terms::{Challenge, now};
 
 /// What identifies a scored entry. The store keeps it with its scores, so the names are part of the format.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -49,7 +44,6 @@ pub struct EntryInfo {
     pub contact: String,
     /// Time of arrival: of the receipt, or of the first `rank` that scored the entry.
     pub received: Timestamp,
-    /// Whether a receipt states the time.
     pub receipt: bool,
     pub file: String,
     /// SHA-256 of the archive.
@@ -110,7 +104,7 @@ struct Truth {
     shear: TrueShear,
     scorer: SetScorer,
     print: String,
-    kind: Option<SetKind>,
+    simulated: bool,
 }
 
 pub struct Judge {
@@ -124,17 +118,11 @@ pub struct Judge {
     pub constant: Option<ConstantShears>,
 }
 
+// A judge must not print the truth.
 impl std::fmt::Debug for Judge {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("Judge").finish_non_exhaustive()
     }
-}
-
-struct Candidate {
-    sending: Sending,
-    reference: bool,
-    arrival: Arrival,
-    content: Content,
 }
 
 struct Arrival {
@@ -142,6 +130,17 @@ struct Arrival {
     received: Timestamp,
     receipt: Option<Receipt>,
 }
+
+struct Candidate {
+    sending: Sending,
+    reference: bool,
+    team: String,
+    arrival: Arrival,
+    content: Content,
+}
+
+// The records of the sets of an entry, and a probable fault.
+type Scores = (Vec<SetRecord>, Option<String>);
 
 impl Judge {
     /// Opens the public and the private folder of a challenge.
@@ -156,22 +155,20 @@ impl Judge {
             choice: Choice::Insist(Convention::STANDARD),
             ..Options::default()
         };
-        let (mut truths, mut shears) = (BTreeMap::new(), Vec::new());
+        let mut truths = BTreeMap::new();
         for &set in &challenge.data.sets {
-            let truth = data.read_truth(set, &grid)?;
-            shears.push((set, truth.clone()));
-            truths.insert(
-                set,
-                Truth {
-                    scorer: SetScorer::new(grid, truth.clone(), options).map_err(unscored)?,
-                    shear: truth,
-                    print: fingerprint::of_set(&source, &data, set, &[])?,
-                    kind: kind_of(&data, set),
-                },
-            );
+            let shear = data.read_truth(set, &grid)?;
+            let truth = Truth {
+                scorer: SetScorer::new(grid, shear.clone(), options).map_err(unscored)?,
+                shear,
+                print: fingerprint::of_set(&source, &data, set, &[])?,
+                simulated: kind_of(&data, set).is_some(),
+            };
+            truths.insert(set, truth);
         }
-        let constant = ConstantShears::of(shears.iter().map(|(set, truth)| (*set, truth)))
-            .map_err(|message| FileError::new(private, message))?;
+        let shears = truths.iter().map(|(set, truth)| (*set, &truth.shear));
+        let constant =
+            ConstantShears::of(shears).map_err(|message| FileError::new(private, message))?;
         Ok(Judge {
             challenge,
             key,
@@ -189,13 +186,17 @@ impl Judge {
             return None;
         }
         let q = |truth: &Truth| {
-            let zero = truth
-                .scorer
-                .score_spectrum(&[0.0; SCORED.end - SCORED.start], None);
-            zero.map_or(f64::NAN, |score| score.zero_q)
+            let zero = [0.0; SCORED.end - SCORED.start];
+            let score = truth.scorer.score_spectrum(&zero, None);
+            score.map_or(f64::NAN, |score| score.zero_q)
         };
         let sum: f64 = self.truths.values().map(q).sum();
         Some(sum / self.truths.len() as f64)
+    }
+
+    // Of two arrivals of one entry, the smaller one counts: an entry that came too early may come again.
+    fn order(&self, received: Timestamp) -> (bool, Timestamp) {
+        (self.challenge.rules.is_early(received), received)
     }
 
     /// The entries of this challenge in a store, in order of their arrival.
@@ -225,26 +226,20 @@ impl Judge {
                 sets: run.sets,
                 withdrawn: None,
             };
-            // Of two processes at the same time, or of a time with and without a receipt, the earlier one counts.
-            // Teams that sent the same archive are not one entry, and an early one may come again.
-            let order = |entry: &Entry| {
-                let received = entry.info.received;
-                (self.challenge.rules.is_early(received), received)
-            };
-            let id = (entry.info.sha256.clone(), entry.info.team.clone());
-            match entries.entry(id) {
-                Slot::Occupied(mut slot) if order(&entry) < order(slot.get()) => {
-                    slot.insert(entry);
+            // Two processes may score one entry at the same time, and a receipt may be found later. Teams that sent the same
+            // archive have an entry each.
+            match entries.entry((entry.info.sha256.clone(), entry.info.team.clone())) {
+                Slot::Occupied(mut slot) => {
+                    let earlier = self.order(slot.get().info.received);
+                    if self.order(entry.info.received) < earlier {
+                        slot.insert(entry);
+                    }
                 }
-                Slot::Occupied(_) => {}
                 Slot::Vacant(slot) => _ = slot.insert(entry),
             }
         }
         let mut entries: Vec<Entry> = entries.into_values().collect();
-        entries.sort_by(|a, b| {
-            let order = |entry: &Entry| (entry.info.received, entry.info.file.clone());
-            order(a).cmp(&order(b))
-        });
+        entries.sort_by_cached_key(|entry| (entry.info.received, entry.info.file.clone()));
         Ok(entries)
     }
 
@@ -269,10 +264,10 @@ impl Judge {
         }
         verify_public(&self.public, threads)?;
         let public = DataFolder::open(&self.public)?;
-        let sets = &self.challenge.data.sets;
-        let ids = References::ids(&public, sets)?;
+        let ids = References::ids(&public, &self.challenge.data.sets)?;
         let references = References::measure(&public, &ids, self.grid, threads, &mut Quiet)?;
         let pool = Pool::new(threads)?;
+        // Each entry is stored as soon as it is scored, so that a stopped command loses none.
         for result in pool.in_order(candidates, |candidate| self.judge(candidate, &references)) {
             progress.advance(self.challenge.data.galaxies());
             match result {
@@ -318,8 +313,7 @@ impl Judge {
             path: entry.to_owned(),
             team: team.map(str::to_owned),
         };
-        let stated = content(&sending)?.entry;
-        let team = team_of(&sending, stated.as_ref(), None);
+        let team = team_of(&sending, content(&sending)?.entry.as_ref(), None);
         check_name(&team).map_err(|error| FileError::new(entry, error))?;
         let counts = |received| !self.challenge.rules.is_early(received);
         match Receipt::read(&self.key, entry, &sha256) {
@@ -330,7 +324,8 @@ impl Judge {
         }
     }
 
-    // The entries that must be scored. Known entries are counted; unreadable entries and repeated archives are refused.
+    // The entries that must be scored, in order of arrival. Known entries are counted; unreadable entries and repeated
+    // archives are refused.
     fn candidates(
         &self,
         sendings: &[(Sending, bool)],
@@ -343,24 +338,18 @@ impl Judge {
         for Entry { info, .. } in known {
             stored.entry(&info.sha256).or_default().push(info);
         }
-        // A receipt that is found later states an earlier time than the store; an entry that came too early may come again.
-        let rules = &self.challenge.rules;
-        let order = |received: Timestamp| (rules.is_early(received), received);
         let is_known = |team: &str, arrival: &Arrival| {
             let same = stored.get(arrival.sha256.as_str()).into_iter().flatten();
+            let order = self.order(arrival.received);
             same.into_iter()
-                .any(|info| info.team == team && order(info.received) <= order(arrival.received))
+                .any(|info| info.team == team && self.order(info.received) <= order)
         };
-        let mut identified = Vec::new();
         let pool = Pool::new(threads)?;
-        let read = pool.in_order(sendings, |(sending, reference)| {
+        let identified = pool.in_order(sendings, |(sending, reference)| {
             let found = self.arrival(sending, now).and_then(|arrival| {
                 // Without a folder or a receipt, the manifest states the team.
-                let receipt = arrival.receipt.as_ref();
-                let team = sending
-                    .team
-                    .as_ref()
-                    .or(receipt.map(|receipt| &receipt.team));
+                let of_receipt = arrival.receipt.as_ref().map(|receipt| &receipt.team);
+                let team = sending.team.as_ref().or(of_receipt);
                 let content = match team.is_some_and(|team| is_known(team, &arrival)) {
                     true => None,
                     false => Some(content(sending)?),
@@ -369,28 +358,24 @@ impl Judge {
             });
             (sending.clone(), *reference, found)
         });
-        for (sending, reference, found) in read {
+        let mut readable = Vec::new();
+        for (sending, reference, found) in identified {
             match found {
-                Ok((arrival, content)) => {
-                    identified.push((sending, reference, arrival, content));
-                }
-                Err(error) => {
-                    let reason = reason_of(&error.path, &error.message, &sending);
-                    round.refused.push(Refused {
-                        team: team_of(&sending, None, None),
-                        path: sending.path,
-                        reason,
-                    });
-                }
+                Ok((arrival, content)) => readable.push((sending, reference, arrival, content)),
+                Err(error) => round.refused.push(Refused {
+                    team: team_of(&sending, None, None),
+                    reason: reason_of(&error.path, &error.message, &sending),
+                    path: sending.path,
+                }),
             }
         }
-        identified.sort_by(|a, b| (a.2.received, &a.0).cmp(&(b.2.received, &b.0)));
+        readable.sort_by(|a, b| (a.2.received, &a.0).cmp(&(b.2.received, &b.0)));
         let mut archives: BTreeMap<(String, String, bool), PathBuf> = BTreeMap::new();
         let mut candidates = Vec::new();
-        for (sending, reference, arrival, content) in identified {
+        for (sending, reference, arrival, content) in readable {
             let entry = content.as_ref().and_then(|content| content.entry.as_ref());
             let team = team_of(&sending, entry, arrival.receipt.as_ref());
-            let early = rules.is_early(arrival.received);
+            let early = self.challenge.rules.is_early(arrival.received);
             // Of other archives with this content, the first one that counts is known only when all are ranked.
             match archives.entry((arrival.sha256.clone(), team.clone(), early)) {
                 Slot::Occupied(first) => {
@@ -403,16 +388,16 @@ impl Judge {
                 }
                 Slot::Vacant(slot) => _ = slot.insert(sending.path.clone()),
             }
-            let Some(content) = content.filter(|_| !is_known(&team, &arrival)) else {
-                round.known += 1;
-                continue;
-            };
-            candidates.push(Candidate {
-                sending,
-                reference,
-                arrival,
-                content,
-            });
+            match content.filter(|_| !is_known(&team, &arrival)) {
+                None => round.known += 1,
+                Some(content) => candidates.push(Candidate {
+                    sending,
+                    reference,
+                    team,
+                    arrival,
+                    content,
+                }),
+            }
         }
         Ok(candidates)
     }
@@ -425,25 +410,22 @@ impl Judge {
         let Candidate {
             sending,
             reference,
+            team,
             arrival,
             content,
         } = candidate;
-        let team = team_of(&sending, content.entry.as_ref(), arrival.receipt.as_ref());
         let refuse = |reason: String| Refused {
             path: sending.path.clone(),
             team: team.clone(),
             reason,
         };
         let stated = content.entry.as_ref();
-        let (title, contact) = stated.map_or_else(Default::default, |entry| {
-            (entry.title.clone(), entry.contact.clone())
-        });
         let mut info = EntryInfo {
             challenge: self.challenge.name.clone(),
             team: team.clone(),
             method: String::new(),
-            title,
-            contact,
+            title: stated.map_or_else(String::new, |entry| entry.title.clone()),
+            contact: stated.map_or_else(String::new, |entry| entry.contact.clone()),
             received: arrival.received,
             receipt: arrival.receipt.is_some(),
             file: file_name(&sending.path),
@@ -473,8 +455,7 @@ impl Judge {
             noise: "measured".into(),
             sets,
         };
-        let doubt = doubt.map(|doubt| (sending.path.clone(), doubt));
-        Ok((run, doubt))
+        Ok((run, doubt.map(|doubt| (sending.path, doubt))))
     }
 
     fn score(
@@ -501,9 +482,8 @@ impl Judge {
             Packed::Catalogues(_) => self.catalogues(&sent, sending, references, info)?,
             Packed::Spectra(files) => {
                 self.check(&sent, sending, references, &mut |_| {})?;
-                let manifest = submission.manifest.as_ref();
                 let (sets, powers) = self
-                    .spectra(files, manifest)
+                    .spectra(files, submission.manifest.as_ref())
                     .map_err(|error| plain(sent.named(error)))?;
                 let (slope, error) = slope_over_sets(&powers);
                 if !is_measurable(slope, error) {
@@ -564,23 +544,18 @@ impl Judge {
         references: &References,
         info: &mut EntryInfo,
     ) -> Result<Scores, String> {
-        let mut sets = Vec::new();
-        let mut failed = None;
-        let mut odd: Vec<String> = Vec::new();
-        self.check(sent, sending, references, &mut |set: CheckedSet<'_>| {
-            let of_set = set.set;
-            odd.extend(
-                set.odd
-                    .iter()
-                    .map(|image| format!("{image} of set {of_set}")),
-            );
-            match self.score_set(&set) {
+        let (mut sets, mut odd, mut failed) = (Vec::new(), Vec::new(), None);
+        self.check(sent, sending, references, &mut |checked: CheckedSet<'_>| {
+            let set = checked.set;
+            let of_set = checked.odd.iter();
+            odd.extend(of_set.map(|image| format!("{image} of set {set}")));
+            match self.score_set(&checked) {
                 Ok(record) => {
-                    info.shapes
-                        .insert(of_set.to_string(), sketch(set.images.total()));
+                    let shapes = sketch(checked.images.total());
+                    info.shapes.insert(set.to_string(), shapes);
                     sets.extend(record);
                 }
-                Err(reason) => failed = failed.take().or(Some(reason)),
+                Err(reason) => failed = failed.take().or(Some(format!("set {set}: {reason}"))),
             }
         })?;
         // Without numbers, because correlations with the truth are secret.
@@ -615,7 +590,7 @@ impl Judge {
             let images = (1..=self.challenge.data.images).collect();
             sets.push(SetRecord {
                 data: truth.print.clone(),
-                ..SetRecord::of_spectrum(set, truth.kind.is_some(), images, &score)
+                ..SetRecord::of_spectrum(set, truth.simulated, images, &score)
             });
         }
         Ok((sets, all))
@@ -624,44 +599,36 @@ impl Judge {
     // The record of a set of catalogues. `None` if the set does not belong to the challenge.
     fn score_set(&self, checked: &CheckedSet<'_>) -> Result<Option<SetRecord>, String> {
         let CheckedSet {
-            set,
-            images,
-            numbers,
-            rows,
-            odd: _,
+            set, images, rows, ..
         } = checked;
         let Some(truth) = self.truths.get(set) else {
             return Ok(None);
         };
-        let wrong = |error: ScoringError| format!("set {set}: {error}");
+        let wrong = |error: ScoringError| error.to_string();
         let score = truth.scorer.score(images).map_err(wrong)?;
         let faults = truth
             .scorer
             .diagnose(images, &score, Convention::STANDARD)
             .map_err(wrong)?;
-        // Without numbers, because correlations with the truth are secret.
-        let wrong_order = faults.iter().find_map(|fault| match fault {
-            Fault::Convention { better, .. } => Some(format!(
-                "signs or axes are wrong (found convention {}, {}; expected 5, standard)",
-                better.number(),
-                better.describe()
-            )),
-            Fault::Swapped { .. } => Some("e1 and e2 are swapped".to_owned()),
-            Fault::Shifted { .. } => Some("the galaxies are in neighbouring cells".to_owned()),
-            _ => None,
-        });
-        if let Some(reason) = wrong_order {
-            return Err(format!("set {set}: {reason}"));
+        for fault in faults {
+            // Without numbers, because correlations with the truth are secret.
+            return Err(match fault {
+                Fault::Convention { better, .. } => format!(
+                    "signs or axes are wrong (found convention {}, {}; expected 5, standard)",
+                    better.number(),
+                    better.describe()
+                ),
+                Fault::Swapped { .. } => "e1 and e2 are swapped".into(),
+                Fault::Shifted { .. } => "the galaxies are in neighbouring cells".into(),
+                _ => continue,
+            });
         }
-        let simulated = truth.kind.is_some();
-        let record = SetRecord::new(*set, simulated, numbers.to_vec(), &score, rows, true);
+        let numbers = checked.numbers.to_vec();
+        let record = SetRecord::new(*set, truth.simulated, numbers, &score, rows, true);
         let data = truth.print.clone();
         Ok(Some(SetRecord { data, ..record }))
     }
 }
-
-// The scores of each set of an entry, and what is doubtful about it.
-type Scores = (Vec<SetRecord>, Option<String>);
 
 // Significance that the response to the shear needs, as for Q cal.
 const CLEAR_RESPONSE: f64 = 3.0;
@@ -720,24 +687,22 @@ fn team_of(sending: &Sending, entry: Option<&Team>, receipt: Option<&Receipt>) -
     folder
         .or_else(|| receipt.map(|receipt| receipt.team.clone()))
         .or_else(|| entry.map(|entry| entry.team.clone()))
-        .unwrap_or_else(|| stem(&sending.path))
+        .unwrap_or_else(|| {
+            let name = file_name(&sending.path);
+            let endings = [".tar.gz", ".tgz"];
+            let stem = endings.iter().find_map(|ending| name.strip_suffix(ending));
+            stem.unwrap_or(&name).to_owned()
+        })
 }
 
 fn file_name(path: &Path) -> String {
     line(&path.file_name().unwrap_or_default().to_string_lossy())
 }
 
-fn stem(path: &Path) -> String {
-    let name = file_name(path);
-    let endings = [".tar.gz", ".tgz"];
-    let stem = endings.iter().find_map(|ending| name.strip_suffix(ending));
-    stem.unwrap_or(&name).to_owned()
-}
-
+// As much of a name as a store accepts.
 fn short(name: &str) -> String {
-    let end = (0..=name.len().min(shearq_submissions::MAX_NAME))
-        .rev()
-        .find(|end| name.is_char_boundary(*end));
+    let mut ends = (0..=shearq_submissions::MAX_NAME).rev();
+    let end = ends.find(|end| name.is_char_boundary(*end));
     name[..end.unwrap_or(0)].to_owned()
 }
 

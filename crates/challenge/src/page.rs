@@ -1,21 +1,19 @@
-//! The leaderboard as a table, and as a page that works without server and network.
+//! The leaderboard as a table, as a page that works without server and network, and the page for participants.
 
 use std::path::Path;
 
 use shearq_files::{FileError, atomic};
-use shearq_render::figure::{Figure, FigureError, LinePlot, Series, Style};
+use shearq_render::figure::{FigureError, LinePlot, Series, Style};
 use shearq_render::html::{Block, Picture, Report, Section};
 use shearq_render::page::PageError;
 use shearq_render::table::{Cell, Table, TableFormat};
-use shearq_results::submit::manifest::Contents;
+use shearq_results::submit::challenge::Kind as FileKind;
 use shearq_results::views::comparison::q_heat_map;
 
 use crate::constant::ConstantShears;
-use crate::copies::NearCopy;
 use crate::judge::{EntryInfo, Refused};
 use crate::kind::RankBy;
-use crate::ranking::{Board, Leaderboard, Standing, better, rounded};
-use crate::readme;
+use crate::ranking::{Board, Leaderboard, NearCopy, Standing, better, rounded};
 use crate::terms::Challenge;
 
 // The palette has eight colours.
@@ -30,7 +28,6 @@ pub struct View<'a> {
     pub zero_shear: Option<f64>,
     /// The true shears of sets with one shear each.
     pub constant: Option<&'a ConstantShears>,
-    /// Entries that are nearly those of others.
     pub copies: &'a [NearCopy<'a>],
     /// Decimals of the metric. More of them reveal more of the true shear.
     pub digits: usize,
@@ -38,10 +35,7 @@ pub struct View<'a> {
     pub detail: bool,
 }
 
-// Name of the line of an entry without images. Teams may have this name, too, but they have a rank.
-const ZERO_SHEAR: &str = "zero shear";
-
-// Names of the columns of a metric and its error.
+// Keys of the columns of a metric and its error.
 fn key(metric: RankBy) -> (&'static str, &'static str) {
     match metric {
         RankBy::Q => ("q", "q_error"),
@@ -51,31 +45,6 @@ fn key(metric: RankBy) -> (&'static str, &'static str) {
         RankBy::C => ("c", "c_error"),
         RankBy::Qc => ("qc", "qc_error"),
         RankBy::Noise => ("noise", "noise_error"),
-    }
-}
-
-// A line of a leaderboard.
-enum Line<'a> {
-    Standing(&'a Standing<'a>),
-    /// An entry of zeros, with its metric.
-    Zero(f64),
-}
-
-impl Line<'_> {
-    // The cell of a standing; an entry of zeros has the words `zero`.
-    fn cell(&self, zero: &str, cell: impl Fn(&Standing<'_>) -> Cell) -> Cell {
-        match self {
-            Line::Standing(standing) => cell(standing),
-            Line::Zero(_) if zero.is_empty() => Cell::Empty,
-            Line::Zero(_) => Cell::text(zero),
-        }
-    }
-}
-
-fn files(contents: Contents) -> &'static str {
-    match contents {
-        Contents::Catalogues => "catalogues",
-        Contents::Spectra | Contents::CrossSpectra => "spectra",
     }
 }
 
@@ -100,18 +69,6 @@ fn rounded_to_error(value: f64, error: f64, most: usize) -> Option<(f64, usize)>
     Some((rounded(value / step, digits) * step, digits))
 }
 
-fn received(info: &EntryInfo) -> String {
-    info.received.strftime("%Y-%m-%d %H:%M").to_string()
-}
-
-fn title(info: &EntryInfo) -> String {
-    match (info.reference, info.title.is_empty()) {
-        (true, true) => "reference".into(),
-        (true, false) => format!("reference: {}", info.title),
-        (false, _) => info.title.clone(),
-    }
-}
-
 // Shift of a team's points. First entries of equal quality would hide each other.
 fn aside(team: usize, teams: usize) -> f64 {
     0.6 * ((team as f64 + 0.5) / teams as f64 - 0.5)
@@ -129,91 +86,87 @@ impl View<'_> {
 
     fn table_of(&self, boards: &[Board]) -> Table {
         let (metric, digits) = (self.metric(), self.digits);
+        let zero = metric.of_zero_shear(self.zero_shear.unwrap_or(f64::NAN));
         let standings = boards.iter().flat_map(|board| self.board.of(*board));
-        let mut lines: Vec<Line<'_>> = standings.map(Line::Standing).collect();
+        // A row without standing is an entry of zeros: whoever is below it has measured nothing.
+        let mut rows: Vec<Option<&Standing<'_>>> = standings.map(Some).collect();
         if boards.contains(&Board::Main) {
-            let zero = metric.of_zero_shear(self.zero_shear.unwrap_or(f64::NAN));
-            let behind = |line: &Line<'_>| match line {
-                Line::Standing(standing) => {
+            let behind = |row: &Option<&Standing<'_>>| {
+                row.is_none_or(|standing| {
                     standing.board != Board::Main || better(metric, zero, standing.best.value)
-                }
-                Line::Zero(_) => true,
+                })
             };
-            let place = lines.iter().position(behind).unwrap_or(lines.len());
-            lines.insert(place, Line::Zero(zero));
+            let place = rows.iter().position(behind).unwrap_or(rows.len());
+            rows.insert(place, None);
         }
         let mut table = Table::titled(format!("Leaderboard of {}", self.challenge.name));
-        table.column("rank", "rank", &lines, |line| {
-            let rank = |rank: usize| Cell::number(rank as f64, 0);
-            line.cell("", |standing| standing.rank.map_or(Cell::Empty, rank))
+        let mut add = |key, label: &str, of_zeros: Cell, cell: &dyn Fn(&Standing<'_>) -> Cell| {
+            table.column(key, label, &rows, |row| {
+                row.map_or_else(|| of_zeros.clone(), cell)
+            });
+        };
+        let info = |text: fn(&EntryInfo) -> String| {
+            move |standing: &Standing<'_>| Cell::text(text(standing.best.info()))
+        };
+        let number = |value: usize| Cell::number(value as f64, 0);
+        add("rank", "rank", Cell::Empty, &|standing| {
+            standing.rank.map_or(Cell::Empty, number)
         });
-        table.column("team", "team", &lines, |line| {
-            line.cell(ZERO_SHEAR, |standing| {
-                Cell::text(&standing.best.info().team)
-            })
+        // Teams may have this name, too, but they have a rank.
+        let team = info(|info| info.team.clone());
+        add("team", "team", Cell::text("zero shear"), &team);
+        let method = info(|info| info.method.clone());
+        add("method", "method", Cell::text("no image"), &method);
+        let title = info(|info| match (info.reference, info.title.is_empty()) {
+            (true, true) => "reference".into(),
+            (true, false) => format!("reference: {}", info.title),
+            (false, _) => info.title.clone(),
         });
-        table.column("method", "method", &lines, |line| {
-            line.cell("no image", |standing| {
-                Cell::text(&standing.best.info().method)
-            })
+        let of_zeros = Cell::text("reference: an entry of zeros");
+        add("title", "title", of_zeros, &title);
+        let files = info(|info| match info.contents.is_spectra() {
+            true => "spectra".into(),
+            false => "catalogues".into(),
         });
-        table.column("title", "title", &lines, |line| {
-            line.cell("reference: an entry of zeros", |standing| {
-                Cell::text(title(standing.best.info()))
-            })
-        });
-        table.column("files", "files", &lines, |line| {
-            line.cell("", |standing| {
-                Cell::text(files(standing.best.info().contents))
-            })
-        });
+        add("files", "files", Cell::Empty, &files);
         // One cell would give the error two digits, and the value as many decimals.
-        table.column(key(metric).0, metric.label(), &lines, |line| match line {
-            Line::Standing(standing) => Cell::number(rounded(standing.best.value, digits), digits),
-            Line::Zero(zero) => Cell::number(rounded(*zero, digits), digits),
+        let value = |value: f64| Cell::number(rounded(value, digits), digits);
+        let (of_value, of_error) = key(metric);
+        add(of_value, metric.label(), value(zero), &|standing| {
+            value(standing.best.value)
         });
-        table.column(key(metric).1, "± error", &lines, |line| {
-            line.cell("", |standing| {
-                Cell::number(rounded_up(standing.best.error, digits), digits)
-            })
+        add(of_error, "± error", Cell::Empty, &|standing| {
+            Cell::number(rounded_up(standing.best.error, digits), digits)
         });
-        let suits = |other: &RankBy| *other != metric && other.suits(self.constant.is_some());
-        let others = [RankBy::QCalibrated, RankBy::M, RankBy::C];
-        for other in others.into_iter().filter(suits) {
+        for other in [RankBy::QCalibrated, RankBy::M, RankBy::C] {
+            if other == metric || !other.suits(self.constant.is_some()) {
+                continue;
+            }
             // No more decimals than the organiser's, where he chose fewer than the metric's.
             let fewer = metric.decimals().saturating_sub(digits);
             let most = other.decimals().saturating_sub(fewer);
-            table.column(key(other).0, other.label(), &lines, |line| {
-                line.cell("", |standing| {
-                    let (value, error) = other.of(&standing.best.entry.sets, self.constant);
-                    match rounded_to_error(value, error, most) {
-                        Some((value, digits)) => Cell::number(value, digits),
-                        None => Cell::Empty,
-                    }
-                })
+            add(key(other).0, other.label(), Cell::Empty, &|standing| {
+                let (value, error) = other.of(&standing.best.entry.sets, self.constant);
+                match rounded_to_error(value, error, most) {
+                    Some((value, digits)) => Cell::number(value, digits),
+                    None => Cell::Empty,
+                }
             });
         }
-        table.column("received", "received (UTC)", &lines, |line| {
-            line.cell("", |standing| Cell::text(received(standing.best.info())))
-        });
-        table.column("entries", "entries", &lines, |line| {
-            line.cell("", |standing| {
-                Cell::number(standing.entries.len() as f64, 0)
-            })
+        let received = info(|info| info.received.strftime("%Y-%m-%d %H:%M").to_string());
+        add("received", "received (UTC)", Cell::Empty, &received);
+        add("entries", "entries", Cell::Empty, &|standing| {
+            number(standing.entries.len())
         });
         let filled =
             |board: &Board| *board != Board::Main && self.board.of(*board).next().is_some();
         if boards.iter().any(filled) {
             let all = self.challenge.data.sets.len();
-            table.column("board", "board", &lines, |line| {
-                line.cell("", |standing| {
-                    Cell::text(match standing.board {
-                        Board::Main => "main".to_owned(),
-                        Board::Late => "late".to_owned(),
-                        Board::Partial => {
-                            format!("{} of {all} sets", standing.best.entry.sets.len())
-                        }
-                    })
+            add("board", "board", Cell::Empty, &|standing| {
+                Cell::text(match standing.board {
+                    Board::Main => "main".to_owned(),
+                    Board::Late => "late".to_owned(),
+                    Board::Partial => format!("{} of {all} sets", standing.best.entry.sets.len()),
                 })
             });
         }
@@ -225,17 +178,15 @@ impl View<'_> {
         table
     }
 
-    // Entries that share files or shapes with an earlier one.
     fn copies(&self) -> Table {
         let name = |info: &EntryInfo| Cell::text(format!("{}: {}", info.team, info.method));
         let mut table = Table::titled("Near copies");
-        table.column("entry", "entry", self.copies, |copy| name(copy.entry));
-        table.column("earlier", "earlier entry", self.copies, |copy| {
+        let copies = self.copies;
+        table.column("entry", "entry", copies, |copy| name(copy.entry));
+        table.column("earlier", "earlier entry", copies, |copy| {
             name(copy.earlier)
         });
-        table.column("reason", "reason", self.copies, |copy| {
-            Cell::text(copy.reason())
-        });
+        table.column("reason", "reason", copies, |copy| Cell::text(copy.reason()));
         table
     }
 
@@ -244,8 +195,7 @@ impl View<'_> {
         let q = Cell::with_error(rounded(self.zero_shear?, 1), Some(f64::NAN), 2)
             .digits()?
             .0;
-        let unknown = self.metric().of_zero_shear(1.0).is_nan();
-        let why = match unknown {
+        let why = match self.metric().of_zero_shear(1.0).is_nan() {
             true => format!(
                 " It has no {}, because it does not respond to the shear.",
                 self.metric().label()
@@ -260,12 +210,11 @@ impl View<'_> {
         let refused = self.refused.iter().map(|refused| {
             let name = refused.path.file_name().unwrap_or_default();
             let name = name.to_string_lossy().into_owned();
-            (name, refused.team.as_str(), refused.reason.as_str())
+            (name, &refused.team, &refused.reason)
         });
         let excluded = self.board.excluded.iter();
-        let excluded = excluded
-            .map(|(info, reason)| (info.method.clone(), info.team.as_str(), reason.as_str()));
-        let rows: Vec<(String, &str, &str)> = refused.chain(excluded).collect();
+        let excluded = excluded.map(|(info, reason)| (info.method.clone(), &info.team, reason));
+        let rows: Vec<(String, &String, &String)> = refused.chain(excluded).collect();
         let mut table = Table::titled("Entries without a rank");
         table.column("entry", "entry", &rows, |row| Cell::text(&row.0));
         table.column("team", "team", &rows, |row| Cell::text(row.1));
@@ -274,8 +223,7 @@ impl View<'_> {
     }
 
     fn history(&self) -> LinePlot {
-        let digits = self.digits;
-        let metric = self.metric();
+        let (digits, metric) = (self.digits, self.metric());
         let plotted: Vec<&Standing<'_>> = self
             .board
             .of(Board::Main)
@@ -315,11 +263,19 @@ impl View<'_> {
     }
 
     fn report(&self) -> Result<Report, FigureError> {
+        let Challenge {
+            name,
+            version,
+            kind,
+            data,
+            rules: terms,
+            ..
+        } = self.challenge;
         let mut blocks = vec![Block::Filtered(self.table_of(&[Board::Main]))];
         if !self.board.standings.is_empty() {
             let caption = format!(
                 "{} of each entry, with its error, for the first {PLOTTED} teams at most.",
-                self.metric().label()
+                terms.metric.label()
             );
             let picture = Picture::draw(&self.history(), "entries", caption)?;
             blocks.push(Block::Figure(picture));
@@ -344,16 +300,8 @@ impl View<'_> {
                 sections.push(Section::new(id, title, vec![Block::Filtered(table)]));
             }
         }
-        let rules = Block::Text(readme::rules(self.challenge).join("\n\n"));
+        let rules = Block::Text(rules(self.challenge).join("\n\n"));
         sections.push(Section::new("rules", "Rules", vec![rules]));
-        let Challenge {
-            name,
-            version,
-            kind,
-            data,
-            rules,
-            ..
-        } = self.challenge;
         let about_data = format!(
             "{} sets of {} images with {2} × {2} galaxies",
             data.sets.len(),
@@ -364,7 +312,7 @@ impl View<'_> {
             ("Version of the data", version.to_string()),
             ("Kind", kind.title.to_owned()),
             ("Data", about_data),
-            ("Metric", rules.metric.label().to_owned()),
+            ("Metric", terms.metric.label().to_owned()),
             ("Decimals", self.digits.to_string()),
             ("Program", format!("shearq {}", shearq_dataset::VERSION)),
         ];
@@ -395,7 +343,7 @@ impl View<'_> {
         map.decimals = map.decimals.min(self.digits);
         let caption =
             "Q of each set. Metrics of single sets reveal more of the true shear than their mean.";
-        let picture = Picture::draw(&map as &dyn Figure, "q-per-set", caption)?;
+        let picture = Picture::draw(&map, "q-per-set", caption)?;
         Ok(Section::new(
             "sets",
             "Metric of each set",
@@ -417,6 +365,108 @@ impl View<'_> {
         }
         Ok(())
     }
+}
+
+// Rules of a challenge, one paragraph each.
+fn rules(challenge: &Challenge) -> Vec<String> {
+    let Challenge {
+        kind,
+        contact,
+        address,
+        rules,
+        ..
+    } = challenge;
+    let mut all: Vec<String> = kind.rules.iter().map(|&rule| rule.to_owned()).collect();
+    if rules.partial {
+        all.push("An entry may cover some sets only. It is listed without a rank.".into());
+    }
+    all.push(format!(
+        "Entries are ranked by {}, over all sets. {}",
+        rules.metric.label(),
+        rules.metric.meaning()
+    ));
+    all.push("The shapes of every image must agree with the image, with one scale in all images of a set, and their response to the shear must be at least 3σ from zero.".into());
+    all.push("Entries whose difference is below its error share a rank.".into());
+    all.push("Symbolic links are not accepted. Entries that share files or shapes with an earlier entry are listed.".into());
+    if let Some(most) = rules.entries_per_team {
+        all.push(format!(
+            "Each team may send at most {most} entries, because published values reveal the true shear entry by entry."
+        ));
+    }
+    if let Some(opens) = &rules.opens {
+        all.push(format!("Entries are accepted from {opens}."));
+    }
+    if let Some(closes) = &rules.closes {
+        all.push(format!(
+            "Entries are accepted until {closes}. Later entries have their own board."
+        ));
+    }
+    for (what, place) in [("Data and rules", address), ("Contact", contact)] {
+        if !place.is_empty() {
+            all.push(format!("{what}: {place}"));
+        }
+    }
+    all
+}
+
+// The page for participants, as Markdown.
+pub(crate) fn readme(challenge: &Challenge) -> String {
+    let Challenge {
+        name,
+        version,
+        kind,
+        data,
+        conventions,
+        rules,
+        ..
+    } = challenge;
+    let sets: Vec<String> = data.sets.iter().map(u32::to_string).collect();
+    let first = data.sets.first().copied().unwrap_or(1);
+    let method = || "METHOD".to_owned();
+    let catalogue = FileKind::Catalogue {
+        set: first,
+        image: 1,
+        method: method(),
+    };
+    let spectrum = FileKind::Spectrum {
+        set: first,
+        method: method(),
+    };
+    let half = 0.5 * (data.stamp as f64 + 1.0);
+    let mut text = format!(
+        "# {name}\n\nVersion {version}. Kind: {} (`{}`).\n\nMeasure the shapes of the galaxies. The true shear is secret. `challenge.toml` has the numbers below in machine-readable form.\n\n## Data\n\n",
+        kind.title, kind.name
+    );
+    text.push_str(&format!(
+        "* Sets: {}.\n* Images per set: {}, numbered from 1.\n* Galaxies per image: {2} × {2}, in stamps of {3} × {3} pixels.\n* Side of the field: {4} degrees.\n* `layout.toml` has the names of images and PSFs.\n* Verify the download with `sha256sum -c SHA256SUMS`.\n\n",
+        sets.join(", "),
+        data.images,
+        data.grid,
+        data.stamp,
+        data.field_degrees
+    ));
+    text.push_str("## Conventions\n\n");
+    for (name, meaning) in conventions {
+        text.push_str(&format!("* {name}: {meaning}.\n"));
+    }
+    text.push_str(&format!(
+        "\n## Entries\n\nAn ellipticity catalogue is an ASCII file `{}` per image with one line per galaxy: `x y e1 e2`. For example, the first galaxy:\n\n```text\n{half} {half} 0.0312 -0.0147\n```\n\n",
+        catalogue.file_name()
+    ));
+    if rules.contents.iter().any(|contents| contents.is_spectra()) {
+        text.push_str(&format!(
+            "A power spectrum is an ASCII file `{}` per set with the bins 2 to 9: `index l power`.\n\n",
+            spectrum.file_name()
+        ));
+    }
+    text.push_str(&format!(
+        "Put the files of an entry into one `.tar.gz` without folders. [shearq](https://github.com/shearq/shearq) does it for its own catalogues, and for yours if you describe them (`--foreign`):\n\n```sh\nshearq measure --data . --submission 48/linear/star --out ../catalogues\nshearq pack --measured ../catalogues --challenge \"{}\" --team TEAM --out ../entry.tar.gz\nshearq challenge check ../entry.tar.gz --challenge .\n```\n\nThe last command checks any entry, and needs no true shear. It finds missing and duplicate galaxies, swapped or flipped components, shapes that do not agree with their images, and distortions that are given as shear.\n\n## Rules\n\n",
+        name.replace(['"', '\\', '$', '`'], "")
+    ));
+    for rule in self::rules(challenge) {
+        text.push_str(&format!("* {rule}\n"));
+    }
+    text
 }
 
 #[cfg(test)]

@@ -1,17 +1,20 @@
-//! Ranks the entries of a challenge.
+//! The board of a challenge: ranks, near copies, and what the organiser decides about entries.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
 
+use serde::Deserialize;
+use shearq_files::FileError;
 use shearq_results::compare::difference;
 
 use crate::constant::ConstantShears;
-use crate::deadline::Deadline;
 use crate::judge::{Entry, EntryInfo};
 use crate::kind::RankBy;
-use crate::terms::Challenge;
+use crate::seal::{BOARD_FILE, Key, read_toml};
+use crate::terms::{Challenge, Deadline};
 
 #[derive(Debug, Clone)]
-pub struct Result<'a> {
+pub struct Scored<'a> {
     pub entry: &'a Entry,
     /// Number of the entry of its team, from 1.
     pub number: usize,
@@ -20,7 +23,7 @@ pub struct Result<'a> {
     pub error: f64,
 }
 
-impl Result<'_> {
+impl Scored<'_> {
     pub fn info(&self) -> &EntryInfo {
         &self.entry.info
     }
@@ -32,9 +35,9 @@ pub struct Standing<'a> {
     pub board: Board,
     /// Rank of a team, from 1. References and partial entries have none.
     pub rank: Option<usize>,
-    pub best: Result<'a>,
+    pub best: Scored<'a>,
     /// All entries that count, in order of arrival.
-    pub entries: Vec<Result<'a>>,
+    pub entries: Vec<Scored<'a>>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -74,14 +77,14 @@ pub fn rank<'a>(
     let rules = &challenge.rules;
     let metric = rules.metric;
     let mut leaderboard = Leaderboard::default();
-    let mut teams: BTreeMap<(Board, bool, &str), Vec<Result<'a>>> = BTreeMap::new();
+    let mut teams: BTreeMap<(Board, bool, &str), Vec<Scored<'a>>> = BTreeMap::new();
     let mut numbers: BTreeMap<&str, usize> = BTreeMap::new();
     // Only entries that count make later ones copies, so that nobody can block others with an entry that does not.
     let mut firsts: BTreeMap<&str, &EntryInfo> = BTreeMap::new();
     for entry in entries {
         let info = &entry.info;
         let (value, error) = metric.of(&entry.sets, constant);
-        let mut result = Result {
+        let mut result = Scored {
             entry,
             number: 1,
             value,
@@ -176,7 +179,7 @@ pub fn rank<'a>(
 
 // Ranks the standings of a board, which are in order of their values.
 fn number(standings: &mut [Standing<'_>], metric: RankBy, digits: usize) {
-    let mut leader: Option<(usize, Result<'_>)> = None;
+    let mut leader: Option<(usize, Scored<'_>)> = None;
     let mut printed = None;
     let mut place = 0;
     for standing in standings {
@@ -216,7 +219,7 @@ pub(crate) fn better(metric: RankBy, a: f64, b: f64) -> bool {
 // respond to the images alike; for an entry with shapes in one of eight images, whose Q was
 // 171.8 ± 20.7, it exceeded the lead of 154 over 17.9 ± 1.7. The quadratic sum of both errors neglects common noise, so it is an upper limit. In that sum, the error of
 // `other` counts at most as much as that of `best`: otherwise an entry with much noise would share every rank.
-fn equal(metric: RankBy, best: &Result<'_>, other: &Result<'_>) -> bool {
+fn equal(metric: RankBy, best: &Scored<'_>, other: &Scored<'_>) -> bool {
     let gap = other.value - best.value;
     let apart = best.error.hypot(other.error.min(best.error));
     let paired = metric
@@ -225,6 +228,171 @@ fn equal(metric: RankBy, best: &Result<'_>, other: &Result<'_>) -> bool {
         .map_or(f64::NAN, |found| found.error);
     // Without a known error, only equal values are equal.
     gap == 0.0 || gap.abs() < paired.min(apart)
+}
+
+// Largest 1 - r of a near copy, with r the correlation of its shapes. Noise of a thousandth of the shapes has it.
+const DECORRELATION: f64 = 1e-6;
+
+/// An entry that is nearly an earlier one.
+#[derive(Debug, Clone)]
+pub struct NearCopy<'a> {
+    pub entry: &'a EntryInfo,
+    pub earlier: &'a EntryInfo,
+    pub files: usize,
+    /// 1 - r, with r the correlation of the shapes; NaN without common sets of catalogues.
+    pub decorrelation: f64,
+}
+
+impl NearCopy<'_> {
+    pub fn reason(&self) -> String {
+        let of = self.entry.files.len();
+        format!(
+            "{} of {of} files are identical, 1 - correlation of the shapes is {:.0e}",
+            self.files, self.decorrelation
+        )
+    }
+}
+
+// Smallest 1 - r of the shapes of two entries in a common set: a copy may have another scale and shift in each set.
+fn decorrelation(a: &EntryInfo, b: &EntryInfo) -> f64 {
+    let of_set = |(set, shapes): (&String, &Vec<i32>)| {
+        let (a, b) = (centred(shapes), centred(b.shapes.get(set)?));
+        let product = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+        let r = product(&a, &b) / (product(&a, &a) * product(&b, &b)).sqrt();
+        Some((1.0 - r).clamp(0.0, 2.0))
+    };
+    // NaN, which shapes without scatter have, is left out.
+    a.shapes.iter().filter_map(of_set).fold(f64::NAN, f64::min)
+}
+
+// Components relative to their means.
+fn centred(shapes: &[i32]) -> Vec<f64> {
+    let mean = |k: usize| {
+        let own = shapes.iter().skip(k).step_by(2);
+        own.map(|e| f64::from(*e)).sum::<f64>() / (shapes.len() as f64 / 2.0)
+    };
+    let means = [mean(0), mean(1)];
+    let each = shapes.iter().enumerate();
+    each.map(|(k, e)| f64::from(*e) - means[k % 2]).collect()
+}
+
+/// For each of `entries`, which are in order of arrival, the first earlier entry with a common file or equal shapes.
+pub fn near_copies(entries: &[Entry]) -> Vec<NearCopy<'_>> {
+    let mut owners: BTreeMap<&str, usize> = BTreeMap::new();
+    let mut copies = Vec::new();
+    for (own, Entry { info, .. }) in entries.iter().enumerate() {
+        let of_files = info.files.iter().filter_map(|file| owners.get(&**file));
+        let of_shapes = || {
+            let near = |other: &Entry| decorrelation(info, &other.info) < DECORRELATION;
+            entries[..own].iter().position(near)
+        };
+        if let Some(first) = of_files.min().copied().or_else(of_shapes) {
+            let earlier = &entries[first].info;
+            let theirs: BTreeSet<&String> = earlier.files.iter().collect();
+            copies.push(NearCopy {
+                entry: info,
+                earlier,
+                files: info
+                    .files
+                    .iter()
+                    .filter(|file| theirs.contains(file))
+                    .count(),
+                decorrelation: decorrelation(info, earlier),
+            });
+        }
+        for file in &info.files {
+            owners.entry(file).or_insert(own);
+        }
+    }
+    copies
+}
+
+// Fewest digits of an SHA-256 that name an entry.
+const LEAST_DIGITS: usize = 8;
+
+#[derive(Debug, Clone, Default, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Decisions {
+    /// Whether teams without an alias have drawn names, and methods, titles and refused entries are not published.
+    pub anonymous: bool,
+    pub aliases: BTreeMap<String, String>,
+    /// Reasons, by the first digits of the SHA-256 of the archive, or `DIGITS/TEAM` if several teams sent it.
+    pub withdrawn: BTreeMap<String, String>,
+}
+
+impl Decisions {
+    /// Reads the decisions in a private folder; without a file there are none.
+    pub fn read(private: &Path) -> Result<Self, FileError> {
+        let decisions = read_toml(&private.join(BOARD_FILE), "decisions")?;
+        Ok(decisions.unwrap_or_default())
+    }
+
+    /// Marks withdrawn entries and replaces the names of teams.
+    ///
+    /// # Errors
+    /// If an entry or a team is unknown, or a name stands for two teams.
+    pub fn apply(&self, entries: &mut [Entry], key: &Key) -> Result<(), String> {
+        for (id, reason) in &self.withdrawn {
+            // Two teams may have sent the same archive.
+            let (digits, team) = match id.split_once('/') {
+                Some((digits, team)) => (digits, Some(team)),
+                None => (id.as_str(), None),
+            };
+            let names = |entry: &Entry| {
+                digits.len() >= LEAST_DIGITS
+                    && entry.info.sha256.starts_with(digits)
+                    && team.is_none_or(|team| entry.info.team == team)
+            };
+            let named: Vec<usize> = (0..entries.len()).filter(|k| names(&entries[*k])).collect();
+            let [entry] = named.as_slice() else {
+                let known: Vec<String> = entries
+                    .iter()
+                    .map(|entry| {
+                        let info = &entry.info;
+                        format!("{} ({}, {})", info.short_id(), info.team, info.file)
+                    })
+                    .collect();
+                return Err(format!(
+                    "`withdrawn` names no single entry (found `{id}`, expected {LEAST_DIGITS} digits or more of an SHA-256: {})",
+                    known.join(", ")
+                ));
+            };
+            entries[*entry].withdrawn = Some(reason.clone());
+        }
+        let teams: BTreeSet<String> = entries
+            .iter()
+            .filter(|entry| !entry.info.reference)
+            .map(|entry| entry.info.team.clone())
+            .collect();
+        if let Some(unknown) = self.aliases.keys().find(|team| !teams.contains(*team)) {
+            let known: Vec<&str> = teams.iter().map(String::as_str).collect();
+            return Err(format!(
+                "`aliases` has an unknown team (found `{unknown}`, expected one of {})",
+                known.join(", ")
+            ));
+        }
+        let mut names: BTreeMap<String, String> = BTreeMap::new();
+        for team in &teams {
+            let name = match (self.aliases.get(team), self.anonymous) {
+                (Some(alias), _) => alias.clone(),
+                // Neither the order of arrival nor the rank may tell the name, and it stays from board to board.
+                (None, true) => format!("team {}", &key.sign("team", &[team])[..6]),
+                (None, false) => team.clone(),
+            };
+            if let Some((other, _)) = names.iter().find(|(_, own)| **own == name) {
+                return Err(format!("`{name}` stands for two teams: {other} and {team}"));
+            }
+            names.insert(team.clone(), name);
+        }
+        for Entry { info, .. } in entries.iter_mut().filter(|entry| !entry.info.reference) {
+            info.team = names[&info.team].clone();
+            if self.anonymous {
+                info.method.clear();
+                info.title.clear();
+            }
+        }
+        Ok(())
+    }
 }
 
 #[cfg(test)]
@@ -493,5 +661,34 @@ pub(crate) mod tests {
             reasons,
             ["withdrawn: a mistake", "the team has 2 entries already"]
         );
+    }
+}
+
+#[cfg(test)]
+mod copy_tests {
+    use super::tests::entry;
+    use super::*;
+
+    #[test]
+    fn another_scale_and_shift_in_each_set_hide_no_copy() {
+        let of = |team: &str, scales: [f64; 2], noise: f64| {
+            let mut entry = entry(team, "2026-11-24T10:00:00Z", 1.0, &[1.0]);
+            for (set, scale) in (1..).zip(scales) {
+                let shapes = (0..64).map(|k| {
+                    let value = (f64::from(k * set) * 1.7).sin() + noise * f64::from(k).cos();
+                    (1e6 * (scale * value + 0.1 * scale)).round() as i32
+                });
+                entry.info.shapes.insert(set.to_string(), shapes.collect());
+            }
+            entry
+        };
+        let entries = [
+            of("Owner", [1.0, 1.0], 0.0),
+            of("Copy", [1.5, 1.01], 0.0),
+            of("Other", [1.0, 1.0], 0.1),
+        ];
+        let copies = near_copies(&entries);
+        let teams: Vec<&str> = copies.iter().map(|copy| copy.entry.team.as_str()).collect();
+        assert_eq!(teams, ["Copy"]);
     }
 }
