@@ -22,7 +22,6 @@ use shearq_scoring::TruthSign;
 
 use crate::errors::in_python;
 
-/// The sign of g2 of a name.
 pub(crate) fn sign_of(name: &str) -> PyResult<TruthSign> {
     let signs = [TruthSign::Standard, TruthSign::Challenge];
     let found = signs.into_iter().find(|sign| word(*sign) == name);
@@ -37,7 +36,8 @@ fn of_bias(error: BiasFailure) -> PyErr {
     PyValueError::new_err(in_python(&error.to_string()))
 }
 
-/// Refuses a file that does not exist; `FILE[TABLE]` is a table of a file.
+// Python's callers expect FileNotFoundError of a wrong path, which the readers below report as any fault of a file.
+// `FILE[TABLE]` is a table of a file.
 fn require(path: &Path) -> PyResult<()> {
     match Place::of(path).path.exists() {
         true => Ok(()),
@@ -48,7 +48,7 @@ fn require(path: &Path) -> PyResult<()> {
     }
 }
 
-/// The design of a name of the command line.
+// A design without a true shear follows from its absence, so that null is no argument.
 fn design_of(name: &str) -> PyResult<Design> {
     const ALL: [Design; 6] = [
         Design::Single,
@@ -76,7 +76,8 @@ fn shapes_of(name: &str) -> PyResult<Shapes> {
     }
 }
 
-/// A table in memory: numbers or text by name.
+// Frames of pandas and astropy arrive as columns of float64 or of text, because those are the types that `bias` reads:
+// other types, masks and integers beyond 2⁵³ are converted in _bias.py, where each package's rules are known.
 fn table_of(name: &str, columns: Vec<(String, Bound<'_, PyAny>)>) -> PyResult<Input> {
     let columns = columns.iter().map(|(label, values)| {
         if let Ok(reals) = values.extract::<PyReadonlyArray1<'_, f64>>() {
@@ -98,14 +99,14 @@ fn table_of(name: &str, columns: Vec<(String, Bound<'_, PyAny>)>) -> PyResult<In
     })
 }
 
-/// A catalogue: a path, or the name and the columns of a table.
+// A path, or the name and the columns of a table.
 #[derive(FromPyObject)]
 pub(crate) enum Given<'py> {
     Path(PathBuf),
     Table(String, Vec<(String, Bound<'py, PyAny>)>),
 }
 
-/// The true shear: of all, of each table, or in a file.
+// Of all, of each table by its name, or in a file.
 #[derive(FromPyObject)]
 pub(crate) enum GivenTruth {
     Constant((f64, f64)),
@@ -152,12 +153,14 @@ impl BiasSums {
         seed: u64,
     ) -> PyResult<(String, String)> {
         let errors = bootstrap.map_or(Errors::Jackknife, |draws| Errors::Bootstrap { draws, seed });
+        // Without the interpreter, so that other threads of Python go on during the jackknife.
         py.detach(|| {
             let result = self.summed.clone().result(errors)?;
             let mut table = bias_table(&result);
             for note in &mut table.notes {
                 *note = in_python(note);
             }
+            // The table's own JSON, so that Python and the command line have the same keys.
             let mut json = table.json();
             // The label of an axis.
             json["binned"] = result.about.binned.as_str().into();
@@ -233,6 +236,7 @@ pub(crate) fn bias_sums(
             truth
         }
     };
+    // Paths one by one, because a folder may lie between tables, and catalogues pair by their order.
     let (mut inputs, mut truth) = (Vec::new(), truth);
     for given in catalogues {
         match given {
@@ -264,6 +268,7 @@ pub(crate) fn bias_sums(
         drop_missing,
         step,
     };
+    // Shards are of files of the command line; workers in Python sum catalogues of their own.
     let summed = py.detach(|| sum(&request, &|_| true)).map_err(of_bias)?;
     Ok(BiasSums { summed })
 }

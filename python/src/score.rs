@@ -5,7 +5,7 @@ use numpy::{IntoPyArray, PyArray1, PyReadonlyArray1, ToPyArray};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use shearq_dataset::truth::{Sign, word};
+use shearq_dataset::truth::{Sign, SignFault, word};
 use shearq_quantities::MeasuredRange;
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_results::foreign;
@@ -19,7 +19,7 @@ use shearq_scoring::{
 };
 
 use crate::bias::sign_of;
-use crate::errors::{in_python, of_scoring};
+use crate::errors::of_scoring;
 
 /// Names, headings and meanings of the metrics.
 #[pyfunction]
@@ -199,8 +199,13 @@ pub(crate) fn score<'py>(
         }
         let mut warnings = diagnosis::oddities(&counts, "e1, e2");
         let by_modes = sign_by_modes(&grid, &standard).map_err(of_scoring)?;
-        let refused = |fault: String| {
-            PyValueError::new_err(format!("truth_g2: {}", in_python(&fault)))
+        let refused = |fault: SignFault| {
+            // Arrays have no line that states a sign, as files do.
+            let text = match fault {
+                SignFault::Unclear => "cannot determine the sign of g2 in the truth (found no E-mode field, and no slope of e2 on g2 of 5σ; expected one of them). Try: truth_sign=\"standard\" (g2 > 0 along x = y), or truth_sign=\"challenge\" (the other sign)".to_owned(),
+                other => other.to_string(),
+            };
+            PyValueError::new_err(format!("truth_g2: {text}"))
         };
         let sign = match Sign::of_truth(None, given, || by_modes).map_err(refused)? {
             Some(sign) => sign,

@@ -20,6 +20,22 @@ pub struct Reading {
     pub sign: Option<TruthSign>,
 }
 
+/// Why the sign of g2 in a truth is not known.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum SignFault {
+    #[error("the file states `{SIGN_KEY}: {}`, but `{}` was specified. Try: omit --truth-sign", word(*stated), word(*specified))]
+    Contradicted {
+        stated: TruthSign,
+        specified: TruthSign,
+    },
+    // There is no default, because a wrong sign turns a bias of 0 into one of -2.
+    #[error(
+        "cannot determine the sign of g2 in the truth (found no statement, no E-mode field, and no slope of e2 on g2 of 5σ; expected one of them). Try: --truth-sign standard (g2 > 0 along x = y), --truth-sign challenge (the other sign), or a line `# {SIGN_KEY}: standard` in the file"
+    )]
+    Unclear,
+}
+
 /// How the sign of g2 in a truth was determined.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub enum SignBasis {
@@ -55,14 +71,10 @@ impl Sign {
         stated: Option<TruthSign>,
         specified: Option<TruthSign>,
         by_modes: impl FnOnce() -> Option<TruthSign>,
-    ) -> Result<Option<Self>, String> {
+    ) -> Result<Option<Self>, SignFault> {
         let (of, basis) = match (stated, specified) {
             (Some(stated), Some(specified)) if stated != specified => {
-                return Err(format!(
-                    "the file states `{SIGN_KEY}: {}`, but `{}` was specified. Try: omit --truth-sign",
-                    word(stated),
-                    word(specified)
-                ));
+                return Err(SignFault::Contradicted { stated, specified });
             }
             (Some(sign), _) => (sign, SignBasis::Stated),
             (None, Some(sign)) => (sign, SignBasis::Specified),
@@ -74,14 +86,9 @@ impl Sign {
         Ok(Some(Sign { of, basis }))
     }
 
-    // There is no default, because a wrong sign turns a bias of 0 into one of -2.
-    pub fn of_catalogues(found: Option<TruthSign>) -> Result<Self, String> {
+    pub fn of_catalogues(found: Option<TruthSign>) -> Result<Self, SignFault> {
         let basis = SignBasis::Catalogues;
-        found.map(|of| Sign { of, basis }).ok_or_else(|| {
-            format!(
-                "cannot determine the sign of g2 in the truth (found no statement, no E-mode field, and no slope of e2 on g2 of 5σ; expected one of them). Try: --truth-sign standard (g2 > 0 along x = y), --truth-sign challenge (the other sign), or a line `# {SIGN_KEY}: standard` in the file"
-            )
-        })
+        found.map(|of| Sign { of, basis }).ok_or(SignFault::Unclear)
     }
 
     /// Which sign is used and why; `None` if no g2 has a sign.
