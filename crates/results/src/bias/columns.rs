@@ -197,123 +197,65 @@ fn is_distortion(e1: &str) -> bool {
 // A public catalogue or a program's output, whose columns are known by its documentation.
 struct Survey {
     name: &'static str,
-    // The columns by role, in any case. Those of e1 and e2 and those with a plus identify the catalogue; others may be
-    // absent. `none` for a role that has no column although a general name is there.
-    columns: &'static str,
     distortion: bool,
+    // The columns by role, in any case. Those of e1 and e2 and those with a plus identify the catalogue; others may be absent.
+    // `none` for a role that has no column although a general name is there.
+    columns: &'static str,
 }
 
-const fn survey(name: &'static str, columns: &'static str) -> Survey {
+const fn survey(name: &'static str, distortion: bool, columns: &'static str) -> Survey {
     Survey {
         name,
+        distortion,
         columns,
-        distortion: false,
     }
 }
 
-// Regauss of HSC and LSST. Their columns of a calibration of the shear bias (`derived_shear_bias_m`, `_c1`, `_c2`) have no
-// role, because m and c are to be found before it.
-const fn distortions(name: &'static str, columns: &'static str) -> Survey {
-    Survey {
-        name,
-        columns,
-        distortion: true,
-    }
-}
+const SHEAR: bool = false;
+const DISTORTION: bool = true;
 
-// From the column lists in tests/data/columns. The first that fits is used.
+// From the column lists in tests/data/columns. The first that fits is used. Regauss of HSC and LSST are distortions; their
+// columns of a calibration of the shear bias (`derived_shear_bias_m`, `_c1`, `_c2`) have no role, because m and c are to be
+// found before it.
+#[rustfmt::skip]
 const SURVEYS: [Survey; 22] = [
-    survey(
-        "KiDS, internal",
-        "e1=autocal_e1_A e2=autocal_e2_A w=recal_weight_A psf_e1=PSF_e1 psf_e2=PSF_e2",
-    ),
-    survey(
-        "KV450",
-        "e1=bias_corrected_e1 e2=bias_corrected_e2 w=recal_weight psf_e1=PSF_e1 psf_e2=PSF_e2",
-    ),
-    survey(
-        "KiDS",
-        "e1=e1 e2=e2 +w=weight +model_SNratio psf_e1=PSF_e1 psf_e2=PSF_e2",
-    ),
-    distortions(
-        "HSC Y1",
-        "e1=ishape_hsm_regauss_e1 e2=ishape_hsm_regauss_e2 w=ishape_hsm_regauss_derived_shape_weight rms_e=ishape_hsm_regauss_derived_rms_e flag=ishape_hsm_regauss_flags",
-    ),
-    distortions(
-        "HSC Y1",
-        "e1=ishape_hsm_regauss_e1 e2=ishape_hsm_regauss_e2 w=ishape_hsm_regauss_derived_weight rms_e=ishape_hsm_regauss_derived_rms_e flag=ishape_hsm_regauss_flags",
-    ),
-    distortions(
-        "HSC Y3",
-        "e1=i_hsmshaperegauss_e1 e2=i_hsmshaperegauss_e2 +w=i_hsmshaperegauss_derived_weight rms_e=i_hsmshaperegauss_derived_rms_e flag=i_hsmshaperegauss_flag",
-    ),
-    distortions(
-        "LSST",
-        "e1=i_hsmShapeRegauss_e1 e2=i_hsmShapeRegauss_e2 flag=i_hsmShapeRegauss_flag",
-    ),
-    distortions(
-        "LSST",
-        "e1=r_hsmShapeRegauss_e1 e2=r_hsmShapeRegauss_e2 flag=r_hsmShapeRegauss_flag",
-    ),
-    distortions(
-        "LSST",
-        "e1=ext_shapeHSM_HsmShapeRegauss_e1 e2=ext_shapeHSM_HsmShapeRegauss_e2 flag=ext_shapeHSM_HsmShapeRegauss_flag",
-    ),
-    survey(
-        "DES Y1",
-        "e1=e1 e2=e2 +R11=R11 R22=R22 R12=R12 R21=R21 +flag=flags_select id=coadd_objects_id",
-    ),
-    survey(
-        "DES Y3",
-        "e1=e_1 e2=e_2 +R11=R11 R22=R22 R12=R12 R21=R21 w=weight flag=flags",
-    ),
-    survey(
-        "DES Y6",
-        "e1=gauss_g_1 e2=gauss_g_2 +version=mdet_step w=w flag=mdet_flags",
-    ),
-    survey(
-        "metadetect",
-        "e1=wmom_g_1 e2=wmom_g_2 +version=shear flag=wmom_flags psf_e1=psfrec_g_1 psf_e2=psfrec_g_2",
-    ),
+    survey("KiDS, internal", SHEAR, "e1=autocal_e1_A e2=autocal_e2_A w=recal_weight_A psf_e1=PSF_e1 psf_e2=PSF_e2"),
+    survey("KV450", SHEAR, "e1=bias_corrected_e1 e2=bias_corrected_e2 w=recal_weight psf_e1=PSF_e1 psf_e2=PSF_e2"),
+    survey("KiDS", SHEAR, "e1=e1 e2=e2 +w=weight +model_SNratio psf_e1=PSF_e1 psf_e2=PSF_e2"),
+    survey("HSC Y1", DISTORTION, "e1=ishape_hsm_regauss_e1 e2=ishape_hsm_regauss_e2 \
+        w=ishape_hsm_regauss_derived_shape_weight rms_e=ishape_hsm_regauss_derived_rms_e flag=ishape_hsm_regauss_flags"),
+    survey("HSC Y1", DISTORTION, "e1=ishape_hsm_regauss_e1 e2=ishape_hsm_regauss_e2 w=ishape_hsm_regauss_derived_weight \
+        rms_e=ishape_hsm_regauss_derived_rms_e flag=ishape_hsm_regauss_flags"),
+    survey("HSC Y3", DISTORTION, "e1=i_hsmshaperegauss_e1 e2=i_hsmshaperegauss_e2 +w=i_hsmshaperegauss_derived_weight \
+        rms_e=i_hsmshaperegauss_derived_rms_e flag=i_hsmshaperegauss_flag"),
+    survey("LSST", DISTORTION, "e1=i_hsmShapeRegauss_e1 e2=i_hsmShapeRegauss_e2 flag=i_hsmShapeRegauss_flag"),
+    survey("LSST", DISTORTION, "e1=r_hsmShapeRegauss_e1 e2=r_hsmShapeRegauss_e2 flag=r_hsmShapeRegauss_flag"),
+    survey("LSST", DISTORTION, "e1=ext_shapeHSM_HsmShapeRegauss_e1 e2=ext_shapeHSM_HsmShapeRegauss_e2 \
+        flag=ext_shapeHSM_HsmShapeRegauss_flag"),
+    survey("DES Y1", SHEAR, "e1=e1 e2=e2 +R11=R11 R22=R22 R12=R12 R21=R21 +flag=flags_select id=coadd_objects_id"),
+    survey("DES Y3", SHEAR, "e1=e_1 e2=e_2 +R11=R11 R22=R22 R12=R12 R21=R21 w=weight flag=flags"),
+    survey("DES Y6", SHEAR, "e1=gauss_g_1 e2=gauss_g_2 +version=mdet_step w=w flag=mdet_flags"),
+    survey("metadetect", SHEAR, "e1=wmom_g_1 e2=wmom_g_2 +version=shear flag=wmom_flags psf_e1=psfrec_g_1 psf_e2=psfrec_g_2"),
     // Already divided by the mean response.
-    survey(
-        "UNIONS",
-        "e1=e1 e2=e2 +w=w_des R11=none R22=none psf_e1=e1_PSF psf_e2=e2_PSF",
-    ),
-    survey(
-        "UNIONS",
-        "e1=e1 e2=e2 +w=w_iv R11=none R22=none psf_e1=e1_PSF psf_e2=e2_PSF",
-    ),
-    survey(
-        "UNIONS, uncalibrated",
-        "e1=e1_uncal e2=e2_uncal R11=R_g11 R12=R_g12 R21=R_g21 R22=R_g22 w=w_des psf_e1=e1_PSF psf_e2=e2_PSF",
-    ),
-    survey(
-        "ShapePipe",
-        "e1=NGMIX_G1_NOSHEAR e2=NGMIX_G2_NOSHEAR flag=NGMIX_MCAL_FLAGS e1_1p=NGMIX_G1_1P e1_1m=NGMIX_G1_1M e2_2p=NGMIX_G2_2P e2_2m=NGMIX_G2_2M e1_2p=NGMIX_G1_2P e1_2m=NGMIX_G1_2M e2_1p=NGMIX_G2_1P e2_1m=NGMIX_G2_1M",
-    ),
-    survey(
-        "Euclid, LensMC",
-        "e1=SHE_LENSMC_E1 e2=SHE_LENSMC_E2 w=SHE_LENSMC_WEIGHT",
-    ),
-    survey(
-        "TXPipe",
-        "e1=mcal_g1 e2=mcal_g2 flag=mcal_flags psf_e1=mcal_psf_g1 psf_e2=mcal_psf_g2 e1_1p=mcal_g1_1p e1_1m=mcal_g1_1m e2_2p=mcal_g2_2p e2_2m=mcal_g2_2m e1_2p=mcal_g1_2p e1_2m=mcal_g1_2m e2_1p=mcal_g2_1p e2_1m=mcal_g2_1m",
-    ),
+    survey("UNIONS", SHEAR, "e1=e1 e2=e2 +w=w_des R11=none R22=none psf_e1=e1_PSF psf_e2=e2_PSF"),
+    survey("UNIONS", SHEAR, "e1=e1 e2=e2 +w=w_iv R11=none R22=none psf_e1=e1_PSF psf_e2=e2_PSF"),
+    survey("UNIONS, uncalibrated", SHEAR, "e1=e1_uncal e2=e2_uncal R11=R_g11 R12=R_g12 R21=R_g21 R22=R_g22 w=w_des \
+        psf_e1=e1_PSF psf_e2=e2_PSF"),
+    survey("ShapePipe", SHEAR, "e1=NGMIX_G1_NOSHEAR e2=NGMIX_G2_NOSHEAR flag=NGMIX_MCAL_FLAGS e1_1p=NGMIX_G1_1P \
+        e1_1m=NGMIX_G1_1M e2_2p=NGMIX_G2_2P e2_2m=NGMIX_G2_2M e1_2p=NGMIX_G1_2P e1_2m=NGMIX_G1_2M e2_1p=NGMIX_G2_1P \
+        e2_1m=NGMIX_G2_1M"),
+    survey("Euclid, LensMC", SHEAR, "e1=SHE_LENSMC_E1 e2=SHE_LENSMC_E2 w=SHE_LENSMC_WEIGHT"),
+    survey("TXPipe", SHEAR, "e1=mcal_g1 e2=mcal_g2 flag=mcal_flags psf_e1=mcal_psf_g1 psf_e2=mcal_psf_g2 e1_1p=mcal_g1_1p \
+        e1_1m=mcal_g1_1m e2_2p=mcal_g2_2p e2_2m=mcal_g2_2m e1_2p=mcal_g1_2p e1_2m=mcal_g1_2m e2_1p=mcal_g2_1p \
+        e2_1m=mcal_g2_1m"),
     // Of a model by default. Those of FPFS have their own responses. The weight of the selection contains that of the
     // detection.
-    survey(
-        "AnaCal task",
-        "e1=e1 e2=e2 +fpfs_e1 +R11=de1_dg1 R12=de1_dg2 R21=de2_dg1 R22=de2_dg2 +w=wsel dw1=dwsel_dg1 dw2=dwsel_dg2",
-    ),
-    survey(
-        "AnaCal task",
-        "e1=e1 e2=e2 +fpfs_e1 +R11=de1_dg1 R12=de1_dg2 R21=de2_dg1 R22=de2_dg2 w=wdet dw1=dwdet_dg1 dw2=dwdet_dg2",
-    ),
-    survey(
-        "AnaCal FPFS",
-        "e1=fpfs_e1 e2=fpfs_e2 R11=fpfs_de1_dg1 R12=fpfs_de1_dg2 R21=fpfs_de2_dg1 R22=fpfs_de2_dg2 +w=wsel dw1=dwsel_dg1 dw2=dwsel_dg2",
-    ),
+    survey("AnaCal task", SHEAR, "e1=e1 e2=e2 +fpfs_e1 +R11=de1_dg1 R12=de1_dg2 R21=de2_dg1 R22=de2_dg2 +w=wsel \
+        dw1=dwsel_dg1 dw2=dwsel_dg2"),
+    survey("AnaCal task", SHEAR, "e1=e1 e2=e2 +fpfs_e1 +R11=de1_dg1 R12=de1_dg2 R21=de2_dg1 R22=de2_dg2 w=wdet dw1=dwdet_dg1 \
+        dw2=dwdet_dg2"),
+    survey("AnaCal FPFS", SHEAR, "e1=fpfs_e1 e2=fpfs_e2 R11=fpfs_de1_dg1 R12=fpfs_de1_dg2 R21=fpfs_de2_dg1 R22=fpfs_de2_dg2 \
+        +w=wsel dw1=dwsel_dg1 dw2=dwsel_dg2"),
 ];
 
 impl Survey {
