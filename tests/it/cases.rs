@@ -5,9 +5,9 @@
 //! `...` any lines. Times and checksums are printed as `[..]`, and the folder as `[CASE]`. Commands of [`crate::inputs`] make images.
 
 use std::path::Path;
-use std::process::Command;
 
 use crate::inputs;
+use crate::support::shell;
 
 /// A command with what it is expected to print.
 struct Step {
@@ -77,21 +77,10 @@ fn run(functions: &str, command: &str, root: &Path) -> (i32, Vec<String>) {
     if let Some(printed) = inputs::run(command, root) {
         return (0, printed.lines().map(str::to_owned).collect());
     }
-    let binary = Path::new(env!("CARGO_BIN_EXE_shearq"));
-    let others = std::env::var("PATH").unwrap_or_default();
     let data = std::env::current_dir().unwrap().join("tests/data");
     let command = command.replace("[tests/data]", data.to_str().unwrap());
-    let output = Command::new("sh")
-        .args(["-c", &format!("exec 2>&1\n{functions}\n{command}")])
-        .current_dir(root)
-        .env(
-            "PATH",
-            format!("{}:{others}", binary.parent().unwrap().display()),
-        )
-        .env("LC_ALL", "C")
-        .env("COLUMNS", "120")
-        .output()
-        .expect("a shell");
+    let settings = "exec 2>&1; export LC_ALL=C COLUMNS=120";
+    let output = shell(root, &format!("{settings}\n{functions}\n{command}"));
     let printed = String::from_utf8_lossy(&output.stdout);
     assert!(!printed.contains("panicked"), "{command}: {printed}");
     let root = root.to_str().unwrap();

@@ -2,9 +2,8 @@
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::Command;
 
-use crate::support::{fits_image, floats, pixels_of, succeed, text};
+use crate::support::{fits_image, floats, pixels_of, printed};
 
 /// The documents.
 pub(crate) fn pages() -> Vec<PathBuf> {
@@ -53,10 +52,9 @@ fn links_lead_to_files_and_the_summary_has_every_page() {
 
 /// Simulated images instead of those that the tutorial's script renders.
 fn images(folder: &Path) {
-    let challenge = folder.join("challenge");
-    let set = challenge.join("set02");
-    let simulate = ["simulate", "--sets", "2", "--images", "2", "--grid", "16"];
-    succeed(&[&simulate[..], &["--out", text(&challenge)]].concat());
+    let set = folder.join("challenge/set02");
+    let simulate = "shearq simulate --sets 2 --images 2 --grid 16 --out challenge";
+    printed(folder, simulate);
     let (pixels, width) = pixels_of(&set.join("galaxies-001.fits"));
     let stamps: Vec<f32> = (0..100)
         .flat_map(|k| {
@@ -70,24 +68,15 @@ fn images(folder: &Path) {
     fs::copy(set.join("psf-001.fits"), folder.join("star.fits")).unwrap();
 }
 
-/// Does what a page says, in `folder`: the lines of its blocks for a shell, which are so many.
+/// Does what a page says, in `folder`: the commands of its blocks for a shell, which are so many.
 fn follow(page: &str, folder: &Path, expected: usize) {
     let text = fs::read_to_string(Path::new("docs").join(page)).unwrap();
     let text = text.replace("\\\n", " ");
     let blocks = text.split("```sh\n").skip(1);
     let lines = blocks.flat_map(|block| block.split("```").next().unwrap_or("").lines());
-    let mut commands = 0;
-    for line in lines.filter(|line| line.starts_with("shearq ")) {
-        let done = Command::new(env!("CARGO_BIN_EXE_shearq"))
-            .args(line.split_whitespace().skip(1))
-            .current_dir(folder)
-            .output()
-            .unwrap();
-        let said = String::from_utf8_lossy(&done.stderr);
-        assert!(done.status.success(), "{page}: {line}: {said}");
-        commands += 1;
-    }
-    assert_eq!(commands, expected, "{page}");
+    let commands = lines.filter(|line| line.starts_with("shearq "));
+    let done = commands.map(|line| printed(folder, line)).count();
+    assert_eq!(done, expected, "{page}");
 }
 
 /// The files are there and hold something.
@@ -108,34 +97,36 @@ fn own_images_are_measured_as_their_page_says() {
 
 #[test]
 fn commands_of_the_pages_run() {
-    let first = tempfile::tempdir().unwrap();
-    follow("quickstart.md", first.path(), 6);
-    written(first.path(), &["steps.png"]);
-    let scored = tempfile::tempdir().unwrap();
-    follow("score-a-catalogue.md", scored.path(), 4);
-    let challenge = tempfile::tempdir().unwrap();
-    follow("challenge.md", challenge.path(), 10);
-    written(
-        challenge.path(),
-        &["linear.html", "compare.html", "to-send.tar.gz"],
-    );
-    let organised = tempfile::tempdir().unwrap();
-    follow("run-a-challenge.md", organised.path(), 7);
-    written(
-        organised.path(),
-        &[
-            "leaderboard.html",
-            "pilot/README.md",
-            "truth/set08/truth.csv",
-        ],
-    );
-    let recipes = tempfile::tempdir().unwrap();
-    follow("recipes.md", recipes.path(), 27);
-    let files = [
-        "own.toml",
-        "parts/scores.csv",
-        "spectra.tar.gz",
-        "study/report.html",
-    ];
-    written(recipes.path(), &files);
+    for (page, commands, files) in [
+        ("quickstart.md", 6, &["steps.png"][..]),
+        ("score-a-catalogue.md", 4, &[]),
+        (
+            "challenge.md",
+            10,
+            &["linear.html", "compare.html", "to-send.tar.gz"],
+        ),
+        (
+            "run-a-challenge.md",
+            7,
+            &[
+                "leaderboard.html",
+                "pilot/README.md",
+                "truth/set08/truth.csv",
+            ],
+        ),
+        (
+            "recipes.md",
+            27,
+            &[
+                "own.toml",
+                "parts/scores.csv",
+                "spectra.tar.gz",
+                "study/report.html",
+            ],
+        ),
+    ] {
+        let root = tempfile::tempdir().unwrap();
+        follow(page, root.path(), commands);
+        written(root.path(), files);
+    }
 }

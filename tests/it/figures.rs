@@ -23,12 +23,8 @@ fn draw(figure: &impl Figure) {
     let svg = String::from_utf8(figure.render(PictureFormat::Svg).expect("SVG")).expect("UTF-8");
     assert!(svg.starts_with("<svg") && svg.trim_end().ends_with("</svg>"));
     assert!(!svg.contains("NaN") && !svg.contains("inf"));
-    assert!(
-        figure
-            .render(PictureFormat::Png)
-            .expect("PNG")
-            .starts_with(b"\x89PNG")
-    );
+    let png = figure.render(PictureFormat::Png).expect("PNG");
+    assert!(png.starts_with(b"\x89PNG"));
 }
 
 fn lines(x: &[f64], y: &[f64], log: bool) -> LinePlot {

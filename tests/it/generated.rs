@@ -24,29 +24,16 @@ fn config() -> ProptestConfig {
 
 /// Any value of a setting: numbers at their limits, words that other settings use, and other types.
 fn setting() -> impl Strategy<Value = Value> {
-    let words = [
-        "star",
-        "functional",
-        "linear",
-        "network",
-        "image",
-        "border",
-        "header",
-        "response",
-        "none",
-        "total",
-        "peak",
-        "shear",
-        "distortion",
-        "",
-    ];
+    let words = "star,functional,linear,network,image,border,header,response,\
+        none,total,peak,shear,distortion,";
     prop_oneof![
         any::<i64>().prop_map(Value::Integer),
         (-3i64..100).prop_map(Value::Integer),
         proptest::num::f64::ANY.prop_map(Value::Float),
         (-1.0..30.0).prop_map(Value::Float),
         any::<bool>().prop_map(Value::Boolean),
-        proptest::sample::select(words.to_vec()).prop_map(|word| Value::String(word.to_owned())),
+        proptest::sample::select(words.split(',').collect::<Vec<_>>())
+            .prop_map(|word| Value::String(word.to_owned())),
         Just(Value::Array(Vec::new())),
     ]
 }
@@ -103,15 +90,6 @@ proptest! {
             }
             Err(error) => prop_assert!(!error.to_string().trim().is_empty()),
         }
-    }
-
-    /// Settings that are not changed are the configuration.
-    #[test]
-    fn named_configurations_are_read_back(name in any::<prop::sample::Index>()) {
-        let registry = Registry::embedded().unwrap();
-        let configuration = registry.get(&registry.names()[name.index(registry.names().len())]).unwrap().configuration;
-        let text = toml::to_string(&configuration).unwrap();
-        prop_assert_eq!(text.parse::<Configuration>().unwrap(), configuration);
     }
 
     /// Catalogues are read back from files of both formats and from text. cfitsio reads subnormal numbers and −0 as 0.

@@ -5,9 +5,6 @@ use rand_chacha::ChaCha8Rng;
 use shearq_dataset::record::{read_record, write_record};
 use shearq_files::fits::{ImageReader, ImageWriter, Value};
 use shearq_render::table::{Cell, Heading, Table, TableFormat};
-use shearq_simulate::field::ShearSpectrum;
-use shearq_simulate::set::SimulationSettings;
-use shearq_submissions::{Configuration, Denoise, Method, Registry};
 
 /// Finite numbers of every size.
 fn numbers(count: usize) -> Vec<f64> {
@@ -84,45 +81,6 @@ fn every_number_of_a_header_is_read_as_it_was_written() {
         assert!(
             read.to_bits() == number.to_bits() || (read, number) == (0.0, 0.0),
             "{number:e}: {read:e}"
-        );
-    }
-}
-
-#[test]
-fn settings_of_all_digits_are_read_as_they_were_written() {
-    let mut random = ChaCha8Rng::seed_from_u64(3);
-    let folder = tempfile::tempdir().unwrap();
-    let base = Registry::embedded()
-        .unwrap()
-        .get("paper")
-        .unwrap()
-        .configuration;
-    for _ in 0..500 {
-        let mut submission = base.clone();
-        let Method::Network(network) = &mut submission.method else {
-            panic!("a submission of the network");
-        };
-        network.deconvolution.lambda = 10.0 * random.random::<f64>();
-        if let Denoise::WaveletWiener(wavelet) = &mut network.denoise {
-            wavelet.strength = 0.1 + random.random::<f64>();
-        }
-        network.shape.acf_share = 0.5 + 0.5 * random.random::<f64>();
-        let simulation = SimulationSettings {
-            spectrum: ShearSpectrum {
-                amplitude: 100.0 * random.random::<f64>(),
-                tilt: random.random::<f64>() - 0.5,
-                scatter: 1.0 + random.random::<f64>(),
-            },
-            ..SimulationSettings::new(random.random(), 12)
-        };
-        let path = folder.path().join("settings.json");
-        write_record(&path, &(&submission, simulation)).unwrap();
-        let read: (Configuration, SimulationSettings) = read_record(&path).unwrap().unwrap();
-        assert_eq!(read, (submission.clone(), simulation));
-        let written = toml::to_string(&submission).unwrap();
-        assert_eq!(
-            toml::from_str::<Configuration>(&written).unwrap(),
-            submission
         );
     }
 }

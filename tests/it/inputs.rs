@@ -1,7 +1,7 @@
 //! Commands of the pages of `tests/cases` that make or show what no text can hold: images and tables of FITS.
 //!
 //! * `image FROM TO WHAT...`: an image of the pixels of another. WHAT is applied in order: `size=WxH` or other axes,
-//!   `pad=SIDE` (zeros around it), `cube=STAMP,SIDE` (the central pixels of the stamps of a mosaic), `copy=STAMP` (the first
+//!   `pad=SIDE` (zeros around it), `pads=STAMP,SIDE` (zeros around each stamp), `cube=STAMP,SIDE` (the central pixels of the stamps of a mosaic), `copy=STAMP` (the first
 //!   stamp everywhere), `number=SIDE` (of the square of pixels from 0), `shift=X,Y`, `scale=F`, `add=F`, `background=F` (of
 //!   the peak), `slope=STAMP,F` (light per pixel along x of each stamp), `snr=F` (adds noise), `pixel=X,Y,F` (from 1),
 //!   `bitpix=N`, or a card such as `STAMP=48` or `CTYPE1="RA---TAN"`.
@@ -9,15 +9,19 @@
 //!   place of the last one of this key; `"` stands for `'`.
 //! * `tables TO NAME=CSV...`: a file of tables, each from a CSV of numbers.
 //! * `stamps FROM SIDE`: prints the first pixel of each stamp of a mosaic.
+//! * `csv FROM TO COLUMN...`: writes columns of a catalogue as CSV, or prints why it cannot be read.
+//! * `sign PRIVATE ENTRY TEAM TIME`: writes a receipt for an entry of the past, with the key of a challenge.
 
 use std::fs;
 use std::path::Path;
 
+use shearq_challenge::seal::{Key, Receipt, sha256};
 use shearq_files::fits::write_table;
 use shearq_files::frames::frame;
 use shearq_files::frames::polars::Column;
+use shearq_files::table;
 
-use crate::support::{csv, fits_image, pixels_of};
+use crate::support::{contents, csv, fits_image, pixels_of, text};
 
 /// Runs a command of this module in `root`, and gives what it prints; `None` if it is another.
 pub fn run(command: &str, root: &Path) -> Option<String> {
@@ -67,6 +71,30 @@ pub fn run(command: &str, root: &Path) -> Option<String> {
             let shown: Vec<String> = corners.map(ToString::to_string).collect();
             return Some(shown.join(" "));
         }
+        ["csv", from, to, names @ ..] => {
+            let read = match table::read(&at(from), Some(names), table::MAX_ROWS) {
+                Ok(read) => read,
+                Err(error) => return Some(error.to_string().replace(text(root), "[CASE]")),
+            };
+            let column = |name: &&str| table::numbers(&read, name, Path::new(from)).unwrap();
+            let columns: Vec<_> = names.iter().map(column).collect();
+            let row = |k: usize| columns.iter().map(|c| c[k].to_string()).collect::<Vec<_>>();
+            let rows = (0..read.height()).map(|k| row(k).join(",") + "\n");
+            fs::write(at(to), names.join(",") + "\n" + &rows.collect::<String>()).unwrap();
+        }
+        ["sign", private, entry, team, time] => {
+            let (key, entry) = (Key::read(&at(private)).unwrap().unwrap(), at(entry));
+            let content = match entry.is_dir() {
+                true => {
+                    let files = contents(&entry).into_iter();
+                    let lines = files.map(|(name, file)| format!("{name} {}\n", sha256(&file)));
+                    lines.collect::<String>().into_bytes()
+                }
+                false => fs::read(&entry).unwrap(),
+            };
+            let receipt = Receipt::sign(&key, team, time.parse().unwrap(), &sha256(&content));
+            receipt.write(&entry).unwrap();
+        }
         _ => return None,
     }
     Some(String::new())
@@ -111,6 +139,17 @@ fn image(from: &Path, what: &[&str]) -> Vec<u8> {
                     padded[(first + k / width) * side + first + k % width] = *pixel;
                 }
                 (pixels, sides) = (padded, vec![side; 2]);
+            }
+            "pads" => {
+                let [stamp, side] = numbers(value).map(|side| side as usize);
+                let (n, width) = (sides[0] / stamp, sides[0]);
+                let first = (side - stamp) / 2;
+                let mut padded = vec![0.0; n * side * n * side];
+                for (k, pixel) in pixels.iter().enumerate() {
+                    let at = |at: usize| at / stamp * side + first + at % stamp;
+                    padded[at(k / width) * n * side + at(k % width)] = *pixel;
+                }
+                (pixels, sides) = (padded, vec![n * side; 2]);
             }
             "slope" => {
                 let [side, slope] = numbers(value);

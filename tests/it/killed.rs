@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::support::{contents, succeed, text};
+use crate::support::{contents, printed, refused, succeed, text};
 
 /// Kills of each of the three commands in the ordinary test.
 const KILLS: usize = 17;
@@ -29,16 +29,26 @@ fn commands_killed_many_times_go_on_to_the_same_bytes() {
 
 fn kill_all(kills: usize) {
     let root = tempfile::tempdir().unwrap();
-    let data = root.path().join("data");
-    let sets = ["--sets", "1,7", "--images", "3", "--grid", "12"];
-    let simulate: Vec<&str> = ["simulate"].into_iter().chain(sets).collect();
-    kill(&simulate, &data, kills, 1);
-    let measure = ["measure", "--submission", "23/den/star", "--data"];
-    let measure: Vec<&str> = measure.into_iter().chain([text(&data)]).collect();
-    kill(&measure, &root.path().join("measured"), kills, 2);
-    let run = ["run", "--submission", "23/raw/star", "--simulate"];
-    let run: Vec<&str> = run.into_iter().chain(sets).collect();
-    kill(&run, &root.path().join("run"), kills, 3);
+    let sets = "--sets 1,7 --images 3 --grid 12";
+    let at = |name: &str| root.path().join(name);
+    let measure = format!(
+        "measure --submission 23/den/star --data {}",
+        text(&at("data"))
+    );
+    for (seed, (command, out)) in [
+        (format!("simulate {sets}"), "data"),
+        (measure, "measured"),
+        (
+            format!("run --submission 23/raw/star --simulate {sets}"),
+            "run",
+        ),
+    ]
+    .into_iter()
+    .enumerate()
+    {
+        let command: Vec<&str> = command.split(' ').collect();
+        kill(&command, &at(out), kills, seed as u64);
+    }
 }
 
 /// Runs a command undisturbed into `whole`, then again and again into another folder, with kills
@@ -80,39 +90,23 @@ fn what_killed_commands_leave_is_removed_by_the_next() {
     let root = tempfile::tempdir().unwrap();
     let at = |name: &str| root.path().join(name);
     let (measured, archive) = (at("measured"), at("whole.tar.gz"));
-    let sets = ["--sets", "1,7", "--images", "20", "--grid", "16"];
-    let run = [
-        "run",
-        "--simulate",
-        "--submission",
-        "23/raw/star",
-        "--out",
-        text(&measured),
-    ];
-    succeed(&[&run[..], &sets].concat());
-    succeed(&[
-        "pack",
-        "--measured",
-        text(&measured),
-        "--out",
-        text(&archive),
-    ]);
-    let pack = ["pack", "--measured", text(&measured), "--out"];
-    let unpack = ["unpack", text(&archive), "--out"];
-    let store = ["score", "--measured", text(&measured), "--store"];
-    let record = [
-        "baseline",
-        "record",
-        "mine",
-        "--simulate",
-        "--submission",
-        "23/raw/star",
-    ];
-    let few = ["--sets", "1,7", "--images", "4", "--grid", "16"];
-    let record = [&record[..], &few, &["--folder"]].concat();
+    let (measured, archive) = (text(&measured), text(&archive));
+    let run = "run --simulate --submission 23/raw/star --sets 1,7 --grid 16";
+    printed(
+        root.path(),
+        &format!("shearq {run} --images 20 --out measured"),
+    );
+    printed(
+        root.path(),
+        "shearq pack --measured measured --out whole.tar.gz",
+    );
+    let pack = format!("pack --measured {measured} --out");
+    let unpack = format!("unpack {archive} --out");
+    let store = format!("score --measured {measured} --store");
+    let record = format!("baseline record mine {} --images 4 --folder", &run[4..]);
     // With what is taken away so that the command can run again.
     for (command, out, made) in [
-        (&pack[..], "sent", "sent"),
+        (&pack, "sent", "sent"),
         (&pack, "sent.tar.gz", "sent.tar.gz"),
         (&unpack, "unpacked", "unpacked"),
         (&store, "store", "nothing"),
@@ -122,7 +116,7 @@ fn what_killed_commands_leave_is_removed_by_the_next() {
         let temporary = place.path().join("tmp");
         std::fs::create_dir(&temporary).unwrap();
         let (out, made) = (place.path().join(out), place.path().join(made));
-        let arguments = [command, &[text(&out)]].concat();
+        let arguments: Vec<&str> = command.split(' ').chain([text(&out)]).collect();
         let run = |delay| {
             let _ = std::fs::remove_dir_all(&made);
             let _ = std::fs::remove_file(&made);
@@ -132,35 +126,17 @@ fn what_killed_commands_leave_is_removed_by_the_next() {
         assert!(run(Duration::MAX));
         let length = start.elapsed();
         let mut moments = ChaCha8Rng::seed_from_u64(4);
-        let kills = (0..KILLS).filter(|_| !run(length.mul_f64(moments.random())));
-        eprintln!(
-            "{}: {} kills within {length:.2?}",
-            command[0],
-            kills.count()
-        );
+        for _ in 0..KILLS {
+            run(length.mul_f64(moments.random()));
+        }
         assert!(run(Duration::MAX));
         for folder in [place.path(), &temporary, &out] {
             let names = std::fs::read_dir(folder).into_iter().flatten();
             let names = names.map(|entry| entry.unwrap().file_name().into_string().unwrap());
             let left: Vec<String> = names.filter(|name| name.starts_with('.')).collect();
-            assert!(
-                left.is_empty(),
-                "{command:?}: {left:?} in {}",
-                folder.display()
-            );
+            assert!(left.is_empty(), "{command}: {left:?}");
         }
     }
-}
-
-/// The binary where no file may be longer than `blocks` of 512 bytes, as on a disk that is full.
-#[cfg(unix)]
-fn confined(blocks: usize, arguments: &[&str]) -> std::process::Output {
-    let script = format!("trap '' XFSZ; ulimit -f {blocks}; exec \"$0\" \"$@\"");
-    Command::new("sh")
-        .args(["-c", &script, env!("CARGO_BIN_EXE_shearq")])
-        .args(arguments)
-        .output()
-        .unwrap()
 }
 
 #[cfg(unix)]
@@ -168,40 +144,46 @@ fn confined(blocks: usize, arguments: &[&str]) -> std::process::Output {
 fn what_a_full_disk_does_not_take_is_an_error_and_no_file() {
     let root = tempfile::tempdir().unwrap();
     let at = |name: &str| root.path().join(name);
-    let (data, measured, cube) = (at("data"), at("measured"), at("cube"));
-    let sets = ["--sets", "2", "--images", "1", "--grid", "8"];
-    let simulate = [&["simulate"][..], &sets].concat();
-    let measure = ["measure", "--submission", "23/raw/star", "--data"];
-    let measure = [&measure[..], &[text(&data), "--catalogue-format", "fits"]].concat();
-    succeed(&[&simulate[..], &["--out", text(&data)]].concat());
-    let stamp = data.join("set02/psf-001.fits");
-    let gather = ["gather", "--stamps", text(&stamp), "--psf", text(&stamp)];
+    let files = |name: &str| contents(&at(name)).into_iter().collect::<BTreeMap<_, _>>();
     // The largest file of each is of 593,280, 17,280 and 12,096 bytes: none of it, half, and all but the end fit.
     for (command, whole, sizes) in [
-        (&simulate[..], &data, [1, 600, 1158]),
-        (&measure, &measured, [1, 12, 32]),
-        (&gather, &cube, [1, 12, 20]),
+        (
+            "simulate --sets 2 --images 1 --grid 8",
+            "data",
+            [1, 600, 1158],
+        ),
+        (
+            "measure --submission 23/raw/star --data data --catalogue-format fits",
+            "measured",
+            [1, 12, 32],
+        ),
+        (
+            "gather --stamps data/set02/psf-001.fits --psf data/set02/psf-001.fits",
+            "cube",
+            [1, 12, 20],
+        ),
     ] {
-        if !whole.exists() {
-            succeed(&[command, &["--out", text(whole)]].concat());
-        }
-        let expected: BTreeMap<String, Vec<u8>> = contents(whole).into_iter().collect();
-        let out = whole.with_extension("again");
+        printed(root.path(), &format!("shearq {command} --out {whole}"));
+        let expected = files(whole);
+        let again = format!("shearq {command} --out again");
         for blocks in sizes {
-            let arguments = [command, &["--out", text(&out)]].concat();
-            let output = confined(blocks, &arguments);
-            let message = String::from_utf8_lossy(&output.stderr);
-            assert_eq!(output.status.code(), Some(1), "{command:?}: {message}");
-            assert!(message.contains("cannot write"), "{command:?}: {message}");
-            if out.exists() {
-                for (name, bytes) in contents(&out) {
-                    assert!(expected.get(&name) == Some(&bytes), "{command:?}: {name}");
-                }
+            // No file may be longer than this many blocks of 512 bytes, as on a disk that is full.
+            let limit = format!("trap '' XFSZ; ulimit -f {blocks}; exec {again}");
+            let message = refused(root.path(), &limit);
+            assert!(message.contains("cannot write"), "{command}: {message}");
+            for (name, bytes) in at("again")
+                .exists()
+                .then(|| files("again"))
+                .unwrap_or_default()
+            {
+                assert!(expected.get(&name) == Some(&bytes), "{command}: {name}");
             }
-            succeed(&arguments);
-            let found: BTreeMap<String, Vec<u8>> = contents(&out).into_iter().collect();
-            assert!(found == expected, "{command:?} after {blocks} blocks");
-            std::fs::remove_dir_all(&out).unwrap();
+            printed(root.path(), &again);
+            assert!(
+                files("again") == expected,
+                "{command} after {blocks} blocks"
+            );
+            fs::remove_dir_all(at("again")).unwrap();
         }
     }
 }
@@ -236,41 +218,26 @@ fn ends_within(arguments: &[&str], delay: Duration, temporary: &Path) -> bool {
 fn an_output_folder_that_is_taken_away_is_an_error() {
     let root = tempfile::tempdir().unwrap();
     let at = |name: &str| root.path().join(name);
-    let data = at("data");
-    succeed(&[
-        "simulate",
-        "--sets",
-        "2",
-        "--images",
-        "40",
-        "--grid",
-        "8",
-        "--out",
-        text(&data),
-    ]);
-    let sets = ["--sets", "2", "--images", "40", "--grid", "8"];
-    let submission = ["--submission", "23/den/star"];
+    let (sets, submission) = ("--sets 2 --images 40 --grid 8", "--submission 23/den/star");
+    printed(root.path(), &format!("shearq simulate {sets} --out data"));
     for (name, first, command) in [
         (
             "measured",
             "catalogue-001.parquet",
-            [&["measure", "--data", text(&data)], &submission[..]].concat(),
+            format!("measure --data data {submission}"),
         ),
         (
             "run",
             "catalogue-001.parquet",
-            [&["run", "--simulate"], &submission[..], &sets].concat(),
+            format!("run --simulate {submission} {sets}"),
         ),
-        (
-            "simulated",
-            "galaxies-001.fits",
-            [&["simulate"], &sets[..]].concat(),
-        ),
+        ("simulated", "galaxies-001.fits", format!("simulate {sets}")),
     ] {
         let out = at(name);
         let child = Command::new(env!("CARGO_BIN_EXE_shearq"))
-            .args(&command)
+            .args(command.split(' '))
             .args(["--threads", "1", "--out", text(&out)])
+            .current_dir(root.path())
             .stderr(Stdio::piped())
             .stdout(Stdio::null())
             .spawn()

@@ -7,39 +7,29 @@
     reason = "a failed test stops at the cause and prints to standard error; tables of cases are long"
 )]
 
-mod baselines;
 mod bias;
 mod bias_design;
 mod cases;
-mod chain;
 mod challenge;
 mod damaged;
 mod documents;
 mod entry_points;
-mod examined;
 mod figures;
 mod fuzz;
-mod galsim_galaxies;
-mod galsim_measured;
+mod galsim;
 mod gathered;
 mod generated;
 mod identity;
 mod inputs;
 mod killed;
 mod ledger;
-mod noisy_stars;
 mod one_session;
 mod orientation;
-mod own_images;
 mod packed;
 mod printed;
 mod reference;
 mod reproduced;
 mod scoring_cases;
-mod selected;
-mod shards;
-mod stored;
-mod submitted;
 mod support;
 mod terminal;
 mod truth_sign;

@@ -9,7 +9,7 @@ use shearq_measure::{
     ArraySource, Batch, KnownNoise, Measurement, Measurer, OneThread, Psfs, Session,
 };
 
-use crate::support::{contents, fits_image, floats, pixels_of, shearq, succeed, text};
+use crate::support::{contents, fits_image, floats, pixels_of, printed, shell};
 
 /// Galaxies along a side: more than are surveyed.
 const GRID: usize = 33;
@@ -180,9 +180,8 @@ fn files_and_arrays_take_the_same_way_through_a_session() {
     let root = tempfile::tempdir().unwrap();
     let at = |name: &str| root.path().join(name);
     let folder = at("data");
-    let (grid, data) = (GRID.to_string(), text(&folder));
-    let simulate = ["simulate", "--sets", "2", "--images", "1", "--grid", &grid];
-    succeed(&[&simulate[..], &["--out", data]].concat());
+    let simulate = format!("shearq simulate --sets 2 --images 1 --grid {GRID} --out data");
+    printed(root.path(), &simulate);
     let plain = Data {
         stamps: cube(&folder.join("set02/galaxies-001.fits")),
         stars: cube(&folder.join("set02/psf-001.fits")),
@@ -198,19 +197,19 @@ fn files_and_arrays_take_the_same_way_through_a_session() {
         data.write(&folder);
         let measurer = Measurer::named(configuration, STAMP).unwrap();
         let batch = data.batch(&measurer);
-        let outs = [("measure", "1"), ("measure", "3"), ("run", "2")].map(|(command, threads)| {
-            let out = at(&format!("{command}-{threads}"));
-            let _ = std::fs::remove_dir_all(&out);
-            let measure = [
-                command,
-                "--data",
-                text(&folder),
-                "--submission",
-                configuration,
-            ];
-            let output =
-                shearq(&[&measure[..], &["--threads", threads, "--out", text(&out)]].concat());
-            (out, String::from_utf8(output.stderr).unwrap())
+        let outs = [
+            "measure --threads 1",
+            "measure --threads 3",
+            "run --threads 2",
+        ]
+        .map(|command| {
+            let out = command.replace(' ', "");
+            let options = format!("--data data --submission {configuration} --out {out}");
+            let output = shell(
+                root.path(),
+                &format!("rm -rf {out}; shearq {command} {options}"),
+            );
+            (at(&out), String::from_utf8(output.stderr).unwrap())
         });
         let Ok(batch) = batch else {
             let error = batch.unwrap_err();
@@ -221,46 +220,38 @@ fn files_and_arrays_take_the_same_way_through_a_session() {
             continue;
         };
         let warnings: Vec<String> = batch.warnings.iter().map(ToString::to_string).collect();
-        assert_eq!(
-            warnings.is_empty(),
-            expected.is_empty(),
-            "{name}: {warnings:?}"
-        );
-        assert!(
-            warnings.join("\n").contains(expected),
-            "{name}: {warnings:?}"
-        );
+        let silent = warnings.is_empty();
+        assert_eq!(silent, expected.is_empty(), "{name}: {warnings:?}");
+        let all = warnings.join("\n");
+        assert!(all.contains(expected), "{name}: {all}");
         for (out, said) in &outs {
             for warning in &warnings {
                 assert!(said.contains(warning), "{name}: {said}\n{warning}");
             }
             let path = out.join("set02/catalogue-001.parquet");
             let read = table::read(&path, None, table::MAX_ROWS).unwrap();
-            let column = |name: &str| table::numbers(&read, name, &path).unwrap().into_owned();
-            let bits = |values: Vec<f64>| {
-                values
-                    .into_iter()
-                    .map(|value| match value.is_nan() {
-                        true => u64::MAX,
-                        false => value.to_bits(),
-                    })
-                    .collect::<Vec<_>>()
+            let columns: [(&str, fn(&Measurement) -> f64); 5] = [
+                ("e1", |g| g.e1),
+                ("e2", |g| g.e2),
+                ("noise", |g| g.noise),
+                ("R12", |g| g.response.map_or(f64::NAN, |r| r[0][1])),
+                ("flags", |g| f64::from(g.flags.bits())),
+            ];
+            // NaN is not equal to itself.
+            let bits = |value: f64| {
+                if value.is_nan() {
+                    u64::MAX
+                } else {
+                    value.to_bits()
+                }
             };
-            let of =
-                |value: fn(&Measurement) -> f64| bits(batch.galaxies.iter().map(value).collect());
-            assert_eq!(bits(column("e1")), of(|g| g.e1), "{name}");
-            assert_eq!(bits(column("e2")), of(|g| g.e2), "{name}");
-            assert_eq!(bits(column("noise")), of(|g| g.noise), "{name}");
-            assert_eq!(
-                bits(column("R12")),
-                of(|g| g.response.map_or(f64::NAN, |r| r[0][1])),
-                "{name}"
-            );
-            assert_eq!(
-                bits(column("flags")),
-                of(|g| f64::from(g.flags.bits())),
-                "{name}"
-            );
+            for (column, value) in columns {
+                let found = table::numbers(&read, column, &path).unwrap();
+                assert_eq!(found.len(), batch.galaxies.len());
+                for (found, galaxy) in found.iter().zip(&batch.galaxies) {
+                    assert_eq!(bits(*found), bits(value(galaxy)), "{name}: {column}");
+                }
+            }
         }
     }
 }
@@ -268,22 +259,18 @@ fn files_and_arrays_take_the_same_way_through_a_session() {
 #[test]
 fn simulated_images_are_measured_like_their_files() {
     let root = tempfile::tempdir().unwrap();
-    let at = |name: &str| root.path().join(name);
-    let data = at("data");
-    let settings = ["--images", "2", "--grid", "34"];
-    let simulate = ["simulate", "--sets", "2,19", "--out", text(&data)];
-    succeed(&[&simulate[..], &settings].concat());
+    let sets = "--sets 2,19 --images 2 --grid 34";
+    printed(root.path(), &format!("shearq simulate {sets} --out data"));
     for name in ["48/linear/star", "48/linear/func", "23/den/star"] {
-        let (files, memory) = (at("files"), at("memory"));
-        for out in [&files, &memory] {
-            let _ = std::fs::remove_dir_all(out);
-        }
-        let measure = ["measure", "--data", text(&data), "--submission", name];
-        succeed(&[&measure[..], &["--out", text(&files)]].concat());
-        let run = ["run", "--simulate", "--sets", "2,19", "--submission", name];
-        succeed(&[&run[..], &["--out", text(&memory)], &settings].concat());
-        let catalogues = |folder: &Path| -> Vec<Vec<f64>> {
-            let all = contents(folder).into_iter();
+        let measure = format!("shearq measure --submission {name} --data data --out files");
+        let run = format!("shearq run --submission {name} --simulate {sets} --out memory");
+        printed(
+            root.path(),
+            &format!("rm -rf files memory; {measure} && {run}"),
+        );
+        let catalogues = |folder: &str| -> Vec<Vec<String>> {
+            let folder = root.path().join(folder);
+            let all = contents(&folder).into_iter();
             let all = all.filter(|(path, _)| path.ends_with(".parquet"));
             let values = all.flat_map(|(path, _)| {
                 let path = folder.join(path);
@@ -291,17 +278,13 @@ fn simulated_images_are_measured_like_their_files() {
                 ["e1", "e2", "R11", "noise", "flags"].map(|name| {
                     let column = table::numbers(&read, name, &path).unwrap();
                     assert_eq!(column.len(), 34 * 34);
-                    // NaN is not equal to itself.
-                    column
-                        .iter()
-                        .map(|v| if v.is_nan() { -9.0 } else { *v })
-                        .collect()
+                    column.iter().map(ToString::to_string).collect()
                 })
             });
             values.collect()
         };
-        let (files, memory) = (catalogues(&files), catalogues(&memory));
+        let files = catalogues("files");
         assert_eq!(files.len(), 4 * 5);
-        assert!(files == memory, "{name}");
+        assert!(files == catalogues("memory"), "{name}");
     }
 }

@@ -18,6 +18,8 @@ use shearq_studies::calibration::{Curves, LOG_LAMBDA, LambdaSums, PAPER_LAMBDA, 
 use shearq_studies::reproduce::{Plan, SetResult, Study, run_sets};
 use shearq_submissions::{Configuration, PsfForm, Registry};
 
+use crate::support::shearq;
+
 /// A set of each kind.
 const KINDS: [u32; 10] = [2, 5, 8, 11, 14, 16, 18, 20, 22, 24];
 
@@ -298,4 +300,14 @@ fn updates_compare_as_the_paper_found() {
     eprintln!("highest CTR at 10^{adopted}, as printed 10^{printed}");
     assert!((-4.0..=-3.0).contains(&adopted), "10^{adopted}");
     assert!(printed > 0.0, "10^{printed}");
+}
+
+#[test]
+fn named_configurations_keep_their_baselines() {
+    for name in ["named", "linear", "printed"] {
+        let folder = "submissions/baselines";
+        let output = shearq(&["baseline", "check", name, "--folder", folder]);
+        let [found, said] = [output.stdout, output.stderr].map(|text| String::from_utf8(text));
+        assert!(output.status.success(), "{found:?} {said:?}");
+    }
 }

@@ -51,10 +51,29 @@ fn compare(place: &str, found: &Value, expected: &Value, tolerance: f64, wrong: 
     }
 }
 
+fn keys_of(value: &Value, found: &mut Vec<String>) {
+    for (key, value) in value.as_object().into_iter().flatten() {
+        found.push(key.clone());
+        keys_of(value, found);
+    }
+}
+
+/// Asserts that the manual describes each key, apart from numbers of conventions.
+fn assert_described(keys: &[String]) {
+    let docs = std::fs::read_to_string("docs/files-challenge.md").unwrap();
+    let docs = &docs[docs.find("## JSON of one set").unwrap()..];
+    let between = |c: char| !c.is_alphanumeric() && c != '_';
+    assert!(keys.len() > 60);
+    for key in keys.iter().filter(|key| key.parse::<u8>().is_err()) {
+        let described = docs.split(between).any(|word| word == key);
+        assert!(described, "{key} is not described");
+    }
+}
+
 #[test]
-fn the_printed_object_holds_every_figure_of_the_public_cases() {
+fn json_has_each_figure_of_the_public_cases_and_each_key_a_text() {
     let mut wrong = Vec::new();
-    let mut cases = 0;
+    let (mut cases, mut keys) = (0, Vec::new());
     for entry in std::fs::read_dir("scoring/tests/data").unwrap() {
         let case = entry.unwrap().path();
         let Ok(expected) = std::fs::read_to_string(case.join("expected.json")) else {
@@ -74,6 +93,7 @@ fn the_printed_object_holds_every_figure_of_the_public_cases() {
         arguments.extend(catalogues.iter().map(|path| text(path)));
         arguments.extend(["--noise-var", &noise, "--format", "json"]);
         let found: Value = serde_json::from_str(&succeed(&arguments)).unwrap();
+        keys_of(&found, &mut keys);
         let name = expected["case"].as_str().unwrap();
         assert_eq!(found["case"], name);
         assert!(found["description"].is_string() && found["files"]["truth"].is_string());
@@ -85,5 +105,6 @@ fn the_printed_object_holds_every_figure_of_the_public_cases() {
         compare(name, &found, &expected, tolerance, &mut wrong);
     }
     assert_eq!(cases, 4);
+    assert_described(&keys);
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
 }

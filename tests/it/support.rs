@@ -1,4 +1,4 @@
-//! Helpers of several tests: the binary, images that GalSim rendered, numbers from CSV files.
+//! Helpers of several tests: the binary and a shell, images that GalSim rendered, numbers from CSV files.
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -41,9 +41,37 @@ pub fn succeed(arguments: &[&str]) -> String {
 
 /// Runs the binary, which must fail with exit code 1 and one error, and gives that.
 pub fn fail(arguments: &[&str]) -> String {
-    let output = shearq(arguments);
+    one_error(shearq(arguments), &arguments)
+}
+
+/// Runs a line of a shell in a folder, where `shearq` is the binary.
+pub fn shell(root: &Path, line: &str) -> Output {
+    let binary = Path::new(env!("CARGO_BIN_EXE_shearq")).parent().unwrap();
+    let path = std::env::var("PATH").unwrap_or_default();
+    Command::new("sh")
+        .args(["-c", line])
+        .current_dir(root)
+        .env("PATH", format!("{}:{path}", binary.display()))
+        .output()
+        .expect("a shell")
+}
+
+/// Runs a line of a shell, which must succeed, and gives its standard output.
+pub fn printed(root: &Path, line: &str) -> String {
+    let output = shell(root, line);
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{line}: {said}");
+    String::from_utf8(output.stdout).expect("UTF-8")
+}
+
+/// Runs a line of a shell, which must fail with exit code 1 and one error, and gives that.
+pub fn refused(root: &Path, line: &str) -> String {
+    one_error(shell(root, line), &line)
+}
+
+fn one_error(output: Output, command: &dyn std::fmt::Debug) -> String {
     let message = String::from_utf8(output.stderr).expect("UTF-8");
-    assert_eq!(output.status.code(), Some(1), "{arguments:?}: {message}");
+    assert_eq!(output.status.code(), Some(1), "{command:?}: {message}");
     assert!(message.starts_with("error: "), "{message}");
     assert!(!message.contains("panicked"), "{message}");
     message
@@ -67,21 +95,6 @@ pub fn contents(folder: &Path) -> Vec<(String, Vec<u8>)> {
     }
     found.sort();
     found
-}
-
-/// Runs a submission on small simulated sets, three images each, with more arguments.
-pub fn run_simulated(sets: &str, submission: &str, out: &Path, more: &[&str]) {
-    let mut arguments = vec!["run", "--simulate", "--images", "3", "--grid", "12"];
-    arguments.extend([
-        "--sets",
-        sets,
-        "--submission",
-        submission,
-        "--out",
-        text(out),
-    ]);
-    arguments.extend(more);
-    succeed(&arguments);
 }
 
 /// A path as an argument.
@@ -128,25 +141,20 @@ impl Small {
         self.root.path().join(name)
     }
 
-    /// Measures `data` into a new folder `out`, as `settings` say, and must fail; gives the error.
-    pub fn fail_to_measure(&self, settings: &[&str]) -> String {
-        let (data, out) = (self.at("data"), self.at("out"));
-        let _ = std::fs::remove_dir_all(&out);
-        fail(
-            &[
-                &["measure", "--data", text(&data), "--out", text(&out)],
-                settings,
-            ]
-            .concat(),
-        )
+    /// Measures `data` into a new folder `out`, as `settings` say.
+    fn measured_into_out(&self, settings: &[&str]) -> Output {
+        let line = "rm -rf out; shearq measure --data data --out out";
+        shell(self.root.path(), &format!("{line} {}", settings.join(" ")))
     }
 
-    /// The same, and must succeed; gives what was said on standard error.
+    /// The same, and must fail; gives the error.
+    pub fn fail_to_measure(&self, settings: &[&str]) -> String {
+        one_error(self.measured_into_out(settings), &settings)
+    }
+
+    /// The same, and must succeed; gives what was printed on standard error.
     pub fn measure(&self, settings: &[&str]) -> String {
-        let (data, out) = (self.at("data"), self.at("out"));
-        let _ = std::fs::remove_dir_all(&out);
-        let measure = ["measure", "--data", text(&data), "--out", text(&out)];
-        let output = shearq(&[&measure[..], settings].concat());
+        let output = self.measured_into_out(settings);
         let said = String::from_utf8(output.stderr).expect("UTF-8");
         assert!(output.status.success(), "{said}");
         said

@@ -91,7 +91,7 @@ fn crates_use_those_below_them() {
 }
 
 #[test]
-fn measuring_simulating_and_scoring_need_neither_files_nor_threads() {
+fn pure_crates_use_neither_files_nor_threads() {
     crate::tree::enter_root();
     for (name, folder) in LEVELS.iter().flat_map(|crates| crates.iter()) {
         if !PURE.contains(name) {
