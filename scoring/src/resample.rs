@@ -122,19 +122,6 @@ mod tests {
     use super::*;
 
     #[test]
-    fn jackknife_of_a_mean_is_its_standard_error() {
-        let data = [1.0, 4.0, 2.0, 7.0, 5.0];
-        let n = data.len() as f64;
-        let sum: f64 = data.iter().sum();
-        let mean = sum / n;
-        let standard =
-            (data.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (n * (n - 1.0))).sqrt();
-        let error = jackknife_error(mean, data.iter().map(|v| (sum - v) / (n - 1.0)), 5);
-        assert!((error / standard - 1.0).abs() < 1e-12);
-        assert!(jackknife_error(1.0, [1.0], 1).is_nan());
-    }
-
-    #[test]
     fn images_are_assigned_to_groups_in_turn() {
         assert_eq!(group_sizes(3), vec![1, 1, 1]);
         assert_eq!(group_sizes(20), vec![1; 20]);
@@ -149,27 +136,5 @@ mod tests {
         let theta = |images: f64| 3.0 + 7.0 / images;
         let replicates = group_sizes(30).into_iter().map(|m| theta(30.0 - m as f64));
         assert!(jackknife_error(theta(30.0), replicates, 30) < 1e-12);
-    }
-
-    #[test]
-    fn common_noise_cancels_in_a_paired_difference() {
-        let first = [1.0, 2.0, 3.0, 1.5, 2.5, 0.5, 3.5, 2.0];
-        let second = first.map(|v| v + 0.5);
-        let pair = |images: usize, second: &[f64]| {
-            paired_difference(&[PairedSet {
-                images,
-                first: 2.0,
-                first_replicates: &first[..images],
-                second: 2.5,
-                second_replicates: second,
-            }])
-        };
-        let paired = pair(8, &second).unwrap();
-        assert_eq!(paired.difference, 0.5);
-        assert!(paired.error < 1e-15);
-        // Too few replicates, and different numbers of them.
-        let few = pair(7, &second[..7]).unwrap();
-        assert!(few.difference == 0.5 && few.error.is_nan() && few.sigma().is_nan());
-        assert_eq!(pair(8, &second[..7]), None);
     }
 }

@@ -3,12 +3,12 @@
 use ndarray::Array2;
 use shearq_scoring::modes::{Decomposer, Modes};
 use shearq_scoring::{
-    Bins, Choice, Complex64, Convention, Definition, Fault, FieldSum, Grid, MeanShear, Metrics,
+    Bins, Complex64, Convention, Definition, Fault, FieldSum, Grid, MeanShear, Metrics,
     Noise, Options, ScoringError, SetImages, SetScore, SetScorer, TrueShear, TruthSign, Unknown,
     cross_spectrum, measured_bandpowers, sign_by_correlation, sign_by_modes,
 };
 
-use crate::common::{Content, Normal, field, truth};
+use crate::common::{Content, Normal, field, score, standard, truth};
 
 fn grid(n: usize) -> Grid {
     Grid::great10(n).unwrap()
@@ -101,21 +101,9 @@ fn only_single_images_of_the_grid_are_added() {
         };
         assert_eq!(all.add(&sum), Err(ScoringError::NotOneImage(images)));
     }
-    let other = Array2::zeros((20, 20));
-    for sum in [
-        FieldSum {
-            e1: other.clone(),
-            ..one.clone()
-        },
-        FieldSum {
-            e2: other.clone(),
-            ..one.clone()
-        },
-        FieldSum {
-            count: other.clone(),
-            ..one.clone()
-        },
-    ] {
+    for k in 0..3 {
+        let mut sum = one.clone();
+        *[&mut sum.e1, &mut sum.e2, &mut sum.count][k] = Array2::zeros((20, 20));
         assert!(is_shape(all.add(&sum)));
     }
     assert_eq!((all.total().images, all.groups().len()), (0, 0));
@@ -148,16 +136,9 @@ fn without_images_nothing_is_scored() {
 fn every_metric_that_is_not_a_number_has_a_reason() {
     let small = grid(16);
     let shear = field(&small, Content::E, 5);
-    let score = |truth: TrueShear, images: &SetImages, noise: Noise| -> SetScore {
-        let options = Options {
-            noise,
-            choice: Choice::Insist(Convention::STANDARD),
-            ..Options::default()
-        };
-        SetScorer::new(small, truth, options)
-            .unwrap()
-            .score(images)
-            .unwrap()
+    let score = |truth: TrueShear, images: &SetImages, noise: Noise| {
+        let options = standard(Definition::Leaderboard);
+        score(small, truth, images, Options { noise, ..options })
     };
     let unknown = |score: &SetScore| -> Vec<(&'static str, Unknown)> {
         for (metric, value) in Metrics::ALL.iter().zip(score.metrics.values()) {
@@ -219,24 +200,15 @@ fn every_metric_that_is_not_a_number_has_a_reason() {
 fn the_sign_of_a_truth_follows_from_modes_and_images() {
     let grid = grid(24);
     let shear = field(&grid, Content::E, 3);
-    let standard = truth(&shear);
+    let plain = truth(&shear);
     let set = images(&shear, 2, 1.0, 0.001);
-    assert_eq!(
-        sign_by_modes(&grid, &standard),
-        Ok(Some(TruthSign::Standard))
-    );
-    assert_eq!(
-        sign_by_modes(&grid, &standard.flipped()),
-        Ok(Some(TruthSign::Challenge))
-    );
-    assert_eq!(
-        sign_by_correlation(&standard, set.total()),
-        Ok(Some(TruthSign::Standard))
-    );
-    assert_eq!(
-        sign_by_correlation(&standard.flipped(), set.total()),
-        Ok(Some(TruthSign::Challenge))
-    );
+    for (truth, sign) in [
+        (&plain, TruthSign::Standard),
+        (&plain.flipped(), TruthSign::Challenge),
+    ] {
+        assert_eq!(sign_by_modes(&grid, truth), Ok(Some(sign)));
+        assert_eq!(sign_by_correlation(truth, set.total()), Ok(Some(sign)));
+    }
 }
 
 /// Random shears have E and B modes of equal power, and thus no sign, however few modes a small grid has.
@@ -268,10 +240,7 @@ fn shifted_rows_are_found_with_their_direction() {
         let from = |k: usize, by: i32| (k as i32 - by).rem_euclid(24) as usize;
         let moved = Array2::from_shape_fn((24, 24), |(ix, iy)| shear[(from(ix, x), from(iy, y))]);
         let set = images(&moved, 2, 1.0, 0.001);
-        let options = Options {
-            choice: Choice::Insist(Convention::STANDARD),
-            ..Options::default()
-        };
+        let options = standard(Definition::Leaderboard);
         let scorer = SetScorer::new(grid, truth(&shear), options).unwrap();
         let score = scorer.score(&set).unwrap();
         let faults = scorer.diagnose(&set, &score, Convention::STANDARD).unwrap();

@@ -4,11 +4,11 @@ use ndarray::Array2;
 use shearq_fourier::Complex64;
 use shearq_scoring::modes::{Decomposer, Modes};
 use shearq_scoring::{
-    Choice, Convention, Definition, FieldSum, Grid, Metrics, Options, SCORED, SetImages, SetScorer,
+    Definition, Grid, Metrics, SCORED, SetImages, SetScorer,
     resample::{PairedSet, paired_difference},
 };
 
-use crate::common::{Content, Normal, field, rows, truth};
+use crate::common::{Content, Normal, add, field, standard, truth};
 
 /// Intrinsic ellipticities: B modes of equal power in all modes, of this scatter per component before the
 /// E modes are taken out.
@@ -42,12 +42,7 @@ struct Kind {
 fn coverage(grid: &Grid, kind: &Kind, definition: Definition) -> Vec<(String, f64, f64)> {
     const TRIALS: usize = 200;
     let shear = field(grid, Content::E, 5);
-    let options = Options {
-        definition,
-        choice: Choice::Insist(Convention::STANDARD),
-        ..Options::default()
-    };
-    let scorer = SetScorer::new(*grid, truth(&shear), options).unwrap();
+    let scorer = SetScorer::new(*grid, truth(&shear), standard(definition)).unwrap();
     let mut normal = Normal(77);
     let mut found: Vec<(Vec<f64>, Vec<f64>)> = Vec::new();
     for _ in 0..TRIALS {
@@ -61,9 +56,7 @@ fn coverage(grid: &Grid, kind: &Kind, definition: Definition) -> Vec<(String, f6
             for e in &mut observed {
                 *e += Complex64::new(kind.noise * normal.draw(), kind.noise * normal.draw());
             }
-            let mut sum = FieldSum::new(grid);
-            sum.add_image(grid, rows(grid, &observed));
-            images.add(&sum).unwrap();
+            add(&mut images, grid, &observed);
         }
         let score = scorer.score(&images).unwrap();
         let with_power =
@@ -156,10 +149,7 @@ fn paired_coverage(metric: fn(&Metrics) -> f64, images: usize, m: [f64; 2]) -> f
     const NOISE: f64 = 0.03;
     let grid = Grid::great10(20).unwrap();
     let shear = field(&grid, Content::E, 5);
-    let options = Options {
-        choice: Choice::Insist(Convention::STANDARD),
-        ..Options::default()
-    };
+    let options = standard(Definition::Leaderboard);
     let scorer = SetScorer::new(grid, truth(&shear), options).unwrap();
     let mut normal = Normal(78);
     let noise = |normal: &mut Normal| {
@@ -177,9 +167,7 @@ fn paired_coverage(metric: fn(&Metrics) -> f64, images: usize, m: [f64; 2]) -> f
                 for (measured, m) in measured.iter_mut().zip(m) {
                     let own = &shared + &noise(&mut normal) + &common;
                     let observed = &shear * Complex64::from(1.0 + m) + own;
-                    let mut sum = FieldSum::new(&grid);
-                    sum.add_image(&grid, rows(&grid, &observed));
-                    measured.add(&sum).unwrap();
+                    add(measured, &grid, &observed);
                 }
             }
             let [first, second] = measured.map(|images| {
@@ -208,7 +196,7 @@ fn paired_coverage(metric: fn(&Metrics) -> f64, images: usize, m: [f64; 2]) -> f
 }
 
 #[test]
-fn errors_of_paired_differences_are_the_scatter_of_repeated_trials() {
+fn errors_of_paired_differences_are_the_scatter_of_trials() {
     for (name, metric) in [
         ("q", (|f| f.q) as fn(&Metrics) -> f64),
         ("q_calibrated", |f| f.q_calibrated),

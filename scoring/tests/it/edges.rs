@@ -5,57 +5,18 @@ use shearq_fourier::Complex64;
 use shearq_scoring::modes::Decomposer;
 use shearq_scoring::quality::quality;
 use shearq_scoring::{
-    BINS, Bins, Choice, Convention, CrossSpectrum, Definition, FieldSum, Grid, Noise, Options, Row,
-    RowCounts, SCORED, SetImages, SetScore, SetScorer, TrueShear, cross_spectrum,
+    BINS, Bins, Convention, CrossSpectrum, Definition, FieldSum, Grid, Noise, Options, Row,
+    RowCounts, SCORED, SetImages, SetScorer, TrueShear, cross_spectrum,
 };
 
-use crate::common::{Content, Normal, field, rows, truth};
-
-const STANDARD: Choice = Choice::Insist(Convention::STANDARD);
-
-/// Images of a shear with noise of their own `sigma`; cells for which `keep` says no are left out.
-fn images(
-    grid: &Grid,
-    shear: &Array2<Complex64>,
-    sigmas: &[f64],
-    keep: impl Fn(usize, usize) -> bool,
-) -> SetImages {
-    let mut normal = Normal(11);
-    let mut images = SetImages::new(grid);
-    for (image, sigma) in sigmas.iter().enumerate() {
-        let mut all = rows(grid, shear);
-        for (k, row) in all.iter_mut().enumerate() {
-            row.e1 += sigma * normal.draw();
-            row.e2 += sigma * normal.draw();
-            if !keep(image, k) {
-                (row.e1, row.e2) = (f64::NAN, f64::NAN);
-            }
-        }
-        let mut sum = FieldSum::new(grid);
-        sum.add_image(grid, all);
-        images.add(&sum).unwrap();
-    }
-    images
-}
-
-fn score(grid: Grid, truth: TrueShear, images: &SetImages, options: Options) -> SetScore {
-    let scorer = SetScorer::new(grid, truth, options).unwrap();
-    scorer.score(images).unwrap()
-}
-
-fn close(found: f64, expected: f64, what: &str) {
-    assert!(
-        (found - expected).abs() <= 1e-10 * expected.abs(),
-        "{what}: {found}, expected {expected}"
-    );
-}
+use crate::common::{Content, close, field, images, score, standard, truth};
 
 #[test]
-fn a_cross_spectrum_and_its_covariance_are_those_of_their_formulae() {
+fn cross_spectra_and_covariances_equal_their_formulae() {
     let grid = Grid::great10(16).unwrap();
     let shear = field(&grid, Content::E, 3);
     let sigmas = [0.05, 0.1, 0.07, 0.2, 0.05, 0.12, 0.06, 0.09, 0.05];
-    let set = images(&grid, &shear, &sigmas, |_, _| true);
+    let set = images(&grid, &shear, &sigmas, 11, |_, _| true);
     let found: CrossSpectrum = cross_spectrum(&grid, &set, Convention::STANDARD).unwrap();
     let bins = Bins::new(&grid, Definition::Leaderboard);
     let decomposer = Decomposer::new(grid);
@@ -119,11 +80,11 @@ fn a_cross_spectrum_and_its_covariance_are_those_of_their_formulae() {
         }
     }
     // Where nothing but the shear is seen, no noise tells weights.
-    let same = images(&grid, &shear, &[0.0, 0.0], |_, _| true);
+    let same = images(&grid, &shear, &[0.0, 0.0], 11, |_, _| true);
     let cross = cross_spectrum(&grid, &same, Convention::STANDARD).unwrap();
     assert_eq!(cross.weights, [0.5, 0.5]);
     // A galaxy that nobody measured counts as zero.
-    let gap = images(&grid, &shear, &[0.1, 0.1], |_, k| k != 7);
+    let gap = images(&grid, &shear, &[0.1, 0.1], 11, |_, k| k != 7);
     let cross = cross_spectrum(&grid, &gap, Convention::STANDARD).unwrap();
     assert!(cross.power.iter().all(|power| power.is_finite()));
     // Two images are one pair, whose errors nobody knows; seven are too few still.
@@ -132,7 +93,7 @@ fn a_cross_spectrum_and_its_covariance_are_those_of_their_formulae() {
         (&sigmas[..7], false),
         (&sigmas[..8], true),
     ] {
-        let set = images(&grid, &shear, sigmas, |_, _| true);
+        let set = images(&grid, &shear, sigmas, 11, |_, _| true);
         let cross = cross_spectrum(&grid, &set, Convention::STANDARD).unwrap();
         assert_eq!(cross.covariance.is_some(), known);
         close(cross.weights.iter().sum(), 1.0, "sum of weights");
@@ -140,17 +101,16 @@ fn a_cross_spectrum_and_its_covariance_are_those_of_their_formulae() {
 }
 
 #[test]
-fn noise_that_is_told_is_spread_over_gaps_in_the_corrected_definition() {
+fn given_noise_is_spread_over_gaps_if_corrected() {
     let grid = Grid::great10(16).unwrap();
     let shear = field(&grid, Content::E, 5);
     let keep = |image: usize, k: usize| !(image + k).is_multiple_of(3) && k != 7;
-    let set = images(&grid, &shear, &[0.1; 5], keep);
+    let set = images(&grid, &shear, &[0.1; 5], 11, keep);
     let (variance, images) = (0.01, 5.0);
     for definition in [Definition::Leaderboard, Definition::Corrected] {
         let options = Options {
-            definition,
             noise: Noise::Given(variance),
-            choice: STANDARD,
+            ..standard(definition)
         };
         let score = score(grid, truth(&shear), &set, options);
         let w = set.total().count.mapv(|count| count / images);
@@ -170,11 +130,8 @@ fn noise_that_is_told_is_spread_over_gaps_in_the_corrected_definition() {
 fn one_of_two_images_alone_has_twice_the_noise_of_both() {
     let grid = Grid::great10(16).unwrap();
     let shear = field(&grid, Content::E, 5);
-    let set = images(&grid, &shear, &[0.1, 0.1], |_, _| true);
-    let options = Options {
-        choice: STANDARD,
-        ..Options::default()
-    };
+    let set = images(&grid, &shear, &[0.1, 0.1], 11, |_, _| true);
+    let options = standard(Definition::Leaderboard);
     let score = score(grid, truth(&shear), &set, options);
     let noise = score.noise.unwrap();
     let decomposer = Decomposer::new(grid);
@@ -195,7 +152,7 @@ fn arrays_are_scored_like_rows_and_must_have_the_grids_shape() {
     let grid = Grid::great10(16).unwrap();
     let shear = field(&grid, Content::E, 5);
     let keep = |image: usize, k: usize| k != 7 * image + 3;
-    let set = images(&grid, &shear, &[0.1, 0.2, 0.1], keep);
+    let set = images(&grid, &shear, &[0.1, 0.2, 0.1], 11, keep);
     let mut arrays: Vec<[Array2<f64>; 2]> = set
         .groups()
         .iter()
@@ -239,21 +196,13 @@ fn arrays_are_scored_like_rows_and_must_have_the_grids_shape() {
             "{error}"
         );
     }
-    let other = Grid::great10(8).unwrap();
-    let wrong = images(&other, &field(&other, Content::E, 1), &[0.1], |_, _| true);
-    let scorer = SetScorer::new(grid, truth(&shear), Options::default()).unwrap();
-    let error = message(scorer.score(&wrong).err().unwrap());
-    assert!(
-        error.contains("has the shape (8, 8); expected (16, 16)"),
-        "{error}"
-    );
 }
 
 #[test]
 fn the_noise_of_one_image_is_not_known() {
     let grid = Grid::great10(16).unwrap();
     let shear = field(&grid, Content::E, 5);
-    let set = images(&grid, &shear, &[0.1], |_, _| true);
+    let set = images(&grid, &shear, &[0.1], 11, |_, _| true);
     let score = score(grid, truth(&shear), &set, Options::default());
     assert!(score.noise.is_none() && score.noise_variance.is_none());
     assert!(score.metrics.q_dn.is_nan() && score.replicates.is_empty());
@@ -280,17 +229,12 @@ fn the_true_spectrum_is_that_of_all_cells_in_both_definitions() {
 }
 
 #[test]
-fn without_any_galaxy_the_leaderboard_counts_zeros_and_nothing_is_not_a_number_by_accident() {
+fn without_galaxies_the_leaderboard_counts_zeros() {
     let grid = Grid::great10(8).unwrap();
     let shear = field(&grid, Content::E, 7);
-    let set = images(&grid, &shear, &[0.1, 0.1], |_, _| false);
+    let set = images(&grid, &shear, &[0.1, 0.1], 11, |_, _| false);
     let of = |definition| {
-        let options = Options {
-            definition,
-            choice: STANDARD,
-            ..Options::default()
-        };
-        score(grid, truth(&shear), &set, options)
+        score(grid, truth(&shear), &set, standard(definition))
     };
     let leaderboard = of(Definition::Leaderboard);
     let nothing = [0.0; BINS];
@@ -310,11 +254,8 @@ fn where_the_shear_is_constant_the_mean_is_the_truth_and_c() {
     let grid = Grid::great10(8).unwrap();
     let of = |e1, e2| Array2::from_elem((8, 8), Complex64::new(e1, e2));
     let measured = of(0.035, -0.024);
-    let set = images(&grid, &measured, &[0.0, 0.0], |_, _| true);
-    let options = Options {
-        choice: STANDARD,
-        ..Options::default()
-    };
+    let set = images(&grid, &measured, &[0.0, 0.0], 11, |_, _| true);
+    let options = standard(Definition::Leaderboard);
     let score = score(grid, truth(&of(0.03, -0.02)), &set, options);
     let mean = score.constant.unwrap();
     assert_eq!(mean.truth, [0.03, -0.02]);
@@ -332,7 +273,7 @@ fn where_the_shear_is_constant_the_mean_is_the_truth_and_c() {
 }
 
 #[test]
-fn errors_of_a_constant_shear_do_not_depend_on_the_sign_of_a_component() {
+fn errors_of_a_constant_shear_ignore_signs() {
     let grid = Grid::great10(16).unwrap();
     // One image has no jackknife.
     let keep = |_: usize, k: usize| !(40..140).contains(&k);
@@ -340,19 +281,13 @@ fn errors_of_a_constant_shear_do_not_depend_on_the_sign_of_a_component() {
         let shear = Array2::from_elem((16, 16), Complex64::new(0.03, -0.02 * sign));
         let mut flipped = SetImages::new(&grid);
         let plain = Array2::from_elem((16, 16), Complex64::new(0.03, -0.02));
-        for group in images(&grid, &plain, &[0.1], keep).groups() {
+        for group in images(&grid, &plain, &[0.1], 11, keep).groups() {
             let mut sum = group.clone();
             sum.e2 *= sign;
             flipped.add(&sum).unwrap();
         }
-        let options = Options {
-            choice: STANDARD,
-            ..Options::default()
-        };
-        score(grid, truth(&shear), &flipped, options)
-            .constant
-            .unwrap()
-            .error
+        let options = standard(Definition::Leaderboard);
+        score(grid, truth(&shear), &flipped, options).constant.unwrap().error
     };
     let (plain, flipped) = (of(1.0), of(-1.0));
     // 156 galaxies of noise 0.1, spread over 256 cells; some fifty modes tell it to 10 %.
@@ -364,7 +299,7 @@ fn errors_of_a_constant_shear_do_not_depend_on_the_sign_of_a_component() {
 }
 
 #[test]
-fn whole_numbers_stand_for_something_else_only_where_no_ellipticity_can_be() {
+fn whole_numbers_beyond_ellipticities_are_sentinels() {
     let grid = Grid::great10(8).unwrap();
     let counts = |e1: f64, e2: f64| -> RowCounts {
         let (x, y) = grid.centre(0, 0);
@@ -409,7 +344,7 @@ fn whole_numbers_stand_for_something_else_only_where_no_ellipticity_can_be() {
 }
 
 #[test]
-fn only_squares_have_a_side_and_only_fields_on_the_sky_make_a_grid() {
+fn grids_are_squares_of_fields_on_the_sky() {
     assert_eq!(
         (Grid::side_of(64), Grid::side_of(63), Grid::side_of(65)),
         (Some(8), None, None)
