@@ -622,7 +622,7 @@ mod tests {
     }
 
     #[test]
-    fn a_file_extends_a_name_and_another_file_but_not_published_figures() {
+    fn files_extend_names_and_files_without_published_figures() {
         let folder = tempfile::tempdir().unwrap();
         write(
             folder.path(),
@@ -644,7 +644,7 @@ mod tests {
     }
 
     #[test]
-    fn files_with_the_name_of_a_known_configuration_have_its_settings() {
+    fn files_of_a_known_name_have_its_settings() {
         let folder = tempfile::tempdir().unwrap();
         let registry = Registry::embedded().unwrap();
         let read = |file: &str, text: &str| {
@@ -750,69 +750,6 @@ mod tests {
         }
         let error = network.validate().unwrap_err();
         assert_eq!((error.key, error.found.as_str()), ("denoise.levels", "60"));
-    }
-
-    #[test]
-    fn mistakes_are_named_with_file_and_place() {
-        let folder = tempfile::tempdir().unwrap();
-        let registry = Registry::embedded().unwrap();
-        let message = |name: &str, text: &str| {
-            let path = write(folder.path(), name, text);
-            registry.get(&path).unwrap_err().to_string()
-        };
-        let unknown = message("a.toml", "extends = \"paper\"\n[stamp]\nsise = 23\n");
-        assert!(
-            unknown.contains("a.toml") && unknown.contains("line 3"),
-            "{unknown}"
-        );
-        assert!(
-            unknown.contains("sise") && unknown.contains("size"),
-            "{unknown}"
-        );
-        let wrong_type = message("b.toml", "extends = \"paper\"\n[stamp]\nsize = \"big\"\n");
-        assert!(wrong_type.contains("line 3"), "{wrong_type}");
-        let range = message("c.toml", "extends = \"paper\"\n[shape]\nacf_share = 1.5\n");
-        assert!(
-            range.contains("shape.acf_share") && range.contains("1.5"),
-            "{range}"
-        );
-        let dead = |text: &str, expected: &str| {
-            let found = message("dead.toml", text);
-            assert!(
-                found.contains("dead.toml") && found.contains(expected),
-                "{found}"
-            );
-        };
-        dead(
-            "extends = \"48/linear/star\"\n[shape]\nacf_share = 0.5\n",
-            "line 3: `shape.acf_share` is not used when method = \"linear\"",
-        );
-        dead(
-            "extends = \"48/linear/star\"\n[noise]\nborder = 3\n",
-            "line 3: `noise.border` is not used when noise.source = \"image\"",
-        );
-        dead(
-            "extends = \"23/raw/star\"\ndenoise = { levels = 2 }\n",
-            "line 2: `denoise.levels` is not used when denoise.method = \"none\"",
-        );
-        dead(
-            "extends = \"23/raw/star\"\n[shape]\ncalibration = \"response\"\n",
-            "line 3: `shape.calibration` is not used when method = \"network\"",
-        );
-        let child = "extends = \"dead.toml\"\n[stamp]\nsize = 29\n";
-        assert!(message("child.toml", child).contains("dead.toml: line 3"));
-        let missing = message("d.toml", "[stamp]\nsize = 23\n");
-        assert!(
-            missing.contains("the key `method` is set neither"),
-            "{missing}"
-        );
-        let cycle = message("e.toml", "extends = \"e.toml\"\n");
-        assert!(cycle.contains("circle"), "{cycle}");
-        let nobody = message("f.toml", "extends = \"23/raw/stars\"\n");
-        assert!(
-            nobody.contains("f.toml") && nobody.contains("23/raw/star,"),
-            "{nobody}"
-        );
     }
 
     #[test]

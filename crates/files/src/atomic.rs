@@ -351,7 +351,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn an_abandoned_file_leaves_nothing_and_a_finished_one_only_itself() {
+    fn abandoned_files_leave_nothing_and_finished_ones_themselves() {
         let folder = tempfile::tempdir().unwrap();
         let target = folder.path().join("new/result.csv");
         let (part, _) = PartFile::create(&target).unwrap();
@@ -409,7 +409,7 @@ mod tests {
     }
 
     #[test]
-    fn threads_that_make_temporary_folders_do_not_remove_those_of_others() {
+    fn threads_keep_the_temporary_folders_of_others() {
         let make = || {
             for _ in 0..200 {
                 let scratch = Scratch::new().unwrap();

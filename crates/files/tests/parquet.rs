@@ -111,7 +111,7 @@ fn equal_tables_give_equal_bytes() {
 }
 
 #[test]
-fn a_missing_column_is_named_with_the_file_and_the_columns_present() {
+fn missing_columns_are_named_with_file_and_columns_present() {
     let folder = tempfile::tempdir().expect("temporary folder");
     let path = place(folder.path(), &encode(&sample()));
     let error = parquet::read(&path, Some(&["g1", "g2"]), MOST)
@@ -186,7 +186,7 @@ fn files_that_are_no_parquet_are_refused() {
 }
 
 #[test]
-fn rows_and_texts_that_take_next_to_nothing_in_a_file_are_counted() {
+fn rows_and_texts_that_compress_to_nothing_are_counted() {
     let folder = tempfile::tempdir().expect("temporary folder");
     let refusal = |table: DataFrame| {
         let path = place(folder.path(), &encode(&table));
@@ -209,7 +209,7 @@ fn rows_and_texts_that_take_next_to_nothing_in_a_file_are_counted() {
 }
 
 #[test]
-fn as_many_rows_are_read_as_the_caller_expects_however_small_the_file_is() {
+fn small_files_have_as_many_rows_as_the_caller_expects() {
     let folder = tempfile::tempdir().expect("temporary folder");
     // As a truth file of 2100 × 2100 cells without shear.
     let rows = 2100 * 2100;

@@ -317,7 +317,7 @@ mod tests {
     }
 
     #[test]
-    fn pure_noise_loses_most_of_its_power_and_a_bright_blob_keeps_its_flux() {
+    fn noise_loses_most_power_and_bright_blobs_keep_their_flux() {
         let mut rng = ChaCha8Rng::seed_from_u64(3);
         let n = 48;
         let filter = WaveletWiener::new(n, &settings(1.0));

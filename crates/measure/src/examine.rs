@@ -691,7 +691,12 @@ mod tests {
         assert!(examined_rows(7, 0).is_empty());
         let rows = examined_rows(100, 100);
         assert_eq!(rows.len(), 10);
-        assert!(rows.windows(2).all(|pair| pair[0] < pair[1]));
+        // Where a few rows more than are enough are spread, two chosen places may be in one row.
+        for side in 1..120 {
+            let rows = examined_rows(side, side);
+            assert!(rows.windows(2).all(|pair| pair[0] < pair[1]), "{side}");
+            assert!(rows.last() < Some(&side));
+        }
         let even = rows.iter().filter(|row| *row % 2 == 0).count();
         assert!((3..=7).contains(&even), "{rows:?}");
     }

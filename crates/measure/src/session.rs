@@ -3,7 +3,7 @@
 //! A [`Session`] is opened on a [`StampSource`]. Opening surveys the image: the noise and the sky of its stamps, and the
 //! common profile of noisy stars. Rows are then read, measured in any thread, and collected in order by a
 //! [`MeasuredImage`], which calibrates them and checks the image. Files, simulations, [`Measurer::batch`] and Python all
-//! use it: while each of them had its own way, they differed in what they noise_plan and reported.
+//! use it: while each of them had its own way, they differed in what they surveyed and reported.
 
 use std::borrow::Cow;
 use std::fmt;
@@ -161,7 +161,7 @@ impl Threads for OneThread {
 type Slices<'a, T, E> = Box<dyn FnMut(Range<usize>) -> Result<T, E> + Send + 'a>;
 
 /// Stamps and PSFs in arrays, in the arrangement nearest to a square: images of as many stamps have the same rows, so
-/// that the same stamps are noise_plan and examined.
+/// that the same stamps are surveyed and examined.
 pub struct ArraySource<'a, E = MeasureError> {
     count: usize,
     stamps: Slices<'a, Pixels<'a, Ix3>, E>,
@@ -478,7 +478,7 @@ impl<'n> Session<'n> {
         if configuration.linear().is_none() || !white || survey_failed {
             return Ok(None);
         }
-        // Small stamps have no border that could be noise_plan.
+        // Small stamps have no border that could be surveyed.
         let found = NoisePlan::new(self.measurer.full(), WHITENESS_TEST_MAX_LAG)
             .map_err(S::Error::from)
             .and_then(|plan| survey_noise(&plan, source, threads));
@@ -934,7 +934,7 @@ mod tests {
     }
 
     #[test]
-    fn a_batch_is_its_stamps_divided_by_their_mean_response_in_either_precision() {
+    fn batches_are_stamps_divided_by_their_mean_response() {
         let measurer = Measurer::named("48/linear/star", 48).unwrap();
         let (stamps, psf) = (stamps(6, 48), moffat(0.02));
         let star = psf.stamp(40);
@@ -1022,7 +1022,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_measured_is_an_error_for_one_and_a_flag_for_one_of_many() {
+    fn unmeasurable_stamps_are_errors_alone_and_flags_in_batches() {
         let measurer = Measurer::named("48/linear/star", 48).unwrap();
         let mut stamps = stamps(3, 48);
         // Both sides of the galaxy.
@@ -1048,7 +1048,7 @@ mod tests {
     }
 
     #[test]
-    fn a_linear_submission_measures_without_a_few_pixels_and_a_network_does_not() {
+    fn linear_methods_measure_without_a_few_pixels() {
         let whole = stamps(2, 48);
         let star = moffat(0.0).stamp(32);
         let mut holed = whole.clone();
@@ -1097,7 +1097,7 @@ mod tests {
     }
 
     #[test]
-    fn wrong_shapes_parities_and_numbers_are_told_with_what_was_expected() {
+    fn wrong_shapes_and_numbers_name_what_was_expected() {
         let measurer = Measurer::named("48/linear/star", 48).unwrap();
         let (good, star) = (stamps(2, 48), moffat(0.0).stamp(32));
         let one = good.slice(s![0, .., ..]);

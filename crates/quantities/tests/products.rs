@@ -20,7 +20,7 @@ fn plain(left: Matrix<'_>, right: Matrix<'_>, inner: usize, at: [usize; 2]) -> [
 }
 
 #[test]
-fn products_are_plain_sums_for_all_sizes_and_strides_and_dirty_results() {
+fn products_are_plain_sums_for_all_sizes_and_strides() {
     let mut rng = ChaCha8Rng::seed_from_u64(3);
     for (rows, inner, width, more) in [
         (8, 1, 16, 0),

@@ -358,7 +358,7 @@ mod tests {
     }
 
     #[test]
-    fn empty_cells_leave_columns_of_numbers_and_parts_leave_out_their_rows() {
+    fn empty_cells_keep_number_columns_and_parts_omit_rows() {
         let mut whole = table();
         whole.rows.push(vec![Cell::text("mean"), Cell::Empty]);
         let columns = whole.columns().unwrap();

@@ -341,16 +341,6 @@ mod tests {
     }
 
     #[test]
-    fn columns_signs_offsets_and_types_are_converted() {
-        let keys = "ellipticity = \"distortion\"\ne2_sign = -1\nposition_offset = 1";
-        let found = rows(keys, "0,5,0.6,0,0\n1,5,0,0.8,0\n");
-        // χ = 2ε/(1 + ε²): 0.6 is ε = 1/3, 0.8 is ε = 1/2. Rounding leaves 1e-15.
-        assert_eq!((found[0].x, found[0].y), (1.0, 6.0));
-        assert!((found[0].e1 - 1.0 / 3.0).abs() < 1e-15, "{}", found[0].e1);
-        assert!((found[1].e2 + 0.5).abs() < 1e-15, "{}", found[1].e2);
-    }
-
-    #[test]
     fn flagged_missing_and_large_ellipticities_are_not_measured() {
         let keys = "ellipticity = \"shear\"\nmissing = -99\nmax_modulus = 0.5";
         let lines = "1,1,0.1,0.2,0\n1,1,0.1,0.2,4\n1,1,-99,0.2,0\n1,1,0.4,0.4,0\n";

@@ -270,7 +270,7 @@ mod tests {
     }
 
     #[test]
-    fn the_noise_of_stars_is_in_the_error_and_falls_with_their_number() {
+    fn noise_of_stars_is_in_the_error_and_falls_with_their_number() {
         let folder = tempfile::tempdir().unwrap();
         let mean = |images: &[&[(&str, &str)]]| {
             let catalogues: Vec<_> = (1..)

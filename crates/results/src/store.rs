@@ -160,6 +160,7 @@ fn merge(run: &mut RunRecord, more: RunRecord, path: &Path, notes: &mut Vec<Stri
 mod tests {
     use super::*;
     use crate::record::SetRecord;
+    use shearq_files::frames::polars::Column;
     use shearq_scoring::Metrics;
 
     fn run(configuration: &str, sets: &[(u32, u32, f64)]) -> RunRecord {
@@ -229,22 +230,20 @@ mod tests {
     }
 
     #[test]
-    fn an_edited_file_and_an_empty_folder_are_noticed() {
+    fn counts_that_no_catalogues_have_are_refused() {
         let folder = tempfile::tempdir().unwrap();
-        let store = folder.path().join("store");
-        let prepared = prepare(&store).unwrap();
-        let path = write(&store, &run("a", &[(1, 1, 5.5)])).unwrap();
-        let other = write(&store, &run("a", &[(1, 2, 6.5)])).unwrap();
-        std::fs::rename(other, path).unwrap();
-        let message = read(&store).unwrap_err().to_string();
-        assert!(
-            message.contains("changed after it was recorded"),
-            "{message}"
-        );
-        drop(prepared);
-        assert!(store.exists());
-        let empty = folder.path().join("empty");
-        drop(prepare(&empty).unwrap());
-        assert!(!empty.exists());
+        let path = write(folder.path(), &run("a", &[(1, 3, 5.5)])).unwrap();
+        let metadata = parquet::metadata(&path).unwrap();
+        for column in ["images", "galaxies", "flagged"] {
+            let mut table = parquet::read(&path, None, 1_000).unwrap();
+            let values = vec![1_i64 << 62; table.height()];
+            table.with_column(Column::new(column.into(), values)).unwrap();
+            let edited = tempfile::tempdir().unwrap();
+            let file = std::fs::File::create(edited.path().join("edited.parquet")).unwrap();
+            parquet::write(file, &table, &metadata).unwrap();
+            let message = read(edited.path()).unwrap_err().to_string();
+            let found = "is 4611686018427387904; expected at most";
+            assert!(message.contains(&format!("row 1: column `{column}` {found}")), "{message}");
+        }
     }
 }

@@ -145,7 +145,7 @@ mod tests {
     use shearq_scoring::{Bins, Definition, SCORED};
 
     #[test]
-    fn the_spectrum_passes_through_its_table_and_tilts_about_its_pivot() {
+    fn spectra_pass_their_table_and_tilt_about_their_pivot() {
         let fiducial = ShearSpectrum::default();
         let power = |s: &ShearSpectrum, l: f64| s.c_l(l) * l * l / (2.0 * std::f64::consts::PI);
         for (l, expected) in FIDUCIAL {

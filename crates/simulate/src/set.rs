@@ -552,7 +552,7 @@ mod tests {
     }
 
     #[test]
-    fn turned_galaxies_are_the_galaxies_on_their_side_and_all_have_the_constant_shear() {
+    fn rotated_galaxies_have_the_opposite_ellipticity() {
         // Set 24 has displaced bulges, which turn with their galaxies.
         let kind = SetKind::of(24).unwrap();
         let draw = |rotated, shear: [f64; 2]| {
@@ -643,7 +643,7 @@ mod tests {
     }
 
     #[test]
-    fn galaxies_do_not_depend_on_order_but_on_seed_set_image_and_place() {
+    fn galaxies_depend_on_image_and_place_not_on_order() {
         let simulator = simulator(22, 5, 16);
         let fields = simulator.image_fields(1);
         let draw = |simulator: &SetSimulator, fields: &ImageFields, ix, iy| {
@@ -659,7 +659,7 @@ mod tests {
     }
 
     #[test]
-    fn galaxies_have_the_same_flux_however_they_lie_to_the_psf_and_are_sheared() {
+    fn flux_does_not_depend_on_orientation_and_shear() {
         // Small ones, of which the stamp holds nearly all light; one elliptical PSF.
         let simulator = simulator(14, 5, 16);
         let fields = simulator.image_fields(1);

@@ -404,7 +404,7 @@ mod tests {
     #[test]
     fn every_reading_equals_plain_sums_on_dirty_scratch() {
         let mut rng = ChaCha8Rng::seed_from_u64(15);
-        for n in [8, 11, 16, 19] {
+        for n in [5, 8, 11, 16, 19, 23, 32] {
             let centre = (n as f64 - 1.0) / 2.0 + 0.3;
             let stamp = Array2::from_shape_fn((n, n), |(y, x)| {
                 let (dy, dx) = (y as f64 - centre, x as f64 - centre);
@@ -492,32 +492,6 @@ mod tests {
         }
     }
 
-    #[test]
-    fn lags_equal_the_plain_definition_for_all_sizes() {
-        let mut rng = ChaCha8Rng::seed_from_u64(1);
-        for n in [3, 5, 8, 11, 19, 23, 29, 32, 48] {
-            let stamp = Array2::from_shape_fn((n, n), |_| rng.random_range(0.0..1.0));
-            let single: Vec<f32> = stamp.iter().map(|&v: &f64| v as f32).collect();
-            for kind in [AcfKind::Full, AcfKind::Circular] {
-                let plan = ClippedAcf::new(n, &settings(kind, Background::None, 0.9));
-                let mut scratch = plan.scratch();
-                scratch.power.fill(f32::NAN);
-                plan.autocorrelate(&single, &mut scratch).unwrap();
-                let refused = plan.autocorrelate(&single[1..], &mut scratch);
-                assert!(refused.is_err());
-                let expected = lags_naive(kind, &stamp);
-                let peak = expected.iter().map(|lag| lag.2).fold(0.0, f64::max);
-                let lags = expected.iter().filter(|lag| lag.1 >= 0);
-                assert_eq!(scratch.acf.len(), lags.clone().count());
-                for (found, lag) in scratch.acf.iter().zip(lags) {
-                    // Sums of up to a hundred terms in f32, a few times.
-                    let apart = (f64::from(*found) - lag.2).abs();
-                    assert!(apart < 1e-6 * peak, "n {n}, {kind:?}, {lag:?}");
-                }
-            }
-        }
-    }
-
     /// Gaussian blob of the given second moments on an n×n stamp, off centre.
     fn blob(n: usize, qxx: f64, qyy: f64, qxy: f64) -> Vec<f32> {
         let det = qxx * qyy - qxy * qxy;
@@ -547,33 +521,6 @@ mod tests {
         assert!((moments.xy / 2.0 - 1.0).abs() < 1e-4);
         let chi = moments.distortion().unwrap();
         assert!((chi.e1 - 0.25).abs() < 1e-4 && (chi.e2 - 0.25).abs() < 1e-4);
-    }
-
-    #[test]
-    fn signs_and_axes_are_those_of_the_stamp() {
-        for share in [0.5, 0.9] {
-            let along_x = measure(23, share, &blob(23, 6.0, 3.0, 0.0))
-                .distortion()
-                .unwrap();
-            assert!(along_x.e1 > 0.05 && along_x.e2.abs() < 1e-5);
-            let diagonal = measure(23, share, &blob(23, 4.0, 4.0, 1.5))
-                .distortion()
-                .unwrap();
-            assert!(diagonal.e2 > 0.05 && diagonal.e1.abs() < 1e-5);
-        }
-    }
-
-    #[test]
-    fn the_radius_encloses_the_share_of_the_light() {
-        // The ACF of a round Gaussian is one of twice the variance: 1 − exp(−r²/2σ²) inside r.
-        let sigma_square: f64 = 6.0;
-        let moments = measure(32, 0.9, &blob(32, 3.0, 3.0, 0.0));
-        let expected = (-2.0 * sigma_square * 0.1f64.ln()).sqrt();
-        assert!(
-            (moments.radius - expected).abs() < 0.5,
-            "{}",
-            moments.radius
-        );
     }
 
     #[test]

@@ -207,10 +207,7 @@ pub fn prefix(set: Option<u32>) -> String {
 
 #[cfg(test)]
 mod tests {
-    use shearq_scoring::Grid;
-
     use super::*;
-    use crate::foreign::fault_of_rows;
 
     #[test]
     fn a_fault_of_several_sets_is_one_line_with_advice() {
@@ -224,60 +221,10 @@ mod tests {
         assert!(of_sets([(None, &two[..])].into_iter())[0].starts_with("warning: the "));
     }
 
-    #[test]
-    fn copies_and_constant_images_are_counted() {
-        let path = |name: &str| PathBuf::from(name);
-        let odd = OddImages {
-            copies: vec![(path("b"), path("a")), (path("c"), path("a"))],
-            constant: vec![(path("d"), [0.0, 0.5])],
-            responses: Vec::new(),
-        };
-        let lines = odd_images(&odd);
-        assert!(lines[0].starts_with("b has the ellipticities of a, and 1 more likewise;"));
-        assert!(lines[1].starts_with("all galaxies of d have the ellipticity (0, 0.5);"));
-    }
-
     fn good() -> RowCounts {
         RowCounts {
             used: 64,
             ..RowCounts::default()
-        }
-    }
-
-    #[test]
-    fn faults_name_the_numbers_and_the_first_row() {
-        let grid = Grid::great10(8).unwrap();
-        assert_eq!(fault_of_rows(&good(), &grid, ""), None);
-        let sentinel = RowCounts {
-            sentinels: 3,
-            first_sentinel: Some((7, -99.0, 99.0)),
-            ..good()
-        };
-        let absurd = RowCounts {
-            absurd: 4,
-            first_absurd: Some((2, 7.5, 0.1)),
-            ..good()
-        };
-        let repeated = RowCounts {
-            repeated: 33,
-            ..good()
-        };
-        let expected: [(RowCounts, &[&str]); 3] = [
-            (
-                sentinel,
-                &["3 rows have a number that no", "row 7 with (-99, 99)"],
-            ),
-            (
-                absurd,
-                &["4 of 64 rows have |e| > 5", "row 2 with (7.5, 0.1)"],
-            ),
-            (repeated, &["33 of 64 rows", "48 px", "8 × 8 grid"]),
-        ];
-        for (counts, expected) in expected {
-            let fault = fault_of_rows(&counts, &grid, "").unwrap();
-            for words in expected {
-                assert!(fault.contains(words), "{fault}");
-            }
         }
     }
 

@@ -294,24 +294,6 @@ fn states_are_those_of_the_matrices() {
 }
 
 #[test]
-fn thresholds_are_half_the_diagonal_of_the_weights() {
-    let mut rng = ChaCha8Rng::seed_from_u64(2);
-    for (n, p) in [(5, 9), (12, 4), (13, 7)] {
-        let psf = psf(&mut rng, p);
-        let matrices = Matrices::new(n, psf.view(), 0.7);
-        let network = network(n, &psf, 0.7);
-        for (a, b) in network.thresholds.iter().zip(&matrices.thresholds) {
-            assert!((f64::from(*a) / b - 1.0).abs() < 1e-7);
-        }
-        assert!(
-            network.thresholds[n * n..]
-                .iter()
-                .all(|th| *th == f32::INFINITY)
-        );
-    }
-}
-
-#[test]
 fn every_stop_occurs_and_is_reported() {
     let mut rng = ChaCha8Rng::seed_from_u64(4);
     let network = network(15, &psf(&mut rng, 7), 0.0);
