@@ -1,9 +1,9 @@
-//! Wrong data through each entry point: the library's `batch`, `gather`, `measure`, `run`, and Python if the interpreter in
-//! SHEARQ_PYTHON (by default `python3`) can import shearq.
+//! Wrong data through each entry point: the library's `batch`, `gather`, `measure` and `run`. Python has
+//! `python/tests/test_wrong_data.py`.
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::process::Output;
 
 use ndarray::{Array2, Array3, s};
 use rand::SeedableRng;
@@ -285,7 +285,7 @@ impl Folder {
         self.root.path().join(name)
     }
 
-    /// Writes the image as a data folder, as a cube of stamps, and as arrays of NumPy.
+    /// Writes the image as a data folder and as a cube of stamps.
     fn write(&self, data: &Data) {
         let side = GRID * STAMP;
         let noise = data.noise.unwrap_or(1.0);
@@ -310,8 +310,6 @@ impl Folder {
                 "cube.fits",
                 fits_image(-32, &[STAMP, STAMP, GRID * GRID], &[], &floats(cube)),
             ),
-            ("stamps.npy", numpy(&[GRID * GRID, STAMP, STAMP], cube)),
-            ("star.npy", numpy(&[STAMP, STAMP], star)),
         ] {
             fs::write(self.at(name), bytes).unwrap();
         }
@@ -330,52 +328,10 @@ impl Folder {
         let line = format!("rm -rf out; shearq {command} --out out");
         Found::of(&shell(self.root.path(), &line))
     }
-
-    /// Measures in Python; none if Python cannot import shearq.
-    fn python(&self, python: &str, data: &Data) -> Found {
-        let noise = data
-            .noise
-            .map_or("None".to_owned(), |noise| noise.to_string());
-        let script = format!(
-            "import sys, warnings, numpy, shearq\n\
-             warnings.simplefilter('always')\n\
-             warnings.showwarning = lambda message, *_: print('warning:', message, file=sys.stderr)\n\
-             try:\n    shearq.measure(numpy.load('stamps.npy'), numpy.load('star.npy'), noise={noise})\n\
-             except ValueError as error:\n    sys.exit(f'error: {{error}}')\n"
-        );
-        let mut command = Command::new(python);
-        let output = command.arg("-c").arg(script).current_dir(self.root.path());
-        Found::of(&output.output().unwrap())
-    }
-}
-
-/// A file of NumPy.
-fn numpy(shape: &[usize], pixels: &[f32]) -> Vec<u8> {
-    let shape: Vec<String> = shape.iter().map(ToString::to_string).collect();
-    let shape = shape.join(", ");
-    let head = format!("{{'descr': '<f4', 'fortran_order': False, 'shape': ({shape}), }}");
-    // The whole header has a multiple of 64 bytes and ends with a new line.
-    let length = (10 + head.len() + 1).next_multiple_of(64) - 10;
-    let mut bytes = b"\x93NUMPY\x01\x00".to_vec();
-    bytes.extend((length as u16).to_le_bytes());
-    bytes.extend(format!("{head:<width$}\n", width = length - 1).bytes());
-    bytes.extend(pixels.iter().flat_map(|value| value.to_le_bytes()));
-    bytes
-}
-
-/// A Python that can import shearq. In SHEARQ_PYTHON it must be able to.
-fn python() -> Option<String> {
-    let named = std::env::var("SHEARQ_PYTHON").ok();
-    let python = named.clone().unwrap_or_else(|| "python3".to_owned());
-    let output = Command::new(&python).args(["-c", "import shearq"]).output();
-    let imports = output.is_ok_and(|output| output.status.success());
-    assert!(imports || named.is_none(), "{python} cannot import shearq");
-    imports.then_some(python)
 }
 
 #[test]
 fn every_entry_point_reports_wrong_data() {
-    let python = python();
     let (good, folder) = (Data::good(), Folder::new());
     let mut wrong = Vec::new();
     for line in CASES.lines().skip(1) {
@@ -386,17 +342,12 @@ fn every_entry_point_reports_wrong_data() {
         folder.write(&data);
         let on_folder =
             |command| folder.run(&format!("{command} --data data --submission {LINEAR}"));
-        let mut found = vec![
+        let found = [
             ("batch", batch(&data)),
             ("gather", folder.gather(&data)),
             ("measure", on_folder("measure")),
             ("run", on_folder("run")),
         ];
-        found.extend(
-            python
-                .as_ref()
-                .map(|python| ("Python", folder.python(python, &data))),
-        );
         for (entry, found) in found {
             if !found.fits(kind, words, entry == "gather") {
                 wrong.push(format!("{what}, {entry}: {:?}", found.messages));

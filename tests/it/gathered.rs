@@ -7,7 +7,9 @@ use std::path::{Path, PathBuf};
 use serde_json::Value;
 use shearq_quantities::{FunctionalPsf, PsfProfile, Shear};
 
-use crate::support::{Small, fail, fits_image, floats, pixels_of, shearq, succeed, text};
+use crate::support::{
+    Small, fail, fits_image, floats, pixels_of, printed, shearq, shell, succeed, text,
+};
 
 const LINEAR: &str = "48/linear/star";
 
@@ -68,6 +70,18 @@ fn measured(small: &Small, data: &Path, set: &str) -> Vec<Vec<u64>> {
             values.iter().map(|value| value.to_bits()).collect()
         })
         .into()
+}
+
+/// Gathers into `data`; what was printed on standard error, and whether it succeeded.
+fn gather(root: &Path, from: &str) -> (bool, String) {
+    let done = shell(
+        root,
+        &format!("rm -rf data; shearq gather {from} --out data"),
+    );
+    (
+        done.status.success(),
+        String::from_utf8(done.stderr).unwrap(),
+    )
 }
 
 #[test]
@@ -193,8 +207,8 @@ fn the_mean_of_a_field_is_that_of_its_catalogue() {
     let small = Small::new("2");
     small.measure(&["--submission", LINEAR]);
     let out = small.at("out");
-    let mean = ["mean", "--measured", text(&out), "--format", "json"];
-    let table: Value = serde_json::from_str(&succeed(&mean)).unwrap();
+    let mean = printed(small.root(), "shearq mean --measured out --format json");
+    let table: Value = serde_json::from_str(&mean).unwrap();
     let row = &table["rows"][0];
     let value = |key: &str| row[key].as_f64().unwrap();
     let (mut flagged, mut galaxies) = (0, Vec::new());
@@ -292,14 +306,11 @@ fn several_stars_of_one_psf_are_averaged() {
         .collect();
     fs::write(at("stamps.fits"), cube(&stamps, 48)).unwrap();
     fs::write(at("stars.fits"), cube(&stars, 48)).unwrap();
-    let (from, psf, out) = (at("stamps.fits"), at("stars.fits"), at("data"));
-    let gather = ["gather", "--stamps", text(&from), "--psf", text(&psf)];
-    let done = shearq(&[&gather[..], &["--out", text(&out)]].concat());
-    let said = String::from_utf8(done.stderr).unwrap();
-    assert!(done.status.success(), "{said}");
+    let (done, said) = gather(root.path(), "--stamps stamps.fits --psf stars.fits");
+    assert!(done, "{said}");
     let expected = "stars.fits: 9 stars were averaged to one PSF for all galaxies";
     assert!(said.contains(expected), "{said}");
-    let (average, side) = pixels_of(&out.join("set01/psf-001.fits"));
+    let (average, side) = pixels_of(&at("data/set01/psf-001.fits"));
     assert_eq!(side, 48);
     let off = |star: &[f32]| {
         let sum: f64 = star.iter().map(|v| f64::from(*v)).sum();
@@ -318,26 +329,24 @@ fn correlated_noise_treated_as_white_and_padding_are_named() {
     let small = Small::new("2");
     let set = small.at("data/set02");
     let galaxies = stamps_of(&set.join("galaxies-001.fits"), 48);
-    let psf = set.join("psf-001.fits");
     let settings = |name: &str, lines: &str| {
-        let path = small.at(name);
-        fs::write(&path, format!("extends = \"{LINEAR}\"\n[noise]\n{lines}\n")).unwrap();
-        path
+        let text = format!("extends = \"{LINEAR}\"\n[noise]\n{lines}\n");
+        fs::write(small.at(name), text).unwrap();
     };
-    let white = settings("white.toml", "correlation = 0");
-    let border = settings("border.toml", "source = \"border\"");
+    settings("white.toml", "correlation = 0");
+    settings("border.toml", "source = \"border\"");
     let measure = |name: &str, stamps: &[Vec<f32>], submission: &str| {
-        let (file, data) = (small.at(&format!("{name}.fits")), small.at(name));
-        if !data.exists() {
-            fs::write(&file, cube(stamps, 48)).unwrap();
-            let gather = ["gather", "--stamps", text(&file), "--psf", text(&psf)];
-            succeed(&[&gather[..], &["--out", text(&data)]].concat());
+        if !small.at(name).exists() {
+            fs::write(small.at("stamps.fits"), cube(stamps, 48)).unwrap();
+            let gather = "shearq gather --stamps stamps.fits --psf data/set02/psf-001.fits";
+            printed(small.root(), &format!("{gather} --out {name}"));
         }
-        let out = tempfile::tempdir().unwrap();
-        let measure = ["measure", "--submission", submission, "--data", text(&data)];
-        let done = shearq(&[&measure[..], &["--out", text(out.path())]].concat());
-        let said = String::from_utf8(done.stderr).unwrap();
-        (done.status.success(), said)
+        let measure = format!("shearq measure --submission {submission} --data {name} --out out");
+        let done = shell(small.root(), &format!("rm -rf out; {measure}"));
+        (
+            done.status.success(),
+            String::from_utf8(done.stderr).unwrap(),
+        )
     };
     let summed: Vec<Vec<f32>> = galaxies
         .iter()
@@ -347,13 +356,12 @@ fn correlated_noise_treated_as_white_and_padding_are_named() {
             (0..48 * 48).map(|k| sum(k / 48, k % 48)).collect()
         })
         .collect();
-    for (submission, told) in [(LINEAR, false), (text(&white), true), (text(&border), true)] {
+    for (submission, told) in [(LINEAR, false), ("white.toml", true), ("border.toml", true)] {
         let (_, said) = measure("plain", &galaxies, submission);
         assert!(!said.contains("is treated as white"), "{said}");
         let (well, said) = measure("summed", &summed, submission);
-        assert_eq!(
-            (well, said.contains("is treated as white")),
-            (true, told),
+        assert!(
+            well && said.contains("is treated as white") == told,
             "{said}"
         );
     }
@@ -372,13 +380,17 @@ fn correlated_noise_treated_as_white_and_padding_are_named() {
 }
 
 /// Pixels of the stamps that were gathered, of which those that are missing are NaN.
-fn gathered(root: &Path, from: &[&str], side: usize) -> Vec<Vec<f32>> {
-    let data = root.join("data");
-    let _ = fs::remove_dir_all(&data);
-    let psf = root.join("psf.fits");
-    let rest = ["--psf", text(&psf), "--out", text(&data)];
-    succeed(&[&["gather"][..], from, &rest].concat());
-    stamps_of(&data.join("set01/galaxies-001.fits"), side)
+fn gathered(root: &Path, from: &str, side: usize) -> Vec<Vec<f32>> {
+    let (done, said) = gather(root, &format!("{from} --psf psf.fits"));
+    assert!(done, "{said}");
+    stamps_of(&root.join("data/set01/galaxies-001.fits"), side)
+}
+
+/// Places of missing pixels, stamp after stamp.
+fn lost(found: &[Vec<f32>]) -> Vec<usize> {
+    let places = found.iter().flatten().enumerate();
+    let missing = places.filter(|(_, value)| value.is_nan());
+    missing.map(|(at, _)| at).collect()
 }
 
 #[test]
@@ -393,19 +405,12 @@ fn extensions_are_chosen_by_name_and_masks_make_pixels_missing() {
     for (stamp, flag) in stamps.iter().zip(&flags) {
         parts.extend([("SCI", &stamp[..]), ("ERR", flag), ("DQ", flag)]);
     }
-    let (parts_file, masks) = (at("parts.fits"), at("masks.fits"));
-    fs::write(&parts_file, named_extensions(&parts, 24)).unwrap();
-    fs::write(&masks, cube(&flags, 24)).unwrap();
-    let from = ["--stamps", text(&parts_file)];
-    let sky = [&from[..], &["--extension", "sci"]].concat();
-    assert_eq!(gathered(root.path(), &sky, 24), stamps);
-    let lost = |found: &[Vec<f32>]| {
-        let places = found.iter().flatten().enumerate();
-        let nan = places.filter(|(_, value)| value.is_nan());
-        nan.map(|(at, _)| at).collect::<Vec<_>>()
-    };
-    for mask in [["--mask-extension", "DQ"], ["--mask", text(&masks)]] {
-        let found = gathered(root.path(), &[&sky[..], &mask].concat(), 24);
+    fs::write(at("parts.fits"), named_extensions(&parts, 24)).unwrap();
+    fs::write(at("masks.fits"), cube(&flags, 24)).unwrap();
+    let sky = "--stamps parts.fits --extension sci";
+    assert_eq!(gathered(root.path(), sky, 24), stamps);
+    for mask in ["--mask-extension DQ", "--mask masks.fits"] {
+        let found = gathered(root.path(), &format!("{sky} {mask}"), 24);
         assert_eq!(lost(&found), [2 * 576 + 24 * 3 + 5]);
         assert_eq!(found[3], stamps[3]);
     }
@@ -416,89 +421,75 @@ fn extensions_are_chosen_by_name_and_masks_make_pixels_missing() {
             (0..24).flat_map(|y| of.iter().flat_map(move |s| s[24 * y..24 * y + 24].to_vec()));
         fits_image(-32, &[96, 24], &[], &floats(&rows.collect::<Vec<_>>()))
     };
-    let (exposure, mask, positions) = (at("wide.fits"), at("wide-mask.fits"), at("places.csv"));
-    fs::write(&exposure, wide(&stamps)).unwrap();
-    fs::write(&mask, wide(&flags)).unwrap();
-    fs::write(
-        &positions,
-        "x,y\n12.5,12.5\n36.5,12.5\n60.5,12.5\n84.5,12.5\n",
-    )
-    .unwrap();
-    let cut = [
-        "--exposure",
-        text(&exposure),
-        "--positions",
-        text(&positions),
-        "--size",
-        "24",
-    ];
-    let found = gathered(
-        root.path(),
-        &[&cut[..], &["--mask", text(&mask)]].concat(),
-        24,
-    );
-    assert_eq!(lost(&found), [2 * 576 + 24 * 3 + 5]);
-
-    let refused = |from: &[&str], expected: &str| {
-        let (psf, out) = (at("psf.fits"), at("none"));
-        let rest = ["--psf", text(&psf), "--out", text(&out)];
-        let message = fail(&[&["gather"][..], from, &rest].concat());
-        assert!(message.contains(expected), "{message}");
-        assert!(!out.join("set01/galaxies-001.fits").exists());
-    };
-    refused(
-        &from,
-        "parts.fits: image 2, plane 1: the image is called ERR; expected an image of the sky or a PSF. Try: choose images by name with --extension",
-    );
-    let wrong = [&from[..], &["--extension", "PRIMARY"]].concat();
-    refused(
-        &wrong,
-        "there is no image called `PRIMARY`; found `SCI`, `ERR`, `DQ`, `SCI`",
-    );
-    refused(
-        &[&sky[..], &["--mask", text(&parts_file)]].concat(),
-        "parts.fits: image 1, plane 1: the mask is the image itself; expected another (--mask-extension)",
-    );
+    fs::write(at("wide.fits"), wide(&stamps)).unwrap();
+    fs::write(at("wide-mask.fits"), wide(&flags)).unwrap();
+    let positions = "x,y\n12.5,12.5\n36.5,12.5\n60.5,12.5\n84.5,12.5\n";
+    fs::write(at("places.csv"), positions).unwrap();
     // What is called a mask may be one.
     let called: Vec<(&str, &[f32])> = flags.iter().map(|flag| ("MASK", &flag[..])).collect();
-    let named = at("named.fits");
-    fs::write(&named, named_extensions(&called, 24)).unwrap();
-    let found = gathered(
-        root.path(),
-        &[&sky[..], &["--mask", text(&named)]].concat(),
-        24,
-    );
-    assert_eq!(lost(&found), [2 * 576 + 24 * 3 + 5]);
-    let pair = ["--mask", text(&mask), text(&named)];
-    refused(
-        &[&cut[..], &pair].concat(),
-        "named.fits: this is a second file",
-    );
-    let three = at("three.fits");
-    fs::write(&three, cube(&flags[..3], 24)).unwrap();
-    refused(
-        &[&sky[..], &["--mask", text(&three)]].concat(),
-        "image 10, plane 1: there is no mask for this stamp",
-    );
+    fs::write(at("named.fits"), named_extensions(&called, 24)).unwrap();
+    let cut = "--exposure wide.fits --positions places.csv --size 24";
+    for masked in [
+        format!("{cut} --mask wide-mask.fits"),
+        format!("{sky} --mask named.fits"),
+    ] {
+        let found = gathered(root.path(), &masked, 24);
+        assert_eq!(lost(&found), [2 * 576 + 24 * 3 + 5]);
+    }
+    fs::write(at("three.fits"), cube(&flags[..3], 24)).unwrap();
     let five = [&flags[..], &flags[..1]].concat();
-    fs::write(&three, cube(&five, 24)).unwrap();
-    refused(
-        &[&sky[..], &["--mask", text(&three)]].concat(),
-        "plane 5: there is no stamp for this mask",
-    );
-    refused(
-        &[&sky[..], &["--mask", text(&mask)]].concat(),
-        "wide-mask.fits: image 1, plane 1: the mask is 96 × 24 pixels; its stamp has 24 × 24",
-    );
-    let narrow = ["--mask", text(&masks)];
-    refused(
-        &[&cut[..], &narrow].concat(),
-        "masks.fits: image 1, plane 1: the image has 4 planes",
-    );
-    refused(
-        &[&cut[..], &["--mask", text(&at("psf.fits"))]].concat(),
-        "the mask is 20 × 20 pixels; the exposure has 96 × 24",
-    );
+    fs::write(at("five.fits"), cube(&five, 24)).unwrap();
+    for (from, more, expected) in [
+        (
+            "--stamps parts.fits",
+            "",
+            "parts.fits: image 2, plane 1: the image is called ERR; expected an image of the sky or a PSF. Try: choose images by name with --extension",
+        ),
+        (
+            "--stamps parts.fits",
+            "--extension PRIMARY",
+            "there is no image called `PRIMARY`; found `SCI`, `ERR`, `DQ`, `SCI`",
+        ),
+        (
+            sky,
+            "--mask parts.fits",
+            "parts.fits: image 1, plane 1: the mask is the image itself; expected another (--mask-extension)",
+        ),
+        (
+            cut,
+            "--mask wide-mask.fits named.fits",
+            "named.fits: this is a second file",
+        ),
+        (
+            sky,
+            "--mask three.fits",
+            "image 10, plane 1: there is no mask for this stamp",
+        ),
+        (
+            sky,
+            "--mask five.fits",
+            "plane 5: there is no stamp for this mask",
+        ),
+        (
+            sky,
+            "--mask wide-mask.fits",
+            "wide-mask.fits: image 1, plane 1: the mask is 96 × 24 pixels; its stamp has 24 × 24",
+        ),
+        (
+            cut,
+            "--mask masks.fits",
+            "masks.fits: image 1, plane 1: the image has 4 planes",
+        ),
+        (
+            cut,
+            "--mask psf.fits",
+            "the mask is 20 × 20 pixels; the exposure has 96 × 24",
+        ),
+    ] {
+        let (done, message) = gather(root.path(), &format!("{from} {more} --psf psf.fits"));
+        assert!(!done && message.contains(expected), "{message}");
+        assert!(!at("data/set01/galaxies-001.fits").exists());
+    }
 }
 
 #[test]
@@ -506,28 +497,24 @@ fn compressed_cubes_are_read_plane_by_plane() {
     let root = tempfile::tempdir().unwrap();
     fs::write(root.path().join("psf.fits"), cube(&[vec![1.0; 400]], 20)).unwrap();
     // As astropy wrote it, in tiles of 24 × 10 pixels.
+    let bytes = fs::read("tests/data/cube.fits").unwrap();
+    fs::write(root.path().join("cube.fits"), &bytes).unwrap();
     let value = |plane: usize, at: usize| {
         ((17 * (at % 24) + 31 * (at / 24) + 101 * plane) % 256) as f32 / 16.0
     };
     let expected: Vec<Vec<f32>> = (0..3)
         .map(|plane| (0..576).map(|at| value(plane, at)).collect())
         .collect();
-    let found = gathered(root.path(), &["--stamps", "tests/data/cube.fits"], 24);
+    let found = gathered(root.path(), "--stamps cube.fits", 24);
     assert_eq!(found[..3], expected);
-    let bytes = fs::read("tests/data/cube.fits").unwrap();
     let text_of = String::from_utf8_lossy(&bytes).into_owned();
     let place = text_of.find("ZTILE3  =                    1").unwrap();
     let mut thick = bytes.clone();
     thick[place + 29] = b'3';
-    let path = root.path().join("thick.fits");
-    fs::write(&path, thick).unwrap();
-    let (psf, out) = (root.path().join("psf.fits"), root.path().join("none"));
-    let gather = ["gather", "--stamps", text(&path), "--psf", text(&psf)];
-    let message = fail(&[&gather[..], &["--out", text(&out)]].concat());
-    assert!(
-        message.contains("its tiles have 3 planes each; expected one"),
-        "{message}"
-    );
+    fs::write(root.path().join("thick.fits"), thick).unwrap();
+    let (_, message) = gather(root.path(), "--stamps thick.fits --psf psf.fits");
+    let expected = "its tiles have 3 planes each; expected one";
+    assert!(message.contains(expected), "{message}");
 }
 
 #[test]
@@ -538,26 +525,17 @@ fn psfs_of_other_pixels_or_wider_than_galaxies_are_reported() {
     let (star, side) = pixels_of(&set.join("psf-001.fits"));
     let scale = |arcsec: &str| format!("PIXSCALE= {arcsec:>20}");
     let write = |name: &str, sides: &[usize], scale: &str, pixels: &[f32]| {
-        let path = small.at(name);
-        fs::write(&path, fits_image(-32, sides, &[scale], &floats(pixels))).unwrap();
-        path
+        let file = fits_image(-32, sides, &[scale], &floats(pixels));
+        fs::write(small.at(name), file).unwrap();
     };
     let sides = [48, 48, galaxies.len()];
-    let stamps = write("stamps.fits", &sides, &scale("0.2"), &galaxies.concat());
-    let gather = |psf: &Path, out: &str| {
-        let out = small.at(out);
-        let gather = ["gather", "--stamps", text(&stamps), "--psf", text(psf)];
-        let done = shearq(&[&gather[..], &["--out", text(&out)]].concat());
-        (
-            done.status.success(),
-            String::from_utf8(done.stderr).unwrap(),
-        )
-    };
-    let good = write("good.fits", &[side; 2], &scale("0.2"), &star);
-    let (done, said) = gather(&good, "good");
+    write("stamps.fits", &sides, &scale("0.2"), &galaxies.concat());
+    let gather = |psf: &str| gather(small.root(), &format!("--stamps stamps.fits --psf {psf}"));
+    write("good.fits", &[side; 2], &scale("0.2"), &star);
+    let (done, said) = gather("good.fits");
     assert!(done && !said.contains("warning"), "{said}");
-    let other = write("other.fits", &[side; 2], &scale("0.263"), &star);
-    let (done, said) = gather(&other, "other");
+    write("other.fits", &[side; 2], &scale("0.263"), &star);
+    let (done, said) = gather("other.fits");
     let expected = "warning: set 01 image 001: the PSF image and the galaxy image have different pixel scales (found 0.263, expected 0.2 arcsec";
     assert!(done && said.contains(expected), "{said}");
     // A Gaussian of FWHM 14 px.
@@ -565,13 +543,11 @@ fn psfs_of_other_pixels_or_wider_than_galaxies_are_reported() {
         .map(|k| [k % side, k / side].map(|at| at as f32 - (side as f32 - 1.0) / 2.0))
         .map(|[x, y]| (-(x * x + y * y) / 72.0).exp())
         .collect();
-    let wide = write("wide.fits", &[side; 2], &scale("0.2"), &wide);
-    let (done, said) = gather(&wide, "wide");
-    assert!(
-        !done && said.contains("wide.fits: the PSF is broader than the galaxies"),
-        "{said}"
-    );
-    assert!(!small.at("wide/set01").exists());
+    write("wide.fits", &[side; 2], &scale("0.2"), &wide);
+    let (done, said) = gather("wide.fits");
+    let expected = "wide.fits: the PSF is broader than the galaxies";
+    assert!(!done && said.contains(expected), "{said}");
+    assert!(!small.at("data/set01").exists());
 }
 
 #[test]
@@ -584,10 +560,8 @@ fn stamps_become_squares_of_the_largest_side_on_request() {
         let pixels: Vec<f32> = (0..columns * rows)
             .map(|at| value(at % columns, at / columns))
             .collect();
-        let path = at(name);
         let file = fits_image(-32, &[columns, rows], &[], &floats(&pixels));
-        fs::write(&path, file).unwrap();
-        path
+        fs::write(at(name), file).unwrap();
     };
     // Column 0 and row 0 of the stamp are at `first` in the file.
     let expected = |side: usize, [columns, rows]: [usize; 2], first: [i64; 2]| -> Vec<u32> {
@@ -601,21 +575,15 @@ fn stamps_become_squares_of_the_largest_side_on_request() {
         (0..side * side).map(pixel).collect()
     };
     let bits = |stamp: &[f32]| -> Vec<u32> { stamp.iter().map(|value| value.to_bits()).collect() };
-    let (wide, small, large) = (
-        image("wide.fits", [24, 20]),
-        image("small.fits", [21, 21]),
-        image("large.fits", [24, 24]),
-    );
-    let (psf, none, said) = (at("psf.fits"), at("none"), at("said"));
-    let from = ["--stamps", text(&wide)];
-    let gather = ["gather", "--psf", text(&psf)];
-    let refused = fail(&[&gather[..], &from, &["--out", text(&none)]].concat());
-    assert!(
-        refused.contains("24 × 20") && refused.contains("--square crop"),
-        "{refused}"
-    );
+    image("wide.fits", [24, 20]);
+    image("small.fits", [21, 21]);
+    image("large.fits", [24, 24]);
+    let wide = "--stamps wide.fits";
+    let (_, message) = gather(root.path(), &format!("{wide} --psf psf.fits"));
+    let explained = message.contains("24 × 20") && message.contains("--square crop");
+    assert!(explained, "{message}");
     let square = |how: &str, side| {
-        let found = gathered(root.path(), &[&from[..], &["--square", how]].concat(), side);
+        let found = gathered(root.path(), &format!("{wide} --square {how}"), side);
         bits(&found[0])
     };
     assert_eq!(square("crop", 20), expected(20, [24, 20], [2, 0]));
@@ -623,20 +591,16 @@ fn stamps_become_squares_of_the_largest_side_on_request() {
     // A mask has the shape of its stamp.
     let mut mask = vec![0.0f32; 480];
     mask[24 * 5 + 7] = 1.0;
-    let path = at("mask.fits");
-    fs::write(&path, fits_image(-32, &[24, 20], &[], &floats(&mask))).unwrap();
-    let masked = ["--square", "crop", "--mask", text(&path)];
-    let found = gathered(root.path(), &[&from[..], &masked].concat(), 20);
-    let lost: Vec<usize> = (0..400).filter(|at| found[0][*at].is_nan()).collect();
-    assert_eq!(lost, [20 * 5 + 5]);
+    let mask = fits_image(-32, &[24, 20], &[], &floats(&mask));
+    fs::write(at("mask.fits"), mask).unwrap();
+    let masked = format!("{wide} --square crop --mask mask.fits");
+    assert_eq!(lost(&gathered(root.path(), &masked, 20)), [20 * 5 + 5]);
     // Without a request: these are squares.
-    let large = text(&large);
-    let both = ["--stamps", text(&small), large, large, large];
-    let found = gathered(root.path(), &both, 24);
+    let both = "--stamps small.fits large.fits large.fits large.fits";
+    let found = gathered(root.path(), both, 24);
     assert_eq!(bits(&found[0]), expected(24, [21, 21], [-2, -2]));
     assert_eq!(bits(&found[1]), expected(24, [24, 24], [0, 0]));
-    let done = shearq(&[&gather[..], &both, &["--out", text(&said)]].concat());
-    let said = String::from_utf8(done.stderr).unwrap();
+    let (_, said) = gather(root.path(), &format!("{both} --psf psf.fits"));
     let note = "the stamps have sides of 21 to 24 px";
     assert!(said.contains(note), "{said}");
 }
@@ -660,29 +624,26 @@ fn mask_bits_and_sextractors_blank_make_pixels_missing() {
     let bytes: Vec<u8> = mask.iter().flat_map(|value| value.to_be_bytes()).collect();
     let mut half = vec![0.0f32; 400];
     half[0] = 0.5;
-    let (stamps, mask, fraction) = (at("stamps.fits"), at("mask.fits"), at("half.fits"));
-    fs::write(&stamps, cube(&[stamp], 20)).unwrap();
-    fs::write(&mask, fits_image(32, &[20, 20], &[], &bytes)).unwrap();
-    fs::write(&fraction, cube(&[half], 20)).unwrap();
-    let from = ["--stamps", text(&stamps)];
-    let lost = |more: &[&str]| {
-        let found = gathered(root.path(), &[&from[..], more].concat(), 20);
-        let missing = (0..400).filter(|at| found[0][*at].is_nan());
-        missing.collect::<Vec<usize>>()
-    };
-    let masked = ["--mask", text(&mask)];
-    let some = |bits: &str| lost(&[&masked[..], &["--mask-bits", bits]].concat());
-    assert_eq!(lost(&[]), [9]);
-    assert_eq!(lost(&masked), [3, 4, 5, 6, 9]);
-    assert_eq!(some("0"), [3, 9]);
-    assert_eq!(some("1,30"), [3, 4, 5, 6, 9]);
-    let (psf, out) = (at("psf.fits"), at("none"));
-    let gather = ["gather", "--mask-bits", "2", "--psf", text(&psf)];
-    let gather = [&gather[..], &from, &["--out", text(&out)]].concat();
-    let message = fail(&[&gather[..], &["--mask", text(&fraction)]].concat());
-    assert!(message.contains("the mask has the value 0.5"), "{message}");
-    let message = fail(&gather);
-    assert!(message.contains("without a mask"), "{message}");
+    fs::write(at("stamps.fits"), cube(&[stamp], 20)).unwrap();
+    fs::write(at("mask.fits"), fits_image(32, &[20, 20], &[], &bytes)).unwrap();
+    fs::write(at("half.fits"), cube(&[half], 20)).unwrap();
+    for (more, expected) in [
+        ("", &[9][..]),
+        ("--mask mask.fits", &[3, 4, 5, 6, 9]),
+        ("--mask mask.fits --mask-bits 0", &[3, 9]),
+        ("--mask mask.fits --mask-bits 1,30", &[3, 4, 5, 6, 9]),
+    ] {
+        let found = gathered(root.path(), &format!("--stamps stamps.fits {more}"), 20);
+        assert_eq!(lost(&found), expected, "{more}");
+    }
+    for (more, expected) in [
+        ("--mask half.fits", "the mask has the value 0.5"),
+        ("", "without a mask"),
+    ] {
+        let from = format!("--stamps stamps.fits --mask-bits 2 --psf psf.fits {more}");
+        let (done, message) = gather(root.path(), &from);
+        assert!(!done && message.contains(expected), "{message}");
+    }
 }
 
 #[test]
@@ -706,14 +667,12 @@ fn small_psfs_and_grids_of_stars_are_explained() {
     ] {
         fs::write(at(name), cube(&stamps, side)).unwrap();
     }
-    let (stamps, out) = (at("stamps.fits"), at("new/data"));
     let said = |psf: &str| {
-        let psf = at(psf);
-        let gather = ["gather", "--stamps", text(&stamps), "--psf", text(&psf)];
-        let done = shearq(&[&gather[..], &["--out", text(&out)]].concat());
+        let line =
+            format!("rm -rf new; shearq gather --stamps stamps.fits --psf {psf} --out new/data");
+        let done = shell(root.path(), &line);
         // A failure leaves no folder.
         assert_eq!(at("new").exists(), done.status.success());
-        let _ = fs::remove_dir_all(at("new"));
         String::from_utf8(done.stderr).unwrap()
     };
     for (psf, expected) in [

@@ -136,6 +136,11 @@ impl Small {
         Small { root }
     }
 
+    /// The temporary folder.
+    pub fn root(&self) -> &Path {
+        self.root.path()
+    }
+
     /// A path in the temporary folder.
     pub fn at(&self, name: &str) -> PathBuf {
         self.root.path().join(name)

@@ -45,6 +45,12 @@ const PURE: [&str; 7] = [
     "shearq-simulate",
 ];
 
+/// The crates below the command line, with their folders.
+pub fn libraries() -> impl Iterator<Item = (&'static str, &'static str)> {
+    let all = LEVELS.iter().flat_map(|crates| crates.iter().copied());
+    all.take_while(|(name, _)| *name != "shearq")
+}
+
 fn manifest(folder: &str) -> toml::Table {
     let path = Path::new(folder).join("Cargo.toml");
     fs::read_to_string(path).unwrap().parse().unwrap()

@@ -4,7 +4,8 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use syn::visit::{self, Visit};
 
-use crate::tree::{LIBRARIES, ModulePath, Target, Tree, attributes, is_test, names};
+use crate::crates::libraries;
+use crate::tree::{ModulePath, Target, Tree, attributes, is_test, names};
 
 /// Imports between the modules of a crate: what each one uses.
 type Uses = BTreeMap<ModulePath, BTreeSet<ModulePath>>;
@@ -84,7 +85,7 @@ fn reached(uses: &Uses, from: &ModulePath) -> BTreeSet<ModulePath> {
 fn modules_do_not_import_each_other_in_circles() {
     crate::tree::enter_root();
     let mut circular = BTreeMap::new();
-    for (name, folder) in LIBRARIES {
+    for (name, folder) in libraries() {
         let tree = Tree::of(folder);
         let uses = uses(&tree);
         assert!(

@@ -16,24 +16,6 @@ pub const CODE: [&str; 6] = [
     "benches",
 ];
 
-/// The crates with a library, by package name, and their folders.
-pub const LIBRARIES: [(&str, &str); 14] = [
-    ("shearq-bias", "crates/bias"),
-    ("shearq-challenge", "crates/challenge"),
-    ("shearq-dataset", "crates/dataset"),
-    ("shearq-files", "crates/files"),
-    ("shearq-fourier", "crates/fourier"),
-    ("shearq-measure", "crates/measure"),
-    ("shearq-pipeline", "crates/pipeline"),
-    ("shearq-quantities", "crates/quantities"),
-    ("shearq-render", "crates/render"),
-    ("shearq-results", "crates/results"),
-    ("shearq-scoring", "scoring"),
-    ("shearq-simulate", "crates/simulate"),
-    ("shearq-studies", "crates/studies"),
-    ("shearq-submissions", "submissions"),
-];
-
 /// Names from the root of a crate to a module; empty for the root.
 pub type ModulePath = Vec<String>;
 

@@ -237,13 +237,18 @@ mod tests {
         for column in ["images", "galaxies", "flagged"] {
             let mut table = parquet::read(&path, None, 1_000).unwrap();
             let values = vec![1_i64 << 62; table.height()];
-            table.with_column(Column::new(column.into(), values)).unwrap();
+            table
+                .with_column(Column::new(column.into(), values))
+                .unwrap();
             let edited = tempfile::tempdir().unwrap();
             let file = std::fs::File::create(edited.path().join("edited.parquet")).unwrap();
             parquet::write(file, &table, &metadata).unwrap();
             let message = read(edited.path()).unwrap_err().to_string();
             let found = "is 4611686018427387904; expected at most";
-            assert!(message.contains(&format!("row 1: column `{column}` {found}")), "{message}");
+            assert!(
+                message.contains(&format!("row 1: column `{column}` {found}")),
+                "{message}"
+            );
         }
     }
 }

@@ -3,8 +3,8 @@
 use ndarray::Array2;
 use shearq_scoring::modes::{Decomposer, Modes};
 use shearq_scoring::{
-    Bins, Complex64, Convention, Definition, Fault, FieldSum, Grid, MeanShear, Metrics,
-    Noise, Options, ScoringError, SetImages, SetScore, SetScorer, TrueShear, TruthSign, Unknown,
+    Bins, Complex64, Convention, Definition, Fault, FieldSum, Grid, MeanShear, Metrics, Noise,
+    Options, ScoringError, SetImages, SetScore, SetScorer, TrueShear, TruthSign, Unknown,
     cross_spectrum, measured_bandpowers, sign_by_correlation, sign_by_modes,
 };
 

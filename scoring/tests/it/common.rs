@@ -41,7 +41,13 @@ pub fn field(grid: &Grid, content: Content, seed: u64) -> Array2<Complex64> {
     let white = Array2::from_shape_fn((n, n), |_| Complex64::new(normal.draw(), normal.draw()));
     let Modes { mut e, mut b } = decomposer.decompose(white).unwrap();
     for ((i, j), value) in e.indexed_iter_mut() {
-        let f = |k: usize| if 2 * k > n { k as f64 - n as f64 } else { k as f64 };
+        let f = |k: usize| {
+            if 2 * k > n {
+                k as f64 - n as f64
+            } else {
+                k as f64
+            }
+        };
         let l = f(i).hypot(f(j));
         let inside = l > 0.0 && 2.0 * l < n as f64 && 2 * i != n && 2 * j != n;
         let scale = if inside { 0.02 / l } else { 0.0 };
@@ -60,7 +66,12 @@ pub fn field(grid: &Grid, content: Content, seed: u64) -> Array2<Complex64> {
 pub fn rows(grid: &Grid, field: &Array2<Complex64>) -> Vec<Row> {
     let row = |((ix, iy), e): ((usize, usize), &Complex64)| {
         let (x, y) = grid.centre(ix, iy);
-        Row { x, y, e1: e.re, e2: e.im }
+        Row {
+            x,
+            y,
+            e1: e.re,
+            e2: e.im,
+        }
     };
     field.indexed_iter().map(row).collect()
 }

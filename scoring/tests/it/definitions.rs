@@ -199,7 +199,9 @@ fn missing_galaxies_bias_the_leaderboard_alone() {
     };
     let images = images(&grid, &shear, &[0.0; 20], 1, keep);
     let m = |definition| {
-        score(grid, truth(&shear), &images, standard(definition)).metrics.m_cross
+        score(grid, truth(&shear), &images, standard(definition))
+            .metrics
+            .m_cross
     };
     // Counting a fifth as zero dilutes the field by a fifth.
     assert!((m(Definition::Leaderboard) + 0.2).abs() < 0.02);

@@ -233,9 +233,7 @@ fn without_galaxies_the_leaderboard_counts_zeros() {
     let grid = Grid::great10(8).unwrap();
     let shear = field(&grid, Content::E, 7);
     let set = images(&grid, &shear, &[0.1, 0.1], 11, |_, _| false);
-    let of = |definition| {
-        score(grid, truth(&shear), &set, standard(definition))
-    };
+    let of = |definition| score(grid, truth(&shear), &set, standard(definition));
     let leaderboard = of(Definition::Leaderboard);
     let nothing = [0.0; BINS];
     let expected = quality(&leaderboard.bins, &nothing, &leaderboard.true_ee).q;
@@ -287,7 +285,10 @@ fn errors_of_a_constant_shear_ignore_signs() {
             flipped.add(&sum).unwrap();
         }
         let options = standard(Definition::Leaderboard);
-        score(grid, truth(&shear), &flipped, options).constant.unwrap().error
+        score(grid, truth(&shear), &flipped, options)
+            .constant
+            .unwrap()
+            .error
     };
     let (plain, flipped) = (of(1.0), of(-1.0));
     // 156 galaxies of noise 0.1, spread over 256 cells; some fifty modes tell it to 10 %.

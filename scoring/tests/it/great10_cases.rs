@@ -77,11 +77,21 @@ fn compare(what: &str, found: &Value, expected: &Value, tolerance: f64, wrong: &
     match found {
         Value::Object(entries) => {
             for (key, value) in entries {
-                compare(&format!("{what}.{key}"), value, &expected[key], tolerance, wrong);
+                compare(
+                    &format!("{what}.{key}"),
+                    value,
+                    &expected[key],
+                    tolerance,
+                    wrong,
+                );
             }
         }
         Value::Array(values) => {
-            assert_eq!(values.len(), expected.as_array().expect(what).len(), "{what}");
+            assert_eq!(
+                values.len(),
+                expected.as_array().expect(what).len(),
+                "{what}"
+            );
             for (bin, value) in values.iter().enumerate() {
                 // A bin without modes has no figure.
                 if !expected[bin].is_null() {
@@ -119,7 +129,11 @@ fn every_public_figure_is_reproduced() {
         let expected: Value = serde_json::from_str(&text).expect("valid JSON");
         let name = expected["case"].as_str().expect("case");
         // The cases' own README: 1e-9, and 1e-8 where nearly equal powers are subtracted.
-        let tolerance = if name.contains("tiny_noise") { 1e-8 } else { 1e-9 };
+        let tolerance = if name.contains("tiny_noise") {
+            1e-8
+        } else {
+            1e-9
+        };
         let found = figures(&score(&case, &expected));
         compare(name, &found, &expected, tolerance, &mut wrong);
     }

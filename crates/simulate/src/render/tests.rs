@@ -67,7 +67,11 @@ fn fiducial((e1, e2): (f64, f64), centre: (f64, f64)) -> Case {
     let plain = case("| 0.5 2.3 4.8 | 0 0 | 0 0 | 3 3.4 0 0 | 0 0");
     let shape = Shear::new(e1, e2);
     let galaxy = Galaxy::bulge_and_disc(30.0, 0.5, 2.3, 4.8, shape).unwrap();
-    Case { galaxy, centre, ..plain }
+    Case {
+        galaxy,
+        centre,
+        ..plain
+    }
 }
 
 fn fast(case: &Case, scratch: &mut RenderScratch) -> Vec<f32> {
@@ -280,7 +284,11 @@ fn small_and_odd_stamps_are_drawn_like_large_ones() {
             let plain = case("| 0.3 1.8 2.6 | 0.2 -0.1 | 0.4 -0.3 | 3 3.4 0.05 0 | 0 0");
             let psf = FunctionalPsf { fwhm, ..plain.psf };
             let centre = (at, at - 0.3);
-            let case = Case { psf, centre, ..plain };
+            let case = Case {
+                psf,
+                centre,
+                ..plain
+            };
             let exact = render_reference(side, &case.galaxy, &case.psf, case.centre, 180, 4.0);
             let out = fast_on(side, &case, &mut RenderScratch::new());
             let error = difference(&out, exact.iter().copied());
