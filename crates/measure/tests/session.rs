@@ -7,7 +7,7 @@ use std::sync::Arc;
 use ndarray::Array3;
 use shearq_measure::{
     ArraySource, Batch, FunctionalPsf, KnownNoise, Measurement, Measurer, OneThread, PsfProfile,
-    Psfs, ResponseMatrix, Session, Shear, Threads, Warning, examined_rows, ndarray,
+    Psfs, ResponseMatrix, Session, Shear, Threads, Warning, ndarray,
 };
 
 /// Threads that are done in the opposite order.

@@ -404,7 +404,7 @@ mod tests {
     #[test]
     fn every_reading_equals_plain_sums_on_dirty_scratch() {
         let mut rng = ChaCha8Rng::seed_from_u64(15);
-        for n in [5, 8, 11, 16, 19, 23, 32] {
+        for n in [8, 11, 16, 19, 23, 32] {
             let centre = (n as f64 - 1.0) / 2.0 + 0.3;
             let stamp = Array2::from_shape_fn((n, n), |(y, x)| {
                 let (dy, dx) = (y as f64 - centre, x as f64 - centre);
