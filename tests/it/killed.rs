@@ -171,11 +171,11 @@ fn what_a_full_disk_does_not_take_is_an_error_and_no_file() {
             let limit = format!("trap '' XFSZ; ulimit -f {blocks}; exec {again}");
             let message = refused(root.path(), &limit);
             assert!(message.contains("cannot write"), "{command}: {message}");
-            for (name, bytes) in at("again")
-                .exists()
-                .then(|| files("again"))
-                .unwrap_or_default()
-            {
+            let left = match at("again").exists() {
+                true => files("again"),
+                false => BTreeMap::new(),
+            };
+            for (name, bytes) in left {
                 assert!(expected.get(&name) == Some(&bytes), "{command}: {name}");
             }
             printed(root.path(), &again);

@@ -88,6 +88,9 @@ impl Data {
 
 type Spoil = fn(&mut Data);
 
+/// The value of a column of the catalogue.
+type Column = fn(&Measurement) -> f64;
+
 /// Name, configuration, what is done to the data, and words of a warning or an error.
 const CASES: [(&str, &str, Spoil, &str); 10] = [
     ("as simulated", "48/linear/star", |_| {}, ""),
@@ -230,7 +233,7 @@ fn files_and_arrays_take_the_same_way_through_a_session() {
             }
             let path = out.join("set02/catalogue-001.parquet");
             let read = table::read(&path, None, table::MAX_ROWS).unwrap();
-            let columns: [(&str, fn(&Measurement) -> f64); 5] = [
+            let columns: [(&str, Column); 5] = [
                 ("e1", |g| g.e1),
                 ("e2", |g| g.e2),
                 ("noise", |g| g.noise),

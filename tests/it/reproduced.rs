@@ -307,7 +307,7 @@ fn named_configurations_keep_their_baselines() {
     for name in ["named", "linear", "printed"] {
         let folder = "submissions/baselines";
         let output = shearq(&["baseline", "check", name, "--folder", folder]);
-        let [found, said] = [output.stdout, output.stderr].map(|text| String::from_utf8(text));
+        let [found, said] = [output.stdout, output.stderr].map(String::from_utf8);
         assert!(output.status.success(), "{found:?} {said:?}");
     }
 }
