@@ -79,7 +79,7 @@ pub(crate) fn measure<'py>(
         _ => Err(PyValueError::new_err("psf: expected one kind of PSFs")),
     }?;
     let noise = match (&noises, noise) {
-        (Some(levels), _) => KnownNoise::GivenEach(levels.as_slice()?),
+        (Some(levels), _) => KnownNoise::GivenEach(levels.as_slice()?.into()),
         (None, Some(level)) => KnownNoise::Given(level),
         (None, None) => KnownNoise::Unknown,
     };

@@ -282,6 +282,7 @@ impl Worker {
         self.method.set_image(of_modes, extent, stars);
         self.to_sky = None;
         self.method.set_pixel_shape(PixelShape::SQUARE);
+        self.method.set_gain(None);
         ImageWorker {
             worker: self,
             level: noise.level(),
@@ -381,6 +382,12 @@ impl ImageWorker<'_> {
             worker: self.worker,
             level: self.level,
         })
+    }
+
+    /// Sets the electrons per unit of the stamps, with which the Poisson noise of the galaxies is part of their noise. Networks
+    /// ignore it.
+    pub fn set_gain(&mut self, gain: Option<f64>) {
+        self.worker.method.set_gain(gain);
     }
 
     /// Sets the Jacobian of the galaxies and PSFs that follow, which are measured in the frame of the sky; with `None`, as

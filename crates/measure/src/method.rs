@@ -64,6 +64,10 @@ pub(crate) trait CutWorker: Send {
     /// of [`PixelShape::map`]. A method that ignores it measures in pixels.
     fn set_pixel_shape(&mut self, _shape: PixelShape) {}
 
+    /// Sets the electrons per unit of the galaxies that follow, whose own Poisson noise is then part of their noise. A method
+    /// that ignores it takes the noise of the sky alone.
+    fn set_gain(&mut self, _gain: Option<f64>) {}
+
     fn set_psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<(), MeasureError>;
 
     /// The settings that were adapted to PSF and galaxies, if the method adapts any.

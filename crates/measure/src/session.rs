@@ -31,7 +31,7 @@ const WHITENESS_TEST_MAX_LAG: usize = 2;
 const MIN_STATED_PSF_NOISE_M: f64 = 1e-5;
 
 /// The noise of an image before it is measured, as far as it is known.
-#[derive(Debug, Clone, Copy, Default)]
+#[derive(Debug, Clone, Default)]
 pub enum KnownNoise<'n> {
     /// Unknown.
     #[default]
@@ -41,7 +41,7 @@ pub enum KnownNoise<'n> {
     /// The level of white noise that the caller gives, which replaces the measurement on the stamps.
     Given(f64),
     /// The same, one level per stamp.
-    GivenEach(&'n [f64]),
+    GivenEach(Cow<'n, [f64]>),
 }
 
 /// The stamps of an image in rows. The last row may be shorter.
@@ -102,6 +102,12 @@ pub trait StampSource<'a> {
     /// If they cannot be determined.
     fn jacobians(&mut self, _row: usize) -> Result<Option<Vec<Jacobian>>, Self::Error> {
         Ok(None)
+    }
+
+    /// Electrons per unit of the stamps. With them, the Poisson noise of the galaxies is part of their noise; without, the
+    /// noise is that of the sky. Networks ignore it.
+    fn gain(&self) -> Option<f64> {
+        None
     }
 }
 
@@ -289,6 +295,7 @@ pub struct Session<'n> {
     rows: StampRows,
     frame: Frame,
     noise: KnownNoise<'n>,
+    gain: Option<f64>,
     survey: Option<Arc<Survey>>,
     stars: Option<Arc<ResidualProfiles>>,
     examined: Vec<usize>,
@@ -385,7 +392,7 @@ impl<'n> Session<'n> {
         threads: &impl Threads,
     ) -> Result<Self, S::Error> {
         let rows = source.rows();
-        check(measurer.configuration(), noise, rows.count)?;
+        check(measurer.configuration(), &noise, rows.count)?;
         let examined = match rows.count {
             0 => Vec::new(),
             _ => examined_rows(rows.columns, rows.len()),
@@ -402,13 +409,14 @@ impl<'n> Session<'n> {
             rows,
             frame,
             noise,
+            gain: source.gain(),
             survey: None,
             stars,
             examined,
             typical_level: None,
             warnings,
         };
-        if let KnownNoise::GivenEach(levels) = noise {
+        if let KnownNoise::GivenEach(levels) = &session.noise {
             let examined = session.examined.iter().flat_map(|&row| rows.stamps(row));
             let mut levels: Vec<f64> = examined.map(|at| levels[at]).collect();
             levels.retain(|level| *level > 0.0);
@@ -416,13 +424,15 @@ impl<'n> Session<'n> {
         }
         if let Some(plan) = session.noise_plan() {
             session.survey = survey_noise(plan, source, threads)?;
-            session.warnings.extend(match (&session.survey, noise) {
-                (None, _) => Some(Warning::NoNoise),
-                (Some(survey), KnownNoise::Stated(level)) => {
-                    Warning::of_stated_noise(level, survey.noise.sigma(), survey.noise.error())
-                }
-                (Some(_), _) => None,
-            });
+            session
+                .warnings
+                .extend(match (&session.survey, &session.noise) {
+                    (None, _) => Some(Warning::NoNoise),
+                    (Some(survey), KnownNoise::Stated(level)) => {
+                        Warning::of_stated_noise(*level, survey.noise.sigma(), survey.noise.error())
+                    }
+                    (Some(_), _) => None,
+                });
         }
         Ok(session)
     }
@@ -448,15 +458,17 @@ impl<'n> Session<'n> {
 
     /// Prepares a worker for galaxies of this image.
     pub fn image<'w>(&self, worker: &'w mut Worker) -> ImageWorker<'w> {
-        let noise = match (&self.survey, self.noise) {
+        let noise = match (&self.survey, &self.noise) {
             (Some(survey), _) => ImageNoise::Survey(survey),
-            (None, KnownNoise::Given(level)) => ImageNoise::Level(level),
+            (None, KnownNoise::Given(level)) => ImageNoise::Level(*level),
             (None, KnownNoise::Stated(level)) if self.noise_plan().is_none() => {
-                ImageNoise::Level(level)
+                ImageNoise::Level(*level)
             }
             (None, _) => ImageNoise::Unknown,
         };
-        worker.image_with_stars(noise, self.stars.as_ref())
+        let mut image = worker.image_with_stars(noise, self.stars.as_ref());
+        image.set_gain(self.gain);
+        image
     }
 
     /// A warning if the configuration treats noise as white that is correlated. It takes a second survey, so that a run
@@ -578,7 +590,7 @@ impl<'n> Session<'n> {
             jacobians.map_or(0, <[_]>::len),
             on_sky,
         )?;
-        let levels = match self.noise {
+        let levels = match &self.noise {
             KnownNoise::GivenEach(levels) => Some(&levels[self.rows.stamps(row)]),
             KnownNoise::Unknown | KnownNoise::Stated(_) | KnownNoise::Given(_) => None,
         };
@@ -610,7 +622,7 @@ impl<'n> Session<'n> {
             let most = EXAMINED_PSFS.div_ceil(enough(self.rows.columns, self.rows.len()));
             examination.add_psfs(psfs, self.measurer.configuration().psf_cut(), most);
         }
-        let scaled = match (self.noise, self.typical_level) {
+        let scaled = match (&self.noise, self.typical_level) {
             (KnownNoise::GivenEach(levels), Some(typical)) => {
                 let mut scaled = Examination::new(self.measurer.full(), stamps.len_of(Axis(0)));
                 let levels = &levels[self.rows.stamps(row)];
@@ -712,13 +724,13 @@ impl MeasuredImage<'_> {
         let mut psf_noise = None;
         if let Some(Examined { stamps, scaled }) = examined {
             warnings.extend(stamps.warnings());
-            warnings.extend(match session.noise {
-                KnownNoise::Given(level) => stamps.given_noise(level),
+            warnings.extend(match &session.noise {
+                KnownNoise::Given(level) => stamps.given_noise(*level),
                 KnownNoise::GivenEach(_) => scaled
                     .zip(session.typical_level)
                     .and_then(|(scaled, level)| scaled.given_noise(level)),
                 KnownNoise::Stated(level) if configuration.noise == NoiseSource::Header => {
-                    let given = stamps.given_noise(level);
+                    let given = stamps.given_noise(*level);
                     given.map(|warning| match warning {
                         Warning::GivenNoise { given, measured } => Warning::NoiseLevel {
                             given,
@@ -749,15 +761,15 @@ impl MeasuredImage<'_> {
 /// Checks the noise levels of `count` stamps, or whether there must be one.
 fn check(
     configuration: &Configuration,
-    noise: KnownNoise<'_>,
+    noise: &KnownNoise<'_>,
     count: usize,
 ) -> Result<(), MeasureError> {
     let header = configuration.noise == NoiseSource::Header;
     let wrong = |level: &f64| (!is_level(*level)).then(|| level.to_string());
     let found = match noise {
         KnownNoise::Unknown => header.then(|| "not given".to_owned()),
-        KnownNoise::Stated(level) => wrong(&level).filter(|_| header),
-        KnownNoise::Given(level) => wrong(&level),
+        KnownNoise::Stated(level) => wrong(level).filter(|_| header),
+        KnownNoise::Given(level) => wrong(level),
         KnownNoise::GivenEach(levels) => {
             length("noise levels", levels.len(), count)?;
             levels.iter().find_map(wrong)

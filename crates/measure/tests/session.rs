@@ -119,7 +119,7 @@ fn a_given_level_replaces_the_survey_and_a_stated_one_does_not() {
     let given = of(&stamps, KnownNoise::Given(1.25));
     assert!(given.galaxies.iter().all(|galaxy| galaxy.noise == 1.25));
     let levels = vec![1.25; 100];
-    let each = of(&stamps, KnownNoise::GivenEach(&levels));
+    let each = of(&stamps, KnownNoise::GivenEach(levels.as_slice().into()));
     assert_eq!(shapes(&each), shapes(&given));
     let surveyed = of(&stamps, KnownNoise::Unknown);
     let stated = of(&stamps, KnownNoise::Stated(2.0));

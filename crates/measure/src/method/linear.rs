@@ -254,6 +254,7 @@ impl LinearFamily {
             denoiser: StarDenoiser::default(),
             noise: StampNoise::white(1.0),
             pixels: PixelShape::SQUARE,
+            gain: None,
             family: Arc::clone(self),
         }
     }
@@ -267,6 +268,7 @@ pub(super) struct LinearWorker {
     current: usize,
     noise: StampNoise,
     pixels: PixelShape,
+    gain: Option<f64>,
     galaxy_variance: Option<f64>,
     moments: WeightedMoments,
     denoiser: StarDenoiser,
@@ -292,6 +294,10 @@ impl CutWorker for LinearWorker {
 
     fn set_pixel_shape(&mut self, shape: PixelShape) {
         self.pixels = shape;
+    }
+
+    fn set_gain(&mut self, gain: Option<f64>) {
+        self.gain = gain;
     }
 
     fn set_psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<(), MeasureError> {
@@ -327,7 +333,7 @@ impl CutWorker for LinearWorker {
 
     fn measure(&mut self, cut: &[f32], noise: f64) -> Result<Option<Found>, MeasureError> {
         Ok((noise >= 0.0 && noise.is_finite())
-            .then(|| self.workers[self.current].1.measure(cut, noise)))
+            .then(|| self.workers[self.current].1.measure(cut, noise, self.gain)))
     }
 
     fn images(&mut self, cut: &[f32], psf: ArrayView2<'_, f64>) -> Images {
@@ -347,6 +353,8 @@ struct PlanWorker {
     /// None if neighbours are kept.
     neighbours: Option<NeighbourRemover>,
     psf: SpectralPsf,
+    /// Mean square per axis in px² of the Gaussian with the Σp² of the PSF.
+    psf_variance: f64,
     /// Terms of [`Regularisation::behind`].
     regularisation: [f32; 2],
     gradients: Gradients,
@@ -371,6 +379,7 @@ impl PlanWorker {
             low_k_noise: 1.0,
             neighbours: plan.removes_neighbours.then(neighbours),
             psf: plan.spectral.psf(),
+            psf_variance: 0.0,
             regularisation: [0.0; 2],
             gradients: plan.spectral.gradients(),
             buffers: plan.spectral.scratch(),
@@ -416,6 +425,8 @@ impl PlanWorker {
         plan.spectral
             .set_psf(psf, &self.noise, &mut self.buffers, &mut self.psf)?;
         self.regularisation = plan.regularisation.behind(&self.psf);
+        let squares: f64 = psf.iter().map(|value| value * value).sum();
+        self.psf_variance = 1.0 / (4.0 * std::f64::consts::PI * squares);
         Ok(())
     }
 
@@ -514,9 +525,29 @@ impl PlanWorker {
         })
     }
 
-    fn measure(&mut self, stamp: &[f32], noise: f64) -> Found {
+    /// What the galaxy's own Poisson noise adds to the variance of a pixel, in units of the image times electrons: as much of
+    /// white noise has its power under the window.
+    ///
+    /// Noise n of variance s(x)/g, s being the light of the galaxy behind the PSF, has the mean power ∫ W² s/g in each mode
+    /// under the window W, white noise the power σ² ∫ W² = σ² π w². The light is that of a Gaussian of the measured flux and size,
+    /// so that the positive noise of a pixel does not raise its own variance; the flux alone is noisy, by 1/ν.
+    fn own_variance(&self, noise: f32) -> f64 {
+        let plan = &*self.plan;
+        let (lags, target) = (&self.lags, plan.lengths.target_sigma);
+        let [_, floor] = self.regularisation.map(|term| term * noise * noise);
+        let typical = plan.regularisation.typical_square;
+        let breadth = plan.breadth.measure(&lags.acf, floor, typical);
+        let [size, ..] = plan.breadth.size(f64::from(breadth.square));
+        let window = plan.lengths.window_sigma * plan.lengths.window_sigma;
+        let of_galaxy = size * size;
+        let flux = f64::from(lags.flux[0]) * (1.0 + (of_galaxy + target * target) / window);
+        let under = flux / (1.0 + 2.0 * (of_galaxy + self.psf_variance) / window);
+        under.max(0.0) / (std::f64::consts::PI * window)
+    }
+
+    fn measure(&mut self, stamp: &[f32], noise: f64, gain: Option<f64>) -> Found {
         let plan = Arc::clone(&self.plan);
-        let sigma = noise as f32;
+        let mut sigma = noise as f32;
         let place = galaxy_centroid(stamp, plan.spectral.stamp_size());
         let neighbours = self.neighbours.as_mut();
         let cleared = neighbours.map_or(Ok(false), |neighbours| {
@@ -535,6 +566,12 @@ impl PlanWorker {
         plan.spectral.place_window(window_centre(centroid), buffers);
         plan.spectral
             .autocorrelate(&self.psf, cut, sigma, buffers, lags);
+        if let Some(gain) = gain {
+            sigma = noise.hypot((self.own_variance(sigma) / gain).sqrt()) as f32;
+            plan.spectral
+                .autocorrelate(&self.psf, cut, sigma, &mut self.buffers, &mut self.lags);
+        }
+        let lags = &self.lags;
         let divisor = self.regularisation[0] * sigma * sigma;
         let shape =
             cleared.and_then(|_| plan.moments.measure(&lags.acf, divisor, &mut self.values));
