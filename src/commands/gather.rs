@@ -129,6 +129,10 @@ pub(crate) struct Arguments {
     /// mirrors or shears the pixels, else pixel].
     #[arg(long, value_name = "pixel|sky")]
     frame: Option<Frame>,
+    /// Electrons per unit of the image: linear configurations then count the Poisson noise of each galaxy, by its measured flux and
+    /// size, as noise.
+    #[arg(long, value_name = "E_PER_ADU")]
+    gain: Option<f64>,
     /// Standard deviation of the noise per pixel, written to the header for configurations that do not measure it.
     #[arg(long, value_name = "SIGMA")]
     noise: Option<f64>,
@@ -196,15 +200,17 @@ fn gathering(arguments: &Arguments) -> anyhow::Result<Gathering<'_>> {
         weight_map,
         weight_extension,
         frame,
+        gain,
         noise,
         set: _,
         image: _,
         out: _,
     } = arguments;
-    if let Some(sigma) = noise {
+    for (option, value) in [("noise", noise), ("gain", gain)] {
         anyhow::ensure!(
-            *sigma > 0.0 && sigma.is_normal(),
-            "--noise is {sigma:e}; expected a positive number"
+            value.is_none_or(|value| value > 0.0 && value.is_normal()),
+            "--{option} is {:e}; expected a positive number",
+            value.unwrap_or_default()
         );
     }
     let images = Files {
@@ -263,7 +269,7 @@ fn gathering(arguments: &Arguments) -> anyhow::Result<Gathering<'_>> {
         psfs,
         noise: *noise,
         variances: variance.or(weight),
-        gain: None,
+        gain: *gain,
         frame: *frame,
     })
 }

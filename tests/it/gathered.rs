@@ -731,10 +731,15 @@ fn pixel_axes_that_are_not_the_skys_are_stated() {
         assert!(done.status.success(), "{said}");
         said
     };
-    let gather = |stamps: &[&str], psf: &Path, image: &str, out: &str| {
+    let gather = |stamps: &[&str], psf: &Path, [image, out, frame]: [&str; 3]| {
         let out = small.at(out);
         let rest = ["--psf", text(psf), "--image", image, "--out", text(&out)];
-        said(&[&["gather", "--stamps"][..], stamps, &rest].concat())
+        let frame = if frame.is_empty() {
+            &[][..]
+        } else {
+            &["--frame", frame]
+        };
+        said(&[&["gather", "--stamps"][..], stamps, &rest, frame].concat())
     };
     let measure = |data: &str| {
         let (data, out) = (small.at(data), small.at(&format!("{data}-out")));
@@ -742,18 +747,45 @@ fn pixel_axes_that_are_not_the_skys_are_stated() {
         said(&[&measure[..], &["--out", text(&out)]].concat())
     };
     let (camera, sky) = (text(&on_camera.0), text(&on_sky.0));
-    let message = gather(&[sky], &on_sky.1, "1", "both");
-    assert!(!message.contains("warning"), "{message}");
+    let message = gather(&[sky], &on_sky.1, ["1", "both", ""]);
+    assert!(
+        !message.contains("warning") && !message.contains("frame"),
+        "{message}"
+    );
     let out = small.at("camera-out");
     let stated = "e1 and e2 are along the pixel axes, which are not the sky's (found +y at position angle 90.0°, mirrored, sheared by (+0.0000, +0.0000)";
     for message in [
-        gather(&[camera], &on_camera.1, "1", "camera"),
+        gather(&[camera], &on_camera.1, ["1", "camera", "pixel"]),
         measure("camera"),
         said(&["mean", "--measured", text(&out)]),
     ] {
         assert!(message.contains(stated), "{message}");
     }
-    gather(&[camera], &on_camera.1, "2", "both");
+    // Without the option, ellipticities are along the sky's axes: those of x to the south and y to the east have the other
+    // sign of e1.
+    let message = gather(&[camera], &on_camera.1, ["1", "turned", ""]);
+    let frame = "frame: sky (e1 > 0 along east–west, e2 > 0 along north-west). The WCS of the first stamp: +y at position angle 90.0°, mirrored";
+    assert!(message.contains(frame), "{message}");
+    measure("turned");
+    let out = small.at("turned-out");
+    let message = said(&["mean", "--measured", text(&out)]);
+    assert!(!message.contains("pixel axes"), "{message}");
+    let shapes = |out: &str| {
+        let path = small.at(out).join("set01/catalogue-001.parquet");
+        let table = shearq_files::table::read(&path, Some(&["e1", "e2"]), 64).unwrap();
+        ["e1", "e2"].map(|name| {
+            shearq_files::table::numbers(&table, name, &path)
+                .unwrap()
+                .into_owned()
+        })
+    };
+    let ([along1, along2], [sky1, sky2]) = (shapes("camera-out"), shapes("turned-out"));
+    for k in 0..along1.len() {
+        let off = (along1[k] + sky1[k]).abs().max((along2[k] - sky2[k]).abs());
+        // Noise of the correction for noise.
+        assert!(off < 0.02 || along1[k].is_nan(), "{k}: {off}");
+    }
+    gather(&[camera], &on_camera.1, ["2", "both", "pixel"]);
     measure("both");
     let out = small.at("both-out");
     let message = fail(&["mean", "--measured", text(&out)]);
@@ -765,7 +797,7 @@ fn pixel_axes_that_are_not_the_skys_are_stated() {
     let expected =
         "the PSF image and the galaxy image have pixel axes of different orientation or shear";
     assert!(message.contains(expected), "{message}");
-    let message = gather(&[sky, camera], &on_sky.1, "1", "two");
+    let message = gather(&[sky, camera], &on_sky.1, ["1", "two", "pixel"]);
     let expected = "camera.fits: image 1, plane 1: the header states other pixel axes";
     assert!(message.contains(expected), "{message}");
 }

@@ -11,6 +11,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 use shearq_measure::{Examination, Warning};
+use shearq_quantities::statistics::upper_median;
 use shearq_quantities::{Frame, Jacobian};
 
 use self::positions::Positions;
@@ -278,7 +279,7 @@ impl Plan {
             } => files,
         };
         let fault = |message: String| Err(FileError::new(&files.paths[0], message));
-        if gathering.frame != Some(Frame::Sky) {
+        if gathering.frame == Some(Frame::Pixel) {
             return Ok(None);
         }
         let all: Option<Vec<Matrix>> = match &self.positions {
@@ -344,7 +345,14 @@ impl Plan {
             columns.extend(named.map(|(name, values)| real(name, values)));
             columns.extend(found.carried);
         }
-        if let Some(levels) = writer.levels.take() {
+        if let Some(mut levels) = writer.levels.take() {
+            // A stamp without a pixel has no level, and its galaxy will be flagged in any.
+            let mut known: Vec<f64> = levels.iter().copied().filter(|v| v.is_finite()).collect();
+            let typical = upper_median(&mut known).unwrap_or(0.0);
+            levels
+                .iter_mut()
+                .filter(|v| v.is_nan())
+                .for_each(|v| *v = typical);
             columns.push(real(stamp_table::NOISE, levels));
         }
         if let Some(all) = jacobians {

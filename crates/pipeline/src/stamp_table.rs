@@ -111,7 +111,6 @@ impl StampTable {
         all.map(Some).map_err(|error| FileError::new(path, error))
     }
 
-    #[expect(dead_code, reason = "the next change measures with it")]
     /// One noise level per stamp, if a map gave them.
     pub(crate) fn noise(&self, path: &Path) -> Result<Option<Vec<f64>>, FileError> {
         match self.columns.column(NOISE) {

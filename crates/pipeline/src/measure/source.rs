@@ -33,8 +33,8 @@ pub struct ImageSource {
     psfs: PsfSource,
     noise: KnownNoise<'static>,
     table: Option<StampTable>,
-    #[expect(dead_code, reason = "the next change measures with them")]
     jacobians: Option<Vec<Jacobian>>,
+    gain: Option<f64>,
     warnings: Vec<Warning>,
 }
 
@@ -60,8 +60,18 @@ impl ImageSource {
         if stamp < configuration.stamp.size {
             return Err(FileError::new(path, too_small(stamp, configuration)).into());
         }
+        let stamps = data.stamps(id.set, id.image);
+        let table = StampTable::read(&stamps, &mosaic)?;
+        let jacobians = match &table {
+            Some(table) => table.jacobians(&stamps)?,
+            None => None,
+        };
+        let levels = match &table {
+            Some(table) => table.noise(&stamps)?,
+            None => None,
+        };
         let stated = image.number("NOISESIG")?;
-        let uses_header = configuration.noise == NoiseSource::Header;
+        let uses_header = configuration.noise == NoiseSource::Header && levels.is_none();
         if uses_header && !stated.is_some_and(|sigma| sigma > 0.0 && sigma.is_finite()) {
             let found = stated.map_or("absent".into(), |sigma| sigma.to_string());
             let other = match configuration.linear() {
@@ -81,11 +91,10 @@ impl ImageSource {
             stated: stated_by_psf,
         } = open_psfs(data, id, configuration, &mosaic)?;
         let mut warnings: Vec<Warning> = moved.map(Warning::of_moved).into_iter().collect();
-        let stamps = data.stamps(id.set, id.image);
-        let table = StampTable::read(&stamps, &mosaic)?;
-        let jacobians = match &table {
-            Some(table) => table.jacobians(&stamps)?,
-            None => None,
+        let noise = match (levels, stated) {
+            (Some(levels), _) => KnownNoise::GivenEach(levels.into()),
+            (None, Some(sigma)) => KnownNoise::Stated(sigma),
+            (None, None) => KnownNoise::Unknown,
         };
         let wcs = Wcs::of_header(&image);
         warnings.extend(Wcs::disagreements(&psf_wcs, &wcs));
@@ -106,7 +115,8 @@ impl ImageSource {
             mosaic,
             image,
             psfs,
-            noise: stated.map_or(KnownNoise::Unknown, KnownNoise::Stated),
+            noise,
+            gain: table.as_ref().and_then(|table| table.head.gain),
             table,
             jacobians,
             warnings,
@@ -128,7 +138,8 @@ impl ImageSource {
         measurer: &Measurer,
         threads: &impl Threads,
     ) -> Result<Session<'static>, PipelineError> {
-        let session = Session::open(measurer, self, self.noise, threads);
+        let noise = std::mem::take(&mut self.noise);
+        let session = Session::open(measurer, self, noise, threads);
         session.map_err(|error| self.named(error))
     }
 
@@ -162,6 +173,15 @@ impl StampSource<'static> for ImageSource {
 
     fn warnings(&self) -> Vec<Warning> {
         self.warnings.clone()
+    }
+
+    fn jacobians(&mut self, row: usize) -> Result<Option<Vec<Jacobian>>, PipelineError> {
+        let range = self.rows().stamps(row);
+        Ok(self.jacobians.as_ref().map(|all| all[range].to_vec()))
+    }
+
+    fn gain(&self) -> Option<f64> {
+        self.gain
     }
 
     fn stamps(&mut self, row: usize) -> Result<LazyStamps<'static>, PipelineError> {
