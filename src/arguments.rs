@@ -40,6 +40,7 @@ impl FromStr for SetList {
                 )),
             }
         };
+        // Sorted and without repetition, so that a list in another order resumes the same run.
         let mut sets = BTreeSet::new();
         for part in text.split(',') {
             match part.split_once('-') {
@@ -61,11 +62,17 @@ impl FromStr for SetList {
     }
 }
 
+// As `merge` expects it in the command that a shard prints at its end.
 impl std::fmt::Display for SetList {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let sets: Vec<String> = self.0.iter().map(u32::to_string).collect();
         f.write_str(&sets.join(","))
     }
+}
+
+// The chosen sets; empty for all.
+pub(super) fn sets_of(list: Option<&SetList>) -> &[u32] {
+    list.map_or(&[], |list| &list.0)
 }
 
 impl SetList {
@@ -79,7 +86,6 @@ impl SetList {
     }
 }
 
-/// How to print a table with columns of detail.
 #[derive(Debug, Clone, Args)]
 pub(super) struct Printing {
     #[command(flatten)]
@@ -111,12 +117,12 @@ impl Printing {
         })
     }
 
-    /// Refuses metrics that the table does not have, before anything is written.
+    // Called before anything is written: a command that fails to print must leave nothing behind.
     pub(super) fn check(&self, table: &Table) -> anyhow::Result<()> {
         self.chosen(table).map(|_| ())
     }
 
-    /// Prints a table with the chosen columns. CSV and JSON have all of them, because programs read these.
+    // CSV and JSON have all columns, because programs read these and a narrow terminal must not change their input.
     pub(super) fn print(&self, table: &Table) -> anyhow::Result<()> {
         let for_people = !matches!(self.form.format, TableFormat::Csv | TableFormat::Json);
         let mut shown = match (self.chooses(), self.wide || !for_people) {
@@ -140,7 +146,6 @@ impl Printing {
     }
 }
 
-/// The page of `--report`.
 #[derive(Debug, Clone, Args)]
 pub(super) struct ReportFile {
     /// Write tables and plots to this file as one self-contained HTML page.
@@ -166,7 +171,6 @@ impl ReportFile {
     }
 }
 
-/// How to print a table.
 #[derive(Debug, Clone, Args)]
 pub(super) struct Form {
     /// Output format; `csv` and `json` have every column in full precision.
@@ -175,7 +179,7 @@ pub(super) struct Form {
 }
 
 impl Form {
-    /// Prints a table. The notes of a CSV table go to standard error.
+    // The notes of a CSV table go to standard error, because CSV has no comments.
     pub(super) fn print(&self, table: &Table) -> anyhow::Result<()> {
         if self.format == TableFormat::Csv {
             for note in &table.notes {
@@ -192,7 +196,6 @@ impl Form {
 const GRID: u16 = 100;
 const SEED: u64 = 1;
 
-/// Settings of simulated data.
 #[derive(Debug, Clone, Args)]
 pub(super) struct SimulationArguments {
     /// Galaxies per side of a simulated image.
@@ -221,25 +224,20 @@ pub(super) struct SimulationArguments {
 
 impl SimulationArguments {
     pub(super) fn settings(&self) -> anyhow::Result<SimulationSettings> {
-        let &SimulationArguments {
-            grid,
-            seed,
-            amplitude,
-            tilt,
-        } = self;
+        let spectrum = ShearSpectrum {
+            amplitude: self.amplitude,
+            tilt: self.tilt,
+            ..ShearSpectrum::default()
+        };
         let settings = SimulationSettings {
-            spectrum: ShearSpectrum {
-                amplitude,
-                tilt,
-                ..ShearSpectrum::default()
-            },
-            ..SimulationSettings::new(seed, usize::from(grid))
+            spectrum,
+            ..SimulationSettings::new(self.seed, usize::from(self.grid))
         };
         settings.validate()?;
         Ok(settings)
     }
 
-    /// Refuses these options for data that are not simulated.
+    // Clap cannot refuse options that have a default. An option that is given with its default value does no harm.
     pub(super) fn must_be_unused(&self) -> anyhow::Result<()> {
         anyhow::ensure!(
             self.settings()? == SimulationSettings::new(SEED, usize::from(GRID)),
@@ -249,7 +247,6 @@ impl SimulationArguments {
     }
 }
 
-/// The share of this process in the work.
 #[derive(Debug, Clone, Args)]
 pub(super) struct Sharding {
     /// Process only shard K of N: an N-th of the images. N processes may write to one folder at the same time.
@@ -264,7 +261,6 @@ impl Sharding {
     }
 }
 
-/// Number of worker threads.
 #[derive(Debug, Clone, Args)]
 pub(super) struct Threads {
     /// Number of worker threads; results do not depend on it [default: one per core].
@@ -275,18 +271,18 @@ pub(super) struct Threads {
 impl Threads {
     pub(super) fn number(&self) -> usize {
         self.threads.map_or_else(
+            // It respects the CPU quota and affinity of a batch system, unlike the number of cores.
             || std::thread::available_parallelism().map_or(1, usize::from),
             usize::from,
         )
     }
 }
 
-/// How to score.
 #[derive(Debug, Clone, Default, Args)]
 pub(super) struct ScoreSettings {
     /// Definition of bandpowers and Q.
     #[arg(long, value_parser = named::<Definition>(), default_value = "leaderboard")]
-    definition: Definition,
+    pub(super) definition: Definition,
     /// Convention of signs and axes: 1 to 8 (5 is the standard one), `matched` or `best`. `matched` correlates best
     /// with the truth of all sets; `best` has the highest Q of each set, as on the leaderboard [default: 5 for
     /// catalogues by shearq, matched for others].
@@ -294,13 +290,6 @@ pub(super) struct ScoreSettings {
     pub(super) convention: Option<Choice>,
 }
 
-impl ScoreSettings {
-    pub(super) fn definition(&self) -> Definition {
-        self.definition
-    }
-}
-
-/// The configurations of `--submission`, each given once.
 pub(super) fn configurations(names: &[String]) -> anyhow::Result<Vec<Configuration>> {
     given_once(names)?;
     let registry = Registry::embedded()?;
@@ -310,6 +299,7 @@ pub(super) fn configurations(names: &[String]) -> anyhow::Result<Vec<Configurati
         .collect()
 }
 
+// A configuration that is given twice would be compared with itself, with an error of zero.
 pub(super) fn given_once(submissions: &[String]) -> anyhow::Result<()> {
     for (k, name) in submissions.iter().enumerate() {
         anyhow::ensure!(
@@ -320,7 +310,6 @@ pub(super) fn given_once(submissions: &[String]) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// A positive number.
 pub(super) fn positive(text: &str) -> Result<f64, String> {
     let number = text.parse().ok();
     number
@@ -341,7 +330,6 @@ fn parse_choice(text: &str) -> Result<Choice, String> {
     }
 }
 
-/// Sign of g2 on the command line.
 #[derive(Debug, Clone, Copy, ValueEnum)]
 pub(crate) enum SignArgument {
     /// Minus the standard g2, as in the challenge's truth files.

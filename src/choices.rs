@@ -11,13 +11,12 @@ use shearq_results::compare::Grouping;
 use shearq_results::submit::manifest::Contents;
 use shearq_scoring::Definition;
 
-/// A type whose values are given by name on the command line.
+// Clap's `ValueEnum` cannot be derived here: the types belong to crates without clap, so that libraries do not compile it.
 pub(crate) trait Named: Copy + Send + Sync + 'static {
     // Each value with its name and its line of `--help`.
     const ALL: &[(Self, &str, &str)];
 }
 
-/// Parses the name of a value.
 pub(crate) fn named<T: Named>() -> impl TypedValueParser<Value = T> {
     let names = T::ALL
         .iter()
@@ -29,7 +28,6 @@ pub(crate) fn named<T: Named>() -> impl TypedValueParser<Value = T> {
     })
 }
 
-/// The name of a value on the command line.
 pub(crate) fn name_of<T: Named + PartialEq>(value: T) -> &'static str {
     let found = T::ALL.iter().find(|(own, _, _)| *own == value);
     found.map_or("", |(_, name, _)| name)

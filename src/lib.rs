@@ -140,6 +140,7 @@ const MISUSED: u8 = 2;
 
 /// Runs the command that this process was started with.
 pub fn main() -> ExitCode {
+    // Signals and hooks are those of the whole process, so they are set before the command runs.
     progress::end_at_interrupt();
     fail_at_size_limits();
     silence_caught_panics();
@@ -237,7 +238,7 @@ fn usage(message: &clap::Error) -> u8 {
     }
 }
 
-/// Failure of a command that has already printed its findings.
+// Ends a command with exit code 1 after its findings are printed, so that they are not followed by an error.
 #[derive(Debug, thiserror::Error)]
 #[error("there are findings")]
 struct Findings;
@@ -253,6 +254,7 @@ fn print_heat_map(map: HeatMap) -> anyhow::Result<()> {
     let decimals = usize::from(!map.values.iter().any(|value| *value >= 10.0));
     let map = HeatMap { decimals, ..map };
     let set = |name| std::env::var_os(name).filter(|value| !value.is_empty());
+    // https://no-color.org: any value that is not empty counts.
     let coloured = set("NO_COLOR").is_none() && set("TERM").is_none_or(|term| term != "dumb");
     // The colours are control characters. Names were checked when they were read.
     write(&format!("\n{}", map.terminal(coloured)))

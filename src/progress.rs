@@ -12,15 +12,13 @@ use indicatif::{
 use crate::tell;
 use shearq_dataset::threads::Progress;
 
-/// Galaxies done, rate and time left.
 pub(super) struct Bar {
     bar: ProgressBar,
-    /// Galaxies that were done before; they do not count for the rate.
+    // Galaxies that were done before; they do not count for the rate.
     skipped: Arc<AtomicU64>,
 }
 
 impl Bar {
-    /// A bar over `galaxies` with the label `what`.
     pub(super) fn new(what: &'static str, galaxies: u64) -> Self {
         let target = if std::io::stderr().is_terminal() {
             ProgressDrawTarget::stderr_with_hz(5)
@@ -88,7 +86,6 @@ impl Drop for Bar {
 // Whether the command of this process resumes.
 static GOES_ON: AtomicBool = AtomicBool::new(false);
 
-/// States that the command of this process resumes when it is given again.
 pub(super) fn goes_on() {
     GOES_ON.store(true, Ordering::Relaxed);
 }

@@ -1,5 +1,3 @@
-//! `shearq bench`.
-
 use clap::Args;
 use shearq_simulate::set::SimulationSettings;
 use shearq_studies::speed;

@@ -1,5 +1,3 @@
-//! `shearq calibrate`.
-
 use std::path::PathBuf;
 
 use anyhow::Context;

@@ -1,5 +1,3 @@
-//! `shearq challenge`.
-
 use std::path::PathBuf;
 
 use clap::{ArgGroup, Args, Subcommand};
@@ -232,7 +230,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     }
 }
 
-// Seeds below this can be found by trying all of them.
+// Seeds below this can be found by trying all of them, because a seed determines every public image.
 const LEAST_SEED: u64 = 1 << 40;
 
 fn new(arguments: &NewArguments) -> anyhow::Result<()> {
@@ -319,6 +317,7 @@ fn check_entry(arguments: &CheckArguments) -> anyhow::Result<()> {
         .transpose()?;
     let challenge = Challenge::read(place)?;
     let expected = challenge.expected()?;
+    // A link could name any file of the organiser's system. An absent entry is reported below.
     if is_there(entry) {
         inbox::refuse_links(entry)?;
     }
@@ -362,6 +361,7 @@ fn check_entry(arguments: &CheckArguments) -> anyhow::Result<()> {
             place.display()
         )),
     }
+    // It fails if there are errors: an entry that cannot be scored gets no receipt.
     report(&findings, entry, *json)?;
     if let Some(judge) = judge {
         let receipt = judge.sign(entry, team.as_deref())?;
@@ -407,7 +407,7 @@ fn rank(arguments: &RankArguments) -> anyhow::Result<()> {
     let view = View {
         challenge: &judge.challenge,
         board: &board,
-        // Names of files and reasons tell who sent an entry.
+        // Names of files and reasons reveal who sent an entry.
         refused: match decisions.anonymous {
             true => &[],
             false => &round.refused,

@@ -1,5 +1,3 @@
-//! `shearq check`.
-
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
@@ -9,8 +7,7 @@ use shearq_scoring::Grid;
 
 use crate::{Findings, count, print, tell_unread};
 use shearq_dataset::grid;
-use shearq_dataset::layout::MAX_IMAGE;
-use shearq_dataset::layout::{DataFolder, Layout, read_rows};
+use shearq_dataset::layout::{DataFolder, Layout, MAX_IMAGE, read_rows};
 use shearq_dataset::truth::grid_of_set;
 use shearq_files::table::{MAX_ROWS, read_truth};
 use shearq_results::catalogues::COLUMNS;
@@ -50,15 +47,8 @@ pub(crate) struct Arguments {
 }
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
-    let Arguments {
-        path,
-        data,
-        grid,
-        stamp,
-        images,
-        json,
-    } = arguments;
-    let data = data.as_ref().map(DataFolder::open).transpose()?;
+    let path = &arguments.path;
+    let data = arguments.data.as_ref().map(DataFolder::open).transpose()?;
     let sets = data
         .as_ref()
         .map_or_else(|| Ok(Vec::new()), DataFolder::sets_with_truth)?;
@@ -67,7 +57,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         (Some(data), None) => data.images(&[])?.sets().first().copied(),
         (_, first) => first.copied(),
     };
-    let mut side = *grid;
+    let mut side = arguments.grid;
     if let (None, Some(data), Some(set)) = (side, &data, first) {
         side = Some(match sets.is_empty() {
             true => grid_of_set(data, set)?.n,
@@ -80,7 +70,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let layout = data
         .as_ref()
         .map_or_else(Layout::default, |data| data.layout().clone());
-    let stamp = match (*stamp, &data, first) {
+    let stamp = match (arguments.stamp, &data, first) {
         (Some(given), ..) => given,
         (None, Some(data), Some(set)) => grid::stamp_of_set(data, set)? as f64,
         _ => layout.stamp as f64,
@@ -105,7 +95,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         grid,
         truth,
         secret_truth: BTreeMap::new(),
-        images: *images,
+        images: arguments.images,
         sets: Vec::new(),
         partial: false,
     };
@@ -113,10 +103,10 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         Ok(sent) => check_sent(&sent, &expected, &mut |_| {}),
         Err(error) => vec![Finding::unreadable(error)],
     };
-    report(&findings, path, *json)
+    report(&findings, path, arguments.json)
 }
 
-/// Side of the grid that the positions of the first catalogue reach, if at least half of its cells have a galaxy.
+// Side of the grid that the positions of the first catalogue reach, if at least half of its cells have a galaxy.
 fn reach(sent: &Sent, stamp: f64) -> Option<usize> {
     let files = sent.files().ok()?;
     let first = files
@@ -129,12 +119,13 @@ fn reach(sent: &Sent, stamp: f64) -> Option<usize> {
     (side >= 8 && side.checked_pow(2)? <= 2 * rows.len()).then_some(side)
 }
 
-/// Prints the findings about `path`, and fails if any is an error.
+// Fails if a finding is an error.
 pub(super) fn report(findings: &[Finding], path: &Path, json: bool) -> anyhow::Result<()> {
     let errors = findings
         .iter()
         .filter(|f| f.severity == Severity::Error)
         .count();
+    // JSON lists each file, because programs correct single files.
     if json {
         print(&(serde_json::to_string_pretty(&findings)? + "\n"))?;
     } else {
@@ -144,8 +135,8 @@ pub(super) fn report(findings: &[Finding], path: &Path, json: bool) -> anyhow::R
                 Severity::Warning => "warning",
             };
             let others = match files {
-                1 => String::new(),
-                _ => format!(" ({files} files; this is the first)"),
+                1 => "",
+                _ => &format!(" ({files} files; this is the first)"),
             };
             print(&format!(
                 "{}: {severity} [{}]: {}{others}\n",
@@ -154,13 +145,10 @@ pub(super) fn report(findings: &[Finding], path: &Path, json: bool) -> anyhow::R
                 finding.message
             ))?;
         }
+        let warnings = count(findings.len() - errors, "warning");
         let summary = match findings.len() {
             0 => "no findings".to_owned(),
-            all => format!(
-                "{} and {} found",
-                count(errors, "error"),
-                count(all - errors, "warning")
-            ),
+            _ => format!("{} and {warnings} found", count(errors, "error")),
         };
         print(&format!("{}: {summary}\n", path.display()))?;
     }
@@ -170,7 +158,7 @@ pub(super) fn report(findings: &[Finding], path: &Path, json: bool) -> anyhow::R
     }
 }
 
-/// The first finding of each problem, in order, and the number of files that have it.
+// The first finding of each problem and the number of files that have it: a wrong sign is found in each of 200 images.
 fn problems(findings: &[Finding]) -> Vec<(&Finding, usize)> {
     let mut problems: Vec<(&Finding, BTreeSet<&Path>)> = Vec::new();
     for finding in findings {

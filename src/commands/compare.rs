@@ -1,5 +1,3 @@
-//! `shearq compare`.
-
 use std::path::{Path, PathBuf};
 
 use clap::Args;
@@ -66,7 +64,6 @@ pub(crate) struct Arguments {
     threads: Threads,
 }
 
-/// A comparison to print.
 struct Comparison {
     table: Table,
     verdict: Option<String>,
@@ -93,13 +90,13 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     arguments
         .report
         .save(title, sections, || made_by(arguments))?;
+    // Other formats are read by programs.
     if arguments.printing.format() == TableFormat::Table {
         print_heat_map(map)?;
     }
     Ok(())
 }
 
-/// Inputs of the comparison, and settings of the folders.
 fn made_by(arguments: &Arguments) -> anyhow::Result<Vec<(String, String)>> {
     let mut made_by = Vec::new();
     for folder in &arguments.measured {
@@ -115,11 +112,10 @@ fn made_by(arguments: &Arguments) -> anyhow::Result<Vec<(String, String)>> {
     Ok(made_by)
 }
 
-/// Compares folders, or groups of their sets.
 fn folders(arguments: &Arguments) -> anyhow::Result<Comparison> {
     let order = arguments.sort.as_ref();
     let options = Options {
-        definition: arguments.settings.definition(),
+        definition: arguments.settings.definition,
         ..Options::default()
     };
     let variants = score_all(
@@ -134,16 +130,13 @@ fn folders(arguments: &Arguments) -> anyhow::Result<Comparison> {
     let table = match arguments.group_by {
         None => compare(&variants, options.definition),
         Some(_) => {
-            let runs = variants.iter().map(|variant| variant.run.clone());
-            let runs: Vec<RunRecord> = runs.collect();
+            let runs: Vec<RunRecord> = variants.iter().map(|own| own.run.clone()).collect();
             let groups = Group::of(&runs, arguments.group_by, order);
             let mut table = compare_runs(&runs, &groups, arguments.group_by);
             table.title = "Comparison of configurations".into();
-            for line in notes_of_variants(&variants) {
-                if !table.notes.contains(&line) {
-                    table.notes.push(line);
-                }
-            }
+            let mut more = notes_of_variants(&variants);
+            more.retain(|line| !table.notes.contains(line));
+            table.notes.extend(more);
             table
         }
     };
@@ -155,7 +148,6 @@ fn folders(arguments: &Arguments) -> anyhow::Result<Comparison> {
     })
 }
 
-/// Compares the runs of a store.
 fn stored(arguments: &Arguments, path: &Path) -> anyhow::Result<Comparison> {
     let (mut runs, notes) = store::read(path)?;
     if let Some(condition) = &arguments.condition {
@@ -180,6 +172,7 @@ fn stored(arguments: &Arguments, path: &Path) -> anyhow::Result<Comparison> {
         .map(|group| (group.name(), group.run.sets.as_slice()));
     Ok(Comparison {
         table,
+        // The verdict is on differences between runs, which groups of sets do not pair.
         verdict: match grouping {
             None => verdict_on_runs(&groups),
             Some(_) => None,

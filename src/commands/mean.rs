@@ -1,10 +1,8 @@
-//! `shearq mean`.
-
 use std::path::PathBuf;
 
 use clap::Args;
 
-use crate::arguments::{Form, SetList, Threads};
+use crate::arguments::{Form, SetList, Threads, sets_of};
 use crate::tell;
 use shearq_dataset::fingerprint;
 use shearq_dataset::run::{Run, Source};
@@ -48,33 +46,23 @@ pub(crate) struct Arguments {
 }
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
-    let Arguments {
-        measured,
-        sets,
-        condition,
-        weight,
-        form,
-        threads,
-    } = arguments;
+    let (measured, sets) = (&arguments.measured, sets_of(arguments.sets.as_ref()));
+    let (condition, weight) = (&arguments.condition, &arguments.weight);
     let selection = smooth_selection(condition.as_deref(), weight.as_deref())?;
     let run = Run::require(measured)?;
-    let sets = sets.as_ref().map_or(&[][..], |list| &list.0);
     // The data may have been removed since.
     let data = match &run.source {
         Source::Folder { .. } => run.source.data(measured).ok(),
         Source::Simulated(_) => None,
     };
     if let Some(data) = &data {
-        fingerprint::verify(data, measured, &run, sets, &Pool::new(threads.number())?)?;
+        let pool = Pool::new(arguments.threads.number())?;
+        fingerprint::verify(data, measured, &run, sets, &pool)?;
     }
-    let means = mean_shears(
-        &run,
-        measured,
-        sets,
-        selection
-            .as_ref()
-            .and_then(|stated| stated.weights.as_ref()),
-    )?;
+    let weights = selection
+        .as_ref()
+        .and_then(|stated| stated.weights.as_ref());
+    let means = mean_shears(&run, measured, sets, weights)?;
     for mean in &means {
         let set = mean.set;
         anyhow::ensure!(
@@ -109,19 +97,16 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             .notes
             .push(format!("The catalogues have the selection `{text}`."));
     }
-    let chosen = [("where", condition), ("weight", weight)];
-    for (name, text) in chosen {
-        if let Some(text) = text {
-            table
-                .notes
-                .push(format!("Galaxies of --{name} \"{text}\"."));
-        }
+    for (name, text) in [("where", condition), ("weight", weight)] {
+        let note = text
+            .iter()
+            .map(|text| format!("Galaxies of --{name} \"{text}\"."));
+        table.notes.extend(note);
     }
     if let Some(data) = &data {
         let used = means.iter().map(|mean| (mean.set, mean.images.as_slice()));
-        table
-            .notes
-            .extend(without_catalogue(data, &used.collect(), sets)?);
+        let without = without_catalogue(data, &used.collect(), sets)?;
+        table.notes.extend(without);
     }
-    form.print(&table)
+    arguments.form.print(&table)
 }

@@ -1,18 +1,16 @@
-//! `shearq merge`.
-
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use clap::Args;
 
-use crate::arguments::{SetList, Threads};
+use crate::arguments::{SetList, Threads, sets_of};
 use crate::progress::{Bar, goes_on};
 use crate::{Findings, count, print, run, tell, tell_unread};
 use shearq_dataset::images::{self, ImageId, Shard};
 use shearq_dataset::layout::{DataFolder, MAX_IMAGE, check_folder};
 use shearq_dataset::record::{claim, read_record};
-use shearq_dataset::run::{RUN_FILE, Run, Source};
-use shearq_dataset::run::{SIMULATION_FILE, SimulationRecord};
+use shearq_dataset::run::{RUN_FILE, Run, SIMULATION_FILE, SimulationRecord, Source};
 use shearq_files::open::is_there;
 use shearq_pipeline::complete::{Fault, Results};
 
@@ -63,6 +61,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             out.display()
         )
     })?;
+    // Other processes may still write to the folder, but none with other settings.
     let _claim = claim(&path, &record)?;
     let data = DataFolder::open(out)?;
     let results = Results::Images {
@@ -76,7 +75,7 @@ fn merge_run(arguments: &Arguments, run: &Run) -> anyhow::Result<()> {
     let out = &arguments.out;
     let _claim = claim(&out.join(RUN_FILE), run)?;
     let data = run.source.data(out)?;
-    let sets = arguments.sets.as_ref().map_or(&[][..], |list| &list.0);
+    let sets = sets_of(arguments.sets.as_ref());
     let images = match &run.source {
         Source::Simulated(_) => simulated_images(arguments)?,
         Source::Folder { .. } => {
@@ -96,6 +95,7 @@ fn merge_run(arguments: &Arguments, run: &Run) -> anyhow::Result<()> {
         out,
     };
     require_complete(arguments, &results, &images)?;
+    // Data of a survey have no true shear.
     if images.iter().any(|id| is_there(&data.truth(id.set))) {
         run::score(run, out, sets, None, arguments.threads.number())?;
         return Ok(());
@@ -107,7 +107,7 @@ fn merge_run(arguments: &Arguments, run: &Run) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// The expected images of a simulation, from the arguments: its record does not list them.
+// The record of a simulation does not list its images.
 fn simulated_images(arguments: &Arguments) -> anyhow::Result<Vec<ImageId>> {
     match (&arguments.sets, arguments.images) {
         (Some(sets), Some(images)) => Ok(images::of_simulation(&sets.0, images)),
@@ -118,7 +118,6 @@ fn simulated_images(arguments: &Arguments) -> anyhow::Result<Vec<ImageId>> {
     }
 }
 
-/// Fails with a list of missing or damaged images, if any.
 fn require_complete(
     arguments: &Arguments,
     results: &Results<'_>,
@@ -147,12 +146,10 @@ fn require_complete(
         faults.len(),
         images.len()
     ));
-    let mut shards: Vec<u32> = faults
-        .iter()
+    let of_faults = faults.iter();
+    let shards: BTreeSet<u32> = of_faults
         .filter_map(|fault| Some(shard_of(fault, arguments.shards)?.number()))
         .collect();
-    shards.sort_unstable();
-    shards.dedup();
     if !shards.is_empty() {
         let list: Vec<String> = shards.iter().map(u32::to_string).collect();
         text.push_str(&format!("shards to run again: {}\n", list.join(",")));
@@ -164,12 +161,12 @@ fn require_complete(
     Err(Findings.into())
 }
 
-/// The shard of an image, if the number of shards is known.
 fn shard_of(fault: &Fault, shards: Option<u32>) -> Option<Shard> {
     shards.map(|of| Shard::holding(fault.position, of))
 }
 
 fn discard(faults: &[Fault]) -> anyhow::Result<()> {
+    // A missing result is a fault, too, and cannot be removed.
     let there = |path: &&Path| path.is_file();
     for path in faults.iter().map(|f| f.result.as_path()).filter(there) {
         std::fs::remove_file(path)

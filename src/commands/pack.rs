@@ -1,5 +1,3 @@
-//! `shearq pack`.
-
 use std::path::PathBuf;
 
 use anyhow::Context;
@@ -16,10 +14,10 @@ use shearq_results::submit::archive::is_archive;
 use shearq_results::submit::manifest::{Contents, Entry};
 use shearq_results::submit::pack::Packing;
 
-/// Longest name of a method in bytes: a tar header has 100 for a file name.
+// Longest name of a method in bytes: a tar header has 100 for a file name.
 const MAX_METHOD_BYTES: usize = 64;
 
-/// Endings of unsupported archives.
+// A folder with such a name would be mistaken for an archive.
 const OTHER_ARCHIVES: [&str; 7] = ["zip", "tar", "gz", "bz2", "xz", "zst", "7z"];
 
 /// Write catalogues as a submission: the files that the challenge accepts, with a manifest.
@@ -82,28 +80,23 @@ struct EntryArguments {
 }
 
 impl EntryArguments {
-    /// The entry, if any option is given.
     fn entry(&self) -> anyhow::Result<Option<Entry>> {
-        let EntryArguments {
-            file,
-            challenge,
-            team,
-            title,
-            contact,
-        } = self;
-        let mut values = match file {
+        let place = || match &self.file {
+            Some(path) => path.display().to_string(),
+            None => "the entry".into(),
+        };
+        let mut values = match &self.file {
             None => toml::Table::new(),
             Some(path) => {
-                let text = read_to_string(path, SETTINGS);
-                let text = text.with_context(|| path.display().to_string())?;
-                text.parse().with_context(|| path.display().to_string())?
+                let text = read_to_string(path, SETTINGS).with_context(place)?;
+                text.parse().with_context(place)?
             }
         };
         for (key, value) in [
-            ("challenge", challenge),
-            ("team", team),
-            ("title", title),
-            ("contact", contact),
+            ("challenge", &self.challenge),
+            ("team", &self.team),
+            ("title", &self.title),
+            ("contact", &self.contact),
         ] {
             if let Some(value) = value {
                 values.insert(key.into(), value.clone().into());
@@ -118,40 +111,27 @@ impl EntryArguments {
                 "the entry has no {key}. Try: {option}"
             );
         }
-        let place = || match file {
-            Some(path) => path.display().to_string(),
-            None => "the entry".into(),
-        };
         Ok(Some(values.try_into().with_context(place)?))
     }
 }
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
-    let Arguments {
-        measured,
-        foreign,
-        data,
-        out,
-        method,
-        entry,
-        kind,
-    } = arguments;
-    let entry = entry.entry()?;
+    let out = &arguments.out;
+    let entry = arguments.entry.entry()?;
     let ending = out.extension().unwrap_or_default().to_string_lossy();
     anyhow::ensure!(
         is_archive(out) || !OTHER_ARCHIVES.contains(&ending.as_ref()),
         "--out {}: unsupported archive (found .{ending}, expected a folder, .tar.gz or .tgz)",
         out.display()
     );
-    let catalogues = match (measured, foreign) {
+    let catalogues = match (&arguments.measured, &arguments.foreign) {
         (Some(folder), _) => Catalogues::measured(&Run::require(folder)?, folder, &[])?,
         (None, Some(path)) => Catalogues::foreign(path, &[])?,
         _ => anyhow::bail!("cannot find catalogues to pack. Try: --measured DIR or --foreign FILE"),
     };
-    let data = data.as_deref().map(open_data).transpose()?;
-    let method = method
-        .clone()
-        .unwrap_or_else(|| catalogues.name.replace('/', "-"));
+    let data = arguments.data.as_deref().map(open_data).transpose()?;
+    let own_name = || catalogues.name.replace('/', "-");
+    let method = arguments.method.clone().unwrap_or_else(own_name);
     anyhow::ensure!(
         (1..=MAX_METHOD_BYTES).contains(&method.len())
             && !method.starts_with('.')
@@ -162,9 +142,10 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         catalogues: &catalogues,
         data: data.as_ref(),
         method,
-        contents: *kind,
+        contents: arguments.kind,
         entry,
     };
+    // Before the archive is opened: catalogues that cannot be packed leave no file.
     let galaxies = packing.galaxies()?;
     tell_unread(catalogues.unread());
     let mut bar = Bar::new("packing", galaxies);

@@ -1,5 +1,3 @@
-//! `shearq reproduce`.
-
 use std::path::PathBuf;
 
 use anyhow::bail;

@@ -1,5 +1,3 @@
-//! `shearq run`.
-
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
@@ -16,8 +14,7 @@ use shearq_dataset::run::{Run, Source, open_data};
 use shearq_files::atomic;
 use shearq_pipeline::run::run_folder;
 use shearq_render::table::{Table, TableFormat};
-use shearq_results::catalogues::Catalogues;
-use shearq_results::catalogues::OWN;
+use shearq_results::catalogues::{Catalogues, OWN};
 use shearq_results::score::{ScoredSet, score_catalogues};
 use shearq_results::store;
 use shearq_results::views::comparison::verdict_line;
@@ -59,13 +56,12 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     goes_on();
     let Arguments {
         measuring,
-        data,
-        simulate: _,
         sets,
         images,
         simulation,
         store,
         report,
+        ..
     } = arguments;
     let (out, shard) = (&measuring.out, measuring.sharding.shard);
     anyhow::ensure!(
@@ -73,14 +69,15 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         "a shard is not scored (found --shard with --store or --report). Try: shearq score --measured {} --store DIR, after `shearq merge`",
         out.display()
     );
+    // Before hours of work: a store that cannot be written is an error at once.
     let _prepared = store.as_deref().map(store::prepare).transpose()?;
     let threads = measuring.threads();
     let wanted = match sets {
         None => &[],
-        Some(list) if data.is_none() => list.simulated()?,
+        Some(list) if arguments.simulate => list.simulated()?,
         Some(list) => &list.0[..],
     };
-    let data = data.as_deref().map(open_data).transpose()?;
+    let data = arguments.data.as_deref().map(open_data).transpose()?;
     let source = match &data {
         Some(data) => {
             simulation.must_be_unused()?;
@@ -121,18 +118,13 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     }
     let scored = score(&run, out, wanted, store.as_deref(), threads)?;
     let title = format!("Scores of {}", run.configuration.name);
-    let sections = || {
-        Ok(vec![pages::scores(
-            &run.configuration.name,
-            &scored.0,
-            scored.1,
-        )?])
-    };
+    let name = &run.configuration.name;
+    let sections = || Ok(vec![pages::scores(name, &scored.0, scored.1)?]);
     report.save(&title, sections, || score::made_by(&run, out))
 }
 
-/// Scores a folder of catalogues (of `sets`, or of all if empty) and prints the scores. Stores them with the bandpowers
-/// next to the catalogues, and in the results store if there is one.
+// Scores a folder of catalogues (of `sets`, or of all if empty) and prints the scores. Stores them with the bandpowers
+// next to the catalogues, and in the results store if there is one.
 pub(super) fn score(
     run: &Run,
     out: &Path,
@@ -140,6 +132,7 @@ pub(super) fn score(
     store: Option<&Path>,
     threads: usize,
 ) -> anyhow::Result<(Vec<ScoredSet>, Table)> {
+    // Own catalogues are in the standard convention, so that it is not searched for.
     let options = Options {
         choice: OWN,
         ..Options::default()

@@ -1,5 +1,3 @@
-//! `shearq score`.
-
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
@@ -10,16 +8,14 @@ use shearq_scoring::{Noise, Options, SetScorer};
 use shearq_submissions::EllipticityType;
 
 use crate::arguments::{
-    Printing, ReportFile, ScoreSettings, SetList, SignArgument, Threads, positive,
+    Printing, ReportFile, ScoreSettings, SetList, SignArgument, Threads, positive, sets_of,
 };
 use crate::{print, tell, tell_unread};
 use shearq_dataset::layout::DataFolder;
-use shearq_dataset::run::kind_of;
-use shearq_dataset::run::{Run, Source};
+use shearq_dataset::run::{Run, Source, kind_of};
 use shearq_dataset::truth::{ReadTruth, Reading, Sign, read_truth, reading_of};
 use shearq_render::table::TableFormat;
-use shearq_results::catalogues::COLUMNS;
-use shearq_results::catalogues::Catalogues;
+use shearq_results::catalogues::{COLUMNS, Catalogues};
 use shearq_results::foreign::{Screen, folder_of, plain_columns};
 use shearq_results::record::{RunRecord, SetRecord};
 use shearq_results::score::{ScoredSet, score_catalogues, score_files, unscored};
@@ -110,9 +106,9 @@ pub(crate) struct Arguments {
     threads: Threads,
 }
 
-/// Options of input with a data folder. Its layout specifies the sign of g2, the stamps and the field.
+// Options of input with a data folder. Its layout specifies the sign of g2, the stamps and the field.
 const FOLDERS: [&str; 6] = ["data", "measured", "foreign", "packed", "sets", "store"];
-/// Options of input other than plain catalogues.
+// Options of input other than plain catalogues.
 const NOT_PLAIN: [&str; 7] = [
     "data", "measured", "foreign", "packed", "spectra", "sets", "store",
 ];
@@ -127,7 +123,7 @@ fn parse_ellipticity(text: &str) -> Result<EllipticityType, String> {
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let options = Options {
-        definition: arguments.settings.definition(),
+        definition: arguments.settings.definition,
         noise: arguments.noise_var.map_or(Noise::Measured, Noise::Given),
         choice: arguments.settings.convention.unwrap_or_default(),
     };
@@ -143,7 +139,6 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     }
 }
 
-/// Scores the catalogues of a folder of results, of another program, or of a submission.
 fn catalogues(
     arguments: &Arguments,
     data: Option<DataFolder>,
@@ -151,7 +146,7 @@ fn catalogues(
 ) -> anyhow::Result<()> {
     let store = arguments.store.as_deref();
     let _prepared = store.map(store::prepare).transpose()?;
-    let sets = arguments.sets.as_ref().map_or(&[][..], |list| &list.0);
+    let sets = sets_of(arguments.sets.as_ref());
     let (catalogues, data) = match (&arguments.measured, &arguments.foreign, data) {
         (Some(folder), _, data) => {
             let run = Run::require(folder)?;
@@ -173,8 +168,8 @@ fn catalogues(
             let path = path.context("--packed: expected a folder or an archive")?;
             let sent = Sent::open(path)?;
             let submission = Submission::read(&sent)?;
-            if let Packed::Spectra(_) = submission.packed {
-                return packed_spectra(arguments, &data, &sent, submission, options);
+            if let Packed::Spectra(files) = &submission.packed {
+                return packed_spectra(arguments, &data, &sent, &submission, files, options);
             }
             (Catalogues::packed(sent, submission, &data)?, data)
         }
@@ -213,7 +208,6 @@ fn catalogues(
         })
 }
 
-/// Source and settings of a run, for reports.
 pub(super) fn made_by(run: &Run, out: &Path) -> anyhow::Result<Vec<(String, String)>> {
     Ok(vec![
         ("Catalogues".into(), out.display().to_string()),
@@ -225,7 +219,6 @@ pub(super) fn made_by(run: &Run, out: &Path) -> anyhow::Result<Vec<(String, Stri
     ])
 }
 
-/// Records scores in a results store and prints the file name.
 pub(super) fn record(
     store: &Path,
     catalogues: &Catalogues,
@@ -250,42 +243,39 @@ fn write_record(
     Ok(())
 }
 
-/// Scores the power spectra of a submission.
+// The power spectra of a submission.
 fn packed_spectra(
     arguments: &Arguments,
     data: &DataFolder,
     sent: &Sent,
-    submission: Submission,
+    submission: &Submission,
+    files: &BTreeMap<u32, PathBuf>,
     options: Options,
 ) -> anyhow::Result<()> {
-    let Packed::Spectra(files) = &submission.packed else {
-        return Ok(());
-    };
     let path = sent.as_given(sent.path());
     anyhow::ensure!(
         arguments.noise_var.is_none(),
         "--noise-var applies to catalogues only; {} contains power spectra. Try: without --noise-var",
         path.display()
     );
-    let named = |error: anyhow::Error| {
-        let named = |error| sent.named(error).into();
-        error.downcast().map_or_else(|other| other, named)
-    };
     let manifest = submission.manifest.as_ref();
-    let spectra =
-        score_spectra(arguments, data, files.clone(), manifest, &path, options).map_err(named)?;
-    spectra.print(arguments, &path, options)?;
+    let sets = score_spectra(arguments, data, files.clone(), manifest, &path, options).map_err(
+        // An archive is unpacked to a temporary folder, whose name means nothing to users.
+        |error| match error.downcast() {
+            Ok(error) => sent.named(error).into(),
+            Err(other) => other,
+        },
+    )?;
     let Some(store) = &arguments.store else {
         return Ok(());
     };
     let settings = submission.settings(&path, data)?;
     // The images that the spectra were made from are not recorded, so that differences cannot be paired.
-    let sets = spectra.records;
     let run = RunRecord::new(&submission.method, &settings, String::new(), options, sets);
     write_record(store, run, &Source::folder(data, folder_of(&path))?, data)
 }
 
-/// Scores the power spectra of a folder, one file per set.
+// The power spectra of a folder, one file per set.
 fn spectrum_folder(
     arguments: &Arguments,
     data: &DataFolder,
@@ -313,51 +303,11 @@ fn spectrum_folder(
         folder.display()
     );
     let manifest = Manifest::read(folder)?;
-    let spectra = score_spectra(arguments, data, files, manifest.as_ref(), folder, options)?;
-    spectra.print(arguments, folder, options)
+    score_spectra(arguments, data, files, manifest.as_ref(), folder, options)?;
+    Ok(())
 }
 
-/// Scored power spectra.
-#[derive(Default)]
-struct Spectra {
-    records: Vec<SetRecord>,
-    /// Q of zero shear in each set.
-    zero_q: Vec<f64>,
-}
-
-impl Spectra {
-    /// Scores the power spectrum of a set (0 for a plain file).
-    fn add(
-        &mut self,
-        set: u32,
-        simulated: bool,
-        truth: ReadTruth,
-        path: &Path,
-        manifest: Option<&Manifest>,
-        options: Options,
-    ) -> anyhow::Result<()> {
-        let ReadTruth { grid, shear, .. } = truth;
-        let powers = read_bandpowers(path, &grid)?;
-        let covariance = manifest.and_then(|manifest| {
-            let name = path.file_name()?.to_str()?;
-            manifest.covariances.get(name)
-        });
-        let score = SetScorer::new(grid, shear, options)?.score_spectrum(&powers, covariance)?;
-        self.zero_q.push(score.zero_q);
-        let record = SetRecord::of_spectrum(set, simulated, Vec::new(), &score);
-        self.records.push(record);
-        Ok(())
-    }
-
-    fn print(&self, arguments: &Arguments, path: &Path, options: Options) -> anyhow::Result<()> {
-        let title = format!("Scores of the power spectra of {}", path.display());
-        let zero = &self.zero_q;
-        let table = spectra(&self.records, zero, &title, options.definition);
-        arguments.printing.print(&table)
-    }
-}
-
-/// Scores the power spectra `files` by set, of the submission at `place`.
+// Scores the power spectra `files` by set, of the submission at `place`.
 fn score_spectra(
     arguments: &Arguments,
     data: &DataFolder,
@@ -365,20 +315,22 @@ fn score_spectra(
     manifest: Option<&Manifest>,
     place: &Path,
     options: Options,
-) -> anyhow::Result<Spectra> {
+) -> anyhow::Result<Vec<SetRecord>> {
     if let Some(wanted) = &arguments.sets {
         if let Some(set) = wanted.0.iter().find(|set| !files.contains_key(set)) {
             bail!("{}: found no spectrum of set {set}", place.display());
         }
         files.retain(|set, _| wanted.0.contains(set));
     }
-    let mut spectra = Spectra::default();
+    let mut scored = Vec::new();
     for (&set, path) in &files {
         let truth = read_truth(&data.truth(set), &reading_of(data, set)?)?;
         let simulated = kind_of(data, set).is_some();
-        spectra.add(set, simulated, truth, path, manifest, options)?;
+        scored.push(score_spectrum(
+            set, simulated, truth, path, manifest, options,
+        )?);
     }
-    Ok(spectra)
+    print_spectra(arguments, scored, place, options)
 }
 
 fn spectrum_file(
@@ -395,15 +347,45 @@ fn spectrum_file(
     }
     let manifest = Manifest::read(folder_of(spectrum))?;
     let line = truth.sign.and_then(Sign::line);
-    let mut spectra = Spectra::default();
-    spectra.add(0, false, truth, spectrum, manifest.as_ref(), options)?;
+    // A plain file has no set.
+    let scored = score_spectrum(0, false, truth, spectrum, manifest.as_ref(), options)?;
     if let Some(line) = line {
         tell(format_args!("{line}"));
     }
-    spectra.print(arguments, spectrum, options)
+    print_spectra(arguments, vec![scored], spectrum, options)?;
+    Ok(())
 }
 
-/// How to read the file of `--truth`.
+// The record of a set and its Q of zero shear.
+fn score_spectrum(
+    set: u32,
+    simulated: bool,
+    ReadTruth { grid, shear, .. }: ReadTruth,
+    path: &Path,
+    manifest: Option<&Manifest>,
+    options: Options,
+) -> anyhow::Result<(SetRecord, f64)> {
+    let powers = read_bandpowers(path, &grid)?;
+    let covariance =
+        manifest.and_then(|manifest| manifest.covariances.get(path.file_name()?.to_str()?));
+    let score = SetScorer::new(grid, shear, options)?.score_spectrum(&powers, covariance)?;
+    let record = SetRecord::of_spectrum(set, simulated, Vec::new(), &score);
+    Ok((record, score.zero_q))
+}
+
+fn print_spectra(
+    arguments: &Arguments,
+    scored: Vec<(SetRecord, f64)>,
+    path: &Path,
+    options: Options,
+) -> anyhow::Result<Vec<SetRecord>> {
+    let (records, zero): (Vec<SetRecord>, Vec<f64>) = scored.into_iter().unzip();
+    let title = format!("Scores of the power spectra of {}", path.display());
+    let table = spectra(&records, &zero, &title, options.definition);
+    arguments.printing.print(&table)?;
+    Ok(records)
+}
+
 fn plain_reading(arguments: &Arguments) -> Reading {
     Reading {
         field: Degrees(arguments.field.unwrap_or(10.0)),
@@ -413,11 +395,10 @@ fn plain_reading(arguments: &Arguments) -> Reading {
 }
 
 fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Result<()> {
-    let columns = arguments.columns.as_deref();
-    let columns: Vec<&str> = columns.map_or_else(
-        || COLUMNS.to_vec(),
-        |given| given.iter().map(String::as_str).collect(),
-    );
+    let columns: Vec<&str> = match &arguments.columns {
+        Some(given) => given.iter().map(String::as_str).collect(),
+        None => COLUMNS.to_vec(),
+    };
     let columns: [&str; 4] = columns.as_slice().try_into().map_err(|_| {
         anyhow::anyhow!(
             "--columns: wrong number of columns (found {}, expected 4: x, y, e1 and e2)",
@@ -430,8 +411,10 @@ fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Resul
         max_modulus: arguments.max_modulus,
         distortion: arguments.ellipticity == Some(EllipticityType::Distortion),
     };
+    // A file that is given twice would count as two images without noise between them.
     let mut seen = BTreeSet::new();
     for path in &arguments.catalogues {
+        // Two names may lead to one file.
         let same = path.canonicalize().unwrap_or_else(|_| path.clone());
         anyhow::ensure!(
             seen.insert(same),
@@ -473,13 +456,9 @@ fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Resul
         arguments.printing.print(&table)?;
     }
     let mut made_by = vec![("Truth".to_owned(), truth.display().to_string())];
-    made_by.extend(
-        arguments
-            .catalogues
-            .iter()
-            .enumerate()
-            .map(|(k, path)| (format!("Catalogue {}", k + 1), path.display().to_string())),
-    );
+    for (path, number) in arguments.catalogues.iter().zip(1..) {
+        made_by.push((format!("Catalogue {number}"), path.display().to_string()));
+    }
     let sections = || Ok(vec![pages::scores("catalogues", &scored, table)?]);
     arguments.report.save(&title, sections, || Ok(made_by))
 }

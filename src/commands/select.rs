@@ -1,5 +1,3 @@
-//! `shearq select`.
-
 use std::path::PathBuf;
 
 use clap::Args;
@@ -39,20 +37,15 @@ pub(crate) struct Arguments {
 }
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
-    let Arguments {
-        measured,
-        condition,
-        weight,
-        out,
-    } = arguments;
-    let run = Run::require(measured)?;
+    let (condition, weight) = (&arguments.condition, &arguments.weight);
+    let run = Run::require(&arguments.measured)?;
     let Some(selection) = smooth_selection(condition.as_deref(), weight.as_deref())? else {
         return Ok(());
     };
-    let (kept, good) = write_selected(&run, measured, out, &selection)?;
+    let (kept, good) = write_selected(&run, &arguments.measured, &arguments.out, &selection)?;
     tell(format_args!(
         "{}: {kept} of {good} galaxies without a flag have a weight above zero",
-        out.display()
+        arguments.out.display()
     ));
     Ok(())
 }

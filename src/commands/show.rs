@@ -1,5 +1,3 @@
-//! `shearq show`.
-
 use std::path::PathBuf;
 use std::str::FromStr;
 
@@ -39,7 +37,6 @@ pub(crate) struct Arguments {
     out: PathBuf,
 }
 
-/// A galaxy on the command line.
 #[derive(Debug, Clone, Copy)]
 struct GalaxyId {
     image: ImageId,
@@ -65,18 +62,16 @@ impl FromStr for GalaxyId {
 }
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
-    let Arguments {
-        submission,
-        data,
-        galaxy,
-        out,
-    } = arguments;
+    let out = &arguments.out;
+    // Before the work: an ending that is no picture is an error.
     PictureFormat::of(out)?;
-    let submission = Registry::embedded()?.get(submission)?.configuration;
-    let data = open_data(data)?;
+    let submission = Registry::embedded()?
+        .get(&arguments.submission)?
+        .configuration;
+    let data = open_data(&arguments.data)?;
     let threads = Pool::new(0)?;
     let (mut rows, mut responses) = (Vec::new(), false);
-    for &GalaxyId { image, index } in galaxy {
+    for &GalaxyId { image, index } in &arguments.galaxy {
         let mut source = ImageSource::open(&data, image, &submission)?;
         let measurer = Measurer::new(&submission, source.mosaic().stamp)?;
         if measurer.configuration() != &submission {

@@ -1,5 +1,3 @@
-//! `shearq simulate`.
-
 use std::path::PathBuf;
 
 use clap::Args;
@@ -8,8 +6,7 @@ use crate::arguments::{SetList, Sharding, SimulationArguments, Threads};
 use crate::progress::{Bar, goes_on};
 use crate::tell;
 use shearq_dataset::images;
-use shearq_dataset::layout::DataFolder;
-use shearq_dataset::layout::MAX_IMAGE;
+use shearq_dataset::layout::{DataFolder, MAX_IMAGE};
 use shearq_dataset::run::SimulationRecord;
 use shearq_pipeline::simulate::simulate_folder;
 use shearq_simulate::set::SimulationSettings;
@@ -53,7 +50,6 @@ pub(crate) struct Arguments {
     threads: Threads,
 }
 
-/// Parses `G1,G2`.
 fn parse_shear(text: &str) -> Result<[f64; 2], String> {
     let expected = || "expected two numbers, as in `0.02,0`".to_owned();
     let (g1, g2) = text.split_once(',').ok_or_else(expected)?;
@@ -61,34 +57,25 @@ fn parse_shear(text: &str) -> Result<[f64; 2], String> {
     Ok([number(g1)?, number(g2)?])
 }
 
-/// A version of the simulated galaxies, with the folder for it.
-struct Version {
-    settings: SimulationSettings,
-    out: PathBuf,
-}
-
-/// The versions that are asked for.
-fn versions(arguments: &Arguments) -> anyhow::Result<Vec<Version>> {
+// The settings of each version of the galaxies, with its folder.
+fn versions(arguments: &Arguments) -> anyhow::Result<Vec<(SimulationSettings, PathBuf)>> {
     let settings = arguments.simulation.settings()?;
     let mut shears = Vec::new();
-    for shear in &arguments.constant_shear {
-        shears.push(*shear);
-        if arguments.opposite {
-            // Adding zero makes zero of minus zero.
-            shears.push(shear.map(|g| 0.0 - g));
+    for &shear in &arguments.constant_shear {
+        // Adding zero makes zero of minus zero, which would name another folder.
+        let opposite = arguments.opposite.then(|| shear.map(|g| 0.0 - g));
+        for [g1, g2] in std::iter::once(shear).chain(opposite) {
+            anyhow::ensure!(
+                !shears.contains(&[g1, g2]),
+                "--constant-shear: the shear {g1}, {g2} is asked for twice"
+            );
+            shears.push([g1, g2]);
         }
     }
-    for (k, shear) in shears.iter().enumerate() {
-        anyhow::ensure!(
-            !shears[..k].contains(shear),
-            "--constant-shear: the shear {}, {} is asked for twice",
-            shear[0],
-            shear[1]
-        );
-    }
+    let out = &arguments.out;
     let mut versions = Vec::new();
-    for shear in shears {
-        for rotated in [false, true] {
+    for shear @ [g1, g2] in shears {
+        for (rotated, ending) in [(false, ""), (true, "_rotated")] {
             if rotated && !arguments.rotated {
                 continue;
             }
@@ -98,20 +85,14 @@ fn versions(arguments: &Arguments) -> anyhow::Result<Vec<Version>> {
                 ..settings
             };
             settings.validate()?;
-            let [g1, g2] = shear;
-            let ending = if rotated { "_rotated" } else { "" };
-            let out = arguments.out.join(format!("g1_{g1:+}_g2_{g2:+}{ending}"));
-            versions.push(Version { settings, out });
+            versions.push((settings, out.join(format!("g1_{g1:+}_g2_{g2:+}{ending}"))));
         }
     }
-    if let [only] = &mut versions[..] {
-        only.out.clone_from(&arguments.out);
-    }
-    if versions.is_empty() {
-        let out = arguments.out.clone();
-        versions.push(Version { settings, out });
-    }
-    Ok(versions)
+    Ok(match versions.as_slice() {
+        [] => vec![(settings, out.clone())],
+        [(only, _)] => vec![(*only, out.clone())],
+        _ => versions,
+    })
 }
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
@@ -119,11 +100,11 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let images = images::of_simulation(arguments.sets.simulated()?, arguments.images);
     let images = arguments.sharding.part(&images);
     let versions = versions(arguments)?;
-    let grid = versions[0].settings.grid as u64;
+    let grid = versions[0].0.grid as u64;
     let galaxies = (versions.len() * images.len()) as u64 * grid * grid;
     let mut bar = Bar::new("simulating", galaxies);
     let (mut made, mut already) = (0, 0);
-    for Version { settings, out } in &versions {
+    for (settings, out) in &versions {
         let record = SimulationRecord {
             version: shearq_dataset::VERSION.into(),
             settings: *settings,
@@ -140,10 +121,8 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         arguments.out.display()
     ));
     if versions.len() > 1 {
-        let shown: Vec<String> = versions
-            .iter()
-            .map(|version| version.out.display().to_string())
-            .collect();
+        let folders = versions.iter();
+        let shown: Vec<String> = folders.map(|(_, out)| out.display().to_string()).collect();
         tell(format_args!("folders: {}", shown.join(", ")));
     }
     Ok(())

@@ -1,5 +1,3 @@
-//! `shearq study`.
-
 use std::path::PathBuf;
 
 use clap::Args;
@@ -52,32 +50,22 @@ pub(crate) struct Arguments {
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     goes_on();
-    let Arguments {
-        submission,
-        sets,
-        images,
-        pairs,
-        simulation,
-        out,
-        form,
-        threads,
-    } = arguments;
-    let sets = sets.simulated()?;
-    let configurations = configurations(submission)?;
+    let &Arguments { images, pairs, .. } = arguments;
+    let (sets, threads) = (arguments.sets.simulated()?, arguments.threads.number());
     let plan = Plan {
         version: shearq_dataset::VERSION.into(),
-        simulation: simulation.settings()?,
-        images: *images,
-        configurations,
+        simulation: arguments.simulation.settings()?,
+        images,
+        configurations: configurations(&arguments.submission)?,
     };
-    let study = Study::open(&plan, out)?;
-    let threads = threads.number();
+    // The study claims its folder: two processes with one plan share the sets, and another plan is refused.
+    let study = Study::open(&plan, &arguments.out)?;
     let image = (plan.simulation.grid as u64).pow(2) * sets.len() as u64;
-    let mut bar = Bar::new("simulating and measuring", image * u64::from(*images));
+    let mut bar = Bar::new("simulating and measuring", image * u64::from(images));
     let results = run_sets(&study, sets, threads, &mut bar)?;
     drop(bar);
-    let mut bar = Bar::new("measuring biases", image * u64::from(*pairs));
-    let biases = bias_sets(&study, sets, *pairs, threads, &mut bar)?;
+    let mut bar = Bar::new("measuring biases", image * u64::from(pairs));
+    let biases = bias_sets(&study, sets, pairs, threads, &mut bar)?;
     drop(bar);
     let table = contest_table(&plan, &results, &biases)?;
     let data = format!(
@@ -93,7 +81,12 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         made_by.push((configuration.name.clone(), toml::to_string(configuration)?));
     }
     study.claim.check()?;
-    let mut page = Page::new(out, "Configurations compared", "Simulated data", made_by);
+    let mut page = Page::new(
+        &arguments.out,
+        "Configurations compared",
+        "Simulated data",
+        made_by,
+    );
     let [shapes, quality] = contest_parts(&table);
     page.section("Ellipticities", "Scatter and biases on every kind of set.");
     page.figure(
@@ -107,6 +100,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     page.data("study", &table)?;
     study.claim.check()?;
     page.save()?;
+    let form = &arguments.form;
     if matches!(form.format, TableFormat::Csv | TableFormat::Json) {
         return form.print(&table);
     }

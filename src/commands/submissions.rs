@@ -1,14 +1,12 @@
-//! `shearq submissions`.
-
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand, ValueEnum};
-use shearq_submissions::{PsfForm, Registry, Template};
+use shearq_submissions::{Configuration, PsfForm, Published, Registry, Template};
 
 use crate::arguments::Form;
 use crate::{print, tell};
 use shearq_files::atomic;
-use shearq_render::table::{Cell, Heading, Table};
+use shearq_render::table::{Cell, Table};
 
 /// List, show and create configurations: the settings that `measure` uses.
 #[derive(Debug, Args)]
@@ -82,47 +80,38 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
 
 fn list() -> anyhow::Result<Table> {
     let registry = Registry::embedded()?;
-    let mut rows = Vec::new();
-    for name in registry.names() {
-        let entry = registry.get(name)?;
-        let s = &entry.configuration;
-        let published = |value: fn(&shearq_submissions::Published) -> f64| {
-            entry.published.as_ref().map_or(f64::NAN, value)
-        };
-        rows.push(vec![
-            Cell::text(name),
-            Cell::text(format!("{0}×{0}", s.stamp.size)),
-            Cell::text(match s.wavelet() {
-                None => "raw",
-                Some(_) => "denoised",
-            }),
-            Cell::text(match s.psf.form {
-                PsfForm::Star => "star",
-                PsfForm::Functional => "functional",
-            }),
-            Cell::number(published(|p| p.m_half), 4),
-            Cell::number(published(|p| p.sqrt_a), 4),
-            Cell::number(published(|p| p.q), 2),
-            Cell::text(&s.description),
-        ]);
-    }
-    let headings = [
-        ("name", "Name"),
-        ("stamp", "Stamp"),
-        ("data", "Data"),
-        ("psf", "PSF"),
-        ("m_half_published", "M/2 publ."),
-        ("sqrt_a_published", "√A×10⁴ publ."),
-        ("q_published", "Q publ."),
-        ("description", "Description"),
-    ];
-    Ok(Table {
-        title: "Configurations".into(),
-        headings: headings
-            .iter()
-            .map(|(key, label)| Heading::new(key, *label))
-            .collect(),
-        rows,
-        notes: vec!["Published: Table 1 of the paper.".into()],
-    })
+    let entries = registry
+        .names()
+        .iter()
+        .map(|name| Ok((name, registry.get(name)?)));
+    let rows: Vec<_> = entries.collect::<anyhow::Result<_>>()?;
+    let mut table = Table::titled("Configurations");
+    let mut words = |key, label, word: fn(&Configuration) -> String| {
+        table.column(key, label, &rows, |(_, entry)| {
+            Cell::text(word(&entry.configuration))
+        });
+    };
+    words("name", "Name", |own| own.name.clone());
+    words("stamp", "Stamp", |own| format!("{0}×{0}", own.stamp.size));
+    words("data", "Data", |own| match own.wavelet() {
+        None => "raw".into(),
+        Some(_) => "denoised".into(),
+    });
+    words("psf", "PSF", |own| match own.psf.form {
+        PsfForm::Star => "star".into(),
+        PsfForm::Functional => "functional".into(),
+    });
+    let mut published = |key, label, decimals, value: fn(&Published) -> f64| {
+        table.column(key, label, &rows, |(_, entry)| {
+            Cell::number(entry.published.as_ref().map_or(f64::NAN, value), decimals)
+        });
+    };
+    published("m_half_published", "M/2 publ.", 4, |p| p.m_half);
+    published("sqrt_a_published", "√A×10⁴ publ.", 4, |p| p.sqrt_a);
+    published("q_published", "Q publ.", 2, |p| p.q);
+    table.column("description", "Description", &rows, |(_, entry)| {
+        Cell::text(&entry.configuration.description)
+    });
+    table.notes = vec!["Published: Table 1 of the paper.".into()];
+    Ok(table)
 }

@@ -1,5 +1,3 @@
-//! `shearq unpack`.
-
 use std::path::PathBuf;
 
 use clap::Args;
@@ -25,16 +23,12 @@ pub(crate) struct Arguments {
 }
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
-    let Arguments {
-        archive,
-        out,
-        verify,
-    } = arguments;
-    let unpacked = match out {
-        Some(out) => unpack(archive, out, *verify)?,
+    let (archive, verify) = (&arguments.archive, arguments.verify);
+    let unpacked = match &arguments.out {
+        Some(out) => unpack(archive, out, verify)?,
         None => {
             let read = read(archive, None)?;
-            read.verify(archive, *verify)?;
+            read.verify(archive, verify)?;
             read
         }
     };
