@@ -16,9 +16,6 @@ pub type Measured = (f64, f64);
 
 impl ConstantShears {
     /// `None` if the shear of every set varies.
-    ///
-    /// # Errors
-    /// If only some sets are constant, or their shears do not determine m and c.
     pub fn of<'a>(
         truths: impl IntoIterator<Item = (u32, &'a TrueShear)>,
     ) -> Result<Option<Self>, String> {

@@ -154,7 +154,7 @@ fn together(firsts: &[&First], change: Change) -> Vec<Sums> {
         .collect()
 }
 
-/// The first set, or all sets together, whose true shear the images contradict, and the likely cause.
+// The first set, or all sets together, whose true shear the images contradict, and the likely cause.
 pub(crate) fn contradiction(firsts: &[First]) -> Option<String> {
     let zeros = median_bias(firsts);
     let slopes = |parts: &[Sums]| -> [Slope; 3] {

@@ -58,7 +58,6 @@ pub struct Simulation {
     pub amplitude: Option<f64>,
     /// Extra slope of the shear power; `None` to draw it from the seed.
     pub tilt: Option<f64>,
-    /// Seed; `None` for a seed of the operating system.
     pub seed: Option<u64>,
 }
 
@@ -146,9 +145,6 @@ fn drawn(seed: u64, purpose: &str) -> f64 {
 }
 
 /// Writes a challenge of simulated images. The same command resumes a stopped one. Returns the description.
-///
-/// # Errors
-/// If a folder belongs to something else, a setting is out of range, or a file cannot be written.
 pub fn simulated(
     plan: &Plan,
     simulation: &Simulation,
@@ -215,9 +211,6 @@ pub fn simulated(
 /// Writes a challenge of the images in `data`, which another program made. New headers are written, because the old headers
 /// may contain the seed or the shear. The true shear is in the files `truth` with `{set}` for the set number, or in the
 /// data folder.
-///
-/// # Errors
-/// If sets differ in number of images or grid, the sign of the true shear is unknown, the images contradict it, or a file cannot be read or written.
 pub fn of_images(
     plan: &Plan,
     data: &DataFolder,

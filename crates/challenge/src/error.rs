@@ -49,14 +49,12 @@ pub enum ChallengeError {
         metric: &'static str,
         constant: bool,
     },
-    /// The true shears of sets with one shear each do not determine m and c.
     #[error("{0}")]
     Shears(String),
     #[error(
         "noise is measured between images (found 1 image per set, expected at least 2). Try: --images 8"
     )]
     OneImage,
-    /// The images contradict the true shear.
     #[error("{0}. Try: the same command with the right true shear")]
     Contradiction(String),
     #[error(

@@ -20,7 +20,6 @@ const FILE_DIGITS: usize = 16;
 // How the names of files that are neither catalogues nor spectra start in the list of an entry's content.
 const OTHER_FILE: &str = "other ";
 
-/// An entry as it was found.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Sending {
     /// Archive, or folder of files.
@@ -109,9 +108,6 @@ fn search(
 
 /// Refuses an entry that is a symbolic link or contains one: it could name any file of the organiser's system, such as
 /// the truth.
-///
-/// # Errors
-/// If there is a link, or the entry cannot be read.
 pub fn refuse_links(entry: &Path) -> Result<(), FileError> {
     let mut paths = vec![entry.to_owned()];
     if entry.is_dir() {
@@ -126,7 +122,6 @@ pub fn refuse_links(entry: &Path) -> Result<(), FileError> {
     }
 }
 
-/// SHA-256 of an archive, or of the list of a folder's files.
 pub fn identify(path: &Path) -> Result<String, FileError> {
     refuse_links(path)?;
     Ok(match path.is_dir() {
@@ -160,16 +155,12 @@ pub struct Content {
     /// SHA-256 of sets, images and checksums of all files but the manifest. It depends neither on the name of the method nor on the
     /// compression.
     pub sha256: String,
-    /// First digits of the checksum of each file.
     pub files: Vec<String>,
     /// Team and challenge, if a manifest states them.
     pub entry: Option<Entry>,
 }
 
 /// Reads the manifest of an entry, and the checksum of its content.
-///
-/// # Errors
-/// If the archive is damaged or too large, or its files disagree with the manifest.
 pub fn content(sending: &Sending) -> Result<Content, FileError> {
     let path = &sending.path;
     let (manifest, files) = match path.is_dir() {

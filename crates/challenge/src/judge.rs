@@ -46,16 +46,13 @@ pub struct EntryInfo {
     pub received: Timestamp,
     pub receipt: bool,
     pub file: String,
-    /// SHA-256 of the archive.
     pub sha256: String,
     /// SHA-256 of sets, images and files.
     pub content: String,
-    /// First digits of the checksum of each file.
     pub files: Vec<String>,
     /// Some mean shapes of each set of catalogues ([`sketch`]).
     pub shapes: BTreeMap<String, Vec<i32>>,
     pub contents: Contents,
-    /// Whether it is a reference of the organiser, without a rank.
     pub reference: bool,
 }
 
@@ -66,7 +63,6 @@ impl EntryInfo {
     }
 }
 
-/// A scored entry of the store.
 #[derive(Debug, Clone)]
 pub struct Entry {
     pub info: EntryInfo,
@@ -83,7 +79,6 @@ struct Stored {
     entry: EntryInfo,
 }
 
-/// An entry that was not scored.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Refused {
     pub path: PathBuf,
@@ -143,7 +138,6 @@ struct Candidate {
 type Scores = (Vec<SetRecord>, Option<String>);
 
 impl Judge {
-    /// Opens the public and the private folder of a challenge.
     pub fn open(public: &Path, private: &Path, threads: usize) -> Result<Self, ChallengeError> {
         let challenge = Challenge::read(public)?;
         let (key, id) = verify(public, private, &challenge, threads)?;
@@ -200,9 +194,6 @@ impl Judge {
     }
 
     /// The entries of this challenge in a store, in order of their arrival.
-    ///
-    /// # Errors
-    /// If the store cannot be read, or contains entries that were scored with another truth or other data.
     pub fn entries(&self, store: &Path) -> Result<Vec<Entry>, FileError> {
         let mut entries: BTreeMap<(String, String), Entry> = BTreeMap::new();
         for (path, run) in store::files(store)? {
@@ -245,9 +236,6 @@ impl Judge {
 
     /// Checks and scores entries and keeps them in `store`, one file per entry. `sendings` have a mark for references.
     /// Entries of the store are not scored again. An entry that cannot be scored does not stop the others.
-    ///
-    /// # Errors
-    /// If the store cannot be read or written.
     pub fn round(
         &self,
         sendings: &[(Sending, bool)],
@@ -304,9 +292,6 @@ impl Judge {
 
     /// Signs the arrival of an entry, now, for `team` or the team in the manifest, and returns the file of the receipt. A
     /// receipt that the same content has already is kept, unless it is of a time before entries are accepted.
-    ///
-    /// # Errors
-    /// If the entry cannot be read, or the receipt cannot be written.
     pub fn sign(&self, entry: &Path, team: Option<&str>) -> Result<PathBuf, FileError> {
         let sha256 = identify(entry)?;
         let sending = Sending {

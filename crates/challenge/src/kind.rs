@@ -9,23 +9,17 @@ use shearq_scoring::Definition;
 
 use crate::constant::ConstantShears;
 
-/// Metric that ranks the entries of a challenge.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum RankBy {
-    /// Q with the arithmetic of GREAT10's leaderboard.
     Q,
-    /// Q with azimuthal averages over fixed bins.
     QCorrected,
-    /// Q after dividing by the measured response.
     QCalibrated,
     /// |m|, the multiplicative bias by cross-correlation; of constant shears, the mean over both components.
     M,
     /// c, the modulus of the additive bias, divided by the response: otherwise shrunk shapes have less of it.
     C,
-    /// GREAT3's Q_c, from m and c of constant shears.
     Qc,
-    /// Noise of one galaxy's ellipticity per component.
     Noise,
 }
 
@@ -147,7 +141,6 @@ impl RankBy {
         }
     }
 
-    /// The metric of paired differences, if there is one.
     pub fn paired(self) -> Option<Paired> {
         match self {
             RankBy::Q | RankBy::QCorrected => Some(Paired::Q),
@@ -178,9 +171,7 @@ pub struct Kind {
     pub name: &'static str,
     pub title: &'static str,
     pub metric: RankBy,
-    /// Metric that ranks the entries if each set has one shear.
     pub constant_metric: RankBy,
-    /// Files that are accepted without another rule.
     pub contents: &'static [Contents],
     /// Most entries of a team; `None` for any number.
     pub entries_per_team: Option<u32>,
@@ -233,7 +224,6 @@ impl Serialize for &'static Kind {
     }
 }
 
-/// For `#[serde(deserialize_with)]`: reads the name of a kind.
 pub(crate) fn by_name<'de, D: Deserializer<'de>>(d: D) -> Result<&'static Kind, D::Error> {
     let name = String::deserialize(d)?;
     kind(&name).ok_or_else(|| {

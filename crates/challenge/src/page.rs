@@ -31,7 +31,6 @@ pub struct View<'a> {
     pub copies: &'a [NearCopy<'a>],
     /// Decimals of the metric. More of them reveal more of the true shear.
     pub digits: usize,
-    /// Whether the metric of each set is shown.
     pub detail: bool,
 }
 

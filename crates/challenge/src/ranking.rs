@@ -19,7 +19,6 @@ pub struct Scored<'a> {
     /// Number of the entry of its team, from 1.
     pub number: usize,
     pub value: f64,
-    /// Its standard error; not a number if unknown.
     pub error: f64,
 }
 
@@ -29,7 +28,6 @@ impl Scored<'_> {
     }
 }
 
-/// A team, or a reference of the organiser.
 #[derive(Debug, Clone)]
 pub struct Standing<'a> {
     pub board: Board,
@@ -233,7 +231,6 @@ fn equal(metric: RankBy, best: &Scored<'_>, other: &Scored<'_>) -> bool {
 // Largest 1 - r of a near copy, with r the correlation of its shapes. Noise of a thousandth of the shapes has it.
 const DECORRELATION: f64 = 1e-6;
 
-/// An entry that is nearly an earlier one.
 #[derive(Debug, Clone)]
 pub struct NearCopy<'a> {
     pub entry: &'a EntryInfo,
@@ -328,9 +325,6 @@ impl Decisions {
     }
 
     /// Marks withdrawn entries and replaces the names of teams.
-    ///
-    /// # Errors
-    /// If an entry or a team is unknown, or a name stands for two teams.
     pub fn apply(&self, entries: &mut [Entry], key: &Key) -> Result<(), String> {
         for (id, reason) in &self.withdrawn {
             // Two teams may have sent the same archive.

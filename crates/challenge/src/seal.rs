@@ -45,7 +45,6 @@ pub struct Key {
     // Keys of version 0.2 and earlier have it, and it is not used any more.
     #[serde(default, skip_serializing)]
     expected: IgnoredAny,
-    /// Checksums of the other private files.
     #[serde(default)]
     pub files: Sums,
 }
@@ -63,7 +62,6 @@ impl Key {
         }
     }
 
-    /// Reads the key of a private folder; `None` if there is none.
     pub fn read(private: &Path) -> Result<Option<Self>, FileError> {
         read_toml(&private.join(KEY_FILE), "key")
     }
@@ -128,7 +126,6 @@ pub fn close(path: &Path) -> Result<(), FileError> {
     }
 }
 
-/// Whether other users of the system may look into a folder.
 pub fn is_open_to_others(folder: &Path) -> bool {
     #[cfg(unix)]
     {
@@ -150,7 +147,7 @@ pub(crate) fn entries(folder: &Path) -> Result<Vec<PathBuf>, FileError> {
         .map_err(FileError::doing(folder, "cannot list the folder"))
 }
 
-/// Names of all files below a folder, without those that change after a challenge is complete.
+// Names of all files below a folder, without those that change after a challenge is complete.
 pub(crate) fn names(folder: &Path) -> Result<Vec<String>, FileError> {
     let (mut folders, mut names) = (vec![folder.to_owned()], Vec::new());
     while let Some(next) = folders.pop() {
@@ -170,7 +167,6 @@ pub(crate) fn names(folder: &Path) -> Result<Vec<String>, FileError> {
     Ok(names)
 }
 
-/// Checksums of the files `names` below a folder.
 pub(crate) fn sums(
     folder: &Path,
     names: Vec<String>,
@@ -239,9 +235,6 @@ pub fn verify_public(public: &Path, threads: usize) -> Result<(), ChallengeError
 
 /// Checks that the description in `public` and the key in `private` belong together, and that no private file was changed.
 /// Returns the key and the SHA-256 that identifies the challenge.
-///
-/// # Errors
-/// If one of them is incomplete or was changed, with the name of the file.
 pub fn verify(
     public: &Path,
     private: &Path,
@@ -333,7 +326,6 @@ impl Receipt {
         entry.with_file_name(name)
     }
 
-    /// Reads the receipt of an entry; `None` if there is none.
     pub fn read(key: &Key, entry: &Path, sha256: &str) -> Result<Option<Self>, FileError> {
         let path = Receipt::path(entry);
         refuse_link(&path)?;
@@ -354,7 +346,6 @@ impl Receipt {
         Ok(Some(receipt))
     }
 
-    /// Writes the receipt beside the entry and returns its path.
     pub fn write(&self, entry: &Path) -> Result<PathBuf, FileError> {
         let path = Receipt::path(entry);
         refuse_link(&path)?;

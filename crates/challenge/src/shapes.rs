@@ -33,7 +33,6 @@ const SLOPE_RATIO: f64 = 2.0;
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Fault {
-    /// Another convention of signs and axes agrees better.
     Convention(Convention),
     Swapped,
     /// No convention agrees.
@@ -60,7 +59,7 @@ impl Fault {
     }
 }
 
-/// Ellipticities of one image by cell, in single precision because all images are in memory; NaN for none.
+// Ellipticities of one image by cell, in single precision because all images are in memory; NaN for none.
 pub(crate) type Shapes = Array2<[f32; 2]>;
 
 fn shapes_of(sum: &FieldSum) -> Shapes {
@@ -152,10 +151,6 @@ pub struct References {
 }
 
 impl References {
-    /// Measures the images `ids` in the public folder `data`.
-    ///
-    /// # Errors
-    /// If an image cannot be measured.
     pub fn measure(
         data: &DataFolder,
         ids: &[ImageId],
@@ -186,7 +181,6 @@ impl References {
         Ok(references)
     }
 
-    /// The images of `sets` that the public folder `data` contains.
     pub fn ids(data: &DataFolder, sets: &[u32]) -> Result<Vec<ImageId>, FileError> {
         let files = data.images(sets)?;
         let of_set = |set: &u32| {
@@ -223,9 +217,6 @@ impl References {
     }
 
     /// Findings about the catalogues of an entry: one for each fault and set, with the numbers of its images.
-    ///
-    /// # Errors
-    /// If the files of the entry cannot be listed.
     pub fn findings(&self, sent: &Sent) -> Result<Vec<Finding>, FileError> {
         let files = sent
             .files()

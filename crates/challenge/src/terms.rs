@@ -19,10 +19,8 @@ use shearq_submissions::{check_name, checked_name};
 
 use crate::kind::{Kind, RankBy, by_name};
 
-/// Name of the description in the public folder.
 pub const CHALLENGE_FILE: &str = "challenge.toml";
 
-/// Description of a challenge. It is public.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Challenge {
@@ -51,7 +49,6 @@ pub struct Data {
     pub images: u32,
     pub grid: usize,
     pub stamp: usize,
-    /// Side of the field in degrees.
     pub field_degrees: f64,
 }
 
@@ -60,10 +57,6 @@ impl Data {
         self.sets.len() as u64 * u64::from(self.images) * (self.grid as u64).pow(2)
     }
 
-    /// Grid of the galaxies.
-    ///
-    /// # Errors
-    /// If a value is out of range.
     pub fn grid(&self) -> Result<Grid, shearq_scoring::ScoringError> {
         Grid::new(
             self.grid,
@@ -104,17 +97,12 @@ impl Rules {
         }
     }
 
-    /// Whether a time is before the first day of entries.
     pub fn is_early(&self, received: Timestamp) -> bool {
         self.opens
             .as_ref()
             .is_some_and(|opens| received < opens.first)
     }
 
-    /// Kind of the files of an entry.
-    ///
-    /// # Errors
-    /// If the challenge does not accept it.
     pub fn accept(&self, submission: &Submission) -> Result<Contents, String> {
         let contents = match (&submission.packed, &submission.manifest) {
             (Packed::Catalogues(_), _) => Contents::Catalogues,
@@ -138,9 +126,6 @@ impl Rules {
 
 impl Challenge {
     /// Reads the description in a public folder, or the file itself.
-    ///
-    /// # Errors
-    /// If there is none, or a value is out of range.
     pub fn read(place: &Path) -> Result<Self, FileError> {
         let path = match place.is_dir() {
             true => place.join(CHALLENGE_FILE),
@@ -158,7 +143,6 @@ impl Challenge {
         Ok(challenge)
     }
 
-    /// Properties that an entry must have.
     pub fn expected(&self) -> Result<Expected, FileError> {
         let Data { sets, images, .. } = &self.data;
         let grid = self.data.grid();
@@ -183,7 +167,6 @@ impl Challenge {
         check_name(&self.name).map_err(|error| error.to_string())
     }
 
-    /// The text of the file.
     pub fn text(&self, path: &Path) -> Result<String, FileError> {
         toml::to_string(self).map_err(FileError::doing(path, "cannot write the description"))
     }
