@@ -4,13 +4,14 @@ use std::ops::Range;
 use std::sync::Arc;
 
 use ndarray::{ArcArray2, ArrayView2};
-use numpy::{IntoPyArray, PyReadonlyArray1, PyReadonlyArray2};
+use numpy::{IntoPyArray, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use shearq_measure::{
-    ArraySource, Batch, Flag, FunctionalPsf, KnownNoise, MeanShear, MeanShearError, MeasureError,
-    Measurement, Measurer, PsfProfile, Psfs, Session, ShearSum, Warning,
+    ArraySource, Batch, Flag, FunctionalPsf, Jacobian, JacobianError, KnownNoise, MeanShear,
+    MeanShearError, MeasureError, Measurement, Measurer, PsfProfile, Psfs, Session, ShearSum,
+    Warning,
 };
 use shearq_pipeline::PipelineError;
 use shearq_pipeline::measure::{COLUMNS, ImageRow, Measured, Value, measure_images, more_columns};
@@ -44,14 +45,15 @@ impl<'a> AllPsfs<'a> {
     }
 }
 
-/// The catalogue, the warnings, and an error if all galaxies are flagged.
-type Catalogue<'py> = (Bound<'py, PyDict>, Vec<String>, Option<String>);
+/// The catalogue, the warnings, an error if all galaxies are flagged, and the frame.
+type Catalogue<'py> = (Bound<'py, PyDict>, Vec<String>, Option<String>, String);
 
 /// Measures stamps `(n, ny, nx)`.
 ///
 /// PSFs are one star stamp for all, star stamps one per galaxy, or formulas (FWHM, e1, e2 and β, which is NaN for
 /// Kolmogorov), one for all or one per galaxy. The noise is one level for all or one per stamp. Without any, the
-/// configuration measures it on the stamps. Returns the columns of the catalogue, the warnings, and an error if all
+/// configuration measures it on the stamps. Jacobians (n, 2, 2), one for all or one per galaxy, are for the frame of the sky.
+/// Returns the columns of the catalogue, the warnings, and an error if all
 /// galaxies are flagged.
 #[pyfunction]
 #[expect(clippy::too_many_arguments, reason = "Python passes them by name")]
@@ -63,6 +65,7 @@ pub(crate) fn measure<'py>(
     formulas: Option<PyReadonlyArray2<'py, f64>>,
     noise: Option<f64>,
     noises: Option<PyReadonlyArray1<'py, f64>>,
+    jacobians: Option<PyReadonlyArray3<'py, f64>>,
     submission: &Bound<'py, Configuration>,
     threads_asked: Option<u16>,
     progress: Option<Py<PyAny>>,
@@ -83,6 +86,15 @@ pub(crate) fn measure<'py>(
         (None, Some(level)) => KnownNoise::Given(level),
         (None, None) => KnownNoise::Unknown,
     };
+    let jacobians = jacobians.map(|array| {
+        let matrices = array.as_array();
+        let matrices = matrices
+            .outer_iter()
+            .map(|m| [[m[(0, 0)], m[(0, 1)]], [m[(1, 0)], m[(1, 1)]]]);
+        let each: Result<Vec<_>, JacobianError> = matrices.map(Jacobian::new).collect();
+        each.map_err(|error| PyValueError::new_err(format!("wcs: {error}")))
+    });
+    let jacobians = jacobians.transpose()?;
     let failure = Failure::default();
     let moved = match psfs {
         AllPsfs::Shared { moved, .. } => moved,
@@ -95,6 +107,10 @@ pub(crate) fn measure<'py>(
         move |range| psfs.slice(range).map_err(|error| failed.keep(error)),
         moved,
     );
+    let source = match jacobians {
+        Some(jacobians) => source.with_jacobians(jacobians).map_err(of_measuring)?,
+        None => source,
+    };
     let watch = Watch::new(progress, &failure);
     let threads = threads(threads_asked);
     let measured = py.detach(|| measured(&measurer, source, noise, threads, watch));
@@ -110,7 +126,7 @@ pub(crate) fn measure<'py>(
             columns.set_item(name, vec![value; count].into_pyarray(py))?;
         }
     }
-    Ok((columns, warnings, all_flagged))
+    Ok((columns, warnings, all_flagged, batch.frame.to_string()))
 }
 
 /// Measures and calibrates all galaxies.

@@ -49,7 +49,8 @@ pub fn stated_frame(path: &Path, format: FileFormat) -> Result<Option<PixelFrame
     let Some(text) = metadata.get(FRAME) else {
         return Ok(None);
     };
-    if text.parse() == Ok(Frame::Sky) {
+    // Python states the frame of the pixels, too.
+    if text.parse::<Frame>().is_ok() {
         return Ok(None);
     }
     let numbers: Option<Vec<f64>> = text.split(' ').map(|word| word.parse().ok()).collect();

@@ -17,7 +17,7 @@ type Matrix = [[f64; 2]; 2];
 
 /// Of squares, with u to the right.
 const SQUARE: Matrix = [[SCALE, 0.0], [0.0, SCALE]];
-/// East to the left; turned by 37° and mirrored; columns to the north and rows to the west.
+/// Columns to the east, which is mirrored; turned by 37° and mirrored; columns to the north and rows to the west.
 const TURNED: [Matrix; 3] = [
     [[-SCALE, 0.0], [0.0, SCALE]],
     [

@@ -277,7 +277,7 @@ mod tests {
             let (orientation, _) = Jacobian::new(matrix).unwrap().factors();
             orientation.spin2().turn([0.3, 0.1])
         };
-        // East to the right, as in most images: columns run to the east, −u.
+        // Columns to the east, −u: mirrored.
         close(
             [turned([[-1.0, 0.0], [0.0, 1.0]]), [0.0; 2]],
             [[0.3, -0.1], [0.0; 2]],

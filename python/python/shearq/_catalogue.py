@@ -140,7 +140,8 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
     ----------
     attrs : dict
         ``submission``: name of the configuration; ``settings``: all settings as TOML; ``ellipticity``: 'shear' or
-        'distortion'; ``version``: of shearq. Nothing is computed from them.
+        'distortion'; ``frame``: 'pixel' or 'sky', the axes of e1 and e2; ``version``: of shearq. Nothing is computed from
+        them.
     """
 
     attrs: dict[str, Any]
@@ -423,7 +424,7 @@ def concatenate(catalogues: Iterable[Catalogue]) -> Catalogue:
     Raises
     ------
     ValueError
-        If there is none, the columns differ, or one has shears and another one distortions.
+        If there is none, the columns differ, or one has shears and another one distortions, or another frame.
     """
     parts = list(catalogues)
     if not parts:
@@ -440,6 +441,8 @@ def concatenate(catalogues: Iterable[Catalogue]) -> Catalogue:
     kinds = {part.attrs["ellipticity"] for part in parts if "ellipticity" in part.attrs}
     if len(kinds) > 1:
         raise ValueError("catalogues: found shears and distortions; expected ellipticities of one type")
+    if len({part.attrs["frame"] for part in parts if "frame" in part.attrs}) > 1:
+        raise ValueError("catalogues: found ellipticities in the frames of pixels and of the sky; expected one frame")
     names = list(parts[0].dtype.names or ())
     plain = [np.atleast_1d(part.view(np.ndarray))[names] for part in parts]
     joined = np.concatenate(plain).view(Catalogue)

@@ -62,12 +62,18 @@ def square_pixels(name: str, jacobian: tuple[float, float, float, float], remedy
     )
 
 
+def _local(image: Any) -> Any:
+    """The local WCS at the centre of an image; None if it has none."""
+    wcs = getattr(image, "wcs", None)
+    return None if wcs is None else wcs.local(image.true_center)
+
+
 def _scale(image: Any, name: str) -> float | None:
     """The pixel scale of an image; None if it has no WCS."""
     if getattr(image, "wcs", None) is None:
         return None
     local = image.wcs.local(image.true_center).jacobian()
-    remedy = "Try: resample the image, or from_galsim(…, wcs='ignore') for shears along the pixel axes"
+    remedy = "Try: measure(…, wcs=image.wcs), or from_galsim(…, wcs='ignore') for shears along the pixel axes"
     return square_pixels(name, (local.dudx, local.dudy, local.dvdx, local.dvdy), remedy)
 
 
@@ -137,15 +143,17 @@ def from_galsim(
     profiles = _many(psf, _is_profile)
     if profiles is not None:
         side = pixels.shape[-1]
-        # Every profile on the pixels of its stamp.
+        # Every profile on the pixels of its stamp, and one for all on those of each if they differ.
+        shared = len(profiles) == 1 and len({repr(_local(image)) for image in stamps}) > 1
+        profiles = profiles * len(stamps) if shared else profiles
         places = stamps if len(profiles) == len(stamps) else stamps[:1]
         drawn = []
         for k, profile in enumerate(profiles):
             place = places[k if len(places) > 1 else 0]
-            local = None if place.wcs is None else place.wcs.local(place.true_center)
+            local = _local(place)
             how = {"scale": 1.0} if local is None else {"wcs": local}
             drawn.append(profile.drawImage(nx=side, ny=side, dtype=np.float64, **how).array)
-        return {"stamps": pixels, "psf": drawn[0] if _is_profile(psf) else np.stack(drawn)}
+        return {"stamps": pixels, "psf": drawn[0] if _is_profile(psf) and not shared else np.stack(drawn)}
     stars = _many(psf, _is_image)
     if stars is None:
         return {"stamps": pixels, "psf": np.asarray(psf)}
@@ -155,15 +163,16 @@ def from_galsim(
     return {"stamps": pixels, "psf": stars[0].array if _is_image(psf) else _array("psf", stars)}
 
 
-def unpacked(stamps: Any, psf: Any) -> tuple[Any, Any]:
-    """Stamps and PSFs, of which GalSim's become arrays."""
+def unpacked(stamps: Any, psf: Any, *, check: bool) -> tuple[Any, Any]:
+    """Stamps and PSFs, of which GalSim's become arrays; with ``check``, pixels are square and along the axes."""
     if _many(stamps, _is_image) is not None:
         if hasattr(psf, "fwhm") and not _is_profile(psf):
             # Formulas in pixels.
             images = _many(stamps, _is_image) or []
-            _common("stamps", images)
+            if check:
+                _common("stamps", images)
             return _array("stamps", images), psf
-        found = from_galsim(stamps, psf)
+        found = from_galsim(stamps, psf, wcs="check" if check else "ignore")
         return found["stamps"], found["psf"]
     if _many(psf, _is_profile) is not None:
         raise TypeError(
@@ -172,6 +181,7 @@ def unpacked(stamps: Any, psf: Any) -> tuple[Any, Any]:
         )
     stars = _many(psf, _is_image)
     if stars is not None:
-        _common("psf", stars)
+        if check:
+            _common("psf", stars)
         psf = stars[0].array if _is_image(psf) else _array("psf", stars)
     return stamps, psf

@@ -15,6 +15,7 @@ from ._galsim import GalSimImage, GalSimProfile
 from ._submissions import Configuration, SubmissionLike, submission as resolve
 from ._threads import thread_count
 from ._warn import warn
+from ._wcs import WcsLike, jacobians
 
 StampsLike = Union[ArrayLike, GalSimImage, Sequence[GalSimImage]]
 """Stamps: an array, a sequence of arrays, or one or more GalSim images."""
@@ -115,6 +116,7 @@ def measure(
     x: ArrayLike | None = None,
     y: ArrayLike | None = None,
     ids: ArrayLike | None = None,
+    wcs: WcsLike | None = None,
     submission: SubmissionLike = "48/linear/star",
     threads: int | None = None,
     progress: Callable[[int], object] | None = None,
@@ -143,6 +145,13 @@ def measure(
         Positions in pixels, which become columns.
     ids : array of shape (n,), optional
         Whole numbers or words, which become the column ``id``.
+    wcs : array of shape (2, 2) or (n, 2, 2), or WCS of GalSim or astropy, optional
+        With it, shapes and responses are in the frame of the sky, as in GalSim and TreeCorr: e1 > 0 is elongation
+        east–west, e2 > 0 along north-west. Rotated, mirrored and sheared pixels are measured exactly. Arrays are
+        Jacobians ((du/dx, du/dy), (dv/dx, dv/dy)) in arcsec per pixel, u to the west and v to the north, for all stamps
+        or per stamp; lists have a GalSim WCS per stamp. A WCS that varies over the image needs ``x`` and ``y`` in its own
+        convention (the first pixel is 1 for GalSim, 0 for astropy). PSFs are on the pixels of their stamps: images,
+        or formulas whose shapes refer to the pixel axes. Without a WCS, the frame is that of the pixels.
     submission : str, path, mapping or Configuration
         The configuration: see :func:`submission`.
     threads : int, optional
@@ -154,7 +163,8 @@ def measure(
     Returns
     -------
     Catalogue
-        Of shape (n,), with the same bits as a catalogue of the command line.
+        Of shape (n,), with the same bits as a catalogue of the command line. ``attrs['frame']`` is 'pixel' or 'sky'.
+        Sizes are in pixels; with a WCS, in sides of a square of a pixel's area.
 
     Raises
     ------
@@ -188,8 +198,8 @@ def measure(
     g1 = ... ± ..., g2 = ... ± ... (400 galaxies, 0 flagged)
     >>> cat.write("shapes.parquet", overwrite=True)
     """
-    stamps, psf = _galsim.unpacked(stamps, psf)
-    return _measure(stamps, psf, noise, mask, (ids, x, y), resolve(submission), thread_count(threads), callback(progress))
+    stamps, psf = _galsim.unpacked(stamps, psf, check=wcs is None)
+    return _measure(stamps, psf, noise, mask, wcs, (ids, x, y), resolve(submission), thread_count(threads), callback(progress))
 
 
 def measure_blocks(
@@ -202,6 +212,7 @@ def measure_blocks(
     x: ArrayLike | None = None,
     y: ArrayLike | None = None,
     ids: ArrayLike | None = None,
+    wcs: WcsLike | None = None,
     submission: SubmissionLike = "48/linear/star",
     threads: int | None = None,
     progress: Callable[[int], object] | None = None,
@@ -212,7 +223,7 @@ def measure_blocks(
     ----------
     stamps : array, or anything with a shape (n, ny, nx) and slices
         Memory maps, and arrays of h5py, zarr or dask: each block is read when it is measured.
-    psf, noise, mask, x, y, ids, submission, threads, progress
+    psf, noise, mask, x, y, ids, wcs, submission, threads, progress
         As for :func:`measure`.
     block : int
         Most stamps of a block. Blocks are as equal as possible. A block needs enough galaxies for its mean response:
@@ -236,7 +247,7 @@ def measure_blocks(
     >>> print(shearq.mean_shear(blocks))
     g1 = ... ± ..., g2 = ... ± ... (400 galaxies, 0 flagged)
     """
-    stamps, psf = _galsim.unpacked(stamps, psf)
+    stamps, psf = _galsim.unpacked(stamps, psf, check=wcs is None)
     most = whole("block", block, 1, 1 << 40)
     if isinstance(stamps, (list, tuple)):
         stamps = numeric("stamps", stamps)
@@ -244,6 +255,8 @@ def measure_blocks(
     if len(shape) != 3:
         raise ValueError(f"stamps: found an array of shape {shown(shape)}; expected (n, ny, nx)")
     each: dict[str, Any] = {"psf": psf, "noise": noise, "mask": mask, "ids": ids, "x": x, "y": y}
+    if wcs is not None:
+        wcs = jacobians(wcs, shape[0], x, y)
     per_galaxy = {"psf": 3, "noise": 1, "mask": 3, "ids": 1, "x": 1, "y": 1}
     for name, value in each.items():
         if value is not None and not isinstance(value, FunctionalPsf) and not hasattr(value, "shape"):
@@ -265,8 +278,9 @@ def measure_blocks(
             one, level, missing, *columns = (part(name, start, end) for name in each)
             pixels = stamps[start:end]
             pixels = pixels if isinstance(pixels, np.ndarray) else np.asarray(pixels)
+            local = wcs if wcs is None or len(wcs) == 1 else wcs[start:end]
             try:
-                yield _measure(pixels, one, level, missing, tuple(columns), settings, count, done)
+                yield _measure(pixels, one, level, missing, local, tuple(columns), settings, count, done)
             except ValueError as error:
                 raise ValueError(f"{error} (stamps {start} to {end - 1})") from None
 
@@ -278,6 +292,7 @@ def _measure(
     psf: Any,
     noise: ArrayLike | None,
     mask: ArrayLike | None,
+    wcs: WcsLike | None,
     columns: tuple[Any, ...],
     settings: Configuration,
     threads: int,
@@ -291,6 +306,8 @@ def _measure(
     if rows != sides:
         raise ValueError(f"stamps: found an array of shape {shown(stamps.shape)}; expected squares, ny = nx")
     own = _own_columns(columns, count)
+    _, x, y = columns
+    on_sky = None if wcs is None else jacobians(wcs, count, x, y)
     star = stars = formulas = None
     if isinstance(psf, FunctionalPsf):
         formulas = psf._rows
@@ -314,8 +331,8 @@ def _measure(
             raise ValueError(
                 f"noise: found an array of shape {shown(sigmas.shape)}; expected one number, or ({count},), one for each stamp"
             )
-    found, doubts, failure = _shearq.measure(
-        stamps, star, stars, formulas, sigma, sigmas, settings._resolved, threads, progress
+    found, doubts, failure, frame = _shearq.measure(
+        stamps, star, stars, formulas, sigma, sigmas, on_sky, settings._resolved, threads, progress
     )
     for doubt in doubts:
         warn(doubt, DataWarning)
@@ -331,6 +348,7 @@ def _measure(
     catalogue.attrs = {
         "submission": settings.name,
         "ellipticity": settings.ellipticity,
+        "frame": frame,
         "settings": settings.toml,
         "version": _shearq.__version__,
     }

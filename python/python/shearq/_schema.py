@@ -28,7 +28,7 @@ UNITS = {"x": "pix", "y": "pix", "radius": "pix"}
 # Keys of files, and the names of ``attrs``.
 KEYS = {"submiss": "submission", "elltype": "ellipticity", "settings": "settings", "creator": "version"}
 # Keys of the command line's files that are kept as they are.
-OTHER_KEYS = ("set", "image", "warnings")
+OTHER_KEYS = ("set", "image", "warnings", "frame")
 # The keys of the command line's files for the noise of a star, and for its fingerprint.
 STAR_KEY, PSF_KEY = "psfnoise", "psf"
 _CREATOR = "shearq "

@@ -1,0 +1,107 @@
+"""Shapes in the frame of the sky."""
+
+import numpy as np
+import pytest
+import shearq
+from shearq._wcs import jacobians
+
+from conftest import same_bits
+
+# Mirrored, turned and sheared pixels.
+MATRIX = np.array([[0.02, 0.16], [0.157, -0.01]])
+CENTRE = (150.0, 60.0)
+
+
+def _raw(catalogue):
+    """Ellipticities before calibration."""
+    return [catalogue[f"e{k}"] * catalogue[f"divisor{k}"] for k in "12"]
+
+
+def test_mirrored_pixels_change_the_sign_of_e2(image):
+    plain = shearq.measure(image.stamps, image.psf)
+    assert plain.attrs["frame"] == "pixel"
+    along = shearq.measure(image.stamps, image.psf, wcs=np.diag([0.2, 0.2]))
+    assert along.attrs["frame"] == "sky"
+    for name in ("e1", "e2", "R12", "size_g2", "n2_es"):
+        assert same_bits(plain[name], along[name])
+    mirrored = shearq.measure(image.stamps, image.psf, wcs=np.tile(np.diag([-0.2, 0.2]), (len(plain), 1, 1)))
+    for name, sign in {"e1": 1, "e2": -1, "R11": 1, "R12": -1, "size_g1": 1, "size_g2": -1}.items():
+        assert np.allclose(mirrored[name], sign * plain[name], rtol=1e-12, equal_nan=True), name
+    with pytest.raises(ValueError, match="frames of pixels and of the sky"):
+        shearq.concatenate([plain, along])
+
+
+def test_turned_pixels_turn_ellipticities_and_responses(image):
+    plain = shearq.measure(image.stamps, image.psf)
+    cos, sin = np.cos(np.radians(37)), np.sin(np.radians(37))
+    turned = shearq.measure(image.stamps, image.psf, wcs=0.2 * np.array([[cos, -sin], [sin, cos]]))
+    (e1, e2), (f1, f2) = _raw(plain), _raw(turned)
+    expected = (e1 + 1j * e2) * np.exp(2j * np.radians(37))
+    assert np.allclose(f1 + 1j * f2, expected, atol=1e-12, equal_nan=True)
+    trace, other = plain["R11"] + plain["R22"], turned["R11"] + turned["R22"]
+    assert np.allclose(trace, other, rtol=1e-12, equal_nan=True)
+    # The frame is kept by files.
+    assert shearq.concatenate([turned, turned]).attrs["frame"] == "sky"
+
+
+def test_blocks_take_their_own_jacobians(image):
+    each = np.array([MATRIX * (1 if k % 3 else -1) @ np.diag([1 + 1e-3 * (k % 5), 1]) for k in range(144)])
+    blocks = list(shearq.measure_blocks(image.stamps, image.psf, block=72, wcs=each))
+    assert [part.attrs["frame"] for part in blocks] == ["sky", "sky"]
+    alone = shearq.measure(image.stamps[72:], image.psf, wcs=each[72:])
+    assert same_bits(blocks[1], alone)
+
+
+def test_a_wcs_gives_the_same_jacobians_in_galsim_and_astropy():
+    galsim = pytest.importorskip("galsim")
+    pytest.importorskip("astropy")
+    from astropy.wcs import WCS
+
+    header = {"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRPIX1": 100.0, "CRPIX2": 120.0}
+    header |= {"CRVAL1": CENTRE[0], "CRVAL2": CENTRE[1], "CUNIT1": "deg", "CUNIT2": "deg"}
+    # Right ascension is to the east, −u.
+    header |= {f"CD{i}_{j}": value / 3600 for (i, j), value in {(1, 1): -0.02, (1, 2): -0.16, (2, 1): 0.157, (2, 2): -0.01}.items()}
+    affine = galsim.AffineTransform(*MATRIX.ravel(), origin=galsim.PositionD(100.0, 120.0))
+    centre = galsim.CelestialCoord(CENTRE[0] * galsim.degrees, CENTRE[1] * galsim.degrees)
+    x, y = np.array([100.0, 9000.0, -4000.0]), np.array([120.0, 500.0, 8000.0])
+    by_galsim = jacobians(galsim.TanWCS(affine, centre), 3, x, y)
+    by_astropy = jacobians(WCS(header), 3, x - 1, y - 1)
+    assert np.allclose(by_galsim[0], MATRIX, atol=1e-9)
+    assert np.allclose(by_astropy, by_galsim, atol=1e-8)
+    # It varies.
+    assert np.abs(by_galsim[1] - MATRIX).max() > 1e-4
+    assert np.array_equal(jacobians(galsim.JacobianWCS(*MATRIX.ravel()), 3, None, None), [MATRIX])
+    assert np.array_equal(jacobians([galsim.PixelScale(0.1 * k) for k in (1, 2, 3)], 3, None, None)[1], 0.2 * np.eye(2))
+    with pytest.raises(ValueError, match="Try: x=, y="):
+        jacobians(WCS(header), 3, None, None)
+    with pytest.raises(ValueError, match=r"expected \(3,\)"):
+        jacobians(WCS(header), 3, x[:2], y[:2])
+
+
+def test_galsim_images_are_measured_on_their_own_pixels():
+    galsim = pytest.importorskip("galsim")
+    wcs = galsim.JacobianWCS(*MATRIX.ravel())
+    psf = galsim.Moffat(beta=3, fwhm=0.55).shear(g1=0.03, g2=-0.02)
+    shapes = [(0.1, 0.0), (-0.1, 0.0), (0.0, 0.1), (0.0, -0.1)]
+    galaxies = [galsim.Exponential(half_light_radius=0.6, flux=1e3).shear(g1=g1, g2=g2) for g1, g2 in shapes]
+    images = [galsim.Convolve(galaxy, psf).drawImage(nx=48, ny=48, wcs=wcs) for galaxy in galaxies]
+    found = shearq.measure(images, psf, noise=0.01, wcs=wcs)
+    # Galaxies of these shapes, not of shears: they respond by a little less than the mean.
+    assert np.allclose(np.sign(np.round(found["e1"], 2)), [1, -1, 0, 0])
+    assert np.allclose(np.sign(np.round(found["e2"], 2)), [0, 0, 1, -1])
+
+
+def test_wrong_wcs_are_named(image):
+    def measure(wcs, **more):
+        return shearq.measure(image.stamps, image.psf, wcs=wcs, **more)
+
+    with pytest.raises(ValueError, match=r"wcs: found an array of shape \(3, 2, 2\); expected \(2, 2\), or \(144, 2, 2\)"):
+        measure(np.ones((3, 2, 2)))
+    with pytest.raises(ValueError, match="wcs: the Jacobian .* determinant other than zero"):
+        measure([[0.2, 0.1], [0.4, 0.2]])
+    with pytest.raises(ValueError, match="sheared by .* Try: resampled images"):
+        measure(np.diag([0.3, 0.1]))
+    with pytest.raises(ValueError, match="sheared by .* Try: a linear configuration"):
+        measure(MATRIX, submission="23/raw/star")
+    with pytest.raises(TypeError, match="wcs"):
+        measure("header")
