@@ -463,8 +463,10 @@ impl ImageWorker<'_> {
             }
             let usable_psf = match &shared {
                 Some(psf) => {
-                    if new {
-                        self.worker.method.set_psf(psf.view())?;
+                    match (k, new) {
+                        (0, _) => self.worker.method.set_psf(psf.view())?,
+                        (_, true) => self.worker.method.retake_psf(),
+                        (_, false) => {}
                     }
                     true
                 }

@@ -70,6 +70,9 @@ pub(crate) trait CutWorker: Send {
 
     fn set_psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<(), MeasureError>;
 
+    /// Takes the PSF set last on pixels of another shape: what was adapted to it stays.
+    fn retake_psf(&mut self) {}
+
     /// The settings that were adapted to PSF and galaxies, if the method adapts any.
     fn adapted(&self) -> Option<AdaptedSettings> {
         None

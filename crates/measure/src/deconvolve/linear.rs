@@ -110,7 +110,7 @@ pub struct Spectral {
 }
 
 /// Buffers for one thread. Their content between calls does not matter, but for the stamp that
-/// [`Spectral::noise_field`] looks at.
+/// [`Spectral::noise_field`] looks at, and the PSF on pixels of another shape.
 #[derive(Debug, Clone)]
 pub struct SpectralScratch {
     of_stamp: TransformScratch,
@@ -448,6 +448,23 @@ impl Spectral {
         let fits = side < p && (p - side).is_multiple_of(2);
         check_psf(psf, if fits { side } else { p })?;
         let first = (p - side) / 2;
+        let image = &mut scratch.psf_image;
+        image.fill(0.0);
+        let rows = image.chunks_exact_mut(p).skip(first);
+        for (row, from) in rows.zip(psf.into_outer_iter()) {
+            copy_row(from, &mut row[first..]);
+        }
+        self.retake_psf(noise, scratch, out);
+        Ok(())
+    }
+
+    /// Takes the PSF last given again, after a change of the noise or of the shape of pixels.
+    pub(crate) fn retake_psf(
+        &self,
+        noise: &ModeNoise,
+        scratch: &mut SpectralScratch,
+        out: &mut SpectralPsf,
+    ) {
         let SpectralScratch {
             of_psf,
             windowed: spectra,
@@ -464,11 +481,6 @@ impl Spectral {
             Some(skewed) if *pixels != PixelShape::SQUARE => &skewed[1],
             _ => &self.psf,
         };
-        image.fill(0.0);
-        let rows = image.chunks_exact_mut(p).skip(first);
-        for (row, from) in rows.zip(psf.into_outer_iter()) {
-            copy_row(from, &mut row[first..]);
-        }
         to_modes.transform_moments(image, of_psf, spectra);
         for (modes, spectrum) in changes.iter_mut().zip(&*spectra) {
             modes.take_spectrum(spectrum);
@@ -497,7 +509,6 @@ impl Spectral {
             weighted(kind, power, &self.counts, area, even);
             even_parities(even, out);
         }
-        Ok(())
     }
 
     /// Puts the window at `centre`, (x, y) in pixels from the middle of the stamp, for the stamps that follow.

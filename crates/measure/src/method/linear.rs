@@ -327,6 +327,12 @@ impl CutWorker for LinearWorker {
         worker.set_psf(psf)
     }
 
+    fn retake_psf(&mut self) {
+        let worker = &mut self.workers[self.current].1;
+        worker.set_pixel_shape(self.pixels, &self.noise);
+        worker.retake_psf();
+    }
+
     fn adapted(&self) -> Option<AdaptedSettings> {
         Some(self.workers[self.current].1.plan.lengths)
     }
@@ -428,6 +434,13 @@ impl PlanWorker {
         let squares: f64 = psf.iter().map(|value| value * value).sum();
         self.psf_variance = 1.0 / (4.0 * std::f64::consts::PI * squares);
         Ok(())
+    }
+
+    fn retake_psf(&mut self) {
+        let plan = &self.plan;
+        plan.spectral
+            .retake_psf(&self.noise, &mut self.buffers, &mut self.psf);
+        self.regularisation = plan.regularisation.behind(&self.psf);
     }
 
     /// Response of `shape` to a change of the autocorrelation by `lags.shear1` and `lags.shear2`.
