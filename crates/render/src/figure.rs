@@ -97,9 +97,6 @@ pub enum PictureFormat {
 
 impl PictureFormat {
     /// The format that the extension of `path` names, in capitals or not.
-    ///
-    /// # Errors
-    /// [`FigureError::Extension`] if it is neither `png` nor `svg`.
     pub fn of(path: &Path) -> Result<Self, FigureError> {
         let extension = path.extension().map(|e| e.to_string_lossy());
         match extension.as_deref().map(str::to_ascii_lowercase).as_deref() {
@@ -115,20 +112,13 @@ impl PictureFormat {
 
 /// A picture that can be drawn. Values that are not finite, or not positive on a logarithmic axis, are left out.
 pub trait Figure {
-    // Width and height in points.
+    /// Width and height in points.
     fn size(&self) -> (f64, f64);
 
-    // The contents of a picture file. The same figure gives the same bytes.
-    //
-    // # Errors
-    // `FigureError::Lengths`, `FigureError::TooLarge` and `FigureError::Drawing`.
+    /// The contents of a picture file. The same figure gives the same bytes.
     fn render(&self, format: PictureFormat) -> Result<Vec<u8>, FigureError>;
 
-    // Writes the figure to `path`, as PNG or SVG by its extension; a file that is there is replaced
-    // at once or, on failure, not at all.
-    //
-    // # Errors
-    // Those of `PictureFormat::of` and `Figure::render`, and `FigureError::File`.
+    // Writes the figure to `path`, as PNG or SVG by its extension.
     fn save(&self, path: impl AsRef<Path>) -> Result<(), FigureError>
     where
         Self: Sized,

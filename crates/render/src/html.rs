@@ -227,19 +227,34 @@ impl Render for Words<'_> {
     }
 }
 
-// Words in which symbols with an index are typeset. Not for attributes.
+// Words in which symbols with an index are typeset, such as C_ℓ, Q_dn and σ_sys. Not for attributes.
 struct Typeset<'a>(&'a str);
 
 impl Render for Typeset<'_> {
     fn render_to(&self, page: &mut String) {
         let words = Words(self.0).render().into_string();
-        page.push_str(
-            &words
-                .replace("C_ℓ", "C<sub>ℓ</sub>")
-                .replace("Q_dn", "Q<sub>dn</sub>")
-                .replace("σ_sys", "σ<sub>sys</sub>"),
-        );
+        let is_word = |c: char| c.is_alphanumeric() || c == '_';
+        for word in words.split_inclusive(|c| !is_word(c)) {
+            let end = word.find(|c| !is_word(c)).unwrap_or(word.len());
+            match word[..end].split_once('_') {
+                Some((symbol, index)) if is_symbol(symbol, index) => {
+                    page.push_str(&format!("{symbol}<sub>{index}</sub>{}", &word[end..]));
+                }
+                _ => page.push_str(word),
+            }
+        }
     }
+}
+
+// One letter with a short index, perhaps after others that are not ASCII, as in ℓ²C_ℓ. Names of files and columns keep their
+// underscores.
+fn is_symbol(symbol: &str, index: &str) -> bool {
+    let mut letters = symbol.chars().rev();
+    let is_letter = |c: char| c.is_uppercase() || !c.is_ascii();
+    letters.next().is_some_and(is_letter)
+        && letters.all(|c| !c.is_ascii())
+        && (1..=3).contains(&index.chars().count())
+        && index.chars().all(char::is_alphabetic)
 }
 
 fn head(title: &str) -> Markup {

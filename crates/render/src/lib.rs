@@ -8,7 +8,6 @@
 
 pub mod escape;
 pub mod figure;
-mod formats;
 pub mod html;
 pub mod page;
 pub mod table;

@@ -71,6 +71,7 @@ impl<'a> Page<'a> {
         figure: &impl Figure,
         caption: &str,
     ) -> Result<(), PageError> {
+        // PNG for slides, SVG for papers.
         for ending in ["png", "svg"] {
             figure.save(self.out.join(format!("figures/{name}.{ending}")))?;
         }

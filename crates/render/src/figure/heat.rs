@@ -62,6 +62,7 @@ impl HeatMap {
     /// The table for a terminal, with coloured cells if it has colours.
     pub fn terminal(&self, coloured: bool) -> String {
         let cells = self.values.map(|&value| self.cell(value));
+        // Counted in characters, as terminals do, and not in bytes.
         let longest = |texts: &mut dyn Iterator<Item = &String>| {
             texts.map(|text| text.chars().count()).max().unwrap_or(0)
         };
@@ -75,6 +76,7 @@ impl HeatMap {
         for (name, row) in self.rows.iter().zip(cells.rows()) {
             text.push_str(&format!("{name:names$}"));
             for (words, paper) in row {
+                // A missing value has no colour of the map, which would look like a value.
                 if coloured && words != "–" {
                     let (RGBColor(r, g, b), RGBColor(pr, pg, pb)) = (text_on(*paper), paper);
                     text.push_str(&format!(
@@ -96,6 +98,7 @@ impl HeatMap {
             .map(|&value| self.cell(value).0)
             .collect();
         let value = widest(values.iter().map(String::as_str), TICK_SIZE);
+        // All columns are equally wide, so that colours compare by area.
         let name = widest(self.columns.iter().map(String::as_str), TICK_SIZE);
         let cell = value.max(name) + 16.0;
         let rows = widest(self.rows.iter().map(String::as_str), TICK_SIZE);

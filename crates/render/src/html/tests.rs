@@ -187,8 +187,10 @@ fn control_characters_are_written_out() {
         "a\\u0000\\u000d\n&lt;"
     );
     assert_eq!(
-        Typeset("√A of C_ℓ").render().into_string(),
-        "√A of C<sub>ℓ</sub>"
+        Typeset("ℓ²C_ℓ/2π, σ_sys and Q_dn of NN_set1.dat, A_1 and q_dn")
+            .render()
+            .into_string(),
+        "ℓ²C<sub>ℓ</sub>/2π, σ<sub>sys</sub> and Q<sub>dn</sub> of NN_set1.dat, A_1 and q_dn"
     );
 }
 
