@@ -238,6 +238,7 @@ pub fn verify(
     pool: &Pool,
 ) -> Result<(), FileError> {
     if let Source::Folder { layout, .. } = &run.source {
+        // They are in no file of an image, but change the scale of ℓ and the sign of the true g2.
         let of = |layout: &Layout| (layout.field_degrees, layout.truth_sign);
         let (then, now) = (of(layout), of(data.layout()));
         if then != now {

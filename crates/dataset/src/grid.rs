@@ -10,7 +10,7 @@ use crate::mosaic::Mosaic;
 use shearq_files::FileError;
 use shearq_files::fits::ImageReader;
 
-/// Pixels a side of a stamp of an image: STAMP in its header, or else `stamp` in the layout.
+// Pixels a side of a stamp of an image: STAMP in its header, or else `stamp` in the layout.
 fn stamp_of_image(data: &DataFolder, path: &Path, image: &ImageReader) -> Result<usize, FileError> {
     Ok(whole(image, path, "STAMP", MAX_STAMP)?.unwrap_or(data.layout().stamp))
 }

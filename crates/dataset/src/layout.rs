@@ -71,7 +71,7 @@ impl<'de> Deserialize<'de> for Layout {
 }
 
 impl Layout {
-    /// Checks every value against its range.
+    // Checks every value against its range.
     fn validate(&self) -> Result<(), String> {
         let Layout {
             galaxies,
@@ -169,7 +169,7 @@ impl DataFolder {
         self.image(&self.layout.psf_star, set, image)
     }
 
-    /// A FITS image, which may be compressed, by the pattern of its name.
+    // A FITS image, which may be compressed, by the pattern of its name.
     fn image(&self, pattern: &str, set: u32, image: u32) -> PathBuf {
         let plain = self.root.join(fill(pattern, set, image));
         endings(pattern)
@@ -266,7 +266,7 @@ pub fn truth_is_there(path: &Path) -> Result<(), FileError> {
     Err(FileError::new(path, message))
 }
 
-/// Further endings of the names of images: of gzip and fpack.
+// Further endings of the names of images: of gzip and fpack.
 fn endings(pattern: &str) -> &'static [&'static str] {
     match pattern.ends_with(".fits") || pattern.ends_with(".fit") {
         true => &["", ".gz", ".fz"],

@@ -220,7 +220,7 @@ impl Search<'_> {
         self.files.pass_over(Reason::Second, path, || name);
     }
 
-    /// Notes a name that nearly matches a pattern.
+    // Notes a name that nearly matches a pattern.
     fn pass_over(&mut self, path: PathBuf, name: &str, pattern: &[Piece<'_>], folder: bool) {
         if path.is_dir() != folder {
             return;
@@ -394,7 +394,7 @@ fn pieces(pattern: &OsStr) -> Vec<Piece<'_>> {
     found
 }
 
-/// All ways in which a name can follow a pattern, given the numbers known already.
+// All ways in which a name can follow a pattern, given the numbers known already.
 fn matches(pattern: &[Piece<'_>], name: &str, known: Numbers) -> Vec<Numbers> {
     let Some((piece, rest)) = pattern.split_first() else {
         return if name.is_empty() {

@@ -100,7 +100,7 @@ impl Claim {
         self.check().map_or_else(E::from, |()| error)
     }
 
-    /// Whether the record is the file that was claimed.
+    // Whether the record is the file that was claimed.
     #[cfg(unix)]
     fn is_there(&self) -> bool {
         use std::os::unix::fs::MetadataExt;
@@ -170,7 +170,7 @@ pub fn claim<R: Serialize + DeserializeOwned>(path: &Path, record: &R) -> Result
 const MAX_DIFFERENCES: usize = 6;
 const MAX_DIFFERENCE_CHARS: usize = 160;
 
-/// The differences that explain most, in this order, and the number of the others.
+// The differences that explain most, in this order, and the number of the others.
 fn most_important(mut differences: Vec<String>) -> Vec<String> {
     const FIRST: [&str; 8] = [
         "version",

@@ -52,7 +52,7 @@ impl Threads for Pool {
 /// Receives the progress of long work, from the thread that called it.
 pub trait Progress {
     fn advance(&mut self, galaxies: u64);
-    /// `galaxies` more were done before.
+    // `galaxies` more were done before.
     fn skip(&mut self, galaxies: u64) {
         self.advance(galaxies);
     }

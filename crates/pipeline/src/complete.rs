@@ -67,6 +67,7 @@ impl Results<'_> {
         };
         let pool = Pool::new(threads)?;
         let checked = pool.in_order(0..images.len(), |position| {
+            // The true shear belongs to a set, so it is checked with the first of its images.
             let first = position == 0 || images[position - 1].set != images[position].set;
             self.check(images[position], first, inputs.as_ref())
         });
@@ -91,7 +92,7 @@ impl Results<'_> {
         Ok(faults)
     }
 
-    /// The file that is written last for an image.
+    // The file that is written last for an image.
     fn result(&self, id: ImageId) -> PathBuf {
         match self {
             Results::Catalogues { run, out, .. } => run.catalogue(out, id.set, id.image),
@@ -99,7 +100,6 @@ impl Results<'_> {
         }
     }
 
-    /// Number of galaxies that an image should have.
     fn cells(&self, id: ImageId) -> Result<usize, PipelineError> {
         let settings = match self {
             Results::Catalogues { run, data, .. } => match &run.source {
@@ -111,8 +111,8 @@ impl Results<'_> {
         Ok(settings.grid.pow(2))
     }
 
-    /// Number of galaxies of an image whose results are right. With the `first` image of a set, its true shear is checked
-    /// too.
+    // Number of galaxies of an image whose results are right. With the `first` image of a set, its true shear is checked
+    // too.
     fn check(
         &self,
         id: ImageId,
@@ -157,6 +157,7 @@ fn check_catalogue(
     path: &Path,
     cells: usize,
 ) -> Result<(), PipelineError> {
+    // One row more than expected is enough to find that there are too many.
     let rows = table::read(path, None, cells.saturating_add(1))?.height();
     check_rows(path, rows, cells)?;
     let expected = kept(&metadata(run, id, prints)?, run.format);
@@ -176,7 +177,6 @@ fn check_catalogue(
     }
 }
 
-/// Checks the files of one simulated image.
 fn check_image(
     record: &SimulationRecord,
     data: &DataFolder,
@@ -193,6 +193,7 @@ fn check_image(
         );
         return Err(FileError::new(&path, message).into());
     }
+    // A truncated file has a whole header, which states pixels that are missing.
     let bytes = std::fs::metadata(&path)
         .map_err(FileError::doing(&path, "cannot open the image"))?
         .len();

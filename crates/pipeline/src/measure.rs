@@ -79,6 +79,7 @@ pub fn measure_images<'n, H: Send + Sync>(
             Ok((row.head, rows.collect::<Result<Vec<_>, PipelineError>>()?))
         },
         |(head, rows)| {
+            // Rows come in order, so that the image of the first row is complete before another one begins.
             if images.is_empty() {
                 let sessions = rows.iter().map(|(session, _)| Arc::clone(session).begin());
                 images = sessions.collect::<Result<_, _>>()?;
@@ -116,6 +117,7 @@ impl<'a> FolderMeasurement<'a> {
         out: &'a Path,
         images: &'a [ImageId],
     ) -> Result<Self, PipelineError> {
+        // Opened before anything is written: a folder whose first image cannot be read stays as it is.
         let (todo, _) = catalogue::to_do(run, out, images);
         let first = todo.first().map(|&id| {
             let source = ImageSource::open(data, id, &run.configuration)?;
@@ -144,6 +146,7 @@ impl<'a> FolderMeasurement<'a> {
     ) -> Result<Summary, PipelineError> {
         let mut catalogues = Catalogues::claim(self.run, self.out, self.images)?;
         let inputs = Inputs::new(self.run, self.data, self.images)?;
+        // Catalogues of an earlier call are kept only if their images are still the same.
         inputs.verify(self.out, &catalogues.done, &Pool::new(threads)?)?;
         let Some((_, mosaic)) = self.todo else {
             return catalogues.finish(progress);
@@ -181,6 +184,7 @@ impl<'a> FolderMeasurement<'a> {
             let prints = inputs.prints(id)?;
             let mut source = ImageSource::open(self.data, id, measurer.configuration())?;
             let (mosaic, stamp) = (source.mosaic(), measurer.full());
+            // The method is planned once, for one size of stamps.
             if mosaic.stamp != stamp {
                 let path = self.data.galaxies(id.set, id.image);
                 let message = format!(

@@ -32,7 +32,7 @@ pub struct SimulatedSource<'s> {
     fields: Arc<ImageFields>,
     form: PsfForm,
     shared: Option<ArcArray2<f64>>,
-    /// Rows that are measured by several measurers, or were drawn for a survey and will be measured.
+    // Rows that are measured by several measurers, or were drawn for a survey and will be measured.
     drawn: Arc<Mutex<BTreeMap<usize, LazyStamps<'s>>>>,
 }
 
@@ -50,6 +50,7 @@ impl<'s> SimulatedSource<'s> {
                 let cut = configuration.psf_cut();
                 let psf = match form {
                     PsfForm::Functional => psf.stamp_beside(cut.size, STAMP),
+                    // A star that cannot be cut is an error: zeros in its place would be measured like any PSF.
                     PsfForm::Star => Star::cut(fields.psf.star(0, 0).view(), cut)?.psf,
                 };
                 Some(psf.into_shared())
@@ -64,7 +65,7 @@ impl<'s> SimulatedSource<'s> {
         })
     }
 
-    /// The PSFs of a row in the form that the configuration uses.
+    // The PSFs of a row in the form that the configuration uses.
     fn row_psfs(&self, row: usize) -> Lazy<'s, Psfs<'s>> {
         if let Some(psf) = &self.shared {
             return Psfs::Prepared(psf.clone()).into();
@@ -102,6 +103,7 @@ impl<'s> StampSource<'s> for SimulatedSource<'s> {
         let (set, fields) = (self.set, Arc::clone(&self.fields));
         let mut drawn = self.drawn.lock().unwrap_or_else(PoisonError::into_inner);
         let lazy = drawn.entry(row).or_insert_with(|| {
+            // By the function that `simulate` stores images with, so that what is stored and what is measured in memory are equal.
             let draw = move |scratch: &mut RenderScratch| set.draw_row(&fields, row, scratch);
             Lazy::new(move || stamps(SCRATCH.with_borrow_mut(draw), set.grid().n))
         });
@@ -136,6 +138,7 @@ impl<'s> SimulatedSessions<'s> {
         let sessions = measurers.iter().map(|measurer| {
             let configuration = measurer.configuration();
             let mut source = SimulatedSource::new(set, &fields, configuration, &drawn)?;
+            // What the header of a stored image states, so that catalogues are equal to those of `measure`.
             let noise = KnownNoise::Stated(NOISE_SIGMA);
             let session = Session::open(measurer, &mut source, noise, threads)?;
             Ok((Arc::new(session), source))
@@ -146,13 +149,14 @@ impl<'s> SimulatedSessions<'s> {
         })
     }
 
-    /// Reads a row for all measurers, which is drawn once.
+    // Reads a row for all measurers, which is drawn once.
     fn read(&mut self, row: usize) -> Result<ImageRow<'s, ImageFields>, PipelineError> {
         let each = self.sessions.iter_mut();
         let jobs = each.map(|(session, source)| session.read(source, row));
         let jobs = jobs.collect::<Result<_, _>>()?;
         if let Some((_, source)) = self.sessions.first() {
             let mut drawn = source.drawn.lock().unwrap_or_else(PoisonError::into_inner);
+            // All sessions have read the row. Kept rows would add up to the whole image.
             drawn.remove(&row);
         }
         Ok(ImageRow {
@@ -206,6 +210,7 @@ pub fn run_folder(
         let set = of_set[0].set;
         let todo: Vec<u32> = of_set.iter().map(|id| id.image).collect();
         let simulator = simulate::simulator(set, settings)?;
+        // Beside the catalogues, because there is no data folder that `score` could read it from.
         simulate::write_truth(&truth, &simulator)?;
         run_set(
             &simulator,
@@ -308,7 +313,7 @@ mod tests {
     use super::*;
     use shearq_dataset::run::Source;
 
-    /// Galaxies that were done when each warning was shown.
+    // Galaxies that were done when each warning was shown.
     #[derive(Default)]
     struct Recorder {
         done: u64,

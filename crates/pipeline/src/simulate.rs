@@ -50,6 +50,7 @@ pub fn simulate_blind(
     progress: &mut dyn Progress,
 ) -> Result<(usize, usize), PipelineError> {
     let claim = claim(&private.root().join(SIMULATION_FILE), record)?;
+    // The galaxies of an image are written last, so that their file shows that the image is complete.
     let todo: Vec<ImageId> = images
         .iter()
         .filter(|id| !public.galaxies(id.set, id.image).is_file())
@@ -103,7 +104,6 @@ pub fn simulate_blind(
     Ok((made, already))
 }
 
-/// A row of stamps to draw.
 struct Row<'s> {
     set: &'s SetSimulator,
     fields: Arc<ImageFields>,
@@ -129,7 +129,6 @@ pub(super) fn write_truth(data: &DataFolder, set: &SetSimulator) -> Result<(), P
     Ok(truth::write_truth(&path, &set.grid(), &set.truth())?)
 }
 
-/// Files of one image that is being written.
 struct OpenImage<'s> {
     set: &'s SetSimulator,
     fields: Arc<ImageFields>,
@@ -158,12 +157,14 @@ impl<'s> OpenImage<'s> {
             ("NOISESIG", Value::Real(NOISE_SIGMA)),
             creator.clone(),
         ]);
+        // Participants of a challenge get the public folder: the seed would repeat the simulation, with its shear.
         if public.root() == private.root() {
             let seed = record.settings.seed;
             header.extend([
                 ("SNR", Value::Real(set.nominal_snr())),
                 ("KIND", Value::Text(set.kind().image.label().into())),
                 match i64::try_from(seed) {
+                    // Integers of FITS are signed, seeds are not.
                     Ok(seed) => ("SEED", Value::Int(seed)),
                     Err(_) => ("SEED", Value::Text(seed.to_string())),
                 },
@@ -224,7 +225,7 @@ impl<'s> OpenImage<'s> {
         Ok(())
     }
 
-    /// The galaxies are renamed last: an image with galaxies is complete.
+    // The galaxies are renamed last: an image with galaxies is complete.
     fn finish(self, private: &DataFolder) -> Result<(), PipelineError> {
         if let Some(stars) = self.stars {
             stars.finish()?;
