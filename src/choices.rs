@@ -8,7 +8,7 @@ use shearq_files::table::FileFormat;
 use shearq_render::table::TableFormat;
 use shearq_results::bias::columns::Shapes;
 use shearq_results::compare::Grouping;
-use shearq_results::submit::manifest::Contents;
+use shearq_results::submit::Contents;
 use shearq_scoring::Definition;
 
 // Clap's `ValueEnum` cannot be derived here: the types belong to crates without clap, so that libraries do not compile it.

@@ -9,7 +9,7 @@ use shearq_dataset::truth::{Sign, SignFault, word};
 use shearq_quantities::MeasuredRange;
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_results::foreign;
-use shearq_results::views::diagnosis;
+use shearq_results::views::scores;
 use shearq_scoring::modes::Decomposer;
 use shearq_scoring::resample::{PairedSet, paired_difference};
 use shearq_scoring::{
@@ -197,7 +197,7 @@ pub(crate) fn score<'py>(
         if let Some(fault) = foreign::fault_of_rows(&counts, &grid, ADVICE) {
             return Err(of_rows(&fault));
         }
-        let mut warnings = diagnosis::oddities(&counts, "e1, e2");
+        let mut warnings = scores::oddities(&counts, "e1, e2");
         let by_modes = sign_by_modes(&grid, &standard).map_err(of_scoring)?;
         let refused = |fault: SignFault| {
             // Arrays have no line that states a sign, as files do.
@@ -234,7 +234,7 @@ pub(crate) fn score<'py>(
             faults.add_response(scorer.response(image, scored.chosen));
             Ok(())
         })?;
-        let odd = diagnosis::odd_arrays(&faults).into_iter();
+        let odd = scores::odd_arrays(&faults).into_iter();
         warnings.extend(odd.map(|line| format!("warning: {line}.")));
         let faults_of_set = scorer.diagnose(&images, &scored, scored.chosen);
         for fault in faults_of_set.map_err(of_scoring)? {
@@ -245,7 +245,7 @@ pub(crate) fn score<'py>(
                 _ => false,
             };
             if !told {
-                warnings.push(format!("warning: {}.", diagnosis::words(&fault)));
+                warnings.push(format!("warning: {}.", scores::words(&fault)));
             }
         }
         PyResult::Ok((scored, warnings, challenge))

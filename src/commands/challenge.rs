@@ -16,7 +16,7 @@ use shearq_files::FileError;
 use shearq_files::open::is_there;
 use shearq_render::escape::line;
 use shearq_results::submit::check::{Finding, Severity, check_sent};
-use shearq_results::submit::packed::{Sent, Submission};
+use shearq_results::submit::{Sent, Submission};
 
 use super::check::report;
 use crate::arguments::{Form, SetList, Threads};

@@ -11,9 +11,8 @@ use shearq_dataset::layout::{DataFolder, Layout, MAX_IMAGE, read_rows};
 use shearq_dataset::truth::grid_of_set;
 use shearq_files::table::{MAX_ROWS, read_truth};
 use shearq_results::catalogues::COLUMNS;
-use shearq_results::submit::challenge::Kind;
 use shearq_results::submit::check::{Expected, Finding, Severity, check_sent};
-use shearq_results::submit::packed::Sent;
+use shearq_results::submit::{Kind, Sent};
 
 /// Check a submission before you send it.
 ///

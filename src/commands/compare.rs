@@ -8,12 +8,11 @@ use crate::{print_heat_map, score};
 use shearq_dataset::run::Run;
 use shearq_render::figure::{Figure, HeatMap};
 use shearq_render::table::{Table, TableFormat};
-use shearq_results::compare::{Group, Grouping, Order, chosen, score_all};
-use shearq_results::conditions::choose;
+use shearq_results::compare::{Group, Grouping, Order, choose, chosen, score_all};
 use shearq_results::expression::Expression;
 use shearq_results::record::RunRecord;
 use shearq_results::store;
-use shearq_results::submit::packed::is_packed;
+use shearq_results::submit::is_packed;
 use shearq_results::views::comparison::{
     compare, compare_runs, named, notes_of_variants, q_heat_map, verdict, verdict_on_runs,
 };

@@ -10,9 +10,8 @@ use crate::progress::Bar;
 use crate::{count, tell, tell_unread};
 use shearq_dataset::run::{Run, open_data};
 use shearq_results::catalogues::Catalogues;
-use shearq_results::submit::archive::is_archive;
-use shearq_results::submit::manifest::{Contents, Entry};
 use shearq_results::submit::pack::Packing;
+use shearq_results::submit::{Contents, Entry, is_archive};
 
 // Longest name of a method in bytes: a tar header has 100 for a file name.
 const MAX_METHOD_BYTES: usize = 64;

@@ -16,13 +16,11 @@ use shearq_dataset::run::{Run, Source, kind_of};
 use shearq_dataset::truth::{ReadTruth, Reading, Sign, read_truth, reading_of};
 use shearq_render::table::TableFormat;
 use shearq_results::catalogues::{COLUMNS, Catalogues};
-use shearq_results::foreign::{Screen, folder_of, plain_columns};
+use shearq_results::foreign::{Conversion, Screen, folder_of, plain_columns};
 use shearq_results::record::{RunRecord, SetRecord};
 use shearq_results::score::{ScoredSet, score_catalogues, score_files, unscored};
 use shearq_results::store;
-use shearq_results::submit::challenge::{Kind, read_bandpowers};
-use shearq_results::submit::manifest::Manifest;
-use shearq_results::submit::packed::{Packed, Sent, Submission};
+use shearq_results::submit::{Kind, Manifest, Packed, Sent, Submission, read_bandpowers};
 use shearq_results::views::comparison::verdict_line;
 use shearq_results::views::pages;
 use shearq_results::views::scores::{SetInput, one_set_json, per_set, spectra};
@@ -409,7 +407,10 @@ fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Resul
         missing: arguments.missing,
         drop_missing: arguments.drop_missing,
         max_modulus: arguments.max_modulus,
-        distortion: arguments.ellipticity == Some(EllipticityType::Distortion),
+        conversion: match arguments.ellipticity {
+            Some(EllipticityType::Distortion) => Conversion::ToShear,
+            _ => Conversion::None,
+        },
     };
     // A file that is given twice would count as two images without noise between them.
     let mut seen = BTreeSet::new();

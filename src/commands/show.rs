@@ -13,7 +13,7 @@ use shearq_dataset::run::open_data;
 use shearq_dataset::threads::Pool;
 use shearq_pipeline::measure::ImageSource;
 use shearq_render::figure::{Figure, PictureFormat};
-use shearq_results::views::steps::{steps_figure, steps_row};
+use shearq_results::views::pages::{steps_figure, steps_row};
 
 /// Plot each processing step of single galaxies, as in Fig. 3 of the paper.
 ///

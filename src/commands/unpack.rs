@@ -3,8 +3,7 @@ use std::path::PathBuf;
 use clap::Args;
 
 use crate::{count, tell};
-use shearq_results::submit::archive::{read, unpack};
-use shearq_results::submit::manifest::MANIFEST_FILE;
+use shearq_results::submit::{MANIFEST_FILE, read_archive, unpack};
 
 /// Unpack an archive that `pack` wrote, and verify its files.
 ///
@@ -27,7 +26,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let unpacked = match &arguments.out {
         Some(out) => unpack(archive, out, verify)?,
         None => {
-            let read = read(archive, None)?;
+            let read = read_archive(archive, None)?;
             read.verify(archive, verify)?;
             read
         }

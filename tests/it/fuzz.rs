@@ -14,7 +14,7 @@ use shearq_files::table;
 use shearq_measure::StampSource;
 use shearq_pipeline::measure::ImageSource;
 use shearq_results::foreign::Foreign;
-use shearq_results::submit::challenge::{Kind, read_spectrum};
+use shearq_results::submit::{Kind, read_spectrum};
 use shearq_submissions::{Configuration, Registry};
 
 use crate::support::{PACKED, Small, fits_image, gzip, pixels_of};

@@ -18,7 +18,7 @@ use shearq_pipeline::simulate::simulate_blind;
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_results::record::SetRecord;
 use shearq_results::score::ScoreError;
-use shearq_results::submit::manifest::Contents;
+use shearq_results::submit::Contents;
 use shearq_scoring::{Choice, Convention, Options, RowCounts, SetImages, SetScorer, TrueShear};
 use shearq_simulate::field::ShearSpectrum;
 use shearq_simulate::set::{STAMP, SimulationSettings};

@@ -3,9 +3,9 @@
 use std::path::{Path, PathBuf};
 
 use shearq_files::FileError;
-use shearq_results::submit::archive::{self, is_archive};
-use shearq_results::submit::challenge::Kind;
-use shearq_results::submit::manifest::{Entry, FileSum, MANIFEST_FILE, Manifest};
+use shearq_results::submit::{
+    Entry, FileSum, Kind, MANIFEST_FILE, Manifest, is_archive, read_archive,
+};
 
 use crate::seal::{entries, sha256};
 
@@ -166,7 +166,7 @@ pub fn content(sending: &Sending) -> Result<Content, FileError> {
     let (manifest, files) = match path.is_dir() {
         true => (Manifest::read(path)?, sums(path)?),
         false if is_archive(path) => {
-            let unpacked = archive::read(path, None)?;
+            let unpacked = read_archive(path, None)?;
             unpacked.verify(path, false)?;
             (unpacked.manifest, unpacked.files.into_iter().collect())
         }

@@ -15,10 +15,10 @@ use shearq_render::escape::line;
 use shearq_results::record::{RunRecord, SetRecord, definition_word};
 use shearq_results::score::ScoreError;
 use shearq_results::store;
-use shearq_results::submit::challenge::read_bandpowers;
 use shearq_results::submit::check::{CheckedSet, Severity, check_sent};
-use shearq_results::submit::manifest::{Contents, Entry as Team, Manifest};
-use shearq_results::submit::packed::{Packed, Sent, Submission};
+use shearq_results::submit::{
+    Contents, Entry as Team, Manifest, Packed, Sent, Submission, read_bandpowers,
+};
 use shearq_scoring::{
     Choice, Convention, Fault, Grid, Options, SCORED, ScoringError, SetScorer, TrueShear,
 };

@@ -4,7 +4,7 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use shearq_dataset::layout::Layout;
 use shearq_results::compare::Paired;
 use shearq_results::record::{SetRecord, mean};
-use shearq_results::submit::manifest::Contents;
+use shearq_results::submit::Contents;
 use shearq_scoring::Definition;
 
 use crate::constant::ConstantShears;

@@ -7,7 +7,7 @@ use shearq_render::figure::{FigureError, LinePlot, Series, Style};
 use shearq_render::html::{Block, Picture, Report, Section};
 use shearq_render::page::PageError;
 use shearq_render::table::{Cell, Table, TableFormat};
-use shearq_results::submit::challenge::Kind as FileKind;
+use shearq_results::submit::Kind as FileKind;
 use shearq_results::views::comparison::q_heat_map;
 
 use crate::constant::ConstantShears;

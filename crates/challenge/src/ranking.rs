@@ -395,7 +395,7 @@ pub(crate) mod tests {
     use crate::kind::GREAT10;
     use crate::terms::{Data, Rules};
     use shearq_results::record::SetRecord;
-    use shearq_results::submit::manifest::Contents;
+    use shearq_results::submit::Contents;
     use shearq_scoring::Metrics;
 
     pub(crate) fn record(set: u32, q: f64, replicates: &[f64]) -> SetRecord {

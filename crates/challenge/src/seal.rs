@@ -15,7 +15,7 @@ use sha2::{Digest, Sha256};
 use shearq_dataset::fingerprint::hex;
 use shearq_dataset::threads::Pool;
 use shearq_files::{FileError, atomic, open};
-use shearq_results::submit::manifest::FileSum;
+use shearq_results::submit::FileSum;
 
 use crate::error::ChallengeError;
 use crate::terms::{CHALLENGE_FILE, Challenge};

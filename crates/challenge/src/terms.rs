@@ -12,8 +12,7 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use shearq_files::{FileError, open};
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_results::submit::check::Expected;
-use shearq_results::submit::manifest::Contents;
-use shearq_results::submit::packed::{Packed, Submission};
+use shearq_results::submit::{Contents, Packed, Submission};
 use shearq_scoring::Grid;
 use shearq_submissions::{check_name, checked_name};
 

@@ -12,7 +12,7 @@ use shearq_dataset::run::{Run, Source, shortened};
 use shearq_dataset::threads::Pool;
 use shearq_files::table::{self, MAX_ROWS};
 use shearq_files::{FileError, atomic};
-use shearq_render::table::{Cell, Heading, Table};
+use shearq_render::table::{Cell, Table};
 use shearq_scoring::{Metric, Metrics, Options};
 use shearq_submissions::{Configuration, ConfigurationError, Registry, checked_name};
 use thiserror::Error;
@@ -67,6 +67,7 @@ impl BaselineConfiguration {
 #[serde(deny_unknown_fields)]
 pub struct BaselineSet {
     pub set: u32,
+    // Compared first: other data have other noise, so that metrics may differ by standard errors.
     pub data: String,
     pub images: Vec<u32>,
     pub galaxies: u64,
@@ -126,6 +127,7 @@ impl Baseline {
             let mut metrics = set.metrics.values();
             metrics.any(|[value, error]| value.is_infinite() || error.is_infinite() || *error < 0.0)
         };
+        // No metric would move by more than an infinite error.
         if let Some(set) = sets_of(&baseline.submissions).find(wild) {
             let message = format!(
                 "set {}: a metric is infinite, or its error is infinite or negative",
@@ -134,6 +136,7 @@ impl Baseline {
             return Err(FileError::new(path, message));
         }
         let found = sets_of(&baseline.submissions).count();
+        // A TOML file that ends early after a set is valid.
         if let Some(held) = baseline.sets_held.filter(|held| *held != found) {
             let message = format!(
                 "the file was truncated or edited (found {found} sets, expected {held} as in `sets_held`)"
@@ -511,46 +514,49 @@ pub fn check<E: From<BaselineError>>(
 
 /// The metrics of all checks, or only the moved ones.
 pub fn shift_table(checks: &[Checked], all: bool) -> Table {
-    let headings = [
-        ("baseline", "Baseline"),
-        ("submission", "Configuration"),
-        ("set", "Set"),
-        ("metric", "Metric"),
-        ("before", "Before"),
-        ("now", "Now"),
-        ("difference", "Difference"),
-        ("sigma", "in σ"),
-        ("moved", "Moved"),
-    ];
-    let mut rows = Vec::new();
-    for check in checks {
-        for shift in check.shifts.iter().filter(|shift| all || shift.moved) {
-            let cell = |[value, error]: [f64; 2]| {
-                Cell::with_error(value, Some(error).filter(|e| e.is_finite()), 6)
-            };
-            rows.push(vec![
-                Cell::text(&check.baseline),
-                Cell::text(&check.configuration),
-                Cell::number(f64::from(shift.set), 0),
-                Cell::text(shift.metric),
-                cell(shift.before),
-                cell(shift.now),
-                Cell::number(shift.now[0] - shift.before[0], 6),
-                Cell::number(shift.sigma, 3),
-                Cell::text(if shift.moved { "yes" } else { "no" }),
-            ]);
-        }
-    }
+    let rows = checks.iter().flat_map(|check| {
+        let shown = check.shifts.iter().filter(|shift| all || shift.moved);
+        shown.map(move |shift| (check, shift))
+    });
+    let rows: Vec<(&Checked, &Shift)> = rows.collect();
+    let value = |[value, error]: [f64; 2]| {
+        Cell::with_error(value, Some(error).filter(|e| e.is_finite()), 6)
+    };
+    let mut table = Table::titled("Shifts from baselines");
+    table.column("baseline", "Baseline", &rows, |(check, _)| {
+        Cell::text(&check.baseline)
+    });
+    table.column("submission", "Configuration", &rows, |(check, _)| {
+        Cell::text(&check.configuration)
+    });
+    table.column("set", "Set", &rows, |(_, shift)| {
+        Cell::number(f64::from(shift.set), 0)
+    });
+    table.column("metric", "Metric", &rows, |(_, shift)| {
+        Cell::text(shift.metric)
+    });
+    table.column("before", "Before", &rows, |(_, shift)| value(shift.before));
+    table.column("now", "Now", &rows, |(_, shift)| value(shift.now));
+    table.column("difference", "Difference", &rows, |(_, shift)| {
+        Cell::number(shift.now[0] - shift.before[0], 6)
+    });
+    table.column("sigma", "in σ", &rows, |(_, shift)| {
+        Cell::number(shift.sigma, 3)
+    });
+    table.column("moved", "Moved", &rows, |(_, shift)| {
+        Cell::text(if shift.moved { "yes" } else { "no" })
+    });
     let compared: usize = checks.iter().map(|check| check.shifts.len()).sum();
     let moved = checks
         .iter()
         .flat_map(|check| &check.shifts)
         .filter(|shift| shift.moved)
         .count();
-    let mut notes = vec![format!(
+    let notes = &mut table.notes;
+    notes.push(format!(
         "{moved} of {compared} metrics of {} configuration(s) moved by more than rounding or noise. In σ: difference over the standard error of the metric.",
         checks.len()
-    )];
+    ));
     for check in checks {
         let name = format!("{}, {}", check.baseline, check.configuration);
         for line in &check.settings {
@@ -560,12 +566,7 @@ pub fn shift_table(checks: &[Checked], all: bool) -> Table {
             notes.push(format!("{name}: {line}"));
         }
     }
-    Table {
-        title: "Shifts from baselines".into(),
-        headings: headings.map(|(key, label)| Heading::new(key, label)).into(),
-        rows,
-        notes,
-    }
+    table
 }
 
 /// The checks as JUnit: a suite per baseline, a case per configuration.

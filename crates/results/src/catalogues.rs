@@ -12,7 +12,7 @@ use shearq_files::table::most_rows;
 use shearq_scoring::{Choice, Convention, FieldSum, Grid, Row, RowCounts};
 
 use crate::foreign::{Foreign, Screen, folder_of, plain_columns};
-use crate::submit::packed::{Packed, Sent, Submission, settings_of};
+use crate::submit::{Packed, Sent, Submission, settings_of};
 
 /// The scored columns of catalogues by shearq.
 pub const COLUMNS: [&str; 4] = ["x", "y", "e1", "e2"];
@@ -97,6 +97,7 @@ impl Catalogues {
             path,
             origin: Origin::Packed {
                 sent,
+                // Catalogues by shearq have its convention also after packing. Only their manifest has a run.
                 own: submission.manifest.is_some_and(|own| own.run.is_some()),
                 files,
             },
@@ -156,6 +157,7 @@ impl Catalogues {
     pub fn source(&self, data: &DataFolder) -> Result<Source, FileError> {
         match &self.origin {
             Origin::Measured(run, _) => Ok(run.source.clone()),
+            // Other programs do not record what they measured, so that the fingerprints of the data identify it.
             _ => Source::folder(data, folder_of(&self.path)),
         }
     }
@@ -181,6 +183,7 @@ impl Catalogues {
     pub fn rows(&self, path: &Path, most: usize) -> Result<Vec<Row>, FileError> {
         match &self.origin {
             Origin::Foreign(foreign, _) => foreign.rows(path, most),
+            // Catalogues of other programs were converted when they were packed.
             Origin::Measured(..) | Origin::Packed { .. } => read_rows(path, &COLUMNS, most),
         }
     }

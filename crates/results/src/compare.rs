@@ -9,18 +9,20 @@ use shearq_dataset::fingerprint;
 use shearq_dataset::layout::{DataFolder, MAX_SET};
 use shearq_dataset::run::{Run, Source};
 use shearq_dataset::threads::Pool;
-use shearq_files::FileError;
+use shearq_files::frames::polars::DataFrame;
+use shearq_files::frames::{TableError, reals};
+use shearq_files::{FileError, names_of};
 use shearq_render::table::Cell;
 use shearq_scoring::resample::{PairedDifference, PairedSet, paired_difference};
 use shearq_scoring::{Choice, Metrics, Options};
 use shearq_submissions::{Published, Registry};
+use thiserror::Error;
 
 use crate::catalogues::Catalogues;
-use crate::conditions::{ChoiceError, choose};
-use crate::expression::Expression;
-use crate::record::{Column, RunRecord, SetRecord, columns_named};
+use crate::expression::{Expression, Operand, fits};
+use crate::record::{Column, RunRecord, SetRecord, columns_named, frame_of};
 use crate::score::{ScoreError, ScoredSet, score_variants, unscored};
-use crate::submit::packed::{Sent, Submission, is_packed};
+use crate::submit::{Sent, Submission, is_packed};
 
 /// A method in a comparison.
 #[derive(Debug, Clone)]
@@ -204,6 +206,70 @@ fn given_catalogues(
     Ok(found)
 }
 
+/// Why sets cannot be chosen.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum ChoiceError {
+    #[error(transparent)]
+    Table(#[from] TableError),
+    #[error(
+        "--where: unknown column of a results store (found `{found}`, expected one of {known})"
+    )]
+    UnknownColumn { found: String, known: String },
+    #[error(
+        "--where: column `{0}` contains numbers (found a comparison with a text, expected a number)"
+    )]
+    Numbers(String),
+    #[error(
+        "--where: column `{0}` contains text (expected == or != with a text in quotation marks, such as {0} == 'a*')"
+    )]
+    Text(String),
+    #[error("--where: no set meets the conditions")]
+    NoSet,
+    #[error("--where: the sets that meet the conditions have none in common")]
+    NoCommonSet,
+}
+
+/// Keeps the sets of each run for which the `condition` holds, and drops runs without such a set.
+pub fn choose(
+    condition: &Expression,
+    mut runs: Vec<RunRecord>,
+) -> Result<Vec<RunRecord>, ChoiceError> {
+    let table = frame_of(&runs)?;
+    let operands = condition.operands().iter();
+    let values: Vec<Vec<f64>> = operands
+        .map(|operand| values(&table, operand))
+        .collect::<Result<_, _>>()?;
+    let mut rows = 0..table.height();
+    for run in &mut runs {
+        run.sets.retain(|_| {
+            let row = rows.next().unwrap_or_default();
+            // A missing number, such as Q of a set without errors, meets no condition.
+            let held = condition.value(&|place| values[place][row]);
+            held != 0.0 && !held.is_nan()
+        });
+    }
+    runs.retain(|run| !run.sets.is_empty());
+    Ok(runs)
+}
+
+fn values(table: &DataFrame, operand: &Operand) -> Result<Vec<f64>, ChoiceError> {
+    let name = &operand.column;
+    let column = table.column(name).map_err(|_| ChoiceError::UnknownColumn {
+        found: name.clone(),
+        known: names_of(&table.get_column_names()),
+    })?;
+    match (&operand.pattern, column.str()) {
+        (Some(pattern), Ok(texts)) => Ok(texts
+            .iter()
+            .map(|text| f64::from(u8::from(fits(pattern, text.unwrap_or_default()))))
+            .collect()),
+        (Some(_), Err(_)) => Err(ChoiceError::Numbers(name.clone())),
+        (None, Ok(_)) => Err(ChoiceError::Text(name.clone())),
+        (None, Err(_)) => Ok(reals(column).unwrap_or_default().into_owned()),
+    }
+}
+
 /// By which column the sets of a run are grouped.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Grouping {
@@ -272,7 +338,7 @@ impl FromStr for Order {
 impl Order {
     fn key(&self, group: &Group) -> Cell {
         match columns_named(&[&self.field]).first() {
-            Some(column) => column.cell(&group.run, &group.run.sets),
+            Some(column) => column.cell(&group.run),
             None => group.value.clone(),
         }
     }
@@ -302,7 +368,7 @@ impl Group {
             let first = groups.len();
             for set in &run.sets {
                 let value = column.map_or(Cell::Empty, |column| {
-                    column.cell(run, std::slice::from_ref(set))
+                    column.cell_of_sets(std::slice::from_ref(set))
                 });
                 match groups[first..].iter_mut().find(|own| own.value == value) {
                     Some(group) => group.run.sets.push(set.clone()),

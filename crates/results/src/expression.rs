@@ -175,7 +175,7 @@ impl Node {
         }
     }
 
-    /// Takes the steps beside `and` out, and returns the rest.
+    // Takes the steps beside `and` out, and returns the rest.
     fn without_steps(self, steps: &mut Vec<Step>) -> Option<Node> {
         match self {
             Node::Step(step) => {
@@ -242,7 +242,7 @@ struct Parser<'a> {
 }
 
 impl<'a> Parser<'a> {
-    /// The rest of the text, from the next character that is not blank.
+    // The rest of the text, from the next character that is not blank.
     fn rest(&mut self) -> &'a str {
         let rest = &self.text[self.at..];
         self.at = self.text.len() - rest.trim_start().len();
@@ -261,7 +261,7 @@ impl<'a> Parser<'a> {
         }
     }
 
-    /// Consumes `token`, which must not continue as a word.
+    // Consumes `token`, which must not continue as a word.
     fn take(&mut self, token: &str) -> bool {
         let Some(rest) = self.rest().strip_prefix(token) else {
             return false;
@@ -291,7 +291,7 @@ impl<'a> Parser<'a> {
         Ok(node)
     }
 
-    /// Compares a column with the text in quotation marks that follows, if one does.
+    // Compares a column with the text in quotation marks that follows, if one does.
     fn pattern(&mut self, column: &str) -> Option<Result<Node, ExpressionError>> {
         let before = self.at;
         let equal = self.take("==");
@@ -388,7 +388,7 @@ impl<'a> Parser<'a> {
         Ok(sign * number)
     }
 
-    /// The step whose bracket was opened.
+    // The step whose bracket was opened.
     fn step(&mut self) -> Result<Node, ExpressionError> {
         let column = self.word().to_owned();
         if column.is_empty() {
@@ -433,7 +433,7 @@ pub(crate) fn fits(pattern: &str, text: &str) -> bool {
     ends.any(|at| fits(rest, &text[at..]))
 }
 
-/// Characters of the number that a text starts with, with its exponent.
+// Characters of the number that a text starts with, with its exponent.
 fn number_length(text: &str) -> usize {
     let bytes = text.as_bytes();
     let digits = |from: usize| {

@@ -70,7 +70,7 @@ pub struct Foreign {
     folder: PathBuf,
 }
 
-/// The name or the number of a table.
+// The name or the number of a table.
 fn name_or_number<'de, D: Deserializer<'de>>(value: D) -> Result<Option<String>, D::Error> {
     #[derive(Deserialize)]
     #[serde(untagged, expecting = "expected the name or the number of a table")]
@@ -114,15 +114,13 @@ pub fn folder_of(path: &Path) -> &Path {
 
 impl Foreign {
     /// Reads a description.
-    ///
-    /// # Errors
-    /// If the file cannot be read or is invalid.
     pub fn read(path: &Path) -> Result<Self, FileError> {
         let text = shearq_files::open::read_to_string(path, shearq_files::open::SETTINGS).map_err(
             FileError::doing(path, "cannot read the description of catalogues"),
         )?;
         let mut foreign: Foreign =
             toml::from_str(&text).map_err(|e| FileError::new(path, e.to_string().trim_end()))?;
+        // Another factor would be a calibration, and change m silently.
         if foreign.e2_sign.abs() != 1 {
             let message = format!("`e2_sign` is {}; expected 1 or -1", foreign.e2_sign);
             return Err(FileError::new(path, message));
@@ -143,26 +141,17 @@ impl Foreign {
     }
 
     /// The existing catalogues of `sets` (of all if empty).
-    ///
-    /// # Errors
-    /// If a folder cannot be listed.
     pub fn catalogues(&self, sets: &[u32]) -> Result<Files, FileError> {
         listing::find(&self.folder, &self.catalogues, &[""], sets)
     }
 
     /// The rows of one image ([`Foreign::rows`]) on the grid.
-    ///
-    /// # Errors
-    /// If the file cannot be read, a column is absent, or the values are no ellipticities.
     pub fn sum(&self, grid: &Grid, path: &Path) -> Result<(FieldSum, RowCounts), FileError> {
         sum_foreign(grid, path, self.rows(path, most_rows(grid.cells()))?)
     }
 
     /// The rows of one image, at most `most`, converted to standard signs and the reported type.
     /// Flagged rows and distortions above 1 have no ellipticity.
-    ///
-    /// # Errors
-    /// If the file cannot be read or a column is absent.
     pub fn rows(&self, path: &Path, most: usize) -> Result<Vec<Row>, FileError> {
         let mut names = vec![
             self.x.as_str(),
@@ -179,88 +168,88 @@ impl Foreign {
         let flags = self.flag.as_deref().map(column).transpose()?;
         let (x, y) = (column(&self.x)?, column(&self.y)?);
         let (e1, e2) = (column(&self.e1)?, column(&self.e2)?);
+        let screen = Screen {
+            missing: self.missing,
+            max_modulus: self.max_modulus,
+            drop_missing: self.drop_missing,
+            conversion: match (self.ellipticity, self.report) {
+                (EllipticityType::Distortion, EllipticityType::Shear) => Conversion::ToShear,
+                (EllipticityType::Shear, EllipticityType::Distortion) => Conversion::ToDistortion,
+                _ => Conversion::None,
+            },
+        };
         let row = |k: usize| {
-            let good = flags.as_ref().is_none_or(|flags| flags[k] == 0.0)
-                && self.missing.is_none_or(|m| e1[k] != m && e2[k] != m);
-            let shape = if good {
-                self.convert(e1[k], f64::from(self.e2_sign) * e2[k])
-            } else {
-                None
+            let flagged = flags.as_ref().is_some_and(|flags| flags[k] != 0.0);
+            let (e1, e2) = match flagged {
+                true => (f64::NAN, f64::NAN),
+                false => (e1[k], e2[k]),
             };
-            let shape =
-                shape.filter(|(e1, e2)| self.max_modulus.is_none_or(|most| e1.hypot(*e2) <= most));
-            let (e1, e2) = shape.unwrap_or((f64::NAN, f64::NAN));
-            Row {
-                x: x[k] + self.position_offset,
-                y: y[k] + self.position_offset,
-                e1,
-                e2,
-            }
+            let (x, y) = (x[k] + self.position_offset, y[k] + self.position_offset);
+            let row = screen.apply(Row { x, y, e1, e2 });
+            // After the screen, which compares with the values in the file. Conversions do not change the orientation.
+            let e2 = f64::from(self.e2_sign) * row.e2;
+            Row { e2, ..row }
         };
         Ok((0..x.len()).map(row).collect())
     }
-
-    fn convert(&self, e1: f64, e2: f64) -> Option<(f64, f64)> {
-        if is_failure(e1, e2) {
-            // Refused with the sum, although no shear belongs to such a distortion.
-            return (!self.drop_missing).then_some((e1, e2));
-        }
-        match (self.ellipticity, self.report) {
-            (EllipticityType::Distortion, EllipticityType::Shear) => {
-                let shear = Distortion::new(e1, e2).to_shear()?;
-                Some((shear.e1, shear.e2))
-            }
-            (EllipticityType::Shear, EllipticityType::Distortion) => {
-                let distortion = Shear::new(e1, e2).to_distortion();
-                Some((distortion.e1, distortion.e2))
-            }
-            _ => Some((e1, e2)),
-        }
-    }
 }
 
-/// Whether one component stands for a failed measurement.
+// Whether one component stands for a failed measurement.
 fn is_failure(e1: f64, e2: f64) -> bool {
+    // HSM's −10 in one row of a hundred gave c = −0.096, and 1e30 gave m = 3.5e12, both without a message.
     let range = MeasuredRange::ELLIPTICITY;
     range.excludes(e1) || range.excludes(e2)
 }
 
 /// Which ellipticities of other programs mark a galaxy as not measured, and their type.
-#[derive(Debug, Clone, Copy, Default, PartialEq, serde::Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Screen {
     /// A value of e1 or e2.
     pub missing: Option<f64>,
     /// The largest valid |e|, after conversion.
     pub max_modulus: Option<f64>,
     /// Whether numbers that stand for a failed measurement mark it.
-    #[serde(default)]
     pub drop_missing: bool,
-    /// Whether to convert the ellipticities from distortions to shear-type ellipticities.
-    #[serde(default)]
-    pub distortion: bool,
+    pub conversion: Conversion,
+}
+
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub enum Conversion {
+    #[default]
+    None,
+    /// From distortions to shear-type ellipticities.
+    ToShear,
+    /// The inverse.
+    ToDistortion,
 }
 
 impl Screen {
-    /// The row with a shear-type ellipticity, or NaN if the galaxy was not measured.
+    /// The row with a converted ellipticity, or NaN if the galaxy was not measured.
     pub fn apply(&self, row: Row) -> Row {
-        let failed = is_failure(row.e1, row.e2);
-        let missing =
-            self.missing.is_some_and(|m| row.e1 == m || row.e2 == m) || failed && self.drop_missing;
-        let shape = match (missing, self.distortion && !failed) {
-            (true, _) => None,
-            (false, true) => Distortion::new(row.e1, row.e2).to_shear(),
-            (false, false) => Some(Shear::new(row.e1, row.e2)),
+        let Row { e1, e2, .. } = row;
+        let failed = is_failure(e1, e2);
+        let missing = self.missing.is_some_and(|m| e1 == m || e2 == m);
+        let shape = match self.conversion {
+            _ if missing || failed && self.drop_missing => None,
+            // No shear belongs to such a number, but only a request makes it missing: the sum refuses it.
+            _ if failed => Some((e1, e2)),
+            Conversion::None => Some((e1, e2)),
+            Conversion::ToShear => Distortion::new(e1, e2).to_shear().map(|e| (e.e1, e.e2)),
+            Conversion::ToDistortion => {
+                let e = Shear::new(e1, e2).to_distortion();
+                Some((e.e1, e.e2))
+            }
         };
-        let shape = shape.filter(|e| self.max_modulus.is_none_or(|most| e.modulus() <= most));
-        let Shear { e1, e2 } = shape.unwrap_or(Shear::new(f64::NAN, f64::NAN));
+        let valid = |(e1, e2): &(f64, f64)| {
+            let most = self.max_modulus;
+            most.is_none_or(|most| e1.hypot(*e2) <= most)
+        };
+        let (e1, e2) = shape.filter(valid).unwrap_or((f64::NAN, f64::NAN));
         Row { e1, e2, ..row }
     }
 }
 
 /// Sums rows of another program's catalogue `path`.
-///
-/// # Errors
-/// If the values are no ellipticities, or the positions have other units.
 pub fn sum_foreign(
     grid: &Grid,
     path: &Path,
@@ -318,6 +307,7 @@ pub fn fault_of_rows(counts: &RowCounts, grid: &Grid, advice: &str) -> Option<St
 
 pub fn shown(value: f64) -> String {
     match value.abs() >= 1e7 {
+        // Thirty digits would hide the message.
         true => format!("{value:e}"),
         false => value.to_string(),
     }
@@ -327,7 +317,7 @@ pub fn shown(value: f64) -> String {
 mod tests {
     use super::*;
 
-    /// The rows of a catalogue with the columns a, b, u, v and bad, described by more keys.
+    // The rows of a catalogue with the columns a, b, u, v and bad, described by more keys.
     fn rows(keys: &str, lines: &str) -> Vec<Row> {
         let folder = tempfile::tempdir().unwrap();
         let (toml, csv) = (folder.path().join("f.toml"), folder.path().join("1-1.csv"));
@@ -353,7 +343,7 @@ mod tests {
             missing: Some(-99.0),
             max_modulus: Some(0.5),
             drop_missing: false,
-            distortion: true,
+            conversion: Conversion::ToShear,
         };
         let apply = |e1| {
             let (x, y, e2) = (1.0, 1.0, 0.0);
@@ -367,7 +357,7 @@ mod tests {
         for drop_missing in [false, true] {
             let screen = Screen {
                 drop_missing,
-                distortion: true,
+                conversion: Conversion::ToShear,
                 ..Screen::default()
             };
             assert_eq!(screen.apply(Row { x, y, e1, e2 }).e1.is_nan(), drop_missing);

@@ -7,7 +7,7 @@
 //! * [`mean`] averages catalogues to one shear per set.
 //! * [`star_noise`] adds the noise of stars to the error of a mean shear.
 //! * [`record`] is the record of a scored set with the list of its columns, and [`store`] keeps records in Parquet files.
-//! * [`conditions`] choose records; [`compare`] groups and compares them.
+//! * [`compare`] chooses, groups and compares records.
 //! * [`baseline`] compares metrics with stored metrics.
 //! * [`submit`] packs and checks a submission to a challenge.
 //! * [`views`] makes tables, plots and pages.
@@ -17,7 +17,6 @@ pub mod baseline;
 pub mod bias;
 pub mod catalogues;
 pub mod compare;
-pub mod conditions;
 pub mod expression;
 pub mod foreign;
 pub mod mean;

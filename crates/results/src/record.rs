@@ -12,7 +12,7 @@ use shearq_files::FileError;
 use shearq_files::frames::TableError;
 use shearq_files::frames::polars::{Column as FrameColumn, DataFrame};
 use shearq_files::table::MAX_ROWS;
-use shearq_render::table::{Cell, Heading};
+use shearq_render::table::Cell;
 use shearq_scoring::resample::mean_over_sets;
 use shearq_scoring::{
     Choice, Convention, Definition, Metric, Metrics, Noise, Options, RowCounts, SetScore,
@@ -215,15 +215,17 @@ impl RunRecord {
 #[derive(Debug, Clone, Copy)]
 pub struct Column {
     pub name: &'static str,
-    heading: &'static str,
+    pub heading: &'static str,
     value: Value,
 }
 
 // The type of a column. It determines how a cell shows several sets.
 #[derive(Debug, Clone, Copy)]
 enum Value {
+    /// The same for all sets.
+    OfRun(fn(&RunRecord) -> String),
     /// The text of the first set.
-    Text(fn(&RunRecord, &SetRecord) -> String),
+    Text(fn(&SetRecord) -> String),
     /// The sum.
     Count(fn(&SetRecord) -> u64),
     /// The mean.
@@ -232,12 +234,7 @@ enum Value {
     Metric(Metric),
 }
 
-const fn text(
-    name: &'static str,
-    heading: &'static str,
-    value: fn(&RunRecord, &SetRecord) -> String,
-) -> Column {
-    let value = Value::Text(value);
+const fn column(name: &'static str, heading: &'static str, value: Value) -> Column {
     Column {
         name,
         heading,
@@ -245,13 +242,24 @@ const fn text(
     }
 }
 
+const fn of_run(
+    name: &'static str,
+    heading: &'static str,
+    value: fn(&RunRecord) -> String,
+) -> Column {
+    column(name, heading, Value::OfRun(value))
+}
+
+const fn text(
+    name: &'static str,
+    heading: &'static str,
+    value: fn(&SetRecord) -> String,
+) -> Column {
+    column(name, heading, Value::Text(value))
+}
+
 const fn count(name: &'static str, heading: &'static str, value: fn(&SetRecord) -> u64) -> Column {
-    let value = Value::Count(value);
-    Column {
-        name,
-        heading,
-        value,
-    }
+    column(name, heading, Value::Count(value))
 }
 
 fn kind(set: &SetRecord, label: fn(&SetKind) -> &'static str) -> String {
@@ -259,40 +267,40 @@ fn kind(set: &SetRecord, label: fn(&SetKind) -> &'static str) -> String {
 }
 
 const BEFORE_METRICS: [Column; 20] = [
-    text("run", "Run", |run, _| run.id()),
-    text("submission", "Configuration", |run, _| {
+    of_run("run", "Run", RunRecord::id),
+    of_run("submission", "Configuration", |run| {
         run.configuration.clone()
     }),
-    text("version", "Version", |run, _| run.version.clone()),
-    text("settings", "Settings", |run, _| run.settings.clone()),
-    text("source", "Source", |run, _| run.source.clone()),
-    text("definition", "Definition", |run, _| run.definition.clone()),
-    text("choice", "Choice", |run, _| run.choice.clone()),
-    text("noise", "Noise", |run, _| run.noise.clone()),
+    of_run("version", "Version", |run| run.version.clone()),
+    of_run("settings", "Settings", |run| run.settings.clone()),
+    of_run("source", "Source", |run| run.source.clone()),
+    of_run("definition", "Definition", |run| run.definition.clone()),
+    of_run("choice", "Choice", |run| run.choice.clone()),
+    of_run("noise", "Noise", |run| run.noise.clone()),
     count("set", "Set", |set| set.set.into()),
-    text("set_kind", "Kind", |_, set| kind(set, |k| k.image.label())),
-    text("psf", "PSF", |_, set| kind(set, |k| k.psf.label())),
-    text("psf_profile", "PSF profile", |_, set| {
+    text("set_kind", "Kind", |set| kind(set, |k| k.image.label())),
+    text("psf", "PSF", |set| kind(set, |k| k.psf.label())),
+    text("psf_profile", "PSF profile", |set| {
         kind(set, |k| k.image.psf_profile())
     }),
-    text("ellipticity", "Ellipticity", |_, set| {
+    text("ellipticity", "Ellipticity", |set| {
         kind(set, |k| k.ellipticity.label())
     }),
-    text("snr", "S/N", |_, set| kind(set, |k| k.image.snr_class())),
-    text("size", "Size", |_, set| kind(set, |k| k.image.size_class())),
-    text("data", "Data", |_, set| set.data.clone()),
+    text("snr", "S/N", |set| kind(set, |k| k.image.snr_class())),
+    text("size", "Size", |set| kind(set, |k| k.image.size_class())),
+    text("data", "Data", |set| set.data.clone()),
     count("images", "Images", |set| set.images.len() as u64),
-    text("image_numbers", "Image numbers", |_, set| list(&set.images)),
+    text("image_numbers", "Image numbers", |set| list(&set.images)),
     count("galaxies", "Galaxies", |set| set.galaxies),
     count("flagged", "Flagged", |set| set.flagged),
 ];
 
 const AFTER_METRICS: [Column; 6] = [
-    Column {
-        name: "q_leaderboard",
-        heading: "Q leaderboard",
-        value: Value::Real(|set| set.q_leaderboard),
-    },
+    column(
+        "q_leaderboard",
+        "Q leaderboard",
+        Value::Real(|set| set.q_leaderboard),
+    ),
     count("convention", "Conv.", |set| set.convention.into()),
     count("convention_known", "Conv. known", |set| {
         set.convention_known.into()
@@ -300,20 +308,18 @@ const AFTER_METRICS: [Column; 6] = [
     count("convention_leaderboard", "Conv. leaderboard", |set| {
         set.convention_leaderboard.into()
     }),
-    text("q_replicates", "Q replicates", |_, set| {
+    text("q_replicates", "Q replicates", |set| {
         list(&set.q_replicates)
     }),
-    text("q_calibrated_replicates", "Q cal. replicates", |_, set| {
+    text("q_calibrated_replicates", "Q cal. replicates", |set| {
         list(&set.q_calibrated_replicates)
     }),
 ];
 
 pub fn columns() -> impl Iterator<Item = Column> {
-    let metrics = Metrics::ALL.into_iter().map(|metric| Column {
-        name: metric.name,
-        heading: metric.heading,
-        value: Value::Metric(metric),
-    });
+    let metrics = Metrics::ALL
+        .into_iter()
+        .map(|metric| column(metric.name, metric.heading, Value::Metric(metric)));
     BEFORE_METRICS
         .into_iter()
         .chain(metrics)
@@ -329,29 +335,30 @@ pub fn columns_named(names: &[&str]) -> Vec<Column> {
 // The mean of a text or a convention over sets has no meaning, so that such columns are printed for single sets and for
 // groups in which they are equal.
 impl Column {
-    pub fn heading(&self) -> Heading {
-        Heading::new(self.name, self.heading)
-    }
-
-    /// The cell of some sets of `run`.
-    pub fn cell(&self, run: &RunRecord, sets: &[SetRecord]) -> Cell {
-        let count = sets.len() as f64;
+    /// The cell of the sets of `run`.
+    pub fn cell(&self, run: &RunRecord) -> Cell {
         match self.value {
-            Value::Text(value) => match sets.first() {
-                Some(set) => Cell::text(value(run, set)),
-                None => Cell::Empty,
-            },
-            Value::Count(value) => Cell::number(sets.iter().map(value).sum::<u64>() as f64, 0),
-            Value::Real(value) => Cell::number(sets.iter().map(value).sum::<f64>() / count, 2),
-            Value::Metric(metric) => metric_cell(metric, sets),
+            Value::OfRun(value) => Cell::text(value(run)),
+            _ => self.cell_of_sets(&run.sets),
         }
     }
-}
 
-/// The mean of a metric over sets, with its error.
-pub fn metric_cell(metric: Metric, sets: &[SetRecord]) -> Cell {
-    let (value, error) = mean(sets, metric.value);
-    Cell::with_error(value, Some(error), metric.decimals)
+    /// The cell of sets, empty for a column of runs.
+    pub fn cell_of_sets(&self, sets: &[SetRecord]) -> Cell {
+        let count = sets.len() as f64;
+        match self.value {
+            Value::OfRun(_) => Cell::Empty,
+            Value::Text(value) => sets
+                .first()
+                .map_or(Cell::Empty, |set| Cell::text(value(set))),
+            Value::Count(value) => Cell::number(sets.iter().map(value).sum::<u64>() as f64, 0),
+            Value::Real(value) => Cell::number(sets.iter().map(value).sum::<f64>() / count, 2),
+            Value::Metric(metric) => {
+                let (value, error) = mean(sets, metric.value);
+                Cell::with_error(value, Some(error), metric.decimals)
+            }
+        }
+    }
 }
 
 /// Mean of a metric over sets, and its error.
@@ -375,8 +382,12 @@ pub fn frame_of(runs: &[RunRecord]) -> Result<DataFrame, TableError> {
     let mut frame = Vec::new();
     for Column { name, value, .. } in columns() {
         match value {
+            Value::OfRun(value) => {
+                let texts: Vec<String> = sets.clone().map(|(run, _)| value(run)).collect();
+                frame.push(FrameColumn::new(name.into(), texts));
+            }
             Value::Text(value) => {
-                let texts: Vec<String> = sets.clone().map(|(run, set)| value(run, set)).collect();
+                let texts: Vec<String> = sets.clone().map(|(_, set)| value(set)).collect();
                 frame.push(FrameColumn::new(name.into(), texts));
             }
             Value::Count(value) => {
@@ -408,6 +419,7 @@ pub fn run_of_frame(frame: &DataFrame, path: &Path) -> Result<RunRecord, FileErr
     let rows = Rows { path, frame };
     let text = |name| rows.text(name, 0).map(str::to_owned);
     let configuration = text("submission")?;
+    // Stores come from others, and names end up on terminals and in file names.
     check_name(&configuration).map_err(|error| FileError::new(path, error.to_string()))?;
     let run = RunRecord {
         configuration,
@@ -519,9 +531,11 @@ impl Rows<'_> {
     fn set(&self, row: usize) -> Result<SetRecord, FileError> {
         let images: Vec<u32> = self.list("image_numbers", row)?;
         self.at_most("images", row, images.len() as u64)?;
+        // Sums over sets would overflow with counts that no images can have.
         let galaxies = self.at_most("galaxies", row, images.len() as u64 * MAX_ROWS as u64)?;
         Ok(SetRecord {
             set: self.count("set", row)?,
+            // A missing column is an error: it would make simulated sets count as data of unknown kind.
             simulated: !self.text("set_kind", row)?.is_empty(),
             data: self.text("data", row)?.to_owned(),
             images,

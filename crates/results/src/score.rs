@@ -99,6 +99,7 @@ pub struct OddImages {
     /// Catalogues whose galaxies all have one ellipticity.
     pub constant: Vec<(PathBuf, [f64; 2])>,
     /// Catalogues that follow the true shear differently from the others of the set.
+    // One catalogue of several with x and y exchanged, or of another set, changed m by 0.17 to 0.33 without a warning.
     pub responses: Vec<(PathBuf, OddResponse)>,
 }
 
@@ -169,6 +170,7 @@ impl SetFiles<'_> {
             images.add(&sum).map_err(self.wrong())?;
             rows += more;
         }
+        // Without galaxies, the score would be the score of a method that measures no shear.
         if let (0, Some(first)) = (rows.used, self.names.first()) {
             let message = nothing_used(&rows, self.names.len(), grid);
             return Err(FileError::new(first, message).into());
@@ -269,6 +271,7 @@ pub fn score_files(
 
 fn nothing_used(counts: &RowCounts, files: usize, grid: &Grid) -> String {
     let (n, stamp) = (grid.n, grid.stamp.0);
+    // The more frequent reason is the probable cause.
     if counts.outside > counts.not_finite {
         return format!(
             "no row of the {files} catalogue(s) is on the {n} × {n} grid of {stamp} px stamps; expected x and y in pixels from 0.5 to {}. Are they sky coordinates in degrees?",
@@ -359,6 +362,7 @@ fn sets_to_score(
     variants: &[(&Catalogues, Choice)],
     wanted: &[u32],
 ) -> Result<Vec<u32>, ScoreError> {
+    // Sets differ in Q by more than methods do, so that methods are compared on their common sets.
     let complete = |set: &u32| variants.iter().all(|v| !v.0.of_set(*set).is_empty());
     if let Some(set) = wanted.iter().find(|set| !complete(set)) {
         return Err(ScoreError::NoCatalogue { set: Some(*set) });

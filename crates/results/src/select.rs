@@ -121,16 +121,13 @@ fn cut(step: &Step) -> Result<Cut, SelectionError> {
         .ok_or_else(|| SelectionError::Range(step.column.clone()))
 }
 
-/// Name of the column with the weights.
+// Name of the column with the weights.
 const WEIGHT: &str = "selection";
 
 /// Writes the catalogues of the folder `from` with the weights of a `stated` selection to the folder `to`:
 /// ellipticities are multiplied by the weights and divided by the mean response of their image, so that all that uses catalogues
 /// uses the selection. Galaxies that are left out have an ellipticity and a response of zero. Returns the number of
 /// galaxies that are kept, and of those without a flag.
-///
-/// # Errors
-/// If `from` contains a selection already, a catalogue cannot be used, no galaxy of an image is left, or `to` has other results.
 pub fn write_selected(
     run: &Run,
     from: &Path,
@@ -138,6 +135,7 @@ pub fn write_selected(
     stated: &StatedSelection,
 ) -> Result<(usize, usize), FileError> {
     let selection = stated.weights.clone().unwrap_or_default();
+    // The second selection would divide by the response of the first one again.
     if let Some(earlier) = &run.selection {
         return Err(FileError::new(
             from,
@@ -183,6 +181,7 @@ pub fn write_selected(
                 .count();
             good += weighted.e[0].iter().filter(|e| e.is_finite()).count();
             let changed = weighted.table(&path, &read)?;
+            // The origin of the catalogue stays, so that it is still compared with its images.
             let mut metadata = table::read_metadata(&path, run.format, keys.iter())?;
             metadata.insert("select".into(), stated.text.clone());
             let out = record.catalogue(to, set, image);
@@ -229,9 +228,6 @@ pub struct Weighted {
 
 impl Weighted {
     /// Applies `selection` to the rows of the catalogue `path`. `column` gives a column of it by name.
-    ///
-    /// # Errors
-    /// If a column is missing, or a weight is not a number from 0 on.
     pub fn of<'a>(
         path: &Path,
         selection: &Selection,
@@ -262,6 +258,7 @@ impl Weighted {
                 continue;
             }
             let observables = Observables::from_array(&std::array::from_fn(|k| all[k][row]));
+            // Before calibration, because a selection changes the mean response that the ellipticities are divided by.
             let e = [e1[row] * d1[row], e2[row] * d2[row]];
             let response = [[r11[row], r12[row]], [r21[row], r22[row]]];
             let selected = selection.apply(e, response, &observables);
@@ -286,9 +283,6 @@ impl Weighted {
     }
 
     /// The same for a table in memory.
-    ///
-    /// # Errors
-    /// As [`Weighted::of`].
     pub fn of_table(
         path: &Path,
         selection: &Selection,
@@ -300,9 +294,6 @@ impl Weighted {
     }
 
     /// The same for the columns of a file that a selection needs, with the flags of its rows.
-    ///
-    /// # Errors
-    /// If the file cannot be read, or as [`Weighted::of`].
     pub fn read(path: &Path, selection: &Selection) -> Result<(Self, Vec<f64>), FileError> {
         let present = table::columns(&Place::of(path))?;
         let names = present.named.iter().flat_map(|named| &named.names);
@@ -361,7 +352,7 @@ impl Weighted {
         Ok(mean)
     }
 
-    /// The catalogue `read` with weighted and calibrated ellipticities.
+    // The catalogue `read` with weighted and calibrated ellipticities.
     fn table(&self, path: &Path, read: &DataFrame) -> Result<DataFrame, FileError> {
         let mean = self.divisors(path)?;
         let e = |k: usize| self.e[k].iter().map(|e| e / mean[k]).collect::<Vec<f64>>();

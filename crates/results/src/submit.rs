@@ -1,8 +1,729 @@
-//! Submissions to a challenge: their files, archives and checks.
+//! Submissions to a challenge: the two kinds of files that it accepts, their manifest, and archives of them.
+//!
+//! * Catalogue: ASCII `x y e1 e2`, one line per galaxy, one file per image, `g10_v1_objs_{set}_{image}.{method}.dat`.
+//! * Power spectrum: ASCII `index l power`, the eight bins 2 to 9, one file per set, `{method}_set{set}.dat`; power is
+//!   ℓ²C_ℓ/2π.
+//!
+//! [`pack`] writes submissions and [`check`] looks for their faults.
 
-pub mod archive;
-pub mod challenge;
 pub mod check;
-pub mod manifest;
 pub mod pack;
-pub mod packed;
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{BufReader, Read, Write};
+use std::path::{Path, PathBuf};
+
+use flate2::bufread::GzDecoder;
+use serde::de::Error as _;
+use serde::{Deserialize, Deserializer, Serialize};
+use sha2::{Digest, Sha256};
+use shearq_dataset::fingerprint::hex;
+use shearq_dataset::layout::{DataFolder, MAX_IMAGE, MAX_SET, check_folder};
+use shearq_dataset::record::read_record;
+use shearq_dataset::run::{Run, way};
+use shearq_files::atomic::{PartFolder, Scratch};
+use shearq_files::open::{is_there, open};
+use shearq_files::{FileError, table};
+use shearq_scoring::{Bins, Definition, Grid, SCORED, SpectrumCovariance};
+use shearq_submissions::{check_name, checked_name};
+use tar::Archive;
+
+use crate::foreign::Foreign;
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SpectrumLine {
+    pub index: u32,
+    pub l: f64,
+    pub power: f64,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Kind {
+    Catalogue {
+        set: u32,
+        image: u32,
+        method: String,
+    },
+    Spectrum {
+        set: u32,
+        method: String,
+    },
+}
+
+impl Kind {
+    pub const EXPECTED: &str =
+        "neither g10_v1_objs_{set}_{image}.{method}.dat nor {method}_set{set}.dat";
+
+    pub fn of(path: &Path) -> Option<Self> {
+        let name = path.file_name()?.to_str()?.strip_suffix(".dat")?;
+        if let Some(rest) = name.strip_prefix("g10_v1_objs_") {
+            let (numbers, method) = rest.split_once('.')?;
+            let (set, image) = numbers.split_once('_')?;
+            return Some(Kind::Catalogue {
+                set: number(set, MAX_SET)?,
+                image: number(image, MAX_IMAGE)?,
+                method: method.to_owned(),
+            });
+        }
+        let (method, set) = name.rsplit_once("_set")?;
+        Some(Kind::Spectrum {
+            set: number(set, MAX_SET)?,
+            method: method.to_owned(),
+        })
+    }
+
+    pub fn file_name(&self) -> String {
+        match self {
+            Kind::Catalogue { set, image, method } => {
+                format!("g10_v1_objs_{set}_{image}.{method}.dat")
+            }
+            Kind::Spectrum { set, method } => format!("{method}_set{set}.dat"),
+        }
+    }
+}
+
+fn number(text: &str, most: u32) -> Option<u32> {
+    // A leading zero would give one image two names.
+    if text.starts_with('0') || !text.bytes().all(|b| b.is_ascii_digit()) {
+        return None;
+    }
+    text.parse().ok().filter(|number| *number <= most)
+}
+
+/// Reads a power-spectrum file without checking it; [`check`] checks it.
+pub fn read_spectrum(path: &Path) -> Result<Vec<SpectrumLine>, FileError> {
+    let table = table::read_text(path, &["index", "l", "power"])?;
+    let column = |name: &str| table::numbers(&table, name, path);
+    let (index, l, power) = (column("index")?, column("l")?, column("power")?);
+    if let Some(odd) = index
+        .iter()
+        .find(|i| i.fract() != 0.0 || !(0.0..=99.0).contains(*i))
+    {
+        return Err(FileError::new(
+            path,
+            format!("not the number of a bin (found {odd}, expected 2 to 9)"),
+        ));
+    }
+    Ok((0..index.len())
+        .map(|k| SpectrumLine {
+            index: index[k] as u32,
+            l: l[k],
+            power: power[k],
+        })
+        .collect())
+}
+
+/// The first line whose multipole differs from its bin's, the bin's multipole, and the number of such lines.
+pub fn wrong_multipoles<'a>(
+    lines: &'a [SpectrumLine],
+    bins: &Bins,
+) -> Option<(&'a SpectrumLine, f64, usize)> {
+    let centre = |line: &SpectrumLine| bins.l.get((line.index as usize).wrapping_sub(1)).copied();
+    let off = |line: &'a SpectrumLine| {
+        let centre = centre(line).filter(|l| !(line.l - l).abs().le(&(0.5 * bins.width)))?;
+        Some((line, centre))
+    };
+    let mut wrong = lines.iter().filter_map(off);
+    let (line, centre) = wrong.next()?;
+    Some((line, centre, 1 + wrong.count()))
+}
+
+/// The eight bandpowers of a power-spectrum file for galaxies on `grid`, in order.
+pub fn read_bandpowers(path: &Path, grid: &Grid) -> Result<Vec<f64>, FileError> {
+    let lines = read_spectrum(path)?;
+    let bins = Bins::new(grid, Definition::Leaderboard);
+    if let Some((SpectrumLine { index, l, .. }, centre, _)) = wrong_multipoles(&lines, &bins) {
+        let message = format!(
+            "bin {index} has l = {l}; expected {centre:.1}, as the true shear has {n} × {n} cells",
+            n = grid.n
+        );
+        return Err(FileError::new(path, message));
+    }
+    let found: Vec<u32> = lines.iter().map(|line| line.index).collect();
+    let expected: Vec<u32> = SCORED.map(|b| b as u32 + 1).collect();
+    if found != expected {
+        return Err(FileError::new(
+            path,
+            format!("the bins are {found:?}; expected {expected:?}"),
+        ));
+    }
+    if let Some(bad) = lines.iter().find(|line| !line.power.is_finite()) {
+        return Err(FileError::new(
+            path,
+            format!("the power of bin {} is not a finite number", bad.index),
+        ));
+    }
+    Ok(lines.iter().map(|line| line.power).collect())
+}
+
+pub const MANIFEST_FILE: &str = "manifest.json";
+
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Contents {
+    #[default]
+    Catalogues,
+    /// Power spectra of the ellipticities averaged over the images, noise included.
+    Spectra,
+    /// Shear power spectra from cross-spectra between groups of images; their noise averages to zero.
+    CrossSpectra,
+}
+
+impl Contents {
+    /// Whether the files are power spectra.
+    pub fn is_spectra(self) -> bool {
+        self != Contents::Catalogues
+    }
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Entry {
+    #[serde(deserialize_with = "checked_name")]
+    pub challenge: String,
+    #[serde(deserialize_with = "checked_name")]
+    pub team: String,
+    /// One line about the entry; may be empty.
+    #[serde(default, deserialize_with = "checked_line")]
+    pub title: String,
+    /// Address for questions of the organiser; may be empty. It is not published.
+    #[serde(default, deserialize_with = "checked_line")]
+    pub contact: String,
+}
+
+// For `#[serde(deserialize_with)]`: reads a name that may be empty.
+fn checked_line<'de, D: Deserializer<'de>>(deserializer: D) -> Result<String, D::Error> {
+    let line = String::deserialize(deserializer)?;
+    match line.is_empty() {
+        true => Ok(line),
+        false => check_name(&line).map(|()| line).map_err(D::Error::custom),
+    }
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Manifest {
+    pub version: String,
+    /// Name of the method in file names.
+    #[serde(deserialize_with = "checked_name")]
+    pub method: String,
+    pub contents: Contents,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub entry: Option<Entry>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub run: Option<Run>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub foreign: Option<Foreign>,
+    /// The files by name, without the manifest.
+    pub files: BTreeMap<String, FileSum>,
+    /// Noise covariance of the bandpowers of each cross-spectrum, by file name.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub covariances: BTreeMap<String, SpectrumCovariance>,
+}
+
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct FileSum {
+    pub bytes: u64,
+    /// SHA-256 in hexadecimal digits.
+    pub sha256: String,
+}
+
+impl FileSum {
+    pub fn copying(from: &mut impl Read, to: &mut impl Write) -> std::io::Result<Self> {
+        let mut hasher = Sha256::new();
+        let mut bytes = 0;
+        let mut buffer = vec![0; 1 << 16];
+        loop {
+            let read = match from.read(&mut buffer) {
+                Ok(0) => break,
+                Ok(read) => read,
+                Err(error) if error.kind() == std::io::ErrorKind::Interrupted => continue,
+                Err(error) => return Err(error),
+            };
+            hasher.update(&buffer[..read]);
+            to.write_all(&buffer[..read])?;
+            bytes += read as u64;
+        }
+        Ok(FileSum {
+            bytes,
+            sha256: hex(&hasher.finalize()),
+        })
+    }
+
+    pub fn of(path: &Path) -> Result<Self, FileError> {
+        open(path)
+            .and_then(|mut file| FileSum::copying(&mut file, &mut std::io::sink()))
+            .map_err(FileError::doing(path, "cannot read the file"))
+    }
+}
+
+impl Manifest {
+    /// Reads the manifest of a folder; `None` if there is none.
+    pub fn read(folder: &Path) -> Result<Option<Self>, FileError> {
+        read_record(&folder.join(MANIFEST_FILE))
+    }
+
+    fn verify(&self, found: &BTreeMap<String, FileSum>, whole: &Path) -> Result<(), FileError> {
+        let faults = self.faults(found);
+        if faults.is_empty() {
+            return Ok(());
+        }
+        let lines = faults.iter();
+        let lines: String = lines
+            .map(|(name, message)| format!("\n  {name}: {message}"))
+            .collect();
+        let message = format!("the files disagree with {MANIFEST_FILE}:{lines}");
+        Err(FileError::new(whole, message))
+    }
+
+    /// Files that disagree with the manifest: names and messages.
+    pub fn faults(&self, found: &BTreeMap<String, FileSum>) -> Vec<(String, String)> {
+        let listed = self.files.iter().filter_map(|(name, sum)| {
+            let message = match found.get(name) {
+                None => format!("the file is missing, but {MANIFEST_FILE} lists it"),
+                Some(there) if there.bytes != sum.bytes => format!(
+                    "the file was changed (found {} bytes, expected {} as in {MANIFEST_FILE})",
+                    there.bytes, sum.bytes
+                ),
+                Some(there) if there != sum => format!(
+                    "the file was changed (found SHA-256 {}, expected {} as in {MANIFEST_FILE})",
+                    there.sha256, sum.sha256
+                ),
+                Some(_) => return None,
+            };
+            Some((name.clone(), message))
+        });
+        let extra = found
+            .keys()
+            .filter(|name| !self.files.contains_key(*name))
+            .map(|name| {
+                (
+                    name.clone(),
+                    format!("{MANIFEST_FILE} does not list this file"),
+                )
+            });
+        listed.chain(extra).collect()
+    }
+}
+
+// Largest accepted manifest in bytes: about 200 per file, with room for covariances.
+const MAX_MANIFEST_BYTES: u64 = 1 << 26;
+
+// Largest accepted compression ratio beyond the first [`FREE_BYTES`] bytes. ASCII numbers reach 3, blank catalogues
+// about 100.
+const MAX_RATIO: u64 = 300;
+// Unpacked bytes that any archive may have.
+const FREE_BYTES: u64 = 1 << 24;
+// Bytes counted per file in addition to its content, about its cost on disk.
+const BYTES_PER_FILE: u64 = 1 << 12;
+// Most files, including the manifest: more than 8,000 images in each of 24 sets.
+pub const MAX_FILES: u64 = 200_000;
+
+pub fn is_archive(path: &Path) -> bool {
+    let name = path.to_string_lossy();
+    name.ends_with(".tar.gz") || name.ends_with(".tgz")
+}
+
+/// The manifest of an archive, and the checksums of its other files.
+#[derive(Debug, Clone, Default)]
+pub struct Unpacked {
+    pub manifest: Option<Manifest>,
+    pub files: BTreeMap<String, FileSum>,
+}
+
+impl Unpacked {
+    /// Compares the files with the manifest, which must exist if it is `required`.
+    pub fn verify(&self, archive: &Path, required: bool) -> Result<(), FileError> {
+        match &self.manifest {
+            Some(manifest) => manifest.verify(&self.files, archive),
+            None if required => {
+                let message =
+                    format!("cannot verify the files, because there is no {MANIFEST_FILE}");
+                Err(FileError::new(archive, message))
+            }
+            None => Ok(()),
+        }
+    }
+}
+
+/// Unpacks the archive at `path` into the new folder `out`. After an error no folder remains. The manifest must exist if
+/// it is `required`.
+pub fn unpack(path: &Path, out: &Path, required: bool) -> Result<Unpacked, FileError> {
+    let part = PartFolder::new(out)?;
+    let unpacked = read_archive(path, Some(part.path()))?;
+    unpacked.verify(path, required)?;
+    part.finish()?;
+    Ok(unpacked)
+}
+
+/// Reads a whole archive and writes its files to the folder `into`, if given.
+pub fn read_archive(path: &Path, into: Option<&Path>) -> Result<Unpacked, FileError> {
+    let cannot_read = || FileError::doing::<std::io::Error>(path, "cannot read the archive");
+    let file = open(path).map_err(cannot_read())?;
+    let most = FREE_BYTES + MAX_RATIO * file.metadata().map_err(cannot_read())?.len();
+    let mut files = 0;
+    let mut archive = Archive::new(Bounded {
+        decoder: GzDecoder::new(BufReader::new(file)),
+        read: 0,
+        most,
+    });
+    let mut unpacked = Unpacked::default();
+    // Raw: extensions of tar, such as names of any length, are entries that are not plain files.
+    for entry in archive.entries().map_err(cannot_read())?.raw(true) {
+        let mut entry = entry.map_err(cannot_read())?;
+        // Python's tarfile writes PAX headers for times and long names. Names and sizes here are those of the plain headers.
+        let kind = entry.header().entry_type();
+        if kind.is_pax_global_extensions() || kind.is_pax_local_extensions() {
+            continue;
+        }
+        let name = String::from_utf8_lossy(&entry.path_bytes()).into_owned();
+        // `tar czf … -C folder .` starts with the folder itself.
+        if name == "./" && entry.header().entry_type().is_dir() {
+            continue;
+        }
+        let name = match name.strip_prefix("./") {
+            Some(rest) if is_plain_name(rest) => rest.to_owned(),
+            _ => name,
+        };
+        if !entry.header().entry_type().is_file() || !is_plain_name(&name) {
+            let message = format!(
+                "unsupported member (found `{name}`, expected plain files without folders)"
+            );
+            return Err(FileError::new(path, message));
+        }
+        let is_manifest = name == MANIFEST_FILE;
+        if unpacked.files.contains_key(&name) || (is_manifest && unpacked.manifest.is_some()) {
+            let message = format!("the archive contains `{name}` twice");
+            return Err(FileError::new(path, message));
+        }
+        files += 1;
+        if files > MAX_FILES.min(most / BYTES_PER_FILE) {
+            let message = format!("too many files (found more than {})", files - 1);
+            return Err(FileError::new(path, message));
+        }
+        let mut bytes = Vec::new();
+        let mut target: Box<dyn Write> = match into {
+            _ if is_manifest => Box::new(&mut bytes),
+            None => Box::new(std::io::sink()),
+            Some(folder) => {
+                let target = folder.join(&name);
+                Box::new(
+                    File::create_new(&target).map_err(FileError::doing(&target, "cannot write"))?,
+                )
+            }
+        };
+        if is_manifest && entry.size() > MAX_MANIFEST_BYTES {
+            let message = format!(
+                "{MANIFEST_FILE} is too large (found {} bytes, expected at most {MAX_MANIFEST_BYTES})",
+                entry.size()
+            );
+            return Err(FileError::new(path, message));
+        }
+        let sum = FileSum::copying(&mut entry, &mut target)
+            .map_err(|error| FileError::new(path, format!("cannot unpack `{name}`: {error}")))?;
+        drop(target);
+        if !is_manifest {
+            unpacked.files.insert(name, sum);
+            continue;
+        }
+        let manifest: Manifest = serde_json::from_slice(&bytes).map_err(|error| {
+            FileError::new(
+                path,
+                format!("{MANIFEST_FILE} is not the manifest of a submission: {error}"),
+            )
+        })?;
+        unpacked.manifest = Some(manifest);
+        if let Some(folder) = into {
+            std::fs::write(folder.join(MANIFEST_FILE), &bytes)
+                .map_err(FileError::doing(folder, "cannot write the manifest"))?;
+        }
+    }
+    check_end(archive.into_inner()).map_err(cannot_read())?;
+    Ok(unpacked)
+}
+
+struct Bounded {
+    decoder: GzDecoder<BufReader<File>>,
+    read: u64,
+    most: u64,
+}
+
+impl Read for Bounded {
+    fn read(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
+        let found = self.decoder.read(buffer)?;
+        self.read += found as u64;
+        if self.read > self.most {
+            let most = self.most;
+            let message = format!("it unpacks to more than {most} bytes");
+            return Err(std::io::Error::new(
+                std::io::ErrorKind::FileTooLarge,
+                message,
+            ));
+        }
+        Ok(found)
+    }
+}
+
+// Checks that only blank blocks and the checksum of gzip follow the last file.
+fn check_end(mut archive: Bounded) -> std::io::Result<()> {
+    let wrong = |what| Err(std::io::Error::new(std::io::ErrorKind::InvalidData, what));
+    // No checksum covers what follows the last file, so it could carry anything.
+    let mut buffer = [0; 4096];
+    loop {
+        let read = archive.read(&mut buffer)?;
+        if read == 0 {
+            break;
+        }
+        if buffer[..read].iter().any(|byte| *byte != 0) {
+            return wrong("found data after the end");
+        }
+    }
+    if archive.decoder.into_inner().read(&mut buffer)? > 0 {
+        return wrong("found data after the end");
+    }
+    Ok(())
+}
+
+fn is_plain_name(name: &str) -> bool {
+    // A name with a separator could leave the folder that it is unpacked to.
+    !name.is_empty()
+        && !name.starts_with('.')
+        && !name.contains(|c: char| "/\\:".contains(c) || c.is_control())
+}
+
+/// A given folder or file, or the temporary folder of an unpacked archive.
+#[derive(Debug)]
+pub struct Sent {
+    path: PathBuf,
+    given: PathBuf,
+    _unpacked: Option<Scratch>,
+}
+
+impl Sent {
+    /// Opens a submission, and unpacks it if it has the ending of an archive.
+    pub fn open(given: &Path) -> Result<Self, FileError> {
+        // A folder or file is read in place.
+        let given = given.to_owned();
+        if !is_archive(&given) {
+            return Ok(Sent {
+                path: given.clone(),
+                given,
+                _unpacked: None,
+            });
+        }
+        let folder = Scratch::new()?;
+        read_archive(&given, Some(folder.path()))?;
+        Ok(Sent {
+            path: folder.path().to_owned(),
+            given,
+            _unpacked: Some(folder),
+        })
+    }
+
+    /// The folder or file with the content.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// The name of a file for messages: a member of the archive, not of the temporary folder.
+    pub fn as_given(&self, path: &Path) -> PathBuf {
+        match path.strip_prefix(&self.path) {
+            Ok(name) if name.as_os_str().is_empty() => self.given.clone(),
+            Ok(name) => self.given.join(name),
+            Err(_) => path.to_owned(),
+        }
+    }
+
+    pub fn named(&self, error: FileError) -> FileError {
+        FileError::new(self.as_given(&error.path), error.message)
+    }
+
+    /// The files without the manifest and hidden files, or the given file.
+    pub fn files(&self) -> std::io::Result<Vec<PathBuf>> {
+        if !self.path.is_dir() {
+            std::fs::metadata(&self.path)?;
+            return Ok(vec![self.path.clone()]);
+        }
+        let mut files = Vec::new();
+        for entry in std::fs::read_dir(&self.path)? {
+            let file = entry?.path();
+            let own = file.file_name().is_some_and(|name| {
+                name == MANIFEST_FILE || name.to_string_lossy().starts_with('.')
+            });
+            if !file.is_dir() && !own {
+                files.push(file);
+            }
+        }
+        files.sort();
+        Ok(files)
+    }
+}
+
+#[derive(Debug, Clone)]
+pub enum Packed {
+    /// Catalogues by set and image.
+    Catalogues(BTreeMap<u32, BTreeMap<u32, PathBuf>>),
+    /// A power spectrum per set.
+    Spectra(BTreeMap<u32, PathBuf>),
+}
+
+#[derive(Debug, Clone)]
+pub struct Submission {
+    pub method: String,
+    pub packed: Packed,
+    pub manifest: Option<Manifest>,
+}
+
+impl Submission {
+    /// What distinguishes methods of one name: the configuration as TOML, or the path from the data to the submission.
+    pub fn settings(&self, path: &Path, data: &DataFolder) -> Result<String, FileError> {
+        let run = self.manifest.as_ref().and_then(|own| own.run.as_ref());
+        match run {
+            Some(run) => settings_of(run, path),
+            None => Ok(way(data.root(), path)?.display().to_string()),
+        }
+    }
+
+    pub fn read(sent: &Sent) -> Result<Self, FileError> {
+        let whole = |message: String| FileError::new(&sent.given, message);
+        check_folder(&sent.path, "a folder or an archive (.tar.gz)")?;
+        let files = sent
+            .files()
+            .map_err(FileError::doing(&sent.given, "cannot list the folder"))?;
+        let manifest = Manifest::read(&sent.path)?;
+        if let Some(manifest) = &manifest {
+            manifest.verify(&sums_of(&files)?, &sent.given)?;
+        }
+        let mut catalogues = BTreeMap::<u32, BTreeMap<u32, PathBuf>>::new();
+        let mut spectra = BTreeMap::new();
+        let mut methods = Vec::new();
+        for file in files {
+            let kind = Kind::of(&file).ok_or_else(|| {
+                FileError::new(
+                    sent.as_given(&file),
+                    format!("the name is {}", Kind::EXPECTED),
+                )
+            })?;
+            match kind {
+                Kind::Catalogue { set, image, method } => {
+                    catalogues.entry(set).or_default().insert(image, file);
+                    methods.push(method);
+                }
+                Kind::Spectrum { set, method } => {
+                    spectra.insert(set, file);
+                    methods.push(method);
+                }
+            }
+        }
+        // Files of two methods would be scored as one.
+        methods.sort();
+        methods.dedup();
+        let [method] = methods.as_slice() else {
+            return Err(whole(match methods.len() {
+                0 => "the submission contains no files".into(),
+                _ => format!(
+                    "the files belong to several methods: {}",
+                    methods.join(", ")
+                ),
+            }));
+        };
+        let packed = match (catalogues.is_empty(), spectra.is_empty()) {
+            (false, true) => Packed::Catalogues(catalogues),
+            (true, false) => Packed::Spectra(spectra),
+            _ => {
+                return Err(whole(
+                    "the submission contains catalogues and spectra; expected one kind".into(),
+                ));
+            }
+        };
+        Ok(Submission {
+            method: method.clone(),
+            packed,
+            manifest,
+        })
+    }
+}
+
+pub fn settings_of(run: &Run, path: &Path) -> Result<String, FileError> {
+    toml::to_string(&run.configuration)
+        .map_err(FileError::doing(path, "cannot write the settings as TOML"))
+}
+
+/// Whether a path is an archive, or a folder that `pack` wrote.
+pub fn is_packed(path: &Path) -> bool {
+    // Below a file, the system's answer is an error other than "not found", which counts as there.
+    is_archive(path) || (path.is_dir() && is_there(&path.join(MANIFEST_FILE)))
+}
+
+// The checksums of files by their names.
+fn sums_of(files: &[PathBuf]) -> Result<BTreeMap<String, FileSum>, FileError> {
+    let sum = |file: &PathBuf| {
+        let name = file.file_name().unwrap_or_default().to_string_lossy();
+        Ok((name.into_owned(), FileSum::of(file)?))
+    };
+    files.iter().map(sum).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_are_recognised_and_made() {
+        for name in [
+            "g10_v1_objs_7_12.NN23.dat",
+            "g10_v1_objs_100_1000.NN23.dat",
+            "NN_23_set24.dat",
+        ] {
+            let kind = Kind::of(Path::new(name)).unwrap();
+            assert_eq!(kind.file_name(), name);
+        }
+        for wrong in [
+            "g10_v1_objs_7.NN.dat",
+            "NN_set1.txt",
+            "NN_set01.dat",
+            "NN_set10000.dat",
+            "g10_v1_objs_1_1000000.NN.dat",
+            "set.dat",
+            "x",
+        ] {
+            assert_eq!(Kind::of(Path::new(wrong)), None, "{wrong}");
+        }
+    }
+
+    // Reads a folder of empty files.
+    fn read(names: &[&str]) -> Result<Submission, FileError> {
+        let folder = tempfile::tempdir().unwrap();
+        for name in names {
+            std::fs::write(folder.path().join(name), "").unwrap();
+        }
+        Submission::read(&Sent::open(folder.path())?)
+    }
+
+    #[test]
+    fn files_are_sorted_by_kind_set_and_image() {
+        let names = ["g10_v1_objs_2_10.M.dat", "g10_v1_objs_2_9.M.dat", ".hidden"];
+        let submission = read(&names).unwrap();
+        let Packed::Catalogues(sets) = submission.packed else {
+            panic!("catalogues are no spectra");
+        };
+        let images: Vec<u32> = sets[&2].keys().copied().collect();
+        assert_eq!((submission.method.as_str(), images), ("M", vec![9, 10]));
+        let spectra = read(&["M_set1.dat", "M_set2.dat"]).unwrap();
+        assert!(matches!(spectra.packed, Packed::Spectra(files) if files.len() == 2));
+    }
+
+    #[test]
+    fn a_submission_has_one_method_and_one_kind() {
+        let one = "g10_v1_objs_2_1.M.dat";
+        for (names, expected) in [
+            (&[][..], "contains no files"),
+            (&[one, "g10_v1_objs_2_2.N.dat"], "several methods: M, N"),
+            (&[one, "M_set2.dat"], "catalogues and spectra"),
+            (&[one, "notes.txt"], "the name is neither"),
+        ] {
+            let message = read(names).unwrap_err().to_string();
+            assert!(message.contains(expected), "{names:?}: {message}");
+        }
+    }
+}

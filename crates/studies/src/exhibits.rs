@@ -7,8 +7,7 @@ use shearq_pipeline::simulate::simulator;
 use shearq_render::figure::{ColourMap, HeatMap, ImageRow, LinePlot, PanelGrid, Series, Style};
 use shearq_render::page::{Page, PageError};
 use shearq_render::table::{Cell, Table};
-use shearq_results::views::spectrum;
-use shearq_results::views::steps::{steps_figure, steps_row};
+use shearq_results::views::pages::{bins, spectrum_panel, steps_figure, steps_row};
 use shearq_scoring::Metrics;
 use shearq_simulate::kinds::{ImageType, SetKind, shares};
 use shearq_submissions::{Configuration, PsfForm, Published};
@@ -191,7 +190,7 @@ fn power_spectra(results: &[SetResult], place: usize, name: &str) -> (PanelGrid,
     let panel = |set: &SetResult| {
         let own = &set.results[place];
         let powers = [&set.l, &set.true_ee, &own.ee, &own.ee_error];
-        spectrum::panel(Some(set.set), SetKind::of(set.set), powers, None)
+        spectrum_panel(Some(set.set), SetKind::of(set.set), powers, None)
     };
     let figure = PanelGrid {
         title: format!("Shear power spectra of {name}"),
@@ -204,7 +203,7 @@ fn power_spectra(results: &[SetResult], place: usize, name: &str) -> (PanelGrid,
             let measured = (own.ee[b], own.ee_error[b]);
             (set.set, b + 1, set.l[b], set.true_ee[b], measured)
         };
-        spectrum::bins(&set.l).map(bin).collect()
+        bins(&set.l).map(bin).collect()
     };
     let rows: Vec<_> = results.iter().flat_map(bins).collect();
     let mut table = Table::titled("Shear power spectra");

@@ -8,12 +8,12 @@ use shearq_scoring::{
     RowCounts, SCORED, SetImages, SetScorer, TrueShear,
 };
 
-use super::challenge::{Kind, SpectrumLine, read_spectrum, wrong_multipoles};
-use super::manifest::{Contents, FileSum, Manifest};
-use super::packed::Sent;
+use super::{
+    Contents, FileSum, Kind, Manifest, Sent, SpectrumLine, read_spectrum, wrong_multipoles,
+};
 use crate::catalogues::COLUMNS;
 use crate::foreign::{ADVICE_ON_SENTINELS, fault_of_rows};
-use crate::views::diagnosis::{odd_response, words};
+use crate::views::scores::{odd_response, words};
 use shearq_dataset::layout::read_rows;
 use shearq_files::FileError;
 use shearq_files::table::most_rows;
@@ -53,6 +53,7 @@ pub struct Expected {
 }
 
 // Largest accepted distance of a position from the centre of its cell, in cells.
+// 0.48 px of the challenge's stamps, so that 0-based positions, which are off by 1 px, are found.
 const POSITION_TOLERANCE: f64 = 0.01;
 
 #[derive(Debug)]
@@ -84,7 +85,14 @@ pub fn check_sent(
     expected: &Expected,
     done: &mut dyn FnMut(CheckedSet<'_>),
 ) -> Vec<Finding> {
-    let mut findings = check_files(sent, expected, done);
+    let path = sent.path();
+    let mut report = Report::default();
+    match sent.files() {
+        Ok(files) => check_files(path, &files, expected, done, &mut report),
+        Err(error) => report.error(path, "readable", error.to_string()),
+    }
+    let mut findings = report.findings;
+    // Participants do not know the folder that their archive was unpacked to.
     for finding in &mut findings {
         finding.path = sent.as_given(&finding.path);
     }
@@ -92,46 +100,44 @@ pub fn check_sent(
 }
 
 fn check_files(
-    sent: &Sent,
+    path: &Path,
+    files: &[PathBuf],
     expected: &Expected,
     done: &mut dyn FnMut(CheckedSet<'_>),
-) -> Vec<Finding> {
-    let path = sent.path();
-    let mut report = Report::default();
-    let files = match sent.files() {
-        Ok(files) => files,
-        Err(error) => {
-            report.error(path, "readable", error.to_string());
-            return report.findings;
-        }
-    };
+    report: &mut Report,
+) {
     if files.is_empty() {
         report.error(path, "empty", "found no file".into());
     }
     if path.is_dir() {
-        check_manifest(path, &files, &mut report);
+        check_manifest(path, files, report);
     }
-    let single = files.len() == 1 && path.is_file();
     let mut catalogues: BTreeMap<u32, Vec<(u32, &PathBuf)>> = BTreeMap::new();
     let mut spectra = BTreeSet::new();
     let mut methods: BTreeSet<String> = BTreeSet::new();
-    for file in &files {
-        let kind = check_name(file, single, &mut report);
-        if let Some(Kind::Catalogue { method, .. } | Kind::Spectrum { method, .. }) = &kind {
-            methods.insert(method.clone());
+    for file in files {
+        let kind = Kind::of(file);
+        if kind.is_none() {
+            // A single file given by hand may have any name; in a folder it would not be scored.
+            let severity = match files.len() == 1 && path.is_file() {
+                true => Severity::Warning,
+                false => Severity::Error,
+            };
+            let message = format!("the name is {}", Kind::EXPECTED);
+            report.add(file, severity, "name", message);
         }
-        match &kind {
-            Some(Kind::Catalogue { set, image, .. }) => {
-                catalogues.entry(*set).or_default().push((*image, file));
+        match kind {
+            Some(Kind::Catalogue { set, image, method }) => {
+                methods.insert(method);
+                catalogues.entry(set).or_default().push((image, file));
             }
-            Some(Kind::Spectrum { set, .. }) => {
-                spectra.insert(*set);
-                check_spectrum(file, kind.as_ref(), expected, &mut report);
+            Some(Kind::Spectrum { set, method }) => {
+                methods.insert(method);
+                spectra.insert(set);
+                check_spectrum(file, Some(set), expected, report);
             }
-            None if looks_like_spectrum(file) => {
-                check_spectrum(file, None, expected, &mut report);
-            }
-            None => check_unnamed(file, files.len() == 1, expected, &mut report),
+            None if looks_like_spectrum(file) => check_spectrum(file, None, expected, report),
+            None => check_unnamed(file, files.len() == 1, expected, report),
         }
     }
     if methods.len() > 1 {
@@ -141,26 +147,39 @@ fn check_files(
     }
     if path.is_dir() && !(catalogues.is_empty() && spectra.is_empty()) {
         let found = catalogues.keys().chain(&spectra).copied().collect();
-        check_sets(path, &found, expected, &mut report);
+        check_sets(path, &found, expected, report);
     }
     let numbers = catalogues.values().flatten().map(|(image, _)| *image);
     let most = numbers.max().unwrap_or(0).max(expected.images.unwrap_or(0));
     for (set, of_set) in catalogues {
         let mut files: Option<SetFiles> = None;
         for (image, file) in of_set {
-            let Some((sum, counts)) = check_catalogue(file, expected, &mut report) else {
+            // An unreadable catalogue is reported, and the others of its set are checked without it.
+            let Some((sum, counts)) = check_catalogue(file, expected, report) else {
                 continue;
             };
             let files = files.get_or_insert_with(|| SetFiles::new(expected, set));
             files.add(&sum, counts, image, file);
         }
         if let Some(mut files) = files {
-            check_copies(&files, &mut report);
+            for (copy, first) in &files.faults.copies {
+                let message = format!(
+                    "the ellipticities are copies of {}; expected an independent measurement per image",
+                    name_of(&files.paths[*first])
+                );
+                report.error(&files.paths[*copy], "copies", message);
+            }
             let odd = files.faults.odd();
+            // Of a secret truth, only `done` gets the numbers of such images: their response is the correlation with it.
+            if expected.truth.contains_key(&set) {
+                for odd in &odd {
+                    let message = format!("set {set}: the image {}", odd_response(odd));
+                    report.error(&files.paths[odd.place], "image", message);
+                }
+            }
             let odd = odd.iter().map(|odd| files.numbers[odd.place]).collect();
-            check_responses(set, &files, expected, &mut report);
-            check_images(set, &mut files, most, path, expected, &mut report);
-            check_against_truth(set, &files, expected, &mut report);
+            check_images(set, &mut files, most, path, expected, report);
+            check_against_truth(set, &files, expected, report);
             done(CheckedSet {
                 set,
                 images: &files.images,
@@ -170,7 +189,6 @@ fn check_files(
             });
         }
     }
-    report.findings
 }
 
 // Checks a catalogue whose name contains no set. A `single` file belongs to the only set.
@@ -219,19 +237,6 @@ fn check_sets(path: &Path, found: &BTreeSet<u32>, expected: &Expected, report: &
             report.add(path, severity, "sets", format!("set {set} {what}"));
         }
     }
-}
-
-fn check_name(file: &Path, single: bool, report: &mut Report) -> Option<Kind> {
-    let kind = Kind::of(file);
-    if kind.is_none() {
-        let severity = match single {
-            true => Severity::Warning,
-            false => Severity::Error,
-        };
-        let message = format!("the name is {}", Kind::EXPECTED);
-        report.add(file, severity, "name", message);
-    }
-    kind
 }
 
 struct SetFiles {
@@ -355,72 +360,74 @@ fn check_catalogue(
         true => Severity::Error,
         false => Severity::Warning,
     };
-    let mut add = |count: usize, severity, check, message: String| {
+    let error = Severity::Error;
+    let (off_centre, [dx, dy]) = off_centre(&rows, grid);
+    let found = [
+        (
+            counts.excess,
+            error,
+            "excess",
+            format!(
+                "too many rows (found {}, expected at most {cells}); the rest is ignored",
+                rows.len()
+            ),
+        ),
+        (
+            counts.outside,
+            error,
+            "outside",
+            format!(
+                "{} rows are outside the {1} × {1} grid",
+                counts.outside, grid.n
+            ),
+        ),
+        (
+            counts.missing,
+            more_than(counts.missing, 10, cells),
+            "missing",
+            match counts.missing == cells {
+                true => "no galaxy is on the grid".into(),
+                false => format!(
+                    "{} of {cells} galaxies are missing; each counts as zero",
+                    counts.missing
+                ),
+            },
+        ),
+        (
+            counts.repeated,
+            error,
+            "duplicates",
+            format!(
+                "{} rows repeat a galaxy; the scoring adds their ellipticities",
+                counts.repeated
+            ),
+        ),
+        (
+            off_centre,
+            Severity::Warning,
+            "positions",
+            format!(
+                "{off_centre} positions are not at the centres of their cells (mean offset {dx:+.2}, {dy:+.2} px); expected 1-based FITS pixels of the stamp centre"
+            ),
+        ),
+        (
+            counts.not_finite,
+            error,
+            "not-finite",
+            format!("{} ellipticities are not finite numbers", counts.not_finite),
+        ),
+        (
+            counts.above_one,
+            more_than(counts.above_one, 20, rows.len()),
+            "range",
+            format!("{} galaxies have |e| > 1", counts.above_one),
+        ),
+    ];
+    for (count, severity, check, message) in found {
         if count > 0 {
             report.add(path, severity, check, message);
         }
-    };
-    let error = Severity::Error;
-    add(
-        counts.excess,
-        error,
-        "excess",
-        format!(
-            "too many rows (found {}, expected at most {cells}); the rest is ignored",
-            rows.len()
-        ),
-    );
-    add(
-        counts.outside,
-        error,
-        "outside",
-        format!(
-            "{} rows are outside the {1} × {1} grid",
-            counts.outside, grid.n
-        ),
-    );
-    add(
-        counts.missing,
-        more_than(counts.missing, 10, cells),
-        "missing",
-        match counts.missing == cells {
-            true => "no galaxy is on the grid".into(),
-            false => format!(
-                "{} of {cells} galaxies are missing; each counts as zero",
-                counts.missing
-            ),
-        },
-    );
-    add(
-        counts.repeated,
-        error,
-        "duplicates",
-        format!(
-            "{} rows repeat a galaxy; the scoring adds their ellipticities",
-            counts.repeated
-        ),
-    );
-    let (off_centre, [dx, dy]) = off_centre(&rows, grid);
-    add(
-        off_centre,
-        Severity::Warning,
-        "positions",
-        format!(
-            "{off_centre} positions are not at the centres of their cells (mean offset {dx:+.2}, {dy:+.2} px); expected 1-based FITS pixels of the stamp centre"
-        ),
-    );
-    add(
-        counts.not_finite,
-        error,
-        "not-finite",
-        format!("{} ellipticities are not finite numbers", counts.not_finite),
-    );
-    add(
-        counts.above_one,
-        more_than(counts.above_one, 20, rows.len()),
-        "range",
-        format!("{} galaxies have |e| > 1", counts.above_one),
-    );
+    }
     if counts.used > 0 && sum.e1.iter().chain(&sum.e2).all(|e| *e == 0.0) {
         report.error(path, "constant", "all ellipticities are zero".into());
     } else if counts.used > 1 {
@@ -451,26 +458,6 @@ fn off_centre(rows: &[Row], grid: &Grid) -> (usize, [f64; 2]) {
         }
     }
     (count, offset.map(|sum| sum / count as f64))
-}
-
-fn check_copies(files: &SetFiles, report: &mut Report) {
-    for (copy, first) in &files.faults.copies {
-        let message = format!(
-            "the ellipticities are copies of {}; expected an independent measurement per image",
-            name_of(&files.paths[*first])
-        );
-        report.error(&files.paths[*copy], "copies", message);
-    }
-}
-
-fn check_responses(set: u32, files: &SetFiles, expected: &Expected, report: &mut Report) {
-    if !expected.truth.contains_key(&set) {
-        return;
-    }
-    for odd in files.faults.odd() {
-        let message = format!("set {set}: the image {}", odd_response(&odd));
-        report.error(&files.paths[odd.place], "image", message);
-    }
 }
 
 // The name of a file without its folder, which may be temporary.
@@ -530,6 +517,7 @@ fn check_against_truth(set: u32, files: &SetFiles, expected: &Expected, report: 
     let Some(path) = paths.first() else {
         return;
     };
+    // Without galaxies each catalogue has its finding already.
     let absent = images.total().count.iter().all(|count| *count == 0.0);
     if absent || !expected.truth.contains_key(&set) {
         return;
@@ -559,6 +547,7 @@ fn check_against_truth(set: u32, files: &SetFiles, expected: &Expected, report: 
         let message = format!("set {set}: {}", words(&finding));
         report.add(path, severity, check, message);
     }
+    // A fault that is named explains a low correlation.
     let clear = report.findings.len() == before;
     let matched = &score.conventions[score.matching.best().index()];
     if clear && score.constant.is_none() && matched.correlation < score.matching.least_clear() {
@@ -570,7 +559,7 @@ fn check_against_truth(set: u32, files: &SetFiles, expected: &Expected, report: 
     }
 }
 
-fn check_spectrum(path: &Path, kind: Option<&Kind>, expected: &Expected, report: &mut Report) {
+fn check_spectrum(path: &Path, set: Option<u32>, expected: &Expected, report: &mut Report) {
     let lines = match read_spectrum(path) {
         Ok(lines) => lines,
         Err(error) => {
@@ -611,7 +600,7 @@ fn check_spectrum(path: &Path, kind: Option<&Kind>, expected: &Expected, report:
             );
         }
     }
-    let truth = kind.and_then(|kind| expected.truth.get(&kind.set()));
+    let truth = set.and_then(|set| expected.truth.get(&set));
     if let Some(truth) = truth
         && found == wanted
         && let Ok(scorer) = SetScorer::new(expected.grid, truth.clone(), Options::default())
@@ -625,6 +614,7 @@ fn check_spectrum(path: &Path, kind: Option<&Kind>, expected: &Expected, report:
         });
         // A cross-spectrum of noise can be negative.
         let ratio = (sum / true_sum).abs();
+        // A power C_ℓ without the factor ℓ²/2π is smaller by 200 at the lowest multipole of a field of 10°.
         if !(0.01..100.0).contains(&ratio) {
             let message = format!(
                 "the power is {ratio:.1e} times the true power; expected the unit ℓ²C_ℓ/2π. Noise also raises the power"

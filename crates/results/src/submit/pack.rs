@@ -1,16 +1,19 @@
 //! Writes catalogues as a submission to a challenge, with a manifest.
 
 use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 
+use flate2::write::GzEncoder;
+use flate2::{Compression, GzBuilder};
 use shearq_quantities::units::Degrees;
 use shearq_scoring::{
-    Convention, ConventionMatch, FieldSum, Grid, Options, SetImages, SetScorer, SpectrumCovariance,
+    Convention, ConventionMatch, FieldSum, Grid, Options, Row, SCORED, ScoringError, SetImages,
+    SetScorer, SpectrumCovariance, cross_spectrum, measured_bandpowers,
 };
 
-use super::archive::{ArchiveWriter, MAX_FILES, is_archive};
-use super::challenge::{Kind, catalogue_text, spectrum_text};
-use super::manifest::{Contents, Entry, FileSum, MANIFEST_FILE, Manifest};
+use super::{Contents, Entry, FileSum, Kind, MANIFEST_FILE, MAX_FILES, Manifest, is_archive};
 use crate::catalogues::Catalogues;
 use crate::foreign::Foreign;
 use shearq_dataset::layout::DataFolder;
@@ -18,9 +21,10 @@ use shearq_dataset::record::record_text;
 use shearq_dataset::threads::Progress;
 use shearq_dataset::{grid, truth};
 use shearq_files::FileError;
-use shearq_files::atomic::PartFolder;
+use shearq_files::atomic::{PartFile, PartFolder, sweep_beside};
 use shearq_files::open::is_there;
 use shearq_files::table::{MAX_ROWS, most_rows};
+use tar::{Builder, Header};
 
 #[derive(Debug, Clone)]
 pub struct Packing<'a> {
@@ -194,6 +198,40 @@ fn check_number(files: usize, out: &Path) -> Result<(), FileError> {
     Err(FileError::new(out, message))
 }
 
+// The measured galaxies of a catalogue in the challenge's format. Galaxies without an ellipticity are left out; the
+// original scoring counts them as zero.
+fn catalogue_text(rows: &[Row]) -> String {
+    let mut text = String::new();
+    for Row { x, y, e1, e2 } in rows {
+        if e1.is_finite() && e2.is_finite() {
+            text.push_str(&format!("{x} {y} {e1:.9} {e2:.9}\n"));
+        }
+    }
+    text
+}
+
+// The power spectrum of a set in the challenge's format, and the covariance of its bandpowers, if known.
+fn spectrum_text(
+    grid: &Grid,
+    images: &SetImages,
+    contents: Contents,
+) -> Result<(String, Option<SpectrumCovariance>), ScoringError> {
+    let standard = Convention::STANDARD;
+    let (bins, power, covariance) = match contents {
+        Contents::CrossSpectra => cross_spectrum(grid, images, standard)
+            .map(|cross| (cross.bins, cross.power, cross.covariance))?,
+        _ => measured_bandpowers(grid, images.total(), standard)
+            .map(|(bins, power)| (bins, power, None))?,
+    };
+    let text = SCORED
+        .map(|b| format!("{} {:.6} {:.12e}\n", b + 1, bins.l[b], power[b]))
+        .collect();
+    let first = SCORED.start;
+    let scored = covariance
+        .map(|all| std::array::from_fn(|i| std::array::from_fn(|j| all[first + i][first + j])));
+    Ok((text, scored))
+}
+
 enum Destination {
     Folder(PartFolder),
     Archive(Box<ArchiveWriter>),
@@ -227,8 +265,76 @@ impl Destination {
     }
 }
 
+// Packs files so that equal files give equal bytes.
+struct ArchiveWriter {
+    builder: Builder<GzEncoder<BufWriter<File>>>,
+    part: PartFile,
+}
+
+impl ArchiveWriter {
+    fn create(path: &Path) -> Result<Self, FileError> {
+        if is_there(path) {
+            return Err(exists(path));
+        }
+        sweep_beside(path);
+        let (part, file) = PartFile::create(path)?;
+        // Time and system would change the bytes.
+        let encoder = GzBuilder::new()
+            .mtime(0)
+            .operating_system(UNKNOWN_SYSTEM)
+            .write(BufWriter::new(file), Compression::default());
+        Ok(ArchiveWriter {
+            builder: Builder::new(encoder),
+            part,
+        })
+    }
+
+    fn add(&mut self, name: &str, bytes: &[u8]) -> Result<(), FileError> {
+        let mut header = Header::new_gnu();
+        header.set_size(bytes.len() as u64);
+        header.set_mode(0o644);
+        header.set_mtime(0);
+        header.set_uid(0);
+        header.set_gid(0);
+        self.builder
+            .append_data(&mut header, name, bytes)
+            .map_err(cannot_write(self.part.target()))
+    }
+
+    fn finish(self) -> Result<(), FileError> {
+        let ArchiveWriter { builder, part } = self;
+        builder
+            .into_inner()
+            .and_then(GzEncoder::finish)
+            .and_then(|mut file| file.flush())
+            .map_err(cannot_write(part.target()))?;
+        let path = part.target().to_owned();
+        match part.finish_if_absent()? {
+            true => Ok(()),
+            false => Err(exists(&path)),
+        }
+    }
+}
+
+fn exists(path: &Path) -> FileError {
+    FileError::new(
+        path,
+        "the archive exists already; expected a new file. Try: another name for --out",
+    )
+}
+
+// gzip's code for an unknown system.
+const UNKNOWN_SYSTEM: u8 = 255;
+
+fn cannot_write(path: &Path) -> impl FnOnce(std::io::Error) -> FileError {
+    FileError::doing(path, "cannot write the archive")
+}
+
 #[cfg(test)]
 mod tests {
+    use std::io::Read;
+
+    use super::super::read_archive;
     use super::*;
 
     #[test]
@@ -240,5 +346,73 @@ mod tests {
             message,
             "sent.tar.gz: too many files to pack (found 200000, expected at most 199999)"
         );
+    }
+
+    // The error of reading an archive of files, and bytes after its end.
+    fn refusal(files: &mut dyn Iterator<Item = (String, &[u8])>, after: u64) -> String {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.tar.gz");
+        let mut writer = ArchiveWriter::create(&path).unwrap();
+        for (name, bytes) in files {
+            writer.add(&name, bytes).unwrap();
+        }
+        writer.builder.finish().unwrap();
+        let zeros = std::io::repeat(0).take(after);
+        std::io::copy(&mut { zeros }, writer.builder.get_mut()).unwrap();
+        writer.finish().unwrap();
+        read_archive(&path, None)
+            .err()
+            .map_or_else(String::new, |e| e.message)
+    }
+
+    #[test]
+    fn everything_in_an_archive_is_counted() {
+        let mut one = [("a".to_owned(), &b"x"[..])].into_iter();
+        assert_eq!(refusal(&mut one.clone(), 1 << 20), "");
+        let message = refusal(&mut one, 200 << 20);
+        assert!(message.contains("it unpacks to more than"), "{message}");
+        let mut empty = (0..30_000).map(|k| (format!("{k}"), &b""[..]));
+        let message = refusal(&mut empty, 0);
+        assert!(message.contains("too many files"), "{message}");
+        let zeros = vec![0; 64 << 20];
+        let message = refusal(&mut [("a".to_owned(), &zeros[..])].into_iter(), 0);
+        assert!(message.contains("it unpacks to more than"), "{message}");
+    }
+
+    #[test]
+    fn pax_headers_are_no_files() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.tar.gz");
+        let mut writer = ArchiveWriter::create(&path).unwrap();
+        for kind in [tar::EntryType::XGlobalHeader, tar::EntryType::XHeader] {
+            let times = b"20 mtime=1700000000\n";
+            let mut header = Header::new_ustar();
+            header.set_entry_type(kind);
+            header.set_size(times.len() as u64);
+            writer
+                .builder
+                .append_data(&mut header, "pax/header", &times[..])
+                .unwrap();
+        }
+        writer.add("a", b"x").unwrap();
+        writer.finish().unwrap();
+        let names: Vec<String> = read_archive(&path, None)
+            .unwrap()
+            .files
+            .into_keys()
+            .collect();
+        assert_eq!(names, ["a"]);
+    }
+
+    #[test]
+    fn an_invalid_manifest_is_refused() {
+        for wrong in ["null", "[]", "{}", "1", "", "{\"method\": null}"] {
+            let mut files = [(MANIFEST_FILE.to_owned(), wrong.as_bytes())].into_iter();
+            let message = refusal(&mut files, 0);
+            assert!(
+                message.contains("is not the manifest of a submission"),
+                "{wrong}: {message}"
+            );
+        }
     }
 }

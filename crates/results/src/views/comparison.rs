@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 
 use ndarray::Array2;
 use shearq_render::figure::{ColourMap, HeatMap};
-use shearq_render::table::{Cell, Heading, Table};
+use shearq_render::table::{Cell, Table};
 use shearq_scoring::resample::PairedDifference;
 use shearq_scoring::{Definition, Fault, Metrics};
 use shearq_submissions::Published;
@@ -12,8 +12,7 @@ use shearq_submissions::Published;
 use crate::compare::{Group, Grouping, Paired, Variant, difference, keep_common_sets};
 use crate::record::{RunRecord, SetRecord, columns_named, mean};
 use crate::score::ScoredSet;
-use crate::views::diagnosis::of_sets;
-use crate::views::scores::{best_is_another, definition_note, notes, zero_shear_note};
+use crate::views::scores::{best_is_another, definition_note, notes, of_sets, zero_shear_note};
 
 /// A method or run with its sets.
 pub type Named<'a> = (String, &'a [SetRecord]);
@@ -36,29 +35,10 @@ const METRICS: [&str; 6] = [
     "sqrt_a",
 ];
 
-// Headings of Q and calibrated Q, each with difference and significance, and of `METRICS`.
-fn metric_headings<'a>(mut sets: impl Iterator<Item = &'a SetRecord>) -> Vec<Heading> {
-    let mut headings = Vec::new();
-    for (name, difference, label, sigma) in [
-        ("q", "q_difference", "ΔQ to first", "sigma"),
-        (
-            "q_calibrated",
-            "q_calibrated_difference",
-            "ΔQ cal.",
-            "q_calibrated_sigma",
-        ),
-    ] {
-        headings.extend(columns_named(&[name]).iter().map(|own| own.heading()));
-        headings.push(Heading::new(difference, label));
-        headings.push(Heading::new(sigma, "in σ"));
-    }
-    // Equal to Q if the leaderboard uses the same class of conventions.
-    let differs = sets.any(|set| best_is_another(set.q_leaderboard, set.metrics.q));
-    headings.extend(columns_named(&METRICS).iter().map(|own| Heading {
-        detail: own.name == "q_leaderboard" && !differs,
-        ..own.heading()
-    }));
-    headings
+// A row of a comparison.
+struct Compared<'a> {
+    run: &'a RunRecord,
+    differences: Differences,
 }
 
 type Differences = [Option<PairedDifference>; 2];
@@ -73,20 +53,43 @@ fn differences(first: &RunRecord, run: &RunRecord) -> Differences {
     }
 }
 
-fn metric_cells(run: &RunRecord, differences: Differences) -> Vec<Cell> {
-    let cells = |names: &[&str]| -> Vec<Cell> {
-        let columns = columns_named(names);
-        columns.iter().map(|own| own.cell(run, &run.sets)).collect()
+// Adds Q and calibrated Q, each with difference and significance, and `METRICS`.
+fn add_metrics(table: &mut Table, rows: &[Compared<'_>]) {
+    let add = |table: &mut Table, name: &str| {
+        for own in columns_named(&[name]) {
+            table.column(own.name, own.heading, rows, |row| own.cell(row.run));
+        }
     };
-    let mut row = Vec::new();
-    for (name, found) in ["q", "q_calibrated"].into_iter().zip(differences) {
-        row.extend(cells(&[name]));
-        let (value, error) = (found.map(|d| d.difference), found.map(|d| d.error));
-        row.push(Cell::with_error(value.unwrap_or(f64::NAN), error, 2));
-        row.push(Cell::number(found.map_or(f64::NAN, |d| d.sigma()), 1));
+    for (k, (name, difference, label, sigma)) in [
+        ("q", "q_difference", "ΔQ to first", "sigma"),
+        (
+            "q_calibrated",
+            "q_calibrated_difference",
+            "ΔQ cal.",
+            "q_calibrated_sigma",
+        ),
+    ]
+    .into_iter()
+    .enumerate()
+    {
+        add(table, name);
+        table.column(difference, label, rows, |row| {
+            let (value, error) = row.differences[k].map(|d| (d.difference, d.error)).unzip();
+            Cell::with_error(value.unwrap_or(f64::NAN), error, 2)
+        });
+        table.column(sigma, "in σ", rows, |row| {
+            Cell::number(row.differences[k].map_or(f64::NAN, |d| d.sigma()), 1)
+        });
     }
-    row.extend(cells(&METRICS));
-    row
+    for name in METRICS {
+        add(table, name);
+    }
+    // Equal to Q if the leaderboard uses the same class of conventions.
+    let mut sets = rows.iter().flat_map(|row| &row.run.sets);
+    let differs = sets.any(|set| best_is_another(set.q_leaderboard, set.metrics.q));
+    for heading in &mut table.headings {
+        heading.detail |= heading.key == "q_leaderboard" && !differs;
+    }
 }
 
 fn unpaired_note(names: &[String]) -> Option<String> {
@@ -101,42 +104,50 @@ fn unpaired_note(names: &[String]) -> Option<String> {
 /// Methods side by side: means over their common sets, differences in Q from the first method, paired over equal images,
 /// and published metrics.
 pub fn compare(variants: &[Variant], definition: Definition) -> Table {
-    let mut headings = vec![Heading::new("submission", "Configuration")];
-    headings.extend(metric_headings(
-        variants.iter().flat_map(|variant| &variant.run.sets),
-    ));
-    headings.extend([
-        Heading::new("q_published", "Q publ."),
-        Heading::new("m_half_published", "M/2 publ."),
-        Heading::new("sqrt_a_published", "√A publ."),
-    ]);
-    let mut others = Metrics::ALL.map(|metric| metric.name).to_vec();
-    others.retain(|name| headings.iter().all(|heading| heading.key != *name));
-    let others = columns_named(&others);
-    headings.extend(others.iter().map(|own| own.heading().detail()));
-    let (mut rows, mut unpaired) = (Vec::new(), Vec::new());
-    for (k, variant) in variants.iter().enumerate() {
-        let run = &variant.run;
-        let differences = match k {
-            0 => [None; 2],
-            _ => differences(&variants[0].run, run),
-        };
-        if k > 0 && differences[0].is_none() {
-            unpaired.push(variant.name.clone());
+    let rows = variants
+        .iter()
+        .enumerate()
+        .map(|(k, Variant { run, .. })| Compared {
+            run,
+            differences: match k {
+                0 => [None; 2],
+                _ => differences(&variants[0].run, run),
+            },
+        });
+    let rows: Vec<Compared<'_>> = rows.collect();
+    let mut table = Table::titled("Comparison of configurations");
+    table.column("submission", "Configuration", variants, |variant| {
+        Cell::text(&variant.name)
+    });
+    add_metrics(&mut table, &rows);
+    let published = |value: fn(&Published) -> f64, decimals: usize| {
+        move |variant: &Variant| {
+            let value = variant.published.as_ref().map_or(f64::NAN, value);
+            Cell::number(value, decimals)
         }
-        let published = |value: fn(&Published) -> f64, decimals: usize| {
-            Cell::number(variant.published.as_ref().map_or(f64::NAN, value), decimals)
-        };
-        let mut row = vec![Cell::text(&variant.name)];
-        row.extend(metric_cells(run, differences));
-        row.extend([
-            published(|p| p.q, 2),
-            published(|p| p.m_half, 4),
-            published(|p| p.sqrt_a, 4),
-        ]);
-        row.extend(others.iter().map(|own| own.cell(run, &run.sets)));
-        rows.push(row);
+    };
+    table.column("q_published", "Q publ.", variants, published(|p| p.q, 2));
+    table.column(
+        "m_half_published",
+        "M/2 publ.",
+        variants,
+        published(|p| p.m_half, 4),
+    );
+    table.column(
+        "sqrt_a_published",
+        "√A publ.",
+        variants,
+        published(|p| p.sqrt_a, 4),
+    );
+    let mut others = Metrics::ALL.map(|metric| metric.name).to_vec();
+    others.retain(|name| table.place(name).is_none());
+    for own in columns_named(&others) {
+        let place = table.column(own.name, own.heading, &rows, |row| own.cell(row.run));
+        table.headings[place].detail = true;
     }
+    let unpaired = variants.iter().zip(&rows).skip(1);
+    let unpaired = unpaired.filter(|(_, row)| row.differences[0].is_none());
+    let unpaired: Vec<String> = unpaired.map(|(variant, _)| variant.name.clone()).collect();
     let (sets, images) = sets_and_images(variants);
     let mut lines = vec![
         match sets.contains(',') {
@@ -151,12 +162,8 @@ pub fn compare(variants: &[Variant], definition: Definition) -> Table {
     }
     lines.extend(unpaired_note(&unpaired));
     lines.extend(notes_of_variants(variants));
-    Table {
-        title: "Comparison of configurations".into(),
-        headings,
-        rows,
-        notes: lines,
-    }
+    table.notes = lines;
+    table
 }
 
 fn sets_and_images(variants: &[Variant]) -> (String, usize) {
@@ -190,13 +197,12 @@ pub fn notes_of_variants(variants: &[Variant]) -> Vec<String> {
 
 /// The metrics that decide between methods: Q, calibrated Q, m and noise, as means over their common sets.
 pub fn compact(variants: &[Variant]) -> Table {
-    let columns = columns_named(&["submission", "q", "q_calibrated", "m_cross", "galaxy_noise"]);
-    let rows = variants.iter().map(|Variant { run, .. }| {
-        columns
-            .iter()
-            .map(|own| own.cell(run, &run.sets))
-            .collect::<Vec<_>>()
-    });
+    let mut table = Table::titled("Comparison of configurations");
+    for own in columns_named(&["submission", "q", "q_calibrated", "m_cross", "galaxy_noise"]) {
+        table.column(own.name, own.heading, variants, |variant| {
+            own.cell(&variant.run)
+        });
+    }
     let (sets, images) = sets_and_images(variants);
     let mut notes = vec![
         format!("Means over the simulated sets {sets}; {images} images. ± is a standard error."),
@@ -206,58 +212,49 @@ pub fn compact(variants: &[Variant]) -> Table {
     let q = |variant: &Variant| mean(&variant.run.sets, |metrics| metrics.q).0;
     let best = variants.iter().max_by(|a, b| q(a).total_cmp(&q(b)));
     notes.extend(best.and_then(|best| zero_shear_note(&best.scored())));
-    Table {
-        title: "Comparison of configurations".into(),
-        headings: columns.iter().map(|own| own.heading()).collect(),
-        rows: rows.collect(),
-        notes,
-    }
+    table.notes = notes;
+    table
 }
 
 /// Runs side by side: means over sets or groups of sets, and the difference in Q from the first row, or the first row of
 /// the group, on the same images.
 pub fn compare_runs(runs: &[RunRecord], groups: &[Group], grouping: Option<Grouping>) -> Table {
-    let mut headings = vec![
-        Heading::new("submission", "Configuration"),
-        Heading::new("run", "Run"),
-        Heading::new("version", "Version").detail(),
-    ];
-    let column = grouping.and_then(Grouping::column);
-    headings.extend(column.map(|column| column.heading()));
-    headings.extend([
-        Heading::new("sets", "Sets"),
-        Heading::new("images", "Images"),
-    ]);
-    headings.extend(metric_headings(
-        groups.iter().flat_map(|group| &group.run.sets),
-    ));
-    let mut rows = Vec::new();
     let mut unpaired: Vec<String> = Vec::new();
+    let mut rows = Vec::new();
     for (k, group) in groups.iter().enumerate() {
-        let (run, id) = (&group.run, group.id());
+        // Differences are meaningful within a group only: sets differ by more than methods do.
         let first = groups[..k].iter().find(|other| other.value == group.value);
-        let differences = first.map(|first| differences(&first.run, run));
-        if matches!(differences, Some([None, _])) && !unpaired.contains(&id) {
-            unpaired.push(id.clone());
+        let differences = first.map(|first| differences(&first.run, &group.run));
+        if matches!(differences, Some([None, _])) && !unpaired.contains(&group.id()) {
+            unpaired.push(group.id());
         }
-        let mut row = vec![
-            Cell::text(&run.configuration),
-            Cell::text(id),
-            Cell::text(&run.version),
-        ];
-        row.extend(column.map(|_| group.value.clone()));
-        let images: usize = run.sets.iter().map(|set| set.images.len()).sum();
-        row.push(Cell::text(ranges(&run.sets)));
-        row.push(Cell::number(images as f64, 0));
-        row.extend(metric_cells(run, differences.unwrap_or_default()));
-        rows.push(row);
+        rows.push(Compared {
+            run: &group.run,
+            differences: differences.unwrap_or_default(),
+        });
     }
-    Table {
-        title: "Recorded runs".into(),
-        headings,
-        rows,
-        notes: run_notes(runs, grouping, &unpaired),
+    let mut table = Table::titled("Recorded runs");
+    table.column("submission", "Configuration", groups, |group| {
+        Cell::text(&group.run.configuration)
+    });
+    table.column("run", "Run", groups, |group| Cell::text(group.id()));
+    let version = table.column("version", "Version", groups, |group| {
+        Cell::text(&group.run.version)
+    });
+    table.headings[version].detail = true;
+    if let Some(own) = grouping.and_then(Grouping::column) {
+        table.column(own.name, own.heading, groups, |group| group.value.clone());
     }
+    table.column("sets", "Sets", groups, |group| {
+        Cell::text(ranges(&group.run.sets))
+    });
+    table.column("images", "Images", groups, |group| {
+        let images: usize = group.run.sets.iter().map(|set| set.images.len()).sum();
+        Cell::number(images as f64, 0)
+    });
+    add_metrics(&mut table, &rows);
+    table.notes = run_notes(runs, grouping, &unpaired);
+    table
 }
 
 fn run_notes(runs: &[RunRecord], grouping: Option<Grouping>, unpaired: &[String]) -> Vec<String> {
@@ -286,6 +283,7 @@ fn run_notes(runs: &[RunRecord], grouping: Option<Grouping>, unpaired: &[String]
 }
 
 fn bias_note(run: &RunRecord) -> Option<String> {
+    // Records of a store have no other findings than those that follow from their metrics.
     let findings = run.sets.iter().map(|set| {
         let finding = Fault::of_bias(set.metrics.m_cross, set.errors.m_cross);
         (Some(set.set), finding.into_iter().collect::<Vec<Fault>>())
@@ -439,7 +437,7 @@ pub fn verdict(methods: &[Named<'_>]) -> Option<String> {
 mod tests {
     use super::*;
 
-    /// A method with one set of eight images, whose calibrated Q scatters as `replicates`.
+    // A method with one set of eight images, whose calibrated Q scatters as `replicates`.
     fn method(name: &str, q: f64, calibrated: f64, replicates: [f64; 8]) -> (String, SetRecord) {
         let with = |q, q_calibrated, m_cross| {
             let mut metrics = Metrics::unknown();

@@ -3,45 +3,37 @@
 use shearq_submissions::{Calibration, Configuration, EllipticityType};
 
 use crate::mean::SetMean;
-use shearq_render::table::{Cell, Heading, Table};
+use shearq_render::table::{Cell, Table};
 
 /// Mean shears of sets that `configuration` measured, of the catalogues called `name`.
 pub fn mean_table(means: &[SetMean], configuration: &Configuration, name: &str) -> Table {
-    /// Place of the column of galaxies that a selection leaves out.
-    const CUT: usize = 3;
-    let selected = means.iter().any(|mean| mean.cut > 0);
-    let headings = [
-        ("set", "Set"),
-        ("galaxies", "Galaxies"),
-        ("flagged", "Flagged"),
-        ("g1", "g1"),
-        ("g2", "g2"),
-        ("scatter1", "σ(e1)"),
-        ("scatter2", "σ(e2)"),
-    ];
-    let rows = means.iter().map(|mean| {
-        let shear = |k: usize| match &mean.shear {
+    let mut table = Table::titled("Mean shear");
+    let count = |galaxies: usize| Cell::number(galaxies as f64, 0);
+    table.column("set", "Set", means, |mean| {
+        Cell::number(f64::from(mean.set), 0)
+    });
+    table.column("galaxies", "Galaxies", means, |mean| count(mean.galaxies));
+    table.column("flagged", "Flagged", means, |mean| count(mean.flagged));
+    if means.iter().any(|mean| mean.cut > 0) {
+        table.column("cut", "Cut", means, |mean| count(mean.cut));
+    }
+    for (k, key) in ["g1", "g2"].into_iter().enumerate() {
+        table.column(key, key, means, |mean| match &mean.shear {
             Some(found) => Cell::with_error(found.shear[k], Some(found.error()[k]), 5),
             None => Cell::number(f64::NAN, 5),
-        };
-        let mut row = vec![
-            Cell::number(f64::from(mean.set), 0),
-            Cell::number(mean.galaxies as f64, 0),
-            Cell::number(mean.flagged as f64, 0),
-            shear(0),
-            shear(1),
-            Cell::number(mean.scatter[0], 4),
-            Cell::number(mean.scatter[1], 4),
-        ];
-        if selected {
-            row.insert(CUT, Cell::number(mean.cut as f64, 0));
-        }
-        row
+        });
+    }
+    table.column("scatter1", "σ(e1)", means, |mean| {
+        Cell::number(mean.scatter[0], 4)
     });
-    let mut notes = vec![format!(
+    table.column("scatter2", "σ(e2)", means, |mean| {
+        Cell::number(mean.scatter[1], 4)
+    });
+    let notes = &mut table.notes;
+    notes.push(format!(
         "Mean ellipticities of {name} by {}. Positive g2 is a stretch along x = y.",
         configuration.name
-    )];
+    ));
     if configuration.calibration() == Calibration::None {
         notes.push(
             "This configuration does not divide by the response to shear, so these are no shears."
@@ -60,16 +52,7 @@ pub fn mean_table(means: &[SetMean], configuration: &Configuration, name: &str) 
         };
         notes.push(format!("Errors include the noise of the star of {of}."));
     }
-    let mut headings: Vec<Heading> = headings.map(|(key, label)| Heading::new(key, label)).into();
-    if selected {
-        headings.insert(CUT, Heading::new("cut", "Cut"));
-    }
-    Table {
-        title: "Mean shear".into(),
-        headings,
-        rows: rows.collect(),
-        notes,
-    }
+    table
 }
 
 /// Whether the noise of the stars is at least a tenth of an error.

@@ -1,14 +1,18 @@
-//! HTML pages of scores and comparisons.
+//! HTML pages of scores and comparisons, and their figures.
 
 use std::path::Path;
 
 use crate::score::ScoredSet;
-use crate::views::spectrum;
 use shearq_bias::QUANTITIES;
-use shearq_render::figure::{Band, FigureError, HeatMap, LinePlot, PanelGrid, Series, Style};
+use shearq_measure::Steps;
+use shearq_render::figure::{
+    Band, ColourMap, FigureError, HeatMap, ImageGrid, ImagePanel, ImageRow, LinePlot, PanelGrid,
+    Series, Stretch, Style,
+};
 use shearq_render::html::{Block, Picture, Report, Section};
 use shearq_render::table::{Cell, Table};
-use shearq_scoring::Metrics;
+use shearq_scoring::{BINS, Metrics, SCORED};
+use shearq_simulate::kinds::SetKind;
 
 pub fn scores(name: &str, scored: &[ScoredSet], table: Table) -> Result<Section, FigureError> {
     let mut blocks = vec![Block::Table(table)];
@@ -144,7 +148,7 @@ fn spectra(name: &str, scored: &[&ScoredSet]) -> PanelGrid {
             &score.spectra().ee,
             &score.ee_error,
         ];
-        spectrum::panel(
+        spectrum_panel(
             set.number(),
             set.record.kind(),
             powers,
@@ -155,6 +159,87 @@ fn spectra(name: &str, scored: &[&ScoredSet]) -> PanelGrid {
         title: format!("Shear power of {name}"),
         columns: 3,
         plots: scored.iter().map(plot).collect(),
+    }
+}
+
+// Share of the highest power below which true power is rounding.
+const ROUNDING: f64 = 1e-12;
+
+/// E-mode bandpowers of a set: (multipoles, truth, measured, standard errors).
+pub type Powers<'a> = [&'a [f64; BINS]; 4];
+
+/// The scored bins with modes, which have a multipole `l`. Small grids lack some.
+pub fn bins(l: &[f64; BINS]) -> impl Iterator<Item = usize> {
+    SCORED.filter(|&bin| l[bin] > 0.0)
+}
+
+/// The scored bandpowers of the true and the measured shear, and the measured ones without noise, if it is known.
+pub fn spectrum_panel(
+    set: Option<u32>,
+    kind: Option<SetKind>,
+    [l, truth, measured, errors]: Powers<'_>,
+    noise: Option<&[f64; BINS]>,
+) -> LinePlot {
+    // At the highest multipole, the truth of small grids is rounding only.
+    let highest = truth[SCORED].iter().copied().fold(0.0, f64::max);
+    let seen: Vec<usize> = bins(l)
+        .filter(|&bin| truth[bin] > ROUNDING * highest)
+        .collect();
+    let scored = |values: &[f64; BINS]| seen.iter().map(|&bin| values[bin]).collect::<Vec<_>>();
+    let title = set.map(|number| {
+        let kind = kind.map_or("", |kind| kind.image.label());
+        format!("Set {number} {kind}").trim_end().to_owned()
+    });
+    let mut series = vec![
+        Series::new("true", scored(l), scored(truth), Style::Line, 2),
+        Series::new("measured", scored(l), scored(measured), Style::Points, 5)
+            .with_errors(scored(errors)),
+    ];
+    if let Some(noise) = noise {
+        let rest = seen.iter().map(|&bin| measured[bin] - noise[bin]).collect();
+        series.push(
+            Series::new("minus its noise", scored(l), rest, Style::Points, 0)
+                .with_errors(scored(errors)),
+        );
+    }
+    LinePlot {
+        title: title.unwrap_or_default(),
+        x_label: "ℓ".into(),
+        y_label: "ℓ²C(ℓ)/2π".into(),
+        x_log: true,
+        y_log: true,
+        series,
+        ..LinePlot::default()
+    }
+}
+
+/// One galaxy: stamp, PSF, deconvolved stamp, residual, ACF, and the part of the ACF that is measured.
+pub fn steps_row(label: &str, steps: Steps) -> ImageRow {
+    use ColourMap::{Diverging, Viridis};
+    let panel = |title: &str, image, map, stretch| ImagePanel {
+        title: title.into(),
+        image,
+        map,
+        stretch,
+    };
+    ImageRow {
+        label: label.into(),
+        panels: vec![
+            panel("Stamp", steps.stamp, Viridis, Stretch::Linear),
+            panel("PSF", steps.psf, Viridis, Stretch::Asinh),
+            panel("Deconvolved", steps.deconvolved, Viridis, Stretch::Linear),
+            panel("Residual", steps.residual, Diverging, Stretch::Linear),
+            panel("ACF", steps.acf, Viridis, Stretch::Linear),
+            panel("ACF used", steps.used, Viridis, Stretch::Linear),
+        ],
+    }
+}
+
+/// Several galaxies under a title, which ends with the version.
+pub fn steps_figure(title: &str, rows: Vec<ImageRow>) -> ImageGrid {
+    ImageGrid {
+        title: format!("{title} (shearq {})", shearq_dataset::VERSION),
+        rows,
     }
 }
 
@@ -197,18 +282,12 @@ pub fn contest(table: &Table) -> PanelGrid {
         );
         vec![least - 0.5, most + 0.5]
     };
-    let plot = |key: &str, label: &str, of_levels: &str, levels: &[f64]| {
-        let level = |(k, &value): (usize, &f64)| {
-            let name = if k == 0 { of_levels } else { "" };
-            Series::new(
-                name,
-                ends(),
-                vec![value; 2],
-                Style::Dashed,
-                REQUIREMENT_COLOUR,
-            )
-        };
-        let mut series: Vec<Series> = levels.iter().enumerate().map(level).collect();
+    let plot = |key: &str, label: &str, level: Option<(&str, f64)>| {
+        let line = level.map(|(name, value)| {
+            let colour = REQUIREMENT_COLOUR;
+            Series::new(name, ends(), vec![value; 2], Style::Dashed, colour)
+        });
+        let mut series: Vec<Series> = line.into_iter().collect();
         for (k, name) in names.iter().enumerate() {
             // Shifted, so that points do not hide each other.
             let aside = (k as f64 - (names.len() as f64 - 1.0) / 2.0) * 0.2;
@@ -237,7 +316,7 @@ pub fn contest(table: &Table) -> PanelGrid {
                 low: -REQUIREMENT,
                 high: REQUIREMENT,
             }],
-            ..plot(key, label, "", &[])
+            ..plot(key, label, None)
         };
         let beyond: Vec<bool> = rows
             .iter()
@@ -252,7 +331,7 @@ pub fn contest(table: &Table) -> PanelGrid {
             ..plot
         }
     };
-    let mut q = plot("q_spectrum", "Q of cross-spectra", "", &[]);
+    let mut q = plot("q_spectrum", "Q of cross-spectra", None);
     let expected = rows
         .iter()
         .map(|(_, row)| number(row, "q_limit").0)
@@ -275,13 +354,12 @@ pub fn contest(table: &Table) -> PanelGrid {
             plot(
                 "scatter_over_bound",
                 "scatter / bound",
-                "Cramér–Rao bound",
-                &[1.0],
+                Some(("Cramér–Rao bound", 1.0)),
             ),
             near("m1", "m1×10³"),
             near("m2", "m2×10³"),
-            plot("c1", "c1×10⁴", "", &[0.0]),
-            plot("leakage", "PSF leakage", "", &[0.0]),
+            plot("c1", "c1×10⁴", Some(("", 0.0))),
+            plot("leakage", "PSF leakage", Some(("", 0.0))),
             q,
         ],
     }

@@ -1,17 +1,19 @@
-//! Scores as tables and as JSON.
+//! Scores as tables, as JSON and as warnings about probable faults of catalogues and of the true shear.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::path::PathBuf;
 
 use serde_json::{Value, json};
 use shearq_dataset::truth::Sign;
-use shearq_render::table::{Cell, Heading, Table};
+use shearq_render::table::{Cell, Table};
 use shearq_scoring::{
-    BINS, Bias, BiasFits, ConventionClass, ConventionScore, Definition, Fault, Metrics, SetScore,
+    BINS, Bias, BiasFits, ConventionClass, ConventionScore, Definition, Fault, ImageFaults,
+    Metrics, OddResponse, RowCounts, SetScore,
 };
 
-use crate::record::{SetRecord, definition_word, mean, metric_cell};
-use crate::score::{Basis, ScoredSet};
-use crate::views::{diagnosis, spectrum};
+use crate::record::{SetRecord, columns_named, definition_word, mean};
+use crate::score::{Basis, OddImages, ScoredSet};
+use crate::views::pages::bins;
 
 fn kind_cell(record: &SetRecord) -> Cell {
     Cell::text(record.kind().map_or("", |kind| kind.image.label()))
@@ -72,8 +74,8 @@ pub fn notes(scored: &[ScoredSet]) -> Vec<String> {
     lines.extend(signs);
     for own in scored {
         let (set, score) = (own.number(), &own.score);
-        let odd = diagnosis::odd_images(&own.odd_images).into_iter();
-        lines.extend(odd.map(|odd| format!("{}{odd}.", diagnosis::prefix(set))));
+        let odd = odd_images(&own.odd_images).into_iter();
+        lines.extend(odd.map(|odd| format!("{}{odd}.", prefix(set))));
         let name = set.map_or_else(|| "this set".to_owned(), |set| format!("set {set}"));
         if let Some(mean) = &score.constant {
             lines.push(format!(
@@ -93,15 +95,16 @@ pub fn notes(scored: &[ScoredSet]) -> Vec<String> {
                 "warning: {name}: the leaderboard uses {best}, these metrics {chosen}."
             ));
         }
+        // Lensing makes E modes only; the wrong sign of g2 mixes them with B modes. The limit is chosen by hand.
         if score.constant.is_none() && score.true_b_share() > 0.2 {
             lines.push(format!(
                 "warning: {:.0} % of the true power of {name} is in B modes; g2 may have the other sign. Try: --truth-sign.",
                 100.0 * score.true_b_share()
             ));
         }
-        lines.extend(diagnosis::oddities(&own.rows, &name));
+        lines.extend(oddities(&own.rows, &name));
     }
-    lines.extend(diagnosis::of_sets(
+    lines.extend(of_sets(
         scored.iter().map(|set| (set.number(), believable(set))),
     ));
     lines.extend(zero_shear_note(scored));
@@ -160,55 +163,55 @@ fn set_cell(record: &SetRecord) -> Cell {
     }
 }
 
+// A row for each set, and a row of means for several, with the columns of records called `names`.
+fn table_of_sets(records: &[SetRecord], title: &str, names: &[&str]) -> Table {
+    let single = records
+        .iter()
+        .map(|set| ([set_cell(set), kind_cell(set)], std::slice::from_ref(set)));
+    let mean = ([Cell::text("mean"), Cell::Empty], records);
+    let means = (records.len() > 1).then_some(mean);
+    let rows: Vec<_> = single.chain(means).collect();
+    let mut table = Table::titled(title);
+    table.column("set", "Set", &rows, |([set, _], _)| set.clone());
+    table.column("kind", "Kind", &rows, |([_, kind], _)| kind.clone());
+    for own in columns_named(names) {
+        table.column(own.name, own.heading, &rows, |(_, sets)| {
+            own.cell_of_sets(sets)
+        });
+    }
+    table
+}
+
 /// Metrics per set, with a row of means for several sets.
 pub fn per_set(scored: &[ScoredSet], title: &str, definition: Definition) -> Table {
     if scored.iter().all(|set| set.score.constant.is_some()) {
         return constant_shear(scored, title);
     }
     let records: Vec<SetRecord> = scored.iter().map(|set| set.record.clone()).collect();
-    let mut headings = vec![
-        Heading::new("set", "Set"),
-        Heading::new("kind", "Kind"),
-        Heading::new("images", "Images").detail(),
-    ];
-    let metrics = Metrics::ALL.iter();
-    headings.extend(metrics.map(|metric| Heading {
-        detail: metric.detail,
-        ..Heading::new(metric.name, metric.heading)
-    }));
-    headings.push(Heading::new("convention", "Conv.").detail());
+    let metrics = Metrics::ALL.map(|metric| metric.name);
+    let names = [&["images"], &metrics[..], &["convention", "q_leaderboard"]].concat();
+    let mut table = table_of_sets(&records, title, &names);
     let apart = records
         .iter()
         .any(|set| best_is_another(set.q_leaderboard, set.metrics.q));
-    headings.push(Heading {
-        detail: !apart,
-        ..Heading::new("q_leaderboard", "Q leaderboard")
-    });
-    let row = |names: [Cell; 2], sets: &[SetRecord], convention: Cell| {
-        let images: usize = sets.iter().map(|set| set.images.len()).sum();
-        let best: f64 = sets.iter().map(|set| set.q_leaderboard).sum();
-        let mut row = names.to_vec();
-        row.push(Cell::number(images as f64, 0));
-        row.extend(Metrics::ALL.map(|metric| metric_cell(metric, sets)));
-        row.push(convention);
-        row.push(Cell::number(best / sets.len() as f64, 2));
-        row
-    };
-    let mut rows: Vec<Vec<Cell>> = records
-        .iter()
-        .map(|record| {
-            let names = [set_cell(record), kind_cell(record)];
-            let convention = Cell::text(record.convention.to_string());
-            row(names, std::slice::from_ref(record), convention)
-        })
-        .collect();
-    if records.len() > 1 {
-        let names = [Cell::text("mean"), Cell::Empty];
-        rows.push(row(names, &records, Cell::Empty));
+    for (place, heading) in table.headings.iter_mut().enumerate() {
+        heading.detail = match heading.key {
+            "images" => true,
+            "q_leaderboard" => !apart,
+            // A number of a convention is a name, and has no mean.
+            "convention" => {
+                for (k, row) in table.rows.iter_mut().enumerate() {
+                    let name = records.get(k).map(|set| set.convention.to_string());
+                    row[place] = name.map_or(Cell::Empty, Cell::text);
+                }
+                true
+            }
+            metric => Metrics::named(metric).is_some_and(|metric| metric.detail),
+        };
     }
     let counts: BTreeSet<usize> = scored.iter().map(|set| set.score.images).collect();
     let counts: Vec<String> = counts.iter().map(usize::to_string).collect();
-    let mut lines = vec![
+    table.notes = vec![
         format!(
             "Images per set: {}.{}",
             counts.join(", "),
@@ -216,13 +219,8 @@ pub fn per_set(scored: &[ScoredSet], title: &str, definition: Definition) -> Tab
         ),
         definition_note(definition),
     ];
-    lines.extend(notes(scored));
-    Table {
-        title: title.to_owned(),
-        headings,
-        rows,
-        notes: lines,
-    }
+    table.notes.extend(notes(scored));
+    table
 }
 
 // Whether the leaderboard's Q has another class of conventions than the metrics. Within a class Q differs by
@@ -232,37 +230,40 @@ pub(super) fn best_is_another(q_leaderboard: f64, q: f64) -> bool {
 }
 
 fn constant_shear(scored: &[ScoredSet], title: &str) -> Table {
-    let headings = [
-        ("set", "Set"),
-        ("images", "Images"),
-        ("e1", "mean e1"),
-        ("e2", "mean e2"),
-        ("g1", "true g1"),
-        ("g2", "true g2"),
-        ("c1", "c1"),
-        ("c2", "c2"),
-    ];
-    let rows = scored.iter().filter_map(|scored| {
-        let score = &scored.score;
-        let mean = score.constant?;
-        let shear = |value, error| Cell::with_error(value, Some(error), 5);
-        Some(vec![
-            set_cell(&scored.record),
-            Cell::number(score.images as f64, 0),
-            shear(mean.e[0], mean.error[0]),
-            shear(mean.e[1], mean.error[1]),
-            Cell::number(mean.truth[0], 5),
-            Cell::number(mean.truth[1], 5),
-            shear(score.metrics.c1, mean.error[0]),
-            shear(score.metrics.c2, mean.error[1]),
-        ])
+    let rows = scored
+        .iter()
+        .filter_map(|own| Some((own, own.score.constant?)));
+    let rows: Vec<_> = rows.collect();
+    let shear = |value, error| Cell::with_error(value, Some(error), 5);
+    let mut table = Table::titled(title);
+    table.column("set", "Set", &rows, |(own, _)| set_cell(&own.record));
+    table.column("images", "Images", &rows, |(own, _)| {
+        Cell::number(own.score.images as f64, 0)
     });
-    Table {
-        title: title.to_owned(),
-        headings: headings.map(|(key, label)| Heading::new(key, label)).into(),
-        rows: rows.collect(),
-        notes: notes(scored),
+    for (k, (key, label)) in [("e1", "mean e1"), ("e2", "mean e2")]
+        .into_iter()
+        .enumerate()
+    {
+        table.column(key, label, &rows, |(_, mean)| {
+            shear(mean.e[k], mean.error[k])
+        });
     }
+    for (k, (key, label)) in [("g1", "true g1"), ("g2", "true g2")]
+        .into_iter()
+        .enumerate()
+    {
+        table.column(key, label, &rows, |(_, mean)| {
+            Cell::number(mean.truth[k], 5)
+        });
+    }
+    table.column("c1", "c1", &rows, |(own, mean)| {
+        shear(own.score.metrics.c1, mean.error[0])
+    });
+    table.column("c2", "c2", &rows, |(own, mean)| {
+        shear(own.score.metrics.c2, mean.error[1])
+    });
+    table.notes = notes(scored);
+    table
 }
 
 /// Metrics of power spectra, with a row per set and a row of means. `zero_q` has Q of zero shear of each set.
@@ -272,77 +273,258 @@ pub fn spectra(
     title: &str,
     definition: Definition,
 ) -> Table {
-    let metrics = ["q", "sigma_sys_1e4", "m_half", "sqrt_a"].map(Metrics::named);
-    let mut headings = vec![Heading::new("set", "Set"), Heading::new("kind", "Kind")];
-    let metrics = || metrics.into_iter().flatten();
-    headings.extend(metrics().map(|metric| Heading::new(metric.name, metric.heading)));
-    let row = |names: [Cell; 2], sets: &[SetRecord]| {
-        let mut row = names.to_vec();
-        row.extend(metrics().map(|metric| metric_cell(metric, sets)));
-        row
-    };
-    let mut rows: Vec<Vec<Cell>> = records
-        .iter()
-        .map(|set| row([set_cell(set), kind_cell(set)], std::slice::from_ref(set)))
-        .collect();
-    if records.len() > 1 {
-        rows.push(row([Cell::text("mean"), Cell::Empty], records));
-    }
+    let names = ["q", "sigma_sys_1e4", "m_half", "sqrt_a"];
+    let mut table = table_of_sets(records, title, &names);
     let errors = match records.iter().all(|set| set.errors.q.is_nan()) {
         true => "No errors, because no covariance of the bandpowers is known.",
         false => "Errors: from the covariance in the manifest, to first order.",
     };
     let zero = zero_q.iter().sum::<f64>() / zero_q.len() as f64;
-    let mut notes = vec![format!(
+    table.notes = vec![format!(
         "Metrics: {} definition. {errors} √A in 10⁻⁴ for C_ℓ in steradian.{}",
         definition_word(definition),
         kinds_note(records)
     )];
-    notes.extend(zero_shear_line(zero, mean(records, |metrics| metrics.q).0));
-    Table {
-        title: title.to_owned(),
-        headings,
-        rows,
-        notes,
-    }
+    let zero = zero_shear_line(zero, mean(records, |metrics| metrics.q).0);
+    table.notes.extend(zero);
+    table
 }
 
 pub fn bandpowers(scored: &[ScoredSet]) -> Table {
+    let rows = scored.iter().flat_map(|own| {
+        let measured = own.score.spectra();
+        bins(&own.score.bins.l).map(move |bin| (own, bin, measured))
+    });
+    let rows: Vec<_> = rows.collect();
     let power = |value: f64| Cell::number(value * 1e6, 4);
-    let mut rows = Vec::new();
-    for own in scored {
-        let score = &own.score;
-        let measured = score.spectra();
-        for b in spectrum::bins(&score.bins.l) {
-            rows.push(vec![
-                own.number()
-                    .map_or(Cell::Empty, |set| Cell::number(f64::from(set), 0)),
-                Cell::number(b as f64 + 1.0, 0),
-                Cell::number(score.bins.l[b], 1),
-                power(score.true_ee[b]),
-                Cell::with_error(measured.ee[b] * 1e6, Some(score.ee_error[b] * 1e6), 4),
-                power(measured.bb[b]),
-                power(measured.eb[b]),
-            ]);
+    let mut table = Table::titled("Shear bandpowers ℓ²C_ℓ/2π of the scored bins");
+    table.column("set", "Set", &rows, |(own, ..)| {
+        own.number()
+            .map_or(Cell::Empty, |set| Cell::number(f64::from(set), 0))
+    });
+    table.column("bin", "Bin", &rows, |(_, bin, _)| {
+        Cell::number(*bin as f64 + 1.0, 0)
+    });
+    table.column("l", "ℓ", &rows, |(own, bin, _)| {
+        Cell::number(own.score.bins.l[*bin], 1)
+    });
+    table.column("true_ee", "true EE×10⁶", &rows, |(own, bin, _)| {
+        power(own.score.true_ee[*bin])
+    });
+    table.column("ee", "EE×10⁶", &rows, |(own, bin, measured)| {
+        let error = own.score.ee_error[*bin] * 1e6;
+        Cell::with_error(measured.ee[*bin] * 1e6, Some(error), 4)
+    });
+    table.column("bb", "BB×10⁶", &rows, |(_, bin, measured)| {
+        power(measured.bb[*bin])
+    });
+    table.column("eb", "EB×10⁶", &rows, |(_, bin, measured)| {
+        power(measured.eb[*bin])
+    });
+    table.notes =
+        vec!["Errors: from the part that the truth does not explain, at fixed truth.".into()];
+    table
+}
+
+/// A line for each kind of odd row in the catalogues of `whose`: how many there are, and how they are scored.
+pub fn oddities(counts: &RowCounts, whose: &str) -> Vec<String> {
+    let mut lines = Vec::new();
+    if counts.outside + counts.excess > 0 {
+        lines.push(format!(
+            "warning: {whose} has {} outside the grid and {} beyond the number of cells; they do not count.",
+            rows(counts.outside),
+            counts.excess
+        ));
+    }
+    if counts.repeated > 0 {
+        lines.push(format!(
+            "warning: {} of {whose} of galaxies that have one already; they add up.",
+            rows(counts.repeated)
+        ));
+    }
+    if counts.missing > 0 {
+        lines.push(format!(
+            "warning: {} of {} galaxies of {whose} are not in the catalogues; each counts as zero.",
+            counts.missing,
+            counts.missing + counts.used + counts.not_finite - counts.repeated
+        ));
+    }
+    if counts.above_one > 0 {
+        lines.push(format!(
+            "warning: {} of {whose} with |e| > 1, {} with |e| > {}; scored unchanged.",
+            rows(counts.above_one),
+            counts.absurd,
+            RowCounts::ABSURD
+        ));
+    }
+    if counts.not_finite > 0 {
+        lines.push(format!(
+            "note: {} of {} galaxies of {whose} have no ellipticity (NaN, flagged, marked as missing, or a distortion above 1, which noise makes) and count as missing.",
+            counts.not_finite,
+            counts.not_finite + counts.used
+        ));
+    }
+    lines
+}
+
+fn rows(count: usize) -> String {
+    format!("{count} row{}", if count == 1 { "" } else { "s" })
+}
+
+pub fn words(finding: &Fault) -> String {
+    match *finding {
+        Fault::StrongTruth { rms } => format!(
+            "the true shear is too strong for weak lensing (rms {rms:.3}, expected below 0.3); it may be in percent, or another quantity"
+        ),
+        Fault::Convention {
+            scored,
+            correlation,
+            better,
+            with,
+        } => format!(
+            "the convention is probably wrong: convention {} ({}) correlates with the true shear by {with:.2}, convention {} only by {correlation:.2}. Check the signs of e1 and e2 and the order of x and y",
+            better.number(),
+            better.describe(),
+            scored.number()
+        ),
+        Fault::Swapped { correlation, with } => format!(
+            "e1 and e2 seem to be swapped: swapped they correlate with the true shear by {with:.2}, as given only by {correlation:.2}. Check the order of the columns"
+        ),
+        Fault::Shifted {
+            x,
+            y,
+            correlation,
+            with,
+        } => format!(
+            "the ellipticities seem to be shifted by ({x:+}, {y:+}) cells: shifted back they correlate with the true shear by {with:.2}, as given only by {correlation:.2}. Check the order of the rows and the positions"
+        ),
+        Fault::Uncorrelated {
+            correlation,
+            allowed,
+        } => format!(
+            "the ellipticities correlate with the true shear by only {correlation:.2}, but their noise allows {allowed:.2}. Check the order of the rows, the positions, the columns, and that truth and catalogues belong together"
+        ),
+        Fault::Distortion { m, error } => format!(
+            "the ellipticities respond to shear by a factor of {:.2} ± {error:.2}, expected 1: they seem to be distortions χ, not shear-type ε",
+            1.0 + m
+        ),
+        Fault::Biased { m, error } => format!(
+            "m = {m:.3} ± {error:.3}, expected |m| below 0.1: a high Q does not make such ellipticities fit for use. Calibrate them"
+        ),
+    }
+}
+
+/// Faults of arrays of images, one sentence each; images count from 1.
+pub fn odd_arrays(faults: &ImageFaults) -> Vec<String> {
+    let name = |place: usize| PathBuf::from(format!("image {}", place + 1));
+    let images: Vec<PathBuf> = (0..faults.images()).map(name).collect();
+    odd_images(&OddImages::new(faults, &images))
+}
+
+pub fn odd_images(odd: &OddImages) -> Vec<String> {
+    let mut lines = Vec::new();
+    let more = |count: usize| match count {
+        1 => String::new(),
+        2 => ", and 1 more likewise".to_owned(),
+        _ => format!(", and {} more likewise", count - 1),
+    };
+    if let Some((copy, first)) = odd.copies.first() {
+        lines.push(format!(
+            "{} has the ellipticities of {}{}; expected an independent measurement per image. Noise, Q_dn and errors are wrong",
+            copy.display(),
+            first.display(),
+            more(odd.copies.len())
+        ));
+    }
+    if let Some((path, [e1, e2])) = odd.constant.first() {
+        lines.push(format!(
+            "all galaxies of {} have the ellipticity ({e1}, {e2}){}; expected measured values. Check the column names",
+            path.display(),
+            more(odd.constant.len())
+        ));
+    }
+    for (path, response) in odd.responses.iter().take(MOST_NAMED) {
+        lines.push(format!("{} {}", path.display(), odd_response(response)));
+    }
+    if let Some(left) = odd.responses.len().checked_sub(MOST_NAMED + 1) {
+        let names = odd.responses[MOST_NAMED..].iter().map(|(path, _)| path);
+        let names: Vec<String> = names.map(|path| path.display().to_string()).collect();
+        lines.push(format!(
+            "{} more images likewise: {}",
+            left + 1,
+            names.join(", ")
+        ));
+    }
+    lines
+}
+
+// Chosen by hand: more sentences hide the others.
+const MOST_NAMED: usize = 4;
+
+/// How an image differs from the others of its set, with the probable cause.
+pub fn odd_response(odd: &OddResponse) -> String {
+    let OddResponse {
+        response,
+        slope,
+        correlation,
+        ..
+    } = odd;
+    let ratio = response.slope / slope;
+    // Chosen by hand. Exchanged rows leave a slope near 0, another sign the slope −1, and distortions a slope near 2.
+    let cause = match ratio {
+        _ if ratio < -0.5 => "Its signs are probably wrong",
+        _ if ratio < 0.5 => {
+            "Its galaxies are probably in another order, at other positions or of another set"
+        }
+        _ => "Its ellipticities are probably of another type or scale",
+    };
+    format!(
+        "follows the true shear by {:.2} ± {:.2} (correlation {:.2}), the images of its set by {slope:.2} ({correlation:.2}). {cause}",
+        response.slope, response.error, response.correlation
+    )
+}
+
+/// Findings of several sets, one line per kind: the message of the first set, and the numbers of the other sets.
+pub fn of_sets<'a>(sets: impl Iterator<Item = (Option<u32>, &'a [Fault])>) -> Vec<String> {
+    let mut kinds: Vec<(Fault, Vec<Option<u32>>)> = Vec::new();
+    for (set, findings) in sets {
+        for finding in findings {
+            // A fault of the whole method appears in all of its sets; a line for each would hide the others.
+            let kind = std::mem::discriminant(finding);
+            match kinds
+                .iter_mut()
+                .find(|(first, _)| std::mem::discriminant(first) == kind)
+            {
+                Some((_, sets)) => sets.push(set),
+                None => kinds.push((*finding, vec![set])),
+            }
         }
     }
-    let headings = [
-        ("set", "Set"),
-        ("bin", "Bin"),
-        ("l", "ℓ"),
-        ("true_ee", "true EE×10⁶"),
-        ("ee", "EE×10⁶"),
-        ("bb", "BB×10⁶"),
-        ("eb", "EB×10⁶"),
-    ];
-    Table {
-        title: "Shear bandpowers ℓ²C_ℓ/2π of the scored bins".into(),
-        headings: headings.map(|(key, label)| Heading::new(key, label)).into(),
-        rows,
-        notes: vec![
-            "Errors: from the part that the truth does not explain, at fixed truth.".into(),
-        ],
-    }
+    kinds
+        .iter()
+        .map(|(finding, sets)| {
+            let others: Vec<String> = sets[1..].iter().flatten().map(u32::to_string).collect();
+            let others = match others.is_empty() {
+                true => String::new(),
+                false => format!(" (likewise in set {})", others.join(", ")),
+            };
+            let advice = match finding {
+                Fault::Distortion { .. } => {
+                    " Try: --ellipticity distortion, or `ellipticity = \"distortion\"` with --foreign."
+                }
+                _ => "",
+            };
+            format!("{}{}{others}.{advice}", prefix(sets[0]), words(finding))
+        })
+        .collect()
+}
+
+/// `warning: set 02: `, or `warning: ` if the set has no number.
+pub fn prefix(set: Option<u32>) -> String {
+    set.map_or_else(
+        || "warning: ".into(),
+        |set| format!("warning: set {set:02}: "),
+    )
 }
 
 fn bias_json(bias: &Bias) -> Value {
@@ -485,4 +667,68 @@ pub fn one_set_json(scored: &ScoredSet, input: &SetInput) -> Value {
         }
     }
     object
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_fault_of_several_sets_is_one_line_with_advice() {
+        let distorted = |m| Fault::Distortion { m, error: 0.1 };
+        let (two, five) = ([distorted(1.02)], [distorted(0.9)]);
+        let sets = [(Some(2), &two[..]), (Some(5), &five[..])];
+        let lines = of_sets(sets.into_iter());
+        assert_eq!(lines.len(), 1);
+        assert!(lines[0].starts_with("warning: set 02: ") && lines[0].contains("2.02 ± 0.10"));
+        assert!(lines[0].contains("(likewise in set 5). Try: --ellipticity distortion"));
+        assert!(of_sets([(None, &two[..])].into_iter())[0].starts_with("warning: the "));
+    }
+
+    fn good() -> RowCounts {
+        RowCounts {
+            used: 64,
+            ..RowCounts::default()
+        }
+    }
+
+    #[test]
+    fn each_kind_of_odd_row_has_a_line() {
+        assert!(oddities(&good(), "x").is_empty());
+        let odd = RowCounts {
+            used: 50,
+            outside: 1,
+            excess: 2,
+            not_finite: 3,
+            repeated: 4,
+            missing: 15,
+            above_one: 5,
+            absurd: 2,
+            ..RowCounts::default()
+        };
+        let lines = oddities(&odd, "set 7");
+        let expected = [
+            "set 7 has 1 row outside the grid and 2 beyond",
+            "4 rows of set 7",
+            "15 of 64 galaxies of set 7 are not in the catalogues",
+            "5 rows of set 7 with |e| > 1, 2 with |e| > 5",
+            "3 of 53 galaxies of set 7 have no ellipticity",
+        ];
+        assert_eq!(lines.len(), expected.len());
+        for (line, words) in lines.iter().zip(expected) {
+            assert!(line.contains(words), "{line}");
+        }
+        let (outside, excess) = (
+            RowCounts {
+                outside: 1,
+                ..good()
+            },
+            RowCounts {
+                excess: 1,
+                ..good()
+            },
+        );
+        assert_eq!(oddities(&outside, "x").len(), 1);
+        assert_eq!(oddities(&excess, "x").len(), 1);
+    }
 }
