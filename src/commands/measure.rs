@@ -132,6 +132,12 @@ pub(super) fn report(
         summary.already,
         out.display()
     ));
+    if summary.on_sky > 0 {
+        tell(format_args!(
+            "frame: sky (e1 > 0 along east–west, e2 > 0 along north-west), of {}",
+            count(summary.on_sky, "image")
+        ));
+    }
     if summary.flagged > 0 {
         let reasons: Vec<String> = summary
             .flags

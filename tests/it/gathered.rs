@@ -801,3 +801,74 @@ fn pixel_axes_that_are_not_the_skys_are_stated() {
     let expected = "camera.fits: image 1, plane 1: the header states other pixel axes";
     assert!(message.contains(expected), "{message}");
 }
+
+#[test]
+fn each_galaxy_has_the_noise_of_its_place_and_of_its_light() {
+    let small = Small::new("2");
+    let set = small.at("data/set02");
+    let (exposure, psf) = (set.join("galaxies-001.fits"), set.join("psf-001.fits"));
+    let width = pixels_of(&exposure).1;
+    let at = |k: usize| (k % 8 * 48 + 24, k / 8 * 48 + 24);
+    let rows = (0..64).map(|k| format!("{k},{}.5,{}.5\n", at(k).0, at(k).1));
+    let positions = small.at("positions.csv");
+    fs::write(
+        &positions,
+        "id,x,y\n".to_owned() + &rows.collect::<String>(),
+    )
+    .unwrap();
+    // The map has the light of the galaxies, as maps of counts do, and another depth from column 180 on, which is on a stamp.
+    let variance: Vec<f32> = (0..width * width)
+        .map(|pixel| {
+            let [x, y] = [pixel % width, pixel / width];
+            let centre = (x % 48).abs_diff(24).max((y % 48).abs_diff(24));
+            let own = if centre < 8 { 5.0 } else { 0.0 };
+            own + if x < 180 { 1.0 } else { 4.0 }
+        })
+        .collect();
+    let write = |name: &str, values: Vec<f32>| {
+        let path = small.at(name);
+        fs::write(&path, fits_image(-32, &[width; 2], &[], &floats(&values))).unwrap();
+        path
+    };
+    let map = write("variance.fits", variance.clone());
+    let weight = write("weight.fits", variance.iter().map(|v| 1.0 / v).collect());
+    let columns = |name: &str, options: &[&str]| {
+        let (data, out) = (small.at(name), small.at(&format!("{name}-out")));
+        let from = ["gather", "--exposure", text(&exposure), "--psf", text(&psf)];
+        let to = ["--positions", text(&positions), "--out", text(&data)];
+        succeed(&[&from[..], &to, options].concat());
+        let measure = ["measure", "--submission", LINEAR, "--data", text(&data)];
+        succeed(&[&measure[..], &["--out", text(&out)]].concat());
+        let path = out.join("set01/catalogue-001.parquet");
+        let table = shearq_files::table::read(&path, None, 64).unwrap();
+        ["noise", "flux_error", "flux"].map(|name| {
+            let values = shearq_files::table::numbers(&table, name, &path);
+            values.unwrap().into_owned()
+        })
+    };
+    for (name, option, file) in [
+        ("variance", "--variance", &map),
+        ("weight", "--weight-map", &weight),
+    ] {
+        let [noise, ..] = columns(name, &[option, text(file)]);
+        for (k, found) in noise.iter().enumerate() {
+            // Column 180 is right of the middle of the fourth stamp.
+            let expected = if at(k).0 <= 180 { 1.0 } else { 2.0 };
+            assert!((found - expected).abs() < 1e-6, "{name} {k}: {found}");
+        }
+    }
+    let plain = columns("plain", &[]);
+    assert_eq!(columns("bright", &["--gain", "1e30"])[1..], plain[1..]);
+    // The light of a galaxy under the window adds to the variance: flux over gain and area, less what the window leaves out.
+    let own = columns("gain", &["--gain", "0.2"]);
+    for k in 0..64 {
+        let (noise, flux) = (plain[0][k], plain[2][k]);
+        if flux.is_nan() {
+            continue;
+        }
+        let ratio = (own[1][k] / plain[1][k]).powi(2) - 1.0;
+        let area = ratio.recip() * flux / 0.2 / (noise * noise);
+        // π w² for windows of 6.7 to 9.5 px, and up to 1.6 times as much.
+        assert!((140.0..450.0).contains(&area) || flux < 0.0, "{k}: {area}");
+    }
+}

@@ -194,6 +194,8 @@ pub struct Summary {
     pub galaxies: u64,
     /// Galaxies measured now that are flagged.
     pub flagged: u64,
+    /// Images measured now in the frame of the sky.
+    pub on_sky: usize,
     /// Galaxies measured now with each of [`Flag::ALL`].
     pub flags: [u64; Flag::ALL.len()],
 }
@@ -297,16 +299,17 @@ impl<'a> Catalogues<'a> {
                 metadata.extend([frame_entry(frame)]);
             }
         }
+        if batch.frame == Frame::Sky {
+            metadata.insert(FRAME.into(), Frame::Sky.to_string());
+        }
         if let Some(table) = &head.table {
-            if table.head.frame == Frame::Sky {
-                metadata.insert(FRAME.into(), Frame::Sky.to_string());
-            }
             metadata.insert(FIRST_PIXEL.into(), table.head.first_pixel.to_string());
         }
         if let Some([m, c]) = batch.psf_noise {
             metadata.insert(PSF_NOISE.into(), format!("{m:.2e} {c:.2e}"));
         }
         table::write(&path, self.run.format, &table, &metadata)?;
+        self.summary.on_sky += usize::from(batch.frame == Frame::Sky);
         self.summary.count(&batch.galaxies);
         progress.note(&format!("set {set:02} image {image:03}"));
         Ok(())
