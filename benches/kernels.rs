@@ -88,7 +88,6 @@ fn linear(c: &mut Criterion) {
         let plan = Spectral::new(n, n, settings).expect("valid sizes");
         let white = plan.noise(&shearq_measure::StampNoise::white(1.0));
         let (mut psf, mut scratch, mut lags) = (plan.psf(), plan.scratch(), plan.lags());
-        let mut turned = plan.lags().acf;
         let moffat = moffat(n);
         group.bench_function(BenchmarkId::new("take a PSF", n), |b| {
             b.iter(|| plan.set_psf(black_box(moffat.view()), &white, &mut scratch, &mut psf));
@@ -98,9 +97,6 @@ fn linear(c: &mut Criterion) {
         let data = stamp(n);
         group.bench_function(BenchmarkId::new("autocorrelate", n), |b| {
             b.iter(|| plan.autocorrelate(&psf, black_box(&data), 1.0, &mut scratch, &mut lags));
-        });
-        group.bench_function(BenchmarkId::new("field of noise", n), |b| {
-            b.iter(|| plan.noise_field(&psf, black_box(1), &mut scratch, &mut lags, &mut turned));
         });
     }
     let reach = 10;

@@ -103,7 +103,8 @@ pub(crate) struct Found {
     distortion: Result<Distortion, Flag>,
     /// Response of the distortion, if the method determines it.
     response: Option<ResponseMatrix>,
-    noise_field: Option<NoiseField>,
+    /// On the galaxies that the method determines it for.
+    noise_moments: Option<NoiseMoments>,
     observables: Option<FoundObservables>,
     flux: f64,
     radius: f64,
@@ -119,23 +120,82 @@ struct FoundObservables {
     square_response: [f64; 2],
     /// The size, and its first and second derivative with T.
     size: [f64; 3],
-    /// On galaxies with a noise field: mean products of the changes by noise of χ₁, χ₂, T and the flux, in the order 00, 01,
-    /// 02, 03, 11, …, for noise changed by γ₁, by γ₂, turned, and unchanged.
-    products: Option<[[f64; 4]; 10]>,
     /// For sheared catalogues, if they are requested.
     sheared: Option<ShearSettings>,
 }
 
-/// Changes of a galaxy with a field of noise that is added and subtracted.
-struct NoiseField {
-    /// Distortion with the field added and subtracted, with the response to a shear of the field alone.
-    sides: [(Distortion, ResponseMatrix); 2],
-    /// Change of the distortion on either side by the difference of the field to a field behind a PSF turned by 90 degrees.
-    turned: [[f64; 2]; 2],
-    /// Change of the size's T on either side by the field under γ₁ and γ₂, and by the same difference.
-    square: [[f64; 3]; 2],
-    /// Factor from the difference of both sides to the effect of sheared noise on the mean response.
-    weight: f64,
+/// Means over the noise of a galaxy, each for noise that γ₁ changes, that γ₂ changes, for the difference to noise behind a PSF
+/// turned by 90 degrees, and for noise as it is.
+struct NoiseMoments {
+    /// Products of the changes of χ₁, χ₂, T and the flux, in the order 00, 01, 02, 03, 11, …
+    products: [[f64; 4]; 10],
+    /// Second derivatives of χ₁ and χ₂.
+    distortion: [[f64; 4]; 2],
+    /// Second derivative of T.
+    square: [f64; 4],
+}
+
+impl NoiseMoments {
+    /// Turns both components of χ, and both components of the shear that changes the noise.
+    fn turn(&mut self, by: &Spin2) {
+        let NoiseMoments {
+            products,
+            distortion,
+            square: [square1, square2, ..],
+        } = self;
+        [*square1, *square2] = by.turn([*square1, *square2]);
+        let of_shear = by.turn_response(distortion.map(|[first, second, ..]| [first, second]));
+        for kind in 2..4 {
+            let turned = by.turn(distortion.map(|means| means[kind]));
+            for (means, turned) in distortion.iter_mut().zip(turned) {
+                means[kind] = turned;
+            }
+        }
+        for (means, of_shear) in distortion.iter_mut().zip(of_shear) {
+            [means[0], means[1]] = of_shear;
+        }
+        for [first, second, ..] in products.iter_mut() {
+            [*first, *second] = by.turn([*first, *second]);
+        }
+        for kind in 0..4 {
+            let [chi11, chi12, size1, flux1, chi22, size2, flux2, ..] =
+                products.map(|each| each[kind]);
+            let [[chi11, chi12], [_, chi22]] = by.turn_response([[chi11, chi12], [chi12, chi22]]);
+            let [[size1, size2], [flux1, flux2]] =
+                [by.turn([size1, size2]), by.turn([flux1, flux2])];
+            let new = [chi11, chi12, size1, flux1, chi22, size2, flux2];
+            for (products, new) in products.iter_mut().zip(new) {
+                products[kind] = new;
+            }
+        }
+    }
+
+    /// Mean second derivatives of the ellipticity of type `kind`.
+    fn ellipticity(&self, kind: EllipticityType, chi: Distortion) -> [[f64; 4]; 2] {
+        let of_type = |noise: usize| match kind {
+            EllipticityType::Distortion => self.distortion.map(|means| means[noise]),
+            EllipticityType::Shear => {
+                // With f and s of `response_of_type` and g = f²/s, ∂²ε_i/∂χ_j∂χ_k is
+                // g(χ_i δ_jk + χ_j δ_ik + χ_k δ_ij + h χ_i χ_j χ_k), h = (2f + 1/s)/s.
+                let x = [chi.e1, chi.e2];
+                let s = (1.0 - x[0] * x[0] - x[1] * x[1]).sqrt();
+                let f = 1.0 / (1.0 + s);
+                let (g, h) = (f * f / s, (2.0 * f + 1.0 / s) / s);
+                let [p11, p12, p22] = [0, 1, 4].map(|pair: usize| self.products[pair][noise]);
+                let along = [p11 * x[0] + p12 * x[1], p12 * x[0] + p22 * x[1]];
+                let square = along[0] * x[0] + along[1] * x[1];
+                // A change of χ is like the response to one shear that changes both components.
+                let change = self.distortion.map(|means| [means[noise]; 2]);
+                let change = response_of_type(kind, chi, change);
+                [0, 1].map(|i| {
+                    let curved = x[i] * (p11 + p22 + h * square) + 2.0 * along[i];
+                    change[i][i] + g * curved
+                })
+            }
+        };
+        let all: [[f64; 2]; 4] = std::array::from_fn(of_type);
+        [0, 1].map(|i| all.map(|means| means[i]))
+    }
 }
 
 /// The steps of a measurement as images.
@@ -177,23 +237,12 @@ impl Found {
         if let Some(response) = &mut self.response {
             *response = by.turn_response(*response);
         }
-        if let Some(field) = &mut self.noise_field {
-            for (chi, response) in &mut field.sides {
-                (*chi, *response) = (turned(by, *chi), by.turn_response(*response));
-            }
-            for change in &mut field.turned {
-                *change = by.turn(*change);
-            }
-            for [first, second, _] in &mut field.square {
-                [*first, *second] = by.turn([*first, *second]);
-            }
+        if let Some(noise) = &mut self.noise_moments {
+            noise.turn(by);
         }
         if let Some(found) = &mut self.observables {
             found.flux_response = by.turn(found.flux_response);
             found.square_response = by.turn(found.square_response);
-            if let Some(products) = &mut found.products {
-                turn_products(by, products);
-            }
         }
     }
 
@@ -239,25 +288,15 @@ impl Found {
         let chi = self.distortion?;
         let mut e = of_type(kind, chi).ok_or(Flag::NoShear)?;
         let mut response = self.response.map(|r| response_of_type(kind, chi, r));
-        let usable = |field: &&NoiseField| {
-            let mut sides = field.sides.iter();
-            sides.all(|(chi, _)| of_type(kind, *chi).is_some())
-        };
-        if let Some(field) = self.noise_field.as_ref().filter(usable) {
-            let [plus, minus] = field.sides.map(|(chi, r)| response_of_type(kind, chi, r));
-            for (i, row) in response.iter_mut().flatten().enumerate() {
-                for (j, value) in row.iter_mut().enumerate() {
-                    *value -= field.weight * (plus[i][j] - minus[i][j]);
+        if let Some(noise) = &self.noise_moments {
+            let curved = noise.ellipticity(kind, chi);
+            for (row, curved) in response.iter_mut().flatten().zip(curved) {
+                for (value, curved) in row.iter_mut().zip(curved) {
+                    *value -= curved;
                 }
             }
-            let [plus, minus] = [0, 1].map(|side| {
-                // A change of χ is like the response to one shear that changes both components.
-                let change = field.turned[side].map(|change| [change; 2]);
-                let change = response_of_type(kind, field.sides[side].0, change);
-                [change[0][0], change[1][1]]
-            });
-            for k in 0..2 {
-                e[k] += 0.5 * field.weight * (plus[k] - minus[k]);
+            for (e, [_, _, turned, _]) in e.iter_mut().zip(curved) {
+                *e += 0.5 * turned;
             }
         }
         Ok((e, response))
@@ -269,8 +308,8 @@ impl Found {
         let [size, first, second] = found.size;
         let mut size_response = found.square_response.map(|response| first * response);
         let mut coupling = Coupling::default();
-        if let (Some(field), Some(products)) = (&self.noise_field, &found.products) {
-            let product = |number: usize, noise: usize| products[number][noise];
+        if let Some(moments) = &self.noise_moments {
+            let product = |number: usize, noise: usize| moments.products[number][noise];
             let jacobian = response_of_type(kind, chi, [[1.0, 0.0], [0.0, 1.0]]);
             let with_e = |i: usize, numbers: [usize; 2], noise: usize| {
                 let [one, two] = numbers.map(|number| product(number, noise));
@@ -283,10 +322,7 @@ impl Found {
                 [flux2, first * cross, first * first * size2]
             };
             // The size is not linear in T, and T not in the autocorrelation.
-            let curved = |noise: usize| {
-                let [plus, minus] = field.square;
-                first * field.weight * (plus[noise] - minus[noise]) + second * product(7, noise)
-            };
+            let curved = |noise: usize| first * moments.square[noise] + second * product(7, noise);
             for (k, response) in size_response.iter_mut().enumerate() {
                 let [flux2, cross, size2] = squares(k);
                 let (e_flux, e_size) = (with_e(k, with_flux, k), first * with_e(k, with_size, k));
@@ -329,7 +365,8 @@ impl Found {
     ) -> Option<ShearedCatalogues> {
         let (chi, found) = (self.distortion.ok()?, self.observables.as_ref()?);
         let settings = found.sheared?;
-        let products = found.products.unwrap_or_default();
+        let noise = self.noise_moments.as_ref();
+        let products = noise.map(|noise| noise.products).unwrap_or_default();
         let [[a, b], [c, d]] = response_of_type(kind, chi, [[1.0, 0.0], [0.0, 1.0]]);
         // Rows are e1, e2, flux and size; columns χ₁, χ₂, T and flux.
         let rows = [
@@ -378,23 +415,6 @@ fn turned(by: &Spin2, Distortion { e1, e2 }: Distortion) -> Distortion {
     Distortion::new(e1, e2)
 }
 
-/// Turns products of the changes of χ₁, χ₂, T and the flux: both components of χ, and both components of the shear that
-/// changes the noise.
-fn turn_products(by: &Spin2, products: &mut [[f64; 4]; 10]) {
-    for [first, second, ..] in products.iter_mut() {
-        [*first, *second] = by.turn([*first, *second]);
-    }
-    for kind in 0..4 {
-        let [chi11, chi12, size1, flux1, chi22, size2, flux2, ..] = products.map(|each| each[kind]);
-        let [[chi11, chi12], [_, chi22]] = by.turn_response([[chi11, chi12], [chi12, chi22]]);
-        let [[size1, size2], [flux1, flux2]] = [by.turn([size1, size2]), by.turn([flux1, flux2])];
-        let new = [chi11, chi12, size1, flux1, chi22, size2, flux2];
-        for (products, new) in products.iter_mut().zip(new) {
-            products[kind] = new;
-        }
-    }
-}
-
 /// The ellipticity of type `kind`; `None` if the distortion exceeds 1 and has no shear-type ellipticity.
 fn of_type(kind: EllipticityType, chi: Distortion) -> Option<[f64; 2]> {
     match kind {
@@ -438,13 +458,9 @@ mod tests {
     fn found() -> Found {
         let mut state = 0.37;
         let mut next = || numbers(&mut state);
-        let mut pair = || [next(), next()];
-        let mut side = || {
-            let [e1, e2] = pair();
-            (Distortion::new(e1, e2), [pair(), pair()])
-        };
-        let (sides, (distortion, response)) = ([side(), side()], side());
-        let mut three = || [next(), next(), next()];
+        let mut four = || [next(), next(), next(), next()];
+        let [e1, e2, ..] = four();
+        let [r11, r12, r21, r22] = four();
         Found {
             descent: Descent {
                 iterations: 1,
@@ -453,13 +469,12 @@ mod tests {
                 energy: 0.0,
                 updated: 0,
             },
-            distortion: Ok(distortion),
-            response: Some(response),
-            noise_field: Some(NoiseField {
-                sides,
-                turned: [[0.1, -0.05], [0.02, 0.04]],
-                square: [three(), three()],
-                weight: 0.7,
+            distortion: Ok(Distortion::new(e1, e2)),
+            response: Some([[r11, r12], [r21, r22]]),
+            noise_moments: Some(NoiseMoments {
+                products: [(); 10].map(|()| four()),
+                distortion: [four(), four()],
+                square: four(),
             }),
             observables: Some(FoundObservables {
                 flux: 10.0,
@@ -467,7 +482,6 @@ mod tests {
                 flux_response: [0.3, -0.1],
                 square_response: [0.2, 0.5],
                 size: [2.0, 0.4, -0.1],
-                products: Some([[0.0; 4]; 10].map(|products| products.map(|_: f64| next()))),
                 sheared: Some(ShearSettings {
                     step: 0.02,
                     normals: [0.0; 4],

@@ -105,8 +105,15 @@ impl Plane {
 pub(crate) struct Spectrum(pub(crate) Vec<f32>);
 
 impl Spectrum {
-    pub(crate) fn take_modes(&mut self, modes: &Modes) {
-        parities_of(&modes.re, &modes.im, &mut self.0);
+    // cc = ½[Re f(k_x, −k_y) + Re f(k_x, k_y)], and so on.
+    #[cfg(test)]
+    pub(crate) fn take_modes(&mut self, Modes { re, im }: &Modes) {
+        let [cc, cs, sc, ss] = self.quarters_mut();
+        for at in 0..cc.len() {
+            let below = at + cc.len();
+            (cc[at], ss[at]) = (0.5 * (re[below] + re[at]), 0.5 * (re[below] - re[at]));
+            (sc[at], cs[at]) = (0.5 * (im[at] + im[below]), 0.5 * (im[at] - im[below]));
+        }
     }
 
     pub(crate) fn copy_from(&mut self, other: &Self) {
@@ -173,16 +180,6 @@ fn modes_of(spectrum: &Spectrum, re: &mut [f32], im: &mut [f32]) {
     let (im_above, im_below) = im.split_at_mut(cc.len());
     sums_and_differences(ss, cc, re_below, re_above);
     sums_and_differences(cs, sc, im_above, im_below);
-}
-
-// The inverse: cc = ½[Re f(k_x, −k_y) + Re f(k_x, k_y)], and so on.
-#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn parities_of(re: &[f32], im: &[f32], spectrum: &mut [f32]) {
-    let [cc, cs, sc, ss] = four_parts(spectrum);
-    let ((re_above, re_below), (im_above, im_below)) =
-        (re.split_at(cc.len()), im.split_at(cc.len()));
-    half_sums_and_differences(re_below, re_above, cc, ss);
-    half_sums_and_differences(im_above, im_below, sc, cs);
 }
 
 /// Writes the parities cc and ss of a real even spectrum, whose other parities are zero, from its modes.

@@ -110,7 +110,7 @@ pub struct Spectral {
 }
 
 /// Buffers for one thread. Their content between calls does not matter, but for the stamp that
-/// [`Spectral::noise_field`] looks at, and the PSF on pixels of another shape.
+/// [`Spectral::products`] looks at, and the PSF on pixels of another shape.
 #[derive(Debug, Clone)]
 pub struct SpectralScratch {
     of_stamp: TransformScratch,
@@ -122,6 +122,7 @@ pub struct SpectralScratch {
     psf_image: Vec<f32>,
     /// v̂ of the stamp behind the window.
     stamp: Spectrum,
+    gradients: [Spectrum; 8],
     /// Real spectra, mode by mode.
     real: [Vec<f32>; 2],
     /// A real even spectrum by parity.
@@ -171,12 +172,8 @@ pub struct SpectralPsf {
     tilts: [Modes; 2],
     /// |p|²/S of each mode: the square of what a point of flux one is there, in units of the noise.
     clarity: Vec<f32>,
-    /// What a field of noise of σ = 1 becomes of one that is white: v̂/û times √S.
-    field: Modes,
-    /// Change of a mode of the field with the components of shear, in units of it and in the mean.
+    /// Change of a mode of noise with the components of shear, in units of it and in the mean.
     field_tilts: [Vec<f32>; 2],
-    /// What the field would be with the PSF turned by 90 degrees, less what it is, in units of it.
-    turned: Vec<f32>,
     /// Mean power of windowed noise, in units of σ², by parity.
     floor: Vec<f32>,
     /// Mean of −Re(conj(v̂)·δv̂) of windowed noise, in units of σ², by parity.
@@ -198,18 +195,20 @@ impl SpectralPsf {
     }
 }
 
-/// Weights of the lags whose sum with an autocorrelation's change is the change of a quantity.
-#[derive(Debug, Clone)]
-pub(crate) struct Gradients {
-    /// Of two quantities; laid out as `Lags`, of both lags that each place stands for.
-    pub(crate) pair: [Vec<f32>; 2],
-    /// Of a third one, as its spectrum by parity.
-    pub(crate) third: Vec<f32>,
-}
-
 /// Means of a product for four kinds of noise: its change with γ₁, its change with γ₂, what it lacks to be that
 /// behind a PSF turned by 90 degrees, and the noise itself.
 pub(crate) type Kinds = [f32; 4];
+
+/// Mean products of the changes with noise of σ = 1 of χ₁, χ₂, the size's T and the flux, and those that their second
+/// derivatives consist of.
+pub(crate) struct Products {
+    /// Of pairs in the order 00, 01, 02, 03, 11, 12, 13, 22, 23, 33.
+    pub(crate) pairs: [Kinds; 10],
+    /// Σ_k χ′_k · ∂φ_i/∂χ_k of `AdaptiveMoments`.
+    pub(crate) distortion: [Kinds; 2],
+    /// T′ · P₀ of `SizeMoments`.
+    pub(crate) square: Kinds,
+}
 
 impl Spectral {
     /// Plans for n×n stamps and p×p PSFs.
@@ -328,6 +327,7 @@ impl Spectral {
             windowed: [(); 3].map(|()| self.plane.spectrum()),
             psf_image: vec![0.0; p * p],
             stamp: self.plane.spectrum(),
+            gradients: [(); 8].map(|()| self.plane.spectrum()),
             real: [zeros(2), zeros(2)],
             even: zeros(2),
             quarter: zeros(1),
@@ -358,9 +358,7 @@ impl Spectral {
             restore: self.plane.mode_by_mode(),
             tilts: [(); 2].map(|()| self.plane.mode_by_mode()),
             clarity: zeros(),
-            field: self.plane.mode_by_mode(),
             field_tilts: [zeros(), zeros()],
-            turned: zeros(),
             floor: zeros(),
             noise_tilts: [zeros(), zeros()],
             powers: [zeros(), zeros(), zeros(), zeros()],
@@ -386,14 +384,6 @@ impl Spectral {
         ModeNoise {
             power: column(0),
             tilts: [column(1), column(2)],
-        }
-    }
-
-    /// Room for gradients.
-    pub(crate) fn gradients(&self) -> Gradients {
-        Gradients {
-            pair: [self.lags().acf, self.lags().acf],
-            third: vec![0.0; self.target.len()],
         }
     }
 
@@ -487,12 +477,6 @@ impl Spectral {
         }
         take_psf(self, noise, changes, power, out);
 
-        roots(power, modes);
-        let amplitudes = modes.iter().zip(&self.turned);
-        for (out, (here, &there)) in out.turned.iter_mut().zip(amplitudes) {
-            let there = modes[there as usize];
-            *out = if *here > 0.0 { there / here - 1.0 } else { 0.0 };
-        }
         let mut spread = |modes: &[f32], out: &mut [f32]| {
             even_parities(modes, out);
             self.leak.apply_even(out, quarter);
@@ -502,13 +486,23 @@ impl Spectral {
             negative_products(tilts, power, modes);
             spread(modes, out);
         }
+        // Amplitude behind the turned PSF in units of that behind the PSF, less one.
+        roots(power, even);
+        for (at, (out, &there)) in modes.iter_mut().zip(&self.turned).enumerate() {
+            let (here, there) = (even[at], even[there as usize]);
+            *out = if here > 0.0 { there / here - 1.0 } else { 0.0 };
+        }
         let area = (self.plane.period * self.plane.period) as f32 * self.inside;
-        modes.fill(1.0);
-        let kinds = [&out.field_tilts[0], &out.field_tilts[1], &out.turned, modes];
-        for (out, kind) in out.powers.iter_mut().zip(kinds) {
+        let mut weigh = |kind: &[f32], out: &mut [f32]| {
             weighted(kind, power, &self.counts, area, even);
             even_parities(even, out);
-        }
+        };
+        let [first, second, turned, plain] = &mut out.powers;
+        weigh(&out.field_tilts[0], first);
+        weigh(&out.field_tilts[1], second);
+        weigh(modes, turned);
+        modes.fill(1.0);
+        weigh(modes, plain);
     }
 
     /// Puts the window at `centre`, (x, y) in pixels from the middle of the stamp, for the stamps that follow.
@@ -685,92 +679,7 @@ impl Spectral {
         (0..n * n).map(pixel).collect()
     }
 
-    /// Writes how the autocorrelation of the stamp last given changes with a field of noise of σ = 1
-    /// that is added to it, and with what a shear makes of that field: in `acf` the one, in `shear1` and
-    /// `shear2` the other. In `turned`, how it would change further, were the PSF behind the field turned by 90 degrees.
-    ///
-    /// Of the change of noise under shear only the symmetric part is taken, −Re(tilt) of each mode (and what
-    /// the slope of its own power adds): the rest moves pixels about, and its mean is zero. Modes have random signs.
-    pub fn noise_field(
-        &self,
-        psf: &SpectralPsf,
-        seed: u64,
-        scratch: &mut SpectralScratch,
-        out: &mut Lags,
-        turned: &mut [f32],
-    ) {
-        let [field, first, second] = &mut scratch.changes;
-        self.random_signs(seed, field);
-        multiply_modes(field, &psf.field);
-        scale_into(first, field, &psf.field_tilts[0]);
-        scale_into(second, field, &psf.field_tilts[1]);
-        let outs = [&mut out.acf[..], &mut out.shear1, &mut out.shear2];
-        for (which, out) in outs.into_iter().enumerate() {
-            self.apply_window(which, scratch);
-            self.take_change(which, scratch, out);
-        }
-        let [field, lack, _] = &mut scratch.changes;
-        scale_into(lack, field, &psf.turned);
-        self.apply_window(1, scratch);
-        self.take_change(1, scratch, turned);
-    }
-
-    // Multiplies the image of a spectrum of `scratch.changes` by the window, which is at its origin, to `scratch.windowed`.
-    fn apply_window(&self, which: usize, scratch: &mut SpectralScratch) {
-        let windowed = &mut scratch.windowed[which];
-        windowed.take_modes(&scratch.changes[which]);
-        self.window.apply(windowed, &mut scratch.quarter);
-    }
-
-    // Writes how the autocorrelation of the stamp last given changes with a change of v̂ in `scratch.windowed`.
-    fn take_change(&self, which: usize, scratch: &mut SpectralScratch, out: &mut [f32]) {
-        let SpectralScratch {
-            windowed,
-            stamp,
-            real: [nothing, _],
-            even,
-            lags,
-            ..
-        } = scratch;
-        nothing.fill(0.0);
-        change_of_power(stamp, &windowed[which], &self.scale, nothing, 0.0, even);
-        self.to_lags.lags(even, lags, out);
-    }
-
-    // The half spectrum of a real field with the power of white noise of σ = 1 in each mode and random
-    // signs of real and imaginary parts.
-    fn random_signs(&self, seed: u64, out: &mut Modes) {
-        let size = self.plane.period as f32 * std::f32::consts::FRAC_1_SQRT_2;
-        let quarter = self.plane.quarter();
-        let (above_re, below_re) = out.re.split_at_mut(quarter);
-        let (above_im, below_im) = out.im.split_at_mut(quarter);
-        let mut state = seed;
-        for at in (0..quarter).step_by(LANES) {
-            // Four bits for each of sixteen places.
-            let bits = split_mix(&mut state);
-            let parts = [&mut *above_re, above_im, below_re, below_im];
-            for (part, out) in parts.into_iter().enumerate() {
-                let bits = bits >> (part * LANES);
-                for (lane, value) in out[at..][..LANES].iter_mut().enumerate() {
-                    *value = if bits >> lane & 1 == 0 { size } else { -size };
-                }
-            }
-        }
-        // Modes without k_y are stored twice. Those without k_x are conjugate to their opposites.
-        let width = self.plane.width;
-        below_re[..width].copy_from_slice(&above_re[..width]);
-        below_im[..width].copy_from_slice(&above_im[..width]);
-        for at in (0..quarter).step_by(width) {
-            below_re[at] = above_re[at];
-            below_im[at] = -above_im[at];
-        }
-        for half in [above_re, below_re] {
-            half[0] *= std::f32::consts::SQRT_2;
-        }
-        (above_im[0], below_im[0]) = (0.0, 0.0);
-    }
-
-    /// The spectrum of weights of the lags, for [`Gradients::third`].
+    /// The spectrum of weights of the lags.
     pub(crate) fn spectrum_of(&self, weights: &[f32], scratch: &mut SpectralScratch) -> Vec<f32> {
         let mut spectrum = scratch.even.clone();
         self.to_lags
@@ -778,45 +687,56 @@ impl Spectral {
         spectrum
     }
 
-    /// Mean products of the changes with noise of σ = 1 of four quantities of the stamp last given: the three of
-    /// `gradients`, and `Lags::flux`. Of each pair in the order 00, 01, 02, 03, 11, 12, 13, 22, 23, 33.
+    /// Mean products for the stamp last given. `distortion` has the weights of the lags of `AdaptiveMoments::second_order`;
+    /// `size` the spectra by parity of the weights of T and P₀.
     ///
     /// A quantity a that depends on the windowed result changes with noise n by a′(n) = Σ_k conj(h_a)·n̂, where n̂ is the
     /// deconvolved noise before the window and h_a the gradient of a, taken through the window. Modes of noise are
-    /// independent, so that the mean of a′(n)·b′(tn), with each mode of the second times t, is Σ_k |n̂|² t conj(h_a)·h_b: no
-    /// field of noise is drawn.
+    /// independent, so that the mean of a′(n)·b′(tn), with each mode of the second times t, is Σ_k |n̂|² t conj(h_a)·h_b.
     pub(crate) fn products(
         &self,
         psf: &SpectralPsf,
-        gradients: &Gradients,
+        distortion: &[Vec<f32>; 6],
+        size: [&[f32]; 2],
         scratch: &mut SpectralScratch,
-    ) -> [Kinds; 10] {
+    ) -> Products {
         let SpectralScratch {
-            windowed,
+            gradients,
             stamp,
             even,
             quarter,
             lags,
             ..
         } = scratch;
-        let [first, second, third] = &mut *windowed;
-        for (weights, out) in gradients.pair.iter().zip([first, second]) {
+        let (of_distortion, of_size) = gradients.split_at_mut(distortion.len());
+        for (weights, out) in distortion.iter().zip(of_distortion) {
             self.to_lags.spectrum(weights, lags, even);
             twice_scaled(stamp, even, &self.scale, out);
         }
-        twice_scaled(stamp, &gradients.third, &self.scale, third);
-        for gradient in &mut *windowed {
+        for (spectrum, out) in size.into_iter().zip(of_size) {
+            twice_scaled(stamp, spectrum, &self.scale, out);
+        }
+        for gradient in &mut *gradients {
             self.window.apply(gradient, quarter);
         }
-        let [first, second, third] = windowed;
+        let [first, second, g11, g12, g21, g22, square, zero] = &*gradients;
+        let mean = |a: &Spectrum, b: &Spectrum| sums_of_products(a, b, &psf.powers);
+        let trace = |row: [&Spectrum; 2]| {
+            let [one, two] = [mean(first, row[0]), mean(second, row[1])];
+            std::array::from_fn(|kind| one[kind] + two[kind])
+        };
         // The flux is the sum under the window.
-        let gradients = [first, second, third, &self.window_spectrum];
-        let mut found = [[0.0; 4]; 10];
-        let pairs = (0..4).flat_map(|a| (a..4).map(move |b| [a, b]));
-        for (found, [a, b]) in found.iter_mut().zip(pairs) {
-            *found = sums_of_products(gradients[a], gradients[b], &psf.powers);
+        let quantities = [first, second, square, &self.window_spectrum];
+        let mut pairs = [[0.0; 4]; 10];
+        let places = (0..4).flat_map(|a| (a..4).map(move |b| [a, b]));
+        for (found, [a, b]) in pairs.iter_mut().zip(places) {
+            *found = mean(quantities[a], quantities[b]);
         }
-        found
+        Products {
+            pairs,
+            distortion: [trace([g11, g12]), trace([g21, g22])],
+            square: mean(square, zero),
+        }
     }
 }
 
@@ -1308,7 +1228,7 @@ fn take_psf(
             squares[l] = p_re[l] * p_re[l] + p_im[l] * p_im[l];
         }
         let amplitudes = amplitudes(&squares, rough, target, plan.step, plan.iterations);
-        let [mut restore, mut field, mut first, mut second] = [[[0.0f32; LANES]; 2]; 4];
+        let [mut restore, mut first, mut second] = [[[0.0f32; LANES]; 2]; 3];
         let mut field_tilts = [[0.0f32; LANES]; 2];
         let [mut clarity, mut power] = [[0.0f32; LANES]; 2];
         for l in 0..LANES {
@@ -1325,21 +1245,15 @@ fn take_psf(
                 ((ar * re - ai * im) * inverse, (ar * im + ai * re) * inverse);
             (second[0][l], second[1][l]) =
                 ((br * re - bi * im) * inverse, (br * im + bi * re) * inverse);
-            let root = noise_power[l].sqrt();
             (restore[0][l], restore[1][l]) = (re * amplitudes[l], im * amplitudes[l]);
-            (field[0][l], field[1][l]) = (restore[0][l] * root, restore[1][l] * root);
-            power[l] = field[0][l] * field[0][l] + field[1][l] * field[1][l];
+            let square = restore[0][l] * restore[0][l] + restore[1][l] * restore[1][l];
+            power[l] = square * noise_power[l];
             clarity[l] = squares[l] / noise_power[l];
             field_tilts[0][l] = noise_tilts[0][l] - first[0][l];
             field_tilts[1][l] = noise_tilts[1][l] - second[0][l];
         }
         let [tilt1, tilt2] = &mut out.tilts;
-        for (modes, values) in [
-            (&mut out.restore, restore),
-            (&mut out.field, field),
-            (tilt1, first),
-            (tilt2, second),
-        ] {
+        for (modes, values) in [(&mut out.restore, restore), (tilt1, first), (tilt2, second)] {
             store([&mut modes.re[..], &mut modes.im[..]], at, values);
         }
         let [tilt1, tilt2] = &mut out.field_tilts;
@@ -1418,16 +1332,6 @@ fn multiply_modes(modes: &mut Modes, by: &Modes) {
     let modes = modes.re.iter_mut().zip(&mut modes.im);
     for ((re, im), (a, b)) in modes.zip(by.re.iter().zip(&by.im)) {
         (*re, *im) = (*re * a - *im * b, *re * b + *im * a);
-    }
-}
-
-// Writes real numbers times complex modes.
-#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn scale_into(out: &mut Modes, modes: &Modes, factors: &[f32]) {
-    for (out, values) in [(&mut out.re, &modes.re), (&mut out.im, &modes.im)] {
-        for (out, (value, factor)) in out.iter_mut().zip(values.iter().zip(factors)) {
-            *out = value * factor;
-        }
     }
 }
 

@@ -79,7 +79,7 @@ impl CutWorker for NetworkWorker {
             descent,
             distortion,
             response: None,
-            noise_field: None,
+            noise_moments: None,
             observables: None,
             flux,
             radius,

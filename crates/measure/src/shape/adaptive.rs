@@ -13,6 +13,18 @@
 //! Newton's method (Bernstein & Jarvis 2002 do this to images; an autocorrelation needs no centring,
 //! and the noise at zero lag does not enter). The same derivatives give the response of χ to a change
 //! of the autocorrelation.
+//!
+//! # Second derivatives
+//!
+//! With the integrals L_T, L₁ and L₂ of the bases x² + y², x² − y² and 2xy, χ is where F_i(χ, A) = L_i − χ_i(L_T + s) = 0 for a
+//! regularisation s. F is linear in A, so that implicit differentiation along changes a and b of A gives
+//!
+//! ```text
+//! χ′(a) = K φ(a),   K = (−∂F/∂χ)⁻¹,   φ_i(a) = L_i(a) − χ_i L_T(a),
+//! χ″(a, b) = K [F_χχ(χ′(a), χ′(b)) + φ_χ(b) χ′(a) + φ_χ(a) χ′(b)].
+//! ```
+//!
+//! The four φ_χ = ∂φ_i/∂χ_j are sums over lags, as φ is.
 
 use multiversion::multiversion;
 use shearq_quantities::Distortion;
@@ -59,6 +71,8 @@ pub struct AdaptiveScratch {
     /// Weights W of the lags times their area, for the ellipticity `chi`.
     weights: Vec<f32>,
     chi: [f32; 2],
+    /// Gradients on the same lags.
+    gradients: [Vec<f32>; 6],
 }
 
 /// What was found on an autocorrelation.
@@ -72,6 +86,29 @@ pub struct AdaptiveShape {
     trace: f32,
     /// (1 − ∂m/∂χ)⁻¹.
     inverse: [[f32; 2]; 2],
+}
+
+/// F_χχ of both components in units of the trace: for χ₁ twice, for χ₁ and χ₂, for χ₂ twice.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Curvature([[f32; 3]; 2]);
+
+impl AdaptiveShape {
+    /// Mean of χ″(a, b) over changes a and b, from the means of the products χ′_j(a) χ′_k(b) for the pairs 11, 12 and 22, and of
+    /// Σ_k χ′_k(a) ∂φ_i(b)/∂χ_k, which is the same if a and b are exchanged, in units of the trace.
+    pub(crate) fn mean_second_derivative(
+        &self,
+        curvature: &Curvature,
+        products: [f32; 3],
+        mixed: [f32; 2],
+    ) -> [f64; 2] {
+        let Curvature(curvature) = curvature;
+        let along = [0, 1].map(|i| {
+            let terms = curvature[i].iter().zip([1.0, 2.0, 1.0]).zip(products);
+            terms.map(|((f, count), p)| f * count * p).sum::<f32>() + 2.0 * mixed[i]
+        });
+        self.inverse
+            .map(|row| f64::from(row[0] * along[0] + row[1] * along[1]))
+    }
 }
 
 /// Integrals over lags, weighted with W: the bases a, b, c; weighted with −2 ∂W/∂q: the products aa, ab,
@@ -121,6 +158,7 @@ impl AdaptiveMoments {
             values: vec![0.0; self.area.len()],
             weights: vec![0.0; self.area.len()],
             chi: [f32::NAN; 2],
+            gradients: [(); 6].map(|()| vec![0.0; self.area.len()]),
         }
     }
 
@@ -221,47 +259,43 @@ impl AdaptiveMoments {
             .map(|row| f64::from(row[0] * moved[0] + row[1] * moved[1]))
     }
 
-    /// Writes the weights of the lags, each for itself, whose sum with a change of the autocorrelation is the change of χ₁,
-    /// and those for χ₂; laid out as `deconvolve::Lags`.
-    pub(crate) fn gradients(
+    /// Writes the weights of the lags, each for itself, whose sums with a change of the autocorrelation are χ′₁, χ′₂ and, in
+    /// units of the trace, ∂φ₁/∂χ₁, ∂φ₁/∂χ₂, ∂φ₂/∂χ₁ and ∂φ₂/∂χ₂; laid out as `deconvolve::Lags`. Lags beyond the circle
+    /// are left as they are. Returns F_χχ on `acf`.
+    pub(crate) fn second_order(
         &self,
         shape: &AdaptiveShape,
+        acf: &[f32],
         scratch: &mut AdaptiveScratch,
-        out: [&mut [f32]; 2],
-    ) {
-        let [out1, out2] = out;
-        out1.fill(0.0);
-        out2.fill(0.0);
-        self.weigh(shape, scratch);
-        let [chi1, chi2] = shape.chi;
-        let [[i11, i12], [i21, i22]] = shape.inverse;
+        out: &mut [Vec<f32>; 6],
+    ) -> Curvature {
+        let AdaptiveScratch {
+            values, gradients, ..
+        } = scratch;
+        self.gather(acf, values);
         let [a, b, c] = &self.bases;
+        let scale = self.scale(shape.chi);
+        let found = second_order_sums(values, &self.area, [a, b, c], shape, scale, gradients);
         // Lags of the row y = 0 are stored with both signs, those of others with one.
         let width = 2 * ((self.lags as f64 / 2.0).sqrt() as usize) + 1;
-        let mut from = 0;
-        for &(first, count) in &self.runs {
-            let lags = from..from + count;
-            let bases = a[lags.clone()]
-                .iter()
-                .zip(&b[lags.clone()])
-                .zip(&c[lags.clone()]);
-            let out = out1[first..].iter_mut().zip(&mut out2[first..]);
-            let weights = scratch.weights[lags].iter().zip(bases);
-            for ((out1, out2), (weight, ((a, b), c))) in out.zip(weights) {
-                let weight = 0.5 * weight / shape.trace;
-                let (along, across) = (weight * (b - chi1 * a), weight * (c - chi2 * a));
-                *out1 = i11 * along + i12 * across;
-                *out2 = i21 * along + i22 * across;
+        for (out, gradient) in out.iter_mut().zip(gradients) {
+            let mut from = 0;
+            for &(first, count) in &self.runs {
+                out[first..first + count].copy_from_slice(&gradient[from..from + count]);
+                from += count;
             }
-            from += count;
-        }
-        // Zero lag stands for itself alone, and so twice for half of it; but its bases are zero.
-        for out in [out1, out2] {
+            // Zero lag stands for itself alone, and so twice for half of it; but its bases are zero.
             let (left, right) = out[..width].split_at_mut(width / 2);
             for (left, right) in left.iter_mut().rev().zip(&right[1..]) {
                 *left = *right;
             }
         }
+        let [first, second, [t1, t2, _]] = found.map(|sums| sums.map(|sum| sum / shape.trace));
+        // F_i = L_i − χ_i T: beside the second derivatives of the weights, those of the product.
+        Curvature([
+            [first[0] - 2.0 * t1, first[1] - t2, first[2]],
+            [second[0], second[1] - t1, second[2] - 2.0 * t2],
+        ])
     }
 
     /// The weight W at lag (x, y), in pixels, that `shape` was found with.
@@ -296,6 +330,7 @@ impl AdaptiveMoments {
             values,
             weights,
             chi: of,
+            ..
         } = scratch;
         *of = chi;
         weighted_sums(values, &self.area, [a, b, c], chi, self.scale(chi), weights)
@@ -388,6 +423,73 @@ fn plain_sums(values: &[f32], weights: &[f32], bases: [&[f32]; 3]) -> [f32; 3] {
         }
     }
     lanes.map(|lane| lane.iter().sum())
+}
+
+// Sums over the values of φ₁ and φ₂ with the second derivatives of W for χ₁ twice, χ₁ and χ₂, and χ₂ twice; and of L_T with the
+// first derivatives. Writes gradients of the lags.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn second_order_sums(
+    values: &[f32],
+    area: &[f32],
+    bases: [&[f32]; 3],
+    shape: &AdaptiveShape,
+    scale: f32,
+    out: &mut [Vec<f32>; 6],
+) -> [[f32; 3]; 3] {
+    let [chi1, chi2] = shape.chi;
+    let per_rest = 1.0 / (1.0 - chi1 * chi1 - chi2 * chi2);
+    let (turn1, turn2) = (chi1 * per_rest, chi2 * per_rest);
+    // ∂²q/∂χ_j∂χ_k in units of q, but for the terms with the bases.
+    let own1 = per_rest + 3.0 * turn1 * turn1;
+    let own2 = per_rest + 3.0 * turn2 * turn2;
+    let cross = 3.0 * turn1 * turn2;
+    // Each lag for itself: half of an area, which is of both.
+    let unit = 0.5 / shape.trace;
+    let [[i11, i12], [i21, i22]] = shape.inverse;
+    let mut lanes = [[0.0f32; LANES]; 8];
+    for at in (0..values.len()).step_by(LANES) {
+        let part =
+            |all: &'_ [f32]| -> [f32; LANES] { std::array::from_fn(|l| all[at..][..LANES][l]) };
+        let [values, area] = [values, area].map(part);
+        let [a, b, c] = bases.map(part);
+        let mut gradients = [[0.0f32; LANES]; 6];
+        for l in 0..LANES {
+            let q = scale * (a[l] - chi1 * b[l] - chi2 * c[l]);
+            let inverse = 1.0 / (1.0 + q);
+            // W, −∂W/∂q and ∂²W/∂q².
+            let weight = area[l] * inverse * inverse.sqrt();
+            let bend = 1.5 * weight * inverse;
+            let bend2 = 2.5 * bend * inverse;
+            // −∂q/∂χ_j.
+            let (p1, p2) = (scale * b[l] - q * turn1, scale * c[l] - q * turn2);
+            let (along, across) = (b[l] - chi1 * a[l], c[l] - chi2 * a[l]);
+            let (moved1, moved2) = (bend * p1, bend * p2);
+            gradients[0][l] = unit * weight * (i11 * along + i12 * across);
+            gradients[1][l] = unit * weight * (i21 * along + i22 * across);
+            gradients[2][l] = unit * (moved1 * along - weight * a[l]);
+            gradients[3][l] = unit * moved2 * along;
+            gradients[4][l] = unit * moved1 * across;
+            gradients[5][l] = unit * (moved2 * across - weight * a[l]);
+            let v = values[l];
+            let (tb, tc) = (scale * turn1, scale * turn2);
+            let w11 = v * (bend2 * p1 * p1 + bend * (2.0 * tb * b[l] - own1 * q));
+            let w12 = v * (bend2 * p1 * p2 + bend * (tc * b[l] + tb * c[l] - cross * q));
+            let w22 = v * (bend2 * p2 * p2 + bend * (2.0 * tc * c[l] - own2 * q));
+            lanes[0][l] += w11 * along;
+            lanes[1][l] += w12 * along;
+            lanes[2][l] += w22 * along;
+            lanes[3][l] += w11 * across;
+            lanes[4][l] += w12 * across;
+            lanes[5][l] += w22 * across;
+            lanes[6][l] += v * moved1 * a[l];
+            lanes[7][l] += v * moved2 * a[l];
+        }
+        for (out, gradient) in out.iter_mut().zip(gradients) {
+            out[at..][..LANES].copy_from_slice(&gradient);
+        }
+    }
+    let [s0, s1, s2, s3, s4, s5, t1, t2] = lanes.map(|lane| lane.iter().sum());
+    [[s0, s1, s2], [s3, s4, s5], [t1, t2, 0.0]]
 }
 
 #[cfg(test)]
@@ -543,6 +645,50 @@ mod tests {
             for (found, expected) in response.iter().zip(slope) {
                 // f32 resolves χ to 3e-6, divided by 0.02; the third derivative is smaller.
                 assert!((found - expected).abs() < 5e-4, "{found} {expected}");
+            }
+        }
+    }
+
+    #[test]
+    fn second_derivatives_are_differences_of_responses() {
+        let moments = moments(1.5);
+        let mut scratch = moments.scratch();
+        let width = 2 * REACH + 1;
+        // Over all lags: those below the first row stand for two.
+        let sum = |weights: &[f32], change: &[f32]| -> f32 {
+            let lags = weights.iter().zip(change).enumerate();
+            lags.map(|(at, (w, v))| w * v * if at < width { 1.0 } else { 2.0 })
+                .sum()
+        };
+        let other = gaussian(1.0, 14.0, -0.1, 0.4);
+        for (e1, e2, regularisation) in [(0.0, 0.0, 0.0), (0.3, -0.2, 20.0), (-0.1, 0.6, 0.0)] {
+            let acf = gaussian(1.0, 20.0, e1, e2);
+            let shape = moments.measure(&acf, regularisation, &mut scratch).unwrap();
+            let response = moments.response(&shape, &other, &mut scratch);
+            let mut gradients = [(); 6].map(|()| vec![0.0; acf.len()]);
+            let curvature = moments.second_order(&shape, &acf, &mut scratch, &mut gradients);
+            let [x1, x2, g11, g12, g21, g22] = gradients.map(|weights| sum(&weights, &other));
+            for (found, expected) in [x1, x2].into_iter().zip(response) {
+                assert!((f64::from(found) - expected).abs() < 1e-4 * (1.0 + expected.abs()));
+            }
+            let found = shape.mean_second_derivative(
+                &curvature,
+                [x1 * x1, x1 * x2, x2 * x2],
+                [x1 * g11 + x2 * g12, x1 * g21 + x2 * g22],
+            );
+            let mut moved = |h: f32| {
+                let acf: Vec<f32> = acf.iter().zip(&other).map(|(a, o)| a + h * o).collect();
+                let shape = moments.measure(&acf, regularisation, &mut scratch).unwrap();
+                moments.response(&shape, &other, &mut scratch)
+            };
+            let (plus, minus) = (moved(0.02), moved(-0.02));
+            for k in 0..2 {
+                let expected = (plus[k] - minus[k]) / 0.04;
+                // f32 resolves responses to some 10⁻⁵, divided by 0.04.
+                assert!(
+                    (found[k] - expected).abs() < 2e-3 * (1.0 + expected.abs()),
+                    "{e1} {e2}: {found:?} {expected}"
+                );
             }
         }
     }

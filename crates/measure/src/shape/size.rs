@@ -108,6 +108,11 @@ impl SizeMoments {
         [each(&self.weights[0]), each(&self.weights[1])]
     }
 
+    /// Mean of T″(a, b) over changes a and b, from the mean product of P₀(a) and T′(b), which is the same if a and b are exchanged.
+    pub(crate) fn mean_second_derivative(found: &FoundBreadth, product: f32) -> f64 {
+        f64::from(-2.0 * product / found.divisor)
+    }
+
     /// Gradient of T from those of P₀ and P₂.
     pub(crate) fn combine(found: &FoundBreadth, [zero, two]: [f32; 2]) -> f32 {
         (two - found.square * zero) / found.divisor
@@ -228,6 +233,21 @@ mod tests {
         assert!(
             (change / response - 1.0).abs() < 0.02,
             "{change} {response}"
+        );
+        let product = breadth.sums(&other)[0] * response;
+        let curved = SizeMoments::mean_second_derivative(&found, product);
+        let side = |step: f32| {
+            let moved: Vec<f32> = galaxy
+                .iter()
+                .zip(&other)
+                .map(|(a, b)| a + step * b)
+                .collect();
+            f64::from(breadth.response(&breadth.measure(&moved, 3.0, 20.0), &other))
+        };
+        let expected = (side(0.01) - side(-0.01)) / 0.02;
+        assert!(
+            (curved / expected - 1.0).abs() < 0.02,
+            "{curved} {expected}"
         );
         let nothing = vec![0.0; galaxy.len()];
         assert_eq!(breadth.measure(&nothing, 3.0, 20.0).square, 20.0);

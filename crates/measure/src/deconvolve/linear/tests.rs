@@ -6,6 +6,7 @@ use shearq_submissions::{LinearDeconvolution, Registry};
 use super::super::network::convolve;
 use super::*;
 use crate::noise::StampNoise;
+use crate::shape::{AdaptiveMoments, SizeMoments};
 
 fn settings(iterations: usize, target: f64, window: f64, lambda: f64) -> LinearDeconvolution {
     let registry = Registry::embedded().unwrap();
@@ -196,8 +197,6 @@ fn the_autocorrelation_equals_plain_sums_on_dirty_scratch() {
             .unwrap();
         let other: Vec<f32> = data.iter().map(|v| 1e3 - v).collect();
         plan.autocorrelate(&own, &other, 3.0, &mut scratch, &mut lags);
-        let mut turned = plan.lags().acf;
-        plan.noise_field(&own, 1, &mut scratch, &mut lags, &mut turned);
         plan.set_psf(h.view(), &white(&plan), &mut scratch, &mut own)
             .unwrap();
         plan.autocorrelate(&own, &data, 0.0, &mut scratch, &mut lags);
@@ -535,16 +534,26 @@ fn subtracted_in_the_mean(own_noise: &StampNoise, pixels: PixelShape, rng: &mut 
 }
 
 #[test]
-fn a_field_of_noise_changes_lags_as_noise_on_the_stamp_does() {
+fn mean_products_are_those_of_noise_on_the_stamp() {
     let mut rng = ChaCha8Rng::seed_from_u64(2);
     let correlated = of_summed(&mut rng);
-    for own in [&StampNoise::white(1.0), &correlated] {
-        changed_as_by_noise(own, PixelShape::SQUARE, &mut rng);
-    }
-    changed_as_by_noise(&correlated, PIXELS[2], &mut rng);
+    let square = PixelShape::SQUARE;
+    let largest = [
+        (&StampNoise::white(1.0), square),
+        (&correlated, square),
+        (&correlated, PIXELS[2]),
+    ]
+    .map(|(own, pixels)| products_of_noise_on_the_stamp(own, pixels, &mut rng));
+    // Products with sheared noise are noticed.
+    assert!(largest.iter().any(|share| *share > 0.15), "{largest:?}");
 }
 
-fn changed_as_by_noise(own_noise: &StampNoise, pixels: PixelShape, rng: &mut ChaCha8Rng) {
+/// Returns the largest product with sheared noise in units of that with noise.
+fn products_of_noise_on_the_stamp(
+    own_noise: &StampNoise,
+    pixels: PixelShape,
+    rng: &mut ChaCha8Rng,
+) -> f64 {
     let (n, p) = (32, 9);
     let h = psf(p);
     let plan = Spectral::new(n, p, &settings(1000, 1.5, 5.0, 0.0)).unwrap();
@@ -554,82 +563,83 @@ fn changed_as_by_noise(own_noise: &StampNoise, pixels: PixelShape, rng: &mut Cha
     plan.set_psf(h.view(), &noise_of_modes, &mut scratch, &mut own)
         .unwrap();
     let data = observed_on(n, &h, pixels, 0.0, 0.0);
-    // Products of the change of a lag with itself and with the changes under sheared noise, summed
-    // over lags: of both kinds of noise.
-    let mut sums = [[0.0f64; 3]; 2];
-    let add = |sums: &mut [f64; 3], lags: &Lags| {
-        for (sum, other) in sums.iter_mut().zip([&lags.acf, &lags.shear1, &lags.shear2]) {
-            let products = lags.acf.iter().zip(other);
-            *sum += products.map(|(a, b)| f64::from(a * b)).sum::<f64>();
-        }
-    };
     let mut lags = plan.lags();
-    let mut turned = plan.lags().acf;
     plan.autocorrelate(&own, &data, 0.0, &mut scratch, &mut lags);
-    for seed in 0..6000 {
+    let weights: [Vec<f32>; 6] = std::array::from_fn(|_| even(&plan, rng));
+    let spectra = [0, 1].map(|k| plan.spectrum_of(&weights[k], &mut scratch));
+    let found = plan.products(
+        &own,
+        &weights,
+        spectra.each_ref().map(|s| &s[..]),
+        &mut scratch,
+    );
+    // Products of the first two quantities with themselves, of noise and of noise sheared, and their squares.
+    let mut sums = [[[0.0f64; 2]; 3]; 2];
+    let count = 12_000;
+    for _ in 0..count {
         let stamp = if own_noise.is_correlated() {
             summed(n, rng)
         } else {
             noise(n, rng)
         };
         plan.deconvolve(&own, &stamp, &mut scratch);
-        let outs = [&mut lags.acf, &mut lags.shear1, &mut lags.shear2];
-        for (which, out) in outs.into_iter().enumerate() {
-            plan.take_change(which, &mut scratch, out);
+        let changes = [0, 1, 2].map(|which| {
+            take_change(&plan, which, &mut scratch, &mut lags.acf);
+            [0, 1].map(|k| over_lags(&plan, &weights[k], &lags.acf))
+        });
+        for (k, sums) in sums.iter_mut().enumerate() {
+            for ([sum, square], change) in sums.iter_mut().zip(changes) {
+                let product = changes[0][k] * change[k];
+                *sum += product / f64::from(count);
+                *square += product * product / f64::from(count);
+            }
         }
-        add(&mut sums[0], &lags);
-        plan.noise_field(&own, seed, &mut scratch, &mut lags, &mut turned);
-        add(&mut sums[1], &lags);
     }
-    let [expected, found] = sums;
-    let apart = |k: usize| (found[k] - expected[k]).abs() / expected[0];
-    // 6000 sums of some ten independent squares: 0.6 % each.
-    assert!(apart(0) < 0.04, "{found:?} {expected:?}");
-    for k in 1..3 {
-        // A shear moves the noise's pixels by several of their distances, which has no mean product but
-        // adds to its error.
-        assert!(apart(k) < 0.04, "{k}: {found:?} {expected:?}");
-        assert!(expected[k].abs() > 0.12 * expected[0], "{k}: {expected:?}");
+    let mut largest = 0.0f64;
+    for (sums, pair) in sums.into_iter().zip([0, 4]) {
+        let [first, second, _, plain] = found.pairs[pair].map(f64::from);
+        largest = largest.max(first.abs().max(second.abs()) / plain);
+        for ([mean, square], found) in sums.into_iter().zip([plain, first, second]) {
+            let error = ((square - mean * mean) / f64::from(count)).sqrt();
+            // The noise of `summed` is known from as many pixels as 2000 stamps have.
+            let tolerance = 4.5 * error + 0.01 * plain;
+            assert!((found - mean).abs() < tolerance, "{found} {mean} ± {error}");
+            assert!(error < 0.2 * plain, "{error} {plain}");
+        }
     }
+    largest
 }
 
 #[test]
-fn the_field_of_a_turned_psf_is_the_field_and_what_it_lacks() {
+fn turned_noise_is_the_geometric_mean_of_both_powers_less_one() {
     for (n, p) in [(40, 11), (33, 10)] {
         let plan = Spectral::new(n, p, &settings(1000, 1.5, 8.0, 0.0)).unwrap();
-        let (mut own, mut scratch) = (plan.psf(), plan.scratch());
         let straight = psf(p);
         // Of even and odd sides alike: about the middle of its stamp.
         let rotated = Array2::from_shape_fn((p, p), |(y, x)| straight[(x, p - 1 - y)]);
-        let mut lags = [(); 2].map(|()| plan.lags());
-        let mut turned = plan.lags().acf;
-        let stamp = observed(n, &psf(11), 0.1, 0.2);
-        let take = |psf: &Array2<f64>, own: &mut SpectralPsf, scratch: &mut SpectralScratch| {
-            plan.set_psf(psf.view(), &white(&plan), scratch, own)
+        let mut scratch = plan.scratch();
+        let [straight, rotated] = [straight, rotated].map(|psf| {
+            let mut own = plan.psf();
+            plan.set_psf(psf.view(), &white(&plan), &mut scratch, &mut own)
                 .unwrap();
+            own
+        });
+        let quarter = plan.plane.quarter();
+        let modes = |parities: &[f32]| -> Vec<f32> {
+            let pairs = (0..quarter).map(|at| [parities[at], parities[quarter + at]]);
+            pairs.flat_map(|[cc, ss]| [cc - ss, cc + ss]).collect()
         };
-        take(&rotated, &mut own, &mut scratch);
-        plan.autocorrelate(&own, &stamp, 0.0, &mut scratch, &mut lags[0]);
-        let seen = scratch.stamp.clone();
-        plan.noise_field(&own, 7, &mut scratch, &mut lags[0], &mut turned);
-        take(&straight, &mut own, &mut scratch);
-        // The same stamp behind both.
-        scratch.stamp.copy_from(&seen);
-        plan.noise_field(&own, 7, &mut scratch, &mut lags[1], &mut turned);
-        let [expected, field] = lags.map(|lags| lags.acf);
-        let lack = turned;
-        let peak = expected
-            .iter()
-            .fold(0.0f32, |most, value| most.max(value.abs()));
-        let largest = lack
-            .iter()
-            .fold(0.0f32, |most, value| most.max(value.abs()));
+        let [lack, plain] = [2, 3].map(|kind| modes(&straight.powers[kind]));
+        let there = modes(&rotated.powers[3]);
+        let peak = plain.iter().fold(0.0f32, |most, value| most.max(*value));
+        let largest = lack.iter().fold(0.0f32, |most, v| most.max(v.abs()));
         assert!(largest > 0.05 * peak, "{largest} {peak}");
-        for ((expected, field), lack) in expected.iter().zip(&field).zip(&lack) {
+        for ((lack, plain), there) in lack.iter().zip(&plain).zip(&there) {
+            let expected = (plain * there).max(0.0).sqrt();
             // f32 transforms of two PSFs, divided by modes of which some are small.
             assert!(
-                (expected - field - lack).abs() < 1e-4 * peak,
-                "{expected} {field} {lack}"
+                (plain + lack - expected).abs() < 1e-3 * peak,
+                "{plain} {lack} {expected}"
             );
         }
     }
@@ -677,84 +687,205 @@ fn over_lags(plan: &Spectral, weights: &[f32], values: &[f32]) -> f64 {
         .sum()
 }
 
+/// Writes how the autocorrelation of the stamp last given changes with a change of v̂ in `scratch.windowed`.
+fn take_change(plan: &Spectral, which: usize, scratch: &mut SpectralScratch, out: &mut [f32]) {
+    let SpectralScratch {
+        windowed,
+        stamp,
+        even,
+        lags,
+        ..
+    } = scratch;
+    let nothing = vec![0.0; even.len()];
+    change_of_power(stamp, &windowed[which], &plan.scale, &nothing, 0.0, even);
+    plan.to_lags.lags(even, lags, out);
+}
+
+/// Calls `visit` for fields of noise of one mode, real and imaginary: with the change of the lags of the stamp last given and
+/// of its flux by an amplitude of one, and with the mean square of amplitudes in noise of σ = 1, times the change with γ₁, the
+/// change with γ₂, the difference to noise behind a turned PSF, and one.
+fn for_each_mode(
+    plan: &Spectral,
+    psf: &SpectralPsf,
+    scratch: &mut SpectralScratch,
+    mut visit: impl FnMut(&[f32], f64, [f64; 4]),
+) {
+    let (width, quarter) = (plan.plane.width, plan.plane.quarter());
+    let mut change = plan.lags().acf;
+    let mut field = plan.plane.mode_by_mode();
+    for at in 0..2 * quarter {
+        let (below, x, y) = (at >= quarter, at % width, at % quarter / width);
+        // Modes that are stored twice are taken once.
+        if plan.counts[at] == 0.0 || (below && (x == 0 || y == 0)) {
+            continue;
+        }
+        let alone = at == 0;
+        for phase in [Complex64::ONE, Complex64::I] {
+            if alone && phase == Complex64::I {
+                continue;
+            }
+            field.re.fill(0.0);
+            field.im.fill(0.0);
+            let (re, im) = (phase.re as f32, phase.im as f32);
+            (field.re[at], field.im[at]) = (re, im);
+            if x == 0 {
+                let opposite = plan.plane.place(0, y, true);
+                (field.re[opposite], field.im[opposite]) = (re, -im);
+            }
+            if y == 0 {
+                let same = plan.plane.place(x, 0, true);
+                (field.re[same], field.im[same]) = (re, im);
+            }
+            scratch.windowed[0].take_modes(&field);
+            plan.window
+                .apply(&mut scratch.windowed[0], &mut scratch.quarter);
+            let flux = f64::from(scratch.windowed[0].sum());
+            take_change(plan, 0, scratch, &mut change);
+            // Half of the power of a mode is that of its real part; but for the mean, which has no other.
+            let share = if alone { 1.0 } else { 0.5 };
+            let powers = [0, 1, 2, 3].map(|kind: usize| {
+                let [cc, ss] = [0, quarter].map(|part| psf.powers[kind][part + at % quarter]);
+                let power = if below { cc + ss } else { cc - ss };
+                share * f64::from(power / plan.counts[at])
+            });
+            visit(&change, flux, powers);
+        }
+    }
+}
+
 #[test]
 fn mean_products_are_sums_over_modes_of_what_each_changes() {
     let mut rng = ChaCha8Rng::seed_from_u64(8);
     let settings = settings(400, 1.5, 6.0, 1e-4);
     let h = psf(31);
-    let plan = Spectral::new(32, 31, &settings).unwrap();
-    let (width, quarter) = (plan.plane.width, plan.plane.quarter());
-    let mut scratch = plan.scratch();
-    let mut psf = plan.psf();
-    plan.set_psf(h.view(), &white(&plan), &mut scratch, &mut psf)
-        .unwrap();
+    let (plan, psf, mut scratch) = planned(32, &h, &settings);
     for centre in [[0.0, 0.0], [1.5, -2.0]] {
         plan.place_window(centre, &mut scratch);
         let stamp = observed(32, &h, 0.0, 0.0);
         let mut lags = plan.lags();
         plan.autocorrelate(&psf, &stamp, 0.0, &mut scratch, &mut lags);
-        let weights = [(); 3].map(|()| even(&plan, &mut rng));
-        let mut gradients = plan.gradients();
-        gradients.pair = [weights[0].clone(), weights[1].clone()];
-        gradients.third = plan.spectrum_of(&weights[2], &mut scratch);
-        let found = plan.products(&psf, &gradients, &mut scratch);
-
-        // A field of one mode at a time, real and imaginary.
-        let mut expected = [[0.0f64; 4]; 10];
-        let mut sizes = [0.0f64; 10];
-        for at in 0..2 * quarter {
-            let (below, x, y) = (at >= quarter, at % width, at % quarter / width);
-            // Modes that are stored twice are taken once.
-            if plan.counts[at] == 0.0 || (below && (x == 0 || y == 0)) {
-                continue;
-            }
-            let alone = at == 0;
-            for phase in [Complex64::ONE, Complex64::I] {
-                if alone && phase == Complex64::I {
-                    continue;
-                }
-                let field = &mut scratch.changes[0];
-                field.re.fill(0.0);
-                field.im.fill(0.0);
-                let (re, im) = (phase.re as f32, phase.im as f32);
-                (field.re[at], field.im[at]) = (re, im);
-                if x == 0 {
-                    let opposite = plan.plane.place(0, y, true);
-                    (field.re[opposite], field.im[opposite]) = (re, -im);
-                }
-                if y == 0 {
-                    let same = plan.plane.place(x, 0, true);
-                    (field.re[same], field.im[same]) = (re, im);
-                }
-                plan.apply_window(0, &mut scratch);
-                let flux = f64::from(scratch.windowed[0].sum());
-                plan.take_change(0, &mut scratch, &mut lags.acf);
-                let [a, b, c] = [0, 1, 2].map(|k| over_lags(&plan, &weights[k], &lags.acf));
-                let changes = [a, b, c, flux];
-                // Half of the power of a mode is that of its real part; but for the mean, which has no other.
-                let share = if alone { 1.0 } else { 0.5 };
-                let mut number = 0;
-                for a in 0..4 {
-                    for b in a..4 {
-                        let product = share * changes[a] * changes[b];
-                        for (kind, sum) in expected[number].iter_mut().enumerate() {
-                            let [cc, ss] =
-                                [0, quarter].map(|part| psf.powers[kind][part + at % quarter]);
-                            let power = if below { cc + ss } else { cc - ss };
-                            let power = f64::from(power / plan.counts[at]);
-                            *sum += power * product;
-                            sizes[number] = sizes[number].max(sum.abs());
-                        }
-                        number += 1;
-                    }
+        let distortion: [Vec<f32>; 6] = std::array::from_fn(|_| even(&plan, &mut rng));
+        let size = [(); 2].map(|()| even(&plan, &mut rng));
+        let spectra = size
+            .each_ref()
+            .map(|weights| plan.spectrum_of(weights, &mut scratch));
+        let found = plan.products(
+            &psf,
+            &distortion,
+            spectra.each_ref().map(|spectrum| &spectrum[..]),
+            &mut scratch,
+        );
+        let mut expected = [[0.0f64; 4]; 13];
+        let mut sizes = [0.0f64; 13];
+        for_each_mode(&plan, &psf, &mut scratch, |change, flux, powers| {
+            let of = |weights: &Vec<f32>| over_lags(&plan, weights, change);
+            let [a, b, aa, ab, ba, bb] = distortion.each_ref().map(of);
+            let [c, d] = size.each_ref().map(of);
+            let quantities = [a, b, c, flux];
+            let pairs = (0..4).flat_map(|k| quantities[k..].iter().map(move |q| quantities[k] * q));
+            let products = pairs.chain([a * aa + b * ab, a * ba + b * bb, c * d]);
+            let rows = expected.iter_mut().zip(&mut sizes).zip(products);
+            for ((expected, size), product) in rows {
+                for (sum, power) in expected.iter_mut().zip(powers) {
+                    *sum += power * product;
+                    *size = size.max(sum.abs());
                 }
             }
-        }
-        for ((found, expected), size) in found.iter().zip(expected).zip(sizes) {
+        });
+        let [first, second] = found.distortion;
+        let found = found.pairs.into_iter().chain([first, second, found.square]);
+        for ((found, expected), size) in found.zip(expected).zip(sizes) {
             for (found, expected) in found.iter().zip(expected) {
                 // A thousand terms of both signs in single precision.
                 let difference = (f64::from(*found) - expected).abs();
                 assert!(difference < 1e-4 * size, "{found} {expected} {size}");
+            }
+        }
+    }
+}
+
+#[test]
+fn mean_second_derivatives_are_sums_of_differences_over_modes() {
+    let mut rng = ChaCha8Rng::seed_from_u64(9);
+    let n = 32;
+    let round = Array2::from_shape_fn((9, 9), |(y, x)| {
+        let (x, y) = (x as f64 - 4.0, y as f64 - 4.0);
+        (-(1.05 * x * x + 0.95 * y * y) / 4.0).exp()
+    });
+    let round = &round / round.sum();
+    let settings = settings(1000, 1.5, 5.0, 0.0);
+    // Noise of the stamp, whose galaxy has a peak of some 0.3, and the regularisation in units of the moments' trace.
+    for (h, level, share) in [
+        (psf(9), 0.0, 0.0),
+        (psf(9), 0.02, 0.3),
+        (round.clone(), 0.005, 0.1),
+        (round, 0.03, 0.5),
+    ] {
+        let (plan, own, mut scratch) = planned(n, &h, &settings);
+        let moments = AdaptiveMoments::new(2.0, plan.spacing(), plan.reach());
+        let sizes = SizeMoments::new(1.5, 5.0, plan.spacing(), plan.reach());
+        let noise = noise(n, &mut rng);
+        let stamp = observed(n, &h, 0.0, 0.0);
+        let stamp: Vec<f32> = stamp
+            .iter()
+            .zip(noise)
+            .map(|(v, x)| v + level * x)
+            .collect();
+        let mut lags = plan.lags();
+        plan.autocorrelate(&own, &stamp, level, &mut scratch, &mut lags);
+        let mut values = moments.scratch();
+        let regularisation = share * moments.halving(&lags.acf);
+        let acf = lags.acf.clone();
+        let shape = moments.measure(&acf, regularisation, &mut values).unwrap();
+        let floor = share * sizes.sums(&acf)[0];
+        let breadth = sizes.measure(&acf, floor, 20.0);
+
+        let mut gradients = [(); 6].map(|()| plan.lags().acf);
+        let curvature = moments.second_order(&shape, &acf, &mut values, &mut gradients);
+        let [zero, two] = sizes.gradients();
+        let square: Vec<f32> = zero
+            .iter()
+            .zip(&two)
+            .map(|(zero, two)| SizeMoments::combine(&breadth, [*zero, *two]))
+            .collect();
+        let spectra = [square, zero].map(|weights| plan.spectrum_of(&weights, &mut scratch));
+        let spectra = spectra.each_ref().map(|spectrum| &spectrum[..]);
+        let found = plan.products(&own, &gradients, spectra, &mut scratch);
+
+        let mut expected = [[0.0f64; 3]; 4];
+        let mut size = [[0.0f64; 3]; 4];
+        let most = |lags: &[f32]| lags.iter().fold(0.0f32, |most, v| most.max(v.abs()));
+        let peak = most(&acf);
+        for_each_mode(&plan, &own, &mut scratch, |change, _, powers| {
+            let step = 0.01 * peak / most(change);
+            let mut side = |step: f32| {
+                let acf: Vec<f32> = acf.iter().zip(change).map(|(a, c)| a + step * c).collect();
+                let shape = moments.measure(&acf, regularisation, &mut values).unwrap();
+                let [e1, e2] = moments.response(&shape, change, &mut values);
+                let square = sizes.response(&sizes.measure(&acf, floor, 20.0), change);
+                [e1, e2, f64::from(square)]
+            };
+            let (plus, minus) = (side(step), side(-step));
+            for (kind, power) in powers.into_iter().enumerate() {
+                for k in 0..3 {
+                    let term = power * (plus[k] - minus[k]) / (2.0 * f64::from(step));
+                    expected[kind][k] += term;
+                    size[kind][k] += term.abs();
+                }
+            }
+        });
+        for kind in 0..4 {
+            let pairs = [0, 1, 4].map(|pair: usize| found.pairs[pair][kind]);
+            let mixed = found.distortion.map(|mixed| mixed[kind]);
+            let [e1, e2] = shape.mean_second_derivative(&curvature, pairs, mixed);
+            let square = SizeMoments::mean_second_derivative(&breadth, found.square[kind]);
+            for (k, found) in [e1, e2, square].into_iter().enumerate() {
+                let (expected, size) = (expected[kind][k], size[kind][k]);
+                // Third derivatives, and differences of f32.
+                assert!(
+                    (found - expected).abs() < 2e-3 * size,
+                    "{level} {kind} {k}: {found} {expected} of {size}"
+                );
             }
         }
     }
