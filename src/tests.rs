@@ -101,8 +101,12 @@ const WAYS: [(&str, &[&str]); 32] = [
     (
         "gather",
         &[
-            "stamps extension mask mask-extension mask-bits square psf psf-extension noise set image out",
-            "exposure positions table first-pixel columns size extension mask mask-extension mask-bits psf psf-extension noise set image out",
+            "stamps square extension mask mask-extension mask-bits psf psf-extension noise frame gain set image out",
+            "stamps square extension mask mask-extension mask-bits psf psf-extension variance variance-extension frame gain set image out",
+            "stamps square extension mask mask-extension mask-bits psf psf-extension weight-map weight-extension frame gain set image out",
+            "exposure positions table first-pixel columns degrees id carry size extension mask mask-extension mask-bits psf psf-extension noise frame gain set image out",
+            "exposure positions table first-pixel columns degrees id carry size extension mask mask-extension mask-bits psf psf-extension variance variance-extension frame gain set image out",
+            "exposure positions table first-pixel columns degrees id carry size extension mask mask-extension mask-bits psf psf-extension weight-map weight-extension frame gain set image out",
         ],
     ),
     (
