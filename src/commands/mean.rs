@@ -5,9 +5,11 @@ use clap::Args;
 use crate::arguments::{Form, SetList, Threads, sets_of};
 use crate::tell;
 use shearq_dataset::fingerprint;
+use shearq_dataset::metadata::Axes;
 use shearq_dataset::run::{Run, Source};
 use shearq_dataset::threads::Pool;
-use shearq_measure::Warning;
+use shearq_measure::{PixelFrame, Warning};
+use shearq_render::table::TableFormat;
 use shearq_results::mean::mean_shears;
 use shearq_results::score::without_catalogue;
 use shearq_results::select::smooth_selection;
@@ -79,7 +81,9 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             anyhow::ensure!(mean.galaxies > 0, "set {set:02}: {flagged}");
             tell(format_args!("warning: set {set:02}: {flagged}"));
         }
-        if let Some(frame) = mean.frame {
+        if let Axes::Oriented(frame) = mean.axes
+            && frame != PixelFrame::default()
+        {
             let warning = Warning::PixelFrame(frame);
             tell(format_args!("warning: set {set:02}: {warning}"));
         }
@@ -107,6 +111,9 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         let used = means.iter().map(|mean| (mean.set, mean.images.as_slice()));
         let without = without_catalogue(data, &used.collect(), sets)?;
         table.notes.extend(without);
+    }
+    if !matches!(arguments.form.format, TableFormat::Csv | TableFormat::Json) {
+        table = table.narrow();
     }
     arguments.form.print(&table)
 }

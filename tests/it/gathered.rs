@@ -789,7 +789,40 @@ fn pixel_axes_that_are_not_the_skys_are_stated() {
     measure("both");
     let out = small.at("both-out");
     let message = fail(&["mean", "--measured", text(&out)]);
-    let expected = "the pixel axes of image 2 are not those of image 1";
+    let expected = "catalogue-001.parquet and no common mean with them (found pixel axes with +y at position angle 90.0°, mirrored, sheared by (+0.0000, +0.0000); expected pixel axes with +y at position angle 0.0°, not mirrored";
+    assert!(message.contains(expected), "{message}");
+    // Both are along the sky in one set: axes that are the sky's anyhow, and those that the WCS turns.
+    gather(&[sky], &on_sky.1, ["1", "all", ""]);
+    gather(&[camera], &on_camera.1, ["2", "all", ""]);
+    measure("all");
+    let json = |out: &str| -> Value {
+        let line = format!("shearq mean --measured {out}-out --format json");
+        let table: Value = serde_json::from_str(&printed(small.root(), &line)).unwrap();
+        table["rows"][0].clone()
+    };
+    let (mixed, turned, along) = (json("all"), json("turned"), json("camera"));
+    assert_eq!([&mixed["frame"], &along["frame"]], ["sky", "pixel"]);
+    // The stamps are the same, so that on the sky e1 of the two images differs in sign and e2 does not.
+    let [g2, turned2] = [&mixed, &turned].map(|row| row["g2"].as_f64().unwrap());
+    assert!((g2 - turned2).abs() < 0.005, "{g2} {turned2}");
+    assert!(mixed["g1"].as_f64().unwrap().abs() < 0.005, "{mixed}");
+    // Pixels without a WCS may lie in any orientation.
+    let plain = small.at("plain.fits");
+    let stack = [48, 48, galaxies.len()];
+    fs::write(
+        &plain,
+        fits_image(-32, &stack, &[], &floats(&galaxies.concat())),
+    )
+    .unwrap();
+    gather(&[camera], &on_camera.1, ["1", "open", ""]);
+    gather(
+        &[text(&plain)],
+        &set.join("psf-001.fits"),
+        ["2", "open", ""],
+    );
+    measure("open");
+    let message = fail(&["mean", "--measured", text(&small.at("open-out"))]);
+    let expected = "(found pixel axes without a WCS; expected the axes of the sky)";
     assert!(message.contains(expected), "{message}");
     let mixed = small.at("mixed");
     let of = ["gather", "--stamps", sky, "--psf", text(&on_camera.1)];

@@ -1,6 +1,7 @@
 //! The metadata of catalogues: what they were measured with and from.
 
-use std::path::Path;
+use std::fmt;
+use std::path::{Path, PathBuf};
 
 use shearq_files::FileError;
 use shearq_files::table::{self, FileFormat};
@@ -42,21 +43,110 @@ pub fn frame_entry(frame: &PixelFrame) -> (String, String) {
     (FRAME.into(), text)
 }
 
-/// The pixel axes of a catalogue's image; `None` if they are the sky's, or unknown.
-pub fn stated_frame(path: &Path, format: FileFormat) -> Result<Option<PixelFrame>, FileError> {
+/// The axes of the ellipticities of a catalogue.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub enum Axes {
+    Sky,
+    /// Pixel axes of an orientation that no WCS states.
+    #[default]
+    Pixel,
+    /// Pixel axes whose orientation on the sky is known; the default is that of the sky.
+    Oriented(PixelFrame),
+}
+
+impl Axes {
+    pub fn frame(self) -> Frame {
+        match self {
+            Axes::Sky => Frame::Sky,
+            Axes::Pixel | Axes::Oriented(_) => Frame::Pixel,
+        }
+    }
+
+    /// Whether ellipticities along these and along `other` axes have a mean, to twice the rotation and ten times the shear
+    /// below which pixel axes are taken for the sky's.
+    pub fn agree(self, other: Axes) -> bool {
+        let [a, b] = match (self, other) {
+            (Axes::Sky, Axes::Pixel) | (Axes::Pixel, Axes::Sky) => return false,
+            axes => [axes.0, axes.1].map(|own| match own {
+                Axes::Oriented(frame) => frame,
+                // Pixels without a WCS belong to one detector, and are as likely the sky's as others.
+                Axes::Sky | Axes::Pixel => PixelFrame::default(),
+            }),
+        };
+        // Ellipticities do not change by half a turn.
+        let turned = (a.angle - b.angle + 90.0).rem_euclid(180.0) - 90.0;
+        let [g1, g2] = [0, 1].map(|k| a.shear[k] - b.shear[k]);
+        a.mirrored == b.mirrored && turned.abs() < 2.0 && g1.hypot(g2) < 0.01
+    }
+}
+
+impl fmt::Display for Axes {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Axes::Sky => f.write_str("the axes of the sky"),
+            Axes::Pixel => f.write_str("pixel axes without a WCS"),
+            Axes::Oriented(frame) => write!(f, "pixel axes with {frame}"),
+        }
+    }
+}
+
+/// The axes of catalogues that are averaged.
+#[derive(Debug, Default)]
+pub struct CommonAxes {
+    first: Option<(PathBuf, Axes)>,
+    on_sky: bool,
+}
+
+impl CommonAxes {
+    /// Adds a catalogue. True shears along the pixel axes of each image can be compared with catalogues of `any_pixels`; a
+    /// mean requires one orientation.
+    ///
+    /// # Errors
+    /// If its axes are not those of the others.
+    pub fn add(&mut self, path: &Path, axes: Axes, any_pixels: bool) -> Result<(), FileError> {
+        let (first, expected) = self.first.get_or_insert_with(|| (path.to_owned(), axes));
+        let both_pixels = (axes.frame(), expected.frame()) == (Frame::Pixel, Frame::Pixel);
+        if axes.agree(*expected) || any_pixels && both_pixels {
+            self.on_sky |= axes == Axes::Sky;
+            return Ok(());
+        }
+        let remedy = match both_pixels {
+            true => "images of one orientation per set (gather --set), or gather --frame sky",
+            false => "gather all with --frame sky, or all with --frame pixel",
+        };
+        let message = format!(
+            "the ellipticities have other axes than those of {} and no common mean with them (found {axes}; expected {expected}). Try: {remedy}",
+            first.display()
+        );
+        Err(FileError::new(path, message))
+    }
+
+    /// The axes of all; `None` without a catalogue.
+    pub fn common(&self) -> Option<Axes> {
+        // Pixel axes that are the sky's count as the sky beside it.
+        let first = self.first.as_ref().map(|(_, axes)| *axes);
+        first.map(|axes| if self.on_sky { Axes::Sky } else { axes })
+    }
+}
+
+/// The axes that a catalogue states.
+pub fn stated_axes(path: &Path, format: FileFormat) -> Result<Axes, FileError> {
     let keys = [FRAME.to_owned()];
     let metadata = table::read_metadata(path, format, keys.iter())?;
     let Some(text) = metadata.get(FRAME) else {
-        return Ok(None);
+        return Ok(Axes::Pixel);
     };
     // Python states the frame of the pixels, too.
-    if text.parse::<Frame>().is_ok() {
-        return Ok(None);
+    if let Ok(frame) = text.parse::<Frame>() {
+        return Ok(match frame {
+            Frame::Sky => Axes::Sky,
+            Frame::Pixel => Axes::Pixel,
+        });
     }
     let numbers: Option<Vec<f64>> = text.split(' ').map(|word| word.parse().ok()).collect();
     match numbers.as_deref() {
         Some(&[angle, parity, g1, g2]) if numbers.iter().flatten().all(|n| n.is_finite()) => {
-            Ok(Some(PixelFrame {
+            Ok(Axes::Oriented(PixelFrame {
                 angle,
                 mirrored: parity < 0.0,
                 shear: [g1, g2],

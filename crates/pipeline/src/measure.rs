@@ -35,6 +35,8 @@ pub struct ImageHead {
     pub run_warnings: Vec<Warning>,
     /// The table of the stamps if they were gathered.
     pub(crate) table: Option<StampTable>,
+    /// Whether ellipticities are along pixel axes that a WCS states to be the sky's.
+    pub(crate) aligned: bool,
     /// Fingerprints of the files that the image is measured from.
     pub prints: BTreeMap<String, String>,
 }
@@ -203,6 +205,7 @@ impl<'a> FolderMeasurement<'a> {
                 mosaic,
                 run_warnings: correlated.into_iter().collect(),
                 table: source.take_table(),
+                aligned: source.is_aligned(),
                 prints,
             });
             for row in 0..mosaic.rows() {

@@ -227,6 +227,7 @@ pub fn run_folder(
                     mosaic: Mosaic::square(settings.grid, STAMP),
                     run_warnings: Vec::new(),
                     table: None,
+                    aligned: false,
                     prints: BTreeMap::new(),
                 };
                 catalogues.add(&head, &image.batches[0], progress)

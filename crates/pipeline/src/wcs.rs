@@ -399,6 +399,10 @@ impl Wcs {
         frame(jacobian)
     }
 
+    pub(crate) fn states_axes(&self) -> bool {
+        self.reference().is_some()
+    }
+
     /// A warning if the ellipticities along these pixels are not along the sky's axes.
     pub(crate) fn frame(&self) -> Option<Warning> {
         let jacobian = self.reference()?;

@@ -17,9 +17,11 @@ use shearq_bias::{
     group,
 };
 use shearq_dataset::layout::stated_sign;
+use shearq_dataset::metadata::{CommonAxes, stated_axes};
 use shearq_dataset::truth::{Sign, SignBasis, word};
 use shearq_files::FileError;
 use shearq_files::frames::polars::DataFrame;
+use shearq_files::table::FileFormat;
 use shearq_scoring::TruthSign;
 use thiserror::Error;
 
@@ -209,6 +211,8 @@ pub struct About {
     pub columns: Vec<String>,
     /// The sign of the true g2; `None` if the truth needs none.
     pub sign: Option<Sign>,
+    /// `pixel` or `sky`, of catalogues by shearq.
+    pub frame: Option<String>,
 }
 
 impl About {
@@ -335,6 +339,7 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
         selection: request.selection.as_ref().map(|own| own.text.clone()),
         columns: described,
         sign,
+        frame: common_frame(&all)?,
     };
     let mut summed = Summed { sums, about };
     // The catalogues are read again rather than the sums changed: g2 enters them in products of all terms.
@@ -461,6 +466,19 @@ fn check_columns(request: &Request, all: &[Vec<Source>]) -> Result<(), BiasFailu
         }
     }
     Ok(())
+}
+
+// The frame of catalogues by shearq. Others do not state theirs.
+fn common_frame(all: &[Vec<Source>]) -> Result<Option<String>, FileError> {
+    let mut axes = CommonAxes::default();
+    for source in all.iter().flatten() {
+        let path = &source.place.path;
+        let own = source.columns.is_of_shearq() && source.frame.is_none();
+        if let Some(format) = FileFormat::of(path).filter(|_| own) {
+            axes.add(path, stated_axes(path, format)?, true)?;
+        }
+    }
+    Ok(axes.common().map(|axes| axes.frame().to_string()))
 }
 
 fn known(truth: &Truth, source: &Source) -> bool {
@@ -598,6 +616,9 @@ impl Summed {
         }
         if self.about.sign.map(|sign| sign.of) != other.about.sign.map(|sign| sign.of) {
             return Err(BiasFailure::Unlike("signs of g2"));
+        }
+        if self.about.frame != other.about.frame {
+            return Err(BiasFailure::Unlike("frames of ellipticities"));
         }
         Ok(())
     }

@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 
 use shearq_dataset::layout::{DataFolder, read_rows};
 use shearq_dataset::listing::Files;
+use shearq_dataset::metadata::{CommonAxes, stated_axes};
 use shearq_dataset::run::{Run, Source};
 use shearq_files::FileError;
 use shearq_files::table::most_rows;
@@ -113,6 +114,18 @@ impl Catalogues {
                 images.map(|(image, path)| (*image, path.clone())).collect()
             }
         }
+    }
+
+    /// Refuses a set of which only some catalogues by shearq are in the frame of the sky. The true shear is that of one frame.
+    pub fn check_axes(&self, set: u32) -> Result<(), FileError> {
+        let Origin::Measured(run, files) = &self.origin else {
+            return Ok(());
+        };
+        let mut axes = CommonAxes::default();
+        for (_, path) in files.of_set(set) {
+            axes.add(&path, stated_axes(&path, run.format)?, true)?;
+        }
+        Ok(())
     }
 
     pub fn sets(&self) -> Vec<u32> {

@@ -2,11 +2,11 @@
 
 use std::path::{Path, PathBuf};
 
-use shearq_dataset::metadata::stated_frame;
+use shearq_dataset::metadata::{Axes, CommonAxes, stated_axes};
 use shearq_dataset::run::Run;
 use shearq_files::FileError;
 use shearq_files::table::FileFormat;
-use shearq_measure::{Flag, Flags, MeanShear, PixelFrame, Selection, ShearSum, Warning};
+use shearq_measure::{Flag, Flags, MeanShear, Selection, ShearSum, Warning};
 use shearq_quantities::statistics::RunningMean;
 use shearq_submissions::Calibration;
 
@@ -38,8 +38,8 @@ pub struct SetMean {
     pub noisy_stars: usize,
     /// Standard deviation of e1 and of e2 of one galaxy.
     pub scatter: [f64; 2],
-    /// The pixel axes, if they are not the sky's.
-    pub frame: Option<PixelFrame>,
+    /// The axes of the shear.
+    pub axes: Axes,
 }
 
 impl SetMean {
@@ -108,21 +108,9 @@ fn mean_of(
     let (mut sum, mut moments) = (ShearSum::default(), [RunningMean::default(); 2]);
     let (mut flags, mut flagged, mut cut) = ([0; Flag::ALL.len()], 0, 0);
     let mut stars = Stars::default();
-    let mut first = None;
-    for (image, path) in catalogues {
-        let frame = stated_frame(path, format)?;
-        let (before, expected) = *first.get_or_insert((*image, frame));
-        if !agree(frame, expected) {
-            let shown = |frame: Option<PixelFrame>| {
-                frame.map_or("those of the sky".into(), |frame| frame.to_string())
-            };
-            let message = format!(
-                "the pixel axes of image {image} are not those of image {before}, so that the ellipticities of set {set} have no common mean (found {}; expected {}). Try: images of one orientation per set (gather --set)",
-                shown(frame),
-                shown(expected)
-            );
-            return Err(FileError::new(path, message));
-        }
+    let mut axes = CommonAxes::default();
+    for (_, path) in catalogues {
+        axes.add(path, stated_axes(path, format)?, false)?;
         let (rows, bits) = match selection {
             Some(selection) => Weighted::read(path, selection)?,
             None => Weighted::unselected(path, calibrated)?,
@@ -172,26 +160,18 @@ fn mean_of(
         psf_error,
         noisy_stars: stars.stated(),
         scatter: [0, 1].map(|k| moments[k].deviation() / response[k]),
-        frame: first.and_then(|(_, frame)| frame),
+        axes: axes.common().unwrap_or_default(),
     })
-}
-
-/// Whether two images have one frame, to twice the rotation and ten times the shear that are not stated.
-fn agree(a: Option<PixelFrame>, b: Option<PixelFrame>) -> bool {
-    let [a, b] = [a, b].map(Option::unwrap_or_default);
-    // Ellipticities do not change by half a turn.
-    let turned = (a.angle - b.angle + 90.0).rem_euclid(180.0) - 90.0;
-    let [g1, g2] = [0, 1].map(|k| a.shear[k] - b.shear[k]);
-    a.mirrored == b.mirrored && turned.abs() < 2.0 && g1.hypot(g2) < 0.01
 }
 
 #[cfg(test)]
 mod tests {
     use shearq_dataset::fingerprint::PSF;
-    use shearq_dataset::metadata::PSF_NOISE;
+    use shearq_dataset::metadata::{FRAME, PSF_NOISE};
     use shearq_files::frames::frame;
     use shearq_files::frames::polars::Column;
     use shearq_files::table;
+    use shearq_measure::PixelFrame;
 
     use super::*;
 
@@ -267,6 +247,52 @@ mod tests {
         let mean = mean_of(7, &catalogues, FileFormat::Parquet, true, None);
         let found = mean.unwrap().shear.unwrap().shear[0];
         assert!((found - (0.25 + 0.01) / 1.002).abs() < 1e-15, "{found}");
+    }
+
+    #[test]
+    fn only_ellipticities_along_common_axes_have_a_mean() {
+        let folder = tempfile::tempdir().unwrap();
+        let mean = |frames: &[&str]| {
+            let mut catalogues = Vec::new();
+            for (image, frame) in (1..).zip(frames) {
+                let path = folder.path().join(format!("{image}.parquet"));
+                let stated = (FRAME, *frame);
+                let metadata = if frame.is_empty() { &[][..] } else { &[stated] };
+                written(&path, [0.05, 0.2], metadata);
+                catalogues.push((image, path));
+            }
+            mean_of(7, &catalogues, FileFormat::Parquet, true, None)
+        };
+        let turned = PixelFrame {
+            angle: 37.0,
+            ..PixelFrame::default()
+        };
+        let (aligned, other) = ("0.00 1 0.0000 0.0000", "37.00 1 0.0000 0.0000");
+        for (frames, axes) in [
+            (&[""; 2], Axes::Pixel),
+            (&["pixel", ""], Axes::Pixel),
+            (&["sky"; 2], Axes::Sky),
+            // A WCS states that these pixels are along the sky.
+            (&[aligned, "sky"], Axes::Sky),
+            (&["sky", aligned], Axes::Sky),
+            (&[other, "217.50 1 0.0010 0.0000"], Axes::Oriented(turned)),
+        ] {
+            assert_eq!(mean(frames).unwrap().axes, axes, "{frames:?}");
+        }
+        for frames in [
+            &["sky", ""],
+            &["", "sky"],
+            &["pixel", "sky"],
+            &["sky", other],
+            &[other, aligned],
+            &[other, "37.00 -1 0.0000 0.0000"],
+        ] {
+            let error = mean(frames).unwrap_err().to_string();
+            assert!(error.contains("have other axes than those"), "{error}");
+        }
+        for text in ["galactic", "37.00 1", "37.00 1 0.0 NaN"] {
+            assert!(mean(&[text]).unwrap_err().to_string().contains("`frame`"));
+        }
     }
 
     #[test]

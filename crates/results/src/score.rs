@@ -312,6 +312,9 @@ fn score_sets(
     options: Options,
     pool: &Pool,
 ) -> Result<Vec<ScoredSet>, ScoreError> {
+    for &set in sets {
+        catalogues.check_axes(set)?;
+    }
     let read = |grid: &Grid, path: &Path| catalogues.sum(grid, path);
     let files = |set: u32| {
         let (images, paths): (Vec<u32>, Vec<PathBuf>) = catalogues.of_set(set).into_iter().unzip();

@@ -7,7 +7,9 @@ use shearq_files::FileError;
 use shearq_files::frames::polars::{Column, DataFrame};
 use shearq_files::frames::{TableError, frame};
 use shearq_files::table;
-use shearq_measure::{Batch, Flag, Flags, Measurement, Observables, ShearedCatalogues, Warning};
+use shearq_measure::{
+    Batch, Flag, Flags, Measurement, Observables, PixelFrame, ShearedCatalogues, Warning,
+};
 use shearq_quantities::Frame;
 use shearq_submissions::{Configuration, EllipticityType};
 
@@ -298,6 +300,9 @@ impl<'a> Catalogues<'a> {
             if let Warning::PixelFrame(frame) = warning {
                 metadata.extend([frame_entry(frame)]);
             }
+        }
+        if head.aligned {
+            metadata.extend([frame_entry(&PixelFrame::default())]);
         }
         if batch.frame == Frame::Sky {
             metadata.insert(FRAME.into(), Frame::Sky.to_string());

@@ -35,6 +35,7 @@ pub struct ImageSource {
     table: Option<StampTable>,
     jacobians: Option<Vec<Jacobian>>,
     gain: Option<f64>,
+    aligned: bool,
     warnings: Vec<Warning>,
 }
 
@@ -98,9 +99,9 @@ impl ImageSource {
         };
         let wcs = Wcs::of_header(&image);
         warnings.extend(Wcs::disagreements(&psf_wcs, &wcs));
-        if jacobians.is_none() {
-            warnings.extend(wcs.frame());
-        }
+        let of_pixels = jacobians.is_none().then(|| wcs.frame()).flatten();
+        let aligned = jacobians.is_none() && of_pixels.is_none() && wcs.states_axes();
+        warnings.extend(of_pixels);
         for (of, stated) in [("galaxies", stated_image(&image)), ("PSF", stated_by_psf)] {
             let expected = [id.set, id.image];
             let other = stated.filter(|stated| *stated != expected);
@@ -119,12 +120,17 @@ impl ImageSource {
             gain: table.as_ref().and_then(|table| table.head.gain),
             table,
             jacobians,
+            aligned,
             warnings,
         })
     }
 
     pub fn mosaic(&self) -> Mosaic {
         self.mosaic
+    }
+
+    pub(super) fn is_aligned(&self) -> bool {
+        self.aligned
     }
 
     /// The table of the stamps if they were gathered.

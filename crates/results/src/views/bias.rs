@@ -27,7 +27,7 @@ type BinColumn = (
 );
 
 // The quantities of the estimate follow.
-const COLUMNS: [BinColumn; 6] = [
+const COLUMNS: [BinColumn; 7] = [
     ("bin", "Bin", false, |result, bin| {
         Cell::text(label(result, bin.edges))
     }),
@@ -45,6 +45,10 @@ const COLUMNS: [BinColumn; 6] = [
     }),
     ("units", "Units", true, |_, bin| {
         count(bin, |found| found.units as f64)
+    }),
+    ("frame", "Frame", true, |result, _| {
+        let frame = result.about.frame.as_ref();
+        frame.map_or(Cell::Empty, Cell::text)
     }),
 ];
 
@@ -72,9 +76,13 @@ pub fn bias_table(result: &BiasResult) -> Table {
         heading if detail => heading.detail(),
         heading => heading,
     };
-    let headings = COLUMNS
-        .iter()
-        .map(|(key, label, detail, _)| heading(key, *label, *detail));
+    // Programs other than shearq do not state a frame.
+    let columns = || {
+        COLUMNS
+            .iter()
+            .filter(|own| own.0 != "frame" || result.about.frame.is_some())
+    };
+    let headings = columns().map(|(key, label, detail, _)| heading(key, *label, *detail));
     let of_quantities = quantities.iter().map(|own| {
         let detail = !MAIN.contains(&own.key) && own.key != "alpha";
         heading(own.key, own.label, detail)
@@ -87,7 +95,7 @@ pub fn bias_table(result: &BiasResult) -> Table {
                 label(result, bin.edges)
             ));
         }
-        let cells = COLUMNS.iter().map(|(.., cell)| cell(result, bin));
+        let cells = columns().map(|(.., cell)| cell(result, bin));
         let quantity = |own: &&Quantity| {
             let found = bin
                 .estimate

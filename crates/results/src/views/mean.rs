@@ -3,6 +3,7 @@
 use shearq_submissions::{Calibration, Configuration, EllipticityType};
 
 use crate::mean::SetMean;
+use shearq_dataset::metadata::Axes;
 use shearq_render::table::{Cell, Table};
 
 /// Mean shears of sets that `configuration` measured, of the catalogues called `name`.
@@ -29,9 +30,21 @@ pub fn mean_table(means: &[SetMean], configuration: &Configuration, name: &str) 
     table.column("scatter2", "σ(e2)", means, |mean| {
         Cell::number(mean.scatter[1], 4)
     });
+    let frame = table.column("frame", "Frame", means, |mean| {
+        Cell::text(mean.axes.frame().to_string())
+    });
+    table.headings[frame].detail = true;
+    let on_sky = means.iter().filter(|mean| mean.axes == Axes::Sky).count();
+    let convention = match on_sky {
+        0 => "Positive g2 is a stretch along x = y.",
+        _ if on_sky == means.len() => {
+            "Frame: sky, north up and seen from Earth. Positive g1 is a stretch along east–west, positive g2 along north-west."
+        }
+        _ => "The frame of each set is the pixels' or the sky's (--format csv).",
+    };
     let notes = &mut table.notes;
     notes.push(format!(
-        "Mean ellipticities of {name} by {}. Positive g2 is a stretch along x = y.",
+        "Mean ellipticities of {name} by {}. {convention}",
         configuration.name
     ));
     if configuration.calibration() == Calibration::None {
