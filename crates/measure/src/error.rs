@@ -81,6 +81,9 @@ pub enum MeasureError {
         /// The largest that the method can use.
         most: f64,
     },
+    /// Epochs of a galaxy that cannot be combined.
+    #[error(transparent)]
+    Epochs(#[from] EpochError),
     /// A PSF profile that does not exist.
     #[error(transparent)]
     Profile(#[from] ProfileError),
@@ -90,6 +93,49 @@ pub enum MeasureError {
     /// A submission that does not exist or is not valid.
     #[error(transparent)]
     Configuration(#[from] ConfigurationError),
+}
+
+/// Why epochs of a galaxy cannot be combined. Epochs are counted from 0.
+#[derive(Debug, Clone, Copy, PartialEq, Error)]
+#[non_exhaustive]
+pub enum EpochError {
+    /// A galaxy without epochs.
+    #[error("found a galaxy without epochs (expected one or more)")]
+    None,
+    /// A noise level by which an epoch cannot be weighted.
+    #[error(
+        "the noise level of epoch {epoch} is {noise} (expected a finite number above 0 in image units)"
+    )]
+    Noise {
+        /// The epoch.
+        epoch: usize,
+        /// The level found.
+        noise: f64,
+    },
+    /// A galaxy that is not near the middle of its stamp.
+    #[error(
+        "the galaxy of epoch {epoch} is ({x}, {y}) px from the centre of its stamp (expected up to {most}). Try: stamps that are cut around the galaxy"
+    )]
+    Offset {
+        /// The epoch.
+        epoch: usize,
+        /// Offset along x.
+        x: f64,
+        /// Offset along y.
+        y: f64,
+        /// The largest that is possible.
+        most: f64,
+    },
+    /// Epochs in the frame of the sky and of the pixels.
+    #[error(
+        "some epochs have Jacobians and others have none (expected Jacobians for all or for none)"
+    )]
+    Frames,
+    /// A method that is not linear.
+    #[error(
+        "the configuration measures with the network, which combines no epochs. Try: a linear configuration, such as 48/linear/star"
+    )]
+    Network,
 }
 
 impl MeasureError {

@@ -30,6 +30,11 @@
 //! For galaxies without an image, the types fix the order: worker, image, PSF, galaxy. [`calibrate`] divides by their mean
 //! response.
 //!
+//! # Epochs
+//!
+//! [`ImageWorker::measure_epochs`] measures a galaxy on several stamps, which a linear configuration combines with
+//! inverse-variance weights in each Fourier mode before it measures the shape.
+//!
 //! # Conventions
 //!
 //! Stamps are indexed `[y, x]`. e1 > 0 is elongation along +x, e2 > 0 along x = y. With Jacobians
@@ -66,11 +71,11 @@ mod transform;
 mod warning;
 
 pub use calibration::{MeanShear, MeanShearError, ShearSum, calibrate};
-pub use error::MeasureError;
+pub use error::{EpochError, MeasureError};
 pub use examine::{EXAMINED_PSFS, Examination, examined_rows};
 pub use measurement::{Coupling, Flag, Flags, Measurement, Observables, ResponseMatrix};
 pub use measurement::{Descent, Stop};
-pub use measurer::{ImageNoise, ImageWorker, Measurer, PsfWorker, Steps, Worker};
+pub use measurer::{Epoch, ImageNoise, ImageWorker, Measurer, PsfWorker, Steps, Worker};
 pub use method::AdaptedSettings;
 pub use ndarray;
 pub use noise::{StampNoise, Survey};

@@ -10,11 +10,11 @@ use ndarray::{Array2, ArrayView2, ArrayView3};
 use shearq_quantities::{Jacobian, PixelShape, Spin2};
 use shearq_submissions::{Configuration, ConfigurationError, NoiseSource, Registry};
 
-use crate::deconvolve::convolve;
+use crate::deconvolve::{EpochPixels, convolve};
 use crate::denoise::{DenoiseScratch, WaveletWiener, border_noise};
-use crate::error::MeasureError;
+use crate::error::{EpochError, MeasureError};
 use crate::measurement::{Flag, Measurement};
-use crate::method::{AdaptedSettings, CutWorker, Images, MethodPlan};
+use crate::method::{AdaptedSettings, CutEpoch, CutWorker, Images, MethodPlan};
 use crate::missing_pixels::MissingPixels;
 use crate::noise::{NoisePlan, StampNoise, Survey};
 use crate::pixel::{self, PEAKS, Pixel, all_finite, highest, is_level};
@@ -138,6 +138,8 @@ impl Measurer {
             cells: SkyCells::new(plan.full),
             subtraction: SkySubtraction::Nothing,
             to_sky: None,
+            epochs: Vec::new(),
+            used: Vec::new(),
         }
     }
 
@@ -226,6 +228,24 @@ pub struct Worker {
     subtraction: SkySubtraction,
     /// What turns ellipticities to the frame of the sky, if they are measured there.
     to_sky: Option<Spin2>,
+    /// Cut stamps of the usable epochs of a galaxy, and which epochs they are.
+    epochs: Vec<f32>,
+    used: Vec<usize>,
+}
+
+/// One of several stamps of a galaxy: an exposure, or a band.
+#[derive(Debug, Clone, Copy)]
+pub struct Epoch<'a, T> {
+    /// The full stamp, of the size planned.
+    pub stamp: ArrayView2<'a, T>,
+    /// The PSF, as [`ImageWorker::psf`] takes it.
+    pub psf: ArrayView2<'a, f64>,
+    /// Standard deviation per pixel of the stamp's noise, which is taken as white; above 0.
+    pub noise: f64,
+    /// The map from pixels to the sky, for all epochs or for none. Pixels may differ in rotation, parity, shear and scale.
+    pub jacobian: Option<Jacobian>,
+    /// Offset (x, y) of the galaxy from the centre of the stamp in pixels.
+    pub offset: [f64; 2],
 }
 
 /// A worker for the galaxies of one image.
@@ -296,6 +316,30 @@ impl Worker {
         level: f64,
         usable_psf: bool,
     ) -> Result<Measurement, MeasureError> {
+        let noise = match self.cut(stamp, level, usable_psf)? {
+            Ok(noise) => noise,
+            Err(flagged) => return Ok(flagged),
+        };
+        let Some(mut found) = self.method.measure(&self.cut, noise)? else {
+            return Ok(Measurement {
+                noise,
+                ..Measurement::flagged(Flag::NoScale)
+            });
+        };
+        if let Some(to_sky) = &self.to_sky {
+            found.turn(to_sky);
+        }
+        Ok(found.measurement(self.configuration().ellipticity(), noise))
+    }
+
+    /// Cuts a stamp and prepares its pixels. Returns the level of its noise, or the measurement if it is flagged before its shape is
+    /// measured.
+    fn cut<T: Pixel>(
+        &mut self,
+        stamp: ArrayView2<'_, T>,
+        level: f64,
+        usable_psf: bool,
+    ) -> Result<Result<f64, Measurement>, MeasureError> {
         let plan = Arc::clone(&self.measurer.0);
         let n = plan.configuration.stamp.size;
         let linear = plan.configuration.linear().is_some();
@@ -304,13 +348,13 @@ impl Worker {
             whole = false;
         }
         if !whole && !linear {
-            return Ok(Measurement::flagged(Flag::NotFinite));
+            return Ok(Err(Measurement::flagged(Flag::NotFinite)));
         }
         if !usable_psf {
-            return Ok(Measurement::flagged(Flag::BadPsf));
+            return Ok(Err(Measurement::flagged(Flag::BadPsf)));
         }
         if self.full.iter().all(|v| *v == self.full[0]) {
-            return Ok(Measurement::flagged(Flag::NoScale));
+            return Ok(Err(Measurement::flagged(Flag::NoScale)));
         }
         if self.subtraction != SkySubtraction::Nothing {
             self.subtraction.apply(&mut self.full, &mut self.cells);
@@ -335,22 +379,67 @@ impl Worker {
             }
         }
         if !whole && !self.missing.fill(&mut self.cut, n) {
-            return Ok(Measurement::flagged(Flag::NotFinite));
+            return Ok(Err(Measurement::flagged(Flag::NotFinite)));
         }
-        let no_scale = Measurement {
-            noise,
-            ..Measurement::flagged(Flag::NoScale)
-        };
         if !PEAKS.contains(&highest(&self.cut)) || (noise.is_finite() && !is_level(noise)) {
-            return Ok(no_scale);
+            return Ok(Err(Measurement {
+                noise,
+                ..Measurement::flagged(Flag::NoScale)
+            }));
         }
-        let Some(mut found) = self.method.measure(&self.cut, noise)? else {
-            return Ok(no_scale);
+        Ok(Ok(noise))
+    }
+
+    /// Measures a galaxy on its epochs, whose input was checked.
+    fn measure_epochs<T: Pixel>(
+        &mut self,
+        epochs: &[Epoch<'_, T>],
+    ) -> Result<Measurement, MeasureError> {
+        let mut flagged = None;
+        self.epochs.clear();
+        self.used.clear();
+        for (k, epoch) in epochs.iter().enumerate() {
+            match self.cut(epoch.stamp, epoch.noise, true)? {
+                Ok(_) => {
+                    self.epochs.extend_from_slice(&self.cut);
+                    self.used.push(k);
+                }
+                Err(found) => flagged = flagged.or(Some(found)),
+            }
+        }
+        let (Some(&first), size) = (self.used.first(), self.cut.len()) else {
+            return Ok(flagged.unwrap_or(Measurement::flagged(Flag::NoScale)));
         };
-        if let Some(to_sky) = &self.to_sky {
-            found.turn(to_sky);
+        let frame = epochs[first].jacobian.map(|jacobian| {
+            let (orientation, _) = jacobian.factors();
+            (orientation, jacobian.pixel_scale())
+        });
+        let (cuts, used) = (&self.epochs, &self.used);
+        let epoch = |at: usize| {
+            let epoch = &epochs[used[at]];
+            let matrix = match (&frame, &epoch.jacobian) {
+                (Some((orientation, scale)), Some(jacobian)) => {
+                    // The transpose of an orthogonal matrix is its inverse.
+                    let ([[a, b], [c, d]], [u, v]) = (orientation.matrix(), jacobian.matrix());
+                    [[a, c], [b, d]].map(|[of_u, of_v]| {
+                        [0, 1].map(|axis| (of_u * u[axis] + of_v * v[axis]) / scale)
+                    })
+                }
+                _ => [[1.0, 0.0], [0.0, 1.0]],
+            };
+            CutEpoch {
+                cut: &cuts[at * size..][..size],
+                psf: epoch.psf,
+                noise: epoch.noise,
+                pixels: EpochPixels::new(matrix),
+                offset: epoch.offset,
+            }
+        };
+        let (mut found, noise) = self.method.measure_epochs(used.len(), &epoch)?;
+        if let Some((orientation, _)) = &frame {
+            found.turn(&orientation.spin2());
         }
-        Ok(found.measurement(plan.configuration.ellipticity(), noise))
+        Ok(found.measurement(self.configuration().ellipticity(), noise))
     }
 
     /// Copies a full stamp; whether all of its pixels are finite.
@@ -403,6 +492,13 @@ impl ImageWorker<'_> {
             }
             None => (None, PixelShape::SQUARE),
         };
+        self.check_shape(shape)?;
+        self.worker.to_sky = to_sky;
+        self.worker.method.set_pixel_shape(shape);
+        Ok(())
+    }
+
+    fn check_shape(&self, shape: PixelShape) -> Result<(), MeasureError> {
         let most = match self.configuration().linear() {
             Some(_) => MAX_PIXEL_SHEAR,
             None => MAX_NETWORK_PIXEL_SHEAR,
@@ -411,9 +507,64 @@ impl ImageWorker<'_> {
         if shear > most {
             return Err(MeasureError::ShearedPixels { shear, most });
         }
-        self.worker.to_sky = to_sky;
-        self.worker.method.set_pixel_shape(shape);
         Ok(())
+    }
+
+    /// Measures one galaxy on several stamps, without calibration.
+    ///
+    /// Deconvolved stamps are combined in each Fourier mode with inverse-variance weights, the squares of the epochs' signal over
+    /// noise there, and the shape is measured once. Its noise is that of one stamp of the summed S/N², and its response
+    /// that of the combined image, where a mean of the epochs' ellipticities would divide by noisy responses. `noise` of
+    /// the measurement is that of the combination, per pixel of the first usable epoch; lengths are in its pixels. Shapes are in
+    /// the frame of the sky if there are Jacobians.
+    ///
+    /// An epoch without usable pixels has no weight, and without usable epochs the galaxy is flagged. Centroid and neighbours
+    /// are found on the weighted mean of the stamps. Stamps should have one flux: of bands, the shape is that of
+    /// the image summed with weights. One epoch with the galaxy in the centre of its stamp is measured as by
+    /// [`PsfWorker::measure`], with the same bits. Size of the window and correlation of noise do not follow a survey, and
+    /// the gain is not used. The PSF of a [`PsfWorker`] has to be set again after it.
+    ///
+    /// # Errors
+    /// An [`EpochError`] if there are no epochs, a noise level is not above 0, an offset is beyond a quarter of the stamp, some
+    /// have Jacobians and others none, or the configuration is not linear. Also if sizes do not fit, pixels of a PSF are
+    /// not finite, or pixels are sheared too much.
+    pub fn measure_epochs<T: Pixel>(
+        &mut self,
+        epochs: &[Epoch<'_, T>],
+    ) -> Result<Measurement, MeasureError> {
+        if self.configuration().linear().is_none() {
+            return Err(EpochError::Network.into());
+        }
+        let one = epochs.first().ok_or(EpochError::None)?;
+        let most = self.configuration().stamp.size as f64 / 4.0;
+        for (k, found) in epochs.iter().enumerate() {
+            let (noise, [x, y]) = (found.noise, found.offset);
+            if !(noise > 0.0 && noise.is_finite()) {
+                return Err(EpochError::Noise { epoch: k, noise }.into());
+            }
+            // Not a number fails, too.
+            if !(x.abs() <= most && y.abs() <= most) {
+                return Err(EpochError::Offset {
+                    epoch: k,
+                    x,
+                    y,
+                    most,
+                }
+                .into());
+            }
+            if found.jacobian.is_some() != one.jacobian.is_some() {
+                return Err(EpochError::Frames.into());
+            }
+            if let Some(jacobian) = &found.jacobian {
+                self.check_shape(jacobian.factors().1)?;
+            }
+        }
+        if epochs.len() == 1 && one.offset == [0.0; 2] {
+            self.set_jacobian(one.jacobian.as_ref())?;
+            self.worker.method.set_psf(one.psf)?;
+            return self.worker.measure(one.stamp, one.noise, true);
+        }
+        self.worker.measure_epochs(epochs)
     }
 
     /// Measures stamps, one per galaxy along the first axis, without calibration, in the noise of the image.

@@ -11,7 +11,8 @@ use shearq_submissions::{Configuration, EllipticityType, Method};
 
 use self::linear::LinearFamily;
 use self::network::{NetworkPlan, NetworkWorker};
-use crate::error::MeasureError;
+use crate::deconvolve::EpochPixels;
+use crate::error::{EpochError, MeasureError};
 use crate::measurement::Descent;
 use crate::measurement::{Coupling, Flag, Flags, Measurement, Observables, ResponseMatrix};
 use crate::noise::StampNoise;
@@ -81,8 +82,30 @@ pub(crate) trait CutWorker: Send {
     /// Measures a cut stamp of noise level `noise`. `None` if there is no unit of brightness.
     fn measure(&mut self, cut: &[f32], noise: f64) -> Result<Option<Found>, MeasureError>;
 
+    /// Measures a galaxy on the cut stamps of so many epochs, which are combined before the shape is. Returns what was found
+    /// with the level of the combined noise, for a pixel of the first epoch. PSFs that were set are lost.
+    fn measure_epochs<'a>(
+        &mut self,
+        _count: usize,
+        _epoch: &dyn Fn(usize) -> CutEpoch<'a>,
+    ) -> Result<(Found, f64), MeasureError> {
+        Err(EpochError::Network.into())
+    }
+
     /// The deconvolved stamp and the autocorrelation of the last measurement.
     fn images(&mut self, cut: &[f32], psf: ArrayView2<'_, f64>) -> Images;
+}
+
+/// One of several stamps of a galaxy.
+pub(crate) struct CutEpoch<'a> {
+    pub(crate) cut: &'a [f32],
+    pub(crate) psf: ArrayView2<'a, f64>,
+    /// Level of white noise.
+    pub(crate) noise: f64,
+    /// From pixels to coordinates that all epochs have in common.
+    pub(crate) pixels: EpochPixels,
+    /// Of the galaxy from the middle of the stamp, in pixels.
+    pub(crate) offset: [f64; 2],
 }
 
 /// Lengths of the linear method after their adaptation to the PSF and to the galaxies of a survey.

@@ -22,6 +22,10 @@
 //! Each sum along an axis is a dense product. Both methods keep 16 to 48 modes along an axis; a transform of 23 px to 31 modes
 //! and back takes 0.9 µs so, and 5.4 µs with rustfft (`docs/speed.md`).
 
+mod turned;
+
+pub(crate) use self::turned::ToTurnedModes;
+
 use multiversion::multiversion;
 use shearq_quantities::PixelShape;
 use shearq_quantities::product::{LANES, Matrix, ROWS, multiply};
@@ -106,7 +110,6 @@ pub(crate) struct Spectrum(pub(crate) Vec<f32>);
 
 impl Spectrum {
     // cc = ½[Re f(k_x, −k_y) + Re f(k_x, k_y)], and so on.
-    #[cfg(test)]
     pub(crate) fn take_modes(&mut self, Modes { re, im }: &Modes) {
         let [cc, cs, sc, ss] = self.quarters_mut();
         for at in 0..cc.len() {

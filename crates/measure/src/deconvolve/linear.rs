@@ -33,6 +33,10 @@
 //! lags and shear are round in those coordinates. Ellipticities that were turned and sheared afterwards instead leave
 //! m = −0.004 for pixels that are sheared by 0.03.
 
+mod epochs;
+
+pub(crate) use self::epochs::{EpochPixels, EpochScratch, SpectralEpoch};
+
 use multiversion::multiversion;
 use ndarray::ArrayView2;
 use shearq_fourier::Complex64;
@@ -433,17 +437,7 @@ impl Spectral {
         scratch: &mut SpectralScratch,
         out: &mut SpectralPsf,
     ) -> Result<(), MeasureError> {
-        let (p, side) = (self.psf.side(), psf.nrows());
-        // Zero around a smaller one.
-        let fits = side < p && (p - side).is_multiple_of(2);
-        check_psf(psf, if fits { side } else { p })?;
-        let first = (p - side) / 2;
-        let image = &mut scratch.psf_image;
-        image.fill(0.0);
-        let rows = image.chunks_exact_mut(p).skip(first);
-        for (row, from) in rows.zip(psf.into_outer_iter()) {
-            copy_row(from, &mut row[first..]);
-        }
+        self.fill_psf_image(psf, &mut scratch.psf_image)?;
         self.retake_psf(noise, scratch, out);
         Ok(())
     }
@@ -455,14 +449,23 @@ impl Spectral {
         scratch: &mut SpectralScratch,
         out: &mut SpectralPsf,
     ) {
+        self.psf_modes(scratch);
+        let SpectralScratch {
+            changes,
+            real: [power, _],
+            ..
+        } = scratch;
+        take_psf(self, noise, changes, power, out);
+        self.spread_noise(scratch, out);
+    }
+
+    // The transforms of the PSF last given and of it times x and y, to `scratch.changes`.
+    fn psf_modes(&self, scratch: &mut SpectralScratch) {
         let SpectralScratch {
             of_psf,
             windowed: spectra,
             changes,
             psf_image: image,
-            real: [power, modes],
-            even,
-            quarter,
             pixels,
             skewed,
             ..
@@ -475,8 +478,34 @@ impl Spectral {
         for (modes, spectrum) in changes.iter_mut().zip(&*spectra) {
             modes.take_spectrum(spectrum);
         }
-        take_psf(self, noise, changes, power, out);
+    }
 
+    // Copies a PSF to the middle of an image of the planned size, with zero around a smaller one.
+    fn fill_psf_image(
+        &self,
+        psf: ArrayView2<'_, f64>,
+        image: &mut [f32],
+    ) -> Result<(), MeasureError> {
+        let (p, side) = (self.psf.side(), psf.nrows());
+        let fits = side < p && (p - side).is_multiple_of(2);
+        check_psf(psf, if fits { side } else { p })?;
+        let first = (p - side) / 2;
+        image.fill(0.0);
+        let rows = image.chunks_exact_mut(p).skip(first);
+        for (row, from) in rows.zip(psf.into_outer_iter()) {
+            copy_row(from, &mut row[first..]);
+        }
+        Ok(())
+    }
+
+    // Writes what follows from the power of noise of σ = 1 before the window, which is in `scratch.real[0]`.
+    fn spread_noise(&self, scratch: &mut SpectralScratch, out: &mut SpectralPsf) {
+        let SpectralScratch {
+            real: [power, modes],
+            even,
+            quarter,
+            ..
+        } = scratch;
         let mut spread = |modes: &[f32], out: &mut [f32]| {
             even_parities(modes, out);
             self.leak.apply_even(out, quarter);
@@ -542,7 +571,19 @@ impl Spectral {
         scratch: &mut SpectralScratch,
         out: &mut Lags,
     ) {
-        self.deconvolve(psf, stamp, scratch);
+        self.restore(&psf.restore, &psf.tilts, stamp, scratch);
+        self.take_lags(psf, noise, scratch, out);
+    }
+
+    // Writes the lags of v̂ and its changes in `scratch.windowed`, before the window, with noise of level `noise`.
+    fn take_lags(
+        &self,
+        psf: &SpectralPsf,
+        noise: f32,
+        scratch: &mut SpectralScratch,
+        out: &mut Lags,
+    ) {
+        self.apply_window(scratch);
         let SpectralScratch {
             windowed: [v, first, second],
             stamp,
@@ -563,13 +604,24 @@ impl Spectral {
         }
     }
 
-    // v̂ of a stamp and its changes with the components of shear, windowed, to `scratch.windowed`.
-    fn deconvolve(&self, psf: &SpectralPsf, stamp: &[f32], scratch: &mut SpectralScratch) {
+    fn apply_window(&self, scratch: &mut SpectralScratch) {
+        for spectrum in &mut scratch.windowed {
+            self.window.apply(spectrum, &mut scratch.quarter);
+        }
+    }
+
+    // v̂ of a stamp and its changes with the components of shear, before the window, to `scratch.windowed`.
+    fn restore(
+        &self,
+        amplitudes: &Modes,
+        tilts: &[Modes; 2],
+        stamp: &[f32],
+        scratch: &mut SpectralScratch,
+    ) {
         let SpectralScratch {
             of_stamp,
             changes: [moved, edges1, edges2],
             windowed,
-            quarter,
             centre,
             phases,
             edges,
@@ -598,35 +650,37 @@ impl Spectral {
         }
         let off_middle = centre != [0.0; 2];
         if off_middle {
-            moved.copy_from(&psf.restore);
+            moved.copy_from(amplitudes);
             multiply_modes(moved, phases);
         }
         let with = Restoration {
-            restore: if off_middle { moved } else { &psf.restore },
-            tilts: &psf.tilts,
+            restore: if off_middle { moved } else { amplitudes },
+            tilts,
             waves: &self.waves,
             centre,
             edges: at_edges.then_some([edges1, edges2]),
         };
         restore(windowed, &with);
-        for spectrum in windowed {
-            self.window.apply(spectrum, quarter);
-        }
     }
 
     // Whether a window at `centre` contains light at the edges.
     fn sees_edges(&self, centre: [f32; 2], pixels: PixelShape) -> bool {
-        let half = self.stamp_size() as f64 / 2.0;
-        let away = if pixels == PixelShape::SQUARE {
+        if pixels == PixelShape::SQUARE {
+            let half = self.stamp_size() as f64 / 2.0;
             let off = centre.into_iter().map(f32::abs).fold(0.0, f32::max);
-            (half - f64::from(off)) / self.window_sigma
-        } else {
-            // Distances from edges are those in pixels over the lengths of the gradients of x and y.
-            let PixelShape { stretch, skew } = pixels;
-            let [x, y] = pixels.pixel(centre.map(f64::from));
-            let (sides, levels) = ((1.0 / stretch).hypot(skew), stretch);
-            ((half - x.abs()) / sides).min((half - y.abs()) / levels) / self.window_sigma
-        };
+            let away = (half - f64::from(off)) / self.window_sigma;
+            return (-0.5 * away * away).exp() > LEAST_EDGE_WINDOW;
+        }
+        let PixelShape { stretch, skew } = pixels;
+        let gradients = [(1.0 / stretch).hypot(skew), stretch];
+        self.contains_light(pixels.pixel(centre.map(f64::from)), gradients)
+    }
+
+    // Whether a window at a place in pixels contains light at the edges. Distances from edges are those in pixels over the lengths
+    // of the gradients of x and y.
+    fn contains_light(&self, [x, y]: [f64; 2], [sides, levels]: [f64; 2]) -> bool {
+        let half = self.stamp_size() as f64 / 2.0;
+        let away = ((half - x.abs()) / sides).min((half - y.abs()) / levels) / self.window_sigma;
         (-0.5 * away * away).exp() > LEAST_EDGE_WINDOW
     }
 
@@ -918,7 +972,7 @@ impl Edges {
         changes: [&mut Modes; 2],
     ) {
         let (n, width) = (self.n, self.width);
-        let (middle, half) = ((n as f32 - 1.0) / 2.0, n as f64 / 2.0);
+        let half = n as f64 / 2.0;
         let PixelShape { stretch, skew } = pixels;
         let [x0, y0] = pixels.pixel(centre.map(f64::from)).map(|at| at as f32);
         let shears = [
@@ -935,29 +989,7 @@ impl Edges {
             waves,
             spectrum,
         } = scratch;
-        // Lines of a shear: left and right, lower and upper edge.
-        for (which, shear) in shears.iter().enumerate() {
-            let [[xx, xy], [yx, yy]] = shear.map(|row| row.map(|value| value as f32));
-            for at in 0..n {
-                let edge = |first: usize, step: usize| {
-                    let beyond = |a: usize, b: usize| 1.5 * stamp[a] - 0.5 * stamp[b];
-                    let last = first + (n - 1) * step;
-                    [beyond(first, first + step), beyond(last, last - step)]
-                };
-                let ([left, right], [lower, upper]) = (edge(at * n, 1), edge(at, n));
-                let (half, place) = (half as f32, at as f32 - middle);
-                // v·∇T: light moves in at the first edge, and out at the last.
-                let values = [
-                    left * (xx * (-half - x0) + xy * (place - y0)),
-                    -right * (xx * (half - x0) + xy * (place - y0)),
-                    lower * (yx * (place - x0) + yy * (-half - y0)),
-                    -upper * (yx * (place - x0) + yy * (half - y0)),
-                ];
-                for (line, value) in values.into_iter().enumerate() {
-                    lines[(4 * which + line) * n + at] = value;
-                }
-            }
-        }
+        edge_lines(stamp, n, shears, [x0, y0], lines);
         to_modes.transform_lines(lines, transform, [re, im]);
         edge_phases(plane, half * skew, waves);
         let edges = re.chunks_exact_mut(width).zip(im.chunks_exact_mut(width));
@@ -1062,6 +1094,40 @@ impl Edges {
                 let sides = sides.map(|[re, im]| [re[y], sign * im[y]]);
                 let [cos, sin] = &self.phase;
                 add_edges([re, im], sides, [cos, sin], levels, [cos[y], sign * sin[y]]);
+            }
+        }
+    }
+}
+
+// Writes I v·∇T of a stamp on its edges for two shears about (x0, y0), v = S (x − x0, y − y0) with a matrix S in pixels: for each
+// shear the left, right, lower and upper edge.
+fn edge_lines(
+    stamp: &[f32],
+    n: usize,
+    shears: [[[f64; 2]; 2]; 2],
+    [x0, y0]: [f32; 2],
+    lines: &mut [f32],
+) {
+    let (middle, half) = ((n as f32 - 1.0) / 2.0, n as f32 / 2.0);
+    for (which, shear) in shears.iter().enumerate() {
+        let [[xx, xy], [yx, yy]] = shear.map(|row| row.map(|value| value as f32));
+        for at in 0..n {
+            let edge = |first: usize, step: usize| {
+                let beyond = |a: usize, b: usize| 1.5 * stamp[a] - 0.5 * stamp[b];
+                let last = first + (n - 1) * step;
+                [beyond(first, first + step), beyond(last, last - step)]
+            };
+            let ([left, right], [lower, upper]) = (edge(at * n, 1), edge(at, n));
+            let place = at as f32 - middle;
+            // Light moves in at the first edge, and out at the last.
+            let values = [
+                left * (xx * (-half - x0) + xy * (place - y0)),
+                -right * (xx * (half - x0) + xy * (place - y0)),
+                lower * (yx * (place - x0) + yy * (-half - y0)),
+                -upper * (yx * (place - x0) + yy * (half - y0)),
+            ];
+            for (line, value) in values.into_iter().enumerate() {
+                lines[(4 * which + line) * n + at] = value;
             }
         }
     }

@@ -26,14 +26,16 @@ use shearq_submissions::limits::{MAX_TARGET, MIN_TARGET, WINDOWS};
 use shearq_submissions::{LinearDeconvolution, LinearMethod, Neighbours, PsfCut};
 
 use super::{
-    AdaptedSettings, CutWorker, Found, FoundObservables, Images, NoiseMoments, image, whole_lags,
+    AdaptedSettings, CutEpoch, CutWorker, Found, FoundObservables, Images, NoiseMoments, image,
+    whole_lags,
 };
 use crate::centroid::{galaxy_centroid, window_centre};
 use crate::deconvolve::{
-    Lags, ModeNoise, Products, Spectral, SpectralPsf, SpectralScratch, uniform,
+    EpochScratch, Lags, ModeNoise, Products, Spectral, SpectralEpoch, SpectralPsf, SpectralScratch,
+    uniform,
 };
 use crate::error::MeasureError;
-use crate::measurement::{Descent, ResponseMatrix, Stop};
+use crate::measurement::{Descent, Flag, ResponseMatrix, Stop};
 use crate::neighbours::NeighbourRemover;
 use crate::noise::StampNoise;
 use crate::pixel::hash;
@@ -243,6 +245,17 @@ impl LinearFamily {
         Ok(Arc::clone(place.get_or_init(|| Arc::new(plan))))
     }
 
+    fn check_side(&self, psf: ArrayView2<'_, f64>) -> Result<(), MeasureError> {
+        let PsfCut { size, least, .. } = self.cut;
+        let side = psf.nrows();
+        if !(least..=size).contains(&side) || side % 2 != size % 2 {
+            let parity = if size % 2 == 0 { "an even" } else { "an odd" };
+            let expected = format!("{parity} number a side, {least} to {size}");
+            return Err(MeasureError::square("a PSF stamp", psf.dim(), expected));
+        }
+        Ok(())
+    }
+
     /// A worker for one thread.
     pub(super) fn worker(self: &Arc<Self>) -> LinearWorker {
         LinearWorker {
@@ -251,6 +264,7 @@ impl LinearFamily {
             galaxy_variance: None,
             moments: WeightedMoments::default(),
             denoiser: StarDenoiser::default(),
+            epoch_weights: Vec::new(),
             noise: StampNoise::white(1.0),
             pixels: PixelShape::SQUARE,
             gain: None,
@@ -271,6 +285,8 @@ pub(super) struct LinearWorker {
     galaxy_variance: Option<f64>,
     moments: WeightedMoments,
     denoiser: StarDenoiser,
+    /// Of the epochs of a galaxy; their sum is one.
+    epoch_weights: Vec<f32>,
 }
 
 impl CutWorker for LinearWorker {
@@ -300,27 +316,13 @@ impl CutWorker for LinearWorker {
     }
 
     fn set_psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<(), MeasureError> {
-        let PsfCut { size, least, .. } = self.family.cut;
-        let side = psf.nrows();
-        if !(least..=size).contains(&side) || side % 2 != size % 2 {
-            let parity = if size % 2 == 0 { "an even" } else { "an odd" };
-            let expected = format!("{parity} number a side, {least} to {size}");
-            return Err(MeasureError::square("a PSF stamp", psf.dim(), expected));
-        }
+        self.family.check_side(psf)?;
         let psf = self.denoiser.denoised(psf);
         let settings = &self.family.method.deconvolution;
         let (reference, variance) = (settings.reference_extent, self.galaxy_variance);
         let window = window_index(variance, psf, reference, &mut self.moments);
         let index = (width::step(psf, settings.reference_area), window);
-        let known = self.workers.iter().position(|(of, _)| *of == index);
-        self.current = if let Some(known) = known {
-            known
-        } else {
-            let mut worker = PlanWorker::new(self.family.plan(index)?);
-            worker.set_noise(&self.noise, PixelShape::SQUARE);
-            self.workers.push((index, worker));
-            self.workers.len() - 1
-        };
+        self.current = place_of(index, &mut self.workers, &self.family, &self.noise)?;
         let worker = &mut self.workers[self.current].1;
         worker.set_pixel_shape(self.pixels, &self.noise);
         worker.set_psf(psf)
@@ -341,9 +343,108 @@ impl CutWorker for LinearWorker {
             .then(|| self.workers[self.current].1.measure(cut, noise, self.gain)))
     }
 
+    // The plan follows the PSFs, not the galaxy: it is that of a PSF whose Σp² is the weighted mean of theirs.
+    fn measure_epochs<'a>(
+        &mut self,
+        count: usize,
+        epoch: &dyn Fn(usize) -> CutEpoch<'a>,
+    ) -> Result<(Found, f64), MeasureError> {
+        let precision = |of: &CutEpoch<'_>| of.pixels.area() / (of.noise * of.noise);
+        let total: f64 = (0..count).map(|k| precision(&epoch(k))).sum();
+        self.epoch_weights.clear();
+        let mut squares = 0.0;
+        for k in 0..count {
+            let epoch = epoch(k);
+            self.family.check_side(epoch.psf)?;
+            let weight = precision(&epoch) / total;
+            let area = width::noise_equivalent_area(self.denoiser.denoised(epoch.psf));
+            squares += weight / (area * epoch.pixels.area());
+            self.epoch_weights.push(weight as f32);
+        }
+        let reference = self.family.method.deconvolution.reference_area;
+        let index = (
+            width::step_of_area(1.0 / squares, reference),
+            CONFIGURED_WINDOW,
+        );
+        self.current = place_of(index, &mut self.workers, &self.family, &self.noise)?;
+        let worker = &mut self.workers[self.current].1;
+        let level = total.sqrt().recip();
+        let found = worker.measure_epochs(&self.epoch_weights, level, epoch, &mut self.denoiser)?;
+        Ok((found, level))
+    }
+
     fn images(&mut self, cut: &[f32], psf: ArrayView2<'_, f64>) -> Images {
         self.workers[self.current].1.images(cut, psf)
     }
+}
+
+/// Place of the worker for a plan, which is made if it is new.
+fn place_of(
+    index: PlanIndex,
+    workers: &mut Vec<(PlanIndex, PlanWorker)>,
+    family: &LinearFamily,
+    noise: &StampNoise,
+) -> Result<usize, MeasureError> {
+    if let Some(known) = workers.iter().position(|(of, _)| *of == index) {
+        return Ok(known);
+    }
+    let mut worker = PlanWorker::new(family.plan(index)?);
+    worker.set_noise(noise, PixelShape::SQUARE);
+    workers.push((index, worker));
+    Ok(workers.len() - 1)
+}
+
+/// Buffers of one thread for several stamps of a galaxy.
+struct EpochBuffers {
+    psfs: Vec<SpectralEpoch>,
+    scratch: EpochScratch,
+    /// The mean stamp on the pixels of the first epoch, and then the light of neighbours on it.
+    mean: Vec<f32>,
+    neighbours: Vec<f32>,
+    /// Stamps without neighbours.
+    cleaned: Vec<f32>,
+}
+
+impl EpochBuffers {
+    fn new(spectral: &Spectral) -> Self {
+        let stamp = || vec![0.0; spectral.stamp_size().pow(2)];
+        EpochBuffers {
+            psfs: Vec::new(),
+            scratch: spectral.epoch_scratch(),
+            mean: stamp(),
+            neighbours: stamp(),
+            cleaned: Vec::new(),
+        }
+    }
+}
+
+/// The value at a place (x, y) from the middle of a stamp, between pixels along straight lines; zero beyond the stamp.
+fn value_at(stamp: &[f32], n: usize, place: [f64; 2]) -> f32 {
+    let [x, y] = place.map(|at| at + (n as f64 - 1.0) / 2.0);
+    let (first_x, first_y) = (x.floor(), y.floor());
+    let (share_x, share_y) = ((x - first_x) as f32, (y - first_y) as f32);
+    let pixel = |x: f64, y: f64| {
+        let inside = |at: f64| (0.0..n as f64).contains(&at);
+        if inside(x) && inside(y) {
+            stamp[y as usize * n + x as usize]
+        } else {
+            0.0
+        }
+    };
+    let row = |y: f64| {
+        let next = if share_x > 0.0 {
+            share_x * pixel(first_x + 1.0, y)
+        } else {
+            0.0
+        };
+        (1.0 - share_x) * pixel(first_x, y) + next
+    };
+    let next = if share_y > 0.0 {
+        share_y * row(first_y + 1.0)
+    } else {
+        0.0
+    };
+    (1.0 - share_y) * row(first_y) + next
 }
 
 /// Buffers of one thread for one plan.
@@ -371,6 +472,8 @@ struct PlanWorker {
     /// The shape last measured on `lags`.
     shape: Option<AdaptiveShape>,
     values: AdaptiveScratch,
+    /// For galaxies with several stamps.
+    epochs: Option<Box<EpochBuffers>>,
 }
 
 impl PlanWorker {
@@ -391,6 +494,7 @@ impl PlanWorker {
             lags: plan.spectral.lags(),
             shape: None,
             values: plan.moments.scratch(),
+            epochs: None,
             plan,
         }
     }
@@ -566,6 +670,120 @@ impl PlanWorker {
             plan.spectral
                 .autocorrelate(&self.psf, cut, sigma, &mut self.buffers, &mut self.lags);
         }
+        self.measure_lags(stamp, (noise, sigma), cleared)
+    }
+
+    /// Measures a galaxy on the stamps of epochs with these weights, in combined noise of level `noise`.
+    ///
+    /// Centroid and neighbours are found on the weighted mean of the stamps, interpolated to the pixels of the first one: a
+    /// neighbour of the S/N of a galaxy is below the noise of one epoch of many. The shape does not depend on the interpolation but
+    /// through the light of neighbours, 16 px away or more, that is subtracted from each stamp.
+    fn measure_epochs<'a>(
+        &mut self,
+        weights: &[f32],
+        noise: f64,
+        epoch: &dyn Fn(usize) -> CutEpoch<'a>,
+        denoiser: &mut StarDenoiser,
+    ) -> Result<Found, MeasureError> {
+        let plan = Arc::clone(&self.plan);
+        let (spectral, sigma) = (&plan.spectral, noise as f32);
+        let new = || Box::new(EpochBuffers::new(spectral));
+        let mut epochs = self.epochs.take().unwrap_or_else(new);
+        let EpochBuffers {
+            psfs,
+            scratch,
+            mean,
+            neighbours: light,
+            cleaned,
+        } = &mut *epochs;
+        for k in 0..weights.len() {
+            let CutEpoch { psf, pixels, .. } = epoch(k);
+            if psfs.len() <= k {
+                psfs.push(spectral.epoch());
+            }
+            let psf = denoiser.denoised(psf);
+            spectral.set_epoch_psf(psf, pixels, &mut self.buffers, scratch, &mut psfs[k])?;
+        }
+        let psfs = &mut psfs[..weights.len()];
+        spectral.combine(psfs, weights, &mut self.buffers, &mut self.psf);
+        self.regularisation = plan.regularisation.behind(&self.psf);
+        let n = spectral.stamp_size();
+        let middle = (n as f64 - 1.0) / 2.0;
+        let pixels = epoch(0).pixels;
+        let offset_of = |at: usize| [at % n, at / n].map(|at| at as f64 - middle);
+        mean.fill(0.0);
+        for (k, weight) in weights.iter().enumerate() {
+            let epoch = epoch(k);
+            // A pixel of another area has another share of the light.
+            let weight = weight / epoch.pixels.area() as f32;
+            let same = epoch.pixels == pixels && epoch.offset == [0.0; 2];
+            for (at, mean) in mean.iter_mut().enumerate() {
+                *mean += weight
+                    * if same {
+                        epoch.cut[at]
+                    } else {
+                        let [x, y] = epoch.pixels.pixel(pixels.map(offset_of(at)));
+                        value_at(epoch.cut, n, [x + epoch.offset[0], y + epoch.offset[1]])
+                    };
+            }
+        }
+        let place = galaxy_centroid(mean, n);
+        let mut cleared = Ok(false);
+        if let Some(remover) = &mut self.neighbours {
+            cleared = remover.remove(mean, place, sigma);
+            if cleared == Ok(true) {
+                for ((light, mean), left) in light.iter_mut().zip(&*mean).zip(&remover.cleaned) {
+                    *light = mean - left;
+                }
+                cleaned.resize(cleaned.len().max(weights.len() * n * n), 0.0);
+                for (k, cleaned) in cleaned
+                    .chunks_exact_mut(n * n)
+                    .take(weights.len())
+                    .enumerate()
+                {
+                    let epoch = epoch(k);
+                    let area = epoch.pixels.area() as f32;
+                    for (at, (cleaned, value)) in cleaned.iter_mut().zip(epoch.cut).enumerate() {
+                        let [x, y] = offset_of(at);
+                        let place = [x - epoch.offset[0], y - epoch.offset[1]];
+                        let place = pixels.pixel(epoch.pixels.map(place));
+                        *cleaned = value - area * value_at(light, n, place);
+                    }
+                }
+            }
+        }
+        let centre = window_centre(pixels.map(place.map(f64::from)).map(|at| at as f32));
+        let stamp = |k: usize| {
+            let CutEpoch { cut, offset, .. } = epoch(k);
+            let cut = if cleared == Ok(true) {
+                &cleaned[k * n * n..][..n * n]
+            } else {
+                cut
+            };
+            (cut, offset)
+        };
+        spectral.autocorrelate_epochs(
+            &self.psf,
+            psfs,
+            stamp,
+            (centre, sigma),
+            (&mut self.buffers, scratch),
+            &mut self.lags,
+        );
+        let found = self.measure_lags(mean, (noise, sigma), cleared);
+        self.epochs = Some(epochs);
+        Ok(found)
+    }
+
+    /// Measures `lags` of a galaxy in noise of the sky of level `noise`, and with the galaxy's own of level `sigma`. `stamp`
+    /// decides for which galaxies the effects of noise are determined.
+    fn measure_lags(
+        &mut self,
+        stamp: &[f32],
+        (noise, sigma): (f64, f32),
+        cleared: Result<bool, Flag>,
+    ) -> Found {
+        let plan = Arc::clone(&self.plan);
         let lags = &self.lags;
         let divisor = self.regularisation[0] * sigma * sigma;
         let shape =

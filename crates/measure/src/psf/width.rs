@@ -20,7 +20,7 @@ const MIN_BORDERED_SIDE: usize = 12;
 ///
 /// The noise is the mean square of the border, with the light of the wings. Fourth differences, which the denoising of
 /// stars uses, would leave this light in: other areas, and other steps of width near their bounds.
-pub(super) fn noise_equivalent_area(psf: ArrayView2<'_, f64>) -> f64 {
+pub(crate) fn noise_equivalent_area(psf: ArrayView2<'_, f64>) -> f64 {
     let mut sum = sum_of_squares(psf);
     let n = psf.nrows();
     if n >= MIN_BORDERED_SIDE {
@@ -39,7 +39,15 @@ pub(crate) fn step(psf: ArrayView2<'_, f64>, reference: f64) -> i32 {
     if reference == 0.0 {
         return 0;
     }
-    let steps = STEPS_PER_DOUBLING * 0.5 * (noise_equivalent_area(psf) / reference).log2();
+    step_of_area(noise_equivalent_area(psf), reference)
+}
+
+/// The same for a noise-equivalent area in px².
+pub(crate) fn step_of_area(area: f64, reference: f64) -> i32 {
+    if reference == 0.0 {
+        return 0;
+    }
+    let steps = STEPS_PER_DOUBLING * 0.5 * (area / reference).log2();
     let whole = if steps < 0.0 {
         (steps + 1.0).ceil().min(0.0)
     } else {

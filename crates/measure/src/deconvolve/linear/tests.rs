@@ -582,7 +582,8 @@ fn products_of_noise_on_the_stamp(
         } else {
             noise(n, rng)
         };
-        plan.deconvolve(&own, &stamp, &mut scratch);
+        plan.restore(&own.restore, &own.tilts, &stamp, &mut scratch);
+        plan.apply_window(&mut scratch);
         let changes = [0, 1, 2].map(|which| {
             take_change(&plan, which, &mut scratch, &mut lags.acf);
             [0, 1].map(|k| over_lags(&plan, &weights[k], &lags.acf))
