@@ -99,7 +99,7 @@ pub(super) fn measure(
     let work = FolderMeasurement::open(run, data, out, images)?;
     let mut bar = Bar::new("measuring", work.galaxies());
     let start = Instant::now();
-    let summary = work.measure(threads, &mut bar)?;
+    let summary = work.write_catalogues(threads, &mut bar)?;
     drop(bar);
     report(run, &summary, start.elapsed(), threads, out)
 }

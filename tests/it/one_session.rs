@@ -80,7 +80,7 @@ impl Data {
         let mut image = Arc::clone(&session).begin().unwrap();
         for row in 0..session.rows().len() {
             let row = session.read(&mut source, row).unwrap();
-            image.add(row.measure(&mut worker).unwrap());
+            image.add(row.measure_row(&mut worker).unwrap());
         }
         Ok(image.finish())
     }

@@ -310,7 +310,7 @@ impl Worker {
     }
 
     /// Measures a galaxy in noise of `level`, without calibration. Without a usable PSF it is flagged.
-    fn measure<T: Pixel>(
+    fn measure_stamp<T: Pixel>(
         &mut self,
         stamp: ArrayView2<'_, T>,
         level: f64,
@@ -320,7 +320,7 @@ impl Worker {
             Ok(noise) => noise,
             Err(flagged) => return Ok(flagged),
         };
-        let Some(mut found) = self.method.measure(&self.cut, noise)? else {
+        let Some(mut found) = self.method.measure_cut(&self.cut, noise)? else {
             return Ok(Measurement {
                 noise,
                 ..Measurement::flagged(Flag::NoScale)
@@ -562,7 +562,7 @@ impl ImageWorker<'_> {
         if epochs.len() == 1 && one.offset == [0.0; 2] {
             self.set_jacobian(one.jacobian.as_ref())?;
             self.worker.method.set_psf(one.psf)?;
-            return self.worker.measure(one.stamp, one.noise, true);
+            return self.worker.measure_stamp(one.stamp, one.noise, true);
         }
         self.worker.measure_epochs(epochs)
     }
@@ -577,11 +577,11 @@ impl ImageWorker<'_> {
         stamps: ArrayView3<'_, T>,
         psfs: &Psfs<'_>,
     ) -> Result<Vec<Measurement>, MeasureError> {
-        self.measure_in_noise(stamps, psfs, None, None)
+        self.measure_stamps(stamps, psfs, None, None)
     }
 
     /// The same for white noise with one level per stamp, and with one Jacobian per stamp, if there are any.
-    pub(crate) fn measure_in_noise<T: Pixel>(
+    pub(crate) fn measure_stamps<T: Pixel>(
         &mut self,
         stamps: ArrayView3<'_, T>,
         psfs: &Psfs<'_>,
@@ -606,7 +606,7 @@ impl ImageWorker<'_> {
         let stamps = stamps.outer_iter().enumerate();
         let measured = stamps.map(|(k, stamp)| {
             let jacobian = jacobians.map(|each| &each[k]);
-            // Of a PSF for all galaxies, the transform depends on the Jacobian.
+            // The transform of a shared PSF holds for one Jacobian; in most images all galaxies have the same.
             let new = last != Some(jacobian);
             if new {
                 self.set_jacobian(jacobian)?;
@@ -628,7 +628,7 @@ impl ImageWorker<'_> {
                 }
             };
             let level = levels.map_or(self.level, |levels| levels[k]);
-            self.worker.measure(stamp, level, usable_psf)
+            self.worker.measure_stamp(stamp, level, usable_psf)
         });
         measured.collect()
     }
@@ -654,7 +654,7 @@ impl PsfWorker<'_> {
         &mut self,
         stamp: ArrayView2<'_, T>,
     ) -> Result<Measurement, MeasureError> {
-        self.worker.measure(stamp, self.level, true)
+        self.worker.measure_stamp(stamp, self.level, true)
     }
 
     /// Measures a galaxy behind `psf`, the PSF of this worker, with the steps of the method unless it did not run.

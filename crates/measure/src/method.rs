@@ -80,7 +80,7 @@ pub(crate) trait CutWorker: Send {
     }
 
     /// Measures a cut stamp of noise level `noise`. `None` if there is no unit of brightness.
-    fn measure(&mut self, cut: &[f32], noise: f64) -> Result<Option<Found>, MeasureError>;
+    fn measure_cut(&mut self, cut: &[f32], noise: f64) -> Result<Option<Found>, MeasureError>;
 
     /// Measures a galaxy on the cut stamps of so many epochs, which are combined before the shape is. Returns what was found
     /// with the level of the combined noise, for a pixel of the first epoch. PSFs that were set are lost.

@@ -527,7 +527,7 @@ impl<'n> Session<'n> {
     ///
     /// # Errors
     /// If sizes or the frame do not fit, pixels are sheared too much, or a PSF for all galaxies cannot be used.
-    pub fn measure(
+    pub fn measure_row(
         &self,
         worker: &mut Worker,
         row: usize,
@@ -536,8 +536,12 @@ impl<'n> Session<'n> {
         jacobians: Option<&[Jacobian]>,
     ) -> Result<MeasuredRow, MeasureError> {
         match stamps {
-            Pixels::Single(stamps) => self.measure_row(worker, row, stamps.view(), psfs, jacobians),
-            Pixels::Double(stamps) => self.measure_row(worker, row, stamps.view(), psfs, jacobians),
+            Pixels::Single(stamps) => {
+                self.measure_row_of(worker, row, stamps.view(), psfs, jacobians)
+            }
+            Pixels::Double(stamps) => {
+                self.measure_row_of(worker, row, stamps.view(), psfs, jacobians)
+            }
         }
     }
 
@@ -570,7 +574,7 @@ impl<'n> Session<'n> {
         })
     }
 
-    fn measure_row<T: Pixel>(
+    fn measure_row_of<T: Pixel>(
         &self,
         worker: &mut Worker,
         row: usize,
@@ -595,7 +599,7 @@ impl<'n> Session<'n> {
             KnownNoise::Unknown | KnownNoise::Stated(_) | KnownNoise::Given(_) => None,
         };
         let mut image = self.image(worker);
-        let galaxies = image.measure_in_noise(stamps, psfs, levels, jacobians)?;
+        let galaxies = image.measure_stamps(stamps, psfs, levels, jacobians)?;
         let examined = match self.examined.contains(&row) {
             true => Some(self.examine(row, stamps, psfs)?),
             false => None,
@@ -668,14 +672,14 @@ impl<'n> Session<'n> {
 }
 
 impl<'n> RowJob<'n> {
-    /// Measures the row.
+    /// The galaxies of the row before calibration.
     ///
     /// # Errors
-    /// As [`Session::measure`].
-    pub fn measure(&self, worker: &mut Worker) -> Result<MeasuredRow, MeasureError> {
+    /// As [`Session::measure_row`].
+    pub fn measure_row(&self, worker: &mut Worker) -> Result<MeasuredRow, MeasureError> {
         let jacobians = self.jacobians.as_deref();
         self.session
-            .measure(worker, self.row, &self.stamps, &self.psfs, jacobians)
+            .measure_row(worker, self.row, &self.stamps, &self.psfs, jacobians)
     }
 
     /// The image of the row.
@@ -910,7 +914,7 @@ impl Measurer {
         let mut image = Arc::clone(&session).begin()?;
         let mut worker = self.worker();
         for row in 0..session.rows().len() {
-            image.add(session.read(&mut source, row)?.measure(&mut worker)?);
+            image.add(session.read(&mut source, row)?.measure_row(&mut worker)?);
         }
         image.finish().checked()
     }

@@ -63,7 +63,7 @@ fn measured(
     let mut worker = measurer.worker();
     for row in 0..session.rows().len() {
         let row = session.read(&mut source, row).unwrap();
-        image.add(row.measure(&mut worker).unwrap());
+        image.add(row.measure_row(&mut worker).unwrap());
     }
     assert!(image.is_complete());
     image.finish()

@@ -151,7 +151,7 @@ fn batch(measurer: &Measurer, jacobians: Option<Vec<Jacobian>>) -> Result<Batch,
     let mut image = Arc::clone(&session).begin()?;
     let mut worker = measurer.worker();
     for row in 0..session.rows().len() {
-        image.add(session.read(&mut source, row)?.measure(&mut worker)?);
+        image.add(session.read(&mut source, row)?.measure_row(&mut worker)?);
     }
     Ok(image.finish())
 }

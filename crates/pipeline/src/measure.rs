@@ -75,7 +75,7 @@ pub fn measure_images<'n, H: Send + Sync>(
         |workers, row: ImageRow<'n, H>| {
             let jobs = row.jobs.iter().zip(workers);
             let rows = jobs.map(|(job, worker)| {
-                let measured = job.measure(worker)?;
+                let measured = job.measure_row(worker)?;
                 Ok((Arc::clone(job.session()), measured))
             });
             Ok((row.head, rows.collect::<Result<Vec<_>, PipelineError>>()?))
@@ -106,13 +106,13 @@ pub struct FolderMeasurement<'a> {
     data: &'a DataFolder,
     out: &'a Path,
     images: &'a [ImageId],
-    /// Number of images to measure, and the stamps of the first of them.
+    // Number of images without a catalogue, and the stamps of the first one.
     todo: Option<(usize, Mosaic)>,
 }
 
 impl<'a> FolderMeasurement<'a> {
     /// Plans the measurement of `images` of the run's data into catalogues in `out`. Catalogues of the same settings
-    /// that are there already are kept. Only [`FolderMeasurement::measure`] writes.
+    /// that are there already are kept. Only [`FolderMeasurement::write_catalogues`] writes.
     pub fn open(
         run: &'a Run,
         data: &'a DataFolder,
@@ -140,8 +140,8 @@ impl<'a> FolderMeasurement<'a> {
             .map_or(0, |(images, mosaic)| (images * mosaic.galaxies) as u64)
     }
 
-    /// Measures the images and writes their catalogues.
-    pub fn measure(
+    /// Measures the images that have no catalogue yet.
+    pub fn write_catalogues(
         self,
         threads: usize,
         progress: &mut dyn Progress,
@@ -230,5 +230,5 @@ pub fn measure_folder(
     threads: usize,
     progress: &mut dyn Progress,
 ) -> Result<Summary, PipelineError> {
-    FolderMeasurement::open(run, data, out, images)?.measure(threads, progress)
+    FolderMeasurement::open(run, data, out, images)?.write_catalogues(threads, progress)
 }

@@ -32,7 +32,7 @@ pub struct SimulatedSource<'s> {
     fields: Arc<ImageFields>,
     form: PsfForm,
     shared: Option<ArcArray2<f64>>,
-    // Rows that are measured by several measurers, or were drawn for a survey and will be measured.
+    // Kept until they are measured, so that several measurers and the survey draw a row once.
     drawn: Arc<Mutex<BTreeMap<usize, LazyStamps<'s>>>>,
 }
 
@@ -65,7 +65,6 @@ impl<'s> SimulatedSource<'s> {
         })
     }
 
-    // The PSFs of a row in the form that the configuration uses.
     fn row_psfs(&self, row: usize) -> Lazy<'s, Psfs<'s>> {
         if let Some(psf) = &self.shared {
             return Psfs::Prepared(psf.clone()).into();
@@ -138,7 +137,7 @@ impl<'s> SimulatedSessions<'s> {
         let sessions = measurers.iter().map(|measurer| {
             let configuration = measurer.configuration();
             let mut source = SimulatedSource::new(set, &fields, configuration, &drawn)?;
-            // What the header of a stored image states, so that catalogues are equal to those of `measure`.
+            // As the header of a stored image states it: catalogues are then equal to those of `simulate` and `measure`.
             let noise = KnownNoise::Stated(NOISE_SIGMA);
             let session = Session::open(measurer, &mut source, noise, threads)?;
             Ok((Arc::new(session), source))
@@ -149,7 +148,6 @@ impl<'s> SimulatedSessions<'s> {
         })
     }
 
-    // Reads a row for all measurers, which is drawn once.
     fn read(&mut self, row: usize) -> Result<ImageRow<'s, ImageFields>, PipelineError> {
         let each = self.sessions.iter_mut();
         let jobs = each.map(|(session, source)| session.read(source, row));
@@ -176,7 +174,9 @@ impl<'s> SimulatedSessions<'s> {
         let each = self.sessions.iter().zip(workers);
         let measured = each.map(|((session, source), worker)| {
             let psfs = source.row_psfs(row);
-            Ok(session.measure(worker, row, &stamps, &psfs, None)?.galaxies)
+            Ok(session
+                .measure_row(worker, row, &stamps, &psfs, None)?
+                .galaxies)
         });
         measured.collect()
     }

@@ -83,8 +83,8 @@ const WINDOW_COUNT: usize = CONFIGURED_WINDOW + 1 + WINDOW_STEPS.end().unsigned_
 /// S/N 20, and 0.8 % for large galaxies. The galaxy is taken as deconvolved to the target, which is not exact for few
 /// iterations or λ > 0.
 struct Regularisation {
-    /// Divisor of the moments at half of the response, for such a galaxy of flux one, times ν₀².
-    moments: f32,
+    /// What halves the ellipticity of such a galaxy of flux one, times ν₀² (`shape.half_snr`).
+    ellipticity: f32,
     /// P₀ of [`SizeMoments`] for such a galaxy of flux one, times the square of [`HALF_SIZE_SNR`].
     size: f32,
     /// Power of such a galaxy in each mode, as `Spectral::light` returns it.
@@ -120,18 +120,19 @@ impl Regularisation {
             .collect();
         let [zero, two] = breadth.sums(&acf);
         Regularisation {
-            moments: moments.halving(&acf) * method.shape.half_snr.powi(2) as f32,
+            ellipticity: moments.halving_regularisation(&acf)
+                * method.shape.half_snr.powi(2) as f32,
             size: zero * HALF_SIZE_SNR * HALF_SIZE_SNR,
             galaxy: spectral.light(variance),
             typical_square: two / zero,
         }
     }
 
-    /// The terms for moments and size behind `psf` in noise of level one; not finite if the PSF passes no light.
+    /// What is added for the ellipticity and for the size behind `psf` in noise of level one; not finite if the PSF passes no light.
     fn behind(&self, psf: &SpectralPsf) -> [f32; 2] {
         let modes = self.galaxy.iter().zip(psf.clarity());
         let snr_squared = modes.map(|(light, clarity)| light * clarity).sum::<f32>();
-        [self.moments / snr_squared, self.size / snr_squared]
+        [self.ellipticity, self.size].map(|term| term / snr_squared)
     }
 }
 
@@ -338,9 +339,12 @@ impl CutWorker for LinearWorker {
         Some(self.workers[self.current].1.plan.lengths)
     }
 
-    fn measure(&mut self, cut: &[f32], noise: f64) -> Result<Option<Found>, MeasureError> {
-        Ok((noise >= 0.0 && noise.is_finite())
-            .then(|| self.workers[self.current].1.measure(cut, noise, self.gain)))
+    fn measure_cut(&mut self, cut: &[f32], noise: f64) -> Result<Option<Found>, MeasureError> {
+        Ok((noise >= 0.0 && noise.is_finite()).then(|| {
+            self.workers[self.current]
+                .1
+                .measure_shape(cut, noise, self.gain)
+        }))
     }
 
     // The plan follows the PSFs, not the galaxy: it is that of a PSF whose Σp² is the weighted mean of theirs.
@@ -633,9 +637,9 @@ impl PlanWorker {
     fn own_variance(&self, noise: f32) -> f64 {
         let plan = &*self.plan;
         let (lags, target) = (&self.lags, plan.lengths.target_sigma);
-        let [_, floor] = self.regularisation.map(|term| term * noise * noise);
+        let [_, of_size] = self.regularisation.map(|term| term * noise * noise);
         let typical = plan.regularisation.typical_square;
-        let breadth = plan.breadth.measure(&lags.acf, floor, typical);
+        let breadth = plan.breadth.measure(&lags.acf, of_size, typical);
         let [size, ..] = plan.breadth.size(f64::from(breadth.square));
         let window = plan.lengths.window_sigma * plan.lengths.window_sigma;
         let of_galaxy = size * size;
@@ -644,7 +648,7 @@ impl PlanWorker {
         under.max(0.0) / (std::f64::consts::PI * window)
     }
 
-    fn measure(&mut self, stamp: &[f32], noise: f64, gain: Option<f64>) -> Found {
+    fn measure_shape(&mut self, stamp: &[f32], noise: f64, gain: Option<f64>) -> Found {
         let plan = Arc::clone(&self.plan);
         let mut sigma = noise as f32;
         let place = galaxy_centroid(stamp, plan.spectral.stamp_size());
@@ -785,9 +789,11 @@ impl PlanWorker {
     ) -> Found {
         let plan = Arc::clone(&self.plan);
         let lags = &self.lags;
-        let divisor = self.regularisation[0] * sigma * sigma;
-        let shape =
-            cleared.and_then(|_| plan.moments.measure(&lags.acf, divisor, &mut self.values));
+        let [of_ellipticity, of_size] = self.regularisation.map(|term| term * sigma * sigma);
+        let shape = cleared.and_then(|_| {
+            plan.moments
+                .measure(&lags.acf, of_ellipticity, &mut self.values)
+        });
         self.shape = shape.as_ref().ok().copied();
         let mut found = Found {
             descent: Descent {
@@ -809,9 +815,8 @@ impl PlanWorker {
             let response = Self::response(&plan, &shape, &self.lags, &mut self.values);
             found.response = Some(response);
             let seed = seed_of(stamp, sigma);
-            let floor = self.regularisation[1] * sigma * sigma;
             let typical = plan.regularisation.typical_square;
-            let breadth = plan.breadth.measure(&self.lags.acf, floor, typical);
+            let breadth = plan.breadth.measure(&self.lags.acf, of_size, typical);
             if noise > 0.0 && seed.is_multiple_of(plan.noise_moments_interval) {
                 found.noise_moments = Some(self.noise_moments(&shape, &breadth, sigma));
             }

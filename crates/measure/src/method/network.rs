@@ -58,7 +58,7 @@ impl CutWorker for NetworkWorker {
         Ok(())
     }
 
-    fn measure(&mut self, cut: &[f32], noise: f64) -> Result<Option<Found>, MeasureError> {
+    fn measure_cut(&mut self, cut: &[f32], noise: f64) -> Result<Option<Found>, MeasureError> {
         let plan = &*self.plan;
         let peak = cut.iter().copied().fold(0.0f32, f32::max);
         let Some(rule) = Rule::new(&plan.settings, f64::from(peak), noise) else {

@@ -230,7 +230,7 @@ impl AdaptiveMoments {
     ///
     /// The weight follows the galaxy: with m = aχ′ + bχ the moments of a galaxy of distortion χ′ under a weight of χ,
     /// χ = aχ′/(1 − b) is aχ′T/((1 − b)T + s) after regularisation by s.
-    pub fn halving(&self, acf: &[f32]) -> f32 {
+    pub fn halving_regularisation(&self, acf: &[f32]) -> f32 {
         let mut scratch = self.scratch();
         self.gather(acf, &mut scratch.values);
         let sums = self.sums(&mut scratch, [0.0; 2]);
@@ -613,7 +613,7 @@ mod tests {
         let moments = moments(1.5);
         let mut scratch = moments.scratch();
         for variance in [9.0, 16.0, 30.0] {
-            let halving = moments.halving(&gaussian(1.0, variance, 0.0, 0.0));
+            let halving = moments.halving_regularisation(&gaussian(1.0, variance, 0.0, 0.0));
             for (e1, e2, tolerance) in [(0.01, 0.0, 1e-3), (0.0, 0.01, 0.02)] {
                 let acf = gaussian(1.0, variance, e1, e2);
                 let [hard, soft] = [0.0, halving].map(|regularisation| {

@@ -835,7 +835,7 @@ fn mean_second_derivatives_are_sums_of_differences_over_modes() {
         let mut lags = plan.lags();
         plan.autocorrelate(&own, &stamp, level, &mut scratch, &mut lags);
         let mut values = moments.scratch();
-        let regularisation = share * moments.halving(&lags.acf);
+        let regularisation = share * moments.halving_regularisation(&lags.acf);
         let acf = lags.acf.clone();
         let shape = moments.measure(&acf, regularisation, &mut values).unwrap();
         let floor = share * sizes.sums(&acf)[0];
