@@ -35,7 +35,7 @@ pub mod limits {
 }
 use limits::{MAX_CUT, MAX_PSF, MAX_ROUGHNESS, MAX_TARGET, MIN_PSF, MIN_TARGET, WINDOWS};
 
-/// The fault of `key` unless its value is `good`. Comparisons are false for NaN, so that it is never good.
+// Callers write the condition for good values, not for bad ones: comparisons with NaN are false, so NaN is refused.
 fn require(
     good: bool,
     key: &'static str,
@@ -45,7 +45,7 @@ fn require(
     if good {
         return Ok(());
     }
-    // As a settings file has it.
+    // In TOML, so that the message shows the value as the user wrote it.
     let found = toml::Value::try_from(found).map_or_else(|e| e.to_string(), |v| v.to_string());
     Err(OutOfRange {
         key,
@@ -64,7 +64,8 @@ fn within<T: PartialOrd + Display + Serialize>(
     require(range.contains(&found), key, found, expected)
 }
 
-// Zero turns these settings off.
+// Zero turns these settings off, not an absent key: a configuration states every setting of its method, so that an absent key
+// is an error.
 fn zero_or_within(
     key: &'static str,
     found: f64,
@@ -192,7 +193,6 @@ impl Wavelet {
     }
 }
 
-/// Checks the settings that both methods have.
 fn validate_rule(step: f64, lambda: f64, max_iterations: usize) -> Result<(), OutOfRange> {
     positive("deconvolution.step", step)?;
     let good = lambda >= 0.0 && lambda.is_finite();
@@ -247,7 +247,7 @@ impl NetworkDeconvolution {
         positive("deconvolution.unit_divisor", self.unit_divisor)?;
         let (key, divisor) = ("deconvolution.high_pass_divisor", self.high_pass_divisor);
         within(key, divisor, 1e-3..=1e6, "")?;
-        // Momentum goes on from a state of its own, which nothing would clip.
+        // Nesterov's momentum continues from a second, extrapolated state, which `after-test` would not clip.
         require(
             !(self.clipping == Clipping::AfterTest && self.update == Update::Accelerated),
             "deconvolution.clipping",
@@ -569,7 +569,8 @@ impl LinearMethod {
     fn validate(&self, n: usize, p: usize) -> Result<(), OutOfRange> {
         self.deconvolution.validate()?;
         self.shape.validate()?;
-        // Lags are up to 0.95 target_sigma apart; of a sharper weight their sums depend on where they lie.
+        // Lags are up to 0.95 target_sigma apart. A narrower weight is not sampled finely enough: its sums depend on the phase
+        // of the lags.
         let scale = self.shape.weight_scale;
         require(
             scale >= self.deconvolution.target_sigma,
@@ -583,7 +584,7 @@ impl LinearMethod {
             p,
             "even with an even stamp.size and odd with an odd one, with the linear method, whose window is centred on the stamp",
         )?;
-        // A wider one sees a galaxy that is beyond the stamp, and what wraps around.
+        // A wider window reaches beyond the stamp, and includes light that the periodic transform wraps around.
         let window = self.deconvolution.window_sigma;
         require(
             4.0 * window <= n as f64,
@@ -596,13 +597,13 @@ impl LinearMethod {
 
 impl Serialize for Configuration {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        // The derived one.
+        // The derived function: `remote` makes it one of the type, so that reading can check the keys.
         Configuration::serialize(self, serializer)
     }
 }
 
 impl Configuration {
-    /// The derived reader, which ignores what the method does not use.
+    // The derived reader. It ignores unused keys, which `registry` checks with the file and the line.
     pub(crate) fn from_table(table: Table) -> Result<Self, toml::de::Error> {
         Configuration::deserialize(table)
     }
@@ -642,15 +643,14 @@ impl Configuration {
 pub struct PsfCut {
     /// Pixels a side.
     pub size: usize,
-    /// Pixels a side of the smallest stamp that will do, of which all are taken; of the parity of `size`.
+    /// Pixels a side of the smallest usable stamp, which is not cut; of the parity of `size`.
     pub least: usize,
-    /// Whether the middle of the PSF must be the middle of these pixels: stars on stamps of the other parity are shifted
-    /// by half a pixel. The network does not need it, as an autocorrelation does not change with a shift.
+    /// Whether the PSF must be centred on these pixels: stars on stamps of the other parity are then shifted by half a pixel.
+    /// The network does not need it, because an autocorrelation does not change with a shift.
     pub centred: bool,
 }
 
 impl From<usize> for PsfCut {
-    /// So many pixels a side, of any PSF.
     fn from(size: usize) -> Self {
         PsfCut {
             size,
