@@ -73,7 +73,7 @@ impl Scale {
 impl CandidateFinder {
     pub(super) fn new(n: usize) -> Self {
         // The cells of a galaxy up to two pixels off the centre are on the stamp.
-        let basis = GalaxyBasis::of((n / 2).saturating_sub(2) / CELL_SIDE);
+        let basis = GalaxyBasis::for_half_side((n / 2).saturating_sub(2) / CELL_SIDE);
         let distance = |at: usize| {
             let middle = |cell: usize| CELL_SIDE as f32 * (cell as f32 + 0.5);
             middle(at % HALF_SIDE).hypot(middle(at / HALF_SIDE))

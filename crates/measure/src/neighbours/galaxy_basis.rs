@@ -1,11 +1,12 @@
-//! A basis for the light of single galaxies, so that a neighbour can be separated from a galaxy's own shape.
+//! Principal components of the light of isolated galaxies, with which [`super::candidate`] separates a galaxy's shape from a
+//! neighbour.
 //!
-//! A reference population of single galaxies behind PSFs is drawn on cells of 2 × 2 pixels. It has a wide range of sizes,
-//! ellipticities and displacements, and no neighbours. Light that its principal components explain belongs to the galaxy, as
-//! far as the variances of their amplitudes allow.
+//! A reference population of isolated galaxies behind PSFs, with a wide range of sizes, ellipticities and displacements, is
+//! drawn on cells of 2 × 2 pixels. Its principal components with the variances of their amplitudes are a prior: light that
+//! they explain belongs to the galaxy, and the residual is compared with a neighbour.
 //!
-//! The population is the same after reflections of either axis and after an exchange of both. The components are therefore
-//! even or odd along each axis, and one quadrant of the cells is enough.
+//! The population is symmetric under reflection of either axis and under exchange of both. The components are therefore even
+//! or odd along each axis, so that one quadrant of the cells determines them, in a quarter of the time and memory.
 
 use std::f64::consts::PI;
 use std::sync::OnceLock;
@@ -16,31 +17,31 @@ use crate::asymmetry::INNER_HALF_SIDE;
 use crate::deconvolve::uniform;
 
 // Pixels on a side of a cell.
-// Finer than the PSF. Chosen by hand.
+// Smaller than the PSF's FWHM, with a quarter of the products that single pixels take. Chosen by hand.
 pub(super) const CELL_SIDE: usize = 2;
 // Cells from the centre to an edge, at most.
 // 48 px less two on each side, for galaxies off the centre.
 pub(super) const HALF_SIDE: usize = 11;
-/// Cells of a quadrant, in rows of [`HALF_SIDE`], up to whole vectors.
+// Cells of a quadrant in rows of HALF_SIDE, padded with zeros to whole SIMD vectors.
 pub(super) const QUADRANT: usize = (HALF_SIDE * HALF_SIDE).next_multiple_of(16);
-// Components of each parity: those of the largest variances.
+// Components of each parity, those of the largest variances.
 // With 12, three times as many Gaussian galaxies are flagged at S/N 50.
 pub(super) const COMPONENTS: usize = 16;
-// Directions among which the components are found: at least twice as many, so that the last components converge too.
-// Chosen by hand.
+// Galaxies that span the space in which the components are found. All 600 would make the eigenvectors take longer than many
+// galaxies; with few more than COMPONENTS, the last components would not converge. Chosen by hand.
 const SEARCH_DIMENSIONS: usize = 32;
-/// The parities along x and y: whether odd.
+// Whether a component is odd along x and along y.
 pub(super) const PARITIES: [[bool; 2]; 4] =
     [[false, false], [true, true], [true, false], [false, true]];
-/// The quadrants: whether x and y are negative.
+// Whether x and y are negative in a quadrant.
 pub(super) const QUADRANT_SIGNS: [[bool; 2]; 4] =
     [[false, false], [true, false], [false, true], [true, true]];
-// σ in cells (of 2 px) of the Gaussian that stands for a neighbour: a galaxy of the population behind its PSF. Chosen by hand.
+// σ of the Gaussian that is the model of a neighbour: 3 px, a typical galaxy of the population behind its PSF. Chosen by hand.
 const NEIGHBOUR_SIGMA_CELLS: f64 = 1.5;
-// Cells from the centre of the neighbour to its last one: 2.7 σ. Chosen by hand.
+// Cells from the centre of the neighbour to the edge of its model, at 2.7 σ. Chosen by hand.
 pub(super) const NEIGHBOUR_HALF_SIDE: usize = 4;
 
-// Each is in the population twice. With 6,000 galaxies instead, the share of neighbours found changes by 0.2 %.
+// Galaxies that are drawn; each is used again with exchanged axes. With 6,000 galaxies instead, the share of neighbours found changes by 0.2 %.
 const POPULATION_SIZE: usize = 300;
 // In pixels before the PSF: from unresolved ones to half-light radii of 10 px. Chosen by hand.
 const GALAXY_SCALES_PX: [f64; 2] = [0.5, 8.0];
@@ -50,46 +51,44 @@ const MAX_ELLIPTICITY: f64 = 0.9;
 const MAX_DISPLACEMENT: f64 = 0.55;
 // σ in pixels: FWHM of 2.4 to 5.7 px. A wider range finds 2 % fewer neighbours at 5 to 7 px.
 const PSF_SIGMAS: [f64; 2] = [1.0, 2.4];
-// Range of the share of a galaxy's light with the profile of a single Gaussian; negative shares are zero.
+// Range from which the share of a galaxy's light in a single Gaussian is drawn. Negative shares become zero, so that a third of
+// the galaxies have a bulge and a disc only.
 // Without such galaxies, 3 instead of 0.9 % of Gaussian galaxies with a half-light radius of 8 px are flagged at S/N 20.
 const GAUSSIAN_SHARES: [f64; 2] = [-0.5, 1.0];
 // σ of the concentric Gaussians of a galaxy in units of its scale.
 // Steps of 2: a bulge, a disc and wings. The last one is the single Gaussian.
 const GALAXY_SIGMAS: [f64; 5] = [0.35, 0.75, 1.5, 2.8, 1.0];
-/// Cells from the centre to an edge of the square whose sum is the galaxy's light.
-const INNER_CELLS: usize = INNER_HALF_SIDE as usize / CELL_SIDE;
+// The square whose sum is the unit of the galaxy's light, as in the asymmetry.
+const INNER_HALF_CELLS: usize = INNER_HALF_SIDE as usize / CELL_SIDE;
 const SEED: u64 = 0x6761_6c61_7879; // "galaxy" in ASCII.
 
-/// One number for each cell of a quadrant.
 pub(super) type Quadrant = [f32; QUADRANT];
 type Cells = [f64; HALF_SIDE * HALF_SIDE];
-/// Light of a galaxy in cells of a quadrant, for each of [`PARITIES`], in units of the light of the inner cells.
+// The even and odd parts of a galaxy's light in the positive quadrant, one for each of PARITIES, in units of the galaxy's
+// light within INNER_HALF_CELLS.
 type Folded = [Cells; 4];
 
-/// Components of one parity, each of length one over all cells.
+// Of one parity, orthonormal over all cells.
 pub(super) struct Components {
-    /// In the positive quadrant, times two: length one over the quadrant alone.
+    // In the positive quadrant, times two: the norm is one over this quadrant.
     pub(super) shapes: [Quadrant; COMPONENTS],
-    /// Convolved with a neighbour.
+    // The scalar product of a component with a neighbour centred on each cell.
     pub(super) smoothed: [Quadrant; COMPONENTS],
-    /// Of the amplitudes in units of the square of the galaxy's light; infinite if free: a galaxy's brightness, and a sky.
+    // Of the amplitudes, in units of the galaxy's light squared; infinite for components without a prior, as flux and sky.
     pub(super) variances: [f32; COMPONENTS],
 }
 
-/// The basis for stamps of one size.
 pub(super) struct GalaxyBasis {
     /// Cells from the centre to an edge.
     pub(super) half_side: usize,
-    /// Of each of [`PARITIES`].
     pub(super) components: [Components; 4],
-    /// Σ of the squared light of a neighbour in the middle of each cell.
+    // Norm squared of a neighbour centred on each cell, without the light beyond the cells.
     pub(super) squares: Quadrant,
 }
 
 impl GalaxyBasis {
-    /// The basis on cells that extend `half` cells from the centre to each side. It takes longer than many galaxies, and is
-    /// found once per process.
-    pub(super) fn of(half: usize) -> &'static GalaxyBasis {
+    // Once per process, because it takes longer than many galaxies.
+    pub(super) fn for_half_side(half: usize) -> &'static GalaxyBasis {
         static ALL: [OnceLock<GalaxyBasis>; HALF_SIDE + 1] =
             [const { OnceLock::new() }; HALF_SIDE + 1];
         let half = half.min(HALF_SIDE);
@@ -116,7 +115,6 @@ impl GalaxyBasis {
     }
 }
 
-/// Whether a cell is within `half` cells of the centre; the first one beyond the centre is 0.
 fn on_cells(at: i32, half: usize) -> bool {
     (-(half as i32)..half as i32).contains(&at)
 }
@@ -127,7 +125,7 @@ pub(super) fn neighbour_light(step: i32) -> f64 {
     (-0.5 * offset * offset).exp() / ((2.0 * PI).sqrt() * NEIGHBOUR_SIGMA_CELLS)
 }
 
-/// Each galaxy is there once more under exchanged axes.
+// Each galaxy is added again with exchanged axes, which makes the components as symmetric as the cells.
 fn reference_population(half: usize) -> Vec<Folded> {
     let mut state = SEED;
     let mut within = move |[low, high]: [f64; 2]| low + (high - low) * uniform(&mut state);
@@ -135,12 +133,12 @@ fn reference_population(half: usize) -> Vec<Folded> {
     for _ in 0..POPULATION_SIZE {
         let galaxy = Galaxy {
             scale: within(GALAXY_SCALES_PX.map(f64::ln)).exp(),
-            // Uniform in the plane of both components.
+            // The root makes the density uniform in the plane of both components.
             ellipticity: MAX_ELLIPTICITY * within([0.0, 1.0]).sqrt(),
             angle: within([0.0, PI]),
             bulge: within([0.0, 1.0]),
             gaussian: within(GAUSSIAN_SHARES).max(0.0),
-            place: [(); 2].map(|()| within([-MAX_DISPLACEMENT, MAX_DISPLACEMENT])),
+            centre: [(); 2].map(|()| within([-MAX_DISPLACEMENT, MAX_DISPLACEMENT])),
             psf_sigma: within(PSF_SIGMAS.map(f64::ln)).exp(),
         };
         let folded = galaxy.folded(half);
@@ -161,12 +159,11 @@ struct Galaxy {
     bulge: f64,
     /// Share of the light with a Gaussian profile.
     gaussian: f64,
-    place: [f64; 2],
+    centre: [f64; 2],
     psf_sigma: f64,
 }
 
 impl Galaxy {
-    /// The light of cells that extend `half` cells to each side.
     fn cells(&self, half: usize) -> Vec<f64> {
         let along = 2 * half;
         let mut cells = vec![0.0; along * along];
@@ -193,12 +190,13 @@ impl Galaxy {
             // The logarithm of the light is a x² + b y² + c x y.
             let [a, b, c] = [yy, xx, -2.0 * xy].map(|term| -0.5 * term / determinant);
             let from = 0.5 - (CELL_SIDE * half) as f64;
-            let x = from - self.place[0];
+            let x = from - self.centre[0];
             let peak = light / determinant.sqrt();
-            // From pixel to pixel the light changes by a factor, which changes by exp(2a).
+            // Along a row the logarithm is a quadratic function, so that the ratio of neighbouring pixels changes by the factor
+            // exp(2a): two products instead of an exponential per pixel.
             let change = (2.0 * a).exp();
             for row in 0..CELL_SIDE * along {
-                let y = from + row as f64 - self.place[1];
+                let y = from + row as f64 - self.centre[1];
                 let mut pixel = peak * (a * x * x + b * y * y + c * x * y).exp();
                 let mut factor = (a * (2.0 * x + 1.0) + c * y).exp();
                 let line = &mut cells[row / CELL_SIDE * along..][..along];
@@ -232,15 +230,15 @@ impl Galaxy {
                 }
             }
         }
-        // Twice the sum over the quadrant of the even part is the sum over all four.
+        // `folded` has half of the sum over the four quadrants.
         let inner = (0..HALF_SIDE * HALF_SIDE)
-            .filter(|at| at % HALF_SIDE < INNER_CELLS && at / HALF_SIDE < INNER_CELLS);
+            .filter(|at| at % HALF_SIDE < INNER_HALF_CELLS && at / HALF_SIDE < INNER_HALF_CELLS);
         let light = 2.0 * inner.map(|at| folded[0][at]).sum::<f64>();
         folded.map(|cells| cells.map(|value| value / light))
     }
 }
 
-/// Place along an axis of the cell that is this many cells from the centre on one side, of `half` cells to each side.
+// Index along an axis, counted from the edge, of the `cell`-th cell from the centre.
 #[inline(always)]
 pub(super) fn mirrored(half: usize, cell: usize, negative: bool) -> usize {
     if negative {
@@ -260,16 +258,15 @@ pub(super) fn parity_sign(odd: [bool; 2], negative: [bool; 2]) -> f64 {
 }
 
 impl Components {
-    /// Of the parity at this place of [`PARITIES`].
     fn new(galaxies: &[Folded], half: usize, parity: usize) -> Components {
         let odd = PARITIES[parity];
         let mut rows: Vec<Cells> = galaxies.iter().map(|one| one[parity]).collect();
         let mut basis = Basis::default();
-        for free in free(&rows, half, odd) {
-            basis.add(free, &mut rows);
+        for component in unconstrained_components(&rows, half, odd) {
+            basis.add(component, &mut rows);
         }
-        let count = basis.vectors.len();
-        // The directions of those galaxies that the earlier directions explain the least.
+        let unconstrained = basis.vectors.len();
+        // Greedy pivoting as in a pivoted Cholesky decomposition: the next vector is the galaxy with the largest residual.
         while basis.vectors.len() < SEARCH_DIMENSIONS {
             let sizes = rows.iter().map(|row| (dot(row, row), row));
             let Some((_, unexplained)) = sizes.max_by(|a, b| a.0.total_cmp(&b.0)) else {
@@ -277,7 +274,7 @@ impl Components {
             };
             basis.add(*unexplained, &mut rows);
         }
-        let (vectors, variances) = basis.principal(galaxies, parity, count);
+        let (vectors, variances) = basis.principal(galaxies, parity, unconstrained);
         let mut components = Components {
             shapes: [[0.0; QUADRANT]; COMPONENTS],
             smoothed: [[0.0; QUADRANT]; COMPONENTS],
@@ -287,15 +284,16 @@ impl Components {
         for (k, vector) in vectors.iter().enumerate() {
             for at in 0..HALF_SIDE * HALF_SIDE {
                 components.shapes[k][at] = vector[at] as f32;
-                components.smoothed[k][at] = under_neighbour(vector, half, odd, &light, at) as f32;
+                components.smoothed[k][at] =
+                    overlap_with_neighbour(vector, half, odd, &light, at) as f32;
             }
         }
         components
     }
 }
 
-/// Components of free amplitude: a sky, its gradients, and the mean galaxy.
-fn free(rows: &[Cells], half: usize, odd: [bool; 2]) -> Vec<Cells> {
+// Components without a prior on their amplitudes: a constant sky, its gradients, and the mean galaxy, whose amplitude is flux.
+fn unconstrained_components(rows: &[Cells], half: usize, odd: [bool; 2]) -> Vec<Cells> {
     let field = |value: &dyn Fn(usize) -> f64| {
         std::array::from_fn(|at| {
             let on = at % HALF_SIDE < half && at / HALF_SIDE < half;
@@ -311,18 +309,17 @@ fn free(rows: &[Cells], half: usize, odd: [bool; 2]) -> Vec<Cells> {
     }
 }
 
-/// Orthonormal vectors.
+// Orthonormal vectors, or zeros.
 #[derive(Default)]
 struct Basis {
     vectors: Vec<Cells>,
 }
 
 impl Basis {
-    /// Adds the part of `vector` that is orthogonal to the others, and projects it out of the rows. Of a vector without such
-    /// a part it adds zeros.
+    // A Gram–Schmidt step. A vector that depends linearly on the others adds zeros, so that the number of vectors stays known.
     fn add(&mut self, vector: Cells, rows: &mut [Cells]) {
         let mut new = vector;
-        // Twice, against rounding.
+        // Rounding leaves parts of the other vectors after one pass; "twice is enough" (Kahan, in Parlett 1980, Sect. 6.9).
         for _ in 0..2 {
             for old in &self.vectors {
                 project_out(&mut new, old);
@@ -341,17 +338,19 @@ impl Basis {
         self.vectors.push(new);
     }
 
-    /// Principal components of the galaxies in the space of the vectors, after the first `free` ones, which are kept.
+    // Principal components of the galaxies in the space of the vectors. The first `unconstrained` vectors are components
+    // themselves.
     fn principal(
         &self,
         galaxies: &[Folded],
         parity: usize,
-        free: usize,
+        unconstrained: usize,
     ) -> ([Cells; COMPONENTS], [f64; COMPONENTS]) {
         let mut products = [[0.0; SEARCH_DIMENSIONS]; SEARCH_DIMENSIONS];
         for galaxy in galaxies {
             let mut amplitudes = [0.0; SEARCH_DIMENSIONS];
-            for (amplitude, vector) in amplitudes.iter_mut().zip(&self.vectors).skip(free) {
+            for (amplitude, vector) in amplitudes.iter_mut().zip(&self.vectors).skip(unconstrained)
+            {
                 *amplitude = dot(&galaxy[parity], vector);
             }
             for (row, a) in products.iter_mut().zip(amplitudes) {
@@ -361,9 +360,9 @@ impl Basis {
             }
         }
         let axes = eigenvectors(&mut products);
-        // Free ones have no products, and come first.
+        // Without products, unconstrained vectors are eigenvectors of eigenvalue 0, and infinity sorts them first.
         let variance = |k: usize| {
-            if k < free {
+            if k < unconstrained {
                 f64::INFINITY
             } else {
                 products[k][k]
@@ -384,7 +383,7 @@ impl Basis {
     }
 }
 
-/// With columns side by side, so that no addition waits for the one before.
+// A sum per column, so that additions do not wait for each other and vectorise.
 fn dot(a: &Cells, b: &Cells) -> f64 {
     let mut columns = [0.0; HALF_SIDE];
     for (a, b) in a.chunks_exact(HALF_SIDE).zip(b.chunks_exact(HALF_SIDE)) {
@@ -402,9 +401,9 @@ fn project_out(vector: &mut Cells, direction: &Cells) {
     }
 }
 
-/// The product of a component with a neighbour of flux 1 in the middle of a cell of the positive quadrant. `light` is the
-/// neighbour's along an axis, from its middle on.
-fn under_neighbour(
+// Scalar product of a component with a neighbour of flux 1 that is centred on a cell of the positive quadrant. `light` is the
+// profile of the neighbour along an axis, from its centre on.
+fn overlap_with_neighbour(
     vector: &Cells,
     half: usize,
     odd: [bool; 2],
@@ -422,7 +421,7 @@ fn under_neighbour(
             if !on_cells(x, half) || !on_cells(y, half) {
                 continue;
             }
-            // Cell −1 is the mirror image of cell 0.
+            // The centre of the stamp lies between cells −1 and 0.
             let mirror = |cell: i32| if cell < 0 { -1 - cell } else { cell } as usize;
             let side = [x, y].map(|cell| cell < 0);
             let [across, along] = [along, down].map(|step| light[step.unsigned_abs() as usize]);
@@ -437,14 +436,14 @@ fn under_neighbour(
 mod tests {
     use super::*;
 
-    fn galaxy(scale: f64, ellipticity: f64, angle: f64, place: [f64; 2]) -> Galaxy {
+    fn galaxy(scale: f64, ellipticity: f64, angle: f64, centre: [f64; 2]) -> Galaxy {
         Galaxy {
             scale,
             ellipticity,
             angle,
             bulge: 0.4,
             gaussian: 0.0,
-            place,
+            centre,
             psf_sigma: 1.5,
         }
     }
@@ -464,13 +463,13 @@ mod tests {
 
     #[test]
     fn galaxies_have_their_position_and_angle() {
-        for (scale, angle, place) in [(2.0, 0.3, [0.4, -0.2]), (3.0, 2.0, [-0.5, 0.5])] {
-            let cells = galaxy(scale, 0.3, angle, place).cells(HALF_SIDE);
+        for (scale, angle, centre) in [(2.0, 0.3, [0.4, -0.2]), (3.0, 2.0, [-0.5, 0.5])] {
+            let cells = galaxy(scale, 0.3, angle, centre).cells(HALF_SIDE);
             let [all, x, y, xx, xy, yy] = sums(&cells);
             let (x, y) = (x / all, y / all);
             // 2 % of the light of the larger one is beyond the cells, on one side more than on the other.
             assert!(
-                (x - place[0]).abs() < 0.05 && (y - place[1]).abs() < 0.05,
+                (x - centre[0]).abs() < 0.05 && (y - centre[1]).abs() < 0.05,
                 "{x} {y}"
             );
             let found = 0.5 * (2.0 * xy / all - 2.0 * x * y).atan2((xx - yy) / all - x * x + y * y);
@@ -495,7 +494,7 @@ mod tests {
 
     #[test]
     fn components_are_orthonormal_and_symmetric() {
-        let basis = GalaxyBasis::of(HALF_SIDE);
+        let basis = GalaxyBasis::for_half_side(HALF_SIDE);
         for components in &basis.components {
             for (i, a) in components.shapes.iter().enumerate() {
                 for (j, b) in components.shapes.iter().enumerate() {
@@ -524,7 +523,7 @@ mod tests {
 
     #[test]
     fn galaxies_are_explained_and_pairs_are_not() {
-        let basis = GalaxyBasis::of(HALF_SIDE);
+        let basis = GalaxyBasis::for_half_side(HALF_SIDE);
         // The squared residual, in units of the squared light.
         let left = |folded: &Folded| -> f64 {
             let parts = basis.components.iter().zip(folded);
