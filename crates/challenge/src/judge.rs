@@ -50,7 +50,7 @@ pub struct EntryInfo {
     /// SHA-256 of sets, images and files.
     pub content: String,
     pub files: Vec<String>,
-    /// Some mean shapes of each set of catalogues ([`sketch`]).
+    /// Means of ellipticities over parts of each set ([`sketch`]), by which copies of another entry are found.
     pub shapes: BTreeMap<String, Vec<i32>>,
     pub contents: Contents,
     pub reference: bool,
@@ -71,8 +71,8 @@ pub struct Entry {
     pub withdrawn: Option<String>,
 }
 
-// How the settings column of an entry starts, in contrast to those of runs.
-const STORED: &str = "[entry]\n";
+// A store keeps entries and runs in one format. The settings of an entry start with this, those of a run do not.
+const ENTRY_SETTINGS_PREFIX: &str = "[entry]\n";
 
 #[derive(Serialize, Deserialize)]
 struct Stored {
@@ -109,11 +109,11 @@ pub struct Judge {
     public: PathBuf,
     grid: Grid,
     truths: BTreeMap<u32, Truth>,
-    /// The true shears, if each set has one.
+    /// The true shears, if the shear is constant over each set.
     pub constant: Option<ConstantShears>,
 }
 
-// A judge must not print the truth.
+// Written by hand: the derived one would print the true shears in logs and panics.
 impl std::fmt::Debug for Judge {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("Judge").finish_non_exhaustive()
@@ -188,7 +188,8 @@ impl Judge {
         Some(sum / self.truths.len() as f64)
     }
 
-    // Of two arrivals of one entry, the smaller one counts: an entry that came too early may come again.
+    // An entry may be sent before the challenge accepts entries, and then again: of two arrivals the one that sorts first
+    // counts, and arrivals that are too early sort last.
     fn order(&self, received: Timestamp) -> (bool, Timestamp) {
         (self.challenge.rules.is_early(received), received)
     }
@@ -197,7 +198,7 @@ impl Judge {
     pub fn entries(&self, store: &Path) -> Result<Vec<Entry>, FileError> {
         let mut entries: BTreeMap<(String, String), Entry> = BTreeMap::new();
         for (path, run) in store::files(store)? {
-            if !run.settings.starts_with(STORED) {
+            if !run.settings.starts_with(ENTRY_SETTINGS_PREFIX) {
                 continue;
             }
             let Stored { entry: info } = toml::from_str(&run.settings)
@@ -255,7 +256,7 @@ impl Judge {
         let ids = References::ids(&public, &self.challenge.data.sets)?;
         let references = References::measure(&public, &ids, self.grid, threads, &mut Quiet)?;
         let pool = Pool::new(threads)?;
-        // Each entry is stored as soon as it is scored, so that a stopped command loses none.
+        // Stored one by one, so that an interrupted command keeps the entries that it scored.
         for result in pool.in_order(candidates, |candidate| self.judge(candidate, &references)) {
             progress.advance(self.challenge.data.galaxies());
             match result {
@@ -309,8 +310,8 @@ impl Judge {
         }
     }
 
-    // The entries that must be scored, in order of arrival. Known entries are counted; unreadable entries and repeated
-    // archives are refused.
+    // The entries that are not in the store yet, in order of arrival. Those in the store are only counted, because scoring is
+    // slow; unreadable entries and repeated archives are refused.
     fn candidates(
         &self,
         sendings: &[(Sending, bool)],
@@ -361,7 +362,8 @@ impl Judge {
             let entry = content.as_ref().and_then(|content| content.entry.as_ref());
             let team = team_of(&sending, entry, arrival.receipt.as_ref());
             let early = self.challenge.rules.is_early(arrival.received);
-            // Of other archives with this content, the first one that counts is known only when all are ranked.
+            // The same content in another archive is handled by `ranking`, because which of them came first is known only when all
+            // are scored.
             match archives.entry((arrival.sha256.clone(), team.clone(), early)) {
                 Slot::Occupied(first) => {
                     round.refused.push(Refused {
@@ -427,7 +429,7 @@ impl Judge {
         for name in [&info.team, &info.method] {
             check_name(name).map_err(|error| refuse(error.to_string()))?;
         }
-        let configuration = short(&format!("{}: {}", info.team, info.method));
+        let configuration = truncated(&format!("{}: {}", info.team, info.method));
         let settings =
             toml::to_string(&Stored { entry: info }).map_err(|error| refuse(error.to_string()))?;
         let run = RunRecord {
@@ -615,18 +617,19 @@ impl Judge {
     }
 }
 
-// Significance that the response to the shear needs, as for Q cal.
-const CLEAR_RESPONSE: f64 = 3.0;
+// In σ, as for Q cal. Below, the entry contains no shear that could be ranked.
+const MIN_RESPONSE_SIGNIFICANCE: f64 = 3.0;
 
-// Whether a response is clearly above zero. An unknown error counts as small.
+// An error that cannot be determined (NaN) does not refuse an entry.
 fn is_measurable(response: f64, error: f64) -> bool {
-    response > 0.0 && (error.is_nan() || response > CLEAR_RESPONSE * error)
+    response > 0.0 && (error.is_nan() || response > MIN_RESPONSE_SIGNIFICANCE * error)
 }
 
 type Powers = (Vec<f64>, Vec<f64>);
 
-// Slope of sent bandpowers on true ones over sets, and its standard error from the residuals. Each bandpower is divided by
-// its true mean over sets: what all sets have in common can be had from own simulations, without images.
+// Slope of the sent bandpowers on the true ones over sets, and its standard error from the residuals. Each bandpower is divided
+// by its true mean over the sets and only deviations from it count: a team could find the mean spectrum with simulations,
+// without measuring an image.
 fn slope_over_sets(sets: &[Powers]) -> (f64, f64) {
     let bins = sets.first().map_or(0, |(truth, _)| truth.len());
     let count = sets.len() as f64;
@@ -647,7 +650,7 @@ fn slope_over_sets(sets: &[Powers]) -> (f64, f64) {
     }
     let number = count * bins as f64;
     let slope = cross / square;
-    // x has the mean zero.
+    // The regression has an intercept, which does not change the slope because x has the mean zero.
     let residual = squares - all * all / number - slope * cross;
     (slope, (residual.max(0.0) / (number - 2.0) / square).sqrt())
 }
@@ -656,7 +659,7 @@ pub(crate) fn unscored(source: ScoringError) -> ChallengeError {
     ChallengeError::Score(ScoreError::Scoring { set: None, source })
 }
 
-// A message without the path of the entry, which a list of entries has already.
+// Lists of refused entries state the path of the entry before the reason, so it is removed here.
 fn reason_of(path: &Path, message: &str, sending: &Sending) -> String {
     match path.strip_prefix(&sending.path) {
         Ok(name) if !name.as_os_str().is_empty() => {
@@ -684,8 +687,8 @@ fn file_name(path: &Path) -> String {
     line(&path.file_name().unwrap_or_default().to_string_lossy())
 }
 
-// As much of a name as a store accepts.
-fn short(name: &str) -> String {
+// Stores limit names, and team and method together can be longer.
+fn truncated(name: &str) -> String {
     let mut ends = (0..=shearq_submissions::MAX_NAME).rev();
     let end = ends.find(|end| name.is_char_boundary(*end));
     name[..end.unwrap_or(0)].to_owned()

@@ -1,4 +1,5 @@
-//! CSV and ASCII tables of numbers, plain or compressed by gzip, read as they stream by.
+//! CSV and ASCII tables of numbers, plain or compressed by gzip. Rows are read from a stream, so that the text of a large table
+//! is never in memory as a whole.
 
 use std::cell::Cell;
 use std::io::{BufRead, BufReader, Chain, Cursor, ErrorKind, Read};
@@ -13,20 +14,21 @@ use crate::frames::polars::{Column, DataFrame};
 use crate::error::{FileError, names_of};
 use crate::open;
 
-/// Columns of an ASCII table without a header: the challenge's catalogue.
+// Columns of a GREAT10 catalogue, an ASCII table without a header.
 pub(super) const CHALLENGE_COLUMNS: [&str; 4] = ["x", "y", "e1", "e2"];
 
-// Most bytes of a row with the comments before it, and of all that stands before the first row.
+// Of a row with the comments before it, and of everything before the first row. A binary or malicious file has no line feeds,
+// and would be read into memory as one line. Chosen by hand.
 const MAX_RECORD_BYTES: usize = 1 << 20;
-// Most rows of a file of fewer bytes than that; a larger one may have one for each byte. Numbers do not
-// compress further, and zeros are no catalogue.
-const FREE_ROWS: usize = 1 << 20;
-// Bytes read at a time.
+// A file may have as many rows as bytes on disk, and at least this many: gzip can expand a thousandfold, but
+// rows of measured numbers do not compress to less than a byte. Chosen by hand.
+const MIN_ROW_LIMIT: usize = 1 << 20;
+// Chosen by hand.
 const BUFFER_BYTES: usize = 1 << 15;
-// Most characters of a damaged field that a message shows.
+// Of a field in a message: a damaged field may be a megabyte. Chosen by hand.
 const MAX_FIELD_CHARS: usize = 40;
-// First bytes of gzip-compressed files.
-const GZIP: [u8; 2] = [0x1f, 0x8b];
+// RFC 1952, Sect. 2.3.1. The content decides, not the ending of the name.
+const GZIP_MAGIC: [u8; 2] = [0x1f, 0x8b];
 
 /// Start of a cell of CSV that keeps a spreadsheet from interpreting `text` as a formula.
 pub fn formula_mark(text: &str) -> &'static str {
@@ -37,12 +39,11 @@ pub fn formula_mark(text: &str) -> &'static str {
 }
 
 pub(super) struct Request<'a> {
-    /// Columns to read; all, with NaN for what is not a number, if `None`.
+    // `None` reads all columns, with NaN for fields that are not numbers.
     pub(super) wanted: Option<&'a [&'a str]>,
-    /// Wanted columns of texts or of integers of any length. They become columns of text if 64-bit floats do not contain
-    /// all values.
+    // Columns of identifiers. They become columns of text if a value is no number or an integer above 2⁵³: as floats, 4000
+    // identifiers from 10¹⁸ on were 32 different ones.
     pub(super) identities: &'a [&'a str],
-    /// Names of the columns of a table without a header.
     pub(super) default_names: &'a [&'a str],
     pub(super) most_rows: usize,
 }
@@ -66,7 +67,7 @@ pub(super) fn read(path: &Path, request: &Request<'_>) -> Result<DataFrame, File
     let separator = Separator::of(head.header.as_deref(), head.first.as_deref());
     let names = head.names(path, separator, request)?;
     let mut rows = Rows::new(path, request, &names)?;
-    rows.most = rows.most.min(FREE_ROWS.max(size));
+    rows.most = rows.most.min(MIN_ROW_LIMIT.max(size));
     input.read_rows(head, separator, &mut rows)?;
     rows.table()
 }
@@ -109,11 +110,12 @@ pub(super) fn comments(path: &Path) -> Result<Vec<String>, FileError> {
 
 struct Input {
     text: BufReader<Metered>,
-    /// Bytes that may still be taken from the file for the present row.
+    // Shared with `Metered` below: bytes that it may still read for the present row.
     left: Rc<Cell<usize>>,
 }
 
-/// A file, decompressed, that refuses to give more bytes than are left.
+// A decompressed file that refuses to return more than `left` bytes. The limit is here because the csv reader buffers a whole
+// row before the caller sees it.
 struct Metered {
     file: Box<dyn Read>,
     left: Rc<Cell<usize>>,
@@ -142,7 +144,7 @@ impl Input {
         let file = open::open(path).map_err(cannot_read(path))?;
         let mut file = BufReader::with_capacity(BUFFER_BYTES, file);
         let start = file.fill_buf().map_err(cannot_read(path))?;
-        let file: Box<dyn Read> = if start.starts_with(&GZIP) {
+        let file: Box<dyn Read> = if start.starts_with(&GZIP_MAGIC) {
             Box::new(MultiGzDecoder::new(file))
         } else {
             Box::new(file)
@@ -188,8 +190,8 @@ fn read_delimited(
     before: u64,
     rows: &mut Rows<'_>,
 ) -> Result<(), FileError> {
-    // After a row the reader is behind its line feed, but before it if a carriage return ends the row. A line end is
-    // added so that the last row does not differ.
+    // csv counts the line feed of a row before it returns the row, but after it if the row ends with a carriage return, so that
+    // line numbers differ by one. A line end is appended so that the last row is counted like the others.
     let (end, after): (&[u8], u64) = if crlf { (b"\r\n", 0) } else { (b"\n", 1) };
     let mut reader = delimited(delimiter).from_reader(text.chain(end));
     let mut record = StringRecord::new();
@@ -207,7 +209,7 @@ fn read_delimited(
                 });
             }
         }
-        // Blank lines, and comments that blanks stand before.
+        // csv skips empty lines and lines that start with `#`, but not blank lines and indented comments.
         let first = record.get(0).unwrap_or_default();
         let start = first.trim_start();
         if record.len() == 1 && start.is_empty() || first != start && start.starts_with('#') {
@@ -266,16 +268,16 @@ fn read_blanks(
     }
 }
 
-// Text formats that are no text tables: the start of their first line, and their name.
+// Formats that are text but no tables, by the start of their first line, so that the message names the format instead of a
+// field that is not a number.
 const OTHER_FORMATS: [(&str, &str); 2] = [
     ("<?xml", "XML, such as a VOTable"),
     ("<VOTABLE", "a VOTable"),
 ];
 
-// The first bytes of HDF5.
-const HDF5: [u8; 8] = *b"\x89HDF\r\n\x1a\n";
+// The signature of HDF5. Astronomers pass such catalogues, and "not UTF-8" would not help them.
+const HDF5_MAGIC: [u8; 8] = *b"\x89HDF\r\n\x1a\n";
 
-/// Refuses a first line of another format.
 fn check_format(path: &Path, line: &str) -> Result<(), FileError> {
     match OTHER_FORMATS.iter().find(|(start, _)| {
         let first = line.get(..start.len());
@@ -293,9 +295,9 @@ fn check_format(path: &Path, line: &str) -> Result<(), FileError> {
 }
 
 fn not_text(path: &Path, line: u64) -> FileError {
-    let mut start = [0; HDF5.len()];
+    let mut start = [0; HDF5_MAGIC.len()];
     let read = std::fs::File::open(path).and_then(|mut file| file.read_exact(&mut start));
-    if read.is_ok() && start == HDF5 {
+    if read.is_ok() && start == HDF5_MAGIC {
         return FileError::new(
             path,
             "the file is HDF5, which is not read; expected a text, FITS or Parquet table. Try: pandas or astropy to write Parquet or FITS",
@@ -307,7 +309,7 @@ fn not_text(path: &Path, line: u64) -> FileError {
     )
 }
 
-/// Fields between blanks, some of them in quotes.
+// Split at blanks outside of quotes; csv splits at single characters only.
 fn quoted_blanks(line: &str) -> impl Iterator<Item = &str> {
     let mut quoted = false;
     line.split(move |c: char| {
@@ -339,8 +341,7 @@ enum Separator {
 }
 
 impl Separator {
-    // The separator of a table with these lines: one that divides both into as many fields, or else any that divides the
-    // row.
+    // Preferably one that divides header and first row into equally many fields, because a comma may also occur in a name; else any that divides the row.
     fn of(header: Option<&str>, row: Option<&str>) -> Self {
         let Some(row) = row.or(header) else {
             return Separator::Blanks;
@@ -349,7 +350,7 @@ impl Separator {
         let alike = |separator: Separator| {
             header.is_some_and(|header| count(header, separator) == count(row, separator))
         };
-        // Tabs among blanks are blanks.
+        // A table aligned with blanks may contain tabs. They are separators only if they divide it further than blanks.
         let blank = |separator: Separator| {
             matches!(separator, Separator::Byte(b'\t'))
                 && count(row, Separator::Blanks) > count(row, separator)
@@ -373,7 +374,7 @@ impl Separator {
                 let mut reader = delimited(byte).from_reader(line.as_bytes());
                 match reader.read_record(&mut record) {
                     Ok(_) => record.iter().map(|field| field.trim().to_owned()).collect(),
-                    // Reading text from memory does not fail.
+                    // Valid UTF-8 in memory has no error: `flexible` accepts any number of fields.
                     Err(_) => Vec::new(),
                 }
             }
@@ -386,7 +387,7 @@ struct Head {
     comments: Vec<String>,
     header: Option<String>,
     first: Option<String>,
-    /// Number of lines before the first row.
+    // Lines before the first row, for line numbers in messages.
     before: u64,
 }
 
@@ -418,7 +419,7 @@ impl Head {
             if let Some(comment) = text.strip_prefix('#') {
                 let comment = comment.trim_start_matches('#').trim();
                 head.comments.push(comment.to_owned());
-            } else if head.header.is_none() && names_something(text) {
+            } else if head.header.is_none() && is_header(text) {
                 head.header = Some(text.to_owned());
             } else if !text.is_empty() {
                 head.first = Some(line);
@@ -433,8 +434,8 @@ impl Head {
         first.map_or_else(Vec::new, |line| separator.split(line))
     }
 
-    // Names of the columns by SExtractor's comments, `# NUMBER NAME description [unit]`, if there are some. The columns
-    // of an array have one comment, for the first of them: the second one is called `NAME_1`.
+    // SExtractor's ASCII_HEAD: a comment `# NUMBER NAME description [unit]` per column. An array has one comment with the number
+    // of its first column; the second column is called `NAME_1` here.
     fn sextractor_names(&self, fields: &[String]) -> Option<Vec<String>> {
         let mut names: Vec<String> = Vec::new();
         let mut named: (usize, &str) = (0, "");
@@ -469,7 +470,7 @@ impl Head {
         Some(names)
     }
 
-    /// Names of the columns: those that the file gives, numbers, or the default ones.
+    // In the order that `read` documents.
     fn names(
         &self,
         path: &Path,
@@ -482,7 +483,7 @@ impl Head {
             None => fields.len() == names.len(),
         };
         if let Some(header) = &self.header {
-            // Names need not be separated like numbers.
+            // Some programs separate the names by commas and the numbers by blanks.
             let (names, others) = (separator.split(header), split_names(header));
             let other = !fits(&names) && fits(&others);
             return Ok(if other { others } else { names });
@@ -498,7 +499,7 @@ impl Head {
         {
             return Ok(numbers);
         }
-        // The last comment that can be a header is one.
+        // The names are usually in the last line before the rows, after a history of commands.
         let comments = self.comments.iter().rev();
         if let Some(names) = comments.map(|line| split_names(line)).find(fits) {
             return Ok(names);
@@ -510,14 +511,14 @@ impl Head {
     }
 }
 
-// Whether a line is one of names: its first field that is not empty is not a number.
-fn names_something(line: &str) -> bool {
+// The first field decides, because later fields of rows may be texts. Empty fields are skipped.
+fn is_header(line: &str) -> bool {
     split_names(line)
         .first()
         .is_some_and(|field| field.parse::<f64>().is_err())
 }
 
-// Names in a line, between any separators, quoted or not.
+// Any separator: comments and headers are often separated in another way than the rows.
 fn split_names(line: &str) -> Vec<String> {
     line.split([';', ',', ' ', '\t'])
         .map(|name| name.trim().trim_matches('"'))
@@ -533,7 +534,7 @@ fn owned(names: &[&str]) -> Vec<String> {
 struct Rows<'a> {
     path: &'a Path,
     names: &'a [String],
-    /// Whether a field that is no number is an error.
+    // Only wanted columns must be numbers; other columns of a catalogue may be dates or names.
     strict: bool,
     most: usize,
     slots: Vec<Option<usize>>,
@@ -544,14 +545,14 @@ struct Rows<'a> {
 
 enum Values {
     Numbers(Vec<f64>),
-    /// Numbers, and texts from the first one that a float does not contain.
+    // Becomes `Texts` at the first value that a float does not represent exactly.
     Identities(Vec<f64>),
     Texts(Vec<String>),
 }
 
 impl Values {
     fn add(&mut self, field: &str) -> bool {
-        let exact = |value: &f64| value.abs() <= FLOAT_INTEGERS;
+        let exact = |value: &f64| value.abs() <= MAX_EXACT_INTEGER;
         match self {
             Values::Numbers(values) => {
                 let value = number(field);
@@ -572,8 +573,8 @@ impl Values {
     }
 }
 
-// Integers up to 2⁵³ are 64-bit floats.
-const FLOAT_INTEGERS: f64 = 9_007_199_254_740_992.0;
+// 2⁵³: all integers up to it are 64-bit floats.
+const MAX_EXACT_INTEGER: f64 = 9_007_199_254_740_992.0;
 
 impl<'a> Rows<'a> {
     fn new(path: &'a Path, request: &Request<'_>, names: &'a [String]) -> Result<Self, FileError> {
@@ -664,7 +665,7 @@ impl<'a> Rows<'a> {
     }
 }
 
-/// The number in a field, NaN in an empty one.
+// Trimmed only if that fails, because fields rarely contain blanks. An empty field is a missing value.
 fn number(field: &str) -> Option<f64> {
     field.parse().ok().or_else(|| match field.trim() {
         "" => Some(f64::NAN),

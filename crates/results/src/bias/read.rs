@@ -1,4 +1,5 @@
-//! Rows of catalogues, as the sums need them.
+//! Rows of shear catalogues of any program: checks of their numbers, and the shape, response, weight and true shear that each
+//! row adds to the sums of the bias.
 
 use std::borrow::Cow;
 use std::collections::{HashMap, HashSet};
@@ -23,22 +24,23 @@ use super::identity;
 use super::source::{Reading, Source, catalogue_named};
 use super::truth::{OfRows, check};
 
-pub(super) struct Item {
+pub(super) struct SummedRow {
     pub(super) key: u64,
-    // The catalogue of the row: 0 without artificial shear.
+    // Index of the sheared catalogue, with 0 for noshear.
     pub(super) catalogue: usize,
     pub(super) row: Row,
-    // The binned quantity in each catalogue that has it; infinity if the row is not selected.
+    // The binned quantity in noshear and each sheared catalogue; infinity where the row is not selected. A shear may move a
+    // galaxy over a cut, which is the response of the selection.
     pub(super) binned: [f64; CATALOGUES],
     pub(super) weights: [f64; CATALOGUES],
 }
 
-// Reads the rows of a catalogue and gives those that count to `take`, with a description of the catalogue.
+// Calls `take` for each row that is neither flagged nor cut, and returns counts and means of the catalogue.
 pub(super) fn rows(
     path: &Path,
     reading: &Reading<'_>,
     sources: &[Source],
-    mut take: impl FnMut(&Item),
+    mut take: impl FnMut(&SummedRow),
 ) -> Result<Catalogue, FileError> {
     let mut about = Catalogue {
         name: path.display().to_string(),
@@ -46,7 +48,7 @@ pub(super) fn rows(
     };
     if let Some(first) = sources.first().filter(|own| own.columns.is_of_shearq()) {
         let path = &first.place.path;
-        // Other programs may use the same key for something else.
+        // Only in catalogues by shearq: other programs may use the same key for another quantity.
         about.star = match (&first.frame, FileFormat::of(path)) {
             (Some(frame), _) => star_noise::of_table(frame, path),
             (None, Some(format)) => star_noise::of_any(path, format)?,
@@ -60,7 +62,7 @@ pub(super) fn rows(
         let (mut first, mut checks) = (0, None::<Vec<Check>>);
         source.parts(reading, |frame| {
             let part = Part::new(source, reading, &frame, path)?;
-            // The units of all parts are those of the first.
+            // Ranges follow from the first part, so that a file is judged in the same way however it is split.
             let checks = checks.get_or_insert_with(|| part.checks());
             repeats.look_for(&part);
             for at in 0..part.rows {
@@ -80,7 +82,7 @@ pub(super) fn rows(
     about.rows = counts[0];
     if let Some(first) = sources.first() {
         check_share(path, first, reading, &about)?;
-        repeats.check_choices(path, first)?;
+        repeats.refuse_unused_cuts(path, first)?;
         about.repeated = repeats.found(first);
     }
     Ok(about)
@@ -93,9 +95,9 @@ const OTHER_RESPONSE: [Role; 2] = [Role::R12, Role::R21];
 const DERIVATIVE: [Role; 2] = [Role::Dw1, Role::Dw2];
 const KSB: [Role; 2] = [Role::KsbE1, Role::KsbE2];
 
-// Weights in any unit are smaller; programs write 1e20, 1e30 or the largest number for a failure.
-const HUGE: f64 = 1e20;
-// Values from which the range of a quantity is determined.
+// Inverse variances in any unit are smaller; programs write 1e20, 1e30 or the largest float for a failure.
+const MIN_FAILED_WEIGHT: f64 = 1e20;
+// Values of a column that determine its range. A sample is enough for an order of magnitude. Chosen by hand.
 const SAMPLED_VALUES: usize = 1 << 16;
 
 // A test of a column for numbers that stand for failed measurements. HSM's −10 in one row of a hundred gave c = −0.096, and 1e30
@@ -126,18 +128,19 @@ struct Part<'a> {
 enum Response {
     Known(f64),
     Column(usize),
-    // Over the divisor that the ellipticity was divided by; the number without a response, where both are NaN.
+    // Response, divisor of the ellipticity, and the value without calibration, where both columns are NaN. shearq's catalogues
+    // have ellipticities that are divided already, but responses that are not.
     Divided(usize, usize, f64),
     // (e₊ − e₋)/2h of two sheared catalogues.
     Difference([usize; 2]),
 }
 
-// NaN weighs, so that it is refused.
-fn weighs(weight: f64) -> bool {
+// NaN counts as a weight, so that a later check refuses it instead of dropping the row silently.
+fn has_weight(weight: f64) -> bool {
     weight.is_nan() || weight > 0.0
 }
 
-enum LeftOut {
+enum Rejection {
     // A number stands for a failed measurement.
     Failed,
     // A distortion above 1 has no shear.
@@ -158,13 +161,13 @@ impl<'a> Part<'a> {
         let mut columns = Vec::new();
         for Operand { column, pattern } in &source.wanted {
             columns.push(match pattern {
-                Some(pattern) => Cow::Owned(compared(frame, column, pattern, path)?),
+                Some(pattern) => Cow::Owned(text_matches(frame, column, pattern, path)?),
                 None if source.is_text(reading, column) => Cow::Borrowed(&[][..]),
                 None => table::numbers(frame, column, path)?,
             });
         }
-        check_steps(frame, &source.columns, path)?;
-        check_selected(frame, source, reading)?;
+        refuse_sheared_rows(frame, &source.columns, path)?;
+        refuse_boolean_flags(frame, source, reading)?;
         let keys = |name: &str| identity::keys(frame, name, path);
         let catalogues = source.columns.of(Role::ShearedCatalogue);
         let catalogues = catalogues.map(|name| catalogues_of(frame, name, path));
@@ -211,7 +214,7 @@ impl<'a> Part<'a> {
         MeasuredRange::from_values(&values.collect::<Vec<_>>())
     }
 
-    // The tests of each row, in the order in which a row that fails several is explained.
+    // The first check that a row fails is reported, so that causes come before consequences.
     fn checks(&self) -> Vec<Check> {
         let (source, mut checks) = (self.source, Vec::new());
         let mut add = |columns: &[usize], expected, range, fails| {
@@ -230,7 +233,7 @@ impl<'a> Part<'a> {
         };
         let measured: fn(f64, MeasuredRange) -> bool = |value, range| range.excludes(value);
         let sheared = sheared_columns(source);
-        // Ellipticities with a response may have any unit.
+        // With a response, ellipticities may have any scale, which cancels in the ratio.
         let any_unit =
             self.roles(RESPONSE).is_some() || sheared[0].is_some() || source.has_sheared_rows();
         let range_e = range(if any_unit { &self.e } else { &[] });
@@ -257,7 +260,7 @@ impl<'a> Part<'a> {
         for catalogue in 1..CATALOGUES {
             let weights = source.places.all((Role::Weight, catalogue));
             add(weights, "a weight", shear, |weight, _| {
-                weight.is_nan() || weight >= HUGE
+                weight.is_nan() || weight >= MIN_FAILED_WEIGHT
             });
         }
         let range_r = range(&pair(RESPONSE));
@@ -273,7 +276,9 @@ impl<'a> Part<'a> {
             size <= 0.0 || range.excludes(size)
         });
         let weight = source.places.all((Role::Weight, 0));
-        add(weight, "a weight", shear, |weight, _| weight >= HUGE);
+        add(weight, "a weight", shear, |weight, _| {
+            weight >= MIN_FAILED_WEIGHT
+        });
         checks
     }
 
@@ -295,7 +300,8 @@ impl<'a> Part<'a> {
         checks.find(|(column, check)| (check.fails)(self.value(*column, at), check.range))
     }
 
-    // What a row adds to the sums; `None` if it does not count. `number` counts rows of the table from 0.
+    // `None` for rows without a contribution, which are counted by reason in `about`. `number` is the row of the table from 0,
+    // for messages.
     fn row(
         &self,
         at: usize,
@@ -303,7 +309,7 @@ impl<'a> Part<'a> {
         checks: &[Check],
         counts: &mut [u64; CATALOGUES],
         about: &mut Catalogue,
-    ) -> Result<Option<Item>, FileError> {
+    ) -> Result<Option<SummedRow>, FileError> {
         let places = &self.source.places;
         let catalogue = match &self.catalogues {
             Some(catalogues) => catalogues[at],
@@ -323,7 +329,7 @@ impl<'a> Part<'a> {
         });
         // A sheared catalogue may choose a row that is left out without shear: these rows are the response of the selection.
         let counted: [bool; CATALOGUES] =
-            std::array::from_fn(|catalogue| !flagged(catalogue) && weighs(weights[catalogue]));
+            std::array::from_fn(|catalogue| !flagged(catalogue) && has_weight(weights[catalogue]));
         if !counted[0] {
             match flagged(0) {
                 true => about.flagged += own,
@@ -342,7 +348,7 @@ impl<'a> Part<'a> {
                 "`{name}` looks like a weight but is not used, and is {value} here, so that this galaxy would count wrongly. Try: --columns w={name}, or w=none"
             )));
         }
-        // A step is zero far from its threshold, and its row then adds nothing to any sum.
+        // Smooth steps of `--where` are zero far below their threshold. Such a row would add zeros to all sums.
         let weight = self.weighted.as_ref().map(|own| own.weight[at]);
         if weight.is_some_and(|weight| weight <= 0.0) {
             about.unselected += own;
@@ -352,7 +358,7 @@ impl<'a> Part<'a> {
         if counted[0] && binned[0].is_infinite() {
             about.unselected += own;
         }
-        // Infinity leaves a row out of a catalogue, as a condition that does not hold.
+        // Flags and weights leave out a row in the same way as a condition of `--where`.
         for (bin, counted) in binned.iter_mut().zip(counted) {
             if !counted {
                 *bin = f64::INFINITY;
@@ -367,14 +373,14 @@ impl<'a> Part<'a> {
             Ok(row) => row,
             Err(reason) => {
                 match reason {
-                    LeftOut::Failed => about.failed += own,
-                    LeftOut::AboveOne => about.above_one += own,
-                    LeftOut::Missing => about.missing += own,
+                    Rejection::Failed => about.failed += own,
+                    Rejection::AboveOne => about.above_one += own,
+                    Rejection::Missing => about.missing += own,
                 }
                 return Ok(None);
             }
         };
-        // After the cuts: a truth needs no shears of galaxies that do not count.
+        // After the cuts, because a table of true shears may lack galaxies that are cut.
         row.g = match self.truth(at) {
             Err(_) if self.reading.request.drop_missing && self.truth.may_lack_rows() => {
                 about.missing += own;
@@ -392,7 +398,7 @@ impl<'a> Part<'a> {
                 about.ellipticity[k].add(row.e[k]);
             }
         }
-        Ok(Some(Item {
+        Ok(Some(SummedRow {
             key: self.key(at, index),
             catalogue,
             weights,
@@ -401,25 +407,25 @@ impl<'a> Part<'a> {
         }))
     }
 
-    // A column that looks like a weight, is not used, and would leave out this row.
+    // Without it, galaxies that another program excludes by a weight of zero would count fully.
     fn unused_weight(&self, at: usize) -> Option<(&str, f64)> {
         let place = self.of(Role::DoubtfulWeight)?;
         let (name, value) = (self.source.name(place), self.value(place, at));
         (value.is_nan() || value <= 0.0).then_some((name, value))
     }
 
-    // A row without its true shear, or why it is left out.
+    // A row with a true shear of zero, which the caller sets. The outer error stops the command, the inner one skips the row.
     fn measured(
         &self,
         at: usize,
         weight: f64,
         binned: f64,
         checks: &[Check],
-    ) -> Result<Result<Row, LeftOut>, String> {
+    ) -> Result<Result<Row, Rejection>, String> {
         let drop_missing = self.reading.request.drop_missing;
         if let Some((column, check)) = self.failure(at, checks) {
             if drop_missing {
-                return Ok(Err(LeftOut::Failed));
+                return Ok(Err(Rejection::Failed));
             }
             let value = self.value(column, at);
             let mut of_psf = [Role::Psf1, Role::Psf2, Role::PsfSize].into_iter();
@@ -438,7 +444,7 @@ impl<'a> Part<'a> {
             ));
         }
         let Some((e, response)) = self.shape(at, weight) else {
-            return Ok(Err(LeftOut::AboveOne));
+            return Ok(Err(Rejection::AboveOne));
         };
         let psf = self.roles(PSF).map_or([0.0; 2], |psf| self.pair(psf, at));
         let psf_size = self
@@ -457,7 +463,7 @@ impl<'a> Part<'a> {
             ),
         ];
         match checked.iter().find(|(_, value)| !value.is_finite()) {
-            Some(_) if drop_missing => Ok(Err(LeftOut::Missing)),
+            Some(_) if drop_missing => Ok(Err(Rejection::Missing)),
             Some((what, value)) => Err(format!(
                 "{what} is {value} in a row without a flag (expected a number). Try: --drop-missing"
             )),
@@ -520,7 +526,7 @@ impl<'a> Part<'a> {
         match *of {
             Response::Known(response) => response,
             Response::Column(column) => self.value(column, at),
-            // Configurations without a response have none, and no divisor.
+            // Networks have no response, and NaN in both columns.
             Response::Divided(column, divisor, without) => {
                 match self.value(column, at) / self.value(divisor, at) {
                     ratio if ratio.is_nan() => without,
@@ -625,15 +631,15 @@ fn responses(source: &Source) -> [[Response; 2]; 2] {
     })
 }
 
-// Rows of a part that are searched for ellipticities that occur several times.
-const SEARCHED: usize = 4096;
+// Rows of a part that are sampled for repeated numbers; only those are then counted in all rows. Chosen by hand.
+const SEARCHED_ROWS: usize = 4096;
 
-// Numbers with few digits are shared by many rows, but the ten that most rows have are about equally frequent: around its
-// maximum, a distribution is flat. One number that is so much more frequent than the tenth stands for something else.
-const FREQUENT: usize = 10;
+// Many rows share numbers that were rounded to few digits, but a distribution is flat around its maximum, so that the ten most
+// frequent numbers are about equally frequent. A number ten times as frequent as the tenth marks a failure or a default.
+const COMPARED_RANK: usize = 10;
 
 #[derive(Clone, Copy, PartialEq)]
-enum Kind {
+enum RepeatKind {
     // Pairs of ellipticities, if a row in a thousand has them: with two digits, 10⁴ galaxies share one in ten rows at most.
     Ellipticities,
     // Zeros of both columns, if not all rows have them.
@@ -644,7 +650,7 @@ enum Kind {
 
 // Numbers that several rows share exactly in two columns, or in one that is named twice.
 struct Repeat {
-    kind: Kind,
+    kind: RepeatKind,
     columns: [usize; 2],
     counts: HashMap<[u64; 2], u64>,
     different: usize,
@@ -660,8 +666,8 @@ struct Repeats {
 }
 
 impl Repeat {
-    fn new(kind: Kind, columns: [usize; 2]) -> Self {
-        let zeros = (kind == Kind::Zeros).then_some(([0, 0], 0));
+    fn new(kind: RepeatKind, columns: [usize; 2]) -> Self {
+        let zeros = (kind == RepeatKind::Zeros).then_some(([0, 0], 0));
         Repeat {
             kind,
             columns,
@@ -676,13 +682,12 @@ impl Repeat {
             .map(|value| (value + 0.0).to_bits())
     }
 
-    // Notes the numbers that a sample of rows repeats, which are then counted in all rows.
     fn look_for(&mut self, part: &Part<'_>) {
         let (searched, or_zero) = match self.kind {
-            Kind::Zeros => return,
-            Kind::Ellipticities => (SEARCHED, true),
+            RepeatKind::Zeros => return,
+            RepeatKind::Ellipticities => (SEARCHED_ROWS, true),
             // Half of the failures in one of 1000 rows of a small catalogue are enough.
-            Kind::Number { or_zero } => (4 * SEARCHED, or_zero),
+            RepeatKind::Number { or_zero } => (4 * SEARCHED_ROWS, or_zero),
         };
         let mut seen = HashSet::new();
         for at in (0..part.rows).step_by(part.rows.div_ceil(searched).max(1)) {
@@ -696,18 +701,18 @@ impl Repeat {
         self.different = self.different.max(seen.len());
     }
 
-    // The numbers that most of the `used` rows share, if that is no coincidence.
+    // The most frequent numbers of the `used` rows, if coincidence does not explain their frequency.
     fn found(&self, used: u64) -> Option<([f64; 2], u64)> {
         let mut counts: Vec<(u64, [u64; 2])> = self.counts.iter().map(|(v, n)| (*n, *v)).collect();
         counts.sort_unstable_by(|a, b| b.cmp(a));
         let (most, values) = *counts.first()?;
         let worth = match self.kind {
-            Kind::Ellipticities => most >= 3.max(used.div_ceil(1000)),
-            Kind::Zeros => most >= 3 && most < used,
-            Kind::Number { or_zero } => {
-                let tenth = counts.get(FREQUENT - 1).map_or(1, |(count, _)| *count);
-                let stands_out = most > FREQUENT as u64 * tenth.max(1) && most < used;
-                stands_out && (self.different > FREQUENT || !or_zero)
+            RepeatKind::Ellipticities => most >= 3.max(used.div_ceil(1000)),
+            RepeatKind::Zeros => most >= 3 && most < used,
+            RepeatKind::Number { or_zero } => {
+                let tenth = counts.get(COMPARED_RANK - 1).map_or(1, |(count, _)| *count);
+                let stands_out = most > COMPARED_RANK as u64 * tenth.max(1) && most < used;
+                stands_out && (self.different > COMPARED_RANK || !or_zero)
             }
         };
         worth.then(|| (values.map(f64::from_bits), most))
@@ -724,16 +729,19 @@ impl Repeats {
 
     fn of(part: &Part<'_>) -> Vec<Repeat> {
         let source = part.source;
-        let mut all = vec![Repeat::new(Kind::Ellipticities, part.e)];
+        let mut all = vec![Repeat::new(RepeatKind::Ellipticities, part.e)];
         for roles in [RESPONSE, PSF] {
-            all.extend(part.roles(roles).map(|own| Repeat::new(Kind::Zeros, own)));
+            all.extend(
+                part.roles(roles)
+                    .map(|own| Repeat::new(RepeatKind::Zeros, own)),
+            );
         }
         if source.columns.is_of_shearq() {
             return all;
         }
         let mut number = |columns: &[usize], or_zero| {
             let columns = columns.iter().map(|column| [*column; 2]);
-            all.extend(columns.map(|own| Repeat::new(Kind::Number { or_zero }, own)));
+            all.extend(columns.map(|own| Repeat::new(RepeatKind::Number { or_zero }, own)));
         };
         if part.roles(KSB).is_none() {
             number(&part.e, true);
@@ -764,8 +772,9 @@ impl Repeats {
         }
     }
 
-    // Refuses rows of which an unused column says that they do not count, if other rows do.
-    fn check_choices(&self, path: &Path, source: &Source) -> Result<(), FileError> {
+    // If a column for cuts that the user did not choose excludes some rows and not others, the catalogue needs a decision: its
+    // authors excluded these rows from their shears.
+    fn refuse_unused_cuts(&self, path: &Path, source: &Source) -> Result<(), FileError> {
         let found = self
             .excluded
             .iter()
@@ -794,7 +803,7 @@ impl Repeats {
             let columns = own.columns.map(|column| source.name(column).to_owned());
             // A pair explains its columns.
             let known = all.iter().any(|pair| pair.columns.contains(&columns[0]));
-            let is_number = matches!(own.kind, Kind::Number { .. });
+            let is_number = matches!(own.kind, RepeatKind::Number { .. });
             if let Some((values, rows)) = own.found(self.used).filter(|_| !(is_number && known)) {
                 all.push(Repeated {
                     columns,
@@ -807,7 +816,7 @@ impl Repeats {
     }
 }
 
-fn compared(
+fn text_matches(
     frame: &DataFrame,
     name: &str,
     pattern: &str,
@@ -839,7 +848,7 @@ fn is_sheared(text: Option<&str>) -> bool {
 
 // Refuses a table whose rows belong to sheared catalogues, if no column has this role: its mean would be one of all of
 // them.
-fn check_steps(frame: &DataFrame, columns: &Columns, path: &Path) -> Result<(), FileError> {
+fn refuse_sheared_rows(frame: &DataFrame, columns: &Columns, path: &Path) -> Result<(), FileError> {
     let mut steps = columns.steps.iter();
     match steps.find(|name| texts_of(frame, name).is_some_and(|mut texts| texts.any(is_sheared))) {
         None => Ok(()),
@@ -884,7 +893,7 @@ fn check_share(
 }
 
 // Refuses a recognised flag that is true for selected rows.
-fn check_selected(
+fn refuse_boolean_flags(
     frame: &DataFrame,
     source: &Source,
     reading: &Reading<'_>,
