@@ -1,8 +1,8 @@
-//! One simulated set: fields shared by its images, fields of each image, and each galaxy.
+//! One simulated set: the shear field of all of its images, the intrinsic ellipticities and PSFs of each image, and the
+//! drawing of each galaxy.
 //!
-//! Random numbers come from ChaCha8 streams: the key is (seed, set, image, purpose), the stream the
-//! galaxy's place on the grid. What a galaxy is like therefore does not depend on the order or the
-//! thread in which it is drawn.
+//! Random numbers come from ChaCha8 streams with the key (seed, set, image, purpose) and, for galaxies, the index on the grid
+//! as the number of the stream. A galaxy therefore does not depend on the order or the thread in which it is drawn.
 
 use std::ops::RangeInclusive;
 
@@ -34,18 +34,28 @@ pub const STAMP: usize = 48;
 /// Noise per pixel; images are scaled so that it is one.
 pub const NOISE_SIGMA: f64 = 1.0;
 // Per component, by default. Chosen by hand: GREAT10 did not publish it.
-const INTRINSIC_SIGMA: f64 = 0.14;
+const DEFAULT_INTRINSIC_SIGMA: f64 = 0.14;
 // Larger intrinsic ellipticities are scaled back to this modulus. Chosen by hand.
-const MAX_INTRINSIC: f64 = 0.7;
+const MAX_INTRINSIC_MODULUS: f64 = 0.7;
 // Beyond it shears are not weak, and with intrinsic shapes ellipticities could exceed 1.
 const MAX_SHEAR: f64 = 0.5;
-// In pixels, of every PSF. Chosen by hand.
-const FWHM: f64 = 3.4;
+// Of PSFs, where it does not vary. Chosen by hand.
+const PSF_FWHM_PX: f64 = 3.4;
+// Relative amplitude of the FWHM over the field of a variable PSF. Chosen by hand.
+const PSF_FWHM_VARIATION: f64 = 0.1;
+// |ε| of fixed PSFs, and of variable Moffat PSFs, which cancel partly over the field. Chosen by hand.
+const FIXED_PSF_ELLIPTICITY: f64 = 0.025;
+const VARIABLE_PSF_ELLIPTICITY: f64 = 0.05;
+// |ε| of turbulent PSFs: rms over the field, and the largest value. Chosen by hand.
+const TURBULENT_PSF_RMS: f64 = 0.03;
+const MAX_TURBULENT_PSF_ELLIPTICITY: f64 = 0.2;
+// Standard deviation of ln(size) in sets 17 and 18. Chosen by hand.
+const SIZE_SCATTER: f64 = 0.2;
 // Range of S/N in the "smooth" sets. Chosen by hand.
 const SNR_RANGE: (f64, f64) = (10.0, 80.0);
 
 // Galaxies a side: scoring needs 8 or more, and an image of 400² stamps has 1.5 GB.
-const SIDES: RangeInclusive<usize> = 8..=400;
+const GRID_SIDES: RangeInclusive<usize> = 8..=400;
 
 // Beyond these tilts all power lies in one mode or none.
 const TILTS: RangeInclusive<f64> = -20.0..=20.0;
@@ -53,8 +63,8 @@ const TILTS: RangeInclusive<f64> = -20.0..=20.0;
 // Factors on bandpowers: beyond these, most sets have all power in one bandpower.
 const SCATTERS: RangeInclusive<f64> = 1.0..=100.0;
 
-/// What a simulation is made from, beside the sets and images asked for. Wherever it is read from, it is
-/// checked by [`SimulationSettings::validate`].
+/// Settings of a simulation apart from the list of sets and images. Reading them checks them by
+/// [`SimulationSettings::validate`].
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(remote = "Self", deny_unknown_fields)]
 pub struct SimulationSettings {
@@ -95,7 +105,7 @@ enum Purpose {
     Bandpowers = 5,
 }
 
-// Image number in the key of streams that the whole set shares; images count from 1.
+// Stands for the image in keys of streams that all images of a set share. Images count from 1, so no image has it.
 const WHOLE_SET: u32 = 0;
 
 impl SimulationSettings {
@@ -104,7 +114,7 @@ impl SimulationSettings {
             seed,
             grid,
             spectrum: ShearSpectrum::default(),
-            intrinsic_sigma: INTRINSIC_SIGMA,
+            intrinsic_sigma: DEFAULT_INTRINSIC_SIGMA,
             constant_shear: None,
             rotated: false,
         }
@@ -132,8 +142,8 @@ impl SimulationSettings {
                 )));
             }
         }
-        if !SIDES.contains(&grid) {
-            let (least, most) = (SIDES.start(), SIDES.end());
+        if !GRID_SIDES.contains(&grid) {
+            let (least, most) = (GRID_SIDES.start(), GRID_SIDES.end());
             return Err(SettingsError(format!(
                 "the simulation has {grid} galaxies a side; expected {least} to {most}"
             )));
@@ -210,7 +220,8 @@ impl std::fmt::Debug for SetSimulator {
     }
 }
 
-/// Properties of a galaxy that a study varies while all random numbers stay the same.
+/// A galaxy's properties that a study varies with all random numbers fixed: differences between versions are then free of
+/// shape noise and pixel noise.
 #[derive(Debug, Clone, Copy)]
 pub struct Version {
     pub intrinsic: Shear,
@@ -220,7 +231,7 @@ pub struct Version {
     pub noise: f32,
 }
 
-/// What is common to all galaxies of one image.
+/// Intrinsic ellipticities and PSFs over the grid of one image.
 pub struct ImageFields {
     pub image: u32,
     /// Unlensed shear-type ellipticities, `[ix, iy]`.
@@ -255,7 +266,7 @@ impl SetSimulator {
             }
         };
         let strongest = shear.iter().map(|g| g.norm()).fold(0.0, f64::max);
-        // NaN passes the first comparison.
+        // Comparisons with NaN are false, so that the first one alone would accept it.
         if strongest > MAX_SHEAR || shear.iter().any(|g| !g.norm().is_finite()) {
             return Err(shearq_scoring::ScoringError::StrongShear {
                 found: strongest,
@@ -305,15 +316,16 @@ impl SetSimulator {
 
     /// Draws the fields of image `image` (from 1).
     pub fn image_fields(&self, image: u32) -> ImageFields {
-        let number = |variability| match variability {
+        let image_key = |variability| match variability {
             Variability::Fixed => WHOLE_SET,
             Variability::Variable => image,
         };
         let set = self.kind.set;
-        let mut rng = self
-            .settings
-            .stream(set, number(self.kind.ellipticity), Purpose::Intrinsic);
-        // A white B-mode field: σ² per component and cell is half the power of both modes.
+        let mut rng =
+            self.settings
+                .stream(set, image_key(self.kind.ellipticity), Purpose::Intrinsic);
+        // As in GREAT10, intrinsic ellipticities are B modes only, which do not add to the E-mode power that is scored. The
+        // variance σ² of a component is half of the power per cell.
         let cell = (self.grid.side().0 / self.grid.n as f64).powi(2);
         let power = 2.0 * self.settings.intrinsic_sigma.powi(2) * cell;
         let mut intrinsic = random_field(&self.decomposer, &mut rng, Content::BOnly, |_| {
@@ -321,8 +333,8 @@ impl SetSimulator {
         });
         intrinsic.mapv_inplace(|e| {
             let modulus = e.norm();
-            let e = if modulus > MAX_INTRINSIC {
-                e * (MAX_INTRINSIC / modulus)
+            let e = if modulus > MAX_INTRINSIC_MODULUS {
+                e * (MAX_INTRINSIC_MODULUS / modulus)
             } else {
                 e
             };
@@ -330,7 +342,7 @@ impl SetSimulator {
         });
         let mut rng = self
             .settings
-            .stream(set, number(self.kind.psf), Purpose::Psf);
+            .stream(set, image_key(self.kind.psf), Purpose::Psf);
         ImageFields {
             image,
             intrinsic,
@@ -338,10 +350,9 @@ impl SetSimulator {
         }
     }
 
-    /// Fixed PSF: one, of small ellipticity in a direction of the set's own. Variable PSF: an
-    /// ellipticity of modulus 0.05 turning over the field and a FWHM varying by ± 10 %, with phases
-    /// and directions of the image's own; for Kolmogorov a turbulent random field of ellipticity
-    /// instead, power ∝ ℓ^(−11/3).
+    // A fixed PSF has one small ellipticity in a random direction. Variable PSFs have an ellipticity that rotates over the
+    // field and a FWHM that varies, with random phases. Kolmogorov PSFs have a random field of ellipticity with the power
+    // ∝ ℓ^(−11/3) of turbulence instead.
     fn psf_field(&self, rng: &mut ChaCha8Rng) -> PsfField {
         let profile = psf_profile(self.kind);
         let tau = std::f64::consts::TAU;
@@ -351,7 +362,10 @@ impl SetSimulator {
         };
         if self.kind.psf == Variability::Fixed {
             let angle = rng.random_range(0.0..tau);
-            return PsfField::One(psf(FWHM, Complex64::from_polar(0.025, angle)));
+            return PsfField::One(psf(
+                PSF_FWHM_PX,
+                Complex64::from_polar(FIXED_PSF_ELLIPTICITY, angle),
+            ));
         }
         let n = self.grid.n;
         let phases: [f64; 4] = std::array::from_fn(|_| rng.random_range(0.0..tau));
@@ -365,17 +379,20 @@ impl SetSimulator {
                 l.powf(-11.0 / 3.0)
             });
             let mean_square = field.iter().map(|e| e.norm_sqr()).sum::<f64>() / field.len() as f64;
-            // Scaled to an rms of 0.03, and no more than 0.2 anywhere.
+            // Limited, because a Gaussian field has no largest value, and an |ε| near 1 has no PSF.
             field.mapv(|e| {
-                let e = e * (0.03 / mean_square.sqrt());
-                e * (0.2 / e.norm()).min(1.0)
+                let e = e * (TURBULENT_PSF_RMS / mean_square.sqrt());
+                e * (MAX_TURBULENT_PSF_ELLIPTICITY / e.norm()).min(1.0)
             })
         });
         PsfField::PerGalaxy(Array2::from_shape_fn((n, n), |(ix, iy)| {
-            let fwhm = FWHM * (1.0 + 0.1 * wave(phases[0], ix, iy, 1.0).sin());
+            let fwhm =
+                PSF_FWHM_PX * (1.0 + PSF_FWHM_VARIATION * wave(phases[0], ix, iy, 1.0).sin());
             let e = match &turbulence {
                 Some(field) => field[(ix, iy)],
-                None => Complex64::from_polar(0.05, wave(phases[1], ix, iy, 1.5)),
+                None => {
+                    Complex64::from_polar(VARIABLE_PSF_ELLIPTICITY, wave(phases[1], ix, iy, 1.5))
+                }
             };
             psf(fwhm, e)
         }))
@@ -427,7 +444,7 @@ impl SetSimulator {
             .of(fields.psf.at(ix, iy))
             .expect("all PSFs of a set have one profile");
         self.renderer.render(&galaxy, &psf, (x, y), scratch, out);
-        // Lensing leaves the flux as it is: S/N is that of the galaxy before.
+        // The S/N is defined before lensing: it sets the flux, which shear does not change.
         let (unlensed, _) = self.galaxy(version.intrinsic, (Shear::ZERO, 1.0), &mut again);
         let scale = (snr * NOISE_SIGMA / power(&unlensed, &psf).sqrt()) as f32;
         let sigma = version.noise * NOISE_SIGMA as f32;
@@ -478,7 +495,7 @@ impl SetSimulator {
         Shear::new(e.re, e.im).sheared_by(self.shear_at(ix, iy))
     }
 
-    /// The galaxy of the set's kind, of an intrinsic ellipticity, under a shear and with radii times `size`, and its S/N.
+    // The galaxy and its S/N; radii are multiplied by `size`.
     fn galaxy(
         &self,
         intrinsic: Shear,
@@ -486,6 +503,7 @@ impl SetSimulator {
         rng: &mut ChaCha8Rng,
     ) -> (Galaxy, f64) {
         let shape = intrinsic.sheared_by(shear);
+        // Half-light radii in pixels before the PSF. Chosen by hand.
         let (mut bulge, mut disc) = match self.kind.image {
             ImageType::SmallGalaxy => (1.8, 2.6),
             ImageType::LargeGalaxy => (3.4, 10.0),
@@ -496,14 +514,14 @@ impl SetSimulator {
         let mut snr = self.nominal_snr();
         match self.kind.image {
             ImageType::SmoothSnr => {
-                // Rayleigh with its mode at 20.
+                // A Rayleigh distribution with its mode at the nominal S/N.
                 let u: f64 = rng.random_range(f64::EPSILON..1.0);
                 snr = (snr * (-2.0 * u.ln()).sqrt()).clamp(SNR_RANGE.0, SNR_RANGE.1);
             }
             ImageType::SmoothGalaxy => {
-                // Log-normal sizes, 20 % wide, about the fiducial.
+                // Log-normal about the fiducial sizes.
                 let draw: f64 = StandardNormal.sample(rng);
-                let scale = (0.2 * draw).exp();
+                let scale = (SIZE_SCATTER * draw).exp();
                 bulge *= scale;
                 disc *= scale;
             }
@@ -564,7 +582,8 @@ mod tests {
             let set = SetSimulator::new(kind, settings).unwrap();
             let mut fields = set.image_fields(1);
             // A round PSF: only the galaxies turn.
-            let round = FunctionalPsf::new(psf_profile(kind), FWHM, Shear::new(0.0, 0.0)).unwrap();
+            let round =
+                FunctionalPsf::new(psf_profile(kind), PSF_FWHM_PX, Shear::new(0.0, 0.0)).unwrap();
             fields.psf = PsfField::One(round);
             let mut scratch = RenderScratch::new();
             let version = |e: Complex64| Version {
