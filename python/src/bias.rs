@@ -106,7 +106,7 @@ pub(crate) enum Given<'py> {
     Table(String, Vec<(String, Bound<'py, PyAny>)>),
 }
 
-// Of all, of each table by its name, or in a file.
+// One shear of all catalogues, one of each by its name, or a file of true shears.
 #[derive(FromPyObject)]
 pub(crate) enum GivenTruth {
     Constant((f64, f64)),
@@ -122,7 +122,7 @@ pub(crate) struct BiasSums {
 
 #[pymethods]
 impl BiasSums {
-    /// From what `to_json` returned.
+    /// Sums that `to_json` returned.
     #[staticmethod]
     fn from_json(text: &str) -> PyResult<Self> {
         let summed: Summed = serde_json::from_str(text)
@@ -131,13 +131,13 @@ impl BiasSums {
         Ok(BiasSums { summed })
     }
 
-    /// All that it consists of.
+    /// The sums as JSON, to store or to send to another process.
     fn to_json(&self) -> PyResult<String> {
         serde_json::to_string(&self.summed)
             .map_err(|error| PyValueError::new_err(error.to_string()))
     }
 
-    /// These and the sums of other catalogues, which follow.
+    /// The sums of these catalogues and of others.
     fn append(&self, other: &BiasSums) -> PyResult<Self> {
         let mut summed = self.summed.clone();
         summed.append(other.summed.clone()).map_err(of_bias)?;

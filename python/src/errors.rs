@@ -7,7 +7,7 @@ use shearq_pipeline::PipelineError;
 use shearq_scoring::ScoringError;
 use shearq_submissions::ConfigurationError;
 
-/// Errors about stamps, PSFs, the noise or the configuration.
+// The argument that the user can change comes first. Errors of a method are about its PSF unless they state something else.
 pub(crate) fn of_measuring(error: MeasureError) -> PyErr {
     let argument = match error {
         MeasureError::Configuration(error) => return of_configuration(error),
@@ -24,7 +24,7 @@ pub(crate) fn of_measuring(error: MeasureError) -> PyErr {
     PyValueError::new_err(format!("{argument}: {error}"))
 }
 
-/// Errors about the name or the settings of a configuration.
+// An unknown name is a KeyError, as for a dictionary.
 pub(crate) fn of_configuration(error: ConfigurationError) -> PyErr {
     let message = format!("submission: {error}");
     match error {
@@ -33,12 +33,11 @@ pub(crate) fn of_configuration(error: ConfigurationError) -> PyErr {
     }
 }
 
-/// Errors of scoring.
 pub(crate) fn of_scoring(error: ScoringError) -> PyErr {
     PyValueError::new_err(error.to_string())
 }
 
-/// Errors of the engine.
+// What is not a fault of an argument, such as threads that cannot start, is a RuntimeError.
 pub(crate) fn of_pipeline(error: PipelineError) -> PyErr {
     match error {
         PipelineError::Measure(error) => of_measuring(error),
@@ -48,7 +47,8 @@ pub(crate) fn of_pipeline(error: PipelineError) -> PyErr {
     }
 }
 
-/// Options of the command line whose arguments in Python have other names or values.
+// Messages of the crates advise with options of the command line; these have other names or values in Python. Longer options
+// come first, because they contain shorter ones.
 const OPTIONS: [(&str, &str); 5] = [
     ("--drop-missing", "drop_missing=True"),
     ("--truth-sign standard", "truth_sign=\"standard\""),
@@ -58,7 +58,6 @@ const OPTIONS: [(&str, &str); 5] = [
     (" --", " "),
 ];
 
-/// A message of the command line with the arguments of Python for its options.
 pub(crate) fn in_python(message: &str) -> String {
     let options = OPTIONS.iter();
     options.fold(message.to_owned(), |text, (option, argument)| {
@@ -66,7 +65,7 @@ pub(crate) fn in_python(message: &str) -> String {
     })
 }
 
-/// A failed allocation.
+// Reserving the largest arrays first turns an absurd number of images into an exception instead of an abort of the interpreter.
 pub(crate) fn no_memory(what: &str) -> PyErr {
     PyMemoryError::new_err(format!("there is no memory for {what}"))
 }

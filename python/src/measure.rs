@@ -23,7 +23,6 @@ use crate::stamps::{Borrowed, Stamps};
 use crate::submissions::Configuration;
 use crate::work::{Failure, Watch, threads};
 
-/// PSFs of all stamps.
 enum AllPsfs<'a> {
     Shared {
         psf: ArcArray2<f64>,
@@ -35,7 +34,7 @@ enum AllPsfs<'a> {
 }
 
 impl<'a> AllPsfs<'a> {
-    /// The PSFs of some galaxies.
+    // Rows of the image are read one after another, so that converted stars are not in memory all at once.
     fn slice(&self, range: Range<usize>) -> PyResult<Psfs<'a>> {
         Ok(match self {
             AllPsfs::Shared { psf, .. } => Psfs::Prepared(psf.clone()),
@@ -45,7 +44,8 @@ impl<'a> AllPsfs<'a> {
     }
 }
 
-/// The catalogue, the warnings, an error if all galaxies are flagged, and the frame.
+// The columns, the warnings, an error if all galaxies are flagged, and the frame. The Python package decides about the error,
+// after it has issued the warnings that explain it.
 type Catalogue<'py> = (Bound<'py, PyDict>, Vec<String>, Option<String>, String);
 
 /// Measures stamps `(n, ny, nx)`.
@@ -120,6 +120,7 @@ pub(crate) fn measure<'py>(
         .map(|warning| format!("stamps: no galaxy could be measured: {warning}"));
     let warnings = batch.warnings.iter().map(Warning::to_string).collect();
     let columns = catalogue(py, configuration, &batch.galaxies)?;
+    // A column although it is one number per call: tables of several images can then be concatenated.
     if configuration.linear().is_some() {
         let [m, c] = batch.psf_noise.unwrap_or_default();
         for (name, value) in [("psf_m", m), ("psf_c", c)] {
@@ -129,7 +130,7 @@ pub(crate) fn measure<'py>(
     Ok((columns, warnings, all_flagged, batch.frame.to_string()))
 }
 
-/// Measures and calibrates all galaxies.
+// By the same engine as the command line, so that arrays and files have equal results.
 fn measured<'a>(
     measurer: &Measurer,
     mut source: ArraySource<'a, PipelineError>,
@@ -164,11 +165,11 @@ fn measured<'a>(
         },
     )?;
     watch.report()?;
-    // No stamps have no rows.
+    // Without stamps there is no row, and no image was finished.
     Ok(whole.unwrap_or_default().checked()?)
 }
 
-/// A star for all galaxies.
+// Cut once here, not once per row.
 fn star_for_all<'a>(measurer: &Measurer, star: ArrayView2<'_, f64>) -> PyResult<AllPsfs<'a>> {
     let cut = measurer.configuration().psf_cut();
     let found = shearq_measure::Star::cut(star, cut).map_err(of_measuring)?;
@@ -178,7 +179,7 @@ fn star_for_all<'a>(measurer: &Measurer, star: ArrayView2<'_, f64>) -> PyResult<
     })
 }
 
-/// A star for each of `count` galaxies.
+// Sizes are checked before the work, which would flag each galaxy with `BadPsf`.
 fn star_of_each<'a>(
     measurer: &Measurer,
     stars: &'a Borrowed<'_>,
@@ -197,7 +198,6 @@ fn star_of_each<'a>(
     Ok(AllPsfs::Stars(stars.shared()))
 }
 
-/// One formula, or one for each of `count` galaxies.
 fn formula_psfs<'a>(
     measurer: &Measurer,
     rows: ArrayView2<'_, f64>,
@@ -213,7 +213,6 @@ fn formula_psfs<'a>(
     Ok(AllPsfs::Shared { psf, moved: None })
 }
 
-/// Checks that there is one for each stamp.
 fn one_each(argument: &str, found: usize, count: usize) -> PyResult<()> {
     if found == count {
         return Ok(());
@@ -223,7 +222,7 @@ fn one_each(argument: &str, found: usize, count: usize) -> PyResult<()> {
     )))
 }
 
-/// PSFs from rows of FWHM, e1, e2 and β.
+// Rows are FWHM, e1, e2 and β, with NaN for Kolmogorov.
 fn formulas(rows: ArrayView2<'_, f64>) -> Result<Vec<FunctionalPsf>, MeasureError> {
     let formula = |row: ndarray::ArrayView1<'_, f64>| {
         let profile = match row[3] {
@@ -239,7 +238,7 @@ fn formulas(rows: ArrayView2<'_, f64>) -> Result<Vec<FunctionalPsf>, MeasureErro
     rows.outer_iter().map(formula).collect()
 }
 
-/// The columns of a catalogue, by name.
+// The list of columns is the pipeline's, so that files and arrays have the same ones.
 fn catalogue<'py>(
     py: Python<'py>,
     configuration: &shearq_submissions::Configuration,
@@ -264,7 +263,7 @@ fn catalogue<'py>(
     Ok(columns)
 }
 
-/// The mean shear: g1 and g2, their covariance, the mean responses R11 and R22, R12 and R21, and the number of galaxies.
+// g1 and g2, their covariance, the mean R11 and R22, R12 and R21, and the number of galaxies.
 type Mean = ([f64; 2], [[f64; 2]; 2], [f64; 2], [f64; 2], usize);
 
 /// The mean shear of galaxies without flags from columns e1, e2, (R11, R22, R12, R21) and weights of one length. The covariance
@@ -293,6 +292,7 @@ pub(crate) fn mean_shear(
         shares[place as usize][0] += weight * r11;
         shares[place as usize][1] += weight * r22;
     }
+    // Galaxies behind one star share its noise, so that their errors do not average: each star adds with its share of the response.
     let mut noise = Stars::default();
     for ([star, m, c], share) in stars.into_iter().zip(shares) {
         let star = format!("{star:.0}");

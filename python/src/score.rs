@@ -30,12 +30,10 @@ pub(crate) fn metrics() -> Vec<(&'static str, &'static str, &'static str)> {
         .collect()
 }
 
-/// A grid of `n` cells a side.
 fn grid(n: usize, stamp: f64, field_degrees: f64) -> PyResult<Grid> {
     Grid::new(n, Pixels(stamp), Degrees(field_degrees)).map_err(of_scoring)
 }
 
-/// A bandpower definition by its name.
 fn definition(name: &str) -> PyResult<Definition> {
     match name {
         "leaderboard" => Ok(Definition::Leaderboard),
@@ -46,7 +44,6 @@ fn definition(name: &str) -> PyResult<Definition> {
     }
 }
 
-/// A convention, or how to choose one, by its name.
 fn choice(name: &str) -> PyResult<Choice> {
     let number = || Convention::try_from(name.parse::<u8>().ok()?).ok();
     match name {
@@ -60,10 +57,9 @@ fn choice(name: &str) -> PyResult<Choice> {
     }
 }
 
-/// Two columns of one length.
 type Pair<'py> = (PyReadonlyArray1<'py, f64>, PyReadonlyArray1<'py, f64>);
 
-/// Rows of images, one after the other, at positions or in the order of the grid.
+// Images one after the other, `lengths` rows each. Without positions, rows are in the order of the grid.
 struct Rows<'a> {
     e1: ArrayView1<'a, f64>,
     e2: ArrayView1<'a, f64>,
@@ -81,12 +77,13 @@ impl<'a> Rows<'a> {
         }
     }
 
-    /// Gives each image on the grid to `take`, with how its rows were used.
+    // One image on the grid at a time: all images of a set would take gigabytes.
     fn each(
         &self,
         grid: &Grid,
         mut take: impl FnMut(&FieldSum, RowCounts) -> PyResult<()>,
     ) -> PyResult<()> {
+        // The sum is checked for overflow, because the lengths come from the caller and index the arrays below.
         let count = self.e1.len();
         let fits = self
             .lengths
@@ -127,7 +124,7 @@ impl<'a> Rows<'a> {
     }
 }
 
-/// What to do about numbers that stand for a failed measurement: arrays have NaN for what is missing.
+// Ends messages about numbers that stand for failed measurements. Arrays have NaN where a measurement is missing.
 const ADVICE: &str = "try drop_missing=True or set it to NaN";
 
 fn of_rows(fault: &str) -> PyErr {
@@ -177,6 +174,7 @@ pub(crate) fn score<'py>(
     let given = truth_sign.map(sign_of).transpose()?;
     let catalogue = Rows::new(&e, positions.as_ref(), lengths);
     let (scored, mut warnings, challenge) = py.detach(|| {
+        // One row more than the grid has, so that a truth that is too long is an error.
         let truth = g1.iter().zip(&g2).take(grid.cells() + 1).enumerate();
         let truth = truth.map(|(k, (&e1, &e2))| {
             let (x, y) = grid.centre(k % n, k / n);
@@ -228,6 +226,7 @@ pub(crate) fn score<'py>(
         };
         let scorer = SetScorer::new(grid, truth, options).map_err(of_scoring)?;
         let scored = scorer.score(&images).map_err(of_scoring)?;
+        // A second pass, because images are compared with the truth in the convention that the first pass found.
         let mut faults = ImageFaults::default();
         catalogue.each(&grid, |image, _| {
             faults.add(image);
@@ -239,7 +238,7 @@ pub(crate) fn score<'py>(
         let faults_of_set = scorer.diagnose(&images, &scored, scored.chosen);
         for fault in faults_of_set.map_err(of_scoring)? {
             let told = match fault {
-                // The Python package words it.
+                // The Python package words this one, with the name of its argument.
                 Fault::Convention { .. } => true,
                 Fault::Uncorrelated { .. } => !faults.copies.is_empty(),
                 _ => false,
@@ -266,6 +265,7 @@ pub(crate) fn score<'py>(
     };
     found.set_item("metrics", by_name(&scored.metrics)?)?;
     found.set_item("errors", by_name(&scored.errors)?)?;
+    // For paired differences of two methods (`difference`), whose common noise cancels.
     let replicates: Vec<f64> = scored.replicates.iter().flat_map(Metrics::values).collect();
     let replicates = Array2::from_shape_vec((scored.replicates.len(), names.len()), replicates)
         .map_err(|error| PyValueError::new_err(error.to_string()))?;
@@ -307,7 +307,6 @@ pub(crate) fn score<'py>(
     Ok(found)
 }
 
-/// What is known of the bins alone.
 fn bins<'py>(py: Python<'py>, bins: &Bins) -> PyResult<Bound<'py, PyDict>> {
     let found = PyDict::new(py);
     found.set_item("l", bins.l.to_pyarray(py))?;
@@ -344,7 +343,7 @@ pub(crate) fn spectrum<'py>(
             counts += rows;
             images.add(image).map_err(of_scoring)
         })?;
-        // Any field has a spectrum, but not numbers for failures.
+        // Other faults of rows are no errors here, because any field has a spectrum.
         let failed = (counts.sentinels > 0).then(|| foreign::fault_of_rows(&counts, &grid, ADVICE));
         if let Some(fault) = failed.flatten() {
             return Err(of_rows(&fault));

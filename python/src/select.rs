@@ -10,7 +10,7 @@ use pyo3::prelude::*;
 use shearq_files::FileError;
 use shearq_results::select::{Weighted, smooth_selection};
 
-/// Columns of a catalogue after a selection: e1, e2, R11, R22, R12 and R21 before calibration, and the weight.
+// e1, e2, R11, R22, R12 and R21 before calibration, and the weight.
 type Selected<'py> = [Bound<'py, PyArray1<f64>>; 7];
 
 /// Applies cuts and a weight to the columns of a catalogue.
@@ -23,6 +23,7 @@ pub(crate) fn select<'py>(
 ) -> PyResult<Selected<'py>> {
     let fault = |error: &dyn std::fmt::Display| PyValueError::new_err(error.to_string());
     let selection = smooth_selection(condition, weight).map_err(|error| fault(&error))?;
+    // Stands for the file in messages.
     let path = Path::new("catalogue");
     let column = |name: &str| {
         let found = columns.get(name).and_then(|values| values.as_slice().ok());

@@ -19,10 +19,9 @@ use shearq_simulate::set::{
 use crate::errors::{no_memory, of_pipeline};
 use crate::work::{Failure, Watch, threads};
 
-/// Numbers of a functional PSF: FWHM, e1, e2 and β.
+// FWHM, e1, e2 and β.
 const FORMULA: usize = 4;
 
-/// One row of galaxies, drawn.
 struct Drawn {
     pixels: Vec<f32>,
     stars: Vec<f32>,
@@ -63,6 +62,7 @@ pub(crate) fn simulate<'py>(
         .detach(|| simulator(set, settings))
         .map_err(of_pipeline)?;
     let cells = grid * grid;
+    // Reserved before the work: memory that is missing is an exception at once, not after minutes.
     let mut pixels: Vec<f32> = Vec::new();
     let wanted = images
         .len()
@@ -126,7 +126,7 @@ pub(crate) fn simulate<'py>(
     Ok(found)
 }
 
-/// A row of stamps with their PSFs. A PSF for all galaxies comes with the first row only.
+// A PSF for all galaxies comes with the first row only, so that arrays of PSFs have one element per PSF.
 fn draw(set: &SetSimulator, fields: &ImageFields, iy: usize, scratch: &mut RenderScratch) -> Drawn {
     let n = set.grid().n;
     let mut pixels = vec![0.0; n * STAMP * STAMP];
@@ -152,6 +152,7 @@ fn draw(set: &SetSimulator, fields: &ImageFields, iy: usize, scratch: &mut Rende
 }
 
 fn formula(psf: &FunctionalPsf) -> [f64; FORMULA] {
+    // NaN stands for Kolmogorov, which has no β, so that the array has one type.
     let beta = match psf.profile {
         PsfProfile::Moffat { beta } => beta,
         PsfProfile::Kolmogorov => f64::NAN,

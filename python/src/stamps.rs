@@ -1,4 +1,5 @@
-//! Stamps of Python: viewed without a copy if possible, otherwise converted row by row.
+//! Stamps in numpy arrays, which are viewed without a copy if possible. Others are converted one row of the image at a time, so
+//! that a memory-mapped FITS file, whose bytes are big-endian, is never in memory as a whole.
 
 use std::ops::Range;
 
@@ -9,7 +10,7 @@ use pyo3::prelude::*;
 use pyo3::types::PySlice;
 use shearq_measure::Pixels;
 
-/// A borrowed array `(n, ny, nx)`.
+// Of shape `(n, ny, nx)`.
 pub(crate) enum Borrowed<'py> {
     Single(PyReadonlyArray3<'py, f32>),
     Double(PyReadonlyArray3<'py, f64>),
@@ -18,16 +19,12 @@ pub(crate) enum Borrowed<'py> {
 }
 
 impl<'py> Borrowed<'py> {
-    /// Borrows an array of three axes.
-    ///
-    /// # Errors
-    /// If it has another number of axes.
     pub(crate) fn new(array: &Bound<'py, PyAny>) -> PyResult<Self> {
         let array = array.cast::<PyUntypedArray>()?;
         if array.ndim() != 3 {
             return Err(PyTypeError::new_err("expected an array of three axes"));
         }
-        // Views of unaligned memory are undefined.
+        // Rust references to unaligned floats are undefined behaviour.
         if array.is_aligned() {
             if let Ok(single) = array.cast::<PyArray3<f32>>() {
                 return Ok(Borrowed::Single(single.try_readonly()?));
@@ -39,7 +36,6 @@ impl<'py> Borrowed<'py> {
         Ok(Borrowed::Other(array.clone()))
     }
 
-    /// Number of stamps, rows and columns.
     pub(crate) fn dim(&self) -> (usize, usize, usize) {
         match self {
             Borrowed::Single(array) => array.as_array().dim(),
@@ -51,7 +47,7 @@ impl<'py> Borrowed<'py> {
         }
     }
 
-    /// The form that threads without the interpreter share.
+    // Without references to the interpreter, so that threads can use it while the interpreter is released.
     pub(crate) fn shared(&self) -> Stamps<'_> {
         match self {
             Borrowed::Single(array) => Stamps::Single(array.as_array()),
@@ -61,7 +57,6 @@ impl<'py> Borrowed<'py> {
     }
 }
 
-/// Many stamps.
 pub(crate) enum Stamps<'a> {
     Single(ArrayView3<'a, f32>),
     Double(ArrayView3<'a, f64>),
@@ -69,12 +64,9 @@ pub(crate) enum Stamps<'a> {
 }
 
 impl<'a> Stamps<'a> {
-    /// Some of the stamps. Converting them requires the interpreter.
-    ///
-    /// # Errors
-    /// An exception of the conversion.
+    // Only `Other` needs the interpreter, for numpy's `astype`, which knows all of its types.
     pub(crate) fn slice(&self, range: Range<usize>) -> PyResult<Pixels<'a, Ix3>> {
-        // Copies of the views live longer than this borrow.
+        // Views are copied (not their pixels), because the result outlives this borrow.
         Ok(match self {
             Stamps::Single(all) => Pixels::from(*all).into_slice(range),
             Stamps::Double(all) => Pixels::from(*all).into_slice(range),

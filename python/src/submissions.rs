@@ -1,4 +1,4 @@
-//! Named configurations, and those of one's own.
+//! Configurations of the measurement, by name, file or settings.
 
 use std::path::Path;
 
@@ -8,10 +8,11 @@ use shearq_submissions::{EllipticityType, Entry, NoiseSource, PsfForm, Published
 
 use crate::errors::of_configuration;
 
-/// What a text of settings is called where it does not name itself.
+// The name of settings that state none.
 const OWN: &str = "own";
 
-/// Settings as JSON, what they extend, and Q, M/2 and √A·10⁴ as published.
+// Settings as JSON, what they extend, and the published Q, M/2 and √A·10⁴. Plain types, which pickle stores for processes of dask
+// or multiprocessing.
 type Parts = (String, Option<String>, Option<(f64, f64, f64)>);
 
 /// Settings of a configuration, resolved.
@@ -45,15 +46,16 @@ impl Configuration {
     #[staticmethod]
     fn json(text: &str) -> PyResult<Self> {
         let wrong = |error: String| {
-            PyValueError::new_err(format!("submission: settings that are none: {error}"))
+            PyValueError::new_err(format!("submission: not valid settings: {error}"))
         };
         let value: toml::Table =
             serde_json::from_str(text).map_err(|error| wrong(error.to_string()))?;
+        // By way of TOML, so that JSON may have `extends` and gets the same checks and messages.
         let text = toml::to_string(&value).map_err(|error| wrong(error.to_string()))?;
         Self::text(&text)
     }
 
-    /// The configuration of which `parts` are the parts.
+    /// The configuration with these `parts`.
     #[staticmethod]
     fn restored(parts: Parts) -> PyResult<Self> {
         let (settings, extends, published) = parts;
@@ -69,7 +71,7 @@ impl Configuration {
         })
     }
 
-    /// All that it consists of, for pickle.
+    /// Its state, for pickle.
     #[getter]
     fn parts(&self) -> PyResult<Parts> {
         Ok((

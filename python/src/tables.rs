@@ -12,6 +12,7 @@ use shearq_files::frames::polars::Column;
 use shearq_files::frames::{frame, reals};
 use shearq_files::table::{self, FileFormat, MAX_ROWS};
 
+// Python's own exception for a wrong path, because scripts catch it.
 fn of_file(path: &std::path::Path, error: &FileError) -> PyErr {
     if path.exists() {
         PyValueError::new_err(error.to_string())
@@ -20,7 +21,6 @@ fn of_file(path: &std::path::Path, error: &FileError) -> PyErr {
     }
 }
 
-/// The format of the name of a format.
 fn format(name: &str) -> PyResult<FileFormat> {
     match name {
         "parquet" => Ok(FileFormat::Parquet),
@@ -49,6 +49,7 @@ pub(crate) fn read_table<'py>(
     let columns = PyDict::new(py);
     for column in read.columns() {
         let (name, series) = (column.name().as_str(), column.as_materialized_series());
+        // numpy has no missing integers: a column with nulls becomes floats with NaN.
         if let Ok(whole) = series.i64()
             && whole.null_count() == 0
         {

@@ -8,10 +8,10 @@ use shearq_pipeline::PipelineError;
 
 use crate::errors::of_pipeline;
 
-/// Period of calls to Python. Attaching to the interpreter may wait for its other threads.
+// Between calls to Python. Attaching to the interpreter may wait for its other threads, which would slow the measurement. Chosen
+// by hand: Ctrl-C still seems immediate.
 const PERIOD: Duration = Duration::from_millis(50);
 
-/// Worker threads: the given number, or one per core.
 pub(crate) fn threads(asked: Option<u16>) -> usize {
     asked.map_or_else(
         || std::thread::available_parallelism().map_or(1, usize::from),
@@ -19,18 +19,18 @@ pub(crate) fn threads(asked: Option<u16>) -> usize {
     )
 }
 
-/// An exception of any thread that stops the work.
+// The first exception of a callback or a conversion, in any thread. The engine's errors cannot contain it, because the crates
+// below do not depend on Python.
 #[derive(Default)]
 pub(crate) struct Failure(Mutex<Option<PyErr>>);
 
 impl Failure {
-    /// Keeps an exception, and returns the error that stops the engine.
     pub(crate) fn keep(&self, error: PyErr) -> PipelineError {
         *self.0.lock().unwrap_or_else(PoisonError::into_inner) = Some(error);
         PipelineError::Interrupted
     }
 
-    /// The result of the work, or the exception that stopped it.
+    // The exception first: the engine reports only that it was interrupted.
     pub(crate) fn or<T>(self, result: Result<T, PipelineError>) -> PyResult<T> {
         match self.0.into_inner().unwrap_or_else(PoisonError::into_inner) {
             Some(error) => Err(error),
@@ -39,8 +39,8 @@ impl Failure {
     }
 }
 
-/// Calls back with the number of galaxies done since the last call, and checks signals such as Ctrl-C. For the thread
-/// that called from Python.
+// Calls back with the number of galaxies since the last call, and checks signals such as Ctrl-C, which Python handles only in
+// the thread that called.
 pub(crate) struct Watch<'a> {
     callback: Option<Py<PyAny>>,
     failure: &'a Failure,
@@ -58,7 +58,6 @@ impl<'a> Watch<'a> {
         }
     }
 
-    /// `galaxies` more are done.
     pub(crate) fn advance(&mut self, galaxies: usize) -> Result<(), PipelineError> {
         self.unreported += galaxies as u64;
         if self.reported.elapsed() < PERIOD {
@@ -67,7 +66,6 @@ impl<'a> Watch<'a> {
         self.report()
     }
 
-    /// Calls back with the galaxies that were not reported.
     pub(crate) fn report(&mut self) -> Result<(), PipelineError> {
         let (more, callback) = (std::mem::take(&mut self.unreported), &self.callback);
         let result = Python::attach(|py| {

@@ -140,7 +140,7 @@ def submission(of: SubmissionLike) -> Configuration:
         try:
             text = json.dumps(of, default=_plain, allow_nan=False)
         except (TypeError, ValueError, RecursionError) as error:
-            raise ValueError(f"submission: settings that are none: {error}") from None
+            raise ValueError(f"submission: not valid settings: {error}") from None
         return Configuration(_shearq.Configuration.json(text))
     if not isinstance(of, (str, os.PathLike)):
         raise TypeError(
