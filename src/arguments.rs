@@ -21,7 +21,7 @@ use shearq_simulate::kinds::SETS;
 use shearq_simulate::set::SimulationSettings;
 use shearq_submissions::{Configuration, Registry};
 
-/// A list of sets such as `1,2,7-9` or `all`.
+// `1,2,7-9` or `all`. Own code, because clap has no ranges in lists.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct SetList(pub(super) Vec<u32>);
 
@@ -43,6 +43,7 @@ impl FromStr for SetList {
         // Sorted and without repetition, so that a list in another order resumes the same run.
         let mut sets = BTreeSet::new();
         for part in text.split(',') {
+            // `-` cannot be a sign: sets count from 1.
             match part.split_once('-') {
                 Some((first, last)) => {
                     let (first, last) = (number(first)?, number(last)?);
@@ -70,7 +71,7 @@ impl std::fmt::Display for SetList {
     }
 }
 
-// The chosen sets; empty for all.
+// Empty for all sets, as the crates below expect.
 pub(super) fn sets_of(list: Option<&SetList>) -> &[u32] {
     list.map_or(&[], |list| &list.0)
 }
@@ -132,6 +133,7 @@ impl Printing {
         };
         match (self.form.format, self.wide) {
             (TableFormat::Table, true) => print(&fitted(&shown, None)),
+            // Users must learn that a narrow table is not all there is.
             (TableFormat::Table, false) if !self.chooses() => {
                 let details = table.headings.iter().filter(|heading| heading.detail);
                 let details: Vec<&str> = details.map(|heading| heading.label.as_str()).collect();
@@ -164,6 +166,7 @@ impl ReportFile {
         sections: impl FnOnce() -> Result<Vec<Section>, FigureError>,
         made_by: impl FnOnce() -> anyhow::Result<Vec<(String, String)>>,
     ) -> anyhow::Result<()> {
+        // Sections are closures, because plots take seconds that a command without a report should not spend.
         if let Some(path) = &self.path {
             pages::save(path, title, sections()?, made_by()?)?;
         }
@@ -193,6 +196,7 @@ impl Form {
     }
 }
 
+// As in GREAT10. The seed is arbitrary.
 const GRID: u16 = 100;
 const SEED: u64 = 1;
 

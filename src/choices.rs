@@ -13,7 +13,6 @@ use shearq_scoring::Definition;
 
 // Clap's `ValueEnum` cannot be derived here: the types belong to crates without clap, so that libraries do not compile it.
 pub(crate) trait Named: Copy + Send + Sync + 'static {
-    // Each value with its name and its line of `--help`.
     const ALL: &[(Self, &str, &str)];
 }
 
@@ -21,7 +20,7 @@ pub(crate) fn named<T: Named>() -> impl TypedValueParser<Value = T> {
     let names = T::ALL
         .iter()
         .map(|(_, name, help)| PossibleValue::new(*name).help(*help));
-    // Clap has refused other names.
+    // Other names were refused by `PossibleValuesParser`, so that the first value is never used as a default.
     PossibleValuesParser::new(names).map(|given| {
         let found = T::ALL.iter().find(|(_, name, _)| *name == given);
         found.unwrap_or(&T::ALL[0]).0

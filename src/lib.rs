@@ -1,5 +1,5 @@
-//! The command line: one file per subcommand. Exit codes: 0 done, 1 failed, 2 wrong usage. A closed pipe
-//! (`| head`) is not an error: the command finishes its work.
+//! The command line: one file per subcommand in `commands`. Exit codes: 0 done, 1 failed, 2 wrong usage. A closed pipe
+//! (`| head`) is not an error: the command still writes its files.
 
 #[cfg(doctest)]
 #[doc = include_str!("../docs/library.md")]
@@ -133,14 +133,15 @@ enum Command {
     Manual(help_files::Manual),
 }
 
-// Exit codes of success, of an error or of findings, and of wrong usage.
-const DONE: u8 = 0;
-const FAILED: u8 = 1;
-const MISUSED: u8 = 2;
+// Exit codes. A baseline that changed and a check with findings exit like errors, so that scripts and CI stop; 2 for wrong
+// usage is clap's.
+const EXIT_DONE: u8 = 0;
+const EXIT_FAILED: u8 = 1;
+const EXIT_WRONG_USAGE: u8 = 2;
 
 /// Runs the command that this process was started with.
 pub fn main() -> ExitCode {
-    // Signals and hooks are those of the whole process, so they are set before the command runs.
+    // Signals and hooks belong to the whole process, and must be set before there are other threads.
     progress::end_at_interrupt();
     fail_at_size_limits();
     silence_caught_panics();
@@ -159,8 +160,8 @@ pub fn silence_caught_panics() {
     }));
 }
 
-// Turns writing beyond a file size limit (`ulimit -f`) into an ordinary error. By default the signal ends the
-// process without a message and leaves files half written.
+// Turns writing beyond a file size limit (`ulimit -f`), which clusters set, into an ordinary error. By default the signal ends
+// the process without a message, and temporary files remain.
 fn fail_at_size_limits() {
     #[cfg(unix)]
     // SAFETY: ignoring a signal runs none of our code, and no other thread has been started.
@@ -203,16 +204,16 @@ pub fn run_with(arguments: impl IntoIterator<Item = OsString>) -> u8 {
         Command::Manual(arguments) => help_files::manual(&arguments),
     };
     match result {
-        Ok(()) => DONE,
-        Err(error) if error.is::<Findings>() => FAILED,
+        Ok(()) => EXIT_DONE,
+        Err(error) if error.is::<Findings>() => EXIT_FAILED,
         Err(error) => {
             tell(format_args!("error: {}", causes(&error)));
-            FAILED
+            EXIT_FAILED
         }
     }
 }
 
-// An error with its causes. A cause that the error itself mentions is not repeated.
+// An error with its causes. Messages of some errors end with their cause, which is not repeated.
 fn causes(error: &anyhow::Error) -> String {
     let mut text = String::new();
     for cause in error.chain() {
@@ -227,18 +228,18 @@ fn causes(error: &anyhow::Error) -> String {
     text
 }
 
-// Prints help, the version, or the error in the arguments.
+// clap reports help and the version as errors, with exit code 0.
 fn usage(message: &clap::Error) -> u8 {
-    match written(|| message.print()) {
-        Ok(()) => u8::try_from(message.exit_code()).unwrap_or(MISUSED),
+    match flushed(|| message.print()) {
+        Ok(()) => u8::try_from(message.exit_code()).unwrap_or(EXIT_WRONG_USAGE),
         Err(error) => {
             tell(format_args!("error: {}", causes(&error)));
-            FAILED
+            EXIT_FAILED
         }
     }
 }
 
-// Ends a command with exit code 1 after its findings are printed, so that they are not followed by an error.
+// Returned after findings were printed, which are the message: the program exits with 1 and prints no error.
 #[derive(Debug, thiserror::Error)]
 #[error("there are findings")]
 struct Findings;
@@ -250,43 +251,41 @@ fn print_heat_map(map: HeatMap) -> anyhow::Result<()> {
     if !std::io::stdout().is_terminal() {
         return Ok(());
     }
-    // Two digits per cell leave room for 24 sets.
+    // Without decimals, cells of values up to 99 are two characters wide, and the 24 sets of a simulation fit into a line.
     let decimals = usize::from(!map.values.iter().any(|value| *value >= 10.0));
     let map = HeatMap { decimals, ..map };
     let set = |name| std::env::var_os(name).filter(|value| !value.is_empty());
     // https://no-color.org: any value that is not empty counts.
     let coloured = set("NO_COLOR").is_none() && set("TERM").is_none_or(|term| term != "dumb");
-    // The colours are control characters. Names were checked when they were read.
+    // Not by `print`, which would escape the control characters of the colours. Names were checked when they were read.
     write(&format!("\n{}", map.terminal(coloured)))
 }
 
-// Prints a line on standard error. If that is closed, there is nobody to be told.
+// Prints a line on standard error. A closed standard error is ignored: the results matter more than the message.
 fn tell(line: std::fmt::Arguments<'_>) {
     use std::io::Write;
     let _ = writeln!(std::io::stderr(), "{}", visible(&line.to_string()));
 }
 
-// Warns about files that look like data and are not read.
 fn tell_unread(unread: Vec<String>) {
     for line in unread {
         tell(format_args!("warning: {line}"));
     }
 }
 
-// What made a report: this version, and `settings` by name.
+// For the head of a report, so that its results can be repeated.
 fn made_by<const N: usize>(settings: [(&str, String); N]) -> Vec<(String, String)> {
     let version = ("Version", format!("shearq {}", shearq_dataset::VERSION));
     let all = std::iter::once(version).chain(settings);
     all.map(|(name, value)| (name.to_owned(), value)).collect()
 }
 
-// A number with its noun, in the plural unless it is 1.
 fn count(number: usize, thing: &str) -> String {
     let ending = if number == 1 { "" } else { "s" };
     format!("{number} {thing}{ending}")
 }
 
-// Columns of the terminal; `COLUMNS` or 80 if the output goes elsewhere.
+// Of the terminal, else `COLUMNS`, by which scripts choose the width of a table in a file.
 fn width() -> usize {
     let stated = || std::env::var("COLUMNS").ok()?.parse().ok();
     let terminal = terminal_size::terminal_size_of(std::io::stdout());
@@ -301,18 +300,18 @@ fn print_table(table: &Table) -> anyhow::Result<()> {
     print(&fitted(table, Some(width())))
 }
 
-// Prints results to standard output, with control characters escaped. A closed pipe is not an error.
+// Escaped, because names in foreign files could contain control sequences that change the terminal.
 fn print(text: &str) -> anyhow::Result<()> {
     write(&visible(text))
 }
 
 fn write(text: &str) -> anyhow::Result<()> {
     use std::io::Write;
-    written(|| std::io::stdout().write_all(text.as_bytes()))
+    flushed(|| std::io::stdout().write_all(text.as_bytes()))
 }
 
-// Writes to standard output and flushes it, so that a failed write is reported.
-fn written(write: impl FnOnce() -> std::io::Result<()>) -> anyhow::Result<()> {
+// Flushed here, because the flush at the end of the process reports no error: a full disk would truncate a table unnoticed.
+fn flushed(write: impl FnOnce() -> std::io::Result<()>) -> anyhow::Result<()> {
     use std::io::Write;
     match write().and_then(|()| std::io::stdout().flush()) {
         Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => {

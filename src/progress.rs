@@ -14,7 +14,7 @@ use shearq_dataset::threads::Progress;
 
 pub(super) struct Bar {
     bar: ProgressBar,
-    // Galaxies that were done before; they do not count for the rate.
+    // Galaxies of an earlier call, without which the rate would be far too high after a resumption.
     skipped: Arc<AtomicU64>,
 }
 
@@ -23,11 +23,11 @@ impl Bar {
         let target = if std::io::stderr().is_terminal() {
             ProgressDrawTarget::stderr_with_hz(5)
         } else {
+            // In log files a bar would be thousands of lines.
             ProgressDrawTarget::hidden()
         };
         let bar = ProgressBar::with_draw_target(Some(galaxies), target);
         let skipped = Arc::new(AtomicU64::new(0));
-        // The bar fills the rest of the line.
         let template = "{prefix} {wide_bar} {percent}% of {human_len} galaxies{pace}{msg}";
         if let Ok(style) = ProgressStyle::with_template(template) {
             let skipped = Arc::clone(&skipped);
@@ -83,23 +83,24 @@ impl Drop for Bar {
     }
 }
 
-// Whether the command of this process resumes.
-static GOES_ON: AtomicBool = AtomicBool::new(false);
+// Whether the same command would resume the work, which the message after Ctrl-C then says. Static, because the handler of the
+// signal has no other access to the command.
+static RESUMABLE: AtomicBool = AtomicBool::new(false);
 
-pub(super) fn goes_on() {
-    GOES_ON.store(true, Ordering::Relaxed);
+pub(super) fn mark_resumable() {
+    RESUMABLE.store(true, Ordering::Relaxed);
 }
 
 // Exit code after Ctrl-C, as in shells.
 const INTERRUPTED: i32 = 130;
 
-/// Ends the process at Ctrl-C and prints how to resume. At any moment, a file is complete or absent.
+// Ends the process at once instead of finishing its galaxies: files are written atomically, so that each is complete or absent.
 pub(super) fn end_at_interrupt() {
     let handler = || {
-        let goes_on = GOES_ON.load(Ordering::Relaxed);
+        let resumable = RESUMABLE.load(Ordering::Relaxed);
         tell(format_args!(
             "\nstopped{}",
-            match goes_on {
+            match resumable {
                 true => "; the same command resumes",
                 false => "",
             }

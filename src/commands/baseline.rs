@@ -1,5 +1,3 @@
-//! `shearq baseline`.
-
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
@@ -130,7 +128,7 @@ struct Place {
     folder: PathBuf,
 }
 
-/// Checks a name that becomes a file name.
+// The name becomes a file name, on any operating system.
 fn file_stem(text: &str) -> Result<String, String> {
     let good = |c: char| c.is_alphanumeric() || "-_.+".contains(c);
     if text.chars().all(good) && !text.starts_with('.') && !text.is_empty() {
@@ -191,7 +189,6 @@ fn record(arguments: &RecordArguments) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Measures the chosen configurations on `source`.
 fn of_source(
     arguments: &RecordArguments,
     source: Source,
@@ -208,8 +205,7 @@ fn of_source(
     Ok((source, configurations))
 }
 
-/// The configurations called `names`, or all in the registry, with the paths of their files relative to the folder
-/// `beside`.
+// With the paths of users' settings files relative to the folder `beside`, so that a repository with both can be cloned anywhere.
 fn chosen(
     names: &[String],
     beside: &Path,
@@ -233,7 +229,6 @@ fn chosen(
         .collect()
 }
 
-/// The metrics of folders of catalogues, and their common source relative to the folder `beside`.
 fn of_folders(
     folders: &[PathBuf],
     beside: &Path,
@@ -270,8 +265,7 @@ fn of_folders(
     ))
 }
 
-/// Measures a configuration into a temporary folder, with a progress bar, and returns its metrics. Paths of `source` are
-/// relative to the folder `beside`.
+// Into a temporary folder: only the metrics are kept. Paths of `source` are relative to the folder `beside`.
 fn measured(
     source: &Source,
     beside: &Path,
@@ -294,7 +288,7 @@ fn measured(
             run.source.data(out)?
         }
         Source::Folder { .. } => {
-            // By its own path, because messages must not name the temporary folder.
+            // By the path that the user gave, because messages must not name the temporary folder.
             let data = source.data(beside)?;
             let mut sets: Vec<u32> = images.iter().map(|id| id.set).collect();
             sets.dedup();
@@ -348,7 +342,6 @@ fn check(arguments: &CheckArguments) -> anyhow::Result<()> {
     Ok(())
 }
 
-/// Measures one baseline again, and updates it with `--update`.
 fn check_one(arguments: &CheckArguments, name: &str, path: &Path) -> anyhow::Result<Vec<Checked>> {
     let baseline = Baseline::read(path)?;
     let beside = &arguments.place.folder;

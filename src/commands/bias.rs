@@ -129,7 +129,7 @@ pub(crate) struct Arguments {
     report: ReportFile,
 }
 
-/// Artificial shear of metacalibration in ngmix and metadetect.
+// Of metacalibration in ngmix and metadetect, whose catalogues do not state it.
 const DEFAULT_STEP: f64 = 0.01;
 
 fn columns_help() -> String {
@@ -139,7 +139,7 @@ fn columns_help() -> String {
     )
 }
 
-/// Parses `EXPRESSION:N` or `EXPRESSION:EDGE,EDGE,...`.
+// Split at the last colon, because an expression may contain others in names of columns.
 fn parse_bins(text: &str) -> anyhow::Result<Binning> {
     let expected =
         || anyhow!("expected EXPRESSION:N, or EXPRESSION:EDGE,EDGE,... with increasing edges");
@@ -169,10 +169,11 @@ fn parse_bins(text: &str) -> anyhow::Result<Binning> {
     }
 }
 
-/// Most bytes of a file of sums.
+// Of a file of sums, which is read into memory. Chosen by hand.
 const MOST_BYTES: u64 = 1 << 31;
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    // Before the catalogues are read, which takes minutes for a survey.
     if let Some(plot) = &arguments.plot {
         PictureFormat::of(plot)?;
     }
@@ -189,6 +190,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             draws,
             seed: arguments.seed,
         });
+    // A shard may have too few units for errors, or one side of a pair. Its sums are what counts, and they are written.
     let result = match summed.result(errors) {
         Err(error) if arguments.shard.is_some() => {
             tell(format_args!(
@@ -221,6 +223,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     if let Some(plot) = &arguments.plot {
         bias_plot(&result).save(plot)?;
     }
+    // Of all galaxies, not of bins, of which some exceed a limit by chance.
     let checks = check(result.all()?, &arguments.fail_above);
     if let Some(path) = &arguments.junit {
         atomic::write(path, junit(&checks).as_bytes())?;
@@ -315,6 +318,7 @@ fn of_catalogues(arguments: &Arguments, catalogues: &[PathBuf]) -> anyhow::Resul
             truth
         }
         (None, Some((g1, g2))) => {
+            // Reduced shears of images with positive parity are below 1.
             anyhow::ensure!(
                 g1.hypot(g2) < 1.0,
                 "--g1, --g2: this is no shear (found {g1} and {g2}, expected a modulus below 1)"
@@ -367,7 +371,6 @@ fn of_catalogues(arguments: &Arguments, catalogues: &[PathBuf]) -> anyhow::Resul
     Ok(sum(&request, &own)?)
 }
 
-/// Merges files of sums.
 fn merged(files: &[PathBuf]) -> anyhow::Result<Summed> {
     let read = |path: &Path| -> anyhow::Result<Summed> {
         let bytes = open::read(path, MOST_BYTES)
@@ -382,6 +385,7 @@ fn merged(files: &[PathBuf]) -> anyhow::Result<Summed> {
         all.merge(more)
             .with_context(|| path.display().to_string())?;
     }
+    // Sums of some shards would give an estimate without a sign that galaxies are missing.
     let absent = all.absent();
     anyhow::ensure!(
         absent.is_empty(),

@@ -21,7 +21,7 @@ use shearq_results::submit::{Sent, Submission};
 use super::check::report;
 use crate::arguments::{Form, SetList, Threads};
 use crate::choices::named;
-use crate::progress::{Bar, goes_on};
+use crate::progress::{Bar, mark_resumable};
 use crate::{count, tell};
 
 /// Run a challenge: write blind data, check entries, and rank them.
@@ -234,7 +234,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
 const LEAST_SEED: u64 = 1 << 40;
 
 fn new(arguments: &NewArguments) -> anyhow::Result<()> {
-    goes_on();
+    mark_resumable();
     let plan = Plan {
         name: arguments.name.clone(),
         version: arguments.data_version,
@@ -277,6 +277,7 @@ fn new(arguments: &NewArguments) -> anyhow::Result<()> {
         }
         (Some(data), ..) => {
             let data = DataFolder::open(data)?;
+            // Images of other simulators state their number of galaxies only when they are opened.
             let mut bar = Bar::new("copying", 0);
             let truth = arguments.truth_table.as_deref();
             of_images(&plan, &data, truth, folders, threads, &mut bar)?
@@ -337,6 +338,7 @@ fn check_entry(arguments: &CheckArguments) -> anyhow::Result<()> {
             message,
         });
     }
+    // With challenge.toml alone, participants can check the form of an entry without downloading the images.
     let references = match place.is_dir() {
         true => {
             verify_public(place, threads)?;
@@ -361,7 +363,7 @@ fn check_entry(arguments: &CheckArguments) -> anyhow::Result<()> {
             place.display()
         )),
     }
-    // It fails if there are errors: an entry that cannot be scored gets no receipt.
+    // Before the receipt, because it fails if there are errors: an entry that cannot be scored must not hold a place in time.
     report(&findings, entry, *json)?;
     if let Some(judge) = judge {
         let receipt = judge.sign(entry, team.as_deref())?;
@@ -371,9 +373,10 @@ fn check_entry(arguments: &CheckArguments) -> anyhow::Result<()> {
 }
 
 fn rank(arguments: &RankArguments) -> anyhow::Result<()> {
-    goes_on();
+    mark_resumable();
     let threads = arguments.threads.number();
     let judge = Judge::open(&arguments.challenge, &arguments.truth, threads)?;
+    // Before scoring, which takes minutes: a mistake in board.toml is an error at once.
     let decisions = Decisions::read(&arguments.truth)?;
     if is_open_to_others(&arguments.truth) {
         tell(format_args!(
@@ -418,6 +421,7 @@ fn rank(arguments: &RankArguments) -> anyhow::Result<()> {
         digits,
         detail: arguments.detail,
     };
+    // The table first: warnings are for the organiser, and must not delay or replace the board.
     arguments.form.print(&view.table())?;
     for refused in &round.refused {
         tell(format_args!(

@@ -89,7 +89,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     arguments
         .report
         .save(title, sections, || made_by(arguments))?;
-    // Other formats are read by programs.
+    // Other formats are for programs, which a map of characters would confuse.
     if arguments.printing.format() == TableFormat::Table {
         print_heat_map(map)?;
     }

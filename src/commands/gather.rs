@@ -1,5 +1,3 @@
-//! `shearq gather`.
-
 use std::path::PathBuf;
 
 use clap::Args;
@@ -147,7 +145,7 @@ pub(crate) struct Arguments {
     out: PathBuf,
 }
 
-/// Maps of the stamps or of the exposure, in files of their own or in those of the images; `None` if none are given.
+// An extension without a file means the files of the images: surveys store masks and weights beside the pixels.
 fn companion<'a>(
     paths: &'a [PathBuf],
     extension: Option<&'a String>,
@@ -206,6 +204,7 @@ fn gathering(arguments: &Arguments) -> anyhow::Result<Gathering<'_>> {
         image: _,
         out: _,
     } = arguments;
+    // Destructured in full, so that the compiler finds an option that is not passed on.
     for (option, value) in [("noise", noise), ("gain", gain)] {
         anyhow::ensure!(
             value.is_none_or(|value| value > 0.0 && value.is_normal()),

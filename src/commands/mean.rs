@@ -52,7 +52,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let (condition, weight) = (&arguments.condition, &arguments.weight);
     let selection = smooth_selection(condition.as_deref(), weight.as_deref())?;
     let run = Run::require(measured)?;
-    // The data may have been removed since.
+    // A mean needs catalogues only. Data that were removed meanwhile are therefore no error, but data that changed are.
     let data = match &run.source {
         Source::Folder { .. } => run.source.data(measured).ok(),
         Source::Simulated(_) => None,

@@ -1,5 +1,3 @@
-//! `shearq measure`.
-
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
@@ -14,7 +12,7 @@ use shearq_submissions::Registry;
 
 use crate::arguments::{SetList, Sharding, Threads};
 use crate::choices::named;
-use crate::progress::{Bar, goes_on};
+use crate::progress::{Bar, mark_resumable};
 use crate::{count, tell, tell_unread};
 
 /// Measure the galaxies of a data folder: one catalogue per image.
@@ -53,28 +51,25 @@ pub(super) struct Measuring {
 }
 
 impl Measuring {
-    /// The run that measures galaxies of `source`.
     pub(super) fn run(&self, source: Source) -> anyhow::Result<Run> {
         let configuration = Registry::embedded()?.get(&self.submission)?.configuration;
         let format = self.catalogue_format.unwrap_or_default();
         Ok(Run::new(source, configuration, format))
     }
 
-    /// The images of this shard in a data folder.
     pub(super) fn images(&self, data: &DataFolder, sets: &[u32]) -> anyhow::Result<Vec<ImageId>> {
         let images = self.sharding.part(&images::of_folder(data, sets)?);
         tell_unread(data.images(sets)?.unread());
         Ok(images)
     }
 
-    /// Number of worker threads.
     pub(super) fn threads(&self) -> usize {
         self.threads.number()
     }
 }
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
-    goes_on();
+    mark_resumable();
     let Arguments {
         measuring,
         data,
@@ -88,7 +83,6 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     measure(&run, &data, out, &images, measuring.threads())
 }
 
-/// Measures with a progress bar, and reports on standard error.
 pub(super) fn measure(
     run: &Run,
     data: &DataFolder,
@@ -96,6 +90,7 @@ pub(super) fn measure(
     images: &[ImageId],
     threads: usize,
 ) -> anyhow::Result<()> {
+    // Before the bar, which would hide an error about the first image.
     let work = FolderMeasurement::open(run, data, out, images)?;
     let mut bar = Bar::new("measuring", work.galaxies());
     let start = Instant::now();
@@ -104,10 +99,8 @@ pub(super) fn measure(
     report(run, &summary, start.elapsed(), threads, out)
 }
 
-/// Reports on standard error what was measured and how fast.
-///
-/// # Errors
-/// If all galaxies that were measured now are flagged; or, if none was, all that were measured before.
+// On standard error, which leaves standard output to results. All galaxies flagged is an error: the cause is a setting or a PSF,
+// and a script would go on with a catalogue of NaN.
 pub(super) fn report(
     run: &Run,
     summary: &Summary,
@@ -119,6 +112,7 @@ pub(super) fn report(
     let speed = if summary.galaxies == 0 {
         String::new()
     } else {
+        // Per thread, so that machines can be compared; times in docs/speed.md are of this kind.
         let each = 1e6 * seconds * threads as f64 / summary.galaxies as f64;
         format!(
             " ({} galaxies, {} flagged) in {seconds:.1} s, {each:.0} µs per galaxy and thread",
@@ -148,7 +142,7 @@ pub(super) fn report(
             .collect();
         tell(format_args!("flagged: {}", reasons.join(", ")));
     }
-    // What failed fails again if it is continued.
+    // If the command only resumed a finished run, the reasons are in the catalogues of the earlier call.
     let earlier = match summary.images {
         0 => all_flagged(run, out)?,
         _ => None,

@@ -5,7 +5,7 @@ use anyhow::Context;
 use clap::Args;
 
 use crate::arguments::{SetList, Threads, sets_of};
-use crate::progress::{Bar, goes_on};
+use crate::progress::{Bar, mark_resumable};
 use crate::{Findings, count, print, run, tell, tell_unread};
 use shearq_dataset::images::{self, ImageId, Shard};
 use shearq_dataset::layout::{DataFolder, MAX_IMAGE, check_folder};
@@ -45,7 +45,7 @@ pub(crate) struct Arguments {
 }
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
-    goes_on();
+    mark_resumable();
     let out = &arguments.out;
     check_folder(
         out,
@@ -95,7 +95,7 @@ fn merge_run(arguments: &Arguments, run: &Run) -> anyhow::Result<()> {
         out,
     };
     require_complete(arguments, &results, &images)?;
-    // Data of a survey have no true shear.
+    // Survey data have no true shear, and are complete without a score.
     if images.iter().any(|id| is_there(&data.truth(id.set))) {
         run::score(run, out, sets, None, arguments.threads.number())?;
         return Ok(());
@@ -107,7 +107,7 @@ fn merge_run(arguments: &Arguments, run: &Run) -> anyhow::Result<()> {
     Ok(())
 }
 
-// The record of a simulation does not list its images.
+// The record of a simulation does not list its images, because shards with other images share it.
 fn simulated_images(arguments: &Arguments) -> anyhow::Result<Vec<ImageId>> {
     match (&arguments.sets, arguments.images) {
         (Some(sets), Some(images)) => Ok(images::of_simulation(&sets.0, images)),
@@ -166,7 +166,7 @@ fn shard_of(fault: &Fault, shards: Option<u32>) -> Option<Shard> {
 }
 
 fn discard(faults: &[Fault]) -> anyhow::Result<()> {
-    // A missing result is a fault, too, and cannot be removed.
+    // Missing results are among the faults, too.
     let there = |path: &&Path| path.is_file();
     for path in faults.iter().map(|f| f.result.as_path()).filter(there) {
         std::fs::remove_file(path)

@@ -5,7 +5,7 @@ use shearq_scoring::Options;
 use shearq_submissions::Registry;
 
 use crate::arguments::Threads;
-use crate::progress::{Bar, goes_on};
+use crate::progress::{Bar, mark_resumable};
 use crate::{print, print_table, tell};
 use shearq_dataset::images;
 use shearq_dataset::run::{Run, Source};
@@ -46,7 +46,7 @@ const SEED: u64 = 2013;
 const SUBMISSIONS: [&str; 3] = ["23/raw/star", "23/den/star", "48/linear/star"];
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
-    goes_on();
+    mark_resumable();
     let Arguments { out, wide, threads } = arguments;
     let threads = threads.number();
     let settings = SimulationSettings::new(SEED, GRID);
@@ -88,7 +88,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     }
     let mut variants = score_all(&folders, &[], None, None, options, threads)?;
     for variant in &mut variants {
-        // Published metrics are for 200 images per set.
+        // Published metrics are means over 200 images of all sets, and would look like a failure beside these two sets.
         variant.published = None;
     }
     let full = compare(&variants, options.definition);
@@ -113,7 +113,6 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     Ok(())
 }
 
-// Q of each set, as text.
 fn q_of(scored: &[ScoredSet]) -> String {
     let sets = scored.iter().map(|set| {
         let record = &set.record;

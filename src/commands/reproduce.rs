@@ -5,7 +5,7 @@ use clap::Args;
 use shearq_submissions::{Configuration, Published, Registry};
 
 use crate::arguments::{SetList, Threads, given_once};
-use crate::progress::{Bar, goes_on};
+use crate::progress::{Bar, mark_resumable};
 use crate::{made_by, print, print_table, tell};
 use shearq_dataset::layout::MAX_IMAGE;
 use shearq_render::page::Page;
@@ -50,7 +50,7 @@ pub(crate) struct Arguments {
 }
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
-    goes_on();
+    mark_resumable();
     let Arguments {
         out,
         images,

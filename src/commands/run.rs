@@ -6,7 +6,7 @@ use shearq_scoring::Options;
 
 use crate::arguments::{ReportFile, SetList, SimulationArguments};
 use crate::measure::Measuring;
-use crate::progress::{Bar, goes_on};
+use crate::progress::{Bar, mark_resumable};
 use crate::{measure, print_table, score, tell};
 use shearq_dataset::images;
 use shearq_dataset::layout::MAX_IMAGE;
@@ -53,7 +53,7 @@ pub(crate) struct Arguments {
 }
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
-    goes_on();
+    mark_resumable();
     let Arguments {
         measuring,
         sets,
@@ -101,6 +101,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             let images = measuring.images(data, wanted)?;
             measure::measure(&run, data, out, &images, threads)?;
         }
+        // A folder as source comes from `data`.
         (Source::Folder { .. }, None) => {}
     }
     if let Some(shard) = shard {
@@ -123,8 +124,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     report.save(&title, sections, || score::made_by(&run, out))
 }
 
-// Scores a folder of catalogues (of `sets`, or of all if empty) and prints the scores. Stores them with the bandpowers
-// next to the catalogues, and in the results store if there is one.
+// Also for `merge`. Scores and bandpowers are stored next to the catalogues, so that a run without a terminal keeps them.
 pub(super) fn score(
     run: &Run,
     out: &Path,

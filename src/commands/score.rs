@@ -104,9 +104,10 @@ pub(crate) struct Arguments {
     threads: Threads,
 }
 
-// Options of input with a data folder. Its layout specifies the sign of g2, the stamps and the field.
+// Inputs with a data folder, whose layout specifies the sign of g2, the stamps and the field: options for these could contradict
+// it.
 const FOLDERS: [&str; 6] = ["data", "measured", "foreign", "packed", "sets", "store"];
-// Options of input other than plain catalogues.
+// Inputs whose columns, type and missing values are specified by a record or a description.
 const NOT_PLAIN: [&str; 7] = [
     "data", "measured", "foreign", "packed", "spectra", "sets", "store",
 ];
@@ -180,7 +181,7 @@ fn catalogues(
     let threads = arguments.threads.number();
     let scored = score_catalogues(&data, &catalogues, sets, options, threads);
     let scored = match catalogues.description() {
-        // What is wrong with a catalogue may be wrong in its description.
+        // The cause of an error in a catalogue may be its description, so the message names both.
         Some(_) => scored.with_context(|| catalogues.path.display().to_string())?,
         None => scored?,
     };
@@ -190,7 +191,7 @@ fn catalogues(
     table.notes.extend(unscored(&data, &scored, sets)?);
     table.notes.extend(verdict_line(name, &scored));
     if let Some(store) = store {
-        // A command that fails to print records nothing.
+        // Before recording, so that a wrong --metrics leaves no run in the store.
         arguments.printing.check(&table)?;
         record(store, &catalogues, &data, &scored, options)?;
     }
@@ -241,7 +242,6 @@ fn write_record(
     Ok(())
 }
 
-// The power spectra of a submission.
 fn packed_spectra(
     arguments: &Arguments,
     data: &DataFolder,
@@ -273,7 +273,6 @@ fn packed_spectra(
     write_record(store, run, &Source::folder(data, folder_of(&path))?, data)
 }
 
-// The power spectra of a folder, one file per set.
 fn spectrum_folder(
     arguments: &Arguments,
     data: &DataFolder,
@@ -305,7 +304,6 @@ fn spectrum_folder(
     Ok(())
 }
 
-// Scores the power spectra `files` by set, of the submission at `place`.
 fn score_spectra(
     arguments: &Arguments,
     data: &DataFolder,
@@ -338,14 +336,14 @@ fn spectrum_file(
     options: Options,
 ) -> anyhow::Result<()> {
     let truth = read_truth(path, &plain_reading(arguments))?;
-    // Power spectra do not contain the sign of e2.
+    // A power spectrum does not change with the sign of e2, so that only the file itself can state the sign.
     if truth.sign.is_none() {
         let unknown = Sign::of_catalogues(None).map_err(anyhow::Error::msg);
         unknown.with_context(|| path.display().to_string())?;
     }
     let manifest = Manifest::read(folder_of(spectrum))?;
     let line = truth.sign.and_then(Sign::line);
-    // A plain file has no set.
+    // Set 0: plain files have no set number, and sets count from 1.
     let scored = score_spectrum(0, false, truth, spectrum, manifest.as_ref(), options)?;
     if let Some(line) = line {
         tell(format_args!("{line}"));
@@ -354,7 +352,7 @@ fn spectrum_file(
     Ok(())
 }
 
-// The record of a set and its Q of zero shear.
+// With Q of a spectrum of zeros, the value that a method without any signal reaches.
 fn score_spectrum(
     set: u32,
     simulated: bool,
@@ -386,6 +384,7 @@ fn print_spectra(
 
 fn plain_reading(arguments: &Arguments) -> Reading {
     Reading {
+        // The field and the stamps of GREAT10.
         field: Degrees(arguments.field.unwrap_or(10.0)),
         stamp: Pixels(arguments.stamp.unwrap_or(48.0)),
         sign: arguments.truth_sign.map(Into::into),

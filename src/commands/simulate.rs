@@ -3,7 +3,7 @@ use std::path::PathBuf;
 use clap::Args;
 
 use crate::arguments::{SetList, Sharding, SimulationArguments, Threads};
-use crate::progress::{Bar, goes_on};
+use crate::progress::{Bar, mark_resumable};
 use crate::tell;
 use shearq_dataset::images;
 use shearq_dataset::layout::{DataFolder, MAX_IMAGE};
@@ -96,7 +96,7 @@ fn versions(arguments: &Arguments) -> anyhow::Result<Vec<(SimulationSettings, Pa
 }
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
-    goes_on();
+    mark_resumable();
     let images = images::of_simulation(arguments.sets.simulated()?, arguments.images);
     let images = arguments.sharding.part(&images);
     let versions = versions(arguments)?;

@@ -3,7 +3,7 @@ use std::path::PathBuf;
 use clap::Args;
 
 use crate::arguments::{Form, SetList, SimulationArguments, Threads, configurations};
-use crate::progress::{Bar, goes_on};
+use crate::progress::{Bar, mark_resumable};
 use crate::{made_by, print};
 use shearq_dataset::layout::MAX_IMAGE;
 use shearq_render::page::Page;
@@ -49,7 +49,7 @@ pub(crate) struct Arguments {
 }
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
-    goes_on();
+    mark_resumable();
     let &Arguments { images, pairs, .. } = arguments;
     let (sets, threads) = (arguments.sets.simulated()?, arguments.threads.number());
     let plan = Plan {

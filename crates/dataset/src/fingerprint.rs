@@ -21,7 +21,7 @@ use shearq_files::open::{self, is_there};
 use shearq_files::table::read_metadata;
 use shearq_submissions::PsfForm;
 
-// Bytes of the longest file that is read completely.
+// Longer files are sampled, because reading all images again would delay each resumption. Chosen by hand.
 const MAX_WHOLE_BYTES: u64 = 1 << 20;
 // Bytes at the beginning of a longer file: its headers.
 const HEAD_BYTES: u64 = 16 * 1024;
@@ -30,7 +30,8 @@ const BLOCKS: u64 = 64;
 // Bytes of a block: what a system reads at once.
 const BLOCK_BYTES: u64 = 4096;
 
-/// A SHA-256 of several parts with their lengths.
+/// A SHA-256 of several parts.
+// With their lengths, so that `ab`, `c` differs from `a`, `bc`.
 #[derive(Debug, Default)]
 pub struct Fingerprint(Sha256);
 
@@ -48,12 +49,10 @@ impl Fingerprint {
     }
 }
 
-/// Bytes in hexadecimal digits.
 pub fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
-/// Fingerprint of some bytes.
 pub fn of_bytes(bytes: &[u8]) -> String {
     let mut print = Fingerprint::default();
     print.add(bytes);
@@ -86,7 +85,7 @@ fn sample(path: &Path) -> std::io::Result<String> {
         return Ok(print.finish());
     }
     add(&mut file, HEAD_BYTES)?;
-    // The last block ends with the file.
+    // The last block ends with the file, so that a truncated or extended file differs.
     let room = length - HEAD_BYTES - BLOCK_BYTES;
     for block in 1..=BLOCKS {
         let start = HEAD_BYTES + (u128::from(room) * u128::from(block) / u128::from(BLOCKS)) as u64;
@@ -183,7 +182,6 @@ impl<'a> Inputs<'a> {
         ])
     }
 
-    /// The fingerprints of an image's files, by their keys.
     pub fn prints(&self, id: ImageId) -> Result<BTreeMap<String, String>, FileError> {
         let mut prints = BTreeMap::new();
         if let Source::Simulated(_) = self.run.source {
@@ -209,6 +207,7 @@ impl<'a> Inputs<'a> {
     fn verify_image(&self, out: &Path, id: ImageId) -> Result<(), FileError> {
         let catalogue = self.run.catalogue(out, id.set, id.image);
         let now = self.prints(id)?;
+        // Simulated in memory: the settings in the record identify the data.
         if now.is_empty() {
             return Ok(());
         }

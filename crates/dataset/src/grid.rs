@@ -10,7 +10,7 @@ use crate::mosaic::Mosaic;
 use shearq_files::FileError;
 use shearq_files::fits::ImageReader;
 
-// Pixels a side of a stamp of an image: STAMP in its header, or else `stamp` in the layout.
+// The header wins: folders of `gather` have stamps of any size, and the default layout has 48.
 fn stamp_of_image(data: &DataFolder, path: &Path, image: &ImageReader) -> Result<usize, FileError> {
     Ok(whole(image, path, "STAMP", MAX_STAMP)?.unwrap_or(data.layout().stamp))
 }
@@ -69,7 +69,6 @@ pub fn stamp_of_set(data: &DataFolder, set: u32) -> Result<usize, FileError> {
     }
 }
 
-/// Grid of a set's first image, `None` where there is none.
 pub(crate) fn of_first_image(data: &DataFolder, set: u32) -> Result<Option<Grid>, FileError> {
     let images = data.images(&[set])?.of_set(set);
     let first = images.first().map(|(_, path)| {
@@ -82,6 +81,7 @@ pub(crate) fn of_first_image(data: &DataFolder, set: u32) -> Result<Option<Grid>
 /// Grid of a catalogue of shearq, which has a row for every cell at its centre.
 pub fn of_catalogue(path: &Path, rows: &[Row], field: Degrees) -> Result<Grid, FileError> {
     let n = side(path, rows.len())?;
+    // The first cell is centred on (s + 1)/2 in FITS pixels, from which the stamp's side s follows.
     let whole = |cell: &Row| (cell.x == cell.y).then_some(2.0 * cell.x - 1.0);
     let stamp = rows.first().and_then(whole).unwrap_or(f64::NAN);
     let grid = Grid::new(n, Pixels(stamp), field).map_err(|error| FileError::new(path, error))?;
@@ -109,7 +109,7 @@ pub fn side(path: &Path, rows: usize) -> Result<usize, FileError> {
     })
 }
 
-/// A header value that counts something, `None` where absent.
+/// A count in a header; `None` if absent. Other programs use these keys for other quantities, so that wrong values are errors.
 pub fn whole(
     image: &ImageReader,
     path: &Path,

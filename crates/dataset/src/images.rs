@@ -39,7 +39,6 @@ pub fn of_folder(data: &DataFolder, sets: &[u32]) -> Result<Vec<ImageId>, FileEr
     Ok(found)
 }
 
-// Advice for a folder without images: rename a file, or use the folder above.
 fn advice(data: &DataFolder, files: &Files) -> String {
     if let Some(line) = files.unread().first() {
         return format!(". {line}");
@@ -71,6 +70,7 @@ pub struct Shard {
 impl Shard {
     pub const WHOLE: Shard = Shard { number: 1, of: 1 };
 
+    // In turn, not in blocks, so that shards have equally many images of each set, too: sets take different times.
     pub fn part(&self, all: &[ImageId]) -> Vec<ImageId> {
         all.iter()
             .enumerate()

@@ -10,7 +10,7 @@ use shearq_quantities::Frame;
 
 pub const WARNINGS: &str = "warnings";
 /// Key of the effect of the noise of an image's star on its mean shear: the standard deviations of m and c.
-// A FITS key has eight characters.
+// Keys have at most eight characters, the limit of FITS.
 pub const PSF_NOISE: &str = "psfnoise";
 /// Key of the frame of ellipticities: `sky`, or pixel axes that are not the sky's: position angle of +y in degrees, parity (−1
 /// for mirrored), and both components of the shear.
@@ -136,7 +136,7 @@ pub fn stated_axes(path: &Path, format: FileFormat) -> Result<Axes, FileError> {
     let Some(text) = metadata.get(FRAME) else {
         return Ok(Axes::Pixel);
     };
-    // Python states the frame of the pixels, too.
+    // Catalogues written by Python state `pixel`, too, which has no angle.
     if let Ok(frame) = text.parse::<Frame>() {
         return Ok(match frame {
             Frame::Sky => Axes::Sky,

@@ -36,6 +36,7 @@ impl Mosaic {
         self.galaxies.div_ceil(self.columns)
     }
 
+    // Saturating: rows beyond the last one have no stamps.
     pub fn of_row(&self, iy: usize) -> usize {
         self.galaxies
             .saturating_sub(iy * self.columns)

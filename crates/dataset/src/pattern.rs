@@ -10,6 +10,7 @@ pub(crate) const PLACEHOLDERS: [[&str; 2]; 2] = [SET_PLACEHOLDERS, IMAGE_PLACEHO
 pub fn fill(pattern: &str, set: u32, image: u32) -> String {
     let [[set_plain, set_padded], [image_plain, image_padded]] = PLACEHOLDERS;
     pattern
+        // Any of the two forms, because the files of GREAT10 are not padded and those of shearq are.
         .replace(set_padded, &format!("{set:02}"))
         .replace(image_padded, &format!("{image:03}"))
         .replace(set_plain, &set.to_string())

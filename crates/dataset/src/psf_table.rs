@@ -20,6 +20,7 @@ pub fn read(path: &Path, mosaic: &Mosaic) -> Result<Vec<FunctionalPsf>, FileErro
     if let [(_, psf)] = rows.as_slice() {
         return Ok(vec![*psf]);
     }
+    // By position, so that the order of the rows does not matter.
     let mut field = vec![None; mosaic.galaxies];
     for ((x, y), psf) in &rows {
         let place = mosaic.place(*x, *y).ok_or_else(|| {

@@ -8,7 +8,7 @@ use serde::{Deserialize, Deserializer, Serialize};
 use shearq_files::FileError;
 use shearq_files::atomic;
 
-/// Reads any record; `None` where there is none.
+/// `None` if there is no record.
 pub fn read_record<R: DeserializeOwned>(path: &Path) -> Result<Option<R>, FileError> {
     let text = match shearq_files::open::read_to_string(path, shearq_files::open::SETTINGS) {
         Ok(text) => text,
@@ -16,7 +16,7 @@ pub fn read_record<R: DeserializeOwned>(path: &Path) -> Result<Option<R>, FileEr
         Err(error) => return Err(FileError::doing(path, "cannot read the record")(error)),
     };
     serde_json::from_str(&text).map(Some).map_err(|error| {
-        // Valid JSON with other keys or types.
+        // `is_data`: valid JSON, but with other keys or types.
         let hint = match error.is_data() {
             true => "; the record belongs to another version. Try: another folder",
             false => "",
@@ -25,12 +25,11 @@ pub fn read_record<R: DeserializeOwned>(path: &Path) -> Result<Option<R>, FileEr
     })
 }
 
-/// Writes any record as indented JSON.
 pub fn write_record(path: &Path, record: &impl Serialize) -> Result<(), FileError> {
     atomic::write(path, record_text(path, record)?.as_bytes())
 }
 
-/// Any record as indented JSON, for a file at `path`.
+/// Indented, because users read and compare records. `path` is for messages.
 pub fn record_text(path: &Path, record: &impl Serialize) -> Result<String, FileError> {
     let mut text = serde_json::to_string_pretty(record)
         .map_err(FileError::doing(path, "cannot write the record"))?;
@@ -38,10 +37,9 @@ pub fn record_text(path: &Path, record: &impl Serialize) -> Result<String, FileE
     Ok(text)
 }
 
-/// Numbers of records that may be NaN, which is null in JSON.
+/// Numbers that may be NaN. JSON has no NaN: serde_json writes null, which it does not read as a number.
 pub trait Numbers: Sized {
     type Form: DeserializeOwned;
-    /// The numbers, with NaN for null.
     fn from_form(form: Self::Form) -> Self;
 }
 
@@ -110,7 +108,7 @@ impl Claim {
         (held.dev(), held.ino()) == (found.dev(), found.ino())
     }
 
-    // Elsewhere an open file cannot be removed.
+    // Windows does not remove an open file, so that a file of this name is the one that was claimed.
     #[cfg(not(unix))]
     fn is_there(&self) -> bool {
         self.path.exists()
@@ -154,7 +152,8 @@ pub fn claim<R: Serialize + DeserializeOwned>(path: &Path, record: &R) -> Result
         ));
     }
     let file = open_to_lock(path).map_err(FileError::doing(path, "cannot open the record"))?;
-    // A process with an exclusive lock is the only one at work here.
+    // All processes at work hold a shared lock, so that an exclusive one shows that there are no others. Without this test, leftovers
+    // could be files that another process is just writing.
     if file.try_lock().is_ok() {
         atomic::remove_leftovers(folder)?;
     }
@@ -167,6 +166,7 @@ pub fn claim<R: Serialize + DeserializeOwned>(path: &Path, record: &R) -> Result
     })
 }
 
+// A message must fit on a screen. Chosen by hand.
 const MAX_DIFFERENCES: usize = 6;
 const MAX_DIFFERENCE_CHARS: usize = 160;
 
@@ -262,6 +262,8 @@ fn compare(key: &str, a: &serde_json::Value, b: &serde_json::Value, found: &mut 
     }
 }
 
+// Lists of named objects, such as configurations, are compared by name first: an inserted one would otherwise make all that
+// follow differ.
 fn names(values: &[serde_json::Value]) -> Option<Vec<&str>> {
     values
         .iter()

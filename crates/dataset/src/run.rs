@@ -20,7 +20,7 @@ pub const RUN_FILE: &str = "run.json";
 #[serde(rename_all = "kebab-case")]
 pub enum Source {
     Folder {
-        /// The folder, relative to the folder of the record.
+        // Relative to the folder of the record, so that both can be moved together.
         path: PathBuf,
         layout: Layout,
     },
@@ -29,7 +29,7 @@ pub enum Source {
 }
 
 impl Source {
-    /// A data folder, for a record in the folder `beside`.
+    /// `beside` is the folder of the record.
     pub fn folder(data: &DataFolder, beside: &Path) -> Result<Self, FileError> {
         Ok(Source::Folder {
             path: way(beside, data.root())?,
@@ -65,7 +65,6 @@ impl Source {
     }
 }
 
-/// The relative path from the folder of a record to a data folder or a file.
 pub fn way(from: &Path, to: &Path) -> Result<PathBuf, FileError> {
     relative(from, to).map_err(FileError::doing(to, "cannot determine where the folder is"))
 }
@@ -83,6 +82,7 @@ impl std::fmt::Display for Source {
 pub struct Run {
     pub version: String,
     pub source: Source,
+    // The name that stored records have.
     #[serde(rename = "submission")]
     pub configuration: Configuration,
     pub format: FileFormat,
@@ -146,7 +146,7 @@ pub fn open_data(folder: &Path) -> Result<DataFolder, FileError> {
     let Some(run) = Run::read(folder).ok().flatten() else {
         return Ok(data);
     };
-    // Catalogues may be beside the images.
+    // Users may measure into the data folder, which then has a record of catalogues and images.
     if !data.images(&[])?.sets().is_empty() {
         return Ok(data);
     }
@@ -187,8 +187,7 @@ pub fn kind_of(data: &DataFolder, set: u32) -> Option<SetKind> {
     }
 }
 
-// `path` relative to `folder` if possible, otherwise absolute. Both may be relative to the current folder, and need not
-// exist.
+// Absolute if there is no common ancestor, as for two drives on Windows. Neither path must exist.
 fn relative(folder: &Path, path: &Path) -> std::io::Result<PathBuf> {
     let (folder, path) = (resolve(folder)?, resolve(path)?);
     let shared = folder
@@ -224,14 +223,14 @@ pub fn shortened(path: PathBuf) -> PathBuf {
     if short.as_os_str().is_empty() {
         short.push(".");
     }
-    // Behind a link, `..` leads elsewhere.
+    // After a symbolic link, `..` is the parent of its target.
     match (resolve(&short), resolve(&path)) {
         (Ok(one), Ok(other)) if one == other => short,
         _ => path,
     }
 }
 
-// An absolute path without links, as far as it exists, and without `.` and `..`.
+// `canonicalize` fails for paths that do not exist yet, such as a new output folder, so only the existing part is resolved by it.
 fn resolve(path: &Path) -> std::io::Result<PathBuf> {
     let path = std::path::absolute(path)?;
     for there in path.ancestors() {

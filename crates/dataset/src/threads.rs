@@ -52,7 +52,7 @@ impl Threads for Pool {
 /// Receives the progress of long work, from the thread that called it.
 pub trait Progress {
     fn advance(&mut self, galaxies: u64);
-    // `galaxies` more were done before.
+    // Galaxies of an earlier call, which must not count for the rate.
     fn skip(&mut self, galaxies: u64) {
         self.advance(galaxies);
     }

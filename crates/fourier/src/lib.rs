@@ -18,6 +18,7 @@ pub use rustfft::num_complex::{Complex32, Complex64};
 pub type Plan64 = Arc<dyn Fft<f64>>;
 
 /// Makes plans in double precision. Plans from one planner share their tables.
+// Single precision has no planner here: the only transforms of f32 are those of `measure`, which are not plans of rustfft.
 pub struct Planner64(FftPlanner<f64>);
 
 impl std::fmt::Debug for Planner64 {
@@ -28,7 +29,7 @@ impl std::fmt::Debug for Planner64 {
 
 impl Planner64 {
     /// An empty planner.
-    // Inlined, rustfft's transforms would be compiled where it is called.
+    // As for the plans below: inlined, rustfft's transforms would be compiled where it is called.
     #[inline(never)]
     pub fn new() -> Self {
         Planner64(FftPlanner::new())

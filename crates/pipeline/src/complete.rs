@@ -67,7 +67,6 @@ impl Results<'_> {
         };
         let pool = Pool::new(threads)?;
         let checked = pool.in_order(0..images.len(), |position| {
-            // The true shear belongs to a set, so it is checked with the first of its images.
             let first = position == 0 || images[position - 1].set != images[position].set;
             self.check(images[position], first, inputs.as_ref())
         });
@@ -92,7 +91,7 @@ impl Results<'_> {
         Ok(faults)
     }
 
-    // The file that is written last for an image.
+    // The last file of an image to be written: if it is there, the others are.
     fn result(&self, id: ImageId) -> PathBuf {
         match self {
             Results::Catalogues { run, out, .. } => run.catalogue(out, id.set, id.image),
@@ -111,8 +110,7 @@ impl Results<'_> {
         Ok(settings.grid.pow(2))
     }
 
-    // Number of galaxies of an image whose results are right. With the `first` image of a set, its true shear is checked
-    // too.
+    // Returns the number of galaxies, for progress. The true shear belongs to the set, and is checked with its `first` image.
     fn check(
         &self,
         id: ImageId,

@@ -63,13 +63,14 @@ where
     I: Send,
     O: Send,
 {
+    // Two pools: the reader surveys whole images on `ahead`, and would wait for ever for workers of `pool`, which wait for the reader.
     let (Pool(pool), ahead) = (Pool::new(threads)?, Pool::new(threads)?);
     let capacity = IN_FLIGHT * threads;
     let (item_sender, item_receiver) = sync_channel::<(u64, I)>(capacity);
     let (result_sender, result_receiver) = sync_channel::<(u64, Done<O>)>(capacity);
     let (permit_sender, permit_receiver) = sync_channel::<()>(capacity);
     for _ in 0..capacity {
-        // The new channel has room for all of them.
+        // Cannot fail: the channel is new and has this capacity.
         let _ = permit_sender.try_send(());
     }
     let items = Mutex::new(item_receiver);
@@ -104,7 +105,7 @@ where
             }
             drop(result_sender);
             outcome = collect(&result_receiver, &permit_sender, &mut write);
-            // Threads that still wait find the channel closed and stop.
+            // Closed channels end the reader and the workers that wait on them.
             drop(result_receiver);
             drop(permit_sender);
             if !matches!(outcome, Ok(Ok(()))) {
@@ -124,6 +125,7 @@ fn collect<O>(
     permits: &SyncSender<()>,
     write: &mut impl FnMut(O) -> Result<(), PipelineError>,
 ) -> Done<()> {
+    // Bounded by the permits: the reader waits while an early item is not finished.
     let mut early = BTreeMap::new();
     let mut next = 0;
     for (number, result) in results {

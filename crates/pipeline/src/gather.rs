@@ -142,6 +142,7 @@ pub fn gather(
         .map(Path::to_owned)
         .collect();
     fs::create_dir_all(folder).map_err(FileError::doing(folder, cannot))?;
+    // A lock on the folder, not on a file in it, because the files are replaced.
     let alone = fs::File::open(folder).map_err(FileError::doing(folder, cannot))?;
     // Not all file systems have locks.
     let _ = alone.lock();
@@ -224,7 +225,7 @@ fn gather_alone(
     })
 }
 
-/// Removes the PSFs that a stopped process left.
+// A process may have been stopped between PSFs and image. The user would otherwise have to remove files by hand.
 fn remove_leftovers(data: &DataFolder, id: ImageId) -> Result<(), FileError> {
     let target = data.galaxies(id.set, id.image);
     if is_there(&target) {
@@ -245,7 +246,7 @@ fn remove_leftovers(data: &DataFolder, id: ImageId) -> Result<(), FileError> {
     Ok(())
 }
 
-// The stamps of an image before they are read.
+// Sizes and positions of all stamps are checked before the first one is written.
 struct Plan {
     /// Where they are cut out of an exposure.
     positions: Option<Positions>,
@@ -270,7 +271,7 @@ impl Plan {
         self.positions.as_ref().map_or(&[], |found| &found.all)
     }
 
-    /// One Jacobian per stamp, if ellipticities are along the sky's axes.
+    // `None` if ellipticities stay on the pixel axes.
     fn jacobians(&self, gathering: &Gathering<'_>) -> Result<Option<Vec<Matrix>>, FileError> {
         let files = match &gathering.stamps {
             Stamps::Files(files)
@@ -302,6 +303,7 @@ impl Plan {
                 _ => Ok(None),
             };
         };
+        // Pixels that are already along the sky need no Jacobians, which take time in each measurement.
         let plain = all.iter().all(aligned);
         if plain && gathering.frame.is_none() {
             return Ok(None);
@@ -322,7 +324,6 @@ impl Plan {
         Ok(Some(all))
     }
 
-    /// The columns of the table of stamps.
     fn columns(
         self,
         head: Head,
@@ -334,6 +335,7 @@ impl Plan {
         let real = |name: &str, values: Vec<f64>| Column::new(name.into(), values);
         if let Some(found) = self.positions {
             columns.extend(found.id);
+            // Catalogues have the positions as the user counts them, so that rows match the input.
             let shift = f64::from(head.first_pixel) - 1.0;
             let (x, y) = found
                 .all
@@ -346,7 +348,7 @@ impl Plan {
             columns.extend(found.carried);
         }
         if let Some(mut levels) = writer.levels.take() {
-            // A stamp without a pixel has no level, and its galaxy will be flagged in any.
+            // A stamp without pixels has no level. Any positive one will do, because its galaxy is flagged.
             let mut known: Vec<f64> = levels.iter().copied().filter(|v| v.is_finite()).collect();
             let typical = upper_median(&mut known).unwrap_or(0.0);
             levels
@@ -476,7 +478,7 @@ impl Stack {
                 return Err(origin.fault(&format!("there are more than {MAX_STAMPS} stamps")));
             }
         }
-        // No list of files is empty.
+        // Clap requires a file, so that the default is never used.
         let (_, wcs) = first.unwrap_or_default();
         let [least, side] = sides;
         if least < side {
@@ -496,7 +498,7 @@ impl Stack {
     }
 }
 
-/// States in which frame ellipticities are.
+// A user who did not ask for a frame must learn that the components differ from those on the pixels.
 fn frame_line(jacobians: &[Matrix]) -> String {
     let pixels = Wcs::frame_of(&jacobians[0]);
     format!(
@@ -504,7 +506,7 @@ fn frame_line(jacobians: &[Matrix]) -> String {
     )
 }
 
-// Refuses a PSF of other pixels than the galaxies'.
+// A PSF on other pixels, such as of a rotated or resampled exposure, would be deconvolved with the wrong orientation: m and leakage.
 fn check_psf(
     psfs: &GatheredPsfs,
     plan: &Plan,
@@ -514,7 +516,7 @@ fn check_psf(
     let typical = jacobians.map(|all| Wcs::of_jacobian(all[all.len() / 2]));
     let galaxies = typical.as_ref().unwrap_or(&plan.stack.wcs);
     let warnings: Vec<Warning> = Wcs::disagreements(&psfs.wcs, galaxies).collect();
-    // A scale that a key states may be another's; axes are those of a matrix.
+    // A pixel scale in a header key is often copied from another image, so it only warns. Axes come from a CD matrix, and are refused.
     let refused =
         |warning: &&Warning| jacobians.is_some() || matches!(warning, Warning::PsfFrame { .. });
     match warnings.iter().find(refused) {
@@ -523,7 +525,7 @@ fn check_psf(
     }
 }
 
-// A warning if the PSF is too broad for the galaxies.
+// The examinations of both are joined, because the condition compares the width of the PSF with that of the galaxies.
 fn width(galaxies: &Examination, psfs: &GatheredPsfs) -> Result<Option<Warning>, FileError> {
     let mut both = galaxies.clone();
     both.join(&psfs.examination);
@@ -534,7 +536,7 @@ fn width(galaxies: &Examination, psfs: &GatheredPsfs) -> Result<Option<Warning>,
     }
 }
 
-// Advice if positions are counted from another first pixel than specified.
+// An offset of all galaxies by one pixel in both axes is the difference between positions from 0 (numpy) and from 1 (FITS).
 fn one_pixel_off(stamps: &Stamps<'_>, warning: &Warning) -> Option<String> {
     let (Stamps::Cutouts { first_pixel, .. }, Warning::OffCentre { offset, .. }) =
         (stamps, warning)

@@ -84,7 +84,7 @@ pub fn simulate_blind(
             let image = match &mut open {
                 Some(image) => image,
                 None => {
-                    // Writing would make the folder again, without the earlier images.
+                    // If a user removed the folder meanwhile, writing would create it again with the later images only.
                     claim.check()?;
                     open.insert(OpenImage::create(record, [public, private], &row)?)
                 }

@@ -23,12 +23,10 @@ pub(crate) const JACOBIAN: [&str; 4] = ["dudx", "dudy", "dvdx", "dvdy"];
 /// Places of the stamps in the image of the data folder, and where they come from.
 pub(crate) const ORIGIN: [&str; 5] = ["tile_x", "tile_y", "file", "image", "plane"];
 
-// Keys of the metadata.
 const FRAME: &str = "frame";
 const FIRST_PIXEL: &str = "first_pixel";
 const GAIN: &str = "gain";
 
-/// What holds for all stamps.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(crate) struct Head {
     pub(crate) frame: Frame,
@@ -45,7 +43,6 @@ pub(crate) struct StampTable {
 }
 
 impl StampTable {
-    /// The table as a file.
     pub(crate) fn write(&self, path: &Path) -> Result<(), FileError> {
         let Head {
             frame,
@@ -119,7 +116,8 @@ impl StampTable {
         }
     }
 
-    /// The columns before the measured ones of a catalogue, and those after them.
+    // Identity and position before the measured columns of a catalogue; columns that the user carried along after them. Columns that
+    // only the measurement needs are left out.
     pub(crate) fn of_catalogue(&self) -> (Vec<Column>, Vec<Column>) {
         let all = self.columns.columns();
         let first = |column: &&Column| {
@@ -136,7 +134,6 @@ impl StampTable {
     }
 }
 
-/// A table from its columns.
 pub(crate) fn table(
     path: &Path,
     head: Head,

@@ -27,7 +27,6 @@ const MIN_STAR_CELL_PX: usize = 16;
 // Most pixels of stars that are averaged. All of them are in memory.
 const MAX_AVERAGED_PIXELS: usize = 1 << 24;
 
-/// The PSFs of an image, not yet written.
 pub(super) struct GatheredPsfs {
     pub(super) file: PsfFile,
     pub(super) examination: Examination,
@@ -36,7 +35,6 @@ pub(super) struct GatheredPsfs {
     pub(super) first: PathBuf,
 }
 
-/// Reads the PSFs of an image: functional PSFs of a table, or stars.
 pub(super) fn gather_psfs(
     data: &DataFolder,
     id: ImageId,
@@ -65,7 +63,6 @@ pub(super) fn gather_psfs(
     if count > 1 && 2 * count <= mosaic.galaxies {
         return averaged(&path, files, &stack, messages);
     }
-    // No list of files is empty.
     check_count(&files.paths[0], count, mosaic)?;
     // One, or one per galaxy in the same places.
     let mut image = Rows::create(&path, Mosaic::of(count, side), &wcs.keys())?;
@@ -111,7 +108,7 @@ pub(super) fn gather_psfs(
     })
 }
 
-/// A warning about PSF stamps that named configurations refuse.
+// Named configurations refuse such PSF stamps. Users should know before they measure, not after they have gathered all images.
 fn small(path: &Path, side: usize) -> Option<String> {
     let shown = path.display();
     (side < MIN_PSF).then(|| {
@@ -154,7 +151,6 @@ fn several_stars(path: &Path, pixels: &[f32], side: usize) -> Option<String> {
     ))
 }
 
-/// Checks that there is one PSF, or one per galaxy.
 fn check_count(path: &Path, found: usize, mosaic: &Mosaic) -> Result<(), FileError> {
     if found == 1 || found == mosaic.galaxies {
         return Ok(());
@@ -166,7 +162,6 @@ fn check_count(path: &Path, found: usize, mosaic: &Mosaic) -> Result<(), FileErr
     Err(FileError::new(path, message))
 }
 
-/// The part of a PSF stamp of `side` pixels that is examined.
 fn examined_cut(side: usize) -> PsfCut {
     let size = side - side.saturating_sub(EXAMINED_SIDE).next_multiple_of(2);
     PsfCut {
@@ -177,7 +172,7 @@ fn examined_cut(side: usize) -> PsfCut {
     }
 }
 
-/// Functional PSFs of a table, in the order of the galaxies.
+// By order, like stars. Positions in the table are those of another image, and are replaced by those in the mosaic.
 fn functional(path: PathBuf, table: &Path, mosaic: &Mosaic) -> Result<GatheredPsfs, FileError> {
     let mut rows = psf_table::read_all(table)?;
     check_count(table, rows.len(), mosaic)?;

@@ -13,18 +13,17 @@ use super::{Gathering, Stamps};
 use crate::wcs::Wcs;
 use shearq_dataset::mosaic::Mosaic;
 
-/// Writes stamps to the image, and examines some of them.
 pub(super) struct StampWriter {
     pub(super) image: Rows,
     pub(super) examination: Examination,
     pub(super) incomplete: usize,
     examined: Vec<usize>,
     pub(super) origins: Origins,
-    /// Standard deviations of the noise at the galaxies, if a map gives them; NaN for stamps without a pixel.
+    // At the galaxies, if a map gives them; NaN for stamps without pixels.
     pub(super) levels: Option<Vec<f64>>,
 }
 
-/// Where the stamps come from, one after the other.
+// For users who look for the file of a strange galaxy.
 #[derive(Default)]
 pub(super) struct Origins {
     pub(super) file: Vec<String>,
@@ -171,6 +170,7 @@ impl StampWriter {
     }
 }
 
+// Forgetting --mask-extension makes the image its own mask: all bright pixels would be missing.
 fn another(map: &Origin<'_>, image: &Origin<'_>, content: Content) -> Result<(), FileError> {
     if (map.file, map.image) == (image.file, image.image) {
         let (noun, option) = (content.noun(), content.option());
@@ -180,7 +180,7 @@ fn another(map: &Origin<'_>, image: &Origin<'_>, content: Content) -> Result<(),
     Ok(())
 }
 
-/// Makes weights variances, and pixels missing that have no weight. Missing pixels may have any value.
+// Maps may have any value where the pixel is missing already.
 fn variance(pixels: &mut [f32], values: &mut [f64], content: Content) -> Result<(), String> {
     for (pixel, value) in pixels.iter_mut().zip(values) {
         let stated = *value;
@@ -209,12 +209,12 @@ fn variance(pixels: &mut [f32], values: &mut [f64], content: Content) -> Result<
     Ok(())
 }
 
-/// The noise level at the galaxy of a stamp with these variances: the median over the pixels outside a circle around the centre.
-///
-/// Maps of many surveys contain the Poisson noise of the counts themselves. A level from pixels of the galaxy would then be high
-/// where its noise is positive, and what is subtracted would correlate with the data. Outside the circle the light of the galaxy
-/// and its noise have no part. As the galaxy is in the middle, it lies on the larger side of any straight border of two depths,
-/// of which the median takes the level, and a gradient cancels. The galaxy's own Poisson noise has to be added (gain).
+// The median over the pixels outside a circle around the galaxy.
+//
+// Variance maps of many surveys contain the Poisson noise of the counts themselves. A level from pixels of the galaxy would be
+// high where its noise is positive, and the subtracted noise power would correlate with the data. If two depths meet on the
+// stamp, the galaxy in the centre lies on the larger part, whose level the median takes; a gradient cancels. The galaxy's own
+// Poisson noise is added by `gain`.
 fn level(variances: &[f64], side: usize) -> f64 {
     let middle = (side as f64 - 1.0) / 2.0;
     // Chosen by hand: 12 px of 48, where most galaxies of a stamp of this size have no light.

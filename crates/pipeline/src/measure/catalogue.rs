@@ -21,7 +21,6 @@ use shearq_dataset::record::{Claim, claim};
 use shearq_dataset::run::{RUN_FILE, Run};
 use shearq_dataset::threads::Progress;
 
-/// The value of a column.
 #[derive(Debug, Clone, Copy)]
 pub enum Value {
     Real(fn(&Measurement) -> f64),
@@ -118,7 +117,7 @@ fn catalogue(
         Some(table) => table.of_catalogue(),
         None => Default::default(),
     };
-    // Stamps that are not of an exposure have places in the image of the data folder.
+    // Stamps that were not cut from an exposure have no other position than that in the mosaic.
     if !columns.iter().any(|column| column.name() == "x") {
         let positions = (0..galaxies.len()).map(|place| head.mosaic.position(place));
         let (x, y): (Vec<f64>, Vec<f64>) = positions.unzip();
@@ -140,7 +139,7 @@ fn catalogue(
     frame(columns)
 }
 
-/// The origin of the catalogue of an image from files with the fingerprints `prints`.
+// By these, `merge` and a later call determine whether a catalogue belongs to this run and to these files.
 pub(crate) fn metadata(
     run: &Run,
     id: ImageId,
@@ -231,14 +230,13 @@ impl Summary {
     }
 }
 
-/// The images without a catalogue, and those with one.
+// Catalogues are written atomically, so that one that exists is complete.
 pub(super) fn to_do(run: &Run, out: &Path, images: &[ImageId]) -> (Vec<ImageId>, Vec<ImageId>) {
     images
         .iter()
         .partition(|id| !run.catalogue(out, id.set, id.image).is_file())
 }
 
-/// The catalogues of a run, written one by one.
 pub(crate) struct Catalogues<'a> {
     run: &'a Run,
     out: &'a Path,
@@ -251,7 +249,6 @@ pub(crate) struct Catalogues<'a> {
 }
 
 impl<'a> Catalogues<'a> {
-    /// Claims the folder `out` for the catalogues of `images`.
     pub(crate) fn claim(
         run: &'a Run,
         out: &'a Path,
@@ -275,7 +272,7 @@ impl<'a> Catalogues<'a> {
         })
     }
 
-    /// Shows the warnings of an image, and writes its catalogue.
+    // Warnings first, because a fatal one must not leave a catalogue.
     pub(crate) fn add(
         &mut self,
         head: &ImageHead,
@@ -286,7 +283,7 @@ impl<'a> Catalogues<'a> {
         let found = &batch.warnings;
         self.warned
             .add(head.id, found.iter().chain(&head.run_warnings), progress)?;
-        // Writing would make the folder again, without the earlier catalogues.
+        // If a user removed the folder meanwhile, writing would create it again with the later catalogues only.
         self.claim.check()?;
         let path = self.run.catalogue(self.out, set, image);
         let table = catalogue(head, &batch.galaxies, &self.run.configuration)
@@ -320,12 +317,11 @@ impl<'a> Catalogues<'a> {
         Ok(())
     }
 
-    /// The error of the work: that the folder was removed, if it was, else `error`.
+    // A removed folder causes other errors, such as files that cannot be written; it is the one to report.
     pub(crate) fn explain(&self, error: PipelineError) -> PipelineError {
         self.claim.explain(error)
     }
 
-    /// Checks that all catalogues are there, and counts the warnings that were not shown.
     pub(crate) fn finish(self, progress: &mut dyn Progress) -> Result<Summary, PipelineError> {
         let path = |id: &ImageId| -> PathBuf { self.run.catalogue(self.out, id.set, id.image) };
         self.claim.check_results(self.images.iter().map(path))?;
@@ -342,7 +338,6 @@ struct Warned {
 }
 
 impl Warned {
-    /// Shows the first warning of each kind, and counts images with others.
     fn add<'w>(
         &mut self,
         id: ImageId,
@@ -368,7 +363,6 @@ impl Warned {
         Ok(())
     }
 
-    /// Shows how many more images have each kind of warning that was shown.
     fn finish(self, progress: &mut dyn Progress) {
         for (kind, more) in self.kinds.iter().filter(|(_, more)| **more > 0) {
             let images = if *more == 1 {

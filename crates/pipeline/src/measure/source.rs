@@ -133,7 +133,6 @@ impl ImageSource {
         self.aligned
     }
 
-    /// The table of the stamps if they were gathered.
     pub(super) fn take_table(&mut self) -> Option<StampTable> {
         self.table.take()
     }
@@ -199,7 +198,7 @@ impl StampSource<'static> for ImageSource {
     }
 }
 
-/// The message for stamps that are too small, with the lines of a configuration that measures them.
+// The remedy needs several settings that must agree, so that the message has the whole settings file.
 fn too_small(stamp: usize, configuration: &Configuration) -> String {
     let Configuration { name, .. } = configuration;
     let needed = configuration.stamp.size;
@@ -367,7 +366,7 @@ fn open_stars(path: &Path, cut: PsfCut, mosaic: &Mosaic) -> Result<OpenPsfs, Fil
     })
 }
 
-/// Reads a row of stamps of `side` pixels; the last row may be shorter.
+// From the first row of the file, because surveys have read rows in another order. The last row may be shorter.
 fn read_row(
     image: &mut ImageReader,
     mosaic: Mosaic,
