@@ -23,6 +23,7 @@ pub(crate) struct Arguments {
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let threads = arguments.threads.number();
     let configurations = configurations(&arguments.submission)?;
+    // 2,500 galaxies per image, so that the command takes less than a minute. Chosen by hand.
     let settings = SimulationSettings::new(1, 50);
     let measuring = speed::configurations(&configurations, settings, threads)?;
     arguments.form.print(&measuring)?;

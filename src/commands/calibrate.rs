@@ -44,6 +44,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         "{} has no λ to calibrate (found method = \"linear\", expected \"network\"). Try: --submission paper",
         submission.name
     );
+    // Before the work, so that a folder that cannot be made is an error at once.
     if let Some(out) = &arguments.out {
         std::fs::create_dir_all(out)
             .with_context(|| format!("{}: cannot make the folder", out.display()))?;

@@ -27,6 +27,7 @@ pub(crate) struct Manual {
 pub(crate) fn completions(arguments: &Completions) -> anyhow::Result<()> {
     let mut text = Vec::new();
     clap_complete::generate(arguments.shell, &mut Cli::command(), "shearq", &mut text);
+    // Not by `print`, which would escape the control characters of the script.
     write(&String::from_utf8(text)?)
 }
 
@@ -49,7 +50,6 @@ pub(crate) fn manual(arguments: &Manual) -> anyhow::Result<()> {
     Ok(())
 }
 
-// Adds the pages of a command and its subcommands, each with its file name.
 fn add_pages(name: &str, command: &Command, pages: &mut Vec<(String, Command)>) {
     // `man` finds a page by the name of its command.
     pages.push((format!("{name}.1"), command.clone().name(name.to_owned())));

@@ -39,6 +39,7 @@ pub(crate) struct Arguments {
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let (condition, weight) = (&arguments.condition, &arguments.weight);
     let run = Run::require(&arguments.measured)?;
+    // Clap requires one of both options, so that there is a selection.
     let Some(selection) = smooth_selection(condition.as_deref(), weight.as_deref())? else {
         return Ok(());
     };

@@ -57,7 +57,7 @@ fn parse_shear(text: &str) -> Result<[f64; 2], String> {
     Ok([number(g1)?, number(g2)?])
 }
 
-// The settings of each version of the galaxies, with its folder.
+// A folder per version, by whose names `bias` finds the pairs.
 fn versions(arguments: &Arguments) -> anyhow::Result<Vec<(SimulationSettings, PathBuf)>> {
     let settings = arguments.simulation.settings()?;
     let mut shears = Vec::new();
@@ -90,6 +90,7 @@ fn versions(arguments: &Arguments) -> anyhow::Result<Vec<(SimulationSettings, Pa
     }
     Ok(match versions.as_slice() {
         [] => vec![(settings, out.clone())],
+        // One version needs no folder of its own.
         [(only, _)] => vec![(*only, out.clone())],
         _ => versions,
     })

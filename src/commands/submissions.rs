@@ -56,6 +56,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         Command::List { form } => form.print(&list()?),
         Command::Show { name } => {
             let entry = Registry::embedded()?.get(name)?;
+            // Resolved: the output has every setting, so that it does not depend on the files that it extends.
             let mut text = toml::to_string(&entry.configuration)?;
             if let Some(published) = entry.published {
                 text.push_str(&format!("\n[published]\n{}", toml::to_string(&published)?));

@@ -1,4 +1,5 @@
-//! Finds the files of numbered sets and images by listing folders.
+//! Finds the files of numbered sets and images by listing folders, not by trying all numbers: any of a million may exist. Names
+//! that nearly match are reported, because a file that is skipped silently is a missing image in the result.
 
 use std::collections::BTreeMap;
 use std::ffi::OsStr;
@@ -220,7 +221,6 @@ impl Search<'_> {
         self.files.pass_over(Reason::Second, path, || name);
     }
 
-    // Notes a name that nearly matches a pattern.
     fn pass_over(&mut self, path: PathBuf, name: &str, pattern: &[Piece<'_>], folder: bool) {
         if path.is_dir() != folder {
             return;
@@ -228,7 +228,7 @@ impl Search<'_> {
         let runs = digits(name);
         let of_set = |piece: &&Piece<'_>| matches!(piece, Piece::Number { of_set: true, .. });
         let known = |run: &&str| run.parse().is_ok_and(|set| self.sets.contains(&set));
-        // A name of another set.
+        // Only sets that the user asked for are worth a warning.
         if !self.sets.is_empty() && pattern.iter().any(|p| of_set(&p)) && !runs.iter().any(known) {
             return;
         }
@@ -252,7 +252,7 @@ impl Files {
     }
 }
 
-// The name that a pattern has with the numbers in `runs` of digits; the pattern's form if they do not fit it.
+// The name that the file should have, for the message: with its own numbers, if there are as many as the pattern has.
 fn expected(pattern: &[Piece<'_>], runs: &[&str]) -> String {
     let places = |piece: &&Piece<'_>| match piece {
         Piece::Text(text) => digits(text).len(),
@@ -320,7 +320,7 @@ fn shape(name: &str) -> String {
     shape
 }
 
-// Most names of a folder that a message lists.
+// Of names in a message. Chosen by hand.
 const MAX_LISTED: usize = 4;
 
 /// The first names in a folder as a message lists them.
@@ -335,7 +335,7 @@ pub fn sample(folder: &Path) -> Result<String, FileError> {
     })
 }
 
-// Names in a folder that are UTF-8, in order, none if it does not exist.
+// Sorted, because file systems list in any order and results must not depend on it. Names that are not UTF-8 follow no pattern.
 fn names(folder: &Path) -> Result<Vec<String>, FileError> {
     let place = match folder.as_os_str().is_empty() {
         true => Path::new("."),
@@ -343,7 +343,7 @@ fn names(folder: &Path) -> Result<Vec<String>, FileError> {
     };
     let entries = match fs::read_dir(place) {
         Err(error) if error.kind() == ErrorKind::NotFound => {
-            // A broken link exists.
+            // A broken link is likely a disk that is not mounted, and must not look like an empty folder.
             return match place.ancestors().find(|place| is_there(place)) {
                 Some(link) if !link.exists() => {
                     let message = "this is a broken link; expected a folder";
@@ -368,7 +368,6 @@ enum Piece<'a> {
     Number { of_set: bool, padded: bool },
 }
 
-// Parts of a pattern of one name. A name that is not UTF-8 has no numbers.
 fn pieces(pattern: &OsStr) -> Vec<Piece<'_>> {
     let Some(mut rest) = pattern.to_str() else {
         return Vec::new();
@@ -394,7 +393,7 @@ fn pieces(pattern: &OsStr) -> Vec<Piece<'_>> {
     found
 }
 
-// All ways in which a name can follow a pattern, given the numbers known already.
+// Several ways are possible where two numbers touch, as in `{set}{image}`; the numbers of earlier folders exclude most.
 fn matches(pattern: &[Piece<'_>], name: &str, known: Numbers) -> Vec<Numbers> {
     let Some((piece, rest)) = pattern.split_first() else {
         return if name.is_empty() {

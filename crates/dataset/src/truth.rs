@@ -153,6 +153,7 @@ pub fn read_truth(truth: &Path, reading: &Reading) -> Result<ReadTruth, FileErro
     let bad = |error: shearq_scoring::ScoringError| FileError::new(truth, error);
     let grid = Grid::new(side, reading.stamp, reading.field).map_err(bad)?;
     let standard = TrueShear::from_rows(&grid, TruthSign::Standard, rows).map_err(bad)?;
+    // Freed before the transforms allocate theirs: grids may have 10⁷ galaxies.
     drop(table);
     let by_modes = || sign_by_modes(&grid, &standard).ok().flatten();
     let mut sign = Sign::of_truth(stated_sign(truth)?, reading.sign, by_modes)
@@ -167,7 +168,7 @@ pub fn read_truth(truth: &Path, reading: &Reading) -> Result<ReadTruth, FileErro
     Ok(ReadTruth { grid, shear, sign })
 }
 
-/// Writes a true shear in the standard sign.
+/// Writes a true shear in the standard sign, and states it, so that no reader has to guess.
 pub fn write_truth(path: &Path, grid: &Grid, truth: &TrueShear) -> Result<(), FileError> {
     // The comment follows the header, so that readers that skip one line or a `#` read the columns.
     let mut text = format!("x,y,g1,g2\n# {SIGN_KEY}: standard (g2 > 0 is a stretch along x = y)\n");

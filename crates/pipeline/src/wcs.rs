@@ -7,18 +7,18 @@ use shearq_measure::{PixelFrame, Warning};
 // Keys with the pixel scale in arcseconds: of surveys, and of GalSim.
 const PIXEL_SCALE_KEYS: [&str; 2] = ["PIXSCALE", "GS_SCALE"];
 // Keys of the matrix from pixels to the sky, in the unit CUNIT1.
-const MATRIX: [&str; 4] = ["CD1_1", "CD1_2", "CD2_1", "CD2_2"];
-const STEPLESS: [&str; 4] = ["PC1_1", "PC1_2", "PC2_1", "PC2_2"];
+const CD_KEYS: [&str; 4] = ["CD1_1", "CD1_2", "CD2_1", "CD2_2"];
+const PC_KEYS: [&str; 4] = ["PC1_1", "PC1_2", "PC2_1", "PC2_2"];
 const CDELT_KEYS: [&str; 2] = ["CDELT1", "CDELT2"];
 // Rotation of the second axis in degrees, before there was a matrix (Calabretta & Greisen 2002, A&A 395, 1077, eq. 189).
-const ROTATION: &str = "CROTA2";
+const ROTATION_KEY: &str = "CROTA2";
 // Plausible scales in arcseconds. Headers without a sky have scales such as 1 degree per pixel.
-const PLAUSIBLE: std::ops::RangeInclusive<f64> = 1e-3..=60.0;
+const PLAUSIBLE_ARCSEC: std::ops::RangeInclusive<f64> = 1e-3..=60.0;
 // Least relative difference of scales, and least shear between the pixels of the PSF and of the galaxies, that is reported: a
 // difference of 1 % changes m by about 0.01.
-const LEAST_DIFFERENCE: f64 = 0.01;
+const MIN_PIXEL_DIFFERENCE: f64 = 0.01;
 // Least rotation in degrees between the pixels of the PSF and of the galaxies that is reported.
-const LEAST_ROTATION: f64 = 1.0;
+const MIN_ROTATION_DEGREES: f64 = 1.0;
 // Rotation in degrees and shear of the pixels below which pixel axes count as the sky's. They change m by −2 sin² 0.01° and add
 // 4e-4 of g2 to g1, and 1e-4 to c: less than what calibrations reach.
 const ALIGNED_DEGREES: f64 = 0.01;
@@ -31,24 +31,23 @@ const MAX_TPV: usize = 39;
 // (https://fits.gsfc.nasa.gov/registry/tpvwcs/tpv.html).
 const TPV_ORDERS: i32 = 7;
 // Distortions are small, so that Newton's method needs some five steps.
-const MAX_STEPS: usize = 50;
+const MAX_NEWTON_STEPS: usize = 50;
 const INVERSE_ERROR_PX: f64 = 1e-9;
 
 pub(crate) type Matrix = [[f64; 2]; 2];
 
 const ARCSEC_PER_RADIAN: f64 = 648_000.0 / std::f64::consts::PI;
 
-/// Coefficients of a distortion of one axis.
 #[derive(Debug, Clone, PartialEq)]
 struct Polynomial {
     /// Powers of x and y.
     terms: Vec<([i32; 2], f64)>,
-    /// Odd powers of the distance from the origin.
+    // Odd powers of the distance r from the origin, which TPV has besides x and y.
     radial: Vec<(i32, f64)>,
 }
 
 impl Polynomial {
-    /// The value and its derivatives.
+    // Derivatives are analytic, because Jacobians of each galaxy follow from them: finite differences would lose half of the digits.
     fn at(&self, [x, y]: [f64; 2]) -> (f64, [f64; 2]) {
         let (mut value, mut slope) = (0.0, [0.0; 2]);
         for &([i, j], factor) in &self.terms {
@@ -64,7 +63,7 @@ impl Polynomial {
         let r = x.hypot(y);
         for &(n, factor) in &self.radial {
             value += factor * r.powi(n);
-            // The distance itself has no derivative at the origin, where its mean is zero.
+            // r has a cusp at the origin; the mean of its derivative over all directions, zero, is used there.
             if r > 0.0 {
                 let by_r = factor * f64::from(n) * r.powi(n - 2);
                 slope[0] += by_r * x;
@@ -82,7 +81,7 @@ impl Polynomial {
 
 #[derive(Debug, Clone, PartialEq)]
 enum Projection {
-    /// A plane in arcseconds.
+    // Arcseconds; of simulations and of projections that are not read.
     Plane,
     /// The gnomonic one about a point, with the distortion of TPV or without.
     Tangent {
@@ -94,8 +93,8 @@ enum Projection {
     },
 }
 
-/// The way from pixels to the sky (Greisen & Calabretta 2002, A&A 395, 1061; Calabretta & Greisen 2002, A&A 395, 1077). The CDS's
-/// crate `wcs` 0.4 has no TPV, leaves SIP untested and gives no derivative.
+// From pixels to the sky (Greisen & Calabretta 2002, A&A 395, 1061; Calabretta & Greisen 2002, A&A 395, 1077). The CDS's crate
+// `wcs` 0.4 has no TPV, leaves SIP untested and gives no derivative.
 #[derive(Debug, Clone, PartialEq)]
 struct Map {
     /// The pixel of the reference point.
@@ -128,10 +127,10 @@ impl Map {
         }
     }
 
-    /// The pixel of coordinates on the projection plane; `None` where the distortion has no inverse.
+    // By Newton's method, because SIP's inverse coefficients AP and BP are optional and approximate. `None` where it diverges.
     fn pixel(&self, wanted: [f64; 2]) -> Option<[f64; 2]> {
         let mut at = self.origin;
-        for _ in 0..MAX_STEPS {
+        for _ in 0..MAX_NEWTON_STEPS {
             let (place, slope) = self.plane(at);
             let step = apply(&inverse(&slope)?, [0, 1].map(|k| wanted[k] - place[k]));
             at = [0, 1].map(|k| at[k] + step[k]);
@@ -206,7 +205,6 @@ fn dot(a: &[f64; 3], b: &[f64; 3]) -> f64 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
-/// What a header states of the pixels on the sky.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub(crate) struct Wcs {
     /// Arcseconds per pixel.
@@ -218,7 +216,7 @@ pub(crate) struct Wcs {
 
 impl Wcs {
     pub(crate) fn of_header(image: &ImageReader) -> Self {
-        // A key that is no number is no scale.
+        // Other programs use keys such as PIXSCALE for text, which is ignored rather than an error.
         Wcs::of_keys(
             |key| image.number(key).ok().flatten(),
             |key| image.text(key).trim().to_ascii_uppercase(),
@@ -238,10 +236,10 @@ impl Wcs {
             _ => 3600.0,
         };
         let steps = CDELT_KEYS.map(&number);
-        let matrix = cd(MATRIX.map(&number)).or_else(|| {
+        let matrix = cd(CD_KEYS.map(&number)).or_else(|| {
             let [x, y] = [steps[0]?, steps[1]?];
-            let (sine, cosine) = number(ROTATION).unwrap_or(0.0).to_radians().sin_cos();
-            let [xx, xy, yx, yy] = STEPLESS.map(&number);
+            let (sine, cosine) = number(ROTATION_KEY).unwrap_or(0.0).to_radians().sin_cos();
+            let [xx, xy, yx, yy] = PC_KEYS.map(&number);
             Some(match [xx, xy, yx, yy].iter().any(Option::is_some) {
                 true => {
                     let [xx, yy] = [xx, yy].map(|value| value.unwrap_or(1.0));
@@ -253,7 +251,7 @@ impl Wcs {
         });
         let matrix = matrix.filter(|m| determinant(m).is_normal());
         let stated = PIXEL_SCALE_KEYS.into_iter().find_map(&number);
-        let plausible = |scale: &f64| PLAUSIBLE.contains(scale);
+        let plausible = |scale: &f64| PLAUSIBLE_ARCSEC.contains(scale);
         let of_matrix = matrix.map(|matrix| determinant(&matrix).abs().sqrt() * unit);
         let scale = stated.or(of_matrix).filter(plausible);
         let Some(matrix) = matrix else {
@@ -294,7 +292,8 @@ impl Wcs {
         let [first, second] = in_unit(matrix, unit / 3600.0);
         let centre = ["CRVAL1", "CRVAL2"].map(|key| number(key).unwrap_or(0.0) * unit / 3600.0);
         let (ra, dec) = (centre[longitude], centre[1 - longitude]);
-        let usual = if dec >= 90.0 { 0.0 } else { 180.0 };
+        // The default of LONPOLE for zenithal projections (Calabretta & Greisen 2002).
+        let lonpole = if dec >= 90.0 { 0.0 } else { 180.0 };
         let sip = kind
             .ends_with("-SIP")
             .then(|| ["A", "B"].map(|name| sip(name, &number)));
@@ -314,7 +313,7 @@ impl Wcs {
                 projection: Projection::Tangent {
                     ra,
                     dec,
-                    lonpole: number("LONPOLE").unwrap_or(usual).to_radians(),
+                    lonpole: number("LONPOLE").unwrap_or(lonpole).to_radians(),
                     tpv: tpv.then(|| {
                         [longitude, 1 - longitude]
                             .map(|axis| tpv_of(axis, &number, axis == longitude))
@@ -345,7 +344,6 @@ impl Wcs {
         })
     }
 
-    /// Whether pixels have places on the sky.
     pub(crate) fn has_sky(&self) -> bool {
         let projection = self.map.as_ref().map(|map| &map.projection);
         matches!(projection, Some(Projection::Tangent { .. }))
@@ -376,11 +374,10 @@ impl Wcs {
         keys.extend(["CTYPE1", "CTYPE2"].map(|key| (key, text("LINEAR"))));
         keys.extend(["CUNIT1", "CUNIT2"].map(|key| (key, text("arcsec"))));
         let matrix = [xx, xy, yx, yy].map(Value::Real);
-        keys.extend(MATRIX.into_iter().zip(matrix));
+        keys.extend(CD_KEYS.into_iter().zip(matrix));
         keys
     }
 
-    /// A plane of these pixels.
     pub(crate) fn of_jacobian(matrix: Matrix) -> Self {
         Wcs {
             scale: Some(determinant(&matrix).abs().sqrt()),
@@ -394,7 +391,6 @@ impl Wcs {
         }
     }
 
-    /// The pixel axes against the sky's.
     pub(crate) fn frame_of(jacobian: &Matrix) -> PixelFrame {
         frame(jacobian)
     }
@@ -413,7 +409,7 @@ impl Wcs {
     pub(crate) fn disagreements(psf: &Self, galaxies: &Self) -> impl Iterator<Item = Warning> {
         let scale = || {
             let (psf, galaxies) = (psf.scale?, galaxies.scale?);
-            let differs = (psf / galaxies - 1.0).abs() > LEAST_DIFFERENCE;
+            let differs = (psf / galaxies - 1.0).abs() > MIN_PIXEL_DIFFERENCE;
             differs.then_some(Warning::PixelScale { psf, galaxies })
         };
         let frames = || {
@@ -423,8 +419,9 @@ impl Wcs {
                 mirrored,
                 shear: [g1, g2],
             } = frame(&product(&inverse(&psf)?, &galaxies));
-            let differs =
-                mirrored || angle.abs() > LEAST_ROTATION || g1.hypot(g2) > LEAST_DIFFERENCE;
+            let differs = mirrored
+                || angle.abs() > MIN_ROTATION_DEGREES
+                || g1.hypot(g2) > MIN_PIXEL_DIFFERENCE;
             differs.then(|| Warning::PsfFrame {
                 psf: frame(&psf),
                 galaxies: frame(&galaxies),
@@ -434,7 +431,7 @@ impl Wcs {
     }
 }
 
-/// The matrix of four keys, of which some may be absent.
+// Absent keys of a matrix are zero (Greisen & Calabretta 2002) if others are present.
 fn cd([xx, xy, yx, yy]: [Option<f64>; 4]) -> Option<[[f64; 2]; 2]> {
     if xx.is_none() && yy.is_none() && xy.is_none() {
         return None;
@@ -461,7 +458,7 @@ fn tpv_of(axis: usize, number: impl Fn(&str) -> Option<f64>, longitude: bool) ->
     let mut m = 0;
     for order in 0..=TPV_ORDERS {
         for j in 0..=order {
-            // Without it the coordinate itself.
+            // Without PVi_1 the coordinate itself, as the convention prescribes.
             let factor = factor(m).or((m == 1).then_some(1.0));
             let powers = if longitude {
                 [order - j, j]
@@ -591,7 +588,7 @@ mod tests {
     fn sky(matrix: [f64; 4]) -> Wcs {
         let mut keys = vec![("CTYPE1", Value::Text("RA---TAN".into()))];
         keys.extend(
-            MATRIX
+            CD_KEYS
                 .into_iter()
                 .zip(matrix.map(|value| real(value * DEGREES))),
         );
@@ -674,7 +671,7 @@ mod tests {
         let pc = [cosine, -sine, sine, cosine].map(real);
         let keys: Vec<_> = [a, b]
             .into_iter()
-            .chain(STEPLESS.into_iter().zip(pc))
+            .chain(PC_KEYS.into_iter().zip(pc))
             .collect();
         for other in [aips, wcs(&keys)] {
             assert_eq!(Wcs::disagreements(&other, &same).count(), 0, "{other:?}");

@@ -15,7 +15,7 @@ use crate::stamp_table;
 use crate::wcs::Wcs;
 
 // Names of columns of positions in pixels counted from 1, the best first, in any case.
-const KNOWN: [[&str; 2]; 6] = [
+const PIXEL_NAMES: [[&str; 2]; 6] = [
     ["x", "y"],
     ["xwin_image", "ywin_image"],
     ["x_image", "y_image"],
@@ -24,9 +24,9 @@ const KNOWN: [[&str; 2]; 6] = [
     ["xpsf_image", "ypsf_image"],
 ];
 // Names of columns of identities, in any case, the best first.
-const IDS: [&str; 4] = ["id", "object_id", "source_id", "number"];
+const ID_NAMES: [&str; 4] = ["id", "object_id", "source_id", "number"];
 // Names of columns of right ascension and declination in degrees, in any case.
-const DEGREES: [[&str; 2]; 6] = [
+const SKY_NAMES: [[&str; 2]; 6] = [
     ["ra", "dec"],
     ["ra_deg", "dec_deg"],
     ["alpha_j2000", "delta_j2000"],
@@ -55,16 +55,13 @@ pub struct Table<'a> {
     pub carry: &'a [String],
 }
 
-/// Positions on an exposure.
 pub(super) struct Positions {
     place: Place,
     /// In FITS pixels: the centre of the first is at 1.
     pub(super) all: Vec<(f64, f64)>,
     /// In degrees, if the table or the WCS has them.
     pub(super) sky: Option<[Vec<f64>; 2]>,
-    /// Identities.
     pub(super) id: Option<Column>,
-    /// Further columns.
     pub(super) carried: Vec<Column>,
     /// Which columns they are, if the user did not name them.
     pub(super) note: Option<String>,
@@ -85,15 +82,15 @@ impl Positions {
             None => known(&mut place, &columns, wcs.has_sky())?,
         };
         let names = names_in(&columns, &place, [&x, &y]);
-        let degrees = table.degrees || DEGREES.iter().any(|pair| is_pair(pair, [&x, &y]));
+        let degrees = table.degrees || SKY_NAMES.iter().any(|pair| is_pair(pair, [&x, &y]));
         let sky = if degrees {
             None
         } else {
-            pair_of(&DEGREES, names)
+            pair_of(&SKY_NAMES, names)
         };
         let id = match table.id {
             Some(id) => Some(id.to_owned()),
-            None => IDS.iter().find_map(|id| find(names, id)),
+            None => ID_NAMES.iter().find_map(|id| find(names, id)),
         };
         if x == y {
             let message = format!("the column `{x}` is asked for twice");
@@ -105,7 +102,7 @@ impl Positions {
             );
             return Err(FileError::new(&place.path, message));
         }
-        // An identity may be carried too.
+        // A column may be the identity and carried, too, and must be read once.
         let mut wanted: Vec<&str> = vec![&x, &y];
         let texts: Vec<&str> = id.iter().chain(table.carry).map(String::as_str).collect();
         let reals = sky.iter().flatten().map(String::as_str);
@@ -133,7 +130,7 @@ impl Positions {
                 )
             }
             false => {
-                // From here on the first pixel is 1.
+                // FITS pixels, counted from 1, in all that follows.
                 let shift = 1.0 - f64::from(first_pixel);
                 let all: Vec<_> = given.map(|(x, y)| (x + shift, y + shift)).collect();
                 let sky = match &sky {
@@ -149,6 +146,7 @@ impl Positions {
                 (all, sky)
             }
         };
+        // Larger positions would overflow the indices of pixels.
         let most = f64::from(i32::MAX);
         let wrong = |(x, y): &(f64, f64)| !(x.abs() < most && y.abs() < most);
         if let Some(row) = all.iter().position(wrong) {
@@ -196,7 +194,7 @@ impl Positions {
             .iter()
             .all(|(x, y)| (0.0..=360.0).contains(x) && y.abs() <= 90.0);
         let (x, y) = self.all[0];
-        // Degrees that are treated as pixels lie within a few pixels.
+        // Degrees that are taken for pixels all lie within a few pixels of each other, even if these are on the exposure.
         if beyond == count || degrees && count > 2 && 2 * repeated > count {
             let cause = match degrees {
                 true => {
@@ -237,7 +235,7 @@ impl Positions {
         Ok(doubts)
     }
 
-    /// The number of positions near an earlier one, and the first such pair.
+    // A galaxy that is measured twice counts twice in the mean, as if its noise were independent.
     fn repeated(&self) -> (usize, Option<(usize, usize)>) {
         // Two positions in one cell are nearer than SAME_GALAXY_PX. So a cell has at most one that is no repetition, and others
         // of it lie at most two cells away.
@@ -266,7 +264,7 @@ impl Positions {
     }
 }
 
-/// Which columns were found, unless they are plain x and y.
+// Users must be able to see which of several columns of positions was taken.
 fn note(place: &Place, names: [&String; 2]) -> Option<String> {
     let [x, y] = names.map(String::as_str);
     let shown = place.path.display();
@@ -277,7 +275,6 @@ fn note(place: &Place, names: [&String; 2]) -> Option<String> {
     }
 }
 
-/// The pixel of a place on the sky, of a row from 0.
 fn on_exposure(
     path: &Path,
     row: usize,
@@ -329,9 +326,9 @@ fn known(place: &mut Place, columns: &Columns, of_sky: bool) -> Result<[String; 
         let found = named.filter_map(|named| Some((named, pair_of(known, &named.names)?)));
         found.collect()
     };
-    let mut found = pairs(&KNOWN);
+    let mut found = pairs(&PIXEL_NAMES);
     if found.is_empty() && of_sky {
-        found = pairs(&DEGREES);
+        found = pairs(&SKY_NAMES);
     }
     match found.as_slice() {
         [(named, pair), others @ ..] if others.is_empty() || named.doubtful => {
@@ -356,9 +353,11 @@ fn known(place: &mut Place, columns: &Columns, of_sky: bool) -> Result<[String; 
         }
     }
     let all: Vec<&String> = columns.named.iter().flat_map(|n| &n.names).collect();
-    let sky = all
-        .iter()
-        .any(|name| DEGREES.iter().any(|[ra, _]| name.eq_ignore_ascii_case(ra)));
+    let sky = all.iter().any(|name| {
+        SKY_NAMES
+            .iter()
+            .any(|[ra, _]| name.eq_ignore_ascii_case(ra))
+    });
     let degrees = match sky {
         true => ". Coordinates on the sky need an exposure with a WCS (TAN, TAN-SIP or TPV)",
         false => "",

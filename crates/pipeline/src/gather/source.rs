@@ -9,7 +9,8 @@ use shearq_files::fits::{ImageReader, Pixel};
 
 use crate::wcs::Wcs;
 
-// Names of images that accompany an image of the sky. They are refused unless they are chosen.
+// Names of images that accompany an image of the sky in one file. They are refused unless the user chooses them: a weight map
+// would be measured like a galaxy.
 const COMPANIONS: [&str; 15] = [
     "PSF",
     "ERR",
@@ -28,7 +29,7 @@ const COMPANIONS: [&str; 15] = [
     "BACKGROUND",
 ];
 
-/// Writes a path as text; not all paths are Unicode.
+// serde refuses paths that are not Unicode; a record may show them lossily.
 pub(super) fn shown<S: Serializer>(path: &Path, serializer: S) -> Result<S::Ok, S::Error> {
     serializer.collect_str(&path.display())
 }
@@ -131,7 +132,6 @@ impl<'a> Images<'a> {
         }
     }
 
-    /// The next image; `None` after the last.
     pub(super) fn next(&mut self) -> Result<Option<(Origin<'a>, &mut ImageReader)>, FileError> {
         loop {
             if let Some(image) = self.now.take() {
@@ -171,7 +171,7 @@ impl<'a> Images<'a> {
         }
     }
 
-    /// Checks that the file that ends had a chosen image.
+    // A file without an image of the chosen name would otherwise be skipped, and the stamps would no longer match the PSFs.
     fn all_there(&self) -> Result<(), FileError> {
         match (
             self.files.extension,
@@ -188,7 +188,6 @@ impl<'a> Images<'a> {
     }
 }
 
-/// The planes of the images of files, in order: stamps.
 pub(super) struct Planes<'a> {
     images: Images<'a>,
     origin: Option<Origin<'a>>,
@@ -213,7 +212,7 @@ impl<'a> Planes<'a> {
         now.map_or([0; 2], |image| [image.width(), image.height()])
     }
 
-    /// The next one with its pixels, `None` after the last.
+    // One plane at a time: a cube of stamps can be larger than the memory.
     pub(super) fn next<P: Pixel>(&mut self) -> Result<Option<(Origin<'a>, Vec<P>)>, FileError> {
         let origin = match self.origin {
             Some(origin) if self.left > 0 => Origin {
