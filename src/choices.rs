@@ -8,6 +8,7 @@ use shearq_files::table::FileFormat;
 use shearq_render::table::TableFormat;
 use shearq_results::bias::columns::Shapes;
 use shearq_results::compare::Grouping;
+use shearq_results::response::{Position, Shared};
 use shearq_results::submit::Contents;
 use shearq_scoring::Definition;
 
@@ -51,6 +52,15 @@ choices! {
         Csv: "csv", "Comma-separated, full precision, values and errors in separate columns. An apostrophe protects text that spreadsheets would execute as a formula";
         Markdown: "markdown", "Markdown";
         Latex: "latex", "A LaTeX tabular";
+    }
+    Shared {
+        Survey: "survey", "All";
+        Set: "set", "Those of a set";
+        Image: "image", "Those of an image";
+    }
+    Position {
+        Sky: "ra,dec", "Right ascension and declination in degrees, for shears in the frame of the sky";
+        Pixel: "x,y", "Pixels of the image, for shears in their frame";
     }
     Definition {
         Leaderboard: "leaderboard", "The arithmetic of the challenge";

@@ -18,6 +18,7 @@ pub(crate) mod reproduce;
 pub(crate) mod run;
 pub(crate) mod score;
 pub(crate) mod select;
+pub(crate) mod shear;
 pub(crate) mod show;
 pub(crate) mod simulate;
 pub(crate) mod study;

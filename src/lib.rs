@@ -19,8 +19,8 @@ use clap::{Parser, Subcommand};
 
 use commands::{
     baseline, bench, bias, calibrate, challenge, check, compare, gather, help_files, mean, measure,
-    merge, pack, quickstart, reproduce, run, score, select, show, simulate, study, submissions,
-    unpack,
+    merge, pack, quickstart, reproduce, run, score, select, shear, show, simulate, study,
+    submissions, unpack,
 };
 use shearq_files::parquet::panic_is_caught;
 use shearq_render::escape::visible;
@@ -34,9 +34,9 @@ use shearq_render::terminal::fitted;
 ///
 /// 1. `gather` makes a data folder from your stamps and PSFs. `simulate` makes a folder of simulated data.
 ///
-/// 2. `measure` writes a catalogue of calibrated ellipticities per image.
+/// 2. `measure` writes a catalogue of ellipticities and responses to shear per image.
 ///
-/// 3. `mean` prints the shear of a set with one shear. `score` compares catalogues with a known shear field.
+/// 3. `mean` prints the shear of a set with one shear. `shear` writes a shear per galaxy. `score` compares catalogues with a known shear field.
 ///
 /// 4. `compare` shows several configurations side by side. `pack` and `check` prepare a submission to a challenge.
 ///
@@ -79,6 +79,10 @@ enum Command {
         after_help = "Example:\n  shearq select --measured linear --where 'step(snr, 10) and step(size, 2.5)' --out bright"
     )]
     Select(select::Arguments),
+    #[command(
+        after_help = "Examples:\n  shearq shear --measured linear --out shears.parquet\n  shearq shear --measured linear --treecorr --out treecorr.fits"
+    )]
+    Shear(shear::Arguments),
     #[command(
         after_help = "Examples:\n  shearq score --measured linear --wide\n  shearq score --truth truth.csv catalogue-1.csv catalogue-2.csv"
     )]
@@ -185,6 +189,7 @@ pub fn run_with(arguments: impl IntoIterator<Item = OsString>) -> u8 {
         Command::Run(arguments) => run::run(&arguments),
         Command::Mean(arguments) => mean::run(&arguments),
         Command::Select(arguments) => select::run(&arguments),
+        Command::Shear(arguments) => shear::run(&arguments),
         Command::Merge(arguments) => merge::run(&arguments),
         Command::Score(arguments) => score::run(&arguments),
         Command::Compare(arguments) => compare::run(&arguments),

@@ -89,7 +89,7 @@ fn every_command_has_examples_that_parse() {
 
 // The ways to use each command, and the options that each way uses. Two options without a common way must be
 // refused.
-const WAYS: [(&str, &[&str]); 32] = [
+const WAYS: [(&str, &[&str]); 33] = [
     ("quickstart", &["out threads wide"]),
     (
         "simulate",
@@ -123,6 +123,7 @@ const WAYS: [(&str, &[&str]); 32] = [
     ("merge", &["OUT sets images shards discard-damaged threads"]),
     ("mean", &["measured sets where weight format threads"]),
     ("select", &["measured where weight out"]),
+    ("shear", &["measured response treecorr out format"]),
     (
         "score",
         &[

@@ -6,8 +6,6 @@ Run: python score_catalogue.py [--quick] [--out plot.png]
 
 import argparse
 
-import numpy as np
-
 import shearq
 
 
@@ -20,9 +18,10 @@ def main() -> None:
 
     simulation = shearq.simulate(set=8, images=images, grid=grid, seed=11)
     catalogues = [shearq.measure(image.stamps, image.psf) for image in simulation]
-    e1, e2 = (np.stack([catalogue[name] for catalogue in catalogues]) for name in ("e1", "e2"))
+    # Divided by the mean response of all images.
+    g1, g2 = shearq.concatenate(catalogues).shear()
 
-    score = shearq.score(e1, e2, simulation.g1, simulation.g2)
+    score = shearq.score(g1.reshape(images, -1), g2.reshape(images, -1), simulation.g1, simulation.g2)
     print(score)
 
     from matplotlib import pyplot

@@ -92,7 +92,7 @@ def test_workers_of_dask_sum_their_own_catalogues(pair):
     same(found, shearq.bias(pair, g1=[0.02, -0.02], g2=[0.01, -0.01]))
 
 
-def test_measured_catalogues_are_calibrated_by_their_divisors(image):
+def test_measured_catalogues_are_calibrated_by_their_responses(image):
     measured = shearq.measure(image.stamps, image.psf)
     for part in (measured, measured[20:90]):
         found, mean = shearq.bias(part, g1=0.0, g2=0.0), part.mean_shear()
@@ -284,7 +284,7 @@ def test_the_response_is_a_matrix_and_the_mean_shear_agrees():
     assert [found["c1"], found["c2"]] == pytest.approx(shear.tolist(), rel=1e-11)
     known = shearq.bias(table, g1=0.02, g2=0.02, columns={"R12": "a", "R21": "b"})
     assert abs(known["m1"]) < 1e-3 and shearq.bias(table, g1=0.02, g2=0.02, columns={"R12": "none", "R21": "none"})["m1"] > 0.1
-    own = {"R12": table["a"], "R21": table["b"], "flags": np.zeros(2000), "divisor1": np.ones(2000), "divisor2": np.ones(2000)}
+    own = {"R12": table["a"], "R21": table["b"], "flags": np.zeros(2000)}
     rows = shearq.Catalogue.from_table({**{name: table[name] for name in ("e1", "e2", "R11", "R22")}, **own})
     assert list(rows.mean_shear(w)) == pytest.approx(shear.tolist(), rel=1e-12)
 

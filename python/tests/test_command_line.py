@@ -106,7 +106,8 @@ def test_scores_are_those_of_the_command_line(command, data, simulations, tmp_pa
     rows = {int(row["set"]): row for row in _sets(json.loads(printed))}
     for set, simulation in simulations.items():
         catalogues = [shearq.measure(i.stamps, i.psf, noise=i.noise) for i in simulation]
-        e1, e2 = (np.stack([c[name] for c in catalogues]) for name in ("e1", "e2"))
+        joined = shearq.concatenate(catalogues)
+        e1, e2 = (np.stack([c[f"e{k}"] for c in catalogues]) / joined[f"R{k}{k}"][joined.good].mean() for k in (1, 2))
         scored = shearq.score(e1, e2, simulation.g1, simulation.g2)
         for name, value in scored.metrics.items():
             found = rows[set][name]

@@ -17,7 +17,7 @@ use shearq_results::views::mean::mean_table;
 
 /// Mean shear of each set, for fields of constant shear.
 ///
-/// The mean shear is the mean ellipticity before calibration of all galaxies without a flag, divided by their mean response if
+/// The mean shear is the mean ellipticity of all galaxies without a flag, divided by their mean response if
 /// the configuration does so. The error includes the error of the mean response, and the noise of one star per image. It
 /// assumes independent galaxies: for pairs that are rotated by 90 degrees it is too large.
 ///

@@ -9,8 +9,7 @@ use shearq_results::select::{smooth_selection, write_selected};
 /// Write catalogues with cuts and weights that keep the shear calibrated.
 ///
 /// Galaxies of linear configurations are selected and weighted by `snr`, `flux` (image units) and `size` (px). Ellipticities
-/// are multiplied by the weights and divided by the mean response of their image, which contains how shear and noise change
-/// the selection. `score`, `mean`, `bias`, `compare` and `pack` then use the selection. Rows of galaxies that are left out
+/// are multiplied by the weights, and responses contain how shear and noise change the selection. `score`, `mean`, `bias`, `compare`, `shear` and `pack` then use the selection. Rows of galaxies that are left out
 /// stay, with ellipticity and response zero; the column `selection` has the weights.
 ///
 /// Cuts are smooth steps, because a sharp one has no finite response. `step(snr, 10, 1.5)` is a weight of 1/2 at an S/N of 10

@@ -221,17 +221,9 @@ fn the_mean_of_a_field_is_that_of_its_catalogue() {
             .filter(|k| columns[0][*k].is_finite())
             .collect();
         flagged += columns[0].len() - good.len();
-        // The ellipticities of an image are divided by its mean responses.
-        let mean = |column: usize| {
-            good.iter().map(|k| columns[column][*k]).sum::<f64>() / good.len() as f64
-        };
-        let divisors = [mean(2), mean(5)];
         galaxies.extend(good.iter().map(|k| {
             let row: [f64; 6] = std::array::from_fn(|column| columns[column][*k]);
-            (
-                [row[0] * divisors[0], row[1] * divisors[1]],
-                [[row[2], row[3]], [row[4], row[5]]],
-            )
+            ([row[0], row[1]], [[row[2], row[3]], [row[4], row[5]]])
         }));
     }
     let n = galaxies.len() as f64;

@@ -160,9 +160,11 @@ def measure(program, configuration, data, number, work, factor=None):
             environment["SCAN"] = factor
         if run_measure(options, data, Path(folder) / "out", environment):
             return None
-        tables = read_catalogues(Path(folder) / "out", ["e1", "e2", "flags"], number)
+        tables = read_catalogues(Path(folder) / "out", ["e1", "e2", "R11", "R22", "flags"], number)
     stack = lambda name: np.array([table[name].to_numpy() for table in tables]).reshape(2, 2, -1)
-    return np.array([stack("e1"), stack("e2")]), stack("flags")
+    # Networks have no response.
+    e = [stack(f"e{k}") / (np.nanmean(r) if np.isfinite(r := stack(f"R{k}{k}")).any() else 1.0) for k in (1, 2)]
+    return np.array(e), stack("flags")
 
 
 def change(base, other):

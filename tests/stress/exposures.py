@@ -85,7 +85,7 @@ def bias(catalogues, chosen):
     """m1 and m2 with errors, of catalogues (+γ, +n), (−γ, +n), (+γ, −n), (−γ, −n), from whole fours."""
     good = chosen & np.all([c["flags"] == 0 for c in catalogues], axis=0)
     whole = good.reshape(-1, TURNS).all(1).repeat(TURNS)
-    e = [np.stack([c["e1"] * c["divisor1"], c["e2"] * c["divisor2"]], 1)[whole] for c in catalogues]
+    e = [np.stack([c["e1"], c["e2"]], 1)[whole] for c in catalogues]
     response = np.mean([c[["R11", "R12", "R21", "R22"]].to_numpy()[whole].mean(0) for c in catalogues], 0).reshape(2, 2)
     own = np.mean([c[["R11", "R12", "R21", "R22"]].to_numpy()[whole] for c in catalogues], 0).reshape(-1, 2, 2)
     difference = ((e[0] - e[1]) + (e[2] - e[3])) / 4 / SHEAR
@@ -151,7 +151,9 @@ def halo(folder, n, rng):
     fits.writeto(folder.path / "psf.fits", psf.drawImage(nx=SIDE, ny=SIDE, wcs=sky.local(galsim.PositionD(side / 2, side / 2))).array, overwrite=True)
     exposure += rng.normal(size=exposure.shape)
     [found] = folder.measure("halo", [exposure], places, header=header)
-    found = found[found["flags"] == 0]
+    found = found[found["flags"] == 0].copy()
+    response = found[["R11", "R12", "R21", "R22"]].to_numpy().mean(0).reshape(2, 2)
+    found[["e1", "e2"]] = np.linalg.solve(response, found[["e1", "e2"]].to_numpy().T).T
     lens = treecorr.Catalog(ra=[150.0], dec=[2.0], ra_units="deg", dec_units="deg")
     source = treecorr.Catalog(ra=found["ra"], dec=found["dec"], g1=found["e1"], g2=found["e2"], ra_units="deg", dec_units="deg")
     correlation = treecorr.NGCorrelation(min_sep=3 * einstein, max_sep=side * scale / 2, nbins=4, sep_units="arcsec")

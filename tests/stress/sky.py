@@ -64,7 +64,7 @@ def scene(jacobian, count, snr, rng):
 def measured(stamps, psf, wcs):
     """Ellipticities and responses before calibration, [e1, e2, R11, R12, R21, R22][galaxy]; NaN if flagged."""
     catalogue = shearq.measure(stamps, psf, noise=1.0, wcs=wcs)
-    e = [catalogue[f"e{k}"] * catalogue[f"divisor{k}"] for k in "12"]
+    e = [catalogue[f"e{k}"] for k in "12"]
     return np.array([*e, *(np.where(catalogue.good, catalogue[f"R{k}"], np.nan) for k in ("11", "12", "21", "22"))])
 
 

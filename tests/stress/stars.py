@@ -94,7 +94,7 @@ def measured(stamps, stars, images):
         columns = []
         for k in "12":
             response = np.where(catalogue.good, catalogue[f"R{k}{k}"], np.nan)
-            columns += [catalogue[f"e{k}"] * catalogue[f"divisor{k}"], response]
+            columns += [catalogue[f"e{k}"], response]
         parts.append(columns)
     return np.concatenate(parts, axis=1)
 

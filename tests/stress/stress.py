@@ -179,9 +179,6 @@ def measure_case(case, options, others):
         for k in (1, 2):
             response = np.where(found["flags"] == 0, found[f"R{k}{k}"], np.nan)
             if good.any():
-                # Ellipticities are divided by the mean response of their image: undone, for one mean over all.
-                for name in [name for name in found if name.split("_")[0] == f"e{k}"]:
-                    found[name] = found[name] * np.nanmean(response, 2, keepdims=True)
                 row[k] = weighted(case, found, k, good, options)
         rows.append(row)
     return rows

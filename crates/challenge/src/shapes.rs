@@ -14,6 +14,7 @@ use shearq_files::table::{FileFormat, most_rows};
 use shearq_pipeline::PipelineError;
 use shearq_pipeline::measure::measure_folder;
 use shearq_results::catalogues::COLUMNS;
+use shearq_results::response::response_of;
 use shearq_results::submit::check::{Finding, Severity};
 use shearq_results::submit::{Kind, Sent};
 use shearq_scoring::ndarray::Array2;
@@ -172,10 +173,23 @@ impl References {
         let source = Source::folder(data, folder.path())?;
         let run = Run::new(source, configuration, FileFormat::Parquet);
         measure_folder(&run, data, folder.path(), ids, threads, progress)?;
-        for &ImageId { set, image } in ids {
-            let path = run.catalogue(folder.path(), set, image);
-            let shapes = shapes_of(&references.read(&path)?);
-            references.images.insert((set, image), shapes);
+        let path = |id: &ImageId| run.catalogue(folder.path(), id.set, id.image);
+        let mut sets: BTreeMap<u32, Vec<ImageId>> = BTreeMap::new();
+        for id in ids {
+            sets.entry(id.set).or_default().push(*id);
+        }
+        for ids in sets.into_values() {
+            let paths: Vec<PathBuf> = ids.iter().map(path).collect();
+            // Images of noise have no response, and shapes of them are no reference.
+            let Ok([r1, r2]) = response_of(paths.iter().map(PathBuf::as_path)) else {
+                continue;
+            };
+            for (ImageId { set, image }, path) in ids.into_iter().zip(&paths) {
+                let mut sum = references.read(path)?;
+                sum.e1 /= r1;
+                sum.e2 /= r2;
+                references.images.insert((set, image), shapes_of(&sum));
+            }
         }
         Ok(references)
     }

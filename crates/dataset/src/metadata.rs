@@ -17,8 +17,13 @@ pub const PSF_NOISE: &str = "psfnoise";
 pub const FRAME: &str = "frame";
 /// Key of the coordinate of the centre of the first pixel in x and y, of stamps of an exposure.
 pub const FIRST_PIXEL: &str = "xyfirst";
+/// Key of the mean response: [`NOT_APPLIED`] if e1 and e2 are still to be divided by it, else the responses that g1 and g2
+/// were divided by. Ellipticities without a response, and catalogues of earlier versions, do not have it.
+pub const RESPONSE: &str = "response";
+/// Value of [`RESPONSE`] of measured catalogues.
+pub const NOT_APPLIED: &str = "not applied";
 /// All keys beside fingerprints.
-pub const KEYS: [&str; 10] = [
+pub const KEYS: [&str; 11] = [
     "creator",
     "submiss",
     "elltype",
@@ -29,6 +34,7 @@ pub const KEYS: [&str; 10] = [
     WARNINGS,
     FRAME,
     FIRST_PIXEL,
+    RESPONSE,
 ];
 
 /// Key and value that state the pixel axes.

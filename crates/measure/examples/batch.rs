@@ -1,8 +1,8 @@
-//! Calibrated ellipticities of many stamps.
+//! Ellipticities and responses of many stamps.
 #![expect(clippy::print_stdout, reason = "an example shows what it finds")]
 
 use ndarray::Array3;
-use shearq_measure::{FunctionalPsf, Measurer, PsfProfile, Psfs, Shear};
+use shearq_measure::{FunctionalPsf, Measurer, PsfProfile, Psfs, Shear, ShearSum};
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
     // Stand-ins for your images: a star, and galaxies of which every other is elongated along x.
@@ -14,10 +14,17 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
 
     let measurer = Measurer::named("48/linear/star", 48)?;
     let batch = measurer.batch(stamps.view(), &Psfs::star(star.view()), Some(1.0))?;
-    println!("mean response: {:.2?}", batch.response);
+    let mut sum = ShearSum::default();
     for galaxy in batch.galaxies.iter().filter(|g| g.flags.is_empty()) {
-        println!("calibrated e = ({:+.3}, {:+.3})", galaxy.e1, galaxy.e2);
+        println!("e = ({:+.3}, {:+.3})", galaxy.e1, galaxy.e2);
+        sum.add(
+            [galaxy.e1, galaxy.e2],
+            galaxy.response.ok_or("no response")?,
+            1.0,
+        );
     }
-    assert!(batch.response.is_some() && batch.galaxies[1].e1 > batch.galaxies[0].e1);
+    let mean = sum.mean()?;
+    println!("shear {:+.3?} ± {:.3?}", mean.shear, mean.error());
+    assert!(mean.shear[0] > 0.0 && batch.galaxies[1].e1 > batch.galaxies[0].e1);
     Ok(())
 }

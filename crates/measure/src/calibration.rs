@@ -1,53 +1,38 @@
-//! Calibration by the mean response to shear, and the mean shear with an error that includes the error of the response.
+//! The mean response to shear, and the mean shear with an error that includes the error of the response.
 
 use shearq_quantities::statistics::RunningMean;
-use shearq_submissions::{Calibration, Configuration};
 use thiserror::Error;
 
-use crate::measurement::{Flag, Measurement, ResponseMatrix};
+use crate::measurement::{Measurement, ResponseMatrix};
 
 // In standard errors. Chosen by hand.
 const LEAST_SIGNIFICANCE: f64 = 3.0;
 
-/// Divides the ellipticities of all galaxies of an image as the configuration requests: each component by its mean response
-/// over the good galaxies, which is returned; `None` if nothing is divided.
+/// The mean responses R11 and R22 of the good galaxies, and whether each is positive by three standard errors. The response
+/// of a single galaxy has no error, and must only be positive.
 ///
-/// The response of one galaxy is far too noisy to divide by, and correlated with its ellipticity. The mean over 10,000 has
-/// an error of 0.2 to 0.5 %, independent from image to image, so that the error of the mean ellipticity of a set is far
-/// below a thousandth. If a mean is not positive by three standard errors, for example because there are no galaxies on the
-/// stamps, all galaxies are flagged. The response of a single galaxy has no error, and must only be positive.
-pub fn calibrate(configuration: &Configuration, galaxies: &mut [Measurement]) -> Option<[f64; 2]> {
-    if configuration.calibration() == Calibration::None {
-        return None;
-    }
-    let good = || galaxies.iter().filter(|g| g.flags.is_empty());
-    let count = good().count() as f64;
-    // Lags on a square grid, and elliptical PSFs, give the components different responses.
-    let means = [0, 1].map(|k| good().map(|g| g.response_diagonal()[k]).sum::<f64>() / count);
-    let usable = [0, 1].into_iter().all(|k| {
-        let mut responses = RunningMean::default();
-        good().for_each(|g| responses.add(g.response_diagonal()[k]));
-        let error = responses.deviation() / count.sqrt();
-        means[k].is_finite()
-            && means[k] > 0.0
-            && (count == 1.0 || means[k] >= LEAST_SIGNIFICANCE * error)
-    });
-    for galaxy in galaxies {
-        if usable {
-            galaxy.e1 /= means[0];
-            galaxy.e2 /= means[1];
-            galaxy.divisor = Some(means);
-            for sheared in galaxy.sheared.iter_mut().flat_map(|all| &mut all.each) {
-                sheared.e1 /= means[0];
-                sheared.e2 /= means[1];
-            }
-        } else {
-            (galaxy.e1, galaxy.e2) = (f64::NAN, f64::NAN);
-            galaxy.sheared = None;
-            galaxy.flags.add(Flag::NoResponse);
+/// One galaxy's response is far too noisy to divide by, and correlated with its ellipticity. The mean over one image of 40
+/// to 400 galaxies at S/N 10 is too: ⟨1/R̂⟩ exceeds 1/⟨R⟩ by 17 to 1 in a thousand. So ellipticities stay as they are, and
+/// who averages them divides by the response of what is averaged.
+pub(crate) fn mean_response(galaxies: &[Measurement]) -> ([f64; 2], bool) {
+    let mut responses = [RunningMean::default(); 2];
+    for galaxy in galaxies.iter().filter(|galaxy| galaxy.flags.is_empty()) {
+        for (mean, response) in responses.iter_mut().zip(galaxy.response_diagonal()) {
+            mean.add(response);
         }
     }
-    usable.then_some(means)
+    (
+        responses.map(|own| own.mean()),
+        responses.iter().all(is_significant),
+    )
+}
+
+/// Whether a mean response can be divided by: positive by three standard errors. Otherwise the quotient is dominated by the
+/// noise of its divisor, for example because there are no galaxies on the stamps.
+pub fn is_significant(response: &RunningMean) -> bool {
+    let (mean, count) = (response.mean(), response.count());
+    let error = response.deviation() / (count as f64).sqrt();
+    mean.is_finite() && mean > 0.0 && (count == 1 || mean >= LEAST_SIGNIFICANCE * error)
 }
 
 /// The mean shear of many galaxies.
@@ -122,7 +107,7 @@ pub struct ShearSum {
 impl ShearSum {
     /// Adds a galaxy without a flag, with its response and a weight.
     ///
-    /// Ellipticity and response must both be divided by the mean response, or neither. The response is the unit matrix for
+    /// The response is the unit matrix for
     /// ellipticities without calibration. A weight of zero adds nothing. The weight must not depend on the measured
     /// ellipticity.
     pub fn add(&mut self, e: [f64; 2], response: ResponseMatrix, weight: f64) {
@@ -228,53 +213,41 @@ mod tests {
     use rand::{RngExt, SeedableRng};
     use rand_chacha::ChaCha8Rng;
     use rand_distr::{Distribution, StandardNormal};
-    use shearq_submissions::Registry;
 
     use super::*;
-    use crate::measurement::Flags;
+    use crate::measurement::{Flag, Flags};
 
     fn row(responses: &[f64]) -> Vec<Measurement> {
-        let galaxies = responses.iter().map(|&r| {
-            let nothing = Measurement::flagged(Flag::NoLight);
-            Measurement {
-                e1: 0.1,
-                e2: -0.2,
-                response: (!r.is_nan()).then_some([[r, 0.0], [0.0, 2.0 * r]]),
-                flags: if r.is_nan() {
-                    nothing.flags
-                } else {
-                    Flags::NONE
-                },
-                ..nothing
-            }
+        let galaxies = responses.iter().map(|&r| match r.is_nan() {
+            true => Measurement::flagged(Flag::NoLight),
+            false => Measurement {
+                response: Some([[r, 0.0], [0.0, 2.0 * r]]),
+                ..Measurement::flagged(Flags::NONE)
+            },
         });
         galaxies.collect()
     }
 
     #[test]
-    fn ellipticities_are_divided_by_the_mean_of_good_galaxies() {
-        let registry = Registry::embedded().unwrap();
-        let of = |name| registry.get(name).unwrap().configuration;
-        let (plain, calibrated) = (of("paper"), of("48/linear/star"));
-        let mut rows = row(&[0.4, 0.8, f64::NAN, 0.3]);
-        assert_eq!(calibrate(&plain, &mut rows), None);
-        assert_eq!(rows[0].e1, 0.1);
-        let mean = calibrate(&calibrated, &mut rows).unwrap();
-        assert!((mean[0] - 0.5).abs() < 1e-12 && mean[1] == 2.0 * mean[0]);
-        assert!((rows[0].e1 - 0.2).abs() < 1e-12);
-        assert!(rows.iter().all(|g| g.divisor == Some(mean)));
-        assert!((rows[3].e2 + 0.2).abs() < 1e-12);
+    fn mean_responses_are_those_of_good_galaxies() {
+        let (mean, significant) = mean_response(&row(&[0.4, 0.8, f64::NAN, 0.3]));
+        assert!((mean[0] - 0.5).abs() < 1e-12 && (mean[1] - 1.0).abs() < 1e-12);
+        assert!(significant);
         // 0.1 ± 0.1 and, of others, 0.1 ± 0.03.
-        let unsure = [0.3, -0.1, 0.25, -0.05];
-        assert_eq!(calibrate(&calibrated, &mut row(&unsure)), None);
         let scatter = [0.19, 0.01, 0.17, 0.03];
-        let mut rows = row(&[scatter, scatter].concat());
-        assert!(calibrate(&calibrated, &mut rows).is_some());
-        let mut rows = row(&[-0.1, f64::NAN]);
-        assert_eq!(calibrate(&calibrated, &mut rows), None);
-        assert_eq!(rows[0].flags, Flag::NoResponse.into());
-        assert!(rows[0].e1.is_nan());
-        assert!(rows[1].flags.contains(Flag::NoLight));
+        for (responses, significant) in [
+            (&[0.3, -0.1, 0.25, -0.05][..], false),
+            (&[scatter, scatter].concat(), true),
+            (&[-0.1, f64::NAN], false),
+            (&[0.1], true),
+            (&[f64::NAN], false),
+        ] {
+            assert_eq!(
+                mean_response(&row(responses)).1,
+                significant,
+                "{responses:?}"
+            );
+        }
     }
 
     const TRUE_SHEAR: [f64; 2] = [0.08, -0.05];

@@ -1,7 +1,7 @@
 //! Galaxy shapes from stamps and PSFs, for weak lensing.
 //!
 //! A configuration deconvolves by a Hopfield network or by its linear closed form, measures moments of the
-//! autocorrelation, and calibrates them by the response to shear. Input are views of arrays, output are plain structs.
+//! autocorrelation, and determines their response to shear. Input are views of arrays, output are plain structs.
 //! The crate reads no files and starts no threads.
 //!
 //! # A batch
@@ -10,7 +10,8 @@
 #![doc = include_str!("../examples/batch.rs")]
 //! ```
 //!
-//! The ellipticities of a [`Batch`] are divided by its mean response. PSFs are stars or formulas, one for all galaxies
+//! The ellipticities of a [`Batch`] are not divided by a response: the mean shear of any galaxies is the sum of their
+//! ellipticities over the sum of their responses ([`ShearSum`]). PSFs are stars or formulas, one for all galaxies
 //! or one per galaxy ([`Psfs`]). Pixels are `f32` or `f64`.
 //!
 //! # One stamp
@@ -25,10 +26,9 @@
 //!
 //! A [`Measurer`] serves all threads. Each thread has a [`Worker`] with its own buffers; measuring a galaxy allocates
 //! nothing. A [`Session`] measures one image of any [`StampSource`]: it surveys noise, sky and stars, measures rows in the
-//! caller's threads, calibrates and warns.
+//! caller's threads, and warns.
 //!
-//! For galaxies without an image, the types fix the order: worker, image, PSF, galaxy. [`calibrate`] divides by their mean
-//! response.
+//! For galaxies without an image, the types fix the order: worker, image, PSF, galaxy.
 //!
 //! # Epochs
 //!
@@ -70,7 +70,7 @@ mod sky;
 mod transform;
 mod warning;
 
-pub use calibration::{MeanShear, MeanShearError, ShearSum, calibrate};
+pub use calibration::{MeanShear, MeanShearError, ShearSum, is_significant};
 pub use error::{EpochError, MeasureError};
 pub use examine::{EXAMINED_PSFS, Examination, examined_rows};
 pub use measurement::{Coupling, Flag, Flags, Measurement, Observables, ResponseMatrix};

@@ -45,16 +45,14 @@ pub struct Measurement {
     pub e2: f64,
     /// Reasons why the galaxy could not be measured.
     pub flags: Flags,
-    /// Response of the reported ellipticity to shear, before calibration; `None` for the network and for galaxies that
-    /// could not be measured. Only means over many galaxies are unbiased: the mean contribution of sheared noise is
+    /// Response of the reported ellipticity to shear; `None` for the network, for galaxies that could not be
+    /// measured, and in images of a configuration without calibration. Only means over many galaxies are unbiased: the mean contribution of sheared noise is
     /// subtracted from one galaxy in eight, for all.
     pub response: Option<ResponseMatrix>,
     /// Flux and size before the PSF, with their responses; `None` for the network and for galaxies that could not be measured.
     pub observables: Option<Observables>,
     /// The galaxy under small shears, if the configuration requests sheared catalogues.
     pub sheared: Option<ShearedCatalogues>,
-    /// Mean responses of the galaxies calibrated together, by which e1 and e2 were divided; `None` before calibration.
-    pub divisor: Option<[f64; 2]>,
     /// Iterations of the network; `None` if it did not run.
     pub descent: Option<Descent>,
     /// Standard deviation of the noise that was used, in image units; NaN if unknown.
@@ -83,7 +81,6 @@ impl Measurement {
             response: None,
             observables: None,
             sheared: None,
-            divisor: None,
             descent: None,
             noise: f64::NAN,
             flux: f64::NAN,
@@ -117,9 +114,7 @@ pub enum Flag {
     /// The distortion exceeds 1 and has no shear-type ellipticity.
     #[error("distortion above 1")]
     NoShear = 32,
-    /// The response by which the ellipticities were to be divided is not positive.
-    #[error("no response to shear to divide by")]
-    NoResponse = 64,
+    // 64 was "no response to divide by", when each image was calibrated by itself.
     /// Another galaxy is too near to be separated, or the galaxy has such a shape.
     #[error("a neighbour or an unusual shape")]
     Neighbour = 128,
@@ -127,14 +122,13 @@ pub enum Flag {
 
 impl Flag {
     /// All, in the order of their bits.
-    pub const ALL: [Flag; 8] = [
+    pub const ALL: [Flag; 7] = [
         Flag::NotFinite,
         Flag::BadPsf,
         Flag::NoScale,
         Flag::NoLight,
         Flag::NoExtent,
         Flag::NoShear,
-        Flag::NoResponse,
         Flag::Neighbour,
     ];
 }
@@ -172,10 +166,6 @@ impl Flags {
     /// The flags of a value of the column `flags`.
     pub fn from_bits(bits: u32) -> Flags {
         Flags(bits)
-    }
-
-    pub(crate) fn add(&mut self, flag: Flag) {
-        self.0 |= flag as u32;
     }
 }
 

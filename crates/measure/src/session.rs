@@ -1,8 +1,8 @@
-//! The measurement of one image, from its stamps and PSFs to calibrated rows and warnings.
+//! The measurement of one image, from its stamps and PSFs to rows and warnings.
 //!
 //! A [`Session`] is opened on a [`StampSource`]. Opening surveys the image: the noise and the sky of its stamps, and the
 //! common profile of noisy stars. Rows are then read, measured in any thread, and collected in order by a
-//! [`MeasuredImage`], which calibrates them and checks the image. Files, simulations, [`Measurer::batch`] and Python all
+//! [`MeasuredImage`], which checks the image. Files, simulations, [`Measurer::batch`] and Python all
 //! use it: while each of them had its own way, they differed in what they surveyed and reported.
 
 use std::borrow::Cow;
@@ -13,9 +13,9 @@ use std::sync::{Arc, LazyLock};
 use ndarray::{ArrayView3, Axis, Ix3, Slice};
 use shearq_quantities::statistics::upper_median;
 use shearq_quantities::{Frame, Jacobian, columns_of};
-use shearq_submissions::{Configuration, NoiseSource};
+use shearq_submissions::{Calibration, Configuration, NoiseSource};
 
-use crate::calibration::calibrate;
+use crate::calibration::mean_response;
 use crate::error::{MeasureError, length};
 use crate::examine::{EXAMINED_PSFS, Examination, enough, examined_rows};
 use crate::measurement::Measurement;
@@ -314,7 +314,7 @@ pub struct RowJob<'n> {
     jacobians: Option<Vec<Jacobian>>,
 }
 
-/// The galaxies of a row before calibration.
+/// The galaxies of a row.
 #[derive(Debug)]
 pub struct MeasuredRow {
     row: usize,
@@ -339,13 +339,13 @@ pub struct MeasuredImage<'n> {
     examined: Option<Examined>,
 }
 
-/// The galaxies of an image, measured and calibrated.
+/// The galaxies of an image.
 #[derive(Debug, Clone, Default)]
 pub struct Batch {
-    /// One per stamp. Ellipticities are calibrated; responses are the galaxies' own.
+    /// One per stamp. Ellipticities are not divided by a response.
     pub galaxies: Vec<Measurement>,
-    /// The mean response of e1 to γ1 and of e2 to γ2 that ellipticities were divided by; `None` if the configuration
-    /// asks for no calibration, or (then all galaxies are flagged) if it is not positive.
+    /// The mean response of e1 to γ1 and of e2 to γ2 of the galaxies without a flag; `None` if the configuration asks for no
+    /// calibration. The mean shear of many images is the sum of their ellipticities over that of their responses.
     pub response: Option<[f64; 2]>,
     /// What is wrong with the stamps and PSFs.
     pub warnings: Vec<Warning>,
@@ -714,7 +714,7 @@ impl MeasuredImage<'_> {
         self.next == self.session.rows.len()
     }
 
-    /// Calibrates the galaxies, and collects what is wrong with the image.
+    /// Collects what is wrong with the image.
     pub fn finish(self) -> Batch {
         let MeasuredImage {
             session,
@@ -723,7 +723,14 @@ impl MeasuredImage<'_> {
             ..
         } = self;
         let configuration = session.measurer.configuration();
-        let response = calibrate(configuration, &mut galaxies);
+        let calibrated = configuration.calibration() == Calibration::Response;
+        let response = calibrated.then(|| mean_response(&galaxies));
+        if !calibrated {
+            // A response in a catalogue is one to divide by.
+            galaxies
+                .iter_mut()
+                .for_each(|galaxy| galaxy.response = None);
+        }
         let mut warnings = session.warnings.clone();
         let mut psf_noise = None;
         if let Some(Examined { stamps, scaled }) = examined {
@@ -752,9 +759,14 @@ impl MeasuredImage<'_> {
             psf_noise = effect.filter(|_| configuration.linear().is_some());
         }
         warnings.extend(Warning::of_galaxies(&galaxies));
+        if let Some((response, false)) = response
+            && galaxies.iter().any(|galaxy| galaxy.flags.is_empty())
+        {
+            warnings.push(Warning::NoResponse { response });
+        }
         Batch {
             galaxies,
-            response,
+            response: response.map(|(response, _)| response),
             warnings,
             psf_noise,
             frame: session.frame,
@@ -892,9 +904,8 @@ fn scan<R: Send + Sync, L: Send, E: Send>(
 }
 
 impl Measurer {
-    /// Measures stamps `[galaxy, y, x]` and divides their ellipticities by the mean response, if the configuration sets it.
-    /// `noise` is σ of white noise; without it, a configuration with `noise.source = "border"` measures the noise on the
-    /// stamps. Several thousand galaxies determine the response to 1 %.
+    /// Measures stamps `[galaxy, y, x]`. `noise` is σ of white noise; without it, a configuration with `noise.source = "border"` measures the noise on the
+    /// stamps. Ellipticities are to be divided by the mean response, which several thousand galaxies determine to 1 %.
     ///
     /// A galaxy with pixels that are not finite (under a linear method: too many), or with a PSF of its own that cannot be
     /// used, is flagged.
@@ -950,7 +961,7 @@ mod tests {
     }
 
     #[test]
-    fn batches_are_stamps_divided_by_their_mean_response() {
+    fn batches_are_stamps_with_their_mean_response() {
         let measurer = Measurer::named("48/linear/star", 48).unwrap();
         let (stamps, psf) = (stamps(6, 48), moffat(0.02));
         let star = psf.stamp(40);
@@ -964,7 +975,7 @@ mod tests {
                 .stamp(double.view(), star.view(), Some(0.5))
                 .unwrap();
             assert_eq!(one.response, galaxy.response);
-            assert_eq!(one.e1 / response[0], galaxy.e1);
+            assert_eq!(one.e1, galaxy.e1);
             means = [0, 1].map(|k| means[k] + one.response_diagonal()[k] / 6.0);
         }
         assert!((means[0] / response[0] - 1.0).abs() < 1e-12);

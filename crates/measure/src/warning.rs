@@ -99,6 +99,14 @@ pub enum Warning {
         /// Number of galaxies that the network ran on.
         of: usize,
     },
+    /// The mean response of the galaxies is not positive by three standard errors.
+    #[error(
+        "the mean response to shear is not positive by 3 standard errors (found {:.3}, {:.3}). Try: check that the PSF has the pixel scale of the galaxies, and that there are galaxies", response[0], response[1]
+    )]
+    NoResponse {
+        /// Mean R11 and R22.
+        response: [f64; 2],
+    },
     /// Stamps are copies of other stamps.
     #[error(
         "stamps are copies of each other (found {count} of {of}; expected none). Copies make errors too small. Try: remove repeated galaxies"
@@ -508,8 +516,7 @@ impl Warning {
 
     /// A warning if `count` of `of` galaxies are flagged and these are more than half. `with` counts a flag.
     pub fn of_counts(with: impl Fn(Flag) -> usize, count: usize, of: usize) -> Option<Warning> {
-        // Galaxies without a usable mean response have this flag together with the one that explains it.
-        let explains = |flag: &Flag| *flag != Flag::NoResponse && 2 * with(*flag) > of;
+        let explains = |flag: &Flag| 2 * with(*flag) > of;
         let flag = Flag::ALL.into_iter().find(explains);
         // Of equal numbers the first reason.
         let most = || Flag::ALL.into_iter().rev().max_by_key(|flag| with(*flag));
@@ -528,6 +535,7 @@ impl Warning {
             Warning::Depths { .. } => "depths",
             Warning::LongCorrelation { .. } => "long-correlation",
             Warning::Idle { .. } => "idle",
+            Warning::NoResponse { .. } => "no-response",
             Warning::Copies { .. } => "copies",
             Warning::Blank { .. } => "blank",
             Warning::Brightness { .. } => "brightness",
@@ -633,9 +641,6 @@ fn advice(flag: Flag) -> &'static str {
         Flag::NoScale => "check that the stamps are not blank and that the noise is known",
         Flag::NoLight | Flag::NoExtent => "check the sky, the sign of the image and its units",
         Flag::NoShear => "check that there is a galaxy on the stamps",
-        Flag::NoResponse => {
-            "check that the PSF has the pixel scale of the galaxies, and that there are galaxies"
-        }
         Flag::Neighbour => {
             "check sky gradients and that the stamps are centred on the galaxies. If each stamp has one galaxy, set shape.neighbours = \"keep\""
         }

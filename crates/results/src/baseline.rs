@@ -19,6 +19,7 @@ use thiserror::Error;
 
 use crate::catalogues::OWN;
 use crate::record::SetRecord;
+use crate::response::response_of;
 use crate::score::{ScoreError, score_folder};
 use crate::views::junit::{Case, document};
 
@@ -233,6 +234,7 @@ pub fn metrics_of(
 // Rms of e1 and e2 over the measured galaxies of a set, each with its standard error rms/√(2N).
 fn scatter(run: &Run, out: &Path, set: u32, threads: usize) -> Result<[[f64; 2]; 2], ScoreError> {
     let catalogues = run.catalogues(out, &[set])?.of_set(set);
+    let response = response_of(catalogues.iter().map(|(_, path)| path.as_path()))?;
     let pool = Pool::new(threads)?;
     let sums = pool.in_order(catalogues, |(_, path)| {
         let table = table::read(&path, Some(&["e1", "e2"]), MAX_ROWS)?;
@@ -257,8 +259,8 @@ fn scatter(run: &Run, out: &Path, set: u32, threads: usize) -> Result<[[f64; 2];
         squares[1] += more[1];
         count += galaxies;
     }
-    Ok(squares.map(|sum| {
-        let rms = (sum / count).sqrt();
+    Ok([0, 1].map(|k| {
+        let rms = (squares[k] / count).sqrt() / response[k];
         [rms, rms / (2.0 * count).sqrt()]
     }))
 }

@@ -13,6 +13,7 @@ use shearq_files::table::most_rows;
 use shearq_scoring::{Choice, Convention, FieldSum, Grid, Row, RowCounts};
 
 use crate::foreign::{Foreign, Screen, folder_of, plain_columns};
+use crate::response::response_of;
 use crate::submit::{Packed, Sent, Submission, settings_of};
 
 /// The scored columns of catalogues by shearq.
@@ -192,16 +193,35 @@ impl Catalogues {
         }
     }
 
-    /// The rows of one catalogue, at most `most`, with the signs and the type of ellipticity that are scored.
-    pub fn rows(&self, path: &Path, most: usize) -> Result<Vec<Row>, FileError> {
+    /// The mean responses R11 and R22 of a set that its ellipticities are still to be divided by; 1 if none.
+    pub fn response(&self, set: u32) -> Result<[f64; 2], FileError> {
         match &self.origin {
-            Origin::Foreign(foreign, _) => foreign.rows(path, most),
-            // Catalogues of other programs were converted when they were packed.
-            Origin::Measured(..) | Origin::Packed { .. } => read_rows(path, &COLUMNS, most),
+            Origin::Packed { .. } => Ok([1.0; 2]),
+            _ => response_of(self.of_set(set).iter().map(|(_, path)| path.as_path())),
         }
     }
 
-    /// One catalogue on the grid.
+    /// The rows of one catalogue, at most `most`, with the signs and the type of ellipticity that are scored, divided by
+    /// `response`.
+    pub fn rows(
+        &self,
+        path: &Path,
+        response: [f64; 2],
+        most: usize,
+    ) -> Result<Vec<Row>, FileError> {
+        let mut rows = match &self.origin {
+            Origin::Foreign(foreign, _) => foreign.rows(path, most)?,
+            // Catalogues of other programs were converted when they were packed.
+            Origin::Measured(..) | Origin::Packed { .. } => read_rows(path, &COLUMNS, most)?,
+        };
+        for row in &mut rows {
+            row.e1 /= response[0];
+            row.e2 /= response[1];
+        }
+        Ok(rows)
+    }
+
+    /// One catalogue on the grid, not divided by a response.
     pub fn sum(&self, grid: &Grid, path: &Path) -> Result<(FieldSum, RowCounts), FileError> {
         match &self.origin {
             Origin::Measured(..) => own_catalogue(grid, path),

@@ -5,6 +5,7 @@
 //! * [`bias`] estimates m and c of catalogues of any program.
 //! * [`select`] applies cuts and weights to catalogues without a bias; [`expression`] reads formulas of columns.
 //! * [`mean`] averages catalogues to one shear per set.
+//! * [`response`] is what ellipticities of many catalogues are divided by, for scores and for a shear per galaxy.
 //! * [`star_noise`] adds the noise of stars to the error of a mean shear.
 //! * [`record`] is the record of a scored set with the list of its columns, and [`store`] keeps records in Parquet files.
 //! * [`compare`] chooses, groups and compares records.
@@ -21,6 +22,7 @@ pub mod expression;
 pub mod foreign;
 pub mod mean;
 pub mod record;
+pub mod response;
 pub mod score;
 pub mod select;
 pub mod star_noise;

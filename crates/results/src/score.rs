@@ -18,6 +18,7 @@ use thiserror::Error;
 
 use crate::catalogues::Catalogues;
 use crate::record::SetRecord;
+use crate::response::response_of;
 
 /// Why catalogues cannot be scored or compared.
 #[derive(Debug, Error)]
@@ -132,6 +133,8 @@ struct SetFiles<'a> {
     // Their names in messages: members of an archive, not of the folder that it was unpacked to.
     names: Vec<PathBuf>,
     read: ReadImage<'a>,
+    // Of the whole set: that of one image of few galaxies is noisy, and ⟨1/R̂⟩ exceeds 1/⟨R⟩.
+    response: [f64; 2],
     pool: &'a Pool,
 }
 
@@ -159,7 +162,9 @@ impl SetFiles<'_> {
         let mut images = SetImages::new(grid);
         let mut rows = RowCounts::default();
         let read = self.pool.in_order(&self.paths, |path| {
-            let (sum, rows) = (self.read)(grid, path)?;
+            let (mut sum, rows) = (self.read)(grid, path)?;
+            sum.e1 /= self.response[0];
+            sum.e2 /= self.response[1];
             let response = compared.and_then(|(scorer, own)| scorer.response(&sum, own));
             Ok::<_, FileError>((sum, rows, response))
         });
@@ -247,6 +252,7 @@ pub fn score_files(
         paths: catalogues.to_vec(),
         names: catalogues.to_vec(),
         read,
+        response: response_of(catalogues.iter().map(PathBuf::as_path))?,
         pool: &Pool::new(threads)?,
     };
     let added = files.add_up(&grid, None)?;
@@ -316,17 +322,18 @@ fn score_sets(
         catalogues.check_axes(set)?;
     }
     let read = |grid: &Grid, path: &Path| catalogues.sum(grid, path);
-    let files = |set: u32| {
+    let files = |set: u32| -> Result<_, ScoreError> {
         let (images, paths): (Vec<u32>, Vec<PathBuf>) = catalogues.of_set(set).into_iter().unzip();
-        SetFiles {
+        Ok(SetFiles {
             set: Some(set),
             simulated: kind_of(data, set).is_some(),
             images,
             names: paths.iter().map(|path| catalogues.as_given(path)).collect(),
             paths,
             read: &read,
+            response: catalogues.response(set)?,
             pool,
-        }
+        })
     };
     let scorer = |files: &SetFiles<'_>, set: u32, options| -> Result<_, ScoreError> {
         let ReadTruth { grid, shear, .. } = read_truth(&data.truth(set), &reading_of(data, set)?)?;
@@ -338,7 +345,7 @@ fn score_sets(
     if choice == Choice::Matched {
         let mut all = ConventionMatch::default();
         for &set in sets {
-            let files = files(set);
+            let files = files(set)?;
             let (grid, scorer) = scorer(&files, set, Options::default())?;
             let images = files.add_up(&grid, None)?.images;
             all.merge(&scorer.match_convention(&images).map_err(files.wrong())?);
@@ -349,7 +356,7 @@ fn score_sets(
     }
     let mut scored = Vec::new();
     for &set in sets {
-        let files = files(set);
+        let files = files(set)?;
         let (grid, scorer) = scorer(&files, set, options)?;
         let compared = match options.choice {
             Choice::Insist(convention) => Some((&scorer, convention)),

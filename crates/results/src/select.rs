@@ -11,15 +11,16 @@ use shearq_files::frames::frame;
 use shearq_files::frames::polars::{Column, DataFrame};
 use shearq_files::table::Place;
 use shearq_files::{FileError, atomic, table};
-use shearq_measure::{Cut, Observables, Quantity, ResponseMatrix, Selection, ShearedCatalogues};
+use shearq_measure::{
+    Cut, Observables, Quantity, ResponseMatrix, Selection, ShearSum, ShearedCatalogues,
+};
 use thiserror::Error;
 
 use crate::expression::{Condition, Expression, ExpressionError, Step};
+use crate::response::refuse_divided;
 
 /// Columns that a selection replaces or reads. It also reads the columns of [`Observables`].
-pub(crate) const READ: [&str; 9] = [
-    "e1", "e2", "flags", "R11", "R22", "R12", "R21", "divisor1", "divisor2",
-];
+pub(crate) const READ: [&str; 7] = ["e1", "e2", "flags", "R11", "R22", "R12", "R21"];
 
 /// Why `--where` and `--weight` cannot be used.
 #[derive(Debug, Clone, PartialEq, Error)]
@@ -122,12 +123,11 @@ fn cut(step: &Step) -> Result<Cut, SelectionError> {
 }
 
 // Name of the column with the weights.
-const WEIGHT: &str = "selection";
+pub(crate) const WEIGHT: &str = "selection";
 
 /// Writes the catalogues of the folder `from` with the weights of a `stated` selection to the folder `to`:
-/// ellipticities are multiplied by the weights and divided by the mean response of their image, so that all that uses catalogues
-/// uses the selection. Galaxies that are left out have an ellipticity and a response of zero. Returns the number of
-/// galaxies that are kept, and of those without a flag.
+/// ellipticities and responses are multiplied by the weights, so that all that uses catalogues uses the selection. Galaxies
+/// that are left out have an ellipticity and a response of zero. Returns the number of galaxies that are kept, and of those without a flag.
 pub fn write_selected(
     run: &Run,
     from: &Path,
@@ -145,10 +145,20 @@ pub fn write_selected(
         ));
     }
     let files = run.catalogues(from, &[])?;
-    // Nothing is written if one of the images has too few galaxies left.
+    // Nothing is written if one of the sets has too few galaxies left.
     for set in files.wanted(&[]) {
+        let mut sum = ShearSum::default();
         for (_, path) in files.of_set(set) {
-            Weighted::read(&path, &selection)?.0.divisors(&path)?;
+            let (rows, flags) = Weighted::read(&path, &selection)?;
+            for row in (0..flags.len()).filter(|row| flags[*row] == 0.0) {
+                sum.add([rows.e[0][row], rows.e[1][row]], rows.matrix(row), 1.0);
+            }
+        }
+        if let Err(error) = sum.mean() {
+            let message = format!(
+                "set {set:02}: the selection leaves no galaxies with a response to shear: {error}. Try: a lower threshold"
+            );
+            return Err(FileError::new(from, message));
         }
     }
     let record = Run {
@@ -197,6 +207,7 @@ pub(crate) fn require_responses<'a>(
     path: &Path,
     mut names: impl Iterator<Item = &'a str> + Clone,
 ) -> Result<(), FileError> {
+    refuse_divided(path, names.clone())?;
     if names.clone().any(|name| name == WEIGHT) {
         return Err(FileError::new(
             path,
@@ -212,11 +223,17 @@ pub(crate) fn require_responses<'a>(
     ))
 }
 
+fn check_undivided(path: &Path) -> Result<(), FileError> {
+    let present = table::columns(&Place::of(path))?;
+    let names = present.named.iter().flat_map(|named| &named.names);
+    refuse_divided(path, names.map(String::as_str))
+}
+
 /// Rows of a catalogue after a selection.
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
 pub struct Weighted {
-    /// Weighted ellipticities before calibration; NaN in rows with a flag.
+    /// Weighted ellipticities; NaN in rows with a flag.
     pub e: [Vec<f64>; 2],
     /// Their responses R11 and R22; NaN in rows with a flag.
     pub response: [Vec<f64>; 2],
@@ -237,7 +254,7 @@ impl Weighted {
             .iter()
             .map(|name| column(name))
             .collect::<Result<_, _>>()?;
-        let [e1, e2, flags, r11, r22, r12, r21, d1, d2] = {
+        let [e1, e2, flags, r11, r22, r12, r21] = {
             let read: Vec<_> = READ
                 .iter()
                 .map(|name| column(name))
@@ -258,8 +275,7 @@ impl Weighted {
                 continue;
             }
             let observables = Observables::from_array(&std::array::from_fn(|k| all[k][row]));
-            // Before calibration, because a selection changes the mean response that the ellipticities are divided by.
-            let e = [e1[row] * d1[row], e2[row] * d2[row]];
+            let e = [e1[row], e2[row]];
             let response = [[r11[row], r12[row]], [r21[row], r22[row]]];
             let selected = selection.apply(e, response, &observables);
             if !(selected.weight >= 0.0 && selected.weight.is_finite()) {
@@ -308,19 +324,17 @@ impl Weighted {
     /// ellipticities are not `calibrated`.
     pub(crate) fn unselected(path: &Path, calibrated: bool) -> Result<(Self, Vec<f64>), FileError> {
         let names = if calibrated { &READ[..] } else { &READ[..3] };
+        if calibrated {
+            check_undivided(path)?;
+        }
         let read = table::read(path, Some(names), table::MAX_ROWS)?;
         let column = |name: &str| table::numbers(&read, name, path).map(Cow::into_owned);
         let pair = |[a, b]: [&str; 2]| Ok::<_, FileError>([column(a)?, column(b)?]);
-        let (flags, mut e) = (column("flags")?, pair(["e1", "e2"])?);
+        let (flags, e) = (column("flags")?, pair(["e1", "e2"])?);
         let all = |value: f64| vec![value; flags.len()];
         let (mut response, mut cross) = ([all(1.0), all(1.0)], [all(0.0), all(0.0)]);
         if calibrated {
             (response, cross) = (pair(["R11", "R22"])?, pair(["R12", "R21"])?);
-            // Sums of ellipticities before calibration over sums of responses: a mean of ratios would weigh each galaxy by
-            // its response, which follows its noise.
-            for (e, divisors) in e.iter_mut().zip(pair(["divisor1", "divisor2"])?) {
-                e.iter_mut().zip(divisors).for_each(|(e, d)| *e *= d);
-            }
         }
         let weighted = Weighted {
             e,
@@ -337,39 +351,15 @@ impl Weighted {
         [[r11[row], r12[row]], [r21[row], r22[row]]]
     }
 
-    /// The mean responses, which have to be positive for a calibration.
-    fn divisors(&self, path: &Path) -> Result<[f64; 2], FileError> {
-        let mean = self.mean_response();
-        if !mean.iter().all(|mean| *mean > 0.0) {
-            return Err(FileError::new(
-                path,
-                format!(
-                    "the selection leaves no galaxies with a response to shear (found mean responses of {} and {}, expected positive numbers). Try: a lower threshold",
-                    mean[0], mean[1]
-                ),
-            ));
-        }
-        Ok(mean)
-    }
-
-    // The catalogue `read` with weighted and calibrated ellipticities.
+    // The catalogue `read` with weighted ellipticities and their responses.
     fn table(&self, path: &Path, read: &DataFrame) -> Result<DataFrame, FileError> {
-        let mean = self.divisors(path)?;
-        let e = |k: usize| self.e[k].iter().map(|e| e / mean[k]).collect::<Vec<f64>>();
-        let divisor = |k: usize| {
-            let rows = self.e[k].iter();
-            rows.map(|e| if e.is_finite() { mean[k] } else { f64::NAN })
-                .collect()
-        };
         let new = |name: &str| match name {
-            "e1" => Some(e(0)),
-            "e2" => Some(e(1)),
+            "e1" => Some(self.e[0].clone()),
+            "e2" => Some(self.e[1].clone()),
             "R11" => Some(self.response[0].clone()),
             "R22" => Some(self.response[1].clone()),
             "R12" => Some(self.cross[0].clone()),
             "R21" => Some(self.cross[1].clone()),
-            "divisor1" => Some(divisor(0)),
-            "divisor2" => Some(divisor(1)),
             _ => None,
         };
         // Sheared versions would not have the selection.
@@ -386,16 +376,5 @@ impl Weighted {
             .collect();
         columns.push(Column::new(WEIGHT.into(), self.weight.clone()));
         frame(columns).map_err(|error| FileError::new(path, error.to_string()))
-    }
-
-    /// Mean responses of all rows without a flag. Means are divided by them.
-    pub fn mean_response(&self) -> [f64; 2] {
-        [0, 1].map(|k| {
-            let good = self.response[k]
-                .iter()
-                .filter(|response| response.is_finite());
-            let (count, sum) = good.fold((0.0, 0.0), |(n, sum), r| (n + 1.0, sum + r));
-            sum / count
-        })
     }
 }

@@ -80,25 +80,25 @@ fn biases(
     let mut both = side(galaxies.sides[0].view())?;
     let half = both.len();
     both.extend(side(galaxies.sides[1].view())?);
-    shearq_measure::calibrate(measurer.configuration(), &mut both);
     let sides = both.split_at(half);
     // Galaxies count with all of their versions or not at all.
-    let (mut sums, mut count) = ([[0.0; 2]; 2], 0.0);
+    let (mut sums, mut responses) = ([[0.0; 2]; 2], [0.0; 2]);
     for (plus, minus) in sides.0.chunks(4).zip(sides.1.chunks(4)) {
         let whole = plus.iter().chain(minus).all(|g| g.flags.is_empty());
         if !whole {
             continue;
         }
-        count += 4.0;
         for (sum, versions) in sums.iter_mut().zip([plus, minus]) {
             for galaxy in versions {
                 sum[0] += galaxy.e1;
                 sum[1] += galaxy.e2;
+                let of_galaxy = galaxy.response_diagonal();
+                responses = [0, 1].map(|k| responses[k] + of_galaxy[k] / 2.0);
             }
         }
     }
-    let m = |k: usize| (sums[0][k] - sums[1][k]) / count / 2.0 / SHEAR - 1.0;
-    let c = |k: usize| (sums[0][k] + sums[1][k]) / count / 2.0;
+    let m = |k: usize| (sums[0][k] - sums[1][k]) / responses[k] / 2.0 / SHEAR - 1.0;
+    let c = |k: usize| (sums[0][k] + sums[1][k]) / responses[k] / 2.0;
     Ok([m(0), m(1), c(0), c(1)])
 }
 

@@ -154,8 +154,7 @@ def bias(
         the first number of a vector. No column may have two roles. Roles:
 
         * ``e1 e2`` ellipticity, ``w`` weight, ``flag`` (0 for good rows), ``id`` of the galaxy, ``unit`` of the errors;
-        * ``R11 R22 R12 R21`` response, R12 that of e1 to g2; ``dw1 dw2`` derivatives of the weight; ``divisor1 divisor2``
-          what e1 and e2 were divided by;
+        * ``R11 R22 R12 R21`` response, R12 that of e1 to g2; ``dw1 dw2`` derivatives of the weight;
         * ``rms_e sigma_e`` standard deviation of a distortion without noise, and its noise, for ``'responsivity'``;
           ``ksb_e1 ksb_e2`` shears of rows without a distortion;
         * ``g1 g2`` true shear, ``x y`` position (px), ``psf_e1 psf_e2 psf_size`` of the PSF;

@@ -35,8 +35,6 @@ class Flag(enum.IntFlag):
     """Moments without extent."""
     NoShear = 32
     """Distortion above 1."""
-    NoResponse = 64
-    """No response to shear to divide by."""
     Neighbour = 128
     """A neighbour or an unusual shape."""
 
@@ -97,8 +95,8 @@ _Whole = Literal["flags", "iterations", "stop", "updated"]
 class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
     """A structured array with one row per galaxy, as :func:`measure` returns it.
 
-    Each row contains its response and what its ellipticity was divided by. So rows of any catalogues can be chosen,
-    sorted, joined, saved and read, and the mean shear of the rows stays correct.
+    Each row contains its ellipticity and its response to shear, by which the ellipticity is not divided: the mean shear of any
+    rows is ⟨e⟩/⟨R⟩. So rows of any catalogues can be chosen by position, sorted, joined, saved and read.
 
     Fields
     ------
@@ -107,7 +105,7 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
     x, y : float64
         Position in pixels, if given.
     e1, e2 : float64
-        Ellipticity, divided by ``divisor1`` and ``divisor2``; NaN if flagged.
+        Ellipticity; NaN if flagged. With a response, it is about R times a shear: :meth:`Catalogue.shear` divides.
     flags : int32
         Reasons why the galaxy could not be measured, bits of :class:`Flag`; 0 for a good galaxy.
     iterations, stop, updated : int32
@@ -123,11 +121,8 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
         Radius of the autocorrelation that is used in pixels, and its Qxx + Qyy in px². For the linear method, ``size`` is
         the standard deviation per axis, in pixels, of a Gaussian galaxy with the same moments.
     R11, R22, R12, R21 : float64
-        Response of the galaxy to shear before the division: R12 is the response of e1 to the second component. Only
-        means over many galaxies are unbiased.
-    divisor1, divisor2 : float64
-        Mean responses of the galaxies that were measured together, by which e1 and e2 were divided; NaN if they were
-        not. The shear is Σ e1·divisor1 / Σ R11.
+        Response of e1 and e2 to shear: R12 is the response of e1 to the second component. Only means over many galaxies are
+        unbiased. NaN for networks, which have none.
     snr, flux_error : float64
         Flux over its error, and the error in image units. For linear configurations.
     flux_g1, …, t_s : float64
@@ -140,8 +135,8 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
     ----------
     attrs : dict
         ``submission``: name of the configuration; ``settings``: all settings as TOML; ``ellipticity``: 'shear' or
-        'distortion'; ``frame``: 'pixel' or 'sky', the axes of e1 and e2; ``version``: of shearq. Nothing is computed from
-        them.
+        'distortion'; ``frame``: 'pixel' or 'sky', the axes of e1 and e2; ``response``: 'not applied' if e1 and e2 are to be
+        divided by the mean response; ``version``: of shearq. Nothing is computed from them.
     """
 
     attrs: dict[str, Any]
@@ -251,9 +246,7 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
             mean = float(response[kept].mean())
             if not mean > 0:
                 raise ValueError(f"where: the mean response R{k}{k} of the selection is {mean:.3g}; expected a positive number")
-            chosen[f"e{k}"] = e[kept] / mean
-            chosen[f"R{k}{k}"] = response[kept]
-            chosen[f"divisor{k}"] = mean
+            chosen[f"e{k}"], chosen[f"R{k}{k}"] = e[kept], response[kept]
         chosen["R12"], chosen["R21"] = r12[kept], r21[kept]
         # A second selection would need responses that the rows do not have.
         left = [name for name in chosen.dtype.names or () if name not in _schema.OBSERVED]
@@ -263,8 +256,7 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
     def mean_shear(
         self, weights: ArrayLike | None = None, *, where: str | None = None, weight: str | None = None
     ) -> MeanShear:
-        """The mean shear of the good galaxies: g = (ΣwR)⁻¹ Σwe, with the ellipticities e before calibration and the 2 × 2
-        responses R.
+        """The mean shear of the good galaxies: g = (ΣwR)⁻¹ Σwe, with the ellipticities e and the 2 × 2 responses R.
 
         The error is that of this ratio to first order: the covariance (ΣwR)⁻¹ [Σw²(e − Rg)(e − Rg)ᵀ n/(n − 1)] (ΣwR)⁻ᵀ.
         Catalogues without R12 and R21 have a diagonal R. It assumes independent
@@ -294,6 +286,40 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
             raise ValueError("weights: cannot be combined with where or weight; expected one of them")
         return mean_shear(self.select(where, weight))
 
+    def shear(self, response: ArrayLike | None = None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """A shear for each galaxy: g = ⟨R⟩⁻¹ e, with one mean 2 × 2 response.
+
+        The response of one galaxy is too noisy to divide by, and that of few galaxies biases g: by 0.017 for 40 galaxies at
+        S/N 10. Join the catalogues of a survey by :func:`concatenate`, or pass the response of all.
+
+        Parameters
+        ----------
+        response : array of shape (2, 2), optional
+            ((R11, R12), (R21, R22)). By default the mean of the good galaxies; the unit matrix without a response.
+
+        Returns
+        -------
+        g1, g2 : array of shape (n,)
+            NaN if flagged.
+
+        Raises
+        ------
+        ValueError
+            If no galaxy is good, or the response has no positive determinant.
+        """
+        rows = np.atleast_1d(self).view(Catalogue)
+        e, (r11, r22) = raw(rows)
+        if response is None:
+            if not rows.good.any():
+                raise ValueError(f"catalogue: each of the {len(rows)} galaxies has a flag; expected one without")
+            r12, r21 = _cross(rows)
+            response = np.array([[column[rows.good].mean() for column in pair] for pair in ((r11, r12), (r21, r22))])
+        matrix = double("response", response)
+        if matrix.shape != (2, 2) or not np.linalg.det(matrix) > 0:
+            raise ValueError(f"response: found {matrix.tolist()}; expected a 2 × 2 matrix with a positive determinant")
+        g1, g2 = np.linalg.inv(matrix) @ np.stack(e)
+        return g1, g2
+
     def columns(self, names: Literal["shearq", "anacal", "ngmix"] = "shearq") -> dict[str, NDArray[Any]]:
         """Columns by the names that a program uses.
 
@@ -301,8 +327,7 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
         ----------
         names : {'shearq', 'anacal', 'ngmix'}
             ``'anacal'``: ``e1``, ``e2``, responses ``de1_dg1``, ``de2_dg2``, ``de1_dg2``, ``de2_dg1`` and ``flags``;
-            ``'ngmix'``: ``g`` of shape (n, 2), ``R11``, ``R22``, ``R12``, ``R21`` and ``flags``. In both, ellipticities
-            are those before calibration: the shear is the inverse of the summed 2 × 2 responses times the summed
+            ``'ngmix'``: ``g`` of shape (n, 2), ``R11``, ``R22``, ``R12``, ``R21`` and ``flags``. The shear is the inverse of the summed 2 × 2 responses times the summed
             ellipticities. ``'shearq'``: all columns of the catalogue.
 
         Returns
@@ -374,7 +399,8 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
         Raises
         ------
         ValueError
-            If a column is absent, columns have several lengths, responses are there without divisors, or an ellipticity
+            If a column is absent, columns have several lengths, an earlier version divided the ellipticities by ``divisor1``
+            and ``divisor2``, or an ellipticity
             without ``flags`` stands for a failed measurement (−10, −99, 1e30).
         """
         found: Catalogue = _tables.from_table(Catalogue, table, columns)
@@ -454,23 +480,21 @@ def concatenate(catalogues: Iterable[Catalogue]) -> Catalogue:
 
 
 def raw(rows: Catalogue) -> tuple[list[NDArray[np.float64]], list[NDArray[np.float64]]]:
-    """Ellipticities before calibration, and their responses R11 and R22; those of rows without calibration are 1."""
-    e, responses = [], []
-    for k in "12":
-        divisor = np.asarray(rows[f"divisor{k}"], dtype=np.float64)
-        plain = np.isnan(divisor)
-        e.append(np.ascontiguousarray(rows[f"e{k}"] * np.where(plain, 1.0, divisor)))
-        response = np.where(plain & (rows["flags"] == 0), 1.0, rows[f"R{k}{k}"])
-        responses.append(np.ascontiguousarray(response, dtype=np.float64))
-    return e, responses
+    """Ellipticities, and their responses R11 and R22; 1 in rows without a response."""
+    e = [np.ascontiguousarray(rows[f"e{k}"], dtype=np.float64) for k in "12"]
+    return e, [np.where(_plain(rows), 1.0, np.asarray(rows[f"R{k}{k}"], dtype=np.float64)) for k in "12"]
+
+
+def _plain(rows: Catalogue) -> NDArray[np.bool_]:
+    """Good rows without a response: their ellipticities are taken as shears."""
+    return np.asarray(np.isnan(rows["R11"]) & np.isnan(rows["R22"]) & (rows["flags"] == 0))
 
 
 def _cross(rows: Catalogue) -> list[NDArray[np.float64]]:
-    """R12 and R21; 0 without the columns, and in rows without calibration."""
+    """R12 and R21; 0 without the columns, and in rows without a response."""
     if not all(name in (rows.dtype.names or ()) for name in ("R12", "R21")):
         return [np.zeros(len(rows)), np.zeros(len(rows))]
-    plain = (np.isnan(rows["divisor1"]) & (rows["flags"] == 0), np.isnan(rows["divisor2"]) & (rows["flags"] == 0))
-    return [np.where(plain[k], 0.0, np.asarray(rows[name], dtype=np.float64)) for k, name in enumerate(("R12", "R21"))]
+    return [np.where(_plain(rows), 0.0, np.asarray(rows[name], dtype=np.float64)) for name in ("R12", "R21")]
 
 
 def mean_shear(catalogues: Catalogue | Iterable[Catalogue], weights: ArrayLike | None = None) -> MeanShear:
@@ -505,7 +529,7 @@ def mean_shear(catalogues: Catalogue | Iterable[Catalogue], weights: ArrayLike |
         parts.append([*e, *responses, *_cross(rows)])
         stars.append(_stars(rows))
         goods.append(rows.good)
-        calibrated = calibrated or bool(np.isfinite(rows["divisor1"]).any())
+        calibrated = calibrated or bool(np.isfinite(rows["R11"]).any())
     if not parts:
         raise ValueError("catalogues: found none; expected one or more")
     good = np.concatenate(goods)

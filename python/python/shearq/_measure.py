@@ -1,4 +1,4 @@
-"""Measure stamps and PSFs into catalogues of calibrated ellipticities."""
+"""Measure stamps and PSFs into catalogues of ellipticities and their responses to shear."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def measure(
     threads: int | None = None,
     progress: Callable[[int], object] | None = None,
 ) -> Catalogue:
-    """Measure the shapes of galaxies and calibrate them by their mean response to shear.
+    """Measure the shapes of galaxies and their response to shear.
 
     Parameters
     ----------
@@ -182,8 +182,10 @@ def measure(
 
     Notes
     -----
-    e1 and e2 are divided by the mean response of the good galaxies of this call. Its error is about a per cent for
-    some thousand galaxies. Combine several calls by :func:`mean_shear` or :func:`concatenate`.
+    e1 and e2 are not divided by the response to shear, which the columns R11, R22, R12 and R21 contain (until version 0.2 they
+    were divided by the mean of the call). :func:`mean_shear` and :func:`bias` divide by the mean response of the galaxies that
+    they average; :meth:`Catalogue.shear` gives a shear per galaxy. Combine several calls by :func:`mean_shear` or
+    :func:`concatenate`. The mean response of some thousand galaxies has an error of about a per cent.
 
     Other Python threads run meanwhile; they must not change the arrays.
 
@@ -226,8 +228,8 @@ def measure_blocks(
     psf, noise, mask, x, y, ids, wcs, submission, threads, progress
         As for :func:`measure`.
     block : int
-        Most stamps of a block. Blocks are as equal as possible. A block needs enough galaxies for its mean response:
-        1000 or more.
+        Most stamps of a block. Blocks are as equal as possible. The noise and the galaxy size are measured on each: it
+        needs some hundred galaxies.
 
     Yields
     ------
@@ -352,6 +354,8 @@ def _measure(
         "settings": settings.toml,
         "version": _shearq.__version__,
     }
+    if np.isfinite(catalogue["R11"]).any():
+        catalogue.attrs["response"] = _schema.NOT_APPLIED
     return catalogue
 
 

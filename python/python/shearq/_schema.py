@@ -11,9 +11,8 @@ NOT_FINITE = 1
 # Whole numbers; the other columns of the schema are reals.
 WHOLE = ("flags", "iterations", "stop", "updated")
 # What the mean shear follows from.
-NEEDED = ("e1", "e2", "flags", "R11", "R22", "divisor1", "divisor2")
+NEEDED = ("e1", "e2", "flags", "R11", "R22")
 REAL: tuple[str, ...] = ("x", "y", "e1", "e2", "first_energy", "energy", "noise", "flux", "radius", "size", "R11", "R22", "R12", "R21")
-REAL += ("divisor1", "divisor2")
 # What linear configurations add: S/N, and how flux and size change with shear and noise (docs/files-catalogues.md).
 OBSERVED: tuple[str, ...] = ("flux_error", "flux_g1", "flux_g2", "size_g1", "size_g2")
 OBSERVED += tuple(f"n{k}_{pair}" for k in "12" for pair in ("ef", "es", "ff", "fs", "ss"))
@@ -22,13 +21,15 @@ OBSERVED += tuple(f"t_{pair}" for pair in ("e1f", "e1s", "e2f", "e2s", "ff", "fs
 STAR: tuple[str, ...] = ("psf_id", "psf_m", "psf_c")
 REAL += ("snr", *OBSERVED, *STAR)
 # What a selection reads.
-SELECTED = ("e1", "e2", "flags", "R11", "R22", "R12", "R21", "divisor1", "divisor2", "flux", "size", *OBSERVED)
+SELECTED = ("e1", "e2", "flags", "R11", "R22", "R12", "R21", "flux", "size", *OBSERVED)
 UNITS = {"x": "pix", "y": "pix", "radius": "pix"}
 
 # Keys of files, and the names of ``attrs``.
 KEYS = {"submiss": "submission", "elltype": "ellipticity", "settings": "settings", "creator": "version"}
 # Keys of the command line's files that are kept as they are.
-OTHER_KEYS = ("set", "image", "warnings", "frame")
+OTHER_KEYS = ("set", "image", "warnings", "frame", "response")
+# Value of ``response`` of ellipticities that are still to be divided by it.
+NOT_APPLIED = "not applied"
 # The keys of the command line's files for the noise of a star, and for its fingerprint.
 STAR_KEY, PSF_KEY = "psfnoise", "psf"
 _CREATOR = "shearq "

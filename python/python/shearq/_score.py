@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from . import _display, _shearq
 from ._arrays import degrees, double, flat, real, shown, whole
+from ._catalogue import Catalogue, raw
 from ._submissions import submissions
 from ._warn import warn
 
@@ -283,8 +284,8 @@ def compare(
     Parameters
     ----------
     catalogues : mapping of str to Catalogue, or to a list of one per image
-        What to compare; anything with ``["e1"]`` and ``["e2"]`` in the order of the grid will do. The first is the
-        one that others are held against.
+        What to compare; anything with ``["e1"]`` and ``["e2"]`` in the order of the grid will do. Catalogues are divided by
+        the mean response of all images. The first is the one that others are held against.
     truth : tuple of two arrays, or a simulation
         True shear, as for :func:`score`, or what :func:`simulate` returned.
     frame : {'pandas', 'polars', 'list'}, optional
@@ -310,6 +311,10 @@ def compare(
         parts = [given] if isinstance(given, (np.ndarray, Mapping)) or not isinstance(given, Sequence) else given
         try:
             e1, e2 = (np.stack([flat(f"catalogues[{name!r}]", part[column]) for part in parts]) for column in ("e1", "e2"))
+            if all(isinstance(part, Catalogue) for part in parts):
+                # Of all images, component by component, as the command line divides a set.
+                responses = np.concatenate([np.stack(raw(part)[1])[:, part.good] for part in parts], axis=1)
+                e1, e2 = e1 / responses[0].mean(), e2 / responses[1].mean()
         except (KeyError, IndexError, TypeError, ValueError) as error:
             raise ValueError(
                 f"catalogues: {name!r} has no images of e1 and e2 of one length: {error}; expected catalogues"

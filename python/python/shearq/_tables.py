@@ -193,14 +193,16 @@ def build(cls: Any, found: dict[str, Any], attrs: dict[str, Any]) -> Any:
     for name, shape in shapes.items():
         if len(rows) != 1 or shape != rows:
             raise ValueError(f"table: {name} has the shape {shape} and e1 {rows}; expected columns of one length")
-    responses, divisors = [[f"{kind}{k}" in found for k in end] for kind, end in (("R", ("11", "22")), ("divisor", "12"))]
-    if any(responses) != any(divisors) or any(responses) != all(responses) or any(divisors) != all(divisors):
+    if "divisor1" in found:
         raise ValueError(
-            "table: found only some of R11, R22, divisor1 and divisor2; expected all or none. Set divisor1 and divisor2"
-            " to the numbers by which e1 and e2 were divided: 1 if they are not calibrated"
+            "table: found divisor1, by which an earlier version of shearq divided e1; expected ellipticities before the division."
+            " Try: measure again, or multiply e1 by divisor1 and e2 by divisor2 and remove these columns"
         )
+    responses = ["R11" in found, "R22" in found]
+    if any(responses) and not all(responses):
+        raise ValueError("table: found only one of R11 and R22; expected both or none")
     if not any(responses):
-        found.update({name: np.full(rows, np.nan) for name in ("R11", "R22", "divisor1", "divisor2")})
+        found.update({name: np.full(rows, np.nan) for name in ("R11", "R22")})
     types = {name: np.dtype(np.int32) for name in _schema.WHOLE} | {name: np.dtype(np.float64) for name in _schema.REAL}
     arrays = {name: np.asarray(column) for name, column in found.items()}
     if "id" in arrays and arrays["id"].dtype.kind == "f":
@@ -257,6 +259,9 @@ def write(catalogue: Any, path: str | os.PathLike[str], overwrite: bool) -> None
                     f"path: {file.suffix} files have columns of numbers (found words in {name}). Try: a name that ends in .ecsv"
                 )
         metadata = _schema.to_keys(catalogue.attrs)
+        if "R11" in (catalogue.dtype.names or ()) and np.isfinite(catalogue["R11"]).any():
+            # Rows of plain columns have no attrs, by which the command line would know.
+            metadata.setdefault("response", _schema.NOT_APPLIED)
         stars = [np.unique(catalogue[name]) for name in _schema.STAR if name in (catalogue.dtype.names or ())]
         # As the command line states it, which does not read the columns.
         if len(stars) == 3 and all(len(star) == 1 and star[0] > 0 for star in stars):

@@ -11,12 +11,14 @@ use shearq_measure::{
     Batch, Flag, Flags, Measurement, Observables, PixelFrame, ShearedCatalogues, Warning,
 };
 use shearq_quantities::Frame;
-use shearq_submissions::{Configuration, EllipticityType};
+use shearq_submissions::{Calibration, Configuration, EllipticityType};
 
 use super::ImageHead;
 use crate::PipelineError;
 use shearq_dataset::images::ImageId;
-use shearq_dataset::metadata::{FIRST_PIXEL, FRAME, PSF_NOISE, WARNINGS, frame_entry};
+use shearq_dataset::metadata::{
+    FIRST_PIXEL, FRAME, NOT_APPLIED, PSF_NOISE, RESPONSE, WARNINGS, frame_entry,
+};
 use shearq_dataset::record::{Claim, claim};
 use shearq_dataset::run::{RUN_FILE, Run};
 use shearq_dataset::threads::Progress;
@@ -28,7 +30,7 @@ pub enum Value {
 }
 
 /// The columns of catalogues after the position, in order, for the command line and Python. [`more_columns`] follow.
-pub const COLUMNS: [(&str, Value); 18] = [
+pub const COLUMNS: [(&str, Value); 16] = [
     ("e1", Value::Real(|g| g.e1)),
     ("e2", Value::Real(|g| g.e2)),
     ("flags", Value::Whole(|g| g.flags.bits() as i32)),
@@ -61,8 +63,6 @@ pub const COLUMNS: [(&str, Value); 18] = [
     ("R22", Value::Real(|g| response(g, 1, 1))),
     ("R12", Value::Real(|g| response(g, 0, 1))),
     ("R21", Value::Real(|g| response(g, 1, 0))),
-    ("divisor1", Value::Real(|g| divisor(g)[0])),
-    ("divisor2", Value::Real(|g| divisor(g)[1])),
 ];
 
 /// Columns of catalogues after [`COLUMNS`]. Linear configurations have the S/N and the other [`Observables`]; then sheared
@@ -98,10 +98,6 @@ pub fn more_columns(
         columns.extend(names.map(|(at, name)| (name, values(at))));
     }
     columns
-}
-
-fn divisor(galaxy: &Measurement) -> [f64; 2] {
-    galaxy.divisor.unwrap_or([f64::NAN; 2])
 }
 
 fn response(galaxy: &Measurement, i: usize, j: usize) -> f64 {
@@ -162,6 +158,9 @@ pub(crate) fn metadata(
         ]
         .map(|(key, value)| (key.to_owned(), value)),
     );
+    if run.configuration.calibration() == Calibration::Response {
+        all.insert(RESPONSE.into(), NOT_APPLIED.into());
+    }
     Ok(all)
 }
 

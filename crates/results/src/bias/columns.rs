@@ -7,6 +7,7 @@ use shearq_bias::SHEARED_CATALOGUES;
 use shearq_files::{FileError, names_of};
 
 use crate::expression::fits;
+use crate::response::refuse_divided;
 
 /// How ellipticities become shears.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -52,8 +53,6 @@ pub enum Role {
     PsfSize,
     Id,
     /// What e1 and e2 were divided by.
-    Divisor1,
-    Divisor2,
     /// Position in pixels.
     X,
     Y,
@@ -94,7 +93,7 @@ pub(super) fn sheared_pair(of: usize, sheared: usize) -> [Key; 2] {
 // columns that are recognised in any case, the preferred one first. χ marks ellipticities that are distortions: GalSim's
 // and LSST's HSM documents e = (1 − q²)/(1 + q²) for all its methods but KSB.
 #[rustfmt::skip]
-const TABLE: [(Role, &str, Option<Role>, &str); 26] = [
+const TABLE: [(Role, &str, Option<Role>, &str); 24] = [
     (Role::E1, "e1", Some(Role::E2), "e1 e_1 e1_noshear g1_noshear g[0] ngmix_ell_noshear[0] wmom_g_1 wmom_g1 gauss_g1 \
         pgauss_g1 gauss_g_1 pgauss_g_1 mdet_g_1 mcal_g_1 fpfs_e1 fpfs1_e1 χregauss_e1 χcorrected_e1 \
         χext_shapehsm_hsmshaperegauss_e1 corrected_g1"),
@@ -119,8 +118,6 @@ const TABLE: [(Role, &str, Option<Role>, &str); 26] = [
     (Role::Psf2, "psf_e2", None, "psf_e2 e2_psf psf_g2 g2_psf psf_g_2 psfrec_g_2"),
     (Role::PsfSize, "psf_size", None, "psf_size psf_t t_psf psf_fwhm psf_sigma psfrec_t"),
     (Role::Id, "id", None, "id galaxy_id gal_id object_id objectid coadd_object_id coadd_objects_id source_id number"),
-    (Role::Divisor1, "divisor1", Some(Role::Divisor2), "divisor1"),
-    (Role::Divisor2, "divisor2", Some(Role::Divisor1), "divisor2"),
     (Role::X, "x", None, "x x_image xwin_image x_pix"),
     (Role::Y, "y", None, "y y_image ywin_image y_pix"),
     (Role::Unit, "unit", None, "pair pair_id seed patch"),
@@ -381,11 +378,7 @@ pub enum NameError {
 
 // Roles that one column may have together: a scalar response of both components, and identifiers of units.
 // Other columns with two roles compare a quantity with itself: `e1=g1` beside the true shear g1 gave m = 0.
-const SHARED: [[Role; 2]; 3] = [
-    [Role::R11, Role::R22],
-    [Role::Divisor1, Role::Divisor2],
-    [Role::Id, Role::Unit],
-];
+const SHARED: [[Role; 2]; 2] = [[Role::R11, Role::R22], [Role::Id, Role::Unit]];
 
 impl Names {
     /// Adds `ROLE=COLUMN`.
@@ -459,7 +452,7 @@ impl Names {
 pub enum Preset {
     /// No known program.
     Plain,
-    /// shearq: ellipticities are already divided by the divisors.
+    /// shearq, without sheared catalogues.
     Shearq,
     /// shearq with sheared catalogues in columns, after `shape.sheared_step`.
     Sheared,
@@ -473,12 +466,15 @@ pub enum Preset {
     Anacal,
 }
 
+// A column that no other program writes: the energy of the network.
+const OWN_COLUMN: &str = "first_energy";
+
 impl Preset {
-    fn of_columns(columns: &BTreeMap<Key, String>, is_hsm: bool) -> Self {
+    fn of_columns(columns: &BTreeMap<Key, String>, is_hsm: bool, found: &[String]) -> Self {
         let have = |key| columns.contains_key(&key);
         if have((Role::ShearedCatalogue, 0)) {
             Preset::Metadetect
-        } else if have((Role::Divisor1, 0)) && have((Role::R11, 0)) {
+        } else if have((Role::R11, 0)) && found.iter().any(|name| name == OWN_COLUMN) {
             Preset::Shearq
         } else if have((Role::E1, 1)) && have((Role::E2, 3)) {
             Preset::Metacal
@@ -594,7 +590,10 @@ impl Columns {
             }
         }
         let distortion = is_distortion(&e1) || survey.is_some_and(|survey| survey.distortion);
-        let preset = Preset::of_columns(&columns, distortion || e1 == "corrected_g1");
+        let preset = Preset::of_columns(&columns, distortion || e1 == "corrected_g1", found);
+        if preset == Preset::Shearq {
+            refuse_divided(path, found.iter().map(String::as_str))?;
+        }
         let mut columns = Columns {
             columns,
             preset,
@@ -834,9 +833,9 @@ mod tests {
     fn programs_are_recognised_by_their_columns() {
         for (columns, preset) in [
             ("e1 e2 w flag", Preset::Plain),
-            ("x y e1 e2 flags R11 R22 divisor1 divisor2", Preset::Shearq),
+            ("x y e1 e2 flags R11 R22 first_energy", Preset::Shearq),
             (
-                "e1 e2 flags R11 R22 divisor1 divisor2 e1_noshear e2_noshear e1_1p e1_1m e2_2p e2_2m",
+                "e1 e2 flags R11 R22 first_energy e1_noshear e2_noshear e1_1p e1_1m e2_2p e2_2m",
                 Preset::Shearq,
             ),
             ("corrected_e1 corrected_e2", Preset::Hsm),
@@ -851,7 +850,7 @@ mod tests {
         }
         assert!(found("corrected_e1 corrected_e2", &[]).unwrap().distortion);
         let names =
-            "e1 e2 flags R11 R22 divisor1 divisor2 e1_noshear e2_noshear e1_1p e1_1m e2_2p e2_2m";
+            "e1 e2 flags R11 R22 first_energy e1_noshear e2_noshear e1_1p e1_1m e2_2p e2_2m";
         for (required, preset, e1, plus) in [
             (true, Preset::Sheared, "e1_noshear", Some("e1_1p")),
             (false, Preset::Shearq, "e1", None),

@@ -128,9 +128,8 @@ struct Part<'a> {
 enum Response {
     Known(f64),
     Column(usize),
-    // Response, divisor of the ellipticity, and the value without calibration, where both columns are NaN. shearq's catalogues
-    // have ellipticities that are divided already, but responses that are not.
-    Divided(usize, usize, f64),
+    // The number in rows where the column is NaN: configurations of networks have no response.
+    ColumnOr(usize, f64),
     // (e₊ − e₋)/2h of two sheared catalogues.
     Difference([usize; 2]),
 }
@@ -526,13 +525,10 @@ impl<'a> Part<'a> {
         match *of {
             Response::Known(response) => response,
             Response::Column(column) => self.value(column, at),
-            // Networks have no response, and NaN in both columns.
-            Response::Divided(column, divisor, without) => {
-                match self.value(column, at) / self.value(divisor, at) {
-                    ratio if ratio.is_nan() => without,
-                    ratio => ratio,
-                }
-            }
+            Response::ColumnOr(column, without) => match self.value(column, at) {
+                missing if missing.is_nan() => without,
+                response => response,
+            },
             Response::Difference([plus, minus]) => {
                 (self.value(plus, at) - self.value(minus, at)) / (2.0 * self.reading.request.step)
             }
@@ -604,7 +600,7 @@ fn sheared_columns(source: &Source) -> [Option<[[usize; 2]; 2]>; 2] {
 // Where R11, R12, R21 and R22 come from: sheared catalogues, else columns, else the ellipticities are shears already.
 fn responses(source: &Source) -> [[Response; 2]; 2] {
     let [own, other] = sheared_columns(source);
-    let divisors = source.places.pair([Role::Divisor1, Role::Divisor2]);
+    let own_catalogue = source.columns.is_of_shearq();
     let diagonal = source.places.pair(RESPONSE).is_some();
     let off_diagonal = source.places.pair(OTHER_RESPONSE).is_some();
     [0, 1].map(|i| {
@@ -619,12 +615,10 @@ fn responses(source: &Source) -> [[Response; 2]; 2] {
                 (Some(own), _) if i == j => Response::Difference(own[i]),
                 (Some(_), Some(other)) => Response::Difference(other[i]),
                 (Some(_), None) => Response::Known(0.0),
-                (None, _) => match (column, divisors) {
-                    (None, _) => Response::Known(without),
-                    (Some(column), None) => Response::Column(column),
-                    (Some(column), Some(divisors)) => {
-                        Response::Divided(column, divisors[i], without)
-                    }
+                (None, _) => match column {
+                    None => Response::Known(without),
+                    Some(column) if own_catalogue => Response::ColumnOr(column, without),
+                    Some(column) => Response::Column(column),
                 },
             }
         })

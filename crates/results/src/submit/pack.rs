@@ -50,7 +50,7 @@ impl Packing<'_> {
         let Some((_, first)) = all.next() else {
             return Err(FileError::new(place(), "found no catalogue to pack"));
         };
-        let rows = own.rows(&first, MAX_ROWS)?.len();
+        let rows = own.rows(&first, [1.0; 2], MAX_ROWS)?.len();
         Ok(((1 + all.count()) * rows) as u64)
     }
 
@@ -75,7 +75,7 @@ impl Packing<'_> {
         match (self.catalogues.run(), self.data) {
             (Some(run), _) => {
                 let field = Degrees(run.source.layout().field_degrees);
-                let rows = self.catalogues.rows(catalogue, MAX_ROWS)?;
+                let rows = self.catalogues.rows(catalogue, [1.0; 2], MAX_ROWS)?;
                 grid::of_catalogue(catalogue, &rows, field)
             }
             (None, Some(data)) => truth::grid_of_set(data, set),
@@ -121,9 +121,10 @@ impl Packing<'_> {
                 add(kind, text)?;
                 continue;
             }
+            let response = found.response(set)?;
             for (image, path) in catalogues {
                 let method = method.clone();
-                let rows = self.catalogues.rows(&path, MAX_ROWS)?;
+                let rows = self.catalogues.rows(&path, response, MAX_ROWS)?;
                 add(
                     Kind::Catalogue { set, image, method },
                     catalogue_text(&rows),
@@ -169,10 +170,13 @@ impl Packing<'_> {
         let first = &catalogues[0].1;
         let grid = self.grid(set, first)?;
         let mut images = SetImages::new(&grid);
+        let response = self.catalogues.response(set)?;
         let mut used = 0;
         for (_, path) in catalogues {
             let mut sum = FieldSum::new(&grid);
-            let rows = self.catalogues.rows(path, most_rows(grid.cells()))?;
+            let rows = self
+                .catalogues
+                .rows(path, response, most_rows(grid.cells()))?;
             progress.advance(rows.len() as u64);
             used += sum.add_image(&grid, rows).used;
             images

@@ -1,0 +1,477 @@
+//! The response to shear that ellipticities of many catalogues are divided by.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use shearq_dataset::metadata::{
+    CommonAxes, FIRST_PIXEL, FRAME, NOT_APPLIED, RESPONSE, stated_axes,
+};
+use shearq_dataset::run::Run;
+use shearq_files::FileError;
+use shearq_files::frames::polars::{Column, DataFrame};
+use shearq_files::frames::{Metadata, frame};
+use shearq_files::table::{self, FileFormat};
+use shearq_measure::{Observables, ShearedCatalogues, is_significant};
+use shearq_quantities::Frame;
+use shearq_quantities::statistics::RunningMean;
+use shearq_submissions::Calibration;
+
+use crate::select::{READ, WEIGHT, Weighted};
+
+/// The mean responses R11 and R22 of the good galaxies of all `catalogues` of a set; 1 of catalogues whose ellipticities are
+/// not to be divided: of networks, of other programs, and of earlier versions, which divided each image by its own response.
+///
+/// # Errors
+/// If a catalogue cannot be read, only some are to be divided, or a mean is not positive by three standard errors.
+pub fn response_of<'a>(catalogues: impl Iterator<Item = &'a Path>) -> Result<[f64; 2], FileError> {
+    let mut means = [RunningMean::default(); 2];
+    let mut first: Option<(&Path, bool)> = None;
+    for path in catalogues {
+        let divide = is_to_divide(path)?;
+        let (before, expected) = *first.get_or_insert((path, divide));
+        if divide != expected {
+            let message = format!(
+                "these ellipticities are {}, and those of {} are not, so that they have no common response. Try: measure both with one version",
+                if divide {
+                    "not divided by the response"
+                } else {
+                    "shears"
+                },
+                before.display()
+            );
+            return Err(FileError::new(path, message));
+        }
+        if divide {
+            let read = table::read(path, Some(&["R11", "R22", "flags"]), table::MAX_ROWS)?;
+            let flags = table::numbers(&read, "flags", path)?;
+            for (mean, name) in means.iter_mut().zip(["R11", "R22"]) {
+                let responses = table::numbers(&read, name, path)?;
+                let good = responses
+                    .iter()
+                    .zip(&*flags)
+                    .filter(|(_, flag)| **flag == 0.0);
+                good.for_each(|(response, _)| mean.add(*response));
+            }
+        }
+    }
+    match first {
+        Some((path, true)) if means[0].count() > 0 => {
+            check_significance(path, &means)?;
+            Ok(means.map(|mean| mean.mean()))
+        }
+        _ => Ok([1.0; 2]),
+    }
+}
+
+// Text has no metadata, so that a catalogue in text is taken as it is.
+fn is_to_divide(path: &Path) -> Result<bool, FileError> {
+    let Some(format) = FileFormat::of(path) else {
+        return Ok(false);
+    };
+    let metadata = table::read_metadata(path, format, [RESPONSE.to_owned()].iter())?;
+    Ok(metadata
+        .get(RESPONSE)
+        .is_some_and(|text| text == NOT_APPLIED))
+}
+
+fn check_significance(path: &Path, means: &[RunningMean; 2]) -> Result<(), FileError> {
+    let mut numbered = (1..).zip(means);
+    let Some((k, mean)) = numbered.find(|(_, mean)| !is_significant(mean)) else {
+        return Ok(());
+    };
+    let message = format!(
+        "the mean response R{k}{k} of the {} galaxies of this and further catalogues is {:.4} ± {:.4} (expected a positive number of three standard errors), so that their ellipticities give no shear. Try: more galaxies, and check that the PSF has the pixel scale of the galaxies",
+        mean.count(),
+        mean.mean(),
+        mean.deviation() / (mean.count() as f64).sqrt()
+    );
+    Err(FileError::new(path, message))
+}
+
+/// Refuses catalogues of earlier versions, whose ellipticities were divided by `divisor1` and `divisor2`: Σ e / Σ R would be
+/// too large by 1/R.
+pub(crate) fn refuse_divided<'a>(
+    path: &Path,
+    mut columns: impl Iterator<Item = &'a str>,
+) -> Result<(), FileError> {
+    if columns.any(|name| name == "divisor1") {
+        let message = "an earlier version of shearq measured this catalogue and divided e1 and e2 by their mean response (found the column `divisor1`; expected ellipticities before the division). Try: shearq measure, or multiply e1 by divisor1 and e2 by divisor2 and remove these columns";
+        return Err(FileError::new(path, message));
+    }
+    Ok(())
+}
+
+/// Which galaxies share a mean response.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Shared {
+    /// All.
+    Survey,
+    /// Those of a set.
+    Set,
+    /// Those of an image, whose response is noisy: 40 to 400 galaxies at S/N 10 bias the shears by +17 to +1 in a thousand.
+    Image,
+}
+
+/// The response of galaxies that share one.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SharedResponse {
+    /// `survey`, `set 02` or `set 02 image 001`.
+    pub of: String,
+    /// Galaxies without a flag.
+    pub galaxies: usize,
+    /// Mean R11, R22, R12 and R21.
+    pub mean: [f64; 4],
+    /// Their standard errors, of independent galaxies.
+    pub error: [f64; 4],
+}
+
+/// The columns of a galaxy's position that TreeCorr shall read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Position {
+    /// `ra` and `dec`.
+    Sky,
+    /// `x` and `y`.
+    Pixel,
+}
+
+/// A shear for each galaxy of a survey.
+#[derive(Debug)]
+pub struct Shears {
+    pub table: DataFrame,
+    pub metadata: Metadata,
+    pub responses: Vec<SharedResponse>,
+    /// Galaxies with a shear.
+    pub good: usize,
+}
+
+struct Image {
+    path: PathBuf,
+    place: (u32, u32),
+    group: (usize, u32, u32),
+    table: DataFrame,
+    rows: Weighted,
+}
+
+#[derive(Default)]
+struct Sum {
+    responses: [RunningMean; 4],
+    weight: RunningMean,
+}
+
+/// The shears of the catalogues of the folders `measured`: g = ⟨R⟩⁻¹ e, with the mean response of the galaxies that share one.
+/// Ellipticities of a selection are divided by their weights, so that the weighted mean of g is the mean shear.
+///
+/// The table has the columns of the catalogues that were not measured on the stamps (identifiers, positions, carried ones), the
+/// numbers of set and image, `g1`, `g2`, `w` (the weight of the selection, or 1; 0 of galaxies without a shear) and `flags`.
+/// For `treecorr` it has two columns of positions, g1, g2 and w of the galaxies with a shear.
+///
+/// # Errors
+/// If a catalogue cannot be read, its ellipticities were not measured with a response, catalogues have several frames or
+/// columns, or a mean response is not positive by three standard errors.
+pub fn shears(
+    measured: &[PathBuf],
+    shared: Shared,
+    treecorr: Option<Position>,
+) -> Result<Shears, FileError> {
+    let (mut images, mut sums) = (Vec::new(), BTreeMap::<_, Sum>::new());
+    let mut metadata = Metadata::new();
+    let mut axes = CommonAxes::default();
+    for (folder, out) in measured.iter().enumerate() {
+        let run = Run::require(out)?;
+        if run.configuration.calibration() == Calibration::None {
+            let message = format!(
+                "the configuration {} does not measure a response, so that its ellipticities are no shears (found no response; expected a linear configuration such as 48/linear/star)",
+                run.configuration.name
+            );
+            return Err(FileError::new(out, message));
+        }
+        let files = run.catalogues(out, &[])?;
+        for set in files.wanted(&[]) {
+            for (image, path) in files.of_set(set) {
+                let keys = [FRAME, FIRST_PIXEL, "creator", "submiss", "elltype"].map(str::to_owned);
+                let stated = table::read_metadata(&path, run.format, keys.iter())?;
+                let own = stated_axes(&path, run.format)?;
+                axes.add(&path, own, false)?;
+                check_positions(&path, treecorr, own.frame() == Frame::Sky)?;
+                if metadata.is_empty() {
+                    metadata = stated;
+                }
+                let group = match shared {
+                    Shared::Survey => (0, 0, 0),
+                    Shared::Set => (folder, set, 0),
+                    Shared::Image => (folder, set, image),
+                };
+                let (image, sum) = (
+                    Image::read(path, (set, image), group)?,
+                    sums.entry(group).or_default(),
+                );
+                image.add_to(sum);
+                images.push(image);
+            }
+        }
+    }
+    let Some(Image { path, .. }) = images.first() else {
+        let none = measured.first().cloned().unwrap_or_default();
+        return Err(FileError::new(
+            none,
+            "there is no catalogue; expected folders that `measure` wrote",
+        ));
+    };
+    let mut responses = BTreeMap::new();
+    for (group, sum) in &sums {
+        let [r11, r22, ..] = sum.responses;
+        check_significance(path, &[r11, r22])?;
+        responses.insert(*group, sum.response(*group));
+    }
+    let (mut whole, mut good) = (None::<DataFrame>, 0);
+    for image in images {
+        let (table, with_shear) = image.sheared(&responses[&image.group], treecorr)?;
+        good += with_shear;
+        match &mut whole {
+            None => whole = Some(table),
+            Some(whole) => {
+                whole.vstack_mut_owned(table).map_err(|error| {
+                    let message =
+                        format!("the columns are not those of the first catalogue: {error}");
+                    FileError::new(&image.path, message)
+                })?;
+            }
+        }
+    }
+    let responses: Vec<SharedResponse> = responses.into_values().collect();
+    let lines = responses.iter().map(|own| {
+        let numbers = own.mean.iter().chain(&own.error);
+        let numbers: Vec<String> = numbers.map(|value| format!("{value:.6e}")).collect();
+        format!("{}: {}", own.of, numbers.join(" "))
+    });
+    let heading = "R11 R22 R12 R21 and their errors".to_owned();
+    let lines: Vec<String> = [heading].into_iter().chain(lines).collect();
+    metadata.insert(RESPONSE.into(), lines.join("\n"));
+    let mut table = whole.unwrap_or_default();
+    table.align_chunks_par();
+    Ok(Shears {
+        table,
+        metadata,
+        responses,
+        good,
+    })
+}
+
+// TreeCorr takes right ascension and declination on the sky, where our signs are its own, or x and y of the pixels' axes.
+fn check_positions(path: &Path, treecorr: Option<Position>, is_sky: bool) -> Result<(), FileError> {
+    let message = match (treecorr, is_sky) {
+        (Some(Position::Sky), false) => {
+            "the ellipticities are in the frame of the pixels, so that they have no direction on the sky (found `pixel`; expected `sky`). Try: gather --frame sky, or --treecorr x,y"
+        }
+        (Some(Position::Pixel), true) => {
+            "the ellipticities are in the frame of the sky, so that they have no direction along x and y (found `sky`; expected `pixel`). Try: --treecorr ra,dec"
+        }
+        _ => return Ok(()),
+    };
+    Err(FileError::new(path, message))
+}
+
+impl Image {
+    fn read(path: PathBuf, place: (u32, u32), group: (usize, u32, u32)) -> Result<Self, FileError> {
+        let table = table::read(&path, None, table::MAX_ROWS)?;
+        let (mut rows, flags) = Weighted::unselected(&path, true)?;
+        if table
+            .get_column_names()
+            .iter()
+            .any(|name| name.as_str() == WEIGHT)
+        {
+            rows.weight = table::numbers(&table, WEIGHT, &path)?.into_owned();
+        }
+        for (row, _) in flags.iter().enumerate().filter(|(_, flag)| **flag != 0.0) {
+            rows.weight[row] = f64::NAN;
+        }
+        Ok(Image {
+            path,
+            place,
+            group,
+            table,
+            rows,
+        })
+    }
+
+    fn add_to(&self, sum: &mut Sum) {
+        let Weighted {
+            response: [r11, r22],
+            cross: [r12, r21],
+            weight,
+            ..
+        } = &self.rows;
+        // The weight of flagged galaxies is NaN.
+        for row in (0..weight.len()).filter(|row| weight[*row].is_finite()) {
+            sum.weight.add(weight[row]);
+            let responses = [r11, r22, r12, r21].map(|column| column[row]);
+            let means = sum.responses.iter_mut().zip(responses);
+            means.for_each(|(mean, response)| mean.add(response));
+        }
+    }
+
+    // The table with shears, and the number of galaxies that have one.
+    fn sheared(
+        &self,
+        response: &SharedResponse,
+        treecorr: Option<Position>,
+    ) -> Result<(DataFrame, usize), FileError> {
+        let Weighted { e, weight, .. } = &self.rows;
+        let [r11, r22, r12, r21] = response.mean;
+        let determinant = r11 * r22 - r12 * r21;
+        let shear = |row: usize| {
+            let [e1, e2] = [e[0][row], e[1][row]].map(|e| e / weight[row]);
+            [
+                (r22 * e1 - r12 * e2) / determinant,
+                (r11 * e2 - r21 * e1) / determinant,
+            ]
+        };
+        let counts: Vec<bool> = weight.iter().map(|weight| *weight > 0.0).collect();
+        let missing = [f64::NAN; 2];
+        let g = counts.iter().enumerate();
+        let g: Vec<[f64; 2]> = g
+            .map(|(row, counts)| if *counts { shear(row) } else { missing })
+            .collect();
+        let w = weight.iter().map(|weight| weight.max(0.0));
+        let number =
+            |name: &str, value: u32| Column::new(name.into(), vec![i64::from(value); counts.len()]);
+        let measured = [
+            Column::new("g1".into(), g.iter().map(|g| g[0]).collect::<Vec<_>>()),
+            Column::new("g2".into(), g.iter().map(|g| g[1]).collect::<Vec<_>>()),
+            Column::new("w".into(), w.collect::<Vec<f64>>()),
+        ];
+        let wrong = |error: &dyn std::fmt::Display| FileError::new(&self.path, error.to_string());
+        let mut columns = Vec::new();
+        match treecorr {
+            None => {
+                let all = self.table.columns().iter();
+                let kept = all.filter(|own| own.name() == "flags" || !is_measured(own.name()));
+                columns.extend(kept.cloned());
+                // After the position, as in catalogues.
+                let after = columns
+                    .iter()
+                    .take_while(|own| own.name() != "flags")
+                    .count();
+                let (set, image) = self.place;
+                let new = [number("set", set), number("image", image)];
+                columns.splice(after..after, new.into_iter().chain(measured));
+            }
+            Some(position) => {
+                let names = match position {
+                    Position::Sky => ["ra", "dec"],
+                    Position::Pixel => ["x", "y"],
+                };
+                for name in names {
+                    let found = self.table.column(name).map_err(|_| {
+                        let names = self.table.get_column_names();
+                        let names: Vec<String> =
+                            names.iter().map(|name| name.to_string()).collect();
+                        FileError::no_column(&self.path, name, &names)
+                    })?;
+                    columns.push(found.clone());
+                }
+                columns.extend(measured);
+            }
+        }
+        let mut table = frame(columns).map_err(|error| wrong(&error))?;
+        if treecorr.is_some() {
+            let mask = counts.iter().copied().collect();
+            table = table.filter(&mask).map_err(|error| wrong(&error))?;
+        }
+        Ok((table, counts.iter().filter(|counts| **counts).count()))
+    }
+}
+
+impl Sum {
+    fn response(&self, (folder, set, image): (usize, u32, u32)) -> SharedResponse {
+        // Responses of a selection contain its weights.
+        let (weight, count) = (self.weight.mean(), self.weight.count());
+        let folder = match folder {
+            0 => String::new(),
+            more => format!("folder {} ", more + 1),
+        };
+        SharedResponse {
+            of: match (set, image) {
+                (0, _) => "survey".into(),
+                (set, 0) => format!("{folder}set {set:02}"),
+                (set, image) => format!("{folder}set {set:02} image {image:03}"),
+            },
+            galaxies: count,
+            mean: self.responses.map(|own| own.mean() / weight),
+            error: self
+                .responses
+                .map(|own| own.deviation() / (count as f64).sqrt() / weight),
+        }
+    }
+}
+
+// Whether a column was measured on the stamps.
+fn is_measured(name: &str) -> bool {
+    const OTHERS: [&str; 9] = [
+        "iterations",
+        "stop",
+        "updated",
+        "first_energy",
+        "energy",
+        "noise",
+        "radius",
+        "snr",
+        WEIGHT,
+    ];
+    READ.contains(&name)
+        || OTHERS.contains(&name)
+        || Observables::COLUMNS.contains(&name)
+        || ShearedCatalogues::columns().any(|own| own == name)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn catalogue(path: &Path, responses: &[f64], metadata: &[(&str, &str)]) {
+        let column = |name: &str, values: &[f64]| Column::new(name.into(), values.to_vec());
+        let table = frame(vec![
+            column("R11", responses),
+            column(
+                "R22",
+                &responses.iter().map(|r| 2.0 * r).collect::<Vec<_>>(),
+            ),
+            column(
+                "flags",
+                &responses
+                    .iter()
+                    .map(|r| f64::from(u8::from(r.is_nan())))
+                    .collect::<Vec<_>>(),
+            ),
+        ]);
+        let metadata = metadata.iter();
+        let metadata = metadata.map(|(key, value)| ((*key).to_owned(), (*value).to_owned()));
+        let (table, metadata) = (table.unwrap(), metadata.collect());
+        table::write(path, FileFormat::Parquet, &table, &metadata).unwrap();
+    }
+
+    #[test]
+    fn a_set_has_one_response_of_all_good_galaxies() {
+        let folder = tempfile::tempdir().unwrap();
+        let paths = ["1", "2", "3"].map(|name| folder.path().join(format!("{name}.parquet")));
+        let to_divide = [(RESPONSE, NOT_APPLIED)];
+        let of = |paths: &[PathBuf]| response_of(paths.iter().map(PathBuf::as_path));
+        catalogue(&paths[0], &[0.3, 0.5, f64::NAN], &to_divide);
+        catalogue(&paths[1], &[0.4], &to_divide);
+        let [r1, r2] = of(&paths[..2]).unwrap();
+        assert!((r1 - 0.4).abs() < 1e-15 && (r2 - 0.8).abs() < 1e-15);
+        // One that was divided already.
+        catalogue(&paths[2], &[0.1], &[]);
+        assert_eq!(of(&paths[2..]).unwrap(), [1.0; 2]);
+        let error = of(&paths).unwrap_err().to_string();
+        assert!(error.contains("have no common response"), "{error}");
+        catalogue(&paths[2], &[-0.5, -0.4, -0.6], &to_divide);
+        let error = of(&paths[1..]).unwrap_err().to_string();
+        assert!(
+            error.contains("the mean response R11 of the 4 galaxies"),
+            "{error}"
+        );
+        catalogue(&paths[2], &[f64::NAN], &to_divide);
+        assert_eq!(of(&paths[2..]).unwrap(), [1.0; 2]);
+    }
+}
