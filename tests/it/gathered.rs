@@ -857,9 +857,9 @@ fn each_galaxy_has_the_noise_of_its_place_and_of_its_light() {
     };
     let map = write("variance.fits", variance.clone());
     let weight = write("weight.fits", variance.iter().map(|v| 1.0 / v).collect());
-    let columns = |name: &str, options: &[&str]| {
+    let of = |exposure: &Path, name: &str, options: &[&str]| {
         let (data, out) = (small.at(name), small.at(&format!("{name}-out")));
-        let from = ["gather", "--exposure", text(&exposure), "--psf", text(&psf)];
+        let from = ["gather", "--exposure", text(exposure), "--psf", text(&psf)];
         let to = ["--positions", text(&positions), "--out", text(&data)];
         succeed(&[&from[..], &to, options].concat());
         let measure = ["measure", "--submission", LINEAR, "--data", text(&data)];
@@ -871,6 +871,7 @@ fn each_galaxy_has_the_noise_of_its_place_and_of_its_light() {
             values.unwrap().into_owned()
         })
     };
+    let columns = |name: &str, options: &[&str]| of(&exposure, name, options);
     for (name, option, file) in [
         ("variance", "--variance", &map),
         ("weight", "--weight-map", &weight),
@@ -883,6 +884,20 @@ fn each_galaxy_has_the_noise_of_its_place_and_of_its_light() {
         }
     }
     let plain = columns("plain", &[]);
+    // With a map, too, the sky is subtracted.
+    let (pixels, _) = pixels_of(&exposure);
+    let raised = pixels.iter().map(|value| value + 30.0).collect();
+    let light = of(
+        &write("raised.fits", raised),
+        "light",
+        &["--variance", text(&map)],
+    );
+    let dark = columns("dark", &["--variance", text(&map)]);
+    for (k, (light, dark)) in light[2].iter().zip(&dark[2]).enumerate() {
+        // A sky of 30 on the hundred pixels of a window has thousands.
+        let off = (light - dark).abs();
+        assert!(off < 50.0 || dark.is_nan(), "{k}: {light} {dark}");
+    }
     assert_eq!(columns("bright", &["--gain", "1e30"])[1..], plain[1..]);
     // The light of a galaxy under the window adds to the variance: flux over gain and area, less what the window leaves out.
     let own = columns("gain", &["--gain", "0.2"]);

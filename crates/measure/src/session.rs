@@ -42,6 +42,17 @@ pub enum KnownNoise<'n> {
     Given(f64),
     /// The same, one level per stamp.
     GivenEach(Cow<'n, [f64]>),
+    /// Levels that the data state, one per stamp. Sky, galaxies and the correlation of the noise are measured on the stamps.
+    StatedEach(Cow<'n, [f64]>),
+}
+
+impl KnownNoise<'_> {
+    fn levels(&self) -> Option<&[f64]> {
+        match self {
+            KnownNoise::GivenEach(levels) | KnownNoise::StatedEach(levels) => Some(levels),
+            KnownNoise::Unknown | KnownNoise::Stated(_) | KnownNoise::Given(_) => None,
+        }
+    }
 }
 
 /// The stamps of an image in rows. The last row may be shorter.
@@ -416,7 +427,7 @@ impl<'n> Session<'n> {
             typical_level: None,
             warnings,
         };
-        if let KnownNoise::GivenEach(levels) = &session.noise {
+        if let Some(levels) = session.noise.levels() {
             let examined = session.examined.iter().flat_map(|&row| rows.stamps(row));
             let mut levels: Vec<f64> = examined.map(|at| levels[at]).collect();
             levels.retain(|level| *level > 0.0);
@@ -427,6 +438,7 @@ impl<'n> Session<'n> {
             session
                 .warnings
                 .extend(match (&session.survey, &session.noise) {
+                    (None, KnownNoise::StatedEach(_)) => None,
                     (None, _) => Some(Warning::NoNoise),
                     (Some(survey), KnownNoise::Stated(level)) => {
                         Warning::of_stated_noise(*level, survey.noise.sigma(), survey.noise.error())
@@ -442,6 +454,8 @@ impl<'n> Session<'n> {
         let plan = self.measurer.noise_plan().filter(|_| self.rows.count > 0);
         match self.noise {
             KnownNoise::Unknown | KnownNoise::Stated(_) => plan,
+            // Unscaled: sky has the units of the image, and the mean correlation of noise of several levels is that of each.
+            KnownNoise::StatedEach(_) => plan,
             KnownNoise::Given(_) | KnownNoise::GivenEach(_) => None,
         }
     }
@@ -594,10 +608,8 @@ impl<'n> Session<'n> {
             jacobians.map_or(0, <[_]>::len),
             on_sky,
         )?;
-        let levels = match &self.noise {
-            KnownNoise::GivenEach(levels) => Some(&levels[self.rows.stamps(row)]),
-            KnownNoise::Unknown | KnownNoise::Stated(_) | KnownNoise::Given(_) => None,
-        };
+        let levels = self.noise.levels();
+        let levels = levels.map(|levels| &levels[self.rows.stamps(row)]);
         let mut image = self.image(worker);
         let galaxies = image.measure_stamps(stamps, psfs, levels, jacobians)?;
         let examined = match self.examined.contains(&row) {
@@ -626,8 +638,8 @@ impl<'n> Session<'n> {
             let most = EXAMINED_PSFS.div_ceil(enough(self.rows.columns, self.rows.len()));
             examination.add_psfs(psfs, self.measurer.configuration().psf_cut(), most);
         }
-        let scaled = match (&self.noise, self.typical_level) {
-            (KnownNoise::GivenEach(levels), Some(typical)) => {
+        let scaled = match (self.noise.levels(), self.typical_level) {
+            (Some(levels), Some(typical)) => {
                 let mut scaled = Examination::new(self.measurer.full(), stamps.len_of(Axis(0)));
                 let levels = &levels[self.rows.stamps(row)];
                 for (stamp, level) in stamps.outer_iter().zip(levels) {
@@ -734,10 +746,14 @@ impl MeasuredImage<'_> {
         let mut warnings = session.warnings.clone();
         let mut psf_noise = None;
         if let Some(Examined { stamps, scaled }) = examined {
-            warnings.extend(stamps.warnings());
+            // Levels of their own serve images of several depths.
+            let one_level = session.noise.levels().is_none();
+            let found = stamps.warnings().into_iter();
+            warnings
+                .extend(found.filter(|own| one_level || !matches!(own, Warning::Depths { .. })));
             warnings.extend(match &session.noise {
                 KnownNoise::Given(level) => stamps.given_noise(*level),
-                KnownNoise::GivenEach(_) => scaled
+                KnownNoise::GivenEach(_) | KnownNoise::StatedEach(_) => scaled
                     .zip(session.typical_level)
                     .and_then(|(scaled, level)| scaled.given_noise(level)),
                 KnownNoise::Stated(level) if configuration.noise == NoiseSource::Header => {
@@ -786,7 +802,7 @@ fn check(
         KnownNoise::Unknown => header.then(|| "not given".to_owned()),
         KnownNoise::Stated(level) => wrong(level).filter(|_| header),
         KnownNoise::Given(level) => wrong(level),
-        KnownNoise::GivenEach(levels) => {
+        KnownNoise::GivenEach(levels) | KnownNoise::StatedEach(levels) => {
             length("noise levels", levels.len(), count)?;
             levels.iter().find_map(wrong)
         }

@@ -124,6 +124,10 @@ fn a_given_level_replaces_the_survey_and_a_stated_one_does_not() {
     let surveyed = of(&stamps, KnownNoise::Unknown);
     let stated = of(&stamps, KnownNoise::Stated(2.0));
     assert_eq!(shapes(&stated), shapes(&surveyed));
+    // Levels of the data beside a survey: sky, galaxies and correlation are those of the survey.
+    let levels = vec![surveyed.galaxies[0].noise; 100];
+    let each = of(&stamps, KnownNoise::StatedEach(levels.as_slice().into()));
+    assert_eq!(shapes(&each), shapes(&surveyed));
     let differs = |warning: &&Warning| matches!(warning, Warning::NoiseLevel { used: true, .. });
     assert_eq!(stated.warnings.iter().filter(differs).count(), 1);
     // Without a stamp to survey, a stated level measures nothing.

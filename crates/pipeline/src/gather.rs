@@ -191,6 +191,9 @@ fn gather_alone(
     let mut writer = StampWriter::create(&target, mosaic, gathering.noise, wcs)?;
     writer.copy(gathering, plan.places())?;
     let mut warnings = writer.examination.warnings();
+    if gathering.variances.is_some() {
+        warnings.retain(|warning| !matches!(warning, Warning::Depths { .. }));
+    }
     warnings.extend(
         gathering
             .noise

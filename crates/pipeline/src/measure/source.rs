@@ -93,7 +93,7 @@ impl ImageSource {
         } = open_psfs(data, id, configuration, &mosaic)?;
         let mut warnings: Vec<Warning> = moved.map(Warning::of_moved).into_iter().collect();
         let noise = match (levels, stated) {
-            (Some(levels), _) => KnownNoise::GivenEach(levels.into()),
+            (Some(levels), _) => KnownNoise::StatedEach(levels.into()),
             (None, Some(sigma)) => KnownNoise::Stated(sigma),
             (None, None) => KnownNoise::Unknown,
         };
