@@ -1,0 +1,121 @@
+"""Tests of a survey whose true shear is unknown, by TreeCorr."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+_DEGREES = {"ra_units": "deg", "dec_units": "deg"}
+
+
+def null_tests(
+    shears: Any, *, points: Any = None, stars: Any = None, against: tuple[str, ...] = (), bins: int = 5, **separations: Any
+) -> dict[str, dict[str, Any]]:
+    """Tests of additive errors of shears in the frame of the sky. Needs TreeCorr.
+
+    The true shear of a survey is unknown, but its B modes, its mean, and the tangential shear about points without mass are
+    zero, and residuals of the PSF should not correlate. m cannot be tested so.
+
+    Parameters
+    ----------
+    shears : table or mapping of columns
+        ``ra``, ``dec`` in degrees, ``g1``, ``g2`` and perhaps ``w``, of galaxies with a shear, as ``shearq shear --treecorr``
+        writes them.
+    points : table or mapping of columns, optional
+        ``ra``, ``dec`` of points without mass, such as stars or random places.
+    stars : table or mapping of columns, optional
+        ``ra``, ``dec``, ellipticities ``e1``, ``e2`` and size ``T`` of stars, and those of the PSF model at their places,
+        ``model_e1``, ``model_e2`` and ``model_T``, in the frame of the sky. Stars that the model was not fitted to test most.
+    against : tuple of str, optional
+        Columns of shears against which the mean shear is tested, such as positions on the exposure.
+    bins : int, optional
+        Bins of equally many galaxies of each of these.
+    **separations
+        Of TreeCorr: ``min_sep``, ``max_sep``, ``nbins``, ``sep_units``. By default 10 bins from 1 to 100 arcmin.
+
+    Returns
+    -------
+    dict
+        Arrays by name of each test:
+        ``'modes'``: ``r``, ``xip``, ``xim`` and their ``error``, and ⟨M_ap²⟩ of E and B modes (``map2``, ``mx2``,
+        ``map2_error``) for apertures r (Schneider et al. 2002, A&A 396, 1).
+        ``'points'``: ``r``, ``gt``, ``gx``, ``error``.
+        ``'rho'``: ``r`` and ``rho1`` to ``rho5`` (Rowe 2010, MNRAS 404, 350; Jarvis et al. 2016, MNRAS 460, 2245), each
+        with ``rho1_error`` and so on.
+        One test per column of ``against``: the mean ``at`` of the column, ``g1``, ``g2``, ``g1_error`` and ``g2_error``.
+
+    Raises
+    ------
+    ValueError
+        If columns are missing.
+    """
+    try:
+        import treecorr
+    except ImportError as error:
+        raise ImportError("null_tests needs TreeCorr. Try: pip install treecorr") from error
+    separations = {"min_sep": 1.0, "max_sep": 100.0, "nbins": 10, "sep_units": "arcmin", **separations}
+    galaxies = _columns("shears", shears, ("ra", "dec", "g1", "g2", *against))
+    weight = _columns("shears", shears, ("w",))["w"] if "w" in _names(shears) else np.ones(len(galaxies["ra"]))
+
+    def catalogue(table: Mapping[str, Any], **values: Any) -> Any:
+        return treecorr.Catalog(ra=table["ra"], dec=table["dec"], **_DEGREES, **values)
+
+    sources = catalogue(galaxies, g1=galaxies["g1"], g2=galaxies["g2"], w=weight)
+    modes = treecorr.GGCorrelation(**separations)
+    modes.process(sources)
+    map2, _, mx2, _, variance = modes.calculateMapSq()
+    found: dict[str, dict[str, Any]] = {
+        "modes": {"r": modes.meanr, "xip": modes.xip, "xim": modes.xim, "error": np.sqrt(modes.varxip)}
+        | {"map2": map2, "mx2": mx2, "map2_error": np.sqrt(variance)}
+    }
+    if points is not None:
+        about = treecorr.NGCorrelation(**separations)
+        about.process(catalogue(_columns("points", points, ("ra", "dec"))), sources)
+        found["points"] = {"r": about.meanr, "gt": about.xi, "gx": about.xi_im, "error": np.sqrt(about.varxi)}
+    if stars is not None:
+        found["rho"] = _rho(treecorr, catalogue, stars, separations)
+    for name in against:
+        found[name] = _means(galaxies, weight, name, bins)
+    return found
+
+
+def _rho(treecorr: Any, catalogue: Any, stars: Any, separations: dict[str, Any]) -> dict[str, Any]:
+    names = ("ra", "dec", "e1", "e2", "T", "model_e1", "model_e2", "model_T")
+    table = _columns("stars", stars, names)
+    size = (table["T"] - table["model_T"]) / table["T"]
+    # Spin-2 fields: the PSF's shape, its residual, and the shape times the residual of the size.
+    shape = [table["e1"], table["e2"]]
+    residual = [table["e1"] - table["model_e1"], table["e2"] - table["model_e2"]]
+    fields = [catalogue(table, g1=g1, g2=g2) for g1, g2 in (shape, residual, [e * size for e in shape])]
+    found: dict[str, Any] = {}
+    for number, (first, second) in enumerate([(1, 1), (1, 0), (2, 2), (1, 2), (0, 2)], 1):
+        pairs = treecorr.GGCorrelation(**separations)
+        pairs.process(fields[first], None if first == second else fields[second])
+        found |= {"r": pairs.meanr, f"rho{number}": pairs.xip, f"rho{number}_error": np.sqrt(pairs.varxip)}
+    return found
+
+
+def _means(galaxies: Mapping[str, Any], weight: Any, name: str, bins: int) -> dict[str, Any]:
+    rows: dict[str, list[float]] = {key: [] for key in ("at", "g1", "g2", "g1_error", "g2_error")}
+    for chosen in np.array_split(np.argsort(galaxies[name], kind="stable"), bins):
+        w = weight[chosen]
+        rows["at"].append(np.average(galaxies[name][chosen], weights=w))
+        for key in ("g1", "g2"):
+            mean = np.average(galaxies[key][chosen], weights=w)
+            rows[key].append(mean)
+            rows[f"{key}_error"].append(np.sqrt(np.sum((w * (galaxies[key][chosen] - mean)) ** 2)) / np.sum(w))
+    return {key: np.array(values) for key, values in rows.items()}
+
+
+def _names(table: Any) -> list[str]:
+    names = getattr(getattr(table, "dtype", None), "names", None) or getattr(table, "columns", None)
+    return list(table if names is None else names)
+
+
+def _columns(name: str, table: Any, wanted: tuple[str, ...]) -> dict[str, Any]:
+    absent = [column for column in wanted if column not in _names(table)]
+    if absent:
+        raise ValueError(f"{name}: no column {', '.join(absent)} (expected {', '.join(wanted)})")
+    return {column: np.asarray(table[column], float) for column in wanted}

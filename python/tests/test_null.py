@@ -1,0 +1,47 @@
+"""Null tests of a survey by TreeCorr."""
+
+import numpy as np
+import pytest
+import shearq
+
+SEPARATIONS = {"min_sep": 1, "max_sep": 20, "nbins": 6}
+
+
+def _field(rng, n=4000):
+    """Places within half a degree, and shears of a plane E wave in noise."""
+    ra, dec = 150 + rng.uniform(-0.25, 0.25, n), 2 + rng.uniform(-0.25, 0.25, n)
+    # A wave along the declination: g1 > 0 is along east–west, so that g1 has no B modes.
+    g1 = 0.05 * np.cos(2 * np.pi * dec / 0.25) + rng.normal(0, 0.01, n)
+    return {"ra": ra, "dec": dec, "g1": g1, "g2": rng.normal(0, 0.01, n), "x": rng.uniform(0, 1000, n)}
+
+
+def test_faults_are_found_where_they_are():
+    pytest.importorskip("treecorr")
+    rng = np.random.default_rng(5)
+    field = _field(rng)
+    points = {"ra": 150 + rng.uniform(-0.2, 0.2, 50), "dec": 2 + rng.uniform(-0.2, 0.2, 50)}
+    found = shearq.null_tests(field, points=points, against=("x",), **SEPARATIONS)
+    modes = found["modes"]
+    # Small and large apertures mix modes, because pairs are missing.
+    assert np.argmax(modes["map2"]) == 2 and modes["map2"][2] > 5 * abs(modes["mx2"][2])
+    assert np.all(np.abs(found["points"]["gx"]) < 0.02)
+    assert np.all(np.abs(found["x"]["g2"]) < 4 * found["x"]["g2_error"]) and np.all(np.diff(found["x"]["at"]) > 0)
+    # Turned by 45 degrees, E modes are B modes; a fault of the left half is seen against x.
+    turned = {**field, "g1": -field["g2"], "g2": field["g1"] + 0.02 * (field["x"] < 500)}
+    found = shearq.null_tests(turned, against=("x",), bins=2, **SEPARATIONS)
+    assert found["modes"]["mx2"][2] > 5 * abs(found["modes"]["map2"][2])
+    assert found["x"]["g2"][0] - found["x"]["g2"][1] > 0.015
+
+
+def test_rho_statistics_are_those_of_residuals():
+    pytest.importorskip("treecorr")
+    rng = np.random.default_rng(6)
+    field = _field(rng)
+    stars = {"ra": field["ra"], "dec": field["dec"], "e1": np.full(4000, 0.05), "e2": np.zeros(4000), "T": np.ones(4000)}
+    stars |= {"model_e1": np.full(4000, 0.04), "model_e2": np.zeros(4000), "model_T": np.full(4000, 0.9)}
+    rho = shearq.null_tests(field, stars=stars, **SEPARATIONS)["rho"]
+    # Residuals of 0.01 in shape and 0.1 in size, and a shape of 0.05.
+    for number, expected in enumerate([1e-4, 5e-4, 2.5e-5, 5e-5, 2.5e-4], 1):
+        assert np.allclose(rho[f"rho{number}"], expected, rtol=1e-3), number
+    with pytest.raises(ValueError, match="stars: no column T, model_T"):
+        shearq.null_tests(field, stars={k: v for k, v in stars.items() if "T" not in k})
