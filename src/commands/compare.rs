@@ -96,6 +96,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     Ok(())
 }
 
+// Archives have no record of a run, so only their path can be stated.
 fn made_by(arguments: &Arguments) -> anyhow::Result<Vec<(String, String)>> {
     let mut made_by = Vec::new();
     for folder in &arguments.measured {

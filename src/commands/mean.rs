@@ -87,6 +87,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             let warning = Warning::PixelFrame(frame);
             tell(format_args!("warning: set {set:02}: {warning}"));
         }
+        // An error of zero would look like a perfect measurement.
         if mean.is_constant() {
             tell(format_args!(
                 "warning: set {set:02}: all {} galaxies have the same ellipticity (found a scatter of 0, expected noise), so the error is meaningless. Try: check the stamps for copies",

@@ -141,6 +141,7 @@ fn require_complete(
         let shard = shard.map_or_else(String::new, |shard| format!(" (shard {shard})"));
         text.push_str(&format!("{set}/{image}{shard}: {}\n", fault.error));
     }
+    // The number last, because a terminal shows the end of a long list.
     text.push_str(&format!(
         "{out}: {} of {} images are missing or damaged\n",
         faults.len(),

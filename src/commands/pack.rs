@@ -97,6 +97,7 @@ impl EntryArguments {
             ("title", &self.title),
             ("contact", &self.contact),
         ] {
+            // Options win over the file, so that one file serves several entries.
             if let Some(value) = value {
                 values.insert(key.into(), value.clone().into());
             }
@@ -129,6 +130,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         _ => anyhow::bail!("cannot find catalogues to pack. Try: --measured DIR or --foreign FILE"),
     };
     let data = arguments.data.as_deref().map(open_data).transpose()?;
+    // `/` in names of configurations would make folders in the archive.
     let own_name = || catalogues.name.replace('/', "-");
     let method = arguments.method.clone().unwrap_or_else(own_name);
     anyhow::ensure!(

@@ -93,6 +93,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         ("Calibration", format!("{galaxies} synthetic galaxies")),
         ("Settings of the calibration", toml::to_string(&base)?),
     ]);
+    // The folder may have been removed during hours of work; a page without its results would be made there.
     study.claim.check()?;
     let mut page = Page::new(
         out,

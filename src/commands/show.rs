@@ -69,13 +69,14 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         .get(&arguments.submission)?
         .configuration;
     let data = open_data(&arguments.data)?;
+    // For the survey of the whole image, with which a galaxy is measured as in `measure`.
     let threads = Pool::new(0)?;
     let (mut rows, mut responses) = (Vec::new(), false);
     for &GalaxyId { image, index } in &arguments.galaxy {
         let mut source = ImageSource::open(&data, image, &submission)?;
         let measurer = Measurer::new(&submission, source.mosaic().stamp)?;
         if measurer.configuration() != &submission {
-            // Stamps of the other parity require other pixels of the PSFs.
+            // `Measurer` changes the sizes for stamps of the other parity, and with them the pixels that are cut of PSFs.
             source = ImageSource::open(&data, image, measurer.configuration())?;
         }
         let session = source.session(&measurer, &threads)?;
@@ -116,7 +117,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     Ok(())
 }
 
-// The response of this galaxy to shear after `lead`, if the method provides it.
+// Networks have no response, so that nothing is printed for them.
 fn response(measured: &Measurement, lead: &str) -> String {
     match measured.response_diagonal() {
         [first, second] if first.is_finite() && second.is_finite() => {

@@ -31,6 +31,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             read
         }
     };
+    // Archives by hand or by other programs have no manifest. They are unpacked, but the message must not claim a verification.
     let compared = match &unpacked.manifest {
         Some(_) => format!("agree with {MANIFEST_FILE}"),
         None => format!("were not verified, because there is no {MANIFEST_FILE}"),

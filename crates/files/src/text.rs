@@ -341,7 +341,8 @@ enum Separator {
 }
 
 impl Separator {
-    // Preferably one that divides header and first row into equally many fields, because a comma may also occur in a name; else any that divides the row.
+    // Preferably one that divides header and first row into equally many fields, because a comma may also occur in a name; else
+    // any that divides the row.
     fn of(header: Option<&str>, row: Option<&str>) -> Self {
         let Some(row) = row.or(header) else {
             return Separator::Blanks;

@@ -41,7 +41,8 @@ const NEIGHBOUR_SIGMA_CELLS: f64 = 1.5;
 // Cells from the centre of the neighbour to the edge of its model, at 2.7 σ. Chosen by hand.
 pub(super) const NEIGHBOUR_HALF_SIDE: usize = 4;
 
-// Galaxies that are drawn; each is used again with exchanged axes. With 6,000 galaxies instead, the share of neighbours found changes by 0.2 %.
+// Galaxies that are drawn; each is used again with exchanged axes. With 6,000 galaxies instead, the share of neighbours found
+// changes by 0.2 %.
 const POPULATION_SIZE: usize = 300;
 // In pixels before the PSF: from unresolved ones to half-light radii of 10 px. Chosen by hand.
 const GALAXY_SCALES_PX: [f64; 2] = [0.5, 8.0];

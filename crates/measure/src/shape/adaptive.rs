@@ -226,7 +226,8 @@ impl AdaptiveMoments {
         Err(Flag::NoExtent)
     }
 
-    /// The regularisation that halves what a small distortion of the round `acf` does to χ₁ (and, but for 2 %, to χ₂: the grid is square).
+    /// The regularisation that halves the effect of a small distortion of the round `acf` on χ₁, and within 2 % on χ₂: the grid is
+    /// square.
     ///
     /// The weight follows the galaxy: with m = aχ′ + bχ the moments of a galaxy of distortion χ′ under a weight of χ,
     /// χ = aχ′/(1 − b) is aχ′T/((1 − b)T + s) after regularisation by s.
