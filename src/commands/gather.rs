@@ -101,7 +101,7 @@ pub(crate) struct Arguments {
     size: u16,
     /// Make squares of stamps that are not: by their central square (crop), or by missing pixels around them (pad). A galaxy with
     /// many missing pixels is flagged. PSFs are cropped [default: refuse].
-    #[arg(long, value_name = "HOW", value_parser = ["crop", "pad"], conflicts_with_all = ["exposure", "positions", "table", "first_pixel", "columns", "size"])]
+    #[arg(long, value_name = "HOW", value_parser = ["crop", "pad"], conflicts_with_all = ["exposure", "positions", "table", "first_pixel", "columns", "degrees", "id", "carry", "size"])]
     square: Option<String>,
     /// FITS files of PSF stamps, or one table of functional PSFs (.csv): one PSF for all galaxies, or one per galaxy.
     /// Several stars, at most half as many as galaxies, are averaged to one PSF.
