@@ -8,6 +8,7 @@
 
 pub mod escape;
 pub mod figure;
+mod formats;
 pub mod html;
 pub mod page;
 pub mod table;
