@@ -88,19 +88,6 @@ fn check_significance(path: &Path, means: &[RunningMean; 2]) -> Result<(), FileE
     Err(FileError::new(path, message))
 }
 
-/// Refuses catalogues of earlier versions, whose ellipticities were divided by `divisor1` and `divisor2`: Σ e / Σ R would be
-/// too large by 1/R.
-pub(crate) fn refuse_divided<'a>(
-    path: &Path,
-    mut columns: impl Iterator<Item = &'a str>,
-) -> Result<(), FileError> {
-    if columns.any(|name| name == "divisor1") {
-        let message = "an earlier version of shearq measured this catalogue and divided e1 and e2 by their mean response (found the column `divisor1`; expected ellipticities before the division). Try: shearq measure, or multiply e1 by divisor1 and e2 by divisor2 and remove these columns";
-        return Err(FileError::new(path, message));
-    }
-    Ok(())
-}
-
 /// Which galaxies share a mean response.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Shared {

@@ -17,7 +17,6 @@ use shearq_measure::{
 use thiserror::Error;
 
 use crate::expression::{Condition, Expression, ExpressionError, Step};
-use crate::response::refuse_divided;
 
 /// Columns that a selection replaces or reads. It also reads the columns of [`Observables`].
 pub(crate) const READ: [&str; 7] = ["e1", "e2", "flags", "R11", "R22", "R12", "R21"];
@@ -227,6 +226,19 @@ fn check_undivided(path: &Path) -> Result<(), FileError> {
     let present = table::columns(&Place::of(path))?;
     let names = present.named.iter().flat_map(|named| &named.names);
     refuse_divided(path, names.map(String::as_str))
+}
+
+/// Refuses catalogues of earlier versions, whose ellipticities were divided by `divisor1` and `divisor2`: Σ e / Σ R would be
+/// too large by 1/R.
+pub(crate) fn refuse_divided<'a>(
+    path: &Path,
+    mut columns: impl Iterator<Item = &'a str>,
+) -> Result<(), FileError> {
+    if columns.any(|name| name == "divisor1") {
+        let message = "an earlier version of shearq measured this catalogue and divided e1 and e2 by their mean response (found the column `divisor1`; expected ellipticities before the division). Try: shearq measure, or multiply e1 by divisor1 and e2 by divisor2 and remove these columns";
+        return Err(FileError::new(path, message));
+    }
+    Ok(())
 }
 
 /// Rows of a catalogue after a selection.

@@ -7,7 +7,7 @@ use shearq_bias::SHEARED_CATALOGUES;
 use shearq_files::{FileError, names_of};
 
 use crate::expression::fits;
-use crate::response::refuse_divided;
+use crate::select::refuse_divided;
 
 /// How ellipticities become shears.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -814,6 +814,30 @@ fn find_flags(
 fn in_vector(name: &str) -> Option<String> {
     let first = name.strip_suffix("_1").map(|vector| format!("{vector}[0]"));
     first.or_else(|| name.strip_suffix("_2").map(|vector| format!("{vector}[1]")))
+}
+
+// What is read of a row by sheared catalogue and role, as places in [`Source::wanted`]. A role may have several columns (flags,
+// operands), or in sheared catalogues the column without artificial shear.
+#[derive(Default)]
+pub(super) struct Places(pub(super) [[Vec<usize>; ROLES]; CATALOGUES]);
+
+impl Places {
+    pub(super) fn all(&self, (role, catalogue): Key) -> &[usize] {
+        &self.0[catalogue][role as usize]
+    }
+
+    pub(super) fn of(&self, key: Key) -> Option<usize> {
+        self.all(key).first().copied()
+    }
+
+    // Of two roles in the catalogue without artificial shear, if both have a column.
+    pub(super) fn pair(&self, [a, b]: [Role; 2]) -> Option<[usize; 2]> {
+        Some([self.of((a, 0))?, self.of((b, 0))?])
+    }
+
+    pub(super) fn set(&mut self, (role, catalogue): Key, places: Vec<usize>) {
+        self.0[catalogue][role as usize] = places;
+    }
 }
 
 #[cfg(test)]

@@ -12,7 +12,7 @@ use shearq_measure::{Observables, Selection};
 use crate::expression::{Expression, Operand};
 use crate::select::{READ, require_responses};
 
-use super::columns::{CATALOGUES, Columns, Key, Preset, ROLES, Role, Shapes, base, fits_any};
+use super::columns::{CATALOGUES, Columns, Places, Preset, Role, Shapes, base, fits_any};
 use super::truth::Truth;
 use super::{Input, Request, Units};
 
@@ -72,30 +72,6 @@ const UNITS: &str = "tile tile_id tileid tilename tile_name field field_id patch
 // galaxies are chosen by it: a cut at S/N 7 biases m by −0.1 (docs/limitations.md).
 const FIXED: &str = "*psf* *tile* *field* *patch* *seed* *true* *truth* *image* *ccd* *exp* *airmass* *seeing* *depth* \
     *zbin* *z_bin* *primary* *inner* ra dec x y z number row alpha delta set";
-
-// What is read of a row by sheared catalogue and role, as places in [`Source::wanted`]. A role may have several columns (flags,
-// operands), or in sheared catalogues the column without artificial shear.
-#[derive(Default)]
-pub(super) struct Places([[Vec<usize>; ROLES]; CATALOGUES]);
-
-impl Places {
-    pub(super) fn all(&self, (role, catalogue): Key) -> &[usize] {
-        &self.0[catalogue][role as usize]
-    }
-
-    pub(super) fn of(&self, key: Key) -> Option<usize> {
-        self.all(key).first().copied()
-    }
-
-    // Of two roles in the catalogue without artificial shear, if both have a column.
-    pub(super) fn pair(&self, [a, b]: [Role; 2]) -> Option<[usize; 2]> {
-        Some([self.of((a, 0))?, self.of((b, 0))?])
-    }
-
-    fn set(&mut self, (role, catalogue): Key, places: Vec<usize>) {
-        self.0[catalogue][role as usize] = places;
-    }
-}
 
 pub(super) struct Source {
     pub(super) place: Place,

@@ -13,8 +13,8 @@ use shearq_files::table::{self, MAX_ROWS, Place, TRUTH_COLUMNS};
 use shearq_files::{FileError, names_of};
 use shearq_scoring::{Row, TruthSign};
 
+use super::columns::Places;
 use super::columns::{Role, names_of_role};
-use super::source::Places;
 use super::{BiasFailure, Input, identity};
 
 /// Where the true shear comes from.
