@@ -32,7 +32,7 @@ impl ToTurnedModes {
             folded: vec![0.0; folding.len()],
             along_x: waves(),
             along_y: waves(),
-            lines: vec![[0.0; 2]; LINES * folding.half],
+            lines: vec![[0.0; 2]; EDGE_LINES * folding.half],
         }
     }
 
@@ -79,7 +79,7 @@ impl ToTurnedModes {
         mut out: [&mut Modes; 2],
     ) {
         let Folding { n, half, .. } = self.folding;
-        let lines = edges.chunks_exact(n).take(LINES);
+        let lines = edges.chunks_exact(n).take(EDGE_LINES);
         for (line, folded) in lines.zip(self.lines.chunks_exact_mut(half)) {
             for (place, folded) in folded.iter_mut().enumerate() {
                 let (above, below) = (line[n / 2 + place], line[half - 1 - place]);
@@ -94,13 +94,13 @@ impl ToTurnedModes {
             let phases = [&p, &q].map(|wave| wave.map(|k| (k * beyond).sin_cos()));
             for (which, out) in out.iter_mut().enumerate() {
                 let mut sums = [[0.0f32; LANES]; 2];
-                for line in 0..LINES / 2 {
+                for line in 0..EDGE_LINES / 2 {
                     let (waves, phase) = match line < 2 {
                         true => (&self.along_y, &phases[0]),
                         false => (&self.along_x, &phases[1]),
                     };
                     let sign = if line % 2 == 0 { 1.0 } else { -1.0 };
-                    let first = (which * LINES / 2 + line) * half;
+                    let first = (which * EDGE_LINES / 2 + line) * half;
                     let mut along = [[0.0f32; LANES]; 2];
                     for ([even, odd], [cos, _, sin, _]) in self.lines[first..].iter().zip(waves) {
                         for l in 0..LANES {
@@ -121,8 +121,8 @@ impl ToTurnedModes {
     }
 }
 
-/// Edges of two shears: left, right, lower, upper.
-const LINES: usize = 8;
+// Left, right, lower and upper edge for each of two shears.
+const EDGE_LINES: usize = 8;
 
 /// Calls with the first place of LANES modes, and their wave numbers along the axes of the pixels. Places without modes get some
 /// wave numbers, too; their amplitudes are zero in all that follows.
@@ -235,7 +235,9 @@ mod tests {
             let mut to_modes = ToTurnedModes::new(n);
             to_modes.transform_moments(&image, matrix, &plane, &mut out);
             let middle = (n as f64 - 1.0) / 2.0;
-            let edges: Vec<f32> = (0..LINES * n).map(|at| (at as f32 * 0.61).cos()).collect();
+            let edges: Vec<f32> = (0..EDGE_LINES * n)
+                .map(|at| (at as f32 * 0.61).cos())
+                .collect();
             let mut of_edges = [(); 2].map(|()| plane.mode_by_mode());
             let [first, second] = &mut of_edges;
             to_modes.transform_edges(&edges, matrix, &plane, [first, second]);
@@ -271,14 +273,14 @@ mod tests {
                     );
                 }
                 for (which, modes) in of_edges.iter().enumerate() {
-                    let lines = (0..LINES / 2 * n).map(|place| {
+                    let lines = (0..EDGE_LINES / 2 * n).map(|place| {
                         let along = (place % n) as f64 - middle;
                         let beyond = if (place / n) % 2 == 0 { -0.5 } else { 0.5 } * n as f64;
                         let [x, y] = match place / n < 2 {
                             true => [beyond, along],
                             false => [along, beyond],
                         };
-                        phase(map(x, y)) * f64::from(edges[which * LINES / 2 * n + place])
+                        phase(map(x, y)) * f64::from(edges[which * EDGE_LINES / 2 * n + place])
                     });
                     check(modes, lines.sum(), n as f64);
                 }
