@@ -30,8 +30,8 @@
 //!
 //! On the sky, pixels may be sheared. Stamp and PSF are then transformed as what they are, samples on a skewed lattice
 //! ([`PixelShape::map`]), at the wave vectors of square pixels of their area. All that follows stays as it is: target, window,
-//! lags and shear are round in those coordinates. Ellipticities that were turned and sheared afterwards instead leave
-//! m = −0.004 for pixels that are sheared by 0.03.
+//! lags and shear are round in those coordinates. Turning and shearing the ellipticities afterwards would be right to
+//! first order in the shear of the pixels only.
 
 mod epochs;
 
