@@ -137,8 +137,10 @@ impl StampWriter {
             }
             if let Some(map) = &mut maps {
                 let mut values = map.square::<f64>((x, y), side)?;
-                variance(&mut pixels, &mut values, map.content())
-                    .map_err(|fault| map.origin.fault(&format!("stamp at ({x:.1}, {y:.1}): {fault}")))?;
+                variance(&mut pixels, &mut values, map.content()).map_err(|fault| {
+                    map.origin
+                        .fault(&format!("stamp at ({x:.1}, {y:.1}): {fault}"))
+                })?;
                 self.levels
                     .get_or_insert_default()
                     .push(level(&values, side));
