@@ -39,6 +39,8 @@ def test_one_response_serves_a_survey_of_small_images(command, tmp_path):
 
 def test_treecorr_finds_the_tangential_shear_of_a_halo(command, tmp_path):
     treecorr = pytest.importorskip("treecorr", reason="its signs are tested")
+    pytest.importorskip("pyarrow", reason="TreeCorr reads the table with it")
+    pytest.importorskip("pandas", reason="TreeCorr reads the table with it")
     galsim = pytest.importorskip("galsim", reason="the galaxies are drawn with it")
     fits = pytest.importorskip("astropy.io.fits", reason="the exposure is written with it")
     wcs = pytest.importorskip("astropy.wcs", reason="places are transformed with it")
