@@ -107,4 +107,28 @@ pub enum ScoringError {
         /// Bins expected.
         expected: usize,
     },
+    /// A galaxy is not on the lattice.
+    #[error("node {node:?} is outside the lattice of {side} × {side} nodes")]
+    OutsideLattice {
+        /// Column and row, 0-based.
+        node: (usize, usize),
+        /// Nodes per side.
+        side: usize,
+    },
+    /// A number is NaN or infinite.
+    #[error("{0} is not a finite number")]
+    NotFinite(&'static str),
+    /// Lists that belong together differ in length, or have too few entries.
+    #[error("{what}: found {found}, expected {expected}")]
+    Count {
+        /// What is counted.
+        what: &'static str,
+        /// Its number.
+        found: usize,
+        /// The number expected.
+        expected: usize,
+    },
+    /// The true shears of all fields are the same in one component, so that m and c cannot be separated.
+    #[error("the true shears do not vary, so that they determine no m")]
+    SameShears,
 }

@@ -27,10 +27,15 @@
 //! ```
 //!
 //! [`cross_spectrum`] uses pairs of images only, so noise does not bias it.
+//!
+//! # Other challenges
+//!
+//! [`great3`] has the metrics of GREAT3 and GREAT08, [`aperture`] correlations and aperture masses of galaxies on a lattice.
 
 #![warn(missing_docs, clippy::missing_errors_doc)]
 #![forbid(unsafe_code)]
 
+pub mod aperture;
 pub mod bandpower;
 mod catalogue;
 mod convention;
@@ -38,6 +43,7 @@ mod cross;
 mod diagnosis;
 mod error;
 mod errors;
+pub mod great3;
 mod grid;
 mod metrics;
 pub mod modes;

@@ -14,5 +14,6 @@ mod definitions;
 mod derivations;
 mod edges;
 mod great10_cases;
+mod great3;
 mod input;
 mod responses;

@@ -1,0 +1,285 @@
+//! The metrics of GREAT3 (Mandelbaum et al. 2014, ApJS 212, 5) and GREAT08 (Bridle et al. 2010, MNRAS 405, 2044).
+
+#[cfg(feature = "serde")]
+use serde::Serialize;
+use shearq_quantities::Shear;
+use shearq_quantities::units::Radians;
+
+use crate::aperture::SEPARATION_BINS;
+use crate::error::ScoringError;
+use crate::resample::{group_sizes, jackknife_error};
+
+/// Simulated ground or space data, which differ in the floor of Q.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Observation {
+    /// From the ground.
+    Ground,
+    /// From space.
+    Space,
+}
+
+impl Observation {
+    // σ² of Q_c and of Q_v: without it, luck would have the best scores.
+    fn floors(self) -> (f64, f64) {
+        match self {
+            Observation::Ground => (4.0, 9e-8),
+            Observation::Space => (1.0, 4e-8),
+        }
+    }
+
+    /// Q_c = 1.232 · 2000 / √[Σ (c/2·10⁻⁴)² + Σ (m/2·10⁻³)² + σ²], of `[c, m]` of both components. The targets of m and c are those
+    /// of a survey of Stage IV.
+    pub fn q_c(self, biases: [[f64; 2]; 2]) -> f64 {
+        let terms = biases.map(|[c, m]| (c / 2e-4).powi(2) + (m / 2e-3).powi(2));
+        1.232 * 2000.0 / (terms[0] + terms[1] + self.floors().0).sqrt()
+    }
+}
+
+/// Component of an ellipticity along an axis and at 45° to it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(Serialize))]
+pub struct PlusCross<T> {
+    /// Along the axis.
+    pub plus: T,
+    /// At 45° to the axis.
+    pub cross: T,
+}
+
+/// Position angle φ = ½ atan2(e2, e1) of an ellipse, from +x towards +y; 0 if it is round.
+pub fn position_angle(shape: Shear) -> Radians {
+    Radians(0.5 * shape.e2.atan2(shape.e1))
+}
+
+/// The components in a frame whose first axis has the position angle φ: g e^(−2iφ).
+pub fn along(g: Shear, axis: Radians) -> PlusCross<f64> {
+    let (sin, cos) = (2.0 * axis.0).sin_cos();
+    PlusCross {
+        plus: g.e1 * cos + g.e2 * sin,
+        cross: g.e2 * cos - g.e1 * sin,
+    }
+}
+
+/// A value with two errors.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(Serialize))]
+pub struct Bias {
+    /// Best value.
+    pub value: f64,
+    /// The challenge's error, from the mean square of the residuals: σ² = Σ residual²/N.
+    pub error: f64,
+    /// Error by the jackknife over fields.
+    pub jackknife: f64,
+}
+
+/// The score of a branch with one shear per field.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(Serialize))]
+pub struct ConstantScore {
+    /// Q_c.
+    pub q: f64,
+    /// Its error by the jackknife over fields.
+    pub jackknife: f64,
+    /// Additive bias.
+    pub c: PlusCross<Bias>,
+    /// Multiplicative bias.
+    pub m: PlusCross<Bias>,
+}
+
+/// Submitted and true shear of a field, in the frame of its PSF.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ConstantField {
+    /// True shear.
+    pub truth: Shear,
+    /// Submitted shear.
+    pub submitted: Shear,
+    /// Mean ellipticity of the PSF, zero if unknown.
+    pub psf: Shear,
+}
+
+// [c, m] and their errors, of one component.
+#[derive(Clone, Copy)]
+struct Line {
+    values: [f64; 2],
+    errors: [f64; 2],
+}
+
+// g_sub − g_true = c + m g_true without weights.
+fn line(points: &[(f64, f64)]) -> Result<Line, ScoringError> {
+    let n = points.len() as f64;
+    let mean = |of: &dyn Fn(&(f64, f64)) -> f64| points.iter().map(of).sum::<f64>() / n;
+    let (x, y) = (mean(&|p| p.0), mean(&|p| p.1 - p.0));
+    let variance = mean(&|p| (p.0 - x).powi(2));
+    if variance.is_nan() || variance <= 0.0 {
+        return Err(ScoringError::SameShears);
+    }
+    let m = mean(&|p| (p.0 - x) * (p.1 - p.0 - y)) / variance;
+    let c = y - m * x;
+    // Over N, not N − 2, as in the challenge.
+    let scatter = mean(&|p| (p.1 - p.0 - c - m * p.0).powi(2));
+    let error_m = (scatter / variance / n).sqrt();
+    Ok(Line {
+        values: [c, m],
+        errors: [error_m * (variance + x * x).sqrt(), error_m],
+    })
+}
+
+fn biases(fields: &[ConstantField]) -> Result<[Line; 2], ScoringError> {
+    let rotated = |of: fn(PlusCross<f64>) -> f64| -> Vec<(f64, f64)> {
+        let pair = |field: &ConstantField| {
+            let axis = position_angle(field.psf);
+            (
+                of(along(field.truth, axis)),
+                of(along(field.submitted, axis)),
+            )
+        };
+        fields.iter().map(pair).collect()
+    };
+    Ok([
+        line(&rotated(|own| own.plus))?,
+        line(&rotated(|own| own.cross))?,
+    ])
+}
+
+/// Q_c, c and m of the fields of a branch with constant shear.
+///
+/// # Errors
+/// If a number is not finite, or the true shears do not determine m.
+pub fn constant_score(
+    fields: &[ConstantField],
+    observation: Observation,
+) -> Result<ConstantScore, ScoringError> {
+    let numbers = |field: &ConstantField| [field.truth, field.submitted, field.psf];
+    let mut shears = fields.iter().flat_map(numbers);
+    if !shears.all(|g| g.e1.is_finite() && g.e2.is_finite()) {
+        return Err(ScoringError::NotFinite("a shear"));
+    }
+    let whole = biases(fields)?;
+    let quality = |of: &[Line; 2]| observation.q_c(of.map(|line| line.values));
+    let groups = group_sizes(fields.len()).len();
+    let mut replicates = Vec::with_capacity(groups);
+    for left_out in 0..groups {
+        let kept = fields.iter().enumerate();
+        let kept = kept.filter(|(k, _)| k % groups != left_out);
+        let kept: Vec<ConstantField> = kept.map(|(_, field)| *field).collect();
+        // With two fields, one determines no line: the errors are unknown.
+        replicates.extend(biases(&kept));
+    }
+    let error = |full: f64, of: &dyn Fn(&[Line; 2]) -> f64| {
+        jackknife_error(full, replicates.iter().map(of), fields.len())
+    };
+    let bias = |component: usize, which: usize| {
+        let Line { values, errors } = whole[component];
+        Bias {
+            value: values[which],
+            error: errors[which],
+            jackknife: error(values[which], &|of| of[component].values[which]),
+        }
+    };
+    let both = |which| PlusCross {
+        plus: bias(0, which),
+        cross: bias(1, which),
+    };
+    let q = quality(&whole);
+    Ok(ConstantScore {
+        q,
+        jackknife: error(q, &quality),
+        c: both(0),
+        m: both(1),
+    })
+}
+
+/// Q with its error by the jackknife.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[cfg_attr(feature = "serde", derive(Serialize))]
+pub struct Quality {
+    /// Q.
+    pub q: f64,
+    /// Its error by the jackknife: over fields for Q_v, over sets for GREAT08. Not a number for a single one.
+    pub jackknife: f64,
+}
+
+impl Quality {
+    // `of` gives Q from the chosen of `count` fields.
+    fn over(count: usize, of: impl Fn(&dyn Fn(usize) -> bool) -> f64) -> Self {
+        let groups = group_sizes(count).len();
+        let q = of(&|_| true);
+        let replicates = (0..groups).map(|left_out| of(&|k| k % groups != left_out));
+        Quality {
+            q,
+            jackknife: jackknife_error(q, replicates, count),
+        }
+    }
+}
+
+// Bins of separation that Q_v uses, 0.0853° to 3.5495°: in the others the sums are cut at the field or lack pairs.
+const Q_V_BINS: std::ops::RangeInclusive<usize> = 3..=12;
+
+/// Q_v = 1.837·10⁻⁴ / [σ² + ⟨|⟨M_E,sub − M_E,true⟩_fields|⟩_bins] of ⟨M_ap²⟩ by field and bin.
+///
+/// # Errors
+/// If the numbers of fields differ or a number is not finite.
+pub fn variable_score(
+    submitted: &[[f64; SEPARATION_BINS]],
+    truth: &[[f64; SEPARATION_BINS]],
+    observation: Observation,
+) -> Result<Quality, ScoringError> {
+    if submitted.len() != truth.len() || truth.is_empty() {
+        return Err(ScoringError::Count {
+            what: "fields",
+            found: submitted.len(),
+            expected: truth.len().max(1),
+        });
+    }
+    let mut values = submitted.iter().chain(truth).flatten();
+    if !values.all(|value| value.is_finite()) {
+        return Err(ScoringError::NotFinite("an aperture mass"));
+    }
+    let pairs: Vec<_> = submitted.iter().zip(truth).collect();
+    Ok(Quality::over(pairs.len(), |is_in| {
+        let chosen = || {
+            let all = pairs.iter().enumerate();
+            all.filter(|(k, _)| is_in(*k)).map(|(_, pair)| pair)
+        };
+        let fields = chosen().count() as f64;
+        let difference = |bin: usize| chosen().map(|(s, t)| s[bin] - t[bin]).sum::<f64>().abs();
+        let mean = Q_V_BINS.map(difference).sum::<f64>() / (fields * Q_V_BINS.count() as f64);
+        1.837e-4 / (observation.floors().1 + mean)
+    }))
+}
+
+/// Q of GREAT08: 10⁻⁴ / ⟨(⟨g_sub − g_true⟩_images)²⟩ over sets and both components. `sets` has the differences
+/// of the images of each set.
+///
+/// The mean over the images is inside the square: noise that averages to zero over a set costs little.
+///
+/// # Errors
+/// If a set is empty, there is none, or a number is not finite.
+pub fn great08_score(sets: &[Vec<Shear>]) -> Result<Quality, ScoringError> {
+    let empty = sets.iter().filter(|set| set.is_empty()).count();
+    if empty > 0 || sets.is_empty() {
+        return Err(ScoringError::Count {
+            what: "sets with images",
+            found: sets.len() - empty,
+            expected: sets.len().max(1),
+        });
+    }
+    let mut shears = sets.iter().flatten();
+    if !shears.all(|g| g.e1.is_finite() && g.e2.is_finite()) {
+        return Err(ScoringError::NotFinite("a shear"));
+    }
+    let squares: Vec<f64> = sets
+        .iter()
+        .map(|set| {
+            let mean = |of: fn(&Shear) -> f64| set.iter().map(of).sum::<f64>() / set.len() as f64;
+            0.5 * (mean(|g| g.e1).powi(2) + mean(|g| g.e2).powi(2))
+        })
+        .collect();
+    Ok(Quality::over(squares.len(), |is_in| {
+        let chosen = squares.iter().enumerate();
+        let chosen: Vec<f64> = chosen
+            .filter(|(k, _)| is_in(*k))
+            .map(|(_, square)| *square)
+            .collect();
+        1e-4 * chosen.len() as f64 / chosen.iter().sum::<f64>()
+    }))
+}
