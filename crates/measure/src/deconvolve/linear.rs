@@ -1011,27 +1011,38 @@ impl Edges {
         }
         edge_phases(plane, half / stretch, waves);
         let line = |k: usize| [&re[k * width..][..width], &im[k * width..][..width]];
-        for (which, Modes { re, im }) in changes.into_iter().enumerate() {
+        for (which, change) in changes.into_iter().enumerate() {
             let levels = [line(4 * which + 2), line(4 * which + 3)];
-            let rows = re.chunks_exact_mut(width).zip(im.chunks_exact_mut(width));
-            for (row, (re, im)) in rows.enumerate() {
-                let (y, sign) = if row < self.rows {
-                    (row, 1.0)
-                } else {
-                    (row - self.rows, -1.0)
-                };
-                let [cos, sin] = &*waves;
-                // Their phase along y has a place for each mode, and rows beyond the modes are not used.
-                let down = [cos, sin].map(|wave| wave.get(y).copied().unwrap_or_default());
-                let nothing = [[0.0; 2]; 2];
-                add_edges(
-                    [re, im],
-                    nothing,
-                    [cos, sin],
-                    levels,
-                    [down[0], sign * down[1]],
-                );
-            }
+            self.add_rows(change, None, levels, waves);
+        }
+    }
+
+    // Adds edges at both ends of the stamp to all rows of modes: `sides` along y, unless they are added already, and `levels`
+    // along x. `phase` is that of each frequency at the first edge.
+    fn add_rows(
+        &self,
+        Modes { re, im }: &mut Modes,
+        sides: Option<[[&[f32]; 2]; 2]>,
+        levels: [[&[f32]; 2]; 2],
+        [cos, sin]: &[Vec<f32>; 2],
+    ) {
+        let rows = re.chunks_exact_mut(self.width);
+        for (row, (re, im)) in rows.zip(im.chunks_exact_mut(self.width)).enumerate() {
+            // Real lines have conjugate transforms at opposite frequencies: those of the rows below.
+            let (y, sign) = if row < self.rows {
+                (row, 1.0)
+            } else {
+                (row - self.rows, -1.0)
+            };
+            let sides = sides.map(|sides| sides.map(|[re, im]| [re[y], sign * im[y]]));
+            let down = [cos[y], sign * sin[y]];
+            add_edges(
+                [re, im],
+                sides.unwrap_or_default(),
+                [cos, sin],
+                levels,
+                down,
+            );
         }
     }
 
@@ -1078,23 +1089,12 @@ impl Edges {
         }
         to_modes.transform_lines(lines, transform, [re, im]);
         let line = |k: usize| [&re[k * width..][..width], &im[k * width..][..width]];
-        for (which, Modes { re, im }) in changes.into_iter().enumerate() {
+        for (which, change) in changes.into_iter().enumerate() {
             let sides = [line(2 * which), line(2 * which + 1)];
             let levels = [line(2 * which + 4), line(2 * which + 5)];
-            re.fill(0.0);
-            im.fill(0.0);
-            let rows = re.chunks_exact_mut(width).zip(im.chunks_exact_mut(width));
-            for (row, (re, im)) in rows.enumerate() {
-                // Real lines have conjugate transforms at opposite frequencies: those of the rows below.
-                let (y, sign) = if row < self.rows {
-                    (row, 1.0)
-                } else {
-                    (row - self.rows, -1.0)
-                };
-                let sides = sides.map(|[re, im]| [re[y], sign * im[y]]);
-                let [cos, sin] = &self.phase;
-                add_edges([re, im], sides, [cos, sin], levels, [cos[y], sign * sin[y]]);
-            }
+            change.re.fill(0.0);
+            change.im.fill(0.0);
+            self.add_rows(change, Some(sides), levels, &self.phase);
         }
     }
 }

@@ -129,11 +129,21 @@ impl Regularisation {
     }
 
     /// What is added for the ellipticity and for the size behind `psf` in noise of level one; not finite if the PSF passes no light.
-    fn behind(&self, psf: &SpectralPsf) -> [f32; 2] {
+    fn behind(&self, psf: &SpectralPsf) -> RegularisationTerms {
         let modes = self.galaxy.iter().zip(psf.clarity());
         let snr_squared = modes.map(|(light, clarity)| light * clarity).sum::<f32>();
-        [self.ellipticity, self.size].map(|term| term / snr_squared)
+        RegularisationTerms {
+            ellipticity: self.ellipticity / snr_squared,
+            size: self.size / snr_squared,
+        }
     }
+}
+
+/// What is added to the divisors of ellipticity and size in noise of level one; it grows with the variance of the noise.
+#[derive(Debug, Clone, Copy, Default)]
+struct RegularisationTerms {
+    ellipticity: f32,
+    size: f32,
 }
 
 /// The plan for one target, window and weight.
@@ -465,8 +475,7 @@ struct PlanWorker {
     psf: SpectralPsf,
     /// Mean square per axis in px² of the Gaussian with the Σp² of the PSF.
     psf_variance: f64,
-    /// Terms of [`Regularisation::behind`].
-    regularisation: [f32; 2],
+    regularisation: RegularisationTerms,
     /// Of χ and of its slopes: weights of the lags.
     gradients: [Vec<f32>; 6],
     /// Of the size's T: the spectrum of weights of the lags.
@@ -491,7 +500,7 @@ impl PlanWorker {
             neighbours: plan.removes_neighbours.then(neighbours),
             psf: plan.spectral.psf(),
             psf_variance: 0.0,
-            regularisation: [0.0; 2],
+            regularisation: RegularisationTerms::default(),
             gradients: [(); 6].map(|()| plan.spectral.lags().acf),
             square_gradient: plan.size_gradients[0].clone(),
             buffers: plan.spectral.scratch(),
@@ -637,7 +646,7 @@ impl PlanWorker {
     fn own_variance(&self, noise: f32) -> f64 {
         let plan = &*self.plan;
         let (lags, target) = (&self.lags, plan.lengths.target_sigma);
-        let [_, of_size] = self.regularisation.map(|term| term * noise * noise);
+        let of_size = self.regularisation.size * noise * noise;
         let typical = plan.regularisation.typical_square;
         let breadth = plan.breadth.measure(&lags.acf, of_size, typical);
         let [size, ..] = plan.breadth.size(f64::from(breadth.square));
@@ -789,10 +798,11 @@ impl PlanWorker {
     ) -> Found {
         let plan = Arc::clone(&self.plan);
         let lags = &self.lags;
-        let [of_ellipticity, of_size] = self.regularisation.map(|term| term * sigma * sigma);
+        let RegularisationTerms { ellipticity, size } = self.regularisation;
         let shape = cleared.and_then(|_| {
+            let regularisation = ellipticity * sigma * sigma;
             plan.moments
-                .measure(&lags.acf, of_ellipticity, &mut self.values)
+                .measure(&lags.acf, regularisation, &mut self.values)
         });
         self.shape = shape.as_ref().ok().copied();
         let mut found = Found {
@@ -816,6 +826,7 @@ impl PlanWorker {
             found.response = Some(response);
             let seed = seed_of(stamp, sigma);
             let typical = plan.regularisation.typical_square;
+            let of_size = size * sigma * sigma;
             let breadth = plan.breadth.measure(&self.lags.acf, of_size, typical);
             if noise > 0.0 && seed.is_multiple_of(plan.noise_moments_interval) {
                 found.noise_moments = Some(self.noise_moments(&shape, &breadth, sigma));
