@@ -1,5 +1,6 @@
 //! The mean response to shear, and the mean shear with an error that includes the error of the response.
 
+use shearq_quantities::matrix::{determinant, inverse, solve};
 use shearq_quantities::statistics::RunningMean;
 use thiserror::Error;
 
@@ -147,7 +148,7 @@ impl ShearSum {
                 return Err(MeanShearError::Response { component, found });
             }
         }
-        let determinant = r11 * r22 - r12 * r21;
+        let determinant = determinant(self.response);
         if determinant <= 0.0 {
             return Err(MeanShearError::Singular {
                 found: determinant / (self.weight * self.weight),
@@ -158,7 +159,7 @@ impl ShearSum {
         let [e1, e2] = self.e;
         let shear = match diagonal {
             true => [e1 / r11, e2 / r22],
-            false => [r22 * e1 - r12 * e2, r11 * e2 - r21 * e1].map(|sum| sum / determinant),
+            false => solve(self.response, self.e),
         };
         let n = self.galaxies as f64;
         let squares = [0, 1].map(|k| {
@@ -188,7 +189,7 @@ impl ShearSum {
                 [0, 1].map(|l| squares[k][l] / (self.response[k][k] * self.response[l][l]))
             }),
             false => {
-                let inverse = [[r22, -r12], [-r21, r11]].map(|row| row.map(|r| r / determinant));
+                let inverse = inverse(self.response);
                 [0, 1].map(|k| {
                     [0, 1].map(|l| {
                         let row = [0, 1]

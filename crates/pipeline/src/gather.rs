@@ -11,6 +11,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 use shearq_measure::{Examination, Warning};
+use shearq_quantities::matrix::Matrix2;
 use shearq_quantities::statistics::upper_median;
 use shearq_quantities::{Frame, Jacobian};
 
@@ -23,7 +24,7 @@ use self::stamps::{Origins, StampWriter, already};
 use super::PipelineError;
 use super::measure::check_strip;
 use crate::stamp_table::{self, Head};
-use crate::wcs::{Matrix, Wcs, aligned};
+use crate::wcs::{Wcs, aligned};
 use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::{DataFolder, MAX_STAMP};
 use shearq_dataset::mosaic::Mosaic;
@@ -275,7 +276,7 @@ impl Plan {
     }
 
     // `None` if ellipticities stay on the pixel axes.
-    fn jacobians(&self, gathering: &Gathering<'_>) -> Result<Option<Vec<Matrix>>, FileError> {
+    fn jacobians(&self, gathering: &Gathering<'_>) -> Result<Option<Vec<Matrix2>>, FileError> {
         let files = match &gathering.stamps {
             Stamps::Files(files)
             | Stamps::Cutouts {
@@ -286,7 +287,7 @@ impl Plan {
         if gathering.frame == Some(Frame::Pixel) {
             return Ok(None);
         }
-        let all: Option<Vec<Matrix>> = match &self.positions {
+        let all: Option<Vec<Matrix2>> = match &self.positions {
             Some(found) => {
                 let each = found
                     .all
@@ -332,7 +333,7 @@ impl Plan {
         head: Head,
         mosaic: &Mosaic,
         writer: &mut StampWriter,
-        jacobians: Option<&[Matrix]>,
+        jacobians: Option<&[Matrix2]>,
     ) -> Vec<Column> {
         let mut columns = Vec::new();
         let real = |name: &str, values: Vec<f64>| Column::new(name.into(), values);
@@ -424,7 +425,7 @@ struct Stack {
     /// Of the first image.
     wcs: Wcs,
     /// Jacobians of images with several stamps each, with the numbers of stamps.
-    of_images: Vec<(usize, Option<Matrix>)>,
+    of_images: Vec<(usize, Option<Matrix2>)>,
     /// A warning if the pixels of an image differ from those of the first.
     differs: Option<String>,
 }
@@ -502,7 +503,7 @@ impl Stack {
 }
 
 // A user who did not ask for a frame must learn that the components differ from those on the pixels.
-fn frame_line(jacobians: &[Matrix]) -> String {
+fn frame_line(jacobians: &[Matrix2]) -> String {
     let pixels = Wcs::frame_of(&jacobians[0]);
     format!(
         "frame: sky (e1 > 0 along east–west, e2 > 0 along north-west). The WCS of the first stamp: {pixels}. --frame pixel keeps the pixel axes"
@@ -513,7 +514,7 @@ fn frame_line(jacobians: &[Matrix]) -> String {
 fn check_psf(
     psfs: &GatheredPsfs,
     plan: &Plan,
-    jacobians: Option<&[Matrix]>,
+    jacobians: Option<&[Matrix2]>,
 ) -> Result<Vec<Warning>, FileError> {
     // The stars of a field have the pixels of its middle, from which distortions differ by less than what is refused.
     let typical = jacobians.map(|all| Wcs::of_jacobian(all[all.len() / 2]));

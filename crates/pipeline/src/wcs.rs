@@ -3,6 +3,7 @@
 
 use shearq_files::fits::{ImageReader, Value};
 use shearq_measure::{PixelFrame, Warning};
+use shearq_quantities::matrix::{Matrix2, apply, determinant, inverse, product};
 
 // Keys with the pixel scale in arcseconds: of surveys, and of GalSim.
 const PIXEL_SCALE_KEYS: [&str; 2] = ["PIXSCALE", "GS_SCALE"];
@@ -33,8 +34,6 @@ const TPV_ORDERS: i32 = 7;
 // Distortions are small, so that Newton's method needs some five steps.
 const MAX_NEWTON_STEPS: usize = 50;
 const INVERSE_ERROR_PX: f64 = 1e-9;
-
-pub(crate) type Matrix = [[f64; 2]; 2];
 
 const ARCSEC_PER_RADIAN: f64 = 648_000.0 / std::f64::consts::PI;
 
@@ -73,7 +72,7 @@ impl Polynomial {
         (value, slope)
     }
 
-    fn both(axes: &[Self; 2], at: [f64; 2]) -> ([f64; 2], Matrix) {
+    fn both(axes: &[Self; 2], at: [f64; 2]) -> ([f64; 2], Matrix2) {
         let [first, second] = axes.each_ref().map(|axis| axis.at(at));
         ([first.0, second.0], [first.1, second.1])
     }
@@ -101,13 +100,13 @@ struct Map {
     origin: [f64; 2],
     sip: Option<[Polynomial; 2]>,
     /// To arcseconds of a plane along west and north, or to degrees of longitude and latitude.
-    matrix: Matrix,
+    matrix: Matrix2,
     projection: Projection,
 }
 
 impl Map {
     /// Coordinates on the projection plane, longitude first, and their derivatives by pixels.
-    fn plane(&self, at: [f64; 2]) -> ([f64; 2], Matrix) {
+    fn plane(&self, at: [f64; 2]) -> ([f64; 2], Matrix2) {
         let mut offset = [0, 1].map(|k| at[k] - self.origin[k]);
         let mut slope = self.matrix;
         if let Some(sip) = &self.sip {
@@ -115,13 +114,13 @@ impl Map {
             offset = [0, 1].map(|k| offset[k] + shift[k]);
             by[0][0] += 1.0;
             by[1][1] += 1.0;
-            slope = product(&self.matrix, &by);
+            slope = product(self.matrix, by);
         }
-        let place = apply(&self.matrix, offset);
+        let place = apply(self.matrix, offset);
         match &self.projection {
             Projection::Tangent { tpv: Some(tpv), .. } => {
                 let (place, by) = Polynomial::both(tpv, place);
-                (place, product(&by, &slope))
+                (place, product(by, slope))
             }
             _ => (place, slope),
         }
@@ -132,7 +131,10 @@ impl Map {
         let mut at = self.origin;
         for _ in 0..MAX_NEWTON_STEPS {
             let (place, slope) = self.plane(at);
-            let step = apply(&inverse(&slope)?, [0, 1].map(|k| wanted[k] - place[k]));
+            let step = apply(
+                regular_inverse(slope)?,
+                [0, 1].map(|k| wanted[k] - place[k]),
+            );
             at = [0, 1].map(|k| at[k] + step[k]);
             if step[0].hypot(step[1]) < INVERSE_ERROR_PX {
                 return Some(at);
@@ -142,7 +144,7 @@ impl Map {
     }
 
     /// Right ascension and declination in degrees, and the derivatives of (west, north) in arcseconds there.
-    fn sky(&self, at: [f64; 2]) -> (Option<[f64; 2]>, Matrix) {
+    fn sky(&self, at: [f64; 2]) -> (Option<[f64; 2]>, Matrix2) {
         let (place, slope) = self.plane(at);
         let Projection::Tangent {
             ra, dec, lonpole, ..
@@ -164,7 +166,7 @@ impl Map {
         let row = |axis: &[f64; 3]| [&east, &north].map(|by| dot(axis, by) / length);
         let local = [row(&its_east).map(|value| -value), row(&its_north)];
         let scale = ARCSEC_PER_RADIAN * 1f64.to_radians();
-        let jacobian = product(&local, &slope).map(|row| row.map(|value| value * scale));
+        let jacobian = product(local, slope).map(|row| row.map(|value| value * scale));
         (Some(there), jacobian)
     }
 
@@ -249,10 +251,10 @@ impl Wcs {
                 false => [[x * cosine, -y * sine], [x * sine, y * cosine]],
             })
         });
-        let matrix = matrix.filter(|m| determinant(m).is_normal());
+        let matrix = matrix.filter(|m| determinant(*m).is_normal());
         let stated = PIXEL_SCALE_KEYS.into_iter().find_map(&number);
         let plausible = |scale: &f64| PLAUSIBLE_ARCSEC.contains(scale);
-        let of_matrix = matrix.map(|matrix| determinant(&matrix).abs().sqrt() * unit);
+        let of_matrix = matrix.map(|matrix| determinant(matrix).abs().sqrt() * unit);
         let scale = stated.or(of_matrix).filter(plausible);
         let Some(matrix) = matrix else {
             return Wcs {
@@ -265,7 +267,7 @@ impl Wcs {
         let equatorial = kind.starts_with("DEC") || kind.starts_with("RA");
         let longitude = usize::from(latitude_first);
         let origin = ["CRPIX1", "CRPIX2"].map(|key| number(key).unwrap_or(0.0));
-        let in_unit = |matrix: Matrix, unit: f64| matrix.map(|row| row.map(|v| v * unit));
+        let in_unit = |matrix: Matrix2, unit: f64| matrix.map(|row| row.map(|v| v * unit));
         let projection = kind.get(5..8).unwrap_or_default();
         let read = equatorial && ["TAN", "TPV"].contains(&projection);
         if !read {
@@ -275,7 +277,7 @@ impl Wcs {
                 (true, _) => [first, second],
                 (_, true) => [west(second), first],
                 // Unnamed axes are right ascension and declination if one of them is reversed.
-                _ if named || determinant(&matrix) < 0.0 => [west(first), second],
+                _ if named || determinant(matrix) < 0.0 => [west(first), second],
                 _ => [first, second],
             };
             return Wcs {
@@ -325,12 +327,12 @@ impl Wcs {
     }
 
     /// Derivatives of (u, v) by x (first column) and y in arcseconds at a pixel, with u to the west and v to the north.
-    pub(crate) fn jacobian(&self, at: [f64; 2]) -> Option<Matrix> {
+    pub(crate) fn jacobian(&self, at: [f64; 2]) -> Option<Matrix2> {
         Some(self.map.as_ref()?.sky(at).1)
     }
 
     /// The same at the reference point.
-    fn reference(&self) -> Option<Matrix> {
+    fn reference(&self) -> Option<Matrix2> {
         let map = self.map.as_ref()?;
         Some(match map.projection {
             Projection::Plane => map.matrix,
@@ -378,9 +380,9 @@ impl Wcs {
         keys
     }
 
-    pub(crate) fn of_jacobian(matrix: Matrix) -> Self {
+    pub(crate) fn of_jacobian(matrix: Matrix2) -> Self {
         Wcs {
-            scale: Some(determinant(&matrix).abs().sqrt()),
+            scale: Some(determinant(matrix).abs().sqrt()),
             map: Some(Map {
                 origin: [0.0; 2],
                 sip: None,
@@ -391,7 +393,7 @@ impl Wcs {
         }
     }
 
-    pub(crate) fn frame_of(jacobian: &Matrix) -> PixelFrame {
+    pub(crate) fn frame_of(jacobian: &Matrix2) -> PixelFrame {
         frame(jacobian)
     }
 
@@ -418,7 +420,7 @@ impl Wcs {
                 angle,
                 mirrored,
                 shear: [g1, g2],
-            } = frame(&product(&inverse(&psf)?, &galaxies));
+            } = frame(&product(regular_inverse(psf)?, galaxies));
             let differs = mirrored
                 || angle.abs() > MIN_ROTATION_DEGREES
                 || g1.hypot(g2) > MIN_PIXEL_DIFFERENCE;
@@ -432,7 +434,7 @@ impl Wcs {
 }
 
 // Absent keys of a matrix are zero (Greisen & Calabretta 2002) if others are present.
-fn cd([xx, xy, yx, yy]: [Option<f64>; 4]) -> Option<[[f64; 2]; 2]> {
+fn cd([xx, xy, yx, yy]: [Option<f64>; 4]) -> Option<Matrix2> {
     if xx.is_none() && yy.is_none() && xy.is_none() {
         return None;
     }
@@ -476,23 +478,12 @@ fn tpv_of(axis: usize, number: impl Fn(&str) -> Option<f64>, longitude: bool) ->
     Polynomial { terms, radial }
 }
 
-fn apply(matrix: &Matrix, [x, y]: [f64; 2]) -> [f64; 2] {
-    matrix.map(|row| row[0] * x + row[1] * y)
-}
-
-fn product(a: &Matrix, b: &Matrix) -> Matrix {
-    a.map(|row| [0, 1].map(|k| row[0] * b[0][k] + row[1] * b[1][k]))
-}
-
-fn inverse(matrix: &Matrix) -> Option<Matrix> {
-    let all = determinant(matrix);
-    let [[a, b], [c, d]] = *matrix;
-    all.is_normal()
-        .then(|| [[d / all, -b / all], [-c / all, a / all]])
+fn regular_inverse(matrix: Matrix2) -> Option<Matrix2> {
+    determinant(matrix).is_normal().then(|| inverse(matrix))
 }
 
 /// Whether ellipticities along the pixel axes are ellipticities along the sky's.
-pub(crate) fn aligned(jacobian: &Matrix) -> bool {
+pub(crate) fn aligned(jacobian: &Matrix2) -> bool {
     let frame = frame(jacobian);
     // Ellipticities do not change by half a turn.
     let turned = (frame.angle + 90.0).rem_euclid(180.0) - 90.0;
@@ -501,13 +492,9 @@ pub(crate) fn aligned(jacobian: &Matrix) -> bool {
         && frame.shear[0].hypot(frame.shear[1]) <= ALIGNED_SHEAR
 }
 
-fn determinant([[a, b], [c, d]]: &[[f64; 2]; 2]) -> f64 {
-    a * d - b * c
-}
-
-fn frame(jacobian: &[[f64; 2]; 2]) -> PixelFrame {
+fn frame(jacobian: &Matrix2) -> PixelFrame {
     let [[ux, uy], [vx, vy]] = *jacobian;
-    let all = determinant(jacobian);
+    let all = determinant(*jacobian);
     // A round object has the second moments J⁻¹ J⁻ᵀ in pixels, of which this is the ellipticity (Bartelmann & Schneider 2001,
     // eq. 4.10).
     let (xx, yy, xy) = (vy * vy + uy * uy, vx * vx + ux * ux, -(vx * vy + ux * uy));

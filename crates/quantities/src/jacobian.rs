@@ -7,6 +7,8 @@ use std::str::FromStr;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
+use crate::matrix::{Matrix2, apply, determinant};
+
 /// The axes that components of ellipticities and shears refer to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 #[cfg_attr(feature = "serde", derive(Serialize, Deserialize))]
@@ -47,7 +49,7 @@ impl FromStr for Frame {
 /// the tangent plane is seen from Earth with north up. This is the convention of GalSim's `JacobianWCS` and of TreeCorr's
 /// flat positions, in which no component of a shear changes its sign.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Jacobian([[f64; 2]; 2]);
+pub struct Jacobian(Matrix2);
 
 /// A matrix that maps no pixel to an area of the sky.
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
@@ -55,7 +57,7 @@ pub struct Jacobian([[f64; 2]; 2]);
     "the Jacobian ((du/dx, du/dy), (dv/dx, dv/dy)) is (({}, {}), ({}, {})) (expected finite numbers in arcsec per pixel with a determinant other than zero)",
     .0[0][0], .0[0][1], .0[1][0], .0[1][1]
 )]
-pub struct JacobianError(pub [[f64; 2]; 2]);
+pub struct JacobianError(pub Matrix2);
 
 // Ratio of the determinant to the square of the longer axis below which the axes of a pixel count as parallel.
 // Chosen by hand: rounding in the conversion of coordinates leaves 1e-10.
@@ -66,10 +68,10 @@ impl Jacobian {
     ///
     /// # Errors
     /// If the matrix is singular or has an element that is not finite.
-    pub fn new(matrix: [[f64; 2]; 2]) -> Result<Self, JacobianError> {
+    pub fn new(matrix: Matrix2) -> Result<Self, JacobianError> {
         let [[a, b], [c, d]] = matrix;
         let longest = a.hypot(c).max(b.hypot(d));
-        let area = (a * d - b * c).abs();
+        let area = determinant(matrix).abs();
         // Not a number fails, too.
         let usable = area.is_normal() && area > LEAST_RELATIVE_AREA * longest * longest;
         usable
@@ -78,14 +80,13 @@ impl Jacobian {
     }
 
     /// `[[du/dx, du/dy], [dv/dx, dv/dy]]`.
-    pub fn matrix(&self) -> [[f64; 2]; 2] {
+    pub fn matrix(&self) -> Matrix2 {
         self.0
     }
 
     /// The side in arcsec of a square of a pixel's area, √|det J|.
     pub fn pixel_scale(&self) -> f64 {
-        let [[a, b], [c, d]] = self.0;
-        (a * d - b * c).abs().sqrt()
+        determinant(self.0).abs().sqrt()
     }
 
     /// The factors U and T of J = scale · U T.
@@ -97,7 +98,7 @@ impl Jacobian {
         let [[a, b], [c, d]] = self.0;
         let scale = self.pixel_scale();
         let length = a.hypot(c);
-        let sign = (a * d - b * c).signum();
+        let sign = determinant(self.0).signum();
         let (cos, sin) = (a / length, c / length);
         let orientation = Orientation([[cos, -sign * sin], [sin, sign * cos]]);
         let shape = PixelShape {
@@ -110,11 +111,11 @@ impl Jacobian {
 
 /// A rotation, with a reflection if the determinant is −1: an orthogonal matrix.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Orientation([[f64; 2]; 2]);
+pub struct Orientation(Matrix2);
 
 impl Orientation {
     /// The matrix that acts on coordinates.
-    pub fn matrix(&self) -> [[f64; 2]; 2] {
+    pub fn matrix(&self) -> Matrix2 {
         self.0
     }
 
@@ -128,21 +129,21 @@ impl Orientation {
 
 /// What an [`Orientation`] does to spin-2 quantities: ellipticities, shears, and responses of one to the other.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Spin2([[f64; 2]; 2]);
+pub struct Spin2(Matrix2);
 
 impl Spin2 {
     /// The matrix that acts on (e1, e2).
-    pub fn matrix(&self) -> [[f64; 2]; 2] {
+    pub fn matrix(&self) -> Matrix2 {
         self.0
     }
 
     /// Components of an ellipticity or shear, or derivatives of a number with respect to a shear.
-    pub fn turn(&self, [e1, e2]: [f64; 2]) -> [f64; 2] {
-        self.0.map(|[one, two]| one * e1 + two * e2)
+    pub fn turn(&self, e: [f64; 2]) -> [f64; 2] {
+        apply(self.0, e)
     }
 
     /// A response ∂e_i/∂γ_j, as `[i][j]`, whose ellipticity and shear are both turned: U₂ R U₂ᵀ.
-    pub fn turn_response(&self, response: [[f64; 2]; 2]) -> [[f64; 2]; 2] {
+    pub fn turn_response(&self, response: Matrix2) -> Matrix2 {
         // Rows of R U₂ᵀ, then U₂ times its columns.
         let [first, second] = response.map(|row| self.turn(row));
         let columns = [0, 1].map(|j| self.turn([first[j], second[j]]));
@@ -196,10 +197,11 @@ impl PixelShape {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::matrix::product;
     use crate::{Distortion, Shear};
 
     // Rotated, mirrored, and sheared with a skew of either sign.
-    const MATRICES: [[[f64; 2]; 2]; 6] = [
+    const MATRICES: [Matrix2; 6] = [
         [[0.2, 0.0], [0.0, 0.2]],
         [[-0.2, 0.0], [0.0, 0.2]],
         [[0.16, -0.12], [0.12, 0.16]],
@@ -208,16 +210,11 @@ mod tests {
         [[0.19, -0.02], [-0.03, -0.21]],
     ];
 
-    fn times(a: [[f64; 2]; 2], b: [[f64; 2]; 2]) -> [[f64; 2]; 2] {
-        let element = |i: usize, j: usize| a[i][0] * b[0][j] + a[i][1] * b[1][j];
-        [0, 1].map(|i| [0, 1].map(|j| element(i, j)))
-    }
-
-    fn transposed([[a, b], [c, d]]: [[f64; 2]; 2]) -> [[f64; 2]; 2] {
+    fn transposed([[a, b], [c, d]]: Matrix2) -> Matrix2 {
         [[a, c], [b, d]]
     }
 
-    fn close(found: [[f64; 2]; 2], expected: [[f64; 2]; 2]) {
+    fn close(found: Matrix2, expected: Matrix2) {
         for (found, expected) in found.iter().flatten().zip(expected.iter().flatten()) {
             assert!((found - expected).abs() < 1e-14, "{found} {expected}");
         }
@@ -229,7 +226,7 @@ mod tests {
             let jacobian = Jacobian::new(matrix).unwrap();
             let (orientation, shape) = jacobian.factors();
             let turn = orientation.matrix();
-            close(times(turn, transposed(turn)), [[1.0, 0.0], [0.0, 1.0]]);
+            close(product(turn, transposed(turn)), [[1.0, 0.0], [0.0, 1.0]]);
             let map = transposed([shape.map([1.0, 0.0]), shape.map([0.0, 1.0])]);
             assert!(map[1][0] == 0.0 && map[0][0] > 0.0 && map[1][1] > 0.0);
             close(
@@ -238,9 +235,9 @@ mod tests {
             );
             let scale = jacobian.pixel_scale();
             let scaled = matrix.map(|row| row.map(|value| value / scale));
-            close(times(turn, map), scaled);
+            close(product(turn, map), scaled);
             // |g| of T from its moments T Tᵀ.
-            let moments = times(map, transposed(map));
+            let moments = product(map, transposed(map));
             let trace = moments[0][0] + moments[1][1];
             let distortion = Distortion::new(
                 (moments[0][0] - moments[1][1]) / trace,
@@ -258,8 +255,8 @@ mod tests {
             let turn = orientation.matrix();
             let e = Shear::new(0.1, 0.07);
             // Moments of a circle that e makes an ellipse of, turned as coordinates are.
-            let moments = times(e.matrix(), e.matrix());
-            let moments = times(times(turn, moments), transposed(turn));
+            let moments = product(e.matrix(), e.matrix());
+            let moments = product(product(turn, moments), transposed(turn));
             let trace = moments[0][0] + moments[1][1];
             let expected = Distortion::new(
                 (moments[0][0] - moments[1][1]) / trace,
@@ -301,7 +298,7 @@ mod tests {
         for matrix in MATRICES {
             let (orientation, _) = Jacobian::new(matrix).unwrap().factors();
             let spin = orientation.spin2();
-            let expected = times(times(spin.matrix(), response), transposed(spin.matrix()));
+            let expected = product(product(spin.matrix(), response), transposed(spin.matrix()));
             close(spin.turn_response(response), expected);
         }
         // A rotation keeps what is antisymmetric, a reflection changes its sign.

@@ -13,6 +13,7 @@ use shearq_files::frames::{Metadata, frame};
 use shearq_files::table::{self, FileFormat};
 use shearq_measure::{Observables, ShearedCatalogues, is_significant};
 use shearq_quantities::Frame;
+use shearq_quantities::matrix::solve;
 use shearq_quantities::statistics::RunningMean;
 use shearq_submissions::Calibration;
 
@@ -306,13 +307,11 @@ impl Image {
     ) -> Result<(DataFrame, usize), FileError> {
         let Weighted { e, weight, .. } = &self.rows;
         let [r11, r22, r12, r21] = response.mean;
-        let determinant = r11 * r22 - r12 * r21;
         let shear = |row: usize| {
-            let [e1, e2] = [e[0][row], e[1][row]].map(|e| e / weight[row]);
-            [
-                (r22 * e1 - r12 * e2) / determinant,
-                (r11 * e2 - r21 * e1) / determinant,
-            ]
+            solve(
+                [[r11, r12], [r21, r22]],
+                [0, 1].map(|k| e[k][row] / weight[row]),
+            )
         };
         let counts: Vec<bool> = weight.iter().map(|weight| *weight > 0.0).collect();
         let missing = [f64::NAN; 2];

@@ -15,6 +15,8 @@
 //! Stamps may be turned against each other. Modes are those of common axes, at which turned stamps are transformed as
 //! they are ([`ToTurnedModes`]); nothing is interpolated. The window is at the same place of the sky in all of them.
 
+use shearq_quantities::matrix::{Matrix2, apply, determinant, inverse, product};
+
 use super::*;
 use crate::transform::ToTurnedModes;
 
@@ -26,11 +28,11 @@ const SAME: f64 = 1e-7;
 pub(crate) enum EpochPixels {
     /// Triangular, of determinant one: sums along the axes are separable.
     Shaped(PixelShape),
-    Turned([[f64; 2]; 2]),
+    Turned(Matrix2),
 }
 
 impl EpochPixels {
-    pub(crate) fn new(matrix: [[f64; 2]; 2]) -> Self {
+    pub(crate) fn new(matrix: Matrix2) -> Self {
         let [[stretch, skew], [below, last]] = matrix;
         let triangular = below.abs() < SAME && stretch > 0.0;
         if triangular && (stretch * last - 1.0).abs() < SAME {
@@ -40,7 +42,7 @@ impl EpochPixels {
         }
     }
 
-    fn matrix(self) -> [[f64; 2]; 2] {
+    fn matrix(self) -> Matrix2 {
         match self {
             EpochPixels::Shaped(PixelShape { stretch, skew }) => {
                 [[stretch, skew], [0.0, 1.0 / stretch]]
@@ -49,24 +51,21 @@ impl EpochPixels {
         }
     }
 
-    pub(crate) fn map(self, [x, y]: [f64; 2]) -> [f64; 2] {
-        self.matrix().map(|[a, b]| a * x + b * y)
+    pub(crate) fn map(self, at: [f64; 2]) -> [f64; 2] {
+        apply(self.matrix(), at)
     }
 
-    pub(crate) fn pixel(self, [x, y]: [f64; 2]) -> [f64; 2] {
-        self.inverse().map(|[a, b]| a * x + b * y)
+    pub(crate) fn pixel(self, at: [f64; 2]) -> [f64; 2] {
+        apply(self.inverse(), at)
     }
 
-    fn inverse(self) -> [[f64; 2]; 2] {
-        let [[a, b], [c, d]] = self.matrix();
-        let determinant = a * d - b * c;
-        [[d, -b], [-c, a]].map(|row| row.map(|value| value / determinant))
+    fn inverse(self) -> Matrix2 {
+        inverse(self.matrix())
     }
 
     /// Area of a pixel.
     pub(crate) fn area(self) -> f64 {
-        let [[a, b], [c, d]] = self.matrix();
-        (a * d - b * c).abs()
+        determinant(self.matrix()).abs()
     }
 }
 
@@ -195,7 +194,7 @@ impl Spectral {
     fn restore_turned(
         &self,
         epoch: &SpectralEpoch,
-        matrix: [[f64; 2]; 2],
+        matrix: Matrix2,
         stamp: &[f32],
         scratch: &mut SpectralScratch,
         buffers: &mut EpochScratch,
@@ -237,10 +236,6 @@ impl Spectral {
         };
         restore(windowed, &with);
     }
-}
-
-fn product(a: [[f64; 2]; 2], b: [[f64; 2]; 2]) -> [[f64; 2]; 2] {
-    a.map(|[first, second]| [0, 1].map(|column| first * b[0][column] + second * b[1][column]))
 }
 
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
