@@ -452,10 +452,13 @@ impl Spectral {
         self.psf_modes(scratch);
         let SpectralScratch {
             changes,
-            real: [power, _],
+            real: [power, amplitude],
             ..
         } = scratch;
-        take_psf(self, noise, changes, power, out);
+        squared_moduli(&changes[0], power);
+        let of_modes = [&power[..], &self.rough, &self.target];
+        amplitudes(of_modes, self.step, self.iterations, amplitude);
+        take_psf(self, noise, (changes, amplitude), power, out);
         self.spread_noise(scratch, out);
     }
 
@@ -1271,13 +1274,13 @@ fn sheared(x: [f32; 2], y: [f32; 2], kx: f32, ky: f32) -> [[f32; 2]; 2] {
     ]
 }
 
-// Writes what follows for each mode from the transforms of a PSF and of it times x and y; and the power of noise of σ = 1
-// before the window.
+// Writes what follows for each mode from the transforms of a PSF and of it times x and y and from the amplitudes. `powers` are
+// |p|², and become those of noise of σ = 1 before the window.
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 fn take_psf(
     plan: &Spectral,
     noise: &ModeNoise,
-    [p, x, y]: &[Modes; 3],
+    ([p, x, y], amplitudes): (&[Modes; 3], &[f32]),
     powers: &mut [f32],
     out: &mut SpectralPsf,
 ) {
@@ -1286,14 +1289,9 @@ fn take_psf(
         let (x_re, x_im) = (lanes(&x.re, at), lanes(&x.im, at));
         let (y_re, y_im) = (lanes(&y.re, at), lanes(&y.im, at));
         let (kx, ky) = (lanes(&plan.waves[0], at), lanes(&plan.waves[1], at));
-        let (rough, target) = (lanes(&plan.rough, at), lanes(&plan.target, at));
+        let (squares, amplitudes) = (*lanes(powers, at), lanes(amplitudes, at));
         let noise_power = lanes(&noise.power, at);
         let noise_tilts = [lanes(&noise.tilts[0], at), lanes(&noise.tilts[1], at)];
-        let mut squares = [0.0f32; LANES];
-        for l in 0..LANES {
-            squares[l] = p_re[l] * p_re[l] + p_im[l] * p_im[l];
-        }
-        let amplitudes = amplitudes(&squares, rough, target, plan.step, plan.iterations);
         let [mut restore, mut first, mut second] = [[[0.0f32; LANES]; 2]; 3];
         let mut field_tilts = [[0.0f32; LANES]; 2];
         let [mut clarity, mut power] = [[0.0f32; LANES]; 2];
@@ -1328,46 +1326,55 @@ fn take_psf(
     }
 }
 
-// Γ[1 − (1 − c w)^M]/w of modes with |p|² = `powers`; zero where the PSF leaves nothing.
-#[inline(always)]
-fn amplitudes(
-    powers: &[f32; LANES],
-    rough: &[f32; LANES],
-    target: &[f32; LANES],
-    step: f32,
-    iterations: i32,
-) -> [f32; LANES] {
-    let mut base = [0.0f64; LANES];
-    let mut power_of_base = [1.0f64; LANES];
-    for l in 0..LANES {
-        base[l] = f64::from(1.0 - step * (powers[l] + rough[l]));
-        // A positive (1 − c w)^M below exp(−40) is nothing in single precision, and would make denormal numbers on the way.
-        let nothing = base[l] > 0.0 && (1.0 - base[l]) * f64::from(iterations) > 40.0;
-        base[l] = if nothing { 0.0 } else { base[l] };
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn squared_moduli(modes: &Modes, out: &mut [f32]) {
+    for (out, (re, im)) in out.iter_mut().zip(modes.re.iter().zip(&modes.im)) {
+        *out = re * re + im * im;
     }
-    // By repeated squares, for all lanes at a time.
-    let mut exponent = iterations;
-    while exponent > 0 {
-        if exponent & 1 == 1 {
-            for l in 0..LANES {
-                power_of_base[l] *= base[l];
-            }
+}
+
+// Γ[1 − (1 − c w)^M]/w of modes with |p|² = `powers`; zero where the PSF leaves nothing. Inlined into a longer loop, the powers of
+// the lanes were computed one by one.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn amplitudes([powers, rough, target]: [&[f32]; 3], step: f32, iterations: i32, out: &mut [f32]) {
+    let modes = powers
+        .chunks(LANES)
+        .zip(rough.chunks(LANES))
+        .zip(target.chunks(LANES));
+    for (out, ((powers, rough), target)) in out.chunks_mut(LANES).zip(modes) {
+        let mut base = [0.0f64; LANES];
+        let mut power_of_base = [1.0f64; LANES];
+        for (base, (power, rough)) in base.iter_mut().zip(powers.iter().zip(rough)) {
+            *base = f64::from(1.0 - step * (power + rough));
         }
         for base in &mut base {
-            *base *= *base;
+            // A positive (1 − c w)^M below exp(−40) is nothing in single precision, and would make denormal numbers on the way.
+            let nothing = *base > 0.0 && (1.0 - *base) * f64::from(iterations) > 40.0;
+            *base = if nothing { 0.0 } else { *base };
         }
-        exponent >>= 1;
+        // By repeated squares, for all lanes at a time.
+        let mut exponent = iterations;
+        while exponent > 0 {
+            if exponent & 1 == 1 {
+                for (power, base) in power_of_base.iter_mut().zip(&base) {
+                    *power *= base;
+                }
+            }
+            for base in &mut base {
+                *base *= *base;
+            }
+            exponent >>= 1;
+        }
+        let modes = powers.iter().zip(rough).zip(target).zip(power_of_base);
+        for (out, (((power, rough), target), power_of_base)) in out.iter_mut().zip(modes) {
+            // Without signal a mode is noise alone, whatever λ makes of it.
+            *out = if *power < LEAST_PSF_POWER || *target == 0.0 {
+                0.0
+            } else {
+                target * (1.0 - power_of_base) as f32 / (power + rough)
+            };
+        }
     }
-    let mut out = [0.0f32; LANES];
-    for l in 0..LANES {
-        // Without signal a mode is noise alone, whatever λ makes of it.
-        out[l] = if powers[l] < LEAST_PSF_POWER || target[l] == 0.0 {
-            0.0
-        } else {
-            target[l] * (1.0 - power_of_base[l]) as f32 / (powers[l] + rough[l])
-        };
-    }
-    out
 }
 
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]

@@ -264,7 +264,9 @@ fn combine(
         }
         let (rough, target) = (lanes(&plan.rough, at), lanes(&plan.target, at));
         let (kx, ky) = (lanes(&plan.waves[0], at), lanes(&plan.waves[1], at));
-        let amplitudes = amplitudes(&squares, rough, target, plan.step, plan.iterations);
+        let mut amplitudes = [0.0; LANES];
+        let of_modes = [&squares[..], rough, target];
+        super::amplitudes(of_modes, plan.step, plan.iterations, &mut amplitudes);
         let mut power = [0.0f32; LANES];
         let mut mean_tilts = [[0.0f32; LANES]; 2];
         for (epoch, weight) in epochs.iter_mut().zip(weights) {
