@@ -133,6 +133,7 @@ const WAYS: [(&str, &[&str]); 33] = [
             "data spectra sets format wide metrics definition threads",
             "truth CATALOGUE truth-sign stamp field columns ellipticity missing drop-missing max-modulus noise-var format wide metrics report definition convention threads",
             "truth spectra truth-sign stamp field format wide metrics definition threads",
+            "challenge branch truth psf CATALOGUE format threads",
         ],
     ),
     (
@@ -140,6 +141,7 @@ const WAYS: [(&str, &[&str]); 33] = [
         &[
             "OUT data foreign where sort group-by heat-map format wide metrics report definition convention threads",
             "store where sort group-by heat-map format wide metrics report",
+            "OUT challenge branch truth psf leaderboard format threads",
         ],
     ),
     (
@@ -169,12 +171,19 @@ const WAYS: [(&str, &[&str]); 33] = [
         "challenge rank",
         &["INBOX challenge truth store reference report digits detail format threads"],
     ),
-    ("check", &["PATH data grid stamp images json"]),
+    (
+        "check",
+        &[
+            "PATH data grid stamp images json",
+            "PATH challenge branch json",
+        ],
+    ),
     (
         "pack",
         &[
             "measured out method kind challenge team title contact entry",
             "foreign data out method kind challenge team title contact entry",
+            "CATALOGUE challenge branch subfields grid whole-galaxies out",
         ],
     ),
     ("unpack", &["ARCHIVE out verify"]),

@@ -5,6 +5,7 @@ use clap::Args;
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_scoring::Grid;
 
+use super::published;
 use crate::{Findings, count, print, tell_unread};
 use shearq_dataset::grid;
 use shearq_dataset::layout::{DataFolder, Layout, MAX_IMAGE, read_rows};
@@ -40,6 +41,12 @@ pub(crate) struct Arguments {
     /// Number of images of every set [default: the highest number found].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=i64::from(MAX_IMAGE)))]
     images: Option<u32>,
+    /// Check a submission file of this challenge: great3, great08.
+    #[arg(long, value_name = "NAME", conflicts_with_all = ["data", "grid", "stamp", "images"])]
+    challenge: Option<String>,
+    /// Branch of the challenge, such as control-ground-constant.
+    #[arg(long, value_name = "NAME", requires = "challenge", conflicts_with_all = ["data", "grid", "stamp", "images"])]
+    branch: Option<String>,
     /// Print the findings as JSON.
     #[arg(long)]
     json: bool,
@@ -47,6 +54,10 @@ pub(crate) struct Arguments {
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let path = &arguments.path;
+    if let Some(challenge) = &arguments.challenge {
+        let branch = published::branch_of(challenge, arguments.branch.as_deref())?;
+        return report(&published::check(&*branch, path), path, arguments.json);
+    }
     let data = arguments.data.as_ref().map(DataFolder::open).transpose()?;
     let sets = data
         .as_ref()

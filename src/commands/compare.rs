@@ -2,6 +2,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 
+use super::published;
 use crate::arguments::{Printing, ReportFile, ScoreSettings, Threads};
 use crate::choices;
 use crate::{print_heat_map, score};
@@ -10,6 +11,7 @@ use shearq_render::figure::{Figure, HeatMap};
 use shearq_render::table::{Table, TableFormat};
 use shearq_results::compare::{Group, Grouping, Order, choose, chosen, score_all};
 use shearq_results::expression::Expression;
+use shearq_results::published::Truth;
 use shearq_results::record::RunRecord;
 use shearq_results::store;
 use shearq_results::submit::is_packed;
@@ -26,10 +28,13 @@ use shearq_scoring::Options;
 ///
 /// With --store, the command compares the runs that `score --store` and `run --store` recorded. A terminal also
 /// shows Q of each set as a heat map, without colours if NO_COLOR is set.
+///
+/// With `--challenge great3 --leaderboard`, each OUT is a submission file, which is ranked among the published entries of
+/// its branch.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
     /// Folders that `measure` or `run` wrote, or submissions (with --data).
-    #[arg(value_name = "OUT", required_unless_present_any = ["foreign", "store"])]
+    #[arg(value_name = "OUT", required_unless_present_any = ["foreign", "store", "leaderboard"])]
     measured: Vec<PathBuf>,
     /// Data folder with the true shear [default: the data that the first OUT was measured from].
     #[arg(long, value_name = "DIR")]
@@ -40,6 +45,21 @@ pub(crate) struct Arguments {
     /// Results store with the runs to compare, instead of folders.
     #[arg(long, value_name = "DIR", conflicts_with_all = ["measured", "data", "foreign", "definition", "convention", "threads"])]
     store: Option<PathBuf>,
+    /// Show the published entries of this challenge: great3.
+    #[arg(long, value_name = "NAME", requires = "leaderboard", conflicts_with_all = GREAT10_ONLY)]
+    challenge: Option<String>,
+    /// Branch of the challenge, such as control-ground-constant.
+    #[arg(long, value_name = "NAME", requires = "challenge", conflicts_with_all = GREAT10_ONLY)]
+    branch: Option<String>,
+    /// Truth that submissions to the challenge are scored with, as for `score`.
+    #[arg(long, value_name = "PATH", requires = "challenge", conflicts_with_all = GREAT10_ONLY)]
+    truth: Option<PathBuf>,
+    /// Ellipticities of the PSF of the challenge, as for `score`.
+    #[arg(long, value_name = "PATH", requires = "truth", conflicts_with_all = GREAT10_ONLY)]
+    psf: Option<PathBuf>,
+    /// Rank submissions among the published entries of a branch.
+    #[arg(long, requires = "challenge", conflicts_with_all = GREAT10_ONLY)]
+    leaderboard: bool,
     /// Compare only sets for which this holds, such as "snr == 'low' and submission == '23/*' and q > 50": columns of a
     /// results store. In a text `*` stands for any characters.
     #[arg(long = "where", value_name = "CONDITION", value_parser = Expression::parse)]
@@ -63,6 +83,22 @@ pub(crate) struct Arguments {
     threads: Threads,
 }
 
+// Options without a meaning for submissions to other challenges; `path` is --report.
+const GREAT10_ONLY: [&str; 12] = [
+    "data",
+    "foreign",
+    "store",
+    "condition",
+    "sort",
+    "group_by",
+    "heat_map",
+    "wide",
+    "metrics",
+    "path",
+    "definition",
+    "convention",
+];
+
 struct Comparison {
     table: Table,
     verdict: Option<String>,
@@ -70,6 +106,15 @@ struct Comparison {
 }
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    if let Some(challenge) = &arguments.challenge {
+        let branch = published::branch_of(challenge, arguments.branch.as_deref())?;
+        let psf = arguments.psf.as_deref();
+        let truth = arguments.truth.as_deref();
+        let truth = truth.map(|path| Truth { path, psf });
+        let threads = arguments.threads.number();
+        let table = published::leaderboard(&*branch, truth, &arguments.measured, threads)?;
+        return arguments.printing.print(&table);
+    }
     let Comparison {
         table,
         verdict,

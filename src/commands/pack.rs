@@ -5,12 +5,14 @@ use clap::Args;
 use shearq_files::open::{SETTINGS, read_to_string};
 use shearq_submissions::is_control;
 
+use super::published;
 use crate::choices::named;
 use crate::progress::Bar;
 use crate::{count, tell, tell_unread};
 use shearq_dataset::run::{Run, open_data};
 use shearq_results::catalogues::Catalogues;
-use shearq_results::submit::pack::Packing;
+use shearq_results::published::{Packing, great3};
+use shearq_results::submit::pack::Packing as Submission;
 use shearq_results::submit::{Contents, Entry, is_archive};
 
 // Longest name of a method in bytes: a tar header has 100 for a file name.
@@ -28,10 +30,13 @@ const OTHER_ARCHIVES: [&str; 7] = ["zip", "tar", "gz", "bz2", "xz", "zst", "7z"]
 /// manifest.json lists the files with their SHA-256 checksums, the settings, and the covariances of cross-spectra of
 /// eight or more images. The same catalogues give the same bytes. `shearq check` checks a submission, `shearq unpack`
 /// unpacks an archive.
+///
+/// With `--challenge great3 --branch BRANCH`, the command makes the submission file of GREAT3 from catalogues of all
+/// galaxies of a branch, after the checks of the challenge's own program (docs/great3.md).
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
     /// Folder of catalogues that `measure` or `run` wrote.
-    #[arg(long, value_name = "DIR", required_unless_present = "foreign")]
+    #[arg(long, value_name = "DIR", required_unless_present_any = ["foreign", "catalogues"])]
     measured: Option<PathBuf>,
     /// Catalogues of another program, described by a TOML file (docs/files-foreign.md). They are packed with the signs and
     /// the type of ellipticity that are scored.
@@ -56,7 +61,28 @@ pub(crate) struct Arguments {
     /// Content of the submission.
     #[arg(long, value_parser = named::<Contents>(), default_value = "catalogues")]
     kind: Contents,
+    /// Catalogues of GREAT3: `ID g1 g2` and perhaps `weight`, as text, FITS or Parquet; 10 for a galaxy that was not measured.
+    #[arg(value_name = "CATALOGUE", requires = "branch", conflicts_with_all = GREAT10_ONLY)]
+    catalogues: Vec<PathBuf>,
+    /// Branch of the challenge, such as control-ground-constant.
+    #[arg(long, value_name = "NAME", requires_all = ["challenge", "catalogues"], conflicts_with_all = GREAT10_ONLY)]
+    branch: Option<String>,
+    /// Subfields of a branch of GREAT3 that was simulated [default: 200].
+    #[arg(long, value_name = "N", requires = "branch", conflicts_with_all = GREAT10_ONLY, value_parser = clap::value_parser!(u16).range(1..=1000))]
+    subfields: Option<u16>,
+    /// Galaxies per side of a subfield of GREAT3 [default: 100].
+    #[arg(long, value_name = "N", requires = "branch", conflicts_with_all = GREAT10_ONLY, value_parser = clap::value_parser!(u16).range(1..=100))]
+    grid: Option<u16>,
+    /// Leave out a galaxy of which one component is 9.9 or more. The program of GREAT3 leaves out the component alone, so that g1
+    /// and g2 are means over different galaxies.
+    #[arg(long, requires = "branch", conflicts_with_all = GREAT10_ONLY)]
+    whole_galaxies: bool,
 }
+
+// Options without a meaning for submissions to other challenges; `file` is --entry.
+const GREAT10_ONLY: [&str; 9] = [
+    "measured", "foreign", "data", "method", "kind", "team", "title", "contact", "file",
+];
 
 /// Team and challenge of an entry.
 #[derive(Debug, Args)]
@@ -117,6 +143,16 @@ impl EntryArguments {
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let out = &arguments.out;
+    if let (Some(branch), Some(challenge)) = (&arguments.branch, &arguments.entry.challenge) {
+        let packing = Packing {
+            catalogues: &arguments.catalogues,
+            subfields: arguments.subfields.map_or(great3::SUBFIELDS, usize::from),
+            grid: arguments.grid.map_or(great3::GRID, usize::from),
+            whole_galaxies: arguments.whole_galaxies,
+        };
+        let branch = published::branch_of(challenge, Some(branch))?;
+        return published::pack(&*branch, &packing, out);
+    }
     let entry = arguments.entry.entry()?;
     let ending = out.extension().unwrap_or_default().to_string_lossy();
     anyhow::ensure!(
@@ -139,7 +175,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             && !method.contains(|c: char| "/\\:".contains(c) || c.is_whitespace() || is_control(c)),
         "--method: unusable name (found `{method}`, expected 1 to {MAX_METHOD_BYTES} bytes without `/`, `\\`, `:`, blanks and a leading `.`)"
     );
-    let packing = Packing {
+    let packing = Submission {
         catalogues: &catalogues,
         data: data.as_ref(),
         method,

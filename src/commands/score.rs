@@ -7,6 +7,7 @@ use shearq_quantities::units::{Degrees, Pixels};
 use shearq_scoring::{Noise, Options, SetScorer};
 use shearq_submissions::EllipticityType;
 
+use super::published;
 use crate::arguments::{
     Printing, ReportFile, ScoreSettings, SetList, SignArgument, Threads, positive, sets_of,
 };
@@ -17,6 +18,7 @@ use shearq_dataset::truth::{ReadTruth, Reading, Sign, read_truth, reading_of};
 use shearq_render::table::TableFormat;
 use shearq_results::catalogues::{COLUMNS, Catalogues};
 use shearq_results::foreign::{Conversion, Screen, folder_of, plain_columns};
+use shearq_results::published::Truth;
 use shearq_results::record::{RunRecord, SetRecord};
 use shearq_results::score::{ScoredSet, score_catalogues, score_files, unscored};
 use shearq_results::store;
@@ -32,7 +34,7 @@ use shearq_results::views::scores::{SetInput, one_set_json, per_set, spectra};
 ///
 /// Plain files are one catalogue per image: CSV with a header, ASCII `x y e1 e2`, FITS or Parquet, by the file's
 /// ending. Their `--format json` lists all eight conventions. Score power spectra with --spectra, and a submission
-/// as `pack` writes it with --packed.
+/// as `pack` writes it with --packed, and a submission to GREAT3 or GREAT08 with --challenge (docs/great3.md).
 #[derive(Debug, Args)]
 #[command(group = ArgGroup::new("input").required(true).args(["measured", "foreign", "spectra", "packed", "catalogues"]))]
 pub(crate) struct Arguments {
@@ -42,8 +44,9 @@ pub(crate) struct Arguments {
     /// Folder of catalogues that `measure` or `run` wrote.
     #[arg(long, value_name = "DIR", conflicts_with = "truth")]
     measured: Option<PathBuf>,
-    /// Table of the true shear of one set: x, y, g1, g2.
-    #[arg(long, value_name = "FILE")]
+    /// Table of the true shear of one set: x, y, g1, g2. With --challenge: table of the truth, or folder of the files that
+    /// the organisers released.
+    #[arg(long, value_name = "PATH")]
     truth: Option<PathBuf>,
     /// Catalogues of the set of --truth, one per image.
     #[arg(value_name = "CATALOGUE", requires = "truth", conflicts_with_all = ["data", "sets", "store"])]
@@ -91,6 +94,16 @@ pub(crate) struct Arguments {
     /// Treat galaxies with a larger |e| as not measured; for --truth [default: no limit].
     #[arg(long, value_name = "E", value_parser = positive, requires = "truth", conflicts_with_all = NOT_PLAIN)]
     max_modulus: Option<f64>,
+    /// Score a submission to this challenge: great3, great08.
+    #[arg(long, value_name = "NAME", requires = "truth", conflicts_with_all = GREAT10_ONLY)]
+    challenge: Option<String>,
+    /// Branch of the challenge, such as control-ground-constant.
+    #[arg(long, value_name = "NAME", requires = "challenge", conflicts_with_all = GREAT10_ONLY)]
+    branch: Option<String>,
+    /// Table of the ellipticities of the PSF, `subfield epoch psf_g1 psf_g2`, for branches of GREAT3 with constant shear
+    /// [default: starshape_parameters-* in the folder of --truth].
+    #[arg(long, value_name = "PATH", requires = "challenge", conflicts_with_all = GREAT10_ONLY)]
+    psf: Option<PathBuf>,
     /// Record the scores in this results store, for `compare --store`.
     #[arg(long, value_name = "DIR", conflicts_with_all = ["truth", "spectra"])]
     store: Option<PathBuf>,
@@ -112,6 +125,31 @@ const NOT_PLAIN: [&str; 7] = [
     "data", "measured", "foreign", "packed", "spectra", "sets", "store",
 ];
 
+// Options without a meaning for submissions to other challenges.
+const GREAT10_ONLY: [&str; 21] = [
+    "data",
+    "measured",
+    "foreign",
+    "spectra",
+    "packed",
+    "sets",
+    "noise_var",
+    "truth_sign",
+    "stamp",
+    "field",
+    "columns",
+    "ellipticity",
+    "missing",
+    "drop_missing",
+    "max_modulus",
+    "store",
+    "wide",
+    "metrics",
+    "path",
+    "definition",
+    "convention",
+];
+
 fn parse_ellipticity(text: &str) -> Result<EllipticityType, String> {
     match text {
         "shear" => Ok(EllipticityType::Shear),
@@ -121,6 +159,21 @@ fn parse_ellipticity(text: &str) -> Result<EllipticityType, String> {
 }
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    if let (Some(challenge), Some(truth)) = (&arguments.challenge, &arguments.truth) {
+        let branch = published::branch_of(challenge, arguments.branch.as_deref())?;
+        let truth = Truth {
+            path: truth,
+            psf: arguments.psf.as_deref(),
+        };
+        let table = published::score(
+            &*branch,
+            truth,
+            &arguments.catalogues,
+            arguments.printing.format(),
+            arguments.threads.number(),
+        )?;
+        return table.map_or(Ok(()), |table| arguments.printing.print(&table));
+    }
     let options = Options {
         definition: arguments.settings.definition,
         noise: arguments.noise_var.map_or(Noise::Measured, Noise::Given),

@@ -19,6 +19,7 @@ mod fuzz;
 mod galsim;
 mod gathered;
 mod generated;
+mod great3;
 mod identity;
 mod inputs;
 mod killed;

@@ -21,6 +21,7 @@ pub mod compare;
 pub mod expression;
 pub mod foreign;
 pub mod mean;
+pub mod published;
 pub mod record;
 pub mod response;
 pub mod score;

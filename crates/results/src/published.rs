@@ -1,0 +1,346 @@
+//! Challenges that others ran and whose truth is public. Each is a module with the same interface: truth, submission, metrics,
+//! pre-submission and leaderboard. GREAT10 is the format of `score`, `pack` and `check` themselves.
+//!
+//! A further challenge is a module with a type that implements [`Branch`], and a line in [`CHALLENGES`].
+
+pub mod great08;
+pub mod great3;
+
+use std::fmt::Display;
+use std::path::{Path, PathBuf};
+
+use serde_json::{Map, Value};
+use shearq_dataset::threads::Pool;
+use shearq_files::frames::reals;
+use shearq_files::table::{self, MAX_ROWS, Place};
+use shearq_files::{FileError, atomic};
+use shearq_render::table::{Cell, Table};
+
+/// A challenge by the name that users type.
+#[derive(Debug)]
+pub struct Challenge {
+    pub name: &'static str,
+    /// Its branches by name; empty if it has a single one.
+    pub branches: fn() -> Vec<String>,
+    branch: fn(Option<&str>) -> Option<Box<dyn Branch>>,
+}
+
+pub static CHALLENGES: [Challenge; 2] = [
+    Challenge {
+        name: "great3",
+        branches: great3::branches,
+        branch: |name| Some(Box::new(great3::Great3::named(name?)?)),
+    },
+    Challenge {
+        name: "great08",
+        branches: Vec::new,
+        branch: |name| {
+            name.is_none()
+                .then(|| Box::new(great08::Great08) as Box<dyn Branch>)
+        },
+    },
+];
+
+/// No challenge has this name, or the challenge no such branch.
+#[derive(Debug, thiserror::Error)]
+pub enum Unknown {
+    #[error("--challenge: unknown challenge (found `{found}`, expected {expected})")]
+    Challenge { found: String, expected: String },
+    #[error("--branch: {challenge} has no such branch (found `{found}`, expected {expected})")]
+    Branch {
+        challenge: &'static str,
+        found: String,
+        expected: String,
+    },
+}
+
+impl Challenge {
+    pub fn named(name: &str) -> Result<&'static Self, Unknown> {
+        let found = CHALLENGES.iter().find(|own| own.name == name);
+        found.ok_or_else(|| Unknown::Challenge {
+            found: name.into(),
+            expected: CHALLENGES.each_ref().map(|own| own.name).join(" or "),
+        })
+    }
+
+    pub fn branch(&self, name: Option<&str>) -> Result<Box<dyn Branch>, Unknown> {
+        (self.branch)(name).ok_or_else(|| Unknown::Branch {
+            challenge: self.name,
+            found: name.unwrap_or("none").into(),
+            expected: match (self.branches)() {
+                branches if branches.is_empty() => "none".into(),
+                branches => branches.join(", "),
+            },
+        })
+    }
+}
+
+/// Where the truth of a branch is.
+#[derive(Debug, Clone, Copy)]
+pub struct Truth<'a> {
+    /// A table, or a folder of the files that the organisers released.
+    pub path: &'a Path,
+    /// Table of the ellipticities of the PSF, if the challenge needs them and the folder has none.
+    pub psf: Option<&'a Path>,
+}
+
+/// What differs between challenges and between their branches.
+pub trait Branch {
+    fn title(&self) -> String;
+    /// Scores a submission.
+    fn score(&self, truth: Truth<'_>, submission: &Path, pool: &Pool) -> Result<Score, FileError>;
+    /// Refuses a submission that the challenge would not score as it is meant.
+    fn check(&self, submission: &Path) -> Result<(), FileError>;
+    /// Makes a submission of catalogues of galaxies. `None` if the challenge has no pre-submission.
+    fn pack(&self, packing: &Packing<'_>, pool: &Pool) -> Option<Result<Packed, FileError>>;
+    /// Published entries.
+    fn leaderboard(&self) -> Vec<Entry>;
+}
+
+/// Catalogues of a branch, and how they are summarised.
+#[derive(Debug, Clone)]
+pub struct Packing<'a> {
+    pub catalogues: &'a [PathBuf],
+    /// Subfields of the branch: 200 unless it is simulated.
+    pub subfields: usize,
+    /// Galaxies per side of a subfield: 100 unless it is simulated.
+    pub grid: usize,
+    /// Whether a galaxy with one component that was not measured is left out of both. The challenge's program leaves out single
+    /// components, so that the two means are over different galaxies.
+    pub whole_galaxies: bool,
+}
+
+/// A submission file, and what to tell about it.
+#[derive(Debug, Clone)]
+pub struct Packed {
+    pub text: String,
+    pub note: String,
+}
+
+impl Packed {
+    pub fn write(&self, path: &Path) -> Result<(), FileError> {
+        atomic::write(path, self.text.as_bytes())
+    }
+}
+
+/// A published entry of a leaderboard.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Entry {
+    pub team: String,
+    pub method: String,
+    pub q: f64,
+    /// m₊, m×, c₊, c×; not a number if unknown.
+    pub biases: [f64; 4],
+}
+
+/// One figure of a score.
+#[derive(Debug, Clone)]
+pub struct Figure {
+    /// Name in JSON.
+    pub key: &'static str,
+    pub value: f64,
+    /// Error by the challenge's own convention, where it has one.
+    pub error: Option<f64>,
+    pub jackknife: f64,
+    /// Best possible Q, or largest |bias| that the challenge aimed at.
+    pub target: Option<f64>,
+    pub decimals: usize,
+}
+
+/// The score of a submission; Q is first.
+#[derive(Debug, Clone)]
+pub struct Score {
+    /// Name of the branch in JSON, if the challenge has several.
+    pub branch: Option<String>,
+    pub figures: Vec<Figure>,
+}
+
+impl Score {
+    pub fn q(&self) -> &Figure {
+        &self.figures[0]
+    }
+
+    pub fn json(&self) -> Value {
+        let mut found = Map::new();
+        if let Some(branch) = &self.branch {
+            found.insert("branch".into(), branch.clone().into());
+        }
+        for figure in &self.figures {
+            let key = figure.key;
+            found.insert(key.into(), figure.value.into());
+            if let Some(error) = figure.error {
+                found.insert(format!("sigma_{key}"), error.into());
+            }
+            found.insert(format!("jackknife_{key}"), figure.jackknife.into());
+        }
+        found.into()
+    }
+
+    pub fn table(&self, title: String) -> Table {
+        let mut table = Table::titled(title);
+        let rows = &self.figures;
+        table.column("figure", "Figure", rows, |own| Cell::text(own.key));
+        table.column("value", "Value", rows, |own| {
+            Cell::number(own.value, own.decimals)
+        });
+        table.column("error", "Error", rows, |own| {
+            let error = own.error.map(|error| Cell::number(error, own.decimals));
+            error.unwrap_or(Cell::Empty)
+        });
+        table.column("jackknife", "Jackknife", rows, |own| {
+            Cell::number(own.jackknife, own.decimals)
+        });
+        table.column("target", "Target", rows, |own| {
+            let target = own.target.map(|target| Cell::number(target, own.decimals));
+            target.unwrap_or(Cell::Empty)
+        });
+        table
+    }
+}
+
+/// The leaderboard of a branch with own scores among the published entries, best first.
+pub fn ranking(branch: &dyn Branch, own: &[(String, Score)]) -> Table {
+    let published = branch.leaderboard();
+    let mut rows: Vec<(Entry, Option<f64>)> = own
+        .iter()
+        .map(|(name, score)| {
+            let bias = |key: &str| {
+                let figure = score.figures.iter().find(|figure| figure.key == key);
+                figure.map_or(f64::NAN, |figure| figure.value)
+            };
+            let entry = Entry {
+                team: "this".into(),
+                method: name.clone(),
+                q: score.q().value,
+                biases: ["m_plus", "m_cross", "c_plus", "c_cross"].map(bias),
+            };
+            (entry, Some(score.q().jackknife))
+        })
+        .collect();
+    rows.extend(published.into_iter().map(|entry| (entry, None)));
+    rows.sort_by(|(a, _), (b, _)| b.q.total_cmp(&a.q));
+    let rows: Vec<(usize, Entry, Option<f64>)> = rows
+        .into_iter()
+        .zip(1..)
+        .map(|((entry, error), rank)| (rank, entry, error))
+        .collect();
+    let mut table = Table::titled(format!("Leaderboard of {}", branch.title()));
+    table.column("rank", "Rank", &rows, |own| Cell::number(own.0 as f64, 0));
+    table.column("team", "Team", &rows, |own| Cell::text(&own.1.team));
+    table.column("method", "Method", &rows, |own| Cell::text(&own.1.method));
+    table.column("q", "Q", &rows, |own| Cell::with_error(own.1.q, own.2, 1));
+    let biases = [
+        ("m_plus", "m₊×10³", 1e3),
+        ("m_cross", "m××10³", 1e3),
+        ("c_plus", "c₊×10⁴", 1e4),
+        ("c_cross", "c××10⁴", 1e4),
+    ];
+    for (k, (key, label, scale)) in biases.into_iter().enumerate() {
+        table.column(key, label, &rows, |own| {
+            Cell::number(scale * own.1.biases[k], 2)
+        });
+    }
+    table.notes.push(great3::LEADERBOARD_SOURCE.into());
+    table
+}
+
+// A table that a participant or an organiser wrote. Each wanted column has several names; the last ones may be absent, and are
+// then empty.
+struct Columns<'a> {
+    names: &'a [&'a [&'a str]],
+    required: usize,
+    // Places of the columns in a text table without names, by its number of columns.
+    unnamed: &'a [(usize, &'a [usize])],
+}
+
+impl Columns<'_> {
+    fn read(&self, path: &Path) -> Result<Vec<Vec<f64>>, FileError> {
+        let mut place = Place::of(path);
+        let found = table::columns(&place)?;
+        let pick = |names: &[String]| -> Option<Vec<Option<String>>> {
+            let is = |name: &String, aliases: &[&str]| {
+                aliases.iter().any(|own| name.eq_ignore_ascii_case(own))
+            };
+            let picked = self.names.iter().zip(0..).map(|(aliases, k)| {
+                match names.iter().find(|name| is(name, aliases)) {
+                    None if k < self.required => None,
+                    name => Some(name.cloned()),
+                }
+            });
+            picked.collect()
+        };
+        let (certain, doubtful): (Vec<_>, Vec<_>) =
+            found.named.into_iter().partition(|named| !named.doubtful);
+        let chosen = if certain.is_empty() {
+            // Words of a comment name columns only if they are as many, which the comments of the challenge's own files are not.
+            let number = |names: &[String], name: &String| {
+                let place = names.iter().position(|own| own == name)?;
+                Some((place + 1).to_string())
+            };
+            let by_comment = doubtful.iter().find_map(|named| {
+                let picked = pick(&named.names)?.into_iter();
+                let numbers = picked.map(|name| number(&named.names, &name?));
+                Some(numbers.collect::<Vec<_>>())
+            });
+            let by_number = || {
+                let count = found.unnamed.len();
+                let (_, places) = self.unnamed.iter().find(|(n, _)| *n == count)?;
+                let places = (0..self.names.len()).map(|k| places.get(k));
+                Some(places.map(|place| Some((place? + 1).to_string())).collect())
+            };
+            by_comment.or_else(by_number).ok_or_else(|| {
+                let count = found.unnamed.len();
+                let message = format!("found {count} columns, expected {}", self.described());
+                FileError::new(path, message)
+            })?
+        } else {
+            let picked = certain.iter().find_map(|named| {
+                place.table = named.table.as_ref().map(|(number, _)| number.to_string());
+                pick(&named.names)
+            });
+            picked.ok_or_else(|| {
+                let names = &certain[0].names;
+                let message = format!(
+                    "found the columns {}, expected {}",
+                    names.join(", "),
+                    self.described()
+                );
+                FileError {
+                    no_column: true,
+                    ..FileError::new(path, message)
+                }
+            })?
+        };
+        let wanted: Vec<&str> = chosen.iter().flatten().map(String::as_str).collect();
+        let read = table::read_from(&place, Some(&wanted), MAX_ROWS)?;
+        let column = |name: &Option<String>| match name {
+            None => Ok(Vec::new()),
+            Some(name) => {
+                let values = read.column(name).ok().and_then(reals);
+                let message = || format!("column `{name}` does not hold numbers");
+                let values = values.ok_or_else(|| FileError::new(path, message()))?;
+                Ok(values.into_owned())
+            }
+        };
+        chosen.iter().map(column).collect()
+    }
+
+    fn described(&self) -> String {
+        let names = self.names.iter().zip(0..);
+        let names = names.map(|(names, k)| match k < self.required {
+            true => names[0].to_owned(),
+            false => format!("[{}]", names[0]),
+        });
+        names.collect::<Vec<_>>().join(" ")
+    }
+}
+
+// `of` a value that must be a whole number below `end`.
+fn whole(value: f64, end: usize) -> Option<usize> {
+    let is_whole = value >= 0.0 && value < end as f64 && value.fract() == 0.0;
+    is_whole.then_some(value as usize)
+}
+
+fn wrong<T>(path: &Path, fault: impl Display) -> Result<T, FileError> {
+    Err(FileError::new(path, fault))
+}

@@ -1,0 +1,142 @@
+//! GREAT08: constant shear per image, several images of one true shear per set (Bridle et al. 2010, MNRAS 405, 2044).
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
+
+use shearq_dataset::threads::Pool;
+use shearq_files::FileError;
+use shearq_quantities::Shear;
+use shearq_scoring::great3::great08_score;
+
+use super::{Branch, Columns, Entry, Figure, Packed, Packing, Score, Truth, whole, wrong};
+
+#[derive(Debug)]
+pub struct Great08;
+
+// More images than the challenge had (2700), so that a wrong column is noticed.
+const MAX_IMAGES: usize = 1_000_000;
+
+const SHEARS: Columns<'static> = Columns {
+    names: &[&["image", "set", "index"], &["g1"], &["g2"]],
+    required: 3,
+    unnamed: &[(3, &[0, 1, 2])],
+};
+
+// Shears by the number of their image or set.
+fn read_shears(path: &Path) -> Result<BTreeMap<usize, Shear>, FileError> {
+    let columns = SHEARS.read(path)?;
+    let mut found = BTreeMap::new();
+    for (k, &number) in columns[0].iter().enumerate() {
+        let Some(image) = whole(number, MAX_IMAGES) else {
+            let message = format!(
+                "row {}: not the number of an image or set (found {number}, expected 0, 1, 2, …)",
+                k + 1
+            );
+            return wrong(path, message);
+        };
+        let g = Shear::new(columns[1][k], columns[2][k]);
+        if g.modulus().is_nan() || g.modulus() >= 1.0 {
+            let message = format!(
+                "{image}: not a shear (found {} {}, expected |g| < 1)",
+                g.e1, g.e2
+            );
+            return wrong(path, message);
+        }
+        if found.insert(image, g).is_some() {
+            return wrong(
+                path,
+                format!("{image} is there twice; expected one row each"),
+            );
+        }
+    }
+    if found.is_empty() {
+        return wrong(path, "found no row, expected index g1 g2");
+    }
+    Ok(found)
+}
+
+impl Branch for Great08 {
+    fn title(&self) -> String {
+        "GREAT08".into()
+    }
+
+    // Truth: `image set g1 g2`, or `index g1 g2` where rows with the same true shear are a set. The submission has a row per image
+    // or per set.
+    fn score(&self, truth: Truth<'_>, submission: &Path, _: &Pool) -> Result<Score, FileError> {
+        let with_sets = Columns {
+            names: &[&["image"], &["set"], &["g1"], &["g2"]],
+            required: 4,
+            unnamed: &[(4, &[0, 1, 2, 3])],
+        };
+        let submitted = read_shears(submission)?;
+        let images: Vec<(usize, String, Shear)> = match with_sets.read(truth.path) {
+            Ok(own) => (0..own[0].len())
+                .map(|k| {
+                    let shear = Shear::new(own[2][k], own[3][k]);
+                    (own[0][k] as usize, own[1][k].to_string(), shear)
+                })
+                .collect(),
+            Err(_) => read_shears(truth.path)?
+                .into_iter()
+                .map(|(image, g)| (image, format!("{} {}", g.e1, g.e2), g))
+                .collect(),
+        };
+        let numbers: BTreeSet<usize> = images.iter().map(|own| own.0).collect();
+        let sets: BTreeSet<&String> = images.iter().map(|own| &own.1).collect();
+        let named: BTreeSet<String> = submitted.keys().map(usize::to_string).collect();
+        let per_set = sets.iter().copied().eq(named.iter()) && sets.len() < numbers.len();
+        if !per_set && !numbers.iter().eq(submitted.keys()) {
+            let lacking = numbers.iter().find(|own| !submitted.contains_key(own));
+            let odd = submitted.keys().find(|own| !numbers.contains(own));
+            let which = match (lacking, odd) {
+                (Some(image), _) => format!("image {image} is missing"),
+                (None, image) => format!("image {} is not in the truth", image.unwrap_or(&0)),
+            };
+            let message = format!(
+                "{which} (found {} rows, expected {} images or {} sets as in {})",
+                submitted.len(),
+                numbers.len(),
+                sets.len(),
+                truth.path.display()
+            );
+            return wrong(submission, message);
+        }
+        let mut differences: BTreeMap<&String, Vec<Shear>> = BTreeMap::new();
+        for (image, set, g) in &images {
+            let number = if per_set {
+                set.parse().unwrap_or(*image)
+            } else {
+                *image
+            };
+            let own = submitted[&number];
+            let difference = Shear::new(own.e1 - g.e1, own.e2 - g.e2);
+            differences.entry(set).or_default().push(difference);
+        }
+        let sets: Vec<Vec<Shear>> = differences.into_values().collect();
+        let found = great08_score(&sets).map_err(|error| FileError::new(submission, error))?;
+        Ok(Score {
+            branch: None,
+            figures: vec![Figure {
+                key: "Q",
+                value: found.q,
+                error: None,
+                jackknife: found.jackknife,
+                // Of the nominal mean square of 10⁻⁷.
+                target: Some(1000.0),
+                decimals: 1,
+            }],
+        })
+    }
+
+    fn check(&self, submission: &Path) -> Result<(), FileError> {
+        read_shears(submission).map(|_| ())
+    }
+
+    fn pack(&self, _: &Packing<'_>, _: &Pool) -> Option<Result<Packed, FileError>> {
+        None
+    }
+
+    fn leaderboard(&self) -> Vec<Entry> {
+        Vec::new()
+    }
+}

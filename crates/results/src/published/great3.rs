@@ -1,0 +1,987 @@
+//! GREAT3 (Mandelbaum et al. 2014, ApJS 212, 5; results: 2015, MNRAS 450, 2963): branches, identities of galaxies, truth as
+//! released, pre-submission and leaderboard.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::fmt::{self, Display, Write};
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+
+use shearq_dataset::threads::Pool;
+use shearq_files::open::{SETTINGS, is_there, read_to_string};
+use shearq_files::{FileError, table};
+use shearq_quantities::Shear;
+use shearq_scoring::aperture::{ApertureMass, Lattice, LatticeShear, SEPARATION_BINS, separations};
+use shearq_scoring::great3::{
+    ConstantField, Observation, PlusCross, constant_score, variable_score,
+};
+
+use super::{Branch, Columns, Entry, Figure, Packed, Packing, Score, Truth, whole, wrong};
+
+// Subfields of a field, where galaxies share a shear field or a PSF model.
+const SUBFIELDS_PER_FIELD: usize = 20;
+// Nodes of the lattice of a field between neighbouring galaxies of a subfield.
+const NODES_PER_GALAXY: usize = 7;
+/// Subfields of a branch.
+pub const SUBFIELDS: usize = 200;
+/// Galaxies per side of a subfield.
+pub const GRID: usize = 100;
+// Identities have three digits each for subfield, column and row.
+const MAX_SUBFIELDS: usize = 1000;
+const EPOCHS: usize = 6;
+
+// A component from here on was not measured: averages leave out 9.9 and more, correlations 10 and more. Both as in the challenge.
+const NOT_AVERAGED: f64 = 9.9;
+const NOT_CORRELATED: f64 = 10.0;
+
+const EXPERIMENTS: [&str; 5] = [
+    "control",
+    "real_galaxy",
+    "variable_psf",
+    "multiepoch",
+    "full",
+];
+
+/// One of the 20 branches.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Great3 {
+    experiment: &'static str,
+    observation: Observation,
+    constant: bool,
+}
+
+fn all() -> impl Iterator<Item = Great3> {
+    let kinds = [
+        (Observation::Ground, true),
+        (Observation::Ground, false),
+        (Observation::Space, true),
+        (Observation::Space, false),
+    ];
+    EXPERIMENTS.into_iter().flat_map(move |experiment| {
+        kinds.map(|(observation, constant)| Great3 {
+            experiment,
+            observation,
+            constant,
+        })
+    })
+}
+
+pub fn branches() -> Vec<String> {
+    all().map(|branch| branch.to_string()).collect()
+}
+
+impl Display for Great3 {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let observation = match self.observation {
+            Observation::Ground => "ground",
+            Observation::Space => "space",
+        };
+        let shear = if self.constant {
+            "constant"
+        } else {
+            "variable"
+        };
+        write!(f, "{}-{observation}-{shear}", self.experiment)
+    }
+}
+
+/// Identity of a galaxy, SSSXXXYYY: subfield, column and row. In variable branches columns and rows are nodes of the lattice.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+struct Identity(u32);
+
+impl Identity {
+    fn of(value: f64) -> Option<Self> {
+        whole(value, 1_000_000_000).map(|id| Identity(id as u32))
+    }
+
+    fn subfield(self) -> usize {
+        self.0 as usize / 1_000_000
+    }
+
+    fn place(self) -> (usize, usize) {
+        (self.0 as usize / 1000 % 1000, self.0 as usize % 1000)
+    }
+}
+
+impl Display for Identity {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{:09}", self.0)
+    }
+}
+
+/// What a catalogue or a submission lacks, has twice, or should not have.
+#[derive(Debug, thiserror::Error)]
+enum Fault {
+    #[error(
+        "row {row}: not the identity of a galaxy (found {found}, expected SSSXXXYYY, such as 012034056)"
+    )]
+    NotAnIdentity { row: usize, found: f64 },
+    #[error(
+        "galaxy {id}: subfield {found} does not exist in {branch} (expected 0 to {last}). Try: only the catalogues of one branch"
+    )]
+    Subfield {
+        id: String,
+        found: usize,
+        branch: String,
+        last: usize,
+    },
+    #[error(
+        "galaxy {id}: column {x} and row {y} are outside of the grid (expected 0 to {last}). Try: --branch with the branch of these identities"
+    )]
+    OutsideGrid {
+        id: String,
+        x: usize,
+        y: usize,
+        last: usize,
+    },
+    #[error(
+        "galaxy {id}: its offset from the first galaxy of its subfield is not a multiple of {NODES_PER_GALAXY} nodes (found {found:?}, expected {expected:?} as of {first}). Try: the identities of galaxy_catalog-*.fits"
+    )]
+    Offset {
+        id: String,
+        found: (usize, usize),
+        expected: (usize, usize),
+        first: String,
+    },
+    #[error("galaxy {id} is there twice; it is also in {first}. Try: remove one of the two rows")]
+    Repeated { id: String, first: String },
+    #[error(
+        "galaxy {id}: {name} is {found}, which the challenge's program would average. Try: 10 for a galaxy that was not measured"
+    )]
+    Sentinel {
+        id: String,
+        name: &'static str,
+        found: f64,
+    },
+    #[error("galaxy {id}: the weight is {found}, expected zero or a positive number")]
+    Weight { id: String, found: f64 },
+    #[error(
+        "{count} of {expected} subfields are missing: {which}. Try: the catalogues of all subfields in one command"
+    )]
+    Subfields {
+        count: usize,
+        expected: usize,
+        which: String,
+    },
+    #[error("galaxy {id} is missing{}: subfield {subfield} has {found} galaxies, expected {expected}. Try: a row with g1 = g2 = 10 for each galaxy that was not measured", more(*count))]
+    Galaxies {
+        id: String,
+        count: usize,
+        subfield: usize,
+        found: usize,
+        expected: usize,
+    },
+    #[error(
+        "field {field} has no measured galaxy with a weight, so that it has no shear. Try: a smaller cut on quality"
+    )]
+    Unmeasured { field: usize },
+    #[error("row {row}: not the number of a field (found {found}, expected 0 to {last})")]
+    NotAField { row: usize, found: f64, last: usize },
+    #[error("field {field} is there twice; expected each once")]
+    RepeatedField { field: usize },
+    #[error("field {field} is missing{} (found {found} fields, expected {expected})", more(*count))]
+    MissingField {
+        field: usize,
+        count: usize,
+        found: usize,
+        expected: usize,
+    },
+    #[error("field {field}: {name} is {found}, expected {expected}")]
+    Value {
+        field: usize,
+        name: &'static str,
+        found: f64,
+        expected: &'static str,
+    },
+    #[error("field {field}: theta is {found}, expected one of the {SEPARATION_BINS} centres {:.4} to {:.4} degrees to 3 decimals. Try: shearq pack --challenge great3", separations()[0].0, separations()[SEPARATION_BINS - 1].0)]
+    Theta { field: usize, found: f64 },
+    #[error("field {field}: theta = {theta:.4} is there twice; expected each once")]
+    RepeatedTheta { field: usize, theta: f64 },
+    #[error(
+        "field {field}: theta = {theta:.4} is missing; expected {SEPARATION_BINS} rows per field"
+    )]
+    MissingTheta { field: usize, theta: f64 },
+    #[error("all values of {0} are zero, as of a method that measures nothing")]
+    AllZero(&'static str),
+}
+
+fn more(count: usize) -> String {
+    match count {
+        1 => String::new(),
+        _ => format!(" and {} more", count - 1),
+    }
+}
+
+const SHEARS: Columns<'static> = Columns {
+    names: &[&["index", "field"], &["g1"], &["g2"]],
+    required: 3,
+    unnamed: &[(3, &[0, 1, 2])],
+};
+
+const MASSES: Columns<'static> = Columns {
+    names: &[
+        &["field", "index"],
+        &["theta", "theta[deg]"],
+        &["map_E"],
+        &["map_B"],
+        &["error"],
+    ],
+    required: 5,
+    unnamed: &[(5, &[0, 1, 2, 3, 4])],
+};
+
+const GALAXIES: Columns<'static> = Columns {
+    names: &[&["ID"], &["g1"], &["g2"], &["weight", "w"]],
+    required: 3,
+    // The last with positions, as the challenge's own catalogues had.
+    unnamed: &[(3, &[0, 1, 2]), (4, &[0, 1, 2, 3]), (6, &[0, 3, 4, 5])],
+};
+
+impl Great3 {
+    pub fn named(name: &str) -> Option<Self> {
+        // The folders are called control/ground/constant.
+        let name = name.replace('/', "-");
+        all().find(|branch| branch.to_string() == name)
+    }
+
+    fn subfields_per_field(&self) -> usize {
+        match self.constant && !["variable_psf", "full"].contains(&self.experiment) {
+            true => 1,
+            false => SUBFIELDS_PER_FIELD,
+        }
+    }
+
+    fn fields(&self) -> usize {
+        SUBFIELDS / self.subfields_per_field()
+    }
+
+    // The folder that holds `stem` of subfield 0: the given one, or that of the branch below it.
+    fn folder(&self, root: &Path, stem: &str) -> Result<PathBuf, FileError> {
+        let below = root.join(self.to_string().replace('-', "/"));
+        let folders = [root.to_owned(), below];
+        let found = folders.iter().find(|folder| {
+            let is = |ending: &&str| is_there(&folder.join(format!("{stem}.{ending}")));
+            ["yaml", "txt", "fits"].iter().any(is)
+        });
+        found.cloned().ok_or_else(|| {
+            let message = format!(
+                "found no {stem}.yaml, .txt or .fits, here or in {}",
+                folders[1].display()
+            );
+            FileError::new(root, message)
+        })
+    }
+
+    fn true_shears(&self, truth: &Path) -> Result<Vec<Shear>, FileError> {
+        if !truth.is_dir() {
+            return self.read_shears(truth, None);
+        }
+        let folder = self.folder(truth, "shear_params-000")?;
+        let mut shears = Vec::new();
+        for subfield in 0..MAX_SUBFIELDS {
+            let stem = format!("shear_params-{subfield:03}");
+            let Some(found) = Parameters::read(&folder, &stem)? else {
+                break;
+            };
+            // All subfields of a field have one shear.
+            if subfield % self.subfields_per_field() == 0 {
+                shears.push(Shear::new(found.number("g1")?, found.number("g2")?));
+            }
+        }
+        Ok(shears)
+    }
+
+    // Mean ellipticities of the PSF of each of `fields`.
+    fn psfs(&self, truth: Truth<'_>, fields: usize) -> Result<Vec<Shear>, FileError> {
+        let subfields = fields * self.subfields_per_field();
+        let mut known = vec![Vec::new(); subfields];
+        let mut there = vec![false; subfields];
+        let mut add = |subfield: usize, psf: Shear| {
+            there[subfield] = true;
+            // −10: not known.
+            if psf.e1 > -10.0 && psf.e2 > -10.0 {
+                known[subfield].push(psf);
+            }
+        };
+        let source = truth.psf.unwrap_or(truth.path);
+        if truth.psf.is_none() && !source.is_dir() {
+            return wrong(source, "Q_c needs the PSF. Try: --psf FILE");
+        }
+        if source.is_dir() {
+            let folder = self.folder(source, "starshape_parameters-000-0")?;
+            for subfield in 0..subfields {
+                for epoch in 0..EPOCHS {
+                    let stem = format!("starshape_parameters-{subfield:03}-{epoch}");
+                    if let Some(found) = Parameters::read(&folder, &stem)? {
+                        let psf = [found.number("psf_g1")?, found.number("psf_g2")?];
+                        add(subfield, Shear::new(psf[0], psf[1]));
+                    }
+                }
+            }
+        } else {
+            let columns = Columns {
+                names: &[&["subfield"], &["epoch"], &["psf_g1"], &["psf_g2"]],
+                required: 4,
+                unnamed: &[(4, &[0, 1, 2, 3])],
+            }
+            .read(source)?;
+            for (k, &number) in columns[0].iter().enumerate() {
+                let Some(subfield) = whole(number, subfields) else {
+                    let message = format!(
+                        "row {}: not a subfield (found {number}, expected 0 to {})",
+                        k + 1,
+                        subfields - 1
+                    );
+                    return wrong(source, message);
+                };
+                add(subfield, Shear::new(columns[2][k], columns[3][k]));
+            }
+        }
+        if let Some(subfield) = there.iter().position(|there| !there) {
+            let message = format!("subfield {subfield} has no PSF; expected {subfields} subfields");
+            return wrong(source, message);
+        }
+        let mean = |shears: &[Shear]| match shears.len() {
+            0 => Shear::ZERO,
+            n => {
+                let mean = |of: fn(&Shear) -> f64| shears.iter().map(of).sum::<f64>() / n as f64;
+                Shear::new(mean(|g| g.e1), mean(|g| g.e2))
+            }
+        };
+        // A subfield without a known PSF counts as round, as in the challenge.
+        let subfields: Vec<Shear> = known.iter().map(|own| mean(own)).collect();
+        Ok(subfields
+            .chunks(self.subfields_per_field())
+            .map(mean)
+            .collect())
+    }
+
+    // `index g1 g2`, a row for each of `fields` (as many as there are, if unknown).
+    fn read_shears(&self, path: &Path, fields: Option<usize>) -> Result<Vec<Shear>, FileError> {
+        let columns = SHEARS.read(path)?;
+        let expected = fields.unwrap_or(columns[0].len()).max(1);
+        let mut found = vec![None; expected];
+        for (k, &number) in columns[0].iter().enumerate() {
+            let Some(field) = whole(number, expected) else {
+                return wrong(
+                    path,
+                    Fault::NotAField {
+                        row: k + 1,
+                        found: number,
+                        last: expected - 1,
+                    },
+                );
+            };
+            for (name, column) in [("g1", &columns[1]), ("g2", &columns[2])] {
+                let found = column[k];
+                if found.is_nan() || found.abs() >= 1.0 {
+                    let expected = "a shear below 1";
+                    return wrong(
+                        path,
+                        Fault::Value {
+                            field,
+                            name,
+                            found,
+                            expected,
+                        },
+                    );
+                }
+            }
+            let g = Shear::new(columns[1][k], columns[2][k]);
+            if found[field].replace(g).is_some() {
+                return wrong(path, Fault::RepeatedField { field });
+            }
+        }
+        let found = complete(path, found)?;
+        for (name, of) in [("g1", (|g| g.e1) as fn(&Shear) -> f64), ("g2", |g| g.e2)] {
+            if found.iter().all(|g| of(g) == 0.0) {
+                return wrong(path, Fault::AllZero(name));
+            }
+        }
+        Ok(found)
+    }
+
+    // `field theta map_E map_B error`; returns map_E by field and bin.
+    fn read_masses(
+        &self,
+        path: &Path,
+        fields: Option<usize>,
+    ) -> Result<Vec<[f64; SEPARATION_BINS]>, FileError> {
+        let columns = MASSES.read(path)?;
+        let rows = columns[0].len();
+        let expected = fields.unwrap_or(rows.div_ceil(SEPARATION_BINS)).max(1);
+        let mut found = vec![None::<[Option<f64>; SEPARATION_BINS]>; expected];
+        for (k, &number) in columns[0].iter().enumerate() {
+            let Some(field) = whole(number, expected) else {
+                return wrong(
+                    path,
+                    Fault::NotAField {
+                        row: k + 1,
+                        found: number,
+                        last: expected - 1,
+                    },
+                );
+            };
+            let theta = columns[1][k];
+            // As the challenge compares them: equal to 3 decimals.
+            let is = |centre: f64| (centre - theta).abs() < 1.5e-3;
+            let Some(bin) = separations().iter().position(|centre| is(centre.0)) else {
+                return wrong(
+                    path,
+                    Fault::Theta {
+                        field,
+                        found: theta,
+                    },
+                );
+            };
+            for (name, column) in [("map_E", 2), ("map_B", 3), ("error", 4)] {
+                let found = columns[column][k];
+                let least = if name == "error" { 0.0 } else { -1.0 };
+                // Dispersions of shears below 1.
+                if !(least..1.0).contains(&found) {
+                    let expected = if name == "error" { "0 to 1" } else { "-1 to 1" };
+                    return wrong(
+                        path,
+                        Fault::Value {
+                            field,
+                            name,
+                            found,
+                            expected,
+                        },
+                    );
+                }
+            }
+            let own = found[field].get_or_insert_default();
+            if own[bin].replace(columns[2][k]).is_some() {
+                let theta = separations()[bin].0;
+                return wrong(path, Fault::RepeatedTheta { field, theta });
+            }
+        }
+        let mut masses = Vec::new();
+        for (field, own) in complete(path, found)?.into_iter().enumerate() {
+            if let Some(bin) = own.iter().position(Option::is_none) {
+                let theta = separations()[bin].0;
+                return wrong(path, Fault::MissingTheta { field, theta });
+            }
+            masses.push(own.map(Option::unwrap_or_default));
+        }
+        if masses.iter().flatten().all(|mass| *mass == 0.0) {
+            return wrong(path, Fault::AllZero("map_E"));
+        }
+        Ok(masses)
+    }
+
+    fn true_masses(
+        &self,
+        truth: &Path,
+        pool: &Pool,
+    ) -> Result<Vec<[f64; SEPARATION_BINS]>, FileError> {
+        if !truth.is_dir() {
+            return self.read_masses(truth, None);
+        }
+        let folder = self.folder(truth, "galaxy_catalog-000")?;
+        let catalogue = |subfield: usize| folder.join(format!("galaxy_catalog-{subfield:03}.fits"));
+        let subfields = (0..MAX_SUBFIELDS)
+            .take_while(|&k| is_there(&catalogue(k)))
+            .count();
+        if subfields % SUBFIELDS_PER_FIELD != 0 {
+            let message = format!(
+                "found {subfields} files galaxy_catalog-*.fits, expected a multiple of {SUBFIELDS_PER_FIELD}"
+            );
+            return wrong(&folder, message);
+        }
+        let fields = (0..subfields).step_by(SUBFIELDS_PER_FIELD);
+        let masses = pool.in_order(fields, |first| {
+            let mut galaxies = lattice()?;
+            for subfield in first..first + SUBFIELDS_PER_FIELD {
+                add_truth(&mut galaxies, &folder, &catalogue(subfield), subfield)?;
+            }
+            Ok(galaxies.correlations().aperture_mass().map_e)
+        });
+        masses.collect()
+    }
+}
+
+fn complete<T>(path: &Path, found: Vec<Option<T>>) -> Result<Vec<T>, FileError> {
+    let lacking: Vec<usize> = found
+        .iter()
+        .enumerate()
+        .filter(|(_, own)| own.is_none())
+        .map(|(field, _)| field)
+        .collect();
+    match lacking.first() {
+        Some(&field) => wrong(
+            path,
+            Fault::MissingField {
+                field,
+                count: lacking.len(),
+                found: found.len() - lacking.len(),
+                expected: found.len(),
+            },
+        ),
+        None => Ok(found.into_iter().flatten().collect()),
+    }
+}
+
+fn lattice() -> Result<LatticeShear, FileError> {
+    LatticeShear::new(Lattice::GREAT3).map_err(|error| FileError::new("GREAT3", error))
+}
+
+// Adds the galaxies of a subfield with their intrinsic ellipticities, sheared: ⟨M_ap²⟩ of the shear alone would not have their
+// noise, which the submission has.
+fn add_truth(
+    galaxies: &mut LatticeShear,
+    folder: &Path,
+    path: &Path,
+    subfield: usize,
+) -> Result<(), FileError> {
+    const WANTED: [&str; 5] = ["ID", "g1", "g2", "g1_intrinsic", "g2_intrinsic"];
+    let read = table::read(path, Some(&WANTED), table::MAX_ROWS)?;
+    let mut columns = Vec::new();
+    for name in WANTED {
+        columns.push(table::numbers(&read, name, path)?);
+    }
+    // Files of offsets are optional, as identities contain them.
+    let offset = match Parameters::read(folder, &format!("subfield_offset-{subfield:03}"))? {
+        None => None,
+        Some(found) => Some([found.number("offset_deg_x")?, found.number("offset_deg_y")?]),
+    };
+    for (k, &found) in columns[0].iter().enumerate() {
+        let id = Identity::of(found).filter(|id| id.subfield() == subfield);
+        let Some(id) = id else {
+            return wrong(path, Fault::NotAnIdentity { row: k + 1, found });
+        };
+        let (x, y) = id.place();
+        if let Some(degrees) = offset {
+            let nodes = degrees.map(|offset| {
+                (offset * Lattice::GREAT3.side as f64 / Lattice::GREAT3.field.0).round() as usize
+            });
+            if [x % NODES_PER_GALAXY, y % NODES_PER_GALAXY] != nodes {
+                let message = format!(
+                    "galaxy {id} disagrees with subfield_offset-{subfield:03} (found the offset {} and {} nodes, expected {} and {})",
+                    x % NODES_PER_GALAXY,
+                    y % NODES_PER_GALAXY,
+                    nodes[0],
+                    nodes[1]
+                );
+                return wrong(path, message);
+            }
+        }
+        let intrinsic = Shear::new(columns[3][k], columns[4][k]);
+        let g = intrinsic.sheared_by(Shear::new(columns[1][k], columns[2][k]));
+        galaxies
+            .add((x, y), g, 1.0)
+            .map_err(|error| FileError::new(path, format!("galaxy {id}: {error}")))?;
+    }
+    Ok(())
+}
+
+// Numbers by name, as the challenge wrote them: YAML of one level, or a line of names after `#` and a line of values.
+struct Parameters {
+    path: PathBuf,
+    numbers: BTreeMap<String, f64>,
+}
+
+impl Parameters {
+    // `None` if there is no such file.
+    fn read(folder: &Path, stem: &str) -> Result<Option<Self>, FileError> {
+        let files = ["yaml", "txt"].map(|ending| folder.join(format!("{stem}.{ending}")));
+        let Some(path) = files.into_iter().find(|path| is_there(path)) else {
+            return Ok(None);
+        };
+        let text = read_to_string(&path, SETTINGS)
+            .map_err(FileError::doing(&path, "cannot read the parameters"))?;
+        let mut lines = text.lines().filter(|line| !line.trim().is_empty());
+        let number = |name: &str, value: &str| {
+            let name = name.trim_matches(['"', '\'', ' ']).to_owned();
+            Some((name, value.trim().parse().ok()?))
+        };
+        let numbers = match lines.clone().next().and_then(|line| line.strip_prefix('#')) {
+            Some(names) => {
+                let values = lines.nth(1).unwrap_or_default().split_whitespace();
+                let pairs = names.split_whitespace().zip(values);
+                pairs
+                    .filter_map(|(name, value)| number(name, value))
+                    .collect()
+            }
+            None => text
+                .split(['\n', ',', '{', '}'])
+                .filter_map(|part| part.split_once(':'))
+                .filter_map(|(name, value)| number(name, value))
+                .collect(),
+        };
+        Ok(Some(Parameters { path, numbers }))
+    }
+
+    fn number(&self, name: &str) -> Result<f64, FileError> {
+        let found = self.numbers.get(name).copied();
+        found.ok_or_else(|| FileError::new(&self.path, format!("there is no number `{name}`")))
+    }
+}
+
+impl Branch for Great3 {
+    fn title(&self) -> String {
+        format!("GREAT3 {self}")
+    }
+
+    fn score(&self, truth: Truth<'_>, submission: &Path, pool: &Pool) -> Result<Score, FileError> {
+        let of_submission = |error| FileError::new(submission, error);
+        let mut figures = Vec::new();
+        if self.constant {
+            let shears = self.true_shears(truth.path)?;
+            let psfs = self.psfs(truth, shears.len())?;
+            let submitted = self.read_shears(submission, Some(shears.len()))?;
+            let fields = shears.iter().zip(&submitted).zip(&psfs);
+            let fields: Vec<ConstantField> = fields
+                .map(|((&truth, &submitted), &psf)| ConstantField {
+                    truth,
+                    submitted,
+                    psf,
+                })
+                .collect();
+            let found = constant_score(&fields, self.observation).map_err(of_submission)?;
+            figures.push(Figure {
+                key: "Q_c",
+                value: found.q,
+                error: None,
+                jackknife: found.jackknife,
+                target: Some(self.observation.q_c([[0.0; 2]; 2])),
+                decimals: 1,
+            });
+            let of = |PlusCross { plus, cross }| [plus, cross];
+            let [(c_plus, c_cross), (m_plus, m_cross)] =
+                [of(found.c), of(found.m)].map(|[plus, cross]| (plus, cross));
+            for (key, bias, target) in [
+                ("c_plus", c_plus, 2e-4),
+                ("m_plus", m_plus, 2e-3),
+                ("c_cross", c_cross, 2e-4),
+                ("m_cross", m_cross, 2e-3),
+            ] {
+                figures.push(Figure {
+                    key,
+                    value: bias.value,
+                    error: Some(bias.error),
+                    jackknife: bias.jackknife,
+                    target: Some(target),
+                    decimals: 6,
+                });
+            }
+        } else {
+            let masses = self.true_masses(truth.path, pool)?;
+            let submitted = self.read_masses(submission, Some(masses.len()))?;
+            let score = |submitted: &[_]| variable_score(submitted, &masses, self.observation);
+            let found = score(&submitted).map_err(of_submission)?;
+            let most = score(&masses).map_err(of_submission)?;
+            figures.push(Figure {
+                key: "Q_v",
+                value: found.q,
+                error: None,
+                jackknife: found.jackknife,
+                target: Some(most.q),
+                decimals: 1,
+            });
+        }
+        Ok(Score {
+            branch: Some(self.to_string()),
+            figures,
+        })
+    }
+
+    fn check(&self, submission: &Path) -> Result<(), FileError> {
+        match self.constant {
+            true => self
+                .read_shears(submission, Some(self.fields()))
+                .map(|_| ()),
+            false => self
+                .read_masses(submission, Some(self.fields()))
+                .map(|_| ()),
+        }
+    }
+
+    fn pack(&self, packing: &Packing<'_>, pool: &Pool) -> Option<Result<Packed, FileError>> {
+        let read = Galaxies::read(self, packing);
+        Some(read.and_then(|galaxies| galaxies.summarise(packing, pool)))
+    }
+
+    fn leaderboard(&self) -> Vec<Entry> {
+        let branch = self.to_string();
+        let entries = LEADERBOARD.lines().filter_map(|line| {
+            let fields: Vec<&str> = line.split(',').collect();
+            let [board, team, method, numbers @ ..] = fields.as_slice() else {
+                return None;
+            };
+            let number = |k: usize| numbers[k].parse().unwrap_or(f64::NAN);
+            (*board == branch).then(|| Entry {
+                team: (*team).to_owned(),
+                method: (*method).to_owned(),
+                q: number(0),
+                biases: [1, 2, 3, 4].map(number),
+            })
+        });
+        entries.collect()
+    }
+}
+
+// board,team,method,Q_c,m_plus,m_cross,c_plus,c_cross. Rows without a team have the highest Q of a branch, whose biases are not given.
+const LEADERBOARD: &str = include_str!("great3-leaderboard.csv");
+
+/// Of the values of [`Branch::leaderboard`].
+pub const LEADERBOARD_SOURCE: &str = "Source: public leaderboard of GREAT3 (2014) in github.com/barnabytprowe/great3-public; 120 of its entries, and the best of each branch. Teams sent many entries, and the best of many is partly luck.";
+
+// A row of a catalogue.
+struct Galaxy {
+    id: Identity,
+    g: Shear,
+    weight: f64,
+    catalogue: usize,
+}
+
+// All galaxies of a branch, in the order of their identities.
+struct Galaxies<'a> {
+    branch: &'a Great3,
+    galaxies: Vec<Galaxy>,
+}
+
+impl<'a> Galaxies<'a> {
+    fn read(branch: &'a Great3, packing: &Packing<'_>) -> Result<Self, FileError> {
+        let mut galaxies = Vec::new();
+        for (catalogue, path) in packing.catalogues.iter().enumerate() {
+            // `measure` writes ellipticities that are not divided by their response.
+            let hint = "catalogues of measure become shears by: shearq shear --measured DIR --out shears.parquet";
+            let columns = GALAXIES.read(path);
+            let columns = columns.map_err(|error| error.hint_of_columns(hint))?;
+            for k in 0..columns[0].len() {
+                let fault = |fault| wrong(path, fault);
+                let found = columns[0][k];
+                let Some(id) = Identity::of(found) else {
+                    return fault(Fault::NotAnIdentity { row: k + 1, found });
+                };
+                if id.subfield() >= packing.subfields {
+                    return fault(Fault::Subfield {
+                        id: id.to_string(),
+                        found: id.subfield(),
+                        branch: branch.to_string(),
+                        last: packing.subfields - 1,
+                    });
+                }
+                let (x, y) = id.place();
+                let side = if branch.constant {
+                    packing.grid
+                } else {
+                    packing.grid * NODES_PER_GALAXY
+                };
+                if x >= side || y >= side {
+                    let (id, last) = (id.to_string(), side - 1);
+                    return fault(Fault::OutsideGrid { id, x, y, last });
+                }
+                let g = Shear::new(columns[1][k], columns[2][k]);
+                for (name, found) in [("g1", g.e1), ("g2", g.e2)] {
+                    if found <= -NOT_AVERAGED {
+                        let id = id.to_string();
+                        return fault(Fault::Sentinel { id, name, found });
+                    }
+                }
+                let weight = columns[3].get(k).copied().unwrap_or(1.0);
+                if !(weight.is_finite() && weight >= 0.0) {
+                    let (id, found) = (id.to_string(), weight);
+                    return fault(Fault::Weight { id, found });
+                }
+                galaxies.push(Galaxy {
+                    id,
+                    g,
+                    weight,
+                    catalogue,
+                });
+            }
+        }
+        let all = Galaxies { branch, galaxies };
+        all.checked(packing)
+    }
+
+    // The checks of the challenge's program, in the order in which their messages help most: a repeated galaxy before the missing
+    // one that it stands for.
+    fn checked(mut self, packing: &Packing<'_>) -> Result<Self, FileError> {
+        let file = |galaxy: &Galaxy| packing.catalogues[galaxy.catalogue].as_path();
+        // Stable, so that the first of two rows stays first.
+        self.galaxies.sort_by_key(|galaxy| galaxy.id);
+        if let Some(pair) = self
+            .galaxies
+            .windows(2)
+            .find(|pair| pair[0].id == pair[1].id)
+        {
+            let id = pair[0].id.to_string();
+            let first = file(&pair[0]).display().to_string();
+            return wrong(file(&pair[1]), Fault::Repeated { id, first });
+        }
+        let there: BTreeSet<usize> = self.galaxies.iter().map(|own| own.id.subfield()).collect();
+        let last = packing
+            .catalogues
+            .last()
+            .map_or(Path::new("catalogues"), PathBuf::as_path);
+        let lacking: Vec<usize> = (0..packing.subfields)
+            .filter(|k| !there.contains(k))
+            .collect();
+        if !lacking.is_empty() {
+            let first = lacking.iter().take(5).map(usize::to_string);
+            let which = first.collect::<Vec<_>>().join(", ");
+            let which = which + if lacking.len() > 5 { ", …" } else { "" };
+            let (count, expected) = (lacking.len(), packing.subfields);
+            return wrong(
+                last,
+                Fault::Subfields {
+                    count,
+                    expected,
+                    which,
+                },
+            );
+        }
+        for subfield in self
+            .galaxies
+            .chunk_by(|a, b| a.id.subfield() == b.id.subfield())
+        {
+            self.check_subfield(subfield, packing, file)?;
+        }
+        Ok(self)
+    }
+
+    fn check_subfield<'p>(
+        &self,
+        galaxies: &[Galaxy],
+        packing: &Packing<'_>,
+        file: impl Fn(&Galaxy) -> &'p Path,
+    ) -> Result<(), FileError> {
+        let first = &galaxies[0];
+        let step = if self.branch.constant {
+            1
+        } else {
+            NODES_PER_GALAXY
+        };
+        let offset = |id: Identity| (id.place().0 % step, id.place().1 % step);
+        let expected = offset(first.id);
+        if let Some(odd) = galaxies.iter().find(|own| offset(own.id) != expected) {
+            return wrong(
+                file(odd),
+                Fault::Offset {
+                    id: odd.id.to_string(),
+                    found: offset(odd.id),
+                    expected,
+                    first: first.id.to_string(),
+                },
+            );
+        }
+        let count = packing.grid * packing.grid;
+        if galaxies.len() != count {
+            let subfield = first.id.subfield();
+            let there: BTreeSet<Identity> = galaxies.iter().map(|own| own.id).collect();
+            let nodes = |offset: usize| (0..packing.grid).map(move |k| step * k + offset);
+            let all = nodes(expected.0).flat_map(|x| nodes(expected.1).map(move |y| (x, y)));
+            let mut all = all.map(|(x, y)| Identity((subfield * 1_000_000 + x * 1000 + y) as u32));
+            let id = all
+                .find(|id| !there.contains(id))
+                .unwrap_or(first.id)
+                .to_string();
+            return wrong(
+                file(first),
+                Fault::Galaxies {
+                    id,
+                    count: count - galaxies.len(),
+                    subfield,
+                    found: galaxies.len(),
+                    expected: count,
+                },
+            );
+        }
+        Ok(())
+    }
+
+    fn summarise(&self, packing: &Packing<'_>, pool: &Pool) -> Result<Packed, FileError> {
+        let size = self.branch.subfields_per_field() * packing.grid * packing.grid;
+        let fields: Vec<Range<usize>> = (0..self.galaxies.len())
+            .step_by(size)
+            .map(|start| start..(start + size).min(self.galaxies.len()))
+            .collect();
+        let file = &packing.catalogues[0];
+        let mut text = String::new();
+        let is_measured = |g: f64, limit: f64| g < limit;
+        if self.branch.constant {
+            text += "# index g1 g2\n";
+            for (field, range) in fields.into_iter().enumerate() {
+                let mean = |of: fn(&Shear) -> f64, other: fn(&Shear) -> f64| {
+                    let own = self.galaxies[range.clone()].iter().filter(|own| {
+                        is_measured(of(&own.g), NOT_AVERAGED)
+                            && (!packing.whole_galaxies || is_measured(other(&own.g), NOT_AVERAGED))
+                    });
+                    let (mut sum, mut weight) = (0.0, 0.0);
+                    for own in own {
+                        sum += own.weight * of(&own.g);
+                        weight += own.weight;
+                    }
+                    match weight > 0.0 {
+                        true => Ok(sum / weight),
+                        false => wrong(file, Fault::Unmeasured { field }),
+                    }
+                };
+                let g1 = mean(|g| g.e1, |g| g.e2)?;
+                let g2 = mean(|g| g.e2, |g| g.e1)?;
+                let _ = writeln!(text, "{field} {g1} {g2}");
+            }
+        } else {
+            text += "# field theta[deg] map_E map_B error\n";
+            let limit = if packing.whole_galaxies {
+                NOT_AVERAGED
+            } else {
+                NOT_CORRELATED
+            };
+            let masses = pool.in_order(fields.into_iter().enumerate(), |(field, range)| {
+                self.masses(&self.galaxies[range], limit)
+                    .map_err(|fault| match fault {
+                        Some(error) => error,
+                        None => FileError::new(file, Fault::Unmeasured { field }),
+                    })
+            });
+            for (field, own) in masses.enumerate() {
+                let own = own?;
+                for b in 0..SEPARATION_BINS {
+                    let _ = writeln!(
+                        text,
+                        "{field} {} {:e} {:e} {:e}",
+                        own.theta[b], own.map_e[b], own.map_b[b], own.error[b]
+                    );
+                }
+            }
+        }
+        let unmeasured = self.galaxies.iter().filter(|own| {
+            !is_measured(own.g.e1, NOT_AVERAGED) || !is_measured(own.g.e2, NOT_AVERAGED)
+        });
+        let note = format!(
+            "{} galaxies of {}, {} not measured",
+            self.galaxies.len(),
+            self.branch,
+            unmeasured.count()
+        );
+        Ok(Packed { text, note })
+    }
+
+    // `None` of galaxies without a shear.
+    fn masses(&self, galaxies: &[Galaxy], limit: f64) -> Result<ApertureMass, Option<FileError>> {
+        let mut found = lattice()?;
+        let mut weight = 0.0;
+        for own in galaxies
+            .iter()
+            .filter(|own| own.g.e1 < limit && own.g.e2 < limit)
+        {
+            weight += own.weight;
+            found
+                .add(own.id.place(), own.g, own.weight)
+                .map_err(|error| {
+                    Some(FileError::new(
+                        "GREAT3",
+                        format!("galaxy {}: {error}", own.id),
+                    ))
+                })?;
+        }
+        match weight > 0.0 {
+            true => Ok(found.correlations().aperture_mass()),
+            false => Err(None),
+        }
+    }
+}
