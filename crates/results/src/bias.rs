@@ -189,6 +189,8 @@ pub struct About {
     pub catalogues: Vec<Catalogue>,
     /// The program that wrote them.
     pub program: String,
+    #[serde(default)]
+    pub by_shearq: bool,
     truth: bool,
     /// Whether responses were read, or the type of the ellipticities was given.
     response: bool,
@@ -319,6 +321,7 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
         version: env!("CARGO_PKG_VERSION").into(),
         catalogues,
         program: first.columns.program().into(),
+        by_shearq: first.columns.is_of_shearq(),
         truth,
         response: response || request.shapes.is_some(),
         response_column: first.columns.have(&[Role::R11]),
@@ -379,7 +382,11 @@ fn add_up(
         let selects = sources[0].selects;
         let number = number as u32;
         catalogues.push(read::rows(name, reading, sources, |item| {
-            let (row, own) = (&item.row, bin_of(edges, item.binned[0]));
+            let bin = |catalogue: usize| {
+                let value = item.selected.binned[catalogue].ok()?;
+                bin_of(edges, value)
+            };
+            let (row, own) = (&item.row, bin(0));
             // Differences of 1p and 1m are then derivatives.
             let scaled = row.e.map(|e| e / (2.0 * request.step));
             let mut add_sheared = |bin, catalogue: usize, weight| {
@@ -396,8 +403,8 @@ fn add_up(
                 // weights: the selection response R_S of Sheldon & Huff (2017, ApJ 841, 24). It needs all four catalogues,
                 // because a cut by S/N responds to both components.
                 for catalogue in 1..CATALOGUES {
-                    if let Some(bin) = bin_of(edges, item.binned[catalogue]) {
-                        add_sheared(bin, catalogue, item.weights[catalogue]);
+                    if let Some(bin) = bin(catalogue) {
+                        add_sheared(bin, catalogue, item.selected.weights[catalogue]);
                     }
                 }
             }
@@ -485,9 +492,9 @@ fn known(truth: &Truth, source: &Source) -> bool {
     !matches!(truth, Truth::Columns) || source.columns.have(&[Role::G1, Role::G2])
 }
 
-// The bin of a value; the last one is outside of all edges. `None` for a row that is not selected.
+// The bin of a value; the last one is outside of all edges. `None` if a number is missing.
 fn bin_of(edges: &[f64], value: f64) -> Option<usize> {
-    if !value.is_finite() {
+    if value.is_nan() {
         return None;
     }
     let Some((last, _)) = edges.split_last() else {
@@ -510,9 +517,9 @@ fn equal_edges(
     let (mut values, mut stride, mut number) = (Vec::new(), 1u64, 0u64);
     for (input, sources) in reading.request.catalogues.iter().zip(all) {
         read::rows(&input.name, reading, sources, |item| {
-            if item.catalogue == 0 && item.binned[0].is_finite() {
+            if let (0, Ok(value)) = (item.catalogue, item.selected.binned[0]) {
                 if number % stride == 0 {
-                    values.push(item.binned[0]);
+                    values.push(value);
                 }
                 number += 1;
             }
@@ -594,23 +601,18 @@ impl Summed {
         if self.about.version != other.about.version {
             return Err(BiasFailure::Unlike("versions"));
         }
-        if (&self.about.binned, &self.about.edges, &self.about.selection)
-            != (
-                &other.about.binned,
-                &other.about.edges,
-                &other.about.selection,
-            )
-            || (
-                self.about.truth,
-                self.about.matched,
-                self.about.design,
-                self.about.by_key,
-            ) != (
-                other.about.truth,
-                other.about.matched,
-                other.about.design,
-                other.about.by_key,
-            )
+        let options = |of: &About| {
+            let About {
+                truth,
+                matched,
+                design,
+                by_key,
+                ..
+            } = *of;
+            (truth, matched, design, by_key)
+        };
+        let rows = |of: &About| (of.binned.clone(), of.edges.clone(), of.selection.clone());
+        if options(&self.about) != options(&other.about) || rows(&self.about) != rows(&other.about)
         {
             return Err(BiasFailure::Unlike("options"));
         }
@@ -906,6 +908,6 @@ mod tests {
         let bins = [0.5, 1.0, 1.9, 2.0, 4.0, 4.1].map(|value| bin_of(&edges, value));
         assert_eq!(bins, [2, 0, 0, 1, 1, 2].map(Some));
         assert_eq!(bin_of(&[], 3.0), Some(0));
-        assert_eq!(bin_of(&edges, f64::INFINITY), None);
+        assert_eq!(bin_of(&edges, f64::NAN), None);
     }
 }

@@ -17,22 +17,69 @@ use crate::select::Weighted;
 use crate::star_noise;
 
 use super::Input;
-use super::columns::{
-    CATALOGUES, Columns, Key, RESPONSES, Role, Shapes, chosen_value, sheared_pair,
-};
+use super::columns::{CATALOGUES, Columns, RESPONSES, Role, Shapes, chosen_value, sheared_pair};
 use super::identity;
 use super::source::{Reading, Source, catalogue_named};
 use super::truth::{OfRows, check};
 
+// A row that counts, in the catalogue without artificial shear or in a sheared one.
 pub(super) struct SummedRow {
     pub(super) key: u64,
     // Index of the sheared catalogue, with 0 for noshear.
     pub(super) catalogue: usize,
     pub(super) row: Row,
-    // The binned quantity in noshear and each sheared catalogue; infinity where the row is not selected. A shear may move a
-    // galaxy over a cut, which is the response of the selection.
-    pub(super) binned: [f64; CATALOGUES],
+    pub(super) selected: Selected,
+}
+
+// What flags, weights, `--where` and `--bins` make of a row in noshear and in each sheared catalogue. A shear may move a galaxy
+// over a cut, which is the response of the selection.
+pub(super) struct Selected {
+    // The binned quantity where the row is selected: 0 without bins, NaN if a number is missing.
+    pub(super) binned: [Result<f64, Exclusion>; CATALOGUES],
     pub(super) weights: [f64; CATALOGUES],
+}
+
+// Why a row does not count.
+#[derive(Clone, Copy)]
+pub(super) enum Exclusion {
+    Flagged,
+    Unweighted,
+    Unselected,
+    // A number stands for a failed measurement.
+    Failed,
+    // A distortion above 1 has no shear.
+    AboveOne,
+    // NaN or infinity, or no true shear.
+    Missing,
+}
+
+// Why a row gives no galaxy: it is left out, or the message with which the command ends.
+enum Rejected {
+    Excluded(Exclusion),
+    Invalid(String),
+}
+
+impl From<Exclusion> for Rejected {
+    fn from(reason: Exclusion) -> Self {
+        Rejected::Excluded(reason)
+    }
+}
+
+impl From<String> for Rejected {
+    fn from(message: String) -> Self {
+        Rejected::Invalid(message)
+    }
+}
+
+fn count(about: &mut Catalogue, excluded: Exclusion) {
+    *match excluded {
+        Exclusion::Flagged => &mut about.flagged,
+        Exclusion::Unweighted => &mut about.unweighted,
+        Exclusion::Unselected => &mut about.unselected,
+        Exclusion::Failed => &mut about.failed,
+        Exclusion::AboveOne => &mut about.above_one,
+        Exclusion::Missing => &mut about.missing,
+    } += 1;
 }
 
 // Calls `take` for each row that is neither flagged nor cut, and returns counts and means of the catalogue.
@@ -66,14 +113,37 @@ pub(super) fn rows(
             let checks = checks.get_or_insert_with(|| part.checks());
             repeats.look_for(&part);
             for at in 0..part.rows {
-                let found = part.row(at, first + at, checks, &mut counts, &mut about)?;
-                let Some(item) = found else {
-                    continue;
-                };
-                if item.catalogue == 0 && item.binned[0].is_finite() {
-                    repeats.add(&part, at);
+                let catalogue = part.catalogue(at);
+                let index = counts[catalogue];
+                counts[catalogue] += 1;
+                let selected = part.select(at);
+                let mut excluded = selected.binned[0].err();
+                if selected.binned.iter().any(Result::is_ok) {
+                    match part.galaxy(at, index, selected, checks) {
+                        Ok(item) => {
+                            if catalogue == 0 {
+                                for k in 0..2 {
+                                    about.shear[k].add(item.row.g[k]);
+                                    about.ellipticity[k].add(item.row.e[k]);
+                                }
+                                if excluded.is_none() {
+                                    repeats.add(&part, at);
+                                }
+                            }
+                            take(&item);
+                        }
+                        // A row counts for its first reason.
+                        Err(Rejected::Excluded(reason)) => _ = excluded.get_or_insert(reason),
+                        Err(Rejected::Invalid(what)) => {
+                            let row = first + at + 1;
+                            let message = format!("row {row}: {what}");
+                            return Err(FileError::new(&source.place.path, message));
+                        }
+                    }
                 }
-                take(&item);
+                if let Some(reason) = excluded.filter(|_| catalogue == 0) {
+                    count(&mut about, reason);
+                }
             }
             first += part.rows;
             Ok(())
@@ -137,15 +207,6 @@ enum Response {
 // NaN counts as a weight, so that a later check refuses it instead of dropping the row silently.
 fn has_weight(weight: f64) -> bool {
     weight.is_nan() || weight > 0.0
-}
-
-enum Rejection {
-    // A number stands for a failed measurement.
-    Failed,
-    // A distortion above 1 has no shear.
-    AboveOne,
-    // NaN or infinity.
-    Missing,
 }
 
 impl<'a> Part<'a> {
@@ -299,181 +360,163 @@ impl<'a> Part<'a> {
         checks.find(|(column, check)| (check.fails)(self.value(*column, at), check.range))
     }
 
-    // `None` for rows without a contribution, which are counted by reason in `about`. `number` is the row of the table from 0,
-    // for messages.
-    fn row(
-        &self,
-        at: usize,
-        number: usize,
-        checks: &[Check],
-        counts: &mut [u64; CATALOGUES],
-        about: &mut Catalogue,
-    ) -> Result<Option<SummedRow>, FileError> {
-        let places = &self.source.places;
-        let catalogue = match &self.catalogues {
+    fn catalogue(&self, at: usize) -> usize {
+        match &self.catalogues {
             Some(catalogues) => catalogues[at],
             None => self.source.catalogue.unwrap_or(0),
-        };
-        let index = counts[catalogue];
-        counts[catalogue] += 1;
-        let own = u64::from(catalogue == 0);
-        let flagged = |catalogue: usize| {
-            let mut flags = places.all((Role::Flag, catalogue)).iter();
-            flags.any(|flag| self.value(*flag, at) != 0.0)
-        };
+        }
+    }
+
+    // A sheared catalogue may choose a row that is left out without shear: these rows are the response of the selection.
+    fn select(&self, at: usize) -> Selected {
+        let places = &self.source.places;
         let weights: [f64; CATALOGUES] = std::array::from_fn(|catalogue| {
             let own = places.of((Role::Weight, catalogue));
             let own = own.or_else(|| self.of(Role::Weight));
             own.map_or(1.0, |weight| self.value(weight, at))
         });
-        // A sheared catalogue may choose a row that is left out without shear: these rows are the response of the selection.
-        let counted: [bool; CATALOGUES] =
-            std::array::from_fn(|catalogue| !flagged(catalogue) && has_weight(weights[catalogue]));
-        if !counted[0] {
-            match flagged(0) {
-                true => about.flagged += own,
-                false => about.unweighted += own,
-            }
-            if counted == [false; CATALOGUES] {
-                return Ok(None);
-            }
-        }
-        let fault = |what: String| {
-            let row = number + 1;
-            FileError::new(&self.source.place.path, format!("row {row}: {what}"))
+        let flagged = |catalogue: usize| {
+            let mut flags = places.all((Role::Flag, catalogue)).iter();
+            flags.any(|flag| self.value(*flag, at) != 0.0)
         };
-        if let Some((name, value)) = self.unused_weight(at) {
-            return Err(fault(format!(
-                "`{name}` looks like a weight but is not used, and is {value} here, so that this galaxy would count wrongly. Try: --columns w={name}, or w=none"
-            )));
-        }
         // Smooth steps of `--where` are zero far below their threshold. Such a row would add zeros to all sums.
+        let stepped = self.weighted.as_ref().map(|own| own.weight[at]);
+        let is_outside = stepped.is_some_and(|weight| weight <= 0.0);
+        let binned = std::array::from_fn(|catalogue| {
+            if flagged(catalogue) {
+                Err(Exclusion::Flagged)
+            } else if !has_weight(weights[catalogue]) {
+                Err(Exclusion::Unweighted)
+            } else {
+                let binned = self.binned(at, catalogue).filter(|_| !is_outside);
+                binned.ok_or(Exclusion::Unselected)
+            }
+        });
+        Selected { binned, weights }
+    }
+
+    // The binned quantity in a catalogue if `--where` selects the row; NaN if a number is missing.
+    fn binned(&self, at: usize, catalogue: usize) -> Option<f64> {
+        let of = |expression: Option<&Expression>, role: Role, without: f64| {
+            let Some(own) = expression else {
+                return Some(without);
+            };
+            let places = self.source.places.all((role, catalogue));
+            // A sheared catalogue without the columns of the expression selects nothing.
+            let known = own.operands().len() == places.len();
+            let value = known.then(|| own.value(&|k| self.value(places[k], at)));
+            value.filter(|value| !value.is_infinite())
+        };
+        let selected = of(self.reading.condition(), Role::Condition, 1.0)?;
+        if selected == 0.0 {
+            return None;
+        }
+        let binned = of(self.reading.binned(), Role::Binned, 0.0)?;
+        Some(if selected.is_nan() { f64::NAN } else { binned })
+    }
+
+    // The row, the `index`-th of its catalogue, with its shape and its true shear.
+    fn galaxy(
+        &self,
+        at: usize,
+        index: u64,
+        selected: Selected,
+        checks: &[Check],
+    ) -> Result<SummedRow, Rejected> {
+        self.check_unused_weight(at)?;
+        self.check_failures(at, checks)?;
         let weight = self.weighted.as_ref().map(|own| own.weight[at]);
-        if weight.is_some_and(|weight| weight <= 0.0) {
-            about.unselected += own;
-            return Ok(None);
-        }
-        let mut binned = self.binned(at);
-        if counted[0] && binned[0].is_infinite() {
-            about.unselected += own;
-        }
-        // Flags and weights leave out a row in the same way as a condition of `--where`.
-        for (bin, counted) in binned.iter_mut().zip(counted) {
-            if !counted {
-                *bin = f64::INFINITY;
-            }
-        }
-        if binned.iter().all(|value| value.is_infinite()) {
-            return Ok(None);
-        }
-        let weight = weight.unwrap_or(weights[0]);
-        let found = self.measured(at, weight, binned[0], checks);
-        let mut row = match found.map_err(&fault)? {
-            Ok(row) => row,
-            Err(reason) => {
-                match reason {
-                    Rejection::Failed => about.failed += own,
-                    Rejection::AboveOne => about.above_one += own,
-                    Rejection::Missing => about.missing += own,
-                }
-                return Ok(None);
-            }
-        };
+        let weight = weight.unwrap_or(selected.weights[0]);
+        let mut row = self.measured(at, weight)?;
+        self.check_numbers(&row, &selected)?;
         // After the cuts, because a table of true shears may lack galaxies that are cut.
-        row.g = match self.truth(at) {
-            Err(_) if self.reading.request.drop_missing && self.truth.may_lack_rows() => {
-                about.missing += own;
-                return Ok(None);
-            }
-            found => found.map_err(&fault)?,
-        };
-        check(row.g).map_err(&fault)?;
+        row.g = self.truth(at)?;
+        check(row.g)?;
         if self.reading.flip_g2 {
             row.g[1] = -row.g[1];
         }
-        if catalogue == 0 {
-            for k in 0..2 {
-                about.shear[k].add(row.g[k]);
-                about.ellipticity[k].add(row.e[k]);
-            }
-        }
-        Ok(Some(SummedRow {
+        Ok(SummedRow {
             key: self.key(at, index),
-            catalogue,
-            weights,
+            catalogue: self.catalogue(at),
             row,
-            binned,
-        }))
+            selected,
+        })
     }
 
     // Without it, galaxies that another program excludes by a weight of zero would count fully.
-    fn unused_weight(&self, at: usize) -> Option<(&str, f64)> {
-        let place = self.of(Role::DoubtfulWeight)?;
+    fn check_unused_weight(&self, at: usize) -> Result<(), String> {
+        let Some(place) = self.of(Role::DoubtfulWeight) else {
+            return Ok(());
+        };
         let (name, value) = (self.source.name(place), self.value(place, at));
-        (value.is_nan() || value <= 0.0).then_some((name, value))
+        if has_weight(value) && !value.is_nan() {
+            return Ok(());
+        }
+        Err(format!(
+            "`{name}` looks like a weight but is not used, and is {value} here, so that this galaxy would count wrongly. Try: --columns w={name}, or w=none"
+        ))
     }
 
-    // A row with a true shear of zero, which the caller sets. The outer error stops the command, the inner one skips the row.
-    fn measured(
-        &self,
-        at: usize,
-        weight: f64,
-        binned: f64,
-        checks: &[Check],
-    ) -> Result<Result<Row, Rejection>, String> {
-        let drop_missing = self.reading.request.drop_missing;
-        if let Some((column, check)) = self.failure(at, checks) {
-            if drop_missing {
-                return Ok(Err(Rejection::Failed));
-            }
-            let value = self.value(column, at);
-            let mut of_psf = [Role::Psf1, Role::Psf2, Role::PsfSize].into_iter();
-            let of_psf = of_psf.any(|role| self.of(role) == Some(column));
-            // A PSF of 2 in all rows is another quantity, rather than a failure in each.
-            let all_equal = || self.columns[column].iter().all(|other| *other == value);
-            let remedy = match of_psf && all_equal() {
-                true => "--columns psf_e1=none,psf_e2=none,psf_size=none",
-                false => "--drop-missing",
-            };
-            return Err(format!(
-                "column `{}` is {} in a row without a flag, which stands for a failed measurement (expected {}). Try: {remedy}",
-                self.source.name(column),
-                shown(value),
-                check.expected
-            ));
-        }
-        let Some((e, response)) = self.shape(at, weight) else {
-            return Ok(Err(Rejection::AboveOne));
+    fn check_failures(&self, at: usize, checks: &[Check]) -> Result<(), Rejected> {
+        let Some((column, check)) = self.failure(at, checks) else {
+            return Ok(());
         };
-        let psf = self.roles(PSF).map_or([0.0; 2], |psf| self.pair(psf, at));
-        let psf_size = self
-            .of(Role::PsfSize)
-            .map_or(1.0, |size| self.value(size, at));
-        let [[r11, r12], [r21, r22]] = response;
+        if self.reading.request.drop_missing {
+            return Err(Exclusion::Failed.into());
+        }
+        let value = self.value(column, at);
+        let mut of_psf = [Role::Psf1, Role::Psf2, Role::PsfSize].into_iter();
+        let of_psf = of_psf.any(|role| self.of(role) == Some(column));
+        // A PSF of 2 in all rows is another quantity, rather than a failure in each.
+        let all_equal = || self.columns[column].iter().all(|other| *other == value);
+        let remedy = match of_psf && all_equal() {
+            true => "--columns psf_e1=none,psf_e2=none,psf_size=none",
+            false => "--drop-missing",
+        };
+        Err(Rejected::Invalid(format!(
+            "column `{}` is {} in a row without a flag, which stands for a failed measurement (expected {}). Try: {remedy}",
+            self.source.name(column),
+            shown(value),
+            check.expected
+        )))
+    }
+
+    // A row with a true shear of zero.
+    fn measured(&self, at: usize, weight: f64) -> Result<Row, Exclusion> {
+        let (e, response) = self.shape(at, weight).ok_or(Exclusion::AboveOne)?;
+        let size = self.of(Role::PsfSize);
+        Ok(Row {
+            e,
+            weight,
+            response,
+            g: [0.0; 2],
+            psf: self.roles(PSF).map_or([0.0; 2], |psf| self.pair(psf, at)),
+            psf_size: size.map_or(1.0, |size| self.value(size, at)),
+        })
+    }
+
+    fn check_numbers(&self, row: &Row, selected: &Selected) -> Result<(), Rejected> {
+        let [[r11, r12], [r21, r22]] = row.response;
         let checked = [
-            ("e1", e[0]),
-            ("e2", e[1]),
-            ("the weight", weight),
+            ("e1", row.e[0]),
+            ("e2", row.e[1]),
+            ("the weight", row.weight),
             ("the response or its derivative", r11 + r22 + r12 + r21),
-            ("the PSF's ellipticity or size", psf[0] + psf[1] + psf_size),
+            (
+                "the PSF's ellipticity or size",
+                row.psf[0] + row.psf[1] + row.psf_size,
+            ),
             (
                 "the expression of --where or --bins",
-                if binned.is_nan() { binned } else { 0.0 },
+                selected.binned[0].unwrap_or(0.0),
             ),
         ];
         match checked.iter().find(|(_, value)| !value.is_finite()) {
-            Some(_) if drop_missing => Ok(Err(Rejection::Missing)),
-            Some((what, value)) => Err(format!(
+            None => Ok(()),
+            Some(_) if self.reading.request.drop_missing => Err(Exclusion::Missing.into()),
+            Some((what, value)) => Err(Rejected::Invalid(format!(
                 "{what} is {value} in a row without a flag (expected a number). Try: --drop-missing"
-            )),
-            None => Ok(Ok(Row {
-                e,
-                weight,
-                response,
-                g: [0.0; 2],
-                psf,
-                psf_size,
-            })),
+            ))),
         }
     }
 
@@ -535,32 +578,8 @@ impl<'a> Part<'a> {
         }
     }
 
-    // The binned quantity in each catalogue. Infinity if the row is not selected; NaN if a number is missing.
-    fn binned(&self, at: usize) -> [f64; CATALOGUES] {
-        let (condition, binned) = (self.reading.condition(), self.reading.binned());
-        if condition.is_none() && binned.is_none() {
-            return [0.0; CATALOGUES];
-        }
-        let of = |expression: Option<&Expression>, key: Key, without: f64| {
-            let places = self.source.places.all(key);
-            match expression {
-                None => without,
-                Some(own) if own.operands().len() != places.len() => f64::INFINITY,
-                Some(own) => own.value(&|k| self.value(places[k], at)),
-            }
-        };
-        std::array::from_fn(|catalogue| {
-            let selected = of(condition, (Role::Condition, catalogue), 1.0);
-            if selected == 0.0 || selected.is_infinite() {
-                return f64::INFINITY;
-            }
-            let binned = of(binned, (Role::Binned, catalogue), 0.0);
-            if selected.is_nan() { f64::NAN } else { binned }
-        })
-    }
-
-    fn truth(&self, at: usize) -> Result<[f64; 2], String> {
-        match self.truth {
+    fn truth(&self, at: usize) -> Result<[f64; 2], Rejected> {
+        let found = match self.truth {
             OfRows::Constant(shear) => Ok(shear),
             OfRows::Identifiers(galaxies) => {
                 let key = self.ids.as_ref().and_then(|ids| galaxies.get(&ids[at]));
@@ -572,7 +591,12 @@ impl<'a> Part<'a> {
             }
             OfRows::Positions(positions, columns) => positions.at(self.pair(columns, at)),
             OfRows::Columns(columns) => Ok(self.pair(columns, at)),
-        }
+        };
+        let may_lack = self.reading.request.drop_missing && self.truth.may_lack_rows();
+        found.map_err(|message| match may_lack {
+            true => Exclusion::Missing.into(),
+            false => message.into(),
+        })
     }
 
     // The key of the unit of a row, the `index`-th of its catalogue.

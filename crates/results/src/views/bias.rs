@@ -175,7 +175,7 @@ fn label(result: &BiasResult, edges: Option<[f64; 2]>) -> String {
 /// A warning if galaxies were selected or binned by what was measured on them.
 pub fn chosen_by_measurement(result: &BiasResult) -> Option<String> {
     let column = result.about.measured.first()?;
-    let remedy = match result.about.program.starts_with("shearq") {
+    let remedy = match result.about.by_shearq {
         true => {
             "--where 'step(snr, THRESHOLD)' for cuts by snr, flux or size, or catalogues with shape.sheared_step".into()
         }
