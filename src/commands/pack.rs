@@ -184,7 +184,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     };
     // Before the archive is opened: catalogues that cannot be packed leave no file.
     let galaxies = packing.galaxies()?;
-    tell_unread(catalogues.unread());
+    tell_unread(catalogues.files.unread());
     let mut bar = Bar::new("packing", galaxies);
     let files = packing.write(out, &mut bar)?;
     drop(bar);

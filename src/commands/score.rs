@@ -17,7 +17,7 @@ use shearq_dataset::run::{Run, Source, kind_of};
 use shearq_dataset::truth::{ReadTruth, Reading, Sign, read_truth, reading_of};
 use shearq_render::table::TableFormat;
 use shearq_results::catalogues::{COLUMNS, Catalogues};
-use shearq_results::foreign::{Conversion, Screen, folder_of, plain_columns};
+use shearq_results::foreign::{Foreign, folder_of};
 use shearq_results::published::Truth;
 use shearq_results::record::{RunRecord, SetRecord};
 use shearq_results::score::{ScoredSet, score_catalogues, score_files, unscored};
@@ -208,11 +208,11 @@ fn catalogues(
         (None, Some(path), Some(data)) => {
             let catalogues = Catalogues::foreign(path, sets)?;
             anyhow::ensure!(
-                !catalogues.serve_all_sets() || !sets.is_empty(),
+                !catalogues.files.serve_all_sets() || !sets.is_empty(),
                 "{}: cannot determine the sets, because `catalogues` contains no {{set}}. Try: --sets 1",
                 path.display()
             );
-            tell_unread(catalogues.unread());
+            tell_unread(catalogues.files.unread());
             (catalogues, data)
         }
         (None, None, Some(data)) => {
@@ -233,7 +233,7 @@ fn catalogues(
     };
     let threads = arguments.threads.number();
     let scored = score_catalogues(&data, &catalogues, sets, options, threads);
-    let scored = match catalogues.description() {
+    let scored = match &catalogues.description {
         // The cause of an error in a catalogue may be its description, so the message names both.
         Some(_) => scored.with_context(|| catalogues.path.display().to_string())?,
         None => scored?,
@@ -252,7 +252,7 @@ fn catalogues(
     let sections = || Ok(vec![pages::scores(name, &scored, table)?]);
     arguments
         .report
-        .save(&title, sections, || match catalogues.run() {
+        .save(&title, sections, || match &catalogues.run {
             Some(run) => made_by(run, &catalogues.path),
             None => Ok([("Catalogues", &*catalogues.path), ("Data", data.root())]
                 .map(|(what, path)| (what.to_owned(), path.display().to_string()))
@@ -455,15 +455,11 @@ fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Resul
             columns.len()
         )
     })?;
-    let screen = Screen {
-        missing: arguments.missing,
-        drop_missing: arguments.drop_missing,
-        max_modulus: arguments.max_modulus,
-        conversion: match arguments.ellipticity {
-            Some(EllipticityType::Distortion) => Conversion::ToShear,
-            _ => Conversion::None,
-        },
-    };
+    let ellipticity = arguments.ellipticity.unwrap_or(EllipticityType::Shear);
+    let mut described = Foreign::of_columns(columns, ellipticity);
+    described.missing = arguments.missing;
+    described.drop_missing = arguments.drop_missing;
+    described.max_modulus = arguments.max_modulus;
     // A file that is given twice would count as two images without noise between them.
     let mut seen = BTreeSet::new();
     for path in &arguments.catalogues {
@@ -477,9 +473,8 @@ fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Resul
     }
     let scored = score_files(
         truth,
-        &arguments.catalogues,
+        &Catalogues::plain(&arguments.catalogues, described),
         &plain_reading(arguments),
-        &plain_columns(columns, screen),
         options,
         arguments.threads.number(),
     )?;

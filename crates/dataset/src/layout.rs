@@ -299,11 +299,13 @@ pub fn truth_rows<'t>(
     rows_of(path, table, &table::TRUTH_COLUMNS)
 }
 
+/// Where to name other columns of catalogues that are scored.
+pub const HINT_OF_COLUMNS: &str = "`score --columns` (names, or numbers such as 2,3,4,5) or a description (--foreign) names others";
+
 /// Rows of a catalogue, at most `most`, from four named columns.
 pub fn read_rows(path: &Path, names: &[&str; 4], most: usize) -> Result<Vec<Row>, FileError> {
-    let hint = "`score --columns` (names, or numbers such as 2,3,4,5) or a description (--foreign) names others";
-    let table =
-        table::read(path, Some(names), most).map_err(|error| error.hint_of_columns(hint))?;
+    let table = table::read(path, Some(names), most);
+    let table = table.map_err(|error| error.hint_of_columns(HINT_OF_COLUMNS))?;
     Ok(rows_of(path, &table, names)?.collect())
 }
 

@@ -45,6 +45,18 @@ struct Found {
 }
 
 impl Files {
+    /// Files by the numbers of set and image.
+    pub fn from_sets(sets: BTreeMap<u32, BTreeMap<u32, PathBuf>>) -> Self {
+        let found = |(image, path)| (image, Found { path, rank: 0 });
+        let by_set = sets.into_iter();
+        let by_set =
+            by_set.map(|(set, images)| (Some(set), images.into_iter().map(found).collect()));
+        Files {
+            by_set: by_set.collect(),
+            ..Files::default()
+        }
+    }
+
     pub fn of_set(&self, set: u32) -> Vec<(u32, PathBuf)> {
         let files = self.by_set.get(&Some(set)).or(self.by_set.get(&None));
         let files = files.into_iter().flatten();

@@ -17,10 +17,10 @@ use shearq_scoring::{Metric, Metrics, Options};
 use shearq_submissions::{Configuration, ConfigurationError, Registry, checked_name};
 use thiserror::Error;
 
-use crate::catalogues::OWN;
+use crate::catalogues::{Catalogues, OWN};
 use crate::record::SetRecord;
 use crate::response::response_of;
-use crate::score::{ScoreError, score_folder};
+use crate::score::{ScoreError, score_catalogues};
 use crate::views::junit::{Case, document};
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -197,7 +197,8 @@ pub fn metrics_of(
         choice: OWN,
         ..Options::default()
     };
-    let scored = score_folder(data, out, run, &[], options, threads)?;
+    let catalogues = Catalogues::measured(run, out, &[])?;
+    let scored = score_catalogues(data, &catalogues, &[], options, threads)?;
     scored
         .iter()
         .map(|scored| {

@@ -109,13 +109,16 @@ pub fn score_all(
     let mut all = given_catalogues(folders, &mut data, threads)?;
     all.extend(described);
     let data = data.ok_or(ScoreError::NoTruth)?;
-    if all.iter().all(Catalogues::serve_all_sets) {
+    if all.iter().all(|own| own.files.serve_all_sets()) {
         return Err(ScoreError::NoSetNumber);
     }
-    if let Some(empty) = all.iter().find(|catalogues| catalogues.sets().is_empty()) {
+    if let Some(empty) = all
+        .iter()
+        .find(|catalogues| catalogues.files.sets().is_empty())
+    {
         return Err(ScoreError::NoCatalogueOf(empty.name.clone()));
     }
-    let common = |set: u32| all.iter().all(|own| !own.of_set(set).is_empty());
+    let common = |set: u32| all.iter().all(|own| !own.files.of_set(set).is_empty());
     if !(1..=MAX_SET).any(common) {
         return Err(ScoreError::NoCommonSet);
     }
@@ -127,7 +130,7 @@ pub fn score_all(
     for (&(catalogues, choice), scored) in variants.iter().zip(scored) {
         let sets: Vec<SetRecord> = scored.iter().map(|set| set.record.clone()).collect();
         let numbers: Vec<u32> = sets.iter().map(|set| set.set).collect();
-        let unread = catalogues.unread().into_iter();
+        let unread = catalogues.files.unread().into_iter();
         let mut warnings: Vec<String> = unread.map(|line| format!("warning: {line}.")).collect();
         warnings.extend(unscored(&data, &scored, &numbers)?);
         let name = &catalogues.name;
@@ -138,7 +141,7 @@ pub fn score_all(
                 _ => format!("{name} ({})", catalogues.path.display()),
             },
             // Published metrics belong to the built-in settings, not to a file with their name.
-            published: catalogues.run().and_then(|run| {
+            published: catalogues.run.as_ref().and_then(|run| {
                 let entry = registry.get(&run.configuration.name).ok()?;
                 (entry.configuration == run.configuration).then_some(entry.published)?
             }),

@@ -4,14 +4,13 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Deserializer, Serialize};
 use shearq_quantities::{Distortion, MeasuredRange, Shear};
-use shearq_scoring::{FieldSum, Grid, Row, RowCounts, RowFault};
+use shearq_scoring::{Grid, Row, RowCounts, RowFault};
 use shearq_submissions::{EllipticityType, checked_name};
 
-use shearq_dataset::layout::read_rows;
-use shearq_dataset::layout::{IMAGE_PLACEHOLDERS, check_pattern};
+use shearq_dataset::layout::{HINT_OF_COLUMNS, IMAGE_PLACEHOLDERS, check_pattern};
 use shearq_dataset::listing::{self, Files};
 use shearq_files::FileError;
-use shearq_files::table::{self, Place, most_rows};
+use shearq_files::table::{self, Place};
 
 /// How to read another program's catalogues.
 ///
@@ -57,11 +56,14 @@ pub struct Foreign {
     #[serde(default = "e2")]
     e2: String,
     flag: Option<String>,
-    missing: Option<f64>,
+    /// A value of e1 or e2 of galaxies that were not measured.
+    pub missing: Option<f64>,
+    /// Whether numbers that stand for a failed measurement count as not measured.
     // Left out of what is written unless set, so that descriptions of packed results stay the same.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
-    drop_missing: bool,
-    max_modulus: Option<f64>,
+    pub drop_missing: bool,
+    /// The largest valid |e|, after conversion.
+    pub max_modulus: Option<f64>,
     #[serde(default)]
     position_offset: f64,
     #[serde(default = "one")]
@@ -113,8 +115,31 @@ pub fn folder_of(path: &Path) -> &Path {
 }
 
 impl Foreign {
-    /// Reads a description.
-    pub fn read(path: &Path) -> Result<Self, FileError> {
+    /// The description of plain files with the columns x, y, e1 and e2 of these names.
+    pub fn of_columns(columns: [&str; 4], ellipticity: EllipticityType) -> Self {
+        let [x, y, e1, e2] = columns.map(str::to_owned);
+        Foreign {
+            name: String::new(),
+            catalogues: String::new(),
+            ellipticity,
+            report: EllipticityType::Shear,
+            table: None,
+            x,
+            y,
+            e1,
+            e2,
+            flag: None,
+            missing: None,
+            drop_missing: false,
+            max_modulus: None,
+            position_offset: 0.0,
+            e2_sign: 1,
+            folder: PathBuf::new(),
+        }
+    }
+
+    /// Reads a description, and returns its text too.
+    pub fn read(path: &Path) -> Result<(Self, String), FileError> {
         let text = shearq_files::open::read_to_string(path, shearq_files::open::SETTINGS).map_err(
             FileError::doing(path, "cannot read the description of catalogues"),
         )?;
@@ -132,7 +157,7 @@ impl Foreign {
         check_pattern("catalogues", &foreign.catalogues, &[IMAGE_PLACEHOLDERS])
             .map_err(|message| FileError::new(path, message))?;
         foreign.folder = folder_of(path).to_owned();
-        Ok(foreign)
+        Ok((foreign, text))
     }
 
     /// The pattern of the catalogues' names, with its folder.
@@ -143,11 +168,6 @@ impl Foreign {
     /// The existing catalogues of `sets` (of all if empty).
     pub fn catalogues(&self, sets: &[u32]) -> Result<Files, FileError> {
         listing::find(&self.folder, &self.catalogues, &[""], sets)
-    }
-
-    /// The rows of one image ([`Foreign::rows`]) on the grid.
-    pub fn sum(&self, grid: &Grid, path: &Path) -> Result<(FieldSum, RowCounts), FileError> {
-        sum_foreign(grid, path, self.rows(path, most_rows(grid.cells()))?)
     }
 
     /// The rows of one image, at most `most`, converted to standard signs and the reported type.
@@ -162,22 +182,16 @@ impl Foreign {
         names.extend(self.flag.as_deref());
         let place = Place::with_table(path, self.table.as_deref())?;
         let table = table::read_from(&place, Some(&names), most).map_err(|error| {
-            error.hint_of_columns("the description of the catalogues specifies the names")
+            let hint = match self.catalogues.is_empty() {
+                true => HINT_OF_COLUMNS,
+                false => "the description of the catalogues specifies the names",
+            };
+            error.hint_of_columns(hint)
         })?;
         let column = |name: &str| table::numbers(&table, name, path);
         let flags = self.flag.as_deref().map(column).transpose()?;
         let (x, y) = (column(&self.x)?, column(&self.y)?);
         let (e1, e2) = (column(&self.e1)?, column(&self.e2)?);
-        let screen = Screen {
-            missing: self.missing,
-            max_modulus: self.max_modulus,
-            drop_missing: self.drop_missing,
-            conversion: match (self.ellipticity, self.report) {
-                (EllipticityType::Distortion, EllipticityType::Shear) => Conversion::ToShear,
-                (EllipticityType::Shear, EllipticityType::Distortion) => Conversion::ToDistortion,
-                _ => Conversion::None,
-            },
-        };
         let row = |k: usize| {
             let flagged = flags.as_ref().is_some_and(|flags| flags[k] != 0.0);
             let (e1, e2) = match flagged {
@@ -185,12 +199,33 @@ impl Foreign {
                 false => (e1[k], e2[k]),
             };
             let (x, y) = (x[k] + self.position_offset, y[k] + self.position_offset);
-            let row = screen.apply(Row { x, y, e1, e2 });
+            let [e1, e2] = self.screened(e1, e2).unwrap_or([f64::NAN; 2]);
             // After the screen, which compares with the values in the file. Conversions do not change the orientation.
-            let e2 = f64::from(self.e2_sign) * row.e2;
-            Row { e2, ..row }
+            let e2 = f64::from(self.e2_sign) * e2;
+            Row { x, y, e1, e2 }
         };
         Ok((0..x.len()).map(row).collect())
+    }
+
+    // The converted ellipticity; `None` if the galaxy was not measured.
+    fn screened(&self, e1: f64, e2: f64) -> Option<[f64; 2]> {
+        use EllipticityType::{Distortion as Chi, Shear as Epsilon};
+        let failed = is_failure(e1, e2);
+        let missing = self.missing.is_some_and(|m| e1 == m || e2 == m);
+        let e = match (self.ellipticity, self.report) {
+            _ if missing || failed && self.drop_missing => return None,
+            // No shear belongs to such a number, but only a request makes it missing: the sum refuses it.
+            _ if failed => [e1, e2],
+            (Chi, Epsilon) => Distortion::new(e1, e2).to_shear().map(|e| [e.e1, e.e2])?,
+            (Epsilon, Chi) => {
+                let e = Shear::new(e1, e2).to_distortion();
+                [e.e1, e.e2]
+            }
+            _ => [e1, e2],
+        };
+        let most = self.max_modulus;
+        most.is_none_or(|most| e[0].hypot(e[1]) <= most)
+            .then_some(e)
     }
 }
 
@@ -199,79 +234,6 @@ fn is_failure(e1: f64, e2: f64) -> bool {
     // HSM's −10 in one row of a hundred gave c = −0.096, and 1e30 gave m = 3.5e12, both without a message.
     let range = MeasuredRange::ELLIPTICITY;
     range.excludes(e1) || range.excludes(e2)
-}
-
-/// Which ellipticities of other programs mark a galaxy as not measured, and their type.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct Screen {
-    /// A value of e1 or e2.
-    pub missing: Option<f64>,
-    /// The largest valid |e|, after conversion.
-    pub max_modulus: Option<f64>,
-    /// Whether numbers that stand for a failed measurement mark it.
-    pub drop_missing: bool,
-    pub conversion: Conversion,
-}
-
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub enum Conversion {
-    #[default]
-    None,
-    /// From distortions to shear-type ellipticities.
-    ToShear,
-    /// The inverse.
-    ToDistortion,
-}
-
-impl Screen {
-    /// The row with a converted ellipticity, or NaN if the galaxy was not measured.
-    pub fn apply(&self, row: Row) -> Row {
-        let Row { e1, e2, .. } = row;
-        let failed = is_failure(e1, e2);
-        let missing = self.missing.is_some_and(|m| e1 == m || e2 == m);
-        let shape = match self.conversion {
-            _ if missing || failed && self.drop_missing => None,
-            // No shear belongs to such a number, but only a request makes it missing: the sum refuses it.
-            _ if failed => Some((e1, e2)),
-            Conversion::None => Some((e1, e2)),
-            Conversion::ToShear => Distortion::new(e1, e2).to_shear().map(|e| (e.e1, e.e2)),
-            Conversion::ToDistortion => {
-                let e = Shear::new(e1, e2).to_distortion();
-                Some((e.e1, e.e2))
-            }
-        };
-        let valid = |(e1, e2): &(f64, f64)| {
-            let most = self.max_modulus;
-            most.is_none_or(|most| e1.hypot(*e2) <= most)
-        };
-        let (e1, e2) = shape.filter(valid).unwrap_or((f64::NAN, f64::NAN));
-        Row { e1, e2, ..row }
-    }
-}
-
-/// Sums rows of another program's catalogue `path`.
-pub fn sum_foreign(
-    grid: &Grid,
-    path: &Path,
-    rows: impl IntoIterator<Item = Row>,
-) -> Result<(FieldSum, RowCounts), FileError> {
-    let mut sum = FieldSum::new(grid);
-    let counts = sum.add_image(grid, rows);
-    match fault_of_rows(&counts, grid, ADVICE_ON_SENTINELS) {
-        Some(fault) => Err(FileError::new(path, fault)),
-        None => Ok((sum, counts)),
-    }
-}
-
-/// A reader of images for other programs' catalogues with the given columns.
-pub fn plain_columns<'a>(
-    columns: [&'a str; 4],
-    screen: Screen,
-) -> impl Fn(&Grid, &Path) -> Result<(FieldSum, RowCounts), FileError> + Sync + 'a {
-    move |grid, path| {
-        let rows = read_rows(path, &columns, most_rows(grid.cells()))?;
-        sum_foreign(grid, path, rows.into_iter().map(|row| screen.apply(row)))
-    }
 }
 
 /// What to do about numbers that stand for a failed measurement, on the command line.
@@ -325,7 +287,7 @@ mod tests {
         let start = "name = \"F\"\ncatalogues = \"{set}-{image}.csv\"";
         std::fs::write(&toml, format!("{start}\n{names}\n{keys}\n")).unwrap();
         std::fs::write(&csv, format!("a,b,u,v,bad\n{lines}")).unwrap();
-        let foreign = Foreign::read(&toml).unwrap();
+        let foreign = Foreign::read(&toml).unwrap().0;
         assert_eq!(foreign.catalogues(&[]).unwrap().of_set(1).len(), 1);
         foreign.rows(&csv, 100).unwrap()
     }
@@ -339,28 +301,22 @@ mod tests {
         let failed = |keys| rows(keys, "1,1,-10,0.2,0\n")[0].e1;
         assert_eq!(failed("ellipticity = \"shear\""), -10.0);
         assert!(failed("ellipticity = \"shear\"\ndrop_missing = true").is_nan());
-        let screen = Screen {
+        let described = Foreign {
             missing: Some(-99.0),
             max_modulus: Some(0.5),
-            drop_missing: false,
-            conversion: Conversion::ToShear,
+            ..Foreign::of_columns(["a", "b", "u", "v"], EllipticityType::Distortion)
         };
-        let apply = |e1| {
-            let (x, y, e2) = (1.0, 1.0, 0.0);
-            screen.apply(Row { x, y, e1, e2 }).e1
-        };
-        assert!((apply(0.6) - 1.0 / 3.0).abs() < 1e-15);
+        let apply = |e1| described.screened(e1, 0.0).map(|e| e[0]);
+        assert!((apply(0.6).unwrap() - 1.0 / 3.0).abs() < 1e-15);
         // A distortion of 0.9 is a shear of 0.63.
-        assert!(apply(-99.0).is_nan() && apply(0.9).is_nan());
+        assert_eq!([-99.0, 0.9].map(apply), [None; 2]);
         // No shear belongs to −10, but only a request makes it missing.
-        let (x, y, e1, e2) = (1.0, 1.0, -10.0, 0.0);
         for drop_missing in [false, true] {
-            let screen = Screen {
+            let described = Foreign {
                 drop_missing,
-                conversion: Conversion::ToShear,
-                ..Screen::default()
+                ..Foreign::of_columns(["a", "b", "u", "v"], EllipticityType::Distortion)
             };
-            assert_eq!(screen.apply(Row { x, y, e1, e2 }).e1.is_nan(), drop_missing);
+            assert_eq!(described.screened(-10.0, 0.0).is_none(), drop_missing);
         }
     }
 }

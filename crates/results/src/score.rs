@@ -5,20 +5,19 @@ use std::path::{Path, PathBuf};
 
 use shearq_dataset::fingerprint;
 use shearq_dataset::layout::{DataFolder, MAX_SET};
-use shearq_dataset::run::{Run, kind_of};
+use shearq_dataset::run::kind_of;
 use shearq_dataset::threads::{Pool, ThreadError};
 use shearq_dataset::truth::{ReadTruth, Reading, Sign, read_truth, reading_of};
 use shearq_files::FileError;
 use shearq_scoring::{
-    Choice, Convention, ConventionMatch, Fault, FieldSum, Grid, ImageFaults, OddResponse, Options,
-    RowCounts, ScoringError, SetImages, SetScore, SetScorer, TruthSign, sign_by_correlation,
+    Choice, Convention, ConventionMatch, Fault, Grid, ImageFaults, OddResponse, Options, RowCounts,
+    ScoringError, SetImages, SetScore, SetScorer, TruthSign, sign_by_correlation,
 };
 use shearq_submissions::ConfigurationError;
 use thiserror::Error;
 
-use crate::catalogues::Catalogues;
+use crate::catalogues::{Catalogues, PLAIN_SET};
 use crate::record::SetRecord;
-use crate::response::response_of;
 
 /// Why catalogues cannot be scored or compared.
 #[derive(Debug, Error)]
@@ -66,7 +65,7 @@ pub struct ScoredSet {
 impl ScoredSet {
     /// `None` for plain files.
     pub fn number(&self) -> Option<u32> {
-        (self.record.set > 0).then_some(self.record.set)
+        (self.record.set != PLAIN_SET).then_some(self.record.set)
     }
 }
 
@@ -120,19 +119,13 @@ impl OddImages {
     }
 }
 
-/// Reads one catalogue onto the grid.
-pub type ReadImage<'a> =
-    &'a (dyn Fn(&Grid, &Path) -> Result<(FieldSum, RowCounts), FileError> + Sync);
-
 struct SetFiles<'a> {
     // `None` for plain files.
     set: Option<u32>,
     simulated: bool,
+    catalogues: &'a Catalogues,
     images: Vec<u32>,
     paths: Vec<PathBuf>,
-    // Their names in messages: members of an archive, not of the folder that it was unpacked to.
-    names: Vec<PathBuf>,
-    read: ReadImage<'a>,
     // Of the whole set: that of one image of few galaxies is noisy, and ⟨1/R̂⟩ exceeds 1/⟨R⟩.
     response: [f64; 2],
     pool: &'a Pool,
@@ -145,7 +138,31 @@ struct Added {
     compared: bool,
 }
 
-impl SetFiles<'_> {
+impl<'a> SetFiles<'a> {
+    fn new(
+        catalogues: &'a Catalogues,
+        number: u32,
+        simulated: bool,
+        pool: &'a Pool,
+    ) -> Result<Self, FileError> {
+        let (images, paths) = catalogues.files.of_set(number).into_iter().unzip();
+        Ok(SetFiles {
+            set: (number != PLAIN_SET).then_some(number),
+            simulated,
+            catalogues,
+            images,
+            paths,
+            response: catalogues.response(number)?,
+            pool,
+        })
+    }
+
+    // Members of an archive, not of the folder that it was unpacked to.
+    fn names(&self) -> Vec<PathBuf> {
+        let names = self.paths.iter().map(|path| self.catalogues.as_given(path));
+        names.collect()
+    }
+
     fn wrong(&self) -> impl Fn(ScoringError) -> ScoreError + use<> {
         let set = self.set;
         move |source| ScoreError::Scoring { set, source }
@@ -162,7 +179,7 @@ impl SetFiles<'_> {
         let mut images = SetImages::new(grid);
         let mut rows = RowCounts::default();
         let read = self.pool.in_order(&self.paths, |path| {
-            let (mut sum, rows) = (self.read)(grid, path)?;
+            let (mut sum, rows) = self.catalogues.sum(grid, path)?;
             sum.e1 /= self.response[0];
             sum.e2 /= self.response[1];
             let response = compared.and_then(|(scorer, own)| scorer.response(&sum, own));
@@ -176,14 +193,15 @@ impl SetFiles<'_> {
             rows += more;
         }
         // Without galaxies, the score would be the score of a method that measures no shear.
-        if let (0, Some(first)) = (rows.used, self.names.first()) {
-            let message = nothing_used(&rows, self.names.len(), grid);
+        let names = self.names();
+        if let (0, Some(first)) = (rows.used, names.first()) {
+            let message = nothing_used(&rows, names.len(), grid);
             return Err(FileError::new(first, message).into());
         }
         Ok(Added {
             images,
             rows,
-            odd_images: OddImages::new(&faults, &self.names),
+            odd_images: OddImages::new(&faults, &names),
             compared: compared.is_some(),
         })
     }
@@ -216,7 +234,7 @@ impl SetFiles<'_> {
             added.odd_images = self.add_up(&score.grid, compared)?.odd_images;
         }
         let findings = scorer.diagnose(&added.images, &score, convention);
-        let (set, images) = (self.set.unwrap_or(0), self.images.clone());
+        let (set, images) = (self.set.unwrap_or(PLAIN_SET), self.images.clone());
         let known = basis.is_known();
         let record = SetRecord::new(set, self.simulated, images, &score, &added.rows, known);
         Ok(ScoredSet {
@@ -231,12 +249,11 @@ impl SetFiles<'_> {
     }
 }
 
-/// Scores one set from a truth file and one catalogue per image.
+/// Scores plain files of one set against a truth file.
 pub fn score_files(
     truth: &Path,
-    catalogues: &[PathBuf],
+    catalogues: &Catalogues,
     reading: &Reading,
-    read: ReadImage<'_>,
     options: Options,
     threads: usize,
 ) -> Result<ScoredSet, ScoreError> {
@@ -245,16 +262,8 @@ pub fn score_files(
         mut shear,
         sign,
     } = read_truth(truth, reading)?;
-    let files = SetFiles {
-        set: None,
-        simulated: false,
-        images: (1..=catalogues.len() as u32).collect(),
-        paths: catalogues.to_vec(),
-        names: catalogues.to_vec(),
-        read,
-        response: response_of(catalogues.iter().map(PathBuf::as_path))?,
-        pool: &Pool::new(threads)?,
-    };
+    let pool = Pool::new(threads)?;
+    let files = SetFiles::new(catalogues, PLAIN_SET, false, &pool)?;
     let added = files.add_up(&grid, None)?;
     let sign = match sign {
         Some(sign) => sign,
@@ -321,20 +330,7 @@ fn score_sets(
     for &set in sets {
         catalogues.check_axes(set)?;
     }
-    let read = |grid: &Grid, path: &Path| catalogues.sum(grid, path);
-    let files = |set: u32| -> Result<_, ScoreError> {
-        let (images, paths): (Vec<u32>, Vec<PathBuf>) = catalogues.of_set(set).into_iter().unzip();
-        Ok(SetFiles {
-            set: Some(set),
-            simulated: kind_of(data, set).is_some(),
-            images,
-            names: paths.iter().map(|path| catalogues.as_given(path)).collect(),
-            paths,
-            read: &read,
-            response: catalogues.response(set)?,
-            pool,
-        })
-    };
+    let files = |set| SetFiles::new(catalogues, set, kind_of(data, set).is_some(), pool);
     let scorer = |files: &SetFiles<'_>, set: u32, options| -> Result<_, ScoreError> {
         let ReadTruth { grid, shear, .. } = read_truth(&data.truth(set), &reading_of(data, set)?)?;
         let scorer = SetScorer::new(grid, shear, options).map_err(files.wrong())?;
@@ -373,7 +369,7 @@ fn sets_to_score(
     wanted: &[u32],
 ) -> Result<Vec<u32>, ScoreError> {
     // Sets differ in Q by more than methods do, so that methods are compared on their common sets.
-    let complete = |set: &u32| variants.iter().all(|v| !v.0.of_set(*set).is_empty());
+    let complete = |set: &u32| variants.iter().all(|v| !v.0.files.of_set(*set).is_empty());
     if let Some(set) = wanted.iter().find(|set| !complete(set)) {
         return Err(ScoreError::NoCatalogue { set: Some(*set) });
     }
@@ -393,31 +389,18 @@ pub fn score_catalogues(
     options: Options,
     threads: usize,
 ) -> Result<Vec<ScoredSet>, ScoreError> {
-    if let Some(run) = catalogues.run() {
+    if let Some(run) = &catalogues.run {
         fingerprint::verify(data, &catalogues.path, run, sets, &Pool::new(threads)?)?;
     }
     let variant = [(catalogues, options.choice)];
     let scored = score_variants(data, &variant, sets, options, threads);
     let scored = scored.map_err(|error| match error {
-        ScoreError::NoCatalogue { .. } if catalogues.run().is_some() => {
+        ScoreError::NoCatalogue { .. } if catalogues.run.is_some() => {
             FileError::new(&catalogues.path, error).into()
         }
         other => other,
     })?;
     Ok(scored.into_iter().flatten().collect())
-}
-
-/// Scores `sets` of a folder of results, or all if it is empty, against the truth of `data`.
-pub fn score_folder(
-    data: &DataFolder,
-    out: &Path,
-    run: &Run,
-    sets: &[u32],
-    options: Options,
-    threads: usize,
-) -> Result<Vec<ScoredSet>, ScoreError> {
-    let catalogues = Catalogues::measured(run, out, sets)?;
-    score_catalogues(data, &catalogues, sets, options, threads)
 }
 
 /// Warnings about images of `data` that were not scored, in `sets` (in all if empty).

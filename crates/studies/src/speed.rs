@@ -19,13 +19,14 @@ use shearq_pipeline::simulate::simulator;
 use shearq_quantities::statistics::median;
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_render::table::{Cell, Table};
-use shearq_results::catalogues::COLUMNS;
-use shearq_results::foreign::{Screen, plain_columns};
+use shearq_results::catalogues::{COLUMNS, Catalogues};
+use shearq_results::foreign::Foreign;
 use shearq_results::score::{ScoreError, score_files};
 use shearq_scoring::{Options, TruthSign};
 use shearq_simulate::render::RenderScratch;
 use shearq_simulate::set::{NOISE_SIGMA, STAMP, SimulationSettings};
 use shearq_submissions::Configuration;
+use shearq_submissions::EllipticityType;
 
 // Set 2 is the fiducial one: S/N 20 and one PSF for all galaxies.
 const FIDUCIAL_SET: u32 = 2;
@@ -187,7 +188,6 @@ pub fn scoring(threads: usize) -> Result<Table, ScoreError> {
         stamp: Pixels(48.0),
         sign: Some(TruthSign::Standard),
     };
-    let read = plain_columns(COLUMNS, Screen::default());
     let mut rows = Vec::new();
     for (name, ending, format) in [
         ("Parquet", "parquet", Some(FileFormat::Parquet)),
@@ -203,7 +203,9 @@ pub fn scoring(threads: usize) -> Result<Table, ScoreError> {
             }
         }
         let options = Options::default();
-        let score = || score_files(&truth, &paths, &reading, &read, options, threads);
+        let described = Foreign::of_columns(COLUMNS, EllipticityType::Shear);
+        let catalogues = Catalogues::plain(&paths, described);
+        let score = || score_files(&truth, &catalogues, &reading, options, threads);
         let seconds = median_seconds(|| score().map(|scored| _ = black_box(scored)))?;
         rows.push((name, seconds));
     }

@@ -41,12 +41,20 @@ impl Packing<'_> {
     /// Number of galaxies to pack, estimated from the first catalogue for progress bars.
     pub fn galaxies(&self) -> Result<u64, FileError> {
         let own = self.catalogues;
-        let place = || own.description().map_or(own.path.clone(), Foreign::pattern);
-        if own.serve_all_sets() {
+        let place = || {
+            own.description
+                .as_ref()
+                .map_or(own.path.clone(), Foreign::pattern)
+        };
+        if own.files.serve_all_sets() {
             let message = "the pattern of the catalogues contains no {set}, which the names of packed files need";
             return Err(FileError::new(place(), message));
         }
-        let mut all = own.sets().into_iter().flat_map(|set| own.of_set(set));
+        let mut all = own
+            .files
+            .sets()
+            .into_iter()
+            .flat_map(|set| own.files.of_set(set));
         let Some((_, first)) = all.next() else {
             return Err(FileError::new(place(), "found no catalogue to pack"));
         };
@@ -72,7 +80,7 @@ impl Packing<'_> {
     }
 
     fn grid(&self, set: u32, catalogue: &Path) -> Result<Grid, FileError> {
-        match (self.catalogues.run(), self.data) {
+        match (&self.catalogues.run, self.data) {
             (Some(run), _) => {
                 let field = Degrees(run.source.layout().field_degrees);
                 let rows = self.catalogues.rows(catalogue, [1.0; 2], MAX_ROWS)?;
@@ -91,11 +99,11 @@ impl Packing<'_> {
     pub fn write(&self, out: &Path, progress: &mut dyn Progress) -> Result<usize, FileError> {
         let found = self.catalogues;
         let per_set = |set| match self.contents {
-            Contents::Catalogues => found.of_set(set).len(),
+            Contents::Catalogues => found.files.of_set(set).len(),
             Contents::Spectra | Contents::CrossSpectra => 1,
         };
         // Checked first, because catalogues of a whole challenge take minutes to pack.
-        check_number(found.sets().into_iter().map(per_set).sum(), out)?;
+        check_number(found.files.sets().into_iter().map(per_set).sum(), out)?;
         let mut destination = Destination::create(out)?;
         let mut files = BTreeMap::new();
         let mut covariances = BTreeMap::new();
@@ -108,8 +116,8 @@ impl Packing<'_> {
             files.insert(name, sum);
             Ok(())
         };
-        for set in found.sets() {
-            let catalogues = found.of_set(set);
+        for set in found.files.sets() {
+            let catalogues = found.files.of_set(set);
             let method = self.method.clone();
             if self.contents.is_spectra() {
                 let kind = Kind::Spectrum { set, method };
@@ -133,7 +141,7 @@ impl Packing<'_> {
             }
         }
         // A spectrum does not contain the convention, so that a wrong one could not be found by the organiser.
-        if let (true, Some(foreign)) = (matching.is_clear(), found.description())
+        if let (true, Some(foreign)) = (matching.is_clear(), &found.description)
             && matching.convention() != Convention::STANDARD
         {
             let wrong = matching.convention();
@@ -150,8 +158,8 @@ impl Packing<'_> {
             method: self.method.clone(),
             contents: self.contents,
             entry: self.entry.clone(),
-            run: found.run().cloned(),
-            foreign: found.description().cloned(),
+            run: found.run.clone(),
+            foreign: found.description.clone(),
             files,
             covariances,
         };
