@@ -4,6 +4,7 @@ use std::fmt;
 use std::path::{Path, PathBuf};
 
 use shearq_files::FileError;
+use shearq_files::frames::Metadata;
 use shearq_files::table::{self, FileFormat};
 use shearq_measure::PixelFrame;
 use shearq_quantities::Frame;
@@ -138,7 +139,11 @@ impl CommonAxes {
 /// The axes that a catalogue states.
 pub fn stated_axes(path: &Path, format: FileFormat) -> Result<Axes, FileError> {
     let keys = [FRAME.to_owned()];
-    let metadata = table::read_metadata(path, format, keys.iter())?;
+    axes_of(path, &table::read_metadata(path, format, keys.iter())?)
+}
+
+/// The axes that the metadata of the catalogue `path` state by [`FRAME`].
+pub fn axes_of(path: &Path, metadata: &Metadata) -> Result<Axes, FileError> {
     let Some(text) = metadata.get(FRAME) else {
         return Ok(Axes::Pixel);
     };

@@ -3,9 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use shearq_dataset::metadata::{
-    CommonAxes, FIRST_PIXEL, FRAME, NOT_APPLIED, RESPONSE, stated_axes,
-};
+use shearq_dataset::metadata::{CommonAxes, FIRST_PIXEL, FRAME, NOT_APPLIED, RESPONSE, axes_of};
 use shearq_dataset::run::Run;
 use shearq_files::FileError;
 use shearq_files::frames::polars::{Column, DataFrame};
@@ -17,7 +15,7 @@ use shearq_quantities::matrix::solve;
 use shearq_quantities::statistics::RunningMean;
 use shearq_submissions::Calibration;
 
-use crate::select::{READ, WEIGHT, Weighted};
+use crate::select::{READ, WEIGHT, undivided_columns};
 
 /// The mean responses R11 and R22 of the good galaxies of all `catalogues` of a set; 1 of catalogues whose ellipticities are
 /// not to be divided: of networks, of other programs, and of earlier versions, which divided each image by its own response.
@@ -137,8 +135,6 @@ struct Image {
     path: PathBuf,
     place: (u32, u32),
     group: (usize, u32, u32),
-    table: DataFrame,
-    rows: Weighted,
 }
 
 #[derive(Default)]
@@ -179,7 +175,7 @@ pub fn shears(
             for (image, path) in files.of_set(set) {
                 let keys = [FRAME, FIRST_PIXEL, "creator", "submiss", "elltype"].map(str::to_owned);
                 let stated = table::read_metadata(&path, run.format, keys.iter())?;
-                let own = stated_axes(&path, run.format)?;
+                let own = axes_of(&path, &stated)?;
                 axes.add(&path, own, false)?;
                 check_positions(&path, treecorr, own.frame() == Frame::Sky)?;
                 if metadata.is_empty() {
@@ -190,12 +186,9 @@ pub fn shears(
                     Shared::Set => (folder, set, 0),
                     Shared::Image => (folder, set, image),
                 };
-                let (image, sum) = (
-                    Image::read(path, (set, image), group)?,
-                    sums.entry(group).or_default(),
-                );
-                image.add_to(sum);
-                images.push(image);
+                sums.entry(group).or_default().add_catalogue(&path)?;
+                let place = (set, image);
+                images.push(Image { path, place, group });
             }
         }
     }
@@ -212,6 +205,7 @@ pub fn shears(
         check_significance(path, &[r11, r22])?;
         responses.insert(*group, sum.response(*group));
     }
+    // Catalogues are read a second time, so that only the columns that are written stay in memory.
     let (mut whole, mut good) = (None::<DataFrame>, 0);
     for image in images {
         let (table, with_shear) = image.sheared(&responses[&image.group], treecorr)?;
@@ -261,51 +255,37 @@ fn check_positions(path: &Path, treecorr: Option<Position>, is_sky: bool) -> Res
 }
 
 impl Image {
-    fn read(path: PathBuf, place: (u32, u32), group: (usize, u32, u32)) -> Result<Self, FileError> {
-        let table = table::read(&path, None, table::MAX_ROWS)?;
-        let (mut rows, flags) = Weighted::unselected(&path, true)?;
-        if table
-            .get_column_names()
-            .iter()
-            .any(|name| name.as_str() == WEIGHT)
-        {
-            rows.weight = table::numbers(&table, WEIGHT, &path)?.into_owned();
-        }
-        for (row, _) in flags.iter().enumerate().filter(|(_, flag)| **flag != 0.0) {
-            rows.weight[row] = f64::NAN;
-        }
-        Ok(Image {
-            path,
-            place,
-            group,
-            table,
-            rows,
-        })
-    }
-
-    fn add_to(&self, sum: &mut Sum) {
-        let Weighted {
-            response: [r11, r22],
-            cross: [r12, r21],
-            weight,
-            ..
-        } = &self.rows;
-        // The weight of flagged galaxies is NaN.
-        for row in (0..weight.len()).filter(|row| weight[*row].is_finite()) {
-            sum.weight.add(weight[row]);
-            let responses = [r11, r22, r12, r21].map(|column| column[row]);
-            let means = sum.responses.iter_mut().zip(responses);
-            means.for_each(|(mean, response)| mean.add(response));
-        }
-    }
-
     // The table with shears, and the number of galaxies that have one.
     fn sheared(
         &self,
         response: &SharedResponse,
         treecorr: Option<Position>,
     ) -> Result<(DataFrame, usize), FileError> {
-        let Weighted { e, weight, .. } = &self.rows;
+        let path = &self.path;
+        let names = undivided_columns(path)?;
+        let positions: &[&str] = match treecorr {
+            None => &[],
+            Some(Position::Sky) => &["ra", "dec"],
+            Some(Position::Pixel) => &["x", "y"],
+        };
+        let absent = |name: &&&str| !names.iter().any(|own| own == **name);
+        if let Some(name) = positions.iter().find(absent) {
+            return Err(FileError::no_column(path, name, &names));
+        }
+        // Columns that were not measured on the stamps are copied.
+        let copied = |name: &str| match treecorr {
+            None => name == "flags" || !is_measured(name),
+            Some(_) => positions.contains(&name),
+        };
+        let wanted = names.iter().map(String::as_str);
+        let wanted =
+            wanted.filter(|name| ["e1", "e2"].contains(name) || is_counted(name) || copied(name));
+        let table = table::read(path, Some(&wanted.collect::<Vec<_>>()), table::MAX_ROWS)?;
+        let e = [
+            table::numbers(&table, "e1", path)?,
+            table::numbers(&table, "e2", path)?,
+        ];
+        let weight = weights(path, &table)?;
         let [r11, r22, r12, r21] = response.mean;
         let shear = |row: usize| {
             solve(
@@ -328,12 +308,10 @@ impl Image {
             Column::new("w".into(), w.collect::<Vec<f64>>()),
         ];
         let wrong = |error: &dyn std::fmt::Display| FileError::new(&self.path, error.to_string());
-        let mut columns = Vec::new();
+        let all = table.columns().iter();
+        let mut columns: Vec<Column> = all.filter(|own| copied(own.name())).cloned().collect();
         match treecorr {
             None => {
-                let all = self.table.columns().iter();
-                let kept = all.filter(|own| own.name() == "flags" || !is_measured(own.name()));
-                columns.extend(kept.cloned());
                 // After the position, as in catalogues.
                 let after = columns
                     .iter()
@@ -343,20 +321,8 @@ impl Image {
                 let new = [number("set", set), number("image", image)];
                 columns.splice(after..after, new.into_iter().chain(measured));
             }
-            Some(position) => {
-                let names = match position {
-                    Position::Sky => ["ra", "dec"],
-                    Position::Pixel => ["x", "y"],
-                };
-                for name in names {
-                    let found = self.table.column(name).map_err(|_| {
-                        let names = self.table.get_column_names();
-                        let names: Vec<String> =
-                            names.iter().map(|name| name.to_string()).collect();
-                        FileError::no_column(&self.path, name, &names)
-                    })?;
-                    columns.push(found.clone());
-                }
+            Some(_) => {
+                columns.sort_by_key(|own| positions.iter().position(|name| own.name() == name));
                 columns.extend(measured);
             }
         }
@@ -370,6 +336,27 @@ impl Image {
 }
 
 impl Sum {
+    fn add_catalogue(&mut self, path: &Path) -> Result<(), FileError> {
+        const RESPONSES: [&str; 4] = ["R11", "R22", "R12", "R21"];
+        let names = undivided_columns(path)?;
+        let counted = names
+            .iter()
+            .map(String::as_str)
+            .filter(|name| is_counted(name));
+        let wanted: Vec<&str> = RESPONSES.into_iter().chain(counted).collect();
+        let table = table::read(path, Some(&wanted), table::MAX_ROWS)?;
+        let weight = weights(path, &table)?;
+        for (mean, name) in self.responses.iter_mut().zip(RESPONSES) {
+            let responses = table::numbers(&table, name, path)?;
+            let good = responses.iter().zip(&weight);
+            let good = good.filter(|(_, weight)| weight.is_finite());
+            good.for_each(|(response, _)| mean.add(*response));
+        }
+        let good = weight.into_iter().filter(|weight| weight.is_finite());
+        good.for_each(|weight| self.weight.add(weight));
+        Ok(())
+    }
+
     fn response(&self, (folder, set, image): (usize, u32, u32)) -> SharedResponse {
         // Responses of a selection contain its weights.
         let (weight, count) = (self.weight.mean(), self.weight.count());
@@ -390,6 +377,28 @@ impl Sum {
                 .map(|own| own.deviation() / (count as f64).sqrt() / weight),
         }
     }
+}
+
+// Whether a column determines which galaxies count.
+fn is_counted(name: &str) -> bool {
+    name == "flags" || name == WEIGHT
+}
+
+// The weights of a selection, or 1; NaN of flagged galaxies.
+fn weights(path: &Path, table: &DataFrame) -> Result<Vec<f64>, FileError> {
+    let flags = table::numbers(table, "flags", path)?;
+    let mut weights = match table.column(WEIGHT) {
+        Ok(_) => table::numbers(table, WEIGHT, path)?.into_owned(),
+        Err(_) => vec![1.0; flags.len()],
+    };
+    for (weight, _) in weights
+        .iter_mut()
+        .zip(&*flags)
+        .filter(|(_, flag)| **flag != 0.0)
+    {
+        *weight = f64::NAN;
+    }
+    Ok(weights)
 }
 
 // Whether a column was measured on the stamps.

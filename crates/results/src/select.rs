@@ -222,10 +222,13 @@ pub(crate) fn require_responses<'a>(
     ))
 }
 
-fn check_undivided(path: &Path) -> Result<(), FileError> {
+/// The names of the columns of a catalogue that is not divided by its response.
+pub(crate) fn undivided_columns(path: &Path) -> Result<Vec<String>, FileError> {
     let present = table::columns(&Place::of(path))?;
-    let names = present.named.iter().flat_map(|named| &named.names);
-    refuse_divided(path, names.map(String::as_str))
+    let names = present.named.into_iter().flat_map(|named| named.names);
+    let names: Vec<String> = names.collect();
+    refuse_divided(path, names.iter().map(String::as_str))?;
+    Ok(names)
 }
 
 /// Refuses catalogues of earlier versions, whose ellipticities were divided by `divisor1` and `divisor2`: Σ e / Σ R would be
@@ -337,7 +340,7 @@ impl Weighted {
     pub(crate) fn unselected(path: &Path, calibrated: bool) -> Result<(Self, Vec<f64>), FileError> {
         let names = if calibrated { &READ[..] } else { &READ[..3] };
         if calibrated {
-            check_undivided(path)?;
+            undivided_columns(path)?;
         }
         let read = table::read(path, Some(names), table::MAX_ROWS)?;
         let column = |name: &str| table::numbers(&read, name, path).map(Cow::into_owned);
