@@ -386,6 +386,14 @@ impl SetImages {
         Ok(())
     }
 
+    /// Divides e₁ and e₂ of all images by a response to shear, which may be known only after the last image.
+    pub fn divide(&mut self, response: [f64; 2]) {
+        for sum in self.groups.iter_mut().chain([&mut self.total]) {
+            sum.e1 /= response[0];
+            sum.e2 /= response[1];
+        }
+    }
+
     /// The sums of the groups.
     pub fn groups(&self) -> &[FieldSum] {
         &self.groups

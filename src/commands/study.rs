@@ -8,8 +8,7 @@ use crate::{made_by, print};
 use shearq_dataset::layout::MAX_IMAGE;
 use shearq_render::page::Page;
 use shearq_render::table::TableFormat;
-use shearq_results::views::pages;
-use shearq_studies::contest::{bias_sets, contest_parts, contest_table};
+use shearq_studies::contest::{bias_sets, contest_figure, contest_parts, contest_table};
 use shearq_studies::reproduce::{Plan, Study, run_sets};
 
 /// Compare configurations with each other and with the Cramér–Rao bound.
@@ -91,7 +90,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     page.section("Ellipticities", "Scatter and biases on every kind of set.");
     page.figure(
         "study",
-        &pages::contest(&table),
+        &contest_figure(&plan, &results, &biases),
         "Each configuration on each set, with errors. Grey: the requirement |m| < 0.002. Dashed: the Cramér–Rao bound, zero additive bias. The expected Q is for noise at the bound and a perfect spectrum. A method that loses shear together with noise can exceed it.",
     )?;
     page.table("biases", &shapes)?;

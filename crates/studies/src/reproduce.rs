@@ -16,10 +16,11 @@ use shearq_dataset::mosaic::Mosaic;
 use shearq_dataset::record::{Claim, claim, nan_for_null, read_record, write_record};
 use shearq_dataset::threads::Progress;
 use shearq_files::FileError;
-use shearq_measure::{Batch, Measurement, Measurer};
+use shearq_measure::{Measurement, Measurer};
 use shearq_pipeline::PipelineError;
 use shearq_pipeline::run::{measurers, run_set};
 use shearq_pipeline::simulate::simulator;
+use shearq_quantities::statistics::RunningMean;
 use shearq_results::catalogues::OWN;
 use shearq_results::record::SetRecord;
 use shearq_simulate::kinds::SetKind;
@@ -134,6 +135,15 @@ pub fn run_sets(
     })
 }
 
+// Sums over the images of a set that one configuration measured. Ellipticities are not yet divided by a response.
+#[derive(Clone)]
+struct ConfigurationSums {
+    images: SetImages,
+    rows: RowCounts,
+    regression: Regression,
+    responses: [RunningMean; 2],
+}
+
 // Simulates the images of a set, measures them with all measurers and scores the results.
 fn measure_set(
     plan: &Plan,
@@ -149,11 +159,12 @@ fn measure_set(
     let simulator = simulator(set, plan.simulation)?;
     let grid = simulator.grid();
     let images: Vec<u32> = (1..=plan.images).collect();
-    let sums = (
-        SetImages::new(&grid),
-        RowCounts::default(),
-        Regression::default(),
-    );
+    let sums = ConfigurationSums {
+        images: SetImages::new(&grid),
+        rows: RowCounts::default(),
+        regression: Regression::default(),
+        responses: [RunningMean::default(); 2],
+    };
     let mut sums = vec![sums; measurers.len()];
     run_set(
         &simulator,
@@ -162,12 +173,18 @@ fn measure_set(
         threads,
         progress,
         |image, _| {
-            for ((sum, counts, regression), batch) in sums.iter_mut().zip(image.batches) {
-                let galaxies = divided(batch);
-                let (field, used) = field_sum(&grid, &galaxies);
-                sum.add(&field).map_err(scoring)?;
-                *counts += used;
-                regression.add(image.observed.iter().copied().zip(&galaxies));
+            for (sums, batch) in sums.iter_mut().zip(image.batches) {
+                let galaxies = &batch.galaxies;
+                let (field, used) = field_sum(&grid, galaxies);
+                sums.images.add(&field).map_err(scoring)?;
+                sums.rows += used;
+                let pairs = image.observed.iter().copied().zip(galaxies);
+                sums.regression.add(pairs);
+                let good = galaxies.iter().filter(|galaxy| galaxy.flags.is_empty());
+                for galaxy in good.filter(|_| batch.response.is_some()) {
+                    let means = sums.responses.iter_mut().zip(galaxy.response_diagonal());
+                    means.for_each(|(mean, response)| mean.add(response));
+                }
             }
             Ok(())
         },
@@ -186,21 +203,27 @@ fn measure_set(
         true_ee: [0.0; BINS],
         results: Vec::new(),
     };
-    for (sum, rows, regression) in &sums {
-        let score = scorer.score(sum).map_err(scoring)?;
-        let (q_spectrum, q_spectrum_error) = spectrum_quality(&score, sum).unzip();
+    for mut sums in sums {
+        // The response of a set, as `score` uses it: that of an image is noisy, and ⟨1/R̂⟩ exceeds 1/⟨R⟩.
+        if sums.responses[0].count() > 0 {
+            let response = sums.responses.map(|own| own.mean());
+            sums.images.divide(response);
+            sums.regression.divide(response);
+        }
+        let score = scorer.score(&sums.images).map_err(scoring)?;
+        let (q_spectrum, q_spectrum_error) = spectrum_quality(&score, &sums.images).unzip();
         (result.l, result.true_ee) = (score.bins.l, score.true_ee);
         // The settings of the plan identify simulated data, so there is no fingerprint.
         let simulated = SetKind::of(set).is_some();
         result.results.push(ConfigurationResult {
             configuration: String::new(),
-            score: SetRecord::new(set, simulated, images.clone(), &score, rows, true),
+            score: SetRecord::new(set, simulated, images.clone(), &score, &sums.rows, true),
             convention_matched: score.matching.best().number(),
             ee: score.spectra().ee,
             ee_error: score.ee_error,
             q_spectrum,
             q_spectrum_error: q_spectrum_error.flatten(),
-            response: regression.response(),
+            response: sums.regression.response(),
         });
     }
     Ok(result)
@@ -235,19 +258,6 @@ fn distinct(configurations: &[Configuration]) -> (Vec<Configuration>, Vec<usize>
         }));
     }
     (kept, place)
-}
-
-// The galaxies of an image, divided by its own mean response: simulated images have 10,000 galaxies, which determine it to
-// 0.5 %, so that the quotient is biased by 3·10⁻⁵, and one image after the other fits into memory.
-fn divided(batch: &Batch) -> Vec<Measurement> {
-    let [r1, r2] = batch.response.unwrap_or([1.0; 2]);
-    let divided = |galaxy: &Measurement| {
-        let mut galaxy = *galaxy;
-        galaxy.e1 /= r1;
-        galaxy.e2 /= r2;
-        galaxy
-    };
-    batch.galaxies.iter().map(divided).collect()
 }
 
 // The measurements of one image on the grid, and how the rows were used. Flagged galaxies count as missing.

@@ -64,6 +64,15 @@ impl Regression {
         }
     }
 
+    /// Divides the measured ellipticities by a response, which is known only after the last galaxy.
+    pub fn divide(&mut self, response: [f64; 2]) {
+        for (sums, response) in self.components.iter_mut().zip(response) {
+            sums.e /= response;
+            sums.te /= response;
+            sums.ee /= response * response;
+        }
+    }
+
     /// The fit; not a number if there are too few galaxies.
     pub fn response(&self) -> Response {
         let n = self.galaxies as f64;

@@ -6,8 +6,8 @@ use crate::score::ScoredSet;
 use shearq_bias::QUANTITIES;
 use shearq_measure::Steps;
 use shearq_render::figure::{
-    Band, ColourMap, FigureError, HeatMap, ImageGrid, ImagePanel, ImageRow, LinePlot, PanelGrid,
-    Series, Stretch, Style,
+    ColourMap, FigureError, HeatMap, ImageGrid, ImagePanel, ImageRow, LinePlot, PanelGrid, Series,
+    Stretch, Style,
 };
 use shearq_render::html::{Block, Picture, Report, Section};
 use shearq_render::table::{Cell, Table};
@@ -240,128 +240,6 @@ pub fn steps_figure(title: &str, rows: Vec<ImageRow>) -> ImageGrid {
     ImageGrid {
         title: format!("{title} (shearq {})", shearq_dataset::VERSION),
         rows,
-    }
-}
-
-// Requirement of future surveys on |m| in units of 10⁻³, as in the table of a study.
-const REQUIREMENT: f64 = 2.0;
-const REQUIREMENT_COLOUR: usize = 6;
-// Largest plotted m, if any m is smaller.
-const LARGEST_M: f64 = 20.0;
-
-/// Plots of a study: scatter over the bound, biases and Q, with requirements and bounds. `table` has one row per set
-/// and configuration.
-#[allow(clippy::too_many_lines, reason = "one panel after the other")]
-pub fn contest(table: &Table) -> PanelGrid {
-    let text = |row: &[Cell], key: &str| match table.place(key).and_then(|k| row.get(k)) {
-        Some(Cell::Text(words)) => words.clone(),
-        _ => String::new(),
-    };
-    let number = |row: &[Cell], key: &str| match table.place(key).and_then(|k| row.get(k)) {
-        Some(&Cell::Number { value, error, .. }) => (value, error.unwrap_or(f64::NAN)),
-        _ => (f64::NAN, f64::NAN),
-    };
-    // Rows of means have no set number.
-    let rows: Vec<(f64, &[Cell])> = table
-        .rows
-        .iter()
-        .filter_map(|row| Some((text(row, "set").parse().ok()?, row.as_slice())))
-        .collect();
-    let mut names: Vec<String> = Vec::new();
-    for (_, row) in &rows {
-        let name = text(row, "submission");
-        if !names.contains(&name) {
-            names.push(name);
-        }
-    }
-    let ends = || {
-        let sets = || rows.iter().map(|(set, _)| *set);
-        let (least, most) = (
-            sets().fold(f64::INFINITY, f64::min),
-            sets().fold(f64::NEG_INFINITY, f64::max),
-        );
-        vec![least - 0.5, most + 0.5]
-    };
-    let plot = |key: &str, label: &str, level: Option<(&str, f64)>| {
-        let line = level.map(|(name, value)| {
-            let colour = REQUIREMENT_COLOUR;
-            Series::new(name, ends(), vec![value; 2], Style::Dashed, colour)
-        });
-        let mut series: Vec<Series> = line.into_iter().collect();
-        for (k, name) in names.iter().enumerate() {
-            // Shifted, so that points do not hide each other.
-            let aside = (k as f64 - (names.len() as f64 - 1.0) / 2.0) * 0.2;
-            let own = || {
-                rows.iter()
-                    .filter(|(_, row)| text(row, "submission") == *name)
-            };
-            let (y, errors) = own().map(|(_, row)| number(row, key)).unzip();
-            let x = own().map(|(set, _)| set + aside).collect();
-            series.push(Series::new(name, x, y, Style::Points, k).with_errors(errors));
-        }
-        LinePlot {
-            title: label.into(),
-            x_label: "set".into(),
-            x_whole: true,
-            y_label: label.into(),
-            series,
-            ..LinePlot::default()
-        }
-    };
-    // Uncalibrated configurations would compress the others, so their points lie outside the plot.
-    let near = |key: &str, label: &str| {
-        let plot = LinePlot {
-            bands: vec![Band {
-                label: format!("requirement |m| < {REQUIREMENT}×10⁻³"),
-                low: -REQUIREMENT,
-                high: REQUIREMENT,
-            }],
-            ..plot(key, label, None)
-        };
-        let beyond: Vec<bool> = rows
-            .iter()
-            .map(|(_, row)| number(row, key).0.abs() > LARGEST_M)
-            .collect();
-        if !(beyond.contains(&true) && beyond.contains(&false)) {
-            return plot;
-        }
-        LinePlot {
-            title: format!("{label}, values beyond ± {LARGEST_M} not shown"),
-            y_range: Some((-LARGEST_M, LARGEST_M)),
-            ..plot
-        }
-    };
-    let mut q = plot("q_spectrum", "Q of cross-spectra", None);
-    let expected = rows
-        .iter()
-        .map(|(_, row)| number(row, "q_limit").0)
-        .collect();
-    let sets = rows.iter().map(|(set, _)| *set).collect();
-    q.series.insert(
-        0,
-        Series::new(
-            "expected Q",
-            sets,
-            expected,
-            Style::Points,
-            REQUIREMENT_COLOUR,
-        ),
-    );
-    PanelGrid {
-        title: "Configurations, requirements and the Cramér–Rao bound".into(),
-        columns: 2,
-        plots: vec![
-            plot(
-                "scatter_over_bound",
-                "scatter / bound",
-                Some(("Cramér–Rao bound", 1.0)),
-            ),
-            near("m1", "m1×10³"),
-            near("m2", "m2×10³"),
-            plot("c1", "c1×10⁴", Some(("", 0.0))),
-            plot("leakage", "PSF leakage", Some(("", 0.0))),
-            q,
-        ],
     }
 }
 
