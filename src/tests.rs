@@ -57,6 +57,19 @@ fn causes_are_printed_once() {
 }
 
 #[test]
+fn names_contain_no_character_that_messages_escape() {
+    for c in (char::MIN..=char::MAX).filter(|c| !['\n', '\t'].contains(c)) {
+        let name = c.to_string();
+        let is_plain = shearq_render::escape::visible(&name) == name;
+        assert_eq!(
+            shearq_submissions::check_name(&name).is_ok(),
+            is_plain,
+            "{c:?}"
+        );
+    }
+}
+
+#[test]
 fn documented_commands_parse() {
     let commands = documented();
     assert!(commands.len() > 20);

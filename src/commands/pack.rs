@@ -3,7 +3,7 @@ use std::path::PathBuf;
 use anyhow::Context;
 use clap::Args;
 use shearq_files::open::{SETTINGS, read_to_string};
-use shearq_submissions::is_control;
+use shearq_submissions::check_name;
 
 use super::published;
 use crate::choices::named;
@@ -172,7 +172,8 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     anyhow::ensure!(
         (1..=MAX_METHOD_BYTES).contains(&method.len())
             && !method.starts_with('.')
-            && !method.contains(|c: char| "/\\:".contains(c) || c.is_whitespace() || is_control(c)),
+            && check_name(&method).is_ok()
+            && !method.contains(|c: char| "/\\:".contains(c) || c.is_whitespace()),
         "--method: unusable name (found `{method}`, expected 1 to {MAX_METHOD_BYTES} bytes without `/`, `\\`, `:`, blanks and a leading `.`)"
     );
     let packing = Submission {
@@ -184,6 +185,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     };
     // Before the archive is opened: catalogues that cannot be packed leave no file.
     let galaxies = packing.galaxies()?;
+    // A catalogue with a misspelt name would otherwise be missing from the submission without notice.
     tell_unread(catalogues.files.unread());
     let mut bar = Bar::new("packing", galaxies);
     let files = packing.write(out, &mut bar)?;

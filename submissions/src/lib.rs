@@ -11,7 +11,7 @@ mod registry;
 mod settings;
 
 pub use error::{ConfigurationError, OutOfRange, SettingError};
-pub use name::{MAX_NAME, check_name, checked_name, is_control};
+pub use name::{MAX_NAME, check_name, checked_name};
 pub use registry::{Entry, Published, Registry, Template};
 pub use settings::{
     AcfKind, Background, BrightnessUnit, Calibration, ClippedShape, Clipping, Configuration,

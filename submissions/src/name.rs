@@ -45,9 +45,8 @@ pub fn checked_name<'de, D: Deserializer<'de>>(deserializer: D) -> Result<String
     Ok(name)
 }
 
-/// Whether a character is not seen but does something to the text around it: control characters, marks
-/// that turn the direction of writing, separators of lines, and what no text may hold.
-pub fn is_control(c: char) -> bool {
+// As `visible` in shearq-render escapes; a test of the command line compares them. Names are printed unescaped in figures.
+fn is_control(c: char) -> bool {
     c.is_control()
         || matches!(
             c,

@@ -3,6 +3,7 @@
 
 use std::process::{Command, Stdio};
 
+use shearq_render::escape::visible;
 use shearq_results::store;
 
 use crate::support::{printed, refused, shell};
@@ -67,7 +68,7 @@ fn a_full_disk_at_standard_output_is_one_error() {
 
 /// Whether nothing in what was said acts on a terminal.
 fn quiet(said: &str) -> bool {
-    !said.contains(|c: char| shearq_submissions::is_control(c) && c != '\n')
+    visible(said) == said
 }
 
 #[test]

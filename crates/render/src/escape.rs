@@ -3,9 +3,18 @@
 
 use std::borrow::Cow;
 
-use shearq_submissions::is_control;
-
 use shearq_files::text::formula_mark;
+
+/// Whether a character is invisible but acts on the text around it: control characters, marks of the direction of writing,
+/// separators of lines, and code points that no text may contain.
+fn is_control(c: char) -> bool {
+    c.is_control()
+        || matches!(
+            c,
+            '\u{61c}' | '\u{200e}' | '\u{200f}' | '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}'
+        )
+        || matches!(c, '\u{fffe}' | '\u{ffff}')
+}
 
 /// Text for a terminal: control characters but line breaks and tabs are written out as `\u001b`, which in
 /// JSON and TOML means the same character.
