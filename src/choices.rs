@@ -3,7 +3,7 @@
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 
 use shearq_bias::Design;
-use shearq_challenge::kind::RankBy;
+use shearq_challenge::kind::{Kind, RankBy};
 use shearq_files::table::FileFormat;
 use shearq_render::table::TableFormat;
 use shearq_results::bias::columns::Shapes;
@@ -42,6 +42,9 @@ macro_rules! choices {
 }
 
 choices! {
+    Kind {
+        Great10: "great10", "GREAT10 Galaxy Challenge";
+    }
     FileFormat {
         Parquet: "parquet", "Parquet";
         Fits: "fits", "FITS binary table";

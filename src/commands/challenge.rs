@@ -4,7 +4,7 @@ use clap::{ArgGroup, Args, Subcommand};
 use shearq_challenge::create::{Folders, Plan, Simulation, of_images, simulated};
 use shearq_challenge::inbox;
 use shearq_challenge::judge::Judge;
-use shearq_challenge::kind::{Kind, RankBy, kind};
+use shearq_challenge::kind::{Kind, RankBy};
 use shearq_challenge::page::View;
 use shearq_challenge::ranking::{Decisions, near_copies, rank as ranked};
 use shearq_challenge::seal::{BOARD_FILE, is_open_to_others, verify_public};
@@ -63,8 +63,8 @@ struct NewArguments {
     #[arg(long, value_name = "NAME", value_parser = name)]
     name: String,
     /// Kind of the challenge: metric, layout and rules.
-    #[arg(long, value_name = "KIND", default_value = "great10", value_parser = kind_of)]
-    kind: &'static Kind,
+    #[arg(long, value_name = "KIND", default_value = "great10", value_parser = named::<Kind>())]
+    kind: Kind,
     /// New folder for participants.
     #[arg(long, value_name = "DIR")]
     public: PathBuf,
@@ -218,10 +218,6 @@ fn name(text: &str) -> Result<String, String> {
         .map_err(|error| error.to_string())
 }
 
-fn kind_of(text: &str) -> Result<&'static Kind, String> {
-    kind(text).ok_or_else(|| "expected `great10`".into())
-}
-
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     match &arguments.command {
         Command::New(arguments) => new(arguments),
@@ -245,7 +241,7 @@ fn new(arguments: &NewArguments) -> anyhow::Result<()> {
         address: arguments.address.clone(),
         entries_per_team: arguments
             .entries_per_team
-            .or(arguments.kind.entries_per_team),
+            .or(arguments.kind.entries_per_team()),
         opens: arguments.opens.clone(),
         closes: arguments.closes.clone(),
         partial: arguments.partial,

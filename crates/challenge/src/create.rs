@@ -18,7 +18,6 @@ use shearq_pipeline::simulate::simulate_blind;
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_results::record::SetRecord;
 use shearq_results::score::ScoreError;
-use shearq_results::submit::Contents;
 use shearq_scoring::{Choice, Convention, Options, RowCounts, SetImages, SetScorer, TrueShear};
 use shearq_simulate::field::ShearSpectrum;
 use shearq_simulate::set::{STAMP, SimulationSettings};
@@ -37,7 +36,7 @@ use crate::terms::{CHALLENGE_FILE, Challenge, Data, Deadline, Rules};
 pub struct Plan {
     pub name: String,
     pub version: u32,
-    pub kind: &'static Kind,
+    pub kind: Kind,
     /// Metric that ranks the entries; `None` for that of the kind, which depends on the true shear.
     pub metric: Option<RankBy>,
     pub spectra: bool,
@@ -277,7 +276,7 @@ impl Plan {
             let (opens, closes) = (opens.clone(), closes.clone());
             return Err(ChallengeError::ClosesFirst { opens, closes });
         }
-        match self.metric.unwrap_or(self.kind.metric) {
+        match self.metric.unwrap_or(self.kind.metric(false)) {
             metric if self.spectra && !metric.is_of_spectra() => {
                 let metric = metric.label();
                 Err(ChallengeError::NotOfSpectra { metric })
@@ -372,10 +371,9 @@ fn rankable(
     let truths: Vec<(u32, TrueShear)> = truths.collect::<Result<_, ChallengeError>>()?;
     let constant = ConstantShears::of(truths.iter().map(|(set, truth)| (*set, truth)))
         .map_err(ChallengeError::Shears)?;
-    let metric = plan.metric.unwrap_or(match &constant {
-        Some(_) => plan.kind.constant_metric,
-        None => plan.kind.metric,
-    });
+    let metric = plan
+        .metric
+        .unwrap_or_else(|| plan.kind.metric(constant.is_some()));
     let label = metric.label();
     if !metric.suits(constant.is_some()) {
         return Err(ChallengeError::Undefined {
@@ -524,7 +522,6 @@ fn finish(
 ) -> Result<Challenge, ChallengeError> {
     let kind = plan.kind;
     let layout = layout_text(kind, &data);
-    let conventions = kind.conventions.iter();
     let mut challenge = Challenge {
         name: plan.name.clone(),
         version: plan.version,
@@ -532,15 +529,10 @@ fn finish(
         contact: plan.contact.clone(),
         address: plan.address.clone(),
         seal: String::new(),
-        conventions: conventions
-            .map(|(name, text)| ((*name).to_owned(), (*text).to_owned()))
-            .collect(),
+        conventions: kind.conventions(),
         rules: Rules {
             metric,
-            contents: match plan.spectra {
-                true => [kind.contents, &[Contents::Spectra, Contents::CrossSpectra]].concat(),
-                false => kind.contents.to_vec(),
-            },
+            contents: kind.contents(plan.spectra),
             entries_per_team: plan.entries_per_team,
             opens: plan.opens.clone(),
             closes: plan.closes.clone(),
@@ -563,8 +555,8 @@ fn finish(
 }
 
 // The layout of the images, without names of truth files.
-fn layout_text(kind: &Kind, data: &Data) -> String {
-    let layout = (kind.layout)();
+fn layout_text(kind: Kind, data: &Data) -> String {
+    let layout = kind.layout();
     format!(
         "galaxies = {:?}\npsf_star = {:?}\npsf_functional = {:?}\nfield_degrees = {:?}\nstamp = {}\n",
         layout.galaxies, layout.psf_star, layout.psf_functional, data.field_degrees, data.stamp

@@ -1,6 +1,8 @@
-//! Kinds of challenges. A kind is one value with metric, layout and rules.
+//! Kinds of challenges: what differs between them, and the metrics that rank entries.
 
-use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
 use shearq_dataset::layout::Layout;
 use shearq_results::compare::Paired;
 use shearq_results::record::{SetRecord, mean};
@@ -164,74 +166,93 @@ pub fn response(sets: &[SetRecord], constant: Option<&ConstantShears>) -> (f64, 
     }
 }
 
-/// A kind of challenge. Its values are the defaults of a new challenge.
-#[derive(Debug)]
-pub struct Kind {
+/// A kind of challenge: all in which challenges of different kinds differ. Its values are the defaults of a new challenge.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum Kind {
+    /// The Galaxy Challenge of GREAT10 (Kitching et al. 2012): 24 sets with a variable shear field each.
+    Great10,
+}
+
+impl Kind {
     /// Name on the command line and in `challenge.toml`.
-    pub name: &'static str,
-    pub title: &'static str,
-    pub metric: RankBy,
-    pub constant_metric: RankBy,
-    pub contents: &'static [Contents],
-    /// Most entries of a team; `None` for any number.
-    pub entries_per_team: Option<u32>,
-    pub layout: fn() -> Layout,
-    pub conventions: &'static [(&'static str, &'static str)],
-    /// Rules for participants, one sentence each.
-    pub rules: &'static [&'static str],
-}
-
-/// The Galaxy Challenge of GREAT10 (Kitching et al. 2012): 24 sets with a variable shear field each.
-pub static GREAT10: Kind = Kind {
-    name: "great10",
-    title: "GREAT10 Galaxy Challenge",
-    // Q itself is the challenge's, but entries without images win it while noise dominates, and so do shrunk shapes.
-    metric: RankBy::QCalibrated,
-    constant_metric: RankBy::Qc,
-    // Q of a spectrum can be tuned without images, entry by entry (crates/challenge/tests/extraction.rs).
-    contents: &[Contents::Catalogues],
-    // Published values determine the truth entry by entry (docs/run-a-challenge.md).
-    entries_per_team: Some(10),
-    layout: Layout::default,
-    conventions: &[
-        (
-            "positions",
-            "FITS pixels of the stamp centre; the first pixel of an image has its centre at 1",
-        ),
-        (
-            "ellipticity",
-            "shear type: (a - b)/(a + b) for an ellipse with the axes a and b",
-        ),
-        ("e1", "positive along x"),
-        ("e2", "positive along x = y"),
-        ("power", "l^2 C_l / (2 pi) with l in radian^-1"),
-    ],
-    rules: &[
-        "An entry covers all images of all sets.",
-        "All images of a set have one shear field, so methods may average over them.",
-    ],
-};
-
-pub static KINDS: [&Kind; 1] = [&GREAT10];
-
-pub fn kind(name: &str) -> Option<&'static Kind> {
-    KINDS.into_iter().find(|kind| kind.name == name)
-}
-
-impl Serialize for &'static Kind {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        serializer.serialize_str(self.name)
+    pub fn name(self) -> &'static str {
+        match self {
+            Kind::Great10 => "great10",
+        }
     }
-}
 
-pub(crate) fn by_name<'de, D: Deserializer<'de>>(d: D) -> Result<&'static Kind, D::Error> {
-    let name = String::deserialize(d)?;
-    kind(&name).ok_or_else(|| {
-        let known: Vec<&str> = KINDS.iter().map(|kind| kind.name).collect();
-        let message = format!(
-            "unknown kind of challenge (found `{name}`, expected {})",
-            known.join(" or ")
-        );
-        serde::de::Error::custom(message)
-    })
+    pub fn title(self) -> &'static str {
+        match self {
+            Kind::Great10 => "GREAT10 Galaxy Challenge",
+        }
+    }
+
+    /// Metric that ranks entries, of sets with one shear each (`constant`) or with a shear that varies.
+    pub fn metric(self, constant: bool) -> RankBy {
+        match self {
+            // Q itself is the challenge's, but entries without images win it while noise dominates, and so do shrunk shapes.
+            Kind::Great10 if constant => RankBy::Qc,
+            Kind::Great10 => RankBy::QCalibrated,
+        }
+    }
+
+    pub fn contents(self, spectra: bool) -> Vec<Contents> {
+        match self {
+            // Q of a spectrum can be tuned without images, entry by entry (crates/challenge/tests/extraction.rs).
+            Kind::Great10 if spectra => {
+                vec![
+                    Contents::Catalogues,
+                    Contents::Spectra,
+                    Contents::CrossSpectra,
+                ]
+            }
+            Kind::Great10 => vec![Contents::Catalogues],
+        }
+    }
+
+    /// Most entries of a team; `None` for any number.
+    pub fn entries_per_team(self) -> Option<u32> {
+        match self {
+            // Published values determine the truth entry by entry (docs/run-a-challenge.md).
+            Kind::Great10 => Some(10),
+        }
+    }
+
+    /// Names of images and PSFs.
+    pub fn layout(self) -> Layout {
+        match self {
+            Kind::Great10 => Layout::default(),
+        }
+    }
+
+    pub fn conventions(self) -> BTreeMap<String, String> {
+        let conventions = match self {
+            Kind::Great10 => [
+                (
+                    "positions",
+                    "FITS pixels of the stamp centre; the first pixel of an image has its centre at 1",
+                ),
+                (
+                    "ellipticity",
+                    "shear type: (a - b)/(a + b) for an ellipse with the axes a and b",
+                ),
+                ("e1", "positive along x"),
+                ("e2", "positive along x = y"),
+                ("power", "l^2 C_l / (2 pi) with l in radian^-1"),
+            ],
+        };
+        let owned = |(name, text): (&str, &str)| (name.to_owned(), text.to_owned());
+        conventions.map(owned).into()
+    }
+
+    /// Rules for participants, one sentence each.
+    pub fn rules(self) -> [&'static str; 2] {
+        match self {
+            Kind::Great10 => [
+                "An entry covers all images of all sets.",
+                "All images of a set have one shear field, so methods may average over them.",
+            ],
+        }
+    }
 }

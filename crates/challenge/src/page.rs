@@ -309,7 +309,7 @@ impl View<'_> {
         );
         let settings = [
             ("Version of the data", version.to_string()),
-            ("Kind", kind.title.to_owned()),
+            ("Kind", kind.title().to_owned()),
             ("Data", about_data),
             ("Metric", terms.metric.label().to_owned()),
             ("Decimals", self.digits.to_string()),
@@ -317,7 +317,7 @@ impl View<'_> {
         ];
         Ok(Report {
             title: name.clone(),
-            subtitle: format!("{}: leaderboard", kind.title),
+            subtitle: format!("{}: leaderboard", kind.title()),
             sections,
             settings: settings
                 .map(|(name, value)| (name.to_owned(), value))
@@ -375,7 +375,7 @@ fn rules(challenge: &Challenge) -> Vec<String> {
         rules,
         ..
     } = challenge;
-    let mut all: Vec<String> = kind.rules.iter().map(|&rule| rule.to_owned()).collect();
+    let mut all: Vec<String> = kind.rules().map(String::from).into();
     if rules.partial {
         all.push("An entry may cover some sets only. It is listed without a rank.".into());
     }
@@ -434,7 +434,8 @@ pub(crate) fn readme(challenge: &Challenge) -> String {
     let half = 0.5 * (data.stamp as f64 + 1.0);
     let mut text = format!(
         "# {name}\n\nVersion {version}. Kind: {} (`{}`).\n\nMeasure the shapes of the galaxies. The true shear is secret. `challenge.toml` has the numbers below in machine-readable form.\n\n## Data\n\n",
-        kind.title, kind.name
+        kind.title(),
+        kind.name()
     );
     text.push_str(&format!(
         "* Sets: {}.\n* Images per set: {}, numbered from 1.\n* Galaxies per image: {2} × {2}, in stamps of {3} × {3} pixels.\n* Side of the field: {4} degrees.\n* `layout.toml` has the names of images and PSFs.\n* Verify the download with `sha256sum -c SHA256SUMS`.\n\n",

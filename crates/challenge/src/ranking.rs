@@ -392,7 +392,7 @@ impl Decisions {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
-    use crate::kind::GREAT10;
+    use crate::kind::Kind;
     use crate::terms::{Data, Rules};
     use shearq_results::record::SetRecord;
     use shearq_results::submit::Contents;
@@ -449,7 +449,7 @@ pub(crate) mod tests {
         Challenge {
             name: "c".into(),
             version: 1,
-            kind: &GREAT10,
+            kind: Kind::Great10,
             contact: String::new(),
             address: String::new(),
             seal: String::new(),

@@ -16,7 +16,7 @@ use shearq_results::submit::{Contents, Packed, Submission};
 use shearq_scoring::Grid;
 use shearq_submissions::{check_name, checked_name};
 
-use crate::kind::{Kind, RankBy, by_name};
+use crate::kind::{Kind, RankBy};
 
 pub const CHALLENGE_FILE: &str = "challenge.toml";
 
@@ -26,8 +26,7 @@ pub struct Challenge {
     #[serde(deserialize_with = "checked_name")]
     pub name: String,
     pub version: u32,
-    #[serde(deserialize_with = "by_name")]
-    pub kind: &'static Kind,
+    pub kind: Kind,
     #[serde(default)]
     pub contact: String,
     #[serde(default, skip_serializing_if = "String::is_empty")]
