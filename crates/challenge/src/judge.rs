@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 use shearq_dataset::fingerprint;
 use shearq_dataset::layout::DataFolder;
 use shearq_dataset::run::{Source, kind_of};
-use shearq_dataset::threads::{Pool, Progress, Quiet};
+use shearq_dataset::threads::{Pool, Progress};
 use shearq_files::{FileError, names_of};
 use shearq_render::escape::line;
 use shearq_results::record::{RunRecord, SetRecord, definition_word};
@@ -254,7 +254,7 @@ impl Judge {
         verify_public(&self.public, threads)?;
         let public = DataFolder::open(&self.public)?;
         let ids = References::ids(&public, &self.challenge.data.sets)?;
-        let references = References::measure(&public, &ids, self.grid, threads, &mut Quiet)?;
+        let references = References::kept(store, &self.id, &public, &ids, self.grid, threads)?;
         let pool = Pool::new(threads)?;
         // Stored one by one, so that an interrupted command keeps the entries that it scored.
         for result in pool.in_order(candidates, |candidate| self.judge(candidate, &references)) {

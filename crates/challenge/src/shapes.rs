@@ -7,10 +7,13 @@ use std::path::{Path, PathBuf};
 use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::{DataFolder, read_rows};
 use shearq_dataset::run::{Run, Source};
-use shearq_dataset::threads::Progress;
+use shearq_dataset::threads::{Progress, Quiet};
 use shearq_files::FileError;
 use shearq_files::atomic::Scratch;
-use shearq_files::table::{FileFormat, most_rows};
+use shearq_files::frames::polars::Column;
+use shearq_files::frames::{Metadata, frame};
+use shearq_files::open::is_there;
+use shearq_files::table::{self, FileFormat, most_rows};
 use shearq_pipeline::PipelineError;
 use shearq_pipeline::measure::measure_folder;
 use shearq_results::catalogues::COLUMNS;
@@ -147,10 +150,41 @@ fn product(reference: &Shapes, sent: &FieldSum, convention: Convention) -> Produ
 #[derive(Debug)]
 pub struct References {
     grid: Grid,
-    images: BTreeMap<(u32, u32), Shapes>,
+    images: ShapesOfImages,
 }
 
 impl References {
+    /// The reference measurement of images that do not change, as their fingerprint `print` states. It is kept in `folder`,
+    /// a table per set, because it takes longer than to score an entry.
+    pub fn kept(
+        folder: &Path,
+        print: &str,
+        data: &DataFolder,
+        ids: &[ImageId],
+        grid: Grid,
+        threads: usize,
+    ) -> Result<Self, PipelineError> {
+        let mut references = References {
+            grid,
+            images: BTreeMap::new(),
+        };
+        for of_set in ids.chunk_by(|a, b| a.set == b.set) {
+            // Hidden, so that a results store does not take it for a run. Another version may measure other shapes.
+            let (version, set) = (shearq_dataset::VERSION, of_set[0].set);
+            let path = folder.join(format!(".reference-{version}-{print}-set{set:02}.parquet"));
+            let images = match is_there(&path) {
+                true => restored(&path, set, &grid)?,
+                false => {
+                    let measured = References::measure(data, of_set, grid, threads, &mut Quiet)?;
+                    write_shapes(&path, &measured.images)?;
+                    measured.images
+                }
+            };
+            references.images.extend(images);
+        }
+        Ok(references)
+    }
+
     pub fn measure(
         data: &DataFolder,
         ids: &[ImageId],
@@ -257,6 +291,44 @@ impl References {
         }
         Ok(found)
     }
+}
+
+type ShapesOfImages = BTreeMap<(u32, u32), Shapes>;
+
+const KEPT_COLUMNS: [&str; 3] = ["image", "e1", "e2"];
+
+// One row per cell, image by image.
+fn write_shapes(path: &Path, images: &ShapesOfImages) -> Result<(), FileError> {
+    let mut columns: [Vec<f64>; 3] = Default::default();
+    for ((_, image), shapes) in images {
+        for [e1, e2] in shapes {
+            let values = [f64::from(*image), f64::from(*e1), f64::from(*e2)];
+            columns.iter_mut().zip(values).for_each(|(c, v)| c.push(v));
+        }
+    }
+    let columns = KEPT_COLUMNS.into_iter().zip(columns);
+    let columns = columns.map(|(name, values)| Column::new(name.into(), values));
+    let table = frame(columns.collect()).map_err(|error| FileError::new(path, error))?;
+    table::write(path, FileFormat::Parquet, &table, &Metadata::new())
+}
+
+fn restored(path: &Path, set: u32, grid: &Grid) -> Result<ShapesOfImages, FileError> {
+    let read = table::read(path, Some(&KEPT_COLUMNS), table::MAX_ROWS)?;
+    let [numbers, e1, e2] = KEPT_COLUMNS.map(|name| table::numbers(&read, name, path));
+    let (numbers, e1, e2) = (numbers?, e1?, e2?);
+    let cells = grid.cells();
+    let mut images = BTreeMap::new();
+    for (number, (e1, e2)) in numbers
+        .chunks(cells)
+        .zip(e1.chunks(cells).zip(e2.chunks(cells)))
+    {
+        let shapes = e1.iter().zip(e2).map(|(e1, e2)| [*e1 as f32, *e2 as f32]);
+        let shapes = Array2::from_shape_vec((grid.n, grid.n), shapes.collect());
+        let message = "not the shapes of whole images. Try: remove the file";
+        let shapes = shapes.map_err(|_| FileError::new(path, message))?;
+        images.insert((set, number[0] as u32), shapes);
+    }
+    Ok(images)
 }
 
 // Faults of the images of a set, with the numbers of their images.
@@ -433,5 +505,27 @@ mod tests {
         );
         assert_eq!(set(&[distortion(1.9), distortion(1.8)])[0].1, [1, 2]);
         assert_eq!(ranges(&[1, 2, 3, 7, 9, 10]), "1-3,7,9-10");
+    }
+
+    #[test]
+    fn a_kept_measurement_is_read_back_bit_for_bit() {
+        let grid = Grid::new(16, Pixels(48.0), Degrees(10.0)).unwrap();
+        let mut shapes = shapes_of(&field(|a, b| (a, b)));
+        shapes[(3, 4)] = [f32::NAN; 2];
+        let images =
+            ShapesOfImages::from([((7, 1), shapes.clone()), ((7, 3), shapes.t().to_owned())]);
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("kept.parquet");
+        write_shapes(&path, &images).unwrap();
+        let bits = |images: ShapesOfImages| -> Vec<_> {
+            let bits = |shapes: Shapes| shapes.mapv(|shape| shape.map(f32::to_bits));
+            images
+                .into_iter()
+                .map(|(id, shapes)| (id, bits(shapes)))
+                .collect()
+        };
+        assert_eq!(bits(restored(&path, 7, &grid).unwrap()), bits(images));
+        let other = Grid::new(15, Pixels(48.0), Degrees(10.0)).unwrap();
+        assert!(restored(&path, 7, &other).is_err());
     }
 }
