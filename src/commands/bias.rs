@@ -34,70 +34,8 @@ use shearq_results::views::bias::{
 /// a star that several units share. The output names design and units.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
-    /// Catalogues, all with the same columns, or folders that `measure` or `run` wrote. FILE[TABLE] is one table of a
-    /// FITS file.
-    #[arg(
-        value_name = "CATALOGUE",
-        required_unless_present = "merge",
-        conflicts_with = "merge"
-    )]
-    catalogues: Vec<PathBuf>,
-    /// Catalogues of another program on the same galaxies, in the same order. The output contains both and the
-    /// difference, with paired errors.
-    #[arg(long, value_name = "CATALOGUE", num_args = 1.., conflicts_with_all = ["merge", "sums", "shard", "bootstrap", "seed", "fail_above", "junit", "plot", "path"])]
-    against: Vec<PathBuf>,
-    /// True g1 of all catalogues.
-    #[arg(long, value_name = "G1", allow_negative_numbers = true, requires = "g2", conflicts_with_all = ["truth", "merge"])]
-    g1: Option<f64>,
-    /// True g2 of all catalogues.
-    #[arg(long, value_name = "G2", allow_negative_numbers = true, requires = "g1", conflicts_with_all = ["truth", "merge"])]
-    g2: Option<f64>,
-    /// Table of true shears: columns catalogue, g1, g2 or id, g1, g2 or x, y, g1, g2 (within 1 pixel) [default: columns
-    /// g1 and g2 of the catalogues, or the true shear of the data of a folder].
-    #[arg(long, value_name = "FILE", conflicts_with = "merge")]
-    truth: Option<PathBuf>,
-    // The roles are appended to this text.
-    #[arg(
-        long,
-        help = columns_help(),
-        value_name = "ROLE=COLUMN",
-        value_delimiter = ',',
-        conflicts_with = "merge"
-    )]
-    columns: Vec<String>,
-    /// Type of the ellipticities [default: responsivity for columns of HSM that are distortions, else shear].
-    #[arg(long, value_parser = named::<Shapes>(), conflicts_with = "merge")]
-    ellipticity: Option<Shapes>,
-    /// Sign of the true g2 [default: as the file of --truth states; else, for x, y, g1, g2, the sign in which the shear is
-    /// an E-mode field; else the sign that e2 follows; required if these are unclear. Shears of options, of columns of
-    /// the catalogues and of tables with the column catalogue: standard].
-    #[arg(long, value_enum, conflicts_with = "merge")]
-    truth_sign: Option<SignArgument>,
-    /// Also estimate in bins of a column or expression: `snr:5` has five bins with equally many galaxies,
-    /// `flux/flux_error:5,10,20` has these edges.
-    #[arg(long, value_name = "EXPRESSION:BINS", value_parser = parse_bins, conflicts_with = "merge")]
-    bins: Option<Binning>,
-    /// Use only galaxies for which this holds, such as "snr > 10 and size < 4". Catalogues of linear configurations can
-    /// also be cut by steps, such as "step(snr, 10, 1.5) and step(size, 2.5)", whose response to shear enters (see
-    /// `select`). The response of other conditions on measured quantities needs sheared catalogues.
-    #[arg(long = "where", value_name = "CONDITION", conflicts_with = "merge")]
-    condition: Option<String>,
-    /// Weight of each galaxy, a smooth formula of `snr`, `flux` and `size`, such as `snr^2 / (snr^2 + 50)`.
-    #[arg(long, value_name = "FORMULA", conflicts_with_all = ["merge", "against", "ellipticity", "step"])]
-    weight: Option<String>,
-    /// How catalogues belong together [default: recognised from the true shears].
-    #[arg(long, value_parser = named::<Design>(), conflicts_with = "merge")]
-    design: Option<Design>,
-    /// Independent units for errors: `rows`, `catalogues` or a column, such as `seed` [default: a column pair, seed or
-    /// patch; else groups of catalogues if there are 20 or more; else rows].
-    #[arg(long, value_name = "UNIT", conflicts_with = "merge")]
-    units: Option<String>,
-    /// Leave out rows with missing numbers or without a true shear.
-    #[arg(long, conflicts_with = "merge")]
-    drop_missing: bool,
-    /// Artificial shear of metacalibration [default: 0.01].
-    #[arg(long, value_name = "G", value_parser = positive, conflicts_with = "merge")]
-    step: Option<f64>,
+    #[command(flatten)]
+    summing: Summing,
     /// Errors from so many bootstrap draws of units instead of a jackknife.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(10..=100_000))]
     bootstrap: Option<u32>,
@@ -111,14 +49,8 @@ pub(crate) struct Arguments {
     /// Also write the checks of --fail-above to this file as JUnit XML.
     #[arg(long, value_name = "FILE", requires = "fail_above")]
     junit: Option<PathBuf>,
-    /// Write the sums of the catalogues to this file, for --merge.
-    #[arg(long, value_name = "FILE", conflicts_with = "merge")]
-    sums: Option<PathBuf>,
-    /// Read only shard K of N of the catalogues.
-    #[arg(long, value_name = "K/N", requires = "sums", conflicts_with = "merge")]
-    shard: Option<Shard>,
     /// Merge files that --sums wrote for shards of one list of catalogues.
-    #[arg(long, value_name = "FILE", num_args = 1..)]
+    #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with = "Summing")]
     merge: Vec<PathBuf>,
     /// Plot m and c to this file, PNG or SVG by its ending.
     #[arg(long, value_name = "FILE")]
@@ -127,6 +59,88 @@ pub(crate) struct Arguments {
     printing: Printing,
     #[command(flatten)]
     report: ReportFile,
+}
+
+// What catalogues are summed, and how: one group, because the files of `--merge` were summed already.
+#[derive(Debug, Args)]
+struct Summing {
+    /// Catalogues, all with the same columns, or folders that `measure` or `run` wrote. FILE[TABLE] is one table of a
+    /// FITS file.
+    #[arg(value_name = "CATALOGUE", required_unless_present = "merge")]
+    catalogues: Vec<PathBuf>,
+    /// Catalogues of another program on the same galaxies, in the same order. The output contains both and the
+    /// difference, with paired errors.
+    #[arg(long, value_name = "CATALOGUE", num_args = 1.., conflicts_with_all = ["sums", "shard", "bootstrap", "seed", "fail_above", "junit", "plot", "path"])]
+    against: Vec<PathBuf>,
+    /// True g1 of all catalogues.
+    #[arg(
+        long,
+        value_name = "G1",
+        allow_negative_numbers = true,
+        requires = "g2",
+        conflicts_with = "truth"
+    )]
+    g1: Option<f64>,
+    /// True g2 of all catalogues.
+    #[arg(
+        long,
+        value_name = "G2",
+        allow_negative_numbers = true,
+        requires = "g1",
+        conflicts_with = "truth"
+    )]
+    g2: Option<f64>,
+    /// Table of true shears: columns catalogue, g1, g2 or id, g1, g2 or x, y, g1, g2 (within 1 pixel) [default: columns
+    /// g1 and g2 of the catalogues, or the true shear of the data of a folder].
+    #[arg(long, value_name = "FILE")]
+    truth: Option<PathBuf>,
+    // The roles are appended to this text.
+    #[arg(
+        long,
+        help = columns_help(),
+        value_name = "ROLE=COLUMN",
+        value_delimiter = ','
+    )]
+    columns: Vec<String>,
+    /// Type of the ellipticities [default: responsivity for columns of HSM that are distortions, else shear].
+    #[arg(long, value_parser = named::<Shapes>())]
+    ellipticity: Option<Shapes>,
+    /// Sign of the true g2 [default: as the file of --truth states; else, for x, y, g1, g2, the sign in which the shear is
+    /// an E-mode field; else the sign that e2 follows; required if these are unclear. Shears of options, of columns of
+    /// the catalogues and of tables with the column catalogue: standard].
+    #[arg(long, value_enum)]
+    truth_sign: Option<SignArgument>,
+    /// Also estimate in bins of a column or expression: `snr:5` has five bins with equally many galaxies,
+    /// `flux/flux_error:5,10,20` has these edges.
+    #[arg(long, value_name = "EXPRESSION:BINS", value_parser = parse_bins)]
+    bins: Option<Binning>,
+    /// Use only galaxies for which this holds, such as "snr > 10 and size < 4". Catalogues of linear configurations can
+    /// also be cut by steps, such as "step(snr, 10, 1.5) and step(size, 2.5)", whose response to shear enters (see
+    /// `select`). The response of other conditions on measured quantities needs sheared catalogues.
+    #[arg(long = "where", value_name = "CONDITION")]
+    condition: Option<String>,
+    /// Weight of each galaxy, a smooth formula of `snr`, `flux` and `size`, such as `snr^2 / (snr^2 + 50)`.
+    #[arg(long, value_name = "FORMULA", conflicts_with_all = ["against", "ellipticity", "step"])]
+    weight: Option<String>,
+    /// How catalogues belong together [default: recognised from the true shears].
+    #[arg(long, value_parser = named::<Design>())]
+    design: Option<Design>,
+    /// Independent units for errors: `rows`, `catalogues` or a column, such as `seed` [default: a column pair, seed or
+    /// patch; else groups of catalogues if there are 20 or more; else rows].
+    #[arg(long, value_name = "UNIT")]
+    units: Option<String>,
+    /// Leave out rows with missing numbers or without a true shear.
+    #[arg(long)]
+    drop_missing: bool,
+    /// Artificial shear of metacalibration [default: 0.01].
+    #[arg(long, value_name = "G", value_parser = positive)]
+    step: Option<f64>,
+    /// Write the sums of the catalogues to this file, for --merge.
+    #[arg(long, value_name = "FILE")]
+    sums: Option<PathBuf>,
+    /// Read only shard K of N of the catalogues.
+    #[arg(long, value_name = "K/N", requires = "sums")]
+    shard: Option<Shard>,
 }
 
 // Of metacalibration in ngmix and metadetect, whose catalogues do not state it.
@@ -173,15 +187,16 @@ fn parse_bins(text: &str) -> anyhow::Result<Binning> {
 const MOST_BYTES: u64 = 1 << 31;
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    let summing = &arguments.summing;
     // Before the catalogues are read, which takes minutes for a survey.
     if let Some(plot) = &arguments.plot {
         PictureFormat::of(plot)?;
     }
     let summed = match arguments.merge.as_slice() {
-        [] => of_catalogues(arguments, &arguments.catalogues)?,
+        [] => of_catalogues(summing, &summing.catalogues)?,
         files => merged(files)?,
     };
-    if let Some(path) = &arguments.sums {
+    if let Some(path) = &summing.sums {
         atomic::write(path, &serde_json::to_vec(&summed)?)?;
     }
     let errors = arguments
@@ -192,7 +207,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         });
     // A shard may have too few units for errors, or one side of a pair. Its sums are what counts, and they are written.
     let result = match summed.result(errors) {
-        Err(error) if arguments.shard.is_some() => {
+        Err(error) if summing.shard.is_some() => {
             tell(format_args!(
                 "note: no estimate of this shard alone: {error}"
             ));
@@ -206,8 +221,8 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             tell(format_args!("warning: {warning}"));
         }
     };
-    if !arguments.against.is_empty() {
-        let other = of_catalogues(arguments, &arguments.against)?;
+    if !summing.against.is_empty() {
+        let other = of_catalogues(summing, &summing.against)?;
         let difference = summed.difference(&other)?;
         let other = other.result(errors)?;
         warn();
@@ -245,20 +260,19 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
 
 // The report states what it was made by, so that it can be made again.
 fn made_by(arguments: &Arguments) -> Vec<(String, String)> {
+    let summing = &arguments.summing;
     let joined = |all: Vec<String>, between: &str| Some(all.join(between));
     let paths = |paths: &[PathBuf]| {
         let shown = paths.iter().map(|path| path.display().to_string());
         joined(shown.collect(), "\n")
     };
-    let truth = arguments.truth.as_ref();
-    let constant = arguments.g1.zip(arguments.g2);
+    let truth = summing.truth.as_ref();
+    let constant = summing.g1.zip(summing.g2);
     let truth = truth
         .map(|path| path.display().to_string())
         .or_else(|| constant.map(|(g1, g2)| format!("{g1}, {g2}")));
-    let sign = arguments
-        .truth_sign
-        .map(|sign| word(sign.into()).to_owned());
-    let bins = arguments.bins.as_ref().map(|bins| {
+    let sign = summing.truth_sign.map(|sign| word(sign.into()).to_owned());
+    let bins = summing.bins.as_ref().map(|bins| {
         let edges = match &bins.edges {
             Edges::Equal(count) => format!("{count} with equally many galaxies"),
             Edges::Given(edges) => format!("{edges:?}"),
@@ -272,27 +286,27 @@ fn made_by(arguments: &Arguments) -> Vec<(String, String)> {
     let bootstrap = arguments.bootstrap;
     let bootstrap = bootstrap.map(|draws| format!("{draws} draws, seed {}", arguments.seed));
     let made_by = [
-        ("Catalogues", paths(&arguments.catalogues)),
+        ("Catalogues", paths(&summing.catalogues)),
         ("Sums", paths(&arguments.merge)),
-        ("Columns", joined(arguments.columns.clone(), ", ")),
+        ("Columns", joined(summing.columns.clone(), ", ")),
         ("True shear", truth),
-        ("Where", arguments.condition.clone()),
-        ("Weight", arguments.weight.clone()),
-        ("Design", arguments.design.map(|own| name_of(own).into())),
-        ("Units", arguments.units.clone()),
+        ("Where", summing.condition.clone()),
+        ("Weight", summing.weight.clone()),
+        ("Design", summing.design.map(|own| name_of(own).into())),
+        ("Units", summing.units.clone()),
         (
             "Ellipticities",
-            arguments.ellipticity.map(|own| name_of(own).into()),
+            summing.ellipticity.map(|own| name_of(own).into()),
         ),
         ("Sign of the true g2", sign),
         ("Bins", bins),
         (
             "Rows with missing numbers are left out",
-            arguments.drop_missing.then(|| "yes".into()),
+            summing.drop_missing.then(|| "yes".into()),
         ),
         (
             "Step of metacalibration",
-            arguments.step.map(|step| step.to_string()),
+            summing.step.map(|step| step.to_string()),
         ),
         ("Limits", joined(limits.collect(), ", ")),
         ("Bootstrap", bootstrap),
@@ -304,14 +318,14 @@ fn made_by(arguments: &Arguments) -> Vec<(String, String)> {
     made_by.into_iter().filter_map(given).collect()
 }
 
-fn of_catalogues(arguments: &Arguments, catalogues: &[PathBuf]) -> anyhow::Result<Summed> {
+fn of_catalogues(summing: &Summing, catalogues: &[PathBuf]) -> anyhow::Result<Summed> {
     let mut names = Names::default();
-    for text in &arguments.columns {
+    for text in &summing.columns {
         names.add(text)?;
     }
-    let specified = arguments.truth_sign.map(Into::into);
+    let specified = summing.truth_sign.map(Into::into);
     let mut sign = TrueSign::or_standard(specified);
-    let truth = match (&arguments.truth, arguments.g1.zip(arguments.g2)) {
+    let truth = match (&summing.truth, summing.g1.zip(summing.g2)) {
         (Some(path), _) => {
             let (truth, own) = Truth::read(path, specified)?;
             sign = own;
@@ -327,22 +341,21 @@ fn of_catalogues(arguments: &Arguments, catalogues: &[PathBuf]) -> anyhow::Resul
         }
         (None, None) => Truth::Columns,
     };
-    let shard = arguments.shard.unwrap_or(Shard::WHOLE);
-    if let (Some(_), Some(Edges::Equal(_))) = (
-        arguments.shard,
-        arguments.bins.as_ref().map(|bins| &bins.edges),
-    ) {
+    let shard = summing.shard.unwrap_or(Shard::WHOLE);
+    if let (Some(_), Some(Edges::Equal(_))) =
+        (summing.shard, summing.bins.as_ref().map(|bins| &bins.edges))
+    {
         anyhow::bail!(
             "--shard: all shards need the same bins (found a number of bins, expected edges). Try: --bins 'snr:5,10,20'"
         );
     }
-    let selection = selection(arguments.condition.as_deref(), arguments.weight.as_deref())?;
+    let selection = selection(summing.condition.as_deref(), summing.weight.as_deref())?;
     if selection.as_ref().is_some_and(|own| own.weights.is_some()) {
         // Catalogues of linear configurations contain shears with responses and no sheared catalogues.
         let unused = [
-            ("--against", !arguments.against.is_empty()),
-            ("--ellipticity", arguments.ellipticity.is_some()),
-            ("--step", arguments.step.is_some()),
+            ("--against", !summing.against.is_empty()),
+            ("--ellipticity", summing.ellipticity.is_some()),
+            ("--step", summing.step.is_some()),
         ];
         if let Some((option, _)) = unused.into_iter().find(|(_, given)| *given) {
             anyhow::bail!("{option}: cannot be used with step() in --where");
@@ -353,19 +366,19 @@ fn of_catalogues(arguments: &Arguments, catalogues: &[PathBuf]) -> anyhow::Resul
         catalogues,
         names,
         truth,
-        shapes: arguments.ellipticity,
+        shapes: summing.ellipticity,
         sign,
-        bins: arguments.bins.clone(),
+        bins: summing.bins.clone(),
         selection,
-        design: arguments.design,
-        units: match arguments.units.as_deref() {
+        design: summing.design,
+        units: match summing.units.as_deref() {
             None => Units::Recognised,
             Some("rows") => Units::Rows,
             Some("catalogues") => Units::Catalogues,
             Some(column) => Units::Column(column.to_owned()),
         },
-        drop_missing: arguments.drop_missing,
-        step: arguments.step.unwrap_or(DEFAULT_STEP),
+        drop_missing: summing.drop_missing,
+        step: summing.step.unwrap_or(DEFAULT_STEP),
     };
     let own = |number: usize| Shard::holding(number, shard.of()) == shard;
     Ok(sum(&request, &own)?)
@@ -379,6 +392,7 @@ fn merged(files: &[PathBuf]) -> anyhow::Result<Summed> {
         let summed: Summed = serde_json::from_slice(&bytes).with_context(what)?;
         summed.checked().with_context(what)
     };
+    // The other files are compared with the first, and the message names the file that differs.
     let mut all = read(&files[0])?;
     for path in &files[1..] {
         let more = read(path)?;

@@ -26,7 +26,7 @@ use shearq_quantities::Frame;
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
     /// FITS files of stamps, in the order of the galaxies.
-    #[arg(long, value_name = "FILE", num_args = 1.., required_unless_present = "exposure", conflicts_with = "exposure")]
+    #[arg(long, value_name = "FILE", num_args = 1.., required_unless_present = "exposure", conflicts_with_all = ["exposure", "Cutouts"])]
     stamps: Vec<PathBuf>,
     /// Image to cut stamps out of: the first of its file.
     #[arg(long, value_name = "FILE", requires = "positions")]
@@ -43,65 +43,11 @@ pub(crate) struct Arguments {
     /// Use only masks of this name [default files: the stamps or the exposure].
     #[arg(long, value_name = "NAME")]
     mask_extension: Option<String>,
-    /// Table of positions on the exposure: text, FITS or Parquet, in FITS pixels (the centre of the first pixel is 1), or in
-    /// degrees on the sky if the exposure has a WCS (TAN, TAN-SIP, TPV). Catalogues have its identities and places.
-    /// `FILE[NAME]` and `FILE[NUMBER]` are tables of a FITS file.
-    #[arg(
-        long,
-        value_name = "FILE",
-        requires = "exposure",
-        conflicts_with = "stamps"
-    )]
-    positions: Option<PathBuf>,
-    /// Table of a FITS file: its name (EXTNAME), or its number from 1 [default: the table that has the columns].
-    #[arg(
-        long,
-        value_name = "NAME|NUMBER",
-        requires = "positions",
-        conflicts_with = "stamps"
-    )]
-    table: Option<String>,
-    /// Coordinate of the centre of the first pixel: 1 for FITS and SExtractor, 0 for NumPy and sep.
-    #[arg(long, value_name = "0|1", default_value_t = 1, value_parser = clap::value_parser!(u8).range(0..=1), requires = "exposure", conflicts_with = "stamps")]
-    first_pixel: u8,
-    /// Columns of the positions: names, or numbers from 1 if the table has no names [default: x and y, names of SExtractor
-    /// such as X_IMAGE and Y_IMAGE, ra and dec, or the only two columns].
-    #[arg(
-        long,
-        value_name = "X,Y",
-        value_delimiter = ',',
-        num_args = 1,
-        requires = "positions",
-        conflicts_with = "stamps"
-    )]
-    columns: Option<Vec<String>>,
-    /// The columns are right ascension and declination in degrees, whatever their names.
-    #[arg(long, requires = "columns", conflicts_with = "stamps")]
-    degrees: bool,
-    /// Column of identities, integers or texts [default: id, object_id, source_id or NUMBER, if there is one].
-    #[arg(
-        long,
-        value_name = "NAME",
-        requires = "positions",
-        conflicts_with = "stamps"
-    )]
-    id: Option<String>,
-    /// Further columns of the positions for the catalogue, such as mag,z.
-    #[arg(
-        long,
-        value_name = "NAMES",
-        value_delimiter = ',',
-        num_args = 1,
-        requires = "positions",
-        conflicts_with = "stamps"
-    )]
-    carry: Vec<String>,
-    /// Pixels a side of the stamps that are cut out.
-    #[arg(long, value_name = "N", default_value_t = 48, value_parser = clap::value_parser!(u16).range(5..=1024), requires = "exposure", conflicts_with = "stamps")]
-    size: u16,
+    #[command(flatten)]
+    cutouts: Cutouts,
     /// Make squares of stamps that are not: by their central square (crop), or by missing pixels around them (pad). A galaxy with
     /// many missing pixels is flagged. PSFs are cropped [default: refuse].
-    #[arg(long, value_name = "HOW", value_parser = ["crop", "pad"], conflicts_with_all = ["exposure", "positions", "table", "first_pixel", "columns", "degrees", "id", "carry", "size"])]
+    #[arg(long, value_name = "HOW", value_parser = ["crop", "pad"], conflicts_with_all = ["exposure", "Cutouts"])]
     square: Option<String>,
     /// FITS files of PSF stamps, or one table of functional PSFs (.csv): one PSF for all galaxies, or one per galaxy.
     /// Several stars, at most half as many as galaxies, are averaged to one PSF.
@@ -145,6 +91,39 @@ pub(crate) struct Arguments {
     out: PathBuf,
 }
 
+// The options of stamps that are cut out of an exposure, as one group, so that `--stamps` and `--square` refuse each of them.
+#[derive(Debug, Args)]
+#[group(requires_all = ["exposure", "positions"])]
+struct Cutouts {
+    /// Table of positions on the exposure: text, FITS or Parquet, in FITS pixels (the centre of the first pixel is 1), or in
+    /// degrees on the sky if the exposure has a WCS (TAN, TAN-SIP, TPV). Catalogues have its identities and places.
+    /// `FILE[NAME]` and `FILE[NUMBER]` are tables of a FITS file.
+    #[arg(long, value_name = "FILE")]
+    positions: Option<PathBuf>,
+    /// Table of a FITS file: its name (EXTNAME), or its number from 1 [default: the table that has the columns].
+    #[arg(long, value_name = "NAME|NUMBER")]
+    table: Option<String>,
+    /// Coordinate of the centre of the first pixel: 1 for FITS and SExtractor, 0 for NumPy and sep.
+    #[arg(long, value_name = "0|1", default_value_t = 1, value_parser = clap::value_parser!(u8).range(0..=1))]
+    first_pixel: u8,
+    /// Columns of the positions: names, or numbers from 1 if the table has no names [default: x and y, names of SExtractor
+    /// such as X_IMAGE and Y_IMAGE, ra and dec, or the only two columns].
+    #[arg(long, value_name = "X,Y", value_delimiter = ',', num_args = 1)]
+    columns: Option<Vec<String>>,
+    /// The columns are right ascension and declination in degrees, whatever their names.
+    #[arg(long, requires = "columns")]
+    degrees: bool,
+    /// Column of identities, integers or texts [default: id, object_id, source_id or NUMBER, if there is one].
+    #[arg(long, value_name = "NAME")]
+    id: Option<String>,
+    /// Further columns of the positions for the catalogue, such as mag,z.
+    #[arg(long, value_name = "NAMES", value_delimiter = ',', num_args = 1)]
+    carry: Vec<String>,
+    /// Pixels a side of the stamps that are cut out.
+    #[arg(long, value_name = "N", default_value_t = 48, value_parser = clap::value_parser!(u16).range(5..=1024))]
+    size: u16,
+}
+
 // An extension without a file means the files of the images: surveys store masks and weights beside the pixels.
 fn companion<'a>(
     paths: &'a [PathBuf],
@@ -182,14 +161,17 @@ fn gathering(arguments: &Arguments) -> anyhow::Result<Gathering<'_>> {
         mask,
         mask_extension,
         mask_bits,
-        positions,
-        table,
-        first_pixel,
-        columns,
-        degrees,
-        id,
-        carry,
-        size,
+        cutouts:
+            Cutouts {
+                positions,
+                table,
+                first_pixel,
+                columns,
+                degrees,
+                id,
+                carry,
+                size,
+            },
         square,
         psf,
         psf_extension,
@@ -207,6 +189,7 @@ fn gathering(arguments: &Arguments) -> anyhow::Result<Gathering<'_>> {
     // Destructured in full, so that the compiler finds an option that is not passed on.
     for (option, value) in [("noise", noise), ("gain", gain)] {
         anyhow::ensure!(
+            // Not subnormal: noise is divided by, and 1/5e-324 is infinite.
             value.is_none_or(|value| value > 0.0 && value.is_normal()),
             "--{option} is {:e}; expected a positive number",
             value.unwrap_or_default()
@@ -219,6 +202,7 @@ fn gathering(arguments: &Arguments) -> anyhow::Result<Gathering<'_>> {
     };
     let masks = companion(mask, mask_extension.as_ref(), Content::Mask, &images);
     anyhow::ensure!(
+        // Not by `requires` of clap, because either of two options gives a mask.
         masks.is_some() || mask_bits.is_none(),
         "--mask-bits is given without a mask; expected --mask or --mask-extension"
     );
@@ -276,6 +260,7 @@ fn gathering(arguments: &Arguments) -> anyhow::Result<Gathering<'_>> {
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let gathering = gathering(arguments)?;
     let out = &arguments.out;
+    // An existing folder may have a layout.toml with other names of files.
     let data = if out.is_dir() {
         DataFolder::open(out)?
     } else {
