@@ -29,6 +29,7 @@ impl FromStr for SetList {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
+        // The sets that can be simulated; data folders have a default for all of theirs.
         if text == "all" {
             return Ok(SetList((1..=SETS).collect()));
         }

@@ -236,6 +236,7 @@ fn causes(error: &anyhow::Error) -> String {
 // clap reports help and the version as errors, with exit code 0.
 fn usage(message: &clap::Error) -> u8 {
     match flushed(|| message.print()) {
+        // 0 for help and the version, 2 for wrong usage.
         Ok(()) => u8::try_from(message.exit_code()).unwrap_or(EXIT_WRONG_USAGE),
         Err(error) => {
             tell(format_args!("error: {}", causes(&error)));

@@ -323,8 +323,10 @@ fn check(arguments: &CheckArguments) -> anyhow::Result<()> {
     if let Some(path) = &arguments.junit {
         atomic::write(path, junit(&checks).as_bytes())?;
     }
+    // Programs compare every metric; people want to see those that moved.
     let all = matches!(arguments.form.format, TableFormat::Csv | TableFormat::Json);
     let table = shift_table(&checks, all);
+    // A table without rows would show headings only.
     if table.rows.is_empty() && arguments.form.format == TableFormat::Table {
         print(&(table.notes.join("\n") + "\n"))?;
     } else {
@@ -335,6 +337,7 @@ fn check(arguments: &CheckArguments) -> anyhow::Result<()> {
         .filter(|check| !check.moved().is_empty())
         .count();
     anyhow::ensure!(
+        // An update accepts the moved metrics.
         failed == 0 || arguments.update,
         "{failed} of {} configurations moved from their baseline",
         checks.len()

@@ -40,6 +40,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         .get(&arguments.submission)?
         .configuration;
     anyhow::ensure!(
+        // A linear configuration deconvolves in closed form, without λ.
         submission.network().is_some(),
         "{} has no λ to calibrate (found method = \"linear\", expected \"network\"). Try: --submission paper",
         submission.name

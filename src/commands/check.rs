@@ -96,6 +96,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     )?;
     let mut truth = BTreeMap::new();
     if let Some(data) = &data {
+        // An image with a misspelt name would otherwise be missing from the count without notice.
         tell_unread(data.images(&[])?.unread());
         for set in sets {
             truth.insert(set, data.read_truth(set, &grid)?);
@@ -132,6 +133,7 @@ fn reach(sent: &Sent, stamp: f64) -> Option<usize> {
 
 // Fails if a finding is an error.
 pub(super) fn report(findings: &[Finding], path: &Path, json: bool) -> anyhow::Result<()> {
+    // Warnings alone do not make a submission wrong, so that the command succeeds with them.
     let errors = findings
         .iter()
         .filter(|f| f.severity == Severity::Error)

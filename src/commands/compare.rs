@@ -123,10 +123,12 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         Some(store) => stored(arguments, store)?,
         None => folders(arguments)?,
     };
+    // The report shows the verdict as text above the table, the terminal as a note below it.
     let mut printed = table.clone();
     printed.notes.extend(verdict.clone());
     arguments.printing.print(&printed)?;
     if let Some(path) = &arguments.heat_map {
+        // After printing: the comparison is not lost if the file cannot be written.
         map.save(path)?;
     }
     let sections = || Ok(vec![pages::comparison(table, verdict, &map)?]);

@@ -81,6 +81,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             anyhow::ensure!(mean.galaxies > 0, "set {set:02}: {flagged}");
             tell(format_args!("warning: set {set:02}: {flagged}"));
         }
+        // The pixel axes are rotated, mirrored or sheared against the sky, and the printed shear is along them.
         if let Axes::Oriented(frame) = mean.axes
             && frame != PixelFrame::default()
         {
@@ -110,10 +111,12 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     }
     if let Some(data) = &data {
         let used = means.iter().map(|mean| (mean.set, mean.images.as_slice()));
+        // A mean over fewer images than the data have is valid, but the reader must know.
         let without = without_catalogue(data, &used.collect(), sets)?;
         table.notes.extend(without);
     }
     if !matches!(arguments.form.format, TableFormat::Csv | TableFormat::Json) {
+        // Machine-readable formats keep every column, because a missing one breaks the program that reads them.
         table = table.narrow();
     }
     arguments.form.print(&table)

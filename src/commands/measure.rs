@@ -59,6 +59,7 @@ impl Measuring {
 
     pub(super) fn images(&self, data: &DataFolder, sets: &[u32]) -> anyhow::Result<Vec<ImageId>> {
         let images = self.sharding.part(&images::of_folder(data, sets)?);
+        // An image whose name nearly follows the layout would otherwise be absent from the results without notice.
         tell_unread(data.images(sets)?.unread());
         Ok(images)
     }

@@ -77,6 +77,7 @@ fn merge_run(arguments: &Arguments, run: &Run) -> anyhow::Result<()> {
     let data = run.source.data(out)?;
     let sets = sets_of(arguments.sets.as_ref());
     let images = match &run.source {
+        // The record has no list of images; a data folder shows them.
         Source::Simulated(_) => simulated_images(arguments)?,
         Source::Folder { .. } => {
             anyhow::ensure!(

@@ -79,6 +79,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let results = run_sets(&study, sets, threads, &mut bar)?;
     drop(bar);
     let mut bar = Bar::new("calibrating", *galaxies);
+    // Sect. 4 calibrates one network; the configurations of Table 1 extend its settings.
     let base = registry.get("paper")?.configuration;
     let curves = calibrate(&base, *galaxies, *seed, threads, &mut bar)?;
     drop(bar);
@@ -131,6 +132,7 @@ fn of_table_one(
     given_once(wanted)?;
     let mut all = registry.published()?;
     let known: Vec<String> = all.iter().map(|(own, _)| own.name.clone()).collect();
+    // Only configurations of Table 1 have published values to compare with.
     if let Some(name) = wanted.iter().find(|name| !known.contains(name)) {
         bail!(
             "--submission: not in Table 1 (found {name}, expected one of {}). Try: shearq study --submission {name}",

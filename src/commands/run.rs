@@ -88,6 +88,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let run = measuring.run(source)?;
     match (&run.source, &data) {
         (Source::Simulated(settings), _) => {
+            // Clap requires --images with --simulate.
             let images = images::of_simulation(wanted, images.unwrap_or(1));
             let images = measuring.sharding.part(&images);
             let galaxies = images.len() as u64 * (settings.grid as u64).pow(2);
@@ -104,6 +105,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         // A folder as source comes from `data`.
         (Source::Folder { .. }, None) => {}
     }
+    // Other shards may not be done, and scores of a part of the images would look like those of all.
     if let Some(shard) = shard {
         let expected = [
             sets.as_ref().map(|list| format!(" --sets {list}")),

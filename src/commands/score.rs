@@ -197,6 +197,7 @@ fn catalogues(
     options: Options,
 ) -> anyhow::Result<()> {
     let store = arguments.store.as_deref();
+    // Before scoring: a store that cannot be written is an error at once.
     let _prepared = store.map(store::prepare).transpose()?;
     let sets = sets_of(arguments.sets.as_ref());
     let (catalogues, data) = match (&arguments.measured, &arguments.foreign, data) {
@@ -228,6 +229,7 @@ fn catalogues(
         (None, _, None) => bail!("--foreign needs the true shear. Try: --data DIR"),
     };
     let options = Options {
+        // Catalogues of shearq have the standard convention. That of other programs is determined from the data.
         choice: arguments.settings.convention.unwrap_or(catalogues.choice()),
         ..options
     };
@@ -339,6 +341,7 @@ fn spectrum_folder(
         let Some(Kind::Spectrum { set, .. }) = Kind::of(&path) else {
             continue;
         };
+        // Which of two spectra is meant cannot be guessed from their names.
         if let Some(other) = files.insert(set, path.clone()) {
             bail!(
                 "{}: {} is also a spectrum of set {set}; expected one method",
@@ -369,6 +372,7 @@ fn score_spectra(
         if let Some(set) = wanted.0.iter().find(|set| !files.contains_key(set)) {
             bail!("{}: found no spectrum of set {set}", place.display());
         }
+        // Spectra of other sets are not read: a damaged one must not stop the chosen sets.
         files.retain(|set, _| wanted.0.contains(set));
     }
     let mut scored = Vec::new();
@@ -415,6 +419,7 @@ fn score_spectrum(
     options: Options,
 ) -> anyhow::Result<(SetRecord, f64)> {
     let powers = read_bandpowers(path, &grid)?;
+    // A bandpower alone has no error. `pack` stores the covariance of cross-spectra from eight images on.
     let covariance =
         manifest.and_then(|manifest| manifest.covariances.get(path.file_name()?.to_str()?));
     let score = SetScorer::new(grid, shear, options)?.score_spectrum(&powers, covariance)?;
@@ -482,6 +487,7 @@ fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Resul
     let scored = [scored];
     let mut table = per_set(&scored, &title, options.definition);
     table.notes.extend(verdict_line("The catalogues", &scored));
+    // The JSON of plain files has the keys of the public scoring cases of GREAT10, so that both can be compared.
     if arguments.printing.format() == TableFormat::Json {
         anyhow::ensure!(
             !arguments.printing.chooses(),

@@ -63,6 +63,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             .chain(values.map(|(value, error)| Cell::with_error(*value, Some(error), 5)))
             .collect()
     });
+    // TreeCorr has no default names of columns, so that the table states the call that reads it.
     let mut notes = Vec::new();
     if let Some(position) = arguments.treecorr {
         let [first, second, units] = match position {

@@ -96,6 +96,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         let steps = steps
             .with_context(|| format!("galaxy {index} could not be measured: {}", measured.flags))?;
         let response_text = response(&measured, "\nR ");
+        // The title explains R if any galaxy has one.
         responses |= !response_text.is_empty();
         let label = format!(
             "{}/{}/{index}: {:+.3}, {:+.3}{response_text}",

@@ -121,6 +121,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         "{made} images simulated, {already} there already, in {}",
         arguments.out.display()
     ));
+    // The names of the folders are made here, and are arguments of the next commands.
     if versions.len() > 1 {
         let folders = versions.iter();
         let shown: Vec<String> = folders.map(|(_, out)| out.display().to_string()).collect();

@@ -64,6 +64,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let results = run_sets(&study, sets, threads, &mut bar)?;
     drop(bar);
     let mut bar = Bar::new("measuring biases", image * u64::from(pairs));
+    // With fewer images than Q: paired versions of the same galaxies cancel shape noise and pixel noise.
     let biases = bias_sets(&study, sets, pairs, threads, &mut bar)?;
     drop(bar);
     let table = contest_table(&plan, &results, &biases)?;
@@ -100,6 +101,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     study.claim.check()?;
     page.save()?;
     let form = &arguments.form;
+    // One table for programs; for people two, each of which fits a terminal.
     if matches!(form.format, TableFormat::Csv | TableFormat::Json) {
         return form.print(&table);
     }

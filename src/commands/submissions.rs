@@ -69,6 +69,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
                 Method::Linear => Template::Linear,
             };
             anyhow::ensure!(
+                // Never over a file: it may be the settings that the user tuned.
                 atomic::write_if_absent(file, template.text()?.as_bytes())?,
                 "{}: the file exists; expected a new file name",
                 file.display()

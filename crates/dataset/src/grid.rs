@@ -24,6 +24,7 @@ pub fn of_image(data: &DataFolder, path: &Path, image: &ImageReader) -> Result<M
         Some(n) => (n, n),
         None => (width / stamp, height / stamp),
     };
+    // A part of a stamp at the edge shows that the side of the stamps is wrong, and all others would be cut wrongly.
     if columns == 0 || rows == 0 || (width, height) != (columns * stamp, rows * stamp) {
         let (columns, rows) = (columns.max(1), rows.max(1));
         let message = format!(
@@ -38,6 +39,7 @@ pub fn of_image(data: &DataFolder, path: &Path, image: &ImageReader) -> Result<M
         galaxies,
         stamp,
     };
+    // `gather` fills all rows but the last, so that such a number belongs to another image.
     if mosaic.rows() != rows {
         let message = format!(
             "the header key NSTAMPS is {galaxies}; expected more than {}, as there are {rows} rows of {columns} stamps",
@@ -50,6 +52,7 @@ pub fn of_image(data: &DataFolder, path: &Path, image: &ImageReader) -> Result<M
 
 fn square(data: &DataFolder, path: &Path, mosaic: &Mosaic) -> Result<Grid, FileError> {
     let (n, rows) = (mosaic.columns, mosaic.rows());
+    // Modes are Fourier transforms on a square grid.
     if mosaic.galaxies != n * n {
         let message = format!(
             "there are {} stamps in {rows} rows of {n}; scoring expects as many rows as columns, all of them full",

@@ -40,6 +40,7 @@ pub fn of_folder(data: &DataFolder, sets: &[u32]) -> Result<Vec<ImageId>, FileEr
 }
 
 fn advice(data: &DataFolder, files: &Files) -> String {
+    // Misspelt names explain missing images better than a wrong folder does.
     if let Some(line) = files.unread().first() {
         return format!(". {line}");
     }

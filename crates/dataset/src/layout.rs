@@ -93,6 +93,7 @@ impl Layout {
         ] {
             check_pattern(key, pattern, &[])?;
         }
+        // Here and not when scoring, so that the message names the key of layout.toml.
         if !Grid::FIELDS.contains(field_degrees) {
             let (least, most) = (Grid::FIELDS.start(), Grid::FIELDS.end());
             return Err(format!(
@@ -215,6 +216,7 @@ impl DataFolder {
             .parent()
             .filter(|path| !path.as_os_str().is_empty());
         let here = listing::find(root.parent()?, first, &[""], &[]).ok()?;
+        // Any folder name with digits may look like that of a set; images of the layout in it decide.
         let is_set = here
             .sets()
             .into_iter()
@@ -228,6 +230,7 @@ impl DataFolder {
         let [plain, padded] = IMAGE_PLACEHOLDERS;
         let pattern = &self.layout.truth.replace(padded, "000").replace(plain, "0");
         let truths = listing::find(&self.root, pattern, &[""], &[])?;
+        // The pattern has no {set}: one file may be the truth of a million sets.
         if truths.serve_all_sets() {
             return Ok(self.images(&[])?.sets());
         }
@@ -253,6 +256,7 @@ impl DataFolder {
                 );
                 Err(FileError::new(&path, message))
             }
+            // A file of the standard sign in a folder of the challenge's is the only contradiction: the layout's default is no statement.
             stated => Ok(stated.unwrap_or(layout)),
         }
     }

@@ -67,6 +67,7 @@ impl Files {
 
     pub fn sets(&self) -> Vec<u32> {
         if self.serve_all_sets() {
+            // The files do not limit the sets; those with images do.
             return (1..=MAX_SET).collect();
         }
         self.by_set.keys().copied().flatten().collect()
@@ -173,6 +174,7 @@ impl Search<'_> {
         let part = part.as_os_str();
         let pattern = pieces(part);
         let endings = if rest.is_empty() { self.endings } else { &[""] };
+        // Without a number the name is known, and the folder need not be listed: it may have a million files.
         if let [Piece::Text(_)] | [] = pattern.as_slice() {
             if !rest.is_empty() {
                 return self.walk(&folder.join(part), rest, numbers);
@@ -234,6 +236,7 @@ impl Search<'_> {
     }
 
     fn pass_over(&mut self, path: PathBuf, name: &str, pattern: &[Piece<'_>], folder: bool) {
+        // A folder in the place of a file, or the reverse, is something else with a similar name.
         if path.is_dir() != folder {
             return;
         }
@@ -270,6 +273,7 @@ fn expected(pattern: &[Piece<'_>], runs: &[&str]) -> String {
         Piece::Text(text) => digits(text).len(),
         Piece::Number { .. } => 1,
     };
+    // With more or fewer runs, it is not known which of them are the set and the image.
     let fits = pattern.iter().map(|piece| places(&piece)).sum::<usize>() == runs.len();
     let (mut name, mut next) = (String::new(), 0);
     for piece in pattern {

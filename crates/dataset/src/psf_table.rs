@@ -71,11 +71,13 @@ pub fn read_all(path: &Path) -> Result<Vec<Placed>, FileError> {
         .read_record(&mut record)
         .map_err(FileError::doing(path, DOING))?
     {
+        // A line of blanks, as editors leave it at the end.
         if record.len() == 1 && record[0].is_empty() {
             continue;
         }
         let end = reader.position().byte() as usize;
         let wrong = |what: String| {
+            // Counted only for a message: for each row it would take a time quadratic in the length.
             let line = text[..end].trim_end().lines().count();
             FileError::new(path, format!("line {line}: {what}"))
         };

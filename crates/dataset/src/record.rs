@@ -198,6 +198,7 @@ fn most_important(mut differences: Vec<String>) -> Vec<String> {
     differences.truncate(MAX_DIFFERENCES);
     for line in &mut differences {
         if let Some((end, _)) = line.char_indices().nth(MAX_DIFFERENCE_CHARS) {
+            // Values of settings may be lists or texts of any length.
             line.truncate(end);
             line.push('…');
         }

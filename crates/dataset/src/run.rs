@@ -114,6 +114,7 @@ impl Run {
         if let Some(run) = Run::read(folder)? {
             return Ok(run);
         }
+        // The most frequent mistake is to name the data in place of the results.
         let images = DataFolder::open(folder).and_then(|data| data.images(&[]));
         let message = match images {
             Ok(images) if !images.sets().is_empty() => format!(

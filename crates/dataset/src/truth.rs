@@ -76,6 +76,7 @@ impl Sign {
             (Some(stated), Some(specified)) if stated != specified => {
                 return Err(SignFault::Contradicted { stated, specified });
             }
+            // Both agree here. The statement of the file is named, because it travels with the numbers.
             (Some(sign), _) => (sign, SignBasis::Stated),
             (None, Some(sign)) => (sign, SignBasis::Specified),
             (None, None) => match by_modes() {
@@ -123,6 +124,7 @@ pub fn sign_on_any_grid(rows: &[Row]) -> Option<TruthSign> {
     let least = |of: fn(&Row) -> f64| rows.iter().map(of).fold(f64::INFINITY, f64::min);
     let (x, y) = (least(|row| row.x), least(|row| row.y));
     let reach = rows.iter().map(|row| row.x - x).fold(0.0, f64::max);
+    // The first and the last cell are side − 1 cells apart.
     let stamp = reach / (side - 1) as f64;
     // The sign depends on neither the side of the field nor its place.
     let grid = Grid::new(side, Pixels(stamp), Degrees(10.0)).ok()?;

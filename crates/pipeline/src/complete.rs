@@ -67,6 +67,7 @@ impl Results<'_> {
         };
         let pool = Pool::new(threads)?;
         let checked = pool.in_order(0..images.len(), |position| {
+            // Images are in the order of their sets.
             let first = position == 0 || images[position - 1].set != images[position].set;
             self.check(images[position], first, inputs.as_ref())
         });
@@ -80,6 +81,7 @@ impl Results<'_> {
                         id,
                         position,
                         error: match error {
+                            // It names its own file, which may be one of the data.
                             PipelineError::File(error) => error,
                             other => FileError::new(&result, other),
                         },
@@ -158,6 +160,7 @@ fn check_catalogue(
     // One row more than expected is enough to find that there are too many.
     let rows = table::read(path, None, cells.saturating_add(1))?.height();
     check_rows(path, rows, cells)?;
+    // FITS has no room for keys of more than eight characters, so that their absence is no fault.
     let expected = kept(&metadata(run, id, prints)?, run.format);
     let found = read_metadata(path, run.format, expected.keys())?;
     let differing = expected

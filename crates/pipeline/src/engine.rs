@@ -66,6 +66,7 @@ where
     // Two pools: the reader surveys whole images on `ahead`, and would wait for ever for workers of `pool`, which wait for the reader.
     let (Pool(pool), ahead) = (Pool::new(threads)?, Pool::new(threads)?);
     let capacity = IN_FLIGHT * threads;
+    // The channels of the standard library suffice: an item is a row of stamps, which takes milliseconds.
     let (item_sender, item_receiver) = sync_channel::<(u64, I)>(capacity);
     let (result_sender, result_receiver) = sync_channel::<(u64, Done<O>)>(capacity);
     let (permit_sender, permit_receiver) = sync_channel::<()>(capacity);

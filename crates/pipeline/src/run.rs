@@ -48,6 +48,7 @@ impl<'s> SimulatedSource<'s> {
             PsfField::PerGalaxy(_) => None,
             PsfField::One(psf) => {
                 let cut = configuration.psf_cut();
+                // No noise is added, as `simulate` adds none to its star images.
                 let psf = match form {
                     PsfForm::Functional => psf.stamp_beside(cut.size, STAMP),
                     // A star that cannot be cut is an error: zeros in its place would be measured like any PSF.
@@ -228,6 +229,7 @@ pub fn run_folder(
                     run_warnings: Vec::new(),
                     table: None,
                     aligned: false,
+                    // There are no files to compare with later; the settings and the seed determine the data.
                     prints: BTreeMap::new(),
                 };
                 catalogues.add(&head, &image.batches[0], progress)
@@ -265,6 +267,7 @@ pub fn run_set(
         measurers,
         |feeder| {
             for &image in images {
+                // One image at a time: sessions keep what they found in the whole image until its last row is measured.
                 let mut open = SimulatedSessions::new(set, image, measurers, feeder.ahead())?;
                 for row in 0..n {
                     if !feeder.push(open.read(row)?) {

@@ -74,6 +74,7 @@ pub fn simulate_blind(
         RenderScratch::new,
         |scratch, row: Row<'_>| {
             let pixels = row.set.draw_row(&row.fields, row.iy, scratch);
+            // One PSF of the image is written with its header, not with each row.
             let one_each = matches!(row.fields.psf, PsfField::PerGalaxy(_));
             let stars = one_each.then(|| row.set.draw_stars(&row.fields, row.iy));
             Ok((row, pixels, stars))
@@ -189,6 +190,7 @@ impl<'s> OpenImage<'s> {
             PsfField::One(_) => vec![psf((0, 0))],
             PsfField::PerGalaxy(_) => (0..grid.cells()).map(|k| psf((k % n, k / n))).collect(),
         };
+        // Both forms of the PSF, so that configurations of either can be compared on the same galaxies.
         psf_table::write(&public.psf_functional(number, image), &rows)?;
         // Writing to memory cannot fail.
         let mut intrinsic = csv::Writer::from_writer(Vec::new());

@@ -67,6 +67,7 @@ impl StampTable {
         }
         let columns = parquet::read(path, None, MAX_ROWS)?;
         let (found, expected) = (columns.height(), mosaic.galaxies);
+        // The image and its table are two files, and one of them may be of an earlier `gather`.
         if found != expected {
             let message = format!(
                 "{found} rows; expected {expected}, one per stamp of the image. Try: gather it again"
@@ -97,6 +98,7 @@ impl StampTable {
 
     /// One Jacobian per stamp, if shapes are measured on the sky.
     pub(crate) fn jacobians(&self, path: &Path) -> Result<Option<Vec<Jacobian>>, FileError> {
+        // Ellipticities stay along the pixel axes, whatever Jacobians the table has.
         if self.head.frame == Frame::Pixel {
             return Ok(None);
         }

@@ -152,6 +152,7 @@ impl SimulationSettings {
             ("amplitude", amplitude),
             ("intrinsic_sigma", intrinsic_sigma),
         ] {
+            // NaN passes no comparison, so that the condition is that of good values.
             if !(value.is_finite() && value >= 0.0) {
                 return Err(SettingsError(format!(
                     "the simulation's {what} is {value}; expected a finite number, not negative"
@@ -257,6 +258,7 @@ impl SetSimulator {
             Some([g1, g2]) => Array2::from_elem((grid.n, grid.n), Complex64::new(g1, g2)),
             None => {
                 let mut rng = settings.stream(kind.set, WHOLE_SET, Purpose::Bandpowers);
+                // From a stream of their own: the field of a scatter of one is that of simulations without scatter.
                 let factors = settings.spectrum.factors(&mut rng);
                 let bins = Bins::new(&grid, Definition::Leaderboard);
                 let mut rng = settings.stream(kind.set, WHOLE_SET, Purpose::Shear);
@@ -310,6 +312,7 @@ impl SetSimulator {
         match self.kind.image {
             ImageType::LowSnr => 10.0,
             ImageType::HighSnr => 40.0,
+            // The fiducial S/N of Table 2 of the paper.
             _ => 20.0,
         }
     }

@@ -131,6 +131,7 @@ fn catalogue(
     }));
     let more = more_columns(configuration, galaxies).into_iter();
     columns.extend(more.map(|(name, values)| Column::new(name.into(), values)));
+    // Last, because these are the user's and differ from image to image.
     columns.extend(carried);
     frame(columns)
 }

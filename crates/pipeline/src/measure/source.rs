@@ -58,6 +58,7 @@ impl ImageSource {
         let path = data.galaxies(id.set, id.image);
         let (image, mosaic) = open_galaxies(data, id)?;
         let stamp = mosaic.stamp;
+        // Larger stamps are cut to the size of the configuration; smaller ones have no pixels to fill it with.
         if stamp < configuration.stamp.size {
             return Err(FileError::new(path, too_small(stamp, configuration)).into());
         }
@@ -72,6 +73,7 @@ impl ImageSource {
             None => None,
         };
         let stated = image.number("NOISESIG")?;
+        // Levels of single stamps, from a variance map, replace the one of the header.
         let uses_header = configuration.noise == NoiseSource::Header && levels.is_none();
         if uses_header && !stated.is_some_and(|sigma| sigma > 0.0 && sigma.is_finite()) {
             let found = stated.map_or("absent".into(), |sigma| sigma.to_string());
@@ -291,10 +293,12 @@ fn open_functional(path: &Path, cut: PsfCut, mosaic: &Mosaic) -> Result<PsfSourc
         );
         return Err(FileError::new(path, message));
     }
+    // One PSF is drawn here once, those of galaxies by the workers.
     let [psf] = rows.as_slice() else {
         return Ok(PsfSource::Functional(rows));
     };
     let stamp = psf.stamp_beside(cut.size, mosaic.stamp);
+    // The stamp is divided by its sum, which is zero for a profile between the pixels.
     if stamp.iter().any(|value| !value.is_finite()) {
         let message = format!(
             "a PSF with a FWHM of {} px has no light on its stamp; expected a width of about a pixel or more",
@@ -337,6 +341,7 @@ fn open_stars(path: &Path, cut: PsfCut, mosaic: &Mosaic) -> Result<OpenPsfs, Fil
         return Err(FileError::new(path, message));
     }
     let one = (width, height) == (side, side);
+    // A single galaxy has a shared star: both are one stamp, and a shared one is prepared once.
     if mosaic.galaxies > 1 && (width, height) == (columns * side, rows * side) {
         check_strip(path, columns, side)?;
         let image = Box::new(image);
