@@ -339,8 +339,6 @@ pub struct WeightedShape {
     /// Shear of the sheared catalogues (`1p`, `1m`, `2p`, `2m`): further columns of ellipticity, S/N, flux and size. Zero
     /// for none.
     pub sheared_step: f64,
-    /// What is done about neighbours.
-    pub neighbours: Neighbours,
     /// Which ellipticity the catalogue reports as e1, e2.
     pub ellipticity: EllipticityType,
     /// What ellipticities are divided by.
@@ -482,16 +480,6 @@ pub enum BrightnessUnit {
     Noise,
     /// The stamp's brightest pixel.
     Peak,
-}
-
-/// What is done about neighbours of a galaxy on its stamp.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Neighbours {
-    /// Those that are near or much brighter flag the galaxy; others are subtracted.
-    Flag,
-    /// They are not looked for: all light counts as light of the galaxy.
-    Keep,
 }
 
 /// Calibration of reported ellipticities.

@@ -16,8 +16,10 @@ AEGIS = "AEGIS_F814w_catalog.fits"
 PIXEL = 0.2
 #: Half-light radii in pixels of mixed galaxies, and indices of their Sérsic profiles.
 RADII, INDICES = {"mixed": (2.5, 5.0), "mixed8": (8.0, 8.0)}, (0.5, 4.0)
+#: Galaxies whose light is lopsided, clumpy or hollow.
+UNUSUAL = ("knots", "offset", "ring")
 #: Galaxies that need no catalogue.
-RENDERED = [*PROFILES, *RADII]
+RENDERED = [*PROFILES, *RADII, *UNUSUAL]
 
 
 def profile(kind):
@@ -37,6 +39,22 @@ def mixture(kind, random):
     return 0.5 * bulge + 0.5 * galsim.Exponential(half_light_radius=1.25 * radius)
 
 
+def unusual(kind, random):
+    """A disc with 40 % of its light in knots, with a bulge off by its half-light radius, or a ring; round but for those."""
+    radius = random.uniform(3.0, 5.0)
+    disc = galsim.Exponential(half_light_radius=radius)
+    if kind == "knots":
+        generator = galsim.BaseDeviate(int(random.integers(1, 2**31)))
+        knots = galsim.RandomKnots(int(random.integers(10, 31)), profile=disc, rng=generator)
+        return 0.6 * disc + 0.4 * knots
+    if kind == "offset":
+        bulge = galsim.DeVaucouleurs(half_light_radius=0.4 * radius)
+        return 0.7 * disc + 0.3 * bulge.shift(*direction(random, radius))
+    # A Gaussian with a hollow as wide as 0.7 of it, and as bright.
+    sigma = 1.5 * radius
+    return galsim.Gaussian(sigma=sigma) - 0.49 * galsim.Gaussian(sigma=0.7 * sigma)
+
+
 class Galaxies:
     """Draws galaxies of a kind before shear and PSF."""
 
@@ -53,7 +71,12 @@ class Galaxies:
         if self.kind in RENDERED:
             modulus = min(random.rayleigh(0.14), 0.6)
             angle = random.uniform(0.0, np.pi)
-            round_one = profile(self.kind) if self.kind in PROFILES else mixture(self.kind, random)
+            if self.kind in PROFILES:
+                round_one = profile(self.kind)
+            elif self.kind in UNUSUAL:
+                round_one = unusual(self.kind, random)
+            else:
+                round_one = mixture(self.kind, random)
             return round_one.shear(
                 g1=modulus * np.cos(2 * angle), g2=modulus * np.sin(2 * angle)
             )

@@ -198,9 +198,7 @@ def examine(case, options):
         "peers": others.results(),
     }
     if good.sum() < 8:
-        least = case.flagged[0] or 0.5
-        passes = (case.or_flagged or case.flagged[0] > 0.0) and result["flagged_once"] >= least
-        return result | {"verdict": "flagged" if passes else "FAILED"}
+        return result | {"verdict": "FAILED"}
     kept = [row for row in rows if 1 in row]
     of = np.concatenate([row["good"] for row in kept])
     images = []
@@ -237,8 +235,6 @@ def verdict(case, result, count):
     if case.images:
         held.append(result["images"] <= case.images + 2 * result["images_error"])
     held.append(case.flagged[0] <= result["flagged_once"] <= case.flagged[1])
-    if case.or_flagged and result["flagged_once"] > 0.5:
-        return "flagged"
     if not all(held):
         return "FAILED"
     sharp = max(result["m1_error"], result["m2_error"]) <= max(case.aim, 0.7)

@@ -8,12 +8,6 @@ use multiversion::multiversion;
 const CELL_SIDE: i32 = 3;
 // In pixels, of the middle of a place from the galaxy's centre. Chosen by hand.
 const MIN_DISTANCE: f32 = 9.0;
-// Half the side of the square whose sum is the galaxy's light, in pixels.
-// Chosen by hand.
-pub(crate) const INNER_HALF_SIDE: i32 = 8;
-// Weights of a cell and of those beside it, along an axis.
-// With cells of 3 px, a σ of 2.3 px: near that of a galaxy behind its PSF.
-const SMOOTHING: [f32; 3] = [0.5, 1.0, 0.5];
 
 /// A place of a stamp that is brighter than the opposite one.
 #[derive(Debug, Clone, Copy)]
@@ -46,12 +40,8 @@ pub(crate) struct Asymmetry {
     /// their opposites.
     lines: [Vec<f32>; 2],
     cells: Vec<Cell>,
-    /// Excess and pixels of a smoothed row, between zeros.
-    smoothed: [Vec<f32>; 2],
     /// Those found last.
     pub(crate) places: Vec<BrightPlace>,
-    /// Light of the galaxy of the last stamp.
-    pub(crate) light: f32,
 }
 
 /// Excess of a cell over its opposite, and the number of pixels of both.
@@ -92,14 +82,11 @@ fn cells_to_edge(n: i32) -> i32 {
 
 impl Asymmetry {
     pub(crate) fn new(n: usize) -> Self {
-        let row = 2 * cells_to_edge(n as i32) as usize;
         Asymmetry {
             n: n as i32,
             lines: std::array::from_fn(|_| vec![0.0; 3 * n]),
             cells: Vec::with_capacity(n * n / 8),
-            smoothed: std::array::from_fn(|_| vec![0.0; row + 2]),
             places: Vec::with_capacity(n * n / 8),
-            light: 0.0,
         }
     }
 
@@ -132,57 +119,12 @@ impl Asymmetry {
         }
     }
 
-    /// Compares places under a weight as wide as a galaxy behind its PSF: of 1 for a cell, 1/2 for those beside it and 1/4
-    /// for those at its corners. A weight w counts as w² pixels, because noise adds in squares. Keeps the places that
-    /// `is_neighbour` accepts by the galaxy's light, the excess and the number of pixels.
-    pub(crate) fn compare_smoothed(
-        &mut self,
-        stamp: &[f32],
-        rotation: [i32; 2],
-        is_neighbour: impl Fn(f32, f32, f32) -> bool,
-    ) {
-        let to_edge = self.compare_cells(stamp, rotation);
-        let [x0, y0] = beyond_centre(rotation);
-        let middle = |first: i32, step: i32, sum: i32| {
-            (first + step * CELL_SIDE) as f32 + 0.5 * (CELL_SIDE - 1) as f32 - 0.5 * sum as f32
-        };
-        let row = 2 * to_edge as usize;
-        let [beside, _, _] = SMOOTHING;
-        for j in 0..to_edge {
-            let y = middle(y0, j, rotation[1]);
-            // The last row has no cells beyond it.
-            let lines = self.cells[j as usize * row..].chunks_exact(row).take(3);
-            let [excesses, counts] = &mut self.smoothed;
-            excesses.fill(0.0);
-            counts.fill(0.0);
-            for (line, weight) in lines.zip(SMOOTHING) {
-                let sums = excesses[1..].iter_mut().zip(&mut counts[1..]);
-                for ((excess, pixels), cell) in sums.zip(line) {
-                    *excess += weight * cell.excess;
-                    *pixels += weight * weight * cell.pixels as f32;
-                }
-            }
-            for i in 0..row {
-                let [excesses, counts] = &self.smoothed;
-                let excess = excesses[i + 1] + beside * (excesses[i] + excesses[i + 2]);
-                let pixels = counts[i + 1] + beside * beside * (counts[i] + counts[i + 2]);
-                let x = middle(x0, i as i32 - to_edge, rotation[0]);
-                let is_near = x * x + y * y < MIN_DISTANCE * MIN_DISTANCE;
-                if !is_near && is_neighbour(self.light, excess.abs(), pixels) {
-                    self.places
-                        .push(BrightPlace::from_excess(excess, pixels, [x, y]));
-                }
-            }
-        }
-    }
-
-    /// Compares all cells, and sums the galaxy's light. Returns the number of cells from the centre to an edge.
+    /// Compares all cells. Returns the number of cells from the centre to an edge.
     fn compare_cells(&mut self, stamp: &[f32], rotation: [i32; 2]) -> i32 {
         self.places.clear();
         self.cells.clear();
         let to_edge = cells_to_edge(self.n);
         let [x0, y0] = beyond_centre(rotation);
-        self.light = self.inner_light(stamp, rotation);
         let n = self.n as usize;
         let columns = |x: i32| cell_on_stamp(x, self.n).len() as i32;
         // One row of cells from the other half, for blocks on the line between both.
@@ -210,21 +152,6 @@ impl Asymmetry {
             }
         }
         to_edge
-    }
-
-    /// The light of 16 × 16 pixels around the galaxy's centre.
-    pub(crate) fn inner_light(&self, stamp: &[f32], rotation: [i32; 2]) -> f32 {
-        let range = |first: i32| {
-            let on_stamp = |at: i32| at.clamp(0, self.n) as usize;
-            on_stamp(first - INNER_HALF_SIDE)..on_stamp(first + INNER_HALF_SIDE)
-        };
-        let [columns, rows] = beyond_centre(rotation).map(range);
-        stamp
-            .chunks_exact(self.n as usize)
-            .skip(rows.start)
-            .take(rows.len())
-            .map(|line| line[columns.clone()].iter().sum::<f32>())
-            .sum()
     }
 }
 

@@ -16,16 +16,6 @@ const STEP_FACTOR: f64 = 1.5;
 const GALAXY_STEPS: usize = 3;
 // A weighted centroid of one σ of the weight. Chosen by hand.
 const MAX_GALAXY_STEP: f64 = 3.0;
-// At 1.0 and 1.5 px, 6 and 4 % fewer blends at 5 to 7 px are found: the centre moves between both.
-const REFINED_OFFSET: f32 = 2.0;
-// For a galaxy of σ = 5 px, a step goes 0.2 of the way.
-const REFINING_STEPS: usize = 12;
-
-// A window on every centroid gives m = −0.004 at S/N 20. Command and seed not recorded.
-const FIXED_WINDOW_OFFSET: f32 = 1.25;
-// Chosen by hand.
-const CENTRED_WINDOW_OFFSET: f32 = 2.0;
-
 // A star of FWHM 10 px is found to 10⁻³ px. Chosen by hand.
 const MAX_STAR_STEPS: usize = 40;
 // Chosen by hand.
@@ -36,30 +26,10 @@ pub(crate) const MAX_STAR_SHIFT: f64 = 3.0;
 
 /// Offset (x, y) of the galaxy from the centre of its stamp of `n` pixels a side; zero if there is no light.
 pub(crate) fn galaxy_centroid(stamp: &[f32], n: usize) -> [f32; 2] {
-    follow_galaxy(stamp, n, [0.0; 2], GALAXY_STEPS)
-}
-
-/// More steps for a galaxy far off its stamp's centre, where the first ones fall short if it is large.
-pub(crate) fn refined_centroid(stamp: &[f32], n: usize, found: [f32; 2]) -> [f32; 2] {
-    if found[0].hypot(found[1]) < REFINED_OFFSET {
-        found
-    } else {
-        follow_galaxy(stamp, n, found, REFINING_STEPS)
-    }
-}
-
-/// Where the window of a linear method is centred for a galaxy with this centroid.
-pub(crate) fn window_centre(centroid: [f32; 2]) -> [f32; 2] {
-    let offset = centroid[0].hypot(centroid[1]);
-    let share = (offset - FIXED_WINDOW_OFFSET) / (CENTRED_WINDOW_OFFSET - FIXED_WINDOW_OFFSET);
-    centroid.map(|c| share.clamp(0.0, 1.0) * c)
-}
-
-fn follow_galaxy(stamp: &[f32], n: usize, from: [f32; 2], steps: usize) -> [f32; 2] {
     let centre = (n as f64 - 1.0) / 2.0;
     let bound = centre / 2.0;
-    let mut offset = from.map(f64::from);
-    for _ in 0..steps {
+    let mut offset = [0.0; 2];
+    for _ in 0..GALAXY_STEPS {
         let row = |y: usize| &stamp[y * n..][..n];
         let Some(step) = step([n; 2], row, offset.map(|at| centre + at)) else {
             return [0.0; 2];
@@ -153,7 +123,7 @@ mod tests {
     const N: usize = 48;
 
     #[test]
-    fn galaxies_are_centred_and_the_window_follows_far_ones() {
+    fn centroids_of_galaxies_are_found() {
         for (x, y) in [(0.0, 0.0), (1.0, -0.5), (-3.0, 1.5), (0.3, 4.0)] {
             let stamp: Vec<f32> = (0..N * N)
                 .map(|at| {
@@ -166,8 +136,6 @@ mod tests {
             let rest = (found[0] - x).hypot(found[1] - y);
             assert!(rest < 0.16 * x.hypot(y) + 0.01, "{found:?} {x} {y}");
         }
-        assert_eq!(window_centre([0.9, -0.8]), [0.0; 2]);
-        assert_eq!(window_centre([-2.0, 1.0]), [-2.0, 1.0]);
         assert_eq!(galaxy_centroid(&[-1.0; N * N], N), [0.0; 2]);
     }
 }

@@ -56,7 +56,6 @@ mod measurement;
 mod measurer;
 mod method;
 mod missing_pixels;
-mod neighbours;
 mod noise;
 pub mod parts;
 mod pixel;

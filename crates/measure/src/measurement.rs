@@ -114,22 +114,19 @@ pub enum Flag {
     /// The distortion exceeds 1 and has no shear-type ellipticity.
     #[error("distortion above 1")]
     NoShear = 32,
-    // 64 was "no response to divide by", when each image was calibrated by itself.
-    /// Another galaxy is too near to be separated, or the galaxy has such a shape.
-    #[error("a neighbour or an unusual shape")]
-    Neighbour = 128,
+    // 64 was "no response to divide by", when each image was calibrated by itself, and 128 "a neighbour or an unusual shape". Neither
+    // may mean something else. A flag for neighbours selects by shear: m was −0.13 for galaxies with knots at S/N 100.
 }
 
 impl Flag {
     /// All, in the order of their bits.
-    pub const ALL: [Flag; 7] = [
+    pub const ALL: [Flag; 6] = [
         Flag::NotFinite,
         Flag::BadPsf,
         Flag::NoScale,
         Flag::NoLight,
         Flag::NoExtent,
         Flag::NoShear,
-        Flag::Neighbour,
     ];
 }
 

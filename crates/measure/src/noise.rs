@@ -25,7 +25,7 @@ use shearq_quantities::statistics::{SCATTER, median};
 use shearq_submissions::SkySource;
 
 use crate::asymmetry::{Asymmetry, rotation_sum};
-use crate::centroid::{galaxy_centroid, window_centre};
+use crate::centroid::galaxy_centroid;
 use crate::error::MeasureError;
 use crate::examine::enough;
 use crate::missing_pixels::MissingPixels;
@@ -551,8 +551,7 @@ impl NoiseSurvey {
     fn add_contrasts(&mut self) {
         let full = self.plan.full;
         let centroid = galaxy_centroid(&self.pixels, full);
-        self.galaxies
-            .add(&self.pixels, full, window_centre(centroid));
+        self.galaxies.add(&self.pixels, full);
         let rotation = rotation_sum(centroid, full);
         self.asymmetry.compare(&self.pixels, rotation);
         let places = &self.asymmetry.places;

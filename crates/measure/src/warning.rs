@@ -641,9 +641,6 @@ fn advice(flag: Flag) -> &'static str {
         Flag::NoScale => "check that the stamps are not blank and that the noise is known",
         Flag::NoLight | Flag::NoExtent => "check the sky, the sign of the image and its units",
         Flag::NoShear => "check that there is a galaxy on the stamps",
-        Flag::Neighbour => {
-            "check sky gradients and that the stamps are centred on the galaxies. If each stamp has one galaxy, set shape.neighbours = \"keep\""
-        }
     }
 }
 

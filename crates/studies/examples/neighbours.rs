@@ -1,7 +1,6 @@
 //! The bias m of galaxies that have one neighbour, by its distance and flux.
 //!
-//! `cargo run --release -p shearq-studies --example neighbours -- SCENES SEED SNR [FIGURE]` prints a table in Markdown, and
-//! draws it to a PNG or SVG file. m is less that of the same galaxies without their neighbours. Galaxies and neighbours are a bulge and a disc with half-light radii of 2.5 to 5 px, behind
+//! `cargo run --release -p shearq-studies --example neighbours -- SCENES SEED SNR` prints a table in Markdown. m is less that of the same galaxies without their neighbours. Galaxies and neighbours are a bulge and a disc with half-light radii of 2.5 to 5 px, behind
 //! a Moffat PSF with a FWHM of 3.4 px. The shear is (γ, γ) and (−γ, −γ) with γ = 0.02. Each scene is measured in eight
 //! versions: both shears, turned by 90 degrees or not, and both signs of the noise. Only the galaxy is sheared, or the
 //! whole scene about the galaxy.
@@ -9,7 +8,6 @@
 
 use std::error::Error;
 use std::f64::consts::{PI, TAU};
-use std::path::Path;
 
 use ndarray::{Array2, Array3, ArrayView2};
 use rand::{RngExt, SeedableRng};
@@ -19,7 +17,6 @@ use shearq_measure::{
     ArraySource, KnownNoise, Measurement, Measurer, OneThread, PsfWorker, Psfs, Session,
 };
 use shearq_quantities::{FunctionalPsf, PsfProfile, PsfTransform, Shear, TransformedPsf};
-use shearq_render::figure::{Figure, LinePlot, PanelGrid, PictureFormat, Series, Style};
 use shearq_simulate::galaxy::Galaxy;
 use shearq_simulate::render::{RenderScratch, Renderer};
 
@@ -38,10 +35,6 @@ const DISTANCES: [[f64; 2]; 6] = [
 ];
 // Fluxes of the neighbour in units of the galaxy's.
 const RATIOS: [[f64; 2]; 2] = [[0.3, 1.0], [1.0, 3.0]];
-// Ends of the axis of m in the figure, in 10⁻³.
-const SHOWN: (f64, f64) = (-100.0, 100.0);
-// Largest error of m that the figure shows.
-const MOST_ERROR: f64 = 0.05;
 // Groups of scenes that the errors come from.
 const GROUPS: usize = 20;
 
@@ -148,23 +141,6 @@ impl Away {
 // A scene's versions `[sign of the shear][version]`.
 type Scene = [[Measurement; 4]; 2];
 
-#[derive(Default, Clone)]
-struct Bin {
-    scenes: Vec<Scene>,
-}
-
-// What is printed of a bin: m less that of the same galaxies without a neighbour, and shares.
-struct Row {
-    // Of scenes of which all versions can be measured.
-    m: [f64; 2],
-    m_error: [f64; 2],
-    // Of versions that can be measured, each for itself.
-    single: [f64; 2],
-    single_error: [f64; 2],
-    // Share of versions with a flag under the positive and the negative shear.
-    flagged: [f64; 2],
-}
-
 // Sums of one component over scenes.
 #[derive(Clone, Copy, Default)]
 struct Sums {
@@ -202,13 +178,11 @@ impl Sums {
 }
 
 // m of one component less that without a neighbour, and its error: a jackknife over groups of scenes.
-fn bias(bin: &Bin, alone: &Bin, k: usize, whole: bool) -> (f64, f64) {
+fn bias(scenes: &[Scene], alone: &[Scene], k: usize) -> (f64, f64) {
     let mut groups = [[Sums::default(); 2]; GROUPS];
-    for (at, (scene, without)) in bin.scenes.iter().zip(&alone.scenes).enumerate() {
-        if !whole || scene.iter().flatten().all(|g| g.flags.is_empty()) {
-            groups[at % GROUPS][0].add(Sums::of(scene, k), 1.0);
-            groups[at % GROUPS][1].add(Sums::of(without, k), 1.0);
-        }
+    for (at, (scene, without)) in scenes.iter().zip(alone).enumerate() {
+        groups[at % GROUPS][0].add(Sums::of(scene, k), 1.0);
+        groups[at % GROUPS][1].add(Sums::of(without, k), 1.0);
     }
     let mut all = [Sums::default(); 2];
     for group in groups {
@@ -225,25 +199,6 @@ fn bias(bin: &Bin, alone: &Bin, k: usize, whole: bool) -> (f64, f64) {
     let squares: f64 = left_out.iter().map(|v| (v - mean) * (v - mean)).sum();
     let error = (squares * (GROUPS as f64 - 1.0) / GROUPS as f64).sqrt();
     (all[0].bias() - all[1].bias(), error)
-}
-
-impl Bin {
-    fn row(&self, alone: &Bin) -> Row {
-        let all = |whole: bool| [0, 1].map(|k| bias(self, alone, k, whole));
-        let (whole, single) = (all(true), all(false));
-        let flagged = [0, 1].map(|side| {
-            let versions = self.scenes.iter().flat_map(|scene| &scene[side]);
-            let bad = versions.filter(|g| !g.flags.is_empty()).count();
-            bad as f64 / (4 * self.scenes.len()) as f64
-        });
-        Row {
-            m: whole.map(|m| m.0),
-            m_error: whole.map(|m| m.1),
-            single: single.map(|m| m.0),
-            single_error: single.map(|m| m.1),
-            flagged,
-        }
-    }
 }
 
 fn measured(
@@ -267,33 +222,19 @@ fn measured(
     Ok([side(0)?, side(1)?])
 }
 
-fn name(range: [f64; 2]) -> String {
-    format!("{} to {}", range[0], range[1])
-}
-
-fn print(case: &str, row: &Row) {
-    let milli = |m: [f64; 2], error: [f64; 2]| {
-        let [m1, m2] = m.map(|m| 1e3 * m);
-        format!("{m1:+.1}, {m2:+.1} ± {:.1}", 1e3 * error[0].max(error[1]))
-    };
-    println!(
-        "| {case} | {} | {} | {:.2} %, {:.2} % |",
-        milli(row.m, row.m_error),
-        milli(row.single, row.single_error),
-        100.0 * row.flagged[0],
-        100.0 * row.flagged[1],
-    );
+fn print(case: &str, scenes: &[Scene], alone: &[Scene]) {
+    let [(m1, error1), (m2, error2)] = [0, 1].map(|k| bias(scenes, alone, k));
+    let (m1, m2, error) = (1e3 * m1, 1e3 * m2, 1e3 * error1.max(error2));
+    let versions = scenes.iter().flatten().flatten();
+    let lost = versions.filter(|g| !g.flags.is_empty()).count();
+    println!("| {case} | {m1:+.1}, {m2:+.1} ± {error:.1} | {lost} |");
 }
 
 fn main() -> Result<(), Box<dyn Error>> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
-    let ([scenes, seed, snr], figure) = match arguments.as_slice() {
-        [scenes, seed, snr] => ([scenes, seed, snr], None),
-        [scenes, seed, snr, figure] => ([scenes, seed, snr], Some(Path::new(figure))),
-        _ => return Err("expected SCENES SEED SNR [FIGURE]".into()),
+    let [scenes, seed, snr] = arguments.as_slice() else {
+        return Err("expected SCENES SEED SNR".into());
     };
-    // Found out before the work is done.
-    figure.map(PictureFormat::of).transpose()?;
     let (scenes, seed): (usize, u64) = (scenes.parse()?, seed.parse()?);
     let profile = PsfProfile::Moffat { beta: 3.0 };
     let transform = PsfTransform::new(profile)?;
@@ -304,7 +245,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         scratch: RenderScratch::new(),
         snr: snr.parse()?,
     };
-    let mut bins = vec![Bin::default(); 1 + 2 * DISTANCES.len() * RATIOS.len()];
+    let mut bins = vec![Vec::<Scene>::new(); 1 + 2 * DISTANCES.len() * RATIOS.len()];
 
     let measurer = Measurer::named("48/linear/star", SIDE)?;
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
@@ -335,9 +276,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         let at = place(&mut rng);
         let (galaxy, flux) = drawing.central(Profile::drawn(&mut rng), at)?;
         let noise = noise(&mut rng);
-        bins[0]
-            .scenes
-            .push(measured(&mut worker, &galaxy, None, noise.view())?);
+        bins[0].push(measured(&mut worker, &galaxy, None, noise.view())?);
         let mut bin = 1;
         for range in DISTANCES {
             let profile = Profile::drawn(&mut rng);
@@ -353,81 +292,24 @@ fn main() -> Result<(), Box<dyn Error>> {
                     let light = flux * (ratio[0] * (ratio[1] / ratio[0]).powf(share)) as f32;
                     let neighbour = Some((&stamps, light));
                     let found = measured(&mut worker, &galaxy, neighbour, noise.view())?;
-                    bins[bin].scenes.push(found);
+                    bins[bin].push(found);
                     bin += 1;
                 }
             }
         }
     }
 
-    println!(
-        "| neighbour at (px) | sheared | flux ratio | m1, m2 (10⁻³) | m1, m2 (10⁻³), versions alone | flagged |"
-    );
-    println!("|---|---|---|---|---|---|");
-    print("none | | ", &bins[0].row(&bins[0]));
-    let rows: Vec<Row> = bins[1..].iter().map(|bin| bin.row(&bins[0])).collect();
-    let mut rest = rows.iter();
-    for range in DISTANCES {
+    println!("| neighbour at (px) | sheared | flux ratio | m1, m2 (10⁻³) | flagged |");
+    println!("|---|---|---|---|---|");
+    let mut rest = bins[1..].iter();
+    for [near, far] in DISTANCES {
         for sheared in ["no", "yes"] {
-            for ratio in RATIOS {
-                let row = rest.next().expect("a bin for each");
-                print(
-                    &format!("{} | {sheared} | {}", name(range), name(ratio)),
-                    row,
-                );
+            for [faint, bright] in RATIOS {
+                let scenes = rest.next().expect("scenes of each kind");
+                let case = format!("{near} to {far} | {sheared} | {faint} to {bright}");
+                print(&case, scenes, &bins[0]);
             }
         }
-    }
-    if let Some(path) = figure {
-        plots(&rows).save(path)?;
     }
     Ok(())
-}
-
-// m against distance, for galaxies sheared alone and with the neighbour.
-fn plots(rows: &[Row]) -> PanelGrid {
-    let plot = |sheared: usize, title: &str| {
-        let of_ratio = |ratio: usize| {
-            let (mut x, mut y, mut errors) = (Vec::new(), Vec::new(), Vec::new());
-            for (at, range) in DISTANCES.into_iter().enumerate() {
-                let row = &rows[4 * at + 2 * sheared + ratio];
-                let (m, error) = (
-                    0.5 * (row.m[0] + row.m[1]),
-                    row.m_error[0].max(row.m_error[1]),
-                );
-                // Beside each other, not on top.
-                x.push(0.5 * (range[0] + range[1]) + 0.3 * (ratio as f64 - 0.5));
-                y.push(if error < MOST_ERROR {
-                    1e3 * m
-                } else {
-                    f64::NAN
-                });
-                errors.push(1e3 * error);
-            }
-            let [low, high] = RATIOS[ratio];
-            let label = format!("flux ratio {low} to {high}");
-            Series::new(&label, x, y, Style::Points, ratio).with_errors(errors)
-        };
-        LinePlot {
-            title: title.into(),
-            x_label: "distance [px]".into(),
-            y_label: "m [10⁻³]".into(),
-            y_range: Some(SHOWN),
-            series: vec![
-                Series::new("", vec![9.0, 25.0], vec![0.0; 2], Style::Dashed, 7),
-                of_ratio(0),
-                of_ratio(1),
-            ],
-            x_range: Some((9.0, 25.0)),
-            ..LinePlot::default()
-        }
-    };
-    PanelGrid {
-        title: "Bias by a neighbour, of galaxies without a flag".into(),
-        columns: 2,
-        plots: vec![
-            plot(0, "galaxy sheared alone"),
-            plot(1, "neighbour sheared, too"),
-        ],
-    }
 }

@@ -35,8 +35,6 @@ class Flag(enum.IntFlag):
     """Moments without extent."""
     NoShear = 32
     """Distortion above 1."""
-    Neighbour = 128
-    """A neighbour or an unusual shape."""
 
 
 @dataclass(frozen=True, repr=False)

@@ -153,20 +153,19 @@ impl Spectral {
     }
 
     /// Deconvolves the stamps of combined epochs and writes the autocorrelation with its derivatives, with noise of level
-    /// `noise`. The window is at `centre` in common coordinates, from the places of the galaxy.
+    /// `noise`. The window is at the places of the galaxy.
     pub(crate) fn autocorrelate_epochs<'a>(
         &self,
         psf: &SpectralPsf,
         epochs: &[SpectralEpoch],
         stamp: impl Fn(usize) -> EpochStamp<'a>,
-        (centre, noise): ([f32; 2], f32),
+        noise: f32,
         (scratch, buffers): (&mut SpectralScratch, &mut EpochScratch),
         out: &mut Lags,
     ) {
         for (which, epoch) in epochs.iter().enumerate() {
             let (stamp, place) = stamp(which);
-            let place = epoch.pixels.map(place);
-            let at = std::array::from_fn(|axis| centre[axis] + place[axis] as f32);
+            let at = epoch.pixels.map(place).map(|at| at as f32);
             self.place_window(at, scratch);
             match epoch.pixels {
                 EpochPixels::Shaped(shape) => {
