@@ -13,6 +13,7 @@ pub(crate) mod mean;
 pub(crate) mod measure;
 pub(crate) mod merge;
 pub(crate) mod pack;
+pub(crate) mod plan;
 pub(crate) mod published;
 pub(crate) mod quickstart;
 pub(crate) mod reproduce;

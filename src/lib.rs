@@ -92,7 +92,7 @@ enum Command {
     )]
     Compare(compare::Arguments),
     #[command(
-        after_help = "Examples:\n  shearq bias catalogue.fits --bins snr:5\n  shearq bias plus.parquet minus.parquet --truth shears.csv --fail-above m=2e-3@3sigma"
+        after_help = "Examples:\n  shearq bias --plan 1e-3\n  shearq bias catalogue.fits --bins snr:5\n  shearq bias plus.parquet minus.parquet --truth shears.csv --fail-above m=2e-3@3sigma"
     )]
     Bias(Box<bias::Arguments>),
     #[command(

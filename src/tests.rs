@@ -167,6 +167,8 @@ const WAYS: [(&str, &[&str]); 33] = [
             "CATALOGUE against g1 g2 columns ellipticity truth-sign bins where design units drop-missing step format wide metrics",
             "CATALOGUE against truth columns ellipticity truth-sign bins where design units drop-missing step format wide metrics",
             "merge bootstrap seed fail-above junit plot format wide metrics report",
+            "plan",
+            "example",
         ],
     ),
     (
@@ -271,7 +273,8 @@ fn refused(command: &Command, a: &Arg, b: &Arg) -> bool {
         // Flattened structures are groups that allow several members.
         both && !group.clone().is_multiple()
     });
-    names(a, b) || names(b, a) || exclusive
+    let alone = a.is_exclusive_set() || b.is_exclusive_set();
+    names(a, b) || names(b, a) || exclusive || alone
 }
 
 // Compares a command, or its subcommands, with the table.

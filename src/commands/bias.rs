@@ -8,6 +8,7 @@ use shearq_bias::{Design, Errors};
 
 use crate::arguments::{Printing, ReportFile, SignArgument, positive};
 use crate::choices::{name_of, named};
+use crate::commands::plan::{example, plan};
 use crate::{Findings, tell};
 use shearq_dataset::images::Shard;
 use shearq_dataset::truth::word;
@@ -52,6 +53,13 @@ pub(crate) struct Arguments {
     /// Merge files that --sums wrote for shards of one list of catalogues.
     #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with = "Summing")]
     merge: Vec<PathBuf>,
+    /// Print how many measurements determine m to this error, such as 1e-3. Needs no catalogues.
+    #[arg(long, value_name = "ERROR", value_parser = positive, exclusive = true)]
+    plan: Option<f64>,
+    /// Write example catalogues `plus.csv` and `minus.csv` into this folder: 20,000 galaxies of which m1 is 0.01, m2 -0.02,
+    /// c1 0.001 and c2 -0.0005.
+    #[arg(long, value_name = "DIR", exclusive = true)]
+    example: Option<PathBuf>,
     /// Plot m and c to this file, PNG or SVG by its ending.
     #[arg(long, value_name = "FILE")]
     plot: Option<PathBuf>,
@@ -66,7 +74,7 @@ pub(crate) struct Arguments {
 struct Summing {
     /// Catalogues, all with the same columns, or folders that `measure` or `run` wrote. FILE[TABLE] is one table of a
     /// FITS file.
-    #[arg(value_name = "CATALOGUE", required_unless_present = "merge")]
+    #[arg(value_name = "CATALOGUE", required_unless_present_any = ["merge", "plan", "example"])]
     catalogues: Vec<PathBuf>,
     /// Catalogues of another program on the same galaxies, in the same order. The output contains both and the
     /// difference, with paired errors.
@@ -187,6 +195,12 @@ fn parse_bins(text: &str) -> anyhow::Result<Binning> {
 const MOST_BYTES: u64 = 1 << 31;
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    if let Some(error) = arguments.plan {
+        return arguments.printing.print(&plan(error));
+    }
+    if let Some(folder) = &arguments.example {
+        return example(folder);
+    }
     let summing = &arguments.summing;
     // Before the catalogues are read, which takes minutes for a survey.
     if let Some(plot) = &arguments.plot {
