@@ -9,7 +9,7 @@ import shearq
 PAGE = pathlib.Path(__file__).parent.parent / "docs" / "python-api.md"
 HEAD = """# Python API
 
-This page is made from the docstrings by `python python/api.py`. [Python](python.md) introduces the package.
+This page is made from the docstrings by `python python/api.py`. [Tutorial 2](own-images.md) introduces the package.
 """
 
 

@@ -8,7 +8,7 @@ use crate::print;
 /// Measure the speed on this machine: measuring, simulating, threads, and scoring.
 ///
 /// It takes less than a minute. Other work on the machine disturbs it, so compare ratios within one run rather than
-/// absolute times. docs/speed.md explains the results.
+/// absolute times. docs/validation.md explains the results.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
     /// Configuration: a name from `shearq submissions list` or a TOML file. May be given several times.

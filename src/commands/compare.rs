@@ -39,7 +39,7 @@ pub(crate) struct Arguments {
     /// Data folder with the true shear [default: the data that the first OUT was measured from].
     #[arg(long, value_name = "DIR")]
     data: Option<PathBuf>,
-    /// Catalogues of another program, described by a TOML file (docs/files-foreign.md). May be given several times.
+    /// Catalogues of another program, described by a TOML file (docs/files.md). May be given several times.
     #[arg(long, value_name = "FILE")]
     foreign: Vec<PathBuf>,
     /// Results store with the runs to compare, instead of folders.

@@ -20,7 +20,7 @@ use shearq_quantities::Frame;
 /// fills a few from the opposite side of the galaxy; a network flags the galaxy.
 ///
 /// The PSF is one star stamp for all galaxies, or one per galaxy in the same order. It may also be a table of functional
-/// PSFs (x,y,profile,beta,fwhm,e1,e2; docs/files-data.md), whose positions are not used. Width, noise and pixel scale of
+/// PSFs (x,y,profile,beta,fwhm,e1,e2; docs/files.md), whose positions are not used. Width, noise and pixel scale of
 /// stamps and PSFs are compared. A table next to the image lists
 /// the stamps in the order of the catalogues.
 #[derive(Debug, Args)]

@@ -18,7 +18,7 @@ use crate::{count, tell, tell_unread};
 /// Measure the galaxies of a data folder: one catalogue per image.
 ///
 /// A catalogue has one row per galaxy with its position (x, y), ellipticity (e1, e2), flags, noise and response. See
-/// docs/files-catalogues.md for all columns. Catalogues of the same settings that are in the folder already are kept. So the
+/// docs/files.md for all columns. Catalogues of the same settings that are in the folder already are kept. So the
 /// same command continues a measurement that was stopped.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
@@ -113,7 +113,7 @@ pub(super) fn report(
     let speed = if summary.galaxies == 0 {
         String::new()
     } else {
-        // Per thread, so that machines can be compared; times in docs/speed.md are of this kind.
+        // Per thread, so that machines can be compared; times in docs/validation.md are of this kind.
         let each = 1e6 * seconds * threads as f64 / summary.galaxies as f64;
         format!(
             " ({} galaxies, {} flagged) in {seconds:.1} s, {each:.0} µs per galaxy and thread",

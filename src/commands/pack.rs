@@ -38,7 +38,7 @@ pub(crate) struct Arguments {
     /// Folder of catalogues that `measure` or `run` wrote.
     #[arg(long, value_name = "DIR", required_unless_present_any = ["foreign", "catalogues"])]
     measured: Option<PathBuf>,
-    /// Catalogues of another program, described by a TOML file (docs/files-foreign.md). They are packed with the signs and
+    /// Catalogues of another program, described by a TOML file (docs/files.md). They are packed with the signs and
     /// the type of ellipticity that are scored.
     #[arg(long, value_name = "FILE", conflicts_with = "measured")]
     foreign: Option<PathBuf>,

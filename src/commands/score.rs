@@ -51,7 +51,7 @@ pub(crate) struct Arguments {
     /// Catalogues of the set of --truth, one per image.
     #[arg(value_name = "CATALOGUE", requires = "truth", conflicts_with_all = ["data", "sets", "store"])]
     catalogues: Vec<PathBuf>,
-    /// Catalogues of another program, described by a TOML file (docs/files-foreign.md).
+    /// Catalogues of another program, described by a TOML file (docs/files.md).
     #[arg(long, value_name = "FILE", requires = "data", conflicts_with = "truth")]
     foreign: Option<PathBuf>,
     /// Power spectra (`index l power`): a file with --truth, a folder of `{method}_set{set}.dat` with --data.

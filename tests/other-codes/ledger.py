@@ -51,7 +51,6 @@ def main():
             ("method (S/N 20, the same galaxies)", name, ""),
             ("m1, m2 (10⁻³)", *bias(row)),
             ("noise", *spread(row, "noise")),
-            ("CPU time (µs)", f"{row['cpu_us']:.0f}", ""),
         ]
         lines += [["readme", number, *cell, RUN] for cell in cells]
     number = 0

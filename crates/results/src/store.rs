@@ -1,7 +1,7 @@
 //! A results store: a folder with one Parquet file per recorded run, one row per set.
 //!
 //! A file's name is derived from its content. Processes that write into one store therefore do not collide, and
-//! recording a run twice has no effect. docs/files-stores.md describes the columns.
+//! recording a run twice has no effect. docs/files.md describes the columns.
 
 use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;

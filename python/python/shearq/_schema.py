@@ -1,4 +1,4 @@
-"""The columns and metadata of catalogues: one schema for arrays, tables and files (docs/files-catalogues.md)."""
+"""The columns and metadata of catalogues: one schema for arrays, tables and files (docs/files.md)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ WHOLE = ("flags", "iterations", "stop", "updated")
 # What the mean shear follows from.
 NEEDED = ("e1", "e2", "flags", "R11", "R22")
 REAL: tuple[str, ...] = ("x", "y", "e1", "e2", "first_energy", "energy", "noise", "flux", "radius", "size", "R11", "R22", "R12", "R21")
-# What linear configurations add: S/N, and how flux and size change with shear and noise (docs/files-catalogues.md).
+# What linear configurations add: S/N, and how flux and size change with shear and noise (docs/files.md).
 OBSERVED: tuple[str, ...] = ("flux_error", "flux_g1", "flux_g2", "size_g1", "size_g2")
 OBSERVED += tuple(f"n{k}_{pair}" for k in "12" for pair in ("ef", "es", "ff", "fs", "ss"))
 OBSERVED += tuple(f"t_{pair}" for pair in ("e1f", "e1s", "e2f", "e2s", "ff", "fs", "ss", "s"))
