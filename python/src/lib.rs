@@ -28,7 +28,7 @@ mod _shearq {
     #[pymodule_export]
     use super::measure::{flags, mean_shear, measure};
     #[pymodule_export]
-    use super::score::{difference, failed, metrics, score, spectrum};
+    use super::score::{aperture_mass, difference, failed, metrics, score, spectrum};
     #[pymodule_export]
     use super::select::select;
     #[pymodule_export]

@@ -6,10 +6,11 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use shearq_dataset::truth::{Sign, SignFault, word};
-use shearq_quantities::MeasuredRange;
 use shearq_quantities::units::{Degrees, Pixels};
+use shearq_quantities::{MeasuredRange, Shear};
 use shearq_results::foreign;
 use shearq_results::views::scores;
+use shearq_scoring::aperture::{Lattice, LatticeShear};
 use shearq_scoring::modes::Decomposer;
 use shearq_scoring::resample::{PairedSet, paired_difference};
 use shearq_scoring::{
@@ -386,4 +387,47 @@ pub(crate) fn difference(
         second_replicates: &second_replicates,
     };
     paired_difference(&[set]).map(|found| (found.difference, found.error))
+}
+
+/// Correlations and aperture masses of galaxies at nodes of a lattice, with weights. NaN marks a galaxy without a shear.
+#[pyfunction]
+pub(crate) fn aperture_mass<'py>(
+    py: Python<'py>,
+    g: Pair<'py>,
+    nodes: (PyReadonlyArray1<'py, i64>, PyReadonlyArray1<'py, i64>),
+    weights: PyReadonlyArray1<'py, f64>,
+    side: usize,
+    field_degrees: f64,
+) -> PyResult<Bound<'py, PyDict>> {
+    let (g1, g2, weights) = (g.0.as_array(), g.1.as_array(), weights.as_array());
+    let (x, y) = (nodes.0.as_array(), nodes.1.as_array());
+    let (found, masses) = py.detach(|| {
+        let field = Degrees(field_degrees);
+        let mut galaxies = LatticeShear::new(Lattice { side, field }).map_err(of_scoring)?;
+        for k in 0..g1.len() {
+            // The package checks that nodes are not negative; larger ones are errors here.
+            let node = (x[k] as usize, y[k] as usize);
+            if !(g1[k].is_nan() || g2[k].is_nan()) {
+                let g = Shear::new(g1[k], g2[k]);
+                galaxies.add(node, g, weights[k]).map_err(of_scoring)?;
+            }
+        }
+        let found = galaxies.correlations();
+        let masses = found.aperture_mass();
+        PyResult::Ok((found, masses))
+    })?;
+    let columns = PyDict::new(py);
+    for (name, values) in [
+        ("theta", masses.theta),
+        ("map_e", masses.map_e),
+        ("map_b", masses.map_b),
+        ("error", masses.error),
+        ("pairs", found.pairs),
+        ("mean_r", found.mean_r),
+        ("xi_plus", found.xi_plus),
+        ("xi_minus", found.xi_minus),
+    ] {
+        columns.set_item(name, values.to_vec().into_pyarray(py))?;
+    }
+    Ok(columns)
 }

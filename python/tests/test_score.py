@@ -286,3 +286,36 @@ def test_nothing_to_score_is_an_error_and_a_constant_truth_is_noted():
     constant = np.full_like(g1, 0.01)
     scored = shearq.score(e1 - g1 + constant, e2 - g2 + constant, constant, constant)
     assert np.isnan(scored["q"]) and any("the true shear is the same everywhere" in note for note in scored.notes)
+
+
+def test_aperture_masses_are_those_of_treecorr():
+    case = CASES / "great3/p7_aperture_weights_holes"
+    expected = json.loads((case / "expected.json").read_text())
+    with gzip.open(case / "catalogue.txt.gz", "rt") as file:
+        rows = np.array([line.split() for line in file if not line.startswith("#")], dtype=float)
+    number = rows[:, 0].astype(int)
+    g = np.where((rows[:, 3:5] < 10).all(axis=1)[:, None], rows[:, 3:5], np.nan)
+    found = shearq.aperture_mass(*g.T, nodes=(number // 1000 % 1000, number % 1000), weights=rows[:, 5], side=700)
+    assert found["pairs"].tolist() == expected["pairs"]
+    # TreeCorr keeps shears in 32 bits.
+    assert found["xi_plus"] == pytest.approx(np.array(expected["xi_plus"]), abs=1e-11)
+    largest = np.abs(expected["map_E"]).max()
+    assert found["map_e"] == pytest.approx(np.array(expected["map_E"]), abs=1e-8 * largest)
+    assert found["map_b"] == pytest.approx(np.array(expected["map_B"]), abs=1e-8 * largest)
+
+
+def test_a_lattice_is_its_grid_and_faults_are_named(wave):
+    g1, g2 = wave
+    y, x = np.indices(g1.shape)
+    plain = shearq.aperture_mass(g1, g2)
+    same_bits(plain, shearq.aperture_mass(g1.ravel(), g2.ravel(), nodes=(x, y), side=16))
+    assert (plain["map_e"][10:13] > 0).all()
+    for arguments, argument in [
+        ({"nodes": (x, y)}, "side"),
+        ({"nodes": (x - 1, y), "side": 16}, "nodes"),
+        ({"nodes": (x, y), "side": 15}, "lattice"),
+        ({"weights": [1.0]}, "lengths"),
+        ({"weights": np.full(256, np.inf)}, "finite"),
+    ]:
+        with pytest.raises(ValueError, match=argument):
+            shearq.aperture_mass(g1, g2, **arguments)

@@ -6,7 +6,7 @@
 
 use std::ops::AddAssign;
 
-use ndarray::Array2;
+use ndarray::{Array2, ArrayView2};
 #[cfg(feature = "serde")]
 use serde::Serialize;
 use shearq_fourier::{Complex64, Plan64, Planner64};
@@ -14,6 +14,7 @@ use shearq_quantities::Shear;
 use shearq_quantities::units::Degrees;
 
 use crate::error::ScoringError;
+use crate::grid::{Grid, check_shape};
 
 /// Logarithmic bins of separation of GREAT3.
 pub const SEPARATION_BINS: usize = 15;
@@ -167,6 +168,29 @@ impl LatticeShear {
         self.power += (weight * g.modulus()).powi(2);
         self.total += weight;
         Ok(())
+    }
+
+    /// Galaxies at the cells `[ix, iy]` of a grid, where `weights` is not zero.
+    ///
+    /// # Errors
+    /// If the arrays have another shape than the grid, or a number is not finite.
+    pub fn on_grid(
+        grid: &Grid,
+        shear: &Array2<Complex64>,
+        weights: ArrayView2<'_, f64>,
+    ) -> Result<Self, ScoringError> {
+        check_shape("the shear", shear, grid.n)?;
+        check_shape("the weights", &weights, grid.n)?;
+        let mut galaxies = LatticeShear::new(Lattice {
+            side: grid.n,
+            field: grid.field,
+        })?;
+        for ((node, g), &weight) in shear.indexed_iter().zip(weights) {
+            if weight != 0.0 {
+                galaxies.add(node, Shear::new(g.re, g.im), weight)?;
+            }
+        }
+        Ok(galaxies)
     }
 
     /// ξ± of all pairs, by Fourier transforms: exact to rounding.

@@ -16,6 +16,7 @@ use shearq_dataset::layout::DataFolder;
 use shearq_dataset::run::{Run, Source, kind_of};
 use shearq_dataset::truth::{ReadTruth, Reading, Sign, read_truth, reading_of};
 use shearq_render::table::TableFormat;
+use shearq_results::aperture;
 use shearq_results::catalogues::{COLUMNS, Catalogues};
 use shearq_results::foreign::{Foreign, folder_of};
 use shearq_results::published::Truth;
@@ -94,6 +95,9 @@ pub(crate) struct Arguments {
     /// Treat galaxies with a larger |e| as not measured; for --truth [default: no limit].
     #[arg(long, value_name = "E", value_parser = positive, requires = "truth", conflicts_with_all = NOT_PLAIN)]
     max_modulus: Option<f64>,
+    /// Print the aperture mass dispersion of the catalogues and of the true shear instead of scores.
+    #[arg(long, conflicts_with_all = ["spectra", "packed", "store", "path", "noise_var", "definition", "challenge", "branch", "psf"])]
+    aperture_mass: bool,
     /// Score a submission to this challenge: great3, great08.
     #[arg(long, value_name = "NAME", requires = "truth", conflicts_with_all = GREAT10_ONLY)]
     challenge: Option<String>,
@@ -241,6 +245,12 @@ fn catalogues(
         None => scored?,
     };
     let name = &catalogues.name;
+    if arguments.aperture_mass {
+        let truth = |set: u32| read_truth(&data.truth(set), &reading_of(&data, set)?);
+        let masses = aperture::masses(&catalogues, &scored, truth, threads)?;
+        let title = format!("Aperture masses of {name}");
+        return arguments.printing.print(&aperture::table(title, &masses));
+    }
     let title = format!("Scores of {name}");
     let mut table = per_set(&scored, &title, options.definition);
     table.notes.extend(unscored(&data, &scored, sets)?);
@@ -476,15 +486,20 @@ fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Resul
             path.display()
         );
     }
-    let scored = score_files(
-        truth,
-        &Catalogues::plain(&arguments.catalogues, described),
-        &plain_reading(arguments),
-        options,
-        arguments.threads.number(),
-    )?;
+    let catalogues = Catalogues::plain(&arguments.catalogues, described);
+    let (reading, threads) = (plain_reading(arguments), arguments.threads.number());
+    let scored = [score_files(truth, &catalogues, &reading, options, threads)?];
+    if arguments.aperture_mass {
+        let masses = aperture::masses(
+            &catalogues,
+            &scored,
+            |_| read_truth(truth, &reading),
+            threads,
+        )?;
+        let title = format!("Aperture masses against {}", truth.display());
+        return arguments.printing.print(&aperture::table(title, &masses));
+    }
     let title = format!("Scores against {}", truth.display());
-    let scored = [scored];
     let mut table = per_set(&scored, &title, options.definition);
     table.notes.extend(verdict_line("The catalogues", &scored));
     // The JSON of plain files has the keys of the public scoring cases of GREAT10, so that both can be compared.

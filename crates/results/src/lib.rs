@@ -14,6 +14,7 @@
 //! * [`views`] makes tables, plots and pages.
 #![forbid(unsafe_code)]
 
+pub mod aperture;
 pub mod baseline;
 pub mod bias;
 pub mod catalogues;

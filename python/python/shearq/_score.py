@@ -272,6 +272,63 @@ def power_spectrum(
     return _table(_shearq.spectrum(n, cell, degrees(field_degrees), rows, where, lengths, _text("definition", definition)))
 
 
+def aperture_mass(
+    g1: ArrayLike,
+    g2: ArrayLike,
+    *,
+    nodes: tuple[ArrayLike, ArrayLike] | None = None,
+    weights: ArrayLike | None = None,
+    side: int | None = None,
+    field_degrees: float = 10.0,
+) -> NDArray[np.void]:
+    """⟨M_ap²⟩ and ξ± of galaxies on a square lattice, from exact sums over all pairs, in the 15 bins of GREAT3.
+
+    Fourier transforms take the place of the pairs: 200,000 galaxies on the lattice of GREAT3 take a quarter of a second.
+
+    Parameters
+    ----------
+    g1, g2 : array
+        Shears, g2 > 0 along x = y; NaN for a galaxy that was not measured. Arrays of shape (side, side), x running
+        fastest, or of any shape with ``nodes``.
+    nodes : (x, y), optional
+        Integer nodes of the galaxies, from 0. For the IDs of GREAT3: ``(ID // 1000 % 1000, ID % 1000)`` with side=700.
+    weights : array, optional
+        Weights of the galaxies, 1 unless given.
+    side : int, optional
+        Nodes a side of the lattice, at most 2000: required with ``nodes``.
+    field_degrees : float
+        Side of the field, ``side`` times the distance of neighbouring nodes.
+
+    Returns
+    -------
+    structured array of shape (15,)
+        Radius ``theta`` in degrees, ⟨M_ap²⟩ ``map_e``, ⟨M_×²⟩ ``map_b`` and their ``error`` by the scatter of shapes;
+        ``pairs``, ``mean_r`` in degrees, ``xi_plus`` and ``xi_minus`` of the bins around the radii.
+
+    Notes
+    -----
+    ⟨M_ap²⟩(R) = ∫ d ln r s²/2 (T₊(s) ξ₊ + T₋(s) ξ₋) with s = r/R (Crittenden et al. 2002, ApJ 568, 20).
+    """
+    rows = [flat("g1", g1), flat("g2", g2)]
+    shape = np.shape(g1)
+    if nodes is None:
+        if len(shape) != 2 or shape[0] != shape[1]:
+            raise ValueError(f"g1: found an array of shape {shown(shape)}; expected (side, side), or nodes=(x, y)")
+        side = shape[0]
+        where = [index.ravel() for index in np.indices(shape)[::-1]]
+    else:
+        if side is None:
+            raise ValueError("side: expected the nodes a side of the lattice, such as 700 for GREAT3")
+        where = [np.asarray(index).ravel() for index in nodes]
+        if any(index.dtype.kind not in "iu" or (index < 0).any() for index in where):
+            raise ValueError("nodes: expected integers from 0")
+    given = np.ones(rows[0].size) if weights is None else flat("weights", weights)
+    if len({values.size for values in (*rows, *where, given)}) != 1:
+        raise ValueError("g1, g2, nodes, weights: lengths that differ")
+    x, y = (np.ascontiguousarray(index, dtype=np.int64) for index in where)
+    return _table(_shearq.aperture_mass((rows[0], rows[1]), (x, y), given, whole("side", side, 1, 2000), degrees(field_degrees)))
+
+
 def compare(
     catalogues: Mapping[str, Any],
     truth: Any,

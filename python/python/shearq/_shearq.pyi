@@ -95,6 +95,13 @@ def spectrum(
     lengths: Sequence[int],
     definition: str,
 ) -> dict[str, NDArray[Any]]: ...
+def aperture_mass(
+    g: tuple[_Doubles, _Doubles],
+    nodes: tuple[NDArray[np.int64], NDArray[np.int64]],
+    weights: _Doubles,
+    side: int,
+    field_degrees: float,
+) -> dict[str, NDArray[Any]]: ...
 def difference(
     images: int,
     first: float,

@@ -361,16 +361,7 @@ impl Great3 {
         let expected = fields.unwrap_or(columns[0].len()).max(1);
         let mut found = vec![None; expected];
         for (k, &number) in columns[0].iter().enumerate() {
-            let Some(field) = whole(number, expected) else {
-                return wrong(
-                    path,
-                    Fault::NotAField {
-                        row: k + 1,
-                        found: number,
-                        last: expected - 1,
-                    },
-                );
-            };
+            let field = field_of(path, k, number, expected)?;
             for (name, column) in [("g1", &columns[1]), ("g2", &columns[2])] {
                 let found = column[k];
                 if found.is_nan() || found.abs() >= 1.0 {
@@ -411,16 +402,7 @@ impl Great3 {
         let expected = fields.unwrap_or(rows.div_ceil(SEPARATION_BINS)).max(1);
         let mut found = vec![None::<[Option<f64>; SEPARATION_BINS]>; expected];
         for (k, &number) in columns[0].iter().enumerate() {
-            let Some(field) = whole(number, expected) else {
-                return wrong(
-                    path,
-                    Fault::NotAField {
-                        row: k + 1,
-                        found: number,
-                        last: expected - 1,
-                    },
-                );
-            };
+            let field = field_of(path, k, number, expected)?;
             let theta = columns[1][k];
             // As the challenge compares them: equal to 3 decimals.
             let is = |centre: f64| (centre - theta).abs() < 1.5e-3;
@@ -499,6 +481,12 @@ impl Great3 {
         });
         masses.collect()
     }
+}
+
+fn field_of(path: &Path, k: usize, found: f64, fields: usize) -> Result<usize, FileError> {
+    let (row, last) = (k + 1, fields - 1);
+    let fault = || FileError::new(path, Fault::NotAField { row, found, last });
+    whole(found, fields).ok_or_else(fault)
 }
 
 fn complete<T>(path: &Path, found: Vec<Option<T>>) -> Result<Vec<T>, FileError> {
