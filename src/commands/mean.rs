@@ -21,12 +21,13 @@ use shearq_results::views::mean::mean_table;
 /// the configuration does so. The error includes the error of the mean response, and the noise of one star per image. It
 /// assumes independent galaxies: for pairs that are rotated by 90 degrees it is too large.
 ///
-/// --where and --weight select and weight galaxies of linear configurations by `snr`, `flux` (image units) and `size` (px).
+/// --where and --weight select and weight galaxies of linear configurations by `snr`, `flux` (image units) and `size` (px), and
+/// select by `neighbour`, the light in a ring around the galaxy over its flux.
 /// The mean stays calibrated: the response contains how shear and noise change the selection.
 ///
 /// Cuts are smooth steps, because a sharp one has no finite response. `step(snr, 10, 1.5)` is a weight of 1/2 at an S/N of 10
 /// that reaches 0 and 1 at 10 ∓ 1.5; `1 - step(size, 6)` keeps small galaxies, and `and` joins steps. The default half
-/// width is 1.5 in `snr`, 1.5 errors in `flux` and 0.3 px in `size`. Wider steps give smaller errors.
+/// width is 1.5 in `snr`, 1.5 errors in `flux`, 0.3 px in `size` and 0.15 in `neighbour`. Wider steps give smaller errors.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
     /// Folder of catalogues that `measure` or `run` wrote.

@@ -8,13 +8,14 @@ use shearq_results::select::{smooth_selection, write_selected};
 
 /// Write catalogues with cuts and weights that keep the shear calibrated.
 ///
-/// Galaxies of linear configurations are selected and weighted by `snr`, `flux` (image units) and `size` (px). Ellipticities
+/// Galaxies of linear configurations are selected and weighted by `snr`, `flux` (image units) and `size` (px), and
+/// selected by `neighbour`, the light in a ring around the galaxy over its flux. Ellipticities
 /// are multiplied by the weights, and responses contain how shear and noise change the selection. `score`, `mean`, `bias`, `compare`, `shear` and `pack` then use the selection. Rows of galaxies that are left out
 /// stay, with ellipticity and response zero; the column `selection` has the weights.
 ///
 /// Cuts are smooth steps, because a sharp one has no finite response. `step(snr, 10, 1.5)` is a weight of 1/2 at an S/N of 10
 /// that reaches 0 and 1 at 10 ∓ 1.5; `1 - step(size, 6)` keeps small galaxies, and `and` joins steps. The default half
-/// width is 1.5 in `snr`, 1.5 errors in `flux` and 0.3 px in `size`. Wider steps give smaller errors.
+/// width is 1.5 in `snr`, 1.5 errors in `flux`, 0.3 px in `size` and 0.15 in `neighbour`. Wider steps give smaller errors.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
     /// Folder of catalogues that `measure` or `run` wrote.

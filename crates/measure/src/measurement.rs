@@ -197,13 +197,18 @@ pub struct Observables {
     pub flux_response: [f64; 2],
     /// Derivatives of the size with γ1 and γ2.
     pub size_response: [f64; 2],
+    /// Light of a ring around the galaxy, in image units: the deconvolved image under (r/R)⁴ exp(2 − 2r²/R²), where R is 1.5 times
+    /// σ of the window, at most a quarter of the stamp's side. It is linear in the image, so that its response is exact.
+    pub ring: f64,
+    /// Derivatives of the light of the ring with γ1 and γ2.
+    pub ring_response: [f64; 2],
     /// Effect of noise on products of flux, size and ellipticity.
     pub coupling: Coupling,
 }
 
 impl Observables {
     /// Names of the columns of catalogues with the values of [`Observables::to_array`].
-    pub const COLUMNS: [&'static str; 25] = [
+    pub const COLUMNS: [&'static str; 41] = [
         "flux",
         "size",
         "flux_error",
@@ -229,6 +234,22 @@ impl Observables {
         "t_fs",
         "t_ss",
         "t_s",
+        "ring",
+        "ring_g1",
+        "ring_g2",
+        "n1_er",
+        "n1_fr",
+        "n1_sr",
+        "n1_rr",
+        "n2_er",
+        "n2_fr",
+        "n2_sr",
+        "n2_rr",
+        "t_e1r",
+        "t_e2r",
+        "t_fr",
+        "t_sr",
+        "t_rr",
     ];
 
     /// Flux over its error.
@@ -236,26 +257,43 @@ impl Observables {
         self.flux / self.flux_error
     }
 
+    /// Light of the ring over the flux: what is beside the galaxy, relative to it. Single galaxies with half-light radii of 2.5 to 5 px
+    /// have 0.1 to 0.5 at S/N 20.
+    pub fn neighbour(&self) -> f64 {
+        self.ring / self.flux
+    }
+
     /// All values, in the order of [`Observables::COLUMNS`].
-    pub fn to_array(&self) -> [f64; 25] {
+    pub fn to_array(&self) -> [f64; 41] {
         let Observables {
             flux,
             flux_error,
             size,
             flux_response: [f1, f2],
             size_response: [s1, s2],
-            coupling: Coupling { shear, turned },
+            ring,
+            ring_response: [r1, r2],
+            coupling:
+                Coupling {
+                    shear,
+                    turned,
+                    ring_shear,
+                    ring_turned,
+                },
         } = *self;
-        let mut all = [0.0; 25];
+        let mut all = [0.0; 41];
         all[..7].copy_from_slice(&[flux, size, flux_error, f1, f2, s1, s2]);
         all[7..12].copy_from_slice(&shear[0]);
         all[12..17].copy_from_slice(&shear[1]);
-        all[17..].copy_from_slice(&turned);
+        all[17..25].copy_from_slice(&turned);
+        all[25..28].copy_from_slice(&[ring, r1, r2]);
+        all[28..36].copy_from_slice(ring_shear.as_flattened());
+        all[36..].copy_from_slice(&ring_turned);
         all
     }
 
     /// Observables with these values, in the order of [`Observables::COLUMNS`].
-    pub fn from_array(all: &[f64; 25]) -> Self {
+    pub fn from_array(all: &[f64; 41]) -> Self {
         let five = |first: usize| std::array::from_fn(|k| all[first + k]);
         Observables {
             flux: all[0],
@@ -263,9 +301,13 @@ impl Observables {
             flux_error: all[2],
             flux_response: [all[3], all[4]],
             size_response: [all[5], all[6]],
+            ring: all[25],
+            ring_response: [all[26], all[27]],
             coupling: Coupling {
                 shear: [five(7), five(12)],
                 turned: std::array::from_fn(|k| all[17 + k]),
+                ring_shear: [28, 32].map(|first| std::array::from_fn(|k| all[first + k])),
+                ring_turned: std::array::from_fn(|k| all[36 + k]),
             },
         }
     }
@@ -283,6 +325,10 @@ pub struct Coupling {
     /// For the difference to noise behind a PSF turned by 90 degrees: e1 and flux, e1 and size, e2 and flux, e2 and size, flux and
     /// flux, flux and size, size and size; and the mean change of the size alone.
     pub turned: [f64; 8],
+    /// For the change of noise with γ1 and with γ2: products of the light of the ring with e (of the same component), flux, size and itself.
+    pub ring_shear: [[f64; 4]; 2],
+    /// For the difference to noise behind a PSF turned by 90 degrees: the same with e1, e2, flux, size and itself.
+    pub ring_turned: [f64; 5],
 }
 
 #[cfg(test)]
@@ -291,7 +337,7 @@ mod tests {
 
     #[test]
     fn columns_keep_every_value_in_its_place() {
-        let all: [f64; 25] = std::array::from_fn(|k| k as f64 + 0.5);
+        let all: [f64; 41] = std::array::from_fn(|k| k as f64 + 0.5);
         let observables = Observables::from_array(&all);
         assert_eq!(observables.to_array(), all);
         let at = |name: &str| {
@@ -301,5 +347,6 @@ mod tests {
         assert_eq!(observables.size_response[1], at("size_g2"));
         assert_eq!(observables.coupling.shear[1][3], at("n2_fs"));
         assert_eq!(observables.coupling.turned[2], at("t_e2f"));
+        assert_eq!(observables.coupling.ring_shear[1][2], at("n2_sr"));
     }
 }

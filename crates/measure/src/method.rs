@@ -143,6 +143,8 @@ struct FoundObservables {
     square_response: [f64; 2],
     /// The size, and its first and second derivative with T.
     size: [f64; 3],
+    /// Light of the ring, and its derivatives with γ₁ and γ₂.
+    ring: [f64; 3],
     /// For sheared catalogues, if they are requested.
     sheared: Option<ShearSettings>,
 }
@@ -156,6 +158,8 @@ struct NoiseMoments {
     distortion: [[f64; 4]; 2],
     /// Second derivative of T.
     square: [f64; 4],
+    /// Products of the changes of the light of the ring with those of χ₁, χ₂, T, the flux and itself.
+    ring: [[f64; 4]; 5],
 }
 
 impl NoiseMoments {
@@ -165,6 +169,7 @@ impl NoiseMoments {
             products,
             distortion,
             square: [square1, square2, ..],
+            ring,
         } = self;
         [*square1, *square2] = by.turn([*square1, *square2]);
         let of_shear = by.turn_response(distortion.map(|[first, second, ..]| [first, second]));
@@ -177,10 +182,11 @@ impl NoiseMoments {
         for (means, of_shear) in distortion.iter_mut().zip(of_shear) {
             [means[0], means[1]] = of_shear;
         }
-        for [first, second, ..] in products.iter_mut() {
+        for [first, second, ..] in products.iter_mut().chain(&mut *ring) {
             [*first, *second] = by.turn([*first, *second]);
         }
         for kind in 0..4 {
+            [ring[0][kind], ring[1][kind]] = by.turn([ring[0][kind], ring[1][kind]]);
             let [chi11, chi12, size1, flux1, chi22, size2, flux2, ..] =
                 products.map(|each| each[kind]);
             let [[chi11, chi12], [_, chi22]] = by.turn_response([[chi11, chi12], [chi12, chi22]]);
@@ -266,6 +272,8 @@ impl Found {
         if let Some(found) = &mut self.observables {
             found.flux_response = by.turn(found.flux_response);
             found.square_response = by.turn(found.square_response);
+            let [_, first, second] = &mut found.ring;
+            [*first, *second] = by.turn([*first, *second]);
         }
     }
 
@@ -355,6 +363,17 @@ impl Found {
             let [flux2, cross, size2] = squares(2);
             let [one, two] =
                 [0, 1].map(|i| [with_e(i, with_flux, 2), first * with_e(i, with_size, 2)]);
+            let with_ring = |noise: usize| {
+                let [chi1, chi2, square, flux, ring] = moments.ring.map(|kinds| kinds[noise]);
+                let e = jacobian.map(|row| row[0] * chi1 + row[1] * chi2);
+                (e, [flux, first * square, ring])
+            };
+            for (k, of_shear) in coupling.ring_shear.iter_mut().enumerate() {
+                let (e, [flux, size, ring]) = with_ring(k);
+                *of_shear = [e[k], flux, size, ring];
+            }
+            let ([e1, e2], [flux, size, ring]) = with_ring(2);
+            coupling.ring_turned = [e1, e2, flux, size, ring];
             let size_change = curved(2);
             coupling.turned = [
                 one[0],
@@ -373,6 +392,8 @@ impl Found {
             size,
             flux_response: found.flux_response,
             size_response,
+            ring: found.ring[0],
+            ring_response: [found.ring[1], found.ring[2]],
             coupling,
         })
     }
@@ -498,6 +519,7 @@ mod tests {
                 products: [(); 10].map(|()| four()),
                 distortion: [four(), four()],
                 square: four(),
+                ring: [(); 5].map(|()| four()),
             }),
             observables: Some(FoundObservables {
                 flux: 10.0,
@@ -505,6 +527,7 @@ mod tests {
                 flux_response: [0.3, -0.1],
                 square_response: [0.2, 0.5],
                 size: [2.0, 0.4, -0.1],
+                ring: [1.5, 0.6, -0.4],
                 sheared: Some(ShearSettings {
                     step: 0.02,
                     normals: [0.0; 4],
@@ -577,10 +600,22 @@ mod tests {
         for response in [
             &mut observables.flux_response,
             &mut observables.size_response,
+            &mut observables.ring_response,
         ] {
             *response = [one * response[0], two * response[1]];
         }
-        let Coupling { shear, turned } = &mut observables.coupling;
+        let Coupling {
+            shear,
+            turned,
+            ring_shear,
+            ring_turned,
+        } = &mut observables.coupling;
+        for (row, sign) in ring_shear.iter_mut().zip([one, two]) {
+            row[1..].iter_mut().for_each(|value| *value *= sign);
+        }
+        for (value, sign) in ring_turned.iter_mut().zip([one, two]) {
+            *value *= sign;
+        }
         for (row, sign) in shear.iter_mut().zip([one, two]) {
             row[2..].iter_mut().for_each(|value| *value *= sign);
         }

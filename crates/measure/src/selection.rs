@@ -24,6 +24,8 @@ use crate::measurement::{Coupling, Observables, ResponseMatrix};
 const SNR_HALF_WIDTH: f64 = 1.5;
 // In px. The same measurement: the standard deviation of the size is 0.40 px.
 const SIZE_HALF_WIDTH: f64 = 0.3;
+// Chosen by hand: the noise of the light of the ring is 0.12 of the flux at S/N 20.
+const NEIGHBOUR_HALF_WIDTH: f64 = 0.15;
 
 /// A quantity that galaxies can be selected by.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -35,14 +37,17 @@ pub enum Quantity {
     Flux,
     /// [`Observables::size`].
     Size,
+    /// [`Observables::neighbour`].
+    Neighbour,
 }
 
 impl Quantity {
     /// All, with the names of their columns.
-    pub const ALL: [(&str, Quantity); 3] = [
+    pub const ALL: [(&str, Quantity); 4] = [
         ("snr", Quantity::Snr),
         ("flux", Quantity::Flux),
         ("size", Quantity::Size),
+        ("neighbour", Quantity::Neighbour),
     ];
 }
 
@@ -56,7 +61,8 @@ pub struct Cut {
     pub above: bool,
     /// Where the weight is one half.
     pub threshold: f64,
-    /// Distance from the threshold at which the weight is 0 or 1. `None`: 1.5 for S/N, 1.5 errors for the flux, 0.3 px for the size.
+    /// Distance from the threshold at which the weight is 0 or 1. `None`: 1.5 for S/N, 1.5 errors for the flux, 0.3 px for the size, 0.15 for
+    /// neighbours.
     pub half_width: Option<f64>,
 }
 
@@ -91,13 +97,15 @@ pub struct Selected {
     pub weight: f64,
 }
 
-/// A weight and its derivatives with flux and size.
+// Flux, size and the light of the ring.
+const VARIABLES: usize = 3;
+
+/// A weight and its derivatives with flux, size and the light of the ring.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Jet {
     value: f64,
-    first: [f64; 2],
-    /// Flux and flux, flux and size, size and size.
-    second: [f64; 3],
+    first: [f64; VARIABLES],
+    second: [[f64; VARIABLES]; VARIABLES],
 }
 
 impl Cut {
@@ -145,34 +153,46 @@ impl Selection {
     /// The weighted ellipticity and response of a galaxy with the ellipticity `e` and the `response` before calibration.
     pub fn apply(&self, e: [f64; 2], response: ResponseMatrix, galaxy: &Observables) -> Selected {
         let w = self.jet(galaxy);
-        if w.value == 0.0 && w.first == [0.0; 2] {
+        if w.value == 0.0 && w.first == [0.0; VARIABLES] {
             return Selected::default();
         }
-        let Coupling { shear, turned } = galaxy.coupling;
-        let [w_f, w_s] = w.first;
-        // Σ w_ab C_ab, both orders of flux and size.
-        let curved = |ff: f64, fs: f64, ss: f64| {
-            let [w_ff, w_fs, w_ss] = w.second;
-            w_ff * ff + 2.0 * w_fs * fs + w_ss * ss
+        let Coupling {
+            shear,
+            turned,
+            ring_shear,
+            ring_turned,
+        } = galaxy.coupling;
+        let along = |values: [f64; VARIABLES]| -> f64 {
+            w.first.iter().zip(values).map(|(w, value)| w * value).sum()
         };
-        let [.., t_ff, t_fs, t_ss, t_s] = turned;
+        // Σ w_ab C_ab, from the products ff, fs and ss, and fr, sr and rr.
+        let curved = |[ff, fs, ss]: [f64; 3], [fr, sr, rr]: [f64; 3]| -> f64 {
+            let products = [[ff, fs, fr], [fs, ss, sr], [fr, sr, rr]];
+            let pairs = w.second.as_flattened().iter().zip(products.as_flattened());
+            pairs.map(|(w, product)| w * product).sum()
+        };
+        let [t_e1f, t_e1s, t_e2f, t_e2s, t_ff, t_fs, t_ss, t_s] = turned;
+        let [t_e1r, t_e2r, t_fr, t_sr, t_rr] = ring_turned;
+        let t_e = [[t_e1f, t_e1s, t_e1r], [t_e2f, t_e2s, t_e2r]];
+        let t_curved = curved([t_ff, t_fs, t_ss], [t_fr, t_sr, t_rr]) + w.first[1] * t_s;
         let mut selected = Selected {
             weight: w.value,
             ..Selected::default()
         };
         for k in 0..2 {
             let [e_f, e_s, ff, fs, ss] = shear[k];
-            let [t_ef, t_es] = [turned[2 * k], turned[2 * k + 1]];
-            selected.e[k] = w.value * e[k]
-                + w_f * t_ef
-                + w_s * t_es
-                + 0.5 * e[k] * (curved(t_ff, t_fs, t_ss) + w_s * t_s);
+            let [e_r, fr, sr, rr] = ring_shear[k];
+            selected.e[k] = w.value * e[k] + along(t_e[k]) + 0.5 * e[k] * t_curved;
             selected.response[k] = [0, 1].map(|j| {
-                w.value * response[k][j]
-                    + e[k] * (w_f * galaxy.flux_response[j] + w_s * galaxy.size_response[j])
+                let responses = [
+                    galaxy.flux_response[j],
+                    galaxy.size_response[j],
+                    galaxy.ring_response[j],
+                ];
+                w.value * response[k][j] + e[k] * along(responses)
             });
-            selected.response[k][k] -= 2.0 * (w_f * e_f + w_s * e_s);
-            selected.response[k][k] -= e[k] * curved(ff, fs, ss);
+            selected.response[k][k] -= 2.0 * along([e_f, e_s, e_r]);
+            selected.response[k][k] -= e[k] * curved([ff, fs, ss], [fr, sr, rr]);
         }
         selected
     }
@@ -180,8 +200,8 @@ impl Selection {
     fn jet(&self, galaxy: &Observables) -> Jet {
         let one = Jet {
             value: 1.0,
-            first: [0.0; 2],
-            second: [0.0; 3],
+            first: [0.0; VARIABLES],
+            second: [[0.0; VARIABLES]; VARIABLES],
         };
         let cuts = self.cuts.iter().map(|cut| cut.jet(galaxy));
         let weight = self
@@ -195,44 +215,85 @@ impl Selection {
 impl Cut {
     /// The step u³(10 − 15u + 6u²), u from 0 to 1 between the bounds: two derivatives vanish at either end.
     fn jet(&self, galaxy: &Observables) -> Jet {
-        // A place along flux or size; S/N is flux in units of its error.
-        let (value, along, unit, usual) = match self.quantity {
-            Quantity::Snr => (galaxy.flux, 0, galaxy.flux_error, SNR_HALF_WIDTH),
-            Quantity::Flux => (galaxy.flux, 0, 1.0, SNR_HALF_WIDTH * galaxy.flux_error),
-            Quantity::Size => (galaxy.size, 1, 1.0, SIZE_HALF_WIDTH),
+        let (flux, error) = (galaxy.flux, galaxy.flux_error);
+        let mut place = Jet {
+            value: 0.0,
+            first: [0.0; VARIABLES],
+            second: [[0.0; VARIABLES]; VARIABLES],
         };
-        let half = self.half_width.unwrap_or(usual) * unit;
+        let usual = match self.quantity {
+            Quantity::Snr => {
+                (place.value, place.first[0]) = (flux / error, 1.0 / error);
+                SNR_HALF_WIDTH
+            }
+            Quantity::Flux => {
+                (place.value, place.first[0]) = (flux, 1.0);
+                SNR_HALF_WIDTH * error
+            }
+            Quantity::Size => {
+                (place.value, place.first[1]) = (galaxy.size, 1.0);
+                SIZE_HALF_WIDTH
+            }
+            Quantity::Neighbour => {
+                let ratio = galaxy.neighbour();
+                place.value = ratio;
+                (place.first[0], place.first[2]) = (-ratio / flux, 1.0 / flux);
+                let mixed = -1.0 / (flux * flux);
+                place.second[0] = [2.0 * ratio / (flux * flux), 0.0, mixed];
+                place.second[2][0] = mixed;
+                NEIGHBOUR_HALF_WIDTH
+            }
+        };
         let sign = if self.above { 1.0 } else { -1.0 };
-        let slope = sign / (2.0 * half);
-        let u = 0.5 + (value - self.threshold * unit) * slope;
+        let slope = sign / (2.0 * self.half_width.unwrap_or(usual));
+        let u = 0.5 + (place.value - self.threshold) * slope;
         // A galaxy without noise has no S/N: beyond all bounds.
         let u = if u.is_nan() { 0.0 } else { u.clamp(0.0, 1.0) };
         let rest = 1.0 - u;
-        let mut jet = Jet {
-            value: u * u * u * (10.0 - 15.0 * u + 6.0 * u * u),
-            first: [0.0; 2],
-            second: [0.0; 3],
+        let value = u * u * u * (10.0 - 15.0 * u + 6.0 * u * u);
+        let (first, second) = if u > 0.0 && u < 1.0 {
+            (
+                30.0 * u * u * rest * rest * slope,
+                60.0 * u * rest * (rest - u) * slope * slope,
+            )
+        } else {
+            (0.0, 0.0)
         };
-        if u > 0.0 && u < 1.0 {
-            jet.first[along] = 30.0 * u * u * rest * rest * slope;
-            jet.second[2 * along] = 60.0 * u * rest * (rest - u) * slope * slope;
-        }
-        jet
+        place.mapped(value, first, second)
     }
 }
 
 impl Jet {
-    fn times(self, other: Self) -> Self {
-        let (a, b) = (self, other);
-        let [[af, a_s], [bf, bs]] = [a.first, b.first];
+    /// A function of it with these derivatives.
+    fn mapped(self, value: f64, first: f64, second: f64) -> Self {
+        let chain = |a: usize, b: usize| {
+            if first == 0.0 && second == 0.0 {
+                return 0.0;
+            }
+            first * self.second[a][b] + second * self.first[a] * self.first[b]
+        };
         Jet {
-            value: a.value * b.value,
-            first: [0, 1].map(|k| a.first[k] * b.value + a.value * b.first[k]),
-            second: [
-                a.second[0] * b.value + 2.0 * af * bf + a.value * b.second[0],
-                a.second[1] * b.value + af * bs + a_s * bf + a.value * b.second[1],
-                a.second[2] * b.value + 2.0 * a_s * bs + a.value * b.second[2],
-            ],
+            value,
+            first: self
+                .first
+                .map(|of| if first == 0.0 { 0.0 } else { first * of }),
+            second: std::array::from_fn(|a| std::array::from_fn(|b| chain(a, b))),
+        }
+    }
+
+    fn times(self, other: Self) -> Self {
+        let product = |a: usize, b: usize| {
+            self.second[a][b] * other.value
+                + self.first[a] * other.first[b]
+                + self.first[b] * other.first[a]
+                + self.value * other.second[a][b]
+        };
+        Jet {
+            value: self.value * other.value,
+            first: std::array::from_fn(|k| {
+                self.first[k] * other.value + self.value * other.first[k]
+            }),
+            second: std::array::from_fn(|a| std::array::from_fn(|b| product(a, b))),
         }
     }
 }
@@ -252,13 +313,18 @@ fn numerical(weight: &dyn Fn(f64, f64, f64) -> f64, galaxy: &Observables) -> Jet
     let middle = at(0, 0);
     let [[fp, fm], [sp, sm]] = [[at(1, 0), at(-1, 0)], [at(0, 1), at(0, -1)]];
     let cross = at(1, 1) - at(1, -1) - at(-1, 1) + at(-1, -1);
+    let cross = cross / (4.0 * steps[0] * steps[1]);
     Jet {
         value: middle,
-        first: [(fp - fm) / (2.0 * steps[0]), (sp - sm) / (2.0 * steps[1])],
+        first: [
+            (fp - fm) / (2.0 * steps[0]),
+            (sp - sm) / (2.0 * steps[1]),
+            0.0,
+        ],
         second: [
-            (fp - 2.0 * middle + fm) / (steps[0] * steps[0]),
-            cross / (4.0 * steps[0] * steps[1]),
-            (sp - 2.0 * middle + sm) / (steps[1] * steps[1]),
+            [(fp - 2.0 * middle + fm) / (steps[0] * steps[0]), cross, 0.0],
+            [cross, (sp - 2.0 * middle + sm) / (steps[1] * steps[1]), 0.0],
+            [0.0; VARIABLES],
         ],
     }
 }
@@ -274,9 +340,13 @@ mod tests {
             size: 2.5,
             flux_response: [3.0, -1.0],
             size_response: [0.2, 0.4],
+            ring: 9.0,
+            ring_response: [0.5, -0.3],
             coupling: Coupling {
                 shear: [[0.1, 0.2, 0.3, 0.4, 0.5], [0.6, 0.7, 0.8, 0.9, 1.0]],
                 turned: [0.1, -0.2, 0.3, -0.4, 0.5, 0.6, -0.7, 0.8],
+                ring_shear: [[0.1, 0.2, 0.3, 0.4], [0.5, 0.6, 0.7, 0.8]],
+                ring_turned: [0.1, -0.2, 0.3, -0.4, 0.5],
             },
         }
     }
@@ -324,11 +394,41 @@ mod tests {
                 "{jet:?} {expected:?}"
             );
         }
-        for k in 0..3 {
-            assert!(
-                close(jet.second[k], expected.second[k]),
-                "{jet:?} {expected:?}"
-            );
+        for (a, b) in jet
+            .second
+            .as_flattened()
+            .iter()
+            .zip(expected.second.as_flattened())
+        {
+            assert!(close(*a, *b), "{jet:?} {expected:?}");
+        }
+    }
+
+    #[test]
+    fn steps_of_neighbours_have_the_derivatives_of_differences() {
+        let selection = cuts(&[(Quantity::Neighbour, false, 0.31, None)]);
+        let at = |flux: f64, ring: f64| {
+            let moved = Observables {
+                flux,
+                ring,
+                ..galaxy()
+            };
+            selection.jet(&moved)
+        };
+        let (flux, ring) = (galaxy().flux, galaxy().ring);
+        let middle = at(flux, ring);
+        const STEP: f64 = 1e-4;
+        for (axis, [df, dr]) in [(0, [STEP, 0.0]), (2, [0.0, STEP])] {
+            let [plus, minus] = [1.0, -1.0].map(|s| at(flux + s * df, ring + s * dr));
+            let close = |a: f64, b: f64| (a - b).abs() < 1e-6;
+            assert!(close(
+                (plus.value - minus.value) / (2.0 * STEP),
+                middle.first[axis]
+            ));
+            for other in 0..VARIABLES {
+                let slope = (plus.first[other] - minus.first[other]) / (2.0 * STEP);
+                assert!(close(slope, middle.second[axis][other]), "{axis} {other}");
+            }
         }
     }
 

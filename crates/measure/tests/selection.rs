@@ -119,9 +119,11 @@ fn cuts_on_noisy_sizes_and_fluxes_leave_the_shear_as_it_is() {
         Selection::default()
             .with_cut(cut(Quantity::Flux, false, 125.0, Some(30.0)))
             .with_cut(cut(Quantity::Size, true, 2.2, None)),
+        // Noise alone decides: the light of the ring has a tenth of its noise.
+        Selection::default().with_cut(cut(Quantity::Neighbour, false, 0.2, Some(0.3))),
     ];
     // Of each cut: with the response of the selection, and with the responses of the galaxies alone.
-    let mut sums = [[[Sums::default(); BATCHES]; 2]; 3];
+    let mut sums = [[[Sums::default(); BATCHES]; 2]; 4];
     let flagged = measure_pairs(&measurer, |batch, sign, galaxy| {
         let (e, response) = ([galaxy.e1, galaxy.e2], galaxy.response.unwrap());
         for (cut, sums) in cuts.iter().zip(&mut sums) {

@@ -123,8 +123,10 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
         unbiased. NaN for networks, which have none.
     snr, flux_error : float64
         Flux over its error, and the error in image units. For linear configurations.
-    flux_g1, …, t_s : float64
-        How flux and size change with shear and noise; :meth:`Catalogue.select` uses them. For linear configurations.
+    neighbour : float64
+        Light in a ring of 12 px around the galaxy over its flux. For linear configurations.
+    flux_g1, …, t_rr : float64
+        How flux, size and the light of the ring change with shear and noise; :meth:`Catalogue.select` uses them. For linear configurations.
     psf_id, psf_m, psf_c : float64
         A number for the star that all galaxies of the image share, and the standard deviations of m and c by its noise;
         0 without such a star. :meth:`Catalogue.mean_shear` adds them to its errors. For linear configurations.

@@ -17,9 +17,12 @@ REAL: tuple[str, ...] = ("x", "y", "e1", "e2", "first_energy", "energy", "noise"
 OBSERVED: tuple[str, ...] = ("flux_error", "flux_g1", "flux_g2", "size_g1", "size_g2")
 OBSERVED += tuple(f"n{k}_{pair}" for k in "12" for pair in ("ef", "es", "ff", "fs", "ss"))
 OBSERVED += tuple(f"t_{pair}" for pair in ("e1f", "e1s", "e2f", "e2s", "ff", "fs", "ss", "s"))
+OBSERVED += ("ring", "ring_g1", "ring_g2")
+OBSERVED += tuple(f"n{k}_{pair}" for k in "12" for pair in ("er", "fr", "sr", "rr"))
+OBSERVED += tuple(f"t_{pair}" for pair in ("e1r", "e2r", "fr", "sr", "rr"))
 # The star that all galaxies of an image share, and what its noise does to m and c.
 STAR: tuple[str, ...] = ("psf_id", "psf_m", "psf_c")
-REAL += ("snr", *OBSERVED, *STAR)
+REAL += ("snr", "neighbour", *OBSERVED, *STAR)
 # What a selection reads.
 SELECTED = ("e1", "e2", "flags", "R11", "R22", "R12", "R21", "flux", "size", *OBSERVED)
 UNITS = {"x": "pix", "y": "pix", "radius": "pix"}

@@ -69,6 +69,11 @@ const TAPER_START: f64 = 0.75;
 /// Value of the window at the middle of an edge above which the edge correction is applied.
 // Chosen by hand. Below it |m| stays under 10⁻³ for the largest galaxies, and a tenth of the time is saved.
 const LEAST_EDGE_WINDOW: f64 = 0.02;
+/// Radius of the ring whose light tells neighbours from galaxies, in σ of the window.
+// Chosen by hand: 12 px for a window of 8 px.
+const RING_RADIUS: f64 = 1.5;
+/// Largest radius of the ring in units of the stamp's side: where its weight falls to 4 % of the peak at the edges of the stamp.
+const LARGEST_RING: f64 = 0.25;
 /// Largest lag of the autocorrelation in σ of the window.
 // Chosen by hand: the window's autocorrelation is a fifth there.
 const LARGEST_LAG: f64 = 2.5;
@@ -101,6 +106,9 @@ pub struct Spectral {
     window_sigma: f64,
     window: Smoothing,
     window_spectrum: Spectrum,
+    /// Of the ring (r/R)⁴ exp(2 − 2r²/R²), and what its parts cc count in the light of the ring.
+    ring_spectrum: Spectrum,
+    ring_counts: Vec<f32>,
     /// What windowed noise of a power becomes, in units of σ².
     leak: Smoothing,
     edges: Edges,
@@ -155,6 +163,8 @@ pub struct Lags {
     pub shear2: Vec<f32>,
     /// Sum of the windowed result, and its derivatives with respect to γ₁ and γ₂.
     pub flux: [f32; 3],
+    /// Sum of the result under the ring, and its derivatives.
+    pub ring: [f32; 3],
 }
 
 /// Noise as the linear network uses it: of level one, and white but for its power.
@@ -212,6 +222,8 @@ pub(crate) struct Products {
     pub(crate) distortion: [Kinds; 2],
     /// T′ · P₀ of `SizeMoments`.
     pub(crate) square: Kinds,
+    /// Of the light of the ring with χ₁, χ₂, T, the flux and itself.
+    pub(crate) ring: [Kinds; 5],
 }
 
 impl Spectral {
@@ -273,14 +285,29 @@ impl Spectral {
                 0.0
             }
         });
-        let window = window_modes(window_sigma, &plane);
+        let window = even_modes(|x| (-0.5 * (x / window_sigma).powi(2)).exp(), &plane);
+        let radius = (RING_RADIUS * window_sigma).min(LARGEST_RING * n as f64);
+        let [ring0, ring2, ring4] = [0, 2, 4].map(|power| {
+            let along =
+                |x: f64| (x / radius).powi(power) * (1.0 - 2.0 * (x / radius).powi(2)).exp();
+            even_modes(along, &plane)
+        });
+        let ring = |y: usize, x: usize| {
+            ring0[x] * ring4[y] + 2.0 * ring2[x] * ring2[y] + ring4[x] * ring0[y]
+        };
         let inside = inside(n, window_sigma);
         let mut window_spectrum = plane.spectrum();
         let [cc, ..] = window_spectrum.quarters_mut();
         let side = plane.modes + 1;
-        cc.copy_from_slice(&table([side, side], [plane.rows, plane.width], |y, x| {
-            window[x] * window[y]
-        }));
+        let stored = [plane.rows, plane.width];
+        cc.copy_from_slice(&table([side, side], stored, |y, x| window[x] * window[y]));
+        let mut ring_spectrum = plane.spectrum();
+        let [cc, ..] = ring_spectrum.quarters_mut();
+        cc.copy_from_slice(&table([side, side], stored, ring));
+        let count = |mode: usize| if mode == 0 { 1.0 } else { 2.0 };
+        let ring_counts = table([side, side], stored, |y, x| {
+            count(y) * count(x) * ring(y, x)
+        });
         Ok(Spectral {
             step: settings.step as f32,
             iterations: i32::try_from(settings.max_iterations).unwrap_or(i32::MAX),
@@ -295,6 +322,8 @@ impl Spectral {
             window_sigma,
             window: Smoothing::new(|distance| window[distance], &plane),
             window_spectrum,
+            ring_spectrum,
+            ring_counts,
             leak: Smoothing::new(|distance| inside * size * window[distance].powi(2), &plane),
             edges: Edges::new(n, &plane),
             to_lags: ToLags::new(reach, lags, &plane, 1.0),
@@ -352,6 +381,7 @@ impl Spectral {
             shear1: lags.clone(),
             shear2: lags,
             flux: [0.0; 3],
+            ring: [0.0; 3],
         }
     }
 
@@ -586,6 +616,11 @@ impl Spectral {
         scratch: &mut SpectralScratch,
         out: &mut Lags,
     ) {
+        let ring = |spectrum: &Spectrum| {
+            let [cc, ..] = spectrum.quarters();
+            dot(cc, &self.ring_counts)
+        };
+        out.ring = scratch.windowed.each_ref().map(ring);
         self.apply_window(scratch);
         let SpectralScratch {
             windowed: [v, first, second],
@@ -793,6 +828,10 @@ impl Spectral {
             pairs,
             distortion: [trace([g11, g12]), trace([g21, g22])],
             square: mean(square, zero),
+            ring: std::array::from_fn(|at| {
+                let with = quantities.get(at).copied().unwrap_or(&self.ring_spectrum);
+                mean(with, &self.ring_spectrum)
+            }),
         }
     }
 }
@@ -833,13 +872,11 @@ fn inside(n: usize, sigma: f64) -> f64 {
     share(0, side) / share(-side, 2 * side)
 }
 
-// Transform of a Gaussian window of `sigma` px along an axis, over the plane's period, at modes 0, 1, … 2·`modes`.
-fn window_modes(sigma: f64, plane: &Plane) -> Vec<f64> {
+// Transform of an even function along an axis, over the plane's period, at modes 0, 1, … 2·`modes`.
+fn even_modes(function: impl Fn(f64) -> f64, plane: &Plane) -> Vec<f64> {
     let period = plane.period as f64;
     let places = (0..plane.period).map(|at| at as f64 - (plane.period / 2) as f64);
-    let window: Vec<[f64; 2]> = places
-        .map(|x| [x, (-0.5 * (x / sigma).powi(2)).exp() / period])
-        .collect();
+    let window: Vec<[f64; 2]> = places.map(|x| [x, function(x) / period]).collect();
     let mode = |j: usize| {
         let terms = window.iter();
         terms.map(|[x, w]| w * (plane.wave(j) * x).cos()).sum()
@@ -1406,6 +1443,17 @@ fn multiply_modes(modes: &mut Modes, by: &Modes) {
     for ((re, im), (a, b)) in modes.zip(by.re.iter().zip(&by.im)) {
         (*re, *im) = (*re * a - *im * b, *re * b + *im * a);
     }
+}
+
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn dot(a: &[f32], b: &[f32]) -> f32 {
+    let mut sums = [0.0f32; LANES];
+    for (a, b) in a.chunks_exact(LANES).zip(b.chunks_exact(LANES)) {
+        for l in 0..LANES {
+            sums[l] += a[l] * b[l];
+        }
+    }
+    sums.iter().sum()
 }
 
 // Replaces |v̂|² by scale·(|v̂|² − variance·floor).

@@ -536,6 +536,7 @@ impl PlanWorker {
             flux: flux[0],
             flux_error: aperture * f64::from(noise * self.psf.flux_error()),
             flux_response: [flux[1], flux[2]],
+            ring: self.lags.ring.map(f64::from),
             square_response: [response(&self.lags.shear1), response(&self.lags.shear2)],
             size: moments.size(f64::from(breadth.square)),
             sheared: shear_step.map(|step| ShearSettings {
@@ -564,6 +565,7 @@ impl PlanWorker {
             pairs,
             distortion,
             square,
+            ring,
         } = plan.spectral.products(
             &self.psf,
             &self.gradients,
@@ -586,6 +588,10 @@ impl PlanWorker {
                 pairs[pair].map(|value| unit * f64::from(value))
             }),
             distortion: [0, 1].map(|i| chi.map(|chi| chi[i])),
+            ring: std::array::from_fn(|with| {
+                let aperture = if with == 3 { plan.aperture } else { 1.0 };
+                ring[with].map(|value| unit * aperture * f64::from(value))
+            }),
             square: square
                 .map(|product| unit * SizeMoments::mean_second_derivative(breadth, product)),
         }

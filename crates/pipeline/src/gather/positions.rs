@@ -422,7 +422,7 @@ fn is_taken(name: &str) -> bool {
     let own = stamp_table::PLACE.into_iter().chain(stamp_table::JACOBIAN);
     let own = own
         .chain(stamp_table::ORIGIN)
-        .chain([stamp_table::ID, "snr"]);
+        .chain([stamp_table::ID, "snr", "neighbour"]);
     let mut taken = measured.chain(Observables::COLUMNS).chain(own);
     taken.any(|other| name.eq_ignore_ascii_case(other))
         || ShearedCatalogues::columns().any(|other| name.eq_ignore_ascii_case(&other))

@@ -76,7 +76,11 @@ pub fn more_columns(
     };
     let found = || galaxies.iter().map(|galaxy| galaxy.observables.as_ref());
     let snr = found().map(|found| found.map_or(f64::NAN, Observables::snr));
-    let mut columns = vec![("snr".to_owned(), snr.collect())];
+    let neighbour = found().map(|found| found.map_or(f64::NAN, Observables::neighbour));
+    let mut columns = vec![
+        ("snr".to_owned(), snr.collect()),
+        ("neighbour".to_owned(), neighbour.collect()),
+    ];
     let missing = [f64::NAN; Observables::COLUMNS.len()];
     let rows = found().map(|found| found.map_or(missing, Observables::to_array));
     let rows: Vec<_> = rows.collect();

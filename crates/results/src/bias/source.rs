@@ -543,7 +543,7 @@ pub(super) fn catalogue_named(name: &str) -> Option<usize> {
 // Whether a column of shearq's catalogues was measured on the galaxies.
 fn is_measured(name: &str) -> bool {
     let known = Observables::COLUMNS.contains(&name) || READ.contains(&name);
-    (known || name == "snr" || name == "radius") && name != "flags"
+    (known || ["snr", "neighbour", "radius"].contains(&name)) && name != "flags"
 }
 
 // Refuses to choose galaxies by columns of one sheared catalogue, or by measured ones without sheared columns.
