@@ -1,13 +1,10 @@
 //! Files, simulations in memory and arrays are measured alike, on data that take each way through a session.
 
 use std::path::Path;
-use std::sync::Arc;
 
 use shearq_files::table;
 use shearq_measure::ndarray::{Array3, Axis, s};
-use shearq_measure::{
-    ArraySource, Batch, KnownNoise, Measurement, Measurer, OneThread, Psfs, Session,
-};
+use shearq_measure::{ArraySource, Batch, KnownNoise, Measurement, Measurer, OneThread, Psfs};
 
 use crate::support::{contents, fits_image, floats, pixels_of, printed, shell};
 
@@ -74,15 +71,8 @@ impl Data {
         };
         let mut source = ArraySource::new(measurer, self.stamps.view(), &psfs).unwrap();
         let noise = self.noise.map_or(KnownNoise::Unknown, KnownNoise::Stated);
-        let session = Session::open(measurer, &mut source, noise, &OneThread);
-        let session = Arc::new(session.map_err(|error| error.to_string())?);
-        let mut worker = measurer.worker();
-        let mut image = Arc::clone(&session).begin().unwrap();
-        for row in 0..session.rows().len() {
-            let row = session.read(&mut source, row).unwrap();
-            image.add(row.measure_row(&mut worker).unwrap());
-        }
-        Ok(image.finish())
+        let batch = measurer.measure_image(&mut source, noise, &OneThread);
+        batch.map_err(|error| error.to_string())
     }
 }
 

@@ -40,7 +40,7 @@ pub struct DenoiseScratch {
     line: Vec<f32>,
 }
 
-/// B₃-spline scaling filter of the wavelet transform. See docs/constants.md.
+// B₃-spline scaling filter of the wavelet transform (Starck & Murtagh 2006).
 const SPLINE: [f32; 5] = [1.0 / 16.0, 4.0 / 16.0, 6.0 / 16.0, 4.0 / 16.0, 1.0 / 16.0];
 
 impl WaveletWiener {
@@ -131,7 +131,6 @@ impl WaveletWiener {
         }
     }
 
-    /// A row with its mirrored continuation on both sides.
     #[inline(always)]
     fn mirror_row(&self, row: &[f32], line: &mut [f32]) {
         let (n, reach) = (self.n, self.reach);
@@ -145,7 +144,6 @@ impl WaveletWiener {
     }
 }
 
-/// Sum of five rows with weights.
 #[inline(always)]
 fn weigh(rows: [&[f32]; 5], taps: &[f32; 5], out: &mut [f32]) {
     let [a, b, c, d, e] = rows;
@@ -155,7 +153,6 @@ fn weigh(rows: [&[f32]; 5], taps: &[f32; 5], out: &mut [f32]) {
     }
 }
 
-/// [`WaveletWiener::apply`], compiled for each instruction set.
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 fn filter(plan: &WaveletWiener, stamp: &mut [f32], sigma: f32, scratch: &mut DenoiseScratch) {
     let DenoiseScratch {

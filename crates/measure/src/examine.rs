@@ -10,12 +10,13 @@ use shearq_submissions::PsfCut;
 
 use crate::centroid::galaxy_centroid;
 use crate::error::MeasureError;
-use crate::pixel::{self, PEAKS, Pixel, highest};
 use crate::psf::quality::{self, PsfQuality};
 use crate::psf::{Psfs, Star};
 use crate::second_moments::{CoreSize, core_sums};
-use crate::sky::{INNER_AREA, INNER_RADIUS, SkyCells, SkySubtraction, inner_light};
-use crate::warning::{Estimate, Warning};
+use crate::stamp::{
+    FullStamp, INNER_AREA, INNER_RADIUS, PEAKS, Pixel, SkySubtraction, hash, highest, inner_light,
+};
+use crate::warning::Warning;
 
 // Largest side in px of the corner blocks in which the sky is measured. Chosen by hand.
 const BLOCK: usize = 8;
@@ -28,6 +29,25 @@ const EXAMINED_STAMPS: usize = 1000;
 const MIN_GALAXIES_CORE: usize = 30;
 // Largest weight of one galaxy in units of the median light. Chosen by hand.
 const MAX_LIGHT: f64 = 4.0;
+// Light of the sky within 8 px, in units of the galaxy's. A share of 0.48 changes m by −0.006 (fiducial), −0.013 (large) and −0.011
+// (S/N 10); the threshold keeps |Δm| below 5·10⁻³. Command and seed were not kept.
+const SKY_SHARE: f64 = 0.15;
+// Largest ratio of corner to side brightness of a galaxy's wings; a sky is equal in both. Chosen by hand.
+const WINGS_RATIO: f64 = 0.6;
+// Change of the sky's share over 8 px. A change of 0.076 gives c = 0.0035, and m = −0.009 at S/N 10. Command and seed were
+// not kept.
+const GRADIENT_SHARE: f64 = 0.04;
+// Mean offset of the galaxies in px: between half a pixel and one pixel along both axes (0.71 and 1.41).
+const OFFSET: f64 = 0.85;
+// Scatter of the galaxies' positions in px. Chosen by hand.
+const POSITION_SCATTER: f64 = 2.0;
+// Relative difference of given noise and noise in the corners: it changes m by 0.005 at S/N 20. Command and seed were not
+// kept.
+const GIVEN_NOISE_DIFFERENCE: f64 = 0.02;
+// Relative scatter of the noise between stamps. Chosen by hand.
+const DEPTHS: f64 = 0.1;
+// Correlation at distances of 4 and 5 px. Chosen by hand.
+const LONG_CORRELATION: f64 = 0.03;
 /// PSFs of single galaxies of an image that are examined.
 pub const EXAMINED_PSFS: usize = 100; // Chosen by hand.
 
@@ -76,16 +96,28 @@ struct Look {
 /// Sums over stamps of an image. They depend on nothing but the stamps and their order.
 #[derive(Debug, Clone)]
 pub struct Examination {
-    full: usize,
+    stamp: FullStamp,
     block: usize,
-    pixels: Vec<f32>,
     looks: Vec<Look>,
     blank: usize,
     psfs: Vec<PsfQuality>,
     /// Whether each PSF is that of one galaxy.
     each: bool,
-    cells: SkyCells,
-    subtraction: SkySubtraction,
+}
+
+/// A measured quantity with its standard error.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Estimate {
+    pub(crate) value: f64,
+    pub(crate) error: f64,
+}
+
+impl Estimate {
+    /// Whether the value differs from zero. 5σ, chosen by hand: among 10 tests on 200 images, Gaussian noise alone exceeds
+    /// it in one of 1,000 runs.
+    pub(crate) fn is_significant(self) -> bool {
+        self.value.abs() > 5.0 * self.error
+    }
 }
 
 /// A block's mean, variance about its plane, and sums over pairs.
@@ -100,24 +132,19 @@ impl Examination {
     /// For `count` stamps of `full` pixels a side.
     pub fn new(full: usize, count: usize) -> Self {
         Examination {
-            full,
+            stamp: FullStamp::new(full),
             block: BLOCK.min(full / BLOCKS_PER_SIDE),
-            pixels: vec![0.0; full * full],
             looks: Vec::with_capacity(count),
             blank: 0,
             psfs: Vec::new(),
             each: false,
-            cells: SkyCells::new(full),
-            subtraction: SkySubtraction::Nothing,
         }
     }
 
     /// The same for stamps from which this is subtracted before they are measured.
-    pub(crate) fn without(self, subtraction: SkySubtraction) -> Self {
-        Examination {
-            subtraction,
-            ..self
-        }
+    pub(crate) fn without(mut self, subtraction: SkySubtraction) -> Self {
+        self.stamp.subtraction = subtraction;
+        self
     }
 
     /// The same for PSFs of one galaxy each.
@@ -139,7 +166,7 @@ impl Examination {
         let count = count.unwrap_or(1);
         let some = most.min(count);
         for at in (0..some).map(|k| (2 * k + 1) * count / (2 * some)) {
-            if let Ok(Star { psf, moved }) = psfs.at(at, cut, self.full) {
+            if let Ok(Star { psf, moved }) = psfs.at(at, cut, self.stamp.side) {
                 self.add_psf(psf.view(), moved);
             }
         }
@@ -162,21 +189,16 @@ impl Examination {
         stamp: ArrayView2<'_, T>,
         place: [f64; 2],
     ) -> Result<(), MeasureError> {
-        let n = self.full;
-        if stamp.dim() != (n, n) {
-            let expected = format!("{n} × {n}");
-            return Err(MeasureError::square("a stamp", stamp.dim(), expected));
-        }
-        pixel::copy(stamp, &mut self.pixels);
-        if self.pixels.iter().all(|v| *v == self.pixels[0]) {
+        let n = self.stamp.side;
+        self.stamp.read(stamp)?;
+        if self.stamp.is_blank() {
             self.blank += 1;
             return Ok(());
         }
-        if self.subtraction != SkySubtraction::Nothing {
-            self.subtraction.apply(&mut self.pixels, &mut self.cells);
-        }
+        self.stamp.subtract_sky();
+        let pixels = &mut self.stamp.pixels;
         let (edge, middle) = (n - self.block, (n - self.block) / 2);
-        let at = |y, x| block(&self.pixels, n, self.block, (y, x));
+        let at = |y, x| block(pixels, n, self.block, (y, x));
         let corners = [at(0, 0), at(0, edge), at(edge, 0), at(edge, edge)];
         let sides = [
             at(0, middle),
@@ -208,15 +230,15 @@ impl Examination {
             slope: [(b + d - a - c) / apart, (c + d - a - b) / apart],
             noise: [noise(corners[0], corners[3]), noise(corners[1], corners[2])],
             pairs,
-            peak: f64::from(highest(&self.pixels)),
-            trace: trace(&self.pixels),
+            peak: f64::from(highest(pixels)),
+            trace: trace(pixels),
             place: [0.0; 2],
             flux: 0.0,
             core: [0.0; 2],
         };
         // The sky of a stamp without corners is unknown.
         let sky = if corner.is_nan() { 0.0 } else { corner };
-        for value in &mut self.pixels {
+        for value in pixels.iter_mut() {
             // Missing pixels are as bright as the sky.
             *value = if value.is_finite() {
                 (f64::from(*value) - sky) as f32
@@ -224,12 +246,12 @@ impl Examination {
                 0.0
             };
         }
-        let found = galaxy_centroid(&self.pixels, n);
+        let found = galaxy_centroid(pixels, n);
         self.looks.push(Look {
             place: [0, 1].map(|k| f64::from(found[k]) - place[k]),
-            flux: inner_light(&self.pixels, n),
+            flux: inner_light(pixels, n),
             core: core_sums(
-                |x, y| f64::from(self.pixels[y * n + x]),
+                |x, y| f64::from(pixels[y * n + x]),
                 [n; 2],
                 found.map(f64::from),
             ),
@@ -301,10 +323,21 @@ impl Examination {
 
     /// A warning if `given` is not the noise of the stamps.
     pub fn given_noise(&self, given: f64) -> Option<Warning> {
-        Warning::of_given_noise(given, self.noise())
+        let measured = self.noise_unlike(given)?;
+        Some(Warning::GivenNoise { given, measured })
     }
 
-    /// Median noise in the corners of the stamps.
+    /// The noise in the corners of the stamps, if it differs from `given`.
+    pub(crate) fn noise_unlike(&self, given: f64) -> Option<f64> {
+        let Estimate { value, error } = self.noise();
+        let apart = Estimate {
+            value: given - value,
+            error,
+        };
+        let differs = apart.value.abs() > GIVEN_NOISE_DIFFERENCE * value;
+        (apart.is_significant() && differs && value > 0.0).then_some(value)
+    }
+
     fn noise(&self) -> Estimate {
         let of = |look: &Look| look.noise[0].hypot(look.noise[1]) / 2f64.sqrt();
         let Estimate { value, error } = self.median(of, 0.0);
@@ -318,7 +351,6 @@ impl Examination {
         quality::warnings(&self.psfs, !self.each, galaxies)
     }
 
-    /// How broad the core of the galaxies is, with the PSF.
     fn core(&self) -> Option<CoreSize> {
         let mut lights: Vec<f64> = self.looks.iter().map(|look| look.core[0].abs()).collect();
         let most = MAX_LIGHT * median(&mut lights).filter(|_| lights.len() >= MIN_GALAXIES_CORE)?;
@@ -339,13 +371,25 @@ impl Examination {
         let pixels = (self.block * self.block) as f64;
         // The median of four corners is about the mean of two.
         let corner = self.median(|look| look.corner, noise / (2.0 * pixels).sqrt());
-        let side = self.median(|look| look.side, 0.0);
-        Warning::of_sky(corner, side.value, noise, INNER_AREA / flux.abs())
+        let side = self.median(|look| look.side, 0.0).value;
+        let Estimate {
+            value: level,
+            error,
+        } = corner;
+        let share = level * (INNER_AREA / flux.abs());
+        let wings = level > 0.0 && level < WINGS_RATIO * side;
+        let found = corner.is_significant() && share.abs() > SKY_SHARE && !wings;
+        found.then_some(Warning::Sky {
+            level,
+            error,
+            noise,
+            share,
+            subtracted: false,
+        })
     }
 
-    /// What was found and subtracted.
     fn subtracted(&self, noise: f64, flux: f64) -> Vec<Warning> {
-        let SkySubtraction::Plane(sky) = self.subtraction else {
+        let SkySubtraction::Plane(sky) = self.stamp.subtraction else {
             return Vec::new();
         };
         let level = (sky.level != 0.0).then(|| Warning::Sky {
@@ -365,17 +409,29 @@ impl Examination {
     }
 
     fn gradient(&self, noise: f64, flux: f64) -> Option<Warning> {
-        let edge = (self.full - self.block) as f64;
+        let edge = (self.stamp.side - self.block) as f64;
         let floor = noise / (self.block as f64 * edge);
         let slope = [0, 1].map(|k| self.median(|look| look.slope[k], floor));
-        Warning::of_gradient(slope, noise, INNER_RADIUS * INNER_AREA / flux.abs())
+        let (slope, steep) = vector(slope);
+        let share = steep.value * (INNER_RADIUS * INNER_AREA / flux.abs());
+        (steep.is_significant() && share > GRADIENT_SHARE).then_some(Warning::Gradient {
+            slope,
+            error: steep.error,
+            noise,
+            subtracted: false,
+        })
     }
 
     fn places(&self) -> Option<Warning> {
         let offset = [0, 1].map(|k| self.median(|look| look.place[k], 0.0));
         let count = self.looks.len() as f64;
         let scatter = offset.map(|offset| offset.error * count.sqrt() / OF_MEDIAN);
-        Warning::of_places(offset, scatter)
+        let (offset, away) = vector(offset);
+        if away.value > OFFSET && away.is_significant() {
+            let error = away.error;
+            return Some(Warning::OffCentre { offset, error });
+        }
+        (scatter[0].max(scatter[1]) > POSITION_SCATTER).then_some(Warning::Wandering { scatter })
     }
 
     /// Compares the noise of two corners with the noise of the other two. Both vary together from stamp to stamp if
@@ -399,10 +455,12 @@ impl Examination {
             .iter()
             .map(|product| (product - mean).powi(2))
             .sum::<f64>();
-        Warning::of_depths(Estimate {
+        let variance = Estimate {
             value: mean,
             error: (square / (count - 1.0) / count).sqrt(),
-        })
+        };
+        let scatter = mean.max(0.0).sqrt();
+        (variance.is_significant() && scatter > DEPTHS).then_some(Warning::Depths { scatter })
     }
 
     fn long_correlation(&self, noise: f64) -> Option<Warning> {
@@ -417,10 +475,13 @@ impl Examination {
         let (middle, scatter) = scatter(&mut all).filter(|_| count > 1.0)?;
         let most = 3.0 * scatter;
         let clipped = all.iter().map(|r| (r - middle).clamp(-most, most));
-        Warning::of_long_correlation(Estimate {
+        let found = Estimate {
             value: middle + clipped.sum::<f64>() / count,
             error: scatter / count.sqrt(),
-        })
+        };
+        let correlation = found.value;
+        (found.is_significant() && correlation > LONG_CORRELATION)
+            .then_some(Warning::LongCorrelation { correlation })
     }
 
     fn copies(&self, of: usize) -> Option<Warning> {
@@ -439,6 +500,15 @@ impl Examination {
         let error = OF_MEDIAN * scatter.max(floor) / count.sqrt();
         Estimate { value, error }
     }
+}
+
+/// Both components, and their length with the larger of their errors.
+fn vector([x, y]: [Estimate; 2]) -> ([f64; 2], Estimate) {
+    let length = Estimate {
+        value: x.value.hypot(y.value),
+        error: x.error.max(y.error),
+    };
+    ([x.value, y.value], length)
 }
 
 /// Mean, variance and pairs of a square block from (y, x) on. A missing pixel counts as the mean of those that are present;
@@ -508,7 +578,7 @@ fn block(pixels: &[f32], n: usize, side: usize, (y0, x0): (usize, usize)) -> Blo
 /// A number from the bits of the stamp's pixels.
 fn trace(pixels: &[f32]) -> u64 {
     // Noise makes a fifth of the pixels different for every stamp.
-    pixel::hash(pixels.iter().step_by(5).map(|value| value.to_bits()))
+    hash(pixels.iter().step_by(5).map(|value| value.to_bits()))
 }
 
 /// Mean of the two in the middle of up to four numbers, without those that are none.

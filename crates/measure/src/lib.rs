@@ -55,10 +55,8 @@ mod examine;
 mod measurement;
 mod measurer;
 mod method;
-mod missing_pixels;
 mod noise;
 pub mod parts;
-mod pixel;
 mod psf;
 mod second_moments;
 mod selection;
@@ -66,6 +64,7 @@ mod session;
 mod shape;
 mod sheared;
 mod sky;
+mod stamp;
 mod transform;
 mod warning;
 
@@ -78,7 +77,6 @@ pub use measurer::{Epoch, ImageNoise, ImageWorker, Measurer, PsfWorker, Steps, W
 pub use method::AdaptedSettings;
 pub use ndarray;
 pub use noise::{StampNoise, Survey};
-pub use pixel::{Pixel, Pixels};
 pub use psf::{Psfs, Star, average_stars};
 pub use selection::{Cut, Quantity, Selected, Selection};
 pub use session::{
@@ -91,6 +89,7 @@ pub use shearq_quantities::{
 };
 pub use shearq_submissions::{Configuration, ConfigurationError, PsfCut};
 pub use sky::Sky;
+pub use stamp::{Pixel, Pixels};
 pub use warning::{Of, PixelFrame, Warning};
 
 /// The examples of README.md.

@@ -15,11 +15,12 @@ use crate::denoise::{DenoiseScratch, WaveletWiener, border_noise};
 use crate::error::{EpochError, MeasureError};
 use crate::measurement::{Flag, Measurement};
 use crate::method::{AdaptedSettings, CutEpoch, CutWorker, Images, MethodPlan};
-use crate::missing_pixels::MissingPixels;
 use crate::noise::{NoisePlan, StampNoise, Survey};
-use crate::pixel::{self, PEAKS, Pixel, all_finite, highest, is_level};
 use crate::psf::{Psfs, ResidualProfiles, Star, StarSurvey, cut_start};
-use crate::sky::{SkyCells, SkySubtraction};
+use crate::stamp::{
+    FullStamp, MissingPixels, PEAKS, Pixel, SkySubtraction, all_finite, highest, is_level,
+    lose_padding,
+};
 
 // The longest spacing of pixels is then 1.22 times that of square ones, and the largest wave number of the sharpest target,
 // 2.2 per pixel, still below the Nyquist frequency. Chosen by hand: cameras are below 0.02.
@@ -80,7 +81,7 @@ impl Measurer {
             method: MethodPlan::new(&configuration, configuration.stamp.size)?,
             noise: match configuration.noise {
                 NoiseSource::Image { correlation, sky } => {
-                    Some(NoisePlan::new(full, correlation)?.with_sky(sky))
+                    Some(NoisePlan::new(full, correlation, Some(sky))?)
                 }
                 NoiseSource::Header | NoiseSource::Border { .. } => None,
             },
@@ -112,7 +113,6 @@ impl Measurer {
         self.0.noise.as_ref()
     }
 
-    /// The sky that is subtracted from stamps of an image with this survey.
     pub(crate) fn subtraction(&self, survey: Option<&Survey>) -> SkySubtraction {
         let sky = survey.and_then(|survey| survey.sky);
         SkySubtraction::of(self.0.configuration.noise.sky(), sky)
@@ -131,12 +131,10 @@ impl Measurer {
             measurer: self.clone(),
             method: plan.method.worker(),
             denoise: plan.denoise.as_ref().map(WaveletWiener::scratch),
-            full: vec![0.0; plan.full * plan.full],
+            full: FullStamp::new(plan.full),
             cut: vec![0.0; n * n],
             border: Vec::with_capacity(plan.full * plan.full),
             missing: MissingPixels::new(n),
-            cells: SkyCells::new(plan.full),
-            subtraction: SkySubtraction::Nothing,
             to_sky: None,
             epochs: Vec::new(),
             used: Vec::new(),
@@ -218,14 +216,11 @@ pub struct Worker {
     measurer: Measurer,
     method: Box<dyn CutWorker>,
     denoise: Option<DenoiseScratch>,
-    /// Full stamp, denoised in place.
-    full: Vec<f32>,
-    /// Cut stamp.
+    /// Denoised in place.
+    full: FullStamp,
     cut: Vec<f32>,
     border: Vec<f32>,
     missing: MissingPixels,
-    cells: SkyCells,
-    subtraction: SkySubtraction,
     /// What turns ellipticities to the frame of the sky, if they are measured there.
     to_sky: Option<Spin2>,
     /// Cut stamps of the usable epochs of a galaxy, and which epochs they are.
@@ -266,17 +261,11 @@ impl fmt::Debug for Worker {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("Worker")
             .field("measurer", &self.measurer)
-            .field("subtraction", &self.subtraction)
             .finish_non_exhaustive()
     }
 }
 
 impl Worker {
-    /// The configuration.
-    pub fn configuration(&self) -> &Configuration {
-        self.measurer.configuration()
-    }
-
     /// Prepares for the galaxies of an image with this noise.
     ///
     /// Noise of a survey is treated as white if its correlation is not significant. Without a survey, noise is white, and
@@ -293,7 +282,7 @@ impl Worker {
         stars: Option<&Arc<ResidualProfiles>>,
     ) -> ImageWorker<'_> {
         let (white, survey) = (StampNoise::white(1.0), noise.survey());
-        self.subtraction = self.measurer.subtraction(survey);
+        self.full.subtraction = self.measurer.subtraction(survey);
         let correlated = survey
             .map(|survey| &survey.noise)
             .filter(|noise| noise.is_correlated());
@@ -329,7 +318,7 @@ impl Worker {
         if let Some(to_sky) = &self.to_sky {
             found.turn(to_sky);
         }
-        Ok(found.measurement(self.configuration().ellipticity(), noise))
+        Ok(found.measurement(self.measurer.configuration().ellipticity(), noise))
     }
 
     /// Cuts a stamp and prepares its pixels. Returns the level of its noise, or the measurement if it is flagged before its shape is
@@ -343,8 +332,9 @@ impl Worker {
         let plan = Arc::clone(&self.measurer.0);
         let n = plan.configuration.stamp.size;
         let linear = plan.configuration.linear().is_some();
-        let mut whole = self.read(stamp)?;
-        if linear && pixel::lose_padding(&mut self.full, plan.full) {
+        self.full.read(stamp)?;
+        let mut whole = all_finite(&self.full.pixels);
+        if linear && lose_padding(&mut self.full.pixels, plan.full) {
             whole = false;
         }
         if !whole && !linear {
@@ -353,29 +343,28 @@ impl Worker {
         if !usable_psf {
             return Ok(Err(Measurement::flagged(Flag::BadPsf)));
         }
-        if self.full.iter().all(|v| *v == self.full[0]) {
+        if self.full.is_blank() {
             return Ok(Err(Measurement::flagged(Flag::NoScale)));
         }
-        if self.subtraction != SkySubtraction::Nothing {
-            self.subtraction.apply(&mut self.full, &mut self.cells);
-        }
+        self.full.subtract_sky();
+        let pixels = &mut self.full.pixels;
         let noise = match plan.configuration.noise {
             NoiseSource::Header | NoiseSource::Image { .. } => level,
             NoiseSource::Border { border } => {
-                let found = border_noise(&self.full, plan.full, border, &mut self.border);
+                let found = border_noise(pixels, plan.full, border, &mut self.border);
                 found.map_or(f64::NAN, f64::from)
             }
         };
         if let (Some(filter), Some(buffers)) = (&plan.denoise, &mut self.denoise) {
-            filter.apply(&mut self.full, noise as f32, buffers);
+            filter.apply(pixels, noise as f32, buffers);
         }
         if n == plan.full {
-            std::mem::swap(&mut self.cut, &mut self.full);
+            std::mem::swap(&mut self.cut, pixels);
         } else {
             let start = cut_start(plan.full, n).unwrap_or(0);
             for (y, row) in self.cut.chunks_exact_mut(n).enumerate() {
                 let from = (start + y) * plan.full + start;
-                row.copy_from_slice(&self.full[from..from + n]);
+                row.copy_from_slice(&pixels[from..from + n]);
             }
         }
         if !whole && !self.missing.fill(&mut self.cut, n) {
@@ -439,27 +428,11 @@ impl Worker {
         if let Some((orientation, _)) = &frame {
             found.turn(&orientation.spin2());
         }
-        Ok(found.measurement(self.configuration().ellipticity(), noise))
-    }
-
-    /// Copies a full stamp; whether all of its pixels are finite.
-    fn read<T: Pixel>(&mut self, stamp: ArrayView2<'_, T>) -> Result<bool, MeasureError> {
-        let full = self.measurer.full();
-        if stamp.dim() != (full, full) {
-            let expected = format!("{full} × {full}");
-            return Err(MeasureError::square("a stamp", stamp.dim(), expected));
-        }
-        pixel::copy(stamp, &mut self.full);
-        Ok(all_finite(&self.full))
+        Ok(found.measurement(self.measurer.configuration().ellipticity(), noise))
     }
 }
 
 impl ImageWorker<'_> {
-    /// The configuration.
-    pub fn configuration(&self) -> &Configuration {
-        self.worker.configuration()
-    }
-
     /// Prepares for galaxies with this PSF: centred, of sum one, and with the pixels that
     /// [`Star::cut`](crate::Star::cut) cuts for [`Configuration::psf_cut`].
     ///
@@ -499,7 +472,7 @@ impl ImageWorker<'_> {
     }
 
     fn check_shape(&self, shape: PixelShape) -> Result<(), MeasureError> {
-        let most = match self.configuration().linear() {
+        let most = match self.worker.measurer.configuration().linear() {
             Some(_) => MAX_PIXEL_SHEAR,
             None => MAX_NETWORK_PIXEL_SHEAR,
         };
@@ -532,11 +505,11 @@ impl ImageWorker<'_> {
         &mut self,
         epochs: &[Epoch<'_, T>],
     ) -> Result<Measurement, MeasureError> {
-        if self.configuration().linear().is_none() {
+        if self.worker.measurer.configuration().linear().is_none() {
             return Err(EpochError::Network.into());
         }
         let one = epochs.first().ok_or(EpochError::None)?;
-        let most = self.configuration().stamp.size as f64 / 4.0;
+        let most = self.worker.measurer.configuration().stamp.size as f64 / 4.0;
         for (k, found) in epochs.iter().enumerate() {
             let (noise, [x, y]) = (found.noise, found.offset);
             if !(noise > 0.0 && noise.is_finite()) {
@@ -588,7 +561,7 @@ impl ImageWorker<'_> {
         levels: Option<&[f64]>,
         jacobians: Option<&[Jacobian]>,
     ) -> Result<Vec<Measurement>, MeasureError> {
-        let cut = self.configuration().psf_cut();
+        let cut = self.worker.measurer.configuration().psf_cut();
         let (count, full, _) = stamps.dim();
         let given = psfs.count();
         if let Some(given) = given.filter(|given| *given != count) {
@@ -635,11 +608,6 @@ impl ImageWorker<'_> {
 }
 
 impl PsfWorker<'_> {
-    /// The configuration.
-    pub fn configuration(&self) -> &Configuration {
-        self.worker.configuration()
-    }
-
     /// The settings that were adapted to the PSF, and to the galaxies of a survey. `None` for the network, which adapts
     /// nothing.
     pub fn adapted(&self) -> Option<AdaptedSettings> {
@@ -667,7 +635,7 @@ impl PsfWorker<'_> {
         if measured.descent.is_none() {
             return Ok((measured, None));
         }
-        let n = self.configuration().stamp.size;
+        let n = self.worker.measurer.configuration().stamp.size;
         let start = cut_start(stamp.nrows(), n).unwrap_or(0);
         let pixel = |(y, x)| f64::from(stamp[(start + y, start + x)].to_f32());
         let stamp = Array2::from_shape_fn((n, n), pixel);

@@ -28,10 +28,12 @@ use crate::asymmetry::{Asymmetry, rotation_sum};
 use crate::centroid::galaxy_centroid;
 use crate::error::MeasureError;
 use crate::examine::enough;
-use crate::missing_pixels::MissingPixels;
-use crate::pixel::{self, PEAKS, Pixel, highest};
 use crate::second_moments::GalaxyMoments;
-use crate::sky::{Sky, SkyCells, SkyLevels, SkySubtraction, inner_light};
+use crate::sky::{Sky, SkyLevels};
+use crate::stamp::{
+    FullStamp, MissingPixels, PEAKS, Pixel, SkySubtraction, all_finite, highest, inner_light,
+    padding,
+};
 use crate::warning::Warning;
 
 #[cfg(test)]
@@ -229,11 +231,9 @@ pub struct NoisePlan {
 }
 
 impl NoisePlan {
-    /// For stamps of `full` pixels a side and a covariance of lags up to `max_lag` along each axis.
-    ///
-    /// # Errors
-    /// If the stamps are smaller than 24 × 24 pixels, or the lags longer than 4 px.
-    pub fn new(full: usize, max_lag: usize) -> Result<Self, MeasureError> {
+    /// For stamps of `full` pixels a side and a covariance of lags up to `max_lag` along each axis; `sky` as a configuration
+    /// treats it.
+    pub fn new(full: usize, max_lag: usize, sky: Option<SkySource>) -> Result<Self, MeasureError> {
         if full < MIN_STAMP_SIDE {
             let expected = format!(
                 "at least {MIN_STAMP_SIDE} × {MIN_STAMP_SIDE}, for the noise to be measured on their frames"
@@ -252,21 +252,12 @@ impl NoisePlan {
         Ok(NoisePlan {
             full,
             max_lag,
-            sky: None,
+            sky,
             blocks: border_blocks(full).into(),
             matrix: Arc::new(matrix(&lags, &polynomials)),
             lags: lags.into(),
             polynomials: Arc::new(polynomials),
         })
-    }
-
-    /// The same with the sky of images, as a configuration treats it.
-    #[must_use]
-    pub fn with_sky(self, sky: SkySource) -> Self {
-        NoisePlan {
-            sky: Some(sky),
-            ..self
-        }
     }
 
     /// Which of `rows` rows of `columns` stamps are surveyed, evenly spread: enough for a thousand stamps, or all.
@@ -281,7 +272,10 @@ impl NoisePlan {
     pub fn survey(&self) -> NoiseSurvey {
         NoiseSurvey {
             plan: self.clone(),
-            pixels: vec![0.0; self.full * self.full],
+            stamp: FullStamp {
+                subtraction: SkySubtraction::of(self.sky, None),
+                ..FullStamp::new(self.full)
+            },
             asymmetry: Asymmetry::new(self.full),
             missing: MissingPixels::new(self.full),
             contrasts: Vec::new(),
@@ -290,9 +284,7 @@ impl NoisePlan {
             block_contrasts: Vec::new(),
             typical_contrasts: Vec::new(),
             galaxies: GalaxyMoments::default(),
-            cells: SkyCells::new(self.full),
             levels: (self.sky == Some(SkySource::Image)).then(SkyLevels::default),
-            subtraction: SkySubtraction::of(self.sky, None),
             peak: 0.0,
             surveyed: 0,
             incomplete: 0,
@@ -441,7 +433,8 @@ fn product(rows: &[[f64; 3 * BLOCK_SIDE]; BLOCK_SIDE], dx: i32, dy: i32) -> f64 
 #[derive(Debug, Clone)]
 pub struct NoiseSurvey {
     plan: NoisePlan,
-    pixels: Vec<f32>,
+    /// Its sky is subtracted for all but the noise.
+    stamp: FullStamp,
     asymmetry: Asymmetry,
     missing: MissingPixels,
     /// Of each place of the last stamp its excess over its opposite in units of √pixels, and its (x, y) from the galaxy.
@@ -454,11 +447,8 @@ pub struct NoiseSurvey {
     /// Of each stamp the median contrast.
     typical_contrasts: Vec<f32>,
     galaxies: GalaxyMoments,
-    cells: SkyCells,
     /// Until the sky is found.
     levels: Option<SkyLevels>,
-    /// From the stamps for all but the noise.
-    subtraction: SkySubtraction,
     peak: f32,
     surveyed: usize,
     incomplete: usize,
@@ -473,42 +463,36 @@ impl NoiseSurvey {
     /// If the stamp has other sizes than planned.
     pub fn add<T: Pixel>(&mut self, stamp: ArrayView2<'_, T>) -> Result<(), MeasureError> {
         let full = self.plan.full;
-        if stamp.dim() != (full, full) {
-            let expected = format!("{full} × {full}");
-            return Err(MeasureError::square("a stamp", stamp.dim(), expected));
-        }
-        pixel::copy(stamp, &mut self.pixels);
-        let is_whole = self.pixels.iter().all(|value| value.is_finite());
-        let padded = pixel::padding(&self.pixels, full).map(|depth| depth > 0);
-        let is_flat = self.pixels.iter().all(|value| *value == self.pixels[0]);
-        self.peak = self.peak.max(highest(&self.pixels));
+        self.stamp.read(stamp)?;
+        let is_whole = all_finite(&self.stamp.pixels);
+        let padded = padding(&self.stamp.pixels, full).map(|depth| depth > 0);
+        self.peak = self.peak.max(highest(&self.stamp.pixels));
         self.surveyed += 1;
         self.incomplete += usize::from(!is_whole);
-        if is_flat {
+        if self.stamp.is_blank() {
             self.unusable += 1;
             return Ok(());
         }
         if self.levels.is_some() {
-            self.cells.measure(&self.pixels);
+            self.stamp.cells.measure(&self.stamp.pixels);
         }
-        if self.subtraction != SkySubtraction::Nothing {
-            self.subtraction.apply(&mut self.pixels, &mut self.cells);
-        }
-        if !(is_whole || self.missing.fill(&mut self.pixels, full)) {
+        let products = self.products.len();
+        // Of pixels as given: a sky is smooth, and the light that fills missing pixels has no noise.
+        self.add_products(padded);
+        self.stamp.subtract_sky();
+        if !(is_whole || self.missing.fill(&mut self.stamp.pixels, full)) {
+            self.products.truncate(products);
             self.unusable += 1;
             return Ok(());
         }
         if let Some(levels) = &mut self.levels {
-            levels.add(&self.cells, inner_light(&self.pixels, full));
+            levels.add(&self.stamp.cells, inner_light(&self.stamp.pixels, full));
         }
-        self.add_products(stamp, padded);
         self.add_contrasts();
         Ok(())
     }
 
-    /// Adds the products of the blocks of a stamp, with pixels as given: a sky is smooth, and the light that fills missing
-    /// pixels has no noise.
-    fn add_products<T: Pixel>(&mut self, stamp: ArrayView2<'_, T>, padded: [bool; 4]) {
+    fn add_products(&mut self, padded: [bool; 4]) {
         let NoisePlan {
             full,
             ref blocks,
@@ -518,11 +502,10 @@ impl NoiseSurvey {
         } = self.plan;
         let mut block = [0.0; BLOCK_PIXELS];
         for &(y0, x0) in &**blocks {
-            for (y, to) in (y0..).zip(block.chunks_exact_mut(BLOCK_SIDE)) {
-                let row = stamp.row(y);
-                match row.as_slice() {
-                    Some(row) => widen(to, row[x0..].iter()),
-                    None => widen(to, row.iter().skip(x0)),
+            let rows = self.stamp.pixels.chunks_exact(full).skip(y0);
+            for (to, row) in block.chunks_exact_mut(BLOCK_SIDE).zip(rows) {
+                for (value, pixel) in to.iter_mut().zip(&row[x0..]) {
+                    *value = f64::from(*pixel);
                 }
             }
             let edges = [
@@ -550,10 +533,10 @@ impl NoiseSurvey {
     /// Adds the size of the galaxy, and by how much places are brighter than their opposites.
     fn add_contrasts(&mut self) {
         let full = self.plan.full;
-        let centroid = galaxy_centroid(&self.pixels, full);
-        self.galaxies.add(&self.pixels, full);
+        let centroid = galaxy_centroid(&self.stamp.pixels, full);
+        self.galaxies.add(&self.stamp.pixels, full);
         let rotation = rotation_sum(centroid, full);
-        self.asymmetry.compare(&self.pixels, rotation);
+        self.asymmetry.compare(&self.stamp.pixels, rotation);
         let places = &self.asymmetry.places;
         self.contrasts.clear();
         self.contrasts
@@ -616,7 +599,7 @@ impl NoiseSurvey {
     /// # Errors
     /// If usable stamps do not show the noise.
     pub fn result(&self) -> Result<Option<Survey>, MeasureError> {
-        let sky = match self.subtraction {
+        let sky = match self.stamp.subtraction {
             SkySubtraction::Plane(sky) => Some(sky),
             SkySubtraction::Nothing | SkySubtraction::EachStamp => None,
         };
@@ -643,11 +626,10 @@ impl NoiseSurvey {
     /// centred and compared better without sky.
     pub fn without_sky(&self) -> Option<NoiseSurvey> {
         let sky = self.sky()?;
-        Some(NoiseSurvey {
-            levels: None,
-            subtraction: SkySubtraction::of(self.plan.sky, Some(sky)),
-            ..self.plan.survey()
-        })
+        let mut again = self.plan.survey();
+        again.levels = None;
+        again.stamp.subtraction = SkySubtraction::of(self.plan.sky, Some(sky));
+        Some(again)
     }
 
     /// The sky under the stamps, away from other galaxies.
@@ -670,6 +652,7 @@ impl NoiseSurvey {
         let blocks = self.plan.blocks.iter();
         let blocks: Vec<[f64; 2]> = blocks.map(|&(y, x)| [middle(x), middle(y)]).collect();
         let nearest: Vec<usize> = self
+            .stamp
             .cells
             .places()
             .map(|[x, y]| {
@@ -680,7 +663,7 @@ impl NoiseSurvey {
                     .unwrap_or(0)
             })
             .collect();
-        levels.sky(&self.cells, |stamp, cell| {
+        levels.sky(&self.stamp.cells, |stamp, cell| {
             rejected[stamp * ring + nearest[cell]]
         })
     }
@@ -732,13 +715,6 @@ impl NoiseSurvey {
         let count = count as f64;
         let means: Vec<f64> = sums.iter().map(|sum| sum / count).collect();
         StampNoise::from_products(&self.plan, &means, count)
-    }
-}
-
-/// By way of single precision, in which galaxies are measured.
-fn widen<'a, T: Pixel + 'a>(to: &mut [f64], from: impl Iterator<Item = &'a T>) {
-    for (value, pixel) in to.iter_mut().zip(from) {
-        *value = f64::from(pixel.to_f32());
     }
 }
 

@@ -22,7 +22,7 @@ pub use self::star::Star;
 pub(crate) use self::star::cut_start;
 pub(crate) use self::star_survey::StarSurvey;
 use crate::error::MeasureError;
-use crate::pixel::Pixels;
+use crate::stamp::Pixels;
 
 // Above it stars differ by more than their noise, and count alike. Chosen by hand.
 const MAX_WEIGHT_SNR: f64 = 1000.0;
@@ -69,17 +69,6 @@ impl<'a> Psfs<'a> {
             Psfs::Star(stamp) => Psfs::Star(stamp.view()),
             Psfs::Stars(stamps) => Psfs::Stars(stamps.view().into_slice(galaxies)),
             Psfs::Functional(formulas) => Psfs::functional(&formulas[galaxies]),
-        }
-    }
-
-    /// The PSFs of some galaxies. Star stamps are not copied.
-    #[must_use]
-    pub fn into_slice(self, galaxies: Range<usize>) -> Self {
-        match self {
-            Psfs::Prepared(_) | Psfs::Star(_) => self,
-            Psfs::Stars(stamps) => Psfs::Stars(stamps.into_slice(galaxies)),
-            Psfs::Functional(Cow::Borrowed(formulas)) => Psfs::functional(&formulas[galaxies]),
-            Psfs::Functional(Cow::Owned(formulas)) => Psfs::functional(formulas[galaxies].to_vec()),
         }
     }
 
@@ -158,7 +147,6 @@ pub fn average_stars(
     }
 }
 
-/// Stars for the tests of this module.
 #[cfg(test)]
 mod test_stars {
     use ndarray::{Array2, ArrayView2};

@@ -10,7 +10,7 @@ use ndarray::ArrayView2;
 use shearq_quantities::statistics::upper_median;
 
 use crate::denoise::frame;
-use crate::pixel::{Pixel, contiguous};
+use crate::stamp::{Pixel, contiguous};
 
 // σ of the weight in pixels. Chosen by hand.
 const WEIGHT_SIGMA: f64 = 5.0;
@@ -35,7 +35,6 @@ pub(crate) struct CoreSize {
 }
 
 impl CoreSize {
-    /// From the mean square `q` under the narrow weight.
     pub(crate) fn from_weighted(q: f64, error: f64) -> Option<CoreSize> {
         let mean_square_radius = without_weight(q, CORE_SIGMA)?;
         error.is_finite().then(|| CoreSize {
@@ -44,7 +43,6 @@ impl CoreSize {
         })
     }
 
-    /// FWHM in pixels of a Gaussian with this core.
     pub(crate) fn fwhm(&self) -> f64 {
         (8.0 * std::f64::consts::LN_2 * self.mean_square_radius).sqrt()
     }
@@ -186,7 +184,6 @@ fn add_row<P: Pixel>(
     }
 }
 
-/// Moments of the galaxies of an image.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct GalaxyMoments {
     /// Σ W I and Σ W r² I of each stamp.

@@ -6,22 +6,11 @@
 //! galaxy. Powers of r have q = 0, exponentials q = 1 and Gaussians q = 2. All p and q that the profile allows bound the
 //! level; only what is beyond that bound is sky.
 
-use std::f64::consts::PI;
-
 use shearq_quantities::linear::cholesky;
-use shearq_quantities::statistics::{FROM_MODULI, OF_MEDIAN, median, scatter};
-use shearq_submissions::SkySource;
+use shearq_quantities::statistics::{OF_MEDIAN, median, scatter};
 
-use crate::pixel;
+use crate::stamp::{INNER_AREA, INNER_RADIUS, SkyCells};
 
-// Radius in pixels within which a galaxy's light is summed.
-// Chosen by hand.
-pub(crate) const INNER_RADIUS: f64 = 8.0;
-pub(crate) const INNER_AREA: f64 = PI * INNER_RADIUS * INNER_RADIUS;
-// 4 px on 48 px: 117 cells away from the galaxy.
-const CELLS_PER_SIDE: usize = 12;
-// From the centre, in units of the stamp's side: 12 px on 48 px, where galaxies and wings of one family remain.
-const MIN_CELL_DISTANCE: f64 = 0.25;
 // r₀, at which p is the slope of the wing, in units of the stamp's side.
 // Definition; the middle of the cells' distances.
 const WING_RADIUS: f64 = 0.4;
@@ -47,11 +36,8 @@ const MIN_LEVEL_SHARE: f64 = 0.03;
 // Change of this share over 8 px above which the gradient is subtracted.
 // A change of 0.0075 (0.001 σ per pixel at S/N 20) changes c by −0.3·10⁻⁴, seed 5, 16,000 measurements per shear.
 const MIN_SLOPE_SHARE: f64 = 0.01;
-// Residual in units of the scatter beyond which a cell of a stamp does not count.
-// Loses 0.3 % of Gaussian noise. Chosen by hand.
-const OUTLIER_SCATTERS: f64 = 3.0;
 // Level and two slopes.
-const PLANE_TERMS: usize = 3;
+pub(crate) const PLANE_TERMS: usize = 3;
 // The plane, the wing and its displacement along both axes.
 const TERMS: usize = 6;
 
@@ -74,7 +60,7 @@ impl Sky {
         self.level + self.slope[0] * x + self.slope[1] * y
     }
 
-    fn subtract(&self, pixels: &mut [f32], n: usize) {
+    pub(crate) fn subtract(&self, pixels: &mut [f32], n: usize) {
         let middle = (n as f64 - 1.0) / 2.0;
         let step = self.slope[0] as f32;
         for (y, row) in pixels.chunks_exact_mut(n).enumerate() {
@@ -86,182 +72,8 @@ impl Sky {
     }
 }
 
-/// The sky that is subtracted from stamps.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub enum SkySubtraction {
-    /// None.
-    #[default]
-    Nothing,
-    /// The plane of the image.
-    Plane(Sky),
-    /// The plane of each stamp, measured on its border.
-    EachStamp,
-}
-
-impl SkySubtraction {
-    /// What a configuration with this key subtracts if `sky` was found.
-    pub(crate) fn of(source: Option<SkySource>, sky: Option<Sky>) -> Self {
-        match (source, sky) {
-            (Some(SkySource::Stamp), _) => SkySubtraction::EachStamp,
-            (Some(SkySource::Image), Some(sky)) => SkySubtraction::Plane(sky),
-            (Some(SkySource::Image | SkySource::None) | None, _) => SkySubtraction::Nothing,
-        }
-    }
-
-    /// Subtracts from a stamp. Missing pixels stay missing.
-    pub(crate) fn apply(&self, pixels: &mut [f32], cells: &mut SkyCells) {
-        let sky = match self {
-            SkySubtraction::Nothing => None,
-            SkySubtraction::Plane(sky) => Some(*sky),
-            SkySubtraction::EachStamp => cells.plane_of(pixels),
-        };
-        if let Some(sky) = sky {
-            sky.subtract(pixels, cells.full);
-        }
-    }
-}
-
-/// Square cells of a stamp away from its centre, and their levels on one stamp.
-#[derive(Debug, Clone)]
-pub(crate) struct SkyCells {
-    full: usize,
-    side: usize,
-    cells: Vec<Cell>,
-    /// On the stamp measured last; NaN if a pixel is missing or padding.
-    levels: Vec<f32>,
-    residuals: Vec<f64>,
-    kept: Vec<usize>,
-}
-
-#[derive(Debug, Clone, Copy)]
-struct Cell {
-    /// First pixel (y, x).
-    first: (usize, usize),
-    /// Middle (x, y), from the centre of the stamp.
-    place: [f64; 2],
-    is_at_edge: bool,
-}
-
-impl SkyCells {
-    pub(crate) fn new(full: usize) -> Self {
-        let side = (full / CELLS_PER_SIDE).max(1);
-        let count = full / side;
-        // From the edges inwards, so that opposite cells are opposite pixels.
-        let start = |at: usize| match 2 * at < count {
-            true => at * side,
-            false => full - (count - at) * side,
-        };
-        let middle = |at: usize| start(at) as f64 + (side as f64 - full as f64) / 2.0;
-        let all = (0..count).flat_map(|y| (0..count).map(move |x| (y, x)));
-        let cells: Vec<Cell> = all
-            .map(|(y, x)| Cell {
-                first: (start(y), start(x)),
-                place: [middle(x), middle(y)],
-                is_at_edge: [y, x].iter().any(|at| *at == 0 || at + 1 == count),
-            })
-            .filter(|cell| cell.place[0].hypot(cell.place[1]) >= MIN_CELL_DISTANCE * full as f64)
-            .collect();
-        SkyCells {
-            full,
-            side,
-            levels: vec![0.0; cells.len()],
-            residuals: Vec::with_capacity(cells.len()),
-            kept: Vec::with_capacity(cells.len()),
-            cells,
-        }
-    }
-
-    /// The middle of each cell (x, y), from the centre of the stamp.
-    pub(crate) fn places(&self) -> impl Iterator<Item = [f64; 2]> {
-        self.cells.iter().map(|cell| cell.place)
-    }
-
-    /// Measures the levels of the cells on a stamp.
-    pub(crate) fn measure(&mut self, pixels: &[f32]) {
-        let (n, side) = (self.full, self.side);
-        let [low, high, left, right] = pixel::padding(pixels, n);
-        for (level, cell) in self.levels.iter_mut().zip(&self.cells) {
-            let (y, x) = cell.first;
-            let is_padded = y < low || x < left || y + side > n - high || x + side > n - right;
-            let mut sum = if is_padded { f32::NAN } else { 0.0 };
-            for row in pixels[y * n..(y + side) * n].chunks_exact(n) {
-                sum += row[x..x + side].iter().sum::<f32>();
-            }
-            *level = if sum.is_finite() {
-                sum / (side * side) as f32
-            } else {
-                f32::NAN
-            };
-        }
-    }
-
-    /// The plane of one stamp, fitted to the cells at its edges without outliers; `None` if too few remain.
-    fn plane_of(&mut self, pixels: &[f32]) -> Option<Sky> {
-        self.measure(pixels);
-        let SkyCells {
-            cells,
-            levels,
-            residuals,
-            kept,
-            ..
-        } = self;
-        kept.clear();
-        kept.extend((0..cells.len()).filter(|&k| cells[k].is_at_edge && !levels[k].is_nan()));
-        let residual = |[level, x_slope, y_slope]: [f64; PLANE_TERMS], k: usize| {
-            let [x, y] = cells[k].place;
-            f64::from(levels[k]) - level - x_slope * x - y_slope * y
-        };
-        let mut plane = [0.0; PLANE_TERMS];
-        for round in 0..3 {
-            if round == 0 {
-                // The median first: outliers would tilt a plane, and hide behind it.
-                residuals.clear();
-                residuals.extend(kept.iter().map(|&k| residual(plane, k)));
-                plane[0] = median(residuals)?;
-            } else {
-                let mut sums = NormalEquations::<PLANE_TERMS>::default();
-                for &k in &*kept {
-                    let [x, y] = cells[k].place;
-                    sums.add([1.0, x, y], f64::from(levels[k]), 1.0);
-                }
-                plane = sums.solve(PLANE_TERMS)?;
-            }
-            residuals.clear();
-            residuals.extend(kept.iter().map(|&k| residual(plane, k).abs()));
-            let limit = OUTLIER_SCATTERS * FROM_MODULI * median(residuals)?;
-            kept.retain(|&k| residual(plane, k).abs() <= limit);
-        }
-        Some(Sky {
-            level: plane[0],
-            level_error: f64::NAN,
-            slope: [plane[1], plane[2]],
-            slope_error: f64::NAN,
-        })
-    }
-}
-
-/// Light within [`INNER_RADIUS`] of the centre.
-pub(crate) fn inner_light(pixels: &[f32], n: usize) -> f64 {
-    let middle = (n as f64 - 1.0) / 2.0;
-    let mut sum = 0.0;
-    for (y, row) in pixels.chunks_exact(n).enumerate() {
-        let dy = y as f64 - middle;
-        let square = INNER_RADIUS * INNER_RADIUS - dy * dy;
-        if square < 0.0 {
-            continue;
-        }
-        let half = square.sqrt();
-        let first = (middle - half).ceil().max(0.0) as usize;
-        let last = ((middle + half).floor() as usize).min(n - 1);
-        sum += row[first..=last].iter().map(|v| f64::from(*v)).sum::<f64>();
-    }
-    sum
-}
-
-/// Levels of the cells of many stamps.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct SkyLevels {
-    /// Stamp by stamp.
     levels: Vec<f32>,
     /// Light within 8 px of each galaxy.
     fluxes: Vec<f64>,
@@ -285,7 +97,7 @@ impl SkyLevels {
         cells: &SkyCells,
         is_rejected: impl Fn(usize, usize) -> bool,
     ) -> Option<Sky> {
-        let count = cells.cells.len();
+        let count = cells.levels.len();
         let of_group = |group: Option<usize>| -> Vec<CellLevel> {
             let mut values = Vec::new();
             let places = cells.places().enumerate();
@@ -334,12 +146,10 @@ impl SkyLevels {
     }
 }
 
-/// The level of a cell over stamps.
 #[derive(Debug, Clone, Copy)]
 struct CellLevel {
     place: [f64; 2],
     level: f64,
-    /// One over its variance.
     weight: f64,
 }
 
@@ -359,7 +169,6 @@ impl CellLevel {
     }
 }
 
-/// A wing of slope p and steepening q.
 #[derive(Debug, Clone, Copy)]
 struct Wing {
     p: f64,
@@ -465,7 +274,7 @@ fn fit(levels: &[CellLevel], full: usize, wing: Option<Wing>) -> Option<Fit> {
 
 /// Normal equations of a fit of N parameters.
 #[derive(Debug, Clone, Copy)]
-struct NormalEquations<const N: usize> {
+pub(crate) struct NormalEquations<const N: usize> {
     matrix: [[f64; N]; N],
     right: [f64; N],
 }
@@ -480,7 +289,7 @@ impl<const N: usize> Default for NormalEquations<N> {
 }
 
 impl<const N: usize> NormalEquations<N> {
-    fn add(&mut self, basis: [f64; N], value: f64, weight: f64) {
+    pub(crate) fn add(&mut self, basis: [f64; N], value: f64, weight: f64) {
         for (i, row) in self.matrix.iter_mut().enumerate() {
             for (sum, b) in row.iter_mut().zip(&basis) {
                 *sum += weight * basis[i] * b;
@@ -490,7 +299,7 @@ impl<const N: usize> NormalEquations<N> {
     }
 
     /// The first `count` parameters, the others being zero.
-    fn solve(&self, count: usize) -> Option<[f64; N]> {
+    pub(crate) fn solve(&self, count: usize) -> Option<[f64; N]> {
         self.solve_for(self.right, count)
     }
 
@@ -530,8 +339,11 @@ mod tests {
     use rand::{RngExt, SeedableRng};
     use rand_chacha::ChaCha8Rng;
 
+    use shearq_submissions::SkySource;
+
     use super::*;
     use crate::noise::{NoisePlan, Survey};
+    use crate::stamp::{FullStamp, SkySubtraction};
 
     const N: usize = 48;
     const COUNT: usize = 400;
@@ -571,7 +383,7 @@ mod tests {
                 stamp
             })
             .collect();
-        let plan = NoisePlan::new(N, 1).unwrap().with_sky(SkySource::Image);
+        let plan = NoisePlan::new(N, 1, Some(SkySource::Image)).unwrap();
         let survey_all = |mut survey: crate::noise::NoiseSurvey| {
             stamps
                 .iter()
@@ -713,28 +525,26 @@ mod tests {
 
     #[test]
     fn each_stamp_loses_its_own_plane() {
-        let mut cells = SkyCells::new(N);
+        let mut full = FullStamp::new(N);
+        full.subtraction = SkySubtraction::EachStamp;
         let mut rng = ChaCha8Rng::seed_from_u64(5);
         let mut mean = [0.0; 3];
         let count = 100;
         for _ in 0..count {
-            let mut stamp: Vec<f32> = (0..N * N)
-                .map(|at| {
-                    let (x, y) = ((at % N) as f32 - 23.5, (at / N) as f32 - 23.5);
-                    let half = 3f32.sqrt();
-                    2.0 + 0.03 * x - 0.01 * y + rng.random_range(-half..half)
-                })
-                .collect();
+            let mut stamp = Array2::from_shape_fn((N, N), |(y, x)| {
+                let (x, y) = (x as f32 - 23.5, y as f32 - 23.5);
+                let half = 3f32.sqrt();
+                2.0 + 0.03 * x - 0.01 * y + rng.random_range(-half..half)
+            });
             // A neighbour on the border, and a missing pixel.
-            for y in 20..28 {
-                stamp[y * N..y * N + 6].fill(30.0);
-            }
-            stamp[100] = f32::NAN;
-            let sky = cells.plane_of(&stamp).unwrap();
+            stamp.slice_mut(ndarray::s![20..28, ..6]).fill(30.0);
+            stamp[(2, 4)] = f32::NAN;
+            full.read(stamp.view()).unwrap();
+            let sky = full.cells.plane_of(&full.pixels).unwrap();
             let found = [sky.level, sky.slope[0], sky.slope[1]];
             mean = [0, 1, 2].map(|k| mean[k] + found[k] / f64::from(count));
-            SkySubtraction::EachStamp.apply(&mut stamp, &mut cells);
-            let again = cells.plane_of(&stamp).unwrap();
+            full.subtract_sky();
+            let again = full.cells.plane_of(&full.pixels).unwrap();
             // Other cells may be beyond 3σ the second time: a cell with a mean of 0.75σ moves the level of 44 cells by
             // 0.02 and the slope by 10⁻³. Four of them.
             assert!(

@@ -30,7 +30,6 @@ use multiversion::multiversion;
 use shearq_quantities::PixelShape;
 use shearq_quantities::product::{LANES, Matrix, ROWS, multiply};
 
-/// Pixels that are folded side by side.
 // Layout: one vector of AVX2.
 const FOLDED_PIXELS: usize = 8;
 
@@ -56,12 +55,10 @@ impl Plane {
         }
     }
 
-    /// All modes of a plane.
     pub(crate) fn with_all_modes(period: usize) -> Self {
         Plane::new(period, period / 2)
     }
 
-    /// Numbers in a quarter.
     pub(crate) fn quarter(&self) -> usize {
         self.rows * self.width
     }
@@ -490,7 +487,6 @@ fn take_waves(waves: &mut Waves, cos: &mut [f32], s: &mut [f32]) {
 /// Buffers for one thread. Their content between calls does not matter, but for the zeros that fill up `folded`.
 #[derive(Debug, Clone)]
 pub(crate) struct TransformScratch {
-    /// A folded image.
     pub(crate) folded: Vec<f32>,
     /// The same transformed along x.
     pub(crate) lines: Vec<f32>,
@@ -602,7 +598,6 @@ impl ToModes {
         }
     }
 
-    /// Pixels a side.
     pub(crate) fn side(&self) -> usize {
         self.folding.n
     }
@@ -614,7 +609,6 @@ impl ToModes {
         }
     }
 
-    /// The transform of a row-major image.
     pub(crate) fn transform(
         &self,
         image: &[f32],
@@ -846,7 +840,6 @@ impl ToPixels {
         }
     }
 
-    /// The row-major image of a spectrum.
     pub(crate) fn transform(
         &self,
         spectrum: &Spectrum,
@@ -955,7 +948,6 @@ impl ToLags {
         }
     }
 
-    /// Number of lags.
     pub(crate) fn len(&self) -> usize {
         (self.reach + 1) * (2 * self.reach + 1)
     }

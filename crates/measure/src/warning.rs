@@ -1,10 +1,8 @@
-//! Warnings about data that can be measured all the same: the text, the threshold and the condition of each.
-//!
-//! [`Examination`](crate::Examination) and `psf::examine` measure the quantities that are tested here.
+//! Warnings about data that can be measured all the same, and their texts. `examine.rs`, `psf/quality.rs` and `session.rs` have
+//! the conditions.
 
 use std::fmt;
 
-use shearq_submissions::Configuration;
 use shearq_submissions::limits::MIN_PSF;
 use thiserror::Error;
 
@@ -136,7 +134,7 @@ pub enum Warning {
     /// The noise of the stamps disagrees with the header.
     #[error(
         "NOISESIG disagrees with the measured noise (found {}, expected {}): {} is used",
-        five_digits(*given), five_digits(*measured),
+        significant(*given, 5), significant(*measured, 5),
         if *used { "the measured noise" } else { "NOISESIG" }
     )]
     NoiseLevel {
@@ -150,7 +148,7 @@ pub enum Warning {
     /// The noise of the stamps disagrees with the one in the call.
     #[error(
         "the given noise disagrees with the noise of the stamps (found {}, expected {}), which biases shears. Try: leave out the noise, so that it is measured",
-        five_digits(*given), five_digits(*measured)
+        significant(*given, 5), significant(*measured, 5)
     )]
     GivenNoise {
         /// The noise in the call.
@@ -186,7 +184,7 @@ pub enum Warning {
     /// The PSF image contains a background.
     #[error(
         "the PSF contains a background (found {} % of its peak{of}; expected 0). It changes the star's light by {:+.0} % and biases shears. Try: subtract the background, or use a larger PSF stamp if the PSF fills it",
-        three_digits(100.0 * level), 100.0 * share
+        significant(100.0 * level, 3), 100.0 * share
     )]
     PsfBackground {
         /// Level in units of the peak.
@@ -353,147 +351,13 @@ impl fmt::Display for Of {
     }
 }
 
-/// A measured quantity with its standard error.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Estimate {
-    pub(crate) value: f64,
-    pub(crate) error: f64,
-}
-
-impl Estimate {
-    /// Whether the value differs from zero. 5σ, chosen by hand: among 10 tests on 200 images, Gaussian noise alone exceeds
-    /// it in one of 1,000 runs.
-    pub(crate) fn is_significant(self) -> bool {
-        self.value.abs() > 5.0 * self.error
-    }
-}
-
-// Light of the sky within 8 px, in units of the galaxy's. A share of 0.48 changes m by −0.006 (fiducial), −0.013 (large) and −0.011
-// (S/N 10); the threshold keeps |Δm| below 5·10⁻³. Command and seed were not kept.
-const SKY_SHARE: f64 = 0.15;
-// Largest ratio of corner to side brightness of a galaxy's wings; a sky is equal in both. Chosen by hand.
-const WINGS_RATIO: f64 = 0.6;
-// Change of the sky's share over 8 px. A change of 0.076 gives c = 0.0035, and m = −0.009 at S/N 10. Command and seed were
-// not kept.
-const GRADIENT_SHARE: f64 = 0.04;
-// Mean offset of the galaxies in px: between half a pixel and one pixel along both axes (0.71 and 1.41).
-const OFFSET: f64 = 0.85;
-// Scatter of the galaxies' positions in px. Chosen by hand.
-const POSITION_SCATTER: f64 = 2.0;
-// Relative difference of stated and surveyed noise, whose median of 1,000 stamps has an error of 0.15 %. Chosen by hand.
-const STATED_NOISE_DIFFERENCE: f64 = 0.01;
-// Relative difference of given noise and noise in the corners: it changes m by 0.005 at S/N 20. Command and seed were not
-// kept.
-const GIVEN_NOISE_DIFFERENCE: f64 = 0.02;
-// Relative scatter of the noise between stamps. Chosen by hand.
-const DEPTHS: f64 = 0.1;
-// Correlation at distances of 4 and 5 px. Chosen by hand.
-const LONG_CORRELATION: f64 = 0.03;
-
 impl Warning {
-    /// A warning if the configuration uses too little of the PSF.
-    pub(crate) fn of_settings(configuration: &Configuration) -> Option<Warning> {
-        let size = configuration.psf.size;
-        let cut = configuration.linear().is_some() && size < MIN_PSF;
-        cut.then_some(Warning::PsfSize { size })
-    }
-
     /// A warning about the star for all galaxies, which was `moved` to the middle by so many pixels.
     pub fn of_moved(moved: [f64; 2]) -> Warning {
         Warning::PsfOffCentre {
             offset: moved,
             of: Of { count: 1, of: 1 },
         }
-    }
-
-    /// Tests the level in corners and on sides of the stamps. `light` is the light of a level of one within 8 px of a galaxy,
-    /// in units of the galaxy's.
-    pub(crate) fn of_sky(corner: Estimate, side: f64, noise: f64, light: f64) -> Option<Warning> {
-        let Estimate {
-            value: level,
-            error,
-        } = corner;
-        let share = level * light;
-        let wings = level > 0.0 && level < WINGS_RATIO * side;
-        let found = corner.is_significant() && share.abs() > SKY_SHARE && !wings;
-        found.then_some(Warning::Sky {
-            level,
-            error,
-            noise,
-            share,
-            subtracted: false,
-        })
-    }
-
-    /// Tests the change of the corners' level per pixel. `light` is the light of a change of one, as above.
-    pub(crate) fn of_gradient(slope: [Estimate; 2], noise: f64, light: f64) -> Option<Warning> {
-        let (slope, error) = vector(slope);
-        let steep = Estimate {
-            value: slope[0].hypot(slope[1]),
-            error,
-        };
-        let found = steep.is_significant() && steep.value * light > GRADIENT_SHARE;
-        found.then_some(Warning::Gradient {
-            slope,
-            error,
-            noise,
-            subtracted: false,
-        })
-    }
-
-    /// Tests the median of the galaxies' centroids from the middle, and their scatter.
-    pub(crate) fn of_places(offset: [Estimate; 2], scatter: [f64; 2]) -> Option<Warning> {
-        let (offset, error) = vector(offset);
-        let away = Estimate {
-            value: offset[0].hypot(offset[1]),
-            error,
-        };
-        if away.value > OFFSET && away.is_significant() {
-            return Some(Warning::OffCentre { offset, error });
-        }
-        (scatter[0].max(scatter[1]) > POSITION_SCATTER).then_some(Warning::Wandering { scatter })
-    }
-
-    /// Tests the variance of the logarithm of the noise between stamps.
-    pub(crate) fn of_depths(variance: Estimate) -> Option<Warning> {
-        let scatter = variance.value.max(0.0).sqrt();
-        let found = variance.is_significant() && scatter > DEPTHS;
-        found.then_some(Warning::Depths { scatter })
-    }
-
-    /// Tests the mean correlation of pixels 4 and 5 px apart.
-    pub(crate) fn of_long_correlation(correlation: Estimate) -> Option<Warning> {
-        let found = correlation.is_significant() && correlation.value > LONG_CORRELATION;
-        found.then_some(Warning::LongCorrelation {
-            correlation: correlation.value,
-        })
-    }
-
-    /// Tests a noise level that replaces the measurement against the noise in the corners of the stamps.
-    pub(crate) fn of_given_noise(given: f64, measured: Estimate) -> Option<Warning> {
-        let apart = Estimate {
-            value: given - measured.value,
-            error: measured.error,
-        };
-        let measured = measured.value;
-        let differs = apart.value.abs() > GIVEN_NOISE_DIFFERENCE * measured;
-        let found = apart.is_significant() && differs && measured > 0.0;
-        found.then_some(Warning::GivenNoise { given, measured })
-    }
-
-    /// Tests a level of the header, which is not used, against the survey, which has a relative `error`.
-    pub(crate) fn of_stated_noise(given: f64, measured: f64, error: f64) -> Option<Warning> {
-        let apart = Estimate {
-            value: measured / given - 1.0,
-            error,
-        };
-        let differs = apart.is_significant() && apart.value.abs() > STATED_NOISE_DIFFERENCE;
-        // NaN if the stated level is zero or NaN.
-        (differs || apart.value.is_nan()).then_some(Warning::NoiseLevel {
-            given,
-            measured,
-            used: true,
-        })
     }
 
     /// Warnings about the galaxies of an image.
@@ -564,19 +428,13 @@ impl Warning {
     }
 }
 
-/// Both components, and the larger of their errors.
-fn vector(components: [Estimate; 2]) -> ([f64; 2], f64) {
-    let [x, y] = components;
-    ([x.value, y.value], x.error.max(y.error))
-}
-
 fn sky(level: f64, error: f64, noise: f64, share: f64, subtracted: bool) -> String {
     let decimals = if subtracted { 3 } else { 2 };
     let in_noise = match noise > 0.0 {
         true => format!(", or {:.decimals$} of the noise", level / noise),
         false => String::new(),
     };
-    let (level, error) = (three_digits(level), three_digits(error));
+    let (level, error) = (significant(level, 3), significant(error, 3));
     match subtracted {
         true => format!(
             "(found {level} ± {error}{in_noise}; expected 0). It was subtracted from all stamps"
@@ -614,14 +472,6 @@ fn significant(value: f64, digits: i32) -> String {
     }
     let decimals = decimals - value.abs().log10().floor() as i32;
     format!("{value:.*}", decimals.max(0) as usize)
-}
-
-fn three_digits(value: f64) -> String {
-    significant(value, 3)
-}
-
-fn five_digits(value: f64) -> String {
-    significant(value, 5)
 }
 
 /// A pixel scale to six digits, without trailing zeros.

@@ -2,12 +2,10 @@
 
 #![expect(clippy::unwrap_used, reason = "a test fails by a panic")]
 
-use std::sync::Arc;
-
 use ndarray::Array3;
 use shearq_measure::{
     ArraySource, Batch, FunctionalPsf, KnownNoise, Measurement, Measurer, OneThread, PsfProfile,
-    Psfs, ResponseMatrix, Session, Shear, Threads, Warning, ndarray,
+    Psfs, ResponseMatrix, Shear, Threads, Warning, ndarray,
 };
 
 /// Threads that are done in the opposite order.
@@ -58,15 +56,7 @@ fn measured(
     threads: &impl Threads,
 ) -> Batch {
     let mut source = ArraySource::new(measurer, stamps.view(), psfs).unwrap();
-    let session = Arc::new(Session::open(measurer, &mut source, noise, threads).unwrap());
-    let mut image = Arc::clone(&session).begin().unwrap();
-    let mut worker = measurer.worker();
-    for row in 0..session.rows().len() {
-        let row = session.read(&mut source, row).unwrap();
-        image.add(row.measure_row(&mut worker).unwrap());
-    }
-    assert!(image.is_complete());
-    image.finish()
+    measurer.measure_image(&mut source, noise, threads).unwrap()
 }
 
 /// What depends on every step; other numbers may be NaN, which is not equal to itself.

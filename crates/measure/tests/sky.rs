@@ -2,12 +2,10 @@
 
 #![expect(clippy::unwrap_used, reason = "a test fails by a panic")]
 
-use std::sync::Arc;
-
 use ndarray::{Array2, Array3, ArrayView2, Axis, stack};
 use shearq_measure::{
     ArraySource, Batch, Frame, ImageNoise, Jacobian, KnownNoise, MeasureError, Measurement,
-    Measurer, OneThread, Psfs, Session, Shear, ndarray,
+    Measurer, OneThread, Psfs, Shear, ndarray,
 };
 
 const N: usize = 48;
@@ -146,14 +144,7 @@ fn batch(measurer: &Measurer, jacobians: Option<Vec<Jacobian>>) -> Result<Batch,
     if let Some(jacobians) = jacobians {
         source = source.with_jacobians(jacobians)?;
     }
-    let session = Session::open(measurer, &mut source, KnownNoise::Given(0.5), &OneThread)?;
-    let session = Arc::new(session);
-    let mut image = Arc::clone(&session).begin()?;
-    let mut worker = measurer.worker();
-    for row in 0..session.rows().len() {
-        image.add(session.read(&mut source, row)?.measure_row(&mut worker)?);
-    }
-    Ok(image.finish())
+    measurer.measure_image(&mut source, KnownNoise::Given(0.5), &OneThread)
 }
 
 #[test]

@@ -47,8 +47,7 @@ use shearq_submissions::LinearDeconvolution;
 use super::network::high_pass;
 use crate::error::MeasureError;
 use crate::noise::StampNoise;
-use crate::pixel::copy_row;
-use crate::pixel::{check_psf, check_sizes};
+use crate::stamp::{check_psf, check_sizes, copy_row};
 use crate::transform::{
     LagsScratch, Modes, Plane, Spectrum, ToLags, ToModes, TransformScratch, even_parities,
     four_lanes, lanes, store, table,

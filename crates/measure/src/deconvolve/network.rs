@@ -26,7 +26,7 @@ use shearq_submissions::{
 
 use crate::error::{MeasureError, length};
 use crate::measurement::{Descent, Stop};
-use crate::pixel::{check_psf, check_sizes};
+use crate::stamp::{check_psf, check_sizes};
 use crate::transform::{Plane, Spectrum, ToModes, ToPixels, TransformScratch};
 
 /// High-pass kernel D of the regularisation; its elements sum to zero.
@@ -154,9 +154,7 @@ pub struct Network {
 pub struct NetworkScratch {
     n: usize,
     p: usize,
-    /// Accepted state.
     state: Vec<f32>,
-    /// Candidate state.
     next: Vec<f32>,
     /// State after an accelerated update, before its momentum; and the same one iteration before.
     moved: Vec<f32>,

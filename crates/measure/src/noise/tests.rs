@@ -28,7 +28,7 @@ fn survey(
     mut stamp: impl FnMut(&mut ChaCha8Rng) -> Array2<f32>,
 ) -> StampNoise {
     let mut rng = ChaCha8Rng::seed_from_u64(9);
-    let mut survey = NoisePlan::new(SIDE, reach).unwrap().survey();
+    let mut survey = NoisePlan::new(SIDE, reach, None).unwrap().survey();
     for _ in 0..count {
         survey.add(stamp(&mut rng).view()).unwrap();
     }
@@ -52,7 +52,7 @@ fn white_noise_has_its_level_and_no_correlation() {
 #[test]
 fn white_noise_has_the_correlation_of_chance() {
     let mut rng = ChaCha8Rng::seed_from_u64(21);
-    let plan = NoisePlan::new(SIDE, 3).unwrap();
+    let plan = NoisePlan::new(SIDE, 3, None).unwrap();
     let count = 150;
     let found = (0..count).map(|_| {
         let mut survey = plan.survey();
@@ -93,7 +93,7 @@ fn padding_is_no_noise() {
         );
     }
     let mut rng = ChaCha8Rng::seed_from_u64(10);
-    let mut survey = NoisePlan::new(SIDE, 3).unwrap().survey();
+    let mut survey = NoisePlan::new(SIDE, 3, None).unwrap().survey();
     for _ in 0..30 {
         survey.add(padded(&[true; 4], &mut rng).view()).unwrap();
     }
@@ -120,7 +120,7 @@ fn missing_pixels_cost_their_blocks_alone() {
         found.error() < 2.5e-3 && !found.is_correlated(),
         "{found:?}"
     );
-    let mut survey = NoisePlan::new(SIDE, 3).unwrap().survey();
+    let mut survey = NoisePlan::new(SIDE, 3, None).unwrap().survey();
     survey
         .add(Array2::from_elem((SIDE, SIDE), f32::NAN).view())
         .unwrap();
@@ -129,7 +129,7 @@ fn missing_pixels_cost_their_blocks_alone() {
 
 #[test]
 fn blank_stamps_are_unusable_and_do_not_count() {
-    let plan = NoisePlan::new(SIDE, 3).unwrap();
+    let plan = NoisePlan::new(SIDE, 3, None).unwrap();
     let (mut empty, mut with, mut without) = (plan.survey(), plan.survey(), plan.survey());
     let mut rng = ChaCha8Rng::seed_from_u64(12);
     for _ in 0..20 {
@@ -147,7 +147,7 @@ fn blank_stamps_are_unusable_and_do_not_count() {
 
 #[test]
 fn surveys_joined_are_one() {
-    let plan = NoisePlan::new(SIDE, 2).unwrap();
+    let plan = NoisePlan::new(SIDE, 2, None).unwrap();
     let mut rng = ChaCha8Rng::seed_from_u64(10);
     let mut whole = plan.survey();
     let mut parts = [plan.survey(), plan.survey()];
@@ -223,12 +223,12 @@ fn blocks_go_once_around_the_border() {
     assert_eq!(border_blocks(48).len(), 20);
     let odd = border_blocks(51);
     assert_eq!((odd.len(), odd[0], odd[5]), (20, (0, 0), (0, 43)));
-    assert!(NoisePlan::new(23, 2).is_err());
-    let long = NoisePlan::new(48, 5).unwrap_err().to_string();
+    assert!(NoisePlan::new(23, 2, None).is_err());
+    let long = NoisePlan::new(48, 5, None).unwrap_err().to_string();
     assert!(long.contains("lags up to 5 px"), "{long}");
-    let mut survey = NoisePlan::new(48, 3).unwrap().survey();
+    let mut survey = NoisePlan::new(48, 3, None).unwrap().survey();
     for (full, reach) in [(48, 2), (50, 3)] {
-        let other = NoisePlan::new(full, reach).unwrap().survey();
+        let other = NoisePlan::new(full, reach, None).unwrap().survey();
         let refused = survey.join(&other).unwrap_err().to_string();
         assert!(
             refused.contains(&format!(
@@ -237,7 +237,7 @@ fn blocks_go_once_around_the_border() {
             "{refused}"
         );
     }
-    let plan = NoisePlan::new(48, 3).unwrap();
+    let plan = NoisePlan::new(48, 3, None).unwrap();
     assert_eq!(plan.rows(3, 3), [0, 1, 2]);
     // Stamps one by one, as in a batch: a thousand of them, not one.
     assert_eq!(plan.rows(1, 10_000).len(), 1000);

@@ -36,7 +36,6 @@ const DIFFERENCE_VARIANCE: f64 = 70.0;
 /// Coefficients by order along y and order along x.
 type Coefficients = [[f64; MAX_ORDER + 1]; MAX_ORDER + 1];
 
-/// Denoises stars of any size, with buffers for one thread.
 #[derive(Debug, Default)]
 pub(crate) struct StarDenoiser {
     star: Array2<f64>,
@@ -54,7 +53,6 @@ struct Fit {
 }
 
 impl StarDenoiser {
-    /// Stars have these residual profiles, or none.
     pub(crate) fn set_residual_profiles(&mut self, profiles: Option<&Arc<ResidualProfiles>>) {
         self.residual_profiles = profiles.cloned();
     }

@@ -292,7 +292,6 @@ fn add(
     }
 }
 
-/// The wing and its derivative with s.
 #[inline(always)]
 fn tail(s: f32) -> (f32, f32) {
     let base = 1.0 + s / WING_SQUARE;

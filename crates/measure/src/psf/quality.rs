@@ -56,7 +56,6 @@ const BIAS_TIMES_SNR: [f64; 2] = [2.3, 1.2];
 // The same command at S/N 1000: 0.0055 and 0.0023.
 const BIAS_TIMES_SNR_UNCHANGED: [f64; 2] = [5.5, 2.3];
 
-/// The measured quality of one PSF.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct PsfQuality {
     side: usize,

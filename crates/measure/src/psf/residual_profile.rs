@@ -27,7 +27,6 @@ const RELATIVE_RIDGE: f64 = 1e-9;
 const PAIRS: usize = TERMS * (TERMS + 1) / 2;
 const UNKNOWNS: usize = RADII * TERMS;
 
-/// Residual profiles of the stars of an image.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ResidualProfiles {
     /// For each range of S/N its lower end and the residual profile of its stars. The first also serves fainter stars.
@@ -45,7 +44,6 @@ impl ResidualProfiles {
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct ResidualProfile {
     values: [[f64; TERMS]; RADII],
-    /// Number of terms that are not zero.
     terms: usize,
 }
 
@@ -132,7 +130,6 @@ impl ResidualSums {
         sums
     }
 
-    /// Adds the equations of another star.
     pub(super) fn add(&mut self, other: &ResidualSums, weight: f64) {
         for (sums, more) in [
             (

@@ -13,7 +13,7 @@ use shearq_submissions::PsfCut;
 
 use crate::centroid::{MAX_STAR_SHIFT, star_centroid};
 use crate::error::MeasureError;
-use crate::pixel::{Pixel, contiguous};
+use crate::stamp::{Pixel, contiguous};
 
 // One pixel off adds an ellipticity of about 0.01 for a PSF of 15 px. Chosen by hand.
 const MAX_CENTROID_OFFSET: f64 = 1.0;
@@ -128,7 +128,6 @@ pub(crate) fn cut_start(full: usize, size: usize) -> Option<usize> {
     full.checked_sub(size).map(|rest| rest / 2)
 }
 
-/// Offset (x, y) of the star of a PSF from the centre of its stamp.
 pub(super) fn psf_offset(psf: ArrayView2<'_, f64>) -> [f64; 2] {
     brightest_pixel(psf).map_or([0.0; 2], |brightest| star_offset(psf, brightest))
 }
@@ -155,7 +154,6 @@ fn star_offset<P: Pixel>(stamp: ArrayView2<'_, P>, brightest: [usize; 2]) -> [f6
     offset(star_centroid(stamp, there.map(|at| at as f64)))
 }
 
-/// The brightest pixel (x, y) of a stamp of finite pixels.
 fn brightest_pixel<P: Pixel>(stamp: ArrayView2<'_, P>) -> Result<[usize; 2], MeasureError> {
     let mut best = ([0, 0], f64::NEG_INFINITY);
     for (y, row) in stamp.into_outer_iter().enumerate() {
@@ -222,7 +220,6 @@ pub(super) fn fourier_shift(from: usize, to: usize, first: f64) -> Array2<f64> {
     })
 }
 
-/// The sum of all pixels, the same wherever they are in memory.
 pub(super) fn sum<P: Pixel>(pixels: ArrayView2<'_, P>) -> f64 {
     sum_of::<P, false>(pixels)
 }

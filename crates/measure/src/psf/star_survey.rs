@@ -72,7 +72,6 @@ impl StarSurvey {
         }
     }
 
-    /// Whether no more stars are needed, because the first ones have no noise.
     pub fn is_over(&self) -> bool {
         self.surveyed >= MAX_NOISELESS_STARS && self.noisy.is_empty()
     }

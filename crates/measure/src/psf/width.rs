@@ -36,9 +36,6 @@ pub(crate) fn noise_equivalent_area(psf: ArrayView2<'_, f64>) -> f64 {
 /// Steps to wider PSFs are rounded. Those to narrower ones are rounded towards zero, less one, so that lengths first shrink
 /// where the PSF is 1/√2 as wide: sharp lengths bring noise into the response before they take any out of ellipticities.
 pub(crate) fn step(psf: ArrayView2<'_, f64>, reference: f64) -> i32 {
-    if reference == 0.0 {
-        return 0;
-    }
     step_of_area(noise_equivalent_area(psf), reference)
 }
 

@@ -36,16 +36,12 @@ pub(crate) struct SizeMoments {
     target: f64,
     /// 2/τ² + 1/σ_W².
     rest: f64,
-    /// σ_W.
     window: f64,
-    /// Lags in a row.
     width: usize,
 }
 
-/// Size as found on an autocorrelation.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct FoundBreadth {
-    /// T.
     pub(crate) square: f32,
     /// P₀ + s.
     divisor: f32,

@@ -458,7 +458,7 @@ fn summed(n: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
 
 /// The noise of [`summed`], as it is known from many frames of it.
 fn of_summed(rng: &mut ChaCha8Rng) -> StampNoise {
-    let mut survey = crate::noise::NoisePlan::new(48, 1).unwrap().survey();
+    let mut survey = crate::noise::NoisePlan::new(48, 1, None).unwrap().survey();
     for _ in 0..2000 {
         let stamp = Array2::from_shape_vec((48, 48), summed(48, rng)).unwrap();
         survey.add(stamp.view()).unwrap();

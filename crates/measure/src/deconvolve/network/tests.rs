@@ -231,6 +231,7 @@ fn states_are_those_of_the_matrices() {
         (48, 15),
         (48, 25),
     ];
+    let mut stops = Vec::new();
     for (k, (n, p)) in sizes.into_iter().enumerate() {
         let psf = psf(&mut rng, p);
         let u0 = stamp(&mut rng, n);
@@ -250,6 +251,8 @@ fn states_are_those_of_the_matrices() {
                 (Step::Adaptive(3.0), 0.03),
                 (Step::Accelerated(0.8), 0.03),
                 (Step::Accelerated(3.0), 0.03),
+                // No gradient reaches its threshold.
+                (Step::Adaptive(0.5), 1e6),
             ]
             .into_iter()
             .enumerate()
@@ -271,6 +274,7 @@ fn states_are_those_of_the_matrices() {
                 let label = format!("n {n}, p {p}, λ {lambda}, {rule:?}");
                 assert_eq!(descent.iterations, reference.iterations, "{label}");
                 assert_eq!(descent.stop, reference.stop, "{label}");
+                stops.push(descent.stop);
                 // A neuron within rounding of its threshold may be updated or not, and moves by its threshold then, or by
                 // a constant step.
                 let flipped = descent.updated.abs_diff(reference.updated);
@@ -291,27 +295,9 @@ fn states_are_those_of_the_matrices() {
             }
         }
     }
-}
-
-#[test]
-fn every_stop_occurs_and_is_reported() {
-    let mut rng = ChaCha8Rng::seed_from_u64(4);
-    let network = network(15, &psf(&mut rng, 7), 0.0);
-    let u0 = stamp(&mut rng, 15);
-    let descent = |c, unit, most| run(&network, &rule(Step::Adaptive(c), unit, most), &u0).1;
-    let all = descent(0.5, 0.01, 5);
-    assert_eq!((all.stop, all.iterations), (Stop::MaxIterations, 5));
-    assert!(all.energy < all.first_energy);
-    // A unit so large that no gradient reaches its threshold.
-    let stable = descent(0.5, 1e6, 50);
-    assert_eq!(
-        (stable.stop, stable.iterations, stable.updated),
-        (Stop::Stable, 0, 0)
-    );
-    // A step beyond the stability limit of 2 over the largest eigenvalue.
-    let rise = descent(50.0, 0.01, 50);
-    assert_eq!(rise.stop, Stop::EnergyRise);
-    assert!(rise.energy <= rise.first_energy);
+    for stop in [Stop::Stable, Stop::EnergyRise, Stop::MaxIterations] {
+        assert!(stops.contains(&stop), "{stop:?}");
+    }
 }
 
 #[test]
