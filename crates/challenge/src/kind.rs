@@ -8,6 +8,7 @@ use shearq_results::compare::Paired;
 use shearq_results::record::{SetRecord, mean};
 use shearq_results::submit::Contents;
 use shearq_scoring::Definition;
+use shearq_scoring::great3::Observation;
 
 use crate::constant::ConstantShears;
 
@@ -138,7 +139,7 @@ impl RankBy {
         match self {
             RankBy::Q | RankBy::QCorrected => q,
             RankBy::M => 1.0,
-            RankBy::Qc => 1.232 * 2000.0 / (2.0 * 500f64.powi(2) + 4.0).sqrt(),
+            RankBy::Qc => Observation::Ground.q_c([[0.0, -1.0]; 2]),
             RankBy::QCalibrated | RankBy::C | RankBy::Noise => f64::NAN,
         }
     }
@@ -172,6 +173,9 @@ pub fn response(sets: &[SetRecord], constant: Option<&ConstantShears>) -> (f64, 
 pub enum Kind {
     /// The Galaxy Challenge of GREAT10 (Kitching et al. 2012): 24 sets with a variable shear field each.
     Great10,
+    /// Sets with one shear each, ranked by Q_c, as the branches of GREAT3 with constant shear (Mandelbaum et al. 2014). The images
+    /// are those of GREAT10's layout.
+    Great3,
 }
 
 impl Kind {
@@ -179,12 +183,14 @@ impl Kind {
     pub fn name(self) -> &'static str {
         match self {
             Kind::Great10 => "great10",
+            Kind::Great3 => "great3",
         }
     }
 
     pub fn title(self) -> &'static str {
         match self {
             Kind::Great10 => "GREAT10 Galaxy Challenge",
+            Kind::Great3 => "GREAT3-like challenge of constant shear",
         }
     }
 
@@ -194,6 +200,8 @@ impl Kind {
             // Q itself is the challenge's, but entries without images win it while noise dominates, and so do shrunk shapes.
             Kind::Great10 if constant => RankBy::Qc,
             Kind::Great10 => RankBy::QCalibrated,
+            // Not defined for a shear that varies, so that such data are refused.
+            Kind::Great3 => RankBy::Qc,
         }
     }
 
@@ -207,7 +215,7 @@ impl Kind {
                     Contents::CrossSpectra,
                 ]
             }
-            Kind::Great10 => vec![Contents::Catalogues],
+            Kind::Great10 | Kind::Great3 => vec![Contents::Catalogues],
         }
     }
 
@@ -215,20 +223,20 @@ impl Kind {
     pub fn entries_per_team(self) -> Option<u32> {
         match self {
             // Published values determine the truth entry by entry (docs/run-a-challenge.md).
-            Kind::Great10 => Some(10),
+            Kind::Great10 | Kind::Great3 => Some(10),
         }
     }
 
     /// Names of images and PSFs.
     pub fn layout(self) -> Layout {
         match self {
-            Kind::Great10 => Layout::default(),
+            Kind::Great10 | Kind::Great3 => Layout::default(),
         }
     }
 
     pub fn conventions(self) -> BTreeMap<String, String> {
         let conventions = match self {
-            Kind::Great10 => [
+            Kind::Great10 | Kind::Great3 => [
                 (
                     "positions",
                     "FITS pixels of the stamp centre; the first pixel of an image has its centre at 1",
@@ -252,6 +260,10 @@ impl Kind {
             Kind::Great10 => [
                 "An entry covers all images of all sets.",
                 "All images of a set have one shear field, so methods may average over them.",
+            ],
+            Kind::Great3 => [
+                "An entry covers all images of all sets.",
+                "All galaxies of a set have one shear; no two sets have the same.",
             ],
         }
     }
