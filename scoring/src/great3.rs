@@ -153,6 +153,7 @@ pub fn constant_score(
     if !shears.all(|g| g.e1.is_finite() && g.e2.is_finite()) {
         return Err(ScoringError::NotFinite("a shear"));
     }
+    // m and c along the PSF show its leakage in c₊ alone; in pixel axes it would average out.
     let whole = biases(fields)?;
     let quality = |of: &[Line; 2]| observation.q_c(of.map(|line| line.values));
     let groups = group_sizes(fields.len()).len();

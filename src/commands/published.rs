@@ -27,6 +27,7 @@ pub(super) fn score(
         );
     };
     let score = branch.score(truth, submission, &Pool::new(threads)?)?;
+    // One object with the challenge's names, not the rows of a table.
     if format == TableFormat::Json {
         print(&(serde_json::to_string_pretty(&score.json())? + "\n"))?;
         return Ok(None);
@@ -61,6 +62,7 @@ pub(super) fn pack(branch: &dyn Branch, packing: &Packing<'_>, out: &Path) -> an
     let Some(packed) = packed else {
         anyhow::bail!("{} has no pre-submission of catalogues", branch.title());
     };
+    // Written only after all checks, so that a faulty catalogue leaves no file.
     let packed = packed?;
     packed.write(out)?;
     tell(format_args!("{}: {}", out.display(), packed.note));

@@ -95,6 +95,8 @@ pub trait Branch {
     fn pack(&self, packing: &Packing<'_>, pool: &Pool) -> Option<Result<Packed, FileError>>;
     /// Published entries.
     fn leaderboard(&self) -> Vec<Entry>;
+    /// Where the published entries are from.
+    fn leaderboard_source(&self) -> Option<&'static str>;
 }
 
 /// Catalogues of a branch, and how they are summarised.
@@ -160,6 +162,7 @@ impl Score {
         &self.figures[0]
     }
 
+    // The names of the challenge's own functions, so that programs for their output read it.
     pub fn json(&self) -> Value {
         let mut found = Map::new();
         if let Some(branch) = &self.branch {
@@ -217,6 +220,7 @@ pub fn ranking(branch: &dyn Branch, own: &[(String, Score)]) -> Table {
             (entry, Some(score.q().jackknife))
         })
         .collect();
+    // Published values have no error: the challenge gave none.
     rows.extend(published.into_iter().map(|entry| (entry, None)));
     rows.sort_by(|(a, _), (b, _)| b.q.total_cmp(&a.q));
     let rows: Vec<(usize, Entry, Option<f64>)> = rows
@@ -240,7 +244,9 @@ pub fn ranking(branch: &dyn Branch, own: &[(String, Score)]) -> Table {
             Cell::number(scale * own.1.biases[k], 2)
         });
     }
-    table.notes.push(great3::LEADERBOARD_SOURCE.into());
+    table
+        .notes
+        .extend(branch.leaderboard_source().map(Into::into));
     table
 }
 
@@ -258,6 +264,7 @@ impl Columns<'_> {
         let mut place = Place::of(path);
         let found = table::columns(&place)?;
         let pick = |names: &[String]| -> Option<Vec<Option<String>>> {
+            // Programs write ID, id and Id.
             let is = |name: &String, aliases: &[&str]| {
                 aliases.iter().any(|own| name.eq_ignore_ascii_case(own))
             };
@@ -294,6 +301,7 @@ impl Columns<'_> {
                 FileError::new(path, message)
             })?
         } else {
+            // A FITS file may have several tables: the first with all columns is meant.
             let picked = certain.iter().find_map(|named| {
                 place.table = named.table.as_ref().map(|(number, _)| number.to_string());
                 pick(&named.names)
@@ -335,7 +343,7 @@ impl Columns<'_> {
     }
 }
 
-// `of` a value that must be a whole number below `end`.
+// Identities are read as numbers; a fraction or a sign means another column, which `as usize` would hide.
 fn whole(value: f64, end: usize) -> Option<usize> {
     let is_whole = value >= 0.0 && value < end as f64 && value.fract() == 0.0;
     is_whole.then_some(value as usize)

@@ -139,4 +139,8 @@ impl Branch for Great08 {
     fn leaderboard(&self) -> Vec<Entry> {
         Vec::new()
     }
+
+    fn leaderboard_source(&self) -> Option<&'static str> {
+        None
+    }
 }

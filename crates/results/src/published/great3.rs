@@ -707,13 +707,16 @@ impl Branch for Great3 {
         });
         entries.collect()
     }
+
+    fn leaderboard_source(&self) -> Option<&'static str> {
+        Some(
+            "Source: public leaderboard of GREAT3 (2014) in github.com/barnabytprowe/great3-public; 120 of its entries, and the best of each branch. Teams sent many entries, and the best of many is partly luck.",
+        )
+    }
 }
 
 // board,team,method,Q_c,m_plus,m_cross,c_plus,c_cross. Rows without a team have the highest Q of a branch, whose biases are not given.
 const LEADERBOARD: &str = include_str!("great3-leaderboard.csv");
-
-/// Of the values of [`Branch::leaderboard`].
-pub const LEADERBOARD_SOURCE: &str = "Source: public leaderboard of GREAT3 (2014) in github.com/barnabytprowe/great3-public; 120 of its entries, and the best of each branch. Teams sent many entries, and the best of many is partly luck.";
 
 // A row of a catalogue.
 struct Galaxy {
