@@ -77,7 +77,7 @@ pub use measurer::{Epoch, ImageNoise, ImageWorker, Measurer, PsfWorker, Steps, W
 pub use method::AdaptedSettings;
 pub use ndarray;
 pub use noise::{StampNoise, Survey};
-pub use psf::{Psfs, Star, average_stars};
+pub use psf::{PsfShape, Psfs, Star, average_stars};
 pub use selection::{Cut, Quantity, Selected, Selection};
 pub use session::{
     ArraySource, Batch, KnownNoise, Lazy, LazyStamps, MeasuredImage, MeasuredRow, OneThread,

@@ -4,6 +4,7 @@ use std::fmt;
 
 use thiserror::Error;
 
+use crate::psf::PsfShape;
 use crate::sheared::ShearedCatalogues;
 
 /// Response ∂e_i/∂γ_j of an ellipticity to shear, as `[i][j]`: R11, R12 and R21, R22.
@@ -63,6 +64,9 @@ pub struct Measurement {
     pub radius: f64,
     /// Qxx + Qyy of the clipped autocorrelation in px². For the linear method, the size of [`Observables`] in px.
     pub size: f64,
+    /// The PSF in the frame of the ellipticity; of epochs, the mean of their moments with inverse-variance weights. NaN if the PSF
+    /// cannot be used. Sigma is in pixels, on the sky in sides of a square of a pixel's area.
+    pub psf: PsfShape,
 }
 
 impl Measurement {
@@ -86,6 +90,7 @@ impl Measurement {
             flux: f64::NAN,
             radius: f64::NAN,
             size: f64::NAN,
+            psf: PsfShape::UNKNOWN,
         }
     }
 }

@@ -16,7 +16,7 @@ use crate::error::{EpochError, MeasureError};
 use crate::measurement::{Flag, Measurement};
 use crate::method::{AdaptedSettings, CutEpoch, CutWorker, Images, MethodPlan};
 use crate::noise::{NoisePlan, StampNoise, Survey};
-use crate::psf::{Psfs, ResidualProfiles, Star, StarSurvey, cut_start};
+use crate::psf::{PsfShape, Psfs, ResidualProfiles, Star, StarSurvey, cut_start};
 use crate::stamp::{
     FullStamp, MissingPixels, PEAKS, Pixel, SkySubtraction, all_finite, highest, is_level,
     lose_padding,
@@ -136,6 +136,8 @@ impl Measurer {
             border: Vec::with_capacity(plan.full * plan.full),
             missing: MissingPixels::new(n),
             to_sky: None,
+            jacobian: None,
+            psf: PsfShape::UNKNOWN,
             epochs: Vec::new(),
             used: Vec::new(),
         }
@@ -223,6 +225,9 @@ pub struct Worker {
     missing: MissingPixels,
     /// What turns ellipticities to the frame of the sky, if they are measured there.
     to_sky: Option<Spin2>,
+    jacobian: Option<Jacobian>,
+    /// The present PSF on its pixels.
+    psf: PsfShape,
     /// Cut stamps of the usable epochs of a galaxy, and which epochs they are.
     epochs: Vec<f32>,
     used: Vec<usize>,
@@ -289,7 +294,7 @@ impl Worker {
         let extent = survey.and_then(|survey| survey.mean_square_radius);
         let of_modes = correlated.unwrap_or(&white);
         self.method.set_image(of_modes, extent, stars);
-        self.to_sky = None;
+        (self.to_sky, self.jacobian) = (None, None);
         self.method.set_pixel_shape(PixelShape::SQUARE);
         self.method.set_gain(None);
         ImageWorker {
@@ -300,6 +305,20 @@ impl Worker {
 
     /// Measures a galaxy in noise of `level`, without calibration. Without a usable PSF it is flagged.
     fn measure_stamp<T: Pixel>(
+        &mut self,
+        stamp: ArrayView2<'_, T>,
+        level: f64,
+        usable_psf: bool,
+    ) -> Result<Measurement, MeasureError> {
+        let mut found = self.measure_in_frame(stamp, level, usable_psf)?;
+        if usable_psf {
+            let psf = self.psf;
+            found.psf = self.jacobian.map_or(psf, |jacobian| psf.on_sky(&jacobian));
+        }
+        Ok(found)
+    }
+
+    fn measure_in_frame<T: Pixel>(
         &mut self,
         stamp: ArrayView2<'_, T>,
         level: f64,
@@ -428,7 +447,34 @@ impl Worker {
         if let Some((orientation, _)) = &frame {
             found.turn(&orientation.spin2());
         }
-        Ok(found.measurement(self.measurer.configuration().ellipticity(), noise))
+        let mut measured = found.measurement(self.measurer.configuration().ellipticity(), noise);
+        let scale = epochs[first]
+            .jacobian
+            .map_or(1.0, |jacobian| jacobian.pixel_scale());
+        let psfs = self.used.iter().map(|&k| {
+            let (epoch, psf) = (&epochs[k], PsfShape::from_psf(epochs[k].psf));
+            let (psf, area) = match &epoch.jacobian {
+                Some(jacobian) => (
+                    psf.on_sky(jacobian),
+                    (jacobian.pixel_scale() / scale).powi(2),
+                ),
+                None => (psf, 1.0),
+            };
+            (psf, area, area / (epoch.noise * epoch.noise))
+        });
+        measured.psf = PsfShape::mean(psfs);
+        Ok(measured)
+    }
+
+    /// Copies a full stamp; whether all of its pixels are finite.
+    fn read<T: Pixel>(&mut self, stamp: ArrayView2<'_, T>) -> Result<bool, MeasureError> {
+        let full = self.measurer.full();
+        if stamp.dim() != (full, full) {
+            let expected = format!("{full} × {full}");
+            return Err(MeasureError::square("a stamp", stamp.dim(), expected));
+        }
+        pixel::copy(stamp, &mut self.full);
+        Ok(all_finite(&self.full))
     }
 }
 
@@ -440,6 +486,7 @@ impl ImageWorker<'_> {
     /// If the PSF has another size, or a pixel that is not finite.
     pub fn psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<PsfWorker<'_>, MeasureError> {
         self.worker.method.set_psf(psf)?;
+        self.worker.psf = PsfShape::from_psf(psf);
         Ok(PsfWorker {
             worker: self.worker,
             level: self.level,
@@ -467,6 +514,7 @@ impl ImageWorker<'_> {
         };
         self.check_shape(shape)?;
         self.worker.to_sky = to_sky;
+        self.worker.jacobian = jacobian.copied();
         self.worker.method.set_pixel_shape(shape);
         Ok(())
     }
@@ -494,8 +542,8 @@ impl ImageWorker<'_> {
     /// An epoch without usable pixels has no weight, and without usable epochs the galaxy is flagged. Centroid and neighbours
     /// are found on the weighted mean of the stamps. Stamps should have one flux: of bands, the shape is that of
     /// the image summed with weights. One epoch with the galaxy in the centre of its stamp is measured as by
-    /// [`PsfWorker::measure`], with the same bits. Size of the window and correlation of noise do not follow a survey, and
-    /// the gain is not used. The PSF of a [`PsfWorker`] has to be set again after it.
+    /// [`PsfWorker::measure`], with the same bits and what this worker knows of the image. Noise of several is taken as
+    /// white. The PSF of a [`PsfWorker`] has to be set again after it.
     ///
     /// # Errors
     /// An [`EpochError`] if there are no epochs, a noise level is not above 0, an offset is beyond a quarter of the stamp, some
@@ -535,6 +583,7 @@ impl ImageWorker<'_> {
         if epochs.len() == 1 && one.offset == [0.0; 2] {
             self.set_jacobian(one.jacobian.as_ref())?;
             self.worker.method.set_psf(one.psf)?;
+            self.worker.psf = PsfShape::from_psf(one.psf);
             return self.worker.measure_stamp(one.stamp, one.noise, true);
         }
         self.worker.measure_epochs(epochs)
@@ -575,6 +624,9 @@ impl ImageWorker<'_> {
             Some(_) => None,
             None => Some(psfs.at(0, cut, full)?.psf),
         };
+        if let Some(psf) = &shared {
+            self.worker.psf = PsfShape::from_psf(psf.view());
+        }
         let mut last = None;
         let stamps = stamps.outer_iter().enumerate();
         let measured = stamps.map(|(k, stamp)| {
@@ -595,9 +647,12 @@ impl ImageWorker<'_> {
                     true
                 }
                 None => {
-                    let psf = psfs.at(k, cut, full);
-                    psf.and_then(|psf| self.worker.method.set_psf(psf.psf.view()))
-                        .is_ok()
+                    let psf = psfs.at(k, cut, full).and_then(|Star { psf, .. }| {
+                        self.worker.method.set_psf(psf.view())?;
+                        self.worker.psf = PsfShape::from_psf(psf.view());
+                        Ok(())
+                    });
+                    psf.is_ok()
                 }
             };
             let level = levels.map_or(self.level, |levels| levels[k]);

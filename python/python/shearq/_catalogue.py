@@ -121,6 +121,9 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
     R11, R22, R12, R21 : float64
         Response of e1 and e2 to shear: R12 is the response of e1 to the second component. Only means over many galaxies are
         unbiased. NaN for networks, which have none.
+    psf_e1, psf_e2, psf_sigma : float64
+        The PSF in the frame of e1 and e2, by adaptive moments as of GalSim's ``FindAdaptiveMom``: ellipticity
+        (1 − q)/(1 + q), and σ in pixels. :func:`bias` and :func:`null_tests` measure leakage by them.
     snr, flux_error : float64
         Flux over its error, and the error in image units. For linear configurations.
     neighbour : float64

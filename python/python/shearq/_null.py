@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 _DEGREES = {"ra_units": "deg", "dec_units": "deg"}
+_PSF = ("psf_e1", "psf_e2")
 
 
 def null_tests(
-    shears: Any, *, points: Any = None, stars: Any = None, against: tuple[str, ...] = (), bins: int = 5, **separations: Any
+    shears: Any, *, points: Any = None, stars: Any = None, against: tuple[str, ...] | None = None, bins: int = 5, **separations: Any
 ) -> dict[str, dict[str, Any]]:
     """Tests of additive errors of shears in the frame of the sky. Needs TreeCorr.
 
@@ -21,15 +22,16 @@ def null_tests(
     Parameters
     ----------
     shears : table or mapping of columns
-        ``ra``, ``dec`` in degrees, ``g1``, ``g2`` and perhaps ``w``, of galaxies with a shear, as ``shearq shear --treecorr``
-        writes them.
+        ``ra``, ``dec`` in degrees, ``g1``, ``g2`` and perhaps ``w``, ``psf_e1`` and ``psf_e2``, as ``shearq shear`` writes them.
+        Galaxies without a shear are left out.
     points : table or mapping of columns, optional
         ``ra``, ``dec`` of points without mass, such as stars or random places.
     stars : table or mapping of columns, optional
         ``ra``, ``dec``, ellipticities ``e1``, ``e2`` and size ``T`` of stars, and those of the PSF model at their places,
         ``model_e1``, ``model_e2`` and ``model_T``, in the frame of the sky. Stars that the model was not fitted to test most.
     against : tuple of str, optional
-        Columns of shears against which the mean shear is tested, such as positions on the exposure.
+        Columns of shears against which the mean shear is tested, such as positions on the exposure. By default the shape
+        and size of the PSF, ``psf_e1``, ``psf_e2`` and ``psf_sigma``, if they are there.
     bins : int, optional
         Bins of equally many galaxies of each of these.
     **separations
@@ -44,6 +46,8 @@ def null_tests(
         ``'points'``: ``r``, ``gt``, ``gx``, ``error``.
         ``'rho'``: ``r`` and ``rho1`` to ``rho5`` (Rowe 2010, MNRAS 404, 350; Jarvis et al. 2016, MNRAS 460, 2245), each
         with ``rho1_error`` and so on.
+        ``'leakage'``, with ``psf_e1`` and ``psf_e2``: ``alpha`` and its ``error`` for each component of g = α e_PSF + c, by
+        least squares.
         One test per column of ``against``: the mean ``at`` of the column, ``g1``, ``g2``, ``g1_error`` and ``g2_error``.
 
     Raises
@@ -56,8 +60,13 @@ def null_tests(
     except ImportError as error:
         raise ImportError("null_tests needs TreeCorr. Try: pip install treecorr") from error
     separations = {"min_sep": 1.0, "max_sep": 100.0, "nbins": 10, "sep_units": "arcmin", **separations}
+    names = _names(shears)
+    if against is None:
+        against = tuple(name for name in (*_PSF, "psf_sigma") if name in names)
     galaxies = _columns("shears", shears, ("ra", "dec", "g1", "g2", *against))
-    weight = _columns("shears", shears, ("w",))["w"] if "w" in _names(shears) else np.ones(len(galaxies["ra"]))
+    weight = _columns("shears", shears, ("w",))["w"] if "w" in names else np.ones(len(galaxies["ra"]))
+    good = (weight > 0) & np.isfinite(galaxies["g1"]) & np.isfinite(galaxies["g2"])
+    galaxies, weight = {name: column[good] for name, column in galaxies.items()}, weight[good]
 
     def catalogue(table: Mapping[str, Any], **values: Any) -> Any:
         return treecorr.Catalog(ra=table["ra"], dec=table["dec"], **_DEGREES, **values)
@@ -76,6 +85,8 @@ def null_tests(
         found["points"] = {"r": about.meanr, "gt": about.xi, "gx": about.xi_im, "error": np.sqrt(about.varxi)}
     if stars is not None:
         found["rho"] = _rho(treecorr, catalogue, stars, separations)
+    if all(name in against for name in _PSF):
+        found["leakage"] = _leakage(galaxies, weight)
     for name in against:
         found[name] = _means(galaxies, weight, name, bins)
     return found
@@ -95,6 +106,19 @@ def _rho(treecorr: Any, catalogue: Any, stars: Any, separations: dict[str, Any])
         pairs.process(fields[first], None if first == second else fields[second])
         found |= {"r": pairs.meanr, f"rho{number}": pairs.xip, f"rho{number}_error": np.sqrt(pairs.varxip)}
     return found
+
+
+def _leakage(galaxies: Mapping[str, Any], weight: Any) -> dict[str, Any]:
+    found: dict[str, list[float]] = {"alpha": [], "error": []}
+    for component, name in zip(("g1", "g2"), _PSF):
+        g, e = (values - np.average(values, weights=weight) for values in (galaxies[component], galaxies[name]))
+        power = np.sum(weight * e * e)
+        # With one PSF for all galaxies, α cannot be told from c.
+        alpha = np.sum(weight * e * g) / power if power > 0 else np.nan
+        found["alpha"].append(alpha)
+        # From the scatter of the residuals, so that galaxies may have any weights.
+        found["error"].append(np.sqrt(np.sum((weight * e * (g - alpha * e)) ** 2)) / power if power > 0 else np.nan)
+    return {key: np.array(values) for key, values in found.items()}
 
 
 def _means(galaxies: Mapping[str, Any], weight: Any, name: str, bins: int) -> dict[str, Any]:

@@ -22,10 +22,10 @@ OBSERVED += tuple(f"n{k}_{pair}" for k in "12" for pair in ("er", "fr", "sr", "r
 OBSERVED += tuple(f"t_{pair}" for pair in ("e1r", "e2r", "fr", "sr", "rr"))
 # The star that all galaxies of an image share, and what its noise does to m and c.
 STAR: tuple[str, ...] = ("psf_id", "psf_m", "psf_c")
-REAL += ("snr", "neighbour", *OBSERVED, *STAR)
+REAL += ("psf_e1", "psf_e2", "psf_sigma", "snr", "neighbour", *OBSERVED, *STAR)
 # What a selection reads.
 SELECTED = ("e1", "e2", "flags", "R11", "R22", "R12", "R21", "flux", "size", *OBSERVED)
-UNITS = {"x": "pix", "y": "pix", "radius": "pix"}
+UNITS = {"x": "pix", "y": "pix", "radius": "pix", "psf_sigma": "pix"}
 
 # Keys of files, and the names of ``attrs``.
 KEYS = {"submiss": "submission", "elltype": "ellipticity", "settings": "settings", "creator": "version"}

@@ -30,7 +30,7 @@ pub enum Value {
 }
 
 /// The columns of catalogues after the position, in order, for the command line and Python. [`more_columns`] follow.
-pub const COLUMNS: [(&str, Value); 16] = [
+pub const COLUMNS: [(&str, Value); 19] = [
     ("e1", Value::Real(|g| g.e1)),
     ("e2", Value::Real(|g| g.e2)),
     ("flags", Value::Whole(|g| g.flags.bits() as i32)),
@@ -63,6 +63,9 @@ pub const COLUMNS: [(&str, Value); 16] = [
     ("R22", Value::Real(|g| response(g, 1, 1))),
     ("R12", Value::Real(|g| response(g, 0, 1))),
     ("R21", Value::Real(|g| response(g, 1, 0))),
+    ("psf_e1", Value::Real(|g| g.psf.ellipticity()[0])),
+    ("psf_e2", Value::Real(|g| g.psf.ellipticity()[1])),
+    ("psf_sigma", Value::Real(|g| g.psf.sigma())),
 ];
 
 /// Columns of catalogues after [`COLUMNS`]. Linear configurations have the S/N and the other [`Observables`]; then sheared
