@@ -155,6 +155,8 @@ fn main() -> Result<(), Box<dyn Error>> {
                                 noise: level * depth,
                                 jacobian: Some(Jacobian::new(of.frame)?),
                                 offset: of.offset,
+                                survey: None,
+                                gain: None,
                             });
                         }
                         let mut image = worker.image(ImageNoise::Unknown);

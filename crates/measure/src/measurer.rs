@@ -246,6 +246,10 @@ pub struct Epoch<'a, T> {
     pub jacobian: Option<Jacobian>,
     /// Offset (x, y) of the galaxy from the centre of the stamp in pixels.
     pub offset: [f64; 2],
+    /// The survey of the epoch's image: its sky is subtracted, and the window follows its galaxies.
+    pub survey: Option<&'a Survey>,
+    /// Electrons per unit of the stamp, with which the galaxy's Poisson noise is part of the noise.
+    pub gain: Option<f64>,
 }
 
 /// A worker for the galaxies of one image.
@@ -407,6 +411,7 @@ impl Worker {
         self.epochs.clear();
         self.used.clear();
         for (k, epoch) in epochs.iter().enumerate() {
+            self.full.subtraction = self.measurer.subtraction(epoch.survey);
             match self.cut(epoch.stamp, epoch.noise, true)? {
                 Ok(_) => {
                     self.epochs.extend_from_slice(&self.cut);
@@ -441,6 +446,8 @@ impl Worker {
                 noise: epoch.noise,
                 pixels: EpochPixels::new(matrix),
                 offset: epoch.offset,
+                galaxy_variance: epoch.survey.and_then(|survey| survey.mean_square_radius),
+                gain: epoch.gain,
             }
         };
         let (mut found, noise) = self.method.measure_epochs(used.len(), &epoch)?;

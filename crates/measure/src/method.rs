@@ -106,6 +106,10 @@ pub(crate) struct CutEpoch<'a> {
     pub(crate) pixels: EpochPixels,
     /// Of the galaxy from the middle of the stamp, in pixels.
     pub(crate) offset: [f64; 2],
+    /// Mean square per axis of the image's galaxies with the PSF in px².
+    pub(crate) galaxy_variance: Option<f64>,
+    /// Electrons per unit of the stamp.
+    pub(crate) gain: Option<f64>,
 }
 
 /// Lengths of the linear method after their adaptation to the PSF and to the galaxies of a survey.

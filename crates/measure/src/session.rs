@@ -10,17 +10,17 @@ use std::fmt;
 use std::ops::{ControlFlow, Deref, Range};
 use std::sync::{Arc, LazyLock};
 
-use ndarray::{ArrayView3, Axis, Ix3, Slice};
+use ndarray::{ArrayView3, Axis, CowArray, Ix3, Slice};
 use shearq_quantities::statistics::upper_median;
 use shearq_quantities::{Frame, Jacobian, columns_of};
 use shearq_submissions::limits::MIN_PSF;
 use shearq_submissions::{Calibration, Configuration, NoiseSource};
 
 use crate::calibration::mean_response;
-use crate::error::{MeasureError, length};
+use crate::error::{EpochError, MeasureError, length};
 use crate::examine::{EXAMINED_PSFS, Estimate, Examination, enough, examined_rows};
-use crate::measurement::Measurement;
-use crate::measurer::{ImageNoise, ImageWorker, Measurer, Steps, Worker};
+use crate::measurement::{Flag, Measurement};
+use crate::measurer::{Epoch, ImageNoise, ImageWorker, Measurer, Steps, Worker};
 use crate::noise::{NoisePlan, NoiseSurvey, StampNoise, Survey};
 use crate::psf::{Psfs, ResidualProfiles, Star};
 use crate::stamp::{Pixel, Pixels, is_level};
@@ -118,6 +118,15 @@ pub trait StampSource<'a> {
         Ok(None)
     }
 
+    /// Offsets (x, y) of a row's galaxies from the centres of their stamps in pixels, which several epochs of a galaxy need; zero if
+    /// `None`. A single stamp has its galaxy where it is found.
+    ///
+    /// # Errors
+    /// If they cannot be read.
+    fn offsets(&mut self, _row: usize) -> Result<Option<Vec<[f64; 2]>>, Self::Error> {
+        Ok(None)
+    }
+
     /// Electrons per unit of the stamps. With them, the Poisson noise of the galaxies is part of their noise; without, the
     /// noise is that of the sky. Networks ignore it.
     fn gain(&self) -> Option<f64> {
@@ -189,6 +198,7 @@ pub struct ArraySource<'a, E = MeasureError> {
     moved: Option<[f64; 2]>,
     /// One for all stamps or one per stamp.
     jacobians: Option<Cow<'a, [Jacobian]>>,
+    offsets: Option<Cow<'a, [[f64; 2]]>>,
 }
 
 impl<E> fmt::Debug for ArraySource<'_, E> {
@@ -252,7 +262,22 @@ impl<'a, E> ArraySource<'a, E> {
             psfs: Box::new(psfs),
             moved,
             jacobians: None,
+            offsets: None,
         }
+    }
+
+    /// The same stamps with their galaxies at these offsets (x, y) from their centres in pixels, one per stamp.
+    ///
+    /// # Errors
+    /// If there are another number of them.
+    pub fn with_offsets(
+        mut self,
+        offsets: impl Into<Cow<'a, [[f64; 2]]>>,
+    ) -> Result<Self, MeasureError> {
+        let offsets = offsets.into();
+        length("offsets", offsets.len(), self.count)?;
+        self.offsets = Some(offsets);
+        Ok(self)
     }
 
     /// The same stamps in the frame of the sky, with one Jacobian for all or one per stamp.
@@ -303,6 +328,11 @@ impl<'a, E: From<MeasureError> + Send> StampSource<'a> for ArraySource<'a, E> {
             each => each[range].to_vec(),
         }))
     }
+
+    fn offsets(&mut self, row: usize) -> Result<Option<Vec<[f64; 2]>>, E> {
+        let range = self.rows().stamps(row);
+        Ok(self.offsets.as_deref().map(|each| each[range].to_vec()))
+    }
 }
 
 /// One image between its survey and its last row. Threads share it.
@@ -319,6 +349,8 @@ pub struct Session<'n> {
     /// Median of the positive levels of the examined stamps, if each stamp has its own.
     typical_level: Option<f64>,
     warnings: Vec<Warning>,
+    /// Of the images that contain further epochs of the galaxies.
+    epochs: Vec<Arc<Session<'n>>>,
 }
 
 /// A row of stamps that was read, for the thread that measures it.
@@ -329,6 +361,8 @@ pub struct RowJob<'n> {
     stamps: LazyStamps<'n>,
     psfs: Lazy<'n, Psfs<'n>>,
     jacobians: Option<Vec<Jacobian>>,
+    offsets: Option<Vec<[f64; 2]>>,
+    epochs: Vec<RowJob<'n>>,
 }
 
 /// The galaxies of a row.
@@ -337,7 +371,8 @@ pub struct MeasuredRow {
     row: usize,
     /// One per stamp.
     pub galaxies: Vec<Measurement>,
-    examined: Option<Examined>,
+    /// Of each image with an epoch of the galaxies.
+    examined: Vec<Option<Examined>>,
 }
 
 /// Examinations of stamps: as they are and, if each has a noise level of its own, in units of these levels.
@@ -353,7 +388,7 @@ pub struct MeasuredImage<'n> {
     session: Arc<Session<'n>>,
     galaxies: Vec<Measurement>,
     next: usize,
-    examined: Option<Examined>,
+    examined: Vec<Option<Examined>>,
 }
 
 /// The galaxies of an image.
@@ -435,6 +470,7 @@ impl<'n> Session<'n> {
             examined,
             typical_level: None,
             warnings,
+            epochs: Vec::new(),
         };
         if let Some(levels) = session.noise.levels() {
             let examined = session.examined.iter().flat_map(|&row| rows.stamps(row));
@@ -456,6 +492,31 @@ impl<'n> Session<'n> {
                 });
         }
         Ok(session)
+    }
+
+    /// The image with those of further epochs: galaxy k is on stamp k of each. Several [`RowJob`]s make a row then
+    /// ([`RowJob::with_epochs`]).
+    ///
+    /// # Errors
+    /// If the images have other numbers of stamps, or other frames.
+    pub fn with_epochs(mut self, epochs: Vec<Arc<Session<'n>>>) -> Result<Self, MeasureError> {
+        for epoch in &epochs {
+            length("stamps of an epoch", epoch.rows.count, self.rows.count)?;
+            if epoch.frame != self.frame {
+                return Err(EpochError::Frames.into());
+            }
+        }
+        self.epochs = epochs;
+        Ok(self)
+    }
+
+    /// The level of noise that stamps without their own have; `None` if it is unknown.
+    fn level(&self) -> Option<f64> {
+        match (&self.survey, &self.noise) {
+            (Some(survey), _) => Some(survey.noise.sigma()),
+            (None, KnownNoise::Given(level) | KnownNoise::Stated(level)) => Some(*level),
+            (None, _) => None,
+        }
     }
 
     /// The plan by which the noise is measured on the stamps, if it is.
@@ -543,6 +604,8 @@ impl<'n> Session<'n> {
             stamps: source.stamps(row)?,
             psfs: source.psfs(row)?,
             jacobians: source.jacobians(row)?,
+            offsets: source.offsets(row)?,
+            epochs: Vec::new(),
         })
     }
 
@@ -621,14 +684,10 @@ impl<'n> Session<'n> {
         let levels = levels.map(|levels| &levels[self.rows.stamps(row)]);
         let mut image = self.image(worker);
         let galaxies = image.measure_stamps(stamps, psfs, levels, jacobians)?;
-        let examined = match self.examined.contains(&row) {
-            true => Some(self.examine(row, stamps, psfs)?),
-            false => None,
-        };
         Ok(MeasuredRow {
             row,
             galaxies,
-            examined,
+            examined: vec![self.examine(row, stamps, psfs)?],
         })
     }
 
@@ -637,7 +696,10 @@ impl<'n> Session<'n> {
         row: usize,
         stamps: ArrayView3<'_, T>,
         psfs: &Psfs<'_>,
-    ) -> Result<Examined, MeasureError> {
+    ) -> Result<Option<Examined>, MeasureError> {
+        if !self.examined.contains(&row) {
+            return Ok(None);
+        }
         let mut examination = self.examination();
         for stamp in stamps.outer_iter() {
             examination.add(stamp)?;
@@ -662,10 +724,10 @@ impl<'n> Session<'n> {
             }
             _ => None,
         };
-        Ok(Examined {
+        Ok(Some(Examined {
             stamps: examination,
             scaled,
-        })
+        }))
     }
 
     fn examination(&self) -> Examination {
@@ -687,20 +749,110 @@ impl<'n> Session<'n> {
             session: self,
             galaxies,
             next: 0,
-            examined: None,
+            examined: Vec::new(),
         })
     }
 }
 
 impl<'n> RowJob<'n> {
+    /// The row with the rows of the images of further epochs, in the order of [`Session::with_epochs`].
+    #[must_use]
+    pub fn with_epochs(mut self, epochs: Vec<RowJob<'n>>) -> Self {
+        self.epochs = epochs;
+        self
+    }
+
     /// The galaxies of the row before calibration.
     ///
     /// # Errors
     /// As [`Session::measure_row`].
     pub fn measure_row(&self, worker: &mut Worker) -> Result<MeasuredRow, MeasureError> {
+        if !self.epochs.is_empty() {
+            return self.measure_epochs(worker);
+        }
         let jacobians = self.jacobians.as_deref();
         self.session
             .measure_row(worker, self.row, &self.stamps, &self.psfs, jacobians)
+    }
+
+    fn measure_epochs(&self, worker: &mut Worker) -> Result<MeasuredRow, MeasureError> {
+        let measurer = &self.session.measurer;
+        let jobs: Vec<&RowJob<'n>> = std::iter::once(self).chain(&self.epochs).collect();
+        let count = self.session.rows.stamps(self.row).len();
+        let mut all = Vec::with_capacity(jobs.len());
+        for job in &jobs {
+            // Pixels in one precision serve epochs of both, and single precision keeps its bits.
+            let stamps = match &*job.stamps {
+                Pixels::Single(stamps) => CowArray::from(stamps.mapv(f64::from)),
+                Pixels::Double(stamps) => CowArray::from(stamps.view()),
+            };
+            length("a row", stamps.len_of(Axis(0)), count)?;
+            all.push(stamps);
+        }
+        let cut = measurer.configuration().psf_cut();
+        let shared = jobs.iter().map(|job| match job.psfs.count() {
+            Some(_) => Ok(None),
+            None => job
+                .psfs
+                .at(0, cut, measurer.full())
+                .map(|star| Some(star.psf)),
+        });
+        let shared: Vec<_> = shared.collect::<Result<_, _>>()?;
+        let mut galaxies = Vec::with_capacity(count);
+        for k in 0..count {
+            let own = jobs.iter().zip(&shared).map(|(job, shared)| match shared {
+                Some(_) => None,
+                None => job
+                    .psfs
+                    .at(k, cut, measurer.full())
+                    .ok()
+                    .map(|star| star.psf),
+            });
+            let own: Vec<_> = own.collect();
+            let mut epochs = Vec::with_capacity(jobs.len());
+            let mut usable_psf = false;
+            for (at, job) in jobs.iter().enumerate() {
+                // An epoch without PSF or noise has no weight, as one without pixels.
+                let Some(psf) = shared[at].as_ref().or(own[at].as_ref()) else {
+                    continue;
+                };
+                usable_psf = true;
+                let session = &job.session;
+                let stamp = session.rows.stamps(job.row).start + k;
+                let levels = session.noise.levels();
+                let level = levels.map_or_else(|| session.level(), |levels| Some(levels[stamp]));
+                let Some(noise) = level.filter(|level| *level > 0.0) else {
+                    continue;
+                };
+                epochs.push(Epoch {
+                    stamp: all[at].index_axis(Axis(0), k),
+                    psf: psf.view(),
+                    noise,
+                    jacobian: job.jacobians.as_ref().map(|each| each[k]),
+                    offset: job.offsets.as_ref().map_or([0.0; 2], |each| each[k]),
+                    survey: session.survey.as_deref(),
+                    gain: session.gain,
+                });
+            }
+            let flag = if usable_psf {
+                Flag::NoScale
+            } else {
+                Flag::BadPsf
+            };
+            galaxies.push(match epochs.is_empty() {
+                true => Measurement::flagged(flag),
+                false => worker.image(ImageNoise::Unknown).measure_epochs(&epochs)?,
+            });
+        }
+        let examined = jobs
+            .iter()
+            .zip(&all)
+            .map(|(job, stamps)| job.session.examine(job.row, stamps.view(), &job.psfs));
+        Ok(MeasuredRow {
+            row: self.row,
+            galaxies,
+            examined: examined.collect::<Result<_, _>>()?,
+        })
     }
 
     /// The image of the row.
@@ -718,13 +870,16 @@ impl MeasuredImage<'_> {
         assert_eq!(row.row, self.next, "rows are collected in order");
         self.next += 1;
         self.galaxies.extend(row.galaxies);
-        let Some(more) = row.examined else { return };
-        match &mut self.examined {
-            None => self.examined = Some(more),
-            Some(all) => {
-                all.stamps.join(&more.stamps);
-                if let (Some(all), Some(more)) = (&mut all.scaled, &more.scaled) {
-                    all.join(more);
+        self.examined.resize_with(row.examined.len(), || None);
+        for (all, more) in self.examined.iter_mut().zip(row.examined) {
+            match (all, more) {
+                (_, None) => {}
+                (all @ None, more) => *all = more,
+                (Some(all), Some(more)) => {
+                    all.stamps.join(&more.stamps);
+                    if let (Some(all), Some(more)) = (&mut all.scaled, &more.scaled) {
+                        all.join(more);
+                    }
                 }
             }
         }
@@ -752,33 +907,25 @@ impl MeasuredImage<'_> {
                 .iter_mut()
                 .for_each(|galaxy| galaxy.response = None);
         }
-        let mut warnings = session.warnings.clone();
+        let images = std::iter::once(&session).chain(&session.epochs);
+        let mut warnings = Vec::new();
         let mut psf_noise = None;
-        if let Some(Examined { stamps, scaled }) = examined {
-            // Levels of their own serve images of several depths.
-            let one_level = session.noise.levels().is_none();
-            let found = stamps.warnings().into_iter();
-            warnings
-                .extend(found.filter(|own| one_level || !matches!(own, Warning::Depths { .. })));
-            warnings.extend(match &session.noise {
-                KnownNoise::Given(level) => stamps.given_noise(*level),
-                KnownNoise::GivenEach(_) | KnownNoise::StatedEach(_) => scaled
-                    .zip(session.typical_level)
-                    .and_then(|(scaled, level)| scaled.given_noise(level)),
-                &KnownNoise::Stated(given) if configuration.noise == NoiseSource::Header => stamps
-                    .noise_unlike(given)
-                    .map(|measured| Warning::NoiseLevel {
-                        given,
-                        measured,
-                        used: false,
+        for (epoch, (image, examined)) in images.clone().zip(examined).enumerate() {
+            warnings.extend(image.warnings.iter().cloned());
+            warnings.extend(image.warnings_of(examined, &mut psf_noise));
+            let noise = image.survey.as_ref().map(|survey| &survey.noise);
+            let correlated = noise.filter(|noise| noise.is_correlated());
+            warnings.extend(
+                correlated
+                    .filter(|_| !session.epochs.is_empty())
+                    .map(|noise| Warning::EpochNoise {
+                        epoch: epoch + 1,
+                        correlation: [(1, 0), (0, 1)].map(|(x, y)| noise.correlation(x, y)),
                     }),
-                KnownNoise::Stated(_) | KnownNoise::Unknown => None,
-            });
-            let effect = stamps
-                .psf_noise()
-                .filter(|[m, _]| *m > MIN_STATED_PSF_NOISE_M);
-            psf_noise = effect.filter(|_| configuration.linear().is_some());
+            );
         }
+        // The noise of several stars averages, and its effect is not known.
+        psf_noise = psf_noise.filter(|_| session.epochs.is_empty());
         warnings.extend(Warning::of_galaxies(&galaxies));
         if let Some((response, false)) = response
             && galaxies.iter().any(|galaxy| galaxy.flags.is_empty())
@@ -792,6 +939,43 @@ impl MeasuredImage<'_> {
             psf_noise,
             frame: session.frame,
         }
+    }
+}
+
+impl Session<'_> {
+    /// Warnings of examined stamps; writes the effect of the star's noise on m and c, if there is one.
+    fn warnings_of(
+        &self,
+        examined: Option<Examined>,
+        psf_noise: &mut Option<[f64; 2]>,
+    ) -> Vec<Warning> {
+        let configuration = self.measurer.configuration();
+        let Some(Examined { stamps, scaled }) = examined else {
+            return Vec::new();
+        };
+        // Levels of their own serve images of several depths.
+        let one_level = self.noise.levels().is_none();
+        let mut warnings = stamps.warnings();
+        warnings.retain(|own| one_level || !matches!(own, Warning::Depths { .. }));
+        warnings.extend(match &self.noise {
+            KnownNoise::Given(level) => stamps.given_noise(*level),
+            KnownNoise::GivenEach(_) | KnownNoise::StatedEach(_) => scaled
+                .zip(self.typical_level)
+                .and_then(|(scaled, level)| scaled.given_noise(level)),
+            &KnownNoise::Stated(given) if configuration.noise == NoiseSource::Header => stamps
+                .noise_unlike(given)
+                .map(|measured| Warning::NoiseLevel {
+                    given,
+                    measured,
+                    used: false,
+                }),
+            KnownNoise::Stated(_) | KnownNoise::Unknown => None,
+        });
+        let effect = stamps
+            .psf_noise()
+            .filter(|[m, _]| *m > MIN_STATED_PSF_NOISE_M);
+        *psf_noise = effect.filter(|_| configuration.linear().is_some());
+        warnings
     }
 }
 
@@ -987,7 +1171,6 @@ mod tests {
     use shearq_quantities::{FunctionalPsf, PsfProfile, Shear};
 
     use super::*;
-    use crate::measurement::Flag;
 
     fn moffat(e1: f64) -> FunctionalPsf {
         let profile = PsfProfile::Moffat { beta: 3.0 };

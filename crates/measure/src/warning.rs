@@ -165,6 +165,17 @@ pub enum Warning {
         /// Correlation of neighbours along x and y.
         correlation: [f64; 2],
     },
+    /// Noise of one of several epochs is correlated, and all are combined as white noise.
+    #[error(
+        "the noise of neighbouring pixels of epoch {epoch} is correlated, but epochs are combined as if it were white (found {:.2} along x and {:.2} along y, expected 0). Try: exposures that were not resampled",
+        correlation[0], correlation[1]
+    )]
+    EpochNoise {
+        /// The epoch, from 1.
+        epoch: usize,
+        /// Correlation of neighbours along x and y.
+        correlation: [f64; 2],
+    },
     /// No stamp is good enough to measure the noise on.
     #[error(
         "cannot measure the noise: no stamp has enough pixels that differ. All galaxies are flagged. Try: set noise.source to \"header\" to use NOISESIG"
@@ -406,6 +417,7 @@ impl Warning {
             Warning::NoiseLevel { .. } => "noise-level",
             Warning::GivenNoise { .. } => "given-noise",
             Warning::CorrelatedNoise { .. } => "correlated-noise",
+            Warning::EpochNoise { .. } => "epoch-noise",
             Warning::NoNoise => "no-noise",
             Warning::PsfOffCentre { .. } => "psf-off-centre",
             Warning::PsfBackground { .. } => "psf-background",

@@ -42,6 +42,8 @@ fn epoch<'a>(stamp: &'a Array2<f64>, psf: &'a Array2<f64>, noise: f64) -> Epoch<
         noise,
         jacobian: None,
         offset: [0.0; 2],
+        survey: None,
+        gain: None,
     }
 }
 

@@ -326,8 +326,13 @@ impl CutWorker for LinearWorker {
         self.family.check_side(psf)?;
         let psf = self.denoiser.denoised(psf);
         let settings = &self.family.method.deconvolution;
-        let (reference, variance) = (settings.reference_extent, self.galaxy_variance);
-        let window = window_index(variance, psf, reference, &mut self.moments);
+        let known = self
+            .galaxy_variance
+            .filter(|_| settings.reference_extent > 0.0);
+        let known = known.and_then(|seen| Some(seen - self.moments.psf_mean_square(psf)?));
+        let window = known.map_or(CONFIGURED_WINDOW, |variance| {
+            window_index(variance, settings.reference_extent)
+        });
         let index = (width::step(psf, settings.reference_area), window);
         self.current = place_of(index, &mut self.workers, &self.family, &self.noise)?;
         let worker = &mut self.workers[self.current].1;
@@ -367,25 +372,41 @@ impl CutWorker for LinearWorker {
     ) -> Result<(Found, f64), MeasureError> {
         let precision = |of: &CutEpoch<'_>| of.pixels.area() / (of.noise * of.noise);
         let total: f64 = (0..count).map(|k| precision(&epoch(k))).sum();
+        let settings = &self.family.method.deconvolution;
         self.epoch_weights.clear();
-        let mut squares = 0.0;
+        let (mut squares, mut inverse_gain) = (0.0, 0.0);
+        // Weights of epochs with a survey, and the weighted mean squares of their galaxies without the PSF.
+        let (mut surveyed, mut variance) = (0.0, 0.0);
         for k in 0..count {
             let epoch = epoch(k);
             self.family.check_side(epoch.psf)?;
-            let weight = precision(&epoch) / total;
-            let area = width::noise_equivalent_area(self.denoiser.denoised(epoch.psf));
-            squares += weight / (area * epoch.pixels.area());
+            let (weight, pixel) = (precision(&epoch) / total, epoch.pixels.area());
+            let psf = self.denoiser.denoised(epoch.psf);
+            squares += weight / (width::noise_equivalent_area(psf) * pixel);
+            if let Some((seen, psf)) = epoch.galaxy_variance.zip(self.moments.psf_mean_square(psf))
+            {
+                surveyed += weight;
+                variance += weight * pixel * (seen - psf);
+            }
+            // A photon of one epoch counts with its weight, and its variance with the square.
+            inverse_gain += epoch.gain.map_or(0.0, |gain| weight * weight / gain);
             self.epoch_weights.push(weight as f32);
         }
-        let reference = self.family.method.deconvolution.reference_area;
+        let window = match surveyed > 0.0 {
+            true => window_index(variance / surveyed, settings.reference_extent),
+            false => CONFIGURED_WINDOW,
+        };
         let index = (
-            width::step_of_area(1.0 / squares, reference),
-            CONFIGURED_WINDOW,
+            width::step_of_area(1.0 / squares, settings.reference_area),
+            window,
         );
         self.current = place_of(index, &mut self.workers, &self.family, &self.noise)?;
         let worker = &mut self.workers[self.current].1;
+        worker.psf_variance = 1.0 / (4.0 * std::f64::consts::PI * squares);
         let level = total.sqrt().recip();
-        let found = worker.measure_epochs(&self.epoch_weights, level, epoch, &mut self.denoiser)?;
+        let gain = (inverse_gain > 0.0).then(|| inverse_gain.recip());
+        let weights = &self.epoch_weights;
+        let found = worker.measure_epochs(weights, (level, gain), epoch, &mut self.denoiser)?;
         Ok((found, level))
     }
 
@@ -638,12 +659,12 @@ impl PlanWorker {
     fn measure_epochs<'a>(
         &mut self,
         weights: &[f32],
-        noise: f64,
+        (noise, gain): (f64, Option<f64>),
         epoch: &dyn Fn(usize) -> CutEpoch<'a>,
         denoiser: &mut StarDenoiser,
     ) -> Result<Found, MeasureError> {
         let plan = Arc::clone(&self.plan);
-        let (spectral, sigma) = (&plan.spectral, noise as f32);
+        let (spectral, mut sigma) = (&plan.spectral, noise as f32);
         let new = || Box::new(EpochBuffers::new(spectral));
         let mut epochs = self.epochs.take().unwrap_or_else(new);
         let EpochBuffers { psfs, scratch } = &mut *epochs;
@@ -670,6 +691,11 @@ impl PlanWorker {
             (&mut self.buffers, scratch),
             &mut self.lags,
         );
+        if let Some(gain) = gain {
+            sigma = noise.hypot((self.own_variance(sigma) / gain).sqrt()) as f32;
+            let buffers = (&mut self.buffers, &*scratch);
+            spectral.take_epoch_lags(&self.psf, sigma, buffers, &mut self.lags);
+        }
         let found = self.measure_lags(epoch(0).cut, (noise, sigma));
         self.epochs = Some(epochs);
         Ok(found)
@@ -743,25 +769,16 @@ impl PlanWorker {
     }
 }
 
-/// Index of the width for galaxies whose mean square per axis, PSF included, is `seen` px². The configured width is for
-/// `reference` px² without the PSF.
-fn window_index(
-    seen: Option<f64>,
-    psf: ArrayView2<'_, f64>,
-    reference: f64,
-    moments: &mut WeightedMoments,
-) -> usize {
-    let (Some(seen), true) = (seen, reference > 0.0) else {
-        return CONFIGURED_WINDOW;
-    };
-    let Some(psf) = moments.psf_mean_square(psf) else {
-        return CONFIGURED_WINDOW;
-    };
+/// Index of the width for galaxies of a mean square of `variance` px² per axis. The configured width is for `reference` px².
+fn window_index(variance: f64, reference: f64) -> usize {
     // A point source has no positive ratio, and gets the narrowest window.
-    let ratio = ((seen - psf) / reference).max(f64::MIN_POSITIVE);
+    let ratio = (variance / reference).max(f64::MIN_POSITIVE);
     let step = (WINDOWS_PER_OCTAVE * WINDOW_POWER * ratio.log2()).round() as i32;
-    CONFIGURED_WINDOW
-        .wrapping_add_signed(step.clamp(*WINDOW_STEPS.start(), *WINDOW_STEPS.end()) as isize)
+    match reference > 0.0 {
+        true => CONFIGURED_WINDOW
+            .wrapping_add_signed(step.clamp(*WINDOW_STEPS.start(), *WINDOW_STEPS.end()) as isize),
+        false => CONFIGURED_WINDOW,
+    }
 }
 
 /// Mean square per axis in px² of the galaxies that the width at `index` is for, if the configured width is `sigma` px
@@ -819,22 +836,15 @@ mod tests {
     use crate::noise::Survey;
 
     #[test]
-    fn windows_follow_the_galaxies_without_their_psf() {
+    fn windows_follow_the_galaxies() {
         assert_eq!(WINDOW_STEPS.count(), WINDOW_COUNT);
-        let mut moments = WeightedMoments::default();
-        // A variance of 3 px².
-        let psf = Array2::from_shape_fn((32, 32), |(y, x)| {
-            let (x, y) = (x as f64 - 15.5, y as f64 - 15.5);
-            (-(x * x + y * y) / 6.0).exp()
-        });
-        let mut index = |seen, reference| window_index(seen, psf.view(), reference, &mut moments);
-        let found = [13.0, 5.0, 23.0, 3.0, 1.0, 1e9].map(|seen| index(Some(seen), 10.0));
+        let index = |variance| window_index(variance, 10.0);
         // Once, a fifth, twice, and nothing of 10 px²: 3.2·log₂ of it, within bounds.
+        let found = [10.0, 2.0, 20.0, 0.0, -2.0, 1e9].map(index);
         assert_eq!(found, [CONFIGURED_WINDOW, 0, 6, 0, 0, 6]);
-        let wider = index(Some(3.0 + 10.0 * 2f64.powf(0.34)), 10.0);
+        let wider = index(10.0 * 2f64.powf(0.34));
         assert_eq!(wider, CONFIGURED_WINDOW + 1);
-        assert_eq!(index(None, 10.0), CONFIGURED_WINDOW);
-        assert_eq!(index(Some(5.0), 0.0), CONFIGURED_WINDOW);
+        assert_eq!(window_index(2.0, 0.0), CONFIGURED_WINDOW);
         let ratio =
             |of: &dyn Fn(usize) -> f64| of(CONFIGURED_WINDOW + 2) / of(CONFIGURED_WINDOW - 2);
         let twice = ratio(&|at| window_width(5.0, at, 48));

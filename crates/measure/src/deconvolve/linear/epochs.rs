@@ -183,6 +183,17 @@ impl Spectral {
                 }
             }
         }
+        self.take_epoch_lags(psf, noise, (scratch, buffers), out);
+    }
+
+    /// Writes the lags of the epochs autocorrelated last, in noise of another level.
+    pub(crate) fn take_epoch_lags(
+        &self,
+        psf: &SpectralPsf,
+        noise: f32,
+        (scratch, buffers): (&mut SpectralScratch, &EpochScratch),
+        out: &mut Lags,
+    ) {
         for (spectrum, sum) in scratch.windowed.iter_mut().zip(&buffers.sums) {
             spectrum.copy_from(sum);
         }
