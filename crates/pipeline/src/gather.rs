@@ -18,6 +18,7 @@ use shearq_quantities::{Frame, Jacobian};
 use self::positions::Positions;
 pub use self::positions::Table;
 use self::psfs::{GatheredPsfs, gather_psfs};
+pub(crate) use self::source::off_middle;
 pub use self::source::{Content, Files};
 use self::source::{Exposure, Images, shown};
 use self::stamps::{Origins, StampWriter, already};
@@ -302,6 +303,11 @@ impl Plan {
             }
         };
         let Some(all) = all else {
+            if let Some(error) = self.stack.wcs.fault() {
+                return fault(format!(
+                    "{error}. Try: --frame pixel, for ellipticities along the pixel axes"
+                ));
+            }
             return match gathering.frame {
                 Some(Frame::Sky) => fault("--frame is sky, and the header has no WCS (expected TAN, TAN-SIP, TPV or a linear one)".to_owned()),
                 _ => Ok(None),

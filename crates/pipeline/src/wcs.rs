@@ -35,6 +35,9 @@ const TPV_ORDERS: i32 = 7;
 const MAX_NEWTON_STEPS: usize = 50;
 const INVERSE_ERROR_PX: f64 = 1e-9;
 
+// Ratio of the determinant to the sum of squares below which axes count as parallel. Chosen by hand: as Jacobian::new.
+const LEAST_RELATIVE_AREA: f64 = 1e-6;
+
 const ARCSEC_PER_RADIAN: f64 = 648_000.0 / std::f64::consts::PI;
 
 #[derive(Debug, Clone, PartialEq)]
@@ -214,6 +217,8 @@ pub(crate) struct Wcs {
     map: Option<Map>,
     /// CTYPE1 if it is a projection that is not read: only the matrix is used then.
     unread: Option<String>,
+    /// A matrix that maps pixels to a line, or to a point.
+    singular: Option<Matrix2>,
 }
 
 impl Wcs {
@@ -251,7 +256,11 @@ impl Wcs {
                 false => [[x * cosine, -y * sine], [x * sine, y * cosine]],
             })
         });
-        let matrix = matrix.filter(|m| determinant(*m).is_normal());
+        // Relative to its size: rounded numbers of parallel axes leave a small determinant. A header of zeros has no WCS.
+        let size = |m: &Matrix2| m.iter().flatten().map(|v| v * v).sum::<f64>();
+        let regular = |m: &Matrix2| determinant(*m).abs() > LEAST_RELATIVE_AREA * size(m);
+        let singular = matrix.filter(|m| !regular(m) && size(m) > 0.0);
+        let matrix = matrix.filter(regular);
         let stated = PIXEL_SCALE_KEYS.into_iter().find_map(&number);
         let plausible = |scale: &f64| PLAUSIBLE_ARCSEC.contains(scale);
         let of_matrix = matrix.map(|matrix| determinant(matrix).abs().sqrt() * unit);
@@ -259,6 +268,7 @@ impl Wcs {
         let Some(matrix) = matrix else {
             return Wcs {
                 scale,
+                singular,
                 ..Wcs::default()
             };
         };
@@ -289,6 +299,7 @@ impl Wcs {
                     projection: Projection::Plane,
                 }),
                 unread: named.then(|| kind.to_owned()),
+                singular: None,
             };
         }
         let [first, second] = in_unit(matrix, unit / 3600.0);
@@ -323,6 +334,7 @@ impl Wcs {
                 },
             }),
             unread: None,
+            singular: None,
         }
     }
 
@@ -366,6 +378,18 @@ impl Wcs {
         self.unread.as_deref()
     }
 
+    /// What is wrong with a header that states a WCS but gives no places on the sky; `None` for a usable WCS, and without one.
+    pub(crate) fn fault(&self) -> Option<String> {
+        let expected = "expected TAN, TAN-SIP or TPV";
+        match (&self.singular, &self.unread) {
+            (Some([[a, b], [c, d]]), _) => Some(format!(
+                "the matrix of the WCS, CD or PC with CDELT, is singular (found {a}, {b}, {c}, {d}; expected one with an inverse)"
+            )),
+            (None, Some(kind)) => Some(format!("the projection {kind} is not read ({expected})")),
+            (None, None) => None,
+        }
+    }
+
     /// Keys that state the same of an image of other stamps of these pixels, as GalSim writes and reads them.
     pub(crate) fn keys(&self) -> Vec<(&'static str, Value)> {
         let Some([[xx, xy], [yx, yy]]) = self.reference() else {
@@ -390,6 +414,7 @@ impl Wcs {
                 projection: Projection::Plane,
             }),
             unread: None,
+            singular: None,
         }
     }
 

@@ -79,7 +79,7 @@ impl Positions {
         let columns = table::columns(&place)?;
         let [x, y] = match table.columns {
             Some(names) => given(&place, &columns, names)?,
-            None => known(&mut place, &columns, wcs.has_sky())?,
+            None => known(&mut place, &columns, (exposure, wcs), table.degrees)?,
         };
         let names = names_in(&columns, &place, [&x, &y]);
         let degrees = table.degrees || SKY_NAMES.iter().any(|pair| is_pair(pair, [&x, &y]));
@@ -275,6 +275,21 @@ fn note(place: &Place, names: [&String; 2]) -> Option<String> {
     }
 }
 
+// An error if positions on the sky have no WCS.
+fn no_sky<T>(path: &Path, exposure: &Path, wcs: &Wcs) -> Result<T, FileError> {
+    let found = match wcs.fault() {
+        Some(fault) => format!("{}: {fault}", exposure.display()),
+        None => format!(
+            "the header of {} has no WCS (expected TAN, TAN-SIP or TPV)",
+            exposure.display()
+        ),
+    };
+    let message = format!(
+        "the positions are right ascensions and declinations; {found}. Try: columns in pixels, --columns X,Y"
+    );
+    Err(FileError::new(path, message))
+}
+
 fn on_exposure(
     path: &Path,
     row: usize,
@@ -290,10 +305,7 @@ fn on_exposure(
         true => format!(
             "row {row}: the WCS of {shown} does not reach ({ra}, {dec}); expected right ascension and declination in degrees near the exposure"
         ),
-        false => format!(
-            "the positions are right ascensions and declinations, and the header of {shown} has no WCS for them (found {}; expected TAN, TAN-SIP or TPV). Try: columns in pixels, --columns X,Y",
-            wcs.unread().unwrap_or("none")
-        ),
+        false => return no_sky(path, exposure, wcs),
     };
     Err(FileError::new(path, message))
 }
@@ -319,16 +331,29 @@ fn given(place: &Place, columns: &Columns, names: [&str; 2]) -> Result<[String; 
     ))
 }
 
-/// The columns with known names, or the only two columns: of pixels, or else `of_sky`. Sets the table that has them.
-fn known(place: &mut Place, columns: &Columns, of_sky: bool) -> Result<[String; 2], FileError> {
+/// The columns with known names, or the only two columns: of pixels unless they are `degrees`, or else of the sky. Sets the table
+/// that has them.
+fn known(
+    place: &mut Place,
+    columns: &Columns,
+    (exposure, wcs): (&Path, &Wcs),
+    degrees: bool,
+) -> Result<[String; 2], FileError> {
     let pairs = |known: &[[&str; 2]; 6]| -> Vec<(&Named, [String; 2])> {
         let named = columns.named.iter();
         let found = named.filter_map(|named| Some((named, pair_of(known, &named.names)?)));
         found.collect()
     };
-    let mut found = pairs(&PIXEL_NAMES);
-    if found.is_empty() && of_sky {
+    let mut found = match degrees {
+        true => Vec::new(),
+        false => pairs(&PIXEL_NAMES),
+    };
+    if found.is_empty() {
         found = pairs(&SKY_NAMES);
+        // Of columns that may be the sky's, the WCS is at fault.
+        if !found.is_empty() && !wcs.has_sky() {
+            return no_sky(&place.path, exposure, wcs);
+        }
     }
     match found.as_slice() {
         [(named, pair), others @ ..] if others.is_empty() || named.doubtful => {
@@ -352,23 +377,13 @@ fn known(place: &mut Place, columns: &Columns, of_sky: bool) -> Result<[String; 
             return Err(FileError::new(&place.path, message));
         }
     }
-    let all: Vec<&String> = columns.named.iter().flat_map(|n| &n.names).collect();
-    let sky = all.iter().any(|name| {
-        SKY_NAMES
-            .iter()
-            .any(|[ra, _]| name.eq_ignore_ascii_case(ra))
-    });
-    let degrees = match sky {
-        true => ". Coordinates on the sky need an exposure with a WCS (TAN, TAN-SIP or TPV)",
-        false => "",
-    };
     let certain: Vec<&String> = columns
         .named
         .iter()
-        .filter(|named| !named.doubtful || sky)
+        .filter(|named| !named.doubtful)
         .flat_map(|named| &named.names)
         .collect();
-    if columns.unnamed.len() == 2 && !sky {
+    if columns.unnamed.len() == 2 {
         return Ok(["1".into(), "2".into()]);
     }
     let (found, example) = match certain.as_slice() {
@@ -382,7 +397,11 @@ fn known(place: &mut Place, columns: &Columns, of_sky: bool) -> Result<[String; 
     Err(FileError::new(
         &place.path,
         format!(
-            "cannot determine the columns of the positions (found {found}; expected x and y, X_IMAGE and Y_IMAGE, or two columns){degrees}. Try: --columns {example}"
+            "cannot determine the columns of the positions (found {found}; expected {}). Try: --columns {example}",
+            match degrees {
+                true => "ra and dec, ALPHA_J2000 and DELTA_J2000, or two columns",
+                false => "x and y, X_IMAGE and Y_IMAGE, ra and dec, or two columns",
+            }
         ),
     ))
 }

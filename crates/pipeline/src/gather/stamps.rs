@@ -129,6 +129,8 @@ impl StampWriter {
             companion.like(&mut exposure)?;
             another(&companion.origin, &exposure.origin, companion.content())?;
         }
+        let [_, height] = exposure.sides()?;
+        let mut fit = MapFit::default();
         for &(x, y) in positions {
             let mut pixels = exposure.square::<f32>((x, y), side)?;
             if let Some(mask) = &mut masks {
@@ -141,9 +143,20 @@ impl StampWriter {
                     map.origin
                         .fault(&format!("stamp at ({x:.1}, {y:.1}): {fault}"))
                 })?;
-                self.levels
-                    .get_or_insert_default()
-                    .push(level(&values, side));
+                let stated = level(&values, side);
+                self.levels.get_or_insert_default().push(stated);
+                if fit.residuals.len() < MOST_FITTED {
+                    let mut other = map.square::<f64>((x, height as f64 + 1.0 - y), side)?;
+                    if map.content() == Content::Weight {
+                        other.iter_mut().for_each(|value| *value = 1.0 / *value);
+                    }
+                    other.iter_mut().for_each(|value| {
+                        if !(*value > 0.0 && value.is_finite()) {
+                            *value = f64::NAN;
+                        }
+                    });
+                    fit.add(&pixels, stated, level(&other, side), side);
+                }
             }
             let origin = Origin {
                 position: Some((x, y)),
@@ -151,7 +164,16 @@ impl StampWriter {
             };
             self.add(&origin, &pixels)?;
         }
-        Ok(())
+        match &maps {
+            Some(map) if fit.is_upside_down() => {
+                let message = format!(
+                    "the {} fits the noise of the exposure upside down and not as it is (expected the rows of the exposure). Try: the map without its rows reversed",
+                    map.content().noun()
+                );
+                Err(map.origin.fault(&message))
+            }
+            _ => Ok(()),
+        }
     }
 
     fn add(&mut self, origin: &Origin<'_>, pixels: &[f32]) -> Result<(), FileError> {
@@ -169,6 +191,52 @@ impl StampWriter {
         self.origins.image.push(origin.image as i64);
         self.origins.plane.push(origin.plane as i64);
         self.image.add(pixels)
+    }
+}
+
+// Stamps by which a map is compared with the noise. Chosen by hand: a map that halves the noise needs about ten.
+const MOST_FITTED: usize = 2000;
+const LEAST_FITTED: usize = 20;
+// Standard errors by which the map turned upside down must fit better. Chosen by hand.
+const UPSIDE_DOWN_SIGNIFICANCE: f64 = 5.0;
+
+/// Logarithms of the variance that stamps have beyond the galaxy, less those that the map states, and that it would state upside
+/// down. A wrong level biases m by a third in each half of an exposure, and no other test finds it: its mean is right.
+#[derive(Default)]
+struct MapFit {
+    residuals: Vec<[f64; 2]>,
+}
+
+impl MapFit {
+    fn add(&mut self, pixels: &[f32], stated: f64, turned: f64, side: usize) {
+        // Differences of neighbours are free of the sky and of the smooth wings of galaxies.
+        let differences = (0..pixels.len())
+            .filter(|at| at % side > 0 && is_outside(*at, side))
+            .map(|at| f64::from(pixels[at] - pixels[at - 1]).abs());
+        let mut differences: Vec<f64> = differences.filter(|value| value.is_finite()).collect();
+        let Some(spread) = upper_median(&mut differences) else {
+            return;
+        };
+        let residuals = [stated, turned].map(|level| 2.0 * (spread / level).ln());
+        if residuals.iter().all(|value| value.is_finite()) {
+            self.residuals.push(residuals);
+        }
+    }
+
+    fn is_upside_down(&self) -> bool {
+        let count = self.residuals.len() as f64;
+        if self.residuals.len() < LEAST_FITTED {
+            return false;
+        }
+        let means = [0, 1].map(|k| self.residuals.iter().map(|of| of[k]).sum::<f64>() / count);
+        let gains = self.residuals.iter().map(|of| {
+            let [stated, turned] = [0, 1].map(|k| (of[k] - means[k]).powi(2));
+            stated - turned
+        });
+        let gains: Vec<f64> = gains.collect();
+        let mean = gains.iter().sum::<f64>() / count;
+        let squares = gains.iter().map(|gain| (gain - mean).powi(2)).sum::<f64>();
+        mean > UPSIDE_DOWN_SIGNIFICANCE * squares.sqrt() / count
     }
 }
 
@@ -218,17 +286,10 @@ fn variance(pixels: &mut [f32], values: &mut [f64], content: Content) -> Result<
 // stamp, the galaxy in the centre lies on the larger part, whose level the median takes; a gradient cancels. The galaxy's own
 // Poisson noise is added by `gain`.
 fn level(variances: &[f64], side: usize) -> f64 {
-    let middle = (side as f64 - 1.0) / 2.0;
-    // Chosen by hand: 12 px of 48, where most galaxies of a stamp of this size have no light.
-    let radius = side as f64 / 4.0;
-    let outside = |at: usize| {
-        let [x, y] = [at % side, at / side].map(|k| k as f64 - middle);
-        x.hypot(y) > radius
-    };
     let finite = |at: &usize| variances[*at].is_finite();
     let chosen = (0..variances.len())
         .filter(finite)
-        .filter(|&at| outside(at));
+        .filter(|&at| is_outside(at, side));
     let mut chosen: Vec<f64> = chosen.map(|at| variances[at]).collect();
     if chosen.is_empty() {
         chosen = variances
@@ -238,6 +299,15 @@ fn level(variances: &[f64], side: usize) -> f64 {
             .collect();
     }
     upper_median(&mut chosen).map_or(f64::NAN, f64::sqrt)
+}
+
+// Whether a pixel of a stamp is beyond the galaxy.
+fn is_outside(at: usize, side: usize) -> bool {
+    let middle = (side as f64 - 1.0) / 2.0;
+    // Chosen by hand: 12 px of 48, where most galaxies of a stamp of this size have no light.
+    let radius = side as f64 / 4.0;
+    let [x, y] = [at % side, at / side].map(|k| k as f64 - middle);
+    x.hypot(y) > radius
 }
 
 // Makes the pixels of a stamp missing whose `mask` is not zero, or has one of these bits.
@@ -356,5 +426,35 @@ pub(super) fn first(named: bool, path: PathBuf) -> Result<(), FileError> {
     match named {
         true => Ok(()),
         false => Err(already(path)),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn maps_upside_down_are_recognised() {
+        const SIDE: usize = 32;
+        let mut state = 3u64;
+        let (mut right, mut wrong, mut flat) =
+            (MapFit::default(), MapFit::default(), MapFit::default());
+        for k in 0..60 {
+            // The lower half of the exposure has 1.3 times the noise of the upper one.
+            let (own, other) = if k % 2 == 0 { (1.3, 1.0) } else { (1.0, 1.3) };
+            let noise = |_| {
+                // The generator of Knuth's MMIX; uniform noise will do.
+                state = state
+                    .wrapping_mul(6_364_136_223_846_793_005)
+                    .wrapping_add(1_442_695_040_888_963_407);
+                (own * (state >> 11) as f64 / (1u64 << 53) as f64) as f32
+            };
+            let pixels: Vec<f32> = (0..SIDE * SIDE).map(noise).collect();
+            right.add(&pixels, own, other, SIDE);
+            wrong.add(&pixels, other, own, SIDE);
+            flat.add(&pixels, 1.0, 1.0, SIDE);
+        }
+        let found = [right, wrong, flat].map(|fit| fit.is_upside_down());
+        assert_eq!(found, [false, true, false]);
     }
 }
