@@ -124,7 +124,7 @@ const WAYS: [(&str, &[&str]); 33] = [
     ),
     (
         "measure",
-        &["submission data out sets catalogue-format shard threads"],
+        &["submission data out sets epochs catalogue-format shard threads"],
     ),
     (
         "run",

@@ -28,9 +28,10 @@ pub(crate) struct Arguments {
     /// FITS files of stamps, in the order of the galaxies.
     #[arg(long, value_name = "FILE", num_args = 1.., required_unless_present = "exposure", conflicts_with_all = ["exposure", "Cutouts"])]
     stamps: Vec<PathBuf>,
-    /// Image to cut stamps out of: the first of its file.
-    #[arg(long, value_name = "FILE", requires = "positions")]
-    exposure: Option<PathBuf>,
+    /// Image to cut stamps out of: the first of its file. Several exposures of the same galaxies become images of consecutive
+    /// numbers, each with the PSF, map and mask at its place in the lists, for `measure --epochs`.
+    #[arg(long, value_name = "FILE", num_args = 1.., requires = "positions")]
+    exposure: Vec<PathBuf>,
     /// Use only images of this name (EXTNAME), such as SCI.
     #[arg(long, value_name = "NAME")]
     extension: Option<String>,
@@ -97,9 +98,9 @@ pub(crate) struct Arguments {
 struct Cutouts {
     /// Table of positions on the exposure: text, FITS or Parquet, in FITS pixels (the centre of the first pixel is 1), or in
     /// degrees on the sky if the exposure has a WCS (TAN, TAN-SIP, TPV). Catalogues have its identities and places.
-    /// `FILE[NAME]` and `FILE[NUMBER]` are tables of a FITS file.
-    #[arg(long, value_name = "FILE")]
-    positions: Option<PathBuf>,
+    /// `FILE[NAME]` and `FILE[NUMBER]` are tables of a FITS file. One table for all exposures, or one for each.
+    #[arg(long, value_name = "FILE", num_args = 1..)]
+    positions: Vec<PathBuf>,
     /// Table of a FITS file: its name (EXTNAME), or its number from 1 [default: the table that has the columns].
     #[arg(long, value_name = "NAME|NUMBER")]
     table: Option<String>,
@@ -110,8 +111,9 @@ struct Cutouts {
     /// such as X_IMAGE and Y_IMAGE, ra and dec, or the only two columns].
     #[arg(long, value_name = "X,Y", value_delimiter = ',', num_args = 1)]
     columns: Option<Vec<String>>,
-    /// The columns are right ascension and declination in degrees, whatever their names.
-    #[arg(long, requires = "columns")]
+    /// Positions are right ascension and declination in degrees: the columns of --columns, whatever their names, or those of such
+    /// names even if there are x and y.
+    #[arg(long)]
     degrees: bool,
     /// Column of identities, integers or texts [default: id, object_id, source_id or NUMBER, if there is one].
     #[arg(long, value_name = "NAME")]
@@ -153,17 +155,62 @@ fn two_columns(columns: Option<&[String]>) -> anyhow::Result<Option<[&str; 2]>> 
     }
 }
 
-fn gathering(arguments: &Arguments) -> anyhow::Result<Gathering<'_>> {
+/// The part of a list that belongs to exposure `at` of `of`: all of it if there is only one.
+fn own<'a>(
+    (at, of): (usize, usize),
+    option: &str,
+    files: &'a [PathBuf],
+    one_for_all: bool,
+) -> anyhow::Result<&'a [PathBuf]> {
+    match files.len() {
+        0 => Ok(files),
+        _ if of < 2 => Ok(files),
+        1 if one_for_all => Ok(files),
+        found if found == of => Ok(&files[at..=at]),
+        found => anyhow::bail!(
+            "--{option} names {} for {of} exposures (expected one for each, in the same order)",
+            count(found, "file")
+        ),
+    }
+}
+
+/// Images, masks, PSFs, variance and weight maps, and positions of exposure `at`, or of all stamps.
+fn own_files(arguments: &Arguments, at: usize) -> anyhow::Result<[&[PathBuf]; 6]> {
     let Arguments {
-        stamps,
         exposure,
-        extension,
         mask,
+        psf,
+        variance,
+        weight_map,
+        ..
+    } = arguments;
+    let place = (at, exposure.len());
+    let images = match exposure.is_empty() {
+        true => &arguments.stamps,
+        false => own(place, "exposure", exposure, false)?,
+    };
+    Ok([
+        images,
+        own(place, "mask", mask, false)?,
+        own(place, "psf", psf, false)?,
+        own(place, "variance", variance, false)?,
+        own(place, "weight-map", weight_map, false)?,
+        own(place, "positions", &arguments.cutouts.positions, true)?,
+    ])
+}
+
+/// What to gather from exposure `at`, from 0, or from all stamps.
+fn gathering(arguments: &Arguments, at: usize) -> anyhow::Result<Gathering<'_>> {
+    let Arguments {
+        stamps: _,
+        exposure: _,
+        extension,
+        mask: _,
         mask_extension,
         mask_bits,
         cutouts:
             Cutouts {
-                positions,
+                positions: _,
                 table,
                 first_pixel,
                 columns,
@@ -173,11 +220,11 @@ fn gathering(arguments: &Arguments) -> anyhow::Result<Gathering<'_>> {
                 size,
             },
         square,
-        psf,
+        psf: _,
         psf_extension,
-        variance,
+        variance: _,
         variance_extension,
-        weight_map,
+        weight_map: _,
         weight_extension,
         frame,
         gain,
@@ -186,17 +233,19 @@ fn gathering(arguments: &Arguments) -> anyhow::Result<Gathering<'_>> {
         image: _,
         out: _,
     } = arguments;
-    // Destructured in full, so that the compiler finds an option that is not passed on.
+    // Destructured in full, so that the compiler finds an option that is not passed on. `own_files` takes the lists of files.
+    let [own, mask, psf, variance, weight_map, positions] = own_files(arguments, at)?;
     for (option, value) in [("noise", noise), ("gain", gain)] {
         anyhow::ensure!(
             // Not subnormal: noise is divided by, and 1/5e-324 is infinite.
             value.is_none_or(|value| value > 0.0 && value.is_normal()),
-            "--{option} is {:e}; expected a positive number",
-            value.unwrap_or_default()
+            "--{option} is {}; expected a positive number",
+            // `{}` would print 324 digits of the least number.
+            format!("{:?}", value.unwrap_or_default()).trim_end_matches(".0")
         );
     }
     let images = Files {
-        paths: exposure.as_ref().map_or(stamps, std::slice::from_ref),
+        paths: own,
         extension: extension.as_deref(),
         content: Content::Sky,
     };
@@ -227,7 +276,7 @@ fn gathering(arguments: &Arguments) -> anyhow::Result<Gathering<'_>> {
         content: Content::Psf,
     };
     let stamps = match positions {
-        Some(path) => Stamps::Cutouts {
+        [path, ..] => Stamps::Cutouts {
             exposure: images,
             positions: Table {
                 path,
@@ -240,7 +289,7 @@ fn gathering(arguments: &Arguments) -> anyhow::Result<Gathering<'_>> {
             first_pixel: *first_pixel,
             side: usize::from(*size),
         },
-        None => Stamps::Files(images),
+        [] => Stamps::Files(images),
     };
     Ok(Gathering {
         stamps,
@@ -258,23 +307,39 @@ fn gathering(arguments: &Arguments) -> anyhow::Result<Gathering<'_>> {
 }
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
-    let gathering = gathering(arguments)?;
+    let exposures = arguments.exposure.len().max(1);
+    let all: Vec<Gathering<'_>> = (0..exposures)
+        .map(|at| gathering(arguments, at))
+        .collect::<anyhow::Result<_>>()?;
+    let last = arguments.image as usize + exposures - 1;
+    anyhow::ensure!(
+        last <= MAX_IMAGE as usize,
+        "{exposures} exposures from --image {} on need the image number {last} (expected up to {MAX_IMAGE})",
+        arguments.image
+    );
     let out = &arguments.out;
-    // An existing folder may have a layout.toml with other names of files.
-    let data = if out.is_dir() {
-        DataFolder::open(out)?
-    } else {
-        DataFolder::new(out)
-    };
-    let id = ImageId {
-        set: arguments.set,
-        image: arguments.image,
-    };
+    for (image, gathering) in (arguments.image..).zip(&all) {
+        // An existing folder may have a layout.toml with other names of files.
+        let data = if out.is_dir() {
+            DataFolder::open(out)?
+        } else {
+            DataFolder::new(out)
+        };
+        let id = ImageId {
+            set: arguments.set,
+            image,
+        };
+        gather_image(&data, id, gathering)?;
+    }
+    Ok(())
+}
+
+fn gather_image(data: &DataFolder, id: ImageId, gathering: &Gathering<'_>) -> anyhow::Result<()> {
     let Gathered {
         mosaic,
         incomplete,
         messages,
-    } = gather(&data, id, &gathering)?;
+    } = gather(data, id, gathering)?;
     for message in messages {
         tell(format_args!("{message}"));
     }

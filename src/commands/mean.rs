@@ -110,7 +110,8 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             .map(|text| format!("Galaxies of --{name} \"{text}\"."));
         table.notes.extend(note);
     }
-    if let Some(data) = &data {
+    // Of epochs, one image of a set has a catalogue.
+    if let Some(data) = data.as_ref().filter(|_| !run.epochs) {
         let used = means.iter().map(|mean| (mean.set, mean.images.as_slice()));
         // A mean over fewer images than the data have is valid, but the reader must know.
         let without = without_catalogue(data, &used.collect(), sets)?;

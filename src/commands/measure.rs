@@ -2,7 +2,7 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use clap::Args;
-use shearq_dataset::images::{self, ImageId};
+use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::DataFolder;
 use shearq_dataset::run::{Run, Source, open_data};
 use shearq_files::table::FileFormat;
@@ -30,6 +30,11 @@ pub(crate) struct Arguments {
     /// Sets to measure [default: all].
     #[arg(long, value_name = "LIST")]
     sets: Option<SetList>,
+    /// The images of a set are epochs of the same galaxies, as `gather` writes them from several exposures: one catalogue per
+    /// set, of the galaxies of its first image. Galaxies are joined by `id`, or else by ra and dec to 0.5″. Stamps are combined
+    /// in each Fourier mode with inverse-variance weights before the shape is measured.
+    #[arg(long)]
+    epochs: bool,
 }
 
 /// How to measure, and where to write catalogues.
@@ -57,8 +62,13 @@ impl Measuring {
         Ok(Run::new(source, configuration, format))
     }
 
-    pub(super) fn images(&self, data: &DataFolder, sets: &[u32]) -> anyhow::Result<Vec<ImageId>> {
-        let images = self.sharding.part(&images::of_folder(data, sets)?);
+    pub(super) fn images(
+        &self,
+        run: &Run,
+        data: &DataFolder,
+        sets: &[u32],
+    ) -> anyhow::Result<Vec<ImageId>> {
+        let images = self.sharding.part(&run.images(data, sets)?);
         // An image whose name nearly follows the layout would otherwise be absent from the results without notice.
         tell_unread(data.images(sets)?.unread());
         Ok(images)
@@ -75,12 +85,16 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         measuring,
         data,
         sets,
+        epochs,
     } = arguments;
     let out = &measuring.out;
     let data = open_data(data)?;
     let sets = sets.as_ref().map_or(&[][..], |list| &list.0);
-    let run = measuring.run(Source::folder(&data, out)?)?;
-    let images = measuring.images(&data, sets)?;
+    let run = Run {
+        epochs: *epochs,
+        ..measuring.run(Source::folder(&data, out)?)?
+    };
+    let images = measuring.images(&run, &data, sets)?;
     measure(&run, &data, out, &images, measuring.threads())
 }
 

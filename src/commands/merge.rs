@@ -85,7 +85,7 @@ fn merge_run(arguments: &Arguments, run: &Run) -> anyhow::Result<()> {
                 "--images applies to simulated data only; every image of {} is expected. Try: without --images",
                 run.source
             );
-            let images = images::of_folder(&data, sets)?;
+            let images = run.images(&data, sets)?;
             tell_unread(data.images(sets)?.unread());
             images
         }

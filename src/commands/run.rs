@@ -99,7 +99,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             measure::report(&run, &summary, start.elapsed(), threads, out)?;
         }
         (Source::Folder { .. }, Some(data)) => {
-            let images = measuring.images(data, wanted)?;
+            let images = measuring.images(&run, data, wanted)?;
             measure::measure(&run, data, out, &images, threads)?;
         }
         // A folder as source comes from `data`.

@@ -188,15 +188,28 @@ impl<'a> Inputs<'a> {
         if let Source::Simulated(_) = self.run.source {
             return Ok(prints);
         }
+        let epochs = self.run.epochs_of(self.data, id)?;
         for (key, path) in self.files(id) {
             let print = match key {
                 TRUTH => self.truths.get(&id.set).cloned(),
+                _ if epochs.len() > 1 => Some(self.print_of_all(key, &epochs)?),
                 _ if is_there(&path) => Some(of_image(&path)?),
                 _ => None,
             };
             prints.extend(print.map(|print| (key.to_owned(), print)));
         }
         Ok(prints)
+    }
+
+    fn print_of_all(&self, key: &str, epochs: &[ImageId]) -> Result<String, FileError> {
+        let mut print = Fingerprint::default();
+        for &id in epochs {
+            if let Some(path) = self.files(id).get(key).filter(|path| is_there(path)) {
+                print.add(id.image.to_le_bytes());
+                print.add(of_image(path)?);
+            }
+        }
+        Ok(print.finish())
     }
 
     /// Checks that the catalogues of `images` in `out` were measured from the present files.

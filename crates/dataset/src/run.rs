@@ -5,6 +5,7 @@ use std::path::{Component, Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use shearq_submissions::Configuration;
 
+use crate::images::{self, ImageId};
 use crate::layout::{DataFolder, Layout, check_folder, fill};
 use crate::listing::{self, Files};
 use crate::record::read_record;
@@ -89,6 +90,9 @@ pub struct Run {
     /// Cuts and weights that were applied to the catalogues, if any.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub selection: Option<String>,
+    /// Whether the images of a set are epochs of the same galaxies, with one catalogue by the number of the first.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub epochs: bool,
 }
 
 impl Run {
@@ -104,6 +108,24 @@ impl Run {
             configuration,
             format,
             selection: None,
+            epochs: false,
+        }
+    }
+
+    /// Images of `sets` of a data folder (of all its sets if empty) by whose numbers there are catalogues.
+    pub fn images(&self, data: &DataFolder, sets: &[u32]) -> Result<Vec<ImageId>, FileError> {
+        let mut all = images::of_folder(data, sets)?;
+        if self.epochs {
+            all.dedup_by_key(|id| id.set);
+        }
+        Ok(all)
+    }
+
+    /// The images that the catalogue `id` is measured from.
+    pub fn epochs_of(&self, data: &DataFolder, id: ImageId) -> Result<Vec<ImageId>, FileError> {
+        match self.epochs {
+            true => images::of_folder(data, &[id.set]),
+            false => Ok(vec![id]),
         }
     }
 

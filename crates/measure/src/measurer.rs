@@ -472,17 +472,6 @@ impl Worker {
         measured.psf = PsfShape::mean(psfs);
         Ok(measured)
     }
-
-    /// Copies a full stamp; whether all of its pixels are finite.
-    fn read<T: Pixel>(&mut self, stamp: ArrayView2<'_, T>) -> Result<bool, MeasureError> {
-        let full = self.measurer.full();
-        if stamp.dim() != (full, full) {
-            let expected = format!("{full} × {full}");
-            return Err(MeasureError::square("a stamp", stamp.dim(), expected));
-        }
-        pixel::copy(stamp, &mut self.full);
-        Ok(all_finite(&self.full))
-    }
 }
 
 impl ImageWorker<'_> {

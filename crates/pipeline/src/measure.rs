@@ -4,6 +4,7 @@
 //! measures the images of a data folder, and writes a catalogue when all rows of an image are measured.
 
 mod catalogue;
+mod epochs;
 mod source;
 
 use std::collections::BTreeMap;
@@ -184,17 +185,16 @@ impl<'a> FolderMeasurement<'a> {
     ) -> Result<(), PipelineError> {
         for (k, &id) in todo.iter().enumerate() {
             let prints = inputs.prints(id)?;
-            let mut source = ImageSource::open(self.data, id, measurer.configuration())?;
-            let (mosaic, stamp) = (source.mosaic(), measurer.full());
-            // The method is planned once, for one size of stamps.
-            if mosaic.stamp != stamp {
-                let path = self.data.galaxies(id.set, id.image);
-                let message = format!(
-                    "the stamps have {} pixels a side; the stamps of earlier images have {stamp}",
-                    mosaic.stamp
-                );
-                return Err(FileError::new(path, message).into());
+            let epochs = self.run.epochs_of(self.data, id)?;
+            if epochs.len() > 1 {
+                if !self.read_epochs(&epochs, measurer, prints, feeder)? {
+                    return Ok(());
+                }
+                continue;
             }
+            let mut source = ImageSource::open(self.data, id, measurer.configuration())?;
+            let mosaic = source.mosaic();
+            self.check_side(id, mosaic, measurer)?;
             let session = Arc::new(source.session(measurer, feeder.ahead())?);
             let correlated = match k {
                 0 => source.correlated_noise(&session, feeder.ahead())?,
@@ -219,6 +219,73 @@ impl<'a> FolderMeasurement<'a> {
             }
         }
         Ok(())
+    }
+}
+
+impl FolderMeasurement<'_> {
+    // The method is planned once, for one size of stamps.
+    fn check_side(
+        &self,
+        id: ImageId,
+        mosaic: Mosaic,
+        measurer: &Measurer,
+    ) -> Result<(), FileError> {
+        let stamp = measurer.full();
+        if mosaic.stamp == stamp {
+            return Ok(());
+        }
+        let message = format!(
+            "the stamps have {} pixels a side; the stamps of earlier images have {stamp}",
+            mosaic.stamp
+        );
+        Err(FileError::new(
+            self.data.galaxies(id.set, id.image),
+            message,
+        ))
+    }
+
+    // Hands over the rows of a set whose images are epochs; false if the work has ended.
+    fn read_epochs(
+        &self,
+        ids: &[ImageId],
+        measurer: &Measurer,
+        prints: BTreeMap<String, String>,
+        feeder: &mut Feeder<'_, ImageRow<'static, ImageHead>>,
+    ) -> Result<bool, PipelineError> {
+        let mut sources = epochs::open(self.data, ids, measurer.configuration())?;
+        let mut sessions = Vec::new();
+        for (id, source) in ids.iter().zip(&mut sources) {
+            self.check_side(*id, source.image.mosaic(), measurer)?;
+            sessions.push(source.session(measurer, feeder.ahead())?);
+        }
+        let first = sessions.remove(0);
+        let others: Vec<_> = sessions.into_iter().map(Arc::new).collect();
+        let first = Arc::new(first.with_epochs(others.clone())?);
+        let mosaic = sources[0].image.mosaic();
+        let head = Arc::new(ImageHead {
+            id: ids[0],
+            mosaic,
+            run_warnings: Vec::new(),
+            table: sources[0].image.take_table(),
+            aligned: sources.iter().all(|source| source.image.is_aligned()),
+            prints,
+        });
+        for row in 0..mosaic.rows() {
+            let jobs = sources
+                .iter_mut()
+                .zip(std::iter::once(&first).chain(&others));
+            let jobs = jobs.map(|(source, session)| session.read(source, row));
+            let mut jobs = jobs.collect::<Result<Vec<_>, _>>()?;
+            let own = jobs.remove(0);
+            let row = ImageRow {
+                head: Arc::clone(&head),
+                jobs: vec![own.with_epochs(jobs)],
+            };
+            if !feeder.push(row) {
+                return Ok(false);
+            }
+        }
+        Ok(true)
     }
 }
 

@@ -27,13 +27,13 @@ const MAX_ROW_PIXELS: usize = 1 << 24;
 
 /// An open image with its PSFs.
 pub struct ImageSource {
-    path: PathBuf,
+    pub(super) path: PathBuf,
     mosaic: Mosaic,
-    image: ImageReader,
-    psfs: PsfSource,
-    noise: KnownNoise<'static>,
-    table: Option<StampTable>,
-    jacobians: Option<Vec<Jacobian>>,
+    pub(super) image: ImageReader,
+    pub(super) psfs: PsfSource,
+    pub(super) noise: KnownNoise<'static>,
+    pub(super) table: Option<StampTable>,
+    pub(super) jacobians: Option<Vec<Jacobian>>,
     gain: Option<f64>,
     aligned: bool,
     warnings: Vec<Warning>,
@@ -160,7 +160,7 @@ impl ImageSource {
         found.map_err(|error| self.named(error))
     }
 
-    fn named(&self, error: PipelineError) -> PipelineError {
+    pub(super) fn named(&self, error: PipelineError) -> PipelineError {
         match error {
             PipelineError::Measure(error) => FileError::new(&self.path, error).into(),
             other => other,
@@ -232,7 +232,7 @@ pub(crate) fn open_galaxies(
     Ok((image, mosaic))
 }
 
-enum PsfSource {
+pub(super) enum PsfSource {
     Shared(ArcArray2<f64>),
     Stars {
         image: Box<ImageReader>,
