@@ -48,45 +48,57 @@ impl<'a> AllPsfs<'a> {
 // after it has issued the warnings that explain it.
 type Catalogue<'py> = (Bound<'py, PyDict>, Vec<String>, Option<String>, String);
 
-/// Measures stamps `(n, ny, nx)`.
+/// One image: stamps `(n, ny, nx)`, with offsets of the galaxies from their centres for epochs.
 ///
 /// PSFs are one star stamp for all, star stamps one per galaxy, or formulas (FWHM, e1, e2 and β, which is NaN for
 /// Kolmogorov), one for all or one per galaxy. The noise is one level for all or one per stamp. Without any, the
 /// configuration measures it on the stamps. Jacobians (n, 2, 2), one for all or one per galaxy, are for the frame of the sky.
-/// Returns the columns of the catalogue, the warnings, and an error if all
-/// galaxies are flagged.
-#[pyfunction]
-#[expect(clippy::too_many_arguments, reason = "Python passes them by name")]
-pub(crate) fn measure<'py>(
-    py: Python<'py>,
-    stamps: &Bound<'py, PyAny>,
+#[derive(FromPyObject)]
+#[pyo3(from_item_all)]
+pub(crate) struct Image<'py> {
+    stamps: Bound<'py, PyAny>,
     star: Option<PyReadonlyArray2<'py, f64>>,
-    stars: Option<&Bound<'py, PyAny>>,
+    stars: Option<Bound<'py, PyAny>>,
     formulas: Option<PyReadonlyArray2<'py, f64>>,
     noise: Option<f64>,
     noises: Option<PyReadonlyArray1<'py, f64>>,
     jacobians: Option<PyReadonlyArray3<'py, f64>>,
-    submission: &Bound<'py, Configuration>,
-    threads_asked: Option<u16>,
-    progress: Option<Py<PyAny>>,
-) -> PyResult<Catalogue<'py>> {
-    let configuration = &submission.get().entry.configuration;
-    let stamps = Borrowed::new(stamps)?;
-    let (count, rows, _) = stamps.dim();
-    let measurer = Measurer::new(configuration, rows).map_err(of_measuring)?;
-    let stars = stars.map(Borrowed::new).transpose()?;
-    let psfs = match (star, &stars, formulas) {
-        (Some(star), None, None) => star_for_all(&measurer, star.as_array()),
-        (None, Some(stars), None) => star_of_each(&measurer, stars, count),
-        (None, None, Some(formulas)) => formula_psfs(&measurer, formulas.as_array(), count),
+    offsets: Option<PyReadonlyArray2<'py, f64>>,
+}
+
+/// The arrays of an image, which its source borrows.
+struct Arrays<'py> {
+    stamps: Borrowed<'py>,
+    stars: Option<Borrowed<'py>>,
+}
+
+type Source<'a> = (ArraySource<'a, PipelineError>, KnownNoise<'a>);
+
+fn source<'a>(
+    image: &'a Image<'_>,
+    arrays: &'a Arrays<'_>,
+    measurer: &Measurer,
+    failed: &'a Failure,
+) -> PyResult<Source<'a>> {
+    let (count, rows, _) = arrays.stamps.dim();
+    if rows != measurer.full() {
+        return Err(PyValueError::new_err(format!(
+            "epochs: stamps of {rows} px a side; expected {}, as the first epoch has",
+            measurer.full()
+        )));
+    }
+    let psfs = match (&image.star, &arrays.stars, &image.formulas) {
+        (Some(star), None, None) => star_for_all(measurer, star.as_array()),
+        (None, Some(stars), None) => star_of_each(measurer, stars, count),
+        (None, None, Some(formulas)) => formula_psfs(measurer, formulas.as_array(), count),
         _ => Err(PyValueError::new_err("psf: expected one kind of PSFs")),
     }?;
-    let noise = match (&noises, noise) {
+    let noise = match (&image.noises, image.noise) {
         (Some(levels), _) => KnownNoise::GivenEach(levels.as_slice()?.into()),
         (None, Some(level)) => KnownNoise::Given(level),
         (None, None) => KnownNoise::Unknown,
     };
-    let jacobians = jacobians.map(|array| {
+    let jacobians = image.jacobians.as_ref().map(|array| {
         let matrices = array.as_array();
         let matrices = matrices
             .outer_iter()
@@ -95,25 +107,57 @@ pub(crate) fn measure<'py>(
         each.map_err(|error| PyValueError::new_err(format!("wcs: {error}")))
     });
     let jacobians = jacobians.transpose()?;
-    let failure = Failure::default();
     let moved = match psfs {
         AllPsfs::Shared { moved, .. } => moved,
         AllPsfs::Stars(_) | AllPsfs::Formulas(_) => None,
     };
-    let (stamps, failed) = (stamps.shared(), &failure);
-    let source = ArraySource::from_fn(
+    let stamps = arrays.stamps.shared();
+    let mut source = ArraySource::from_fn(
         count,
         move |range| stamps.slice(range).map_err(|error| failed.keep(error)),
         move |range| psfs.slice(range).map_err(|error| failed.keep(error)),
         moved,
     );
-    let source = match jacobians {
-        Some(jacobians) => source.with_jacobians(jacobians).map_err(of_measuring)?,
-        None => source,
-    };
+    if let Some(jacobians) = jacobians {
+        source = source.with_jacobians(jacobians).map_err(of_measuring)?;
+    }
+    if let Some(offsets) = &image.offsets {
+        let rows = offsets.as_array();
+        let each: Vec<[f64; 2]> = rows.outer_iter().map(|row| [row[0], row[1]]).collect();
+        source = source.with_offsets(each).map_err(of_measuring)?;
+    }
+    Ok((source, noise))
+}
+
+/// Measures the galaxies of an image, or of several whose stamps are epochs of the same galaxies.
+///
+/// Returns the columns of the catalogue, the warnings, an error if all galaxies are flagged, and the frame.
+#[pyfunction]
+pub(crate) fn measure<'py>(
+    py: Python<'py>,
+    images: Vec<Image<'py>>,
+    submission: &Bound<'py, Configuration>,
+    threads_asked: Option<u16>,
+    progress: Option<Py<PyAny>>,
+) -> PyResult<Catalogue<'py>> {
+    let configuration = &submission.get().entry.configuration;
+    let borrowed = images.iter().map(|image| {
+        Ok(Arrays {
+            stamps: Borrowed::new(&image.stamps)?,
+            stars: image.stars.as_ref().map(Borrowed::new).transpose()?,
+        })
+    });
+    let arrays: Vec<Arrays<'_>> = borrowed.collect::<PyResult<_>>()?;
+    let (count, rows, _) = arrays.first().map_or((0, 0, 0), |first| first.stamps.dim());
+    let measurer = Measurer::new(configuration, rows).map_err(of_measuring)?;
+    let failure = Failure::default();
+    let sources = images.iter().zip(&arrays);
+    let sources: Vec<Source<'_>> = sources
+        .map(|(image, arrays)| source(image, arrays, &measurer, &failure))
+        .collect::<PyResult<_>>()?;
     let watch = Watch::new(progress, &failure);
     let threads = threads(threads_asked);
-    let measured = py.detach(|| measured(&measurer, source, noise, threads, watch));
+    let measured = py.detach(|| measured(&measurer, sources, threads, watch));
     let batch = failure.or(measured)?;
     let all_flagged = batch
         .all_flagged()
@@ -133,8 +177,7 @@ pub(crate) fn measure<'py>(
 // By the same engine as the command line, so that arrays and files have equal results.
 fn measured<'a>(
     measurer: &Measurer,
-    mut source: ArraySource<'a, PipelineError>,
-    noise: KnownNoise<'a>,
+    images: Vec<Source<'a>>,
     threads: usize,
     mut watch: Watch<'_>,
 ) -> Result<Batch, PipelineError> {
@@ -143,12 +186,26 @@ fn measured<'a>(
         threads,
         std::slice::from_ref(measurer),
         |feeder| {
-            let session = Session::open(measurer, &mut source, noise, feeder.ahead())?;
-            let (session, head) = (Arc::new(session), Arc::new(()));
-            for row in 0..session.rows().len() {
+            let (mut sources, mut sessions) = (Vec::new(), Vec::new());
+            for (mut source, noise) in images {
+                sessions.push(Session::open(measurer, &mut source, noise, feeder.ahead())?);
+                sources.push(source);
+            }
+            if sessions.is_empty() {
+                return Ok(());
+            }
+            let first = sessions.remove(0);
+            let others: Vec<_> = sessions.into_iter().map(Arc::new).collect();
+            let (first, head) = (Arc::new(first.with_epochs(others.clone())?), Arc::new(()));
+            for row in 0..first.rows().len() {
+                let all = std::iter::once(&first).chain(&others);
+                let jobs = sources.iter_mut().zip(all);
+                let jobs = jobs.map(|(source, session)| session.read(source, row));
+                let mut jobs = jobs.collect::<Result<Vec<_>, _>>()?;
+                let own = jobs.remove(0);
                 let row = ImageRow {
                     head: Arc::clone(&head),
-                    jobs: vec![session.read(&mut source, row)?],
+                    jobs: vec![own.with_epochs(jobs)],
                 };
                 if !feeder.push(row) {
                     break;

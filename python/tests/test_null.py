@@ -33,6 +33,24 @@ def test_faults_are_found_where_they_are():
     assert found["x"]["g2"][0] - found["x"]["g2"][1] > 0.015
 
 
+def test_leakage_and_the_psf_are_tested_by_default():
+    pytest.importorskip("treecorr")
+    rng = np.random.default_rng(9)
+    field = _field(rng)
+    field |= {"psf_e1": rng.normal(0, 0.03, 4000), "psf_e2": rng.normal(0, 0.03, 4000), "psf_sigma": rng.normal(2, 0.1, 4000)}
+    field["g1"] = rng.normal(0, 0.1, 4000) + 0.3 * field["psf_e1"]
+    field["g2"] = rng.normal(0, 0.1, 4000)
+    # Galaxies without a shear, as `shear` writes them.
+    field["w"] = np.ones(4000)
+    field["w"][:50], field["g1"][:50] = 0, np.nan
+    found = shearq.null_tests(field, **SEPARATIONS)
+    alpha, error = found["leakage"]["alpha"], found["leakage"]["error"]
+    assert np.all(np.abs(alpha - [0.3, 0.0]) < 4 * error) and np.all(error < 0.07)
+    assert found["psf_e1"]["g1"][-1] > found["psf_e1"]["g1"][0] + 0.01 and "psf_sigma" in found
+    one = {**field, "psf_e1": np.full(4000, 0.03)}
+    assert np.isnan(shearq.null_tests(one, **SEPARATIONS)["leakage"]["alpha"][0])
+
+
 def test_rho_statistics_are_those_of_residuals():
     pytest.importorskip("treecorr")
     rng = np.random.default_rng(6)

@@ -86,6 +86,38 @@ def test_galsim_images_are_measured_on_their_own_pixels():
     assert np.allclose(np.sign(np.round(found["e2"], 2)), [0, 0, 1, -1])
 
 
+    arguments = shearq.from_galsim(images, psf, wcs="sky")
+    assert np.array_equal(arguments["wcs"], [MATRIX] * 4)
+    again = shearq.measure(**arguments, noise=0.01)
+    assert again.attrs["frame"] == "sky" and np.array_equal(again["e1"], found["e1"])
+    star = psf.drawImage(nx=48, ny=48, scale=0.2)
+    with pytest.raises(ValueError, match="psf: image 0 has the Jacobian .* and its stamp"):
+        shearq.from_galsim(images, star, wcs="sky")
+    with pytest.raises(ValueError, match="images: image 0 has no WCS"):
+        shearq.from_galsim([galsim.Image(48, 48)], star, wcs="sky")
+
+
+def test_the_shape_of_the_psf_is_that_of_hsm_in_the_frame(image):
+    galsim = pytest.importorskip("galsim")
+    profile = galsim.Moffat(beta=3, fwhm=0.6).shear(g1=0.05, g2=-0.03)
+    wcs = galsim.JacobianWCS(*MATRIX.ravel())
+    own = shearq.measure(image.stamps[:2], profile.drawImage(nx=48, ny=48, wcs=wcs).array, noise=1.0, wcs=MATRIX)
+    moments = galsim.hsm.FindAdaptiveMom(profile.drawImage(nx=96, ny=96, scale=0.2, method="no_pixel"))
+    # Pixels make it rounder by a few per cent of its shape.
+    assert np.allclose([own["psf_e1"][0], own["psf_e2"][0]], [moments.observed_shape.g1, moments.observed_shape.g2], atol=5e-3)
+    assert own["psf_sigma"][0] == pytest.approx(moments.moments_sigma * 0.2 / np.sqrt(abs(np.linalg.det(MATRIX))), rel=0.1)
+    pixels = galsim.hsm.FindAdaptiveMom(profile.drawImage(nx=48, ny=48, scale=0.2))
+    flat = shearq.measure(image.stamps[:2], profile.drawImage(nx=48, ny=48, scale=0.2).array, noise=1.0)
+    expected = [pixels.observed_shape.g1, pixels.observed_shape.g2, pixels.moments_sigma]
+    assert np.allclose([flat[name][0] for name in ("psf_e1", "psf_e2", "psf_sigma")], expected, atol=1e-3)
+
+
+def test_catalogues_of_two_frames_have_no_bias(image):
+    flat, sky = (shearq.measure(image.stamps, image.psf, noise=1.0, wcs=wcs) for wcs in (None, np.eye(2)))
+    with pytest.raises(ValueError, match="found ellipticities in the frames pixel and sky"):
+        shearq.bias([flat, sky], g1=[0.02, -0.02], g2=0.0)
+
+
 def test_wrong_wcs_are_named(image):
     def measure(wcs, **more):
         return shearq.measure(image.stamps, image.psf, wcs=wcs, **more)

@@ -242,7 +242,12 @@ def bias_sums(
     """
     if not (np.isfinite(step) and step > 0):
         raise ValueError(f"step: found {step!r}; expected a positive number")
-    given = [_catalogue(f"catalogue {number}", table) for number, table in enumerate(_several(catalogues), 1)]
+    tables = list(_several(catalogues))
+    # Of files, the extension module compares the metadata.
+    frames = sorted({table.attrs["frame"] for table in tables if "frame" in getattr(table, "attrs", {})})
+    if len(frames) > 1:
+        raise ValueError(f"catalogues: found ellipticities in the frames {' and '.join(frames)}; expected one frame")
+    given = [_catalogue(f"catalogue {number}", table) for number, table in enumerate(tables, 1)]
     if not given:
         raise ValueError("catalogues: found none; expected at least one")
     return BiasSums(

@@ -68,6 +68,15 @@ def _local(image: Any) -> Any:
     return None if wcs is None else wcs.local(image.true_center)
 
 
+def _jacobian(name: str, k: int, image: Any) -> NDArray[np.float64]:
+    """(∂u/∂x, ∂u/∂y), (∂v/∂x, ∂v/∂y) at the centre of an image."""
+    local = _local(image)
+    if local is None:
+        raise ValueError(f"{name}: image {k} has no WCS; expected one, to measure on the sky")
+    local = local.jacobian()
+    return np.array([[local.dudx, local.dudy], [local.dvdx, local.dvdy]])
+
+
 def _scale(image: Any, name: str) -> float | None:
     """The pixel scale of an image; None if it has no WCS."""
     if getattr(image, "wcs", None) is None:
@@ -102,7 +111,7 @@ def from_galsim(
     images: GalSimImage | Sequence[GalSimImage],
     psf: GalSimImage | GalSimProfile | Sequence[GalSimImage] | Sequence[GalSimProfile],
     *,
-    wcs: Literal["check", "ignore"] = "check",
+    wcs: Literal["check", "ignore", "sky"] = "check",
 ) -> dict[str, NDArray[Any]]:
     """Arguments of :func:`measure` for stamps and PSFs of GalSim.
 
@@ -113,14 +122,15 @@ def from_galsim(
     psf : galsim.Image, galsim.GSObject, or sequence of them
         One for all galaxies or one per galaxy. A profile is drawn on the pixels of the stamps, and convolved with
         them.
-    wcs : {'check', 'ignore'}
+    wcs : {'check', 'ignore', 'sky'}
         ``'check'`` refuses pixels that are flipped, rotated or sheared, and PSF images of another scale. ``'ignore'``
-        measures shears along the pixel axes.
+        measures shears along the pixel axes. ``'sky'`` measures any pixels in the frame of the sky, by the WCS of each image, and
+        refuses PSF images on other pixels.
 
     Returns
     -------
     dict
-        ``stamps`` of shape (n, ny, nx), and ``psf`` of shape (py, px) or (n, py, px).
+        ``stamps`` of shape (n, ny, nx), ``psf`` of shape (py, px) or (n, py, px), and for the sky ``wcs`` of shape (n, 2, 2).
 
     Raises
     ------
@@ -133,11 +143,18 @@ def from_galsim(
     --------
     ``shearq.measure(**shearq.from_galsim(images, psf))``
     """
-    if wcs not in ("check", "ignore"):
-        raise ValueError(f"wcs: found {wcs!r}; expected 'check' or 'ignore'")
+    if wcs not in ("check", "ignore", "sky"):
+        raise ValueError(f"wcs: found {wcs!r}; expected 'check', 'ignore' or 'sky'")
     stamps = _many(images, _is_image)
     if stamps is None:
         raise TypeError(f"images: found {type(images).__name__}; expected images of GalSim")
+    if wcs == "sky":
+        matrices = np.array([_jacobian("images", k, image) for k, image in enumerate(stamps)])
+        for k, image in enumerate(_many(psf, _is_image) or []):
+            own, of_stamps = _jacobian("psf", k, image), matrices[k] if k < len(matrices) else matrices[0]
+            if np.abs(own - of_stamps).max() > SAME * np.abs(of_stamps).max():
+                raise ValueError(f"psf: image {k} has the Jacobian {own.tolist()} and its stamp {of_stamps.tolist()}; expected one")
+        return {**from_galsim(images, psf, wcs="ignore"), "wcs": matrices}
     pixels = _array("stamps", stamps)
     scale = _common("stamps", stamps) if wcs == "check" else None
     profiles = _many(psf, _is_profile)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Union
 
 import numpy as np
@@ -108,9 +108,10 @@ class FunctionalPsf:
 
 
 def measure(
-    stamps: StampsLike,
-    psf: PsfLike,
+    stamps: StampsLike | None = None,
+    psf: PsfLike | None = None,
     *,
+    epochs: Sequence[Mapping[str, Any]] | None = None,
     noise: ArrayLike | None = None,
     mask: ArrayLike | None = None,
     x: ArrayLike | None = None,
@@ -135,6 +136,14 @@ def measure(
         One PSF for all galaxies or one per galaxy, centred like the stamps, of even or odd size, and at least as large
         as the configuration requires (32 pixels by default). It is cut and normalised. Profiles of GalSim are drawn
         on the pixels of GalSim stamps.
+    epochs : sequence of mappings, optional
+        Instead of `stamps` and `psf`: several stamps of each galaxy, which a linear configuration combines in each Fourier mode
+        with inverse-variance weights before it measures the shape. Each epoch has ``stamps`` and ``psf``, and perhaps
+        ``noise``, ``mask``, ``wcs``, ``x`` and ``y`` (for a WCS that varies), ``offsets`` of shape (n, 2): the galaxies from
+        the centres of their stamps along x and y in pixels, and ``flux``: that of the galaxies in relation to the other
+        epochs, a number or (n,), for bands. Galaxy k is on stamp k of each epoch; stamps of NaN are absent. The noise of an
+        epoch is taken as white. Each band counts with flux/noise², so that the fluxes are weights: they may be those of a
+        typical galaxy, and should not be measured on the noise of the galaxy itself.
     noise : float or array of shape (n,), optional
         Standard deviation of white noise per pixel in the unit of the stamps, for all or per stamp. By default it is
         measured. A linear configuration assumes one image, and measures noise, its correlation and the galaxy size on
@@ -200,8 +209,17 @@ def measure(
     g1 = ... ± ..., g2 = ... ± ... (400 galaxies, 0 flagged)
     >>> cat.write("shapes.parquet", overwrite=True)
     """
-    stamps, psf = _galsim.unpacked(stamps, psf, check=wcs is None)
-    return _measure(stamps, psf, noise, mask, wcs, (ids, x, y), resolve(submission), thread_count(threads), callback(progress))
+    settings, count, done = resolve(submission), thread_count(threads), callback(progress)
+    if epochs is None:
+        if stamps is None or psf is None:
+            raise TypeError("stamps, psf: found none; expected both, or epochs")
+        stamps, psf = _galsim.unpacked(stamps, psf, check=wcs is None)
+        return _measure([_image(stamps, psf, noise, mask, wcs, x, y)], (ids, x, y), settings, count, done)
+    given = {"stamps": stamps, "psf": psf, "noise": noise, "mask": mask, "wcs": wcs}
+    for name, value in given.items():
+        if value is not None:
+            raise TypeError(f"{name}: found with epochs; expected in each epoch")
+    return _measure([_epoch(k, epoch) for k, epoch in enumerate(epochs)], (ids, x, y), settings, count, done)
 
 
 def measure_blocks(
@@ -282,60 +300,101 @@ def measure_blocks(
             pixels = pixels if isinstance(pixels, np.ndarray) else np.asarray(pixels)
             local = wcs if wcs is None or len(wcs) == 1 else wcs[start:end]
             try:
-                yield _measure(pixels, one, level, missing, local, tuple(columns), settings, count, done)
+                image = _image(pixels, one, level, missing, local, *columns[1:])
+                yield _measure([image], tuple(columns), settings, count, done)
             except ValueError as error:
                 raise ValueError(f"{error} (stamps {start} to {end - 1})") from None
 
     return measured()
 
 
-def _measure(
-    stamps: Any,
-    psf: Any,
-    noise: ArrayLike | None,
-    mask: ArrayLike | None,
-    wcs: WcsLike | None,
-    columns: tuple[Any, ...],
-    settings: Configuration,
-    threads: int,
-    progress: Callable[[int], object] | None,
-) -> Catalogue:
-    """Measure arrays."""
+_EPOCH = ("stamps", "psf", "noise", "mask", "wcs", "x", "y", "offsets", "flux")
+
+
+def _epoch(k: int, epoch: Mapping[str, Any]) -> dict[str, Any]:
+    """The arrays of an epoch, in units of the flux that all epochs have."""
+    try:
+        unknown = [name for name in epoch if name not in _EPOCH]
+        if unknown or "stamps" not in epoch or "psf" not in epoch:
+            raise ValueError(f"found {', '.join(epoch)}; expected stamps, psf and perhaps {', '.join(_EPOCH[2:])}")
+        own = {name: epoch.get(name) for name in _EPOCH}
+        stamps, psf = _galsim.unpacked(own["stamps"], own["psf"], check=own["wcs"] is None)
+        noise = own["noise"]
+        if own["flux"] is not None:
+            flux = np.asarray(own["flux"], dtype=np.float64)
+            if not (np.isfinite(flux).all() and (flux > 0).all()):
+                raise ValueError("flux: found a number that is not positive; expected fluxes in any unit. Try: without the band")
+            stamps = numeric("stamps", stamps)
+            if flux.shape not in ((), (len(stamps),)):
+                raise ValueError(f"flux: found shape {shown(flux.shape)}; expected a number, or ({len(stamps)},)")
+            if noise is None and flux.ndim:
+                raise ValueError("noise: found none with a flux for each galaxy; expected a level")
+            stamps = stamps / flux.reshape(-1, 1, 1)
+            noise = None if noise is None else np.asarray(noise) / flux
+        image = _image(stamps, psf, noise, own["mask"], own["wcs"], own["x"], own["y"])
+        if own["offsets"] is not None:
+            offsets = double("offsets", own["offsets"])
+            if offsets.shape != (len(image["stamps"]), 2):
+                raise ValueError(f"offsets: found shape {shown(offsets.shape)}; expected ({len(image['stamps'])}, 2)")
+            image["offsets"] = offsets
+        return image
+    except (ValueError, TypeError) as error:
+        raise type(error)(f"epochs: epoch {k}: {error}") from None
+
+
+def _image(stamps: Any, psf: Any, noise: Any, mask: Any, wcs: Any, x: Any, y: Any) -> dict[str, Any]:
+    """The arrays of an image as the extension module takes them."""
     stamps = with_missing("stamps", stamps, mask)
     stamps = shaped("stamps", stamps, "(n, ny, nx), of one stamp stamps[np.newaxis]", axes=3)
     stamps = without_sentinels(stamps)
     count, rows, sides = stamps.shape
     if rows != sides:
         raise ValueError(f"stamps: found an array of shape {shown(stamps.shape)}; expected squares, ny = nx")
-    own = _own_columns(columns, count)
-    _, x, y = columns
-    on_sky = None if wcs is None else jacobians(wcs, count, x, y)
-    star = stars = formulas = None
+    image: dict[str, Any] = dict.fromkeys(("star", "stars", "formulas", "noise", "noises", "offsets"))
+    image["stamps"] = stamps
+    image["jacobians"] = None if wcs is None else jacobians(wcs, count, x, y)
     if isinstance(psf, FunctionalPsf):
-        formulas = psf._rows
+        image["formulas"] = psf._rows
     else:
         psf = numeric("psf", psf)
         psf = without_sentinels(psf) if psf.ndim in (2, 3) else psf
         if psf.ndim == 2:
-            star = double("psf", psf)
+            image["star"] = double("psf", psf)
         elif psf.ndim == 3 and len(psf) == count:
-            stars = psf
+            image["stars"] = psf
         else:
             raise ValueError(
                 f"psf: found an array of shape {shown(psf.shape)}; expected (py, px) or ({count}, py, px), one for each stamp"
             )
-    sigma = sigmas = None
     if noise is not None and np.ndim(noise) == 0:
-        sigma = real("noise", noise, "a finite number of image units, not negative", least=0.0)
+        image["noise"] = real("noise", noise, "a finite number of image units, not negative", least=0.0)
     elif noise is not None:
-        sigmas = double("noise", noise)
+        image["noises"] = sigmas = double("noise", noise)
         if sigmas.shape != (count,):
             raise ValueError(
                 f"noise: found an array of shape {shown(sigmas.shape)}; expected one number, or ({count},), one for each stamp"
             )
-    found, doubts, failure, frame = _shearq.measure(
-        stamps, star, stars, formulas, sigma, sigmas, on_sky, settings._resolved, threads, progress
-    )
+    return image
+
+
+def _measure(
+    images: list[dict[str, Any]],
+    columns: tuple[Any, ...],
+    settings: Configuration,
+    threads: int,
+    progress: Callable[[int], object] | None,
+) -> Catalogue:
+    """Measure the arrays of an image, or of several with epochs."""
+    if not images:
+        raise ValueError("epochs: found none; expected one or more")
+    count = len(images[0]["stamps"])
+    for k, image in enumerate(images):
+        if len(image["stamps"]) != count:
+            raise ValueError(f"epochs: epoch {k} has {len(image['stamps'])} stamps; expected {count}, one for each galaxy")
+    own = _own_columns(columns, count)
+    # The noise of several stars is not that of one.
+    star = images[0]["star"] if len(images) == 1 else None
+    found, doubts, failure, frame = _shearq.measure(images, settings._resolved, threads, progress)
     for doubt in doubts:
         warn(doubt, DataWarning)
     if failure is not None:

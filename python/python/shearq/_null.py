@@ -113,11 +113,13 @@ def _leakage(galaxies: Mapping[str, Any], weight: Any) -> dict[str, Any]:
     for component, name in zip(("g1", "g2"), _PSF):
         g, e = (values - np.average(values, weights=weight) for values in (galaxies[component], galaxies[name]))
         power = np.sum(weight * e * e)
-        # With one PSF for all galaxies, α cannot be told from c.
-        alpha = np.sum(weight * e * g) / power if power > 0 else np.nan
+        # With one PSF for all galaxies, whose mean is rounded, α cannot be told from c.
+        if power <= 1e-12 * np.sum(weight * galaxies[name] ** 2):
+            power = np.nan
+        alpha = np.sum(weight * e * g) / power
         found["alpha"].append(alpha)
         # From the scatter of the residuals, so that galaxies may have any weights.
-        found["error"].append(np.sqrt(np.sum((weight * e * (g - alpha * e)) ** 2)) / power if power > 0 else np.nan)
+        found["error"].append(np.sqrt(np.sum((weight * e * (g - alpha * e)) ** 2)) / power)
     return {key: np.array(values) for key, values in found.items()}
 
 

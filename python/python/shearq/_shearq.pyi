@@ -50,16 +50,11 @@ def read_table(path: str, format: str, keys: Sequence[str]) -> tuple[dict[str, A
 def write_table(path: str, format: str, columns: Sequence[tuple[str, Any]], metadata: dict[str, str]) -> None: ...
 def flags() -> list[tuple[str, int, str]]: ...
 def measure(
-    stamps: NDArray[Any],
-    star: _Doubles | None,
-    stars: NDArray[Any] | None,
-    formulas: _Doubles | None,
-    noise: float | None,
-    noises: _Doubles | None,
+    images: Sequence[dict[str, Any]],
     submission: Configuration,
     threads_asked: int,
     progress: Callable[[int], object] | None,
-) -> tuple[dict[str, NDArray[Any]], list[str], str | None]: ...
+) -> tuple[dict[str, NDArray[Any]], list[str], str | None, str]: ...
 def mean_shear(
     e1: _Doubles,
     e2: _Doubles,

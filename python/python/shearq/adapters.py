@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 # Pixels between the centre of an observation and the middle of its stamp.
 _OFF_CENTRE = 1.0
+# σ in pixels of the Gaussian under which mean fluxes of bands are measured. Chosen by hand: they are weights only.
+_FLUX_SIGMA = 3.0
 
 
 def _position(jacobian: Any, shape: tuple[int, int], k: int) -> None:
@@ -31,68 +33,59 @@ def _position(jacobian: Any, shape: tuple[int, int], k: int) -> None:
         )
 
 
-def from_ngmix(observations: Any) -> dict[str, NDArray[Any]]:
-    """Arguments of :func:`measure` for an ngmix ``Observation``, or a sequence of them.
+def from_ngmix(observations: Any, fluxes: Any = None) -> dict[str, Any]:
+    """Arguments of :func:`measure` for ngmix ``Observation``, ``ObsList`` or ``MultiBandObsList``, or a sequence of them.
 
     The noise is the inverse root of the median of the positive weights. Pixels with a weight of zero, or with a bit of
     ``bmask``, are missing.
 
     Parameters
     ----------
-    observations : ngmix.Observation or sequence of them
-        One per galaxy, each with a PSF observation, and with its galaxy in the middle of the stamp.
+    observations
+        One per galaxy, each with a PSF observation. An ``Observation`` has its galaxy in the middle of the stamp. An
+        ``ObsList`` has epochs, which may be rotated and dithered, and a ``MultiBandObsList`` has them in several bands.
+    fluxes : array of shape (bands,) or (n, bands), optional
+        Fluxes of the galaxies in the bands, in any unit. They weight the bands, with flux/noise², and should not be measured on
+        the noise of the galaxy itself. By default they are the mean fluxes of all galaxies of the call under a Gaussian of
+        σ = 3 px: any common weights leave the shear unbiased, so that only the noise grows where colours differ.
 
     Returns
     -------
     dict
         ``stamps`` of shape (n, ny, nx), ``psf`` of shape (n, py, px), ``noise`` of shape (n,), and ``mask`` of shape
-        (n, ny, nx) if pixels are missing.
+        (n, ny, nx) if pixels are missing. Of lists, ``epochs``, with a WCS: shapes are in the frame of ngmix's (u, v).
 
     Raises
     ------
     ValueError
-        If pixels are not square and along the axes, or scales or shapes differ; or if weights or a PSF are absent.
+        If pixels of single observations are not square and along the axes, or scales or shapes differ; if weights or a PSF are
+        absent; or if the galaxies of a band have no mean flux.
 
     Examples
     --------
     ``shearq.measure(**shearq.from_ngmix(observations))``
     """
-    many = list(observations) if isinstance(observations, Sequence) else [observations]
+    is_one = not isinstance(observations, Sequence) or type(observations).__name__ in ("ObsList", "MultiBandObsList")
+    many = [observations] if is_one else list(observations)
     if not many:
         raise ValueError("observations: found none; expected one or more")
-    stamps, psfs, noise, masks = [], [], [], []
+    if any(isinstance(one, Sequence) for one in many):
+        return {"epochs": _epochs([_bands(k, one) for k, one in enumerate(many)], fluxes)}
+    if fluxes is not None:
+        raise ValueError("fluxes: found for observations of one band; expected none")
+    parts = []
     for k, observation in enumerate(many):
-        if not hasattr(observation, "jacobian"):
-            raise TypeError(
-                f"observations: number {k} is of type {type(observation).__name__}; expected one Observation per galaxy,"
-                " of one band and epoch"
-            )
+        image, psf, noise, missing, matrices = _arrays(f"observation {k}", observation)
         scales = []
-        try:
-            pair = (("observation", observation), ("the PSF of observation", observation.psf))
-        except (AttributeError, RuntimeError) as error:
-            raise ValueError(f"observations: observation {k} has no PSF: {error}; expected one") from None
-        for what, one in pair:
-            jacobian = getattr(one, "jacobian", None)
-            if jacobian is not None:
-                values = [getattr(jacobian, f"get_d{way}")() for way in ("udcol", "udrow", "vdcol", "vdrow")]
-                remedy = "Try: resample the image, or transform the shears of the pixel axes yourself"
-                name = f"observations: {what} {k}"
-                scales.append(square_pixels(name, (values[0], values[1], values[2], values[3]), remedy))
+        for what, matrix in zip(("observation", "the PSF of observation"), matrices):
+            if matrix is not None:
+                remedy = "Try: an ObsList for each galaxy, which is measured on the sky"
+                scales.append(square_pixels(f"observations: {what} {k}", matrix, remedy))
         if max(scales) - min(scales) > SAME * min(scales):
             raise ValueError(f"observations: observation {k} has the pixel scales {scales} (image, PSF); expected one scale")
-        image, weight = np.asarray(observation.image), np.asarray(observation.weight)
         _position(observation.jacobian, (image.shape[0], image.shape[1]), k)
-        positive = weight[weight > 0]
-        if positive.size == 0:
-            raise ValueError(f"observations: no weight of observation {k} is positive; expected inverse variances")
-        missing = weight <= 0
-        if getattr(observation, "bmask", None) is not None:
-            missing |= np.asarray(observation.bmask) != 0
-        stamps.append(image)
-        psfs.append(np.asarray(observation.psf.image))
-        noise.append(1 / np.sqrt(np.median(positive)))
-        masks.append(missing)
+        parts.append((image, psf, noise, missing))
+    stamps, psfs, noise, masks = zip(*parts)
     for name, images in (("image", stamps), ("PSF image", psfs)):
         shapes = {np.shape(image) for image in images}
         if len(shapes) > 1:
@@ -101,6 +94,103 @@ def from_ngmix(observations: Any) -> dict[str, NDArray[Any]]:
     if any(mask.any() for mask in masks):
         found["mask"] = np.stack(masks)
     return found
+
+
+def _arrays(what: str, observation: Any) -> tuple[Any, Any, float, Any, list[Any]]:
+    """Image, PSF, noise, missing pixels, and the Jacobians (du/dx, du/dy, dv/dx, dv/dy) of both."""
+    if not hasattr(observation, "jacobian"):
+        raise TypeError(
+            f"observations: {what} is of type {type(observation).__name__}; expected an Observation, ObsList or MultiBandObsList"
+        )
+    try:
+        star = observation.psf
+    except (AttributeError, RuntimeError) as error:
+        raise ValueError(f"observations: {what} has no PSF: {error}; expected one") from None
+    matrices: list[Any] = []
+    for one in (observation, star):
+        jacobian = getattr(one, "jacobian", None)
+        ways = ("udcol", "udrow", "vdcol", "vdrow")
+        matrices.append(None if jacobian is None else tuple(getattr(jacobian, f"get_d{way}")() for way in ways))
+    image, weight = np.asarray(observation.image), np.asarray(observation.weight)
+    positive = weight[weight > 0]
+    if positive.size == 0:
+        raise ValueError(f"observations: no weight of {what} is positive; expected inverse variances")
+    missing = weight <= 0
+    if getattr(observation, "bmask", None) is not None:
+        missing |= np.asarray(observation.bmask) != 0
+    return image, np.asarray(star.image), float(1 / np.sqrt(np.median(positive))), missing, matrices
+
+
+def _bands(k: int, galaxy: Any) -> list[list[Any]]:
+    """The epochs of a galaxy in each band."""
+    if not isinstance(galaxy, Sequence):
+        raise TypeError(f"observations: galaxy {k} is an Observation and others are lists; expected one kind")
+    bands = list(galaxy)
+    return bands if bands and all(isinstance(band, Sequence) for band in bands) else [bands]
+
+
+def _epochs(galaxies: list[list[list[Any]]], fluxes: Any) -> list[dict[str, Any]]:
+    """Epochs of all galaxies: the first of each, the second, and so on, band by band."""
+    bands = len(galaxies[0])
+    if any(len(galaxy) != bands for galaxy in galaxies):
+        raise ValueError(f"observations: the galaxies have other numbers of bands; expected {bands}, empty lists without epochs")
+    found = []
+    for band in range(bands):
+        for number in range(max(len(galaxy[band]) for galaxy in galaxies)):
+            found.append((band, _epoch_of(galaxies, band, number)))
+    if not found:
+        raise ValueError("observations: found no epoch; expected one or more")
+    if fluxes is None:
+        mean = [_mean_flux([epoch for of, epoch in found if of == band]) for band in range(bands)]
+        for band, flux in enumerate(mean):
+            if bands > 1 and not flux > 0:
+                raise ValueError(f"observations: the galaxies of band {band} have no mean flux (found {flux:g}). Try: without the band")
+        weights = np.array(mean) / np.nanmax(mean) if bands > 1 else np.ones(1)
+    else:
+        weights = np.asarray(fluxes, dtype=float)
+        if weights.shape not in ((bands,), (len(galaxies), bands)):
+            raise ValueError(f"fluxes: found shape {weights.shape}; expected ({bands},) or ({len(galaxies)}, {bands})")
+    for band, epoch in found:
+        if bands > 1:
+            epoch["flux"] = weights[..., band]
+    return [epoch for _, epoch in found]
+
+
+def _epoch_of(galaxies: list[list[list[Any]]], band: int, number: int) -> dict[str, Any]:
+    """One epoch of each galaxy, with stamps of NaN for those without it."""
+    parts = {}
+    for k, galaxy in enumerate(galaxies):
+        if number < len(galaxy[band]):
+            what = f"epoch {number} of band {band} of galaxy {k}"
+            observation = galaxy[band][number]
+            image, psf, noise, missing, (own, of_psf) = _arrays(what, observation)
+            if of_psf is not None and not np.allclose(own, of_psf, rtol=0, atol=SAME * np.max(np.abs(own))):
+                raise ValueError(f"observations: the PSF of {what} has another Jacobian; expected the pixels of its image")
+            row, column = observation.jacobian.get_cen()
+            offset = (column - (image.shape[1] - 1) / 2, row - (image.shape[0] - 1) / 2)
+            parts[k] = np.where(missing, np.nan, image), psf, noise, np.reshape(own, (2, 2)), offset
+    for name, place in (("image", 0), ("PSF image", 1)):
+        shapes = {np.shape(part[place]) for part in parts.values()}
+        if len(shapes) > 1:
+            raise ValueError(f"observations: {name}s of shapes {sorted(shapes)}; expected one shape")
+    stamp, psf, noise, matrix, _ = next(iter(parts.values()))
+    none = np.full(np.shape(stamp), np.nan), psf, noise, matrix, (0.0, 0.0)
+    columns = zip(*(parts.get(k, none) for k in range(len(galaxies))))
+    return dict(zip(("stamps", "psf", "noise", "wcs", "offsets"), map(np.array, columns)))
+
+
+def _mean_flux(epochs: list[dict[str, Any]]) -> float:
+    """The mean flux of galaxies under a Gaussian, with inverse-variance weights."""
+    light = weights = 0.0
+    for epoch in epochs:
+        side = epoch["stamps"].shape[-1]
+        rows, columns = np.indices((side, side)) - (side - 1) / 2
+        for stamp, noise, offset in zip(epoch["stamps"], epoch["noise"], epoch["offsets"]):
+            window = np.exp(-((columns - offset[0]) ** 2 + (rows - offset[1]) ** 2) / (2 * _FLUX_SIGMA**2))
+            seen = np.isfinite(stamp)
+            light += np.sum(window[seen] * stamp[seen]) / noise**2
+            weights += np.sum(window[seen] ** 2) / noise**2
+    return float(light / weights) if weights > 0 else np.nan
 
 
 def to_astropy(catalogue: Catalogue) -> astropy.table.Table:
