@@ -7,7 +7,7 @@ use ndarray::ArrayView2;
 use shearq_benches::{configuration, stamp};
 use shearq_measure::Measurer;
 use shearq_measure::parts::{
-    AdaptiveMoments, ClippedAcf, Network, Rule, Spectral, Step, WaveletWiener,
+    AdaptiveMoments, ClippedAcf, HexLattice, Network, Rule, Spectral, Step, WaveletWiener,
 };
 use shearq_quantities::Shear;
 use shearq_quantities::{FunctionalPsf, PsfProfile};
@@ -99,14 +99,14 @@ fn linear(c: &mut Criterion) {
             b.iter(|| plan.autocorrelate(&psf, black_box(&data), 1.0, &mut scratch, &mut lags));
         });
     }
-    let reach = 10;
-    let moments = AdaptiveMoments::new(method.shape.weight_scale, 2.0, reach);
-    let side = 2 * reach + 1;
-    let acf: Vec<f32> = (0..side * (reach + 1))
-        .map(|k| {
-            let (y, x) = ((k / side) as f32, (k % side) as f32 - reach as f32);
-            (-(x * x + y * y + 0.3 * x * y) / 5.0).exp()
-        })
+    let lattice = HexLattice {
+        row_spacing: 2.0,
+        reach: 10,
+    };
+    let moments = AdaptiveMoments::new(method.shape.weight_scale, lattice);
+    let acf: Vec<f32> = lattice
+        .places()
+        .map(|[x, y]| (-(x * x + y * y + 0.3 * x * y) / 20.0).exp() as f32)
         .collect();
     let mut values = moments.scratch();
     group.bench_function("adaptive moments", |b| {

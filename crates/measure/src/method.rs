@@ -306,7 +306,10 @@ impl Found {
             e1: e[0],
             e2: e[1],
             flags: Flags::NONE,
-            response,
+            // A shear of galaxies of all orientations sees the mean of R over rotations and reflections of the galaxy, half of
+            // its trace. The rest is noise that averages need not have: R11 and R22 correlate with −0.43, and with the mean of
+            // both the error of m is 1.5 times smaller. Sheared catalogues may be cut by e, and need all of R.
+            response: response.map(|[[r11, _], [_, r22]]| isotropic(0.5 * (r11 + r22))),
             observables,
             sheared: pair.and_then(|(observables, response)| {
                 self.sheared_catalogues(kind, e, response, observables)
@@ -456,6 +459,11 @@ impl Found {
             flux_error: observables.flux_error,
         })
     }
+}
+
+/// A response that is the same for both components.
+pub(crate) fn isotropic(response: f64) -> ResponseMatrix {
+    [[response, 0.0], [0.0, response]]
 }
 
 fn turned(by: &Spin2, Distortion { e1, e2 }: Distortion) -> Distortion {

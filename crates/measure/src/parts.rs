@@ -9,3 +9,4 @@ pub use crate::denoise::{DenoiseScratch, WaveletWiener, border_noise, frame};
 pub use crate::shape::{
     AdaptiveMoments, AdaptiveScratch, AdaptiveShape, ClippedAcf, ClippedAcfScratch, Moments,
 };
+pub use crate::transform::HexLattice;

@@ -18,6 +18,7 @@ use std::fmt;
 use std::sync::Arc;
 
 use crate::measurement::{Coupling, Observables, ResponseMatrix};
+use crate::method::isotropic;
 
 // In units of the noise of the S/N. At S/N 20, half widths of 0.25, 0.5 and 1 standard deviation of the size give errors of
 // m of 2.4, 1.8 and 1.4 (10⁻³) for 64,000 measurements.
@@ -91,7 +92,7 @@ impl fmt::Debug for Selection {
 pub struct Selected {
     /// Weighted ellipticity, before calibration.
     pub e: [f64; 2],
-    /// Its response to shear. Changes with noise are corrected on the diagonal; off it they vanish in the mean.
+    /// Its response to shear, in the mean over orientations of the galaxy.
     pub response: ResponseMatrix,
     /// The weight; zero for galaxies that are cut.
     pub weight: f64,
@@ -179,21 +180,21 @@ impl Selection {
             weight: w.value,
             ..Selected::default()
         };
+        let mut trace = 0.0;
         for k in 0..2 {
             let [e_f, e_s, ff, fs, ss] = shear[k];
             let [e_r, fr, sr, rr] = ring_shear[k];
             selected.e[k] = w.value * e[k] + along(t_e[k]) + 0.5 * e[k] * t_curved;
-            selected.response[k] = [0, 1].map(|j| {
-                let responses = [
-                    galaxy.flux_response[j],
-                    galaxy.size_response[j],
-                    galaxy.ring_response[j],
-                ];
-                w.value * response[k][j] + e[k] * along(responses)
-            });
-            selected.response[k][k] -= 2.0 * along([e_f, e_s, e_r]);
-            selected.response[k][k] -= e[k] * curved([ff, fs, ss], [fr, sr, rr]);
+            let responses = [
+                galaxy.flux_response[k],
+                galaxy.size_response[k],
+                galaxy.ring_response[k],
+            ];
+            trace += w.value * response[k][k] + e[k] * along(responses)
+                - 2.0 * along([e_f, e_s, e_r])
+                - e[k] * curved([ff, fs, ss], [fr, sr, rr]);
         }
+        selected.response = isotropic(0.5 * trace);
         selected
     }
 
@@ -437,7 +438,8 @@ mod tests {
         let e = [0.1, -0.2];
         let all = cuts(&[(Quantity::Snr, true, 5.0, None)]);
         let kept = all.apply(e, RESPONSE, &galaxy());
-        assert_eq!((kept.e, kept.response, kept.weight), (e, RESPONSE, 1.0));
+        assert_eq!((kept.e, kept.weight), (e, 1.0));
+        assert_eq!(kept.response, isotropic(0.5 * (0.4 + 0.3)));
         let none = cuts(&[(Quantity::Snr, false, 5.0, None)]);
         assert_eq!(none.apply(e, RESPONSE, &galaxy()), Selected::default());
     }
@@ -459,17 +461,9 @@ mod tests {
         let e2 = -w * 0.2 + w_f * 0.3 - w_s * 0.4 - 0.5 * 0.2 * curved;
         // Rounding of second differences.
         let close = |a: f64, b: f64| (a - b).abs() < 1e-6;
-        assert!(
-            close(found.response[0][0], first) && close(found.response[1][1], second),
-            "{found:?}"
-        );
-        // To the other component, flux and size respond as they do to this component.
-        let first = w * RESPONSE[0][1] + 0.1 * (-w_f + w_s * 0.4);
-        let second = w * RESPONSE[1][0] - 0.2 * (w_f * 3.0 + w_s * 0.2);
-        assert!(
-            close(found.response[0][1], first) && close(found.response[1][0], second),
-            "{found:?}"
-        );
+        let [[r11, r12], [r21, r22]] = found.response;
+        assert!(close(r11, 0.5 * (first + second)), "{found:?}");
+        assert_eq!((r22, r12, r21), (r11, 0.0, 0.0));
         assert!(close(found.e[0], e1) && close(found.e[1], e2), "{found:?}");
     }
 }

@@ -864,27 +864,109 @@ impl ToPixels {
     }
 }
 
+/// Lags on a hexagonal lattice: rows along x, of which every second one begins half a step further.
+///
+/// It is the same after rotations by 60 degrees. Sums over it, and the circle that ends it, cannot prefer an axis to the
+/// diagonal between axes, as on a square lattice, where the response of e1 exceeds that of e2 by 1 to 6 % for small galaxies.
+/// It also has 13 % fewer places for the same distance to the nearest alias.
+#[derive(Debug, Clone, Copy)]
+pub struct HexLattice {
+    /// Pixels between rows.
+    pub row_spacing: f64,
+    /// Number of the last row, and radius of the circle of the lags that are used in rows.
+    pub reach: usize,
+}
+
+impl HexLattice {
+    /// Pixels between the lags of a row.
+    pub fn spacing(self) -> f64 {
+        self.row_spacing * 2.0 / 3f64.sqrt()
+    }
+
+    /// Largest whole number of steps along x within the circle.
+    fn columns(self) -> usize {
+        (self.radius() / self.spacing()) as usize
+    }
+
+    /// Lags in a row.
+    pub fn width(self) -> usize {
+        2 * self.columns() + 2
+    }
+
+    /// Lags in half the plane.
+    pub fn count(self) -> usize {
+        (self.reach + 1) * self.width()
+    }
+
+    /// Area in px² of a lag.
+    pub fn area(self) -> f64 {
+        self.row_spacing * self.spacing()
+    }
+
+    /// Where a row has x = 0, in lags.
+    pub fn middle(self, row: usize) -> f64 {
+        (2 * self.columns() + row % 2) as f64 / 2.0
+    }
+
+    /// Places (x, y) of the lags in px, row by row.
+    pub fn places(self) -> impl Iterator<Item = [f64; 2]> {
+        (0..=self.reach).flat_map(move |row| {
+            (0..self.width()).map(move |at| {
+                let x = (at as f64 - self.middle(row)) * self.spacing();
+                [x, row as f64 * self.row_spacing]
+            })
+        })
+    }
+
+    /// Largest lag that is used, in px.
+    pub fn radius(self) -> f64 {
+        self.reach as f64 * self.row_spacing
+    }
+
+    /// Whether a lag is within the circle.
+    pub fn contains(self, [x, y]: [f64; 2]) -> bool {
+        x.hypot(y) <= self.radius() * (1.0 + 1e-12)
+    }
+}
+
 /// From real even spectra, given as cc and ss, to lags of autocorrelations, and the adjoint.
 ///
-/// Lags dy = 0…R, dx = −R…R are laid out as `[dy·(2R+1) + dx + R]`; the others follow from A(−dx, −dy) = A(dx, dy).
+/// Lags are sums over modes along y, and then along x.
 #[derive(Debug, Clone)]
 pub(crate) struct ToLags {
-    reach: usize,
+    /// Lags in a row, and those from zero or half a step on. The last may be beyond them, and is zero.
+    row: usize,
+    count: usize,
     modes: usize,
     rows: usize,
     width: usize,
-    /// Rows and columns of lags from zero, filled up.
-    lag_rows: usize,
+    /// Columns of lags from zero, filled up.
     lag_width: usize,
-    /// cos and sin by lag along y and mode, and by mode and lag along x: a mode stands for its opposite.
+    /// Columns of `down_back`: stored rows of lags, filled up.
+    down_width: usize,
+    /// cos and sin by stored row of lags and mode: a mode stands for its opposite.
     down: [Vec<f32>; 2],
-    across: [Vec<f32>; 2],
-    /// The adjoint: by mode and lag along y, which stands for its opposite, and by lag along x and mode.
+    /// The adjoint, by mode and stored row of lags, which stands for its opposite.
     down_back: [Vec<f32>; 2],
+    groups: Vec<LagRows>,
+}
+
+/// Rows whose lags have the same places along x.
+#[derive(Debug, Clone)]
+struct LagRows {
+    /// Number of each row along y.
+    rows: Vec<usize>,
+    /// Stored rows before these, and of these, filled up.
+    first: usize,
+    stored: usize,
+    /// Whether the first lag is at zero, and not half a step from it.
+    from_zero: bool,
+    /// cos and sin by mode and lag along x: a mode stands for its opposite. And the adjoint, by lag and mode.
+    across: [Vec<f32>; 2],
     across_back: [Vec<f32>; 2],
 }
 
-/// Buffers for one thread. Their content between calls does not matter.
+/// Buffers for one thread.
 #[derive(Debug, Clone)]
 pub(crate) struct LagsScratch {
     /// Halfway between modes and lags.
@@ -896,118 +978,183 @@ pub(crate) struct LagsScratch {
 impl ToLags {
     /// For lags up to `reach` steps along an axis, of which a period has `steps`; `scale` multiplies the sums over modes.
     pub(crate) fn new(reach: usize, steps: usize, plane: &Plane, scale: f64) -> Self {
-        let unit = std::f64::consts::TAU / steps as f64;
-        let (modes, lags) = (plane.modes + 1, reach + 1);
-        let lag_rows = lags.next_multiple_of(ROWS);
-        let lag_width = lags.next_multiple_of(LANES);
+        let all = vec![((0..=reach).collect(), true)];
+        let (row, steps) = (2 * reach + 1, [steps as f64; 2]);
+        Self::of_groups(all, [row, reach + 1], steps, plane, scale)
+    }
+
+    /// For the lags of a lattice, of whose rows a period has `steps`.
+    pub(crate) fn hexagonal(lattice: HexLattice, steps: usize, plane: &Plane) -> Self {
+        let rows = |first: usize| (first..=lattice.reach).step_by(2).collect();
+        let groups = vec![(rows(0), true), (rows(1), false)];
+        let lags = [lattice.width(), lattice.columns() + 1];
+        let along_x = steps as f64 * lattice.row_spacing / lattice.spacing();
+        Self::of_groups(groups, lags, [along_x, steps as f64], plane, 1.0)
+    }
+
+    // Of each group: the rows, and whether they have a lag at zero.
+    fn of_groups(
+        groups: Vec<(Vec<usize>, bool)>,
+        [row, count]: [usize; 2],
+        steps: [f64; 2],
+        plane: &Plane,
+        scale: f64,
+    ) -> Self {
+        let [unit_x, unit_y] = steps.map(|steps| std::f64::consts::TAU / steps);
+        let modes = plane.modes + 1;
         // A spectrum that is the same at opposite modes has an even image: Σ P cos(k_x dx + k_y dy), of which cc takes the products
         // of cosines and ss those of sines.
-        let wave = |parity: usize, lag: usize, mode: usize| {
-            let angle = unit * (lag * mode) as f64;
+        let wave = |parity: usize, angle: f64| {
             if parity == 0 {
                 angle.cos()
             } else {
                 angle.sin()
             }
         };
-        let both_signs = |lag: usize| if lag == 0 { 1.0 } else { 2.0 };
         let tables = |used, stored, value: &dyn Fn(usize, usize, usize) -> f64| {
             [0, 1].map(|parity| table(used, stored, |a, b| value(parity, a, b)))
         };
+        let lag_width = (row - count + 1).next_multiple_of(LANES);
+        let mut stored_rows: Vec<Option<usize>> = Vec::new();
+        let mut found = Vec::new();
+        for (rows, from_zero) in groups {
+            let start = if from_zero { 0.0 } else { 0.5 };
+            let first = stored_rows.len();
+            stored_rows.extend(rows.iter().map(|&row| Some(row)));
+            stored_rows.resize(stored_rows.len().next_multiple_of(ROWS), None);
+            let place = |lag: usize, mode: usize| unit_x * (lag as f64 + start) * mode as f64;
+            found.push(LagRows {
+                first,
+                stored: stored_rows.len() - first,
+                rows,
+                from_zero,
+                across: tables([modes, count], [modes, lag_width], &|parity, mode, lag| {
+                    scale * (plane.count(mode) * wave(parity, place(lag, mode)))
+                }),
+                across_back: tables(
+                    [count, modes],
+                    [count, plane.width],
+                    &|parity, lag, mode| scale * wave(parity, place(lag, mode)),
+                ),
+            });
+        }
+        let lag_rows = stored_rows.len();
+        let down_width = lag_rows.next_multiple_of(LANES);
+        let both_signs = |lag: usize| if lag == 0 { 1.0 } else { 2.0 };
+        let angle = |lag: usize, mode: usize| unit_y * (lag * mode) as f64;
         ToLags {
-            reach,
+            row,
+            count,
             modes,
             rows: plane.rows,
             width: plane.width,
-            lag_rows,
             lag_width,
+            down_width,
             down: tables(
-                [lags, modes],
+                [lag_rows, modes],
                 [lag_rows, plane.width],
-                &|parity, lag, mode| plane.count(mode) * wave(parity, lag, mode),
+                &|parity, at, mode| {
+                    stored_rows[at].map_or(0.0, |lag| {
+                        plane.count(mode) * wave(parity, angle(lag, mode))
+                    })
+                },
             ),
-            across: tables([modes, lags], [modes, lag_width], &|parity, mode, lag| {
-                scale * (plane.count(mode) * wave(parity, lag, mode))
-            }),
             down_back: tables(
-                [modes, lags],
-                [plane.rows, lag_width],
-                &|parity, mode, lag| both_signs(lag) * wave(parity, lag, mode),
+                [modes, lag_rows],
+                [plane.rows, down_width],
+                &|parity, mode, at| {
+                    stored_rows[at]
+                        .map_or(0.0, |lag| both_signs(lag) * wave(parity, angle(lag, mode)))
+                },
             ),
-            across_back: tables([lags, modes], [lags, plane.width], &|parity, lag, mode| {
-                scale * wave(parity, lag, mode)
-            }),
+            groups: found,
         }
     }
 
     pub(crate) fn scratch(&self) -> LagsScratch {
-        let (rows, width) = (self.rows.max(self.lag_rows), self.width.max(self.lag_width));
+        let stored = self.groups.iter().map(|group| group.stored).sum::<usize>();
+        let (rows, width) = (self.rows.max(stored), self.width.max(self.lag_width));
         LagsScratch {
             between: vec![0.0; rows * width],
-            lags: [0, 1].map(|_| vec![0.0; self.lag_rows * self.lag_width]),
+            lags: [0, 1].map(|_| vec![0.0; stored * self.lag_width]),
         }
     }
 
     pub(crate) fn len(&self) -> usize {
-        (self.reach + 1) * (2 * self.reach + 1)
+        self.row
+            * self
+                .groups
+                .iter()
+                .map(|group| group.rows.len())
+                .sum::<usize>()
     }
 
     /// The image of a spectrum at the lags.
     pub(crate) fn lags(&self, spectrum: &[f32], scratch: &mut LagsScratch, out: &mut [f32]) {
         let (modes, width, lag_width) = (self.modes, self.width, self.lag_width);
-        let between = &mut scratch.between[..self.lag_rows * width];
         let quarters = spectrum.chunks_exact(self.rows * width);
         for (parity, (quarter, lags)) in quarters.zip(&mut scratch.lags).enumerate() {
+            let between = &mut scratch.between[..self.down[parity].len()];
             let down = Matrix::new(&self.down[parity], width);
             multiply(down, Matrix::new(quarter, width), modes, between, width);
-            let across = Matrix::new(&self.across[parity], lag_width);
-            multiply(Matrix::new(between, width), across, modes, lags, lag_width);
+            for group in &self.groups {
+                let across = Matrix::new(&group.across[parity], lag_width);
+                let between = Matrix::new(&between[group.first * width..], width);
+                let lags = &mut lags[group.first * lag_width..][..group.stored * lag_width];
+                multiply(between, across, modes, lags, lag_width);
+            }
         }
         let [even, odd] = &scratch.lags;
-        let rows = even
-            .chunks_exact(lag_width)
-            .zip(odd.chunks_exact(lag_width));
-        for (out, (even, odd)) in out.chunks_exact_mut(2 * self.reach + 1).zip(rows) {
-            let (left, right) = out.split_at_mut(self.reach);
-            for (out, (even, odd)) in right.iter_mut().zip(even.iter().zip(odd)) {
-                *out = even + odd;
-            }
-            let opposite = even[1..].iter().zip(&odd[1..]);
-            for (out, (even, odd)) in left.iter_mut().rev().zip(opposite) {
-                *out = even - odd;
+        for group in &self.groups {
+            let skip = usize::from(group.from_zero);
+            for (stored, &dy) in (group.first..).zip(&group.rows) {
+                let [even, odd] = [even, odd].map(|part| &part[stored * lag_width..][..lag_width]);
+                let (left, right) =
+                    out[dy * self.row..][..self.row].split_at_mut(self.count - skip);
+                for (out, (even, odd)) in right.iter_mut().zip(even.iter().zip(odd)) {
+                    *out = even + odd;
+                }
+                let opposite = even[skip..].iter().zip(&odd[skip..]);
+                for (out, (even, odd)) in left.iter_mut().rev().zip(opposite) {
+                    *out = even - odd;
+                }
             }
         }
     }
 
     /// The adjoint of [`ToLags::lags`]: the real even spectrum of an even function of the lags.
     pub(crate) fn spectrum(&self, lags: &[f32], scratch: &mut LagsScratch, out: &mut [f32]) {
-        let (reach, width, lag_width) = (self.reach, self.width, self.lag_width);
+        let (width, lag_width) = (self.width, self.lag_width);
         let [even, odd] = &mut scratch.lags;
-        let rows = even
-            .chunks_exact_mut(lag_width)
-            .zip(odd.chunks_exact_mut(lag_width));
-        for (from, (even, odd)) in lags.chunks_exact(2 * reach + 1).zip(rows) {
-            let (left, right) = from.split_at(reach);
-            (even[0], odd[0]) = (right[0], 0.0);
-            let pairs = right[1..].iter().zip(left.iter().rev());
-            let out = even[1..].iter_mut().zip(&mut odd[1..]);
-            for ((even, odd), (right, left)) in out.zip(pairs) {
-                (*even, *odd) = (right + left, right - left);
+        for group in &self.groups {
+            let skip = usize::from(group.from_zero);
+            for (stored, &dy) in (group.first..).zip(&group.rows) {
+                let [even, odd] =
+                    [&mut *even, odd].map(|part| &mut part[stored * lag_width..][..lag_width]);
+                let (left, right) = lags[dy * self.row..][..self.row].split_at(self.count - skip);
+                (even[0], odd[0]) = (right[0], 0.0);
+                let pairs = right[skip..].iter().zip(left.iter().rev());
+                let out = even[skip..].iter_mut().zip(&mut odd[skip..]);
+                for ((even, odd), (right, left)) in out.zip(pairs) {
+                    (*even, *odd) = (right + left, right - left);
+                }
             }
         }
-        let between = &mut scratch.between[..self.lag_rows * width];
+        let lag_rows = scratch.lags[0].len() / lag_width;
         let quarters = out.chunks_exact_mut(self.rows * width);
         for (parity, (quarter, folded)) in quarters.zip(&scratch.lags).enumerate() {
-            let across = Matrix::new(&self.across_back[parity], width);
-            multiply(
-                Matrix::new(folded, lag_width),
-                across,
-                reach + 1,
-                between,
-                width,
-            );
-            let down = Matrix::new(&self.down_back[parity], lag_width);
-            multiply(down, Matrix::new(between, width), reach + 1, quarter, width);
+            let between = &mut scratch.between[..lag_rows * width];
+            for group in &self.groups {
+                multiply(
+                    Matrix::new(&folded[group.first * lag_width..], lag_width),
+                    Matrix::new(&group.across_back[parity], width),
+                    self.count,
+                    &mut between[group.first * width..][..group.stored * width],
+                    width,
+                );
+            }
+            let down = Matrix::new(&self.down_back[parity], self.down_width);
+            multiply(down, Matrix::new(between, width), lag_rows, quarter, width);
         }
     }
 }
@@ -1215,14 +1362,36 @@ mod tests {
     #[test]
     fn lags_are_plain_sums_and_spectra_of_weights_their_adjoint() {
         let mut rng = ChaCha8Rng::seed_from_u64(6);
-        for (plane, reach, steps) in [
-            (Plane::new(64, 23), 15, 48),
-            (Plane::new(48, 7), 9, 24),
-            (Plane::with_all_modes(12), 6, 12),
-            (Plane::with_all_modes(9), 4, 9),
+        for (plane, reach, steps, hexagonal) in [
+            (Plane::new(64, 23), 15, 48, false),
+            (Plane::new(48, 7), 9, 24, false),
+            (Plane::with_all_modes(12), 6, 12, false),
+            (Plane::with_all_modes(9), 4, 9, false),
+            (Plane::new(64, 23), 15, 48, true),
+            (Plane::new(48, 7), 10, 24, true),
         ] {
-            let to_lags = ToLags::new(reach, steps, &plane, 0.5);
-            let (side, quarter) = (2 * reach + 1, plane.quarter());
+            // Places in steps along y.
+            let lattice = HexLattice {
+                row_spacing: 1.0,
+                reach,
+            };
+            let square = (0..=reach).flat_map(|y| {
+                let reach = reach as i32;
+                (-reach..=reach).map(move |x| [f64::from(x), y as f64])
+            });
+            let (to_lags, places, scale): (_, Vec<_>, _) = if hexagonal {
+                let to_lags = ToLags::hexagonal(lattice, steps, &plane);
+                (to_lags, lattice.places().collect(), 1.0)
+            } else {
+                (
+                    ToLags::new(reach, steps, &plane, 0.5),
+                    square.collect(),
+                    0.5,
+                )
+            };
+            let quarter = plane.quarter();
+            // The last place of rows with a lag at zero is beyond the circle, and is not used.
+            let used = |[x, y]: [f64; 2]| !hexagonal || lattice.contains([x, y]);
             let mut scratch = to_lags.scratch();
             // What another one left behind does not matter.
             scratch.between.fill(f32::NAN);
@@ -1248,23 +1417,28 @@ mod tests {
                 plane.count(x) * plane.count(y) / 2.0
             };
             let unit = std::f64::consts::TAU / steps as f64;
-            for (place, found) in lags.iter().enumerate() {
-                let (dy, dx) = ((place / side) as f64, (place % side) as f64 - reach as f64);
+            assert_eq!(lags.len(), places.len());
+            for (place, found) in places.iter().zip(&lags).filter(|(place, _)| used(**place)) {
+                let [dx, dy] = *place;
                 let terms = kept(&plane).map(|(at, _)| {
                     let (x, y, below) = plane.indices(at);
                     let y = if below { -(y as f64) } else { y as f64 };
                     share(at) * f64::from(modes[at]) * (unit * (x as f64 * dx + y * dy)).cos()
                 });
-                let plain = 0.5 * terms.sum::<f64>();
+                let plain = scale * terms.sum::<f64>();
                 assert!(
                     (f64::from(*found) - plain).abs() < 1e-4,
-                    "{place}: {found} {plain}"
+                    "{place:?}: {found} {plain}"
                 );
             }
             // Weights of the lags that are the same at opposite lags.
             let mut weights = numbers(&mut rng, to_lags.len());
-            for x in 0..reach {
-                weights[x] = weights[side - 1 - x];
+            for (at, &[x, y]) in places.iter().enumerate() {
+                if !used([x, y]) {
+                    weights[at] = 0.0;
+                } else if y == 0.0 && x < 0.0 {
+                    weights[at] = weights[places.iter().position(|at| *at == [-x, 0.0]).unwrap()];
+                }
             }
             let mut adjoint = vec![f32::NAN; 2 * quarter];
             to_lags.spectrum(&weights, &mut scratch, &mut adjoint);
@@ -1277,7 +1451,7 @@ mod tests {
             });
             let by_lags = weights.iter().zip(&lags).enumerate().map(|(at, (w, v))| {
                 // A place below the first row stands for two.
-                let count = if at >= side { 2.0 } else { 1.0 };
+                let count = if places[at][1] > 0.0 { 2.0 } else { 1.0 };
                 count * f64::from(*w) * f64::from(*v)
             });
             let (by_modes, by_lags): (f64, f64) = (by_modes.sum(), by_lags.sum());

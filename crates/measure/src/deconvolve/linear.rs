@@ -49,8 +49,8 @@ use crate::error::MeasureError;
 use crate::noise::StampNoise;
 use crate::stamp::{check_psf, check_sizes, copy_row};
 use crate::transform::{
-    LagsScratch, Modes, Plane, Spectrum, ToLags, ToModes, TransformScratch, even_parities,
-    four_lanes, lanes, store, table,
+    HexLattice, LagsScratch, Modes, Plane, Spectrum, ToLags, ToModes, TransformScratch,
+    even_parities, four_lanes, lanes, store, table,
 };
 
 /// Margin around a stamp, so that the deconvolved stamp does not wrap around.
@@ -76,9 +76,9 @@ const LARGEST_RING: f64 = 0.25;
 /// Largest lag of the autocorrelation in σ of the window.
 // Chosen by hand: the window's autocorrelation is a fifth there.
 const LARGEST_LAG: f64 = 2.5;
-/// Lags per sample of a grid that samples the kept modes, along an axis, at least.
+/// Rows of lags per sample of a grid that samples the kept modes, along an axis, at least.
 // Chosen by hand. Lags are closer together than the modes would need because the autocorrelation is multiplied by a weight with
-// structure of its own: sums over sparser lags depend on whether a galaxy lies along the grid or across it.
+// structure of its own.
 const LAGS_PER_SAMPLE: f64 = 1.5;
 /// Least power of the PSF's transform; modes below it are left out as pure noise.
 // Below 10⁻³, the least power in the simulated sets, and within single precision.
@@ -112,8 +112,7 @@ pub struct Spectral {
     leak: Smoothing,
     edges: Edges,
     to_lags: ToLags,
-    reach: usize,
-    lag_spacing: f64,
+    lattice: HexLattice,
     /// Scale of the autocorrelation for modes in the largest circle of those kept, zero outside; of a quarter.
     scale: Vec<f32>,
     /// Share of the noise under the window that the stamp contains.
@@ -150,8 +149,8 @@ pub struct SpectralScratch {
     lags: LagsScratch,
 }
 
-/// Autocorrelations on lags dy = 0…R, dx = −R…R, in steps of [`Spectral::spacing`]:
-/// `[dy·(2R+1) + dx + R]`.
+/// Autocorrelations on the half of the lags of [`Spectral::lattice`] with dy ≥ 0, row by row; the others follow from
+/// A(−dx, −dy) = A(dx, dy).
 #[derive(Debug, Clone)]
 pub struct Lags {
     /// Of the result.
@@ -240,9 +239,12 @@ impl Spectral {
         let samples = smooth_length(samples).min(period);
         let plane = Plane::new(period, samples / 2 - 1);
         let lags = smooth_length((LAGS_PER_SAMPLE * samples as f64).ceil() as usize);
-        let lag_spacing = period as f64 / lags as f64;
-        let reach = (LARGEST_LAG * window_sigma / lag_spacing) as usize;
-        let reach = reach.clamp(1, lags / 2 - 1);
+        let row_spacing = period as f64 / lags as f64;
+        let reach = (LARGEST_LAG * window_sigma / row_spacing) as usize;
+        let lattice = HexLattice {
+            row_spacing,
+            reach: reach.clamp(1, lags / 2 - 1),
+        };
 
         let indices = || (0..2 * plane.quarter()).map(|at| plane.indices(at));
         let waves: Vec<[f64; 2]> = indices()
@@ -325,9 +327,8 @@ impl Spectral {
             ring_counts,
             leak: Smoothing::new(|distance| inside * size * window[distance].powi(2), &plane),
             edges: Edges::new(n, &plane),
-            to_lags: ToLags::new(reach, lags, &plane, 1.0),
-            reach,
-            lag_spacing,
+            to_lags: ToLags::hexagonal(lattice, lags, &plane),
+            lattice,
             inside: (inside * inside) as f32,
             plane,
         })
@@ -338,14 +339,9 @@ impl Spectral {
         self.stamp.side()
     }
 
-    /// Largest lag, in steps of [`Spectral::spacing`].
-    pub fn reach(&self) -> usize {
-        self.reach
-    }
-
-    /// Pixels between lags.
-    pub fn spacing(&self) -> f64 {
-        self.lag_spacing
+    /// Where the lags are.
+    pub fn lattice(&self) -> HexLattice {
+        self.lattice
     }
 
     /// Buffers that fit this plan.

@@ -27,7 +27,6 @@ use shearq_submissions::{LinearDeconvolution, LinearMethod, PsfCut};
 
 use super::{
     AdaptedSettings, CutEpoch, CutWorker, Found, FoundObservables, Images, NoiseMoments, image,
-    whole_lags,
 };
 use crate::deconvolve::{
     EpochScratch, Lags, ModeNoise, Products, Spectral, SpectralEpoch, SpectralPsf, SpectralScratch,
@@ -41,6 +40,7 @@ use crate::second_moments::WeightedMoments;
 use crate::shape::{AdaptiveMoments, AdaptiveScratch, AdaptiveShape, FoundBreadth, SizeMoments};
 use crate::sheared::ShearSettings;
 use crate::stamp::hash;
+use crate::transform::HexLattice;
 
 // Of the error of the mean response, the choice of galaxies makes less than 1 % (tests/stress: base, snr10, cosmos20). Sheared
 // catalogues need the noise of every galaxy.
@@ -105,17 +105,14 @@ impl Regularisation {
             window_sigma,
             ..
         } = method.deconvolution;
-        let side = 2 * spectral.reach() as i32 + 1;
         let deconvolved = variance + target_sigma * target_sigma;
         let windowed = 1.0 / (1.0 / deconvolved + 1.0 / (window_sigma * window_sigma));
         let peak = windowed / (4.0 * std::f64::consts::PI * deconvolved * deconvolved);
-        let acf: Vec<f32> = (0..=spectral.reach() as i32)
-            .flat_map(|y| (0..side).map(move |x| (x - side / 2, y)))
-            .map(|(x, y)| {
-                let square = f64::from(x * x + y * y) * spectral.spacing().powi(2);
-                (peak * (-square / (4.0 * windowed)).exp()) as f32
-            })
-            .collect();
+        let lags = spectral.lattice().places().map(|[x, y]| {
+            let square = x * x + y * y;
+            (peak * (-square / (4.0 * windowed)).exp()) as f32
+        });
+        let acf: Vec<f32> = lags.collect();
         let [zero, two] = breadth.sums(&acf);
         Regularisation {
             ellipticity: moments.halving_regularisation(&acf)
@@ -167,9 +164,9 @@ impl LinearPlan {
         let settings = &method.deconvolution;
         let spectral = Spectral::new(n, p, settings)?;
         let scale = method.shape.weight_scale;
-        let moments = AdaptiveMoments::new(scale, spectral.spacing(), spectral.reach());
+        let moments = AdaptiveMoments::new(scale, spectral.lattice());
         let (target, window) = (settings.target_sigma, settings.window_sigma);
-        let breadth = SizeMoments::new(target, window, spectral.spacing(), spectral.reach());
+        let breadth = SizeMoments::new(target, window, spectral.lattice());
         let mut scratch = spectral.scratch();
         let gradients = breadth.gradients();
         let step = method.shape.sheared_step;
@@ -724,7 +721,7 @@ impl PlanWorker {
             noise_moments: None,
             observables: None,
             flux: plan.aperture * f64::from(lags.flux[0]),
-            radius: plan.spectral.reach() as f64 * plan.spectral.spacing(),
+            radius: plan.spectral.lattice().radius(),
             size: f64::NAN,
         };
         if let Some(shape) = self.shape {
@@ -755,8 +752,9 @@ impl PlanWorker {
             0.0
         };
         let deconvolved = spectral.deconvolved(&self.psf, cut, shift, &mut self.buffers);
-        let acf = whole_lags(&self.lags.acf, spectral.reach());
-        let lag = |place: usize| (place as f64 - spectral.reach() as f64) * spectral.spacing();
+        let lattice = spectral.lattice();
+        let acf = square_lags(&self.lags.acf, lattice);
+        let lag = |place: usize| (place as f64 - lattice.reach as f64) * lattice.row_spacing;
         let weight = self.shape.map(|shape| {
             Array2::from_shape_fn(acf.dim(), |(y, x)| moments.weight(&shape, lag(x), lag(y)))
         });
@@ -764,9 +762,33 @@ impl PlanWorker {
             deconvolved: image(&deconvolved, spectral.stamp_size()),
             acf,
             weight,
-            spacing: spectral.spacing(),
+            spacing: lattice.row_spacing,
         }
     }
+}
+
+/// An autocorrelation as an image, as many pixels apart as the rows of its lattice: interpolated along the rows.
+fn square_lags(lags: &[f32], lattice: HexLattice) -> Array2<f64> {
+    let side = 2 * lattice.reach + 1;
+    Array2::from_shape_fn((side, side), |(y, x)| {
+        let [x, y] = [x, y].map(|at| at as f64 - lattice.reach as f64);
+        // A(−dx, −dy) = A(dx, dy).
+        let (x, row) = if y < 0.0 {
+            (-x, -y as usize)
+        } else {
+            (x, y as usize)
+        };
+        let at = x * lattice.row_spacing / lattice.spacing() + lattice.middle(row);
+        let first = at.floor();
+        let value = |column: f64| {
+            if (0.0..lattice.width() as f64).contains(&column) {
+                f64::from(lags[row * lattice.width() + column as usize])
+            } else {
+                0.0
+            }
+        };
+        (1.0 - (at - first)) * value(first) + (at - first) * value(first + 1.0)
+    })
 }
 
 /// Index of the width for galaxies of a mean square of `variance` px² per axis. The configured width is for `reference` px².

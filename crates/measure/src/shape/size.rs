@@ -18,6 +18,8 @@
 use multiversion::multiversion;
 use shearq_quantities::product::LANES;
 
+use crate::transform::HexLattice;
+
 /// Scale τ of the weight in units of the window's σ.
 // Chosen by hand: wide enough that sizes up to 10 px differ.
 const WEIGHT_SCALE: f64 = 0.6;
@@ -48,27 +50,24 @@ pub(crate) struct FoundBreadth {
 }
 
 impl SizeMoments {
-    /// For lags up to `reach` steps of `spacing` px, a target of `target` px and a window of `window` px.
-    pub(crate) fn new(target: f64, window: f64, spacing: f64, reach: usize) -> Self {
+    /// For the lags of `lattice`, a target of `target` px and a window of `window` px.
+    pub(crate) fn new(target: f64, window: f64, lattice: HexLattice) -> Self {
         let tau = WEIGHT_SCALE * window;
-        let side = reach as i32;
         let mut weights = [Vec::new(), Vec::new()];
-        for y in 0..=side {
-            for x in -side..=side {
-                let square = f64::from(x * x + y * y) * spacing * spacing;
-                let within = x * x + y * y <= side * side;
-                let count = f64::from(u8::from(within)) * if y == 0 { 1.0 } else { 2.0 };
-                let weight = count * spacing * spacing * (-0.5 * square / (tau * tau)).exp();
-                weights[0].push(weight as f32);
-                weights[1].push((weight * square) as f32);
-            }
+        for [x, y] in lattice.places() {
+            let square = x * x + y * y;
+            let within = f64::from(u8::from(lattice.contains([x, y])));
+            let count = within * if y == 0.0 { 1.0 } else { 2.0 };
+            let weight = count * lattice.area() * (-0.5 * square / (tau * tau)).exp();
+            weights[0].push(weight as f32);
+            weights[1].push((weight * square) as f32);
         }
         SizeMoments {
             weights,
             target,
             rest: 2.0 / (tau * tau) + 1.0 / (window * window),
             window,
-            width: 2 * reach + 1,
+            width: lattice.width(),
         }
     }
 
@@ -168,28 +167,26 @@ fn sums(lags: &[f32], zero: &[f32], two: &[f32]) -> [f32; 2] {
 mod tests {
     use super::*;
 
-    const SPACING: f64 = 4.0 / 3.0;
-    const REACH: usize = 15;
+    const LATTICE: HexLattice = HexLattice {
+        row_spacing: 4.0 / 3.0,
+        reach: 15,
+    };
     const TARGET: f64 = 1.5;
     const WINDOW: f64 = 8.0;
 
     /// Autocorrelation of a windowed round Gaussian galaxy of standard deviation `r` and flux one.
     fn acf(r: f64) -> Vec<f32> {
         let variance = 1.0 / (1.0 / (r * r + TARGET * TARGET) + 1.0 / (WINDOW * WINDOW));
-        let side = REACH as i32;
-        let mut lags = Vec::new();
-        for y in 0..=side {
-            for x in -side..=side {
-                let square = f64::from(x * x + y * y) * SPACING * SPACING;
-                lags.push((-square / (4.0 * variance)).exp() as f32);
-            }
-        }
-        lags
+        let lags = LATTICE.places().map(|[x, y]| {
+            let square = x * x + y * y;
+            (-square / (4.0 * variance)).exp() as f32
+        });
+        lags.collect()
     }
 
     #[test]
     fn the_size_of_a_gaussian_is_its_standard_deviation() {
-        let breadth = SizeMoments::new(TARGET, WINDOW, SPACING, REACH);
+        let breadth = SizeMoments::new(TARGET, WINDOW, LATTICE);
         for r in [1.0, 2.0, 3.0, 5.0, 8.0] {
             let found = breadth.measure(&acf(r), 0.0, 0.0);
             let [size, first, second] = breadth.size(f64::from(found.square));
@@ -214,7 +211,7 @@ mod tests {
 
     #[test]
     fn responses_are_differences_and_noise_has_the_typical_size() {
-        let breadth = SizeMoments::new(TARGET, WINDOW, SPACING, REACH);
+        let breadth = SizeMoments::new(TARGET, WINDOW, LATTICE);
         let (galaxy, other) = (acf(2.0), acf(4.0));
         let found = breadth.measure(&galaxy, 3.0, 20.0);
         let step = 1e-3;
@@ -249,7 +246,7 @@ mod tests {
         assert_eq!(breadth.measure(&nothing, 3.0, 20.0).square, 20.0);
         let [zero, two] = breadth.gradients();
         let each = |weights: &[f32]| -> f32 {
-            let width = 2 * REACH + 1;
+            let width = LATTICE.width();
             let rows = weights.iter().zip(&other).enumerate();
             rows.map(|(at, (w, v))| w * v * if at < width { 1.0 } else { 2.0 })
                 .sum()

@@ -40,6 +40,10 @@ fn planned(
     (plan, psf, scratch)
 }
 
+fn zero_lag(plan: &Spectral) -> usize {
+    plan.lattice().middle(0) as usize
+}
+
 /// A lopsided PSF of sum one, centred on its stamp.
 fn psf(p: usize) -> Array2<f64> {
     let centre = (p as f64 - 1.0) / 2.0;
@@ -159,7 +163,6 @@ fn plain(
     });
     // Its power and the lags.
     let circle = unit * modes as f64 * (1.0 + 1e-12);
-    let reach = plan.reach() as i32;
     let powers: Vec<(f64, f64, f64)> = plane()
         .filter(|(kx, ky)| kx.hypot(*ky) <= circle)
         .map(|(kx, ky)| {
@@ -171,16 +174,13 @@ fn plain(
             )
         })
         .collect();
-    let mut lags = Vec::new();
-    for y in 0..=reach {
-        for x in -reach..=reach {
-            let terms = powers.iter().map(|(kx, ky, power)| {
-                power * (plan.spacing() * (kx * f64::from(x) + ky * f64::from(y))).cos()
-            });
-            lags.push(terms.sum());
-        }
-    }
-    lags
+    let lags = plan.lattice().places().map(|[x, y]| {
+        let terms = powers.iter();
+        terms
+            .map(|(kx, ky, power)| power * (kx * x + ky * y).cos())
+            .sum()
+    });
+    lags.collect()
 }
 
 #[test]
@@ -201,8 +201,10 @@ fn the_autocorrelation_equals_plain_sums_on_dirty_scratch() {
             .unwrap();
         plan.autocorrelate(&own, &data, 0.0, &mut scratch, &mut lags);
         let expected = plain(&plan, &settings, &h, &stamp);
-        let peak = expected[plan.reach()];
-        for (found, expected) in lags.acf.iter().zip(&expected) {
+        let peak = expected[zero_lag(&plan)];
+        let used = |place: &[f64; 2]| plan.lattice().contains(*place);
+        let pairs = lags.acf.iter().zip(&expected).zip(plan.lattice().places());
+        for ((found, expected), _) in pairs.filter(|(_, place)| used(place)) {
             // f32 transforms; modes below `LEAST_PSF_POWER`, which are left out, have none of the light.
             let apart = (f64::from(*found) - expected).abs();
             assert!(apart < 1e-5 * peak, "{n} {p}: {found} {expected}");
@@ -231,7 +233,7 @@ fn pictured(n: usize, h: &Array2<f64>, settings: &LinearDeconvolution, pixels: P
     plan.autocorrelate(&own, &data, 0.0, &mut scratch, &mut lags);
     let picture = plan.deconvolved(&own, &data, 0.0, &mut scratch);
     let square: f64 = picture.iter().map(|v| f64::from(v * v)).sum();
-    let peak = f64::from(lags.acf[plan.reach()]);
+    let peak = f64::from(lags.acf[zero_lag(&plan)]);
     // The window spreads a little light beyond the largest circle of modes.
     assert!((square / peak - 1.0).abs() < 4e-3, "{square} {peak}");
 }
@@ -256,7 +258,7 @@ fn the_response_on(pixels: PixelShape) {
         lags
     };
     let here = lags_of(0.0, 0.0);
-    let peak = here.acf[plan.reach()];
+    let peak = here.acf[zero_lag(&plan)];
     let step = 0.01;
     for (derivative, plus, minus) in [
         (&here.shear1, lags_of(step, 0.0), lags_of(-step, 0.0)),
@@ -414,7 +416,7 @@ fn a_window_that_follows_the_galaxy_gives_equal_lags() {
     plan.autocorrelate(&own, &moved, 0.0, &mut scratch, &mut there);
     plan.place_window([0.0; 2], &mut scratch);
     plan.autocorrelate(&own, &middle, 0.0, &mut scratch, &mut here);
-    let peak = here.acf[plan.reach()];
+    let peak = here.acf[zero_lag(&plan)];
     let pairs = |a: &[f32], b: &[f32]| {
         let apart = a.iter().zip(b).map(|(a, b)| (a - b).abs());
         apart.fold(0.0, f32::max)
@@ -438,11 +440,13 @@ fn a_round_galaxy_keeps_nothing_of_the_psfs_ellipticity() {
     let (plan, own, mut scratch) = planned(n, &h, &settings(1000, 1.5, 8.0, 0.0));
     let mut lags = plan.lags();
     plan.autocorrelate(&own, &data, 0.0, &mut scratch, &mut lags);
-    let (reach, width) = (plan.reach(), 2 * plan.reach() + 1);
-    for lag in 1..=reach {
-        let (x, y) = (lags.acf[reach + lag], lags.acf[lag * width + reach]);
+    let (lattice, zero) = (plan.lattice(), zero_lag(&plan));
+    for lag in 1..zero {
+        // 60 degrees further, rows are half a step apart.
+        let turned = lag * lattice.width() + zero + lag.div_ceil(2);
+        let (x, y) = (lags.acf[zero + lag], lags.acf[turned]);
         // 1e-5 is f32 through the division by the PSF's transform.
-        assert!((x - y).abs() < 2e-5 * lags.acf[reach], "{lag}: {x} {y}");
+        assert!((x - y).abs() < 2e-5 * lags.acf[zero], "{lag}: {x} {y}");
     }
 }
 
@@ -487,7 +491,7 @@ fn there_is_no_noise_beyond_the_edges_of_the_stamp() {
         let stamp = noise(n, &mut rng);
         for (mean, level) in means.iter_mut().zip([1.0, 0.0]) {
             plan.autocorrelate(&own, &stamp, level, &mut scratch, &mut lags);
-            *mean += f64::from(lags.acf[plan.reach()]);
+            *mean += f64::from(lags.acf[zero_lag(&plan)]);
         }
     }
     // 0.5 % of the window's square is beyond the edges of either axis. 8000 squares of some fifty modes: 0.2 %.
@@ -521,7 +525,7 @@ fn subtracted_in_the_mean(own_noise: &StampNoise, pixels: PixelShape, rng: &mut 
         }
     }
     let [with, without] = means;
-    let peak = without[0][plan.reach()];
+    let peak = without[0][zero_lag(&plan)];
     let largest = |lags: &[f64]| lags.iter().fold(0.0f64, |a, b| a.max(b.abs()));
     for (kind, (with, without)) in with.iter().zip(&without).enumerate() {
         let (left, all) = (largest(with), largest(without));
@@ -667,12 +671,15 @@ fn unusable_sizes_and_psfs_are_refused() {
 
 /// Weights of the lags that are the same at opposite lags.
 fn even(plan: &Spectral, rng: &mut ChaCha8Rng) -> Vec<f32> {
-    let width = 2 * plan.reach + 1;
-    let mut weights: Vec<f32> = (0..(plan.reach + 1) * width)
-        .map(|_| rng.random_range(-1.0..1.0))
-        .collect();
-    for x in 0..plan.reach {
-        weights[x] = weights[width - 1 - x];
+    let lattice = plan.lattice();
+    let weights = lattice.places().map(|place| {
+        let weight = rng.random_range(-1.0..1.0);
+        if lattice.contains(place) { weight } else { 0.0 }
+    });
+    let mut weights: Vec<f32> = weights.collect();
+    let zero = zero_lag(plan);
+    for lag in 1..=zero {
+        weights[zero - lag] = weights[zero + lag];
     }
     weights
 }
@@ -682,7 +689,11 @@ fn over_lags(plan: &Spectral, weights: &[f32], values: &[f32]) -> f64 {
     let products = weights.iter().zip(values).enumerate();
     products
         .map(|(at, (w, v))| {
-            let count = if at > 2 * plan.reach { 2.0 } else { 1.0 };
+            let count = if at < plan.lattice().width() {
+                1.0
+            } else {
+                2.0
+            };
             count * f64::from(*w) * f64::from(*v)
         })
         .sum()
@@ -823,8 +834,8 @@ fn mean_second_derivatives_are_sums_of_differences_over_modes() {
         (round, 0.03, 0.5),
     ] {
         let (plan, own, mut scratch) = planned(n, &h, &settings);
-        let moments = AdaptiveMoments::new(2.0, plan.spacing(), plan.reach());
-        let sizes = SizeMoments::new(1.5, 5.0, plan.spacing(), plan.reach());
+        let moments = AdaptiveMoments::new(2.0, plan.lattice());
+        let sizes = SizeMoments::new(1.5, 5.0, plan.lattice());
         let noise = noise(n, &mut rng);
         let stamp = observed(n, &h, 0.0, 0.0);
         let stamp: Vec<f32> = stamp
