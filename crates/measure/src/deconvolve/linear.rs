@@ -71,7 +71,8 @@ const LEAST_EDGE_WINDOW: f64 = 0.02;
 /// Radius of the ring whose light tells neighbours from galaxies, in σ of the window.
 // Chosen by hand: 12 px for a window of 8 px.
 const RING_RADIUS: f64 = 1.5;
-/// Largest radius of the ring in units of the stamp's side: where its weight falls to 4 % of the peak at the edges of the stamp.
+/// Largest radius of the ring in units of the stamp's side.
+// At the edges of the stamp the ring's weight has fallen to 4 % of its peak.
 const LARGEST_RING: f64 = 0.25;
 /// Largest lag of the autocorrelation in σ of the window.
 // Chosen by hand: the window's autocorrelation is a fifth there.
