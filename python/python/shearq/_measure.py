@@ -211,8 +211,9 @@ def measure(
     """
     settings, count, done = resolve(submission), thread_count(threads), callback(progress)
     if epochs is None:
-        if stamps is None or psf is None:
-            raise TypeError("stamps, psf: found none; expected both, or epochs")
+        for name, value in (("stamps", stamps), ("psf", psf)):
+            if value is None:
+                raise TypeError(f"{name}: found none; expected stamps and their PSF, or epochs")
         stamps, psf = _galsim.unpacked(stamps, psf, check=wcs is None)
         return _measure([_image(stamps, psf, noise, mask, wcs, x, y)], (ids, x, y), settings, count, done)
     given = {"stamps": stamps, "psf": psf, "noise": noise, "mask": mask, "wcs": wcs}
