@@ -333,8 +333,8 @@ impl ClippedShape {
 pub struct WeightedShape {
     /// Scale in pixels of the Moffat weight.
     pub weight_scale: f64,
-    /// Matched-filter S/N ν₀ of a round galaxy of `reference_extent` at which the regularisation of the ellipticity halves
-    /// it: e is weighted by ν²/(ν² + ν₀²), because noisier galaxies deserve less weight. Zero for no regularisation.
+    /// Matched-filter S/N ν₀ at which the regularisation halves the ellipticity of a round Gaussian galaxy of the size that the
+    /// window in use is for (`reference_extent` at the configured window): e is weighted by ν²/(ν² + ν₀²), because noisier galaxies deserve less weight. Zero for no regularisation.
     pub half_snr: f64,
     /// Shear of the sheared catalogues (`1p`, `1m`, `2p`, `2m`): further columns of ellipticity, S/N, flux and size. Zero
     /// for none.

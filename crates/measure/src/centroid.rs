@@ -2,7 +2,7 @@
 
 use ndarray::ArrayView2;
 
-use crate::stamp::{Pixel, contiguous};
+use crate::pixel::{Pixel, contiguous};
 
 // Narrow, so that a centroid does not follow noise: at S/N 20 it is good to 0.2 px. Chosen by hand.
 const WEIGHT_SIGMA: f64 = 2.0;

@@ -10,12 +10,12 @@ use shearq_submissions::PsfCut;
 
 use crate::centroid::galaxy_centroid;
 use crate::error::MeasureError;
+use crate::pixel::{PEAKS, Pixel, hash, highest};
 use crate::psf::quality::{self, PsfQuality};
 use crate::psf::{Psfs, Star};
 use crate::second_moments::{CoreSize, core_sums};
-use crate::stamp::{
-    FullStamp, INNER_AREA, INNER_RADIUS, PEAKS, Pixel, SkySubtraction, hash, highest, inner_light,
-};
+use crate::sky::{INNER_AREA, INNER_RADIUS, inner_light};
+use crate::stamp::{FullStamp, SkySubtraction};
 use crate::warning::Warning;
 
 // Largest side in px of the corner blocks in which the sky is measured. Chosen by hand.

@@ -57,6 +57,7 @@ mod measurer;
 mod method;
 mod noise;
 pub mod parts;
+mod pixel;
 mod psf;
 mod second_moments;
 mod selection;
@@ -72,12 +73,13 @@ pub use calibration::{MeanShear, MeanShearError, ShearSum, is_significant};
 pub use error::{EpochError, MeasureError};
 pub use examine::{EXAMINED_PSFS, Examination, examined_rows};
 pub use measurement::{Coupling, Flag, Flags, Measurement, Observables, ResponseMatrix};
-pub use measurement::{Descent, Stop};
+pub use measurement::{Descent, PsfShape, Stop};
 pub use measurer::{Epoch, ImageNoise, ImageWorker, Measurer, PsfWorker, Steps, Worker};
 pub use method::AdaptedSettings;
 pub use ndarray;
 pub use noise::{StampNoise, Survey};
-pub use psf::{PsfShape, Psfs, Star, average_stars};
+pub use pixel::{Pixel, Pixels};
+pub use psf::{Psfs, Star, average_stars};
 pub use selection::{Cut, Quantity, Selected, Selection};
 pub use session::{
     ArraySource, Batch, KnownNoise, Lazy, LazyStamps, MeasuredImage, MeasuredRow, OneThread,
@@ -89,7 +91,6 @@ pub use shearq_quantities::{
 };
 pub use shearq_submissions::{Configuration, ConfigurationError, PsfCut};
 pub use sky::Sky;
-pub use stamp::{Pixel, Pixels};
 pub use warning::{Of, PixelFrame, Warning};
 
 /// The examples of README.md.

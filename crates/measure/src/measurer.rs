@@ -13,14 +13,12 @@ use shearq_submissions::{Configuration, ConfigurationError, NoiseSource, Registr
 use crate::deconvolve::{EpochPixels, convolve};
 use crate::denoise::{DenoiseScratch, WaveletWiener, border_noise};
 use crate::error::{EpochError, MeasureError};
-use crate::measurement::{Flag, Measurement};
+use crate::measurement::{Flag, Measurement, PsfShape};
 use crate::method::{AdaptedSettings, CutEpoch, CutWorker, Images, MethodPlan};
 use crate::noise::{NoisePlan, StampNoise, Survey};
-use crate::psf::{PsfShape, Psfs, ResidualProfiles, Star, StarSurvey, cut_start};
-use crate::stamp::{
-    FullStamp, MissingPixels, PEAKS, Pixel, SkySubtraction, all_finite, highest, is_level,
-    lose_padding,
-};
+use crate::pixel::{PEAKS, Pixel, all_finite, highest, is_level};
+use crate::psf::{Psfs, ResidualProfiles, Star, StarSurvey, cut_start};
+use crate::stamp::{FullStamp, MissingPixels, SkySubtraction, lose_padding};
 
 // The longest spacing of pixels is then 1.22 times that of square ones, and the largest wave number of the sharpest target,
 // 2.2 per pixel, still below the Nyquist frequency. Chosen by hand: cameras are below 0.02.

@@ -28,12 +28,11 @@ use crate::asymmetry::{Asymmetry, rotation_sum};
 use crate::centroid::galaxy_centroid;
 use crate::error::MeasureError;
 use crate::examine::enough;
+use crate::pixel::{PEAKS, Pixel, all_finite, highest, padding};
 use crate::second_moments::GalaxyMoments;
+use crate::sky::inner_light;
 use crate::sky::{Sky, SkyLevels};
-use crate::stamp::{
-    FullStamp, MissingPixels, PEAKS, Pixel, SkySubtraction, all_finite, highest, inner_light,
-    padding,
-};
+use crate::stamp::{FullStamp, MissingPixels, SkySubtraction};
 use crate::warning::Warning;
 
 #[cfg(test)]

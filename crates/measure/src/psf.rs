@@ -19,12 +19,11 @@ use shearq_submissions::PsfCut;
 pub(crate) use self::denoised_star::StarDenoiser;
 use self::quality::PsfQuality;
 pub(crate) use self::residual_profile::ResidualProfiles;
-pub use self::shape::PsfShape;
 pub use self::star::Star;
 pub(crate) use self::star::cut_start;
 pub(crate) use self::star_survey::StarSurvey;
 use crate::error::MeasureError;
-use crate::stamp::Pixels;
+use crate::pixel::Pixels;
 
 // Above it stars differ by more than their noise, and count alike. Chosen by hand.
 const MAX_WEIGHT_SNR: f64 = 1000.0;

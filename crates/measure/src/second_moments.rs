@@ -10,7 +10,7 @@ use ndarray::ArrayView2;
 use shearq_quantities::statistics::upper_median;
 
 use crate::denoise::frame;
-use crate::stamp::{Pixel, contiguous};
+use crate::pixel::{Pixel, contiguous};
 
 // σ of the weight in pixels. Chosen by hand.
 const WEIGHT_SIGMA: f64 = 5.0;

@@ -22,8 +22,8 @@ use crate::examine::{EXAMINED_PSFS, Estimate, Examination, enough, examined_rows
 use crate::measurement::{Flag, Measurement};
 use crate::measurer::{Epoch, ImageNoise, ImageWorker, Measurer, Steps, Worker};
 use crate::noise::{NoisePlan, NoiseSurvey, StampNoise, Survey};
+use crate::pixel::{Pixel, Pixels, is_level};
 use crate::psf::{Psfs, ResidualProfiles, Star};
-use crate::stamp::{Pixel, Pixels, is_level};
 use crate::warning::Warning;
 
 // In pixels along each axis. Chosen by hand.

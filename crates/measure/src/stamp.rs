@@ -1,222 +1,28 @@
-//! A stamp before its shape is measured: its pixels in either precision, padding, sky and missing pixels.
+//! A stamp before its shape is measured: padding, sky and missing pixels.
 //!
 //! Missing pixels are bad ones, cosmic rays, another object's, or those beyond the edge of an exposure. They get the light of
 //! the opposite ones, which a galaxy that looks the same rotated by 180 degrees has there, sheared or not. Noise that is
 //! repeated like this adds to the autocorrelation at the lag between the two, so that near the galaxy only few may be missing.
 
-use std::borrow::Cow;
-use std::f64::consts::PI;
-use std::ops::{Range, RangeInclusive};
-
-use multiversion::multiversion;
-use ndarray::{
-    Array, Array3, ArrayView, ArrayView1, ArrayView2, ArrayView3, Axis, CowArray, Dimension, Ix3,
-    RemoveAxis, Slice,
-};
-use shearq_quantities::statistics::{FROM_MODULI, median};
+use ndarray::ArrayView2;
 use shearq_submissions::SkySource;
-use shearq_submissions::limits::{MAX_CUT, MAX_PSF};
 
 use crate::asymmetry::{opposite, rotation_sum};
 use crate::centroid::galaxy_centroid;
-use crate::error::{MeasureError, length};
-use crate::sky::{NormalEquations, PLANE_TERMS, Sky};
+use crate::error::MeasureError;
+use crate::pixel::{Pixel, copy_row, padding};
+use crate::sky::{Sky, SkyCells};
 
 // Of the pixels of a stamp. Chosen by hand.
 const MAX_MISSING_SHARE: f32 = 0.25;
-// Of the pixels of a stamp, if the opposite ones are missing too. Chosen by hand.
+// Of the pixels of a stamp that become zero: the opposite one is missing, and too few adjacent ones are present. Chosen by hand.
 const MAX_MISSING_PAIR_SHARE: f32 = 0.02;
 // In pixels around the galaxy's centre, with stricter limits. Chosen by hand.
 const INNER_MISSING_RADIUS: f32 = 12.0;
 // Missing pixels within that radius. Chosen by hand.
 const MAX_INNER_MISSING: usize = 24;
-// Of the eight around a pixel whose opposite is missing too. Chosen by hand.
+// Of the eight around a pixel whose opposite is missing or off the stamp. Chosen by hand.
 const MIN_ADJACENT_PRESENT: usize = 7;
-// Radius in pixels within which a galaxy's light is summed.
-// Chosen by hand.
-pub(crate) const INNER_RADIUS: f64 = 8.0;
-pub(crate) const INNER_AREA: f64 = PI * INNER_RADIUS * INNER_RADIUS;
-// 4 px on 48 px: 117 cells away from the galaxy.
-const CELLS_PER_SIDE: usize = 12;
-// From the centre, in units of the stamp's side: 12 px on 48 px, where galaxies and wings of one family remain.
-const MIN_CELL_DISTANCE: f64 = 0.25;
-// Residual in units of the scatter beyond which a cell of a stamp does not count.
-// Loses 0.3 % of Gaussian noise. Chosen by hand.
-const OUTLIER_SCATTERS: f64 = 3.0;
-/// Brightest pixels, in image units, whose autocorrelation keeps single precision: the squares of its values neither
-/// vanish nor overflow.
-pub(crate) const PEAKS: RangeInclusive<f32> = 1e-18..=1e17;
-/// Noise levels other than zero, in image units, whose squares keep single precision beside those of [`PEAKS`].
-const LEVELS: RangeInclusive<f64> = 1e-30..=1e18;
-
-/// Whether a noise level can be used.
-pub(crate) fn is_level(sigma: f64) -> bool {
-    sigma == 0.0 || LEVELS.contains(&sigma)
-}
-
-/// `f32` or `f64`.
-pub trait Pixel: Copy + Send + Sync + Into<f64> + private::Sealed {
-    /// Rounded to single precision, in which stamps are measured.
-    fn to_f32(self) -> f32;
-
-    /// Stamps of this precision.
-    fn pixels(stamps: ArrayView3<'_, Self>) -> Pixels<'_, Ix3>;
-}
-
-impl Pixel for f32 {
-    #[inline(always)]
-    fn to_f32(self) -> f32 {
-        self
-    }
-
-    fn pixels(stamps: ArrayView3<'_, Self>) -> Pixels<'_, Ix3> {
-        stamps.into()
-    }
-}
-
-impl Pixel for f64 {
-    #[inline(always)]
-    fn to_f32(self) -> f32 {
-        self as f32
-    }
-
-    fn pixels(stamps: ArrayView3<'_, Self>) -> Pixels<'_, Ix3> {
-        stamps.into()
-    }
-}
-
-/// Pixels of stamps in single or double precision, borrowed or owned.
-#[derive(Debug, Clone)]
-pub enum Pixels<'a, D: Dimension> {
-    /// `f32`.
-    Single(CowArray<'a, f32, D>),
-    /// `f64`.
-    Double(CowArray<'a, f64, D>),
-}
-
-impl<'a, D: Dimension> From<ArrayView<'a, f32, D>> for Pixels<'a, D> {
-    fn from(pixels: ArrayView<'a, f32, D>) -> Self {
-        Pixels::Single(pixels.into())
-    }
-}
-
-impl<'a, D: Dimension> From<ArrayView<'a, f64, D>> for Pixels<'a, D> {
-    fn from(pixels: ArrayView<'a, f64, D>) -> Self {
-        Pixels::Double(pixels.into())
-    }
-}
-
-impl<D: Dimension> From<Array<f32, D>> for Pixels<'_, D> {
-    fn from(pixels: Array<f32, D>) -> Self {
-        Pixels::Single(pixels.into())
-    }
-}
-
-impl<D: Dimension> From<Array<f64, D>> for Pixels<'_, D> {
-    fn from(pixels: Array<f64, D>) -> Self {
-        Pixels::Double(pixels.into())
-    }
-}
-
-impl<D: Dimension> Pixels<'_, D> {
-    /// Lengths of the axes.
-    pub fn dim(&self) -> D::Pattern {
-        match self {
-            Pixels::Single(pixels) => pixels.dim(),
-            Pixels::Double(pixels) => pixels.dim(),
-        }
-    }
-
-    /// A view of the same pixels.
-    pub fn view(&self) -> Pixels<'_, D> {
-        match self {
-            Pixels::Single(pixels) => pixels.view().into(),
-            Pixels::Double(pixels) => pixels.view().into(),
-        }
-    }
-}
-
-impl<D: RemoveAxis> Pixels<'_, D> {
-    /// Some of the stamps along the first axis, without a copy.
-    #[must_use]
-    pub fn into_slice(mut self, range: Range<usize>) -> Self {
-        match &mut self {
-            Pixels::Single(stamps) => stamps.slice_axis_inplace(Axis(0), Slice::from(range)),
-            Pixels::Double(stamps) => stamps.slice_axis_inplace(Axis(0), Slice::from(range)),
-        }
-        self
-    }
-}
-
-impl Pixels<'_, Ix3> {
-    /// Stamps of an image of `count` stamps of `side` pixels next to each other, row-major.
-    ///
-    /// # Errors
-    /// If the image has another number of pixels.
-    pub fn strip(pixels: Vec<f32>, count: usize, side: usize) -> Result<Self, MeasureError> {
-        length("a strip of stamps", pixels.len(), count * side * side)?;
-        let rows = Array3::from_shape_vec((side, count, side), pixels);
-        let rows = rows.map_err(|error| MeasureError::Shape {
-            what: "a strip of stamps",
-            found: format!("{count} stamps of {side} × {side} pixels"),
-            expected: error.to_string(),
-        })?;
-        Ok(rows.permuted_axes([1, 0, 2]).into())
-    }
-}
-
-/// A number from words such as the bits of pixels, the same on all machines: Fowler, Noll and Vo's hash.
-pub(crate) fn hash(words: impl Iterator<Item = u32>) -> u64 {
-    words.fold(0xcbf2_9ce4_8422_2325, |hash, word| {
-        (hash ^ u64::from(word)).wrapping_mul(0x0100_0000_01b3)
-    })
-}
-
-pub(crate) fn copy_row<P: Pixel>(row: ArrayView1<'_, P>, to: &mut [f32]) {
-    // Contiguous pixels, as in an image, are converted several at a time.
-    match row.as_slice() {
-        Some(row) => convert(to, row.iter()),
-        None => convert(to, row.iter()),
-    }
-}
-
-/// The pixels of a row, copied where they are apart in memory.
-pub(crate) fn contiguous<P: Pixel>(row: ArrayView1<'_, P>) -> Cow<'_, [P]> {
-    row.to_slice()
-        .map_or_else(|| Cow::Owned(row.to_vec()), Cow::Borrowed)
-}
-
-fn convert<'a, P: Pixel + 'a>(to: &mut [f32], from: impl Iterator<Item = &'a P>) {
-    for (value, pixel) in to.iter_mut().zip(from) {
-        *value = pixel.to_f32();
-    }
-}
-
-/// The largest pixel, or zero if none is positive. 64 running maxima let vector instructions take several at a time.
-#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-pub(crate) fn highest(pixels: &[f32]) -> f32 {
-    // Four vectors of AVX-512, so that comparisons overlap.
-    const LANES: usize = 64;
-    let mut lanes = [0.0f32; LANES];
-    let chunks = pixels.chunks_exact(LANES);
-    let rest = chunks.remainder().iter().copied().fold(0.0, f32::max);
-    for chunk in chunks {
-        for (lane, value) in lanes.iter_mut().zip(chunk) {
-            // Not a number is not larger.
-            *lane = if *value > *lane { *value } else { *lane };
-        }
-    }
-    lanes.into_iter().fold(rest, f32::max)
-}
-
-#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-pub(crate) fn all_finite(pixels: &[f32]) -> bool {
-    // No early exit, so that several pixels are tested at a time.
-    let largest = pixels
-        .iter()
-        .fold(0, |most: u32, value| most.max(value.abs().to_bits()));
-    largest < f32::INFINITY.to_bits()
-}
 
 /// A full stamp in single precision and the sky that is subtracted from it, with buffers for one thread.
 #[derive(Debug, Clone)]
@@ -268,21 +74,6 @@ impl FullStamp {
     }
 }
 
-/// How many rows of pixels at the lower and upper edge, and columns at the left and right edge, are all equal.
-pub(crate) fn padding(pixels: &[f32], n: usize) -> [usize; 4] {
-    [0, 1, 2, 3].map(|edge| {
-        let at = |depth: usize, along: usize| match edge {
-            0 => depth * n + along,
-            1 => (n - 1 - depth) * n + along,
-            2 => along * n + depth,
-            _ => along * n + n - 1 - depth,
-        };
-        let value = pixels[at(0, 0)];
-        let equal = |depth: &usize| (0..n).all(|along| pixels[at(*depth, along)] == value);
-        (0..n).take_while(equal).count()
-    })
-}
-
 /// Makes rows and columns of padding missing, unless the opposite edge has some as well: a stamp beyond an edge of an
 /// exposure. Whether there are any.
 pub(crate) fn lose_padding(pixels: &mut [f32], n: usize) -> bool {
@@ -322,140 +113,6 @@ impl SkySubtraction {
     }
 }
 
-/// Square cells of a stamp away from its centre, and their levels on one stamp.
-#[derive(Debug, Clone)]
-pub(crate) struct SkyCells {
-    pub(crate) full: usize,
-    side: usize,
-    cells: Vec<Cell>,
-    /// On the stamp measured last; NaN if a pixel is missing or padding.
-    pub(crate) levels: Vec<f32>,
-    residuals: Vec<f64>,
-    kept: Vec<usize>,
-}
-
-#[derive(Debug, Clone, Copy)]
-struct Cell {
-    first: (usize, usize),
-    /// Middle (x, y), from the centre of the stamp.
-    place: [f64; 2],
-    is_at_edge: bool,
-}
-
-impl SkyCells {
-    pub(crate) fn new(full: usize) -> Self {
-        let side = (full / CELLS_PER_SIDE).max(1);
-        let count = full / side;
-        // From the edges inwards, so that opposite cells are opposite pixels.
-        let start = |at: usize| match 2 * at < count {
-            true => at * side,
-            false => full - (count - at) * side,
-        };
-        let middle = |at: usize| start(at) as f64 + (side as f64 - full as f64) / 2.0;
-        let all = (0..count).flat_map(|y| (0..count).map(move |x| (y, x)));
-        let cells: Vec<Cell> = all
-            .map(|(y, x)| Cell {
-                first: (start(y), start(x)),
-                place: [middle(x), middle(y)],
-                is_at_edge: [y, x].iter().any(|at| *at == 0 || at + 1 == count),
-            })
-            .filter(|cell| cell.place[0].hypot(cell.place[1]) >= MIN_CELL_DISTANCE * full as f64)
-            .collect();
-        SkyCells {
-            full,
-            side,
-            levels: vec![0.0; cells.len()],
-            residuals: Vec::with_capacity(cells.len()),
-            kept: Vec::with_capacity(cells.len()),
-            cells,
-        }
-    }
-
-    /// The middle of each cell (x, y), from the centre of the stamp.
-    pub(crate) fn places(&self) -> impl Iterator<Item = [f64; 2]> {
-        self.cells.iter().map(|cell| cell.place)
-    }
-
-    pub(crate) fn measure(&mut self, pixels: &[f32]) {
-        let (n, side) = (self.full, self.side);
-        let [low, high, left, right] = padding(pixels, n);
-        for (level, cell) in self.levels.iter_mut().zip(&self.cells) {
-            let (y, x) = cell.first;
-            let is_padded = y < low || x < left || y + side > n - high || x + side > n - right;
-            let mut sum = if is_padded { f32::NAN } else { 0.0 };
-            for row in pixels[y * n..(y + side) * n].chunks_exact(n) {
-                sum += row[x..x + side].iter().sum::<f32>();
-            }
-            *level = if sum.is_finite() {
-                sum / (side * side) as f32
-            } else {
-                f32::NAN
-            };
-        }
-    }
-
-    /// The plane of one stamp, fitted to the cells at its edges without outliers; `None` if too few remain.
-    pub(crate) fn plane_of(&mut self, pixels: &[f32]) -> Option<Sky> {
-        self.measure(pixels);
-        let SkyCells {
-            cells,
-            levels,
-            residuals,
-            kept,
-            ..
-        } = self;
-        kept.clear();
-        kept.extend((0..cells.len()).filter(|&k| cells[k].is_at_edge && !levels[k].is_nan()));
-        let residual = |[level, x_slope, y_slope]: [f64; PLANE_TERMS], k: usize| {
-            let [x, y] = cells[k].place;
-            f64::from(levels[k]) - level - x_slope * x - y_slope * y
-        };
-        let mut plane = [0.0; PLANE_TERMS];
-        for round in 0..3 {
-            if round == 0 {
-                // The median first: outliers would tilt a plane, and hide behind it.
-                residuals.clear();
-                residuals.extend(kept.iter().map(|&k| residual(plane, k)));
-                plane[0] = median(residuals)?;
-            } else {
-                let mut sums = NormalEquations::<PLANE_TERMS>::default();
-                for &k in &*kept {
-                    let [x, y] = cells[k].place;
-                    sums.add([1.0, x, y], f64::from(levels[k]), 1.0);
-                }
-                plane = sums.solve(PLANE_TERMS)?;
-            }
-            residuals.clear();
-            residuals.extend(kept.iter().map(|&k| residual(plane, k).abs()));
-            let limit = OUTLIER_SCATTERS * FROM_MODULI * median(residuals)?;
-            kept.retain(|&k| residual(plane, k).abs() <= limit);
-        }
-        Some(Sky {
-            level: plane[0],
-            level_error: f64::NAN,
-            slope: [plane[1], plane[2]],
-            slope_error: f64::NAN,
-        })
-    }
-}
-
-pub(crate) fn inner_light(pixels: &[f32], n: usize) -> f64 {
-    let middle = (n as f64 - 1.0) / 2.0;
-    let mut sum = 0.0;
-    for (y, row) in pixels.chunks_exact(n).enumerate() {
-        let dy = y as f64 - middle;
-        let square = INNER_RADIUS * INNER_RADIUS - dy * dy;
-        if square < 0.0 {
-            continue;
-        }
-        let half = square.sqrt();
-        let first = (middle - half).ceil().max(0.0) as usize;
-        let last = ((middle + half).floor() as usize).min(n - 1);
-        sum += row[first..=last].iter().map(|v| f64::from(*v)).sum::<f64>();
-    }
-    sum
-}
-
 /// Fills missing pixels, with buffers for one thread.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct MissingPixels {
@@ -472,8 +129,8 @@ impl MissingPixels {
         }
     }
 
-    /// Fills the pixels of a stamp of `n` pixels a side that are not finite. False if too many are, or a hole is on both
-    /// sides of the galaxy's centre.
+    /// Fills the pixels of a stamp of `n` pixels a side that are not finite. False if too many are, or if holes on
+    /// both sides leave a pixel near the centre or too many elsewhere unknown.
     pub(crate) fn fill(&mut self, stamp: &mut [f32], n: usize) -> bool {
         self.places.clear();
         let pixels = stamp.iter().enumerate();
@@ -494,7 +151,7 @@ impl MissingPixels {
     }
 
     /// Gives missing pixels the light of the opposite ones, or if that is missing too the mean of the adjacent ones, or
-    /// zero. False if that happens near the centre, or to many.
+    /// zero. False if a pixel near the centre becomes zero, or too many elsewhere whose opposite is on the stamp.
     fn fill_about(&mut self, stamp: &mut [f32], n: usize, centroid: [f32; 2]) -> bool {
         let rotation = rotation_sum(centroid, n);
         let (mut is_known, mut dark) = (true, 0);
@@ -530,43 +187,6 @@ fn adjacent_mean(stamp: &[f32], n: usize, at: usize) -> Option<f32> {
     let there = square.filter(|light| light.is_finite());
     let (sum, count) = there.fold((0.0, 0), |(sum, count), light| (sum + light, count + 1));
     (count >= MIN_ADJACENT_PRESENT).then(|| sum / count as f32)
-}
-
-pub(crate) fn check_sizes(n: usize, p: usize) -> Result<(), MeasureError> {
-    if !(3..=MAX_CUT).contains(&n) {
-        let expected = format!("a side of 3 to {MAX_CUT} pixels");
-        return Err(MeasureError::square("a stamp", (n, n), expected));
-    }
-    if !(2..=MAX_PSF).contains(&p) {
-        let expected = format!("a side of 2 to {MAX_PSF} pixels");
-        return Err(MeasureError::square("a PSF stamp", (p, p), expected));
-    }
-    Ok(())
-}
-
-pub(crate) fn check_psf(psf: ArrayView2<'_, f64>, p: usize) -> Result<(), MeasureError> {
-    if psf.dim() != (p, p) {
-        let expected = format!("{p} × {p}");
-        return Err(MeasureError::square("a PSF stamp", psf.dim(), expected));
-    }
-    // Without the places of its pixels, which only a bad one needs, and without an early exit.
-    if !psf.fold(false, |bad, value| bad | !value.is_finite()) {
-        return Ok(());
-    }
-    match psf.indexed_iter().find(|(_, value)| !value.is_finite()) {
-        None => Ok(()),
-        Some(((y, x), _)) => Err(MeasureError::NotFinite {
-            what: "PSF stamp",
-            x: x + 1,
-            y: y + 1,
-        }),
-    }
-}
-
-mod private {
-    pub trait Sealed {}
-    impl Sealed for f32 {}
-    impl Sealed for f64 {}
 }
 
 #[cfg(test)]

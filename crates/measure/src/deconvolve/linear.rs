@@ -47,7 +47,7 @@ use shearq_submissions::LinearDeconvolution;
 use super::network::high_pass;
 use crate::error::MeasureError;
 use crate::noise::StampNoise;
-use crate::stamp::{check_psf, check_sizes, copy_row};
+use crate::pixel::{check_psf, check_sizes, copy_row};
 use crate::transform::{
     HexLattice, LagsScratch, Modes, Plane, Spectrum, ToLags, ToModes, TransformScratch,
     even_parities, four_lanes, lanes, store, table,
@@ -68,7 +68,7 @@ const TAPER_START: f64 = 0.75;
 /// Value of the window at the middle of an edge above which the edge correction is applied.
 // Chosen by hand. Below it |m| stays under 10⁻³ for the largest galaxies, and a tenth of the time is saved.
 const LEAST_EDGE_WINDOW: f64 = 0.02;
-/// Radius of the ring whose light tells neighbours from galaxies, in σ of the window.
+/// Radius of the ring whose light over the flux is the column `neighbour`, in σ of the window.
 // Chosen by hand: 12 px for a window of 8 px.
 const RING_RADIUS: f64 = 1.5;
 /// Largest radius of the ring in units of the stamp's side.
@@ -564,7 +564,7 @@ impl Spectral {
     }
 
     /// Puts the window at `centre`, (x, y) in pixels from the middle of the stamp, for the stamps that follow.
-    /// Their shear is about this place: the window is where the galaxy is, sheared or not.
+    /// Their shear is about this place: the middle of single stamps, the offsets of epochs.
     pub fn place_window(&self, centre: [f32; 2], scratch: &mut SpectralScratch) {
         if scratch.centre == centre {
             return;

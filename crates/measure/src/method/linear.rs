@@ -35,11 +35,11 @@ use crate::deconvolve::{
 use crate::error::MeasureError;
 use crate::measurement::{Descent, ResponseMatrix, Stop};
 use crate::noise::StampNoise;
+use crate::pixel::hash;
 use crate::psf::{ResidualProfiles, StarDenoiser, width};
 use crate::second_moments::WeightedMoments;
 use crate::shape::{AdaptiveMoments, AdaptiveScratch, AdaptiveShape, FoundBreadth, SizeMoments};
 use crate::sheared::ShearSettings;
-use crate::stamp::hash;
 use crate::transform::HexLattice;
 
 // Of the error of the mean response, the choice of galaxies makes less than 1 % (tests/stress: base, snr10, cosmos20). Sheared

@@ -4,6 +4,7 @@ use ndarray::ArrayView2;
 use shearq_quantities::{Distortion, Jacobian, Shear};
 
 use super::width::noise_equivalent_area;
+use crate::measurement::PsfShape;
 
 // In σ of the weight, as GalSim's HSM takes pixels.
 const RADIUS_SIGMAS: f64 = 5.0;
@@ -12,20 +13,7 @@ const CONVERGED: f64 = 1e-7;
 // Moffat profiles need about ten. Chosen by hand.
 const MAX_ITERATIONS: usize = 100;
 
-/// The adaptive moments of a PSF, pixels included: those of the elliptical Gaussian M that is its own best weight,
-/// M = 2 Σ W x xᵀ p / Σ W p with W = exp(−½ xᵀ M⁻¹ x) about the centroid under W (Bernstein & Jarvis 2002, AJ 123, 583;
-/// Hirata & Seljak 2003, MNRAS 343, 459). GalSim's `FindAdaptiveMom` has the same `observed_shape` and `moments_sigma`.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct PsfShape {
-    /// xx, xy and yy in px²; NaN if unknown.
-    moments: [f64; 3],
-}
-
 impl PsfShape {
-    pub(crate) const UNKNOWN: PsfShape = PsfShape {
-        moments: [f64::NAN; 3],
-    };
-
     /// Of the pixels of a PSF; NaN if the moments do not converge, as those of a PSF that is mostly noise.
     pub(crate) fn from_psf(psf: ArrayView2<'_, f64>) -> Self {
         let round = noise_equivalent_area(psf) / (4.0 * std::f64::consts::PI);

@@ -13,7 +13,7 @@ use shearq_submissions::PsfCut;
 
 use crate::centroid::{MAX_STAR_SHIFT, star_centroid};
 use crate::error::MeasureError;
-use crate::stamp::{Pixel, contiguous};
+use crate::pixel::{Pixel, contiguous};
 
 // One pixel off adds an ellipticity of about 0.01 for a PSF of 15 px. Chosen by hand.
 const MAX_CENTROID_OFFSET: f64 = 1.0;

@@ -153,7 +153,7 @@ impl Spectral {
     }
 
     /// Deconvolves the stamps of combined epochs and writes the autocorrelation with its derivatives, with noise of level
-    /// `noise`. The window is at the places of the galaxy.
+    /// `noise`. The window is at the offset of each epoch.
     pub(crate) fn autocorrelate_epochs<'a>(
         &self,
         psf: &SpectralPsf,
