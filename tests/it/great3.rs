@@ -406,7 +406,7 @@ fn aperture_masses_of_grids_follow_the_square_of_the_response() {
 }
 
 // Changes of sound files: which files, what is changed, and what the error says. `set ROW COLUMN VALUE`, `column COLUMN VALUE`,
-// `drop ROW`, `twice ROW`, `keep ROWS`, `first LINE`, `all CONTENT`.
+// `zero ROW`, `drop ROW`, `twice ROW`, `keep ROWS`, `first LINE`, `all CONTENT`.
 const MALFORMED: &str = include_str!("malformed.txt");
 
 fn edited(sound: &[String], edit: &str) -> String {
@@ -423,6 +423,7 @@ fn edited(sound: &[String], edit: &str) -> String {
             let (column, value) = (number(), rest.next().unwrap());
             rows.iter_mut().for_each(|row| row[column] = value);
         }
+        "zero" => rows[number()][1..].fill("0"),
         "drop" => _ = rows.remove(number()),
         "twice" => rows.push(rows[number()].clone()),
         "keep" => rows.truncate(number()),
@@ -436,7 +437,7 @@ fn edited(sound: &[String], edit: &str) -> String {
 #[test]
 fn a_hundred_malformed_submissions_have_one_clear_error_each() {
     let folder = tempfile::tempdir().unwrap();
-    let shears = (0..200).map(|k| format!("{k} {} 0.01", 0.001 + f64::from(k) * 1e-4));
+    let shears = (0..200).map(|k| format!("{k} {0} {0}", 0.001 + f64::from(k) * 1e-4));
     let masses = rows("p4_control_ground", "submission");
     let masses = masses.iter().map(|row| {
         let words: Vec<String> = row.iter().map(f64::to_string).collect();

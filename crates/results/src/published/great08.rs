@@ -55,6 +55,18 @@ fn read_shears(path: &Path) -> Result<BTreeMap<usize, Shear>, FileError> {
     Ok(found)
 }
 
+fn read_entry(path: &Path) -> Result<BTreeMap<usize, Shear>, FileError> {
+    let shears = read_shears(path)?;
+    let first = shears.values().next();
+    if shears.len() > 1 && shears.values().all(|g| Some(g) == first) {
+        return wrong(
+            path,
+            "all shears are the same, as of a method that measures nothing",
+        );
+    }
+    Ok(shears)
+}
+
 impl Branch for Great08 {
     fn title(&self) -> String {
         "GREAT08".into()
@@ -68,7 +80,7 @@ impl Branch for Great08 {
             required: 4,
             unnamed: &[(4, &[0, 1, 2, 3])],
         };
-        let submitted = read_shears(submission)?;
+        let submitted = read_entry(submission)?;
         let images: Vec<(usize, String, Shear)> = match with_sets.read(truth.path) {
             Ok(own) => (0..own[0].len())
                 .map(|k| {
@@ -129,7 +141,7 @@ impl Branch for Great08 {
     }
 
     fn check(&self, submission: &Path) -> Result<(), FileError> {
-        read_shears(submission).map(|_| ())
+        read_entry(submission).map(|_| ())
     }
 
     fn pack(&self, _: &Packing<'_>, _: &Pool) -> Option<Result<Packed, FileError>> {

@@ -200,8 +200,14 @@ enum Fault {
         "field {field}: theta = {theta:.4} is missing; expected {SEPARATION_BINS} rows per field"
     )]
     MissingTheta { field: usize, theta: f64 },
-    #[error("all values of {0} are zero, as of a method that measures nothing")]
-    AllZero(&'static str),
+    #[error("all values of {0} are the same, as of a method that measures nothing")]
+    Alike(&'static str),
+    #[error("field {field}: {name} is exactly zero, which no measurement gives")]
+    Zero { field: usize, name: &'static str },
+}
+
+fn is_zero(masses: &[f64; SEPARATION_BINS]) -> bool {
+    masses.iter().all(|mass| *mass == 0.0)
 }
 
 fn more(count: usize) -> String {
@@ -384,9 +390,19 @@ impl Great3 {
         }
         let found = complete(path, found)?;
         for (name, of) in [("g1", (|g| g.e1) as fn(&Shear) -> f64), ("g2", |g| g.e2)] {
-            if found.iter().all(|g| of(g) == 0.0) {
-                return wrong(path, Fault::AllZero(name));
+            if found.len() > 1 && found.windows(2).all(|g| of(&g[0]) == of(&g[1])) {
+                return wrong(path, Fault::Alike(name));
             }
+        }
+        // A program that writes zeros for what it could not measure would gain from them: Q_v of such a field is high.
+        if let Some(field) = found.iter().position(|g| *g == Shear::ZERO) {
+            return wrong(
+                path,
+                Fault::Zero {
+                    field,
+                    name: "(g1, g2)",
+                },
+            );
         }
         Ok(found)
     }
@@ -446,8 +462,17 @@ impl Great3 {
             }
             masses.push(own.map(Option::unwrap_or_default));
         }
-        if masses.iter().flatten().all(|mass| *mass == 0.0) {
-            return wrong(path, Fault::AllZero("map_E"));
+        if let Some(field) = masses.iter().position(is_zero) {
+            return wrong(
+                path,
+                Fault::Zero {
+                    field,
+                    name: "map_E",
+                },
+            );
+        }
+        if masses.windows(2).all(|pair| pair[0] == pair[1]) && masses.len() > 1 {
+            return wrong(path, Fault::Alike("map_E"));
         }
         Ok(masses)
     }
@@ -913,6 +938,15 @@ impl<'a> Galaxies<'a> {
                 };
                 let g1 = mean(|g| g.e1, |g| g.e2)?;
                 let g2 = mean(|g| g.e2, |g| g.e1)?;
+                if Shear::new(g1, g2) == Shear::ZERO {
+                    return wrong(
+                        file,
+                        Fault::Zero {
+                            field,
+                            name: "(g1, g2)",
+                        },
+                    );
+                }
                 let _ = writeln!(text, "{field} {g1} {g2}");
             }
         } else {
@@ -931,6 +965,16 @@ impl<'a> Galaxies<'a> {
             });
             for (field, own) in masses.enumerate() {
                 let own = own?;
+                // Without a pair, or of galaxies without shears.
+                if own.map_e.iter().all(|mass| *mass == 0.0) {
+                    return wrong(
+                        file,
+                        Fault::Zero {
+                            field,
+                            name: "map_E",
+                        },
+                    );
+                }
                 for b in 0..SEPARATION_BINS {
                     let _ = writeln!(
                         text,
