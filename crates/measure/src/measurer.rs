@@ -533,8 +533,8 @@ impl ImageWorker<'_> {
     /// the measurement is that of the combination, per pixel of the first usable epoch; lengths are in its pixels. Shapes are in
     /// the frame of the sky if there are Jacobians.
     ///
-    /// An epoch without usable pixels has no weight, and without usable epochs the galaxy is flagged. Centroid and neighbours
-    /// are found on the weighted mean of the stamps. Stamps should have one flux: of bands, the shape is that of
+    /// An epoch without usable pixels has no weight, and without usable epochs the galaxy is flagged. The window of each epoch
+    /// is at its offset, and all light under it is measured. Stamps should have one flux: of bands, the shape is that of
     /// the image summed with weights. One epoch with the galaxy in the centre of its stamp is measured as by
     /// [`PsfWorker::measure`], with the same bits and what this worker knows of the image. Noise of several is taken as
     /// white. The PSF of a [`PsfWorker`] has to be set again after it.
