@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use shearq_results::record::SetRecord;
 use shearq_scoring::TrueShear;
+use shearq_scoring::great3::{Observation, REQUIRED_C, REQUIRED_M};
 
 // Fewest sets for m and c of a component: two for the line, and one that the line does not pass through by
 // construction. A team that knows its mean ellipticities solves for one shear with three published values.
@@ -105,15 +106,20 @@ impl ConstantShears {
     /// GREAT3's Q_c (Mandelbaum et al. 2014, ApJS 212, 5) with σ² = 4 of its ground branches, and its error to first order.
     /// Components are those of the pixel axes; GREAT3 turns them to the PSF, which leaves the part of c as it is.
     pub fn q_c(&self, sets: &[SetRecord]) -> Measured {
-        let (mut sum, mut variance) = (4.0, 0.0);
-        for (m, c) in self.biases(sets) {
-            for ((value, error), target) in [(m, 2e-3), (c, 2e-4)] {
-                sum += (value / target).powi(2);
-                variance += (value * error / (target * target)).powi(2);
-            }
-        }
-        let q = 1.232 * 2000.0 / sum.sqrt();
-        (q, q / sum * variance.sqrt())
+        let biases = self.biases(sets);
+        let q = |biases| Observation::Ground.q_c(biases);
+        let best = q(biases.map(|(m, c)| [c.0, m.0]));
+        // ∂Q/∂b = −Q³b/(Q₀·requirement)² for each bias b, Q₀ being Q times the root.
+        let perfect = q([[0.0; 2]; 2]);
+        let variance: f64 = biases
+            .iter()
+            .flat_map(|(m, c)| [(m, REQUIRED_M), (c, REQUIRED_C)])
+            .map(|((value, error), required)| (value * error / (required * required)).powi(2))
+            .sum();
+        (
+            best,
+            best.powi(3) / (4.0 * perfect * perfect) * variance.sqrt(),
+        )
     }
 }
 

@@ -324,7 +324,7 @@ impl Judge {
         for Entry { info, .. } in known {
             stored.entry(&info.sha256).or_default().push(info);
         }
-        let is_known = |team: &str, arrival: &Arrival| {
+        let is_scored = |team: &str, arrival: &Arrival| {
             let same = stored.get(arrival.sha256.as_str()).into_iter().flatten();
             let order = self.order(arrival.received);
             same.into_iter()
@@ -336,7 +336,7 @@ impl Judge {
                 // Without a folder or a receipt, the manifest states the team.
                 let of_receipt = arrival.receipt.as_ref().map(|receipt| &receipt.team);
                 let team = sending.team.as_ref().or(of_receipt);
-                let content = match team.is_some_and(|team| is_known(team, &arrival)) {
+                let content = match team.is_some_and(|team| is_scored(team, &arrival)) {
                     true => None,
                     false => Some(content(sending)?),
                 };
@@ -375,7 +375,7 @@ impl Judge {
                 }
                 Slot::Vacant(slot) => _ = slot.insert(sending.path.clone()),
             }
-            match content.filter(|_| !is_known(&team, &arrival)) {
+            match content.filter(|_| !is_scored(&team, &arrival)) {
                 None => round.known += 1,
                 Some(content) => candidates.push(Candidate {
                     sending,

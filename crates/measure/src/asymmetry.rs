@@ -51,25 +51,6 @@ struct Cell {
     pixels: i32,
 }
 
-/// Sum of a pixel and its opposite under rotation by 180° about a galaxy, along each axis. It rounds the galaxy's centre to
-/// half a pixel, so that opposites are pixels.
-pub(crate) fn rotation_sum(centroid: [f32; 2], n: usize) -> [i32; 2] {
-    centroid.map(|c| (2.0 * c).round() as i32 + n as i32 - 1)
-}
-
-/// The light of the opposite of a pixel (x, y) on a stamp of `n` pixels a side; `None` off the stamp.
-pub(crate) fn opposite(
-    stamp: &[f32],
-    n: usize,
-    rotation: [i32; 2],
-    [x, y]: [usize; 2],
-) -> Option<f32> {
-    let on_stamp = |at: i32| usize::try_from(at).ok().filter(|&at| at < n);
-    let column = on_stamp(rotation[0] - x as i32)?;
-    let row = on_stamp(rotation[1] - y as i32)?;
-    Some(stamp[row * n + column])
-}
-
 /// The first pixel beyond the centre along each axis.
 fn beyond_centre(rotation: [i32; 2]) -> [i32; 2] {
     rotation.map(|sum| sum.div_euclid(2) + 1)

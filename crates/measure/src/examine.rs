@@ -10,7 +10,7 @@ use shearq_submissions::PsfCut;
 
 use crate::centroid::galaxy_centroid;
 use crate::error::MeasureError;
-use crate::pixel::{PEAKS, Pixel, hash, highest};
+use crate::pixel::{PEAK_RANGE, Pixel, hash, highest};
 use crate::psf::quality::{self, PsfQuality};
 use crate::psf::{Psfs, Star};
 use crate::second_moments::{CoreSize, core_sums};
@@ -72,7 +72,7 @@ pub(crate) fn enough(columns: usize, rows: usize) -> usize {
 }
 
 #[derive(Debug, Clone, Copy)]
-struct Look {
+struct StampStatistics {
     /// Level of its corners, and of the middles of its sides.
     corner: f64,
     side: f64,
@@ -98,7 +98,7 @@ struct Look {
 pub struct Examination {
     stamp: FullStamp,
     block: usize,
-    looks: Vec<Look>,
+    stamps: Vec<StampStatistics>,
     blank: usize,
     psfs: Vec<PsfQuality>,
     /// Whether each PSF is that of one galaxy.
@@ -134,7 +134,7 @@ impl Examination {
         Examination {
             stamp: FullStamp::new(full),
             block: BLOCK.min(full / BLOCKS_PER_SIDE),
-            looks: Vec::with_capacity(count),
+            stamps: Vec::with_capacity(count),
             blank: 0,
             psfs: Vec::new(),
             each: false,
@@ -224,7 +224,7 @@ impl Examination {
             }
         }
         let corner = middle_of(&mut corners.map(|corner| corner.mean));
-        let look = Look {
+        let border = StampStatistics {
             corner,
             side: middle_of(&mut sides.map(|side| side.mean)),
             slope: [(b + d - a - c) / apart, (c + d - a - b) / apart],
@@ -247,7 +247,7 @@ impl Examination {
             };
         }
         let found = galaxy_centroid(pixels, n);
-        self.looks.push(Look {
+        self.stamps.push(StampStatistics {
             place: [0, 1].map(|k| f64::from(found[k]) - place[k]),
             flux: inner_light(pixels, n),
             core: core_sums(
@@ -255,14 +255,14 @@ impl Examination {
                 [n; 2],
                 found.map(f64::from),
             ),
-            ..look
+            ..border
         });
         Ok(())
     }
 
     /// Adds what another examination has found, as if its stamps had been added here.
     pub fn join(&mut self, other: &Self) {
-        self.looks.extend_from_slice(&other.looks);
+        self.stamps.extend_from_slice(&other.stamps);
         self.blank += other.blank;
         self.psfs.extend_from_slice(&other.psfs);
         self.each |= other.each;
@@ -271,26 +271,26 @@ impl Examination {
     /// What is wrong with the stamps.
     pub fn warnings(&self) -> Vec<Warning> {
         let mut found = Vec::new();
-        let examined = self.looks.len() + self.blank;
-        if self.looks.is_empty() {
+        let examined = self.stamps.len() + self.blank;
+        if self.stamps.is_empty() {
             if self.blank > 0 {
                 found.push(Warning::Blank { of: self.blank });
             }
             found.extend(self.psfs(None));
             return found;
         }
-        let Estimate { value: peak, .. } = self.median(|look| look.peak, 0.0);
+        let Estimate { value: peak, .. } = self.median(|stamp| stamp.peak, 0.0);
         // Zero on stamps without a positive pixel.
-        if peak > 0.0 && !PEAKS.contains(&(peak as f32)) {
+        if peak > 0.0 && !PEAK_RANGE.contains(&(peak as f32)) {
             found.push(Warning::Brightness { peak });
         }
         let Estimate { value: noise, .. } = self.noise();
-        let flux = self.median(|look| look.flux, noise * INNER_RADIUS);
+        let flux = self.median(|stamp| stamp.flux, noise * INNER_RADIUS);
         // An offset needs light to be measured.
         let lit = flux.is_significant();
         let Estimate { value: flux, .. } = flux;
         if lit && flux < 0.0 {
-            let count = self.looks.iter().filter(|look| look.flux < 0.0).count();
+            let count = self.stamps.iter().filter(|stamp| stamp.flux < 0.0).count();
             found.push(Warning::Negative {
                 count,
                 of: examined,
@@ -317,8 +317,8 @@ impl Examination {
     /// How much the noise of the star changes m and c of a linear configuration: one standard deviation, the same for all
     /// galaxies. `None` if each galaxy has a PSF of its own, or no PSF was examined.
     pub fn psf_noise(&self) -> Option<[f64; 2]> {
-        let look = self.psfs.first().filter(|_| !self.each)?;
-        Some(look.noise_bias())
+        let psf = self.psfs.first().filter(|_| !self.each)?;
+        Some(psf.noise_bias())
     }
 
     /// A warning if `given` is not the noise of the stamps.
@@ -339,10 +339,10 @@ impl Examination {
     }
 
     fn noise(&self) -> Estimate {
-        let of = |look: &Look| look.noise[0].hypot(look.noise[1]) / 2f64.sqrt();
+        let of = |stamp: &StampStatistics| stamp.noise[0].hypot(stamp.noise[1]) / 2f64.sqrt();
         let Estimate { value, error } = self.median(of, 0.0);
         // One stamp or two have no scatter. The variance of n pixels has the relative error √(2/n).
-        let pixels = (4 * self.block * self.block * self.looks.len()) as f64;
+        let pixels = (4 * self.block * self.block * self.stamps.len()) as f64;
         let error = error.max(OF_MEDIAN * value / (2.0 * pixels).sqrt());
         Estimate { value, error }
     }
@@ -352,13 +352,17 @@ impl Examination {
     }
 
     fn core(&self) -> Option<CoreSize> {
-        let mut lights: Vec<f64> = self.looks.iter().map(|look| look.core[0].abs()).collect();
+        let mut lights: Vec<f64> = self
+            .stamps
+            .iter()
+            .map(|stamp| stamp.core[0].abs())
+            .collect();
         let most = MAX_LIGHT * median(&mut lights).filter(|_| lights.len() >= MIN_GALAXIES_CORE)?;
         let sums = || {
-            self.looks.iter().map(|look| {
+            self.stamps.iter().map(|stamp| {
                 // Bright stars and bad pixels count no more than a few galaxies.
-                let share = (most / look.core[0].abs()).min(1.0);
-                look.core.map(|sum| share * sum)
+                let share = (most / stamp.core[0].abs()).min(1.0);
+                stamp.core.map(|sum| share * sum)
             })
         };
         let light: f64 = sums().map(|core| core[0]).sum();
@@ -370,8 +374,8 @@ impl Examination {
     fn sky(&self, noise: f64, flux: f64) -> Option<Warning> {
         let pixels = (self.block * self.block) as f64;
         // The median of four corners is about the mean of two.
-        let corner = self.median(|look| look.corner, noise / (2.0 * pixels).sqrt());
-        let side = self.median(|look| look.side, 0.0).value;
+        let corner = self.median(|stamp| stamp.corner, noise / (2.0 * pixels).sqrt());
+        let side = self.median(|stamp| stamp.side, 0.0).value;
         let Estimate {
             value: level,
             error,
@@ -411,7 +415,7 @@ impl Examination {
     fn gradient(&self, noise: f64, flux: f64) -> Option<Warning> {
         let edge = (self.stamp.side - self.block) as f64;
         let floor = noise / (self.block as f64 * edge);
-        let slope = [0, 1].map(|k| self.median(|look| look.slope[k], floor));
+        let slope = [0, 1].map(|k| self.median(|stamp| stamp.slope[k], floor));
         let (slope, steep) = vector(slope);
         let share = steep.value * (INNER_RADIUS * INNER_AREA / flux.abs());
         (steep.is_significant() && share > GRADIENT_SHARE).then_some(Warning::Gradient {
@@ -423,8 +427,8 @@ impl Examination {
     }
 
     fn places(&self) -> Option<Warning> {
-        let offset = [0, 1].map(|k| self.median(|look| look.place[k], 0.0));
-        let count = self.looks.len() as f64;
+        let offset = [0, 1].map(|k| self.median(|stamp| stamp.place[k], 0.0));
+        let count = self.stamps.len() as f64;
         let scatter = offset.map(|offset| offset.error * count.sqrt() / OF_MEDIAN);
         let (offset, away) = vector(offset);
         if away.value > OFFSET && away.is_significant() {
@@ -437,12 +441,12 @@ impl Examination {
     /// Compares the noise of two corners with the noise of the other two. Both vary together from stamp to stamp if
     /// the stamps' noise differs, and independently if all stamps have one level.
     fn depths(&self) -> Option<Warning> {
-        let usable = |look: &&Look| look.noise.iter().all(|noise| *noise > 0.0);
+        let usable = |stamp: &&StampStatistics| stamp.noise.iter().all(|noise| *noise > 0.0);
         let logs: Vec<[f64; 2]> = self
-            .looks
+            .stamps
             .iter()
             .filter(usable)
-            .map(|look| look.noise.map(f64::ln))
+            .map(|stamp| stamp.noise.map(f64::ln))
             .collect();
         let count = logs.len() as f64;
         let middle = [0, 1].map(|k| median(&mut logs.iter().map(|log| log[k]).collect::<Vec<_>>()));
@@ -464,12 +468,12 @@ impl Examination {
     }
 
     fn long_correlation(&self, noise: f64) -> Option<Warning> {
-        let Estimate { value: level, .. } = self.median(|look| look.corner, 0.0);
-        let of = |look: &Look| {
-            let [products, sums, count] = look.pairs;
+        let Estimate { value: level, .. } = self.median(|stamp| stamp.corner, 0.0);
+        let of = |stamp: &StampStatistics| {
+            let [products, sums, count] = stamp.pairs;
             (products - level * sums + count * level * level) / (count * noise * noise)
         };
-        let all = self.looks.iter().map(of);
+        let all = self.stamps.iter().map(of);
         let mut all: Vec<f64> = all.filter(|r| r.is_finite()).collect();
         let count = all.len() as f64;
         let (middle, scatter) = scatter(&mut all).filter(|_| count > 1.0)?;
@@ -485,15 +489,15 @@ impl Examination {
     }
 
     fn copies(&self, of: usize) -> Option<Warning> {
-        let mut traces: Vec<u64> = self.looks.iter().map(|look| look.trace).collect();
+        let mut traces: Vec<u64> = self.stamps.iter().map(|stamp| stamp.trace).collect();
         traces.sort_unstable();
         let count = traces.windows(2).filter(|pair| pair[0] == pair[1]).count();
         (count > 0).then_some(Warning::Copies { count, of })
     }
 
     /// Median of a number over stamps. Each stamp has an error of at least `floor`.
-    fn median(&self, of: impl Fn(&Look) -> f64, floor: f64) -> Estimate {
-        let all = self.looks.iter().map(of);
+    fn median(&self, of: impl Fn(&StampStatistics) -> f64, floor: f64) -> Estimate {
+        let all = self.stamps.iter().map(of);
         let mut all: Vec<f64> = all.filter(|value| !value.is_nan()).collect();
         let count = all.len() as f64;
         let (value, scatter) = scatter(&mut all).unwrap_or((f64::NAN, f64::NAN));
@@ -617,15 +621,15 @@ mod tests {
         let mut examination = Examination::new(N, 1);
         let stamp = stamp(0.5, [0.01, -0.02], [0.75, -0.5]);
         examination.add_at(stamp.view(), [0.75, 0.0]).unwrap();
-        let look = examination.looks[0];
+        let stamp = examination.stamps[0];
         // In single precision.
-        assert!((look.corner - 0.5).abs() < 1e-5, "{look:?}");
-        assert!((look.slope[0] - 0.01).abs() < 1e-6, "{look:?}");
-        assert!((look.slope[1] + 0.02).abs() < 1e-6, "{look:?}");
-        assert!(look.noise[0] < 1e-4 && look.noise[1] < 1e-4, "{look:?}");
+        assert!((stamp.corner - 0.5).abs() < 1e-5, "{stamp:?}");
+        assert!((stamp.slope[0] - 0.01).abs() < 1e-6, "{stamp:?}");
+        assert!((stamp.slope[1] + 0.02).abs() < 1e-6, "{stamp:?}");
+        assert!(stamp.noise[0] < 1e-4 && stamp.noise[1] < 1e-4, "{stamp:?}");
         // Centroids fall short of the centre, and planes pull them.
-        assert!(look.place[0].abs() < 0.15, "{look:?}");
-        assert!((look.place[1] + 0.5).abs() < 0.15, "{look:?}");
+        assert!(stamp.place[0].abs() < 0.15, "{stamp:?}");
+        assert!((stamp.place[1] + 0.5).abs() < 0.15, "{stamp:?}");
     }
 
     #[test]
@@ -635,7 +639,7 @@ mod tests {
         stamp[(1, 1)] = f32::NAN;
         stamp[(46, 2)] = 1e4;
         examination.add(stamp.view()).unwrap();
-        assert!((examination.looks[0].corner - 0.5).abs() < 1e-5);
+        assert!((examination.stamps[0].corner - 0.5).abs() < 1e-5);
         assert!(middle_of(&mut [f64::NAN; 4]).is_nan());
         assert_eq!(middle_of(&mut [3.0, -f64::NAN, f64::NAN, 1.0]), 2.0);
         assert_eq!(middle_of(&mut [4.0, 1.0, 9.0, 2.0]), 3.0);
@@ -707,8 +711,8 @@ mod tests {
             let text = warning.to_string();
             assert!(!text.contains("inf") && !text.contains("NaN"), "{text}");
         }
-        assert!(examination.core().is_none() && examination.looks.len() < MIN_GALAXIES_CORE);
-        assert!(examination.looks.iter().all(|look| look.flux > 100.0));
+        assert!(examination.core().is_none() && examination.stamps.len() < MIN_GALAXIES_CORE);
+        assert!(examination.stamps.iter().all(|stamp| stamp.flux > 100.0));
     }
 
     #[test]

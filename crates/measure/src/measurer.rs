@@ -16,9 +16,9 @@ use crate::error::{EpochError, MeasureError};
 use crate::measurement::{Flag, Measurement, PsfShape};
 use crate::method::{AdaptedSettings, CutEpoch, CutWorker, Images, MethodPlan};
 use crate::noise::{NoisePlan, StampNoise, Survey};
-use crate::pixel::{PEAKS, Pixel, all_finite, highest, is_level};
+use crate::pixel::{PEAK_RANGE, Pixel, all_finite, highest, is_level};
 use crate::psf::{Psfs, ResidualProfiles, Star, StarSurvey, cut_start};
-use crate::stamp::{FullStamp, MissingPixels, SkySubtraction, lose_padding};
+use crate::stamp::{FullStamp, MissingPixels, SkySubtraction, mark_padding_missing};
 
 // The longest spacing of pixels is then 1.22 times that of square ones, and the largest wave number of the sharpest target,
 // 2.2 per pixel, still below the Nyquist frequency. Chosen by hand: cameras are below 0.02.
@@ -355,7 +355,7 @@ impl Worker {
         let linear = plan.configuration.linear().is_some();
         self.full.read(stamp)?;
         let mut whole = all_finite(&self.full.pixels);
-        if linear && lose_padding(&mut self.full.pixels, plan.full) {
+        if linear && mark_padding_missing(&mut self.full.pixels, plan.full) {
             whole = false;
         }
         if !whole && !linear {
@@ -391,7 +391,7 @@ impl Worker {
         if !whole && !self.missing.fill(&mut self.cut, n) {
             return Ok(Err(Measurement::flagged(Flag::NotFinite)));
         }
-        if !PEAKS.contains(&highest(&self.cut)) || (noise.is_finite() && !is_level(noise)) {
+        if !PEAK_RANGE.contains(&highest(&self.cut)) || (noise.is_finite() && !is_level(noise)) {
             return Ok(Err(Measurement {
                 noise,
                 ..Measurement::flagged(Flag::NoScale)

@@ -24,15 +24,14 @@ use shearq_quantities::linear::{Pivots, eliminate, substitute};
 use shearq_quantities::statistics::{SCATTER, median};
 use shearq_submissions::SkySource;
 
-use crate::asymmetry::{Asymmetry, rotation_sum};
+use crate::asymmetry::Asymmetry;
 use crate::centroid::galaxy_centroid;
 use crate::error::MeasureError;
 use crate::examine::enough;
-use crate::pixel::{PEAKS, Pixel, all_finite, highest, padding};
+use crate::pixel::{PEAK_RANGE, Pixel, all_finite, highest, padding};
 use crate::second_moments::GalaxyMoments;
-use crate::sky::inner_light;
-use crate::sky::{Sky, SkyLevels};
-use crate::stamp::{FullStamp, MissingPixels, SkySubtraction};
+use crate::sky::{Sky, SkyLevels, inner_light};
+use crate::stamp::{FullStamp, MissingPixels, SkySubtraction, rotation_sum};
 use crate::warning::Warning;
 
 #[cfg(test)]
@@ -609,7 +608,7 @@ impl NoiseSurvey {
                 sky,
             })),
             None if self.surveyed == self.unusable => Ok(None),
-            None if self.peak > 0.0 && !PEAKS.contains(&self.peak) => {
+            None if self.peak > 0.0 && !PEAK_RANGE.contains(&self.peak) => {
                 Err(MeasureError::Data(Warning::Brightness {
                     peak: f64::from(self.peak),
                 }))

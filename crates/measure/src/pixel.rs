@@ -14,13 +14,13 @@ use crate::error::{MeasureError, length};
 
 /// Brightest pixels, in image units, whose autocorrelation keeps single precision: the squares of its values neither
 /// vanish nor overflow.
-pub(crate) const PEAKS: RangeInclusive<f32> = 1e-18..=1e17;
-/// Noise levels other than zero, in image units, whose squares keep single precision beside those of [`PEAKS`].
-const LEVELS: RangeInclusive<f64> = 1e-30..=1e18;
+pub(crate) const PEAK_RANGE: RangeInclusive<f32> = 1e-18..=1e17;
+/// Noise levels other than zero, in image units, whose squares keep single precision beside those of [`PEAK_RANGE`].
+const NOISE_LEVEL_RANGE: RangeInclusive<f64> = 1e-30..=1e18;
 
 /// Whether a noise level can be used.
 pub(crate) fn is_level(sigma: f64) -> bool {
-    sigma == 0.0 || LEVELS.contains(&sigma)
+    sigma == 0.0 || NOISE_LEVEL_RANGE.contains(&sigma)
 }
 
 /// `f32` or `f64`.

@@ -10,4 +10,4 @@ mod size;
 
 pub use adaptive::{AdaptiveMoments, AdaptiveScratch, AdaptiveShape};
 pub use clipped::{ClippedAcf, ClippedAcfScratch, Moments};
-pub(crate) use size::{FoundBreadth, SizeMoments};
+pub(crate) use size::{MeanSquare, SizeMoments};

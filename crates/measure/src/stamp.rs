@@ -7,7 +7,6 @@
 use ndarray::ArrayView2;
 use shearq_submissions::SkySource;
 
-use crate::asymmetry::{opposite, rotation_sum};
 use crate::centroid::galaxy_centroid;
 use crate::error::MeasureError;
 use crate::pixel::{Pixel, copy_row, padding};
@@ -74,9 +73,23 @@ impl FullStamp {
     }
 }
 
+/// Sum of a pixel and its opposite under rotation by 180° about a galaxy, along each axis. It rounds the galaxy's centre to
+/// half a pixel, so that opposites are pixels.
+pub(crate) fn rotation_sum(centroid: [f32; 2], n: usize) -> [i32; 2] {
+    centroid.map(|c| (2.0 * c).round() as i32 + n as i32 - 1)
+}
+
+/// The light of the opposite of a pixel (x, y) on a stamp of `n` pixels a side; `None` off the stamp.
+fn opposite(stamp: &[f32], n: usize, rotation: [i32; 2], [x, y]: [usize; 2]) -> Option<f32> {
+    let on_stamp = |at: i32| usize::try_from(at).ok().filter(|&at| at < n);
+    let column = on_stamp(rotation[0] - x as i32)?;
+    let row = on_stamp(rotation[1] - y as i32)?;
+    Some(stamp[row * n + column])
+}
+
 /// Makes rows and columns of padding missing, unless the opposite edge has some as well: a stamp beyond an edge of an
 /// exposure. Whether there are any.
-pub(crate) fn lose_padding(pixels: &mut [f32], n: usize) -> bool {
+pub(crate) fn mark_padding_missing(pixels: &mut [f32], n: usize) -> bool {
     let [low, high, left, right] = padding(pixels, n);
     let one = |a: usize, b: usize| if a > 0 && b > 0 { [0; 2] } else { [a, b] };
     let ([low, high], [left, right]) = (one(low, high), one(left, right));
@@ -146,15 +159,15 @@ impl MissingPixels {
             stamp[at] = f32::NAN;
         }
         let inner = self.places.iter().filter(|at| is_inner(**at, n, centroid));
-        let is_known = inner.count() <= MAX_INNER_MISSING;
-        self.fill_about(stamp, n, centroid) && is_known
+        let few_inner = inner.count() <= MAX_INNER_MISSING;
+        self.fill_about(stamp, n, centroid) && few_inner
     }
 
     /// Gives missing pixels the light of the opposite ones, or if that is missing too the mean of the adjacent ones, or
     /// zero. False if a pixel near the centre becomes zero, or too many elsewhere whose opposite is on the stamp.
     fn fill_about(&mut self, stamp: &mut [f32], n: usize, centroid: [f32; 2]) -> bool {
         let rotation = rotation_sum(centroid, n);
-        let (mut is_known, mut dark) = (true, 0);
+        let (mut inner_filled, mut zeroed) = (true, 0);
         self.lights.clear();
         for &at in &self.places {
             let other = opposite(stamp, n, rotation, [at % n, at / n]);
@@ -162,8 +175,8 @@ impl MissingPixels {
             let light = light.or_else(|| adjacent_mean(stamp, n, at));
             if light.is_none() {
                 // An opposite that is off the stamp is so far out that there is no light.
-                dark += usize::from(other.is_some());
-                is_known &= !is_inner(at, n, centroid);
+                zeroed += usize::from(other.is_some());
+                inner_filled &= !is_inner(at, n, centroid);
             }
             self.lights.push(light.unwrap_or(0.0));
         }
@@ -171,7 +184,7 @@ impl MissingPixels {
         for (&at, &light) in self.places.iter().zip(&self.lights) {
             stamp[at] = light;
         }
-        is_known && dark as f32 <= MAX_MISSING_PAIR_SHARE * stamp.len() as f32
+        inner_filled && zeroed as f32 <= MAX_MISSING_PAIR_SHARE * stamp.len() as f32
     }
 }
 
@@ -286,10 +299,10 @@ mod tests {
     #[test]
     fn padding_at_one_of_opposite_edges_is_missing() {
         let (mut corner, mut around) = (stamp(), stamp());
-        assert!(!lose_padding(&mut corner, SMALL));
+        assert!(!mark_padding_missing(&mut corner, SMALL));
         corner[(SMALL - 2) * SMALL..].fill(0.0);
         (0..SMALL).for_each(|y| corner[y * SMALL] = 0.0);
-        assert!(lose_padding(&mut corner, SMALL));
+        assert!(mark_padding_missing(&mut corner, SMALL));
         for (at, value) in corner.iter().enumerate() {
             let missing = at / SMALL >= SMALL - 2 || at % SMALL == 0;
             assert_eq!(value.is_nan(), missing, "{at}");
@@ -300,6 +313,6 @@ mod tests {
         }) {
             around[at] = 0.0;
         }
-        assert!(!lose_padding(&mut around, SMALL));
+        assert!(!mark_padding_missing(&mut around, SMALL));
     }
 }

@@ -61,7 +61,7 @@ const UNITS: f64 = 4.0;
 // lines, the mean over four coordinates does.
 const UNITS_PER_PIXEL: usize = 2;
 // The largest figure in square points. A PNG takes 60 bytes per square point while it is drawn.
-const LARGEST: f64 = 5e6;
+const MAX_AREA: f64 = 5e6;
 
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
@@ -79,7 +79,7 @@ pub enum FigureError {
         expected: usize,
     },
     #[error(
-        "the figure would be {width:.0} × {height:.0} points, expected at most {LARGEST:.0} \
+        "the figure would be {width:.0} × {height:.0} points, expected at most {MAX_AREA:.0} \
          square points: put fewer panels into it"
     )]
     TooLarge { width: f64, height: f64 },
@@ -150,7 +150,7 @@ impl<D: Drawing> Figure for D {
     fn render(&self, format: PictureFormat) -> Result<Vec<u8>, FigureError> {
         self.check()?;
         let (width, height) = self.size();
-        if width * height > LARGEST {
+        if width * height > MAX_AREA {
             return Err(FigureError::TooLarge { width, height });
         }
         let size = (units(width) as u32, units(height) as u32);

@@ -144,8 +144,10 @@ pub struct Figure {
     /// Error by the challenge's own convention, where it has one.
     pub error: Option<f64>,
     pub jackknife: f64,
-    /// Best possible Q, or largest |bias| that the challenge aimed at.
-    pub target: Option<f64>,
+    /// Value of a submission of the true shear, where the challenge limits it.
+    pub perfect: Option<f64>,
+    /// What surveys need, as the challenge states it: Q, or the largest |bias|.
+    pub requirement: Option<f64>,
     pub decimals: usize,
 }
 
@@ -186,17 +188,15 @@ impl Score {
         table.column("value", "Value", rows, |own| {
             Cell::number(own.value, own.decimals)
         });
-        table.column("error", "Error", rows, |own| {
-            let error = own.error.map(|error| Cell::number(error, own.decimals));
-            error.unwrap_or(Cell::Empty)
-        });
-        table.column("jackknife", "Jackknife", rows, |own| {
-            Cell::number(own.jackknife, own.decimals)
-        });
-        table.column("target", "Target", rows, |own| {
-            let target = own.target.map(|target| Cell::number(target, own.decimals));
-            target.unwrap_or(Cell::Empty)
-        });
+        let mut column = |key, label, value: fn(&Figure) -> Option<f64>| {
+            table.column(key, label, rows, |own| {
+                value(own).map_or(Cell::Empty, |value| Cell::number(value, own.decimals))
+            });
+        };
+        column("error", "Error", |own| own.error);
+        column("jackknife", "Jackknife", |own| Some(own.jackknife));
+        column("perfect", "Perfect", |own| own.perfect);
+        column("requirement", "Requirement", |own| own.requirement);
         table
     }
 }

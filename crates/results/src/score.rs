@@ -82,7 +82,7 @@ pub enum Basis {
 
 impl Basis {
     /// Whether the convention is certain, so that differences from other methods are meaningful.
-    pub fn is_known(&self) -> bool {
+    pub fn is_certain(&self) -> bool {
         match self {
             Basis::Given => true,
             Basis::Matched(matching) => matching.is_clear(),
@@ -235,7 +235,7 @@ impl<'a> SetFiles<'a> {
         }
         let findings = scorer.diagnose(&added.images, &score, convention);
         let (set, images) = (self.set.unwrap_or(PLAIN_SET), self.images.clone());
-        let known = basis.is_known();
+        let known = basis.is_certain();
         let record = SetRecord::new(set, self.simulated, images, &score, &added.rows, known);
         Ok(ScoredSet {
             record,

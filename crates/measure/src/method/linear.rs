@@ -38,7 +38,7 @@ use crate::noise::StampNoise;
 use crate::pixel::hash;
 use crate::psf::{ResidualProfiles, StarDenoiser, width};
 use crate::second_moments::WeightedMoments;
-use crate::shape::{AdaptiveMoments, AdaptiveScratch, AdaptiveShape, FoundBreadth, SizeMoments};
+use crate::shape::{AdaptiveMoments, AdaptiveScratch, AdaptiveShape, MeanSquare, SizeMoments};
 use crate::sheared::ShearSettings;
 use crate::transform::HexLattice;
 
@@ -98,7 +98,7 @@ impl Regularisation {
         variance: f64,
         spectral: &Spectral,
         moments: &AdaptiveMoments,
-        breadth: &SizeMoments,
+        size_moments: &SizeMoments,
     ) -> Self {
         let LinearDeconvolution {
             target_sigma,
@@ -113,7 +113,7 @@ impl Regularisation {
             (peak * (-square / (4.0 * windowed)).exp()) as f32
         });
         let acf: Vec<f32> = lags.collect();
-        let [zero, two] = breadth.sums(&acf);
+        let [zero, two] = size_moments.sums(&acf);
         Regularisation {
             ellipticity: moments.halving_regularisation(&acf)
                 * method.shape.half_snr.powi(2) as f32,
@@ -151,7 +151,7 @@ struct LinearPlan {
     regularisation: Regularisation,
     spectral: Spectral,
     moments: AdaptiveMoments,
-    breadth: SizeMoments,
+    size_moments: SizeMoments,
     /// Gradients of P₀ and P₂ of [`SizeMoments`].
     size_gradients: [Vec<f32>; 2],
     /// Factor that corrects the flux for the light beyond the window.
@@ -166,9 +166,9 @@ impl LinearPlan {
         let scale = method.shape.weight_scale;
         let moments = AdaptiveMoments::new(scale, spectral.lattice());
         let (target, window) = (settings.target_sigma, settings.window_sigma);
-        let breadth = SizeMoments::new(target, window, spectral.lattice());
+        let size_moments = SizeMoments::new(target, window, spectral.lattice());
         let mut scratch = spectral.scratch();
-        let gradients = breadth.gradients();
+        let gradients = size_moments.gradients();
         let step = method.shape.sheared_step;
         let shear_step = (step > 0.0).then_some(step);
         Ok(LinearPlan {
@@ -180,10 +180,16 @@ impl LinearPlan {
                 weight_scale: scale,
             },
             iterations: u32::try_from(settings.max_iterations).unwrap_or(u32::MAX),
-            regularisation: Regularisation::new(method, variance, &spectral, &moments, &breadth),
+            regularisation: Regularisation::new(
+                method,
+                variance,
+                &spectral,
+                &moments,
+                &size_moments,
+            ),
             aperture: 1.0 + (variance + target * target) / (window * window),
             size_gradients: gradients.map(|weights| spectral.spectrum_of(&weights, &mut scratch)),
-            breadth,
+            size_moments,
             moments,
             spectral,
         })
@@ -541,14 +547,14 @@ impl PlanWorker {
     }
 
     /// Flux and size with their responses.
-    fn observables(&self, breadth: &FoundBreadth, noise: f32, seed: u64) -> FoundObservables {
+    fn observables(&self, mean_square: &MeanSquare, noise: f32, seed: u64) -> FoundObservables {
         let LinearPlan {
-            breadth: moments,
+            size_moments: moments,
             aperture,
             shear_step,
             ..
         } = &*self.plan;
-        let response = |change: &[f32]| f64::from(moments.response(breadth, change));
+        let response = |change: &[f32]| f64::from(moments.response(mean_square, change));
         let flux = self.lags.flux.map(|flux| aperture * f64::from(flux));
         FoundObservables {
             flux: flux[0],
@@ -556,7 +562,7 @@ impl PlanWorker {
             flux_response: [flux[1], flux[2]],
             ring: self.lags.ring.map(f64::from),
             square_response: [response(&self.lags.shear1), response(&self.lags.shear2)],
-            size: moments.size(f64::from(breadth.square)),
+            size: moments.size(f64::from(mean_square.square)),
             sheared: shear_step.map(|step| ShearSettings {
                 step,
                 normals: normals(seed),
@@ -568,7 +574,7 @@ impl PlanWorker {
     fn noise_moments(
         &mut self,
         shape: &AdaptiveShape,
-        breadth: &FoundBreadth,
+        mean_square: &MeanSquare,
         noise: f32,
     ) -> NoiseMoments {
         let plan = &*self.plan;
@@ -577,7 +583,7 @@ impl PlanWorker {
                 .second_order(shape, &self.lags.acf, &mut self.values, &mut self.gradients);
         let [zero, two] = &plan.size_gradients;
         for ((out, zero), two) in self.square_gradient.iter_mut().zip(zero).zip(two) {
-            *out = SizeMoments::combine(breadth, [*zero, *two]);
+            *out = SizeMoments::combine(mean_square, [*zero, *two]);
         }
         let Products {
             pairs,
@@ -611,7 +617,7 @@ impl PlanWorker {
                 ring[with].map(|value| unit * aperture * f64::from(value))
             }),
             square: square
-                .map(|product| unit * SizeMoments::mean_second_derivative(breadth, product)),
+                .map(|product| unit * SizeMoments::mean_second_derivative(mean_square, product)),
         }
     }
 
@@ -626,8 +632,8 @@ impl PlanWorker {
         let (lags, target) = (&self.lags, plan.lengths.target_sigma);
         let of_size = self.regularisation.size * noise * noise;
         let typical = plan.regularisation.typical_square;
-        let breadth = plan.breadth.measure(&lags.acf, of_size, typical);
-        let [size, ..] = plan.breadth.size(f64::from(breadth.square));
+        let mean_square = plan.size_moments.measure(&lags.acf, of_size, typical);
+        let [size, ..] = plan.size_moments.size(f64::from(mean_square.square));
         let window = plan.lengths.window_sigma * plan.lengths.window_sigma;
         let of_galaxy = size * size;
         let flux = f64::from(lags.flux[0]) * (1.0 + (of_galaxy + target * target) / window);
@@ -649,7 +655,7 @@ impl PlanWorker {
             plan.spectral
                 .autocorrelate(&self.psf, stamp, sigma, &mut self.buffers, &mut self.lags);
         }
-        self.measure_lags(stamp, (noise, sigma))
+        self.measure_lags(stamp, noise, sigma)
     }
 
     /// Measures a galaxy on the stamps of epochs with these weights, in combined noise of level `noise`.
@@ -693,20 +699,22 @@ impl PlanWorker {
             let buffers = (&mut self.buffers, &*scratch);
             spectral.take_epoch_lags(&self.psf, sigma, buffers, &mut self.lags);
         }
-        let found = self.measure_lags(epoch(0).cut, (noise, sigma));
+        let found = self.measure_lags(epoch(0).cut, noise, sigma);
         self.epochs = Some(epochs);
         Ok(found)
     }
 
-    /// Measures `lags` of a galaxy in noise of the sky of level `noise`, and with the galaxy's own of level `sigma`. `stamp`
-    /// decides for which galaxies the effects of noise are determined.
-    fn measure_lags(&mut self, stamp: &[f32], (noise, sigma): (f64, f32)) -> Found {
+    /// Measures `lags` of a galaxy in noise of the sky of level `sky_noise`, and together with the galaxy's own of level
+    /// `total_noise`. `stamp` decides for which galaxies the effects of noise are determined.
+    fn measure_lags(&mut self, stamp: &[f32], sky_noise: f64, total_noise: f32) -> Found {
         let plan = Arc::clone(&self.plan);
         let lags = &self.lags;
         let RegularisationTerms { ellipticity, size } = self.regularisation;
-        let shape = plan
-            .moments
-            .measure(&lags.acf, ellipticity * sigma * sigma, &mut self.values);
+        let shape = plan.moments.measure(
+            &lags.acf,
+            ellipticity * total_noise * total_noise,
+            &mut self.values,
+        );
         self.shape = shape.as_ref().ok().copied();
         let mut found = Found {
             descent: Descent {
@@ -727,14 +735,14 @@ impl PlanWorker {
         if let Some(shape) = self.shape {
             let response = Self::response(&plan, &shape, &self.lags, &mut self.values);
             found.response = Some(response);
-            let seed = seed_of(stamp, sigma);
+            let seed = seed_of(stamp, total_noise);
             let typical = plan.regularisation.typical_square;
-            let of_size = size * sigma * sigma;
-            let breadth = plan.breadth.measure(&self.lags.acf, of_size, typical);
-            if noise > 0.0 && seed.is_multiple_of(plan.noise_moments_interval) {
-                found.noise_moments = Some(self.noise_moments(&shape, &breadth, sigma));
+            let of_size = size * total_noise * total_noise;
+            let mean_square = plan.size_moments.measure(&self.lags.acf, of_size, typical);
+            if sky_noise > 0.0 && seed.is_multiple_of(plan.noise_moments_interval) {
+                found.noise_moments = Some(self.noise_moments(&shape, &mean_square, total_noise));
             }
-            let observables = self.observables(&breadth, sigma, seed);
+            let observables = self.observables(&mean_square, total_noise, seed);
             found.size = observables.size[0];
             found.observables = Some(observables);
         }

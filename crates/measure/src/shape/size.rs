@@ -43,7 +43,7 @@ pub(crate) struct SizeMoments {
 }
 
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct FoundBreadth {
+pub(crate) struct MeanSquare {
     pub(crate) square: f32,
     /// P₀ + s.
     divisor: f32,
@@ -78,17 +78,17 @@ impl SizeMoments {
     }
 
     /// T of an autocorrelation, with `regularisation` and the typical T.
-    pub(crate) fn measure(&self, acf: &[f32], regularisation: f32, typical: f32) -> FoundBreadth {
+    pub(crate) fn measure(&self, acf: &[f32], regularisation: f32, typical: f32) -> MeanSquare {
         let [zero, two] = self.sums(acf);
         let divisor = zero + regularisation;
-        FoundBreadth {
+        MeanSquare {
             square: (two + regularisation * typical) / divisor,
             divisor,
         }
     }
 
     /// Change of T with a change of the autocorrelation.
-    pub(crate) fn response(&self, found: &FoundBreadth, change: &[f32]) -> f32 {
+    pub(crate) fn response(&self, found: &MeanSquare, change: &[f32]) -> f32 {
         Self::combine(found, self.sums(change))
     }
 
@@ -104,12 +104,12 @@ impl SizeMoments {
     }
 
     /// Mean of T″(a, b) over changes a and b, from the mean product of P₀(a) and T′(b), which is the same if a and b are exchanged.
-    pub(crate) fn mean_second_derivative(found: &FoundBreadth, product: f32) -> f64 {
+    pub(crate) fn mean_second_derivative(found: &MeanSquare, product: f32) -> f64 {
         f64::from(-2.0 * product / found.divisor)
     }
 
     /// Gradient of T from those of P₀ and P₂.
-    pub(crate) fn combine(found: &FoundBreadth, [zero, two]: [f32; 2]) -> f32 {
+    pub(crate) fn combine(found: &MeanSquare, [zero, two]: [f32; 2]) -> f32 {
         (two - found.square * zero) / found.divisor
     }
 
@@ -186,15 +186,15 @@ mod tests {
 
     #[test]
     fn the_size_of_a_gaussian_is_its_standard_deviation() {
-        let breadth = SizeMoments::new(TARGET, WINDOW, LATTICE);
+        let moments = SizeMoments::new(TARGET, WINDOW, LATTICE);
         for r in [1.0, 2.0, 3.0, 5.0, 8.0] {
-            let found = breadth.measure(&acf(r), 0.0, 0.0);
-            let [size, first, second] = breadth.size(f64::from(found.square));
+            let found = moments.measure(&acf(r), 0.0, 0.0);
+            let [size, first, second] = moments.size(f64::from(found.square));
             // The lags end at 20 px, four standard deviations of the weight.
             assert!((size / r - 1.0).abs() < 0.01, "{r}: {size}");
-            assert!((breadth.square_of(size) / f64::from(found.square) - 1.0).abs() < 1e-9);
+            assert!((moments.square_of(size) / f64::from(found.square) - 1.0).abs() < 1e-9);
             let step = 1e-4 * f64::from(found.square);
-            let side = |by: f64| breadth.size(f64::from(found.square) + by)[0];
+            let side = |by: f64| moments.size(f64::from(found.square) + by)[0];
             let (plus, minus) = (side(step), side(-step));
             // Truncation and rounding of differences of 10⁻⁴.
             assert!(((plus - minus) / (2.0 * step) / first - 1.0).abs() < 1e-5);
@@ -204,30 +204,30 @@ mod tests {
                 "{r}"
             );
         }
-        assert_eq!(breadth.size(0.0), [SMALLEST_SIZE * TARGET, 0.0, 0.0]);
-        assert_eq!(breadth.size(1e9), [LARGEST_SIZE * WINDOW, 0.0, 0.0]);
-        assert_eq!(breadth.size(f64::NAN), [SMALLEST_SIZE * TARGET, 0.0, 0.0]);
+        assert_eq!(moments.size(0.0), [SMALLEST_SIZE * TARGET, 0.0, 0.0]);
+        assert_eq!(moments.size(1e9), [LARGEST_SIZE * WINDOW, 0.0, 0.0]);
+        assert_eq!(moments.size(f64::NAN), [SMALLEST_SIZE * TARGET, 0.0, 0.0]);
     }
 
     #[test]
     fn responses_are_differences_and_noise_has_the_typical_size() {
-        let breadth = SizeMoments::new(TARGET, WINDOW, LATTICE);
+        let moments = SizeMoments::new(TARGET, WINDOW, LATTICE);
         let (galaxy, other) = (acf(2.0), acf(4.0));
-        let found = breadth.measure(&galaxy, 3.0, 20.0);
+        let found = moments.measure(&galaxy, 3.0, 20.0);
         let step = 1e-3;
         let moved: Vec<f32> = galaxy
             .iter()
             .zip(&other)
             .map(|(a, b)| a + step * b)
             .collect();
-        let change = (breadth.measure(&moved, 3.0, 20.0).square - found.square) / step;
-        let response = breadth.response(&found, &other);
+        let change = (moments.measure(&moved, 3.0, 20.0).square - found.square) / step;
+        let response = moments.response(&found, &other);
         // Single precision over a step of 10⁻³.
         assert!(
             (change / response - 1.0).abs() < 0.02,
             "{change} {response}"
         );
-        let product = breadth.sums(&other)[0] * response;
+        let product = moments.sums(&other)[0] * response;
         let curved = SizeMoments::mean_second_derivative(&found, product);
         let side = |step: f32| {
             let moved: Vec<f32> = galaxy
@@ -235,7 +235,7 @@ mod tests {
                 .zip(&other)
                 .map(|(a, b)| a + step * b)
                 .collect();
-            f64::from(breadth.response(&breadth.measure(&moved, 3.0, 20.0), &other))
+            f64::from(moments.response(&moments.measure(&moved, 3.0, 20.0), &other))
         };
         let expected = (side(0.01) - side(-0.01)) / 0.02;
         assert!(
@@ -243,8 +243,8 @@ mod tests {
             "{curved} {expected}"
         );
         let nothing = vec![0.0; galaxy.len()];
-        assert_eq!(breadth.measure(&nothing, 3.0, 20.0).square, 20.0);
-        let [zero, two] = breadth.gradients();
+        assert_eq!(moments.measure(&nothing, 3.0, 20.0).square, 20.0);
+        let [zero, two] = moments.gradients();
         let each = |weights: &[f32]| -> f32 {
             let width = LATTICE.width();
             let rows = weights.iter().zip(&other).enumerate();

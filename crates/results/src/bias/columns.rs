@@ -64,7 +64,7 @@ pub enum Role {
     /// Operands of `--where`, and of `--bins`.
     Condition,
     Binned,
-    /// Columns of [`CHOICES`] that no condition names.
+    /// Columns of [`CUT_COLUMNS`] that no condition names.
     Choice,
     /// Flags of failed measurements of sheared catalogues.
     ShearedFailure,
@@ -292,7 +292,7 @@ impl Survey {
 
 // Columns that say which rows count, and whether those of value 1 do. Rows of the overlap of tiles are there twice; of
 // blends that were not separated, and of stars, the shapes are not those of a galaxy.
-const CHOICES: [(&str, bool); 7] = [
+const CUT_COLUMNS: [(&str, bool); 7] = [
     ("is_primary", true),
     ("is_inner", true),
     ("primary", true),
@@ -303,15 +303,15 @@ const CHOICES: [(&str, bool); 7] = [
 ];
 
 // Whether rows count that have 1 in a column of this name, rather than 0; `None` for a column that makes no choice.
-pub(super) fn chosen_value(name: &str) -> Option<bool> {
-    let mut known = CHOICES.iter();
+pub(super) fn counted_value(name: &str) -> Option<bool> {
+    let mut known = CUT_COLUMNS.iter();
     let known = known.find(|(known, _)| known.eq_ignore_ascii_case(name))?;
     Some(known.1)
 }
 
 // What a name in small letters suggests that a column is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Look {
+enum SuspectedRole {
     Choice,
     Derivative,
     Sheared,
@@ -323,27 +323,30 @@ enum Look {
 }
 
 // The first that fits counts: `w_1p` is a weight of a sheared catalogue.
-const LOOKS: [(Look, &str); 7] = [
-    (Look::Derivative, "*_dg1 *_dg2"),
-    (Look::Sheared, "*_1p *_1m *_2p *_2m"),
-    (Look::Calibration, "*shear_bias*"),
-    (Look::Weight, "w wt wt_a w_* *weight *weight_a"),
-    (Look::Flag, "*flag* *mask*"),
+const SUSPECTED_ROLES: [(SuspectedRole, &str); 7] = [
+    (SuspectedRole::Derivative, "*_dg1 *_dg2"),
+    (SuspectedRole::Sheared, "*_1p *_1m *_2p *_2m"),
+    (SuspectedRole::Calibration, "*shear_bias*"),
+    (SuspectedRole::Weight, "w wt wt_a w_* *weight *weight_a"),
+    (SuspectedRole::Flag, "*flag* *mask*"),
     (
-        Look::Response,
+        SuspectedRole::Response,
         "r11 r12 r21 r22 r_11 r_12 r_21 r_22 *_g11 *_g12 *_g21 *_g22 *_r11 *_r12 *_r21 *_r22 *response*",
     ),
-    (Look::Noise, "*rms_e* *sigma_e* *regauss_sigma* *shape_err*"),
+    (
+        SuspectedRole::Noise,
+        "*rms_e* *sigma_e* *regauss_sigma* *shape_err*",
+    ),
 ];
 
-fn look(name: &str) -> Option<Look> {
-    if chosen_value(name).is_some() {
-        return Some(Look::Choice);
+fn suspected_role(name: &str) -> Option<SuspectedRole> {
+    if counted_value(name).is_some() {
+        return Some(SuspectedRole::Choice);
     }
     let name = name.to_ascii_lowercase();
-    let mut looks = LOOKS.iter();
-    let found = looks.find(|(_, patterns)| fits_any(patterns, &name));
-    found.map(|(look, _)| *look)
+    let mut roles = SUSPECTED_ROLES.iter();
+    let found = roles.find(|(_, patterns)| fits_any(patterns, &name));
+    found.map(|(role, _)| *role)
 }
 
 // Whether a text has one of several patterns with blanks between them.
@@ -629,17 +632,17 @@ impl Columns {
         };
         let choices = unused
             .iter()
-            .filter_map(|name| chosen_value(name).map(|_| (*name).clone()));
+            .filter_map(|name| counted_value(name).map(|_| (*name).clone()));
         let choices = choices.collect();
         if self.of(Role::ShearedCatalogue).is_none() && !names.is_given(Role::ShearedCatalogue) {
             self.steps =
                 all(&|name| fits_any("*step* *shear_type* shear", &name.to_ascii_lowercase()));
         }
         if self.of(Role::Weight).is_none() && !names.is_given(Role::Weight) {
-            let weights = all(&|name| look(name) == Some(Look::Weight));
+            let weights = all(&|name| suspected_role(name) == Some(SuspectedRole::Weight));
             self.doubtful_weight = weights.into_iter().next();
         }
-        self.unused = all(&|name| look(name).is_some());
+        self.unused = all(&|name| suspected_role(name).is_some());
         self.choices = choices;
     }
 
@@ -664,7 +667,7 @@ impl Columns {
         let unused: Vec<&String> = unused.collect();
         let mut calibrations = unused
             .iter()
-            .filter(|name| look(name) == Some(Look::Calibration));
+            .filter(|name| suspected_role(name) == Some(SuspectedRole::Calibration));
         let calibration = match calibrations.next() {
             Some(name) => format!(" m and c are those before the calibration by `{name}`."),
             None => String::new(),

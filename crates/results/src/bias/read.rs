@@ -17,7 +17,7 @@ use crate::select::Weighted;
 use crate::star_noise;
 
 use super::Input;
-use super::columns::{CATALOGUES, Columns, RESPONSES, Role, Shapes, chosen_value, sheared_pair};
+use super::columns::{CATALOGUES, Columns, RESPONSES, Role, Shapes, counted_value, sheared_pair};
 use super::identity;
 use super::source::{Reading, Source, catalogue_named};
 use super::truth::{OfRows, check};
@@ -71,14 +71,14 @@ impl From<String> for Rejected {
     }
 }
 
-fn count(about: &mut Catalogue, excluded: Exclusion) {
+fn count(summary: &mut Catalogue, excluded: Exclusion) {
     *match excluded {
-        Exclusion::Flagged => &mut about.flagged,
-        Exclusion::Unweighted => &mut about.unweighted,
-        Exclusion::Unselected => &mut about.unselected,
-        Exclusion::Failed => &mut about.failed,
-        Exclusion::AboveOne => &mut about.above_one,
-        Exclusion::Missing => &mut about.missing,
+        Exclusion::Flagged => &mut summary.flagged,
+        Exclusion::Unweighted => &mut summary.unweighted,
+        Exclusion::Unselected => &mut summary.unselected,
+        Exclusion::Failed => &mut summary.failed,
+        Exclusion::AboveOne => &mut summary.above_one,
+        Exclusion::Missing => &mut summary.missing,
     } += 1;
 }
 
@@ -89,14 +89,17 @@ pub(super) fn rows(
     sources: &[Source],
     mut take: impl FnMut(&SummedRow),
 ) -> Result<Catalogue, FileError> {
-    let mut about = Catalogue {
+    let mut summary = Catalogue {
         name: path.display().to_string(),
         ..Catalogue::default()
     };
-    if let Some(first) = sources.first().filter(|own| own.columns.is_of_shearq()) {
+    if let Some(first) = sources
+        .first()
+        .filter(|source| source.columns.is_of_shearq())
+    {
         let path = &first.place.path;
         // Only in catalogues by shearq: other programs may use the same key for another quantity.
-        about.star = match (&first.frame, FileFormat::of(path)) {
+        summary.star = match (&first.frame, FileFormat::of(path)) {
             (Some(frame), _) => star_noise::of_table(frame, path),
             (None, Some(format)) => star_noise::of_any(path, format)?,
             (None, None) => None,
@@ -108,7 +111,7 @@ pub(super) fn rows(
     for source in sources {
         let (mut first, mut checks) = (0, None::<Vec<Check>>);
         source.parts(reading, |frame| {
-            let part = Part::new(source, reading, &frame, path)?;
+            let part = TableRows::new(source, reading, &frame, path)?;
             // Ranges follow from the first part, so that a file is judged in the same way however it is split.
             let checks = checks.get_or_insert_with(|| part.checks());
             repeats.look_for(&part);
@@ -123,8 +126,8 @@ pub(super) fn rows(
                         Ok(item) => {
                             if catalogue == 0 {
                                 for k in 0..2 {
-                                    about.shear[k].add(item.row.g[k]);
-                                    about.ellipticity[k].add(item.row.e[k]);
+                                    summary.shear[k].add(item.row.g[k]);
+                                    summary.ellipticity[k].add(item.row.e[k]);
                                 }
                                 if excluded.is_none() {
                                     repeats.add(&part, at);
@@ -142,28 +145,28 @@ pub(super) fn rows(
                     }
                 }
                 if let Some(reason) = excluded.filter(|_| catalogue == 0) {
-                    count(&mut about, reason);
+                    count(&mut summary, reason);
                 }
             }
             first += part.rows;
             Ok(())
         })?;
     }
-    about.rows = counts[0];
+    summary.rows = counts[0];
     if let Some(first) = sources.first() {
-        check_share(path, first, reading, &about)?;
+        check_share(path, first, reading, &summary)?;
         repeats.refuse_unused_cuts(path, first)?;
-        about.repeated = repeats.found(first);
+        summary.repeated = repeats.found(first);
     }
-    Ok(about)
+    Ok(summary)
 }
 
-const E: [Role; 2] = [Role::E1, Role::E2];
-const PSF: [Role; 2] = [Role::Psf1, Role::Psf2];
-const RESPONSE: [Role; 2] = [Role::R11, Role::R22];
-const OTHER_RESPONSE: [Role; 2] = [Role::R12, Role::R21];
-const DERIVATIVE: [Role; 2] = [Role::Dw1, Role::Dw2];
-const KSB: [Role; 2] = [Role::KsbE1, Role::KsbE2];
+const E_ROLES: [Role; 2] = [Role::E1, Role::E2];
+const PSF_ROLES: [Role; 2] = [Role::Psf1, Role::Psf2];
+const RESPONSE_ROLES: [Role; 2] = [Role::R11, Role::R22];
+const CROSS_RESPONSE_ROLES: [Role; 2] = [Role::R12, Role::R21];
+const WEIGHT_DERIVATIVE_ROLES: [Role; 2] = [Role::Dw1, Role::Dw2];
+const KSB_ROLES: [Role; 2] = [Role::KsbE1, Role::KsbE2];
 
 // Inverse variances in any unit are smaller; programs write 1e20, 1e30 or the largest float for a failure.
 const MIN_FAILED_WEIGHT: f64 = 1e20;
@@ -179,7 +182,7 @@ struct Check {
     fails: fn(f64, MeasuredRange) -> bool,
 }
 
-struct Part<'a> {
+struct TableRows<'a> {
     source: &'a Source,
     reading: &'a Reading<'a>,
     rows: usize,
@@ -209,7 +212,7 @@ fn has_weight(weight: f64) -> bool {
     weight.is_nan() || weight > 0.0
 }
 
-impl<'a> Part<'a> {
+impl<'a> TableRows<'a> {
     fn new(
         source: &'a Source,
         reading: &'a Reading<'a>,
@@ -234,11 +237,11 @@ impl<'a> Part<'a> {
         let weighted = reading.weights().map(|selection| {
             Weighted::of(path, selection, |name| table::numbers(frame, name, path))
         });
-        Ok(Part {
+        Ok(TableRows {
             weighted: weighted.transpose()?,
             rows: frame.height(),
             columns,
-            e: places.pair(E).unwrap_or_default(),
+            e: places.pair(E_ROLES).unwrap_or_default(),
             responses: responses(source),
             catalogues: catalogues.transpose()?,
             ids: source.columns.of(Role::Id).map(keys).transpose()?,
@@ -294,8 +297,9 @@ impl<'a> Part<'a> {
         let measured: fn(f64, MeasuredRange) -> bool = |value, range| range.excludes(value);
         let sheared = sheared_columns(source);
         // With a response, ellipticities may have any scale, which cancels in the ratio.
-        let any_unit =
-            self.roles(RESPONSE).is_some() || sheared[0].is_some() || source.has_sheared_rows();
+        let any_unit = self.roles(RESPONSE_ROLES).is_some()
+            || sheared[0].is_some()
+            || source.has_sheared_rows();
         let range_e = range(if any_unit { &self.e } else { &[] });
         let sheared: Vec<usize> = sheared.into_iter().flatten().flatten().flatten().collect();
         let expected = "an ellipticity";
@@ -323,13 +327,13 @@ impl<'a> Part<'a> {
                 weight.is_nan() || weight >= MIN_FAILED_WEIGHT
             });
         }
-        let range_r = range(&pair(RESPONSE));
-        add(&pair(RESPONSE), "a response", range_r, measured);
-        add(&pair(OTHER_RESPONSE), "a response", range_r, measured);
-        let derivative = pair(DERIVATIVE);
+        let range_r = range(&pair(RESPONSE_ROLES));
+        add(&pair(RESPONSE_ROLES), "a response", range_r, measured);
+        add(&pair(CROSS_RESPONSE_ROLES), "a response", range_r, measured);
+        let derivative = pair(WEIGHT_DERIVATIVE_ROLES);
         add(&derivative, "a derivative", range(&derivative), measured);
         let expected = "an ellipticity of a PSF, below 1";
-        add(&pair(PSF), expected, shear, |e, _| e.abs() >= 1.0);
+        add(&pair(PSF_ROLES), expected, shear, |e, _| e.abs() >= 1.0);
         let size = source.places.all((Role::PsfSize, 0));
         let expected = "a size of a PSF, above 0";
         add(size, expected, range(size), |size, range| {
@@ -344,7 +348,7 @@ impl<'a> Part<'a> {
 
     // The columns of the ellipticity of a row. GalSim's HSM writes −10 into those that its method does not determine.
     fn shape_columns(&self, at: usize) -> [usize; 2] {
-        match (self.roles(KSB), self.pair(self.e, at)) {
+        match (self.roles(KSB_ROLES), self.pair(self.e, at)) {
             (Some(ksb), [-10.0, -10.0]) => ksb,
             _ => self.e,
         }
@@ -371,16 +375,16 @@ impl<'a> Part<'a> {
     fn select(&self, at: usize) -> Selected {
         let places = &self.source.places;
         let weights: [f64; CATALOGUES] = std::array::from_fn(|catalogue| {
-            let own = places.of((Role::Weight, catalogue));
-            let own = own.or_else(|| self.of(Role::Weight));
-            own.map_or(1.0, |weight| self.value(weight, at))
+            let column = places.of((Role::Weight, catalogue));
+            let column = column.or_else(|| self.of(Role::Weight));
+            column.map_or(1.0, |weight| self.value(weight, at))
         });
         let flagged = |catalogue: usize| {
             let mut flags = places.all((Role::Flag, catalogue)).iter();
             flags.any(|flag| self.value(*flag, at) != 0.0)
         };
         // Smooth steps of `--where` are zero far below their threshold. Such a row would add zeros to all sums.
-        let stepped = self.weighted.as_ref().map(|own| own.weight[at]);
+        let stepped = self.weighted.as_ref().map(|selection| selection.weight[at]);
         let is_outside = stepped.is_some_and(|weight| weight <= 0.0);
         let binned = std::array::from_fn(|catalogue| {
             if flagged(catalogue) {
@@ -425,7 +429,7 @@ impl<'a> Part<'a> {
     ) -> Result<SummedRow, Rejected> {
         self.check_unused_weight(at)?;
         self.check_failures(at, checks)?;
-        let weight = self.weighted.as_ref().map(|own| own.weight[at]);
+        let weight = self.weighted.as_ref().map(|selection| selection.weight[at]);
         let weight = weight.unwrap_or(selected.weights[0]);
         let mut row = self.measured(at, weight)?;
         self.check_numbers(&row, &selected)?;
@@ -490,7 +494,9 @@ impl<'a> Part<'a> {
             weight,
             response,
             g: [0.0; 2],
-            psf: self.roles(PSF).map_or([0.0; 2], |psf| self.pair(psf, at)),
+            psf: self
+                .roles(PSF_ROLES)
+                .map_or([0.0; 2], |psf| self.pair(psf, at)),
             psf_size: size.map_or(1.0, |size| self.value(size, at)),
         })
     }
@@ -555,7 +561,7 @@ impl<'a> Part<'a> {
             return Some((e, [[0.0; 2]; 2]));
         }
         let dw = self
-            .roles(DERIVATIVE)
+            .roles(WEIGHT_DERIVATIVE_ROLES)
             .map_or([0.0; 2], |dw| self.pair(dw, at));
         // d(w e_i)/dg_j = w R_ij + e_i dw/dg_j: weights of AnaCal change with shear.
         let response = [0, 1].map(|i| {
@@ -601,11 +607,11 @@ impl<'a> Part<'a> {
 
     // The key of the unit of a row, the `index`-th of its catalogue.
     fn key(&self, at: usize, index: u64) -> u64 {
-        let neighbours = self.reading.neighbours();
+        let rotated_pairs = self.reading.rows_are_rotated_pairs();
         match (&self.units, &self.ids) {
             (Some(units), _) => units[at],
-            (None, Some(ids)) if !neighbours => ids[at],
-            _ => index >> u32::from(neighbours),
+            (None, Some(ids)) if !rotated_pairs => ids[at],
+            _ => index >> u32::from(rotated_pairs),
         }
     }
 }
@@ -625,8 +631,8 @@ fn sheared_columns(source: &Source) -> [Option<[[usize; 2]; 2]>; 2] {
 fn responses(source: &Source) -> [[Response; 2]; 2] {
     let [own, other] = sheared_columns(source);
     let own_catalogue = source.columns.is_of_shearq();
-    let diagonal = source.places.pair(RESPONSE).is_some();
-    let off_diagonal = source.places.pair(OTHER_RESPONSE).is_some();
+    let diagonal = source.places.pair(RESPONSE_ROLES).is_some();
+    let off_diagonal = source.places.pair(CROSS_RESPONSE_ROLES).is_some();
     [0, 1].map(|i| {
         [0, 1].map(|j| {
             let (without, known) = if i == j {
@@ -654,7 +660,10 @@ const SEARCHED_ROWS: usize = 4096;
 
 // Many rows share numbers that were rounded to few digits, but a distribution is flat around its maximum, so that the ten most
 // frequent numbers are about equally frequent. A number ten times as frequent as the tenth marks a failure or a default.
-const COMPARED_RANK: usize = 10;
+const REFERENCE_RANK: usize = 10;
+const OUTSTANDING_RATIO: u64 = 10;
+// A column of fewer different numbers is one of classes, whose frequencies differ. Chosen by hand.
+const MAX_CLASSES: usize = 10;
 
 #[derive(Clone, Copy, PartialEq)]
 enum RepeatKind {
@@ -695,12 +704,12 @@ impl Repeat {
     }
 
     // Zeros with either sign are equal.
-    fn key(&self, part: &Part<'_>, at: usize) -> [u64; 2] {
+    fn key(&self, part: &TableRows<'_>, at: usize) -> [u64; 2] {
         part.pair(self.columns, at)
             .map(|value| (value + 0.0).to_bits())
     }
 
-    fn look_for(&mut self, part: &Part<'_>) {
+    fn look_for(&mut self, part: &TableRows<'_>) {
         let (searched, or_zero) = match self.kind {
             RepeatKind::Zeros => return,
             RepeatKind::Ellipticities => (SEARCHED_ROWS, true),
@@ -728,9 +737,11 @@ impl Repeat {
             RepeatKind::Ellipticities => most >= 3.max(used.div_ceil(1000)),
             RepeatKind::Zeros => most >= 3 && most < used,
             RepeatKind::Number { or_zero } => {
-                let tenth = counts.get(COMPARED_RANK - 1).map_or(1, |(count, _)| *count);
-                let stands_out = most > COMPARED_RANK as u64 * tenth.max(1) && most < used;
-                stands_out && (self.different > COMPARED_RANK || !or_zero)
+                let tenth = counts
+                    .get(REFERENCE_RANK - 1)
+                    .map_or(1, |(count, _)| *count);
+                let stands_out = most > OUTSTANDING_RATIO * tenth.max(1) && most < used;
+                stands_out && (self.different > MAX_CLASSES || !or_zero)
             }
         };
         worth.then(|| (values.map(f64::from_bits), most))
@@ -738,17 +749,17 @@ impl Repeat {
 }
 
 impl Repeats {
-    fn look_for(&mut self, part: &Part<'_>) {
+    fn look_for(&mut self, part: &TableRows<'_>) {
         if self.all.is_empty() {
             self.all = Self::of(part);
         }
-        self.all.iter_mut().for_each(|own| own.look_for(part));
+        self.all.iter_mut().for_each(|repeat| repeat.look_for(part));
     }
 
-    fn of(part: &Part<'_>) -> Vec<Repeat> {
+    fn of(part: &TableRows<'_>) -> Vec<Repeat> {
         let source = part.source;
         let mut all = vec![Repeat::new(RepeatKind::Ellipticities, part.e)];
-        for roles in [RESPONSE, PSF] {
+        for roles in [RESPONSE_ROLES, PSF_ROLES] {
             all.extend(
                 part.roles(roles)
                     .map(|own| Repeat::new(RepeatKind::Zeros, own)),
@@ -761,30 +772,39 @@ impl Repeats {
             let columns = columns.iter().map(|column| [*column; 2]);
             all.extend(columns.map(|own| Repeat::new(RepeatKind::Number { or_zero }, own)));
         };
-        if part.roles(KSB).is_none() {
+        if part.roles(KSB_ROLES).is_none() {
             number(&part.e, true);
         }
-        number(part.roles(RESPONSE).as_slice().as_flattened(), true);
+        number(part.roles(RESPONSE_ROLES).as_slice().as_flattened(), true);
         let sheared = sheared_columns(source).into_iter().flatten().flatten();
         number(&sheared.flatten().collect::<Vec<_>>(), true);
         let no_rms = source.shapes == Shapes::Responsivity && part.of(Role::RmsE).is_none();
         let sigma = part.of(Role::SigmaE).filter(|_| no_rms);
         number(sigma.as_slice(), true);
-        number(part.roles(DERIVATIVE).as_slice().as_flattened(), false);
+        number(
+            part.roles(WEIGHT_DERIVATIVE_ROLES)
+                .as_slice()
+                .as_flattened(),
+            false,
+        );
         all
     }
 
-    fn add(&mut self, part: &Part<'_>, at: usize) {
+    fn add(&mut self, part: &TableRows<'_>, at: usize) {
         self.used += 1;
         let choices = part.source.places.all((Role::Choice, 0));
         self.excluded.resize(choices.len(), 0);
         for (count, column) in self.excluded.iter_mut().zip(choices) {
-            let good = chosen_value(part.source.name(*column)) == Some(true);
+            let good = counted_value(part.source.name(*column)) == Some(true);
             *count += u64::from((part.value(*column, at) != 0.0) != good);
         }
-        for own in self.all.iter_mut().filter(|own| !own.counts.is_empty()) {
-            let key = own.key(part, at);
-            if let Some(count) = own.counts.get_mut(&key) {
+        for repeat in self
+            .all
+            .iter_mut()
+            .filter(|repeat| !repeat.counts.is_empty())
+        {
+            let key = repeat.key(part, at);
+            if let Some(count) = repeat.counts.get_mut(&key) {
                 *count += 1;
             }
         }
@@ -802,7 +822,7 @@ impl Repeats {
             return Ok(());
         };
         let name = source.name(*column);
-        let choice = match chosen_value(name) {
+        let choice = match counted_value(name) {
             Some(true) => name.to_owned(),
             _ => format!("not({name})"),
         };
@@ -817,12 +837,13 @@ impl Repeats {
 
     fn found(&self, source: &Source) -> Vec<Repeated> {
         let mut all: Vec<Repeated> = Vec::new();
-        for own in &self.all {
-            let columns = own.columns.map(|column| source.name(column).to_owned());
+        for repeat in &self.all {
+            let columns = repeat.columns.map(|column| source.name(column).to_owned());
             // A pair explains its columns.
             let known = all.iter().any(|pair| pair.columns.contains(&columns[0]));
-            let is_number = matches!(own.kind, RepeatKind::Number { .. });
-            if let Some((values, rows)) = own.found(self.used).filter(|_| !(is_number && known)) {
+            let is_number = matches!(repeat.kind, RepeatKind::Number { .. });
+            if let Some((values, rows)) = repeat.found(self.used).filter(|_| !(is_number && known))
+            {
                 all.push(Repeated {
                     columns,
                     values,
@@ -893,17 +914,17 @@ fn check_share(
     path: &Path,
     source: &Source,
     reading: &Reading<'_>,
-    about: &Catalogue,
+    summary: &Catalogue,
 ) -> Result<(), FileError> {
-    let most = 2 * about.flagged > about.rows;
+    let most = 2 * summary.flagged > summary.rows;
     match recognised_cuts(source, reading).next().filter(|_| most) {
         None => Ok(()),
         Some(name) => Err(FileError::new(
             path,
             format!(
                 "flags exclude {} of {} rows, among them `{name}` (expected less than half: 0 for good rows). Try: --columns flag=none --where {name} if good rows have 1, --columns flag={} otherwise",
-                about.flagged,
-                about.rows,
+                summary.flagged,
+                summary.rows,
                 source.columns.flags.join("+")
             ),
         )),

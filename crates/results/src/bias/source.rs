@@ -48,8 +48,8 @@ impl Reading<'_> {
         self.expressions().flat_map(|(_, own)| own.columns())
     }
 
-    // Whether two neighbouring rows form a unit.
-    pub(super) fn neighbours(&self) -> bool {
+    // Whether rows 2k and 2k + 1 are a galaxy and its rotated image, which form a unit.
+    pub(super) fn rows_are_rotated_pairs(&self) -> bool {
         self.request.design == Some(Design::Rotated) && self.request.catalogues.len() == 1
     }
 

@@ -133,8 +133,9 @@ impl Branch for Great08 {
                 value: found.q,
                 error: None,
                 jackknife: found.jackknife,
-                // Of the nominal mean square of 10⁻⁷.
-                target: Some(1000.0),
+                perfect: None,
+                // Of a mean square error of 10⁻⁷.
+                requirement: Some(1000.0),
                 decimals: 1,
             }],
         })

@@ -647,7 +647,7 @@ pub fn one_set_json(scored: &ScoredSet, input: &SetInput) -> Value {
     // Keys that the public cases do not have.
     let own = json!({
         "chosen": score.chosen.number(),
-        "convention_known": scored.basis.is_known(),
+        "convention_known": scored.basis.is_certain(),
         "metrics": score.metrics,
         "metric_errors": score.errors,
         "error_method": "from the part that the truth does not explain, at fixed truth; for c1 and c2 at least the jackknife over images",

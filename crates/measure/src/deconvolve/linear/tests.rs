@@ -850,7 +850,7 @@ fn mean_second_derivatives_are_sums_of_differences_over_modes() {
         let acf = lags.acf.clone();
         let shape = moments.measure(&acf, regularisation, &mut values).unwrap();
         let floor = share * sizes.sums(&acf)[0];
-        let breadth = sizes.measure(&acf, floor, 20.0);
+        let mean_square = sizes.measure(&acf, floor, 20.0);
 
         let mut gradients = [(); 6].map(|()| plan.lags().acf);
         let curvature = moments.second_order(&shape, &acf, &mut values, &mut gradients);
@@ -858,7 +858,7 @@ fn mean_second_derivatives_are_sums_of_differences_over_modes() {
         let square: Vec<f32> = zero
             .iter()
             .zip(&two)
-            .map(|(zero, two)| SizeMoments::combine(&breadth, [*zero, *two]))
+            .map(|(zero, two)| SizeMoments::combine(&mean_square, [*zero, *two]))
             .collect();
         let spectra = [square, zero].map(|weights| plan.spectrum_of(&weights, &mut scratch));
         let spectra = spectra.each_ref().map(|spectrum| &spectrum[..]);
@@ -890,7 +890,7 @@ fn mean_second_derivatives_are_sums_of_differences_over_modes() {
             let pairs = [0, 1, 4].map(|pair: usize| found.pairs[pair][kind]);
             let mixed = found.distortion.map(|mixed| mixed[kind]);
             let [e1, e2] = shape.mean_second_derivative(&curvature, pairs, mixed);
-            let square = SizeMoments::mean_second_derivative(&breadth, found.square[kind]);
+            let square = SizeMoments::mean_second_derivative(&mean_square, found.square[kind]);
             for (k, found) in [e1, e2, square].into_iter().enumerate() {
                 let (expected, size) = (expected[kind][k], size[kind][k]);
                 // Third derivatives, and differences of f32.
