@@ -125,3 +125,17 @@ fn the_architecture_page_lists_every_crate_with_its_level() {
         }
     }
 }
+
+#[test]
+fn files_that_the_architecture_page_names_exist() {
+    crate::tree::enter_root();
+    let page = fs::read_to_string("docs/architecture.md").unwrap();
+    let folders = [&crate::tree::CODE[..], &["tests"]].concat();
+    let files = crate::tree::files(&folders);
+    let quoted = page.split('`').skip(1).step_by(2);
+    let named: Vec<&str> = quoted.filter(|name| name.ends_with(".rs")).collect();
+    for name in &named {
+        assert!(files.iter().any(|file| file.ends_with(name)), "{name}");
+    }
+    assert!(named.len() > 30, "{} files", named.len());
+}
