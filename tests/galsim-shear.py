@@ -121,10 +121,8 @@ def main():
         slopes, offsets = [], []
         for k in range(2):
             response = np.where(flagged, np.nan, column(f"R{k + 1}{k + 1}"))
-            # Undo each image's own calibration and take the mean response of all.
-            e = column(f"e{k + 1}") * np.nanmean(response, 2, keepdims=True)
             mean = np.nanmean(response)
-            e = np.where(good[:, None], e, np.nan)
+            e = np.where(good[:, None], column(f"e{k + 1}"), np.nan)
             signs = np.array([shear[k] for _, shear in VERSIONS])
             slope = (e * signs[:, None]).sum(1) / (4 * SHEAR)
             surplus = (slope - response.mean(1)) / mean
