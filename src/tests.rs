@@ -114,9 +114,9 @@ const WAYS: [(&str, &[&str]); 33] = [
     (
         "gather",
         &[
-            "stamps square extension mask mask-extension mask-bits psf psf-extension noise frame gain set image out",
-            "stamps square extension mask mask-extension mask-bits psf psf-extension variance variance-extension frame gain set image out",
-            "stamps square extension mask mask-extension mask-bits psf psf-extension weight-map weight-extension frame gain set image out",
+            "stamps positions table id carry square extension mask mask-extension mask-bits psf psf-extension noise frame gain set image out",
+            "stamps positions table id carry square extension mask mask-extension mask-bits psf psf-extension variance variance-extension frame gain set image out",
+            "stamps positions table id carry square extension mask mask-extension mask-bits psf psf-extension weight-map weight-extension frame gain set image out",
             "exposure positions table first-pixel columns degrees id carry size extension mask mask-extension mask-bits psf psf-extension noise frame gain set image out",
             "exposure positions table first-pixel columns degrees id carry size extension mask mask-extension mask-bits psf psf-extension variance variance-extension frame gain set image out",
             "exposure positions table first-pixel columns degrees id carry size extension mask mask-extension mask-bits psf psf-extension weight-map weight-extension frame gain set image out",

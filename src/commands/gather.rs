@@ -26,7 +26,7 @@ use shearq_quantities::Frame;
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
     /// FITS files of stamps, in the order of the galaxies.
-    #[arg(long, value_name = "FILE", num_args = 1.., required_unless_present = "exposure", conflicts_with_all = ["exposure", "Cutouts"])]
+    #[arg(long, value_name = "FILE", num_args = 1.., required_unless_present = "exposure", conflicts_with_all = ["exposure", "first_pixel", "columns", "degrees", "size"])]
     stamps: Vec<PathBuf>,
     /// Image to cut stamps out of: the first of its file. Several exposures of the same galaxies become images of consecutive
     /// numbers, each with the PSF, map and mask at its place in the lists, for `measure --epochs`.
@@ -44,11 +44,32 @@ pub(crate) struct Arguments {
     /// Use only masks of this name [default files: the stamps or the exposure].
     #[arg(long, value_name = "NAME")]
     mask_extension: Option<String>,
+    /// Table of positions on the exposure: text, FITS or Parquet, in FITS pixels (the centre of the first pixel is 1), or in
+    /// degrees on the sky if the exposure has a WCS (TAN, TAN-SIP, TPV). Catalogues have its identities and places.
+    /// `FILE[NAME]` and `FILE[NUMBER]` are tables of a FITS file. One table for all exposures, or one for each.
+    /// With --stamps, a row per stamp in their order: its columns id, x, y, ra and dec are copied as they are.
+    #[arg(long, value_name = "FILE", num_args = 1..)]
+    positions: Vec<PathBuf>,
+    /// Table of a FITS file: its name (EXTNAME), or its number from 1 [default: the table that has the columns].
+    #[arg(long, value_name = "NAME|NUMBER", requires = "positions")]
+    table: Option<String>,
+    /// Column of identities, integers or texts [default: id, object_id, source_id or NUMBER, if there is one].
+    #[arg(long, value_name = "NAME", requires = "positions")]
+    id: Option<String>,
+    /// Further columns of the positions for the catalogue, such as mag,z.
+    #[arg(
+        long,
+        value_name = "NAMES",
+        value_delimiter = ',',
+        num_args = 1,
+        requires = "positions"
+    )]
+    carry: Vec<String>,
     #[command(flatten)]
     cutouts: Cutouts,
     /// Make squares of stamps that are not: by their central square (crop), or by missing pixels around them (pad). A galaxy with
     /// many missing pixels is flagged. PSFs are cropped [default: refuse].
-    #[arg(long, value_name = "HOW", value_parser = ["crop", "pad"], conflicts_with_all = ["exposure", "Cutouts"])]
+    #[arg(long, value_name = "HOW", value_parser = ["crop", "pad"], conflicts_with = "exposure")]
     square: Option<String>,
     /// FITS files of PSF stamps, or one table of functional PSFs (.csv): one PSF for all galaxies, or one per galaxy.
     /// Several stars, at most half as many as galaxies, are averaged to one PSF.
@@ -92,18 +113,10 @@ pub(crate) struct Arguments {
     out: PathBuf,
 }
 
-// The options of stamps that are cut out of an exposure, as one group, so that `--stamps` and `--square` refuse each of them.
+// The options of stamps that are cut out of an exposure.
 #[derive(Debug, Args)]
 #[group(requires_all = ["exposure", "positions"])]
 struct Cutouts {
-    /// Table of positions on the exposure: text, FITS or Parquet, in FITS pixels (the centre of the first pixel is 1), or in
-    /// degrees on the sky if the exposure has a WCS (TAN, TAN-SIP, TPV). Catalogues have its identities and places.
-    /// `FILE[NAME]` and `FILE[NUMBER]` are tables of a FITS file. One table for all exposures, or one for each.
-    #[arg(long, value_name = "FILE", num_args = 1..)]
-    positions: Vec<PathBuf>,
-    /// Table of a FITS file: its name (EXTNAME), or its number from 1 [default: the table that has the columns].
-    #[arg(long, value_name = "NAME|NUMBER")]
-    table: Option<String>,
     /// Coordinate of the centre of the first pixel: 1 for FITS and SExtractor, 0 for NumPy and sep.
     #[arg(long, value_name = "0|1", default_value_t = 1, value_parser = clap::value_parser!(u8).range(0..=1))]
     first_pixel: u8,
@@ -115,12 +128,6 @@ struct Cutouts {
     /// names even if there are x and y.
     #[arg(long)]
     degrees: bool,
-    /// Column of identities, integers or texts [default: id, object_id, source_id or NUMBER, if there is one].
-    #[arg(long, value_name = "NAME")]
-    id: Option<String>,
-    /// Further columns of the positions for the catalogue, such as mag,z.
-    #[arg(long, value_name = "NAMES", value_delimiter = ',', num_args = 1)]
-    carry: Vec<String>,
     /// Pixels a side of the stamps that are cut out.
     #[arg(long, value_name = "N", default_value_t = 48, value_parser = clap::value_parser!(u16).range(5..=1024))]
     size: u16,
@@ -195,8 +202,51 @@ fn own_files(arguments: &Arguments, at: usize) -> anyhow::Result<[&[PathBuf]; 6]
         own(place, "psf", psf, false)?,
         own(place, "variance", variance, false)?,
         own(place, "weight-map", weight_map, false)?,
-        own(place, "positions", &arguments.cutouts.positions, true)?,
+        own(place, "positions", &arguments.positions, true)?,
     ])
+}
+
+/// The stamps of files with the table of their identities, or those cut out at the positions.
+fn stamps_and_rows<'a>(
+    arguments: &'a Arguments,
+    images: Files<'a>,
+    positions: &'a [PathBuf],
+) -> anyhow::Result<(Stamps<'a>, Option<Table<'a>>)> {
+    anyhow::ensure!(
+        positions.len() <= 1,
+        "--positions names {} for one image (expected one)",
+        count(positions.len(), "file")
+    );
+    let Arguments {
+        table, id, carry, ..
+    } = arguments;
+    let Cutouts {
+        first_pixel,
+        columns,
+        degrees,
+        size,
+    } = &arguments.cutouts;
+    let columns = two_columns(columns.as_deref())?;
+    let table = positions.first().map(|path| Table {
+        path,
+        table: table.as_deref(),
+        columns,
+        degrees: *degrees,
+        id: id.as_deref(),
+        carry,
+    });
+    Ok(match table {
+        Some(positions) if !arguments.exposure.is_empty() => {
+            let cutouts = Stamps::Cutouts {
+                exposure: images,
+                positions,
+                first_pixel: *first_pixel,
+                side: usize::from(*size),
+            };
+            (cutouts, None)
+        }
+        rows => (Stamps::Files(images), rows),
+    })
 }
 
 /// What to gather from exposure `at`, from 0, or from all stamps.
@@ -208,17 +258,11 @@ fn gathering(arguments: &Arguments, at: usize) -> anyhow::Result<Gathering<'_>> 
         mask: _,
         mask_extension,
         mask_bits,
-        cutouts:
-            Cutouts {
-                positions: _,
-                table,
-                first_pixel,
-                columns,
-                degrees,
-                id,
-                carry,
-                size,
-            },
+        positions: _,
+        table: _,
+        id: _,
+        carry: _,
+        cutouts: _,
         square,
         psf: _,
         psf_extension,
@@ -233,7 +277,8 @@ fn gathering(arguments: &Arguments, at: usize) -> anyhow::Result<Gathering<'_>> 
         image: _,
         out: _,
     } = arguments;
-    // Destructured in full, so that the compiler finds an option that is not passed on. `own_files` takes the lists of files.
+    // Destructured in full, so that the compiler finds an option that is not passed on. `own_files` takes the lists of files, and
+    // `stamps_and_rows` the options of tables and cut-outs.
     let [own, mask, psf, variance, weight_map, positions] = own_files(arguments, at)?;
     for (option, value) in [("noise", noise), ("gain", gain)] {
         anyhow::ensure!(
@@ -275,24 +320,10 @@ fn gathering(arguments: &Arguments, at: usize) -> anyhow::Result<Gathering<'_>> 
         extension: psf_extension.as_deref(),
         content: Content::Psf,
     };
-    let stamps = match positions {
-        [path, ..] => Stamps::Cutouts {
-            exposure: images,
-            positions: Table {
-                path,
-                table: table.as_deref(),
-                columns: two_columns(columns.as_deref())?,
-                degrees: *degrees,
-                id: id.as_deref(),
-                carry,
-            },
-            first_pixel: *first_pixel,
-            side: usize::from(*size),
-        },
-        [] => Stamps::Files(images),
-    };
+    let (stamps, rows) = stamps_and_rows(arguments, images, positions)?;
     Ok(Gathering {
         stamps,
+        rows,
         square: square.as_deref().map(|how| match how {
             "crop" => Square::Crop,
             _ => Square::Pad,

@@ -1,4 +1,5 @@
-//! Runs the pages of `tests/cases`: commands, and what they print. `SHEARQ_ACCEPT=1` writes what they print now.
+//! Runs the pages of `tests/cases`: commands, and what they print. `SHEARQ_ACCEPT=1` writes what they print now, and
+//! `SHEARQ_CASES=positions` runs the page of this name alone.
 //!
 //! A page has cases under `##` headings, each in a new folder, and may start with functions of the shell. In blocks of `console`, `$` starts a command of the shell,
 //! `>` continues it, and `? 1` states an exit code other than 0; then comes the output. In it `[..]` is any text and a line
@@ -168,7 +169,11 @@ fn differences(path: &Path) -> Vec<String> {
 #[test]
 fn commands_of_the_cases_print_what_their_pages_say() {
     let pages = std::fs::read_dir("tests/cases").unwrap();
-    let pages: Vec<_> = pages.map(|entry| entry.unwrap().path()).collect();
+    let mut pages: Vec<_> = pages.map(|entry| entry.unwrap().path()).collect();
+    if let Ok(name) = std::env::var("SHEARQ_CASES") {
+        pages.retain(|page| page.file_stem().is_some_and(|stem| *stem == *name));
+        assert!(!pages.is_empty(), "there is no page tests/cases/{name}.md");
+    }
     let wrong: Vec<String> = std::thread::scope(|scope| {
         let running: Vec<_> = pages
             .iter()

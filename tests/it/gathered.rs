@@ -745,7 +745,7 @@ fn pixel_axes_that_are_not_the_skys_are_stated() {
         "{message}"
     );
     let out = small.at("camera-out");
-    let stated = "e1 and e2 are along the pixel axes, which are not the sky's (found +y at position angle 90.0°, mirrored, sheared by (+0.0000, +0.0000)";
+    let stated = "e1 and e2 are along the pixel axes, which are not the sky's (found rotated by 90.0° from north to east, mirrored, sheared by (+0.0000, +0.0000)";
     for message in [
         gather(&[camera], &on_camera.1, ["1", "camera", "pixel"]),
         measure("camera"),
@@ -756,7 +756,7 @@ fn pixel_axes_that_are_not_the_skys_are_stated() {
     // Without the option, ellipticities are along the sky's axes: those of x to the south and y to the east have the other
     // sign of e1.
     let message = gather(&[camera], &on_camera.1, ["1", "turned", ""]);
-    let frame = "frame: sky (e1 > 0 along east–west, e2 > 0 along north-west). The WCS of the first stamp: +y at position angle 90.0°, mirrored";
+    let frame = "frame: sky (e1 > 0 along east–west, e2 > 0 along north-west). The WCS of the first stamp: rotated by 90.0° from north to east, mirrored";
     assert!(message.contains(frame), "{message}");
     measure("turned");
     let out = small.at("turned-out");
@@ -781,7 +781,7 @@ fn pixel_axes_that_are_not_the_skys_are_stated() {
     measure("both");
     let out = small.at("both-out");
     let message = fail(&["mean", "--measured", text(&out)]);
-    let expected = "catalogue-001.parquet and no common mean with them (found pixel axes with +y at position angle 90.0°, mirrored, sheared by (+0.0000, +0.0000); expected pixel axes with +y at position angle 0.0°, not mirrored";
+    let expected = "catalogue-001.parquet and no common mean with them (found pixel axes rotated by 90.0° from north to east, mirrored, sheared by (+0.0000, +0.0000); expected pixel axes rotated by 0.0° from north to east, not mirrored";
     assert!(message.contains(expected), "{message}");
     // Both are along the sky in one set: axes that are the sky's anyhow, and those that the WCS turns.
     gather(&[sky], &on_sky.1, ["1", "all", ""]);

@@ -93,7 +93,7 @@ impl fmt::Display for Axes {
         match self {
             Axes::Sky => f.write_str("the axes of the sky"),
             Axes::Pixel => f.write_str("pixel axes without a WCS"),
-            Axes::Oriented(frame) => write!(f, "pixel axes with {frame}"),
+            Axes::Oriented(frame) => write!(f, "pixel axes {frame}"),
         }
     }
 }

@@ -72,7 +72,7 @@ pub enum Warning {
     },
     /// The noise differs from stamp to stamp.
     #[error(
-        "the noise differs between stamps (found a scatter of {:.0} %; expected one level). Try: put stamps of one depth into an image",
+        "the noise differs between stamps (found a scatter of {:.0} %; expected one level). Try: give the noise of each stamp (gather --variance or --weight-map, `noise` in Python), or put stamps of one depth into an image",
         100.0 * scatter
     )]
     Depths {
@@ -339,7 +339,7 @@ impl fmt::Display for PixelFrame {
         let [g1, g2] = self.shear.map(|g| (g * 1e4).round() / 1e4 + 0.0);
         write!(
             f,
-            "+y at position angle {angle:.1}°, {not}mirrored, sheared by ({g1:+.4}, {g2:+.4})"
+            "rotated by {angle:.1}° from north to east, {not}mirrored, sheared by ({g1:+.4}, {g2:+.4})"
         )
     }
 }

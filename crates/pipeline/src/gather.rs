@@ -15,8 +15,8 @@ use shearq_quantities::matrix::Matrix2;
 use shearq_quantities::statistics::upper_median;
 use shearq_quantities::{Frame, Jacobian};
 
-use self::positions::Positions;
 pub use self::positions::Table;
+use self::positions::{Positions, rows_of_stamps};
 use self::psfs::{GatheredPsfs, gather_psfs};
 pub(crate) use self::source::off_middle;
 pub use self::source::{Content, Files};
@@ -100,6 +100,9 @@ pub struct Masks<'a> {
 #[derive(Debug, Clone, Serialize)]
 pub struct Gathering<'a> {
     pub stamps: Stamps<'a>,
+    /// Table of the identities and places of stamps of files.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub rows: Option<Table<'a>>,
     /// What stamps and PSFs of files that are not square become; without it they are refused.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub square: Option<Square>,
@@ -185,6 +188,8 @@ fn gather_alone(
         ref wcs,
         ..
     } = &plan.stack;
+    let rows = gathering.rows.map(|rows| rows_of_stamps(rows, count));
+    let rows = rows.transpose()?;
     let mosaic = Mosaic::of(count, side);
     check_strip(&target, mosaic.columns, side)?;
     let psfs = gather_psfs(data, id, gathering.psfs, gathering.square, &mosaic)?;
@@ -217,7 +222,8 @@ fn gather_alone(
         gain: gathering.gain,
     };
     let incomplete = writer.incomplete;
-    let columns = plan.columns(head, &mosaic, &mut writer, jacobians.as_deref());
+    let mut columns = rows.unwrap_or_default();
+    columns.extend(plan.columns(head, &mosaic, &mut writer, jacobians.as_deref()));
     let record = format!("{record}\n");
     atomic::write(which.with_extension("json"), record.as_bytes())?;
     stamp_table::table(&which, head, columns)?.write(&which)?;

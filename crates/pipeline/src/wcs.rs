@@ -671,7 +671,7 @@ mod tests {
         let same = wcs(&sky([-cosine, sine, sine, cosine]).keys());
         let turned = Warning::PixelFrame(frame(&same.reference().unwrap())).to_string();
         assert!(
-            turned.contains("+y at position angle 30.0°, not mirrored"),
+            turned.contains("rotated by 30.0° from north to east, not mirrored"),
             "{turned}"
         );
         assert!((same.scale.unwrap() - 0.2).abs() < 1e-12);

@@ -3,7 +3,9 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use shearq_dataset::metadata::{CommonAxes, FIRST_PIXEL, FRAME, NOT_APPLIED, RESPONSE, axes_of};
+use shearq_dataset::metadata::{
+    Axes, CommonAxes, FIRST_PIXEL, FRAME, NOT_APPLIED, RESPONSE, axes_of,
+};
 use shearq_dataset::run::Run;
 use shearq_files::FileError;
 use shearq_files::frames::polars::{Column, DataFrame};
@@ -177,7 +179,7 @@ pub fn shears(
                 let stated = table::read_metadata(&path, run.format, keys.iter())?;
                 let own = axes_of(&path, &stated)?;
                 axes.add(&path, own, false)?;
-                check_positions(&path, treecorr, own.frame() == Frame::Sky)?;
+                check_positions(&path, treecorr, own)?;
                 if metadata.is_empty() {
                     metadata = stated;
                 }
@@ -241,12 +243,13 @@ pub fn shears(
 }
 
 // TreeCorr takes right ascension and declination on the sky, where our signs are its own, or x and y of the pixels' axes.
-fn check_positions(path: &Path, treecorr: Option<Position>, is_sky: bool) -> Result<(), FileError> {
-    let message = match (treecorr, is_sky) {
-        (Some(Position::Sky), false) => {
+fn check_positions(path: &Path, treecorr: Option<Position>, axes: Axes) -> Result<(), FileError> {
+    let message = match treecorr {
+        // Pixel axes that a WCS states to be the sky's are as good as `mean` takes them.
+        Some(Position::Sky) if !axes.agree(Axes::Sky) => {
             "the ellipticities are in the frame of the pixels, so that they have no direction on the sky (found `pixel`; expected `sky`). Try: gather --frame sky, or --treecorr x,y"
         }
-        (Some(Position::Pixel), true) => {
+        Some(Position::Pixel) if axes.frame() == Frame::Sky => {
             "the ellipticities are in the frame of the sky, so that they have no direction along x and y (found `sky`; expected `pixel`). Try: --treecorr ra,dec"
         }
         _ => return Ok(()),

@@ -96,25 +96,9 @@ impl Positions {
             let message = format!("the column `{x}` is asked for twice");
             return Err(FileError::new(&place.path, message));
         }
-        if let Some(name) = table.carry.iter().find(|name| is_taken(name)) {
-            let message = format!(
-                "the column `{name}` cannot be carried, because catalogues have one of this name. Try: rename it in the table"
-            );
-            return Err(FileError::new(&place.path, message));
-        }
-        // A column may be the identity and carried, too, and must be read once.
-        let mut wanted: Vec<&str> = vec![&x, &y];
-        let texts: Vec<&str> = id.iter().chain(table.carry).map(String::as_str).collect();
-        let reals = sky.iter().flatten().map(String::as_str);
-        for name in reals.chain(texts.iter().copied()) {
-            if !wanted.contains(&name) {
-                wanted.push(name);
-            }
-        }
-        let texts: Vec<&str> = texts
-            .into_iter()
-            .filter(|name| *name != x && *name != y)
-            .collect();
+        let mut reals: Vec<&str> = vec![&x, &y];
+        reals.extend(sky.iter().flatten().map(String::as_str));
+        let (wanted, texts) = selection(&place, reals, id.as_ref(), table.carry)?;
         let read = read_all(&place, &wanted, &texts)
             .map_err(|error| error.hint_of_columns("--columns X,Y names others"))?;
         let of = |name: &str| table::numbers(&read, name, &place.path);
@@ -157,15 +141,7 @@ impl Positions {
             );
             return Err(FileError::new(&place.path, message));
         }
-        let column = |name: &String| {
-            let column = read.column(name).cloned();
-            column.map_err(|error| FileError::new(&place.path, error))
-        };
-        let id = id
-            .as_ref()
-            .map(|id| identities(&place.path, column(id)?))
-            .transpose()?;
-        let carried = table.carry.iter().map(column).collect::<Result<_, _>>()?;
+        let (id, carried) = id_and_carried(&place, &read, id.as_ref(), table.carry)?;
         let note = table.columns.is_none().then(|| note(&place, [&x, &y]));
         Ok(Positions {
             place,
@@ -262,6 +238,100 @@ impl Positions {
         }
         (count, first)
     }
+}
+
+/// Identities, places and further columns of `count` stamps that are not cut out, a row for each in their order.
+pub(super) fn rows_of_stamps(table: Table<'_>, count: usize) -> Result<Vec<Column>, FileError> {
+    let place = Place::with_table(table.path, table.table)?;
+    let columns = table::columns(&place)?;
+    let fault = |message: String| FileError::new(&place.path, message);
+    // Comments of a text table may look like names. Of several tables of a FITS file any may have as many rows as stamps.
+    let mut certain = columns.named.iter().filter(|named| !named.doubtful);
+    let names = match (certain.next(), certain.next()) {
+        (Some(named), None) => &named.names,
+        (found, _) => {
+            let found = found.map_or("no names of columns", |_| "several tables");
+            return Err(fault(format!(
+                "found {found}; expected one table with names. Try: --table with a name or a number"
+            )));
+        }
+    };
+    let id = match table.id {
+        Some(id) => Some(id.to_owned()),
+        None => ID_NAMES.iter().find_map(|id| find(names, id)),
+    };
+    let [pixels, sky] = [&PIXEL_NAMES, &SKY_NAMES].map(|known| pair_of(known, names));
+    let places: Vec<(&str, &String)> = stamp_table::PLACE
+        .into_iter()
+        .zip([&pixels, &sky].into_iter().flat_map(|pair| match pair {
+            Some([a, b]) => [Some(a), Some(b)],
+            None => [None; 2],
+        }))
+        .filter_map(|(name, column)| Some((name, column?)))
+        .collect();
+    if id.is_none() && places.is_empty() && table.carry.is_empty() {
+        return Err(fault(format!(
+            "no column identifies the stamps (found {}; expected id, x and y, or ra and dec). Try: --id or --carry with a name",
+            names_of(names)
+        )));
+    }
+    let reals = places.iter().map(|(_, column)| column.as_str()).collect();
+    let (wanted, texts) = selection(&place, reals, id.as_ref(), table.carry)?;
+    let read = read_all(&place, &wanted, &texts)?;
+    if read.height() != count {
+        return Err(fault(format!(
+            "{} rows for {count} stamps; expected one row per stamp, in the same order",
+            read.height()
+        )));
+    }
+    let (id, carried) = id_and_carried(&place, &read, id.as_ref(), table.carry)?;
+    let mut all: Vec<Column> = id.into_iter().collect();
+    for (name, column) in places {
+        let values = table::numbers(&read, column, &place.path)?;
+        all.push(Column::new(name.into(), values.to_vec()));
+    }
+    all.extend(carried);
+    Ok(all)
+}
+
+/// Names of all columns to read, each once, and of those among them that keep texts and all digits of integers.
+fn selection<'n>(
+    place: &Place,
+    reals: Vec<&'n str>,
+    id: Option<&'n String>,
+    carry: &'n [String],
+) -> Result<(Vec<&'n str>, Vec<&'n str>), FileError> {
+    if let Some(name) = carry.iter().find(|name| is_taken(name)) {
+        let message = format!(
+            "the column `{name}` cannot be carried, because catalogues have one of this name. Try: rename it in the table"
+        );
+        return Err(FileError::new(&place.path, message));
+    }
+    let mut wanted = reals;
+    let mut texts = Vec::new();
+    // A column may be the identity and carried, too, and must be read once.
+    for name in id.into_iter().chain(carry).map(String::as_str) {
+        if !wanted.contains(&name) {
+            wanted.push(name);
+            texts.push(name);
+        }
+    }
+    Ok((wanted, texts))
+}
+
+fn id_and_carried(
+    place: &Place,
+    read: &DataFrame,
+    id: Option<&String>,
+    carry: &[String],
+) -> Result<(Option<Column>, Vec<Column>), FileError> {
+    let column = |name: &String| {
+        let column = read.column(name).cloned();
+        column.map_err(|error| FileError::new(&place.path, error))
+    };
+    let id = id.map(|id| identities(&place.path, column(id)?));
+    let carried = carry.iter().map(column).collect::<Result<_, _>>()?;
+    Ok((id.transpose()?, carried))
 }
 
 // Users must be able to see which of several columns of positions was taken.
