@@ -1,5 +1,6 @@
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
+use anyhow::Context;
 use clap::Args;
 
 use crate::arguments::{SetList, Sharding, SimulationArguments, Threads};
@@ -8,7 +9,8 @@ use crate::tell;
 use shearq_dataset::images;
 use shearq_dataset::layout::{DataFolder, MAX_IMAGE};
 use shearq_dataset::run::SimulationRecord;
-use shearq_pipeline::simulate::simulate_folder;
+use shearq_pipeline::simulate::{great3, simulate_folder};
+use shearq_simulate::great3::{Branch, BranchSimulator, GRID};
 use shearq_simulate::set::SimulationSettings;
 
 /// Write simulated GREAT10-like sets: images, PSFs, true shear and intrinsic shapes.
@@ -22,14 +24,17 @@ use shearq_simulate::set::SimulationSettings;
 ///
 /// With --constant-shear all galaxies have one shear. Several shears, --opposite or --rotated make a folder for each
 /// version of the same galaxies, with the same noise: OUT/g1_+0.02_g2_+0 and so on. `bias` recognises the pairs.
+///
+/// With `--challenge great3 --branch BRANCH`, the command writes a branch of GREAT3 in its layout into
+/// OUT/EXPERIMENT/OBSERVATION/SHEAR, and its truth, as it was released, below OUT/truth (docs/great3.md).
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
     /// Sets, as `1,2,7-9` or `all`.
-    #[arg(long, value_name = "LIST")]
-    sets: SetList,
+    #[arg(long, value_name = "LIST", required_unless_present = "challenge")]
+    sets: Option<SetList>,
     /// Images per set.
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=i64::from(MAX_IMAGE)))]
-    images: u32,
+    #[arg(long, value_name = "N", required_unless_present = "challenge", value_parser = clap::value_parser!(u32).range(1..=i64::from(MAX_IMAGE)))]
+    images: Option<u32>,
     #[command(flatten)]
     simulation: SimulationArguments,
     /// Shear of all galaxies, instead of a shear field. May be given several times.
@@ -41,6 +46,19 @@ pub(crate) struct Arguments {
     /// Also simulate the galaxies rotated by 90 degrees.
     #[arg(long, requires = "constant_shear", conflicts_with_all = ["amplitude", "tilt"])]
     rotated: bool,
+    /// Simulate a branch of this challenge: great3.
+    #[arg(long, value_parser = ["great3"], requires = "branch", conflicts_with_all = GREAT10_ONLY)]
+    challenge: Option<String>,
+    /// Branch: control or multiepoch, ground or space, constant or variable, such as control-ground-constant.
+    #[arg(long, value_name = "NAME", requires = "challenge", conflicts_with_all = GREAT10_ONLY, value_parser = branch)]
+    branch: Option<Branch>,
+    /// Subfields of the branch [default: 200].
+    #[arg(long, value_name = "N", requires = "branch", conflicts_with_all = GREAT10_ONLY, value_parser = clap::value_parser!(u16).range(1..=1000))]
+    subfields: Option<u16>,
+    /// Fits to galaxies, drawn at random: a table with the columns n, r_e (half the light is within the ellipse of this long half
+    /// axis, in arcsec) and q (axis ratio), and perhaps flux, bulge_r_e, bulge_q, bulge_flux (n = 4; flux 0 for none) and snr.
+    #[arg(long, value_name = "FILE", requires = "branch", conflicts_with_all = GREAT10_ONLY)]
+    galaxies: Option<PathBuf>,
     /// Folder to write to.
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
@@ -48,6 +66,29 @@ pub(crate) struct Arguments {
     sharding: Sharding,
     #[command(flatten)]
     threads: Threads,
+}
+
+// Options without a meaning for branches of GREAT3.
+const GREAT10_ONLY: [&str; 8] = [
+    "sets",
+    "images",
+    "amplitude",
+    "tilt",
+    "constant_shear",
+    "opposite",
+    "rotated",
+    "shard",
+];
+
+// Subfields of a branch.
+const SUBFIELDS: u16 = 200;
+
+fn branch(name: &str) -> Result<Branch, String> {
+    let found = Branch::all().find(|(own, _)| own == name);
+    found.map(|(_, branch)| branch).ok_or_else(|| {
+        let names: Vec<String> = Branch::all().map(|(own, _)| own).collect();
+        format!("expected one of {}", names.join(", "))
+    })
 }
 
 fn parse_shear(text: &str) -> Result<[f64; 2], String> {
@@ -96,9 +137,62 @@ fn versions(arguments: &Arguments) -> anyhow::Result<Vec<(SimulationSettings, Pa
     })
 }
 
+fn run_branch(arguments: &Arguments, branch: Branch) -> anyhow::Result<()> {
+    let settings = arguments.simulation.settings()?;
+    anyhow::ensure!(
+        settings.grid <= GRID,
+        "--grid: found {}, expected at most {GRID} for a branch of GREAT3",
+        settings.grid
+    );
+    let fits = match &arguments.galaxies {
+        Some(path) => great3::read_fits(path)?,
+        None => Vec::new(),
+    };
+    let record = great3::Record {
+        version: shearq_dataset::VERSION.into(),
+        branch: branch.folder(),
+        seed: settings.seed,
+        grid: settings.grid,
+        galaxies: arguments.galaxies.clone(),
+    };
+    let simulator =
+        BranchSimulator::new(branch, settings.seed, settings.grid, fits).with_context(|| {
+            let path = arguments.galaxies.as_deref().unwrap_or(Path::new(""));
+            path.display().to_string()
+        })?;
+    let subfields = usize::from(arguments.subfields.unwrap_or(SUBFIELDS));
+    let images = subfields * branch.epochs();
+    let mut bar = Bar::new(
+        "simulating",
+        (images * settings.grid * settings.grid) as u64,
+    );
+    let threads = arguments.threads.number();
+    let made = great3::simulate_branch(
+        &simulator,
+        &record,
+        subfields,
+        &arguments.out,
+        threads,
+        &mut bar,
+    )?;
+    drop(bar);
+    tell(format_args!(
+        "{made} images simulated, {} there already, in {}; truth in {}",
+        images - made,
+        arguments.out.join(branch.folder()).display(),
+        great3::truth_folder(&arguments.out, branch).display()
+    ));
+    Ok(())
+}
+
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     mark_resumable();
-    let images = images::of_simulation(arguments.sets.simulated()?, arguments.images);
+    let (sets, images) = match (arguments.branch, &arguments.sets, arguments.images) {
+        (Some(branch), ..) => return run_branch(arguments, branch),
+        (None, Some(sets), Some(images)) => (sets, images),
+        _ => anyhow::bail!("expected --sets and --images, or --challenge and --branch"),
+    };
+    let images = images::of_simulation(sets.simulated()?, images);
     let images = arguments.sharding.part(&images);
     let versions = versions(arguments)?;
     let grid = versions[0].0.grid as u64;

@@ -14,7 +14,7 @@ use shearq_results::published::{CHALLENGES, Challenge};
 use shearq_scoring::aperture::{Lattice, LatticeShear};
 use shearq_scoring::great3::Observation;
 
-use crate::support::{fail, shearq, succeed};
+use crate::support::{fail, pixels_of, shearq, succeed};
 
 const CASES: &str = "scoring/tests/data/great3";
 
@@ -502,4 +502,107 @@ fn a_hundred_malformed_submissions_have_one_clear_error_each() {
     }
     assert!(wrong.is_empty(), "{}\n{}", wrong.len(), wrong.join("\n"));
     assert!(count >= 100, "{count}");
+}
+
+// ID, g1 and g2 of the galaxies of simulated truth, as rows of text: sheared shapes, or shears alone.
+fn true_galaxies(folder: &Path, subfields: usize, sheared: bool) -> String {
+    let mut rows = String::new();
+    for subfield in 0..subfields {
+        let path = folder.join(format!("galaxy_catalog-{subfield:03}.fits"));
+        let read = table::read(&path, None, table::MAX_ROWS).unwrap();
+        let column = |name| table::numbers(&read, name, &path).unwrap();
+        let [ids, g1, g2, e1, e2] = ["ID", "g1", "g2", "g1_intrinsic", "g2_intrinsic"].map(column);
+        for k in 0..ids.len() {
+            let shear = Shear::new(g1[k], g2[k]);
+            let shape = Shear::new(e1[k], e2[k]).sheared_by(shear);
+            let Shear { e1, e2 } = if sheared { shape } else { shear };
+            let _ = writeln!(rows, "{:.0} {e1} {e2}", ids[k]);
+        }
+    }
+    rows
+}
+
+#[test]
+fn simulated_branches_are_scored_by_their_released_truth() {
+    let folder = tempfile::tempdir().unwrap();
+    for (branch, subfields, ceiling) in [
+        ("control-space-constant", 3, 2464.0),
+        ("multiepoch-ground-constant", 3, 1232.0),
+        ("control-ground-variable", 20, 1.837e-4 / 9e-8),
+    ] {
+        let root = folder.path().join(branch);
+        let out = root.display();
+        let line = format!(
+            "simulate --challenge great3 --branch {branch} --subfields {subfields} --grid 8 --out {out}"
+        );
+        succeed(&words(&line));
+        let below = branch.replace('-', "/");
+        let truth = root.join("truth").join(&below);
+        let rows = true_galaxies(&truth, subfields, branch.ends_with("variable"));
+        let galaxies = file(&root, "galaxies.txt", &rows);
+        let (packed, released) = (root.join("packed.txt"), root.join("truth"));
+        let (packed, released) = (packed.display(), released.display());
+        let line = format!(
+            "pack --challenge great3 --branch {branch} --subfields {subfields} --grid 8 --out {packed} {galaxies}"
+        );
+        succeed(&words(&line));
+        let line =
+            format!("score --challenge great3 --branch {branch} --truth {released} {packed}");
+        let found = json(&line);
+        let q = found["Q_c"].as_f64().or(found["Q_v"].as_f64()).unwrap();
+        assert!((q / ceiling - 1.0).abs() < 1e-6, "{branch}: {q}");
+
+        // What participants got: 3 x 3 stars, and stamps whose lower central pixels the catalogue names.
+        let data = root.join(&below);
+        let (_, width) = pixels_of(&data.join("starfield_image-000-0.fits"));
+        let path = data.join("galaxy_catalog-001.fits");
+        let read = table::read(&path, None, table::MAX_ROWS).unwrap();
+        assert_eq!(read.get_column_names(), ["x", "y", "ID"]);
+        let x = table::numbers(&read, "x", &path).unwrap();
+        let stamp = if branch.contains("space") { 96 } else { 48 };
+        assert_eq!(width, 3 * stamp);
+        assert_eq!(
+            [x[0], x[7], x[8]],
+            [0.5, 7.5, 0.5].map(|k| k * stamp as f64 - 1.0)
+        );
+        let (_, width) = pixels_of(&data.join("image-001-0.fits"));
+        assert_eq!(width, 8 * stamp);
+    }
+}
+
+#[test]
+fn simulated_branches_draw_from_a_table_of_fits() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("out").display().to_string();
+    let line = |path: &str| {
+        format!(
+            "simulate --challenge great3 --branch control-ground-constant --subfields 1 --grid 8 --galaxies {path} --out {out}"
+        )
+    };
+    let head = "n r_e q flux bulge_r_e bulge_q bulge_flux snr";
+    let fits = file(
+        folder.path(),
+        "fits.txt",
+        &format!("{head}\n1 0.5 0.6 2 0.2 0.9 1 50\n2.3 0.3 1 1 0 0 0 30\n"),
+    );
+    succeed(&words(&line(&fits)));
+    // Round galaxies and pairs of one axis ratio.
+    let truth = Path::new(&out).join("truth/control/ground/constant");
+    let path = truth.join("galaxy_catalog-000.fits");
+    let read = table::read(&path, None, table::MAX_ROWS).unwrap();
+    let column = |name| table::numbers(&read, name, &path).unwrap();
+    let (e1, e2) = (column("g1_intrinsic"), column("g2_intrinsic"));
+    for (e1, e2) in e1.iter().zip(e2.iter()) {
+        let modulus = e1.hypot(*e2);
+        assert!(modulus < 1e-9 || (modulus - 0.25).abs() < 1e-9, "{modulus}");
+    }
+    for (rows, says) in [
+        ("n r_e q\n1 0.5 0\n", "row 1: the axis ratio is 0"),
+        ("n r_e q\n1 -0.5 0.5\n", "half-light radius"),
+        ("n r_e\n1 0.5\n", "q"),
+    ] {
+        let path = file(folder.path(), "wrong.txt", rows);
+        let told = fail(&words(&line(&path)));
+        assert!(told.contains("wrong.txt") && told.contains(says), "{told}");
+    }
 }

@@ -1,5 +1,7 @@
 //! Simulating sets into a data folder.
 
+pub mod great3;
+
 use std::sync::Arc;
 
 use super::PipelineError;

@@ -29,7 +29,7 @@ pub mod units;
 
 pub use ellipticity::{Distortion, Shear};
 pub use jacobian::{Frame, Jacobian, JacobianError, Orientation, PixelShape, Spin2, UnknownFrame};
-pub use psf::{FunctionalPsf, ProfileError, PsfProfile, PsfTransform, TransformedPsf};
+pub use psf::{FunctionalPsf, ProfileError, PsfProfile, PsfTransform, Pupil, TransformedPsf};
 pub use range::MeasuredRange;
 
 /// Stamps in a row of the arrangement of `count` stamps that is nearest to a square: 1 or more.

@@ -351,11 +351,60 @@ fn kolmogorov_brightness(rule: &[(f64, f64)], s: f64) -> f64 {
     sum / (2.0 * PI)
 }
 
+/// The circular aperture of a telescope with a circular obscuration in its middle.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Pupil {
+    /// Wavelength over diameter, in units of the FWHM of the profile that it blurs.
+    pub lambda_over_diameter: f64,
+    /// Diameter of the obscuration in units of that of the aperture, 0 or more and below 1.
+    pub obscuration: f64,
+}
+
+impl Pupil {
+    /// The transform of its diffraction pattern of flux 1 against k·FWHM: the area that two apertures share, over that of one
+    /// (O'Neill 1956, J. Opt. Soc. Am. 46, 285). Zero beyond 2π/(λ/D).
+    pub fn fourier(self, k_fwhm: f64) -> f64 {
+        let shift = k_fwhm.abs() * self.lambda_over_diameter / PI;
+        let inner = self.obscuration;
+        let shared = shared_area(1.0, 1.0, shift) + shared_area(inner, inner, shift)
+            - 2.0 * shared_area(1.0, inner, shift);
+        (shared / (PI * (1.0 - inner * inner))).max(0.0)
+    }
+
+    // The brightest rings at `radius` FWHM, per FWHM². Amplitudes of both edges add up where they are in phase; that of the
+    // inner one is √ε of the outer one.
+    fn rings(self, radius: f64) -> f64 {
+        let e = self.obscuration;
+        let in_phase = (1.0 + e.sqrt()).powi(2) / (1.0 - e * e);
+        2.0 / PI.powi(3) * self.lambda_over_diameter * in_phase / radius.powi(3)
+    }
+
+    // The square of the radius in FWHM of a disc with the flux and the central brightness of the pattern, π/4 (1 − ε²) (D/λ)².
+    fn disc2(self) -> f64 {
+        4.0 / (PI * PI) * self.lambda_over_diameter.powi(2) / (1.0 - self.obscuration.powi(2))
+    }
+}
+
+/// The area that discs of radii `a` ≥ `b` share whose centres are `d` apart.
+fn shared_area(a: f64, b: f64, d: f64) -> f64 {
+    if d >= a + b {
+        return 0.0;
+    }
+    if d <= a - b {
+        return PI * b * b;
+    }
+    let (a2, b2, d2) = (a * a, b * b, d * d);
+    let kite = ((a + b - d) * (d + b - a) * (d + a - b) * (a + b + d)).sqrt();
+    b2 * ((d2 + b2 - a2) / (2.0 * d * b)).acos() + a2 * ((d2 + a2 - b2) / (2.0 * d * a)).acos()
+        - 0.5 * kite
+}
+
 /// The transform of one round profile, tabulated against (k·FWHM)²; make one for each profile and
 /// use it for PSFs of every width and shape.
 #[derive(Debug, Clone)]
 pub struct PsfTransform {
     profile: PsfProfile,
+    pupil: Option<Pupil>,
     table: RadialTable,
 }
 
@@ -366,11 +415,31 @@ impl PsfTransform {
     /// # Errors
     /// When a Moffat β is not above 1.
     pub fn new(profile: PsfProfile) -> Result<Self, ProfileError> {
+        Self::through(profile, None)
+    }
+
+    /// Tabulates the transform of `profile` convolved with the diffraction pattern of `pupil`. The FWHM of a PSF remains
+    /// that of the profile alone.
+    ///
+    /// # Errors
+    /// As [`PsfTransform::new`].
+    pub fn behind(profile: PsfProfile, pupil: Pupil) -> Result<Self, ProfileError> {
+        Self::through(profile, Some(pupil))
+    }
+
+    fn through(profile: PsfProfile, pupil: Option<Pupil>) -> Result<Self, ProfileError> {
         profile.check()?;
         // Neither transform is smooth at k = 0 (k^{5/3}, and |k|^{2β−2}): a small unit confines
         // that to wavenumbers that no stamp resolves.
-        let table = RadialTable::new(1e-6, |u| profile.fourier(u.sqrt()));
-        Ok(PsfTransform { profile, table })
+        let table = RadialTable::new(1e-6, |u| {
+            let k = u.sqrt();
+            profile.fourier(k) * pupil.map_or(1.0, |pupil| pupil.fourier(k))
+        });
+        Ok(PsfTransform {
+            profile,
+            pupil,
+            table,
+        })
     }
 
     /// The tabulated profile.
@@ -421,13 +490,30 @@ pub struct TransformedPsf<'a> {
 }
 
 impl TransformedPsf<'_> {
-    /// The PSF by its formula.
+    /// The PSF by its formula, without the pupil.
     pub fn functional(&self) -> FunctionalPsf {
         FunctionalPsf {
             profile: self.transform.profile,
             fwhm: self.fwhm,
             shape: self.shape,
         }
+    }
+
+    /// The pupil that its profile is convolved with.
+    pub fn pupil(&self) -> Option<Pupil> {
+        self.transform.pupil
+    }
+
+    /// About the largest surface brightness per px² of the round PSF at `radius` pixels, far from its centre.
+    pub fn wings(&self, radius: f64) -> f64 {
+        let rings = |pupil: Pupil| pupil.rings(radius / self.fwhm) / (self.fwhm * self.fwhm);
+        self.functional().round_value(radius) + self.pupil().map_or(0.0, rings)
+    }
+
+    /// The radius in pixels of a disc about as bright as its core, rather too small than too large.
+    pub fn core(&self) -> f64 {
+        let disc2 = self.pupil().map_or(0.0, Pupil::disc2);
+        self.fwhm * (0.36 + disc2).sqrt()
     }
 }
 
@@ -443,6 +529,41 @@ mod tests {
         let mut stamp = Array2::zeros((size, size));
         psf.draw_into(centre.0, centre.1, stamp.view_mut());
         stamp
+    }
+
+    #[test]
+    fn pupils_have_the_transform_of_their_diffraction_pattern() {
+        // ∫ I J0(kr) 2πr dr of I = π/4 / (1 − ε²) · [2J1(x)/x − ε² 2J1(εx)/(εx)]², x = πr, at λ/D = 1.
+        let rule = composite_rule(0.0, 400.0, 1600, 12);
+        for obscuration in [0.0, 0.3] {
+            let pupil = Pupil {
+                lambda_over_diameter: 1.0,
+                obscuration,
+            };
+            let somb = |x: f64| if x == 0.0 { 1.0 } else { 2.0 * Jn(1, x) / x };
+            let brightness = |r: f64| {
+                let e2 = obscuration * obscuration;
+                let amplitude = somb(PI * r) - e2 * somb(PI * r * obscuration);
+                PI / 4.0 / (1.0 - e2) * amplitude * amplitude
+            };
+            for k in [0.5, 2.0, 4.0, 6.0, 7.0] {
+                let sum: f64 = rule
+                    .iter()
+                    .map(|(r, w)| w * 2.0 * PI * r * brightness(*r) * Jn(0, k * r))
+                    .sum();
+                let found = pupil.fourier(k);
+                assert!(
+                    (found - sum).abs() < 1e-4,
+                    "{obscuration} {k}: {found} {sum}"
+                );
+            }
+            assert!((pupil.fourier(0.0) - 1.0).abs() < 1e-15);
+            // The envelope of the rings, over some of them.
+            let rings = (0..40).map(|i| brightness(20.0 + 0.1 * f64::from(i)));
+            let ratio = rings.fold(0.0, f64::max) / pupil.rings(20.0);
+            assert!((0.5..1.05).contains(&ratio), "{obscuration}: {ratio}");
+            assert!((brightness(0.0) * PI * pupil.disc2() - 1.0).abs() < 1e-12);
+        }
     }
 
     #[test]

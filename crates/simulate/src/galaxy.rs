@@ -2,10 +2,11 @@
 //!
 //! Lengths are pixels, wavenumbers radians per pixel. A transform is F(k) = ∫ I(x) e^{−ik·x} d²x.
 
-use std::f64::consts::PI;
-use std::sync::LazyLock;
+use std::f64::consts::{LN_2, PI};
+use std::sync::OnceLock;
 
 use puruspe::bessel::Kn;
+use puruspe::gamma::{gamma, invgammp};
 use shearq_quantities::Shear;
 use shearq_quantities::radial::{QuadraticForm, RadialTable, composite_rule};
 use thiserror::Error;
@@ -16,47 +17,65 @@ pub const EXPONENTIAL_HALF_LIGHT: f64 = 1.678_346_990_016_660_7;
 /// b of a de Vaucouleurs profile exp(−b (r/r_e)^{1/4}): half the light of Γ(8) lies below b.
 pub const DE_VAUCOULEURS_B: f64 = 7.669_249_442_500_804;
 
-const GAMMA_8: f64 = 5040.0; // Γ(8) = 7!
-
-static DE_VAUCOULEURS: LazyLock<RadialTable> = LazyLock::new(|| {
-    let rule = composite_rule(0.0, 1.0, 16, 16);
-    RadialTable::new(1e-3, |u| de_vaucouleurs_fourier(&rule, u.sqrt()))
-});
-
-/// The radial form of a galaxy component; neither is truncated.
+/// The radial form of a galaxy component, I ∝ exp(−b (r/r_e)^{1/n}); none is truncated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Sersic {
+    /// n = 1/2.
+    Gaussian,
     /// n = 1, a disc: I ∝ exp(−r/r_s).
     Exponential,
-    /// n = 4, a bulge: I ∝ exp(−b (r/r_e)^{1/4}).
+    /// n = 4, a bulge.
     DeVaucouleurs,
+    /// Twice the index n, 3 or more.
+    Steep(u8),
 }
 
+// Up to n = 6, beyond which fits to galaxies mean a sky that is too bright.
+const TABLES: usize = 12;
+
+// By twice the index, less one.
+static TABULATED: [OnceLock<RadialTable>; TABLES] = [const { OnceLock::new() }; TABLES];
+
 impl Sersic {
+    /// The profile with the index nearest to `n` among 1/2, 1, 3/2, … 6.
+    pub fn nearest(n: f64) -> Self {
+        match (2.0 * n).round().clamp(1.0, TABLES as f64) as u8 {
+            1 => Sersic::Gaussian,
+            2 => Sersic::Exponential,
+            8 => Sersic::DeVaucouleurs,
+            twice => Sersic::Steep(twice),
+        }
+    }
+
+    fn twice_index(self) -> u8 {
+        match self {
+            Sersic::Gaussian => 1,
+            Sersic::Exponential => 2,
+            Sersic::DeVaucouleurs => 8,
+            Sersic::Steep(twice) => twice,
+        }
+    }
+
     /// The transform of the round profile of flux 1, at the square of k·r_e.
     ///
-    /// Exponential: (1 + (k r_s)²)^(−3/2). De Vaucouleurs: from a table, made at the first call,
-    /// with errors below 1e-6.
+    /// Exponential: (1 + (k r_s)²)^(−3/2). Others: from a table, made at the first call, with errors below 1e-6.
     pub fn fourier(self, k_re2: f64) -> f64 {
         match self {
             Sersic::Exponential => exponential_fourier(k_re2),
-            Sersic::DeVaucouleurs => DE_VAUCOULEURS.at(k_re2),
+            _ => self.table().at(k_re2),
         }
     }
 
     #[inline(always)]
     pub(crate) fn fourier_each(self, values: &mut [f64]) {
-        match self {
-            Sersic::Exponential => {
-                for value in values {
-                    *value = exponential_fourier(*value);
-                }
+        if self == Sersic::Exponential {
+            for value in values {
+                *value = exponential_fourier(*value);
             }
-            Sersic::DeVaucouleurs => {
-                let table = &*DE_VAUCOULEURS;
-                for value in values {
-                    *value = table.at(*value);
-                }
+        } else {
+            let table = self.table();
+            for value in values {
+                *value = table.at(*value);
             }
         }
     }
@@ -68,48 +87,94 @@ impl Sersic {
                 let h = EXPONENTIAL_HALF_LIGHT;
                 h * h / (2.0 * PI) * (-h * radius).exp()
             }
-            Sersic::DeVaucouleurs => {
-                de_vaucouleurs_centre() * (-DE_VAUCOULEURS_B * radius.sqrt().sqrt()).exp()
-            }
+            _ => Law::new(self.twice_index()).brightness(radius),
         }
     }
 
-    pub(crate) fn de_vaucouleurs_table() -> &'static RadialTable {
-        &DE_VAUCOULEURS
+    pub(crate) fn table(self) -> &'static RadialTable {
+        let twice = self.twice_index();
+        TABULATED[usize::from(twice) - 1].get_or_init(|| Law::new(twice).tabulate())
     }
 }
 
-/// Central surface brightness for flux 1, per r_e²: b⁸ / (8π Γ(8)).
-fn de_vaucouleurs_centre() -> f64 {
-    DE_VAUCOULEURS_B.powi(8) / (8.0 * PI * GAMMA_8)
+// b, n and the central surface brightness per r_e² for flux 1 of a Sérsic profile.
+struct Law {
+    twice: i32,
+    b: f64,
+    centre: f64,
 }
 
-/// F(k r_e) of a de Vaucouleurs profile; `rule` integrates over (0, 1).
-///
-/// The Hankel integral ∫ r I(r) J0(kr) dr oscillates under wings that hardly fall. J0 is the real
-/// part of a Hankel function, and r may turn onto the imaginary axis, where that becomes K0 and
-/// r^{1/4} only turns by π/8. With r = i t⁴ (in r_e) and b e^{iπ/8} = p + iq,
-///
-///   F(k) = 2 b⁸ / (π Γ(8)) · ∫ t⁷ e^{−pt} sin(qt) K0(k t⁴) dt,
-///
-/// which decays on both counts and keeps its relative accuracy from k → 0 to k → ∞.
-fn de_vaucouleurs_fourier(rule: &[(f64, f64)], k: f64) -> f64 {
-    // Here F = 1 − 5.4 k² is 1 to 1e-11.
-    if k < 1e-6 {
-        return 1.0;
+// x^(m/2), in products where m is even.
+fn half_power(x: f64, m: i32) -> f64 {
+    let whole = x.powi(m / 2);
+    if m % 2 == 0 { whole } else { whole * x.sqrt() }
+}
+
+impl Law {
+    fn new(twice: u8) -> Self {
+        let twice = i32::from(twice);
+        let b = match twice {
+            // To more digits than the inverse has, which iterates to 1e-8.
+            8 => DE_VAUCOULEURS_B,
+            2 => EXPONENTIAL_HALF_LIGHT,
+            1 => LN_2,
+            _ => invgammp(0.5, f64::from(twice)),
+        };
+        // b^(2n) / (2πn Γ(2n)).
+        let centre = b.powi(twice) / (f64::from(twice) * PI * gamma(f64::from(twice)).round());
+        Law { twice, b, centre }
     }
-    let (q, p) = (PI / 8.0).sin_cos();
-    let (p, q) = (p * DE_VAUCOULEURS_B, q * DE_VAUCOULEURS_B);
-    // Past the first bound e^{−pt} t⁷, past the second K0, leaves less than 1e-17.
-    let end = f64::min(9.5, (50.0 / k).sqrt().sqrt());
-    let sum: f64 = rule
-        .iter()
-        .map(|&(x, weight)| {
-            let t = x * end;
-            weight * t.powi(7) * (-p * t).exp() * (q * t).sin() * Kn(0, k * t.powi(4))
+
+    fn brightness(&self, radius: f64) -> f64 {
+        let root = match self.twice {
+            8 => radius.sqrt().sqrt(),
+            twice => radius.powf(2.0 / f64::from(twice)),
+        };
+        self.centre * (-self.b * root).exp()
+    }
+
+    fn tabulate(&self) -> RadialTable {
+        let rule = composite_rule(0.0, 1.0, 16, 16);
+        RadialTable::new(1e-3, |u| match self.twice {
+            1 => (-u / (4.0 * LN_2)).exp(),
+            2 => exponential_fourier(u),
+            _ => self.fourier(&rule, u.sqrt()),
         })
-        .sum();
-    16.0 * de_vaucouleurs_centre() * sum * end
+    }
+
+    /// F(k r_e) for n of 3/2 and more; `rule` integrates over (0, 1).
+    ///
+    /// The Hankel integral ∫ r I(r) J0(kr) dr oscillates under wings that hardly fall. J0 is the real
+    /// part of a Hankel function, and r may turn onto the imaginary axis, where that becomes K0 and
+    /// r^{1/n} only turns by π/2n. With r = i tⁿ (in r_e) and b e^{iπ/2n} = p + iq,
+    ///
+    ///   F(k) = 4 n I(0) · ∫ t^(2n−1) e^{−pt} sin(qt) K0(k tⁿ) dt,
+    ///
+    /// which decays on both counts and keeps its relative accuracy from k → 0 to k → ∞. For n = 1 the exponential no longer falls.
+    fn fourier(&self, rule: &[(f64, f64)], k: f64) -> f64 {
+        // Here F is 1 to 1e-10 (for n = 4, 1 − 5.4 k²).
+        if k < 1e-6 {
+            return 1.0;
+        }
+        let twice = self.twice;
+        let (q, p) = (PI / f64::from(twice)).sin_cos();
+        let (p, q) = (p * self.b, q * self.b);
+        // Past the first bound e^{−pt} t^(2n−1), past the second K0, leaves less than 1e-17.
+        let last = match twice {
+            8 => (50.0 / k).sqrt().sqrt(),
+            _ => (50.0 / k).powf(2.0 / f64::from(twice)),
+        };
+        let end = f64::min(67.3 / p, last);
+        let sum: f64 = rule
+            .iter()
+            .map(|&(x, weight)| {
+                let t = x * end;
+                let light = t.powi(twice - 1) * (-p * t).exp() * (q * t).sin();
+                weight * light * Kn(0, k * half_power(t, twice))
+            })
+            .sum();
+        2.0 * f64::from(twice) * self.centre * sum * end
+    }
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
@@ -280,31 +345,50 @@ impl Galaxy {
 mod tests {
     use super::*;
     use puruspe::bessel::Jn;
-    use puruspe::gamma::gamma;
     use shearq_quantities::radial::gauss_legendre;
 
     fn table(k: f64) -> f64 {
         Sersic::DeVaucouleurs.fourier(k * k)
     }
 
-    /// The Hankel integral along the real axis, r = t⁴, panels short against the oscillation.
-    fn by_real_axis(k: f64) -> f64 {
-        let rule = gauss_legendre(12);
+    fn de_vaucouleurs_centre() -> f64 {
+        Law::new(8).centre
+    }
+
+    /// The Hankel integral of index n along the real axis, r = tⁿ, panels short against the oscillation.
+    fn by_real_axis(twice: i32, k: f64) -> f64 {
+        let (law, rule) = (Law::new(twice as u8), gauss_legendre(12));
+        let n = 0.5 * f64::from(twice);
         let (mut sum, mut t) = (0.0, 0.0);
-        while t < 8.0 {
-            let rate = 4.0 * k * f64::powi(t + 0.02, 3);
+        while t < 60.0 / law.b {
+            let rate = k * n * f64::powf(t + 0.02, n - 1.0);
             let width = f64::min(0.05, 3.0 / rate.max(1e-9));
-            sum += rule
-                .iter()
-                .map(|&(x, w)| {
-                    let t = t + 0.5 * width * (1.0 + x);
-                    let light = t.powi(7) * (-DE_VAUCOULEURS_B * t).exp();
-                    0.5 * width * w * light * Jn(0, k * t.powi(4))
-                })
-                .sum::<f64>();
+            for &(x, w) in &rule {
+                let t = t + 0.5 * width * (1.0 + x);
+                let light = t.powi(twice - 1) * (-law.b * t).exp();
+                sum += 0.5 * width * w * light * Jn(0, k * t.powf(n));
+            }
             t += width;
         }
-        8.0 * PI * de_vaucouleurs_centre() * sum
+        2.0 * PI * n * law.centre * sum
+    }
+
+    #[test]
+    fn transforms_of_all_indices_agree_with_the_real_axis() {
+        for twice in 1..=TABLES as i32 {
+            let profile = Sersic::nearest(0.5 * f64::from(twice));
+            for k in [0.01, 0.1, 0.5, 1.0, 2.0, 5.0] {
+                let (found, slow) = (profile.fourier(k * k), by_real_axis(twice, k));
+                assert!((found - slow).abs() < 2e-6, "{twice} {k}: {found} {slow}");
+            }
+            // ∫₀¹ 2πr I dr with r = t⁶.
+            let half = composite_rule(0.0, 1.0, 16, 12).into_iter().map(|(t, w)| {
+                let r = t.powi(6);
+                w * 6.0 * t.powi(5) * 2.0 * PI * r * profile.brightness(r)
+            });
+            let half: f64 = half.sum();
+            assert!((half - 0.5).abs() < 1e-7, "{twice}: {half}");
+        }
     }
 
     /// exp(−b r^{1/4}) expanded in powers of r^{1/4} and transformed term by term: converges for
@@ -324,7 +408,7 @@ mod tests {
     #[test]
     fn de_vaucouleurs_transform_agrees_with_two_other_ways() {
         for k in [1e-3, 0.01, 0.03, 0.1, 0.3, 1.0, 2.0] {
-            let slow = by_real_axis(k);
+            let slow = by_real_axis(8, k);
             assert!(
                 (table(k) - slow).abs() < 1e-6,
                 "k = {k}: {} {slow}",
@@ -346,7 +430,7 @@ mod tests {
         let rule = composite_rule(0.0, 1.0, 40, 20);
         for i in 0..400 {
             let k = 1e-4 * (0.04 * f64::from(i)).exp();
-            let exact = de_vaucouleurs_fourier(&rule, k);
+            let exact = Law::new(8).fourier(&rule, k);
             assert!((table(k) - exact).abs() < 2e-7 * exact.max(1e-3), "k = {k}");
         }
     }
@@ -356,7 +440,7 @@ mod tests {
         assert_eq!(table(0.0), 1.0);
         assert_eq!(Sersic::Exponential.fourier(0.0), 1.0);
         // <r²> = Γ(16)/(Γ(8) b⁸) r_e²; 1 − F = k² <r²> / 4.
-        let r2 = gamma(16.0) / GAMMA_8 / DE_VAUCOULEURS_B.powi(8);
+        let r2 = gamma(16.0) / gamma(8.0) / DE_VAUCOULEURS_B.powi(8);
         let k = 2e-3;
         assert!(((1.0 - table(k)) / (0.25 * r2 * k * k) - 1.0).abs() < 1e-3);
         // Far out the cusp rules: only the first term of the power series is left, ∝ k^(−9/4).
@@ -370,7 +454,7 @@ mod tests {
             * (PI / 8.0).sin()
             * (2.0 / k).powf(0.25)
             / (k * k);
-        let exact = de_vaucouleurs_fourier(&composite_rule(0.0, 1.0, 16, 16), k);
+        let exact = Law::new(8).fourier(&composite_rule(0.0, 1.0, 16, 16), k);
         assert!((exact / cusp - 1.0).abs() < 0.02, "{exact} {cusp}");
     }
 

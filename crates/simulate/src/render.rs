@@ -13,10 +13,9 @@ use std::f64::consts::{PI, TAU};
 
 use ndarray::Array2;
 use shearq_fourier::{Complex32, Complex64};
-use shearq_quantities::FunctionalPsf;
-use shearq_quantities::TransformedPsf;
 use shearq_quantities::product::{LANES, Matrix, ROWS, multiply};
 use shearq_quantities::radial::{QuadraticForm, SingleTable};
+use shearq_quantities::{FunctionalPsf, Pupil, TransformedPsf};
 
 use super::galaxy::{Component, Galaxy};
 
@@ -108,7 +107,7 @@ impl std::fmt::Debug for RenderScratch {
 /// PSF × pixel, of the PSF that was used last: galaxies of an image often share it.
 #[derive(Default)]
 struct Transfer {
-    of: Option<(FunctionalPsf, usize)>,
+    of: Option<(FunctionalPsf, Option<Pupil>, usize)>,
     /// Wavenumbers along an axis. Lines of kx are at ky from 0, and after them at ky from 0 downwards.
     count: usize,
     lines: Vec<f32>,
@@ -119,7 +118,7 @@ struct Transfer {
 impl Transfer {
     /// Drops the cached PSF unless it is `psf` with a period of `size`, and `count` wavenumbers have room.
     fn prepare(&mut self, psf: &TransformedPsf<'_>, size: usize, count: usize) {
-        let of = Some((psf.functional(), size));
+        let of = Some((psf.functional(), psf.pupil(), size));
         if self.of == of && count <= self.count {
             return;
         }
@@ -495,7 +494,7 @@ fn largest_wavenumber(galaxy: &Galaxy, psf: &TransformedPsf<'_>) -> f64 {
 
 /// A rough peak surface brightness after the PSF, on the low side.
 fn rough_peak(galaxy: &Galaxy, psf: &TransformedPsf<'_>) -> f64 {
-    let blur = 0.6 * psf.fwhm;
+    let blur = psf.core();
     galaxy
         .components()
         .iter()
@@ -528,9 +527,7 @@ fn folded_light(galaxy: &Galaxy, psf: &TransformedPsf<'_>, period: f64, reach: (
         );
         beside.min(above).sqrt()
     };
-    let wings = psf
-        .functional()
-        .round_value(nearest(QuadraticForm::of_positions(psf.shape)));
+    let wings = psf.wings(nearest(QuadraticForm::of_positions(psf.shape)));
     galaxy
         .components()
         .iter()

@@ -36,7 +36,7 @@ pub const NOISE_SIGMA: f64 = 1.0;
 // Per component, by default. Chosen by hand: GREAT10 did not publish it.
 const DEFAULT_INTRINSIC_SIGMA: f64 = 0.14;
 // Larger intrinsic ellipticities are scaled back to this modulus. Chosen by hand.
-const MAX_INTRINSIC_MODULUS: f64 = 0.7;
+pub(crate) const MAX_INTRINSIC_MODULUS: f64 = 0.7;
 // Beyond it shears are not weak, and with intrinsic shapes ellipticities could exceed 1.
 const MAX_SHEAR: f64 = 0.5;
 // Of PSFs, where it does not vary. Chosen by hand.
@@ -175,13 +175,17 @@ impl SimulationSettings {
     }
 
     fn stream(&self, set: u32, image: u32, purpose: Purpose) -> ChaCha8Rng {
-        let mut key = [0; 32];
-        let words = [self.seed, u64::from(set), u64::from(image), purpose as u64];
-        for (bytes, word) in key.chunks_exact_mut(8).zip(words) {
-            bytes.copy_from_slice(&word.to_le_bytes());
-        }
-        ChaCha8Rng::from_seed(key)
+        stream([self.seed, u64::from(set), u64::from(image), purpose as u64])
     }
+}
+
+/// Random numbers that depend on these words alone.
+pub(crate) fn stream(words: [u64; 4]) -> ChaCha8Rng {
+    let mut key = [0; 32];
+    for (bytes, word) in key.chunks_exact_mut(8).zip(words) {
+        bytes.copy_from_slice(&word.to_le_bytes());
+    }
+    ChaCha8Rng::from_seed(key)
 }
 
 #[derive(Debug, Clone)]
@@ -555,7 +559,7 @@ impl SetSimulator {
 
 /// Share of the grid's modes inside the circle of the axes' Nyquist multipole, which random fields
 /// fill: π/4.
-const NYQUIST_SHARE: f64 = std::f64::consts::FRAC_PI_4;
+pub(crate) const NYQUIST_SHARE: f64 = std::f64::consts::FRAC_PI_4;
 
 fn psf_profile(kind: SetKind) -> PsfProfile {
     match kind.image {

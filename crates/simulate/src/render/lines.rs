@@ -27,7 +27,7 @@ impl Wave {
             flux: component.flux as f32,
             form: match component.profile {
                 Sersic::Exponential => form.scaled(EXPONENTIAL_HALF_LIGHT.powi(-2)),
-                Sersic::DeVaucouleurs => form,
+                _ => form,
             },
         }
     }
@@ -56,12 +56,10 @@ pub(super) fn shine(
     line.fill(0.0);
     for wave in waves.iter().flatten() {
         let form = on_line(wave.form, j);
-        match wave.profile {
-            Sersic::Exponential => add_exponential(form, wave.flux, line),
-            Sersic::DeVaucouleurs => {
-                let table = Sersic::de_vaucouleurs_table().single();
-                add_tabulated(table, form, wave.flux, line);
-            }
+        if wave.profile == Sersic::Exponential {
+            add_exponential(form, wave.flux, line);
+        } else {
+            add_tabulated(wave.profile.table().single(), form, wave.flux, line);
         }
     }
     for (value, blur) in line.iter_mut().zip(blur) {
