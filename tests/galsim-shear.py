@@ -6,12 +6,12 @@
 
 Every galaxy is drawn four times: with intrinsic ellipticity e under shears of (g, g) and (-g, -g), and with -e
 under (g, -g) and (-g, g), all with the same noise, so that shape noise cancels exactly, noise to first order,
-and so does what one component of shear does to the other. Each rendered stamp is used with several fields of
+and so does what one component of shear does to the other. Every other galaxy is the one before, turned by 45 degrees. Each rendered stamp is used with several fields of
 noise, every other the negative of the one before. Nothing of shearq's simulator is used; its binary is run on
 FITS images in the layout that `measure` reads.
 
 m is half the difference between +g and -g over g, less the response that the submission measured, over that
-response; c the mean of all four over it. Errors are the scatter over galaxies over the root of their number.
+response; c the mean of all four over it. Errors are the scatter over pairs of galaxies over the root of their number.
 """
 
 import argparse
@@ -54,10 +54,14 @@ def render(kind, count, rng):
     psf = psf_of(profile)
     stamps = np.empty((4, count, STAMP, STAMP), np.float32)
     for k in range(count):
-        e = np.minimum(rng.rayleigh(0.14), 0.6)
-        angle = rng.uniform(0, np.pi)
-        place = rng.uniform(-0.5, 0.5, 2)
-        away = rng.normal(size=2) if offset else np.zeros(2)
+        if k % 2 == 0:
+            e, angle = np.minimum(rng.rayleigh(0.14), 0.6), rng.uniform(0, np.pi)
+            place = rng.uniform(-0.5, 0.5, 2)
+            away = rng.normal(size=2) if offset else np.zeros(2)
+        else:
+            # The galaxy before, turned by 45 degrees: the part of the response that has spin 4 cancels.
+            angle += np.pi / 4
+            away = np.array([away[0] - away[1], away[0] + away[1]]) / np.sqrt(2)
         for v, (sign, (first, second)) in enumerate(VERSIONS):
             shape = dict(g1=sign * e * np.cos(2 * angle), g2=sign * e * np.sin(2 * angle))
             inner = galsim.DeVaucouleurs(half_light_radius=bulge).shear(**shape).shift(*away)
@@ -100,7 +104,7 @@ def main():
     parser.add_argument("--binary", default="target/release/shearq")
     parser.add_argument("--submission", default="48/linear/star")
     parser.add_argument("--kinds", default=",".join(KINDS))
-    parser.add_argument("--grid", type=int, default=64, help="galaxies a side of an image")
+    parser.add_argument("--grid", type=int, default=64, help="galaxies a side of an image, an even number")
     parser.add_argument("--fields", type=int, default=40, help="fields of noise for each galaxy")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
@@ -128,9 +132,9 @@ def main():
             surplus = (slope - response.mean(1)) / mean
 
             def figure(values, scale):
-                # A galaxy's fields share its shape: their mean is one sample.
-                own = np.nanmean(values, 0)
-                return f"{scale * own.mean():7.2f} +- {scale * own.std() / np.sqrt(cells):.2f}"
+                # The fields of two galaxies that differ by a turn share a shape: their mean is one sample.
+                own = np.nanmean(values, 0).reshape(-1, 2).mean(1)
+                return f"{scale * own.mean():7.2f} +- {scale * own.std() / np.sqrt(len(own)):.2f}"
 
             slopes.append(figure(surplus, 1e3))
             offsets.append(figure(e.mean(1) / mean, 1e4))
