@@ -174,8 +174,7 @@ def shearq(stamps, _places, _noise, options, configuration):
     _, seconds = measured([stamps.reshape(-1, STAMP, STAMP)])
     column = lambda name: np.array([table[name].to_numpy() for table in tables])
     response = np.stack([column("R11"), column("R22")], 2)
-    # Ellipticities were divided by the mean response of their image.
-    e = np.stack([column(f"e{k}") for k in (1, 2)], 2) * np.nanmean(response, 1, keepdims=True)
+    e = np.stack([column(f"e{k}") for k in (1, 2)], 2)
     e[column("flags") != 0] = np.nan
     return e, response, seconds
 

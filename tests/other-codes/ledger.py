@@ -64,7 +64,6 @@ def main():
                 ("noise", *spread(row, "noise")),
                 ("noise / bound", f"{row['noise'] * snr / bound:.2f}", ""),
                 ("with shape noise", *spread(row, "noise_with_shapes")),
-                ("CPU time (µs)", f"{row['cpu_us']:.0f}", ""),
                 ("failed", f"{100 * row['failed']:.1f} %", ""),
             ]
             lines += [["other-codes", number, *cell, RUN] for cell in cells]

@@ -21,7 +21,7 @@ DRAWN = {
     ("FPFS", "centred, not renoised, kernel 4.5 px"): ("FPFS, not renoised", "#1c7a42", "v"),
     ("FPFS", "centred, renoised, kernel 4.5 px"): ("FPFS, renoised", "#1c7a42", "^"),
     ("FPFS", "dithered, own detection, renoised"): ("FPFS, own detection", "#6b6b00", "<"),
-    ("metacal", "dithered, weighted moments"): ("metacal, fixed moments", "#8e3fb0", "s"),
+    ("metacal", "dithered, weighted moments"): ("metacal, fixed weight", "#8e3fb0", "s"),
     ("REGAUSS", "dithered, responsivity"): ("REGAUSS", "#a8560a", "D"),
     ("KSB", "dithered, uncalibrated"): ("KSB, not calibrated", "#c02f3f", "X"),
 }
@@ -51,7 +51,7 @@ def main():
         row = next(r for r in rows if r["snr"] == 20)
         m = np.hypot(row["m1"], row["m2"]) / np.sqrt(2)
         bars.append((label, colour, m, np.hypot(row["m1_error"], row["m2_error"]) / np.sqrt(2)))
-    left.set(xscale="log", yscale="log", ylim=(0.93, 7), xlabel="S/N", title="Measurement noise of ε over the Cramér–Rao bound")
+    left.set(xscale="log", yscale="log", ylim=(0.93, 7), xlabel="S/N", title="Noise of ε over the Cramér–Rao bound")
     left.set_xticks([7, 10, 20, 40, 100], ["7", "10", "20", "40", "100"])
     left.set_yticks([1, 1.2, 1.5, 2, 3, 4, 6], ["1", "1.2", "1.5", "2", "3", "4", "6"])
     left.minorticks_off()
@@ -65,9 +65,10 @@ def main():
         right.barh(k, length, color="white" if limit else colour, edgecolor=colour, hatch="///" if limit else None, height=0.6)
         value = f"< {length:.1g}" if limit else f"{m:.2g}"
         right.text(length * 1.2, k, value, color=DARK, va="center", fontsize=11, bbox=dict(facecolor="white", edgecolor="none", pad=1))
-    right.set(xscale="log", xlim=(3e-5, 1), xlabel="r.m.s. of m1 and m2", title="|m| at S/N 20")
+    right.set(xscale="log", xlim=(3e-5, 1), ylim=(-0.9, 6.6), xlabel="r.m.s. of m1 and m2", title="|m| at S/N 20")
     right.set_yticks(range(len(bars)), [bar[0] for bar in bars[::-1]])
     right.axvline(REQUIRED, color=DARK, linestyle="--", linewidth=1.2)
+    right.text(REQUIRED * 1.1, -0.62, "required", color=DARK, va="center", fontsize=11)
     right.minorticks_off()
     right.set_axisbelow(True)
     right.grid(axis="x", color="#cccccc", linewidth=0.6)

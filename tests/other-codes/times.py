@@ -15,8 +15,8 @@ import galsim
 import numpy as np
 import shearq
 
-#: Galaxies along a side of the mosaic, pixels a side of FPFS's stamps, and arcseconds a pixel.
-GRID, SIDE, SCALE = 100, 64, 0.2
+#: Galaxies along a side of the mosaic, pixels a side of FPFS's stamps, as of all others, and arcseconds a pixel.
+GRID, SIDE, SCALE = 100, 48, 0.2
 #: σ of the shapelets of FPFS in pixels. It does not change the time.
 KERNEL = 4.0
 #: REGAUSS measures every so many galaxies, because it takes long.
