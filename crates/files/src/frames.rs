@@ -1,58 +1,20 @@
 //! polars' frames of named columns, with text metadata.
 
 use std::borrow::Cow;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 use ::polars::prelude::{
-    ChunkedArray, Column, DataFrame, DataType, PolarsError, PolarsNumericType,
+    ChunkedArray, Column, DataFrame, DataType, PolarsNumericType, PolarsResult,
 };
 
 pub use ::polars::prelude as polars;
 
-/// Why columns make no frame, or a frame no file.
-#[derive(Debug, thiserror::Error)]
-#[non_exhaustive]
-pub enum TableError {
-    #[error("column `{name}` is named twice; expected every name once")]
-    DuplicateColumn { name: String },
-    #[error(
-        "column `{column}` has {found} rows; expected {expected}, as in the first column `{first}`"
-    )]
-    UnequalLengths {
-        column: String,
-        found: usize,
-        first: String,
-        expected: usize,
-    },
-    #[error("cannot make a table: {0}")]
-    Invalid(PolarsError),
-    #[error("metadata key `{key}` is reserved for the file's own schema; use another")]
-    ReservedKey { key: String },
-    #[error("cannot write the Parquet table: {0}")]
-    Write(PolarsError),
-}
-
 /// Text by name, which a file contains in addition to its columns.
 pub type Metadata = BTreeMap<String, String>;
 
-pub fn frame(columns: Vec<Column>) -> Result<DataFrame, TableError> {
-    let mut seen = BTreeSet::new();
-    for column in &columns {
-        let name = column.name().to_string();
-        let (first, expected) = (columns[0].name(), columns[0].len());
-        if column.len() != expected {
-            return Err(TableError::UnequalLengths {
-                column: name,
-                found: column.len(),
-                first: first.to_string(),
-                expected,
-            });
-        }
-        if !seen.insert(name.clone()) {
-            return Err(TableError::DuplicateColumn { name });
-        }
-    }
-    DataFrame::new_infer_height(columns).map_err(TableError::Invalid)
+/// A frame of columns of one length with different names.
+pub fn frame(columns: Vec<Column>) -> PolarsResult<DataFrame> {
+    DataFrame::new_infer_height(columns)
 }
 
 /// The values of a column of numbers as 64-bit floats; `None` for another column. A missing value is NaN, true is 1 and

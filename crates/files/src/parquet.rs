@@ -30,7 +30,7 @@ use polars_parquet::read::{
 use serde_json::{Map, Value, json};
 
 use crate::error::FileError;
-use crate::frames::{Metadata, TableError, element_name, element_of, frame, reals};
+use crate::frames::{Metadata, element_name, element_of, frame, reals};
 use crate::open;
 
 // Longest vector whose numbers are columns with names of their own.
@@ -58,15 +58,11 @@ const INFLATION: u64 = 8;
 /// speed. Repeated values still become small, by dictionaries.
 ///
 /// The file must be opened (and, to be replaced at once or not at all, renamed) by the caller.
-pub fn write<W: Write>(
-    writer: W,
-    frame: &DataFrame,
-    metadata: &Metadata,
-) -> Result<(), TableError> {
+pub fn write<W: Write>(writer: W, frame: &DataFrame, metadata: &Metadata) -> PolarsResult<()> {
     if metadata.contains_key(SCHEMA_KEY) {
-        return Err(TableError::ReservedKey {
-            key: SCHEMA_KEY.into(),
-        });
+        let message =
+            format!("the metadata key {SCHEMA_KEY} is reserved for the file's own schema");
+        return Err(PolarsError::InvalidOperation(message.into()));
     }
     let pairs = metadata.iter();
     let mut pairs: Vec<_> = pairs
@@ -86,7 +82,6 @@ pub fn write<W: Write>(
         .set_parallel(false)
         .finish(&mut frame.clone())
         .map(drop)
-        .map_err(TableError::Write)
 }
 
 // Key of what becomes `DataFrame.attrs` in pandas.
@@ -359,8 +354,9 @@ impl<'a> Source<'a> {
             .iter()
             .map(|&name| {
                 if !seen.insert(name) {
-                    let error = TableError::DuplicateColumn { name: name.into() };
-                    return Err(FileError::new(self.path, error));
+                    let message =
+                        format!("column `{name}` is named twice; expected every name once");
+                    return Err(FileError::new(self.path, message));
                 }
                 let called = |name| self.fields.iter().find(move |field| field.name == name);
                 let whole = || called(name).cloned().map(Wanted::whole);

@@ -9,8 +9,8 @@ use shearq_dataset::fingerprint;
 use shearq_dataset::layout::{DataFolder, MAX_SET};
 use shearq_dataset::run::{Run, Source};
 use shearq_dataset::threads::Pool;
-use shearq_files::frames::polars::DataFrame;
-use shearq_files::frames::{TableError, reals};
+use shearq_files::frames::polars::{DataFrame, PolarsError};
+use shearq_files::frames::reals;
 use shearq_files::{FileError, names_of};
 use shearq_render::table::Cell;
 use shearq_scoring::resample::{PairedDifference, PairedSet, paired_difference};
@@ -214,7 +214,7 @@ fn given_catalogues(
 #[non_exhaustive]
 pub enum ChoiceError {
     #[error(transparent)]
-    Table(#[from] TableError),
+    Table(#[from] PolarsError),
     #[error(
         "--where: unknown column of a results store (found `{found}`, expected one of {known})"
     )]

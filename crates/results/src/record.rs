@@ -9,8 +9,7 @@ use shearq_dataset::layout::DataFolder;
 use shearq_dataset::record::nan_for_null;
 use shearq_dataset::run::Source;
 use shearq_files::FileError;
-use shearq_files::frames::TableError;
-use shearq_files::frames::polars::{Column as FrameColumn, DataFrame};
+use shearq_files::frames::polars::{Column as FrameColumn, DataFrame, PolarsResult};
 use shearq_files::table::MAX_ROWS;
 use shearq_render::table::Cell;
 use shearq_scoring::resample::mean_over_sets;
@@ -371,7 +370,7 @@ pub fn mean(sets: &[SetRecord], metric: fn(&Metrics) -> f64) -> (f64, f64) {
 }
 
 /// The frame of a store: a row per set of each run. A metric has a second column with its error.
-pub fn frame_of(runs: &[RunRecord]) -> Result<DataFrame, TableError> {
+pub fn frame_of(runs: &[RunRecord]) -> PolarsResult<DataFrame> {
     let sets = runs
         .iter()
         .flat_map(|run| run.sets.iter().map(move |set| (run, set)));

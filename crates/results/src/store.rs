@@ -7,7 +7,8 @@ use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
 use std::path::{Path, PathBuf};
 
-use shearq_files::frames::{Metadata, TableError};
+use shearq_files::frames::Metadata;
+use shearq_files::frames::polars::PolarsError;
 use shearq_files::parquet;
 
 use super::record::{RunRecord, frame_of, run_of_frame};
@@ -44,7 +45,7 @@ pub fn prepare(store: &Path) -> Result<Prepared, FileError> {
 }
 
 pub fn write(store: &Path, run: &RunRecord) -> Result<PathBuf, FileError> {
-    let failed = |error: TableError| FileError::new(store, error);
+    let failed = |error: PolarsError| FileError::new(store, error);
     let metadata = Metadata::from([(SCHEMA.0.to_owned(), SCHEMA.1.to_owned())]);
     let table = frame_of(std::slice::from_ref(run)).map_err(failed)?;
     let mut bytes = Vec::new();

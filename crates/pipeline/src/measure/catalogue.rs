@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use shearq_files::FileError;
-use shearq_files::frames::polars::{Column, DataFrame};
-use shearq_files::frames::{TableError, frame};
+use shearq_files::frames::frame;
+use shearq_files::frames::polars::{Column, DataFrame, PolarsResult};
 use shearq_files::table;
 use shearq_measure::{
     Batch, Flag, Flags, Measurement, Observables, PixelFrame, ShearedCatalogues, Warning,
@@ -115,7 +115,7 @@ fn catalogue(
     head: &ImageHead,
     galaxies: &[Measurement],
     configuration: &Configuration,
-) -> Result<DataFrame, TableError> {
+) -> PolarsResult<DataFrame> {
     let (mut columns, carried) = match &head.table {
         Some(table) => table.of_catalogue(),
         None => Default::default(),
