@@ -4,12 +4,9 @@ use clap::Args;
 
 use crate::arguments::{Form, SetList, SimulationArguments, Threads, configurations};
 use crate::progress::{Bar, mark_resumable};
-use crate::{made_by, print};
 use shearq_dataset::layout::MAX_IMAGE;
-use shearq_render::page::Page;
-use shearq_render::table::TableFormat;
-use shearq_studies::contest::{bias_sets, contest_figure, contest_parts, contest_table};
 use shearq_studies::reproduce::{Plan, Study, run_sets};
+use shearq_studies::study::{bias_sets, study_table};
 
 /// Compare configurations with each other and with the Cramér–Rao bound.
 ///
@@ -38,7 +35,7 @@ pub(crate) struct Arguments {
     pairs: u32,
     #[command(flatten)]
     simulation: SimulationArguments,
-    /// Folder for results and report.
+    /// Folder for the results of finished sets.
     #[arg(long, value_name = "DIR", default_value = "shearq-study")]
     out: PathBuf,
     #[command(flatten)]
@@ -67,45 +64,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     // With fewer images than Q: paired versions of the same galaxies cancel shape noise and pixel noise.
     let biases = bias_sets(&study, sets, pairs, threads, &mut bar)?;
     drop(bar);
-    let table = contest_table(&plan, &results, &biases)?;
-    let data = format!(
-        "simulated: {images} images of {0} × {0} galaxies per set, {pairs} for biases",
-        plan.simulation.grid
-    );
-    let mut made_by = made_by([
-        ("Seed", plan.simulation.seed.to_string()),
-        ("Data", data),
-        ("Simulation", toml::to_string(&plan.simulation)?),
-    ]);
-    for configuration in &plan.configurations {
-        made_by.push((configuration.name.clone(), toml::to_string(configuration)?));
-    }
-    study.claim.check()?;
-    let mut page = Page::new(
-        &arguments.out,
-        "Configurations compared",
-        "Simulated data",
-        made_by,
-    );
-    let [shapes, quality] = contest_parts(&table);
-    page.section("Ellipticities", "Scatter and biases on every kind of set.");
-    page.figure(
-        "study",
-        &contest_figure(&plan, &results, &biases),
-        "Each configuration on each set, with errors. Grey: the requirement |m| < 0.002. Dashed: the Cramér–Rao bound, zero additive bias. The expected Q is for noise at the bound and a perfect spectrum. A method that loses shear together with noise can exceed it.",
-    )?;
-    page.table("biases", &shapes)?;
-    page.section("Spectra", "Quality on every kind of set, and cost.");
-    page.table("quality", &quality)?;
-    page.data("study", &table)?;
-    study.claim.check()?;
-    page.save()?;
-    let form = &arguments.form;
-    // One table for programs; for people two, each of which fits a terminal.
-    if matches!(form.format, TableFormat::Csv | TableFormat::Json) {
-        return form.print(&table);
-    }
-    form.print(&shapes)?;
-    print("\n")?;
-    form.print(&quality)
+    arguments
+        .form
+        .print(&study_table(&plan, &results, &biases)?)
 }

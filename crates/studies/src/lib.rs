@@ -6,11 +6,11 @@
 pub mod bias;
 pub mod bound;
 pub mod calibration;
-pub mod contest;
 pub mod exhibits;
 pub mod reproduce;
 pub mod response;
 pub mod speed;
+pub mod study;
 
 // The examples of README.md.
 #[cfg(doctest)]

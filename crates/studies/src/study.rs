@@ -12,7 +12,6 @@ use shearq_dataset::threads::Progress;
 use shearq_pipeline::PipelineError;
 use shearq_pipeline::run::measurers;
 use shearq_pipeline::simulate::simulator;
-use shearq_render::figure::{Band, LinePlot, PanelGrid, Series, Style};
 use shearq_render::table::{Cell, Table};
 use shearq_simulate::kinds::SetKind;
 
@@ -75,7 +74,7 @@ type CellOf<'a> = &'a dyn Fn(&Response, &SetBiases, &ShearBias) -> Cell;
 
 /// A row for each configuration on each set, and means over sets if there are several.
 #[allow(clippy::too_many_lines, reason = "one column after the other")]
-pub fn contest_table(
+pub fn study_table(
     plan: &Plan,
     results: &[SetResult],
     biases: &[SetBiases],
@@ -181,130 +180,12 @@ pub fn contest_table(
     Ok(table)
 }
 
-/// The table in two parts: scatter and biases; Q and cost.
-pub fn contest_parts(table: &Table) -> [Table; 2] {
-    let keys: Vec<&str> = table.headings.iter().map(|heading| heading.key).collect();
-    let (names, metrics) = keys.split_at(3);
-    let quality = table.place("q").map_or(0, |place| place - names.len());
-    let (shapes, spectra) = metrics.split_at(quality);
-    let (of_shapes, of_spectra) = table.notes.split_at(2);
-    [
-        table.part(
-            &[names, shapes].concat(),
-            "Scatter and biases (simulated data)",
-            of_shapes,
-        ),
-        table.part(
-            &[names, spectra].concat(),
-            "Quality and cost (simulated data)",
-            of_spectra,
-        ),
-    ]
-}
-
 // The scatter over its bound, and the error.
 fn over_bound(own: &Response, set: &SetBiases) -> (f64, f64) {
     let (scatter, error) = (own.rms_scatter(), own.rms_scatter_error());
     let bound = set.bound.unwrap_or(f64::NAN);
     let relative = (error / scatter).hypot(set.bound_error.unwrap_or(f64::NAN) / bound);
     (scatter / bound, scatter / bound * relative)
-}
-
-// Requirement of future surveys on |m| in units of 10⁻³.
-const REQUIREMENT: f64 = 2.0;
-const REQUIREMENT_COLOUR: usize = 6;
-// Largest plotted |m| in units of 10⁻³, if any is smaller. Chosen by hand.
-const LARGEST_M: f64 = 20.0;
-
-// A value of a configuration on a set, and its error.
-type ValueOf<'a> = &'a dyn Fn(&ConfigurationResult, &SetBiases, &ShearBias) -> (f64, f64);
-
-/// Plots of scatter over the bound, biases and Q by set, with requirements and bounds.
-pub fn contest_figure(plan: &Plan, results: &[SetResult], biases: &[SetBiases]) -> PanelGrid {
-    let sets: Vec<f64> = results.iter().map(|own| f64::from(own.set)).collect();
-    let values = |k: usize, value: ValueOf<'_>| -> Vec<(f64, f64)> {
-        let of_sets = results.iter().zip(biases);
-        let of_sets = of_sets.map(|(own, set)| value(&own.results[k], set, &set.biases[k]));
-        of_sets.collect()
-    };
-    let ends = [
-        sets.iter().copied().fold(f64::INFINITY, f64::min) - 0.5,
-        sets.iter().copied().fold(f64::NEG_INFINITY, f64::max) + 0.5,
-    ];
-    let plot = |label: &str, level: Option<(&str, f64)>, value: ValueOf<'_>| {
-        let line = level.map(|(name, value)| {
-            let colour = REQUIREMENT_COLOUR;
-            Series::new(name, ends.to_vec(), vec![value; 2], Style::Dashed, colour)
-        });
-        let mut series: Vec<Series> = line.into_iter().collect();
-        for (k, configuration) in plan.configurations.iter().enumerate() {
-            // Shifted, so that points do not hide each other.
-            let aside = (k as f64 - (plan.configurations.len() as f64 - 1.0) / 2.0) * 0.2;
-            let (y, errors) = values(k, value).into_iter().unzip();
-            let x = sets.iter().map(|set| set + aside).collect();
-            let name = &configuration.name;
-            series.push(Series::new(name, x, y, Style::Points, k).with_errors(errors));
-        }
-        LinePlot {
-            title: label.into(),
-            x_label: "set".into(),
-            x_whole: true,
-            y_label: label.into(),
-            series,
-            ..LinePlot::default()
-        }
-    };
-    // Uncalibrated configurations would compress the others, so their points lie outside the plot.
-    let near = |k: usize| {
-        let label = format!("m{}×10³", k + 1);
-        let m: ValueOf<'_> = &|_, _, bias| (bias.m[k] * 1e3, bias.m_error[k] * 1e3);
-        let plot = LinePlot {
-            bands: vec![Band {
-                label: format!("requirement |m| < {REQUIREMENT}×10⁻³"),
-                low: -REQUIREMENT,
-                high: REQUIREMENT,
-            }],
-            ..plot(&label, None, m)
-        };
-        let all = (0..plan.configurations.len()).flat_map(|k| values(k, m));
-        let (beyond, within): (Vec<_>, Vec<_>) = all.partition(|(m, _)| m.abs() > LARGEST_M);
-        if beyond.is_empty() || within.is_empty() {
-            return plot;
-        }
-        LinePlot {
-            title: format!("{label}, values beyond ± {LARGEST_M} not shown"),
-            y_range: Some((-LARGEST_M, LARGEST_M)),
-            ..plot
-        }
-    };
-    let mut q = plot("Q of cross-spectra", None, &|own, _, _| spectrum(own));
-    let expected = biases.iter();
-    let expected = expected
-        .map(|set| set.expected_q.unwrap_or(f64::NAN))
-        .collect();
-    let colour = REQUIREMENT_COLOUR;
-    let expected = Series::new("expected Q", sets.clone(), expected, Style::Points, colour);
-    q.series.insert(0, expected);
-    PanelGrid {
-        title: "Configurations, requirements and the Cramér–Rao bound".into(),
-        columns: 2,
-        plots: vec![
-            plot(
-                "scatter / bound",
-                Some(("Cramér–Rao bound", 1.0)),
-                &|own, set, _| over_bound(&own.response, set),
-            ),
-            near(0),
-            near(1),
-            plot("c1×10⁴", Some(("", 0.0)), &|_, _, bias| {
-                (bias.c[0] * 1e4, bias.c_error[0] * 1e4)
-            }),
-            plot("PSF leakage", Some(("", 0.0)), &|_, _, bias| {
-                (bias.leakage, bias.leakage_error)
-            }),
-            q,
-        ],
-    }
 }
 
 // Q of a configuration's cross-spectrum and its error.
