@@ -3,9 +3,8 @@ use shearq_simulate::set::SimulationSettings;
 use shearq_studies::speed;
 
 use crate::arguments::{Form, Threads, configurations};
-use crate::print;
 
-/// Measure the speed on this machine: measuring, simulating, threads, and scoring.
+/// Measure the speed on this machine: measuring, simulating and threads.
 ///
 /// It takes less than a minute. Other work on the machine disturbs it, so compare ratios within one run rather than
 /// absolute times. docs/validation.md explains the results.
@@ -25,8 +24,6 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let configurations = configurations(&arguments.submission)?;
     // 2,500 galaxies per image, so that the command takes less than a minute. Chosen by hand.
     let settings = SimulationSettings::new(1, 50);
-    let measuring = speed::configurations(&configurations, settings, threads)?;
-    arguments.form.print(&measuring)?;
-    print("\n")?;
-    arguments.form.print(&speed::scoring(threads)?)
+    let table = speed::speeds(&configurations, settings, threads)?;
+    arguments.form.print(&table)
 }

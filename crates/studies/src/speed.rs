@@ -1,32 +1,19 @@
-//! Speed on the user's machine: measuring, simulating, threads, and scoring from files. `cargo bench` times the kernels.
+//! Speed on the user's machine: measuring, simulating and threads. `cargo bench` times the kernels.
 
 use std::hint::black_box;
-use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use ndarray::{Array2, ArrayView2};
 use shearq_dataset::threads::Quiet;
-use shearq_dataset::truth::Reading;
-use shearq_files::FileError;
-use shearq_files::atomic::{self, Scratch};
-use shearq_files::frames::frame;
-use shearq_files::frames::polars::Column;
-use shearq_files::table::{self, FileFormat};
 use shearq_measure::{ImageNoise, Measurer};
 use shearq_pipeline::PipelineError;
 use shearq_pipeline::run::{measurers, run_set};
 use shearq_pipeline::simulate::simulator;
 use shearq_quantities::statistics::median;
-use shearq_quantities::units::{Degrees, Pixels};
 use shearq_render::table::{Cell, Table};
-use shearq_results::catalogues::{COLUMNS, Catalogues};
-use shearq_results::foreign::Foreign;
-use shearq_results::score::{ScoreError, score_files};
-use shearq_scoring::{Options, TruthSign};
 use shearq_simulate::render::RenderScratch;
 use shearq_simulate::set::{NOISE_SIGMA, STAMP, SimulationSettings};
 use shearq_submissions::Configuration;
-use shearq_submissions::EllipticityType;
 
 // Set 2 is the fiducial one: S/N 20 and one PSF for all galaxies.
 const FIDUCIAL_SET: u32 = 2;
@@ -36,9 +23,6 @@ const SAMPLE_GALAXIES: usize = 64;
 const MIN_RUNS: usize = 5;
 // Longest time per timing. Chosen by hand: all timings of three configurations take about a minute.
 const BUDGET: Duration = Duration::from_millis(400);
-// Catalogues of a set in the challenge, and galaxies along their sides.
-const CATALOGUES: usize = 200;
-const SIDE: usize = 100;
 
 // Median time of `run`, after a first one that fills caches and grows buffers.
 fn median_seconds<E>(mut run: impl FnMut() -> Result<(), E>) -> Result<f64, E> {
@@ -113,7 +97,7 @@ pub fn costs(
 }
 
 /// Time per galaxy of each configuration, and the rate of simulating and measuring in memory with `threads`.
-pub fn configurations(
+pub fn speeds(
     configurations: &[Configuration],
     settings: SimulationSettings,
     threads: usize,
@@ -153,67 +137,5 @@ pub fn configurations(
     table.notes = vec![format!(
         "Medians. µs are on one thread, with given noise; a PSF is set for each galaxy or once per image. Galaxies per second are simulated and measured in memory with {threads} thread(s); the speed-up is relative to one thread."
     )];
-    Ok(table)
-}
-
-/// Time of scoring a set of catalogues from each format, in a temporary folder.
-///
-/// # Errors
-/// If the files cannot be written or read.
-pub fn scoring(threads: usize) -> Result<Table, ScoreError> {
-    let folder = Scratch::new()?;
-    let cells = || 0..SIDE * SIDE;
-    let position = |k: usize| (k as f64).mul_add(48.0, 24.5);
-    let x: Vec<f64> = cells().map(|k| position(k % SIDE)).collect();
-    let y: Vec<f64> = cells().map(|k| position(k / SIDE)).collect();
-    // Ellipticities that differ in every digit: short ones would be read faster as text.
-    let e1: Vec<f64> = cells().map(|k| 0.1 * (k as f64 * 0.7).sin()).collect();
-    let e2: Vec<f64> = cells().map(|k| 0.1 * (k as f64 * 1.3).cos()).collect();
-    let ascii = |header: &str, separator: &str| -> String {
-        let lines = cells().map(|k| {
-            let fields = [x[k], y[k], e1[k], e2[k]].map(|value| format!("{value:.9}"));
-            fields.join(separator) + "\n"
-        });
-        header.to_owned() + &lines.collect::<String>()
-    };
-    let truth = folder.path().join("truth.csv");
-    atomic::write(&truth, ascii("x,y,g1,g2\n", ",").as_bytes())?;
-    let columns = [("x", &x), ("y", &y), ("e1", &e1), ("e2", &e2)];
-    let columns = columns.map(|(name, values)| Column::new(name.into(), values));
-    let columns =
-        frame(columns.into()).map_err(|error| FileError::new(&truth, error.to_string()))?;
-    let text = ascii("", " ");
-    let reading = Reading {
-        field: Degrees(10.0),
-        stamp: Pixels(48.0),
-        sign: Some(TruthSign::Standard),
-    };
-    let mut rows = Vec::new();
-    for (name, ending, format) in [
-        ("Parquet", "parquet", Some(FileFormat::Parquet)),
-        ("FITS", "fits", Some(FileFormat::Fits)),
-        ("ASCII", "dat", None),
-    ] {
-        let path = |k: usize| folder.path().join(format!("{k}.{ending}"));
-        let paths: Vec<PathBuf> = (0..CATALOGUES).map(path).collect();
-        for path in &paths {
-            match format {
-                Some(format) => table::write(path, format, &columns, &Default::default())?,
-                None => atomic::write(path, text.as_bytes())?,
-            }
-        }
-        let options = Options::default();
-        let described = Foreign::of_columns(COLUMNS, EllipticityType::Shear);
-        let catalogues = Catalogues::plain(&paths, described);
-        let score = || score_files(&truth, &catalogues, &reading, options, threads);
-        let seconds = median_seconds(|| score().map(|scored| _ = black_box(scored)))?;
-        rows.push((name, seconds));
-    }
-    let mut table = Table::titled(format!(
-        "Scoring {CATALOGUES} catalogues of 10,000 rows, {threads} thread(s)"
-    ));
-    table.column("format", "Format", &rows, |row| Cell::text(row.0));
-    table.column("seconds", "seconds", &rows, |row| Cell::number(row.1, 3));
-    table.notes = vec!["Reading, summing, spectra of eight conventions, jackknife.".into()];
     Ok(table)
 }
