@@ -4,8 +4,8 @@ use std::collections::BTreeSet;
 use std::path::PathBuf;
 use std::str::FromStr;
 
-use clap::{Args, ValueEnum};
-use shearq_scoring::{Choice, Convention, Definition, TruthSign};
+use clap::Args;
+use shearq_scoring::{Choice, Convention, Definition};
 
 use crate::choices::named;
 use crate::{print, print_table, tell};
@@ -332,23 +332,6 @@ fn parse_choice(text: &str) -> Result<Choice, String> {
             .and_then(|number: u8| Convention::try_from(number).ok())
             .map(Choice::Insist)
             .ok_or_else(|| "expected `matched`, `best` or a number from 1 to 8".into()),
-    }
-}
-
-#[derive(Debug, Clone, Copy, ValueEnum)]
-pub(crate) enum SignArgument {
-    /// Minus the standard g2, as in the challenge's truth files.
-    Challenge,
-    /// Positive along x = y.
-    Standard,
-}
-
-impl From<SignArgument> for TruthSign {
-    fn from(sign: SignArgument) -> Self {
-        match sign {
-            SignArgument::Challenge => TruthSign::Challenge,
-            SignArgument::Standard => TruthSign::Standard,
-        }
     }
 }
 

@@ -5,12 +5,14 @@ use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use shearq_bias::Design;
 use shearq_challenge::kind::{Kind, RankBy};
 use shearq_files::table::FileFormat;
+use shearq_pipeline::gather::Square;
 use shearq_render::table::TableFormat;
 use shearq_results::bias::columns::Shapes;
 use shearq_results::compare::Grouping;
 use shearq_results::response::{Position, Shared};
 use shearq_results::submit::Contents;
-use shearq_scoring::Definition;
+use shearq_scoring::{Definition, TruthSign};
+use shearq_submissions::{EllipticityType, Template};
 
 // Clap's `ValueEnum` cannot be derived here: the types belong to crates without clap, so that libraries do not compile it.
 pub(crate) trait Named: Copy + Send + Sync + 'static {
@@ -26,11 +28,6 @@ pub(crate) fn named<T: Named>() -> impl TypedValueParser<Value = T> {
         let found = T::ALL.iter().find(|(_, name, _)| *name == given);
         found.unwrap_or(&T::ALL[0]).0
     })
-}
-
-pub(crate) fn name_of<T: Named + PartialEq>(value: T) -> &'static str {
-    let found = T::ALL.iter().find(|(own, _, _)| *own == value);
-    found.map_or("", |(_, name, _)| name)
 }
 
 macro_rules! choices {
@@ -65,6 +62,22 @@ choices! {
     Position {
         Sky: "ra,dec", "Right ascension and declination in degrees, for shears in the frame of the sky";
         Pixel: "x,y", "Pixels of the image, for shears in their frame";
+    }
+    TruthSign {
+        Challenge: "challenge", "Minus the standard g2, as in the challenge's truth files";
+        Standard: "standard", "Positive along x = y";
+    }
+    EllipticityType {
+        Shear: "shear", "(1 − q)/(1 + q) for an axis ratio q";
+        Distortion: "distortion", "(1 − q²)/(1 + q²), converted to shear-type ellipticities";
+    }
+    Template {
+        Linear: "linear", "The linear network in closed form (recommended)";
+        Network: "network", "The Hopfield network of the paper";
+    }
+    Square {
+        Crop: "crop", "By the central square";
+        Pad: "pad", "By missing pixels around them; PSFs are cropped";
     }
     Definition {
         Leaderboard: "leaderboard", "The arithmetic of the challenge";

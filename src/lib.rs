@@ -24,7 +24,6 @@ use commands::{
 };
 use shearq_files::parquet::panic_is_caught;
 use shearq_render::escape::visible;
-use shearq_render::figure::HeatMap;
 use shearq_render::table::Table;
 use shearq_render::terminal::fitted;
 
@@ -177,6 +176,8 @@ fn fail_at_size_limits() {
 /// Parses the arguments (the first is the program's name), runs the command and prints its error, if any.
 /// Returns the exit code.
 pub fn run_with(arguments: impl IntoIterator<Item = OsString>) -> u8 {
+    let arguments: Vec<OsString> = arguments.into_iter().collect();
+    let command_line = command_line(&arguments);
     let cli = match Cli::try_parse_from(arguments) {
         Ok(cli) => cli,
         Err(message) => return usage(&message),
@@ -193,7 +194,7 @@ pub fn run_with(arguments: impl IntoIterator<Item = OsString>) -> u8 {
         Command::Merge(arguments) => merge::run(&arguments),
         Command::Score(arguments) => score::run(&arguments),
         Command::Compare(arguments) => compare::run(&arguments),
-        Command::Bias(arguments) => bias::run(&arguments),
+        Command::Bias(arguments) => bias::run(&arguments, &command_line),
         Command::Baseline(arguments) => baseline::run(&arguments),
         Command::Challenge(arguments) => challenge::run(&arguments),
         Command::Check(arguments) => check::run(&arguments),
@@ -216,6 +217,18 @@ pub fn run_with(arguments: impl IntoIterator<Item = OsString>) -> u8 {
             EXIT_FAILED
         }
     }
+}
+
+// As a shell reads it, for the head of a report.
+fn command_line(arguments: &[OsString]) -> String {
+    let words = arguments.iter().skip(1).map(|word| {
+        let word = word.to_string_lossy();
+        match word.contains(|c: char| c.is_whitespace() || "'\"()*<>|&;$".contains(c)) {
+            true => format!(" '{}'", word.replace('\'', r"'\''")),
+            false => format!(" {word}"),
+        }
+    });
+    format!("shearq{}", words.collect::<String>())
 }
 
 // An error with its causes. Messages of some errors end with their cause, which is not repeated.
@@ -249,23 +262,6 @@ fn usage(message: &clap::Error) -> u8 {
 #[derive(Debug, thiserror::Error)]
 #[error("there are findings")]
 struct Findings;
-
-// Prints a heat map on a terminal; prints nothing if the output goes to a file or another program.
-// `NO_COLOR` and terminals without colours are respected.
-fn print_heat_map(map: HeatMap) -> anyhow::Result<()> {
-    use std::io::IsTerminal;
-    if !std::io::stdout().is_terminal() {
-        return Ok(());
-    }
-    // Without decimals, cells of values up to 99 are two characters wide, and the 24 sets of a simulation fit into a line.
-    let decimals = usize::from(!map.values.iter().any(|value| *value >= 10.0));
-    let map = HeatMap { decimals, ..map };
-    let set = |name| std::env::var_os(name).filter(|value| !value.is_empty());
-    // https://no-color.org: any value that is not empty counts.
-    let coloured = set("NO_COLOR").is_none() && set("TERM").is_none_or(|term| term != "dumb");
-    // Not by `print`, which would escape the control characters of the colours. Names were checked when they were read.
-    write(&format!("\n{}", map.terminal(coloured)))
-}
 
 // Prints a line on standard error. A closed standard error is ignored: the results matter more than the message.
 fn tell(line: std::fmt::Arguments<'_>) {

@@ -144,7 +144,6 @@ const WAYS: [(&str, &[&str]); 33] = [
             "data measured sets noise-var store format wide metrics report definition convention threads",
             "data foreign sets noise-var store format wide metrics report definition convention threads",
             "data packed sets noise-var store format wide metrics definition convention threads",
-            "data spectra sets format wide metrics definition threads",
             "truth CATALOGUE truth-sign stamp field columns ellipticity missing drop-missing max-modulus noise-var format wide metrics report definition convention threads",
             "truth spectra truth-sign stamp field format wide metrics definition threads",
             "data measured sets aperture-mass format wide metrics convention threads",
@@ -156,8 +155,8 @@ const WAYS: [(&str, &[&str]); 33] = [
     (
         "compare",
         &[
-            "OUT data foreign where sort group-by heat-map format wide metrics report definition convention threads",
-            "store where sort group-by heat-map format wide metrics report",
+            "OUT data foreign where sort group-by plot format wide metrics report definition convention threads",
+            "store where sort group-by plot format wide metrics report",
             "OUT challenge branch truth psf leaderboard format threads",
         ],
     ),

@@ -6,12 +6,11 @@ use anyhow::{Context, anyhow};
 use clap::Args;
 use shearq_bias::{Design, Errors};
 
-use crate::arguments::{Printing, ReportFile, SignArgument, positive};
-use crate::choices::{name_of, named};
+use crate::arguments::{Printing, ReportFile, positive};
+use crate::choices::named;
 use crate::commands::plan::{example, plan};
-use crate::{Findings, tell};
+use crate::{Findings, made_by, tell};
 use shearq_dataset::images::Shard;
-use shearq_dataset::truth::word;
 use shearq_files::{atomic, open};
 use shearq_render::figure::{Figure, PictureFormat};
 use shearq_results::bias::columns::{Names, Shapes, role_names};
@@ -23,6 +22,7 @@ use shearq_results::views::bias::{
     Limit, bias_plot, bias_table, check, chosen_by_measurement, compared_table, junit, of_design,
     section,
 };
+use shearq_scoring::TruthSign;
 
 /// Multiplicative and additive bias (m and c) of any program's catalogues.
 ///
@@ -116,8 +116,8 @@ struct Summing {
     /// Sign of the true g2 [default: as the file of --truth states; else, for x, y, g1, g2, the sign in which the shear is
     /// an E-mode field; else the sign that e2 follows; required if these are unclear. Shears of options, of columns of
     /// the catalogues and of tables with the column catalogue: standard].
-    #[arg(long, value_enum)]
-    truth_sign: Option<SignArgument>,
+    #[arg(long, value_parser = named::<TruthSign>())]
+    truth_sign: Option<TruthSign>,
     /// Also estimate in bins of a column or expression: `snr:5` has five bins with equally many galaxies,
     /// `flux/flux_error:5,10,20` has these edges.
     #[arg(long, value_name = "EXPRESSION:BINS", value_parser = parse_bins)]
@@ -194,7 +194,7 @@ fn parse_bins(text: &str) -> anyhow::Result<Binning> {
 // Of a file of sums, which is read into memory. Chosen by hand.
 const MOST_BYTES: u64 = 1 << 31;
 
-pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+pub(crate) fn run(arguments: &Arguments, command_line: &str) -> anyhow::Result<()> {
     if let Some(error) = arguments.plan {
         return arguments.printing.print(&plan(error));
     }
@@ -259,9 +259,9 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     }
     arguments.printing.print(&table)?;
     let sections = || Ok(vec![section(&result, table)?]);
-    arguments
-        .report
-        .save("Shear bias", sections, || Ok(made_by(arguments)))?;
+    arguments.report.save("Shear bias", sections, || {
+        Ok(made_by([("Command", command_line.to_owned())]))
+    })?;
     let failed: Vec<_> = checks.iter().filter(|check| check.failed).collect();
     for check in &failed {
         tell(format_args!("error: {}", check.text));
@@ -272,72 +272,12 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     }
 }
 
-// The report states what it was made by, so that it can be made again.
-fn made_by(arguments: &Arguments) -> Vec<(String, String)> {
-    let summing = &arguments.summing;
-    let joined = |all: Vec<String>, between: &str| Some(all.join(between));
-    let paths = |paths: &[PathBuf]| {
-        let shown = paths.iter().map(|path| path.display().to_string());
-        joined(shown.collect(), "\n")
-    };
-    let truth = summing.truth.as_ref();
-    let constant = summing.g1.zip(summing.g2);
-    let truth = truth
-        .map(|path| path.display().to_string())
-        .or_else(|| constant.map(|(g1, g2)| format!("{g1}, {g2}")));
-    let sign = summing.truth_sign.map(|sign| word(sign.into()).to_owned());
-    let bins = summing.bins.as_ref().map(|bins| {
-        let edges = match &bins.edges {
-            Edges::Equal(count) => format!("{count} with equally many galaxies"),
-            Edges::Given(edges) => format!("{edges:?}"),
-        };
-        format!("{}: {edges}", bins.of.text())
-    });
-    let limits = arguments
-        .fail_above
-        .iter()
-        .map(|Limit { of, limit, sigma }| format!("|{of}| ≤ {limit:e} within {sigma} σ"));
-    let bootstrap = arguments.bootstrap;
-    let bootstrap = bootstrap.map(|draws| format!("{draws} draws, seed {}", arguments.seed));
-    let made_by = [
-        ("Catalogues", paths(&summing.catalogues)),
-        ("Sums", paths(&arguments.merge)),
-        ("Columns", joined(summing.columns.clone(), ", ")),
-        ("True shear", truth),
-        ("Where", summing.condition.clone()),
-        ("Weight", summing.weight.clone()),
-        ("Design", summing.design.map(|own| name_of(own).into())),
-        ("Units", summing.units.clone()),
-        (
-            "Ellipticities",
-            summing.ellipticity.map(|own| name_of(own).into()),
-        ),
-        ("Sign of the true g2", sign),
-        ("Bins", bins),
-        (
-            "Rows with missing numbers are left out",
-            summing.drop_missing.then(|| "yes".into()),
-        ),
-        (
-            "Step of metacalibration",
-            summing.step.map(|step| step.to_string()),
-        ),
-        ("Limits", joined(limits.collect(), ", ")),
-        ("Bootstrap", bootstrap),
-    ];
-    let given = |(name, value): (&str, Option<String>)| {
-        let value = value.filter(|value| !value.is_empty())?;
-        Some((name.to_owned(), value))
-    };
-    made_by.into_iter().filter_map(given).collect()
-}
-
 fn of_catalogues(summing: &Summing, catalogues: &[PathBuf]) -> anyhow::Result<Summed> {
     let mut names = Names::default();
     for text in &summing.columns {
         names.add(text)?;
     }
-    let specified = summing.truth_sign.map(Into::into);
+    let specified = summing.truth_sign;
     let mut sign = TrueSign::or_standard(specified);
     let truth = match (&summing.truth, summing.g1.zip(summing.g2)) {
         (Some(path), _) => {

@@ -5,10 +5,10 @@ use clap::Args;
 use super::published;
 use crate::arguments::{Printing, ReportFile, ScoreSettings, Threads};
 use crate::choices;
-use crate::{print_heat_map, score};
+use crate::score;
 use shearq_dataset::run::Run;
-use shearq_render::figure::{Figure, HeatMap};
-use shearq_render::table::{Table, TableFormat};
+use shearq_render::figure::{Figure, LinePlot};
+use shearq_render::table::Table;
 use shearq_results::compare::{Group, Grouping, Order, choose, chosen, score_all};
 use shearq_results::expression::Expression;
 use shearq_results::published::Truth;
@@ -16,7 +16,7 @@ use shearq_results::record::RunRecord;
 use shearq_results::store;
 use shearq_results::submit::is_packed;
 use shearq_results::views::comparison::{
-    compare, compare_runs, named, notes_of_variants, q_heat_map, verdict, verdict_on_runs,
+    compare, compare_runs, named, notes_of_variants, q_per_set, verdict, verdict_on_runs,
 };
 use shearq_results::views::pages;
 use shearq_scoring::Options;
@@ -26,8 +26,7 @@ use shearq_scoring::Options;
 /// Each OUT is a folder that `measure` or `run` wrote, or a submission as `pack` writes it: a folder or an archive. Differences in Q are relative to the first OUT and paired
 /// over the same images, so that common noise cancels. Published metrics are shown next to them.
 ///
-/// With --store, the command compares the runs that `score --store` and `run --store` recorded. A terminal also
-/// shows Q of each set as a heat map, without colours if NO_COLOR is set.
+/// With --store, the command compares the runs that `score --store` and `run --store` recorded.
 ///
 /// With `--challenge great3 --leaderboard`, each OUT is a submission file, which is ranked among the published entries of
 /// its branch.
@@ -72,7 +71,7 @@ pub(crate) struct Arguments {
     group_by: Option<Grouping>,
     /// Draw Q of each run and set to this file (.png or .svg).
     #[arg(long, value_name = "FILE")]
-    heat_map: Option<PathBuf>,
+    plot: Option<PathBuf>,
     #[command(flatten)]
     printing: Printing,
     #[command(flatten)]
@@ -91,7 +90,7 @@ const GREAT10_ONLY: [&str; 12] = [
     "condition",
     "sort",
     "group_by",
-    "heat_map",
+    "plot",
     "wide",
     "metrics",
     "path",
@@ -102,7 +101,7 @@ const GREAT10_ONLY: [&str; 12] = [
 struct Comparison {
     table: Table,
     verdict: Option<String>,
-    map: HeatMap,
+    plot: LinePlot,
 }
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
@@ -118,7 +117,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let Comparison {
         table,
         verdict,
-        map,
+        plot,
     } = match &arguments.store {
         Some(store) => stored(arguments, store)?,
         None => folders(arguments)?,
@@ -127,20 +126,15 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let mut printed = table.clone();
     printed.notes.extend(verdict.clone());
     arguments.printing.print(&printed)?;
-    if let Some(path) = &arguments.heat_map {
+    if let Some(path) = &arguments.plot {
         // After printing: the comparison is not lost if the file cannot be written.
-        map.save(path)?;
+        plot.save(path)?;
     }
-    let sections = || Ok(vec![pages::comparison(table, verdict, &map)?]);
+    let sections = || Ok(vec![pages::comparison(table, verdict, &plot)?]);
     let title = "Comparison of configurations";
     arguments
         .report
-        .save(title, sections, || made_by(arguments))?;
-    // Other formats are for programs, which a map of characters would confuse.
-    if arguments.printing.format() == TableFormat::Table {
-        print_heat_map(map)?;
-    }
-    Ok(())
+        .save(title, sections, || made_by(arguments))
 }
 
 // Archives have no record of a run, so only their path can be stated.
@@ -191,7 +185,7 @@ fn folders(arguments: &Arguments) -> anyhow::Result<Comparison> {
     Ok(Comparison {
         table,
         verdict: verdict(&named),
-        map: q_heat_map(&named),
+        plot: q_per_set(&named),
     })
 }
 
@@ -224,6 +218,6 @@ fn stored(arguments: &Arguments, path: &Path) -> anyhow::Result<Comparison> {
             None => verdict_on_runs(&groups),
             Some(_) => None,
         },
-        map: q_heat_map(&rows.collect::<Vec<_>>()),
+        plot: q_per_set(&rows.collect::<Vec<_>>()),
     })
 }

@@ -2,6 +2,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 
+use crate::choices::named;
 use crate::{count, tell};
 use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::DataFolder;
@@ -69,8 +70,8 @@ pub(crate) struct Arguments {
     cutouts: Cutouts,
     /// Make squares of stamps that are not: by their central square (crop), or by missing pixels around them (pad). A galaxy with
     /// many missing pixels is flagged. PSFs are cropped [default: refuse].
-    #[arg(long, value_name = "HOW", value_parser = ["crop", "pad"], conflicts_with = "exposure")]
-    square: Option<String>,
+    #[arg(long, value_name = "HOW", value_parser = named::<Square>(), conflicts_with = "exposure")]
+    square: Option<Square>,
     /// FITS files of PSF stamps, or one table of functional PSFs (.csv): one PSF for all galaxies, or one per galaxy.
     /// Several stars, at most half as many as galaxies, are averaged to one PSF.
     #[arg(long, value_name = "FILE", num_args = 1.., required = true)]
@@ -324,10 +325,7 @@ fn gathering(arguments: &Arguments, at: usize) -> anyhow::Result<Gathering<'_>> 
     Ok(Gathering {
         stamps,
         rows,
-        square: square.as_deref().map(|how| match how {
-            "crop" => Square::Crop,
-            _ => Square::Pad,
-        }),
+        square: *square,
         masks: masks.map(|files| Masks { files, bits }),
         psfs,
         noise: *noise,

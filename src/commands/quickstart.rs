@@ -16,7 +16,7 @@ use shearq_results::catalogues::{Catalogues, OWN};
 use shearq_results::compare::score_all;
 use shearq_results::score::{ScoredSet, score_catalogues};
 use shearq_results::views::comparison::verdict_line;
-use shearq_results::views::comparison::{compact, compare, named, q_heat_map, verdict};
+use shearq_results::views::comparison::{compact, compare, named, q_per_set, verdict};
 use shearq_results::views::pages;
 use shearq_results::views::scores::per_set;
 use shearq_simulate::set::SimulationSettings;
@@ -100,7 +100,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     }
     let rows = named(&variants);
     let verdict = verdict(&rows);
-    let comparison = pages::comparison(full, verdict.clone(), &q_heat_map(&rows))?;
+    let comparison = pages::comparison(full, verdict.clone(), &q_per_set(&rows))?;
     if let Some(verdict) = verdict {
         print(&format!("\n{}\n", wrapped(&verdict, Some(80))))?;
     }

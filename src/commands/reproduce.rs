@@ -19,7 +19,7 @@ use shearq_studies::reproduce::{Plan, Study, run_sets};
 /// Sect. 4: calibration of λ on synthetic galaxies (Figs 4 to 7). Sect. 5: the seven configurations of Table 1 on 24
 /// sets (Table 1, Figs 8 to 11), simulated and measured in memory.
 ///
-/// The command writes an HTML report, figures as PNG and SVG, and their data as CSV and Parquet. Finished sets are
+/// The command writes an HTML report, figures as PNG and SVG, and their data as CSV. Finished sets are
 /// kept, so the same command resumes a stopped run. The default takes minutes; --images 200, as in the challenge,
 /// takes hours.
 #[derive(Debug, Args)]

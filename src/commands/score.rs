@@ -4,13 +4,12 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, bail};
 use clap::{ArgGroup, Args};
 use shearq_quantities::units::{Degrees, Pixels};
-use shearq_scoring::{Noise, Options, SetScorer};
+use shearq_scoring::{Noise, Options, SetScorer, TruthSign};
 use shearq_submissions::EllipticityType;
 
 use super::published;
-use crate::arguments::{
-    Printing, ReportFile, ScoreSettings, SetList, SignArgument, Threads, positive, sets_of,
-};
+use crate::arguments::{Printing, ReportFile, ScoreSettings, SetList, Threads, positive, sets_of};
+use crate::choices::named;
 use crate::{print, tell, tell_unread};
 use shearq_dataset::layout::DataFolder;
 use shearq_dataset::run::{Run, Source, kind_of};
@@ -23,7 +22,7 @@ use shearq_results::published::Truth;
 use shearq_results::record::{RunRecord, SetRecord};
 use shearq_results::score::{ScoredSet, score_catalogues, score_files, unscored};
 use shearq_results::store;
-use shearq_results::submit::{Kind, Manifest, Packed, Sent, Submission, read_bandpowers};
+use shearq_results::submit::{Manifest, Packed, Sent, Submission, read_bandpowers};
 use shearq_results::views::comparison::verdict_line;
 use shearq_results::views::pages;
 use shearq_results::views::scores::{SetInput, one_set_json, per_set, spectra};
@@ -34,7 +33,7 @@ use shearq_results::views::scores::{SetInput, one_set_json, per_set, spectra};
 /// `--data DATA --foreign FILE`, and plain files of one set with `--truth truth.csv CATALOGUE...`.
 ///
 /// Plain files are one catalogue per image: CSV with a header, ASCII `x y e1 e2`, FITS or Parquet, by the file's
-/// ending. Their `--format json` lists all eight conventions. Score power spectra with --spectra, and a submission
+/// ending. Their `--format json` lists all eight conventions. Score a power spectrum with --spectra, a submission
 /// as `pack` writes it with --packed, and a submission to GREAT3 or GREAT08 with --challenge (docs/great3.md).
 #[derive(Debug, Args)]
 #[command(group = ArgGroup::new("input").required(true).args(["measured", "foreign", "spectra", "packed", "catalogues"]))]
@@ -55,8 +54,8 @@ pub(crate) struct Arguments {
     /// Catalogues of another program, described by a TOML file (docs/files.md).
     #[arg(long, value_name = "FILE", requires = "data", conflicts_with = "truth")]
     foreign: Option<PathBuf>,
-    /// Power spectra (`index l power`): a file with --truth, a folder of `{method}_set{set}.dat` with --data.
-    #[arg(long, value_name = "PATH", conflicts_with_all = ["noise_var", "convention", "path"])]
+    /// Power spectrum (`index l power`) of the set of --truth.
+    #[arg(long, value_name = "FILE", requires = "truth", conflicts_with_all = ["data", "sets", "noise_var", "convention", "path"])]
     spectra: Option<PathBuf>,
     /// Submission as `pack` writes it: a folder or an archive (.tar.gz) of catalogues or power spectra.
     #[arg(long, value_name = "PATH", requires = "data", conflicts_with_all = ["truth", "path"])]
@@ -69,8 +68,8 @@ pub(crate) struct Arguments {
     noise_var: Option<f64>,
     /// Sign of g2 in the file of --truth; data folders state it in layout.toml [default: as the file states, else
     /// the sign in which the shear is an E-mode field, else the sign that e2 follows; required if these are unclear].
-    #[arg(long, value_enum, requires = "truth", conflicts_with_all = FOLDERS)]
-    truth_sign: Option<SignArgument>,
+    #[arg(long, value_parser = named::<TruthSign>(), requires = "truth", conflicts_with_all = FOLDERS)]
+    truth_sign: Option<TruthSign>,
     /// Pixels per side of a stamp, for --truth [default: 48].
     #[arg(long, value_name = "PX", allow_negative_numbers = true, requires = "truth", conflicts_with_all = FOLDERS)]
     stamp: Option<f64>,
@@ -81,9 +80,8 @@ pub(crate) struct Arguments {
     /// x,y,e1,e2].
     #[arg(long, value_name = "X,Y,E1,E2", value_delimiter = ',', num_args = 1, requires = "truth", conflicts_with_all = NOT_PLAIN)]
     columns: Option<Vec<String>>,
-    /// Type of the ellipticities, `shear` or `distortion`, for --truth. Distortions are converted to shear-type
-    /// ellipticities [default: shear].
-    #[arg(long, value_name = "TYPE", value_parser = parse_ellipticity, requires = "truth", conflicts_with_all = NOT_PLAIN)]
+    /// Type of the ellipticities, for --truth [default: shear].
+    #[arg(long, value_name = "TYPE", value_parser = named::<EllipticityType>(), requires = "truth", conflicts_with_all = NOT_PLAIN)]
     ellipticity: Option<EllipticityType>,
     /// Value of e1 or e2 that marks a galaxy as not measured, such as -99; for --truth.
     #[arg(long, value_name = "VALUE", allow_negative_numbers = true, requires = "truth", conflicts_with_all = NOT_PLAIN)]
@@ -154,14 +152,6 @@ const GREAT10_ONLY: [&str; 21] = [
     "convention",
 ];
 
-fn parse_ellipticity(text: &str) -> Result<EllipticityType, String> {
-    match text {
-        "shear" => Ok(EllipticityType::Shear),
-        "distortion" => Ok(EllipticityType::Distortion),
-        _ => Err("expected `shear` or `distortion`".into()),
-    }
-}
-
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     if let (Some(challenge), Some(truth)) = (&arguments.challenge, &arguments.truth) {
         let branch = published::branch_of(challenge, arguments.branch.as_deref())?;
@@ -184,14 +174,11 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         choice: arguments.settings.convention.unwrap_or_default(),
     };
     let data = arguments.data.as_ref().map(DataFolder::open).transpose()?;
-    match (&arguments.truth, &arguments.spectra, data) {
-        (Some(truth), Some(spectrum), _) => spectrum_file(arguments, truth, spectrum, options),
-        (Some(truth), None, _) => files(arguments, truth, options),
-        (None, Some(spectra), Some(data)) => spectrum_folder(arguments, &data, spectra, options),
-        (None, Some(_), None) => {
-            bail!("--spectra needs the true shear. Try: --data DIR, or --truth FILE")
-        }
-        (None, None, data) => catalogues(arguments, data, options),
+    match (&arguments.truth, &arguments.spectra) {
+        (Some(truth), Some(spectrum)) => spectrum_file(arguments, truth, spectrum, options),
+        (Some(truth), None) => files(arguments, truth, options),
+        // Clap requires --truth with --spectra.
+        (None, _) => catalogues(arguments, data, options),
     }
 }
 
@@ -338,38 +325,6 @@ fn packed_spectra(
     write_record(store, run, &Source::folder(data, folder_of(&path))?, data)
 }
 
-fn spectrum_folder(
-    arguments: &Arguments,
-    data: &DataFolder,
-    folder: &Path,
-    options: Options,
-) -> anyhow::Result<()> {
-    let mut files = BTreeMap::<u32, PathBuf>::new();
-    let cannot_read = || format!("{}: cannot read the folder", folder.display());
-    for entry in std::fs::read_dir(folder).with_context(cannot_read)? {
-        let path = entry.with_context(cannot_read)?.path();
-        let Some(Kind::Spectrum { set, .. }) = Kind::of(&path) else {
-            continue;
-        };
-        // Which of two spectra is meant cannot be guessed from their names.
-        if let Some(other) = files.insert(set, path.clone()) {
-            bail!(
-                "{}: {} is also a spectrum of set {set}; expected one method",
-                path.display(),
-                other.display()
-            );
-        }
-    }
-    anyhow::ensure!(
-        !files.is_empty(),
-        "{}: found no file named {{method}}_set{{set}}.dat",
-        folder.display()
-    );
-    let manifest = Manifest::read(folder)?;
-    score_spectra(arguments, data, files, manifest.as_ref(), folder, options)?;
-    Ok(())
-}
-
 fn score_spectra(
     arguments: &Arguments,
     data: &DataFolder,
@@ -455,7 +410,7 @@ fn plain_reading(arguments: &Arguments) -> Reading {
         // The field and the stamps of GREAT10.
         field: Degrees(arguments.field.unwrap_or(10.0)),
         stamp: Pixels(arguments.stamp.unwrap_or(48.0)),
-        sign: arguments.truth_sign.map(Into::into),
+        sign: arguments.truth_sign,
     }
 }
 

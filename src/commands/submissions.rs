@@ -1,9 +1,10 @@
 use std::path::PathBuf;
 
-use clap::{Args, Subcommand, ValueEnum};
+use clap::{Args, Subcommand};
 use shearq_submissions::{Configuration, PsfForm, Published, Registry, Template};
 
 use crate::arguments::Form;
+use crate::choices::named;
 use crate::{print, tell};
 use shearq_files::atomic;
 use shearq_render::table::{Cell, Table};
@@ -37,18 +38,9 @@ enum Command {
         #[arg(value_name = "FILE")]
         file: PathBuf,
         /// Method to configure.
-        #[arg(long, value_enum, default_value_t = Method::Linear)]
-        method: Method,
+        #[arg(long, value_parser = named::<Template>(), default_value = "linear")]
+        method: Template,
     },
-}
-
-/// Method of a new configuration.
-#[derive(Debug, Clone, Copy, ValueEnum)]
-enum Method {
-    /// The linear network in closed form (recommended).
-    Linear,
-    /// The Hopfield network of the paper.
-    Network,
 }
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
@@ -64,13 +56,9 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             print(&text)
         }
         Command::Init { file, method } => {
-            let template = match method {
-                Method::Network => Template::Network,
-                Method::Linear => Template::Linear,
-            };
             anyhow::ensure!(
                 // Never over a file: it may be the settings that the user tuned.
-                atomic::write_if_absent(file, template.text()?.as_bytes())?,
+                atomic::write_if_absent(file, method.text()?.as_bytes())?,
                 "{}: the file exists; expected a new file name",
                 file.display()
             );

@@ -2,8 +2,8 @@
 
 use ndarray::{Array2, array};
 use shearq_render::figure::{
-    Band, ColourMap, Figure, FigureError, HeatMap, ImageGrid, ImagePanel, ImageRow, LinePlot,
-    PanelGrid, PictureFormat, Series, Stretch, Style,
+    Band, ColourMap, Figure, FigureError, ImageGrid, ImagePanel, ImageRow, LinePlot, PanelGrid,
+    PictureFormat, Series, Stretch, Style,
 };
 
 const HARD: [&[f64]; 9] = [
@@ -84,18 +84,10 @@ fn names_and_bands_of_any_data_are_drawn() {
 }
 
 #[test]
-fn tables_and_images_of_any_data_are_drawn() {
-    draw(&HeatMap::default());
+fn images_of_any_data_are_drawn() {
     draw(&ImageGrid::default());
     for values in HARD {
         let image = Array2::from_shape_vec((1, values.len()), values.to_vec()).expect("one row");
-        draw(&HeatMap {
-            rows: vec!["only".into()],
-            columns: (0..values.len()).map(|number| number.to_string()).collect(),
-            values: image.clone(),
-            decimals: 3,
-            ..HeatMap::default()
-        });
         let maps = [ColourMap::Viridis, ColourMap::Diverging];
         let panel = |map| ImagePanel {
             image: image.clone(),
@@ -204,14 +196,6 @@ fn errors_name_the_place_and_what_was_expected() {
             .to_string(),
         "figure `Bias`, series `hard`: found 2 values of y, expected 1"
     );
-    let table = HeatMap {
-        values: array![[1.0]],
-        ..HeatMap::default()
-    };
-    assert!(matches!(
-        table.render(PictureFormat::Svg),
-        Err(FigureError::Lengths { expected: 1, .. })
-    ));
     let many = PanelGrid {
         title: String::new(),
         columns: 2,

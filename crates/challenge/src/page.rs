@@ -8,7 +8,7 @@ use shearq_render::html::{Block, Picture, Report, Section};
 use shearq_render::page::PageError;
 use shearq_render::table::{Cell, Table, TableFormat};
 use shearq_results::submit::Kind as FileKind;
-use shearq_results::views::comparison::q_heat_map;
+use shearq_results::views::comparison::q_per_set;
 
 use crate::constant::ConstantShears;
 use crate::judge::{EntryInfo, Refused};
@@ -337,12 +337,16 @@ impl View<'_> {
                 (name, standing.best.entry.sets.as_slice())
             })
             .collect();
-        let mut map = q_heat_map(&rows);
-        map.row_label = "entry".into();
-        map.decimals = map.decimals.min(self.digits);
+        let mut plot = q_per_set(&rows);
+        for series in &mut plot.series {
+            let values = series.y.iter_mut();
+            values.for_each(|q| *q = rounded(*q, self.digits));
+            let errors = series.y_err.iter_mut().flatten();
+            errors.for_each(|error| *error = rounded_up(*error, self.digits));
+        }
         let caption =
             "Q of each set. Metrics of single sets reveal more of the true shear than their mean.";
-        let picture = Picture::draw(&map, "q-per-set", caption)?;
+        let picture = Picture::draw(&plot, "q-per-set", caption)?;
         Ok(Section::new(
             "sets",
             "Metric of each set",

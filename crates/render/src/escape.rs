@@ -124,10 +124,8 @@ const SYMBOLS: [(char, &str); 11] = [
 
 #[cfg(test)]
 mod tests {
-    use ndarray::Array2;
-
     use super::*;
-    use crate::figure::{Figure, HeatMap, PictureFormat};
+    use crate::figure::{Figure, LinePlot, PictureFormat, Series, Style};
     use crate::html::{Block, Report, Section};
     use crate::table::{Cell, Heading, Table, TableFormat};
 
@@ -275,15 +273,14 @@ mod tests {
                 settings: vec![(name.into(), name.into())],
                 ..Report::default()
             };
-            let map = |name: &str| HeatMap {
+            let plot = |name: &str| LinePlot {
                 title: name.into(),
-                rows: vec![name.into()],
-                columns: vec!["1".into()],
-                values: Array2::ones((1, 1)),
-                ..HeatMap::default()
+                x_names: vec![name.into()],
+                series: vec![Series::new(name, vec![0.0], vec![1.0], Style::Points, 0)],
+                ..LinePlot::default()
             };
             let svg = |name: &str| {
-                String::from_utf8(map(name).render(PictureFormat::Svg).unwrap()).unwrap()
+                String::from_utf8(plot(name).render(PictureFormat::Svg).unwrap()).unwrap()
             };
             let tags = |text: &str| text.matches('<').count();
             // A setting of two lines is shown as lines of code.

@@ -1,4 +1,4 @@
-//! Figures for reports: curves and points with errors, tables in colour, and images, drawn by `plotters`.
+//! Figures for reports: curves and points with errors, and images, drawn by `plotters`.
 //!
 //! ```
 //! # use shearq_render::figure::{Figure, PictureFormat, LinePlot, Series, Style};
@@ -17,7 +17,6 @@
 
 mod axis;
 mod colour;
-mod heat;
 mod image;
 mod plot;
 
@@ -38,7 +37,6 @@ use shearq_files::{FileError, atomic};
 
 use crate::escape;
 pub use colour::ColourMap;
-pub use heat::HeatMap;
 pub use image::{ImageGrid, ImagePanel, ImageRow, Stretch};
 pub use plot::{Band, LinePlot, PanelGrid, Series, Style};
 

@@ -2,8 +2,6 @@
 
 use comfy_table::{CellAlignment, ContentArrangement, presets};
 use serde_json::{Map, Value, json};
-use shearq_files::frames::polars::{Column, DataFrame};
-use shearq_files::frames::{TableError, frame};
 
 use crate::table::{Cell, Table, TableFormat};
 use crate::{escape, terminal};
@@ -77,35 +75,6 @@ impl Table {
             text.push_str(&format!("% {}\n", escape::line(note)));
         }
         text
-    }
-
-    /// The table as columns of numbers or words, those of errors beside their values: what CSV has,
-    /// for other formats.
-    pub fn columns(&self) -> Result<DataFrame, TableError> {
-        let mut columns = Vec::new();
-        for (k, heading) in self.headings.iter().enumerate() {
-            let cells = || self.rows.iter().filter_map(|row| row.get(k));
-            let numbers: Option<Vec<(f64, f64)>> = cells()
-                .map(|cell| match cell {
-                    Cell::Text(_) => None,
-                    Cell::Empty => Some((f64::NAN, f64::NAN)),
-                    Cell::Number { value, error, .. } => Some((*value, error.unwrap_or(f64::NAN))),
-                })
-                .collect();
-            let unzipped = numbers.map(|pairs| pairs.into_iter().unzip());
-            let Some((values, errors)): Option<(Vec<f64>, Vec<f64>)> = unzipped else {
-                let words: Vec<String> = cells()
-                    .map(|cell| cell.print(str::to_owned, false))
-                    .collect();
-                columns.push(Column::new(heading.key.into(), words));
-                continue;
-            };
-            columns.push(Column::new(heading.key.into(), values));
-            if self.has_errors(k) {
-                columns.push(Column::new(format!("{}_error", heading.key).into(), errors));
-            }
-        }
-        frame(columns)
     }
 
     fn csv(&self) -> String {

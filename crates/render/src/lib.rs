@@ -1,7 +1,7 @@
 //! Tables, plots and HTML pages, independent of what they show.
 //!
 //! * [`table`]: rows and columns, as text for a terminal, Markdown, LaTeX, CSV or JSON; [`terminal`] fits them to a width.
-//! * [`figure`]: curves, points with errors, heat maps and images, as SVG and PNG.
+//! * [`figure`]: curves, points with errors, and images, as SVG and PNG.
 //! * [`html`], [`page`]: pages that need no other file.
 //! * [`escape`]: text of unknown origin, made safe for each format.
 #![forbid(unsafe_code)]

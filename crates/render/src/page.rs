@@ -1,10 +1,8 @@
 //! A report with the pictures and data of its exhibits beside it.
 
-use std::collections::BTreeMap;
 use std::path::Path;
 
-use shearq_files::frames::TableError;
-use shearq_files::{FileError, atomic, table};
+use shearq_files::{FileError, atomic};
 use thiserror::Error;
 
 use crate::figure::{Figure, FigureError};
@@ -18,21 +16,17 @@ pub enum PageError {
     Figure(#[from] FigureError),
     #[error(transparent)]
     File(#[from] FileError),
-    #[error(transparent)]
-    Data(#[from] TableError),
 }
 
 /// The report on its way. Figures and data are written at once, so that a stopped command leaves those that are done.
 #[derive(Debug)]
 pub struct Page<'a> {
     out: &'a Path,
-    made_by: BTreeMap<String, String>,
     report: Report,
 }
 
 impl<'a> Page<'a> {
-    /// An empty report to be written to `out`. `settings` are what made it: shown at its end, and
-    /// stored with the data.
+    /// An empty report to be written to `out`, with the settings that made it at its end.
     pub fn new(
         out: &'a Path,
         title: &str,
@@ -41,7 +35,6 @@ impl<'a> Page<'a> {
     ) -> Self {
         Page {
             out,
-            made_by: settings.iter().cloned().collect(),
             report: Report {
                 title: title.into(),
                 subtitle: subtitle.into(),
@@ -89,11 +82,8 @@ impl<'a> Page<'a> {
     /// Writes a table's data beside the report.
     pub fn data(&self, name: &str, exhibit: &Table) -> Result<(), PageError> {
         let text = exhibit.render(TableFormat::Csv);
-        atomic::write(self.out.join(format!("data/{name}.csv")), text.as_bytes())?;
-        let path = self.out.join(format!("data/{name}.parquet"));
-        let columns = exhibit.columns()?;
-        table::write(&path, table::FileFormat::Parquet, &columns, &self.made_by)?;
-        Ok(())
+        let path = self.out.join(format!("data/{name}.csv"));
+        Ok(atomic::write(path, text.as_bytes())?)
     }
 
     /// Writes the report.

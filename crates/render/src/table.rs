@@ -331,10 +331,6 @@ mod tests {
             "name,q,q_error\n\"a,b\",87.125,1.5\nc_d,,\n"
         );
         assert_eq!(escape::latex("√A×10⁴"), "$\\sqrt{A}\\times$10$^{4}$");
-        let columns = table().columns().unwrap();
-        assert_eq!(columns.get_column_names(), ["name", "q", "q_error"]);
-        let words = columns.column("name").unwrap().str().unwrap();
-        assert!(words.iter().eq([Some("a,b"), Some("c_d")]));
         let json: Value = serde_json::from_str(&table().render(TableFormat::Json)).unwrap();
         assert_eq!(json["rows"][0]["q_error"], 1.5);
         assert!(json["rows"][1]["q"].is_null());
@@ -359,9 +355,6 @@ mod tests {
     fn empty_cells_keep_number_columns_and_parts_omit_rows() {
         let mut whole = table();
         whole.rows.push(vec![Cell::text("mean"), Cell::Empty]);
-        let columns = whole.columns().unwrap();
-        let values = shearq_files::frames::reals(columns.column("q").unwrap()).unwrap();
-        assert!(values[0] == 87.125 && values[2].is_nan());
         assert!(whole.render(TableFormat::Csv).ends_with("mean,,\n"));
         assert!(whole.json()["rows"][2]["q"].is_null());
         let part = whole.part(&["name", "q"], "Part", &[]);

@@ -7,8 +7,8 @@ use std::path::Path;
 
 use ndarray::Array2;
 use shearq_render::figure::{
-    Band, ColourMap, Figure, HeatMap, ImageGrid, ImagePanel, ImageRow, LinePlot, PanelGrid,
-    PictureFormat, Series, Style,
+    Band, ColourMap, Figure, ImageGrid, ImagePanel, ImageRow, LinePlot, PanelGrid, PictureFormat,
+    Series, Style,
 };
 
 fn compare(name: &str, figure: &impl Figure) {
@@ -115,25 +115,6 @@ fn long_names_stand_below_each_other() {
         ..LinePlot::default()
     };
     compare("names", &plot);
-}
-
-#[test]
-fn a_heat_map() {
-    compare(
-        "heat",
-        &HeatMap {
-            title: "Quality factor per set".into(),
-            row_label: "configuration".into(),
-            column_label: "set".into(),
-            rows: vec!["23/raw/star".into(), "48/linear/star".into()],
-            columns: ["2", "5", "8"].map(String::from).into(),
-            values: Array2::from_shape_vec((2, 3), vec![10.0, 20.5, f64::NAN, 40.0, 50.0, 60.0])
-                .unwrap(),
-            decimals: 1,
-            value_label: "Q".into(),
-            map: ColourMap::Viridis,
-        },
-    );
 }
 
 #[test]

@@ -1,10 +1,9 @@
 //! The page of `shearq reproduce`: Fig. 3, Table 1 and Figs 8 to 11 of the paper, and what denoising does to ellipticities.
 
-use ndarray::Array2;
 use shearq_pipeline::PipelineError;
 use shearq_pipeline::run::{measurers, simulated_steps};
 use shearq_pipeline::simulate::simulator;
-use shearq_render::figure::{ColourMap, HeatMap, ImageRow, LinePlot, PanelGrid, Series, Style};
+use shearq_render::figure::{ImageRow, LinePlot, PanelGrid, Series, Style};
 use shearq_render::page::{Page, PageError};
 use shearq_render::table::{Cell, Table};
 use shearq_results::views::pages::{bins, spectrum_panel, steps_figure, steps_row};
@@ -107,29 +106,6 @@ pub fn table_one(results: &[SetResult], configurations: &[(Configuration, Publis
     table
 }
 
-// Fig. 8: Q per set and configuration.
-fn q_per_set(results: &[SetResult], names: &[String]) -> HeatMap {
-    let mut columns: Vec<String> = results.iter().map(|set| set.set.to_string()).collect();
-    columns.push("mean".into());
-    let values = Array2::from_shape_fn((names.len(), columns.len()), |(place, k)| {
-        match results.get(k) {
-            Some(set) => set.results[place].score.metrics.q,
-            None => mean_of_24(results, place, |f| f.q).0,
-        }
-    });
-    HeatMap {
-        title: "Quality factor per set".into(),
-        row_label: "configuration".into(),
-        column_label: "set".into(),
-        rows: names.to_vec(),
-        columns,
-        values,
-        decimals: 1,
-        value_label: "Q".into(),
-        map: ColourMap::Viridis,
-    }
-}
-
 // Metrics of every set and configuration: the data of Figs 8, 10 and 11.
 fn per_set_table(results: &[SetResult]) -> Table {
     let of_set = |set: &'_ SetResult| -> Vec<_> {
@@ -215,8 +191,8 @@ fn power_spectra(results: &[SetResult], place: usize, name: &str) -> (PanelGrid,
     (figure, table)
 }
 
-// Figs 10 and 11: M/2 or √A per set for the configurations at `places`.
-fn bias_per_set(
+// Figs 8, 10 and 11: a metric per set for the configurations at `places`.
+fn metric_per_set(
     results: &[SetResult],
     places: &[(usize, &str)],
     metric: Metric,
@@ -309,9 +285,11 @@ pub fn exhibits(
     page.table("calibration", calibration)?;
     page.section("Configurations (Sect. 5)", SECT_FIVE);
     page.table("table1", table_one)?;
+    let all: Vec<(usize, &str)> = names.iter().map(String::as_str).enumerate().collect();
+    let title = "Quality factor per set";
     page.figure(
         "fig8-q-per-set",
-        &q_per_set(results, names),
+        &metric_per_set(results, &all, |f| f.q, title, "Q"),
         "As Fig. 8 of the paper: quality factor per set and configuration.",
     )?;
     let [at_raw, at_den] = [RAW, DENOISED].map(|name| names.iter().position(|own| own == name));
@@ -328,13 +306,13 @@ pub fn exhibits(
         let title = "Multiplicative bias per set";
         page.figure(
             "fig10-multiplicative",
-            &bias_per_set(results, &both, |f| f.m_half, title, "M/2"),
+            &metric_per_set(results, &both, |f| f.m_half, title, "M/2"),
             "As Fig. 10 of the paper: multiplicative bias per set.",
         )?;
         let title = "Additive bias per set";
         page.figure(
             "fig11-additive",
-            &bias_per_set(results, &both, |f| f.sqrt_a, title, "√A × 10⁴"),
+            &metric_per_set(results, &both, |f| f.sqrt_a, title, "√A × 10⁴"),
             "As Fig. 11 of the paper: additive bias per set.",
         )?;
     }

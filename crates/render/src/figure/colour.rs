@@ -104,16 +104,6 @@ pub(super) fn position(value: f64, (low, high): (f64, f64)) -> f64 {
     }
 }
 
-/// Black or white, whichever reads better on `background`.
-pub(super) fn text_on(RGBColor(red, green, blue): RGBColor) -> RGBColor {
-    let [red, green, blue] = [red, green, blue].map(f64::from);
-    // The luma of ITU-R BT.601.
-    match 0.299 * red + 0.587 * green + 0.114 * blue > 140.0 {
-        true => RGBColor(0, 0, 0),
-        false => RGBColor(255, 255, 255),
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -2,8 +2,7 @@
 
 use std::collections::BTreeSet;
 
-use ndarray::Array2;
-use shearq_render::figure::{ColourMap, HeatMap};
+use shearq_render::figure::{LinePlot, Series, Style};
 use shearq_render::table::{Cell, Table};
 use shearq_scoring::resample::PairedDifference;
 use shearq_scoring::{Definition, Fault, Metrics};
@@ -305,31 +304,23 @@ fn ranges(sets: &[SetRecord]) -> String {
     texts.collect::<Vec<_>>().join(",")
 }
 
-/// Q of each set (column) and method or run (row), with means in the last column.
-pub fn q_heat_map(rows: &[Named<'_>]) -> HeatMap {
-    let sets = rows.iter().flat_map(|(_, sets)| sets.iter());
-    let sets: BTreeSet<u32> = sets.map(|set| set.set).collect();
-    let mut columns: Vec<String> = sets.iter().map(u32::to_string).collect();
-    columns.push("mean".into());
-    let mut values = Array2::from_elem((rows.len(), columns.len()), f64::NAN);
-    for (mut row, (_, own)) in values.rows_mut().into_iter().zip(rows) {
-        for (value, set) in row.iter_mut().zip(&sets) {
-            let found = own.iter().find(|own| own.set == *set);
-            *value = found.map_or(f64::NAN, |own| own.metrics.q);
-        }
-        row[sets.len()] = mean(own, |metrics| metrics.q).0;
-    }
-    let most = values.iter().copied().fold(f64::NAN, f64::max);
-    HeatMap {
+/// Q of each set with its error, a series per configuration.
+pub fn q_per_set(rows: &[Named<'_>]) -> LinePlot {
+    let series = rows.iter().enumerate().map(|(k, (name, sets))| {
+        // Shifted, so that points do not hide each other.
+        let aside = 0.6 * ((k as f64 + 0.5) / rows.len() as f64 - 0.5);
+        let x = sets.iter().map(|own| f64::from(own.set) + aside).collect();
+        let y = sets.iter().map(|own| own.metrics.q).collect();
+        let errors = sets.iter().map(|own| own.errors.q).collect();
+        Series::new(name, x, y, Style::Points, k).with_errors(errors)
+    });
+    LinePlot {
         title: "Quality factor per set".into(),
-        row_label: "configuration".into(),
-        column_label: "set".into(),
-        rows: rows.iter().map(|(name, _)| name.clone()).collect(),
-        columns,
-        values,
-        decimals: if most < 10.0 { 2 } else { 1 },
-        value_label: "Q".into(),
-        map: ColourMap::Viridis,
+        x_label: "set".into(),
+        x_whole: true,
+        y_label: "Q".into(),
+        series: series.collect(),
+        ..LinePlot::default()
     }
 }
 

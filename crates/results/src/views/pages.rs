@@ -6,8 +6,8 @@ use crate::score::ScoredSet;
 use shearq_bias::QUANTITIES;
 use shearq_measure::Steps;
 use shearq_render::figure::{
-    ColourMap, FigureError, HeatMap, ImageGrid, ImagePanel, ImageRow, LinePlot, PanelGrid, Series,
-    Stretch, Style,
+    ColourMap, FigureError, ImageGrid, ImagePanel, ImageRow, LinePlot, PanelGrid, Series, Stretch,
+    Style,
 };
 use shearq_render::html::{Block, Picture, Report, Section};
 use shearq_render::table::{Cell, Table};
@@ -35,7 +35,7 @@ pub fn scores(name: &str, scored: &[ScoredSet], table: Table) -> Result<Section,
 pub fn comparison(
     table: Table,
     verdict: Option<String>,
-    map: &HeatMap,
+    q_per_set: &LinePlot,
 ) -> Result<Section, FigureError> {
     let mut blocks = Vec::new();
     if let Some(verdict) = verdict {
@@ -65,8 +65,9 @@ pub fn comparison(
             blocks.push(Block::Figure(Picture::draw(&plot, key, caption)?));
         }
     }
-    let caption = "Q of each set in the convention of the table, and the mean.";
-    blocks.push(Block::Figure(Picture::draw(map, "q-per-set", caption)?));
+    let caption = "Q of each set in the convention of the table.";
+    let picture = Picture::draw(q_per_set, "q-per-set", caption)?;
+    blocks.push(Block::Figure(picture));
     blocks.push(Block::Table(table));
     Ok(Section::new("comparison", "Comparison", blocks))
 }
