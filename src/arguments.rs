@@ -35,16 +35,16 @@ impl FromStr for SetList {
         }
         let number = |part: &str| -> Result<u32, String> {
             match part.trim().parse() {
-                Ok(set) if (1..=MAX_SET).contains(&set) => Ok(set),
+                Ok(set) if set <= MAX_SET => Ok(set),
                 _ => Err(format!(
-                    "expected sets such as `1,2,7-9`, or `all` (found `{part}`, expected a number from 1 to {MAX_SET})"
+                    "expected sets such as `1,2,7-9`, or `all` (found `{part}`, expected a number from 0 to {MAX_SET})"
                 )),
             }
         };
         // Sorted and without repetition, so that a list in another order resumes the same run.
         let mut sets = BTreeSet::new();
         for part in text.split(',') {
-            // `-` cannot be a sign: sets count from 1.
+            // `-` cannot be a sign: no set is negative.
             match part.split_once('-') {
                 Some((first, last)) => {
                     let (first, last) = (number(first)?, number(last)?);
@@ -79,7 +79,7 @@ pub(super) fn sets_of(list: Option<&SetList>) -> &[u32] {
 
 impl SetList {
     pub(super) fn simulated(&self) -> anyhow::Result<&[u32]> {
-        if let Some(set) = self.0.iter().find(|&&set| set > SETS) {
+        if let Some(set) = self.0.iter().find(|&&set| !(1..=SETS).contains(&set)) {
             anyhow::bail!(
                 "--sets: this set cannot be simulated (found {set}, expected 1 to {SETS})"
             );
@@ -344,7 +344,7 @@ mod tests {
         let parse = |text: &str| text.parse::<SetList>().map(|list| list.0);
         assert_eq!(parse("7-9,1,2,8"), Ok(vec![1, 2, 7, 8, 9]));
         assert_eq!(parse("all").unwrap().len(), 24);
-        for wrong in ["", "0", "x", "3-1", "1,,2", "10000"] {
+        for wrong in ["", "x", "3-1", "1,,2", "10000"] {
             assert!(parse(wrong).is_err(), "{wrong}");
         }
     }

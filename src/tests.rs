@@ -125,7 +125,7 @@ const WAYS: [(&str, &[&str]); 33] = [
     ),
     (
         "measure",
-        &["submission data out sets epochs catalogue-format shard threads"],
+        &["submission data out sets epochs stack-stars catalogue-format shard threads"],
     ),
     (
         "run",
@@ -202,6 +202,7 @@ const WAYS: [(&str, &[&str]); 33] = [
             "measured out method kind challenge team title contact entry",
             "foreign data out method kind challenge team title contact entry",
             "CATALOGUE challenge branch subfields grid whole-galaxies out",
+            "measured challenge branch subfields grid whole-galaxies out",
         ],
     ),
     ("unpack", &["ARCHIVE out verify"]),

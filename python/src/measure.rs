@@ -191,21 +191,15 @@ fn measured<'a>(
                 sessions.push(Session::open(measurer, &mut source, noise, feeder.ahead())?);
                 sources.push(source);
             }
-            if sessions.is_empty() {
+            let Some((own, others)) = sources.split_first_mut() else {
                 return Ok(());
-            }
-            let first = sessions.remove(0);
-            let others: Vec<_> = sessions.into_iter().map(Arc::new).collect();
-            let (first, head) = (Arc::new(first.with_epochs(others.clone())?), Arc::new(()));
+            };
+            let first = sessions.remove(0).with_epochs(sessions)?;
+            let (first, head) = (Arc::new(first), Arc::new(()));
             for row in 0..first.rows().len() {
-                let all = std::iter::once(&first).chain(&others);
-                let jobs = sources.iter_mut().zip(all);
-                let jobs = jobs.map(|(source, session)| session.read(source, row));
-                let mut jobs = jobs.collect::<Result<Vec<_>, _>>()?;
-                let own = jobs.remove(0);
                 let row = ImageRow {
                     head: Arc::clone(&head),
-                    jobs: vec![own.with_epochs(jobs)],
+                    jobs: vec![first.read_epochs(own, others, row)?],
                 };
                 if !feeder.push(row) {
                     break;

@@ -19,7 +19,8 @@ use shearq_results::views::mean::mean_table;
 ///
 /// The mean shear is the mean ellipticity of all galaxies without a flag, divided by their mean response if
 /// the configuration does so. The error includes the error of the mean response, and the noise of one star per image. It
-/// assumes independent galaxies: for pairs that are rotated by 90 degrees it is too large.
+/// assumes independent galaxies, apart from branches of GREAT3 with constant shear: their galaxies are pairs that are rotated by
+/// 90 degrees, so that the error is that of the noise of pixels alone.
 ///
 /// --where and --weight select and weight galaxies of linear configurations by `snr`, `flux` (image units) and `size` (px), and
 /// select by `neighbour`, the light in a ring around the galaxy over its flux.

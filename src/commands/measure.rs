@@ -18,7 +18,7 @@ use crate::{count, tell, tell_unread};
 /// Measure the galaxies of a data folder: one catalogue per image.
 ///
 /// A catalogue has one row per galaxy with its position (x, y), ellipticity (e1, e2), flags, noise and response. See
-/// docs/files.md for all columns. Catalogues of the same settings that are in the folder already are kept. So the
+/// docs/files.md for all columns. A branch of GREAT3 is recognised by its files (docs/great3.md). Catalogues of the same settings that are in the folder already are kept. So the
 /// same command continues a measurement that was stopped.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
@@ -35,6 +35,9 @@ pub(crate) struct Arguments {
     /// in each Fourier mode with inverse-variance weights before the shape is measured.
     #[arg(long)]
     epochs: bool,
+    /// Stack all nine stars of each star field of GREAT3, shifted to the lower-left one, which is used alone otherwise.
+    #[arg(long)]
+    stack_stars: bool,
 }
 
 /// How to measure, and where to write catalogues.
@@ -86,12 +89,17 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         data,
         sets,
         epochs,
+        stack_stars,
     } = arguments;
     let out = &measuring.out;
-    let data = open_data(data)?;
+    let mut data = open_data(data)?;
+    if *stack_stars {
+        data = data.with_stacked_stars()?;
+    }
     let sets = sets.as_ref().map_or(&[][..], |list| &list.0);
     let run = Run {
-        epochs: *epochs,
+        // All images of a subfield are epochs.
+        epochs: *epochs || data.layout().great3.is_some(),
         ..measuring.run(Source::folder(&data, out)?)?
     };
     let images = measuring.images(&run, &data, sets)?;

@@ -11,7 +11,7 @@ use crate::progress::Bar;
 use crate::{count, tell, tell_unread};
 use shearq_dataset::run::{Run, open_data};
 use shearq_results::catalogues::Catalogues;
-use shearq_results::published::{Packing, great3};
+use shearq_results::published::{self as challenges, Packing, great3};
 use shearq_results::submit::pack::Packing as Submission;
 use shearq_results::submit::{Contents, Entry, is_archive};
 
@@ -31,8 +31,8 @@ const OTHER_ARCHIVES: [&str; 7] = ["zip", "tar", "gz", "bz2", "xz", "zst", "7z"]
 /// eight or more images. The same catalogues give the same bytes. `shearq check` checks a submission, `shearq unpack`
 /// unpacks an archive.
 ///
-/// With `--challenge great3 --branch BRANCH`, the command makes the submission file of GREAT3 from catalogues of all
-/// galaxies of a branch, after the checks of the challenge's own program (docs/great3.md).
+/// With `--challenge great3 --branch BRANCH`, the command makes the submission file of GREAT3 from a folder that `measure`
+/// wrote, or from catalogues of all galaxies of a branch, after the checks of the challenge's own program (docs/great3.md).
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
     /// Folder of catalogues that `measure` or `run` wrote.
@@ -62,10 +62,10 @@ pub(crate) struct Arguments {
     #[arg(long, value_parser = named::<Contents>(), default_value = "catalogues")]
     kind: Contents,
     /// Catalogues of GREAT3: `ID g1 g2` and perhaps `weight`, as text, FITS or Parquet; 10 for a galaxy that was not measured.
-    #[arg(value_name = "CATALOGUE", requires = "branch", conflicts_with_all = GREAT10_ONLY)]
+    #[arg(value_name = "CATALOGUE", requires = "branch", conflicts_with = "measured", conflicts_with_all = GREAT10_ONLY)]
     catalogues: Vec<PathBuf>,
     /// Branch of the challenge, such as control-ground-constant.
-    #[arg(long, value_name = "NAME", requires_all = ["challenge", "catalogues"], conflicts_with_all = GREAT10_ONLY)]
+    #[arg(long, value_name = "NAME", requires = "challenge", conflicts_with_all = GREAT10_ONLY)]
     branch: Option<String>,
     /// Subfields of a branch of GREAT3 that was simulated [default: 200].
     #[arg(long, value_name = "N", requires = "branch", conflicts_with_all = GREAT10_ONLY, value_parser = clap::value_parser!(u16).range(1..=1000))]
@@ -80,8 +80,8 @@ pub(crate) struct Arguments {
 }
 
 // Options without a meaning for submissions to other challenges; `file` is --entry.
-const GREAT10_ONLY: [&str; 9] = [
-    "measured", "foreign", "data", "method", "kind", "team", "title", "contact", "file",
+const GREAT10_ONLY: [&str; 8] = [
+    "foreign", "data", "method", "kind", "team", "title", "contact", "file",
 ];
 
 /// Team and challenge of an entry.
@@ -145,7 +145,10 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let out = &arguments.out;
     if let (Some(branch), Some(challenge)) = (&arguments.branch, &arguments.entry.challenge) {
         let packing = Packing {
-            catalogues: &arguments.catalogues,
+            catalogues: match &arguments.measured {
+                Some(folder) => challenges::Catalogues::Measured(folder),
+                None => challenges::Catalogues::Files(&arguments.catalogues),
+            },
             subfields: arguments.subfields.map_or(great3::SUBFIELDS, usize::from),
             grid: arguments.grid.map_or(great3::GRID, usize::from),
             whole_galaxies: arguments.whole_galaxies,

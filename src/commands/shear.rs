@@ -45,7 +45,12 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             out.display()
         ),
     };
-    let found = shears(&arguments.measured, arguments.response, arguments.treecorr)?;
+    let found = shears(
+        &arguments.measured,
+        &[],
+        arguments.response,
+        arguments.treecorr,
+    )?;
     table::write(out, format, &found.table, &found.metadata)?;
     tell(format_args!(
         "{}: {} galaxies, {} with a shear",

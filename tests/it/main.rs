@@ -20,6 +20,7 @@ mod galsim;
 mod gathered;
 mod generated;
 mod great3;
+mod great3_release;
 mod identity;
 mod inputs;
 mod killed;

@@ -6,6 +6,7 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use shearq_files::frames::polars::DataFrame;
 use shearq_scoring::{Grid, Row, TrueShear, TruthSign};
 
+use crate::great3;
 use crate::listing::{self, Files};
 use crate::pattern::PLACEHOLDERS;
 pub use crate::pattern::{IMAGE_PLACEHOLDERS, MAX_IMAGE, MAX_SET, check_pattern, fill};
@@ -37,6 +38,9 @@ pub struct Layout {
     pub field_degrees: f64,
     /// Pixels a side of a stamp, if the image header has no STAMP.
     pub stamp: usize,
+    /// The folder is a branch of GREAT3.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub great3: Option<great3::Branch>,
 }
 
 impl Default for Layout {
@@ -50,6 +54,7 @@ impl Default for Layout {
             truth_sign: TruthSign::Standard,
             field_degrees: 10.0,
             stamp: 48,
+            great3: None,
         }
     }
 }
@@ -82,6 +87,7 @@ impl Layout {
             truth_sign: _,
             field_degrees,
             stamp,
+            great3: _,
         } = self;
         check_pattern("galaxies", galaxies, &PLACEHOLDERS)?;
         // One of these may serve several sets or images.
@@ -131,7 +137,7 @@ pub struct DataFolder {
 }
 
 impl DataFolder {
-    /// Opens a folder, with the layout of its `layout.toml` or the default one.
+    /// Opens a folder, with the layout of its `layout.toml`, that of GREAT3 if it has such files, or the default one.
     pub fn open(root: impl AsRef<Path>) -> Result<Self, FileError> {
         let root = root.as_ref().to_owned();
         check_folder(&root, "a data folder")?;
@@ -141,9 +147,19 @@ impl DataFolder {
                 .map_err(FileError::doing(&path, "cannot read the layout"))?;
             toml::from_str(&text).map_err(|e| FileError::new(&path, e.to_string().trim_end()))?
         } else {
-            Layout::default()
+            great3::detect(&root)?.unwrap_or_default()
         };
         Ok(DataFolder { root, layout })
+    }
+
+    /// The folder with all stars of each star field of GREAT3 stacked.
+    pub fn with_stacked_stars(mut self) -> Result<Self, FileError> {
+        let Some(branch) = &mut self.layout.great3 else {
+            let message = "only star fields of GREAT3 can be stacked (expected image-000-0.fits, starfield_image-000-0.fits and galaxy_catalog-000.fits)";
+            return Err(FileError::new(&self.root, message));
+        };
+        branch.stacked_stars = true;
+        Ok(self)
     }
 
     pub fn new(root: impl AsRef<Path>) -> Self {
@@ -189,8 +205,12 @@ impl DataFolder {
             .join(fill(&self.layout.psf_functional, set, image))
     }
 
+    /// The table of an image's stamps.
     pub fn stamps(&self, set: u32, image: u32) -> PathBuf {
-        self.root.join(fill(STAMPS, set, image))
+        match self.layout.great3 {
+            Some(_) => great3::galaxy_catalogue(&self.root, set),
+            None => self.root.join(fill(STAMPS, set, image)),
+        }
     }
 
     pub fn truth(&self, set: u32) -> PathBuf {
@@ -227,9 +247,11 @@ impl DataFolder {
 
     /// Sets that have a file of true shear. If one file serves all sets, these are the sets that have images.
     pub fn sets_with_truth(&self) -> Result<Vec<u32>, FileError> {
-        let [plain, padded] = IMAGE_PLACEHOLDERS;
-        let pattern = &self.layout.truth.replace(padded, "000").replace(plain, "0");
-        let truths = listing::find(&self.root, pattern, &[""], &[])?;
+        let mut pattern = self.layout.truth.clone();
+        for form in IMAGE_PLACEHOLDERS {
+            pattern = pattern.replace(form, &fill(form, 0, 0));
+        }
+        let truths = listing::find(&self.root, &pattern, &[""], &[])?;
         // The pattern has no {set}: one file may be the truth of a million sets.
         if truths.serve_all_sets() {
             return Ok(self.images(&[])?.sets());

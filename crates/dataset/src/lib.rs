@@ -4,6 +4,7 @@
 #![forbid(unsafe_code)]
 
 pub mod fingerprint;
+pub mod great3;
 pub mod grid;
 pub mod images;
 pub mod layout;

@@ -68,7 +68,7 @@ impl Files {
     pub fn sets(&self) -> Vec<u32> {
         if self.serve_all_sets() {
             // The files do not limit the sets; those with images do.
-            return (1..=MAX_SET).collect();
+            return (0..=MAX_SET).collect();
         }
         self.by_set.keys().copied().flatten().collect()
     }
@@ -282,18 +282,13 @@ fn expected(pattern: &[Piece<'_>], runs: &[&str]) -> String {
                 name.push_str(text);
                 next += digits(text).len();
             }
-            Piece::Number { of_set, padded } => {
-                let (most, width) = match of_set {
-                    true => (MAX_SET, 2),
-                    false => (MAX_IMAGE, 3),
-                };
+            Piece::Number { of_set, digits } => {
+                let most = most(of_set);
                 let run = runs.get(next).filter(|_| fits);
                 let number = run.and_then(|run| run.parse::<u32>().ok());
-                let number = number.filter(|number| (1..=most).contains(number));
-                match (number, padded) {
-                    (Some(number), true) => name.push_str(&format!("{number:0width$}")),
-                    (Some(number), false) => name.push_str(&number.to_string()),
-                    (None, _) => name.push_str(&format!("{{1 to {most}}}")),
+                match number.filter(|number| *number <= most) {
+                    Some(number) => name.push_str(&format!("{number:0digits$}")),
+                    None => name.push_str(&format!("{{0 to {most}}}")),
                 }
                 next += 1;
             }
@@ -381,7 +376,18 @@ fn names(folder: &Path) -> Result<Vec<String>, FileError> {
 #[derive(Debug, Clone, Copy)]
 enum Piece<'a> {
     Text(&'a str),
-    Number { of_set: bool, padded: bool },
+    Number {
+        of_set: bool,
+        /// Zeros fill so many digits, and no more.
+        digits: usize,
+    },
+}
+
+fn most(of_set: bool) -> u32 {
+    match of_set {
+        true => MAX_SET,
+        false => MAX_IMAGE,
+    }
 }
 
 fn pieces(pattern: &OsStr) -> Vec<Piece<'_>> {
@@ -393,17 +399,17 @@ fn pieces(pattern: &OsStr) -> Vec<Piece<'_>> {
         let next = [SET_PLACEHOLDERS, IMAGE_PLACEHOLDERS]
             .into_iter()
             .zip([true, false])
-            .flat_map(|([plain, padded], of_set)| [(plain, of_set, false), (padded, of_set, true)])
-            .filter_map(|(name, of_set, padded)| Some((rest.find(name)?, name, of_set, padded)))
+            .flat_map(|(forms, of_set)| forms.into_iter().zip(1..).map(move |form| (form, of_set)))
+            .filter_map(|((form, digits), of_set)| Some((rest.find(form)?, form, of_set, digits)))
             .min_by_key(|(at, ..)| *at);
-        let Some((at, name, of_set, padded)) = next else {
+        let Some((at, name, of_set, digits)) = next else {
             found.push(Piece::Text(rest));
             break;
         };
         if at > 0 {
             found.push(Piece::Text(&rest[..at]));
         }
-        found.push(Piece::Number { of_set, padded });
+        found.push(Piece::Number { of_set, digits });
         rest = &rest[at + name.len()..];
     }
     found
@@ -418,29 +424,21 @@ fn matches(pattern: &[Piece<'_>], name: &str, known: Numbers) -> Vec<Numbers> {
             Vec::new()
         };
     };
-    let (of_set, padded) = match *piece {
+    let (of_set, zeros) = match *piece {
         Piece::Text(text) => {
             let end = name.strip_prefix(text);
             return end.map_or_else(Vec::new, |end| matches(rest, end, known));
         }
-        Piece::Number { of_set, padded } => (of_set, padded),
+        Piece::Number { of_set, digits } => (of_set, digits),
     };
-    let (most, before) = match of_set {
-        true => (MAX_SET, known.set),
-        false => (MAX_IMAGE, known.image),
-    };
+    let most = most(of_set);
+    let before = if of_set { known.set } else { known.image };
     let width = most.to_string().len();
     let digits = name.bytes().take_while(u8::is_ascii_digit).take(width);
-    // Leading zeros fill two digits of a set and three of an image, and no more.
-    let zeros = match (padded, of_set) {
-        (false, _) => 1,
-        (true, true) => 2,
-        (true, false) => 3,
-    };
     (1..=digits.count())
         .filter(|length| *length == zeros || *length > zeros && !name.starts_with('0'))
         .filter_map(|length| Some((name[..length].parse().ok()?, &name[length..])))
-        .filter(|(number, _)| (1..=most).contains(number))
+        .filter(|(number, _)| *number <= most)
         .filter(|(number, _)| before.is_none_or(|before| before == *number))
         .flat_map(|(number, end)| {
             let numbers = match of_set {
@@ -487,11 +485,14 @@ mod tests {
             [both(1, 12), both(11, 2)].concat()
         );
         assert_eq!(numbers("{set}-{image}-{set}", "3-4-3"), both(3, 4));
+        assert_eq!(
+            numbers("image-{set:03}-{image}.fits", "image-000-0.fits"),
+            both(0, 0)
+        );
         for (pattern, name) in [
             ("set{set:02}", "set7"),
             ("set{set:02}", "set007"),
             ("set{set}", "set07"),
-            ("set{set}", "set0"),
             ("set{set}", "set10000"),
             ("g-{image}.fits", "g-1000000.fits"),
             ("g-{image:03}.fits", "g-0001.fits"),

@@ -13,6 +13,9 @@ pub const WARNINGS: &str = "warnings";
 /// Key of the effect of the noise of an image's star on its mean shear: the standard deviations of m and c.
 // Keys have at most eight characters, the limit of FITS.
 pub const PSF_NOISE: &str = "psfnoise";
+/// Key of the measurement noise of e1 and e2 of a galaxy, of galaxies in pairs that are rotated by 90°: their mean shear has no
+/// shape noise.
+pub const E_NOISE: &str = "enoise";
 /// Key of the frame of ellipticities: `sky`, or pixel axes that are not the sky's: position angle of +y in degrees, parity (−1
 /// for mirrored), and both components of the shear.
 pub const FRAME: &str = "frame";
@@ -24,7 +27,7 @@ pub const RESPONSE: &str = "response";
 /// Value of [`RESPONSE`] of measured catalogues.
 pub const NOT_APPLIED: &str = "not applied";
 /// All keys beside fingerprints.
-pub const KEYS: [&str; 11] = [
+pub const KEYS: [&str; 12] = [
     "creator",
     "submiss",
     "elltype",
@@ -32,6 +35,7 @@ pub const KEYS: [&str; 11] = [
     "image",
     "settings",
     PSF_NOISE,
+    E_NOISE,
     WARNINGS,
     FRAME,
     FIRST_PIXEL,

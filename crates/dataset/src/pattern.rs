@@ -3,22 +3,24 @@
 pub const MAX_SET: u32 = 9_999;
 pub const MAX_IMAGE: u32 = 999_999;
 
-pub(crate) const SET_PLACEHOLDERS: [&str; 2] = ["{set}", "{set:02}"];
-pub const IMAGE_PLACEHOLDERS: [&str; 2] = ["{image}", "{image:03}"];
-pub(crate) const PLACEHOLDERS: [[&str; 2]; 2] = [SET_PLACEHOLDERS, IMAGE_PLACEHOLDERS];
+/// The forms of a number: at least as many digits as their place, from 1.
+// The files of GREAT10 are not padded, those of shearq have 2 and 3 digits, subfields of GREAT3 have 3.
+pub(crate) const SET_PLACEHOLDERS: [&str; 3] = ["{set}", "{set:02}", "{set:03}"];
+pub const IMAGE_PLACEHOLDERS: [&str; 3] = ["{image}", "{image:02}", "{image:03}"];
+pub(crate) const PLACEHOLDERS: [[&str; 3]; 2] = [SET_PLACEHOLDERS, IMAGE_PLACEHOLDERS];
 
 pub fn fill(pattern: &str, set: u32, image: u32) -> String {
-    let [[set_plain, set_padded], [image_plain, image_padded]] = PLACEHOLDERS;
-    pattern
-        // Any of the two forms, because the files of GREAT10 are not padded and those of shearq are.
-        .replace(set_padded, &format!("{set:02}"))
-        .replace(image_padded, &format!("{image:03}"))
-        .replace(set_plain, &set.to_string())
-        .replace(image_plain, &image.to_string())
+    let mut filled = pattern.to_owned();
+    for (forms, number) in PLACEHOLDERS.into_iter().zip([set, image]) {
+        for (form, digits) in forms.into_iter().zip(1..) {
+            filled = filled.replace(form, &format!("{number:0digits$}"));
+        }
+    }
+    filled
 }
 
 /// Checks that the pattern of `key` has a placeholder of each kind in `needed`, and no other braces.
-pub fn check_pattern(key: &str, pattern: &str, needed: &[[&str; 2]]) -> Result<(), String> {
+pub fn check_pattern(key: &str, pattern: &str, needed: &[[&str; 3]]) -> Result<(), String> {
     for one_of in needed {
         if !one_of.iter().any(|name| pattern.contains(name)) {
             return Err(format!(
@@ -50,6 +52,10 @@ mod tests {
         assert_eq!(
             fill("g10_v1_objs_{set}_{image}.me.dat", 7, 12),
             "g10_v1_objs_7_12.me.dat"
+        );
+        assert_eq!(
+            fill("image-{set:03}-{image}.fits", 7, 0),
+            "image-007-0.fits"
         );
     }
 }

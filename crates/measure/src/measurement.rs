@@ -64,6 +64,9 @@ pub struct Measurement {
     /// measured, and in images of a configuration without calibration. Only means over many galaxies are unbiased: the mean contribution of sheared noise is
     /// subtracted from one galaxy in eight, for all.
     pub response: Option<ResponseMatrix>,
+    /// Variances of e1 and e2 by the noise of the pixels, to first order. They are determined for one galaxy in eight, with eight
+    /// times the weight, and zero for the others: only means enter. Zero for the network.
+    pub e_variance: [f64; 2],
     /// Flux and size before the PSF, with their responses; `None` for the network and for galaxies that could not be measured.
     pub observables: Option<Observables>,
     /// The galaxy under small shears, if the configuration requests sheared catalogues.
@@ -97,6 +100,7 @@ impl Measurement {
             e2: f64::NAN,
             flags: flag.into(),
             response: None,
+            e_variance: [0.0; 2],
             observables: None,
             sheared: None,
             descent: None,

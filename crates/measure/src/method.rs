@@ -310,6 +310,7 @@ impl Found {
             // its trace. The rest is noise that averages need not have: R11 and R22 correlate with −0.43, and with the mean of
             // both the error of m is 1.5 times smaller. Sheared catalogues may be cut by e, and need all of R.
             response: response.map(|[[r11, _], [_, r22]]| isotropic(0.5 * (r11 + r22))),
+            e_variance: self.e_variance(kind),
             observables,
             sheared: pair.and_then(|(observables, response)| {
                 self.sheared_catalogues(kind, e, response, observables)
@@ -338,6 +339,17 @@ impl Found {
             }
         }
         Ok((e, response))
+    }
+
+    /// Variances of an ellipticity of type `kind` by noise, of the galaxies that they are determined for.
+    fn e_variance(&self, kind: EllipticityType) -> [f64; 2] {
+        let (Ok(chi), Some(noise)) = (self.distortion, &self.noise_moments) else {
+            return [0.0; 2];
+        };
+        // Products of χ₁ and χ₂ in noise as it is.
+        let [p11, p12, p22] = [0, 1, 4].map(|pair: usize| noise.products[pair][3]);
+        response_of_type(kind, chi, [[1.0, 0.0], [0.0, 1.0]])
+            .map(|[a, b]| a * a * p11 + 2.0 * a * b * p12 + b * b * p22)
     }
 
     /// Flux and size with their couplings to an ellipticity of type `kind`.

@@ -399,6 +399,9 @@ pub struct Batch {
     /// The mean response of e1 to γ1 and of e2 to γ2 of the galaxies without a flag; `None` if the configuration asks for no
     /// calibration. The mean shear of many images is the sum of their ellipticities over that of their responses.
     pub response: Option<[f64; 2]>,
+    /// Root mean square of the measurement noise of e1 and e2 of the galaxies without a flag, before division by the response; zero
+    /// for the network. Their scatter contains the intrinsic shapes, too.
+    pub e_noise: [f64; 2],
     /// What is wrong with the stamps and PSFs.
     pub warnings: Vec<Warning>,
     /// Standard deviations of m and c of the image by the noise of the star that all of its galaxies share. `None` if
@@ -494,19 +497,18 @@ impl<'n> Session<'n> {
         Ok(session)
     }
 
-    /// The image with those of further epochs: galaxy k is on stamp k of each. Several [`RowJob`]s make a row then
-    /// ([`RowJob::with_epochs`]).
+    /// The image with those of further epochs: galaxy k is on stamp k of each. [`Session::read_epochs`] reads a row then.
     ///
     /// # Errors
     /// If the images have other numbers of stamps, or other frames.
-    pub fn with_epochs(mut self, epochs: Vec<Arc<Session<'n>>>) -> Result<Self, MeasureError> {
+    pub fn with_epochs(mut self, epochs: Vec<Session<'n>>) -> Result<Self, MeasureError> {
         for epoch in &epochs {
             length("stamps of an epoch", epoch.rows.count, self.rows.count)?;
             if epoch.frame != self.frame {
                 return Err(EpochError::Frames.into());
             }
         }
-        self.epochs = epochs;
+        self.epochs = epochs.into_iter().map(Arc::new).collect();
         Ok(self)
     }
 
@@ -607,6 +609,23 @@ impl<'n> Session<'n> {
             offsets: source.offsets(row)?,
             epochs: Vec::new(),
         })
+    }
+
+    /// Reads a row of the image from `first`, and of its further epochs from `others`, in the order of [`Session::with_epochs`].
+    ///
+    /// # Errors
+    /// If it cannot be read.
+    pub fn read_epochs<S: StampSource<'n>>(
+        self: &Arc<Self>,
+        first: &mut S,
+        others: &mut [S],
+        row: usize,
+    ) -> Result<RowJob<'n>, S::Error> {
+        let mut job = self.read(first, row)?;
+        let others = others.iter_mut().zip(&self.epochs);
+        let epochs = others.map(|(source, session)| session.read(source, row));
+        job.epochs = epochs.collect::<Result<_, _>>()?;
+        Ok(job)
     }
 
     /// Measures the stamps of a row, before calibration, with one Jacobian per stamp in the frame of the sky.
@@ -755,13 +774,6 @@ impl<'n> Session<'n> {
 }
 
 impl<'n> RowJob<'n> {
-    /// The row with the rows of the images of further epochs, in the order of [`Session::with_epochs`].
-    #[must_use]
-    pub fn with_epochs(mut self, epochs: Vec<RowJob<'n>>) -> Self {
-        self.epochs = epochs;
-        self
-    }
-
     /// The galaxies of the row before calibration.
     ///
     /// # Errors
@@ -932,9 +944,14 @@ impl MeasuredImage<'_> {
         {
             warnings.push(Warning::NoResponse { response });
         }
+        let good = galaxies.iter().filter(|galaxy| galaxy.flags.is_empty());
+        let count = good.clone().count().max(1) as f64;
+        let variance = |k: usize| good.clone().map(|galaxy| galaxy.e_variance[k]).sum::<f64>();
+        let e_noise = [0, 1].map(|k| (variance(k) / count).sqrt());
         Batch {
             galaxies,
             response: response.map(|(response, _)| response),
+            e_noise,
             warnings,
             psf_noise,
             frame: session.frame,

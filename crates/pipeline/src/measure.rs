@@ -259,8 +259,7 @@ impl FolderMeasurement<'_> {
             sessions.push(source.session(measurer, feeder.ahead())?);
         }
         let first = sessions.remove(0);
-        let others: Vec<_> = sessions.into_iter().map(Arc::new).collect();
-        let first = Arc::new(first.with_epochs(others.clone())?);
+        let first = Arc::new(first.with_epochs(sessions)?);
         let mosaic = sources[0].image.mosaic();
         let head = Arc::new(ImageHead {
             id: ids[0],
@@ -270,16 +269,13 @@ impl FolderMeasurement<'_> {
             aligned: sources.iter().all(|source| source.image.is_aligned()),
             prints,
         });
+        let Some((own, others)) = sources.split_first_mut() else {
+            return Ok(true);
+        };
         for row in 0..mosaic.rows() {
-            let jobs = sources
-                .iter_mut()
-                .zip(std::iter::once(&first).chain(&others));
-            let jobs = jobs.map(|(source, session)| session.read(source, row));
-            let mut jobs = jobs.collect::<Result<Vec<_>, _>>()?;
-            let own = jobs.remove(0);
             let row = ImageRow {
                 head: Arc::clone(&head),
-                jobs: vec![own.with_epochs(jobs)],
+                jobs: vec![first.read_epochs(own, others, row)?],
             };
             if !feeder.push(row) {
                 return Ok(false);

@@ -4,6 +4,7 @@
 
 use std::path::Path;
 
+use shearq_dataset::great3::GalaxyCatalogue;
 use shearq_dataset::mosaic::Mosaic;
 use shearq_files::FileError;
 use shearq_files::atomic;
@@ -94,6 +95,16 @@ impl StampTable {
                 .transpose()?,
         };
         Ok(Some(StampTable { head, columns }))
+    }
+
+    /// The table of a subfield of GREAT3: identities alone, because each stamp is where its galaxy is.
+    pub(crate) fn of_great3(path: &Path, mosaic: &Mosaic) -> Result<Self, FileError> {
+        let ids = GalaxyCatalogue::read(path)?.identities(mosaic)?;
+        let head = Head {
+            first_pixel: 1,
+            ..Head::default()
+        };
+        table(path, head, vec![Column::new(ID.into(), ids)])
     }
 
     /// One Jacobian per stamp, if shapes are measured on the sky.

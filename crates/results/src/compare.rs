@@ -119,7 +119,7 @@ pub fn score_all(
         return Err(ScoreError::NoCatalogueOf(empty.name.clone()));
     }
     let common = |set: u32| all.iter().all(|own| !own.files.of_set(set).is_empty());
-    if !(1..=MAX_SET).any(common) {
+    if !(0..=MAX_SET).any(common) {
         return Err(ScoreError::NoCommonSet);
     }
     let variants = all.iter().map(|own| (own, choice.unwrap_or(own.choice())));

@@ -99,10 +99,19 @@ pub trait Branch {
     fn leaderboard_source(&self) -> Option<&'static str>;
 }
 
+/// Where the galaxies of a branch are.
+#[derive(Debug, Clone, Copy)]
+pub enum Catalogues<'a> {
+    /// In tables with a shear for each galaxy.
+    Files(&'a [PathBuf]),
+    /// In a folder of catalogues that `measure` wrote, whose ellipticities are divided by the mean response of their set.
+    Measured(&'a Path),
+}
+
 /// Catalogues of a branch, and how they are summarised.
 #[derive(Debug, Clone)]
 pub struct Packing<'a> {
-    pub catalogues: &'a [PathBuf],
+    pub catalogues: Catalogues<'a>,
     /// Subfields of the branch: 200 unless it is simulated.
     pub subfields: usize,
     /// Galaxies per side of a subfield: 100 unless it is simulated.

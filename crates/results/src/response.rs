@@ -136,8 +136,11 @@ pub struct Shears {
 struct Image {
     path: PathBuf,
     place: (u32, u32),
-    group: (usize, u32, u32),
+    group: Group,
 }
+
+// The galaxies that share a response: of a folder, of a set of it, or of an image of it; all if there is no set.
+type Group = (usize, Option<u32>, Option<u32>);
 
 #[derive(Default)]
 struct Sum {
@@ -145,7 +148,7 @@ struct Sum {
     weight: RunningMean,
 }
 
-/// The shears of the catalogues of the folders `measured`: g = ⟨R⟩⁻¹ e, with the mean response of the galaxies that share one.
+/// The shears of the catalogues of `sets` (of all if empty) in the folders `measured`: g = ⟨R⟩⁻¹ e, with the mean response of the galaxies that share one.
 /// Ellipticities of a selection are divided by their weights, so that the weighted mean of g is the mean shear.
 ///
 /// The table has the columns of the catalogues that were not measured on the stamps (identifiers, positions, carried ones), the
@@ -157,6 +160,7 @@ struct Sum {
 /// columns, or a mean response is not positive by three standard errors.
 pub fn shears(
     measured: &[PathBuf],
+    sets: &[u32],
     shared: Shared,
     treecorr: Option<Position>,
 ) -> Result<Shears, FileError> {
@@ -172,8 +176,8 @@ pub fn shears(
             );
             return Err(FileError::new(out, message));
         }
-        let files = run.catalogues(out, &[])?;
-        for set in files.wanted(&[]) {
+        let files = run.catalogues(out, sets)?;
+        for set in files.wanted(sets) {
             for (image, path) in files.of_set(set) {
                 let keys = [FRAME, FIRST_PIXEL, "creator", "submiss", "elltype"].map(str::to_owned);
                 let stated = table::read_metadata(&path, run.format, keys.iter())?;
@@ -184,9 +188,9 @@ pub fn shears(
                     metadata = stated;
                 }
                 let group = match shared {
-                    Shared::Survey => (0, 0, 0),
-                    Shared::Set => (folder, set, 0),
-                    Shared::Image => (folder, set, image),
+                    Shared::Survey => (0, None, None),
+                    Shared::Set => (folder, Some(set), None),
+                    Shared::Image => (folder, Some(set), Some(image)),
                 };
                 sums.entry(group).or_default().add_catalogue(&path)?;
                 let place = (set, image);
@@ -360,7 +364,7 @@ impl Sum {
         Ok(())
     }
 
-    fn response(&self, (folder, set, image): (usize, u32, u32)) -> SharedResponse {
+    fn response(&self, (folder, set, image): Group) -> SharedResponse {
         // Responses of a selection contain its weights.
         let (weight, count) = (self.weight.mean(), self.weight.count());
         let folder = match folder {
@@ -369,9 +373,9 @@ impl Sum {
         };
         SharedResponse {
             of: match (set, image) {
-                (0, _) => "survey".into(),
-                (set, 0) => format!("{folder}set {set:02}"),
-                (set, image) => format!("{folder}set {set:02} image {image:03}"),
+                (None, _) => "survey".into(),
+                (Some(set), None) => format!("{folder}set {set:02}"),
+                (Some(set), Some(image)) => format!("{folder}set {set:02} image {image:03}"),
             },
             galaxies: count,
             mean: self.responses.map(|own| own.mean() / weight),

@@ -374,7 +374,7 @@ fn sets_to_score(
         return Err(ScoreError::NoCatalogue { set: Some(*set) });
     }
     let asked = |set: &u32| wanted.is_empty() || wanted.contains(set);
-    let sets: Vec<u32> = (1..=MAX_SET).filter(asked).filter(complete).collect();
+    let sets: Vec<u32> = (0..=MAX_SET).filter(asked).filter(complete).collect();
     match sets.is_empty() {
         true => Err(ScoreError::NoCatalogue { set: None }),
         false => Ok(sets),

@@ -60,6 +60,39 @@ impl Star {
     }
 }
 
+impl Star {
+    /// The mean of several stars of one PSF, of equal weight, each shifted to the centroid of the first.
+    ///
+    /// # Errors
+    /// If there is no star, stamps differ in size, have pixels that are not finite, or no light.
+    pub fn stack<'a, P: Pixel + 'a>(
+        stamps: impl IntoIterator<Item = ArrayView2<'a, P>>,
+    ) -> Result<Array2<f64>, MeasureError> {
+        let mut stack: Option<([f64; 2], Array2<f64>)> = None;
+        for stamp in stamps {
+            let light = sum(stamp);
+            let offset = star_offset(stamp, brightest_pixel(stamp)?);
+            if !(light > 0.0 && light.is_finite()) {
+                return Err(MeasureError::DarkPsf(light));
+            }
+            let star = stamp.mapv(|value| Into::<f64>::into(value) / light);
+            let Some((first, sum)) = &mut stack else {
+                stack = Some((offset, star));
+                continue;
+            };
+            if sum.dim() != star.dim() {
+                let expected = format!("{} × {}, as the first", sum.ncols(), sum.nrows());
+                return Err(MeasureError::square("a star", star.dim(), expected));
+            }
+            let (rows, columns) = star.dim();
+            let along_y = fourier_shift(rows, rows, offset[1] - first[1]);
+            let along_x = fourier_shift(columns, columns, offset[0] - first[0]);
+            *sum += &along_y.dot(&star).dot(&along_x.t());
+        }
+        stack.map_or(Err(MeasureError::DarkPsf(0.0)), |(_, stack)| Ok(stack))
+    }
+}
+
 fn cut_around_star<P: Pixel>(stamp: ArrayView2<'_, P>, cut: PsfCut) -> Result<Star, MeasureError> {
     let (rows, columns) = stamp.dim();
     let size = cut.least;
@@ -323,6 +356,29 @@ mod tests {
             assert!((found - expected).abs() < 1e-12, "{given}");
         }
         assert!(Star::cut(stamp.slice(s![..31, ..31]), limits).is_err());
+    }
+
+    #[test]
+    fn stacked_stars_are_at_the_place_of_the_first() {
+        let psf = moffat(3.4);
+        let star = psf.stamp(48);
+        let moved = |dx: f64, dy: f64| {
+            let along = |offset: f64| fourier_shift(48, 48, -offset);
+            3.0 * along(dy).dot(&star).dot(&along(dx).t())
+        };
+        let others = [moved(0.4, -0.9), moved(-0.25, 0.1)];
+        let all = [star.view(), others[0].view(), others[1].view()];
+        let stack = Star::stack(all).unwrap() / 3.0;
+        let light = star.sum();
+        for (found, expected) in stack.iter().zip(&star) {
+            // Centroids are found to 10⁻³ px.
+            assert!(
+                (found - expected / light).abs() < 1e-4,
+                "{found} {expected}"
+            );
+        }
+        assert!(Star::stack([star.view(), star.slice(s![1.., 1..])]).is_err());
+        assert!(Star::stack(std::iter::empty::<ArrayView2<'_, f64>>()).is_err());
     }
 
     #[test]

@@ -17,7 +17,7 @@ use super::ImageHead;
 use crate::PipelineError;
 use shearq_dataset::images::ImageId;
 use shearq_dataset::metadata::{
-    FIRST_PIXEL, FRAME, NOT_APPLIED, PSF_NOISE, RESPONSE, WARNINGS, frame_entry,
+    E_NOISE, FIRST_PIXEL, FRAME, NOT_APPLIED, PSF_NOISE, RESPONSE, WARNINGS, frame_entry,
 };
 use shearq_dataset::record::{Claim, claim};
 use shearq_dataset::run::{RUN_FILE, Run};
@@ -248,6 +248,7 @@ pub(crate) struct Catalogues<'a> {
     run: &'a Run,
     out: &'a Path,
     images: &'a [ImageId],
+    rotated_pairs: bool,
     claim: Claim,
     pub(crate) todo: Vec<ImageId>,
     pub(crate) done: Vec<ImageId>,
@@ -263,6 +264,7 @@ impl<'a> Catalogues<'a> {
     ) -> Result<Self, FileError> {
         let claim = claim(&out.join(RUN_FILE), run)?;
         let (todo, done) = to_do(run, out, images);
+        let great3 = run.source.layout().great3;
         let summary = Summary {
             already: done.len(),
             ..Summary::default()
@@ -271,6 +273,7 @@ impl<'a> Catalogues<'a> {
             run,
             out,
             images,
+            rotated_pairs: great3.is_some_and(|branch| branch.rotated_pairs),
             claim,
             todo,
             done,
@@ -316,6 +319,10 @@ impl<'a> Catalogues<'a> {
         }
         if let Some([m, c]) = batch.psf_noise {
             metadata.insert(PSF_NOISE.into(), format!("{m:.2e} {c:.2e}"));
+        }
+        let [e1, e2] = batch.e_noise;
+        if self.rotated_pairs && e1 > 0.0 && e2 > 0.0 {
+            metadata.insert(E_NOISE.into(), format!("{e1:.3e} {e2:.3e}"));
         }
         table::write(&path, self.run.format, &table, &metadata)?;
         self.summary.on_sky += usize::from(batch.frame == Frame::Sky);

@@ -3,21 +3,19 @@
 use std::collections::HashMap;
 use std::path::Path;
 
-use ndarray::{Array3, Ix3};
+use shearq_dataset::great3;
 use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::DataFolder;
 use shearq_dataset::mosaic::Mosaic;
 use shearq_files::FileError;
-use shearq_files::fits::ImageReader;
 use shearq_files::table::numbers;
 use shearq_measure::{
-    FunctionalPsf, KnownNoise, Lazy, LazyStamps, Measurer, Pixels, Psfs, Session, StampRows,
-    StampSource, Threads, Warning,
+    KnownNoise, Lazy, LazyStamps, Measurer, Psfs, Session, StampRows, StampSource, Threads, Warning,
 };
 use shearq_quantities::Jacobian;
 use shearq_submissions::Configuration;
 
-use super::source::{ImageSource, PsfSource};
+use super::source::{ImageSource, squares};
 use crate::PipelineError;
 use crate::gather::off_middle;
 use crate::stamp_table::{ID, PLACE, StampTable};
@@ -52,12 +50,14 @@ pub(super) fn open(
             None => (0..mosaic.galaxies).map(Some).collect(),
             Some((of, first)) => first.find_in(*of, &galaxies, &path)?,
         };
-        let offsets = image
-            .table
-            .as_ref()
-            .map(|table| offsets(table, &path, mosaic.stamp))
-            .transpose()?
-            .flatten();
+        let offsets = match (data.layout().great3, &image.table) {
+            (Some(_), _) => Some(vec![
+                great3::dither(data, id.set, id.image)?;
+                mosaic.galaxies
+            ]),
+            (None, Some(table)) => offsets(table, &path, mosaic.stamp)?,
+            (None, None) => None,
+        };
         let mosaic = sources.first().map_or(mosaic, |first| first.image.mosaic());
         sources.push(EpochSource {
             rows: StampRows {
@@ -265,26 +265,6 @@ impl EpochSource {
     }
 }
 
-/// Squares of a mosaic of stamps, `missing` for those that are not there.
-fn squares(
-    image: &mut ImageReader,
-    (columns, side): (usize, usize),
-    tiles: &[Option<usize>],
-    missing: f64,
-) -> Result<Pixels<'static, Ix3>, FileError> {
-    let mut all = Array3::from_elem((tiles.len(), side, side), missing);
-    for (tile, mut square) in tiles.iter().zip(all.outer_iter_mut()) {
-        let Some(tile) = tile else { continue };
-        let corner = [tile % columns, tile / columns].map(|at| (at * side) as i64);
-        let pixels = image.read_square::<f64>(corner[0], corner[1], side)?;
-        square
-            .iter_mut()
-            .zip(pixels)
-            .for_each(|(to, from)| *to = from);
-    }
-    Ok(Pixels::from(all))
-}
-
 impl StampSource<'static> for EpochSource {
     type Error = PipelineError;
 
@@ -311,17 +291,7 @@ impl StampSource<'static> for EpochSource {
         }
         let columns = self.image.mosaic().columns;
         let tiles = self.tiles[self.rows.stamps(row)].to_vec();
-        let psfs = match &mut self.image.psfs {
-            PsfSource::Shared(psf) => Psfs::Prepared(psf.clone()),
-            PsfSource::Stars { image, side } => {
-                Psfs::Stars(squares(image, (columns, *side), &tiles, 0.0)?)
-            }
-            PsfSource::Functional(field) => {
-                let of = |tile: &Option<usize>| -> FunctionalPsf { field[tile.unwrap_or(0)] };
-                Psfs::functional(tiles.iter().map(of).collect::<Vec<_>>())
-            }
-        };
-        Ok(psfs.into())
+        Ok(self.image.psfs.of_tiles(columns, &tiles)?.into())
     }
 
     fn jacobians(&mut self, row: usize) -> Result<Option<Vec<Jacobian>>, PipelineError> {

@@ -3,7 +3,7 @@
 use std::fmt;
 use std::path::{Path, PathBuf};
 
-use ndarray::{ArcArray2, ArrayView2, Ix3};
+use ndarray::{ArcArray2, Array3, ArrayView2, Axis, Ix3, Slice};
 use shearq_files::FileError;
 use shearq_files::fits::ImageReader;
 use shearq_measure::{
@@ -16,9 +16,10 @@ use shearq_submissions::{Configuration, NoiseSource, PsfCut, PsfForm};
 use crate::PipelineError;
 use crate::stamp_table::StampTable;
 use crate::wcs::Wcs;
+use shearq_dataset::great3::{self, GalaxyCatalogue};
 use shearq_dataset::grid::{self, whole};
 use shearq_dataset::images::ImageId;
-use shearq_dataset::layout::{DataFolder, MAX_STAMP};
+use shearq_dataset::layout::{DataFolder, Layout, MAX_STAMP, fill};
 use shearq_dataset::mosaic::Mosaic;
 use shearq_dataset::psf_table;
 
@@ -63,7 +64,10 @@ impl ImageSource {
             return Err(FileError::new(path, too_small(stamp, configuration)).into());
         }
         let stamps = data.stamps(id.set, id.image);
-        let table = StampTable::read(&stamps, &mosaic)?;
+        let table = match data.layout().great3 {
+            Some(_) => Some(StampTable::of_great3(&stamps, &mosaic)?),
+            None => StampTable::read(&stamps, &mosaic)?,
+        };
         let jacobians = match &table {
             Some(table) => table.jacobians(&stamps)?,
             None => None,
@@ -238,6 +242,11 @@ pub(super) enum PsfSource {
         image: Box<ImageReader>,
         side: usize,
     },
+    /// A plane per galaxy, whose number each stamp has.
+    Cube {
+        image: Box<ImageReader>,
+        planes: Vec<usize>,
+    },
     Functional(Vec<FunctionalPsf>),
 }
 
@@ -246,12 +255,66 @@ impl PsfSource {
         Ok(match self {
             PsfSource::Shared(psf) => Psfs::Prepared(psf.clone()),
             PsfSource::Stars { image, side } => Psfs::Stars(read_row(image, mosaic, *side, row)?),
-            PsfSource::Functional(field) => {
+            PsfSource::Cube { .. } | PsfSource::Functional(_) => {
                 let first = row * mosaic.columns;
-                Psfs::functional(field[first..first + mosaic.of_row(row)].to_vec())
+                let tiles: Vec<_> = (first..first + mosaic.of_row(row)).map(Some).collect();
+                self.of_tiles(mosaic.columns, &tiles)?
             }
         })
     }
+
+    /// PSFs of these stamps, of rows of `columns`; any of a galaxy without a stamp.
+    pub(super) fn of_tiles(
+        &mut self,
+        columns: usize,
+        tiles: &[Option<usize>],
+    ) -> Result<Psfs<'static>, FileError> {
+        Ok(match self {
+            PsfSource::Shared(psf) => Psfs::Prepared(psf.clone()),
+            PsfSource::Stars { image, side } => {
+                Psfs::Stars(squares(image, (columns, *side), tiles, 0.0)?)
+            }
+            PsfSource::Cube { image, planes } => {
+                let side = image.width();
+                let mut all = Array3::zeros((tiles.len(), side, side));
+                for (tile, mut square) in tiles.iter().zip(all.outer_iter_mut()) {
+                    let Some(tile) = tile else { continue };
+                    image.rewind();
+                    image.skip_rows(planes[*tile] * side);
+                    let pixels = image.read_rows_as::<f64>(side)?;
+                    square
+                        .iter_mut()
+                        .zip(pixels)
+                        .for_each(|(to, from)| *to = from);
+                }
+                Psfs::Stars(Pixels::from(all))
+            }
+            PsfSource::Functional(field) => {
+                let of = |tile: &Option<usize>| -> FunctionalPsf { field[tile.unwrap_or(0)] };
+                Psfs::functional(tiles.iter().map(of).collect::<Vec<_>>())
+            }
+        })
+    }
+}
+
+/// Squares of a mosaic of stamps, `missing` for those that are not there.
+pub(super) fn squares(
+    image: &mut ImageReader,
+    (columns, side): (usize, usize),
+    tiles: &[Option<usize>],
+    missing: f64,
+) -> Result<Pixels<'static, Ix3>, FileError> {
+    let mut all = Array3::from_elem((tiles.len(), side, side), missing);
+    for (tile, mut square) in tiles.iter().zip(all.outer_iter_mut()) {
+        let Some(tile) = tile else { continue };
+        let corner = [tile % columns, tile / columns].map(|at| (at * side) as i64);
+        let pixels = image.read_square::<f64>(corner[0], corner[1], side)?;
+        square
+            .iter_mut()
+            .zip(pixels)
+            .for_each(|(to, from)| *to = from);
+    }
+    Ok(Pixels::from(all))
 }
 
 struct OpenPsfs {
@@ -280,8 +343,114 @@ fn open_psfs(
                 stated: None,
             })
         }
-        PsfForm::Star => open_stars(&data.psf_star(id.set, id.image), cut, mosaic),
+        PsfForm::Star => {
+            let path = data.psf_star(id.set, id.image);
+            match data.layout() {
+                Layout { great3: None, .. } => open_stars(&path, cut, mosaic),
+                layout if layout.psf_star == great3::PSF_IMAGES => {
+                    open_interpolated(data, id, &path, cut, mosaic)
+                }
+                _ => open_star_field(data, id, &path, cut),
+            }
+        }
     }
+}
+
+// PSFs that another program interpolated to the galaxies of GREAT3: a mosaic as the galaxies', or a cube in the order of their
+// catalogue.
+fn open_interpolated(
+    data: &DataFolder,
+    id: ImageId,
+    path: &Path,
+    cut: PsfCut,
+    mosaic: &Mosaic,
+) -> Result<OpenPsfs, FileError> {
+    let image = ImageReader::open_stack(path)?;
+    let (side, planes) = (image.width(), image.planes());
+    if planes == 1 {
+        return open_stars(path, cut, mosaic);
+    }
+    if image.height() != side
+        || planes != mosaic.galaxies
+        || !(cut.least..=MAX_STAMP).contains(&side)
+    {
+        let message = format!(
+            "the cube has {planes} planes of {side} × {} pixels; expected {}, one per galaxy, of squares of {} to {MAX_STAMP} pixels a side",
+            image.height(),
+            mosaic.galaxies,
+            cut.least
+        );
+        return Err(FileError::new(path, message));
+    }
+    check_strip(path, mosaic.columns, side)?;
+    let places = GalaxyCatalogue::read(&data.stamps(id.set, id.image))?.places(mosaic)?;
+    let mut of_stamps = vec![0; planes];
+    for (plane, place) in places.into_iter().enumerate() {
+        of_stamps[place] = plane;
+    }
+    Ok(OpenPsfs {
+        source: PsfSource::Cube {
+            image: Box::new(image),
+            planes: of_stamps,
+        },
+        moved: None,
+        wcs: Wcs::default(),
+        stated: None,
+    })
+}
+
+// The star field of a subfield and epoch of GREAT3.
+fn open_star_field(
+    data: &DataFolder,
+    id: ImageId,
+    path: &Path,
+    cut: PsfCut,
+) -> Result<OpenPsfs, FileError> {
+    const ALL: usize = great3::STARS_PER_SIDE;
+    if great3::has_varying_psf(data, id.set) {
+        let expected = fill(great3::PSF_IMAGES, id.set, id.image);
+        let message = format!(
+            "the stars are all over the field, so that each galaxy has another PSF (expected {expected} beside this file). Try: a program that interpolates stars, such as PSFEx or PIFF, to write one PSF stamp per galaxy, as a mosaic like the galaxies' or a cube in the order of their catalogue"
+        );
+        return Err(FileError::new(path, message));
+    }
+    let mut image = ImageReader::open(path)?;
+    let (width, height) = (image.width(), image.height());
+    let side = width / ALL;
+    if width != height || width % ALL != 0 || !(cut.least..=MAX_STAMP).contains(&side) {
+        let message = format!(
+            "the star field is {width} × {height} pixels; expected {ALL} × {ALL} stars of {} to {MAX_STAMP} pixels a side",
+            cut.least
+        );
+        return Err(FileError::new(path, message));
+    }
+    let pixels = image.read_rows(height)?;
+    let field = ArrayView2::from_shape((height, width), &pixels)
+        .map_err(|error| FileError::new(path, error))?;
+    let star = |place: usize| {
+        let [x, y] = [place % ALL, place / ALL].map(|at| Slice::from(at * side..(at + 1) * side));
+        let mut star = field;
+        star.slice_axis_inplace(Axis(0), y);
+        star.slice_axis_inplace(Axis(1), x);
+        star
+    };
+    let stacked = data
+        .layout()
+        .great3
+        .is_some_and(|branch| branch.stacked_stars);
+    let found = match stacked {
+        true => {
+            Star::stack((0..ALL * ALL).map(star)).and_then(|stack| Star::cut(stack.view(), cut))
+        }
+        false => Star::cut(star(0), cut),
+    };
+    let Star { psf, moved } = found.map_err(|error| FileError::new(path, error))?;
+    Ok(OpenPsfs {
+        source: PsfSource::Shared(psf.into_shared()),
+        moved,
+        wcs: Wcs::default(),
+        stated: None,
+    })
 }
 
 fn open_functional(path: &Path, cut: PsfCut, mosaic: &Mosaic) -> Result<PsfSource, FileError> {

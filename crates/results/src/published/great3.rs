@@ -1,21 +1,29 @@
 //! GREAT3 (Mandelbaum et al. 2014, ApJS 212, 5; results: 2015, MNRAS 450, 2963): branches, identities of galaxies, truth as
 //! released, pre-submission and leaderboard.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::fmt::{self, Display, Write};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
+use shearq_dataset::great3::Parameters;
 use shearq_dataset::threads::Pool;
-use shearq_files::open::{SETTINGS, is_there, read_to_string};
+use shearq_files::open::is_there;
 use shearq_files::{FileError, table};
 use shearq_quantities::Shear;
+use shearq_quantities::statistics::median;
 use shearq_scoring::aperture::{ApertureMass, Lattice, LatticeShear, SEPARATION_BINS, separations};
 use shearq_scoring::great3::{
     ConstantField, Observation, PlusCross, REQUIRED_C, REQUIRED_M, constant_score, variable_score,
 };
 
-use super::{Branch, Columns, Entry, Figure, Packed, Packing, Score, Truth, whole, wrong};
+use crate::mean::mean_shears;
+use crate::response::{Shared, shears};
+use shearq_dataset::run::Run;
+
+use super::{
+    Branch, Catalogues, Columns, Entry, Figure, Packed, Packing, Score, Truth, whole, wrong,
+};
 
 // Subfields of a field, where galaxies share a shear field or a PSF model.
 const SUBFIELDS_PER_FIELD: usize = 20;
@@ -595,49 +603,6 @@ fn add_truth(
     Ok(())
 }
 
-// Numbers by name, as the challenge wrote them: YAML of one level, or a line of names after `#` and a line of values.
-struct Parameters {
-    path: PathBuf,
-    numbers: BTreeMap<String, f64>,
-}
-
-impl Parameters {
-    // `None` if there is no such file.
-    fn read(folder: &Path, stem: &str) -> Result<Option<Self>, FileError> {
-        let files = ["yaml", "txt"].map(|ending| folder.join(format!("{stem}.{ending}")));
-        let Some(path) = files.into_iter().find(|path| is_there(path)) else {
-            return Ok(None);
-        };
-        let text = read_to_string(&path, SETTINGS)
-            .map_err(FileError::doing(&path, "cannot read the parameters"))?;
-        let mut lines = text.lines().filter(|line| !line.trim().is_empty());
-        let number = |name: &str, value: &str| {
-            let name = name.trim_matches(['"', '\'', ' ']).to_owned();
-            Some((name, value.trim().parse().ok()?))
-        };
-        let numbers = match lines.clone().next().and_then(|line| line.strip_prefix('#')) {
-            Some(names) => {
-                let values = lines.nth(1).unwrap_or_default().split_whitespace();
-                let pairs = names.split_whitespace().zip(values);
-                pairs
-                    .filter_map(|(name, value)| number(name, value))
-                    .collect()
-            }
-            None => text
-                .split(['\n', ',', '{', '}'])
-                .filter_map(|part| part.split_once(':'))
-                .filter_map(|(name, value)| number(name, value))
-                .collect(),
-        };
-        Ok(Some(Parameters { path, numbers }))
-    }
-
-    fn number(&self, name: &str) -> Result<f64, FileError> {
-        let found = self.numbers.get(name).copied();
-        found.ok_or_else(|| FileError::new(&self.path, format!("there is no number `{name}`")))
-    }
-}
-
 impl Branch for Great3 {
     fn title(&self) -> String {
         format!("GREAT3 {self}")
@@ -764,71 +729,111 @@ struct Galaxy {
 // All galaxies of a branch, in the order of their identities.
 struct Galaxies<'a> {
     branch: &'a Great3,
+    files: Vec<PathBuf>,
     galaxies: Vec<Galaxy>,
 }
 
 impl<'a> Galaxies<'a> {
     fn read(branch: &'a Great3, packing: &Packing<'_>) -> Result<Self, FileError> {
-        let mut galaxies = Vec::new();
-        for (catalogue, path) in packing.catalogues.iter().enumerate() {
-            // `measure` writes ellipticities that are not divided by their response.
-            let hint = "catalogues of measure become shears by: shearq shear --measured DIR --out shears.parquet";
-            let columns = GALAXIES.read(path);
-            let columns = columns.map_err(|error| error.hint_of_columns(hint))?;
-            for k in 0..columns[0].len() {
-                let fault = |fault| wrong(path, fault);
-                let found = columns[0][k];
-                let Some(id) = Identity::of(found) else {
-                    return fault(Fault::NotAnIdentity { row: k + 1, found });
-                };
-                if id.subfield() >= packing.subfields {
-                    return fault(Fault::Subfield {
-                        id: id.to_string(),
-                        found: id.subfield(),
-                        branch: branch.to_string(),
-                        last: packing.subfields - 1,
-                    });
+        let mut all = Galaxies {
+            branch,
+            files: Vec::new(),
+            galaxies: Vec::new(),
+        };
+        match packing.catalogues {
+            Catalogues::Files(files) => {
+                for path in files {
+                    // `measure` writes ellipticities that are not divided by their response.
+                    let hint = "catalogues of measure are packed by --measured DIR";
+                    let columns = GALAXIES.read(path);
+                    let columns = columns.map_err(|error| error.hint_of_columns(hint))?;
+                    all.add(path, &columns, packing)?;
                 }
-                let (x, y) = id.place();
-                let side = if branch.constant {
-                    packing.grid
-                } else {
-                    packing.grid * NODES_PER_GALAXY
-                };
-                if x >= side || y >= side {
-                    let (id, last) = (id.to_string(), side - 1);
-                    return fault(Fault::OutsideGrid { id, x, y, last });
+            }
+            Catalogues::Measured(folder) => {
+                let run = Run::require(folder)?;
+                let files = run.catalogues(folder, &[])?;
+                // Set by set, because the columns of two million galaxies are 200 MB.
+                for set in files.sets() {
+                    let found = shears(&[folder.to_owned()], &[set], Shared::Set, None)?;
+                    let path = files.of_set(set).swap_remove(0).1;
+                    let column = |name: &str| {
+                        let read = table::numbers(&found.table, name, &path);
+                        Ok(read?.into_owned())
+                    };
+                    let columns: Vec<_> = ["id", "g1", "g2", "w"]
+                        .into_iter()
+                        .map(column)
+                        .collect::<Result<_, FileError>>()
+                        .map_err(|error| error.hint_of_columns("galaxies of a branch of GREAT3 have identities (galaxy_catalog-*.fits)"))?;
+                    all.add(&path, &columns, packing)?;
                 }
-                let g = Shear::new(columns[1][k], columns[2][k]);
-                for (name, found) in [("g1", g.e1), ("g2", g.e2)] {
-                    if found <= -NOT_AVERAGED {
-                        let id = id.to_string();
-                        return fault(Fault::Sentinel { id, name, found });
-                    }
-                }
-                let weight = columns[3].get(k).copied().unwrap_or(1.0);
-                if !(weight.is_finite() && weight >= 0.0) {
-                    let (id, found) = (id.to_string(), weight);
-                    return fault(Fault::Weight { id, found });
-                }
-                galaxies.push(Galaxy {
-                    id,
-                    g,
-                    weight,
-                    catalogue,
-                });
             }
         }
-        let all = Galaxies { branch, galaxies };
         all.checked(packing)
+    }
+
+    // Adds the galaxies of a table with the columns of `GALAXIES`.
+    fn add(
+        &mut self,
+        path: &Path,
+        columns: &[Vec<f64>],
+        packing: &Packing<'_>,
+    ) -> Result<(), FileError> {
+        let (branch, catalogue) = (self.branch, self.files.len());
+        self.files.push(path.to_owned());
+        for k in 0..columns[0].len() {
+            let fault = |fault| wrong(path, fault);
+            let found = columns[0][k];
+            let Some(id) = Identity::of(found) else {
+                return fault(Fault::NotAnIdentity { row: k + 1, found });
+            };
+            if id.subfield() >= packing.subfields {
+                return fault(Fault::Subfield {
+                    id: id.to_string(),
+                    found: id.subfield(),
+                    branch: branch.to_string(),
+                    last: packing.subfields - 1,
+                });
+            }
+            let (x, y) = id.place();
+            let side = if branch.constant {
+                packing.grid
+            } else {
+                packing.grid * NODES_PER_GALAXY
+            };
+            if x >= side || y >= side {
+                let (id, last) = (id.to_string(), side - 1);
+                return fault(Fault::OutsideGrid { id, x, y, last });
+            }
+            let g = Shear::new(columns[1][k], columns[2][k]);
+            for (name, found) in [("g1", g.e1), ("g2", g.e2)] {
+                if found <= -NOT_AVERAGED {
+                    let id = id.to_string();
+                    return fault(Fault::Sentinel { id, name, found });
+                }
+            }
+            let weight = columns[3].get(k).copied().unwrap_or(1.0);
+            if !(weight.is_finite() && weight >= 0.0) {
+                let (id, found) = (id.to_string(), weight);
+                return fault(Fault::Weight { id, found });
+            }
+            self.galaxies.push(Galaxy {
+                id,
+                g,
+                weight,
+                catalogue,
+            });
+        }
+        Ok(())
     }
 
     // The checks of the challenge's program, in the order in which their messages help most: a repeated galaxy before the missing
     // one that it stands for.
     fn checked(mut self, packing: &Packing<'_>) -> Result<Self, FileError> {
-        let file = |galaxy: &Galaxy| packing.catalogues[galaxy.catalogue].as_path();
         // Stable, so that the first of two rows stays first.
         self.galaxies.sort_by_key(|galaxy| galaxy.id);
+        let file = |galaxy: &Galaxy| self.files[galaxy.catalogue].as_path();
         if let Some(pair) = self
             .galaxies
             .windows(2)
@@ -839,8 +844,8 @@ impl<'a> Galaxies<'a> {
             return wrong(file(&pair[1]), Fault::Repeated { id, first });
         }
         let there: BTreeSet<usize> = self.galaxies.iter().map(|own| own.id.subfield()).collect();
-        let last = packing
-            .catalogues
+        let last = self
+            .files
             .last()
             .map_or(Path::new("catalogues"), PathBuf::as_path);
         let lacking: Vec<usize> = (0..packing.subfields)
@@ -925,7 +930,7 @@ impl<'a> Galaxies<'a> {
             .step_by(size)
             .map(|start| start..(start + size).min(self.galaxies.len()))
             .collect();
-        let file = &packing.catalogues[0];
+        let file = &self.files[0];
         let mut text = String::new();
         let is_measured = |g: f64, limit: f64| g < limit;
         if self.branch.constant {
@@ -997,12 +1002,25 @@ impl<'a> Galaxies<'a> {
         let unmeasured = self.galaxies.iter().filter(|own| {
             !is_measured(own.g.e1, NOT_AVERAGED) || !is_measured(own.g.e2, NOT_AVERAGED)
         });
-        let note = format!(
+        let mut note = format!(
             "{} galaxies of {}, {} not measured",
             self.galaxies.len(),
             self.branch,
             unmeasured.count()
         );
+        if let (true, Catalogues::Measured(folder)) = (self.branch.constant, packing.catalogues) {
+            let means = mean_shears(&Run::require(folder)?, folder, &[], None)?;
+            let errors = means.iter().filter_map(|mean| Some(mean.shear?.error()));
+            let errors: Vec<_> = errors.collect();
+            let typical = |k: usize| {
+                median(&mut errors.iter().map(|own| own[k]).collect::<Vec<_>>()).unwrap_or(f64::NAN)
+            };
+            let [g1, g2] = [0, 1].map(typical);
+            let _ = write!(
+                note,
+                "; errors of g1 and g2 of a subfield: {g1:.1e} and {g2:.1e}"
+            );
+        }
         Ok(Packed { text, note })
     }
 

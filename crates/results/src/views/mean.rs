@@ -55,6 +55,12 @@ pub fn mean_table(means: &[SetMean], configuration: &Configuration, name: &str) 
     } else if configuration.ellipticity() == EllipticityType::Distortion {
         notes.push("The ellipticities are distortions, divided by their response to shear.".into());
     }
+    if means.iter().any(|mean| mean.rotated_pairs) {
+        notes.push(
+            "Errors are of the noise of pixels: each galaxy has a partner rotated by 90°, so that intrinsic shapes cancel."
+                .into(),
+        );
+    }
     if means.iter().any(noticed) {
         let images = means.iter().map(|mean| mean.images.len()).sum::<usize>();
         let stated = means.iter().map(|mean| mean.noisy_stars).sum::<usize>();

@@ -1,0 +1,245 @@
+//! A branch of GREAT3 as it was released (Mandelbaum et al. 2014, ApJS 212, 5): subfields are sets and epochs are images, both
+//! from 0.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+use shearq_files::FileError;
+use shearq_files::open::{SETTINGS, is_there, read_to_string};
+use shearq_files::table::{self, MAX_ROWS};
+
+use crate::layout::{DataFolder, Layout, MAX_STAMP};
+use crate::listing;
+use crate::mosaic::Mosaic;
+use crate::pattern::fill;
+
+const GALAXIES: &str = "image-{set:03}-{image}.fits";
+/// Stars of branches with one PSF per subfield and epoch.
+pub const STAR_FIELDS: &str = "starfield_image-{set:03}-{image}.fits";
+/// Images of one PSF per galaxy, which are not part of the release: users interpolate them.
+pub const PSF_IMAGES: &str = "psf_image-{set:03}-{image}.fits";
+// Stars all over the field, of branches whose PSF varies.
+const STAR_CATALOGUES: &str = "star_catalog-{set:03}.fits";
+const GALAXY_CATALOGUES: &str = "galaxy_catalog-{set:03}.fits";
+const DITHERS: &str = "epoch_dither-{set:03}-{image}";
+
+/// Stars per side of a star field.
+pub const STARS_PER_SIDE: usize = 3;
+
+/// What a branch has that other data folders do not.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Branch {
+    /// Whether each galaxy has a partner in its subfield that is rotated by 90°, as in all branches of constant shear.
+    pub rotated_pairs: bool,
+    /// Whether all stars of a field are stacked. Otherwise the lower-left one is used, which alone is at a known place.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub stacked_stars: bool,
+}
+
+/// The layout of a folder with the files of a branch.
+pub(crate) fn detect(root: &Path) -> Result<Option<Layout>, FileError> {
+    let images = listing::find(root, GALAXIES, &[""], &[])?;
+    let catalogue = |set: &u32| root.join(fill(GALAXY_CATALOGUES, *set, 0));
+    // Images alone may be anyone's.
+    let first = images
+        .sets()
+        .iter()
+        .map(catalogue)
+        .find(|path| is_there(path));
+    let Some(path) = first else {
+        return Ok(None);
+    };
+    let galaxies = GalaxyCatalogue::read(&path)?;
+    let interpolated = listing::find(root, PSF_IMAGES, &[""], &[])?;
+    let psf_star = match interpolated.is_empty() {
+        true => STAR_FIELDS,
+        false => PSF_IMAGES,
+    };
+    Ok(Some(Layout {
+        galaxies: GALAXIES.into(),
+        psf_star: psf_star.into(),
+        stamp: galaxies.stamp()?,
+        great3: Some(Branch {
+            rotated_pairs: galaxies.have_constant_shear()?,
+            stacked_stars: false,
+        }),
+        ..Layout::default()
+    }))
+}
+
+/// Whether the stars of a subfield are all over its field, so that its galaxies have different PSFs.
+pub fn has_varying_psf(data: &DataFolder, set: u32) -> bool {
+    is_there(&data.root().join(fill(STAR_CATALOGUES, set, 0)))
+}
+
+/// The table of a subfield's galaxies.
+pub(crate) fn galaxy_catalogue(root: &Path, set: u32) -> PathBuf {
+    root.join(fill(GALAXY_CATALOGUES, set, 0))
+}
+
+/// Shift (x, y) in pixels of all galaxies of an epoch; zero in branches of a single epoch.
+// The challenge's example of a coadd shifts each image by the negative of these numbers.
+pub fn dither(data: &DataFolder, set: u32, image: u32) -> Result<[f64; 2], FileError> {
+    let stem = fill(DITHERS, set, image);
+    let Some(found) = Parameters::read(data.root(), &stem)? else {
+        let path = data.root().join(stem + ".yaml");
+        let message = "there is no such file, nor one ending in .txt; expected the dither of this epoch, by which its galaxies are shifted";
+        return Err(FileError::new(path, message));
+    };
+    Ok([
+        found.number("xdither_pixels")?,
+        found.number("ydither_pixels")?,
+    ])
+}
+
+#[derive(Debug)]
+struct Galaxy {
+    /// The lower one of the two central pixels along each axis, from 0.
+    x: usize,
+    y: usize,
+    /// SSSXXXYYY.
+    id: i64,
+}
+
+/// Places and identities of the galaxies of a subfield.
+#[derive(Debug)]
+pub struct GalaxyCatalogue {
+    path: PathBuf,
+    galaxies: Vec<Galaxy>,
+}
+
+impl GalaxyCatalogue {
+    pub fn read(path: &Path) -> Result<Self, FileError> {
+        const WANTED: [&str; 3] = ["x", "y", "ID"];
+        let table = table::read(path, Some(&WANTED), MAX_ROWS)?;
+        let column = |name: &str| table::numbers(&table, name, path);
+        let (x, y, id) = (column("x")?, column("y")?, column("ID")?);
+        let whole = |row: usize, name: &str, value: f64| {
+            if value.fract() == 0.0 && (0.0..1e9).contains(&value) {
+                return Ok(value as usize);
+            }
+            let message = format!(
+                "row {}: {name} is {value}; expected a whole number, 0 or more",
+                row + 1
+            );
+            Err(FileError::new(path, message))
+        };
+        let galaxy = |row: usize| {
+            Ok(Galaxy {
+                x: whole(row, "x", x[row])?,
+                y: whole(row, "y", y[row])?,
+                id: whole(row, "ID", id[row])? as i64,
+            })
+        };
+        Ok(GalaxyCatalogue {
+            path: path.to_owned(),
+            galaxies: (0..x.len()).map(galaxy).collect::<Result<_, FileError>>()?,
+        })
+    }
+
+    /// Pixels a side of the stamps, which no header states: the distance of neighbours.
+    fn stamp(&self) -> Result<usize, FileError> {
+        let columns: BTreeSet<usize> = self.galaxies.iter().map(|galaxy| galaxy.x).collect();
+        let first = columns.first().map(|x| 2 * (x + 1));
+        let distance = columns.iter().zip(columns.iter().skip(1));
+        let distance = distance.map(|(left, right)| right - left).min();
+        let found = distance.or(first).unwrap_or(0);
+        if (1..=MAX_STAMP).contains(&found) {
+            return Ok(found);
+        }
+        let message = format!(
+            "neighbouring galaxies are {found} pixels apart along x; expected 1 to {MAX_STAMP}"
+        );
+        Err(FileError::new(&self.path, message))
+    }
+
+    /// Whether identities count columns and rows. Those of variable shear are nodes of a lattice with seven per galaxy.
+    fn have_constant_shear(&self) -> Result<bool, FileError> {
+        let stamp = self.stamp()?;
+        Ok(self.galaxies.iter().all(|Galaxy { x, y, id }| {
+            let place = id % 1_000_000;
+            [place / 1000, place % 1000] == [x / stamp, y / stamp].map(|at| at as i64)
+        }))
+    }
+
+    /// The stamp of each row of the table.
+    pub fn places(&self, mosaic: &Mosaic) -> Result<Vec<usize>, FileError> {
+        let (found, expected) = (self.galaxies.len(), mosaic.galaxies);
+        if found != expected {
+            let message = format!("{found} galaxies; expected {expected}, one per stamp");
+            return Err(FileError::new(&self.path, message));
+        }
+        let mut taken = vec![false; expected];
+        let mut places = Vec::with_capacity(expected);
+        for Galaxy { x, y, id } in &self.galaxies {
+            // FITS pixels count from 1.
+            let place = mosaic.place(*x as f64 + 1.0, *y as f64 + 1.0);
+            match place.filter(|place| !std::mem::replace(&mut taken[*place], true)) {
+                Some(place) => places.push(place),
+                None => {
+                    let message = format!(
+                        "galaxy {id:09} at x = {x}, y = {y} is outside the image, or another one is on its stamp; expected one galaxy per stamp of {} pixels",
+                        mosaic.stamp
+                    );
+                    return Err(FileError::new(&self.path, message));
+                }
+            }
+        }
+        Ok(places)
+    }
+
+    /// Identities in the order of the stamps.
+    pub fn identities(&self, mosaic: &Mosaic) -> Result<Vec<i64>, FileError> {
+        let mut ids = vec![0; mosaic.galaxies];
+        for (galaxy, place) in self.galaxies.iter().zip(self.places(mosaic)?) {
+            ids[place] = galaxy.id;
+        }
+        Ok(ids)
+    }
+}
+
+/// Numbers by name, as the challenge wrote them: YAML of one level, or a line of names after `#` and a line of values.
+#[derive(Debug)]
+pub struct Parameters {
+    path: PathBuf,
+    numbers: BTreeMap<String, f64>,
+}
+
+impl Parameters {
+    /// `None` if the folder has neither `stem`.yaml nor `stem`.txt.
+    pub fn read(folder: &Path, stem: &str) -> Result<Option<Self>, FileError> {
+        let files = ["yaml", "txt"].map(|ending| folder.join(format!("{stem}.{ending}")));
+        let Some(path) = files.into_iter().find(|path| is_there(path)) else {
+            return Ok(None);
+        };
+        let text = read_to_string(&path, SETTINGS)
+            .map_err(FileError::doing(&path, "cannot read the parameters"))?;
+        let mut lines = text.lines().filter(|line| !line.trim().is_empty());
+        let number = |name: &str, value: &str| {
+            let name = name.trim_matches(['"', '\'', ' ']).to_owned();
+            Some((name, value.trim().parse().ok()?))
+        };
+        let numbers = match lines.clone().next().and_then(|line| line.strip_prefix('#')) {
+            Some(names) => {
+                let values = lines.nth(1).unwrap_or_default().split_whitespace();
+                let pairs = names.split_whitespace().zip(values);
+                pairs
+                    .filter_map(|(name, value)| number(name, value))
+                    .collect()
+            }
+            None => text
+                .split(['\n', ',', '{', '}'])
+                .filter_map(|part| part.split_once(':'))
+                .filter_map(|(name, value)| number(name, value))
+                .collect(),
+        };
+        Ok(Some(Parameters { path, numbers }))
+    }
+
+    pub fn number(&self, name: &str) -> Result<f64, FileError> {
+        let found = self.numbers.get(name).copied();
+        found.ok_or_else(|| FileError::new(&self.path, format!("there is no number `{name}`")))
+    }
+}
