@@ -109,7 +109,7 @@ const WAYS: [(&str, &[&str]); 33] = [
         &[
             "sets images grid seed amplitude tilt out shard threads",
             "sets images grid seed constant-shear opposite rotated out shard threads",
-            "challenge branch subfields galaxies grid seed out threads",
+            "challenge branch subfields galaxies opposite grid seed out threads",
         ],
     ),
     (

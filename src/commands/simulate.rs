@@ -1,7 +1,7 @@
 use std::path::{Path, PathBuf};
 
 use anyhow::Context;
-use clap::Args;
+use clap::{ArgGroup, Args};
 
 use crate::arguments::{SetList, Sharding, SimulationArguments, Threads};
 use crate::progress::{Bar, mark_resumable};
@@ -28,6 +28,7 @@ use shearq_simulate::set::SimulationSettings;
 /// With `--challenge great3 --branch BRANCH`, the command writes a branch of GREAT3 in its layout into
 /// OUT/EXPERIMENT/OBSERVATION/SHEAR, and its truth, as it was released, below OUT/truth (docs/great3.md).
 #[derive(Debug, Args)]
+#[command(group = ArgGroup::new("sheared").args(["constant_shear", "branch"]))]
 pub(crate) struct Arguments {
     /// Sets, as `1,2,7-9` or `all`.
     #[arg(long, value_name = "LIST", required_unless_present = "challenge")]
@@ -40,8 +41,8 @@ pub(crate) struct Arguments {
     /// Shear of all galaxies, instead of a shear field. May be given several times.
     #[arg(long, value_name = "G1,G2", allow_hyphen_values = true, value_parser = parse_shear, conflicts_with_all = ["amplitude", "tilt"])]
     constant_shear: Vec<[f64; 2]>,
-    /// Also simulate the galaxies under the opposite shear.
-    #[arg(long, requires = "constant_shear", conflicts_with_all = ["amplitude", "tilt"])]
+    /// Also simulate the galaxies under the opposite shear, those of a branch into OUT/opposite.
+    #[arg(long, requires = "sheared", conflicts_with_all = ["amplitude", "tilt"])]
     opposite: bool,
     /// Also simulate the galaxies rotated by 90 degrees.
     #[arg(long, requires = "constant_shear", conflicts_with_all = ["amplitude", "tilt"])]
@@ -69,13 +70,12 @@ pub(crate) struct Arguments {
 }
 
 // Options without a meaning for branches of GREAT3.
-const GREAT10_ONLY: [&str; 8] = [
+const GREAT10_ONLY: [&str; 7] = [
     "sets",
     "images",
     "amplitude",
     "tilt",
     "constant_shear",
-    "opposite",
     "rotated",
     "shard",
 ];
@@ -148,33 +148,35 @@ fn run_branch(arguments: &Arguments, branch: Branch) -> anyhow::Result<()> {
         Some(path) => great3::read_fits(path)?,
         None => Vec::new(),
     };
-    let record = great3::Record {
-        version: shearq_dataset::VERSION.into(),
-        branch: branch.folder(),
-        seed: settings.seed,
-        grid: settings.grid,
-        galaxies: arguments.galaxies.clone(),
-    };
-    let simulator =
-        BranchSimulator::new(branch, settings.seed, settings.grid, fits).with_context(|| {
+    let mut simulator = BranchSimulator::new(branch, settings.seed, settings.grid, fits)
+        .with_context(|| {
             let path = arguments.galaxies.as_deref().unwrap_or(Path::new(""));
             path.display().to_string()
         })?;
     let subfields = usize::from(arguments.subfields.unwrap_or(SUBFIELDS));
-    let images = subfields * branch.epochs();
+    let mut folders = vec![(arguments.out.clone(), false)];
+    if arguments.opposite {
+        folders.push((arguments.out.join("opposite"), true));
+    }
+    let images = folders.len() * subfields * branch.epochs();
     let mut bar = Bar::new(
         "simulating",
         (images * settings.grid * settings.grid) as u64,
     );
     let threads = arguments.threads.number();
-    let made = great3::simulate_branch(
-        &simulator,
-        &record,
-        subfields,
-        &arguments.out,
-        threads,
-        &mut bar,
-    )?;
+    let mut made = 0;
+    for (out, opposite) in folders {
+        simulator.opposite = opposite;
+        let record = great3::Record {
+            version: shearq_dataset::VERSION.into(),
+            branch: branch.folder(),
+            seed: settings.seed,
+            grid: settings.grid,
+            opposite,
+            galaxies: arguments.galaxies.clone(),
+        };
+        made += great3::simulate_branch(&simulator, &record, subfields, &out, threads, &mut bar)?;
+    }
     drop(bar);
     tell(format_args!(
         "{made} images simulated, {} there already, in {}; truth in {}",

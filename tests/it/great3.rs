@@ -533,9 +533,21 @@ fn simulated_branches_are_scored_by_their_released_truth() {
         let root = folder.path().join(branch);
         let out = root.display();
         let line = format!(
-            "simulate --challenge great3 --branch {branch} --subfields {subfields} --grid 8 --out {out}"
+            "simulate --challenge great3 --branch {branch} --subfields {subfields} --grid 8 --opposite --out {out}"
         );
         succeed(&words(&line));
+        let catalogue = Path::new("truth")
+            .join(branch.replace('-', "/"))
+            .join("galaxy_catalog-001.fits");
+        let [plain, opposite] = [
+            root.join(&catalogue),
+            root.join("opposite").join(&catalogue),
+        ]
+        .map(|path| {
+            let read = table::read(&path, None, table::MAX_ROWS).unwrap();
+            ["g1", "g2_intrinsic"].map(|name| table::numbers(&read, name, &path).unwrap()[5])
+        });
+        assert_eq!(opposite, [-plain[0], plain[1]]);
         let below = branch.replace('-', "/");
         let truth = root.join("truth").join(&below);
         let rows = true_galaxies(&truth, subfields, branch.ends_with("variable"));

@@ -142,6 +142,8 @@ pub struct BranchSimulator {
     pub seed: u64,
     /// Galaxies per side of a subfield.
     pub grid: usize,
+    /// Whether all shears have the opposite sign; all else stays, noise included.
+    pub opposite: bool,
     /// Galaxies are drawn from these; if it is empty, from the default distribution.
     fits: Vec<Fit>,
     renderer: Renderer,
@@ -237,6 +239,7 @@ impl BranchSimulator {
             branch,
             seed,
             grid,
+            opposite: false,
             fits,
             renderer: Renderer::new(branch.stamp()),
         };
@@ -331,7 +334,9 @@ impl BranchSimulator {
             lensing = (0..cells)
                 .map(|place| {
                     let node = self.node(offset, (place % self.grid, place / self.grid));
-                    (shear(field.shear[node]), shear(field.intrinsic[node]))
+                    let g = field.shear[node];
+                    let g = if self.opposite { -g } else { g };
+                    (shear(g), shear(field.intrinsic[node]))
                 })
                 .collect();
         } else {
@@ -340,6 +345,7 @@ impl BranchSimulator {
             let (low, high) = SHEARS;
             let modulus = Self::uniform(&mut rng, (low * low, high * high)).sqrt();
             let g = Complex64::from_polar(modulus, rng.random_range(0.0..TAU));
+            let g = if self.opposite { -g } else { g };
             constant_shear = Some(Shear::new(g.re, g.im));
             galaxies.shuffle(&mut self.stream(number, 0, Purpose::Places));
         }

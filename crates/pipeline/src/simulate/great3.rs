@@ -28,6 +28,9 @@ pub struct Record {
     pub branch: String,
     pub seed: u64,
     pub grid: usize,
+    /// Whether all shears have the opposite sign.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub opposite: bool,
     /// Table of fits to galaxies.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub galaxies: Option<PathBuf>,
