@@ -231,8 +231,8 @@ impl File {
         Ok(sides)
     }
 
-    /// Bytes of a pixel of the image here as stored.
-    pub fn pixel_bytes(&self) -> Result<u64, FileError> {
+    /// BITPIX of the image here as stored: bits per pixel, negative for floats.
+    pub fn bits_per_pixel(&self) -> Result<c_int, FileError> {
         let mut bits = 0;
         // SAFETY: the file is open, and the pointer is to a live variable.
         self.call(
@@ -241,7 +241,7 @@ impl File {
                 sys::ffgidt(raw, &mut bits, status);
             },
         )?;
-        Ok(u64::from(bits.unsigned_abs()) / 8)
+        Ok(bits)
     }
 
     /// First byte of the data here, and the first one after them.

@@ -33,6 +33,10 @@ const TLONGLONG: c_int = 81;
 // The offset by which FITS stores unsigned 64-bit integers as signed ones.
 const UNSIGNED: f64 = 9_223_372_036_854_775_808.0;
 
+// Pixels that are read at a time: cfitsio swaps their bytes, missing ones are looked for, and all are copied, which takes less
+// time in the cache.
+const PIXELS_AT_A_TIME: usize = 1 << 14;
+
 // Pixels of this value are missing: SExtractor writes it, in single precision.
 const MISSING: f32 = -1e30;
 
@@ -73,9 +77,13 @@ impl std::fmt::Debug for ImageReader {
 }
 
 enum Pixels {
-    /// Uncompressed, with this number of bytes per pixel.
-    Plain(u64),
+    /// Uncompressed, with BITPIX bits per pixel: negative for floats.
+    Plain(c_int),
     Tiles(Tiles),
+}
+
+fn bytes_of(bits: c_int) -> u64 {
+    u64::from(bits.unsigned_abs()) / 8
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -168,11 +176,11 @@ impl ImageReader {
         };
         let pixels = match file.take_tiling()? {
             Some(tiling) => Pixels::Tiles(Tiles::open(&file, tiling)?),
-            None => Pixels::Plain(file.pixel_bytes()?),
+            None => Pixels::Plain(file.bits_per_pixel()?),
         };
-        if let Pixels::Plain(bytes) = pixels {
+        if let Pixels::Plain(bits) = pixels {
             let pixels = (width as u64 * height as u64).saturating_mul(planes as u64);
-            file.expect(pixels.saturating_mul(bytes))?;
+            file.expect(pixels.saturating_mul(bytes_of(bits)))?;
         }
         Ok(ImageReader {
             file,
@@ -236,8 +244,19 @@ impl ImageReader {
         let first = self.next_row;
         let last = (first + rows).min(self.rows());
         self.need(last)?;
-        let mut pixels = vec![P::default(); (last - first) * self.width];
-        self.fill(first * self.width, &mut pixels)?;
+        let (start, count) = (first * self.width, (last - first) * self.width);
+        let at_a_time = match self.pixels {
+            Pixels::Plain(_) => PIXELS_AT_A_TIME.min(count),
+            // A part of a tile takes as long as the tile.
+            Pixels::Tiles(_) => count,
+        };
+        let mut part = vec![P::default(); at_a_time];
+        let mut pixels = Vec::with_capacity(count);
+        while pixels.len() < count {
+            let part = &mut part[..at_a_time.min(count - pixels.len())];
+            self.fill(start + pixels.len(), part)?;
+            pixels.extend_from_slice(part);
+        }
         self.next_row = last;
         if self.last && last == self.rows() {
             self.file.check_end()?;
@@ -273,7 +292,7 @@ impl ImageReader {
     /// Makes sure that the first `rows` rows are there.
     fn need(&mut self, rows: usize) -> Result<(), FileError> {
         match &mut self.pixels {
-            Pixels::Plain(bytes) => self.file.need((rows * self.width) as u64 * *bytes),
+            Pixels::Plain(bits) => self.file.need((rows * self.width) as u64 * bytes_of(*bits)),
             Pixels::Tiles(tiles) => tiles.check(&mut self.file, rows),
         }
     }
@@ -282,6 +301,10 @@ impl ImageReader {
     fn fill<P: Pixel>(&mut self, first: usize, pixels: &mut [P]) -> Result<(), FileError> {
         // cfitsio always writes to the second.
         let (mut blank, mut some_blank) = (P::MISSING, 0);
+        if matches!(self.pixels, Pixels::Plain(bits) if bits < 0) {
+            // cfitsio would test the bits of one pixel at a time. Those that are not finite are found below.
+            blank = P::default();
+        }
         let start = (first + 1) as i64;
         let (width, rows) = (self.width, self.rows());
         let last = (first + pixels.len()).div_ceil(width);
@@ -302,9 +325,12 @@ impl ImageReader {
             },
         )?;
         for pixel in pixels {
-            if (*pixel).into() as f32 == MISSING {
-                *pixel = P::MISSING;
-            }
+            let value: f64 = (*pixel).into();
+            *pixel = if value as f32 == MISSING || !value.is_finite() {
+                P::MISSING
+            } else {
+                *pixel
+            };
         }
         Ok(())
     }
