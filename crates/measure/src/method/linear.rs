@@ -646,7 +646,8 @@ impl PlanWorker {
         let mut sigma = noise as f32;
         let (buffers, lags) = (&mut self.buffers, &mut self.lags);
         // In the middle, whatever is there. A window on the centroid changes with the shear of lopsided galaxies and of blends, which
-        // R does not contain: m was +4.4e-3 for rings at S/N 60 and +6e-3 for blends at 5 to 7 px, instead of 0.3e-3 and 0 ± 1e-3.
+        // R does not contain: m was +23e-3 for rings at S/N 20, +4.4e-3 at S/N 60, and +6e-3 for blends at 5 to 7 px, instead of
+        // 0.4 ± 0.6e-3, 0.3 ± 0.1e-3 and 0 ± 1e-3.
         plan.spectral.place_window([0.0; 2], buffers);
         plan.spectral
             .autocorrelate(&self.psf, stamp, sigma, buffers, lags);
