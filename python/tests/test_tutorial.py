@@ -1,7 +1,8 @@
-"""The tutorials of the documentation that need GalSim: their commands run, and print what the pages show."""
+"""Tutorials of the documentation: their commands run, and print what the pages show."""
 
 import runpy
 import shlex
+from pathlib import Path
 
 import pytest
 
@@ -18,8 +19,19 @@ def test_a_tutorial_prints_what_its_page_shows(page, script, command, tmp_path, 
     for library in ("galsim", "astropy"):
         pytest.importorskip(library, reason=f"the tutorials need {library}")
     monkeypatch.chdir(tmp_path)
+    follow(page, command, script)
+
+
+def test_the_tutorial_of_great3_prints_what_its_page_shows(command, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    follow("tutorial-great3.md", command)
+
+
+def follow(page, command, script=None):
+    """Runs the commands of a page in the working folder and compares what they print."""
     text = (DOCS / page).read_text()
-    (tmp_path / "hsm.toml").write_text(blocks(text, "toml")[0])
+    for settings in blocks(text, "toml")[:1]:
+        Path("hsm.toml").write_text(settings)
     said = ""
     for line in "".join(blocks(text, "sh")).splitlines():
         if line == f"python {script}":
