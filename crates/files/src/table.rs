@@ -10,12 +10,11 @@
 //! `FILE[TABLE]` is a table of a FITS file, by name or number.
 
 use std::borrow::Cow;
-use std::collections::HashSet;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use crate::frames::polars::DataFrame;
-use crate::frames::{Metadata, frame, reals};
+use crate::frames::{Metadata, reals};
 
 use crate::error::FileError;
 use crate::open::{is_there, open};
@@ -295,48 +294,8 @@ pub fn read_parts(
 pub fn read_truth(path: &Path, most_rows: usize) -> Result<DataFrame, FileError> {
     match Ending::of(path) {
         Ending::Text => read_text(path, &TRUTH_COLUMNS),
-        Ending::Fits => read(path, Some(&TRUTH_COLUMNS), most_rows),
-        Ending::Parquet => parquet_truth(path, most_rows),
+        Ending::Fits | Ending::Parquet => read(path, Some(&TRUTH_COLUMNS), most_rows),
     }
-}
-
-// A truth file in Parquet. A small file may repeat one row millions of times, so that the positions are checked before
-// the shears are decoded.
-fn parquet_truth(path: &Path, most_rows: usize) -> Result<DataFrame, FileError> {
-    let [x, y, shears @ ..] = TRUTH_COLUMNS;
-    let mut columns = Vec::with_capacity(TRUTH_COLUMNS.len());
-    for position in [x, y] {
-        let table = parquet::read_numbers(path, Some(&[position]), most_rows)?;
-        check_positions(path, position, &numbers(&table, position, path)?)?;
-        columns.extend_from_slice(table.columns());
-    }
-    let table = parquet::read_numbers(path, Some(&shears), most_rows)?;
-    columns.extend_from_slice(table.columns());
-    frame(columns).map_err(|error| FileError::new(path, error))
-}
-
-/// Checks that positions along one axis can belong to a square grid: n × n rows have n different values or more.
-fn check_positions(path: &Path, name: &str, values: &[f64]) -> Result<(), FileError> {
-    let side = values.len().isqrt();
-    let mut different = HashSet::new();
-    let mut last = None;
-    for value in values.iter().map(|value| value.to_bits()) {
-        if different.len() >= side {
-            return Ok(());
-        }
-        if last.replace(value) != Some(value) {
-            different.insert(value);
-        }
-    }
-    if different.len() >= side {
-        return Ok(());
-    }
-    let message = format!(
-        "column `{name}` has {} different values in {} rows; expected {side} or more, for one row per cell of a square grid",
-        different.len(),
-        values.len()
-    );
-    Err(FileError::new(path, message))
 }
 
 /// Reads an ASCII or CSV table. `names` are the columns of a table without a header.

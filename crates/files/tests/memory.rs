@@ -1,13 +1,8 @@
 //! Memory for small files that claim to be large. One test, so that no other allocates at the same time.
 
 use std::fs;
-use std::path::Path;
 
 use shearq_files::fits::ImageReader;
-use shearq_files::frames::polars::{Column, DataFrame};
-use shearq_files::frames::{Metadata, frame};
-use shearq_files::parquet;
-use shearq_files::table::{MAX_ROWS, read_truth};
 
 /// Bytes in use beyond those before `work`, at most, and what it returns.
 fn peak<T>(work: impl FnOnce() -> T) -> (u64, T) {
@@ -22,28 +17,6 @@ fn peak<T>(work: impl FnOnce() -> T) -> (u64, T) {
     let before = bytes("VmRSS:");
     let result = work();
     (bytes("VmHWM:").saturating_sub(before), result)
-}
-
-fn write(path: &Path, table: &DataFrame) {
-    let mut bytes = Vec::new();
-    parquet::write(&mut bytes, table, &Metadata::new()).expect("written");
-    fs::write(path, bytes).expect("written");
-}
-
-/// A truth of `n` × `n` cells without shear, whose positions are `position` of a cell's number along an axis.
-fn truth(n: usize, position: impl Fn(usize) -> i64) -> DataFrame {
-    let x = (0..n * n).map(|k| position(k % n)).collect::<Vec<_>>();
-    let y = (0..n * n).map(|k| position(k / n)).collect::<Vec<_>>();
-    let g1 = Column::new("g1".into(), vec![0_i64; n * n]);
-    let mut g2 = g1.clone();
-    g2.rename("g2".into());
-    frame(vec![
-        Column::new("x".into(), x),
-        Column::new("y".into(), y),
-        g1,
-        g2,
-    ])
-    .expect("a frame")
 }
 
 #[cfg(target_os = "linux")]
@@ -65,24 +38,5 @@ fn small_files_do_not_claim_memory() {
     assert!(
         error.contains("TFIELDS is 16000000; expected a whole number, 0 to 999"),
         "{error}"
-    );
-
-    let path = folder.path().join("truth.parquet");
-    write(&path, &truth(4000, |_| 24));
-    let size = fs::metadata(&path).expect("file").len();
-    assert!(size < 4 << 20, "{size} bytes");
-    let (used, error) = peak(|| read_truth(&path, MAX_ROWS).err().map(|e| e.to_string()));
-    // One column is 128 MB, and it is copied once if the file has several row groups. Four columns are 512 MB.
-    assert!(used < 320 << 20, "{used} bytes");
-    let error = error.expect("one position");
-    assert!(
-        error.contains("column `x` has 1 different values in 16000000 rows; expected 4000 or more"),
-        "{error}"
-    );
-
-    write(&path, &truth(2100, |cell| cell as i64 * 48 + 24));
-    assert_eq!(
-        read_truth(&path, MAX_ROWS).expect("read").height(),
-        2100 * 2100
     );
 }
