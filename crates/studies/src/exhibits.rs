@@ -1,4 +1,4 @@
-//! The page of `shearq reproduce`: Fig. 3, Table 1 and Figs 8 to 11 of the paper, and what denoising does to ellipticities.
+//! The page of `shearq reproduce`: Fig. 3, Table 1 and Figs 8 to 11 of the paper.
 
 use shearq_pipeline::PipelineError;
 use shearq_pipeline::run::{measurers, simulated_steps};
@@ -8,7 +8,7 @@ use shearq_render::page::{Page, PageError};
 use shearq_render::table::{Cell, Table};
 use shearq_results::views::pages::{bins, spectrum_panel, steps_figure, steps_row};
 use shearq_scoring::Metrics;
-use shearq_simulate::kinds::{ImageType, SetKind, shares};
+use shearq_simulate::kinds::{SetKind, shares};
 use shearq_submissions::{Configuration, PsfForm, Published};
 
 use crate::calibration::{self, Curves};
@@ -136,29 +136,19 @@ fn per_set_table(results: &[SetResult]) -> Table {
         let best = own.score.convention_leaderboard;
         Cell::text(format!("{}/{best}", own.convention_matched))
     });
-    responses(&mut table, &rows, |(_, own)| vec![own.response]);
+    let mut response = |key, label, value: fn(&Response) -> (f64, f64), decimals| {
+        table.column(key, label, &rows, |(_, own)| {
+            measured(value(&own.response), decimals)
+        });
+    };
+    response("slope1", "slope e1", |r| (r.slope[0], r.slope_error[0]), 3);
+    response("slope2", "slope e2", |r| (r.slope[1], r.slope_error[1]), 3);
+    let scatter = |r: &Response| (r.rms_scatter(), r.rms_scatter_error());
+    response("scatter", "scatter / slope", scatter, 4);
     table.column("flagged", "Flagged", &rows, |(_, own)| {
         Cell::number(own.response.flagged as f64, 0)
     });
     table
-}
-
-// Columns with the slope and scatter of ellipticities, which are means over the responses of a row.
-fn responses<R>(table: &mut Table, rows: &[R], of: impl Fn(&R) -> Vec<Response>) {
-    let mut mean = |key, label, value: &dyn Fn(&Response) -> (f64, f64), decimals| {
-        table.column(key, label, rows, |row| {
-            // Sets have the same number of galaxies, so that an unweighted mean is the best.
-            let all: Vec<(f64, f64)> = of(row).iter().map(value).collect();
-            let count = all.len() as f64;
-            let mean = all.iter().map(|(value, _)| value).sum::<f64>() / count;
-            let variance: f64 = all.iter().map(|(_, error)| error * error).sum();
-            measured((mean, variance.sqrt() / count), decimals)
-        });
-    };
-    mean("slope1", "slope e1", &|r| (r.slope[0], r.slope_error[0]), 3);
-    mean("slope2", "slope e2", &|r| (r.slope[1], r.slope_error[1]), 3);
-    let scatter = |r: &Response| (r.rms_scatter(), r.rms_scatter_error());
-    mean("scatter", "scatter / slope", &scatter, 4);
 }
 
 // Fig. 9: true and measured shear power spectra, a panel per set, and its data.
@@ -216,37 +206,6 @@ fn metric_per_set(
     }
 }
 
-// Means over the sets of S/N 10, 20 and 40 for the configurations at `places`.
-fn denoising_table(results: &[SetResult], places: &[(usize, &str)]) -> Table {
-    let mut rows: Vec<(f64, &str, Vec<Response>)> = Vec::new();
-    for (snr, kind) in [
-        (10.0, ImageType::LowSnr),
-        (20.0, ImageType::Fiducial),
-        (40.0, ImageType::HighSnr),
-    ] {
-        for &(place, name) in places {
-            let own = |set: &&SetResult| SetKind::of(set.set).is_some_and(|own| own.image == kind);
-            let of_kind = results.iter().filter(own);
-            rows.push((
-                snr,
-                name,
-                of_kind.map(|set| set.results[place].response).collect(),
-            ));
-        }
-    }
-    rows.retain(|(.., responses)| !responses.is_empty());
-    let mut table = Table::titled("Ellipticities with and without denoising (simulated data)");
-    table.column("snr", "S/N", &rows, |(snr, ..)| Cell::number(*snr, 0));
-    table.column("submission", "Configuration", &rows, |(_, name, _)| {
-        Cell::text(*name)
-    });
-    responses(&mut table, &rows, |(.., responses)| responses.clone());
-    table.notes = vec![
-        "Reported ellipticity against the true shear-type one of each galaxy; scatter per component about the line, divided by the slope.".into(),
-    ];
-    table
-}
-
 /// The steps of one galaxy at S/N 10, 20 and 40, as in Fig. 3, if the plan has the configuration of that figure.
 pub fn steps(plan: &Plan) -> Result<Vec<ImageRow>, PipelineError> {
     let configuration = plan.configurations.iter().find(|own| own.name == RAW);
@@ -295,7 +254,6 @@ pub fn exhibits(
     let [at_raw, at_den] = [RAW, DENOISED].map(|name| names.iter().position(|own| own == name));
     if let (Some(at_raw), Some(at_den)) = (at_raw, at_den) {
         let both = [(at_raw, RAW), (at_den, DENOISED)];
-        page.table("denoising", &denoising_table(results, &both))?;
         let images = results.first().map_or(0, |set| set.images);
         let (figure, table) = power_spectra(results, at_den, DENOISED);
         let caption = format!(
