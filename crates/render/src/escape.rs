@@ -1,5 +1,5 @@
 //! Words that come from files, made harmless in each format that they are put into. One function a format;
-//! JSON is written by serde_json, which knows its own.
+//! serde_json escapes JSON itself.
 
 use std::borrow::Cow;
 
@@ -69,7 +69,7 @@ pub(super) fn latex(text: &str) -> String {
             '~' => (false, false, "\\textasciitilde{}".into()),
             '^' => (false, false, "\\textasciicircum{}".into()),
             '_' | '%' | '&' | '#' | '$' | '{' | '}' => (false, false, format!("\\{c}")),
-            // After the end of a row these would be taken for its options.
+            // LaTeX reads these as options after the end of a row.
             '[' | ']' | '*' => (false, false, format!("{{{c}}}")),
             '<' | '>' | '|' => (true, false, plain()),
             // The root covers the one letter that follows.

@@ -108,43 +108,29 @@ impl PictureFormat {
     }
 }
 
-/// A picture that can be drawn. Values that are not finite, or not positive on a logarithmic axis, are left out.
-pub trait Figure {
-    /// Width and height in points.
-    fn size(&self) -> (f64, f64);
-
-    /// The contents of a picture file. The same figure gives the same bytes.
-    fn render(&self, format: PictureFormat) -> Result<Vec<u8>, FigureError>;
-
-    // Writes the figure to `path`, as PNG or SVG by its extension.
-    fn save(&self, path: impl AsRef<Path>) -> Result<(), FigureError>
-    where
-        Self: Sized,
-    {
-        let path = path.as_ref();
-        let bytes = self.render(PictureFormat::of(path)?)?;
-        Ok(atomic::write(path, &bytes)?)
-    }
-}
-
 // Where a figure is drawn, in `UNITS` from its upper left corner.
 type Canvas<B> = DrawingArea<B, Shift>;
 type Drawn<B> = Result<(), DrawingAreaErrorKind<<B as DrawingBackend>::ErrorType>>;
 
-// What a kind of figure consists of; the two formats are common to all. A trait beside `Figure`, because `dyn Figure`
-// could not have a function that is generic in the backend.
-trait Drawing {
-    fn check(&self) -> Result<(), FigureError>;
-    fn extent(&self) -> (f64, f64);
-    fn draw<B: DrawingBackend>(&self, canvas: &Canvas<B>) -> Drawn<B>;
-}
+/// A picture that can be drawn. Values that are not finite, or not positive on a logarithmic axis, are left out.
+pub trait Figure: Sized {
+    /// Refuses lengths that differ.
+    fn check(&self) -> Result<(), FigureError> {
+        Ok(())
+    }
 
-impl<D: Drawing> Figure for D {
+    /// Width and height in points that it needs.
+    fn extent(&self) -> (f64, f64);
+
+    fn draw<B: DrawingBackend>(&self, canvas: &Canvas<B>) -> Drawn<B>;
+
+    /// Width and height in points.
     fn size(&self) -> (f64, f64) {
         let (width, height) = self.extent();
         (width.max(1.0).ceil(), height.max(1.0).ceil())
     }
 
+    /// The contents of a picture file. The same figure gives the same bytes.
     fn render(&self, format: PictureFormat) -> Result<Vec<u8>, FigureError> {
         self.check()?;
         let (width, height) = self.size();
@@ -155,7 +141,7 @@ impl<D: Drawing> Figure for D {
         match format {
             PictureFormat::Svg => {
                 let mut svg = String::new();
-                draw(self, SVGBackend::with_string(&mut svg, size))?;
+                draw_on(self, SVGBackend::with_string(&mut svg, size))?;
                 let (_, shapes) = svg.split_once(">\n").unwrap_or_default();
                 let shapes =
                     shapes.replace("dy=\"0.5ex\"", &format!("dy=\"{CENTRE_TO_BASELINE}em\""));
@@ -170,14 +156,21 @@ impl<D: Drawing> Figure for D {
             }
             PictureFormat::Png => {
                 let mut rgb = vec![0; 3 * size.0 as usize * size.1 as usize];
-                draw(self, BitMapBackend::with_buffer(&mut rgb, size))?;
+                draw_on(self, BitMapBackend::with_buffer(&mut rgb, size))?;
                 png(&rgb, size.0 as usize).map_err(failed)
             }
         }
     }
+
+    /// Writes the figure to `path`, as PNG or SVG by its extension.
+    fn save(&self, path: impl AsRef<Path>) -> Result<(), FigureError> {
+        let path = path.as_ref();
+        let bytes = self.render(PictureFormat::of(path)?)?;
+        Ok(atomic::write(path, &bytes)?)
+    }
 }
 
-fn draw<B: DrawingBackend>(figure: &impl Drawing, backend: B) -> Result<(), FigureError> {
+fn draw_on<B: DrawingBackend>(figure: &impl Figure, backend: B) -> Result<(), FigureError> {
     let canvas = backend.into_drawing_area();
     canvas.fill(&WHITE).map_err(failed)?;
     figure.draw(&canvas).map_err(failed)?;
@@ -224,7 +217,7 @@ fn place((x, y): (f64, f64)) -> (i32, i32) {
     (units(x), units(y))
 }
 
-// In a PNG, `plotters` writes texts that are centred upwards with their baseline so many em below the place, and 0.27 em
+// Distance of the baseline from the place of a text that `plotters` centres upwards in a PNG, in em; 0.27 em
 // in an SVG.
 const CENTRE_TO_BASELINE: f64 = 0.12;
 // Half the height of digits and capitals above that, in em.
@@ -319,7 +312,7 @@ fn frame<B: DrawingBackend>(
     line(canvas, vec![(x1, y0), (x1, y1), (x0, y1)], INK, LINE)
 }
 
-// Height of a text with the space beside it; zero for an empty text.
+// Height of a text with its margin; zero for an empty text.
 fn room(text: &str, size: f64) -> f64 {
     match text {
         "" => 0.0,

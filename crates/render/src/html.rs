@@ -105,7 +105,7 @@ pub struct Picture {
 impl Picture {
     /// Draws a figure for a report.
     pub fn draw(
-        figure: &dyn Figure,
+        figure: &impl Figure,
         name: impl Into<String>,
         caption: impl Into<String>,
     ) -> Result<Self, FigureError> {

@@ -1,4 +1,4 @@
-//! Tables, plots and HTML pages, independent of what they show.
+//! Tables, plots and HTML pages, for any contents.
 //!
 //! * [`table`]: rows and columns, as text for a terminal, Markdown, LaTeX, CSV or JSON; [`terminal`] fits them to a width.
 //! * [`figure`]: curves, points with errors, and images, as SVG and PNG.

@@ -1,4 +1,4 @@
-//! A report with the pictures and data of its exhibits beside it.
+//! A report, and a folder with the pictures and data of its exhibits.
 
 use std::path::Path;
 
@@ -79,7 +79,7 @@ impl<'a> Page<'a> {
         Ok(())
     }
 
-    /// Writes a table's data beside the report.
+    /// Writes a table's data into the folder of the report.
     pub fn data(&self, name: &str, exhibit: &Table) -> Result<(), PageError> {
         let text = exhibit.render(TableFormat::Csv);
         let path = self.out.join(format!("data/{name}.csv"));

@@ -5,8 +5,8 @@ pub enum TableFormat {
     #[default]
     Table,
     Json,
-    /// Comma-separated, full precision, value and error in columns of their own; words that a spreadsheet
-    /// would take for a formula have an apostrophe in front.
+    /// Comma-separated, full precision, value and error in separate columns; an apostrophe before words that a
+    /// spreadsheet would execute as a formula.
     Csv,
     Markdown,
     Latex,
@@ -17,7 +17,7 @@ pub enum Cell {
     /// Nothing, in a column of words or of numbers.
     Empty,
     Text(String),
-    /// A number, perhaps with an error, to be printed with so many decimals.
+    /// A number, perhaps with an error, and the decimals that are printed.
     Number {
         // The value; not a number is printed as a dash.
         value: f64,
@@ -118,7 +118,7 @@ fn decimals_of(error: f64, otherwise: usize) -> usize {
     }
 }
 
-// Decimals that give a number so many significant `digits`.
+// Decimals that give a number this number of significant `digits`.
 fn decimals_for(number: f64, digits: i32) -> usize {
     // Rounding can lengthen a number: 0.0996 is 0.10.
     let before = usize::try_from(digits - 1).unwrap_or(0);

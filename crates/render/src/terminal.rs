@@ -8,7 +8,7 @@ use unicode_width::UnicodeWidthStr;
 use crate::escape;
 use crate::table::{Cell, Table};
 
-// Blanks after a column's contents: one of its own, and one between columns.
+// Blanks after a column's contents: its margin, and one between columns.
 const PADDING: usize = 2;
 // Words longer than this may be broken.
 const LONGEST_WORD: usize = 16;
@@ -75,7 +75,7 @@ pub fn fitted(table: &Table, width: Option<usize>) -> String {
         // Where they leave little room for anything else, the first has to do.
         let names = if 2 * room > width { 1 } else { words.max(1) };
         let (names, mut rest) = all.split_at(names);
-        // As many as fit at a time, one at least.
+        // The columns that fit together, at least one.
         loop {
             let mut part: Vec<&Column> = names.iter().collect();
             let mut used: usize = names.iter().map(least).sum();

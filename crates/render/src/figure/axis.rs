@@ -34,7 +34,7 @@ pub(super) fn shown(value: f64, log: bool) -> bool {
 }
 
 impl Axis {
-    /// An axis of `length` points around those of `values` that can be shown, or exactly over `range` if it is given and
+    /// An axis of `length` points around the `values` that can be shown, or exactly over `range` if it is given and
     /// makes sense.
     pub fn new(
         values: impl Iterator<Item = f64>,
@@ -158,7 +158,7 @@ fn padded(places: impl Iterator<Item = f64>, log: bool) -> (f64, f64) {
 type Tick = (f64, String);
 type Ticks = Vec<Tick>;
 
-// Round ticks, as many as fit up to nine and no nearer than `least`.
+// Round ticks: the largest number up to nine that fits, at distances of at least `least`.
 fn linear_ticks(low: f64, high: f64, least: f64, fits: &dyn Fn(&[Tick]) -> bool) -> Ticks {
     let exponent = low.abs().max(high.abs()).log10().floor() as i32;
     // Up to 99999 and down to two zeros after the point, numbers read well without an exponent.
@@ -196,7 +196,7 @@ fn round_step(step: f64) -> f64 {
 }
 
 // Ticks of 1, 2, 5 × 10ⁿ from 10^`low` to 10^`high`, fewer where they do not fit, with the other multiples as minor
-// ticks. Where no two of them fit, those of a linear axis.
+// ticks. Where no two of them fit, the ticks of a linear axis.
 fn log_ticks(low: f64, high: f64, fits: &dyn Fn(&[Tick]) -> bool) -> (Ticks, Vec<f64>) {
     let decades = low.floor() as i32..=high.ceil() as i32;
     let places = |factors: RangeInclusive<i32>, stride: i32| {

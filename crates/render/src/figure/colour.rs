@@ -80,7 +80,7 @@ impl ColourMap {
         RGBColor(r, g, b)
     }
 
-    /// The ends of the scale of `values`, around zero for a diverging map; NaN if there are none.
+    /// The ends of the scale of `values`, around zero for a diverging map; NaN without values.
     pub(super) fn limits<'a>(self, values: impl Iterator<Item = &'a f64>) -> (f64, f64) {
         let finite = values.filter(|value| super::axis::shown(**value, false));
         let (low, high) = finite.fold((f64::NAN, f64::NAN), |(low, high), value| {

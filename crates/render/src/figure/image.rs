@@ -8,8 +8,8 @@ use plotters::style::Color;
 use super::axis::short;
 use super::colour::{ColourMap, position};
 use super::{
-    Canvas, Drawing, Drawn, FigureError, LABEL_SIZE, LEFT, MARGIN, MIDDLE, RIGHT, TITLE_SIZE,
-    frame, place, room, text_width, write, write_upwards,
+    Canvas, Drawn, Figure, LABEL_SIZE, LEFT, MARGIN, MIDDLE, RIGHT, TITLE_SIZE, frame, place, room,
+    text_width, write, write_upwards,
 };
 
 // The em of the numbers at colour bars.
@@ -27,7 +27,7 @@ const GAP: f64 = 18.0;
 pub enum Stretch {
     #[default]
     Linear,
-    /// By asinh, which shows faint wings beside a bright centre: evenly up to a tenth of the scale,
+    /// By asinh, which shows faint wings of a bright centre: evenly up to a tenth of the scale,
     /// logarithmically beyond.
     Asinh,
 }
@@ -65,11 +65,7 @@ impl ImageGrid {
     }
 }
 
-impl Drawing for ImageGrid {
-    fn check(&self) -> Result<(), FigureError> {
-        Ok(())
-    }
-
+impl Figure for ImageGrid {
     fn extent(&self) -> (f64, f64) {
         let (label, panels) = self.widths();
         let row = LABEL_SIZE + 6.0 + IMAGE_SIDE_PX + BAR_ROOM;
@@ -173,7 +169,7 @@ fn draw_panel<B: DrawingBackend>(
         (limits.1, RIGHT, left + IMAGE_SIDE_PX),
     ] {
         if value.is_finite() {
-            // What is nothing beside the scale reads as zero.
+            // Limits below 1/500 of the scale are printed as zero.
             let none = value.abs() < 2e-3 * (limits.1 - limits.0);
             let text = short(if none { 0.0 } else { value });
             write(canvas, &text, NUMBER_SIZE, anchor, (x, below))?;

@@ -8,7 +8,7 @@ use plotters::style::{Color, RGBColor, TRANSPARENT};
 use super::axis::{Axis, Scale, shown};
 use super::colour::{GREY, series_colour};
 use super::{
-    Canvas, Drawing, Drawn, FigureError, INK, LABEL_SIZE, LEFT, LINE, MARGIN, MIDDLE, TICK_SIZE,
+    Canvas, Drawn, Figure, FigureError, INK, LABEL_SIZE, LEFT, LINE, MARGIN, MIDDLE, TICK_SIZE,
     TITLE_SIZE, TO_CENTRE, font, frame, line, place, room, text_width, units, widest, write,
 };
 
@@ -45,7 +45,7 @@ pub struct Series {
     pub label: String,
     pub x: Vec<f64>,
     pub y: Vec<f64>,
-    /// Half the length of an error bar at each point, as many as in `x`.
+    /// Half the length of the error bar of each point.
     pub y_err: Option<Vec<f64>>,
     pub style: Style,
     /// Which colour of the palette of eight; the last is grey.
@@ -111,15 +111,15 @@ pub struct LinePlot {
     pub x_label: String,
     pub y_label: String,
     pub x_log: bool,
-    /// Whether the horizontal axis is of whole numbers, as those of sets.
+    /// Whether the horizontal axis has whole numbers, such as sets.
     pub x_whole: bool,
     /// Names at x = 0, 1, … instead of numbers. They stand below each other, and x runs down and y across, so that
     /// long names are read without turning the head.
     pub x_names: Vec<String>,
     pub y_log: bool,
-    /// The ends of the horizontal axis; from the data if there are none.
+    /// The ends of the horizontal axis; `None` to take them from the data.
     pub x_range: Option<(f64, f64)>,
-    /// The ends of the vertical axis; from the data if there are none.
+    /// The ends of the vertical axis; `None` to take them from the data.
     pub y_range: Option<(f64, f64)>,
     pub bands: Vec<Band>,
     /// What is drawn, the last on top.
@@ -230,7 +230,7 @@ impl LinePlot {
         for band in &self.bands {
             let ends = [(x.low, band.low), (x.high, band.high)];
             let [(x0, y0), (x1, y1)] = ends.map(|(x, end)| at(x, y.clamped(end)));
-            // A band that is narrow on this axis shall not be taken for a line of the grid.
+            // A band that is narrow on this axis must differ from a line of the grid.
             let wider = |a: i32, b: i32| (units(THINNEST) - (b - a).abs()).max(0) / 2;
             let (dx, dy) = (wider(x0, x1), wider(y0, y1));
             let corners = [(x0 - dx, y0 + dy), (x1 + dx, y1 - dy)];
@@ -337,7 +337,7 @@ fn draw_series<B: DrawingBackend>(
     Ok(())
 }
 
-impl Drawing for LinePlot {
+impl Figure for LinePlot {
     fn check(&self) -> Result<(), FigureError> {
         let mut series = self.series.iter();
         series.try_for_each(|series| series.check(&self.title))
@@ -379,7 +379,7 @@ impl From<&LinePlot> for PanelGrid {
 struct Layout<'a> {
     columns: usize,
     frame: (f64, f64),
-    // Space of the numbers below and beside a frame, and of its labels.
+    // Space of the numbers below and to the left of a frame, and of its labels.
     numbers: [f64; 2],
     labels: [f64; 2],
     // Whether all plots have the same label across, upwards.
@@ -452,7 +452,7 @@ impl PanelGrid {
         }
     }
 
-    // The entries that have a label, each once, in as many rows as `width` asks for.
+    // The entries that have a label, each once, in rows of at most `width`.
     fn legend(&self, width: f64) -> Vec<Vec<(&str, Sample)>> {
         let mut entries: Vec<(&str, Sample)> = Vec::new();
         for entry in self.plots.iter().flat_map(LinePlot::legend) {
@@ -480,7 +480,7 @@ fn entry_width(label: &str) -> f64 {
     SAMPLE_ROOM + text_width(label, LABEL_SIZE) + 1.5 * MARGIN
 }
 
-impl Drawing for PanelGrid {
+impl Figure for PanelGrid {
     fn check(&self) -> Result<(), FigureError> {
         self.plots.iter().try_for_each(LinePlot::check)
     }
