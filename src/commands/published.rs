@@ -3,11 +3,11 @@
 use std::path::{Path, PathBuf};
 
 use shearq_dataset::threads::Pool;
-use shearq_render::table::{Table, TableFormat};
+use shearq_render::table::Table;
 use shearq_results::published::{Branch, Challenge, Packing, Score, Truth, ranking};
 use shearq_results::submit::check::Finding;
 
-use crate::{print, tell};
+use crate::tell;
 
 pub(super) fn branch_of(challenge: &str, branch: Option<&str>) -> anyhow::Result<Box<dyn Branch>> {
     Ok(Challenge::named(challenge)?.branch(branch)?)
@@ -17,23 +17,15 @@ pub(super) fn score(
     branch: &dyn Branch,
     truth: Truth<'_>,
     submissions: &[PathBuf],
-    format: TableFormat,
     threads: usize,
-) -> anyhow::Result<Option<Table>> {
+) -> anyhow::Result<Score> {
     let [submission] = submissions else {
         anyhow::bail!(
             "--challenge: found {} submissions, expected one",
             submissions.len()
         );
     };
-    let score = branch.score(truth, submission, &Pool::new(threads)?)?;
-    // One object with the challenge's names, not the rows of a table.
-    if format == TableFormat::Json {
-        print(&(serde_json::to_string_pretty(&score.json())? + "\n"))?;
-        return Ok(None);
-    }
-    let title = format!("{}: {}", branch.title(), submission.display());
-    Ok(Some(score.table(title)))
+    Ok(branch.score(truth, submission, &Pool::new(threads)?)?)
 }
 
 pub(super) fn leaderboard(

@@ -128,7 +128,7 @@ const NOT_PLAIN: [&str; 7] = [
 ];
 
 // Options without a meaning for submissions to other challenges.
-const GREAT10_ONLY: [&str; 21] = [
+const GREAT10_ONLY: [&str; 20] = [
     "data",
     "measured",
     "foreign",
@@ -147,7 +147,6 @@ const GREAT10_ONLY: [&str; 21] = [
     "store",
     "wide",
     "metrics",
-    "path",
     "definition",
     "convention",
 ];
@@ -159,14 +158,20 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             path: truth,
             psf: arguments.psf.as_deref(),
         };
-        let table = published::score(
-            &*branch,
-            truth,
-            &arguments.catalogues,
-            arguments.printing.format(),
-            arguments.threads.number(),
-        )?;
-        return table.map_or(Ok(()), |table| arguments.printing.print(&table));
+        let (files, threads) = (&arguments.catalogues, arguments.threads.number());
+        let score = published::score(&*branch, truth, files, threads)?;
+        let title = format!("{}: {}", branch.title(), files[0].display());
+        match arguments.printing.format() {
+            // One object with the challenge's names, not the rows of a table.
+            TableFormat::Json => print(&(serde_json::to_string_pretty(&score.json())? + "\n"))?,
+            _ => arguments.printing.print(&score.table(title.clone()))?,
+        }
+        let made_by = [("Truth", truth.path), ("Submission", &*files[0])];
+        let made_by = made_by.map(|(what, path)| (what.to_owned(), path.display().to_string()));
+        let sections = || Ok(vec![score.section(&title)?]);
+        return arguments
+            .report
+            .save(&title, sections, || Ok(made_by.into()));
     }
     let options = Options {
         definition: arguments.settings.definition,

@@ -82,12 +82,20 @@ fn json_has_the_figures_of_the_challenge() {
             }
         }
         let q = if branch.ends_with("constant") {
-            "jackknife_Q_c"
+            "Q_c"
         } else {
-            "jackknife_Q_v"
+            "Q_v"
         };
-        assert!(found[q].as_f64().unwrap() > 0.0);
+        assert!(found[format!("jackknife_{q}")].as_f64().unwrap() > 0.0);
+        let folder = tempfile::tempdir().unwrap();
+        let report = folder.path().join("report.html");
+        let _ = write!(line, " --report {}", report.display());
         assert!(succeed(&words(&line)).contains(branch));
+        let page = fs::read_to_string(report).unwrap();
+        assert!(
+            page.contains("data:image/svg+xml") && page.contains(q),
+            "{branch}"
+        );
     }
     assert_eq!(cases, 5);
 }

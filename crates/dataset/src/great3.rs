@@ -9,7 +9,7 @@ use shearq_files::FileError;
 use shearq_files::open::{SETTINGS, is_there, read_to_string};
 use shearq_files::table::{self, MAX_ROWS};
 
-use crate::layout::{DataFolder, Layout, MAX_STAMP};
+use crate::layout::{DataFolder, Layout, MAX_STAMP, endings};
 use crate::listing;
 use crate::mosaic::Mosaic;
 use crate::pattern::fill;
@@ -40,7 +40,7 @@ pub struct Branch {
 
 /// The layout of a folder with the files of a branch.
 pub(crate) fn detect(root: &Path) -> Result<Option<Layout>, FileError> {
-    let images = listing::find(root, GALAXIES, &[""], &[])?;
+    let images = listing::find(root, GALAXIES, endings(GALAXIES), &[])?;
     let catalogue = |set: &u32| root.join(fill(GALAXY_CATALOGUES, *set, 0));
     // Images alone may be anyone's.
     let first = images
@@ -51,8 +51,10 @@ pub(crate) fn detect(root: &Path) -> Result<Option<Layout>, FileError> {
     let Some(path) = first else {
         return Ok(None);
     };
+    // The first catalogue stands for all: the stamps of a branch have one side, and its shear is constant or varies in all subfields.
     let galaxies = GalaxyCatalogue::read(&path)?;
-    let interpolated = listing::find(root, PSF_IMAGES, &[""], &[])?;
+    // Beside the images, so that a folder of links to released files can have them.
+    let interpolated = listing::find(root, PSF_IMAGES, endings(PSF_IMAGES), &[])?;
     let psf_star = match interpolated.is_empty() {
         true => STAR_FIELDS,
         false => PSF_IMAGES,
@@ -116,6 +118,7 @@ impl GalaxyCatalogue {
         let table = table::read(path, Some(&WANTED), MAX_ROWS)?;
         let column = |name: &str| table::numbers(&table, name, path);
         let (x, y, id) = (column("x")?, column("y")?, column("ID")?);
+        // Fractions would be centroids, of which the challenge stated none; a column of them was matched by mistake.
         let whole = |row: usize, name: &str, value: f64| {
             if value.fract() == 0.0 && (0.0..1e9).contains(&value) {
                 return Ok(value as usize);
@@ -141,6 +144,7 @@ impl GalaxyCatalogue {
 
     /// Pixels a side of the stamps, which no header states: the distance of neighbours.
     fn stamp(&self) -> Result<usize, FileError> {
+        // Not side of the image over √galaxies, because a part of a subfield need not be square.
         let columns: BTreeSet<usize> = self.galaxies.iter().map(|galaxy| galaxy.x).collect();
         let first = columns.first().map(|x| 2 * (x + 1));
         let distance = columns.iter().zip(columns.iter().skip(1));
@@ -171,6 +175,7 @@ impl GalaxyCatalogue {
             let message = format!("{found} galaxies; expected {expected}, one per stamp");
             return Err(FileError::new(&self.path, message));
         }
+        // By place: nothing states that the rows of the table are in the order of the stamps.
         let mut taken = vec![false; expected];
         let mut places = Vec::with_capacity(expected);
         for Galaxy { x, y, id } in &self.galaxies {

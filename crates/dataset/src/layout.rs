@@ -293,7 +293,7 @@ pub fn truth_is_there(path: &Path) -> Result<(), FileError> {
 }
 
 // Further endings of the names of images: of gzip and fpack.
-fn endings(pattern: &str) -> &'static [&'static str] {
+pub(crate) fn endings(pattern: &str) -> &'static [&'static str] {
     match pattern.ends_with(".fits") || pattern.ends_with(".fit") {
         true => &["", ".gz", ".fz"],
         false => &[""],

@@ -38,7 +38,7 @@ const WINGS_RATIO: f64 = 0.6;
 // not kept.
 const GRADIENT_SHARE: f64 = 0.04;
 // Mean offset of the galaxies in px: between half a pixel and one pixel along both axes (0.71 and 1.41).
-const OFFSET: f64 = 0.85;
+pub(crate) const OFFSET: f64 = 0.85;
 // Scatter of the galaxies' positions in px. Chosen by hand.
 const POSITION_SCATTER: f64 = 2.0;
 // Relative difference of given noise and noise in the corners: it changes m by 0.005 at S/N 20. Command and seed were not

@@ -18,7 +18,7 @@ use shearq_submissions::{Calibration, Configuration, NoiseSource};
 
 use crate::calibration::mean_response;
 use crate::error::{EpochError, MeasureError, length};
-use crate::examine::{EXAMINED_PSFS, Estimate, Examination, enough, examined_rows};
+use crate::examine::{EXAMINED_PSFS, Estimate, Examination, OFFSET, enough, examined_rows};
 use crate::measurement::{Flag, Measurement};
 use crate::measurer::{Epoch, ImageNoise, ImageWorker, Measurer, Steps, Worker};
 use crate::noise::{NoisePlan, NoiseSurvey, StampNoise, Survey};
@@ -348,6 +348,8 @@ pub struct Session<'n> {
     examined: Vec<usize>,
     /// Median of the positive levels of the examined stamps, if each stamp has its own.
     typical_level: Option<f64>,
+    /// Mean offset (x, y) of the first row's galaxies from the centres of their stamps, in pixels.
+    offset: [f64; 2],
     warnings: Vec<Warning>,
     /// Of the images that contain further epochs of the galaxies.
     epochs: Vec<Arc<Session<'n>>>,
@@ -462,6 +464,14 @@ impl<'n> Session<'n> {
             0 => Frame::Pixel,
             _ => source.jacobians(0)?.map_or(Frame::Pixel, |_| Frame::Sky),
         };
+        let offsets = match rows.count {
+            0 => None,
+            _ => source.offsets(0)?,
+        };
+        let offset = offsets.map_or([0.0; 2], |all| {
+            let count = all.len().max(1) as f64;
+            [0, 1].map(|k| all.iter().map(|offset| offset[k]).sum::<f64>() / count)
+        });
         let mut session = Session {
             measurer: measurer.clone(),
             rows,
@@ -472,6 +482,7 @@ impl<'n> Session<'n> {
             stars,
             examined,
             typical_level: None,
+            offset,
             warnings,
             epochs: Vec::new(),
         };
@@ -973,7 +984,15 @@ impl Session<'_> {
         // Levels of their own serve images of several depths.
         let one_level = self.noise.levels().is_none();
         let mut warnings = stamps.warnings();
-        warnings.retain(|own| one_level || !matches!(own, Warning::Depths { .. }));
+        warnings.retain(|own| match own {
+            Warning::Depths { .. } => one_level,
+            // Galaxies of a dithered epoch are where they were said to be.
+            Warning::OffCentre { offset, .. } => {
+                let away = [0, 1].map(|k| offset[k] - self.offset[k]);
+                away[0].hypot(away[1]) > OFFSET
+            }
+            _ => true,
+        });
         warnings.extend(match &self.noise {
             KnownNoise::Given(level) => stamps.given_noise(*level),
             KnownNoise::GivenEach(_) | KnownNoise::StatedEach(_) => scaled

@@ -14,6 +14,8 @@ use shearq_dataset::threads::Pool;
 use shearq_files::frames::reals;
 use shearq_files::table::{self, MAX_ROWS, Place};
 use shearq_files::{FileError, atomic};
+use shearq_render::figure::{FigureError, LinePlot, PanelGrid};
+use shearq_render::html::{Block, Picture, Section};
 use shearq_render::table::{Cell, Table};
 
 /// A challenge by the name that users type.
@@ -166,6 +168,8 @@ pub struct Score {
     /// Name of the branch in JSON, if the challenge has several.
     pub branch: Option<String>,
     pub figures: Vec<Figure>,
+    /// What the figures come from, for a report.
+    pub plots: Vec<LinePlot>,
 }
 
 impl Score {
@@ -188,6 +192,21 @@ impl Score {
             found.insert(format!("jackknife_{key}"), figure.jackknife.into());
         }
         found.into()
+    }
+
+    /// The section of a report.
+    pub fn section(&self, title: &str) -> Result<Section, FigureError> {
+        let mut blocks = vec![Block::Table(self.table(title.to_owned()))];
+        if !self.plots.is_empty() {
+            let panels = PanelGrid {
+                title: String::new(),
+                columns: 2,
+                plots: self.plots.clone(),
+            };
+            let caption = "Fields of the submission beside the truth. Dashed: the requirement of the challenge.";
+            blocks.push(Block::Figure(Picture::draw(&panels, "score", caption)?));
+        }
+        Ok(Section::new("score", title, blocks))
     }
 
     pub fn table(&self, title: String) -> Table {

@@ -138,6 +138,7 @@ impl Branch for Great08 {
                 requirement: Some(1000.0),
                 decimals: 1,
             }],
+            plots: Vec::new(),
         })
     }
 

@@ -11,10 +11,12 @@ use shearq_dataset::threads::Pool;
 use shearq_files::open::is_there;
 use shearq_files::{FileError, table};
 use shearq_quantities::Shear;
-use shearq_quantities::statistics::median;
+use shearq_quantities::statistics::{RunningMean, median};
+use shearq_render::figure::{LinePlot, Series, Style};
 use shearq_scoring::aperture::{ApertureMass, Lattice, LatticeShear, SEPARATION_BINS, separations};
 use shearq_scoring::great3::{
-    ConstantField, Observation, PlusCross, REQUIRED_C, REQUIRED_M, constant_score, variable_score,
+    Bias, ConstantField, Observation, PlusCross, REQUIRED_C, REQUIRED_M, along, constant_score,
+    position_angle, variable_score,
 };
 
 use crate::mean::mean_shears;
@@ -523,6 +525,79 @@ impl Great3 {
     }
 }
 
+// The error of each field's shear against the true shear, along the PSF and at 45° to it, with the fit (c, m) and the requirement.
+fn residual_plots(fields: &[ConstantField], biases: [(Bias, Bias); 2]) -> Vec<LinePlot> {
+    let plots = [("₊", true), ("×", false)].into_iter().zip(biases);
+    let plots = plots.map(|((name, is_plus), (c, m))| {
+        let of = |g: Shear, field: &ConstantField| {
+            let PlusCross { plus, cross } = along(g, position_angle(field.psf));
+            if is_plus { plus } else { cross }
+        };
+        let x: Vec<f64> = fields.iter().map(|own| of(own.truth, own)).collect();
+        let submitted = fields.iter().map(|own| of(own.submitted, own));
+        let y = submitted
+            .zip(&x)
+            .map(|(g, truth)| 1e3 * (g - truth))
+            .collect();
+        let most = x.iter().fold(0.0_f64, |most, g| most.max(g.abs()));
+        let ends = vec![-most, 0.0, most];
+        let line = |name: &str, c: f64, m: f64, size: &dyn Fn(f64) -> f64, style| {
+            let y = ends.iter().map(|g| 1e3 * (c + m * size(*g))).collect();
+            Series::new(name, ends.clone(), y, style, 7)
+        };
+        LinePlot {
+            title: format!(
+                "m{name} = ({:.1} ± {:.1})·10⁻³, c{name} = ({:.1} ± {:.1})·10⁻⁴",
+                1e3 * m.value,
+                1e3 * m.error,
+                1e4 * c.value,
+                1e4 * c.error
+            ),
+            x_label: format!("true g{name}"),
+            y_label: format!("g{name} − true g{name}, 10⁻³"),
+            series: vec![
+                Series::new("fields", x, y, Style::Points, 0),
+                line("c + m g", c.value, m.value, &|g| g, Style::Line),
+                line(
+                    "requirement",
+                    REQUIRED_C,
+                    REQUIRED_M,
+                    &f64::abs,
+                    Style::Dashed,
+                ),
+                line("", -REQUIRED_C, -REQUIRED_M, &f64::abs, Style::Dashed),
+            ],
+            ..LinePlot::default()
+        }
+    });
+    plots.collect()
+}
+
+// ⟨M_ap²⟩ of the submission and of the truth, means over fields with the error by their scatter.
+fn mass_plot(truth: &[[f64; SEPARATION_BINS]], submitted: &[[f64; SEPARATION_BINS]]) -> LinePlot {
+    let theta: Vec<f64> = separations().iter().map(|centre| centre.0).collect();
+    let mean = |fields: &[[f64; SEPARATION_BINS]], b: usize| {
+        let mut mean = RunningMean::default();
+        fields.iter().for_each(|own| mean.add(1e6 * own[b]));
+        mean
+    };
+    let means = |fields| (0..SEPARATION_BINS).map(move |b| mean(fields, b));
+    let error = |own: RunningMean| own.deviation() / (own.count() as f64).sqrt();
+    let values = |fields| means(fields).map(|own| own.mean()).collect();
+    LinePlot {
+        title: "Aperture mass dispersion".into(),
+        x_label: "θ, degrees".into(),
+        y_label: "⟨M_ap²⟩, 10⁻⁶".into(),
+        x_log: true,
+        series: vec![
+            Series::new("true", theta.clone(), values(truth), Style::Line, 2),
+            Series::new("submitted", theta, values(submitted), Style::Points, 5)
+                .with_errors(means(submitted).map(error).collect()),
+        ],
+        ..LinePlot::default()
+    }
+}
+
 fn field_of(path: &Path, k: usize, found: f64, fields: usize) -> Result<usize, FileError> {
     let (row, last) = (k + 1, fields - 1);
     let fault = || FileError::new(path, Fault::NotAField { row, found, last });
@@ -611,6 +686,7 @@ impl Branch for Great3 {
     fn score(&self, truth: Truth<'_>, submission: &Path, pool: &Pool) -> Result<Score, FileError> {
         let of_submission = |error| FileError::new(submission, error);
         let mut figures = Vec::new();
+        let plots;
         if self.constant {
             let shears = self.true_shears(truth.path)?;
             let psfs = self.psfs(truth, shears.len())?;
@@ -624,6 +700,10 @@ impl Branch for Great3 {
                 })
                 .collect();
             let found = constant_score(&fields, self.observation).map_err(of_submission)?;
+            plots = residual_plots(
+                &fields,
+                [(found.c.plus, found.m.plus), (found.c.cross, found.m.cross)],
+            );
             figures.push(Figure {
                 key: "Q_c",
                 value: found.q,
@@ -658,6 +738,7 @@ impl Branch for Great3 {
             let score = |submitted: &[_]| variable_score(submitted, &masses, self.observation);
             let found = score(&submitted).map_err(of_submission)?;
             let perfect = score(&masses).map_err(of_submission)?;
+            plots = vec![mass_plot(&masses, &submitted)];
             figures.push(Figure {
                 key: "Q_v",
                 value: found.q,
@@ -671,6 +752,7 @@ impl Branch for Great3 {
         Ok(Score {
             branch: Some(self.to_string()),
             figures,
+            plots,
         })
     }
 
