@@ -77,14 +77,15 @@ struct Summing {
     #[arg(value_name = "CATALOGUE", required_unless_present_any = ["merge", "plan", "example"])]
     catalogues: Vec<PathBuf>,
     /// Catalogues of another program on the same galaxies, in the same order. The output contains both and the
-    /// difference, with paired errors.
+    /// difference, with paired errors. A --truth table by catalogue contains those of both, or names of files that both
+    /// have, in two folders.
     #[arg(long, value_name = "CATALOGUE", num_args = 1.., conflicts_with_all = ["sums", "shard", "bootstrap", "seed", "fail_above", "junit", "plot", "path"])]
     against: Vec<PathBuf>,
     /// True g1 of all catalogues.
     #[arg(
         long,
         value_name = "G1",
-        allow_negative_numbers = true,
+        allow_hyphen_values = true,
         requires = "g2",
         conflicts_with = "truth"
     )]
@@ -93,7 +94,7 @@ struct Summing {
     #[arg(
         long,
         value_name = "G2",
-        allow_negative_numbers = true,
+        allow_hyphen_values = true,
         requires = "g1",
         conflicts_with = "truth"
     )]

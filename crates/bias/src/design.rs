@@ -50,6 +50,21 @@ pub struct Repeated {
     pub rows: u64,
 }
 
+/// A row that has much of the sum of all responses. It is reported, not removed.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Dominant {
+    /// The row, from 1.
+    pub row: u64,
+    /// The component, 0 or 1.
+    pub component: usize,
+    /// Its response, times its weight.
+    pub response: f64,
+    /// The mean of all rows that count.
+    pub mean: f64,
+    /// The part of the sum that it has.
+    pub share: f64,
+}
+
 /// What is known of a catalogue: its rows, how many of them do not count and why, and its ranges. A row is counted in the
 /// first of these reasons that applies.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
@@ -75,6 +90,9 @@ pub struct Catalogue {
     /// Pairs of numbers that many rows share exactly.
     #[serde(default)]
     pub repeated: Vec<Repeated>,
+    /// A row with much of the response.
+    #[serde(default)]
+    pub dominant: Option<Dominant>,
     /// Range of the true shears g1 and g2 of the rows that count. Designs are recognised from it.
     pub shear: [Range; 2],
     /// Range of the ellipticities e1 and e2 of the rows that count.

@@ -40,7 +40,7 @@ mod sums;
 mod units;
 mod verdict;
 
-pub use design::{Catalogue, Design, Grouping, Missing, Range, Repeated, group};
+pub use design::{Catalogue, Design, Dominant, Grouping, Missing, Range, Repeated, group};
 pub use error::BiasError;
 pub use estimate::{Errors, Estimate, Measured, QUANTITIES, Quantity, difference, estimate};
 pub use stars::{Behind, StarNoise};

@@ -229,6 +229,23 @@ pub fn of_design(result: &BiasResult) -> Vec<String> {
             FEW_EFFECTIVE * all.galaxies as f64
         ));
     }
+    let catalogues = result.about.catalogues.iter();
+    let mut dominant = catalogues.filter_map(|own| Some((own, own.dominant.as_ref()?)));
+    if let Some((catalogue, own)) = dominant.next() {
+        let more = match dominant.count() {
+            0 => String::new(),
+            more => format!(" (and {more} more catalogues likewise)"),
+        };
+        let k = own.component + 1;
+        lines.push(format!(
+            "{}: row {} has {:.1} % of the sum of the response R{k}{k} (found {}, expected about {:.3}), and changes m{k} by about as much{more}. Try: check its measurement, or flag it",
+            catalogue.name,
+            own.row,
+            100.0 * own.share,
+            own.response,
+            own.mean,
+        ));
+    }
     if let Some(alpha) = all.value("alpha")
         && alpha.value < OTHER_PSF.min(-IMPLAUSIBLE_SIGNIFICANCE * alpha.error)
     {
