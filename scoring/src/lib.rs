@@ -56,7 +56,8 @@ pub use catalogue::{FieldSum, OddRow, Row, RowCounts, RowFault, SetImages, TrueS
 pub use convention::{Convention, ConventionClass, ConventionMatch};
 pub use cross::{CrossSpectrum, cross_spectrum};
 pub use diagnosis::{
-    Fault, ImageFaults, ImageResponse, OddResponse, sign_by_correlation, sign_by_modes,
+    Fault, ImageFaults, ImageResponse, OddResponse, Repeated, repeated, sign_by_correlation,
+    sign_by_modes,
 };
 pub use error::ScoringError;
 pub use grid::{Grid, cell_at, centre_of};

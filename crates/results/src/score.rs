@@ -10,8 +10,8 @@ use shearq_dataset::threads::{Pool, ThreadError};
 use shearq_dataset::truth::{ReadTruth, Reading, Sign, read_truth, reading_of};
 use shearq_files::FileError;
 use shearq_scoring::{
-    Choice, Convention, ConventionMatch, Fault, Grid, ImageFaults, OddResponse, Options, RowCounts,
-    ScoringError, SetImages, SetScore, SetScorer, TruthSign, sign_by_correlation,
+    Choice, Convention, ConventionMatch, Fault, Grid, ImageFaults, OddResponse, Options, Repeated,
+    RowCounts, ScoringError, SetImages, SetScore, SetScorer, TruthSign, sign_by_correlation,
 };
 use shearq_submissions::ConfigurationError;
 use thiserror::Error;
@@ -96,8 +96,8 @@ impl Basis {
 pub struct OddImages {
     /// Pairs of catalogues with equal ellipticities: the copy, and the first.
     pub copies: Vec<(PathBuf, PathBuf)>,
-    /// Catalogues whose galaxies all have one ellipticity.
-    pub constant: Vec<(PathBuf, [f64; 2])>,
+    /// Catalogues in which galaxies share ellipticities.
+    pub repeated: Vec<(PathBuf, Repeated<2>)>,
     /// Catalogues that follow the true shear differently from the others of the set.
     // One catalogue of several with x and y exchanged, or of another set, changed m by 0.17 to 0.33 without a warning.
     pub responses: Vec<(PathBuf, OddResponse)>,
@@ -107,13 +107,15 @@ impl OddImages {
     /// The images of `faults` were added in the order of `names`.
     pub fn new(faults: &ImageFaults, names: &[PathBuf]) -> Self {
         let name = |place: usize| names[place].clone();
-        let (copies, constant) = (faults.copies.iter(), faults.constant.iter());
+        let (copies, repeated) = (faults.copies.iter(), faults.repeated.iter());
         let responses = faults.odd().into_iter();
         OddImages {
             copies: copies
                 .map(|&(copy, first)| (name(copy), name(first)))
                 .collect(),
-            constant: constant.map(|&(place, e)| (name(place), e)).collect(),
+            repeated: repeated
+                .map(|&(place, found)| (name(place), found))
+                .collect(),
             responses: responses.map(|odd| (name(odd.place), odd)).collect(),
         }
     }

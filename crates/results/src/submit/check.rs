@@ -13,7 +13,7 @@ use super::{
 };
 use crate::catalogues::COLUMNS;
 use crate::foreign::{ADVICE_ON_SENTINELS, fault_of_rows};
-use crate::views::scores::{odd_response, words};
+use crate::views::scores::{odd_response, repeated_shapes, words};
 use shearq_dataset::layout::read_rows;
 use shearq_files::FileError;
 use shearq_files::table::most_rows;
@@ -428,17 +428,16 @@ fn check_catalogue(
             report.add(path, severity, check, message);
         }
     }
-    if counts.used > 0 && sum.e1.iter().chain(&sum.e2).all(|e| *e == 0.0) {
-        report.error(path, "constant", "all ellipticities are zero".into());
-    } else if counts.used > 1 {
-        let first = rows.iter().find(|r| r.e1.is_finite());
-        if first.is_some_and(|f| rows.iter().all(|r| r.e1 == f.e1 && r.e2 == f.e2)) {
-            report.error(
-                path,
-                "constant",
-                "all galaxies have the same ellipticity".into(),
-            );
-        }
+    let mut faults = ImageFaults::default();
+    faults.add(&sum);
+    if let Some((_, found)) = faults.repeated.first() {
+        // Such galaxies are as good as missing, and are limited like these.
+        let severity = more_than(found.rows, 10, found.of);
+        let message = format!(
+            "{}; expected measured values, which do not repeat, and no row for a galaxy that was not measured",
+            repeated_shapes(found)
+        );
+        report.add(path, severity, "constant", message);
     }
     Some((sum, counts))
 }
@@ -526,10 +525,10 @@ fn check_against_truth(set: u32, files: &SetFiles, expected: &Expected, report: 
     let Ok(score) = scorer.score(images) else {
         return;
     };
-    // Copies appear to have no noise, and constant ellipticities no response. Both are reported already.
+    // Copies appear to have no noise, and repeated ellipticities no response. Both are reported already.
     let explained = |fault: &Fault| match fault {
         Fault::Uncorrelated { .. } => !faults.copies.is_empty(),
-        Fault::Biased { .. } => !faults.constant.is_empty(),
+        Fault::Biased { .. } => faults.repeated.iter().any(|(_, found)| found.is_constant()),
         _ => false,
     };
     let Ok(found) = scorer.diagnose(images, &score, Convention::STANDARD) else {

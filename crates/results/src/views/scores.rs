@@ -8,7 +8,7 @@ use shearq_dataset::truth::Sign;
 use shearq_render::table::{Cell, Table};
 use shearq_scoring::{
     BINS, Bias, BiasFits, ConventionClass, ConventionScore, Definition, Fault, ImageFaults,
-    Metrics, OddResponse, RowCounts, SetScore,
+    Metrics, OddResponse, Repeated, RowCounts, SetScore,
 };
 
 use crate::record::{SetRecord, columns_named, definition_word, mean};
@@ -145,13 +145,13 @@ fn zero_shear_line(zero: f64, own: f64) -> Option<String> {
         .then(|| format!("note: without any image, zero shear has Q = {zero:.2}{verdict}."))
 }
 
-// Findings of a set that odd images do not explain. Copies appear to have no noise, and constant ellipticities no
+// Findings of a set that odd images do not explain. Copies appear to have no noise, and repeated ellipticities no
 // response.
 fn believable(set: &ScoredSet) -> &[Fault] {
     let odd = &set.odd_images;
     match set.findings.as_slice() {
         [Fault::Uncorrelated { .. }] if !odd.copies.is_empty() => &[],
-        [Fault::Biased { .. }] if !odd.constant.is_empty() => &[],
+        [Fault::Biased { .. }] if odd.repeated.iter().any(|(_, found)| found.is_constant()) => &[],
         all => all,
     }
 }
@@ -436,11 +436,12 @@ pub fn odd_images(odd: &OddImages) -> Vec<String> {
             more(odd.copies.len())
         ));
     }
-    if let Some((path, [e1, e2])) = odd.constant.first() {
+    if let Some((path, found)) = odd.repeated.first() {
         lines.push(format!(
-            "all galaxies of {} have the ellipticity ({e1}, {e2}){}; expected measured values. Check the column names",
+            "{}: {}{}; expected measured values, which do not repeat. Check the column names, and leave out galaxies that were not measured",
             path.display(),
-            more(odd.constant.len())
+            repeated_shapes(found),
+            more(odd.repeated.len())
         ));
     }
     for (path, response) in odd.responses.iter().take(MOST_NAMED) {
@@ -456,6 +457,20 @@ pub fn odd_images(odd: &OddImages) -> Vec<String> {
         ));
     }
     lines
+}
+
+/// Galaxies that share ellipticities.
+pub fn repeated_shapes(found: &Repeated<2>) -> String {
+    let [e1, e2] = found.value;
+    let value = match found.component {
+        None => format!("(e1, e2) = ({e1}, {e2})"),
+        Some(0) => format!("e1 = {e1}"),
+        Some(_) => format!("e2 = {e2}"),
+    };
+    format!(
+        "{} of {} galaxies have repeated values, most often {value}",
+        found.rows, found.of
+    )
 }
 
 // Chosen by hand: more sentences hide the others.
