@@ -151,8 +151,8 @@ impl Printing {
 
 #[derive(Debug, Clone, Args)]
 pub(super) struct ReportFile {
-    /// Write tables and plots to this file as one self-contained HTML page.
-    #[arg(long = "report", value_name = "FILE")]
+    /// Write tables and plots to this file as one self-contained HTML page (.html).
+    #[arg(long = "report", value_name = "FILE", value_parser = page)]
     path: Option<PathBuf>,
 }
 
@@ -214,7 +214,7 @@ pub(super) struct SimulationArguments {
         long,
         value_name = "A",
         default_value_t = 1.0,
-        allow_negative_numbers = true
+        allow_hyphen_values = true
     )]
     amplitude: f64,
     /// Extra slope of the simulated shear power spectrum, with its pivot at ℓ = 1000.
@@ -222,7 +222,7 @@ pub(super) struct SimulationArguments {
         long,
         value_name = "T",
         default_value_t = 0.0,
-        allow_negative_numbers = true
+        allow_hyphen_values = true
     )]
     tilt: f64,
 }
@@ -313,6 +313,16 @@ pub(super) fn given_once(submissions: &[String]) -> anyhow::Result<()> {
         );
     }
     Ok(())
+}
+
+// A page of another ending opens as text.
+pub(super) fn page(text: &str) -> Result<PathBuf, String> {
+    let path = PathBuf::from(text);
+    let ending = path.extension().unwrap_or_default().to_ascii_lowercase();
+    match ending == "html" || ending == "htm" {
+        true => Ok(path),
+        false => Err("expected a name that ends in .html".into()),
+    }
 }
 
 pub(super) fn positive(text: &str) -> Result<f64, String> {

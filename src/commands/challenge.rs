@@ -19,7 +19,7 @@ use shearq_results::submit::check::{Finding, Severity, check_sent};
 use shearq_results::submit::{Sent, Submission};
 
 use super::check::report;
-use crate::arguments::{Form, SetList, Threads};
+use crate::arguments::{Form, SetList, Threads, page};
 use crate::choices::named;
 use crate::progress::{Bar, mark_resumable};
 use crate::{count, tell};
@@ -85,7 +85,7 @@ struct NewArguments {
         long,
         value_name = "A",
         conflicts_with = "data",
-        allow_negative_numbers = true
+        allow_hyphen_values = true
     )]
     amplitude: Option<f64>,
     /// Extra slope of the simulated shear power spectrum [default: drawn from -0.2 to 0.2, and secret].
@@ -93,7 +93,7 @@ struct NewArguments {
         long,
         value_name = "T",
         conflicts_with = "data",
-        allow_negative_numbers = true
+        allow_hyphen_values = true
     )]
     tilt: Option<f64>,
     /// Seed of all random numbers [default: from the operating system].
@@ -198,7 +198,7 @@ struct RankArguments {
     #[arg(long, value_name = "PATH")]
     reference: Vec<PathBuf>,
     /// Write the leaderboard to this HTML file, and as CSV and JSON with the same name.
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", value_parser = page)]
     report: Option<PathBuf>,
     /// Decimals of published metrics. More decimals reveal more of the true shear [default: as the metric].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(0..=12))]

@@ -36,7 +36,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "N")]
     grid: Option<usize>,
     /// Pixels per side of a stamp [default: as in the data, or 48].
-    #[arg(long, value_name = "PX", allow_negative_numbers = true)]
+    #[arg(long, value_name = "PX", allow_hyphen_values = true)]
     stamp: Option<f64>,
     /// Number of images of every set [default: the highest number found].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=i64::from(MAX_IMAGE)))]

@@ -29,7 +29,7 @@ use crate::error::ChallengeError;
 use crate::inbox::{Content, Sending, content, identify};
 use crate::kind::response;
 use crate::seal::{Key, Receipt, verify, verify_public};
-use crate::shapes::{References, sketch};
+use crate::shapes::{References, sketch, sketch_of_spectra};
 use crate::terms::{Challenge, now};
 
 /// What identifies a scored entry. The store keeps it with its scores, so the names are part of the format.
@@ -50,7 +50,8 @@ pub struct EntryInfo {
     /// SHA-256 of sets, images and files.
     pub content: String,
     pub files: Vec<String>,
-    /// Means of ellipticities over parts of each set ([`sketch`]), by which copies of another entry are found.
+    /// Means of ellipticities over parts of each set ([`sketch`]), or the spectra under [`SPECTRA`], by which copies of another
+    /// entry are found.
     pub shapes: BTreeMap<String, Vec<i32>>,
     pub contents: Contents,
     pub reference: bool,
@@ -70,6 +71,9 @@ pub struct Entry {
     /// Why the organiser withdrew it.
     pub withdrawn: Option<String>,
 }
+
+/// Key of the sketch of spectra, of all sets together: the eight numbers of one are not enough to tell a copy.
+pub const SPECTRA: &str = "spectra";
 
 // A store keeps entries and runs in one format. The settings of an entry start with this, those of a run do not.
 const ENTRY_SETTINGS_PREFIX: &str = "[entry]\n";
@@ -254,7 +258,9 @@ impl Judge {
         verify_public(&self.public, threads)?;
         let public = DataFolder::open(&self.public)?;
         let ids = References::ids(&public, &self.challenge.data.sets)?;
-        let references = References::kept(store, &self.id, &public, &ids, self.grid, threads)?;
+        let references = References::kept(
+            store, &self.key, &self.id, &public, &ids, self.grid, threads,
+        )?;
         let pool = Pool::new(threads)?;
         // Stored one by one, so that an interrupted command keeps the entries that it scored.
         for result in pool.in_order(candidates, |candidate| self.judge(candidate, &references)) {
@@ -472,6 +478,8 @@ impl Judge {
                 let (sets, powers) = self
                     .spectra(files, submission.manifest.as_ref())
                     .map_err(|error| plain(sent.named(error)))?;
+                let sent: Vec<f64> = powers.iter().flat_map(|(_, sent)| sent.clone()).collect();
+                info.shapes.insert(SPECTRA.into(), sketch_of_spectra(&sent));
                 let (slope, error) = slope_over_sets(&powers);
                 if !is_measurable(slope, error) {
                     return Err("the spectra do not follow the differences of the true spectra between sets, so they contain no measurable shear".into());

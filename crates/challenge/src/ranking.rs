@@ -250,27 +250,29 @@ impl NearCopy<'_> {
     }
 }
 
-// Smallest 1 - r of the shapes of two entries in a common set: a copy may have another scale and shift in each set.
+// Smallest 1 - r of a component of the shapes of two entries in a common set: a copy may have another scale and shift in each set
+// and component. Of both components together, a factor of 0.99 on one of them alone leaves 1 - r = 10⁻⁵.
 fn decorrelation(a: &EntryInfo, b: &EntryInfo) -> f64 {
     let of_set = |(set, shapes): (&String, &Vec<i32>)| {
-        let (a, b) = (centred(shapes), centred(b.shapes.get(set)?));
-        let product = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
-        let r = product(&a, &b) / (product(&a, &a) * product(&b, &b)).sqrt();
-        Some((1.0 - r).clamp(0.0, 2.0))
+        let other = b.shapes.get(set)?;
+        let of_component = |k: usize| {
+            let (a, b) = (centred(shapes, k), centred(other, k));
+            let product = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
+            let r = product(&a, &b) / (product(&a, &a) * product(&b, &b)).sqrt();
+            (1.0 - r).clamp(0.0, 2.0)
+        };
+        Some(of_component(0).min(of_component(1)))
     };
     // NaN, which shapes without scatter have, is left out.
     a.shapes.iter().filter_map(of_set).fold(f64::NAN, f64::min)
 }
 
-// Components relative to their means.
-fn centred(shapes: &[i32]) -> Vec<f64> {
-    let mean = |k: usize| {
-        let own = shapes.iter().skip(k).step_by(2);
-        own.map(|e| f64::from(*e)).sum::<f64>() / (shapes.len() as f64 / 2.0)
-    };
-    let means = [mean(0), mean(1)];
-    let each = shapes.iter().enumerate();
-    each.map(|(k, e)| f64::from(*e) - means[k % 2]).collect()
+// A component relative to its mean.
+fn centred(shapes: &[i32], component: usize) -> Vec<f64> {
+    let own = shapes.iter().skip(component).step_by(2);
+    let own: Vec<f64> = own.map(|e| f64::from(*e)).collect();
+    let mean = own.iter().sum::<f64>() / own.len() as f64;
+    own.iter().map(|e| e - mean).collect()
 }
 
 /// For each of `entries`, which are in order of arrival, the first earlier entry with a common file or equal shapes.
@@ -665,11 +667,13 @@ mod copy_tests {
 
     #[test]
     fn another_scale_and_shift_in_each_set_hide_no_copy() {
-        let of = |team: &str, scales: [f64; 2], noise: f64| {
+        // The second component has a factor of its own.
+        let of = |team: &str, scales: [f64; 2], second: f64, noise: f64| {
             let mut entry = entry(team, "2026-11-24T10:00:00Z", 1.0, &[1.0]);
             for (set, scale) in (1..).zip(scales) {
                 let shapes = (0..64).map(|k| {
                     let value = (f64::from(k * set) * 1.7).sin() + noise * f64::from(k).cos();
+                    let scale = if k % 2 == 1 { second * scale } else { scale };
                     (1e6 * (scale * value + 0.1 * scale)).round() as i32
                 });
                 entry.info.shapes.insert(set.to_string(), shapes.collect());
@@ -677,12 +681,13 @@ mod copy_tests {
             entry
         };
         let entries = [
-            of("Owner", [1.0, 1.0], 0.0),
-            of("Copy", [1.5, 1.01], 0.0),
-            of("Other", [1.0, 1.0], 0.1),
+            of("Owner", [1.0, 1.0], 1.0, 0.0),
+            of("Copy", [1.5, 1.01], 1.0, 0.0),
+            of("Scaled", [0.99, 0.99], 0.9, 0.0),
+            of("Other", [1.0, 1.0], 1.0, 0.1),
         ];
         let copies = near_copies(&entries);
         let teams: Vec<&str> = copies.iter().map(|copy| copy.entry.team.as_str()).collect();
-        assert_eq!(teams, ["Copy"]);
+        assert_eq!(teams, ["Copy", "Scaled"]);
     }
 }
