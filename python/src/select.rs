@@ -35,13 +35,23 @@ pub(crate) fn select<'py>(
         };
         found.map(Cow::Borrowed).ok_or_else(lacks)
     };
-    let weighted = Weighted::of(
-        path,
-        &selection
-            .and_then(|stated| stated.weights)
-            .unwrap_or_default(),
-        column,
-    );
+    let stated = selection.unwrap_or_default();
+    let weights = stated.weights.clone().unwrap_or_default();
+    let weighted = Weighted::of(path, &weights, column).and_then(|mut weighted| {
+        if let Some(condition) = &stated.rows {
+            weighted.keep(path, condition, |operand| match operand.pattern {
+                None => column(&operand.column),
+                Some(_) => {
+                    let message = format!(
+                        "column {} is compared with a text (expected numbers)",
+                        operand.column
+                    );
+                    Err(FileError::new(path, message))
+                }
+            })?;
+        }
+        Ok(weighted)
+    });
     let Weighted {
         e: [e1, e2],
         response: [r11, r22],

@@ -37,7 +37,8 @@ pub(crate) struct Arguments {
     /// Sets [default: all there are].
     #[arg(long, value_name = "LIST")]
     sets: Option<SetList>,
-    /// Galaxies to keep, such as "step(snr, 10) and step(size, 2.5, 0.5)".
+    /// Galaxies to keep, such as "step(snr, 10) and step(size, 2.5, 0.5)", or by columns that shear does not change, such as
+    /// "x < 1280".
     #[arg(long = "where", value_name = "CONDITION")]
     condition: Option<String>,
     /// Weight as a formula of snr, flux and size, such as "snr^2/(snr^2 + 100)".
@@ -63,10 +64,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         let pool = Pool::new(arguments.threads.number())?;
         fingerprint::verify(data, measured, &run, sets, &pool)?;
     }
-    let weights = selection
-        .as_ref()
-        .and_then(|stated| stated.weights.as_ref());
-    let means = mean_shears(&run, measured, sets, weights)?;
+    let means = mean_shears(&run, measured, sets, selection.as_ref())?;
     for mean in &means {
         let set = mean.set;
         anyhow::ensure!(

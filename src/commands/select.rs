@@ -21,7 +21,8 @@ pub(crate) struct Arguments {
     /// Folder of catalogues that `measure` or `run` wrote.
     #[arg(long, value_name = "DIR")]
     measured: PathBuf,
-    /// Galaxies to keep, such as "step(snr, 10) and step(size, 2.5, 0.5)".
+    /// Galaxies to keep, such as "step(snr, 10) and step(size, 2.5, 0.5)", or by columns that shear does not change, such as
+    /// "x < 1280".
     #[arg(
         long = "where",
         value_name = "CONDITION",

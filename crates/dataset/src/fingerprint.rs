@@ -140,7 +140,7 @@ fn read(path: &Path) -> Result<Vec<u8>, FileError> {
     open::read(path, open::DATA).map_err(FileError::doing(path, "cannot read the file"))
 }
 
-const GALAXIES: &str = "galaxies";
+pub const GALAXIES: &str = "galaxies";
 pub const PSF: &str = "psf";
 const TRUTH: &str = "truth";
 // The table of gathered stamps, which has their noise and their pixels on the sky.

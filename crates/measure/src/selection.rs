@@ -28,6 +28,9 @@ const SIZE_HALF_WIDTH: f64 = 0.3;
 // Chosen by hand: the noise of the light of the ring is 0.12 of the flux at S/N 20.
 const NEIGHBOUR_HALF_WIDTH: f64 = 0.15;
 
+// Chosen by hand: one galaxy of some thousands lies within a step of 0.015 in S/N, and the error of the response is its own size.
+const LEAST_WIDTH_RATIO: f64 = 0.01;
+
 /// A quantity that galaxies can be selected by.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
@@ -109,7 +112,25 @@ struct Jet {
     second: [[f64; VARIABLES]; VARIABLES],
 }
 
+impl Quantity {
+    /// The half width of a step without a stated one, of a galaxy with this error of its flux.
+    fn usual_half_width(self, flux_error: f64) -> f64 {
+        match self {
+            Quantity::Snr => SNR_HALF_WIDTH,
+            Quantity::Flux => SNR_HALF_WIDTH * flux_error,
+            Quantity::Size => SIZE_HALF_WIDTH,
+            Quantity::Neighbour => NEIGHBOUR_HALF_WIDTH,
+        }
+    }
+}
+
 impl Cut {
+    /// The least useful half width for a galaxy with this error of its flux. A narrower step is a sharp cut: its response to shear is
+    /// the number of galaxies within it, divided by its width, and hardly any lies within it.
+    pub fn least_half_width(&self, flux_error: f64) -> f64 {
+        LEAST_WIDTH_RATIO * self.quantity.usual_half_width(flux_error)
+    }
+
     /// A cut; `None` if the threshold is not finite or the half width not positive.
     pub fn new(
         quantity: Quantity,
@@ -222,19 +243,10 @@ impl Cut {
             first: [0.0; VARIABLES],
             second: [[0.0; VARIABLES]; VARIABLES],
         };
-        let usual = match self.quantity {
-            Quantity::Snr => {
-                (place.value, place.first[0]) = (flux / error, 1.0 / error);
-                SNR_HALF_WIDTH
-            }
-            Quantity::Flux => {
-                (place.value, place.first[0]) = (flux, 1.0);
-                SNR_HALF_WIDTH * error
-            }
-            Quantity::Size => {
-                (place.value, place.first[1]) = (galaxy.size, 1.0);
-                SIZE_HALF_WIDTH
-            }
+        match self.quantity {
+            Quantity::Snr => (place.value, place.first[0]) = (flux / error, 1.0 / error),
+            Quantity::Flux => (place.value, place.first[0]) = (flux, 1.0),
+            Quantity::Size => (place.value, place.first[1]) = (galaxy.size, 1.0),
             Quantity::Neighbour => {
                 let ratio = galaxy.neighbour();
                 place.value = ratio;
@@ -242,9 +254,9 @@ impl Cut {
                 let mixed = -1.0 / (flux * flux);
                 place.second[0] = [2.0 * ratio / (flux * flux), 0.0, mixed];
                 place.second[2][0] = mixed;
-                NEIGHBOUR_HALF_WIDTH
             }
-        };
+        }
+        let usual = self.quantity.usual_half_width(error);
         let sign = if self.above { 1.0 } else { -1.0 };
         let slope = sign / (2.0 * self.half_width.unwrap_or(usual));
         let u = 0.5 + (place.value - self.threshold) * slope;

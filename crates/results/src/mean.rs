@@ -6,11 +6,11 @@ use shearq_dataset::metadata::{Axes, CommonAxes, E_NOISE, stated_axes};
 use shearq_dataset::run::Run;
 use shearq_files::FileError;
 use shearq_files::table::{self, FileFormat};
-use shearq_measure::{Flag, Flags, MeanShear, Selection, ShearSum, Warning};
+use shearq_measure::{Flag, Flags, MeanShear, ShearSum, Warning};
 use shearq_quantities::statistics::RunningMean;
 use shearq_submissions::Calibration;
 
-use crate::select::Weighted;
+use crate::select::{StatedSelection, Weighted};
 use crate::star_noise::{Stars, of_catalogue};
 
 /// The mean shear of the galaxies of a set.
@@ -71,7 +71,7 @@ pub fn mean_shears(
     run: &Run,
     out: &Path,
     sets: &[u32],
-    selection: Option<&Selection>,
+    selection: Option<&StatedSelection>,
 ) -> Result<Vec<SetMean>, FileError> {
     let files = run.catalogues(out, sets)?;
     let calibrated = run.configuration.calibration() != Calibration::None;
@@ -109,7 +109,7 @@ fn mean_of(
     catalogues: &[(u32, PathBuf)],
     format: FileFormat,
     calibrated: bool,
-    selection: Option<&Selection>,
+    selection: Option<&StatedSelection>,
     pairs: bool,
 ) -> Result<SetMean, FileError> {
     let (mut sum, mut moments) = (ShearSum::default(), [RunningMean::default(); 2]);
@@ -126,10 +126,14 @@ fn mean_of(
         };
         in_pairs &= stated.is_some();
         axes.add(path, stated_axes(path, format)?, false)?;
-        let (rows, bits) = match selection {
-            Some(selection) => Weighted::read(path, selection)?,
+        let weights = selection.and_then(|stated| stated.weights.as_ref());
+        let (mut rows, bits) = match weights {
+            Some(weights) => Weighted::read(path, weights)?,
             None => Weighted::unselected(path, calibrated)?,
         };
+        if let Some(selection) = selection {
+            rows.keep_of_file(path, selection)?;
+        }
         for &bits in &bits {
             for (count, flag) in flags.iter_mut().zip(Flag::ALL) {
                 *count += usize::from(Flags::from_bits(bits as u32).contains(flag));

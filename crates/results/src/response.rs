@@ -3,10 +3,11 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use shearq_dataset::fingerprint::GALAXIES;
 use shearq_dataset::metadata::{
     Axes, CommonAxes, FIRST_PIXEL, FRAME, NOT_APPLIED, RESPONSE, axes_of,
 };
-use shearq_dataset::run::Run;
+use shearq_dataset::run::{Run, Source};
 use shearq_files::FileError;
 use shearq_files::frames::polars::{Column, DataFrame};
 use shearq_files::frames::{Metadata, frame};
@@ -167,6 +168,7 @@ pub fn shears(
     let (mut images, mut sums) = (Vec::new(), BTreeMap::<_, Sum>::new());
     let mut metadata = Metadata::new();
     let mut axes = CommonAxes::default();
+    let mut seen = BTreeMap::new();
     for (folder, out) in measured.iter().enumerate() {
         let run = Run::require(out)?;
         if run.configuration.calibration() == Calibration::None {
@@ -179,6 +181,7 @@ pub fn shears(
         let files = run.catalogues(out, sets)?;
         for set in files.wanted(sets) {
             for (image, path) in files.of_set(set) {
+                refuse_seen(&mut seen, &run, &path, (set, image))?;
                 let keys = [FRAME, FIRST_PIXEL, "creator", "submiss", "elltype"].map(str::to_owned);
                 let stated = table::read_metadata(&path, run.format, keys.iter())?;
                 let own = axes_of(&path, &stated)?;
@@ -244,6 +247,38 @@ pub fn shears(
         responses,
         good,
     })
+}
+
+// Refuses a second catalogue of an image: its galaxies would count twice, and errors would be too small by √2. An image is known by its
+// fingerprint, which survives a copy of the folder and is the same for another configuration, or by the settings of its simulation.
+fn refuse_seen(
+    seen: &mut BTreeMap<String, PathBuf>,
+    run: &Run,
+    path: &Path,
+    (set, image): (u32, u32),
+) -> Result<(), FileError> {
+    let key = GALAXIES.to_owned();
+    let print = table::read_metadata(path, run.format, std::iter::once(&key))?.remove(GALAXIES);
+    let identity = match (print, &run.source) {
+        (Some(print), _) => print,
+        (None, Source::Simulated(settings)) => format!("{settings:?} {set} {image}"),
+        (None, Source::Folder { .. }) => path
+            .canonicalize()
+            .as_deref()
+            .unwrap_or(path)
+            .display()
+            .to_string(),
+    };
+    match seen.insert(identity, path.to_owned()) {
+        None => Ok(()),
+        Some(first) => {
+            let message = format!(
+                "its image was measured for {}, too, so that its galaxies would count twice (expected each image once). Try: --measured with one of the folders",
+                first.display()
+            );
+            Err(FileError::new(path, message))
+        }
+    }
 }
 
 // TreeCorr takes right ascension and declination on the sky, where our signs are its own, or x and y of the pixels' axes.
@@ -409,7 +444,7 @@ fn weights(path: &Path, table: &DataFrame) -> Result<Vec<f64>, FileError> {
 }
 
 // Whether a column was measured on the stamps.
-fn is_measured(name: &str) -> bool {
+pub(crate) fn is_measured(name: &str) -> bool {
     const OTHERS: [&str; 9] = [
         "iterations",
         "stop",

@@ -16,7 +16,9 @@ use shearq_measure::{
 };
 use thiserror::Error;
 
-use crate::expression::{Condition, Expression, ExpressionError, Step};
+use crate::bias::text_matches;
+use crate::expression::{Condition, Expression, ExpressionError, Operand, Step};
+use crate::response::is_measured;
 
 /// Columns that a selection replaces or reads. It also reads the columns of [`Observables`].
 pub(crate) const READ: [&str; 7] = ["e1", "e2", "flags", "R11", "R22", "R12", "R21"];
@@ -33,9 +35,17 @@ pub enum SelectionError {
     Unknown(String),
     #[error("a step of `{0}`: the threshold must be finite and the half width positive")]
     Range(String),
+    #[error(
+        "a step of `{column}` is so narrow that hardly any galaxy lies within it, so that it is a sharp cut without a finite response to shear (found a half width of {found:e}, expected at least {least:.3}). Try: step({column}, THRESHOLD)"
+    )]
+    Sharp {
+        column: &'static str,
+        found: f64,
+        least: f64,
+    },
     // A sharp cut gives the response the density of galaxies at its edge, which no galaxy by itself determines.
     #[error(
-        "`{0}` is a condition, whose response to shear is not known, so the mean shear would be biased (expected steps, such as `step(snr, 10, 1.5) and step(size, 2.5)`). Try: step(NAME, THRESHOLD)"
+        "`{0}` is a condition on a measured quantity, whose response to shear is not known, so the mean shear would be biased (expected steps, such as `step(snr, 10, 1.5) and step(size, 2.5)`, and conditions on positions and carried columns only). Try: step(NAME, THRESHOLD)"
     )]
     Condition(String),
     #[error(
@@ -100,15 +110,18 @@ pub fn selection(
     Ok((condition.is_some() || weight.is_some()).then_some(stated))
 }
 
-/// The selection of `--where` and `--weight` by steps and weights alone, which keep a mean shear calibrated.
+/// The selection of `--where` and `--weight` by steps, weights, and conditions on columns that shear does not change, such as
+/// positions: all keep a mean shear calibrated.
 pub fn smooth_selection(
     condition: Option<&str>,
     weight: Option<&str>,
 ) -> Result<Option<StatedSelection>, SelectionError> {
     let stated = selection(condition, weight)?;
     match stated.as_ref().and_then(|stated| stated.rows.as_ref()) {
-        Some(rows) => Err(SelectionError::Condition(rows.text().to_owned())),
-        None => Ok(stated),
+        Some(rows) if rows.columns().any(is_measured) => {
+            Err(SelectionError::Condition(rows.text().to_owned()))
+        }
+        _ => Ok(stated),
     }
 }
 
@@ -119,6 +132,27 @@ fn cut(step: &Step) -> Result<Cut, SelectionError> {
     };
     Cut::new(quantity, !step.falls, step.threshold, step.half_width)
         .ok_or_else(|| SelectionError::Range(step.column.clone()))
+}
+
+// A step may state a width; without one it is wide enough.
+fn refuse_sharp(selection: &Selection, flux_error: f64) -> Result<(), SelectionError> {
+    let mut stated = selection
+        .cuts()
+        .iter()
+        .filter_map(|cut| Some((cut, cut.half_width?)));
+    // Not of NaN, which a galaxy without an error has.
+    match stated.find(|(cut, found)| *found < cut.least_half_width(flux_error)) {
+        None => Ok(()),
+        Some((cut, found)) => {
+            let mut known = Quantity::ALL.into_iter();
+            let name = known.find(|(_, quantity)| *quantity == cut.quantity);
+            Err(SelectionError::Sharp {
+                column: name.map_or("", |(name, _)| name),
+                found,
+                least: cut.least_half_width(flux_error),
+            })
+        }
+    }
 }
 
 // Name of the column with the weights.
@@ -148,7 +182,8 @@ pub fn write_selected(
     for set in files.wanted(&[]) {
         let mut sum = ShearSum::default();
         for (_, path) in files.of_set(set) {
-            let (rows, flags) = Weighted::read(&path, &selection)?;
+            let (mut rows, flags) = Weighted::read(&path, &selection)?;
+            rows.keep_of_file(&path, stated)?;
             for row in (0..flags.len()).filter(|row| flags[*row] == 0.0) {
                 sum.add([rows.e[0][row], rows.e[1][row]], rows.matrix(row), 1.0);
             }
@@ -182,7 +217,8 @@ pub fn write_selected(
         }
         for (image, path) in files.of_set(set) {
             let read = table::read(&path, None, table::MAX_ROWS)?;
-            let weighted = Weighted::of_table(&path, &selection, &read)?;
+            let mut weighted = Weighted::of_table(&path, &selection, &read)?;
+            weighted.keep_of_file(&path, stated)?;
             kept += weighted
                 .weight
                 .iter()
@@ -290,6 +326,8 @@ impl Weighted {
                 continue;
             }
             let observables = Observables::from_array(&std::array::from_fn(|k| all[k][row]));
+            refuse_sharp(selection, observables.flux_error)
+                .map_err(|error| FileError::new(path, error))?;
             let e = [e1[row], e2[row]];
             let response = [[r11[row], r12[row]], [r21[row], r22[row]]];
             let selected = selection.apply(e, response, &observables);
@@ -358,6 +396,67 @@ impl Weighted {
             weight: all(1.0),
         };
         Ok((weighted, flags))
+    }
+
+    /// Leaves out rows for which a condition on columns that shear does not change does not hold; the others keep their weights.
+    /// `column` gives the values of an operand.
+    ///
+    /// # Errors
+    /// If a column cannot be read, or a row that counts neither holds nor fails the condition because a number is missing.
+    pub fn keep<'a>(
+        &mut self,
+        path: &Path,
+        condition: &Expression,
+        column: impl Fn(&Operand) -> Result<Cow<'a, [f64]>, FileError>,
+    ) -> Result<(), FileError> {
+        let columns = condition.operands().iter().map(column);
+        let columns: Vec<_> = columns.collect::<Result<_, _>>()?;
+        for row in 0..self.weight.len() {
+            // Of galaxies with a flag, carried numbers may be missing, too.
+            if !self.e[0][row].is_finite() {
+                continue;
+            }
+            let holds = condition.value(&|place| columns[place][row]);
+            if holds.is_nan() {
+                let message = format!(
+                    "row {}: a number of `{}` is missing (expected one in each row without a flag)",
+                    row + 1,
+                    condition.text()
+                );
+                return Err(FileError::new(path, message));
+            }
+            if holds == 0.0 {
+                self.weight[row] = 0.0;
+                for values in [&mut self.e, &mut self.response, &mut self.cross] {
+                    values.iter_mut().for_each(|own| own[row] = 0.0);
+                }
+            }
+        }
+        Ok(())
+    }
+
+    // The same for the condition of a selection on the columns of a file, if it has one.
+    pub(crate) fn keep_of_file(
+        &mut self,
+        path: &Path,
+        stated: &StatedSelection,
+    ) -> Result<(), FileError> {
+        let Some(condition) = &stated.rows else {
+            return Ok(());
+        };
+        let names: Vec<&str> = condition.columns().collect();
+        let read = table::read(path, Some(&names), table::MAX_ROWS)?;
+        self.keep(
+            path,
+            condition,
+            |Operand { column, pattern }| match pattern {
+                Some(pattern) => text_matches(&read, column, pattern, path).map(Cow::Owned),
+                None => {
+                    let numbers = table::numbers(&read, column, path)?;
+                    Ok(Cow::Owned(numbers.into_owned()))
+                }
+            },
+        )
     }
 
     /// The response of e1 and e2 of a row, by rows, to g1 and g2.
