@@ -225,8 +225,10 @@ fn gather_alone(
     let mut columns = rows.unwrap_or_default();
     columns.extend(plan.columns(head, &mosaic, &mut writer, jacobians.as_deref()));
     let record = format!("{record}\n");
+    // Made before the record is written, so that columns that cannot be written leave no file.
+    let table = stamp_table::table(&which, head, columns)?;
     atomic::write(which.with_extension("json"), record.as_bytes())?;
-    stamp_table::table(&which, head, columns)?.write(&which)?;
+    table.write(&which)?;
     psfs.file.finish()?;
     writer.image.finish()?;
     Ok(Gathered {

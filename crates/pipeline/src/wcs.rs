@@ -1,6 +1,8 @@
 //! What headers state of an image's pixels on the sky: to detect a PSF that is sampled in other pixels than the galaxies, and
 //! ellipticities that are not along the sky's axes.
 
+use std::cell::RefCell;
+
 use shearq_files::fits::{ImageReader, Value};
 use shearq_measure::{PixelFrame, Warning};
 use shearq_quantities::matrix::{Matrix2, apply, determinant, inverse, product};
@@ -191,6 +193,23 @@ impl Map {
     }
 }
 
+// Arcseconds of a unit of CUNIT1; `arcsec` states whether this is the one without a name.
+fn arcsec_of(unit: &str, arcsec: bool) -> f64 {
+    match unit {
+        "ARCSEC" => 1.0,
+        "" if arcsec => 1.0,
+        "ARCMIN" => 60.0,
+        "RAD" => ARCSEC_PER_RADIAN,
+        _ => 3600.0,
+    }
+}
+
+fn singular_text([[a, b], [c, d]]: Matrix2) -> String {
+    format!(
+        "the matrix of the WCS, CD or PC with CDELT, is singular (found {a}, {b}, {c}, {d}; expected one with an inverse)"
+    )
+}
+
 /// Unit vectors to a place in degrees, and along the axes of the tangent plane there: east and north, if the pole is at π.
 fn tangent([ra, dec]: [f64; 2], lonpole: f64) -> [[f64; 3]; 3] {
     let ((sin_ra, cos_ra), (sin_dec, cos_dec)) =
@@ -217,17 +236,40 @@ pub(crate) struct Wcs {
     map: Option<Map>,
     /// CTYPE1 if it is a projection that is not read: only the matrix is used then.
     unread: Option<String>,
-    /// A matrix that maps pixels to a line, or to a point.
-    singular: Option<Matrix2>,
+    /// What is wrong with the numbers, if they give no map.
+    damage: Option<String>,
 }
 
 impl Wcs {
     pub(crate) fn of_header(image: &ImageReader) -> Self {
-        // Other programs use keys such as PIXSCALE for text, which is ignored rather than an error.
-        Wcs::of_keys(
-            |key| image.number(key).ok().flatten(),
-            |key| image.text(key).trim().to_ascii_uppercase(),
-        )
+        let text = |key: &str| image.text(key).trim().to_owned();
+        let unreadable = RefCell::new(None);
+        let wcs = Wcs::of_keys(
+            |key| match image.number(key) {
+                Ok(number) => number,
+                // Other programs use PIXSCALE for text.
+                Err(_) if PIXEL_SCALE_KEYS.contains(&key) => None,
+                Err(_) => {
+                    unreadable
+                        .borrow_mut()
+                        .get_or_insert_with(|| key.to_owned());
+                    None
+                }
+            },
+            |key| text(key).to_ascii_uppercase(),
+        );
+        // Without this key, the others would place galaxies elsewhere on the sky.
+        match unreadable.into_inner() {
+            None => wcs,
+            Some(key) => Wcs {
+                scale: wcs.scale,
+                damage: Some(format!(
+                    "the WCS has {key} = '{}' (expected a number)",
+                    text(&key)
+                )),
+                ..Wcs::default()
+            },
+        }
     }
 
     fn of_keys(number: impl Fn(&str) -> Option<f64>, text: impl Fn(&str) -> String) -> Self {
@@ -235,13 +277,8 @@ impl Wcs {
         let kind = kinds[0].as_str();
         // GalSim writes planes in arcseconds without a unit.
         let plane = kind == "LINEAR";
-        let unit = match text("CUNIT1").as_str() {
-            "ARCSEC" => 1.0,
-            "" if plane && !text("GS_WCS").is_empty() => 1.0,
-            "ARCMIN" => 60.0,
-            "RAD" => ARCSEC_PER_RADIAN,
-            _ => 3600.0,
-        };
+        let gs_plane = plane && !text("GS_WCS").is_empty();
+        let unit = arcsec_of(&text("CUNIT1"), gs_plane);
         let steps = CDELT_KEYS.map(&number);
         let matrix = cd(CD_KEYS.map(&number)).or_else(|| {
             let [x, y] = [steps[0]?, steps[1]?];
@@ -259,16 +296,18 @@ impl Wcs {
         // Relative to its size: rounded numbers of parallel axes leave a small determinant. A header of zeros has no WCS.
         let size = |m: &Matrix2| m.iter().flatten().map(|v| v * v).sum::<f64>();
         let regular = |m: &Matrix2| determinant(*m).abs() > LEAST_RELATIVE_AREA * size(m);
-        let singular = matrix.filter(|m| !regular(m) && size(m) > 0.0);
+        let singular = |m: &Matrix2| !regular(m) && size(m) > 0.0;
+        let damage = matrix.filter(singular).map(singular_text);
         let matrix = matrix.filter(regular);
         let stated = PIXEL_SCALE_KEYS.into_iter().find_map(&number);
-        let plausible = |scale: &f64| PLAUSIBLE_ARCSEC.contains(scale);
         let of_matrix = matrix.map(|matrix| determinant(matrix).abs().sqrt() * unit);
-        let scale = stated.or(of_matrix).filter(plausible);
+        let scale = stated
+            .or(of_matrix)
+            .filter(|scale| PLAUSIBLE_ARCSEC.contains(scale));
         let Some(matrix) = matrix else {
             return Wcs {
                 scale,
-                singular,
+                damage,
                 ..Wcs::default()
             };
         };
@@ -299,7 +338,7 @@ impl Wcs {
                     projection: Projection::Plane,
                 }),
                 unread: named.then(|| kind.to_owned()),
-                singular: None,
+                damage: None,
             };
         }
         let [first, second] = in_unit(matrix, unit / 3600.0);
@@ -334,7 +373,7 @@ impl Wcs {
                 },
             }),
             unread: None,
-            singular: None,
+            damage: None,
         }
     }
 
@@ -381,10 +420,8 @@ impl Wcs {
     /// What is wrong with a header that states a WCS but gives no places on the sky; `None` for a usable WCS, and without one.
     pub(crate) fn fault(&self) -> Option<String> {
         let expected = "expected TAN, TAN-SIP or TPV";
-        match (&self.singular, &self.unread) {
-            (Some([[a, b], [c, d]]), _) => Some(format!(
-                "the matrix of the WCS, CD or PC with CDELT, is singular (found {a}, {b}, {c}, {d}; expected one with an inverse)"
-            )),
+        match (&self.damage, &self.unread) {
+            (Some(damage), _) => Some(damage.clone()),
             (None, Some(kind)) => Some(format!("the projection {kind} is not read ({expected})")),
             (None, None) => None,
         }
@@ -414,7 +451,7 @@ impl Wcs {
                 projection: Projection::Plane,
             }),
             unread: None,
-            singular: None,
+            damage: None,
         }
     }
 

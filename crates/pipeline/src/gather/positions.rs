@@ -307,6 +307,14 @@ fn selection<'n>(
         );
         return Err(FileError::new(&place.path, message));
     }
+    if let Some(name) = carry
+        .iter()
+        .enumerate()
+        .find_map(|(k, name)| carry[..k].contains(name).then_some(name))
+    {
+        let message = format!("--carry names the column `{name}` twice; expected every name once");
+        return Err(FileError::new(&place.path, message));
+    }
     let mut wanted = reals;
     let mut texts = Vec::new();
     // A column may be the identity and carried, too, and must be read once.
@@ -456,6 +464,13 @@ fn known(
     if columns.unnamed.len() == 2 {
         return Ok(["1".into(), "2".into()]);
     }
+    // Of pixels, two unknown names may be anything.
+    if let (true, [first, second]) = (degrees, certain.as_slice()) {
+        if !wcs.has_sky() {
+            return no_sky(&place.path, exposure, wcs);
+        }
+        return Ok([first, second].map(|name| (*name).clone()));
+    }
     let (found, example) = match certain.as_slice() {
         [] if columns.unnamed.is_empty() => ("no column".into(), "X,Y"),
         [] => {
@@ -470,7 +485,7 @@ fn known(
             "cannot determine the columns of the positions (found {found}; expected {}). Try: --columns {example}",
             match degrees {
                 true => "ra and dec, ALPHA_J2000 and DELTA_J2000, or two columns",
-                false => "x and y, X_IMAGE and Y_IMAGE, ra and dec, or two columns",
+                false => "x and y, X_IMAGE and Y_IMAGE, ra and dec, or two columns without names",
             }
         ),
     ))
