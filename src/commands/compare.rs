@@ -109,7 +109,12 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         let branch = published::branch_of(challenge, arguments.branch.as_deref())?;
         let psf = arguments.psf.as_deref();
         let truth = arguments.truth.as_deref();
-        let truth = truth.map(|path| Truth { path, psf });
+        let truth = truth.map(|path| Truth {
+            path,
+            psf,
+            // A part of a branch does not compare with the published entries.
+            subfields: None,
+        });
         let threads = arguments.threads.number();
         let table = published::leaderboard(&*branch, truth, &arguments.measured, threads)?;
         return arguments.printing.print(&table);

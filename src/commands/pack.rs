@@ -18,8 +18,8 @@ use shearq_results::submit::{Contents, Entry, is_archive};
 // Longest name of a method in bytes: a tar header has 100 for a file name.
 const MAX_METHOD_BYTES: usize = 64;
 
-// A folder with such a name would be mistaken for an archive.
-const OTHER_ARCHIVES: [&str; 7] = ["zip", "tar", "gz", "bz2", "xz", "zst", "7z"];
+// A folder or a text with such a name would be mistaken for an archive.
+pub(super) const ARCHIVES: [&str; 8] = ["zip", "tar", "gz", "tgz", "bz2", "xz", "zst", "7z"];
 
 /// Write catalogues as a submission: the files that the challenge accepts, with a manifest.
 ///
@@ -159,7 +159,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let entry = arguments.entry.entry()?;
     let ending = out.extension().unwrap_or_default().to_string_lossy();
     anyhow::ensure!(
-        is_archive(out) || !OTHER_ARCHIVES.contains(&ending.as_ref()),
+        is_archive(out) || !ARCHIVES.contains(&ending.as_ref()),
         "--out {}: unsupported archive (found .{ending}, expected a folder, .tar.gz or .tgz)",
         out.display()
     );

@@ -7,7 +7,9 @@ use shearq_render::table::Table;
 use shearq_results::published::{Branch, Challenge, Packing, Score, Truth, ranking};
 use shearq_results::submit::check::Finding;
 
+use super::pack::ARCHIVES;
 use crate::tell;
+use shearq_files::open::is_there;
 
 pub(super) fn branch_of(challenge: &str, branch: Option<&str>) -> anyhow::Result<Box<dyn Branch>> {
     Ok(Challenge::named(challenge)?.branch(branch)?)
@@ -25,7 +27,11 @@ pub(super) fn score(
             submissions.len()
         );
     };
-    Ok(branch.score(truth, submission, &Pool::new(threads)?)?)
+    let score = branch.score(truth, submission, &Pool::new(threads)?)?;
+    for warning in score.refusal.iter().chain(&score.warnings) {
+        tell(format_args!("warning: {}: {warning}", submission.display()));
+    }
+    Ok(score)
 }
 
 pub(super) fn leaderboard(
@@ -34,6 +40,11 @@ pub(super) fn leaderboard(
     submissions: &[PathBuf],
     threads: usize,
 ) -> anyhow::Result<Table> {
+    anyhow::ensure!(
+        !branch.leaderboard().is_empty(),
+        "--leaderboard: no published entries of {} are known (expected --challenge great3)",
+        branch.title()
+    );
     let pool = Pool::new(threads)?;
     let mut own: Vec<(String, Score)> = Vec::new();
     for submission in submissions {
@@ -44,12 +55,33 @@ pub(super) fn leaderboard(
             );
         };
         let name = submission.display().to_string();
-        own.push((name, branch.score(truth, submission, &pool)?));
+        let score = branch.score(truth, submission, &pool)?;
+        // As in own challenges, a rank of an entry that measures no shear would be luck.
+        if let Some(refusal) = &score.refusal {
+            anyhow::bail!("{name}: not ranked: {refusal}");
+        }
+        for warning in &score.warnings {
+            tell(format_args!("warning: {name}: {warning}"));
+        }
+        own.push((name, score));
     }
     Ok(ranking(branch, &own))
 }
 
 pub(super) fn pack(branch: &dyn Branch, packing: &Packing<'_>, out: &Path) -> anyhow::Result<()> {
+    // As of other submissions: an earlier one may have been sent.
+    anyhow::ensure!(
+        !is_there(out),
+        "--out {}: the file exists already; expected a new file",
+        out.display()
+    );
+    let ending = out.extension().unwrap_or_default().to_string_lossy();
+    anyhow::ensure!(
+        !ARCHIVES.contains(&ending.as_ref()),
+        "--out {}: a submission to {} is one text file (found .{ending}, expected a name such as entry.txt)",
+        out.display(),
+        branch.title()
+    );
     let packed = branch.pack(packing, &Pool::new(0)?);
     let Some(packed) = packed else {
         anyhow::bail!("{} has no pre-submission of catalogues", branch.title());

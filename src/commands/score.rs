@@ -64,14 +64,14 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "LIST", conflicts_with = "truth")]
     sets: Option<SetList>,
     /// Noise variance per component, galaxy and image for Q_dn [default: from differences between images].
-    #[arg(long, value_name = "V", allow_negative_numbers = true)]
+    #[arg(long, value_name = "V", allow_hyphen_values = true)]
     noise_var: Option<f64>,
     /// Sign of g2 in the file of --truth; data folders state it in layout.toml [default: as the file states, else
     /// the sign in which the shear is an E-mode field, else the sign that e2 follows; required if these are unclear].
     #[arg(long, value_parser = named::<TruthSign>(), requires = "truth", conflicts_with_all = FOLDERS)]
     truth_sign: Option<TruthSign>,
     /// Pixels per side of a stamp, for --truth [default: 48].
-    #[arg(long, value_name = "PX", allow_negative_numbers = true, requires = "truth", conflicts_with_all = FOLDERS)]
+    #[arg(long, value_name = "PX", allow_hyphen_values = true, requires = "truth", conflicts_with_all = FOLDERS)]
     stamp: Option<f64>,
     /// Side of the field in degrees, for --truth [default: 10].
     #[arg(long, value_name = "DEG", requires = "truth", conflicts_with_all = FOLDERS)]
@@ -84,7 +84,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "TYPE", value_parser = named::<EllipticityType>(), requires = "truth", conflicts_with_all = NOT_PLAIN)]
     ellipticity: Option<EllipticityType>,
     /// Value of e1 or e2 that marks a galaxy as not measured, such as -99; for --truth.
-    #[arg(long, value_name = "VALUE", allow_negative_numbers = true, requires = "truth", conflicts_with_all = NOT_PLAIN)]
+    #[arg(long, value_name = "VALUE", allow_hyphen_values = true, requires = "truth", conflicts_with_all = NOT_PLAIN)]
     missing: Option<f64>,
     /// Treat galaxies with numbers that stand for a failed measurement, such as -10, -99 or 1e30, as not measured; for
     /// --truth.
@@ -94,7 +94,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "E", value_parser = positive, requires = "truth", conflicts_with_all = NOT_PLAIN)]
     max_modulus: Option<f64>,
     /// Print the aperture mass dispersion of the catalogues and of the true shear instead of scores.
-    #[arg(long, conflicts_with_all = ["spectra", "packed", "store", "path", "noise_var", "definition", "challenge", "branch", "psf"])]
+    #[arg(long, conflicts_with_all = ["spectra", "packed", "store", "path", "noise_var", "definition", "challenge", "branch", "psf", "subfields"])]
     aperture_mass: bool,
     /// Score a submission to this challenge: great3, great08.
     #[arg(long, value_name = "NAME", requires = "truth", conflicts_with_all = GREAT10_ONLY)]
@@ -106,6 +106,9 @@ pub(crate) struct Arguments {
     /// [default: starshape_parameters-* in the folder of --truth].
     #[arg(long, value_name = "PATH", requires = "challenge", conflicts_with_all = GREAT10_ONLY)]
     psf: Option<PathBuf>,
+    /// Subfields of a branch of GREAT3 that was simulated [default: 200].
+    #[arg(long, value_name = "N", requires = "branch", conflicts_with_all = GREAT10_ONLY, value_parser = clap::value_parser!(u16).range(1..=1000))]
+    subfields: Option<u16>,
     /// Record the scores in this results store, for `compare --store`.
     #[arg(long, value_name = "DIR", conflicts_with_all = ["truth", "spectra"])]
     store: Option<PathBuf>,
@@ -157,6 +160,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         let truth = Truth {
             path: truth,
             psf: arguments.psf.as_deref(),
+            subfields: arguments.subfields.map(usize::from),
         };
         let (files, threads) = (&arguments.catalogues, arguments.threads.number());
         let score = published::score(&*branch, truth, files, threads)?;

@@ -188,8 +188,17 @@ fn pack_averages_fields_and_its_result_is_sound() {
             "pack {branch} --grid 2 --out {} {first} {second} {option}",
             out.display()
         );
-        succeed(&words(&pack));
+        let told = said(&pack);
+        assert!(
+            told.contains("not measured; columns that are not used: other"),
+            "{told}"
+        );
+        // Neither an earlier submission is replaced nor a text named as an archive.
+        assert!(fail(&words(&pack)).contains("out.txt: the file exists already"));
+        let archive = pack.replace("out.txt", "out.tar.gz");
+        assert!(fail(&words(&archive)).contains("is one text file (found .gz"));
         let packed = fs::read_to_string(&out).unwrap();
+        fs::remove_file(&out).unwrap();
         let mean = |field: usize, of: fn(&Shear) -> f64| {
             let own = galaxies[4 * field..4 * field + 4].iter();
             let own = own.filter(|own| of(&own.1) < 9.9 && !(whole && own.1.e1 >= 9.9));
@@ -208,8 +217,20 @@ fn pack_averages_fields_and_its_result_is_sound() {
             assert!(off.iter().all(|off| off.abs() < 1e-15), "{line}: {off:?}");
         }
         assert_eq!(packed.lines().count(), 201);
+        fs::write(&out, &packed).unwrap();
         succeed(&words(&format!("check {} {branch}", out.display())));
+        fs::remove_file(&out).unwrap();
     }
+    // A weight of another name.
+    let other = file(folder.path(), "c.csv", &csv.replacen("weight", "wt", 1));
+    let message = fail(&words(&format!(
+        "pack {branch} --grid 2 --out {} {first} {other}",
+        out.display()
+    )));
+    assert!(
+        message.contains("c.csv: `wt` looks like a weight but is not used"),
+        "{message}"
+    );
 }
 
 #[test]
@@ -292,7 +313,7 @@ fn released_galaxies_make_the_truth_of_variable_shear() {
     succeed(&words(&format!(
         "pack {branch} --grid 3 --subfields 20 --out {root}/out.txt {path}"
     )));
-    let score = format!("score {branch} --truth {root} {root}/out.txt");
+    let score = format!("score {branch} --subfields 20 --truth {root} {root}/out.txt");
     let q = json(&score)["Q_v"].as_f64().unwrap();
     assert!((q - 1.837e-4 / 4e-8).abs() < 1e-3, "{q}");
     // A file of offsets of other data is noticed.
@@ -346,6 +367,278 @@ fn submissions_are_ranked_among_published_entries() {
     );
 }
 
+// The lines of standard error of a command that succeeds.
+fn said(line: &str) -> String {
+    let output = shearq(&words(line));
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert!(output.status.success(), "{line}: {said}");
+    said
+}
+
+#[test]
+fn entries_that_measure_no_shear_have_no_rank() {
+    let folder = tempfile::tempdir().unwrap();
+    let case = format!("{CASES}/p1_control_ground");
+    let sound = rows("p1_control_ground", "submission");
+    let challenge = "--challenge great3 --branch control-ground-constant";
+    let truth = format!("--truth {case}/truth.txt.gz --psf {case}/psf.txt.gz");
+    let entry = |edit: &dyn Fn(usize, [f64; 2]) -> [f64; 2]| {
+        let line = |(k, row): (usize, &Vec<f64>)| {
+            let [g1, g2] = edit(k, [row[1], row[2]]);
+            format!("{k} {g1} {g2}\n")
+        };
+        let text: String = sound.iter().enumerate().map(line).collect();
+        file(folder.path(), "entry.txt", &text)
+    };
+    let noise = |k: usize| (k as f64 * 12.9898).sin();
+    assert_eq!(
+        said(&format!(
+            "score {challenge} {truth} {case}/submission.txt.gz"
+        )),
+        ""
+    );
+    for (edit, cause) in [
+        (
+            &(|_, [g1, g2]: [f64; 2]| [g1, -g2]) as &dyn Fn(usize, [f64; 2]) -> [f64; 2],
+            "g2 does not follow the true g2 (found a slope of -1.00",
+        ),
+        (
+            &|_, [g1, g2]: [f64; 2]| [-g1, g2],
+            "its sign is probably wrong",
+        ),
+        (
+            &|_, [g1, g2]: [f64; 2]| [g2, g1],
+            "g1 and g2 are probably exchanged",
+        ),
+        (
+            &|_, [g1, g2]: [f64; 2]| [g2, -g1],
+            "g1 and g2 are probably exchanged",
+        ),
+        (
+            &|_, g: [f64; 2]| g.map(|g| 0.03 * g),
+            "it contains no measurable shear",
+        ),
+        (
+            &|k, _| [0.01 * noise(k), 0.01 * noise(k + 500)],
+            "it contains no measurable shear",
+        ),
+    ] {
+        let path = entry(edit);
+        let warned = said(&format!("score {challenge} {truth} {path}"));
+        assert!(warned.contains(cause), "{cause}: {warned}");
+        let refused = fail(&words(&format!(
+            "compare {challenge} --leaderboard {truth} {path}"
+        )));
+        assert!(
+            refused.contains(cause) && refused.contains("not ranked"),
+            "{refused}"
+        );
+    }
+    // Exchanged fields are named.
+    let path = entry(&|k, g| match k {
+        3 | 70 => [sound[73 - k][1], sound[73 - k][2]],
+        _ => g,
+    });
+    let warned = said(&format!("score {challenge} {truth} {path}"));
+    assert!(
+        warned.contains("2 of 200 fields do not follow the true shear as the others do: 3, 70"),
+        "{warned}"
+    );
+    // Without the truth, numbers that differ by less than any requirement are placeholders.
+    let path = entry(&|k, _| [1e-300 * noise(k), 1e-300 * noise(k + 7)]);
+    let output = shearq(&words(&format!("check {path} {challenge}")));
+    assert!(
+        String::from_utf8_lossy(&output.stdout).contains("200 of 200 fields have repeated values")
+    );
+}
+
+#[test]
+fn masses_that_are_not_of_the_true_shear_are_doubted() {
+    let folder = tempfile::tempdir().unwrap();
+    let case = format!("{CASES}/p4_control_ground");
+    let score = format!(
+        "score --challenge great3 --branch control-ground-variable --truth {case}/truth.txt.gz"
+    );
+    let truth = rows("p4_control_ground", "truth");
+    let doubt = |edit: &dyn Fn(usize, f64) -> [f64; 2]| {
+        let line = |(k, row): (usize, &Vec<f64>)| {
+            let [e, b] = edit(k, row[2]);
+            format!("{} {} {e} {b} {}\n", row[0], row[1], row[4])
+        };
+        let text: String = truth.iter().enumerate().map(line).collect();
+        said(&format!(
+            "{score} {}",
+            file(folder.path(), "entry.txt", &text)
+        ))
+    };
+    // Of no period of 15 bins, which the masses have.
+    let noise = |k: usize| 1e-5 * (1.7 * (k * k) as f64).sin();
+    assert_eq!(said(&format!("{score} {case}/submission.txt.gz")), "");
+    assert_eq!(doubt(&|k, e| [0.64 * e, 0.1 * noise(k)]), "");
+    // A flipped component leaves ξ₊ and averages ξ₋ to zero.
+    let warned = doubt(&|k, e| [0.5 * e + 0.01 * noise(k), 0.5 * e]);
+    assert!(
+        warned.contains("the sign of g1 or g2, or their order"),
+        "{warned}"
+    );
+    for warned in [
+        doubt(&|_, e| [1e-3 * e, 0.0]),
+        doubt(&|k, _| [noise(k), 0.0]),
+    ] {
+        assert!(
+            warned.contains("map_E does not follow the true one"),
+            "{warned}"
+        );
+    }
+}
+
+// Changes of a sound truth and what the error says, with the file at fault.
+#[test]
+fn faults_of_a_truth_name_its_file() {
+    let case = "p2_multiepoch_space";
+    let folder = tempfile::tempdir().unwrap();
+    let copy = |name: &str, edit: &dyn Fn(&mut Vec<Vec<String>>)| {
+        let mut all: Vec<Vec<String>> = rows(case, name)
+            .iter()
+            .map(|row| row.iter().map(f64::to_string).collect())
+            .collect();
+        edit(&mut all);
+        let lines: Vec<String> = all.iter().map(|row| row.join(" ")).collect();
+        file(folder.path(), &format!("{name}.txt"), &lines.join("\n"))
+    };
+    let set = |row: usize, column: usize, value: &'static str| {
+        move |all: &mut Vec<Vec<String>>| all[row][column] = value.into()
+    };
+    let sound = |_: &mut Vec<Vec<String>>| {};
+    type Edit<'a> = &'a dyn Fn(&mut Vec<Vec<String>>);
+    for (truth, psf, at, says) in [
+        (
+            &sound as Edit,
+            &set(7, 2, "nan") as Edit,
+            "psf.txt",
+            "row 8: not the ellipticity of a PSF (found NaN",
+        ),
+        (
+            &sound,
+            &set(7, 3, "1.2"),
+            "psf.txt",
+            "row 8: not the ellipticity of a PSF",
+        ),
+        (
+            &sound,
+            &set(7, 1, "0"),
+            "psf.txt",
+            "row 8: subfield 1 epoch 0 is there twice",
+        ),
+        (
+            &sound,
+            &set(7, 1, "6"),
+            "psf.txt",
+            "row 8: no epoch of multiepoch-space-constant (found 6, expected 0 to 5)",
+        ),
+        (&sound, &set(7, 0, "200"), "psf.txt", "row 8: no subfield"),
+        (
+            &sound,
+            &|all| _ = all.remove(8),
+            "psf.txt",
+            "subfield 1 has no PSF of epoch 2; expected 200 subfields with 6 epochs each",
+        ),
+        (
+            &|all| _ = all.pop(),
+            &sound,
+            "truth.txt",
+            "field 199 is missing (found 199 fields, expected 200)",
+        ),
+        (
+            &|all| all.truncate(20),
+            &sound,
+            "truth.txt",
+            "field 20 is missing and 179 more",
+        ),
+        (
+            &set(5, 1, "-1.1"),
+            &sound,
+            "truth.txt",
+            "field 5: g1 is -1.1",
+        ),
+    ] {
+        let (truth, psf) = (copy("truth", truth), copy("psf", psf));
+        let line = format!(
+            "score --challenge great3 --branch multiepoch-space-constant --truth {truth} --psf {psf} {CASES}/{case}/submission.txt.gz"
+        );
+        let message = fail(&words(&line));
+        assert!(
+            message.contains(at) && message.contains(says),
+            "{says}: {message}"
+        );
+    }
+    // Released files.
+    let below = folder.path().join("released");
+    for k in 0..200 {
+        file(
+            &below,
+            &format!("shear_params-{k:03}.yaml"),
+            &format!("{{g1: 0.01, g2: {}}}", 1e-4 * f64::from(k)),
+        );
+        file(
+            &below,
+            &format!("starshape_parameters-{k:03}-0.yaml"),
+            "{psf_g1: 0.01, psf_g2: -10}",
+        );
+    }
+    let line = format!(
+        "score --challenge great3 --branch control-ground-constant --truth {} {CASES}/p1_control_ground/submission.txt.gz",
+        below.display()
+    );
+    for (name, content, says) in [
+        (
+            "shear_params-004.yaml",
+            "{g1: 0.8, g2: 0.7}",
+            "shear_params-004.yaml: not a shear (found 0.8 0.7, expected |g| < 1)",
+        ),
+        (
+            "shear_params-004.yaml",
+            "{g1: 0.1, g1: 0.2, g2: 0.7}",
+            "shear_params-004.yaml: `g1` is there twice (found 0.1 and 0.2, expected one)",
+        ),
+        (
+            "starshape_parameters-004-0.yaml",
+            "{psf_g1: .nan, psf_g2: 2}",
+            "there is no number `psf_g1`",
+        ),
+        (
+            "starshape_parameters-004-0.yaml",
+            "{psf_g1: nan, psf_g2: 2}",
+            "starshape_parameters-004-0.yaml: not the ellipticity of a PSF",
+        ),
+        (
+            "starshape_parameters-000-1.yaml",
+            "{psf_g1: 0, psf_g2: 0}",
+            "starshape_parameters-000-1.yaml: control-ground-constant has no such epoch",
+        ),
+        (
+            "shear_params-200.yaml",
+            "{g1: 0, g2: 0}",
+            "shear_params-200.yaml: expected 200 subfields",
+        ),
+    ] {
+        let path = below.join(name);
+        let kept = fs::read(&path);
+        fs::write(&path, content).unwrap();
+        let message = fail(&words(&line));
+        assert!(message.contains(says), "{says}: {message}");
+        match kept {
+            Ok(kept) => fs::write(&path, kept).unwrap(),
+            Err(_) => fs::remove_file(&path).unwrap(),
+        }
+    }
+    fs::remove_file(below.join("shear_params-150.yaml")).unwrap();
+    assert!(
+        fail(&words(&line))
+            .contains("released: found no shear_params-150.*, expected 200 subfields")
+    );
+}
+
 #[test]
 fn great08_scores_images_and_sets() {
     let folder = tempfile::tempdir().unwrap();
@@ -374,6 +667,18 @@ fn great08_scores_images_and_sets() {
         "score --challenge great08 --truth {plain} {sets}"
     )));
     assert!(message.contains("image 2 is missing"), "{message}");
+    let zero = file("zero.txt", "0 0.0203 0.0199\n1 0 0\n2 -0.03 0\n");
+    let score = format!("score --challenge great08 --truth {truth}");
+    let message = fail(&words(&format!("{score} {zero}")));
+    assert!(
+        message.contains("1: the shear is exactly zero"),
+        "{message}"
+    );
+    let message = fail(&words(&format!("{score} {images} --psf {plain}")));
+    assert!(
+        message.contains("--psf: GREAT08 has no use for it"),
+        "{message}"
+    );
 }
 
 #[test]
@@ -414,7 +719,7 @@ fn aperture_masses_of_grids_follow_the_square_of_the_response() {
 }
 
 // Changes of sound files: which files, what is changed, and what the error says. `set ROW COLUMN VALUE`, `column COLUMN VALUE`,
-// `zero ROW`, `drop ROW`, `twice ROW`, `keep ROWS`, `first LINE`, `all CONTENT`.
+// `half COLUMN VALUE`, `all-half VALUE`, `zero ROW`, `drop ROW`, `twice ROW`, `keep ROWS`, `first LINE`, `all CONTENT`.
 const MALFORMED: &str = include_str!("malformed.txt");
 
 fn edited(sound: &[String], edit: &str) -> String {
@@ -430,6 +735,21 @@ fn edited(sound: &[String], edit: &str) -> String {
         "column" => {
             let (column, value) = (number(), rest.next().unwrap());
             rows.iter_mut().for_each(|row| row[column] = value);
+        }
+        // In every second field.
+        "half" => {
+            let (column, value) = (number(), rest.next().unwrap());
+            let odd = |row: &&mut Vec<&str>| row[0].parse::<usize>().unwrap() % 2 == 1;
+            rows.iter_mut()
+                .filter(odd)
+                .for_each(|row| row[column] = value);
+        }
+        "all-half" => {
+            let value = rest.next().unwrap();
+            rows.iter_mut()
+                .skip(1)
+                .step_by(2)
+                .for_each(|row| row[1..].fill(value));
         }
         "zero" => rows[number()][1..].fill("0"),
         "drop" => _ = rows.remove(number()),
@@ -566,8 +886,9 @@ fn simulated_branches_are_scored_by_their_released_truth() {
             "pack --challenge great3 --branch {branch} --subfields {subfields} --grid 8 --out {packed} {galaxies}"
         );
         succeed(&words(&line));
-        let line =
-            format!("score --challenge great3 --branch {branch} --truth {released} {packed}");
+        let line = format!(
+            "score --challenge great3 --branch {branch} --subfields {subfields} --truth {released} {packed}"
+        );
         let found = json(&line);
         let q = found["Q_c"].as_f64().or(found["Q_v"].as_f64()).unwrap();
         assert!((q / ceiling - 1.0).abs() < 1e-6, "{branch}: {q}");

@@ -141,7 +141,7 @@ fn means_of_rotated_pairs_are_packed_with_errors_of_pixel_noise() {
     printed(small.root(), &MEASURE.replace("--out m", "--out other"));
     let message = refused(
         small.root(),
-        "shearq pack --challenge great3 --branch control-ground-constant --measured other --subfields 2 --grid 8 --out g.txt",
+        "shearq pack --challenge great3 --branch control-ground-constant --measured other --subfields 2 --grid 8 --out h.txt",
     );
     assert!(message.contains("is there twice"), "{message}");
 }

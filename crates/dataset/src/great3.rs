@@ -208,7 +208,7 @@ impl GalaxyCatalogue {
 /// Numbers by name, as the challenge wrote them: YAML of one level, or a line of names after `#` and a line of values.
 #[derive(Debug)]
 pub struct Parameters {
-    path: PathBuf,
+    pub path: PathBuf,
     numbers: BTreeMap<String, f64>,
 }
 
@@ -222,24 +222,29 @@ impl Parameters {
         let text = read_to_string(&path, SETTINGS)
             .map_err(FileError::doing(&path, "cannot read the parameters"))?;
         let mut lines = text.lines().filter(|line| !line.trim().is_empty());
-        let number = |name: &str, value: &str| {
+        let pairs: Vec<(&str, &str)> =
+            match lines.clone().next().and_then(|line| line.strip_prefix('#')) {
+                Some(names) => {
+                    let values = lines.nth(1).unwrap_or_default().split_whitespace();
+                    names.split_whitespace().zip(values).collect()
+                }
+                None => text
+                    .split(['\n', ',', '{', '}'])
+                    .filter_map(|part| part.split_once(':'))
+                    .collect(),
+            };
+        let mut numbers = BTreeMap::new();
+        for (name, value) in pairs {
             let name = name.trim_matches(['"', '\'', ' ']).to_owned();
-            Some((name, value.trim().parse().ok()?))
-        };
-        let numbers = match lines.clone().next().and_then(|line| line.strip_prefix('#')) {
-            Some(names) => {
-                let values = lines.nth(1).unwrap_or_default().split_whitespace();
-                let pairs = names.split_whitespace().zip(values);
-                pairs
-                    .filter_map(|(name, value)| number(name, value))
-                    .collect()
+            let Ok(value) = value.trim().parse() else {
+                continue;
+            };
+            if let Some(first) = numbers.insert(name.clone(), value) {
+                let message =
+                    format!("`{name}` is there twice (found {first} and {value}, expected one)");
+                return Err(FileError::new(path, message));
             }
-            None => text
-                .split(['\n', ',', '{', '}'])
-                .filter_map(|part| part.split_once(':'))
-                .filter_map(|(name, value)| number(name, value))
-                .collect(),
-        };
+        }
         Ok(Some(Parameters { path, numbers }))
     }
 

@@ -6,6 +6,7 @@
 pub mod great08;
 pub mod great3;
 
+use std::collections::BTreeSet;
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
@@ -13,7 +14,9 @@ use serde_json::{Map, Value};
 use shearq_dataset::threads::Pool;
 use shearq_files::frames::reals;
 use shearq_files::table::{self, MAX_ROWS, Place};
-use shearq_files::{FileError, atomic};
+use shearq_files::{FileError, atomic, names_of};
+use shearq_quantities::Shear;
+use shearq_quantities::statistics::{RunningMean, median};
 use shearq_render::figure::{FigureError, LinePlot, PanelGrid};
 use shearq_render::html::{Block, Picture, Section};
 use shearq_render::table::{Cell, Table};
@@ -84,6 +87,8 @@ pub struct Truth<'a> {
     pub path: &'a Path,
     /// Table of the ellipticities of the PSF, if the challenge needs them and the folder has none.
     pub psf: Option<&'a Path>,
+    /// Subfields, if the branch was simulated with another number than the challenge's.
+    pub subfields: Option<usize>,
 }
 
 /// What differs between challenges and between their branches.
@@ -170,6 +175,9 @@ pub struct Score {
     pub figures: Vec<Figure>,
     /// What the figures come from, for a report.
     pub plots: Vec<LinePlot>,
+    /// Why the entry is no measurement of the true shear, so that it has no rank.
+    pub refusal: Option<String>,
+    pub warnings: Vec<String>,
 }
 
 impl Score {
@@ -278,6 +286,114 @@ pub fn ranking(branch: &dyn Branch, own: &[(String, Score)]) -> Table {
     table
 }
 
+// Standard errors by which a slope on the true shear must exceed zero, as for the entries of own challenges.
+const MIN_SLOPE_SIGNIFICANCE: f64 = 3.0;
+// Least slope of an entry that measures shear: below, m < −0.9 is no bias of a method. `bias` has the same limit.
+const MIN_SHEAR_SLOPE: f64 = 0.1;
+
+// Slope of the measured on the true values, with its standard error.
+#[derive(Clone, Copy)]
+struct Slope {
+    value: f64,
+    error: f64,
+}
+
+impl Slope {
+    // `None` if the values do not determine it.
+    fn of(pairs: &[(f64, f64)]) -> Option<Self> {
+        let number = pairs.len() as f64;
+        let mean = |of: fn(&(f64, f64)) -> f64| pairs.iter().map(of).sum::<f64>() / number;
+        let (x, y) = (mean(|pair| pair.0), mean(|pair| pair.1));
+        let over = |of: &dyn Fn(f64, f64) -> f64| -> f64 {
+            pairs.iter().map(|pair| of(pair.0 - x, pair.1 - y)).sum()
+        };
+        let square = over(&|x, _| x * x);
+        let value = over(&|x, y| x * y) / square;
+        let scatter = over(&|x, y| (y - value * x).powi(2)) / (number - 2.0);
+        let error = (scatter / square).sqrt();
+        (pairs.len() > 2 && square > 0.0).then_some(Slope { value, error })
+    }
+
+    fn differs_from(self, other: f64) -> bool {
+        (self.value - other).abs() > MIN_SLOPE_SIGNIFICANCE * self.error
+    }
+
+    // Whether it is above zero, and not below `least`.
+    fn is_clear(self, least: f64) -> bool {
+        self.value > 0.0
+            && self.differs_from(0.0)
+            && (self.value >= least || !self.differs_from(least))
+    }
+}
+
+impl Display for Slope {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{:.3} ± {:.3}", self.value, self.error)
+    }
+}
+
+// Why submitted shears are no measurement of the true ones. `pairs` are true and submitted shears.
+fn disagreement(pairs: &[(Shear, Shear)]) -> Option<String> {
+    let component = |g: Shear, k: usize| [g.e1, g.e2][k];
+    let slope = |of: usize, on: usize| {
+        let values = pairs
+            .iter()
+            .map(|(g, own)| (component(*g, on), component(*own, of)));
+        Slope::of(&values.collect::<Vec<_>>())
+    };
+    let own = [slope(0, 0)?, slope(1, 1)?];
+    let wrong = own
+        .iter()
+        .position(|slope| !slope.is_clear(MIN_SHEAR_SLOPE))?;
+    let cross = [slope(0, 1)?, slope(1, 0)?];
+    let stronger =
+        |k: usize| cross[k].differs_from(0.0) && cross[k].value.abs() > own[k].value.abs();
+    let (found, name) = (own[wrong], ["g1", "g2"][wrong]);
+    let cause = if stronger(0) && stronger(1) {
+        "g1 and g2 are probably exchanged"
+    } else if found.differs_from(0.0) && found.value <= -MIN_SHEAR_SLOPE {
+        "its sign is probably wrong"
+    } else {
+        "it contains no measurable shear"
+    };
+    Some(format!(
+        "{name} does not follow the true {name} (found a slope of {found}, expected about 1): {cause}"
+    ))
+}
+
+// Largest residual of a field in standard deviations of the others, and least one in the scatter of the true shears: exchanged fields
+// have residuals of about this scatter. Chosen by hand.
+const MAX_FIELD_RESIDUAL: f64 = 8.0;
+const MIN_ODD_RESIDUAL: f64 = 0.5;
+
+// A warning about fields that follow the true shear differently from the others.
+fn odd_fields(pairs: &[(Shear, Shear)]) -> Option<String> {
+    let mut odd = BTreeSet::new();
+    for of in [(|g| g.e1) as fn(Shear) -> f64, |g| g.e2] {
+        let residual = |(g, own): &(Shear, Shear)| of(*own) - of(*g);
+        let centre = median(&mut pairs.iter().map(residual).collect::<Vec<_>>())?;
+        let off = |pair| (residual(pair) - centre).abs();
+        // 1.4826 median absolute deviations are a standard deviation.
+        let scatter = 1.4826 * median(&mut pairs.iter().map(off).collect::<Vec<_>>())?;
+        let true_scatter = {
+            let mut moments = RunningMean::default();
+            pairs.iter().for_each(|(g, _)| moments.add(of(*g)));
+            moments.deviation()
+        };
+        let most = (MAX_FIELD_RESIDUAL * scatter).max(MIN_ODD_RESIDUAL * true_scatter);
+        odd.extend((0..pairs.len()).filter(|k| off(&pairs[*k]) > most));
+    }
+    let names: Vec<String> = odd.iter().map(usize::to_string).collect();
+    (!names.is_empty() && 4 * names.len() < pairs.len()).then(|| {
+        format!(
+            "{} of {} fields do not follow the true shear as the others do: {}. Were fields exchanged?",
+            names.len(),
+            pairs.len(),
+            names_of(&names)
+        )
+    })
+}
+
 // A table that a participant or an organiser wrote. Each wanted column has several names; the last ones may be absent, and are
 // then empty.
 struct Columns<'a> {
@@ -359,6 +475,20 @@ impl Columns<'_> {
             }
         };
         chosen.iter().map(column).collect()
+    }
+
+    // Columns of a table with names that are none of the wanted ones.
+    fn unused(&self, path: &Path) -> Result<Vec<String>, FileError> {
+        let found = table::columns(&Place::of(path))?;
+        let is_wanted = |name: &String| {
+            let mut wanted = self.names.iter().copied().flatten();
+            wanted.any(|own| name.eq_ignore_ascii_case(own))
+        };
+        let certain = found.named.into_iter().filter(|named| !named.doubtful);
+        // Of a FITS file, the table that is read.
+        let mut tables = certain.filter(|named| named.names.iter().any(is_wanted));
+        let names = tables.next().map_or(Vec::new(), |named| named.names);
+        Ok(names.into_iter().filter(|name| !is_wanted(name)).collect())
     }
 
     fn described(&self) -> String {

@@ -8,7 +8,9 @@ use shearq_files::FileError;
 use shearq_quantities::Shear;
 use shearq_scoring::great3::great08_score;
 
-use super::{Branch, Columns, Entry, Figure, Packed, Packing, Score, Truth, whole, wrong};
+use super::{
+    Branch, Columns, Entry, Figure, Packed, Packing, Score, Truth, disagreement, whole, wrong,
+};
 
 #[derive(Debug)]
 pub struct Great08;
@@ -57,6 +59,10 @@ fn read_shears(path: &Path) -> Result<BTreeMap<usize, Shear>, FileError> {
 
 fn read_entry(path: &Path) -> Result<BTreeMap<usize, Shear>, FileError> {
     let shears = read_shears(path)?;
+    if let Some((image, _)) = shears.iter().find(|(_, g)| **g == Shear::ZERO) {
+        let message = format!("{image}: the shear is exactly zero, which no measurement gives");
+        return wrong(path, message);
+    }
     let first = shears.values().next();
     if shears.len() > 1 && shears.values().all(|g| Some(g) == first) {
         return wrong(
@@ -80,6 +86,17 @@ impl Branch for Great08 {
             required: 4,
             unnamed: &[(4, &[0, 1, 2, 3])],
         };
+        for (option, given) in [
+            ("--psf", truth.psf.is_some()),
+            ("--subfields", truth.subfields.is_some()),
+        ] {
+            if given {
+                return wrong(
+                    Path::new(option),
+                    "GREAT08 has no use for it. Try: without this option",
+                );
+            }
+        }
         let submitted = read_entry(submission)?;
         let images: Vec<(usize, String, Shear)> = match with_sets.read(truth.path) {
             Ok(own) => (0..own[0].len())
@@ -113,6 +130,7 @@ impl Branch for Great08 {
             );
             return wrong(submission, message);
         }
+        let mut pairs = Vec::new();
         let mut differences: BTreeMap<&String, Vec<Shear>> = BTreeMap::new();
         for (image, set, g) in &images {
             let number = if per_set {
@@ -121,6 +139,7 @@ impl Branch for Great08 {
                 *image
             };
             let own = submitted[&number];
+            pairs.push((*g, own));
             let difference = Shear::new(own.e1 - g.e1, own.e2 - g.e2);
             differences.entry(set).or_default().push(difference);
         }
@@ -128,6 +147,8 @@ impl Branch for Great08 {
         let found = great08_score(&sets).map_err(|error| FileError::new(submission, error))?;
         Ok(Score {
             branch: None,
+            refusal: disagreement(&pairs),
+            warnings: Vec::new(),
             figures: vec![Figure {
                 key: "Q",
                 value: found.q,

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use shearq_dataset::great3::Parameters;
 use shearq_dataset::threads::Pool;
 use shearq_files::open::is_there;
-use shearq_files::{FileError, table};
+use shearq_files::{FileError, names_of, table};
 use shearq_quantities::Shear;
 use shearq_quantities::statistics::{RunningMean, median};
 use shearq_render::figure::{LinePlot, Series, Style};
@@ -18,13 +18,15 @@ use shearq_scoring::great3::{
     Bias, ConstantField, Observation, PlusCross, REQUIRED_C, REQUIRED_M, along, constant_score,
     position_angle, variable_score,
 };
+use shearq_scoring::{Repeated, repeated};
 
 use crate::mean::mean_shears;
 use crate::response::{Shared, shears};
 use shearq_dataset::run::Run;
 
 use super::{
-    Branch, Catalogues, Columns, Entry, Figure, Packed, Packing, Score, Truth, whole, wrong,
+    Branch, Catalogues, Columns, Entry, Figure, MIN_SHEAR_SLOPE, Packed, Packing, Score, Slope,
+    Truth, disagreement, odd_fields, whole, wrong,
 };
 
 // Subfields of a field, where galaxies share a shear field or a PSF model.
@@ -35,8 +37,6 @@ const NODES_PER_GALAXY: usize = 7;
 pub const SUBFIELDS: usize = 200;
 /// Galaxies per side of a subfield.
 pub const GRID: usize = 100;
-// Identities have three digits each for subfield, column and row.
-const MAX_SUBFIELDS: usize = 1000;
 // Epochs of a subfield in multiepoch and full; the other experiments have one, and each has a PSF.
 const MAX_EPOCHS: usize = 6;
 
@@ -154,7 +154,7 @@ enum Fault {
         first: String,
     },
     #[error("galaxy {id} is there twice; it is also in {first}. Try: remove one of the two rows")]
-    Repeated { id: String, first: String },
+    RepeatedGalaxy { id: String, first: String },
     #[error(
         "galaxy {id}: {name} is {found}, which the challenge's program would average. Try: 10 for a galaxy that was not measured"
     )]
@@ -163,6 +163,10 @@ enum Fault {
         name: &'static str,
         found: f64,
     },
+    #[error(
+        "`{0}` looks like a weight but is not used (expected `weight` or `w`). Try: rename it to weight, or remove it"
+    )]
+    UnusedWeight(String),
     #[error("galaxy {id}: the weight is {found}, expected zero or a positive number")]
     Weight { id: String, found: f64 },
     #[error(
@@ -180,6 +184,15 @@ enum Fault {
         subfield: usize,
         found: usize,
         expected: usize,
+    },
+    #[error(
+        "subfield {subfield}: {rows} of {of} galaxies have repeated shears, most often {value:?}; expected measured values, which do not repeat. Try: 10 for a galaxy that was not measured"
+    )]
+    Placeholders {
+        subfield: usize,
+        rows: usize,
+        of: usize,
+        value: [f64; 2],
     },
     #[error(
         "field {field} has no measured galaxy with a weight, so that it has no shear. Try: a smaller cut on quality"
@@ -211,14 +224,49 @@ enum Fault {
         "field {field}: theta = {theta:.4} is missing; expected {SEPARATION_BINS} rows per field"
     )]
     MissingTheta { field: usize, theta: f64 },
-    #[error("all values of {0} are the same, as of a method that measures nothing")]
-    Alike(&'static str),
+    #[error(
+        "{rows} of {of} fields have repeated values of {name}, the first of them field {field}; expected measured values, which do not repeat"
+    )]
+    Repeated {
+        name: &'static str,
+        rows: usize,
+        of: usize,
+        field: usize,
+    },
     #[error("field {field}: {name} is exactly zero, which no measurement gives")]
     Zero { field: usize, name: &'static str },
 }
 
-fn is_zero(masses: &[f64; SEPARATION_BINS]) -> bool {
-    masses.iter().all(|mass| *mass == 0.0)
+// Q_c needs shears to 2·10⁻⁴: below, values count as equal. Aperture masses of shear alone are below 10⁻⁹ at the largest separations.
+const EQUAL_SHEARS: f64 = 1e-4;
+const EQUAL_MASSES: f64 = 1e-14;
+
+// Refuses placeholders of fields that were not measured. A program that writes them would gain: Q_v of zeros is high.
+fn refuse_repeated<const N: usize>(
+    path: &Path,
+    rows: &[[f64; N]],
+    step: f64,
+    name: impl Fn(Option<usize>) -> &'static str,
+) -> Result<(), FileError> {
+    if let Some(field) = rows
+        .iter()
+        .position(|row| row.iter().all(|own| *own == 0.0))
+    {
+        let name = name(None);
+        return wrong(path, Fault::Zero { field, name });
+    }
+    match repeated(rows, step) {
+        None => Ok(()),
+        Some(found) => wrong(
+            path,
+            Fault::Repeated {
+                name: name(found.component),
+                rows: found.rows,
+                of: found.of,
+                field: found.first,
+            },
+        ),
+    }
 }
 
 fn more(count: usize) -> String {
@@ -267,8 +315,23 @@ impl Great3 {
         }
     }
 
-    fn fields(&self) -> usize {
-        SUBFIELDS / self.subfields_per_field()
+    // Fields of a branch of so many subfields, which is the whole branch unless the user states another number.
+    fn fields(&self, subfields: Option<usize>) -> Result<usize, FileError> {
+        let (found, per) = (subfields.unwrap_or(SUBFIELDS), self.subfields_per_field());
+        match found > 0 && found % per == 0 {
+            true => Ok(found / per),
+            false => {
+                let message = format!("found {found}, expected a multiple of {per} for {self}");
+                wrong(Path::new("--subfields"), message)
+            }
+        }
+    }
+
+    fn epochs(&self) -> usize {
+        match ["multiepoch", "full"].contains(&self.experiment) {
+            true => MAX_EPOCHS,
+            false => 1,
+        }
     }
 
     // The folder that holds `stem` of subfield 0: the given one, or that of the branch below it.
@@ -288,81 +351,36 @@ impl Great3 {
         })
     }
 
-    fn true_shears(&self, truth: &Path) -> Result<Vec<Shear>, FileError> {
+    fn true_shears(&self, truth: &Path, fields: usize) -> Result<Vec<Shear>, FileError> {
         if !truth.is_dir() {
-            return self.read_shears(truth, None);
+            return self.read_shears(truth, fields);
         }
         let folder = self.folder(truth, "shear_params-000")?;
-        let (mut shears, mut missing) = (Vec::new(), None);
-        for subfield in 0..MAX_SUBFIELDS {
+        let per = self.subfields_per_field();
+        let shear = |subfield: usize| {
             let stem = format!("shear_params-{subfield:03}");
-            match (Parameters::read(&folder, &stem)?, missing) {
-                (None, _) => _ = missing.get_or_insert(subfield),
-                // A simulated branch may have fewer subfields, but fields after a gap would be scored as others.
-                (Some(_), Some(gap)) => {
-                    let message = format!("found {stem}, expected shear_params-{gap:03} too");
-                    return wrong(&folder, message);
-                }
-                // All subfields of a field have one shear.
-                (Some(found), None) if subfield % self.subfields_per_field() == 0 => {
-                    shears.push(Shear::new(found.number("g1")?, found.number("g2")?));
-                }
-                (Some(_), None) => {}
+            match Parameters::read(&folder, &stem)? {
+                Some(found) => shear_of(&found),
+                None => wrong(&folder, missing(&stem, fields * per)),
             }
-        }
-        Ok(shears)
+        };
+        refuse_more(&folder, "shear_params", "", fields * per)?;
+        // All subfields of a field have one shear.
+        (0..fields).map(|field| shear(field * per)).collect()
     }
 
     // Mean ellipticities of the PSF of each of `fields`.
     fn psfs(&self, truth: Truth<'_>, fields: usize) -> Result<Vec<Shear>, FileError> {
-        let subfields = fields * self.subfields_per_field();
-        let mut known = vec![Vec::new(); subfields];
-        let mut there = vec![false; subfields];
-        let mut add = |subfield: usize, psf: Shear| {
-            there[subfield] = true;
-            // −10: not known.
-            if psf.e1 > -10.0 && psf.e2 > -10.0 {
-                known[subfield].push(psf);
-            }
-        };
+        let (subfields, epochs) = (fields * self.subfields_per_field(), self.epochs());
         let source = truth.psf.unwrap_or(truth.path);
         if truth.psf.is_none() && !source.is_dir() {
             return wrong(source, "Q_c needs the PSF. Try: --psf FILE");
         }
-        if source.is_dir() {
-            let folder = self.folder(source, "starshape_parameters-000-0")?;
-            for subfield in 0..subfields {
-                for epoch in 0..MAX_EPOCHS {
-                    let stem = format!("starshape_parameters-{subfield:03}-{epoch}");
-                    if let Some(found) = Parameters::read(&folder, &stem)? {
-                        let psf = [found.number("psf_g1")?, found.number("psf_g2")?];
-                        add(subfield, Shear::new(psf[0], psf[1]));
-                    }
-                }
-            }
-        } else {
-            let columns = Columns {
-                names: &[&["subfield"], &["epoch"], &["psf_g1"], &["psf_g2"]],
-                required: 4,
-                unnamed: &[(4, &[0, 1, 2, 3])],
-            }
-            .read(source)?;
-            for (k, &number) in columns[0].iter().enumerate() {
-                let Some(subfield) = whole(number, subfields) else {
-                    let message = format!(
-                        "row {}: not a subfield (found {number}, expected 0 to {})",
-                        k + 1,
-                        subfields - 1
-                    );
-                    return wrong(source, message);
-                };
-                add(subfield, Shear::new(columns[2][k], columns[3][k]));
-            }
-        }
-        if let Some(subfield) = there.iter().position(|there| !there) {
-            let message = format!("subfield {subfield} has no PSF; expected {subfields} subfields");
-            return wrong(source, message);
-        }
+        let known = match source.is_dir() {
+            true => self.psfs_of_folder(source, subfields)?,
+            false => self.psfs_of_table(source, subfields)?,
+        };
+        // A subfield without a known PSF counts as round, as in the challenge.
         let mean = |shears: &[Shear]| match shears.len() {
             0 => Shear::ZERO,
             n => {
@@ -370,18 +388,95 @@ impl Great3 {
                 Shear::new(mean(|g| g.e1), mean(|g| g.e2))
             }
         };
-        // A subfield without a known PSF counts as round, as in the challenge.
-        let subfields: Vec<Shear> = known.iter().map(|own| mean(own)).collect();
+        let subfields: Vec<Shear> = known
+            .chunks(epochs)
+            .map(|epochs| mean(&epochs.iter().copied().flatten().collect::<Vec<_>>()))
+            .collect();
         Ok(subfields
             .chunks(self.subfields_per_field())
             .map(mean)
             .collect())
     }
 
-    // `index g1 g2`, a row for each of `fields` (as many as there are, if unknown).
-    fn read_shears(&self, path: &Path, fields: Option<usize>) -> Result<Vec<Shear>, FileError> {
+    // The PSF of each epoch of each subfield; `None` if it is not known.
+    fn psfs_of_folder(
+        &self,
+        folder: &Path,
+        subfields: usize,
+    ) -> Result<Vec<Option<Shear>>, FileError> {
+        let folder = self.folder(folder, "starshape_parameters-000-0")?;
+        let epochs = self.epochs();
+        refuse_more(&folder, "starshape_parameters", "-0", subfields)?;
+        let psf = |k: usize| {
+            let stem = format!("starshape_parameters-{:03}-{}", k / epochs, k % epochs);
+            match Parameters::read(&folder, &stem)? {
+                Some(found) => psf_of(&found),
+                None => {
+                    let of = format!("{subfields} subfields with {epochs} epochs each");
+                    wrong(
+                        &folder,
+                        format!("found no {stem}.yaml or .txt; expected {of}"),
+                    )
+                }
+            }
+        };
+        let found: Result<Vec<_>, _> = (0..subfields * epochs).map(psf).collect();
+        let extra = format!("starshape_parameters-000-{epochs}");
+        match Parameters::read(&folder, &extra)? {
+            Some(extra) => {
+                let message = format!("{self} has no such epoch (expected {epochs} per subfield)");
+                wrong(&extra.path, message)
+            }
+            None => found,
+        }
+    }
+
+    fn psfs_of_table(
+        &self,
+        path: &Path,
+        subfields: usize,
+    ) -> Result<Vec<Option<Shear>>, FileError> {
+        let epochs = self.epochs();
+        let columns = Columns {
+            names: &[&["subfield"], &["epoch"], &["psf_g1"], &["psf_g2"]],
+            required: 4,
+            unnamed: &[(4, &[0, 1, 2, 3])],
+        }
+        .read(path)?;
+        let mut found = vec![None; subfields * epochs];
+        let rows = columns[0].iter().zip(&columns[1]);
+        let psfs = columns[2].iter().zip(&columns[3]);
+        for (k, ((subfield, epoch), (e1, e2))) in rows.zip(psfs).enumerate() {
+            let fault = |message: String| FileError::new(path, format!("row {}: {message}", k + 1));
+            let number = |found: f64, end: usize, name: &str| {
+                let last = end - 1;
+                let message =
+                    || format!("no {name} of {self} (found {found}, expected 0 to {last})");
+                whole(found, end).ok_or_else(|| fault(message()))
+            };
+            let subfield = number(*subfield, subfields, "subfield")?;
+            let epoch = number(*epoch, epochs, "epoch")?;
+            let psf = known_psf(Shear::new(*e1, *e2)).map_err(fault)?;
+            if found[subfield * epochs + epoch].replace(psf).is_some() {
+                return Err(fault(format!(
+                    "subfield {subfield} epoch {epoch} is there twice; expected each once"
+                )));
+            }
+        }
+        if let Some(k) = found.iter().position(Option::is_none) {
+            let message = format!(
+                "subfield {} has no PSF of epoch {}; expected {subfields} subfields with {epochs} epochs each",
+                k / epochs,
+                k % epochs
+            );
+            return wrong(path, message);
+        }
+        Ok(found.into_iter().flatten().collect())
+    }
+
+    // `index g1 g2`, a row for each field.
+    fn read_shears(&self, path: &Path, expected: usize) -> Result<Vec<Shear>, FileError> {
         let columns = SHEARS.read(path)?;
-        let expected = fields.unwrap_or(columns[0].len()).max(1);
         let mut found = vec![None; expected];
         for (k, &number) in columns[0].iter().enumerate() {
             let field = field_of(path, k, number, expected)?;
@@ -405,35 +500,22 @@ impl Great3 {
                 return wrong(path, Fault::RepeatedField { field });
             }
         }
-        let found = complete(path, found)?;
-        for (name, of) in [("g1", (|g| g.e1) as fn(&Shear) -> f64), ("g2", |g| g.e2)] {
-            if found.len() > 1 && found.windows(2).all(|g| of(&g[0]) == of(&g[1])) {
-                return wrong(path, Fault::Alike(name));
-            }
-        }
-        // A program that writes zeros for what it could not measure would gain from them: Q_v of such a field is high.
-        if let Some(field) = found.iter().position(|g| *g == Shear::ZERO) {
-            return wrong(
-                path,
-                Fault::Zero {
-                    field,
-                    name: "(g1, g2)",
-                },
-            );
-        }
-        Ok(found)
+        complete(path, found)
     }
 
-    // `field theta map_E map_B error`; returns map_E by field and bin.
-    fn read_masses(
-        &self,
-        path: &Path,
-        fields: Option<usize>,
-    ) -> Result<Vec<[f64; SEPARATION_BINS]>, FileError> {
+    fn submitted_shears(&self, path: &Path, fields: usize) -> Result<Vec<Shear>, FileError> {
+        let shears = self.read_shears(path, fields)?;
+        let rows: Vec<_> = shears.iter().map(|g| [g.e1, g.e2]).collect();
+        let name =
+            |component: Option<usize>| ["(g1, g2)", "g1", "g2"][component.map_or(0, |k| k + 1)];
+        refuse_repeated(path, &rows, EQUAL_SHEARS, name)?;
+        Ok(shears)
+    }
+
+    // `field theta map_E map_B error`, a row for each field and bin.
+    fn read_masses(&self, path: &Path, expected: usize) -> Result<Vec<Masses>, FileError> {
         let columns = MASSES.read(path)?;
-        let rows = columns[0].len();
-        let expected = fields.unwrap_or(rows.div_ceil(SEPARATION_BINS)).max(1);
-        let mut found = vec![None::<[Option<f64>; SEPARATION_BINS]>; expected];
+        let mut found = vec![None::<[Option<[f64; 2]>; SEPARATION_BINS]>; expected];
         for (k, &number) in columns[0].iter().enumerate() {
             let field = field_of(path, k, number, expected)?;
             let theta = columns[1][k];
@@ -466,7 +548,7 @@ impl Great3 {
                 }
             }
             let own = found[field].get_or_insert_default();
-            if own[bin].replace(columns[2][k]).is_some() {
+            if own[bin].replace([columns[2][k], columns[3][k]]).is_some() {
                 let theta = separations()[bin].0;
                 return wrong(path, Fault::RepeatedTheta { field, theta });
             }
@@ -477,41 +559,42 @@ impl Great3 {
                 let theta = separations()[bin].0;
                 return wrong(path, Fault::MissingTheta { field, theta });
             }
-            masses.push(own.map(Option::unwrap_or_default));
+            let own = own.map(Option::unwrap_or_default);
+            masses.push(Masses {
+                e: own.map(|[e, _]| e),
+                b: own.map(|[_, b]| b),
+            });
         }
-        if let Some(field) = masses.iter().position(is_zero) {
-            return wrong(
-                path,
-                Fault::Zero {
-                    field,
-                    name: "map_E",
-                },
-            );
-        }
-        if masses.windows(2).all(|pair| pair[0] == pair[1]) && masses.len() > 1 {
-            return wrong(path, Fault::Alike("map_E"));
-        }
+        Ok(masses)
+    }
+
+    fn submitted_masses(&self, path: &Path, fields: usize) -> Result<Vec<Masses>, FileError> {
+        let masses = self.read_masses(path, fields)?;
+        let rows: Vec<_> = masses.iter().map(|own| own.e).collect();
+        refuse_repeated(path, &rows, EQUAL_MASSES, |_| "map_E")?;
         Ok(masses)
     }
 
     fn true_masses(
         &self,
         truth: &Path,
+        fields: usize,
         pool: &Pool,
-    ) -> Result<Vec<[f64; SEPARATION_BINS]>, FileError> {
+    ) -> Result<Vec<Masses>, FileError> {
         if !truth.is_dir() {
-            return self.read_masses(truth, None);
+            return self.read_masses(truth, fields);
         }
         let folder = self.folder(truth, "galaxy_catalog-000")?;
         let catalogue = |subfield: usize| folder.join(format!("galaxy_catalog-{subfield:03}.fits"));
-        let subfields = (0..MAX_SUBFIELDS)
-            .take_while(|&k| is_there(&catalogue(k)))
-            .count();
-        if subfields % SUBFIELDS_PER_FIELD != 0 {
-            let message = format!(
-                "found {subfields} files galaxy_catalog-*.fits, expected a multiple of {SUBFIELDS_PER_FIELD}"
+        let subfields = fields * SUBFIELDS_PER_FIELD;
+        if let Some(lacking) = (0..subfields).find(|k| !is_there(&catalogue(*k))) {
+            return wrong(
+                &folder,
+                missing(&format!("galaxy_catalog-{lacking:03}"), subfields),
             );
-            return wrong(&folder, message);
+        }
+        if is_there(&catalogue(subfields)) {
+            return wrong(&catalogue(subfields), more_subfields(subfields));
         }
         let fields = (0..subfields).step_by(SUBFIELDS_PER_FIELD);
         let masses = pool.in_order(fields, |first| {
@@ -519,7 +602,11 @@ impl Great3 {
             for subfield in first..first + SUBFIELDS_PER_FIELD {
                 add_truth(&mut galaxies, &folder, &catalogue(subfield), subfield)?;
             }
-            Ok(galaxies.correlations().aperture_mass().map_e)
+            let found = galaxies.correlations().aperture_mass();
+            Ok(Masses {
+                e: found.map_e,
+                b: found.map_b,
+            })
         });
         masses.collect()
     }
@@ -598,6 +685,80 @@ fn mass_plot(truth: &[[f64; SEPARATION_BINS]], submitted: &[[f64; SEPARATION_BIN
     }
 }
 
+// Why aperture masses are not of the true shear. ⟨M_ap²⟩ follows from ξ₊ and ξ₋; a flipped or exchanged component leaves ξ₊ and
+// averages ξ₋ to zero, so that E and B are both the mean of the true E and B.
+fn disagreement_of_masses(submitted: &[Masses], truth: &[Masses]) -> Option<String> {
+    let e: Vec<(f64, f64)> = submitted
+        .iter()
+        .zip(truth)
+        .flat_map(|(own, truth)| truth.e.into_iter().zip(own.e))
+        .collect();
+    let found = Slope::of(&e)?;
+    // Of a square of shears.
+    if !found.is_clear(MIN_SHEAR_SLOPE * MIN_SHEAR_SLOPE) {
+        return Some(format!(
+            "map_E does not follow the true one (found a slope of {found}, expected about 1): it contains no measurable shear"
+        ));
+    }
+    // Of sums over fields, as in Q_v: ξ₋ of one field is not zero by chance.
+    let sum = |of: &dyn Fn(&Masses) -> f64, masses: &[Masses]| masses.iter().map(of).sum::<f64>();
+    let (mut as_given, mut averaged) = (0.0, 0.0);
+    for bin in 0..SEPARATION_BINS {
+        let both = |masses| {
+            [
+                sum(&|own| own.e[bin], masses),
+                sum(&|own| own.b[bin], masses),
+            ]
+        };
+        let ([e, b], [true_e, true_b]) = (both(submitted), both(truth));
+        let mean = 0.5 * (true_e + true_b);
+        as_given += (e - true_e).powi(2) + (b - true_b).powi(2);
+        averaged += (e - mean).powi(2) + (b - mean).powi(2);
+    }
+    // Chosen by hand: map_B of zero, as of a program that does not compute it, reaches one half.
+    (averaged < 0.25 * as_given).then(|| {
+        "map_E and map_B are both the mean of the true E and B: the sign of g1 or g2, or their order, is probably wrong".into()
+    })
+}
+
+// ⟨M_ap²⟩ of a field by separation.
+struct Masses {
+    e: [f64; SEPARATION_BINS],
+    b: [f64; SEPARATION_BINS],
+}
+
+fn missing(stem: &str, subfields: usize) -> String {
+    format!(
+        "found no {stem}.*, expected {subfields} subfields. Try: --subfields N if the branch was simulated with fewer"
+    )
+}
+
+fn more_subfields(subfields: usize) -> String {
+    format!(
+        "expected {subfields} subfields. Try: --subfields N if the branch was simulated with more"
+    )
+}
+
+// Refuses files of a subfield after the last: a part of the branch would be scored as the whole.
+fn refuse_more(folder: &Path, name: &str, ending: &str, subfields: usize) -> Result<(), FileError> {
+    let stem = format!("{name}-{subfields:03}{ending}");
+    match Parameters::read(folder, &stem)? {
+        Some(more) => wrong(&more.path, more_subfields(subfields)),
+        None => Ok(()),
+    }
+}
+
+// The ellipticity of a PSF; `None` if it is not known, which files state by −10.
+fn known_psf(psf: Shear) -> Result<Option<Shear>, String> {
+    match psf {
+        Shear { e1, e2 } if e1 <= -NOT_CORRELATED || e2 <= -NOT_CORRELATED => Ok(None),
+        psf if psf.modulus() < 1.0 => Ok(Some(psf)),
+        Shear { e1, e2 } => Err(format!(
+            "not the ellipticity of a PSF (found {e1} {e2}, expected a modulus below 1, or -10 if it is not known)"
+        )),
+    }
+}
+
 fn field_of(path: &Path, k: usize, found: f64, fields: usize) -> Result<usize, FileError> {
     let (row, last) = (k + 1, fields - 1);
     let fault = || FileError::new(path, Fault::NotAField { row, found, last });
@@ -648,11 +809,18 @@ fn add_truth(
         None => None,
         Some(found) => Some([found.number("offset_deg_x")?, found.number("offset_deg_y")?]),
     };
+    let mut seen = BTreeSet::new();
     for (k, &found) in columns[0].iter().enumerate() {
         let id = Identity::of(found).filter(|id| id.subfield() == subfield);
         let Some(id) = id else {
             return wrong(path, Fault::NotAnIdentity { row: k + 1, found });
         };
+        if !seen.insert(id) {
+            return wrong(
+                path,
+                format!("galaxy {id} is there twice; expected each once"),
+            );
+        }
         let (x, y) = id.place();
         if let Some(degrees) = offset {
             let nodes = degrees.map(|offset| {
@@ -669,13 +837,35 @@ fn add_truth(
                 return wrong(path, message);
             }
         }
-        let intrinsic = Shear::new(columns[3][k], columns[4][k]);
-        let g = intrinsic.sheared_by(Shear::new(columns[1][k], columns[2][k]));
+        let shear = |first: usize| below_one(Shear::new(columns[first][k], columns[first + 1][k]));
+        let fault = |message: String| FileError::new(path, format!("galaxy {id}: {message}"));
+        let intrinsic = shear(3).map_err(fault)?;
+        let g = intrinsic.sheared_by(shear(1).map_err(fault)?);
         galaxies
             .add((x, y), g, 1.0)
             .map_err(|error| FileError::new(path, format!("galaxy {id}: {error}")))?;
     }
     Ok(())
+}
+
+fn shear_of(found: &Parameters) -> Result<Shear, FileError> {
+    let shear = Shear::new(found.number("g1")?, found.number("g2")?);
+    below_one(shear).map_err(|message| FileError::new(&found.path, message))
+}
+
+fn psf_of(found: &Parameters) -> Result<Option<Shear>, FileError> {
+    let psf = Shear::new(found.number("psf_g1")?, found.number("psf_g2")?);
+    known_psf(psf).map_err(|message| FileError::new(&found.path, message))
+}
+
+fn below_one(g: Shear) -> Result<Shear, String> {
+    match g.modulus() < 1.0 {
+        true => Ok(g),
+        false => Err(format!(
+            "not a shear (found {} {}, expected |g| < 1)",
+            g.e1, g.e2
+        )),
+    }
 }
 
 impl Branch for Great3 {
@@ -685,12 +875,20 @@ impl Branch for Great3 {
 
     fn score(&self, truth: Truth<'_>, submission: &Path, pool: &Pool) -> Result<Score, FileError> {
         let of_submission = |error| FileError::new(submission, error);
-        let mut figures = Vec::new();
-        let plots;
+        let fields = self.fields(truth.subfields)?;
+        let (mut figures, mut warnings) = (Vec::new(), Vec::new());
+        let (refusal, plots);
         if self.constant {
-            let shears = self.true_shears(truth.path)?;
-            let psfs = self.psfs(truth, shears.len())?;
-            let submitted = self.read_shears(submission, Some(shears.len()))?;
+            let shears = self.true_shears(truth.path, fields)?;
+            let psfs = self.psfs(truth, fields)?;
+            let submitted = self.submitted_shears(submission, fields)?;
+            let pairs: Vec<_> = shears
+                .iter()
+                .copied()
+                .zip(submitted.iter().copied())
+                .collect();
+            refusal = disagreement(&pairs);
+            warnings.extend(odd_fields(&pairs));
             let fields = shears.iter().zip(&submitted).zip(&psfs);
             let fields: Vec<ConstantField> = fields
                 .map(|((&truth, &submitted), &psf)| ConstantField {
@@ -733,12 +931,21 @@ impl Branch for Great3 {
                 });
             }
         } else {
-            let masses = self.true_masses(truth.path, pool)?;
-            let submitted = self.read_masses(submission, Some(masses.len()))?;
-            let score = |submitted: &[_]| variable_score(submitted, &masses, self.observation);
-            let found = score(&submitted).map_err(of_submission)?;
-            let perfect = score(&masses).map_err(of_submission)?;
-            plots = vec![mass_plot(&masses, &submitted)];
+            if let Some(psf) = truth.psf {
+                return wrong(
+                    psf,
+                    format!("--psf: Q_v of {self} has no use for the PSF. Try: without --psf"),
+                );
+            }
+            let masses = self.true_masses(truth.path, fields, pool)?;
+            let submitted = self.submitted_masses(submission, fields)?;
+            refusal = disagreement_of_masses(&submitted, &masses);
+            let e = |masses: &[Masses]| masses.iter().map(|own| own.e).collect::<Vec<_>>();
+            let true_e = e(&masses);
+            let score = |submitted: &[_]| variable_score(submitted, &true_e, self.observation);
+            let found = score(&e(&submitted)).map_err(of_submission)?;
+            let perfect = score(&true_e).map_err(of_submission)?;
+            plots = vec![mass_plot(&true_e, &e(&submitted))];
             figures.push(Figure {
                 key: "Q_v",
                 value: found.q,
@@ -753,17 +960,16 @@ impl Branch for Great3 {
             branch: Some(self.to_string()),
             figures,
             plots,
+            refusal,
+            warnings,
         })
     }
 
     fn check(&self, submission: &Path) -> Result<(), FileError> {
+        let fields = self.fields(None)?;
         match self.constant {
-            true => self
-                .read_shears(submission, Some(self.fields()))
-                .map(|_| ()),
-            false => self
-                .read_masses(submission, Some(self.fields()))
-                .map(|_| ()),
+            true => self.submitted_shears(submission, fields).map(|_| ()),
+            false => self.submitted_masses(submission, fields).map(|_| ()),
         }
     }
 
@@ -813,6 +1019,14 @@ struct Galaxies<'a> {
     branch: &'a Great3,
     files: Vec<PathBuf>,
     galaxies: Vec<Galaxy>,
+    // Names of columns that are not used.
+    unused: BTreeSet<String>,
+}
+
+// Other names of weights than those that are read.
+fn is_like_a_weight(name: &str) -> bool {
+    let name = name.to_ascii_lowercase();
+    name.contains("weight") || ["wt", "wgt", "wht", "weights"].contains(&name.as_str())
 }
 
 impl<'a> Galaxies<'a> {
@@ -821,6 +1035,7 @@ impl<'a> Galaxies<'a> {
             branch,
             files: Vec::new(),
             galaxies: Vec::new(),
+            unused: BTreeSet::new(),
         };
         match packing.catalogues {
             Catalogues::Files(files) => {
@@ -829,6 +1044,14 @@ impl<'a> Galaxies<'a> {
                     let hint = "catalogues of measure are packed by --measured DIR";
                     let columns = GALAXIES.read(path);
                     let columns = columns.map_err(|error| error.hint_of_columns(hint))?;
+                    let unused = GALAXIES.unused(path)?;
+                    // Galaxies that another program excludes by a weight of zero would count fully.
+                    if let Some(name) = unused.iter().find(|name| is_like_a_weight(name))
+                        && columns[3].is_empty()
+                    {
+                        return wrong(path, Fault::UnusedWeight(name.clone()));
+                    }
+                    all.unused.extend(unused);
                     all.add(path, &columns, packing)?;
                 }
             }
@@ -923,7 +1146,7 @@ impl<'a> Galaxies<'a> {
         {
             let id = pair[0].id.to_string();
             let first = file(&pair[0]).display().to_string();
-            return wrong(file(&pair[1]), Fault::Repeated { id, first });
+            return wrong(file(&pair[1]), Fault::RepeatedGalaxy { id, first });
         }
         let there: BTreeSet<usize> = self.galaxies.iter().map(|own| own.id.subfield()).collect();
         let last = self
@@ -978,6 +1201,27 @@ impl<'a> Galaxies<'a> {
                     found: offset(odd.id),
                     expected,
                     first: first.id.to_string(),
+                },
+            );
+        }
+        let measured =
+            |own: &&Galaxy| own.weight > 0.0 && own.g.e1 < NOT_AVERAGED && own.g.e2 < NOT_AVERAGED;
+        let shears = galaxies.iter().filter(measured);
+        let shears: Vec<_> = shears.map(|own| [own.g.e1, own.g.e2]).collect();
+        // True shears, which all galaxies of a field share, have no such galaxies among others.
+        let among_others = |found: &Repeated<2>| 10 * found.rows > found.of && !found.is_constant();
+        if let Some(found) = repeated(&shears, EQUAL_SHEARS).filter(among_others) {
+            let Repeated {
+                rows, of, value, ..
+            } = found;
+            let subfield = first.id.subfield();
+            return wrong(
+                file(first),
+                Fault::Placeholders {
+                    subfield,
+                    rows,
+                    of,
+                    value,
                 },
             );
         }
@@ -1085,10 +1329,11 @@ impl<'a> Galaxies<'a> {
             !is_measured(own.g.e1, NOT_AVERAGED) || !is_measured(own.g.e2, NOT_AVERAGED)
         });
         let mut note = format!(
-            "{} galaxies of {}, {} not measured",
+            "{} galaxies of {}, {} not measured{}",
             self.galaxies.len(),
             self.branch,
-            unmeasured.count()
+            unmeasured.count(),
+            self.unused_columns()
         );
         if let (true, Catalogues::Measured(folder)) = (self.branch.constant, packing.catalogues) {
             let means = mean_shears(&Run::require(folder)?, folder, &[], None)?;
@@ -1104,6 +1349,14 @@ impl<'a> Galaxies<'a> {
             );
         }
         Ok(Packed { text, note })
+    }
+
+    fn unused_columns(&self) -> String {
+        let unused: Vec<&str> = self.unused.iter().map(String::as_str).collect();
+        match unused.as_slice() {
+            [] => String::new(),
+            names => format!("; columns that are not used: {}", names_of(names)),
+        }
     }
 
     // `None` of galaxies without a shear.
