@@ -149,7 +149,7 @@ const WAYS: [(&str, &[&str]); 33] = [
             "data measured sets aperture-mass format wide metrics convention threads",
             "data foreign sets aperture-mass format wide metrics convention threads",
             "truth CATALOGUE truth-sign stamp field columns ellipticity missing drop-missing max-modulus aperture-mass format wide metrics convention threads",
-            "challenge branch truth psf CATALOGUE report format threads",
+            "challenge branch truth psf subfields CATALOGUE report format threads",
         ],
     ),
     (
