@@ -156,8 +156,8 @@ def measure(options):
     name = "-".join(data[0].relative_to(roots[0]).parts)
     images = sorted(data[0].glob("image-*-0.fits"))
     size = len(fits.getdata(data[0] / "starfield_image-000-0.fits")) // 3
-    branch = ["--challenge", "great3", "--branch", name]
-    known = [*branch, "--subfields", len(images), "--grid", len(fits.getdata(images[0])) // size]
+    branch = ["--challenge", "great3", "--branch", name, "--subfields", len(images)]
+    known = [*branch, "--grid", len(fits.getdata(images[0])) // size]
     for method in options.methods:
         shears, scored = [], []
         for root, folder in zip(roots, data):
