@@ -70,7 +70,7 @@ pub(crate) struct Arguments {
     cutouts: Cutouts,
     /// Make squares of stamps that are not: by their central square (crop), or by missing pixels around them (pad). A galaxy with
     /// many missing pixels is flagged. PSFs are cropped [default: refuse].
-    #[arg(long, value_name = "HOW", value_parser = named::<Square>(), conflicts_with = "exposure")]
+    #[arg(long, value_name = "HOW", value_parser = named::<Square>(), conflicts_with_all = ["exposure", "first_pixel", "columns", "degrees", "size"])]
     square: Option<Square>,
     /// FITS files of PSF stamps, or one table of functional PSFs (.csv): one PSF for all galaxies, or one per galaxy.
     /// Several stars, at most half as many as galaxies, are averaged to one PSF.
