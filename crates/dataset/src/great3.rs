@@ -9,10 +9,9 @@ use shearq_files::FileError;
 use shearq_files::open::{SETTINGS, is_there, read_to_string};
 use shearq_files::table::{self, MAX_ROWS};
 
-use crate::layout::{DataFolder, Layout, MAX_STAMP, endings};
 use crate::listing;
 use crate::mosaic::Mosaic;
-use crate::pattern::fill;
+use crate::pattern::{MAX_STAMP, endings, fill};
 
 const GALAXIES: &str = "image-{set:03}-{image}.fits";
 /// Stars of branches with one PSF per subfield and epoch.
@@ -38,8 +37,16 @@ pub struct Branch {
     pub stacked_stars: bool,
 }
 
-/// The layout of a folder with the files of a branch.
-pub(crate) fn detect(root: &Path) -> Result<Option<Layout>, FileError> {
+/// A folder with the files of a branch: patterns of their names, and what its first catalogue of galaxies states.
+pub(crate) struct Found {
+    pub(crate) galaxies: &'static str,
+    pub(crate) psf_star: &'static str,
+    pub(crate) stamp: usize,
+    pub(crate) branch: Branch,
+}
+
+/// `None` without images and catalogues of the branch.
+pub(crate) fn detect(root: &Path) -> Result<Option<Found>, FileError> {
     let images = listing::find(root, GALAXIES, endings(GALAXIES), &[])?;
     let catalogue = |set: &u32| root.join(fill(GALAXY_CATALOGUES, *set, 0));
     // Images alone may be anyone's.
@@ -59,21 +66,20 @@ pub(crate) fn detect(root: &Path) -> Result<Option<Layout>, FileError> {
         true => STAR_FIELDS,
         false => PSF_IMAGES,
     };
-    Ok(Some(Layout {
-        galaxies: GALAXIES.into(),
-        psf_star: psf_star.into(),
+    Ok(Some(Found {
+        galaxies: GALAXIES,
+        psf_star,
         stamp: galaxies.stamp()?,
-        great3: Some(Branch {
+        branch: Branch {
             rotated_pairs: galaxies.have_constant_shear()?,
             stacked_stars: false,
-        }),
-        ..Layout::default()
+        },
     }))
 }
 
 /// Whether the stars of a subfield are all over its field, so that its galaxies have different PSFs.
-pub fn has_varying_psf(data: &DataFolder, set: u32) -> bool {
-    is_there(&data.root().join(fill(STAR_CATALOGUES, set, 0)))
+pub fn has_varying_psf(root: &Path, set: u32) -> bool {
+    is_there(&root.join(fill(STAR_CATALOGUES, set, 0)))
 }
 
 /// The table of a subfield's galaxies.
@@ -83,10 +89,10 @@ pub(crate) fn galaxy_catalogue(root: &Path, set: u32) -> PathBuf {
 
 /// Shift (x, y) in pixels of all galaxies of an epoch; zero in branches of a single epoch.
 // The challenge's example of a coadd shifts each image by the negative of these numbers.
-pub fn dither(data: &DataFolder, set: u32, image: u32) -> Result<[f64; 2], FileError> {
+pub fn dither(root: &Path, set: u32, image: u32) -> Result<[f64; 2], FileError> {
     let stem = fill(DITHERS, set, image);
-    let Some(found) = Parameters::read(data.root(), &stem)? else {
-        let path = data.root().join(stem + ".yaml");
+    let Some(found) = Parameters::read(root, &stem)? else {
+        let path = root.join(stem + ".yaml");
         let message = "there is no such file, nor one ending in .txt; expected the dither of this epoch, by which its galaxies are shifted";
         return Err(FileError::new(path, message));
     };

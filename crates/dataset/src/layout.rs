@@ -8,14 +8,11 @@ use shearq_scoring::{Grid, Row, TrueShear, TruthSign};
 
 use crate::great3;
 use crate::listing::{self, Files};
-use crate::pattern::PLACEHOLDERS;
-pub use crate::pattern::{IMAGE_PLACEHOLDERS, MAX_IMAGE, MAX_SET, check_pattern, fill};
+pub use crate::pattern::{IMAGE_PLACEHOLDERS, MAX_IMAGE, MAX_SET, MAX_STAMP, check_pattern, fill};
+use crate::pattern::{PLACEHOLDERS, endings};
 use shearq_files::FileError;
 use shearq_files::open::{self, is_there};
 use shearq_files::table;
-
-/// Largest side of a postage stamp, in pixels.
-pub const MAX_STAMP: usize = 1024;
 
 /// Name of the layout file inside a data folder.
 pub const LAYOUT_FILE: &str = "layout.toml";
@@ -147,7 +144,16 @@ impl DataFolder {
                 .map_err(FileError::doing(&path, "cannot read the layout"))?;
             toml::from_str(&text).map_err(|e| FileError::new(&path, e.to_string().trim_end()))?
         } else {
-            great3::detect(&root)?.unwrap_or_default()
+            match great3::detect(&root)? {
+                Some(found) => Layout {
+                    galaxies: found.galaxies.into(),
+                    psf_star: found.psf_star.into(),
+                    stamp: found.stamp,
+                    great3: Some(found.branch),
+                    ..Layout::default()
+                },
+                None => Layout::default(),
+            }
         };
         Ok(DataFolder { root, layout })
     }
@@ -290,14 +296,6 @@ pub fn truth_is_there(path: &Path) -> Result<(), FileError> {
     }
     let message = "there is no true shear to score against. Try: shearq mean --measured OUT, for the mean shear of images of your own";
     Err(FileError::new(path, message))
-}
-
-// Further endings of the names of images: of gzip and fpack.
-pub(crate) fn endings(pattern: &str) -> &'static [&'static str] {
-    match pattern.ends_with(".fits") || pattern.ends_with(".fit") {
-        true => &["", ".gz", ".fz"],
-        false => &[""],
-    }
 }
 
 /// Key under which a truth file states the sign of its g2: `standard` or `challenge`.

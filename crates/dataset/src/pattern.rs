@@ -1,5 +1,8 @@
 //! Patterns of file names with the numbers of sets and images.
 
+/// Largest side of a postage stamp, in pixels.
+pub const MAX_STAMP: usize = 1024;
+
 pub const MAX_SET: u32 = 9_999;
 pub const MAX_IMAGE: u32 = 999_999;
 
@@ -17,6 +20,14 @@ pub fn fill(pattern: &str, set: u32, image: u32) -> String {
         }
     }
     filled
+}
+
+// Further endings of the names of images: of gzip and fpack.
+pub(crate) fn endings(pattern: &str) -> &'static [&'static str] {
+    match pattern.ends_with(".fits") || pattern.ends_with(".fit") {
+        true => &["", ".gz", ".fz"],
+        false => &[""],
+    }
 }
 
 /// Checks that the pattern of `key` has a placeholder of each kind in `needed`, and no other braces.

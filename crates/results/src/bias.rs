@@ -28,7 +28,6 @@ use thiserror::Error;
 use crate::expression::Expression;
 use crate::select::StatedSelection;
 use columns::{CATALOGUES, Names, Role, Shapes};
-pub(crate) use read::text_matches;
 use source::{Reading, Source, sources};
 use truth::{TrueSign, Truth};
 

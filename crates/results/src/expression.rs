@@ -1,5 +1,9 @@
 //! The language of `--where`, `--weight` and `--bins`: formulas and conditions of columns.
 
+use std::path::Path;
+
+use shearq_files::FileError;
+use shearq_files::frames::polars::DataFrame;
 use thiserror::Error;
 
 /// Why a text is no expression.
@@ -460,6 +464,33 @@ fn number_length(text: &str) -> usize {
         }
     }
     length
+}
+
+/// For each row whether the text of a column fits the pattern: 1 or 0.
+pub(crate) fn text_matches(
+    frame: &DataFrame,
+    name: &str,
+    pattern: &str,
+    path: &Path,
+) -> Result<Vec<f64>, FileError> {
+    let Some(texts) = texts_of(frame, name) else {
+        return Err(FileError::new(
+            path,
+            format!(
+                "column `{name}` contains no texts (found a comparison with '{pattern}', expected a number)"
+            ),
+        ));
+    };
+    Ok(texts
+        .map(|text| f64::from(u8::from(fits(pattern, text.unwrap_or_default()))))
+        .collect())
+}
+
+pub(crate) fn texts_of<'f>(
+    frame: &'f DataFrame,
+    name: &str,
+) -> Option<impl Iterator<Item = Option<&'f str>> + use<'f>> {
+    Some(frame.column(name).ok()?.str().ok()?.iter())
 }
 
 #[cfg(test)]

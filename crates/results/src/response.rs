@@ -12,13 +12,13 @@ use shearq_files::FileError;
 use shearq_files::frames::polars::{Column, DataFrame};
 use shearq_files::frames::{Metadata, frame};
 use shearq_files::table::{self, FileFormat};
-use shearq_measure::{Observables, ShearedCatalogues, is_significant};
+use shearq_measure::is_significant;
 use shearq_quantities::Frame;
 use shearq_quantities::matrix::solve;
 use shearq_quantities::statistics::RunningMean;
 use shearq_submissions::Calibration;
 
-use crate::select::{READ, WEIGHT, undivided_columns};
+use crate::select::{WEIGHT, is_measured, undivided_columns};
 
 /// The mean responses R11 and R22 of the good galaxies of all `catalogues` of a set; 1 of catalogues whose ellipticities are
 /// not to be divided: of networks, of other programs, and of earlier versions, which divided each image by its own response.
@@ -441,25 +441,6 @@ fn weights(path: &Path, table: &DataFrame) -> Result<Vec<f64>, FileError> {
         *weight = f64::NAN;
     }
     Ok(weights)
-}
-
-// Whether a column was measured on the stamps.
-pub(crate) fn is_measured(name: &str) -> bool {
-    const OTHERS: [&str; 9] = [
-        "iterations",
-        "stop",
-        "updated",
-        "first_energy",
-        "energy",
-        "noise",
-        "radius",
-        "snr",
-        WEIGHT,
-    ];
-    READ.contains(&name)
-        || OTHERS.contains(&name)
-        || Observables::COLUMNS.contains(&name)
-        || ShearedCatalogues::columns().any(|own| own == name)
 }
 
 #[cfg(test)]

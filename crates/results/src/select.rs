@@ -16,9 +16,7 @@ use shearq_measure::{
 };
 use thiserror::Error;
 
-use crate::bias::text_matches;
-use crate::expression::{Condition, Expression, ExpressionError, Operand, Step};
-use crate::response::is_measured;
+use crate::expression::{Condition, Expression, ExpressionError, Operand, Step, text_matches};
 
 /// Columns that a selection replaces or reads. It also reads the columns of [`Observables`].
 pub(crate) const READ: [&str; 7] = ["e1", "e2", "flags", "R11", "R22", "R12", "R21"];
@@ -491,4 +489,22 @@ impl Weighted {
         columns.push(Column::new(WEIGHT.into(), self.weight.clone()));
         frame(columns).map_err(|error| FileError::new(path, error.to_string()))
     }
+}
+// Whether a column was measured on the stamps.
+pub(crate) fn is_measured(name: &str) -> bool {
+    const OTHERS: [&str; 9] = [
+        "iterations",
+        "stop",
+        "updated",
+        "first_energy",
+        "energy",
+        "noise",
+        "radius",
+        "snr",
+        WEIGHT,
+    ];
+    READ.contains(&name)
+        || OTHERS.contains(&name)
+        || Observables::COLUMNS.contains(&name)
+        || ShearedCatalogues::columns().any(|own| own == name)
 }

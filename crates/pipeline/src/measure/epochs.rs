@@ -52,7 +52,7 @@ pub(super) fn open(
         };
         let offsets = match (data.layout().great3, &image.table) {
             (Some(_), _) => Some(vec![
-                great3::dither(data, id.set, id.image)?;
+                great3::dither(data.root(), id.set, id.image)?;
                 mosaic.galaxies
             ]),
             (None, Some(table)) => offsets(table, &path, mosaic.stamp)?,

@@ -407,7 +407,7 @@ fn open_star_field(
     cut: PsfCut,
 ) -> Result<OpenPsfs, FileError> {
     const ALL: usize = great3::STARS_PER_SIDE;
-    if great3::has_varying_psf(data, id.set) {
+    if great3::has_varying_psf(data.root(), id.set) {
         let expected = fill(great3::PSF_IMAGES, id.set, id.image);
         let message = format!(
             "the stars are all over the field, so that each galaxy has another PSF (expected {expected} beside this file). Try: a program that interpolates stars, such as PSFEx or PIFF, to write one PSF stamp per galaxy, as a mosaic like the galaxies' or a cube in the order of their catalogue"

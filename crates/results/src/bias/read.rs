@@ -11,7 +11,7 @@ use shearq_files::frames::polars::{DataFrame, DataType};
 use shearq_files::table::{self, FileFormat};
 use shearq_quantities::{Distortion, MeasuredRange};
 
-use crate::expression::{Expression, Operand, fits};
+use crate::expression::{Expression, Operand, text_matches, texts_of};
 use crate::foreign::shown;
 use crate::select::Weighted;
 use crate::star_noise;
@@ -907,32 +907,6 @@ impl Repeats {
         }
         all
     }
-}
-
-pub(crate) fn text_matches(
-    frame: &DataFrame,
-    name: &str,
-    pattern: &str,
-    path: &Path,
-) -> Result<Vec<f64>, FileError> {
-    let Some(texts) = texts_of(frame, name) else {
-        return Err(FileError::new(
-            path,
-            format!(
-                "column `{name}` contains no texts (found a comparison with '{pattern}', expected a number)"
-            ),
-        ));
-    };
-    Ok(texts
-        .map(|text| f64::from(u8::from(fits(pattern, text.unwrap_or_default()))))
-        .collect())
-}
-
-fn texts_of<'f>(
-    frame: &'f DataFrame,
-    name: &str,
-) -> Option<impl Iterator<Item = Option<&'f str>> + use<'f>> {
-    Some(frame.column(name).ok()?.str().ok()?.iter())
 }
 
 fn is_sheared(text: Option<&str>) -> bool {
