@@ -216,7 +216,7 @@ pub fn write_selected(
         for (image, path) in files.of_set(set) {
             let read = table::read(&path, None, table::MAX_ROWS)?;
             let mut weighted = Weighted::of_table(&path, &selection, &read)?;
-            weighted.keep_of_file(&path, stated)?;
+            weighted.keep_of_table(&path, stated, &read)?;
             kept += weighted
                 .weight
                 .iter()
@@ -433,7 +433,30 @@ impl Weighted {
         Ok(())
     }
 
-    // The same for the condition of a selection on the columns of a file, if it has one.
+    // The same for the condition of a selection on the columns of a table, if it has one.
+    fn keep_of_table(
+        &mut self,
+        path: &Path,
+        stated: &StatedSelection,
+        table: &DataFrame,
+    ) -> Result<(), FileError> {
+        let Some(condition) = &stated.rows else {
+            return Ok(());
+        };
+        self.keep(
+            path,
+            condition,
+            |Operand { column, pattern }| match pattern {
+                Some(pattern) => text_matches(table, column, pattern, path).map(Cow::Owned),
+                None => {
+                    let numbers = table::numbers(table, column, path)?;
+                    Ok(Cow::Owned(numbers.into_owned()))
+                }
+            },
+        )
+    }
+
+    // The same, reading only the columns of the condition.
     pub(crate) fn keep_of_file(
         &mut self,
         path: &Path,
@@ -444,17 +467,7 @@ impl Weighted {
         };
         let names: Vec<&str> = condition.columns().collect();
         let read = table::read(path, Some(&names), table::MAX_ROWS)?;
-        self.keep(
-            path,
-            condition,
-            |Operand { column, pattern }| match pattern {
-                Some(pattern) => text_matches(&read, column, pattern, path).map(Cow::Owned),
-                None => {
-                    let numbers = table::numbers(&read, column, path)?;
-                    Ok(Cow::Owned(numbers.into_owned()))
-                }
-            },
-        )
+        self.keep_of_table(path, stated, &read)
     }
 
     /// The response of e1 and e2 of a row, by rows, to g1 and g2.
@@ -490,21 +503,26 @@ impl Weighted {
         frame(columns).map_err(|error| FileError::new(path, error.to_string()))
     }
 }
+
+// Whether shear changes a column of shearq's catalogues.
+pub(crate) fn changes_with_shear(name: &str) -> bool {
+    let read = READ.contains(&name) && name != "flags";
+    read || Observables::COLUMNS.contains(&name) || ["snr", "neighbour", "radius"].contains(&name)
+}
+
 // Whether a column was measured on the stamps.
 pub(crate) fn is_measured(name: &str) -> bool {
-    const OTHERS: [&str; 9] = [
+    const OTHERS: [&str; 8] = [
+        "flags",
         "iterations",
         "stop",
         "updated",
         "first_energy",
         "energy",
         "noise",
-        "radius",
-        "snr",
         WEIGHT,
     ];
-    READ.contains(&name)
+    changes_with_shear(name)
         || OTHERS.contains(&name)
-        || Observables::COLUMNS.contains(&name)
-        || ShearedCatalogues::columns().any(|own| own == name)
+        || ShearedCatalogues::columns().any(|column| column == name)
 }

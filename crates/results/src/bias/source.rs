@@ -10,7 +10,7 @@ use shearq_files::{FileError, names_of};
 use shearq_measure::{Observables, Selection};
 
 use crate::expression::{Expression, Operand};
-use crate::select::{READ, require_responses};
+use crate::select::{READ, changes_with_shear, require_responses};
 
 use super::columns::{CATALOGUES, Columns, Places, Preset, Role, Shapes, base, fits_any};
 use super::truth::Truth;
@@ -485,7 +485,7 @@ fn source(
     let unanswered: BTreeSet<&str> = reading
         .chosen_by()
         .filter(|name| match columns.preset {
-            Preset::Shearq => is_measured(name),
+            Preset::Shearq => changes_with_shear(name),
             _ => !is_fixed(name, &columns) && !has_sheared(name),
         })
         .collect();
@@ -540,12 +540,6 @@ pub(super) fn catalogue_named(name: &str) -> Option<usize> {
     sheared.position(|(known, _)| *known == name).map(|k| k + 1)
 }
 
-// Whether a column of shearq's catalogues was measured on the galaxies.
-fn is_measured(name: &str) -> bool {
-    let known = Observables::COLUMNS.contains(&name) || READ.contains(&name);
-    (known || ["snr", "neighbour", "radius"].contains(&name)) && name != "flags"
-}
-
 // Refuses to choose galaxies by columns of one sheared catalogue, or by measured ones without sheared columns.
 fn check_chosen<'a>(
     path: &Path,
@@ -561,7 +555,7 @@ fn check_chosen<'a>(
                 ),
             ));
         }
-        if is_measured(name) && !has_sheared(name) {
+        if changes_with_shear(name) && !has_sheared(name) {
             return Err(FileError::new(
                 path,
                 format!(
