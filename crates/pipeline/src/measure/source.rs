@@ -253,9 +253,9 @@ pub(super) enum PsfSource {
 impl PsfSource {
     fn row(&mut self, mosaic: Mosaic, row: usize) -> Result<Psfs<'static>, PipelineError> {
         Ok(match self {
-            PsfSource::Shared(psf) => Psfs::Prepared(psf.clone()),
+            // Whole rows, which are faster than squares.
             PsfSource::Stars { image, side } => Psfs::Stars(read_row(image, mosaic, *side, row)?),
-            PsfSource::Cube { .. } | PsfSource::Functional(_) => {
+            PsfSource::Shared(_) | PsfSource::Cube { .. } | PsfSource::Functional(_) => {
                 let first = row * mosaic.columns;
                 let tiles: Vec<_> = (first..first + mosaic.of_row(row)).map(Some).collect();
                 self.of_tiles(mosaic.columns, &tiles)?
@@ -276,18 +276,11 @@ impl PsfSource {
             }
             PsfSource::Cube { image, planes } => {
                 let side = image.width();
-                let mut all = Array3::zeros((tiles.len(), side, side));
-                for (tile, mut square) in tiles.iter().zip(all.outer_iter_mut()) {
-                    let Some(tile) = tile else { continue };
+                Psfs::Stars(stack(side, tiles, 0.0, |tile| {
                     image.rewind();
-                    image.skip_rows(planes[*tile] * side);
-                    let pixels = image.read_rows_as::<f64>(side)?;
-                    square
-                        .iter_mut()
-                        .zip(pixels)
-                        .for_each(|(to, from)| *to = from);
-                }
-                Psfs::Stars(Pixels::from(all))
+                    image.skip_rows(planes[tile] * side);
+                    image.read_rows_as::<f64>(side)
+                })?)
             }
             PsfSource::Functional(field) => {
                 let of = |tile: &Option<usize>| -> FunctionalPsf { field[tile.unwrap_or(0)] };
@@ -304,14 +297,24 @@ pub(super) fn squares(
     tiles: &[Option<usize>],
     missing: f64,
 ) -> Result<Pixels<'static, Ix3>, FileError> {
+    stack(side, tiles, missing, |tile| {
+        let corner = [tile % columns, tile / columns].map(|at| (at * side) as i64);
+        image.read_square::<f64>(corner[0], corner[1], side)
+    })
+}
+
+fn stack(
+    side: usize,
+    tiles: &[Option<usize>],
+    missing: f64,
+    mut read: impl FnMut(usize) -> Result<Vec<f64>, FileError>,
+) -> Result<Pixels<'static, Ix3>, FileError> {
     let mut all = Array3::from_elem((tiles.len(), side, side), missing);
     for (tile, mut square) in tiles.iter().zip(all.outer_iter_mut()) {
-        let Some(tile) = tile else { continue };
-        let corner = [tile % columns, tile / columns].map(|at| (at * side) as i64);
-        let pixels = image.read_square::<f64>(corner[0], corner[1], side)?;
+        let Some(tile) = *tile else { continue };
         square
             .iter_mut()
-            .zip(pixels)
+            .zip(read(tile)?)
             .for_each(|(to, from)| *to = from);
     }
     Ok(Pixels::from(all))
