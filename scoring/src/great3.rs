@@ -1,5 +1,7 @@
 //! The metrics of GREAT3 (Mandelbaum et al. 2014, ApJS 212, 5) and GREAT08 (Bridle et al. 2010, MNRAS 405, 2044).
 
+use std::fmt;
+
 #[cfg(feature = "serde")]
 use serde::Serialize;
 use shearq_quantities::Shear;
@@ -8,6 +10,57 @@ use shearq_quantities::units::Radians;
 use crate::aperture::SEPARATION_BINS;
 use crate::error::ScoringError;
 use crate::resample::{group_sizes, jackknife_error};
+
+/// Subfields of a branch.
+pub const SUBFIELDS: usize = 200;
+/// Subfields of a field, where galaxies share a shear field or a model of the PSF.
+pub const SUBFIELDS_PER_FIELD: usize = 20;
+/// Galaxies per side of a subfield.
+pub const GRID: usize = 100;
+/// Nodes of the lattice of a field from a galaxy of a subfield to the next, along each axis.
+pub const NODES_PER_GALAXY: usize = 7;
+/// Epochs of a subfield in the experiments multiepoch and full. The others have one.
+pub const EPOCHS: usize = 6;
+/// Stars per side of an image of stars.
+pub const STARS_PER_SIDE: usize = 3;
+
+/// Identity of a galaxy, SSSXXXYYY: subfield, column and row from 0. In variable branches columns and rows are nodes of the lattice.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Identity(u32);
+
+impl Identity {
+    /// Of numbers below 1000 each.
+    pub fn new(subfield: usize, (x, y): (usize, usize)) -> Self {
+        Identity((1_000_000 * subfield + 1000 * x + y) as u32)
+    }
+
+    /// As it stands in a table; `None` if it has a sign, a fraction or more than nine digits, as a number of another column.
+    pub fn of_number(number: f64) -> Option<Self> {
+        let is_whole = (0.0..1e9).contains(&number) && number.fract() == 0.0;
+        is_whole.then_some(Identity(number as u32))
+    }
+
+    /// As it stands in a table.
+    pub fn number(self) -> i64 {
+        self.0.into()
+    }
+
+    /// Number of its subfield.
+    pub fn subfield(self) -> usize {
+        self.0 as usize / 1_000_000
+    }
+
+    /// Column and row.
+    pub fn place(self) -> (usize, usize) {
+        (self.0 as usize / 1000 % 1000, self.0 as usize % 1000)
+    }
+}
+
+impl fmt::Display for Identity {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{:09}", self.0)
+    }
+}
 
 /// Requirement on |c| of a survey of Stage IV, to which Q_c refers.
 pub const REQUIRED_C: f64 = 2e-4;

@@ -11,9 +11,10 @@ use crate::progress::Bar;
 use crate::{count, tell, tell_unread};
 use shearq_dataset::run::{Run, open_data};
 use shearq_results::catalogues::Catalogues;
-use shearq_results::published::{self as challenges, Packing, great3};
+use shearq_results::published::{self as challenges, Packing};
 use shearq_results::submit::pack::Packing as Submission;
 use shearq_results::submit::{Contents, Entry, is_archive};
+use shearq_scoring::great3::{GRID, SUBFIELDS};
 
 // Longest name of a method in bytes: a tar header has 100 for a file name.
 const MAX_METHOD_BYTES: usize = 64;
@@ -149,8 +150,8 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
                 Some(folder) => challenges::Catalogues::Measured(folder),
                 None => challenges::Catalogues::Files(&arguments.catalogues),
             },
-            subfields: arguments.subfields.map_or(great3::SUBFIELDS, usize::from),
-            grid: arguments.grid.map_or(great3::GRID, usize::from),
+            subfields: arguments.subfields.map_or(SUBFIELDS, usize::from),
+            grid: arguments.grid.map_or(GRID, usize::from),
             whole_galaxies: arguments.whole_galaxies,
         };
         let branch = published::branch_of(challenge, Some(branch))?;

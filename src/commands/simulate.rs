@@ -10,7 +10,8 @@ use shearq_dataset::images;
 use shearq_dataset::layout::{DataFolder, MAX_IMAGE};
 use shearq_dataset::run::SimulationRecord;
 use shearq_pipeline::simulate::{great3, simulate_folder};
-use shearq_simulate::great3::{Branch, BranchSimulator, GRID};
+use shearq_scoring::great3::{GRID, SUBFIELDS};
+use shearq_simulate::great3::{Branch, BranchSimulator};
 use shearq_simulate::set::SimulationSettings;
 
 /// Write simulated GREAT10-like sets: images, PSFs, true shear and intrinsic shapes.
@@ -79,9 +80,6 @@ const GREAT10_ONLY: [&str; 7] = [
     "rotated",
     "shard",
 ];
-
-// Subfields of a branch.
-const SUBFIELDS: u16 = 200;
 
 fn branch(name: &str) -> Result<Branch, String> {
     let found = Branch::all().find(|(own, _)| own == name);
@@ -153,7 +151,7 @@ fn run_branch(arguments: &Arguments, branch: Branch) -> anyhow::Result<()> {
             let path = arguments.galaxies.as_deref().unwrap_or(Path::new(""));
             path.display().to_string()
         })?;
-    let subfields = usize::from(arguments.subfields.unwrap_or(SUBFIELDS));
+    let subfields = arguments.subfields.map_or(SUBFIELDS, usize::from);
     let mut folders = vec![(arguments.out.clone(), false)];
     if arguments.opposite {
         folders.push((arguments.out.join("opposite"), true));

@@ -8,23 +8,26 @@ use serde::{Deserialize, Serialize};
 use shearq_files::FileError;
 use shearq_files::open::{SETTINGS, is_there, read_to_string};
 use shearq_files::table::{self, MAX_ROWS};
+use shearq_scoring::great3::Identity;
 
 use crate::listing;
 use crate::mosaic::Mosaic;
 use crate::pattern::{MAX_STAMP, endings, fill};
 
-const GALAXIES: &str = "image-{set:03}-{image}.fits";
+// Patterns of the names of released files.
+pub const GALAXIES: &str = "image-{set:03}-{image}.fits";
 /// Stars of branches with one PSF per subfield and epoch.
 pub const STAR_FIELDS: &str = "starfield_image-{set:03}-{image}.fits";
 /// Images of one PSF per galaxy, which are not part of the release: users interpolate them.
 pub const PSF_IMAGES: &str = "psf_image-{set:03}-{image}.fits";
 // Stars all over the field, of branches whose PSF varies.
 const STAR_CATALOGUES: &str = "star_catalog-{set:03}.fits";
-const GALAXY_CATALOGUES: &str = "galaxy_catalog-{set:03}.fits";
-const DITHERS: &str = "epoch_dither-{set:03}-{image}";
-
-/// Stars per side of a star field.
-pub const STARS_PER_SIDE: usize = 3;
+pub const GALAXY_CATALOGUES: &str = "galaxy_catalog-{set:03}.fits";
+/// Of [`Parameters`], without the ending. The last two are part of the truth.
+pub const DITHERS: &str = "epoch_dither-{set:03}-{image}";
+pub const SUBFIELD_OFFSETS: &str = "subfield_offset-{set:03}";
+pub const SHEARS: &str = "shear_params-{set:03}";
+pub const PSF_SHAPES: &str = "starshape_parameters-{set:03}-{image}";
 
 /// What a branch has that other data folders do not.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -107,8 +110,7 @@ struct Galaxy {
     /// The lower one of the two central pixels along each axis, from 0.
     x: usize,
     y: usize,
-    /// SSSXXXYYY.
-    id: i64,
+    id: Identity,
 }
 
 /// Places and identities of the galaxies of a subfield.
@@ -125,21 +127,23 @@ impl GalaxyCatalogue {
         let column = |name: &str| table::numbers(&table, name, path);
         let (x, y, id) = (column("x")?, column("y")?, column("ID")?);
         // Fractions would be centroids, of which the challenge stated none; a column of them was matched by mistake.
+        let wrong = |row: usize, name: &str, value: f64| {
+            let row = row + 1;
+            let message =
+                format!("row {row}: {name} is {value}; expected a whole number, 0 or more");
+            FileError::new(path, message)
+        };
         let whole = |row: usize, name: &str, value: f64| {
-            if value.fract() == 0.0 && (0.0..1e9).contains(&value) {
-                return Ok(value as usize);
-            }
-            let message = format!(
-                "row {}: {name} is {value}; expected a whole number, 0 or more",
-                row + 1
-            );
-            Err(FileError::new(path, message))
+            let is_whole = value.fract() == 0.0 && (0.0..1e9).contains(&value);
+            is_whole
+                .then_some(value as usize)
+                .ok_or_else(|| wrong(row, name, value))
         };
         let galaxy = |row: usize| {
             Ok(Galaxy {
                 x: whole(row, "x", x[row])?,
                 y: whole(row, "y", y[row])?,
-                id: whole(row, "ID", id[row])? as i64,
+                id: Identity::of_number(id[row]).ok_or_else(|| wrong(row, "ID", id[row]))?,
             })
         };
         Ok(GalaxyCatalogue {
@@ -168,10 +172,10 @@ impl GalaxyCatalogue {
     /// Whether identities count columns and rows. Those of variable shear are nodes of a lattice with seven per galaxy.
     fn have_constant_shear(&self) -> Result<bool, FileError> {
         let stamp = self.stamp()?;
-        Ok(self.galaxies.iter().all(|Galaxy { x, y, id }| {
-            let place = id % 1_000_000;
-            [place / 1000, place % 1000] == [x / stamp, y / stamp].map(|at| at as i64)
-        }))
+        Ok(self
+            .galaxies
+            .iter()
+            .all(|Galaxy { x, y, id }| id.place() == (x / stamp, y / stamp)))
     }
 
     /// The stamp of each row of the table.
@@ -191,7 +195,7 @@ impl GalaxyCatalogue {
                 Some(place) => places.push(place),
                 None => {
                     let message = format!(
-                        "galaxy {id:09} at x = {x}, y = {y} is outside the image, or another one is on its stamp; expected one galaxy per stamp of {} pixels",
+                        "galaxy {id} at x = {x}, y = {y} is outside the image, or another one is on its stamp; expected one galaxy per stamp of {} pixels",
                         mosaic.stamp
                     );
                     return Err(FileError::new(&self.path, message));
@@ -205,7 +209,7 @@ impl GalaxyCatalogue {
     pub fn identities(&self, mosaic: &Mosaic) -> Result<Vec<i64>, FileError> {
         let mut ids = vec![0; mosaic.galaxies];
         for (galaxy, place) in self.galaxies.iter().zip(self.places(mosaic)?) {
-            ids[place] = galaxy.id;
+            ids[place] = galaxy.id.number();
         }
         Ok(ids)
     }

@@ -13,6 +13,9 @@ use rand_distr::{Distribution, StandardNormal};
 use shearq_fourier::Complex64;
 use shearq_quantities::{FunctionalPsf, PsfProfile, PsfTransform, Pupil, Shear, TransformedPsf};
 use shearq_scoring::aperture::Lattice;
+use shearq_scoring::great3::{
+    EPOCHS, Identity, NODES_PER_GALAXY, STARS_PER_SIDE, SUBFIELDS_PER_FIELD,
+};
 use shearq_scoring::modes::Decomposer;
 use shearq_scoring::{Grid, ScoringError};
 
@@ -23,14 +26,6 @@ use crate::render::{RenderScratch, Renderer};
 use crate::set::{MAX_INTRINSIC_MODULUS, NYQUIST_SHARE, stream};
 use crate::signal::power;
 
-/// Galaxies per side of a subfield.
-pub const GRID: usize = 100;
-/// Stars per side of an image of stars.
-pub const STARS: usize = 3;
-const SUBFIELDS_PER_FIELD: usize = 20;
-// Nodes of the lattice of a field between neighbouring galaxies of a subfield.
-const NODES_PER_GALAXY: usize = 7;
-const EPOCHS: usize = 6;
 // Galaxies, epochs and stars are off the centres of their stamps by up to this on each axis.
 const MAX_OFFSET_PX: f64 = 1.0;
 const SHEARS: (f64, f64) = (0.01, 0.05);
@@ -403,12 +398,12 @@ impl BranchSimulator {
     /// The pixel (x, y) that the challenge calls the centre of a stamp, and the identity SSSXXXYYY.
     pub fn place(&self, subfield: &Subfield, (ix, iy): (usize, usize)) -> ([i64; 2], i64) {
         let centre = |k: usize| (k * self.branch.stamp() + self.branch.stamp() / 2 - 1) as i64;
-        let (x, y) = match self.branch.variable {
+        let place = match self.branch.variable {
             true => self.node(subfield.offset, (ix, iy)),
             false => (ix, iy),
         };
-        let id = 1_000_000 * subfield.number + 1000 * x + y;
-        ([centre(ix), centre(iy)], id as i64)
+        let id = Identity::new(subfield.number, place);
+        ([centre(ix), centre(iy)], id.number())
     }
 
     /// True shear and intrinsic ellipticity of a galaxy.
@@ -541,8 +536,8 @@ impl BranchSimulator {
         };
         let point = Galaxy::new(&[point]).expect("a valid component");
         let mut stamp = vec![0.0; size * size];
-        let mut image = vec![0.0; (STARS * size).pow(2)];
-        for k in 0..STARS * STARS {
+        let mut image = vec![0.0; (STARS_PER_SIDE * size).pow(2)];
+        for k in 0..STARS_PER_SIDE * STARS_PER_SIDE {
             let offset = match k {
                 0 => (0.0, 0.0),
                 _ => Self::offset(&mut rng),
@@ -552,7 +547,8 @@ impl BranchSimulator {
             self.renderer
                 .render(&point, &psf, centre, scratch, &mut stamp);
             for (y, line) in stamp.chunks_exact(size).enumerate() {
-                let start = ((k / STARS * size + y) * STARS + k % STARS) * size;
+                let start =
+                    ((k / STARS_PER_SIDE * size + y) * STARS_PER_SIDE + k % STARS_PER_SIDE) * size;
                 image[start..][..size].copy_from_slice(line);
             }
         }

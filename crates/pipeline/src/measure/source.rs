@@ -409,7 +409,7 @@ fn open_star_field(
     path: &Path,
     cut: PsfCut,
 ) -> Result<OpenPsfs, FileError> {
-    const ALL: usize = great3::STARS_PER_SIDE;
+    const ALL: usize = shearq_scoring::great3::STARS_PER_SIDE;
     if great3::has_varying_psf(data.root(), id.set) {
         let expected = fill(great3::PSF_IMAGES, id.set, id.image);
         let message = format!(

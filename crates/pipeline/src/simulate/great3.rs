@@ -5,6 +5,8 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
+use shearq_dataset::great3;
+use shearq_dataset::layout::fill;
 use shearq_dataset::record::claim;
 use shearq_dataset::run::SIMULATION_FILE;
 use shearq_dataset::threads::Progress;
@@ -14,8 +16,9 @@ use shearq_files::frames::{Metadata, frame};
 use shearq_files::table::{self, FileFormat, MAX_ROWS};
 use shearq_files::{FileError, atomic};
 use shearq_quantities::Shear;
+use shearq_scoring::great3::STARS_PER_SIDE;
 use shearq_simulate::galaxy::Sersic;
-use shearq_simulate::great3::{Branch, BranchSimulator, Fit, FitComponent, STARS, Subfield};
+use shearq_simulate::great3::{Branch, BranchSimulator, Fit, FitComponent, Subfield};
 use shearq_simulate::render::RenderScratch;
 
 use crate::PipelineError;
@@ -61,8 +64,7 @@ pub fn simulate_branch(
     let folder = out.join(branch.folder());
     let truth = truth_folder(out, branch);
     let epochs = branch.epochs();
-    let image =
-        |subfield: usize, epoch: usize| folder.join(format!("image-{subfield:03}-{epoch}.fits"));
+    let image = |subfield, epoch| folder.join(named(great3::GALAXIES, subfield, epoch));
     // Other files of a subfield are written first, so that the last image shows that all are there.
     let todo: Vec<usize> = (0..subfields)
         .filter(|&number| !image(number, epochs - 1).is_file())
@@ -146,13 +148,18 @@ pub fn simulate_branch(
     Ok(made)
 }
 
-fn yaml(path: &Path, values: &[(&str, &dyn Display)]) -> Result<(), FileError> {
+fn named(pattern: &str, subfield: usize, epoch: usize) -> String {
+    fill(pattern, subfield as u32, epoch as u32)
+}
+
+fn yaml(folder: &Path, stem: String, values: &[(&str, &dyn Display)]) -> Result<(), FileError> {
     let pairs: Vec<String> = values
         .iter()
         .map(|(name, value)| format!("{name}: {value}"))
         .collect();
     // One line in braces, as the challenge's program wrote them.
-    atomic::write(path, format!("{{{}}}\n", pairs.join(", ")).as_bytes())
+    let text = format!("{{{}}}\n", pairs.join(", "));
+    atomic::write(folder.join(stem + ".yaml"), text.as_bytes())
 }
 
 fn write_tables(
@@ -162,24 +169,26 @@ fn write_tables(
     truth: &Path,
 ) -> Result<(), FileError> {
     let number = subfield.number;
-    let named = |stem: &str, ending: &str| format!("{stem}-{number:03}{ending}");
     let (x, y) = subfield.offset_degrees();
     let offset: [(&str, &dyn Display); 2] = [("offset_deg_x", &x), ("offset_deg_y", &y)];
     for of in [folder, truth] {
-        yaml(&of.join(named("subfield_offset", ".yaml")), &offset)?;
+        yaml(of, named(great3::SUBFIELD_OFFSETS, number, 0), &offset)?;
     }
     if let Some(Shear { e1, e2 }) = subfield.constant_shear {
-        let path = truth.join(named("shear_params", ".yaml"));
-        yaml(&path, &[("g1", &e1), ("g2", &e2)])?;
+        let stem = named(great3::SHEARS, number, 0);
+        yaml(truth, stem, &[("g1", &e1), ("g2", &e2)])?;
     }
     for (epoch, own) in subfield.epochs.iter().enumerate() {
-        let ending = format!("-{epoch}.yaml");
         let (x, y) = own.dither;
-        let path = folder.join(named("epoch_dither", &ending));
-        yaml(&path, &[("xdither_pixels", &x), ("ydither_pixels", &y)])?;
+        let stem = named(great3::DITHERS, number, epoch);
+        yaml(
+            folder,
+            stem,
+            &[("xdither_pixels", &x), ("ydither_pixels", &y)],
+        )?;
         let Shear { e1, e2 } = own.psf_ellipticity();
-        let path = truth.join(named("starshape_parameters", &ending));
-        yaml(&path, &[("psf_g1", &e1), ("psf_g2", &e2)])?;
+        let stem = named(great3::PSF_SHAPES, number, epoch);
+        yaml(truth, stem, &[("psf_g1", &e1), ("psf_g2", &e2)])?;
     }
     let (mut places, mut ids) = ([Vec::new(), Vec::new()], Vec::new());
     let mut shears = [const { Vec::new() }; 4];
@@ -210,7 +219,7 @@ fn write_tables(
         .map(|(name, values)| Column::new((*name).into(), values));
     let private = public.iter().cloned().chain(known).collect();
     for (of, columns) in [(folder, public), (truth, private)] {
-        let path = of.join(named("galaxy_catalog", ".fits"));
+        let path = of.join(named(great3::GALAXY_CATALOGUES, number, 0));
         let table = frame(columns).map_err(|error| FileError::new(&path, error))?;
         table::write(&path, FileFormat::Fits, &table, &Metadata::default())?;
     }
@@ -223,11 +232,8 @@ fn write_stars(
     epoch: usize,
     folder: &Path,
 ) -> Result<(), FileError> {
-    let side = STARS * simulator.branch.stamp();
-    let path = folder.join(format!(
-        "starfield_image-{:03}-{epoch}.fits",
-        subfield.number
-    ));
+    let side = STARS_PER_SIDE * simulator.branch.stamp();
+    let path = folder.join(named(great3::STAR_FIELDS, subfield.number, epoch));
     let mut writer = ImageWriter::create(path, side, side, &[])?;
     writer.write_rows(&simulator.stars(subfield, epoch, &mut RenderScratch::new()))?;
     writer.finish()

@@ -6,7 +6,8 @@ use std::fmt::{self, Display, Write};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
-use shearq_dataset::great3::Parameters;
+use shearq_dataset::great3::{self as released, Parameters};
+use shearq_dataset::layout::fill;
 use shearq_dataset::threads::Pool;
 use shearq_files::open::is_there;
 use shearq_files::{FileError, names_of, table};
@@ -15,8 +16,9 @@ use shearq_quantities::statistics::{RunningMean, median};
 use shearq_render::figure::{LinePlot, Series, Style};
 use shearq_scoring::aperture::{ApertureMass, Lattice, LatticeShear, SEPARATION_BINS, separations};
 use shearq_scoring::great3::{
-    Bias, ConstantField, Observation, PlusCross, REQUIRED_C, REQUIRED_M, along, constant_score,
-    position_angle, variable_score,
+    Bias, ConstantField, EPOCHS, Identity, NODES_PER_GALAXY, Observation, PlusCross, REQUIRED_C,
+    REQUIRED_M, SUBFIELDS, SUBFIELDS_PER_FIELD, along, constant_score, position_angle,
+    variable_score,
 };
 use shearq_scoring::{Repeated, repeated};
 
@@ -28,17 +30,6 @@ use super::{
     Branch, Catalogues, Columns, Entry, Figure, MIN_SHEAR_SLOPE, Packed, Packing, Score, Slope,
     Truth, disagreement, odd_fields, whole, wrong,
 };
-
-// Subfields of a field, where galaxies share a shear field or a PSF model.
-const SUBFIELDS_PER_FIELD: usize = 20;
-// Nodes of the lattice of a field between neighbouring galaxies of a subfield.
-const NODES_PER_GALAXY: usize = 7;
-/// Subfields of a branch.
-pub const SUBFIELDS: usize = 200;
-/// Galaxies per side of a subfield.
-pub const GRID: usize = 100;
-// Epochs of a subfield in multiepoch and full; the other experiments have one, and each has a PSF.
-const MAX_EPOCHS: usize = 6;
 
 // A component from here on was not measured: averages leave out 9.9 and more, correlations 10 and more. Both as in the challenge.
 const NOT_AVERAGED: f64 = 9.9;
@@ -92,30 +83,6 @@ impl Display for Great3 {
             "variable"
         };
         write!(f, "{}-{observation}-{shear}", self.experiment)
-    }
-}
-
-/// Identity of a galaxy, SSSXXXYYY: subfield, column and row. In variable branches columns and rows are nodes of the lattice.
-#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-struct Identity(u32);
-
-impl Identity {
-    fn of(value: f64) -> Option<Self> {
-        whole(value, 1_000_000_000).map(|id| Identity(id as u32))
-    }
-
-    fn subfield(self) -> usize {
-        self.0 as usize / 1_000_000
-    }
-
-    fn place(self) -> (usize, usize) {
-        (self.0 as usize / 1000 % 1000, self.0 as usize % 1000)
-    }
-}
-
-impl Display for Identity {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{:09}", self.0)
     }
 }
 
@@ -329,7 +296,7 @@ impl Great3 {
 
     fn epochs(&self) -> usize {
         match ["multiepoch", "full"].contains(&self.experiment) {
-            true => MAX_EPOCHS,
+            true => EPOCHS,
             false => 1,
         }
     }
@@ -355,16 +322,16 @@ impl Great3 {
         if !truth.is_dir() {
             return self.read_shears(truth, fields);
         }
-        let folder = self.folder(truth, "shear_params-000")?;
+        let folder = self.folder(truth, &named(released::SHEARS, 0, 0))?;
         let per = self.subfields_per_field();
         let shear = |subfield: usize| {
-            let stem = format!("shear_params-{subfield:03}");
+            let stem = named(released::SHEARS, subfield, 0);
             match Parameters::read(&folder, &stem)? {
                 Some(found) => shear_of(&found),
                 None => wrong(&folder, missing(&stem, fields * per)),
             }
         };
-        refuse_more(&folder, "shear_params", "", fields * per)?;
+        refuse_more(&folder, released::SHEARS, fields * per)?;
         // All subfields of a field have one shear.
         (0..fields).map(|field| shear(field * per)).collect()
     }
@@ -404,11 +371,11 @@ impl Great3 {
         folder: &Path,
         subfields: usize,
     ) -> Result<Vec<Option<Shear>>, FileError> {
-        let folder = self.folder(folder, "starshape_parameters-000-0")?;
+        let folder = self.folder(folder, &named(released::PSF_SHAPES, 0, 0))?;
         let epochs = self.epochs();
-        refuse_more(&folder, "starshape_parameters", "-0", subfields)?;
+        refuse_more(&folder, released::PSF_SHAPES, subfields)?;
         let psf = |k: usize| {
-            let stem = format!("starshape_parameters-{:03}-{}", k / epochs, k % epochs);
+            let stem = named(released::PSF_SHAPES, k / epochs, k % epochs);
             match Parameters::read(&folder, &stem)? {
                 Some(found) => psf_of(&found),
                 None => {
@@ -421,7 +388,7 @@ impl Great3 {
             }
         };
         let found: Result<Vec<_>, _> = (0..subfields * epochs).map(psf).collect();
-        let extra = format!("starshape_parameters-000-{epochs}");
+        let extra = named(released::PSF_SHAPES, 0, epochs);
         match Parameters::read(&folder, &extra)? {
             Some(extra) => {
                 let message = format!("{self} has no such epoch (expected {epochs} per subfield)");
@@ -584,13 +551,17 @@ impl Great3 {
         if !truth.is_dir() {
             return self.read_masses(truth, fields);
         }
-        let folder = self.folder(truth, "galaxy_catalog-000")?;
-        let catalogue = |subfield: usize| folder.join(format!("galaxy_catalog-{subfield:03}.fits"));
+        let folder = self.folder(truth, &stem_of(&named(released::GALAXY_CATALOGUES, 0, 0)))?;
+        let catalogue =
+            |subfield: usize| folder.join(named(released::GALAXY_CATALOGUES, subfield, 0));
         let subfields = fields * SUBFIELDS_PER_FIELD;
         if let Some(lacking) = (0..subfields).find(|k| !is_there(&catalogue(*k))) {
             return wrong(
                 &folder,
-                missing(&format!("galaxy_catalog-{lacking:03}"), subfields),
+                missing(
+                    &stem_of(&named(released::GALAXY_CATALOGUES, lacking, 0)),
+                    subfields,
+                ),
             );
         }
         if is_there(&catalogue(subfields)) {
@@ -727,6 +698,14 @@ struct Masses {
     b: [f64; SEPARATION_BINS],
 }
 
+fn named(pattern: &str, subfield: usize, epoch: usize) -> String {
+    fill(pattern, subfield as u32, epoch as u32)
+}
+
+fn stem_of(name: &str) -> String {
+    name.trim_end_matches(".fits").to_owned()
+}
+
 fn missing(stem: &str, subfields: usize) -> String {
     format!(
         "found no {stem}.*, expected {subfields} subfields. Try: --subfields N if the branch was simulated with fewer"
@@ -740,9 +719,8 @@ fn more_subfields(subfields: usize) -> String {
 }
 
 // Refuses files of a subfield after the last: a part of the branch would be scored as the whole.
-fn refuse_more(folder: &Path, name: &str, ending: &str, subfields: usize) -> Result<(), FileError> {
-    let stem = format!("{name}-{subfields:03}{ending}");
-    match Parameters::read(folder, &stem)? {
+fn refuse_more(folder: &Path, pattern: &str, subfields: usize) -> Result<(), FileError> {
+    match Parameters::read(folder, &named(pattern, subfields, 0))? {
         Some(more) => wrong(&more.path, more_subfields(subfields)),
         None => Ok(()),
     }
@@ -805,13 +783,13 @@ fn add_truth(
         columns.push(table::numbers(&read, name, path)?);
     }
     // Files of offsets are optional, as identities contain them.
-    let offset = match Parameters::read(folder, &format!("subfield_offset-{subfield:03}"))? {
+    let offset = match Parameters::read(folder, &named(released::SUBFIELD_OFFSETS, subfield, 0))? {
         None => None,
         Some(found) => Some([found.number("offset_deg_x")?, found.number("offset_deg_y")?]),
     };
     let mut seen = BTreeSet::new();
     for (k, &found) in columns[0].iter().enumerate() {
-        let id = Identity::of(found).filter(|id| id.subfield() == subfield);
+        let id = Identity::of_number(found).filter(|id| id.subfield() == subfield);
         let Some(id) = id else {
             return wrong(path, Fault::NotAnIdentity { row: k + 1, found });
         };
@@ -1090,7 +1068,7 @@ impl<'a> Galaxies<'a> {
         for k in 0..columns[0].len() {
             let fault = |fault| wrong(path, fault);
             let found = columns[0][k];
-            let Some(id) = Identity::of(found) else {
+            let Some(id) = Identity::of_number(found) else {
                 return fault(Fault::NotAnIdentity { row: k + 1, found });
             };
             if id.subfield() >= packing.subfields {
@@ -1231,7 +1209,7 @@ impl<'a> Galaxies<'a> {
             let there: BTreeSet<Identity> = galaxies.iter().map(|own| own.id).collect();
             let nodes = |offset: usize| (0..packing.grid).map(move |k| step * k + offset);
             let all = nodes(expected.0).flat_map(|x| nodes(expected.1).map(move |y| (x, y)));
-            let mut all = all.map(|(x, y)| Identity((subfield * 1_000_000 + x * 1000 + y) as u32));
+            let mut all = all.map(|place| Identity::new(subfield, place));
             let id = all
                 .find(|id| !there.contains(id))
                 .unwrap_or(first.id)
