@@ -147,6 +147,20 @@ fn means_of_rotated_pairs_are_packed_with_errors_of_pixel_noise() {
 }
 
 #[test]
+fn nothing_is_gathered_into_a_branch() {
+    let small = Small::new("2");
+    branch(&small);
+    let catalogue = small.at("great3/galaxy_catalog-001.fits");
+    let before = fs::read(&catalogue).unwrap();
+    let message = refused(
+        small.root(),
+        "shearq gather --stamps data/set02/psf-001.fits --psf data/set02/psf-001.fits --out great3",
+    );
+    assert!(message.contains("is a branch of GREAT3"), "{message}");
+    assert_eq!(fs::read(&catalogue).unwrap(), before);
+}
+
+#[test]
 fn epochs_of_a_subfield_are_combined() {
     let small = Small::new("2");
     branch(&small);

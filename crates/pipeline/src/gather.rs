@@ -166,6 +166,11 @@ fn gather_alone(
     id: ImageId,
     gathering: &Gathering<'_>,
 ) -> Result<Gathered, PipelineError> {
+    // The table of stamps would replace the catalogue of galaxies, which another program wrote.
+    if data.layout().great3.is_some() {
+        let message = "this folder is a branch of GREAT3, to which no image can be added (expected a folder of gathered images, or a new one). Try: another folder";
+        return Err(FileError::new(data.root(), message).into());
+    }
     let target = data.galaxies(id.set, id.image);
     let which = data.stamps(id.set, id.image);
     remove_leftovers(data, id)?;
