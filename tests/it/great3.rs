@@ -939,6 +939,8 @@ fn simulated_branches_draw_from_a_table_of_fits() {
     }
     for (rows, says) in [
         ("n r_e q\n1 0.5 0\n", "row 1: the axis ratio is 0"),
+        ("n r_e q\n1 0.5 0.6\nnan 0.5 0.6\n", "row 2: n is NaN"),
+        ("n r_e q flux\n1 0.5 0.6 0\n", "row 1: flux is 0"),
         ("n r_e q\n1 -0.5 0.5\n", "half-light radius"),
         ("n r_e\n1 0.5\n", "q"),
     ] {

@@ -264,6 +264,17 @@ pub fn read_fits(path: &Path) -> Result<Vec<Fit>, FileError> {
         flux,
         axis_ratio: ratio,
     };
+    // A flux of zero has no S/N to scale it by, and a number that is missing has no nearest profile.
+    let mut positive = vec![("n", &n)];
+    positive.extend(flux.as_ref().map(|flux| ("flux", flux)));
+    for (name, values) in positive {
+        let wrong = |value: &f64| !(value.is_finite() && *value > 0.0);
+        if let Some(row) = values.iter().position(wrong) {
+            let (row, found) = (row + 1, values[row]);
+            let message = format!("row {row}: {name} is {found}, expected a positive number");
+            return Err(FileError::new(path, message));
+        }
+    }
     let fits: Vec<Fit> = (0..n.len())
         .map(|k| {
             let main = Sersic::nearest(n[k]);
