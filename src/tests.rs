@@ -163,13 +163,13 @@ const WAYS: [(&str, &[&str]); 33] = [
     (
         "bias",
         &[
-            "CATALOGUE g1 g2 columns ellipticity truth-sign bins where design units drop-missing step bootstrap seed fail-above junit sums shard plot format wide metrics report",
-            "CATALOGUE truth columns ellipticity truth-sign bins where design units drop-missing step bootstrap seed fail-above junit sums shard plot format wide metrics report",
-            "CATALOGUE g1 g2 columns truth-sign bins where weight design units drop-missing bootstrap seed fail-above junit sums shard plot format wide metrics report",
-            "CATALOGUE truth columns truth-sign bins where weight design units drop-missing bootstrap seed fail-above junit sums shard plot format wide metrics report",
+            "CATALOGUE g1 g2 columns ellipticity truth-sign bins where design units drop-missing step bootstrap seed fail-above sums shard plot format wide metrics report",
+            "CATALOGUE truth columns ellipticity truth-sign bins where design units drop-missing step bootstrap seed fail-above sums shard plot format wide metrics report",
+            "CATALOGUE g1 g2 columns truth-sign bins where weight design units drop-missing bootstrap seed fail-above sums shard plot format wide metrics report",
+            "CATALOGUE truth columns truth-sign bins where weight design units drop-missing bootstrap seed fail-above sums shard plot format wide metrics report",
             "CATALOGUE against g1 g2 columns ellipticity truth-sign bins where design units drop-missing step format wide metrics",
             "CATALOGUE against truth columns ellipticity truth-sign bins where design units drop-missing step format wide metrics",
-            "merge bootstrap seed fail-above junit plot format wide metrics report",
+            "merge bootstrap seed fail-above plot format wide metrics report",
             "plan",
             "example",
         ],
@@ -234,7 +234,7 @@ const WAYS: [(&str, &[&str]); 33] = [
     ),
     (
         NAMES_ONLY[1],
-        &["NAME data stored sigma update reason junit folder format threads"],
+        &["NAME data stored sigma update reason folder format threads"],
     ),
     ("help", &[]),
     ("baseline help", &[]),

@@ -10,14 +10,13 @@ use crate::{print, tell};
 use shearq_dataset::images::{self, ImageId};
 use shearq_dataset::layout::MAX_IMAGE;
 use shearq_dataset::run::{Run, Source, open_data, way};
-use shearq_files::atomic::{self, Scratch};
+use shearq_files::atomic::Scratch;
 use shearq_files::table::FileFormat;
 use shearq_pipeline::measure::measure_folder;
 use shearq_pipeline::run::run_folder;
 use shearq_render::table::TableFormat;
 use shearq_results::baseline::{
-    self, Baseline, BaselineConfiguration, BaselineSet, Change, Checked, junit, metrics_of,
-    shift_table,
+    self, Baseline, BaselineConfiguration, BaselineSet, Change, Checked, metrics_of, shift_table,
 };
 
 /// Store metrics as a baseline and check later whether they moved.
@@ -109,9 +108,6 @@ struct CheckArguments {
     /// Why the baseline changes.
     #[arg(long, value_name = "TEXT", requires = "update")]
     reason: Option<String>,
-    /// Also write the result to this file as JUnit XML.
-    #[arg(long, value_name = "FILE")]
-    junit: Option<PathBuf>,
     #[command(flatten)]
     place: Place,
     #[command(flatten)]
@@ -319,9 +315,6 @@ fn check(arguments: &CheckArguments) -> anyhow::Result<()> {
     for name in &names {
         let path = Baseline::path(folder, name);
         checks.extend(check_one(arguments, name, &path)?);
-    }
-    if let Some(path) = &arguments.junit {
-        atomic::write(path, junit(&checks).as_bytes())?;
     }
     // Programs compare every metric; people want to see those that moved.
     let all = matches!(arguments.form.format, TableFormat::Csv | TableFormat::Json);

@@ -19,8 +19,7 @@ use shearq_results::bias::{Binning, Edges, MOST_BINS, Request, Summed, Units, su
 use shearq_results::expression::Expression;
 use shearq_results::select::selection;
 use shearq_results::views::bias::{
-    Limit, bias_plot, bias_table, check, chosen_by_measurement, compared_table, junit, of_design,
-    section,
+    Limit, bias_plot, bias_table, check, chosen_by_measurement, compared_table, of_design, section,
 };
 use shearq_scoring::TruthSign;
 
@@ -47,9 +46,6 @@ pub(crate) struct Arguments {
     /// several times.
     #[arg(long, value_name = "LIMIT")]
     fail_above: Vec<Limit>,
-    /// Also write the checks of --fail-above to this file as JUnit XML.
-    #[arg(long, value_name = "FILE", requires = "fail_above")]
-    junit: Option<PathBuf>,
     /// Merge files that --sums wrote for shards of one list of catalogues.
     #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with = "Summing")]
     merge: Vec<PathBuf>,
@@ -79,7 +75,7 @@ struct Summing {
     /// Catalogues of another program on the same galaxies, in the same order. The output contains both and the
     /// difference, with paired errors. A --truth table by catalogue contains those of both, or names of files that both
     /// have, in two folders.
-    #[arg(long, value_name = "CATALOGUE", num_args = 1.., conflicts_with_all = ["sums", "shard", "bootstrap", "seed", "fail_above", "junit", "plot", "path"])]
+    #[arg(long, value_name = "CATALOGUE", num_args = 1.., conflicts_with_all = ["sums", "shard", "bootstrap", "seed", "fail_above", "plot", "path"])]
     against: Vec<PathBuf>,
     /// True g1 of all catalogues.
     #[arg(
@@ -255,9 +251,6 @@ pub(crate) fn run(arguments: &Arguments, command_line: &str) -> anyhow::Result<(
     }
     // Of all galaxies, not of bins, of which some exceed a limit by chance.
     let checks = check(result.all()?, &arguments.fail_above);
-    if let Some(path) = &arguments.junit {
-        atomic::write(path, junit(&checks).as_bytes())?;
-    }
     arguments.printing.print(&table)?;
     let sections = || Ok(vec![section(&result, table)?]);
     arguments.report.save("Shear bias", sections, || {

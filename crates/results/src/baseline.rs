@@ -21,7 +21,6 @@ use crate::catalogues::{Catalogues, OWN};
 use crate::record::SetRecord;
 use crate::response::response_of;
 use crate::score::{ScoreError, score_catalogues};
-use crate::views::junit::{Case, document};
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -572,24 +571,6 @@ pub fn shift_table(checks: &[Checked], all: bool) -> Table {
     table
 }
 
-/// The checks as JUnit: a suite per baseline, a case per configuration.
-pub fn junit(checks: &[Checked]) -> String {
-    let suites = checks.chunk_by(|a, b| a.baseline == b.baseline);
-    document(suites.map(|suite| {
-        let baseline = suite[0].baseline.as_str();
-        let cases = suite.iter().map(|check| Case {
-            class: format!("baseline.{baseline}"),
-            name: &check.configuration,
-            failure: {
-                let lines = check.moved();
-                let failure = (format!("{} moved", lines.len()), Some(lines.join("\n")));
-                (!lines.is_empty()).then_some(failure)
-            },
-        });
-        (baseline, cases.collect())
-    }))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -627,30 +608,5 @@ mod tests {
         let before = set("a", 0.0);
         let moved = |q: f64| shifts(&before, &set("a", q), 3.0)[0].moved;
         assert!(!moved(1.9 * TOLERANCE_SIGMA) && moved(2.1 * TOLERANCE_SIGMA));
-    }
-
-    #[test]
-    fn junit_counts_failures_and_escapes_names() {
-        let shift = Shift {
-            set: 2,
-            metric: "q",
-            before: [80.0, 2.0],
-            now: [81.0, 2.0],
-            sigma: 0.5,
-            moved: true,
-        };
-        let check = |configuration: &str, shifts: Vec<Shift>| Checked {
-            baseline: "small".into(),
-            configuration: configuration.into(),
-            shifts,
-            settings: Vec::new(),
-            stored: false,
-            notes: Vec::new(),
-        };
-        let text = junit(&[check("a<b", vec![shift]), check("c", Vec::new())]);
-        let totals = "name=\"small\" tests=\"2\" skipped=\"0\" errors=\"0\" failures=\"1\"";
-        assert!(text.contains(totals), "{text}");
-        assert!(text.contains("name=\"a&lt;b\"") && text.contains("+0.50 σ"));
-        assert!(text.contains("name=\"c\" classname=\"baseline.small\"/>"));
     }
 }

@@ -1,4 +1,4 @@
-//! Shear bias as tables, plots, verdicts and JUnit.
+//! Shear bias as tables, plots and verdicts.
 
 use shearq_bias::{
     Catalogue, Design, Estimate, Measured, QUANTITIES, Quantity, REQUIREMENTS, Repeated, Verdict,
@@ -9,7 +9,6 @@ use shearq_render::figure::{Band, FigureError, LinePlot, PanelGrid, Series, Styl
 use shearq_render::html::{Block, Picture, Section};
 use shearq_render::table::{Cell, Heading, Table};
 
-use super::junit::{Case, document};
 use crate::bias::{BiasResult, BinResult};
 use crate::foreign::shown;
 
@@ -612,16 +611,6 @@ fn unknown(key: &str) -> Checked {
         text: format!("{key} is unknown (expected a true shear that determines it)"),
         failed: true,
     }
-}
-
-/// Checks as JUnit: one suite, a case per quantity.
-pub fn junit(checks: &[Checked]) -> String {
-    let cases = checks.iter().map(|check| Case {
-        class: "bias".into(),
-        name: &check.key,
-        failure: check.failed.then(|| (check.text.clone(), None)),
-    });
-    document([("shear bias", cases.collect())])
 }
 
 /// Plots of m and c in bins, or of all galaxies, with the tightest published requirement as a band.
