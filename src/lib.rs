@@ -95,7 +95,7 @@ enum Command {
     )]
     Bias(Box<bias::Arguments>),
     #[command(
-        after_help = "Examples:\n  shearq baseline record mine --measured raw den\n  shearq baseline check mine"
+        after_help = "Examples:\n  shearq baseline record mine --data data --submission 48/linear/star\n  shearq baseline check mine"
     )]
     Baseline(baseline::Arguments),
     #[command(

@@ -229,12 +229,12 @@ const WAYS: [(&str, &[&str]); 33] = [
     (
         NAMES_ONLY[0],
         &[
-            "NAME measured data simulate submission sets images grid seed amplitude tilt folder threads",
+            "NAME data simulate submission sets images grid seed amplitude tilt folder threads",
         ],
     ),
     (
         NAMES_ONLY[1],
-        &["NAME data stored sigma update reason folder format threads"],
+        &["NAME data sigma update reason folder format threads"],
     ),
     ("help", &[]),
     ("baseline help", &[]),

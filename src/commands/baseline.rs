@@ -4,7 +4,9 @@ use anyhow::Context;
 use clap::{ArgGroup, Args, Subcommand};
 use shearq_submissions::{Configuration, Registry};
 
-use crate::arguments::{Form, SetList, SimulationArguments, Threads, given_once, positive};
+use crate::arguments::{
+    Form, SetList, SimulationArguments, Threads, given_once, positive, sets_of,
+};
 use crate::progress::Bar;
 use crate::{print, tell};
 use shearq_dataset::images::{self, ImageId};
@@ -32,7 +34,7 @@ pub(crate) struct Arguments {
 #[derive(Debug, Subcommand)]
 enum Command {
     #[command(
-        after_help = "Examples:\n  shearq baseline record mine --measured raw den\n  shearq baseline record mine --simulate --sets 2,8 --images 4 --submission own.toml"
+        after_help = "Examples:\n  shearq baseline record mine --data data --submission 48/linear/star\n  shearq baseline record mine --simulate --sets 2,8 --images 4 --submission own.toml"
     )]
     Record(RecordArguments),
     #[command(
@@ -43,17 +45,13 @@ enum Command {
 
 /// Store metrics as a new baseline.
 ///
-/// The metrics come from folders that `measure` or `run` wrote (--measured), from a data folder (--data), or from
-/// simulated sets (--simulate).
+/// The metrics are measured on a data folder (--data) or on simulated sets (--simulate).
 #[derive(Debug, Args)]
-#[command(group = ArgGroup::new("input").required(true).args(["measured", "data", "simulate"]))]
+#[command(group = ArgGroup::new("input").required(true).args(["data", "simulate"]))]
 struct RecordArguments {
     /// Name of the baseline; it must be new.
     #[arg(value_name = "NAME", value_parser = file_stem)]
     name: String,
-    /// Folders that `measure` or `run` wrote, measured on the same data.
-    #[arg(long, value_name = "OUT", num_args = 1.., conflicts_with_all = ["submission", "sets", "images"])]
-    measured: Vec<PathBuf>,
     /// Data folder to measure, now and in each check.
     #[arg(long, value_name = "DIR")]
     data: Option<PathBuf>,
@@ -80,9 +78,7 @@ struct RecordArguments {
 
 /// Measure baselines again and compare the metrics.
 ///
-/// Each configuration is measured with its present settings, and changed settings are listed. A baseline of
-/// catalogues (--measured) contains no configuration file, so the stored settings of other than named configurations
-/// are used: such a check finds changes of data and shearq, but not of a settings file.
+/// Each configuration is measured with its present settings, and changed settings are listed.
 ///
 /// Compared are Q, M/2, √A and the scatter of e1 and e2. On the same data they must agree up to rounding, on other
 /// data (--data) within the noise. CSV and JSON list every metric, the other formats the moved ones.
@@ -96,9 +92,6 @@ struct CheckArguments {
     /// Data folder to measure instead of the recorded one.
     #[arg(long, value_name = "DIR")]
     data: Option<PathBuf>,
-    /// Measure with the settings stored in the baseline, not with your configuration files.
-    #[arg(long)]
-    stored: bool,
     /// Largest accepted shift on other data, in standard errors.
     #[arg(long, value_name = "K", default_value_t = 3.0, value_parser = positive)]
     sigma: f64,
@@ -148,27 +141,28 @@ fn record(arguments: &RecordArguments) -> anyhow::Result<()> {
     if path.exists() {
         return Err(Baseline::exists(&path).into());
     }
-    let threads = arguments.threads.number();
-    let (source, configurations) = match &arguments.data {
-        None if arguments.simulate => {
-            let images = arguments.images.unwrap_or(1);
-            let sets = arguments.sets.as_ref().map_or(&[][..], |list| &list.0);
-            let source = Source::Simulated(arguments.simulation.settings()?);
-            of_source(arguments, source, &images::of_simulation(sets, images))?
-        }
+    let sets = sets_of(arguments.sets.as_ref());
+    let (source, images) = match &arguments.data {
         None => {
-            arguments.simulation.must_be_unused()?;
-            of_folders(&arguments.measured, folder, threads)?
+            let images = images::of_simulation(sets, arguments.images.unwrap_or(1));
+            (Source::Simulated(arguments.simulation.settings()?), images)
         }
         Some(data) => {
             arguments.simulation.must_be_unused()?;
             let data = open_data(data)?;
-            let sets = arguments.sets.as_ref().map_or(&[][..], |list| &list.0);
             let mut images = images::of_folder(&data, sets)?;
             images.retain(|id| arguments.images.is_none_or(|most| id.image <= most));
-            of_source(arguments, Source::folder(&data, folder)?, &images)?
+            (Source::folder(&data, folder)?, images)
         }
     };
+    let threads = arguments.threads.number();
+    let configurations: Vec<BaselineConfiguration> = chosen(&arguments.submission, folder)?
+        .into_iter()
+        .map(|(configuration, file)| {
+            let sets = measured(&source, folder, &configuration, &images, threads)?;
+            Ok(BaselineConfiguration::new(&configuration, file, sets)?)
+        })
+        .collect::<anyhow::Result<_>>()?;
     for set in configurations
         .iter()
         .flat_map(|configuration| &configuration.sets)
@@ -183,22 +177,6 @@ fn record(arguments: &RecordArguments) -> anyhow::Result<()> {
     Baseline::new(source, Vec::new(), configurations).create(&path)?;
     tell(format_args!("recorded {}", path.display()));
     Ok(())
-}
-
-fn of_source(
-    arguments: &RecordArguments,
-    source: Source,
-    images: &[ImageId],
-) -> anyhow::Result<(Source, Vec<BaselineConfiguration>)> {
-    let (folder, threads) = (&arguments.place.folder, arguments.threads.number());
-    let configurations = chosen(&arguments.submission, folder)?
-        .into_iter()
-        .map(|(configuration, file)| {
-            let sets = measured(&source, folder, &configuration, images, threads)?;
-            Ok(BaselineConfiguration::new(&configuration, file, sets)?)
-        })
-        .collect::<anyhow::Result<_>>()?;
-    Ok((source, configurations))
 }
 
 // With the paths of users' settings files relative to the folder `beside`, so that a repository with both can be cloned anywhere.
@@ -223,42 +201,6 @@ fn chosen(
             Ok((registry.get(name)?.configuration, file))
         })
         .collect()
-}
-
-fn of_folders(
-    folders: &[PathBuf],
-    beside: &Path,
-    threads: usize,
-) -> anyhow::Result<(Source, Vec<BaselineConfiguration>)> {
-    let mut first: Option<Source> = None;
-    let mut configurations = Vec::new();
-    for folder in folders {
-        let run = Run::require(folder)?;
-        let own = run.source.moved(folder, beside)?;
-        let source = first.get_or_insert_with(|| own.clone());
-        anyhow::ensure!(
-            *source == own,
-            "{}: the folders of a baseline must have one source (found {own}, expected {source})",
-            folder.display(),
-        );
-        let sets = metrics_of(&run, &run.source.data(folder)?, folder, threads)?;
-        // A named configuration is checked with its present settings.
-        if !Registry::embedded()?
-            .names()
-            .contains(&run.configuration.name)
-        {
-            tell(format_args!(
-                "note: {}: a check finds changes of the data and of shearq, but not of your settings file, because the catalogues do not name it; the baseline keeps the settings of {}. Try: baseline record NAME --data DIR --submission FILE",
-                folder.display(),
-                run.configuration.name
-            ));
-        }
-        configurations.push(BaselineConfiguration::new(&run.configuration, None, sets)?);
-    }
-    Ok((
-        first.context("--measured: expected a folder")?,
-        configurations,
-    ))
 }
 
 // Into a temporary folder: only the metrics are kept. Paths of `source` are relative to the folder `beside`.
@@ -349,17 +291,9 @@ fn check_one(arguments: &CheckArguments, name: &str, path: &Path) -> anyhow::Res
     let measure = |configuration: &Configuration, images: &[ImageId]| {
         measured(&source, beside, configuration, images, threads)
     };
-    let files = (beside.as_path(), arguments.stored);
     let (checks, configurations) =
-        baseline::check(name, &baseline, arguments.sigma, files, measure)
+        baseline::check(name, &baseline, arguments.sigma, beside, measure)
             .with_context(|| path.display().to_string())?;
-    for check in checks.iter().filter(|check| check.stored) {
-        tell(format_args!(
-            "note: {}: {}: measured with the stored settings, because the baseline names no configuration file",
-            path.display(),
-            check.configuration
-        ));
-    }
     let moved: Vec<String> = checks.iter().flat_map(Checked::moved).collect();
     if let (true, Some(reason)) = (arguments.update, &arguments.reason) {
         if moved.is_empty() && checks.iter().all(|check| check.notes.is_empty()) {

@@ -40,7 +40,7 @@ pub struct Baseline {
 pub struct BaselineConfiguration {
     #[serde(deserialize_with = "checked_name")]
     pub name: String,
-    /// Configuration file, relative to the folder of the baseline. `None` for a named or unknown configuration.
+    /// Configuration file, relative to the folder of the baseline. `None` for a named configuration.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub file: Option<PathBuf>,
     /// All settings as a TOML table, so that settings of other versions can be compared.
@@ -270,7 +270,7 @@ fn scatter(run: &Run, out: &Path, set: u32, threads: usize) -> Result<[[f64; 2];
 pub enum BaselineError {
     #[error(transparent)]
     Configuration(#[from] ConfigurationError),
-    #[error("{}: cannot find the configuration file of the baseline. Try: shearq baseline check --stored", path.display())]
+    #[error("{}: cannot find the configuration file of the baseline", path.display())]
     NoFile { path: PathBuf },
     // A value of the wrong type, an unknown key, or a value that TOML or JSON does not have.
     #[error("settings of {configuration}")]
@@ -382,8 +382,6 @@ pub struct Checked {
     /// Changed settings, as `key: before ≠ now`.
     pub settings: Vec<String>,
     pub notes: Vec<String>,
-    /// Whether stored settings were used although the configuration may have changed.
-    pub stored: bool,
 }
 
 impl Checked {
@@ -408,37 +406,21 @@ impl Checked {
     }
 }
 
-// The settings to measure a configuration of a baseline with, and whether stored settings replace an unknown file. Files
-// lie relative to the folder `beside`. Present settings, so that a check notices changed ones.
+// The present settings, so that a check notices changed ones. Files lie relative to the folder `beside`.
 fn settings_now(
     before: &BaselineConfiguration,
     registry: &Registry,
     beside: &Path,
-    stored: bool,
-) -> Result<(Configuration, bool), BaselineError> {
-    if let (false, Some(file)) = (stored, &before.file) {
-        let path = shortened(beside.join(file));
-        // The registry could know a plain name.
-        let path = Path::new(".").join(path);
-        if !path.is_file() {
-            return Err(BaselineError::NoFile { path });
-        }
-        return Ok((registry.get(&path.to_string_lossy())?.configuration, false));
-    }
-    if before.file.is_none() && registry.names().contains(&before.name) {
-        return Ok((registry.get(&before.name)?.configuration, false));
-    }
-    // Settings that were introduced after the baseline have the defaults of its method.
-    let base = match before.settings.get("method").and_then(toml::Value::as_str) {
-        Some("linear") => "48/linear/star",
-        _ => "paper",
+) -> Result<Configuration, BaselineError> {
+    let Some(file) = &before.file else {
+        return Ok(registry.get(&before.name)?.configuration);
     };
-    let base = toml::Table::try_from(registry.get(base)?.configuration);
-    let base = base.map_err(settings_error(&before.name))?;
-    let configuration = with_defaults(base, &before.settings)
-        .try_into()
-        .map_err(settings_error::<toml::de::Error>(&before.name))?;
-    Ok((configuration, !stored))
+    // The registry could know a plain name.
+    let path = Path::new(".").join(shortened(beside.join(file)));
+    if !path.is_file() {
+        return Err(BaselineError::NoFile { path });
+    }
+    Ok(registry.get(&path.to_string_lossy())?.configuration)
 }
 
 // `settings`, with the `defaults` of keys that they lack.
@@ -457,19 +439,18 @@ fn with_defaults(mut defaults: toml::Table, settings: &toml::Table) -> toml::Tab
 }
 
 /// Measures the configurations of the baseline `name` again with `measure`, and compares. Configuration files lie relative
-/// to the folder `beside`; with `stored`, they are not read. Returns the checks and the configurations with their present
-/// settings and metrics.
+/// to the folder `beside`. Returns the checks and the configurations with their present settings and metrics.
 pub fn check<E: From<BaselineError>>(
     name: &str,
     baseline: &Baseline,
     sigmas: f64,
-    (beside, stored): (&Path, bool),
+    beside: &Path,
     mut measure: impl FnMut(&Configuration, &[ImageId]) -> Result<Vec<BaselineSet>, E>,
 ) -> Result<(Vec<Checked>, Vec<BaselineConfiguration>), E> {
     let registry = Registry::embedded().map_err(BaselineError::from)?;
     let (mut checks, mut configurations) = (Vec::new(), Vec::new());
     for before in &baseline.submissions {
-        let (configuration, replaced) = settings_now(before, &registry, beside, stored)?;
+        let configuration = settings_now(before, &registry, beside)?;
         let (settings, new) = settings_moved(before, &configuration)?;
         let notes = new
             .iter()
@@ -481,7 +462,6 @@ pub fn check<E: From<BaselineError>>(
             shifts: Vec::new(),
             settings,
             notes,
-            stored: replaced,
         };
         let of_set = |old: &BaselineSet| {
             let set = old.set;
