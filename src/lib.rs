@@ -18,8 +18,8 @@ use std::process::ExitCode;
 use clap::{Parser, Subcommand};
 
 use commands::{
-    baseline, bench, bias, calibrate, challenge, check, compare, gather, help_files, mean, measure,
-    merge, pack, quickstart, reproduce, run, score, select, shear, show, simulate, study,
+    baseline, bench, bias, calibrate, challenge, check, compare, completions, gather, mean,
+    measure, merge, pack, quickstart, reproduce, run, score, select, shear, show, simulate, study,
     submissions, unpack,
 };
 use shearq_files::parquet::panic_is_caught;
@@ -131,9 +131,7 @@ enum Command {
     #[command(
         after_help = "Example:\n  shearq completions bash > ~/.local/share/bash-completion/completions/shearq"
     )]
-    Completions(help_files::Completions),
-    #[command(after_help = "Example:\n  shearq manual ~/.local/share/man/man1")]
-    Manual(help_files::Manual),
+    Completions(completions::Arguments),
 }
 
 // Exit codes. A baseline that changed and a check with findings exit like errors, so that scripts and CI stop; 2 for wrong
@@ -206,8 +204,7 @@ pub fn run_with(arguments: impl IntoIterator<Item = OsString>) -> u8 {
         Command::Study(arguments) => study::run(&arguments),
         Command::Bench(arguments) => bench::run(&arguments),
         Command::Submissions(arguments) => submissions::run(&arguments),
-        Command::Completions(arguments) => help_files::completions(&arguments),
-        Command::Manual(arguments) => help_files::manual(&arguments),
+        Command::Completions(arguments) => completions::run(&arguments),
     };
     match result {
         Ok(()) => EXIT_DONE,

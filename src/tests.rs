@@ -102,7 +102,7 @@ fn every_command_has_examples_that_parse() {
 
 // The ways to use each command, and the options that each way uses. Two options without a common way must be
 // refused.
-const WAYS: [(&str, &[&str]); 33] = [
+const WAYS: [(&str, &[&str]); 32] = [
     ("quickstart", &["out threads wide"]),
     (
         "simulate",
@@ -224,13 +224,10 @@ const WAYS: [(&str, &[&str]); 33] = [
     ("submissions show", &["NAME|FILE"]),
     ("submissions init", &["FILE method"]),
     ("completions", &["SHELL"]),
-    ("manual", &["DIR"]),
     // Only names are compared: the ways of these commands depend on more than two options.
     (
         NAMES_ONLY[0],
-        &[
-            "NAME data simulate submission sets images grid seed amplitude tilt folder threads",
-        ],
+        &["NAME data simulate submission sets images grid seed amplitude tilt folder threads"],
     ),
     (
         NAMES_ONLY[1],

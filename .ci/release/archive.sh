@@ -18,7 +18,7 @@ stage=$(mktemp -d)
 trap 'rm -rf "$stage"' EXIT
 name=shearq-$version-$host
 tree=$stage/$name
-mkdir -p "$tree"/{completions,man}
+mkdir -p "$tree/completions"
 install -m 755 "$binary" "$tree/shearq"
 strip "$tree/shearq"
 cp README.md CHANGELOG.md CITATION.cff LICENSE-MIT LICENSE-APACHE "$tree"
@@ -27,7 +27,6 @@ python3 .ci/release/licences.py > "$tree/LICENCES-OF-DEPENDENCIES.txt"
 for shell in bash zsh fish; do
     "$binary" completions "$shell" > "$tree/completions/shearq.$shell"
 done
-"$binary" manual "$tree/man"
 packed() { tar --sort=name --owner=0 --group=0 --numeric-owner --mtime="@$SOURCE_DATE_EPOCH" "$@"; }
 packed -C "$stage" -c "$name" | gzip -n -9 > "$out/$name.tar.gz"
 
@@ -35,10 +34,8 @@ made=("$name.tar.gz")
 if command -v dpkg-deb > /dev/null; then
     root=$stage/debian
     doc=$root/usr/share/doc/shearq
-    mkdir -p "$root"/{DEBIAN,usr/bin,usr/share/man/man1,usr/share/bash-completion/completions} "$doc"
+    mkdir -p "$root"/{DEBIAN,usr/bin,usr/share/bash-completion/completions} "$doc"
     install -m 755 "$tree/shearq" "$root/usr/bin/shearq"
-    cp "$tree"/man/*.1 "$root/usr/share/man/man1"
-    gzip -n -9 "$root"/usr/share/man/man1/*.1
     cp "$tree/completions/shearq.bash" "$root/usr/share/bash-completion/completions/shearq"
     cp -r README.md CHANGELOG.md docs "$doc"
     cat LICENSE-MIT "$tree/LICENCES-OF-DEPENDENCIES.txt" > "$doc/copyright"
