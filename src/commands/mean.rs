@@ -6,8 +6,7 @@ use crate::arguments::{Form, SetList, Threads, sets_of};
 use crate::tell;
 use shearq_dataset::fingerprint;
 use shearq_dataset::metadata::Axes;
-use shearq_dataset::run::{Run, Source};
-use shearq_dataset::threads::Pool;
+use shearq_dataset::run::Run;
 use shearq_measure::{PixelFrame, Warning};
 use shearq_render::table::TableFormat;
 use shearq_results::mean::mean_shears;
@@ -55,15 +54,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let (condition, weight) = (&arguments.condition, &arguments.weight);
     let selection = smooth_selection(condition.as_deref(), weight.as_deref())?;
     let run = Run::require(measured)?;
-    // A mean needs catalogues only. Data that were removed meanwhile are therefore no error, but data that changed are.
-    let data = match &run.source {
-        Source::Folder { .. } => run.source.data(measured).ok(),
-        Source::Simulated(_) => None,
-    };
-    if let Some(data) = &data {
-        let pool = Pool::new(arguments.threads.number())?;
-        fingerprint::verify(data, measured, &run, sets, &pool)?;
-    }
+    let data = fingerprint::verify_source(measured, &run, sets, arguments.threads.number())?;
     let means = mean_shears(&run, measured, sets, selection.as_ref())?;
     for mean in &means {
         let set = mean.set;

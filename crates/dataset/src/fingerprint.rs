@@ -12,6 +12,7 @@ use std::path::{Path, PathBuf};
 
 use sha2::{Digest, Sha256};
 
+use crate::great3;
 use crate::images::ImageId;
 use crate::layout::{DataFolder, LAYOUT_FILE, Layout};
 use crate::run::{Run, Source};
@@ -145,7 +146,9 @@ pub const PSF: &str = "psf";
 const TRUTH: &str = "truth";
 // The table of gathered stamps, which has their noise and their pixels on the sky.
 const STAMPS: &str = "stamps";
-pub const PRINTS: [&str; 4] = [GALAXIES, PSF, STAMPS, TRUTH];
+// The shift of an epoch of GREAT3, which decides where its galaxies are.
+const DITHER: &str = "dither";
+pub const PRINTS: [&str; 5] = [GALAXIES, PSF, STAMPS, TRUTH, DITHER];
 
 /// The files that a run measures, if they are there. A simulated run has none.
 #[derive(Debug)]
@@ -180,6 +183,10 @@ impl<'a> Inputs<'a> {
             (PSF, psf),
             (STAMPS, self.data.stamps(id.set, id.image)),
             (TRUTH, self.data.truth(id.set)),
+            (
+                DITHER,
+                great3::dither_file(self.data.root(), id.set, id.image),
+            ),
         ])
     }
 
@@ -193,6 +200,8 @@ impl<'a> Inputs<'a> {
             let print = match key {
                 TRUTH => self.truths.get(&id.set).cloned(),
                 _ if epochs.len() > 1 => Some(self.print_of_all(key, &epochs)?),
+                // A single epoch is measured where its galaxies are.
+                DITHER => None,
                 _ if is_there(&path) => Some(of_image(&path)?),
                 _ => None,
             };
@@ -230,8 +239,13 @@ impl<'a> Inputs<'a> {
             if let (Some(now), Some(kept)) = (now.get(key), kept.get(key))
                 && now != kept
             {
+                // One fingerprint is that of the files of all epochs.
+                let what = match self.run.epochs && key != TRUTH {
+                    true => "the file, or that of another epoch,",
+                    false => "the file",
+                };
                 let message = format!(
-                    "the file has changed since {} was measured (found the fingerprint {now}, expected {kept}). Try: measure again into another folder",
+                    "{what} has changed since {} was measured (found the fingerprint {now}, expected {kept}). Try: measure again into another folder",
                     catalogue.display()
                 );
                 return Err(FileError::new(path, message));
@@ -269,6 +283,25 @@ pub fn verify(
     };
     let images: Vec<ImageId> = files.sets().into_iter().flat_map(of_set).collect();
     Inputs::new(run, data, &images)?.verify(out, &images, pool)
+}
+
+/// As [`verify`], with the data folder that the record names, which is returned. Catalogues are read without data, so that data
+/// that were removed meanwhile are no error, but data that changed are.
+pub fn verify_source(
+    out: &Path,
+    run: &Run,
+    sets: &[u32],
+    threads: usize,
+) -> Result<Option<DataFolder>, FileError> {
+    let data = match &run.source {
+        Source::Folder { .. } => run.source.data(out).ok(),
+        Source::Simulated(_) => None,
+    };
+    if let Some(data) = &data {
+        let pool = Pool::new(threads).map_err(|error| FileError::new(out, error))?;
+        verify(data, out, run, sets, &pool)?;
+    }
+    Ok(data)
 }
 
 #[cfg(test)]

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use shearq_files::FileError;
 use shearq_files::open::{SETTINGS, is_there, read_to_string};
 use shearq_files::table::{self, MAX_ROWS};
-use shearq_scoring::great3::Identity;
+use shearq_scoring::great3::{Identity, NODES_PER_GALAXY};
 
 use crate::listing;
 use crate::mosaic::Mosaic;
@@ -28,6 +28,9 @@ pub const DITHERS: &str = "epoch_dither-{set:03}-{image}";
 pub const SUBFIELD_OFFSETS: &str = "subfield_offset-{set:03}";
 pub const SHEARS: &str = "shear_params-{set:03}";
 pub const PSF_SHAPES: &str = "starshape_parameters-{set:03}-{image}";
+
+// Relative difference of a number in two files of parameters. Chosen by hand: the organisers' formats have six digits or more.
+const MAX_ROUNDING: f64 = 1e-5;
 
 /// What a branch has that other data folders do not.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
@@ -90,12 +93,18 @@ pub(crate) fn galaxy_catalogue(root: &Path, set: u32) -> PathBuf {
     root.join(fill(GALAXY_CATALOGUES, set, 0))
 }
 
+/// The file with the shift of an epoch.
+pub(crate) fn dither_file(root: &Path, set: u32, image: u32) -> PathBuf {
+    let [yaml, txt] = Parameters::files(root, &fill(DITHERS, set, image));
+    if is_there(&txt) { txt } else { yaml }
+}
+
 /// Shift (x, y) in pixels of all galaxies of an epoch; zero in branches of a single epoch.
 // The challenge's example of a coadd shifts each image by the negative of these numbers.
 pub fn dither(root: &Path, set: u32, image: u32) -> Result<[f64; 2], FileError> {
     let stem = fill(DITHERS, set, image);
     let Some(found) = Parameters::read(root, &stem)? else {
-        let path = root.join(stem + ".yaml");
+        let path = dither_file(root, set, image);
         let message = "there is no such file, nor one ending in .txt; expected the dither of this epoch, by which its galaxies are shifted";
         return Err(FileError::new(path, message));
     };
@@ -205,10 +214,39 @@ impl GalaxyCatalogue {
         Ok(places)
     }
 
-    /// Identities in the order of the stamps.
-    pub fn identities(&self, mosaic: &Mosaic) -> Result<Vec<i64>, FileError> {
+    /// Identities in the order of the stamps of subfield `set`.
+    pub fn identities(
+        &self,
+        set: u32,
+        branch: Branch,
+        mosaic: &Mosaic,
+    ) -> Result<Vec<i64>, FileError> {
+        let step = match branch.rotated_pairs {
+            true => 1,
+            false => NODES_PER_GALAXY,
+        };
         let mut ids = vec![0; mosaic.galaxies];
+        let mut offset = None;
         for (galaxy, place) in self.galaxies.iter().zip(self.places(mosaic)?) {
+            let [x, y] = [place % mosaic.columns, place / mosaic.columns].map(|at| step * at);
+            // Of variable shear, the first galaxy has the offset of its subfield in the lattice.
+            let (dx, dy) = *offset.get_or_insert_with(|| match step {
+                1 => (0, 0),
+                _ => {
+                    let (first_x, first_y) = galaxy.id.place();
+                    (first_x.saturating_sub(x), first_y.saturating_sub(y))
+                }
+            });
+            let expected = Identity::new(set as usize, (x + dx, y + dy));
+            // Rows in another order, exchanged columns or the catalogue of another subfield would give each galaxy a wrong place on
+            // the sky, and hence shears that are correlated with the wrong ones.
+            if galaxy.id != expected {
+                let Galaxy { x, y, id } = galaxy;
+                let message = format!(
+                    "the galaxy at x = {x}, y = {y} has the ID {id} (expected {expected}, of its subfield, column and row). Try: the released catalogue of subfield {set}"
+                );
+                return Err(FileError::new(&self.path, message));
+            }
             ids[place] = galaxy.id.number();
         }
         Ok(ids)
@@ -223,12 +261,31 @@ pub struct Parameters {
 }
 
 impl Parameters {
+    fn files(folder: &Path, stem: &str) -> [PathBuf; 2] {
+        ["yaml", "txt"].map(|ending| folder.join(format!("{stem}.{ending}")))
+    }
+
     /// `None` if the folder has neither `stem`.yaml nor `stem`.txt.
     pub fn read(folder: &Path, stem: &str) -> Result<Option<Self>, FileError> {
-        let files = ["yaml", "txt"].map(|ending| folder.join(format!("{stem}.{ending}")));
-        let Some(path) = files.into_iter().find(|path| is_there(path)) else {
-            return Ok(None);
-        };
+        let files = Parameters::files(folder, stem).into_iter();
+        let found = files.filter(|path| is_there(path)).map(Parameters::of_file);
+        let found: Vec<Self> = found.collect::<Result<_, _>>()?;
+        if let [first, second] = found.as_slice() {
+            // Both may round.
+            let differs = |(name, b): (&String, &f64)| {
+                let a = first.numbers.get(name)?;
+                let same = (a - b).abs() <= MAX_ROUNDING * a.abs();
+                (!same).then(|| format!("`{name}` is {b}; {} has {a}", first.path.display()))
+            };
+            if let Some(message) = second.numbers.iter().find_map(differs) {
+                let message = format!("{message} (expected the same). Try: remove one of them");
+                return Err(FileError::new(&second.path, message));
+            }
+        }
+        Ok(found.into_iter().next())
+    }
+
+    fn of_file(path: PathBuf) -> Result<Self, FileError> {
         let text = read_to_string(&path, SETTINGS)
             .map_err(FileError::doing(&path, "cannot read the parameters"))?;
         let mut lines = text.lines().filter(|line| !line.trim().is_empty());
@@ -255,7 +312,7 @@ impl Parameters {
                 return Err(FileError::new(path, message));
             }
         }
-        Ok(Some(Parameters { path, numbers }))
+        Ok(Parameters { path, numbers })
     }
 
     pub fn number(&self, name: &str) -> Result<f64, FileError> {

@@ -39,6 +39,33 @@ pub fn of_folder(data: &DataFolder, sets: &[u32]) -> Result<Vec<ImageId>, FileEr
     Ok(found)
 }
 
+/// Checks that each of `sets` (all if empty) has the epochs 0 to N of GREAT3, as the subfield with most epochs has: a galaxy without
+/// one of them would have more noise than its neighbours for no reason that anybody could see.
+pub(crate) fn check_epochs(data: &DataFolder, sets: &[u32]) -> Result<(), FileError> {
+    let files = data.images(&[])?;
+    let of_set = |set: u32| files.of_set(set).into_iter().map(|(epoch, _)| epoch);
+    let last = files
+        .sets()
+        .into_iter()
+        .filter_map(|set| Some((of_set(set).max()?, set)));
+    let Some((last, full)) = last.max_by_key(|(last, _)| *last) else {
+        return Ok(());
+    };
+    for set in files.wanted(sets) {
+        let there: Vec<u32> = of_set(set).collect();
+        if let Some(epoch) = (0..=last).find(|epoch| !there.contains(epoch)) {
+            let message = format!(
+                "there is no such epoch (found {} of subfield {set}, expected {}, as subfield {full} has {last} for the last){}",
+                there.len(),
+                last + 1,
+                advice(data, &files)
+            );
+            return Err(FileError::new(data.galaxies(set, epoch), message));
+        }
+    }
+    Ok(())
+}
+
 fn advice(data: &DataFolder, files: &Files) -> String {
     // Misspelt names explain missing images better than a wrong folder does.
     if let Some(line) = files.unread().first() {

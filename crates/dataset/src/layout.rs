@@ -164,6 +164,13 @@ impl DataFolder {
             let message = "only star fields of GREAT3 can be stacked (expected image-000-0.fits, starfield_image-000-0.fits and galaxy_catalog-000.fits)";
             return Err(FileError::new(&self.root, message));
         };
+        if self.layout.psf_star != great3::STAR_FIELDS {
+            let example = fill(great3::PSF_IMAGES, 0, 0);
+            let message = format!(
+                "there are PSFs of single galaxies (found images such as {example}), which are used in place of the star fields that were to be stacked. Try: without --stack-stars, or remove these images"
+            );
+            return Err(FileError::new(&self.root, message));
+        }
         branch.stacked_stars = true;
         Ok(self)
     }

@@ -122,9 +122,15 @@ impl CommonAxes {
             self.on_sky |= axes == Axes::Sky;
             return Ok(());
         }
-        let remedy = match both_pixels {
-            true => "images of one orientation per set (gather --set), or gather --frame sky",
-            false => "gather all with --frame sky, or all with --frame pixel",
+        // Without a WCS there is no frame of the sky.
+        let has_wcs = axes != Axes::Pixel && *expected != Axes::Pixel;
+        let remedy = match (both_pixels, has_wcs) {
+            (true, true) => {
+                "images of one orientation per set (gather --set), or gather --frame sky"
+            }
+            (true, false) => "images of one orientation per set (gather --set)",
+            (false, true) => "gather all with --frame sky, or all with --frame pixel",
+            (false, false) => "gather all with --frame pixel",
         };
         let message = format!(
             "the ellipticities have other axes than those of {} and no common mean with them (found {axes}; expected {expected}). Try: {remedy}",

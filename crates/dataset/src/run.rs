@@ -116,6 +116,9 @@ impl Run {
     pub fn images(&self, data: &DataFolder, sets: &[u32]) -> Result<Vec<ImageId>, FileError> {
         let mut all = images::of_folder(data, sets)?;
         if self.epochs {
+            if data.layout().great3.is_some() {
+                images::check_epochs(data, sets)?;
+            }
             all.dedup_by_key(|id| id.set);
         }
         Ok(all)

@@ -9,6 +9,9 @@ use thiserror::Error;
 #[error("cannot start the worker threads: {0}")]
 pub struct ThreadError(#[from] ThreadPoolBuildError);
 
+/// For [`Pool::new`]: one thread per core.
+pub const ALL_CORES: usize = 0;
+
 // Items per thread whose results are in memory together. Chosen by hand: threads wait for the slowest item of such a
 // batch, and a sum on a 100 × 100 grid has 240 kB.
 const IN_MEMORY: usize = 4;
@@ -17,7 +20,6 @@ const IN_MEMORY: usize = 4;
 pub struct Pool(pub ThreadPool);
 
 impl Pool {
-    /// `threads`, or one per core for 0.
     pub fn new(threads: usize) -> Result<Self, ThreadError> {
         let pool = ThreadPoolBuilder::new().num_threads(threads).build()?;
         Ok(Pool(pool))

@@ -4,7 +4,7 @@
 
 use std::path::Path;
 
-use shearq_dataset::great3::GalaxyCatalogue;
+use shearq_dataset::great3::{Branch, GalaxyCatalogue};
 use shearq_dataset::mosaic::Mosaic;
 use shearq_files::FileError;
 use shearq_files::atomic;
@@ -98,8 +98,13 @@ impl StampTable {
     }
 
     /// The table of a subfield of GREAT3: identities alone, because each stamp is where its galaxy is.
-    pub(crate) fn of_great3(path: &Path, mosaic: &Mosaic) -> Result<Self, FileError> {
-        let ids = GalaxyCatalogue::read(path)?.identities(mosaic)?;
+    pub(crate) fn of_great3(
+        path: &Path,
+        set: u32,
+        branch: Branch,
+        mosaic: &Mosaic,
+    ) -> Result<Self, FileError> {
+        let ids = GalaxyCatalogue::read(path)?.identities(set, branch, mosaic)?;
         let head = Head {
             first_pixel: 1,
             ..Head::default()

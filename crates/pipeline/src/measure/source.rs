@@ -65,7 +65,7 @@ impl ImageSource {
         }
         let stamps = data.stamps(id.set, id.image);
         let table = match data.layout().great3 {
-            Some(_) => Some(StampTable::of_great3(&stamps, &mosaic)?),
+            Some(branch) => Some(StampTable::of_great3(&stamps, id.set, branch, &mosaic)?),
             None => StampTable::read(&stamps, &mosaic)?,
         };
         let jacobians = match &table {
