@@ -9,7 +9,9 @@ use super::published;
 use crate::choices::named;
 use crate::progress::Bar;
 use crate::{count, tell, tell_unread};
+use shearq_dataset::fingerprint;
 use shearq_dataset::run::{Run, open_data};
+use shearq_dataset::threads::ALL_CORES;
 use shearq_results::catalogues::Catalogues;
 use shearq_results::published::{self as challenges, Packing};
 use shearq_results::submit::pack::Packing as Submission;
@@ -165,7 +167,11 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         out.display()
     );
     let catalogues = match (&arguments.measured, &arguments.foreign) {
-        (Some(folder), _) => Catalogues::measured(&Run::require(folder)?, folder, &[])?,
+        (Some(folder), _) => {
+            let run = Run::require(folder)?;
+            fingerprint::verify_source(folder, &run, &[], ALL_CORES)?;
+            Catalogues::measured(&run, folder, &[])?
+        }
         (None, Some(path)) => Catalogues::foreign(path, &[])?,
         _ => anyhow::bail!("cannot find catalogues to pack. Try: --measured DIR or --foreign FILE"),
     };

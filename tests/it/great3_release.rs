@@ -135,15 +135,44 @@ fn means_of_rotated_pairs_are_packed_with_errors_of_pixel_noise() {
             assert!((0.2..0.9).contains(&ratio), "{ratio}");
         }
     }
-    // An identity of another subfield.
-    let catalogue = small.at("great3/galaxy_catalog-000.fits");
-    fs::copy(small.at("great3/galaxy_catalog-001.fits"), &catalogue).unwrap();
-    printed(small.root(), &MEASURE.replace("--out m", "--out other"));
-    let message = refused(
-        small.root(),
-        "shearq pack --challenge great3 --branch control-ground-constant --measured other --subfields 2 --grid 8 --out h.txt",
+}
+
+#[test]
+fn identities_are_those_of_subfield_column_and_row() {
+    let small = Small::new("2");
+    branch(&small);
+    let catalogue = |subfield: usize| small.at(&format!("great3/galaxy_catalog-00{subfield}.fits"));
+    let other = MEASURE.replace("--out m", "--out other");
+    // Of the second subfield, whose catalogue the first cannot stand for: exchanged axes, and rows in another order.
+    let sound = table::read(&catalogue(1), None, table::MAX_ROWS).unwrap();
+    let of = |name: &str| sound.column(name).unwrap().clone();
+    let exchanged = vec![
+        of("y").with_name("x".into()),
+        of("x").with_name("y".into()),
+        of("ID"),
+    ];
+    let reversed = vec![of("x"), of("y"), of("ID").reverse()];
+    for (columns, says) in [
+        (
+            exchanged,
+            "the galaxy at x = 359, y = 311 has the ID 001006007 (expected 001007006",
+        ),
+        (
+            reversed,
+            "the galaxy at x = 359, y = 359 has the ID 001000000 (expected 001007007",
+        ),
+    ] {
+        let table = frame(columns).unwrap();
+        table::write(&catalogue(1), FileFormat::Fits, &table, &Metadata::new()).unwrap();
+        let message = refused(small.root(), &format!("rm -rf other; {other}"));
+        assert!(message.contains(says), "{message}");
+    }
+    fs::copy(catalogue(0), catalogue(1)).unwrap();
+    let message = refused(small.root(), &format!("rm -rf other; {other}"));
+    assert!(
+        message.contains("has the ID 000007007 (expected 001007007"),
+        "{message}"
     );
-    assert!(message.contains("is there twice"), "{message}");
 }
 
 #[test]
@@ -206,6 +235,40 @@ fn epochs_of_a_subfield_are_combined() {
         "{found:?}"
     );
     assert!(!small.at("epochs/set00/catalogue-001.parquet").exists());
+    // Another dither makes the catalogue one of other data.
+    let dither = at("epoch_dither-000-1.yaml");
+    fs::write(&dither, "{xdither_pixels: -2.0, ydither_pixels: 0.0}").unwrap();
+    for command in [
+        "measure --data great3 --submission 48/linear/star --sets 0 --out epochs",
+        "mean --measured epochs",
+        "shear --measured epochs --out shears.fits",
+        "select --measured epochs --where 'step(snr, 10)' --out selected",
+        "pack --measured epochs --out packed",
+    ] {
+        let message = refused(small.root(), &format!("shearq {command}"));
+        assert!(
+            message.contains("epoch_dither-000-0.yaml: the file, or that of another epoch, has"),
+            "{command}: {message}"
+        );
+    }
+    fs::write(
+        at("epoch_dither-000-1.txt"),
+        "# xdither_pixels ydither_pixels\n2 0\n",
+    )
+    .unwrap();
+    let message = refused(small.root(), &format!("rm -rf epochs; {measure}"));
+    assert!(
+        message.contains("epoch_dither-000-1.txt: `xdither_pixels` is 2; ")
+            && message.contains("has -2 (expected the same)"),
+        "{message}"
+    );
+    let message = refused(small.root(), &MEASURE.replace("--out m", "--out all"));
+    assert!(
+        message.contains(
+            "image-001-1.fits: there is no such epoch (found 1 of subfield 1, expected 2"
+        ),
+        "{message}"
+    );
 }
 
 #[test]
@@ -250,6 +313,11 @@ fn a_varying_psf_is_taken_from_images_of_one_per_galaxy() {
     for (a, b) in column(&cube, "e1").iter().zip(column(&mosaic, "e1")) {
         assert!((a - b).abs() < 1e-9 || a.is_nan(), "{a} {b}");
     }
+    let message = refused(
+        small.root(),
+        &MEASURE.replace("--out m", "--stack-stars --out n"),
+    );
+    assert!(message.contains("without --stack-stars"), "{message}");
     write_image(
         &small.at("great3/psf_image-000-0.fits"),
         &[side, side, 3],

@@ -76,7 +76,8 @@ pub fn mean_shears(
     let files = run.catalogues(out, sets)?;
     let calibrated = run.configuration.calibration() != Calibration::None;
     // Weights differ between the galaxies of a pair, so that shapes do not cancel.
-    let pairs = selection.is_none() && run.selection.is_none();
+    let selected = run.selection.is_some();
+    let pairs = selection.is_none() && !selected;
     let mut means = Vec::new();
     for set in files.wanted(sets) {
         let catalogues = files.of_set(set);
@@ -89,7 +90,7 @@ pub fn mean_shears(
             &catalogues,
             run.format,
             calibrated,
-            selection,
+            (selection, selected),
             pairs,
         )?);
     }
@@ -109,7 +110,7 @@ fn mean_of(
     catalogues: &[(u32, PathBuf)],
     format: FileFormat,
     calibrated: bool,
-    selection: Option<&StatedSelection>,
+    (selection, selected): (Option<&StatedSelection>, bool),
     pairs: bool,
 ) -> Result<SetMean, FileError> {
     let (mut sum, mut moments) = (ShearSum::default(), [RunningMean::default(); 2]);
@@ -129,7 +130,7 @@ fn mean_of(
         let weights = selection.and_then(|stated| stated.weights.as_ref());
         let (mut rows, bits) = match weights {
             Some(weights) => Weighted::read(path, weights)?,
-            None => Weighted::unselected(path, calibrated)?,
+            None => Weighted::unselected(path, calibrated, selected)?,
         };
         if let Some(selection) = selection {
             rows.keep_of_file(path, selection)?;
@@ -272,7 +273,15 @@ mod tests {
         let path = folder.path().join("catalogue-001.parquet");
         written(&path, [0.05, 0.2], &[]);
         let catalogues = [(1, path)];
-        let mean = mean_of(7, &catalogues, FileFormat::Parquet, true, None, true).unwrap();
+        let mean = mean_of(
+            7,
+            &catalogues,
+            FileFormat::Parquet,
+            true,
+            (None, false),
+            true,
+        )
+        .unwrap();
         assert_eq!((mean.galaxies, mean.flagged, mean.flags[2]), (2, 1, 1));
         let shear = mean.shear.unwrap();
         assert!((shear.shear[0] - 0.25).abs() < 1e-15 && (shear.shear[1] + 0.125).abs() < 1e-15);
@@ -282,7 +291,14 @@ mod tests {
         let scatter = 0.3 / 2f64.sqrt();
         assert!((mean.scatter[0] - scatter).abs() < 1e-15, "{mean:?}");
         // Without responses the residuals are ∓0.075.
-        let plain = mean_of(7, &catalogues, FileFormat::Parquet, false, None, true);
+        let plain = mean_of(
+            7,
+            &catalogues,
+            FileFormat::Parquet,
+            false,
+            (None, false),
+            true,
+        );
         let plain = plain.unwrap().shear.unwrap();
         assert!((plain.error()[0] - 0.075).abs() < 1e-15, "{plain:?}");
     }
@@ -306,7 +322,14 @@ mod tests {
         let none = Default::default();
         table::write(&path(2), FileFormat::Parquet, &table.unwrap(), &none).unwrap();
         let catalogues = [1, 2].map(|image| (image, path(image)));
-        let mean = mean_of(7, &catalogues, FileFormat::Parquet, true, None, true);
+        let mean = mean_of(
+            7,
+            &catalogues,
+            FileFormat::Parquet,
+            true,
+            (None, false),
+            true,
+        );
         let found = mean.unwrap().shear.unwrap().shear[0];
         assert!((found - (0.25 + 0.01) / 1.002).abs() < 1e-15, "{found}");
     }
@@ -318,7 +341,14 @@ mod tests {
         let mean = |metadata: &[(&str, &str)], pairs| {
             written(&path, [0.05, 0.2], metadata);
             let catalogues = [(1, path.clone())];
-            mean_of(7, &catalogues, FileFormat::Parquet, true, None, pairs)
+            mean_of(
+                7,
+                &catalogues,
+                FileFormat::Parquet,
+                true,
+                (None, false),
+                pairs,
+            )
         };
         let stated = (E_NOISE, "3.0e-2 2.0e-2");
         let own = mean(&[stated], true).unwrap();
@@ -353,7 +383,14 @@ mod tests {
                 written(&path, [0.05, 0.2], metadata);
                 catalogues.push((image, path));
             }
-            mean_of(7, &catalogues, FileFormat::Parquet, true, None, true)
+            mean_of(
+                7,
+                &catalogues,
+                FileFormat::Parquet,
+                true,
+                (None, false),
+                true,
+            )
         };
         let turned = PixelFrame {
             angle: 37.0,
@@ -399,7 +436,14 @@ mod tests {
                     (image, path)
                 })
                 .collect();
-            mean_of(7, &catalogues, FileFormat::Parquet, true, None, true)
+            mean_of(
+                7,
+                &catalogues,
+                FileFormat::Parquet,
+                true,
+                (None, false),
+                true,
+            )
         };
         let own = |images: usize| mean(&vec![&[][..]; images]).unwrap();
         let noisy = (PSF_NOISE, "4.00e-1 1.00e-2");

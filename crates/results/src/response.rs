@@ -3,11 +3,12 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use shearq_dataset::fingerprint::GALAXIES;
+use shearq_dataset::fingerprint::{GALAXIES, verify_source};
 use shearq_dataset::metadata::{
     Axes, CommonAxes, FIRST_PIXEL, FRAME, NOT_APPLIED, RESPONSE, axes_of,
 };
 use shearq_dataset::run::{Run, Source};
+use shearq_dataset::threads::ALL_CORES;
 use shearq_files::FileError;
 use shearq_files::frames::polars::{Column, DataFrame};
 use shearq_files::frames::{Metadata, frame};
@@ -171,6 +172,7 @@ pub fn shears(
     let mut seen = BTreeMap::new();
     for (folder, out) in measured.iter().enumerate() {
         let run = Run::require(out)?;
+        verify_source(out, &run, sets, ALL_CORES)?;
         if run.configuration.calibration() == Calibration::None {
             let message = format!(
                 "the configuration {} does not measure a response, so that its ellipticities are no shears (found no response; expected a linear configuration such as 48/linear/star)",
@@ -284,6 +286,9 @@ fn refuse_seen(
 // TreeCorr takes right ascension and declination on the sky, where our signs are its own, or x and y of the pixels' axes.
 fn check_positions(path: &Path, treecorr: Option<Position>, axes: Axes) -> Result<(), FileError> {
     let message = match treecorr {
+        Some(Position::Sky) if axes == Axes::Pixel => {
+            "the ellipticities are along pixel axes whose orientation on the sky no WCS states (found no WCS; expected `sky`). Try: --treecorr x,y"
+        }
         // Pixel axes that a WCS states to be the sky's are as good as `mean` takes them.
         Some(Position::Sky) if !axes.agree(Axes::Sky) => {
             "the ellipticities are in the frame of the pixels, so that they have no direction on the sky (found `pixel`; expected `sky`). Try: gather --frame sky, or --treecorr x,y"

@@ -3,10 +3,11 @@
 use std::borrow::Cow;
 use std::path::Path;
 
-use shearq_dataset::fingerprint::PRINTS;
+use shearq_dataset::fingerprint::{PRINTS, verify_source};
 use shearq_dataset::metadata::KEYS;
 use shearq_dataset::record::claim;
 use shearq_dataset::run::{RUN_FILE, Run, Source};
+use shearq_dataset::threads::ALL_CORES;
 use shearq_files::frames::frame;
 use shearq_files::frames::polars::{Column, DataFrame};
 use shearq_files::table::Place;
@@ -166,6 +167,7 @@ pub fn write_selected(
     stated: &StatedSelection,
 ) -> Result<(usize, usize), FileError> {
     let selection = stated.weights.clone().unwrap_or_default();
+    verify_source(from, run, &[], ALL_CORES)?;
     // The second selection would divide by the response of the first one again.
     if let Some(earlier) = &run.selection {
         return Err(FileError::new(
@@ -372,13 +374,18 @@ impl Weighted {
     }
 
     /// The rows of a catalogue without a selection, with the flags: weights of one, and the responses of shears if the
-    /// ellipticities are not `calibrated`.
-    pub(crate) fn unselected(path: &Path, calibrated: bool) -> Result<(Self, Vec<f64>), FileError> {
-        let names = if calibrated { &READ[..] } else { &READ[..3] };
+    /// ellipticities are not `calibrated`. Catalogues of a folder that is `selected` have zero for galaxies that were left out.
+    pub(crate) fn unselected(
+        path: &Path,
+        calibrated: bool,
+        selected: bool,
+    ) -> Result<(Self, Vec<f64>), FileError> {
+        let mut names = if calibrated { &READ[..] } else { &READ[..3] }.to_vec();
+        names.extend(selected.then_some(WEIGHT));
         if calibrated {
             undivided_columns(path)?;
         }
-        let read = table::read(path, Some(names), table::MAX_ROWS)?;
+        let read = table::read(path, Some(&names), table::MAX_ROWS)?;
         let column = |name: &str| table::numbers(&read, name, path).map(Cow::into_owned);
         let pair = |[a, b]: [&str; 2]| Ok::<_, FileError>([column(a)?, column(b)?]);
         let (flags, e) = (column("flags")?, pair(["e1", "e2"])?);
@@ -387,11 +394,17 @@ impl Weighted {
         if calibrated {
             (response, cross) = (pair(["R11", "R22"])?, pair(["R12", "R21"])?);
         }
+        // Ellipticities and responses contain the weights already.
+        let mut weight = all(1.0);
+        if selected {
+            let counts = |weight: f64| f64::from(u8::from(weight != 0.0));
+            weight = column(WEIGHT)?.into_iter().map(counts).collect();
+        }
         let weighted = Weighted {
             e,
             response,
             cross,
-            weight: all(1.0),
+            weight,
         };
         Ok((weighted, flags))
     }
