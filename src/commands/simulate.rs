@@ -1,11 +1,11 @@
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
-use anyhow::Context;
 use clap::{ArgGroup, Args};
 
 use crate::arguments::{SetList, Sharding, SimulationArguments, Threads};
 use crate::progress::{Bar, mark_resumable};
 use crate::tell;
+use shearq_dataset::fingerprint;
 use shearq_dataset::images;
 use shearq_dataset::layout::{DataFolder, MAX_IMAGE};
 use shearq_dataset::run::SimulationRecord;
@@ -146,11 +146,9 @@ fn run_branch(arguments: &Arguments, branch: Branch) -> anyhow::Result<()> {
         Some(path) => great3::read_fits(path)?,
         None => Vec::new(),
     };
-    let mut simulator = BranchSimulator::new(branch, settings.seed, settings.grid, fits)
-        .with_context(|| {
-            let path = arguments.galaxies.as_deref().unwrap_or(Path::new(""));
-            path.display().to_string()
-        })?;
+    let print = arguments.galaxies.as_deref().map(fingerprint::of_file);
+    let print = print.transpose()?;
+    let mut simulator = BranchSimulator::new(branch, settings.seed, settings.grid, fits)?;
     let subfields = arguments.subfields.map_or(SUBFIELDS, usize::from);
     let mut folders = vec![(arguments.out.clone(), false)];
     if arguments.opposite {
@@ -171,7 +169,7 @@ fn run_branch(arguments: &Arguments, branch: Branch) -> anyhow::Result<()> {
             seed: settings.seed,
             grid: settings.grid,
             opposite,
-            galaxies: arguments.galaxies.clone(),
+            galaxies: print.clone(),
         };
         made += great3::simulate_branch(&simulator, &record, subfields, &out, threads, &mut bar)?;
     }

@@ -2,7 +2,7 @@
 
 use std::fmt::Write;
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use flate2::read::GzDecoder;
 use serde_json::Value;
@@ -909,6 +909,62 @@ fn simulated_branches_are_scored_by_their_released_truth() {
         let (_, width) = pixels_of(&data.join("image-001-0.fits"));
         assert_eq!(width, 8 * stamp);
     }
+}
+
+// All files below a folder by name, with their contents.
+fn contents(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {
+    let mut all = Vec::new();
+    for entry in fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        match path.is_dir() {
+            true => all.extend(contents(&path)),
+            false => all.push((path.clone(), fs::read(&path).unwrap())),
+        }
+    }
+    all.sort();
+    all
+}
+
+#[test]
+fn resumed_branches_are_those_of_one_run() {
+    let folder = tempfile::tempdir().unwrap();
+    let fits = file(folder.path(), "fits.txt", "n r_e q\n1 0.5 0.6\n");
+    let out = folder.path().join("out");
+    let line = format!(
+        "simulate --challenge great3 --branch multiepoch-ground-constant --subfields 2 --grid 8 --galaxies {fits} --out {}",
+        out.display()
+    );
+    succeed(&words(&line));
+    let whole = contents(&out);
+    let below = out.join("multiepoch/ground/constant");
+    let truth = out.join("truth/multiepoch/ground/constant");
+    for lost in [
+        below.join("image-001-2.fits"),
+        below.join("starfield_image-000-5.fits"),
+        below.join("epoch_dither-001-3.yaml"),
+        truth.join("galaxy_catalog-000.fits"),
+    ] {
+        fs::remove_file(&lost).unwrap();
+        succeed(&words(&line));
+        assert!(contents(&out) == whole, "{}", lost.display());
+    }
+    for damaged in [
+        below.join("image-001-5.fits"),
+        below.join("galaxy_catalog-001.fits"),
+        truth.join("shear_params-000.yaml"),
+    ] {
+        let bytes = fs::read(&damaged).unwrap();
+        fs::write(&damaged, &bytes[..bytes.len() / 2]).unwrap();
+        succeed(&words(&line));
+        assert!(contents(&out) == whole, "{}", damaged.display());
+    }
+    // Another table of the same name.
+    file(folder.path(), "fits.txt", "n r_e q\n1 0.4 0.6\n");
+    let message = fail(&words(&line));
+    assert!(
+        message.contains("other settings") && message.contains("galaxies: "),
+        "{message}"
+    );
 }
 
 #[test]

@@ -208,6 +208,16 @@ impl Subfield {
     }
 }
 
+/// A galaxy of a subfield, without its noise.
+#[derive(Debug)]
+pub struct DrawnGalaxy {
+    place: usize,
+    sheared: Galaxy,
+    // Factor of its light that gives its S/N in all epochs together.
+    scale: f64,
+    offset: (f64, f64),
+}
+
 #[derive(Clone, Copy)]
 enum Purpose {
     // Beyond those of GREAT10's sets, so that one seed does not repeat their galaxies.
@@ -469,15 +479,8 @@ impl BranchSimulator {
         }
     }
 
-    /// Draws a galaxy with its noise into `out`, a stamp in row-major order.
-    pub fn draw(
-        &self,
-        subfield: &Subfield,
-        epoch: usize,
-        (ix, iy): (usize, usize),
-        scratch: &mut RenderScratch,
-        out: &mut [f32],
-    ) {
+    /// The galaxy in a place.
+    pub fn galaxy_at(&self, subfield: &Subfield, (ix, iy): (usize, usize)) -> DrawnGalaxy {
         let place = iy * self.grid + ix;
         let (fit, direction, snr) = self.draw_fit(subfield, place);
         let (shear, shape) = match subfield.constant_shear {
@@ -497,18 +500,33 @@ impl BranchSimulator {
             .epochs
             .iter()
             .map(|epoch| power(&unlensed, &epoch.transformed()));
-        let scale = snr / powers.sum::<f64>().sqrt();
-        let own = &subfield.epochs[epoch];
         // Galaxies of a pair have offsets and noise of their own.
         let mut rng = self.stream(subfield.number, 0, Purpose::Noise);
         rng.set_stream(place as u64);
-        let offset = Self::offset(&mut rng);
-        let centre = self.centre(offset, own.dither);
+        DrawnGalaxy {
+            place,
+            sheared: drawn(shear),
+            scale: snr / powers.sum::<f64>().sqrt(),
+            offset: Self::offset(&mut rng),
+        }
+    }
+
+    /// Draws a galaxy with its noise into `out`, a stamp in row-major order.
+    pub fn draw(
+        &self,
+        subfield: &Subfield,
+        epoch: usize,
+        galaxy: &DrawnGalaxy,
+        scratch: &mut RenderScratch,
+        out: &mut [f32],
+    ) {
+        let own = &subfield.epochs[epoch];
+        let centre = self.centre(galaxy.offset, own.dither);
         self.renderer
-            .render(&drawn(shear), &own.transformed(), centre, scratch, out);
+            .render(&galaxy.sheared, &own.transformed(), centre, scratch, out);
         let mut rng = self.stream(subfield.number, epoch + 1, Purpose::Noise);
-        rng.set_stream(place as u64);
-        add_noise(&mut rng, scale as f32, PIXEL_NOISE, out);
+        rng.set_stream(galaxy.place as u64);
+        add_noise(&mut rng, galaxy.scale as f32, PIXEL_NOISE, out);
     }
 
     fn centre(&self, offset: (f64, f64), dither: (f64, f64)) -> (f64, f64) {
@@ -676,16 +694,11 @@ mod tests {
         let subfield = subfield(&simulator, 1);
         assert_eq!(subfield.epochs.len(), 6);
         let (fit, _, snr) = simulator.draw_fit(&subfield, 0);
-        let mut squares = 0.0;
+        let galaxy = simulator.galaxy_at(&subfield, (0, 0));
+        let (mut squares, mut scratch) = (0.0, RenderScratch::new());
         for epoch in 0..6 {
             let mut stamp = vec![0.0; 48 * 48];
-            simulator.draw(
-                &subfield,
-                epoch,
-                (0, 0),
-                &mut RenderScratch::new(),
-                &mut stamp,
-            );
+            simulator.draw(&subfield, epoch, &galaxy, &mut scratch, &mut stamp);
             squares += stamp.iter().map(|v| f64::from(*v).powi(2)).sum::<f64>() - 48.0 * 48.0;
         }
         // Σ (I + n)² scatters by √(2·6·2304 + 4 S/N²).

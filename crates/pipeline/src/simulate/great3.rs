@@ -10,7 +10,7 @@ use shearq_dataset::layout::fill;
 use shearq_dataset::record::claim;
 use shearq_dataset::run::SIMULATION_FILE;
 use shearq_dataset::threads::Progress;
-use shearq_files::fits::ImageWriter;
+use shearq_files::fits::{ImageReader, ImageWriter};
 use shearq_files::frames::polars::{Column, DataFrame};
 use shearq_files::frames::{Metadata, frame};
 use shearq_files::table::{self, FileFormat, MAX_ROWS};
@@ -34,9 +34,9 @@ pub struct Record {
     /// Whether all shears have the opposite sign.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub opposite: bool,
-    /// Table of fits to galaxies.
+    /// Fingerprint of the table of fits to galaxies. Its path would not tell an edited table from the first one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub galaxies: Option<PathBuf>,
+    pub galaxies: Option<String>,
 }
 
 /// Where the truth of a branch is, in a folder that holds its data.
@@ -46,11 +46,11 @@ pub fn truth_folder(out: &Path, branch: Branch) -> PathBuf {
 
 struct Row {
     subfield: Arc<Subfield>,
-    epoch: usize,
+    epochs: Arc<[usize]>,
     iy: usize,
 }
 
-/// Simulates subfields from 0 into `out`, and returns the number of new images. Images that are there are kept.
+/// Simulates subfields from 0 into `out`, and returns the number of new images. Whole images are kept.
 pub fn simulate_branch(
     simulator: &BranchSimulator,
     record: &Record,
@@ -63,28 +63,37 @@ pub fn simulate_branch(
     let (branch, grid) = (simulator.branch, simulator.grid);
     let folder = out.join(branch.folder());
     let truth = truth_folder(out, branch);
-    let epochs = branch.epochs();
     let image = |subfield, epoch| folder.join(named(great3::GALAXIES, subfield, epoch));
-    // Other files of a subfield are written first, so that the last image shows that all are there.
-    let todo: Vec<usize> = (0..subfields)
-        .filter(|&number| !image(number, epochs - 1).is_file())
-        .collect();
-    let made = todo.len() * epochs;
-    let side = grid * branch.stamp();
-    let mut open: Option<ImageWriter> = None;
+    let size = branch.stamp();
+    let side = grid * size;
+    // An image that was cut off when a disk was full or a copy stopped has its name, but not its size.
+    let is_whole = |subfield, epoch| {
+        ImageReader::open(image(subfield, epoch))
+            .is_ok_and(|image| (image.width(), image.height()) == (side, side))
+    };
+    let missing = |subfield| -> Arc<[usize]> {
+        let epochs = 0..branch.epochs();
+        epochs.filter(|epoch| !is_whole(subfield, *epoch)).collect()
+    };
+    let todo: Vec<_> = (0..subfields).map(missing).collect();
+    let made = todo.iter().map(|epochs| epochs.len()).sum();
+    let mut open: Vec<ImageWriter> = Vec::new();
     engine::ordered(
         threads,
         |feeder| {
-            for subfield in simulator.subfields(todo.into_iter()) {
+            for (subfield, epochs) in simulator.subfields(0..subfields).zip(todo) {
                 let subfield =
                     subfield.map_err(|source| PipelineError::Scoring { set: None, source })?;
                 let subfield = Arc::new(subfield);
-                let rows = (0..epochs * grid).map(|k| (k / grid, k % grid));
-                for (epoch, iy) in rows {
-                    let subfield = Arc::clone(&subfield);
+                claim.check()?;
+                // Also beside whole images: a table that was lost or edited would make them the images of other galaxies. They take a
+                // thousandth of the time of the images.
+                write_tables(simulator, &subfield, &folder, &truth)?;
+                for iy in (0..grid).filter(|_| !epochs.is_empty()) {
+                    let (subfield, epochs) = (Arc::clone(&subfield), Arc::clone(&epochs));
                     if !feeder.push(Row {
                         subfield,
-                        epoch,
+                        epochs,
                         iy,
                     }) {
                         return Ok(());
@@ -93,58 +102,43 @@ pub fn simulate_branch(
             }
             Ok(())
         },
-        || {
-            (
-                RenderScratch::new(),
-                vec![0.0; branch.stamp() * branch.stamp()],
-            )
-        },
+        || (RenderScratch::new(), vec![0.0; size * size]),
         |(scratch, stamp), row: Row| {
-            let size = branch.stamp();
-            let mut pixels = vec![0.0; side * size];
+            let mut pixels = vec![0.0; row.epochs.len() * side * size];
             for ix in 0..grid {
-                simulator.draw(&row.subfield, row.epoch, (ix, row.iy), scratch, stamp);
-                for (line, own) in pixels.chunks_exact_mut(side).zip(stamp.chunks_exact(size)) {
-                    line[ix * size..][..size].copy_from_slice(own);
+                let galaxy = simulator.galaxy_at(&row.subfield, (ix, row.iy));
+                for (strip, epoch) in pixels.chunks_exact_mut(side * size).zip(&*row.epochs) {
+                    simulator.draw(&row.subfield, *epoch, &galaxy, scratch, stamp);
+                    for (line, own) in strip.chunks_exact_mut(side).zip(stamp.chunks_exact(size)) {
+                        line[ix * size..][..size].copy_from_slice(own);
+                    }
                 }
             }
             Ok((row, pixels))
         },
         |(row, pixels)| {
-            let Row {
-                subfield,
-                epoch,
-                iy,
-            } = row;
-            if iy == 0 {
+            if row.iy == 0 {
                 claim.check()?;
-                if epoch == 0 {
-                    write_tables(simulator, &subfield, &folder, &truth)?;
+                for epoch in &*row.epochs {
+                    // Without keys, as in the challenge: participants had to measure the noise.
+                    let path = image(row.subfield.number, *epoch);
+                    open.push(ImageWriter::create(path, side, side, &[])?);
                 }
-                write_stars(simulator, &subfield, epoch, &folder)?;
             }
-            let writer = match &mut open {
-                Some(writer) => writer,
-                // Without keys, as in the challenge: participants had to measure the noise.
-                None => open.insert(ImageWriter::create(
-                    image(subfield.number, epoch),
-                    side,
-                    side,
-                    &[],
-                )?),
-            };
-            writer.write_rows(&pixels)?;
-            progress.advance(grid as u64);
-            if iy + 1 == grid
-                && let Some(image) = open.take()
-            {
-                image.finish()?;
+            for (writer, strip) in open.iter_mut().zip(pixels.chunks_exact(side * size)) {
+                writer.write_rows(strip)?;
+            }
+            progress.advance((row.epochs.len() * grid) as u64);
+            if row.iy + 1 == grid {
+                open.drain(..).try_for_each(ImageWriter::finish)?;
             }
             Ok(())
         },
     )
     .map_err(|error| claim.explain(error))?;
-    claim.check_results((0..subfields).map(|number| image(number, epochs - 1)))?;
+    let epochs = 0..branch.epochs();
+    let all = (0..subfields).flat_map(|k| epochs.clone().map(move |epoch| (k, epoch)));
+    claim.check_results(all.map(|(subfield, epoch)| image(subfield, epoch)))?;
     Ok(made)
 }
 
@@ -189,6 +183,11 @@ fn write_tables(
         let Shear { e1, e2 } = own.psf_ellipticity();
         let stem = named(great3::PSF_SHAPES, number, epoch);
         yaml(truth, stem, &[("psf_g1", &e1), ("psf_g2", &e2)])?;
+        let side = STARS_PER_SIDE * simulator.branch.stamp();
+        let path = folder.join(named(great3::STAR_FIELDS, number, epoch));
+        let mut writer = ImageWriter::create(path, side, side, &[])?;
+        writer.write_rows(&simulator.stars(subfield, epoch, &mut RenderScratch::new()))?;
+        writer.finish()?;
     }
     let (mut places, mut ids) = ([Vec::new(), Vec::new()], Vec::new());
     let mut shears = [const { Vec::new() }; 4];
@@ -224,19 +223,6 @@ fn write_tables(
         table::write(&path, FileFormat::Fits, &table, &Metadata::default())?;
     }
     Ok(())
-}
-
-fn write_stars(
-    simulator: &BranchSimulator,
-    subfield: &Subfield,
-    epoch: usize,
-    folder: &Path,
-) -> Result<(), FileError> {
-    let side = STARS_PER_SIDE * simulator.branch.stamp();
-    let path = folder.join(named(great3::STAR_FIELDS, subfield.number, epoch));
-    let mut writer = ImageWriter::create(path, side, side, &[])?;
-    writer.write_rows(&simulator.stars(subfield, epoch, &mut RenderScratch::new()))?;
-    writer.finish()
 }
 
 /// Reads fits to galaxies: `n r_e q`, and perhaps `flux bulge_r_e bulge_q bulge_flux` and `snr`.
