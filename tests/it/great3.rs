@@ -994,10 +994,19 @@ fn simulated_branches_draw_from_a_table_of_fits() {
         assert!(modulus < 1e-9 || (modulus - 0.25).abs() < 1e-9, "{modulus}");
     }
     for (rows, says) in [
-        ("n r_e q\n1 0.5 0\n", "row 1: the axis ratio is 0"),
+        ("n r_e q\n1 0.5 0\n", "row 1: q is 0"),
         ("n r_e q\n1 0.5 0.6\nnan 0.5 0.6\n", "row 2: n is NaN"),
         ("n r_e q flux\n1 0.5 0.6 0\n", "row 1: flux is 0"),
-        ("n r_e q\n1 -0.5 0.5\n", "half-light radius"),
+        (
+            "n r_e q\n7 0.5 0.6\n",
+            "row 1: n is 7, expected 0.25 to 6.25",
+        ),
+        ("n r_e q\n1 0.5 0.6\n1 -0.5 0.5\n", "row 2: r_e is -0.5"),
+        ("n r_e q snr\n1 0.5 0.6 inf\n", "row 1: snr is inf"),
+        (
+            "n r_e q bulge_flux bulge_r_e bulge_q\n1 0.5 0.6 nan 0.2 0.9\n",
+            "row 1: bulge_flux is NaN",
+        ),
         ("n r_e\n1 0.5\n", "q"),
     ] {
         let path = file(folder.path(), "wrong.txt", rows);

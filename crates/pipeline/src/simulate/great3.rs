@@ -11,7 +11,7 @@ use shearq_dataset::record::claim;
 use shearq_dataset::run::SIMULATION_FILE;
 use shearq_dataset::threads::Progress;
 use shearq_files::fits::{ImageReader, ImageWriter};
-use shearq_files::frames::polars::{Column, DataFrame};
+use shearq_files::frames::polars::Column;
 use shearq_files::frames::{Metadata, frame};
 use shearq_files::table::{self, FileFormat, MAX_ROWS};
 use shearq_files::{FileError, atomic};
@@ -225,92 +225,64 @@ fn write_tables(
     Ok(())
 }
 
-/// Reads fits to galaxies: `n r_e q`, and perhaps `flux bulge_r_e bulge_q bulge_flux` and `snr`.
+/// Reads fits to galaxies: `n r_e q`, and perhaps `flux`, `bulge_r_e bulge_q bulge_flux` and `snr`.
 pub fn read_fits(path: &Path) -> Result<Vec<Fit>, FileError> {
     let read = table::read(path, None, MAX_ROWS)?;
-    let required = |name| table::numbers(&read, name, path).map(|values| values.to_vec());
-    let optional = |name| match has(&read, name) {
-        true => required(name).map(Some),
-        false => Ok(None),
+    let column = |name: &str| Ok(table::numbers(&read, name, path)?.into_owned());
+    let optional = |name: &str| read.column(name).is_ok().then(|| column(name)).transpose();
+    let (n, radius, ratio) = (column("n")?, column("r_e")?, column("q")?);
+    let (flux, snr) = (optional("flux")?, optional("snr")?);
+    let bulge = match optional("bulge_flux")? {
+        Some(flux) => Some([column("bulge_r_e")?, column("bulge_q")?, flux]),
+        None => None,
     };
-    let [n, radius, ratio] = [required("n")?, required("r_e")?, required("q")?];
-    let flux = optional("flux")?;
-    let snr = optional("snr")?;
-    let bulge = match has(&read, "bulge_flux") {
-        true => Some([
-            required("bulge_r_e")?,
-            required("bulge_q")?,
-            required("bulge_flux")?,
-        ]),
-        false => None,
-    };
-    let component = |profile, radius: f64, ratio: f64, flux| FitComponent {
+    let component = |profile, radius: f64, axis_ratio: f64, flux| FitComponent {
         profile,
-        half_light_arcsec: radius * ratio.sqrt(),
+        half_light_arcsec: radius * axis_ratio.sqrt(),
         flux,
-        axis_ratio: ratio,
+        axis_ratio,
     };
-    // A flux of zero has no S/N to scale it by, and a number that is missing has no nearest profile.
-    let mut positive = vec![("n", &n)];
-    positive.extend(flux.as_ref().map(|flux| ("flux", flux)));
-    for (name, values) in positive {
-        let wrong = |value: &f64| !(value.is_finite() && *value > 0.0);
-        if let Some(row) = values.iter().position(wrong) {
-            let (row, found) = (row + 1, values[row]);
-            let message = format!("row {row}: {name} is {found}, expected a positive number");
-            return Err(FileError::new(path, message));
-        }
-    }
-    let fits: Vec<Fit> = (0..n.len())
-        .map(|k| {
-            let main = Sersic::nearest(n[k]);
-            let bulge = bulge
-                .as_ref()
-                .map(|of| of.each_ref().map(|column| column[k]));
-            let bulge = bulge.filter(|[_, _, flux]| *flux > 0.0);
-            Fit {
-                main: component(
-                    main,
-                    radius[k],
-                    ratio[k],
-                    flux.as_ref().map_or(1.0, |flux| flux[k]),
-                ),
-                bulge: bulge.map(|[radius, ratio, flux]| {
-                    component(Sersic::DeVaucouleurs, radius, ratio, flux)
-                }),
-                snr: snr.as_ref().map(|snr| snr[k]),
+    let positive = |value: f64| value > 0.0 && value.is_finite();
+    let fit = |k: usize| {
+        let check = |is_sound: bool, name: &str, found: f64, expected: &str| match is_sound {
+            true => Ok(found),
+            false => {
+                let message = format!("row {}: {name} is {found}, expected {expected}", k + 1);
+                Err(FileError::new(path, message))
             }
-        })
-        .collect();
-    for (k, fit) in fits.iter().enumerate() {
-        let ratios = [Some(fit.main), fit.bulge]
-            .into_iter()
-            .flatten()
-            .map(|own| own.axis_ratio);
-        if let Some(found) = ratios
-            .into_iter()
-            .find(|ratio| !(0.0..=1.0).contains(ratio) || *ratio == 0.0)
+        };
+        let size = |name: &str, found| check(positive(found), name, found, "a positive number");
+        let axes = |name: &str, q| check(q > 0.0 && q <= 1.0, name, q, "above 0 and up to 1");
+        // Half of the smallest step beyond the indices that can be drawn.
+        let index = check((0.25..6.25).contains(&n[k]), "n", n[k], "0.25 to 6.25")?;
+        let (radius, ratio) = (size("r_e", radius[k])?, axes("q", ratio[k])?);
+        let flux = flux.as_ref().map_or(1.0, |flux| flux[k]);
+        let main = component(Sersic::nearest(index), radius, ratio, size("flux", flux)?);
+        let bulge = match bulge
+            .as_ref()
+            .map(|of| of.each_ref().map(|column| column[k]))
         {
-            let message = format!(
-                "row {}: the axis ratio is {found}, expected above 0 and up to 1",
-                k + 1
-            );
-            return Err(FileError::new(path, message));
-        }
-        if let Some(found) = fit.snr.filter(|snr| !(snr.is_finite() && *snr > 0.0)) {
-            let message = format!("row {}: snr is {found}, expected a positive number", k + 1);
-            return Err(FileError::new(path, message));
-        }
-    }
-    if fits.is_empty() {
-        return Err(FileError::new(
+            None | Some([_, _, 0.0]) => None,
+            Some([radius, ratio, flux]) => Some(component(
+                Sersic::DeVaucouleurs,
+                size("bulge_r_e", radius)?,
+                axes("bulge_q", ratio)?,
+                check(
+                    positive(flux),
+                    "bulge_flux",
+                    flux,
+                    "zero or a positive number",
+                )?,
+            )),
+        };
+        let snr = snr.as_ref().map(|snr| size("snr", snr[k])).transpose()?;
+        Ok(Fit { main, bulge, snr })
+    };
+    match read.height() {
+        0 => Err(FileError::new(
             path,
             "there is no galaxy; expected a row for each fit",
-        ));
+        )),
+        count => (0..count).map(fit).collect(),
     }
-    Ok(fits)
-}
-
-fn has(table: &DataFrame, name: &str) -> bool {
-    table.column(name).is_ok()
 }
