@@ -2,7 +2,7 @@
 //! (`| head`) is not an error: the command still writes its files.
 
 #[cfg(doctest)]
-#[doc = include_str!("../docs/library.md")]
+#[doc = include_str!("../docs/architecture.md")]
 struct GuideToTheCrates;
 
 mod arguments;

@@ -22,9 +22,9 @@ def test_a_tutorial_prints_what_its_page_shows(page, script, command, tmp_path, 
     follow(page, command, script)
 
 
-def test_the_tutorial_of_great3_prints_what_its_page_shows(command, tmp_path, monkeypatch):
+def test_the_page_of_great3_shows_what_its_commands_print(command, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    follow("tutorial-great3.md", command)
+    follow("great3.md", command)
 
 
 def follow(page, command, script=None):

@@ -21,7 +21,7 @@ DRAWN = {
     ("FPFS", "centred, not renoised, kernel 4.5 px"): ("FPFS, not renoised", "#1c7a42", "v"),
     ("FPFS", "centred, renoised, kernel 4.5 px"): ("FPFS, renoised", "#1c7a42", "^"),
     ("FPFS", "dithered, own detection, renoised"): ("FPFS, own detection", "#6b6b00", "<"),
-    ("metacal", "dithered, weighted moments"): ("metacal, fixed weight", "#8e3fb0", "s"),
+    ("metacal", "dithered, weighted moments"): ("metacal, matched weight", "#8e3fb0", "s"),
     ("REGAUSS", "dithered, responsivity"): ("REGAUSS", "#a8560a", "D"),
     ("KSB", "dithered, uncalibrated"): ("KSB, not calibrated", "#c02f3f", "X"),
 }
