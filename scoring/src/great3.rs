@@ -9,6 +9,7 @@ use shearq_quantities::units::Radians;
 
 use crate::aperture::SEPARATION_BINS;
 use crate::error::ScoringError;
+use crate::line::Line;
 use crate::resample::{group_sizes, jackknife_error};
 
 /// Subfields of a branch.
@@ -160,48 +161,24 @@ pub struct ConstantField {
     pub psf: Shear,
 }
 
-// [c, m] and their errors, of one component.
-#[derive(Clone, Copy)]
-struct Line {
-    values: [f64; 2],
-    errors: [f64; 2],
-}
-
-// g_sub − g_true = c + m g_true without weights.
-fn line(points: &[(f64, f64)]) -> Result<Line, ScoringError> {
-    let n = points.len() as f64;
-    let mean = |of: &dyn Fn(&(f64, f64)) -> f64| points.iter().map(of).sum::<f64>() / n;
-    let (x, y) = (mean(&|p| p.0), mean(&|p| p.1 - p.0));
-    let variance = mean(&|p| (p.0 - x).powi(2));
-    if variance.is_nan() || variance <= 0.0 {
-        return Err(ScoringError::SameShears);
-    }
-    let m = mean(&|p| (p.0 - x) * (p.1 - p.0 - y)) / variance;
-    let c = y - m * x;
-    // Over N, not N − 2, as in the challenge.
-    let scatter = mean(&|p| (p.1 - p.0 - c - m * p.0).powi(2));
-    let error_m = (scatter / variance / n).sqrt();
-    Ok(Line {
-        values: [c, m],
-        errors: [error_m * (variance + x * x).sqrt(), error_m],
-    })
-}
-
+// g_sub − g_true = c + m g_true without weights, along the PSF and at 45° to it.
 fn biases(fields: &[ConstantField]) -> Result<[Line; 2], ScoringError> {
     let rotated = |of: fn(PlusCross<f64>) -> f64| -> Vec<(f64, f64)> {
         let pair = |field: &ConstantField| {
             let axis = position_angle(field.psf);
-            (
-                of(along(field.truth, axis)),
-                of(along(field.submitted, axis)),
-            )
+            let truth = of(along(field.truth, axis));
+            (truth, of(along(field.submitted, axis)) - truth)
         };
         fields.iter().map(pair).collect()
     };
-    Ok([
-        line(&rotated(|own| own.plus))?,
-        line(&rotated(|own| own.cross))?,
-    ])
+    let lines = [
+        Line::through(&rotated(|own| own.plus)),
+        Line::through(&rotated(|own| own.cross)),
+    ];
+    match lines.iter().all(Line::is_determined) {
+        true => Ok(lines),
+        false => Err(ScoringError::SameShears),
+    }
 }
 
 /// Q_c, c and m of the fields of a branch with constant shear.
@@ -219,7 +196,7 @@ pub fn constant_score(
     }
     // m and c along the PSF show its leakage in c₊ alone; in pixel axes it would average out.
     let whole = biases(fields)?;
-    let quality = |of: &[Line; 2]| observation.q_c(of.map(|line| line.values));
+    let quality = |of: &[Line; 2]| observation.q_c(of.map(|line| [line.intercept, line.slope]));
     let groups = group_sizes(fields.len()).len();
     let mut replicates = Vec::with_capacity(groups);
     for left_out in 0..groups {
@@ -232,24 +209,23 @@ pub fn constant_score(
     let error = |full: f64, of: &dyn Fn(&[Line; 2]) -> f64| {
         jackknife_error(full, replicates.iter().map(of), fields.len())
     };
-    let bias = |component: usize, which: usize| {
-        let Line { values, errors } = whole[component];
-        Bias {
-            value: values[which],
-            error: errors[which],
-            jackknife: error(values[which], &|of| of[component].values[which]),
+    let both = |which: usize, value: fn(&Line) -> f64| {
+        let bias = |component: usize| Bias {
+            value: value(&whole[component]),
+            error: whole[component].errors_of_great3()[which],
+            jackknife: error(value(&whole[component]), &|of| value(&of[component])),
+        };
+        PlusCross {
+            plus: bias(0),
+            cross: bias(1),
         }
-    };
-    let both = |which| PlusCross {
-        plus: bias(0, which),
-        cross: bias(1, which),
     };
     let q = quality(&whole);
     Ok(ConstantScore {
         q,
         jackknife: error(q, &quality),
-        c: both(0),
-        m: both(1),
+        c: both(0, |line| line.intercept),
+        m: both(1, |line| line.slope),
     })
 }
 
@@ -276,8 +252,8 @@ impl Quality {
     }
 }
 
-// Bins of separation that Q_v uses, 0.0853° to 3.5495°: in the others the sums are cut at the field or lack pairs.
-const Q_V_BINS: std::ops::RangeInclusive<usize> = 3..=12;
+/// Bins of separation that Q_v uses, 0.0853° to 3.5495°: in the others the sums are cut at the field or lack pairs.
+pub const Q_V_BINS: std::ops::RangeInclusive<usize> = 3..=12;
 
 /// Q_v = 1.837·10⁻⁴ / [σ² + ⟨|⟨M_E,sub − M_E,true⟩_fields|⟩_bins] of ⟨M_ap²⟩ by field and bin.
 ///

@@ -45,6 +45,7 @@ mod error;
 mod errors;
 pub mod great3;
 mod grid;
+mod line;
 mod metrics;
 pub mod modes;
 pub mod quality;
@@ -61,6 +62,7 @@ pub use diagnosis::{
 };
 pub use error::ScoringError;
 pub use grid::{Grid, cell_at, centre_of};
+pub use line::{Line, common_slope};
 pub use metrics::{Metric, Metrics};
 pub use ndarray;
 pub use quality::{Bias, BiasFits, Quality};

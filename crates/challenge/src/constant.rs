@@ -3,8 +3,8 @@
 use std::collections::BTreeMap;
 
 use shearq_results::record::SetRecord;
-use shearq_scoring::TrueShear;
 use shearq_scoring::great3::{Observation, REQUIRED_C, REQUIRED_M};
+use shearq_scoring::{Line, TrueShear};
 
 // Fewest sets for m and c of a component: two for the line, and one that the line does not pass through by
 // construction. A team that knows its mean ellipticities solves for one shear with three published values.
@@ -56,47 +56,30 @@ impl ConstantShears {
     /// m and c of component `k` (0 or 1): least squares of ⟨e⟩ − g = m·g + c over the sets, unweighted as in GREAT3. Errors
     /// are those of the scatter of galaxies, or of the residuals if these are larger.
     pub fn bias(&self, sets: &[SetRecord], k: usize) -> (Measured, Measured) {
-        let rows: Vec<(f64, f64, f64)> = sets
-            .iter()
-            .filter_map(|set| {
-                let g = self.0.get(&set.set)?[k];
+        let (mut points, mut errors) = (Vec::new(), Vec::new());
+        for set in sets {
+            if let Some(g) = self.0.get(&set.set) {
                 let of = |metrics: &shearq_scoring::Metrics| [metrics.c1, metrics.c2][k];
-                Some((g, of(&set.metrics), of(&set.errors)))
-            })
-            .collect();
-        let count = rows.len() as f64;
-        let mean = rows.iter().map(|row| row.0).sum::<f64>() / count;
-        let square: f64 = rows.iter().map(|row| (row.0 - mean).powi(2)).sum();
-        let of_m = |g: f64| (g - mean) / square;
-        let of_c = |g: f64| 1.0 / count - mean * of_m(g);
-        let value = |weight: &dyn Fn(f64) -> f64| -> f64 {
-            rows.iter().map(|(g, apart, _)| weight(*g) * apart).sum()
-        };
-        let (m, c) = (value(&of_m), value(&of_c));
-        let residuals: f64 = rows
-            .iter()
-            .map(|(g, apart, _)| (apart - m * g - c).powi(2))
-            .sum();
-        let residual = match count > 2.0 {
-            true => residuals / (count - 2.0),
-            false => 0.0,
-        };
-        // Galaxies that are shrunk towards their mean scatter less, but the means of the sets do not.
-        let error = |weight: &dyn Fn(f64) -> f64| -> f64 {
-            let variance = |of: &dyn Fn(f64) -> f64| -> f64 {
-                rows.iter()
-                    .map(|(g, _, error)| weight(*g).powi(2) * of(*error))
-                    .sum()
-            };
-            let (scatter, fit) = (variance(&|error| error.powi(2)), variance(&|_| residual));
-            // An unknown scatter stays unknown.
+                points.push((g[k], of(&set.metrics)));
+                errors.push(of(&set.errors));
+            }
+        }
+        let line = Line::through(&points);
+        let error = |which: usize| {
+            let each = points.iter().zip(&errors);
+            let derivative = |g: f64| line.derivatives(g)[which];
+            let scatter = each.map(|((g, _), error)| (derivative(*g) * error).powi(2));
+            let fit = points.iter().map(|(g, _)| derivative(*g).powi(2));
+            let (scatter, fit) = (scatter.sum::<f64>(), line.variance() * fit.sum::<f64>());
+            // Galaxies that are shrunk towards their mean scatter less, but the means of the sets do not. An unknown scatter stays
+            // unknown.
             if fit > scatter {
                 fit.sqrt()
             } else {
                 scatter.sqrt()
             }
         };
-        ((m, error(&of_m)), (c, error(&of_c)))
+        ((line.slope, error(1)), (line.intercept, error(0)))
     }
 
     pub fn biases(&self, sets: &[SetRecord]) -> [(Measured, Measured); 2] {

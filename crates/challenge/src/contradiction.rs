@@ -2,7 +2,7 @@
 //! when entries arrive.
 
 use shearq_scoring::ndarray::Array2;
-use shearq_scoring::{FieldSum, TrueShear};
+use shearq_scoring::{FieldSum, Line, TrueShear, common_slope};
 
 type Pair = [(f64, f64); 2];
 
@@ -22,23 +22,11 @@ pub(crate) struct First {
     pub truth: TrueShear,
 }
 
-// Sums of one component over the galaxies of an image.
-#[derive(Clone, Copy)]
-struct Sums {
-    cross: f64,
-    square: f64,
-    // Variance of a measured ellipticity around the line.
-    scatter: f64,
-}
-
 type Slope = (f64, f64);
 
-fn slope(parts: &[Sums]) -> Slope {
-    let square: f64 = parts.iter().map(|part| part.square).sum();
-    let cross: f64 = parts.iter().map(|part| part.cross).sum();
-    let variance: f64 = parts.iter().map(|part| part.square * part.scatter).sum();
-    (cross / square, variance.sqrt() / square)
-}
+// The measured on the true shears of a component of a set, and the point of no bias that the line passes through: the means of
+// the set if its shear varies.
+type Group = (Line, Option<(f64, f64)>);
 
 fn is_wrong((slope, error): Slope) -> bool {
     slope + MIN_SLOPE_SIGNIFICANCE * error < *SLOPE_RANGE.start()
@@ -50,40 +38,11 @@ fn is_right((slope, error): Slope) -> bool {
     slope > MIN_SLOPE_SIGNIFICANCE * error && SLOPE_RANGE.contains(&slope)
 }
 
-// Sums of a component. True and measured shear are relative to `zeros`, or to their means.
-fn sums(
-    e: &Array2<f64>,
-    count: &Array2<f64>,
-    g: &Array2<f64>,
-    sign: f64,
-    zeros: Option<(f64, f64)>,
-) -> Sums {
-    let rows: Vec<(f64, f64)> = e
-        .iter()
-        .zip(count)
-        .zip(g)
-        .filter(|((_, count), _)| **count > 0.0)
-        .map(|((e, count), g)| (sign * g, e / count))
-        .collect();
-    let number = rows.len() as f64;
-    let mean_g = rows.iter().map(|row| row.0).sum::<f64>() / number;
-    let mean_e = rows.iter().map(|row| row.1).sum::<f64>() / number;
-    let (zero_g, zero_e) = zeros.unwrap_or((mean_g, mean_e));
-    let over = |of: &dyn Fn(f64, f64) -> f64| rows.iter().map(|(g, e)| of(*g, *e)).sum::<f64>();
-    let (cross, square) = (
-        over(&|g, e| (g - zero_g) * (e - zero_e)),
-        over(&|g, _| (g - zero_g).powi(2)),
-    );
-    let around_mean = over(&|_, e| (e - mean_e).powi(2));
-    let explained = match zeros {
-        Some(_) => 0.0,
-        None => cross * cross / square,
-    };
-    Sums {
-        cross,
-        square,
-        scatter: (around_mean - explained) / (number - 2.0),
-    }
+fn line(e: &Array2<f64>, count: &Array2<f64>, g: &Array2<f64>, sign: f64) -> Line {
+    let each = e.iter().zip(count).zip(g);
+    let there = each.filter(|((_, count), _)| **count > 0.0);
+    let points = there.map(|((e, count), g)| (sign * g, e / count));
+    Line::through(&points.collect::<Vec<_>>())
 }
 
 // A change of the true shear: signs of both components, and whether they are exchanged.
@@ -109,15 +68,15 @@ fn of_set(
     truth: &TrueShear,
     (s1, s2, exchanged): Change,
     zeros: Zeros,
-) -> [Sums; 2] {
+) -> [Group; 2] {
     let FieldSum { e1, e2, count, .. } = &first.measured;
     let (g1, g2) = match exchanged {
         true => (&truth.g2, &truth.g1),
         false => (&truth.g1, &truth.g2),
     };
     [
-        sums(e1, count, g1, s1, zeros.map(|zeros| zeros[0])),
-        sums(e2, count, g2, s2, zeros.map(|zeros| zeros[1])),
+        (line(e1, count, g1, s1), zeros.map(|zeros| zeros[0])),
+        (line(e2, count, g2, s2), zeros.map(|zeros| zeros[1])),
     ]
 }
 
@@ -142,8 +101,8 @@ fn median_bias(firsts: &[First]) -> Zeros {
     }))
 }
 
-// Sums of several sets. Those with one shear each are relative to their common means.
-fn together(firsts: &[&First], change: Change) -> Vec<Sums> {
+// Groups of several sets. The line of those with one shear each passes through their common means.
+fn together(firsts: &[&First], change: Change) -> Vec<Group> {
     let all: Option<Vec<_>> = firsts.iter().map(|first| means(first, change)).collect();
     let zeros = all.map(|all| {
         let mean = |of: &dyn Fn(&Pair) -> f64| all.iter().map(of).sum::<f64>() / all.len() as f64;
@@ -157,11 +116,11 @@ fn together(firsts: &[&First], change: Change) -> Vec<Sums> {
 // The first set, or all sets together, whose true shear the images contradict, and the likely cause.
 pub(crate) fn contradiction(firsts: &[First]) -> Option<String> {
     let zeros = median_bias(firsts);
-    let slopes = |parts: &[Sums]| -> [Slope; 3] {
-        let component = |k: usize| -> Vec<Sums> { parts.chunks(2).map(|set| set[k]).collect() };
-        [parts.to_vec(), component(0), component(1)].map(|parts| slope(&parts))
+    let slopes = |parts: &[Group]| -> [Slope; 3] {
+        let component = |k: usize| -> Vec<Group> { parts.chunks(2).map(|set| set[k]).collect() };
+        [parts.to_vec(), component(0), component(1)].map(|parts| common_slope(&parts))
     };
-    let wrong = |parts: &[Sums]| slopes(parts).into_iter().find(|slope| is_wrong(*slope));
+    let wrong = |parts: &[Group]| slopes(parts).into_iter().find(|slope| is_wrong(*slope));
     let each: Vec<Option<Slope>> = firsts
         .iter()
         .map(|first| wrong(&of_set(first, &first.truth, SAME, zeros)))
@@ -188,8 +147,8 @@ pub(crate) fn contradiction(firsts: &[First]) -> Option<String> {
         _ => "all sets".into(),
     };
     let after = |change: Change| match wrong_sets {
-        [one] => slope(&of_set(one, &one.truth, change, zeros)),
-        _ => slope(&together(&all, change)),
+        [one] => common_slope(&of_set(one, &one.truth, change, zeros)),
+        _ => common_slope(&together(&all, change)),
     };
     let clearness = |(slope, error): Slope| slope / error;
     let change = CHANGES
@@ -198,7 +157,7 @@ pub(crate) fn contradiction(firsts: &[First]) -> Option<String> {
     let exchanged = wrong_sets.iter().flat_map(|first| {
         let others = firsts.iter().filter(|other| other.set != first.set);
         others.map(|other| {
-            let found = slope(&of_set(first, &other.truth, SAME, zeros));
+            let found = common_slope(&of_set(first, &other.truth, SAME, zeros));
             let cause = format!("the true shear of set {} fits set {}", other.set, first.set);
             (found, cause)
         })

@@ -20,7 +20,7 @@ use shearq_results::submit::{
     Contents, Entry as Team, Manifest, Packed, Sent, Submission, read_bandpowers,
 };
 use shearq_scoring::{
-    Choice, Convention, Fault, Grid, Options, SCORED, ScoringError, SetScorer, TrueShear,
+    Choice, Convention, Fault, Grid, Line, Options, SCORED, ScoringError, SetScorer, TrueShear,
 };
 use shearq_submissions::check_name;
 
@@ -643,24 +643,12 @@ fn slope_over_sets(sets: &[Powers]) -> (f64, f64) {
     let count = sets.len() as f64;
     let mean = |b: usize| sets.iter().map(|(truth, _)| truth[b]).sum::<f64>() / count;
     let means: Vec<f64> = (0..bins).map(mean).collect();
-    let rows = || {
-        sets.iter().flat_map(|(truth, sent)| {
-            let each = truth.iter().zip(sent).zip(&means);
-            each.map(|((truth, sent), mean)| (truth / mean - 1.0, sent / mean))
-        })
-    };
-    let (mut square, mut cross, mut all, mut squares) = (0.0, 0.0, 0.0, 0.0);
-    for (x, y) in rows() {
-        square += x * x;
-        cross += x * y;
-        all += y;
-        squares += y * y;
-    }
-    let number = count * bins as f64;
-    let slope = cross / square;
-    // The regression has an intercept, which does not change the slope because x has the mean zero.
-    let residual = squares - all * all / number - slope * cross;
-    (slope, (residual.max(0.0) / (number - 2.0) / square).sqrt())
+    let rows = sets.iter().flat_map(|(truth, sent)| {
+        let each = truth.iter().zip(sent).zip(&means);
+        each.map(|((truth, sent), mean)| (truth / mean - 1.0, sent / mean))
+    });
+    let line = Line::through(&rows.collect::<Vec<_>>());
+    (line.slope, line.slope_error())
 }
 
 pub(crate) fn unscored(source: ScoringError) -> ChallengeError {
