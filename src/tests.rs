@@ -157,7 +157,7 @@ const WAYS: [(&str, &[&str]); 32] = [
         &[
             "OUT data foreign where sort group-by plot format wide metrics report definition convention threads",
             "store where sort group-by plot format wide metrics report",
-            "OUT challenge branch truth psf leaderboard format threads",
+            "OUT challenge branch truth psf subfields leaderboard format threads",
         ],
     ),
     (
@@ -193,7 +193,7 @@ const WAYS: [(&str, &[&str]); 32] = [
         "check",
         &[
             "PATH data grid stamp images json",
-            "PATH challenge branch json",
+            "PATH challenge branch subfields json",
         ],
     ),
     (

@@ -47,6 +47,9 @@ pub(crate) struct Arguments {
     /// Branch of the challenge, such as control-ground-constant.
     #[arg(long, value_name = "NAME", requires = "challenge", conflicts_with_all = ["data", "grid", "stamp", "images"])]
     branch: Option<String>,
+    /// Subfields of a branch of GREAT3 that was simulated [default: 200].
+    #[arg(long, value_name = "N", requires = "branch", conflicts_with_all = ["data", "grid", "stamp", "images"], value_parser = clap::value_parser!(u16).range(1..=1000))]
+    subfields: Option<u16>,
     /// Print the findings as JSON.
     #[arg(long)]
     json: bool,
@@ -56,7 +59,8 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let path = &arguments.path;
     if let Some(challenge) = &arguments.challenge {
         let branch = published::branch_of(challenge, arguments.branch.as_deref())?;
-        return report(&published::check(&*branch, path), path, arguments.json);
+        let findings = published::check(&*branch, path, arguments.subfields.map(usize::from));
+        return report(&findings, path, arguments.json);
     }
     let data = arguments.data.as_ref().map(DataFolder::open).transpose()?;
     let sets = data

@@ -56,6 +56,9 @@ pub(crate) struct Arguments {
     /// Ellipticities of the PSF of the challenge, as for `score`.
     #[arg(long, value_name = "PATH", requires = "truth", conflicts_with_all = GREAT10_ONLY)]
     psf: Option<PathBuf>,
+    /// Subfields of a branch of GREAT3 that was simulated [default: 200].
+    #[arg(long, value_name = "N", requires = "truth", conflicts_with_all = GREAT10_ONLY, value_parser = clap::value_parser!(u16).range(1..=1000))]
+    subfields: Option<u16>,
     /// Rank submissions among the published entries of a branch.
     #[arg(long, requires = "challenge", conflicts_with_all = GREAT10_ONLY)]
     leaderboard: bool,
@@ -112,8 +115,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         let truth = truth.map(|path| Truth {
             path,
             psf,
-            // A part of a branch does not compare with the published entries.
-            subfields: None,
+            subfields: arguments.subfields.map(usize::from),
         });
         let threads = arguments.threads.number();
         let table = published::leaderboard(&*branch, truth, &arguments.measured, threads)?;

@@ -6,6 +6,7 @@ use shearq_dataset::threads::Pool;
 use shearq_render::table::Table;
 use shearq_results::published::{Branch, Challenge, Packing, Score, Truth, ranking};
 use shearq_results::submit::check::Finding;
+use shearq_scoring::great3::SUBFIELDS;
 
 use super::pack::ARCHIVES;
 use crate::tell;
@@ -65,7 +66,13 @@ pub(super) fn leaderboard(
         }
         own.push((name, score));
     }
-    Ok(ranking(branch, &own))
+    let mut table = ranking(branch, &own);
+    if let Some(subfields) = truth.and_then(|truth| truth.subfields) {
+        table.notes.push(format!(
+            "Your submissions have {subfields} subfields, the published ones {SUBFIELDS}: Q of fewer is noisier, and usually lower."
+        ));
+    }
+    Ok(table)
 }
 
 pub(super) fn pack(branch: &dyn Branch, packing: &Packing<'_>, out: &Path) -> anyhow::Result<()> {
@@ -93,7 +100,11 @@ pub(super) fn pack(branch: &dyn Branch, packing: &Packing<'_>, out: &Path) -> an
     Ok(())
 }
 
-pub(super) fn check(branch: &dyn Branch, submission: &Path) -> Vec<Finding> {
-    let fault = branch.check(submission).err();
+pub(super) fn check(
+    branch: &dyn Branch,
+    submission: &Path,
+    subfields: Option<usize>,
+) -> Vec<Finding> {
+    let fault = branch.check(submission, subfields).err();
     fault.into_iter().map(Finding::unreadable).collect()
 }

@@ -139,6 +139,16 @@ fn released_folders_score_like_tables() {
         let by_table =
             format!("{score} --truth {CASES}/{case}/truth.txt.gz --psf {CASES}/{case}/psf.txt.gz");
         assert_eq!(json(&by_folder), json(&by_table));
+        // One of twenty subfields of a field.
+        file(&below, "shear_params-005.txt", "# g1 g2\n0.5 0.5\n");
+        let _ = fs::remove_file(below.join("shear_params-005.yaml"));
+        if case == "p3_full_ground" {
+            let message = fail(&words(&by_folder));
+            assert!(
+                message.contains("subfields 0 and 5 of field 0 have different shears"),
+                "{message}"
+            );
+        }
     }
 }
 
@@ -173,7 +183,9 @@ fn pack_averages_fields_and_its_result_is_sound() {
     galaxies[1].1.e1 = 9.95;
     galaxies[6].1 = Shear::new(10.0, f64::NAN);
     let half = galaxies.len() / 2;
-    let first = file(folder.path(), "a.txt", &lines(&galaxies[half..]).join("\n"));
+    // Numbers in a comment are no names.
+    let rows = lines(&galaxies[half..]).join("\n");
+    let first = file(folder.path(), "a.txt", &format!("# 0 0 0 1\n{rows}"));
     // In another order of columns, with a column that is not used.
     let csv = galaxies[..half]
         .iter()
@@ -279,17 +291,15 @@ fn released_galaxies_make_the_truth_of_variable_shear() {
     let sheared: Vec<_> = sheared
         .map(|(k, own)| (own.0, intrinsic(k).sheared_by(own.1), 1.0))
         .collect();
-    for subfield in 0..20 {
+    let write = |subfield: usize, kept: usize, amplitude: f64| {
         let column = |name: &str, of: &dyn Fn(usize) -> f64| {
-            let values = (9 * subfield..9 * subfield + 9)
-                .map(of)
-                .collect::<Vec<f64>>();
-            Column::new(name.into(), values)
+            let all = 9 * subfield..9 * subfield + kept;
+            Column::new(name.into(), all.map(of).collect::<Vec<f64>>())
         };
         let columns = vec![
             column("ID", &|k| galaxies[k].0 as f64),
-            column("g1", &|k| galaxies[k].1.e1),
-            column("g2", &|k| galaxies[k].1.e2),
+            column("g1", &|k| amplitude * galaxies[k].1.e1),
+            column("g2", &|k| amplitude * galaxies[k].1.e2),
             column("g1_intrinsic", &|k| intrinsic(k).e1),
             column("g2_intrinsic", &|k| intrinsic(k).e2),
         ];
@@ -298,6 +308,9 @@ fn released_galaxies_make_the_truth_of_variable_shear() {
             .join(format!("galaxy_catalog-{subfield:03}.fits"));
         let table = frame(columns).unwrap();
         table::write(&path, FileFormat::Fits, &table, &Metadata::new()).unwrap();
+    };
+    for subfield in 0..20 {
+        write(subfield, 9, 1.0);
         let offset = |k: usize| (k % 7) as f64 / 70.0;
         let (x, y) = (offset(subfield), offset(subfield / 3));
         let content = format!("{{offset_deg_x: {x}, offset_deg_y: {y}}}");
@@ -316,6 +329,24 @@ fn released_galaxies_make_the_truth_of_variable_shear() {
     let score = format!("score {branch} --subfields 20 --truth {root} {root}/out.txt");
     let q = json(&score)["Q_v"].as_f64().unwrap();
     assert!((q - 1.837e-4 / 4e-8).abs() < 1e-3, "{q}");
+    for (kept, amplitude, says) in [
+        (0, 1.0, "found 0 galaxies, expected those of a square grid"),
+        (8, 1.0, "found 8 galaxies"),
+        (4, 1.0, "is outside of the grid of 2 × 2 galaxies"),
+        (
+            9,
+            0.0,
+            "all galaxies have the true shear 0 0, expected one that varies",
+        ),
+    ] {
+        write(7, kept, amplitude);
+        let message = fail(&words(&score));
+        assert!(
+            message.contains("galaxy_catalog-007") && message.contains(says),
+            "{message}"
+        );
+    }
+    write(7, 9, 1.0);
     // A file of offsets of other data is noticed.
     let other = "{offset_deg_x: 0.0, offset_deg_y: 0.0}";
     file(folder.path(), "subfield_offset-004.yaml", other);
@@ -441,9 +472,17 @@ fn entries_that_measure_no_shear_have_no_rank() {
     });
     let warned = said(&format!("score {challenge} {truth} {path}"));
     assert!(
-        warned.contains("2 of 200 fields do not follow the true shear as the others do: 3, 70"),
+        warned.contains("2 of 200 fields do not follow the truth as the others do: 3, 70"),
         "{warned}"
     );
+    // A truth that shows nothing gives no rank.
+    let same: String = (0..200).map(|k| format!("{k} 0.02 -0.01\n")).collect();
+    let same = file(folder.path(), "same.txt", &same);
+    let path = entry(&|_, g| g);
+    let line = format!("{challenge} --truth {same} --psf {case}/psf.txt.gz {path}");
+    let says = "whether it follows the true shear cannot be determined (found 200 fields";
+    assert!(said(&format!("score {line}")).contains(says));
+    assert!(fail(&words(&format!("compare --leaderboard {line}"))).contains(says));
     // Without the truth, numbers that differ by less than any requirement are placeholders.
     let path = entry(&|k, _| [1e-300 * noise(k), 1e-300 * noise(k + 7)]);
     let output = shearq(&words(&format!("check {path} {challenge}")));
@@ -475,6 +514,19 @@ fn masses_that_are_not_of_the_true_shear_are_doubted() {
     let noise = |k: usize| 1e-5 * (1.7 * (k * k) as f64).sin();
     assert_eq!(said(&format!("{score} {case}/submission.txt.gz")), "");
     assert_eq!(doubt(&|k, e| [0.64 * e, 0.1 * noise(k)]), "");
+    // Fields in another order, and two that are exchanged.
+    let e = |k: usize| [truth[k % 150][2], 0.0];
+    let warned = doubt(&|k, _| e(k + 15));
+    assert!(
+        warned.contains("whether the fields are in the order of the truth cannot be determined"),
+        "{warned}"
+    );
+    let warned = doubt(&|k, _| match k / 15 {
+        3 => e(k + 60),
+        7 => e(k + 90),
+        _ => e(k),
+    });
+    assert!(warned.contains("3, 7. Were fields exchanged?"), "{warned}");
     // A flipped component leaves ξ₊ and averages ξ₋ to zero.
     let warned = doubt(&|k, e| [0.5 * e + 0.01 * noise(k), 0.5 * e]);
     assert!(
@@ -892,6 +944,17 @@ fn simulated_branches_are_scored_by_their_released_truth() {
         let found = json(&line);
         let q = found["Q_c"].as_f64().or(found["Q_v"].as_f64()).unwrap();
         assert!((q / ceiling - 1.0).abs() < 1e-6, "{branch}: {q}");
+        let check =
+            format!("check --challenge great3 --branch {branch} --subfields {subfields} {packed}");
+        succeed(&words(&check));
+        let ranked = line.replacen("score", "compare --leaderboard", 1);
+        let ranked = succeed(&words(&ranked));
+        assert!(
+            ranked.contains(&format!(
+                "have {subfields} subfields, the published ones 200"
+            )),
+            "{ranked}"
+        );
 
         // What participants got: 3 x 3 stars, and stamps whose lower central pixels the catalogue names.
         let data = root.join(&below);

@@ -12,14 +12,14 @@ use std::path::{Path, PathBuf};
 
 use serde_json::{Map, Value};
 use shearq_dataset::threads::Pool;
-use shearq_files::frames::reals;
-use shearq_files::table::{self, MAX_ROWS, Place};
+use shearq_files::table::{self, MAX_ROWS, Named, Place};
 use shearq_files::{FileError, atomic, names_of};
 use shearq_quantities::Shear;
-use shearq_quantities::statistics::{RunningMean, median};
+use shearq_quantities::statistics::{RunningMean, scatter};
 use shearq_render::figure::{FigureError, LinePlot, PanelGrid};
 use shearq_render::html::{Block, Picture, Section};
 use shearq_render::table::{Cell, Table};
+use shearq_scoring::Line;
 
 /// A challenge by the name that users type.
 #[derive(Debug)]
@@ -97,7 +97,7 @@ pub trait Branch {
     /// Scores a submission.
     fn score(&self, truth: Truth<'_>, submission: &Path, pool: &Pool) -> Result<Score, FileError>;
     /// Refuses a submission that the challenge would not score as it is meant.
-    fn check(&self, submission: &Path) -> Result<(), FileError>;
+    fn check(&self, submission: &Path, subfields: Option<usize>) -> Result<(), FileError>;
     /// Makes a submission of catalogues of galaxies. `None` if the challenge has no pre-submission.
     fn pack(&self, packing: &Packing<'_>, pool: &Pool) -> Option<Result<Packed, FileError>>;
     /// Published entries.
@@ -301,17 +301,9 @@ struct Slope {
 impl Slope {
     // `None` if the values do not determine it.
     fn of(pairs: &[(f64, f64)]) -> Option<Self> {
-        let number = pairs.len() as f64;
-        let mean = |of: fn(&(f64, f64)) -> f64| pairs.iter().map(of).sum::<f64>() / number;
-        let (x, y) = (mean(|pair| pair.0), mean(|pair| pair.1));
-        let over = |of: &dyn Fn(f64, f64) -> f64| -> f64 {
-            pairs.iter().map(|pair| of(pair.0 - x, pair.1 - y)).sum()
-        };
-        let square = over(&|x, _| x * x);
-        let value = over(&|x, y| x * y) / square;
-        let scatter = over(&|x, y| (y - value * x).powi(2)) / (number - 2.0);
-        let error = (scatter / square).sqrt();
-        (pairs.len() > 2 && square > 0.0).then_some(Slope { value, error })
+        let line = Line::through(pairs);
+        let (value, error) = (line.slope, line.slope_error());
+        (pairs.len() > 2 && line.is_determined()).then_some(Slope { value, error })
     }
 
     fn differs_from(self, other: f64) -> bool {
@@ -341,11 +333,18 @@ fn disagreement(pairs: &[(Shear, Shear)]) -> Option<String> {
             .map(|(g, own)| (component(*g, on), component(*own, of)));
         Slope::of(&values.collect::<Vec<_>>())
     };
-    let own = [slope(0, 0)?, slope(1, 1)?];
+    let (Some(g1), Some(g2), Some(g1_on_g2), Some(g2_on_g1)) =
+        (slope(0, 0), slope(1, 1), slope(0, 1), slope(1, 0))
+    else {
+        return Some(format!(
+            "whether it follows the true shear cannot be determined (found {} fields, expected at least 3 whose true g1 and g2 differ)",
+            pairs.len()
+        ));
+    };
+    let (own, cross) = ([g1, g2], [g1_on_g2, g2_on_g1]);
     let wrong = own
         .iter()
         .position(|slope| !slope.is_clear(MIN_SHEAR_SLOPE))?;
-    let cross = [slope(0, 1)?, slope(1, 0)?];
     let stronger =
         |k: usize| cross[k].differs_from(0.0) && cross[k].value.abs() > own[k].value.abs();
     let (found, name) = (own[wrong], ["g1", "g2"][wrong]);
@@ -366,29 +365,25 @@ fn disagreement(pairs: &[(Shear, Shear)]) -> Option<String> {
 const MAX_FIELD_RESIDUAL: f64 = 8.0;
 const MIN_ODD_RESIDUAL: f64 = 0.5;
 
-// A warning about fields that follow the true shear differently from the others.
-fn odd_fields(pairs: &[(Shear, Shear)]) -> Option<String> {
-    let mut odd = BTreeSet::new();
-    for of in [(|g| g.e1) as fn(Shear) -> f64, |g| g.e2] {
-        let residual = |(g, own): &(Shear, Shear)| of(*own) - of(*g);
-        let centre = median(&mut pairs.iter().map(residual).collect::<Vec<_>>())?;
-        let off = |pair| (residual(pair) - centre).abs();
-        // 1.4826 median absolute deviations are a standard deviation.
-        let scatter = 1.4826 * median(&mut pairs.iter().map(off).collect::<Vec<_>>())?;
-        let true_scatter = {
-            let mut moments = RunningMean::default();
-            pairs.iter().for_each(|(g, _)| moments.add(of(*g)));
-            moments.deviation()
-        };
-        let most = (MAX_FIELD_RESIDUAL * scatter).max(MIN_ODD_RESIDUAL * true_scatter);
-        odd.extend((0..pairs.len()).filter(|k| off(&pairs[*k]) > most));
+// A warning about fields that follow the truth differently from the others. Each of `quantities` has the true and the submitted
+// value of each field.
+fn odd_fields(quantities: &[Vec<(f64, f64)>]) -> Option<String> {
+    let (mut odd, mut count) = (BTreeSet::new(), 0);
+    for pairs in quantities {
+        count = pairs.len();
+        let residuals = pairs.iter().map(|(truth, own)| own - truth);
+        let residuals: Vec<f64> = residuals.collect();
+        let (centre, deviation) = scatter(&mut residuals.clone())?;
+        let mut true_values = RunningMean::default();
+        pairs.iter().for_each(|(truth, _)| true_values.add(*truth));
+        let most = (MAX_FIELD_RESIDUAL * deviation).max(MIN_ODD_RESIDUAL * true_values.deviation());
+        odd.extend((0..count).filter(|k| (residuals[*k] - centre).abs() > most));
     }
     let names: Vec<String> = odd.iter().map(usize::to_string).collect();
-    (!names.is_empty() && 4 * names.len() < pairs.len()).then(|| {
+    (!names.is_empty() && 4 * names.len() < count).then(|| {
         format!(
-            "{} of {} fields do not follow the true shear as the others do: {}. Were fields exchanged?",
+            "{} of {count} fields do not follow the truth as the others do: {}. Were fields exchanged?",
             names.len(),
-            pairs.len(),
             names_of(&names)
         )
     })
@@ -405,90 +400,93 @@ struct Columns<'a> {
 
 impl Columns<'_> {
     fn read(&self, path: &Path) -> Result<Vec<Vec<f64>>, FileError> {
+        Ok(self.read_all(path)?.0)
+    }
+
+    // The wanted columns, and the names of the others.
+    fn read_all(&self, path: &Path) -> Result<(Vec<Vec<f64>>, Vec<String>), FileError> {
         let mut place = Place::of(path);
         let found = table::columns(&place)?;
-        let pick = |names: &[String]| -> Option<Vec<Option<String>>> {
+        let is_named = |name: &String, aliases: &[&str]| {
             // Programs write ID, id and Id.
-            let is = |name: &String, aliases: &[&str]| {
-                aliases.iter().any(|own| name.eq_ignore_ascii_case(own))
-            };
+            aliases.iter().any(|own| name.eq_ignore_ascii_case(own))
+        };
+        // The place of each wanted column among `names`; `None` if one is missing.
+        let pick = |names: &[String]| -> Option<Vec<Option<usize>>> {
             let picked = self.names.iter().zip(0..).map(|(aliases, k)| {
-                match names.iter().find(|name| is(name, aliases)) {
+                match names.iter().position(|name| is_named(name, aliases)) {
                     None if k < self.required => None,
-                    name => Some(name.cloned()),
+                    place => Some(place),
                 }
             });
             picked.collect()
         };
-        let (certain, doubtful): (Vec<_>, Vec<_>) =
-            found.named.into_iter().partition(|named| !named.doubtful);
-        let chosen = if certain.is_empty() {
-            // Words of a comment name columns only if they are as many, which the comments of the challenge's own files are not.
-            let number = |names: &[String], name: &String| {
-                let place = names.iter().position(|own| own == name)?;
-                Some((place + 1).to_string())
-            };
-            let by_comment = doubtful.iter().find_map(|named| {
-                let picked = pick(&named.names)?.into_iter();
-                let numbers = picked.map(|name| number(&named.names, &name?));
-                Some(numbers.collect::<Vec<_>>())
-            });
-            let by_number = || {
-                let count = found.unnamed.len();
-                let (_, places) = self.unnamed.iter().find(|(n, _)| *n == count)?;
-                let places = (0..self.names.len()).map(|k| places.get(k));
-                Some(places.map(|place| Some((place? + 1).to_string())).collect())
-            };
-            by_comment.or_else(by_number).ok_or_else(|| {
-                let count = found.unnamed.len();
-                let message = format!("found {count} columns, expected {}", self.described());
-                FileError::new(path, message)
-            })?
-        } else {
-            // A FITS file may have several tables: the first with all columns is meant.
-            let picked = certain.iter().find_map(|named| {
+        // A FITS file may have several tables: the first with all columns is meant. Of a text, words of a comment name columns only
+        // if they are as many, which the comments of the challenge's own files are not.
+        let picked = found.named.iter().find_map(|named| {
+            let places = pick(&named.names)?;
+            Some((named, places))
+        });
+        let is_number = |word: &String| word.parse::<f64>().is_ok();
+        let header = |named: &&Named| !named.names.iter().all(is_number);
+        let (names, chosen) = match (picked, found.named.iter().find(header)) {
+            (Some((named, places)), _) => {
                 place.table = named.table.as_ref().map(|(number, _)| number.to_string());
-                pick(&named.names)
-            });
-            picked.ok_or_else(|| {
-                let names = &certain[0].names;
+                let name = |place: usize| match named.doubtful {
+                    true => (place + 1).to_string(),
+                    false => named.names[place].clone(),
+                };
+                let chosen = places.into_iter().map(|place| place.map(name));
+                (&*named.names, chosen.collect::<Vec<_>>())
+            }
+            // By its places, `# ID e2 e1 weight` would exchange the components.
+            (
+                None,
+                Some(Named {
+                    names, doubtful, ..
+                }),
+            ) => {
+                let (of, advice) = match doubtful {
+                    true => (
+                        "comment",
+                        ". Try: these names, or no comment of as many words as columns",
+                    ),
+                    false => ("columns", ""),
+                };
                 let message = format!(
-                    "found the columns {}, expected {}",
+                    "found the {of} {}, expected {}{advice}",
                     names.join(", "),
                     self.described()
                 );
-                FileError {
-                    no_column: true,
+                return Err(FileError {
+                    no_column: !doubtful,
                     ..FileError::new(path, message)
-                }
-            })?
+                });
+            }
+            (None, None) => {
+                let count = found.unnamed.len();
+                let places = self.unnamed.iter().find(|(n, _)| *n == count);
+                let Some((_, places)) = places else {
+                    let message = format!("found {count} columns, expected {}", self.described());
+                    return wrong(path, message);
+                };
+                let number = |k: usize| places.get(k).map(|place| (place + 1).to_string());
+                (&[][..], (0..self.names.len()).map(number).collect())
+            }
         };
         let wanted: Vec<&str> = chosen.iter().flatten().map(String::as_str).collect();
         let read = table::read_from(&place, Some(&wanted), MAX_ROWS)?;
         let column = |name: &Option<String>| match name {
             None => Ok(Vec::new()),
-            Some(name) => {
-                let values = read.column(name).ok().and_then(reals);
-                let message = || format!("column `{name}` does not hold numbers");
-                let values = values.ok_or_else(|| FileError::new(path, message()))?;
-                Ok(values.into_owned())
-            }
+            Some(name) => Ok(table::numbers(&read, name, path)?.into_owned()),
         };
-        chosen.iter().map(column).collect()
-    }
-
-    // Columns of a table with names that are none of the wanted ones.
-    fn unused(&self, path: &Path) -> Result<Vec<String>, FileError> {
-        let found = table::columns(&Place::of(path))?;
-        let is_wanted = |name: &String| {
-            let mut wanted = self.names.iter().copied().flatten();
-            wanted.any(|own| name.eq_ignore_ascii_case(own))
-        };
-        let certain = found.named.into_iter().filter(|named| !named.doubtful);
-        // Of a FITS file, the table that is read.
-        let mut tables = certain.filter(|named| named.names.iter().any(is_wanted));
-        let names = tables.next().map_or(Vec::new(), |named| named.names);
-        Ok(names.into_iter().filter(|name| !is_wanted(name)).collect())
+        let columns = chosen
+            .iter()
+            .map(column)
+            .collect::<Result<_, FileError>>()?;
+        let is_wanted = |name: &&String| self.names.iter().any(|own| is_named(name, own));
+        let others = names.iter().filter(|name| !is_wanted(name)).cloned();
+        Ok((columns, others.collect()))
     }
 
     fn described(&self) -> String {

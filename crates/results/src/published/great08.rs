@@ -73,6 +73,16 @@ fn read_entry(path: &Path) -> Result<BTreeMap<usize, Shear>, FileError> {
     Ok(shears)
 }
 
+fn refuse(option: &str, given: bool) -> Result<(), FileError> {
+    match given {
+        true => wrong(
+            Path::new(option),
+            "GREAT08 has no use for it. Try: without this option",
+        ),
+        false => Ok(()),
+    }
+}
+
 impl Branch for Great08 {
     fn title(&self) -> String {
         "GREAT08".into()
@@ -86,17 +96,8 @@ impl Branch for Great08 {
             required: 4,
             unnamed: &[(4, &[0, 1, 2, 3])],
         };
-        for (option, given) in [
-            ("--psf", truth.psf.is_some()),
-            ("--subfields", truth.subfields.is_some()),
-        ] {
-            if given {
-                return wrong(
-                    Path::new(option),
-                    "GREAT08 has no use for it. Try: without this option",
-                );
-            }
-        }
+        refuse("--psf", truth.psf.is_some())?;
+        refuse("--subfields", truth.subfields.is_some())?;
         let submitted = read_entry(submission)?;
         let images: Vec<(usize, String, Shear)> = match with_sets.read(truth.path) {
             Ok(own) => (0..own[0].len())
@@ -163,7 +164,8 @@ impl Branch for Great08 {
         })
     }
 
-    fn check(&self, submission: &Path) -> Result<(), FileError> {
+    fn check(&self, submission: &Path, subfields: Option<usize>) -> Result<(), FileError> {
+        refuse("--subfields", subfields.is_some())?;
         read_entry(submission).map(|_| ())
     }
 

@@ -16,11 +16,11 @@ use shearq_quantities::statistics::{RunningMean, median};
 use shearq_render::figure::{LinePlot, Series, Style};
 use shearq_scoring::aperture::{ApertureMass, Lattice, LatticeShear, SEPARATION_BINS, separations};
 use shearq_scoring::great3::{
-    Bias, ConstantField, EPOCHS, Identity, NODES_PER_GALAXY, Observation, PlusCross, REQUIRED_C,
-    REQUIRED_M, SUBFIELDS, SUBFIELDS_PER_FIELD, along, constant_score, position_angle,
+    Bias, ConstantField, EPOCHS, Identity, NODES_PER_GALAXY, Observation, PlusCross, Q_V_BINS,
+    REQUIRED_C, REQUIRED_M, SUBFIELDS, SUBFIELDS_PER_FIELD, along, constant_score, position_angle,
     variable_score,
 };
-use shearq_scoring::{Repeated, repeated};
+use shearq_scoring::{Line, Repeated, repeated};
 
 use crate::mean::mean_shears;
 use crate::response::{Shared, shears};
@@ -244,14 +244,19 @@ fn more(count: usize) -> String {
 }
 
 const SHEARS: Columns<'static> = Columns {
-    names: &[&["index", "field"], &["g1"], &["g2"]],
+    // Also as the challenge's program calls them.
+    names: &[
+        &["index", "field", "subfield_index", "field_index"],
+        &["g1"],
+        &["g2"],
+    ],
     required: 3,
     unnamed: &[(3, &[0, 1, 2])],
 };
 
 const MASSES: Columns<'static> = Columns {
     names: &[
-        &["field", "index"],
+        &["field", "index", "field_index"],
         &["theta", "theta[deg]"],
         &["map_E"],
         &["map_B"],
@@ -332,8 +337,22 @@ impl Great3 {
             }
         };
         refuse_more(&folder, released::SHEARS, fields * per)?;
-        // All subfields of a field have one shear.
-        (0..fields).map(|field| shear(field * per)).collect()
+        let of_field = |field: usize| {
+            let first = field * per;
+            let g = shear(first)?;
+            for subfield in first + 1..first + per {
+                let other = shear(subfield)?;
+                if (other.e1 - g.e1).hypot(other.e2 - g.e2) > EQUAL_SHEARS {
+                    let message = format!(
+                        "subfields {first} and {subfield} of field {field} have different shears (found {} {} and {} {}, expected one)",
+                        g.e1, g.e2, other.e1, other.e2
+                    );
+                    return wrong(&folder, message);
+                }
+            }
+            Ok(g)
+        };
+        (0..fields).map(of_field).collect()
     }
 
     // Mean ellipticities of the PSF of each of `fields`.
@@ -664,7 +683,9 @@ fn disagreement_of_masses(submitted: &[Masses], truth: &[Masses]) -> Option<Stri
         .zip(truth)
         .flat_map(|(own, truth)| truth.e.into_iter().zip(own.e))
         .collect();
-    let found = Slope::of(&e)?;
+    let Some(found) = Slope::of(&e) else {
+        return Some("whether map_E follows the true one cannot be determined, because that is the same at all separations".into());
+    };
     // Of a square of shears.
     if !found.is_clear(MIN_SHEAR_SLOPE * MIN_SHEAR_SLOPE) {
         return Some(format!(
@@ -690,6 +711,32 @@ fn disagreement_of_masses(submitted: &[Masses], truth: &[Masses]) -> Option<Stri
     (averaged < 0.25 * as_given).then(|| {
         "map_E and map_B are both the mean of the true E and B: the sign of g1 or g2, or their order, is probably wrong".into()
     })
+}
+
+// Standard errors by which the correlation with the true differences between fields must exceed chance.
+const MIN_ORDER_SIGNIFICANCE: f64 = 3.0;
+
+// A warning about fields that are not clearly in the order of the truth. Q_v does not depend on it, but its jackknife does, and
+// exchanged fields are a fault of a catalogue, such as galaxies with the identities of another subfield.
+fn doubt_of_order(submitted: &[Masses], truth: &[Masses]) -> Option<String> {
+    // The sum over separations, which noise affects least.
+    let sum = |masses: &Masses| masses.e[Q_V_BINS].iter().sum::<f64>();
+    let each = submitted.iter().zip(truth);
+    let pairs: Vec<_> = each.map(|(own, truth)| (sum(truth), sum(own))).collect();
+    let (count, correlation) = (pairs.len() as f64, Line::through(&pairs).correlation());
+    // Fisher's transform of a correlation has the variance 1/(N − 3).
+    let significance = correlation.atanh() * (count - 3.0).max(0.0).sqrt();
+    if pairs.len() < 2 || significance >= MIN_ORDER_SIGNIFICANCE {
+        return odd_fields(&[pairs]);
+    }
+    Some(format!(
+        "whether the fields are in the order of the truth cannot be determined (found a correlation of {correlation:.2} of map_E of {count} fields, which is {:.1}σ above zero, expected {MIN_ORDER_SIGNIFICANCE}σ): they may be exchanged, or their noise is large",
+        if significance.is_nan() {
+            0.0
+        } else {
+            significance
+        }
+    ))
 }
 
 // ⟨M_ap²⟩ of a field by separation.
@@ -787,6 +834,22 @@ fn add_truth(
         None => None,
         Some(found) => Some([found.number("offset_deg_x")?, found.number("offset_deg_y")?]),
     };
+    let side = columns[0].len().isqrt();
+    if side == 0 || side * side != columns[0].len() {
+        let message = format!(
+            "found {} galaxies, expected those of a square grid: the table is incomplete",
+            columns[0].len()
+        );
+        return wrong(path, message);
+    }
+    let is_constant = |column: &[f64]| side > 1 && column.iter().all(|g| *g == column[0]);
+    if is_constant(&columns[1]) && is_constant(&columns[2]) {
+        let message = format!(
+            "all galaxies have the true shear {} {}, expected one that varies. Try: --branch with constant shear",
+            columns[1][0], columns[2][0]
+        );
+        return wrong(path, message);
+    }
     let mut seen = BTreeSet::new();
     for (k, &found) in columns[0].iter().enumerate() {
         let id = Identity::of_number(found).filter(|id| id.subfield() == subfield);
@@ -800,6 +863,13 @@ fn add_truth(
             );
         }
         let (x, y) = id.place();
+        // Without repetition, all places of the grid have their galaxy.
+        if x.max(y) >= side * NODES_PER_GALAXY {
+            let message = format!(
+                "galaxy {id} is outside of the grid of {side} × {side} galaxies: others are missing"
+            );
+            return wrong(path, message);
+        }
         if let Some(degrees) = offset {
             let nodes = degrees.map(|offset| {
                 (offset * Lattice::GREAT3.side as f64 / Lattice::GREAT3.field.0).round() as usize
@@ -866,7 +936,10 @@ impl Branch for Great3 {
                 .zip(submitted.iter().copied())
                 .collect();
             refusal = disagreement(&pairs);
-            warnings.extend(odd_fields(&pairs));
+            let component =
+                |of: fn(Shear) -> f64| pairs.iter().map(move |(g, own)| (of(*g), of(*own)));
+            let components = [component(|g| g.e1), component(|g| g.e2)];
+            warnings.extend(odd_fields(&components.map(Iterator::collect)));
             let fields = shears.iter().zip(&submitted).zip(&psfs);
             let fields: Vec<ConstantField> = fields
                 .map(|((&truth, &submitted), &psf)| ConstantField {
@@ -918,6 +991,7 @@ impl Branch for Great3 {
             let masses = self.true_masses(truth.path, fields, pool)?;
             let submitted = self.submitted_masses(submission, fields)?;
             refusal = disagreement_of_masses(&submitted, &masses);
+            warnings.extend(doubt_of_order(&submitted, &masses));
             let e = |masses: &[Masses]| masses.iter().map(|own| own.e).collect::<Vec<_>>();
             let true_e = e(&masses);
             let score = |submitted: &[_]| variable_score(submitted, &true_e, self.observation);
@@ -943,8 +1017,8 @@ impl Branch for Great3 {
         })
     }
 
-    fn check(&self, submission: &Path) -> Result<(), FileError> {
-        let fields = self.fields(None)?;
+    fn check(&self, submission: &Path, subfields: Option<usize>) -> Result<(), FileError> {
+        let fields = self.fields(subfields)?;
         match self.constant {
             true => self.submitted_shears(submission, fields).map(|_| ()),
             false => self.submitted_masses(submission, fields).map(|_| ()),
@@ -1020,9 +1094,8 @@ impl<'a> Galaxies<'a> {
                 for path in files {
                     // `measure` writes ellipticities that are not divided by their response.
                     let hint = "catalogues of measure are packed by --measured DIR";
-                    let columns = GALAXIES.read(path);
-                    let columns = columns.map_err(|error| error.hint_of_columns(hint))?;
-                    let unused = GALAXIES.unused(path)?;
+                    let read = GALAXIES.read_all(path);
+                    let (columns, unused) = read.map_err(|error| error.hint_of_columns(hint))?;
                     // Galaxies that another program excludes by a weight of zero would count fully.
                     if let Some(name) = unused.iter().find(|name| is_like_a_weight(name))
                         && columns[3].is_empty()
