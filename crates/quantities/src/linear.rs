@@ -87,40 +87,6 @@ pub fn substitute<R: AsRef<[f64]>>(rows: &[R], out: &mut [f64]) {
     }
 }
 
-// Convergence is quadratic at the end, and half as many sweeps reach the width of f64 for a dozen rows.
-const SWEEPS: usize = 12;
-
-/// Diagonalises a symmetric matrix by Jacobi's rotations. The eigenvalues replace its diagonal, in no order. Row k of the result is
-/// the eigenvector of eigenvalue k, of length one.
-pub fn eigenvectors<const N: usize>(matrix: &mut [[f64; N]; N]) -> [[f64; N]; N] {
-    let mut vectors = std::array::from_fn(|i| std::array::from_fn(|j| f64::from(i == j)));
-    for _ in 0..SWEEPS {
-        for p in 0..N {
-            for q in p + 1..N {
-                let beside = matrix[p][q];
-                if beside == 0.0 {
-                    continue;
-                }
-                // The smaller root of t² + 2θt − 1 = 0 is the tangent of the rotation.
-                let theta = (matrix[q][q] - matrix[p][p]) / (2.0 * beside);
-                let tan = 1.0f64.copysign(theta) / (theta.abs() + theta.hypot(1.0));
-                let cos = 1.0 / tan.hypot(1.0);
-                let sin = tan * cos;
-                for row in matrix.iter_mut() {
-                    (row[p], row[q]) = (cos * row[p] - sin * row[q], sin * row[p] + cos * row[q]);
-                }
-                for rows in [&mut *matrix, &mut vectors] {
-                    let (above, below) = rows.split_at_mut(q);
-                    for (a, b) in above[p].iter_mut().zip(&mut below[0]) {
-                        (*a, *b) = (cos * *a - sin * *b, sin * *a + cos * *b);
-                    }
-                }
-            }
-        }
-    }
-    vectors
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -204,25 +170,5 @@ mod tests {
         let (mut matrix, mut right) = (MATRIX, [0.0, 0.0, 1.0]);
         cholesky(&mut matrix, &mut right, 3, Some).unwrap();
         close(&[rows[2][2] * right[2]], &[1.0]);
-    }
-
-    #[test]
-    fn eigenvectors_diagonalise_a_symmetric_matrix() {
-        // Two eigenvalues are equal, and one row is alone.
-        let equal = [[2.0, 1.0, 0.0], [1.0, 2.0, 0.0], [0.0, 0.0, 3.0]];
-        for given in [MATRIX, equal] {
-            let mut matrix = given;
-            let vectors = eigenvectors(&mut matrix);
-            for (k, vector) in vectors.iter().enumerate() {
-                for (row, at) in given.iter().zip(0..) {
-                    let product: f64 = row.iter().zip(vector).map(|(a, b)| a * b).sum();
-                    close(&[product], &[matrix[k][k] * vector[at as usize]]);
-                }
-                for (other, at) in vectors.iter().zip(0..) {
-                    let product: f64 = other.iter().zip(vector).map(|(a, b)| a * b).sum();
-                    close(&[product], &[f64::from(at == k)]);
-                }
-            }
-        }
     }
 }
