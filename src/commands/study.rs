@@ -11,7 +11,8 @@ use shearq_studies::study::{bias_sets, study_table};
 /// Compare configurations with each other and with the Cramér–Rao bound.
 ///
 /// For each set and configuration, the command measures the scatter of calibrated ellipticities and its ratio to the
-/// bound. It also measures multiplicative and additive bias, PSF leakage, Q, and the time per galaxy.
+/// bound. It also measures multiplicative and additive bias, PSF leakage, and the time per galaxy. For Q, use `run` and
+/// `compare`.
 ///
 /// The data are simulated in memory. Finished sets are kept, so the same command resumes a stopped study. Use a seed
 /// with which no setting was tuned.
@@ -27,7 +28,7 @@ pub(crate) struct Arguments {
         default_value = "2,5,8,11,14,16,18,20,22,24"
     )]
     sets: SetList,
-    /// Images per set for Q and scatter, at least 2; the challenge has 200.
+    /// Images per set for the scatter, at least 2.
     #[arg(long, value_name = "N", default_value_t = 4, value_parser = clap::value_parser!(u32).range(2..=i64::from(MAX_IMAGE)))]
     images: u32,
     /// Images per set for the biases; each galaxy is drawn eight times.
@@ -61,7 +62,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let results = run_sets(&study, sets, threads, &mut bar)?;
     drop(bar);
     let mut bar = Bar::new("measuring biases", image * u64::from(pairs));
-    // With fewer images than Q: paired versions of the same galaxies cancel shape noise and pixel noise.
+    // With fewer images than the scatter: paired versions of the same galaxies cancel shape noise and pixel noise.
     let biases = bias_sets(&study, sets, pairs, threads, &mut bar)?;
     drop(bar);
     arguments

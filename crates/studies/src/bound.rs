@@ -1,14 +1,7 @@
-//! The Cramér–Rao bound on the scatter of ellipticities, and the expected Q at this scatter.
+//! The Cramér–Rao bound on the scatter of ellipticities.
 
-use rand::SeedableRng;
-use rand_chacha::ChaCha8Rng;
-use rand_distr::{Distribution, Normal};
 use shearq_quantities::Shear;
 use shearq_quantities::statistics::RunningMean;
-use shearq_scoring::modes::Decomposer;
-use shearq_scoring::quality::quality;
-use shearq_scoring::{Bins, Complex64, Convention, Definition, ScoringError};
-
 use shearq_simulate::kinds::ImageType;
 use shearq_simulate::render::RenderScratch;
 use shearq_simulate::set::{NOISE_SIGMA, STAMP, SetSimulator, Version};
@@ -19,8 +12,6 @@ const STEP: f64 = 0.02;
 const GALAXIES: usize = 1000;
 // A prime, so that no cell is sampled twice; galaxies come from the whole field, because PSFs vary.
 const STRIDE: usize = 7919;
-// Q scatters by a third between noise fields, so the mean of 200 has an error of 2 %.
-const TRIALS: u32 = 200;
 
 /// Smallest possible scatter per component of unbiased ellipticities, and its standard error from the sample of
 /// galaxies. It is the root mean square over galaxies on full stamps with their noise.
@@ -64,36 +55,6 @@ pub fn cramer_rao(set: &SetSimulator) -> Option<(f64, f64)> {
     Some((bound, 0.5 * error / bound))
 }
 
-/// The mean Q of a perfect method, whose only error is white noise of `scatter` per component in each of `images` images, and
-/// which subtracts the mean power of this noise from its spectra.
-pub fn expected_q(set: &SetSimulator, scatter: f64, images: u32) -> Result<f64, ScoringError> {
-    let grid = set.grid();
-    let (decomposer, bins) = (
-        Decomposer::new(grid),
-        Bins::new(&grid, Definition::Leaderboard),
-    );
-    let truth = set.truth();
-    let shear = Convention::STANDARD.apply(&truth.g1, &truth.g2)?;
-    let modes = decomposer.decompose(shear.clone())?.e;
-    let power = bins.power(&modes, &modes)?;
-    let variance = scatter * scatter / f64::from(images);
-    let mean = bins.white_noise(variance);
-    let mut rng = ChaCha8Rng::seed_from_u64(u64::from(set.kind().set));
-    let normal = Normal::new(0.0, variance.sqrt()).expect("a finite scatter");
-    let mut sum = 0.0;
-    for _ in 0..TRIALS {
-        let noisy =
-            shear.mapv(|g| g + Complex64::new(normal.sample(&mut rng), normal.sample(&mut rng)));
-        let modes = decomposer.decompose(noisy)?.e;
-        let mut found = bins.power(&modes, &modes)?;
-        for (found, mean) in found.iter_mut().zip(mean) {
-            *found -= mean;
-        }
-        sum += quality(&bins, &found, &power).q;
-    }
-    Ok(sum / f64::from(TRIALS))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -110,19 +71,5 @@ mod tests {
             // One S/N and one profile: only the spread of ellipticities remains.
             assert!(error / found < 0.005, "set {set}: {found} ± {error}");
         }
-    }
-
-    #[test]
-    fn the_expected_q_agrees_with_the_challenge() {
-        // 200 images with scatter at the bound: 850, 2,200 and 4,900 are published for one shear field. Q
-        // depends on the power of this field in the widest bins, which have few modes.
-        let mut limits = Vec::new();
-        for (scatter, expected) in [(0.214, 850.0), (0.107, 2200.0), (0.054, 4900.0)] {
-            let simulator = simulator(2, SimulationSettings::new(3, 100)).unwrap();
-            let found = expected_q(&simulator, scatter, 200).unwrap();
-            assert!((found / expected - 1.0).abs() < 0.15, "{found} {expected}");
-            limits.push(found);
-        }
-        assert!(limits[0] < limits[1] && limits[1] < limits[2]);
     }
 }

@@ -4,11 +4,7 @@ use std::path::{Path, PathBuf};
 
 use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
-use shearq_scoring::quality::{quality, quality_error};
-use shearq_scoring::{
-    BINS, Convention, FieldSum, Grid, Noise, Options, Row, RowCounts, SetImages, SetScore,
-    SetScorer, cross_spectrum,
-};
+use shearq_scoring::{BINS, FieldSum, Grid, Noise, Options, Row, RowCounts, SetImages, SetScorer};
 use shearq_submissions::{Configuration, checked_name};
 
 use super::response::{Regression, Response};
@@ -95,10 +91,6 @@ pub struct ConfigurationResult {
     /// Standard errors of the bandpowers for a fixed truth; NaN outside the scored bins.
     #[serde(deserialize_with = "nan_for_null")]
     pub ee_error: [f64; BINS],
-    /// Q of the cross-spectrum of the images' groups, `None` for a single image.
-    pub q_spectrum: Option<f64>,
-    /// `None` with fewer than eight images.
-    pub q_spectrum_error: Option<f64>,
     pub response: Response,
 }
 
@@ -211,7 +203,6 @@ fn measure_set(
             sums.regression.divide(response);
         }
         let score = scorer.score(&sums.images).map_err(scoring)?;
-        let (q_spectrum, q_spectrum_error) = spectrum_quality(&score, &sums.images).unzip();
         (result.l, result.true_ee) = (score.bins.l, score.true_ee);
         // The settings of the plan identify simulated data, so there is no fingerprint.
         let simulated = SetKind::of(set).is_some();
@@ -221,23 +212,10 @@ fn measure_set(
             convention_matched: score.matching.best().number(),
             ee: score.spectra().ee,
             ee_error: score.ee_error,
-            q_spectrum,
-            q_spectrum_error: q_spectrum_error.flatten(),
             response: sums.regression.response(),
         });
     }
     Ok(result)
-}
-
-// Q of the cross-spectrum of `images`, with its error if it is known.
-fn spectrum_quality(score: &SetScore, images: &SetImages) -> Option<(f64, Option<f64>)> {
-    let cross = cross_spectrum(&score.grid, images, Convention::STANDARD).ok()?;
-    let truth = &score.true_ee;
-    let error = cross
-        .covariance
-        .map(|covariance| quality_error(&cross.bins, &cross.power, truth, &covariance))
-        .filter(|error| error.is_finite());
-    Some((quality(&cross.bins, &cross.power, truth).q, error))
 }
 
 // The configurations without repetition, and the index among them of each given one.
