@@ -7,14 +7,7 @@ use std::path::{Path, PathBuf};
 use syn::{Attribute, Item, ItemUse, UseTree, Visibility};
 
 /// Folders with code.
-pub const CODE: [&str; 6] = [
-    "src",
-    "crates",
-    "scoring",
-    "submissions",
-    "python",
-    "benches",
-];
+pub const CODE: [&str; 5] = ["src", "crates", "scoring", "submissions", "python"];
 
 /// Names from the root of a crate to a module; empty for the root.
 pub type ModulePath = Vec<String>;

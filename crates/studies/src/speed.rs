@@ -1,4 +1,4 @@
-//! Speed on the user's machine: measuring, simulating and threads. `cargo bench` times the kernels.
+//! Speed on the user's machine: measuring, simulating and threads.
 
 use std::hint::black_box;
 use std::time::{Duration, Instant};
