@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use serde::{Deserialize, Serialize};
+use strum_macros::IntoStaticStr;
 
 use crate::stars::{Behind, StarNoise, shared};
 use crate::units::UnitSums;
@@ -112,7 +113,8 @@ impl Catalogue {
 
 /// How catalogues belong together: which test shears they have, and which of them contain the same galaxies. It determines
 /// the units of the errors; the estimator is the same for all designs.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, IntoStaticStr)]
+#[strum(serialize_all = "lowercase")]
 pub enum Design {
     /// Without true shear: only mean ellipticities and leakage follow.
     Null,
@@ -134,15 +136,7 @@ pub enum Design {
 impl Design {
     /// Name in options and output.
     pub fn name(self) -> &'static str {
-        match self {
-            Design::Null => "null",
-            Design::Single => "single",
-            Design::Pairs => "pairs",
-            Design::Arms => "arms",
-            Design::Fields => "fields",
-            Design::Galaxies => "galaxies",
-            Design::Rotated => "rotated",
-        }
+        self.into()
     }
 
     /// The design in words.

@@ -4,6 +4,7 @@
 use std::fmt;
 
 use shearq_submissions::limits::MIN_PSF;
+use strum_macros::IntoStaticStr;
 use thiserror::Error;
 
 use crate::measurement::{Flag, Measurement};
@@ -11,7 +12,8 @@ use crate::measurement::{Flag, Measurement};
 /// Something in the data of an image that biases shears, or is likely a mistake.
 ///
 /// The text of [`Display`](fmt::Display) is one line without the name of the image.
-#[derive(Debug, Clone, PartialEq, Error)]
+#[derive(Debug, Clone, PartialEq, Error, IntoStaticStr)]
+#[strum(serialize_all = "kebab-case")]
 #[non_exhaustive]
 pub enum Warning {
     /// The corners of the stamps are brighter or darker than zero.
@@ -399,39 +401,9 @@ impl Warning {
         (2 * count > of).then_some(Warning::Flagged { flag, count, of })
     }
 
-    /// A name for each kind of warning, for counting.
+    /// A name for each kind of warning, for counting: that of the variant, such as `psf-noise`.
     pub fn kind(&self) -> &'static str {
-        match self {
-            Warning::Sky { .. } => "sky",
-            Warning::Gradient { .. } => "gradient",
-            Warning::OffCentre { .. } => "off-centre",
-            Warning::Wandering { .. } => "wandering",
-            Warning::Negative { .. } => "negative",
-            Warning::Depths { .. } => "depths",
-            Warning::LongCorrelation { .. } => "long-correlation",
-            Warning::Idle { .. } => "idle",
-            Warning::NoResponse { .. } => "no-response",
-            Warning::Copies { .. } => "copies",
-            Warning::Blank { .. } => "blank",
-            Warning::Brightness { .. } => "brightness",
-            Warning::NoiseLevel { .. } => "noise-level",
-            Warning::GivenNoise { .. } => "given-noise",
-            Warning::CorrelatedNoise { .. } => "correlated-noise",
-            Warning::EpochNoise { .. } => "epoch-noise",
-            Warning::NoNoise => "no-noise",
-            Warning::PsfOffCentre { .. } => "psf-off-centre",
-            Warning::PsfBackground { .. } => "psf-background",
-            Warning::PsfGradient { .. } => "psf-gradient",
-            Warning::PsfNoise { .. } => "psf-noise",
-            Warning::PsfNarrow { .. } => "psf-narrow",
-            Warning::PsfBroad { .. } => "psf-broad",
-            Warning::PixelScale { .. } => "pixel-scale",
-            Warning::OtherImage { .. } => "other-image",
-            Warning::PixelFrame(_) => "pixel-frame",
-            Warning::PsfFrame { .. } => "psf-frame",
-            Warning::PsfSize { .. } => "psf-size",
-            Warning::Flagged { .. } => "flagged",
-        }
+        self.into()
     }
 
     /// Whether no result should be made from such data.

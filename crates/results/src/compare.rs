@@ -16,6 +16,7 @@ use shearq_render::table::Cell;
 use shearq_scoring::resample::{PairedDifference, PairedSet, paired_difference};
 use shearq_scoring::{Choice, Metrics, Options};
 use shearq_submissions::{Published, Registry};
+use strum_macros::IntoStaticStr;
 use thiserror::Error;
 
 use crate::catalogues::Catalogues;
@@ -274,7 +275,8 @@ fn values(table: &DataFrame, operand: &Operand) -> Result<Vec<f64>, ChoiceError>
 }
 
 /// By which column the sets of a run are grouped.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, IntoStaticStr)]
+#[strum(serialize_all = "snake_case")]
 pub enum Grouping {
     Set,
     /// The kinds of the paper's Table 2.
@@ -285,18 +287,8 @@ pub enum Grouping {
 }
 
 impl Grouping {
-    pub fn name(self) -> &'static str {
-        match self {
-            Grouping::Set => "set",
-            Grouping::SetKind => "set_kind",
-            Grouping::Psf => "psf",
-            Grouping::Snr => "snr",
-            Grouping::Size => "size",
-        }
-    }
-
     pub fn column(self) -> Option<Column> {
-        columns_named(&[self.name()]).pop()
+        columns_named(&[self.into()]).pop()
     }
 }
 
