@@ -32,6 +32,7 @@ mod printed;
 mod reference;
 mod reproduced;
 mod scoring_cases;
+mod source;
 mod support;
 mod terminal;
 mod truth_sign;

@@ -1,10 +1,10 @@
-//! A crate of the workspace uses only crates of lower levels.
+//! The source code itself: a crate of the workspace uses only crates of lower levels, and `unsafe` stands where it is known.
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
-/// The crates from the lowest level up, with their folders. A crate uses crates of lower levels only.
+// The crates from the lowest level up, with their folders. A crate uses crates of lower levels only.
 const LEVELS: [&[(&str, &str)]; 8] = [
     &[
         ("shearq-fourier", "crates/fourier"),
@@ -34,7 +34,10 @@ const LEVELS: [&[(&str, &str)]; 8] = [
     &[("shearq-python", "python")],
 ];
 
-/// Crates that use no files, data frames or threads.
+// Folders with code.
+const CODE: [&str; 5] = ["src", "crates", "scoring", "submissions", "python"];
+
+// Crates that use no files, data frames or threads.
 const PURE: [&str; 7] = [
     "shearq-bias",
     "shearq-fourier",
@@ -45,18 +48,12 @@ const PURE: [&str; 7] = [
     "shearq-simulate",
 ];
 
-/// The crates below the command line, with their folders.
-pub fn libraries() -> impl Iterator<Item = (&'static str, &'static str)> {
-    let all = LEVELS.iter().flat_map(|crates| crates.iter().copied());
-    all.take_while(|(name, _)| *name != "shearq")
-}
-
 fn manifest(folder: &str) -> toml::Table {
     let path = Path::new(folder).join("Cargo.toml");
     fs::read_to_string(path).unwrap().parse().unwrap()
 }
 
-/// The dependencies of a crate, without its dev-dependencies.
+// Without dev-dependencies.
 fn dependencies(manifest: &toml::Table) -> Vec<String> {
     let found = manifest["dependencies"].as_table().unwrap();
     found.keys().cloned().collect()
@@ -64,7 +61,6 @@ fn dependencies(manifest: &toml::Table) -> Vec<String> {
 
 #[test]
 fn crates_use_those_below_them() {
-    crate::tree::enter_root();
     let levels: BTreeMap<&str, usize> = LEVELS
         .iter()
         .enumerate()
@@ -98,7 +94,6 @@ fn crates_use_those_below_them() {
 
 #[test]
 fn pure_crates_use_neither_files_nor_threads() {
-    crate::tree::enter_root();
     for (name, folder) in LEVELS.iter().flat_map(|crates| crates.iter()) {
         if !PURE.contains(name) {
             continue;
@@ -112,7 +107,6 @@ fn pure_crates_use_neither_files_nor_threads() {
 
 #[test]
 fn the_architecture_page_lists_every_crate_with_its_level() {
-    crate::tree::enter_root();
     let page = fs::read_to_string("docs/architecture.md").unwrap();
     for (level, crates) in LEVELS.iter().enumerate() {
         for (_, folder) in *crates {
@@ -125,14 +119,57 @@ fn the_architecture_page_lists_every_crate_with_its_level() {
 
 #[test]
 fn files_that_the_architecture_page_names_exist() {
-    crate::tree::enter_root();
     let page = fs::read_to_string("docs/architecture.md").unwrap();
-    let folders = [&crate::tree::CODE[..], &["tests"]].concat();
-    let files = crate::tree::files(&folders);
+    let files = files(&[&CODE[..], &["tests"]].concat());
     let quoted = page.split('`').skip(1).step_by(2);
     let named: Vec<&str> = quoted.filter(|name| name.ends_with(".rs")).collect();
     for name in &named {
         assert!(files.iter().any(|file| file.ends_with(name)), "{name}");
     }
     assert!(named.len() > 30, "{} files", named.len());
+}
+
+fn files(folders: &[&str]) -> Vec<PathBuf> {
+    let mut found = Vec::new();
+    let mut folders: Vec<PathBuf> = folders.iter().map(PathBuf::from).collect();
+    while let Some(folder) = folders.pop() {
+        for entry in fs::read_dir(&folder).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                folders.push(path);
+            } else if path.extension().is_some_and(|ending| ending == "rs") {
+                found.push(path);
+            }
+        }
+    }
+    found.sort();
+    found
+}
+
+// Files, or folders of files, with `unsafe`: calls of cfitsio, and one of the C library. Crates that use the macro of
+// `multiversion` cannot forbid it, because the macro expands to checked calls of functions with target features. So their
+// text is searched.
+const KNOWN: [&str; 2] = ["crates/files/src/fits/", "src/lib.rs"];
+
+#[test]
+fn unsafe_code_is_where_it_is_known() {
+    let mut found = [false; KNOWN.len()];
+    for path in files(&CODE) {
+        let name = path.display().to_string();
+        let text = fs::read_to_string(&path).unwrap();
+        let code = text.lines().map(|line| line.split("//").next().unwrap());
+        let is_unsafe = code.clone().any(|line| {
+            let mut words = line.split(|c: char| !(c.is_alphanumeric() || c == '_'));
+            line.contains("unsafe ")
+                && words.any(|word| word == "unsafe")
+                && !line.contains("'unsafe-")
+        });
+        if !is_unsafe {
+            continue;
+        }
+        let place = KNOWN.iter().position(|known| name.starts_with(known));
+        let place = place.unwrap_or_else(|| panic!("{name} has unsafe code"));
+        found[place] = true;
+    }
+    assert_eq!(found, [true; KNOWN.len()], "{KNOWN:?}");
 }
