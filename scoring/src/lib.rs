@@ -69,7 +69,7 @@ pub use quality::{Bias, BiasFits, Quality};
 pub use resample::MAX_GROUPS;
 pub use score::{
     Choice, ConventionScore, MeanShear, Noise, Options, SetScore, SetScorer, SpectrumCovariance,
-    SpectrumScore, Unknown, measured_bandpowers,
+    SpectrumScore, measured_bandpowers,
 };
 pub use shearq_fourier::Complex64;
 

@@ -99,22 +99,6 @@ pub struct MeanShear {
     pub truth: [f64; 2],
 }
 
-/// Why a metric is not a number.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-#[non_exhaustive]
-pub enum Unknown {
-    /// The true shear, or the component that the metric needs, is the same everywhere.
-    ConstantTruth,
-    /// The noise is unknown: it was not given, and one image cannot determine it.
-    Noise,
-    /// The measured noise power is negative, by chance.
-    NegativeNoise,
-    /// The response is less than 3σ above zero.
-    Response,
-    /// The images have no ellipticities.
-    NoEllipticities,
-}
-
 /// The score of one set.
 #[derive(Debug, Clone)]
 #[non_exhaustive]
@@ -144,7 +128,8 @@ pub struct SetScore {
     pub matching: ConventionMatch,
     /// The convention of the metrics.
     pub chosen: Convention,
-    /// Metrics in the chosen convention. [`SetScore::why_unknown`] explains NaN.
+    /// Metrics in the chosen convention. NaN: Q_dn and the noise of a galaxy if the noise is unknown, calibrated Q and that noise
+    /// if the response is less than 3σ above zero, most metrics if the true shear is constant.
     pub metrics: Metrics,
     /// Standard errors of the metrics; not a number if unknown.
     pub errors: Metrics,
@@ -158,24 +143,6 @@ impl SetScore {
     /// The chosen convention's spectra.
     pub fn spectra(&self) -> &ConventionScore {
         &self.conventions[self.chosen.index()]
-    }
-
-    /// The reason if the metric called `name` is not a number.
-    pub fn why_unknown(&self, name: &str) -> Option<Unknown> {
-        let metric = Metrics::named(name)?;
-        if !(metric.value)(&self.metrics).is_nan() {
-            return None;
-        }
-        // c1 and c2 are means, so they need nothing but ellipticities.
-        Some(match name {
-            _ if self.metrics.c1.is_nan() => Unknown::NoEllipticities,
-            _ if self.constant.is_some() => Unknown::ConstantTruth,
-            "q_dn" => Unknown::Noise,
-            "galaxy_noise" if self.noise.is_none() => Unknown::Noise,
-            "galaxy_noise" if !self.metrics.q_calibrated.is_nan() => Unknown::NegativeNoise,
-            "q_calibrated" | "galaxy_noise" => Unknown::Response,
-            _ => Unknown::ConstantTruth,
-        })
     }
 
     /// Whether the convention with the highest Q is of another class than the chosen one. Its Q is then due to
