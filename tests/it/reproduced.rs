@@ -9,14 +9,13 @@ use shearq_dataset::threads::Quiet;
 use shearq_pipeline::run::measurers;
 use shearq_pipeline::simulate::simulator;
 use shearq_results::catalogues::OWN;
-use shearq_results::compare::{Paired, difference};
 use shearq_scoring::{Metrics, Options, SetImages, SetScorer};
 use shearq_simulate::kinds::shares;
 use shearq_simulate::set::SimulationSettings;
 use shearq_studies::bias::biases;
 use shearq_studies::calibration::{Curves, LOG_LAMBDA, LambdaSums, PAPER_LAMBDA, calibrate};
-use shearq_studies::reproduce::{Plan, SetResult, Study, run_sets};
-use shearq_submissions::{Configuration, PsfForm, Registry};
+use shearq_studies::reproduce::{Plan, Study, run_sets};
+use shearq_submissions::{Configuration, Registry};
 
 use crate::support::shearq;
 
@@ -29,47 +28,6 @@ fn configurations(names: &[&str]) -> Vec<Configuration> {
         .iter()
         .map(|name| registry.get(name).unwrap().configuration)
         .collect()
-}
-
-/// Mean gain in Q from one configuration to another on the same images, relative to the first, and its error.
-fn q_gain(results: &[SetResult], first: usize, second: usize) -> (f64, f64) {
-    let sets: Vec<u32> = results.iter().map(|set| set.set).collect();
-    let (mut mean, mut gain, mut variance) = (0.0, 0.0, 0.0);
-    for (set, share) in results.iter().zip(shares(&sets)) {
-        let [a, b] = [first, second].map(|k| std::slice::from_ref(&set.results[k].score));
-        let paired = difference(Paired::Q, a, b).unwrap();
-        mean += share * a[0].metrics.q;
-        gain += share * paired.difference;
-        variance += (share * paired.error).powi(2);
-    }
-    (gain / mean, variance.sqrt() / mean)
-}
-
-/// Asserts the paper's statements on pairs of configurations: denoising improves Q, and both forms of PSF give the same.
-fn assert_denoising_improves_q(results: &[SetResult], names: &[String]) {
-    for psf in ["star", "func"] {
-        let [raw, den] = ["raw", "den"].map(|data| place(names, &format!("23/{data}/{psf}")));
-        let (gain, error) = q_gain(results, raw, den);
-        assert!(gain > 2.0 * error, "{psf}: {gain} ± {error}");
-    }
-    let [functional, star] = ["23/den/func", "23/den/star"].map(|name| place(names, name));
-    assert!(q_gain(results, functional, star).0.abs() < 0.05);
-}
-
-/// Asserts that Q of 23/den/star is lower in a set than in the fiducial set 2, by two standard errors.
-fn assert_poor_q(results: &[SetResult], names: &[String], poor: u32) {
-    let q = |wanted: u32| {
-        let set = results.iter().find(|set| set.set == wanted).unwrap();
-        let score = &set.results[place(names, "23/den/star")].score;
-        (score.metrics.q, score.errors.q)
-    };
-    let (fiducial, poor) = (q(2), q(poor));
-    let error = fiducial.1.hypot(poor.1);
-    assert!(fiducial.0 - poor.0 > 2.0 * error, "{fiducial:?} {poor:?}");
-}
-
-fn place(names: &[String], name: &str) -> usize {
-    names.iter().position(|n| n == name).unwrap()
 }
 
 /// How a submission's ellipticities follow shear on one kind of set.
@@ -175,69 +133,6 @@ fn table_one_comes_out_at_full_size() {
     assert_eq!(fulfils(found[0], found[1]), [true; 5]);
     // What is printed misses every one of these.
     assert_eq!(fulfils(found[2], found[3]), [false; 5]);
-}
-
-/// `configurations` on `sets`, eight images of 256 galaxies each, so that differences of Q have errors.
-fn on_sets(configurations: Vec<Configuration>, sets: &[u32]) -> (Vec<SetResult>, Vec<String>) {
-    let names = configurations.iter().map(|s| s.name.clone()).collect();
-    let plan = Plan {
-        version: "test".into(),
-        simulation: SimulationSettings::new(5, 16),
-        images: 8,
-        configurations,
-    };
-    let folder = tempfile::tempdir().unwrap();
-    let study = Study::open(&plan, folder.path()).unwrap();
-    let results = run_sets(&study, sets, 2, &mut Quiet).unwrap();
-    (results, names)
-}
-
-#[test]
-fn submissions_compare_as_the_paper_found() {
-    let published = Registry::embedded().unwrap().published().unwrap();
-    let configurations = published.into_iter().map(|(s, _)| s).collect();
-    // Fiducial, low S/N and high S/N: 2,048 galaxies each.
-    let (results, names) = on_sets(configurations, &[2, 5, 8]);
-    assert_denoising_improves_q(&results, &names);
-    assert_poor_q(&results, &names, 5);
-    // The simulator's stars are drawn from the functional PSFs: with both centred alike nothing but the light beyond
-    // the star's stamp tells them apart.
-    let (star, functional) = (place(&names, "23/den/star"), place(&names, "23/den/func"));
-    for set in &results {
-        let q = |k: usize| set.results[k].score.metrics.q;
-        assert!((q(star) / q(functional) - 1.0).abs() < 1e-3, "{}", set.set);
-    }
-}
-
-#[test]
-fn printed_submissions_compare_as_the_paper_found() {
-    // Under the names of those that they stand for, with either form of PSF.
-    let mut printed = Vec::new();
-    for (data, name) in [
-        ("raw", "as-printed/23/raw/star"),
-        ("den", "as-printed/23/den/star"),
-    ] {
-        for (psf, form) in [("star", PsfForm::Star), ("func", PsfForm::Functional)] {
-            let mut submission = configurations(&[name]).remove(0);
-            submission.name = format!("23/{data}/{psf}");
-            submission.psf.form = form;
-            printed.push(submission);
-        }
-    }
-    // Fiducial, low S/N, high S/N, small galaxies: 2,048 galaxies each. The differences are many
-    // times their errors: denoising 30 %, S/N and size factors of two, PSF form below 1 %.
-    let (results, names) = on_sets(printed, &[2, 5, 8, 14]);
-    assert_denoising_improves_q(&results, &names);
-    assert_poor_q(&results, &names, 5);
-    assert_poor_q(&results, &names, 14);
-    // Denoising lowers the scatter of calibrated ellipticities at S/N 10, 20 and 40: by 15 to 25 %,
-    // with errors of 1.3 % each.
-    let (raw, den) = (place(&names, "23/raw/star"), place(&names, "23/den/star"));
-    for set in &results[..3] {
-        let scatter = |k: usize| set.results[k].response.rms_scatter();
-        let (raw, den) = (scatter(raw), scatter(den));
-        assert!(den < 0.95 * raw, "set {}: {den} of {raw}", set.set);
-    }
 }
 
 #[test]

@@ -13,7 +13,6 @@ mod coverage;
 mod definitions;
 mod derivations;
 mod edges;
-mod great10_cases;
 mod great3;
 mod input;
 mod responses;
