@@ -163,13 +163,13 @@ const WAYS: [(&str, &[&str]); 32] = [
     (
         "bias",
         &[
-            "CATALOGUE g1 g2 columns ellipticity truth-sign bins where design units drop-missing step bootstrap seed fail-above sums shard plot format wide metrics report",
-            "CATALOGUE truth columns ellipticity truth-sign bins where design units drop-missing step bootstrap seed fail-above sums shard plot format wide metrics report",
-            "CATALOGUE g1 g2 columns truth-sign bins where weight design units drop-missing bootstrap seed fail-above sums shard plot format wide metrics report",
-            "CATALOGUE truth columns truth-sign bins where weight design units drop-missing bootstrap seed fail-above sums shard plot format wide metrics report",
+            "CATALOGUE g1 g2 columns ellipticity truth-sign bins where design units drop-missing step fail-above sums shard plot format wide metrics report",
+            "CATALOGUE truth columns ellipticity truth-sign bins where design units drop-missing step fail-above sums shard plot format wide metrics report",
+            "CATALOGUE g1 g2 columns truth-sign bins where weight design units drop-missing fail-above sums shard plot format wide metrics report",
+            "CATALOGUE truth columns truth-sign bins where weight design units drop-missing fail-above sums shard plot format wide metrics report",
             "CATALOGUE against g1 g2 columns ellipticity truth-sign bins where design units drop-missing step format wide metrics",
             "CATALOGUE against truth columns ellipticity truth-sign bins where design units drop-missing step format wide metrics",
-            "merge bootstrap seed fail-above plot format wide metrics report",
+            "merge fail-above plot format wide metrics report",
             "plan",
             "example",
         ],

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use numpy::PyReadonlyArray1;
 use pyo3::exceptions::{PyFileNotFoundError, PyTypeError, PyValueError};
 use pyo3::prelude::*;
-use shearq_bias::{Design, Errors};
+use shearq_bias::Design;
 use shearq_dataset::truth::word;
 use shearq_files::frames::frame;
 use shearq_files::frames::polars::Column;
@@ -145,17 +145,10 @@ impl BiasSums {
     }
 
     /// The table of estimates as JSON, and as text.
-    #[pyo3(signature = (bootstrap, seed))]
-    fn result(
-        &self,
-        py: Python<'_>,
-        bootstrap: Option<u32>,
-        seed: u64,
-    ) -> PyResult<(String, String)> {
-        let errors = bootstrap.map_or(Errors::Jackknife, |draws| Errors::Bootstrap { draws, seed });
+    fn result(&self, py: Python<'_>) -> PyResult<(String, String)> {
         // Without the interpreter, so that other threads of Python go on during the jackknife.
         py.detach(|| {
-            let result = self.summed.clone().result(errors)?;
+            let result = self.summed.clone().result()?;
             let mut table = bias_table(&result);
             for note in &mut table.notes {
                 *note = in_python(note);

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
 use clap::Args;
-use shearq_bias::{Design, Errors};
+use shearq_bias::Design;
 
 use crate::arguments::{Printing, ReportFile, positive};
 use crate::choices::named;
@@ -36,12 +36,6 @@ use shearq_scoring::TruthSign;
 pub(crate) struct Arguments {
     #[command(flatten)]
     summing: Summing,
-    /// Errors from so many bootstrap draws of units instead of a jackknife.
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(10..=100_000))]
-    bootstrap: Option<u32>,
-    /// Seed of the bootstrap.
-    #[arg(long, value_name = "SEED", default_value_t = 1, requires = "bootstrap")]
-    seed: u64,
     /// Exit with code 1 if |m| or |c| exceeds a limit, such as `m=2e-3@3sigma`: by three standard errors. May be given
     /// several times.
     #[arg(long, value_name = "LIMIT")]
@@ -75,7 +69,7 @@ struct Summing {
     /// Catalogues of another program on the same galaxies, in the same order. The output contains both and the
     /// difference, with paired errors. A --truth table by catalogue contains those of both, or names of files that both
     /// have, in two folders.
-    #[arg(long, value_name = "CATALOGUE", num_args = 1.., conflicts_with_all = ["sums", "shard", "bootstrap", "seed", "fail_above", "plot", "path"])]
+    #[arg(long, value_name = "CATALOGUE", num_args = 1.., conflicts_with_all = ["sums", "shard", "fail_above", "plot", "path"])]
     against: Vec<PathBuf>,
     /// True g1 of all catalogues.
     #[arg(
@@ -210,14 +204,8 @@ pub(crate) fn run(arguments: &Arguments, command_line: &str) -> anyhow::Result<(
     if let Some(path) = &summing.sums {
         atomic::write(path, &serde_json::to_vec(&summed)?)?;
     }
-    let errors = arguments
-        .bootstrap
-        .map_or(Errors::Jackknife, |draws| Errors::Bootstrap {
-            draws,
-            seed: arguments.seed,
-        });
     // A shard may have too few units for errors, or one side of a pair. Its sums are what counts, and they are written.
-    let result = match summed.result(errors) {
+    let result = match summed.result() {
         Err(error) if summing.shard.is_some() => {
             tell(format_args!(
                 "note: no estimate of this shard alone: {error}"
@@ -235,7 +223,7 @@ pub(crate) fn run(arguments: &Arguments, command_line: &str) -> anyhow::Result<(
     if !summing.against.is_empty() {
         let other = of_catalogues(summing, &summing.against)?;
         let difference = summed.difference(&other)?;
-        let other = other.result(errors)?;
+        let other = other.result()?;
         warn();
         if let Some(chosen) = chosen_by_measurement(&other) {
             tell(format_args!("warning: --against: {chosen}"));

@@ -11,7 +11,7 @@ pub enum BiasError {
     /// No row was added to the bin.
     #[error("no galaxy can be used (found 0 with a positive weight and without a flag)")]
     NoGalaxies,
-    /// A jackknife or bootstrap over one unit has no scatter.
+    /// A jackknife over one unit has no scatter.
     #[error("there is no error without independent units (found {found}, expected 2 or more)")]
     FewUnits {
         /// Units with a galaxy.

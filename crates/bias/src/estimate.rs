@@ -1,7 +1,4 @@
-//! Estimates with errors from a jackknife or bootstrap over units.
-
-use rand::{RngExt, SeedableRng};
-use rand_chacha::ChaCha8Rng;
+//! Estimates with errors from a jackknife over units, which contain the correlation of galaxies within a unit.
 
 use crate::design::Grouping;
 use crate::error::{BiasError, MIN_SIGMA};
@@ -61,21 +58,6 @@ pub const QUANTITIES: [Quantity; ESTIMATES] = [
     quantity("r21", "⟨R21⟩", "mean response of e2 to g1"),
 ];
 
-/// How errors are determined. Both are over units, so that they contain the correlation of galaxies within a unit.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Errors {
-    /// Leave out one unit at a time: σ² = (n − 1)/n Σ (θ₍ᵢ₎ − ⟨θ₍ᵢ₎⟩)² (Efron & Stein 1981, Annals of Statistics 9, 586).
-    #[default]
-    Jackknife,
-    /// Draw units with replacement, so many times.
-    Bootstrap {
-        /// Number of draws.
-        draws: u32,
-        /// Seed of the random numbers.
-        seed: u64,
-    },
-}
-
 /// A value with its standard error.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Measured {
@@ -116,13 +98,8 @@ impl Estimate {
 /// # Errors
 /// [`BiasError::NoGalaxies`] or [`BiasError::FewUnits`] if no galaxy or only one unit was added to the bin, and
 /// [`BiasError::Response`] if a mean response is below five standard errors.
-pub fn estimate(
-    sums: &UnitSums,
-    bin: usize,
-    truth: bool,
-    errors: Errors,
-) -> Result<Estimate, BiasError> {
-    behind_stars(sums, &[], bin, truth, errors)
+pub fn estimate(sums: &UnitSums, bin: usize, truth: bool) -> Result<Estimate, BiasError> {
+    behind_stars(sums, &[], bin, truth)
 }
 
 impl Grouping {
@@ -130,8 +107,8 @@ impl Grouping {
     ///
     /// # Errors
     /// As [`estimate`].
-    pub fn estimate(&self, bin: usize, truth: bool, errors: Errors) -> Result<Estimate, BiasError> {
-        behind_stars(&self.sums, &self.stars, bin, truth, errors)
+    pub fn estimate(&self, bin: usize, truth: bool) -> Result<Estimate, BiasError> {
+        behind_stars(&self.sums, &self.stars, bin, truth)
     }
 }
 
@@ -140,7 +117,6 @@ fn behind_stars(
     stars: &[Behind],
     bin: usize,
     truth: bool,
-    errors: Errors,
 ) -> Result<Estimate, BiasError> {
     let units = sums.of_bin(bin);
     let mut total = vec![0.0; sums.layout().len()];
@@ -157,10 +133,7 @@ fn behind_stars(
     let values = plan.estimates(&total);
     // The bins and terms that all units determine are estimated from each part of them: a unit that is left out changes
     // values, not their meaning.
-    let mut errors = match errors {
-        Errors::Jackknife => jackknife(&plan, &total, &units),
-        Errors::Bootstrap { draws, seed } => bootstrap(&plan, &units, draws, seed),
-    };
+    let mut errors = jackknife(&plan, &total, &units);
     for star in stars {
         let units = (star.sums.of_bin(bin), units.len());
         let more = variances(&plan, (&total, &values), star, units);
@@ -201,8 +174,8 @@ pub fn difference(
     bin: usize,
     truth: bool,
 ) -> Result<Estimate, BiasError> {
-    let first = estimate(sums, bin, truth, Errors::Jackknife)?;
-    let second = estimate(other, bin, truth, Errors::Jackknife)?;
+    let first = estimate(sums, bin, truth)?;
+    let second = estimate(other, bin, truth)?;
     let units = sums.pairs_with(other, bin);
     let plan_of = |place: usize, sums: &UnitSums| {
         let mut total = vec![0.0; sums.layout().len()];
@@ -282,6 +255,7 @@ fn variances(
     more
 }
 
+// σ² = (n − 1)/n Σ (θ₍ᵢ₎ − ⟨θ₍ᵢ₎⟩)² (Efron & Stein 1981, Annals of Statistics 9, 586).
 fn jackknife(plan: &Plan, total: &[f64], units: &[&[f64]]) -> Estimates {
     let mut rest = vec![0.0; total.len()];
     let left_out = units.iter().map(|unit| {
@@ -293,21 +267,6 @@ fn jackknife(plan: &Plan, total: &[f64], units: &[&[f64]]) -> Estimates {
     });
     let n = units.len() as f64;
     squares(&left_out.collect::<Vec<_>>()).map(|sum| ((n - 1.0) / n * sum).sqrt())
-}
-
-fn bootstrap(plan: &Plan, units: &[&[f64]], draws: u32, seed: u64) -> Estimates {
-    // ChaCha has the same numbers on all platforms and in all versions of its crate.
-    let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let mut total = vec![0.0; units[0].len()];
-    let drawn = (0..draws).map(|_| {
-        total.fill(0.0);
-        for _ in units {
-            add(&mut total, units[rng.random_range(0..units.len())]);
-        }
-        plan.estimates(&total)
-    });
-    let drawn: Vec<Estimates> = drawn.collect();
-    squares(&drawn).map(|sum| (sum / (f64::from(draws) - 1.0)).sqrt())
 }
 
 fn squares(all: &[Estimates]) -> Estimates {

@@ -42,7 +42,7 @@ mod verdict;
 
 pub use design::{Catalogue, Design, Dominant, Grouping, Missing, Range, Repeated, group};
 pub use error::BiasError;
-pub use estimate::{Errors, Estimate, Measured, QUANTITIES, Quantity, difference, estimate};
+pub use estimate::{Estimate, Measured, QUANTITIES, Quantity, difference, estimate};
 pub use stars::{Behind, StarNoise};
 pub use sums::{Layout, Row, SHEARED_CATALOGUES, ShearedCatalogue};
 pub use units::UnitSums;

@@ -5,7 +5,7 @@
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use shearq_bias::{Catalogue, Design, Errors, Layout, Range, Row, StarNoise, UnitSums, group};
+use shearq_bias::{Catalogue, Design, Layout, Range, Row, StarNoise, UnitSums, group};
 use shearq_bias::{Estimate, estimate};
 
 type Matrix = [[f64; 2]; 2];
@@ -176,7 +176,7 @@ fn gauss(a: &[Vec<f64>]) -> Vec<f64> {
 }
 
 fn of(sums: &UnitSums, truth: bool) -> Estimate {
-    estimate(sums, 0, truth, Errors::Jackknife).unwrap()
+    estimate(sums, 0, truth).unwrap()
 }
 
 fn layouts() -> impl Iterator<Item = Layout> {
@@ -411,7 +411,7 @@ fn the_noise_of_a_star_changes_shear_before_the_response() {
         };
         let catalogues = [catalogue.clone(), catalogue];
         let grouping = group(sums, &catalogues, Design::Galaxies, Some(true), true);
-        let found = grouping.estimate(0, true, Errors::Jackknife).unwrap();
+        let found = grouping.estimate(0, true).unwrap();
         for (key, expected) in [("m1", 0.06), ("m2", 0.06), ("c1", 4e-3), ("c2", 4e-3)] {
             let error = found.value(key).unwrap().error;
             assert!((error - expected).abs() < 1e-9, "{layout:?} {key}: {error}");

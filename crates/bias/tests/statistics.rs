@@ -5,9 +5,7 @@
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
-use shearq_bias::{
-    Catalogue, Design, Errors, Layout, Range, Row, StarNoise, UnitSums, estimate, group,
-};
+use shearq_bias::{Catalogue, Design, Layout, Range, Row, StarNoise, UnitSums, estimate, group};
 
 const M: [f64; 2] = [0.03, -0.05];
 const C: [f64; 2] = [2e-3, -3e-3];
@@ -187,7 +185,6 @@ fn pulls(
     design: Design,
     weights: Weights,
     (draws, count): (usize, usize),
-    errors: Errors,
     expected: &[(&str, f64)],
 ) -> Vec<[f64; 3]> {
     let rng = ChaCha8Rng::seed_from_u64(5);
@@ -205,7 +202,7 @@ fn pulls(
         } = draw(design, &mut galaxies, count);
         let truth = design != Design::Null;
         let grouping = group(units, &catalogues, design, None, false);
-        let found = estimate(&grouping.sums, 0, truth, errors).unwrap();
+        let found = estimate(&grouping.sums, 0, truth).unwrap();
         for (sums, (key, expected)) in sums.iter_mut().zip(expected) {
             let measured = found.value(key).unwrap();
             let pull = (measured.value - expected) / measured.error;
@@ -224,7 +221,7 @@ const MC: [(&str, f64); 4] = [("m1", M[0]), ("m2", M[1]), ("c1", C[0]), ("c2", C
 
 /// Checks pulls of `draws` draws.
 fn check(design: Design, weights: Weights, draws: usize, count: usize, expected: &[(&str, f64)]) {
-    let found = pulls(design, weights, (draws, count), Errors::Jackknife, expected);
+    let found = pulls(design, weights, (draws, count), expected);
     for ([pull, deviation, _], (key, _)) in found.iter().zip(expected) {
         // Four standard errors of the mean, and a ratio's bias of about its relative error squared.
         let tolerance = 4.0 / (draws as f64).sqrt() + 0.05;
@@ -282,26 +279,10 @@ fn errors_are_right_from_a_hundred_to_a_million_galaxies() {
 }
 
 #[test]
-fn a_bootstrap_agrees_with_the_scatter() {
-    let errors = Errors::Bootstrap {
-        draws: 200,
-        seed: 3,
-    };
-    let found = pulls(Design::Pairs, Weights::Equal, (200, 200), errors, &MC);
-    for [pull, deviation, _] in found {
-        // Four standard errors of 200 draws, each with an error of the error of 5 %.
-        assert!(
-            pull.abs() < 0.3 && (deviation - 1.0).abs() < 0.25,
-            "{deviation}"
-        );
-    }
-}
-
-#[test]
 fn a_weight_that_depends_on_shear_needs_its_derivative() {
     let value = |weights| {
         let sizes = (40, 20_000);
-        let found = pulls(Design::Pairs, weights, sizes, Errors::Jackknife, &MC[..2]);
+        let found = pulls(Design::Pairs, weights, sizes, &MC[..2]);
         [found[0][2], found[1][2]]
     };
     let (with, without) = (value(Weights::OfShape), value(Weights::Incomplete));
@@ -366,7 +347,7 @@ fn sheared_catalogues_give_the_response_of_a_selection() {
             }
         }
     }
-    let of = |sums: UnitSums| estimate(&sums.by_key(), 0, true, Errors::Jackknife).unwrap();
+    let of = |sums: UnitSums| estimate(&sums.by_key(), 0, true).unwrap();
     let (with, without) = (of(sums), of(direct));
     let (m, wrong) = (with.value("m1").unwrap(), without.value("m1").unwrap());
     assert!(m.value.abs() < 4.0 * m.error + 0.01, "{m:?}");
@@ -400,9 +381,9 @@ fn many_units_are_joined_and_shards_merge_to_the_same_sums() {
     merged.merge(other).unwrap();
     let [a, b] = [whole, merged].map(|sums| {
         let sums = sums.by_key();
-        let all = estimate(&sums.all_bins(), 0, true, Errors::Jackknife).unwrap();
+        let all = estimate(&sums.all_bins(), 0, true).unwrap();
         assert!((512..=2048).contains(&all.units), "{}", all.units);
-        (all, estimate(&sums, 1, true, Errors::Jackknife).unwrap())
+        (all, estimate(&sums, 1, true).unwrap())
     });
     for (a, b) in [(&a.0, &b.0), (&a.1, &b.1)] {
         for key in ["m1", "m2", "c1", "c2"] {
@@ -418,7 +399,7 @@ fn many_units_are_joined_and_shards_merge_to_the_same_sums() {
 #[test]
 fn without_galaxies_units_or_response_there_is_an_error() {
     let mut sums = UnitSums::new(Layout::default(), 1, 1);
-    let of = |sums: &UnitSums| estimate(sums, 0, false, Errors::Jackknife).unwrap_err();
+    let of = |sums: &UnitSums| estimate(sums, 0, false).unwrap_err();
     assert!(of(&sums).to_string().contains("no galaxy"));
     let mut row = Row {
         e: [0.1, 0.2],
@@ -515,8 +496,8 @@ fn errors_contain_the_noise_of_stars_once() {
             let grouping = group(sums, &catalogues, Design::Pairs, None, false);
             assert_eq!(grouping.stars.len(), shared);
             let grouping = grouping.all_bins();
-            let found = grouping.estimate(0, true, Errors::Jackknife).unwrap();
-            let without = estimate(&grouping.sums, 0, true, Errors::Jackknife).unwrap();
+            let found = grouping.estimate(0, true).unwrap();
+            let without = estimate(&grouping.sums, 0, true).unwrap();
             for (square, key) in squares.iter_mut().zip(keys) {
                 let measured = found.value(key).unwrap();
                 *square += (measured.value / measured.error).powi(2);
@@ -569,7 +550,7 @@ fn the_part_that_a_jackknife_knows_of_a_star_is_exact() {
             });
         }
         let grouping = group(sums, &catalogues, Design::Pairs, None, false);
-        let found = grouping.estimate(0, true, Errors::Jackknife).unwrap();
+        let found = grouping.estimate(0, true).unwrap();
         ["m1", "c2"].map(|key| found.value(key).unwrap().error)
     };
     // The variance by k stars of 20/k units each is 1/k of that of one star. A jackknife of 20 units contains a part of it.

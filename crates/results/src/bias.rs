@@ -13,8 +13,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 use shearq_bias::{
-    BiasError, Catalogue, Design, Errors, Estimate, Grouping, Layout, Range, UnitSums, difference,
-    group,
+    BiasError, Catalogue, Design, Estimate, Grouping, Layout, Range, UnitSums, difference, group,
 };
 use shearq_dataset::layout::stated_sign;
 use shearq_dataset::metadata::{CommonAxes, stated_axes};
@@ -626,9 +625,9 @@ impl Summed {
     }
 
     /// The estimates.
-    pub fn result(&self, errors: Errors) -> Result<BiasResult, BiasFailure> {
+    pub fn result(&self) -> Result<BiasResult, BiasFailure> {
         let (design, grouping) = self.grouped()?;
-        let all = grouping.all_bins().estimate(0, self.about.truth, errors);
+        let all = grouping.all_bins().estimate(0, self.about.truth);
         let all = all.map_err(|error| match error {
             BiasError::FewUnits { .. } if self.about.by_key == Some(true) => {
                 BiasFailure::OneUnit(error)
@@ -637,7 +636,7 @@ impl Summed {
         })?;
         self.check_responses(&all)?;
         Ok(BiasResult {
-            bins: self.bins(all, |bin| grouping.estimate(bin, self.about.truth, errors)),
+            bins: self.bins(all, |bin| grouping.estimate(bin, self.about.truth)),
             design,
             grouping,
             about: self.about.clone(),
@@ -737,9 +736,9 @@ impl Summed {
             sign.map_err(|fault| FileError::new(truth, fault).into())
         };
         // A shard may be too small for an estimate that all catalogues have.
-        let estimate = self.grouped().and_then(|(_, grouping)| {
-            Ok(grouping.all_bins().estimate(0, true, Errors::Jackknife)?)
-        });
+        let estimate = self
+            .grouped()
+            .and_then(|(_, grouping)| Ok(grouping.all_bins().estimate(0, true)?));
         let all = match estimate {
             Err(_) if !self.absent().is_empty() => return undetermined(None),
             found => found?,

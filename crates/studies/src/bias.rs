@@ -16,7 +16,7 @@
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
-use shearq_bias::{BiasError, Errors, Estimate, Layout, Row, UnitSums, estimate};
+use shearq_bias::{BiasError, Estimate, Layout, Row, UnitSums, estimate};
 use shearq_measure::{Measurement, Measurer, Worker};
 use shearq_quantities::Shear;
 use shearq_submissions::Calibration;
@@ -225,8 +225,8 @@ impl BiasSums {
 
     // The biases; NaN without an estimate.
     fn bias(self) -> ShearBias {
-        let found = estimate(&self.units, 0, true, Errors::Jackknife).ok();
-        let leakage = estimate(&self.leakage, 0, false, Errors::Jackknife).ok();
+        let found = estimate(&self.units, 0, true).ok();
+        let leakage = estimate(&self.leakage, 0, false).ok();
         let of = |found: &Option<Estimate>, key: &str| {
             let value = found.as_ref().and_then(|found| found.value(key));
             value.map_or([f64::NAN; 2], |found| [found.value, found.error])

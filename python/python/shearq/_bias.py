@@ -106,9 +106,9 @@ class BiasSums:
     def __reduce__(self) -> tuple[Any, tuple[str]]:
         return _restored, (self._sums.to_json(),)
 
-    def result(self, *, bootstrap: int | None = None, seed: int = 1) -> Bias:
-        """The bias, with errors from a jackknife or from bootstrap draws of units."""
-        text, shown = self._sums.result(bootstrap, seed)
+    def result(self) -> Bias:
+        """The bias, with errors from a jackknife over units."""
+        text, shown = self._sums.result()
         found = json.loads(text)
         return Bias(found["rows"], found["notes"], shown, found["binned"])
 
@@ -133,8 +133,6 @@ def bias(
     units: str | None = None,
     drop_missing: bool = False,
     step: float = 0.01,
-    bootstrap: int | None = None,
-    seed: int = 1,
 ) -> Bias:
     """Multiplicative and additive bias (m and c) of any program's catalogues, as ``shearq bias`` estimates it.
 
@@ -185,8 +183,6 @@ def bias(
         a true shear. The notes count them.
     step : float
         Artificial shear of metacalibration.
-    bootstrap, seed : int
-        Number of bootstrap draws instead of a jackknife, and its seed.
 
     Raises
     ------
@@ -211,7 +207,7 @@ def bias(
         drop_missing=drop_missing,
         step=step,
     )
-    return sums.result(bootstrap=bootstrap, seed=seed)
+    return sums.result()
 
 
 def bias_sums(

@@ -4,8 +4,8 @@ use ndarray::Array2;
 use shearq_scoring::modes::{Decomposer, Modes};
 use shearq_scoring::{
     Bins, Complex64, Convention, Definition, Fault, FieldSum, Grid, MeanShear, Metrics, Noise,
-    Options, ScoringError, SetImages, SetScore, SetScorer, TrueShear, TruthSign,
-    cross_spectrum, measured_bandpowers, sign_by_correlation, sign_by_modes,
+    Options, ScoringError, SetImages, SetScore, SetScorer, TrueShear, TruthSign, cross_spectrum,
+    measured_bandpowers, sign_by_correlation, sign_by_modes,
 };
 
 use crate::common::{Content, Normal, field, score, standard, truth};
@@ -146,7 +146,10 @@ fn metrics_are_unknown_where_the_data_do_not_determine_them() {
         unknown.map(|(metric, _)| metric.name).collect()
     };
     let two = images(&shear, 2, 1.0, 0.001);
-    assert_eq!(unknown(&score(truth(&shear), &two, Noise::Measured)), [""; 0]);
+    assert_eq!(
+        unknown(&score(truth(&shear), &two, Noise::Measured)),
+        [""; 0]
+    );
     // One image does not determine its noise.
     let one = images(&shear, 1, 1.0, 0.001);
     let found = unknown(&score(truth(&shear), &one, Noise::Measured));
