@@ -560,9 +560,11 @@ impl Values {
                 values.push(value.unwrap_or(f64::NAN));
                 return value.is_some();
             }
-            Values::Identities(values) => match number(field).filter(exact) {
-                Some(value) => values.push(value),
-                None => {
+            Values::Identities(values) => match number(field) {
+                // As a text, a missing identity would turn all others into texts, which differ from the numbers of other catalogues.
+                Some(value) if value.is_nan() => return false,
+                Some(value) if exact(&value) => values.push(value),
+                _ => {
                     let mut texts: Vec<String> = values.iter().map(f64::to_string).collect();
                     texts.push(field.trim().to_owned());
                     *self = Values::Texts(texts);
@@ -643,7 +645,11 @@ impl<'a> Rows<'a> {
     fn not_a_number(&self, line: u64, column: usize, field: &str) -> FileError {
         let field: String = field.trim().chars().take(MAX_FIELD_CHARS).collect();
         let name = &self.names[column];
-        let message = format!("line {line}: `{field}` in column `{name}` is not a number");
+        let expected = match self.slots[column].map(|slot| &self.columns[slot]) {
+            Some(Values::Identities(_)) => "an identity",
+            _ => "a number",
+        };
+        let message = format!("line {line}: `{field}` in column `{name}` is not {expected}");
         FileError::new(self.path, message)
     }
 

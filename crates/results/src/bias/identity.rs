@@ -15,6 +15,18 @@ const INTEGER: u64 = 0x5bd1_e995_9d1b_58d3;
 pub(super) fn keys(frame: &DataFrame, name: &str, path: &Path) -> Result<Vec<u64>, FileError> {
     let column = frame.column(name).ok();
     let series = column.map(|own| own.as_materialized_series());
+    // Galaxies without an identity would be one galaxy.
+    let missing = |count: usize| match count {
+        0 => Ok(()),
+        _ => {
+            let message = format!(
+                "column `{name}` has no identity in {count} of {} rows; expected one in each",
+                frame.height()
+            );
+            Err(FileError::new(path, message))
+        }
+    };
+    missing(series.map_or(0, |own| own.null_count()))?;
     // Floats would round the identifiers of Rubin, which are above 2⁵³.
     if let Some(texts) = series.and_then(|own| own.str().ok()) {
         let key = |text: Option<&str>| of_text(text.unwrap_or_default());
@@ -29,6 +41,7 @@ pub(super) fn keys(frame: &DataFrame, name: &str, path: &Path) -> Result<Vec<u64
         return Ok(integers.iter().map(key).collect());
     }
     let numbers = table::numbers(frame, name, path)?;
+    missing(numbers.iter().filter(|own| own.is_nan()).count())?;
     Ok(numbers.iter().map(|own| hash(own.to_bits())).collect())
 }
 
