@@ -116,7 +116,8 @@ struct Summing {
     /// Use only galaxies for which this holds, such as "snr > 10 and size < 4". Catalogues of linear configurations can
     /// also be cut by steps, such as "step(snr, 10, 1.5) and step(size, 2.5)", whose response to shear enters (see
     /// `select`). The response of other conditions on measured quantities needs sheared catalogues.
-    #[arg(long = "where", value_name = "CONDITION")]
+    // The command that keeps a selection is called select; clap would suggest --seed.
+    #[arg(long = "where", alias = "select", value_name = "CONDITION")]
     condition: Option<String>,
     /// Weight of each galaxy, a smooth formula of `snr`, `flux` and `size`, such as `snr^2 / (snr^2 + 50)`.
     #[arg(long, value_name = "FORMULA", conflicts_with_all = ["against", "ellipticity", "step"])]

@@ -390,7 +390,10 @@ impl Names {
             Some((role, column)) if !column.is_empty() => (role, column),
             _ => return Err(NameError::Syntax(text.to_owned())),
         };
-        let key = named(role).ok_or_else(|| NameError::Role(role.to_owned()))?;
+        // Also by the usual names of its column: AnaCal calls dw1 dw_dg1.
+        let is_recognised = |key: &Key| recognised(*key).iter().any(|own| own == role);
+        let key = named(role).or_else(|| keys().find(is_recognised));
+        let key = key.ok_or_else(|| NameError::Role(role.to_owned()))?;
         match self.0.insert(key, column.to_owned()) {
             Some(_) => Err(NameError::Twice(role.to_owned())),
             None => Ok(()),
@@ -854,6 +857,17 @@ mod tests {
             names.add(text).map_err(|error| error.to_string())?;
         }
         Columns::find(Path::new("c.fits"), &columns, &names).map_err(|error| error.to_string())
+    }
+
+    #[test]
+    fn roles_may_have_the_names_of_their_columns() {
+        let found = found(
+            "a b c d e",
+            &["e1=a", "e2=b", "dw_dg1=c", "dw_dg2=d", "weight=e"],
+        );
+        let found = found.unwrap();
+        assert_eq!(found.of(Role::Dw1), Some("c"));
+        assert_eq!(found.of(Role::Weight), Some("e"));
     }
 
     #[test]
