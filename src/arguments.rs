@@ -21,7 +21,8 @@ use shearq_simulate::kinds::SETS;
 use shearq_simulate::set::SimulationSettings;
 use shearq_submissions::{Configuration, Registry};
 
-// `1,2,7-9` or `all`. Own code, because clap has no ranges in lists.
+// `1,2,7-9`, or `all`, which is empty: data folders have any sets, and simulations the 24 of the paper. Own code, because clap has
+// no ranges in lists.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct SetList(pub(super) Vec<u32>);
 
@@ -29,9 +30,8 @@ impl FromStr for SetList {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        // The sets that can be simulated; data folders have a default for all of theirs.
         if text == "all" {
-            return Ok(SetList((1..=SETS).collect()));
+            return Ok(SetList(Vec::new()));
         }
         let number = |part: &str| -> Result<u32, String> {
             match part.trim().parse() {
@@ -68,7 +68,10 @@ impl FromStr for SetList {
 impl std::fmt::Display for SetList {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         let sets: Vec<String> = self.0.iter().map(u32::to_string).collect();
-        f.write_str(&sets.join(","))
+        match sets.as_slice() {
+            [] => f.write_str("all"),
+            sets => f.write_str(&sets.join(",")),
+        }
     }
 }
 
@@ -78,13 +81,16 @@ pub(super) fn sets_of(list: Option<&SetList>) -> &[u32] {
 }
 
 impl SetList {
-    pub(super) fn simulated(&self) -> anyhow::Result<&[u32]> {
+    pub(super) fn simulated(&self) -> anyhow::Result<Vec<u32>> {
         if let Some(set) = self.0.iter().find(|&&set| !(1..=SETS).contains(&set)) {
             anyhow::bail!(
                 "--sets: this set cannot be simulated (found {set}, expected 1 to {SETS})"
             );
         }
-        Ok(&self.0)
+        Ok(match self.0.is_empty() {
+            true => (1..=SETS).collect(),
+            false => self.0.clone(),
+        })
     }
 }
 
@@ -353,7 +359,9 @@ mod tests {
     fn set_lists_are_sorted_and_checked() {
         let parse = |text: &str| text.parse::<SetList>().map(|list| list.0);
         assert_eq!(parse("7-9,1,2,8"), Ok(vec![1, 2, 7, 8, 9]));
-        assert_eq!(parse("all").unwrap().len(), 24);
+        let all = SetList(parse("all").unwrap());
+        assert_eq!(all.simulated().unwrap().len(), 24);
+        assert_eq!(all.to_string(), "all");
         for wrong in ["", "x", "3-1", "1,,2", "10000"] {
             assert!(parse(wrong).is_err(), "{wrong}");
         }

@@ -144,7 +144,9 @@ fn record(arguments: &RecordArguments) -> anyhow::Result<()> {
     let sets = sets_of(arguments.sets.as_ref());
     let (source, images) = match &arguments.data {
         None => {
-            let images = images::of_simulation(sets, arguments.images.unwrap_or(1));
+            let simulated = arguments.sets.as_ref().map(SetList::simulated);
+            let sets = simulated.transpose()?.unwrap_or_default();
+            let images = images::of_simulation(&sets, arguments.images.unwrap_or(1));
             (Source::Simulated(arguments.simulation.settings()?), images)
         }
         Some(data) => {

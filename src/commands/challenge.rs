@@ -254,7 +254,7 @@ fn new(arguments: &NewArguments) -> anyhow::Result<()> {
     let challenge = match (&arguments.data, &arguments.sets, arguments.images) {
         (None, Some(sets), Some(images)) => {
             let simulation = Simulation {
-                sets: sets.simulated()?.to_vec(),
+                sets: sets.simulated()?,
                 images,
                 grid: arguments.grid.map_or(100, usize::from),
                 amplitude: arguments.amplitude,

@@ -111,7 +111,7 @@ fn merge_run(arguments: &Arguments, run: &Run) -> anyhow::Result<()> {
 // The record of a simulation does not list its images, because shards with other images share it.
 fn simulated_images(arguments: &Arguments) -> anyhow::Result<Vec<ImageId>> {
     match (&arguments.sets, arguments.images) {
-        (Some(sets), Some(images)) => Ok(images::of_simulation(&sets.0, images)),
+        (Some(sets), Some(images)) => Ok(images::of_simulation(&sets.simulated()?, images)),
         _ => anyhow::bail!(
             "{}: cannot determine the expected images of simulated data. Try: --sets LIST --images N",
             arguments.out.display()

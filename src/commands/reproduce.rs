@@ -76,7 +76,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let total = sets.len() as u64 * u64::from(*images) * u64::from(*grid).pow(2);
     let mut bar = Bar::new("simulating and measuring", total);
     let study = Study::open(&plan, out)?;
-    let results = run_sets(&study, sets, threads, &mut bar)?;
+    let results = run_sets(&study, &sets, threads, &mut bar)?;
     drop(bar);
     let mut bar = Bar::new("calibrating", *galaxies);
     // Sect. 4 calibrates one network; the configurations of Table 1 extend its settings.

@@ -4,7 +4,7 @@ use std::time::Instant;
 use clap::Args;
 use shearq_scoring::Options;
 
-use crate::arguments::{ReportFile, SetList, SimulationArguments};
+use crate::arguments::{ReportFile, SetList, SimulationArguments, sets_of};
 use crate::measure::Measuring;
 use crate::progress::{Bar, mark_resumable};
 use crate::{measure, print_table, score, tell};
@@ -73,9 +73,8 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let _prepared = store.as_deref().map(store::prepare).transpose()?;
     let threads = measuring.threads();
     let wanted = match sets {
-        None => &[],
         Some(list) if arguments.simulate => list.simulated()?,
-        Some(list) => &list.0[..],
+        list => sets_of(list.as_ref()).to_vec(),
     };
     let data = arguments.data.as_deref().map(open_data).transpose()?;
     let source = match &data {
@@ -89,7 +88,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     match (&run.source, &data) {
         (Source::Simulated(settings), _) => {
             // Clap requires --images with --simulate.
-            let images = images::of_simulation(wanted, images.unwrap_or(1));
+            let images = images::of_simulation(&wanted, images.unwrap_or(1));
             let images = measuring.sharding.part(&images);
             let galaxies = images.len() as u64 * (settings.grid as u64).pow(2);
             let mut bar = Bar::new("simulating and measuring", galaxies);
@@ -99,7 +98,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             measure::report(&run, &summary, start.elapsed(), threads, out)?;
         }
         (Source::Folder { .. }, Some(data)) => {
-            let images = measuring.images(&run, data, wanted)?;
+            let images = measuring.images(&run, data, &wanted)?;
             measure::measure(&run, data, out, &images, threads)?;
         }
         // A folder as source comes from `data`.
@@ -119,7 +118,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         ));
         return Ok(());
     }
-    let scored = score(&run, out, wanted, store.as_deref(), threads)?;
+    let scored = score(&run, out, &wanted, store.as_deref(), threads)?;
     let title = format!("Scores of {}", run.configuration.name);
     let name = &run.configuration.name;
     let sections = || Ok(vec![pages::scores(name, &scored.0, scored.1)?]);

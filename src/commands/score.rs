@@ -342,12 +342,12 @@ fn score_spectra(
     place: &Path,
     options: Options,
 ) -> anyhow::Result<Vec<SetRecord>> {
-    if let Some(wanted) = &arguments.sets {
-        if let Some(set) = wanted.0.iter().find(|set| !files.contains_key(set)) {
+    if let wanted @ [_, ..] = sets_of(arguments.sets.as_ref()) {
+        if let Some(set) = wanted.iter().find(|set| !files.contains_key(set)) {
             bail!("{}: found no spectrum of set {set}", place.display());
         }
         // Spectra of other sets are not read: a damaged one must not stop the chosen sets.
-        files.retain(|set, _| wanted.0.contains(set));
+        files.retain(|set, _| wanted.contains(set));
     }
     let mut scored = Vec::new();
     for (&set, path) in &files {

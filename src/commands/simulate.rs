@@ -190,7 +190,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         (None, Some(sets), Some(images)) => (sets, images),
         _ => anyhow::bail!("expected --sets and --images, or --challenge and --branch"),
     };
-    let images = images::of_simulation(sets.simulated()?, images);
+    let images = images::of_simulation(&sets.simulated()?, images);
     let images = arguments.sharding.part(&images);
     let versions = versions(arguments)?;
     let grid = versions[0].0.grid as u64;

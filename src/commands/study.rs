@@ -59,11 +59,11 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let study = Study::open(&plan, &arguments.out)?;
     let image = (plan.simulation.grid as u64).pow(2) * sets.len() as u64;
     let mut bar = Bar::new("simulating and measuring", image * u64::from(images));
-    let results = run_sets(&study, sets, threads, &mut bar)?;
+    let results = run_sets(&study, &sets, threads, &mut bar)?;
     drop(bar);
     let mut bar = Bar::new("measuring biases", image * u64::from(pairs));
     // With fewer images than the scatter: paired versions of the same galaxies cancel shape noise and pixel noise.
-    let biases = bias_sets(&study, sets, pairs, threads, &mut bar)?;
+    let biases = bias_sets(&study, &sets, pairs, threads, &mut bar)?;
     drop(bar);
     arguments
         .form

@@ -99,7 +99,10 @@ fn means_of_rotated_pairs_are_packed_with_errors_of_pixel_noise() {
     let small = Small::new("2");
     branch(&small);
     printed(small.root(), MEASURE);
-    let mean = printed(small.root(), "shearq mean --measured m --format csv");
+    let mean = printed(
+        small.root(),
+        "shearq mean --measured m --sets all --format csv",
+    );
     printed(
         small.root(),
         "shearq pack --challenge great3 --branch control-ground-constant --measured m --subfields 2 --grid 8 --out g.txt",
