@@ -79,6 +79,12 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             let warning = Warning::PixelFrame(frame);
             tell(format_args!("warning: set {set:02}: {warning}"));
         }
+        if mean.above_one > 0 {
+            tell(format_args!(
+                "warning: set {set:02}: {} of {} galaxies have |e| of 1 or more, which no ellipse has, and count in the mean (expected 0). Try: check the catalogues, or measure again",
+                mean.above_one, mean.galaxies
+            ));
+        }
         // An error of zero would look like a perfect measurement.
         if mean.is_constant() {
             tell(format_args!(

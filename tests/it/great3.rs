@@ -182,6 +182,8 @@ fn pack_averages_fields_and_its_result_is_sound() {
     // Without g1, and without both.
     galaxies[1].1.e1 = 9.95;
     galaxies[6].1 = Shear::new(10.0, f64::NAN);
+    // No galaxy has such a shear; it counts as in the challenge.
+    galaxies[9].1.e1 = -1.5;
     let half = galaxies.len() / 2;
     // Numbers in a comment are no names.
     let rows = lines(&galaxies[half..]).join("\n");
@@ -202,7 +204,9 @@ fn pack_averages_fields_and_its_result_is_sound() {
         );
         let told = said(&pack);
         assert!(
-            told.contains("not measured; columns that are not used: other"),
+            told.contains(
+                "not measured; columns that are not used: other; 1 with a g of 1 or more"
+            ),
             "{told}"
         );
         // Neither an earlier submission is replaced nor a text named as an archive.

@@ -27,6 +27,9 @@ pub struct SetMean {
     pub flagged: usize,
     /// Galaxies with an ellipticity that the selection leaves out.
     pub cut: usize,
+    /// Galaxies whose ellipticity has a modulus of 1 or more, which no ellipse has. They count like the others, because a cut
+    /// would bias the mean.
+    pub above_one: usize,
     /// Galaxies with each of [`Flag::ALL`].
     pub flags: [usize; Flag::ALL.len()],
     /// Mean shear: the sum of ellipticities over the sum of responses. Errors include the error of the mean
@@ -114,7 +117,7 @@ fn mean_of(
     pairs: bool,
 ) -> Result<SetMean, FileError> {
     let (mut sum, mut moments) = (ShearSum::default(), [RunningMean::default(); 2]);
-    let (mut flags, mut flagged, mut cut) = ([0; Flag::ALL.len()], 0, 0);
+    let (mut flags, mut flagged, mut cut, mut above_one) = ([0; Flag::ALL.len()], 0, 0, 0);
     let mut stars = Stars::default();
     let mut axes = CommonAxes::default();
     let (mut noise, mut in_pairs) = ([0.0; 2], pairs);
@@ -151,6 +154,8 @@ fn mean_of(
                 cut += 1;
                 continue;
             }
+            // Both components are multiplied by the weight.
+            above_one += usize::from(e[0].hypot(e[1]) >= rows.weight[row]);
             let response = rows.matrix(row);
             sum.add(e, response, 1.0);
             for k in 0..2 {
@@ -180,6 +185,7 @@ fn mean_of(
         galaxies: moments[0].count(),
         flagged,
         cut,
+        above_one,
         flags,
         shear,
         psf_error,
@@ -299,8 +305,14 @@ mod tests {
             (None, false),
             true,
         );
-        let plain = plain.unwrap().shear.unwrap();
-        assert!((plain.error()[0] - 0.075).abs() < 1e-15, "{plain:?}");
+        let plain = plain.unwrap();
+        let error = plain.shear.unwrap().error();
+        assert!((error[0] - 0.075).abs() < 1e-15, "{plain:?}");
+        assert_eq!(plain.above_one, 0);
+        written(&catalogues[0].1, [0.05, 5.0], &[]);
+        let (format, selected) = (FileFormat::Parquet, (None, false));
+        let wrong = mean_of(7, &catalogues, format, true, selected, true);
+        assert_eq!(wrong.unwrap().above_one, 1);
     }
 
     #[test]

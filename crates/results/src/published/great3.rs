@@ -1386,6 +1386,17 @@ impl<'a> Galaxies<'a> {
             unmeasured.count(),
             self.unused_columns()
         );
+        // Estimates may exceed 1, and a cut would bias the mean, so that they count as in the challenge.
+        let above_one = self.galaxies.iter().filter(|own| {
+            let most = own.g.e1.abs().max(own.g.e2.abs());
+            own.weight > 0.0 && (1.0..NOT_AVERAGED).contains(&most)
+        });
+        let count = above_one.count();
+        if count > 0 {
+            note += &format!(
+                "; {count} with a g of 1 or more, which no galaxy has, count in the means"
+            );
+        }
         if let (true, Catalogues::Measured(folder)) = (self.branch.constant, packing.catalogues) {
             let means = mean_shears(&Run::require(folder)?, folder, &[], None)?;
             let errors = means.iter().filter_map(|mean| Some(mean.shear?.error()));
