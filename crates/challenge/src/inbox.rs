@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use shearq_dataset::run::RUN_FILE;
 use shearq_files::FileError;
 use shearq_results::submit::{
     Entry, FileSum, Kind, MANIFEST_FILE, Manifest, is_archive, read_archive,
@@ -35,6 +36,14 @@ pub fn find(paths: &[PathBuf]) -> Result<Vec<Sending>, FileError> {
     for path in paths {
         if !path.exists() {
             let message = "there is no such file or folder; expected archives (.tar.gz) or folders of entries";
+            return Err(FileError::new(path, message));
+        }
+        // Catalogues of `measure` have other names and contents than those of an entry.
+        if path.join(RUN_FILE).is_file() {
+            let message = format!(
+                "this folder was written by `measure` or `run`; expected an entry. Try: shearq pack --measured {0} --out {0}.tar.gz",
+                path.display()
+            );
             return Err(FileError::new(path, message));
         }
         search(path, None, DEPTH, &mut found)?;

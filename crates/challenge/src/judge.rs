@@ -285,7 +285,7 @@ impl Judge {
             && receipt.team != *team
         {
             let message = format!(
-                "the receipt is of another team (found `{}`, expected the folder's `{team}`)",
+                "the receipt is of another team (found `{0}`, expected the folder's `{team}`). Try: move both into the folder `{0}`, or sign again by shearq challenge check --truth DIR --team \"{team}\"",
                 receipt.team
             );
             return Err(FileError::new(Receipt::path(&sending.path), message));

@@ -344,7 +344,7 @@ fn restored(path: &Path, key: &Key, set: u32, grid: &Grid) -> Result<ShapesOfIma
     let name = SIGNATURE.to_owned();
     let stated = table::read_metadata(path, FileFormat::Parquet, std::iter::once(&name))?;
     if stated.get(SIGNATURE) != Some(&signed(path, key, [&numbers, &e1, &e2])) {
-        let message = "the shapes were changed after the images were measured, or measured for another challenge (found another signature, expected that of the private folder). Try: remove the file, and the images are measured again";
+        let message = "the shapes were changed, or measured for another challenge or by another build of this version (found another signature or none, expected that of the private folder). Try: remove the file, and the images are measured again";
         return Err(FileError::new(path, message));
     }
     let cells = grid.cells();
