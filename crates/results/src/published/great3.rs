@@ -12,7 +12,7 @@ use shearq_dataset::threads::Pool;
 use shearq_files::open::is_there;
 use shearq_files::{FileError, names_of, table};
 use shearq_quantities::Shear;
-use shearq_quantities::statistics::{RunningMean, median};
+use shearq_quantities::statistics::RunningMean;
 use shearq_render::figure::{LinePlot, Series, Style};
 use shearq_scoring::aperture::{ApertureMass, Lattice, LatticeShear, SEPARATION_BINS, separations};
 use shearq_scoring::great3::{
@@ -22,7 +22,6 @@ use shearq_scoring::great3::{
 };
 use shearq_scoring::{Line, Repeated, repeated};
 
-use crate::mean::mean_shears;
 use crate::response::{Shared, shears};
 use shearq_dataset::run::Run;
 
@@ -1376,48 +1375,33 @@ impl<'a> Galaxies<'a> {
                 }
             }
         }
-        let unmeasured = self.galaxies.iter().filter(|own| {
-            !is_measured(own.g.e1, NOT_AVERAGED) || !is_measured(own.g.e2, NOT_AVERAGED)
-        });
-        let mut note = format!(
-            "{} galaxies of {}, {} not measured{}",
-            self.galaxies.len(),
-            self.branch,
-            unmeasured.count(),
-            self.unused_columns()
-        );
-        // Estimates may exceed 1, and a cut would bias the mean, so that they count as in the challenge.
-        let above_one = self.galaxies.iter().filter(|own| {
-            let most = own.g.e1.abs().max(own.g.e2.abs());
-            own.weight > 0.0 && (1.0..NOT_AVERAGED).contains(&most)
-        });
-        let count = above_one.count();
-        if count > 0 {
-            note += &format!(
-                "; {count} with a g of 1 or more, which no galaxy has, count in the means"
-            );
-        }
-        if let (true, Catalogues::Measured(folder)) = (self.branch.constant, packing.catalogues) {
-            let means = mean_shears(&Run::require(folder)?, folder, &[], None)?;
-            let errors = means.iter().filter_map(|mean| Some(mean.shear?.error()));
-            let errors: Vec<_> = errors.collect();
-            let typical = |k: usize| {
-                median(&mut errors.iter().map(|own| own[k]).collect::<Vec<_>>()).unwrap_or(f64::NAN)
-            };
-            let [g1, g2] = [0, 1].map(typical);
-            let _ = write!(
-                note,
-                "; errors of g1 and g2 of a subfield: {g1:.1e} and {g2:.1e}"
-            );
-        }
+        let note = self.note();
         Ok(Packed { text, note })
     }
 
-    fn unused_columns(&self) -> String {
-        let unused: Vec<&str> = self.unused.iter().map(String::as_str).collect();
-        match unused.as_slice() {
-            [] => String::new(),
-            names => format!("; columns that are not used: {}", names_of(names)),
+    fn note(&self) -> String {
+        let number = |is: &dyn Fn(f64) -> bool| {
+            let all = self.galaxies.iter();
+            all.filter(|own| is(own.g.e1) || is(own.g.e2)).count()
+        };
+        let mut note = format!(
+            "{} galaxies of {}, {} not measured",
+            self.galaxies.len(),
+            self.branch,
+            number(&|g| g.is_nan() || g >= NOT_AVERAGED)
+        );
+        if !self.unused.is_empty() {
+            let unused: Vec<&str> = self.unused.iter().map(String::as_str).collect();
+            note += &format!("; columns that are not used: {}", names_of(&unused));
+        }
+        // Estimates may exceed 1, and a cut would bias the mean, so that they count as in the challenge.
+        match number(&|g| (1.0..NOT_AVERAGED).contains(&g.abs())) {
+            0 => note,
+            count => {
+                note + &format!(
+                    "; {count} with a g of 1 or more, which no galaxy has, count in the means"
+                )
+            }
         }
     }
 
