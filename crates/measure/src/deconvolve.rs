@@ -7,6 +7,6 @@ mod linear;
 mod network;
 
 pub(crate) use linear::{EpochPixels, EpochScratch, SpectralEpoch};
-pub(crate) use linear::{Lags, ModeNoise, Spectral, SpectralPsf, SpectralScratch};
+pub use linear::{Lags, ModeNoise, Spectral, SpectralPsf, SpectralScratch};
 pub(crate) use linear::{Products, uniform};
 pub use network::{Network, NetworkScratch, Rule, Step, convolve, psf_factor};

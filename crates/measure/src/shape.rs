@@ -8,6 +8,6 @@ mod adaptive;
 mod clipped;
 mod size;
 
-pub(crate) use adaptive::{AdaptiveMoments, AdaptiveScratch, AdaptiveShape};
+pub use adaptive::{AdaptiveMoments, AdaptiveScratch, AdaptiveShape};
 pub use clipped::{ClippedAcf, ClippedAcfScratch, Moments};
 pub(crate) use size::{MeanSquare, SizeMoments};
