@@ -26,13 +26,19 @@ pub(crate) const MAX_STAR_SHIFT: f64 = 3.0;
 
 /// Offset (x, y) of the galaxy from the centre of its stamp of `n` pixels a side; zero if there is no light.
 pub(crate) fn galaxy_centroid(stamp: &[f32], n: usize) -> [f32; 2] {
+    galaxy_centroid_near(stamp, n, [0.0; 2])
+}
+
+/// The same of a galaxy that is expected at `start` from the centre, which it is if there is no light. Steps that fall short of the
+/// centroid leave no part of an offset that was expected.
+pub(crate) fn galaxy_centroid_near(stamp: &[f32], n: usize, start: [f64; 2]) -> [f32; 2] {
     let centre = (n as f64 - 1.0) / 2.0;
     let bound = centre / 2.0;
-    let mut offset = [0.0; 2];
+    let mut offset = start;
     for _ in 0..GALAXY_STEPS {
         let row = |y: usize| &stamp[y * n..][..n];
         let Some(step) = step([n; 2], row, offset.map(|at| centre + at)) else {
-            return [0.0; 2];
+            return start.map(|at| at as f32);
         };
         for (at, step) in offset.iter_mut().zip(step) {
             let step = step.clamp(-MAX_GALAXY_STEP, MAX_GALAXY_STEP);

@@ -4,11 +4,14 @@
 //! All numbers are medians over stamps, so that neighbours on a few of them do not matter. The sky is measured in
 //! the corners, where a galaxy has least light.
 
+use std::f64::consts::PI;
+
 use ndarray::ArrayView2;
+use shearq_quantities::matrix::{Matrix2, apply, determinant};
 use shearq_quantities::statistics::{OF_MEDIAN, median, scatter};
 use shearq_submissions::PsfCut;
 
-use crate::centroid::galaxy_centroid;
+use crate::centroid::galaxy_centroid_near;
 use crate::error::MeasureError;
 use crate::pixel::{PEAK_RANGE, Pixel, hash, highest};
 use crate::psf::quality::{self, PsfQuality};
@@ -38,7 +41,7 @@ const WINGS_RATIO: f64 = 0.6;
 // not kept.
 const GRADIENT_SHARE: f64 = 0.04;
 // Mean offset of the galaxies in px: between half a pixel and one pixel along both axes (0.71 and 1.41).
-pub(crate) const OFFSET: f64 = 0.85;
+const OFFSET: f64 = 0.85;
 // Scatter of the galaxies' positions in px. Chosen by hand.
 const POSITION_SCATTER: f64 = 2.0;
 // Relative difference of given noise and noise in the corners: it changes m by 0.005 at S/N 20. Command and seed were not
@@ -48,6 +51,17 @@ const GIVEN_NOISE_DIFFERENCE: f64 = 0.02;
 const DEPTHS: f64 = 0.1;
 // Correlation at distances of 4 and 5 px. Chosen by hand.
 const LONG_CORRELATION: f64 = 0.03;
+// Fewest galaxies by which epochs are compared: the scatter of 30 is known to 13 %. Chosen by hand.
+const MIN_GALAXIES_EPOCHS: usize = 30;
+// Displacement of an epoch in px. Of two equal epochs it adds δ²/4 to a second moment of 3 px² or more, and hence less than 0.0004
+// to an ellipticity; centroids of PSFs with coma under the weight differ from those of galaxies by less.
+const EPOCH_OFFSET: f64 = 0.1;
+// Relative difference of the flux within 8 px. Chosen by hand: different seeing changes it by up to a tenth.
+const EPOCH_FLUX: f64 = 0.2;
+// Share of galaxies whose brightness differs by a factor of 2. Chosen by hand: cosmic rays, masks and variable objects are fewer.
+const OTHER_GALAXIES: f64 = 0.1;
+// Noise of a star's centroid times its S/N in px: the σ of the centroid's weight.
+const PSF_CENTROID_NOISE: f64 = 2.0;
 /// PSFs of single galaxies of an image that are examined.
 pub const EXAMINED_PSFS: usize = 100; // Chosen by hand.
 
@@ -73,6 +87,8 @@ pub(crate) fn enough(columns: usize, rows: usize) -> usize {
 
 #[derive(Debug, Clone, Copy)]
 struct StampStatistics {
+    /// Number among all stamps, from 0.
+    at: usize,
     /// Level of its corners, and of the middles of its sides.
     corner: f64,
     side: f64,
@@ -99,6 +115,8 @@ pub struct Examination {
     stamp: FullStamp,
     block: usize,
     stamps: Vec<StampStatistics>,
+    /// Stamps that were added.
+    added: usize,
     blank: usize,
     psfs: Vec<PsfQuality>,
     /// Whether each PSF is that of one galaxy.
@@ -135,6 +153,7 @@ impl Examination {
             stamp: FullStamp::new(full),
             block: BLOCK.min(full / BLOCKS_PER_SIDE),
             stamps: Vec::with_capacity(count),
+            added: 0,
             blank: 0,
             psfs: Vec::new(),
             each: false,
@@ -191,8 +210,13 @@ impl Examination {
     ) -> Result<(), MeasureError> {
         let n = self.stamp.side;
         self.stamp.read(stamp)?;
+        self.added += 1;
         if self.stamp.is_blank() {
             self.blank += 1;
+            return Ok(());
+        }
+        // Without pixels, as of a galaxy that an exposure does not contain. All such stamps would be copies of each other.
+        if self.stamp.pixels.iter().all(|value| !value.is_finite()) {
             return Ok(());
         }
         self.stamp.subtract_sky();
@@ -225,6 +249,7 @@ impl Examination {
         }
         let corner = middle_of(&mut corners.map(|corner| corner.mean));
         let border = StampStatistics {
+            at: self.added - 1,
             corner,
             side: middle_of(&mut sides.map(|side| side.mean)),
             slope: [(b + d - a - c) / apart, (c + d - a - b) / apart],
@@ -246,7 +271,7 @@ impl Examination {
                 0.0
             };
         }
-        let found = galaxy_centroid(pixels, n);
+        let found = galaxy_centroid_near(pixels, n, place);
         self.stamps.push(StampStatistics {
             place: [0, 1].map(|k| f64::from(found[k]) - place[k]),
             flux: inner_light(pixels, n),
@@ -262,7 +287,13 @@ impl Examination {
 
     /// Adds what another examination has found, as if its stamps had been added here.
     pub fn join(&mut self, other: &Self) {
-        self.stamps.extend_from_slice(&other.stamps);
+        let before = self.added;
+        self.stamps
+            .extend(other.stamps.iter().map(|stamp| StampStatistics {
+                at: before + stamp.at,
+                ..*stamp
+            }));
+        self.added += other.added;
         self.blank += other.blank;
         self.psfs.extend_from_slice(&other.psfs);
         self.each |= other.each;
@@ -497,13 +528,137 @@ impl Examination {
 
     /// Median of a number over stamps. Each stamp has an error of at least `floor`.
     fn median(&self, of: impl Fn(&StampStatistics) -> f64, floor: f64) -> Estimate {
-        let all = self.stamps.iter().map(of);
-        let mut all: Vec<f64> = all.filter(|value| !value.is_nan()).collect();
-        let count = all.len() as f64;
-        let (value, scatter) = scatter(&mut all).unwrap_or((f64::NAN, f64::NAN));
-        let error = OF_MEDIAN * scatter.max(floor) / count.sqrt();
-        Estimate { value, error }
+        median_of(self.stamps.iter().map(of), floor)
     }
+
+    /// What contradicts that this is an epoch of the galaxies of `earlier` ones, whose stamps were added in the same order.
+    /// `axes` maps pixels of the first to pixels of this one. Places and flux must agree, because epochs are added.
+    pub(crate) fn contradictions(&self, earlier: &[&Self], axes: Matrix2) -> Vec<Warning> {
+        let mut found = Vec::new();
+        let is_copy = |own: &&StampStatistics| {
+            let mut others = earlier.iter().filter_map(|other| other.of(own.at));
+            others.any(|other| other.trace == own.trace)
+        };
+        let (count, of) = (self.stamps.iter().filter(is_copy).count(), self.added);
+        if count > 0 {
+            found.push(Warning::EpochCopies { count, of });
+        }
+        let Some(first) = earlier.first() else {
+            return found;
+        };
+        let own = self.stamps.iter();
+        let pairs: Vec<(&StampStatistics, &StampStatistics)> = own
+            .filter_map(|own| Some((own, first.of(own.at)?)))
+            .collect();
+        if pairs.len() < MIN_GALAXIES_EPOCHS {
+            return found;
+        }
+        found.extend(self.displacement(first, &pairs, axes));
+        let medians = |of: &dyn Fn(&StampStatistics) -> f64| {
+            let own = median_of(pairs.iter().map(|(own, _)| of(own)), 0.0);
+            (
+                own,
+                median_of(pairs.iter().map(|(_, other)| of(other)), 0.0),
+            )
+        };
+        let (own, other) = medians(&|stamp| stamp.flux);
+        let lit = own.is_significant() && other.is_significant() && other.value > 0.0;
+        let ratio = own.value / other.value;
+        // From pairs, whose fluxes differ less than those of different galaxies.
+        let rest = pairs
+            .iter()
+            .map(|(own, other)| own.flux - ratio * other.flux);
+        let error = median_of(rest, 0.0).error / other.value.abs();
+        let apart = Estimate {
+            value: ratio - 1.0,
+            error,
+        };
+        // An aperture of 8 px of other sides has other light.
+        let one_scale = (determinant(axes).abs() - 1.0).abs() < EPOCH_FLUX;
+        if lit && one_scale && apart.is_significant() && apart.value.abs() > EPOCH_FLUX {
+            found.push(Warning::EpochFlux { ratio, error });
+        }
+        let (own, other) = medians(&|stamp| stamp.core[0]);
+        let scale = own.value / other.value;
+        // Of Σ W n, whose weight W of σ = 1 px has Σ W² = π.
+        let noise = PI.sqrt() * self.noise().value.hypot(scale * first.noise().value);
+        let differs = |(own, other): &&(&StampStatistics, &StampStatistics)| {
+            let [own, other] = [own.core[0], scale * other.core[0]];
+            let apart = Estimate {
+                value: own - other,
+                error: noise,
+            };
+            apart.is_significant() && apart.value.abs() > 0.5 * own.abs().max(other.abs())
+        };
+        let blank = self.blank.saturating_sub(first.blank);
+        let (count, of) = (
+            pairs.iter().filter(differs).count() + blank,
+            pairs.len() + blank,
+        );
+        if lit && count as f64 > OTHER_GALAXIES * of as f64 {
+            found.push(Warning::EpochGalaxies { count, of });
+        }
+        found
+    }
+
+    /// The displacement of galaxies from those of the first epoch. That of the PSFs explains a part of it, because a galaxy is
+    /// where its PSF is, and deconvolution moves it back.
+    fn displacement(
+        &self,
+        first: &Self,
+        pairs: &[(&StampStatistics, &StampStatistics)],
+        axes: Matrix2,
+    ) -> Option<Warning> {
+        let (own_psf, first_psf) = (self.psf_offset(), first.psf_offset());
+        let of_psfs = apply(axes, first_psf.map(|axis| axis.value));
+        let away = [0, 1].map(|k| {
+            let places = pairs
+                .iter()
+                .map(|(own, other)| own.place[k] - apply(axes, other.place)[k]);
+            let Estimate { value, error } = median_of(places, 0.0);
+            Estimate {
+                value: value - (own_psf[k].value - of_psfs[k]),
+                error: error.hypot(own_psf[k].error).hypot(first_psf[k].error),
+            }
+        });
+        let (offset, away) = vector(away);
+        let found = away.value > EPOCH_OFFSET && away.is_significant();
+        found.then_some(Warning::EpochOffset {
+            offset,
+            error: away.error,
+            from_first: true,
+        })
+    }
+
+    /// Median offset of the PSFs from the centres of their stamps.
+    fn psf_offset(&self) -> [Estimate; 2] {
+        let noise = self.psfs.iter().map(|psf| PSF_CENTROID_NOISE / psf.snr());
+        let noise = median_of(noise, 0.0).value;
+        [0, 1].map(|k| {
+            let found = median_of(self.psfs.iter().map(|psf| psf.offset[k]), noise);
+            match self.psfs.is_empty() {
+                true => Estimate {
+                    value: 0.0,
+                    error: 0.0,
+                },
+                false => found,
+            }
+        })
+    }
+
+    fn of(&self, at: usize) -> Option<&StampStatistics> {
+        let place = self.stamps.binary_search_by_key(&at, |stamp| stamp.at);
+        place.ok().map(|place| &self.stamps[place])
+    }
+}
+
+/// Median of numbers, each with an error of at least `floor`.
+fn median_of(all: impl Iterator<Item = f64>, floor: f64) -> Estimate {
+    let mut all: Vec<f64> = all.filter(|value| !value.is_nan()).collect();
+    let count = all.len() as f64;
+    let (value, scatter) = scatter(&mut all).unwrap_or((f64::NAN, f64::NAN));
+    let error = OF_MEDIAN * scatter.max(floor) / count.sqrt();
+    Estimate { value, error }
 }
 
 /// Both components, and their length with the larger of their errors.
@@ -727,6 +882,74 @@ mod tests {
         first.join(&second);
         assert_eq!(first.warnings(), one.warnings());
         assert!(!one.warnings().is_empty());
+    }
+
+    /// An epoch of galaxies of several fluxes at `centre`, which is expected at `place`, with a PSF at `of_psf`. Its first stamp has
+    /// no pixels.
+    fn epoch(
+        centre: [f32; 2],
+        place: [f64; 2],
+        of_psf: [f32; 2],
+        order: [usize; 2],
+    ) -> Examination {
+        let mut epoch = Examination::new(N, 42);
+        let missing = Array2::from_elem((N, N), f32::NAN);
+        epoch.add(missing.view()).unwrap();
+        epoch.add(missing.view()).unwrap();
+        for k in 0..40 {
+            let flux = 1.0 + ((order[0] + order[1] * k) % 40) as f32;
+            let noise = |at: usize| ((at * at * (k + 1)) % 97) as f32 / 97.0 - 0.5;
+            let mut stamp = stamp(0.0, [0.0; 2], centre) * flux;
+            let pixels = stamp.iter_mut().enumerate();
+            pixels.for_each(|(at, value)| *value += 0.1 * noise(at));
+            epoch.add_at(stamp.view(), place).unwrap();
+        }
+        let star = stamp(0.0, [0.0; 2], of_psf).mapv(f64::from);
+        let star = &star / star.sum();
+        epoch.add_psf(star.view(), None);
+        epoch
+    }
+
+    #[test]
+    fn epochs_that_contradict_the_first_are_named() {
+        const SAME: Matrix2 = [[1.0, 0.0], [0.0, 1.0]];
+        let dither = [0.5, -0.25];
+        let (at, centred) = (dither.map(f64::from), [0.0; 2]);
+        let first = epoch([0.0; 2], centred, [0.0; 2], [0, 1]);
+        let kinds = |other: &Examination, axes: Matrix2| {
+            let found = other.contradictions(&[&first], axes);
+            found.iter().map(Warning::kind).collect::<Vec<_>>()
+        };
+        // Galaxies with a lesser share of noise, so that all are compared.
+        let mut scaled = epoch([0.0; 2], centred, [0.0; 2], [0, 1]);
+        for stamp in &mut scaled.stamps {
+            (stamp.flux, stamp.core[0], stamp.trace) = (2.0 * stamp.flux, 2.0 * stamp.core[0], 0);
+        }
+        for (other, expected) in [
+            (epoch(dither, at, [0.0; 2], [0, 1]), &[][..]),
+            (epoch(dither, centred, dither, [0, 1]), &[]),
+            (
+                epoch(dither, at.map(|at| -at), [0.0; 2], [0, 1]),
+                &["epoch-offset"],
+            ),
+            (epoch(dither, at, [1.0, 0.0], [0, 1]), &["epoch-offset"]),
+            (epoch(dither, at, [0.0; 2], [39, 39]), &["epoch-galaxies"]),
+            (scaled, &["epoch-flux"]),
+            (first.clone(), &["epoch-copies"]),
+        ] {
+            assert_eq!(kinds(&other, SAME), expected);
+        }
+        // Galaxies off their places by as much on the sky, of an epoch whose x axis is mirrored.
+        let both = [
+            epoch(dither, centred, [0.0; 2], [0, 1]),
+            epoch([-0.5, -0.25], centred, [0.0; 2], [0, 1]),
+        ];
+        assert!(
+            both[1]
+                .contradictions(&[&both[0]], [[-1.0, 0.0], [0.0, 1.0]])
+                .is_empty()
+        );
+        assert!(!both[1].contradictions(&[&both[0]], SAME).is_empty());
     }
 
     #[test]

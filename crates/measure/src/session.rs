@@ -11,6 +11,7 @@ use std::ops::{ControlFlow, Deref, Range};
 use std::sync::{Arc, LazyLock};
 
 use ndarray::{ArrayView3, Axis, CowArray, Ix3, Slice};
+use shearq_quantities::matrix::{Matrix2, inverse, product};
 use shearq_quantities::statistics::upper_median;
 use shearq_quantities::{Frame, Jacobian, columns_of};
 use shearq_submissions::limits::MIN_PSF;
@@ -18,7 +19,7 @@ use shearq_submissions::{Calibration, Configuration, NoiseSource};
 
 use crate::calibration::mean_response;
 use crate::error::{EpochError, MeasureError, length};
-use crate::examine::{EXAMINED_PSFS, Estimate, Examination, OFFSET, enough, examined_rows};
+use crate::examine::{EXAMINED_PSFS, Estimate, Examination, enough, examined_rows};
 use crate::measurement::{Flag, Measurement};
 use crate::measurer::{Epoch, ImageNoise, ImageWorker, Measurer, Steps, Worker};
 use crate::noise::{NoisePlan, NoiseSurvey, StampNoise, Survey};
@@ -131,6 +132,11 @@ pub trait StampSource<'a> {
     /// noise is that of the sky. Networks ignore it.
     fn gain(&self) -> Option<f64> {
         None
+    }
+
+    /// Whether the pixels have the unit of flux of other epochs, so that a ratio other than 1 is a mistake.
+    fn has_common_flux(&self) -> bool {
+        true
     }
 }
 
@@ -343,13 +349,14 @@ pub struct Session<'n> {
     frame: Frame,
     noise: KnownNoise<'n>,
     gain: Option<f64>,
+    common_flux: bool,
     survey: Option<Arc<Survey>>,
     stars: Option<Arc<ResidualProfiles>>,
     examined: Vec<usize>,
     /// Median of the positive levels of the examined stamps, if each stamp has its own.
     typical_level: Option<f64>,
-    /// Mean offset (x, y) of the first row's galaxies from the centres of their stamps, in pixels.
-    offset: [f64; 2],
+    /// Of the first stamp, in the frame of the sky.
+    jacobian: Option<Jacobian>,
     warnings: Vec<Warning>,
     /// Of the images that contain further epochs of the galaxies.
     epochs: Vec<Arc<Session<'n>>>,
@@ -460,29 +467,27 @@ impl<'n> Session<'n> {
         let of_settings = loses_wings.then_some(Warning::PsfSize { size });
         let warnings = of_settings.into_iter().chain(source.warnings()).collect();
         let stars = survey_stars(measurer, source, &examined, threads)?;
-        let frame = match rows.count {
-            0 => Frame::Pixel,
-            _ => source.jacobians(0)?.map_or(Frame::Pixel, |_| Frame::Sky),
-        };
-        let offsets = match rows.count {
+        let jacobians = match rows.count {
             0 => None,
-            _ => source.offsets(0)?,
+            _ => source.jacobians(0)?,
         };
-        let offset = offsets.map_or([0.0; 2], |all| {
-            let count = all.len().max(1) as f64;
-            [0, 1].map(|k| all.iter().map(|offset| offset[k]).sum::<f64>() / count)
-        });
+        let frame = match jacobians {
+            None => Frame::Pixel,
+            Some(_) => Frame::Sky,
+        };
+        let jacobian = jacobians.and_then(|all| all.first().copied());
         let mut session = Session {
             measurer: measurer.clone(),
             rows,
             frame,
             noise,
             gain: source.gain(),
+            common_flux: source.has_common_flux(),
             survey: None,
             stars,
             examined,
             typical_level: None,
-            offset,
+            jacobian,
             warnings,
             epochs: Vec::new(),
         };
@@ -717,7 +722,7 @@ impl<'n> Session<'n> {
         Ok(MeasuredRow {
             row,
             galaxies,
-            examined: vec![self.examine(row, stamps, psfs)?],
+            examined: vec![self.examine(row, stamps, psfs, None)?],
         })
     }
 
@@ -726,13 +731,14 @@ impl<'n> Session<'n> {
         row: usize,
         stamps: ArrayView3<'_, T>,
         psfs: &Psfs<'_>,
+        offsets: Option<&[[f64; 2]]>,
     ) -> Result<Option<Examined>, MeasureError> {
         if !self.examined.contains(&row) {
             return Ok(None);
         }
         let mut examination = self.examination();
-        for stamp in stamps.outer_iter() {
-            examination.add(stamp)?;
+        for (k, stamp) in stamps.outer_iter().enumerate() {
+            examination.add_at(stamp, offsets.map_or([0.0; 2], |each| each[k]))?;
         }
         // A PSF for all galaxies is examined once.
         if psfs.count().is_some() || self.examined.first() == Some(&row) {
@@ -867,10 +873,11 @@ impl<'n> RowJob<'n> {
                 false => worker.image(ImageNoise::Unknown).measure_epochs(&epochs)?,
             });
         }
-        let examined = jobs
-            .iter()
-            .zip(&all)
-            .map(|(job, stamps)| job.session.examine(job.row, stamps.view(), &job.psfs));
+        let examined = jobs.iter().zip(&all).map(|(job, stamps)| {
+            let offsets = job.offsets.as_deref();
+            let session = &job.session;
+            session.examine(job.row, stamps.view(), &job.psfs, offsets)
+        });
         Ok(MeasuredRow {
             row: self.row,
             galaxies,
@@ -933,19 +940,23 @@ impl MeasuredImage<'_> {
         let images = std::iter::once(&session).chain(&session.epochs);
         let mut warnings = Vec::new();
         let mut psf_noise = None;
-        for (epoch, (image, examined)) in images.clone().zip(examined).enumerate() {
-            warnings.extend(image.warnings.iter().cloned());
-            warnings.extend(image.warnings_of(examined, &mut psf_noise));
-            let noise = image.survey.as_ref().map(|survey| &survey.noise);
-            let correlated = noise.filter(|noise| noise.is_correlated());
-            warnings.extend(
-                correlated
-                    .filter(|_| !session.epochs.is_empty())
-                    .map(|noise| Warning::EpochNoise {
-                        epoch: epoch + 1,
-                        correlation: [(1, 0), (0, 1)].map(|(x, y)| noise.correlation(x, y)),
-                    }),
-            );
+        let mut earlier = Vec::new();
+        for (epoch, (image, examined)) in images.zip(&examined).enumerate() {
+            let mut own = image.warnings.clone();
+            own.extend(image.warnings_of(examined.as_ref(), &mut psf_noise));
+            if session.epochs.is_empty() {
+                warnings = own;
+                break;
+            }
+            if let Some(Examined { stamps, .. }) = examined {
+                own.extend(stamps.contradictions(&earlier, image.axes_from(&session)));
+                earlier.push(stamps);
+            }
+            let epoch = epoch + 1;
+            warnings.extend(image.of_epoch(own).map(|warning| {
+                let warning = Box::new(warning);
+                Warning::Epoch { epoch, warning }
+            }));
         }
         // The noise of several stars averages, and its effect is not known.
         psf_noise = psf_noise.filter(|_| session.epochs.is_empty());
@@ -971,10 +982,42 @@ impl MeasuredImage<'_> {
 }
 
 impl Session<'_> {
+    /// The map from pixels of another image to those of this one.
+    fn axes_from(&self, other: &Self) -> Matrix2 {
+        match (&self.jacobian, &other.jacobian) {
+            (Some(own), Some(other)) => product(inverse(own.matrix()), other.matrix()),
+            _ => [[1.0, 0.0], [0.0, 1.0]],
+        }
+    }
+
+    /// The warnings of this image as those of an epoch, which is left out without noise, and whose offsets are stated.
+    fn of_epoch(&self, warnings: Vec<Warning>) -> impl Iterator<Item = Warning> {
+        let noise = self.survey.as_ref().map(|survey| &survey.noise);
+        let correlated = noise.filter(|noise| noise.is_correlated());
+        let correlated = correlated.map(|noise| Warning::EpochNoise {
+            correlation: [(1, 0), (0, 1)].map(|(x, y)| noise.correlation(x, y)),
+        });
+        let displaced = |warning: &Warning| matches!(warning, Warning::EpochOffset { .. });
+        let is_displaced = warnings.iter().any(displaced);
+        let common_flux = self.common_flux;
+        let own = move |warning| match warning {
+            Warning::EpochFlux { .. } if !common_flux => None,
+            Warning::NoNoise => Some(Warning::EpochNoNoise),
+            Warning::OffCentre { .. } if is_displaced => None,
+            Warning::OffCentre { offset, error } => Some(Warning::EpochOffset {
+                offset,
+                error,
+                from_first: false,
+            }),
+            other => Some(other),
+        };
+        warnings.into_iter().filter_map(own).chain(correlated)
+    }
+
     /// Warnings of examined stamps; writes the effect of the star's noise on m and c, if there is one.
     fn warnings_of(
         &self,
-        examined: Option<Examined>,
+        examined: Option<&Examined>,
         psf_noise: &mut Option<[f64; 2]>,
     ) -> Vec<Warning> {
         let configuration = self.measurer.configuration();
@@ -984,18 +1027,11 @@ impl Session<'_> {
         // Levels of their own serve images of several depths.
         let one_level = self.noise.levels().is_none();
         let mut warnings = stamps.warnings();
-        warnings.retain(|own| match own {
-            Warning::Depths { .. } => one_level,
-            // Galaxies of a dithered epoch are where they were said to be.
-            Warning::OffCentre { offset, .. } => {
-                let away = [0, 1].map(|k| offset[k] - self.offset[k]);
-                away[0].hypot(away[1]) > OFFSET
-            }
-            _ => true,
-        });
+        warnings.retain(|own| one_level || !matches!(own, Warning::Depths { .. }));
         warnings.extend(match &self.noise {
             KnownNoise::Given(level) => stamps.given_noise(*level),
             KnownNoise::GivenEach(_) | KnownNoise::StatedEach(_) => scaled
+                .as_ref()
                 .zip(self.typical_level)
                 .and_then(|(scaled, level)| scaled.given_noise(level)),
             &KnownNoise::Stated(given) if configuration.noise == NoiseSource::Header => stamps

@@ -167,16 +167,71 @@ pub enum Warning {
         /// Correlation of neighbours along x and y.
         correlation: [f64; 2],
     },
-    /// Noise of one of several epochs is correlated, and all are combined as white noise.
+    /// A warning about one of several epochs.
+    #[error("epoch {epoch}: {warning}")]
+    Epoch {
+        /// The epoch, from 1.
+        epoch: usize,
+        /// The warning.
+        warning: Box<Warning>,
+    },
+    /// Noise of an epoch is correlated, and all epochs are combined as white noise.
     #[error(
-        "the noise of neighbouring pixels of epoch {epoch} is correlated, but epochs are combined as if it were white (found {:.2} along x and {:.2} along y, expected 0). Try: exposures that were not resampled",
+        "the noise of neighbouring pixels is correlated, but epochs are combined as if it were white (found {:.2} along x and {:.2} along y, expected 0). Try: exposures that were not resampled",
         correlation[0], correlation[1]
     )]
     EpochNoise {
-        /// The epoch, from 1.
-        epoch: usize,
         /// Correlation of neighbours along x and y.
         correlation: [f64; 2],
+    },
+    /// The noise of an epoch cannot be measured.
+    #[error(
+        "cannot measure the noise: no stamp has enough pixels that differ (expected galaxies and noise). The epoch is left out. Try: check the file and its extension"
+    )]
+    EpochNoNoise,
+    /// The galaxies of an epoch are not where its offsets and its PSF place them.
+    #[error(
+        "the galaxies are displaced from {} (found {:+.2} px along x and {:+.2} px along y, ± {error:.2}; expected 0), which blurs the combined galaxies. Try: check sign, order and axes of the dithers or positions, and that the PSF is centred on its stamp",
+        if *from_first { "those of the first epoch, beyond offsets and PSFs" } else { "the offsets that are stated" },
+        offset[0], offset[1]
+    )]
+    EpochOffset {
+        /// Median displacement along x and y in pixels.
+        offset: [f64; 2],
+        /// Standard error of either.
+        error: f64,
+        /// Whether it is that from the galaxies of the first epoch, and not from the offsets alone.
+        from_first: bool,
+    },
+    /// The galaxies of an epoch have another flux than in the first one.
+    #[error(
+        "the galaxies have {ratio:.2} ± {error:.2} times the flux of the first epoch (expected 1): weights and leakage of the PSF are those of one flux. Try: scale image, noise and gain to one zero point"
+    )]
+    EpochFlux {
+        /// Ratio of the median fluxes.
+        ratio: f64,
+        /// Its standard error.
+        error: f64,
+    },
+    /// An epoch contains other galaxies than the first one.
+    #[error(
+        "{count} of {of} galaxies are not those of the first epoch (found stamps that are blank, or differ in brightness by a factor of 2 and 5 standard errors; expected the same galaxies). Try: check that files and rows of the epochs belong together"
+    )]
+    EpochGalaxies {
+        /// Galaxies that differ.
+        count: usize,
+        /// Galaxies compared.
+        of: usize,
+    },
+    /// Stamps of an epoch are copies of those of an earlier one.
+    #[error(
+        "stamps are copies of those of an earlier epoch (found {count} of {of}; expected none), so that their noise does not average. Try: remove one of the epochs"
+    )]
+    EpochCopies {
+        /// Stamps that are copies.
+        count: usize,
+        /// Stamps examined.
+        of: usize,
     },
     /// No stamp is good enough to measure the noise on.
     #[error(
@@ -401,14 +456,22 @@ impl Warning {
         (2 * count > of).then_some(Warning::Flagged { flag, count, of })
     }
 
+    /// The warning itself, if it is about an epoch.
+    pub fn inner(&self) -> &Warning {
+        match self {
+            Warning::Epoch { warning, .. } => warning,
+            other => other,
+        }
+    }
+
     /// A name for each kind of warning, for counting: that of the variant, such as `psf-noise`.
     pub fn kind(&self) -> &'static str {
-        self.into()
+        self.inner().into()
     }
 
     /// Whether no result should be made from such data.
     pub fn is_fatal(&self) -> bool {
-        matches!(self, Warning::PsfBroad { fatal: true, .. })
+        matches!(self.inner(), Warning::PsfBroad { fatal: true, .. })
     }
 }
 

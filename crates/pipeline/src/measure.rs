@@ -8,7 +8,7 @@ mod epochs;
 mod source;
 
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use shearq_files::FileError;
@@ -36,6 +36,8 @@ pub struct ImageHead {
     pub run_warnings: Vec<Warning>,
     /// The table of the stamps if they were gathered.
     pub(crate) table: Option<StampTable>,
+    /// The files of its epochs, if there are several.
+    pub(crate) epochs: Vec<PathBuf>,
     /// Whether ellipticities are along pixel axes that a WCS states to be the sky's.
     pub(crate) aligned: bool,
     /// Fingerprints of the files that the image is measured from.
@@ -205,6 +207,7 @@ impl<'a> FolderMeasurement<'a> {
                 mosaic,
                 run_warnings: correlated.into_iter().collect(),
                 table: source.take_table(),
+                epochs: Vec::new(),
                 aligned: source.is_aligned(),
                 prints,
             });
@@ -266,6 +269,10 @@ impl FolderMeasurement<'_> {
             mosaic,
             run_warnings: Vec::new(),
             table: sources[0].image.take_table(),
+            epochs: sources
+                .iter()
+                .map(|source| source.image.path.clone())
+                .collect(),
             aligned: sources.iter().all(|source| source.image.is_aligned()),
             prints,
         });

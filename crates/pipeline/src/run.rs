@@ -228,6 +228,7 @@ pub fn run_folder(
                     mosaic: Mosaic::square(settings.grid, STAMP),
                     run_warnings: Vec::new(),
                     table: None,
+                    epochs: Vec::new(),
                     aligned: false,
                     // There are no files to compare with later; the settings and the seed determine the data.
                     prints: BTreeMap::new(),

@@ -69,11 +69,13 @@ pub(crate) struct PsfQuality {
     area: f64,
     core: Option<CoreSize>,
     moved: Option<[f64; 2]>,
+    /// Centroid from the centre of the pixels that are used.
+    pub(crate) offset: [f64; 2],
 }
 
 impl PsfQuality {
     /// S/N of the star; infinite without noise.
-    pub(super) fn snr(&self) -> f64 {
+    pub(crate) fn snr(&self) -> f64 {
         self.snr
     }
 
@@ -159,6 +161,7 @@ impl PsfQuality {
         }
         let peak = (peak - border.mean()).max(f64::MIN_POSITIVE);
         let area = noise_equivalent_area(psf);
+        let offset = psf_offset(psf);
         Some(PsfQuality {
             side: n,
             snr: (power - count * sigma * sigma).max(0.0).sqrt() / sigma,
@@ -172,8 +175,9 @@ impl PsfQuality {
             } else {
                 f64::INFINITY
             },
-            core: psf_core_size(psf, psf_offset(psf), border.mean(), sigma),
+            core: psf_core_size(psf, offset, border.mean(), sigma),
             moved,
+            offset,
         })
     }
 }

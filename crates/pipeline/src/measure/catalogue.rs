@@ -292,7 +292,7 @@ impl<'a> Catalogues<'a> {
         let ImageId { set, image } = head.id;
         let found = &batch.warnings;
         self.warned
-            .add(head.id, found.iter().chain(&head.run_warnings), progress)?;
+            .add(head, found.iter().chain(&head.run_warnings), progress)?;
         // If a user removed the folder meanwhile, writing would create it again with the later catalogues only.
         self.claim.check()?;
         let path = self.run.catalogue(self.out, set, image);
@@ -304,7 +304,7 @@ impl<'a> Catalogues<'a> {
             metadata.insert(WARNINGS.into(), lines.join("\n"));
         }
         for warning in found {
-            if let Warning::PixelFrame(frame) = warning {
+            if let Warning::PixelFrame(frame) = warning.inner() {
                 metadata.extend([frame_entry(frame)]);
             }
         }
@@ -354,23 +354,34 @@ struct Warned {
 impl Warned {
     fn add<'w>(
         &mut self,
-        id: ImageId,
+        head: &ImageHead,
         warnings: impl IntoIterator<Item = &'w Warning>,
         progress: &mut dyn Progress,
     ) -> Result<(), PipelineError> {
         for warning in warnings {
+            let (epoch, warning) = match warning {
+                Warning::Epoch { epoch, warning } => (head.epochs.get(epoch - 1), &**warning),
+                of_image => (None, of_image),
+            };
             if warning.is_fatal() {
-                let warning = warning.clone();
-                return Err(PipelineError::Fatal { id, warning });
+                return Err(match epoch {
+                    Some(path) => FileError::new(path, warning).into(),
+                    None => PipelineError::Fatal {
+                        id: head.id,
+                        warning: warning.clone(),
+                    },
+                });
             }
             match self.kinds.get_mut(warning.kind()) {
                 Some(more) => *more += 1,
                 None => {
                     self.kinds.insert(warning.kind(), 0);
-                    let ImageId { set, image } = id;
-                    progress.warn(&format!(
-                        "warning: set {set:02} image {image:03}: {warning}"
-                    ));
+                    let ImageId { set, image } = head.id;
+                    let of = match epoch {
+                        Some(path) => path.display().to_string(),
+                        None => format!("set {set:02} image {image:03}"),
+                    };
+                    progress.warn(&format!("warning: {of}: {warning}"));
                 }
             }
         }

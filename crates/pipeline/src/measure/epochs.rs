@@ -32,6 +32,7 @@ pub(super) struct EpochSource {
     /// The stamp of each galaxy, if it has one.
     tiles: Vec<Option<usize>>,
     offsets: Vec<[f64; 2]>,
+    is_great3: bool,
 }
 
 /// Opens the images of epochs.
@@ -67,6 +68,7 @@ pub(super) fn open(
             offsets: ordered(&tiles, offsets.as_deref().unwrap_or(&[])),
             tiles,
             image,
+            is_great3: data.layout().great3.is_some(),
         });
         first.get_or_insert((id, galaxies));
     }
@@ -309,6 +311,11 @@ impl StampSource<'static> for EpochSource {
 
     fn gain(&self) -> Option<f64> {
         self.image.gain()
+    }
+
+    // Exposures of a survey may have a zero point each.
+    fn has_common_flux(&self) -> bool {
+        self.is_great3
     }
 }
 
