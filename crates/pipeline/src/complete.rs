@@ -49,6 +49,7 @@ pub struct Fault {
 impl Results<'_> {
     /// Number of galaxies of `images`, for progress bars: an estimate from the first that can be read.
     pub fn galaxies(&self, images: &[ImageId]) -> u64 {
+        // An image that cannot be read is reported by `faults`, and must not stop the count.
         let first = images.iter().find_map(|&id| self.cells(id).ok());
         (images.len() * first.unwrap_or(0)) as u64
     }

@@ -35,6 +35,7 @@ impl<I> Feeder<'_, I> {
         if self.permits.recv().is_err() {
             return false;
         }
+        // Numbered here, because workers finish in any order.
         self.next += 1;
         self.items.send((self.next - 1, item)).is_ok()
     }

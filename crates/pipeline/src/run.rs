@@ -71,6 +71,7 @@ impl<'s> SimulatedSource<'s> {
             return Psfs::Prepared(psf.clone()).into();
         }
         let (set, fields, form) = (self.set, Arc::clone(&self.fields), self.form);
+        // Drawn by the workers: the one thread that reads rows would otherwise draw all stars.
         Lazy::new(move || {
             let n = set.grid().n;
             match form {

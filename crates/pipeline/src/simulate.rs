@@ -62,6 +62,7 @@ pub fn simulate_blind(
     let mut simulators = Vec::new();
     for of_set in todo.chunk_by(|a, b| a.set == b.set) {
         let simulator = simulator(of_set[0].set, record.settings)?;
+        // Before the images: one whose truth is missing cannot be scored, and a complete image is not simulated again.
         write_truth(private, &simulator)?;
         simulators.push((simulator, of_set));
     }
@@ -116,6 +117,7 @@ struct Row<'s> {
 fn feed<'s>(simulators: &'s [(SetSimulator, &[ImageId])], feeder: &mut Feeder<'_, Row<'s>>) {
     for (set, images) in simulators {
         for id in *images {
+            // Shared by the rows, because they are drawn from one realisation of PSFs and intrinsic shapes.
             let fields = Arc::new(set.image_fields(id.image));
             for iy in 0..set.grid().n {
                 let fields = Arc::clone(&fields);

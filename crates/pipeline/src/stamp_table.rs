@@ -128,6 +128,7 @@ impl StampTable {
 
     /// One noise level per stamp, if a map gave them.
     pub(crate) fn noise(&self, path: &Path) -> Result<Option<Vec<f64>>, FileError> {
+        // Optional: without a map, the survey of the image measures one level for all stamps.
         match self.columns.column(NOISE) {
             Ok(_) => Ok(Some(numbers(&self.columns, NOISE, path)?.into_owned())),
             Err(_) => Ok(None),

@@ -35,6 +35,7 @@ const MAX_TPV: usize = 39;
 const TPV_ORDERS: i32 = 7;
 // Distortions are small, so that Newton's method needs some five steps.
 const MAX_NEWTON_STEPS: usize = 50;
+// Far below the error of a centroid, and above the rounding of pixel numbers up to 10⁵, which is 10⁻¹¹.
 const INVERSE_ERROR_PX: f64 = 1e-9;
 
 // Ratio of the determinant to the sum of squares below which axes count as parallel. Chosen by hand: as Jacobian::new.
@@ -186,6 +187,7 @@ impl Map {
         let [centre, east, north] = tangent([*ra, *dec], *lonpole);
         let [point, ..] = tangent(sky, std::f64::consts::PI);
         let height = dot(&point, &centre);
+        // The other half of the sky would be mirrored onto the plane.
         if height.is_nan() || height <= 0.0 {
             return None;
         }
@@ -275,7 +277,7 @@ impl Wcs {
     fn of_keys(number: impl Fn(&str) -> Option<f64>, text: impl Fn(&str) -> String) -> Self {
         let kinds = ["CTYPE1", "CTYPE2"].map(&text);
         let kind = kinds[0].as_str();
-        // GalSim writes planes in arcseconds without a unit.
+        // GalSim writes planes in arcseconds without a unit; others without a unit have degrees, as the standard prescribes.
         let plane = kind == "LINEAR";
         let gs_plane = plane && !text("GS_WCS").is_empty();
         let unit = arcsec_of(&text("CUNIT1"), gs_plane);
@@ -433,6 +435,7 @@ impl Wcs {
             return Vec::new();
         };
         let text = |text: &str| Value::Text(text.into());
+        // Without a reference point, because the stamps are not where the image of the header had them.
         let mut keys = vec![("GS_WCS", text("JacobianWCS"))];
         keys.extend(["CTYPE1", "CTYPE2"].map(|key| (key, text("LINEAR"))));
         keys.extend(["CUNIT1", "CUNIT2"].map(|key| (key, text("arcsec"))));
@@ -483,6 +486,7 @@ impl Wcs {
                 mirrored,
                 shear: [g1, g2],
             } = frame(&product(regular_inverse(psf)?, galaxies));
+            // A rotation that both have in common does no harm: the PSF is deconvolved in the pixels of the galaxies.
             let differs = mirrored
                 || angle.abs() > MIN_ROTATION_DEGREES
                 || g1.hypot(g2) > MIN_PIXEL_DIFFERENCE;
