@@ -8,7 +8,6 @@ use shearq_files::table::FileFormat;
 use shearq_pipeline::gather::Square;
 use shearq_render::table::TableFormat;
 use shearq_results::bias::columns::Shapes;
-use shearq_results::compare::Grouping;
 use shearq_results::response::{Position, Shared};
 use shearq_results::submit::Contents;
 use shearq_scoring::{Definition, TruthSign};
@@ -82,13 +81,6 @@ choices! {
     Definition {
         Leaderboard: "leaderboard", "The arithmetic of the challenge";
         Corrected: "corrected", "Azimuthal averages over fixed bins";
-    }
-    Grouping {
-        Set: "set", "Each set alone";
-        SetKind: "set-kind", "Kind of set, as in Table 2 of the paper";
-        Psf: "psf", "Fixed or variable PSF";
-        Snr: "snr", "Class of S/N";
-        Size: "size", "Class of galaxy sizes";
     }
     Design {
         Single: "single", "One true shear";

@@ -155,8 +155,8 @@ const WAYS: [(&str, &[&str]); 32] = [
     (
         "compare",
         &[
-            "OUT data foreign where sort group-by plot format wide metrics report definition convention threads",
-            "store where sort group-by plot format wide metrics report",
+            "OUT data foreign where sort plot format wide metrics report definition convention threads",
+            "store where sort plot format wide metrics report",
             "OUT challenge branch truth psf subfields leaderboard format threads",
         ],
     ),

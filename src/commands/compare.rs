@@ -4,19 +4,17 @@ use clap::Args;
 
 use super::published;
 use crate::arguments::{Printing, ReportFile, ScoreSettings, Threads};
-use crate::choices;
 use crate::score;
 use shearq_dataset::run::Run;
 use shearq_render::figure::{Figure, LinePlot};
 use shearq_render::table::Table;
-use shearq_results::compare::{Group, Grouping, Order, choose, chosen, score_all};
+use shearq_results::compare::{Order, choose, chosen, score_all};
 use shearq_results::expression::Expression;
 use shearq_results::published::Truth;
-use shearq_results::record::RunRecord;
 use shearq_results::store;
 use shearq_results::submit::is_packed;
 use shearq_results::views::comparison::{
-    compare, compare_runs, named, notes_of_variants, q_per_set, verdict, verdict_on_runs,
+    compare, compare_runs, named, q_per_set, verdict, verdict_on_runs,
 };
 use shearq_results::views::pages;
 use shearq_scoring::Options;
@@ -69,9 +67,6 @@ pub(crate) struct Arguments {
     /// Metric or column to sort by, such as `q:desc`.
     #[arg(long, value_name = "FIELD[:desc]")]
     sort: Option<Order>,
-    /// Average over groups of sets instead of all sets.
-    #[arg(long, value_parser = choices::named::<Grouping>())]
-    group_by: Option<Grouping>,
     /// Draw Q of each run and set to this file (.png or .svg).
     #[arg(long, value_name = "FILE")]
     plot: Option<PathBuf>,
@@ -86,13 +81,12 @@ pub(crate) struct Arguments {
 }
 
 // Options without a meaning for submissions to other challenges; `path` is --report.
-const GREAT10_ONLY: [&str; 12] = [
+const GREAT10_ONLY: [&str; 11] = [
     "data",
     "foreign",
     "store",
     "condition",
     "sort",
-    "group_by",
     "plot",
     "wide",
     "metrics",
@@ -175,19 +169,7 @@ fn folders(arguments: &Arguments) -> anyhow::Result<Comparison> {
         arguments.threads.number(),
     )?;
     let variants = chosen(variants, arguments.condition.as_ref(), order)?;
-    let table = match arguments.group_by {
-        None => compare(&variants, options.definition),
-        Some(_) => {
-            let runs: Vec<RunRecord> = variants.iter().map(|own| own.run.clone()).collect();
-            let groups = Group::of(&runs, arguments.group_by, order);
-            let mut table = compare_runs(&runs, &groups, arguments.group_by);
-            table.title = "Comparison of configurations".into();
-            let mut more = notes_of_variants(&variants);
-            more.retain(|line| !table.notes.contains(line));
-            table.notes.extend(more);
-            table
-        }
-    };
+    let table = compare(&variants, options.definition);
     let named = named(&variants);
     Ok(Comparison {
         table,
@@ -210,21 +192,17 @@ fn stored(arguments: &Arguments, path: &Path) -> anyhow::Result<Comparison> {
             None => ". Try: shearq score --measured OUT --store DIR",
         }
     );
-    let (grouping, order) = (arguments.group_by, arguments.sort.as_ref());
-    let groups = Group::of(&runs, grouping, order);
-    let mut table = compare_runs(&runs, &groups, grouping);
+    if let Some(order) = &arguments.sort {
+        order.sort(&mut runs);
+    }
+    let mut table = compare_runs(&runs);
     table.notes.extend(notes);
-    let whole = Group::of(&runs, None, order);
-    let rows = whole
+    let rows = runs
         .iter()
-        .map(|group| (group.name(), group.run.sets.as_slice()));
+        .map(|run| (run.name_with_id(), run.sets.as_slice()));
     Ok(Comparison {
         table,
-        // The verdict is on differences between runs, which groups of sets do not pair.
-        verdict: match grouping {
-            None => verdict_on_runs(&groups),
-            Some(_) => None,
-        },
         plot: q_per_set(&rows.collect::<Vec<_>>()),
+        verdict: verdict_on_runs(runs),
     })
 }

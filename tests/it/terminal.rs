@@ -40,7 +40,7 @@ fn tables_fit_eighty_columns_and_wide_ones_are_asked_for() {
     for command in [
         "compare den linear",
         "compare --store store",
-        "compare --store store --group-by snr",
+        "compare --store store",
         "submissions list",
         "study --sets 2 --images 2 --pairs 1 --grid 8 --out study",
         "run --simulate --sets 2 --images 2 --grid 8 --submission 23/raw/star --out run",

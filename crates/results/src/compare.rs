@@ -1,4 +1,4 @@
-//! Compares scores: methods on their common sets, recorded runs and groups of their sets, and paired differences.
+//! Compares scores: methods on their common sets, recorded runs, and paired differences.
 
 use std::cmp::Ordering;
 use std::collections::BTreeSet;
@@ -16,12 +16,11 @@ use shearq_render::table::Cell;
 use shearq_scoring::resample::{PairedDifference, PairedSet, paired_difference};
 use shearq_scoring::{Choice, Metrics, Options};
 use shearq_submissions::{Published, Registry};
-use strum_macros::IntoStaticStr;
 use thiserror::Error;
 
 use crate::catalogues::Catalogues;
 use crate::expression::{Expression, Operand, fits};
-use crate::record::{Column, RunRecord, SetRecord, columns_named, frame_of};
+use crate::record::{RunRecord, SetRecord, columns_named, frame_of};
 use crate::score::{ScoreError, ScoredSet, score_variants, unscored};
 use crate::submit::{Sent, Submission, is_packed};
 
@@ -73,7 +72,7 @@ pub fn chosen(
         return Err(ChoiceError::NoCommonSet);
     }
     if let Some(order) = order {
-        let key = |variant: &Variant| order.key(&Group::whole(&variant.run));
+        let key = |variant: &Variant| order.key(&variant.run);
         kept.sort_by(|a, b| in_order(&key(a), &key(b), order.descending));
     }
     Ok(kept)
@@ -274,24 +273,6 @@ fn values(table: &DataFrame, operand: &Operand) -> Result<Vec<f64>, ChoiceError>
     }
 }
 
-/// By which column the sets of a run are grouped.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, IntoStaticStr)]
-#[strum(serialize_all = "snake_case")]
-pub enum Grouping {
-    Set,
-    /// The kinds of the paper's Table 2.
-    SetKind,
-    Psf,
-    Snr,
-    Size,
-}
-
-impl Grouping {
-    pub fn column(self) -> Option<Column> {
-        columns_named(&[self.into()]).pop()
-    }
-}
-
 /// Field and direction of sorting: `q:desc`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Order {
@@ -299,8 +280,8 @@ pub struct Order {
     descending: bool,
 }
 
-// Fields other than metrics to sort by. `group` is the column of the `Grouping`.
-const SORTED: [&str; 5] = ["submission", "run", "version", "group", "images"];
+// Fields other than metrics to sort by.
+const SORTED: [&str; 4] = ["submission", "run", "version", "images"];
 
 impl FromStr for Order {
     type Err = String;
@@ -331,70 +312,13 @@ impl FromStr for Order {
 }
 
 impl Order {
-    fn key(&self, group: &Group) -> Cell {
-        match columns_named(&[&self.field]).first() {
-            Some(column) => column.cell(&group.run),
-            None => group.value.clone(),
-        }
-    }
-}
-
-/// A run, or those of its sets that have one value in the column of a [`Grouping`].
-#[derive(Debug, Clone)]
-pub struct Group {
-    pub run: RunRecord,
-    /// Empty without a grouping.
-    pub value: Cell,
-}
-
-impl Group {
-    fn whole(run: &RunRecord) -> Self {
-        Group {
-            run: run.clone(),
-            value: Cell::Empty,
-        }
+    fn key(&self, run: &RunRecord) -> Cell {
+        let column = columns_named(&[&self.field]).pop();
+        column.map_or(Cell::Empty, |column| column.cell(run))
     }
 
-    /// The groups of runs. Groups of equal value are adjacent and sorted by `order`.
-    pub fn of(runs: &[RunRecord], grouping: Option<Grouping>, order: Option<&Order>) -> Vec<Self> {
-        let column = grouping.and_then(Grouping::column);
-        let mut groups: Vec<Group> = Vec::new();
-        for run in runs {
-            let first = groups.len();
-            for set in &run.sets {
-                let value = column.map_or(Cell::Empty, |column| {
-                    column.cell_of_sets(std::slice::from_ref(set))
-                });
-                match groups[first..].iter_mut().find(|own| own.value == value) {
-                    Some(group) => group.run.sets.push(set.clone()),
-                    None => groups.push(Group {
-                        run: RunRecord {
-                            sets: vec![set.clone()],
-                            ..run.clone()
-                        },
-                        value,
-                    }),
-                }
-            }
-        }
-        let by_value = Order {
-            field: "group".into(),
-            descending: order.is_some_and(|order| order.field == "group" && order.descending),
-        };
-        // The second sort is stable, so that it keeps the order within a group.
-        for order in order.into_iter().chain([&by_value]) {
-            groups.sort_by(|a, b| in_order(&order.key(a), &order.key(b), order.descending));
-        }
-        groups
-    }
-
-    /// The first digits of the run's id, enough to distinguish the runs of a store.
-    pub fn id(&self) -> String {
-        self.run.id().chars().take(8).collect()
-    }
-
-    pub fn name(&self) -> String {
-        format!("{} {}", self.run.configuration, self.id())
+    pub fn sort(&self, runs: &mut [RunRecord]) {
+        runs.sort_by(|a, b| in_order(&self.key(a), &self.key(b), self.descending));
     }
 }
 

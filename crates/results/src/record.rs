@@ -182,6 +182,15 @@ impl RunRecord {
         Ok(self)
     }
 
+    /// The first digits of the id, enough to distinguish the runs of a store.
+    pub fn short_id(&self) -> String {
+        self.id().chars().take(8).collect()
+    }
+
+    pub fn name_with_id(&self) -> String {
+        format!("{} {}", self.configuration, self.short_id())
+    }
+
     /// Fingerprint of version, settings, data and way of scoring, but not of sets and images: shards of a run share it.
     pub fn id(&self) -> String {
         let RunRecord {

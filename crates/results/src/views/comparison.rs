@@ -8,7 +8,7 @@ use shearq_scoring::resample::PairedDifference;
 use shearq_scoring::{Definition, Fault, Metrics};
 use shearq_submissions::Published;
 
-use crate::compare::{Group, Grouping, Paired, Variant, difference, keep_common_sets};
+use crate::compare::{Paired, Variant, difference, keep_common_sets};
 use crate::record::{RunRecord, SetRecord, columns_named, mean};
 use crate::score::ScoredSet;
 use crate::views::scores::{best_is_another, definition_note, notes, of_sets, zero_shear_note};
@@ -175,7 +175,7 @@ fn sets_and_images(variants: &[Variant]) -> (String, usize) {
 }
 
 /// Notes on the sets of each variant. A note on several variants appears once, with their names.
-pub fn notes_of_variants(variants: &[Variant]) -> Vec<String> {
+fn notes_of_variants(variants: &[Variant]) -> Vec<String> {
     let mut found: Vec<(String, Vec<&str>)> = Vec::new();
     for variant in variants {
         let lines = notes(&variant.scored()).into_iter();
@@ -215,48 +215,37 @@ pub fn compact(variants: &[Variant]) -> Table {
     table
 }
 
-/// Runs side by side: means over sets or groups of sets, and the difference in Q from the first row, or the first row of
-/// the group, on the same images.
-pub fn compare_runs(runs: &[RunRecord], groups: &[Group], grouping: Option<Grouping>) -> Table {
-    let mut unpaired: Vec<String> = Vec::new();
-    let mut rows = Vec::new();
-    for (k, group) in groups.iter().enumerate() {
-        // Differences are meaningful within a group only: sets differ by more than methods do.
-        let first = groups[..k].iter().find(|other| other.value == group.value);
-        let differences = first.map(|first| differences(&first.run, &group.run));
-        if matches!(differences, Some([None, _])) && !unpaired.contains(&group.id()) {
-            unpaired.push(group.id());
-        }
-        rows.push(Compared {
-            run: &group.run,
-            differences: differences.unwrap_or_default(),
-        });
-    }
+/// Runs side by side: means over their sets, and the difference in Q from the first run on the same images.
+pub fn compare_runs(runs: &[RunRecord]) -> Table {
+    let rows = runs.iter().enumerate().map(|(k, run)| Compared {
+        run,
+        differences: match k {
+            0 => [None; 2],
+            _ => differences(&runs[0], run),
+        },
+    });
+    let rows: Vec<Compared<'_>> = rows.collect();
+    let unpaired = rows.iter().skip(1);
+    let unpaired = unpaired.filter(|row| row.differences[0].is_none());
+    let unpaired: Vec<String> = unpaired.map(|row| row.run.short_id()).collect();
     let mut table = Table::titled("Recorded runs");
-    table.column("submission", "Configuration", groups, |group| {
-        Cell::text(&group.run.configuration)
+    table.column("submission", "Configuration", runs, |run| {
+        Cell::text(&run.configuration)
     });
-    table.column("run", "Run", groups, |group| Cell::text(group.id()));
-    let version = table.column("version", "Version", groups, |group| {
-        Cell::text(&group.run.version)
-    });
+    table.column("run", "Run", runs, |run| Cell::text(run.short_id()));
+    let version = table.column("version", "Version", runs, |run| Cell::text(&run.version));
     table.headings[version].detail = true;
-    if let Some(own) = grouping.and_then(Grouping::column) {
-        table.column(own.name, own.heading, groups, |group| group.value.clone());
-    }
-    table.column("sets", "Sets", groups, |group| {
-        Cell::text(ranges(&group.run.sets))
-    });
-    table.column("images", "Images", groups, |group| {
-        let images: usize = group.run.sets.iter().map(|set| set.images.len()).sum();
+    table.column("sets", "Sets", runs, |run| Cell::text(ranges(&run.sets)));
+    table.column("images", "Images", runs, |run| {
+        let images: usize = run.sets.iter().map(|set| set.images.len()).sum();
         Cell::number(images as f64, 0)
     });
     add_metrics(&mut table, &rows);
-    table.notes = run_notes(runs, grouping, &unpaired);
+    table.notes = run_notes(runs, &unpaired);
     table
 }
 
-fn run_notes(runs: &[RunRecord], grouping: Option<Grouping>, unpaired: &[String]) -> Vec<String> {
+fn run_notes(runs: &[RunRecord], unpaired: &[String]) -> Vec<String> {
     let way = |run: &RunRecord| {
         format!(
             "{} definition, {} convention, noise {}",
@@ -270,9 +259,6 @@ fn run_notes(runs: &[RunRecord], grouping: Option<Grouping>, unpaired: &[String]
         "Means over the sets of each row. Metrics: {}. √A in 10⁻⁴ for C_ℓ in steradian.",
         ways.join("; ")
     )];
-    if grouping.is_some() {
-        notes.push("ΔQ, ΔQ cal.: difference from the first row of the group.".into());
-    }
     if several {
         notes.push("warning: the runs were scored in different ways and cannot be compared. Try: --where \"definition == 'leaderboard'\" or \"choice == 'matched'\"".into());
     }
@@ -325,12 +311,11 @@ pub fn q_per_set(rows: &[Named<'_>]) -> LinePlot {
 }
 
 /// The verdict on recorded runs, from the sets that all of them have.
-pub fn verdict_on_runs(groups: &[Group]) -> Option<String> {
-    let mut groups = groups.to_vec();
-    keep_common_sets(groups.iter_mut().map(|group| &mut group.run));
-    let named = groups
+pub fn verdict_on_runs(mut runs: Vec<RunRecord>) -> Option<String> {
+    keep_common_sets(runs.iter_mut());
+    let named = runs
         .iter()
-        .map(|group| (group.name(), group.run.sets.as_slice()));
+        .map(|run| (run.name_with_id(), run.sets.as_slice()));
     verdict(&named.collect::<Vec<_>>())
 }
 
