@@ -145,7 +145,6 @@ const WAYS: [(&str, &[&str]); 32] = [
             "data foreign sets noise-var store format wide metrics report definition convention threads",
             "data packed sets noise-var store format wide metrics definition convention threads",
             "truth CATALOGUE truth-sign stamp field columns ellipticity missing drop-missing max-modulus noise-var format wide metrics report definition convention threads",
-            "truth spectra truth-sign stamp field format wide metrics definition threads",
             "data measured sets aperture-mass format wide metrics convention threads",
             "data foreign sets aperture-mass format wide metrics convention threads",
             "truth CATALOGUE truth-sign stamp field columns ellipticity missing drop-missing max-modulus aperture-mass format wide metrics convention threads",

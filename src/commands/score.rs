@@ -13,7 +13,7 @@ use crate::choices::named;
 use crate::{print, tell, tell_unread};
 use shearq_dataset::layout::DataFolder;
 use shearq_dataset::run::{Run, Source, kind_of};
-use shearq_dataset::truth::{ReadTruth, Reading, Sign, read_truth, reading_of};
+use shearq_dataset::truth::{ReadTruth, Reading, read_truth, reading_of};
 use shearq_render::table::TableFormat;
 use shearq_results::aperture;
 use shearq_results::catalogues::{COLUMNS, Catalogues};
@@ -33,10 +33,10 @@ use shearq_results::views::scores::{SetInput, one_set_json, per_set, spectra};
 /// `--data DATA --foreign FILE`, and plain files of one set with `--truth truth.csv CATALOGUE...`.
 ///
 /// Plain files are one catalogue per image: CSV with a header, ASCII `x y e1 e2`, FITS or Parquet, by the file's
-/// ending. Their `--format json` lists all eight conventions. Score a power spectrum with --spectra, a submission
-/// as `pack` writes it with --packed, and a submission to GREAT3 or GREAT08 with --challenge (docs/great3.md).
+/// ending. Their `--format json` lists all eight conventions. Score a submission as `pack` writes it, of catalogues
+/// or power spectra, with --packed, and a submission to GREAT3 or GREAT08 with --challenge (docs/great3.md).
 #[derive(Debug, Args)]
-#[command(group = ArgGroup::new("input").required(true).args(["measured", "foreign", "spectra", "packed", "catalogues"]))]
+#[command(group = ArgGroup::new("input").required(true).args(["measured", "foreign", "packed", "catalogues"]))]
 pub(crate) struct Arguments {
     /// Data folder with the true shear [default with --measured: the data that were measured].
     #[arg(long, value_name = "DIR", conflicts_with = "truth")]
@@ -54,9 +54,6 @@ pub(crate) struct Arguments {
     /// Catalogues of another program, described by a TOML file (docs/files.md).
     #[arg(long, value_name = "FILE", requires = "data", conflicts_with = "truth")]
     foreign: Option<PathBuf>,
-    /// Power spectrum (`index l power`) of the set of --truth.
-    #[arg(long, value_name = "FILE", requires = "truth", conflicts_with_all = ["data", "sets", "noise_var", "convention", "path"])]
-    spectra: Option<PathBuf>,
     /// Submission as `pack` writes it: a folder or an archive (.tar.gz) of catalogues or power spectra.
     #[arg(long, value_name = "PATH", requires = "data", conflicts_with_all = ["truth", "path"])]
     packed: Option<PathBuf>,
@@ -94,7 +91,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "E", value_parser = positive, requires = "truth", conflicts_with_all = NOT_PLAIN)]
     max_modulus: Option<f64>,
     /// Print the aperture mass dispersion of the catalogues and of the true shear instead of scores.
-    #[arg(long, conflicts_with_all = ["spectra", "packed", "store", "path", "noise_var", "definition", "challenge", "branch", "psf", "subfields"])]
+    #[arg(long, conflicts_with_all = ["packed", "store", "path", "noise_var", "definition", "challenge", "branch", "psf", "subfields"])]
     aperture_mass: bool,
     /// Score a submission to this challenge: great3, great08.
     #[arg(long, value_name = "NAME", requires = "truth", conflicts_with_all = GREAT10_ONLY)]
@@ -110,7 +107,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "N", requires = "branch", conflicts_with_all = GREAT10_ONLY, value_parser = clap::value_parser!(u16).range(1..=1000))]
     subfields: Option<u16>,
     /// Record the scores in this results store, for `compare --store`.
-    #[arg(long, value_name = "DIR", conflicts_with_all = ["truth", "spectra"])]
+    #[arg(long, value_name = "DIR", conflicts_with = "truth")]
     store: Option<PathBuf>,
     #[command(flatten)]
     printing: Printing,
@@ -126,16 +123,13 @@ pub(crate) struct Arguments {
 // it.
 const FOLDERS: [&str; 6] = ["data", "measured", "foreign", "packed", "sets", "store"];
 // Inputs whose columns, type and missing values are specified by a record or a description.
-const NOT_PLAIN: [&str; 7] = [
-    "data", "measured", "foreign", "packed", "spectra", "sets", "store",
-];
+const NOT_PLAIN: [&str; 6] = ["data", "measured", "foreign", "packed", "sets", "store"];
 
 // Options without a meaning for submissions to other challenges.
-const GREAT10_ONLY: [&str; 20] = [
+const GREAT10_ONLY: [&str; 19] = [
     "data",
     "measured",
     "foreign",
-    "spectra",
     "packed",
     "sets",
     "noise_var",
@@ -183,11 +177,9 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         choice: arguments.settings.convention.unwrap_or_default(),
     };
     let data = arguments.data.as_ref().map(DataFolder::open).transpose()?;
-    match (&arguments.truth, &arguments.spectra) {
-        (Some(truth), Some(spectrum)) => spectrum_file(arguments, truth, spectrum, options),
-        (Some(truth), None) => files(arguments, truth, options),
-        // Clap requires --truth with --spectra.
-        (None, _) => catalogues(arguments, data, options),
+    match &arguments.truth {
+        Some(truth) => files(arguments, truth, options),
+        None => catalogues(arguments, data, options),
     }
 }
 
@@ -357,30 +349,11 @@ fn score_spectra(
             set, simulated, truth, path, manifest, options,
         )?);
     }
-    print_spectra(arguments, scored, place, options)
-}
-
-fn spectrum_file(
-    arguments: &Arguments,
-    path: &Path,
-    spectrum: &Path,
-    options: Options,
-) -> anyhow::Result<()> {
-    let truth = read_truth(path, &plain_reading(arguments))?;
-    // A power spectrum does not change with the sign of e2, so that only the file itself can state the sign.
-    if truth.sign.is_none() {
-        let unknown = Sign::of_catalogues(None).map_err(anyhow::Error::msg);
-        unknown.with_context(|| path.display().to_string())?;
-    }
-    let manifest = Manifest::read(folder_of(spectrum))?;
-    let line = truth.sign.and_then(Sign::line);
-    // Set 0: plain files have no set number, and sets count from 1.
-    let scored = score_spectrum(0, false, truth, spectrum, manifest.as_ref(), options)?;
-    if let Some(line) = line {
-        tell(format_args!("{line}"));
-    }
-    print_spectra(arguments, vec![scored], spectrum, options)?;
-    Ok(())
+    let (records, zero): (Vec<SetRecord>, Vec<f64>) = scored.into_iter().unzip();
+    let title = format!("Scores of the power spectra of {}", place.display());
+    let table = spectra(&records, &zero, &title, options.definition);
+    arguments.printing.print(&table)?;
+    Ok(records)
 }
 
 // With Q of a spectrum of zeros, the value that a method without any signal reaches.
@@ -399,19 +372,6 @@ fn score_spectrum(
     let score = SetScorer::new(grid, shear, options)?.score_spectrum(&powers, covariance)?;
     let record = SetRecord::of_spectrum(set, simulated, Vec::new(), &score);
     Ok((record, score.zero_q))
-}
-
-fn print_spectra(
-    arguments: &Arguments,
-    scored: Vec<(SetRecord, f64)>,
-    path: &Path,
-    options: Options,
-) -> anyhow::Result<Vec<SetRecord>> {
-    let (records, zero): (Vec<SetRecord>, Vec<f64>) = scored.into_iter().unzip();
-    let title = format!("Scores of the power spectra of {}", path.display());
-    let table = spectra(&records, &zero, &title, options.definition);
-    arguments.printing.print(&table)?;
-    Ok(records)
 }
 
 fn plain_reading(arguments: &Arguments) -> Reading {
