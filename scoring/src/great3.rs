@@ -124,6 +124,117 @@ pub fn along(g: Shear, axis: Radians) -> PlusCross<f64> {
     }
 }
 
+/// What distinguishes the branches of one observation and shear.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Experiment {
+    /// Parametric galaxies, one PSF per subfield.
+    Control,
+    /// Galaxies of images of the Hubble Space Telescope.
+    RealGalaxy,
+    /// A PSF that varies over the field.
+    VariablePsf,
+    /// Several epochs.
+    Multiepoch,
+    /// All of these.
+    Full,
+}
+
+/// One of the 20 branches, such as control-ground-constant.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Branch {
+    /// The experiment.
+    pub experiment: Experiment,
+    /// From the ground or from space.
+    pub observation: Observation,
+    /// Whether all galaxies of a field have one shear.
+    pub constant: bool,
+}
+
+impl Branch {
+    /// All branches.
+    pub fn all() -> impl Iterator<Item = Self> {
+        use Experiment::{Control, Full, Multiepoch, RealGalaxy, VariablePsf};
+        let kinds = [Observation::Ground, Observation::Space]
+            .into_iter()
+            .flat_map(|observation| [true, false].map(|constant| (observation, constant)));
+        let experiments = [Control, RealGalaxy, VariablePsf, Multiepoch, Full];
+        experiments.into_iter().flat_map(move |experiment| {
+            kinds.clone().map(move |(observation, constant)| Branch {
+                experiment,
+                observation,
+                constant,
+            })
+        })
+    }
+
+    /// The branch of a name or a folder; `None` if there is no such branch.
+    pub fn named(name: &str) -> Option<Self> {
+        Branch::all().find(|branch| branch.to_string() == name.replace('/', "-"))
+    }
+
+    /// Where the challenge has its files, below the root of its data.
+    pub fn folder(self) -> String {
+        self.to_string().replace('-', "/")
+    }
+
+    fn has_epochs(self) -> bool {
+        matches!(self.experiment, Experiment::Multiepoch | Experiment::Full)
+    }
+
+    /// Images of a subfield.
+    pub fn epochs(self) -> usize {
+        if self.has_epochs() { EPOCHS } else { 1 }
+    }
+
+    /// Subfields that share a row of a submission.
+    pub fn subfields_per_field(self) -> usize {
+        match self.experiment {
+            Experiment::VariablePsf | Experiment::Full => SUBFIELDS_PER_FIELD,
+            _ if self.constant => 1,
+            _ => SUBFIELDS_PER_FIELD,
+        }
+    }
+
+    /// Pixels per side of a stamp.
+    pub fn stamp(self) -> usize {
+        match (self.observation, self.has_epochs()) {
+            (Observation::Space, false) => 96,
+            _ => 48,
+        }
+    }
+
+    /// Side of a pixel in arcsec.
+    pub fn pixel_arcsec(self) -> f64 {
+        match (self.observation, self.has_epochs()) {
+            (Observation::Ground, _) => 0.2,
+            (Observation::Space, false) => 0.05,
+            (Observation::Space, true) => 0.1,
+        }
+    }
+}
+
+impl fmt::Display for Branch {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let experiment = match self.experiment {
+            Experiment::Control => "control",
+            Experiment::RealGalaxy => "real_galaxy",
+            Experiment::VariablePsf => "variable_psf",
+            Experiment::Multiepoch => "multiepoch",
+            Experiment::Full => "full",
+        };
+        let observation = match self.observation {
+            Observation::Ground => "ground",
+            Observation::Space => "space",
+        };
+        let shear = if self.constant {
+            "constant"
+        } else {
+            "variable"
+        };
+        write!(f, "{experiment}-{observation}-{shear}")
+    }
+}
+
 /// A value with two errors.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[cfg_attr(feature = "serde", derive(Serialize))]

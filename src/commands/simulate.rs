@@ -10,8 +10,8 @@ use shearq_dataset::images;
 use shearq_dataset::layout::{DataFolder, MAX_IMAGE};
 use shearq_dataset::run::SimulationRecord;
 use shearq_pipeline::simulate::{great3, simulate_folder};
-use shearq_scoring::great3::{GRID, SUBFIELDS};
-use shearq_simulate::great3::{Branch, BranchSimulator};
+use shearq_scoring::great3::{Branch, GRID, SUBFIELDS};
+use shearq_simulate::great3::{BranchSimulator, simulated_branches};
 use shearq_simulate::set::SimulationSettings;
 
 /// Write simulated GREAT10-like sets: images, PSFs, true shear and intrinsic shapes.
@@ -82,9 +82,9 @@ const GREAT10_ONLY: [&str; 7] = [
 ];
 
 fn branch(name: &str) -> Result<Branch, String> {
-    let found = Branch::all().find(|(own, _)| own == name);
-    found.map(|(_, branch)| branch).ok_or_else(|| {
-        let names: Vec<String> = Branch::all().map(|(own, _)| own).collect();
+    let found = simulated_branches().find(|branch| branch.to_string() == name);
+    found.ok_or_else(|| {
+        let names: Vec<String> = simulated_branches().map(|own| own.to_string()).collect();
         format!("expected one of {}", names.join(", "))
     })
 }

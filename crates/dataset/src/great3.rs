@@ -35,7 +35,7 @@ const MAX_ROUNDING: f64 = 1e-5;
 /// What a branch has that other data folders do not.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-pub struct Branch {
+pub struct BranchLayout {
     /// Whether each galaxy has a partner in its subfield that is rotated by 90°, as in all branches of constant shear.
     pub rotated_pairs: bool,
     /// Whether all stars of a field are stacked. Otherwise the lower-left one is used, which alone is at a known place.
@@ -48,7 +48,7 @@ pub(crate) struct Found {
     pub(crate) galaxies: &'static str,
     pub(crate) psf_star: &'static str,
     pub(crate) stamp: usize,
-    pub(crate) branch: Branch,
+    pub(crate) branch: BranchLayout,
 }
 
 /// `None` without images and catalogues of the branch.
@@ -76,7 +76,7 @@ pub(crate) fn detect(root: &Path) -> Result<Option<Found>, FileError> {
         galaxies: GALAXIES,
         psf_star,
         stamp: galaxies.stamp()?,
-        branch: Branch {
+        branch: BranchLayout {
             rotated_pairs: galaxies.have_constant_shear()?,
             stacked_stars: false,
         },
@@ -218,7 +218,7 @@ impl GalaxyCatalogue {
     pub fn identities(
         &self,
         set: u32,
-        branch: Branch,
+        branch: BranchLayout,
         mosaic: &Mosaic,
     ) -> Result<Vec<i64>, FileError> {
         let step = match branch.rotated_pairs {

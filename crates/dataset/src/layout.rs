@@ -37,7 +37,7 @@ pub struct Layout {
     pub stamp: usize,
     /// The folder is a branch of GREAT3.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub great3: Option<great3::Branch>,
+    pub great3: Option<great3::BranchLayout>,
 }
 
 impl Default for Layout {

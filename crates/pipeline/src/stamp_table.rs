@@ -4,7 +4,7 @@
 
 use std::path::Path;
 
-use shearq_dataset::great3::{Branch, GalaxyCatalogue};
+use shearq_dataset::great3::{BranchLayout, GalaxyCatalogue};
 use shearq_dataset::mosaic::Mosaic;
 use shearq_files::FileError;
 use shearq_files::atomic;
@@ -101,7 +101,7 @@ impl StampTable {
     pub(crate) fn of_great3(
         path: &Path,
         set: u32,
-        branch: Branch,
+        branch: BranchLayout,
         mosaic: &Mosaic,
     ) -> Result<Self, FileError> {
         let ids = GalaxyCatalogue::read(path)?.identities(set, branch, mosaic)?;

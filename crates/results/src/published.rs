@@ -1,7 +1,7 @@
 //! Challenges that others ran and whose truth is public. Each is a module with the same interface: truth, submission, metrics,
 //! pre-submission and leaderboard. GREAT10 is the format of `score`, `pack` and `check` themselves.
 //!
-//! A further challenge is a module with a type that implements [`Branch`], and a line in [`CHALLENGES`].
+//! A further challenge is a module with a type that implements [`Board`], and a line in [`CHALLENGES`].
 
 pub mod great08;
 pub mod great3;
@@ -20,6 +20,7 @@ use shearq_render::figure::{FigureError, LinePlot, PanelGrid};
 use shearq_render::html::{Block, Picture, Section};
 use shearq_render::table::{Cell, Table};
 use shearq_scoring::Line;
+use shearq_scoring::great3::Branch;
 
 /// A challenge by the name that users type.
 #[derive(Debug)]
@@ -27,21 +28,21 @@ pub struct Challenge {
     pub name: &'static str,
     /// Its branches by name; empty if it has a single one.
     pub branches: fn() -> Vec<String>,
-    branch: fn(Option<&str>) -> Option<Box<dyn Branch>>,
+    branch: fn(Option<&str>) -> Option<Box<dyn Board>>,
 }
 
 pub static CHALLENGES: [Challenge; 2] = [
     Challenge {
         name: "great3",
-        branches: great3::branches,
-        branch: |name| Some(Box::new(great3::Great3::named(name?)?)),
+        branches: || Branch::all().map(|own| own.to_string()).collect(),
+        branch: |name| Some(Box::new(great3::Great3(Branch::named(name?)?))),
     },
     Challenge {
         name: "great08",
         branches: Vec::new,
         branch: |name| {
             name.is_none()
-                .then(|| Box::new(great08::Great08) as Box<dyn Branch>)
+                .then(|| Box::new(great08::Great08) as Box<dyn Board>)
         },
     },
 ];
@@ -68,7 +69,7 @@ impl Challenge {
         })
     }
 
-    pub fn branch(&self, name: Option<&str>) -> Result<Box<dyn Branch>, Unknown> {
+    pub fn branch(&self, name: Option<&str>) -> Result<Box<dyn Board>, Unknown> {
         (self.branch)(name).ok_or_else(|| Unknown::Branch {
             challenge: self.name,
             found: name.unwrap_or("none").into(),
@@ -91,8 +92,8 @@ pub struct Truth<'a> {
     pub subfields: Option<usize>,
 }
 
-/// What differs between challenges and between their branches.
-pub trait Branch {
+/// What differs between challenges and between their branches, each of which has a leaderboard.
+pub trait Board {
     fn title(&self) -> String;
     /// Scores a submission.
     fn score(&self, truth: Truth<'_>, submission: &Path, pool: &Pool) -> Result<Score, FileError>;
@@ -238,7 +239,7 @@ impl Score {
 }
 
 /// The leaderboard of a branch with own scores among the published entries, best first.
-pub fn ranking(branch: &dyn Branch, own: &[(String, Score)]) -> Table {
+pub fn ranking(branch: &dyn Board, own: &[(String, Score)]) -> Table {
     let published = branch.leaderboard();
     let mut rows: Vec<(Entry, Option<f64>)> = own
         .iter()

@@ -14,7 +14,8 @@ use shearq_fourier::Complex64;
 use shearq_quantities::{FunctionalPsf, PsfProfile, PsfTransform, Pupil, Shear, TransformedPsf};
 use shearq_scoring::aperture::Lattice;
 use shearq_scoring::great3::{
-    EPOCHS, Identity, NODES_PER_GALAXY, STARS_PER_SIDE, SUBFIELDS_PER_FIELD,
+    Branch, Experiment, Identity, NODES_PER_GALAXY, Observation, STARS_PER_SIDE,
+    SUBFIELDS_PER_FIELD,
 };
 use shearq_scoring::modes::Decomposer;
 use shearq_scoring::{Grid, ScoringError};
@@ -56,60 +57,10 @@ const INDICES: [f64; 8] = [0.5, 1.0, 1.0, 1.0, 1.5, 1.5, 2.5, 4.0];
 const SNR: (f64, f64) = (20.0, 400.0);
 const COUNT_SLOPE: f64 = 1.5;
 
-/// What distinguishes the branches that can be simulated.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Branch {
-    multiepoch: bool,
-    space: bool,
-    variable: bool,
-}
-
-impl Branch {
-    /// The branches by name, such as control-ground-constant.
-    pub fn all() -> impl Iterator<Item = (String, Self)> {
-        (0..8).map(|k| {
-            let branch = Branch {
-                multiepoch: k & 4 != 0,
-                space: k & 2 != 0,
-                variable: k & 1 != 0,
-            };
-            (branch.folder().replace('/', "-"), branch)
-        })
-    }
-
-    /// Where the challenge has its files, below the root of its data.
-    pub fn folder(self) -> String {
-        format!(
-            "{}/{}/{}",
-            ["control", "multiepoch"][usize::from(self.multiepoch)],
-            ["ground", "space"][usize::from(self.space)],
-            ["constant", "variable"][usize::from(self.variable)],
-        )
-    }
-
-    pub fn is_variable(self) -> bool {
-        self.variable
-    }
-
-    pub fn epochs(self) -> usize {
-        if self.multiepoch { EPOCHS } else { 1 }
-    }
-
-    /// Pixels per side of a stamp.
-    pub fn stamp(self) -> usize {
-        match (self.space, self.multiepoch) {
-            (true, false) => 96,
-            _ => 48,
-        }
-    }
-
-    fn pixel_arcsec(self) -> f64 {
-        match (self.space, self.multiepoch) {
-            (false, _) => 0.2,
-            (true, false) => 0.05,
-            (true, true) => 0.1,
-        }
-    }
+/// The branches that can be simulated: the PSF of others varies, or their galaxies are images.
+pub fn simulated_branches() -> impl Iterator<Item = Branch> {
+    let simulated = [Experiment::Control, Experiment::Multiepoch];
+    Branch::all().filter(move |branch| simulated.contains(&branch.experiment))
 }
 
 /// A component of a fit to a galaxy. All components of a galaxy have one position angle.
@@ -278,7 +229,7 @@ impl BranchSimulator {
         // The field of the last subfield: twenty share it, and making it takes a second.
         let mut known: Option<LatticeField> = None;
         numbers.map(move |number| {
-            if !self.branch.variable {
+            if self.branch.constant {
                 return Ok(self.subfield(number, None));
             }
             let field = number / SUBFIELDS_PER_FIELD;
@@ -369,7 +320,7 @@ impl BranchSimulator {
     }
 
     fn epoch(&self, rng: &mut ChaCha8Rng) -> Epoch {
-        let (optics, arcsec) = if self.branch.space {
+        let (optics, arcsec) = if self.branch.observation == Observation::Space {
             (SPACE_OPTICS, SMEAR_ARCSEC)
         } else {
             // Frequencies fall from 20 at the best seeing to 9 at the worst: the root of 20x − 5.5x² = 14.5u.
@@ -386,9 +337,9 @@ impl BranchSimulator {
         let e = Complex64::from_polar(modulus, rng.random_range(0.0..TAU));
         let profile = PsfProfile::Kolmogorov;
         let fwhm = arcsec / self.branch.pixel_arcsec();
-        let dither = match self.branch.multiepoch {
-            true => Self::offset(rng),
-            false => (0.0, 0.0),
+        let dither = match self.branch.epochs() {
+            1 => (0.0, 0.0),
+            _ => Self::offset(rng),
         };
         Epoch {
             psf: FunctionalPsf::new(profile, fwhm, Shear::new(e.re, e.im))
@@ -408,9 +359,9 @@ impl BranchSimulator {
     /// The pixel (x, y) that the challenge calls the centre of a stamp, and the identity SSSXXXYYY.
     pub fn place(&self, subfield: &Subfield, (ix, iy): (usize, usize)) -> ([i64; 2], i64) {
         let centre = |k: usize| (k * self.branch.stamp() + self.branch.stamp() / 2 - 1) as i64;
-        let place = match self.branch.variable {
-            true => self.node(subfield.offset, (ix, iy)),
-            false => (ix, iy),
+        let place = match self.branch.constant {
+            true => (ix, iy),
+            false => self.node(subfield.offset, (ix, iy)),
         };
         let id = Identity::new(subfield.number, place);
         ([centre(ix), centre(iy)], id.number())
@@ -434,9 +385,9 @@ impl BranchSimulator {
         let galaxy = subfield.galaxies[place];
         let mut rng = self.stream(subfield.number, 0, Purpose::Galaxy);
         // Two galaxies of a pair are one, turned by 90 degrees. Variable branches have no pairs.
-        let (kind, turned) = match self.branch.variable {
-            true => (galaxy, false),
-            false => (galaxy / 2, galaxy % 2 == 1),
+        let (kind, turned) = match self.branch.constant {
+            false => (galaxy, false),
+            true => (galaxy / 2, galaxy % 2 == 1),
         };
         rng.set_stream(kind as u64);
         let snr = SNR.0 * (1.0 - rng.random::<f64>()).powf(-1.0 / COUNT_SLOPE);
@@ -618,8 +569,7 @@ mod tests {
     use super::*;
 
     fn simulator(name: &str, grid: usize) -> BranchSimulator {
-        let (_, branch) = Branch::all().find(|(own, _)| own == name).unwrap();
-        BranchSimulator::new(branch, 5, grid, Vec::new()).unwrap()
+        BranchSimulator::new(Branch::named(name).unwrap(), 5, grid, Vec::new()).unwrap()
     }
 
     fn subfield(simulator: &BranchSimulator, number: usize) -> Subfield {
@@ -665,7 +615,8 @@ mod tests {
 
     #[test]
     fn only_the_star_at_the_lower_left_is_centred() {
-        for (name, _) in Branch::all() {
+        for branch in simulated_branches() {
+            let name = branch.to_string();
             let simulator = simulator(&name, 2);
             let size = simulator.branch.stamp();
             let subfield = subfield(&simulator, 0);

@@ -16,9 +16,9 @@ use shearq_files::frames::{Metadata, frame};
 use shearq_files::table::{self, FileFormat, MAX_ROWS};
 use shearq_files::{FileError, atomic};
 use shearq_quantities::Shear;
-use shearq_scoring::great3::STARS_PER_SIDE;
+use shearq_scoring::great3::{Branch, STARS_PER_SIDE};
 use shearq_simulate::galaxy::Sersic;
-use shearq_simulate::great3::{Branch, BranchSimulator, Fit, FitComponent, Subfield};
+use shearq_simulate::great3::{BranchSimulator, Fit, FitComponent, Subfield};
 use shearq_simulate::render::RenderScratch;
 
 use crate::PipelineError;

@@ -9,7 +9,7 @@ use shearq_quantities::Shear;
 use shearq_scoring::great3::great08_score;
 
 use super::{
-    Branch, Columns, Entry, Figure, Packed, Packing, Score, Truth, disagreement, whole, wrong,
+    Board, Columns, Entry, Figure, Packed, Packing, Score, Truth, disagreement, whole, wrong,
 };
 
 #[derive(Debug)]
@@ -83,7 +83,7 @@ fn refuse(option: &str, given: bool) -> Result<(), FileError> {
     }
 }
 
-impl Branch for Great08 {
+impl Board for Great08 {
     fn title(&self) -> String {
         "GREAT08".into()
     }

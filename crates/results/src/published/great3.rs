@@ -2,7 +2,7 @@
 //! released, pre-submission and leaderboard.
 
 use std::collections::BTreeSet;
-use std::fmt::{self, Display, Write};
+use std::fmt::Write;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
@@ -16,8 +16,8 @@ use shearq_quantities::statistics::RunningMean;
 use shearq_render::figure::{LinePlot, Series, Style};
 use shearq_scoring::aperture::{ApertureMass, Lattice, LatticeShear, SEPARATION_BINS, separations};
 use shearq_scoring::great3::{
-    Bias, ConstantField, EPOCHS, Identity, NODES_PER_GALAXY, Observation, PlusCross, Q_V_BINS,
-    REQUIRED_C, REQUIRED_M, SUBFIELDS, SUBFIELDS_PER_FIELD, along, constant_score, position_angle,
+    Bias, Branch, ConstantField, Identity, NODES_PER_GALAXY, PlusCross, Q_V_BINS, REQUIRED_C,
+    REQUIRED_M, SUBFIELDS, SUBFIELDS_PER_FIELD, along, constant_score, position_angle,
     variable_score,
 };
 use shearq_scoring::{Line, Repeated, repeated};
@@ -26,7 +26,7 @@ use crate::response::{Shared, shears};
 use shearq_dataset::run::Run;
 
 use super::{
-    Branch, Catalogues, Columns, Entry, Figure, MIN_SHEAR_SLOPE, Packed, Packing, Score, Slope,
+    Board, Catalogues, Columns, Entry, Figure, MIN_SHEAR_SLOPE, Packed, Packing, Score, Slope,
     Truth, disagreement, odd_fields, whole, wrong,
 };
 
@@ -34,56 +34,9 @@ use super::{
 const NOT_AVERAGED: f64 = 9.9;
 const NOT_CORRELATED: f64 = 10.0;
 
-const EXPERIMENTS: [&str; 5] = [
-    "control",
-    "real_galaxy",
-    "variable_psf",
-    "multiepoch",
-    "full",
-];
-
-/// One of the 20 branches.
+/// A branch of GREAT3.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Great3 {
-    experiment: &'static str,
-    observation: Observation,
-    constant: bool,
-}
-
-fn all() -> impl Iterator<Item = Great3> {
-    let kinds = [
-        (Observation::Ground, true),
-        (Observation::Ground, false),
-        (Observation::Space, true),
-        (Observation::Space, false),
-    ];
-    EXPERIMENTS.into_iter().flat_map(move |experiment| {
-        kinds.map(|(observation, constant)| Great3 {
-            experiment,
-            observation,
-            constant,
-        })
-    })
-}
-
-pub fn branches() -> Vec<String> {
-    all().map(|branch| branch.to_string()).collect()
-}
-
-impl Display for Great3 {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let observation = match self.observation {
-            Observation::Ground => "ground",
-            Observation::Space => "space",
-        };
-        let shear = if self.constant {
-            "constant"
-        } else {
-            "variable"
-        };
-        write!(f, "{}-{observation}-{shear}", self.experiment)
-    }
-}
+pub struct Great3(pub Branch);
 
 /// What a catalogue or a submission lacks, has twice, or should not have.
 #[derive(Debug, thiserror::Error)]
@@ -273,41 +226,21 @@ const GALAXIES: Columns<'static> = Columns {
 };
 
 impl Great3 {
-    pub fn named(name: &str) -> Option<Self> {
-        // The folders are called control/ground/constant.
-        let name = name.replace('/', "-");
-        all().find(|branch| branch.to_string() == name)
-    }
-
-    fn subfields_per_field(&self) -> usize {
-        match self.constant && !["variable_psf", "full"].contains(&self.experiment) {
-            true => 1,
-            false => SUBFIELDS_PER_FIELD,
-        }
-    }
-
     // Fields of a branch of so many subfields, which is the whole branch unless the user states another number.
     fn fields(&self, subfields: Option<usize>) -> Result<usize, FileError> {
-        let (found, per) = (subfields.unwrap_or(SUBFIELDS), self.subfields_per_field());
+        let (found, per) = (subfields.unwrap_or(SUBFIELDS), self.0.subfields_per_field());
         match found > 0 && found % per == 0 {
             true => Ok(found / per),
             false => {
-                let message = format!("found {found}, expected a multiple of {per} for {self}");
+                let message = format!("found {found}, expected a multiple of {per} for {}", self.0);
                 wrong(Path::new("--subfields"), message)
             }
         }
     }
 
-    fn epochs(&self) -> usize {
-        match ["multiepoch", "full"].contains(&self.experiment) {
-            true => EPOCHS,
-            false => 1,
-        }
-    }
-
     // The folder that holds `stem` of subfield 0: the given one, or that of the branch below it.
     fn folder(&self, root: &Path, stem: &str) -> Result<PathBuf, FileError> {
-        let below = root.join(self.to_string().replace('-', "/"));
+        let below = root.join(self.0.folder());
         let folders = [root.to_owned(), below];
         let found = folders.iter().find(|folder| {
             let is = |ending: &&str| is_there(&folder.join(format!("{stem}.{ending}")));
@@ -327,7 +260,7 @@ impl Great3 {
             return self.read_shears(truth, fields);
         }
         let folder = self.folder(truth, &named(released::SHEARS, 0, 0))?;
-        let per = self.subfields_per_field();
+        let per = self.0.subfields_per_field();
         let shear = |subfield: usize| {
             let stem = named(released::SHEARS, subfield, 0);
             match Parameters::read(&folder, &stem)? {
@@ -356,7 +289,7 @@ impl Great3 {
 
     // Mean ellipticities of the PSF of each of `fields`.
     fn psfs(&self, truth: Truth<'_>, fields: usize) -> Result<Vec<Shear>, FileError> {
-        let (subfields, epochs) = (fields * self.subfields_per_field(), self.epochs());
+        let (subfields, epochs) = (fields * self.0.subfields_per_field(), self.0.epochs());
         let source = truth.psf.unwrap_or(truth.path);
         if truth.psf.is_none() && !source.is_dir() {
             return wrong(source, "Q_c needs the PSF. Try: --psf FILE");
@@ -378,7 +311,7 @@ impl Great3 {
             .map(|epochs| mean(&epochs.iter().copied().flatten().collect::<Vec<_>>()))
             .collect();
         Ok(subfields
-            .chunks(self.subfields_per_field())
+            .chunks(self.0.subfields_per_field())
             .map(mean)
             .collect())
     }
@@ -390,7 +323,7 @@ impl Great3 {
         subfields: usize,
     ) -> Result<Vec<Option<Shear>>, FileError> {
         let folder = self.folder(folder, &named(released::PSF_SHAPES, 0, 0))?;
-        let epochs = self.epochs();
+        let epochs = self.0.epochs();
         refuse_more(&folder, released::PSF_SHAPES, subfields)?;
         let psf = |k: usize| {
             let stem = named(released::PSF_SHAPES, k / epochs, k % epochs);
@@ -409,7 +342,10 @@ impl Great3 {
         let extra = named(released::PSF_SHAPES, 0, epochs);
         match Parameters::read(&folder, &extra)? {
             Some(extra) => {
-                let message = format!("{self} has no such epoch (expected {epochs} per subfield)");
+                let message = format!(
+                    "{} has no such epoch (expected {epochs} per subfield)",
+                    self.0
+                );
                 wrong(&extra.path, message)
             }
             None => found,
@@ -421,7 +357,7 @@ impl Great3 {
         path: &Path,
         subfields: usize,
     ) -> Result<Vec<Option<Shear>>, FileError> {
-        let epochs = self.epochs();
+        let epochs = self.0.epochs();
         let columns = Columns {
             names: &[&["subfield"], &["epoch"], &["psf_g1"], &["psf_g2"]],
             required: 4,
@@ -435,8 +371,12 @@ impl Great3 {
             let fault = |message: String| FileError::new(path, format!("row {}: {message}", k + 1));
             let number = |found: f64, end: usize, name: &str| {
                 let last = end - 1;
-                let message =
-                    || format!("no {name} of {self} (found {found}, expected 0 to {last})");
+                let message = || {
+                    format!(
+                        "no {name} of {} (found {found}, expected 0 to {last})",
+                        self.0
+                    )
+                };
                 whole(found, end).ok_or_else(|| fault(message()))
             };
             let subfield = number(*subfield, subfields, "subfield")?;
@@ -915,9 +855,9 @@ fn below_one(g: Shear) -> Result<Shear, String> {
     }
 }
 
-impl Branch for Great3 {
+impl Board for Great3 {
     fn title(&self) -> String {
-        format!("GREAT3 {self}")
+        format!("GREAT3 {}", self.0)
     }
 
     fn score(&self, truth: Truth<'_>, submission: &Path, pool: &Pool) -> Result<Score, FileError> {
@@ -925,7 +865,7 @@ impl Branch for Great3 {
         let fields = self.fields(truth.subfields)?;
         let (mut figures, mut warnings) = (Vec::new(), Vec::new());
         let (refusal, plots);
-        if self.constant {
+        if self.0.constant {
             let shears = self.true_shears(truth.path, fields)?;
             let psfs = self.psfs(truth, fields)?;
             let submitted = self.submitted_shears(submission, fields)?;
@@ -947,7 +887,7 @@ impl Branch for Great3 {
                     psf,
                 })
                 .collect();
-            let found = constant_score(&fields, self.observation).map_err(of_submission)?;
+            let found = constant_score(&fields, self.0.observation).map_err(of_submission)?;
             plots = residual_plots(
                 &fields,
                 [(found.c.plus, found.m.plus), (found.c.cross, found.m.cross)],
@@ -957,7 +897,7 @@ impl Branch for Great3 {
                 value: found.q,
                 error: None,
                 jackknife: found.jackknife,
-                perfect: Some(self.observation.q_c([[0.0; 2]; 2])),
+                perfect: Some(self.0.observation.q_c([[0.0; 2]; 2])),
                 requirement: None,
                 decimals: 1,
             });
@@ -984,7 +924,10 @@ impl Branch for Great3 {
             if let Some(psf) = truth.psf {
                 return wrong(
                     psf,
-                    format!("--psf: Q_v of {self} has no use for the PSF. Try: without --psf"),
+                    format!(
+                        "--psf: Q_v of {} has no use for the PSF. Try: without --psf",
+                        self.0
+                    ),
                 );
             }
             let masses = self.true_masses(truth.path, fields, pool)?;
@@ -993,7 +936,7 @@ impl Branch for Great3 {
             warnings.extend(doubt_of_order(&submitted, &masses));
             let e = |masses: &[Masses]| masses.iter().map(|own| own.e).collect::<Vec<_>>();
             let true_e = e(&masses);
-            let score = |submitted: &[_]| variable_score(submitted, &true_e, self.observation);
+            let score = |submitted: &[_]| variable_score(submitted, &true_e, self.0.observation);
             let found = score(&e(&submitted)).map_err(of_submission)?;
             let perfect = score(&true_e).map_err(of_submission)?;
             plots = vec![mass_plot(&true_e, &e(&submitted))];
@@ -1008,7 +951,7 @@ impl Branch for Great3 {
             });
         }
         Ok(Score {
-            branch: Some(self.to_string()),
+            branch: Some(self.0.to_string()),
             figures,
             plots,
             refusal,
@@ -1018,19 +961,19 @@ impl Branch for Great3 {
 
     fn check(&self, submission: &Path, subfields: Option<usize>) -> Result<(), FileError> {
         let fields = self.fields(subfields)?;
-        match self.constant {
+        match self.0.constant {
             true => self.submitted_shears(submission, fields).map(|_| ()),
             false => self.submitted_masses(submission, fields).map(|_| ()),
         }
     }
 
     fn pack(&self, packing: &Packing<'_>, pool: &Pool) -> Option<Result<Packed, FileError>> {
-        let read = Galaxies::read(self, packing);
+        let read = Galaxies::read(self.0, packing);
         Some(read.and_then(|galaxies| galaxies.summarise(packing, pool)))
     }
 
     fn leaderboard(&self) -> Vec<Entry> {
-        let branch = self.to_string();
+        let branch = self.0.to_string();
         let entries = LEADERBOARD.lines().filter_map(|line| {
             let fields: Vec<&str> = line.split(',').collect();
             let [board, team, method, numbers @ ..] = fields.as_slice() else {
@@ -1066,8 +1009,8 @@ struct Galaxy {
 }
 
 // All galaxies of a branch, in the order of their identities.
-struct Galaxies<'a> {
-    branch: &'a Great3,
+struct Galaxies {
+    branch: Branch,
     files: Vec<PathBuf>,
     galaxies: Vec<Galaxy>,
     // Names of columns that are not used.
@@ -1080,8 +1023,8 @@ fn is_like_a_weight(name: &str) -> bool {
     name.contains("weight") || ["wt", "wgt", "wht", "weights"].contains(&name.as_str())
 }
 
-impl<'a> Galaxies<'a> {
-    fn read(branch: &'a Great3, packing: &Packing<'_>) -> Result<Self, FileError> {
+impl Galaxies {
+    fn read(branch: Branch, packing: &Packing<'_>) -> Result<Self, FileError> {
         let mut all = Galaxies {
             branch,
             files: Vec::new(),

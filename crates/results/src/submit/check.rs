@@ -152,13 +152,13 @@ fn check_files(
     let numbers = catalogues.values().flatten().map(|(image, _)| *image);
     let most = numbers.max().unwrap_or(0).max(expected.images.unwrap_or(0));
     for (set, of_set) in catalogues {
-        let mut files: Option<SetFiles> = None;
+        let mut files: Option<SummedSet> = None;
         for (image, file) in of_set {
             // An unreadable catalogue is reported, and the others of its set are checked without it.
             let Some((sum, counts)) = check_catalogue(file, expected, report) else {
                 continue;
             };
-            let files = files.get_or_insert_with(|| SetFiles::new(expected, set));
+            let files = files.get_or_insert_with(|| SummedSet::new(expected, set));
             files.add(&sum, counts, image, file);
         }
         if let Some(mut files) = files {
@@ -198,7 +198,7 @@ fn check_unnamed(file: &Path, single: bool, expected: &Expected, report: &mut Re
     };
     if single && expected.truth.len() == 1 {
         for set in expected.truth.keys() {
-            let mut entry = SetFiles::new(expected, *set);
+            let mut entry = SummedSet::new(expected, *set);
             entry.add(&sum, counts, 1, file);
             check_against_truth(*set, &entry, expected, report);
         }
@@ -239,7 +239,7 @@ fn check_sets(path: &Path, found: &BTreeSet<u32>, expected: &Expected, report: &
     }
 }
 
-struct SetFiles {
+struct SummedSet {
     scorer: Option<SetScorer>,
     images: SetImages,
     faults: ImageFaults,
@@ -248,7 +248,7 @@ struct SetFiles {
     rows: RowCounts,
 }
 
-impl SetFiles {
+impl SummedSet {
     fn new(expected: &Expected, set: u32) -> Self {
         let open = expected.truth.get(&set);
         let truth = open.or_else(|| expected.secret_truth.get(&set));
@@ -257,7 +257,7 @@ impl SetFiles {
             ..Options::default()
         };
         let scorer = |truth: &TrueShear| SetScorer::new(expected.grid, truth.clone(), options).ok();
-        SetFiles {
+        SummedSet {
             scorer: truth.and_then(scorer),
             images: SetImages::new(&expected.grid),
             faults: ImageFaults::default(),
@@ -469,7 +469,7 @@ fn name_of(path: &Path) -> String {
 
 fn check_images(
     set: u32,
-    files: &mut SetFiles,
+    files: &mut SummedSet,
     last: u32,
     path: &Path,
     expected: &Expected,
@@ -502,8 +502,8 @@ fn check_images(
     }
 }
 
-fn check_against_truth(set: u32, files: &SetFiles, expected: &Expected, report: &mut Report) {
-    let SetFiles {
+fn check_against_truth(set: u32, files: &SummedSet, expected: &Expected, report: &mut Report) {
+    let SummedSet {
         scorer: Some(scorer),
         images,
         faults,
