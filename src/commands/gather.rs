@@ -1,4 +1,4 @@
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 
@@ -347,42 +347,39 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         arguments.image
     );
     let out = &arguments.out;
-    for (image, gathering) in (arguments.image..).zip(&all) {
-        // An existing folder may have a layout.toml with other names of files.
-        let data = if out.is_dir() {
-            DataFolder::open(out)?
-        } else {
-            DataFolder::new(out)
-        };
-        let id = ImageId {
-            set: arguments.set,
-            image,
-        };
-        gather_image(&data, id, gathering)?;
+    // An existing folder may have a layout.toml with other names of files.
+    let data = if out.is_dir() {
+        DataFolder::open(out)?
+    } else {
+        DataFolder::new(out)
+    };
+    let (set, image) = (arguments.set, arguments.image);
+    let gathered = gather(&data, ImageId { set, image }, &all)?;
+    for (image, gathered) in (image..).zip(gathered) {
+        tell_gathered(&data.galaxies(set, image), &gathered);
     }
     Ok(())
 }
 
-fn gather_image(data: &DataFolder, id: ImageId, gathering: &Gathering<'_>) -> anyhow::Result<()> {
+fn tell_gathered(path: &Path, gathered: &Gathered) {
     let Gathered {
         mosaic,
         incomplete,
         messages,
-    } = gather(data, id, gathering)?;
+    } = gathered;
     for message in messages {
         tell(format_args!("{message}"));
     }
-    if incomplete > 0 {
+    if *incomplete > 0 {
         tell(format_args!(
             "{} with missing pixels. Networks flag such galaxies; linear configurations flag them if too many pixels are missing",
-            count(incomplete, "stamp")
+            count(*incomplete, "stamp")
         ));
     }
     tell(format_args!(
         "{} of {1} × {1} pixels in {2}",
         count(mosaic.galaxies, "stamp"),
         mosaic.stamp,
-        data.galaxies(id.set, id.image).display()
+        path.display()
     ));
-    Ok(())
 }

@@ -17,14 +17,14 @@ use shearq_quantities::{Frame, Jacobian};
 
 pub use self::positions::Table;
 use self::positions::{Positions, rows_of_stamps};
-use self::psfs::{GatheredPsfs, gather_psfs};
+use self::psfs::{GatheredPsfs, PsfFile, gather_psfs};
 pub(crate) use self::source::off_middle;
 pub use self::source::{Content, Files};
 use self::source::{Exposure, Images, shown};
-use self::stamps::{Origins, StampWriter, already};
+use self::stamps::{Origins, Rows, StampWriter, already};
 use super::PipelineError;
 use super::measure::check_strip;
-use crate::stamp_table::{self, Head};
+use crate::stamp_table::{self, Head, StampTable};
 use crate::wcs::{Wcs, aligned};
 use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::{DataFolder, MAX_STAMP};
@@ -128,16 +128,17 @@ struct Record<'a> {
     gathering: &'a Gathering<'a>,
 }
 
-/// Gathers stamps and their PSFs into image `id` of `data`.
+/// Gathers stamps and their PSFs into images of `data` with consecutive numbers, from that of `first` on. If one of them cannot be
+/// gathered, none is written.
 ///
 /// Writes the table of stamps, the record of the sources, the PSFs, and last the image. Leftovers of a stopped process
 /// are replaced. Other processes that gather into the same folder wait.
 pub fn gather(
     data: &DataFolder,
-    id: ImageId,
-    gathering: &Gathering<'_>,
-) -> Result<Gathered, PipelineError> {
-    let which = data.stamps(id.set, id.image);
+    first: ImageId,
+    all: &[Gathering<'_>],
+) -> Result<Vec<Gathered>, PipelineError> {
+    let which = data.stamps(first.set, first.image);
     let folder = which.parent().unwrap_or(Path::new("."));
     let cannot = "cannot make the folder";
     let absent = |folder: &&Path| !folder.as_os_str().is_empty() && !folder.exists();
@@ -151,7 +152,7 @@ pub fn gather(
     let alone = fs::File::open(folder).map_err(FileError::doing(folder, cannot))?;
     // Not all file systems have locks.
     let _ = alone.lock();
-    let gathered = gather_alone(data, id, gathering);
+    let gathered = gather_alone(data, first, all);
     if gathered.is_err() {
         for folder in made {
             // Fails if the folder is not empty.
@@ -163,17 +164,53 @@ pub fn gather(
 
 fn gather_alone(
     data: &DataFolder,
-    id: ImageId,
-    gathering: &Gathering<'_>,
-) -> Result<Gathered, PipelineError> {
+    first: ImageId,
+    all: &[Gathering<'_>],
+) -> Result<Vec<Gathered>, PipelineError> {
     // The table of stamps would replace the catalogue of galaxies, which another program wrote.
     if data.layout().great3.is_some() {
         let message = "this folder is a branch of GREAT3, to which no image can be added (expected a folder of gathered images, or a new one). Try: another folder";
         return Err(FileError::new(data.root(), message).into());
     }
+    let ids = (first.image..).map(|image| ImageId { image, ..first });
+    for (_, id) in all.iter().zip(ids.clone()) {
+        remove_leftovers(data, id)?;
+    }
+    // All files have temporary names until the last exposure is read: with some of them in the folder, the user could neither repeat
+    // the command nor see which exposures were lost.
+    let prepared = ids.zip(all).map(|(id, one)| prepare(data, id, one));
+    let prepared: Vec<Prepared> = prepared.collect::<Result<_, _>>()?;
+    prepared.into_iter().map(Prepared::finish).collect()
+}
+
+/// The files of an image, which have temporary names or are in memory.
+struct Prepared {
+    record: String,
+    /// Where the table of stamps will be.
+    which: PathBuf,
+    table: StampTable,
+    psfs: PsfFile,
+    image: Rows,
+    gathered: Gathered,
+}
+
+impl Prepared {
+    fn finish(self) -> Result<Gathered, PipelineError> {
+        atomic::write(self.which.with_extension("json"), self.record.as_bytes())?;
+        self.table.write(&self.which)?;
+        self.psfs.finish()?;
+        self.image.finish()?;
+        Ok(self.gathered)
+    }
+}
+
+fn prepare(
+    data: &DataFolder,
+    id: ImageId,
+    gathering: &Gathering<'_>,
+) -> Result<Prepared, PipelineError> {
     let target = data.galaxies(id.set, id.image);
     let which = data.stamps(id.set, id.image);
-    remove_leftovers(data, id)?;
     let record = Record {
         version: shearq_dataset::VERSION,
         gathering,
@@ -229,17 +266,17 @@ fn gather_alone(
     let incomplete = writer.incomplete;
     let mut columns = rows.unwrap_or_default();
     columns.extend(plan.columns(head, &mosaic, &mut writer, jacobians.as_deref()));
-    let record = format!("{record}\n");
-    // Made before the record is written, so that columns that cannot be written leave no file.
-    let table = stamp_table::table(&which, head, columns)?;
-    atomic::write(which.with_extension("json"), record.as_bytes())?;
-    table.write(&which)?;
-    psfs.file.finish()?;
-    writer.image.finish()?;
-    Ok(Gathered {
-        mosaic,
-        incomplete,
-        messages,
+    Ok(Prepared {
+        record: format!("{record}\n"),
+        table: stamp_table::table(&which, head, columns)?,
+        which,
+        psfs: psfs.file,
+        image: writer.image,
+        gathered: Gathered {
+            mosaic,
+            incomplete,
+            messages,
+        },
     })
 }
 
@@ -423,7 +460,7 @@ impl Plan {
         let wcs = exposure.wcs()?;
         let positions = Positions::read(positions, path, &wcs, first_pixel)?;
         let mut messages: Vec<String> = positions.note.clone().into_iter().collect();
-        messages.extend(positions.examine(path, exposure.sides()?)?);
+        messages.extend(positions.examine(path, &wcs, exposure.sides()?)?);
         Ok(Plan {
             stack: Stack {
                 count: positions.all.len(),

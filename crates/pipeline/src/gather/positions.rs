@@ -37,6 +37,10 @@ const SKY_NAMES: [[&str; 2]; 6] = [
 // Distance in pixels below which two positions have the same galaxy: stamps are cut to half a pixel.
 const SAME_GALAXY_PX: f64 = 0.5;
 
+// Distance in pixels from which x, y and ra, dec are places of two galaxies. Chosen by hand: isophotal and windowed centroids differ
+// by less.
+const OTHER_GALAXY_PX: f64 = 3.0;
+
 #[derive(Debug, Clone, Copy, serde::Serialize)]
 pub struct Table<'a> {
     /// The file, with `[TABLE]` behind its name if one of its tables is meant.
@@ -130,6 +134,9 @@ impl Positions {
                 (all, sky)
             }
         };
+        if let Some([ra, dec]) = &sky {
+            check_degrees(&place.path, ra, dec)?;
+        }
         // Larger positions would overflow the indices of pixels.
         let most = f64::from(i32::MAX);
         let wrong = |(x, y): &(f64, f64)| !(x.abs() < most && y.abs() < most);
@@ -153,10 +160,11 @@ impl Positions {
         })
     }
 
-    /// Warnings about the positions on an exposure of this size.
+    /// Warnings about the positions on an exposure of this WCS and size.
     pub(super) fn examine(
         &self,
         exposure: &Path,
+        wcs: &Wcs,
         [width, height]: [usize; 2],
     ) -> Result<Vec<String>, FileError> {
         let path = &self.place.path;
@@ -192,6 +200,7 @@ impl Positions {
             );
             return Err(FileError::new(path, message));
         }
+        self.check_sky(exposure, wcs, |at| !outside(at))?;
         let mut doubts = Vec::new();
         if 10 * beyond > count {
             doubts.push(format!(
@@ -209,6 +218,43 @@ impl Positions {
             ));
         }
         Ok(doubts)
+    }
+
+    /// Refuses positions in pixels that are not those of ra and dec on the exposure, as of a table of another exposure or of a coadd,
+    /// or with rows in another order. Epochs are joined by ra and dec, and shears are averaged by them.
+    fn check_sky(
+        &self,
+        exposure: &Path,
+        wcs: &Wcs,
+        is_inside: impl Fn(&(f64, f64)) -> bool,
+    ) -> Result<(), FileError> {
+        let Some([ra, dec]) = self.sky.as_ref().filter(|_| wcs.has_sky()) else {
+            return Ok(());
+        };
+        let inside = self.all.iter().enumerate().filter(|(_, at)| is_inside(at));
+        let apart = inside.filter_map(|(row, &(x, y))| {
+            let sky = [ra[row], dec[row]];
+            if sky.iter().any(|degrees| degrees.is_nan()) {
+                return None;
+            }
+            let by_sky = wcs.pixel(sky);
+            let distance =
+                by_sky.map_or(f64::INFINITY, |by_sky| (x - by_sky[0]).hypot(y - by_sky[1]));
+            (distance > OTHER_GALAXY_PX).then_some((row, distance))
+        });
+        let apart: Vec<(usize, f64)> = apart.collect();
+        let Some(&(row, distance)) = apart.iter().max_by(|a, b| a.1.total_cmp(&b.1)) else {
+            return Ok(());
+        };
+        let ((x, y), exposure) = (self.all[row], exposure.display());
+        let message = format!(
+            "row {}: x and y are {distance:.0} px from where the WCS of {exposure} has ra and dec (found ({x}, {y}) for ({}, {}), one of {} rows more than {OTHER_GALAXY_PX} px away; expected one place). Try: --degrees, which uses ra and dec, or --columns with x and y on this exposure",
+            row + 1,
+            ra[row],
+            dec[row],
+            apart.len()
+        );
+        Err(FileError::new(&self.place.path, message))
     }
 
     // A galaxy that is measured twice counts twice in the mean, as if its noise were independent.
@@ -284,6 +330,10 @@ pub(super) fn rows_of_stamps(table: Table<'_>, count: usize) -> Result<Vec<Colum
             read.height()
         )));
     }
+    if let Some([ra, dec]) = &sky {
+        let of = |name: &str| table::numbers(&read, name, &place.path);
+        check_degrees(&place.path, &of(ra)?, &of(dec)?)?;
+    }
     let (id, carried) = id_and_carried(&place, &read, id.as_ref(), table.carry)?;
     let mut all: Vec<Column> = id.into_iter().collect();
     for (name, column) in places {
@@ -292,6 +342,25 @@ pub(super) fn rows_of_stamps(table: Table<'_>, count: usize) -> Result<Vec<Colum
     }
     all.extend(carried);
     Ok(all)
+}
+
+// Right ascensions may count from −180.
+fn check_degrees(path: &Path, ra: &[f64], dec: &[f64]) -> Result<(), FileError> {
+    let is_wrong = |(ra, dec): (&f64, &f64)| {
+        !(-180.0..=360.0).contains(ra) && !ra.is_nan() || dec.abs() > 90.0
+    };
+    match ra.iter().zip(dec).position(is_wrong) {
+        None => Ok(()),
+        Some(row) => {
+            let message = format!(
+                "row {}: ra and dec are ({}, {}); expected degrees, −180 to 360 and −90 to 90. Try: correct the table, or rename columns of other quantities",
+                row + 1,
+                ra[row],
+                dec[row]
+            );
+            Err(FileError::new(path, message))
+        }
+    }
 }
 
 /// Names of all columns to read, each once, and of those among them that keep texts and all digits of integers.
