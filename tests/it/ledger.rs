@@ -54,7 +54,8 @@ fn markdown(name: &str, ledger: &[Entry]) -> String {
         assert_eq!(found, columns, "columns of {name}, row {}", row[0].row);
         let cells = row.iter().map(|entry| match entry.error.as_str() {
             "" => entry.value.clone(),
-            error => format!("{} ± {error}", entry.value),
+            // No line breaks between a value and its error, which narrow columns would make three lines of.
+            error => format!("{}\u{a0}±\u{a0}{error}", entry.value),
         });
         writeln!(text, "| {} |", cells.collect::<Vec<_>>().join(" | ")).unwrap();
     }

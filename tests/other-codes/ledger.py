@@ -30,7 +30,7 @@ def signed(value, digits):
 def bias(row):
     """Both components in 10⁻³ with one error, to the error's first digits."""
     error = 1e3 * max(row["m1_error"], row["m2_error"])
-    digits = 2 if error < 0.095 else 1 if error < 2 else 0
+    digits = 3 if error < 0.0095 else 2 if error < 0.095 else 1 if error < 2 else 0
     return ", ".join(signed(1e3 * row[k], digits) for k in ("m1", "m2")), f"{error:.{digits}f}"
 
 
