@@ -19,6 +19,7 @@ use crate::frames::{Metadata, reals};
 use crate::error::FileError;
 use crate::open::{is_there, open};
 
+use crate::fits::TableHead;
 use crate::{atomic, fits, parquet, text};
 
 pub use crate::MAX_ROWS;
@@ -171,8 +172,8 @@ pub struct Columns {
 #[derive(Debug, Clone)]
 pub struct Named {
     pub names: Vec<String>,
-    /// The table of a FITS file that has them: its number, and how it is shown.
-    pub table: Option<(usize, String)>,
+    /// The table of a FITS file that has them.
+    pub table: Option<TableHead>,
     /// Whether they are words of a comment, which may be no names at all.
     pub doubtful: bool,
 }
@@ -194,8 +195,8 @@ pub fn columns(place: &Place) -> Result<Columns, FileError> {
         Ending::Fits => {
             let tables = fits::tables(path, place.table.as_deref())?.into_iter();
             let named = tables.map(|head| Named {
-                table: Some((head.number, head.shown())),
-                names: head.columns,
+                names: head.columns.clone(),
+                table: Some(head),
                 doubtful: false,
             });
             Ok(Columns {

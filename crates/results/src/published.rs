@@ -432,7 +432,7 @@ impl Columns<'_> {
         let header = |named: &&Named| !named.names.iter().all(is_number);
         let (names, chosen) = match (picked, found.named.iter().find(header)) {
             (Some((named, places)), _) => {
-                place.table = named.table.as_ref().map(|(number, _)| number.to_string());
+                place.table = named.table.as_ref().map(|head| head.number.to_string());
                 let name = |place: usize| match named.doubtful {
                     true => (place + 1).to_string(),
                     false => named.names[place].clone(),

@@ -504,17 +504,16 @@ fn known(
     }
     match found.as_slice() {
         [(named, pair), others @ ..] if others.is_empty() || named.doubtful => {
-            if let Some((number, _)) = &named.table {
-                place.table.get_or_insert_with(|| number.to_string());
+            if let Some(head) = &named.table {
+                place.table.get_or_insert_with(|| head.number.to_string());
             }
             return Ok(pair.clone());
         }
         [] => {}
         several => {
-            let tables: Vec<&str> = several
+            let tables: Vec<String> = several
                 .iter()
-                .filter_map(|(named, _)| named.table.as_ref())
-                .map(|(_, shown)| shown.as_str())
+                .filter_map(|(named, _)| Some(named.table.as_ref()?.shown()))
                 .collect();
             let message = format!(
                 "{} tables have positions (found {}, expected one). Try: --table with a number",
@@ -581,7 +580,7 @@ fn find(names: &[String], wanted: &str) -> Option<String> {
 /// The names of the table that has these columns.
 fn names_in<'c>(columns: &'c Columns, place: &Place, both: [&String; 2]) -> &'c [String] {
     let meant = |named: &&Named| {
-        let table = named.table.as_ref().map(|(number, _)| number.to_string());
+        let table = named.table.as_ref().map(|head| head.number.to_string());
         let has = both.iter().all(|name| named.names.contains(name));
         has && (place.table.is_none() || columns.named.len() == 1 || place.table == table)
     };

@@ -4,6 +4,7 @@ use std::collections::BTreeSet;
 use std::path::Path;
 
 use shearq_bias::{Design, SHEARED_CATALOGUES};
+use shearq_files::fits::TableHead;
 use shearq_files::frames::polars::DataFrame;
 use shearq_files::table::{self, FileFormat, Place};
 use shearq_files::{FileError, names_of};
@@ -220,7 +221,6 @@ pub(super) fn sources(input: &Input, reading: &Reading<'_>) -> Result<Vec<Source
     }
     let place = Place::of(path);
     let found = table::columns(&place)?;
-    let name = |shown: &str| shown.split('`').nth(1).unwrap_or_default().to_owned();
     let table = |number: usize| Place {
         path: place.path.clone(),
         table: Some(number.to_string()),
@@ -229,11 +229,11 @@ pub(super) fn sources(input: &Input, reading: &Reading<'_>) -> Result<Vec<Source
     if place.table.is_none() {
         let mut tables = Vec::new();
         for list in &found.named {
-            let Some((number, shown)) = &list.table else {
+            let Some(head) = &list.table else {
                 continue;
             };
-            if let Some(catalogue) = catalogue_named(&name(shown)) {
-                let own = source(table(*number), Some(catalogue), &list.names, reading)?;
+            if let Some(catalogue) = catalogue_named(&head.name) {
+                let own = source(table(head.number), Some(catalogue), &list.names, reading)?;
                 tables.push(own);
             }
         }
@@ -248,23 +248,25 @@ pub(super) fn sources(input: &Input, reading: &Reading<'_>) -> Result<Vec<Source
     let good: Vec<_> = (lists.iter().copied())
         .filter(|list| Columns::find(path, &list.names, names).is_ok())
         .collect();
-    let tables: Vec<&str> = (good.iter())
-        .filter_map(|list| Some(list.table.as_ref()?.1.as_str()))
-        .collect();
-    if let [first, _, ..] = tables[..] {
-        // Tables of chips share a name.
-        let own = name(first);
-        let unique = !own.is_empty()
-            && own.parse::<u64>().is_err()
-            && tables.iter().filter(|other| name(other) == own).count() == 1;
-        let number = first.split(' ').next().unwrap_or_default();
+    let tables: Vec<&TableHead> = good.iter().filter_map(|list| list.table.as_ref()).collect();
+    if let [first, others @ ..] = &tables[..]
+        && !others.is_empty()
+    {
+        // Tables of chips share a name, and a name of digits would be read as a number.
+        let unique = !first.name.is_empty()
+            && first.name.parse::<u64>().is_err()
+            && !others.iter().any(|other| other.is_called(&first.name));
+        let advised = match unique {
+            true => first.name.clone(),
+            false => first.number.to_string(),
+        };
+        let found: Vec<String> = tables.iter().map(|head| head.shown()).collect();
         return Err(FileError::new(
             path,
             format!(
-                "several tables have columns of ellipticities (found {}, expected one). Try: {}[{}]",
-                names_of(&tables),
+                "several tables have columns of ellipticities (found {}, expected one). Try: {}[{advised}]",
+                names_of(&found),
                 path.display(),
-                if unique { &own } else { number }
             ),
         ));
     }
@@ -278,7 +280,7 @@ pub(super) fn sources(input: &Input, reading: &Reading<'_>) -> Result<Vec<Source
         ));
     };
     let own = match (&place.table, &list.table) {
-        (None, Some((number, _))) => table(*number),
+        (None, Some(head)) => table(head.number),
         _ => place,
     };
     Ok(vec![source(own, None, &list.names, reading)?])
