@@ -38,124 +38,6 @@ const NOT_CORRELATED: f64 = 10.0;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Great3(pub Branch);
 
-/// What a catalogue or a submission lacks, has twice, or should not have.
-#[derive(Debug, thiserror::Error)]
-enum Fault {
-    #[error(
-        "row {row}: not the identity of a galaxy (found {found}, expected SSSXXXYYY, such as 012034056)"
-    )]
-    NotAnIdentity { row: usize, found: f64 },
-    #[error(
-        "galaxy {id}: subfield {found} does not exist in {branch} (expected 0 to {last}). Try: only the catalogues of one branch"
-    )]
-    Subfield {
-        id: String,
-        found: usize,
-        branch: String,
-        last: usize,
-    },
-    #[error(
-        "galaxy {id}: column {x} and row {y} are outside of the grid (expected 0 to {last}). Try: --branch with the branch of these identities"
-    )]
-    OutsideGrid {
-        id: String,
-        x: usize,
-        y: usize,
-        last: usize,
-    },
-    #[error(
-        "galaxy {id}: its offset from the first galaxy of its subfield is not a multiple of {NODES_PER_GALAXY} nodes (found {found:?}, expected {expected:?} as of {first}). Try: the identities of galaxy_catalog-*.fits"
-    )]
-    Offset {
-        id: String,
-        found: (usize, usize),
-        expected: (usize, usize),
-        first: String,
-    },
-    #[error("galaxy {id} is there twice; it is also in {first}. Try: remove one of the two rows")]
-    RepeatedGalaxy { id: String, first: String },
-    #[error(
-        "galaxy {id}: {name} is {found}, which the challenge's program would average. Try: 10 for a galaxy that was not measured"
-    )]
-    Sentinel {
-        id: String,
-        name: &'static str,
-        found: f64,
-    },
-    #[error(
-        "`{0}` looks like a weight but is not used (expected `weight` or `w`). Try: rename it to weight, or remove it"
-    )]
-    UnusedWeight(String),
-    #[error("galaxy {id}: the weight is {found}, expected zero or a positive number")]
-    Weight { id: String, found: f64 },
-    #[error(
-        "{count} of {expected} subfields are missing: {which}. Try: the catalogues of all subfields in one command"
-    )]
-    Subfields {
-        count: usize,
-        expected: usize,
-        which: String,
-    },
-    #[error("galaxy {id} is missing{}: subfield {subfield} has {found} galaxies, expected {expected}. Try: a row with g1 = g2 = 10 for each galaxy that was not measured", more(*count))]
-    Galaxies {
-        id: String,
-        count: usize,
-        subfield: usize,
-        found: usize,
-        expected: usize,
-    },
-    #[error(
-        "subfield {subfield}: {rows} of {of} galaxies have repeated shears, most often {value:?}; expected measured values, which do not repeat. Try: 10 for a galaxy that was not measured"
-    )]
-    Placeholders {
-        subfield: usize,
-        rows: usize,
-        of: usize,
-        value: [f64; 2],
-    },
-    #[error(
-        "field {field} has no measured galaxy with a weight, so that it has no shear. Try: a smaller cut on quality"
-    )]
-    Unmeasured { field: usize },
-    #[error("row {row}: not the number of a field (found {found}, expected 0 to {last})")]
-    NotAField { row: usize, found: f64, last: usize },
-    #[error("field {field} is there twice; expected each once")]
-    RepeatedField { field: usize },
-    #[error("field {field} is missing{} (found {found} fields, expected {expected})", more(*count))]
-    MissingField {
-        field: usize,
-        count: usize,
-        found: usize,
-        expected: usize,
-    },
-    #[error("field {field}: {name} is {found}, expected {expected}")]
-    Value {
-        field: usize,
-        name: &'static str,
-        found: f64,
-        expected: &'static str,
-    },
-    #[error("field {field}: theta is {found}, expected one of the {SEPARATION_BINS} centres {:.4} to {:.4} degrees to 3 decimals. Try: shearq pack --challenge great3", separations()[0].0, separations()[SEPARATION_BINS - 1].0)]
-    Theta { field: usize, found: f64 },
-    #[error("field {field}: theta = {theta:.4} is there twice; expected each once")]
-    RepeatedTheta { field: usize, theta: f64 },
-    #[error(
-        "field {field}: theta = {theta:.4} is missing; expected {SEPARATION_BINS} rows per field"
-    )]
-    MissingTheta { field: usize, theta: f64 },
-    #[error(
-        "{rows} of {of} fields have repeated values of {name}, the first of them field {field}; expected measured values, which do not repeat"
-    )]
-    Repeated {
-        name: &'static str,
-        rows: usize,
-        of: usize,
-        field: usize,
-    },
-    #[error("field {field}: {name} is exactly zero, which no measurement gives")]
-    Zero { field: usize, name: &'static str },
-}
-
 // Q_c needs shears to 2·10⁻⁴: below, values count as equal. Aperture masses of shear alone are below 10⁻⁹ at the largest separations.
 const EQUAL_SHEARS: f64 = 1e-4;
 const EQUAL_MASSES: f64 = 1e-14;
@@ -171,21 +53,34 @@ fn refuse_repeated<const N: usize>(
         .iter()
         .position(|row| row.iter().all(|own| *own == 0.0))
     {
-        let name = name(None);
-        return wrong(path, Fault::Zero { field, name });
+        return wrong(path, zero(field, name(None)));
     }
-    match repeated(rows, step) {
-        None => Ok(()),
-        Some(found) => wrong(
-            path,
-            Fault::Repeated {
-                name: name(found.component),
-                rows: found.rows,
-                of: found.of,
-                field: found.first,
-            },
-        ),
-    }
+    let Some(found) = repeated(rows, step) else {
+        return Ok(());
+    };
+    let Repeated { rows, of, .. } = found;
+    let (name, field) = (name(found.component), found.first);
+    let message = format!(
+        "{rows} of {of} fields have repeated values of {name}, the first of them field {field}; expected measured values, which do not repeat"
+    );
+    wrong(path, message)
+}
+
+fn zero(field: usize, name: &str) -> String {
+    format!("field {field}: {name} is exactly zero, which no measurement gives")
+}
+
+fn unmeasured(field: usize) -> String {
+    format!(
+        "field {field} has no measured galaxy with a weight, so that it has no shear. Try: a smaller cut on quality"
+    )
+}
+
+fn not_an_identity(row: usize, found: f64) -> String {
+    format!(
+        "row {}: not the identity of a galaxy (found {found}, expected SSSXXXYYY, such as 012034056)",
+        row + 1
+    )
 }
 
 fn more(count: usize) -> String {
@@ -408,21 +303,15 @@ impl Great3 {
             for (name, column) in [("g1", &columns[1]), ("g2", &columns[2])] {
                 let found = column[k];
                 if found.is_nan() || found.abs() >= 1.0 {
-                    let expected = "a shear below 1";
-                    return wrong(
-                        path,
-                        Fault::Value {
-                            field,
-                            name,
-                            found,
-                            expected,
-                        },
-                    );
+                    let message =
+                        format!("field {field}: {name} is {found}, expected a shear below 1");
+                    return wrong(path, message);
                 }
             }
             let g = Shear::new(columns[1][k], columns[2][k]);
             if found[field].replace(g).is_some() {
-                return wrong(path, Fault::RepeatedField { field });
+                let message = format!("field {field} is there twice; expected each once");
+                return wrong(path, message);
             }
         }
         complete(path, found)
@@ -447,13 +336,11 @@ impl Great3 {
             // As the challenge compares them: equal to 3 decimals.
             let is = |centre: f64| (centre - theta).abs() < 1.5e-3;
             let Some(bin) = separations().iter().position(|centre| is(centre.0)) else {
-                return wrong(
-                    path,
-                    Fault::Theta {
-                        field,
-                        found: theta,
-                    },
+                let [first, last] = [0, SEPARATION_BINS - 1].map(|bin| separations()[bin].0);
+                let message = format!(
+                    "field {field}: theta is {theta}, expected one of the {SEPARATION_BINS} centres {first:.4} to {last:.4} degrees to 3 decimals. Try: shearq pack --challenge great3"
                 );
+                return wrong(path, message);
             };
             for (name, column) in [("map_E", 2), ("map_B", 3), ("error", 4)] {
                 let found = columns[column][k];
@@ -461,28 +348,26 @@ impl Great3 {
                 // Dispersions of shears below 1.
                 if !(least..1.0).contains(&found) {
                     let expected = if name == "error" { "0 to 1" } else { "-1 to 1" };
-                    return wrong(
-                        path,
-                        Fault::Value {
-                            field,
-                            name,
-                            found,
-                            expected,
-                        },
-                    );
+                    let message = format!("field {field}: {name} is {found}, expected {expected}");
+                    return wrong(path, message);
                 }
             }
             let own = found[field].get_or_insert_default();
             if own[bin].replace([columns[2][k], columns[3][k]]).is_some() {
                 let theta = separations()[bin].0;
-                return wrong(path, Fault::RepeatedTheta { field, theta });
+                let message =
+                    format!("field {field}: theta = {theta:.4} is there twice; expected each once");
+                return wrong(path, message);
             }
         }
         let mut masses = Vec::new();
         for (field, own) in complete(path, found)?.into_iter().enumerate() {
             if let Some(bin) = own.iter().position(Option::is_none) {
                 let theta = separations()[bin].0;
-                return wrong(path, Fault::MissingTheta { field, theta });
+                let message = format!(
+                    "field {field}: theta = {theta:.4} is missing; expected {SEPARATION_BINS} rows per field"
+                );
+                return wrong(path, message);
             }
             let own = own.map(Option::unwrap_or_default);
             masses.push(Masses {
@@ -725,29 +610,25 @@ fn known_psf(psf: Shear) -> Result<Option<Shear>, String> {
 
 fn field_of(path: &Path, k: usize, found: f64, fields: usize) -> Result<usize, FileError> {
     let (row, last) = (k + 1, fields - 1);
-    let fault = || FileError::new(path, Fault::NotAField { row, found, last });
-    whole(found, fields).ok_or_else(fault)
+    whole(found, fields).ok_or_else(|| {
+        let message =
+            format!("row {row}: not the number of a field (found {found}, expected 0 to {last})");
+        FileError::new(path, message)
+    })
 }
 
 fn complete<T>(path: &Path, found: Vec<Option<T>>) -> Result<Vec<T>, FileError> {
-    let lacking: Vec<usize> = found
-        .iter()
-        .enumerate()
-        .filter(|(_, own)| own.is_none())
-        .map(|(field, _)| field)
-        .collect();
-    match lacking.first() {
-        Some(&field) => wrong(
-            path,
-            Fault::MissingField {
-                field,
-                count: lacking.len(),
-                found: found.len() - lacking.len(),
-                expected: found.len(),
-            },
-        ),
-        None => Ok(found.into_iter().flatten().collect()),
-    }
+    let expected = found.len();
+    let missing = found.iter().position(Option::is_none);
+    let there: Vec<T> = found.into_iter().flatten().collect();
+    let Some(field) = missing else {
+        return Ok(there);
+    };
+    let found = there.len();
+    let more = more(expected - found);
+    let message =
+        format!("field {field} is missing{more} (found {found} fields, expected {expected})");
+    wrong(path, message)
 }
 
 fn lattice() -> Result<LatticeShear, FileError> {
@@ -793,7 +674,7 @@ fn add_truth(
     for (k, &found) in columns[0].iter().enumerate() {
         let id = Identity::of_number(found).filter(|id| id.subfield() == subfield);
         let Some(id) = id else {
-            return wrong(path, Fault::NotAnIdentity { row: k + 1, found });
+            return wrong(path, not_an_identity(k, found));
         };
         if !seen.insert(id) {
             return wrong(
@@ -1042,7 +923,10 @@ impl Galaxies {
                     if let Some(name) = unused.iter().find(|name| is_like_a_weight(name))
                         && columns[3].is_empty()
                     {
-                        return wrong(path, Fault::UnusedWeight(name.clone()));
+                        let message = format!(
+                            "`{name}` looks like a weight but is not used (expected `weight` or `w`). Try: rename it to weight, or remove it"
+                        );
+                        return wrong(path, message);
                     }
                     all.unused.extend(unused);
                     all.add(path, &columns, packing)?;
@@ -1071,6 +955,14 @@ impl Galaxies {
         all.checked(packing)
     }
 
+    // Places in identities from a galaxy to the next along an axis.
+    fn step(&self) -> usize {
+        match self.branch.constant {
+            true => 1,
+            false => NODES_PER_GALAXY,
+        }
+    }
+
     // Adds the galaxies of a table with the columns of `GALAXIES`.
     fn add(
         &mut self,
@@ -1081,40 +973,38 @@ impl Galaxies {
         let (branch, catalogue) = (self.branch, self.files.len());
         self.files.push(path.to_owned());
         for k in 0..columns[0].len() {
-            let fault = |fault| wrong(path, fault);
             let found = columns[0][k];
             let Some(id) = Identity::of_number(found) else {
-                return fault(Fault::NotAnIdentity { row: k + 1, found });
+                return wrong(path, not_an_identity(k, found));
             };
+            let wrong = |fault: String| wrong(path, format!("galaxy {id}: {fault}"));
             if id.subfield() >= packing.subfields {
-                return fault(Fault::Subfield {
-                    id: id.to_string(),
-                    found: id.subfield(),
-                    branch: branch.to_string(),
-                    last: packing.subfields - 1,
-                });
+                return wrong(format!(
+                    "subfield {} does not exist in {branch} (expected 0 to {}). Try: only the catalogues of one branch",
+                    id.subfield(),
+                    packing.subfields - 1
+                ));
             }
             let (x, y) = id.place();
-            let side = if branch.constant {
-                packing.grid
-            } else {
-                packing.grid * NODES_PER_GALAXY
-            };
-            if x >= side || y >= side {
-                let (id, last) = (id.to_string(), side - 1);
-                return fault(Fault::OutsideGrid { id, x, y, last });
+            let last = packing.grid * self.step() - 1;
+            if x.max(y) > last {
+                return wrong(format!(
+                    "column {x} and row {y} are outside of the grid (expected 0 to {last}). Try: --branch with the branch of these identities"
+                ));
             }
             let g = Shear::new(columns[1][k], columns[2][k]);
             for (name, found) in [("g1", g.e1), ("g2", g.e2)] {
                 if found <= -NOT_AVERAGED {
-                    let id = id.to_string();
-                    return fault(Fault::Sentinel { id, name, found });
+                    return wrong(format!(
+                        "{name} is {found}, which the challenge's program would average. Try: 10 for a galaxy that was not measured"
+                    ));
                 }
             }
             let weight = columns[3].get(k).copied().unwrap_or(1.0);
             if !(weight.is_finite() && weight >= 0.0) {
-                let (id, found) = (id.to_string(), weight);
-                return fault(Fault::Weight { id, found });
+                return wrong(format!(
+                    "the weight is {weight}, expected zero or a positive number"
+                ));
             }
             self.galaxies.push(Galaxy {
                 id,
@@ -1137,9 +1027,12 @@ impl Galaxies {
             .windows(2)
             .find(|pair| pair[0].id == pair[1].id)
         {
-            let id = pair[0].id.to_string();
-            let first = file(&pair[0]).display().to_string();
-            return wrong(file(&pair[1]), Fault::RepeatedGalaxy { id, first });
+            let message = format!(
+                "galaxy {} is there twice; it is also in {}. Try: remove one of the two rows",
+                pair[0].id,
+                file(&pair[0]).display()
+            );
+            return wrong(file(&pair[1]), message);
         }
         let there: BTreeSet<usize> = self.galaxies.iter().map(|own| own.id.subfield()).collect();
         let last = self
@@ -1153,15 +1046,12 @@ impl Galaxies {
             let first = lacking.iter().take(5).map(usize::to_string);
             let which = first.collect::<Vec<_>>().join(", ");
             let which = which + if lacking.len() > 5 { ", …" } else { "" };
-            let (count, expected) = (lacking.len(), packing.subfields);
-            return wrong(
-                last,
-                Fault::Subfields {
-                    count,
-                    expected,
-                    which,
-                },
+            let message = format!(
+                "{} of {} subfields are missing: {which}. Try: the catalogues of all subfields in one command",
+                lacking.len(),
+                packing.subfields
             );
+            return wrong(last, message);
         }
         for subfield in self
             .galaxies
@@ -1179,23 +1069,17 @@ impl Galaxies {
         file: impl Fn(&Galaxy) -> &'p Path,
     ) -> Result<(), FileError> {
         let first = &galaxies[0];
-        let step = if self.branch.constant {
-            1
-        } else {
-            NODES_PER_GALAXY
-        };
+        let (step, subfield) = (self.step(), first.id.subfield());
         let offset = |id: Identity| (id.place().0 % step, id.place().1 % step);
         let expected = offset(first.id);
         if let Some(odd) = galaxies.iter().find(|own| offset(own.id) != expected) {
-            return wrong(
-                file(odd),
-                Fault::Offset {
-                    id: odd.id.to_string(),
-                    found: offset(odd.id),
-                    expected,
-                    first: first.id.to_string(),
-                },
+            let message = format!(
+                "galaxy {}: its offset from the first galaxy of its subfield is not a multiple of {NODES_PER_GALAXY} nodes (found {:?}, expected {expected:?} as of {}). Try: the identities of galaxy_catalog-*.fits",
+                odd.id,
+                offset(odd.id),
+                first.id
             );
+            return wrong(file(odd), message);
         }
         let measured =
             |own: &&Galaxy| own.weight > 0.0 && own.g.e1 < NOT_AVERAGED && own.g.e2 < NOT_AVERAGED;
@@ -1207,38 +1091,24 @@ impl Galaxies {
             let Repeated {
                 rows, of, value, ..
             } = found;
-            let subfield = first.id.subfield();
-            return wrong(
-                file(first),
-                Fault::Placeholders {
-                    subfield,
-                    rows,
-                    of,
-                    value,
-                },
+            let message = format!(
+                "subfield {subfield}: {rows} of {of} galaxies have repeated shears, most often {value:?}; expected measured values, which do not repeat. Try: 10 for a galaxy that was not measured"
             );
+            return wrong(file(first), message);
         }
         let count = packing.grid * packing.grid;
-        if galaxies.len() != count {
-            let subfield = first.id.subfield();
+        let found = galaxies.len();
+        if found != count {
             let there: BTreeSet<Identity> = galaxies.iter().map(|own| own.id).collect();
             let nodes = |offset: usize| (0..packing.grid).map(move |k| step * k + offset);
             let all = nodes(expected.0).flat_map(|x| nodes(expected.1).map(move |y| (x, y)));
             let mut all = all.map(|place| Identity::new(subfield, place));
-            let id = all
-                .find(|id| !there.contains(id))
-                .unwrap_or(first.id)
-                .to_string();
-            return wrong(
-                file(first),
-                Fault::Galaxies {
-                    id,
-                    count: count - galaxies.len(),
-                    subfield,
-                    found: galaxies.len(),
-                    expected: count,
-                },
+            let id = all.find(|id| !there.contains(id)).unwrap_or(first.id);
+            let more = more(count - found);
+            let message = format!(
+                "galaxy {id} is missing{more}: subfield {subfield} has {found} galaxies, expected {count}. Try: a row with g1 = g2 = 10 for each galaxy that was not measured"
             );
+            return wrong(file(first), message);
         }
         Ok(())
     }
@@ -1251,14 +1121,13 @@ impl Galaxies {
             .collect();
         let file = &self.files[0];
         let mut text = String::new();
-        let is_measured = |g: f64, limit: f64| g < limit;
         if self.branch.constant {
             text += "# index g1 g2\n";
             for (field, range) in fields.into_iter().enumerate() {
                 let mean = |of: fn(&Shear) -> f64, other: fn(&Shear) -> f64| {
                     let own = self.galaxies[range.clone()].iter().filter(|own| {
-                        is_measured(of(&own.g), NOT_AVERAGED)
-                            && (!packing.whole_galaxies || is_measured(other(&own.g), NOT_AVERAGED))
+                        of(&own.g) < NOT_AVERAGED
+                            && (!packing.whole_galaxies || other(&own.g) < NOT_AVERAGED)
                     });
                     let (mut sum, mut weight) = (0.0, 0.0);
                     for own in own {
@@ -1267,19 +1136,13 @@ impl Galaxies {
                     }
                     match weight > 0.0 {
                         true => Ok(sum / weight),
-                        false => wrong(file, Fault::Unmeasured { field }),
+                        false => wrong(file, unmeasured(field)),
                     }
                 };
                 let g1 = mean(|g| g.e1, |g| g.e2)?;
                 let g2 = mean(|g| g.e2, |g| g.e1)?;
                 if Shear::new(g1, g2) == Shear::ZERO {
-                    return wrong(
-                        file,
-                        Fault::Zero {
-                            field,
-                            name: "(g1, g2)",
-                        },
-                    );
+                    return wrong(file, zero(field, "(g1, g2)"));
                 }
                 let _ = writeln!(text, "{field} {g1} {g2}");
             }
@@ -1294,20 +1157,14 @@ impl Galaxies {
                 self.masses(&self.galaxies[range], limit)
                     .map_err(|fault| match fault {
                         Some(error) => error,
-                        None => FileError::new(file, Fault::Unmeasured { field }),
+                        None => FileError::new(file, unmeasured(field)),
                     })
             });
             for (field, own) in masses.enumerate() {
                 let own = own?;
                 // Without a pair, or of galaxies without shears.
                 if own.map_e.iter().all(|mass| *mass == 0.0) {
-                    return wrong(
-                        file,
-                        Fault::Zero {
-                            field,
-                            name: "map_E",
-                        },
-                    );
+                    return wrong(file, zero(field, "map_E"));
                 }
                 for b in 0..SEPARATION_BINS {
                     let _ = writeln!(
