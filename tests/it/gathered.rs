@@ -794,6 +794,16 @@ fn pixel_axes_that_are_not_the_skys_are_stated() {
     };
     let (mixed, turned, along) = (json("all"), json("turned"), json("camera"));
     assert_eq!([&mixed["frame"], &along["frame"]], ["sky", "pixel"]);
+    let scored = |out: &str| {
+        let truth = small.at(out).join("set01/truth.csv");
+        fs::copy(small.at("data/set02/truth.csv"), truth).unwrap();
+        let line = format!(
+            "rm -r {out}-out; shearq measure --data {out} --submission {LINEAR} --out {out}-out; shearq score --measured {out}-out --format csv"
+        );
+        printed(small.root(), &line)
+    };
+    assert!(scored("turned").contains(",frame,") && scored("turned").contains(",sky,"));
+    assert!(!scored("camera").contains("frame"));
     // The stamps are the same, so that on the sky e1 of the two images differs in sign and e2 does not.
     let [g2, turned2] = [&mixed, &turned].map(|row| row["g2"].as_f64().unwrap());
     assert!((g2 - turned2).abs() < 0.005, "{g2} {turned2}");

@@ -410,6 +410,7 @@ pub(crate) mod tests {
             images: (1..=replicates.len() as u32).collect(),
             galaxies: 1,
             flagged: 0,
+            frame: Default::default(),
             metrics,
             errors: Metrics::unknown(),
             q_replicates: replicates.to_vec(),

@@ -236,6 +236,7 @@ fn published_q_c(shears: &ConstantShears, truth: &[[f64; 2]], means: &[[f64; 2]]
                 images: vec![1],
                 galaxies: 1,
                 flagged: 0,
+                frame: Default::default(),
                 metrics,
                 errors: Metrics::unknown(),
                 q_replicates: Vec::new(),

@@ -1,13 +1,15 @@
 //! Files that are written completely or not at all.
 //!
 //! Until they are complete they have temporary names, `.NAME.RANDOM.part`. The next process removes the leftovers of a
-//! killed one: [`remove_leftovers`] in a folder that one process uses alone, [`sweep`] elsewhere. A lock marks the files
-//! of a running process.
+//! killed one: [`remove_leftovers`] in a folder that one process uses alone; elsewhere the first file that is written. A lock
+//! marks the files of a running process.
 
+use std::collections::BTreeSet;
 use std::ffi::OsString;
 use std::fs::{self, Permissions};
 use std::io::{self, ErrorKind, Write};
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
 
 use tempfile::{Builder, NamedTempFile, TempDir};
 
@@ -95,7 +97,6 @@ impl PartFolder {
             let message = "this exists already; expected a new or an empty folder";
             return Err(FileError::new(&target, message));
         }
-        sweep_beside(&target);
         let (names, folder) = names_for(&target)?;
         let made = held_folder(&names, &folder, usual(0o777));
         let (part, lock) = made.map_err(FileError::doing(&target, "cannot make the folder"))?;
@@ -230,13 +231,19 @@ impl Names {
     }
 }
 
-/// Temporary names for `target`, and its folder, which is made.
+/// Temporary names for `target`, and its folder, which is made. The first file that a process writes into a folder removes the
+/// leftovers of killed processes there; not each one, because a folder may have thousands.
 fn names_for(target: &Path) -> Result<(Names, PathBuf), FileError> {
     let name = target
         .file_name()
         .ok_or_else(|| FileError::new(target, "this is not the name of a file"))?;
     let folder = folder_of(target);
     fs::create_dir_all(folder).map_err(FileError::doing(folder, "cannot make the folder"))?;
+    static SWEPT: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
+    let mut swept = SWEPT.lock().unwrap_or_else(PoisonError::into_inner);
+    if swept.insert(folder.to_owned()) {
+        sweep(folder);
+    }
     Ok((Names::of(name), folder.to_owned()))
 }
 
@@ -290,7 +297,7 @@ fn is_part(path: &Path) -> bool {
 
 /// Removes the temporary files and folders in `folder` that no running process has locked. Files without a known state
 /// or without permission stay, and do no harm.
-pub fn sweep(folder: &Path) {
+fn sweep(folder: &Path) {
     for path in list(folder).unwrap_or_default() {
         let Ok(about) = path.symlink_metadata() else {
             continue;
@@ -308,10 +315,6 @@ pub fn sweep(folder: &Path) {
             };
         }
     }
-}
-
-pub fn sweep_beside(target: &Path) {
-    sweep(folder_of(target));
 }
 
 // Flushes the names in the folder of `file` to disk, so that even a power failure cannot keep later
@@ -395,6 +398,7 @@ mod tests {
         // Another program's, and one that is being written.
         fs::write(at(".film.mp4.part"), "half").unwrap();
         let (living, _file) = PartFile::create(at("out.csv")).unwrap();
+        assert!(!at(left).exists() && !at(".out.fedcba9876543210.part").exists());
         let folder_of = PartFolder::new(at("packed")).unwrap();
         sweep(folder.path());
         let mut names: Vec<PathBuf> = list(folder.path()).unwrap();

@@ -147,7 +147,6 @@ impl Baseline {
     }
 
     pub fn create(&self, path: &Path) -> Result<(), FileError> {
-        atomic::sweep_beside(path);
         if atomic::write_if_absent(path, self.text(path)?.as_bytes())? {
             return Ok(());
         }
@@ -156,7 +155,6 @@ impl Baseline {
 
     /// Replaces the file. It belongs under version control, which keeps the earlier one.
     pub fn replace(&self, path: &Path) -> Result<(), FileError> {
-        atomic::sweep_beside(path);
         atomic::write(path, self.text(path)?.as_bytes())
     }
 

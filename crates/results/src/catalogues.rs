@@ -6,10 +6,11 @@ use std::path::{Path, PathBuf};
 
 use shearq_dataset::layout::{DataFolder, read_rows};
 use shearq_dataset::listing::Files;
-use shearq_dataset::metadata::{CommonAxes, stated_axes};
+use shearq_dataset::metadata::{Axes, CommonAxes, stated_axes};
 use shearq_dataset::run::{Run, Source};
 use shearq_files::FileError;
 use shearq_files::table::most_rows;
+use shearq_quantities::Frame;
 use shearq_scoring::{Choice, Convention, FieldSum, Grid, Row, RowCounts};
 
 use crate::foreign::{ADVICE_ON_SENTINELS, Foreign, fault_of_rows, folder_of};
@@ -118,15 +119,16 @@ impl Catalogues {
         })
     }
 
-    /// Refuses a set of which only some catalogues by shearq are in the frame of the sky. The true shear is that of one frame.
-    pub fn check_axes(&self, set: u32) -> Result<(), FileError> {
+    /// The frame of a set. One of which only some catalogues by shearq are in the frame of the sky is refused: the true shear is that
+    /// of one frame.
+    pub fn frame(&self, set: u32) -> Result<Frame, FileError> {
         let mut axes = CommonAxes::default();
         if let Some(run) = &self.run {
             for (_, path) in self.files.of_set(set) {
                 axes.add(&path, stated_axes(&path, run.format)?, true)?;
             }
         }
-        Ok(())
+        Ok(axes.common().map_or(Frame::Pixel, Axes::frame))
     }
 
     /// The source of the galaxies, for a store.

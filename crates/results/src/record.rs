@@ -11,6 +11,7 @@ use shearq_dataset::run::Source;
 use shearq_files::FileError;
 use shearq_files::frames::polars::{Column as FrameColumn, DataFrame, PolarsResult};
 use shearq_files::table::MAX_ROWS;
+use shearq_quantities::Frame;
 use shearq_render::table::Cell;
 use shearq_scoring::resample::mean_over_sets;
 use shearq_scoring::{
@@ -33,6 +34,9 @@ pub struct SetRecord {
     pub galaxies: u64,
     /// Galaxies without an ellipticity.
     pub flagged: u64,
+    /// The axes of the ellipticities.
+    #[serde(default, skip_serializing_if = "is_pixel")]
+    pub frame: Frame,
     /// Metrics of the chosen convention.
     pub metrics: Metrics,
     pub errors: Metrics,
@@ -48,6 +52,10 @@ pub struct SetRecord {
     /// meaningless otherwise.
     pub convention_known: bool,
     pub convention_leaderboard: u8,
+}
+
+fn is_pixel(frame: &Frame) -> bool {
+    *frame == Frame::Pixel
 }
 
 fn yes() -> bool {
@@ -75,6 +83,7 @@ impl SetRecord {
             images,
             galaxies: (rows.used + rows.not_finite) as u64,
             flagged: rows.not_finite as u64,
+            frame: Frame::Pixel,
             metrics: score.metrics,
             errors: score.errors,
             q_replicates: score.replicates.iter().map(|r| r.q).collect(),
@@ -99,6 +108,7 @@ impl SetRecord {
             images,
             galaxies: 0,
             flagged: 0,
+            frame: Frame::Pixel,
             metrics: score.metrics,
             errors: score.errors,
             q_replicates: Vec::new(),
@@ -274,7 +284,10 @@ fn kind(set: &SetRecord, label: fn(&SetKind) -> &'static str) -> String {
     set.kind().as_ref().map_or("", label).to_owned()
 }
 
-const BEFORE_METRICS: [Column; 20] = [
+/// The column of the frame, which tables have if it is not that of the pixels.
+pub const FRAME: &str = "frame";
+
+const BEFORE_METRICS: [Column; 21] = [
     of_run("run", "Run", RunRecord::id),
     of_run("submission", "Configuration", |run| {
         run.configuration.clone()
@@ -301,6 +314,7 @@ const BEFORE_METRICS: [Column; 20] = [
     text("image_numbers", "Image numbers", |set| list(&set.images)),
     count("galaxies", "Galaxies", |set| set.galaxies),
     count("flagged", "Flagged", |set| set.flagged),
+    text(FRAME, "Frame", |set| set.frame.to_string()),
 ];
 
 const AFTER_METRICS: [Column; 6] = [
@@ -387,8 +401,9 @@ pub fn frame_of(runs: &[RunRecord]) -> PolarsResult<DataFrame> {
         let values: Vec<f64> = sets.clone().map(|(_, set)| value(set)).collect();
         FrameColumn::new(name.into(), values)
     };
+    let on_sky = sets.clone().any(|(_, set)| !is_pixel(&set.frame));
     let mut frame = Vec::new();
-    for Column { name, value, .. } in columns() {
+    for Column { name, value, .. } in columns().filter(|own| own.name != FRAME || on_sky) {
         match value {
             Value::OfRun(value) => {
                 let texts: Vec<String> = sets.clone().map(|(run, _)| value(run)).collect();
@@ -549,6 +564,13 @@ impl Rows<'_> {
             images,
             galaxies,
             flagged: self.at_most("flagged", row, galaxies)?,
+            frame: match self.frame.column(FRAME) {
+                Ok(_) => {
+                    let word = self.text(FRAME, row)?.parse();
+                    self.found(FRAME, row, "frame, pixel or sky", |_| word.ok())?
+                }
+                Err(_) => Frame::Pixel,
+            },
             metrics: self.metrics("", row)?,
             errors: self.metrics("_error", row)?,
             q_replicates: self.reals("q_replicates", row)?,
@@ -574,6 +596,7 @@ mod tests {
             images: vec![1],
             galaxies: 64,
             flagged: 0,
+            frame: Frame::Sky,
             metrics: Metrics::unknown(),
             errors: Metrics::unknown(),
             q_replicates: Vec::new(),

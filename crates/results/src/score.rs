@@ -9,6 +9,7 @@ use shearq_dataset::run::kind_of;
 use shearq_dataset::threads::{Pool, ThreadError};
 use shearq_dataset::truth::{ReadTruth, Reading, Sign, read_truth, reading_of};
 use shearq_files::FileError;
+use shearq_quantities::Frame;
 use shearq_scoring::{
     Choice, Convention, ConventionMatch, Fault, Grid, ImageFaults, OddResponse, Options, Repeated,
     RowCounts, ScoringError, SetImages, SetScore, SetScorer, TruthSign, sign_by_correlation,
@@ -329,9 +330,8 @@ fn score_sets(
     options: Options,
     pool: &Pool,
 ) -> Result<Vec<ScoredSet>, ScoreError> {
-    for &set in sets {
-        catalogues.check_axes(set)?;
-    }
+    let frames = sets.iter().map(|&set| catalogues.frame(set));
+    let frames: Vec<Frame> = frames.collect::<Result<_, _>>()?;
     let files = |set| SetFiles::new(catalogues, set, kind_of(data, set).is_some(), pool);
     let scorer = |files: &SetFiles<'_>, set: u32, options| -> Result<_, ScoreError> {
         let ReadTruth { grid, shear, .. } = read_truth(&data.truth(set), &reading_of(data, set)?)?;
@@ -353,7 +353,7 @@ fn score_sets(
         options.choice = Choice::Insist(all.convention());
     }
     let mut scored = Vec::new();
-    for &set in sets {
+    for (&set, frame) in sets.iter().zip(frames) {
         let files = files(set)?;
         let (grid, scorer) = scorer(&files, set, options)?;
         let compared = match options.choice {
@@ -361,7 +361,9 @@ fn score_sets(
             Choice::Matched | Choice::Best => None,
         };
         let added = files.add_up(&grid, compared)?;
-        scored.push(files.score(&scorer, added, options.choice, matched)?);
+        let mut one = files.score(&scorer, added, options.choice, matched)?;
+        one.record.frame = frame;
+        scored.push(one);
     }
     Ok(scored)
 }

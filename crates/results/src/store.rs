@@ -40,7 +40,6 @@ pub fn prepare(store: &Path) -> Result<Prepared, FileError> {
     let absent = !store.exists();
     std::fs::create_dir_all(store)
         .map_err(FileError::doing(store, "cannot make the results store"))?;
-    atomic::sweep(store);
     Ok(Prepared(absent.then(|| store.to_owned())))
 }
 
@@ -162,6 +161,7 @@ mod tests {
     use super::*;
     use crate::record::SetRecord;
     use shearq_files::frames::polars::Column;
+    use shearq_quantities::Frame;
     use shearq_scoring::Metrics;
 
     fn run(configuration: &str, sets: &[(u32, u32, f64)]) -> RunRecord {
@@ -172,6 +172,10 @@ mod tests {
             images: (1..=images).collect(),
             galaxies: 64,
             flagged: 1,
+            frame: match set {
+                7 => Frame::Sky,
+                _ => Frame::Pixel,
+            },
             metrics: {
                 let mut metrics = Metrics::unknown();
                 metrics.q = q;
@@ -209,6 +213,8 @@ mod tests {
         write(&store, &run("a", &[(1, 1, 5.5)])).unwrap();
         let (runs, notes) = read(&store).unwrap();
         assert!(notes.is_empty(), "{notes:?}");
+        let sets = runs.iter().flat_map(|run| &run.sets);
+        assert_eq!(sets.filter(|set| set.frame == Frame::Sky).count(), 1);
         let found = |run: &RunRecord| -> Vec<(u32, usize, f64)> {
             let sets = run.sets.iter();
             sets.map(|set| (set.set, set.images.len(), set.metrics.q))

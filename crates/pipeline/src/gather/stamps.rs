@@ -3,8 +3,8 @@
 use std::path::{Path, PathBuf};
 
 use ndarray::ArrayView2;
+use shearq_files::FileError;
 use shearq_files::fits::{ImageWriter, Pixel, Value};
-use shearq_files::{FileError, atomic};
 use shearq_measure::{Examination, examined_rows};
 use shearq_quantities::statistics::upper_median;
 
@@ -382,7 +382,6 @@ impl Rows {
             ("NSTAMPS", Value::Int(galaxies as i64)),
         ];
         keys.extend_from_slice(more);
-        atomic::sweep_beside(path);
         Ok(Rows {
             path: path.to_owned(),
             writer: ImageWriter::create(path, columns * stamp, mosaic.rows() * stamp, &keys)?,

@@ -21,7 +21,7 @@ use shearq_dataset::record::record_text;
 use shearq_dataset::threads::Progress;
 use shearq_dataset::{grid, truth};
 use shearq_files::FileError;
-use shearq_files::atomic::{PartFile, PartFolder, sweep_beside};
+use shearq_files::atomic::{PartFile, PartFolder};
 use shearq_files::open::is_there;
 use shearq_files::table::{MAX_ROWS, most_rows};
 use tar::{Builder, Header};
@@ -288,7 +288,6 @@ impl ArchiveWriter {
         if is_there(path) {
             return Err(exists(path));
         }
-        sweep_beside(path);
         let (part, file) = PartFile::create(path)?;
         // Time and system would change the bytes.
         let encoder = GzBuilder::new()

@@ -427,6 +427,7 @@ mod tests {
             images: (1..=8).collect(),
             galaxies: 8,
             flagged: 0,
+            frame: Default::default(),
             metrics: with(q, calibrated, -0.3),
             errors: with(0.1, 2.0, 0.01),
             q_replicates: vec![q; 8],

@@ -5,13 +5,14 @@ use std::path::PathBuf;
 
 use serde_json::{Value, json};
 use shearq_dataset::truth::Sign;
+use shearq_quantities::Frame;
 use shearq_render::table::{Cell, Table};
 use shearq_scoring::{
     BINS, Bias, BiasFits, ConventionClass, ConventionScore, Definition, Fault, ImageFaults,
     Metrics, OddResponse, Repeated, RowCounts, SetScore,
 };
 
-use crate::record::{SetRecord, columns_named, definition_word, mean};
+use crate::record::{FRAME, SetRecord, columns_named, definition_word, mean};
 use crate::score::{Basis, OddImages, ScoredSet};
 use crate::views::pages::bins;
 
@@ -189,7 +190,14 @@ pub fn per_set(scored: &[ScoredSet], title: &str, definition: Definition) -> Tab
     }
     let records: Vec<SetRecord> = scored.iter().map(|set| set.record.clone()).collect();
     let metrics = Metrics::ALL.map(|metric| metric.name);
-    let names = [&["images"], &metrics[..], &["convention", "q_leaderboard"]].concat();
+    let frame = frame_column(scored);
+    let names = [
+        &["images"],
+        frame,
+        &metrics,
+        &["convention", "q_leaderboard"],
+    ]
+    .concat();
     let mut table = table_of_sets(&records, title, &names);
     let apart = records
         .iter()
@@ -223,6 +231,13 @@ pub fn per_set(scored: &[ScoredSet], title: &str, definition: Definition) -> Tab
     table
 }
 
+fn frame_column(scored: &[ScoredSet]) -> &'static [&'static str] {
+    match scored.iter().all(|set| set.record.frame == Frame::Pixel) {
+        true => &[],
+        false => &[FRAME],
+    }
+}
+
 // Whether the leaderboard's Q has another class of conventions than the metrics. Within a class Q differs by
 // rounding only, at most 1e-7.
 pub(super) fn best_is_another(q_leaderboard: f64, q: f64) -> bool {
@@ -240,6 +255,11 @@ fn constant_shear(scored: &[ScoredSet], title: &str) -> Table {
     table.column("images", "Images", &rows, |(own, _)| {
         Cell::number(own.score.images as f64, 0)
     });
+    for name in frame_column(scored) {
+        table.column(name, "Frame", &rows, |(own, _)| {
+            Cell::text(own.record.frame.to_string())
+        });
+    }
     for (k, (key, label)) in [("e1", "mean e1"), ("e2", "mean e2")]
         .into_iter()
         .enumerate()
