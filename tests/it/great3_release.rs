@@ -240,6 +240,18 @@ fn epochs_of_a_subfield_are_combined() {
         "{found:?}"
     );
     assert!(!small.at("epochs/set00/catalogue-001.parquet").exists());
+    let kept = fs::read(at("image-000-1.fits")).unwrap();
+    write_image(
+        &at("image-000-1.fits"),
+        &[side, side],
+        &vec![0.0; side * side],
+    );
+    let output = shell(small.root(), &measure.replace("--out epochs", "--out zero"));
+    let said = String::from_utf8(output.stderr).unwrap();
+    let expected = "great3/image-000-1.fits: cannot measure the noise: no stamp has enough pixels that differ (expected galaxies and noise). The epoch is left out";
+    assert!(said.contains(expected), "{said}");
+    assert_eq!(snr("zero"), snr("m"));
+    fs::write(at("image-000-1.fits"), kept).unwrap();
     // Another dither makes the catalogue one of other data.
     let dither = at("epoch_dither-000-1.yaml");
     fs::write(&dither, "{xdither_pixels: -2.0, ydither_pixels: 0.0}").unwrap();

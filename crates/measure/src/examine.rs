@@ -916,6 +916,8 @@ mod tests {
         let dither = [0.5, -0.25];
         let (at, centred) = (dither.map(f64::from), [0.0; 2]);
         let first = epoch([0.0; 2], centred, [0.0; 2], [0, 1]);
+        // Stamps without pixels are no copies.
+        assert_eq!(first.copies(42), None);
         let kinds = |other: &Examination, axes: Matrix2| {
             let found = other.contradictions(&[&first], axes);
             found.iter().map(Warning::kind).collect::<Vec<_>>()
