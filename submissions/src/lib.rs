@@ -17,7 +17,7 @@ pub use settings::{
     AcfKind, Background, BrightnessUnit, Calibration, ClippedShape, Clipping, Configuration,
     Denoise, EllipticityType, Kept, LinearDeconvolution, LinearMethod, Method,
     NetworkDeconvolution, NetworkMethod, NoiseSource, Psf, PsfCut, PsfForm, PsfScale, ShareOf,
-    SkySource, Stamp, Start, StepScale, Update, Wavelet, WeightedShape, limits,
+    ShearOrigin, SkySource, Stamp, Start, StepScale, Update, Wavelet, WeightedShape, limits,
 };
 
 /// The examples of README.md.

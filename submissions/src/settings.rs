@@ -336,6 +336,9 @@ pub struct WeightedShape {
     /// Matched-filter S/N ν₀ at which the regularisation halves the ellipticity of a round Gaussian galaxy of the size that the
     /// window in use is for (`reference_extent` at the configured window): e is weighted by ν²/(ν² + ν₀²), because noisier galaxies deserve less weight. Zero for no regularisation.
     pub half_snr: f64,
+    /// What a shear leaves in its place.
+    #[serde(default)]
+    pub origin: ShearOrigin,
     /// Shear of the sheared catalogues (`1p`, `1m`, `2p`, `2m`): further columns of ellipticity, S/N, flux and size. Zero
     /// for none.
     pub sheared_step: f64,
@@ -490,6 +493,17 @@ pub enum Calibration {
     None,
     /// The image's mean response to shear, measured on its own galaxies (metacalibration).
     Response,
+}
+
+/// The place that a shear of the galaxy leaves where it is.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum ShearOrigin {
+    /// The middle of the stamp, or the stated place of the galaxy.
+    #[default]
+    Stamp,
+    /// The galaxy's centroid as far as noise allows, on single stamps.
+    Centroid,
 }
 
 /// Ellipticity definition of a catalogue.

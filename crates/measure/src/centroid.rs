@@ -16,6 +16,10 @@ const STEP_FACTOR: f64 = 1.5;
 const GALAXY_STEPS: usize = 3;
 // A weighted centroid of one σ of the weight. Chosen by hand.
 const MAX_GALAXY_STEP: f64 = 3.0;
+// S/N ν under the weight at which half of a centroid is the origin of the shear. The noise of a centroid correlates with that of the
+// response: whole centroids would make m about +1e-3 (20/ν)² (tests/stress --cases off1,off2,off3), with 30 it is below 0.3e-3 at any ν.
+const HALF_CENTROID_SNR: f64 = 30.0;
+
 // A star of FWHM 10 px is found to 10⁻³ px. Chosen by hand.
 const MAX_STAR_STEPS: usize = 40;
 // Chosen by hand.
@@ -32,20 +36,35 @@ pub(crate) fn galaxy_centroid(stamp: &[f32], n: usize) -> [f32; 2] {
 /// The same of a galaxy that is expected at `start` from the centre, which it is if there is no light. Steps that fall short of the
 /// centroid leave no part of an offset that was expected.
 pub(crate) fn galaxy_centroid_near(stamp: &[f32], n: usize, start: [f64; 2]) -> [f32; 2] {
+    centroid_and_light(stamp, n, start).0
+}
+
+/// Place (x, y) about which a shear deforms the galaxy, from the centre of its stamp of `n` pixels a side in noise of this level.
+pub(crate) fn shear_origin(stamp: &[f32], n: usize, noise: f64) -> [f32; 2] {
+    let (centroid, light) = centroid_and_light(stamp, n, [0.0; 2]);
+    // The integral of the squared weight is πσ².
+    let snr = light / (noise * WEIGHT_SIGMA * std::f64::consts::PI.sqrt());
+    let share = 1.0 / (1.0 + (HALF_CENTROID_SNR / snr).powi(4));
+    centroid.map(|at| at * share as f32)
+}
+
+// The centroid of `galaxy_centroid_near`, and the light under its last weight.
+fn centroid_and_light(stamp: &[f32], n: usize, start: [f64; 2]) -> ([f32; 2], f64) {
     let centre = (n as f64 - 1.0) / 2.0;
     let bound = centre / 2.0;
-    let mut offset = start;
+    let (mut offset, mut light) = (start, 0.0);
     for _ in 0..GALAXY_STEPS {
         let row = |y: usize| &stamp[y * n..][..n];
-        let Some(step) = step([n; 2], row, offset.map(|at| centre + at)) else {
-            return start.map(|at| at as f32);
+        let Some((step, under_weight)) = step([n; 2], row, offset.map(|at| centre + at)) else {
+            return (start.map(|at| at as f32), 0.0);
         };
+        light = under_weight;
         for (at, step) in offset.iter_mut().zip(step) {
             let step = step.clamp(-MAX_GALAXY_STEP, MAX_GALAXY_STEP);
             *at = (*at + step).clamp(-bound, bound);
         }
     }
-    offset.map(|at| at as f32)
+    (offset.map(|at| at as f32), light)
 }
 
 /// Centroid (x, y) of a star near `start`, in pixels from the first; `start` if the search leaves it or finds no light.
@@ -54,7 +73,7 @@ pub(crate) fn star_centroid<P: Pixel>(stamp: ArrayView2<'_, P>, start: [f64; 2])
     let mut at = start;
     for _ in 0..MAX_STAR_STEPS {
         let row = |y: usize| contiguous(stamp.row(y));
-        let Some(step) = step([columns, rows], row, at) else {
+        let Some((step, _)) = step([columns, rows], row, at) else {
             return start;
         };
         for k in 0..2 {
@@ -70,12 +89,12 @@ pub(crate) fn star_centroid<P: Pixel>(stamp: ArrayView2<'_, P>, start: [f64; 2])
     at
 }
 
-/// The step from `at` towards the centroid; `None` without light under the weight.
+/// The step from `at` towards the centroid, and the light under the weight; `None` without light.
 fn step<P: Pixel, R: AsRef<[P]>>(
     [columns, rows]: [usize; 2],
     row: impl Fn(usize) -> R,
     at: [f64; 2],
-) -> Option<[f64; 2]> {
+) -> Option<([f64; 2], f64)> {
     let [first_x, first_y] = at.map(|at| at.floor() as isize + 1 - WEIGHT_HALF_SIDE as isize);
     let weights_x = weights(first_x as f64 - at[0]);
     let weights_y = weights(first_y as f64 - at[1]);
@@ -103,7 +122,7 @@ fn step<P: Pixel, R: AsRef<[P]>>(
     if light <= 0.0 {
         return None;
     }
-    Some(first.map(|sum| STEP_FACTOR * sum / light))
+    Some((first.map(|sum| STEP_FACTOR * sum / light), light))
 }
 
 /// The weight at places one pixel apart, the first of which is `first` pixels from its centre.
@@ -143,5 +162,26 @@ mod tests {
             assert!(rest < 0.16 * x.hypot(y) + 0.01, "{found:?} {x} {y}");
         }
         assert_eq!(galaxy_centroid(&[-1.0; N * N], N), [0.0; 2]);
+        assert_eq!(shear_origin(&[-1.0; N * N], N, 1.0), [0.0; 2]);
+    }
+
+    #[test]
+    fn noisy_centroids_are_no_origins_of_shear() {
+        let stamp: Vec<f32> = (0..N * N)
+            .map(|at| 1.0 + 0.01 * ((at % N) as f32 - 23.5))
+            .collect();
+        let centroid = galaxy_centroid(&stamp, N)[0];
+        assert!(centroid > 0.05);
+        // About one per pixel has a light of 2πσ² under the weight.
+        let noise = |snr: f64| 2.0 * std::f64::consts::PI.sqrt() * WEIGHT_SIGMA / snr;
+        for (snr, share) in [
+            (f64::INFINITY, 1.0),
+            (HALF_CENTROID_SNR, 0.5),
+            (10.0, 1.0 / 82.0),
+        ] {
+            let found = shear_origin(&stamp, N, noise(snr))[0] / centroid;
+            // The stamp is a little brighter about the centroid.
+            assert!((found / share - 1.0).abs() < 0.06, "{snr}: {found}");
+        }
     }
 }

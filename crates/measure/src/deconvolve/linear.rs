@@ -146,6 +146,8 @@ pub struct SpectralScratch {
     /// Where the window is, (x, y) in pixels from the middle of the stamp, and the phases that move this place to the origin.
     centre: [f32; 2],
     phases: Modes,
+    /// Origin of the shear, likewise.
+    origin: [f32; 2],
     edges: EdgesScratch,
     lags: LagsScratch,
 }
@@ -364,6 +366,7 @@ impl Spectral {
             skewed: None,
             centre: [0.0; 2],
             phases: self.plane.mode_by_mode(),
+            origin: [0.0; 2],
             edges: self.edges.scratch(&self.plane),
             lags: self.to_lags.scratch(),
         }
@@ -563,9 +566,10 @@ impl Spectral {
         weigh(modes, plain);
     }
 
-    /// Puts the window at `centre`, (x, y) in pixels from the middle of the stamp, for the stamps that follow.
-    /// Their shear is about this place: the middle of single stamps, the offsets of epochs.
-    pub fn place_window(&self, centre: [f32; 2], scratch: &mut SpectralScratch) {
+    /// Puts the window at `centre` and the origin of the shear at `origin`, (x, y) in pixels from the middle of the stamp, for the
+    /// stamps that follow.
+    pub fn place_window(&self, centre: [f32; 2], origin: [f32; 2], scratch: &mut SpectralScratch) {
+        scratch.origin = origin;
         if scratch.centre == centre {
             return;
         }
@@ -658,6 +662,7 @@ impl Spectral {
             windowed,
             centre,
             phases,
+            origin,
             edges,
             pixels,
             skewed,
@@ -669,14 +674,14 @@ impl Spectral {
             .map(|[stamp, _]| stamp);
         let to_modes = skewed.unwrap_or(&self.stamp);
         to_modes.transform_moments(stamp, of_stamp, windowed);
-        let centre = *centre;
+        let (centre, origin) = (*centre, *origin);
         let at_edges = self.sees_edges(centre, *pixels);
         if at_edges {
             let (transform, out) = ((to_modes, of_stamp), [&mut *edges1, edges2]);
             match skewed {
-                None => self.edges.take(stamp, centre, transform, edges, out),
+                None => self.edges.take(stamp, origin, transform, edges, out),
                 Some(_) => {
-                    let place = (centre, *pixels);
+                    let place = (origin, *pixels);
                     self.edges
                         .take_skewed(stamp, place, (transform, &self.plane), edges, out);
                 }
@@ -691,7 +696,7 @@ impl Spectral {
             restore: if off_middle { moved } else { amplitudes },
             tilts,
             waves: &self.waves,
-            centre,
+            origin,
             edges: at_edges.then_some([edges1, edges2]),
         };
         restore(windowed, &with);
@@ -1214,7 +1219,7 @@ struct Restoration<'a> {
     tilts: &'a [Modes; 2],
     waves: &'a [Vec<f32>; 2],
     /// Origin of the shear, (x, y) in pixels from the middle of the stamp.
-    centre: [f32; 2],
+    origin: [f32; 2],
     /// What the edges of the stamp add to the changes of û.
     edges: Option<[&'a Modes; 2]>,
 }
@@ -1266,7 +1271,7 @@ fn restore_half(
         None => [[zeros; 2]; 2],
     };
     let [tilt1, tilt2] = [complex(&with.tilts[0]), complex(&with.tilts[1])];
-    let (restore, [x0, y0]) = (complex(with.restore), with.centre);
+    let (restore, [x0, y0]) = (complex(with.restore), with.origin);
     let (kx, ky) = (lanes(&with.waves[0], at), lanes(&with.waves[1], at));
     let [[u_re, u_im], [first_re, first_im], [second_re, second_im]] = out;
     for l in 0..LANES {

@@ -166,7 +166,7 @@ impl Spectral {
         for (which, epoch) in epochs.iter().enumerate() {
             let (stamp, place) = stamp(which);
             let at = epoch.pixels.map(place).map(|at| at as f32);
-            self.place_window(at, scratch);
+            self.place_window(at, at, scratch);
             match epoch.pixels {
                 EpochPixels::Shaped(shape) => {
                     self.set_pixel_shape(shape, scratch);
@@ -214,6 +214,7 @@ impl Spectral {
             windowed,
             centre,
             phases,
+            origin,
             ..
         } = scratch;
         let EpochScratch { stamps, edges, .. } = buffers;
@@ -223,14 +224,15 @@ impl Spectral {
         }
         let [moved, edges1, edges2] = changes;
         let (n, inverse) = (self.stamp_size(), epoch.pixels.inverse());
-        let pixel = epoch.pixels.pixel(centre.map(f64::from));
+        let [pixel, origin_pixel] =
+            [*centre, *origin].map(|at| epoch.pixels.pixel(at.map(f64::from)));
         let gradients = inverse.map(|[a, b]| a.hypot(b));
         let at_edges = self.contains_light(pixel, gradients);
         if at_edges {
             // M⁻¹ V M of both shears V.
             let shears = [[[1.0, 0.0], [0.0, -1.0]], [[0.0, 1.0], [1.0, 0.0]]]
                 .map(|shear| product(inverse, product(shear, matrix)));
-            edge_lines(stamp, n, shears, pixel.map(|at| at as f32), edges);
+            edge_lines(stamp, n, shears, origin_pixel.map(|at| at as f32), edges);
             stamps.transform_edges(edges, matrix, &self.plane, [edges1, edges2]);
         }
         moved.copy_from(&epoch.restore);
@@ -241,7 +243,7 @@ impl Spectral {
             restore: moved,
             tilts: &epoch.tilts,
             waves: &self.waves,
-            centre: *centre,
+            origin: *origin,
             edges: at_edges.then_some([edges1, edges2]),
         };
         restore(windowed, &with);

@@ -312,7 +312,8 @@ fn edges_stay_where_they_are_while_the_light_is_sheared() {
         plan.set_pixel_shape(pixels, &mut scratch);
         plan.set_psf(h.view(), &white(&plan), &mut scratch, &mut own)
             .unwrap();
-        plan.place_window(centre.map(|at| at as f32), &mut scratch);
+        let place = centre.map(|at| at as f32);
+        plan.place_window(place, place, &mut scratch);
         let mut lags_of = |plan: &Spectral, g1: f64, g2: f64| {
             let mut lags = plan.lags();
             let stamp = broad(n, &h, (pixels, centre), g1, g2);
@@ -412,9 +413,9 @@ fn a_window_that_follows_the_galaxy_gives_equal_lags() {
         })
         .collect();
     let (mut there, mut here) = (plan.lags(), plan.lags());
-    plan.place_window([3.0, -2.0], &mut scratch);
+    plan.place_window([3.0, -2.0], [3.0, -2.0], &mut scratch);
     plan.autocorrelate(&own, &moved, 0.0, &mut scratch, &mut there);
-    plan.place_window([0.0; 2], &mut scratch);
+    plan.place_window([0.0; 2], [0.0; 2], &mut scratch);
     plan.autocorrelate(&own, &middle, 0.0, &mut scratch, &mut here);
     let peak = here.acf[zero_lag(&plan)];
     let pairs = |a: &[f32], b: &[f32]| {
@@ -772,7 +773,7 @@ fn mean_products_are_sums_over_modes_of_what_each_changes() {
     let h = psf(31);
     let (plan, psf, mut scratch) = planned(32, &h, &settings);
     for centre in [[0.0, 0.0], [1.5, -2.0]] {
-        plan.place_window(centre, &mut scratch);
+        plan.place_window(centre, centre, &mut scratch);
         let stamp = observed(32, &h, 0.0, 0.0);
         let mut lags = plan.lags();
         plan.autocorrelate(&psf, &stamp, 0.0, &mut scratch, &mut lags);
