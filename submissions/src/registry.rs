@@ -26,7 +26,7 @@ macro_rules! embedded {
 }
 
 // In the order of the paper's Table 1, then the configurations that it does not have: tables list them in this order.
-const EMBEDDED: [(&str, &str); 15] = embedded![
+const EMBEDDED: [(&str, &str); 16] = embedded![
     "paper.toml",
     "subm-19-den-star.toml",
     "subm-23-den-func.toml",
@@ -38,6 +38,7 @@ const EMBEDDED: [(&str, &str); 15] = embedded![
     "48-linear-star.toml",
     "48-linear-func.toml",
     "48-linear-survey.toml",
+    "48-linear-centroid.toml",
     "as-printed-paper.toml",
     "as-printed-23-raw-star.toml",
     "as-printed-23-den-star.toml",
