@@ -1,8 +1,6 @@
 #!/usr/bin/env python3
 """Images as one might have them, rendered by GalSim (pip install galsim astropy): a field of one shear as a cube of
-stamps, and a small challenge of one set in shearq's layout. docs/own-images.md goes on from here."""
-
-from pathlib import Path
+stamps. docs/own-images.md goes on from here."""
 
 import galsim
 import numpy as np
@@ -40,32 +38,3 @@ for _ in range(200):
         stamps.append(stamp((0.02, -0.01), (sign * e[0], sign * e[1]), noise))
 fits.writeto("field.fits", np.array(stamps), overwrite=True)
 fits.writeto("star.fits", drawn(psf).astype(np.float32), overwrite=True)
-
-# A challenge: two images of 16 x 16 galaxies under one field of shear, plane waves of E modes.
-N = 16
-place = np.arange(N)
-x, y = np.meshgrid(place, place)
-g1, g2 = np.zeros((N, N)), np.zeros((N, N))
-for kx in range(-5, 6):
-    for ky in range(0, 6):
-        if kx or ky:
-            wave = 0.05 / np.hypot(kx, ky) * np.cos(2 * np.pi * (kx * x + ky * y) / N + rng.uniform(0, 2 * np.pi))
-            angle = 2 * np.arctan2(ky, kx)
-            g1 += wave * np.cos(angle)
-            g2 += wave * np.sin(angle)
-folder = Path("challenge/set01")
-folder.mkdir(parents=True, exist_ok=True)
-for image in (1, 2):
-    mosaic = np.zeros((N * STAMP, N * STAMP), np.float32)
-    for iy in range(N):
-        for ix in range(N):
-            noise = rng.normal(0, 1, (STAMP, STAMP))
-            part = stamp((g1[iy, ix], g2[iy, ix]), ellipticity(), noise)
-            mosaic[iy * STAMP : (iy + 1) * STAMP, ix * STAMP : (ix + 1) * STAMP] = part
-    fits.writeto(folder / f"galaxies-{image:03}.fits", mosaic, overwrite=True)
-    fits.writeto(folder / f"psf-{image:03}.fits", drawn(psf).astype(np.float32), overwrite=True)
-with open(folder / "truth.csv", "w") as truth:
-    truth.write("x,y,g1,g2\n")
-    for iy in range(N):
-        for ix in range(N):
-            truth.write(f"{ix * STAMP + 24.5},{iy * STAMP + 24.5},{g1[iy, ix]},{g2[iy, ix]}\n")
