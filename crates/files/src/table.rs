@@ -167,6 +167,8 @@ pub struct Columns {
     pub named: Vec<Named>,
     /// Fields of the first row of a text table that has no header.
     pub unnamed: Vec<String>,
+    /// Words of the comments of such a table that are more or fewer than its fields, so that none names a column.
+    pub remarks: Vec<Vec<String>>,
 }
 
 #[derive(Debug, Clone)]
@@ -191,6 +193,7 @@ pub fn columns(place: &Place) -> Result<Columns, FileError> {
         Ending::Parquet => Ok(Columns {
             named: vec![plain(parquet::columns(path)?, false)],
             unnamed: Vec::new(),
+            remarks: Vec::new(),
         }),
         Ending::Fits => {
             let tables = fits::tables(path, place.table.as_deref())?.into_iter();
@@ -202,6 +205,7 @@ pub fn columns(place: &Place) -> Result<Columns, FileError> {
             Ok(Columns {
                 named: named.collect(),
                 unnamed: Vec::new(),
+                remarks: Vec::new(),
             })
         }
         Ending::Text => {
@@ -210,11 +214,20 @@ pub fn columns(place: &Place) -> Result<Columns, FileError> {
                 Some(names) => Columns {
                     named: vec![plain(names, false)],
                     unnamed: Vec::new(),
+                    remarks: Vec::new(),
                 },
-                None => Columns {
-                    named: found.comments.into_iter().map(|c| plain(c, true)).collect(),
-                    unnamed: found.fields,
-                },
+                None => {
+                    let count = found.fields.len();
+                    let (names, remarks): (Vec<_>, Vec<_>) = found
+                        .comments
+                        .into_iter()
+                        .partition(|words| words.len() == count);
+                    Columns {
+                        named: names.into_iter().map(|words| plain(words, true)).collect(),
+                        unnamed: found.fields,
+                        remarks,
+                    }
+                }
             })
         }
     }

@@ -76,7 +76,7 @@ pub(super) fn read(path: &Path, request: &Request<'_>) -> Result<DataFrame, File
 pub(super) struct Columns {
     /// Names, if a header or the comments of SExtractor give them.
     pub(super) names: Option<Vec<String>>,
-    /// Comments with as many words as the first row has fields: each may be a header.
+    /// Words of each comment, the last comment first. One with as many words as the first row has fields may be a header.
     pub(super) comments: Vec<Vec<String>>,
     pub(super) fields: Vec<String>,
 }
@@ -96,9 +96,7 @@ pub(super) fn columns(path: &Path) -> Result<Columns, FileError> {
     let comments = head.comments.iter().rev().map(|line| split_names(line));
     Ok(Columns {
         names,
-        comments: comments
-            .filter(|words| words.len() == fields.len())
-            .collect(),
+        comments: comments.collect(),
         fields,
     })
 }

@@ -471,6 +471,22 @@ impl Columns<'_> {
                     let message = format!("found {count} columns, expected {}", self.described());
                     return wrong(path, message);
                 };
+                // `# columns: ID g2 g1 w` and `# ID | g2 | g1 | w` state an order, too, but not which word is which column. One that begins
+                // with the order of the columns, such as `# index g1 g2 (true shear)`, agrees with it.
+                let agrees = |words: &[String]| {
+                    let mut pairs = self.names.iter().zip(*places);
+                    pairs.all(|(aliases, place)| is_named(&words[*place], aliases))
+                };
+                let states_names = |words: &&Vec<String>| {
+                    pick(words).is_some() && !(words.len() > count && agrees(words))
+                };
+                if let Some(words) = found.remarks.iter().find(states_names) {
+                    let message = format!(
+                        "found {count} columns below the comment {}, expected one word per column. Try: these names alone, or no comment of them",
+                        words.join(" ")
+                    );
+                    return wrong(path, message);
+                }
                 let number = |k: usize| places.get(k).map(|place| (place + 1).to_string());
                 (&[][..], (0..self.names.len()).map(number).collect())
             }
