@@ -260,13 +260,20 @@ pub fn ranking(branch: &dyn Board, own: &[(String, Score)]) -> Table {
     // Published values have no error: the challenge gave none.
     rows.extend(published.into_iter().map(|entry| (entry, None)));
     rows.sort_by(|(a, _), (b, _)| b.q.total_cmp(&a.q));
-    let rows: Vec<(usize, Entry, Option<f64>)> = rows
+    // A row without a team is the published best Q of the branch: a goal, but no entry that others rank behind.
+    let mut ranks = 1..;
+    let rows: Vec<(Option<usize>, Entry, Option<f64>)> = rows
         .into_iter()
-        .zip(1..)
-        .map(|((entry, error), rank)| (rank, entry, error))
+        .map(|(entry, error)| {
+            let rank = (!entry.team.is_empty()).then(|| ranks.next()).flatten();
+            (rank, entry, error)
+        })
         .collect();
     let mut table = Table::titled(format!("Leaderboard of {}", branch.title()));
-    table.column("rank", "Rank", &rows, |own| Cell::number(own.0 as f64, 0));
+    table.column("rank", "Rank", &rows, |own| {
+        own.0
+            .map_or(Cell::Empty, |rank| Cell::number(rank as f64, 0))
+    });
     table.column("team", "Team", &rows, |own| Cell::text(&own.1.team));
     table.column("method", "Method", &rows, |own| Cell::text(&own.1.method));
     table.column("q", "Q", &rows, |own| Cell::with_error(own.1.q, own.2, 1));
