@@ -332,8 +332,8 @@ impl Display for Slope {
     }
 }
 
-// Why submitted shears are no measurement of the true ones. `pairs` are true and submitted shears.
-fn disagreement(pairs: &[(Shear, Shear)]) -> Option<String> {
+// Why submitted shears are no measurement of those in the file `truth`. `pairs` are true and submitted shears.
+fn disagreement(pairs: &[(Shear, Shear)], truth: &Path) -> Option<String> {
     let component = |g: Shear, k: usize| [g.e1, g.e2][k];
     let slope = |of: usize, on: usize| {
         let values = pairs
@@ -345,8 +345,9 @@ fn disagreement(pairs: &[(Shear, Shear)]) -> Option<String> {
         (slope(0, 0), slope(1, 1), slope(0, 1), slope(1, 0))
     else {
         return Some(format!(
-            "whether it follows the true shear cannot be determined (found {} fields, expected at least 3 whose true g1 and g2 differ)",
-            pairs.len()
+            "whether it follows the true shear cannot be determined (found {} fields in {}, expected at least 3 whose true g1 and g2 differ)",
+            pairs.len(),
+            truth.display()
         ));
     };
     let (own, cross) = ([g1, g2], [g1_on_g2, g2_on_g1]);

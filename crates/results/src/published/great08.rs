@@ -148,7 +148,7 @@ impl Board for Great08 {
         let found = great08_score(&sets).map_err(|error| FileError::new(submission, error))?;
         Ok(Score {
             branch: None,
-            refusal: disagreement(&pairs),
+            refusal: disagreement(&pairs, truth.path),
             warnings: Vec::new(),
             figures: vec![Figure {
                 key: "Q",

@@ -501,14 +501,17 @@ fn mass_plot(truth: &[[f64; SEPARATION_BINS]], submitted: &[[f64; SEPARATION_BIN
 
 // Why aperture masses are not of the true shear. ⟨M_ap²⟩ follows from ξ₊ and ξ₋; a flipped or exchanged component leaves ξ₊ and
 // averages ξ₋ to zero, so that E and B are both the mean of the true E and B.
-fn disagreement_of_masses(submitted: &[Masses], truth: &[Masses]) -> Option<String> {
+fn disagreement_of_masses(submitted: &[Masses], truth: &[Masses], path: &Path) -> Option<String> {
     let e: Vec<(f64, f64)> = submitted
         .iter()
         .zip(truth)
         .flat_map(|(own, truth)| truth.e.into_iter().zip(own.e))
         .collect();
     let Some(found) = Slope::of(&e) else {
-        return Some("whether map_E follows the true one cannot be determined, because that is the same at all separations".into());
+        return Some(format!(
+            "whether map_E follows the true one cannot be determined, because that of {} is the same at all separations",
+            path.display()
+        ));
     };
     // Of a square of shears.
     if !found.is_clear(MIN_SHEAR_SLOPE * MIN_SHEAR_SLOPE) {
@@ -755,7 +758,7 @@ impl Board for Great3 {
                 .copied()
                 .zip(submitted.iter().copied())
                 .collect();
-            refusal = disagreement(&pairs);
+            refusal = disagreement(&pairs, truth.path);
             let component =
                 |of: fn(Shear) -> f64| pairs.iter().map(move |(g, own)| (of(*g), of(*own)));
             let components = [component(|g| g.e1), component(|g| g.e2)];
@@ -813,7 +816,7 @@ impl Board for Great3 {
             }
             let masses = self.true_masses(truth.path, fields, pool)?;
             let submitted = self.submitted_masses(submission, fields)?;
-            refusal = disagreement_of_masses(&submitted, &masses);
+            refusal = disagreement_of_masses(&submitted, &masses, truth.path);
             warnings.extend(doubt_of_order(&submitted, &masses));
             let e = |masses: &[Masses]| masses.iter().map(|own| own.e).collect::<Vec<_>>();
             let true_e = e(&masses);
