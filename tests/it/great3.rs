@@ -936,6 +936,17 @@ fn simulated_branches_are_scored_by_their_released_truth() {
         });
         assert_eq!(opposite, [-plain[0], plain[1]]);
         let below = branch.replace('-', "/");
+        let [public, private] = ["public", "private"].map(|name| root.join(name));
+        let message = fail(&words(&format!(
+            "challenge new --name own --kind great3 --data {} --public {} --private {}",
+            root.join(&below).display(),
+            public.display(),
+            private.display()
+        )));
+        assert!(
+            message.contains("this is a branch of GREAT3") && !public.exists(),
+            "{message}"
+        );
         let truth = root.join("truth").join(&below);
         let rows = true_galaxies(&truth, subfields, branch.ends_with("variable"));
         let galaxies = file(&root, "galaxies.txt", &rows);

@@ -13,7 +13,7 @@ use shearq_dataset::threads::Quiet;
 use shearq_dataset::truth::{ReadTruth, Reading, grid_of_set, read_truth, reading_of, write_truth};
 use shearq_files::fits::{ImageReader, ImageWriter, Value};
 use shearq_files::open::is_there;
-use shearq_files::{FileError, atomic};
+use shearq_files::{FileError, atomic, names_of};
 use shearq_pipeline::simulate::simulate_blind;
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_results::record::SetRecord;
@@ -428,6 +428,10 @@ fn rankable(
 
 // Sets, images and grid of a data folder, which must be the same for all sets.
 fn about(data: &DataFolder) -> Result<Data, ChallengeError> {
+    if data.layout().great3.is_some() {
+        let message = "this is a branch of GREAT3, whose truth is in another folder already (expected sets with images from 1). Try: give this folder to participants, and score their entries with `shearq score --challenge great3 --branch BRANCH --truth DIR`";
+        return Err(FileError::new(data.root(), message).into());
+    }
     let ids = images::of_folder(data, &[])?;
     let mut about: Option<Data> = None;
     for of_set in ids.chunk_by(|a, b| a.set == b.set) {
@@ -435,7 +439,11 @@ fn about(data: &DataFolder) -> Result<Data, ChallengeError> {
         let path = data.galaxies(set, 1);
         let count = of_set.len() as u32;
         if !of_set.iter().map(|id| id.image).eq(1..=count) {
-            let message = format!("set {set}: expected consecutive images from 1 (found {count})");
+            let numbers: Vec<String> = of_set.iter().map(|id| id.image.to_string()).collect();
+            let message = format!(
+                "set {set}: its images are not numbered from 1 without gaps (found {}, expected 1 to {count})",
+                names_of(&numbers)
+            );
             return Err(FileError::new(path, message).into());
         }
         let grid = grid_of_set(data, set)?;
