@@ -218,6 +218,12 @@ fn causes_of_implausible_results_are_named() {
         "{none}"
     );
     assert!(with.contains("R11=none"), "{with}");
+    // Two catalogues under one shear: first the truth is asked for.
+    write(g, &|e| e, "r", &|_| 1.0);
+    let one = ["--g1", "0.1", "--g2", "0.1"];
+    let shown = succeed(&[&arguments[..], &response, &one].concat());
+    let (asks, advises) = (shown.find("--truth shears.csv"), shown.find("R11=none"));
+    assert!(asks.is_some() && asks < advises, "{shown}");
     // PSFs of other galaxies leave minus a part of their ellipticity.
     for (leak, named) in [(-0.7, true), (0.05, false)] {
         let mut text = String::from("e1,e2,psf_e1,psf_e2,g1,g2\n");

@@ -195,6 +195,13 @@ fn implausible(result: &BiasResult, all: &Estimate) -> Option<String> {
     let large = |m: &Measured| m.value.abs() > IMPLAUSIBLE + IMPLAUSIBLE_SIGNIFICANCE * m.error;
     let mut found = ["m1", "m2"].into_iter();
     let (name, m) = found.find_map(|name| Some((name, all.value(name).filter(large)?)))?;
+    // First, because two catalogues under one shear leave m near −1, whatever their response.
+    let shears = match (result.design, result.about.catalogues.len()) {
+        (Design::Single, 2..) => {
+            " Do the catalogues have different shears? Try: --truth shears.csv, with the columns catalogue,g1,g2."
+        }
+        _ => "",
+    };
     let divided = match result.about.response_column {
         true => {
             " Ellipticities that are divided by their response already have a response of one. Try: --columns R11=none,R22=none"
@@ -202,7 +209,7 @@ fn implausible(result: &BiasResult, all: &Estimate) -> Option<String> {
         false => "",
     };
     Some(format!(
-        "{name} is {:+.2} (expected |m| below {IMPLAUSIBLE}). m = −2 is a wrong sign, m = −1 a wrong truth.{divided}",
+        "{name} is {:+.2} (expected |m| below {IMPLAUSIBLE}). m = −2 is a wrong sign, m = −1 a wrong truth.{shears}{divided}",
         m.value
     ))
 }
