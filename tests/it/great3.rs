@@ -1039,6 +1039,26 @@ fn resumed_branches_are_those_of_one_run() {
         succeed(&words(&line));
         assert!(contents(&out) == whole, "{}", damaged.display());
     }
+    // An image of another seed, and images whose record is lost.
+    let other = folder.path().join("other");
+    let of_other = line.replace(&out.display().to_string(), &other.display().to_string());
+    succeed(&words(&format!("{of_other} --seed 7")));
+    let name = "multiepoch/ground/constant/image-001-2.fits";
+    let own = fs::read(out.join(name)).unwrap();
+    fs::copy(other.join(name), out.join(name)).unwrap();
+    let message = fail(&words(&line));
+    assert!(
+        message.contains("image-001-2.fits: the first galaxy is not the one of this seed"),
+        "{message}"
+    );
+    fs::write(out.join(name), own).unwrap();
+    fs::remove_file(other.join("simulation.json")).unwrap();
+    let message = fail(&words(&of_other));
+    assert!(
+        message.contains("image-000-0.fits: nothing states the settings of this image"),
+        "{message}"
+    );
+    assert!(!other.join("simulation.json").exists());
     // Another table of the same name.
     file(folder.path(), "fits.txt", "n r_e q\n1 0.4 0.6\n");
     let message = fail(&words(&line));

@@ -13,6 +13,7 @@ use shearq_dataset::threads::Progress;
 use shearq_files::fits::{ImageReader, ImageWriter};
 use shearq_files::frames::polars::Column;
 use shearq_files::frames::{Metadata, frame};
+use shearq_files::open::is_there;
 use shearq_files::table::{self, FileFormat, MAX_ROWS};
 use shearq_files::{FileError, atomic};
 use shearq_quantities::Shear;
@@ -50,7 +51,12 @@ struct Row {
     iy: usize,
 }
 
-/// Simulates subfields from 0 into `out`, and returns the number of new images. Whole images are kept.
+// Largest difference of a pixel from the same one drawn again, in standard deviations of the noise. Transforms on other processors
+// round by 10⁻⁶ of the brightness; pixels of another seed differ by one or more. Chosen by hand.
+const MAX_REDRAWN_DIFFERENCE: f32 = 0.1;
+
+/// Simulates subfields from 0 into `out`, and returns the number of new images. Whole images are kept if their first galaxy is the
+/// one that `simulator` draws; the others are not compared, which would take as long as drawing them.
 pub fn simulate_branch(
     simulator: &BranchSimulator,
     record: &Record,
@@ -59,11 +65,15 @@ pub fn simulate_branch(
     threads: usize,
     progress: &mut dyn Progress,
 ) -> Result<usize, PipelineError> {
-    let claim = claim(&out.join(SIMULATION_FILE), record)?;
     let (branch, grid) = (simulator.branch, simulator.grid);
     let folder = out.join(branch.folder());
     let truth = truth_folder(out, branch);
     let image = |subfield, epoch| folder.join(named(great3::GALAXIES, subfield, epoch));
+    let image = &image;
+    let images = |subfield| (0..branch.epochs()).map(move |epoch| image(subfield, epoch));
+    // Before the claim, which would write a record of this seed beside images of another.
+    refuse_without_record(out, (0..subfields).flat_map(images))?;
+    let claim = claim(&out.join(SIMULATION_FILE), record)?;
     let size = branch.stamp();
     let side = grid * size;
     // An image that was cut off when a disk was full or a copy stopped has its name, but not its size.
@@ -86,6 +96,7 @@ pub fn simulate_branch(
                     subfield.map_err(|source| PipelineError::Scoring { set: None, source })?;
                 let subfield = Arc::new(subfield);
                 claim.check()?;
+                check_kept(simulator, &subfield, &epochs, image)?;
                 // Also beside whole images: a table that was lost or edited would make them the images of other galaxies. They take a
                 // thousandth of the time of the images.
                 write_tables(simulator, &subfield, &folder, &truth)?;
@@ -136,10 +147,53 @@ pub fn simulate_branch(
         },
     )
     .map_err(|error| claim.explain(error))?;
-    let epochs = 0..branch.epochs();
-    let all = (0..subfields).flat_map(|k| epochs.clone().map(move |epoch| (k, epoch)));
-    claim.check_results(all.map(|(subfield, epoch)| image(subfield, epoch)))?;
+    claim.check_results((0..subfields).flat_map(images))?;
     Ok(made)
+}
+
+fn refuse_without_record(
+    out: &Path,
+    mut images: impl Iterator<Item = PathBuf>,
+) -> Result<(), FileError> {
+    match images.find(|path| is_there(path)) {
+        Some(found) if !is_there(&out.join(SIMULATION_FILE)) => {
+            let message = format!(
+                "nothing states the settings of this image (found no {SIMULATION_FILE} in {}). Try: another folder, or remove the images",
+                out.display()
+            );
+            Err(FileError::new(found, message))
+        }
+        _ => Ok(()),
+    }
+}
+
+// Compares the first galaxy of the epochs that are not `new`.
+fn check_kept(
+    simulator: &BranchSimulator,
+    subfield: &Subfield,
+    new: &[usize],
+    image: &dyn Fn(usize, usize) -> PathBuf,
+) -> Result<(), FileError> {
+    let size = simulator.branch.stamp();
+    let mut scratch = RenderScratch::new();
+    let mut stamp = vec![0.0; size * size];
+    let galaxy = simulator.galaxy_at(subfield, (0, 0));
+    for epoch in (0..simulator.branch.epochs()).filter(|epoch| !new.contains(epoch)) {
+        simulator.draw(subfield, epoch, &galaxy, &mut scratch, &mut stamp);
+        let path = image(subfield.number, epoch);
+        let mut reader = ImageReader::open(&path)?;
+        let rows = reader.read_rows(size)?;
+        let found = rows
+            .chunks_exact(reader.width())
+            .flat_map(|row| &row[..size]);
+        // Not `>`, which NaN passes.
+        let is_same = |(own, found): (&f32, &f32)| (own - found).abs() <= MAX_REDRAWN_DIFFERENCE;
+        if !stamp.iter().zip(found).all(is_same) {
+            let message = "the first galaxy is not the one of this seed and these settings. Try: remove the image, which is then simulated again";
+            return Err(FileError::new(path, message));
+        }
+    }
+    Ok(())
 }
 
 fn named(pattern: &str, subfield: usize, epoch: usize) -> String {
