@@ -91,7 +91,7 @@ pub use shearq_quantities::{
 };
 pub use shearq_submissions::{Configuration, ConfigurationError, PsfCut};
 pub use sky::Sky;
-pub use warning::{Of, PixelFrame, Warning};
+pub use warning::{ExaminedPsfs, PixelFrame, Warning};
 
 /// The examples of README.md.
 #[cfg(doctest)]

@@ -16,8 +16,8 @@ use crate::pixel::{Pixel, contiguous};
 const WEIGHT_SIGMA: f64 = 5.0;
 // σ of the weight of cores in pixels. Chosen by hand.
 const CORE_SIGMA: f64 = 1.0;
-// In σ: exp(−12.5) = 4·10⁻⁶.
-const CORE_RADIUS: f64 = 5.0;
+// 5σ: exp(−12.5) = 4·10⁻⁶.
+pub(crate) const CORE_RADIUS_PX: f64 = 5.0 * CORE_SIGMA;
 // Width of the border whose mean is the sky, in pixels. Chosen by hand.
 const BORDER: usize = 2;
 // At S/N 10, thirty stamps give the mean square radius to a tenth. Command and seed not recorded.
@@ -54,18 +54,17 @@ pub(crate) fn core_sums(
     sides: [usize; 2],
     centre: [f64; 2],
 ) -> [f64; 2] {
-    const RADIUS: f64 = CORE_RADIUS * CORE_SIGMA;
     let at = [0, 1].map(|k| (sides[k] as f64 - 1.0) / 2.0 + centre[k]);
     let range = |k: usize| {
-        let first = (at[k] - RADIUS).ceil().max(0.0) as usize;
-        let last = (at[k] + RADIUS).floor().max(0.0) as usize;
+        let first = (at[k] - CORE_RADIUS_PX).ceil().max(0.0) as usize;
+        let last = (at[k] + CORE_RADIUS_PX).floor().max(0.0) as usize;
         first..(last + 1).min(sides[k])
     };
     let weight = |at: usize, centre: f64| {
         let square = (at as f64 - centre).powi(2);
         ((-0.5 * square / (CORE_SIGMA * CORE_SIGMA)).exp(), square)
     };
-    let mut along_x = [(0.0, 0.0); 2 * RADIUS as usize + 1];
+    let mut along_x = [(0.0, 0.0); 2 * CORE_RADIUS_PX as usize + 1];
     for (weights, x) in along_x.iter_mut().zip(range(0)) {
         *weights = weight(x, at[0]);
     }

@@ -1,5 +1,5 @@
-//! Warnings about data that can be measured all the same, and their texts. `examine.rs`, `psf/quality.rs` and `session.rs` have
-//! the conditions.
+//! Warnings about data, and their texts; those that [`Warning::is_fatal`] stop the work. The conditions are here, in `examine.rs`,
+//! `psf/quality.rs` and `session.rs`, and in `wcs.rs` and `measure/source.rs` of the pipeline.
 
 use std::fmt;
 
@@ -58,7 +58,7 @@ pub enum Warning {
         "the galaxies are scattered over their stamps (found {:.1} px along x and {:.1} px along y; expected less than 2 px). Try: cut the stamps around the galaxies",
         scatter[0], scatter[1]
     )]
-    Wandering {
+    PositionScatter {
         /// Scatter of their centroids along x and y in pixels.
         scatter: [f64; 2],
     },
@@ -213,9 +213,19 @@ pub enum Warning {
         /// Its standard error.
         error: f64,
     },
+    /// An epoch has no light at the stated places of the galaxies, or the first epoch has none.
+    #[error(
+        "{} at the stated places (found no significant light there; expected the galaxies that {} shows). Try: check that image, WCS and dither belong together",
+        if *from_first { "the first epoch has no galaxies" } else { "there are no galaxies" },
+        if *from_first { "this epoch" } else { "the first epoch" }
+    )]
+    EpochWithoutGalaxies {
+        /// Whether it is the first epoch that has none.
+        from_first: bool,
+    },
     /// An epoch contains other galaxies than the first one.
     #[error(
-        "{count} of {of} galaxies are not those of the first epoch (found stamps that are blank, or differ in brightness by a factor of 2 and 5 standard errors; expected the same galaxies). Try: check that files and rows of the epochs belong together"
+        "{count} of {of} galaxies are not those of the first epoch (found stamps that are blank, or differ in brightness by a factor of 2 and 5 standard errors; expected the same galaxies). Try: check that files and rows of the epochs belong together. Bands of galaxies with various colours may have this warning, too"
     )]
     EpochGalaxies {
         /// Galaxies that differ.
@@ -247,7 +257,7 @@ pub enum Warning {
         /// Offset along x and y in pixels.
         offset: [f64; 2],
         /// PSFs.
-        of: Of,
+        of: ExaminedPsfs,
     },
     /// The PSF image contains a background.
     #[error(
@@ -260,7 +270,7 @@ pub enum Warning {
         /// Its light in units of the star's.
         share: f64,
         /// PSFs.
-        of: Of,
+        of: ExaminedPsfs,
     },
     /// The background of the PSF image changes along x or y.
     #[error(
@@ -271,7 +281,7 @@ pub enum Warning {
         /// Change per pixel along x and y in units of the peak.
         slope: [f64; 2],
         /// PSFs.
-        of: Of,
+        of: ExaminedPsfs,
     },
     /// The noise of the star biases shears.
     #[error(
@@ -289,7 +299,7 @@ pub enum Warning {
         /// Standard deviations of m and c by the noise of one star for all galaxies.
         effect: Option<[f64; 2]>,
         /// PSFs.
-        of: Of,
+        of: ExaminedPsfs,
     },
     /// The PSF is narrower than pixels can show.
     #[error(
@@ -299,7 +309,7 @@ pub enum Warning {
         /// Noise-equivalent area in px².
         area: f64,
         /// PSFs.
-        of: Of,
+        of: ExaminedPsfs,
     },
     /// The PSF is broader than the galaxies that were blurred by it.
     #[error(
@@ -390,9 +400,9 @@ pub struct PixelFrame {
 
 impl fmt::Display for PixelFrame {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let angle = self.angle;
-        let not = if self.mirrored { "" } else { "not " };
         // Adding zero removes the sign of a negative zero.
+        let angle = (self.angle * 10.0).round() / 10.0 + 0.0;
+        let not = if self.mirrored { "" } else { "not " };
         let [g1, g2] = self.shear.map(|g| (g * 1e4).round() / 1e4 + 0.0);
         write!(
             f,
@@ -403,18 +413,18 @@ impl fmt::Display for PixelFrame {
 
 /// How many of the examined PSFs a warning is about.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Of {
+pub struct ExaminedPsfs {
     /// Their number.
     pub count: usize,
     /// PSFs examined.
     pub of: usize,
 }
 
-impl fmt::Display for Of {
+impl fmt::Display for ExaminedPsfs {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Of { of: 1, .. } => Ok(()),
-            Of { count, of } => write!(f, " on {count} of {of} PSFs examined"),
+            ExaminedPsfs { of: 1, .. } => Ok(()),
+            ExaminedPsfs { count, of } => write!(f, " on {count} of {of} PSFs examined"),
         }
     }
 }
@@ -424,7 +434,7 @@ impl Warning {
     pub fn of_moved(moved: [f64; 2]) -> Warning {
         Warning::PsfOffCentre {
             offset: moved,
-            of: Of { count: 1, of: 1 },
+            of: ExaminedPsfs { count: 1, of: 1 },
         }
     }
 

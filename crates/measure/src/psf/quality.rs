@@ -12,7 +12,7 @@ use super::denoised_star::{MIN_DENOISED_SIDE, UNCHANGED_SNR, noise_level};
 use super::star::psf_offset;
 use super::width::noise_equivalent_area;
 use crate::second_moments::{CoreSize, psf_core_size};
-use crate::warning::{Of, Warning};
+use crate::warning::{ExaminedPsfs, Warning};
 
 // Width of the PSF stamp's border, in pixels.
 // Chosen by hand.
@@ -209,7 +209,7 @@ impl Mean {
 /// The PSFs of an image with one defect, if they are more than a few.
 struct Defective<'a> {
     psfs: Vec<&'a PsfQuality>,
-    of: Of,
+    of: ExaminedPsfs,
 }
 
 impl<'a> Defective<'a> {
@@ -222,7 +222,7 @@ impl<'a> Defective<'a> {
         let is_many = count > 0 && count as f64 >= MIN_SHARE * of as f64;
         is_many.then_some(Defective {
             psfs,
-            of: Of { count, of },
+            of: ExaminedPsfs { count, of },
         })
     }
 
