@@ -922,3 +922,79 @@ fn each_galaxy_has_the_noise_of_its_place_and_of_its_light() {
         assert!((140.0..450.0).contains(&area) || flux < 0.0, "{k}: {area}");
     }
 }
+
+#[test]
+fn exposures_of_one_call_are_epochs_or_say_why_not() {
+    let small = Small::new("2");
+    let set = small.at("data/set02");
+    let (pixels, width) = pixels_of(&set.join("galaxies-001.fits"));
+    let psf = set.join("psf-001.fits");
+    let rows = (0..64).map(|k| format!("{k},{},{}\n", k % 8 * 48 + 24, k / 8 * 48 + 24));
+    let table = "id,x,y\n".to_owned() + &rows.collect::<String>();
+    fs::write(small.at("positions.csv"), table).unwrap();
+    let exposure = |name: &str, cards: &[&str]| {
+        let content = fits_image(-32, &[width; 2], cards, &floats(&pixels));
+        fs::write(small.at(name), content).unwrap();
+    };
+    // Without places on the sky, which would be those of other galaxies.
+    let linear = [
+        "CTYPE1  = 'LINEAR'",
+        "CTYPE2  = 'LINEAR'",
+        "CUNIT1  = 'arcsec'",
+        "CUNIT2  = 'arcsec'",
+    ];
+    let along = ["CD1_1   = 0.26", "CD2_2   = 0.26"];
+    let turned = ["CD1_2   = -0.26", "CD2_1   = 0.26"];
+    let coarse = ["CD1_1   = 0.3", "CD2_2   = 0.3"];
+    exposure("along.fits", &[&linear[..], &along].concat());
+    exposure("turned.fits", &[&linear[..], &turned].concat());
+    exposure("coarse.fits", &[&linear[..], &coarse].concat());
+    exposure("plain.fits", &[]);
+    let gather = |exposures: &str, out: &str| {
+        let psfs = vec![text(&psf); exposures.split(' ').count()].join(" ");
+        format!(
+            "shearq gather --exposure {exposures} --psf {psfs} --positions positions.csv --out {out}"
+        )
+    };
+    let measure = |data: &str| {
+        format!("shearq measure --epochs --data {data} --submission {LINEAR} --out {data}-out")
+    };
+    for (exposures, data) in [
+        ("along.fits turned.fits along.fits", "three"),
+        ("along.fits coarse.fits", "scales"),
+    ] {
+        let line = format!("{} && {}", gather(exposures, data), measure(data));
+        let done = shell(small.root(), &line);
+        let said = String::from_utf8(done.stderr).unwrap();
+        assert!(
+            done.status.success() && said.contains("frame: sky"),
+            "{said}"
+        );
+    }
+    let refused = |line: &str| {
+        let done = shell(small.root(), line);
+        assert!(!done.status.success());
+        String::from_utf8(done.stderr).unwrap()
+    };
+    let said = refused(&gather("along.fits plain.fits turned.fits", "none"));
+    assert!(
+        said.contains(
+            "plain.fits: the exposures have different pixels on the sky, and the header has no WCS"
+        ),
+        "{said}"
+    );
+    // Another call does not know the first one.
+    let line = format!("{} --image 4", gather("along.fits", "three"));
+    assert!(shell(small.root(), &line).status.success());
+    let said = refused(&format!("rm -r three-out; {}", measure("three")));
+    assert!(
+        said.contains("galaxies-004.fits: some epochs have Jacobians and others have none")
+            && said.contains("Try:"),
+        "{said}"
+    );
+    fs::remove_file(small.at("three/set01/galaxies-002.fits")).unwrap();
+    let said = refused(&measure("three"));
+    let expected =
+        "galaxies-002.fits: there is no such image (found 1, 3, 4 of set 1, expected 1 to 4";
+    assert!(said.contains(expected), "{said}");
+}

@@ -128,7 +128,7 @@ pub enum EpochError {
     },
     /// Epochs in the frame of the sky and of the pixels.
     #[error(
-        "some epochs have Jacobians and others have none (expected Jacobians for all or for none)"
+        "some epochs have Jacobians and others have none (expected Jacobians for all or for none). Try: a WCS for each epoch, or none; exposures of one call of gather have either"
     )]
     Frames,
     /// A method that is not linear.

@@ -18,14 +18,14 @@ use shearq_quantities::{Frame, Jacobian};
 pub use self::positions::Table;
 use self::positions::{Positions, rows_of_stamps};
 use self::psfs::{GatheredPsfs, PsfFile, gather_psfs};
-pub(crate) use self::source::off_middle;
+pub(crate) use self::source::subpixel_offset;
 pub use self::source::{Content, Files};
 use self::source::{Exposure, Images, shown};
 use self::stamps::{Origins, Rows, StampWriter, already};
 use super::PipelineError;
 use super::measure::check_strip;
 use crate::stamp_table::{self, Head, StampTable};
-use crate::wcs::{Wcs, aligned};
+use crate::wcs::{self, Wcs, aligned};
 use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::{DataFolder, MAX_STAMP};
 use shearq_dataset::mosaic::Mosaic;
@@ -42,8 +42,8 @@ const LARGE_STAMP_PX: usize = 192;
 const SQUARE: &str =
     "--square crop, which takes the central square; --square pad, which adds missing pixels; or ";
 const MOSAIC: &str = "--exposure with --positions, which cuts stamps out of an exposure. A mosaic is read as DATA/set01/galaxies-001.fits, with `stamp = SIDE` in DATA/layout.toml";
-// Largest difference of an offset from a whole pixel.
-const MAX_OFFSET_PX: f64 = 0.5;
+// Largest difference of the median offset from the one pixel between positions from 0 and from 1. Chosen by hand.
+const MAX_ORIGIN_MISMATCH_PX: f64 = 0.5;
 
 #[derive(Debug, Clone, Serialize)]
 #[serde(rename_all = "kebab-case")]
@@ -178,7 +178,12 @@ fn gather_alone(
     }
     // All files have temporary names until the last exposure is read: with some of them in the folder, the user could neither repeat
     // the command nor see which exposures were lost.
-    let prepared = ids.zip(all).map(|(id, one)| prepare(data, id, one));
+    let plans = all.iter().map(|one| Plan::of(&one.stamps, one.square));
+    let plans: Vec<Plan> = plans.collect::<Result<_, _>>()?;
+    let jacobians = jacobians_of_all(&plans, all)?;
+    let prepared = ids.zip(all).zip(plans.into_iter().zip(jacobians));
+    let prepared = prepared
+        .map(|((id, one), (plan, jacobians))| prepare(data, id, one, plan, jacobians.as_deref()));
     let prepared: Vec<Prepared> = prepared.collect::<Result<_, _>>()?;
     prepared.into_iter().map(Prepared::finish).collect()
 }
@@ -208,6 +213,8 @@ fn prepare(
     data: &DataFolder,
     id: ImageId,
     gathering: &Gathering<'_>,
+    plan: Plan,
+    jacobians: Option<&[Matrix2]>,
 ) -> Result<Prepared, PipelineError> {
     let target = data.galaxies(id.set, id.image);
     let which = data.stamps(id.set, id.image);
@@ -217,10 +224,8 @@ fn prepare(
     };
     let record = serde_json::to_string_pretty(&record)
         .map_err(FileError::doing(&which, "cannot write the record"))?;
-    let plan = Plan::of(&gathering.stamps, gathering.square)?;
     let mut messages = plan.messages.clone();
-    let jacobians = plan.jacobians(gathering)?;
-    match &jacobians {
+    match jacobians {
         Some(jacobians) => messages.push(frame_line(jacobians)),
         None => messages.extend(plan.stack.differs.clone()),
     }
@@ -236,7 +241,7 @@ fn prepare(
     check_strip(&target, mosaic.columns, side)?;
     let psfs = gather_psfs(data, id, gathering.psfs, gathering.square, &mosaic)?;
     messages.extend_from_slice(&psfs.messages);
-    let of_psf = check_psf(&psfs, &plan, jacobians.as_deref())?;
+    let of_psf = check_psf(&psfs, &plan, jacobians)?;
     let mut writer = StampWriter::create(&target, mosaic, gathering.noise, wcs)?;
     writer.copy(gathering, plan.places())?;
     let mut warnings = writer.examination.warnings();
@@ -259,13 +264,13 @@ fn prepare(
         format!("warning: set {set:02} image {image:03}: {warning}{hint}")
     }));
     let head = Head {
-        frame: jacobians.as_ref().map_or(Frame::Pixel, |_| Frame::Sky),
+        frame: jacobians.map_or(Frame::Pixel, |_| Frame::Sky),
         first_pixel: gathering.stamps.first_pixel(),
         gain: gathering.gain,
     };
     let incomplete = writer.incomplete;
     let mut columns = rows.unwrap_or_default();
-    columns.extend(plan.columns(head, &mosaic, &mut writer, jacobians.as_deref()));
+    columns.extend(plan.columns(head, &mosaic, &mut writer, jacobians));
     Ok(Prepared {
         record: format!("{record}\n"),
         table: stamp_table::table(&which, head, columns)?,
@@ -278,6 +283,29 @@ fn prepare(
             messages,
         },
     })
+}
+
+// Of all exposures or of none, because `measure --epochs` combines stamps along common axes: exposures along the sky next to turned
+// ones need Jacobians, too, and so do exposures along the sky with different pixel scales.
+fn jacobians_of_all(
+    plans: &[Plan],
+    all: &[Gathering<'_>],
+) -> Result<Vec<Option<Vec<Matrix2>>>, FileError> {
+    let own = |(plan, one): (&Plan, &Gathering<'_>)| plan.jacobians(one, one.frame);
+    let own: Vec<_> = plans.iter().zip(all).map(own).collect::<Result<_, _>>()?;
+    let differs = |plan: &Plan| {
+        let mut found = Wcs::disagreements(&plan.stack.wcs, &plans[0].stack.wcs);
+        found.next().is_some()
+    };
+    if !(own.iter().any(Option::is_some) || plans.iter().any(differs)) {
+        return Ok(own);
+    }
+    let of_each = own.into_iter().zip(plans.iter().zip(all));
+    let of_each = of_each.map(|(own, (plan, one))| match own {
+        Some(own) => Ok(Some(own)),
+        None => plan.jacobians(one, one.frame.or(Some(Frame::Sky))),
+    });
+    of_each.collect()
 }
 
 // A process may have been stopped between PSFs and image. The user would otherwise have to remove files by hand.
@@ -326,8 +354,12 @@ impl Plan {
         self.positions.as_ref().map_or(&[], |found| &found.all)
     }
 
-    // `None` if ellipticities stay on the pixel axes.
-    fn jacobians(&self, gathering: &Gathering<'_>) -> Result<Option<Vec<Matrix2>>, FileError> {
+    // `None` if ellipticities stay on the pixel axes, as `frame` says, or without it the WCS.
+    fn jacobians(
+        &self,
+        gathering: &Gathering<'_>,
+        frame: Option<Frame>,
+    ) -> Result<Option<Vec<Matrix2>>, FileError> {
         let files = match &gathering.stamps {
             Stamps::Files(files)
             | Stamps::Cutouts {
@@ -335,7 +367,7 @@ impl Plan {
             } => files,
         };
         let fault = |message: String| Err(FileError::new(&files.paths[0], message));
-        if gathering.frame == Some(Frame::Pixel) {
+        if frame == Some(Frame::Pixel) {
             return Ok(None);
         }
         let all: Option<Vec<Matrix2>> = match &self.positions {
@@ -358,14 +390,18 @@ impl Plan {
                     "{error}. Try: --frame pixel, for ellipticities along the pixel axes"
                 ));
             }
-            return match gathering.frame {
-                Some(Frame::Sky) => fault("--frame is sky, and the header has no WCS (expected TAN, TAN-SIP, TPV or a linear one)".to_owned()),
+            let expected = "and the header has no WCS (expected TAN, TAN-SIP, TPV or a linear one)";
+            return match (frame, gathering.frame) {
+                (Some(Frame::Sky), Some(_)) => fault(format!("--frame is sky, {expected}")),
+                (Some(Frame::Sky), None) => fault(format!(
+                    "the exposures have different pixels on the sky, {expected}. Try: a header with a WCS, or --frame pixel, for ellipticities along the pixel axes of each exposure"
+                )),
                 _ => Ok(None),
             };
         };
         // Pixels that are already along the sky need no Jacobians, which take time in each measurement.
         let plain = all.iter().all(aligned);
-        if plain && gathering.frame.is_none() {
+        if plain && frame.is_none() {
             return Ok(None);
         }
         if let Some(kind) = self.stack.wcs.unread() {
@@ -560,7 +596,7 @@ impl Stack {
 
 // A user who did not ask for a frame must learn that the components differ from those on the pixels.
 fn frame_line(jacobians: &[Matrix2]) -> String {
-    let pixels = Wcs::frame_of(&jacobians[0]);
+    let pixels = wcs::frame(&jacobians[0]);
     format!(
         "frame: sky (e1 > 0 along east–west, e2 > 0 along north-west). The WCS of the first stamp: {pixels}. --frame pixel keeps the pixel axes"
     )
@@ -607,6 +643,6 @@ fn one_pixel_off(stamps: &Stamps<'_>, warning: &Warning) -> Option<String> {
     let expected = f64::from(*first_pixel) - f64::from(other);
     let off = offset
         .iter()
-        .all(|found| (found - expected).abs() < MAX_OFFSET_PX);
+        .all(|found| (found - expected).abs() < MAX_ORIGIN_MISMATCH_PX);
     off.then(|| format!(". Are the positions counted from {other}? Try: --first-pixel {other}"))
 }

@@ -189,7 +189,7 @@ impl<'a> FolderMeasurement<'a> {
             let prints = inputs.prints(id)?;
             let epochs = self.run.epochs_of(self.data, id)?;
             if epochs.len() > 1 {
-                if !self.read_epochs(&epochs, measurer, prints, feeder)? {
+                if !self.read_epochs(&epochs, k == 0, measurer, prints, feeder)? {
                     return Ok(());
                 }
                 continue;
@@ -251,6 +251,7 @@ impl FolderMeasurement<'_> {
     fn read_epochs(
         &self,
         ids: &[ImageId],
+        is_first_set: bool,
         measurer: &Measurer,
         prints: BTreeMap<String, String>,
         feeder: &mut Feeder<'_, ImageRow<'static, ImageHead>>,
@@ -262,12 +263,21 @@ impl FolderMeasurement<'_> {
             sessions.push(source.session(measurer, feeder.ahead())?);
         }
         let first = sessions.remove(0);
-        let first = Arc::new(first.with_epochs(sessions)?);
+        // Named by its file: the user has to find the exposure that differs.
+        let differs = sessions.iter().position(|one| one.frame() != first.frame());
+        let odd = differs.map_or(0, |at| at + 1);
+        let first = first.with_epochs(sessions);
+        let first = first.map_err(|error| sources[odd].image.named(error.into()))?;
+        let correlated = match is_first_set {
+            true => sources[0].image.correlated_noise(&first, feeder.ahead())?,
+            false => None,
+        };
+        let first = Arc::new(first);
         let mosaic = sources[0].image.mosaic();
         let head = Arc::new(ImageHead {
             id: ids[0],
             mosaic,
-            run_warnings: Vec::new(),
+            run_warnings: correlated.into_iter().collect(),
             table: sources[0].image.take_table(),
             epochs: sources
                 .iter()
@@ -276,9 +286,7 @@ impl FolderMeasurement<'_> {
             aligned: sources.iter().all(|source| source.image.is_aligned()),
             prints,
         });
-        let Some((own, others)) = sources.split_first_mut() else {
-            return Ok(true);
-        };
+        let (own, others) = sources.split_first_mut().expect("a set has an image");
         for row in 0..mosaic.rows() {
             let row = ImageRow {
                 head: Arc::clone(&head),

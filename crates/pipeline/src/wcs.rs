@@ -38,8 +38,9 @@ const MAX_NEWTON_STEPS: usize = 50;
 // Far below the error of a centroid, and above the rounding of pixel numbers up to 10⁵, which is 10⁻¹¹.
 const INVERSE_ERROR_PX: f64 = 1e-9;
 
-// Ratio of the determinant to the sum of squares below which axes count as parallel. Chosen by hand: as Jacobian::new.
-const LEAST_RELATIVE_AREA: f64 = 1e-6;
+// Ratio of the determinant to the sum of squares below which axes count as parallel. Chosen by hand; `Jacobian::new` compares with
+// the longer axis alone.
+const MIN_AREA_TO_SUM_OF_SQUARES: f64 = 1e-6;
 
 const ARCSEC_PER_RADIAN: f64 = 648_000.0 / std::f64::consts::PI;
 
@@ -297,7 +298,7 @@ impl Wcs {
         });
         // Relative to its size: rounded numbers of parallel axes leave a small determinant. A header of zeros has no WCS.
         let size = |m: &Matrix2| m.iter().flatten().map(|v| v * v).sum::<f64>();
-        let regular = |m: &Matrix2| determinant(*m).abs() > LEAST_RELATIVE_AREA * size(m);
+        let regular = |m: &Matrix2| determinant(*m).abs() > MIN_AREA_TO_SUM_OF_SQUARES * size(m);
         let singular = |m: &Matrix2| !regular(m) && size(m) > 0.0;
         let damage = matrix.filter(singular).map(singular_text);
         let matrix = matrix.filter(regular);
@@ -421,7 +422,7 @@ impl Wcs {
 
     /// What is wrong with a header that states a WCS but gives no places on the sky; `None` for a usable WCS, and without one.
     pub(crate) fn fault(&self) -> Option<String> {
-        let expected = "expected TAN, TAN-SIP or TPV";
+        let expected = "expected TAN, TAN-SIP, TPV or a linear one";
         match (&self.damage, &self.unread) {
             (Some(damage), _) => Some(damage.clone()),
             (None, Some(kind)) => Some(format!("the projection {kind} is not read ({expected})")),
@@ -456,10 +457,6 @@ impl Wcs {
             unread: None,
             damage: None,
         }
-    }
-
-    pub(crate) fn frame_of(jacobian: &Matrix2) -> PixelFrame {
-        frame(jacobian)
     }
 
     pub(crate) fn states_axes(&self) -> bool {
@@ -558,7 +555,7 @@ pub(crate) fn aligned(jacobian: &Matrix2) -> bool {
         && frame.shear[0].hypot(frame.shear[1]) <= ALIGNED_SHEAR
 }
 
-fn frame(jacobian: &Matrix2) -> PixelFrame {
+pub(crate) fn frame(jacobian: &Matrix2) -> PixelFrame {
     let [[ux, uy], [vx, vy]] = *jacobian;
     let all = determinant(*jacobian);
     // A round object has the second moments J⁻¹ J⁻ᵀ in pixels, of which this is the ellipticity (Bartelmann & Schneider 2001,

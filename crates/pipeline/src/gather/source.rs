@@ -322,6 +322,6 @@ fn first_pixel(at: f64, side: usize) -> i64 {
 }
 
 /// A position on the square that is cut around it, from the centre.
-pub(crate) fn off_middle((x, y): (f64, f64), side: usize) -> [f64; 2] {
+pub(crate) fn subpixel_offset((x, y): (f64, f64), side: usize) -> [f64; 2] {
     [x, y].map(|at| at - (side as f64 + 1.0) / 2.0 - first_pixel(at, side) as f64)
 }

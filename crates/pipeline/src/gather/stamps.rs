@@ -8,7 +8,7 @@ use shearq_files::fits::{ImageWriter, Pixel, Value};
 use shearq_measure::{Examination, examined_rows};
 use shearq_quantities::statistics::upper_median;
 
-use super::source::{Content, Exposure, Files, Origin, Planes, off_middle};
+use super::source::{Content, Exposure, Files, Origin, Planes, subpixel_offset};
 use super::{Gathering, Stamps};
 use crate::wcs::Wcs;
 use shearq_dataset::mosaic::Mosaic;
@@ -181,7 +181,9 @@ impl StampWriter {
         let side = mosaic.stamp;
         self.incomplete += usize::from(pixels.iter().any(|value| !value.is_finite()));
         if self.examined.contains(&(next / mosaic.columns)) {
-            let place = origin.position.map_or([0.0; 2], |at| off_middle(at, side));
+            let place = origin
+                .position
+                .map_or([0.0; 2], |at| subpixel_offset(at, side));
             let stamp = ArrayView2::from_shape((side, side), pixels);
             let stamp = stamp.map_err(|error| FileError::new(origin.file, error))?;
             let examined = self.examination.add_at(stamp, place);
