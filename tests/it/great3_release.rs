@@ -264,10 +264,22 @@ fn epochs_of_a_subfield_are_combined() {
     ] {
         let message = refused(small.root(), &format!("shearq {command}"));
         assert!(
-            message.contains("epoch_dither-000-0.yaml: the file, or that of another epoch, has"),
+            message.contains("epoch_dither-000-1.yaml: the file has changed since"),
             "{command}: {message}"
         );
     }
+    for (x, found) in [("nan", "(NaN, 0)"), ("1e9", "(1000000000, 0)")] {
+        fs::write(
+            &dither,
+            format!("{{xdither_pixels: {}, ydither_pixels: 0.0}}", x),
+        )
+        .unwrap();
+        let message = refused(small.root(), &format!("rm -rf epochs; {measure}"));
+        let expected =
+            format!("epoch_dither-000-1.yaml: the dither is {found} px (expected up to 12");
+        assert!(message.contains(&expected), "{message}");
+    }
+    fs::write(&dither, "{xdither_pixels: -2.0, ydither_pixels: 0.0}").unwrap();
     fs::write(
         at("epoch_dither-000-1.txt"),
         "# xdither_pixels ydither_pixels\n2 0\n",
@@ -282,8 +294,25 @@ fn epochs_of_a_subfield_are_combined() {
     let message = refused(small.root(), &MEASURE.replace("--out m", "--out all"));
     assert!(
         message.contains(
-            "image-001-1.fits: there is no such epoch (found 1 of subfield 1, expected 2"
+            "image-001-1.fits: there is no such epoch (found 0 of subfield 1, expected epochs 0 to 1, as there is"
         ),
+        "{message}"
+    );
+    // The last epoch, which all subfields lack, and a subfield without images.
+    for set in 0..2 {
+        let _ = fs::remove_file(at(&format!("image-00{set}-1.fits")));
+    }
+    let message = refused(small.root(), &MEASURE.replace("--out m", "--out all"));
+    let expected = "image-000-1.fits: there is no such epoch (found 0 of subfield 0, expected epochs 0 to 1, as there is";
+    assert!(message.contains(expected), "{message}");
+    for epoch in 0..2 {
+        fs::write(at(&format!("image-000-{epoch}.fits")), "").unwrap();
+    }
+    fs::remove_file(at("image-001-0.fits")).unwrap();
+    let message = refused(small.root(), &MEASURE.replace("--out m", "--out all"));
+    let expected = "image-001-0.fits: there is no such epoch (found none of subfield 1";
+    assert!(
+        message.contains(expected) && message.contains("Try: restore the image, or --sets"),
         "{message}"
     );
 }

@@ -13,7 +13,7 @@ use std::path::{Path, PathBuf};
 use sha2::{Digest, Sha256};
 
 use crate::great3;
-use crate::images::ImageId;
+use crate::images::{self, ImageId};
 use crate::layout::{DataFolder, LAYOUT_FILE, Layout};
 use crate::run::{Run, Source};
 use crate::threads::Pool;
@@ -235,14 +235,16 @@ impl<'a> Inputs<'a> {
             return Ok(());
         }
         let kept = read_metadata(&catalogue, self.run.format, now.keys())?;
-        for (key, path) in self.files(id) {
-            if let (Some(now), Some(kept)) = (now.get(key), kept.get(key))
+        let mut files = self.files(id);
+        // In this order: without an epoch all of them differ, and the image explains most.
+        for key in PRINTS {
+            if let (Some(now), Some(kept), Some(path)) =
+                (now.get(key), kept.get(key), files.remove(key))
                 && now != kept
             {
-                // One fingerprint is that of the files of all epochs.
-                let what = match self.run.epochs && key != TRUTH {
-                    true => "the file, or that of another epoch,",
-                    false => "the file",
+                let (path, what) = match self.run.epochs && key != TRUTH {
+                    true => self.changed(key, id, &catalogue)?,
+                    false => (path, "the file"),
                 };
                 let message = format!(
                     "{what} has changed since {} was measured (found the fingerprint {now}, expected {kept}). Try: measure again into another folder",
@@ -252,6 +254,30 @@ impl<'a> Inputs<'a> {
             }
         }
         Ok(())
+    }
+}
+
+impl Inputs<'_> {
+    /// The file that made the fingerprint of all epochs another one. The catalogue has one for all, because the header of a FITS file
+    /// has no room for one of each.
+    fn changed(
+        &self,
+        key: &str,
+        id: ImageId,
+        catalogue: &Path,
+    ) -> Result<(PathBuf, &'static str), FileError> {
+        images::check_epochs(self.data, &[id.set])?;
+        let written = |path: &Path| path.metadata().and_then(|about| about.modified()).ok();
+        let epochs = self.run.epochs_of(self.data, id)?.into_iter();
+        let paths: Vec<PathBuf> = epochs.filter_map(|id| self.files(id).remove(key)).collect();
+        let mut newer = paths
+            .iter()
+            .filter(|path| written(path) > written(catalogue));
+        Ok(match (newer.next(), newer.next(), paths.first()) {
+            (Some(path), None, _) => (path.clone(), "the file"),
+            (_, _, Some(path)) => (path.clone(), "the file, or that of another epoch,"),
+            (_, _, None) => (catalogue.to_owned(), "a file of an epoch"),
+        })
     }
 }
 

@@ -45,7 +45,6 @@ pub struct BranchLayout {
 
 /// A folder with the files of a branch: patterns of their names, and what its first catalogue of galaxies states.
 pub(crate) struct Found {
-    pub(crate) galaxies: &'static str,
     pub(crate) psf_star: &'static str,
     pub(crate) stamp: usize,
     pub(crate) branch: BranchLayout,
@@ -54,7 +53,7 @@ pub(crate) struct Found {
 /// `None` without images and catalogues of the branch.
 pub(crate) fn detect(root: &Path) -> Result<Option<Found>, FileError> {
     let images = listing::find(root, GALAXIES, endings(GALAXIES), &[])?;
-    let catalogue = |set: &u32| root.join(fill(GALAXY_CATALOGUES, *set, 0));
+    let catalogue = |set: &u32| galaxy_catalogue(root, *set);
     // Images alone may be anyone's.
     let first = images
         .sets()
@@ -73,7 +72,6 @@ pub(crate) fn detect(root: &Path) -> Result<Option<Found>, FileError> {
         false => PSF_IMAGES,
     };
     Ok(Some(Found {
-        galaxies: GALAXIES,
         psf_star,
         stamp: galaxies.stamp()?,
         branch: BranchLayout {
@@ -99,18 +97,36 @@ pub(crate) fn dither_file(root: &Path, set: u32, image: u32) -> PathBuf {
     if is_there(&txt) { txt } else { yaml }
 }
 
-/// Shift (x, y) in pixels of all galaxies of an epoch; zero in branches of a single epoch.
+/// Shift (x, y) in pixels of all galaxies of an epoch, of up to `most` along each axis; zero in branches of a single epoch.
 // The challenge's example of a coadd shifts each image by the negative of these numbers.
-pub fn dither(root: &Path, set: u32, image: u32) -> Result<[f64; 2], FileError> {
+pub fn dither(root: &Path, set: u32, image: u32, most: f64) -> Result<[f64; 2], FileError> {
     let stem = fill(DITHERS, set, image);
     let Some(found) = Parameters::read(root, &stem)? else {
         let path = dither_file(root, set, image);
         let message = "there is no such file, nor one ending in .txt; expected the dither of this epoch, by which its galaxies are shifted";
         return Err(FileError::new(path, message));
     };
-    Ok([
+    let dither @ [x, y] = [
         found.number("xdither_pixels")?,
         found.number("ydither_pixels")?,
+    ];
+    if dither.iter().all(|axis| (-most..=most).contains(axis)) {
+        return Ok(dither);
+    }
+    // Here, not where the stamps are combined, whose error would blame the cutting of the stamps and name no file.
+    let message = format!(
+        "the dither is ({x}, {y}) px (expected up to {most} along each axis, which keeps galaxies on their stamps). Try: the released file"
+    );
+    Err(FileError::new(&found.path, message))
+}
+
+/// Files by subfield and epoch that show which images a branch should have: star fields, dithers and, with the number of the
+/// first epoch, catalogues.
+pub(crate) fn files_of_epochs(root: &Path) -> Result<[listing::Files; 3], FileError> {
+    Ok([
+        listing::find(root, STAR_FIELDS, endings(STAR_FIELDS), &[])?,
+        listing::find(root, DITHERS, &[".yaml", ".txt"], &[])?,
+        listing::find(root, GALAXY_CATALOGUES, endings(GALAXY_CATALOGUES), &[])?,
     ])
 }
 

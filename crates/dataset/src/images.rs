@@ -1,8 +1,10 @@
 //! Images of a folder, and the share of one process.
 
+use std::collections::BTreeSet;
 use std::str::FromStr;
 
-use crate::layout::{DataFolder, fill};
+use crate::great3;
+use crate::layout::{DataFolder, STAMPS, fill};
 use crate::listing::{self, Files};
 use shearq_files::FileError;
 
@@ -39,26 +41,48 @@ pub fn of_folder(data: &DataFolder, sets: &[u32]) -> Result<Vec<ImageId>, FileEr
     Ok(found)
 }
 
-/// Checks that each of `sets` (all if empty) has the epochs 0 to N of GREAT3, as the subfield with most epochs has: a galaxy without
-/// one of them would have more noise than its neighbours for no reason that anybody could see.
+/// Checks that no epoch of `sets` (all if empty) is missing: a galaxy without one of them would have more noise than its neighbours
+/// for no reason that anybody could see.
 pub(crate) fn check_epochs(data: &DataFolder, sets: &[u32]) -> Result<(), FileError> {
-    let files = data.images(&[])?;
-    let of_set = |set: u32| files.of_set(set).into_iter().map(|(epoch, _)| epoch);
-    let last = files
-        .sets()
-        .into_iter()
-        .filter_map(|set| Some((of_set(set).max()?, set)));
-    let Some((last, full)) = last.max_by_key(|(last, _)| *last) else {
+    match data.layout().great3 {
+        Some(_) => check_subfields(data, sets),
+        None => check_exposures(data, sets),
+    }
+}
+
+// All subfields of a branch have the same epochs, from 0. Not only images show which: the last epoch may be lost from all subfields,
+// or all epochs of a subfield.
+fn check_subfields(data: &DataFolder, sets: &[u32]) -> Result<(), FileError> {
+    let images = data.images(&[])?;
+    let others = great3::files_of_epochs(data.root())?;
+    let all: Vec<&Files> = std::iter::once(&images).chain(&others).collect();
+    let subfields: BTreeSet<u32> = all.iter().flat_map(|files| files.sets()).collect();
+    let last = subfields
+        .iter()
+        .flat_map(|&set| all.iter().flat_map(move |files| files.of_set(set)));
+    let Some((last, witness)) = last.max_by_key(|(epoch, _)| *epoch) else {
         return Ok(());
     };
-    for set in files.wanted(sets) {
-        let there: Vec<u32> = of_set(set).collect();
+    let wanted = match sets {
+        [] => subfields.into_iter().collect(),
+        sets => sets.to_vec(),
+    };
+    for set in wanted {
+        let there: Vec<u32> = images.of_set(set).into_iter().map(|(at, _)| at).collect();
         if let Some(epoch) = (0..=last).find(|epoch| !there.contains(epoch)) {
+            let witness = witness.file_name().unwrap_or_default().display();
+            let expected = match last {
+                0 => "expected epoch 0, as all subfields of the branch have".to_owned(),
+                last => format!("expected epochs 0 to {last}, as there is {witness}"),
+            };
+            let advice = match there.is_empty() {
+                true => ". Try: restore the image, or --sets with the subfields that have images",
+                false => ". Try: restore the image",
+            };
             let message = format!(
-                "there is no such epoch (found {} of subfield {set}, expected {}, as subfield {full} has {last} for the last){}",
-                there.len(),
-                last + 1,
-                advice(data, &files)
+                "there is no such epoch (found {} of subfield {set}, {expected}){}{advice}",
+                listed(&there),
+                advice_on_names(&images)
             );
             return Err(FileError::new(data.galaxies(set, epoch), message));
         }
@@ -66,10 +90,49 @@ pub(crate) fn check_epochs(data: &DataFolder, sets: &[u32]) -> Result<(), FileEr
     Ok(())
 }
 
+// Sets of gathered exposures may have different numbers of them, but each has consecutive ones with a table of stamps.
+fn check_exposures(data: &DataFolder, sets: &[u32]) -> Result<(), FileError> {
+    let images = data.images(sets)?;
+    let tables = listing::find(data.root(), STAMPS, &[""], sets)?;
+    for set in images.wanted(sets) {
+        let there: BTreeSet<u32> = images.of_set(set).into_iter().map(|(at, _)| at).collect();
+        let stated = tables.of_set(set).into_iter().map(|(at, _)| at);
+        let stated: BTreeSet<u32> = stated.chain(there.iter().copied()).collect();
+        let (Some(&first), Some(&last)) = (stated.first(), stated.last()) else {
+            continue;
+        };
+        if let Some(image) = (first..=last).find(|image| !there.contains(image)) {
+            let there: Vec<u32> = there.into_iter().collect();
+            let message = format!(
+                "there is no such image (found {} of set {set}, expected {first} to {last}, all epochs of the set). Try: gather it again or, if it was left out on purpose, remove its table of stamps and give later images of the set, their stamps and PSFs lower numbers",
+                listed(&there)
+            );
+            return Err(FileError::new(data.galaxies(set, image), message));
+        }
+    }
+    Ok(())
+}
+
+fn listed(numbers: &[u32]) -> String {
+    match numbers {
+        [] => "none".to_owned(),
+        numbers => {
+            let each: Vec<String> = numbers.iter().map(u32::to_string).collect();
+            each.join(", ")
+        }
+    }
+}
+
+// Misspelt names explain missing images better than a wrong folder does.
+fn advice_on_names(files: &Files) -> String {
+    let line = files.unread().into_iter().next();
+    line.map_or_else(String::new, |line| format!(". {line}"))
+}
+
 fn advice(data: &DataFolder, files: &Files) -> String {
-    // Misspelt names explain missing images better than a wrong folder does.
-    if let Some(line) = files.unread().first() {
-        return format!(". {line}");
+    let names = advice_on_names(files);
+    if !names.is_empty() {
+        return names;
     }
     match data.folder_above() {
         Some(folder) => format!(

@@ -18,7 +18,7 @@ use shearq_files::table;
 pub const LAYOUT_FILE: &str = "layout.toml";
 
 // Name of the table of stamps of a gathered image.
-const STAMPS: &str = "set{set:02}/stamps-{image:03}.parquet";
+pub(crate) const STAMPS: &str = "set{set:02}/stamps-{image:03}.parquet";
 
 /// File-name patterns and conventions of a data folder. `{set}` and `{image}` stand for plain numbers, `{set:02}` and
 /// `{image:03}` for numbers with leading zeros. A layout is checked when it is read.
@@ -146,7 +146,7 @@ impl DataFolder {
         } else {
             match great3::detect(&root)? {
                 Some(found) => Layout {
-                    galaxies: found.galaxies.into(),
+                    galaxies: great3::GALAXIES.into(),
                     psf_star: found.psf_star.into(),
                     stamp: found.stamp,
                     great3: Some(found.branch),

@@ -15,9 +15,9 @@ use shearq_measure::{
 use shearq_quantities::Jacobian;
 use shearq_submissions::Configuration;
 
-use super::source::{ImageSource, squares};
+use super::source::{ImageSource, squares, stamp_rows};
 use crate::PipelineError;
-use crate::gather::off_middle;
+use crate::gather::subpixel_offset;
 use crate::stamp_table::{ID, PLACE, StampTable};
 
 // Distance up to which places on the sky are those of one galaxy. Chosen by hand: half of the seeing.
@@ -43,6 +43,8 @@ pub(super) fn open(
 ) -> Result<Vec<EpochSource>, PipelineError> {
     let mut sources: Vec<EpochSource> = Vec::new();
     let mut first: Option<(ImageId, Galaxies)> = None;
+    // Farther galaxies cannot be combined.
+    let most = configuration.stamp.size as f64 / 4.0;
     for &id in ids {
         let image = ImageSource::open(data, id, configuration)?;
         let (path, mosaic) = (data.stamps(id.set, id.image), image.mosaic());
@@ -53,7 +55,7 @@ pub(super) fn open(
         };
         let offsets = match (data.layout().great3, &image.table) {
             (Some(_), _) => Some(vec![
-                great3::dither(data.root(), id.set, id.image)?;
+                great3::dither(data.root(), id.set, id.image, most)?;
                 mosaic.galaxies
             ]),
             (None, Some(table)) => offsets(table, &path, mosaic.stamp)?,
@@ -61,10 +63,7 @@ pub(super) fn open(
         };
         let mosaic = sources.first().map_or(mosaic, |first| first.image.mosaic());
         sources.push(EpochSource {
-            rows: StampRows {
-                columns: mosaic.columns,
-                count: mosaic.galaxies,
-            },
+            rows: stamp_rows(mosaic),
             offsets: ordered(&tiles, offsets.as_deref().unwrap_or(&[])),
             tiles,
             image,
@@ -101,7 +100,9 @@ fn offsets(
     );
     let shift = f64::from(table.head.first_pixel) - 1.0;
     let places = x.iter().zip(&*y).map(|(x, y)| (x - shift, y - shift));
-    Ok(Some(places.map(|place| off_middle(place, side)).collect()))
+    Ok(Some(
+        places.map(|place| subpixel_offset(place, side)).collect(),
+    ))
 }
 
 /// By what galaxies are recognised: identities, which show their type, and degrees on the sky.

@@ -172,14 +172,18 @@ impl ImageSource {
     }
 }
 
+pub(super) fn stamp_rows(mosaic: Mosaic) -> StampRows {
+    StampRows {
+        columns: mosaic.columns,
+        count: mosaic.galaxies,
+    }
+}
+
 impl StampSource<'static> for ImageSource {
     type Error = PipelineError;
 
     fn rows(&self) -> StampRows {
-        StampRows {
-            columns: self.mosaic.columns,
-            count: self.mosaic.galaxies,
-        }
+        stamp_rows(self.mosaic)
     }
 
     fn warnings(&self) -> Vec<Warning> {
