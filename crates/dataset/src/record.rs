@@ -285,8 +285,14 @@ mod tests {
             .join("set01/.catalogue-001.fits.0123456789abcdef.part");
         std::fs::create_dir(folder.path().join("set01")).unwrap();
         std::fs::write(&left, "half").unwrap();
+        // Branches of GREAT3 have images three folders below the record.
+        let deep = folder
+            .path()
+            .join("control/ground/constant/.image-000-0.fits.0123456789abcdef.part");
+        std::fs::create_dir_all(deep.parent().unwrap()).unwrap();
+        std::fs::write(&deep, "half").unwrap();
         let first = claim(&path, &1).unwrap();
-        assert!(!left.exists());
+        assert!(!left.exists() && !deep.exists());
         std::fs::write(&left, "being written").unwrap();
         let second = claim(&path, &1).unwrap();
         assert!(left.exists());

@@ -254,14 +254,22 @@ fn folder_of(target: &Path) -> &Path {
     }
 }
 
+// Folders within folders that results are in, as EXPERIMENT/OBSERVATION/SHEAR of GREAT3. Deeper ones
+// are not searched, because links may form circles.
+const MAX_DEPTH: usize = 3;
+
 /// Removes the temporary files that killed processes left in `folder` and the folders in it. No other
 /// process may be writing there.
 pub fn remove_leftovers(folder: &Path) -> Result<(), FileError> {
+    remove_leftovers_to(folder, MAX_DEPTH)
+}
+
+fn remove_leftovers_to(folder: &Path, depth: usize) -> Result<(), FileError> {
     for path in list(folder)? {
-        if path.is_dir() {
-            list(&path)?.iter().try_for_each(|path| remove_part(path))?;
-        } else {
+        if !path.is_dir() {
             remove_part(&path)?;
+        } else if depth > 0 {
+            remove_leftovers_to(&path, depth - 1)?;
         }
     }
     Ok(())
