@@ -11,7 +11,7 @@ use crate::progress::Bar;
 use crate::{print, tell};
 use shearq_dataset::images::{self, ImageId};
 use shearq_dataset::layout::MAX_IMAGE;
-use shearq_dataset::run::{Run, Source, open_data, way};
+use shearq_dataset::run::{Run, Source, open_data, relative_path};
 use shearq_files::atomic::Scratch;
 use shearq_files::table::FileFormat;
 use shearq_pipeline::measure::measure_folder;
@@ -198,7 +198,7 @@ fn chosen(
         .map(|name| {
             let path = Path::new(name);
             let file = (!registry.names().contains(name) && path.is_file())
-                .then(|| way(beside, path))
+                .then(|| relative_path(beside, path))
                 .transpose()?;
             Ok((registry.get(name)?.configuration, file))
         })
@@ -233,7 +233,7 @@ fn measured(
             let mut sets: Vec<u32> = images.iter().map(|id| id.set).collect();
             sets.dedup();
             // Other data may have fewer images.
-            let mut there = images::of_folder(&data, &sets)?;
+            let mut there = run.images(&data, &sets)?;
             there.retain(|id| images.contains(id));
             // An estimate: the grid of a folder is unknown until its images are opened.
             measure_folder(&run, &data, out, &there, threads, &mut bar(100))?;

@@ -97,11 +97,8 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         data = data.with_stacked_stars()?;
     }
     let sets = sets.as_ref().map_or(&[][..], |list| &list.0);
-    let run = Run {
-        // All images of a subfield are epochs.
-        epochs: *epochs || data.layout().great3.is_some(),
-        ..measuring.run(Source::folder(&data, out)?)?
-    };
+    let mut run = measuring.run(Source::folder(&data, out)?)?;
+    run.epochs |= *epochs;
     let images = measuring.images(&run, &data, sets)?;
     measure(&run, &data, out, &images, measuring.threads())
 }

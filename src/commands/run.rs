@@ -9,7 +9,7 @@ use crate::measure::Measuring;
 use crate::progress::{Bar, mark_resumable};
 use crate::{measure, print_table, score, tell};
 use shearq_dataset::images;
-use shearq_dataset::layout::MAX_IMAGE;
+use shearq_dataset::layout::{MAX_IMAGE, truth_is_there};
 use shearq_dataset::run::{Run, Source, open_data};
 use shearq_files::atomic;
 use shearq_pipeline::run::run_folder;
@@ -99,6 +99,10 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         }
         (Source::Folder { .. }, Some(data)) => {
             let images = measuring.images(&run, data, &wanted)?;
+            // Before hours of work that could not be scored. Other shards are scored by `merge`.
+            for id in images.iter().filter(|_| shard.is_none()) {
+                truth_is_there(&data.truth(id.set))?;
+            }
             measure::measure(&run, data, out, &images, threads)?;
         }
         // A folder as source comes from `data`.

@@ -242,7 +242,12 @@ impl References {
             let images = files.of_set(set).into_iter();
             images.map(move |(image, _)| ImageId { set, image })
         };
-        Ok(sets.iter().flat_map(of_set).collect())
+        let mut ids: Vec<ImageId> = sets.iter().flat_map(of_set).collect();
+        // All images of a subfield of GREAT3 are epochs, which are measured together.
+        if data.layout().great3.is_some() {
+            ids.dedup_by_key(|id| id.set);
+        }
+        Ok(ids)
     }
 
     pub fn is_empty(&self) -> bool {

@@ -33,7 +33,7 @@ impl Source {
     /// `beside` is the folder of the record.
     pub fn folder(data: &DataFolder, beside: &Path) -> Result<Self, FileError> {
         Ok(Source::Folder {
-            path: way(beside, data.root())?,
+            path: relative_path(beside, data.root())?,
             layout: data.layout().clone(),
         })
     }
@@ -42,7 +42,7 @@ impl Source {
     pub fn moved(&self, from: &Path, to: &Path) -> Result<Self, FileError> {
         Ok(match self {
             Source::Folder { path, layout } => Source::Folder {
-                path: way(to, &from.join(path))?,
+                path: relative_path(to, &from.join(path))?,
                 layout: layout.clone(),
             },
             Source::Simulated(settings) => Source::Simulated(*settings),
@@ -66,7 +66,7 @@ impl Source {
     }
 }
 
-pub fn way(from: &Path, to: &Path) -> Result<PathBuf, FileError> {
+pub fn relative_path(from: &Path, to: &Path) -> Result<PathBuf, FileError> {
     relative(from, to).map_err(FileError::doing(to, "cannot determine where the folder is"))
 }
 
@@ -102,13 +102,15 @@ impl Run {
     }
 
     pub fn new(source: Source, configuration: Configuration, format: FileFormat) -> Self {
+        // All images of a subfield of GREAT3 are epochs.
+        let epochs = source.layout().great3.is_some();
         Run {
             version: crate::VERSION.into(),
             source,
             configuration,
             format,
             selection: None,
-            epochs: false,
+            epochs,
         }
     }
 
@@ -116,9 +118,7 @@ impl Run {
     pub fn images(&self, data: &DataFolder, sets: &[u32]) -> Result<Vec<ImageId>, FileError> {
         let mut all = images::of_folder(data, sets)?;
         if self.epochs {
-            if data.layout().great3.is_some() {
-                images::check_epochs(data, sets)?;
-            }
+            images::check_epochs(data, sets)?;
             all.dedup_by_key(|id| id.set);
         }
         Ok(all)

@@ -21,7 +21,7 @@ use sha2::{Digest, Sha256};
 use shearq_dataset::fingerprint::hex;
 use shearq_dataset::layout::{DataFolder, MAX_IMAGE, MAX_SET, check_folder};
 use shearq_dataset::record::read_record;
-use shearq_dataset::run::{Run, way};
+use shearq_dataset::run::{Run, relative_path};
 use shearq_files::atomic::{PartFolder, Scratch};
 use shearq_files::open::{is_there, open};
 use shearq_files::{FileError, table};
@@ -580,7 +580,7 @@ impl Submission {
         let run = self.manifest.as_ref().and_then(|own| own.run.as_ref());
         match run {
             Some(run) => settings_of(run, path),
-            None => Ok(way(data.root(), path)?.display().to_string()),
+            None => Ok(relative_path(data.root(), path)?.display().to_string()),
         }
     }
 
