@@ -218,7 +218,7 @@ fn catalogues(
             }
             (Catalogues::packed(sent, submission, &data)?, data)
         }
-        (None, _, None) => bail!("--foreign needs the true shear. Try: --data DIR"),
+        (None, _, None) => unreachable!("clap requires --data"),
     };
     let options = Options {
         // Catalogues of shearq have the standard convention. That of other programs is determined from the data.

@@ -18,9 +18,9 @@ pub const PSF_NOISE: &str = "psfnoise";
 pub const E_NOISE: &str = "enoise";
 /// Key of the frame of ellipticities: `sky`, or pixel axes that are not the sky's: position angle of +y in degrees, parity (−1
 /// for mirrored), and both components of the shear.
-pub const FRAME: &str = "frame";
+pub const CATALOGUE_FRAME: &str = "frame";
 /// Key of the coordinate of the centre of the first pixel in x and y, of stamps of an exposure.
-pub const FIRST_PIXEL: &str = "xyfirst";
+pub const CATALOGUE_FIRST_PIXEL: &str = "xyfirst";
 /// Key of the mean response: [`NOT_APPLIED`] if e1 and e2 are still to be divided by it, else the responses that g1 and g2
 /// were divided by. Ellipticities without a response, and catalogues of earlier versions, do not have it.
 pub const RESPONSE: &str = "response";
@@ -37,8 +37,8 @@ pub const KEYS: [&str; 12] = [
     PSF_NOISE,
     E_NOISE,
     WARNINGS,
-    FRAME,
-    FIRST_PIXEL,
+    CATALOGUE_FRAME,
+    CATALOGUE_FIRST_PIXEL,
     RESPONSE,
 ];
 
@@ -51,7 +51,7 @@ pub fn frame_entry(frame: &PixelFrame) -> (String, String) {
     } = frame;
     let parity = if *mirrored { -1 } else { 1 };
     let text = format!("{angle:.2} {parity} {g1:.4} {g2:.4}");
-    (FRAME.into(), text)
+    (CATALOGUE_FRAME.into(), text)
 }
 
 /// The axes of the ellipticities of a catalogue.
@@ -149,13 +149,13 @@ impl CommonAxes {
 
 /// The axes that a catalogue states.
 pub fn stated_axes(path: &Path, format: FileFormat) -> Result<Axes, FileError> {
-    let keys = [FRAME.to_owned()];
+    let keys = [CATALOGUE_FRAME.to_owned()];
     axes_of(path, &table::read_metadata(path, format, keys.iter())?)
 }
 
-/// The axes that the metadata of the catalogue `path` state by [`FRAME`].
+/// The axes that the metadata of the catalogue `path` state by [`CATALOGUE_FRAME`].
 pub fn axes_of(path: &Path, metadata: &Metadata) -> Result<Axes, FileError> {
-    let Some(text) = metadata.get(FRAME) else {
+    let Some(text) = metadata.get(CATALOGUE_FRAME) else {
         return Ok(Axes::Pixel);
     };
     // Catalogues written by Python state `pixel`, too, which has no angle.
@@ -176,7 +176,7 @@ pub fn axes_of(path: &Path, metadata: &Metadata) -> Result<Axes, FileError> {
         }
         _ => {
             let message = format!(
-                "the metadata `{FRAME}` are {text:?} (expected four numbers such as 90.00 -1 0.0100 0.0000)"
+                "the metadata `{CATALOGUE_FRAME}` are {text:?} (expected four numbers such as 90.00 -1 0.0100 0.0000)"
             );
             Err(FileError::new(path, message))
         }

@@ -10,7 +10,7 @@ use shearq_files::FileError;
 use shearq_files::atomic;
 use shearq_files::open;
 
-pub type Placed = ((f64, f64), FunctionalPsf);
+pub type PositionedPsf = ((f64, f64), FunctionalPsf);
 
 const HEADER: &str = "x,y,profile,beta,fwhm,e1,e2";
 
@@ -47,7 +47,7 @@ pub fn read(path: &Path, mosaic: &Mosaic) -> Result<Vec<FunctionalPsf>, FileErro
 }
 
 /// PSFs of a table, with their positions, in its order.
-pub fn read_all(path: &Path) -> Result<Vec<Placed>, FileError> {
+pub fn read_all(path: &Path) -> Result<Vec<PositionedPsf>, FileError> {
     const DOING: &str = "cannot read the PSF parameters";
     let text = open::read_to_string(path, open::DATA).map_err(FileError::doing(path, DOING))?;
     let mut reader = csv::ReaderBuilder::new()
@@ -109,11 +109,11 @@ pub fn read_all(path: &Path) -> Result<Vec<Placed>, FileError> {
     Ok(rows)
 }
 
-pub fn write(path: &Path, rows: &[Placed]) -> Result<(), FileError> {
+pub fn write(path: &Path, rows: &[PositionedPsf]) -> Result<(), FileError> {
     atomic::write(path, text(rows).as_bytes())
 }
 
-pub fn text(rows: &[Placed]) -> String {
+pub fn text(rows: &[PositionedPsf]) -> String {
     let mut text = format!("{HEADER}\n");
     for ((x, y), psf) in rows {
         // A Kolmogorov PSF has no β; the column has any valid number.

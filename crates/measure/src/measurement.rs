@@ -71,7 +71,7 @@ pub struct Measurement {
     pub observables: Option<Observables>,
     /// The galaxy under small shears, if the configuration requests sheared catalogues.
     pub sheared: Option<ShearedCatalogues>,
-    /// Iterations of the network; `None` if it did not run.
+    /// Iterations; `None` if the method did not run. The linear method has its `max_iterations`, and energies of NaN.
     pub descent: Option<Descent>,
     /// Standard deviation of the noise that was used, in image units; NaN if unknown.
     pub noise: f64,

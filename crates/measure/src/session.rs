@@ -1197,14 +1197,14 @@ fn scan<R: Send + Sync, L: Send, E: Send>(
 }
 
 impl Measurer {
-    /// Measures stamps `[galaxy, y, x]`. `noise` is σ of white noise; without it, a configuration with `noise.source = "border"` measures the noise on the
-    /// stamps. Ellipticities are to be divided by the mean response, which several thousand galaxies determine to 1 %.
+    /// Measures stamps `[galaxy, y, x]`. `noise` is σ of white noise; without it, it is measured on the stamps as `noise.source`
+    /// says, or refused if that is `"header"`. Ellipticities are to be divided by the mean response, which several thousand galaxies determine to 1 %.
     ///
     /// A galaxy with pixels that are not finite (under a linear method: too many), or with a PSF of its own that cannot be
     /// used, is flagged.
     ///
     /// # Errors
-    /// If shapes do not match, `noise` is not a positive number, or the PSF of all stamps cannot be used.
+    /// If shapes do not match, `noise` is not a finite number of zero or more, or the PSF of all stamps cannot be used.
     pub fn batch<T: Pixel>(
         &self,
         stamps: ArrayView3<'_, T>,

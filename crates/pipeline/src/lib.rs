@@ -1,7 +1,7 @@
 //! Simulating, gathering and measuring many images.
 //!
-//! Only [`engine`] starts threads. The code below it is serial and uses scratch of the caller. Results come back in
-//! order, so they do not depend on the number of threads.
+//! [`engine`] starts threads for rows of images, and [`shearq_dataset::threads`] for files. The code below them is serial and uses
+//! scratch of the caller. Results come back in order, so they do not depend on the number of threads.
 #![forbid(unsafe_code)]
 
 pub mod complete;

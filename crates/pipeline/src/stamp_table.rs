@@ -24,8 +24,8 @@ pub(crate) const JACOBIAN: [&str; 4] = ["dudx", "dudy", "dvdx", "dvdy"];
 /// Places of the stamps in the image of the data folder, and where they come from.
 pub(crate) const ORIGIN: [&str; 5] = ["tile_x", "tile_y", "file", "image", "plane"];
 
-const FRAME: &str = "frame";
-const FIRST_PIXEL: &str = "first_pixel";
+const STAMP_TABLE_FRAME: &str = "frame";
+const STAMP_TABLE_FIRST_PIXEL: &str = "first_pixel";
 const GAIN: &str = "gain";
 
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -51,8 +51,8 @@ impl StampTable {
             gain,
         } = self.head;
         let mut metadata = Metadata::from([
-            (FRAME.to_owned(), frame.to_string()),
-            (FIRST_PIXEL.to_owned(), first_pixel.to_string()),
+            (STAMP_TABLE_FRAME.to_owned(), frame.to_string()),
+            (STAMP_TABLE_FIRST_PIXEL.to_owned(), first_pixel.to_string()),
         ]);
         metadata.extend(gain.map(|gain| (GAIN.to_owned(), gain.to_string())));
         let mut bytes = Vec::new();
@@ -84,12 +84,12 @@ impl StampTable {
         };
         let value = |key: &str| metadata.get(key).map(String::as_str);
         let head = Head {
-            frame: value(FRAME)
+            frame: value(STAMP_TABLE_FRAME)
                 .and_then(|text| text.parse().ok())
-                .ok_or_else(|| wrong(FRAME))?,
-            first_pixel: value(FIRST_PIXEL)
+                .ok_or_else(|| wrong(STAMP_TABLE_FRAME))?,
+            first_pixel: value(STAMP_TABLE_FIRST_PIXEL)
                 .and_then(|text| text.parse().ok())
-                .ok_or_else(|| wrong(FIRST_PIXEL))?,
+                .ok_or_else(|| wrong(STAMP_TABLE_FIRST_PIXEL))?,
             gain: value(GAIN)
                 .map(|text| text.parse().map_err(|_| wrong(GAIN)))
                 .transpose()?,

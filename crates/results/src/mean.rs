@@ -241,7 +241,7 @@ fn e_noise(path: &Path, format: FileFormat) -> Result<Option<[f64; 2]>, FileErro
 #[cfg(test)]
 mod tests {
     use shearq_dataset::fingerprint::PSF;
-    use shearq_dataset::metadata::{FRAME, PSF_NOISE};
+    use shearq_dataset::metadata::{CATALOGUE_FRAME, PSF_NOISE};
     use shearq_files::frames::frame;
     use shearq_files::frames::polars::Column;
     use shearq_measure::PixelFrame;
@@ -390,7 +390,7 @@ mod tests {
             let mut catalogues = Vec::new();
             for (image, frame) in (1..).zip(frames) {
                 let path = folder.path().join(format!("{image}.parquet"));
-                let stated = (FRAME, *frame);
+                let stated = (CATALOGUE_FRAME, *frame);
                 let metadata = if frame.is_empty() { &[][..] } else { &[stated] };
                 written(&path, [0.05, 0.2], metadata);
                 catalogues.push((image, path));

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use shearq_dataset::fingerprint::{GALAXIES, verify_source};
 use shearq_dataset::metadata::{
-    Axes, CommonAxes, FIRST_PIXEL, FRAME, NOT_APPLIED, RESPONSE, axes_of,
+    Axes, CATALOGUE_FIRST_PIXEL, CATALOGUE_FRAME, CommonAxes, NOT_APPLIED, RESPONSE, axes_of,
 };
 use shearq_dataset::run::{Run, Source};
 use shearq_dataset::threads::ALL_CORES;
@@ -184,7 +184,14 @@ pub fn shears(
         for set in files.wanted(sets) {
             for (image, path) in files.of_set(set) {
                 refuse_seen(&mut seen, &run, &path, (set, image))?;
-                let keys = [FRAME, FIRST_PIXEL, "creator", "submiss", "elltype"].map(str::to_owned);
+                let keys = [
+                    CATALOGUE_FRAME,
+                    CATALOGUE_FIRST_PIXEL,
+                    "creator",
+                    "submiss",
+                    "elltype",
+                ]
+                .map(str::to_owned);
                 let stated = table::read_metadata(&path, run.format, keys.iter())?;
                 let own = axes_of(&path, &stated)?;
                 axes.add(&path, own, false)?;

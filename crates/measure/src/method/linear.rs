@@ -82,7 +82,7 @@ const WINDOW_COUNT: usize = CONFIGURED_WINDOW + 1 + WINDOW_STEPS.end().unsigned_
 /// S/N 20, and 0.8 % for large galaxies. The galaxy is taken as deconvolved to the target, which is not exact for few
 /// iterations or λ > 0.
 struct Regularisation {
-    /// What halves the ellipticity of such a galaxy of flux one, times ν₀² (`shape.half_snr`).
+    /// Regularisation that halves the ellipticity of a galaxy of the reference size and flux one, times ν₀² (`shape.half_snr`).
     ellipticity: f32,
     /// P₀ of [`SizeMoments`] for such a galaxy of flux one, times the square of [`HALF_SIZE_SNR`].
     size: f32,

@@ -17,7 +17,8 @@ use super::ImageHead;
 use crate::PipelineError;
 use shearq_dataset::images::ImageId;
 use shearq_dataset::metadata::{
-    E_NOISE, FIRST_PIXEL, FRAME, NOT_APPLIED, PSF_NOISE, RESPONSE, WARNINGS, frame_entry,
+    CATALOGUE_FIRST_PIXEL, CATALOGUE_FRAME, E_NOISE, NOT_APPLIED, PSF_NOISE, RESPONSE, WARNINGS,
+    frame_entry,
 };
 use shearq_dataset::record::{Claim, claim};
 use shearq_dataset::run::{RUN_FILE, Run};
@@ -38,7 +39,7 @@ pub const COLUMNS: [(&str, Value); 19] = [
         "iterations",
         Value::Whole(|g| g.descent.map_or(0, |d| d.iterations as i32)),
     ),
-    // −1 if the network did not run.
+    // −1 if the method did not run.
     (
         "stop",
         Value::Whole(|g| g.descent.map_or(-1, |d| d.stop.code() as i32)),
@@ -312,10 +313,13 @@ impl<'a> Catalogues<'a> {
             metadata.extend([frame_entry(&PixelFrame::default())]);
         }
         if batch.frame == Frame::Sky {
-            metadata.insert(FRAME.into(), Frame::Sky.to_string());
+            metadata.insert(CATALOGUE_FRAME.into(), Frame::Sky.to_string());
         }
         if let Some(table) = &head.table {
-            metadata.insert(FIRST_PIXEL.into(), table.head.first_pixel.to_string());
+            metadata.insert(
+                CATALOGUE_FIRST_PIXEL.into(),
+                table.head.first_pixel.to_string(),
+            );
         }
         if let Some([m, c]) = batch.psf_noise {
             metadata.insert(PSF_NOISE.into(), format!("{m:.2e} {c:.2e}"));

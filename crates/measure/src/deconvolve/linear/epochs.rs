@@ -7,7 +7,8 @@
 //! Σ W û/p = Σ u conj(p) û / q,    W = u |p|²/q,    q = Σ u |p|²,    u = (a/σ²)/Σ(a/σ²).
 //! ```
 //!
-//! What the network makes of it with w = q + λd² is v̂ = Γ[1 − (1 − c w)^M]/w · Σ u conj(p) û, for one epoch what it always was. Noise
+//! With w = q + λd² the closed form of the iterations is v̂ = Γ[1 − (1 − c w)^M]/w · Σ u conj(p) û, which for one epoch equals that of a
+//! single stamp. Noise
 //! has the level (Σ a/σ²)^(−½) and, in its units, the power Γ²[…]²q/w² in each mode; a shear changes it by the mean of the
 //! epochs' changes with the weights W. Averages of ellipticities of single epochs would need a response of each noisy epoch:
 //! with 16 epochs of S/N 5, the error of m is six times as large.
