@@ -271,7 +271,7 @@ fn epochs_of_a_subfield_are_combined() {
     for (x, found) in [("nan", "(NaN, 0)"), ("1e9", "(1000000000, 0)")] {
         fs::write(
             &dither,
-            format!("{{xdither_pixels: {}, ydither_pixels: 0.0}}", x),
+            format!("{{xdither_pixels: {x}, ydither_pixels: 0.0}}"),
         )
         .unwrap();
         let message = refused(small.root(), &format!("rm -rf epochs; {measure}"));
