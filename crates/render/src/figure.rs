@@ -28,9 +28,7 @@ use plotters::coord::Shift;
 use plotters::drawing::{DrawingArea, DrawingAreaErrorKind, IntoDrawingArea};
 use plotters::element::PathElement;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
-use plotters::style::{
-    Color, FontStyle, FontTransform, IntoFont, RGBColor, TextStyle, WHITE, register_font,
-};
+use plotters::style::{Color, FontStyle, IntoFont, RGBColor, TextStyle, WHITE, register_font};
 use plotters_bitmap::BitMapBackend;
 use plotters_svg::SVGBackend;
 use shearq_files::{FileError, atomic};
@@ -263,31 +261,9 @@ fn write<B: DrawingBackend>(
     (x, y): (f64, f64),
 ) -> Drawn<B> {
     let at = place((x, y + TO_CENTRE * size));
-    write_in(canvas, text, &font(size).pos(anchor), at)
-}
-
-// The same upwards.
-fn write_upwards<B: DrawingBackend>(
-    canvas: &Canvas<B>,
-    text: &str,
-    size: f64,
-    anchor: Pos,
-    (x, y): (f64, f64),
-) -> Drawn<B> {
-    let upwards = font(size).transform(FontTransform::Rotate270);
-    let at = place((x + TO_CENTRE * size, y));
-    write_in(canvas, text, &upwards.pos(anchor), at)
-}
-
-fn write_in<B: DrawingBackend>(
-    canvas: &Canvas<B>,
-    text: &str,
-    style: &TextStyle<'_>,
-    at: (i32, i32),
-) -> Drawn<B> {
     match text {
         "" => Ok(()),
-        text => canvas.draw_text(&escape::line(text), style, at),
+        text => canvas.draw_text(&escape::line(text), &font(size).pos(anchor), at),
     }
 }
 

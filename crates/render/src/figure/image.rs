@@ -9,7 +9,7 @@ use super::axis::short;
 use super::colour::{ColourMap, position};
 use super::{
     Canvas, Drawn, Figure, LABEL_SIZE, LEFT, MARGIN, MIDDLE, RIGHT, TITLE_SIZE, frame, place, room,
-    text_width, write, write_upwards,
+    text_width, write,
 };
 
 // The em of the numbers at colour bars.
@@ -55,42 +55,44 @@ pub struct ImageGrid {
 }
 
 impl ImageGrid {
-    // The space of the labels of rows, and the width of all panels.
-    fn widths(&self) -> (f64, f64) {
+    fn width(&self) -> f64 {
         let most = self.rows.iter().map(|row| row.panels.len()).max();
-        let labelled = self.rows.iter().any(|row| !row.label.is_empty());
-        let label = if labelled { LABEL_SIZE + 8.0 } else { 0.0 };
         let panels = (IMAGE_SIDE_PX + GAP) * most.unwrap_or(0) as f64 - GAP;
-        (label, panels.max(text_width(&self.title, TITLE_SIZE)))
+        // Texts above the rows, not beside them: the numbers of a galaxy are longer than an image is high.
+        let labels = self
+            .rows
+            .iter()
+            .map(|row| text_width(&row.label, LABEL_SIZE));
+        labels.fold(panels.max(text_width(&self.title, TITLE_SIZE)), f64::max)
     }
 }
 
 impl Figure for ImageGrid {
     fn extent(&self) -> (f64, f64) {
-        let (label, panels) = self.widths();
-        let row = LABEL_SIZE + 6.0 + IMAGE_SIDE_PX + BAR_ROOM;
-        let rows = self.rows.len() as f64 * row;
+        let rows = self
+            .rows
+            .iter()
+            .map(|row| room(&row.label, LABEL_SIZE) + LABEL_SIZE + 6.0 + IMAGE_SIDE_PX + BAR_ROOM);
         (
-            2.0 * MARGIN + label + panels,
-            2.0 * MARGIN + room(&self.title, TITLE_SIZE) + rows,
+            2.0 * MARGIN + self.width(),
+            2.0 * MARGIN + room(&self.title, TITLE_SIZE) + rows.sum::<f64>(),
         )
     }
 
     fn draw<B: DrawingBackend>(&self, canvas: &Canvas<B>) -> Drawn<B> {
-        let (label, panels) = self.widths();
-        let (left, mut top) = (MARGIN + label, MARGIN);
-        let at = (left + 0.5 * panels, top + 0.5 * TITLE_SIZE);
+        let mut top = MARGIN;
+        let at = (MARGIN + 0.5 * self.width(), top + 0.5 * TITLE_SIZE);
         write(canvas, &self.title, TITLE_SIZE, MIDDLE, at)?;
         top += room(&self.title, TITLE_SIZE);
         for row in &self.rows {
-            top += LABEL_SIZE + 6.0;
-            let beside = (MARGIN + 0.5 * LABEL_SIZE, top + 0.5 * IMAGE_SIDE_PX);
-            write_upwards(canvas, &row.label, LABEL_SIZE, MIDDLE, beside)?;
+            let above = (MARGIN, top + 0.5 * LABEL_SIZE);
+            write(canvas, &row.label, LABEL_SIZE, LEFT, above)?;
+            top += room(&row.label, LABEL_SIZE) + LABEL_SIZE + 6.0;
             for (k, panel) in row.panels.iter().enumerate() {
                 draw_panel(
                     canvas,
                     panel,
-                    (left + k as f64 * (IMAGE_SIDE_PX + GAP), top),
+                    (MARGIN + k as f64 * (IMAGE_SIDE_PX + GAP), top),
                 )?;
             }
             top += IMAGE_SIDE_PX + BAR_ROOM;
