@@ -733,6 +733,15 @@ fn great08_scores_images_and_sets() {
         message.contains("1: the shear is exactly zero"),
         "{message}"
     );
+    // A fault of a truth with sets is not that of one without.
+    let faulty = file("faulty.txt", "0 0 0.01 0.02\n-1 0 0.01 0.02\n2 1 -0.03 0\n");
+    let message = fail(&words(&format!(
+        "score --challenge great08 --truth {faulty} {images}"
+    )));
+    assert!(
+        message.contains("faulty.txt: row 2: not the number of an image or set (found -1"),
+        "{message}"
+    );
     let message = fail(&words(&format!("{score} {images} --psf {plain}")));
     assert!(
         message.contains("--psf: GREAT08 has no use for it"),

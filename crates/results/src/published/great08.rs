@@ -5,6 +5,7 @@ use std::path::Path;
 
 use shearq_dataset::threads::Pool;
 use shearq_files::FileError;
+use shearq_files::table::{self, Place};
 use shearq_quantities::Shear;
 use shearq_scoring::great3::great08_score;
 
@@ -24,26 +25,49 @@ const SHEARS: Columns<'static> = Columns {
     unnamed: &[(3, &[0, 1, 2])],
 };
 
+const WITH_SETS: Columns<'static> = Columns {
+    names: &[&["image"], &["set"], &["g1"], &["g2"]],
+    required: 4,
+    unnamed: &[(4, &[0, 1, 2, 3])],
+};
+
+// The number of the image or set of row `k`, if it and the shear can be.
+fn image_of(path: &Path, k: usize, number: f64, g: Shear) -> Result<usize, FileError> {
+    let Some(image) = whole(number, MAX_IMAGES) else {
+        let message = format!(
+            "row {}: not the number of an image or set (found {number}, expected 0, 1, 2, …)",
+            k + 1
+        );
+        return wrong(path, message);
+    };
+    if g.modulus().is_nan() || g.modulus() >= 1.0 {
+        let message = format!(
+            "{image}: not a shear (found {} {}, expected |g| < 1)",
+            g.e1, g.e2
+        );
+        return wrong(path, message);
+    }
+    Ok(image)
+}
+
+// Whether a truth states the set of each image. Its form decides, not whether it can be read: a fault of such a table would be
+// reported as that of the other kind.
+fn has_sets(path: &Path) -> Result<bool, FileError> {
+    let found = table::columns(&Place::of(path))?;
+    let is_named =
+        |names: &[String], wanted: &str| names.iter().any(|name| name.eq_ignore_ascii_case(wanted));
+    let mut named = found.named.iter().map(|own| &own.names);
+    Ok(found.unnamed.len() == WITH_SETS.required
+        || named.any(|names| is_named(names, "image") && is_named(names, "set")))
+}
+
 // Shears by the number of their image or set.
 fn read_shears(path: &Path) -> Result<BTreeMap<usize, Shear>, FileError> {
     let columns = SHEARS.read(path)?;
     let mut found = BTreeMap::new();
     for (k, &number) in columns[0].iter().enumerate() {
-        let Some(image) = whole(number, MAX_IMAGES) else {
-            let message = format!(
-                "row {}: not the number of an image or set (found {number}, expected 0, 1, 2, …)",
-                k + 1
-            );
-            return wrong(path, message);
-        };
         let g = Shear::new(columns[1][k], columns[2][k]);
-        if g.modulus().is_nan() || g.modulus() >= 1.0 {
-            let message = format!(
-                "{image}: not a shear (found {} {}, expected |g| < 1)",
-                g.e1, g.e2
-            );
-            return wrong(path, message);
-        }
+        let image = image_of(path, k, number, g)?;
         if found.insert(image, g).is_some() {
             return wrong(
                 path,
@@ -91,22 +115,22 @@ impl Board for Great08 {
     // Truth: `image set g1 g2`, or `index g1 g2` where rows with the same true shear are a set. The submission has a row per image
     // or per set.
     fn score(&self, truth: Truth<'_>, submission: &Path, _: &Pool) -> Result<Score, FileError> {
-        let with_sets = Columns {
-            names: &[&["image"], &["set"], &["g1"], &["g2"]],
-            required: 4,
-            unnamed: &[(4, &[0, 1, 2, 3])],
-        };
         refuse("--psf", truth.psf.is_some())?;
         refuse("--subfields", truth.subfields.is_some())?;
         let submitted = read_entry(submission)?;
-        let images: Vec<(usize, String, Shear)> = match with_sets.read(truth.path) {
-            Ok(own) => (0..own[0].len())
-                .map(|k| {
-                    let shear = Shear::new(own[2][k], own[3][k]);
-                    (own[0][k] as usize, own[1][k].to_string(), shear)
-                })
-                .collect(),
-            Err(_) => read_shears(truth.path)?
+        let images: Vec<(usize, String, Shear)> = match has_sets(truth.path)? {
+            true => {
+                let own = WITH_SETS.read(truth.path)?;
+                let row = |k: usize| {
+                    let g = Shear::new(own[2][k], own[3][k]);
+                    let image = image_of(truth.path, k, own[0][k], g)?;
+                    Ok((image, own[1][k].to_string(), g))
+                };
+                (0..own[0].len())
+                    .map(row)
+                    .collect::<Result<_, FileError>>()?
+            }
+            false => read_shears(truth.path)?
                 .into_iter()
                 .map(|(image, g)| (image, format!("{} {}", g.e1, g.e2), g))
                 .collect(),
