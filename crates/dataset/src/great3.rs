@@ -32,6 +32,11 @@ pub const PSF_SHAPES: &str = "starshape_parameters-{set:03}-{image}";
 // Relative difference of a number in two files of parameters. Chosen by hand: the organisers' formats have six digits or more.
 const MAX_ROUNDING: f64 = 1e-5;
 
+/// The name of a file, or its stem, by one of these patterns.
+pub fn file_name(pattern: &str, subfield: usize, epoch: usize) -> String {
+    fill(pattern, subfield as u32, epoch as u32)
+}
+
 /// What a branch has that other data folders do not.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -53,12 +58,11 @@ pub(crate) struct Found {
 /// `None` without images and catalogues of the branch.
 pub(crate) fn detect(root: &Path) -> Result<Option<Found>, FileError> {
     let images = listing::find(root, GALAXIES, endings(GALAXIES), &[])?;
-    let catalogue = |set: &u32| galaxy_catalogue(root, *set);
     // Images alone may be anyone's.
     let first = images
         .sets()
         .iter()
-        .map(catalogue)
+        .map(|set| galaxy_catalogue(root, *set))
         .find(|path| is_there(path));
     let Some(path) = first else {
         return Ok(None);

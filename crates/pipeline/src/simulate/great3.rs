@@ -5,8 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
-use shearq_dataset::great3;
-use shearq_dataset::layout::fill;
+use shearq_dataset::great3::{self, file_name};
 use shearq_dataset::record::claim;
 use shearq_dataset::run::SIMULATION_FILE;
 use shearq_dataset::threads::Progress;
@@ -68,7 +67,7 @@ pub fn simulate_branch(
     let (branch, grid) = (simulator.branch, simulator.grid);
     let folder = out.join(branch.folder());
     let truth = truth_folder(out, branch);
-    let image = |subfield, epoch| folder.join(named(great3::GALAXIES, subfield, epoch));
+    let image = |subfield, epoch| folder.join(file_name(great3::GALAXIES, subfield, epoch));
     let image = &image;
     let images = |subfield| (0..branch.epochs()).map(move |epoch| image(subfield, epoch));
     // Before the claim, which would write a record of this seed beside images of another.
@@ -196,10 +195,6 @@ fn check_kept(
     Ok(())
 }
 
-fn named(pattern: &str, subfield: usize, epoch: usize) -> String {
-    fill(pattern, subfield as u32, epoch as u32)
-}
-
 fn yaml(folder: &Path, stem: String, values: &[(&str, &dyn Display)]) -> Result<(), FileError> {
     let pairs: Vec<String> = values
         .iter()
@@ -220,25 +215,25 @@ fn write_tables(
     let (x, y) = subfield.offset_degrees();
     let offset: [(&str, &dyn Display); 2] = [("offset_deg_x", &x), ("offset_deg_y", &y)];
     for of in [folder, truth] {
-        yaml(of, named(great3::SUBFIELD_OFFSETS, number, 0), &offset)?;
+        yaml(of, file_name(great3::SUBFIELD_OFFSETS, number, 0), &offset)?;
     }
     if let Some(Shear { e1, e2 }) = subfield.constant_shear {
-        let stem = named(great3::SHEARS, number, 0);
+        let stem = file_name(great3::SHEARS, number, 0);
         yaml(truth, stem, &[("g1", &e1), ("g2", &e2)])?;
     }
     for (epoch, own) in subfield.epochs.iter().enumerate() {
         let (x, y) = own.dither;
-        let stem = named(great3::DITHERS, number, epoch);
+        let stem = file_name(great3::DITHERS, number, epoch);
         yaml(
             folder,
             stem,
             &[("xdither_pixels", &x), ("ydither_pixels", &y)],
         )?;
         let Shear { e1, e2 } = own.psf_ellipticity();
-        let stem = named(great3::PSF_SHAPES, number, epoch);
+        let stem = file_name(great3::PSF_SHAPES, number, epoch);
         yaml(truth, stem, &[("psf_g1", &e1), ("psf_g2", &e2)])?;
         let side = STARS_PER_SIDE * simulator.branch.stamp();
-        let path = folder.join(named(great3::STAR_FIELDS, number, epoch));
+        let path = folder.join(file_name(great3::STAR_FIELDS, number, epoch));
         let mut writer = ImageWriter::create(path, side, side, &[])?;
         writer.write_rows(&simulator.stars(subfield, epoch, &mut RenderScratch::new()))?;
         writer.finish()?;
@@ -272,7 +267,7 @@ fn write_tables(
         .map(|(name, values)| Column::new((*name).into(), values));
     let private = public.iter().cloned().chain(known).collect();
     for (of, columns) in [(folder, public), (truth, private)] {
-        let path = of.join(named(great3::GALAXY_CATALOGUES, number, 0));
+        let path = of.join(file_name(great3::GALAXY_CATALOGUES, number, 0));
         let table = frame(columns).map_err(|error| FileError::new(&path, error))?;
         table::write(&path, FileFormat::Fits, &table, &Metadata::default())?;
     }

@@ -1,20 +1,19 @@
 //! GREAT3 (Mandelbaum et al. 2014, ApJS 212, 5; results: 2015, MNRAS 450, 2963): branches, identities of galaxies, truth as
 //! released, pre-submission and leaderboard.
 
+mod pack;
+
 use std::collections::BTreeSet;
-use std::fmt::Write;
-use std::ops::Range;
 use std::path::{Path, PathBuf};
 
-use shearq_dataset::great3::{self as released, Parameters};
-use shearq_dataset::layout::fill;
+use shearq_dataset::great3::{self as released, Parameters, file_name};
 use shearq_dataset::threads::Pool;
 use shearq_files::open::is_there;
-use shearq_files::{FileError, names_of, table};
+use shearq_files::{FileError, table};
 use shearq_quantities::Shear;
 use shearq_quantities::statistics::RunningMean;
 use shearq_render::figure::{LinePlot, Series, Style};
-use shearq_scoring::aperture::{ApertureMass, Lattice, LatticeShear, SEPARATION_BINS, separations};
+use shearq_scoring::aperture::{Lattice, LatticeShear, SEPARATION_BINS, separations};
 use shearq_scoring::great3::{
     Bias, Branch, ConstantField, Identity, NODES_PER_GALAXY, PlusCross, Q_V_BINS, REQUIRED_C,
     REQUIRED_M, SUBFIELDS, SUBFIELDS_PER_FIELD, along, constant_score, position_angle,
@@ -22,12 +21,10 @@ use shearq_scoring::great3::{
 };
 use shearq_scoring::{Line, Repeated, repeated};
 
-use crate::response::{Shared, shears};
-use shearq_dataset::run::Run;
-
+use self::pack::Galaxies;
 use super::{
-    Board, Catalogues, Columns, Entry, Figure, MIN_SHEAR_SLOPE, Packed, Packing, Score, Slope,
-    Truth, disagreement, odd_fields, whole, wrong,
+    Board, Columns, Entry, Figure, MIN_SHEAR_SLOPE, Packed, Packing, Score, Slope, Truth,
+    disagreement, odd_fields, whole, wrong,
 };
 
 // A component from here on was not measured: averages leave out 9.9 and more, correlations 10 and more. Both as in the challenge.
@@ -70,12 +67,6 @@ fn zero(field: usize, name: &str) -> String {
     format!("field {field}: {name} is exactly zero, which no measurement gives")
 }
 
-fn unmeasured(field: usize) -> String {
-    format!(
-        "field {field} has no measured galaxy with a weight, so that it has no shear. Try: a smaller cut on quality"
-    )
-}
-
 fn not_an_identity(row: usize, found: f64) -> String {
     format!(
         "row {}: not the identity of a galaxy (found {found}, expected SSSXXXYYY, such as 012034056)",
@@ -113,13 +104,6 @@ const MASSES: Columns<'static> = Columns {
     unnamed: &[(5, &[0, 1, 2, 3, 4])],
 };
 
-const GALAXIES: Columns<'static> = Columns {
-    names: &[&["ID"], &["g1"], &["g2"], &["weight", "w"]],
-    required: 3,
-    // The last with positions, as the challenge's own catalogues had.
-    unnamed: &[(3, &[0, 1, 2]), (4, &[0, 1, 2, 3]), (6, &[0, 3, 4, 5])],
-};
-
 impl Great3 {
     // Fields of a branch of so many subfields, which is the whole branch unless the user states another number.
     fn fields(&self, subfields: Option<usize>) -> Result<usize, FileError> {
@@ -154,10 +138,10 @@ impl Great3 {
         if !truth.is_dir() {
             return self.read_shears(truth, fields);
         }
-        let folder = self.folder(truth, &named(released::SHEARS, 0, 0))?;
+        let folder = self.folder(truth, &file_name(released::SHEARS, 0, 0))?;
         let per = self.0.subfields_per_field();
         let shear = |subfield: usize| {
-            let stem = named(released::SHEARS, subfield, 0);
+            let stem = file_name(released::SHEARS, subfield, 0);
             match Parameters::read(&folder, &stem)? {
                 Some(found) => shear_of(&found),
                 None => wrong(&folder, missing(&stem, fields * per)),
@@ -217,11 +201,11 @@ impl Great3 {
         folder: &Path,
         subfields: usize,
     ) -> Result<Vec<Option<Shear>>, FileError> {
-        let folder = self.folder(folder, &named(released::PSF_SHAPES, 0, 0))?;
+        let folder = self.folder(folder, &file_name(released::PSF_SHAPES, 0, 0))?;
         let epochs = self.0.epochs();
         refuse_more(&folder, released::PSF_SHAPES, subfields)?;
         let psf = |k: usize| {
-            let stem = named(released::PSF_SHAPES, k / epochs, k % epochs);
+            let stem = file_name(released::PSF_SHAPES, k / epochs, k % epochs);
             match Parameters::read(&folder, &stem)? {
                 Some(found) => psf_of(&found),
                 None => {
@@ -234,7 +218,7 @@ impl Great3 {
             }
         };
         let found: Result<Vec<_>, _> = (0..subfields * epochs).map(psf).collect();
-        let extra = named(released::PSF_SHAPES, 0, epochs);
+        let extra = file_name(released::PSF_SHAPES, 0, epochs);
         match Parameters::read(&folder, &extra)? {
             Some(extra) => {
                 let message = format!(
@@ -394,15 +378,18 @@ impl Great3 {
         if !truth.is_dir() {
             return self.read_masses(truth, fields);
         }
-        let folder = self.folder(truth, &stem_of(&named(released::GALAXY_CATALOGUES, 0, 0)))?;
+        let folder = self.folder(
+            truth,
+            &stem_of(&file_name(released::GALAXY_CATALOGUES, 0, 0)),
+        )?;
         let catalogue =
-            |subfield: usize| folder.join(named(released::GALAXY_CATALOGUES, subfield, 0));
+            |subfield: usize| folder.join(file_name(released::GALAXY_CATALOGUES, subfield, 0));
         let subfields = fields * SUBFIELDS_PER_FIELD;
         if let Some(lacking) = (0..subfields).find(|k| !is_there(&catalogue(*k))) {
             return wrong(
                 &folder,
                 missing(
-                    &stem_of(&named(released::GALAXY_CATALOGUES, lacking, 0)),
+                    &stem_of(&file_name(released::GALAXY_CATALOGUES, lacking, 0)),
                     subfields,
                 ),
             );
@@ -572,10 +559,6 @@ struct Masses {
     b: [f64; SEPARATION_BINS],
 }
 
-fn named(pattern: &str, subfield: usize, epoch: usize) -> String {
-    fill(pattern, subfield as u32, epoch as u32)
-}
-
 fn stem_of(name: &str) -> String {
     name.trim_end_matches(".fits").to_owned()
 }
@@ -594,7 +577,7 @@ fn more_subfields(subfields: usize) -> String {
 
 // Refuses files of a subfield after the last: a part of the branch would be scored as the whole.
 fn refuse_more(folder: &Path, pattern: &str, subfields: usize) -> Result<(), FileError> {
-    match Parameters::read(folder, &named(pattern, subfields, 0))? {
+    match Parameters::read(folder, &file_name(pattern, subfields, 0))? {
         Some(more) => wrong(&more.path, more_subfields(subfields)),
         None => Ok(()),
     }
@@ -653,10 +636,11 @@ fn add_truth(
         columns.push(table::numbers(&read, name, path)?);
     }
     // Files of offsets are optional, as identities contain them.
-    let offset = match Parameters::read(folder, &named(released::SUBFIELD_OFFSETS, subfield, 0))? {
-        None => None,
-        Some(found) => Some([found.number("offset_deg_x")?, found.number("offset_deg_y")?]),
-    };
+    let offset =
+        match Parameters::read(folder, &file_name(released::SUBFIELD_OFFSETS, subfield, 0))? {
+            None => None,
+            Some(found) => Some([found.number("offset_deg_x")?, found.number("offset_deg_y")?]),
+        };
     let side = columns[0].len().isqrt();
     if side == 0 || side * side != columns[0].len() {
         let message = format!(
@@ -739,99 +723,59 @@ fn below_one(g: Shear) -> Result<Shear, String> {
     }
 }
 
-impl Board for Great3 {
-    fn title(&self) -> String {
-        format!("GREAT3 {}", self.0)
-    }
-
-    fn score(&self, truth: Truth<'_>, submission: &Path, pool: &Pool) -> Result<Score, FileError> {
-        let of_submission = |error| FileError::new(submission, error);
+impl Great3 {
+    // Q_c of mean shears of fields.
+    fn score_constant(&self, truth: Truth<'_>, submission: &Path) -> Result<Score, FileError> {
         let fields = self.fields(truth.subfields)?;
-        let (mut figures, mut warnings) = (Vec::new(), Vec::new());
-        let (refusal, plots);
-        if self.0.constant {
-            let shears = self.true_shears(truth.path, fields)?;
-            let psfs = self.psfs(truth, fields)?;
-            let submitted = self.submitted_shears(submission, fields)?;
-            let pairs: Vec<_> = shears
-                .iter()
-                .copied()
-                .zip(submitted.iter().copied())
-                .collect();
-            refusal = disagreement(&pairs, truth.path);
-            let component =
-                |of: fn(Shear) -> f64| pairs.iter().map(move |(g, own)| (of(*g), of(*own)));
-            let components = [component(|g| g.e1), component(|g| g.e2)];
-            warnings.extend(odd_fields(&components.map(Iterator::collect)));
-            let fields = shears.iter().zip(&submitted).zip(&psfs);
-            let fields: Vec<ConstantField> = fields
-                .map(|((&truth, &submitted), &psf)| ConstantField {
-                    truth,
-                    submitted,
-                    psf,
-                })
-                .collect();
-            let found = constant_score(&fields, self.0.observation).map_err(of_submission)?;
-            plots = residual_plots(
-                &fields,
-                [(found.c.plus, found.m.plus), (found.c.cross, found.m.cross)],
-            );
+        let shears = self.true_shears(truth.path, fields)?;
+        let psfs = self.psfs(truth, fields)?;
+        let submitted = self.submitted_shears(submission, fields)?;
+        let pairs: Vec<_> = shears
+            .iter()
+            .copied()
+            .zip(submitted.iter().copied())
+            .collect();
+        let refusal = disagreement(&pairs, truth.path);
+        let component = |of: fn(Shear) -> f64| pairs.iter().map(move |(g, own)| (of(*g), of(*own)));
+        let components = [component(|g| g.e1), component(|g| g.e2)];
+        let warnings = odd_fields(&components.map(Iterator::collect));
+        let fields = shears.iter().zip(&submitted).zip(&psfs);
+        let fields: Vec<ConstantField> = fields
+            .map(|((&truth, &submitted), &psf)| ConstantField {
+                truth,
+                submitted,
+                psf,
+            })
+            .collect();
+        let found = constant_score(&fields, self.0.observation)
+            .map_err(|error| FileError::new(submission, error))?;
+        let plots = residual_plots(
+            &fields,
+            [(found.c.plus, found.m.plus), (found.c.cross, found.m.cross)],
+        );
+        let mut figures = vec![Figure {
+            key: "Q_c",
+            value: found.q,
+            error: None,
+            jackknife: found.jackknife,
+            perfect: Some(self.0.observation.q_c([[0.0; 2]; 2])),
+            requirement: None,
+            decimals: 1,
+        }];
+        for (key, bias, requirement) in [
+            ("c_plus", found.c.plus, REQUIRED_C),
+            ("m_plus", found.m.plus, REQUIRED_M),
+            ("c_cross", found.c.cross, REQUIRED_C),
+            ("m_cross", found.m.cross, REQUIRED_M),
+        ] {
             figures.push(Figure {
-                key: "Q_c",
-                value: found.q,
-                error: None,
-                jackknife: found.jackknife,
-                perfect: Some(self.0.observation.q_c([[0.0; 2]; 2])),
-                requirement: None,
-                decimals: 1,
-            });
-            let of = |PlusCross { plus, cross }| [plus, cross];
-            let [(c_plus, c_cross), (m_plus, m_cross)] =
-                [of(found.c), of(found.m)].map(|[plus, cross]| (plus, cross));
-            for (key, bias, requirement) in [
-                ("c_plus", c_plus, REQUIRED_C),
-                ("m_plus", m_plus, REQUIRED_M),
-                ("c_cross", c_cross, REQUIRED_C),
-                ("m_cross", m_cross, REQUIRED_M),
-            ] {
-                figures.push(Figure {
-                    key,
-                    value: bias.value,
-                    error: Some(bias.error),
-                    jackknife: bias.jackknife,
-                    perfect: None,
-                    requirement: Some(requirement),
-                    decimals: 6,
-                });
-            }
-        } else {
-            if let Some(psf) = truth.psf {
-                return wrong(
-                    psf,
-                    format!(
-                        "--psf: Q_v of {} has no use for the PSF. Try: without --psf",
-                        self.0
-                    ),
-                );
-            }
-            let masses = self.true_masses(truth.path, fields, pool)?;
-            let submitted = self.submitted_masses(submission, fields)?;
-            refusal = disagreement_of_masses(&submitted, &masses, truth.path);
-            warnings.extend(doubt_of_order(&submitted, &masses));
-            let e = |masses: &[Masses]| masses.iter().map(|own| own.e).collect::<Vec<_>>();
-            let true_e = e(&masses);
-            let score = |submitted: &[_]| variable_score(submitted, &true_e, self.0.observation);
-            let found = score(&e(&submitted)).map_err(of_submission)?;
-            let perfect = score(&true_e).map_err(of_submission)?;
-            plots = vec![mass_plot(&true_e, &e(&submitted))];
-            figures.push(Figure {
-                key: "Q_v",
-                value: found.q,
-                error: None,
-                jackknife: found.jackknife,
-                perfect: Some(perfect.q),
-                requirement: None,
-                decimals: 1,
+                key,
+                value: bias.value,
+                error: Some(bias.error),
+                jackknife: bias.jackknife,
+                perfect: None,
+                requirement: Some(requirement),
+                decimals: 6,
             });
         }
         Ok(Score {
@@ -839,8 +783,67 @@ impl Board for Great3 {
             figures,
             plots,
             refusal,
-            warnings,
+            warnings: warnings.into_iter().collect(),
         })
+    }
+
+    // Q_v of aperture masses of fields.
+    fn score_variable(
+        &self,
+        truth: Truth<'_>,
+        submission: &Path,
+        pool: &Pool,
+    ) -> Result<Score, FileError> {
+        let of_submission = |error| FileError::new(submission, error);
+        let fields = self.fields(truth.subfields)?;
+        if let Some(psf) = truth.psf {
+            return wrong(
+                psf,
+                format!(
+                    "--psf: Q_v of {} has no use for the PSF. Try: without --psf",
+                    self.0
+                ),
+            );
+        }
+        let masses = self.true_masses(truth.path, fields, pool)?;
+        let submitted = self.submitted_masses(submission, fields)?;
+        let refusal = disagreement_of_masses(&submitted, &masses, truth.path);
+        let warnings = doubt_of_order(&submitted, &masses);
+        let e = |masses: &[Masses]| masses.iter().map(|own| own.e).collect::<Vec<_>>();
+        let true_e = e(&masses);
+        let score = |submitted: &[_]| variable_score(submitted, &true_e, self.0.observation);
+        let found = score(&e(&submitted)).map_err(of_submission)?;
+        let perfect = score(&true_e).map_err(of_submission)?;
+        let plots = vec![mass_plot(&true_e, &e(&submitted))];
+        let figures = vec![Figure {
+            key: "Q_v",
+            value: found.q,
+            error: None,
+            jackknife: found.jackknife,
+            perfect: Some(perfect.q),
+            requirement: None,
+            decimals: 1,
+        }];
+        Ok(Score {
+            branch: Some(self.0.to_string()),
+            figures,
+            plots,
+            refusal,
+            warnings: warnings.into_iter().collect(),
+        })
+    }
+}
+
+impl Board for Great3 {
+    fn title(&self) -> String {
+        format!("GREAT3 {}", self.0)
+    }
+
+    fn score(&self, truth: Truth<'_>, submission: &Path, pool: &Pool) -> Result<Score, FileError> {
+        match self.0.constant {
+            true => self.score_constant(truth, submission),
+            false => self.score_variable(truth, submission, pool),
+        }
     }
 
     fn check(&self, submission: &Path, subfields: Option<usize>) -> Result<(), FileError> {
@@ -883,352 +886,3 @@ impl Board for Great3 {
 
 // board,team,method,Q_c,m_plus,m_cross,c_plus,c_cross. Rows without a team have the highest Q of a branch, whose biases are not given.
 const LEADERBOARD: &str = include_str!("great3-leaderboard.csv");
-
-// A row of a catalogue.
-struct Galaxy {
-    id: Identity,
-    g: Shear,
-    weight: f64,
-    catalogue: usize,
-}
-
-// All galaxies of a branch, in the order of their identities.
-struct Galaxies {
-    branch: Branch,
-    files: Vec<PathBuf>,
-    galaxies: Vec<Galaxy>,
-    // Names of columns that are not used.
-    unused: BTreeSet<String>,
-}
-
-// Other names of weights than those that are read.
-fn is_like_a_weight(name: &str) -> bool {
-    let name = name.to_ascii_lowercase();
-    name.contains("weight") || ["wt", "wgt", "wht", "weights"].contains(&name.as_str())
-}
-
-impl Galaxies {
-    fn read(branch: Branch, packing: &Packing<'_>) -> Result<Self, FileError> {
-        let mut all = Galaxies {
-            branch,
-            files: Vec::new(),
-            galaxies: Vec::new(),
-            unused: BTreeSet::new(),
-        };
-        match packing.catalogues {
-            Catalogues::Files(files) => {
-                for path in files {
-                    // `measure` writes ellipticities that are not divided by their response.
-                    let hint = "catalogues of measure are packed by --measured DIR";
-                    let read = GALAXIES.read_all(path);
-                    let (columns, unused) = read.map_err(|error| error.hint_of_columns(hint))?;
-                    // Galaxies that another program excludes by a weight of zero would count fully.
-                    if let Some(name) = unused.iter().find(|name| is_like_a_weight(name))
-                        && columns[3].is_empty()
-                    {
-                        let message = format!(
-                            "`{name}` looks like a weight but is not used (expected `weight` or `w`). Try: rename it to weight, or remove it"
-                        );
-                        return wrong(path, message);
-                    }
-                    all.unused.extend(unused);
-                    all.add(path, &columns, packing)?;
-                }
-            }
-            Catalogues::Measured(folder) => {
-                let run = Run::require(folder)?;
-                let files = run.catalogues(folder, &[])?;
-                // Set by set, because the columns of two million galaxies are 200 MB.
-                for set in files.sets() {
-                    let found = shears(&[folder.to_owned()], &[set], Shared::Set, None)?;
-                    let path = files.of_set(set).swap_remove(0).1;
-                    let column = |name: &str| {
-                        let read = table::numbers(&found.table, name, &path);
-                        Ok(read?.into_owned())
-                    };
-                    let columns: Vec<_> = ["id", "g1", "g2", "w"]
-                        .into_iter()
-                        .map(column)
-                        .collect::<Result<_, FileError>>()
-                        .map_err(|error| error.hint_of_columns("galaxies of a branch of GREAT3 have identities (galaxy_catalog-*.fits)"))?;
-                    all.add(&path, &columns, packing)?;
-                }
-            }
-        }
-        all.checked(packing)
-    }
-
-    // Places in identities from a galaxy to the next along an axis.
-    fn step(&self) -> usize {
-        match self.branch.constant {
-            true => 1,
-            false => NODES_PER_GALAXY,
-        }
-    }
-
-    // Adds the galaxies of a table with the columns of `GALAXIES`.
-    fn add(
-        &mut self,
-        path: &Path,
-        columns: &[Vec<f64>],
-        packing: &Packing<'_>,
-    ) -> Result<(), FileError> {
-        let (branch, catalogue) = (self.branch, self.files.len());
-        self.files.push(path.to_owned());
-        for k in 0..columns[0].len() {
-            let found = columns[0][k];
-            let Some(id) = Identity::of_number(found) else {
-                return wrong(path, not_an_identity(k, found));
-            };
-            let wrong = |fault: String| wrong(path, format!("galaxy {id}: {fault}"));
-            if id.subfield() >= packing.subfields {
-                return wrong(format!(
-                    "subfield {} does not exist in {branch} (expected 0 to {}). Try: only the catalogues of one branch",
-                    id.subfield(),
-                    packing.subfields - 1
-                ));
-            }
-            let (x, y) = id.place();
-            let last = packing.grid * self.step() - 1;
-            if x.max(y) > last {
-                return wrong(format!(
-                    "column {x} and row {y} are outside of the grid (expected 0 to {last}). Try: --branch with the branch of these identities"
-                ));
-            }
-            let g = Shear::new(columns[1][k], columns[2][k]);
-            for (name, found) in [("g1", g.e1), ("g2", g.e2)] {
-                if found <= -NOT_AVERAGED {
-                    return wrong(format!(
-                        "{name} is {found}, which the challenge's program would average. Try: 10 for a galaxy that was not measured"
-                    ));
-                }
-            }
-            let weight = columns[3].get(k).copied().unwrap_or(1.0);
-            if !(weight.is_finite() && weight >= 0.0) {
-                return wrong(format!(
-                    "the weight is {weight}, expected zero or a positive number"
-                ));
-            }
-            self.galaxies.push(Galaxy {
-                id,
-                g,
-                weight,
-                catalogue,
-            });
-        }
-        Ok(())
-    }
-
-    // The checks of the challenge's program, in the order in which their messages help most: a repeated galaxy before the missing
-    // one that it stands for.
-    fn checked(mut self, packing: &Packing<'_>) -> Result<Self, FileError> {
-        // Stable, so that the first of two rows stays first.
-        self.galaxies.sort_by_key(|galaxy| galaxy.id);
-        let file = |galaxy: &Galaxy| self.files[galaxy.catalogue].as_path();
-        if let Some(pair) = self
-            .galaxies
-            .windows(2)
-            .find(|pair| pair[0].id == pair[1].id)
-        {
-            let message = format!(
-                "galaxy {} is there twice; it is also in {}. Try: remove one of the two rows",
-                pair[0].id,
-                file(&pair[0]).display()
-            );
-            return wrong(file(&pair[1]), message);
-        }
-        let there: BTreeSet<usize> = self.galaxies.iter().map(|own| own.id.subfield()).collect();
-        let last = self
-            .files
-            .last()
-            .map_or(Path::new("catalogues"), PathBuf::as_path);
-        let lacking: Vec<usize> = (0..packing.subfields)
-            .filter(|k| !there.contains(k))
-            .collect();
-        if !lacking.is_empty() {
-            let first = lacking.iter().take(5).map(usize::to_string);
-            let which = first.collect::<Vec<_>>().join(", ");
-            let which = which + if lacking.len() > 5 { ", …" } else { "" };
-            let message = format!(
-                "{} of {} subfields are missing: {which}. Try: the catalogues of all subfields in one command",
-                lacking.len(),
-                packing.subfields
-            );
-            return wrong(last, message);
-        }
-        for subfield in self
-            .galaxies
-            .chunk_by(|a, b| a.id.subfield() == b.id.subfield())
-        {
-            self.check_subfield(subfield, packing, file)?;
-        }
-        Ok(self)
-    }
-
-    fn check_subfield<'p>(
-        &self,
-        galaxies: &[Galaxy],
-        packing: &Packing<'_>,
-        file: impl Fn(&Galaxy) -> &'p Path,
-    ) -> Result<(), FileError> {
-        let first = &galaxies[0];
-        let (step, subfield) = (self.step(), first.id.subfield());
-        let offset = |id: Identity| (id.place().0 % step, id.place().1 % step);
-        let expected = offset(first.id);
-        if let Some(odd) = galaxies.iter().find(|own| offset(own.id) != expected) {
-            let message = format!(
-                "galaxy {}: its offset from the first galaxy of its subfield is not a multiple of {NODES_PER_GALAXY} nodes (found {:?}, expected {expected:?} as of {}). Try: the identities of galaxy_catalog-*.fits",
-                odd.id,
-                offset(odd.id),
-                first.id
-            );
-            return wrong(file(odd), message);
-        }
-        let measured =
-            |own: &&Galaxy| own.weight > 0.0 && own.g.e1 < NOT_AVERAGED && own.g.e2 < NOT_AVERAGED;
-        let shears = galaxies.iter().filter(measured);
-        let shears: Vec<_> = shears.map(|own| [own.g.e1, own.g.e2]).collect();
-        // True shears, which all galaxies of a field share, have no such galaxies among others.
-        let among_others = |found: &Repeated<2>| 10 * found.rows > found.of && !found.is_constant();
-        if let Some(found) = repeated(&shears, EQUAL_SHEARS).filter(among_others) {
-            let Repeated {
-                rows, of, value, ..
-            } = found;
-            let message = format!(
-                "subfield {subfield}: {rows} of {of} galaxies have repeated shears, most often {value:?}; expected measured values, which do not repeat. Try: 10 for a galaxy that was not measured"
-            );
-            return wrong(file(first), message);
-        }
-        let count = packing.grid * packing.grid;
-        let found = galaxies.len();
-        if found != count {
-            let there: BTreeSet<Identity> = galaxies.iter().map(|own| own.id).collect();
-            let nodes = |offset: usize| (0..packing.grid).map(move |k| step * k + offset);
-            let all = nodes(expected.0).flat_map(|x| nodes(expected.1).map(move |y| (x, y)));
-            let mut all = all.map(|place| Identity::new(subfield, place));
-            let id = all.find(|id| !there.contains(id)).unwrap_or(first.id);
-            let more = more(count - found);
-            let message = format!(
-                "galaxy {id} is missing{more}: subfield {subfield} has {found} galaxies, expected {count}. Try: a row with g1 = g2 = 10 for each galaxy that was not measured"
-            );
-            return wrong(file(first), message);
-        }
-        Ok(())
-    }
-
-    fn summarise(&self, packing: &Packing<'_>, pool: &Pool) -> Result<Packed, FileError> {
-        let size = self.branch.subfields_per_field() * packing.grid * packing.grid;
-        let fields: Vec<Range<usize>> = (0..self.galaxies.len())
-            .step_by(size)
-            .map(|start| start..(start + size).min(self.galaxies.len()))
-            .collect();
-        let file = &self.files[0];
-        let mut text = String::new();
-        if self.branch.constant {
-            text += "# index g1 g2\n";
-            for (field, range) in fields.into_iter().enumerate() {
-                let mean = |of: fn(&Shear) -> f64, other: fn(&Shear) -> f64| {
-                    let own = self.galaxies[range.clone()].iter().filter(|own| {
-                        of(&own.g) < NOT_AVERAGED
-                            && (!packing.whole_galaxies || other(&own.g) < NOT_AVERAGED)
-                    });
-                    let (mut sum, mut weight) = (0.0, 0.0);
-                    for own in own {
-                        sum += own.weight * of(&own.g);
-                        weight += own.weight;
-                    }
-                    match weight > 0.0 {
-                        true => Ok(sum / weight),
-                        false => wrong(file, unmeasured(field)),
-                    }
-                };
-                let g1 = mean(|g| g.e1, |g| g.e2)?;
-                let g2 = mean(|g| g.e2, |g| g.e1)?;
-                if Shear::new(g1, g2) == Shear::ZERO {
-                    return wrong(file, zero(field, "(g1, g2)"));
-                }
-                let _ = writeln!(text, "{field} {g1} {g2}");
-            }
-        } else {
-            text += "# field theta[deg] map_E map_B error\n";
-            let limit = if packing.whole_galaxies {
-                NOT_AVERAGED
-            } else {
-                NOT_CORRELATED
-            };
-            let masses = pool.in_order(fields.into_iter().enumerate(), |(field, range)| {
-                self.masses(&self.galaxies[range], limit)
-                    .map_err(|fault| match fault {
-                        Some(error) => error,
-                        None => FileError::new(file, unmeasured(field)),
-                    })
-            });
-            for (field, own) in masses.enumerate() {
-                let own = own?;
-                // Without a pair, or of galaxies without shears.
-                if own.map_e.iter().all(|mass| *mass == 0.0) {
-                    return wrong(file, zero(field, "map_E"));
-                }
-                for b in 0..SEPARATION_BINS {
-                    let _ = writeln!(
-                        text,
-                        "{field} {} {:e} {:e} {:e}",
-                        own.theta[b], own.map_e[b], own.map_b[b], own.error[b]
-                    );
-                }
-            }
-        }
-        let note = self.note();
-        Ok(Packed { text, note })
-    }
-
-    fn note(&self) -> String {
-        let number = |is: &dyn Fn(f64) -> bool| {
-            let all = self.galaxies.iter();
-            all.filter(|own| is(own.g.e1) || is(own.g.e2)).count()
-        };
-        let mut note = format!(
-            "{} galaxies of {}, {} not measured",
-            self.galaxies.len(),
-            self.branch,
-            number(&|g| g.is_nan() || g >= NOT_AVERAGED)
-        );
-        if !self.unused.is_empty() {
-            let unused: Vec<&str> = self.unused.iter().map(String::as_str).collect();
-            note += &format!("; columns that are not used: {}", names_of(&unused));
-        }
-        // Estimates may exceed 1, and a cut would bias the mean, so that they count as in the challenge.
-        match number(&|g| (1.0..NOT_AVERAGED).contains(&g.abs())) {
-            0 => note,
-            count => {
-                note + &format!(
-                    "; {count} with a g of 1 or more, which no galaxy has, count in the means"
-                )
-            }
-        }
-    }
-
-    // `None` of galaxies without a shear.
-    fn masses(&self, galaxies: &[Galaxy], limit: f64) -> Result<ApertureMass, Option<FileError>> {
-        let mut found = lattice()?;
-        let mut weight = 0.0;
-        for own in galaxies
-            .iter()
-            .filter(|own| own.g.e1 < limit && own.g.e2 < limit)
-        {
-            weight += own.weight;
-            found
-                .add(own.id.place(), own.g, own.weight)
-                .map_err(|error| {
-                    Some(FileError::new(
-                        "GREAT3",
-                        format!("galaxy {}: {error}", own.id),
-                    ))
-                })?;
-        }
-        match weight > 0.0 {
-            true => Ok(found.correlations().aperture_mass()),
-            false => Err(None),
-        }
-    }
-}
