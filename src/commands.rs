@@ -1,4 +1,4 @@
-//! One file per command.
+//! One file per command; `published` is shared by several.
 
 pub(crate) mod baseline;
 pub(crate) mod bench;
@@ -13,7 +13,6 @@ pub(crate) mod mean;
 pub(crate) mod measure;
 pub(crate) mod merge;
 pub(crate) mod pack;
-pub(crate) mod plan;
 pub(crate) mod published;
 pub(crate) mod quickstart;
 pub(crate) mod reproduce;

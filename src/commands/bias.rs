@@ -1,14 +1,16 @@
 //! `shearq bias`.
 
+mod plan;
+
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, anyhow};
 use clap::Args;
 use shearq_bias::Design;
 
+use self::plan::{example, plan};
 use crate::arguments::{Printing, ReportFile, positive};
 use crate::choices::named;
-use crate::commands::plan::{example, plan};
 use crate::{Findings, made_by, tell};
 use shearq_dataset::images::Shard;
 use shearq_files::{atomic, open};
@@ -69,7 +71,7 @@ struct Summing {
     /// Catalogues of another program on the same galaxies, in the same order. The output contains both and the
     /// difference, with paired errors. A --truth table by catalogue contains those of both, or names of files that both
     /// have, in two folders.
-    #[arg(long, value_name = "CATALOGUE", num_args = 1.., conflicts_with_all = ["sums", "shard", "fail_above", "plot", "path"])]
+    #[arg(long, value_name = "CATALOGUE", num_args = 1.., conflicts_with_all = ["sums", "shard", "fail_above", "plot", "report"])]
     against: Vec<PathBuf>,
     /// True g1 of all catalogues.
     #[arg(
