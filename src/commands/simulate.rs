@@ -28,6 +28,7 @@ use shearq_simulate::set::SimulationSettings;
 ///
 /// With `--challenge great3 --branch BRANCH`, the command writes a branch of GREAT3 in its layout into
 /// OUT/EXPERIMENT/OBSERVATION/SHEAR, and its truth, as it was released, below OUT/truth (docs/great3.md).
+/// Of images that are kept, it compares the first galaxy with the one that it would draw.
 #[derive(Debug, Args)]
 #[command(group = ArgGroup::new("sheared").args(["constant_shear", "branch"]))]
 pub(crate) struct Arguments {
