@@ -158,13 +158,13 @@ impl Printing {
 #[derive(Debug, Clone, Args)]
 pub(super) struct ReportFile {
     /// Write tables and plots to this file as one self-contained HTML page (.html).
-    #[arg(long = "report", value_name = "FILE", value_parser = page)]
-    path: Option<PathBuf>,
+    #[arg(long, value_name = "FILE", value_parser = page)]
+    report: Option<PathBuf>,
 }
 
 impl ReportFile {
     pub(super) fn is_wanted(&self) -> bool {
-        self.path.is_some()
+        self.report.is_some()
     }
 
     pub(super) fn save(
@@ -174,7 +174,7 @@ impl ReportFile {
         made_by: impl FnOnce() -> anyhow::Result<Vec<(String, String)>>,
     ) -> anyhow::Result<()> {
         // Sections are closures, because plots take seconds that a command without a report should not spend.
-        if let Some(path) = &self.path {
+        if let Some(path) = &self.report {
             pages::save(path, title, sections()?, made_by()?)?;
         }
         Ok(())

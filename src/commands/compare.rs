@@ -90,7 +90,7 @@ const GREAT10_ONLY: [&str; 11] = [
     "plot",
     "wide",
     "metrics",
-    "path",
+    "report",
     "definition",
     "convention",
 ];

@@ -10,7 +10,7 @@ use shearq_measure::Flag;
 use shearq_pipeline::measure::{FolderMeasurement, Summary, all_flagged};
 use shearq_submissions::Registry;
 
-use crate::arguments::{SetList, Sharding, Threads};
+use crate::arguments::{SetList, Sharding, Threads, sets_of};
 use crate::choices::named;
 use crate::progress::{Bar, mark_resumable};
 use crate::{count, tell, tell_unread};
@@ -96,7 +96,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     if *stack_stars {
         data = data.with_stacked_stars()?;
     }
-    let sets = sets.as_ref().map_or(&[][..], |list| &list.0);
+    let sets = sets_of(sets.as_ref());
     let mut run = measuring.run(Source::folder(&data, out)?)?;
     run.epochs |= *epochs;
     let images = measuring.images(&run, &data, sets)?;

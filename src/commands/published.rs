@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use shearq_dataset::threads::Pool;
+use shearq_dataset::threads::{ALL_CORES, Pool};
 use shearq_render::table::Table;
 use shearq_results::published::{Board, Challenge, Packing, Score, Truth, ranking};
 use shearq_results::submit::check::Finding;
@@ -89,7 +89,7 @@ pub(super) fn pack(branch: &dyn Board, packing: &Packing<'_>, out: &Path) -> any
         out.display(),
         branch.title()
     );
-    let packed = branch.pack(packing, &Pool::new(0)?);
+    let packed = branch.pack(packing, &Pool::new(ALL_CORES)?);
     let Some(packed) = packed else {
         anyhow::bail!("{} has no pre-submission of catalogues", branch.title());
     };

@@ -14,10 +14,11 @@ use crate::{print, tell, tell_unread};
 use shearq_dataset::layout::DataFolder;
 use shearq_dataset::run::{Run, Source, kind_of};
 use shearq_dataset::truth::{ReadTruth, Reading, read_truth, reading_of};
+use shearq_files::atomic::folder_of;
 use shearq_render::table::TableFormat;
 use shearq_results::aperture;
 use shearq_results::catalogues::{COLUMNS, Catalogues};
-use shearq_results::foreign::{Foreign, folder_of};
+use shearq_results::foreign::Foreign;
 use shearq_results::published::Truth;
 use shearq_results::record::{RunRecord, SetRecord};
 use shearq_results::score::{ScoredSet, score_catalogues, score_files, unscored};
@@ -55,7 +56,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "FILE", requires = "data", conflicts_with = "truth")]
     foreign: Option<PathBuf>,
     /// Submission as `pack` writes it: a folder or an archive (.tar.gz) of catalogues or power spectra.
-    #[arg(long, value_name = "PATH", requires = "data", conflicts_with_all = ["truth", "path"])]
+    #[arg(long, value_name = "PATH", requires = "data", conflicts_with_all = ["truth", "report"])]
     packed: Option<PathBuf>,
     /// Sets, such as `1,2,7-9` or `all` [default: all that were measured].
     #[arg(long, value_name = "LIST", conflicts_with = "truth")]
@@ -65,13 +66,13 @@ pub(crate) struct Arguments {
     noise_var: Option<f64>,
     /// Sign of g2 in the file of --truth; data folders state it in layout.toml [default: as the file states, else
     /// the sign in which the shear is an E-mode field, else the sign that e2 follows; required if these are unclear].
-    #[arg(long, value_parser = named::<TruthSign>(), requires = "truth", conflicts_with_all = FOLDERS)]
+    #[arg(long, value_parser = named::<TruthSign>(), requires = "truth", conflicts_with_all = NOT_PLAIN)]
     truth_sign: Option<TruthSign>,
     /// Pixels per side of a stamp, for --truth [default: 48].
-    #[arg(long, value_name = "PX", allow_hyphen_values = true, requires = "truth", conflicts_with_all = FOLDERS)]
+    #[arg(long, value_name = "PX", allow_hyphen_values = true, requires = "truth", conflicts_with_all = NOT_PLAIN)]
     stamp: Option<f64>,
     /// Side of the field in degrees, for --truth [default: 10].
-    #[arg(long, value_name = "DEG", requires = "truth", conflicts_with_all = FOLDERS)]
+    #[arg(long, value_name = "DEG", requires = "truth", conflicts_with_all = NOT_PLAIN)]
     field: Option<f64>,
     /// Names of the catalogues' columns, or their numbers if they have no names, such as 2,3,4,5; for --truth [default:
     /// x,y,e1,e2].
@@ -91,7 +92,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "E", value_parser = positive, requires = "truth", conflicts_with_all = NOT_PLAIN)]
     max_modulus: Option<f64>,
     /// Print the aperture mass dispersion of the catalogues and of the true shear instead of scores.
-    #[arg(long, conflicts_with_all = ["packed", "store", "path", "noise_var", "definition", "challenge", "branch", "psf", "subfields"])]
+    #[arg(long, conflicts_with_all = ["packed", "store", "report", "noise_var", "definition", "challenge", "branch", "psf", "subfields"])]
     aperture_mass: bool,
     /// Score a submission to this challenge: great3, great08.
     #[arg(long, value_name = "NAME", requires = "truth", conflicts_with_all = GREAT10_ONLY)]
@@ -119,10 +120,8 @@ pub(crate) struct Arguments {
     threads: Threads,
 }
 
-// Inputs with a data folder, whose layout specifies the sign of g2, the stamps and the field: options for these could contradict
-// it.
-const FOLDERS: [&str; 6] = ["data", "measured", "foreign", "packed", "sets", "store"];
-// Inputs whose columns, type and missing values are specified by a record or a description.
+// Inputs with a data folder, whose layout specifies the sign of g2, the stamps and the field, and with a record or a description of
+// columns, type and missing values: options for these could contradict them.
 const NOT_PLAIN: [&str; 6] = ["data", "measured", "foreign", "packed", "sets", "store"];
 
 // Options without a meaning for submissions to other challenges.

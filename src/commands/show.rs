@@ -10,7 +10,7 @@ use crate::{print, tell};
 use shearq_dataset::images::ImageId;
 use shearq_dataset::mosaic::Mosaic;
 use shearq_dataset::run::open_data;
-use shearq_dataset::threads::Pool;
+use shearq_dataset::threads::{ALL_CORES, Pool};
 use shearq_pipeline::measure::ImageSource;
 use shearq_render::figure::{Figure, PictureFormat};
 use shearq_results::views::pages::{steps_figure, steps_row};
@@ -70,7 +70,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         .configuration;
     let data = open_data(&arguments.data)?;
     // For the survey of the whole image, with which a galaxy is measured as in `measure`.
-    let threads = Pool::new(0)?;
+    let threads = Pool::new(ALL_CORES)?;
     let (mut rows, mut responses) = (Vec::new(), false);
     for &GalaxyId { image, index } in &arguments.galaxy {
         let mut source = ImageSource::open(&data, image, &submission)?;

@@ -9,6 +9,26 @@ use shearq_files::table::{self, FileFormat};
 use shearq_measure::PixelFrame;
 use shearq_quantities::Frame;
 
+/// Two numbers from 0 to `most`, as the metadata `key` of a catalogue state them with a blank between.
+pub fn number_pair(path: &Path, key: &str, text: &str, most: f64) -> Result<[f64; 2], FileError> {
+    let numbers: Option<Vec<f64>> = text.split(' ').map(|word| word.parse().ok()).collect();
+    match numbers.as_deref() {
+        Some(&[first, second])
+            if [first, second]
+                .iter()
+                .all(|value| (0.0..=most).contains(value)) =>
+        {
+            Ok([first, second])
+        }
+        _ => {
+            let message = format!(
+                "the metadata `{key}` are {text:?} (expected two numbers from 0 to {most} such as 2.3e-2 1.2e-2)"
+            );
+            Err(FileError::new(path, message))
+        }
+    }
+}
+
 pub const WARNINGS: &str = "warnings";
 /// Key of the effect of the noise of an image's star on its mean shear: the standard deviations of m and c.
 // Keys have at most eight characters, the limit of FITS.

@@ -247,7 +247,8 @@ fn names_for(target: &Path) -> Result<(Names, PathBuf), FileError> {
     Ok((Names::of(name), folder.to_owned()))
 }
 
-fn folder_of(target: &Path) -> &Path {
+/// The folder of a file; `.` for a bare file name.
+pub fn folder_of(target: &Path) -> &Path {
     match target.parent() {
         Some(folder) if !folder.as_os_str().is_empty() => folder,
         _ => Path::new("."),

@@ -442,7 +442,7 @@ impl Warning {
     pub(crate) fn of_galaxies(galaxies: &[Measurement]) -> impl Iterator<Item = Warning> {
         let flagged = galaxies.iter().filter(|g| !g.flags.is_empty()).count();
         let with = |flag: Flag| galaxies.iter().filter(|g| g.flags.contains(flag)).count();
-        let flags = Warning::of_counts(with, flagged, galaxies.len());
+        let flags = Warning::of_counts(Flag::ALL.map(with), flagged, galaxies.len());
         flags.into_iter().chain(Warning::of_idle(galaxies))
     }
 
@@ -456,13 +456,14 @@ impl Warning {
         (2 * count > of).then_some(Warning::Idle { count, of })
     }
 
-    /// A warning if `count` of `of` galaxies are flagged and these are more than half. `with` counts a flag.
-    pub fn of_counts(with: impl Fn(Flag) -> usize, count: usize, of: usize) -> Option<Warning> {
-        let explains = |flag: &Flag| 2 * with(*flag) > of;
-        let flag = Flag::ALL.into_iter().find(explains);
+    /// A warning if `count` of `of` galaxies are flagged and these are more than half. `with` has the galaxies
+    /// with each of [`Flag::ALL`].
+    pub fn of_counts(with: [usize; Flag::ALL.len()], count: usize, of: usize) -> Option<Warning> {
+        let counts = || Flag::ALL.into_iter().zip(with);
+        let explains = |(_, with): &(Flag, usize)| 2 * with > of;
         // Of equal numbers the first reason.
-        let most = || Flag::ALL.into_iter().rev().max_by_key(|flag| with(*flag));
-        let flag = flag.or_else(most)?;
+        let most = || counts().rev().max_by_key(|(_, with)| *with);
+        let (flag, _) = counts().find(explains).or_else(most)?;
         (2 * count > of).then_some(Warning::Flagged { flag, count, of })
     }
 

@@ -13,9 +13,10 @@ use shearq_files::table::most_rows;
 use shearq_quantities::Frame;
 use shearq_scoring::{Choice, Convention, FieldSum, Grid, Row, RowCounts};
 
-use crate::foreign::{ADVICE_ON_SENTINELS, Foreign, fault_of_rows, folder_of};
+use crate::foreign::{ADVICE_ON_SENTINELS, Foreign, fault_of_rows};
 use crate::response::response_of;
 use crate::submit::{Packed, Sent, Submission, settings_of};
+use shearq_files::atomic::folder_of;
 
 /// The scored columns of catalogues by shearq.
 pub const COLUMNS: [&str; 4] = ["x", "y", "e1", "e2"];

@@ -10,6 +10,7 @@ use shearq_submissions::{EllipticityType, checked_name};
 use shearq_dataset::layout::{HINT_OF_COLUMNS, IMAGE_PLACEHOLDERS, check_pattern};
 use shearq_dataset::listing::{self, Files};
 use shearq_files::FileError;
+use shearq_files::atomic::folder_of;
 use shearq_files::table::{self, Place};
 
 /// How to read another program's catalogues.
@@ -104,14 +105,6 @@ fn e2() -> String {
 }
 fn one() -> i8 {
     1
-}
-
-/// The folder of a file; `.` for a bare file name.
-pub fn folder_of(path: &Path) -> &Path {
-    match path.parent() {
-        Some(folder) if !folder.as_os_str().is_empty() => folder,
-        _ => Path::new("."),
-    }
 }
 
 impl Foreign {

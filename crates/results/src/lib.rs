@@ -8,9 +8,10 @@
 //! * [`response`] is what ellipticities of many catalogues are divided by, for scores and for a shear per galaxy.
 //! * [`star_noise`] adds the noise of stars to the error of a mean shear.
 //! * [`record`] is the record of a scored set with the list of its columns, and [`store`] keeps records in Parquet files.
-//! * [`compare`] chooses, groups and compares records.
+//! * [`compare`] chooses, sorts and compares records.
 //! * [`baseline`] compares metrics with stored metrics.
-//! * [`submit`] packs and checks a submission to a challenge.
+//! * [`aperture`] estimates aperture masses.
+//! * [`submit`] packs and checks a submission to a challenge; [`published`] has those that others ran.
 //! * [`views`] makes tables, plots and pages.
 #![forbid(unsafe_code)]
 

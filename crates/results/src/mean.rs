@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use shearq_dataset::metadata::{Axes, CommonAxes, E_NOISE, stated_axes};
+use shearq_dataset::metadata::{Axes, CommonAxes, E_NOISE, number_pair, stated_axes};
 use shearq_dataset::run::Run;
 use shearq_files::FileError;
 use shearq_files::table::{self, FileFormat};
@@ -50,13 +50,8 @@ pub struct SetMean {
 impl SetMean {
     /// A warning if more than half of the galaxies are flagged.
     pub fn mostly_flagged(&self) -> Option<Warning> {
-        let with = |flag: Flag| {
-            let mut counts = self.flags.iter().zip(Flag::ALL);
-            counts
-                .find(|(_, other)| *other == flag)
-                .map_or(0, |(count, _)| *count)
-        };
-        Warning::of_counts(with, self.flagged, self.flagged + self.galaxies + self.cut)
+        let of = self.flagged + self.galaxies + self.cut;
+        Warning::of_counts(self.flags, self.flagged, of)
     }
 
     /// Whether all galaxies have one ellipticity, so that the error is meaningless.
@@ -221,21 +216,9 @@ fn covariance_of_pairs(
 fn e_noise(path: &Path, format: FileFormat) -> Result<Option<[f64; 2]>, FileError> {
     let keys = [E_NOISE.to_owned()];
     let metadata = table::read_metadata(path, format, keys.iter())?;
-    let Some(text) = metadata.get(E_NOISE) else {
-        return Ok(None);
-    };
-    let numbers: Option<Vec<f64>> = text.split(' ').map(|word| word.parse().ok()).collect();
-    match numbers.as_deref() {
-        Some(&[e1, e2]) if [e1, e2].iter().all(|sigma| (0.0..=1.0).contains(sigma)) => {
-            Ok(Some([e1, e2]))
-        }
-        _ => {
-            let message = format!(
-                "the metadata `{E_NOISE}` are {text:?} (expected two numbers from 0 to 1 such as 5.1e-2 5.2e-2)"
-            );
-            Err(FileError::new(path, message))
-        }
-    }
+    let text = metadata.get(E_NOISE);
+    text.map(|text| number_pair(path, E_NOISE, text, 1.0))
+        .transpose()
 }
 
 #[cfg(test)]

@@ -373,6 +373,8 @@ fn disagreement(pairs: &[(Shear, Shear)], truth: &Path) -> Option<String> {
 // have residuals of about this scatter. Chosen by hand.
 const MAX_FIELD_RESIDUAL: f64 = 8.0;
 const MIN_ODD_RESIDUAL: f64 = 0.5;
+// Share of the fields from which on they are no exceptions: the submission is of another kind then. Chosen by hand.
+const MAX_ODD_SHARE: f64 = 0.25;
 
 // A warning about fields that follow the truth differently from the others. Each of `quantities` has the true and the submitted
 // value of each field.
@@ -389,7 +391,7 @@ fn odd_fields(quantities: &[Vec<(f64, f64)>]) -> Option<String> {
         odd.extend((0..count).filter(|k| (residuals[*k] - centre).abs() > most));
     }
     let names: Vec<String> = odd.iter().map(usize::to_string).collect();
-    (!names.is_empty() && 4 * names.len() < count).then(|| {
+    (!names.is_empty() && (names.len() as f64) < MAX_ODD_SHARE * count as f64).then(|| {
         format!(
             "{} of {count} fields do not follow the truth as the others do: {}. Were fields exchanged?",
             names.len(),

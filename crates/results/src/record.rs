@@ -1,5 +1,5 @@
-//! The record of a scored set, with the one list of its columns: stores are written, conditions met, groups formed and
-//! tables printed by it. docs/files.md describes the columns.
+//! The record of a scored set, with the one list of its columns: stores are written, conditions met and tables
+//! printed by it. docs/files.md describes the columns.
 
 use std::path::Path;
 

@@ -6,7 +6,7 @@ use std::path::Path;
 
 pub use shearq_bias::StarNoise;
 use shearq_dataset::fingerprint::PSF;
-use shearq_dataset::metadata::PSF_NOISE;
+use shearq_dataset::metadata::{PSF_NOISE, number_pair};
 use shearq_files::FileError;
 use shearq_files::frames::Metadata;
 use shearq_files::frames::polars::DataFrame;
@@ -65,30 +65,10 @@ fn stated(path: &Path, mut metadata: Metadata) -> Result<Option<StarNoise>, File
     let Some(text) = metadata.get(PSF_NOISE) else {
         return Ok(None);
     };
-    let [m, c] = effect(path, text)?;
+    let [m, c] = number_pair(path, PSF_NOISE, text, MAX_STAR_EFFECT)?;
     let star = metadata.remove(PSF);
     let star = star.unwrap_or_else(|| path.display().to_string());
     Ok(Some(StarNoise { star, m, c }))
-}
-
-// The scatter of m and c by the noise of a star, as the metadata state it.
-fn effect(path: &Path, text: &str) -> Result<[f64; 2], FileError> {
-    let numbers: Option<Vec<f64>> = text.split(' ').map(|word| word.parse().ok()).collect();
-    match numbers.as_deref() {
-        Some(&[m, c])
-            if [m, c]
-                .iter()
-                .all(|value| (0.0..=MAX_STAR_EFFECT).contains(value)) =>
-        {
-            Ok([m, c])
-        }
-        _ => Err(FileError::new(
-            path,
-            format!(
-                "the metadata `{PSF_NOISE}` are {text:?} (expected the scatter of m and of c, two numbers from 0 to {MAX_STAR_EFFECT} such as 2.3e-2 1.2e-2)"
-            ),
-        )),
-    }
 }
 
 /// The noise of stars in a mean shear. Images with the same star have the same error.

@@ -53,7 +53,8 @@ const RADII_ARCSEC: (f64, f64) = (0.15, 1.0);
 const BULGE_AND_DISC_SHARE: f64 = 0.2;
 // Indices of single components, of equal frequency.
 const INDICES: [f64; 8] = [0.5, 1.0, 1.0, 1.0, 1.5, 1.5, 2.5, 4.0];
-// The least S/N of the challenge. Counts fall with its power of −1.5, that of galaxies by flux.
+// The least S/N of the challenge, and the slope of N(> S/N) ∝ (S/N)^−1.5, that of galaxies by flux in a Euclidean universe, hence a
+// density of −2.5.
 const SNR: (f64, f64) = (20.0, 400.0);
 const COUNT_SLOPE: f64 = 1.5;
 

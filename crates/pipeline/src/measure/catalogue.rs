@@ -215,11 +215,7 @@ impl Summary {
         let Summary {
             galaxies, flagged, ..
         } = *self;
-        let with = |flag: Flag| {
-            let mut counts = self.flags.iter().zip(Flag::ALL);
-            let found = counts.find(|(_, other)| *other == flag);
-            found.map_or(0, |(count, _)| *count as usize)
-        };
+        let with = self.flags.map(|count| count as usize);
         let all = Warning::of_counts(with, flagged as usize, galaxies as usize)?;
         (galaxies > 0 && flagged == galaxies).then_some(all)
     }

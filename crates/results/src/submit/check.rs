@@ -4,14 +4,14 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use shearq_scoring::{
-    Bins, Choice, Convention, Definition, Fault, FieldSum, Grid, ImageFaults, Options, Row,
-    RowCounts, SCORED, SetImages, SetScorer, TrueShear,
+    Bins, Convention, Definition, Fault, FieldSum, Grid, ImageFaults, Options, Row, RowCounts,
+    SCORED, SetImages, SetScorer, TrueShear,
 };
 
 use super::{
     Contents, FileSum, Kind, Manifest, Sent, SpectrumLine, read_spectrum, wrong_multipoles,
 };
-use crate::catalogues::COLUMNS;
+use crate::catalogues::{COLUMNS, OWN};
 use crate::foreign::{ADVICE_ON_SENTINELS, fault_of_rows};
 use crate::views::scores::{odd_response, repeated_shapes, words};
 use shearq_dataset::layout::read_rows;
@@ -253,7 +253,7 @@ impl SummedSet {
         let open = expected.truth.get(&set);
         let truth = open.or_else(|| expected.secret_truth.get(&set));
         let options = Options {
-            choice: Choice::Insist(Convention::STANDARD),
+            choice: OWN,
             ..Options::default()
         };
         let scorer = |truth: &TrueShear| SetScorer::new(expected.grid, truth.clone(), options).ok();
@@ -329,9 +329,12 @@ fn check_manifest(folder: &Path, files: &[PathBuf], report: &mut Report) {
     }
 }
 
+// Most lines of a file that is taken for a spectrum: catalogues have thousands. Chosen by hand.
+const MAX_SPECTRUM_LINES: usize = 20;
+
 // Whether a file with an unknown name is a spectrum: its lines have three numbers.
 fn looks_like_spectrum(path: &Path) -> bool {
-    read_spectrum(path).is_ok_and(|lines| !lines.is_empty() && lines.len() <= 20)
+    read_spectrum(path).is_ok_and(|lines| !lines.is_empty() && lines.len() <= MAX_SPECTRUM_LINES)
 }
 
 // Checks the rows of a catalogue. Returns their sum on the grid and how they were used, or `None` if the file is not
