@@ -256,21 +256,30 @@ mod tests {
         .unwrap();
     }
 
+    /// The mean of set 7 of these Parquet files, all of whose galaxies are selected.
+    fn mean_of_files(
+        catalogues: &[(u32, PathBuf)],
+        calibrated: bool,
+        pairs: bool,
+    ) -> Result<SetMean, FileError> {
+        let selected = (None, false);
+        mean_of(
+            7,
+            catalogues,
+            FileFormat::Parquet,
+            calibrated,
+            selected,
+            pairs,
+        )
+    }
+
     #[test]
     fn the_shear_is_a_ratio_of_means_and_its_error_that_of_a_ratio() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("catalogue-001.parquet");
         written(&path, [0.05, 0.2], &[]);
         let catalogues = [(1, path)];
-        let mean = mean_of(
-            7,
-            &catalogues,
-            FileFormat::Parquet,
-            true,
-            (None, false),
-            true,
-        )
-        .unwrap();
+        let mean = mean_of_files(&catalogues, true, true).unwrap();
         assert_eq!((mean.galaxies, mean.flagged, mean.flags[2]), (2, 1, 1));
         let shear = mean.shear.unwrap();
         assert!((shear.shear[0] - 0.25).abs() < 1e-15 && (shear.shear[1] + 0.125).abs() < 1e-15);
@@ -280,21 +289,13 @@ mod tests {
         let scatter = 0.3 / 2f64.sqrt();
         assert!((mean.scatter[0] - scatter).abs() < 1e-15, "{mean:?}");
         // Without responses the residuals are ∓0.075.
-        let plain = mean_of(
-            7,
-            &catalogues,
-            FileFormat::Parquet,
-            false,
-            (None, false),
-            true,
-        );
+        let plain = mean_of_files(&catalogues, false, true);
         let plain = plain.unwrap();
         let error = plain.shear.unwrap().error();
         assert!((error[0] - 0.075).abs() < 1e-15, "{plain:?}");
         assert_eq!(plain.above_one, 0);
         written(&catalogues[0].1, [0.05, 5.0], &[]);
-        let (format, selected) = (FileFormat::Parquet, (None, false));
-        let wrong = mean_of(7, &catalogues, format, true, selected, true);
+        let wrong = mean_of_files(&catalogues, true, true);
         assert_eq!(wrong.unwrap().above_one, 1);
     }
 
@@ -317,14 +318,7 @@ mod tests {
         let none = Default::default();
         table::write(&path(2), FileFormat::Parquet, &table.unwrap(), &none).unwrap();
         let catalogues = [1, 2].map(|image| (image, path(image)));
-        let mean = mean_of(
-            7,
-            &catalogues,
-            FileFormat::Parquet,
-            true,
-            (None, false),
-            true,
-        );
+        let mean = mean_of_files(&catalogues, true, true);
         let found = mean.unwrap().shear.unwrap().shear[0];
         assert!((found - (0.25 + 0.01) / 1.002).abs() < 1e-15, "{found}");
     }
@@ -336,14 +330,7 @@ mod tests {
         let mean = |metadata: &[(&str, &str)], pairs| {
             written(&path, [0.05, 0.2], metadata);
             let catalogues = [(1, path.clone())];
-            mean_of(
-                7,
-                &catalogues,
-                FileFormat::Parquet,
-                true,
-                (None, false),
-                pairs,
-            )
+            mean_of_files(&catalogues, true, pairs)
         };
         let stated = (E_NOISE, "3.0e-2 2.0e-2");
         let own = mean(&[stated], true).unwrap();
@@ -378,14 +365,7 @@ mod tests {
                 written(&path, [0.05, 0.2], metadata);
                 catalogues.push((image, path));
             }
-            mean_of(
-                7,
-                &catalogues,
-                FileFormat::Parquet,
-                true,
-                (None, false),
-                true,
-            )
+            mean_of_files(&catalogues, true, true)
         };
         let turned = PixelFrame {
             angle: 37.0,
@@ -431,14 +411,7 @@ mod tests {
                     (image, path)
                 })
                 .collect();
-            mean_of(
-                7,
-                &catalogues,
-                FileFormat::Parquet,
-                true,
-                (None, false),
-                true,
-            )
+            mean_of_files(&catalogues, true, true)
         };
         let own = |images: usize| mean(&vec![&[][..]; images]).unwrap();
         let noisy = (PSF_NOISE, "4.00e-1 1.00e-2");
