@@ -724,6 +724,22 @@ fn below_one(g: Shear) -> Result<Shear, String> {
 }
 
 impl Great3 {
+    fn scored(
+        &self,
+        figures: Vec<Figure>,
+        plots: Vec<LinePlot>,
+        refusal: Option<String>,
+        doubt: Option<String>,
+    ) -> Score {
+        Score {
+            branch: Some(self.0.to_string()),
+            figures,
+            plots,
+            refusal,
+            warnings: doubt.into_iter().collect(),
+        }
+    }
+
     // Q_c of mean shears of fields.
     fn score_constant(&self, truth: Truth<'_>, submission: &Path) -> Result<Score, FileError> {
         let fields = self.fields(truth.subfields)?;
@@ -738,7 +754,7 @@ impl Great3 {
         let refusal = disagreement(&pairs, truth.path);
         let component = |of: fn(Shear) -> f64| pairs.iter().map(move |(g, own)| (of(*g), of(*own)));
         let components = [component(|g| g.e1), component(|g| g.e2)];
-        let warnings = odd_fields(&components.map(Iterator::collect));
+        let doubt = odd_fields(&components.map(Iterator::collect));
         let fields = shears.iter().zip(&submitted).zip(&psfs);
         let fields: Vec<ConstantField> = fields
             .map(|((&truth, &submitted), &psf)| ConstantField {
@@ -778,13 +794,7 @@ impl Great3 {
                 decimals: 6,
             });
         }
-        Ok(Score {
-            branch: Some(self.0.to_string()),
-            figures,
-            plots,
-            refusal,
-            warnings: warnings.into_iter().collect(),
-        })
+        Ok(self.scored(figures, plots, refusal, doubt))
     }
 
     // Q_v of aperture masses of fields.
@@ -808,7 +818,7 @@ impl Great3 {
         let masses = self.true_masses(truth.path, fields, pool)?;
         let submitted = self.submitted_masses(submission, fields)?;
         let refusal = disagreement_of_masses(&submitted, &masses, truth.path);
-        let warnings = doubt_of_order(&submitted, &masses);
+        let doubt = doubt_of_order(&submitted, &masses);
         let e = |masses: &[Masses]| masses.iter().map(|own| own.e).collect::<Vec<_>>();
         let true_e = e(&masses);
         let score = |submitted: &[_]| variable_score(submitted, &true_e, self.0.observation);
@@ -824,13 +834,7 @@ impl Great3 {
             requirement: None,
             decimals: 1,
         }];
-        Ok(Score {
-            branch: Some(self.0.to_string()),
-            figures,
-            plots,
-            refusal,
-            warnings: warnings.into_iter().collect(),
-        })
+        Ok(self.scored(figures, plots, refusal, doubt))
     }
 }
 
