@@ -5,7 +5,7 @@ use ndarray::ArrayView2;
 use crate::pixel::{Pixel, contiguous};
 
 // Narrow, so that a centroid does not follow noise: at S/N 20 it is good to 0.2 px. Chosen by hand.
-const WEIGHT_SIGMA: f64 = 2.0;
+pub(crate) const WEIGHT_SIGMA: f64 = 2.0;
 // Three σ.
 const WEIGHT_HALF_SIDE: usize = 6;
 const WEIGHT_SIDE: usize = 2 * WEIGHT_HALF_SIDE;

@@ -11,7 +11,7 @@ use shearq_quantities::matrix::{Matrix2, apply, determinant};
 use shearq_quantities::statistics::{OF_MEDIAN, median, scatter};
 use shearq_submissions::PsfCut;
 
-use crate::centroid::galaxy_centroid_near;
+use crate::centroid::{WEIGHT_SIGMA, galaxy_centroid_near};
 use crate::error::MeasureError;
 use crate::pixel::{PEAK_RANGE, Pixel, hash, highest};
 use crate::psf::quality::{self, PsfQuality};
@@ -64,7 +64,7 @@ const OTHER_GALAXIES: f64 = 0.1;
 // a set rarely have sixteen times less weight, and those that have need not be told from exposures without galaxies.
 const MIN_EPOCH_DEPTH: f64 = 0.25;
 // Noise of a star's centroid times its S/N in px: the σ of the centroid's weight.
-const PSF_CENTROID_NOISE: f64 = 2.0;
+const PSF_CENTROID_NOISE: f64 = WEIGHT_SIGMA;
 /// PSFs of single galaxies of an image that are examined.
 pub const EXAMINED_PSFS: usize = 100; // Chosen by hand.
 
