@@ -652,7 +652,7 @@ impl PlanWorker {
         // R does not contain: m was +23e-3 for rings at S/N 20, +4.4e-3 at S/N 60, and +6e-3 for blends at 5 to 7 px, instead of
         // 0.4 ± 0.6e-3, 0.3 ± 0.1e-3 and 0 ± 1e-3.
         // About the middle of the stamp, a shear would also move galaxies that are off it under the window: m is −1.5e-3 for those of
-        // control-ground-constant of GREAT3, which are off by up to 1 px. About the centroid, m is up to +3.6e-3 for galaxies with a bulge
+        // control-ground-constant of GREAT3, which are off by up to 1 px, and half of it about the centroid. There, m is about +4e-3 for galaxies with a bulge
         // off their centre by its half-light radius, if that centre is the one that shear leaves in its place.
         let origin = match plan.origin {
             ShearOrigin::Stamp => [0.0; 2],
