@@ -542,8 +542,14 @@ impl Examination {
     }
 
     /// What contradicts that this is an epoch of the galaxies of `earlier` ones, whose stamps were added in the same order.
-    /// `axes` maps pixels of the first to pixels of this one. Places and flux must agree, because epochs are added.
-    pub(crate) fn contradictions(&self, earlier: &[&Self], axes: Matrix2) -> Vec<Warning> {
+    /// `axes` maps pixels of the first to pixels of this one. Places must agree, because epochs are added, and with
+    /// `common_flux` the flux.
+    pub(crate) fn contradictions(
+        &self,
+        earlier: &[&Self],
+        axes: Matrix2,
+        common_flux: bool,
+    ) -> Vec<Warning> {
         let mut found = Vec::new();
         let is_copy = |own: &&StampStatistics| {
             let mut others = earlier.iter().filter_map(|other| other.of(own.at));
@@ -577,20 +583,21 @@ impl Examination {
         let lit = own.is_significant() && other.is_significant() && other.value > 0.0;
         let noise = [self, first].map(|epoch| epoch.noise().value);
         found.extend(missing_galaxies([own, other], noise));
-        let ratio = own.value / other.value;
-        // From pairs, whose fluxes differ less than those of different galaxies.
-        let rest = pairs
-            .iter()
-            .map(|(own, other)| own.flux - ratio * other.flux);
-        let error = median_of(rest, 0.0).error / other.value.abs();
-        let apart = Estimate {
-            value: ratio - 1.0,
-            error,
-        };
         // An aperture of 8 px of other sides has other light.
-        let one_scale = (determinant(axes).abs() - 1.0).abs() < EPOCH_FLUX;
-        if lit && one_scale && apart.is_significant() && apart.value.abs() > EPOCH_FLUX {
-            found.push(Warning::EpochFlux { ratio, error });
+        if common_flux && lit && (determinant(axes).abs() - 1.0).abs() < EPOCH_FLUX {
+            let ratio = own.value / other.value;
+            // From pairs, whose fluxes differ less than those of different galaxies.
+            let residuals = pairs
+                .iter()
+                .map(|(own, other)| own.flux - ratio * other.flux);
+            let error = median_of(residuals, 0.0).error / other.value.abs();
+            let apart = Estimate {
+                value: ratio - 1.0,
+                error,
+            };
+            if apart.is_significant() && apart.value.abs() > EPOCH_FLUX {
+                found.push(Warning::EpochFlux { ratio, error });
+            }
         }
         let (own, other) = medians(&|stamp| stamp.core[0]);
         let scale = own.value / other.value;
@@ -959,7 +966,7 @@ mod tests {
         // Stamps without pixels are no copies.
         assert_eq!(first.copies(42), None);
         let kinds = |other: &Examination, axes: Matrix2| {
-            let found = other.contradictions(&[&first], axes);
+            let found = other.contradictions(&[&first], axes, true);
             found.iter().map(Warning::kind).collect::<Vec<_>>()
         };
         // Galaxies with a lesser share of noise, so that all are compared.
@@ -989,7 +996,7 @@ mod tests {
             dark.add(stamp.view()).unwrap();
         }
         assert_eq!(kinds(&dark, SAME), ["epoch-without-galaxies"]);
-        let found = first.contradictions(&[&dark], SAME);
+        let found = first.contradictions(&[&dark], SAME, true);
         assert_eq!(found, [Warning::EpochWithoutGalaxies { from_first: true }]);
         // Galaxies off their places by as much on the sky, of an epoch whose x axis is mirrored.
         let both = [
@@ -998,10 +1005,10 @@ mod tests {
         ];
         assert!(
             both[1]
-                .contradictions(&[&both[0]], [[-1.0, 0.0], [0.0, 1.0]])
+                .contradictions(&[&both[0]], [[-1.0, 0.0], [0.0, 1.0]], true)
                 .is_empty()
         );
-        assert!(!both[1].contradictions(&[&both[0]], SAME).is_empty());
+        assert!(!both[1].contradictions(&[&both[0]], SAME, true).is_empty());
     }
 
     #[test]
@@ -1020,7 +1027,7 @@ mod tests {
             damaged *= 1.001;
             masked.add(damaged.view()).unwrap();
         }
-        assert_eq!(masked.contradictions(&[&first], SAME), []);
+        assert_eq!(masked.contradictions(&[&first], SAME, true), []);
     }
 
     #[test]

@@ -65,6 +65,7 @@ mod session;
 mod shape;
 mod sheared;
 mod sky;
+mod source;
 mod stamp;
 mod transform;
 mod warning;
@@ -81,16 +82,16 @@ pub use noise::{StampNoise, Survey};
 pub use pixel::{Pixel, Pixels};
 pub use psf::{Psfs, Star, average_stars};
 pub use selection::{Cut, Quantity, Selected, Selection};
-pub use session::{
-    ArraySource, Batch, KnownNoise, Lazy, LazyStamps, MeasuredImage, MeasuredRow, OneThread,
-    RowJob, Session, StampRows, StampSource, Threads,
-};
+pub use session::{Batch, MeasuredImage, MeasuredRow, RowJob, Session};
 pub use sheared::{ShearedCatalogues, ShearedGalaxy};
 pub use shearq_quantities::{
     Distortion, Frame, FunctionalPsf, Jacobian, JacobianError, PsfProfile, Shear,
 };
 pub use shearq_submissions::{Configuration, ConfigurationError, PsfCut};
 pub use sky::Sky;
+pub use source::{
+    ArraySource, KnownNoise, Lazy, LazyStamps, OneThread, StampRows, StampSource, Threads,
+};
 pub use warning::{ExaminedPsfs, PixelFrame, Warning};
 
 /// The examples of README.md.

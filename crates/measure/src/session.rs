@@ -5,15 +5,13 @@
 //! [`MeasuredImage`], which checks the image. Files, simulations, [`Measurer::batch`] and Python all
 //! use it: while each of them had its own way, they differed in what they surveyed and reported.
 
-use std::borrow::Cow;
-use std::fmt;
-use std::ops::{ControlFlow, Deref, Range};
-use std::sync::{Arc, LazyLock};
+use std::ops::{ControlFlow, Range};
+use std::sync::Arc;
 
 use ndarray::{ArrayView3, Axis, CowArray, Ix3, Slice};
 use shearq_quantities::matrix::{Matrix2, inverse, product};
 use shearq_quantities::statistics::upper_median;
-use shearq_quantities::{Frame, Jacobian, columns_of};
+use shearq_quantities::{Frame, Jacobian};
 use shearq_submissions::limits::MIN_PSF;
 use shearq_submissions::{Calibration, Configuration, NoiseSource};
 
@@ -24,7 +22,10 @@ use crate::measurement::{Flag, Measurement};
 use crate::measurer::{Epoch, ImageNoise, ImageWorker, Measurer, Steps, Worker};
 use crate::noise::{NoisePlan, NoiseSurvey, StampNoise, Survey};
 use crate::pixel::{Pixel, Pixels, is_level};
-use crate::psf::{Psfs, ResidualProfiles, Star};
+use crate::psf::{Psfs, ResidualProfiles};
+use crate::source::{
+    ArraySource, KnownNoise, Lazy, LazyStamps, OneThread, StampRows, StampSource, Threads,
+};
 use crate::warning::Warning;
 
 // In pixels along each axis. Chosen by hand.
@@ -33,313 +34,6 @@ const WHITENESS_TEST_MAX_LAG: usize = 2;
 const STATED_NOISE_DIFFERENCE: f64 = 0.01;
 // Effect on m below which the noise of a star is not stated: rounding a star to single precision has this effect.
 const MIN_STATED_PSF_NOISE_M: f64 = 1e-5;
-
-/// The noise of an image before it is measured, as far as it is known.
-#[derive(Debug, Clone, Default)]
-pub enum KnownNoise<'n> {
-    /// Unknown.
-    #[default]
-    Unknown,
-    /// A level that the data state. A configuration that measures the noise on the stamps reports a difference.
-    Stated(f64),
-    /// The level of white noise that the caller gives, which replaces the measurement on the stamps.
-    Given(f64),
-    /// The same, one level per stamp.
-    GivenEach(Cow<'n, [f64]>),
-    /// Levels that the data state, one per stamp. Sky, galaxies and the correlation of the noise are measured on the stamps.
-    StatedEach(Cow<'n, [f64]>),
-}
-
-impl KnownNoise<'_> {
-    fn levels(&self) -> Option<&[f64]> {
-        match self {
-            KnownNoise::GivenEach(levels) | KnownNoise::StatedEach(levels) => Some(levels),
-            KnownNoise::Unknown | KnownNoise::Stated(_) | KnownNoise::Given(_) => None,
-        }
-    }
-}
-
-/// The stamps of an image in rows. The last row may be shorter.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct StampRows {
-    /// Stamps of a full row, 1 or more.
-    pub columns: usize,
-    /// All stamps.
-    pub count: usize,
-}
-
-impl StampRows {
-    /// Number of rows.
-    #[expect(clippy::len_without_is_empty, reason = "an image has rows")]
-    pub fn len(&self) -> usize {
-        self.count.div_ceil(self.columns)
-    }
-
-    /// Which stamps are in a row.
-    pub fn stamps(&self, row: usize) -> Range<usize> {
-        row * self.columns..((row + 1) * self.columns).min(self.count)
-    }
-}
-
-/// Stamps and PSFs of an image: files, arrays, a simulation.
-///
-/// One thread reads, so a source may own a file that threads cannot share. Rows are read in ascending order and, for
-/// surveys, some of them before that.
-pub trait StampSource<'a> {
-    /// Why a row cannot be read or measured.
-    type Error: From<MeasureError> + Send;
-
-    /// The rows of the image.
-    fn rows(&self) -> StampRows;
-
-    /// Warnings about the image from other sources than its pixels, such as headers.
-    fn warnings(&self) -> Vec<Warning> {
-        Vec::new()
-    }
-
-    /// Reads the stamps of a row, one along the first axis per galaxy.
-    ///
-    /// # Errors
-    /// If they cannot be read.
-    fn stamps(&mut self, row: usize) -> Result<LazyStamps<'a>, Self::Error>;
-
-    /// Reads the PSFs of a row: one PSF for all galaxies, or one per galaxy.
-    ///
-    /// # Errors
-    /// If they cannot be read.
-    fn psfs(&mut self, row: usize) -> Result<Lazy<'a, Psfs<'a>>, Self::Error>;
-
-    /// The Jacobians of a row's stamps, one per galaxy, with which shapes are measured in the frame of the sky; `None`
-    /// if they are measured in the frame of the pixels. It is the same for all rows of an image. PSFs are on the pixels of
-    /// their stamps.
-    ///
-    /// # Errors
-    /// If they cannot be determined.
-    fn jacobians(&mut self, _row: usize) -> Result<Option<Vec<Jacobian>>, Self::Error> {
-        Ok(None)
-    }
-
-    /// Offsets (x, y) of a row's galaxies from the centres of their stamps in pixels, which several epochs of a galaxy need; zero if
-    /// `None`. A single stamp has its galaxy where it is found.
-    ///
-    /// # Errors
-    /// If they cannot be read.
-    fn offsets(&mut self, _row: usize) -> Result<Option<Vec<[f64; 2]>>, Self::Error> {
-        Ok(None)
-    }
-
-    /// Electrons per unit of the stamps. With them, the Poisson noise of the galaxies is part of their noise; without, the
-    /// noise is that of the sky. Networks ignore it.
-    fn gain(&self) -> Option<f64> {
-        None
-    }
-
-    /// Whether the pixels have the unit of flux of other epochs, so that a ratio other than 1 is a mistake.
-    fn has_common_flux(&self) -> bool {
-        true
-    }
-}
-
-/// A value that is made by the first thread that needs it: threads share the drawing of simulated galaxies, although one
-/// thread reads the rows. Clones share the value.
-#[derive(Debug, Clone)]
-pub struct Lazy<'a, T>(Arc<LazyLock<T, Box<dyn FnOnce() -> T + Send + 'a>>>);
-
-/// The stamps of a row.
-pub type LazyStamps<'a> = Lazy<'a, Pixels<'a, Ix3>>;
-
-impl<'a, T> Lazy<'a, T> {
-    /// A value that will be made.
-    pub fn new(make: impl FnOnce() -> T + Send + 'a) -> Self {
-        Lazy(Arc::new(LazyLock::new(Box::new(make))))
-    }
-}
-
-impl<'a, T: Send + 'a> From<T> for Lazy<'a, T> {
-    fn from(value: T) -> Self {
-        Lazy::new(move || value)
-    }
-}
-
-impl<T> Deref for Lazy<'_, T> {
-    type Target = T;
-
-    fn deref(&self) -> &T {
-        &self.0
-    }
-}
-
-/// Threads of the caller. This crate starts none.
-pub trait Threads {
-    /// Number of threads, 1 or more.
-    fn count(&self) -> usize;
-
-    /// Maps values, in order, in any thread.
-    fn map<T: Send, R: Send>(&self, of: Vec<T>, map: impl Fn(T) -> R + Sync + Send) -> Vec<R>;
-}
-
-/// The calling thread alone.
-#[derive(Debug, Clone, Copy, Default)]
-pub struct OneThread;
-
-impl Threads for OneThread {
-    fn count(&self) -> usize {
-        1
-    }
-
-    fn map<T: Send, R: Send>(&self, of: Vec<T>, map: impl Fn(T) -> R + Sync + Send) -> Vec<R> {
-        of.into_iter().map(map).collect()
-    }
-}
-
-/// Some of the stamps, or of their PSFs.
-type Slices<'a, T, E> = Box<dyn FnMut(Range<usize>) -> Result<T, E> + Send + 'a>;
-
-/// Stamps and PSFs in arrays, in the arrangement nearest to a square: images of as many stamps have the same rows, so
-/// that the same stamps are surveyed and examined.
-pub struct ArraySource<'a, E = MeasureError> {
-    count: usize,
-    stamps: Slices<'a, Pixels<'a, Ix3>, E>,
-    psfs: Slices<'a, Psfs<'a>, E>,
-    moved: Option<[f64; 2]>,
-    /// One for all stamps or one per stamp.
-    jacobians: Option<Cow<'a, [Jacobian]>>,
-    offsets: Option<Cow<'a, [[f64; 2]]>>,
-}
-
-impl<E> fmt::Debug for ArraySource<'_, E> {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("ArraySource")
-            .field("count", &self.count)
-            .finish_non_exhaustive()
-    }
-}
-
-impl<'a> ArraySource<'a> {
-    /// Of stamps, one along the first axis per galaxy. A star for all galaxies is cut and normalised here.
-    ///
-    /// # Errors
-    /// If there is not one PSF for all or one per galaxy, or the star for all cannot be used.
-    pub fn new<T: Pixel>(
-        measurer: &Measurer,
-        stamps: ArrayView3<'a, T>,
-        psfs: &'a Psfs<'_>,
-    ) -> Result<Self, MeasureError> {
-        let (count, full, _) = stamps.dim();
-        let (shared, moved) = match psfs.count() {
-            Some(given) if given != count => {
-                return Err(MeasureError::Shape {
-                    what: "PSFs",
-                    found: format!("{given} galaxies"),
-                    expected: format!("{count}, one each"),
-                });
-            }
-            None if matches!(psfs, Psfs::Star(_)) => {
-                let Star { psf, moved } = psfs.at(0, measurer.configuration().psf_cut(), full)?;
-                (Some(psf.into_shared()), moved)
-            }
-            _ => (None, None),
-        };
-        let stamps = move |range| {
-            let mut some = stamps;
-            some.slice_axis_inplace(Axis(0), Slice::from(range));
-            Ok(T::pixels(some))
-        };
-        let psfs = move |range| {
-            let shared = shared.clone().map(Psfs::Prepared);
-            Ok(shared.unwrap_or_else(|| psfs.slice(range)))
-        };
-        Ok(ArraySource::from_fn(count, stamps, psfs, moved))
-    }
-}
-
-impl<'a, E> ArraySource<'a, E> {
-    /// A source of `count` stamps that two functions read by range, the pixels and their PSFs. `moved` is the offset in pixels
-    /// by which the star for all galaxies was moved to the centre of its stamp.
-    pub fn from_fn(
-        count: usize,
-        stamps: impl FnMut(Range<usize>) -> Result<Pixels<'a, Ix3>, E> + Send + 'a,
-        psfs: impl FnMut(Range<usize>) -> Result<Psfs<'a>, E> + Send + 'a,
-        moved: Option<[f64; 2]>,
-    ) -> Self {
-        ArraySource {
-            count,
-            stamps: Box::new(stamps),
-            psfs: Box::new(psfs),
-            moved,
-            jacobians: None,
-            offsets: None,
-        }
-    }
-
-    /// The same stamps with their galaxies at these offsets (x, y) from their centres in pixels, one per stamp.
-    ///
-    /// # Errors
-    /// If there are another number of them.
-    pub fn with_offsets(
-        mut self,
-        offsets: impl Into<Cow<'a, [[f64; 2]]>>,
-    ) -> Result<Self, MeasureError> {
-        let offsets = offsets.into();
-        length("offsets", offsets.len(), self.count)?;
-        self.offsets = Some(offsets);
-        Ok(self)
-    }
-
-    /// The same stamps in the frame of the sky, with one Jacobian for all or one per stamp.
-    ///
-    /// # Errors
-    /// If there are another number of them.
-    pub fn with_jacobians(
-        mut self,
-        jacobians: impl Into<Cow<'a, [Jacobian]>>,
-    ) -> Result<Self, MeasureError> {
-        let jacobians = jacobians.into();
-        if jacobians.len() != 1 {
-            length("Jacobians", jacobians.len(), self.count)?;
-        }
-        self.jacobians = Some(jacobians);
-        Ok(self)
-    }
-}
-
-impl<'a, E: From<MeasureError> + Send> StampSource<'a> for ArraySource<'a, E> {
-    type Error = E;
-
-    fn rows(&self) -> StampRows {
-        StampRows {
-            columns: columns_of(self.count),
-            count: self.count,
-        }
-    }
-
-    fn warnings(&self) -> Vec<Warning> {
-        self.moved.map(Warning::of_moved).into_iter().collect()
-    }
-
-    fn stamps(&mut self, row: usize) -> Result<LazyStamps<'a>, E> {
-        let range = self.rows().stamps(row);
-        Ok((self.stamps)(range)?.into())
-    }
-
-    fn psfs(&mut self, row: usize) -> Result<Lazy<'a, Psfs<'a>>, E> {
-        let range = self.rows().stamps(row);
-        Ok((self.psfs)(range)?.into())
-    }
-
-    fn jacobians(&mut self, row: usize) -> Result<Option<Vec<Jacobian>>, E> {
-        let range = self.rows().stamps(row);
-        Ok(self.jacobians.as_deref().map(|all| match all {
-            [one] => vec![*one; range.len()],
-            each => each[range].to_vec(),
-        }))
-    }
-
-    fn offsets(&mut self, row: usize) -> Result<Option<Vec<[f64; 2]>>, E> {
-        let range = self.rows().stamps(row);
-        Ok(self.offsets.as_deref().map(|each| each[range].to_vec()))
-    }
-}
 
 /// One image between its survey and its last row. Threads share it.
 #[derive(Debug)]
@@ -937,29 +631,12 @@ impl MeasuredImage<'_> {
                 .iter_mut()
                 .for_each(|galaxy| galaxy.response = None);
         }
-        let images = std::iter::once(&session).chain(&session.epochs);
-        let mut warnings = Vec::new();
-        let mut psf_noise = None;
-        let mut earlier = Vec::new();
-        for (epoch, (image, examined)) in images.zip(&examined).enumerate() {
-            let mut own = image.warnings.clone();
-            own.extend(image.warnings_of(examined.as_ref(), &mut psf_noise));
-            if session.epochs.is_empty() {
-                warnings = own;
-                break;
-            }
-            if let Some(Examined { stamps, .. }) = examined {
-                own.extend(stamps.contradictions(&earlier, image.axes_from(&session)));
-                earlier.push(stamps);
-            }
-            let epoch = epoch + 1;
-            warnings.extend(image.of_epoch(own).map(|warning| {
-                let warning = Box::new(warning);
-                Warning::Epoch { epoch, warning }
-            }));
-        }
-        // The noise of several stars averages, and its effect is not known.
-        psf_noise = psf_noise.filter(|_| session.epochs.is_empty());
+        let own = examined.first().and_then(Option::as_ref);
+        let (mut warnings, psf_noise) = match session.epochs.is_empty() {
+            true => (session.image_warnings(own), session.psf_noise(own)),
+            // The noise of several stars averages, and its effect is not known.
+            false => (session.epoch_warnings(&examined), None),
+        };
         warnings.extend(Warning::of_galaxies(&galaxies));
         if let Some((response, false)) = response
             && galaxies.iter().any(|galaxy| galaxy.flags.is_empty())
@@ -990,7 +667,27 @@ impl Session<'_> {
         }
     }
 
-    /// The warnings of this image as those of an epoch, which is left out without noise, and whose offsets are stated.
+    /// Warnings of all epochs; each is compared with those before it.
+    fn epoch_warnings(&self, examined: &[Option<Examined>]) -> Vec<Warning> {
+        let images = std::iter::once(self).chain(self.epochs.iter().map(Arc::as_ref));
+        let mut warnings = Vec::new();
+        let mut earlier = Vec::new();
+        for (epoch, (image, examined)) in (1..).zip(images.zip(examined)) {
+            let mut own = image.image_warnings(examined.as_ref());
+            if let Some(Examined { stamps, .. }) = examined {
+                let axes = image.axes_from(self);
+                own.extend(stamps.contradictions(&earlier, axes, image.common_flux));
+                earlier.push(stamps);
+            }
+            warnings.extend(image.of_epoch(own).map(|warning| {
+                let warning = Box::new(warning);
+                Warning::Epoch { epoch, warning }
+            }));
+        }
+        warnings
+    }
+
+    /// Adapts the warnings of this image to an epoch, which is left out without noise, and whose offsets are stated.
     fn of_epoch(&self, warnings: Vec<Warning>) -> impl Iterator<Item = Warning> {
         let noise = self.survey.as_ref().map(|survey| &survey.noise);
         let correlated = noise.filter(|noise| noise.is_correlated());
@@ -999,9 +696,7 @@ impl Session<'_> {
         });
         let displaced = |warning: &Warning| matches!(warning, Warning::EpochOffset { .. });
         let is_displaced = warnings.iter().any(displaced);
-        let common_flux = self.common_flux;
         let own = move |warning| match warning {
-            Warning::EpochFlux { .. } if !common_flux => None,
             Warning::NoNoise => Some(Warning::EpochNoNoise),
             Warning::OffCentre { .. } if is_displaced => None,
             Warning::OffCentre { offset, error } => Some(Warning::EpochOffset {
@@ -1014,40 +709,42 @@ impl Session<'_> {
         warnings.into_iter().filter_map(own).chain(correlated)
     }
 
-    /// Warnings of examined stamps; writes the effect of the star's noise on m and c, if there is one.
-    fn warnings_of(
-        &self,
-        examined: Option<&Examined>,
-        psf_noise: &mut Option<[f64; 2]>,
-    ) -> Vec<Warning> {
-        let configuration = self.measurer.configuration();
+    /// Warnings of the source, of the survey and of the examined stamps.
+    fn image_warnings(&self, examined: Option<&Examined>) -> Vec<Warning> {
+        let mut warnings = self.warnings.clone();
         let Some(Examined { stamps, scaled }) = examined else {
-            return Vec::new();
+            return warnings;
         };
-        // Levels of their own serve images of several depths.
+        // Stamps with stated levels may come from images of several depths.
         let one_level = self.noise.levels().is_none();
-        let mut warnings = stamps.warnings();
-        warnings.retain(|own| one_level || !matches!(own, Warning::Depths { .. }));
+        let found = stamps.warnings().into_iter();
+        warnings.extend(found.filter(|one| one_level || !matches!(one, Warning::Depths { .. })));
+        let header = self.measurer.configuration().noise == NoiseSource::Header;
         warnings.extend(match &self.noise {
             KnownNoise::Given(level) => stamps.given_noise(*level),
             KnownNoise::GivenEach(_) | KnownNoise::StatedEach(_) => scaled
                 .as_ref()
                 .zip(self.typical_level)
                 .and_then(|(scaled, level)| scaled.given_noise(level)),
-            &KnownNoise::Stated(given) if configuration.noise == NoiseSource::Header => stamps
-                .noise_unlike(given)
-                .map(|measured| Warning::NoiseLevel {
-                    given,
-                    measured,
-                    used: false,
-                }),
+            &KnownNoise::Stated(given) if header => {
+                stamps
+                    .noise_unlike(given)
+                    .map(|measured| Warning::NoiseLevel {
+                        given,
+                        measured,
+                        used: false,
+                    })
+            }
             KnownNoise::Stated(_) | KnownNoise::Unknown => None,
         });
-        let effect = stamps
-            .psf_noise()
-            .filter(|[m, _]| *m > MIN_STATED_PSF_NOISE_M);
-        *psf_noise = effect.filter(|_| configuration.linear().is_some());
         warnings
+    }
+
+    /// The effect of the star's noise on m and c of a linear configuration, if it is large enough to be stated.
+    fn psf_noise(&self, examined: Option<&Examined>) -> Option<[f64; 2]> {
+        self.measurer.configuration().linear()?;
+        let effect = examined?.stamps.psf_noise();
+        effect.filter(|[m, _]| *m > MIN_STATED_PSF_NOISE_M)
     }
 }
 
@@ -1167,13 +864,13 @@ fn survey_stars<'a, S: StampSource<'a>>(
     Ok(survey.residual_profiles())
 }
 
-/// Reads `chosen` rows, as many at a time as there are threads, looks at parts of them, and takes what was found in the
-/// order of the stamps.
+/// Reads `chosen` rows, one per thread at a time, surveys parts of them in the threads, and joins the parts in the order of
+/// the stamps.
 fn scan<R: Send + Sync, L: Send, E: Send>(
     (rows, chosen, threads): (StampRows, &[usize], &impl Threads),
     mut read: impl FnMut(usize) -> Result<R, E>,
-    look: impl Fn(&R, Range<usize>) -> Result<L, E> + Send + Sync,
-    mut take: impl FnMut(L) -> Result<ControlFlow<()>, E>,
+    survey: impl Fn(&R, Range<usize>) -> Result<L, E> + Send + Sync,
+    mut join: impl FnMut(L) -> Result<ControlFlow<()>, E>,
 ) -> Result<(), E> {
     let together = threads.count().max(1);
     for some in chosen.chunks(together) {
@@ -1187,8 +884,8 @@ fn scan<R: Send + Sync, L: Send, E: Send>(
             let starts = (0..*count).step_by(size.max(1));
             starts.map(move |start| (row, start..(start + size).min(*count)))
         });
-        for found in threads.map(jobs.collect(), |(row, range)| look(row, range)) {
-            if take(found?)?.is_break() {
+        for found in threads.map(jobs.collect(), |(row, range)| survey(row, range)) {
+            if join(found?)?.is_break() {
                 return Ok(());
             }
         }
