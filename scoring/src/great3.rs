@@ -1,4 +1,4 @@
-//! The metrics of GREAT3 (Mandelbaum et al. 2014, ApJS 212, 5) and GREAT08 (Bridle et al. 2010, MNRAS 405, 2044).
+//! The metrics of GREAT3 (Mandelbaum et al. 2014, ApJS 212, 5).
 
 use std::fmt;
 
@@ -72,8 +72,6 @@ pub const REQUIRED_M: f64 = 2e-3;
 const Q_C_SCALE: f64 = 1.232 * 2000.0;
 // Scale of Q_v in the challenge's program.
 const Q_V_SCALE: f64 = 1.837e-4;
-// Scale of Q of GREAT08: a mean square error of 10⁻⁷ has Q = 1000.
-const GREAT08_SCALE: f64 = 1e-4;
 
 /// Simulated ground or space data, which differ in the floor of Q.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -352,7 +350,7 @@ pub struct Quality {
 
 impl Quality {
     // `of` gives Q from the chosen of `count` fields.
-    fn over(count: usize, of: impl Fn(&dyn Fn(usize) -> bool) -> f64) -> Self {
+    pub(crate) fn over(count: usize, of: impl Fn(&dyn Fn(usize) -> bool) -> f64) -> Self {
         let groups = group_sizes(count).len();
         let q = of(&|_| true);
         let replicates = (0..groups).map(|left_out| of(&|k| k % groups != left_out));
@@ -396,42 +394,5 @@ pub fn variable_score(
         let difference = |bin: usize| chosen().map(|(s, t)| s[bin] - t[bin]).sum::<f64>().abs();
         let mean = Q_V_BINS.map(difference).sum::<f64>() / (fields * Q_V_BINS.count() as f64);
         Q_V_SCALE / (observation.floors().1 + mean)
-    }))
-}
-
-/// Q of GREAT08: 10⁻⁴ / ⟨(⟨g_sub − g_true⟩_images)²⟩ over sets and both components. `sets` has the differences
-/// of the images of each set.
-///
-/// The mean over the images is inside the square: noise that averages to zero over a set costs little.
-///
-/// # Errors
-/// If a set is empty, there is none, or a number is not finite.
-pub fn great08_score(sets: &[Vec<Shear>]) -> Result<Quality, ScoringError> {
-    let empty = sets.iter().filter(|set| set.is_empty()).count();
-    if empty > 0 || sets.is_empty() {
-        return Err(ScoringError::Count {
-            what: "sets with images",
-            found: sets.len() - empty,
-            expected: sets.len().max(1),
-        });
-    }
-    let mut shears = sets.iter().flatten();
-    if !shears.all(|g| g.e1.is_finite() && g.e2.is_finite()) {
-        return Err(ScoringError::NotFinite("a shear"));
-    }
-    let squares: Vec<f64> = sets
-        .iter()
-        .map(|set| {
-            let mean = |of: fn(&Shear) -> f64| set.iter().map(of).sum::<f64>() / set.len() as f64;
-            0.5 * (mean(|g| g.e1).powi(2) + mean(|g| g.e2).powi(2))
-        })
-        .collect();
-    Ok(Quality::over(squares.len(), |is_in| {
-        let chosen = squares.iter().enumerate();
-        let chosen: Vec<f64> = chosen
-            .filter(|(k, _)| is_in(*k))
-            .map(|(_, square)| *square)
-            .collect();
-        GREAT08_SCALE * chosen.len() as f64 / chosen.iter().sum::<f64>()
     }))
 }

@@ -30,7 +30,7 @@
 //!
 //! # Other challenges
 //!
-//! [`great3`] has the metrics of GREAT3 and GREAT08, [`aperture`] correlations and aperture masses of galaxies on a lattice.
+//! [`great3`] and [`great08`] have the metrics of these challenges, [`aperture`] correlations and aperture masses of galaxies on a lattice.
 
 #![warn(missing_docs, clippy::missing_errors_doc)]
 #![forbid(unsafe_code)]
@@ -43,6 +43,7 @@ mod cross;
 mod diagnosis;
 mod error;
 mod errors;
+pub mod great08;
 pub mod great3;
 mod grid;
 mod line;

@@ -12,6 +12,7 @@ use shearq_dataset::run::{Source, kind_of};
 use shearq_dataset::threads::{Pool, Progress};
 use shearq_files::{FileError, names_of};
 use shearq_render::escape::line;
+use shearq_results::published::MIN_SLOPE_SIGNIFICANCE;
 use shearq_results::record::{RunRecord, SetRecord, definition_word};
 use shearq_results::score::ScoreError;
 use shearq_results::store;
@@ -625,12 +626,9 @@ impl Judge {
     }
 }
 
-// In σ, as for Q cal. Below, the entry contains no shear that could be ranked.
-const MIN_RESPONSE_SIGNIFICANCE: f64 = 3.0;
-
 // An error that cannot be determined (NaN) does not refuse an entry.
-fn is_measurable(response: f64, error: f64) -> bool {
-    response > 0.0 && (error.is_nan() || response > MIN_RESPONSE_SIGNIFICANCE * error)
+fn is_measurable(slope: f64, error: f64) -> bool {
+    slope > 0.0 && (error.is_nan() || slope > MIN_SLOPE_SIGNIFICANCE * error)
 }
 
 type Powers = (Vec<f64>, Vec<f64>);

@@ -255,9 +255,7 @@ impl<'a> Inputs<'a> {
         }
         Ok(())
     }
-}
 
-impl Inputs<'_> {
     /// The file that made the fingerprint of all epochs another one. The catalogue has one for all, because the header of a FITS file
     /// has no room for one of each.
     fn changed(

@@ -7,7 +7,7 @@ use thiserror::Error;
 use crate::measurement::{Measurement, ResponseMatrix};
 
 // In standard errors. Chosen by hand.
-const LEAST_SIGNIFICANCE: f64 = 3.0;
+const MIN_RESPONSE_SIGNIFICANCE: f64 = 3.0;
 
 /// The mean responses R11 and R22 of the good galaxies, and whether each is positive by three standard errors. The response
 /// of a single galaxy has no error, and must only be positive.
@@ -33,7 +33,7 @@ pub(crate) fn mean_response(galaxies: &[Measurement]) -> ([f64; 2], bool) {
 pub fn is_significant(response: &RunningMean) -> bool {
     let (mean, count) = (response.mean(), response.count());
     let error = response.deviation() / (count as f64).sqrt();
-    mean.is_finite() && mean > 0.0 && (count == 1 || mean >= LEAST_SIGNIFICANCE * error)
+    mean.is_finite() && mean > 0.0 && (count == 1 || mean >= MIN_RESPONSE_SIGNIFICANCE * error)
 }
 
 /// The mean shear of many galaxies.

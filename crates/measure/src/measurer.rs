@@ -122,6 +122,12 @@ impl Measurer {
         Some(StarSurvey::new(self.0.configuration.psf_cut(), self.full()))
     }
 
+    /// Largest offset of a galaxy from the centre of an epoch's stamp that [`ImageWorker::measure_epochs`] accepts, along each
+    /// axis in pixels. Farther out, the window would reach over the edge.
+    pub fn max_epoch_offset(&self) -> f64 {
+        self.0.configuration.stamp.size as f64 / 4.0
+    }
+
     /// Buffers for one thread.
     pub fn worker(&self) -> Worker {
         let (plan, n) = (&*self.0, self.0.configuration.stamp.size);
@@ -551,7 +557,7 @@ impl ImageWorker<'_> {
             return Err(EpochError::Network.into());
         }
         let one = epochs.first().ok_or(EpochError::None)?;
-        let most = self.worker.measurer.configuration().stamp.size as f64 / 4.0;
+        let most = self.worker.measurer.max_epoch_offset();
         for (k, found) in epochs.iter().enumerate() {
             let (noise, [x, y]) = (found.noise, found.offset);
             if !(noise > 0.0 && noise.is_finite()) {

@@ -15,7 +15,7 @@ use shearq_files::FileError;
 use shearq_measure::{Batch, MeasuredImage, Measurer, RowJob, Warning};
 
 pub use self::catalogue::{COLUMNS, Summary, Value, all_flagged, more_columns};
-pub(crate) use self::catalogue::{Catalogues, metadata};
+pub(crate) use self::catalogue::{CatalogueWriter, metadata};
 pub use self::source::ImageSource;
 pub(crate) use self::source::{check_strip, open_galaxies};
 use crate::PipelineError;
@@ -149,7 +149,7 @@ impl<'a> FolderMeasurement<'a> {
         threads: usize,
         progress: &mut dyn Progress,
     ) -> Result<Summary, PipelineError> {
-        let mut catalogues = Catalogues::claim(self.run, self.out, self.images)?;
+        let mut catalogues = CatalogueWriter::claim(self.run, self.out, self.images)?;
         let inputs = Inputs::new(self.run, self.data, self.images)?;
         // Catalogues of an earlier call are kept only if their images are still the same.
         inputs.verify(self.out, &catalogues.done, &Pool::new(threads)?)?;
@@ -256,7 +256,7 @@ impl FolderMeasurement<'_> {
         prints: BTreeMap<String, String>,
         feeder: &mut Feeder<'_, ImageRow<'static, ImageHead>>,
     ) -> Result<bool, PipelineError> {
-        let mut sources = epochs::open(self.data, ids, measurer.configuration())?;
+        let mut sources = epochs::open(self.data, ids, measurer)?;
         let mut sessions = Vec::new();
         for (id, source) in ids.iter().zip(&mut sources) {
             self.check_side(*id, source.image.mosaic(), measurer)?;

@@ -13,7 +13,7 @@ use shearq_measure::{
 use shearq_quantities::Shear;
 use shearq_submissions::{Configuration, PsfForm};
 
-use super::measure::{Catalogues, ImageHead, ImageRow, Measured, Summary, measure_images};
+use super::measure::{CatalogueWriter, ImageHead, ImageRow, Measured, Summary, measure_images};
 use super::{PipelineError, simulate};
 use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::DataFolder;
@@ -203,7 +203,7 @@ pub fn run_folder(
     threads: usize,
     progress: &mut dyn Progress,
 ) -> Result<Summary, PipelineError> {
-    let mut catalogues = Catalogues::claim(run, out, images)?;
+    let mut catalogues = CatalogueWriter::claim(run, out, images)?;
     let measurers = measurers(std::slice::from_ref(&run.configuration))?;
     let truth = DataFolder::new(out);
     progress.skip((catalogues.done.len() * settings.grid * settings.grid) as u64);

@@ -294,8 +294,9 @@ pub fn ranking(branch: &dyn Board, own: &[(String, Score)]) -> Table {
     table
 }
 
-// Standard errors by which a slope on the true shear must exceed zero, as for the entries of own challenges.
-const MIN_SLOPE_SIGNIFICANCE: f64 = 3.0;
+/// Standard errors by which the slope of an entry on the true shear must exceed zero: below, it contains no shear that could be
+/// ranked.
+pub const MIN_SLOPE_SIGNIFICANCE: f64 = 3.0;
 // Least slope of an entry that measures shear: below, m < −0.9 is no bias of a method. `bias` has the same limit.
 const MIN_SHEAR_SLOPE: f64 = 0.1;
 

@@ -8,9 +8,9 @@ use shearq_quantities::Shear;
 use shearq_quantities::units::Degrees;
 use shearq_scoring::aperture::{Correlations, Lattice, LatticeShear, SEPARATION_BINS, separations};
 use shearq_scoring::great3::{
-    ConstantField, Observation, along, constant_score, great08_score, position_angle,
-    variable_score,
+    ConstantField, Observation, along, constant_score, position_angle, variable_score,
 };
+use shearq_scoring::great08;
 use shearq_scoring::{Grid, ScoringError};
 
 use crate::common::{Content, Normal, field};
@@ -291,12 +291,12 @@ fn components_follow_the_axis_of_the_psf() {
 fn great08_averages_images_within_the_square() {
     // Differences of ±0.01 around 3·10⁻⁴ and −10⁻⁴ in the two components of one set, 0 in the other.
     let set = vec![Shear::new(0.0103, -0.0101), Shear::new(-0.0097, 0.0099)];
-    let found = great08_score(&[set, vec![Shear::ZERO; 3]]).unwrap();
+    let found = great08::score(&[set, vec![Shear::ZERO; 3]]).unwrap();
     let square: f64 = (9e-8 + 1e-8) / 4.0;
     assert!((found.q / (1e-4 / square) - 1.0).abs() < 1e-9);
     // The nominal target.
     let set = vec![Shear::new(1e-7_f64.sqrt(), 1e-7_f64.sqrt())];
-    assert!((great08_score(&[set]).unwrap().q - 1000.0).abs() < 1e-6);
+    assert!((great08::score(&[set]).unwrap().q - 1000.0).abs() < 1e-6);
 }
 
 #[test]
@@ -314,6 +314,6 @@ fn impossible_input_is_an_error() {
     let same = constant_score(&[field; 5], Observation::Ground);
     assert_eq!(same, Err(ScoringError::SameShears));
     assert!(variable_score(&[[0.0; 15]], &[], Observation::Space).is_err());
-    assert!(great08_score(&[]).is_err() && great08_score(&[vec![]]).is_err());
+    assert!(great08::score(&[]).is_err() && great08::score(&[vec![]]).is_err());
     assert!((separations()[3].0 - 0.0853).abs() < 5e-5);
 }

@@ -396,6 +396,14 @@ mod tests {
             &good + &Array2::from_shape_fn((48, 48), gradient)
         };
         assert_eq!(kinds(&slope(0.005)), ["psf-gradient"]);
+        let tilted = slope(0.005);
+        let quality = PsfQuality::from_psf((&tilted / tilted.sum()).view(), None).unwrap();
+        let text = warnings(&[quality], true, None)[0].to_string();
+        // 0.5 % of the peak over 23.5 px.
+        assert!(
+            text.contains("found 0.021 % of the peak per pixel along x and 0.000 %"),
+            "{text}"
+        );
         assert!(kinds(&slope(0.0005)).is_empty());
         let mut delta = Array2::zeros((48, 48));
         delta[(24, 23)] = 3.0;

@@ -18,13 +18,17 @@ use shearq_dataset::layout::DataFolder;
 use shearq_dataset::mosaic::Mosaic;
 use shearq_dataset::psf_table;
 
-// Pixels a side of a PSF that are examined: as many as configurations use.
-const EXAMINED_SIDE: usize = 48;
-// Most stars a side of an image that is examined for several. GREAT3 has three.
+// Central pixels of a PSF that are examined, along each axis: those that configurations use.
+const EXAMINED_SIDE_PX: usize = 48;
+// Largest side of a grid of stars that is looked for in a PSF image. GREAT3 has 3 × 3 stars. Chosen by hand.
 const MAX_GRID_STARS: usize = 10;
-// Least pixels a side of such a star.
+// Smallest side of the square of a star in such a grid. Chosen by hand.
 const MIN_STAR_CELL_PX: usize = 16;
-// Most pixels of stars that are averaged. All of them are in memory.
+// Peak of each star in units of the brightest one: noise and wings beside a single star are fainter. Chosen by hand.
+const MIN_PEAK_RATIO: f32 = 0.5;
+// Fewest galaxies per star whose stars are averaged: fewer are one PSF per galaxy of which some are missing. Chosen by hand.
+const MIN_GALAXIES_PER_STAR: usize = 2;
+// Averaged stars are in memory together: 128 MB in double precision. Chosen by hand.
 const MAX_AVERAGED_PIXELS: usize = 1 << 24;
 
 pub(super) struct GatheredPsfs {
@@ -59,8 +63,7 @@ pub(super) fn gather_psfs(
     messages.extend(stack.differs.clone());
     messages.extend(small(&files.paths[0], side));
     let path = data.psf_star(id.set, id.image);
-    // Stars of a field, not one star too few of one per galaxy.
-    if count > 1 && 2 * count <= mosaic.galaxies {
+    if count > 1 && MIN_GALAXIES_PER_STAR * count <= mosaic.galaxies {
         return averaged(&path, files, &stack, messages);
     }
     check_count(&files.paths[0], count, mosaic)?;
@@ -136,9 +139,8 @@ fn several_stars(path: &Path, pixels: &[f32], side: usize) -> Option<String> {
         let found = brightest(*n);
         let most = found.iter().map(|(_, value)| *value).fold(0.0, f32::max);
         let middle = |at: usize| (cell / 4..cell - cell / 4).contains(&at);
-        // Noise and wings beside one star are fainter than half of it.
         let star = |&(at, value): &(usize, f32)| {
-            value > 0.5 * most && middle(at % cell) && middle(at / cell)
+            value > MIN_PEAK_RATIO * most && middle(at % cell) && middle(at / cell)
         };
         found.iter().all(star)
     };
@@ -163,7 +165,7 @@ fn check_count(path: &Path, found: usize, mosaic: &Mosaic) -> Result<(), FileErr
 }
 
 fn examined_cut(side: usize) -> PsfCut {
-    let size = side - side.saturating_sub(EXAMINED_SIDE).next_multiple_of(2);
+    let size = side - side.saturating_sub(EXAMINED_SIDE_PX).next_multiple_of(2);
     PsfCut {
         size,
         // So that a star off the centre can be cut around itself.

@@ -241,7 +241,7 @@ pub(super) fn to_do(run: &Run, out: &Path, images: &[ImageId]) -> (Vec<ImageId>,
         .partition(|id| !run.catalogue(out, id.set, id.image).is_file())
 }
 
-pub(crate) struct Catalogues<'a> {
+pub(crate) struct CatalogueWriter<'a> {
     run: &'a Run,
     out: &'a Path,
     images: &'a [ImageId],
@@ -253,7 +253,7 @@ pub(crate) struct Catalogues<'a> {
     warned: Warned,
 }
 
-impl<'a> Catalogues<'a> {
+impl<'a> CatalogueWriter<'a> {
     pub(crate) fn claim(
         run: &'a Run,
         out: &'a Path,
@@ -266,7 +266,7 @@ impl<'a> Catalogues<'a> {
             already: done.len(),
             ..Summary::default()
         };
-        Ok(Catalogues {
+        Ok(CatalogueWriter {
             run,
             out,
             images,

@@ -13,7 +13,6 @@ use shearq_measure::{
     KnownNoise, Lazy, LazyStamps, Measurer, Psfs, Session, StampRows, StampSource, Threads, Warning,
 };
 use shearq_quantities::Jacobian;
-use shearq_submissions::Configuration;
 
 use super::source::{ImageSource, squares, stamp_rows};
 use crate::PipelineError;
@@ -39,14 +38,13 @@ pub(super) struct EpochSource {
 pub(super) fn open(
     data: &DataFolder,
     ids: &[ImageId],
-    configuration: &Configuration,
+    measurer: &Measurer,
 ) -> Result<Vec<EpochSource>, PipelineError> {
     let mut sources: Vec<EpochSource> = Vec::new();
     let mut first: Option<(ImageId, Galaxies)> = None;
-    // Farther galaxies cannot be combined.
-    let most = configuration.stamp.size as f64 / 4.0;
+    let most = measurer.max_epoch_offset();
     for &id in ids {
-        let image = ImageSource::open(data, id, configuration)?;
+        let image = ImageSource::open(data, id, measurer.configuration())?;
         let (path, mosaic) = (data.stamps(id.set, id.image), image.mosaic());
         let galaxies = Galaxies::read(&path, image.table.as_ref())?;
         let tiles = match &first {

@@ -7,7 +7,7 @@ use shearq_dataset::threads::Pool;
 use shearq_files::FileError;
 use shearq_files::table::{self, Place};
 use shearq_quantities::Shear;
-use shearq_scoring::great3::great08_score;
+use shearq_scoring::great08;
 
 use super::{
     Board, Columns, Entry, Figure, Packed, Packing, Score, Truth, disagreement, whole, wrong,
@@ -169,7 +169,7 @@ impl Board for Great08 {
             differences.entry(set).or_default().push(difference);
         }
         let sets: Vec<Vec<Shear>> = differences.into_values().collect();
-        let found = great08_score(&sets).map_err(|error| FileError::new(submission, error))?;
+        let found = great08::score(&sets).map_err(|error| FileError::new(submission, error))?;
         Ok(Score {
             branch: None,
             refusal: disagreement(&pairs, truth.path),
