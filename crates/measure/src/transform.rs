@@ -19,8 +19,8 @@
 //!
 //! so that the sums along the axes have other tables, and a phase for each row and k_x is between them.
 //!
-//! Each sum along an axis is a dense product. Both methods keep 16 to 48 modes along an axis; a transform of 23 px to 31 modes
-//! and back takes 0.9 µs so, and 5.4 µs with rustfft (`docs/validation.md`).
+//! Each sum along an axis is a dense product. Both methods keep 16 to 48 modes along an axis, for which products were three to
+//! six times as fast as rustfft in `bench` of one machine: 0.9 µs against 5.4 µs for 23 px to 31 modes and back.
 
 mod turned;
 
