@@ -137,7 +137,8 @@ fn commands_of_the_pages_run() {
                 "to-send.tar.gz",
             ],
         ),
-        ("clusters.md", 10, &["parts/scores.csv"]),
+        ("files.md", 10, &["parts/scores.csv"]),
+        ("install.md", 1, &["shearq-quickstart/report.html"]),
     ] {
         let root = tempfile::tempdir().unwrap();
         follow(page, root.path(), commands, true);
