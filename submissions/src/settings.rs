@@ -339,6 +339,10 @@ pub struct WeightedShape {
     /// What a shear leaves in its place.
     #[serde(default)]
     pub origin: ShearOrigin,
+    /// Modulus a: an ellipticity e is reported as e/√(1 + |e|²/a²), because galaxies of large ellipticity tell less of the
+    /// shear. Zero to report e.
+    #[serde(default)]
+    pub saturation: f64,
     /// Shear of the sheared catalogues (`1p`, `1m`, `2p`, `2m`): further columns of ellipticity, S/N, flux and size. Zero
     /// for none.
     pub sheared_step: f64,
@@ -353,6 +357,7 @@ impl WeightedShape {
         let (scale, half) = (self.weight_scale, self.half_snr);
         within("shape.weight_scale", scale, 0.5..=10.0, " pixels")?;
         within("shape.half_snr", half, 0.0..=1e3, "")?;
+        zero_or_within("shape.saturation", self.saturation, 0.05..=1.0, "")?;
         let (key, step) = ("shape.sheared_step", self.sheared_step);
         zero_or_within(key, step, 1e-3..=0.05, "")
     }

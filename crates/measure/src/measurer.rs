@@ -14,7 +14,7 @@ use crate::deconvolve::{EpochPixels, convolve};
 use crate::denoise::{DenoiseScratch, WaveletWiener, border_noise};
 use crate::error::{EpochError, MeasureError};
 use crate::measurement::{Flag, Measurement, PsfShape};
-use crate::method::{AdaptedSettings, CutEpoch, CutWorker, Images, MethodPlan};
+use crate::method::{AdaptedSettings, CutEpoch, CutWorker, Images, MethodPlan, Reported};
 use crate::noise::{NoisePlan, StampNoise, Survey};
 use crate::pixel::{PEAK_RANGE, Pixel, all_finite, highest, is_level};
 use crate::psf::{Psfs, ResidualProfiles, Star, StarSurvey, cut_start};
@@ -345,7 +345,7 @@ impl Worker {
         if let Some(to_sky) = &self.to_sky {
             found.turn(to_sky);
         }
-        Ok(found.measurement(self.measurer.configuration().ellipticity(), noise))
+        Ok(found.measurement(Reported::of(self.measurer.configuration()), noise))
     }
 
     /// Cuts a stamp and prepares its pixels. Returns the level of its noise, or the measurement if it is flagged before its shape is
@@ -458,7 +458,7 @@ impl Worker {
         if let Some((orientation, _)) = &frame {
             found.turn(&orientation.spin2());
         }
-        let mut measured = found.measurement(self.measurer.configuration().ellipticity(), noise);
+        let mut measured = found.measurement(Reported::of(self.measurer.configuration()), noise);
         let scale = epochs[first]
             .jacobian
             .map_or(1.0, |jacobian| jacobian.pixel_scale());

@@ -6,7 +6,7 @@ mod network;
 use std::sync::Arc;
 
 use ndarray::{Array2, ArrayView2};
-use shearq_quantities::{Distortion, PixelShape, Shear, Spin2};
+use shearq_quantities::{Distortion, PixelShape, Spin2};
 use shearq_submissions::{Configuration, EllipticityType, Method};
 
 use self::linear::LinearFamily;
@@ -203,28 +203,22 @@ impl NoiseMoments {
         }
     }
 
-    /// Mean second derivatives of the ellipticity of type `kind`.
-    fn ellipticity(&self, kind: EllipticityType, chi: Distortion) -> [[f64; 4]; 2] {
-        let of_type = |noise: usize| match kind {
-            EllipticityType::Distortion => self.distortion.map(|means| means[noise]),
-            EllipticityType::Shear => {
-                // With f and s of `response_of_type` and g = f²/s, ∂²ε_i/∂χ_j∂χ_k is
-                // g(χ_i δ_jk + χ_j δ_ik + χ_k δ_ij + h χ_i χ_j χ_k), h = (2f + 1/s)/s.
-                let x = [chi.e1, chi.e2];
-                let s = (1.0 - x[0] * x[0] - x[1] * x[1]).sqrt();
-                let f = 1.0 / (1.0 + s);
-                let (g, h) = (f * f / s, (2.0 * f + 1.0 / s) / s);
-                let [p11, p12, p22] = [0, 1, 4].map(|pair: usize| self.products[pair][noise]);
-                let along = [p11 * x[0] + p12 * x[1], p12 * x[0] + p22 * x[1]];
-                let square = along[0] * x[0] + along[1] * x[1];
-                // A change of χ is like the response to one shear that changes both components.
-                let change = self.distortion.map(|means| [means[noise]; 2]);
-                let change = response_of_type(kind, chi, change);
-                [0, 1].map(|i| {
-                    let curved = x[i] * (p11 + p22 + h * square) + 2.0 * along[i];
-                    change[i][i] + g * curved
-                })
-            }
+    /// Mean second derivatives of the reported ellipticity.
+    fn ellipticity(&self, reported: Reported, chi: Distortion) -> [[f64; 4]; 2] {
+        // With F of `Reported`, ∂²e_i/∂χ_j∂χ_k is 2F′(χ_i δ_jk + χ_j δ_ik + χ_k δ_ij) + 4F″ χ_i χ_j χ_k.
+        let [_, first, second] = reported.factors(chi);
+        let x = [chi.e1, chi.e2];
+        let of_type = |noise: usize| {
+            let [p11, p12, p22] = [0, 1, 4].map(|pair: usize| self.products[pair][noise]);
+            let along = [p11 * x[0] + p12 * x[1], p12 * x[0] + p22 * x[1]];
+            let square = along[0] * x[0] + along[1] * x[1];
+            // A change of χ is like the response to one shear that changes both components.
+            let change = self.distortion.map(|means| [means[noise]; 2]);
+            let change = reported.response(chi, change);
+            [0, 1].map(|i| {
+                let turned = x[i] * (p11 + p22) + 2.0 * along[i];
+                change[i][i] + 2.0 * first * turned + 4.0 * second * x[i] * square
+            })
         };
         let all: [[f64; 2]; 4] = std::array::from_fn(of_type);
         [0, 1].map(|i| all.map(|means| means[i]))
@@ -281,8 +275,8 @@ impl Found {
         }
     }
 
-    /// The measurement with an ellipticity of type `kind`, before calibration.
-    pub(crate) fn measurement(&self, kind: EllipticityType, noise: f64) -> Measurement {
+    /// The measurement, before calibration.
+    pub(crate) fn measurement(&self, reported: Reported, noise: f64) -> Measurement {
         let measured = Measurement {
             descent: Some(self.descent),
             noise,
@@ -291,7 +285,7 @@ impl Found {
             size: self.size,
             ..Measurement::flagged(Flag::NoShear)
         };
-        let (e, response) = match self.ellipticity(kind) {
+        let (e, response) = match self.ellipticity(reported) {
             Ok(found) => found,
             Err(flag) => {
                 return Measurement {
@@ -300,7 +294,7 @@ impl Found {
                 };
             }
         };
-        let observables = self.observables(kind);
+        let observables = self.observables(reported);
         let pair = observables.as_ref().zip(response);
         Measurement {
             e1: e[0],
@@ -310,25 +304,22 @@ impl Found {
             // its trace. The rest is noise that averages need not have: R11 and R22 correlate with −0.43, and with the mean of
             // both the error of m is 1.5 times smaller. Sheared catalogues may be cut by e, and need all of R.
             response: response.map(|[[r11, _], [_, r22]]| isotropic(0.5 * (r11 + r22))),
-            e_variance: self.e_variance(kind),
+            e_variance: self.e_variance(reported),
             observables,
             sheared: pair.and_then(|(observables, response)| {
-                self.sheared_catalogues(kind, e, response, observables)
+                self.sheared_catalogues(reported, e, response, observables)
             }),
             ..measured
         }
     }
 
-    /// The ellipticity of type `kind`, and its response if the method determines it.
-    fn ellipticity(
-        &self,
-        kind: EllipticityType,
-    ) -> Result<([f64; 2], Option<ResponseMatrix>), Flag> {
+    /// The reported ellipticity, and its response if the method determines it.
+    fn ellipticity(&self, reported: Reported) -> Result<([f64; 2], Option<ResponseMatrix>), Flag> {
         let chi = self.distortion?;
-        let mut e = of_type(kind, chi).ok_or(Flag::NoShear)?;
-        let mut response = self.response.map(|r| response_of_type(kind, chi, r));
+        let mut e = reported.ellipticity(chi).ok_or(Flag::NoShear)?;
+        let mut response = self.response.map(|r| reported.response(chi, r));
         if let Some(noise) = &self.noise_moments {
-            let curved = noise.ellipticity(kind, chi);
+            let curved = noise.ellipticity(reported, chi);
             for (row, curved) in response.iter_mut().flatten().zip(curved) {
                 for (value, curved) in row.iter_mut().zip(curved) {
                     *value -= curved;
@@ -341,26 +332,27 @@ impl Found {
         Ok((e, response))
     }
 
-    /// Variances of an ellipticity of type `kind` by noise, of the galaxies that they are determined for.
-    fn e_variance(&self, kind: EllipticityType) -> [f64; 2] {
+    /// Variances of the reported ellipticity by noise, of the galaxies that they are determined for.
+    fn e_variance(&self, reported: Reported) -> [f64; 2] {
         let (Ok(chi), Some(noise)) = (self.distortion, &self.noise_moments) else {
             return [0.0; 2];
         };
         // Products of χ₁ and χ₂ in noise as it is.
         let [p11, p12, p22] = [0, 1, 4].map(|pair: usize| noise.products[pair][3]);
-        response_of_type(kind, chi, [[1.0, 0.0], [0.0, 1.0]])
+        reported
+            .response(chi, [[1.0, 0.0], [0.0, 1.0]])
             .map(|[a, b]| a * a * p11 + 2.0 * a * b * p12 + b * b * p22)
     }
 
-    /// Flux and size with their couplings to an ellipticity of type `kind`.
-    fn observables(&self, kind: EllipticityType) -> Option<Observables> {
+    /// Flux and size with their couplings to the reported ellipticity.
+    fn observables(&self, reported: Reported) -> Option<Observables> {
         let (chi, found) = (self.distortion.ok()?, self.observables.as_ref()?);
         let [size, first, second] = found.size;
         let mut size_response = found.square_response.map(|response| first * response);
         let mut coupling = Coupling::default();
         if let Some(moments) = &self.noise_moments {
             let product = |number: usize, noise: usize| moments.products[number][noise];
-            let jacobian = response_of_type(kind, chi, [[1.0, 0.0], [0.0, 1.0]]);
+            let jacobian = reported.response(chi, [[1.0, 0.0], [0.0, 1.0]]);
             let with_e = |i: usize, numbers: [usize; 2], noise: usize| {
                 let [one, two] = numbers.map(|number| product(number, noise));
                 jacobian[i][0] * one + jacobian[i][1] * two
@@ -421,7 +413,7 @@ impl Found {
     /// effect of noise is unknown, it is not corrected.
     fn sheared_catalogues(
         &self,
-        kind: EllipticityType,
+        reported: Reported,
         e: [f64; 2],
         response: ResponseMatrix,
         observables: &Observables,
@@ -430,7 +422,7 @@ impl Found {
         let settings = found.sheared?;
         let noise = self.noise_moments.as_ref();
         let products = noise.map(|noise| noise.products).unwrap_or_default();
-        let [[a, b], [c, d]] = response_of_type(kind, chi, [[1.0, 0.0], [0.0, 1.0]]);
+        let [[a, b], [c, d]] = reported.response(chi, [[1.0, 0.0], [0.0, 1.0]]);
         // Rows are e1, e2, flux and size; columns χ₁, χ₂, T and flux.
         let rows = [
             [a, b, 0.0, 0.0],
@@ -483,30 +475,71 @@ fn turned(by: &Spin2, Distortion { e1, e2 }: Distortion) -> Distortion {
     Distortion::new(e1, e2)
 }
 
-/// The ellipticity of type `kind`; `None` if the distortion exceeds 1 and has no shear-type ellipticity.
-fn of_type(kind: EllipticityType, chi: Distortion) -> Option<[f64; 2]> {
-    match kind {
-        EllipticityType::Distortion => Some([chi.e1, chi.e2]),
-        EllipticityType::Shear => chi.to_shear().map(|Shear { e1, e2 }| [e1, e2]),
-    }
+/// What is reported of a distortion: e = χ F(|χ|²).
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Reported {
+    kind: EllipticityType,
+    /// Modulus a of an ellipticity e that is reported as e/√(1 + |e|²/a²); zero to report e.
+    saturation: f64,
 }
 
-/// The response of the ellipticity of type `kind`, from the response of the distortion.
-fn response_of_type(kind: EllipticityType, chi: Distortion, r: ResponseMatrix) -> ResponseMatrix {
-    match kind {
-        EllipticityType::Distortion => r,
-        EllipticityType::Shear => {
-            // ε = χ f, f = 1/(1 + s), s = √(1 − |χ|²): ∂ε_i/∂χ_j = f δ_ij + χ_i χ_j f²/s.
-            let s = (1.0 - chi.e1 * chi.e1 - chi.e2 * chi.e2).sqrt();
-            let f = 1.0 / (1.0 + s);
-            let cross = |a: f64, b: f64| a * b * f * f / s;
-            let (own1, own2) = (f + cross(chi.e1, chi.e1), f + cross(chi.e2, chi.e2));
-            let other = cross(chi.e1, chi.e2);
-            [
-                [0, 1].map(|j| own1 * r[0][j] + other * r[1][j]),
-                [0, 1].map(|j| own2 * r[1][j] + other * r[0][j]),
-            ]
+impl Reported {
+    pub(crate) fn of(configuration: &Configuration) -> Self {
+        Reported {
+            kind: configuration.ellipticity(),
+            saturation: match &configuration.method {
+                Method::Network(_) => 0.0,
+                Method::Linear(linear) => linear.shape.saturation,
+            },
         }
+    }
+
+    /// F and its first and second derivative with u = |χ|².
+    fn factors(self, chi: Distortion) -> [f64; 3] {
+        let u = chi.e1 * chi.e1 + chi.e2 * chi.e2;
+        let [f, f1, f2] = match self.kind {
+            EllipticityType::Distortion => [1.0, 0.0, 0.0],
+            EllipticityType::Shear => {
+                // 1/(1 + s), s = √(1 − u).
+                let s = (1.0 - u).sqrt();
+                let f = 1.0 / (1.0 + s);
+                let g = f * f / s;
+                [f, 0.5 * g, 0.25 * g * (2.0 * f + 1.0 / s) / s]
+            }
+        };
+        if self.saturation == 0.0 {
+            return [f, f1, f2];
+        }
+        // F H(v), H = (1 + v/a²)^(−1/2), v = u F² = |e|².
+        let per_square = self.saturation.powi(-2);
+        let v1 = f * f + 2.0 * u * f * f1;
+        let v2 = 4.0 * f * f1 + 2.0 * u * (f1 * f1 + f * f2);
+        let h = (1.0 + u * f * f * per_square).sqrt().recip();
+        let h1 = -0.5 * per_square * h.powi(3);
+        let h2 = 0.75 * per_square * per_square * h.powi(5);
+        [
+            f * h,
+            f1 * h + f * h1 * v1,
+            f2 * h + 2.0 * f1 * h1 * v1 + f * (h2 * v1 * v1 + h1 * v2),
+        ]
+    }
+
+    /// The ellipticity; `None` if the distortion exceeds 1 and has no shear-type ellipticity.
+    fn ellipticity(self, chi: Distortion) -> Option<[f64; 2]> {
+        let [f, ..] = self.factors(chi);
+        f.is_finite().then(|| [chi.e1 * f, chi.e2 * f])
+    }
+
+    /// The response of the ellipticity, from the response of the distortion: ∂e_i/∂χ_j = F δ_ij + 2F′ χ_i χ_j.
+    fn response(self, chi: Distortion, r: ResponseMatrix) -> ResponseMatrix {
+        let [f, first, _] = self.factors(chi);
+        let cross = |a: f64, b: f64| 2.0 * first * a * b;
+        let (own1, own2) = (f + cross(chi.e1, chi.e1), f + cross(chi.e2, chi.e2));
+        let other = cross(chi.e1, chi.e2);
+        [
+            [0, 1].map(|j| own1 * r[0][j] + other * r[1][j]),
+            [0, 1].map(|j| own2 * r[1][j] + other * r[0][j]),
+        ]
     }
 }
 
@@ -563,12 +596,42 @@ mod tests {
         }
     }
 
+    const fn reported(kind: EllipticityType, saturation: f64) -> Reported {
+        Reported { kind, saturation }
+    }
+
+    const REPORTED: [Reported; 4] = [
+        reported(EllipticityType::Distortion, 0.0),
+        reported(EllipticityType::Shear, 0.0),
+        reported(EllipticityType::Distortion, 0.4),
+        reported(EllipticityType::Shear, 0.2),
+    ];
+
+    #[test]
+    fn factors_of_reported_ellipticities_have_their_derivatives() {
+        for reported in REPORTED {
+            for u in [0.04f64, 0.3, 0.7] {
+                let at = |u: f64| reported.factors(Distortion::new(u.sqrt() * 0.6, u.sqrt() * 0.8));
+                let step = 1e-5;
+                let ([plus, first, ..], [minus, first_before, ..]) = (at(u + step), at(u - step));
+                let [_, slope, curvature] = at(u);
+                // Truncation and rounding of differences.
+                let slopes = [plus - minus, first - first_before].map(|apart| apart / (2.0 * step));
+                assert!((slopes[0] - slope).abs() < 1e-6, "{reported:?} {u}");
+                assert!((slopes[1] - curvature).abs() < 1e-5 * (1.0 + curvature.abs()));
+            }
+        }
+        let saturated = REPORTED[3].ellipticity(Distortion::new(0.0, 0.8)).unwrap();
+        // χ = 0.8 is ε = 0.5.
+        assert!((saturated[1] - 0.5 / 7.25f64.sqrt()).abs() < 1e-12 && saturated[0] == 0.0);
+    }
+
     #[test]
     fn turned_galaxies_turn_all_that_refers_to_shear() {
         // A rotation by 90° changes the signs of spin-2 components and of nothing else; a reflection those of e2 and γ2.
         let quarter = [[0.0, -1.0], [1.0, 0.0]];
         let mirror = [[-1.0, 0.0], [0.0, 1.0]];
-        for kind in [EllipticityType::Distortion, EllipticityType::Shear] {
+        for kind in REPORTED {
             let plain = found().measurement(kind, 1.0);
             for (matrix, signs) in [(quarter, [-1.0, -1.0]), (mirror, [1.0, -1.0])] {
                 let (orientation, _) = Jacobian::new(matrix).unwrap().factors();
