@@ -182,7 +182,7 @@ const WAYS: [(&str, &[&str]); 32] = [
     ),
     (
         "challenge check",
-        &["ENTRY challenge truth team json threads"],
+        &["ENTRY challenge json threads"],
     ),
     (
         "challenge rank",
