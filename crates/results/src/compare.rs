@@ -9,8 +9,6 @@ use shearq_dataset::fingerprint;
 use shearq_dataset::layout::{DataFolder, MAX_SET};
 use shearq_dataset::run::{Run, Source};
 use shearq_dataset::threads::Pool;
-use shearq_files::frames::polars::{DataFrame, PolarsError};
-use shearq_files::frames::reals;
 use shearq_files::{FileError, names_of};
 use shearq_render::table::Cell;
 use shearq_scoring::resample::{PairedDifference, PairedSet, paired_difference};
@@ -20,7 +18,7 @@ use thiserror::Error;
 
 use crate::catalogues::Catalogues;
 use crate::expression::{Expression, Operand, fits};
-use crate::record::{RunRecord, SetRecord, columns_named, frame_of};
+use crate::record::{Column, RunRecord, SetRecord, columns_named, compared};
 use crate::score::{ScoreError, ScoredSet, score_variants, unscored};
 use crate::submit::{Sent, Submission, is_packed};
 
@@ -213,8 +211,6 @@ fn given_catalogues(
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ChoiceError {
-    #[error(transparent)]
-    Table(#[from] PolarsError),
     #[error(
         "--where: unknown column of a results store (found `{found}`, expected one of {known})"
     )]
@@ -238,38 +234,48 @@ pub fn choose(
     condition: &Expression,
     mut runs: Vec<RunRecord>,
 ) -> Result<Vec<RunRecord>, ChoiceError> {
-    let table = frame_of(&runs)?;
-    let operands = condition.operands().iter();
-    let values: Vec<Vec<f64>> = operands
-        .map(|operand| values(&table, operand))
-        .collect::<Result<_, _>>()?;
-    let mut rows = 0..table.height();
+    let operands = condition.operands().iter().map(compared_column);
+    let columns: Vec<Column> = operands.collect::<Result<_, _>>()?;
     for run in &mut runs {
-        run.sets.retain(|_| {
-            let row = rows.next().unwrap_or_default();
+        let mut sets = std::mem::take(&mut run.sets);
+        sets.retain(|set| {
+            let held = condition.value(&|place| match (
+                &condition.operands()[place].pattern,
+                columns[place].number(set),
+            ) {
+                (_, Some(number)) => number,
+                (pattern, None) => {
+                    let text = columns[place].text(run, set).unwrap_or_default();
+                    let fits = pattern.as_ref().is_some_and(|own| fits(own, &text));
+                    f64::from(u8::from(fits))
+                }
+            });
             // A missing number, such as Q of a set without errors, meets no condition.
-            let held = condition.value(&|place| values[place][row]);
             held != 0.0 && !held.is_nan()
         });
+        run.sets = sets;
     }
     runs.retain(|run| !run.sets.is_empty());
     Ok(runs)
 }
 
-fn values(table: &DataFrame, operand: &Operand) -> Result<Vec<f64>, ChoiceError> {
-    let name = &operand.column;
-    let column = table.column(name).map_err(|_| ChoiceError::UnknownColumn {
-        found: name.clone(),
-        known: names_of(&table.get_column_names()),
-    })?;
-    match (&operand.pattern, column.str()) {
-        (Some(pattern), Ok(texts)) => Ok(texts
-            .iter()
-            .map(|text| f64::from(u8::from(fits(pattern, text.unwrap_or_default()))))
-            .collect()),
-        (Some(_), Err(_)) => Err(ChoiceError::Numbers(name.clone())),
-        (None, Ok(_)) => Err(ChoiceError::Text(name.clone())),
-        (None, Err(_)) => Ok(reals(column).unwrap_or_default().into_owned()),
+fn compared_column(
+    Operand {
+        column: name,
+        pattern,
+    }: &Operand,
+) -> Result<Column, ChoiceError> {
+    let Some((_, column)) = compared().find(|(own, _)| own == name) else {
+        let known: Vec<String> = compared().map(|(name, _)| name).collect();
+        return Err(ChoiceError::UnknownColumn {
+            found: name.clone(),
+            known: names_of(&known),
+        });
+    };
+    match (pattern, column.is_text()) {
+        (Some(_), false) => Err(ChoiceError::Numbers(name.clone())),
+        (None, true) => Err(ChoiceError::Text(name.clone())),
+        _ => Ok(column),
     }
 }
 

@@ -1,7 +1,5 @@
-//! The record of a scored set, with the one list of its columns: stores are written, conditions met and tables
-//! printed by it. docs/files.md describes the columns.
-
-use std::path::Path;
+//! The record of a scored set, with the one list of its columns: conditions are met and tables printed by it.
+//! docs/files.md describes the columns.
 
 use serde::{Deserialize, Serialize};
 use shearq_dataset::fingerprint::{self, Fingerprint};
@@ -9,8 +7,6 @@ use shearq_dataset::layout::DataFolder;
 use shearq_dataset::record::nan_for_null;
 use shearq_dataset::run::Source;
 use shearq_files::FileError;
-use shearq_files::frames::polars::{Column as FrameColumn, DataFrame, PolarsResult};
-use shearq_files::table::MAX_ROWS;
 use shearq_quantities::Frame;
 use shearq_render::table::Cell;
 use shearq_scoring::resample::mean_over_sets;
@@ -19,14 +15,13 @@ use shearq_scoring::{
     SpectrumScore,
 };
 use shearq_simulate::kinds::SetKind;
-use shearq_submissions::check_name;
+use shearq_submissions::checked_name;
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SetRecord {
     /// 0 for plain files, which have no number.
     pub set: u32,
     /// Whether the set was simulated; its number then gives its kind.
-    #[serde(default = "yes")]
     pub simulated: bool,
     /// [`fingerprint::of_set`], empty unless the record is stored.
     pub data: String,
@@ -41,6 +36,7 @@ pub struct SetRecord {
     pub metrics: Metrics,
     pub errors: Metrics,
     /// Q with each group of images left out in turn, for paired differences.
+    #[serde(deserialize_with = "nan_for_null")]
     pub q_replicates: Vec<f64>,
     #[serde(deserialize_with = "nan_for_null")]
     pub q_calibrated_replicates: Vec<f64>,
@@ -56,10 +52,6 @@ pub struct SetRecord {
 
 fn is_pixel(frame: &Frame) -> bool {
     *frame == Frame::Pixel
-}
-
-fn yes() -> bool {
-    true
 }
 
 impl SetRecord {
@@ -122,9 +114,11 @@ impl SetRecord {
 }
 
 /// The sets of one configuration, scored in one way.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RunRecord {
     /// Name of the configuration, or of another program's catalogues.
+    // Stores come from others, and names end up on terminals and in file names.
+    #[serde(deserialize_with = "checked_name")]
     pub configuration: String,
     pub version: String,
     /// TOML, or where the catalogues are.
@@ -229,7 +223,7 @@ impl RunRecord {
     }
 }
 
-/// A column of a store, and of the tables that are printed from records.
+/// A column of the tables that are printed from records, and of conditions on these.
 #[derive(Debug, Clone, Copy)]
 pub struct Column {
     pub name: &'static str,
@@ -250,6 +244,8 @@ enum Value {
     Real(fn(&SetRecord) -> f64),
     /// The mean with its error.
     Metric(Metric),
+    /// The error, in conditions alone.
+    Error(fn(&Metrics) -> f64),
 }
 
 const fn column(name: &'static str, heading: &'static str, value: Value) -> Column {
@@ -287,7 +283,7 @@ fn kind(set: &SetRecord, label: fn(&SetKind) -> &'static str) -> String {
 /// The column of the frame, which tables have if it is not that of the pixels.
 pub const FRAME: &str = "frame";
 
-const BEFORE_METRICS: [Column; 21] = [
+const BEFORE_METRICS: [Column; 19] = [
     of_run("run", "Run", RunRecord::id),
     of_run("submission", "Configuration", |run| {
         run.configuration.clone()
@@ -309,15 +305,13 @@ const BEFORE_METRICS: [Column; 21] = [
     }),
     text("snr", "S/N", |set| kind(set, |k| k.image.snr_class())),
     text("size", "Size", |set| kind(set, |k| k.image.size_class())),
-    text("data", "Data", |set| set.data.clone()),
     count("images", "Images", |set| set.images.len() as u64),
-    text("image_numbers", "Image numbers", |set| list(&set.images)),
     count("galaxies", "Galaxies", |set| set.galaxies),
     count("flagged", "Flagged", |set| set.flagged),
     text(FRAME, "Frame", |set| set.frame.to_string()),
 ];
 
-const AFTER_METRICS: [Column; 6] = [
+const AFTER_METRICS: [Column; 4] = [
     column(
         "q_leaderboard",
         "Q leaderboard",
@@ -329,12 +323,6 @@ const AFTER_METRICS: [Column; 6] = [
     }),
     count("convention_leaderboard", "Conv. leaderboard", |set| {
         set.convention_leaderboard.into()
-    }),
-    text("q_replicates", "Q replicates", |set| {
-        list(&set.q_replicates)
-    }),
-    text("q_calibrated_replicates", "Q cal. replicates", |set| {
-        list(&set.q_calibrated_replicates)
     }),
 ];
 
@@ -354,9 +342,47 @@ pub fn columns_named(names: &[&str]) -> Vec<Column> {
     names.iter().filter_map(named).collect()
 }
 
+/// The columns that conditions name: all, and the error of each metric, such as `q_error`.
+pub fn compared() -> impl Iterator<Item = (String, Column)> {
+    columns().flat_map(|own| {
+        let error = match own.value {
+            Value::Metric(Metric { value, .. }) => {
+                let value = Value::Error(value);
+                Some((format!("{}_error", own.name), Column { value, ..own }))
+            }
+            _ => None,
+        };
+        [(own.name.to_owned(), own)].into_iter().chain(error)
+    })
+}
+
 // The mean of a text or a convention over sets has no meaning, so that such columns are printed for single sets and for
 // groups in which they are equal.
 impl Column {
+    pub fn is_text(&self) -> bool {
+        matches!(self.value, Value::OfRun(_) | Value::Text(_))
+    }
+
+    /// The text of a set; `None` in a column of numbers.
+    pub fn text(&self, run: &RunRecord, set: &SetRecord) -> Option<String> {
+        match self.value {
+            Value::OfRun(value) => Some(value(run)),
+            Value::Text(value) => Some(value(set)),
+            _ => None,
+        }
+    }
+
+    /// The number of a set; `None` in a column of texts.
+    pub fn number(&self, set: &SetRecord) -> Option<f64> {
+        match self.value {
+            Value::OfRun(_) | Value::Text(_) => None,
+            Value::Count(value) => Some(value(set) as f64),
+            Value::Real(value) => Some(value(set)),
+            Value::Metric(metric) => Some((metric.value)(&set.metrics)),
+            Value::Error(value) => Some(value(&set.errors)),
+        }
+    }
+
     /// The cell of the sets of `run`.
     pub fn cell(&self, run: &RunRecord) -> Cell {
         match self.value {
@@ -369,7 +395,7 @@ impl Column {
     pub fn cell_of_sets(&self, sets: &[SetRecord]) -> Cell {
         let count = sets.len() as f64;
         match self.value {
-            Value::OfRun(_) => Cell::Empty,
+            Value::OfRun(_) | Value::Error(_) => Cell::Empty,
             Value::Text(value) => sets
                 .first()
                 .map_or(Cell::Empty, |set| Cell::text(value(set))),
@@ -390,197 +416,6 @@ pub fn mean(sets: &[SetRecord], metric: fn(&Metrics) -> f64) -> (f64, f64) {
         .map(|set| (metric(&set.metrics), metric(&set.errors)))
         .collect();
     mean_over_sets(&pairs)
-}
-
-/// The frame of a store: a row per set of each run. A metric has a second column with its error.
-pub fn frame_of(runs: &[RunRecord]) -> PolarsResult<DataFrame> {
-    let sets = runs
-        .iter()
-        .flat_map(|run| run.sets.iter().map(move |set| (run, set)));
-    let real = |name: &str, value: &dyn Fn(&SetRecord) -> f64| {
-        let values: Vec<f64> = sets.clone().map(|(_, set)| value(set)).collect();
-        FrameColumn::new(name.into(), values)
-    };
-    let on_sky = sets.clone().any(|(_, set)| !is_pixel(&set.frame));
-    let mut frame = Vec::new();
-    for Column { name, value, .. } in columns().filter(|own| own.name != FRAME || on_sky) {
-        match value {
-            Value::OfRun(value) => {
-                let texts: Vec<String> = sets.clone().map(|(run, _)| value(run)).collect();
-                frame.push(FrameColumn::new(name.into(), texts));
-            }
-            Value::Text(value) => {
-                let texts: Vec<String> = sets.clone().map(|(_, set)| value(set)).collect();
-                frame.push(FrameColumn::new(name.into(), texts));
-            }
-            Value::Count(value) => {
-                let counts: Vec<i64> = sets.clone().map(|(_, set)| value(set) as i64).collect();
-                frame.push(FrameColumn::new(name.into(), counts));
-            }
-            Value::Real(value) => frame.push(real(name, &value)),
-            Value::Metric(Metric { value, .. }) => {
-                frame.push(real(name, &|set| value(&set.metrics)));
-                frame.push(real(&format!("{name}_error"), &|set| value(&set.errors)));
-            }
-        }
-    }
-    shearq_files::frames::frame(frame)
-}
-
-// Numbers as a JSON list with all digits. JSON has no NaN, so that numbers that are not finite become null.
-fn list<T: ToString + Copy + Into<f64>>(numbers: &[T]) -> String {
-    let text = |number: &T| match (*number).into().is_finite() {
-        true => number.to_string(),
-        false => "null".into(),
-    };
-    let texts: Vec<String> = numbers.iter().map(text).collect();
-    format!("[{}]", texts.join(","))
-}
-
-/// The run whose sets are the rows of the frame of a file.
-pub fn run_of_frame(frame: &DataFrame, path: &Path) -> Result<RunRecord, FileError> {
-    let rows = Rows { path, frame };
-    let text = |name| rows.text(name, 0).map(str::to_owned);
-    let configuration = text("submission")?;
-    // Stores come from others, and names end up on terminals and in file names.
-    check_name(&configuration).map_err(|error| FileError::new(path, error.to_string()))?;
-    let run = RunRecord {
-        configuration,
-        version: text("version")?,
-        settings: text("settings")?,
-        source: text("source")?,
-        definition: text("definition")?,
-        choice: text("choice")?,
-        noise: text("noise")?,
-        sets: (0..frame.height())
-            .map(|row| rows.set(row))
-            .collect::<Result<_, _>>()?,
-    };
-    // The settings determine the id, so that an edited setting is noticed.
-    let id = run.id();
-    for row in 0..frame.height() {
-        let found = rows.text("run", row)?;
-        if found != id {
-            let message = format!(
-                "row {}: `run` disagrees with the other columns (found {found}, expected {id}). Was the file edited?",
-                row + 1
-            );
-            return Err(FileError::new(path, message));
-        }
-    }
-    Ok(run)
-}
-
-// Rows of a file. Every value is checked, because other programs write Parquet, too.
-struct Rows<'a> {
-    path: &'a Path,
-    frame: &'a DataFrame,
-}
-
-impl Rows<'_> {
-    fn found<T>(
-        &self,
-        name: &str,
-        row: usize,
-        expected: &str,
-        value: impl FnOnce(&FrameColumn) -> Option<T>,
-    ) -> Result<T, FileError> {
-        let column = self.frame.column(name).ok();
-        column.and_then(value).ok_or_else(|| {
-            let message = format!("row {}: column `{name}`: expected a {expected}", row + 1);
-            FileError::new(self.path, message)
-        })
-    }
-
-    fn text(&self, name: &str, row: usize) -> Result<&str, FileError> {
-        let column = self.frame.column(name).ok();
-        let text = column.and_then(|column| column.str().ok()?.get(row));
-        self.found(name, row, "text", |_| text)
-    }
-
-    fn real(&self, name: &str, row: usize) -> Result<f64, FileError> {
-        self.found(name, row, "real number", |column| {
-            column.f64().ok()?.get(row)
-        })
-    }
-
-    fn count<T: TryFrom<i64>>(&self, name: &str, row: usize) -> Result<T, FileError> {
-        self.found(name, row, "number in the range of counts", |column| {
-            T::try_from(column.i64().ok()?.get(row)?).ok()
-        })
-    }
-
-    // A count that would overflow sums if it were larger than any data have.
-    fn at_most(&self, name: &str, row: usize, most: u64) -> Result<u64, FileError> {
-        match self.count::<u64>(name, row)? {
-            found if found <= most => Ok(found),
-            found => {
-                let message = format!(
-                    "row {}: column `{name}` is {found}; expected at most {most}",
-                    row + 1
-                );
-                Err(FileError::new(self.path, message))
-            }
-        }
-    }
-
-    fn list<T>(&self, name: &str, row: usize) -> Result<Vec<T>, FileError>
-    where
-        Vec<T>: serde::de::DeserializeOwned,
-    {
-        let text = self.text(name, row)?;
-        self.found(name, row, "list of numbers", |_| {
-            serde_json::from_str(text).ok()
-        })
-    }
-
-    fn reals(&self, name: &str, row: usize) -> Result<Vec<f64>, FileError> {
-        let numbers = self.list::<Option<f64>>(name, row)?;
-        Ok(numbers.into_iter().map(|x| x.unwrap_or(f64::NAN)).collect())
-    }
-
-    fn metrics(&self, ending: &str, row: usize) -> Result<Metrics, FileError> {
-        let mut values = [f64::NAN; Metrics::ALL.len()];
-        for (value, Metric { name, .. }) in values.iter_mut().zip(Metrics::ALL) {
-            let column = format!("{name}{ending}");
-            // Files of earlier versions lack metrics that were added later.
-            if name == Metrics::ALWAYS || self.frame.column(&column).is_ok() {
-                *value = self.real(&column, row)?;
-            }
-        }
-        Ok(Metrics::from_values(values))
-    }
-
-    fn set(&self, row: usize) -> Result<SetRecord, FileError> {
-        let images: Vec<u32> = self.list("image_numbers", row)?;
-        self.at_most("images", row, images.len() as u64)?;
-        // Sums over sets would overflow with counts that no images can have.
-        let galaxies = self.at_most("galaxies", row, images.len() as u64 * MAX_ROWS as u64)?;
-        Ok(SetRecord {
-            set: self.count("set", row)?,
-            // A missing column is an error: it would make simulated sets count as data of unknown kind.
-            simulated: !self.text("set_kind", row)?.is_empty(),
-            data: self.text("data", row)?.to_owned(),
-            images,
-            galaxies,
-            flagged: self.at_most("flagged", row, galaxies)?,
-            frame: match self.frame.column(FRAME) {
-                Ok(_) => {
-                    let word = self.text(FRAME, row)?.parse();
-                    self.found(FRAME, row, "frame, pixel or sky", |_| word.ok())?
-                }
-                Err(_) => Frame::Pixel,
-            },
-            metrics: self.metrics("", row)?,
-            errors: self.metrics("_error", row)?,
-            q_replicates: self.reals("q_replicates", row)?,
-            q_calibrated_replicates: self.reals("q_calibrated_replicates", row)?,
-            q_leaderboard: self.real("q_leaderboard", row)?,
-            convention: self.count("convention", row)?,
-            convention_known: self.count::<u8>("convention_known", row)? > 0,
-            convention_leaderboard: self.count("convention_leaderboard", row)?,
-        })
-    }
 }
 
 #[cfg(test)]

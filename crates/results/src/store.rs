@@ -1,25 +1,28 @@
-//! A results store: a folder with one Parquet file per recorded run, one row per set.
+//! A results store: a folder with one JSON file per recorded run.
 //!
 //! A file's name is derived from its content. Processes that write into one store therefore do not collide, and
-//! recording a run twice has no effect. docs/files.md describes the columns.
+//! recording a run twice has no effect. docs/files.md describes the keys.
 
 use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
 use std::path::{Path, PathBuf};
 
-use shearq_files::frames::Metadata;
-use shearq_files::frames::polars::PolarsError;
-use shearq_files::parquet;
-
-use super::record::{RunRecord, frame_of, run_of_frame};
+use serde::{Deserialize, Serialize};
 use shearq_dataset::fingerprint;
+use shearq_dataset::record::{read_record, record_text};
+use shearq_files::table::MAX_ROWS;
 use shearq_files::{FileError, atomic};
 
-// Key and value in the footer that identify the files of a store.
-const SCHEMA: (&str, &str) = ("schema", "shearq results store 1");
+use super::record::RunRecord;
 
-// Most sets of one run: ten times the highest number in file names.
-const MAX_SETS: usize = 100_000;
+// Identifies the files of a store.
+const SCHEMA: &str = "shearq results store 1";
+
+#[derive(Serialize, Deserialize)]
+struct Stored<R> {
+    schema: String,
+    run: R,
+}
 
 /// A store's folder. A new folder that stays empty is removed.
 #[derive(Debug)]
@@ -44,15 +47,15 @@ pub fn prepare(store: &Path) -> Result<Prepared, FileError> {
 }
 
 pub fn write(store: &Path, run: &RunRecord) -> Result<PathBuf, FileError> {
-    let failed = |error: PolarsError| FileError::new(store, error);
-    let metadata = Metadata::from([(SCHEMA.0.to_owned(), SCHEMA.1.to_owned())]);
-    let table = frame_of(std::slice::from_ref(run)).map_err(failed)?;
-    let mut bytes = Vec::new();
-    parquet::write(&mut bytes, &table, &metadata).map_err(failed)?;
+    let stored = Stored {
+        schema: SCHEMA.into(),
+        run,
+    };
+    let text = record_text(store, &stored)?;
     // The name contains a hash of the content: processes that write at the same time do not collide, and recording a run
     // twice has no effect.
-    let path = store.join(file_name(run, &bytes));
-    atomic::write(&path, &bytes)?;
+    let path = store.join(file_name(run, text.as_bytes()));
+    atomic::write(&path, text.as_bytes())?;
     Ok(path)
 }
 
@@ -63,19 +66,19 @@ fn file_name(run: &RunRecord, bytes: &[u8]) -> String {
         .filter(|word| !word.is_empty())
         .collect();
     let print = fingerprint::of_bytes(bytes);
-    format!("{}-{}-{print}.parquet", words.join("-"), run.id())
+    format!("{}-{}-{print}.json", words.join("-"), run.id())
 }
 
 fn read_run(path: &Path) -> Result<RunRecord, FileError> {
-    let table = parquet::read(path, None, MAX_SETS)?;
-    let metadata = parquet::metadata(path)?;
-    let found = metadata.get(SCHEMA.0).map(String::as_str);
-    if found != Some(SCHEMA.1) {
+    let Some(Stored { schema, run }) = read_record::<Stored<RunRecord>>(path)? else {
+        return Err(FileError::new(
+            path,
+            "the file was removed while the store was read",
+        ));
+    };
+    if schema != SCHEMA {
         let message = format!(
-            "not a file of a results store (found {}, expected `{}` = \"{}\" in the metadata)",
-            found.map_or("no schema".into(), |found| format!("schema \"{found}\"")),
-            SCHEMA.0,
-            SCHEMA.1
+            "not a file of a results store (found the schema `{schema}`, expected `{SCHEMA}`)"
         );
         return Err(FileError::new(path, message));
     }
@@ -92,7 +95,18 @@ fn read_run(path: &Path) -> Result<RunRecord, FileError> {
         );
         return Err(FileError::new(path, message));
     }
-    run_of_frame(&table, path)
+    for set in &run.sets {
+        // Sums over sets would overflow with counts that no images can have.
+        let most = (set.images.len() * MAX_ROWS) as u64;
+        if set.galaxies > most || set.flagged > set.galaxies {
+            let message = format!(
+                "set {}: found {} galaxies, {} of them flagged; expected at most {most}",
+                set.set, set.galaxies, set.flagged
+            );
+            return Err(FileError::new(path, message));
+        }
+    }
+    Ok(run)
 }
 
 /// The run of each file of a store, in order of the names.
@@ -107,7 +121,7 @@ pub fn files(store: &Path) -> Result<Vec<(PathBuf, RunRecord)>, FileError> {
             let hidden = path
                 .file_name()
                 .is_some_and(|name| name.as_encoded_bytes().starts_with(b"."));
-            !hidden && path.extension().is_some_and(|ending| ending == "parquet")
+            !hidden && path.extension().is_some_and(|ending| ending == "json")
         })
         .collect();
     // Folders are listed in any order, but warnings and tables must not depend on it.
@@ -160,7 +174,6 @@ fn merge(run: &mut RunRecord, more: RunRecord, path: &Path, notes: &mut Vec<Stri
 mod tests {
     use super::*;
     use crate::record::SetRecord;
-    use shearq_files::frames::polars::Column;
     use shearq_quantities::Frame;
     use shearq_scoring::Metrics;
 
@@ -239,23 +252,16 @@ mod tests {
     #[test]
     fn counts_that_no_catalogues_have_are_refused() {
         let folder = tempfile::tempdir().unwrap();
-        let path = write(folder.path(), &run("a", &[(1, 3, 5.5)])).unwrap();
-        let metadata = parquet::metadata(&path).unwrap();
-        for column in ["images", "galaxies", "flagged"] {
-            let mut table = parquet::read(&path, None, 1_000).unwrap();
-            let values = vec![1_i64 << 62; table.height()];
-            table
-                .with_column(Column::new(column.into(), values))
-                .unwrap();
-            let edited = tempfile::tempdir().unwrap();
-            let file = std::fs::File::create(edited.path().join("edited.parquet")).unwrap();
-            parquet::write(file, &table, &metadata).unwrap();
-            let message = read(edited.path()).unwrap_err().to_string();
-            let found = "is 4611686018427387904; expected at most";
-            assert!(
-                message.contains(&format!("row 1: column `{column}` {found}")),
-                "{message}"
-            );
+        for edit in [
+            |set: &mut SetRecord| set.galaxies = 1 << 62,
+            |set: &mut SetRecord| set.flagged = set.galaxies + 1,
+        ] {
+            let mut own = run("a", &[(1, 3, 5.5)]);
+            edit(&mut own.sets[0]);
+            let path = write(folder.path(), &own).unwrap();
+            let message = read(folder.path()).unwrap_err().to_string();
+            assert!(message.contains("set 1: found "), "{message}");
+            std::fs::remove_file(path).unwrap();
         }
     }
 }
