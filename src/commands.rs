@@ -24,4 +24,3 @@ pub(crate) mod show;
 pub(crate) mod simulate;
 pub(crate) mod study;
 pub(crate) mod submissions;
-pub(crate) mod unpack;
