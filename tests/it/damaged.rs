@@ -5,9 +5,6 @@ use std::fs;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
-use shearq_files::frames::Metadata;
-use shearq_files::frames::polars::df;
-use shearq_files::parquet;
 
 use crate::support::{PACKED, Small, fits_image, floats, pixels_of, shearq, text};
 
@@ -187,16 +184,4 @@ fn damaged_parquet_is_one_error_without_a_panic_message() {
             "{message}"
         );
     }
-}
-
-#[test]
-fn footers_of_parquet_files_are_bounded() {
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("long.parquet");
-    let frame = df!("x" => [1.0]).unwrap();
-    let metadata = Metadata::from([("a".to_owned(), "x".repeat(1 << 24))]);
-    parquet::write(fs::File::create(&path).unwrap(), &frame, &metadata).unwrap();
-    let error = parquet::read(&path, None, 1).unwrap_err().to_string();
-    assert!(error.contains("long.parquet"), "{error}");
-    assert!(error.contains("expected at most 16777216"), "{error}");
 }

@@ -6,6 +6,9 @@
 //! * Files are not memory-mapped: a mapped file that shrinks kills the process.
 //! * No second thread pool starts.
 //! * 8- and 16-bit integers decode into wider ones without polars' features for them.
+//!
+//! Rows are counted before memory is taken for them, but pages that compress to next to nothing are not: catalogues are the
+//! user's own, while entries of challenges, which strangers send, are text.
 
 use std::cell::Cell;
 use std::collections::{BTreeMap, BTreeSet};
@@ -37,18 +40,6 @@ use crate::open;
 const MAX_VECTOR: usize = 8;
 // The key under which Parquet files keep the Arrow schema.
 const SCHEMA_KEY: &str = "ARROW:schema";
-
-// Most values read of all columns of a file of fewer bytes than that; a larger one may have one for each byte.
-const FREE_VALUES: u64 = 1 << 22;
-// Most bytes of a page for each of its values if they are numbers: twice the widest, for dictionaries and gaps.
-const VALUE_BYTES: u64 = 16;
-// Most bytes that the pages of a column chunk, and all texts of a file, may unpack to beyond
-// `INFLATION` times the file's own.
-const FREE_BYTES: u64 = 1 << 26;
-// Most bytes of a footer: names, metadata, and some hundred bytes for each chunk of a column.
-const MAX_FOOTER: u32 = 1 << 24;
-// Most bytes for one of the file's in a large file.
-const INFLATION: u64 = 8;
 
 /// Writes `frame` as a Parquet file with `metadata` into `writer`.
 ///
@@ -140,9 +131,6 @@ pub fn read(
         Some(names) => source.pick(names)?,
     };
     source.check_rows(most_rows)?;
-    if wanted.is_none() {
-        source.check_values(fields.len())?;
-    }
     let columns = fields.iter().map(|field| source.read_column(field));
     let columns = columns.collect::<Result<_, FileError>>()?;
     frame(columns).map_err(|error| FileError::new(path, error))
@@ -281,8 +269,6 @@ struct Source<'a> {
     length: u64,
     footer: FileMetadataRef,
     fields: Vec<ArrowField>,
-    /// Bytes of text that may still be read.
-    text_left: u64,
 }
 
 impl<'a> Source<'a> {
@@ -290,7 +276,6 @@ impl<'a> Source<'a> {
         let cannot = || FileError::doing(path, "cannot read the file");
         let mut file = open::open(path).map_err(cannot())?;
         let length = file.metadata().map_err(cannot())?.len();
-        check_footer(&mut file, length).map_err(|detail| damaged(path, detail))?;
         let (footer, fields) = guarded(path, "footer", || {
             let mut reader = ParquetReader::new(&mut file);
             let fields = reader.schema()?.iter_values().cloned().collect();
@@ -302,7 +287,6 @@ impl<'a> Source<'a> {
             length,
             footer,
             fields,
-            text_left: unpacked_bytes(length),
         })
     }
 
@@ -324,22 +308,6 @@ impl<'a> Source<'a> {
         if rows > most {
             let message = format!("found {rows} rows, expected at most {most}");
             return Err(FileError::new(self.path, message));
-        }
-        Ok(())
-    }
-
-    /// Checks that a file of this size can contain this number of columns.
-    fn check_values(&self, columns: usize) -> Result<(), FileError> {
-        let rows = self.footer.num_rows;
-        let values = (rows as u64).saturating_mul(columns as u64);
-        let most = FREE_VALUES.max(self.length);
-        if values > most {
-            return Err(damaged(
-                self.path,
-                format!(
-                    "found {rows} rows of {columns} columns, expected at most {most} values in a file of this size"
-                ),
-            ));
         }
         Ok(())
     }
@@ -458,8 +426,7 @@ impl<'a> Source<'a> {
         let bytes = self
             .read_bytes(start, chunk.compressed_size())
             .map_err(damaged)?;
-        let most = unpacked_bytes(self.length).max(number_bytes(&field.dtype, most_values));
-        let series = guarded(path, &place, || decode(chunk, bytes, field, most))?;
+        let series = guarded(path, &place, || decode(chunk, bytes, field))?;
         if series.len() != group.num_rows() {
             return Err(damaged(format!(
                 "found {} rows, expected {}",
@@ -467,8 +434,6 @@ impl<'a> Source<'a> {
                 group.num_rows()
             )));
         }
-        let left = self.text_left.checked_sub(text_bytes(&series));
-        self.text_left = left.ok_or_else(|| damaged("found too much text".into()))?;
         wanted.taken(series).map_err(damaged)
     }
 
@@ -495,65 +460,29 @@ impl<'a> Source<'a> {
     }
 }
 
-// Checks the length of a footer, because parsing needs several times as much memory. The last eight bytes of a file are
-// this length and a mark.
-fn check_footer(file: &mut File, length: u64) -> Result<(), String> {
-    let mut end = [0; 8];
-    if length >= 8 {
-        file.seek(SeekFrom::Start(length - 8))
-            .and_then(|_| file.read_exact(&mut end))
-            .map_err(|error| error.to_string())?;
-    }
-    let [a, b, c, d, mark @ ..] = end;
-    let found = u32::from_le_bytes([a, b, c, d]);
-    // The reader reports a file without the mark.
-    match &mark == b"PAR1" && found > MAX_FOOTER {
-        true => Err(format!(
-            "found a footer of {found} bytes, expected at most {MAX_FOOTER}"
-        )),
-        false => Ok(()),
-    }
-}
-
 // The values in one column chunk of a file, as the type in `field`.
 fn decode(
     chunk: &ColumnChunkMetadata,
     bytes: Vec<u8>,
     field: &ArrowField,
-    most: u64,
 ) -> PolarsResult<Series> {
-    let wrong = |what: String| PolarsError::ComputeError(what.into());
     let length = bytes.len();
-    let dictionary = unpacked_size_of_first_page(&bytes);
     // Cloning it shares the bytes.
     let source = Cursor::new(bytes.into());
     let pages = || PageReader::new(source.clone(), chunk, Vec::new(), length);
-    // The decoder makes room for as many values as a page claims, a negative count being taken for
-    // a huge one, and for as many bytes; a failed allocation ends the process: add the claims up first.
-    let (mut claimed, mut unpacked) = (0_usize, 0_u64);
+    // The decoder makes room for as many values as a page claims, a negative count being taken for a huge one; a failed
+    // allocation ends the process: add the claims up first.
+    let mut claimed = 0_usize;
     for page in pages() {
-        let size = match page? {
-            CompressedPage::Data(page) => {
-                claimed = claimed.saturating_add(page.num_values());
-                if page.header().encoding().0 == DELTA_BYTE_ARRAY {
-                    return Err(wrong("found texts without their common beginnings (DELTA_BYTE_ARRAY), expected whole ones".into()));
-                }
-                page.uncompressed_size() as u64
-            }
-            CompressedPage::Dict(_) => dictionary.unwrap_or(u64::MAX),
-        };
-        unpacked = unpacked.saturating_add(size);
+        if let CompressedPage::Data(page) = page? {
+            claimed = claimed.saturating_add(page.num_values());
+        }
     }
     if i64::try_from(claimed) != Ok(chunk.num_values()) {
         let expected = chunk.num_values();
-        return Err(wrong(format!(
-            "found pages with {claimed} values, expected {expected} as in the footer"
-        )));
-    }
-    if unpacked > most {
-        return Err(wrong(format!(
-            "found pages that unpack to {unpacked} bytes, expected at most {most} in a file of this size"
-        )));
+        let wrong =
+            format!("found pages with {claimed} values, expected {expected} as in the footer");
+        return Err(PolarsError::ComputeError(wrong.into()));
     }
     let (arrays, _) = column_iter_to_arrays(
         vec![BasicDecompressor::new(pages(), Vec::new())],
@@ -562,59 +491,6 @@ fn decode(
         None,
     )?;
     Series::try_from((field, arrays))
-}
-
-// Number of the encoding in which a text repeats the beginning of the one before, so that a few bytes
-// stand for any number.
-const DELTA_BYTE_ARRAY: i32 = 7;
-
-/// Most bytes that a part of a file of `length` bytes may unpack to.
-fn unpacked_bytes(length: u64) -> u64 {
-    length.saturating_mul(INFLATION).max(FREE_BYTES)
-}
-
-/// Most bytes that the pages of `rows` values of this type may unpack to, whatever the size of the file. Of text, whose
-/// values have any length, none.
-fn number_bytes(decoded: &ArrowDataType, rows: usize) -> u64 {
-    match decoded {
-        ArrowDataType::Utf8View => 0,
-        _ => (rows as u64).saturating_mul(VALUE_BYTES),
-    }
-}
-
-/// Bytes of the texts of a column.
-fn text_bytes(series: &Series) -> u64 {
-    let texts = series.str().ok();
-    texts.map_or(0, |texts| {
-        texts.iter().flatten().map(|text| text.len() as u64).sum()
-    })
-}
-
-// Unpacked size of the first page of a column chunk; `None` if it cannot be determined. polars' reader does not expose
-// the size of a dictionary page.
-//
-// The header of a page is a list of fields in Thrift's compact form. Each is a byte with its number and type, and a
-// value. The first is the type of the page, the second its unpacked size.
-fn unpacked_size_of_first_page(bytes: &[u8]) -> Option<u64> {
-    const NEXT_FIELD_OF_32_BITS: u8 = 0x15;
-    let mut rest = bytes.iter();
-    let mut field = || {
-        if rest.next() != Some(&NEXT_FIELD_OF_32_BITS) {
-            return None;
-        }
-        // Seven bits a byte, the lowest first; the lowest of all is the sign.
-        let mut number = 0;
-        for shift in (0..35).step_by(7) {
-            let byte = *rest.next()?;
-            number |= u64::from(byte & 0x7f) << shift;
-            if byte < 0x80 {
-                return (number & 1 == 0).then_some(number >> 1);
-            }
-        }
-        None
-    };
-    field()?;
-    field()
 }
 
 // Runs a part of polars on the contents of a file.

@@ -184,29 +184,6 @@ fn files_that_are_no_parquet_are_refused() {
 }
 
 #[test]
-fn rows_and_texts_that_compress_to_nothing_are_counted() {
-    let folder = tempfile::tempdir().expect("temporary folder");
-    let refusal = |table: DataFrame| {
-        let path = place(folder.path(), &encode(&table));
-        parquet::read(&path, None, MOST)
-            .err()
-            .map(|error| error.to_string())
-    };
-    assert_eq!(refusal(df!("a" => vec![7_i64; 1 << 20]).unwrap()), None);
-    let error = refusal(df!("a" => vec![7_i64; 5_000_000]).unwrap()).expect("too many values");
-    assert!(
-        error.contains("found 5000000 rows of 1 columns, expected at most"),
-        "{error}"
-    );
-    let error =
-        refusal(df!("a" => vec!["x".repeat(10_000); 100_000]).unwrap()).expect("too much text");
-    assert!(
-        error.contains("too much text") || error.contains("unpack to"),
-        "{error}"
-    );
-}
-
-#[test]
 fn small_files_have_as_many_rows_as_the_caller_expects() {
     let folder = tempfile::tempdir().expect("temporary folder");
     // As a truth file of 2100 × 2100 cells without shear.
