@@ -527,7 +527,7 @@ impl Reported {
     /// The ellipticity; `None` if the distortion exceeds 1 and has no shear-type ellipticity.
     fn ellipticity(self, chi: Distortion) -> Option<[f64; 2]> {
         let [f, ..] = self.factors(chi);
-        f.is_finite().then(|| [chi.e1 * f, chi.e2 * f])
+        f.is_finite().then_some([chi.e1 * f, chi.e2 * f])
     }
 
     /// The response of the ellipticity, from the response of the distortion: ∂e_i/∂χ_j = F δ_ij + 2F′ χ_i χ_j.
