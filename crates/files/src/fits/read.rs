@@ -33,8 +33,8 @@ const TLONGLONG: c_int = 81;
 // The offset by which FITS stores unsigned 64-bit integers as signed ones.
 const UNSIGNED: f64 = 9_223_372_036_854_775_808.0;
 
-// Pixels that are read at a time: cfitsio swaps their bytes, missing ones are looked for, and all are copied, which takes less
-// time in the cache.
+// Pixels that are read at a time: cfitsio swaps their bytes, and missing ones are looked for, which takes less time in the
+// cache.
 const PIXELS_AT_A_TIME: usize = 1 << 14;
 
 // Pixels of this value are missing: SExtractor writes it, in single precision.
@@ -250,12 +250,11 @@ impl ImageReader {
             // A part of a tile takes as long as the tile.
             Pixels::Tiles(_) => count,
         };
-        let mut part = vec![P::default(); at_a_time];
         let mut pixels = Vec::with_capacity(count);
         while pixels.len() < count {
-            let part = &mut part[..at_a_time.min(count - pixels.len())];
-            self.fill(start + pixels.len(), part)?;
-            pixels.extend_from_slice(part);
+            let first = pixels.len();
+            pixels.resize(count.min(first + at_a_time), P::default());
+            self.fill(start + first, &mut pixels[first..])?;
         }
         self.next_row = last;
         if self.last && last == self.rows() {
