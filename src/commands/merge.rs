@@ -9,8 +9,9 @@ use crate::progress::{Bar, mark_resumable};
 use crate::{Findings, count, print, run, tell, tell_unread};
 use shearq_dataset::images::{self, ImageId, Shard};
 use shearq_dataset::layout::{DataFolder, MAX_IMAGE, check_folder};
-use shearq_dataset::record::{claim, read_record};
-use shearq_dataset::run::{RUN_FILE, Run, SIMULATION_FILE, SimulationRecord, Source};
+use shearq_dataset::run::{
+    RUN_FILE, Run, SIMULATION_FILE, SimulationRecord, Source, claim, read_record,
+};
 use shearq_files::open::is_there;
 use shearq_pipeline::complete::{Fault, Results};
 

@@ -7,8 +7,8 @@ use shearq_measure::{Measurement, Measurer, Stop};
 use shearq_submissions::Registry;
 
 use crate::{print, tell};
+use shearq_dataset::grid::Mosaic;
 use shearq_dataset::images::ImageId;
-use shearq_dataset::mosaic::Mosaic;
 use shearq_dataset::run::open_data;
 use shearq_dataset::threads::{ALL_CORES, Pool};
 use shearq_pipeline::measure::ImageSource;

@@ -2,7 +2,7 @@
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use shearq_dataset::record::{read_record, write_record};
+use shearq_dataset::run::{read_record, write_record};
 use shearq_files::fits::{ImageReader, ImageWriter, Value};
 use shearq_render::table::{Cell, Heading, Table, TableFormat};
 

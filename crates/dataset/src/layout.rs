@@ -1,18 +1,65 @@
-//! Names of the files of a challenge, and their conventions.
+//! Names of the files of a challenge, patterns of names with the numbers of sets and images, and conventions.
 
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use shearq_files::frames::polars::DataFrame;
+use shearq_files::open::is_there;
+use shearq_files::{FileError, open, table};
 use shearq_scoring::{Grid, Row, TrueShear, TruthSign};
 
-use crate::great3;
-use crate::listing::{self, Files};
-pub use crate::pattern::{IMAGE_PLACEHOLDERS, MAX_IMAGE, MAX_SET, MAX_STAMP, check_pattern, fill};
-use crate::pattern::{PLACEHOLDERS, endings};
-use shearq_files::FileError;
-use shearq_files::open::{self, is_there};
-use shearq_files::table;
+use crate::images::Files;
+use crate::{great3, images};
+
+/// Largest side of a postage stamp, in pixels.
+pub const MAX_STAMP: usize = 1024;
+
+pub const MAX_SET: u32 = 9_999;
+pub const MAX_IMAGE: u32 = 999_999;
+
+/// The forms of a number: at least as many digits as their place, from 1.
+// The files of GREAT10 are not padded, those of shearq have 2 and 3 digits, subfields of GREAT3 have 3.
+pub(crate) const SET_PLACEHOLDERS: [&str; 3] = ["{set}", "{set:02}", "{set:03}"];
+pub const IMAGE_PLACEHOLDERS: [&str; 3] = ["{image}", "{image:02}", "{image:03}"];
+pub(crate) const PLACEHOLDERS: [[&str; 3]; 2] = [SET_PLACEHOLDERS, IMAGE_PLACEHOLDERS];
+
+pub fn fill(pattern: &str, set: u32, image: u32) -> String {
+    let mut filled = pattern.to_owned();
+    for (forms, number) in PLACEHOLDERS.into_iter().zip([set, image]) {
+        for (form, digits) in forms.into_iter().zip(1..) {
+            filled = filled.replace(form, &format!("{number:0digits$}"));
+        }
+    }
+    filled
+}
+
+// Further endings of the names of images: of gzip and fpack.
+pub(crate) fn endings(pattern: &str) -> &'static [&'static str] {
+    match pattern.ends_with(".fits") || pattern.ends_with(".fit") {
+        true => &["", ".gz", ".fz"],
+        false => &[""],
+    }
+}
+
+/// Checks that the pattern of `key` has a placeholder of each kind in `needed`, and no other braces.
+pub fn check_pattern(key: &str, pattern: &str, needed: &[[&str; 3]]) -> Result<(), String> {
+    for one_of in needed {
+        if !one_of.iter().any(|name| pattern.contains(name)) {
+            return Err(format!(
+                "`{key}` is \"{pattern}\"; expected a pattern with {}",
+                one_of.join(" or ")
+            ));
+        }
+    }
+    let filled = fill(pattern, 1, 1);
+    if filled.is_empty() || filled.contains(['{', '}']) {
+        return Err(format!(
+            "`{key}` is \"{pattern}\"; expected the name of a file, in which only {} stand for numbers",
+            PLACEHOLDERS.as_flattened().join(", ")
+        ));
+    }
+    Ok(())
+}
 
 /// Name of the layout file inside a data folder.
 pub const LAYOUT_FILE: &str = "layout.toml";
@@ -237,7 +284,7 @@ impl DataFolder {
     /// The galaxy images of `sets` (of all if empty) that are there.
     pub fn images(&self, sets: &[u32]) -> Result<Files, FileError> {
         let pattern = &self.layout.galaxies;
-        listing::find(&self.root, pattern, endings(pattern), sets)
+        images::find(&self.root, pattern, endings(pattern), sets)
     }
 
     /// The data folder, if this is the folder of one of its sets.
@@ -248,13 +295,13 @@ impl DataFolder {
             .root
             .parent()
             .filter(|path| !path.as_os_str().is_empty());
-        let here = listing::find(root.parent()?, first, &[""], &[]).ok()?;
+        let here = images::find(root.parent()?, first, &[""], &[]).ok()?;
         // Any folder name with digits may look like that of a set; images of the layout in it decide.
         let is_set = here
             .sets()
             .into_iter()
             .any(|set| root.ends_with(fill(first, set, 0)));
-        let images = listing::find(&root, rest, endings(rest), &[]).ok()?;
+        let images = images::find(&root, rest, endings(rest), &[]).ok()?;
         (is_set && !images.is_empty()).then(|| above.map_or_else(|| "..".into(), Path::to_owned))
     }
 
@@ -264,7 +311,7 @@ impl DataFolder {
         for form in IMAGE_PLACEHOLDERS {
             pattern = pattern.replace(form, &fill(form, 0, 0));
         }
-        let truths = listing::find(&self.root, &pattern, &[""], &[])?;
+        let truths = images::find(&self.root, &pattern, &[""], &[])?;
         // The pattern has no {set}: one file may be the truth of a million sets.
         if truths.serve_all_sets() {
             return Ok(self.images(&[])?.sets());
@@ -354,4 +401,25 @@ fn rows_of<'t>(
         e1: e1[k],
         e2: e2[k],
     }))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn patterns_accept_plain_and_padded_numbers() {
+        assert_eq!(
+            fill("set{set:02}/galaxies-{image:03}.fits", 7, 12),
+            "set07/galaxies-012.fits"
+        );
+        assert_eq!(
+            fill("g10_v1_objs_{set}_{image}.me.dat", 7, 12),
+            "g10_v1_objs_7_12.me.dat"
+        );
+        assert_eq!(
+            fill("image-{set:03}-{image}.fits", 7, 0),
+            "image-007-0.fits"
+        );
+    }
 }

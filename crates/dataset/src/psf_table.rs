@@ -5,7 +5,7 @@ use std::path::Path;
 use shearq_quantities::Shear;
 use shearq_quantities::{FunctionalPsf, PsfProfile};
 
-use crate::mosaic::Mosaic;
+use crate::grid::Mosaic;
 use shearq_files::FileError;
 use shearq_files::atomic;
 use shearq_files::open;

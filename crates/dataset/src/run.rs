@@ -1,19 +1,19 @@
-//! The record of a folder of results: `run.json`, written before the first result.
+//! Records of folders of results: `run.json`, which is written before the first result, and the claim of a folder by it.
 
+use std::fs::File;
 use std::path::{Component, Path, PathBuf};
 
-use serde::{Deserialize, Serialize};
-use shearq_submissions::Configuration;
-
-use crate::images::{self, ImageId};
-use crate::layout::{DataFolder, Layout, check_folder, fill};
-use crate::listing::{self, Files};
-use crate::record::read_record;
-use shearq_files::FileError;
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Deserializer, Serialize};
 use shearq_files::open::is_there;
 use shearq_files::table::FileFormat;
+use shearq_files::{FileError, atomic};
 use shearq_simulate::kinds::SetKind;
 use shearq_simulate::set::SimulationSettings;
+use shearq_submissions::Configuration;
+
+use crate::images::{self, Files, ImageId};
+use crate::layout::{DataFolder, Layout, check_folder, fill};
 
 pub const RUN_FILE: &str = "run.json";
 
@@ -157,7 +157,7 @@ impl Run {
 
     /// The catalogues of `sets` (of all if empty) that are there.
     pub fn catalogues(&self, folder: &Path, sets: &[u32]) -> Result<Files, FileError> {
-        listing::find(folder, &self.pattern(), &[""], sets)
+        images::find(folder, &self.pattern(), &[""], sets)
     }
 
     fn pattern(&self) -> String {
@@ -276,6 +276,270 @@ fn resolve(path: &Path) -> std::io::Result<PathBuf> {
     Ok(path)
 }
 
+/// `None` if there is no record.
+pub fn read_record<R: DeserializeOwned>(path: &Path) -> Result<Option<R>, FileError> {
+    let text = match shearq_files::open::read_to_string(path, shearq_files::open::SETTINGS) {
+        Ok(text) => text,
+        Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
+        Err(error) => return Err(FileError::doing(path, "cannot read the record")(error)),
+    };
+    serde_json::from_str(&text).map(Some).map_err(|error| {
+        // `is_data`: valid JSON, but with other keys or types.
+        let hint = match error.is_data() {
+            true => "; the record belongs to another version. Try: another folder",
+            false => "",
+        };
+        FileError::new(path, format!("not a record of this kind: {error}{hint}"))
+    })
+}
+
+pub fn write_record(path: &Path, record: &impl Serialize) -> Result<(), FileError> {
+    atomic::write(path, record_text(path, record)?.as_bytes())
+}
+
+/// Indented, because users read and compare records. `path` is for messages.
+pub fn record_text(path: &Path, record: &impl Serialize) -> Result<String, FileError> {
+    let mut text = serde_json::to_string_pretty(record)
+        .map_err(FileError::doing(path, "cannot write the record"))?;
+    text.push('\n');
+    Ok(text)
+}
+
+/// Numbers that may be NaN. JSON has no NaN: serde_json writes null, which it does not read as a number.
+pub trait Numbers: Sized {
+    type Form: DeserializeOwned;
+    fn from_form(form: Self::Form) -> Self;
+}
+
+impl Numbers for f64 {
+    type Form = Option<f64>;
+    fn from_form(form: Option<f64>) -> Self {
+        form.unwrap_or(f64::NAN)
+    }
+}
+
+impl Numbers for Vec<f64> {
+    type Form = Vec<Option<f64>>;
+    fn from_form(form: Vec<Option<f64>>) -> Self {
+        form.into_iter().map(f64::from_form).collect()
+    }
+}
+
+impl<const N: usize> Numbers for [f64; N]
+where
+    [Option<f64>; N]: DeserializeOwned,
+{
+    type Form = [Option<f64>; N];
+    fn from_form(form: [Option<f64>; N]) -> Self {
+        form.map(f64::from_form)
+    }
+}
+
+/// For `#[serde(deserialize_with)]`: reads null as NaN.
+pub fn nan_for_null<'de, D: Deserializer<'de>, N: Numbers>(deserializer: D) -> Result<N, D::Error> {
+    N::Form::deserialize(deserializer).map(N::from_form)
+}
+
+/// A folder of results that this process writes to until it drops this. Other processes of the same settings may write to
+/// it too.
+#[derive(Debug)]
+#[must_use]
+pub struct Claim {
+    /// The record, with a shared lock on it.
+    record: File,
+    path: PathBuf,
+}
+
+impl Claim {
+    /// Checks that the record of the folder has not been removed or replaced.
+    pub fn check(&self) -> Result<(), FileError> {
+        if self.is_there() {
+            return Ok(());
+        }
+        let folder = self.path.parent().unwrap_or(&self.path);
+        let message = "the folder was removed or replaced while results were written to it; they are incomplete";
+        Err(FileError::new(folder, message))
+    }
+
+    /// The error of work in the folder: that the folder was removed, if it was, else `error`.
+    pub fn explain<E: From<FileError>>(&self, error: E) -> E {
+        self.check().map_or_else(E::from, |()| error)
+    }
+
+    // Whether the record is the file that was claimed.
+    #[cfg(unix)]
+    fn is_there(&self) -> bool {
+        use std::os::unix::fs::MetadataExt;
+        let (Ok(held), Ok(found)) = (self.record.metadata(), std::fs::metadata(&self.path)) else {
+            return false;
+        };
+        (held.dev(), held.ino()) == (found.dev(), found.ino())
+    }
+
+    // Windows does not remove an open file, so that a file of this name is the one that was claimed.
+    #[cfg(not(unix))]
+    fn is_there(&self) -> bool {
+        self.path.exists()
+    }
+
+    /// Checks the folder at the end of the work, and that all `results` are there.
+    pub fn check_results(
+        &self,
+        results: impl IntoIterator<Item = PathBuf>,
+    ) -> Result<(), FileError> {
+        self.check()?;
+        match results.into_iter().find(|path| !path.is_file()) {
+            None => Ok(()),
+            Some(path) => {
+                let message = "the file was removed while results were written to its folder. Try: the same command again";
+                Err(FileError::new(path, message))
+            }
+        }
+    }
+}
+
+/// Claims the folder of `path` for `record`. Writes the record if there is none, and refuses a folder with a different
+/// record. Leftovers of killed processes are removed if no other process is at work.
+pub fn claim<R: Serialize + DeserializeOwned>(path: &Path, record: &R) -> Result<Claim, FileError> {
+    let mut earlier: Option<R> = read_record(path)?;
+    if earlier.is_none() {
+        // If another process is first, its record is compared like any earlier record.
+        let _ = atomic::write_if_absent(path, record_text(path, record)?.as_bytes())?;
+        earlier = read_record(path)?;
+    }
+    let differences = differences(&earlier, &Some(record))
+        .map_err(|error| FileError::new(path, format!("cannot compare records: {error}")))?;
+    let folder = path.parent().unwrap_or(path);
+    if !differences.is_empty() {
+        return Err(FileError::new(
+            folder,
+            format!(
+                "this folder contains results of other settings (earlier ≠ now):\n  {}\nuse another folder, or remove this one",
+                most_important(differences).join("\n  ")
+            ),
+        ));
+    }
+    let file = open_to_lock(path).map_err(FileError::doing(path, "cannot open the record"))?;
+    // All processes at work hold a shared lock, so that an exclusive one shows that there are no others. Without this test, leftovers
+    // could be files that another process is just writing.
+    if file.try_lock().is_ok() {
+        atomic::remove_leftovers(folder)?;
+    }
+    // Shares the lock with other processes. On file systems without locks, leftovers stay and do no harm.
+    let _ = file.unlock();
+    let _ = file.lock_shared();
+    Ok(Claim {
+        record: file,
+        path: path.to_owned(),
+    })
+}
+
+// A message must fit on a screen. Chosen by hand.
+const MAX_DIFFERENCES: usize = 6;
+const MAX_DIFFERENCE_CHARS: usize = 160;
+
+// The differences that explain most, in this order, and the number of the others.
+fn most_important(mut differences: Vec<String>) -> Vec<String> {
+    const FIRST: [&str; 8] = [
+        "version",
+        "submission.name",
+        "submissions",
+        "submission.method",
+        "source",
+        "settings",
+        "simulation",
+        "images",
+    ];
+    differences.sort_by_key(|line| {
+        let key = line.split(": ").next().unwrap_or(line);
+        // Descriptions do not change results.
+        if key.ends_with("description") {
+            return FIRST.len() + 1;
+        }
+        let of = |first: &&str| {
+            key.strip_prefix(*first)
+                .is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
+        };
+        FIRST.iter().position(of).unwrap_or(FIRST.len())
+    });
+    let more = differences.len().saturating_sub(MAX_DIFFERENCES);
+    differences.truncate(MAX_DIFFERENCES);
+    for line in &mut differences {
+        if let Some((end, _)) = line.char_indices().nth(MAX_DIFFERENCE_CHARS) {
+            // Values of settings may be lists or texts of any length.
+            line.truncate(end);
+            line.push('…');
+        }
+    }
+    if more > 0 {
+        differences.push(format!("and {more} more"));
+    }
+    differences
+}
+
+// Opens a record so that it can be locked. Over NFS an exclusive lock requires write permission.
+fn open_to_lock(path: &Path) -> std::io::Result<File> {
+    let writable = File::options().read(true).write(true).open(path);
+    writable.or_else(|_| File::open(path))
+}
+
+/// Differences of two records, as `key: first ≠ second`; a missing value is null.
+pub fn differences(
+    first: &impl Serialize,
+    second: &impl Serialize,
+) -> Result<Vec<String>, serde_json::Error> {
+    let (first, second) = (serde_json::to_value(first)?, serde_json::to_value(second)?);
+    let mut found = Vec::new();
+    compare("", &first, &second, &mut found);
+    Ok(found)
+}
+
+fn compare(key: &str, a: &serde_json::Value, b: &serde_json::Value, found: &mut Vec<String>) {
+    if let (serde_json::Value::Array(a), serde_json::Value::Array(b)) = (a, b)
+        && let (Some(first), Some(second)) = (names(a), names(b))
+    {
+        if first != second {
+            let (first, second) = (first.join(", "), second.join(", "));
+            found.push(format!("{key}: {first} ≠ {second}"));
+            return;
+        }
+        for (k, (a, b)) in a.iter().zip(b).enumerate() {
+            compare(&format!("{key}[{k}]"), a, b, found);
+        }
+        return;
+    }
+    match (a, b) {
+        (serde_json::Value::Object(a), serde_json::Value::Object(b)) => {
+            let keys: std::collections::BTreeSet<&String> = a.keys().chain(b.keys()).collect();
+            for name in keys {
+                let null = serde_json::Value::Null;
+                let path = if key.is_empty() {
+                    name.clone()
+                } else {
+                    format!("{key}.{name}")
+                };
+                compare(
+                    &path,
+                    a.get(name).unwrap_or(&null),
+                    b.get(name).unwrap_or(&null),
+                    found,
+                );
+            }
+        }
+        _ if a != b => found.push(format!("{key}: {a} ≠ {b}")),
+        _ => {}
+    }
+}
+
+// Lists of named objects, such as configurations, are compared by name first: an inserted one would otherwise make all that
+// follow differ.
+fn names(values: &[serde_json::Value]) -> Option<Vec<&str>> {
+    values
+        .iter()
+        .map(|value| value.get("name")?.as_str())
+        .collect()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -314,5 +578,85 @@ mod tests {
             std::os::unix::fs::symlink(at("data"), at("link")).unwrap();
             assert_eq!(between("out", "link"), Path::new("../data"));
         }
+    }
+
+    #[test]
+    fn leftovers_are_removed_if_no_other_process_is_at_work() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("record.json");
+        let left = folder
+            .path()
+            .join("set01/.catalogue-001.fits.0123456789abcdef.part");
+        std::fs::create_dir(folder.path().join("set01")).unwrap();
+        std::fs::write(&left, "half").unwrap();
+        // Branches of GREAT3 have images three folders below the record.
+        let deep = folder
+            .path()
+            .join("control/ground/constant/.image-000-0.fits.0123456789abcdef.part");
+        std::fs::create_dir_all(deep.parent().unwrap()).unwrap();
+        std::fs::write(&deep, "half").unwrap();
+        let first = claim(&path, &1).unwrap();
+        assert!(!left.exists() && !deep.exists());
+        std::fs::write(&left, "being written").unwrap();
+        let second = claim(&path, &1).unwrap();
+        assert!(left.exists());
+        drop((first, second));
+        let _third = claim(&path, &1).unwrap();
+        assert!(!left.exists());
+        let message = claim(&path, &2).unwrap_err().to_string();
+        assert!(message.contains(": 1 ≠ 2"), "{message}");
+    }
+
+    #[test]
+    fn important_differences_come_first_and_others_are_counted() {
+        let mut lines: Vec<String> = (0..34)
+            .map(|k| format!("submission.a.k{k}: 1 ≠ 2"))
+            .collect();
+        lines.insert(0, "submission.description: \"a\" ≠ \"b\"".into());
+        lines.push("submission.name: \"a\" ≠ \"b\"".into());
+        lines.push("version: \"1\" ≠ \"2\"".into());
+        let shown = most_important(lines);
+        assert_eq!(shown.len(), MAX_DIFFERENCES + 1);
+        assert!(shown[0].starts_with("version") && shown[1].starts_with("submission.name"));
+        assert_eq!(shown[2], "submission.a.k0: 1 ≠ 2");
+        assert_eq!(shown[MAX_DIFFERENCES], "and 31 more");
+        assert_eq!(
+            most_important(vec!["images: 1 ≠ 2".into()]),
+            ["images: 1 ≠ 2"]
+        );
+    }
+
+    #[test]
+    fn a_removed_or_replaced_folder_is_detected() {
+        let root = tempfile::tempdir().unwrap();
+        let folder = root.path().join("out");
+        let path = folder.join("record.json");
+        let claimed = claim(&path, &1).unwrap();
+        let result = folder.join("result");
+        std::fs::write(&result, "").unwrap();
+        claimed.check_results([result.clone()]).unwrap();
+        std::fs::remove_file(&result).unwrap();
+        let message = claimed.check_results([result]).unwrap_err().to_string();
+        assert!(message.contains("was removed"), "{message}");
+        std::fs::remove_dir_all(&folder).unwrap();
+        assert!(claimed.check().is_err());
+        let _other = claim(&path, &1).unwrap();
+        let message = claimed.check().unwrap_err().to_string();
+        assert!(
+            message.contains("out: the folder was removed or replaced"),
+            "{message}"
+        );
+    }
+
+    #[test]
+    fn lists_of_named_things_differ_by_name_or_by_value() {
+        let of = |values: &[(&str, u32)]| -> Vec<serde_json::Value> {
+            let object = |&(name, size)| serde_json::json!({ "name": name, "size": size });
+            values.iter().map(object).collect()
+        };
+        let found = differences(&of(&[("a", 1), ("b", 2)]), &of(&[("a", 1)])).unwrap();
+        assert_eq!(found, [": a, b ≠ a"]);
+        let found = differences(&of(&[("a", 1), ("b", 2)]), &of(&[("a", 1), ("b", 3)])).unwrap();
+        assert_eq!(found, ["[1].size: 2 ≠ 3"]);
     }
 }

@@ -1,6 +1,6 @@
 //! The mean response to shear, and the mean shear with an error that includes the error of the response.
 
-use shearq_quantities::matrix::{determinant, inverse, solve};
+use shearq_quantities::linear::{determinant, inverse, solve};
 use shearq_quantities::statistics::RunningMean;
 use thiserror::Error;
 

@@ -7,18 +7,18 @@
 use std::f64::consts::PI;
 
 use ndarray::ArrayView2;
-use shearq_quantities::matrix::{Matrix2, apply, determinant};
+use shearq_quantities::linear::{Matrix2, apply, determinant};
 use shearq_quantities::statistics::{OF_MEDIAN, median, scatter};
 use shearq_submissions::PsfCut;
 
-use crate::centroid::{WEIGHT_SIGMA, galaxy_centroid_near};
 use crate::error::MeasureError;
-use crate::pixel::{PEAK_RANGE, Pixel, hash, highest};
+use crate::moments::{
+    CENTROID_WEIGHT_SIGMA, CORE_RADIUS_PX, CoreSize, core_sums, galaxy_centroid_near,
+};
 use crate::psf::quality::{self, PsfQuality};
 use crate::psf::{Psfs, Star};
-use crate::second_moments::{CORE_RADIUS_PX, CoreSize, core_sums};
 use crate::sky::{INNER_AREA, INNER_RADIUS, inner_light};
-use crate::stamp::{FullStamp, SkySubtraction};
+use crate::stamp::{FullStamp, PEAK_RANGE, Pixel, SkySubtraction, hash, highest};
 use crate::warning::Warning;
 
 // Largest side in px of the corner blocks in which the sky is measured. Chosen by hand.
@@ -64,7 +64,7 @@ const OTHER_GALAXIES: f64 = 0.1;
 // a set rarely have sixteen times less weight, and those that have need not be told from exposures without galaxies.
 const MIN_EPOCH_DEPTH: f64 = 0.25;
 // Noise of a star's centroid times its S/N in px: the σ of the centroid's weight.
-const PSF_CENTROID_NOISE: f64 = WEIGHT_SIGMA;
+const PSF_CENTROID_NOISE: f64 = CENTROID_WEIGHT_SIGMA;
 /// PSFs of single galaxies of an image that are examined.
 pub const EXAMINED_PSFS: usize = 100; // Chosen by hand.
 

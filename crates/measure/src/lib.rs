@@ -47,7 +47,6 @@
 
 mod asymmetry;
 mod calibration;
-mod centroid;
 mod deconvolve;
 mod denoise;
 mod error;
@@ -55,11 +54,10 @@ mod examine;
 mod measurement;
 mod measurer;
 mod method;
+mod moments;
 mod noise;
 pub mod parts;
-mod pixel;
 mod psf;
-mod second_moments;
 mod selection;
 mod session;
 mod shape;
@@ -79,7 +77,6 @@ pub use measurer::{Epoch, ImageNoise, ImageWorker, Measurer, PsfWorker, Steps, W
 pub use method::AdaptedSettings;
 pub use ndarray;
 pub use noise::{StampNoise, Survey};
-pub use pixel::{Pixel, Pixels};
 pub use psf::{Psfs, Star, average_stars};
 pub use selection::{Cut, Quantity, Selected, Selection};
 pub use session::{Batch, MeasuredImage, MeasuredRow, RowJob, Session};
@@ -92,6 +89,7 @@ pub use sky::Sky;
 pub use source::{
     ArraySource, KnownNoise, Lazy, LazyStamps, OneThread, StampRows, StampSource, Threads,
 };
+pub use stamp::{Pixel, Pixels};
 pub use warning::{ExaminedPsfs, PixelFrame, Warning};
 
 /// The examples of README.md.

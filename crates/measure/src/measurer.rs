@@ -16,9 +16,11 @@ use crate::error::{EpochError, MeasureError};
 use crate::measurement::{Flag, Measurement, PsfShape};
 use crate::method::{AdaptedSettings, CutEpoch, CutWorker, Images, MethodPlan, Reported};
 use crate::noise::{NoisePlan, StampNoise, Survey};
-use crate::pixel::{PEAK_RANGE, Pixel, all_finite, highest, is_level};
 use crate::psf::{Psfs, ResidualProfiles, Star, StarSurvey, cut_start};
-use crate::stamp::{FullStamp, MissingPixels, SkySubtraction, mark_padding_missing};
+use crate::stamp::{
+    FullStamp, MissingPixels, PEAK_RANGE, Pixel, SkySubtraction, all_finite, highest, is_level,
+    mark_padding_missing,
+};
 
 // The longest spacing of pixels is then 1.22 times that of square ones, and the largest wave number of the sharpest target,
 // 2.2 per pixel, still below the Nyquist frequency. Chosen by hand: cameras are below 0.02.

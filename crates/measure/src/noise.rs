@@ -25,13 +25,14 @@ use shearq_quantities::statistics::{SCATTER, median};
 use shearq_submissions::SkySource;
 
 use crate::asymmetry::Asymmetry;
-use crate::centroid::galaxy_centroid;
 use crate::error::MeasureError;
 use crate::examine::enough;
-use crate::pixel::{PEAK_RANGE, Pixel, all_finite, highest, padding};
-use crate::second_moments::GalaxyMoments;
+use crate::moments::{GalaxyMoments, galaxy_centroid};
 use crate::sky::{Sky, SkyLevels, inner_light};
-use crate::stamp::{FullStamp, MissingPixels, SkySubtraction, rotation_sum};
+use crate::stamp::{
+    FullStamp, MissingPixels, PEAK_RANGE, Pixel, SkySubtraction, all_finite, highest, padding,
+    rotation_sum,
+};
 use crate::warning::Warning;
 
 #[cfg(test)]

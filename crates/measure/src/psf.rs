@@ -1,13 +1,10 @@
 //! Point-spread functions: stars on stamps, and formulas.
 
 mod denoised_star;
-mod moffat;
 pub(crate) mod quality;
 mod residual_profile;
 mod shape;
 mod star;
-mod star_survey;
-pub(crate) mod width;
 
 use std::borrow::Cow;
 use std::ops::Range;
@@ -18,12 +15,14 @@ use shearq_submissions::PsfCut;
 
 pub(crate) use self::denoised_star::StarDenoiser;
 use self::quality::PsfQuality;
-pub(crate) use self::residual_profile::ResidualProfiles;
+pub(crate) use self::residual_profile::{ResidualProfiles, StarSurvey};
+pub(crate) use self::shape::{
+    WIDTH_STEPS, noise_equivalent_area, width_factor, width_step, width_step_of_area,
+};
 pub use self::star::Star;
 pub(crate) use self::star::cut_start;
-pub(crate) use self::star_survey::StarSurvey;
 use crate::error::MeasureError;
-use crate::pixel::Pixels;
+use crate::stamp::Pixels;
 
 // Above it stars differ by more than their noise, and count alike. Chosen by hand.
 const MAX_WEIGHT_SNR: f64 = 1000.0;

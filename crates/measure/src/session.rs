@@ -9,7 +9,7 @@ use std::ops::{ControlFlow, Range};
 use std::sync::Arc;
 
 use ndarray::{ArrayView3, Axis, CowArray, Ix3, Slice};
-use shearq_quantities::matrix::{Matrix2, inverse, product};
+use shearq_quantities::linear::{Matrix2, inverse, product};
 use shearq_quantities::statistics::upper_median;
 use shearq_quantities::{Frame, Jacobian};
 use shearq_submissions::limits::MIN_PSF;
@@ -21,11 +21,11 @@ use crate::examine::{EXAMINED_PSFS, Estimate, Examination, enough, examined_rows
 use crate::measurement::{Flag, Measurement};
 use crate::measurer::{Epoch, ImageNoise, ImageWorker, Measurer, Steps, Worker};
 use crate::noise::{NoisePlan, NoiseSurvey, StampNoise, Survey};
-use crate::pixel::{Pixel, Pixels, is_level};
 use crate::psf::{Psfs, ResidualProfiles};
 use crate::source::{
     ArraySource, KnownNoise, Lazy, LazyStamps, OneThread, StampRows, StampSource, Threads,
 };
+use crate::stamp::{Pixel, Pixels, is_level};
 use crate::warning::Warning;
 
 // In pixels along each axis. Chosen by hand.

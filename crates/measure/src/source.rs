@@ -10,8 +10,8 @@ use shearq_quantities::{Jacobian, columns_of};
 
 use crate::error::{MeasureError, length};
 use crate::measurer::Measurer;
-use crate::pixel::{Pixel, Pixels};
 use crate::psf::{Psfs, Star};
+use crate::stamp::{Pixel, Pixels};
 use crate::warning::Warning;
 
 /// The noise of an image before it is measured, as far as it is known.

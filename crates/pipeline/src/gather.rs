@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 use shearq_measure::{Examination, Warning};
-use shearq_quantities::matrix::Matrix2;
+use shearq_quantities::linear::Matrix2;
 use shearq_quantities::statistics::upper_median;
 use shearq_quantities::{Frame, Jacobian};
 
@@ -26,9 +26,9 @@ use super::PipelineError;
 use super::measure::check_strip;
 use crate::stamp_table::{self, Head, StampTable};
 use crate::wcs::{self, Wcs, aligned};
+use shearq_dataset::grid::Mosaic;
 use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::{DataFolder, MAX_STAMP};
-use shearq_dataset::mosaic::Mosaic;
 use shearq_files::FileError;
 use shearq_files::atomic;
 use shearq_files::frames::polars::Column;

@@ -22,9 +22,9 @@ use crate::PipelineError;
 use crate::engine::{self, Feeder};
 use crate::stamp_table::StampTable;
 use shearq_dataset::fingerprint::Inputs;
+use shearq_dataset::grid::Mosaic;
 use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::DataFolder;
-use shearq_dataset::mosaic::Mosaic;
 use shearq_dataset::run::Run;
 use shearq_dataset::threads::{Pool, Progress};
 

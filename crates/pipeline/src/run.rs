@@ -15,9 +15,9 @@ use shearq_submissions::{Configuration, PsfForm};
 
 use super::measure::{CatalogueWriter, ImageHead, ImageRow, Measured, Summary, measure_images};
 use super::{PipelineError, simulate};
+use shearq_dataset::grid::Mosaic;
 use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::DataFolder;
-use shearq_dataset::mosaic::Mosaic;
 use shearq_dataset::run::Run;
 use shearq_dataset::threads::Progress;
 use shearq_simulate::render::RenderScratch;

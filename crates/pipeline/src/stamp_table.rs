@@ -5,7 +5,7 @@
 use std::path::Path;
 
 use shearq_dataset::great3::{BranchLayout, GalaxyCatalogue};
-use shearq_dataset::mosaic::Mosaic;
+use shearq_dataset::grid::Mosaic;
 use shearq_files::FileError;
 use shearq_files::atomic;
 use shearq_files::frames::polars::{Column, DataFrame};

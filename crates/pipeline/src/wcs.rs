@@ -5,7 +5,7 @@ use std::cell::RefCell;
 
 use shearq_files::fits::{ImageReader, Value};
 use shearq_measure::{PixelFrame, Warning};
-use shearq_quantities::matrix::{Matrix2, apply, determinant, inverse, product};
+use shearq_quantities::linear::{Matrix2, apply, determinant, inverse, product};
 
 // Keys with the pixel scale in arcseconds: of surveys, and of GalSim.
 const PIXEL_SCALE_KEYS: [&str; 2] = ["PIXSCALE", "GS_SCALE"];

@@ -7,7 +7,7 @@ use std::str::FromStr;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-use crate::matrix::{Matrix2, apply, determinant};
+use crate::linear::{Matrix2, apply, determinant};
 
 /// The axes that components of ellipticities and shears refer to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
@@ -197,7 +197,7 @@ impl PixelShape {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::matrix::product;
+    use crate::linear::product;
     use crate::{Distortion, Shear};
 
     // Rotated, mirrored, and sheared with a skew of either sign.

@@ -5,7 +5,7 @@
 //! * [`units`]: degrees, radians, pixels and multipoles.
 //! * [`FunctionalPsf`]: a Moffat or Kolmogorov PSF, integrated over pixels, with its transform.
 //! * [`radial`]: tables of radial profiles, elliptical radii and quadrature rules.
-//! * [`linear`]: the solvers of linear equations; [`matrix`]: 2 × 2 matrices; [`product`]: products of small ones.
+//! * [`linear`]: the solvers of linear equations, and 2 × 2 matrices; [`product`]: products of small ones.
 //! * [`statistics`]: running means and medians.
 //!
 //! # Conventions
@@ -19,7 +19,6 @@
 mod ellipticity;
 mod jacobian;
 pub mod linear;
-pub mod matrix;
 pub mod product;
 mod psf;
 pub mod radial;

@@ -4,8 +4,8 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use shearq_dataset::images::Files;
 use shearq_dataset::layout::{DataFolder, read_rows};
-use shearq_dataset::listing::Files;
 use shearq_dataset::metadata::{Axes, CommonAxes, stated_axes};
 use shearq_dataset::run::{Run, Source};
 use shearq_files::FileError;

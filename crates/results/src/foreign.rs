@@ -7,8 +7,8 @@ use shearq_quantities::{Distortion, MeasuredRange, Shear};
 use shearq_scoring::{Grid, Row, RowCounts, RowFault};
 use shearq_submissions::{EllipticityType, checked_name};
 
+use shearq_dataset::images::{self, Files};
 use shearq_dataset::layout::{HINT_OF_COLUMNS, IMAGE_PLACEHOLDERS, check_pattern};
-use shearq_dataset::listing::{self, Files};
 use shearq_files::FileError;
 use shearq_files::atomic::folder_of;
 use shearq_files::table::{self, Place};
@@ -160,7 +160,7 @@ impl Foreign {
 
     /// The existing catalogues of `sets` (of all if empty).
     pub fn catalogues(&self, sets: &[u32]) -> Result<Files, FileError> {
-        listing::find(&self.folder, &self.catalogues, &[""], sets)
+        images::find(&self.folder, &self.catalogues, &[""], sets)
     }
 
     /// The rows of one image, at most `most`, converted to standard signs and the reported type.

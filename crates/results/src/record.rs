@@ -4,8 +4,7 @@
 use serde::{Deserialize, Serialize};
 use shearq_dataset::fingerprint::{self, Fingerprint};
 use shearq_dataset::layout::DataFolder;
-use shearq_dataset::record::nan_for_null;
-use shearq_dataset::run::Source;
+use shearq_dataset::run::{Source, nan_for_null};
 use shearq_files::FileError;
 use shearq_quantities::Frame;
 use shearq_render::table::Cell;

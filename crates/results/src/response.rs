@@ -15,7 +15,7 @@ use shearq_files::frames::{Metadata, frame};
 use shearq_files::table::{self, FileFormat};
 use shearq_measure::is_significant;
 use shearq_quantities::Frame;
-use shearq_quantities::matrix::solve;
+use shearq_quantities::linear::solve;
 use shearq_quantities::statistics::RunningMean;
 use shearq_submissions::Calibration;
 

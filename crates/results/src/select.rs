@@ -5,8 +5,7 @@ use std::path::Path;
 
 use shearq_dataset::fingerprint::{PRINTS, verify_source};
 use shearq_dataset::metadata::KEYS;
-use shearq_dataset::record::claim;
-use shearq_dataset::run::{RUN_FILE, Run, Source};
+use shearq_dataset::run::{RUN_FILE, Run, Source, claim};
 use shearq_dataset::threads::ALL_CORES;
 use shearq_files::frames::frame;
 use shearq_files::frames::polars::{Column, DataFrame};

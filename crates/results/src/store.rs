@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 use shearq_dataset::fingerprint;
-use shearq_dataset::record::{read_record, record_text};
+use shearq_dataset::run::{read_record, record_text};
 use shearq_files::table::MAX_ROWS;
 use shearq_files::{FileError, atomic};
 

@@ -21,7 +21,7 @@ use shearq_measure::{Measurement, Measurer, Worker};
 use shearq_quantities::Shear;
 use shearq_submissions::Calibration;
 
-use shearq_dataset::record::nan_for_null;
+use shearq_dataset::run::nan_for_null;
 use shearq_dataset::threads::Progress;
 use shearq_pipeline::PipelineError;
 use shearq_pipeline::engine;

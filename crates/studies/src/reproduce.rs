@@ -8,8 +8,8 @@ use shearq_scoring::{BINS, FieldSum, Grid, Noise, Options, Row, RowCounts, SetIm
 use shearq_submissions::{Configuration, checked_name};
 
 use super::response::{Regression, Response};
-use shearq_dataset::mosaic::Mosaic;
-use shearq_dataset::record::{Claim, claim, nan_for_null, read_record, write_record};
+use shearq_dataset::grid::Mosaic;
+use shearq_dataset::run::{Claim, claim, nan_for_null, read_record, write_record};
 use shearq_dataset::threads::Progress;
 use shearq_files::FileError;
 use shearq_measure::{Measurement, Measurer};

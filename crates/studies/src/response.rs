@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 use shearq_measure::Measurement;
 use shearq_quantities::Shear;
 
-use shearq_dataset::record::nan_for_null;
+use shearq_dataset::run::nan_for_null;
 
 /// Least squares of measured against true ellipticities, component by component:
 /// e = slope·ε + offset + noise.

@@ -47,7 +47,7 @@ use shearq_submissions::LinearDeconvolution;
 use super::network::high_pass;
 use crate::error::MeasureError;
 use crate::noise::StampNoise;
-use crate::pixel::{check_psf, check_sizes, copy_row};
+use crate::stamp::{check_psf, check_sizes, copy_row};
 use crate::transform::{
     HexLattice, LagsScratch, Modes, Plane, Spectrum, ToLags, ToModes, TransformScratch,
     even_parities, four_lanes, lanes, store, table,

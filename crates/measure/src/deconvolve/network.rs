@@ -26,7 +26,7 @@ use shearq_submissions::{
 
 use crate::error::{MeasureError, length};
 use crate::measurement::{Descent, Stop};
-use crate::pixel::{check_psf, check_sizes};
+use crate::stamp::{check_psf, check_sizes};
 use crate::transform::{Plane, Spectrum, ToModes, ToPixels, TransformScratch};
 
 /// High-pass kernel D of the regularisation; its elements sum to zero.

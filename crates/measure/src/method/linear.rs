@@ -28,19 +28,21 @@ use shearq_submissions::{LinearDeconvolution, LinearMethod, PsfCut, ShearOrigin}
 use super::{
     AdaptedSettings, CutEpoch, CutWorker, Found, FoundObservables, Images, NoiseMoments, image,
 };
-use crate::centroid::shear_origin;
 use crate::deconvolve::{
     EpochScratch, Lags, ModeNoise, Products, Spectral, SpectralEpoch, SpectralPsf, SpectralScratch,
     uniform,
 };
 use crate::error::MeasureError;
 use crate::measurement::{Descent, ResponseMatrix, Stop};
+use crate::moments::{WeightedMoments, shear_origin};
 use crate::noise::StampNoise;
-use crate::pixel::hash;
-use crate::psf::{ResidualProfiles, StarDenoiser, width};
-use crate::second_moments::WeightedMoments;
+use crate::psf::{
+    ResidualProfiles, StarDenoiser, WIDTH_STEPS, noise_equivalent_area, width_factor, width_step,
+    width_step_of_area,
+};
 use crate::shape::{AdaptiveMoments, AdaptiveScratch, AdaptiveShape, MeanSquare, SizeMoments};
 use crate::sheared::ShearSettings;
+use crate::stamp::hash;
 use crate::transform::HexLattice;
 
 // Of the error of the mean response, the choice of galaxies makes less than 1 % (tests/stress: base, snr10, cosmos20). Sheared
@@ -226,7 +228,7 @@ impl LinearFamily {
             n,
             cut,
             configured: Arc::new(LinearPlan::new(method, n, cut.size, variance)?),
-            others: width::WIDTH_STEPS.map(|_| Default::default()).collect(),
+            others: WIDTH_STEPS.map(|_| Default::default()).collect(),
         })
     }
 
@@ -240,7 +242,7 @@ impl LinearFamily {
             return Ok(Arc::clone(&self.configured));
         }
         let (step, window) = index;
-        let place = &self.others[(step - width::WIDTH_STEPS.start()) as usize][window];
+        let place = &self.others[(step - WIDTH_STEPS.start()) as usize][window];
         if let Some(plan) = place.get() {
             return Ok(Arc::clone(plan));
         }
@@ -248,7 +250,7 @@ impl LinearFamily {
         let target = &mut method.deconvolution.target_sigma;
         // A configured target beyond the bounds is kept.
         let (least, most) = (MIN_TARGET / *target, MAX_TARGET / *target);
-        let factor = width::scale_factor(step).clamp(least.min(1.0), most.max(1.0));
+        let factor = width_factor(step).clamp(least.min(1.0), most.max(1.0));
         *target *= factor;
         method.shape.weight_scale *= factor;
         let variance = Self::variance(&method, window);
@@ -339,7 +341,7 @@ impl CutWorker for LinearWorker {
         let window = known.map_or(CONFIGURED_WINDOW, |variance| {
             window_index(variance, settings.reference_extent)
         });
-        let index = (width::step(psf, settings.reference_area), window);
+        let index = (width_step(psf, settings.reference_area), window);
         self.current = place_of(index, &mut self.workers, &self.family, &self.noise)?;
         let worker = &mut self.workers[self.current].1;
         worker.set_pixel_shape(self.pixels, &self.noise);
@@ -388,7 +390,7 @@ impl CutWorker for LinearWorker {
             self.family.check_side(epoch.psf)?;
             let (weight, pixel) = (precision(&epoch) / total, epoch.pixels.area());
             let psf = self.denoiser.denoised(epoch.psf);
-            squares += weight / (width::noise_equivalent_area(psf) * pixel);
+            squares += weight / (noise_equivalent_area(psf) * pixel);
             if let Some((seen, psf)) = epoch.galaxy_variance.zip(self.moments.psf_mean_square(psf))
             {
                 surveyed += weight;
@@ -403,7 +405,7 @@ impl CutWorker for LinearWorker {
             false => CONFIGURED_WINDOW,
         };
         let index = (
-            width::step_of_area(1.0 / squares, settings.reference_area),
+            width_step_of_area(1.0 / squares, settings.reference_area),
             window,
         );
         self.current = place_of(index, &mut self.workers, &self.family, &self.noise)?;

@@ -11,9 +11,9 @@ use multiversion::multiversion;
 use ndarray::{Array2, ArrayView2, s};
 use shearq_submissions::PsfCut;
 
-use crate::centroid::{MAX_STAR_SHIFT, star_centroid};
 use crate::error::MeasureError;
-use crate::pixel::{Pixel, contiguous};
+use crate::moments::{MAX_STAR_SHIFT, star_centroid};
+use crate::stamp::{Pixel, contiguous};
 
 // One pixel off adds an ellipticity of about 0.01 for a PSF of 15 px. Chosen by hand.
 const MAX_CENTROID_OFFSET: f64 = 1.0;

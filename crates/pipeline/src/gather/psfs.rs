@@ -13,9 +13,9 @@ use super::source::{Files, Planes};
 use super::stamps::{Rows, central, first};
 use super::{Square, Stack};
 use crate::wcs::Wcs;
+use shearq_dataset::grid::Mosaic;
 use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::DataFolder;
-use shearq_dataset::mosaic::Mosaic;
 use shearq_dataset::psf_table;
 
 // Central pixels of a PSF that are examined, along each axis: those that configurations use.

@@ -11,7 +11,7 @@ use shearq_quantities::statistics::upper_median;
 use super::source::{Content, Exposure, Files, Origin, Planes, subpixel_offset};
 use super::{Gathering, Stamps};
 use crate::wcs::Wcs;
-use shearq_dataset::mosaic::Mosaic;
+use shearq_dataset::grid::Mosaic;
 
 pub(super) struct StampWriter {
     pub(super) image: Rows,

@@ -20,8 +20,7 @@ use shearq_dataset::metadata::{
     CATALOGUE_FIRST_PIXEL, CATALOGUE_FRAME, E_NOISE, NOT_APPLIED, PSF_NOISE, RESPONSE, WARNINGS,
     frame_entry,
 };
-use shearq_dataset::record::{Claim, claim};
-use shearq_dataset::run::{RUN_FILE, Run};
+use shearq_dataset::run::{Claim, RUN_FILE, Run, claim};
 use shearq_dataset::threads::Progress;
 
 #[derive(Debug, Clone, Copy)]

@@ -4,9 +4,9 @@ use std::collections::HashMap;
 use std::path::Path;
 
 use shearq_dataset::great3;
+use shearq_dataset::grid::Mosaic;
 use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::DataFolder;
-use shearq_dataset::mosaic::Mosaic;
 use shearq_files::FileError;
 use shearq_files::table::numbers;
 use shearq_measure::{

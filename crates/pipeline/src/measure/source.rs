@@ -17,10 +17,9 @@ use crate::PipelineError;
 use crate::stamp_table::StampTable;
 use crate::wcs::Wcs;
 use shearq_dataset::great3::{self, GalaxyCatalogue};
-use shearq_dataset::grid::{self, whole};
+use shearq_dataset::grid::{self, Mosaic, whole};
 use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::{DataFolder, Layout, MAX_STAMP, fill};
-use shearq_dataset::mosaic::Mosaic;
 use shearq_dataset::psf_table;
 
 // Several rows are in memory at a time: at most 64 MB of pixels each. Chosen by hand.

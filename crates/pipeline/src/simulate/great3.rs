@@ -6,8 +6,7 @@ use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 use shearq_dataset::great3::{self, file_name};
-use shearq_dataset::record::claim;
-use shearq_dataset::run::SIMULATION_FILE;
+use shearq_dataset::run::{SIMULATION_FILE, claim};
 use shearq_dataset::threads::Progress;
 use shearq_files::fits::{ImageReader, ImageWriter};
 use shearq_files::frames::polars::Column;

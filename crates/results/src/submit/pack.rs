@@ -17,7 +17,7 @@ use super::{Contents, Entry, FileSum, Kind, MANIFEST_FILE, MAX_FILES, Manifest, 
 use crate::catalogues::Catalogues;
 use crate::foreign::Foreign;
 use shearq_dataset::layout::DataFolder;
-use shearq_dataset::record::record_text;
+use shearq_dataset::run::record_text;
 use shearq_dataset::threads::Progress;
 use shearq_dataset::{grid, truth};
 use shearq_files::FileError;

@@ -16,7 +16,7 @@
 //! Stamps may be turned against each other. Modes are those of common axes, at which turned stamps are transformed as
 //! they are ([`ToTurnedModes`]); nothing is interpolated. The window is at the same place of the sky in all of them.
 
-use shearq_quantities::matrix::{Matrix2, apply, determinant, inverse, product};
+use shearq_quantities::linear::{Matrix2, apply, determinant, inverse, product};
 
 use super::*;
 use crate::transform::ToTurnedModes;
