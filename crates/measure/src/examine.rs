@@ -54,7 +54,7 @@ const LONG_CORRELATION: f64 = 0.03;
 // Fewest galaxies by which epochs are compared: the scatter of 30 is known to 13 %. Chosen by hand.
 const MIN_GALAXIES_EPOCHS: usize = 30;
 // Displacement of an epoch in px. Of two equal epochs it adds δ²/4 to a second moment of 3 px² or more, and hence less than 0.0004
-// to an ellipticity; centroids of PSFs with coma under the weight differ from those of galaxies by less.
+// to an ellipticity; weighted centroids of PSFs with coma and of galaxies differ by less.
 const EPOCH_OFFSET: f64 = 0.1;
 // Relative difference of the flux within 8 px. Chosen by hand: different seeing changes it by up to a tenth.
 const EPOCH_FLUX: f64 = 0.2;
@@ -124,7 +124,7 @@ pub struct Examination {
     added: usize,
     blank: usize,
     psfs: Vec<PsfQuality>,
-    /// Whether each PSF is that of one galaxy.
+    /// Whether there is a PSF per galaxy.
     each: bool,
 }
 
@@ -180,7 +180,7 @@ impl Examination {
         Examination { each: true, ..self }
     }
 
-    /// Examines the PSF of all galaxies, of sum one, which was `moved` by so many pixels to be in the middle.
+    /// Examines the PSF of all galaxies, of sum one, whose star was at the offset `moved` in pixels before it was centred.
     pub fn add_psf(&mut self, psf: ArrayView2<'_, f64>, moved: Option<[f64; 2]>) {
         self.psfs.extend(PsfQuality::from_psf(psf, moved));
     }
@@ -355,7 +355,7 @@ impl Examination {
     }
 
     /// How much the noise of the star changes m and c of a linear configuration: one standard deviation, the same for all
-    /// galaxies. `None` if each galaxy has a PSF of its own, or no PSF was examined.
+    /// galaxies. `None` if there is a PSF per galaxy, or no PSF was examined.
     pub fn psf_noise(&self) -> Option<[f64; 2]> {
         let psf = self.psfs.first().filter(|_| !self.each)?;
         Some(psf.noise_bias())
@@ -586,7 +586,7 @@ impl Examination {
         // An aperture of 8 px of other sides has other light.
         if common_flux && lit && (determinant(axes).abs() - 1.0).abs() < EPOCH_FLUX {
             let ratio = own.value / other.value;
-            // From pairs, whose fluxes differ less than those of different galaxies.
+            // From pairs, whose fluxes differ less than fluxes of different galaxies.
             let residuals = pairs
                 .iter()
                 .map(|(own, other)| own.flux - ratio * other.flux);
@@ -622,8 +622,8 @@ impl Examination {
         found
     }
 
-    /// The displacement of galaxies from those of the first epoch. That of the PSFs explains a part of it, because a galaxy is
-    /// where its PSF is, and deconvolution moves it back.
+    /// The displacement of galaxies from the first epoch, without the displacement of the PSFs: a galaxy moves with its PSF,
+    /// and deconvolution moves it back.
     fn displacement(
         &self,
         first: &Self,
@@ -673,8 +673,8 @@ impl Examination {
     }
 }
 
-/// A warning if one of two epochs has no light where the other has some. `fluxes` and `noise` are those of this epoch and of the
-/// first.
+/// A warning if one of two epochs has no light where the other has some. `fluxes` and `noise` are of this epoch and of the
+/// first one.
 fn missing_galaxies(fluxes: [Estimate; 2], noise: [f64; 2]) -> Option<Warning> {
     // Fluxes in units of the noise, because epochs may have different zero points.
     let seen = |k: usize| fluxes[k].is_significant() && fluxes[k].value > 0.0;
@@ -705,7 +705,7 @@ fn vector([x, y]: [Estimate; 2]) -> ([f64; 2], Estimate) {
 }
 
 /// Mean, variance and pairs of a square block from (y, x) on. A missing pixel counts as the mean of those that are present;
-/// if these are less than half, nothing is a number.
+/// if less than half are, all results are NaN.
 fn block(pixels: &[f32], n: usize, side: usize, (y0, x0): (usize, usize)) -> Block {
     let mut all = [0.0; BLOCK * BLOCK];
     let all = &mut all[..side * side];
@@ -787,7 +787,7 @@ fn trace(pixels: &[f32]) -> u64 {
 /// Median of up to four numbers, ignoring NaN.
 fn median_ignoring_nan(values: &mut [f64; 4]) -> f64 {
     values.sort_by(f64::total_cmp);
-    // Numbers that are none come last, or first if negative.
+    // NaN comes last, or first if its sign is negative.
     let first = values.iter().take_while(|value| value.is_nan()).count();
     let rest = &values[first..];
     let count = rest.iter().take_while(|value| !value.is_nan()).count();

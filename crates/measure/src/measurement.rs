@@ -6,7 +6,7 @@ use thiserror::Error;
 
 use crate::sheared::ShearedCatalogues;
 
-/// The adaptive moments of a PSF, pixels included: those of the elliptical Gaussian M that is its own best weight,
+/// The adaptive moments of a PSF, pixels included: the moments of the elliptical Gaussian M that is the best weight,
 /// M = 2 Σ W x xᵀ p / Σ W p with W = exp(−½ xᵀ M⁻¹ x) about the centroid under W (Bernstein & Jarvis 2002, AJ 123, 583;
 /// Hirata & Seljak 2003, MNRAS 343, 459). GalSim's `FindAdaptiveMom` has the same `observed_shape` and `moments_sigma`.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -46,7 +46,7 @@ pub struct Descent {
     pub first_energy: f64,
     /// E of the state returned.
     pub energy: f64,
-    /// Neurons above their threshold in the last iteration looked at.
+    /// Neurons above their threshold in the last iteration that was examined.
     pub updated: u32,
 }
 
@@ -280,7 +280,7 @@ impl Observables {
         self.flux / self.flux_error
     }
 
-    /// Light of the ring over the flux: what is beside the galaxy, relative to it. Single galaxies with half-light radii of 2.5 to 5 px
+    /// Light of the ring over the flux: the light of neighbours, relative to the galaxy. Single galaxies with half-light radii of 2.5 to 5 px
     /// have 0.1 to 0.5 at S/N 20.
     pub fn neighbour(&self) -> f64 {
         self.ring / self.flux

@@ -22,10 +22,10 @@ use crate::stamp::{
     mark_padding_missing,
 };
 
-// The longest spacing of pixels is then 1.22 times that of square ones, and the largest wave number of the sharpest target,
-// 2.2 per pixel, still below the Nyquist frequency. Chosen by hand: cameras are below 0.02.
+// Pixels are then 1.22 times as far apart as square ones, so that the largest wave number of the sharpest target, 2.2 per
+// pixel, is still below the Nyquist frequency. Chosen by hand: cameras are below 0.02.
 const MAX_PIXEL_SHEAR: f64 = 0.2;
-// The network works on pixels, so that a shear of pixels becomes an error of shears. Chosen by hand: a tenth of its own errors.
+// The network works on pixels, so that a shear of pixels becomes an error of shears. Chosen by hand: a tenth of the network's errors.
 const MAX_NETWORK_PIXEL_SHEAR: f64 = 1e-3;
 
 /// The plan of a measurement, for one configuration and one size of stamps. Measuring does not change it, so it serves
@@ -152,8 +152,8 @@ impl Measurer {
     /// Measures one stamp with its star stamp and noise level, which may be `None` if the configuration measures the noise
     /// on the border of the stamp.
     ///
-    /// The response is the galaxy's own. The ellipticity is **not calibrated**: dividing it by its own
-    /// response would be noisy and biased. Divide it by [`Batch::response`](crate::Batch::response) of galaxies like this one.
+    /// The response is determined on this galaxy. The ellipticity is **not calibrated**: the quotient of ellipticity and response
+    /// of one galaxy is noisy and biased. Divide it by [`Batch::response`](crate::Batch::response) of galaxies like this one.
     ///
     /// # Errors
     /// If sizes do not fit, the noise level is not finite, pixels are not (more of them than a linear method fills
@@ -536,16 +536,16 @@ impl ImageWorker<'_> {
     /// Measures one galaxy on several stamps, without calibration.
     ///
     /// Deconvolved stamps are combined in each Fourier mode with inverse-variance weights, the squares of the epochs' signal over
-    /// noise there, and the shape is measured once. Its noise is that of one stamp of the summed S/N², and its response
-    /// that of the combined image, where a mean of the epochs' ellipticities would divide by noisy responses. `noise` of
-    /// the measurement is that of the combination, per pixel of the first usable epoch; lengths are in its pixels. Shapes are in
+    /// noise there, and the shape is measured once. It is as noisy as on one stamp of the summed S/N², and responds like the
+    /// combined image, whereas a mean of the epochs' ellipticities would divide by noisy responses. `noise` of the
+    /// measurement is the noise of the combination, per pixel of the first usable epoch; lengths are in its pixels. Shapes are in
     /// the frame of the sky if there are Jacobians.
     ///
     /// An epoch without usable pixels has no weight, and without usable epochs the galaxy is flagged. The window of each epoch
-    /// is at its offset, and all light under it is measured. Stamps should have one flux: of bands, the shape is that of
-    /// the image summed with weights. One epoch with the galaxy in the centre of its stamp is measured as by
-    /// [`PsfWorker::measure`], with the same bits and what this worker knows of the image. Noise of several is taken as
-    /// white. The PSF of a [`PsfWorker`] has to be set again after it.
+    /// is at its offset, and all light under it is measured. Stamps should have one flux: for several bands, the shape is measured on
+    /// the weighted sum of the images. One epoch with the galaxy in the centre of its stamp is measured as by
+    /// [`PsfWorker::measure`], with the same bits and the survey of the image of this worker. Noise of several epochs is treated
+    /// as white. The PSF of a [`PsfWorker`] has to be set again after it.
     ///
     /// # Errors
     /// An [`EpochError`] if there are no epochs, a noise level is not above 0, an offset is beyond a quarter of the stamp, some
@@ -594,8 +594,8 @@ impl ImageWorker<'_> {
     /// Measures stamps, one per galaxy along the first axis, without calibration, in the noise of the image.
     ///
     /// # Errors
-    /// If sizes or numbers do not fit, or a PSF for all galaxies cannot be used. A galaxy whose own PSF cannot be used is
-    /// flagged.
+    /// If sizes or numbers do not fit, or a PSF for all galaxies cannot be used. With PSFs per galaxy, a galaxy with an
+    /// unusable PSF is flagged.
     pub fn measure_each<T: Pixel>(
         &mut self,
         stamps: ArrayView3<'_, T>,

@@ -65,7 +65,7 @@ pub(crate) trait CutWorker: Send {
     /// of [`PixelShape::map`]. A method that ignores it measures in pixels.
     fn set_pixel_shape(&mut self, _shape: PixelShape) {}
 
-    /// Sets the electrons per unit of the galaxies that follow, whose own Poisson noise is then part of their noise. A method
+    /// Sets the electrons per unit of the galaxies that follow, whose Poisson noise is then part of their noise. A method
     /// that ignores it takes the noise of the sky alone.
     fn set_gain(&mut self, _gain: Option<f64>) {}
 
@@ -82,8 +82,8 @@ pub(crate) trait CutWorker: Send {
     /// Measures a cut stamp of noise level `noise`. `None` if there is no unit of brightness.
     fn measure_cut(&mut self, cut: &[f32], noise: f64) -> Result<Option<Found>, MeasureError>;
 
-    /// Measures a galaxy on the cut stamps of so many epochs, which are combined before the shape is. Returns what was found
-    /// with the level of the combined noise, for a pixel of the first epoch. PSFs that were set are lost.
+    /// Measures a galaxy on the cut stamps of `count` epochs, which are combined before the shape is measured. Returns the
+    /// result with the level of the combined noise, for a pixel of the first epoch. PSFs that were set are lost.
     fn measure_epochs<'a>(
         &mut self,
         _count: usize,

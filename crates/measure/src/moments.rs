@@ -43,7 +43,7 @@ pub(crate) fn galaxy_centroid(stamp: &[f32], n: usize) -> [f32; 2] {
     galaxy_centroid_near(stamp, n, [0.0; 2])
 }
 
-/// The same of a galaxy that is expected at `start` from the centre, which it is if there is no light. Steps that fall short of the
+/// The same for a galaxy that is expected at `start` from the centre, which is returned if there is no light. Steps that fall short of the
 /// centroid leave no part of an offset that was expected.
 pub(crate) fn galaxy_centroid_near(stamp: &[f32], n: usize, start: [f64; 2]) -> [f32; 2] {
     centroid_and_light(stamp, n, start).0
@@ -136,7 +136,7 @@ fn step<P: Pixel, R: AsRef<[P]>>(
     Some((first.map(|sum| STEP_FACTOR * sum / light), light))
 }
 
-/// The weight at places one pixel apart, the first of which is `first` pixels from its centre.
+/// The weight at places one pixel apart, from `first` pixels from its centre on.
 fn weights(first: f64) -> [f64; CENTROID_WEIGHT_SIDE] {
     // exp(−(x + 1)²/2σ²) is exp(−x²/2σ²) times exp(−(2x + 1)/2σ²), whose ratio from place to place is exp(−1/σ²): three
     // exponentials in place of twelve.
@@ -230,7 +230,7 @@ pub(crate) fn psf_core_size(
     let sides = [psf.ncols(), psf.nrows()];
     let [light, squares] = core_sums(|x, y| psf[(y, x)] - level, sides, centre);
     let q = 0.5 * squares / light;
-    // Var(Σ W (r²/2 − q) n) = σ² ∫ W² (r²/2 − q)² d²x, of which W² is a Gaussian of half the variance.
+    // Var(Σ W (r²/2 − q) n) = σ² ∫ W² (r²/2 − q)² d²x, where W² is a Gaussian of half the variance.
     let half = CORE_SIGMA * CORE_SIGMA / 2.0;
     let spread = 2.0 * half * half - 2.0 * half * q + q * q;
     let variance = std::f64::consts::PI * CORE_SIGMA * CORE_SIGMA * spread;
@@ -344,7 +344,7 @@ impl GalaxyMoments {
         self.stamps.push(sums);
     }
 
-    /// Adds the stamps of another part of the image, as if they had come after its own.
+    /// Adds the stamps of the next part of the image.
     pub(crate) fn join(&mut self, other: &Self) {
         self.stamps.extend_from_slice(&other.stamps);
     }

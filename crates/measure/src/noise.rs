@@ -10,7 +10,7 @@
 //! Σ_blocks Σ_p q(p) q(p + l) = Σ_l′ M(l, l′) C(l′),    q = (1 − BBᵀ) x,
 //! ```
 //!
-//! B being the polynomials, orthonormal on the block. Blocks brighter than noise makes them, and those beside them along
+//! B being the polynomials, orthonormal on the block. Blocks brighter than noise makes them, and their neighbours along
 //! the border, are left out: there is another galaxy. So are blocks near a place that is brighter than the opposite one:
 //! a neighbour may raise their power by a few per cent only, which adds up if all stamps have one.
 

@@ -3,7 +3,7 @@
 //! A [`Session`] is opened on a [`StampSource`]. Opening surveys the image: the noise and the sky of its stamps, and the
 //! common profile of noisy stars. Rows are then read, measured in any thread, and collected in order by a
 //! [`MeasuredImage`], which checks the image. Files, simulations, [`Measurer::batch`] and Python all
-//! use it: while each of them had its own way, they differed in what they surveyed and reported.
+//! use it, so that they survey and report the same.
 
 use std::ops::{ControlFlow, Range};
 use std::sync::Arc;
@@ -47,7 +47,7 @@ pub struct Session<'n> {
     survey: Option<Arc<Survey>>,
     stars: Option<Arc<ResidualProfiles>>,
     examined: Vec<usize>,
-    /// Median of the positive levels of the examined stamps, if each stamp has its own.
+    /// Median of the positive levels of the examined stamps, if there is a level for each stamp.
     typical_level: Option<f64>,
     /// Of the first stamp, in the frame of the sky.
     jacobian: Option<Jacobian>,
@@ -78,7 +78,7 @@ pub struct MeasuredRow {
     examined: Vec<Option<Examined>>,
 }
 
-/// Examinations of stamps: as they are and, if each has a noise level of its own, in units of these levels.
+/// Examinations of stamps: unscaled and, if there is a noise level for each stamp, in units of these levels.
 #[derive(Debug)]
 struct Examined {
     stamps: Examination,
@@ -100,7 +100,7 @@ pub struct Batch {
     /// One per stamp. Ellipticities are not divided by a response.
     pub galaxies: Vec<Measurement>,
     /// The mean response of e1 to γ1 and of e2 to γ2 of the galaxies without a flag; `None` if the configuration asks for no
-    /// calibration. The mean shear of many images is the sum of their ellipticities over that of their responses.
+    /// calibration. The mean shear of many images is the sum of all ellipticities over the sum of all responses.
     pub response: Option<[f64; 2]>,
     /// Root mean square of the measurement noise of e1 and e2 of the galaxies without a flag, before division by the response; zero
     /// for the network. Their scatter contains the intrinsic shapes, too.
@@ -108,7 +108,7 @@ pub struct Batch {
     /// What is wrong with the stamps and PSFs.
     pub warnings: Vec<Warning>,
     /// Standard deviations of m and c of the image by the noise of the star that all of its galaxies share. `None` if
-    /// each galaxy has its own PSF, the configuration is not linear, or the effect is negligible.
+    /// there is a PSF per galaxy, the configuration is not linear, or the effect is negligible.
     pub psf_noise: Option<[f64; 2]>,
     /// The frame of ellipticities and of everything that refers to components of shear. Lengths are in pixels; in the frame
     /// of the sky, in sides of a square of a pixel's area.
@@ -207,7 +207,7 @@ impl<'n> Session<'n> {
         Ok(session)
     }
 
-    /// The image with those of further epochs: galaxy k is on stamp k of each. [`Session::read_epochs`] reads a row then.
+    /// Adds the images of further epochs: galaxy k is on stamp k of each. [`Session::read_epochs`] reads their rows.
     ///
     /// # Errors
     /// If the images have other numbers of stamps, or other frames.
@@ -222,7 +222,7 @@ impl<'n> Session<'n> {
         Ok(self)
     }
 
-    /// The level of noise that stamps without their own have; `None` if it is unknown.
+    /// The noise level of stamps for which none is given; `None` if it is unknown.
     fn level(&self) -> Option<f64> {
         match (&self.survey, &self.noise) {
             (Some(survey), _) => Some(survey.noise.sigma()),
@@ -236,7 +236,7 @@ impl<'n> Session<'n> {
         let plan = self.measurer.noise_plan().filter(|_| self.rows.count > 0);
         match self.noise {
             KnownNoise::Unknown | KnownNoise::Stated(_) => plan,
-            // Unscaled: sky has the units of the image, and the mean correlation of noise of several levels is that of each.
+            // Unscaled: sky has the units of the image, and all levels of noise have one correlation.
             KnownNoise::StatedEach(_) => plan,
             KnownNoise::Given(_) | KnownNoise::GivenEach(_) => None,
         }
@@ -659,7 +659,7 @@ impl MeasuredImage<'_> {
 }
 
 impl Session<'_> {
-    /// The map from pixels of another image to those of this one.
+    /// The map from pixels of another image to pixels of this image.
     fn axes_from(&self, other: &Self) -> Matrix2 {
         match (&self.jacobian, &other.jacobian) {
             (Some(own), Some(other)) => product(inverse(own.matrix()), other.matrix()),
@@ -828,8 +828,8 @@ fn add_stamps<T: Pixel>(
     stamps.outer_iter().try_for_each(|stamp| survey.add(stamp))
 }
 
-/// The residual profiles of noisy stars, one per galaxy. `None` if there is one PSF for all galaxies, a formula, no noise, or
-/// the configuration uses stars as they are.
+/// The residual profiles of noisy stars, one per galaxy. `None` if all galaxies share a PSF, PSFs are formulas, stars have no noise,
+/// or the configuration does not denoise stars.
 fn survey_stars<'a, S: StampSource<'a>>(
     measurer: &Measurer,
     source: &mut S,
@@ -897,8 +897,8 @@ impl Measurer {
     /// Measures stamps `[galaxy, y, x]`. `noise` is σ of white noise; without it, it is measured on the stamps as `noise.source`
     /// says, or refused if that is `"header"`. Ellipticities are to be divided by the mean response, which several thousand galaxies determine to 1 %.
     ///
-    /// A galaxy with pixels that are not finite (under a linear method: too many), or with a PSF of its own that cannot be
-    /// used, is flagged.
+    /// A galaxy with pixels that are not finite (under a linear method: too many), or with an unusable PSF among PSFs
+    /// per galaxy, is flagged.
     ///
     /// # Errors
     /// If shapes do not match, `noise` is not a finite number of zero or more, or the PSF of all stamps cannot be used.

@@ -142,7 +142,7 @@ impl AdaptiveShape {
 type WeightedSums = [f32; 9];
 
 impl AdaptiveMoments {
-    /// Plans for a weight of `scale` px and autocorrelations on `lattice`, of which the lags within the circle are taken.
+    /// Plans for a weight of `scale` px and autocorrelations on `lattice`; lags within the circle count.
     pub fn new(scale: f64, lattice: HexLattice) -> Self {
         let mut moments = AdaptiveMoments {
             square: (scale * scale) as f32,
@@ -304,7 +304,7 @@ impl AdaptiveMoments {
         let [a, b, c] = &self.bases;
         let scale = self.scale(shape.chi);
         let found = second_order_sums(values, &self.area, [a, b, c], shape, scale, gradients);
-        // Lags of the row y = 0 are stored with both signs, those of others with one.
+        // Lags of the row y = 0 are stored with both signs, lags of other rows with one.
         for (out, gradient) in out.iter_mut().zip(gradients) {
             let mut from = 0;
             for &(first, count) in &self.runs {
@@ -318,7 +318,7 @@ impl AdaptiveMoments {
             }
         }
         let [first, second, [t1, t2, _]] = found.map(|sums| sums.map(|sum| sum / shape.trace));
-        // F_i = L_i − χ_i T: beside the second derivatives of the weights, those of the product.
+        // F_i = L_i − χ_i T: second derivatives of the weights, and of the product.
         Curvature([
             [first[0] - 2.0 * t1, first[1] - t2, first[2]],
             [second[0], second[1] - t1, second[2] - 2.0 * t2],
@@ -607,7 +607,7 @@ impl SizeMoments {
         f64::from(-2.0 * product / found.divisor)
     }
 
-    /// Gradient of T from those of P₀ and P₂.
+    /// Gradient of T from the gradients of P₀ and P₂.
     pub(crate) fn combine(found: &MeanSquare, [zero, two]: [f32; 2]) -> f32 {
         (two - found.square * zero) / found.divisor
     }

@@ -9,7 +9,7 @@
 //!
 //! (Stein's lemma). The responses X′ are already corrected for the first term. Gaussian noise of covariance ∓2hK, added to
 //! X, removes the second one. A covariance cannot be negative, so a small share of C is added in all catalogues, without
-//! its couplings of the ellipticity to flux and size. Likewise, noise of covariance T removes the effect of noise that has
+//! its couplings of the ellipticity to flux and size. In the same way, noise of covariance T removes the effect of noise that has
 //! the shape of the PSF. For each mode, T is the geometric mean of the power behind the PSF and the power behind a PSF turned
 //! by 90 degrees, minus the former.
 //!

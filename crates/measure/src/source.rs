@@ -175,8 +175,8 @@ impl Threads for OneThread {
 /// Some of the stamps, or of their PSFs.
 type Slices<'a, T, E> = Box<dyn FnMut(Range<usize>) -> Result<T, E> + Send + 'a>;
 
-/// Stamps and PSFs in arrays, in the arrangement nearest to a square: images of as many stamps have the same rows, so
-/// that the same stamps are surveyed and examined.
+/// Stamps and PSFs in arrays, in the arrangement nearest to a square: images with equal numbers of stamps have the same rows,
+/// so that the same stamps are surveyed and examined.
 pub struct ArraySource<'a, E = MeasureError> {
     count: usize,
     stamps: Slices<'a, Pixels<'a, Ix3>, E>,

@@ -22,7 +22,7 @@ use crate::sky::{Sky, SkyCells};
 /// Brightest pixels, in image units, whose autocorrelation keeps single precision: the squares of its values neither
 /// vanish nor overflow.
 pub(crate) const PEAK_RANGE: RangeInclusive<f32> = 1e-18..=1e17;
-/// Noise levels other than zero, in image units, whose squares keep single precision beside those of [`PEAK_RANGE`].
+/// Noise levels other than zero, in image units, whose squares keep single precision like the squares of [`PEAK_RANGE`].
 const NOISE_LEVEL_RANGE: RangeInclusive<f64> = 1e-30..=1e18;
 
 /// Whether a noise level can be used.

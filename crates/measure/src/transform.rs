@@ -1,7 +1,7 @@
 //! Transforms of small images by products of real matrices.
 //!
-//! An image lies on a plane that is periodic along both axes. Of the plane's modes those with indices of at most `modes` along
-//! each axis are kept; a real image is determined by the ones with k_x ≥ 0. With s = −sin, its transform at (k_x, ±k_y) is
+//! An image lies on a plane that is periodic along both axes. The plane's modes are kept up to the index `modes` along
+//! each axis; modes with k_x ≥ 0 determine a real image. With s = −sin, its transform at (k_x, ±k_y) is
 //!
 //! ```text
 //! Σ I exp(−i(k_x x ± k_y y)) = (cc ∓ ss) + i(sc ± cs)
@@ -70,7 +70,7 @@ impl Plane {
 
     /// For how many modes along an axis, ±`j`, index `j` stands.
     pub(crate) fn count(&self, j: usize) -> f64 {
-        // The highest mode of an even period is its own opposite.
+        // The highest mode of an even period is equal to its opposite.
         if j == 0 || 2 * j == self.period {
             1.0
         } else {
@@ -146,7 +146,7 @@ impl Spectrum {
     }
 }
 
-/// The spectrum of a real image mode by mode: those with k_y ≥ 0, and then those with k_y ≤ 0, in rows of one |k_y|. Modes
+/// The spectrum of a real image mode by mode: modes with k_y ≥ 0, and then with k_y ≤ 0, in rows of one |k_y|. Modes
 /// without k_y are stored twice.
 #[derive(Debug, Clone)]
 pub(crate) struct Modes {
@@ -208,7 +208,7 @@ fn half_sums_and_differences(a: &[f32], b: &[f32], sums: &mut [f32], differences
 }
 
 // The product of two numbers (cc ∓ ss) + i(sc ± cs), sorted by parity: four terms for each quarter. Real and imaginary parts of
-// modes above and below would need as many products and the way there and back.
+// modes above and below would need the same number of products, and conversions in addition.
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 fn products(spectrum: &mut Spectrum, kernel: &Spectrum) {
     for at in (0..spectrum.0.len() / 4).step_by(LANES) {
@@ -255,8 +255,8 @@ pub(crate) fn four_lanes([cc, cs, sc, ss]: [&[f32]; 4], at: usize) -> [&[f32; LA
     [lanes(cc, at), lanes(cs, at), lanes(sc, at), lanes(ss, at)]
 }
 
-/// Stores lanes together: the compiler does not know that results are apart in memory from what they are made of, and would
-/// not use vectors.
+/// Stores lanes together: the compiler cannot prove that results and operands do not overlap in memory, and would not use
+/// vectors.
 #[inline(always)]
 pub(crate) fn store<const N: usize>(to: [&mut [f32]; N], at: usize, values: [[f32; LANES]; N]) {
     for (to, values) in to.into_iter().zip(values) {
@@ -317,7 +317,7 @@ impl Folding {
         place as f64 + middle
     }
 
-    // The share of a place along one axis: the middle pixel is its own opposite, and folding doubles it.
+    // The share of a place along one axis: folding adds the middle pixel to itself.
     fn share(&self, place: usize) -> f64 {
         if self.distance(place) == 0.0 {
             0.5
@@ -386,7 +386,7 @@ impl Folding {
     }
 }
 
-// A reference to an array: the compiler knows its length and uses one vector.
+// A reference to an array has a constant length, so that the compiler uses one vector.
 #[inline(always)]
 fn run<const K: usize>(values: &[f32], first: usize) -> &[f32; K] {
     values[first..].first_chunk().expect("pixels of a row")
@@ -401,7 +401,7 @@ fn fold(folding: &Folding, image: &[f32], folded: &mut [f32]) {
     }
 }
 
-// The image whose parts, even or odd along each axis, are given: a quarter of what [`fold`] makes of it.
+// The image whose parts, even or odd along each axis, are given: unfolding a folded image multiplies it by four.
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 fn unfold(folding: &Folding, folded: &[f32], image: &mut [f32]) {
     if folding.half < FOLDED_PIXELS {
@@ -416,7 +416,7 @@ fn unfold(folding: &Folding, folded: &[f32], image: &mut [f32]) {
 pub(crate) struct ToModes {
     folding: Folding,
     width: usize,
-    /// Columns of `across`: `width`, and as many again with moments.
+    /// Columns of `across`: `width`, or twice that with moments.
     columns: usize,
     /// By place and mode along x: cos and, with moments, x·s for sums of opposite pixels; s and x·cos for differences.
     across: [Vec<f32>; 2],
@@ -452,8 +452,7 @@ impl Waves {
         }
     }
 
-    // Starts `count` waves, of which number j is at j·`first` and advances by j·`step`; for `halves`, at (j + ½)·`first` and by
-    // (j + ½)·`step`.
+    // Starts `count` waves: number j at j·`first`, advancing by j·`step`; for `halves`, at (j + ½)·`first`, by (j + ½)·`step`.
     fn start(&mut self, count: usize, halves: bool, first: f64, step: f64) {
         for (out, angle) in [(&mut self.at, first), (&mut self.step, step)] {
             let (by_im, by_re) = angle.sin_cos();
@@ -533,7 +532,7 @@ impl ToModes {
         }
     }
 
-    /// Takes the tables for pixels of this shape. Nothing is allocated after the first time.
+    /// Sets the tables for pixels of this shape. It allocates the first time only.
     pub(crate) fn set_pixel_shape(&mut self, plane: &Plane, shape: PixelShape) {
         let (folding, width, columns) = (self.folding, self.width, self.columns);
         let Folding { half, stride, .. } = folding;
@@ -768,7 +767,7 @@ impl ToModes {
     }
 }
 
-// Replaces a real part a and an imaginary part b, of opposite parity along y, by those of them times exp(−iφ).
+// Multiplies a real part a and an imaginary part b, of opposite parity along y, by exp(−iφ).
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 fn turn_pair(a: &mut [f32], b: &mut [f32], cos: &[f32], sin: &[f32]) {
     let pairs = a.iter_mut().zip(b);
@@ -832,7 +831,7 @@ impl ToPixels {
         }
     }
 
-    /// For transforms to pixels, and for those of plain images to modes.
+    /// For transforms to pixels, and of images without moments to modes.
     pub(crate) fn scratch(&self) -> TransformScratch {
         TransformScratch {
             folded: vec![0.0; self.folding.len()],
@@ -850,7 +849,7 @@ impl ToPixels {
         let (width, Folding { stride, band, .. }) = (self.width, self.folding);
         for (part, quarter) in spectrum.quarters().into_iter().enumerate() {
             let down = Matrix::new(&self.down[part % 2], width);
-            // Rows beyond `band` are written again by the next part; those of the last are not used.
+            // The next part overwrites rows beyond `band`; those of the last part are not used.
             let lines = &mut lines[part * band * width..][..self.padded * width];
             multiply(down, Matrix::new(quarter, width), self.modes, lines, width);
         }
@@ -864,10 +863,10 @@ impl ToPixels {
     }
 }
 
-/// Lags on a hexagonal lattice: rows along x, of which every second one begins half a step further.
+/// Lags on a hexagonal lattice: rows along x; every second row is shifted by half a step.
 ///
 /// It is the same after rotations by 60 degrees. Sums over it, and the circle that ends it, cannot prefer an axis to the
-/// diagonal between axes, as on a square lattice, where the response of e1 exceeds that of e2 by 1 to 6 % for small galaxies.
+/// diagonal between axes, as on a square lattice, where the response of e1 is 1 to 6 % larger than the response of e2 for small galaxies.
 /// It also has 13 % fewer places for the same distance to the nearest alias.
 #[derive(Debug, Clone, Copy)]
 pub struct HexLattice {
@@ -976,7 +975,7 @@ pub(crate) struct LagsScratch {
 }
 
 impl ToLags {
-    /// For lags up to `reach` steps along an axis, of which a period has `steps`; `scale` multiplies the sums over modes.
+    /// For lags up to `reach` steps along an axis, `steps` of them per period; `scale` multiplies the sums over modes.
     pub(crate) fn new(reach: usize, steps: usize, plane: &Plane, scale: f64) -> Self {
         let all = vec![((0..=reach).collect(), true)];
         let (row, steps) = (2 * reach + 1, [steps as f64; 2]);
@@ -1002,8 +1001,8 @@ impl ToLags {
     ) -> Self {
         let [unit_x, unit_y] = steps.map(|steps| std::f64::consts::TAU / steps);
         let modes = plane.modes + 1;
-        // A spectrum that is the same at opposite modes has an even image: Σ P cos(k_x dx + k_y dy), of which cc takes the products
-        // of cosines and ss those of sines.
+        // A spectrum that is the same at opposite modes has an even image: Σ P cos(k_x dx + k_y dy). Its part
+        // cc has the products of cosines, and ss the products of sines.
         let wave = |parity: usize, angle: f64| {
             if parity == 0 {
                 angle.cos()

@@ -233,7 +233,7 @@ pub enum Warning {
         /// Galaxies compared.
         of: usize,
     },
-    /// Stamps of an epoch are copies of those of an earlier one.
+    /// Stamps of an epoch are copies of stamps of an earlier one.
     #[error(
         "stamps are copies of those of an earlier epoch (found {count} of {of}; expected none), so that their noise does not average. Try: remove one of the epochs"
     )]
@@ -430,7 +430,7 @@ impl fmt::Display for ExaminedPsfs {
 }
 
 impl Warning {
-    /// A warning about the star for all galaxies, which was `moved` to the middle by so many pixels.
+    /// A warning about the star for all galaxies, which was at the offset `moved` in pixels before it was centred.
     pub fn of_moved(moved: [f64; 2]) -> Warning {
         Warning::PsfOffCentre {
             offset: moved,
@@ -475,7 +475,7 @@ impl Warning {
         }
     }
 
-    /// A name for each kind of warning, for counting: that of the variant, such as `psf-noise`.
+    /// A name for each kind of warning, for counting: the name of the variant, such as `psf-noise`.
     pub fn kind(&self) -> &'static str {
         self.inner().into()
     }

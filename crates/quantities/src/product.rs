@@ -31,7 +31,7 @@ impl<'a> Matrix<'a> {
 /// Sums run over `inner` in order, fused where the processor can: results are the same for AVX-512, AVX2 and NEON.
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 pub fn multiply(left: Matrix<'_>, right: Matrix<'_>, inner: usize, out: &mut [f32], width: usize) {
-    // As many rows at a time as there are registers for.
+    // A number of rows for which there are registers.
     multiversion::target::match_target! {
         "x86_64+avx512f" => product::<ROWS, true>(left, right, inner, out, width),
         "x86_64+fma" => product::<4, true>(left, right, inner, out, width),
@@ -71,7 +71,7 @@ fn bands<const R: usize, const S: usize, const FUSED: bool>(
 ) {
     let stride = if S == 0 { left.stride } else { S };
     debug_assert!(inner <= stride, "{inner} columns of {stride}");
-    // No column is beyond a row, which the compiler does not know otherwise.
+    // No column is beyond a row, which the compiler cannot prove otherwise.
     let inner = inner.min(stride);
     // Of places instead of chunks, whose number would be a division.
     let (mut to, mut from) = (0, 0);

@@ -18,7 +18,7 @@ use crate::Shear;
 use crate::radial::{QuadraticForm, RadialTable, composite_rule};
 
 // λ/r0 in units of the FWHM, times k0·r0/λ: the wavenumber scale k0 of a Kolmogorov profile in radians per FWHM. Both
-// factors are those of GalSim's `Kolmogorov`.
+// factors are from GalSim's `Kolmogorov`.
 const KOLMOGOROV_K0: f64 = 2.992934 * 0.975_863_429_9;
 
 /// Kolmogorov surface brightness of unit flux against (r/FWHM)², per FWHM².
@@ -157,7 +157,7 @@ impl FunctionalPsf {
     /// The `size` × `size` central pixels of a star like this on a stamp of `side` × `side` pixels, normalised to a
     /// sum of one.
     ///
-    /// With `side` that of the galaxies, galaxy and PSF are equally far off the centre of their cuts: half a pixel if one
+    /// If `side` is the side of the galaxies' stamps, galaxy and PSF are equally far off the centre of their cuts: half a pixel if one
     /// side is even and the other odd. That is where a star on a stamp of that side would be.
     pub fn stamp_beside(&self, size: usize, side: usize) -> Array2<f64> {
         let mut stamp = Array2::zeros((size, size));
@@ -356,12 +356,12 @@ fn kolmogorov_brightness(rule: &[(f64, f64)], s: f64) -> f64 {
 pub struct Pupil {
     /// Wavelength over diameter, in units of the FWHM of the profile that it blurs.
     pub lambda_over_diameter: f64,
-    /// Diameter of the obscuration in units of that of the aperture, 0 or more and below 1.
+    /// Ratio of the diameters of obscuration and aperture, 0 or more and below 1.
     pub obscuration: f64,
 }
 
 impl Pupil {
-    /// The transform of its diffraction pattern of flux 1 against k·FWHM: the area that two apertures share, over that of one
+    /// The transform of its diffraction pattern of flux 1 against k·FWHM: the area that two apertures share, over the area of one
     /// (O'Neill 1956, J. Opt. Soc. Am. 46, 285). Zero beyond 2π/(λ/D).
     pub fn fourier(self, k_fwhm: f64) -> f64 {
         let shift = k_fwhm.abs() * self.lambda_over_diameter / PI;
@@ -419,7 +419,7 @@ impl PsfTransform {
     }
 
     /// Tabulates the transform of `profile` convolved with the diffraction pattern of `pupil`. The FWHM of a PSF remains
-    /// that of the profile alone.
+    /// the FWHM of the profile alone.
     ///
     /// # Errors
     /// As [`PsfTransform::new`].

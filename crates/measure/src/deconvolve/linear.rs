@@ -1,4 +1,4 @@
-//! The linear network in closed form, and the autocorrelation of what it makes of a stamp.
+//! The linear network in closed form, and the autocorrelation of its result.
 //!
 //! Without thresholds (Nurbaeva et al. 2015, Eq. 9) and clipping (Eq. 12), the adaptive update v ← v + c·f (Eqs. 10 and 11)
 //! from v = 0 is linear. On a plane without boundary each Fourier mode evolves alone, and after M iterations
@@ -78,8 +78,8 @@ const LARGEST_RING: f64 = 0.25;
 // Chosen by hand: the window's autocorrelation is a fifth there.
 const LARGEST_LAG: f64 = 2.5;
 /// Rows of lags per sample of a grid that samples the kept modes, along an axis, at least.
-// Chosen by hand. Lags are closer together than the modes would need because the autocorrelation is multiplied by a weight with
-// structure of its own.
+// Chosen by hand. Lags are closer together than the modes would need because the weight of the moments, which multiplies the
+// autocorrelation, has finer structure.
 const LAGS_PER_SAMPLE: f64 = 1.5;
 /// Least power of the PSF's transform; modes below it are left out as pure noise.
 // Below 10⁻³, the least power in the simulated sets, and within single precision.
@@ -121,7 +121,7 @@ pub struct Spectral {
 }
 
 /// Buffers for one thread. Their content between calls does not matter, but for the stamp that
-/// [`Spectral::products`] looks at, and the PSF on pixels of another shape.
+/// [`Spectral::products`] reads, and the PSF on pixels of another shape.
 #[derive(Debug, Clone)]
 pub struct SpectralScratch {
     of_stamp: TransformScratch,
@@ -146,7 +146,7 @@ pub struct SpectralScratch {
     /// Where the window is, (x, y) in pixels from the middle of the stamp, and the phases that move this place to the origin.
     centre: [f32; 2],
     phases: Modes,
-    /// Origin of the shear, likewise.
+    /// Origin of the shear (x, y) in pixels from the middle of the stamp.
     origin: [f32; 2],
     edges: EdgesScratch,
     lags: LagsScratch,
@@ -185,7 +185,7 @@ pub struct SpectralPsf {
     restore: Modes,
     /// (k_x ∂_x − k_y ∂_y)p/p and (k_y ∂_x + k_x ∂_y)p/p.
     tilts: [Modes; 2],
-    /// |p|²/S of each mode: the square of what a point of flux one is there, in units of the noise.
+    /// |p|²/S of each mode: the squared S/N of a point source of flux one in noise of level one.
     clarity: Vec<f32>,
     /// Change of a mode of noise with the components of shear, in units of it and in the mean.
     field_tilts: [Vec<f32>; 2],
@@ -1059,7 +1059,7 @@ impl Edges {
     }
 
     // Adds edges at both ends of the stamp to all rows of modes: `sides` along y, unless they are added already, and `levels`
-    // along x. `phase` is that of each frequency at the first edge.
+    // along x. `phase` is the phase of each frequency at the first edge.
     fn add_rows(
         &self,
         Modes { re, im }: &mut Modes,
@@ -1069,7 +1069,7 @@ impl Edges {
     ) {
         let rows = re.chunks_exact_mut(self.width);
         for (row, (re, im)) in rows.zip(im.chunks_exact_mut(self.width)).enumerate() {
-            // Real lines have conjugate transforms at opposite frequencies: those of the rows below.
+            // Real lines have conjugate transforms at opposite frequencies, in the rows below.
             let (y, sign) = if row < self.rows {
                 (row, 1.0)
             } else {
@@ -1098,7 +1098,7 @@ impl Edges {
     ) {
         let (n, width) = (self.n, self.width);
         let middle = (n as f32 - 1.0) / 2.0;
-        // What v·∇T is on either edge, beside the place along it.
+        // v·∇T on either edge, without the factor of the place along it.
         let half = n as f32 / 2.0;
         let factors = [
             [-(half + x0), -(half - x0)],
@@ -1313,7 +1313,7 @@ fn sheared(x: [f32; 2], y: [f32; 2], kx: f32, ky: f32) -> [[f32; 2]; 2] {
 }
 
 // Writes what follows for each mode from the transforms of a PSF and of it times x and y and from the amplitudes. `powers` are
-// |p|², and become those of noise of σ = 1 before the window.
+// |p|², and become powers of noise of σ = 1 before the window.
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 fn take_psf(
     plan: &Spectral,
@@ -1405,7 +1405,7 @@ fn amplitudes([powers, rough, target]: [&[f32]; 3], step: f32, iterations: i32, 
         }
         let modes = powers.iter().zip(rough).zip(target).zip(power_of_base);
         for (out, (((power, rough), target), power_of_base)) in out.iter_mut().zip(modes) {
-            // Without signal a mode is noise alone, whatever λ makes of it.
+            // A mode without signal is noise alone, for any λ.
             *out = if *power < LEAST_PSF_POWER || *target == 0.0 {
                 0.0
             } else {

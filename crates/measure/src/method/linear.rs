@@ -48,7 +48,7 @@ use crate::transform::HexLattice;
 // Of the error of the mean response, the choice of galaxies makes less than 1 % (tests/stress: base, snr10, cosmos20). Sheared
 // catalogues need the noise of every galaxy.
 const NOISE_MOMENTS_INTERVAL: u64 = 8;
-// S/N at which a size is half its own and half the size of a typical galaxy. Chosen by hand: it shrinks sizes at S/N 20 by 6 %.
+// S/N at which a size is the mean of the measured one and of the size of a typical galaxy. Chosen by hand: it shrinks sizes at S/N 20 by 6 %.
 const HALF_SIZE_SNR: f32 = 5.0;
 
 // Correlated noise follows the shape of pixels in steps of 1/1024, because its power in all modes takes as long as several
@@ -88,7 +88,7 @@ struct Regularisation {
     ellipticity: f32,
     /// P₀ of [`SizeMoments`] for such a galaxy of flux one, times the square of [`HALF_SIZE_SNR`].
     size: f32,
-    /// Power of such a galaxy in each mode, as `Spectral::light` returns it.
+    /// Power of this galaxy in each mode, from `Spectral::light`.
     galaxy: Vec<f32>,
     /// T of [`SizeMoments`] for such a galaxy.
     typical_square: f32,
@@ -372,7 +372,7 @@ impl CutWorker for LinearWorker {
         }))
     }
 
-    // The plan follows the PSFs, not the galaxy: it is that of a PSF whose Σp² is the weighted mean of theirs.
+    // The plan follows the PSFs, not the galaxy: Σp² is the weighted mean over the PSFs.
     fn measure_epochs<'a>(
         &mut self,
         count: usize,
@@ -630,8 +630,8 @@ impl PlanWorker {
     /// white noise has its power under the window.
     ///
     /// Noise n of variance s(x)/g, s being the light of the galaxy behind the PSF, has the mean power ∫ W² s/g in each mode
-    /// under the window W, white noise the power σ² ∫ W² = σ² π w². The light is that of a Gaussian of the measured flux and size,
-    /// so that the positive noise of a pixel does not raise its own variance; the flux alone is noisy, by 1/ν.
+    /// under the window W, white noise the power σ² ∫ W² = σ² π w². The light is a Gaussian of the measured flux and size,
+    /// so that positive noise of a pixel does not raise the variance there; the flux is noisy, by 1/ν.
     fn own_variance(&self, noise: f32) -> f64 {
         let plan = &*self.plan;
         let (lags, target) = (&self.lags, plan.lengths.target_sigma);
@@ -653,9 +653,10 @@ impl PlanWorker {
         // In the middle, whatever is there. A window on the centroid changes with the shear of lopsided galaxies and of blends, which
         // R does not contain: m was +23e-3 for rings at S/N 20, +4.4e-3 at S/N 60, and +6e-3 for blends at 5 to 7 px, instead of
         // 0.4 ± 0.6e-3, 0.3 ± 0.1e-3 and 0 ± 1e-3.
-        // About the middle of the stamp, a shear would also move galaxies that are off it under the window: m is −1.5e-3 for those of
-        // control-ground-constant of GREAT3, which are off by up to 1 px, and half of it about the centroid. There, m is about +4e-3 for galaxies with a bulge
-        // off their centre by its half-light radius, if that centre is the one that shear leaves in its place.
+        // A shear about the middle of the stamp also moves off-centre galaxies under the window: m is −1.5e-3 for
+        // control-ground-constant of GREAT3, with offsets up to 1 px, and half of it for a shear about the centroid. About the
+        // centroid, m is about +4e-3 for galaxies whose bulge is off their centre by its half-light radius, if the shear of the
+        // simulation leaves that centre in its place.
         let origin = match plan.origin {
             ShearOrigin::Stamp => [0.0; 2],
             ShearOrigin::Centroid => shear_origin(stamp, plan.spectral.stamp_size(), noise),
@@ -789,7 +790,7 @@ impl PlanWorker {
     }
 }
 
-/// An autocorrelation as an image, as many pixels apart as the rows of its lattice: interpolated along the rows.
+/// An autocorrelation as an image with the spacing of the lattice's rows, interpolated along the rows.
 fn square_lags(lags: &[f32], lattice: HexLattice) -> Array2<f64> {
     let side = 2 * lattice.reach + 1;
     Array2::from_shape_fn((side, side), |(y, x)| {
@@ -826,7 +827,7 @@ fn window_index(variance: f64, reference: f64) -> usize {
 }
 
 /// Mean square per axis in px² of the galaxies that the width at `index` is for, if the configured width is `sigma` px
-/// for `reference` px². Without a reference it is that of GREAT10's galaxies, in proportion to `sigma`².
+/// for `reference` px². Without a reference it is the mean square of GREAT10's galaxies, in proportion to `sigma`².
 fn galaxy_variance(reference: f64, sigma: f64, index: usize) -> f64 {
     let configured = if reference > 0.0 {
         reference

@@ -31,7 +31,7 @@ const MAX_AZIMUTHAL_ORDER: usize = 8;
 const MAX_FITTED_ORDER: usize = 2;
 // Scale of the functions in units of the σ of the profile's core. Chosen by hand.
 const HERMITE_SCALE: f64 = 1.1;
-// Side from which on the border is free of the star's light, in pixels.
+// Smallest side in pixels of a stamp whose border is free of the star's light.
 // As for the noise of galaxies.
 pub(super) const MIN_DENOISED_SIDE: usize = 24;
 // Smaller values of a function are far below the noise of a star. Chosen by hand.

@@ -25,7 +25,7 @@ const TERMS: usize = 5;
 const AZIMUTHAL_STRIDE: usize = 2;
 // One image in a thousand has such an excess by noise.
 const AZIMUTHAL_SIGNIFICANCE: f64 = 3.0;
-// With fewer, the 72 values of the azimuthal terms are as uncertain as those of one star.
+// With fewer, the 72 values of the azimuthal terms are as uncertain as for one star.
 const MIN_STARS_AZIMUTHAL: usize = 100;
 // For radii that no pixel has, which get zero; far below the rounding of others.
 const RELATIVE_RIDGE: f64 = 1e-9;
@@ -53,7 +53,7 @@ pub(super) struct ResidualProfile {
 }
 
 impl ResidualProfile {
-    /// Adds it to a star of which `profile` was drawn.
+    /// Adds it to a star that `profile` was drawn on.
     pub(super) fn add_to(&self, mut star: ArrayViewMut2<'_, f64>, profile: &Moffat) {
         let amplitude = profile.amplitude();
         let (square, [x0, y0]) = (profile.square(), profile.centre());
@@ -168,7 +168,7 @@ impl ResidualSums {
         let freedom = (2 * seen.count() / AZIMUTHAL_STRIDE) as f64;
         for terms in [3, TERMS] {
             let (values, gain) = self.solve(terms)?;
-            // A sum of so many squares of noise has twice their number as variance.
+            // The variance of a sum of n squares of noise is 2n.
             if gain - previous_gain - freedom > AZIMUTHAL_SIGNIFICANCE * (2.0 * freedom).sqrt() {
                 found = ResidualProfile { values, terms };
             }
@@ -258,21 +258,6 @@ fn azimuthal_terms(dx: f64, dy: f64) -> [f64; TERMS] {
     let share = if square > 0.0 { 1.0 / square } else { 0.0 };
     let (cos, sin) = (share * (dx * dx - dy * dy), share * 2.0 * dx * dy);
     [1.0, cos, sin, cos * cos - sin * sin, 2.0 * cos * sin]
-}
-
-#[cfg(test)]
-impl ResidualProfile {
-    pub(super) fn terms(&self) -> usize {
-        self.terms
-    }
-
-    /// Largest difference to another one, in units of the largest value of that one.
-    pub(super) fn difference(&self, other: &Self) -> f64 {
-        let largest = |largest: f64, value: f64| largest.max(value.abs());
-        let [own, other] = [self, other].map(|profile| profile.values.as_flattened());
-        let difference = own.iter().zip(other).map(|(a, b)| a - b).fold(0.0, largest);
-        difference / other.iter().copied().fold(0.0, largest)
-    }
 }
 
 // 12 stars of S/N 50 per image: m1, m2 = +1.6, +2.0 ± 0.2 (10⁻³); they are −7 without a residual profile.
@@ -388,6 +373,21 @@ fn mean_residual(stars: &[(f64, ResidualSums)]) -> Option<ResidualProfile> {
         }
     }
     all.fit(stars.len())
+}
+
+#[cfg(test)]
+impl ResidualProfile {
+    pub(super) fn terms(&self) -> usize {
+        self.terms
+    }
+
+    /// Largest difference to another one, in units of the largest value of that one.
+    pub(super) fn difference(&self, other: &Self) -> f64 {
+        let largest = |largest: f64, value: f64| largest.max(value.abs());
+        let [own, other] = [self, other].map(|profile| profile.values.as_flattened());
+        let difference = own.iter().zip(other).map(|(a, b)| a - b).fold(0.0, largest);
+        difference / other.iter().copied().fold(0.0, largest)
+    }
 }
 
 #[cfg(test)]

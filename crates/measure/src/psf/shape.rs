@@ -59,7 +59,7 @@ pub(crate) fn width_step_of_area(area: f64, reference: f64) -> i32 {
     (whole as i32).clamp(*WIDTH_STEPS.start(), *WIDTH_STEPS.end())
 }
 
-/// How much longer lengths are after so many steps.
+/// Factor of all lengths at a step.
 pub(crate) fn width_factor(step: i32) -> f64 {
     (f64::from(step) / STEPS_PER_DOUBLING).exp2()
 }
@@ -75,7 +75,7 @@ const MAX_ITERATIONS: usize = 100;
 const LANES: usize = 8;
 
 impl PsfShape {
-    /// Of the pixels of a PSF; NaN if the moments do not converge, as those of a PSF that is mostly noise.
+    /// Of the pixels of a PSF; NaN if the moments do not converge, as for a PSF that is mostly noise.
     pub(crate) fn from_psf(psf: ArrayView2<'_, f64>) -> Self {
         let round = noise_equivalent_area(psf) / (4.0 * std::f64::consts::PI);
         let (mut moments, mut centre) = ([round, 0.0, round], [0.0; 2]);

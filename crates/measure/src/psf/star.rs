@@ -23,7 +23,7 @@ const LANES: usize = 16;
 /// The pixels of a star that are used as a PSF.
 #[derive(Debug, Clone)]
 pub struct Star {
-    /// As many pixels as a configuration takes and the stamp has around the star, normalised to a sum of one.
+    /// The pixels around the star, normalised to a sum of one: the number that a configuration uses, or fewer on a small stamp.
     pub psf: Array2<f64>,
     /// Offset (x, y) of the star from the centre of its stamp in pixels, if it is above one pixel along either axis. The
     /// cut was moved by the nearest whole pixels then.
@@ -231,7 +231,7 @@ fn sum_3x3<P: Pixel>(stamp: ArrayView2<'_, P>, [x, y]: [usize; 2]) -> f64 {
     pixels.iter().map(|&value| -> f64 { value.into() }).sum()
 }
 
-/// The matrix that interpolates `from` periodic samples at `to` places, the first of which is at `first`: Dirichlet's
+/// The matrix that interpolates `from` periodic samples at `to` places from `first` on: Dirichlet's
 /// kernel.
 ///
 /// Light at frequencies beyond the sampling comes back with the wrong sign: 1.5e-3 of the peak of a Moffat profile with

@@ -48,7 +48,7 @@ struct Lag {
     dy: i32,
     square: i32,
     /// 2 for a lag that stands for its opposite too, 1 for zero lag; half of it for each component of n/2
-    /// where lags wrap around, of which −n/2 is the same.
+    /// where lags wrap around and −n/2 is the same lag.
     weight: f32,
 }
 

@@ -171,7 +171,7 @@ fn take_waves(folding: &Folding, wave: &[f64; LANES], out: &mut [Waves]) {
 }
 
 // Real and imaginary parts of the transforms of an image, of it times x, and of it times y. Of a row f(x) with even part E and odd
-// part O, Σ f exp(−ipx) = Σ E cos − i Σ O sin, and Σ x f exp(−ipx) = Σ x O cos − i Σ x E sin; along y likewise.
+// part O, Σ f exp(−ipx) = Σ E cos − i Σ O sin, and Σ x f exp(−ipx) = Σ x O cos − i Σ x E sin; and the same along y.
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 fn sum_pixels(
     folding: &Folding,

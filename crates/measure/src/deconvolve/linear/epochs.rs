@@ -7,14 +7,14 @@
 //! Σ W û/p = Σ u conj(p) û / q,    W = u |p|²/q,    q = Σ u |p|²,    u = (a/σ²)/Σ(a/σ²).
 //! ```
 //!
-//! With w = q + λd² the closed form of the iterations is v̂ = Γ[1 − (1 − c w)^M]/w · Σ u conj(p) û, which for one epoch equals that of a
+//! With w = q + λd² the closed form of the iterations is v̂ = Γ[1 − (1 − c w)^M]/w · Σ u conj(p) û, which for one epoch equals the result for a
 //! single stamp. Noise
 //! has the level (Σ a/σ²)^(−½) and, in its units, the power Γ²[…]²q/w² in each mode; a shear changes it by the mean of the
 //! epochs' changes with the weights W. Averages of ellipticities of single epochs would need a response of each noisy epoch:
 //! with 16 epochs of S/N 5, the error of m is six times as large.
 //!
-//! Stamps may be turned against each other. Modes are those of common axes, at which turned stamps are transformed as
-//! they are ([`ToTurnedModes`]); nothing is interpolated. The window is at the same place of the sky in all of them.
+//! Stamps may be turned against each other. Modes are along common axes, and turned stamps are transformed at
+//! these modes ([`ToTurnedModes`]) without interpolation. The window is at the same place of the sky in all of them.
 
 use shearq_quantities::linear::{Matrix2, apply, determinant, inverse, product};
 
