@@ -17,6 +17,8 @@ use multiversion::multiversion;
 use shearq_quantities::statistics::{SCATTER, median};
 use shearq_submissions::Wavelet;
 
+use crate::stamp::frame;
+
 /// Filter for one stamp size; serial, allocates nothing per stamp.
 #[derive(Debug, Clone)]
 pub struct WaveletWiener {
@@ -221,16 +223,6 @@ fn scale_variances(levels: usize) -> Vec<f32> {
             variance as f32
         })
         .collect()
-}
-
-/// The pixels of an n × n stamp within `width` of its edges, in pieces, row by row.
-pub fn frame(stamp: &[f32], n: usize, width: usize) -> impl Iterator<Item = &[f32]> {
-    let width = width.min(n);
-    let rows = stamp.chunks_exact(n).enumerate();
-    rows.flat_map(move |(y, row)| match y < width || y >= n - width {
-        true => [row, &[]],
-        false => [&row[..width], &row[n - width..]],
-    })
 }
 
 /// Noise level of a stamp: 1.4826 times the median absolute deviation from the median of the pixels

@@ -45,7 +45,6 @@
 
 #![warn(missing_docs, clippy::missing_errors_doc)]
 
-mod asymmetry;
 mod calibration;
 mod deconvolve;
 mod denoise;

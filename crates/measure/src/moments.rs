@@ -11,8 +11,7 @@ use multiversion::multiversion;
 use ndarray::ArrayView2;
 use shearq_quantities::statistics::upper_median;
 
-use crate::denoise::frame;
-use crate::stamp::{Pixel, contiguous};
+use crate::stamp::{Pixel, contiguous, frame};
 
 // Narrow, so that a centroid does not follow noise: at S/N 20 it is good to 0.2 px. Chosen by hand.
 pub(crate) const CENTROID_WEIGHT_SIGMA: f64 = 2.0;

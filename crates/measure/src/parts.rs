@@ -5,8 +5,9 @@ pub use crate::deconvolve::{
     Lags, ModeNoise, Network, NetworkScratch, Rule, Spectral, SpectralPsf, SpectralScratch, Step,
     convolve, psf_factor,
 };
-pub use crate::denoise::{DenoiseScratch, WaveletWiener, border_noise, frame};
+pub use crate::denoise::{DenoiseScratch, WaveletWiener, border_noise};
 pub use crate::shape::{
     AdaptiveMoments, AdaptiveScratch, AdaptiveShape, ClippedAcf, ClippedAcfScratch, Moments,
 };
+pub use crate::stamp::frame;
 pub use crate::transform::HexLattice;

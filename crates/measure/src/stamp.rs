@@ -436,6 +436,16 @@ fn adjacent_mean(stamp: &[f32], n: usize, at: usize) -> Option<f32> {
     (count >= MIN_ADJACENT_PRESENT).then(|| sum / count as f32)
 }
 
+/// The pixels of an n × n stamp within `width` of its edges, in pieces, row by row.
+pub fn frame(stamp: &[f32], n: usize, width: usize) -> impl Iterator<Item = &[f32]> {
+    let width = width.min(n);
+    let rows = stamp.chunks_exact(n).enumerate();
+    rows.flat_map(move |(y, row)| match y < width || y >= n - width {
+        true => [row, &[]],
+        false => [&row[..width], &row[n - width..]],
+    })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -18,7 +18,7 @@ use shearq_quantities::statistics::{SCATTER, median};
 
 use super::residual_profile::{ResidualProfiles, ResidualSums};
 use super::shape::noise_equivalent_area;
-use super::star::{psf_offset, sum_of_squares};
+use super::{psf_offset, sum_of_squares};
 
 // S/N between which the share of the raw star in the result grows from 0 to 1. The lower end is chosen by hand.
 // At 1000 the noise of one star changes m by 5·10⁻³.

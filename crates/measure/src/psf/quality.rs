@@ -9,8 +9,8 @@ use ndarray::ArrayView2;
 use shearq_quantities::statistics::upper_median;
 
 use super::denoised_star::{MIN_DENOISED_SIDE, UNCHANGED_SNR, noise_level};
+use super::psf_offset;
 use super::shape::noise_equivalent_area;
-use super::star::psf_offset;
 use crate::moments::{CoreSize, psf_core_size};
 use crate::warning::{ExaminedPsfs, Warning};
 

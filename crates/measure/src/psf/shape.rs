@@ -7,7 +7,7 @@ use multiversion::multiversion;
 use ndarray::{ArrayView2, s};
 use shearq_quantities::{Distortion, Jacobian, Shear};
 
-use super::star::sum_of_squares;
+use super::sum_of_squares;
 use crate::measurement::PsfShape;
 use crate::stamp::contiguous;
 
