@@ -162,12 +162,13 @@ const WAYS: [(&str, &[&str]); 31] = [
     (
         "bias",
         &[
-            "CATALOGUE g1 g2 columns ellipticity truth-sign bins where design units drop-missing step fail-above plot format wide metrics report",
-            "CATALOGUE truth columns ellipticity truth-sign bins where design units drop-missing step fail-above plot format wide metrics report",
-            "CATALOGUE g1 g2 columns truth-sign bins where weight design units drop-missing fail-above plot format wide metrics report",
-            "CATALOGUE truth columns truth-sign bins where weight design units drop-missing fail-above plot format wide metrics report",
+            "CATALOGUE g1 g2 columns ellipticity truth-sign bins where design units drop-missing step fail-above sums shard plot format wide metrics report",
+            "CATALOGUE truth columns ellipticity truth-sign bins where design units drop-missing step fail-above sums shard plot format wide metrics report",
+            "CATALOGUE g1 g2 columns truth-sign bins where weight design units drop-missing fail-above sums shard plot format wide metrics report",
+            "CATALOGUE truth columns truth-sign bins where weight design units drop-missing fail-above sums shard plot format wide metrics report",
             "CATALOGUE against g1 g2 columns ellipticity truth-sign bins where design units drop-missing step format wide metrics",
             "CATALOGUE against truth columns ellipticity truth-sign bins where design units drop-missing step format wide metrics",
+            "merge fail-above plot format wide metrics report",
             "plan",
             "example",
         ],
@@ -179,7 +180,10 @@ const WAYS: [(&str, &[&str]); 31] = [
             "name kind public private data truth-table metric spectra entries-per-team partial address opens closes contact data-version threads",
         ],
     ),
-    ("challenge check", &["ENTRY challenge json threads"]),
+    (
+        "challenge check",
+        &["ENTRY challenge json threads"],
+    ),
     (
         "challenge rank",
         &["INBOX challenge truth store reference report digits detail format threads"],

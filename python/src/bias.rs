@@ -261,6 +261,7 @@ pub(crate) fn bias_sums(
         drop_missing,
         step,
     };
-    let summed = py.detach(|| sum(&request)).map_err(of_bias)?;
+    // Shards are of files of the command line; workers in Python sum catalogues of their own.
+    let summed = py.detach(|| sum(&request, &|_| true)).map_err(of_bias)?;
     Ok(BiasSums { summed })
 }

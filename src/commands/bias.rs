@@ -2,9 +2,9 @@
 
 mod plan;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
-use anyhow::anyhow;
+use anyhow::{Context, anyhow};
 use clap::Args;
 use shearq_bias::Design;
 
@@ -12,6 +12,8 @@ use self::plan::{example, plan};
 use crate::arguments::{Printing, ReportFile, positive};
 use crate::choices::named;
 use crate::{Findings, made_by, tell};
+use shearq_dataset::images::Shard;
+use shearq_files::{atomic, open};
 use shearq_render::figure::{Figure, PictureFormat};
 use shearq_results::bias::columns::{Names, Shapes, role_names};
 use shearq_results::bias::truth::{TrueSign, Truth, expand};
@@ -40,6 +42,9 @@ pub(crate) struct Arguments {
     /// several times.
     #[arg(long, value_name = "LIMIT")]
     fail_above: Vec<Limit>,
+    /// Merge files that --sums wrote for shards of one list of catalogues.
+    #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with = "Summing")]
+    merge: Vec<PathBuf>,
     /// Print how many measurements determine m to this error, such as 1e-3. Needs no catalogues.
     #[arg(long, value_name = "ERROR", value_parser = positive, exclusive = true)]
     plan: Option<f64>,
@@ -56,16 +61,17 @@ pub(crate) struct Arguments {
     report: ReportFile,
 }
 
+// What catalogues are summed, and how: one group, because the files of `--merge` were summed already.
 #[derive(Debug, Args)]
 struct Summing {
     /// Catalogues, all with the same columns, or folders that `measure` or `run` wrote. FILE[TABLE] is one table of a
     /// FITS file.
-    #[arg(value_name = "CATALOGUE", required_unless_present_any = ["plan", "example"])]
+    #[arg(value_name = "CATALOGUE", required_unless_present_any = ["merge", "plan", "example"])]
     catalogues: Vec<PathBuf>,
     /// Catalogues of another program on the same galaxies, in the same order. The output contains both and the
     /// difference, with paired errors. A --truth table by catalogue contains those of both, or names of files that both
     /// have, in two folders.
-    #[arg(long, value_name = "CATALOGUE", num_args = 1.., conflicts_with_all = ["fail_above", "plot", "report"])]
+    #[arg(long, value_name = "CATALOGUE", num_args = 1.., conflicts_with_all = ["sums", "shard", "fail_above", "plot", "report"])]
     against: Vec<PathBuf>,
     /// True g1 of all catalogues.
     #[arg(
@@ -131,6 +137,12 @@ struct Summing {
     /// Artificial shear of metacalibration [default: 0.01].
     #[arg(long, value_name = "G", value_parser = positive)]
     step: Option<f64>,
+    /// Write the sums of the catalogues to this file, for --merge.
+    #[arg(long, value_name = "FILE")]
+    sums: Option<PathBuf>,
+    /// Read only shard K of N of the catalogues.
+    #[arg(long, value_name = "K/N", requires = "sums")]
+    shard: Option<Shard>,
 }
 
 // Of metacalibration in ngmix and metadetect, whose catalogues do not state it.
@@ -173,6 +185,9 @@ fn parse_bins(text: &str) -> anyhow::Result<Binning> {
     }
 }
 
+// Of a file of sums, which is read into memory. Chosen by hand.
+const MOST_BYTES: u64 = 1 << 31;
+
 pub(crate) fn run(arguments: &Arguments, command_line: &str) -> anyhow::Result<()> {
     if let Some(error) = arguments.plan {
         return arguments.printing.print(&plan(error));
@@ -185,8 +200,23 @@ pub(crate) fn run(arguments: &Arguments, command_line: &str) -> anyhow::Result<(
     if let Some(plot) = &arguments.plot {
         PictureFormat::of(plot)?;
     }
-    let summed = of_catalogues(summing, &summing.catalogues)?;
-    let result = summed.result()?;
+    let summed = match arguments.merge.as_slice() {
+        [] => of_catalogues(summing, &summing.catalogues)?,
+        files => merged(files)?,
+    };
+    if let Some(path) = &summing.sums {
+        atomic::write(path, &serde_json::to_vec(&summed)?)?;
+    }
+    // A shard may have too few units for errors, or one side of a pair. Its sums are what counts, and they are written.
+    let result = match summed.result() {
+        Err(error) if summing.shard.is_some() => {
+            tell(format_args!(
+                "note: no estimate of this shard alone: {error}"
+            ));
+            return Ok(());
+        }
+        result => result?,
+    };
     let warn = || {
         let warnings = of_design(&result).into_iter();
         for warning in warnings.chain(chosen_by_measurement(&result)) {
@@ -250,6 +280,14 @@ fn of_catalogues(summing: &Summing, catalogues: &[PathBuf]) -> anyhow::Result<Su
         }
         (None, None) => Truth::Columns,
     };
+    let shard = summing.shard.unwrap_or(Shard::WHOLE);
+    if let (Some(_), Some(Edges::Equal(_))) =
+        (summing.shard, summing.bins.as_ref().map(|bins| &bins.edges))
+    {
+        anyhow::bail!(
+            "--shard: all shards need the same bins (found a number of bins, expected edges). Try: --bins 'snr:5,10,20'"
+        );
+    }
     let selection = selection(summing.condition.as_deref(), summing.weight.as_deref())?;
     if selection.as_ref().is_some_and(|own| own.weights.is_some()) {
         // Catalogues of linear configurations contain shears with responses and no sheared catalogues.
@@ -281,5 +319,31 @@ fn of_catalogues(summing: &Summing, catalogues: &[PathBuf]) -> anyhow::Result<Su
         drop_missing: summing.drop_missing,
         step: summing.step.unwrap_or(DEFAULT_STEP),
     };
-    Ok(sum(&request)?)
+    let own = |number: usize| Shard::holding(number, shard.of()) == shard;
+    Ok(sum(&request, &own)?)
+}
+
+fn merged(files: &[PathBuf]) -> anyhow::Result<Summed> {
+    let read = |path: &Path| -> anyhow::Result<Summed> {
+        let bytes = open::read(path, MOST_BYTES)
+            .with_context(|| format!("{}: cannot read the sums", path.display()))?;
+        let what = || format!("{}: these are no sums that --sums wrote", path.display());
+        let summed: Summed = serde_json::from_slice(&bytes).with_context(what)?;
+        summed.checked().with_context(what)
+    };
+    // The other files are compared with the first, and the message names the file that differs.
+    let mut all = read(&files[0])?;
+    for path in &files[1..] {
+        let more = read(path)?;
+        all.merge(more)
+            .with_context(|| path.display().to_string())?;
+    }
+    // Sums of some shards would give an estimate without a sign that galaxies are missing.
+    let absent = all.absent();
+    anyhow::ensure!(
+        absent.is_empty(),
+        "the sums do not contain all catalogues (absent: {}). Try: --merge with the sums of all shards",
+        shearq_files::names_of(&absent)
+    );
+    Ok(all)
 }

@@ -226,7 +226,7 @@ fn with_matrix(folder: &Path, names: [&str; 6]) -> [PathBuf; 2] {
 }
 
 #[test]
-fn a_response_matrix_is_used_in_bins_and_differences() {
+fn a_response_matrix_is_used_in_bins_sums_and_differences() {
     let folder = tempfile::tempdir().unwrap();
     let truth = folder.path().join("truth.csv");
     fs::write(
@@ -261,6 +261,9 @@ fn a_response_matrix_is_used_in_bins_and_differences() {
         (number(&diagonal[0], "m1") - 0.125).abs() < 0.02,
         "{diagonal:?}"
     );
+    let sums = folder.path().join("sums");
+    succeed(&["bias", plus, minus, "--truth", truth, "--sums", text(&sums)]);
+    zero(&rows(&["--merge", text(&sums)])[0]);
     let others = with_matrix(
         folder.path(),
         ["e1", "e2", "de1_dg1", "de2_dg2", "de1_dg2", "de2_dg1"],

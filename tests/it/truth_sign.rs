@@ -219,6 +219,14 @@ fn tables_by_identifier_follow_the_same_rule_in_shards_too() {
         whole.contains("Sign of g2 in the truth: challenge, which e2"),
         "{whole}"
     );
+    let sums: Vec<PathBuf> = ["1", "2"].map(|k| at(&format!("sums-{k}"))).into();
+    for (k, path) in (1..).zip(&sums) {
+        let shard = format!("{k}/2");
+        succeed(&[&arguments[..], &["--shard", &shard, "--sums", text(path)]].concat());
+    }
+    let merged = succeed(&["bias", "--merge", text(&sums[0]), text(&sums[1])]);
+    assert_eq!(merged, whole);
+    // Sums with the other sign do not belong to them.
     table(
         &truth,
         "id",
@@ -232,8 +240,25 @@ fn tables_by_identifier_follow_the_same_rule_in_shards_too() {
             && error.contains("the statement `standard`"),
         "{error}"
     );
+    succeed(
+        &[
+            &arguments[..],
+            &["--shard", "2/2", "--sums", text(&sums[1])],
+        ]
+        .concat(),
+    );
+    let error = fail(&["bias", "--merge", text(&sums[0]), text(&sums[1])]);
+    assert!(error.contains("different signs of g2"), "{error}");
     measure(0.3);
     table(&truth, "id", "g1,g2", "", &field);
     let error = fail(&arguments);
+    assert!(error.contains("cannot determine the sign of g2"), "{error}");
+    let error = fail(
+        &[
+            &arguments[..],
+            &["--shard", "1/2", "--sums", text(&sums[0])],
+        ]
+        .concat(),
+    );
     assert!(error.contains("cannot determine the sign of g2"), "{error}");
 }

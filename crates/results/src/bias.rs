@@ -53,6 +53,8 @@ pub enum BiasFailure {
     Columns { catalogue: PathBuf, first: PathBuf },
     #[error("the sums do not belong together: they have different {0}")]
     Unlike(&'static str),
+    #[error("{0}: the catalogue is in two files of sums")]
+    InTwoFiles(String),
     #[error(
         "--bins: `{of}` has too few different values for {bins} bins with equally many galaxies. Try: fewer bins or given edges"
     )]
@@ -276,8 +278,8 @@ const SAMPLE: usize = 1 << 20;
 /// Most bins.
 pub const MOST_BINS: usize = 100;
 
-/// Sums the catalogues of a request.
-pub fn sum(request: &Request) -> Result<Summed, BiasFailure> {
+/// Sums the catalogues of a request for which `part` holds, given their number.
+pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, BiasFailure> {
     read::distinct(&request.catalogues)?;
     let paths = request.catalogues.iter().map(|input| input.name.as_path());
     let mut reading = Reading {
@@ -311,7 +313,7 @@ pub fn sum(request: &Request) -> Result<Summed, BiasFailure> {
     };
     let sign = known_sign(request, &all)?.filter(|_| truth);
     reading.flip_g2 = sign.is_some_and(|sign| sign.of == TruthSign::Challenge);
-    let (sums, catalogues) = add_up(&reading, &all, layout, &edges)?;
+    let (sums, catalogues) = add_up(&reading, &all, (layout, &edges), part)?;
     let named_unit = matches!(request.units, Units::Column(_))
         || request.units == Units::Recognised && first.columns.of(Role::Unit).is_some();
     let about = About {
@@ -348,7 +350,7 @@ pub fn sum(request: &Request) -> Result<Summed, BiasFailure> {
         if sign.of == TruthSign::Challenge {
             reading.flip_g2 = true;
             let (layout, edges) = (summed.sums.layout(), &summed.about.edges);
-            let found = add_up(&reading, &all, layout, edges)?;
+            let found = add_up(&reading, &all, (layout, edges), part)?;
             (summed.sums, summed.about.catalogues) = found;
         }
         summed.about.sign = Some(sign);
@@ -356,11 +358,12 @@ pub fn sum(request: &Request) -> Result<Summed, BiasFailure> {
     Ok(summed)
 }
 
+// The sums of the catalogues for whose numbers `part` holds.
 fn add_up(
     reading: &Reading<'_>,
     all: &[Vec<Source>],
-    layout: Layout,
-    edges: &[f64],
+    (layout, edges): (Layout, &[f64]),
+    part: &dyn Fn(usize) -> bool,
 ) -> Result<(UnitSums, Vec<Catalogue>), BiasFailure> {
     let request = reading.request;
     // The last bin is of galaxies outside of the edges.
@@ -368,6 +371,13 @@ fn add_up(
     let mut sums = UnitSums::new(layout, bins, request.catalogues.len());
     let mut catalogues = Vec::new();
     for (number, (Input { name, .. }, sources)) in request.catalogues.iter().zip(all).enumerate() {
+        if !part(number) {
+            catalogues.push(Catalogue {
+                name: name.display().to_string(),
+                ..Catalogue::default()
+            });
+            continue;
+        }
         let selects = sources[0].selects;
         let number = number as u32;
         catalogues.push(read::rows(name, reading, sources, |item| {
@@ -554,11 +564,36 @@ impl Summed {
         Ok(self)
     }
 
+    /// Adds the sums of other catalogues of the same list.
+    pub fn merge(&mut self, other: Summed) -> Result<(), BiasFailure> {
+        self.check_options(&other)?;
+        let names = |all: &[Catalogue]| -> Vec<String> {
+            all.iter().map(|catalogue| catalogue.name.clone()).collect()
+        };
+        if names(&self.about.catalogues) != names(&other.about.catalogues) {
+            return Err(BiasFailure::Unlike("lists of catalogues"));
+        }
+        for (own, more) in self.about.catalogues.iter_mut().zip(other.about.catalogues) {
+            match (own.rows, more.rows) {
+                (0, _) => *own = more,
+                (_, 0) => {}
+                _ => return Err(BiasFailure::InTwoFiles(own.name.clone())),
+            }
+        }
+        Ok(self.sums.merge(other.sums)?)
+    }
+
     /// Adds the sums of other catalogues, which follow these.
     pub fn append(&mut self, other: Summed) -> Result<(), BiasFailure> {
         self.check_options(&other)?;
         self.about.catalogues.extend(other.about.catalogues);
         Ok(self.sums.append(other.sums)?)
+    }
+
+    /// Catalogues without rows, because their shards are absent.
+    pub fn absent(&self) -> Vec<&str> {
+        let empty = self.about.catalogues.iter().filter(|own| own.rows == 0);
+        empty.map(|own| own.name.as_str()).collect()
     }
 
     fn check_options(&self, other: &Summed) -> Result<(), BiasFailure> {
@@ -700,8 +735,14 @@ impl Summed {
             let sign = Sign::of_catalogues(found);
             sign.map_err(|fault| FileError::new(truth, fault).into())
         };
-        let (_, grouping) = self.grouped()?;
-        let all = grouping.all_bins().estimate(0, true)?;
+        // A shard may be too small for an estimate that all catalogues have.
+        let estimate = self
+            .grouped()
+            .and_then(|(_, grouping)| Ok(grouping.all_bins().estimate(0, true)?));
+        let all = match estimate {
+            Err(_) if !self.absent().is_empty() => return undetermined(None),
+            found => found?,
+        };
         let m = all.value("m2").filter(|m| m.error.is_finite());
         let found = m.and_then(|m| {
             let (response, clear) = (1.0 + m.value, SIGNIFICANT * m.error);
