@@ -24,3 +24,4 @@ pub(crate) mod show;
 pub(crate) mod simulate;
 pub(crate) mod study;
 pub(crate) mod submissions;
+pub(crate) mod unpack;

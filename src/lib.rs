@@ -20,7 +20,7 @@ use clap::{Parser, Subcommand};
 use commands::{
     baseline, bench, bias, calibrate, challenge, check, compare, completions, gather, mean,
     measure, merge, pack, quickstart, reproduce, run, score, select, shear, show, simulate, study,
-    submissions,
+    submissions, unpack,
 };
 use shearq_files::parquet::panic_is_caught;
 use shearq_render::escape::visible;
@@ -108,6 +108,8 @@ enum Command {
         after_help = "Example:\n  shearq pack --measured linear --method MINE --out to-send.tar.gz"
     )]
     Pack(pack::Arguments),
+    #[command(after_help = "Example:\n  shearq unpack to-send.tar.gz --out sent")]
+    Unpack(unpack::Arguments),
     #[command(
         after_help = "Example:\n  shearq show --submission 48/linear/star --data data --galaxy 7/1/42 --out galaxy.png"
     )]
@@ -195,6 +197,7 @@ pub fn run_with(arguments: impl IntoIterator<Item = OsString>) -> u8 {
         Command::Challenge(arguments) => challenge::run(&arguments),
         Command::Check(arguments) => check::run(&arguments),
         Command::Pack(arguments) => pack::run(&arguments),
+        Command::Unpack(arguments) => unpack::run(&arguments),
         Command::Show(arguments) => show::run(&arguments),
         Command::Calibrate(arguments) => calibrate::run(&arguments),
         Command::Reproduce(arguments) => reproduce::run(&arguments),

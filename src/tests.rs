@@ -102,7 +102,7 @@ fn every_command_has_examples_that_parse() {
 
 // The ways to use each command, and the options that each way uses. Two options without a common way must be
 // refused.
-const WAYS: [(&str, &[&str]); 31] = [
+const WAYS: [(&str, &[&str]); 32] = [
     ("quickstart", &["out threads wide"]),
     (
         "simulate",
@@ -204,6 +204,7 @@ const WAYS: [(&str, &[&str]); 31] = [
             "measured challenge branch subfields grid whole-galaxies out",
         ],
     ),
+    ("unpack", &["ARCHIVE out verify"]),
     ("show", &["submission data galaxy out"]),
     (
         "calibrate",

@@ -31,8 +31,8 @@ pub(super) const ARCHIVES: [&str; 8] = ["zip", "tar", "gz", "tgz", "bz2", "xz", 
 /// from cross-spectra between groups of images.
 ///
 /// manifest.json lists the files with their SHA-256 checksums, the settings, and the covariances of cross-spectra of
-/// eight or more images. The same catalogues give the same bytes. `shearq check` checks a submission
-/// and its checksums.
+/// eight or more images. The same catalogues give the same bytes. `shearq check` checks a submission, `shearq unpack`
+/// unpacks an archive.
 ///
 /// With `--challenge great3 --branch BRANCH`, the command makes the submission file of GREAT3 from a folder that `measure`
 /// wrote, or from catalogues of all galaxies of a branch, after the checks of the challenge's own program (docs/great3.md).

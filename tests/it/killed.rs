@@ -89,20 +89,26 @@ fn kill(command: &[&str], whole: &Path, kills: usize, seed: u64) {
 fn what_killed_commands_leave_is_removed_by_the_next() {
     let root = tempfile::tempdir().unwrap();
     let at = |name: &str| root.path().join(name);
-    let measured = at("measured");
-    let measured = text(&measured);
+    let (measured, archive) = (at("measured"), at("whole.tar.gz"));
+    let (measured, archive) = (text(&measured), text(&archive));
     let run = "run --simulate --submission 23/raw/star --sets 1,7 --grid 16";
     printed(
         root.path(),
         &format!("shearq {run} --images 20 --out measured"),
     );
+    printed(
+        root.path(),
+        "shearq pack --measured measured --out whole.tar.gz",
+    );
     let pack = format!("pack --measured {measured} --out");
+    let unpack = format!("unpack {archive} --out");
     let store = format!("score --measured {measured} --store");
     let record = format!("baseline record mine {} --images 4 --folder", &run[4..]);
     // With what is taken away so that the command can run again.
     for (command, out, made) in [
         (&pack, "sent", "sent"),
         (&pack, "sent.tar.gz", "sent.tar.gz"),
+        (&unpack, "unpacked", "unpacked"),
         (&store, "store", "nothing"),
         (&record, "baselines", "baselines/mine.toml"),
     ] {

@@ -1,4 +1,4 @@
-//! Archives that were changed or made to do harm are refused. Sound ones are in
+//! Archives that were changed or made to do harm are refused, and leave nothing. Sound ones are in
 //! `tests/cases/submissions.md`.
 
 use std::fs;
@@ -7,7 +7,7 @@ use std::path::Path;
 use flate2::Compression;
 use flate2::write::GzEncoder;
 
-use crate::support::{contents, printed, shell};
+use crate::support::{contents, printed, refused, shell};
 
 /// An archive in memory.
 type Builder = tar::Builder<GzEncoder<fs::File>>;
@@ -33,13 +33,13 @@ fn archive(path: &Path, files: &[(&str, &[u8])]) {
 }
 
 #[test]
-fn changed_archives_are_refused() {
+fn changed_archives_are_refused_and_leave_nothing() {
     let root = tempfile::tempdir().unwrap();
-    let path = root.path().join("bad.tar.gz");
+    let (place, path) = (root.path().join("place"), root.path().join("bad.tar.gz"));
     for line in [
         "shearq simulate --sets 8 --images 3 --grid 16 --out data",
         "shearq measure --submission 23/raw/star --data data --out out",
-        "shearq pack --measured out --method NN --out sent",
+        "shearq pack --measured out --method NN --out sent; mkdir place",
     ] {
         printed(root.path(), line);
     }
@@ -49,17 +49,20 @@ fn changed_archives_are_refused() {
         .map(|(name, content)| (name.as_str(), content.as_slice()))
         .collect();
     let check = |expected: &str| {
-        let check = "shearq check bad.tar.gz --data data --images 3";
-        let check = shell(root.path(), check);
-        let message = String::from_utf8(check.stdout).unwrap();
-        let named = message.contains("bad.tar.gz") && message.contains(expected);
-        assert!(named && check.status.code() == Some(1), "{message}");
+        for more in ["--out place/never", "--verify"] {
+            let message = refused(root.path(), &format!("shearq unpack bad.tar.gz {more}"));
+            let named = message.contains("bad.tar.gz") && message.contains(expected);
+            assert!(named, "{message}");
+        }
+        assert_eq!(fs::read_dir(&place).unwrap().count(), 0, "{expected}");
+        let check = shell(
+            root.path(),
+            "shearq check bad.tar.gz --data data --images 3",
+        );
+        assert_eq!(check.status.code(), Some(1), "{expected}");
     };
     archive(&path, &files);
-    printed(
-        root.path(),
-        "shearq check bad.tar.gz --data data --images 3",
-    );
+    printed(root.path(), "shearq unpack bad.tar.gz --verify");
     let with = |name: &str, content: &[u8]| {
         let mut files = files.clone();
         match files.iter_mut().find(|file| file.0 == name) {

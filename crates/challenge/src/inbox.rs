@@ -169,7 +169,7 @@ pub fn content(sending: &Sending) -> Result<Content, FileError> {
         true => (Manifest::read(path)?, sums(path)?),
         false if is_archive(path) => {
             let unpacked = read_archive(path, None)?;
-            unpacked.verify(path)?;
+            unpacked.verify(path, false)?;
             (unpacked.manifest, unpacked.files.into_iter().collect())
         }
         false => {

@@ -245,7 +245,9 @@ impl Judge {
         verify_public(&self.public, threads)?;
         let public = DataFolder::open(&self.public)?;
         let ids = References::ids(&public, &self.challenge.data.sets)?;
-        let references = References::kept(store, &self.id, &public, &ids, self.grid, threads)?;
+        let references = References::kept(
+            store, &self.id, &public, &ids, self.grid, threads,
+        )?;
         let pool = Pool::new(threads)?;
         // Stored one by one, so that an interrupted command keeps the entries that it scored.
         for result in pool.in_order(candidates, |candidate| self.judge(candidate, &references)) {

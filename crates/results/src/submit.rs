@@ -21,7 +21,7 @@ use sha2::{Digest, Sha256};
 use shearq_dataset::fingerprint::hex;
 use shearq_dataset::layout::{DataFolder, MAX_IMAGE, MAX_SET, check_folder};
 use shearq_dataset::run::{Run, read_record, relative_path};
-use shearq_files::atomic::Scratch;
+use shearq_files::atomic::{PartFolder, Scratch};
 use shearq_files::open::{is_there, open};
 use shearq_files::{FileError, table};
 use shearq_scoring::{Bins, Definition, Grid, SCORED, SpectrumCovariance};
@@ -331,13 +331,28 @@ pub struct Unpacked {
 }
 
 impl Unpacked {
-    /// Compares the files with the manifest, if there is one.
-    pub fn verify(&self, archive: &Path) -> Result<(), FileError> {
+    /// Compares the files with the manifest, which must exist if it is `required`.
+    pub fn verify(&self, archive: &Path, required: bool) -> Result<(), FileError> {
         match &self.manifest {
             Some(manifest) => manifest.verify(&self.files, archive),
+            None if required => {
+                let message =
+                    format!("cannot verify the files, because there is no {MANIFEST_FILE}");
+                Err(FileError::new(archive, message))
+            }
             None => Ok(()),
         }
     }
+}
+
+/// Unpacks the archive at `path` into the new folder `out`. After an error no folder remains. The manifest must exist if
+/// it is `required`.
+pub fn unpack(path: &Path, out: &Path, required: bool) -> Result<Unpacked, FileError> {
+    let part = PartFolder::new(out)?;
+    let unpacked = read_archive(path, Some(part.path()))?;
+    unpacked.verify(path, required)?;
+    part.finish()?;
+    Ok(unpacked)
 }
 
 /// Reads a whole archive and writes its files to the folder `into`, if given.

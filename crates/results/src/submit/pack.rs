@@ -200,7 +200,7 @@ impl Packing<'_> {
     }
 }
 
-// Refuses more files than `check` reads. The manifest is one more file.
+// Refuses more files than `check` and `unpack` read. The manifest is one more file.
 fn check_number(files: usize, out: &Path) -> Result<(), FileError> {
     if (files as u64) < MAX_FILES {
         return Ok(());
