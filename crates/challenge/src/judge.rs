@@ -246,7 +246,7 @@ impl Judge {
         let public = DataFolder::open(&self.public)?;
         let ids = References::ids(&public, &self.challenge.data.sets)?;
         let references = References::kept(
-            store, &self.id, &public, &ids, self.grid, threads,
+            store, &self.key, &self.id, &public, &ids, self.grid, threads,
         )?;
         let pool = Pool::new(threads)?;
         // Stored one by one, so that an interrupted command keeps the entries that it scored.

@@ -4,6 +4,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use shearq_dataset::fingerprint::Fingerprint;
 use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::{DataFolder, read_rows};
 use shearq_dataset::run::{Run, Source};
@@ -23,6 +24,8 @@ use shearq_results::submit::{Kind, Sent};
 use shearq_scoring::ndarray::Array2;
 use shearq_scoring::{Convention, FieldSum, Grid};
 use shearq_submissions::Registry;
+
+use crate::seal::Key;
 
 const REFERENCE: &str = "48/linear/star";
 // Required difference of two correlations, in standard deviations of chance correlations.
@@ -156,8 +159,12 @@ pub struct References {
 impl References {
     /// The reference measurement of images that do not change, as their fingerprint `print` states. It is kept in `folder`,
     /// a table per set, because it takes longer than to score an entry.
+    ///
+    /// # Errors
+    /// If a kept table is not the one that was signed with the `key` when the images were measured.
     pub fn kept(
         folder: &Path,
+        key: &Key,
         print: &str,
         data: &DataFolder,
         ids: &[ImageId],
@@ -173,10 +180,10 @@ impl References {
             let (version, set) = (shearq_dataset::VERSION, of_set[0].set);
             let path = folder.join(format!(".reference-{version}-{print}-set{set:02}.parquet"));
             let images = match is_there(&path) {
-                true => restored(&path, set, &grid)?,
+                true => restored(&path, key, set, &grid)?,
                 false => {
                     let measured = References::measure(data, of_set, grid, threads, &mut Quiet)?;
-                    write_shapes(&path, &measured.images)?;
+                    write_shapes(&path, key, &measured.images)?;
                     measured.images
                 }
             };
@@ -302,8 +309,24 @@ type ShapesOfImages = BTreeMap<(u32, u32), Shapes>;
 
 const KEPT_COLUMNS: [&str; 3] = ["image", "e1", "e2"];
 
+// A team whose entry is judged by shapes that somebody edited gains or loses by it, so that their content is signed.
+const SIGNATURE: &str = "signature";
+
+// The signature of the name of the file, which has version, images and set, and of all rows.
+fn signed(path: &Path, key: &Key, columns: [&[f64]; 3]) -> String {
+    let mut sum = Fingerprint::default();
+    for column in columns {
+        let bytes = column
+            .iter()
+            .flat_map(|value| value.to_bits().to_le_bytes());
+        sum.add(bytes.collect::<Vec<u8>>());
+    }
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    key.sign("reference", &[&name, &sum.finish()])
+}
+
 // One row per cell, image by image.
-fn write_shapes(path: &Path, images: &ShapesOfImages) -> Result<(), FileError> {
+fn write_shapes(path: &Path, key: &Key, images: &ShapesOfImages) -> Result<(), FileError> {
     let mut columns: [Vec<f64>; 3] = Default::default();
     for ((_, image), shapes) in images {
         for [e1, e2] in shapes {
@@ -311,16 +334,24 @@ fn write_shapes(path: &Path, images: &ShapesOfImages) -> Result<(), FileError> {
             columns.iter_mut().zip(values).for_each(|(c, v)| c.push(v));
         }
     }
+    let signature = signed(path, key, columns.each_ref().map(Vec::as_slice));
     let columns = KEPT_COLUMNS.into_iter().zip(columns);
     let columns = columns.map(|(name, values)| Column::new(name.into(), values));
     let table = frame(columns.collect()).map_err(|error| FileError::new(path, error))?;
-    table::write(path, FileFormat::Parquet, &table, &Metadata::new())
+    let metadata = Metadata::from([(SIGNATURE.to_owned(), signature)]);
+    table::write(path, FileFormat::Parquet, &table, &metadata)
 }
 
-fn restored(path: &Path, set: u32, grid: &Grid) -> Result<ShapesOfImages, FileError> {
+fn restored(path: &Path, key: &Key, set: u32, grid: &Grid) -> Result<ShapesOfImages, FileError> {
     let read = table::read(path, Some(&KEPT_COLUMNS), table::MAX_ROWS)?;
     let [numbers, e1, e2] = KEPT_COLUMNS.map(|name| table::numbers(&read, name, path));
     let (numbers, e1, e2) = (numbers?, e1?, e2?);
+    let name = SIGNATURE.to_owned();
+    let stated = table::read_metadata(path, FileFormat::Parquet, std::iter::once(&name))?;
+    if stated.get(SIGNATURE) != Some(&signed(path, key, [&numbers, &e1, &e2])) {
+        let message = "the shapes were changed, or measured for another challenge or by another build of this version (found another signature or none, expected that of the private folder). Try: remove the file, and the images are measured again";
+        return Err(FileError::new(path, message));
+    }
     let cells = grid.cells();
     let mut images = BTreeMap::new();
     for (number, (e1, e2)) in numbers
@@ -503,7 +534,8 @@ mod tests {
             ShapesOfImages::from([((7, 1), shapes.clone()), ((7, 3), shapes.t().to_owned())]);
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("kept.parquet");
-        write_shapes(&path, &images).unwrap();
+        let key = Key::new("pilot", 1, None);
+        write_shapes(&path, &key, &images).unwrap();
         let bits = |images: ShapesOfImages| -> Vec<_> {
             let bits = |shapes: Shapes| shapes.mapv(|shape| shape.map(f32::to_bits));
             images
@@ -511,8 +543,22 @@ mod tests {
                 .map(|(id, shapes)| (id, bits(shapes)))
                 .collect()
         };
-        assert_eq!(bits(restored(&path, 7, &grid).unwrap()), bits(images));
+        assert_eq!(bits(restored(&path, &key, 7, &grid).unwrap()), bits(images));
         let other = Grid::new(15, Pixels(48.0), Degrees(10.0)).unwrap();
-        assert!(restored(&path, 7, &other).is_err());
+        assert!(restored(&path, &key, 7, &other).is_err());
+        // Neither an edited table with the old signature nor one of another challenge is used.
+        let refused = |key: &Key| restored(&path, key, 7, &grid).unwrap_err().message;
+        assert!(refused(&Key::new("pilot", 1, None)).contains("another signature"));
+        let metadata =
+            table::read_metadata(&path, FileFormat::Parquet, [SIGNATURE.to_owned()].iter());
+        let mut edited = table::read(&path, None, table::MAX_ROWS).unwrap();
+        let e1: Vec<f64> = table::numbers(&edited, "e1", &path)
+            .unwrap()
+            .iter()
+            .map(|e| -e)
+            .collect();
+        edited.with_column(Column::new("e1".into(), e1)).unwrap();
+        table::write(&path, FileFormat::Parquet, &edited, &metadata.unwrap()).unwrap();
+        assert!(refused(&key).contains("another signature"));
     }
 }
