@@ -182,7 +182,7 @@ const WAYS: [(&str, &[&str]); 32] = [
     ),
     (
         "challenge check",
-        &["ENTRY challenge json threads"],
+        &["ENTRY challenge truth team json threads"],
     ),
     (
         "challenge rank",

@@ -159,6 +159,13 @@ struct CheckArguments {
     /// Print the findings as JSON.
     #[arg(long)]
     json: bool,
+    /// Private folder, for organisers: if there are no errors, sign the time of arrival in ENTRY.receipt.toml. An earlier
+    /// receipt of the same content is kept.
+    #[arg(long, value_name = "DIR")]
+    truth: Option<PathBuf>,
+    /// Team of the receipt [default: as in the manifest, or the name of the file].
+    #[arg(long, value_name = "NAME", requires = "truth", value_parser = name)]
+    team: Option<String>,
     #[command(flatten)]
     threads: Threads,
 }
@@ -171,8 +178,8 @@ struct CheckArguments {
 /// Every scored entry is kept in the results store. Later runs score only new entries, so a stopped run continues, and
 /// several processes may share a store. Without INBOX, the store alone is ranked.
 ///
-/// The time of an entry is that at which `rank` first scored it, unless board.toml in the private folder states another one.
-/// This file also withdraws entries and names teams (docs/run-a-challenge.md).
+/// The time of an entry is that of its receipt, which `check --truth` signs, or the time at which `rank` first scored it.
+/// board.toml in the private folder withdraws entries and names teams (docs/run-a-challenge.md).
 #[derive(Debug, Args)]
 struct RankArguments {
     /// Entries: archives, or folders of entries.
@@ -296,9 +303,15 @@ fn check_entry(arguments: &CheckArguments) -> anyhow::Result<()> {
         entry,
         challenge: place,
         json,
+        truth,
+        team,
         threads,
     } = arguments;
     let threads = threads.number();
+    let judge = truth
+        .as_ref()
+        .map(|truth| Judge::open(place, truth, threads))
+        .transpose()?;
     let challenge = Challenge::read(place)?;
     let expected = challenge.expected()?;
     // A link could name any file of the organiser's system. An absent entry is reported below.
@@ -346,7 +359,13 @@ fn check_entry(arguments: &CheckArguments) -> anyhow::Result<()> {
             place.display()
         )),
     }
-    report(&findings, entry, *json)
+    // Before the receipt, because it fails if there are errors: an entry that cannot be scored must not hold a place in time.
+    report(&findings, entry, *json)?;
+    if let Some(judge) = judge {
+        let receipt = judge.sign(entry, team.as_deref())?;
+        tell(format_args!("receipt: {}", receipt.display()));
+    }
+    Ok(())
 }
 
 fn rank(arguments: &RankArguments) -> anyhow::Result<()> {

@@ -10,16 +10,18 @@
 //! * `tables TO NAME=CSV...`: a file of tables, each from a CSV of numbers.
 //! * `stamps FROM SIDE`: prints the first pixel of each stamp of a mosaic.
 //! * `csv FROM TO COLUMN...`: writes columns of a catalogue as CSV, or prints why it cannot be read.
+//! * `sign PRIVATE ENTRY TEAM TIME`: writes a receipt for an entry of the past, with the key of a challenge.
 
 use std::fs;
 use std::path::Path;
 
+use shearq_challenge::seal::{Key, Receipt, sha256};
 use shearq_files::fits::write_table;
 use shearq_files::frames::frame;
 use shearq_files::frames::polars::Column;
 use shearq_files::table;
 
-use crate::support::{csv, fits_image, pixels_of, text};
+use crate::support::{contents, csv, fits_image, pixels_of, text};
 
 /// Runs a command of this module in `root`, and gives what it prints; `None` if it is another.
 pub fn run(command: &str, root: &Path) -> Option<String> {
@@ -79,6 +81,19 @@ pub fn run(command: &str, root: &Path) -> Option<String> {
             let row = |k: usize| columns.iter().map(|c| c[k].to_string()).collect::<Vec<_>>();
             let rows = (0..read.height()).map(|k| row(k).join(",") + "\n");
             fs::write(at(to), names.join(",") + "\n" + &rows.collect::<String>()).unwrap();
+        }
+        ["sign", private, entry, team, time] => {
+            let (key, entry) = (Key::read(&at(private)).unwrap().unwrap(), at(entry));
+            let content = match entry.is_dir() {
+                true => {
+                    let files = contents(&entry).into_iter();
+                    let lines = files.map(|(name, file)| format!("{name} {}\n", sha256(&file)));
+                    lines.collect::<String>().into_bytes()
+                }
+                false => fs::read(&entry).unwrap(),
+            };
+            let receipt = Receipt::sign(&key, team, time.parse().unwrap(), &sha256(&content));
+            receipt.write(&entry).unwrap();
         }
         _ => return None,
     }

@@ -218,6 +218,7 @@ mod tests {
         let more = of("c", &["g10_v1_objs_1_1.M.dat", "LICENSE"]);
         assert_eq!(plain.sha256, renamed.sha256);
         assert_ne!(plain.sha256, more.sha256);
+        assert_eq!((more.files.len(), &more.files), (1, &plain.files));
     }
 
     #[test]

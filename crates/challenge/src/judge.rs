@@ -29,7 +29,7 @@ use crate::constant::ConstantShears;
 use crate::error::ChallengeError;
 use crate::inbox::{Content, Sending, content, identify};
 use crate::kind::response;
-use crate::seal::{Key, verify, verify_public};
+use crate::seal::{Key, Receipt, verify, verify_public};
 use crate::shapes::References;
 use crate::terms::{Challenge, now};
 
@@ -43,8 +43,9 @@ pub struct EntryInfo {
     pub title: String,
     /// Address for questions; may be empty. The leaderboard does not show it.
     pub contact: String,
-    /// Time of the first `rank` that scored the entry, or that the organiser states.
+    /// Time of arrival: of the receipt, or of the first `rank` that scored the entry.
     pub received: Timestamp,
+    pub receipt: bool,
     pub file: String,
     pub sha256: String,
     /// SHA-256 of sets, images and files.
@@ -117,12 +118,17 @@ impl std::fmt::Debug for Judge {
     }
 }
 
+struct Arrival {
+    sha256: String,
+    received: Timestamp,
+    receipt: Option<Receipt>,
+}
+
 struct Candidate {
     sending: Sending,
     reference: bool,
     team: String,
-    sha256: String,
-    received: Timestamp,
+    arrival: Arrival,
     content: Content,
 }
 
@@ -210,7 +216,8 @@ impl Judge {
                 sets: run.sets,
                 withdrawn: None,
             };
-            // Two processes may score one entry at the same time. Teams that sent the same archive have an entry each.
+            // Two processes may score one entry at the same time, and a receipt may be found later. Teams that sent the same
+            // archive have an entry each.
             match entries.entry((entry.info.sha256.clone(), entry.info.team.clone())) {
                 Slot::Occupied(mut slot) => {
                     let earlier = self.order(slot.get().info.received);
@@ -264,8 +271,47 @@ impl Judge {
         Ok(round)
     }
 
-    // The entries that are not in the store yet. Those in the store are only counted, because scoring is slow; unreadable
-    // entries and repeated archives are refused.
+    // When an entry arrived, without a receipt `now`.
+    fn arrival(&self, sending: &Sending, now: Timestamp) -> Result<Arrival, FileError> {
+        let sha256 = identify(&sending.path)?;
+        let receipt = Receipt::read(&self.key, &sending.path, &sha256)?;
+        if let (Some(receipt), Some(team)) = (&receipt, &sending.team)
+            && receipt.team != *team
+        {
+            let message = format!(
+                "the receipt is of another team (found `{0}`, expected the folder's `{team}`). Try: move both into the folder `{0}`, or sign again by shearq challenge check --truth DIR --team \"{team}\"",
+                receipt.team
+            );
+            return Err(FileError::new(Receipt::path(&sending.path), message));
+        }
+        Ok(Arrival {
+            sha256,
+            received: receipt.as_ref().map_or(now, |receipt| receipt.received),
+            receipt,
+        })
+    }
+
+    /// Signs the arrival of an entry, now, for `team` or the team in the manifest, and returns the file of the receipt. A
+    /// receipt that the same content has already is kept, unless it is of a time before entries are accepted.
+    pub fn sign(&self, entry: &Path, team: Option<&str>) -> Result<PathBuf, FileError> {
+        let sha256 = identify(entry)?;
+        let sending = Sending {
+            path: entry.to_owned(),
+            team: team.map(str::to_owned),
+        };
+        let team = team_of(&sending, content(&sending)?.entry.as_ref(), None);
+        check_name(&team).map_err(|error| FileError::new(entry, error))?;
+        let counts = |received| !self.challenge.rules.is_early(received);
+        match Receipt::read(&self.key, entry, &sha256) {
+            Ok(Some(earlier)) if earlier.team == team && counts(earlier.received) => {
+                Ok(Receipt::path(entry))
+            }
+            _ => Receipt::sign(&self.key, &team, now(), &sha256).write(entry),
+        }
+    }
+
+    // The entries that are not in the store yet, in order of arrival. Those in the store are only counted, because scoring is
+    // slow; unreadable entries and repeated archives are refused.
     fn candidates(
         &self,
         sendings: &[(Sending, bool)],
@@ -273,48 +319,52 @@ impl Judge {
         threads: usize,
         round: &mut Round,
     ) -> Result<Vec<Candidate>, ChallengeError> {
-        let received = now();
+        let now = now();
         let mut stored: BTreeMap<&str, Vec<&EntryInfo>> = BTreeMap::new();
         for Entry { info, .. } in known {
             stored.entry(&info.sha256).or_default().push(info);
         }
-        let is_scored = |team: &str, sha256: &str| {
-            let mut same = stored.get(sha256).into_iter().flatten();
-            let order = self.order(received);
-            same.any(|info| info.team == team && self.order(info.received) <= order)
+        let is_scored = |team: &str, arrival: &Arrival| {
+            let same = stored.get(arrival.sha256.as_str()).into_iter().flatten();
+            let order = self.order(arrival.received);
+            same.into_iter()
+                .any(|info| info.team == team && self.order(info.received) <= order)
         };
         let pool = Pool::new(threads)?;
         let identified = pool.in_order(sendings, |(sending, reference)| {
-            let found = identify(&sending.path).and_then(|sha256| {
-                // Without a folder, the manifest states the team.
-                let team = sending.team.as_ref();
-                let content = match team.is_some_and(|team| is_scored(team, &sha256)) {
+            let found = self.arrival(sending, now).and_then(|arrival| {
+                // Without a folder or a receipt, the manifest states the team.
+                let of_receipt = arrival.receipt.as_ref().map(|receipt| &receipt.team);
+                let team = sending.team.as_ref().or(of_receipt);
+                let content = match team.is_some_and(|team| is_scored(team, &arrival)) {
                     true => None,
                     false => Some(content(sending)?),
                 };
-                Ok((sha256, content))
+                Ok((arrival, content))
             });
             (sending.clone(), *reference, found)
         });
-        let mut archives: BTreeMap<(String, String), PathBuf> = BTreeMap::new();
-        let mut candidates = Vec::new();
+        let mut readable = Vec::new();
         for (sending, reference, found) in identified {
-            let (sha256, content) = match found {
-                Ok(found) => found,
-                Err(error) => {
-                    round.refused.push(Refused {
-                        team: team_of(&sending, None),
-                        reason: reason_of(&error.path, &error.message, &sending),
-                        path: sending.path,
-                    });
-                    continue;
-                }
-            };
+            match found {
+                Ok((arrival, content)) => readable.push((sending, reference, arrival, content)),
+                Err(error) => round.refused.push(Refused {
+                    team: team_of(&sending, None, None),
+                    reason: reason_of(&error.path, &error.message, &sending),
+                    path: sending.path,
+                }),
+            }
+        }
+        readable.sort_by(|a, b| (a.2.received, &a.0).cmp(&(b.2.received, &b.0)));
+        let mut archives: BTreeMap<(String, String, bool), PathBuf> = BTreeMap::new();
+        let mut candidates = Vec::new();
+        for (sending, reference, arrival, content) in readable {
             let entry = content.as_ref().and_then(|content| content.entry.as_ref());
-            let team = team_of(&sending, entry);
+            let team = team_of(&sending, entry, arrival.receipt.as_ref());
+            let early = self.challenge.rules.is_early(arrival.received);
             // The same content in another archive is handled by `ranking`, because which of them came first is known only when all
             // are scored.
-            match archives.entry((sha256.clone(), team.clone())) {
+            match archives.entry((arrival.sha256.clone(), team.clone(), early)) {
                 Slot::Occupied(first) => {
                     round.refused.push(Refused {
                         path: sending.path,
@@ -325,14 +375,13 @@ impl Judge {
                 }
                 Slot::Vacant(slot) => _ = slot.insert(sending.path.clone()),
             }
-            match content.filter(|_| !is_scored(&team, &sha256)) {
+            match content.filter(|_| !is_scored(&team, &arrival)) {
                 None => round.known += 1,
                 Some(content) => candidates.push(Candidate {
                     sending,
                     reference,
                     team,
-                    sha256,
-                    received,
+                    arrival,
                     content,
                 }),
             }
@@ -349,8 +398,7 @@ impl Judge {
             sending,
             reference,
             team,
-            sha256,
-            received,
+            arrival,
             content,
         } = candidate;
         let refuse = |reason: String| Refused {
@@ -365,9 +413,10 @@ impl Judge {
             method: String::new(),
             title: stated.map_or_else(String::new, |entry| entry.title.clone()),
             contact: stated.map_or_else(String::new, |entry| entry.contact.clone()),
-            received,
+            received: arrival.received,
+            receipt: arrival.receipt.is_some(),
             file: file_name(&sending.path),
-            sha256,
+            sha256: arrival.sha256,
             content: content.sha256,
             contents: Contents::Catalogues,
             reference,
@@ -598,10 +647,11 @@ fn reason_of(path: &Path, message: &str, sending: &Sending) -> String {
     }
 }
 
-// Team of an entry: its folder in the inbox, or as its manifest (`entry`) states, or the name of the file.
-fn team_of(sending: &Sending, entry: Option<&Team>) -> String {
+// Team of an entry: its folder in the inbox, or as its receipt or its manifest (`entry`) states, or the name of the file.
+fn team_of(sending: &Sending, entry: Option<&Team>, receipt: Option<&Receipt>) -> String {
     let folder = sending.team.clone();
     folder
+        .or_else(|| receipt.map(|receipt| receipt.team.clone()))
         .or_else(|| entry.map(|entry| entry.team.clone()))
         .unwrap_or_else(|| {
             let name = file_name(&sending.path);

@@ -3,7 +3,6 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-use jiff::Timestamp;
 use serde::Deserialize;
 use shearq_files::FileError;
 use shearq_results::compare::difference;
@@ -238,8 +237,6 @@ pub struct Decisions {
     /// Whether teams without an alias have drawn names, and methods, titles and refused entries are not published.
     pub anonymous: bool,
     pub aliases: BTreeMap<String, String>,
-    /// Times of arrival of entries that were scored later, by the same digits as `withdrawn`.
-    pub received: BTreeMap<String, Timestamp>,
     /// Reasons, by the first digits of the SHA-256 of the archive, or `DIGITS/TEAM` if several teams sent it.
     pub withdrawn: BTreeMap<String, String>,
 }
@@ -251,15 +248,34 @@ impl Decisions {
         Ok(decisions.unwrap_or_default())
     }
 
-    /// Marks withdrawn entries, replaces the names of teams, and sorts entries by their time of arrival.
+    /// Marks withdrawn entries and replaces the names of teams.
     pub fn apply(&self, entries: &mut [Entry], key: &Key) -> Result<(), String> {
-        for (id, time) in &self.received {
-            entries[named(entries, "received", id)?].info.received = *time;
-        }
-        entries.sort_by_cached_key(|entry| (entry.info.received, entry.info.file.clone()));
         for (id, reason) in &self.withdrawn {
-            let entry = named(entries, "withdrawn", id)?;
-            entries[entry].withdrawn = Some(reason.clone());
+            // Two teams may have sent the same archive.
+            let (digits, team) = match id.split_once('/') {
+                Some((digits, team)) => (digits, Some(team)),
+                None => (id.as_str(), None),
+            };
+            let names = |entry: &Entry| {
+                digits.len() >= LEAST_DIGITS
+                    && entry.info.sha256.starts_with(digits)
+                    && team.is_none_or(|team| entry.info.team == team)
+            };
+            let named: Vec<usize> = (0..entries.len()).filter(|k| names(&entries[*k])).collect();
+            let [entry] = named.as_slice() else {
+                let known: Vec<String> = entries
+                    .iter()
+                    .map(|entry| {
+                        let info = &entry.info;
+                        format!("{} ({}, {})", info.short_id(), info.team, info.file)
+                    })
+                    .collect();
+                return Err(format!(
+                    "`withdrawn` names no single entry (found `{id}`, expected {LEAST_DIGITS} digits or more of an SHA-256: {})",
+                    known.join(", ")
+                ));
+            };
+            entries[*entry].withdrawn = Some(reason.clone());
         }
         let teams: BTreeSet<String> = entries
             .iter()
@@ -295,30 +311,6 @@ impl Decisions {
         }
         Ok(())
     }
-}
-
-// The entry that a `key` of the decisions names by `id`: digits, or `DIGITS/TEAM`, because two teams may have sent one archive.
-fn named(entries: &[Entry], key: &str, id: &str) -> Result<usize, String> {
-    let (digits, team) = match id.split_once('/') {
-        Some((digits, team)) => (digits, Some(team)),
-        None => (id, None),
-    };
-    let names = |entry: &Entry| {
-        digits.len() >= LEAST_DIGITS
-            && entry.info.sha256.starts_with(digits)
-            && team.is_none_or(|team| entry.info.team == team)
-    };
-    let found: Vec<usize> = (0..entries.len()).filter(|k| names(&entries[*k])).collect();
-    let [entry] = found.as_slice() else {
-        let known = entries.iter().map(|Entry { info, .. }| {
-            format!("{} ({}, {})", info.short_id(), info.team, info.file)
-        });
-        return Err(format!(
-            "`{key}` names no single entry (found `{id}`, expected {LEAST_DIGITS} digits or more of an SHA-256: {})",
-            known.collect::<Vec<_>>().join(", ")
-        ));
-    };
-    Ok(*entry)
 }
 
 #[cfg(test)]
@@ -363,6 +355,7 @@ pub(crate) mod tests {
                 title: String::new(),
                 contact: String::new(),
                 received: received.parse().unwrap(),
+                receipt: false,
                 file: String::new(),
                 sha256: format!("{team}{received}"),
                 content: format!("{team}{received}"),

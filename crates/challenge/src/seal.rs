@@ -1,4 +1,4 @@
-//! Checksums of both folders of a challenge, and the private key that belongs to them.
+//! Checksums of both folders of a challenge, the private key that belongs to them, and receipts of entries.
 //!
 //! `key.toml` contains the checksums of all private files and of the list of public checksums. The public description
 //! contains a keyed hash of the private checksums, so that even the organiser cannot change the truth and its checksums
@@ -8,6 +8,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use hmac::{Hmac, KeyInit, Mac};
+use jiff::Timestamp;
 use serde::de::{DeserializeOwned, IgnoredAny};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -275,9 +276,141 @@ pub fn verify(
     Ok((key, id))
 }
 
+/// A signed statement of when an entry arrived.
+///
+/// A receipt shows that somebody with the private folder had this archive, under this team's name, at the stated time. It
+/// shows neither who sent the archive nor whose work it is, and it does not bind the organisers themselves, who have the
+/// secret and the clock.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Receipt {
+    pub challenge: String,
+    pub team: String,
+    pub received: Timestamp,
+    /// SHA-256 of the archive, or of the list of a folder's files.
+    pub sha256: String,
+    /// HMAC-SHA256 of the other values with the secret of the private folder.
+    pub signature: String,
+}
+
+impl Receipt {
+    pub fn sign(key: &Key, team: &str, received: Timestamp, sha256: &str) -> Self {
+        let mut receipt = Receipt {
+            challenge: key.name.clone(),
+            team: team.into(),
+            received,
+            sha256: sha256.into(),
+            signature: String::new(),
+        };
+        receipt.signature = receipt.signed(key);
+        receipt
+    }
+
+    fn signed(&self, key: &Key) -> String {
+        let (version, received) = (key.version.to_string(), self.received.to_string());
+        key.sign(
+            "receipt",
+            &[
+                &self.challenge,
+                &version,
+                &self.team,
+                &received,
+                &self.sha256,
+            ],
+        )
+    }
+
+    pub fn path(entry: &Path) -> PathBuf {
+        let mut name = entry.file_name().unwrap_or_default().to_owned();
+        name.push(".receipt.toml");
+        entry.with_file_name(name)
+    }
+
+    pub fn read(key: &Key, entry: &Path, sha256: &str) -> Result<Option<Self>, FileError> {
+        let path = Receipt::path(entry);
+        refuse_link(&path)?;
+        let Some(receipt) = read_toml::<Receipt>(&path, "receipt")? else {
+            return Ok(None);
+        };
+        if receipt.sha256 != sha256 {
+            let message = format!(
+                "the receipt belongs to other content (found SHA-256 {}, expected {sha256})",
+                receipt.sha256
+            );
+            return Err(FileError::new(path, message));
+        }
+        if receipt.signature != receipt.signed(key) {
+            let message = "the receipt was not signed with the key of this challenge";
+            return Err(FileError::new(path, message));
+        }
+        Ok(Some(receipt))
+    }
+
+    pub fn write(&self, entry: &Path) -> Result<PathBuf, FileError> {
+        let path = Receipt::path(entry);
+        refuse_link(&path)?;
+        let text =
+            toml::to_string(self).map_err(FileError::doing(&path, "cannot write the receipt"))?;
+        atomic::write(&path, text.as_bytes())?;
+        Ok(path)
+    }
+}
+
+// A link in an inbox may name any file of the organiser's system.
+fn refuse_link(path: &Path) -> Result<(), FileError> {
+    match path.is_symlink() {
+        true => Err(FileError::new(path, "this is a link; expected a file")),
+        false => Ok(()),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[cfg(unix)]
+    #[test]
+    fn a_link_is_neither_read_nor_written() {
+        let folder = tempfile::tempdir().unwrap();
+        let (entry, target) = (folder.path().join("a.tgz"), folder.path().join("target"));
+        let key = Key::new("pilot", 1, None);
+        let receipt = Receipt::sign(&key, "A", "2026-11-24T10:00:00Z".parse().unwrap(), "1f");
+        std::fs::write(&target, toml::to_string(&receipt).unwrap()).unwrap();
+        std::os::unix::fs::symlink(&target, Receipt::path(&entry)).unwrap();
+        assert!(
+            Receipt::read(&key, &entry, "1f")
+                .unwrap_err()
+                .message
+                .contains("link")
+        );
+        assert!(receipt.write(&entry).is_err());
+    }
+
+    #[test]
+    fn only_the_signed_time_team_and_content_are_accepted() {
+        let folder = tempfile::tempdir().unwrap();
+        let entry = folder.path().join("a.tar.gz");
+        let key = Key::new("pilot", 1, None);
+        let receipt = Receipt::sign(&key, "A", "2026-11-24T10:00:00Z".parse().unwrap(), "1f");
+        assert_eq!(Receipt::read(&key, &entry, "1f").unwrap(), None);
+        let path = receipt.write(&entry).unwrap();
+        let read = |key: &Key| Receipt::read(key, &entry, "1f");
+        assert_eq!(read(&key).unwrap(), Some(receipt.clone()));
+        assert!(read(&Key::new("pilot", 1, None)).is_err());
+        assert!(Receipt::read(&key, &entry, "2f").is_err());
+        for (from, to) in [
+            ("2026-11-24", "2026-11-23"),
+            ("\"A\"", "\"B\""),
+            ("pilot", "pirat"),
+        ] {
+            let text = toml::to_string(&receipt).unwrap();
+            std::fs::write(&path, text.replacen(from, to, 1)).unwrap();
+            assert!(
+                read(&key).unwrap_err().message.contains("not signed"),
+                "{to}"
+            );
+        }
+    }
 
     #[test]
     fn signatures_are_hmac_sha256() {
