@@ -30,7 +30,7 @@ use crate::error::ChallengeError;
 use crate::inbox::{Content, Sending, content, identify};
 use crate::kind::response;
 use crate::seal::{Key, Receipt, verify, verify_public};
-use crate::shapes::References;
+use crate::shapes::{References, sketch, sketch_of_spectra};
 use crate::terms::{Challenge, now};
 
 /// What identifies a scored entry. The store keeps it with its scores, so the names are part of the format.
@@ -50,6 +50,10 @@ pub struct EntryInfo {
     pub sha256: String,
     /// SHA-256 of sets, images and files.
     pub content: String,
+    pub files: Vec<String>,
+    /// Means of ellipticities over parts of each set ([`sketch`]), or the spectra under [`SPECTRA`], by which copies of another
+    /// entry are found.
+    pub shapes: BTreeMap<String, Vec<i32>>,
     pub contents: Contents,
     pub reference: bool,
 }
@@ -68,6 +72,9 @@ pub struct Entry {
     /// Why the organiser withdrew it.
     pub withdrawn: Option<String>,
 }
+
+/// Key of the sketch of spectra, of all sets together: the eight numbers of one are not enough to tell a copy.
+pub const SPECTRA: &str = "spectra";
 
 // A store keeps entries and runs in one format. The settings of an entry start with this, those of a run do not.
 const ENTRY_SETTINGS_PREFIX: &str = "[entry]\n";
@@ -418,6 +425,8 @@ impl Judge {
             file: file_name(&sending.path),
             sha256: arrival.sha256,
             content: content.sha256,
+            files: content.files,
+            shapes: BTreeMap::new(),
             contents: Contents::Catalogues,
             reference,
         };
@@ -464,12 +473,14 @@ impl Judge {
         let submission = Submission::read(&sent).map_err(plain)?;
         info.contents = rules.accept(&submission)?;
         let (mut sets, doubt) = match &submission.packed {
-            Packed::Catalogues(_) => self.catalogues(&sent, sending, references)?,
+            Packed::Catalogues(_) => self.catalogues(&sent, sending, references, info)?,
             Packed::Spectra(files) => {
                 self.check(&sent, sending, references, &mut |_| {})?;
                 let (sets, powers) = self
                     .spectra(files, submission.manifest.as_ref())
                     .map_err(|error| plain(sent.named(error)))?;
+                let sent: Vec<f64> = powers.iter().flat_map(|(_, sent)| sent.clone()).collect();
+                info.shapes.insert(SPECTRA.into(), sketch_of_spectra(&sent));
                 let (slope, error) = slope_over_sets(&powers);
                 if !is_measurable(slope, error) {
                     return Err("the spectra do not follow the differences of the true spectra between sets, so they contain no measurable shear".into());
@@ -527,6 +538,7 @@ impl Judge {
         sent: &Sent,
         sending: &Sending,
         references: &References,
+        info: &mut EntryInfo,
     ) -> Result<Scores, String> {
         let (mut sets, mut odd, mut failed) = (Vec::new(), Vec::new(), None);
         self.check(sent, sending, references, &mut |checked: CheckedSet<'_>| {
@@ -534,7 +546,11 @@ impl Judge {
             let of_set = checked.odd.iter();
             odd.extend(of_set.map(|image| format!("{image} of set {set}")));
             match self.score_set(&checked) {
-                Ok(record) => sets.extend(record),
+                Ok(record) => {
+                    let shapes = sketch(checked.images.total());
+                    info.shapes.insert(set.to_string(), shapes);
+                    sets.extend(record);
+                }
                 Err(reason) => failed = failed.take().or(Some(format!("set {set}: {reason}"))),
             }
         })?;

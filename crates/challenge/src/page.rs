@@ -13,7 +13,7 @@ use shearq_results::views::comparison::q_per_set;
 use crate::constant::ConstantShears;
 use crate::judge::{EntryInfo, Refused};
 use crate::kind::RankBy;
-use crate::ranking::{Board, Leaderboard, Standing, better, rounded};
+use crate::ranking::{Board, Leaderboard, NearCopy, Standing, better, rounded};
 use crate::terms::Challenge;
 
 // The palette has eight colours.
@@ -28,6 +28,7 @@ pub struct View<'a> {
     pub zero_shear: Option<f64>,
     /// The true shears of sets with one shear each.
     pub constant: Option<&'a ConstantShears>,
+    pub copies: &'a [NearCopy<'a>],
     /// Decimals of the metric. More of them reveal more of the true shear.
     pub digits: usize,
     pub detail: bool,
@@ -176,6 +177,18 @@ impl View<'_> {
         table
     }
 
+    fn copies(&self) -> Table {
+        let name = |info: &EntryInfo| Cell::text(format!("{}: {}", info.team, info.method));
+        let mut table = Table::titled("Near copies");
+        let copies = self.copies;
+        table.column("entry", "entry", copies, |copy| name(copy.entry));
+        table.column("earlier", "earlier entry", copies, |copy| {
+            name(copy.earlier)
+        });
+        table.column("reason", "reason", copies, |copy| Cell::text(copy.reason()));
+        table
+    }
+
     // Q of zero shear on boards of other metrics, too: whoever reads Q elsewhere must see it.
     fn zero_note(&self) -> Option<String> {
         let q = Cell::with_error(rounded(self.zero_shear?, 1), Some(f64::NAN), 2)
@@ -278,6 +291,7 @@ impl View<'_> {
         for (id, table) in [
             ("late", of_board(Board::Late, "Late entries")),
             ("partial", of_board(Board::Partial, "Entries of some sets")),
+            ("copies", self.copies()),
             ("failures", self.failures()),
         ] {
             if !table.rows.is_empty() {
