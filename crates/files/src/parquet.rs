@@ -461,11 +461,7 @@ impl<'a> Source<'a> {
 }
 
 // The values in one column chunk of a file, as the type in `field`.
-fn decode(
-    chunk: &ColumnChunkMetadata,
-    bytes: Vec<u8>,
-    field: &ArrowField,
-) -> PolarsResult<Series> {
+fn decode(chunk: &ColumnChunkMetadata, bytes: Vec<u8>, field: &ArrowField) -> PolarsResult<Series> {
     let length = bytes.len();
     // Cloning it shares the bytes.
     let source = Cursor::new(bytes.into());
