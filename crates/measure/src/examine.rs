@@ -1075,4 +1075,128 @@ mod tests {
         let even = rows.iter().filter(|row| *row % 2 == 0).count();
         assert!((3..=7).contains(&even), "{rows:?}");
     }
+
+    // Odd, so that the median of evenly spread values is the middle one. Errors of the median are then below all limits.
+    const COUNT: usize = 2001;
+
+    /// Stamps with noise of one and galaxies of flux 1000, each changed with its number from −1 to 1.
+    fn examined(change: impl Fn(f64, &mut StampStatistics)) -> Examination {
+        let mut examination = Examination::new(N, COUNT);
+        examination.added = COUNT;
+        examination.stamps = (0..COUNT)
+            .map(|at| {
+                let mut stamp = StampStatistics {
+                    at,
+                    corner: 0.0,
+                    side: 0.0,
+                    slope: [0.0; 2],
+                    noise: [1.0; 2],
+                    pairs: [0.0, 0.0, 100.0],
+                    place: [0.0; 2],
+                    flux: 1000.0,
+                    peak: 20.0,
+                    core: [100.0, 100.0],
+                    trace: at as u64,
+                    is_core_damaged: false,
+                };
+                change(2.0 * at as f64 / (COUNT - 1) as f64 - 1.0, &mut stamp);
+                stamp
+            })
+            .collect();
+        examination
+    }
+
+    /// Whether a kind of warning is there beyond its limit and absent before it, by a fifth. Limits are literal: a test that
+    /// takes the constant itself does not notice another value.
+    fn begins_at(limit: f64, kind: &str, warnings: impl Fn(f64) -> Vec<Warning>) {
+        for (factor, expected) in [(0.8, false), (1.2, true)] {
+            let found = warnings(factor * limit);
+            let has = found.iter().any(|warning| warning.kind() == kind);
+            assert_eq!(has, expected, "{kind} at {factor} times {limit}: {found:?}");
+        }
+    }
+
+    #[test]
+    fn warnings_about_stamps_begin_at_their_limits() {
+        let light_of_sky = 1000.0 / INNER_AREA;
+        begins_at(0.15, "sky", |share| {
+            let level = share * light_of_sky;
+            examined(|_, stamp| (stamp.corner, stamp.side) = (level, level)).warnings()
+        });
+        begins_at(0.6, "sky", |ratio| {
+            examined(|_, stamp| (stamp.corner, stamp.side) = (2.0, 2.0 / ratio)).warnings()
+        });
+        begins_at(0.04, "gradient", |share| {
+            let slope = share * light_of_sky / INNER_RADIUS;
+            examined(|_, stamp| stamp.slope = [0.0, slope]).warnings()
+        });
+        begins_at(0.85, "off-centre", |offset| {
+            examined(|_, stamp| stamp.place = [offset, 0.0]).warnings()
+        });
+        // Half of the places of an even spread of ±1 are within ½ of its median; of a normal one, within 1/1.4826 of σ.
+        begins_at(2.0, "position-scatter", |scatter| {
+            examined(|at, stamp| stamp.place[1] = 2.0 / 1.4826 * scatter * at).warnings()
+        });
+        begins_at(0.1, "depths", |scatter| {
+            examined(|at, stamp| stamp.noise = [(3f64.sqrt() * scatter * at).exp(); 2]).warnings()
+        });
+        begins_at(0.03, "long-correlation", |correlation| {
+            examined(|_, stamp| stamp.pairs[0] = 100.0 * correlation).warnings()
+        });
+        begins_at(0.02, "given-noise", |difference| {
+            let given = examined(|_, _| {}).given_noise(1.0 + difference);
+            given.into_iter().collect()
+        });
+    }
+
+    #[test]
+    fn warnings_about_epochs_begin_at_their_limits() {
+        const SAME: Matrix2 = [[1.0, 0.0], [0.0, 1.0]];
+        // Copies are told by their trace.
+        let epoch = |change: &dyn Fn(f64, &mut StampStatistics)| {
+            let first = examined(|_, _| {});
+            let own = examined(|at, stamp| {
+                stamp.trace += COUNT as u64;
+                change(at, stamp);
+            });
+            own.contradictions(&[&first], SAME, true)
+        };
+        begins_at(0.1, "epoch-offset", |offset| {
+            epoch(&|_, stamp| stamp.place[0] = offset)
+        });
+        begins_at(0.2, "epoch-flux", |difference| {
+            epoch(&|_, stamp| stamp.flux *= 1.0 + difference)
+        });
+        begins_at(0.1, "epoch-galaxies", |share| {
+            epoch(&|at, stamp| {
+                if 0.5 * (at + 1.0) < share {
+                    stamp.core[0] = 300.0;
+                }
+            })
+        });
+        // Without significant flux, this epoch has at most five errors of its median: below the limit it cannot show the galaxies.
+        let error = OF_MEDIAN * 1.4826 * 0.5 / (COUNT as f64).sqrt();
+        begins_at(4.0, "epoch-without-galaxies", |times_deeper| {
+            let spread = 1000.0 / times_deeper / (SIGNIFICANT * error);
+            epoch(&|at, stamp| stamp.flux = spread * at)
+        });
+    }
+
+    #[test]
+    fn bright_stars_count_as_four_galaxies_in_the_core() {
+        let core = |count: usize| {
+            let mut examination = examined(|_, _| {});
+            examination.stamps.truncate(count);
+            examination.stamps[0].core = [10_000.0, 5_000.0];
+            examination.core().map(|core| core.mean_square_radius)
+        };
+        assert_eq!(core(29), None);
+        let q = 0.5 * (29.0 * 100.0 + 4.0 * 50.0) / (29.0 * 100.0 + 4.0 * 100.0);
+        let expected = CoreSize::from_weighted(q, 0.0).unwrap();
+        let found = core(30).unwrap();
+        assert!(
+            (found / expected.mean_square_radius - 1.0).abs() < 1e-12,
+            "{found}"
+        );
+    }
 }

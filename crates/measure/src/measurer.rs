@@ -829,4 +829,23 @@ mod tests {
             "{leak} ± {error}"
         );
     }
+
+    #[test]
+    fn pixels_sheared_beyond_a_limit_are_refused() {
+        for (configuration, limit) in [("48/linear/star", 0.2), ("23/raw/star", 1e-3)] {
+            let measurer = Measurer::named(configuration, N).unwrap();
+            let mut worker = measurer.worker();
+            let mut image = worker.image(ImageNoise::Level(1.0));
+            let mut is_measured = |shear: f64| {
+                let matrix = [[1.0 + shear, 0.0], [0.0, 1.0 - shear]];
+                image
+                    .set_jacobian(Some(&Jacobian::new(matrix).unwrap()))
+                    .is_ok()
+            };
+            assert!(
+                is_measured(0.9 * limit) && !is_measured(1.1 * limit),
+                "{limit}"
+            );
+        }
+    }
 }

@@ -510,4 +510,22 @@ mod tests {
         assert!(of_stamps(MIN_STAMPS - 1, 0.0, 0.0, square).is_none());
         assert!(of_stamps(MIN_STAMPS, 0.0, 0.0, -1.0).is_none());
     }
+
+    #[test]
+    fn a_bright_stamp_counts_as_four_in_the_mean_radius() {
+        let mean = |count: usize| {
+            let mut galaxies = GalaxyMoments {
+                stamps: vec![[1.0, 8.0]; count],
+                ..GalaxyMoments::default()
+            };
+            galaxies.stamps[0] = [100.0, 800.0];
+            galaxies.stamps[1] = [1.0, 80.0];
+            galaxies.mean_square_radius()
+        };
+        assert_eq!(mean(29), None);
+        // The second of ten times the width counts with 0.4 of its light, and four times its moment.
+        let expected = mean_square([28.0 + 4.0 + 0.4, 8.0 * (28.0 + 4.0 + 4.0)]);
+        let [found, expected] = [mean(30), expected].map(Option::unwrap);
+        assert!((found / expected - 1.0).abs() < 1e-12, "{found} {expected}");
+    }
 }

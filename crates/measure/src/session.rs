@@ -1173,4 +1173,12 @@ mod tests {
             "pixel (3, 4) of the PSF stamp",
         );
     }
+
+    #[test]
+    fn stated_noise_may_differ_by_one_percent() {
+        for (difference, expected) in [(0.008, false), (0.012, true)] {
+            let found = stated_noise(1.0 / (1.0 + difference), &StampNoise::white(1.0));
+            assert_eq!(found.is_some(), expected, "{difference}");
+        }
+    }
 }

@@ -873,6 +873,9 @@ mod tests {
     #[test]
     fn the_size_of_a_gaussian_is_its_standard_deviation() {
         let moments = SizeMoments::new(TARGET, WINDOW, LATTICE);
+        // Two window widths at most, and a tenth of the target's width at least.
+        assert_eq!(moments.size(f64::INFINITY)[0], 2.0 * WINDOW);
+        assert_eq!(moments.size(0.0)[0], 0.1 * TARGET);
         for r in [1.0, 2.0, 3.0, 5.0, 8.0] {
             let found = moments.measure(&acf(r), 0.0, 0.0);
             let [size, first, second] = moments.size(f64::from(found.square));

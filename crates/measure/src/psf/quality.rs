@@ -440,4 +440,72 @@ mod tests {
             }
         }
     }
+
+    #[test]
+    fn warnings_begin_at_their_limits() {
+        let good = PsfQuality {
+            snr: 1e6,
+            ..quality(1e6, 48)
+        };
+        // Literal limits, a factor of 1.2 before and beyond each of them.
+        let begins = |kind: &str, shared: bool, limit: f64, of: &dyn Fn(f64) -> PsfQuality| {
+            let [before, beyond] = [limit / 1.2, limit * 1.2].map(|value| {
+                let found = warnings(&[of(value)], shared, None);
+                found.iter().any(|warning| warning.kind() == kind)
+            });
+            assert!(before != beyond, "{kind} {limit}");
+        };
+        begins("psf-background", true, 0.1, &|background| PsfQuality {
+            background,
+            ..good
+        });
+        begins("psf-gradient", true, 0.3, &|gradient| PsfQuality {
+            gradient,
+            ..good
+        });
+        begins("psf-noise", true, 1000.0, &|snr| PsfQuality { snr, ..good });
+        begins("psf-noise", false, 100.0, &|snr| PsfQuality { snr, ..good });
+        begins("psf-narrow", true, 6.0, &|area| PsfQuality { area, ..good });
+        let core = |mean_square_radius| CoreSize {
+            mean_square_radius,
+            error: 0.0,
+        };
+        let broad = |ratio: f64| {
+            let psf = PsfQuality {
+                core: Some(core(ratio)),
+                ..good
+            };
+            let found = warnings(&[psf], true, Some(core(1.0)));
+            found.iter().map(Warning::is_fatal).collect::<Vec<_>>()
+        };
+        assert_eq!(broad(0.8), []);
+        assert_eq!(broad(0.86), [false]);
+        assert_eq!(broad(0.99), [false]);
+        assert_eq!(broad(1.05), [true]);
+        // A tenth of the PSFs of an image.
+        let of_hundred = |bad: usize| {
+            let psf = |k: usize| PsfQuality {
+                gradient: if k < bad { 1.0 } else { 0.0 },
+                ..good
+            };
+            warnings(&(0..100).map(psf).collect::<Vec<_>>(), false, None).len()
+        };
+        assert_eq!([8, 12].map(of_hundred), [0, 1]);
+    }
+
+    #[test]
+    fn the_slowest_wing_is_no_background() {
+        let wing = Array2::from_shape_fn((48, 48), |(y, x)| {
+            let (y, x) = (y as f64 - 23.5, x as f64 - 23.5);
+            (1.0 + x * x + y * y).powf(-1.25)
+        });
+        let background = |stamp: &Array2<f64>| {
+            let psf = stamp / stamp.sum();
+            PsfQuality::from_psf(psf.view(), None).unwrap().background
+        };
+        assert!(background(&wing).abs() < 0.02, "{}", background(&wing));
+        // Light that falls more slowly is one.
+        let slower = wing.mapv(|value| value.powf(0.5));
+        assert!(background(&slower) > 0.2, "{}", background(&slower));
+    }
 }
