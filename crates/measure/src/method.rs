@@ -153,75 +153,134 @@ struct FoundObservables {
     sheared: Option<ShearSettings>,
 }
 
-/// Means over the noise of a galaxy, each for noise that γ₁ changes, that γ₂ changes, for the difference to noise behind a PSF
-/// turned by 90 degrees, and for noise as it is.
+/// Effects of the noise of a galaxy, in the mean over the noise.
+#[derive(Default)]
 struct NoiseMoments {
-    /// Products of the changes of χ₁, χ₂, T and the flux, in the order 00, 01, 02, 03, 11, …
-    products: [[f64; 4]; 10],
-    /// Second derivatives of χ₁ and χ₂.
-    distortion: [[f64; 4]; 2],
-    /// Second derivative of T.
-    square: [f64; 4],
-    /// Products of the changes of the light of the ring with those of χ₁, χ₂, T, the flux and itself.
-    ring: [[f64; 4]; 5],
+    /// Of noise that changes with γ₁, and with γ₂.
+    sheared: [NoiseMeans; 2],
+    /// Of the difference to noise behind a PSF turned by 90 degrees.
+    turned: NoiseMeans,
+    /// Of noise as it is.
+    plain: NoiseMeans,
+}
+
+/// Mean products of the changes of two quantities by noise, and mean second derivatives. T is the mean square from which the
+/// size follows.
+#[derive(Default)]
+struct NoiseMeans {
+    /// χ₁ and χ₁, χ₁ and χ₂, χ₂ and χ₂.
+    chi_chi: [f64; 3],
+    /// χ₁ and T, χ₂ and T.
+    chi_square: [f64; 2],
+    chi_flux: [f64; 2],
+    square_square: f64,
+    square_flux: f64,
+    flux_flux: f64,
+    ring_chi: [f64; 2],
+    ring_square: f64,
+    ring_flux: f64,
+    ring_ring: f64,
+    /// Second derivatives of χ₁ and χ₂, and of T.
+    chi_curvature: [f64; 2],
+    square_curvature: f64,
 }
 
 impl NoiseMoments {
     /// Turns both components of χ, and both components of the shear that changes the noise.
     fn turn(&mut self, by: &Spin2) {
-        let NoiseMoments {
-            products,
-            distortion,
-            square: [square1, square2, ..],
-            ring,
-        } = self;
-        [*square1, *square2] = by.turn([*square1, *square2]);
-        let of_shear = by.turn_response(distortion.map(|[first, second, ..]| [first, second]));
-        for kind in 2..4 {
-            let turned = by.turn(distortion.map(|means| means[kind]));
-            for (means, turned) in distortion.iter_mut().zip(turned) {
-                means[kind] = turned;
-            }
-        }
-        for (means, of_shear) in distortion.iter_mut().zip(of_shear) {
-            [means[0], means[1]] = of_shear;
-        }
-        for [first, second, ..] in products.iter_mut().chain(&mut *ring) {
+        let [first, second] = &mut self.sheared;
+        let curvature = [0, 1].map(|i| [first.chi_curvature[i], second.chi_curvature[i]]);
+        let [[first1, second1], [first2, second2]] = by.turn_response(curvature);
+        for (first, second) in first.values_mut().into_iter().zip(second.values_mut()) {
             [*first, *second] = by.turn([*first, *second]);
         }
-        for kind in 0..4 {
-            [ring[0][kind], ring[1][kind]] = by.turn([ring[0][kind], ring[1][kind]]);
-            let [chi11, chi12, size1, flux1, chi22, size2, flux2, ..] =
-                products.map(|each| each[kind]);
-            let [[chi11, chi12], [_, chi22]] = by.turn_response([[chi11, chi12], [chi12, chi22]]);
-            let [[size1, size2], [flux1, flux2]] =
-                [by.turn([size1, size2]), by.turn([flux1, flux2])];
-            let new = [chi11, chi12, size1, flux1, chi22, size2, flux2];
-            for (products, new) in products.iter_mut().zip(new) {
-                products[kind] = new;
-            }
+        for means in [&mut *first, &mut *second, &mut self.turned, &mut self.plain] {
+            means.turn(by);
+        }
+        first.chi_curvature = [first1, first2];
+        second.chi_curvature = [second1, second2];
+    }
+}
+
+impl NoiseMeans {
+    /// Turns both components of χ.
+    fn turn(&mut self, by: &Spin2) {
+        let [chi11, chi12, chi22] = self.chi_chi;
+        let [[chi11, chi12], [_, chi22]] = by.turn_response([[chi11, chi12], [chi12, chi22]]);
+        self.chi_chi = [chi11, chi12, chi22];
+        for vector in [
+            &mut self.chi_square,
+            &mut self.chi_flux,
+            &mut self.ring_chi,
+            &mut self.chi_curvature,
+        ] {
+            *vector = by.turn(*vector);
         }
     }
 
-    /// Mean second derivatives of the reported ellipticity.
-    fn ellipticity(&self, reported: Reported, chi: Distortion) -> [[f64; 4]; 2] {
+    /// All but the second derivatives of χ, which turn with the shear as a matrix.
+    fn values_mut(&mut self) -> [&mut f64; 16] {
+        let NoiseMeans {
+            chi_chi: [chi11, chi12, chi22],
+            chi_square: [square1, square2],
+            chi_flux: [flux1, flux2],
+            square_square,
+            square_flux,
+            flux_flux,
+            ring_chi: [ring1, ring2],
+            ring_square,
+            ring_flux,
+            ring_ring,
+            chi_curvature: _,
+            square_curvature,
+        } = self;
+        [
+            chi11,
+            chi12,
+            chi22,
+            square1,
+            square2,
+            flux1,
+            flux2,
+            square_square,
+            square_flux,
+            flux_flux,
+            ring1,
+            ring2,
+            ring_square,
+            ring_flux,
+            ring_ring,
+            square_curvature,
+        ]
+    }
+
+    /// The products of χ₁, χ₂, T and the flux with each other.
+    fn matrix(&self) -> [[f64; 4]; 4] {
+        let [chi11, chi12, chi22] = self.chi_chi;
+        let ([t1, t2], [f1, f2]) = (self.chi_square, self.chi_flux);
+        let (tt, tf, ff) = (self.square_square, self.square_flux, self.flux_flux);
+        [
+            [chi11, chi12, t1, f1],
+            [chi12, chi22, t2, f2],
+            [t1, t2, tt, tf],
+            [f1, f2, tf, ff],
+        ]
+    }
+
+    /// Mean second derivative of the reported ellipticity.
+    fn curvature(&self, reported: Reported, chi: Distortion) -> [f64; 2] {
         // With F of `Reported`, ∂²e_i/∂χ_j∂χ_k is 2F′(χ_i δ_jk + χ_j δ_ik + χ_k δ_ij) + 4F″ χ_i χ_j χ_k.
         let [_, first, second] = reported.factors(chi);
         let x = [chi.e1, chi.e2];
-        let of_type = |noise: usize| {
-            let [p11, p12, p22] = [0, 1, 4].map(|pair: usize| self.products[pair][noise]);
-            let along = [p11 * x[0] + p12 * x[1], p12 * x[0] + p22 * x[1]];
-            let square = along[0] * x[0] + along[1] * x[1];
-            // A change of χ is like the response to one shear that changes both components.
-            let change = self.distortion.map(|means| [means[noise]; 2]);
-            let change = reported.response(chi, change);
-            [0, 1].map(|i| {
-                let turned = x[i] * (p11 + p22) + 2.0 * along[i];
-                change[i][i] + 2.0 * first * turned + 4.0 * second * x[i] * square
-            })
-        };
-        let all: [[f64; 2]; 4] = std::array::from_fn(of_type);
-        [0, 1].map(|i| all.map(|means| means[i]))
+        let [p11, p12, p22] = self.chi_chi;
+        let along = [p11 * x[0] + p12 * x[1], p12 * x[0] + p22 * x[1]];
+        let square = along[0] * x[0] + along[1] * x[1];
+        // A change of χ is like the response to one shear that changes both components.
+        let change = reported.response(chi, self.chi_curvature.map(|mean| [mean; 2]));
+        [0, 1].map(|i| {
+            let turned = x[i] * (p11 + p22) + 2.0 * along[i];
+            change[i][i] + 2.0 * first * turned + 4.0 * second * x[i] * square
+        })
     }
 }
 
@@ -319,15 +378,13 @@ impl Found {
         let mut e = reported.ellipticity(chi).ok_or(Flag::NoShear)?;
         let mut response = self.response.map(|r| reported.response(chi, r));
         if let Some(noise) = &self.noise_moments {
-            let curved = noise.ellipticity(reported, chi);
-            for (row, curved) in response.iter_mut().flatten().zip(curved) {
-                for (value, curved) in row.iter_mut().zip(curved) {
-                    *value -= curved;
-                }
+            let [first, second] = &noise.sheared;
+            let of_shear = [first, second].map(|means| means.curvature(reported, chi));
+            for (i, row) in response.iter_mut().flatten().enumerate() {
+                *row = [0, 1].map(|k| row[k] - of_shear[k][i]);
             }
-            for (e, [_, _, turned, _]) in e.iter_mut().zip(curved) {
-                *e += 0.5 * turned;
-            }
+            let turned = noise.turned.curvature(reported, chi);
+            e = [0, 1].map(|i| e[i] + 0.5 * turned[i]);
         }
         Ok((e, response))
     }
@@ -337,8 +394,7 @@ impl Found {
         let (Ok(chi), Some(noise)) = (self.distortion, &self.noise_moments) else {
             return [0.0; 2];
         };
-        // Products of χ₁ and χ₂ in noise as it is.
-        let [p11, p12, p22] = [0, 1, 4].map(|pair: usize| noise.products[pair][3]);
+        let [p11, p12, p22] = noise.plain.chi_chi;
         reported
             .response(chi, [[1.0, 0.0], [0.0, 1.0]])
             .map(|[a, b]| a * a * p11 + 2.0 * a * b * p12 + b * b * p22)
@@ -350,51 +406,51 @@ impl Found {
         let [size, first, second] = found.size;
         let mut size_response = found.square_response.map(|response| first * response);
         let mut coupling = Coupling::default();
-        if let Some(moments) = &self.noise_moments {
-            let product = |number: usize, noise: usize| moments.products[number][noise];
+        if let Some(noise) = &self.noise_moments {
             let jacobian = reported.response(chi, [[1.0, 0.0], [0.0, 1.0]]);
-            let with_e = |i: usize, numbers: [usize; 2], noise: usize| {
-                let [one, two] = numbers.map(|number| product(number, noise));
-                jacobian[i][0] * one + jacobian[i][1] * two
+            let with_e = |products: [f64; 2]| {
+                jacobian.map(|row| row[0] * products[0] + row[1] * products[1])
             };
-            // Numbers of the products of χ₁ and χ₂ with T and with the flux.
-            let (with_size, with_flux) = ([2, 5], [3, 6]);
-            let squares = |noise: usize| {
-                let [size2, cross, flux2] = [7, 8, 9].map(|number| product(number, noise));
-                [flux2, first * cross, first * first * size2]
-            };
+            let with_e_and_size = |products: [f64; 2]| with_e(products).map(|value| first * value);
             // The size is not linear in T, and T not in the autocorrelation.
-            let curved = |noise: usize| first * moments.square[noise] + second * product(7, noise);
-            for (k, response) in size_response.iter_mut().enumerate() {
-                let [flux2, cross, size2] = squares(k);
-                let (e_flux, e_size) = (with_e(k, with_flux, k), first * with_e(k, with_size, k));
-                coupling.shear[k] = [e_flux, e_size, flux2, cross, size2];
-                *response -= curved(k);
+            let curved =
+                |means: &NoiseMeans| first * means.square_curvature + second * means.square_square;
+            for (k, means) in noise.sheared.iter().enumerate() {
+                coupling.shear[k] = [
+                    with_e(means.chi_flux)[k],
+                    with_e_and_size(means.chi_square)[k],
+                    means.flux_flux,
+                    first * means.square_flux,
+                    first * first * means.square_square,
+                ];
+                coupling.ring_shear[k] = [
+                    with_e(means.ring_chi)[k],
+                    means.ring_flux,
+                    first * means.ring_square,
+                    means.ring_ring,
+                ];
+                size_response[k] -= curved(means);
             }
-            let [flux2, cross, size2] = squares(2);
-            let [one, two] =
-                [0, 1].map(|i| [with_e(i, with_flux, 2), first * with_e(i, with_size, 2)]);
-            let with_ring = |noise: usize| {
-                let [chi1, chi2, square, flux, ring] = moments.ring.map(|kinds| kinds[noise]);
-                let e = jacobian.map(|row| row[0] * chi1 + row[1] * chi2);
-                (e, [flux, first * square, ring])
-            };
-            for (k, of_shear) in coupling.ring_shear.iter_mut().enumerate() {
-                let (e, [flux, size, ring]) = with_ring(k);
-                *of_shear = [e[k], flux, size, ring];
-            }
-            let ([e1, e2], [flux, size, ring]) = with_ring(2);
-            coupling.ring_turned = [e1, e2, flux, size, ring];
-            let size_change = curved(2);
+            let means = &noise.turned;
+            let [e1_flux, e2_flux] = with_e(means.chi_flux);
+            let [e1_size, e2_size] = with_e_and_size(means.chi_square);
             coupling.turned = [
-                one[0],
-                one[1],
-                two[0],
-                two[1],
-                flux2,
-                cross,
-                size2,
-                size_change,
+                e1_flux,
+                e1_size,
+                e2_flux,
+                e2_size,
+                means.flux_flux,
+                first * means.square_flux,
+                first * first * means.square_square,
+                curved(means),
+            ];
+            let [e1_ring, e2_ring] = with_e(means.ring_chi);
+            coupling.ring_turned = [
+                e1_ring,
+                e2_ring,
+                means.ring_flux,
+                first * means.ring_square,
+                means.ring_ring,
             ];
         }
         Some(Observables {
@@ -420,8 +476,6 @@ impl Found {
     ) -> Option<ShearedCatalogues> {
         let (chi, found) = (self.distortion.ok()?, self.observables.as_ref()?);
         let settings = found.sheared?;
-        let noise = self.noise_moments.as_ref();
-        let products = noise.map(|noise| noise.products).unwrap_or_default();
         let [[a, b], [c, d]] = reported.response(chi, [[1.0, 0.0], [0.0, 1.0]]);
         // Rows are e1, e2, flux and size; columns χ₁, χ₂, T and flux.
         let rows = [
@@ -430,20 +484,22 @@ impl Found {
             [0.0, 0.0, 0.0, 1.0],
             [0.0, 0.0, found.size[1], 0.0],
         ];
-        // Place of a pair in the order 00, 01, 02, 03, 11, …
-        let number = |i: usize, j: usize| i.min(j) * (7 - i.min(j)) / 2 + i.max(j);
-        let product = |a: usize, b: usize, noise: usize| -> f64 {
-            let terms = (0..4).flat_map(|i| (0..4).map(move |j| [i, j]));
-            terms
-                .map(|[i, j]| rows[a][i] * rows[b][j] * products[number(i, j)][noise])
-                .sum()
+        let matrix = |means: &NoiseMeans| {
+            let products = means.matrix();
+            let product = |a: usize, b: usize| -> f64 {
+                let terms = (0..4).flat_map(|i| (0..4).map(move |j| [i, j]));
+                terms
+                    .map(|[i, j]| rows[a][i] * rows[b][j] * products[i][j])
+                    .sum()
+            };
+            std::array::from_fn(|a| std::array::from_fn(|b| product(a, b)))
         };
-        let matrix =
-            |noise: usize| std::array::from_fn(|a| std::array::from_fn(|b| product(a, b, noise)));
+        let none = NoiseMoments::default();
+        let noise = self.noise_moments.as_ref().unwrap_or(&none);
         let noise = NoiseProducts {
-            plain: matrix(3),
-            sheared: [matrix(0), matrix(1)],
-            turned: matrix(2),
+            plain: matrix(&noise.plain),
+            sheared: noise.sheared.each_ref().map(matrix),
+            turned: matrix(&noise.turned),
         };
         let Observables {
             flux_response,
@@ -556,12 +612,23 @@ mod tests {
         0.3 * *state
     }
 
+    fn means(next: &mut impl FnMut() -> f64) -> NoiseMeans {
+        let mut means = NoiseMeans {
+            chi_curvature: [next(), next()],
+            ..NoiseMeans::default()
+        };
+        means
+            .values_mut()
+            .into_iter()
+            .for_each(|value| *value = next());
+        means
+    }
+
     fn found() -> Found {
         let mut state = 0.37;
         let mut next = || numbers(&mut state);
-        let mut four = || [next(), next(), next(), next()];
-        let [e1, e2, ..] = four();
-        let [r11, r12, r21, r22] = four();
+        let [e1, e2] = [next(), next()];
+        let [r11, r12, r21, r22] = [next(), next(), next(), next()];
         Found {
             descent: Descent {
                 iterations: 1,
@@ -573,10 +640,9 @@ mod tests {
             distortion: Ok(Distortion::new(e1, e2)),
             response: Some([[r11, r12], [r21, r22]]),
             noise_moments: Some(NoiseMoments {
-                products: [(); 10].map(|()| four()),
-                distortion: [four(), four()],
-                square: four(),
-                ring: [(); 5].map(|()| four()),
+                sheared: [means(&mut next), means(&mut next)],
+                turned: means(&mut next),
+                plain: means(&mut next),
             }),
             observables: Some(FoundObservables {
                 flux: 10.0,

@@ -26,7 +26,8 @@ use shearq_submissions::limits::{MAX_TARGET, MIN_TARGET, WINDOWS};
 use shearq_submissions::{LinearDeconvolution, LinearMethod, PsfCut, ShearOrigin};
 
 use super::{
-    AdaptedSettings, CutEpoch, CutWorker, Found, FoundObservables, Images, NoiseMoments, image,
+    AdaptedSettings, CutEpoch, CutWorker, Found, FoundObservables, Images, NoiseMeans,
+    NoiseMoments, image,
 };
 use crate::deconvolve::{
     EpochScratch, Lags, ModeNoise, Products, Spectral, SpectralEpoch, SpectralPsf, SpectralScratch,
@@ -71,7 +72,7 @@ const GREAT10_VARIANCE: f64 = 0.1375;
 // large galaxies.
 const WIDEST_WINDOW: f64 = 0.2;
 
-/// Index of the configured width among all widths.
+// Index of the configured width among all widths.
 const CONFIGURED_WINDOW: usize = WINDOW_STEPS.start().unsigned_abs() as usize;
 const WINDOW_COUNT: usize = CONFIGURED_WINDOW + 1 + WINDOW_STEPS.end().unsigned_abs() as usize;
 
@@ -602,27 +603,39 @@ impl PlanWorker {
             &mut self.buffers,
         );
         let unit = f64::from(noise * noise) * plan.noise_moments_interval as f64;
-        let chi: [[f64; 2]; 4] = std::array::from_fn(|kind| {
-            let of_pairs = [0, 1, 4].map(|pair: usize| pairs[pair][kind]);
-            let mixed = distortion.map(|mixed| mixed[kind]);
-            shape
-                .mean_second_derivative(&curvature, of_pairs, mixed)
-                .map(|value| unit * value)
-        });
-        // The last of four quantities is the flux, and the aperture corrects each of its factors.
-        let powers = [0, 0, 0, 1, 0, 0, 1, 0, 1, 2];
+        // The aperture corrects each factor of the flux.
+        let [unit, with_flux, with_fluxes] =
+            [0, 1, 2].map(|power| unit * plan.aperture.powi(power));
+        let means = |kind: usize| {
+            let [chi11, chi12, t1, f1, chi22, t2, f2, tt, tf, ff] = pairs.map(|pair| pair[kind]);
+            let curvature = shape.mean_second_derivative(
+                &curvature,
+                [chi11, chi12, chi22],
+                distortion.map(|mixed| mixed[kind]),
+            );
+            let [ring1, ring2, ring_t, ring_f, ring_ring] = ring.map(|product| product[kind]);
+            let of = |value: f32| unit * f64::from(value);
+            let of_flux = |value: f32| with_flux * f64::from(value);
+            NoiseMeans {
+                chi_chi: [chi11, chi12, chi22].map(of),
+                chi_square: [t1, t2].map(of),
+                chi_flux: [f1, f2].map(of_flux),
+                square_square: of(tt),
+                square_flux: of_flux(tf),
+                flux_flux: with_fluxes * f64::from(ff),
+                ring_chi: [ring1, ring2].map(of),
+                ring_square: of(ring_t),
+                ring_flux: of_flux(ring_f),
+                ring_ring: of(ring_ring),
+                chi_curvature: curvature.map(|value| unit * value),
+                square_curvature: unit
+                    * SizeMoments::mean_second_derivative(mean_square, square[kind]),
+            }
+        };
         NoiseMoments {
-            products: std::array::from_fn(|pair| {
-                let unit = unit * plan.aperture.powi(powers[pair]);
-                pairs[pair].map(|value| unit * f64::from(value))
-            }),
-            distortion: [0, 1].map(|i| chi.map(|chi| chi[i])),
-            ring: std::array::from_fn(|with| {
-                let aperture = if with == 3 { plan.aperture } else { 1.0 };
-                ring[with].map(|value| unit * aperture * f64::from(value))
-            }),
-            square: square
-                .map(|product| unit * SizeMoments::mean_second_derivative(mean_square, product)),
+            sheared: [means(0), means(1)],
+            turned: means(2),
+            plain: means(3),
         }
     }
 
