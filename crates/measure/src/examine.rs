@@ -1150,6 +1150,16 @@ mod tests {
     }
 
     #[test]
+    fn a_noisy_psf_has_an_uncertain_centroid() {
+        let mut epoch = examined(|_, _| {});
+        epoch.add_psf(stamp(0.0, [0.0; 2], [0.0; 2]).mapv(f64::from).view(), None);
+        // The weight of a centroid has σ = 2 px.
+        let expected = OF_MEDIAN * 2.0 / epoch.psfs[0].snr();
+        let found = epoch.psf_offset()[0].error;
+        assert!((found - expected).abs() < 1e-12, "{found} {expected}");
+    }
+
+    #[test]
     fn warnings_about_epochs_begin_at_their_limits() {
         const SAME: Matrix2 = [[1.0, 0.0], [0.0, 1.0]];
         // Copies are told by their trace.

@@ -689,4 +689,25 @@ mod tests {
             assert_eq!(sum(apart), sum(transposed.view().reversed_axes()));
         }
     }
+
+    #[test]
+    fn bright_stars_count_alike_in_the_average() {
+        let profile = PsfProfile::Moffat { beta: 3.0 };
+        let [narrow, wide] =
+            [3.0, 4.0].map(|fwhm| test_stars::drawn(profile, fwhm, Shear::ZERO, 48));
+        let wide = test_stars::noisy(&wide, 1300.0, &mut ChaCha8Rng::seed_from_u64(8));
+        let mut stars = Array3::zeros((2, 48, 48));
+        stars.slice_mut(s![0, .., ..]).assign(&narrow);
+        stars.slice_mut(s![1, .., ..]).assign(&wide);
+        let cut = PsfCut {
+            size: 48,
+            least: 32,
+            centred: false,
+        };
+        let found = average_stars(stars.view(), cut).unwrap();
+        let [found, narrow, wide] = [&found, &narrow, &wide].map(|psf| psf[(24, 24)] / psf.sum());
+        // By its S/N of 1300, which is above 1000, the second would count less than the first, which has no noise.
+        let share = (found - wide) / (narrow - wide);
+        assert!((share - 0.5).abs() < 0.03, "{share}");
+    }
 }

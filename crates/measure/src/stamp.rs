@@ -19,10 +19,10 @@ use crate::error::{MeasureError, length};
 use crate::moments::galaxy_centroid;
 use crate::sky::{Sky, SkyCells};
 
-/// Brightest pixels, in image units, whose autocorrelation keeps single precision: the squares of its values neither
-/// vanish nor overflow.
+// Brightest pixels, in image units, whose autocorrelation keeps single precision: the squares of its values neither vanish
+// nor overflow.
 pub(crate) const PEAK_RANGE: RangeInclusive<f32> = 1e-18..=1e17;
-/// Noise levels other than zero, in image units, whose squares keep single precision like the squares of [`PEAK_RANGE`].
+// Noise levels other than zero, in image units, whose squares keep single precision like the squares of [`PEAK_RANGE`].
 const NOISE_LEVEL_RANGE: RangeInclusive<f64> = 1e-30..=1e18;
 
 /// Whether a noise level can be used.
@@ -520,6 +520,10 @@ mod tests {
         };
         assert!(mended(both(6, 3)).is_none());
         assert!(mended((0..20).map(|y| (7 + y % 2, 2 + y))).is_some());
+        // Bars of one column on opposite sides, whose ends have enough neighbours: at most a fiftieth of the stamp may become zero.
+        let bars = |length: usize| (0..length).flat_map(|y| [(6, 9 + y), (42, 37 - y)]);
+        assert!(mended(bars(20)).is_some());
+        assert!(mended(bars(28)).is_none());
         // More than a quarter of the stamp.
         let most = |columns: usize| (0..columns).flat_map(|x| (0..N).map(move |y| (x, y)));
         assert!(mended(most(12)).is_some());

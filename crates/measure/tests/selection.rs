@@ -4,7 +4,7 @@ use ndarray::Array2;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
-use shearq_measure::{Cut, ImageNoise, Measurement, Measurer, Quantity, Selection};
+use shearq_measure::{Cut, ImageNoise, Measurement, Measurer, Observables, Quantity, Selection};
 use shearq_submissions::Method;
 
 const N: usize = 48;
@@ -235,5 +235,32 @@ fn sharp_cuts_of_sheared_versions_leave_the_shear_as_it_is() {
         assert!(error < 0.04, "{error}");
         assert!(with.abs() < 3.0 * error + 3e-3, "{name}: {with} ± {error}");
         assert!(without.abs() > 0.02, "{name}: {without}");
+    }
+}
+
+#[test]
+fn steps_have_the_documented_half_widths() {
+    let mut values = [0.0; 41];
+    // Flux, size and error of the flux, and the light of the ring.
+    values[..3].copy_from_slice(&[30.0, 2.5, 2.0]);
+    let ring = Observables::COLUMNS.iter().position(|name| *name == "ring");
+    values[ring.unwrap()] = 9.0;
+    let galaxy = Observables::from_array(&values);
+    for (quantity, value, half_width) in [
+        (Quantity::Snr, 15.0, 1.5),
+        (Quantity::Flux, 30.0, 3.0),
+        (Quantity::Size, 2.5, 0.3),
+        (Quantity::Neighbour, 0.3, 0.15),
+    ] {
+        let cut = |distance: f64| Cut::new(quantity, true, value - distance, None).unwrap();
+        let weight = |distance: f64| {
+            let selection = Selection::default().with_cut(cut(distance));
+            let selected = selection.apply([0.1, 0.0], [[1.0, 0.0], [0.0, 1.0]], &galaxy);
+            selected.weight
+        };
+        assert!(weight(0.9 * half_width) < 1.0, "{quantity:?}");
+        assert_eq!(weight(1.1 * half_width), 1.0, "{quantity:?}");
+        let least = cut(0.0).least_half_width(2.0) / half_width;
+        assert!((least - 0.01).abs() < 1e-12, "{quantity:?} {least}");
     }
 }
