@@ -49,9 +49,8 @@ const MIN_STAMP_SIDE: usize = 24;
 const MIN_PIVOT: f64 = 1e-9;
 // Of a mode of correlated noise, in units of white noise: a sum over few lags may be negative. Chosen by hand.
 const MIN_POWER: f64 = 1e-3;
-// Excess of a block's cube-root power above the median, in units of the scatter, beyond which it is left out.
-// Loses less than 10⁻⁴ of the power of white noise, 2·10⁻³ of the long waves of smoothed noise. Command and seed not
-// recorded.
+// Excess of a block's cube-root power above the median, in units of the scatter, beyond which it is left out. Loses less
+// than 10⁻⁴ of the power of white noise, 2·10⁻³ of the long waves of smoothed noise. Command and seed not recorded.
 const MAX_BLOCK_EXCESS: f64 = 4.0;
 // Blocks to each side of a bright one that are left out with it. Chosen by hand.
 const NEIGHBOURING_BLOCKS: usize = 2;

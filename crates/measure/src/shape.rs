@@ -63,16 +63,13 @@ pub use self::clipped::{ClippedAcf, ClippedAcfScratch, Moments};
 
 // Chosen by hand.
 const MAX_NEWTON_STEPS: usize = 30;
-/// Largest |χ| of a weight.
-// Chosen by hand.
+// Largest |χ| of a weight. Chosen by hand.
 const MAX_WEIGHT_MODULUS: f32 = 0.98;
 // Chosen by hand.
 const MAX_NEWTON_STEP: f32 = 0.3;
-/// Change of χ at which the iteration ends.
-// Resolution of sums of a few hundred single-precision terms.
+// Change of χ at which the iteration ends. Resolution of sums of a few hundred single-precision terms.
 const CONVERGED_STEP: f32 = 3e-6;
-/// Least determinant of 1 − ∂m/∂χ; near zero the moments follow the weight.
-// Chosen by hand.
+// Least determinant of 1 − ∂m/∂χ; near zero the moments follow the weight. Chosen by hand.
 const LEAST_DETERMINANT: f32 = 1e-3;
 
 /// Moments for one size of weight.
@@ -519,14 +516,11 @@ fn second_order_sums(
     [[s0, s1, s2], [s3, s4, s5], [t1, t2, 0.0]]
 }
 
-/// Scale τ of the weight in units of the window's σ.
-// Chosen by hand: wide enough that sizes up to 10 px differ.
+// Scale τ of the weight in units of the window's σ. Chosen by hand: wide enough that sizes up to 10 px differ.
 const SIZE_WEIGHT_SCALE: f64 = 0.6;
-/// Largest size that is reported, in units of the window's σ.
-// Beyond it the window, not the galaxy, sets the size.
+// Largest size that is reported, in units of the window's σ. Beyond it the window, not the galaxy, sets the size.
 const LARGEST_SIZE: f64 = 2.0;
-/// Smallest size that is reported, in units of the target's σ.
-// Far below the noise of a size, 0.24 px at S/N 20.
+// Smallest size that is reported, in units of the target's σ. Far below the noise of a size, 0.24 px at S/N 20.
 const SMALLEST_SIZE: f64 = 0.1;
 
 /// Weights for one window and target.

@@ -13,8 +13,7 @@ use shearq_quantities::statistics::{FROM_MODULI, OF_MEDIAN, median, scatter};
 
 use crate::stamp::padding;
 
-// Radius in pixels within which a galaxy's light is summed.
-// Chosen by hand.
+// Radius in pixels within which a galaxy's light is summed. Chosen by hand.
 pub(crate) const INNER_RADIUS: f64 = 8.0;
 pub(crate) const INNER_AREA: f64 = PI * INNER_RADIUS * INNER_RADIUS;
 // 4 px on 48 px: 112 cells at least 12 px from the centre.
@@ -24,8 +23,7 @@ const MIN_CELL_DISTANCE: f64 = 0.25;
 // Residual in units of the scatter beyond which a cell of a stamp does not count.
 // Loses 0.3 % of Gaussian noise. Chosen by hand.
 const OUTLIER_SCATTERS: f64 = 3.0;
-// r₀, at which p is the slope of the wing, in units of the stamp's side.
-// Definition; the middle of the cells' distances.
+// r₀, at which p is the slope of the wing, in units of the stamp's side. Definition; the middle of the cells' distances.
 const WING_RADIUS: f64 = 0.4;
 // Aureoles of PSFs fall as r⁻², de Vaucouleurs wings as r⁻²·⁴ at twice the half-light radius.
 const WING_SLOPES: [f64; 14] = [
@@ -36,8 +34,7 @@ const WING_STEEPENINGS: [f64; 4] = [0.0, 0.5, 1.0, 2.0];
 // Excess of χ² over the least one, per unit of its scatter, up to which a wing is allowed.
 // Three standard deviations of one number.
 const ALLOWED_CHI2: f64 = 9.0;
-// Groups of stamps whose scatter is the error of the plane.
-// The error is known to a quarter. Chosen by hand.
+// Groups of stamps whose scatter is the error of the plane. The error is known to a quarter. Chosen by hand.
 const GROUPS: usize = 8;
 // In a cell of a group: a scatter needs two.
 const MIN_STAMPS: usize = 2;

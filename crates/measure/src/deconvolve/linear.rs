@@ -53,36 +53,32 @@ use crate::transform::{
     even_parities, four_lanes, lanes, store, table,
 };
 
-/// Margin around a stamp, so that the deconvolved stamp does not wrap around.
-// Chosen by hand.
+// Margin around a stamp, so that the deconvolved stamp does not wrap around. Chosen by hand.
 const MARGIN_PX: usize = 8;
-/// Period of the plane in multiples of this.
-// Layout: sizes whose rows fill vectors.
+// Period of the plane in multiples of this. Layout: sizes whose rows fill vectors.
 const PERIOD_STEP_PX: usize = 16;
-/// Largest wave number of the target Γ, times its σ.
-// Chosen by hand: Γ is 0.09 there, and noise outweighs the galaxy beyond it.
+// Largest wave number of the target Γ, times its σ. Chosen by hand: Γ is 0.09 there, and noise outweighs the galaxy beyond
+// it.
 const TARGET_CUT: f64 = 2.2;
-/// Share of the largest wave number at which the taper of Γ begins.
-// Chosen by hand.
+// Share of the largest wave number at which the taper of Γ begins. Chosen by hand.
 const TAPER_START: f64 = 0.75;
-/// Value of the window at the middle of an edge above which the edge correction is applied.
-// Chosen by hand. Below it |m| stays under 10⁻³ for the largest galaxies, and a tenth of the time is saved.
+// Value of the window at the middle of an edge above which the edge correction is applied. Chosen by hand. Below it |m|
+// stays under 10⁻³ for the largest galaxies, and a tenth of the time is saved.
 const LEAST_EDGE_WINDOW: f64 = 0.02;
-/// Radius of the ring whose light over the flux is the column `neighbour`, in σ of the window.
-// Chosen by hand: 12 px for a window of 8 px.
+// Radius of the ring whose light over the flux is the column `neighbour`, in σ of the window. Chosen by hand: 12 px for a
+// window of 8 px.
 const RING_RADIUS: f64 = 1.5;
-/// Largest radius of the ring in units of the stamp's side.
-// At the edges of the stamp the ring's weight has fallen to 4 % of its peak.
+// Largest radius of the ring in units of the stamp's side. At the edges of the stamp the ring's weight has fallen to 4 % of
+// its peak.
 const LARGEST_RING: f64 = 0.25;
-/// Largest lag of the autocorrelation in σ of the window.
-// Chosen by hand: the window's autocorrelation is a fifth there.
+// Largest lag of the autocorrelation in σ of the window. Chosen by hand: the window's autocorrelation is a fifth there.
 const LARGEST_LAG: f64 = 2.5;
-/// Rows of lags per sample of a grid that samples the kept modes, along an axis, at least.
-// Chosen by hand. Lags are closer together than the modes would need because the weight of the moments, which multiplies the
-// autocorrelation, has finer structure.
+// Rows of lags per sample of a grid that samples the kept modes, along an axis, at least. Chosen by hand. Lags are closer
+// together than the modes would need because the weight of the moments, which multiplies the autocorrelation, has finer
+// structure.
 const LAGS_PER_SAMPLE: f64 = 1.5;
-/// Least power of the PSF's transform; modes below it are left out as pure noise.
-// Below 10⁻³, the least power in the simulated sets, and within single precision.
+// Least power of the PSF's transform; modes below it are left out as pure noise. Below 10⁻³, the least power in the
+// simulated sets, and within single precision.
 const LEAST_PSF_POWER: f32 = 1e-7;
 
 /// The linear network for one stamp size.

@@ -29,8 +29,7 @@ use crate::measurement::{Descent, Stop};
 use crate::stamp::{check_psf, check_sizes};
 use crate::transform::{Plane, Spectrum, ToModes, ToPixels, TransformScratch};
 
-/// High-pass kernel D of the regularisation; its elements sum to zero.
-// Nurbaeva et al., Sect. 3.1.
+// High-pass kernel D of the regularisation; its elements sum to zero. Nurbaeva et al., Sect. 3.1.
 pub(super) const SUN_KERNEL: [[f64; 3]; 3] = [
     [0.007, 0.010, 0.007],
     [0.010, -0.068, 0.010],

@@ -31,8 +31,7 @@ const MAX_AZIMUTHAL_ORDER: usize = 8;
 const MAX_FITTED_ORDER: usize = 2;
 // Scale of the functions in units of the σ of the profile's core. Chosen by hand.
 const HERMITE_SCALE: f64 = 1.1;
-// Smallest side in pixels of a stamp whose border is free of the star's light.
-// As for the noise of galaxies.
+// Smallest side in pixels of a stamp whose border is free of the star's light. As for the noise of galaxies.
 pub(super) const MIN_DENOISED_SIDE: usize = 24;
 // Smaller values of a function are far below the noise of a star. Chosen by hand.
 const MIN_FUNCTION_VALUE: f64 = 1e-4;
@@ -309,7 +308,7 @@ fn hermite(functions: &mut Array2<f64>, centre: f64, scale: f64) {
     }
 }
 
-/// Amplitude, centre (x, y), logarithm of the width w of s = r²/w², two ellipticities, κ and the wing.
+// Amplitude, centre (x, y), logarithm of the width w of s = r²/w², two ellipticities, κ and the wing.
 const PARAMETERS: usize = 8; // Counts them.
 const KAPPA: usize = 6; // Place of κ among the parameters.
 const WING: usize = 7; // Place of the wing's amplitude, in units of the core's.
@@ -322,21 +321,18 @@ const KAPPA_BOUNDS: [f64; 2] = [-0.2, 0.7];
 // Amplitude of the wing that is expected, and its standard deviation.
 // About 2 % and 7 % of the light. Chosen by hand for Moffat, Kolmogorov and Airy profiles.
 const WING_PRIOR: [f64; 2] = [0.002, 0.006];
-// Square of the scale of the wing in units of the core's.
-// Chosen by hand.
+// Square of the scale of the wing in units of the core's. Chosen by hand.
 const WING_SQUARE: f32 = 6.0;
 // Half the side of the square of the fit, in units of the Gaussian σ of the star's area.
 // 15 px for a FWHM of 3.4 px. Chosen by hand.
 const FIT_HALF_SIDE: f64 = 8.0;
 // Chosen by hand.
 const MAX_STEPS: usize = 12;
-// Change of χ² at which the fit ends.
-// A tenth of the error of a parameter, and above the rounding of single precision.
+// Change of χ² at which the fit ends. A tenth of the error of a parameter, and above the rounding of single precision.
 const CONVERGED_CHI2: f64 = 1e-2;
 // One vector of AVX2.
 const LANES: usize = 8;
-// Base of the power at which a profile with κ < 0 ends.
-// Within single precision.
+// Base of the power at which a profile with κ < 0 ends. Within single precision.
 const MIN_BASE: f32 = 1e-6;
 
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -14,46 +14,38 @@ use super::shape::noise_equivalent_area;
 use crate::moments::{CoreSize, psf_core_size};
 use crate::warning::{ExaminedPsfs, Warning};
 
-// Width of the PSF stamp's border, in pixels.
-// Chosen by hand.
+// Width of the PSF stamp's border, in pixels. Chosen by hand.
 const BORDER: usize = 2;
-/// Distances from the centre, in units of half the side, of the pixels with which the border is compared.
+// Distances from the centre, in units of half the side, of the pixels with which the border is compared.
 const HALFWAY: std::ops::Range<f64> = 0.5..0.65;
 // Power of the radius: slower than the averaged rings of an Airy disc (3) and turbulence (11/3).
 const SLOWEST_WING: f64 = 2.5;
 // Chosen by hand, for all warnings.
 const SIGNIFICANCE: f64 = 5.0;
-// Light of a background, in units of the star's.
-// Above it |m| may exceed 2·10⁻³. Chosen by hand.
+// Light of a background, in units of the star's. Above it |m| may exceed 2·10⁻³. Chosen by hand.
 const MAX_BACKGROUND: f64 = 0.1;
 // In units of the peak: stamps without a star have any level.
 const MAX_STATED_LEVEL: f64 = 100.0;
-// Light of a gradient that is extrapolated from the brighter edge, in units of the star's.
-// Chosen by hand.
+// Light of a gradient that is extrapolated from the brighter edge, in units of the star's. Chosen by hand.
 const MAX_GRADIENT: f64 = 0.3;
 // At S/N 1000 the noise of one star changes m by 5.5·10⁻³: docs/limitations.md.
 const MIN_SNR_SHARED: f64 = 1000.0;
 // Of a star per galaxy, the noise averages out. Chosen by hand.
 const MIN_SNR_EACH: f64 = 100.0;
-// Noise-equivalent area in px² of the narrowest PSF that pixels sample.
-// A FWHM of about 1 px.
+// Noise-equivalent area in px² of the narrowest PSF that pixels sample. A FWHM of about 1 px.
 const MIN_AREA: f64 = 6.0;
-// Mean square radius of the PSF's core in units of the galaxies', above which a warning is due.
-// Simulated galaxies, PSF of FWHM 3.4 px: 0.48 to 0.53; PSF 1.3 times too wide: 0.75; 1.4 times: 0.86 to 0.93. Command
-// and seed not recorded.
+// Mean square radius of the PSF's core in units of the galaxies', above which a warning is due. Simulated galaxies, PSF of
+// FWHM 3.4 px: 0.48 to 0.53; PSF 1.3 times too wide: 0.75; 1.4 times: 0.86 to 0.93. Command and seed not recorded.
 const MAX_CORE_RATIO: f64 = 0.83;
-// The same ratio above which an error is due.
-// The same simulation, PSF 1.5 times too wide: 0.97 to 1.06. Stars have 1.
+// The same ratio above which an error is due. The same simulation, PSF 1.5 times too wide: 0.97 to 1.06. Stars have 1.
 const IMPOSSIBLE_CORE_RATIO: f64 = 1.02;
-// Share of the PSFs of an image that a warning requires.
-// Chosen by hand.
+// Share of the PSFs of an image that a warning requires. Chosen by hand.
 const MIN_SHARE: f64 = 0.1;
 // Standard deviations of m and of c by the noise of one star, times its S/N, below S/N 500.
 // cargo run --release -p shearq-studies --example star_noise -- 2 16 40 (seeds 0 to 39): m 2.2 to 2.4, c 1.16 to
 // 1.20 at S/N 50 to 500.
 const BIAS_TIMES_SNR: [f64; 2] = [2.3, 1.2];
-// The same for a star that is not denoised.
-// The same command at S/N 1000: 0.0055 and 0.0023.
+// The same for a star that is not denoised. The same command at S/N 1000: 0.0055 and 0.0023.
 const BIAS_TIMES_SNR_UNCHANGED: [f64; 2] = [5.5, 2.3];
 
 #[derive(Debug, Clone, Copy)]

@@ -13,10 +13,9 @@ use crate::stamp::contiguous;
 
 // Steps of 19 %. Chosen by hand.
 const STEPS_PER_DOUBLING: f64 = 4.0;
-/// Steps of lengths: 0.6 to 2.8 times as long.
+// Steps of lengths: 0.6 to 2.8 times as long.
 pub(crate) const WIDTH_STEPS: RangeInclusive<i32> = -3..=6;
-// Width of the border from which a star's noise is measured, in pixels.
-// Chosen by hand.
+// Width of the border from which a star's noise is measured, in pixels. Chosen by hand.
 const BORDER: usize = 2;
 // The border of smaller stamps has light of the star. Chosen by hand.
 const MIN_BORDERED_SIDE: usize = 12;

@@ -55,7 +55,7 @@ fn psf(p: usize) -> Array2<f64> {
     psf / sum
 }
 
-/// Square pixels, and sheared ones with a skew of either sign.
+// Square pixels, and sheared ones with a skew of either sign.
 const PIXELS: [PixelShape; 3] = [
     PixelShape::SQUARE,
     PixelShape {
