@@ -10,21 +10,21 @@ use crate::warning::Warning;
 /// [`Flags`](crate::Flags).
 #[derive(Debug, Error)]
 #[non_exhaustive]
+#[expect(
+    missing_docs,
+    reason = "the text of a variant states what its fields are"
+)]
 pub enum MeasureError {
     /// Sizes that do not fit.
     #[error("{what} of {found}; expected {expected}")]
     Shape {
-        /// What has these sizes.
         what: &'static str,
-        /// The sizes found.
         found: String,
-        /// The sizes expected.
         expected: String,
     },
     /// A pixel that is not finite.
     #[error("pixel ({x}, {y}) of the {what}, counted from 1, is not a finite number")]
     NotFinite {
-        /// The image.
         what: &'static str,
         /// Column, 1-based.
         x: usize,
@@ -39,12 +39,7 @@ pub enum MeasureError {
         "cannot measure the noise on the borders of {examined} stamp(s){} (expected two or more complete borders with pixels that differ by noise). Try: noise.source = \"border\", or \"header\" if NOISESIG is right",
         match incomplete { 0 => String::new(), count => format!(", {count} of them with missing pixels") }
     )]
-    NoBorders {
-        /// Stamps examined.
-        examined: usize,
-        /// Stamps with missing pixels among them.
-        incomplete: usize,
-    },
+    NoBorders { examined: usize, incomplete: usize },
     /// More galaxies than fit into memory.
     #[error("there is no memory for {0} galaxies")]
     Memory(usize),
@@ -56,15 +51,11 @@ pub enum MeasureError {
         "the star is centred ({dx:+.1}, {dy:+.1}) px off the centre of its stamp of {columns} × {rows} pixels; expected {size} × {size} pixels around the star. Try: a larger PSF stamp, or one that is centred on the star to within 1 px"
     )]
     OffCentre {
-        /// Offset along x.
         dx: f64,
-        /// Offset along y.
         dy: f64,
         /// Pixels a side that are needed around the star.
         size: usize,
-        /// Pixels of the stamp along y.
         rows: usize,
-        /// Pixels of the stamp along x.
         columns: usize,
     },
     /// A Jacobian that maps no pixel to the sky.
@@ -78,7 +69,6 @@ pub enum MeasureError {
     ShearedPixels {
         /// |g| of the shear that makes such pixels of squares.
         shear: f64,
-        /// The largest that the method can use.
         most: f64,
     },
     /// Epochs of a galaxy that cannot be combined.
@@ -98,6 +88,10 @@ pub enum MeasureError {
 /// Why epochs of a galaxy cannot be combined. Epochs are counted from 0.
 #[derive(Debug, Clone, Copy, PartialEq, Error)]
 #[non_exhaustive]
+#[expect(
+    missing_docs,
+    reason = "the text of a variant states what its fields are"
+)]
 pub enum EpochError {
     /// A galaxy without epochs.
     #[error("found a galaxy without epochs (expected one or more)")]
@@ -106,24 +100,15 @@ pub enum EpochError {
     #[error(
         "the noise level of epoch {epoch} is {noise} (expected a finite number above 0 in image units)"
     )]
-    Noise {
-        /// The epoch.
-        epoch: usize,
-        /// The level found.
-        noise: f64,
-    },
+    Noise { epoch: usize, noise: f64 },
     /// A galaxy that is not near the middle of its stamp.
     #[error(
         "the galaxy of epoch {epoch} is ({x}, {y}) px from the centre of its stamp (expected up to {most}). Try: stamps that are cut around the galaxy"
     )]
     Offset {
-        /// The epoch.
         epoch: usize,
-        /// Offset along x.
         x: f64,
-        /// Offset along y.
         y: f64,
-        /// The largest that is possible.
         most: f64,
     },
     /// Epochs in the frame of the sky and of the pixels.

@@ -15,13 +15,16 @@ use crate::measurement::{Flag, Measurement};
 #[derive(Debug, Clone, PartialEq, Error, IntoStaticStr)]
 #[strum(serialize_all = "kebab-case")]
 #[non_exhaustive]
+#[expect(
+    missing_docs,
+    reason = "the text of a variant states what its fields are"
+)]
 pub enum Warning {
     /// The corners of the stamps are brighter or darker than zero.
     #[error("the stamps contain sky {}", sky(*level, *error, *noise, *share, *subtracted))]
     Sky {
         /// Mean level in image units.
         level: f64,
-        /// Its standard error.
         error: f64,
         /// Noise of a pixel in image units.
         noise: f64,
@@ -35,7 +38,6 @@ pub enum Warning {
     Gradient {
         /// Change per pixel along x and y, in image units.
         slope: [f64; 2],
-        /// Standard error of either.
         error: f64,
         /// Noise of a pixel in image units.
         noise: f64,
@@ -50,7 +52,6 @@ pub enum Warning {
     OffCentre {
         /// Median of their centroids from the middle, along x and y in pixels.
         offset: [f64; 2],
-        /// Standard error of either.
         error: f64,
     },
     /// The galaxies are at different places of their stamps.
@@ -66,12 +67,7 @@ pub enum Warning {
     #[error(
         "galaxies are darker than their surroundings (found negative flux on {count} of {of} stamps; expected positive flux). Try: check the sign of the image"
     )]
-    Negative {
-        /// Stamps with a negative flux.
-        count: usize,
-        /// Stamps examined.
-        of: usize,
-    },
+    Negative { count: usize, of: usize },
     /// The noise differs from stamp to stamp.
     #[error(
         "the noise differs between stamps (found a scatter of {:.0} %; expected one level). Try: give the noise of each stamp (gather --variance or --weight-map, `noise` in Python), or put stamps of one depth into an image",
@@ -93,38 +89,22 @@ pub enum Warning {
     #[error(
         "the network makes no iteration (found {count} of {of} galaxies). Their images are not deconvolved. Try: other values of deconvolution.step and deconvolution.lambda"
     )]
-    Idle {
-        /// Number of these galaxies.
-        count: usize,
-        /// Number of galaxies that the network ran on.
-        of: usize,
-    },
+    Idle { count: usize, of: usize },
     /// The mean response of the galaxies is not positive by three standard errors.
     #[error(
         "the mean response to shear is not positive by 3 standard errors (found {:.3}, {:.3}). Try: check that the PSF has the pixel scale of the galaxies, and that there are galaxies", response[0], response[1]
     )]
-    NoResponse {
-        /// Mean R11 and R22.
-        response: [f64; 2],
-    },
+    NoResponse { response: [f64; 2] },
     /// Stamps are copies of other stamps.
     #[error(
         "stamps are copies of each other (found {count} of {of}; expected none). Copies make errors too small. Try: remove repeated galaxies"
     )]
-    Copies {
-        /// Stamps that are copies.
-        count: usize,
-        /// Stamps examined.
-        of: usize,
-    },
+    Copies { count: usize, of: usize },
     /// All pixels of a stamp are equal, on every stamp examined.
     #[error(
         "the stamps are blank (found equal pixels on each of {of} stamps; expected a galaxy and noise). Try: check the file and its extension"
     )]
-    Blank {
-        /// Stamps examined.
-        of: usize,
-    },
+    Blank { of: usize },
     /// Pixel values are too small or large for single precision.
     #[error(
         "pixel values are out of range (found brightest pixels of about {peak:.1e}; expected 1e-18 to 1e17). Try: divide the image and its noise by a constant"
@@ -140,11 +120,8 @@ pub enum Warning {
         if *used { "the measured noise" } else { "NOISESIG" }
     )]
     NoiseLevel {
-        /// The header key NOISESIG.
         given: f64,
-        /// The noise measured on the stamps.
         measured: f64,
-        /// Whether the measured noise is used.
         used: bool,
     },
     /// The noise of the stamps disagrees with the one in the call.
@@ -152,12 +129,7 @@ pub enum Warning {
         "the given noise disagrees with the noise of the stamps (found {}, expected {}), which biases shears. Try: leave out the noise, so that it is measured",
         significant(*given, 5), significant(*measured, 5)
     )]
-    GivenNoise {
-        /// The noise in the call.
-        given: f64,
-        /// The noise measured in the corners of the stamps.
-        measured: f64,
-    },
+    GivenNoise { given: f64, measured: f64 },
     /// Noise is correlated, and the configuration treats it as white.
     #[error(
         "the noise of neighbouring pixels is correlated, but is treated as white (found {:.2} along x and {:.2} along y, expected 0). Try: set noise.source to \"image\" and noise.correlation above 0",
@@ -172,7 +144,6 @@ pub enum Warning {
     Epoch {
         /// The epoch, from 1.
         epoch: usize,
-        /// The warning.
         warning: Box<Warning>,
     },
     /// Noise of an epoch is correlated, and all epochs are combined as white noise.
@@ -198,7 +169,6 @@ pub enum Warning {
     EpochOffset {
         /// Median displacement along x and y in pixels.
         offset: [f64; 2],
-        /// Standard error of either.
         error: f64,
         /// Whether it is that from the galaxies of the first epoch, and not from the offsets alone.
         from_first: bool,
@@ -207,42 +177,24 @@ pub enum Warning {
     #[error(
         "the galaxies have {ratio:.2} ± {error:.2} times the flux of the first epoch (expected 1): weights and leakage of the PSF are those of one flux. Try: scale image, noise and gain to one zero point"
     )]
-    EpochFlux {
-        /// Ratio of the median fluxes.
-        ratio: f64,
-        /// Its standard error.
-        error: f64,
-    },
+    EpochFlux { ratio: f64, error: f64 },
     /// An epoch has no light at the stated places of the galaxies, or the first epoch has none.
     #[error(
         "{} at the stated places (found no significant light there; expected the galaxies that {} shows). Try: check that image, WCS and dither belong together",
         if *from_first { "the first epoch has no galaxies" } else { "there are no galaxies" },
         if *from_first { "this epoch" } else { "the first epoch" }
     )]
-    EpochWithoutGalaxies {
-        /// Whether it is the first epoch that has none.
-        from_first: bool,
-    },
+    EpochWithoutGalaxies { from_first: bool },
     /// An epoch contains other galaxies than the first one.
     #[error(
         "{count} of {of} galaxies are not those of the first epoch (found stamps that are blank, or differ in brightness by a factor of 2 and 5 standard errors; expected the same galaxies). Try: check that files and rows of the epochs belong together. Bands of galaxies with various colours may have this warning, too"
     )]
-    EpochGalaxies {
-        /// Galaxies that differ.
-        count: usize,
-        /// Galaxies compared.
-        of: usize,
-    },
+    EpochGalaxies { count: usize, of: usize },
     /// Stamps of an epoch are copies of stamps of an earlier one.
     #[error(
         "stamps are copies of those of an earlier epoch (found {count} of {of}; expected none), so that their noise does not average. Try: remove one of the epochs"
     )]
-    EpochCopies {
-        /// Stamps that are copies.
-        count: usize,
-        /// Stamps examined.
-        of: usize,
-    },
+    EpochCopies { count: usize, of: usize },
     /// No stamp is good enough to measure the noise on.
     #[error(
         "cannot measure the noise: no stamp has enough pixels that differ. All galaxies are flagged. Try: set noise.source to \"header\" to use NOISESIG"
@@ -256,7 +208,6 @@ pub enum Warning {
     PsfOffCentre {
         /// Offset along x and y in pixels.
         offset: [f64; 2],
-        /// PSFs.
         of: ExaminedPsfs,
     },
     /// The PSF image contains a background.
@@ -269,7 +220,6 @@ pub enum Warning {
         level: f64,
         /// Its light in units of the star's.
         share: f64,
-        /// PSFs.
         of: ExaminedPsfs,
     },
     /// The background of the PSF image changes along x or y.
@@ -280,7 +230,6 @@ pub enum Warning {
     PsfGradient {
         /// Change per pixel along x and y in units of the peak.
         slope: [f64; 2],
-        /// PSFs.
         of: ExaminedPsfs,
     },
     /// The noise of the star biases shears.
@@ -294,11 +243,9 @@ pub enum Warning {
     PsfNoise {
         /// √(Σ p²)/σ.
         snr: f64,
-        /// The S/N that is expected.
         enough: f64,
         /// Standard deviations of m and c by the noise of one star for all galaxies.
         effect: Option<[f64; 2]>,
-        /// PSFs.
         of: ExaminedPsfs,
     },
     /// The PSF is narrower than pixels can show.
@@ -308,7 +255,6 @@ pub enum Warning {
     PsfNarrow {
         /// Noise-equivalent area in px².
         area: f64,
-        /// PSFs.
         of: ExaminedPsfs,
     },
     /// The PSF is broader than the galaxies that were blurred by it.
@@ -359,9 +305,7 @@ pub enum Warning {
         "the PSF image and the galaxy image have pixel axes of different orientation or shear (found {psf}; expected {galaxies}). The PSF is deconvolved in the wrong orientation. Try: draw the PSF with the WCS of the galaxies, or correct its header"
     )]
     PsfFrame {
-        /// The pixel axes of the PSF image.
         psf: PixelFrame,
-        /// The pixel axes of the galaxy image.
         galaxies: PixelFrame,
     },
     /// The configuration uses so little of the PSF that its wings are missing.
@@ -377,14 +321,7 @@ pub enum Warning {
         "{count} of {of} galaxies are flagged (most frequent reason: {flag}). Try: {}",
         advice(*flag)
     )]
-    Flagged {
-        /// The most frequent reason.
-        flag: Flag,
-        /// Galaxies that are flagged.
-        count: usize,
-        /// All galaxies.
-        of: usize,
-    },
+    Flagged { flag: Flag, count: usize, of: usize },
 }
 
 /// The pixel axes of an image against the sky's: +x to the west, +y to the north.
