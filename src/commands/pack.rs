@@ -13,8 +13,8 @@ use shearq_dataset::fingerprint;
 use shearq_dataset::run::{Run, open_data};
 use shearq_dataset::threads::ALL_CORES;
 use shearq_results::catalogues::Catalogues;
-use shearq_results::published::{self as challenges, Packing};
-use shearq_results::submit::pack::Packing as Submission;
+use shearq_results::published::{BranchCatalogues, Presubmitting};
+use shearq_results::submit::pack::Packing;
 use shearq_results::submit::{Contents, Entry, is_archive};
 use shearq_scoring::great3::{GRID, SUBFIELDS};
 
@@ -147,10 +147,10 @@ impl EntryArguments {
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let out = &arguments.out;
     if let (Some(branch), Some(challenge)) = (&arguments.branch, &arguments.entry.challenge) {
-        let packing = Packing {
+        let packing = Presubmitting {
             catalogues: match &arguments.measured {
-                Some(folder) => challenges::Catalogues::Measured(folder),
-                None => challenges::Catalogues::Files(&arguments.catalogues),
+                Some(folder) => BranchCatalogues::Measured(folder),
+                None => BranchCatalogues::Files(&arguments.catalogues),
             },
             subfields: arguments.subfields.map_or(SUBFIELDS, usize::from),
             grid: arguments.grid.map_or(GRID, usize::from),
@@ -186,7 +186,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             && !method.contains(|c: char| "/\\:".contains(c) || c.is_whitespace()),
         "--method: unusable name (found `{method}`, expected 1 to {MAX_METHOD_BYTES} bytes without `/`, `\\`, `:`, blanks and a leading `.`)"
     );
-    let packing = Submission {
+    let packing = Packing {
         catalogues: &catalogues,
         data: data.as_ref(),
         method,

@@ -4,7 +4,9 @@ use std::path::{Path, PathBuf};
 
 use shearq_dataset::threads::{ALL_CORES, Pool};
 use shearq_render::table::Table;
-use shearq_results::published::{Board, Challenge, Packing, Score, Truth, ranking};
+use shearq_results::published::{
+    Presubmitting, PublicBranch, PublicChallenge, Score, Truth, ranking,
+};
 use shearq_results::submit::check::Finding;
 use shearq_scoring::great3::SUBFIELDS;
 
@@ -12,12 +14,15 @@ use super::pack::ARCHIVES;
 use crate::tell;
 use shearq_files::open::is_there;
 
-pub(super) fn branch_of(challenge: &str, branch: Option<&str>) -> anyhow::Result<Box<dyn Board>> {
-    Ok(Challenge::named(challenge)?.branch(branch)?)
+pub(super) fn branch_of(
+    challenge: &str,
+    branch: Option<&str>,
+) -> anyhow::Result<Box<dyn PublicBranch>> {
+    Ok(PublicChallenge::named(challenge)?.branch(branch)?)
 }
 
 pub(super) fn score(
-    branch: &dyn Board,
+    branch: &dyn PublicBranch,
     truth: Truth<'_>,
     submissions: &[PathBuf],
     threads: usize,
@@ -36,7 +41,7 @@ pub(super) fn score(
 }
 
 pub(super) fn leaderboard(
-    branch: &dyn Board,
+    branch: &dyn PublicBranch,
     truth: Option<Truth<'_>>,
     submissions: &[PathBuf],
     threads: usize,
@@ -75,7 +80,11 @@ pub(super) fn leaderboard(
     Ok(table)
 }
 
-pub(super) fn pack(branch: &dyn Board, packing: &Packing<'_>, out: &Path) -> anyhow::Result<()> {
+pub(super) fn pack(
+    branch: &dyn PublicBranch,
+    packing: &Presubmitting<'_>,
+    out: &Path,
+) -> anyhow::Result<()> {
     // As of other submissions: an earlier one may have been sent.
     anyhow::ensure!(
         !is_there(out),
@@ -101,7 +110,7 @@ pub(super) fn pack(branch: &dyn Board, packing: &Packing<'_>, out: &Path) -> any
 }
 
 pub(super) fn check(
-    branch: &dyn Board,
+    branch: &dyn PublicBranch,
     submission: &Path,
     subfields: Option<usize>,
 ) -> Vec<Finding> {

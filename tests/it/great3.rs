@@ -10,7 +10,7 @@ use shearq_files::frames::polars::Column;
 use shearq_files::frames::{Metadata, frame};
 use shearq_files::table::{self, FileFormat};
 use shearq_quantities::Shear;
-use shearq_results::published::{CHALLENGES, Challenge};
+use shearq_results::published::{CHALLENGES, PublicChallenge};
 use shearq_scoring::aperture::{Lattice, LatticeShear};
 use shearq_scoring::great3::Observation;
 
@@ -367,7 +367,7 @@ fn published_q_c_follows_from_published_biases() {
         } else {
             Observation::Space
         };
-        let branch = Challenge::named("great3")
+        let branch = PublicChallenge::named("great3")
             .unwrap()
             .branch(Some(&name))
             .unwrap();

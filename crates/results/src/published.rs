@@ -1,7 +1,7 @@
 //! Challenges that others ran and whose truth is public. Each is a module with the same interface: truth, submission, metrics,
 //! pre-submission and leaderboard. GREAT10 is the format of `score`, `pack` and `check` themselves.
 //!
-//! A further challenge is a module with a type that implements [`Board`], and a line in [`CHALLENGES`].
+//! A further challenge is a module with a type that implements [`PublicBranch`], and a line in [`CHALLENGES`].
 
 pub mod great08;
 pub mod great3;
@@ -24,25 +24,25 @@ use shearq_scoring::great3::Branch;
 
 /// A challenge by the name that users type.
 #[derive(Debug)]
-pub struct Challenge {
+pub struct PublicChallenge {
     pub name: &'static str,
     /// Its branches by name; empty if it has a single one.
     pub branches: fn() -> Vec<String>,
-    branch: fn(Option<&str>) -> Option<Box<dyn Board>>,
+    branch: fn(Option<&str>) -> Option<Box<dyn PublicBranch>>,
 }
 
-pub static CHALLENGES: [Challenge; 2] = [
-    Challenge {
+pub static CHALLENGES: [PublicChallenge; 2] = [
+    PublicChallenge {
         name: "great3",
         branches: || Branch::all().map(|own| own.to_string()).collect(),
         branch: |name| Some(Box::new(great3::Great3(Branch::named(name?)?))),
     },
-    Challenge {
+    PublicChallenge {
         name: "great08",
         branches: Vec::new,
         branch: |name| {
             name.is_none()
-                .then(|| Box::new(great08::Great08) as Box<dyn Board>)
+                .then(|| Box::new(great08::Great08) as Box<dyn PublicBranch>)
         },
     },
 ];
@@ -60,7 +60,7 @@ pub enum Unknown {
     },
 }
 
-impl Challenge {
+impl PublicChallenge {
     pub fn named(name: &str) -> Result<&'static Self, Unknown> {
         let found = CHALLENGES.iter().find(|own| own.name == name);
         found.ok_or_else(|| Unknown::Challenge {
@@ -69,7 +69,7 @@ impl Challenge {
         })
     }
 
-    pub fn branch(&self, name: Option<&str>) -> Result<Box<dyn Board>, Unknown> {
+    pub fn branch(&self, name: Option<&str>) -> Result<Box<dyn PublicBranch>, Unknown> {
         (self.branch)(name).ok_or_else(|| Unknown::Branch {
             challenge: self.name,
             found: name.unwrap_or("none").into(),
@@ -93,14 +93,18 @@ pub struct Truth<'a> {
 }
 
 /// What differs between challenges and between their branches, each of which has a leaderboard.
-pub trait Board {
+pub trait PublicBranch {
     fn title(&self) -> String;
     /// Scores a submission.
     fn score(&self, truth: Truth<'_>, submission: &Path, pool: &Pool) -> Result<Score, FileError>;
     /// Refuses a submission that the challenge would not score as it is meant.
     fn check(&self, submission: &Path, subfields: Option<usize>) -> Result<(), FileError>;
     /// Makes a submission of catalogues of galaxies. `None` if the challenge has no pre-submission.
-    fn pack(&self, packing: &Packing<'_>, pool: &Pool) -> Option<Result<Packed, FileError>>;
+    fn pack(
+        &self,
+        packing: &Presubmitting<'_>,
+        pool: &Pool,
+    ) -> Option<Result<Presubmission, FileError>>;
     /// Published entries.
     fn leaderboard(&self) -> Vec<Entry>;
     /// Where the published entries are from.
@@ -109,7 +113,7 @@ pub trait Board {
 
 /// Where the galaxies of a branch are.
 #[derive(Debug, Clone, Copy)]
-pub enum Catalogues<'a> {
+pub enum BranchCatalogues<'a> {
     /// In tables with a shear for each galaxy.
     Files(&'a [PathBuf]),
     /// In a folder of catalogues that `measure` wrote, whose ellipticities are divided by the mean response of their set.
@@ -118,8 +122,8 @@ pub enum Catalogues<'a> {
 
 /// Catalogues of a branch, and how they are summarised.
 #[derive(Debug, Clone)]
-pub struct Packing<'a> {
-    pub catalogues: Catalogues<'a>,
+pub struct Presubmitting<'a> {
+    pub catalogues: BranchCatalogues<'a>,
     /// Subfields of the branch: 200 unless it is simulated.
     pub subfields: usize,
     /// Galaxies per side of a subfield: 100 unless it is simulated.
@@ -131,12 +135,12 @@ pub struct Packing<'a> {
 
 /// A submission file, and what to tell about it.
 #[derive(Debug, Clone)]
-pub struct Packed {
+pub struct Presubmission {
     pub text: String,
     pub note: String,
 }
 
-impl Packed {
+impl Presubmission {
     pub fn write(&self, path: &Path) -> Result<(), FileError> {
         atomic::write(path, self.text.as_bytes())
     }
@@ -239,7 +243,7 @@ impl Score {
 }
 
 /// The leaderboard of a branch with own scores among the published entries, best first.
-pub fn ranking(branch: &dyn Board, own: &[(String, Score)]) -> Table {
+pub fn ranking(branch: &dyn PublicBranch, own: &[(String, Score)]) -> Table {
     let published = branch.leaderboard();
     let mut rows: Vec<(Entry, Option<f64>)> = own
         .iter()

@@ -10,7 +10,8 @@ use shearq_quantities::Shear;
 use shearq_scoring::great08;
 
 use super::{
-    Board, Columns, Entry, Figure, Packed, Packing, Score, Truth, disagreement, whole, wrong,
+    Columns, Entry, Figure, Presubmission, Presubmitting, PublicBranch, Score, Truth, disagreement,
+    whole, wrong,
 };
 
 #[derive(Debug)]
@@ -107,7 +108,7 @@ fn refuse(option: &str, given: bool) -> Result<(), FileError> {
     }
 }
 
-impl Board for Great08 {
+impl PublicBranch for Great08 {
     fn title(&self) -> String {
         "GREAT08".into()
     }
@@ -193,7 +194,7 @@ impl Board for Great08 {
         read_entry(submission).map(|_| ())
     }
 
-    fn pack(&self, _: &Packing<'_>, _: &Pool) -> Option<Result<Packed, FileError>> {
+    fn pack(&self, _: &Presubmitting<'_>, _: &Pool) -> Option<Result<Presubmission, FileError>> {
         None
     }
 

@@ -23,8 +23,8 @@ use shearq_scoring::{Line, Repeated, repeated};
 
 use self::pack::Galaxies;
 use super::{
-    Board, Columns, Entry, Figure, MIN_SHEAR_SLOPE, Packed, Packing, Score, Slope, Truth,
-    disagreement, odd_fields, whole, wrong,
+    Columns, Entry, Figure, MIN_SHEAR_SLOPE, Presubmission, Presubmitting, PublicBranch, Score,
+    Slope, Truth, disagreement, odd_fields, whole, wrong,
 };
 
 // A component from here on was not measured: averages leave out 9.9 and more, correlations 10 and more. Both as in the challenge.
@@ -838,7 +838,7 @@ impl Great3 {
     }
 }
 
-impl Board for Great3 {
+impl PublicBranch for Great3 {
     fn title(&self) -> String {
         format!("GREAT3 {}", self.0)
     }
@@ -858,7 +858,11 @@ impl Board for Great3 {
         }
     }
 
-    fn pack(&self, packing: &Packing<'_>, pool: &Pool) -> Option<Result<Packed, FileError>> {
+    fn pack(
+        &self,
+        packing: &Presubmitting<'_>,
+        pool: &Pool,
+    ) -> Option<Result<Presubmission, FileError>> {
         let read = Galaxies::read(self.0, packing);
         Some(read.and_then(|galaxies| galaxies.summarise(packing, pool)))
     }

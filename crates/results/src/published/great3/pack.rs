@@ -13,7 +13,7 @@ use shearq_scoring::aperture::{ApertureMass, SEPARATION_BINS};
 use shearq_scoring::great3::{Branch, Identity, NODES_PER_GALAXY};
 use shearq_scoring::{Repeated, repeated};
 
-use super::super::{Catalogues, Columns, Packed, Packing, wrong};
+use super::super::{BranchCatalogues, Columns, Presubmission, Presubmitting, wrong};
 use super::{EQUAL_SHEARS, NOT_AVERAGED, NOT_CORRELATED, lattice, more, not_an_identity, zero};
 use crate::response::{Shared, shears};
 
@@ -57,7 +57,7 @@ fn is_like_a_weight(name: &str) -> bool {
 }
 
 impl Galaxies {
-    pub(super) fn read(branch: Branch, packing: &Packing<'_>) -> Result<Self, FileError> {
+    pub(super) fn read(branch: Branch, packing: &Presubmitting<'_>) -> Result<Self, FileError> {
         let mut all = Galaxies {
             branch,
             files: Vec::new(),
@@ -65,7 +65,7 @@ impl Galaxies {
             unused: BTreeSet::new(),
         };
         match packing.catalogues {
-            Catalogues::Files(files) => {
+            BranchCatalogues::Files(files) => {
                 for path in files {
                     // `measure` writes ellipticities that are not divided by their response.
                     let hint = "catalogues of measure are packed by --measured DIR";
@@ -84,7 +84,7 @@ impl Galaxies {
                     all.add(path, &columns, packing)?;
                 }
             }
-            Catalogues::Measured(folder) => {
+            BranchCatalogues::Measured(folder) => {
                 let run = Run::require(folder)?;
                 let files = run.catalogues(folder, &[])?;
                 // Set by set, because the columns of two million galaxies are 200 MB.
@@ -120,7 +120,7 @@ impl Galaxies {
         &mut self,
         path: &Path,
         columns: &[Vec<f64>],
-        packing: &Packing<'_>,
+        packing: &Presubmitting<'_>,
     ) -> Result<(), FileError> {
         let (branch, catalogue) = (self.branch, self.files.len());
         self.files.push(path.to_owned());
@@ -170,7 +170,7 @@ impl Galaxies {
 
     // The checks of the challenge's program, in the order in which their messages help most: a repeated galaxy before the missing
     // one that it stands for.
-    fn checked(mut self, packing: &Packing<'_>) -> Result<Self, FileError> {
+    fn checked(mut self, packing: &Presubmitting<'_>) -> Result<Self, FileError> {
         // Stable, so that the first of two rows stays first.
         self.galaxies.sort_by_key(|galaxy| galaxy.id);
         let file = |galaxy: &Galaxy| self.files[galaxy.catalogue].as_path();
@@ -217,7 +217,7 @@ impl Galaxies {
     fn check_subfield<'p>(
         &self,
         galaxies: &[Galaxy],
-        packing: &Packing<'_>,
+        packing: &Presubmitting<'_>,
         file: impl Fn(&Galaxy) -> &'p Path,
     ) -> Result<(), FileError> {
         let first = &galaxies[0];
@@ -269,9 +269,9 @@ impl Galaxies {
 
     pub(super) fn summarise(
         &self,
-        packing: &Packing<'_>,
+        packing: &Presubmitting<'_>,
         pool: &Pool,
-    ) -> Result<Packed, FileError> {
+    ) -> Result<Presubmission, FileError> {
         let size = self.branch.subfields_per_field() * packing.grid * packing.grid;
         let fields: Vec<Range<usize>> = (0..self.galaxies.len())
             .step_by(size)
@@ -334,7 +334,7 @@ impl Galaxies {
             }
         }
         let note = self.note();
-        Ok(Packed { text, note })
+        Ok(Presubmission { text, note })
     }
 
     fn note(&self) -> String {
