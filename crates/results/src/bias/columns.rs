@@ -277,14 +277,14 @@ impl Survey {
         parts.find_map(|(own, column, _)| (own == Some(key)).then_some(column))
     }
 
-    // Whether the catalogue with the columns `found` is this one. Given names of e1 and e2 must be those of this one.
+    // Whether the catalogue with the columns `found` is this one. Given names of e1 and e2 must be those of this one; other names
+    // identify nothing: `w=w` made plain catalogues those of UNIONS, whose R11 and R22 are not used.
     fn is_of(&self, found: &[String], names: &Names) -> bool {
         let there = |column: &str| found.iter().any(|own| own.eq_ignore_ascii_case(column));
         self.parts().all(|(key, column, required)| {
             match (key, key.and_then(|key| names.0.get(&key))) {
                 (Some((Role::E1 | Role::E2, 0)), Some(given)) => given.eq_ignore_ascii_case(column),
-                (_, Some(_)) => true,
-                (_, None) => !required || there(column),
+                _ => !required || there(column),
             }
         })
     }
@@ -872,6 +872,8 @@ mod tests {
 
     #[test]
     fn programs_are_recognised_by_their_columns() {
+        let weighted = found("e1 e2 w R11 R22", &["w=w"]).unwrap();
+        assert_eq!(weighted.of(Role::R11), Some("R11"));
         for (columns, preset) in [
             ("e1 e2 w flag", Preset::Plain),
             ("x y e1 e2 flags R11 R22 first_energy", Preset::Shearq),
