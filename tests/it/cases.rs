@@ -79,9 +79,9 @@ fn run(functions: &str, command: &str, root: &Path) -> (i32, Vec<String>) {
         return (0, printed.lines().map(str::to_owned).collect());
     }
     let data = std::env::current_dir().unwrap().join("tests/data");
-    let command = command.replace("[tests/data]", data.to_str().unwrap());
     let settings = "exec 2>&1; export LC_ALL=C COLUMNS=120";
-    let output = shell(root, &format!("{settings}\n{functions}\n{command}"));
+    let lines = format!("{settings}\n{functions}\n{command}");
+    let output = shell(root, &lines.replace("[tests/data]", data.to_str().unwrap()));
     let printed = String::from_utf8_lossy(&output.stdout);
     assert!(!printed.contains("panicked"), "{command}: {printed}");
     let root = root.to_str().unwrap();

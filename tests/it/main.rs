@@ -8,7 +8,6 @@
 )]
 
 mod bias;
-mod bias_design;
 mod cases;
 mod challenge;
 mod damaged;
