@@ -398,28 +398,12 @@ pub(crate) mod tests {
     use crate::terms::{Data, Rules};
     use shearq_results::record::SetRecord;
     use shearq_results::submit::Contents;
-    use shearq_scoring::Metrics;
 
     pub(crate) fn record(set: u32, q: f64, replicates: &[f64]) -> SetRecord {
-        let mut metrics = Metrics::unknown();
-        metrics.q = q;
-        SetRecord {
-            set,
-            simulated: true,
-            data: "d".into(),
-            images: (1..=replicates.len() as u32).collect(),
-            galaxies: 1,
-            flagged: 0,
-            frame: Default::default(),
-            metrics,
-            errors: Metrics::unknown(),
-            q_replicates: replicates.to_vec(),
-            q_calibrated_replicates: Vec::new(),
-            q_leaderboard: q,
-            convention: 5,
-            convention_known: true,
-            convention_leaderboard: 5,
-        }
+        let mut record = SetRecord::unknown(set);
+        record.images = (1..=replicates.len() as u32).collect();
+        (record.metrics.q, record.q_replicates) = (q, replicates.to_vec());
+        record
     }
 
     const DAY: &str = "2026-11-24T10:00:00Z";

@@ -13,8 +13,8 @@ use shearq_pipeline::simulate::simulator;
 use shearq_results::record::SetRecord;
 use shearq_scoring::modes::{Decomposer, Modes};
 use shearq_scoring::{
-    Bins, Choice, Complex64, Convention, Definition, FieldSum, Grid, Metrics, Options, SCORED,
-    SetImages, SetScorer, TrueShear,
+    Bins, Choice, Complex64, Convention, Definition, FieldSum, Grid, Options, SCORED, SetImages,
+    SetScorer, TrueShear,
 };
 use shearq_simulate::field::ShearSpectrum;
 use shearq_simulate::set::SimulationSettings;
@@ -227,25 +227,9 @@ fn published_q_c(shears: &ConstantShears, truth: &[[f64; 2]], means: &[[f64; 2]]
     let sets: Vec<SetRecord> = (1..)
         .zip(truth.iter().zip(means))
         .map(|(set, (g, e))| {
-            let mut metrics = Metrics::unknown();
-            (metrics.c1, metrics.c2) = (e[0] - g[0], e[1] - g[1]);
-            SetRecord {
-                set,
-                simulated: false,
-                data: String::new(),
-                images: vec![1],
-                galaxies: 1,
-                flagged: 0,
-                frame: Default::default(),
-                metrics,
-                errors: Metrics::unknown(),
-                q_replicates: Vec::new(),
-                q_calibrated_replicates: Vec::new(),
-                q_leaderboard: f64::NAN,
-                convention: 5,
-                convention_known: true,
-                convention_leaderboard: 5,
-            }
+            let mut record = SetRecord::unknown(set);
+            (record.metrics.c1, record.metrics.c2) = (e[0] - g[0], e[1] - g[1]);
+            record
         })
         .collect();
     (10.0 * shears.q_c(&sets).0).round() / 10.0

@@ -68,13 +68,10 @@ impl SetRecord {
         convention_known: bool,
     ) -> Self {
         SetRecord {
-            set,
             simulated,
-            data: String::new(),
             images,
             galaxies: (rows.used + rows.not_finite) as u64,
             flagged: rows.not_finite as u64,
-            frame: Frame::Pixel,
             metrics: score.metrics,
             errors: score.errors,
             q_replicates: score.replicates.iter().map(|r| r.q).collect(),
@@ -87,24 +84,37 @@ impl SetRecord {
             convention: score.chosen.number(),
             convention_known,
             convention_leaderboard: score.best.number(),
+            ..SetRecord::unknown(set)
         }
     }
 
     pub fn of_spectrum(set: u32, simulated: bool, images: Vec<u32>, score: &SpectrumScore) -> Self {
+        SetRecord {
+            simulated,
+            images,
+            metrics: score.metrics,
+            errors: score.errors,
+            q_leaderboard: score.metrics.q,
+            ..SetRecord::unknown(set)
+        }
+    }
+
+    /// A record without images and galaxies, whose metrics are unknown, in the standard convention.
+    pub fn unknown(set: u32) -> Self {
         let standard = Convention::STANDARD.number();
         SetRecord {
             set,
-            simulated,
+            simulated: false,
             data: String::new(),
-            images,
+            images: Vec::new(),
             galaxies: 0,
             flagged: 0,
             frame: Frame::Pixel,
-            metrics: score.metrics,
-            errors: score.errors,
+            metrics: Metrics::unknown(),
+            errors: Metrics::unknown(),
             q_replicates: Vec::new(),
             q_calibrated_replicates: Vec::new(),
-            q_leaderboard: score.metrics.q,
+            q_leaderboard: f64::NAN,
             convention: standard,
             convention_known: true,
             convention_leaderboard: standard,
@@ -424,21 +434,11 @@ mod tests {
     #[test]
     fn unknown_numbers_are_read_back_from_json() {
         let record = SetRecord {
-            set: 20,
-            simulated: true,
-            data: String::new(),
             images: vec![1],
-            galaxies: 64,
-            flagged: 0,
             frame: Frame::Sky,
-            metrics: Metrics::unknown(),
-            errors: Metrics::unknown(),
-            q_replicates: Vec::new(),
+            q_replicates: vec![1.0, f64::NAN],
             q_calibrated_replicates: vec![f64::NAN],
-            q_leaderboard: f64::NAN,
-            convention: 5,
-            convention_known: true,
-            convention_leaderboard: 5,
+            ..SetRecord::unknown(20)
         };
         let text = serde_json::to_string(&record).unwrap();
         let read: SetRecord = serde_json::from_str(&text).unwrap();

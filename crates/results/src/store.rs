@@ -175,32 +175,16 @@ mod tests {
     use super::*;
     use crate::record::SetRecord;
     use shearq_quantities::Frame;
-    use shearq_scoring::Metrics;
 
     fn run(configuration: &str, sets: &[(u32, u32, f64)]) -> RunRecord {
-        let record = |&(set, images, q): &(u32, u32, f64)| SetRecord {
-            set,
-            simulated: true,
-            data: "d".into(),
-            images: (1..=images).collect(),
-            galaxies: 64,
-            flagged: 1,
-            frame: match set {
-                7 => Frame::Sky,
-                _ => Frame::Pixel,
-            },
-            metrics: {
-                let mut metrics = Metrics::unknown();
-                metrics.q = q;
-                metrics
-            },
-            errors: Metrics::unknown(),
-            q_replicates: vec![q, f64::NAN],
-            q_calibrated_replicates: Vec::new(),
-            q_leaderboard: q,
-            convention: 5,
-            convention_known: true,
-            convention_leaderboard: 6,
+        let record = |&(set, images, q): &(u32, u32, f64)| {
+            let mut record = SetRecord::unknown(set);
+            (record.images, record.galaxies) = ((1..=images).collect(), 64);
+            (record.metrics.q, record.q_replicates) = (q, vec![q, f64::NAN]);
+            if set == 7 {
+                record.frame = Frame::Sky;
+            }
+            record
         };
         RunRecord {
             configuration: configuration.into(),

@@ -421,21 +421,12 @@ mod tests {
             metrics
         };
         let record = SetRecord {
-            set: 2,
-            simulated: true,
-            data: String::new(),
             images: (1..=8).collect(),
-            galaxies: 8,
-            flagged: 0,
-            frame: Default::default(),
             metrics: with(q, calibrated, -0.3),
             errors: with(0.1, 2.0, 0.01),
             q_replicates: vec![q; 8],
             q_calibrated_replicates: replicates.map(|off| calibrated + off).to_vec(),
-            q_leaderboard: q,
-            convention: 5,
-            convention_known: true,
-            convention_leaderboard: 5,
+            ..SetRecord::unknown(2)
         };
         (name.into(), record)
     }
