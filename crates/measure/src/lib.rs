@@ -46,7 +46,6 @@
 #![warn(missing_docs, clippy::missing_errors_doc)]
 
 mod calibration;
-mod deconvolve;
 mod denoise;
 mod error;
 mod examine;
@@ -54,6 +53,7 @@ mod measurement;
 mod measurer;
 mod method;
 mod moments;
+mod network;
 mod noise;
 pub mod parts;
 mod psf;
@@ -63,6 +63,7 @@ mod shape;
 mod sheared;
 mod sky;
 mod source;
+mod spectral;
 mod stamp;
 mod transform;
 mod warning;

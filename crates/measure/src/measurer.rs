@@ -10,13 +10,14 @@ use ndarray::{Array2, ArrayView2, ArrayView3};
 use shearq_quantities::{Jacobian, PixelShape, Spin2};
 use shearq_submissions::{Configuration, ConfigurationError, NoiseSource, Registry};
 
-use crate::deconvolve::{EpochPixels, convolve};
 use crate::denoise::{DenoiseScratch, WaveletWiener, border_noise};
 use crate::error::{EpochError, MeasureError};
 use crate::measurement::{Flag, Measurement, PsfShape};
 use crate::method::{AdaptedSettings, CutEpoch, CutWorker, Images, MethodPlan, Reported};
+use crate::network::convolve;
 use crate::noise::{NoisePlan, StampNoise, Survey};
 use crate::psf::{Psfs, ResidualProfiles, Star, StarSurvey, cut_start};
+use crate::spectral::EpochPixels;
 use crate::stamp::{
     FullStamp, MissingPixels, PEAK_RANGE, Pixel, SkySubtraction, all_finite, highest, is_level,
     mark_padding_missing,

@@ -11,13 +11,13 @@ use shearq_submissions::{Configuration, EllipticityType, Method};
 
 use self::linear::LinearFamily;
 use self::network::{NetworkPlan, NetworkWorker};
-use crate::deconvolve::EpochPixels;
 use crate::error::{EpochError, MeasureError};
 use crate::measurement::Descent;
 use crate::measurement::{Coupling, Flag, Flags, Measurement, Observables, ResponseMatrix};
 use crate::noise::StampNoise;
 use crate::psf::ResidualProfiles;
 use crate::sheared::{NoiseProducts, ShearSettings, ShearedCatalogues, sheared};
+use crate::spectral::EpochPixels;
 
 /// A method, planned for one size of cut stamps.
 pub(crate) enum MethodPlan {

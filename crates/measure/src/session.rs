@@ -1028,7 +1028,7 @@ mod tests {
         // Uniform noise: enough for a test of who gets what.
         let mut state = 5;
         let mut noise = || {
-            let uniform = crate::deconvolve::uniform(&mut state) as f32;
+            let uniform = crate::spectral::uniform(&mut state) as f32;
             12f32.sqrt() * (uniform - 0.5)
         };
         let stars =

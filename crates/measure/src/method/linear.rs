@@ -4,7 +4,7 @@
 //!
 //! The response of a galaxy is computed on its noisy image, and shears the noise along with the galaxy. The galaxies that
 //! lensing shears have no noise yet. The mean effect of noise on the change of the autocorrelation is subtracted in
-//! `deconvolve`. What remains is that the ellipticity is not linear in the autocorrelation: f″(δA, δA′), with δA the
+//! `spectral.rs`. What remains is that the ellipticity is not linear in the autocorrelation: f″(δA, δA′), with δA the
 //! change by noise and δA′ the change by the shear of this noise. Both are linear in the noise, so that the mean follows from
 //! its power and from gradients of f and of its slopes ([`AdaptiveMoments::second_order`]). Fields of noise, added and
 //! subtracted as in Sheldon & Huff (2017), have the same mean; each field took longer and scattered. One galaxy in
@@ -29,10 +29,6 @@ use super::{
     AdaptedSettings, CutEpoch, CutWorker, Found, FoundObservables, Images, NoiseMeans,
     NoiseMoments, image,
 };
-use crate::deconvolve::{
-    EpochScratch, Lags, ModeNoise, Products, Spectral, SpectralEpoch, SpectralPsf, SpectralScratch,
-    uniform,
-};
 use crate::error::MeasureError;
 use crate::measurement::{Descent, ResponseMatrix, Stop};
 use crate::moments::{WeightedMoments, shear_origin};
@@ -43,6 +39,10 @@ use crate::psf::{
 };
 use crate::shape::{AdaptiveMoments, AdaptiveScratch, AdaptiveShape, MeanSquare, SizeMoments};
 use crate::sheared::ShearSettings;
+use crate::spectral::{
+    EpochScratch, Lags, ModeNoise, Products, Spectral, SpectralEpoch, SpectralPsf, SpectralScratch,
+    uniform,
+};
 use crate::stamp::hash;
 use crate::transform::HexLattice;
 

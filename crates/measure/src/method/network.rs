@@ -6,8 +6,8 @@ use ndarray::ArrayView2;
 use shearq_submissions::{NetworkDeconvolution, NetworkMethod};
 
 use super::{CutWorker, Found, Images, image, whole_lags};
-use crate::deconvolve::{Network, NetworkScratch, Rule};
 use crate::error::MeasureError;
+use crate::network::{Network, NetworkScratch, Rule};
 use crate::shape::{ClippedAcf, ClippedAcfScratch};
 
 pub(crate) struct NetworkPlan {

@@ -30,14 +30,14 @@ use crate::stamp::{check_psf, check_sizes};
 use crate::transform::{Plane, Spectrum, ToModes, ToPixels, TransformScratch};
 
 // High-pass kernel D of the regularisation; its elements sum to zero. Nurbaeva et al., Sect. 3.1.
-pub(super) const SUN_KERNEL: [[f64; 3]; 3] = [
+const SUN_KERNEL: [[f64; 3]; 3] = [
     [0.007, 0.010, 0.007],
     [0.010, -0.068, 0.010],
     [0.007, 0.010, 0.007],
 ];
 
 /// The transform of D, which is real.
-pub(super) fn high_pass(kx: f64, ky: f64) -> f64 {
+pub(crate) fn high_pass(kx: f64, ky: f64) -> f64 {
     let (cx, cy) = (kx.cos(), ky.cos());
     SUN_KERNEL[1][1]
         + 2.0 * SUN_KERNEL[1][0] * cx

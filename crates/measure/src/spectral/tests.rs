@@ -3,8 +3,8 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use shearq_submissions::{LinearDeconvolution, Registry};
 
-use super::super::network::convolve;
 use super::*;
+use crate::network::convolve;
 use crate::noise::StampNoise;
 use crate::shape::{AdaptiveMoments, SizeMoments};
 

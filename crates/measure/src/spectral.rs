@@ -1,5 +1,8 @@
 //! The linear network in closed form, and the autocorrelation of its result.
 //!
+//! A PSF has its centre at (p − 1)/2, as stamps have it, because the window is fixed at the stamp's middle; the network has it at
+//! pixel p/2, as the convolution of the paper.
+//!
 //! Without thresholds (Nurbaeva et al. 2015, Eq. 9) and clipping (Eq. 12), the adaptive update v ← v + c·f (Eqs. 10 and 11)
 //! from v = 0 is linear. On a plane without boundary each Fourier mode evolves alone, and after M iterations
 //!
@@ -44,8 +47,8 @@ use shearq_quantities::PixelShape;
 use shearq_quantities::product::{LANES, Matrix, ROWS, multiply};
 use shearq_submissions::LinearDeconvolution;
 
-use super::network::high_pass;
 use crate::error::MeasureError;
+use crate::network::high_pass;
 use crate::noise::StampNoise;
 use crate::stamp::{check_psf, check_sizes, copy_row};
 use crate::transform::{
