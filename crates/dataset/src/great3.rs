@@ -69,7 +69,7 @@ pub(crate) fn detect(root: &Path) -> Result<Option<Found>, FileError> {
     };
     // The first catalogue stands for all: the stamps of a branch have one side, and its shear is constant or varies in all subfields.
     let galaxies = GalaxyCatalogue::read(&path)?;
-    // Beside the images, so that a folder of links to released files can have them.
+    // In the folder of the images, so that a folder of links to released files can have them.
     let interpolated = images::find(root, PSF_IMAGES, endings(PSF_IMAGES), &[])?;
     let psf_star = match interpolated.is_empty() {
         true => STAR_FIELDS,

@@ -73,7 +73,7 @@ fn stamp_of_image(data: &DataFolder, path: &Path, image: &ImageReader) -> Result
     Ok(whole(image, path, "STAMP", MAX_STAMP)?.unwrap_or(data.layout().stamp))
 }
 
-/// The stamps of an image: n × n if its header has NGRID = n, NSTAMPS along the rows if it has that, otherwise as many as
+/// The stamps of an image: n × n if its header has NGRID = n, NSTAMPS along the rows if it has that, otherwise all that
 /// fit.
 pub fn of_image(data: &DataFolder, path: &Path, image: &ImageReader) -> Result<Mosaic, FileError> {
     let stamp = stamp_of_image(data, path, image)?;
@@ -122,7 +122,7 @@ fn square(data: &DataFolder, path: &Path, mosaic: &Mosaic) -> Result<Grid, FileE
     Grid::new(n, Pixels(mosaic.stamp as f64), field).map_err(|error| FileError::new(path, error))
 }
 
-/// Pixels a side of the stamps of a set: of its first image, or of the layout if there is no image.
+/// Pixels a side of the stamps of a set, from its first image, or from the layout without images.
 pub fn stamp_of_set(data: &DataFolder, set: u32) -> Result<usize, FileError> {
     match data.images(&[set])?.of_set(set).first() {
         Some((_, path)) => stamp_of_image(data, path, &ImageReader::open(path)?),

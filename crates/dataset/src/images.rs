@@ -271,7 +271,7 @@ impl Files {
 
     pub fn sets(&self) -> Vec<u32> {
         if self.serve_all_sets() {
-            // The files do not limit the sets; those with images do.
+            // Images limit the sets, not these files.
             return (0..=MAX_SET).collect();
         }
         self.by_set.keys().copied().flatten().collect()
@@ -471,7 +471,7 @@ impl Files {
     }
 }
 
-// The name that the file should have, for the message: with its own numbers, if there are as many as the pattern has.
+// The name that the file should have, for the message: with the numbers of the file, if their count is the pattern's.
 fn expected(pattern: &[Piece<'_>], runs: &[&str]) -> String {
     let places = |piece: &&Piece<'_>| match piece {
         Piece::Text(text) => digits(text).len(),
@@ -582,7 +582,7 @@ enum Piece<'a> {
     Text(&'a str),
     Number {
         of_set: bool,
-        /// Zeros fill so many digits, and no more.
+        /// Zeros fill numbers to this length.
         digits: usize,
     },
 }

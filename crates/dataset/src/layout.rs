@@ -17,8 +17,8 @@ pub const MAX_STAMP: usize = 1024;
 pub const MAX_SET: u32 = 9_999;
 pub const MAX_IMAGE: u32 = 999_999;
 
-/// The forms of a number: at least as many digits as their place, from 1.
-// The files of GREAT10 are not padded, those of shearq have 2 and 3 digits, subfields of GREAT3 have 3.
+/// The forms of a number: with at least 1, 2 and 3 digits.
+// Numbers in names of GREAT10 are not padded; shearq pads to 2 and 3 digits, subfields of GREAT3 to 3.
 pub(crate) const SET_PLACEHOLDERS: [&str; 3] = ["{set}", "{set:02}", "{set:03}"];
 pub const IMAGE_PLACEHOLDERS: [&str; 3] = ["{image}", "{image:02}", "{image:03}"];
 pub(crate) const PLACEHOLDERS: [[&str; 3]; 2] = [SET_PLACEHOLDERS, IMAGE_PLACEHOLDERS];
@@ -181,7 +181,7 @@ pub struct DataFolder {
 }
 
 impl DataFolder {
-    /// Opens a folder, with the layout of its `layout.toml`, that of GREAT3 if it has such files, or the default one.
+    /// Opens a folder, with the layout of its `layout.toml`, else of GREAT3 if it has such files, else the default one.
     pub fn open(root: impl AsRef<Path>) -> Result<Self, FileError> {
         let root = root.as_ref().to_owned();
         check_folder(&root, "a data folder")?;
@@ -237,7 +237,7 @@ impl DataFolder {
         &self.layout
     }
 
-    /// The galaxy image of a set; the name without a compression ending if there is none.
+    /// The galaxy image of a set; the name without a compression ending if no file exists.
     pub fn galaxies(&self, set: u32, image: u32) -> PathBuf {
         self.image(&self.layout.galaxies, set, image)
     }
@@ -296,7 +296,7 @@ impl DataFolder {
             .parent()
             .filter(|path| !path.as_os_str().is_empty());
         let here = images::find(root.parent()?, first, &[""], &[]).ok()?;
-        // Any folder name with digits may look like that of a set; images of the layout in it decide.
+        // Any folder with digits in its name may be a set; images of the layout in it decide.
         let is_set = here
             .sets()
             .into_iter()

@@ -46,7 +46,7 @@ pub const CATALOGUE_FIRST_PIXEL: &str = "xyfirst";
 pub const RESPONSE: &str = "response";
 /// Value of [`RESPONSE`] of measured catalogues.
 pub const NOT_APPLIED: &str = "not applied";
-/// All keys beside fingerprints.
+/// All keys except fingerprints.
 pub const KEYS: [&str; 12] = [
     "creator",
     "submiss",
@@ -81,7 +81,7 @@ pub enum Axes {
     /// Pixel axes of an orientation that no WCS states.
     #[default]
     Pixel,
-    /// Pixel axes whose orientation on the sky is known; the default is that of the sky.
+    /// Pixel axes of a known orientation on the sky; by default they are the sky's.
     Oriented(PixelFrame),
 }
 
@@ -94,7 +94,7 @@ impl Axes {
     }
 
     /// Whether ellipticities along these and along `other` axes have a mean, to twice the rotation and ten times the shear
-    /// below which pixel axes are taken for the sky's.
+    /// below which pixel axes count as the sky's.
     pub fn agree(self, other: Axes) -> bool {
         let [a, b] = match (self, other) {
             (Axes::Sky, Axes::Pixel) | (Axes::Pixel, Axes::Sky) => return false,
@@ -134,7 +134,7 @@ impl CommonAxes {
     /// mean requires one orientation.
     ///
     /// # Errors
-    /// If its axes are not those of the others.
+    /// If its axes differ from the others'.
     pub fn add(&mut self, path: &Path, axes: Axes, any_pixels: bool) -> Result<(), FileError> {
         let (first, expected) = self.first.get_or_insert_with(|| (path.to_owned(), axes));
         let both_pixels = (axes.frame(), expected.frame()) == (Frame::Pixel, Frame::Pixel);
@@ -161,7 +161,7 @@ impl CommonAxes {
 
     /// The axes of all; `None` without a catalogue.
     pub fn common(&self) -> Option<Axes> {
-        // Pixel axes that are the sky's count as the sky beside it.
+        // Pixel axes that are the sky's agree with axes of the sky.
         let first = self.first.as_ref().map(|(_, axes)| *axes);
         first.map(|axes| if self.on_sky { Axes::Sky } else { axes })
     }

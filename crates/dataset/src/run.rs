@@ -25,7 +25,7 @@ pub enum Source {
         path: PathBuf,
         layout: Layout,
     },
-    /// Simulated and measured in memory. The true shear lies beside the catalogues.
+    /// Simulated and measured in memory. The true shear is in the folder of the catalogues.
     Simulated(SimulationSettings),
 }
 
@@ -96,7 +96,7 @@ pub struct Run {
 }
 
 impl Run {
-    /// Reads the record of a folder; `None` where there is none.
+    /// Reads the record of a folder; `None` without a record.
     pub fn read(folder: &Path) -> Result<Option<Self>, FileError> {
         read_record(&folder.join(RUN_FILE))
     }
@@ -276,7 +276,7 @@ fn resolve(path: &Path) -> std::io::Result<PathBuf> {
     Ok(path)
 }
 
-/// `None` if there is no record.
+/// `None` without a record.
 pub fn read_record<R: DeserializeOwned>(path: &Path) -> Result<Option<R>, FileError> {
     let text = match shearq_files::open::read_to_string(path, shearq_files::open::SETTINGS) {
         Ok(text) => text,

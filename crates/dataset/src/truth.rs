@@ -194,7 +194,7 @@ pub fn reading_of(data: &DataFolder, set: u32) -> Result<Reading, FileError> {
     })
 }
 
-/// Grid of a set, from its first image, or from its true shear if there is no image.
+/// Grid of a set, from its first image, or from its true shear without images.
 pub fn grid_of_set(data: &DataFolder, set: u32) -> Result<Grid, FileError> {
     match grid::of_first_image(data, set)? {
         Some(grid) => Ok(grid),

@@ -128,7 +128,7 @@ struct Record<'a> {
     gathering: &'a Gathering<'a>,
 }
 
-/// Gathers stamps and their PSFs into images of `data` with consecutive numbers, from that of `first` on. If one of them cannot be
+/// Gathers stamps and their PSFs into images of `data` with consecutive numbers, from the number of `first` on. If one of them cannot be
 /// gathered, none is written.
 ///
 /// Writes the table of stamps, the record of the sources, the PSFs, and last the image. Leftovers of a stopped process
@@ -518,7 +518,7 @@ struct Stack {
     wcs: Wcs,
     /// Jacobians of images with several stamps each, with the numbers of stamps.
     of_images: Vec<(usize, Option<Matrix2>)>,
-    /// A warning if the pixels of an image differ from those of the first.
+    /// A warning if an image has other pixels than the first one.
     differs: Option<String>,
 }
 
@@ -621,7 +621,7 @@ fn check_psf(
     }
 }
 
-// The examinations of both are joined, because the condition compares the width of the PSF with that of the galaxies.
+// The examinations of both are joined, because the condition compares the widths of PSF and galaxies.
 fn width(galaxies: &Examination, psfs: &GatheredPsfs) -> Result<Option<Warning>, FileError> {
     let mut both = galaxies.clone();
     both.join(&psfs.examination);

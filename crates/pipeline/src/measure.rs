@@ -56,7 +56,7 @@ pub struct ImageRow<'n, H> {
 /// Progress of [`measure_images`].
 #[derive(Debug)]
 pub enum Measured<'a, H> {
-    /// A row was measured, with so many galaxies.
+    /// A row of this number of galaxies was measured.
     Galaxies(usize),
     /// All rows of an image were measured, and calibrated by each measurer.
     Image(&'a H, Vec<Batch>),
@@ -137,7 +137,7 @@ impl<'a> FolderMeasurement<'a> {
         })
     }
 
-    /// Galaxies to be measured, if all images have as many as the first.
+    /// Galaxies to be measured, if all images are as large as the first.
     pub fn galaxies(&self) -> u64 {
         self.todo
             .map_or(0, |(images, mosaic)| (images * mosaic.galaxies) as u64)

@@ -139,7 +139,7 @@ impl<'s> SimulatedSessions<'s> {
         let sessions = measurers.iter().map(|measurer| {
             let configuration = measurer.configuration();
             let mut source = SimulatedSource::new(set, &fields, configuration, &drawn)?;
-            // As the header of a stored image states it: catalogues are then equal to those of `simulate` and `measure`.
+            // As the header of a stored image states it: catalogues are then equal to the catalogues of `simulate` and `measure`.
             let noise = KnownNoise::Stated(NOISE_SIGMA);
             let session = Session::open(measurer, &mut source, noise, threads)?;
             Ok((Arc::new(session), source))
@@ -212,7 +212,7 @@ pub fn run_folder(
         let set = of_set[0].set;
         let todo: Vec<u32> = of_set.iter().map(|id| id.image).collect();
         let simulator = simulate::simulator(set, settings)?;
-        // Beside the catalogues, because there is no data folder that `score` could read it from.
+        // In the folder of the catalogues, because there is no data folder that `score` could read it from.
         simulate::write_truth(&truth, &simulator)?;
         run_set(
             &simulator,

@@ -168,7 +168,7 @@ impl Map {
             point[2].atan2(point[0].hypot(point[1])).to_degrees(),
         ];
         // A step on the tangent plane moves the direction by its part across it, which west and north of the place itself
-        // measure: towards the poles they turn against those of the reference point.
+        // measure: towards the poles they turn against the axes at the reference point.
         let [_, its_east, its_north] = tangent(there, std::f64::consts::PI);
         let row = |axis: &[f64; 3]| [&east, &north].map(|by| dot(axis, by) / length);
         let local = [row(&its_east).map(|value| -value), row(&its_north)];
@@ -558,7 +558,7 @@ pub(crate) fn aligned(jacobian: &Matrix2) -> bool {
 pub(crate) fn frame(jacobian: &Matrix2) -> PixelFrame {
     let [[ux, uy], [vx, vy]] = *jacobian;
     let all = determinant(*jacobian);
-    // A round object has the second moments J⁻¹ J⁻ᵀ in pixels, of which this is the ellipticity (Bartelmann & Schneider 2001,
+    // A round object has the second moments J⁻¹ J⁻ᵀ in pixels; this is their ellipticity (Bartelmann & Schneider 2001,
     // eq. 4.10).
     let (xx, yy, xy) = (vy * vy + uy * uy, vx * vx + ux * ux, -(vx * vy + ux * uy));
     let size = xx + yy + 2.0 * all.abs();

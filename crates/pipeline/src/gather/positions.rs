@@ -178,7 +178,7 @@ impl Positions {
             .iter()
             .all(|(x, y)| (0.0..=360.0).contains(x) && y.abs() <= 90.0);
         let (x, y) = self.all[0];
-        // Degrees that are taken for pixels all lie within a few pixels of each other, even if these are on the exposure.
+        // Degrees that are read as pixels all lie within a few pixels of each other, even if these are on the exposure.
         if beyond == count || degrees && count > 2 && 2 * repeated > count {
             let cause = match degrees {
                 true => {
@@ -220,7 +220,7 @@ impl Positions {
         Ok(doubts)
     }
 
-    /// Refuses positions in pixels that are not those of ra and dec on the exposure, as of a table of another exposure or of a coadd,
+    /// Refuses positions in pixels that differ from ra and dec on the exposure, as in a table of another exposure or of a coadd,
     /// or with rows in another order. Epochs are joined by ra and dec, and shears are averaged by them.
     fn check_sky(
         &self,
@@ -291,7 +291,7 @@ pub(super) fn rows_of_stamps(table: Table<'_>, count: usize) -> Result<Vec<Colum
     let place = Place::with_table(table.path, table.table)?;
     let columns = table::columns(&place)?;
     let fault = |message: String| FileError::new(&place.path, message);
-    // Comments of a text table may look like names. Of several tables of a FITS file any may have as many rows as stamps.
+    // Comments of a text table may look like names. Any of several tables of a FITS file may have one row per stamp.
     let mut certain = columns.named.iter().filter(|named| !named.doubtful);
     let names = match (certain.next(), certain.next()) {
         (Some(named), None) => &named.names,

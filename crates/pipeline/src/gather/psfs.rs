@@ -26,7 +26,7 @@ const MAX_GRID_STARS: usize = 10;
 const MIN_STAR_CELL_PX: usize = 16;
 // Peak of each star in units of the brightest one: noise and wings beside a single star are fainter. Chosen by hand.
 const MIN_PEAK_RATIO: f32 = 0.5;
-// Fewest galaxies per star whose stars are averaged: fewer are one PSF per galaxy of which some are missing. Chosen by hand.
+// Fewest galaxies per star whose stars are averaged: with fewer, some of one PSF per galaxy are missing. Chosen by hand.
 const MIN_GALAXIES_PER_STAR: usize = 2;
 // Averaged stars are in memory together: 128 MB in double precision. Chosen by hand.
 const MAX_AVERAGED_PIXELS: usize = 1 << 24;
@@ -111,7 +111,7 @@ pub(super) fn gather_psfs(
     })
 }
 
-// Named configurations refuse such PSF stamps. Users should know before they measure, not after they have gathered all images.
+// Named configurations refuse such PSF stamps. Users should learn it before they have gathered all images.
 fn small(path: &Path, side: usize) -> Option<String> {
     let shown = path.display();
     (side < MIN_PSF).then(|| {
@@ -121,7 +121,7 @@ fn small(path: &Path, side: usize) -> Option<String> {
     })
 }
 
-// A warning about an image that is a grid of stars, as those of GREAT3.
+// A warning about an image that is a grid of stars, as in GREAT3.
 fn several_stars(path: &Path, pixels: &[f32], side: usize) -> Option<String> {
     let brightest = |n: usize| {
         let cell = side / n;
@@ -174,7 +174,7 @@ fn examined_cut(side: usize) -> PsfCut {
     }
 }
 
-// By order, like stars. Positions in the table are those of another image, and are replaced by those in the mosaic.
+// In the order of the galaxies, like stars. Positions in the mosaic replace the positions of the table, which are on another image.
 fn functional(path: PathBuf, table: &Path, mosaic: &Mosaic) -> Result<GatheredPsfs, FileError> {
     let mut rows = psf_table::read_all(table)?;
     check_count(table, rows.len(), mosaic)?;

@@ -242,7 +242,7 @@ impl MapFit {
     }
 }
 
-// Forgetting --mask-extension makes the image its own mask: all bright pixels would be missing.
+// Without --mask-extension, the image itself would be read as its mask, and all bright pixels would be missing.
 fn another(map: &Origin<'_>, image: &Origin<'_>, content: Content) -> Result<(), FileError> {
     if (map.file, map.image) == (image.file, image.image) {
         let (noun, option) = (content.noun(), content.option());

@@ -343,8 +343,8 @@ impl<'a> CatalogueWriter<'a> {
     }
 }
 
-/// Kinds of warnings that were shown, and the number of further images with each: many images often share a fault, and a line
-/// for each image would hide the others.
+/// Kinds of warnings that were shown, and the number of further images with each: many images often have the same warning,
+/// and a line for each image would hide the others.
 #[derive(Debug, Default)]
 struct Warned {
     kinds: BTreeMap<&'static str, usize>,

@@ -19,9 +19,9 @@ use crate::PipelineError;
 use crate::gather::subpixel_offset;
 use crate::stamp_table::{ID, PLACE, StampTable};
 
-// Distance up to which places on the sky are those of one galaxy. Chosen by hand: half of the seeing.
+// Distance up to which two places on the sky are one galaxy. Chosen by hand: half of the seeing.
 const SAME_GALAXY_ARCSEC: f64 = 0.5;
-// Distance from which places of one identity are those of two galaxies. Chosen by hand.
+// Distance from which places of one identity are two galaxies. Chosen by hand.
 const OTHER_GALAXY_ARCSEC: f64 = 3.0;
 
 /// An image whose stamps are read in the order of the galaxies of the first epoch.
@@ -103,7 +103,7 @@ fn offsets(
     ))
 }
 
-/// By what galaxies are recognised: identities, which show their type, and degrees on the sky.
+/// Identities of galaxies, which show their type, and degrees on the sky, by which epochs are joined.
 struct Galaxies {
     ids: Option<Vec<String>>,
     sky: Option<[Vec<f64>; 2]>,
@@ -257,7 +257,7 @@ impl EpochSource {
         &self.tiles[self.rows.stamps(row)]
     }
 
-    /// Whether the galaxies of a row are those of the same row of the image.
+    /// Whether a row of galaxies is the same row of the image.
     fn is_whole(&self, row: usize) -> bool {
         let Mosaic { columns, .. } = self.image.mosaic();
         let first = row * columns;

@@ -468,7 +468,7 @@ fn open_functional(path: &Path, cut: PsfCut, mosaic: &Mosaic) -> Result<PsfSourc
         );
         return Err(FileError::new(path, message));
     }
-    // One PSF is drawn here once, those of galaxies by the workers.
+    // A shared PSF is drawn here once; the workers draw PSFs of galaxies.
     let [psf] = rows.as_slice() else {
         return Ok(PsfSource::Functional(rows));
     };

@@ -1,4 +1,4 @@
-//! A branch like those of GREAT3 as files: data as participants got them, and the truth as it was released.
+//! A branch as in GREAT3 as files: data as participants got them, and the truth as it was released.
 
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
@@ -33,7 +33,7 @@ pub struct Record {
     /// Whether all shears have the opposite sign.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub opposite: bool,
-    /// Fingerprint of the table of fits to galaxies. Its path would not tell an edited table from the first one.
+    /// Fingerprint of the table of fits to galaxies. Its path does not change when the table is edited.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub galaxies: Option<String>,
 }
@@ -69,7 +69,7 @@ pub fn simulate_branch(
     let image = |subfield, epoch| folder.join(file_name(great3::GALAXIES, subfield, epoch));
     let image = &image;
     let images = |subfield| (0..branch.epochs()).map(move |epoch| image(subfield, epoch));
-    // Before the claim, which would write a record of this seed beside images of another.
+    // Before the claim, which would write a record of this seed into a folder with images of another.
     refuse_without_record(out, (0..subfields).flat_map(images))?;
     let claim = claim(&out.join(SIMULATION_FILE), record)?;
     let size = branch.stamp();
