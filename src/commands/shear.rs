@@ -21,7 +21,7 @@ pub(crate) struct Arguments {
     /// Folders of catalogues that `measure`, `run` or `select` wrote.
     #[arg(long, value_name = "DIR", required = true, num_args = 1..)]
     measured: Vec<PathBuf>,
-    /// Galaxies that share a mean response. The response of an image of 40 galaxies at S/N 10 biases m by about 0.007.
+    /// Galaxies that share a mean response. The response of an image of 40 galaxies at S/N 10 biases m by 0.002.
     #[arg(long, value_name = "OF", default_value = "survey", value_parser = named::<Shared>())]
     response: Shared,
     /// Write only what TreeCorr reads: these positions, g1, g2 and w of galaxies with a shear.
