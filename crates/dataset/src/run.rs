@@ -283,7 +283,12 @@ pub fn read_record<R: DeserializeOwned>(path: &Path) -> Result<Option<R>, FileEr
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(None),
         Err(error) => return Err(FileError::doing(path, "cannot read the record")(error)),
     };
-    serde_json::from_str(&text).map(Some).map_err(|error| {
+    parse_record(path, &text).map(Some)
+}
+
+/// `path` is for messages.
+pub fn parse_record<R: DeserializeOwned>(path: &Path, text: &str) -> Result<R, FileError> {
+    serde_json::from_str(text).map_err(|error| {
         // `is_data`: valid JSON, but with other keys or types.
         let hint = match error.is_data() {
             true => "; the record belongs to another version. Try: another folder",

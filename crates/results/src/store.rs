@@ -1,7 +1,7 @@
 //! A results store: a folder with one JSON file per recorded run.
 //!
 //! A file's name is derived from its content. Processes that write into one store therefore do not collide, and
-//! recording a run twice has no effect. docs/files.md describes the keys.
+//! recording a run twice has no effect. docs/files.md lists the keys.
 
 use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
@@ -9,7 +9,8 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 use shearq_dataset::fingerprint;
-use shearq_dataset::run::{read_record, record_text};
+use shearq_dataset::run::{parse_record, record_text};
+use shearq_files::open::{DATA, read_to_string};
 use shearq_files::table::MAX_ROWS;
 use shearq_files::{FileError, atomic};
 
@@ -55,6 +56,14 @@ pub fn write(store: &Path, run: &RunRecord) -> Result<PathBuf, FileError> {
     // The name contains a hash of the content: processes that write at the same time do not collide, and recording a run
     // twice has no effect.
     let path = store.join(file_name(run, text.as_bytes()));
+    // A file that cannot be read would make the other runs of the store unreadable, too.
+    if text.len() as u64 > DATA {
+        let message = format!(
+            "the run is too large for a file of a results store (found {} bytes, expected at most {DATA}). Try: shearq score with some --sets at a time",
+            text.len()
+        );
+        return Err(FileError::new(&path, message));
+    }
     atomic::write(&path, text.as_bytes())?;
     Ok(path)
 }
@@ -70,30 +79,27 @@ fn file_name(run: &RunRecord, bytes: &[u8]) -> String {
 }
 
 fn read_run(path: &Path) -> Result<RunRecord, FileError> {
-    let Some(Stored { schema, run }) = read_record::<Stored<RunRecord>>(path)? else {
-        return Err(FileError::new(
-            path,
-            "the file was removed while the store was read",
-        ));
-    };
+    // Records of thousands of sets or images exceed the limit of settings.
+    let text =
+        read_to_string(path, DATA).map_err(FileError::doing(path, "cannot read the record"))?;
+    let Stored { schema, run } = parse_record::<Stored<RunRecord>>(path, &text)?;
     if schema != SCHEMA {
         let message = format!(
             "not a file of a results store (found the schema `{schema}`, expected `{SCHEMA}`)"
         );
         return Err(FileError::new(path, message));
     }
-    let print = fingerprint::of_file(path)?;
+    let print = fingerprint::of_bytes(text.as_bytes());
     let stem = path.file_stem().unwrap_or_default().to_string_lossy();
-    // A renamed file has no print in its name.
-    let named = stem
-        .rsplit('-')
-        .next()
-        .filter(|end| end.len() == print.len() && end.bytes().all(|byte| byte.is_ascii_hexdigit()));
-    if named.is_some_and(|named| named != print) {
+    // JSON is easily edited, and another `settings` or `definition` would be compared as a run that never was.
+    if !stem.ends_with(&format!("-{print}")) {
         let message = format!(
-            "the file was changed after it was recorded (found content {print}, expected the end of its name)"
+            "the file was changed or renamed after it was recorded (found content {print}, expected the end of its name). Try: remove it, and shearq score --measured OUT --store DIR"
         );
         return Err(FileError::new(path, message));
+    }
+    if run.sets.is_empty() {
+        return Err(FileError::new(path, "the run has no sets"));
     }
     for set in &run.sets {
         // Sums over sets would overflow with counts that no images can have.
@@ -118,14 +124,21 @@ pub fn files(store: &Path) -> Result<Vec<(PathBuf, RunRecord)>, FileError> {
         .into_iter()
         .map(|entry| entry.path())
         .filter(|path| {
-            let hidden = path
-                .file_name()
-                .is_some_and(|name| name.as_encoded_bytes().starts_with(b"."));
-            !hidden && path.extension().is_some_and(|ending| ending == "json")
+            let name = path.file_name().unwrap_or_default();
+            !name.as_encoded_bytes().starts_with(b".")
         })
         .collect();
     // Folders are listed in any order, but warnings and tables must not depend on it.
     paths.sort();
+    let is = |path: &Path, ending| path.extension().is_some_and(|own| own == ending);
+    // Earlier versions wrote Parquet. Skipped, its runs would be absent from comparisons, and entries would be ranked as new.
+    if let Some(old) = paths.iter().find(|path| is(path, "parquet")) {
+        return Err(FileError::new(
+            old,
+            "found Parquet in a results store, expected the JSON of this version. Try: shearq score --measured OUT --store DIR with another folder",
+        ));
+    }
+    paths.retain(|path| is(path, "json"));
     paths
         .into_iter()
         .map(|path| Ok((path.clone(), read_run(&path)?)))
@@ -236,16 +249,30 @@ mod tests {
     #[test]
     fn counts_that_no_catalogues_have_are_refused() {
         let folder = tempfile::tempdir().unwrap();
-        for edit in [
-            |set: &mut SetRecord| set.galaxies = 1 << 62,
-            |set: &mut SetRecord| set.flagged = set.galaxies + 1,
+        for (edit, expected) in [
+            (
+                (|run| run.sets[0].galaxies = 1 << 62) as fn(&mut RunRecord),
+                "set 1: found ",
+            ),
+            (|run| run.sets[0].flagged = 65, "set 1: found "),
+            (|run| run.sets.clear(), "the run has no sets"),
         ] {
             let mut own = run("a", &[(1, 3, 5.5)]);
-            edit(&mut own.sets[0]);
+            edit(&mut own);
             let path = write(folder.path(), &own).unwrap();
             let message = read(folder.path()).unwrap_err().to_string();
-            assert!(message.contains("set 1: found "), "{message}");
+            assert!(message.contains(expected), "{message}");
             std::fs::remove_file(path).unwrap();
         }
+    }
+
+    #[test]
+    fn a_run_above_the_limit_of_settings_is_read_back() {
+        let folder = tempfile::tempdir().unwrap();
+        let own = run("a", &[(1, 400_000, 5.5)]);
+        let path = write(folder.path(), &own).unwrap();
+        assert!(path.metadata().unwrap().len() > shearq_files::open::SETTINGS);
+        let (runs, _) = read(folder.path()).unwrap();
+        assert_eq!(runs[0].sets[0].images, own.sets[0].images);
     }
 }
