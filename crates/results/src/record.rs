@@ -292,7 +292,7 @@ fn kind(set: &SetRecord, label: fn(&SetKind) -> &'static str) -> String {
 /// The column of the frame, which tables have if it is not that of the pixels.
 pub const FRAME: &str = "frame";
 
-const BEFORE_METRICS: [Column; 19] = [
+const BEFORE_METRICS: [Column; 20] = [
     of_run("run", "Run", RunRecord::id),
     of_run("submission", "Configuration", |run| {
         run.configuration.clone()
@@ -304,6 +304,7 @@ const BEFORE_METRICS: [Column; 19] = [
     of_run("choice", "Choice", |run| run.choice.clone()),
     of_run("noise", "Noise", |run| run.noise.clone()),
     count("set", "Set", |set| set.set.into()),
+    text("data", "Data", |set| set.data.clone()),
     text("set_kind", "Kind", |set| kind(set, |k| k.image.label())),
     text("psf", "PSF", |set| kind(set, |k| k.psf.label())),
     text("psf_profile", "PSF profile", |set| {
