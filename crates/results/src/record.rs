@@ -433,17 +433,35 @@ mod tests {
     use super::*;
 
     #[test]
-    fn unknown_numbers_are_read_back_from_json() {
+    fn records_are_read_back_from_json() {
+        let read = |record: &SetRecord| -> SetRecord {
+            serde_json::from_str(&serde_json::to_string(record).unwrap()).unwrap()
+        };
+        let metrics =
+            |first: u8| Metrics::from_values(std::array::from_fn(|k| f64::from(first) + k as f64));
+        // No value is that of a record of unknown metrics.
         let record = SetRecord {
-            images: vec![1],
+            set: 20,
+            simulated: true,
+            data: "d".into(),
+            images: vec![1, 3],
+            galaxies: 6,
+            flagged: 2,
             frame: Frame::Sky,
-            q_replicates: vec![1.0, f64::NAN],
+            metrics: metrics(30),
+            errors: metrics(60),
+            q_replicates: vec![7.0],
+            q_calibrated_replicates: vec![8.0, 9.0],
+            q_leaderboard: 10.0,
+            convention: 2,
+            convention_known: false,
+            convention_leaderboard: 3,
+        };
+        assert_eq!(read(&record), record);
+        let unknown = read(&SetRecord {
             q_calibrated_replicates: vec![f64::NAN],
             ..SetRecord::unknown(20)
-        };
-        let text = serde_json::to_string(&record).unwrap();
-        let read: SetRecord = serde_json::from_str(&text).unwrap();
-        assert!(read.q_leaderboard.is_nan() && read.q_calibrated_replicates[0].is_nan());
-        assert_eq!((read.set, read.images), (20, vec![1]));
+        });
+        assert!(unknown.q_leaderboard.is_nan() && unknown.q_calibrated_replicates[0].is_nan());
     }
 }
