@@ -1,5 +1,5 @@
 //! The record of a scored set, with the one list of its columns: conditions are met and tables printed by it.
-//! docs/files.md describes the columns.
+//! docs/files.md describes the columns, and the keys of the JSON, which are the fields of the structs.
 
 use serde::{Deserialize, Serialize};
 use shearq_dataset::fingerprint::{self, Fingerprint};
