@@ -277,14 +277,22 @@ impl Survey {
         parts.find_map(|(own, column, _)| (own == Some(key)).then_some(column))
     }
 
-    // Whether the catalogue with the columns `found` is this one. Given names of e1 and e2 must be those of this one; other names
-    // identify nothing: `w=w` made plain catalogues those of UNIONS, whose R11 and R22 are not used.
+    // Whether the catalogue with the columns `found` is this one. Given names of e1 and e2 must be those of this one. A given
+    // weight is that of this one if all other columns are there, and no column is declined: `w=w` made plain catalogues
+    // those of UNIONS, whose R11 and R22 are not used.
     fn is_of(&self, found: &[String], names: &Names) -> bool {
+        const WEIGHT: Key = (Role::Weight, 0);
         let there = |column: &str| found.iter().any(|own| own.eq_ignore_ascii_case(column));
+        let is_renamed = names.is_given(Role::Weight)
+            && self
+                .parts()
+                .any(|(key, column, required)| key == Some(WEIGHT) && required && !there(column));
         self.parts().all(|(key, column, required)| {
             match (key, key.and_then(|key| names.0.get(&key))) {
                 (Some((Role::E1 | Role::E2, 0)), Some(given)) => given.eq_ignore_ascii_case(column),
-                _ => !required || there(column),
+                (Some(WEIGHT), _) if is_renamed => true,
+                // `none` is no column.
+                _ => !(required || is_renamed) || there(column),
             }
         })
     }
@@ -874,6 +882,14 @@ mod tests {
     fn programs_are_recognised_by_their_columns() {
         let weighted = found("e1 e2 w R11 R22", &["w=w"]).unwrap();
         assert_eq!(weighted.of(Role::R11), Some("R11"));
+        let hsc = "i_hsmshaperegauss_e1 i_hsmshaperegauss_e2 i_hsmshaperegauss_flag w";
+        let rms = "i_hsmshaperegauss_derived_rms_e";
+        let renamed = found(&format!("{hsc} {rms}"), &["w=w"]).unwrap();
+        assert_eq!(
+            (renamed.program(), renamed.of(Role::RmsE)),
+            ("HSC Y3", Some(rms))
+        );
+        assert_eq!(found(hsc, &["w=w"]).unwrap().program(), "LSST");
         for (columns, preset) in [
             ("e1 e2 w flag", Preset::Plain),
             ("x y e1 e2 flags R11 R22 first_energy", Preset::Shearq),
