@@ -5,7 +5,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
 use shearq_measure::{Cut, ImageNoise, Measurement, Measurer, Observables, Quantity, Selection};
-use shearq_submissions::Method;
+use shearq_submissions::{Configuration, Method};
 
 const N: usize = 48;
 const SHEAR: f64 = 0.05;
@@ -235,6 +235,38 @@ fn sharp_cuts_of_sheared_versions_leave_the_shear_as_it_is() {
         assert!(error < 0.04, "{error}");
         assert!(with.abs() < 3.0 * error + 3e-3, "{name}: {with} ± {error}");
         assert!(without.abs() > 0.02, "{name}: {without}");
+    }
+}
+
+#[test]
+fn saturation_limits_the_measured_ellipticity() {
+    let of = |configuration: &Configuration| {
+        let measurer = Measurer::new(configuration, N).unwrap();
+        let mut worker = measurer.worker();
+        let mut image = worker.image(ImageNoise::Level(1.0));
+        let psf = gaussian(48, PSF);
+        let mut worker = image.psf(psf.view()).expect("a PSF of the planned size");
+        let found = measured(&mut worker, &(galaxy(6.0, [0.7, 0.3], 0.0) * 1e5));
+        [found.e1, found.e2]
+    };
+    let own = |name: &str, saturation: &str| {
+        let text = format!("extends = \"{name}\"\n[shape]\n{saturation}\n");
+        of(&text.parse().unwrap())
+    };
+    for (name, without, with) in [
+        ("48/linear/star", "", "saturation = 0.25"),
+        ("48/linear/survey", "saturation = 0.0", ""),
+    ] {
+        let (plain, saturated) = (own(name, without), own(name, with));
+        let factor = (1.0 + (plain[0].hypot(plain[1]) / 0.25).powi(2)).sqrt();
+        assert!(factor > 1.2, "{name}: {plain:?}");
+        for (plain, saturated) in plain.into_iter().zip(saturated) {
+            let expected = plain / factor;
+            assert!(
+                (saturated - expected).abs() < 1e-5,
+                "{name}: {saturated} {expected}"
+            );
+        }
     }
 }
 
