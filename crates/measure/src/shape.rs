@@ -187,7 +187,7 @@ impl AdaptiveMoments {
         }
     }
 
-    /// Finds χ of `acf`, laid out as `deconvolve::Lags`.
+    /// Finds χ of `acf`, laid out as `spectral::Lags`.
     ///
     /// `regularisation`, in px⁴ times the unit of `acf`, is added to the integral of x² + y² by which the
     /// moments are divided. Of an autocorrelation that is all noise that integral is anything; with a
@@ -285,7 +285,7 @@ impl AdaptiveMoments {
     }
 
     /// Writes the weights of the lags, each for itself, whose sums with a change of the autocorrelation are χ′₁, χ′₂ and, in
-    /// units of the trace, ∂φ₁/∂χ₁, ∂φ₁/∂χ₂, ∂φ₂/∂χ₁ and ∂φ₂/∂χ₂; laid out as `deconvolve::Lags`. Lags beyond the circle
+    /// units of the trace, ∂φ₁/∂χ₁, ∂φ₁/∂χ₂, ∂φ₂/∂χ₁ and ∂φ₂/∂χ₂; laid out as `spectral::Lags`. Lags beyond the circle
     /// are left as they are. Returns F_χχ on `acf`.
     pub(crate) fn second_order(
         &self,
