@@ -974,6 +974,8 @@ mod tests {
         for stamp in &mut scaled.stamps {
             (stamp.flux, stamp.core[0], stamp.trace) = (2.0 * stamp.flux, 2.0 * stamp.core[0], 0);
         }
+        // In other filters, galaxies have other fluxes.
+        assert_eq!(scaled.contradictions(&[&first], SAME, false), []);
         for (other, expected) in [
             (epoch(dither, at, [0.0; 2], [0, 1]), &[][..]),
             (epoch(dither, centred, dither, [0, 1]), &[]),
