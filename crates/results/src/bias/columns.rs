@@ -335,7 +335,7 @@ const SUSPECTED_ROLES: [(SuspectedRole, &str); 7] = [
     (SuspectedRole::Derivative, "*_dg1 *_dg2"),
     (SuspectedRole::Sheared, "*_1p *_1m *_2p *_2m"),
     (SuspectedRole::Calibration, "*shear_bias*"),
-    (SuspectedRole::Weight, "w wt wt_a w_* *weight *weight_a"),
+    (SuspectedRole::Weight, "w wt wgt wht wt_a w_* *weight *weight_a"),
     (SuspectedRole::Flag, "*flag* *mask*"),
     (
         SuspectedRole::Response,
@@ -995,6 +995,8 @@ mod tests {
         let read = ["T_1p".to_owned()];
         assert!(!columns.unused(&read).unwrap().contains("T_1p"));
         assert_eq!(columns.doubtful_weight.as_deref(), Some("my_weight"));
+        let swarp = found("e1 e2 wht", &[]).unwrap();
+        assert_eq!(swarp.doubtful_weight.as_deref(), Some("wht"));
         let declined = found("e1 e2 my_weight", &["w=none"]).unwrap();
         assert_eq!(declined.doubtful_weight, None);
         assert!(found("e1 e2 w mag T", &[]).unwrap().unused(&[]).is_none());
