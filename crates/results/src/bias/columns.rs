@@ -335,7 +335,10 @@ const SUSPECTED_ROLES: [(SuspectedRole, &str); 7] = [
     (SuspectedRole::Derivative, "*_dg1 *_dg2"),
     (SuspectedRole::Sheared, "*_1p *_1m *_2p *_2m"),
     (SuspectedRole::Calibration, "*shear_bias*"),
-    (SuspectedRole::Weight, "w wt wgt wht wt_a w_* *weight *weight_a"),
+    (
+        SuspectedRole::Weight,
+        "w wt wgt wht wt_a w_* *weight *weight_a",
+    ),
     (SuspectedRole::Flag, "*flag* *mask*"),
     (
         SuspectedRole::Response,
