@@ -35,44 +35,53 @@ def regauss(stamps, psf, _noise):
     return e, 1.0 - 4.0 * off[0, 0] * off[2, 0]
 
 
-def fpfs(stamps, psf, noise, renoise=True):
-    """FPFS (Li et al. 2022) of AnaCal at the stamps' middles, without detection.
+class Fpfs:
+    """FPFS (Li et al. 2022) of AnaCal at the middles of stamps, without detection; its kernel is in pixels."""
 
-    With `renoise`, it adds noise like that of the stamps, which removes the noise bias of its response.
-    """
-    try:
-        import anacal
-    except ImportError:
-        raise SystemExit("FPFS needs AnaCal: pip install anacal") from None
-    count, side = stamps.shape[2:4]
-    full = max(SIDE, side)
-    grid = int(np.sqrt(count))
-    edge = (full - side) // 2
+    def __init__(self, count, side, psf, kernel):
+        try:
+            import anacal
+        except ImportError:
+            raise SystemExit("FPFS needs AnaCal: pip install anacal") from None
+        self.code, self.count, self.side, self.full = anacal.fpfs, count, side, max(SIDE, side)
+        self.grid = int(np.sqrt(count))
+        # The PSF is half a pixel off the place that is told as its middle, as the galaxies are.
+        self.psf = psf.drawImage(nx=self.full, ny=self.full, scale=1, dtype=float).array
+        self.task = self.code.FpfsTask(
+            npix=self.full, pixel_scale=SCALE, sigma_shapelets=kernel * SCALE, psf_array=self.psf, kmax_thres=1e-12
+        )
+        self.places = np.empty(count, dtype=[("y", np.int32), ("x", np.int32)])
+        y, x = np.mgrid[0 : self.grid, 0 : self.grid] * self.full + self.full // 2
+        self.places["y"], self.places["x"] = y.ravel(), x.ravel()
 
-    def mosaic(galaxies):
-        image = np.zeros((count, full, full))
-        image[:, edge : edge + side, edge : edge + side] = galaxies
+    def mosaic(self, stamps):
+        edge, grid, full = (self.full - self.side) // 2, self.grid, self.full
+        image = np.zeros((self.count, full, full))
+        image[:, edge : edge + self.side, edge : edge + self.side] = stamps
         image = image.reshape(grid, grid, full, full).transpose(0, 2, 1, 3)
         return np.ascontiguousarray(image.reshape(grid * full, grid * full))
 
-    # The PSF is half a pixel off the place that is told as its middle, as the galaxies are.
-    drawn = psf.drawImage(nx=full, ny=full, scale=1, dtype=float).array
-    task = anacal.fpfs.FpfsTask(
-        npix=full, pixel_scale=SCALE, sigma_shapelets=KERNEL * SCALE, psf_array=drawn, kmax_thres=1e-12
-    )
-    places = np.empty(count, dtype=[("y", np.int32), ("x", np.int32)])
-    y, x = np.mgrid[0:grid, 0:grid] * full + full // 2
-    places["y"], places["x"] = y.ravel(), x.ravel()
+    def run(self, stamps, added=None):
+        """Moments of the stamps, under `data`, and of the noise that it adds itself, under `noise`."""
+        added = None if added is None else self.mosaic(added)
+        return self.task.run(gal_array=self.mosaic(stamps), psf=self.psf, noise_array=added, det=self.places)
+
+    def shapes(self, offset, found, added=None):
+        """Ellipticities and responses from moments, with this C."""
+        return self.code.measure_fpfs(C0=offset, x_array=found, y_array=added)
+
+
+def fpfs(stamps, psf, noise, renoise=True):
+    """FPFS. With `renoise`, it adds noise like that of the stamps, which removes the noise bias of its response."""
+    count, side = stamps.shape[2:4]
+    code = Fpfs(count, side, psf, KERNEL)
     e = np.empty((*stamps.shape[:3], 2))
     responses, offset = np.zeros((count, 2)), None
     for field, sign in np.ndindex(e.shape[:2]):
-        # It adds this to the image itself.
-        added = mosaic(noise(field)) if renoise else None
-        found = task.run(gal_array=mosaic(stamps[field, sign]), psf=drawn, noise_array=added, det=places)
+        found = code.run(stamps[field, sign], noise(field) if renoise else None)
         if offset is None:
             offset = OFFSET * float(np.median(found["data"]["m00"]))
-        again = found["noise"] if renoise else None
-        shapes = anacal.fpfs.measure_fpfs(C0=offset, x_array=found["data"], y_array=again)
+        shapes = code.shapes(offset, found["data"], found["noise"] if renoise else None)
         e[field, sign] = np.stack([shapes["e1"], shapes["e2"]], 1)
         responses += np.stack([shapes["de1_dg1"], shapes["de2_dg2"]], 1)
     return e, responses / (len(stamps) * 2)
