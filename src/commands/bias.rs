@@ -8,7 +8,7 @@ use anyhow::{Context, anyhow};
 use clap::Args;
 use shearq_bias::Design;
 
-use self::plan::{example, plan};
+use self::plan::{example, plan, planned_error};
 use crate::arguments::{Printing, ReportFile, positive};
 use crate::choices::named;
 use crate::{Findings, made_by, tell};
@@ -46,7 +46,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with = "Summing")]
     merge: Vec<PathBuf>,
     /// Print how many measurements determine m to this error, such as 1e-3. Needs no catalogues.
-    #[arg(long, value_name = "ERROR", value_parser = positive, exclusive = true)]
+    #[arg(long, value_name = "ERROR", value_parser = planned_error, allow_hyphen_values = true, exclusive = true)]
     plan: Option<f64>,
     /// Write example catalogues `plus.csv` and `minus.csv` into this folder: 20,000 galaxies of which m1 is 0.01, m2 -0.02,
     /// c1 0.001 and c2 -0.0005.

@@ -2,6 +2,7 @@
 
 use std::fmt::Write;
 use std::fs;
+use std::ops::RangeInclusive;
 use std::path::Path;
 
 use anyhow::Context;
@@ -39,6 +40,19 @@ enum Scatter {
     Response(f64),
 }
 const SHEARS: [f64; 3] = [0.02, 0.05, 0.1];
+
+// Errors of m for which a plan is useful: 10⁻⁶ takes 5·10¹⁰ to 2·10¹⁴ measurements.
+const PLANNED_ERRORS: RangeInclusive<f64> = 1e-6..=1.0;
+
+pub(crate) fn planned_error(text: &str) -> Result<f64, String> {
+    let number = text.parse().ok();
+    number
+        .filter(|error| PLANNED_ERRORS.contains(error))
+        .ok_or_else(|| {
+            let (low, high) = (PLANNED_ERRORS.start(), PLANNED_ERRORS.end());
+            format!("found `{text}`, expected an error of m from {low:e} to {high}")
+        })
+}
 
 /// How many measurements determine m of a component to `error`: σ(m) = σ/(γ√N), the error of the slope of N points at ±γ.
 pub(crate) fn plan(error: f64) -> Table {
