@@ -223,8 +223,11 @@ const SURVEYS: [Survey; 22] = [
         w=ishape_hsm_regauss_derived_shape_weight rms_e=ishape_hsm_regauss_derived_rms_e flag=ishape_hsm_regauss_flags"),
     survey("HSC Y1", DISTORTION, "e1=ishape_hsm_regauss_e1 e2=ishape_hsm_regauss_e2 w=ishape_hsm_regauss_derived_weight \
         rms_e=ishape_hsm_regauss_derived_rms_e flag=ishape_hsm_regauss_flags"),
+    // Any of the two derived columns: LSST has neither, and its table of objects the same names of ellipticities.
     survey("HSC Y3", DISTORTION, "e1=i_hsmshaperegauss_e1 e2=i_hsmshaperegauss_e2 +w=i_hsmshaperegauss_derived_weight \
         rms_e=i_hsmshaperegauss_derived_rms_e flag=i_hsmshaperegauss_flag"),
+    survey("HSC Y3", DISTORTION, "e1=i_hsmshaperegauss_e1 e2=i_hsmshaperegauss_e2 \
+        +rms_e=i_hsmshaperegauss_derived_rms_e flag=i_hsmshaperegauss_flag"),
     survey("LSST", DISTORTION, "e1=i_hsmShapeRegauss_e1 e2=i_hsmShapeRegauss_e2 flag=i_hsmShapeRegauss_flag"),
     survey("LSST", DISTORTION, "e1=r_hsmShapeRegauss_e1 e2=r_hsmShapeRegauss_e2 flag=r_hsmShapeRegauss_flag"),
     survey("LSST", DISTORTION, "e1=ext_shapeHSM_HsmShapeRegauss_e1 e2=ext_shapeHSM_HsmShapeRegauss_e2 \
@@ -893,6 +896,9 @@ mod tests {
             ("HSC Y3", Some(rms))
         );
         assert_eq!(found(hsc, &["w=w"]).unwrap().program(), "LSST");
+        let unflagged = hsc.replace("i_hsmshaperegauss_flag ", "");
+        let renamed = found(&format!("{unflagged} {rms}"), &["w=w"]).unwrap();
+        assert_eq!(renamed.program(), "HSC Y3");
         for (columns, preset) in [
             ("e1 e2 w flag", Preset::Plain),
             ("x y e1 e2 flags R11 R22 first_energy", Preset::Shearq),
