@@ -230,15 +230,16 @@ pub(crate) fn bias_sums(
         }
     };
     // Paths one by one, because a folder may lie between tables, and catalogues pair by their order.
-    let (mut inputs, mut truth) = (Vec::new(), truth);
+    let (mut inputs, mut truth, mut without_catalogue) = (Vec::new(), truth, Vec::new());
     for given in catalogues {
         match given {
             Given::Table(name, columns) => inputs.push(table_of(&name, columns)?),
             Given::Path(path) => {
                 require(&path)?;
-                let (found, known) = expand(&[path], truth).map_err(of_bias)?;
-                inputs.extend(found);
-                truth = known;
+                let found = expand(&[path], truth).map_err(of_bias)?;
+                inputs.extend(found.catalogues);
+                truth = found.truth;
+                without_catalogue.extend(found.without_catalogue);
             }
         }
     }
@@ -260,6 +261,7 @@ pub(crate) fn bias_sums(
         },
         drop_missing,
         step,
+        without_catalogue,
     };
     // Shards are of files of the command line; workers in Python sum catalogues of their own.
     let summed = py.detach(|| sum(&request, &|_| true)).map_err(of_bias)?;

@@ -300,11 +300,12 @@ fn of_catalogues(summing: &Summing, catalogues: &[PathBuf]) -> anyhow::Result<Su
             anyhow::bail!("{option}: cannot be used with step() in --where");
         }
     }
-    let (catalogues, truth) = expand(catalogues, truth)?;
+    let found = expand(catalogues, truth)?;
     let request = Request {
-        catalogues,
+        catalogues: found.catalogues,
         names,
-        truth,
+        truth: found.truth,
+        without_catalogue: found.without_catalogue,
         shapes: summing.ellipticity,
         sign,
         bins: summing.bins.clone(),

@@ -179,6 +179,8 @@ pub struct Request {
     pub drop_missing: bool,
     /// Artificial shear of metacalibration.
     pub step: f64,
+    /// Remarks about images of the data that have no catalogue.
+    pub without_catalogue: Vec<String>,
 }
 
 /// What sums of catalogues are sums of.
@@ -214,6 +216,10 @@ pub struct About {
     pub sign: Option<Sign>,
     /// `pixel` or `sky`, of catalogues by shearq.
     pub frame: Option<String>,
+    /// Remarks about images of the data that have no catalogue.
+    // Left out of files of sums unless there are some, so that these stay the same.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub without_catalogue: Vec<String>,
 }
 
 impl About {
@@ -342,6 +348,7 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
         columns: described,
         sign,
         frame: common_frame(&all)?,
+        without_catalogue: request.without_catalogue.clone(),
     };
     let mut summed = Summed { sums, about };
     // The catalogues are read again rather than the sums changed: g2 enters them in products of all terms.
@@ -587,6 +594,8 @@ impl Summed {
     pub fn append(&mut self, other: Summed) -> Result<(), BiasFailure> {
         self.check_options(&other)?;
         self.about.catalogues.extend(other.about.catalogues);
+        let remarks = other.about.without_catalogue;
+        self.about.without_catalogue.extend(remarks);
         Ok(self.sums.append(other.sums)?)
     }
 

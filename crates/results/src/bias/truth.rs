@@ -5,6 +5,7 @@ use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use shearq_dataset::images::Files;
 use shearq_dataset::layout::stated_sign;
 use shearq_dataset::run::{RUN_FILE, Run};
 use shearq_dataset::truth::{Sign, SignBasis, sign_on_any_grid};
@@ -378,10 +379,19 @@ pub(super) fn check([g1, g2]: [f64; 2]) -> Result<(), String> {
     ))
 }
 
+/// Catalogues of files and folders.
+#[derive(Debug)]
+pub struct Expanded {
+    pub catalogues: Vec<Input>,
+    pub truth: Truth,
+    /// Remarks about images of the data that have no catalogue.
+    pub without_catalogue: Vec<String>,
+}
+
 /// Replaces folders of results by their catalogues, in the order of sets and images. Unless `truth` states the true
 /// shear, it is read from the data folders, if they have one.
-pub fn expand(paths: &[PathBuf], truth: Truth) -> Result<(Vec<Input>, Truth), BiasFailure> {
-    let (mut truth, mut catalogues) = (truth, Vec::new());
+pub fn expand(paths: &[PathBuf], mut truth: Truth) -> Result<Expanded, BiasFailure> {
+    let (mut catalogues, mut without_catalogue) = (Vec::new(), Vec::new());
     let mut found = match &mut truth {
         Truth::Data(found) => std::mem::take(found),
         _ => BTreeMap::new(),
@@ -404,6 +414,7 @@ pub fn expand(paths: &[PathBuf], truth: Truth) -> Result<(Vec<Input>, Truth), Bi
         if files.is_empty() {
             return Err(FileError::new(path, "there is no catalogue in this folder").into());
         }
+        without_catalogue.extend(images_without_catalogue(&run, path, &files)?);
         for set in files.sets() {
             let own: Vec<PathBuf> = files
                 .of_set(set)
@@ -423,13 +434,50 @@ pub fn expand(paths: &[PathBuf], truth: Truth) -> Result<(Vec<Input>, Truth), Bi
         }
     }
     if found.is_empty() {
-        return Ok((catalogues, truth));
+        return Ok(Expanded {
+            catalogues,
+            truth,
+            without_catalogue,
+        });
     }
     if let Some(path) = without {
         let message = "its data have no true shear, but the data of other folders have one. Try: separate commands, or --truth FILE";
         return Err(FileError::new(path, message).into());
     }
-    Ok((catalogues, Truth::Data(found)))
+    Ok(Expanded {
+        catalogues,
+        truth: Truth::Data(found),
+        without_catalogue,
+    })
+}
+
+// A bias of fewer images than the data have is valid, but the reader must know.
+fn images_without_catalogue(
+    run: &Run,
+    folder: &Path,
+    catalogues: &Files,
+) -> Result<Vec<String>, FileError> {
+    // Data that are gone are refused where their true shear is needed. Of epochs, one image of a set has a catalogue.
+    let Some(data) = run.source.data(folder).ok().filter(|_| !run.epochs) else {
+        return Ok(Vec::new());
+    };
+    let images = data.images(&[])?;
+    let of_set = |set: u32| {
+        let measured = catalogues.of_set(set);
+        let own = images.of_set(set);
+        let absent = own
+            .iter()
+            .filter(|(image, _)| measured.iter().all(|(measured, _)| measured != image));
+        let absent = absent.count();
+        (absent > 0).then(|| {
+            format!(
+                "{}: {absent} of {} images of set {set} have no catalogue, so that their galaxies do not count.",
+                folder.display(),
+                own.len()
+            )
+        })
+    };
+    Ok(images.sets().into_iter().filter_map(of_set).collect())
 }
 
 fn of_data(run: &Run, folder: &Path, set: u32) -> Result<Option<Positions>, FileError> {

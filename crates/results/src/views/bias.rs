@@ -320,6 +320,7 @@ fn notes(result: &BiasResult) -> Vec<String> {
         ),
     ];
     notes.extend(result.about.columns.iter().cloned());
+    notes.extend(result.about.without_catalogue.iter().cloned());
     notes.extend(result.about.sign.and_then(Sign::line));
     match result.grouping.stars.len() {
         0 => {}
