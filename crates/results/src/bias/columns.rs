@@ -215,7 +215,7 @@ const DISTORTION: bool = true;
 // columns of a calibration of the shear bias (`derived_shear_bias_m`, `_c1`, `_c2`) have no role, because m and c are to be
 // found before it.
 #[rustfmt::skip]
-const SURVEYS: [Survey; 22] = [
+const SURVEYS: [Survey; 23] = [
     survey("KiDS, internal", SHEAR, "e1=autocal_e1_A e2=autocal_e2_A w=recal_weight_A psf_e1=PSF_e1 psf_e2=PSF_e2"),
     survey("KV450", SHEAR, "e1=bias_corrected_e1 e2=bias_corrected_e2 w=recal_weight psf_e1=PSF_e1 psf_e2=PSF_e2"),
     survey("KiDS", SHEAR, "e1=e1 e2=e2 +w=weight +model_SNratio psf_e1=PSF_e1 psf_e2=PSF_e2"),
@@ -320,47 +320,36 @@ pub(super) fn counted_value(name: &str) -> Option<bool> {
     Some(known.1)
 }
 
-// What a name in small letters suggests that a column is.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum SuspectedRole {
-    Choice,
-    Derivative,
-    Sheared,
-    Calibration,
-    Weight,
-    Flag,
-    Response,
-    Noise,
+// Names of weights of shapes, in small letters and between underscores: lensfit's, inverse variances, and the coverage of
+// drizzled and coadded images (`AUTO_WHT`), which is a weight where nothing better is known.
+const WEIGHTS: &str = "*weight* *_w_* *_wt_* *_wgt_* *_wht_* *_ivar_* *_inv*var*";
+// Columns of real catalogues with such names that are no weights of shapes: derivatives and sheared catalogues, SExtractor's
+// FLAGS_WEIGHT, weighted means, and the inverse variances of fluxes, positions and profiles in the Legacy Surveys.
+const NO_WEIGHTS: &str = "*_dg1_ *_dg2_ *_1p_ *_1m_ *_2p_ *_2m_ *flag* *mask* *weighted* *psf* *_star_* *flux* *_mag_* \
+    *redshift* *photoz* *photo_z* *_ra_* *_dec_* *pmra_* *pmdec_* *parallax* *sersic* *_shape_r_* *_z_ivar_*";
+
+/// Whether the name of a column suggests that it is a weight of shapes.
+pub(crate) fn looks_like_weight(name: &str) -> bool {
+    let name = format!("_{}_", name.to_ascii_lowercase());
+    fits_any(WEIGHTS, &name) && !fits_any(NO_WEIGHTS, &name)
 }
 
-// The first that fits counts: `w_1p` is a weight of a sheared catalogue.
-const SUSPECTED_ROLES: [(SuspectedRole, &str); 7] = [
-    (SuspectedRole::Derivative, "*_dg1 *_dg2"),
-    (SuspectedRole::Sheared, "*_1p *_1m *_2p *_2m"),
-    (SuspectedRole::Calibration, "*shear_bias*"),
-    (
-        SuspectedRole::Weight,
-        "w wt wgt wht wt_a w_* *weight *weight_a",
-    ),
-    (SuspectedRole::Flag, "*flag* *mask*"),
-    (
-        SuspectedRole::Response,
-        "r11 r12 r21 r22 r_11 r_12 r_21 r_22 *_g11 *_g12 *_g21 *_g22 *_r11 *_r12 *_r21 *_r22 *response*",
-    ),
-    (
-        SuspectedRole::Noise,
-        "*rms_e* *sigma_e* *regauss_sigma* *shape_err*",
-    ),
-];
+// Calibrations of the shear, which m and c are to be found before.
+const CALIBRATIONS: &str = "*shear_bias*";
+// Names in small letters of derivatives, sheared catalogues, flags, responses and errors of shapes.
+const OTHER_ROLES: &str = "*_dg1 *_dg2 *_1p *_1m *_2p *_2m *flag* *mask* r11 r12 r21 r22 r_11 r_12 r_21 r_22 *_g11 *_g12 \
+    *_g21 *_g22 *_r11 *_r12 *_r21 *_r22 *response* *rms_e* *sigma_e* *regauss_sigma* *shape_err*";
 
-fn suspected_role(name: &str) -> Option<SuspectedRole> {
-    if counted_value(name).is_some() {
-        return Some(SuspectedRole::Choice);
-    }
-    let name = name.to_ascii_lowercase();
-    let mut roles = SUSPECTED_ROLES.iter();
-    let found = roles.find(|(_, patterns)| fits_any(patterns, &name));
-    found.map(|(role, _)| *role)
+fn is_like_a_calibration(name: &str) -> bool {
+    fits_any(CALIBRATIONS, &name.to_ascii_lowercase())
+}
+
+// Whether the name of a column suggests a role that changes the result.
+fn is_like_a_role(name: &str) -> bool {
+    counted_value(name).is_some()
+        || looks_like_weight(name)
+        || is_like_a_calibration(name)
+        || fits_any(OTHER_ROLES, &name.to_ascii_lowercase())
 }
 
 // Whether a text has one of several patterns with blanks between them.
@@ -529,8 +518,8 @@ pub struct Columns {
     survey: Option<&'static str>,
     /// Whether the names say that ellipticities are distortions.
     pub distortion: bool,
-    /// A column that looks like a weight, if none has this role and it was not declined.
-    pub doubtful_weight: Option<String>,
+    /// Columns that look like a weight, if none has this role and it was not declined.
+    pub doubtful_weights: Vec<String>,
     /// Columns that look like a weight, flag, response, derivative or sheared catalogue and have no role.
     unused: Vec<String>,
     /// All columns of flags; the first is that of the role.
@@ -619,7 +608,7 @@ impl Columns {
             preset,
             survey: survey.map(|survey| survey.name),
             distortion,
-            doubtful_weight: None,
+            doubtful_weights: Vec::new(),
             unused: Vec::new(),
             flags,
             choices: Vec::new(),
@@ -656,10 +645,9 @@ impl Columns {
                 all(&|name| fits_any("*step* *shear_type* shear", &name.to_ascii_lowercase()));
         }
         if self.of(Role::Weight).is_none() && !names.is_given(Role::Weight) {
-            let weights = all(&|name| suspected_role(name) == Some(SuspectedRole::Weight));
-            self.doubtful_weight = weights.into_iter().next();
+            self.doubtful_weights = all(&looks_like_weight);
         }
-        self.unused = all(&|name| suspected_role(name).is_some());
+        self.unused = all(&is_like_a_role);
         self.choices = choices;
     }
 
@@ -682,10 +670,7 @@ impl Columns {
     pub fn unused(&self, read: &[String]) -> Option<String> {
         let unused = self.unused.iter().filter(|name| !read.contains(name));
         let unused: Vec<&String> = unused.collect();
-        let mut calibrations = unused
-            .iter()
-            .filter(|name| suspected_role(name) == Some(SuspectedRole::Calibration));
-        let calibration = match calibrations.next() {
+        let calibration = match unused.iter().find(|name| is_like_a_calibration(name)) {
             Some(name) => format!(" m and c are those before the calibration by `{name}`."),
             None => String::new(),
         };
@@ -1003,11 +988,25 @@ mod tests {
         assert!(unused.contains("my_weight, BadFlag, T_1p, R12"), "{unused}");
         let read = ["T_1p".to_owned()];
         assert!(!columns.unused(&read).unwrap().contains("T_1p"));
-        assert_eq!(columns.doubtful_weight.as_deref(), Some("my_weight"));
-        let swarp = found("e1 e2 wht", &[]).unwrap();
-        assert_eq!(swarp.doubtful_weight.as_deref(), Some("wht"));
+        assert_eq!(columns.doubtful_weights, ["my_weight"]);
+        let several = found("e1 e2 wht ivar", &[]).unwrap();
+        assert_eq!(several.doubtful_weights, ["wht", "ivar"]);
         let declined = found("e1 e2 my_weight", &["w=none"]).unwrap();
-        assert_eq!(declined.doubtful_weight, None);
+        assert!(declined.doubtful_weights.is_empty());
         assert!(found("e1 e2 w mag T", &[]).unwrap().unused(&[]).is_none());
+    }
+
+    #[test]
+    fn weights_of_shapes_are_recognised_by_their_names() {
+        let weights = "weight_lensfit ivar inverse_variance AUTO_WHT weightsum wht_sum weight_map WEIGHT_IMAGE my_weight wht \
+            w_iv w_des wt_a recal_weight_A SHE_LENSMC_WEIGHT invVar shape_e1_ivar ivar_e1 wgt lensWeight";
+        for name in weights.split_whitespace() {
+            assert!(looks_like_weight(name), "{name}");
+        }
+        let others = "FLAGS_WEIGHT weight_mask weighted_x psf_weight star_weight flux_ivar_g fiberflux_ivar ra_ivar dec_ivar \
+            pmra_ivar shape_r_ivar sersic_ivar z_ivar mag_weight weight_1p w_dg1 w1mpro W2 wmom_g_1 wdm_r f814w_flux width";
+        for name in others.split_whitespace() {
+            assert!(!looks_like_weight(name), "{name}");
+        }
     }
 }

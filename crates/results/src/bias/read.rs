@@ -452,16 +452,15 @@ impl<'a> TableRows<'a> {
 
     // Without it, galaxies that another program excludes by a weight of zero would count fully.
     fn check_unused_weight(&self, at: usize) -> Result<(), String> {
-        let Some(place) = self.of(Role::DoubtfulWeight) else {
-            return Ok(());
-        };
-        let (name, value) = (self.source.name(place), self.value(place, at));
-        if has_weight(value) && !value.is_nan() {
-            return Ok(());
+        let weights = self.source.places.all((Role::DoubtfulWeight, 0)).iter();
+        let mut weights = weights.map(|place| (self.source.name(*place), self.value(*place, at)));
+        match weights.find(|(_, value)| !(*value > 0.0 && *value < MIN_FAILED_WEIGHT)) {
+            None => Ok(()),
+            Some((name, value)) => Err(format!(
+                "`{name}` looks like a weight but is not used, and is {} here, so that this galaxy would count wrongly. Try: --columns w={name}, or w=none",
+                shown(value)
+            )),
         }
-        Err(format!(
-            "`{name}` looks like a weight but is not used, and is {value} here, so that this galaxy would count wrongly. Try: --columns w={name}, or w=none"
-        ))
     }
 
     fn check_failures(&self, at: usize, checks: &[Check]) -> Result<(), Rejected> {

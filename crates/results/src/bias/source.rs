@@ -116,9 +116,9 @@ impl Source {
             role => !reading.skips(role),
         };
         let mut lines = vec![format!("Used: {}.", self.columns.used(read))];
-        let doubtful = self.columns.doubtful_weight.as_ref();
+        let doubtful = &self.columns.doubtful_weights;
         let read = self.wanted.iter().map(|own| own.column.clone());
-        let read: Vec<String> = read.filter(|name| Some(name) != doubtful).collect();
+        let read: Vec<String> = read.filter(|name| !doubtful.contains(name)).collect();
         lines.extend(self.columns.unused(&read));
         let mut sheared = Vec::new();
         if self.sheared_flags {
@@ -447,9 +447,9 @@ fn source(
         all: Vec::new(),
     };
     let (mut places, known, sheared_flags) = wanted.places(reading, by_catalogue)?;
-    let doubtful = columns.doubtful_weight.as_ref();
-    let doubtful = doubtful.and_then(|name| wanted.add(name, None));
-    places.set((Role::DoubtfulWeight, 0), doubtful.into_iter().collect());
+    let doubtful = columns.doubtful_weights.iter();
+    let doubtful = doubtful.filter_map(|name| wanted.add(name, None));
+    places.set((Role::DoubtfulWeight, 0), doubtful.collect());
     // To refuse them if they name sheared catalogues.
     for name in &columns.steps {
         wanted.require(name)?;

@@ -15,6 +15,7 @@ use shearq_scoring::{Repeated, repeated};
 
 use super::super::{BranchCatalogues, Columns, Presubmission, Presubmitting, wrong};
 use super::{EQUAL_SHEARS, NOT_AVERAGED, NOT_CORRELATED, lattice, more, not_an_identity, zero};
+use crate::bias::columns::looks_like_weight;
 use crate::response::{Shared, shears};
 
 // Share of the galaxies of a branch above which equal shears are placeholders. Chosen by hand.
@@ -50,12 +51,6 @@ pub(super) struct Galaxies {
     unused: BTreeSet<String>,
 }
 
-// Other names of weights than those that are read.
-fn is_like_a_weight(name: &str) -> bool {
-    let name = name.to_ascii_lowercase();
-    name.contains("weight") || ["wt", "wgt", "wht"].contains(&name.as_str())
-}
-
 impl Galaxies {
     pub(super) fn read(branch: Branch, packing: &Presubmitting<'_>) -> Result<Self, FileError> {
         let mut all = Galaxies {
@@ -72,7 +67,7 @@ impl Galaxies {
                     let read = GALAXIES.read_all(path);
                     let (columns, unused) = read.map_err(|error| error.hint_of_columns(hint))?;
                     // Galaxies that another program excludes by a weight of zero would count fully.
-                    if let Some(name) = unused.iter().find(|name| is_like_a_weight(name))
+                    if let Some(name) = unused.iter().find(|name| looks_like_weight(name))
                         && columns[3].is_empty()
                     {
                         let message = format!(
