@@ -52,45 +52,51 @@ mod examine;
 mod measurement;
 mod measurer;
 mod method;
-mod moments;
 mod network;
 mod noise;
-pub mod parts;
 mod psf;
 mod selection;
 mod session;
 mod shape;
-mod sheared;
 mod sky;
-mod source;
 mod spectral;
 mod stamp;
 mod transform;
-mod warning;
 
 pub use calibration::{MeanShear, MeanShearError, ShearSum, is_significant};
 pub use error::{EpochError, MeasureError};
-pub use examine::{EXAMINED_PSFS, Examination, examined_rows};
-pub use measurement::{Coupling, Flag, Flags, Measurement, Observables, ResponseMatrix};
-pub use measurement::{Descent, PsfShape, Stop};
+pub use examine::{EXAMINED_PSFS, Examination, ExaminedPsfs, PixelFrame, Warning, examined_rows};
+pub use measurement::{
+    Coupling, Descent, Flag, Flags, Measurement, Observables, PsfShape, ResponseMatrix, Stop,
+};
 pub use measurer::{Epoch, ImageNoise, ImageWorker, Measurer, PsfWorker, Steps, Worker};
 pub use method::AdaptedSettings;
 pub use ndarray;
 pub use noise::{StampNoise, Survey};
 pub use psf::{Psfs, Star, average_stars};
-pub use selection::{Cut, Quantity, Selected, Selection};
-pub use session::{Batch, MeasuredImage, MeasuredRow, RowJob, Session};
-pub use sheared::{ShearedCatalogues, ShearedGalaxy};
+pub use selection::{Cut, Quantity, Selected, Selection, ShearedCatalogues, ShearedGalaxy};
+pub use session::{
+    ArraySource, Batch, KnownNoise, Lazy, LazyStamps, MeasuredImage, MeasuredRow, OneThread,
+    RowJob, Session, StampRows, StampSource, Threads,
+};
 pub use shearq_quantities::{
     Distortion, Frame, FunctionalPsf, Jacobian, JacobianError, PsfProfile, Shear,
 };
 pub use shearq_submissions::{Configuration, ConfigurationError, PsfCut};
 pub use sky::Sky;
-pub use source::{
-    ArraySource, KnownNoise, Lazy, LazyStamps, OneThread, StampRows, StampSource, Threads,
-};
 pub use stamp::{Pixel, Pixels};
-pub use warning::{ExaminedPsfs, PixelFrame, Warning};
+
+/// The parts of a measurement, for studies, benchmarks and simulations. Slices and buffers have to be of the sizes planned.
+pub mod parts {
+    pub use crate::denoise::{DenoiseScratch, WaveletWiener, border_noise};
+    pub use crate::network::{Network, NetworkScratch, Rule, Step, convolve, psf_factor};
+    pub use crate::shape::{
+        AdaptiveMoments, AdaptiveScratch, AdaptiveShape, ClippedAcf, ClippedAcfScratch, Moments,
+    };
+    pub use crate::spectral::{Lags, ModeNoise, Spectral, SpectralPsf, SpectralScratch};
+    pub use crate::stamp::frame;
+    pub use crate::transform::HexLattice;
+}
 
 /// The examples of README.md.
 #[cfg(doctest)]

@@ -4,7 +4,7 @@ use std::fmt;
 
 use thiserror::Error;
 
-use crate::sheared::ShearedCatalogues;
+use crate::selection::ShearedCatalogues;
 
 /// The adaptive moments of a PSF, pixels included: the moments of the elliptical Gaussian M that is the best weight,
 /// M = 2 Σ W x xᵀ p / Σ W p with W = exp(−½ xᵀ M⁻¹ x) about the centroid under W (Bernstein & Jarvis 2002, AJ 123, 583;

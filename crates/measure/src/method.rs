@@ -1,22 +1,25 @@
 //! A method measures a cut stamp: the network, or the linear method. What it found becomes the reported ellipticity here.
 
 mod linear;
-mod network;
 
 use std::sync::Arc;
 
 use ndarray::{Array2, ArrayView2};
 use shearq_quantities::{Distortion, PixelShape, Spin2};
-use shearq_submissions::{Configuration, EllipticityType, Method};
+use shearq_submissions::{
+    Configuration, EllipticityType, Method, NetworkDeconvolution, NetworkMethod,
+};
 
 use self::linear::LinearFamily;
-use self::network::{NetworkPlan, NetworkWorker};
 use crate::error::{EpochError, MeasureError};
-use crate::measurement::Descent;
-use crate::measurement::{Coupling, Flag, Flags, Measurement, Observables, ResponseMatrix};
+use crate::measurement::{
+    Coupling, Descent, Flag, Flags, Measurement, Observables, ResponseMatrix,
+};
+use crate::network::{Network, NetworkScratch, Rule};
 use crate::noise::StampNoise;
 use crate::psf::ResidualProfiles;
-use crate::sheared::{NoiseProducts, ShearSettings, ShearedCatalogues, sheared};
+use crate::selection::{NoiseProducts, ShearSettings, ShearedCatalogues, sheared};
+use crate::shape::{ClippedAcf, ClippedAcfScratch};
 use crate::spectral::EpochPixels;
 
 /// A method, planned for one size of cut stamps.
@@ -596,6 +599,94 @@ impl Reported {
             [0, 1].map(|j| own1 * r[0][j] + other * r[1][j]),
             [0, 1].map(|j| own2 * r[1][j] + other * r[0][j]),
         ]
+    }
+}
+
+pub(crate) struct NetworkPlan {
+    settings: NetworkDeconvolution,
+    network: Network,
+    acf: ClippedAcf,
+}
+
+impl NetworkPlan {
+    fn new(method: &NetworkMethod, n: usize, p: usize) -> Result<Self, MeasureError> {
+        let settings = method.deconvolution.clone();
+        Ok(NetworkPlan {
+            network: Network::plan(n, p, settings.printed_lambda(settings.lambda))?,
+            acf: ClippedAcf::new(n, &method.shape),
+            settings,
+        })
+    }
+}
+
+struct NetworkWorker {
+    plan: Arc<NetworkPlan>,
+    network: Network,
+    buffers: NetworkScratch,
+    /// Flux of a state per sum of its pixels: a scaled PSF does not have a sum of one.
+    light: f64,
+    acf_buffers: ClippedAcfScratch,
+    deconvolved: Vec<f32>,
+}
+
+impl NetworkWorker {
+    fn new(plan: Arc<NetworkPlan>) -> Self {
+        let n = plan.network.stamp_size();
+        NetworkWorker {
+            network: plan.network.clone(),
+            buffers: plan.network.scratch(),
+            light: 1.0,
+            acf_buffers: plan.acf.scratch(),
+            deconvolved: vec![0.0; n * n],
+            plan,
+        }
+    }
+}
+
+impl CutWorker for NetworkWorker {
+    fn set_psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<(), MeasureError> {
+        let scale = self.plan.settings.psf_scale;
+        self.light = self.network.set_psf(psf, scale)?;
+        Ok(())
+    }
+
+    fn measure_cut(&mut self, cut: &[f32], noise: f64) -> Result<Option<Found>, MeasureError> {
+        let plan = &*self.plan;
+        let peak = cut.iter().copied().fold(0.0f32, f32::max);
+        let Some(rule) = Rule::new(&plan.settings, f64::from(peak), noise) else {
+            return Ok(None);
+        };
+        let buffers = &mut self.buffers;
+        let descent = self
+            .network
+            .deconvolve(&rule, cut, buffers, &mut self.deconvolved)?;
+        let sum: f64 = self.deconvolved.iter().map(|&v| f64::from(v)).sum();
+        let flux = sum * self.light;
+        let measured = plan
+            .acf
+            .measure(&self.deconvolved, sum, &mut self.acf_buffers)?;
+        let (radius, size) = measured.map_or((f64::NAN, f64::NAN), |m| (m.radius, m.xx + m.yy));
+        let distortion = measured.and_then(|moments| moments.distortion());
+        Ok(Some(Found {
+            descent,
+            distortion,
+            response: None,
+            noise_moments: None,
+            observables: None,
+            flux,
+            radius,
+            size,
+        }))
+    }
+
+    fn images(&mut self, _cut: &[f32], _psf: ArrayView2<'_, f64>) -> Images {
+        let n = self.network.stamp_size();
+        Images {
+            deconvolved: image(&self.deconvolved, n),
+            acf: whole_lags(self.acf_buffers.acf(), self.plan.acf.reach()),
+            weight: None,
+            spacing: 1.0,
+        }
     }
 }
 

@@ -18,7 +18,7 @@
 
 use multiversion::multiversion;
 use ndarray::{Array2, ArrayView2};
-use shearq_quantities::product::LANES;
+use shearq_quantities::linear::LANES;
 use shearq_submissions::limits::MAX_PSF;
 use shearq_submissions::{
     BrightnessUnit, Clipping, Kept, NetworkDeconvolution, PsfScale, Start, StepScale, Update,

@@ -5,28 +5,333 @@
 //! [`MeasuredImage`], which checks the image. Files, simulations, [`Measurer::batch`] and Python all
 //! use it, so that they survey and report the same.
 
-use std::ops::{ControlFlow, Range};
-use std::sync::Arc;
+use std::borrow::Cow;
+use std::fmt;
+use std::ops::{ControlFlow, Deref, Range};
+use std::sync::{Arc, LazyLock};
 
 use ndarray::{ArrayView3, Axis, CowArray, Ix3, Slice};
 use shearq_quantities::linear::{Matrix2, inverse, product};
 use shearq_quantities::statistics::upper_median;
-use shearq_quantities::{Frame, Jacobian};
+use shearq_quantities::{Frame, Jacobian, columns_of};
 use shearq_submissions::limits::MIN_PSF;
 use shearq_submissions::{Calibration, Configuration, NoiseSource};
 
 use crate::calibration::mean_response;
 use crate::error::{EpochError, MeasureError, length};
-use crate::examine::{EXAMINED_PSFS, Estimate, Examination, enough, examined_rows};
+use crate::examine::{EXAMINED_PSFS, Estimate, Examination, Warning, enough, examined_rows};
 use crate::measurement::{Flag, Measurement};
 use crate::measurer::{Epoch, ImageNoise, ImageWorker, Measurer, Steps, Worker};
 use crate::noise::{NoisePlan, NoiseSurvey, StampNoise, Survey};
-use crate::psf::{Psfs, ResidualProfiles};
-use crate::source::{
-    ArraySource, KnownNoise, Lazy, LazyStamps, OneThread, StampRows, StampSource, Threads,
-};
+use crate::psf::{Psfs, ResidualProfiles, Star};
 use crate::stamp::{Pixel, Pixels, is_level};
-use crate::warning::Warning;
+
+/// The noise of an image before it is measured, as far as it is known.
+#[derive(Debug, Clone, Default)]
+pub enum KnownNoise<'n> {
+    /// Unknown.
+    #[default]
+    Unknown,
+    /// A level that the data state. A configuration that measures the noise on the stamps reports a difference.
+    Stated(f64),
+    /// The level of white noise that the caller gives, which replaces the measurement on the stamps.
+    Given(f64),
+    /// The same, one level per stamp.
+    GivenEach(Cow<'n, [f64]>),
+    /// Levels that the data state, one per stamp. Sky, galaxies and the correlation of the noise are measured on the stamps.
+    StatedEach(Cow<'n, [f64]>),
+}
+
+impl KnownNoise<'_> {
+    pub(crate) fn levels(&self) -> Option<&[f64]> {
+        match self {
+            KnownNoise::GivenEach(levels) | KnownNoise::StatedEach(levels) => Some(levels),
+            KnownNoise::Unknown | KnownNoise::Stated(_) | KnownNoise::Given(_) => None,
+        }
+    }
+}
+
+/// The stamps of an image in rows. The last row may be shorter.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct StampRows {
+    /// Stamps of a full row, 1 or more.
+    pub columns: usize,
+    /// All stamps.
+    pub count: usize,
+}
+
+impl StampRows {
+    /// Number of rows.
+    #[expect(clippy::len_without_is_empty, reason = "an image has rows")]
+    pub fn len(&self) -> usize {
+        self.count.div_ceil(self.columns)
+    }
+
+    /// Which stamps are in a row.
+    pub fn stamps(&self, row: usize) -> Range<usize> {
+        row * self.columns..((row + 1) * self.columns).min(self.count)
+    }
+}
+
+/// Stamps and PSFs of an image: files, arrays, a simulation.
+///
+/// One thread reads, so a source may own a file that threads cannot share. Rows are read in ascending order and, for
+/// surveys, some of them before that.
+pub trait StampSource<'a> {
+    /// Why a row cannot be read or measured.
+    type Error: From<MeasureError> + Send;
+
+    /// The rows of the image.
+    fn rows(&self) -> StampRows;
+
+    /// Warnings about the image from other sources than its pixels, such as headers.
+    fn warnings(&self) -> Vec<Warning> {
+        Vec::new()
+    }
+
+    /// Reads the stamps of a row, one along the first axis per galaxy.
+    ///
+    /// # Errors
+    /// If they cannot be read.
+    fn stamps(&mut self, row: usize) -> Result<LazyStamps<'a>, Self::Error>;
+
+    /// Reads the PSFs of a row: one PSF for all galaxies, or one per galaxy.
+    ///
+    /// # Errors
+    /// If they cannot be read.
+    fn psfs(&mut self, row: usize) -> Result<Lazy<'a, Psfs<'a>>, Self::Error>;
+
+    /// The Jacobians of a row's stamps, one per galaxy, with which shapes are measured in the frame of the sky; `None`
+    /// if they are measured in the frame of the pixels. It is the same for all rows of an image. PSFs are on the pixels of
+    /// their stamps.
+    ///
+    /// # Errors
+    /// If they cannot be determined.
+    fn jacobians(&mut self, _row: usize) -> Result<Option<Vec<Jacobian>>, Self::Error> {
+        Ok(None)
+    }
+
+    /// Offsets (x, y) of a row's galaxies from the centres of their stamps in pixels, which several epochs of a galaxy need; zero if
+    /// `None`. A single stamp has its galaxy where it is found.
+    ///
+    /// # Errors
+    /// If they cannot be read.
+    fn offsets(&mut self, _row: usize) -> Result<Option<Vec<[f64; 2]>>, Self::Error> {
+        Ok(None)
+    }
+
+    /// Electrons per unit of the stamps. With them, the Poisson noise of the galaxies is part of their noise; without, the
+    /// noise is that of the sky. Networks ignore it.
+    fn gain(&self) -> Option<f64> {
+        None
+    }
+
+    /// Whether the pixels have the unit of flux of other epochs, so that a ratio other than 1 is a mistake.
+    fn has_common_flux(&self) -> bool {
+        true
+    }
+}
+
+/// A value that is made by the first thread that needs it: threads share the drawing of simulated galaxies, although one
+/// thread reads the rows. Clones share the value.
+#[derive(Debug, Clone)]
+pub struct Lazy<'a, T>(Arc<LazyLock<T, Box<dyn FnOnce() -> T + Send + 'a>>>);
+
+/// The stamps of a row.
+pub type LazyStamps<'a> = Lazy<'a, Pixels<'a, Ix3>>;
+
+impl<'a, T> Lazy<'a, T> {
+    /// A value that will be made.
+    pub fn new(make: impl FnOnce() -> T + Send + 'a) -> Self {
+        Lazy(Arc::new(LazyLock::new(Box::new(make))))
+    }
+}
+
+impl<'a, T: Send + 'a> From<T> for Lazy<'a, T> {
+    fn from(value: T) -> Self {
+        Lazy::new(move || value)
+    }
+}
+
+impl<T> Deref for Lazy<'_, T> {
+    type Target = T;
+
+    fn deref(&self) -> &T {
+        &self.0
+    }
+}
+
+/// Threads of the caller. This crate starts none.
+pub trait Threads {
+    /// Number of threads, 1 or more.
+    fn count(&self) -> usize;
+
+    /// Maps values, in order, in any thread.
+    fn map<T: Send, R: Send>(&self, of: Vec<T>, map: impl Fn(T) -> R + Sync + Send) -> Vec<R>;
+}
+
+/// The calling thread alone.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct OneThread;
+
+impl Threads for OneThread {
+    fn count(&self) -> usize {
+        1
+    }
+
+    fn map<T: Send, R: Send>(&self, of: Vec<T>, map: impl Fn(T) -> R + Sync + Send) -> Vec<R> {
+        of.into_iter().map(map).collect()
+    }
+}
+
+/// Some of the stamps, or of their PSFs.
+type Slices<'a, T, E> = Box<dyn FnMut(Range<usize>) -> Result<T, E> + Send + 'a>;
+
+/// Stamps and PSFs in arrays, in the arrangement nearest to a square: images with equal numbers of stamps have the same rows,
+/// so that the same stamps are surveyed and examined.
+pub struct ArraySource<'a, E = MeasureError> {
+    count: usize,
+    stamps: Slices<'a, Pixels<'a, Ix3>, E>,
+    psfs: Slices<'a, Psfs<'a>, E>,
+    moved: Option<[f64; 2]>,
+    /// One for all stamps or one per stamp.
+    jacobians: Option<Cow<'a, [Jacobian]>>,
+    offsets: Option<Cow<'a, [[f64; 2]]>>,
+}
+
+impl<E> fmt::Debug for ArraySource<'_, E> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("ArraySource")
+            .field("count", &self.count)
+            .finish_non_exhaustive()
+    }
+}
+
+impl<'a> ArraySource<'a> {
+    /// Of stamps, one along the first axis per galaxy. A star for all galaxies is cut and normalised here.
+    ///
+    /// # Errors
+    /// If there is not one PSF for all or one per galaxy, or the star for all cannot be used.
+    pub fn new<T: Pixel>(
+        measurer: &Measurer,
+        stamps: ArrayView3<'a, T>,
+        psfs: &'a Psfs<'_>,
+    ) -> Result<Self, MeasureError> {
+        let (count, full, _) = stamps.dim();
+        let (shared, moved) = match psfs.count() {
+            Some(given) if given != count => {
+                return Err(MeasureError::Shape {
+                    what: "PSFs",
+                    found: format!("{given} galaxies"),
+                    expected: format!("{count}, one each"),
+                });
+            }
+            None if matches!(psfs, Psfs::Star(_)) => {
+                let Star { psf, moved } = psfs.at(0, measurer.configuration().psf_cut(), full)?;
+                (Some(psf.into_shared()), moved)
+            }
+            _ => (None, None),
+        };
+        let stamps = move |range| {
+            let mut some = stamps;
+            some.slice_axis_inplace(Axis(0), Slice::from(range));
+            Ok(T::pixels(some))
+        };
+        let psfs = move |range| {
+            let shared = shared.clone().map(Psfs::Prepared);
+            Ok(shared.unwrap_or_else(|| psfs.slice(range)))
+        };
+        Ok(ArraySource::from_fn(count, stamps, psfs, moved))
+    }
+}
+
+impl<'a, E> ArraySource<'a, E> {
+    /// A source of `count` stamps that two functions read by range, the pixels and their PSFs. `moved` is the offset in pixels
+    /// by which the star for all galaxies was moved to the centre of its stamp.
+    pub fn from_fn(
+        count: usize,
+        stamps: impl FnMut(Range<usize>) -> Result<Pixels<'a, Ix3>, E> + Send + 'a,
+        psfs: impl FnMut(Range<usize>) -> Result<Psfs<'a>, E> + Send + 'a,
+        moved: Option<[f64; 2]>,
+    ) -> Self {
+        ArraySource {
+            count,
+            stamps: Box::new(stamps),
+            psfs: Box::new(psfs),
+            moved,
+            jacobians: None,
+            offsets: None,
+        }
+    }
+
+    /// The same stamps with their galaxies at these offsets (x, y) from their centres in pixels, one per stamp.
+    ///
+    /// # Errors
+    /// If there are another number of them.
+    pub fn with_offsets(
+        mut self,
+        offsets: impl Into<Cow<'a, [[f64; 2]]>>,
+    ) -> Result<Self, MeasureError> {
+        let offsets = offsets.into();
+        length("offsets", offsets.len(), self.count)?;
+        self.offsets = Some(offsets);
+        Ok(self)
+    }
+
+    /// The same stamps in the frame of the sky, with one Jacobian for all or one per stamp.
+    ///
+    /// # Errors
+    /// If there are another number of them.
+    pub fn with_jacobians(
+        mut self,
+        jacobians: impl Into<Cow<'a, [Jacobian]>>,
+    ) -> Result<Self, MeasureError> {
+        let jacobians = jacobians.into();
+        if jacobians.len() != 1 {
+            length("Jacobians", jacobians.len(), self.count)?;
+        }
+        self.jacobians = Some(jacobians);
+        Ok(self)
+    }
+}
+
+impl<'a, E: From<MeasureError> + Send> StampSource<'a> for ArraySource<'a, E> {
+    type Error = E;
+
+    fn rows(&self) -> StampRows {
+        StampRows {
+            columns: columns_of(self.count),
+            count: self.count,
+        }
+    }
+
+    fn warnings(&self) -> Vec<Warning> {
+        self.moved.map(Warning::of_moved).into_iter().collect()
+    }
+
+    fn stamps(&mut self, row: usize) -> Result<LazyStamps<'a>, E> {
+        let range = self.rows().stamps(row);
+        Ok((self.stamps)(range)?.into())
+    }
+
+    fn psfs(&mut self, row: usize) -> Result<Lazy<'a, Psfs<'a>>, E> {
+        let range = self.rows().stamps(row);
+        Ok((self.psfs)(range)?.into())
+    }
+
+    fn jacobians(&mut self, row: usize) -> Result<Option<Vec<Jacobian>>, E> {
+        let range = self.rows().stamps(row);
+        Ok(self.jacobians.as_deref().map(|all| match all {
+            [one] => vec![*one; range.len()],
+            each => each[range].to_vec(),
+        }))
+    }
+
+    fn offsets(&mut self, row: usize) -> Result<Option<Vec<[f64; 2]>>, E> {
+        let range = self.rows().stamps(row);
+        Ok(self.offsets.as_deref().map(|each| each[range].to_vec()))
+    }
+}
 
 // In pixels along each axis. Chosen by hand.
 const WHITENESS_TEST_MAX_LAG: usize = 2;
@@ -935,250 +1240,4 @@ impl Measurer {
 }
 
 #[cfg(test)]
-mod tests {
-    use ndarray::{Array3, s};
-    use shearq_quantities::{FunctionalPsf, PsfProfile, Shear};
-
-    use super::*;
-
-    fn moffat(e1: f64) -> FunctionalPsf {
-        let profile = PsfProfile::Moffat { beta: 3.0 };
-        FunctionalPsf::new(profile, 3.4, Shear::new(e1, 0.0)).unwrap()
-    }
-
-    /// Elongated galaxies, every one a little more than the one before.
-    fn stamps(count: usize, side: usize) -> Array3<f32> {
-        let middle = (side as f32 - 1.0) / 2.0;
-        Array3::from_shape_fn((count, side, side), |(k, y, x)| {
-            let (y, x) = (y as f32 - middle, x as f32 - middle);
-            100.0 * (-(x * x / (9.0 + 0.5 * k as f32) + y * y / 9.0)).exp()
-        })
-    }
-
-    fn message<T>(result: Result<T, MeasureError>, expected: &str) {
-        let Err(error) = result else {
-            panic!("nothing wrong; expected {expected}")
-        };
-        assert!(error.to_string().contains(expected), "{error}");
-    }
-
-    #[test]
-    fn batches_are_stamps_with_their_mean_response() {
-        let measurer = Measurer::named("48/linear/star", 48).unwrap();
-        let (stamps, psf) = (stamps(6, 48), moffat(0.02));
-        let star = psf.stamp(40);
-        let batch = measurer.batch(stamps.view(), &Psfs::star(star.view()), Some(0.5));
-        let batch = batch.unwrap();
-        let response = batch.response.unwrap();
-        let mut means = [0.0; 2];
-        for (stamp, galaxy) in stamps.outer_iter().zip(&batch.galaxies) {
-            let double = stamp.mapv(f64::from);
-            let one = measurer
-                .stamp(double.view(), star.view(), Some(0.5))
-                .unwrap();
-            assert_eq!(one.response, galaxy.response);
-            assert_eq!(one.e1, galaxy.e1);
-            means = [0, 1].map(|k| means[k] + one.response_diagonal()[k] / 6.0);
-        }
-        assert!((means[0] / response[0] - 1.0).abs() < 1e-12);
-        assert!((means[1] / response[1] - 1.0).abs() < 1e-12);
-        let increase = batch
-            .galaxies
-            .windows(2)
-            .all(|pair| pair[0].e1 < pair[1].e1);
-        assert!(increase, "{:?}", batch.galaxies);
-    }
-
-    #[test]
-    fn psfs_one_each_are_each_galaxys_own() {
-        let measurer = Measurer::named("23/raw/star", 48).unwrap();
-        let stamps = stamps(3, 48);
-        let formulas = [0.0, 0.1, -0.1].map(moffat);
-        let mut stars = Array3::<f32>::zeros((3, 26, 26));
-        for (formula, mut star) in formulas.iter().zip(stars.outer_iter_mut()) {
-            star.assign(&formula.stamp(26).mapv(|v| v as f32));
-        }
-        let batch = measurer
-            .batch(stamps.view(), &Psfs::stars(stars.view()), None)
-            .unwrap();
-        assert_eq!(batch.response, None);
-        for (k, galaxy) in batch.galaxies.iter().enumerate() {
-            let (stamp, star) = (stamps.slice(s![k, .., ..]), stars.slice(s![k, .., ..]));
-            let one = measurer.stamp(stamp, star, None).unwrap();
-            assert_eq!(
-                (one.e1, one.e2, one.size),
-                (galaxy.e1, galaxy.e2, galaxy.size)
-            );
-        }
-        let functional = Psfs::functional(&formulas);
-        let drawn = measurer.batch(stamps.view(), &functional, None).unwrap();
-        for (drawn, star) in drawn.galaxies.iter().zip(&batch.galaxies) {
-            // Light beyond the 15 px of the submission, which each is normalised without.
-            assert!((drawn.e1 - star.e1).abs() < 1e-3, "{drawn:?} {star:?}");
-        }
-    }
-
-    #[test]
-    fn noisy_stars_one_each_share_what_they_have_in_common() {
-        let measurer = Measurer::named("48/linear/star", 48).unwrap();
-        let psf = FunctionalPsf::new(PsfProfile::Kolmogorov, 3.4, Shear::ZERO).unwrap();
-        let psf = psf.stamp(48).mapv(|v| v as f32);
-        let count = 80;
-        let sigma = psf.mapv(|v| v * v).sum().sqrt() / 100.0;
-        // Uniform noise: enough for a test of who gets what.
-        let mut state = 5;
-        let mut noise = || {
-            let uniform = crate::spectral::uniform(&mut state) as f32;
-            12f32.sqrt() * (uniform - 0.5)
-        };
-        let stars =
-            Array3::from_shape_fn((count, 48, 48), |(_, y, x)| psf[(y, x)] + sigma * noise());
-        let (stamps, psfs) = (stamps(count, 48), Psfs::stars(stars.view()));
-        let batch = measurer.batch(stamps.view(), &psfs, Some(0.5)).unwrap();
-        let mut worker = measurer.worker();
-        let of = |mut image: ImageWorker<'_>| {
-            let found = image.measure_each(stamps.view(), &psfs).unwrap();
-            found.iter().map(|one| one.response).collect::<Vec<_>>()
-        };
-        let of_batch: Vec<_> = batch.galaxies.iter().map(|one| one.response).collect();
-        let session = |measurer: &Measurer| {
-            let mut source = ArraySource::new(measurer, stamps.view(), &psfs).unwrap();
-            Session::open(measurer, &mut source, KnownNoise::Given(0.5), &OneThread).unwrap()
-        };
-        assert_eq!(of(session(&measurer).image(&mut worker)), of_batch);
-        // The next image knows nothing of it.
-        assert_ne!(of(worker.image(ImageNoise::Level(0.5))), of_batch);
-    }
-
-    #[test]
-    fn unmeasurable_stamps_are_errors_alone_and_flags_in_batches() {
-        let measurer = Measurer::named("48/linear/star", 48).unwrap();
-        let mut stamps = stamps(3, 48);
-        // Both sides of the galaxy.
-        stamps[(1, 7, 5)] = f32::NAN;
-        stamps.slice_mut(s![1, 23..25, ..]).fill(f32::NAN);
-        let star = moffat(0.0).stamp(32);
-        let bad = stamps.slice(s![1, .., ..]);
-        message(
-            measurer.stamp(bad, star.view(), Some(1.0)),
-            "pixel (6, 8) of the stamp, counted from 1, is not a finite number",
-        );
-        let mut stars = Array3::zeros((3, 32, 32));
-        stars.slice_mut(s![0, .., ..]).assign(&star);
-        stars.slice_mut(s![1, .., ..]).assign(&star);
-        let batch = measurer.batch(stamps.view(), &Psfs::stars(stars.view()), Some(1.0));
-        let flags: Vec<Vec<Flag>> = batch
-            .unwrap()
-            .galaxies
-            .iter()
-            .map(|galaxy| galaxy.flags.iter().collect())
-            .collect();
-        assert_eq!(flags, [vec![], vec![Flag::NotFinite], vec![Flag::BadPsf]]);
-    }
-
-    #[test]
-    fn linear_methods_measure_without_a_few_pixels() {
-        let whole = stamps(2, 48);
-        let star = moffat(0.0).stamp(32);
-        let mut holed = whole.clone();
-        holed.slice_mut(s![.., 19..22, 26..29]).fill(f32::NAN);
-        let measured = |configuration: &str, stamps: &Array3<f32>| {
-            let measurer = Measurer::named(configuration, 48).unwrap();
-            let psf = &Psfs::star(star.view());
-            measurer.batch(stamps.view(), psf, Some(1.0)).unwrap()
-        };
-        let linear = "48/linear/star";
-        let (found, expected) = (measured(linear, &holed), measured(linear, &whole));
-        for (found, expected) in found.galaxies.iter().zip(&expected.galaxies) {
-            assert!(found.flags.is_empty());
-            // Without noise, and the same turned by 180 degrees.
-            assert!(
-                (found.e1 - expected.e1).abs() < 1e-3,
-                "{found:?} {expected:?}"
-            );
-            assert!(
-                (found.e2 - expected.e2).abs() < 1e-3,
-                "{found:?} {expected:?}"
-            );
-        }
-        // Pixels beyond the 48 that are cut are not looked at.
-        let (mut holed, mut framed) = (stamps(2, 64), stamps(2, 64));
-        framed.slice_mut(s![.., .., ..8]).fill(f32::NAN);
-        framed.slice_mut(s![.., 56.., ..]).fill(f32::NAN);
-        let measurer = Measurer::named(linear, 64).unwrap();
-        let [whole, framed] = [&holed, &framed].map(|stamps| {
-            let psf = &Psfs::star(star.view());
-            measurer.batch(stamps.view(), psf, Some(1.0)).unwrap()
-        });
-        for (whole, framed) in whole.galaxies.iter().zip(&framed.galaxies) {
-            assert_eq!((whole.e1, whole.e2), (framed.e1, framed.e2));
-        }
-        holed.slice_mut(s![.., 30, 30]).fill(f32::NAN);
-        let network = Measurer::named("23/raw/star", 64).unwrap();
-        let network = network.batch(holed.view(), &Psfs::star(star.view()), Some(1.0));
-        let network = network.unwrap();
-        assert!(
-            network
-                .galaxies
-                .iter()
-                .all(|galaxy| galaxy.flags.contains(Flag::NotFinite))
-        );
-    }
-
-    #[test]
-    fn wrong_shapes_and_numbers_name_what_was_expected() {
-        let measurer = Measurer::named("48/linear/star", 48).unwrap();
-        let (good, star) = (stamps(2, 48), moffat(0.0).stamp(32));
-        let one = good.slice(s![0, .., ..]);
-        let noise = Some(1.0);
-        message(
-            Measurer::named("48/linear/star", 40),
-            "stamps of 40 × 40 pixels; expected at least 48 × 48",
-        );
-        message(
-            Measurer::named("48/linear/stra", 48),
-            "no configuration or file named",
-        );
-        let narrow = one.slice(s![.., ..46]);
-        message(
-            measurer.stamp(narrow, star.view(), noise),
-            "a stamp of 48 × 46 pixels; expected 48 × 48",
-        );
-        let small = star.slice(s![..30, ..]);
-        message(
-            measurer.stamp(one, small, noise),
-            "a PSF stamp of 30 × 32 pixels; expected at least 32 × 32",
-        );
-        let stars = Array3::<f32>::zeros((3, 32, 32));
-        message(
-            measurer.batch(good.view(), &Psfs::stars(stars.view()), noise),
-            "PSFs of 3 galaxies; expected 2, one each",
-        );
-        message(
-            measurer.batch(good.view(), &Psfs::prepared(star.slice(s![1.., ..])), noise),
-            "a PSF stamp of 31 × 32 pixels; expected an even number a side, 32 to 48",
-        );
-        for (level, found) in [
-            (None, "not given"),
-            (Some(f64::NAN), "NaN"),
-            (Some(-1.0), "-1"),
-        ] {
-            let expected = format!("the noise level is {found}; expected a finite number");
-            message(measurer.stamp(one, star.view(), level), &expected);
-        }
-        let mut dead = star.clone();
-        dead[(3, 2)] = f64::INFINITY;
-        message(
-            measurer.batch(good.view(), &Psfs::star(dead.view()), noise),
-            "pixel (3, 4) of the PSF stamp",
-        );
-    }
-
-    #[test]
-    fn stated_noise_may_differ_by_one_percent() {
-        for (difference, expected) in [(0.008, false), (0.012, true)] {
-            let found = stated_noise(1.0 / (1.0 + difference), &StampNoise::white(1.0));
-            assert_eq!(found.is_some(), expected, "{difference}");
-        }
-    }
-}
+mod tests;

@@ -44,7 +44,7 @@ use multiversion::multiversion;
 use ndarray::ArrayView2;
 use shearq_fourier::Complex64;
 use shearq_quantities::PixelShape;
-use shearq_quantities::product::{LANES, Matrix, ROWS, multiply};
+use shearq_quantities::linear::{LANES, Matrix, ROWS, multiply};
 use shearq_submissions::LinearDeconvolution;
 
 use crate::error::MeasureError;

@@ -21,14 +21,16 @@
 //!
 //! Each sum along an axis is a dense product. Both methods keep 16 to 48 modes along an axis, for which products were three to
 //! six times as fast as rustfft in `bench` of one machine: 0.9 µs against 5.4 µs for 23 px to 31 modes and back.
-
-mod turned;
-
-pub(crate) use self::turned::ToTurnedModes;
+//!
+//! # Turned pixels
+//!
+//! A triangular map of the lattice leaves the sums along the axes nearly separable; a rotation mixes the axes, so that each mode has
+//! its own wave numbers p and q along both axes of the pixels, k·M(x, y) = p x + q y. Sums over rows are then made anew for
+//! each mode, for LANES of them at a time: ten times the time of the dense products.
 
 use multiversion::multiversion;
 use shearq_quantities::PixelShape;
-use shearq_quantities::product::{LANES, Matrix, ROWS, multiply};
+use shearq_quantities::linear::{LANES, Matrix, ROWS, multiply};
 
 // Layout: one vector of AVX2.
 const FOLDED_PIXELS: usize = 8;
@@ -1158,305 +1160,214 @@ impl ToLags {
     }
 }
 
-#[cfg(test)]
-mod tests {
-    use rand::{RngExt, SeedableRng};
-    use rand_chacha::ChaCha8Rng;
-    use shearq_fourier::Complex64;
+/// TurnedWaves of LANES modes at the places of an axis from the middle on: cos, x sin, sin and x cos.
+type TurnedWaves = [[f32; LANES]; 4];
 
-    use super::*;
+/// From turned pixels to modes, with its buffers for one thread.
+#[derive(Debug, Clone)]
+pub(crate) struct ToTurnedModes {
+    folding: Folding,
+    folded: Vec<f32>,
+    along_x: Vec<TurnedWaves>,
+    along_y: Vec<TurnedWaves>,
+    /// Edges of a stamp, folded: sums and differences of opposite places.
+    lines: Vec<[f32; 2]>,
+}
 
-    fn numbers(rng: &mut ChaCha8Rng, count: usize) -> Vec<f32> {
-        (0..count).map(|_| rng.random_range(-1.0..1.0)).collect()
-    }
-
-    /// All modes of an odd and an even period, and few of a longer one.
-    fn planes(n: usize) -> [Plane; 3] {
-        [
-            Plane::with_all_modes((n + 4) | 1),
-            Plane::with_all_modes((n + 5) & !1),
-            Plane::new(2 * n + 2, n / 2),
-        ]
-    }
-
-    /// Place, and indices of the modes that are kept.
-    fn kept(plane: &Plane) -> impl Iterator<Item = (usize, [f64; 2])> {
-        let wave = |j: usize| plane.wave(j);
-        let all = (0..2 * plane.quarter()).map(|at| (at, plane.indices(at)));
-        let kept = all.filter(|(_, (x, y, _))| *x.max(y) <= plane.modes);
-        kept.map(move |(at, (x, y, below))| (at, [wave(x), if below { -wave(y) } else { wave(y) }]))
-    }
-
-    #[test]
-    fn folding_sums_opposite_pixels_and_unfolding_undoes_it() {
-        for n in [1usize, 2, 3, 5, 14, 15, 16, 19, 23, 24, 31, 48] {
-            let folding = Folding::new(n);
-            let Folding {
-                half, stride, band, ..
-            } = folding;
-            let image: Vec<f32> = (0..n * n).map(|at| ((at * at) % 97) as f32).collect();
-            let mut folded = vec![f32::NAN; folding.len()];
-            fold(&folding, &image, &mut folded);
-            // Opposite pixels are as far from the other end.
-            let pixel = |y: usize, x: usize| image[y * n + x];
-            for (y, x) in (0..half * half).map(|at| (at / half, at % half)) {
-                let (right, upper) = (n / 2 + x, n / 2 + y);
-                let (left, lower) = (n - 1 - right, n - 1 - upper);
-                let (ur, ul) = (pixel(upper, right), pixel(upper, left));
-                let (lr, ll) = (pixel(lower, right), pixel(lower, left));
-                let expected = [
-                    ur + ul + lr + ll,
-                    ur + ul - lr - ll,
-                    ur - ul + lr - ll,
-                    ur - ul - lr + ll,
-                ];
-                for (part, expected) in expected.into_iter().enumerate() {
-                    let found = folded[(part * band + y) * stride + x];
-                    assert_eq!(found, expected, "n {n}, {x}, {y}");
-                }
-            }
-            let parts: Vec<f32> = folded.iter().map(|v| v / 4.0).collect();
-            let mut found = vec![f32::NAN; n * n];
-            unfold(&folding, &parts, &mut found);
-            assert_eq!(found, image, "n {n}");
+impl ToTurnedModes {
+    /// For images of n×n pixels.
+    pub(crate) fn new(n: usize) -> Self {
+        let folding = Folding::new(n);
+        let waves = || vec![[[0.0; LANES]; 4]; folding.half];
+        ToTurnedModes {
+            folding,
+            folded: vec![0.0; folding.len()],
+            along_x: waves(),
+            along_y: waves(),
+            lines: vec![[0.0; 2]; EDGE_LINES * folding.half],
         }
     }
 
-    /// Compares an image's transform, and those of it times places, with plain sums over pixels. Returns the first.
-    fn compare_with_sums(
-        to_modes: &ToModes,
-        plane: &Plane,
+    /// The transforms of a row-major image, and of it times both coordinates M(x, y) of its pixels.
+    pub(crate) fn transform_moments(
+        &mut self,
         image: &[f32],
-        shape: PixelShape,
-    ) -> Spectrum {
-        let n = to_modes.side();
-        let middle = (n as f64 - 1.0) / 2.0;
-        let mut scratch = to_modes.scratch();
-        scratch.lines.fill(f32::NAN);
-        let mut spectra = [(); 3].map(|()| plane.spectrum());
-        to_modes.transform_moments(image, &mut scratch, &mut spectra);
-        for (moment, spectrum) in spectra.iter().enumerate() {
-            let mut modes = plane.mode_by_mode();
-            modes.take_spectrum(spectrum);
-            let pixels: Vec<[f64; 3]> = (0..n * n)
-                .map(|at| {
-                    let place = shape.map([at % n, at / n].map(|x| x as f64 - middle));
-                    let factor = [1.0, place[0], place[1]][moment];
-                    [place[0], place[1], factor * f64::from(image[at])]
-                })
-                .collect();
-            let size: f64 = pixels.iter().map(|[.., v]| v.abs()).sum();
-            // A part of the modes, for time.
-            for (at, [kx, ky]) in kept(plane).step_by(7) {
-                let terms = pixels.iter();
-                let terms = terms.map(|[x, y, v]| Complex64::from_polar(*v, -(kx * x + ky * y)));
-                let plain: Complex64 = terms.sum();
-                let found = Complex64::new(f64::from(modes.re[at]), f64::from(modes.im[at]));
-                // Two sums of a few tens of terms, and waves in single precision.
-                assert!(
-                    (found - plain).norm() <= 2e-6 * size,
-                    "{n} {plane:?} {shape:?} {at}: {found} {plain}"
-                );
+        matrix: [[f64; 2]; 2],
+        plane: &Plane,
+        out: &mut [Modes; 3],
+    ) {
+        let [[a, b], [c, d]] = matrix.map(|row| row.map(|value| value as f32));
+        fold(&self.folding, image, &mut self.folded);
+        let [plain, first, second] = out;
+        for_each_block(plane, matrix, |at, [p, q]| {
+            take_turned_waves(&self.folding, &p, &mut self.along_x);
+            take_turned_waves(&self.folding, &q, &mut self.along_y);
+            let mut sums = [[0.0; LANES]; 6];
+            sum_pixels(
+                &self.folding,
+                &self.folded,
+                [&self.along_x, &self.along_y],
+                &mut sums,
+            );
+            let [re, im, x_re, x_im, y_re, y_im] = &sums;
+            plain.re[at..][..LANES].copy_from_slice(re);
+            plain.im[at..][..LANES].copy_from_slice(im);
+            for l in 0..LANES {
+                first.re[at + l] = a * x_re[l] + b * y_re[l];
+                first.im[at + l] = a * x_im[l] + b * y_im[l];
+                second.re[at + l] = c * x_re[l] + d * y_re[l];
+                second.im[at + l] = c * x_im[l] + d * y_im[l];
             }
-        }
-        let [first, ..] = spectra;
-        first
+        });
     }
 
-    #[test]
-    fn modes_are_plain_sums_and_give_the_image_back() {
-        let mut rng = ChaCha8Rng::seed_from_u64(4);
-        for n in [1, 2, 3, 8, 16, 23, 33, 48] {
-            let image = numbers(&mut rng, n * n);
-            for (which, plane) in planes(n).into_iter().enumerate() {
-                let to_modes = ToModes::new(n, &plane, true);
-                let with = compare_with_sums(&to_modes, &plane, &image, PixelShape::SQUARE);
-                let plain = ToModes::new(n, &plane, false);
-                let mut alone = plane.spectrum();
-                plain.transform(&image, &mut plain.scratch(), &mut alone);
-                assert_eq!(alone.0, with.0);
-                if plane.modes < plane.period / 2 {
-                    continue;
-                }
-                let to_pixels = ToPixels::new(n, &plane);
-                let (mut scratch, mut found) = (to_pixels.scratch(), vec![f32::NAN; n * n]);
-                scratch.lines.fill(f32::NAN);
-                to_pixels.transform(&alone, &mut scratch, &mut found);
-                for (found, expected) in found.iter().zip(&image) {
-                    assert!((found - expected).abs() < 3e-6, "{n} {which}");
-                }
+    /// Writes the transforms of two sets of edges: left, right, lower and upper values along each, half a pixel beyond the
+    /// middles of the last pixels.
+    pub(crate) fn transform_edges(
+        &mut self,
+        edges: &[f32],
+        matrix: [[f64; 2]; 2],
+        plane: &Plane,
+        mut out: [&mut Modes; 2],
+    ) {
+        let Folding { n, half, .. } = self.folding;
+        let lines = edges.chunks_exact(n).take(EDGE_LINES);
+        for (line, folded) in lines.zip(self.lines.chunks_exact_mut(half)) {
+            for (place, folded) in folded.iter_mut().enumerate() {
+                let (above, below) = (line[n / 2 + place], line[half - 1 - place]);
+                *folded = [above + below, above - below];
             }
         }
+        let beyond = n as f64 / 2.0;
+        for_each_block(plane, matrix, |at, [p, q]| {
+            take_turned_waves(&self.folding, &p, &mut self.along_x);
+            take_turned_waves(&self.folding, &q, &mut self.along_y);
+            // Phases of the first edges; the last ones have the conjugates.
+            let phases = [&p, &q].map(|wave| wave.map(|k| (k * beyond).sin_cos()));
+            for (which, out) in out.iter_mut().enumerate() {
+                let mut sums = [[0.0f32; LANES]; 2];
+                for line in 0..EDGE_LINES / 2 {
+                    let (waves, phase) = match line < 2 {
+                        true => (&self.along_y, &phases[0]),
+                        false => (&self.along_x, &phases[1]),
+                    };
+                    let sign = if line % 2 == 0 { 1.0 } else { -1.0 };
+                    let first = (which * EDGE_LINES / 2 + line) * half;
+                    let mut along = [[0.0f32; LANES]; 2];
+                    for ([even, odd], [cos, _, sin, _]) in self.lines[first..].iter().zip(waves) {
+                        for l in 0..LANES {
+                            along[0][l] += even * cos[l];
+                            along[1][l] -= odd * sin[l];
+                        }
+                    }
+                    for l in 0..LANES {
+                        let (sin, cos) = (sign * phase[l].0 as f32, phase[l].1 as f32);
+                        sums[0][l] += along[0][l] * cos - along[1][l] * sin;
+                        sums[1][l] += along[0][l] * sin + along[1][l] * cos;
+                    }
+                }
+                out.re[at..][..LANES].copy_from_slice(&sums[0]);
+                out.im[at..][..LANES].copy_from_slice(&sums[1]);
+            }
+        });
     }
+}
 
-    #[test]
-    fn modes_of_skewed_pixels_are_plain_sums() {
-        let mut rng = ChaCha8Rng::seed_from_u64(14);
-        for n in [1, 2, 3, 8, 16, 23, 33, 48] {
-            let image = numbers(&mut rng, n * n);
-            for plane in planes(n) {
-                // The same tables, one shape after the other.
-                let mut to_modes = ToModes::new(n, &plane, true);
-                let mut without = ToModes::new(n, &plane, false);
-                for (stretch, skew) in [(1.05, 0.08), (0.93, -0.06), (1.0, 0.2), (1.1, 0.0)] {
-                    let shape = PixelShape { stretch, skew };
-                    to_modes.set_pixel_shape(&plane, shape);
-                    let with = compare_with_sums(&to_modes, &plane, &image, shape);
-                    without.set_pixel_shape(&plane, shape);
-                    let mut alone = plane.spectrum();
-                    without.transform(&image, &mut without.scratch(), &mut alone);
-                    assert_eq!(alone.0, with.0);
-                }
-            }
+// Left, right, lower and upper edge for each of two shears.
+const EDGE_LINES: usize = 8;
+
+/// Calls with the first place of LANES modes, and their wave numbers along the axes of the pixels. Places without modes get some
+/// wave numbers, too; their amplitudes are zero in all that follows.
+fn for_each_block(
+    plane: &Plane,
+    [[a, b], [c, d]]: [[f64; 2]; 2],
+    mut with: impl FnMut(usize, [[f64; LANES]; 2]),
+) {
+    for at in (0..2 * plane.quarter()).step_by(LANES) {
+        let (x, y, below) = plane.indices(at);
+        if y > plane.modes || x > plane.modes {
+            continue;
         }
+        let ky = if below { -1.0 } else { 1.0 } * plane.wave(y);
+        let kx: [f64; LANES] = std::array::from_fn(|l| plane.wave(x + l));
+        with(
+            at,
+            [kx.map(|kx| a * kx + c * ky), kx.map(|kx| b * kx + d * ky)],
+        );
     }
+}
 
-    #[test]
-    fn parities_and_modes_are_the_same_spectrum() {
-        let mut rng = ChaCha8Rng::seed_from_u64(12);
-        let plane = Plane::new(48, 15);
-        let quarter = plane.quarter();
-        let mut spectrum = plane.spectrum();
-        spectrum.0 = numbers(&mut rng, 4 * quarter);
-        let mut modes = plane.mode_by_mode();
-        modes.take_spectrum(&spectrum);
-        for at in 0..quarter {
-            let [cc, cs, sc, ss] = spectrum.quarters().map(|part| part[at]);
-            assert_eq!((modes.re[at], modes.im[at]), (cc - ss, sc + cs));
-            let below = (modes.re[quarter + at], modes.im[quarter + at]);
-            assert_eq!(below, (cc + ss, sc - cs));
-        }
-        let mut back = plane.spectrum();
-        back.take_modes(&modes);
-        for (at, (found, expected)) in back.0.iter().zip(&spectrum.0).enumerate() {
-            // A sum and a difference, each rounded.
-            assert!((found - expected).abs() < 3e-7, "{at}");
-        }
-        let mut even = vec![0.0; 2 * quarter];
-        even_parities(&modes.re, &mut even);
-        assert_eq!(even[..quarter], back.0[..quarter]);
-        assert_eq!(even[quarter..], back.0[3 * quarter..]);
-        // Products and powers, mode by mode.
-        let mut kernel = plane.spectrum();
-        kernel.0 = numbers(&mut rng, 4 * quarter);
-        let mut of_kernel = plane.mode_by_mode();
-        of_kernel.take_spectrum(&kernel);
-        let (mut product, mut of_product) = (spectrum.clone(), plane.mode_by_mode());
-        product.multiply(&kernel);
-        of_product.take_spectrum(&product);
-        let mut power = plane.spectrum();
-        spectrum.power(&mut even);
-        power.0[..quarter].copy_from_slice(&even[..quarter]);
-        power.0[3 * quarter..].copy_from_slice(&even[quarter..]);
-        let mut of_power = plane.mode_by_mode();
-        of_power.take_spectrum(&power);
-        for at in 0..2 * quarter {
-            let complex = |modes: &Modes| Complex64::new(modes.re[at].into(), modes.im[at].into());
-            let (a, b) = (complex(&modes), complex(&of_kernel));
-            assert!((complex(&of_product) - a * b).norm() < 3e-6, "{at}");
-            assert!((complex(&of_power) - a.norm_sqr()).norm() < 3e-6, "{at}");
-        }
+// By steps in double precision from the middle on. The middle pixel of an odd number is folded upon itself.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn take_turned_waves(folding: &Folding, wave: &[f64; LANES], out: &mut [TurnedWaves]) {
+    let (mut cos, mut sin) = ([0.0f64; LANES], [0.0f64; LANES]);
+    let (mut step_cos, mut step_sin) = (cos, sin);
+    let first = folding.distance(0);
+    for l in 0..LANES {
+        (sin[l], cos[l]) = (wave[l] * first).sin_cos();
+        (step_sin[l], step_cos[l]) = wave[l].sin_cos();
     }
-
-    #[test]
-    fn lags_are_plain_sums_and_spectra_of_weights_their_adjoint() {
-        let mut rng = ChaCha8Rng::seed_from_u64(6);
-        for (plane, reach, steps, hexagonal) in [
-            (Plane::new(64, 23), 15, 48, false),
-            (Plane::new(48, 7), 9, 24, false),
-            (Plane::with_all_modes(12), 6, 12, false),
-            (Plane::with_all_modes(9), 4, 9, false),
-            (Plane::new(64, 23), 15, 48, true),
-            (Plane::new(48, 7), 10, 24, true),
-        ] {
-            // Places in steps along y.
-            let lattice = HexLattice {
-                row_spacing: 1.0,
-                reach,
-            };
-            let square = (0..=reach).flat_map(|y| {
-                let reach = reach as i32;
-                (-reach..=reach).map(move |x| [f64::from(x), y as f64])
-            });
-            let (to_lags, places, scale): (_, Vec<_>, _) = if hexagonal {
-                let to_lags = ToLags::hexagonal(lattice, steps, &plane);
-                (to_lags, lattice.places().collect(), 1.0)
-            } else {
-                (
-                    ToLags::new(reach, steps, &plane, 0.5),
-                    square.collect(),
-                    0.5,
-                )
-            };
-            let quarter = plane.quarter();
-            // The last place of rows with a lag at zero is beyond the circle, and is not used.
-            let used = |[x, y]: [f64; 2]| !hexagonal || lattice.contains([x, y]);
-            let mut scratch = to_lags.scratch();
-            // What another one left behind does not matter.
-            scratch.between.fill(f32::NAN);
-            scratch.lags[0].fill(f32::NAN);
-            // Modes that are stored twice are the same, and those beyond the kept ones zero.
-            let mut modes = vec![0.0f32; 2 * quarter];
-            for (at, _) in kept(&plane) {
-                modes[at] = rng.random_range(-1.0..1.0);
-            }
-            let own_opposite = |j: usize| plane.count(j) == 1.0;
-            for at in 0..quarter {
-                let (x, y, _) = plane.indices(at);
-                if own_opposite(x) || own_opposite(y) {
-                    modes[quarter + at] = modes[at];
-                }
-            }
-            let mut spectrum = vec![0.0; 2 * quarter];
-            even_parities(&modes, &mut spectrum);
-            let mut lags = vec![f32::NAN; to_lags.len()];
-            to_lags.lags(&spectrum, &mut scratch, &mut lags);
-            let share = |at: usize| {
-                let (x, y, _) = plane.indices(at);
-                plane.count(x) * plane.count(y) / 2.0
-            };
-            let unit = std::f64::consts::TAU / steps as f64;
-            assert_eq!(lags.len(), places.len());
-            for (place, found) in places.iter().zip(&lags).filter(|(place, _)| used(**place)) {
-                let [dx, dy] = *place;
-                let terms = kept(&plane).map(|(at, _)| {
-                    let (x, y, below) = plane.indices(at);
-                    let y = if below { -(y as f64) } else { y as f64 };
-                    share(at) * f64::from(modes[at]) * (unit * (x as f64 * dx + y * dy)).cos()
-                });
-                let plain = scale * terms.sum::<f64>();
-                assert!(
-                    (f64::from(*found) - plain).abs() < 1e-4,
-                    "{place:?}: {found} {plain}"
-                );
-            }
-            // Weights of the lags that are the same at opposite lags.
-            let mut weights = numbers(&mut rng, to_lags.len());
-            for (at, &[x, y]) in places.iter().enumerate() {
-                if !used([x, y]) {
-                    weights[at] = 0.0;
-                } else if y == 0.0 && x < 0.0 {
-                    weights[at] = weights[places.iter().position(|at| *at == [-x, 0.0]).unwrap()];
-                }
-            }
-            let mut adjoint = vec![f32::NAN; 2 * quarter];
-            to_lags.spectrum(&weights, &mut scratch, &mut adjoint);
-            let (cc, ss) = adjoint.split_at(quarter);
-            let by_modes = kept(&plane).map(|(at, _)| {
-                let (below, at_quarter) = (at >= quarter, at % quarter);
-                let sign = if below { 1.0 } else { -1.0 };
-                let value = f64::from(cc[at_quarter] + sign * ss[at_quarter]);
-                share(at) * f64::from(modes[at]) * value
-            });
-            let by_lags = weights.iter().zip(&lags).enumerate().map(|(at, (w, v))| {
-                // A place below the first row stands for two.
-                let count = if places[at][1] > 0.0 { 2.0 } else { 1.0 };
-                count * f64::from(*w) * f64::from(*v)
-            });
-            let (by_modes, by_lags): (f64, f64) = (by_modes.sum(), by_lags.sum());
-            // Thousands of terms of order one in single precision.
-            assert!((by_modes - by_lags).abs() < 0.02, "{by_modes} {by_lags}");
-            assert!(by_lags.abs() > 0.1, "{by_lags}");
+    for (place, [out_cos, out_x_sin, out_sin, out_x_cos]) in out.iter_mut().enumerate() {
+        let (x, share) = (folding.distance(place), folding.share(place));
+        for l in 0..LANES {
+            out_cos[l] = (share * cos[l]) as f32;
+            out_x_sin[l] = (x * sin[l]) as f32;
+            out_sin[l] = sin[l] as f32;
+            out_x_cos[l] = (x * cos[l]) as f32;
+            (cos[l], sin[l]) = (
+                cos[l] * step_cos[l] - sin[l] * step_sin[l],
+                sin[l] * step_cos[l] + cos[l] * step_sin[l],
+            );
         }
     }
 }
+
+// Real and imaginary parts of the transforms of an image, of it times x, and of it times y. Of a row f(x) with even part E and odd
+// part O, Σ f exp(−ipx) = Σ E cos − i Σ O sin, and Σ x f exp(−ipx) = Σ x O cos − i Σ x E sin; and the same along y.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn sum_pixels(
+    folding: &Folding,
+    folded: &[f32],
+    [along_x, along_y]: [&[TurnedWaves]; 2],
+    sums: &mut [[f32; LANES]; 6],
+) {
+    let Folding {
+        half, stride, band, ..
+    } = *folding;
+    let part = |k: usize| &folded[k * band * stride..][..band * stride];
+    let [ee, eo, oe, oo] = [part(0), part(1), part(2), part(3)];
+    for y in 0..half {
+        let [ee, eo, oe, oo] = [ee, eo, oe, oo].map(|part| &part[y * stride..][..half]);
+        let [mut ec_e, mut ex_e, mut ec_o, mut ex_o] = [[0.0f32; LANES]; 4];
+        for ((e, o), [cos, x_sin, ..]) in ee.iter().zip(eo).zip(along_x) {
+            for l in 0..LANES {
+                ec_e[l] += e * cos[l];
+                ex_e[l] += e * x_sin[l];
+                ec_o[l] += o * cos[l];
+                ex_o[l] += o * x_sin[l];
+            }
+        }
+        let [mut os_e, mut ox_e, mut os_o, mut ox_o] = [[0.0f32; LANES]; 4];
+        for ((e, o), [.., sin, x_cos]) in oe.iter().zip(oo).zip(along_x) {
+            for l in 0..LANES {
+                os_e[l] += e * sin[l];
+                ox_e[l] += e * x_cos[l];
+                os_o[l] += o * sin[l];
+                ox_o[l] += o * x_cos[l];
+            }
+        }
+        let [cos, y_sin, sin, y_cos] = &along_y[y];
+        let [re, im, x_re, x_im, y_re, y_im] = &mut *sums;
+        for l in 0..LANES {
+            re[l] += ec_e[l] * cos[l] - os_o[l] * sin[l];
+            im[l] -= os_e[l] * cos[l] + ec_o[l] * sin[l];
+            x_re[l] += ox_e[l] * cos[l] - ex_o[l] * sin[l];
+            x_im[l] -= ex_e[l] * cos[l] + ox_o[l] * sin[l];
+            y_re[l] += ec_o[l] * y_cos[l] - os_e[l] * y_sin[l];
+            y_im[l] -= os_o[l] * y_cos[l] + ec_e[l] * y_sin[l];
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

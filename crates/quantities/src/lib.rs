@@ -5,7 +5,7 @@
 //! * [`units`]: degrees, radians, pixels and multipoles.
 //! * [`FunctionalPsf`]: a Moffat or Kolmogorov PSF, integrated over pixels, with its transform.
 //! * [`radial`]: tables of radial profiles, elliptical radii and quadrature rules.
-//! * [`linear`]: the solvers of linear equations, and 2 × 2 matrices; [`product`]: products of small ones.
+//! * [`linear`]: the solvers of linear equations, 2 × 2 matrices, and products of small ones.
 //! * [`statistics`]: running means and medians.
 //!
 //! # Conventions
@@ -17,24 +17,57 @@
 #![cfg_attr(not(test), forbid(unsafe_code))] // ndarray's slicing in tests allows it
 
 mod ellipticity;
-mod jacobian;
 pub mod linear;
-pub mod product;
 mod psf;
 pub mod radial;
-mod range;
 pub mod statistics;
-pub mod units;
 
-pub use ellipticity::{Distortion, Shear};
-pub use jacobian::{Frame, Jacobian, JacobianError, Orientation, PixelShape, Spin2, UnknownFrame};
+pub use ellipticity::{
+    Distortion, Frame, Jacobian, JacobianError, Orientation, PixelShape, Shear, Spin2, UnknownFrame,
+};
 pub use psf::{FunctionalPsf, ProfileError, PsfProfile, PsfTransform, Pupil, TransformedPsf};
-pub use range::MeasuredRange;
+pub use statistics::MeasuredRange;
 
 /// Stamps in a row of the arrangement of `count` stamps that is nearest to a square: 1 or more.
 pub fn columns_of(count: usize) -> usize {
     let root = count.isqrt();
     (root + usize::from(root * root < count)).max(1)
+}
+
+/// Angles, pixels and multipoles as types, so that they cannot be confused.
+pub mod units {
+    #[cfg(feature = "serde")]
+    use serde::{Deserialize, Serialize};
+
+    /// An angle in degrees, as data files and settings give field sizes.
+    #[derive(Debug, Clone, Copy, PartialEq, PartialOrd)]
+    #[cfg_attr(feature = "serde", derive(Serialize, Deserialize))]
+    #[cfg_attr(feature = "serde", serde(transparent))]
+    pub struct Degrees(pub f64);
+
+    /// An angle in radians, as all formulae take it.
+    #[derive(Debug, Clone, Copy, PartialEq, PartialOrd)]
+    #[cfg_attr(feature = "serde", derive(Serialize, Deserialize))]
+    #[cfg_attr(feature = "serde", serde(transparent))]
+    pub struct Radians(pub f64);
+
+    /// A length in image pixels.
+    #[derive(Debug, Clone, Copy, PartialEq, PartialOrd)]
+    #[cfg_attr(feature = "serde", derive(Serialize, Deserialize))]
+    #[cfg_attr(feature = "serde", serde(transparent))]
+    pub struct Pixels(pub f64);
+
+    /// An angular multipole ℓ (flat sky: the modulus of the wave vector in rad⁻¹).
+    #[derive(Debug, Clone, Copy, PartialEq, PartialOrd)]
+    #[cfg_attr(feature = "serde", derive(Serialize, Deserialize))]
+    #[cfg_attr(feature = "serde", serde(transparent))]
+    pub struct Multipole(pub f64);
+
+    impl From<Degrees> for Radians {
+        fn from(angle: Degrees) -> Self {
+            Radians(angle.0 * std::f64::consts::PI / 180.0)
+        }
+    }
 }
 
 /// The examples of README.md.

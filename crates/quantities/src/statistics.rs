@@ -1,4 +1,4 @@
-//! Means, scatters and medians.
+//! Means, scatters and medians, and the range of measured quantities.
 
 /// Mean and standard deviation of numbers that come one by one (Welford 1962). Sums of squares would lose the digits that a
 /// large mean costs.
@@ -71,6 +71,67 @@ pub fn scatter(values: &mut [f64]) -> Option<(f64, f64)> {
     Some((middle, FROM_MODULI * median(&mut moduli)?))
 }
 
+/// The range of a measured quantity. Numbers outside of it, such as −99 or 1e30, stand for a measurement that failed.
+///
+/// Noise alone reaches far: ratios of noisy moments have tails like those of a Cauchy distribution, so that |e| of 20
+/// occurs among 500 galaxies at S/N 40. Numbers for failures differ from such outliers because they are whole, or because no
+/// tail reaches them.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MeasuredRange {
+    /// Largest modulus of a whole number.
+    whole: f64,
+    /// Largest modulus.
+    any: f64,
+}
+
+// Whole numbers that are so many times the typical modulus stand for a failure: −10 among ellipticities of 0.1 to 0.5, which
+// is HSM's. The whole numbers 0 and ±1 are values of honest catalogues, such as weights, responses and round galaxies.
+const WHOLE: f64 = 10.0;
+// Of a Cauchy distribution, one in 16 000 values exceeds the median by this factor.
+const OUTLIER: f64 = 1e4;
+// The same for quantities in other units, such as an ellipticity times the flux, which itself spans a factor of 10⁴, and
+// derivatives of smooth cuts, which are exponentially small for most galaxies.
+const OUTLIER_IN_OTHER_UNITS: f64 = 1e12;
+// Single-precision numbers from 2²³ on are all whole.
+const FRACTIONS_END: f64 = 8_388_608.0;
+
+impl Default for MeasuredRange {
+    fn default() -> Self {
+        Self::ELLIPTICITY
+    }
+}
+
+impl MeasuredRange {
+    /// Ellipticities of either definition, and quantities that are about one.
+    pub const ELLIPTICITY: Self = MeasuredRange {
+        whole: WHOLE * 0.5,
+        any: OUTLIER * 0.5,
+    };
+
+    /// The range of a quantity in unknown units. The typical modulus is the median of the moduli that occur, each counted
+    /// once, so that a number for failures does not shift it although most rows may have it.
+    pub fn from_values(values: &[f64]) -> Self {
+        let moduli = values.iter().map(|value| value.abs());
+        let mut moduli: Vec<f64> = moduli.filter(|m| m.is_finite() && *m > 0.0).collect();
+        moduli.sort_unstable_by(f64::total_cmp);
+        moduli.dedup();
+        let Some(typical) = moduli.get(moduli.len() / 2) else {
+            return Self::ELLIPTICITY;
+        };
+        MeasuredRange {
+            whole: WHOLE * typical,
+            any: OUTLIER_IN_OTHER_UNITS * typical,
+        }
+    }
+
+    /// Whether a number stands for a failure.
+    pub fn excludes(self, value: f64) -> bool {
+        let modulus = value.abs();
+        let is_whole = modulus < FRACTIONS_END && modulus.fract() == 0.0;
+        modulus > self.any || is_whole && modulus > self.whole
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -103,5 +164,35 @@ mod tests {
         let found = scatter(&mut [5.0, 4.0, 6.0, 7.0, 100.0]);
         assert_eq!(found, Some((6.0, FROM_MODULI)));
         assert_eq!(scatter(&mut []), None);
+    }
+
+    #[test]
+    fn failures_are_excluded_and_outliers_are_not() {
+        let own = MeasuredRange::ELLIPTICITY;
+        for failure in [-10.0, -99.0, 99.0, -9999.0, 1e20, -1e20, 1e30, f64::MAX] {
+            assert!(own.excludes(failure), "{failure}");
+        }
+        // The largest of HSM's KSB among 256 galaxies of a simulation.
+        for value in [0.0, -1.0, 1.09, 21.6099, -7.02415, f64::NAN] {
+            assert!(!own.excludes(value), "{value}");
+        }
+    }
+
+    #[test]
+    fn the_range_follows_units_although_most_rows_failed() {
+        let of = |scale: f64, failure: f64| {
+            let mut values: Vec<f64> = (1..100).map(|k| scale * (k as f64).sqrt()).collect();
+            values.extend(vec![failure; 900]);
+            MeasuredRange::from_values(&values)
+        };
+        let small = of(0.003_001, -1.0);
+        assert!(small.excludes(-1.0) && !small.excludes(0.03));
+        // Single-precision fluxes are whole numbers.
+        let large = of(1e7, -9999.0);
+        assert!(large.excludes(1e30) && !large.excludes(4e9));
+        assert_eq!(
+            MeasuredRange::from_values(&[0.0]),
+            MeasuredRange::ELLIPTICITY
+        );
     }
 }

@@ -3,7 +3,7 @@
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use shearq_quantities::product::{Matrix, ROWS, fuses, multiply, product};
+use shearq_quantities::linear::{Matrix, ROWS, fuses, multiply, multiply_rows};
 
 /// The product as a plain sum, and the sum of moduli.
 fn plain(left: Matrix<'_>, right: Matrix<'_>, inner: usize, at: [usize; 2]) -> [f64; 2] {
@@ -43,9 +43,9 @@ fn products_are_plain_sums_for_all_sizes_and_strides() {
         let right = Matrix::new(&b, width + more);
         let mut all = vec![vec![f32::NAN; rows * width]; 4];
         multiply(left, right, inner, &mut all[0], width);
-        product::<ROWS, true>(left, right, inner, &mut all[1], width);
-        product::<4, true>(left, right, inner, &mut all[2], width);
-        product::<4, false>(left, right, inner, &mut all[3], width);
+        multiply_rows::<ROWS, true>(left, right, inner, &mut all[1], width);
+        multiply_rows::<4, true>(left, right, inner, &mut all[2], width);
+        multiply_rows::<4, false>(left, right, inner, &mut all[3], width);
         // The number of rows at a time does not matter.
         assert_eq!(all[1], all[2]);
         if fuses() {

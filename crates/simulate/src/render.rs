@@ -5,7 +5,7 @@
 //! each galaxy so that neither is seen; [`render_reference`] reads like the equation and is the oracle of its tests.
 //!
 //! So few of the wavenumbers have light that their sums take less time as products with small tables than as fast
-//! transforms ([`shearq_quantities::product`]). Positions are counted from the stamp's middle, where cosines are even and
+//! transforms ([`shearq_quantities::linear`]). Positions are counted from the stamp's middle, where cosines are even and
 //! sines are odd: one half of the stamp gives the other. At the centres of pixels, wavenumbers that differ by 2π are the
 //! same wave, so those beyond π are added onto those within (that is what sampling does to real light, too).
 
@@ -13,7 +13,7 @@ use std::f64::consts::{PI, TAU};
 
 use ndarray::Array2;
 use shearq_fourier::{Complex32, Complex64};
-use shearq_quantities::product::{LANES, Matrix, ROWS, multiply};
+use shearq_quantities::linear::{LANES, Matrix, ROWS, multiply};
 use shearq_quantities::radial::{QuadraticForm, SingleTable};
 use shearq_quantities::{FunctionalPsf, Pupil, TransformedPsf};
 

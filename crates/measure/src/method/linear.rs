@@ -31,19 +31,19 @@ use super::{
 };
 use crate::error::MeasureError;
 use crate::measurement::{Descent, ResponseMatrix, Stop};
-use crate::moments::{WeightedMoments, shear_origin};
 use crate::noise::StampNoise;
 use crate::psf::{
     ResidualProfiles, StarDenoiser, WIDTH_STEPS, noise_equivalent_area, width_factor, width_step,
     width_step_of_area,
 };
+use crate::selection::ShearSettings;
 use crate::shape::{AdaptiveMoments, AdaptiveScratch, AdaptiveShape, MeanSquare, SizeMoments};
-use crate::sheared::ShearSettings;
 use crate::spectral::{
     EpochScratch, Lags, ModeNoise, Products, Spectral, SpectralEpoch, SpectralPsf, SpectralScratch,
     uniform,
 };
 use crate::stamp::hash;
+use crate::stamp::{WeightedMoments, shear_origin};
 use crate::transform::HexLattice;
 
 // Of the error of the mean response, the choice of galaxies makes less than 1 % (tests/stress: base, snr10, cosmos20). Sheared
