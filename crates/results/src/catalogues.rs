@@ -47,47 +47,48 @@ pub struct Catalogues {
 }
 
 impl Catalogues {
-    /// The catalogues of `sets` (of all if empty) that shearq measured into `folder`.
-    pub fn measured(run: &Run, folder: &Path, sets: &[u32]) -> Result<Self, FileError> {
-        Ok(Catalogues {
-            name: run.configuration.name.clone(),
-            path: folder.to_owned(),
-            settings: settings_of(run, folder)?,
-            files: run.catalogues(folder, sets)?,
-            run: Some(run.clone()),
+    fn of_files(name: String, path: &Path, settings: String, files: Files) -> Self {
+        Catalogues {
+            name,
+            path: path.to_owned(),
+            settings,
+            files,
+            run: None,
             description: None,
             sent: None,
+            by_shearq: false,
+        }
+    }
+
+    /// The catalogues of `sets` (of all if empty) that shearq measured into `folder`.
+    pub fn measured(run: &Run, folder: &Path, sets: &[u32]) -> Result<Self, FileError> {
+        let name = run.configuration.name.clone();
+        let (settings, files) = (settings_of(run, folder)?, run.catalogues(folder, sets)?);
+        Ok(Catalogues {
+            run: Some(run.clone()),
             by_shearq: true,
+            ..Self::of_files(name, folder, settings, files)
         })
     }
 
     /// The catalogues of `sets` (of all if empty) of another program with the description `path`.
     pub fn foreign(path: &Path, sets: &[u32]) -> Result<Self, FileError> {
         let (foreign, settings) = Foreign::read(path)?;
+        let (name, files) = (foreign.name.clone(), foreign.catalogues(sets)?);
         Ok(Catalogues {
-            name: foreign.name.clone(),
-            path: path.to_owned(),
-            settings,
-            files: foreign.catalogues(sets)?,
-            run: None,
             description: Some(foreign),
-            sent: None,
-            by_shearq: false,
+            ..Self::of_files(name, path, settings, files)
         })
     }
 
     /// Plain files of one set, one per image, whose columns are `described`.
     pub fn plain(paths: &[PathBuf], described: Foreign) -> Self {
         let images = (1..).zip(paths.iter().cloned()).collect();
+        let files = Files::from_sets(BTreeMap::from([(PLAIN_SET, images)]));
+        let first = paths.first().map_or(Path::new(""), PathBuf::as_path);
         Catalogues {
-            name: String::new(),
-            path: paths.first().cloned().unwrap_or_default(),
-            settings: String::new(),
-            files: Files::from_sets(BTreeMap::from([(PLAIN_SET, images)])),
-            run: None,
             description: Some(described),
-            sent: None,
-            by_shearq: false,
+            ..Self::of_files(String::new(), first, String::new(), files)
         }
     }
 
@@ -106,22 +107,18 @@ impl Catalogues {
             );
             return Err(FileError::new(path, message));
         };
+        let files = Files::from_sets(files);
+        // Catalogues of other programs were converted when they were packed, so that a description would convert them again.
         Ok(Catalogues {
-            name: submission.method,
-            path,
-            settings,
-            files: Files::from_sets(files),
-            run: None,
-            // Catalogues of other programs were converted when they were packed.
-            description: None,
             sent: Some(sent),
             // Only their manifest has a run.
             by_shearq: submission.manifest.is_some_and(|own| own.run.is_some()),
+            ..Self::of_files(submission.method, &path, settings, files)
         })
     }
 
-    /// The frame of a set. One of which only some catalogues by shearq are in the frame of the sky is refused: the true shear is that
-    /// of one frame.
+    /// The frame of a set. A set is refused if only some of its catalogues by shearq are in the frame of the sky, because the true
+    /// shear is in one frame.
     pub fn frame(&self, set: u32) -> Result<Frame, FileError> {
         let mut axes = CommonAxes::default();
         if let Some(run) = &self.run {
@@ -161,12 +158,10 @@ impl Catalogues {
         match &self.sent {
             // Packing divides by the response.
             Some(_) => Ok([1.0; 2]),
-            None => response_of(
-                self.files
-                    .of_set(set)
-                    .iter()
-                    .map(|(_, path)| path.as_path()),
-            ),
+            None => {
+                let files = self.files.of_set(set);
+                response_of(files.iter().map(|(_, path)| path.as_path()))
+            }
         }
     }
 
