@@ -8,7 +8,9 @@ use numpy::{IntoPyArray, PyArray1, PyReadonlyArray1};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use shearq_files::FileError;
-use shearq_results::select::{Weighted, smooth_selection};
+use shearq_results::expression::Operand;
+use shearq_results::select::smooth_selection;
+use shearq_results::shapes::MeasuredShapes;
 
 // e1, e2, R11, R22, R12 and R21 before calibration, and the weight.
 type Selected<'py> = [Bound<'py, PyArray1<f64>>; 7];
@@ -37,27 +39,22 @@ pub(crate) fn select<'py>(
     };
     let stated = selection.unwrap_or_default();
     let weights = stated.weights.clone().unwrap_or_default();
-    let weighted = Weighted::of(path, &weights, column).and_then(|mut weighted| {
-        if let Some(condition) = &stated.rows {
-            weighted.keep(path, condition, |operand| match operand.pattern {
-                None => column(&operand.column),
-                Some(_) => {
-                    let message = format!(
-                        "column {} is compared with a text (expected numbers)",
-                        operand.column
-                    );
-                    Err(FileError::new(path, message))
-                }
-            })?;
+    let operand = |own: &Operand| match own.pattern {
+        None => column(&own.column),
+        Some(_) => {
+            let name = &own.column;
+            let message = format!("column {name} is compared with a text (expected numbers)");
+            Err(FileError::new(path, message))
         }
-        Ok(weighted)
-    });
-    let Weighted {
-        e: [e1, e2],
-        response: [r11, r22],
-        cross: [r12, r21],
-        weight,
-        ..
-    } = weighted.map_err(|error| fault(&error))?;
-    Ok([e1, e2, r11, r22, r12, r21, weight].map(|values| values.into_pyarray(py)))
+    };
+    let selected = || -> Result<_, FileError> {
+        let mut shapes = MeasuredShapes::of(column, true)?;
+        shapes.weigh(path, &weights, column)?;
+        if let Some(condition) = &stated.rows {
+            shapes.keep(path, condition, operand)?;
+        }
+        Ok(shapes)
+    };
+    let shapes = selected().map_err(|error| fault(&error))?;
+    Ok(shapes.columns().map(|values| values.into_pyarray(py)))
 }

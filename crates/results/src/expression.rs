@@ -1,9 +1,11 @@
 //! The language of `--where`, `--weight` and `--bins`: formulas and conditions of columns.
 
+use std::borrow::Cow;
 use std::path::Path;
 
 use shearq_files::FileError;
 use shearq_files::frames::polars::DataFrame;
+use shearq_files::table;
 use thiserror::Error;
 
 /// Why a text is no expression.
@@ -466,24 +468,25 @@ fn number_length(text: &str) -> usize {
     length
 }
 
-/// For each row whether the text of a column fits the pattern: 1 or 0.
-pub(crate) fn text_matches(
-    frame: &DataFrame,
-    name: &str,
-    pattern: &str,
+/// The values of an operand in each row of a table.
+pub(crate) fn operand_values<'f>(
+    frame: &'f DataFrame,
+    Operand { column, pattern }: &Operand,
     path: &Path,
-) -> Result<Vec<f64>, FileError> {
-    let Some(texts) = texts_of(frame, name) else {
+) -> Result<Cow<'f, [f64]>, FileError> {
+    let Some(pattern) = pattern else {
+        return table::numbers(frame, column, path);
+    };
+    let Some(texts) = texts_of(frame, column) else {
         return Err(FileError::new(
             path,
             format!(
-                "column `{name}` contains no texts (found a comparison with '{pattern}', expected a number)"
+                "column `{column}` contains no texts (found a comparison with '{pattern}', expected a number)"
             ),
         ));
     };
-    Ok(texts
-        .map(|text| f64::from(u8::from(fits(pattern, text.unwrap_or_default()))))
-        .collect())
+    let values = texts.map(|text| truth(fits(pattern, text.unwrap_or_default())));
+    Ok(Cow::Owned(values.collect()))
 }
 
 pub(crate) fn texts_of<'f>(

@@ -3,6 +3,7 @@
 //! * [`catalogues`] are those of one method: of shearq, of another program ([`foreign`]), or of a submission. [`score`]
 //!   scores them against a true shear field.
 //! * [`bias`] estimates m and c of catalogues of any program.
+//! * [`shapes`] reads the shapes of catalogues by shearq, for all below.
 //! * [`select`] applies cuts and weights to catalogues without a bias; [`expression`] reads formulas of columns.
 //! * [`mean`] averages catalogues to one shear per set.
 //! * [`response`] is what ellipticities of many catalogues are divided by, for scores and for a shear per galaxy.
@@ -28,6 +29,7 @@ pub mod record;
 pub mod response;
 pub mod score;
 pub mod select;
+pub mod shapes;
 pub mod star_noise;
 pub mod store;
 pub mod submit;

@@ -10,7 +10,8 @@ use shearq_measure::{Flag, Flags, MeanShear, ShearSum, Warning};
 use shearq_quantities::statistics::RunningMean;
 use shearq_submissions::Calibration;
 
-use crate::select::{StatedSelection, Weighted};
+use crate::select::StatedSelection;
+use crate::shapes::MeasuredShapes;
 use crate::star_noise::{Stars, of_catalogue};
 
 /// The mean shear of the galaxies of a set.
@@ -72,10 +73,9 @@ pub fn mean_shears(
     selection: Option<&StatedSelection>,
 ) -> Result<Vec<SetMean>, FileError> {
     let files = run.catalogues(out, sets)?;
-    let calibrated = run.configuration.calibration() != Calibration::None;
+    let with_response = run.configuration.calibration() != Calibration::None;
     // Weights differ between the galaxies of a pair, so that shapes do not cancel.
-    let selected = run.selection.is_some();
-    let pairs = selection.is_none() && !selected;
+    let pairs = selection.is_none() && run.selection.is_none();
     let mut means = Vec::new();
     for set in files.wanted(sets) {
         let catalogues = files.of_set(set);
@@ -87,8 +87,8 @@ pub fn mean_shears(
             set,
             &catalogues,
             run.format,
-            calibrated,
-            (selection, selected),
+            with_response,
+            selection,
             pairs,
         )?);
     }
@@ -101,14 +101,14 @@ pub fn mean_shears(
     Ok(means)
 }
 
-/// The mean shear of a set from its catalogues, of ellipticities that are `calibrated` or not. If catalogues state that their
+/// The mean shear of a set from its catalogues, of ellipticities `with_response` or of shears. If catalogues state that their
 /// galaxies are `pairs`, the errors contain no shape noise.
 fn mean_of(
     set: u32,
     catalogues: &[(u32, PathBuf)],
     format: FileFormat,
-    calibrated: bool,
-    (selection, selected): (Option<&StatedSelection>, bool),
+    with_response: bool,
+    selection: Option<&StatedSelection>,
     pairs: bool,
 ) -> Result<SetMean, FileError> {
     let (mut sum, mut moments) = (ShearSum::default(), [RunningMean::default(); 2]);
@@ -125,33 +125,24 @@ fn mean_of(
         };
         in_pairs &= stated.is_some();
         axes.add(path, stated_axes(path, format)?, false)?;
-        let weights = selection.and_then(|stated| stated.weights.as_ref());
-        let (mut rows, bits) = match weights {
-            Some(weights) => Weighted::read(path, weights)?,
-            None => Weighted::unselected(path, calibrated, selected)?,
-        };
-        if let Some(selection) = selection {
-            rows.keep_of_file(path, selection)?;
-        }
-        for &bits in &bits {
+        let shapes = MeasuredShapes::read(path, selection, with_response)?;
+        for &bits in &shapes.flags {
             for (count, flag) in flags.iter_mut().zip(Flag::ALL) {
                 *count += usize::from(Flags::from_bits(bits as u32).contains(flag));
             }
         }
         let mut share = [0.0; 2];
-        for row in 0..bits.len() {
-            let e = [0, 1].map(|k| rows.e[k][row]);
+        for (row, (&e, &response)) in shapes.e.iter().zip(&shapes.response).enumerate() {
             if !e.iter().all(|e| e.is_finite()) {
                 flagged += 1;
                 continue;
             }
-            if rows.weight[row] == 0.0 {
+            if shapes.weight[row] == 0.0 {
                 cut += 1;
                 continue;
             }
             // Both components are multiplied by the weight.
-            above_one += usize::from(e[0].hypot(e[1]) >= rows.weight[row]);
-            let response = rows.matrix(row);
+            above_one += usize::from(e[0].hypot(e[1]) >= shapes.weight[row]);
             sum.add(e, response, 1.0);
             for k in 0..2 {
                 moments[k].add(e[k]);
@@ -259,16 +250,15 @@ mod tests {
     /// The mean of set 7 of these Parquet files, all of whose galaxies are selected.
     fn mean_of_files(
         catalogues: &[(u32, PathBuf)],
-        calibrated: bool,
+        with_response: bool,
         pairs: bool,
     ) -> Result<SetMean, FileError> {
-        let selected = (None, false);
         mean_of(
             7,
             catalogues,
             FileFormat::Parquet,
-            calibrated,
-            selected,
+            with_response,
+            None,
             pairs,
         )
     }

@@ -19,7 +19,7 @@ use shearq_quantities::linear::solve;
 use shearq_quantities::statistics::RunningMean;
 use shearq_submissions::Calibration;
 
-use crate::select::{WEIGHT, is_measured, undivided_columns};
+use crate::shapes::{MeasuredShapes, WEIGHT, applied_weights, is_measured, undivided_columns};
 
 /// The mean responses R11 and R22 of the good galaxies of all `catalogues` of a set; 1 of catalogues whose ellipticities are
 /// not to be divided: of networks, of other programs, and of earlier versions, which divided each image by its own response.
@@ -27,7 +27,7 @@ use crate::select::{WEIGHT, is_measured, undivided_columns};
 /// # Errors
 /// If a catalogue cannot be read, only some are to be divided, or a mean is not positive by three standard errors.
 pub fn response_of<'a>(catalogues: impl Iterator<Item = &'a Path>) -> Result<[f64; 2], FileError> {
-    let mut means = [RunningMean::default(); 2];
+    let mut sum = Sum::default();
     let mut first: Option<(&Path, bool)> = None;
     for path in catalogues {
         let divide = is_to_divide(path)?;
@@ -45,22 +45,14 @@ pub fn response_of<'a>(catalogues: impl Iterator<Item = &'a Path>) -> Result<[f6
             return Err(FileError::new(path, message));
         }
         if divide {
-            let read = table::read(path, Some(&["R11", "R22", "flags"]), table::MAX_ROWS)?;
-            let flags = table::numbers(&read, "flags", path)?;
-            for (mean, name) in means.iter_mut().zip(["R11", "R22"]) {
-                let responses = table::numbers(&read, name, path)?;
-                let good = responses
-                    .iter()
-                    .zip(&*flags)
-                    .filter(|(_, flag)| **flag == 0.0);
-                good.for_each(|(response, _)| mean.add(*response));
-            }
+            sum.add_catalogue(path, &RESPONSES[..2])?;
         }
     }
+    let [r11, r22, ..] = sum.responses;
     match first {
-        Some((path, true)) if means[0].count() > 0 => {
-            check_significance(path, &means)?;
-            Ok(means.map(|mean| mean.mean()))
+        Some((path, true)) if r11.count() > 0 => {
+            check_significance(path, &[r11, r22])?;
+            Ok([r11.mean(), r22.mean()])
         }
         _ => Ok([1.0; 2]),
     }
@@ -144,6 +136,9 @@ struct Image {
 // The galaxies that share a response: of a folder, of a set of it, or of an image of it; all if there is no set.
 type Group = (usize, Option<u32>, Option<u32>);
 
+const RESPONSES: [&str; 4] = ["R11", "R22", "R12", "R21"];
+
+// Responses and weights of the galaxies without a flag.
 #[derive(Default)]
 struct Sum {
     responses: [RunningMean; 4],
@@ -204,7 +199,8 @@ pub fn shears(
                     Shared::Set => (folder, Some(set), None),
                     Shared::Image => (folder, Some(set), Some(image)),
                 };
-                sums.entry(group).or_default().add_catalogue(&path)?;
+                let sum = sums.entry(group).or_default();
+                sum.add_catalogue(&path, &RESPONSES)?;
                 let place = (set, image);
                 images.push(Image { path, place, group });
             }
@@ -333,33 +329,25 @@ impl Image {
         };
         let wanted = names.iter().map(String::as_str);
         let wanted =
-            wanted.filter(|name| ["e1", "e2"].contains(name) || is_counted(name) || copied(name));
+            wanted.filter(|name| ["e1", "e2", "flags", WEIGHT].contains(name) || copied(name));
         let table = table::read(path, Some(&wanted.collect::<Vec<_>>()), table::MAX_ROWS)?;
-        let e = [
-            table::numbers(&table, "e1", path)?,
-            table::numbers(&table, "e2", path)?,
-        ];
-        let weight = weights(path, &table)?;
+        let MeasuredShapes { e, weight, .. } = MeasuredShapes::of_table(path, &table, false)?;
         let [r11, r22, r12, r21] = response.mean;
-        let shear = |row: usize| {
-            solve(
-                [[r11, r12], [r21, r22]],
-                [0, 1].map(|k| e[k][row] / weight[row]),
-            )
-        };
         let counts: Vec<bool> = weight.iter().map(|weight| *weight > 0.0).collect();
-        let missing = [f64::NAN; 2];
-        let g = counts.iter().enumerate();
-        let g: Vec<[f64; 2]> = g
-            .map(|(row, counts)| if *counts { shear(row) } else { missing })
-            .collect();
-        let w = weight.iter().map(|weight| weight.max(0.0));
+        let g = e
+            .iter()
+            .zip(&weight)
+            .map(|(e, weight)| match *weight > 0.0 {
+                true => solve([[r11, r12], [r21, r22]], e.map(|e| e / weight)),
+                false => [f64::NAN; 2],
+            });
+        let g: Vec<[f64; 2]> = g.collect();
         let number =
             |name: &str, value: u32| Column::new(name.into(), vec![i64::from(value); counts.len()]);
         let measured = [
             Column::new("g1".into(), g.iter().map(|g| g[0]).collect::<Vec<_>>()),
             Column::new("g2".into(), g.iter().map(|g| g[1]).collect::<Vec<_>>()),
-            Column::new("w".into(), w.collect::<Vec<f64>>()),
+            Column::new("w".into(), weight),
         ];
         let wrong = |error: &dyn std::fmt::Display| FileError::new(&self.path, error.to_string());
         let all = table.columns().iter();
@@ -390,24 +378,22 @@ impl Image {
 }
 
 impl Sum {
-    fn add_catalogue(&mut self, path: &Path) -> Result<(), FileError> {
-        const RESPONSES: [&str; 4] = ["R11", "R22", "R12", "R21"];
+    // Adds columns of `RESPONSES`; scores, which divide by the diagonal only, read nothing else.
+    fn add_catalogue(&mut self, path: &Path, responses: &[&'static str]) -> Result<(), FileError> {
         let names = undivided_columns(path)?;
-        let counted = names
-            .iter()
-            .map(String::as_str)
-            .filter(|name| is_counted(name));
-        let wanted: Vec<&str> = RESPONSES.into_iter().chain(counted).collect();
+        let mut wanted = [responses, &["flags"][..]].concat();
+        wanted.extend(names.iter().any(|name| name == WEIGHT).then_some(WEIGHT));
         let table = table::read(path, Some(&wanted), table::MAX_ROWS)?;
-        let weight = weights(path, &table)?;
-        for (mean, name) in self.responses.iter_mut().zip(RESPONSES) {
-            let responses = table::numbers(&table, name, path)?;
-            let good = responses.iter().zip(&weight);
-            let good = good.filter(|(_, weight)| weight.is_finite());
-            good.for_each(|(response, _)| mean.add(*response));
+        let flags = table::numbers(&table, "flags", path)?;
+        let weights = applied_weights(path, &table)?;
+        let add = |mean: &mut RunningMean, values: &[f64]| {
+            let good = values.iter().zip(&*flags).filter(|(_, flag)| **flag == 0.0);
+            good.for_each(|(value, _)| mean.add(*value));
+        };
+        for (mean, name) in self.responses.iter_mut().zip(responses) {
+            add(mean, &table::numbers(&table, name, path)?);
         }
-        let good = weight.into_iter().filter(|weight| weight.is_finite());
-        good.for_each(|weight| self.weight.add(weight));
+        add(&mut self.weight, &weights);
         Ok(())
     }
 
@@ -431,28 +417,6 @@ impl Sum {
                 .map(|own| own.deviation() / (count as f64).sqrt() / weight),
         }
     }
-}
-
-// Whether a column determines which galaxies count.
-fn is_counted(name: &str) -> bool {
-    name == "flags" || name == WEIGHT
-}
-
-// The weights of a selection, or 1; NaN of flagged galaxies.
-fn weights(path: &Path, table: &DataFrame) -> Result<Vec<f64>, FileError> {
-    let flags = table::numbers(table, "flags", path)?;
-    let mut weights = match table.column(WEIGHT) {
-        Ok(_) => table::numbers(table, WEIGHT, path)?.into_owned(),
-        Err(_) => vec![1.0; flags.len()],
-    };
-    for (weight, _) in weights
-        .iter_mut()
-        .zip(&*flags)
-        .filter(|(_, flag)| **flag != 0.0)
-    {
-        *weight = f64::NAN;
-    }
-    Ok(weights)
 }
 
 #[cfg(test)]

@@ -7,7 +7,7 @@ use shearq_bias::SHEARED_CATALOGUES;
 use shearq_files::{FileError, names_of};
 
 use crate::expression::fits;
-use crate::select::refuse_divided;
+use crate::shapes::refuse_divided;
 
 /// How ellipticities become shears.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -601,7 +601,7 @@ impl Columns {
         let distortion = is_distortion(&e1) || survey.is_some_and(|survey| survey.distortion);
         let preset = Preset::of_columns(&columns, distortion || e1 == "corrected_g1", found);
         if preset == Preset::Shearq {
-            refuse_divided(path, found.iter().map(String::as_str))?;
+            refuse_divided(path, found)?;
         }
         let mut columns = Columns {
             columns,

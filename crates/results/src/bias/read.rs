@@ -11,9 +11,9 @@ use shearq_files::frames::polars::{DataFrame, DataType};
 use shearq_files::table::{self, FileFormat};
 use shearq_quantities::{Distortion, MeasuredRange};
 
-use crate::expression::{Expression, Operand, text_matches, texts_of};
+use crate::expression::{Expression, operand_values, texts_of};
 use crate::foreign::shown;
-use crate::select::Weighted;
+use crate::shapes::MeasuredShapes;
 use crate::star_noise;
 
 use super::Input;
@@ -190,7 +190,7 @@ struct TableRows<'a> {
     reading: &'a Reading<'a>,
     rows: usize,
     columns: Vec<Cow<'a, [f64]>>,
-    weighted: Option<Weighted>,
+    weighted: Option<MeasuredShapes>,
     e: [usize; 2],
     responses: [[Response; 2]; 2],
     catalogues: Option<Vec<usize>>,
@@ -225,11 +225,11 @@ impl<'a> TableRows<'a> {
         let (path, places) = (&source.place.path, &source.places);
         let truth = OfRows::new(catalogue, places, &reading.truth)?;
         let mut columns = Vec::new();
-        for Operand { column, pattern } in &source.wanted {
-            columns.push(match pattern {
-                Some(pattern) => Cow::Owned(text_matches(frame, column, pattern, path)?),
-                None if source.is_text(reading, column) => Cow::Borrowed(&[][..]),
-                None => table::numbers(frame, column, path)?,
+        for wanted in &source.wanted {
+            let is_text = wanted.pattern.is_none() && source.is_text(reading, &wanted.column);
+            columns.push(match is_text {
+                true => Cow::Borrowed(&[][..]),
+                false => operand_values(frame, wanted, path)?,
             });
         }
         refuse_sheared_rows(frame, &source.columns, path)?;
@@ -237,8 +237,11 @@ impl<'a> TableRows<'a> {
         let keys = |name: &str| identity::keys(frame, name, path);
         let catalogues = source.columns.of(Role::ShearedCatalogue);
         let catalogues = catalogues.map(|name| catalogues_of(frame, name, path));
-        let weighted = reading.weights().map(|selection| {
-            Weighted::of(path, selection, |name| table::numbers(frame, name, path))
+        let weighted = reading.weights().map(|selection| -> Result<_, FileError> {
+            let column = |name: &str| table::numbers(frame, name, path);
+            let mut shapes = MeasuredShapes::of(column, true)?;
+            shapes.weigh(path, selection, column)?;
+            Ok(shapes)
         });
         Ok(TableRows {
             weighted: weighted.transpose()?,
@@ -532,8 +535,8 @@ impl<'a> TableRows<'a> {
     fn shape(&self, at: usize, weight: f64) -> Option<([f64; 2], [[f64; 2]; 2])> {
         if let Some(weighted) = &self.weighted {
             // Sums multiply by the weight, which these ellipticities contain already, so it is divided out.
-            let e = [0, 1].map(|k| weighted.e[k][at] / weight);
-            return Some((e, weighted.matrix(at)));
+            let e = weighted.e[at].map(|e| e / weight);
+            return Some((e, weighted.response[at]));
         }
         let columns = self.shape_columns(at);
         let mut e = self.pair(columns, at);

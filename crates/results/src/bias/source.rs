@@ -11,7 +11,7 @@ use shearq_files::{FileError, names_of};
 use shearq_measure::{Observables, Selection};
 
 use crate::expression::{Expression, Operand};
-use crate::select::{READ, changes_with_shear, require_responses};
+use crate::shapes::{SHAPE_COLUMNS, changes_with_shear, require_responses};
 
 use super::columns::{CATALOGUES, Columns, Places, Preset, Role, Shapes, base, fits_any};
 use super::truth::Truth;
@@ -471,8 +471,8 @@ fn source(
     }
     places.set((Role::Choice, 0), choices);
     if reading.weights().is_some() {
-        require_responses(path, names.iter().map(String::as_str))?;
-        for name in READ.iter().chain(&Observables::COLUMNS) {
+        require_responses(path, names)?;
+        for name in SHAPE_COLUMNS.iter().chain(&Observables::COLUMNS) {
             wanted.require(name)?;
         }
     }
