@@ -360,6 +360,17 @@ pub(super) fn fits_any(patterns: &str, text: &str) -> bool {
 fn same_name<'a>(found: &'a [String], name: &str) -> Option<&'a String> {
     found.iter().find(|own| own.eq_ignore_ascii_case(name))
 }
+// The column of a sheared catalogue, in any case: `foo_g1_1p` belongs to `foo_g1` and to `foo_g1_noshear`.
+pub(super) fn sheared_column<'f>(
+    found: &'f [String],
+    name: &str,
+    catalogue: usize,
+) -> Option<&'f String> {
+    let sheared = SHEARED_CATALOGUES[catalogue - 1].0;
+    let name = name.to_ascii_lowercase();
+    same_name(found, &format!("{}_{sheared}", base(&name)))
+}
+
 
 // The name of a column without the name of the unsheared catalogue.
 pub(super) fn base(name: &str) -> &str {
@@ -745,21 +756,18 @@ impl Columns {
     }
 }
 
-// Adds sheared catalogues by the names of e1 and e2: `foo_g1_1p` belongs to `foo_g1` or `foo_g1_noshear`.
+// Adds sheared catalogues by the names of e1 and e2.
 fn find_sheared(columns: &mut BTreeMap<Key, String>, found: &[String], names: &Names) {
     for role in [Role::E1, Role::E2] {
-        let Some(name) = columns.get(&(role, 0)).map(|own| own.to_ascii_lowercase()) else {
+        let Some(name) = columns.get(&(role, 0)).cloned() else {
             continue;
         };
-        let sheared: Option<Vec<&String>> = SHEARED_CATALOGUES
-            .iter()
-            .map(|(sheared, _)| same_name(found, &format!("{}_{sheared}", base(&name))))
-            .collect();
+        let sheared = (1..CATALOGUES).map(|catalogue| sheared_column(found, &name, catalogue));
+        let sheared: Option<Vec<_>> = sheared.collect();
         for (catalogue, column) in (1..).zip(sheared.into_iter().flatten()) {
             if !names.0.contains_key(&(role, catalogue)) {
-                columns
-                    .entry((role, catalogue))
-                    .or_insert_with(|| column.clone());
+                let own = columns.entry((role, catalogue));
+                own.or_insert_with(|| column.clone());
             }
         }
     }

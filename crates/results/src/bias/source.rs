@@ -13,7 +13,9 @@ use shearq_measure::{Observables, Selection};
 use crate::expression::{Expression, Operand};
 use crate::shapes::{SHAPE_COLUMNS, changes_with_shear, require_responses};
 
-use super::columns::{CATALOGUES, Columns, Places, Preset, Role, Shapes, base, fits_any};
+use super::columns::{
+    CATALOGUES, Columns, Places, Preset, Role, Shapes, base, fits_any, sheared_column,
+};
 use super::truth::Truth;
 use super::{Input, Request, Units};
 
@@ -315,17 +317,10 @@ impl Wanted<'_> {
         found.ok_or_else(|| FileError::no_column(self.path, name, self.names))
     }
 
-    // The column of a sheared catalogue, in any case.
-    fn sheared(&self, name: &str, catalogue: usize) -> Option<String> {
-        let wanted = format!("{}_{}", base(name), SHEARED_CATALOGUES[catalogue - 1].0);
-        let mut names = self.names.iter();
-        names.find(|own| own.eq_ignore_ascii_case(&wanted)).cloned()
-    }
-
     fn has_sheared(&self, name: &str) -> bool {
         let mut catalogues = 1..CATALOGUES;
         self.columns.give_selection_response()
-            && catalogues.all(|catalogue| self.sheared(name, catalogue).is_some())
+            && catalogues.all(|catalogue| sheared_column(self.names, name, catalogue).is_some())
     }
 
     // Whether a flag is a cut in all catalogues: DES's `flags_select_1p` chooses the galaxies of 1p. Other flags of
@@ -369,15 +364,15 @@ impl Wanted<'_> {
             let mut flags = Vec::new();
             for flag in &columns.flags {
                 let own = match catalogue > 0 && known && self.is_cut(flag) {
-                    true => self.sheared(flag, catalogue),
+                    true => sheared_column(self.names, flag, catalogue),
                     false => None,
                 };
-                flags.push(self.require(own.as_ref().unwrap_or(flag))?);
+                flags.push(self.require(own.unwrap_or(flag))?);
             }
             places.set((Role::Flag, catalogue), flags);
             if let Some(name) = weight.filter(|_| catalogue > 0) {
-                let own = self.sheared(name, catalogue);
-                let own = own.and_then(|name| self.add(&name, None));
+                let own = sheared_column(self.names, name, catalogue);
+                let own = own.and_then(|name| self.add(name, None));
                 places.set((Role::Weight, catalogue), own.into_iter().collect());
             }
         }
@@ -403,10 +398,11 @@ impl Wanted<'_> {
             let found = found.or_else(|| self.add(second, pattern.as_ref()));
             all[0].push(found.ok_or_else(|| FileError::no_column(self.path, column, self.names))?);
         }
-        for (name, _) in SHEARED_CATALOGUES {
+        for catalogue in 1..CATALOGUES {
             let operands = expression.operands().iter();
             let sheared = operands.map(|Operand { column, pattern }| {
-                let own = self.add(&format!("{}_{name}", base(column)), pattern.as_ref());
+                let own = sheared_column(self.names, column, catalogue);
+                let own = own.and_then(|name| self.add(name, pattern.as_ref()));
                 own.or_else(|| self.add(column, pattern.as_ref()).filter(|_| by_catalogue))
             });
             all.push(sheared.collect::<Option<_>>().unwrap_or_default());
@@ -427,7 +423,7 @@ fn source(
     if matches!(reading.truth, Truth::Columns) && !columns.have(&[Role::G1]) {
         given.check_true_shear(path)?;
     }
-    let has_sheared = |name: &str| names.contains(&format!("{}_1p", base(name)));
+    let has_sheared = |name: &str| sheared_column(names, name, 1).is_some();
     let mut chosen_by = reading.chosen_by();
     // Also if one of them is named.
     let by_catalogue =
