@@ -153,7 +153,7 @@ impl Design {
     }
 
     /// Recognises a design from the true shears of `catalogues`, with `truth` whether these are known. Rotated pairs are not
-    /// recognised, because their true shears are those of single catalogues.
+    /// recognised, because single catalogues have the same true shears.
     pub fn of(catalogues: &[Catalogue], truth: bool) -> Self {
         let used = || catalogues.iter().filter(|catalogue| catalogue.rows > 0);
         if !truth {
@@ -201,7 +201,7 @@ fn kinds(shears: &[[f64; 2]]) -> Vec<[f64; 2]> {
     kinds
 }
 
-/// A catalogue under one of the test shears that is absent, while those of the same galaxies under other shears are there.
+/// A catalogue that is absent, although catalogues of the same galaxies under other test shears exist.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Missing {
     /// One of the catalogues that are there.
@@ -220,7 +220,7 @@ pub struct Grouping {
     /// What a unit is, in words.
     pub unit: &'static str,
     /// Whether galaxies under different shears may be in different units: their numbers differ. The error of m is then too
-    /// large, and that of c too small, by up to √2.
+    /// large, and the error of c too small, by up to √2.
     pub misaligned: bool,
     /// The correlation of the ellipticities in units under opposite shears, if it shows that they are not the same
     /// galaxies. Errors are wrong as above if they are the same in another order.
@@ -418,9 +418,9 @@ fn parts(name: &str) -> Vec<&str> {
 }
 
 // The group of each catalogue by the parts of its name that do not follow from its shear, such as `tile03` of
-// `plus/tile03.fits` and `minus/tile03.fits`. `None` if names do not state it: they have different numbers of parts, those
-// of one shear are not distinct, or less than half of the groups are complete. Without names, four shears of 24 tiles of which
-// two were missing became 94 independent catalogues, and m = 0.043 ± 0.089 instead of ± 0.022.
+// `plus/tile03.fits` and `minus/tile03.fits`. `None` if names do not state it: they have different numbers of parts, the
+// names of one shear are not distinct, or less than half of the groups are complete. Without names, four shears of 24 tiles,
+// two of them missing, became 94 independent catalogues, and m = 0.043 ± 0.089 instead of ± 0.022.
 fn by_name(catalogues: &[Catalogue]) -> Option<Vec<u32>> {
     let shears: Vec<[f64; 2]> = catalogues
         .iter()

@@ -73,7 +73,8 @@ pub struct Measured {
 pub struct Estimate {
     /// Galaxies.
     pub galaxies: usize,
-    /// Effective number of galaxies, (Σ w)² / Σ w² (Kish 1965): as many of equal weight have the same information.
+    /// Effective number of galaxies, (Σ w)² / Σ w² (Kish 1965): this number of galaxies with equal weights has the same
+    /// information.
     pub effective: f64,
     /// Units.
     pub units: usize,
@@ -162,7 +163,7 @@ fn behind_stars(
     })
 }
 
-/// Differences of the estimates of two programs on the same galaxies: those of `sums` minus those of `other`. The
+/// Differences of the estimates of two programs on the same galaxies: `sums` minus `other`. The
 /// jackknife leaves out a unit of both, so what both have in common cancels in the errors.
 /// They do not include the noise of stars.
 ///
@@ -213,7 +214,7 @@ pub fn difference(
 // What the noise of a star adds to the variances of the estimates `values` that follow from the sums `total` of `n` units.
 // `units` are the sums of the galaxies behind the star.
 //
-// If the noise changes an estimate by Σ aᵤ, of which the galaxies of unit u make aᵤ, then its variance is A² = (Σ aᵤ)². A
+// If the noise changes an estimate by Σ aᵤ, with aᵤ due to the galaxies of unit u, then its variance is A² = (Σ aᵤ)². A
 // jackknife contains n/(n − 1) (Σ aᵤ² − A²/n) of it, which is subtracted so that a star counts once.
 fn variances(
     plan: &Plan,
@@ -226,7 +227,7 @@ fn variances(
         add(&mut own, unit);
     }
     let mut more = [0.0; ESTIMATES];
-    // m changes in all components alike, and c in each on its own.
+    // m changes in all components alike, and c in each component separately.
     for change in 0..5 {
         let (mut m, mut c) = (0.0, [0.0; 4]);
         match change {
@@ -259,7 +260,7 @@ fn variances(
 fn jackknife(plan: &Plan, total: &[f64], units: &[&[f64]]) -> Estimates {
     let mut rest = vec![0.0; total.len()];
     let left_out = units.iter().map(|unit| {
-        // Subtracting one unit costs as much as adding it: n units need n estimates instead of n² sums.
+        // Subtracting a unit and adding it cost the same: n units need n estimates instead of n² sums.
         for ((rest, total), unit) in rest.iter_mut().zip(total).zip(*unit) {
             *rest = total - unit;
         }

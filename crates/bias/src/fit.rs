@@ -101,7 +101,7 @@ impl Plan {
         terms
     }
 
-    // Without the quadratic, cross and PSF terms, which would enlarge the errors of m and c: each of those is fitted on its own.
+    // Without the quadratic, cross and PSF terms, which would enlarge the errors of m and c: each of them is fitted separately.
     fn main_terms(&self, k: usize) -> &'static [usize] {
         match self.known[k] {
             Known::Both => &[ONE, OWN],

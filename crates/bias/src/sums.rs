@@ -74,8 +74,8 @@ pub struct Layout {
     /// Whether rows have the ellipticity of the PSF. Then there are also sums in the frame of the PSF, for m₊, m×, c₊, c×.
     pub psf: bool,
     /// Whether sheared catalogues are summed with [`crate::UnitSums::add_sheared`]. The difference of their mean
-    /// ellipticities is added to the mean response of the rows: it is all of the response (metadetection), or that of the
-    /// selection R_S (metacalibration).
+    /// ellipticities is added to the mean response of the rows: it is the whole response (metadetection), or the
+    /// response of the selection R_S (metacalibration).
     // The name in files of sums of shearq 0.2.
     #[serde(rename = "versions")]
     pub sheared: bool,
@@ -242,8 +242,8 @@ impl Layout {
         }
     }
 
-    /// Adds the ellipticity of a galaxy to `sums` of the sheared catalogue at this place of [`SHEARED_CATALOGUES`]: one that
-    /// was measured on sheared images, or that of the unsheared image of a galaxy which the sheared catalogue selects.
+    /// Adds the ellipticity of a galaxy to `sums` of the sheared catalogue at this place of [`SHEARED_CATALOGUES`]:
+    /// measured on a sheared image, or on the unsheared image of a galaxy that the sheared catalogue selects.
     ///
     /// `e` is divided by twice the added shear h beforehand, so that differences of means are derivatives,
     /// (⟨e⟩₊ − ⟨e⟩₋)/2h.
@@ -266,7 +266,7 @@ impl Layout {
         if !self.sheared {
             return Extra::default();
         }
-        // Each catalogue has its own sum of weights: it selects and weights other galaxies. Four catalogues are needed
+        // The sum of weights differs from catalogue to catalogue, because each selects and weights other galaxies. Four catalogues are needed
         // because a selection responds to each component, and a one-sided difference has an error of first order in h.
         let mean = |catalogue: usize, at: usize| sums[at] / sums[SHEARED + 2 * catalogue + 1];
         let own = |k: usize| {
@@ -361,7 +361,7 @@ pub(crate) struct Extra {
 pub(crate) struct Mixed<'a> {
     /// Σ w R_kj z_k z_j by rows.
     with_response: &'a [f64],
-    /// Σ w z z of the first with the second component of the pair by rows, if there is such a sum.
+    /// Σ w z z of the first with the second component of the pair by rows; empty without such a sum.
     with_weight: &'a [f64],
     terms: usize,
     /// Whether k is the second component.
@@ -387,7 +387,7 @@ pub(crate) struct Component<'a> {
     pub(crate) with_e: &'a [f64],
     /// Σ w R z z, the lower triangle by rows.
     with_response: &'a [f64],
-    /// Σ w z z, if there is such a sum.
+    /// Σ w z z; empty without such a sum.
     with_weight: &'a [f64],
 }
 

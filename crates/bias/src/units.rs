@@ -21,14 +21,14 @@ const MIN_UNITS_OF_MANY_BINS: usize = 256;
 ///
 /// A unit is a set of galaxies that is independent of others; errors follow from the scatter between units. It is named by
 /// the place of its catalogue in a list and a key: the number of a row, or the hash of an identifier. If there are more than
-/// 2048 to 8192 units, neighbouring keys are joined. Sums can be written by serde, and those of shards merge to the sums of
+/// 2048 to 8192 units, neighbouring keys are joined. Sums can be written by serde, and sums of shards merge to the sums of
 /// all catalogues; the order of additions, and with it the last bits, then follows the order of the shards.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct UnitSums {
     layout: Layout,
     bins: usize,
     catalogues: usize,
-    // Units have the same key after shifting it by so many bits. Sums of shards with different shifts join at the larger
+    // Number of bits by which keys are shifted: units have the same key afterwards. Sums of shards with different shifts join at the larger
     // one, so that a unit contains the same galaxies in all.
     shift: u32,
     units: Vec<((u32, u64), Vec<f64>)>,
@@ -66,7 +66,7 @@ impl UnitSums {
     /// Adds a galaxy to the unit `key` of the `catalogue` of this number, in a bin from 0.
     ///
     /// # Panics
-    /// If there is no such bin.
+    /// If the bin does not exist.
     pub fn add(&mut self, catalogue: u32, key: u64, bin: usize, row: &Row) {
         let layout = self.layout;
         layout.add(self.sums(catalogue, key, bin), row);
@@ -76,7 +76,7 @@ impl UnitSums {
     /// place `sheared` of [`crate::SHEARED_CATALOGUES`]; see [`Layout::add_sheared`].
     ///
     /// # Panics
-    /// If there is no such bin or sheared catalogue.
+    /// If the bin or the sheared catalogue does not exist.
     pub fn add_sheared(
         &mut self,
         catalogue: u32,
@@ -189,7 +189,7 @@ impl UnitSums {
         Ok(())
     }
 
-    /// Adds the sums of other catalogues, whose numbers follow those of these.
+    /// Adds the sums of other catalogues, whose numbers continue the numbers of these.
     ///
     /// # Errors
     /// As [`UnitSums::merge`].

@@ -52,7 +52,7 @@ pub enum Verdict {
     NotMet,
     /// The interval contains the limit.
     Undecided {
-        /// So many galaxies would decide, if the value stays.
+        /// The number of galaxies that would decide, if the value stays.
         galaxies: f64,
     },
 }
@@ -76,7 +76,7 @@ pub fn verdict(measured: Measured, limit: f64, galaxies: usize, units: usize) ->
     }
 }
 
-/// Quantile of Student's t distribution with so many degrees of freedom, for a `probability` of 0.5 to 1. Infinite without
+/// Quantile of Student's t distribution with `degrees` of freedom, for a `probability` of 0.5 to 1. Infinite without
 /// degrees of freedom.
 pub fn student_t(probability: f64, degrees: usize) -> f64 {
     if degrees == 0 {

@@ -76,7 +76,7 @@ pub enum BiasFailure {
         value: f64,
         rows: u64,
     },
-    /// The responses of e1 and e2 to their own components of the true shear.
+    /// The responses of e1 to g1 and of e2 to g2.
     #[error(
         "e1 follows the true g2, and e2 the true g1 (found slopes of {:.3} and {:.3} on the own component, expected about 1): e1 and e2 are probably exchanged. Try: --columns with the names exchanged", .0[0], .0[1]
     )]
@@ -109,7 +109,7 @@ pub struct Binning {
 /// Edges of bins.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Edges {
-    /// So many bins with equally many galaxies.
+    /// A number of bins with equally many galaxies.
     Equal(usize),
     /// Increasing edges. The last bin contains its upper edge.
     Given(Vec<f64>),
@@ -815,7 +815,7 @@ fn ratio(catalogues: &[Catalogue]) -> Option<f64> {
         .then_some(first)
 }
 
-// Largest relative difference of responses from those of exchanged components: a bias of the shapes. Chosen by hand.
+// Largest relative difference of responses from the ones that exchanged components have: a bias of the shapes. Chosen by hand.
 const BIASED: f64 = 0.3;
 
 fn are_exchanged(all: &Estimate, ratio: Option<f64>) -> bool {
@@ -871,7 +871,7 @@ fn check_responses(
     ratio: Option<f64>,
     sign: Option<Sign>,
 ) -> Result<(), BiasFailure> {
-    // 1 + m of each component: what is left of the response after the catalogue's own one.
+    // 1 + m of each component: the response that remains after division by the response in the catalogue.
     let responses = ["m1", "m2"].map(|key| {
         let m = all.value(key).filter(|m| m.error.is_finite())?;
         Some((1.0 + m.value, SIGNIFICANT * m.error))

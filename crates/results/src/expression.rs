@@ -52,7 +52,7 @@ pub struct Step {
     pub falls: bool,
 }
 
-/// A text of `--where`, whose parts beside `and` are conditions on rows or steps.
+/// A text of `--where`: conditions on rows and steps, joined by `and`.
 #[derive(Debug, Clone)]
 pub struct Condition {
     pub text: String,
@@ -181,7 +181,7 @@ impl Node {
         }
     }
 
-    // Takes the steps beside `and` out, and returns the rest.
+    // Takes out the steps that are joined by `and`, and returns the rest.
     fn without_steps(self, steps: &mut Vec<Step>) -> Option<Node> {
         match self {
             Node::Step(step) => {

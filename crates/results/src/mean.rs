@@ -42,7 +42,7 @@ pub struct SetMean {
     pub noisy_stars: usize,
     /// Standard deviation of e1 and of e2 of one galaxy.
     pub scatter: [f64; 2],
-    /// Whether the errors are those of galaxies in pairs that are rotated by 90°.
+    /// Whether errors are for galaxies in pairs that are rotated by 90°, whose shapes cancel.
     pub rotated_pairs: bool,
     /// The axes of the shear.
     pub axes: Axes,
@@ -65,7 +65,7 @@ impl SetMean {
 /// galaxies of a `selection`.
 ///
 /// # Errors
-/// If a catalogue cannot be read, or there is none; or if a selection needs columns that the catalogues do not have.
+/// If a catalogue is missing or cannot be read, or if a selection needs columns that the catalogues do not have.
 pub fn mean_shears(
     run: &Run,
     out: &Path,
@@ -183,7 +183,7 @@ fn mean_of(
 }
 
 // The covariance of the mean shear of galaxies whose shapes cancel in pairs: of the measurement noise, whose variances have the
-// sum `noise`, of responses, and of galaxies whose partner is flagged. GREAT3 does not tell which galaxies are partners, and
+// sum `noise`, of responses, and of galaxies whose partner is flagged. GREAT3 does not state which galaxies are partners, and
 // fluxes and sizes at S/N 20 do not find one of 10,000; the scatter of all was 3.2 times the error.
 fn covariance_of_pairs(
     found: &MeanShear,

@@ -88,9 +88,9 @@ fn check_significance(path: &Path, means: &[RunningMean; 2]) -> Result<(), FileE
 pub enum Shared {
     /// All.
     Survey,
-    /// Those of a set.
+    /// Galaxies of a set.
     Set,
-    /// Those of an image, whose response is noisy: with 40 galaxies at S/N 10 it biases the shears by
+    /// Galaxies of an image, whose response is noisy: with 40 galaxies at S/N 10 it biases the shears by
     /// (7 ± 2)·10⁻³.
     Image,
 }
@@ -133,7 +133,7 @@ struct Image {
     group: Group,
 }
 
-// The galaxies that share a response: of a folder, of a set of it, or of an image of it; all if there is no set.
+// The galaxies that share a response: all (without a set), or the galaxies of a set or of an image of a folder.
 type Group = (usize, Option<u32>, Option<u32>);
 
 const RESPONSES: [&str; 4] = ["R11", "R22", "R12", "R21"];

@@ -201,7 +201,7 @@ pub fn write_selected(
     let (mut kept, mut good) = (0, 0);
     for set in files.wanted(&[]) {
         if let Source::Simulated(_) = run.source {
-            // The truth of a simulated run lies beside the catalogues.
+            // The truth of a simulated run is in the folder of the catalogues.
             let truth = run.source.data(from)?.truth(set);
             if let (Ok(within), Ok(bytes)) = (truth.strip_prefix(from), std::fs::read(&truth)) {
                 atomic::write(to.join(within), &bytes)?;

@@ -52,7 +52,6 @@ pub enum Role {
     Psf2,
     PsfSize,
     Id,
-    /// What e1 and e2 were divided by.
     /// Position in pixels.
     X,
     Y,
@@ -195,7 +194,7 @@ fn is_distortion(e1: &str) -> bool {
 struct Survey {
     name: &'static str,
     distortion: bool,
-    // The columns by role, in any case. Those of e1 and e2 and those with a plus identify the catalogue; others may be absent.
+    // The columns by role, in any case. The catalogue must have e1, e2 and the columns with a plus; others may be absent.
     // `none` for a role that has no column although a general name is there.
     columns: &'static str,
 }
@@ -248,8 +247,8 @@ const SURVEYS: [Survey; 23] = [
     survey("TXPipe", SHEAR, "e1=mcal_g1 e2=mcal_g2 flag=mcal_flags psf_e1=mcal_psf_g1 psf_e2=mcal_psf_g2 e1_1p=mcal_g1_1p \
         e1_1m=mcal_g1_1m e2_2p=mcal_g2_2p e2_2m=mcal_g2_2m e1_2p=mcal_g1_2p e1_2m=mcal_g1_2m e2_1p=mcal_g2_1p \
         e2_1m=mcal_g2_1m"),
-    // Of a model by default. Those of FPFS have their own responses. The weight of the selection contains that of the
-    // detection.
+    // Shapes of a model by default; shapes of FPFS have other responses. The weight of the selection contains the weight of
+    // the detection.
     survey("AnaCal task", SHEAR, "e1=e1 e2=e2 +fpfs_e1 +R11=de1_dg1 R12=de1_dg2 R21=de2_dg1 R22=de2_dg2 +w=wsel \
         dw1=dwsel_dg1 dw2=dwsel_dg2"),
     survey("AnaCal task", SHEAR, "e1=e1 e2=e2 +fpfs_e1 +R11=de1_dg1 R12=de1_dg2 R21=de2_dg1 R22=de2_dg2 w=wdet dw1=dwdet_dg1 \
@@ -280,9 +279,9 @@ impl Survey {
         parts.find_map(|(own, column, _)| (own == Some(key)).then_some(column))
     }
 
-    // Whether the catalogue with the columns `found` is this one. Given names of e1 and e2 must be those of this one. A given
-    // weight is that of this one if all other columns are there, and no column is declined: `w=w` made plain catalogues
-    // those of UNIONS, whose R11 and R22 are not used.
+    // Whether a catalogue with the columns `found` is of this survey. Names of e1 and e2 that the user gives must be the
+    // survey's. A weight that the user gives is the survey's weight if all other columns are there and none is declined: `w=w`
+    // turned plain catalogues into catalogues of UNIONS, whose R11 and R22 are not used.
     fn is_of(&self, found: &[String], names: &Names) -> bool {
         const WEIGHT: Key = (Role::Weight, 0);
         let there = |column: &str| found.iter().any(|own| own.eq_ignore_ascii_case(column));
@@ -301,8 +300,8 @@ impl Survey {
     }
 }
 
-// Columns that say which rows count, and whether those of value 1 do. Rows of the overlap of tiles are there twice; of
-// blends that were not separated, and of stars, the shapes are not those of a galaxy.
+// Columns that state which rows count, and whether rows of value 1 do. Rows in the overlap of tiles occur twice; stars and
+// blends that were not separated have no shape of a galaxy.
 const CUT_COLUMNS: [(&str, bool); 7] = [
     ("is_primary", true),
     ("is_inner", true),
@@ -360,6 +359,7 @@ pub(super) fn fits_any(patterns: &str, text: &str) -> bool {
 fn same_name<'a>(found: &'a [String], name: &str) -> Option<&'a String> {
     found.iter().find(|own| own.eq_ignore_ascii_case(name))
 }
+
 // The column of a sheared catalogue, in any case: `foo_g1_1p` belongs to `foo_g1` and to `foo_g1_noshear`.
 pub(super) fn sheared_column<'f>(
     found: &'f [String],
@@ -370,7 +370,6 @@ pub(super) fn sheared_column<'f>(
     let name = name.to_ascii_lowercase();
     same_name(found, &format!("{}_{sheared}", base(&name)))
 }
-
 
 // The name of a column without the name of the unsheared catalogue.
 pub(super) fn base(name: &str) -> &str {
@@ -394,7 +393,7 @@ pub enum NameError {
 }
 
 // Roles that one column may have together: a scalar response of both components, and identifiers of units.
-// Other columns with two roles compare a quantity with itself: `e1=g1` beside the true shear g1 gave m = 0.
+// Another column with two roles compares a quantity with itself: `e1=g1`, with g1 as the true shear, gave m = 0.
 const SHARED: [[Role; 2]; 2] = [[Role::R11, Role::R22], [Role::Id, Role::Unit]];
 
 impl Names {
@@ -404,7 +403,7 @@ impl Names {
             Some((role, column)) if !column.is_empty() => (role, column),
             _ => return Err(NameError::Syntax(text.to_owned())),
         };
-        // Also by the usual names of its column: AnaCal calls dw1 dw_dg1.
+        // Names of recognised columns are accepted for roles: AnaCal calls dw1 dw_dg1.
         let is_recognised = |key: &Key| recognised(*key).iter().any(|own| own == role);
         let key = named(role).or_else(|| keys().find(is_recognised));
         let key = key.ok_or_else(|| NameError::Role(role.to_owned()))?;
@@ -533,7 +532,7 @@ pub struct Columns {
     pub doubtful_weights: Vec<String>,
     /// Columns that look like a weight, flag, response, derivative or sheared catalogue and have no role.
     unused: Vec<String>,
-    /// All columns of flags; the first is that of the role.
+    /// All columns of flags; the first has the role.
     pub flags: Vec<String>,
     pub choices: Vec<String>,
     /// Columns that may hold names of sheared catalogues, if no column has this role and it was not declined.
@@ -707,7 +706,8 @@ impl Columns {
         }
     }
 
-    // Takes the ellipticity of the unsheared catalogue if there is one: other columns may have less noise.
+    // Takes the ellipticity of the unsheared catalogue, whose noise is the one of the sheared catalogues: other columns may
+    // have less.
     fn take_unsheared(&mut self, found: &[String]) {
         for (role, name) in [(Role::E1, "e1_noshear"), (Role::E2, "e2_noshear")] {
             if found.iter().any(|own| own == name) {
@@ -736,7 +736,7 @@ impl Columns {
         keys.all(|key| self.columns.contains_key(&key))
     }
 
-    // Whether sheared columns of what galaxies are chosen and weighted by give the response of the choice.
+    // Whether sheared columns of cuts and weights give the response of the selection.
     pub(super) fn give_selection_response(&self) -> bool {
         match self.preset {
             Preset::Metacal | Preset::Sheared => true,
@@ -773,8 +773,8 @@ fn find_sheared(columns: &mut BTreeMap<Key, String>, found: &[String], names: &N
     }
 }
 
-// Columns of flags. A row counts if all are zero: DES has the failures in `flags` and the cuts in `flags_select`, and
-// metadetection one flag per kind of shape.
+// Columns of flags. A row counts if all are zero: DES has failures in `flags` and cuts in `flags_select`, and metadetection
+// has one flag per kind of shape.
 fn find_flags(
     path: &Path,
     found: &[String],
@@ -795,7 +795,7 @@ fn find_flags(
         }
     }
     let own = |name: &str| same_name(found, name).filter(|own| names.key_of(own).is_none());
-    // A flag of the survey's list counts before general names: DES Y1 has `flags_select` beside `flags`.
+    // The survey's flag is preferred to general names: DES Y1 has both `flags_select` and `flags`.
     let first = match survey.and_then(|survey| survey.of((Role::Flag, 0))) {
         Some(known) => own(known),
         None => names_of_role(Role::Flag).find_map(own),

@@ -67,7 +67,7 @@ fn of_integer(integer: i128) -> u64 {
 }
 
 fn of_text(text: &str) -> u64 {
-    // `007` is no number: it differs from `7`. Texts of numbers have the keys of the numbers, because CSV has no types.
+    // `007` is a text, because it differs from `7`. Texts of numbers have the keys of the numbers: CSV has no types.
     if let Some(integer) = text
         .parse::<i128>()
         .ok()

@@ -31,8 +31,8 @@ pub(super) struct SummedRow {
     pub(super) selected: Selected,
 }
 
-// What flags, weights, `--where` and `--bins` make of a row in noshear and in each sheared catalogue. A shear may move a galaxy
-// over a cut, which is the response of the selection.
+// Whether a row counts in noshear and in each sheared catalogue, by its flags, weights, `--where` and `--bins`. A shear may move
+// a galaxy over a cut, which is the response of the selection.
 pub(super) struct Selected {
     // The binned quantity where the row is selected: 0 without bins, NaN if a number is missing.
     pub(super) binned: [Result<f64, Exclusion>; CATALOGUES],
@@ -621,7 +621,7 @@ impl<'a> TableRows<'a> {
     }
 }
 
-// The columns of ellipticities under artificial shears of their own component, and of the other one, if all are there.
+// The columns of e1 and e2 under artificial shears of the same component, and of the other component, if all exist.
 fn sheared_columns(source: &Source) -> [Option<[[usize; 2]; 2]>; 2] {
     [[0, 1], [1, 0]].map(|by| {
         let pair = |of: usize| {

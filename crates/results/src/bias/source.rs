@@ -91,9 +91,9 @@ pub(super) struct Source {
     pub(super) places: Places,
     // Columns of expressions that shear changes by an unknown amount.
     unanswered: Vec<String>,
-    // Whether sheared catalogues have flags of their own, which then give the response of the choice.
+    // Whether sheared catalogues have flags, which then give the response of the selection.
     sheared_flags: bool,
-    // Whether each sheared catalogue chooses its own galaxies, so that the response of the choice follows.
+    // Whether each sheared catalogue selects galaxies by its columns, so that the response of the selection follows.
     pub(super) selects: bool,
     declines_matrix: bool,
     has_weights: bool,
@@ -103,7 +103,7 @@ impl Source {
     // Columns of `--where` and `--bins` by which shear changes the choice of galaxies, without a response of the choice.
     pub(super) fn unanswered(&self) -> &[String] {
         match self.has_sheared_rows() {
-            // Each sheared catalogue is chosen by its own columns.
+            // Rows of each sheared catalogue are selected by sheared quantities.
             true => &[],
             false => &self.unanswered,
         }

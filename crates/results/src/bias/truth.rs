@@ -39,7 +39,7 @@ pub enum Truth {
 /// The sign of g2 in a [`Truth`].
 #[derive(Debug, Clone, Default, PartialEq)]
 pub enum TrueSign {
-    /// Shears that the user typed or keeps beside ellipticities, and data folders: standard.
+    /// Standard: shears of options, of columns of the catalogues, and of data folders.
     #[default]
     Convention,
     /// It is known.
@@ -159,7 +159,7 @@ impl Truth {
 
 #[derive(Clone, Copy)]
 pub(super) enum OfRows<'a> {
-    // Zero if there is none.
+    // Zero without a true shear.
     Constant([f64; 2]),
     Identifiers(&'a HashMap<u64, [f64; 2]>),
     Positions(&'a Positions, [usize; 2]),
