@@ -1,18 +1,16 @@
 //! CSV and ASCII tables of numbers, plain or compressed by gzip. Rows are read from a stream, so that the text of a large table
 //! is never in memory as a whole.
 
-use std::cell::Cell;
-use std::io::{BufRead, BufReader, Chain, Cursor, ErrorKind, Read};
+use std::io::{BufRead, BufReader, Read};
 use std::path::Path;
-use std::rc::Rc;
 
 use csv::{ReaderBuilder, StringRecord};
 use flate2::bufread::MultiGzDecoder;
 
 use crate::frames::polars::{Column, DataFrame};
 
-use crate::error::{FileError, names_of};
 use crate::open;
+use crate::{FileError, names_of};
 
 // Columns of a GREAT10 catalogue, an ASCII table without a header.
 pub(super) const CHALLENGE_COLUMNS: [&str; 4] = ["x", "y", "e1", "e2"];
@@ -20,7 +18,7 @@ pub(super) const CHALLENGE_COLUMNS: [&str; 4] = ["x", "y", "e1", "e2"];
 // Of a row with the comments before it, and of everything before the first row. A binary or malicious file has no line feeds,
 // and would be read into memory as one line. Chosen by hand.
 const MAX_RECORD_BYTES: usize = 1 << 20;
-// A file may have as many rows as bytes on disk, and at least this many: gzip can expand a thousandfold, but
+// A file may have one row per byte on disk, and at least this many: gzip can expand a thousandfold, but
 // rows of measured numbers do not compress to less than a byte. Chosen by hand.
 const MIN_ROW_LIMIT: usize = 1 << 20;
 // Chosen by hand.
@@ -41,7 +39,7 @@ pub fn formula_mark(text: &str) -> &'static str {
 pub(super) struct Request<'a> {
     // `None` reads all columns, with NaN for fields that are not numbers.
     pub(super) wanted: Option<&'a [&'a str]>,
-    // Columns of identifiers. They become columns of text if a value is no number or an integer above 2⁵³: as floats, 4000
+    // Columns of identifiers. They become columns of text if a value is not a number, or an integer above 2⁵³: as floats, 4000
     // identifiers from 10¹⁸ on were 32 different ones.
     pub(super) identities: &'a [&'a str],
     pub(super) default_names: &'a [&'a str],
@@ -61,14 +59,14 @@ pub(super) struct Request<'a> {
 /// The separator is the first of `;`, `,` and tab that the first row contains as often as the header. Without one it is
 /// blanks. An empty field is NaN. A file without a row is a table without rows.
 pub(super) fn read(path: &Path, request: &Request<'_>) -> Result<DataFrame, FileError> {
-    let mut input = Input::open(path)?;
+    let mut input = open_text(path)?;
     let size = std::fs::metadata(path).map_or(0, |about| about.len()) as usize;
     let head = Head::read(&mut input, path)?;
     let separator = Separator::of(head.header.as_deref(), head.first.as_deref());
     let names = head.names(path, separator, request)?;
     let mut rows = Rows::new(path, request, &names)?;
     rows.most = rows.most.min(MIN_ROW_LIMIT.max(size));
-    input.read_rows(head, separator, &mut rows)?;
+    read_rows(input, head, separator, &mut rows)?;
     rows.table()
 }
 
@@ -76,13 +74,13 @@ pub(super) fn read(path: &Path, request: &Request<'_>) -> Result<DataFrame, File
 pub(super) struct Columns {
     /// Names, if a header or the comments of SExtractor give them.
     pub(super) names: Option<Vec<String>>,
-    /// Words of each comment, the last comment first. One with as many words as the first row has fields may be a header.
+    /// Words of each comment, the last comment first. One with a word for each field of the first row may be a header.
     pub(super) comments: Vec<Vec<String>>,
     pub(super) fields: Vec<String>,
 }
 
 pub(super) fn columns(path: &Path) -> Result<Columns, FileError> {
-    let head = Head::read(&mut Input::open(path)?, path)?;
+    let head = Head::read(&mut open_text(path)?, path)?;
     let separator = Separator::of(head.header.as_deref(), head.first.as_deref());
     let fields = head.fields(separator);
     let names = match &head.header {
@@ -103,139 +101,58 @@ pub(super) fn columns(path: &Path) -> Result<Columns, FileError> {
 
 /// The comments before the first row, without their `#`.
 pub(super) fn comments(path: &Path) -> Result<Vec<String>, FileError> {
-    Ok(Head::read(&mut Input::open(path)?, path)?.comments)
-}
-
-struct Input {
-    text: BufReader<Metered>,
-    // Shared with `Metered` below: bytes that it may still read for the present row.
-    left: Rc<Cell<usize>>,
-}
-
-// A decompressed file that refuses to return more than `left` bytes. The limit is here because the csv reader buffers a whole
-// row before the caller sees it.
-struct Metered {
-    file: Box<dyn Read>,
-    left: Rc<Cell<usize>>,
-}
-
-impl Read for Metered {
-    fn read(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
-        if self.left.get() == 0 {
-            let message =
-                format!("a row with what stands before it has more than {MAX_RECORD_BYTES} bytes");
-            return Err(std::io::Error::new(ErrorKind::InvalidData, message));
-        }
-        let most = buffer.len().min(self.left.get());
-        let read = self.file.read(&mut buffer[..most])?;
-        self.left.set(self.left.get() - read);
-        Ok(read)
-    }
+    Ok(Head::read(&mut open_text(path)?, path)?.comments)
 }
 
 fn cannot_read<E: std::fmt::Display>(path: &Path) -> impl FnOnce(E) -> FileError {
     FileError::doing(path, "cannot read the table")
 }
 
-impl Input {
-    fn open(path: &Path) -> Result<Self, FileError> {
-        let file = open::open(path).map_err(cannot_read(path))?;
-        let mut file = BufReader::with_capacity(BUFFER_BYTES, file);
-        let start = file.fill_buf().map_err(cannot_read(path))?;
-        let file: Box<dyn Read> = if start.starts_with(&GZIP_MAGIC) {
-            Box::new(MultiGzDecoder::new(file))
-        } else {
-            Box::new(file)
-        };
-        let left = Rc::new(Cell::new(MAX_RECORD_BYTES));
-        let metered = Metered {
-            file,
-            left: Rc::clone(&left),
-        };
-        Ok(Input {
-            text: BufReader::with_capacity(BUFFER_BYTES, metered),
-            left,
-        })
-    }
-
-    fn read_rows(
-        self,
-        head: Head,
-        separator: Separator,
-        rows: &mut Rows<'_>,
-    ) -> Result<(), FileError> {
-        let Input { text, left } = self;
-        let Some(first) = head.first else {
-            return Ok(());
-        };
-        let crlf = first.ends_with("\r\n");
-        let text = Cursor::new(first.into_bytes()).chain(text);
-        match separator {
-            Separator::Byte(byte) => read_delimited(text, byte, crlf, &left, head.before, rows),
-            Separator::Blanks => read_blanks(text, &left, head.before, rows),
-        }
-    }
+fn too_long(path: &Path) -> FileError {
+    cannot_read(path)(format!(
+        "a row with what stands before it has more than {MAX_RECORD_BYTES} bytes"
+    ))
 }
 
-type Rest = Chain<Cursor<Vec<u8>>, BufReader<Metered>>;
-
-// Rows of fields between `delimiter`s, after `before` lines.
-fn read_delimited(
-    text: Rest,
-    delimiter: u8,
-    crlf: bool,
-    left: &Cell<usize>,
-    before: u64,
-    rows: &mut Rows<'_>,
-) -> Result<(), FileError> {
-    // csv counts the line feed of a row before it returns the row, but after it if the row ends with a carriage return, so that
-    // line numbers differ by one. A line end is appended so that the last row is counted like the others.
-    let (end, after): (&[u8], u64) = if crlf { (b"\r\n", 0) } else { (b"\n", 1) };
-    let mut reader = delimited(delimiter).from_reader(text.chain(end));
-    let mut record = StringRecord::new();
-    left.set(MAX_RECORD_BYTES);
-    loop {
-        let read = reader.read_record(&mut record);
-        let line = before + reader.position().line() - after;
-        match read {
-            Ok(true) => {}
-            Ok(false) => return Ok(()),
-            Err(error) => {
-                return Err(match error.kind() {
-                    csv::ErrorKind::Utf8 { .. } => not_text(rows.path, line),
-                    _ => cannot_read(rows.path)(error),
-                });
-            }
-        }
-        // csv skips empty lines and lines that start with `#`, but not blank lines and indented comments.
-        let first = record.get(0).unwrap_or_default();
-        let start = first.trim_start();
-        if record.len() == 1 && start.is_empty() || first != start && start.starts_with('#') {
-            continue;
-        }
-        rows.add(line, record.iter())?;
-        left.set(MAX_RECORD_BYTES);
-    }
+// The text of a file, of a gzip file what it unpacks to.
+fn open_text(path: &Path) -> Result<Box<dyn BufRead>, FileError> {
+    let file = open::open(path).map_err(cannot_read(path))?;
+    let mut file = BufReader::with_capacity(BUFFER_BYTES, file);
+    let start = file.fill_buf().map_err(cannot_read(path))?;
+    Ok(match start.starts_with(&GZIP_MAGIC) {
+        true => Box::new(BufReader::with_capacity(
+            BUFFER_BYTES,
+            MultiGzDecoder::new(file),
+        )),
+        false => Box::new(file),
+    })
 }
 
-// Rows of fields between blanks, after `before` lines.
-fn read_blanks(
-    mut text: Rest,
-    left: &Cell<usize>,
-    before: u64,
+// Lines are split here and not by polars or csv: polars has no line numbers for messages, and csv counts a line feed before or
+// after the row, by the end of the first line. csv splits lines with quotes.
+fn read_rows(
+    mut text: Box<dyn BufRead>,
+    head: Head,
+    separator: Separator,
     rows: &mut Rows<'_>,
 ) -> Result<(), FileError> {
-    let (mut bytes, mut number) = (Vec::new(), before);
+    let Some(first) = head.first else {
+        return Ok(());
+    };
+    let (mut bytes, mut number) = (first.into_bytes(), head.before);
+    // Bytes since the last row.
+    let mut since = bytes.len();
     loop {
         let part = text
             .by_ref()
             .take(BUFFER_BYTES as u64)
             .read_to_end(&mut bytes);
-        let last = part.map_err(cannot_read(rows.path))? == 0;
+        let read = part.map_err(cannot_read(rows.path))?;
+        since += read;
         let end = match bytes.iter().rposition(|byte| *byte == b'\n') {
-            _ if last => bytes.len(),
+            _ if read == 0 => bytes.len(),
             Some(line_feed) => line_feed + 1,
-            None => continue,
+            None => 0,
         };
         let lines = std::str::from_utf8(&bytes[..end]).map_err(|error| {
             let good = &bytes[..error.valid_up_to()];
@@ -246,22 +163,29 @@ fn read_blanks(
         let rows_before = rows.rows;
         for line in lines.lines() {
             number += 1;
-            let line = line.trim_ascii();
-            if line.is_empty() || line.starts_with('#') {
+            let trimmed = line.trim_ascii();
+            if trimmed.is_empty() || trimmed.starts_with('#') {
                 continue;
             }
-            if quotes {
-                rows.add(number, quoted_blanks(line))?;
-            } else {
-                rows.add(number, line.split_ascii_whitespace())?;
+            match separator {
+                Separator::Blanks if quotes => rows.add(number, quoted_blanks(trimmed))?,
+                Separator::Blanks => rows.add(number, trimmed.split_ascii_whitespace())?,
+                Separator::Byte(_) if quotes && line.contains('"') => {
+                    let fields = separator.split(line);
+                    rows.add(number, fields.iter().map(String::as_str))?;
+                }
+                // Not trimmed: the first field of a line that starts with a tab is empty.
+                Separator::Byte(byte) => rows.add(number, line.split(char::from(byte)))?,
             }
         }
-        if last {
+        if read == 0 {
             return Ok(());
         }
         bytes.drain(..end);
         if rows.rows > rows_before {
-            left.set(MAX_RECORD_BYTES);
+            since = bytes.len();
+        } else if since > MAX_RECORD_BYTES {
+            return Err(too_long(rows.path));
         }
     }
 }
@@ -321,17 +245,6 @@ fn quoted_blanks(line: &str) -> impl Iterator<Item = &str> {
     })
 }
 
-fn delimited(delimiter: u8) -> ReaderBuilder {
-    let mut builder = ReaderBuilder::new();
-    builder
-        .delimiter(delimiter)
-        .has_headers(false)
-        .flexible(true)
-        .comment(Some(b'#'))
-        .buffer_capacity(BUFFER_BYTES);
-    builder
-}
-
 #[derive(Clone, Copy)]
 enum Separator {
     Byte(u8),
@@ -370,10 +283,13 @@ impl Separator {
             Separator::Blanks => quoted_blanks(line.trim()).map(str::to_owned).collect(),
             Separator::Byte(byte) => {
                 let mut record = StringRecord::new();
-                let mut reader = delimited(byte).from_reader(line.as_bytes());
+                let mut reader = ReaderBuilder::new()
+                    .delimiter(byte)
+                    .has_headers(false)
+                    .from_reader(line.as_bytes());
                 match reader.read_record(&mut record) {
                     Ok(_) => record.iter().map(|field| field.trim().to_owned()).collect(),
-                    // Valid UTF-8 in memory has no error: `flexible` accepts any number of fields.
+                    // Valid UTF-8 in memory has no error.
                     Err(_) => Vec::new(),
                 }
             }
@@ -391,14 +307,20 @@ struct Head {
 }
 
 impl Head {
-    fn read(input: &mut Input, path: &Path) -> Result<Self, FileError> {
+    fn read(input: &mut impl BufRead, path: &Path) -> Result<Self, FileError> {
         let mut head = Head::default();
+        let mut left = MAX_RECORD_BYTES;
         loop {
             let mut line = Vec::new();
-            let read = input.text.read_until(b'\n', &mut line);
-            if read.map_err(cannot_read(path))? == 0 {
+            let read = input
+                .by_ref()
+                .take(left as u64 + 1)
+                .read_until(b'\n', &mut line)
+                .map_err(cannot_read(path))?;
+            if read == 0 {
                 return Ok(head);
             }
+            left = left.checked_sub(read).ok_or_else(|| too_long(path))?;
             let number = head.before + 1;
             let line = String::from_utf8(line).map_err(|_| not_text(path, number))?;
             let line = match line.strip_prefix('\u{feff}') {
