@@ -13,7 +13,7 @@ use std::sync::{Mutex, PoisonError};
 
 use tempfile::{Builder, NamedTempFile, TempDir};
 
-use crate::error::FileError;
+use crate::FileError;
 
 /// A file that is being written under a temporary name in the same folder, and locked. [`PartFile::finish`] renames it. If
 /// it is dropped before, it is removed.
@@ -71,7 +71,7 @@ impl PartFile {
         match part.persist_noclobber(&target) {
             Ok(_) => sync_names(&target).map_err(cannot()).map(|()| true),
             Err(_) if target.exists() => Ok(false),
-            // Some file systems cannot name a file only if there is none. Then the last one wins.
+            // Some file systems cannot refuse to replace a file. Then the last one wins.
             Err(failure) => {
                 let part = failure.file;
                 PartFile { part, target }.finish().map(|()| true)
@@ -189,7 +189,7 @@ fn held_folder(names: &Names, folder: &Path, mode: Permissions) -> io::Result<(T
     )
 }
 
-/// These permissions, of which the system takes what its `umask` says.
+/// Permissions before the system applies its `umask`.
 fn usual(mode: u32) -> Permissions {
     std::os::unix::fs::PermissionsExt::from_mode(mode)
 }
@@ -287,7 +287,7 @@ fn remove_part(path: &Path) -> Result<(), FileError> {
         return Ok(());
     }
     match fs::remove_file(path) {
-        // Another process that is about to claim the folder may have removed its own.
+        // Another process that is about to claim the folder may have removed it.
         Err(error) if error.kind() == ErrorKind::NotFound => Ok(()),
         result => result.map_err(FileError::doing(path, "cannot remove the leftover")),
     }

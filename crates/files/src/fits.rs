@@ -4,18 +4,11 @@
 //! are read and written row by row in FITS order: the first row of the file is y = 1, row-major.
 //! gzip and tile-compressed (fpack) images are read like plain ones.
 
-mod cards;
-mod cfitsio;
 mod file;
-mod header;
 mod read;
-mod source;
-mod tiles;
-mod tiling;
 mod write;
 
-pub use header::Value;
 pub use read::{
     ImageReader, Pixel, TableHead, read_table, read_table_keys, read_table_parts, tables,
 };
-pub use write::{ImageWriter, write_table};
+pub use write::{ImageWriter, Value, write_table};

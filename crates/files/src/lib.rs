@@ -4,8 +4,12 @@
 //! reading. [`atomic`] writes each file under a temporary name and renames it when it is complete.
 //! [`frames`] are polars' data frames with text metadata.
 
+use std::fmt::Display;
+use std::path::{Path, PathBuf};
+
+use thiserror::Error;
+
 pub mod atomic;
-mod error;
 pub mod fits;
 pub mod frames;
 pub mod open;
@@ -13,13 +17,90 @@ pub mod parquet;
 pub mod table;
 pub mod text;
 
-pub use error::{FileError, names_of};
-
 /// Most rows of a table that may fill the largest grid, of 4000 × 4000 cells.
 pub const MAX_ROWS: usize = 4000 * 4000;
 /// Most pixels per side of an image.
 // Chosen by hand. A damaged header cannot ask for memory beyond it.
 pub(crate) const MAX_SIDE: usize = 200_000;
+
+/// A file that cannot be used: its path, the place, the found and the expected value.
+#[derive(Debug, Error)]
+#[error("{}: {message}", path.display())]
+pub struct FileError {
+    pub path: PathBuf,
+    /// Place, found value, expected value.
+    pub message: String,
+    /// Whether the only fault is that a requested column is absent or that the columns have no names.
+    pub no_column: bool,
+}
+
+// Most names of columns that a message lists.
+const MAX_NAMES: usize = 40;
+
+// Most characters of a message, which may quote contents of a file.
+const MAX_MESSAGE_CHARS: usize = 4000;
+
+/// Names of columns as a message lists them.
+pub fn names_of(names: &[impl AsRef<str>]) -> String {
+    let shown: Vec<&str> = names.iter().take(MAX_NAMES).map(AsRef::as_ref).collect();
+    let more = if names.len() > MAX_NAMES { ", …" } else { "" };
+    shown.join(", ") + more
+}
+
+impl FileError {
+    pub fn new(path: impl AsRef<Path>, message: impl Display) -> Self {
+        let mut message = message.to_string();
+        if let Some((end, _)) = message.char_indices().nth(MAX_MESSAGE_CHARS) {
+            message.truncate(end);
+            message.push('…');
+        }
+        FileError {
+            path: path.as_ref().to_owned(),
+            message,
+            no_column: false,
+        }
+    }
+
+    /// About `path`, whose columns are `found`, without one named `wanted`.
+    pub fn no_column(path: &Path, wanted: &str, found: &[impl AsRef<str>]) -> Self {
+        let found = names_of(found);
+        let message = format!("there is no column `{wanted}`; columns found: {found}");
+        FileError {
+            no_column: true,
+            ..FileError::new(path, message)
+        }
+    }
+
+    /// About `path`, a text table without names whose first row has the fields `first`: more than the columns
+    /// `expected` that a table without names has.
+    pub(crate) fn no_names(path: &Path, first: &[impl AsRef<str>], expected: &[&str]) -> Self {
+        let message = format!(
+            "{} columns have no names (found the first row `{}`, expected {}: {}). Try: add a first line with the names",
+            first.len(),
+            names_of(first),
+            expected.len(),
+            names_of(expected)
+        );
+        FileError {
+            no_column: true,
+            ..FileError::new(path, message)
+        }
+    }
+
+    /// Adds a hint on where the names of columns are specified, if the fault is about columns.
+    pub fn hint_of_columns(mut self, hint: &str) -> Self {
+        if self.no_column {
+            self.message = format!("{}; {hint}", self.message);
+        }
+        self
+    }
+
+    /// For `map_err`: about `path`, while doing `what`.
+    pub fn doing<E: Display>(path: &Path, what: &'static str) -> impl FnOnce(E) -> FileError {
+        let path = path.to_owned();
+        move |error| FileError::new(path, format!("{what}: {error}"))
+    }
+}
 
 /// The examples of README.md.
 #[cfg(doctest)]

@@ -7,7 +7,7 @@
 //! * No second thread pool starts.
 //! * 8- and 16-bit integers decode into wider ones without polars' features for them.
 //!
-//! Rows are counted before memory is taken for them, but pages that compress to next to nothing are not: catalogues are the
+//! Rows are counted before memory is allocated for them, but not pages that compress to next to nothing: catalogues are the
 //! user's own, while entries of challenges, which strangers send, are text.
 
 use std::cell::Cell;
@@ -32,11 +32,11 @@ use polars_parquet::read::{
 };
 use serde_json::{Map, Value, json};
 
-use crate::error::FileError;
+use crate::FileError;
 use crate::frames::{Metadata, element_name, element_of, frame, reals};
 use crate::open;
 
-// Longest vector whose numbers are columns with names of their own.
+// Longest vector that becomes one column per number.
 const MAX_VECTOR: usize = 8;
 // The key under which Parquet files keep the Arrow schema.
 const SCHEMA_KEY: &str = "ARROW:schema";
@@ -75,9 +75,9 @@ pub fn write<W: Write>(writer: W, frame: &DataFrame, metadata: &Metadata) -> Pol
         .map(drop)
 }
 
-// Key of what becomes `DataFrame.attrs` in pandas.
+// pandas reads this key into `DataFrame.attrs`.
 const PANDAS: &str = "PANDAS_ATTRS";
-// Key of what becomes `Table.meta` in astropy: YAML, of which JSON is a part.
+// astropy reads this key into `Table.meta`, as YAML, which includes JSON.
 const ASTROPY: &str = "table_meta_yaml";
 // What precedes the length of a message of Arrow.
 const ARROW_START: [u8; 4] = [0xff; 4];
@@ -117,7 +117,7 @@ fn arrow_schema(table: &DataFrame, metadata: &Metadata) -> String {
 /// Small integers become 32-bit ones, and text with a dictionary plain text. Missing values in float
 /// columns become NaN. Columns that are not wanted may be of any type. It runs on the calling thread
 /// alone, so that a caller with many files reads them in parallel. A file of more than `most_rows` rows is refused before
-/// memory is taken for them: repeated values take next to nothing in a file.
+/// memory is allocated for them: repeated values need next to nothing in a file.
 pub fn read(
     path: impl AsRef<Path>,
     wanted: Option<&[&str]>,
@@ -290,7 +290,6 @@ impl<'a> Source<'a> {
         })
     }
 
-    // Checks the number of rows before memory is taken for them.
     fn check_rows(&self, most: usize) -> Result<(), FileError> {
         let groups = self.footer.row_groups.iter();
         let rows = groups.fold(0, |rows: usize, group| {
@@ -437,7 +436,7 @@ impl<'a> Source<'a> {
         wanted.taken(series).map_err(damaged)
     }
 
-    // The bytes from `start`, as many as `size`, after checking that the file has them.
+    // `size` bytes from `start`, after checking that the file has them.
     fn read_bytes(&mut self, start: i64, size: i64) -> Result<Vec<u8>, String> {
         let range = u64::try_from(start).ok().zip(u64::try_from(size).ok());
         let Some((start, size)) = range.filter(|(start, size)| {
@@ -466,7 +465,7 @@ fn decode(chunk: &ColumnChunkMetadata, bytes: Vec<u8>, field: &ArrowField) -> Po
     // Cloning it shares the bytes.
     let source = Cursor::new(bytes.into());
     let pages = || PageReader::new(source.clone(), chunk, Vec::new(), length);
-    // The decoder makes room for as many values as a page claims, a negative count being taken for a huge one; a failed
+    // The decoder allocates the number of values that a page claims, and reads a negative count as a huge one; a failed
     // allocation ends the process: add the claims up first.
     let mut claimed = 0_usize;
     for page in pages() {

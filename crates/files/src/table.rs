@@ -16,7 +16,7 @@ use std::path::{Path, PathBuf};
 use crate::frames::polars::DataFrame;
 use crate::frames::{Metadata, reals};
 
-use crate::error::FileError;
+use crate::FileError;
 use crate::open::{is_there, open};
 
 use crate::fits::TableHead;
@@ -161,13 +161,13 @@ impl Place {
 }
 
 /// Names and fields of a table, before columns are chosen.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub struct Columns {
     /// Lists of names, one to be chosen: a header, comments that may be one, or the tables of a FITS file.
     pub named: Vec<Named>,
     /// Fields of the first row of a text table that has no header.
     pub unnamed: Vec<String>,
-    /// Words of the comments of such a table that are more or fewer than its fields, so that none names a column.
+    /// Words of the other comments of such a table, whose number differs from that of its fields, so that they name no column.
     pub remarks: Vec<Vec<String>>,
 }
 
@@ -189,12 +189,8 @@ pub fn columns(place: &Place) -> Result<Columns, FileError> {
         table: None,
         doubtful,
     };
-    match Ending::of(path) {
-        Ending::Parquet => Ok(Columns {
-            named: vec![plain(parquet::columns(path)?, false)],
-            unnamed: Vec::new(),
-            remarks: Vec::new(),
-        }),
+    let named = match Ending::of(path) {
+        Ending::Parquet => vec![plain(parquet::columns(path)?, false)],
         Ending::Fits => {
             let tables = fits::tables(path, place.table.as_deref())?.into_iter();
             let named = tables.map(|head| Named {
@@ -202,35 +198,30 @@ pub fn columns(place: &Place) -> Result<Columns, FileError> {
                 table: Some(head),
                 doubtful: false,
             });
-            Ok(Columns {
-                named: named.collect(),
-                unnamed: Vec::new(),
-                remarks: Vec::new(),
-            })
+            named.collect()
         }
         Ending::Text => {
             let found = text::columns(path)?;
-            Ok(match found.names {
-                Some(names) => Columns {
-                    named: vec![plain(names, false)],
-                    unnamed: Vec::new(),
-                    remarks: Vec::new(),
-                },
+            match found.names {
+                Some(names) => vec![plain(names, false)],
                 None => {
                     let count = found.fields.len();
-                    let (names, remarks): (Vec<_>, Vec<_>) = found
-                        .comments
-                        .into_iter()
-                        .partition(|words| words.len() == count);
-                    Columns {
+                    let comments = found.comments.into_iter();
+                    let (names, remarks): (Vec<_>, Vec<_>) =
+                        comments.partition(|words| words.len() == count);
+                    return Ok(Columns {
                         named: names.into_iter().map(|words| plain(words, true)).collect(),
                         unnamed: found.fields,
                         remarks,
-                    }
+                    });
                 }
-            })
+            }
         }
-    }
+    };
+    Ok(Columns {
+        named,
+        ..Columns::default()
+    })
 }
 
 /// Reads the columns `wanted` (all, if `None`) as real numbers; the format follows from the ending. A

@@ -1,24 +1,48 @@
-//! An open FITS file. Values that cfitsio does not check are checked before its functions are called.
+//! An open FITS file, plain or compressed by gzip. Values that cfitsio does not check are checked before its functions are
+//! called.
 
 use std::ffi::{CStr, CString, c_char, c_int};
-use std::path::Path;
+use std::fs;
+use std::io::{BufReader, Read, Seek, SeekFrom};
+use std::ops::RangeInclusive;
+use std::path::{Path, PathBuf};
 use std::ptr;
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use fitsio::sys;
+use flate2::bufread::MultiGzDecoder;
 
-use super::cards::Cards;
-use super::cfitsio::{lock, plain};
-use super::source::Source;
-use super::tiling::Tiling;
-use crate::error::FileError;
+use crate::open::open;
+use crate::{FileError, MAX_SIDE};
 
 // Numbers of cfitsio's interface, from its fitsio.h.
 const READONLY: c_int = 0;
 const IMAGE_HDU: c_int = 0;
 const KEY_NO_EXIST: c_int = 202;
 const VALUE_UNDEFINED: c_int = 204;
-// Bytes of a block of a file.
-const BLOCK: u64 = 2880;
+
+/// Bytes of a block: headers and data each fill whole ones.
+pub const BLOCK: usize = 2880;
+/// Bytes of a header card.
+pub const CARD: usize = 80;
+/// Most columns of a table (FITS standard 4.0, section 7).
+pub const MAX_COLUMNS: usize = 999;
+
+static CFITSIO: Mutex<()> = Mutex::new(());
+
+/// The lock around every cfitsio call. A panic elsewhere does not damage the state of cfitsio.
+pub fn lock() -> MutexGuard<'static, ()> {
+    CFITSIO.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+pub fn plain(buffer: &[c_char]) -> String {
+    let bytes: Vec<u8> = buffer
+        .iter()
+        .take_while(|c| **c != 0)
+        .map(|c| c.to_ne_bytes()[0])
+        .collect();
+    String::from_utf8_lossy(&bytes).trim().to_owned()
+}
 
 /// A type of values of columns, with its code in cfitsio's interface.
 pub trait ColumnValue: Copy + Default {
@@ -46,6 +70,273 @@ impl ColumnValue for u64 {
     const CODE: c_int = 80;
 }
 
+// Most bytes that a gzip file may unpack to: ten images of the challenge.
+const MAX_UNPACKED_BYTES: u64 = 1 << 30;
+// Bytes that are unpacked at a time, at least.
+const UNPACK_STEP_BYTES: u64 = 1 << 23;
+
+struct Source {
+    path: PathBuf,
+    file: fs::File,
+    /// Bytes in it.
+    size: u64,
+    /// Bytes on disk.
+    disk: u64,
+    packed: Option<MultiGzDecoder<BufReader<fs::File>>>,
+}
+
+impl Source {
+    fn open(path: &Path, content: Content) -> Result<Self, FileError> {
+        let cannot = || FileError::doing(path, "cannot open the file");
+        let file = open(path).map_err(cannot())?;
+        let size = file.metadata().map_err(cannot())?.len();
+        let mut source = Source {
+            path: path.to_owned(),
+            file,
+            size,
+            disk: size,
+            packed: None,
+        };
+        if source.start()?.starts_with(&[0x1f, 0x8b]) {
+            source.file.rewind().map_err(cannot())?;
+            let plain = tempfile::tempfile().map_err(FileError::doing(
+                path,
+                "cannot make a temporary file to unpack to",
+            ))?;
+            let packed = std::mem::replace(&mut source.file, plain);
+            source.packed = Some(MultiGzDecoder::new(BufReader::new(packed)));
+            source.size = 0;
+        }
+        let start = source.start()?;
+        if start == *b"SIMPLE" {
+            return Ok(source);
+        }
+        let message = if start.is_empty() {
+            format!("the file is empty; expected a FITS {content}")
+        } else {
+            format!(
+                "the file starts with `{}`; expected a FITS {content}, which starts with `SIMPLE`, plain or compressed by gzip or fpack",
+                start.escape_ascii()
+            )
+        };
+        Err(FileError::new(path, message))
+    }
+
+    fn name(&self) -> Result<CString, FileError> {
+        let name = match self.packed {
+            None => literal(self.path.as_os_str().as_encoded_bytes()),
+            Some(_) => open_file_name(&self.file),
+        };
+        CString::new(name).map_err(FileError::doing(&self.path, "cannot open the file"))
+    }
+
+    /// Refuses a gzip file of more bytes than may be unpacked.
+    fn allow(&self, wanted: u64) -> Result<(), FileError> {
+        if wanted <= MAX_UNPACKED_BYTES {
+            return Ok(());
+        }
+        let message = format!(
+            "its header asks for {wanted} bytes; expected at most {MAX_UNPACKED_BYTES} in a gzip file: unpack it first"
+        );
+        Err(FileError::new(&self.path, message))
+    }
+
+    /// Size of the file; of a gzip file, what was unpacked, until `wanted` bytes or its end.
+    fn size(&mut self, wanted: u64) -> Result<u64, FileError> {
+        if wanted <= self.size || self.packed.is_none() {
+            return Ok(self.size);
+        }
+        self.allow(wanted)?;
+        let Some(packed) = &mut self.packed else {
+            return Ok(self.size);
+        };
+        let more = (wanted - self.size).max(UNPACK_STEP_BYTES);
+        self.size += self
+            .file
+            .seek(SeekFrom::Start(self.size))
+            .and_then(|_| std::io::copy(&mut packed.take(more), &mut self.file))
+            .map_err(FileError::doing(&self.path, "cannot unpack the gzip file"))?;
+        Ok(self.size)
+    }
+
+    /// Bytes from `start`: `size`, or fewer at the end of the file.
+    fn read_at(&mut self, start: u64, size: usize) -> Result<Vec<u8>, FileError> {
+        self.size(start.saturating_add(size as u64))?;
+        let mut bytes = Vec::new();
+        self.file
+            .seek(SeekFrom::Start(start))
+            .and_then(|_| (&mut self.file).take(size as u64).read_to_end(&mut bytes))
+            .map_err(FileError::doing(&self.path, "cannot read the file"))?;
+        Ok(bytes)
+    }
+
+    fn check_end(&mut self) -> Result<(), FileError> {
+        let Some(packed) = &mut self.packed else {
+            return Ok(());
+        };
+        let rest = std::io::copy(&mut packed.take(MAX_UNPACKED_BYTES), &mut std::io::sink())
+            .map_err(FileError::doing(&self.path, "cannot unpack the gzip file"))?;
+        if rest < MAX_UNPACKED_BYTES {
+            return Ok(());
+        }
+        let message =
+            format!("more than {MAX_UNPACKED_BYTES} bytes follow what was read of the gzip file");
+        Err(FileError::new(&self.path, message))
+    }
+
+    fn start(&mut self) -> Result<Vec<u8>, FileError> {
+        self.read_at(0, 6)
+    }
+}
+
+/// A name of an open file that has none.
+fn open_file_name(file: &fs::File) -> Vec<u8> {
+    use std::os::fd::AsRawFd;
+    format!("/dev/fd/{}", file.as_raw_fd()).into_bytes()
+}
+
+// A name that cfitsio does not change. cfitsio replaces a tilde at the start by a home folder.
+fn literal(name: &[u8]) -> Vec<u8> {
+    let here: &[u8] = if name.starts_with(b"~") { b"./" } else { b"" };
+    [here, name].concat()
+}
+
+// Most bytes of a header: fifty thousand cards.
+const MAX_HEADER_BYTES: u64 = 1 << 22;
+// Longest value and comment that cfitsio has room for.
+const LONGEST_VALUE: usize = 70;
+const LONGEST_COMMENT: usize = 72;
+// Numbers that cfitsio uses unchecked while it opens a header: it allocates and fills 160 bytes per column, has arrays for six
+// axes of a compressed image, divides by sides of tiles, and takes ZDITHER0 as an index of ten thousand numbers.
+const LIMITS: [(&str, RangeInclusive<f64>); 7] = [
+    ("TFIELDS", 0.0..=MAX_COLUMNS as f64),
+    ("ZNAXIS", 1.0..=6.0),
+    // 64 bits are read as zeros.
+    ("ZBITPIX", -64.0..=32.0),
+    ("ZTILE1", 1.0..=MAX_SIDE as f64),
+    ("ZTILE2", 1.0..=MAX_SIDE as f64),
+    ("ZTILE3", 1.0..=MAX_SIDE as f64),
+    ("ZDITHER0", 1.0..=10_000.0),
+];
+// cfitsio's decoders of HCOMPRESS and PLIO write the number of pixels that a tile claims, whatever its size; no survey uses them for
+// images of galaxies.
+const CODINGS: [&str; 4] = ["RICE_1", "RICE_ONE", "GZIP_1", "GZIP_2"];
+
+/// Checks the header that starts at byte `start` before cfitsio opens it. Returns whether there is one.
+fn check_header(source: &mut Source, start: u64, content: Content) -> Result<bool, FileError> {
+    let mut at = start;
+    // The block of Rice compression. Headers of other codings have zeros there.
+    let (mut is_rice, mut block_pixels) = (false, f64::INFINITY);
+    loop {
+        let block = source.read_at(at, BLOCK)?;
+        if block.is_empty() && at == start {
+            return Ok(false);
+        }
+        if block.len() < BLOCK || at - start >= MAX_HEADER_BYTES {
+            let read = at - start + block.len() as u64;
+            let message = format!(
+                "cannot open the file: the header from byte {start} has no END in {read} bytes"
+            );
+            return Err(FileError::new(&source.path, message));
+        }
+        for (k, card) in block.chunks_exact(CARD).enumerate() {
+            let byte = at + (k * CARD) as u64;
+            let fault = |message: String| Err(FileError::new(&source.path, message));
+            if card.starts_with(b"END     ") {
+                // cfitsio would decode blocks of no pixels for ever.
+                if is_rice && block_pixels < 1.0 {
+                    return fault(format!(
+                        "the header key ZVAL1 is {block_pixels}; expected the number of pixels of a block"
+                    ));
+                }
+                return Ok(true);
+            }
+            let Some((key, value)) = parse(card) else {
+                return fault(format!(
+                    "the header card at byte {byte} has a value or a comment that is too long"
+                ));
+            };
+            match key.as_str() {
+                // Entries of challenges, which strangers send, are tables: their compressed images never reach cfitsio.
+                "ZCMPTYPE" if content == Content::Table => {
+                    return fault(format!(
+                        "the file has a compressed image (found ZCMPTYPE {value}, expected a FITS table). Try: funpack"
+                    ));
+                }
+                "ZCMPTYPE" if !CODINGS.contains(&value.trim_matches(['\'', ' '])) => {
+                    return fault(format!(
+                        "the header key ZCMPTYPE is {value}; expected RICE_1, GZIP_1 or GZIP_2. Try: funpack"
+                    ));
+                }
+                "ZCMPTYPE" => is_rice |= value.contains("RICE"),
+                "ZVAL1" => block_pixels = block_pixels.min(value.parse().unwrap_or(0.0)),
+                key => {
+                    let limit = LIMITS.iter().find(|(limited, _)| *limited == key);
+                    // Some programs write whole numbers with a decimal point.
+                    let found = value.parse::<f64>().ok();
+                    if let Some((_, range)) = limit
+                        && !found.is_some_and(|found| range.contains(&found))
+                    {
+                        return fault(format!(
+                            "the header key {key} is {value}; expected a whole number, {} to {}",
+                            range.start(),
+                            range.end()
+                        ));
+                    }
+                }
+            }
+        }
+        at += BLOCK as u64;
+    }
+}
+
+// Name in capitals and value of a card, as cfitsio parses it; `None` if they are too long for its buffers.
+fn parse(card: &[u8]) -> Option<(String, String)> {
+    let mut text = [0 as c_char; CARD + 1];
+    for (to, from) in text.iter_mut().zip(card) {
+        *to = c_char::from_ne_bytes([*from]);
+    }
+    // Longer than any text of a card.
+    let [mut name, mut value, mut comment] = [[0 as c_char; 2 * CARD + 2]; 3];
+    let (mut length, mut status): (c_int, c_int) = (0, 0);
+    let _guard = lock();
+    // SAFETY: the card ends in a zero byte, and each buffer is longer than a card.
+    unsafe {
+        sys::ffgknm(
+            text.as_mut_ptr(),
+            name.as_mut_ptr(),
+            &mut length,
+            &mut status,
+        );
+        sys::ffpsvc(
+            text.as_mut_ptr(),
+            value.as_mut_ptr(),
+            comment.as_mut_ptr(),
+            &mut status,
+        );
+        sys::ffcmsg();
+    }
+    let length = |text: &[c_char]| text.iter().take_while(|c| **c != 0).count();
+    let fits = length(&value) <= LONGEST_VALUE && length(&comment) <= LONGEST_COMMENT;
+    fits.then(|| (plain(&name).to_ascii_uppercase(), plain(&value)))
+}
+
+/// What is read from a file.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Content {
+    Image,
+    Table,
+}
+
+impl std::fmt::Display for Content {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Content::Image => "image",
+            Content::Table => "table",
+        })
+    }
+}
+
 /// cfitsio's words for a status, followed by the messages on its stack, which this empties. The first message is
 /// the closest to the cause.
 fn describe(status: c_int) -> String {
@@ -69,23 +360,19 @@ pub struct File {
     /// Bytes of the file when cfitsio opened it.
     seen: u64,
     place: c_int,
-    /// How the current image is compressed; `None` for an uncompressed one.
-    tiling: Option<Tiling>,
-    what: &'static str,
+    content: Content,
 }
 
 impl File {
-    /// Opens a plain or gzip-compressed FITS file; `what` is expected in it.
-    pub fn open(path: &Path, what: &'static str) -> Result<Self, FileError> {
-        let mut source = Source::open(path, what)?;
-        Cards::read(&mut source, 0)?;
+    pub fn open(path: &Path, content: Content) -> Result<Self, FileError> {
+        let mut source = Source::open(path, content)?;
+        check_header(&mut source, 0, content)?;
         let mut file = File {
             raw: ptr::null_mut(),
             source,
             seen: 0,
             place: 1,
-            tiling: None,
-            what,
+            content,
         };
         file.reopen()?;
         Ok(file)
@@ -109,8 +396,8 @@ impl File {
         if status == 0 && !self.raw.is_null() {
             return Ok(());
         }
-        let message = format!("cannot open the {}: {}", self.what, describe(status));
-        Err(FileError::new(self.source.path(), message))
+        let message = format!("cannot open the {}: {}", self.content, describe(status));
+        Err(self.fault(message))
     }
 
     // Closes the file if it is open. The caller has the lock.
@@ -140,28 +427,33 @@ impl File {
         Err(self.fault(format!("{}: {}", doing(), describe(status))))
     }
 
+    // A value that cfitsio writes to a variable.
+    fn find<T: Default>(
+        &self,
+        what: &str,
+        find: impl FnOnce(*mut sys::fitsfile, &mut T, &mut c_int),
+    ) -> Result<T, FileError> {
+        let mut found = T::default();
+        let doing = || format!("cannot determine {what}");
+        self.call(doing, |raw, status| find(raw, &mut found, status))?;
+        Ok(found)
+    }
+
     pub fn fault(&self, message: String) -> FileError {
-        FileError::new(self.source.path(), message)
+        FileError::new(&self.source.path, message)
     }
 
     /// Goes to the next header. Returns whether there is one.
     pub fn next(&mut self) -> Result<bool, FileError> {
         let start = self.extent()?[1];
-        let Some(cards) = Cards::read(&mut self.source, start)? else {
+        if !check_header(&mut self.source, start, self.content)? {
             return Ok(false);
-        };
-        self.tiling = Tiling::of(&cards).map_err(|message| self.fault(message))?;
-        self.place += 1;
+        }
         if self.source.size(0)? > self.seen {
+            self.place += 1;
             self.reopen()?;
         } else {
-            self.call(
-                || format!("cannot read header {} of the file", self.place),
-                // SAFETY: the file is open, and the type of the header is not requested.
-                |raw, status| unsafe {
-                    sys::ffmahd(raw, self.place, ptr::null_mut(), status);
-                },
-            )?;
+            self.go_to(self.number_of_extension() + 1)?;
         }
         Ok(true)
     }
@@ -169,7 +461,6 @@ impl File {
     /// Goes to the header of an extension that was reached before; the first is 1.
     pub fn go_to(&mut self, extension: usize) -> Result<(), FileError> {
         self.place = c_int::try_from(extension + 1).unwrap_or(c_int::MAX);
-        self.tiling = None;
         self.call(
             || format!("cannot read header {} of the file", self.place),
             // SAFETY: the file is open, and the type of the header is not requested.
@@ -185,76 +476,67 @@ impl File {
     }
 
     pub fn path(&self) -> &Path {
-        self.source.path()
+        &self.source.path
     }
 
-    /// Moves the tiling of the current image out; `None` for an uncompressed one.
-    pub fn take_tiling(&mut self) -> Result<Option<Tiling>, FileError> {
-        let mut compressed = 0;
+    pub fn is_compressed(&self) -> Result<bool, FileError> {
         // SAFETY: the file is open.
-        self.call(
-            || "cannot determine the type of the image".into(),
-            |raw, status| unsafe { compressed = sys::fits_is_compressed_image(raw, status) },
-        )?;
-        if (compressed != 0) == self.tiling.is_some() {
-            return Ok(self.tiling.take());
-        }
-        Err(self.fault("the header contradicts itself about a compressed image".into()))
+        self.find(
+            "the type of the image",
+            |raw, found: &mut c_int, status| unsafe {
+                *found = sys::fits_is_compressed_image(raw, status);
+            },
+        )
+        .map(|found| found != 0)
     }
 
     /// Whether an image is here, and no table.
     pub fn is_image(&self) -> Result<bool, FileError> {
-        let mut kind = 0;
-        self.call(
-            || "cannot determine what the header describes".into(),
-            // SAFETY: the file is open, and the pointers are to live variables.
-            |raw, status| unsafe {
-                sys::ffghdt(raw, &mut kind, status);
-            },
-        )?;
-        Ok(kind == IMAGE_HDU)
+        // SAFETY: the file is open, and the pointers are to live variables.
+        self.find("what the header describes", |raw, found, status| unsafe {
+            sys::ffghdt(raw, found, status);
+        })
+        .map(|found| found == IMAGE_HDU)
     }
 
     /// Sides of the image here, the first one along x.
     pub fn sides(&self) -> Result<Vec<i64>, FileError> {
-        let doing = || "cannot determine the size of the image".into();
-        let mut count = 0;
+        let what = "the size of the image";
         // SAFETY: the file is open, and the pointers are to live variables.
-        self.call(doing, |raw, status| unsafe {
-            sys::ffgidm(raw, &mut count, status);
+        let count: c_int = self.find(what, |raw, found, status| unsafe {
+            sys::ffgidm(raw, found, status);
         })?;
-        let mut sides = vec![0; usize::try_from(count).unwrap_or(0)];
+        let length = usize::try_from(count).unwrap_or(0);
         // SAFETY: the file is open, and there is room for `count` numbers.
-        self.call(doing, |raw, status| unsafe {
+        self.find(what, |raw, sides: &mut Vec<i64>, status| unsafe {
+            sides.resize(length, 0);
             sys::ffgiszll(raw, count, sides.as_mut_ptr(), status);
-        })?;
-        Ok(sides)
+        })
     }
 
     /// BITPIX of the image here as stored: bits per pixel, negative for floats.
     pub fn bits_per_pixel(&self) -> Result<c_int, FileError> {
-        let mut bits = 0;
         // SAFETY: the file is open, and the pointer is to a live variable.
-        self.call(
-            || "cannot determine the type of the image".into(),
-            |raw, status| unsafe {
-                sys::ffgidt(raw, &mut bits, status);
-            },
-        )?;
-        Ok(bits)
+        self.find("the type of the image", |raw, found, status| unsafe {
+            sys::ffgidt(raw, found, status);
+        })
     }
 
     /// First byte of the data here, and the first one after them.
     fn extent(&self) -> Result<[u64; 2], FileError> {
-        let (mut header, mut start, mut end) = (0, 0, 0);
         // SAFETY: the file is open, and the pointers are to live variables.
-        self.call(
-            || "cannot determine where the data are".into(),
-            |raw, status| unsafe {
-                sys::ffghadll(raw, &mut header, &mut start, &mut end, status);
+        let [_, start, end] = self.find(
+            "where the data are",
+            |raw, found: &mut [i64; 3], status| unsafe {
+                let [header, start, end] = found;
+                sys::ffghadll(raw, header, start, end, status);
             },
         )?;
-        let place = |byte| u64::try_from(byte).ok().filter(|byte| byte % BLOCK == 0);
+        let place = |byte| {
+            u64::try_from(byte)
+                .ok()
+                .filter(|byte| byte % BLOCK as u64 == 0)
+        };
         match [place(start), place(end)] {
             [Some(start), Some(end)] if start <= end => Ok([start, end]),
             _ => Err(self.fault(format!(
@@ -272,14 +554,14 @@ impl File {
     /// Makes sure that the file has all data of the current header. The padding of the last block may be absent.
     pub fn need_all(&mut self) -> Result<(), FileError> {
         let [start, end] = self.extent()?;
-        self.need_first((end + 1).saturating_sub(BLOCK).max(start))
+        self.need_first((end + 1).saturating_sub(BLOCK as u64).max(start))
     }
 
     /// Makes sure that the file can have the first `bytes` bytes of the data here. A gzip file is unpacked later, when
     /// they are read.
     pub fn expect(&mut self, bytes: u64) -> Result<(), FileError> {
         let wanted = self.extent()?[0].saturating_add(bytes);
-        if self.source.is_packed() {
+        if self.source.packed.is_some() {
             self.source.allow(wanted)
         } else {
             self.need_first(wanted)
@@ -301,7 +583,7 @@ impl File {
 
     /// Bytes of the file on disk.
     pub fn disk_size(&self) -> u64 {
-        self.source.disk_size()
+        self.source.disk
     }
 
     /// Makes sure that a gzip file is complete. Call it after the last data are read.
@@ -327,7 +609,7 @@ impl File {
         Ok(present.then_some(value))
     }
 
-    /// Text of a header key, of all its CONTINUE cards; empty if there is none.
+    /// Text of a header key with all its CONTINUE cards; empty if the key is absent.
     pub fn text(&self, key: &str) -> String {
         let Ok(name) = CString::new(key) else {
             return String::new();
@@ -352,39 +634,33 @@ impl File {
         }
     }
 
+    /// Rows of the table here.
+    pub fn rows(&self) -> Result<i64, FileError> {
+        // SAFETY: the file is open, and the pointers are to live variables.
+        self.find("the number of rows", |raw, found, status| unsafe {
+            sys::ffgnrwll(raw, found, status);
+        })
+    }
+
+    /// Columns of the table here.
+    pub fn columns(&self) -> Result<c_int, FileError> {
+        // SAFETY: the file is open, and the pointers are to live variables.
+        self.find("the number of columns", |raw, found, status| unsafe {
+            sys::ffgncl(raw, found, status);
+        })
+    }
+
     /// Type code of a column of the table here, and values in each of its rows.
     pub fn column_type(&self, column: c_int) -> Result<(c_int, i64), FileError> {
-        let (mut kind, mut repeat, mut width) = (0, 0, 0);
+        let what = format!("the type of column {column}");
         // SAFETY: the file is open, and the pointers are to live variables.
-        self.call(
-            || format!("cannot determine the type of column {column}"),
-            |raw, status| unsafe {
-                sys::ffgtclll(raw, column, &mut kind, &mut repeat, &mut width, status);
-            },
-        )?;
-        Ok((kind, repeat))
+        self.find(&what, |raw, (kind, repeat), status| unsafe {
+            let mut width = 0;
+            sys::ffgtclll(raw, column, kind, repeat, &mut width, status);
+        })
     }
 
-    /// Number of values of the array in a column and a row, from 1.
-    pub fn array_length(&self, column: c_int, row: usize) -> Result<i64, FileError> {
-        let (mut length, mut place) = (0, 0);
-        // SAFETY: the file is open, and the pointers are to live variables.
-        self.call(
-            || format!("cannot read the place of the pixels of tile {row}"),
-            |raw, status| unsafe {
-                sys::ffgdesll(raw, column, row as i64, &mut length, &mut place, status);
-            },
-        )?;
-        Ok(length)
-    }
-
-    /// The first bytes of the array in a column and a row, from 1.
-    pub fn array(&self, column: c_int, row: usize, length: usize) -> Result<Vec<u8>, FileError> {
-        let doing = || format!("cannot read the pixels of tile {row}");
-        self.values(doing, column, row, length, 0)
-    }
-
-    /// As many values of a column as `count`, from the first one of `row`, which is counted from 1. Missing ones are
+    /// `count` values of a column, from the first one of `row`, which is counted from 1. Missing ones are
     /// `missing`; cfitsio does not look for them if this is zero.
     pub fn values<T: ColumnValue>(
         &self,

@@ -8,13 +8,10 @@ use std::ptr;
 
 use fitsio::sys;
 
-use super::cfitsio::plain;
-use super::file::{ColumnValue, File};
-use super::tiles::Tiles;
-use crate::error::{FileError, names_of};
+use super::file::{ColumnValue, Content, File, plain};
 use crate::frames::element_name;
 use crate::frames::polars::{Column, DataFrame};
-use crate::{MAX_ROWS, MAX_SIDE};
+use crate::{FileError, MAX_ROWS, MAX_SIDE, names_of};
 
 // Most numbers read from a table that has fewer bytes than that on disk.
 const FREE_NUMBERS: u64 = 1 << 22;
@@ -26,7 +23,7 @@ const TDOUBLE: c_int = 82;
 // Type codes of columns that `ffgcvd` reads as one number a row: TBYTE, TSBYTE, TUSHORT, TSHORT,
 // TUINT, TINT, TULONG, TLONG, TFLOAT, TULONGLONG, TLONGLONG, TDOUBLE.
 const NUMBERS: [c_int; 12] = [11, 12, 20, 21, 30, 31, 40, 41, 42, 80, 81, 82];
-// Longest vector whose numbers are columns with names of their own; longer ones are stamps.
+// Longest vector that becomes one column per number; longer ones are stamps.
 const MAX_VECTOR: i64 = 8;
 const TSTRING: c_int = 16;
 const TLONGLONG: c_int = 81;
@@ -36,6 +33,10 @@ const UNSIGNED: f64 = 9_223_372_036_854_775_808.0;
 // Pixels that are read at a time: cfitsio swaps their bytes, and missing ones are looked for, which takes less time in the
 // cache.
 const PIXELS_AT_A_TIME: usize = 1 << 14;
+
+// Most pixels per byte of a compressed file. A tile without noise takes a byte for a thousand; images of galaxies take one for
+// less than eight.
+const MAX_COMPRESSION: u64 = 1 << 11;
 
 // Pixels of this value are missing: SExtractor writes it, in single precision.
 const MISSING: f32 = -1e30;
@@ -67,19 +68,14 @@ pub struct ImageReader {
     /// Whether this is the last image that is read, so that a gzip file must be complete after it.
     last: bool,
     next_row: usize,
-    pixels: Pixels,
+    /// BITPIX of an uncompressed image: bits per pixel, negative for floats. `None` for a compressed one.
+    bits: Option<c_int>,
 }
 
 impl std::fmt::Debug for ImageReader {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("ImageReader").finish_non_exhaustive()
     }
-}
-
-enum Pixels {
-    /// Uncompressed, with BITPIX bits per pixel: negative for floats.
-    Plain(c_int),
-    Tiles(Tiles),
 }
 
 fn bytes_of(bits: c_int) -> u64 {
@@ -96,7 +92,7 @@ impl ImageReader {
     /// Opens the first image of a file: the primary image, or the first extension if the primary header has no
     /// image (as fpack writes it).
     pub fn open(path: impl AsRef<Path>) -> Result<Self, FileError> {
-        let mut file = File::open(path.as_ref(), "image")?;
+        let mut file = File::open(path.as_ref(), Content::Image)?;
         let mut place = "primary";
         if file.sides()?.is_empty() && file.next()? {
             place = "first extension";
@@ -113,7 +109,7 @@ impl ImageReader {
     /// of a cube follow each other, as in one image.
     pub fn open_stack(path: impl AsRef<Path>) -> Result<Self, FileError> {
         let path = path.as_ref();
-        let file = File::open(path, "image")?;
+        let file = File::open(path, Content::Image)?;
         if !file.sides()?.is_empty() {
             return ImageReader::here(file, "primary", Dimensions::TwoOrThree);
         }
@@ -174,14 +170,25 @@ impl ImageReader {
         let Some(planes) = planes.filter(|planes| (1..=MAX_ROWS).contains(planes)) else {
             return Err(file.fault(format!("the cube has {z} planes; expected 1 to {MAX_ROWS}")));
         };
-        let pixels = match file.take_tiling()? {
-            Some(tiling) => Pixels::Tiles(Tiles::open(&file, tiling)?),
-            None => Pixels::Plain(file.bits_per_pixel()?),
+        let pixels = (width as u64 * height as u64).saturating_mul(planes as u64);
+        let bits = match file.is_compressed()? {
+            true => {
+                // Also the guard against memory for pixels that a damaged header claims and a file cannot have.
+                file.need_all()?;
+                let most = file.disk_size().saturating_mul(MAX_COMPRESSION);
+                if pixels > most {
+                    return Err(file.fault(format!(
+                        "the compressed image claims {pixels} pixels; expected at most {most} in a file of this size"
+                    )));
+                }
+                None
+            }
+            false => {
+                let bits = file.bits_per_pixel()?;
+                file.expect(pixels.saturating_mul(bytes_of(bits)))?;
+                Some(bits)
+            }
         };
-        if let Pixels::Plain(bits) = pixels {
-            let pixels = (width as u64 * height as u64).saturating_mul(planes as u64);
-            file.expect(pixels.saturating_mul(bytes_of(bits)))?;
-        }
         Ok(ImageReader {
             file,
             width,
@@ -189,7 +196,7 @@ impl ImageReader {
             planes,
             last: dimensions == Dimensions::Two,
             next_row: 0,
-            pixels,
+            bits,
         })
     }
 
@@ -245,10 +252,10 @@ impl ImageReader {
         let last = (first + rows).min(self.rows());
         self.need(last)?;
         let (start, count) = (first * self.width, (last - first) * self.width);
-        let at_a_time = match self.pixels {
-            Pixels::Plain(_) => PIXELS_AT_A_TIME.min(count),
+        let at_a_time = match self.bits {
+            Some(_) => PIXELS_AT_A_TIME.min(count),
             // A part of a tile takes as long as the tile.
-            Pixels::Tiles(_) => count,
+            None => count,
         };
         let mut pixels = Vec::with_capacity(count);
         while pixels.len() < count {
@@ -290,17 +297,17 @@ impl ImageReader {
 
     /// Makes sure that the first `rows` rows are there.
     fn need(&mut self, rows: usize) -> Result<(), FileError> {
-        match &mut self.pixels {
-            Pixels::Plain(bits) => self.file.need((rows * self.width) as u64 * bytes_of(*bits)),
-            Pixels::Tiles(tiles) => tiles.check(&mut self.file, rows),
+        match self.bits {
+            Some(bits) => self.file.need((rows * self.width) as u64 * bytes_of(bits)),
+            None => Ok(()),
         }
     }
 
-    // Reads as many pixels as there is room for, from the one at `first`, from 0.
+    // Fills `pixels` from the image's pixel `first` on, counted from 0.
     fn fill<P: Pixel>(&mut self, first: usize, pixels: &mut [P]) -> Result<(), FileError> {
         // cfitsio always writes to the second.
         let (mut blank, mut some_blank) = (P::MISSING, 0);
-        if matches!(self.pixels, Pixels::Plain(bits) if bits < 0) {
+        if self.bits.is_some_and(|bits| bits < 0) {
             // cfitsio would test the bits of one pixel at a time. Those that are not finite are found below.
             blank = P::default();
         }
@@ -381,7 +388,7 @@ pub struct TableHead {
 impl TableHead {
     fn here(file: &File) -> Result<Self, FileError> {
         let mut columns = Vec::new();
-        for number in 1..=column_count(file)? {
+        for number in 1..=file.columns()? {
             columns.extend(describe_column(file, number)?.names());
         }
         Ok(TableHead {
@@ -418,7 +425,7 @@ fn list_of(tables: &[TableHead]) -> String {
 
 /// The tables of a file, in order; if `table` is a name or a number, those that have it.
 pub fn tables(path: &Path, table: Option<&str>) -> Result<Vec<TableHead>, FileError> {
-    let mut file = File::open(path, "table")?;
+    let mut file = File::open(path, Content::Table)?;
     let all = all_tables(&mut file)?;
     let Some(table) = table else {
         return Ok(all);
@@ -508,7 +515,7 @@ pub fn read_table(
     wanted: Option<&[&str]>,
     table: Option<&str>,
 ) -> Result<DataFrame, FileError> {
-    let mut file = File::open(path, "table")?;
+    let mut file = File::open(path, Content::Table)?;
     go_to_table(&mut file, wanted, table)?;
     let rows = table_rows(&mut file, MAX_ROWS)?;
     let chosen = choose_columns(&file, path, wanted, false)?;
@@ -534,7 +541,7 @@ pub fn read_table_parts(
     most_rows: usize,
     mut take: impl FnMut(DataFrame) -> Result<(), FileError>,
 ) -> Result<(), FileError> {
-    let mut file = File::open(path, "table")?;
+    let mut file = File::open(path, Content::Table)?;
     go_to_table(&mut file, Some(wanted), table)?;
     let rows = table_rows(&mut file, usize::MAX)?;
     let chosen = choose_columns(&file, path, Some(wanted), true)?;
@@ -599,7 +606,7 @@ pub fn read_table_keys<'a>(
     path: &Path,
     keys: impl Iterator<Item = &'a String>,
 ) -> Result<BTreeMap<String, String>, FileError> {
-    let mut file = File::open(path, "table")?;
+    let mut file = File::open(path, Content::Table)?;
     if !file.next()? {
         return Err(file.fault("there is no table in this file".into()));
     }
@@ -609,14 +616,7 @@ pub fn read_table_keys<'a>(
 
 /// Number of rows of the current table, at most `most`, which must fit into the file.
 fn table_rows(file: &mut File, most: usize) -> Result<usize, FileError> {
-    let mut count = 0;
-    // SAFETY: the file is open, and the pointers are to live variables.
-    file.call(
-        || "cannot determine the number of rows".into(),
-        |raw, status| unsafe {
-            sys::ffgnrwll(raw, &mut count, status);
-        },
-    )?;
+    let count = file.rows()?;
     let rows = usize::try_from(count)
         .ok()
         .filter(|rows| *rows <= most)
@@ -630,20 +630,8 @@ fn table_rows(file: &mut File, most: usize) -> Result<usize, FileError> {
     Ok(rows)
 }
 
-fn column_count(file: &File) -> Result<c_int, FileError> {
-    let mut count = 0;
-    // SAFETY: the file is open, and the pointers are to live variables.
-    file.call(
-        || "cannot determine the number of columns".into(),
-        |raw, status| unsafe {
-            sys::ffgncl(raw, &mut count, status);
-        },
-    )?;
-    Ok(count)
-}
-
 fn describe_columns(file: &File) -> Result<Vec<Description>, FileError> {
-    (1..=column_count(file)?)
+    (1..=file.columns()?)
         .map(|number| {
             let found = describe_column(file, number)?;
             check_scale(file, number, &found.name)?;
@@ -678,7 +666,7 @@ fn check_scale(file: &File, number: c_int, name: &str) -> Result<(), FileError> 
     Ok(())
 }
 
-// All values of some rows of a column, as many for each as it repeats them.
+// All values of some rows of a column, with the repeat count of the column for each row.
 fn values_of<T: ColumnValue>(
     file: &File,
     description: &Description,
