@@ -161,7 +161,7 @@ pub struct Inputs<'a> {
 impl<'a> Inputs<'a> {
     pub fn new(run: &'a Run, data: &'a DataFolder, images: &[ImageId]) -> Result<Self, FileError> {
         let mut truths = BTreeMap::new();
-        // Read once per set, not per image: the truth of a set has as many rows as an image has galaxies.
+        // Read once per set, not per image: the truth of a set has a row for each galaxy of an image.
         if let Source::Folder { .. } = run.source {
             for of_set in images.chunk_by(|a, b| a.set == b.set) {
                 let path = data.truth(of_set[0].set);

@@ -155,7 +155,7 @@ impl GalaxyCatalogue {
         let table = table::read(path, Some(&WANTED), MAX_ROWS)?;
         let column = |name: &str| table::numbers(&table, name, path);
         let (x, y, id) = (column("x")?, column("y")?, column("ID")?);
-        // Fractions would be centroids, of which the challenge stated none; a column of them was matched by mistake.
+        // Fractions would be centroids, which the challenge does not state; a column of them was matched by mistake.
         let wrong = |row: usize, name: &str, value: f64| {
             let row = row + 1;
             let message =
@@ -198,7 +198,7 @@ impl GalaxyCatalogue {
         Err(FileError::new(&self.path, message))
     }
 
-    /// Whether identities count columns and rows. Those of variable shear are nodes of a lattice with seven per galaxy.
+    /// Whether identities count columns and rows. For variable shear, they are nodes of a lattice with seven per galaxy.
     fn have_constant_shear(&self) -> Result<bool, FileError> {
         let stamp = self.stamp()?;
         Ok(self

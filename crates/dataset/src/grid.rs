@@ -1,11 +1,13 @@
-//! The stamps of an image side by side, and the grid of their galaxies, for measuring, scoring, packing and checking.
+//! The stamps of an image side by side, the grid of their galaxies, and functional PSFs by their positions: tables with
+//! x, y, profile, beta, fwhm, e1, e2.
 
 use std::path::Path;
 
-use shearq_files::FileError;
 use shearq_files::fits::ImageReader;
-use shearq_quantities::columns_of;
+use shearq_files::table::{self, Place};
+use shearq_files::{FileError, atomic};
 use shearq_quantities::units::{Degrees, Pixels};
+use shearq_quantities::{FunctionalPsf, PsfProfile, Shear, columns_of};
 use shearq_scoring::{Grid, Row, cell_at, centre_of};
 
 use crate::layout::{DataFolder, MAX_STAMP};
@@ -185,6 +187,104 @@ pub fn whole(
     }
     let message = format!("the header key {key} is {value}; expected a whole number, 1 to {most}");
     Err(FileError::new(path, message))
+}
+
+pub type PositionedPsf = ((f64, f64), FunctionalPsf);
+
+const PSF_COLUMNS: &str = "x,y,profile,beta,fwhm,e1,e2";
+
+/// PSFs of an image: one, or one per galaxy along the rows of the mosaic.
+pub fn psfs_of(path: &Path, mosaic: &Mosaic) -> Result<Vec<FunctionalPsf>, FileError> {
+    let rows = read_psfs(path)?;
+    if let [(_, psf)] = rows.as_slice() {
+        return Ok(vec![*psf]);
+    }
+    // By position, so that the order of the rows does not matter.
+    let mut field = vec![None; mosaic.galaxies];
+    for ((x, y), psf) in &rows {
+        let place = mosaic.place(*x, *y).ok_or_else(|| {
+            FileError::new(path, format!("the position ({x}, {y}) is outside the grid"))
+        })?;
+        if field[place].replace(*psf).is_some() {
+            let message = format!("the galaxy at ({x}, {y}) has two rows; expected one");
+            return Err(FileError::new(path, message));
+        }
+    }
+    field
+        .into_iter()
+        .collect::<Option<Vec<_>>>()
+        .ok_or_else(|| {
+            FileError::new(
+                path,
+                format!(
+                    "{} rows; expected one, or one for each of the {} galaxies",
+                    rows.len(),
+                    mosaic.galaxies
+                ),
+            )
+        })
+}
+
+/// PSFs of a table, with their positions, in its order.
+pub fn read_psfs(path: &Path) -> Result<Vec<PositionedPsf>, FileError> {
+    let names: Vec<&str> = PSF_COLUMNS.split(',').collect();
+    let mut psfs = Vec::new();
+    // As an identity, because columns of text are read as such only.
+    table::read_parts(&Place::of(path), &names, &["profile"], |part| {
+        let numbers = |name: &str| table::numbers(&part, name, path);
+        let (x, y) = (numbers("x")?, numbers("y")?);
+        let (beta, fwhm) = (numbers("beta")?, numbers("fwhm")?);
+        let (e1, e2) = (numbers("e1")?, numbers("e2")?);
+        let profiles = part.column("profile").and_then(|column| column.str());
+        // Without rows, or with numbers alone, it is no column of text.
+        let profiles = match (profiles, part.height()) {
+            (_, 0) => return Ok(()),
+            (Ok(profiles), _) => profiles,
+            (Err(_), _) => {
+                let message = "the profiles are numbers; expected `moffat` or `kolmogorov`";
+                return Err(FileError::new(path, message));
+            }
+        };
+        for (row, profile) in profiles.iter().enumerate() {
+            let wrong = |what: String| {
+                // Of all parts.
+                let row = psfs.len() + 1;
+                FileError::new(path, format!("row {row}: {what}"))
+            };
+            let profile = match profile.unwrap_or_default() {
+                "moffat" => PsfProfile::Moffat { beta: beta[row] },
+                "kolmogorov" => PsfProfile::Kolmogorov,
+                other => {
+                    return Err(wrong(format!(
+                        "the profile is `{other}`; expected `moffat` or `kolmogorov`"
+                    )));
+                }
+            };
+            let psf = FunctionalPsf::new(profile, fwhm[row], Shear::new(e1[row], e2[row]))
+                .map_err(|error| wrong(error.to_string()))?;
+            psfs.push(((x[row], y[row]), psf));
+        }
+        Ok(())
+    })?;
+    Ok(psfs)
+}
+
+pub fn write_psfs(path: &Path, rows: &[PositionedPsf]) -> Result<(), FileError> {
+    atomic::write(path, psfs_text(rows).as_bytes())
+}
+
+pub fn psfs_text(rows: &[PositionedPsf]) -> String {
+    let mut text = format!("{PSF_COLUMNS}\n");
+    for ((x, y), psf) in rows {
+        // A Kolmogorov PSF has no β; the column has any valid number.
+        let (profile, beta) = match psf.profile {
+            PsfProfile::Moffat { beta } => ("moffat", beta),
+            PsfProfile::Kolmogorov => ("kolmogorov", 3.0),
+        };
+        let (fwhm, e1, e2) = (psf.fwhm, psf.shape.e1, psf.shape.e2);
+        text.push_str(&format!("{x},{y},{profile},{beta},{fwhm},{e1},{e2}\n"));
+    }
+    text
 }
 
 #[cfg(test)]

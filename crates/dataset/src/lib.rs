@@ -9,7 +9,6 @@ pub mod grid;
 pub mod images;
 pub mod layout;
 pub mod metadata;
-pub mod psf_table;
 pub mod run;
 pub mod threads;
 pub mod truth;
