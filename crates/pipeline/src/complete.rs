@@ -9,10 +9,9 @@ use shearq_scoring::Grid;
 use super::PipelineError;
 use crate::measure::{metadata, open_galaxies};
 use shearq_dataset::fingerprint::Inputs;
-use shearq_dataset::grid::Mosaic;
+use shearq_dataset::grid::{Mosaic, psfs_of};
 use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::DataFolder;
-use shearq_dataset::psf_table;
 use shearq_dataset::run::{Run, SimulationRecord, Source};
 use shearq_dataset::threads::{Pool, Progress};
 use shearq_files::FileError;
@@ -49,12 +48,12 @@ pub struct Fault {
 impl Results<'_> {
     /// Number of galaxies of `images`, for progress bars: an estimate from the first that can be read.
     pub fn galaxies(&self, images: &[ImageId]) -> u64 {
-        // An image that cannot be read is reported by `faults`, and must not stop the count.
+        // An image that cannot be read is reported later, and must not stop the count.
         let first = images.iter().find_map(|&id| self.cells(id).ok());
         (images.len() * first.unwrap_or(0)) as u64
     }
 
-    /// All faults of the results of `images`, in order.
+    /// What is missing or wrong in the results of `images`, in order.
     pub fn faults(
         &self,
         images: &[ImageId],
@@ -82,7 +81,7 @@ impl Results<'_> {
                         id,
                         position,
                         error: match error {
-                            // It names its own file, which may be one of the data.
+                            // It names the file, which may be one of the data.
                             PipelineError::File(error) => error,
                             other => FileError::new(&result, other),
                         },
@@ -208,7 +207,7 @@ fn check_image(
     let field = Degrees(data.layout().field_degrees);
     let grid =
         Grid::new(n, Pixels(STAMP as f64), field).map_err(|error| FileError::new(&path, error))?;
-    psf_table::read(
+    psfs_of(
         &data.psf_functional(id.set, id.image),
         &Mosaic::square(n, STAMP),
     )?;

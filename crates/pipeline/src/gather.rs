@@ -2,8 +2,6 @@
 //! exposure.
 
 mod positions;
-mod psfs;
-mod source;
 mod stamps;
 
 use std::fs;
@@ -17,11 +15,12 @@ use shearq_quantities::{Frame, Jacobian};
 
 pub use self::positions::Table;
 use self::positions::{Positions, rows_of_stamps};
-use self::psfs::{GatheredPsfs, PsfFile, gather_psfs};
-pub(crate) use self::source::subpixel_offset;
-pub use self::source::{Content, Files};
-use self::source::{Exposure, Images, shown};
-use self::stamps::{Origins, Rows, StampWriter, already};
+pub(crate) use self::stamps::subpixel_offset;
+pub use self::stamps::{Content, Files};
+use self::stamps::{
+    Exposure, GatheredPsfs, Images, Origins, PsfFile, Rows, StampWriter, already, gather_psfs,
+    shown,
+};
 use super::PipelineError;
 use super::measure::check_strip;
 use crate::stamp_table::{self, Head, StampTable};

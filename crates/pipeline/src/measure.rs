@@ -4,7 +4,6 @@
 //! measures the images of a data folder, and writes a catalogue when all rows of an image are measured.
 
 mod catalogue;
-mod epochs;
 mod source;
 
 use std::collections::BTreeMap;
@@ -17,6 +16,7 @@ use shearq_measure::{Batch, MeasuredImage, Measurer, RowJob, Warning};
 pub use self::catalogue::{COLUMNS, Summary, Value, all_flagged, more_columns};
 pub(crate) use self::catalogue::{CatalogueWriter, metadata};
 pub use self::source::ImageSource;
+use self::source::open_epochs;
 pub(crate) use self::source::{check_strip, open_galaxies};
 use crate::PipelineError;
 use crate::engine::{self, Feeder};
@@ -36,7 +36,7 @@ pub struct ImageHead {
     pub run_warnings: Vec<Warning>,
     /// The table of the stamps if they were gathered.
     pub(crate) table: Option<StampTable>,
-    /// The files of its epochs, if there are several.
+    /// The files of its epochs.
     pub(crate) epochs: Vec<PathBuf>,
     /// Whether ellipticities are along pixel axes that a WCS states to be the sky's.
     pub(crate) aligned: bool,
@@ -187,34 +187,42 @@ impl<'a> FolderMeasurement<'a> {
     ) -> Result<(), PipelineError> {
         for (k, &id) in todo.iter().enumerate() {
             let prints = inputs.prints(id)?;
-            let epochs = self.run.epochs_of(self.data, id)?;
-            if epochs.len() > 1 {
-                if !self.read_epochs(&epochs, k == 0, measurer, prints, feeder)? {
-                    return Ok(());
-                }
-                continue;
+            let ids = self.run.epochs_of(self.data, id)?;
+            let mut sources = open_epochs(self.data, &ids, measurer)?;
+            let mut sessions = Vec::new();
+            for (id, source) in ids.iter().zip(&mut sources) {
+                self.check_side(*id, source.image.mosaic(), measurer)?;
+                sessions.push(source.session(measurer, feeder.ahead())?);
             }
-            let mut source = ImageSource::open(self.data, id, measurer.configuration())?;
-            let mosaic = source.mosaic();
-            self.check_side(id, mosaic, measurer)?;
-            let session = Arc::new(source.session(measurer, feeder.ahead())?);
+            let first = sessions.remove(0);
+            // Named by its file: the user has to find the exposure that differs.
+            let differs = sessions.iter().position(|one| one.frame() != first.frame());
+            let odd = differs.map_or(0, |at| at + 1);
+            let first = first.with_epochs(sessions);
+            let first = first.map_err(|error| sources[odd].image.named(error.into()))?;
             let correlated = match k {
-                0 => source.correlated_noise(&session, feeder.ahead())?,
+                0 => sources[0].image.correlated_noise(&first, feeder.ahead())?,
                 _ => None,
             };
+            let first = Arc::new(first);
+            let mosaic = sources[0].image.mosaic();
             let head = Arc::new(ImageHead {
                 id,
                 mosaic,
                 run_warnings: correlated.into_iter().collect(),
-                table: source.take_table(),
-                epochs: Vec::new(),
-                aligned: source.is_aligned(),
+                table: sources[0].image.table.take(),
+                epochs: sources
+                    .iter()
+                    .map(|source| source.image.path.clone())
+                    .collect(),
+                aligned: sources.iter().all(|source| source.image.aligned),
                 prints,
             });
+            let (own, others) = sources.split_first_mut().expect("a set has an image");
             for row in 0..mosaic.rows() {
                 let row = ImageRow {
                     head: Arc::clone(&head),
-                    jobs: vec![session.read(&mut source, row)?],
+                    jobs: vec![first.read_epochs(own, others, row)?],
                 };
                 if !feeder.push(row) {
                     return Ok(());
@@ -223,9 +231,7 @@ impl<'a> FolderMeasurement<'a> {
         }
         Ok(())
     }
-}
 
-impl FolderMeasurement<'_> {
     // The method is planned once, for one size of stamps.
     fn check_side(
         &self,
@@ -245,58 +251,6 @@ impl FolderMeasurement<'_> {
             self.data.galaxies(id.set, id.image),
             message,
         ))
-    }
-
-    // Hands over the rows of a set whose images are epochs; false if the work has ended.
-    fn read_epochs(
-        &self,
-        ids: &[ImageId],
-        is_first_set: bool,
-        measurer: &Measurer,
-        prints: BTreeMap<String, String>,
-        feeder: &mut Feeder<'_, ImageRow<'static, ImageHead>>,
-    ) -> Result<bool, PipelineError> {
-        let mut sources = epochs::open(self.data, ids, measurer)?;
-        let mut sessions = Vec::new();
-        for (id, source) in ids.iter().zip(&mut sources) {
-            self.check_side(*id, source.image.mosaic(), measurer)?;
-            sessions.push(source.session(measurer, feeder.ahead())?);
-        }
-        let first = sessions.remove(0);
-        // Named by its file: the user has to find the exposure that differs.
-        let differs = sessions.iter().position(|one| one.frame() != first.frame());
-        let odd = differs.map_or(0, |at| at + 1);
-        let first = first.with_epochs(sessions);
-        let first = first.map_err(|error| sources[odd].image.named(error.into()))?;
-        let correlated = match is_first_set {
-            true => sources[0].image.correlated_noise(&first, feeder.ahead())?,
-            false => None,
-        };
-        let first = Arc::new(first);
-        let mosaic = sources[0].image.mosaic();
-        let head = Arc::new(ImageHead {
-            id: ids[0],
-            mosaic,
-            run_warnings: correlated.into_iter().collect(),
-            table: sources[0].image.take_table(),
-            epochs: sources
-                .iter()
-                .map(|source| source.image.path.clone())
-                .collect(),
-            aligned: sources.iter().all(|source| source.image.is_aligned()),
-            prints,
-        });
-        let (own, others) = sources.split_first_mut().expect("a set has an image");
-        for row in 0..mosaic.rows() {
-            let row = ImageRow {
-                head: Arc::clone(&head),
-                jobs: vec![first.read_epochs(own, others, row)?],
-            };
-            if !feeder.push(row) {
-                return Ok(false);
-            }
-        }
-        Ok(true)
     }
 }
 

@@ -6,9 +6,9 @@ use std::sync::Arc;
 
 use super::PipelineError;
 use super::engine::{self, Feeder};
+use shearq_dataset::grid::write_psfs;
 use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::DataFolder;
-use shearq_dataset::psf_table;
 use shearq_dataset::run::{SIMULATION_FILE, SimulationRecord, claim};
 use shearq_dataset::threads::Progress;
 use shearq_dataset::truth;
@@ -194,7 +194,7 @@ impl<'s> OpenImage<'s> {
             PsfField::PerGalaxy(_) => (0..grid.cells()).map(|k| psf((k % n, k / n))).collect(),
         };
         // Both forms of the PSF, so that configurations of either can be compared on the same galaxies.
-        psf_table::write(&public.psf_functional(number, image), &rows)?;
+        write_psfs(&public.psf_functional(number, image), &rows)?;
         // Writing to memory cannot fail.
         let mut intrinsic = csv::Writer::from_writer(Vec::new());
         let _ = intrinsic.write_record(["x", "y", "e1", "e2", "observed_e1", "observed_e2"]);

@@ -1,17 +1,340 @@
-//! The stamps of a gathered image, with their masks and noise.
+//! Stamps and PSFs in FITS files and on exposures, and the mosaics of them that are written.
 
 use std::path::{Path, PathBuf};
 
-use ndarray::ArrayView2;
-use shearq_files::FileError;
-use shearq_files::fits::{ImageWriter, Pixel, Value};
-use shearq_measure::{Examination, examined_rows};
+use ndarray::{ArrayView2, ArrayView3};
+use serde::{Serialize, Serializer};
+use shearq_dataset::grid::{Mosaic, psfs_text, read_psfs};
+use shearq_dataset::images::ImageId;
+use shearq_dataset::layout::DataFolder;
+use shearq_files::fits::{ImageReader, ImageWriter, Pixel, Value};
+use shearq_files::{FileError, atomic};
+use shearq_measure::{
+    EXAMINED_PSFS, Examination, Psfs, Star, Warning, average_stars, examined_rows,
+};
 use shearq_quantities::statistics::upper_median;
+use shearq_submissions::PsfCut;
+use shearq_submissions::limits::MIN_PSF;
 
-use super::source::{Content, Exposure, Files, Origin, Planes, subpixel_offset};
-use super::{Gathering, Stamps};
+use super::{Gathering, Square, Stack, Stamps};
 use crate::wcs::Wcs;
-use shearq_dataset::grid::Mosaic;
+
+// Names of images that accompany an image of the sky in one file. They are refused unless the user chooses them: a weight map
+// would be measured like a galaxy.
+const COMPANIONS: [&str; 15] = [
+    "PSF",
+    "ERR",
+    "ERROR",
+    "DQ",
+    "MASK",
+    "FLAGS",
+    "SEG",
+    "VAR",
+    "VARIANCE",
+    "IVAR",
+    "WHT",
+    "WEIGHT",
+    "RMS",
+    "BKG",
+    "BACKGROUND",
+];
+
+// serde refuses paths that are not Unicode; a record may show them lossily.
+pub(super) fn shown<S: Serializer>(path: &Path, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_str(&path.display())
+}
+
+fn all_shown<S: Serializer>(paths: &[PathBuf], serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_seq(paths.iter().map(|path| path.display().to_string()))
+}
+
+/// FITS files and the name of the images in them.
+#[derive(Debug, Clone, Copy, Serialize)]
+pub struct Files<'a> {
+    /// At least one.
+    #[serde(serialize_with = "all_shown")]
+    pub paths: &'a [PathBuf],
+    /// Name of the images (EXTNAME, in any case); all images if `None`.
+    pub extension: Option<&'a str>,
+    #[serde(skip)]
+    pub content: Content,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Content {
+    Sky,
+    Psf,
+    /// Masks: not zero for a bad pixel.
+    Mask,
+    /// Variances of pixels, or their inverse: a weight.
+    Variance,
+    Weight,
+}
+
+impl Content {
+    /// Whether an image of this name has another content.
+    fn is_not(self, name: &str) -> bool {
+        let companion = COMPANIONS
+            .iter()
+            .any(|other| name.eq_ignore_ascii_case(other));
+        match self {
+            Content::Sky => companion,
+            Content::Psf => companion && !name.eq_ignore_ascii_case("PSF"),
+            Content::Mask | Content::Variance | Content::Weight => false,
+        }
+    }
+
+    fn option(self) -> &'static str {
+        match self {
+            Content::Sky => "--extension",
+            Content::Psf => "--psf-extension",
+            Content::Mask => "--mask-extension",
+            Content::Variance => "--variance-extension",
+            Content::Weight => "--weight-extension",
+        }
+    }
+
+    fn noun(self) -> &'static str {
+        match self {
+            Content::Sky => "stamp",
+            Content::Psf => "PSF",
+            Content::Mask => "mask",
+            Content::Variance => "variance map",
+            Content::Weight => "weight map",
+        }
+    }
+}
+
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Origin<'a> {
+    pub(super) file: &'a Path,
+    pub(super) image: usize,
+    pub(super) plane: usize,
+    pub(super) position: Option<(f64, f64)>,
+}
+
+impl Origin<'_> {
+    pub(super) fn fault(&self, what: &str) -> FileError {
+        let Origin { image, plane, .. } = self;
+        FileError::new(self.file, format!("image {image}, plane {plane}: {what}"))
+    }
+}
+
+pub(super) struct Images<'a> {
+    files: Files<'a>,
+    begun: usize,
+    now: Option<ImageReader>,
+    number: usize,
+    /// Names of the images that were skipped, and whether one was not.
+    others: Vec<String>,
+    found: bool,
+}
+
+impl<'a> Images<'a> {
+    pub(super) fn of(files: Files<'a>) -> Self {
+        Images {
+            files,
+            begun: 0,
+            now: None,
+            number: 0,
+            others: Vec::new(),
+            found: false,
+        }
+    }
+
+    pub(super) fn next(&mut self) -> Result<Option<(Origin<'a>, &mut ImageReader)>, FileError> {
+        loop {
+            if let Some(image) = self.now.take() {
+                self.now = image.next_stack()?;
+                self.number += 1;
+            }
+            if self.now.is_none() {
+                self.all_there()?;
+                let Some(path) = self.files.paths.get(self.begun) else {
+                    return Ok(None);
+                };
+                self.now = Some(ImageReader::open_stack(path)?);
+                (self.begun, self.number) = (self.begun + 1, 1);
+                (self.found, self.others) = (false, Vec::new());
+            }
+            let origin = Origin {
+                file: &self.files.paths[self.begun - 1],
+                image: self.number,
+                plane: 1,
+                position: None,
+            };
+            let name = self.now.as_ref().map(ImageReader::name).unwrap_or_default();
+            match self.files.extension {
+                Some(wanted) if !name.eq_ignore_ascii_case(wanted) => {
+                    self.others.push(name);
+                    continue;
+                }
+                None if self.files.content.is_not(&name) => {
+                    return Err(origin.fault(&format!(
+                        "the image is called {name}; expected an image of the sky or a PSF. Try: choose images by name with {}",
+                        self.files.content.option()
+                    )));
+                }
+                Some(_) | None => self.found = true,
+            }
+            return Ok(self.now.as_mut().map(|image| (origin, image)));
+        }
+    }
+
+    // A file without an image of the chosen name would otherwise be skipped, and the stamps would no longer match the PSFs.
+    fn all_there(&self) -> Result<(), FileError> {
+        match (
+            self.files.extension,
+            self.files.paths.get(self.begun.wrapping_sub(1)),
+        ) {
+            (Some(wanted), Some(path)) if !self.found => {
+                let names = self.others.iter().map(|name| format!("`{name}`"));
+                let names = names.collect::<Vec<_>>().join(", ");
+                let message = format!("there is no image called `{wanted}`; found {names}");
+                Err(FileError::new(path, message))
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
+struct Planes<'a> {
+    images: Images<'a>,
+    origin: Option<Origin<'a>>,
+    left: usize,
+}
+
+impl<'a> Planes<'a> {
+    pub(super) fn of(files: Files<'a>) -> Self {
+        Planes {
+            images: Images::of(files),
+            origin: None,
+            left: 0,
+        }
+    }
+
+    pub(super) fn content(&self) -> Content {
+        self.images.files.content
+    }
+
+    pub(super) fn sides(&self) -> [usize; 2] {
+        let now = self.images.now.as_ref();
+        now.map_or([0; 2], |image| [image.width(), image.height()])
+    }
+
+    // One plane at a time: a cube of stamps can be larger than the memory.
+    pub(super) fn next<P: Pixel>(&mut self) -> Result<Option<(Origin<'a>, Vec<P>)>, FileError> {
+        let origin = match self.origin {
+            Some(origin) if self.left > 0 => Origin {
+                plane: origin.plane + 1,
+                ..origin
+            },
+            _ => match self.images.next()? {
+                None => return Ok(None),
+                Some((origin, image)) => {
+                    self.left = image.planes();
+                    origin
+                }
+            },
+        };
+        self.origin = Some(origin);
+        self.left -= 1;
+        let Some(image) = self.images.now.as_mut() else {
+            return Ok(None);
+        };
+        let pixels = image.read_rows_as(image.height())?;
+        Ok(Some((origin, pixels)))
+    }
+}
+
+/// The first image of a file, to cut squares out of.
+pub(super) struct Exposure<'a> {
+    images: Images<'a>,
+    pub(super) origin: Origin<'a>,
+}
+
+impl<'a> Exposure<'a> {
+    pub(super) fn open(files: Files<'a>) -> Result<Self, FileError> {
+        if let Some(more) = files.paths.get(1) {
+            return Err(FileError::new(
+                more,
+                "this is a second file; expected one file with the exposure",
+            ));
+        }
+        let mut images = Images::of(files);
+        let (origin, planes) = match images.next()? {
+            Some((origin, image)) => (origin, image.planes()),
+            None => {
+                return Err(FileError::new(
+                    &files.paths[0],
+                    "there is no image in this file",
+                ));
+            }
+        };
+        if planes != 1 {
+            let message =
+                format!("the image has {planes} planes; expected an exposure, which has one");
+            return Err(origin.fault(&message));
+        }
+        Ok(Exposure { images, origin })
+    }
+
+    fn reader(&mut self) -> Result<&mut ImageReader, FileError> {
+        let none = || self.origin.fault("the image is no longer there");
+        self.images.now.as_mut().ok_or_else(none)
+    }
+
+    pub(super) fn content(&self) -> Content {
+        self.images.files.content
+    }
+
+    pub(super) fn sides(&mut self) -> Result<[usize; 2], FileError> {
+        let reader = self.reader()?;
+        Ok([reader.width(), reader.height()])
+    }
+
+    pub(super) fn wcs(&mut self) -> Result<Wcs, FileError> {
+        Ok(Wcs::of_header(self.reader()?))
+    }
+
+    /// Refuses an image of another size than `other`.
+    pub(super) fn like(&mut self, other: &mut Self) -> Result<(), FileError> {
+        let (own, expected) = (self.sides()?, other.sides()?);
+        if own != expected {
+            let message = format!(
+                "the {} is {} × {} pixels; the exposure has {} × {}",
+                self.images.files.content.noun(),
+                own[0],
+                own[1],
+                expected[0],
+                expected[1]
+            );
+            return Err(self.origin.fault(&message));
+        }
+        Ok(())
+    }
+
+    /// The square of `side` pixels a side whose centre is nearest to a position in FITS pixels; NaN beyond the
+    /// image.
+    pub(super) fn square<P: Pixel>(
+        &mut self,
+        (x, y): (f64, f64),
+        side: usize,
+    ) -> Result<Vec<P>, FileError> {
+        self.reader()?
+            .read_square(first_pixel(x, side), first_pixel(y, side), side)
+    }
+}
+
+/// First pixel, from 0, of the `side` pixels whose middle is nearest to a position in FITS pixels.
+fn first_pixel(at: f64, side: usize) -> i64 {
+    (at - (side as f64 + 1.0) / 2.0).round() as i64
+}
+
+/// A position on the square that is cut around it, from the centre.
+pub(crate) fn subpixel_offset((x, y): (f64, f64), side: usize) -> [f64; 2] {
+    [x, y].map(|at| at - (side as f64 + 1.0) / 2.0 - first_pixel(at, side) as f64)
+}
 
 pub(super) struct StampWriter {
     pub(super) image: Rows,
@@ -393,7 +716,7 @@ impl Rows {
         })
     }
 
-    pub(super) fn add(&mut self, stamp: &[f32]) -> Result<(), FileError> {
+    fn add(&mut self, stamp: &[f32]) -> Result<(), FileError> {
         let Mosaic {
             columns,
             stamp: side,
@@ -427,6 +750,254 @@ pub(super) fn first(named: bool, path: PathBuf) -> Result<(), FileError> {
     match named {
         true => Ok(()),
         false => Err(already(path)),
+    }
+}
+
+// Central pixels of a PSF that are examined, along each axis: those that configurations use.
+const EXAMINED_SIDE_PX: usize = 48;
+// Largest side of a grid of stars that is looked for in a PSF image. GREAT3 has 3 × 3 stars. Chosen by hand.
+const MAX_GRID_STARS: usize = 10;
+// Smallest side of the square of a star in such a grid. Chosen by hand.
+const MIN_STAR_CELL_PX: usize = 16;
+// Peak of each star in units of the brightest one: noise and wings around a single star are fainter. Chosen by hand.
+const MIN_PEAK_RATIO: f32 = 0.5;
+// Fewest galaxies per star whose stars are averaged: with fewer, some of one PSF per galaxy are missing. Chosen by hand.
+const MIN_GALAXIES_PER_STAR: usize = 2;
+// Averaged stars are in memory together: 128 MB in double precision. Chosen by hand.
+const MAX_AVERAGED_PIXELS: usize = 1 << 24;
+
+pub(super) struct GatheredPsfs {
+    pub(super) file: PsfFile,
+    pub(super) examination: Examination,
+    pub(super) messages: Vec<String>,
+    pub(super) wcs: Wcs,
+    pub(super) first: PathBuf,
+}
+
+pub(super) fn gather_psfs(
+    data: &DataFolder,
+    id: ImageId,
+    files: Files<'_>,
+    square: Option<Square>,
+    mosaic: &Mosaic,
+) -> Result<GatheredPsfs, FileError> {
+    if let [table] = files.paths
+        && table
+            .extension()
+            .is_some_and(|ending| ending.eq_ignore_ascii_case("csv"))
+    {
+        return functional(data.psf_functional(id.set, id.image), table, mosaic);
+    }
+    let (stack, mut messages) = Stack::of(files, square)?;
+    let &Stack {
+        count,
+        side,
+        ref wcs,
+        ..
+    } = &stack;
+    messages.extend(stack.differs.clone());
+    messages.extend(small(&files.paths[0], side));
+    let path = data.psf_star(id.set, id.image);
+    if count > 1 && MIN_GALAXIES_PER_STAR * count <= mosaic.galaxies {
+        return averaged(&path, files, &stack, messages);
+    }
+    check_count(&files.paths[0], count, mosaic)?;
+    // One, or one per galaxy in the same places.
+    let mut image = Rows::create(&path, Mosaic::of(count, side), &wcs.keys())?;
+    let mut planes = Planes::of(files);
+    let mut examination = Examination::new(side, 0);
+    if count > 1 {
+        examination = examination.with_psf_of_each();
+    }
+    let mut dark = 0;
+    while let Some((origin, pixels)) = planes.next()? {
+        let pixels = central(pixels, planes.sides(), side);
+        if count == 1 {
+            messages.extend(several_stars(&files.paths[0], &pixels, side));
+        }
+        let light: f64 = pixels.iter().map(|&value| f64::from(value)).sum();
+        if !(light > 0.0 && light.is_finite()) {
+            if count == 1 {
+                let message =
+                    format!("the pixels of the PSF add up to {light}; expected a positive sum");
+                return Err(origin.fault(&message));
+            }
+            dark += 1;
+        }
+        if let Ok(stamp) = ArrayView2::from_shape((side, side), &pixels)
+            && let Ok(Star { psf, moved }) = Star::cut(stamp, examined_cut(side))
+        {
+            examination.add_psf(psf.view(), moved);
+        }
+        image.add(&pixels)?;
+    }
+    messages.extend(named(&examination, &files.paths[0]));
+    if dark > 0 {
+        messages.push(format!(
+            "warning: {dark} of {count} PSFs have no positive sum of pixels. Their galaxies will be flagged"
+        ));
+    }
+    Ok(GatheredPsfs {
+        file: PsfFile::Stars(Box::new(image)),
+        examination,
+        messages,
+        wcs: wcs.clone(),
+        first: files.paths[0].clone(),
+    })
+}
+
+// Named configurations refuse such PSF stamps. Users should learn it before they have gathered all images.
+fn small(path: &Path, side: usize) -> Option<String> {
+    let shown = path.display();
+    (side < MIN_PSF).then(|| {
+        format!(
+            "warning: {shown}: the PSF stamps are {side} × {side} px (expected {MIN_PSF} × {MIN_PSF} or more, which configurations of 48 px require). Try: larger PSF stamps; or, if no light is beyond them, --submission own.toml with the file own.toml of these lines:\n  extends = \"48/linear/star\"\n  psf.size = {side}"
+        )
+    })
+}
+
+// A warning about an image that is a grid of stars, as in GREAT3.
+fn several_stars(path: &Path, pixels: &[f32], side: usize) -> Option<String> {
+    let brightest = |n: usize| {
+        let cell = side / n;
+        let square = move |k: usize| {
+            let places = (0..cell * cell).map(move |at| {
+                let (x, y) = (k % n * cell + at % cell, k / n * cell + at / cell);
+                (at, pixels[y * side + x])
+            });
+            places.max_by(|a, b| a.1.total_cmp(&b.1))
+        };
+        (0..n * n).filter_map(square).collect::<Vec<_>>()
+    };
+    let is_grid = |n: &usize| {
+        let cell = side / n;
+        let found = brightest(*n);
+        let most = found.iter().map(|(_, value)| *value).fold(0.0, f32::max);
+        let middle = |at: usize| (cell / 4..cell - cell / 4).contains(&at);
+        let star = |&(at, value): &(usize, f32)| {
+            value > MIN_PEAK_RATIO * most && middle(at % cell) && middle(at / cell)
+        };
+        found.iter().all(star)
+    };
+    let mut grids =
+        (2..=MAX_GRID_STARS).filter(|n| side.is_multiple_of(*n) && side / n >= MIN_STAR_CELL_PX);
+    let n = grids.find(is_grid)?;
+    let (shown, cell, stars) = (path.display(), side / n, n * n);
+    Some(format!(
+        "warning: {shown}: the image has {n} × {n} stars (found a peak in each square of {cell} × {cell} px; expected one star). The brightest is used. Try: a cube of {stars} stamps of {cell} × {cell} px, which are averaged to one PSF"
+    ))
+}
+
+fn check_count(path: &Path, found: usize, mosaic: &Mosaic) -> Result<(), FileError> {
+    if found == 1 || found == mosaic.galaxies {
+        return Ok(());
+    }
+    let message = format!(
+        "there are {found} PSFs; expected one, or one for each of the {} stamps. Several stars are averaged if there are at least twice as many stamps",
+        mosaic.galaxies
+    );
+    Err(FileError::new(path, message))
+}
+
+fn examined_cut(side: usize) -> PsfCut {
+    let size = side - side.saturating_sub(EXAMINED_SIDE_PX).next_multiple_of(2);
+    PsfCut {
+        size,
+        // So that a star off the centre can be cut around itself.
+        least: size - (size / 3).next_multiple_of(2),
+        centred: false,
+    }
+}
+
+// In the order of the galaxies, like stars. Positions in the mosaic replace the positions of the table, which are on another image.
+fn functional(path: PathBuf, table: &Path, mosaic: &Mosaic) -> Result<GatheredPsfs, FileError> {
+    let mut rows = read_psfs(table)?;
+    check_count(table, rows.len(), mosaic)?;
+    for (place, (position, _)) in rows.iter_mut().enumerate() {
+        *position = mosaic.position(place);
+    }
+    let mut examination = Examination::new(mosaic.stamp, 0);
+    let psfs: Vec<_> = rows.iter().map(|(_, psf)| *psf).collect();
+    let cut = examined_cut(mosaic.stamp);
+    examination.add_psfs(&Psfs::functional(psfs), cut, EXAMINED_PSFS);
+    Ok(GatheredPsfs {
+        file: PsfFile::Table(path, psfs_text(&rows)),
+        examination,
+        messages: Vec::new(),
+        wcs: Wcs::default(),
+        first: table.to_owned(),
+    })
+}
+
+// The average of several stars, as the PSF of all galaxies.
+fn averaged(
+    path: &Path,
+    files: Files<'_>,
+    &Stack {
+        count,
+        side,
+        ref wcs,
+        ..
+    }: &Stack,
+    mut messages: Vec<String>,
+) -> Result<GatheredPsfs, FileError> {
+    let first = &files.paths[0];
+    let pixels = count * side * side;
+    if pixels > MAX_AVERAGED_PIXELS {
+        let message = format!(
+            "there are {count} stars of {side} × {side} pixels to average ({pixels} pixels, expected at most {MAX_AVERAGED_PIXELS}). Try: fewer stars"
+        );
+        return Err(FileError::new(first, message));
+    }
+    let mut all = Vec::with_capacity(pixels);
+    let mut planes = Planes::of(files);
+    while let Some((_, pixels)) = planes.next::<f32>()? {
+        let pixels = central(pixels, planes.sides(), side);
+        all.extend(pixels.iter().map(|&value| f64::from(value)));
+    }
+    let stars = ArrayView3::from_shape((count, side, side), &all)
+        .map_err(|error| FileError::new(first, error))?;
+    let psf = average_stars(stars, examined_cut(side))
+        .map_err(|(k, error)| FileError::new(first, format!("star {k}: {error}")))?;
+    let shown = first.display();
+    messages.push(format!(
+        "note: {shown}: {count} stars were averaged to one PSF for all galaxies"
+    ));
+    let mut examination = Examination::new(side, 0);
+    examination.add_psf(psf.view(), None);
+    messages.extend(named(&examination, first));
+    let mut image = Rows::create(path, Mosaic::of(1, psf.nrows()), &wcs.keys())?;
+    let pixels: Vec<f32> = psf.iter().map(|&value| value as f32).collect();
+    image.add(&pixels)?;
+    Ok(GatheredPsfs {
+        file: PsfFile::Stars(Box::new(image)),
+        examination,
+        messages,
+        wcs: wcs.clone(),
+        first: first.clone(),
+    })
+}
+
+/// The warnings of an examination, with the file that they are about.
+fn named(examination: &Examination, path: &Path) -> Vec<String> {
+    let found = examination.warnings();
+    let line = |warning: &Warning| format!("warning: {}: {warning}", path.display());
+    found.iter().map(line).collect()
+}
+
+pub(super) enum PsfFile {
+    Stars(Box<Rows>),
+    Table(PathBuf, String),
+}
+
+impl PsfFile {
+    pub(super) fn finish(self) -> Result<(), FileError> {
+        match self {
+            PsfFile::Stars(image) => image.finish(),
+            PsfFile::Table(path, text) => {
+                first(atomic::write_if_absent(&path, text.as_bytes())?, path)
+            }
+        }
     }
 }
 
