@@ -4,14 +4,13 @@ use clap::{ArgGroup, Args, Subcommand};
 use shearq_challenge::create::{Folders, Plan, Simulation, of_images, simulated};
 use shearq_challenge::inbox;
 use shearq_challenge::judge::Judge;
-use shearq_challenge::kind::{Kind, RankBy};
+use shearq_challenge::kind::{ENTRIES_PER_TEAM, Kind, RankBy};
 use shearq_challenge::page::View;
 use shearq_challenge::ranking::{Decisions, near_copies, rank as ranked};
 use shearq_challenge::seal::{BOARD_FILE, is_open_to_others, verify_public};
 use shearq_challenge::shapes::References;
 use shearq_challenge::terms::{Challenge, Deadline, TUNING_ENTRIES};
-use shearq_dataset::layout::DataFolder;
-use shearq_dataset::layout::MAX_IMAGE;
+use shearq_dataset::layout::{DataFolder, MAX_IMAGE};
 use shearq_files::FileError;
 use shearq_files::open::is_there;
 use shearq_render::escape::line;
@@ -19,8 +18,7 @@ use shearq_results::submit::check::{Finding, Severity, check_sent};
 use shearq_results::submit::{Sent, Submission};
 
 use super::check::report;
-use crate::arguments::{Form, SetList, Threads, page};
-use crate::choices::named;
+use crate::arguments::{Form, SetList, Threads, named, page};
 use crate::progress::{Bar, mark_resumable};
 use crate::{count, tell};
 
@@ -239,9 +237,7 @@ fn new(arguments: &NewArguments) -> anyhow::Result<()> {
         spectra: arguments.spectra,
         contact: arguments.contact.clone(),
         address: arguments.address.clone(),
-        entries_per_team: arguments
-            .entries_per_team
-            .or(arguments.kind.entries_per_team()),
+        entries_per_team: Some(arguments.entries_per_team.unwrap_or(ENTRIES_PER_TEAM)),
         opens: arguments.opens.clone(),
         closes: arguments.closes.clone(),
         partial: arguments.partial,

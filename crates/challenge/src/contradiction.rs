@@ -101,7 +101,7 @@ fn median_bias(firsts: &[First]) -> Zeros {
     }))
 }
 
-// Groups of several sets. The line of those with one shear each passes through their common means.
+// Groups of several sets. The line of sets with one shear each passes through their common means.
 fn together(firsts: &[&First], change: Change) -> Vec<Group> {
     let all: Option<Vec<_>> = firsts.iter().map(|first| means(first, change)).collect();
     let zeros = all.map(|all| {

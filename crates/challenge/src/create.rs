@@ -3,17 +3,16 @@
 use std::path::Path;
 
 use sha2::{Digest, Sha256};
+use shearq_dataset::grid::{read_psfs, write_psfs};
 use shearq_dataset::images::{self, ImageId};
-use shearq_dataset::layout::fill;
-use shearq_dataset::layout::{DataFolder, LAYOUT_FILE};
-use shearq_dataset::psf_table;
+use shearq_dataset::layout::{DataFolder, LAYOUT_FILE, Layout, fill};
 use shearq_dataset::run::SimulationRecord;
-use shearq_dataset::threads::Progress;
-use shearq_dataset::threads::Quiet;
+use shearq_dataset::threads::{Progress, Quiet, ThreadError};
 use shearq_dataset::truth::{ReadTruth, Reading, grid_of_set, read_truth, reading_of, write_truth};
 use shearq_files::fits::{ImageReader, ImageWriter, Value};
 use shearq_files::open::is_there;
 use shearq_files::{FileError, atomic, names_of};
+use shearq_pipeline::PipelineError;
 use shearq_pipeline::simulate::simulate_blind;
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_results::record::SetRecord;
@@ -21,23 +20,92 @@ use shearq_results::score::ScoreError;
 use shearq_scoring::{Choice, Convention, Options, RowCounts, SetImages, SetScorer, TrueShear};
 use shearq_simulate::field::ShearSpectrum;
 use shearq_simulate::set::{STAMP, SimulationSettings};
+use thiserror::Error;
 
-use crate::constant::ConstantShears;
 use crate::contradiction::{First, contradiction};
-use crate::error::{ChallengeError, EXPECTED_RESPONSE};
 use crate::judge::unscored;
-use crate::kind::{Kind, RankBy, response};
+use crate::kind::{ConstantShears, Kind, RankBy, response};
 use crate::page::readme;
 use crate::seal::{Key, close, names, seal_public, sums};
 use crate::shapes::References;
 use crate::terms::{CHALLENGE_FILE, Challenge, Data, Deadline, Rules};
+
+// Significance of the response that a method of ordinary noise must expect. Entries need 3; two more make a refusal by
+// chance unlikely.
+const EXPECTED_RESPONSE: f64 = 5.0;
+
+/// Failure to make a challenge: a file or a measurement, or data and rules by which entries could not be ranked.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum ChallengeError {
+    #[error(transparent)]
+    File(#[from] FileError),
+    #[error(transparent)]
+    Score(#[from] ScoreError),
+    /// Reference images that cannot be simulated or measured.
+    #[error(transparent)]
+    Pipeline(#[from] PipelineError),
+    #[error(transparent)]
+    Threads(#[from] ThreadError),
+    #[error(transparent)]
+    Simulation(#[from] shearq_simulate::set::SettingsError),
+    #[error(
+        "--amplitude 0: without shear, entries cannot be ranked (found 0, expected a positive number)"
+    )]
+    NoShear,
+    #[error(
+        "--closes: the last day is before the first one (found {closes}, expected {opens} or later)"
+    )]
+    ClosesFirst { opens: Deadline, closes: Deadline },
+    #[error("--spectra: {metric} is not defined for power spectra. Try: --metric q or q-corrected")]
+    NotOfSpectra { metric: &'static str },
+    #[error(
+        "--spectra: the response of power spectra follows from differences between sets (found 1 set, expected at least 2)"
+    )]
+    OneSpectrum,
+    #[error("the true shear {}, so {metric} is not defined. Try: --metric {}",
+        if *constant { "is the same for all galaxies of a set" } else { "varies within the sets" },
+        if *constant { "qc, m or c" } else { "q-calibrated, m or c" }
+    )]
+    Undefined {
+        metric: &'static str,
+        constant: bool,
+    },
+    #[error("{0}")]
+    Shears(String),
+    #[error(
+        "noise is measured between images (found 1 image per set, expected at least 2). Try: --images 8"
+    )]
+    OneImage,
+    #[error("{0}. Try: the same command with the right true shear")]
+    Contradiction(String),
+    #[error(
+        "the data are too small to rank entries by {metric}: {of} is expected to be {found:.1}σ from zero (expected at least {EXPECTED_RESPONSE}). Try: {images} images per set, or more galaxies per image"
+    )]
+    SmallResponse {
+        metric: &'static str,
+        of: String,
+        found: f64,
+        // Images that would do.
+        images: f64,
+    },
+    #[error(
+        "the data are too small to rank entries by {metric}: a spectrum without images reaches {template:.0}, a catalogue with the noise of these images about {catalogue:.0}. Try: --metric q-calibrated, or {images} images per set"
+    )]
+    BehindTemplate {
+        metric: &'static str,
+        template: f64,
+        catalogue: f64,
+        images: f64,
+    },
+}
 
 #[derive(Debug, Clone)]
 pub struct Plan {
     pub name: String,
     pub version: u32,
     pub kind: Kind,
-    /// Metric that ranks the entries; `None` for that of the kind, which depends on the true shear.
+    /// Metric that ranks the entries; `None` for the default of the kind, which depends on the true shear.
     pub metric: Option<RankBy>,
     pub spectra: bool,
     pub contact: String,
@@ -71,7 +139,7 @@ const AMPLITUDES: (f64, f64) = (0.5, 2.0);
 // Largest extra slope of the shear power that a seed determines.
 const TILT: f64 = 0.2;
 /// Factor s on bandpowers, log-uniform between 1/s and s. The best spectrum that can be had without images is the median,
-/// with σ_sys = (s − 1)/(s + 1) of that of zero shear: ⟨|x − 1|⟩/⟨x⟩ of a log-uniform x. With 4, no template exceeds 5/3 of
+/// with σ_sys smaller than for zero shear by (s − 1)/(s + 1): ⟨|x − 1|⟩/⟨x⟩ of a log-uniform x. With 4, no template exceeds 5/3 of
 /// the Q of zero shear, and the shear stays weak.
 pub const SCATTER: f64 = 4.0;
 /// Q of the best template relative to the Q of zero shear.
@@ -396,7 +464,7 @@ fn rankable(
         false => vec![&scored],
     };
     for sets in groups {
-        // The response itself is one; that of a single image scatters too much.
+        // The response itself is one; measured on a single image, it scatters too much.
         let (_, error) = response(sets, constant);
         if error * EXPECTED_RESPONSE > 1.0 || error.is_nan() {
             let of = match sets {
@@ -489,8 +557,8 @@ fn copy_image(
         copy_pixels(&mut reader, &public.psf_star(set, image), &numbers[..2])?;
     }
     if is_there(&functional) {
-        let rows = psf_table::read_all(&functional)?;
-        psf_table::write(&public.psf_functional(set, image), &rows)?;
+        let rows = read_psfs(&functional)?;
+        write_psfs(&public.psf_functional(set, image), &rows)?;
     }
     let mut reader = ImageReader::open(data.galaxies(set, image))?;
     let mut header = numbers.to_vec();
@@ -508,7 +576,7 @@ fn copy_pixels(
 ) -> Result<(), FileError> {
     let (width, height) = (from.width(), from.height());
     let mut writer = ImageWriter::create(to, width, height, header)?;
-    // As many rows as fit into a few megabytes.
+    // Rows that fit into a few megabytes.
     let at_a_time = ((1 << 20) / width.max(1)).clamp(1, height.max(1));
     let mut row = 0;
     while row < height {
@@ -529,7 +597,7 @@ fn finish(
     threads: usize,
 ) -> Result<Challenge, ChallengeError> {
     let kind = plan.kind;
-    let layout = layout_text(kind, &data);
+    let layout = layout_text(&data);
     let mut challenge = Challenge {
         name: plan.name.clone(),
         version: plan.version,
@@ -537,7 +605,7 @@ fn finish(
         contact: plan.contact.clone(),
         address: plan.address.clone(),
         seal: String::new(),
-        conventions: kind.conventions(),
+        conventions: Kind::conventions(),
         rules: Rules {
             metric,
             contents: kind.contents(plan.spectra),
@@ -563,8 +631,8 @@ fn finish(
 }
 
 // The layout of the images, without names of truth files.
-fn layout_text(kind: Kind, data: &Data) -> String {
-    let layout = kind.layout();
+fn layout_text(data: &Data) -> String {
+    let layout = Layout::default();
     format!(
         "galaxies = {:?}\npsf_star = {:?}\npsf_functional = {:?}\nfield_degrees = {:?}\nstamp = {}\n",
         layout.galaxies, layout.psf_star, layout.psf_functional, data.field_degrees, data.stamp

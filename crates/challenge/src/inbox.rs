@@ -38,7 +38,7 @@ pub fn find(paths: &[PathBuf]) -> Result<Vec<Sending>, FileError> {
             let message = "there is no such file or folder; expected archives (.tar.gz) or folders of entries";
             return Err(FileError::new(path, message));
         }
-        // Catalogues of `measure` have other names and contents than those of an entry.
+        // Catalogues of `measure` have other names and contents than catalogues of an entry.
         if path.join(RUN_FILE).is_file() {
             let message = format!(
                 "this folder was written by `measure` or `run`; expected an entry. Try: shearq pack --measured {0} --out {0}.tar.gz",

@@ -25,10 +25,9 @@ use shearq_scoring::{
 };
 use shearq_submissions::check_name;
 
-use crate::constant::ConstantShears;
-use crate::error::ChallengeError;
+use crate::create::ChallengeError;
 use crate::inbox::{Content, Sending, content, identify};
-use crate::kind::response;
+use crate::kind::{ConstantShears, response};
 use crate::seal::{Key, Receipt, verify, verify_public};
 use crate::shapes::{References, sketch, sketch_of_spectra};
 use crate::terms::{Challenge, now};
@@ -73,10 +72,10 @@ pub struct Entry {
     pub withdrawn: Option<String>,
 }
 
-/// Key of the sketch of spectra, of all sets together: the eight numbers of one are not enough to tell a copy.
+/// Key of the sketch of spectra, of all sets together: the eight numbers of one set cannot identify a copy.
 pub const SPECTRA: &str = "spectra";
 
-// A store keeps entries and runs in one format. The settings of an entry start with this, those of a run do not.
+// A store keeps entries and runs in one format. Only the settings of an entry start with this.
 const ENTRY_SETTINGS_PREFIX: &str = "[entry]\n";
 
 #[derive(Serialize, Deserialize)]

@@ -1,16 +1,14 @@
-//! Kinds of challenges: what differs between them, and the metrics that rank entries.
+//! Kinds of challenges: what differs between them, and the metrics that rank entries. Challenges whose sets have one shear for all
+//! galaxies determine m and c from the sets, as GREAT3.
 
 use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
-use shearq_dataset::layout::Layout;
 use shearq_results::compare::Paired;
 use shearq_results::record::{SetRecord, mean};
 use shearq_results::submit::Contents;
-use shearq_scoring::Definition;
-use shearq_scoring::great3::Observation;
-
-use crate::constant::ConstantShears;
+use shearq_scoring::great3::{Observation, REQUIRED_C, REQUIRED_M};
+use shearq_scoring::{Definition, Line, TrueShear};
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -167,6 +165,10 @@ pub fn response(sets: &[SetRecord], constant: Option<&ConstantShears>) -> (f64, 
     }
 }
 
+/// Most entries of a team, unless the organiser chooses another number.
+// Published values determine the truth entry by entry (docs/run-a-challenge.md).
+pub const ENTRIES_PER_TEAM: u32 = 10;
+
 /// A kind of challenge: all in which challenges of different kinds differ. Its values are the defaults of a new challenge.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -174,7 +176,7 @@ pub enum Kind {
     /// The Galaxy Challenge of GREAT10 (Kitching et al. 2012): 24 sets with a variable shear field each.
     Great10,
     /// Sets with one shear each, ranked by Q_c, as the branches of GREAT3 with constant shear (Mandelbaum et al. 2014). The images
-    /// are those of GREAT10's layout.
+    /// have GREAT10's layout.
     Great3,
 }
 
@@ -219,39 +221,24 @@ impl Kind {
         }
     }
 
-    /// Most entries of a team; `None` for any number.
-    pub fn entries_per_team(self) -> Option<u32> {
-        match self {
-            // Published values determine the truth entry by entry (docs/run-a-challenge.md).
-            Kind::Great10 | Kind::Great3 => Some(10),
-        }
-    }
-
-    /// Names of images and PSFs.
-    pub fn layout(self) -> Layout {
-        match self {
-            Kind::Great10 | Kind::Great3 => Layout::default(),
-        }
-    }
-
-    pub fn conventions(self) -> BTreeMap<String, String> {
-        let conventions = match self {
-            Kind::Great10 | Kind::Great3 => [
-                (
-                    "positions",
-                    "FITS pixels of the stamp centre; the first pixel of an image has its centre at 1",
-                ),
-                (
-                    "ellipticity",
-                    "shear type: (a - b)/(a + b) for an ellipse with the axes a and b",
-                ),
-                ("e1", "positive along x"),
-                ("e2", "positive along x = y"),
-                ("power", "l^2 C_l / (2 pi) with l in radian^-1"),
-            ],
-        };
-        let owned = |(name, text): (&str, &str)| (name.to_owned(), text.to_owned());
-        conventions.map(owned).into()
+    /// Conventions of entries, for participants: GREAT10's, for all kinds.
+    pub fn conventions() -> BTreeMap<String, String> {
+        let conventions = [
+            (
+                "positions",
+                "FITS pixels of the stamp centre; the first pixel of an image has its centre at 1",
+            ),
+            (
+                "ellipticity",
+                "shear type: (a - b)/(a + b) for an ellipse with the axes a and b",
+            ),
+            ("e1", "positive along x"),
+            ("e2", "positive along x = y"),
+            ("power", "l^2 C_l / (2 pi) with l in radian^-1"),
+        ];
+        conventions
+            .map(|(name, text)| (name.to_owned(), text.to_owned()))
+            .into()
     }
 
     /// Rules for participants, one sentence each.
@@ -266,5 +253,200 @@ impl Kind {
                 "All galaxies of a set have one shear; no two sets have the same.",
             ],
         }
+    }
+}
+
+// Fewest sets for m and c of a component: two for the line, and one that the line does not pass through by
+// construction. With its mean ellipticities and three published values, a team can solve for one shear.
+const MIN_SETS: usize = 3;
+
+#[derive(Debug, Clone, PartialEq)]
+pub struct ConstantShears(BTreeMap<u32, [f64; 2]>);
+
+pub type Measured = (f64, f64);
+
+impl ConstantShears {
+    /// `None` if the shear of every set varies.
+    pub fn of<'a>(
+        truths: impl IntoIterator<Item = (u32, &'a TrueShear)>,
+    ) -> Result<Option<Self>, String> {
+        let all: Vec<(u32, Option<[f64; 2]>)> = truths
+            .into_iter()
+            .map(|(set, truth)| (set, truth.constant()))
+            .collect();
+        let shears: BTreeMap<u32, [f64; 2]> = all
+            .iter()
+            .filter_map(|(set, shear)| Some((*set, (*shear)?)))
+            .collect();
+        if shears.is_empty() {
+            return Ok(None);
+        }
+        if let Some((set, _)) = all.iter().find(|(_, shear)| shear.is_none()) {
+            return Err(format!(
+                "the true shear is constant in {} of {} sets and varies in set {set}; expected one kind of sets",
+                shears.len(),
+                all.len()
+            ));
+        }
+        for k in 0..2 {
+            let mut values: Vec<f64> = shears.values().map(|shear| shear[k]).collect();
+            values.sort_by(f64::total_cmp);
+            values.dedup();
+            if values.len() < MIN_SETS {
+                return Err(format!(
+                    "constant shears need at least {MIN_SETS} sets with different g{} to separate m from c (found {})",
+                    k + 1,
+                    values.len()
+                ));
+            }
+        }
+        Ok(Some(ConstantShears(shears)))
+    }
+
+    /// m and c of component `k` (0 or 1): least squares of ⟨e⟩ − g = m·g + c over the sets, unweighted as in GREAT3. Errors
+    /// follow from the scatter of galaxies, or from the residuals if these are larger.
+    pub fn bias(&self, sets: &[SetRecord], k: usize) -> (Measured, Measured) {
+        let (mut points, mut errors) = (Vec::new(), Vec::new());
+        for set in sets {
+            if let Some(g) = self.0.get(&set.set) {
+                let of = |metrics: &shearq_scoring::Metrics| [metrics.c1, metrics.c2][k];
+                points.push((g[k], of(&set.metrics)));
+                errors.push(of(&set.errors));
+            }
+        }
+        let line = Line::through(&points);
+        let error = |which: usize| {
+            let each = points.iter().zip(&errors);
+            let derivative = |g: f64| line.derivatives(g)[which];
+            let scatter = each.map(|((g, _), error)| (derivative(*g) * error).powi(2));
+            let fit = points.iter().map(|(g, _)| derivative(*g).powi(2));
+            let (scatter, fit) = (scatter.sum::<f64>(), line.variance() * fit.sum::<f64>());
+            // Galaxies that are shrunk towards their mean scatter less, but the means of the sets do not. An unknown scatter stays
+            // unknown.
+            if fit > scatter {
+                fit.sqrt()
+            } else {
+                scatter.sqrt()
+            }
+        };
+        ((line.slope, error(1)), (line.intercept, error(0)))
+    }
+
+    pub fn biases(&self, sets: &[SetRecord]) -> [(Measured, Measured); 2] {
+        [self.bias(sets, 0), self.bias(sets, 1)]
+    }
+
+    /// GREAT3's Q_c (Mandelbaum et al. 2014, ApJS 212, 5) with σ² = 4 of its ground branches, and its error to first order.
+    /// Components are along the pixel axes; GREAT3 rotates them to the PSF, which does not change the term of c.
+    pub fn q_c(&self, sets: &[SetRecord]) -> Measured {
+        let biases = self.biases(sets);
+        let q = |biases| Observation::Ground.q_c(biases);
+        let best = q(biases.map(|(m, c)| [c.0, m.0]));
+        // ∂Q/∂b = −Q³b/(Q₀·requirement)² for each bias b, Q₀ being Q times the root.
+        let perfect = q([[0.0; 2]; 2]);
+        let variance: f64 = biases
+            .iter()
+            .flat_map(|(m, c)| [(m, REQUIRED_M), (c, REQUIRED_C)])
+            .map(|((value, error), required)| (value * error / (required * required)).powi(2))
+            .sum();
+        (
+            best,
+            best.powi(3) / (4.0 * perfect * perfect) * variance.sqrt(),
+        )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ndarray::Array2;
+    use shearq_scoring::Metrics;
+
+    fn shear(g1: f64, g2: f64) -> TrueShear {
+        let all = |g| Array2::from_elem((8, 8), g);
+        TrueShear {
+            g1: all(g1),
+            g2: all(g2),
+        }
+    }
+
+    // Three shears of both signs.
+    const SHEARS: [[f64; 2]; 3] = [[0.02, -0.01], [-0.03, 0.01], [0.04, 0.03]];
+
+    fn shears() -> ConstantShears {
+        let truths = SHEARS.map(|[g1, g2]| shear(g1, g2));
+        ConstantShears::of((1..).zip(&truths)).unwrap().unwrap()
+    }
+
+    // Sets with the biases m and c, and errors of 10⁻⁴ of each mean.
+    fn sets(m: [f64; 2], c: [f64; 2]) -> Vec<SetRecord> {
+        let set = |(number, g): (u32, [f64; 2])| {
+            let (mut metrics, mut errors) = (Metrics::unknown(), Metrics::unknown());
+            metrics.c1 = m[0] * g[0] + c[0];
+            metrics.c2 = m[1] * g[1] + c[1];
+            (errors.c1, errors.c2) = (1e-4, 1e-4);
+            SetRecord {
+                metrics,
+                errors,
+                ..crate::ranking::tests::record(number, 0.0, &[])
+            }
+        };
+        (1..).zip(SHEARS).map(set).collect()
+    }
+
+    #[test]
+    fn m_c_and_q_c_are_those_of_the_shears() {
+        let found = shears().biases(&sets([0.01, -0.02], [3e-4, 0.0]));
+        for ((m, c), expected) in found.iter().zip([(0.01, 3e-4), (-0.02, 0.0)]) {
+            assert!((m.0 - expected.0).abs() < 1e-12 && (c.0 - expected.1).abs() < 1e-14);
+        }
+        // Σ(g − ⟨g⟩)² of 0.02, −0.03, 0.04 is 0.0026, and ⟨g⟩ = 0.01.
+        let (m, c) = found[0];
+        assert!((m.1 - 1e-4 / 0.0026f64.sqrt()).abs() < 1e-12, "{m:?}");
+        let expected = 1e-4 * (1.0 / 3.0 + 1e-4 / 0.0026f64).sqrt();
+        assert!((c.1 - expected).abs() < 1e-12, "{c:?}");
+        // No submission can pass 1232; zero shear has m = −1: 2464/√(2·500² + 4).
+        assert!((shears().q_c(&sets([0.0; 2], [0.0; 2])).0 - 1232.0).abs() < 1e-9);
+        let zero = shears().q_c(&sets([-1.0; 2], [0.0; 2])).0;
+        assert!((zero - 2464.0 / 500_004f64.sqrt()).abs() < 1e-9, "{zero}");
+    }
+
+    #[test]
+    fn small_scatter_of_galaxies_does_not_forge_errors() {
+        // Residuals that are orthogonal to 1 and g change neither m nor c.
+        let g: Vec<f64> = SHEARS.iter().map(|shear| shear[0]).collect();
+        let apart = [g[1] - g[2], g[2] - g[0], g[0] - g[1]].map(|r| 0.01 * r);
+        let mut sets = sets([0.01, 0.0], [0.0, 0.0]);
+        for (set, apart) in sets.iter_mut().zip(apart) {
+            set.metrics.c1 += apart;
+            set.errors.c1 *= 0.02;
+        }
+        let (m, c) = shears().bias(&sets, 0);
+        assert!((m.0 - 0.01).abs() < 1e-12 && c.0.abs() < 1e-14);
+        // One degree of freedom; Σ(g − ⟨g⟩)² = 0.0026.
+        let residual = apart.iter().map(|r| r * r).sum::<f64>().sqrt();
+        assert!((m.1 - residual / 0.0026f64.sqrt()).abs() < 1e-12, "{m:?}");
+        let expected = residual * (1.0 / 3.0 + 1e-4 / 0.0026f64).sqrt();
+        assert!((c.1 - expected).abs() < 1e-12, "{c:?}");
+    }
+
+    #[test]
+    fn shears_that_do_not_separate_m_from_c_are_refused() {
+        let refused = |truths: &[TrueShear]| ConstantShears::of((1..).zip(truths)).unwrap_err();
+        let one = refused(&[shear(0.02, -0.01)]);
+        assert!(one.contains("at least 3 sets with different g1"), "{one}");
+        let same = refused(&[shear(0.02, 0.0), shear(0.01, 0.0), shear(0.03, 0.0)]);
+        assert!(
+            same.contains("different g2 to separate m from c (found 1)"),
+            "{same}"
+        );
+        let mut varies = shear(0.02, 0.01);
+        varies.g1[(0, 0)] = 0.0;
+        let mixed = refused(&[shear(0.02, -0.01), varies.clone()]);
+        assert!(
+            mixed.contains("constant in 1 of 2 sets and varies in set 2"),
+            "{mixed}"
+        );
+        assert_eq!(ConstantShears::of([(1, &varies)]), Ok(None));
     }
 }

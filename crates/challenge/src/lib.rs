@@ -1,7 +1,6 @@
 //! Blind challenges of shape measurement.
 //!
-//! * [`kind`] has the rules of each kind of challenge, and the metrics that rank entries; [`constant`] m and c of sets with
-//!   one shear each.
+//! * [`kind`] has the rules of each kind of challenge, and the metrics that rank entries.
 //! * [`terms`] is the machine-readable description of a challenge, `challenge.toml`.
 //! * [`create`] writes the public and the private folder; [`seal`] ties them together and signs arrivals.
 //! * [`shapes`] compares an entry with the public images, without the true shear.
@@ -9,10 +8,8 @@
 //!   leaderboard.
 #![forbid(unsafe_code)]
 
-pub mod constant;
 mod contradiction;
 pub mod create;
-pub mod error;
 pub mod inbox;
 pub mod judge;
 pub mod kind;

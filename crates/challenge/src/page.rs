@@ -10,9 +10,8 @@ use shearq_render::table::{Cell, Table, TableFormat};
 use shearq_results::submit::Kind as FileKind;
 use shearq_results::views::comparison::q_per_set;
 
-use crate::constant::ConstantShears;
 use crate::judge::{EntryInfo, Refused};
-use crate::kind::RankBy;
+use crate::kind::{ConstantShears, RankBy};
 use crate::ranking::{Board, Leaderboard, NearCopy, Standing, better, rounded};
 use crate::terms::Challenge;
 
@@ -47,7 +46,7 @@ fn key(metric: RankBy) -> (&'static str, &'static str) {
     }
 }
 
-// The next larger number with so many decimals, so that no error becomes zero.
+// Rounded up to this number of decimals, so that no error becomes zero.
 fn rounded_up(error: f64, digits: usize) -> f64 {
     let least = 0.5 * 10f64.powi(-(digits as i32));
     match error > 0.0 {
@@ -56,7 +55,7 @@ fn rounded_up(error: f64, digits: usize) -> f64 {
     }
 }
 
-// A number with the decimals that its error determines, at most `most`, and their number. More decimals would tell how an
+// A number with the decimals that its error determines, at most `most`, and their number. More decimals would show how an
 // entry with one known mode follows the true shear: over 10 such modes, the correlation of |m| with the truth was
 // 0.9999998. `None` without an error.
 fn rounded_to_error(value: f64, error: f64, most: usize) -> Option<(f64, usize)> {
@@ -128,7 +127,7 @@ impl View<'_> {
             false => "catalogues".into(),
         });
         add("files", "files", Cell::Empty, &files);
-        // One cell would give the error two digits, and the value as many decimals.
+        // One cell would give the error two digits, and the value the same decimals.
         let value = |value: f64| Cell::number(rounded(value, digits), digits);
         let (of_value, of_error) = key(metric);
         add(of_value, metric.label(), value(zero), &|standing| {

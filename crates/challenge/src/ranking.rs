@@ -7,9 +7,8 @@ use serde::Deserialize;
 use shearq_files::FileError;
 use shearq_results::compare::difference;
 
-use crate::constant::ConstantShears;
 use crate::judge::{Entry, EntryInfo};
-use crate::kind::RankBy;
+use crate::kind::{ConstantShears, RankBy};
 use crate::seal::{BOARD_FILE, Key, read_toml};
 use crate::terms::{Challenge, Deadline};
 
@@ -44,7 +43,7 @@ pub enum Board {
     Main,
     /// Entries after the deadline. The truth may have become known.
     Late,
-    /// Entries of some sets. They have no rank, because means over other sets, of which some are easier, do not compare.
+    /// Entries of some sets. They have no rank, because some sets are easier than others and means over them do not compare.
     Partial,
 }
 
@@ -89,7 +88,7 @@ pub fn rank<'a>(
             error,
         };
         if info.reference && entry.withdrawn.is_none() {
-            // Each reference has its own line.
+            // Each reference has a line.
             firsts.entry(&info.content).or_insert(info);
             let own = teams.entry((Board::Main, true, info.sha256.as_str()));
             own.or_default().push(result);
@@ -216,7 +215,7 @@ pub(crate) fn better(metric: RankBy, a: f64, b: f64) -> bool {
 // This error is the smallest of three. The jackknife of the paired difference over the same images is right if both entries
 // respond to the images alike; for an entry with shapes in one of eight images, whose Q was
 // 171.8 ± 20.7, it exceeded the lead of 154 over 17.9 ± 1.7. The quadratic sum of both errors neglects common noise, so it is an upper limit. In that sum, the error of
-// `other` counts at most as much as that of `best`: otherwise an entry with much noise would share every rank.
+// `other` is limited to the error of `best`: otherwise an entry with much noise would share every rank.
 fn equal(metric: RankBy, best: &Scored<'_>, other: &Scored<'_>) -> bool {
     let gap = other.value - best.value;
     let apart = best.error.hypot(other.error.min(best.error));
@@ -320,7 +319,7 @@ pub struct Decisions {
 }
 
 impl Decisions {
-    /// Reads the decisions in a private folder; without a file there are none.
+    /// Reads the decisions in a private folder; without a file, nothing is decided.
     pub fn read(private: &Path) -> Result<Self, FileError> {
         let decisions = read_toml(&private.join(BOARD_FILE), "decisions")?;
         Ok(decisions.unwrap_or_default())
@@ -371,7 +370,7 @@ impl Decisions {
         for team in &teams {
             let name = match (self.aliases.get(team), self.anonymous) {
                 (Some(alias), _) => alias.clone(),
-                // Neither the order of arrival nor the rank may tell the name, and it stays from board to board.
+                // The name depends neither on the order of arrival nor on the rank, and is the same on every board.
                 (None, true) => format!("team {}", &key.sign("team", &[team])[..6]),
                 (None, false) => team.clone(),
             };

@@ -17,7 +17,7 @@ use shearq_dataset::threads::Pool;
 use shearq_files::{FileError, atomic, open};
 use shearq_results::submit::FileSum;
 
-use crate::error::ChallengeError;
+use crate::create::ChallengeError;
 use crate::terms::{CHALLENGE_FILE, Challenge};
 
 /// Checksums of the public files, in the format of `sha256sum`.
@@ -92,7 +92,7 @@ impl Key {
     }
 }
 
-// Reads the file of a `thing`; `None` if there is none.
+// Reads the file of a `thing`; `None` if it is absent.
 pub(crate) fn read_toml<T: DeserializeOwned>(
     path: &Path,
     thing: &str,

@@ -367,9 +367,9 @@ fn restored(path: &Path, key: &Key, set: u32, grid: &Grid) -> Result<ShapesOfIma
     Ok(images)
 }
 
-// Faults of the images of a set, with the numbers of their images.
+// What is wrong in a set, each with the numbers of the images.
 fn faults(mut compared: Vec<(u32, Option<Fault>, f64)>) -> Vec<(Fault, Vec<u32>)> {
-    // Images with a fault have no slope to compare with.
+    // Only images that agree with the reference have a slope to compare with.
     let sound = |fault: &Option<Fault>| matches!(fault, None | Some(Fault::Distortion { .. }));
     let slopes = compared.iter().filter(|(_, fault, _)| sound(fault));
     let mut slopes: Vec<f64> = slopes.map(|(.., slope)| *slope).collect();
@@ -402,7 +402,7 @@ fn ranges(numbers: &[u32]) -> String {
     texts.collect::<Vec<_>>().join(",")
 }
 
-// A fault of `images` in words. `file` is the first of them.
+// What is wrong with `images`, in words. `file` is the first of them.
 fn finding(fault: Fault, images: &[u32], sent: &Sent, file: &Path) -> Finding {
     let (check, message) = match fault {
         Fault::Convention(convention) => (
