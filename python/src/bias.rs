@@ -6,7 +6,6 @@ use numpy::PyReadonlyArray1;
 use pyo3::exceptions::{PyFileNotFoundError, PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use shearq_bias::Design;
-use shearq_dataset::truth::word;
 use shearq_files::frames::frame;
 use shearq_files::frames::polars::Column;
 use shearq_files::table::Place;
@@ -20,16 +19,10 @@ use shearq_results::expression::{Expression, ExpressionError};
 use shearq_results::views::bias::bias_table;
 use shearq_scoring::TruthSign;
 
-use crate::errors::in_python;
+use crate::errors::{chosen, in_python};
 
 pub(crate) fn sign_of(name: &str) -> PyResult<TruthSign> {
-    let signs = [TruthSign::Standard, TruthSign::Challenge];
-    let found = signs.into_iter().find(|sign| word(*sign) == name);
-    found.ok_or_else(|| {
-        PyValueError::new_err(format!(
-            "truth_sign: found '{name}'; expected 'standard' or 'challenge'"
-        ))
-    })
+    chosen("truth_sign", name, r#""standard" or "challenge""#)
 }
 
 fn of_bias(error: BiasFailure) -> PyErr {

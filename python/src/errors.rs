@@ -1,7 +1,8 @@
 //! Errors of the crates as exceptions that name the argument.
 
-use pyo3::PyErr;
 use pyo3::exceptions::{PyKeyError, PyMemoryError, PyRuntimeError, PyValueError};
+use pyo3::{PyErr, PyResult};
+use serde::de::DeserializeOwned;
 use shearq_measure::{MeasureError, Warning};
 use shearq_pipeline::PipelineError;
 use shearq_scoring::ScoringError;
@@ -68,4 +69,14 @@ pub(crate) fn in_python(message: &str) -> String {
 // Reserving the largest arrays first turns an absurd number of images into an exception instead of an abort of the interpreter.
 pub(crate) fn no_memory(what: &str) -> PyErr {
     PyMemoryError::new_err(format!("there is no memory for {what}"))
+}
+
+// A value by the name that records give it.
+pub(crate) fn chosen<T: DeserializeOwned>(
+    argument: &str,
+    name: &str,
+    expected: &str,
+) -> PyResult<T> {
+    let found = serde_json::from_value(name.into());
+    found.map_err(|_| PyValueError::new_err(format!("{argument}: {name:?}; expected {expected}")))
 }

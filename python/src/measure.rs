@@ -331,17 +331,14 @@ pub(crate) fn mean_shear(
 ) -> PyResult<Mean> {
     let mut sum = ShearSum::default();
     let mut shares = vec![[0.0; 2]; stars.len()];
-    let e = e1.as_slice()?.iter().zip(e2.as_slice()?);
-    let weighted = weights.as_slice()?.iter().zip(places.as_slice()?);
-    let [r11, r22, r12, r21] = &responses;
-    let own = r11.as_slice()?.iter().zip(r22.as_slice()?);
-    let other = r12.as_slice()?.iter().zip(r21.as_slice()?);
-    for (((&e1, &e2), ((&r11, &r22), (&r12, &r21))), (&weight, &place)) in
-        e.zip(own.zip(other)).zip(weighted)
-    {
-        sum.add([e1, e2], [[r11, r12], [r21, r22]], weight);
-        shares[place as usize][0] += weight * r11;
-        shares[place as usize][1] += weight * r22;
+    let (e1, e2, weights) = (e1.as_array(), e2.as_array(), weights.as_array());
+    let [r11, r22, r12, r21] = responses.each_ref().map(|column| column.as_array());
+    for (k, &place) in places.as_array().iter().enumerate() {
+        let weight = weights[k];
+        let response = [[r11[k], r12[k]], [r21[k], r22[k]]];
+        sum.add([e1[k], e2[k]], response, weight);
+        shares[place as usize][0] += weight * r11[k];
+        shares[place as usize][1] += weight * r22[k];
     }
     // Galaxies behind one star share its noise, so that their errors do not average: each star adds with its share of the response.
     let mut noise = Stars::default();

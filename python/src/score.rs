@@ -20,7 +20,7 @@ use shearq_scoring::{
 };
 
 use crate::bias::sign_of;
-use crate::errors::of_scoring;
+use crate::errors::{chosen, of_scoring};
 
 /// Names, headings and meanings of the metrics.
 #[pyfunction]
@@ -36,13 +36,7 @@ fn grid(n: usize, stamp: f64, field_degrees: f64) -> PyResult<Grid> {
 }
 
 fn definition(name: &str) -> PyResult<Definition> {
-    match name {
-        "leaderboard" => Ok(Definition::Leaderboard),
-        "corrected" => Ok(Definition::Corrected),
-        other => Err(PyValueError::new_err(format!(
-            "definition: {other:?}; expected \"leaderboard\" or \"corrected\""
-        ))),
-    }
+    chosen("definition", name, r#""leaderboard" or "corrected""#)
 }
 
 fn choice(name: &str) -> PyResult<Choice> {

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
-use shearq_submissions::{EllipticityType, Entry, NoiseSource, PsfForm, Published, Registry};
+use shearq_submissions::{Entry, Published, Registry};
 
 use crate::errors::of_configuration;
 
@@ -71,44 +71,18 @@ impl Configuration {
         })
     }
 
-    /// Its state, for pickle.
+    /// Its state, from which the package takes its properties.
     #[getter]
     fn parts(&self) -> PyResult<Parts> {
-        Ok((
-            self.settings()?,
-            self.entry.extends.clone(),
-            self.published(),
-        ))
-    }
-
-    #[getter]
-    fn name(&self) -> &str {
-        &self.entry.configuration.name
-    }
-
-    #[getter]
-    fn description(&self) -> &str {
-        &self.entry.configuration.description
-    }
-
-    #[getter]
-    fn extends(&self) -> Option<&str> {
-        self.entry.extends.as_deref()
-    }
-
-    /// Q, M/2 and √A·10⁴ as published.
-    #[getter]
-    fn published(&self) -> Option<(f64, f64, f64)> {
-        self.entry
-            .published
-            .map(|Published { q, m_half, sqrt_a }| (q, m_half, sqrt_a))
-    }
-
-    /// All settings as JSON.
-    #[getter]
-    fn settings(&self) -> PyResult<String> {
-        serde_json::to_string(&self.entry.configuration)
-            .map_err(|error| PyValueError::new_err(error.to_string()))
+        let Entry {
+            configuration,
+            published,
+            extends,
+        } = &self.entry;
+        let settings = serde_json::to_string(configuration)
+            .map_err(|error| PyValueError::new_err(error.to_string()))?;
+        let published = published.map(|Published { q, m_half, sqrt_a }| (q, m_half, sqrt_a));
+        Ok((settings, extends.clone(), published))
     }
 
     /// All settings as TOML.
@@ -116,34 +90,6 @@ impl Configuration {
     fn toml(&self) -> PyResult<String> {
         toml::to_string(&self.entry.configuration)
             .map_err(|error| PyValueError::new_err(error.to_string()))
-    }
-
-    /// Pixels a side of the piece of a stamp, and of a PSF stamp, that are used.
-    #[getter]
-    fn sizes(&self) -> (usize, usize) {
-        let configuration = &self.entry.configuration;
-        (configuration.stamp.size, configuration.psf.size)
-    }
-
-    /// Whether it takes PSFs by their formula.
-    #[getter]
-    fn functional(&self) -> bool {
-        self.entry.configuration.psf.form == PsfForm::Functional
-    }
-
-    /// Whether the noise level has to be given.
-    #[getter]
-    fn needs_noise(&self) -> bool {
-        self.entry.configuration.noise == NoiseSource::Header
-    }
-
-    /// `shear` or `distortion`.
-    #[getter]
-    fn ellipticity(&self) -> &'static str {
-        match self.entry.configuration.ellipticity() {
-            EllipticityType::Shear => "shear",
-            EllipticityType::Distortion => "distortion",
-        }
     }
 }
 

@@ -12,6 +12,8 @@ use shearq_files::frames::polars::Column;
 use shearq_files::frames::{frame, reals};
 use shearq_files::table::{self, FileFormat, MAX_ROWS};
 
+use crate::errors::chosen;
+
 // Python's own exception for a wrong path, because scripts catch it.
 fn of_file(path: &std::path::Path, error: &FileError) -> PyErr {
     if path.exists() {
@@ -22,13 +24,7 @@ fn of_file(path: &std::path::Path, error: &FileError) -> PyErr {
 }
 
 fn format(name: &str) -> PyResult<FileFormat> {
-    match name {
-        "parquet" => Ok(FileFormat::Parquet),
-        "fits" => Ok(FileFormat::Fits),
-        other => Err(PyValueError::new_err(format!(
-            "format: {other:?}; expected \"parquet\" or \"fits\""
-        ))),
-    }
+    chosen("format", name, r#""parquet" or "fits""#)
 }
 
 /// The columns of numbers of a table by name, and those of the metadata `keys` that it has.

@@ -340,5 +340,5 @@ def test_the_sign_of_g2_in_a_table_is_stated_significant_or_refused(tmp_path):
         assert any(why in note for note in bias(noise, comment, **options).notes), why
     with pytest.raises(ValueError, match='cannot determine the sign of g2.*Try: truth_sign="standard"'):
         bias(0.3)
-    with pytest.raises(ValueError, match="truth_sign: found 'other'"):
+    with pytest.raises(ValueError, match="truth_sign: \"other\""):
         bias(0.3, truth_sign="other")

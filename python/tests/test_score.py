@@ -185,7 +185,7 @@ WRONG = [
     (dict(field_degrees=0), "field_degrees: found 0.0; expected a positive number, at most 360"),
     (dict(field_degrees=1e17), "field_degrees: found 1e"),
     (dict(noise_variance=-1), "noise_variance: found -1.0; expected a finite number, zero or more"),
-    (dict(truth_sign="other"), "truth_sign: found 'other'"),
+    (dict(truth_sign="other"), "truth_sign: \"other\""),
 ]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import os
 from collections.abc import Mapping
@@ -37,27 +38,29 @@ class Configuration:
         The type of e1 and e2.
     """
 
-    __slots__ = ("_resolved",)
-
-    _resolved: _shearq.Configuration
+    __slots__ = ("_extends", "_published", "_resolved", "_settings")
 
     def __init__(self, resolved: _shearq.Configuration) -> None:
         self._resolved = resolved
+        settings, self._extends, self._published = resolved.parts
+        self._settings: dict[str, Any] = json.loads(settings)
 
     @property
     def name(self) -> str:
         """What the configuration is called."""
-        return self._resolved.name
+        name: str = self._settings["name"]
+        return name
 
     @property
     def description(self) -> str:
         """What it is."""
-        return self._resolved.description
+        description: str = self._settings["description"]
+        return description
 
     @property
     def extends(self) -> str | None:
         """What it inherits from."""
-        return self._resolved.extends
+        return self._extends
 
     @property
     def toml(self) -> str:
@@ -67,38 +70,41 @@ class Configuration:
     @property
     def stamp_size(self) -> int:
         """Pixels per side of the part of a stamp that is used."""
-        return self._resolved.sizes[0]
+        size: int = self._settings["stamp"]["size"]
+        return size
 
     @property
     def psf_size(self) -> int:
         """Pixels per side of the part of a PSF stamp that is used."""
-        return self._resolved.sizes[1]
+        size: int = self._settings["psf"]["size"]
+        return size
 
     @property
     def psf_form(self) -> Literal["star", "functional"]:
         """The PSFs that the command line uses with it."""
-        return "functional" if self._resolved.functional else "star"
+        form: Literal["star", "functional"] = self._settings["psf"]["form"]
+        return form
 
     @property
     def needs_noise(self) -> bool:
         """Whether the noise level must be given."""
-        return self._resolved.needs_noise
+        return bool(self._settings["noise"]["source"] == "header")
 
     @property
     def ellipticity(self) -> Literal["shear", "distortion"]:
         """The type of e1 and e2."""
-        return "distortion" if self._resolved.ellipticity == "distortion" else "shear"
+        ellipticity: Literal["shear", "distortion"] = self._settings["shape"]["ellipticity"]
+        return ellipticity
 
     @property
     def settings(self) -> dict[str, Any]:
         """All settings, section by section."""
-        settings: dict[str, Any] = json.loads(self._resolved.settings)
-        return settings
+        return copy.deepcopy(self._settings)
 
     @property
     def published(self) -> dict[str, float] | None:
         """Published metrics ``q``, ``m_half`` (M/2) and ``sqrt_a`` (√A in 10⁻⁴); None if there are none."""
-        metrics = self._resolved.published
+        metrics = self._published
         return None if metrics is None else dict(zip(("q", "m_half", "sqrt_a"), metrics))
 
     def __reduce__(self) -> tuple[Any, ...]:
