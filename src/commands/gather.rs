@@ -2,7 +2,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 
-use crate::choices::named;
+use crate::arguments::named;
 use crate::{count, tell};
 use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::DataFolder;

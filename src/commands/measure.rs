@@ -10,8 +10,7 @@ use shearq_measure::Flag;
 use shearq_pipeline::measure::{FolderMeasurement, Summary, all_flagged};
 use shearq_submissions::Registry;
 
-use crate::arguments::{SetList, Sharding, Threads, sets_of};
-use crate::choices::named;
+use crate::arguments::{SetList, Sharding, Threads, named, sets_of};
 use crate::progress::{Bar, mark_resumable};
 use crate::{count, tell, tell_unread};
 

@@ -6,7 +6,7 @@ use shearq_files::open::{SETTINGS, read_to_string};
 use shearq_submissions::check_name;
 
 use super::published;
-use crate::choices::named;
+use crate::arguments::named;
 use crate::progress::Bar;
 use crate::{count, tell, tell_unread};
 use shearq_dataset::fingerprint;

@@ -8,8 +8,9 @@ use shearq_scoring::{Noise, Options, SetScorer, TruthSign};
 use shearq_submissions::EllipticityType;
 
 use super::published;
-use crate::arguments::{Printing, ReportFile, ScoreSettings, SetList, Threads, positive, sets_of};
-use crate::choices::named;
+use crate::arguments::{
+    Printing, ReportFile, ScoreSettings, SetList, Threads, named, positive, sets_of,
+};
 use crate::{print, tell, tell_unread};
 use shearq_dataset::layout::DataFolder;
 use shearq_dataset::run::{Run, Source, kind_of};
@@ -23,7 +24,7 @@ use shearq_results::published::Truth;
 use shearq_results::record::{RunRecord, SetRecord};
 use shearq_results::score::{ScoredSet, score_catalogues, score_files, unscored};
 use shearq_results::store;
-use shearq_results::submit::{Manifest, Packed, Sent, Submission, read_bandpowers};
+use shearq_results::submit::{Packed, Sent, Submission, read_bandpowers};
 use shearq_results::views::comparison::verdict_line;
 use shearq_results::views::pages;
 use shearq_results::views::scores::{SetInput, one_set_json, per_set, spectra};
@@ -213,6 +214,7 @@ fn catalogues(
             let sent = Sent::open(path)?;
             let submission = Submission::read(&sent)?;
             if let Packed::Spectra(files) = &submission.packed {
+                let files = files.clone();
                 return packed_spectra(arguments, &data, &sent, &submission, files, options);
             }
             (Catalogues::packed(sent, submission, &data)?, data)
@@ -299,7 +301,7 @@ fn packed_spectra(
     data: &DataFolder,
     sent: &Sent,
     submission: &Submission,
-    files: &BTreeMap<u32, PathBuf>,
+    mut files: BTreeMap<u32, PathBuf>,
     options: Options,
 ) -> anyhow::Result<()> {
     let path = sent.as_given(sent.path());
@@ -308,78 +310,39 @@ fn packed_spectra(
         "--noise-var applies to catalogues only; {} contains power spectra. Try: without --noise-var",
         path.display()
     );
+    if let wanted @ [_, ..] = sets_of(arguments.sets.as_ref()) {
+        if let Some(set) = wanted.iter().find(|set| !files.contains_key(set)) {
+            bail!("{}: found no spectrum of set {set}", path.display());
+        }
+        // Spectra of other sets are not read: a damaged one must not stop the chosen sets.
+        files.retain(|set, _| wanted.contains(set));
+    }
     let manifest = submission.manifest.as_ref();
-    let sets = score_spectra(arguments, data, files.clone(), manifest, &path, options).map_err(
+    // Of zeros, Q is the value that a method without any signal reaches.
+    let (mut records, mut of_zeros) = (Vec::new(), Vec::new());
+    for (set, file) in files {
+        let ReadTruth { grid, shear, .. } = read_truth(&data.truth(set), &reading_of(data, set)?)?;
         // An archive is unpacked to a temporary folder, whose name means nothing to users.
-        |error| match error.downcast() {
-            Ok(error) => sent.named(error).into(),
-            Err(other) => other,
-        },
-    )?;
+        let powers = read_bandpowers(&file, &grid).map_err(|error| sent.named(error))?;
+        // A bandpower alone has no error. `pack` stores the covariance of cross-spectra from eight images on.
+        let covariance =
+            manifest.and_then(|manifest| manifest.covariances.get(file.file_name()?.to_str()?));
+        let score = SetScorer::new(grid, shear, options)?.score_spectrum(&powers, covariance)?;
+        let simulated = kind_of(data, set).is_some();
+        records.push(SetRecord::of_spectrum(set, simulated, Vec::new(), &score));
+        of_zeros.push(score.zero_q);
+    }
+    let title = format!("Scores of the power spectra of {}", path.display());
+    let table = spectra(&records, &of_zeros, &title, options.definition);
+    arguments.printing.print(&table)?;
     let Some(store) = &arguments.store else {
         return Ok(());
     };
     let settings = submission.settings(&path, data)?;
     // The images that the spectra were made from are not recorded, so that differences cannot be paired.
-    let run = RunRecord::new(&submission.method, &settings, String::new(), options, sets);
+    let name = &submission.method;
+    let run = RunRecord::new(name, &settings, String::new(), options, records);
     write_record(store, run, &Source::folder(data, folder_of(&path))?, data)
-}
-
-fn score_spectra(
-    arguments: &Arguments,
-    data: &DataFolder,
-    mut files: BTreeMap<u32, PathBuf>,
-    manifest: Option<&Manifest>,
-    place: &Path,
-    options: Options,
-) -> anyhow::Result<Vec<SetRecord>> {
-    if let wanted @ [_, ..] = sets_of(arguments.sets.as_ref()) {
-        if let Some(set) = wanted.iter().find(|set| !files.contains_key(set)) {
-            bail!("{}: found no spectrum of set {set}", place.display());
-        }
-        // Spectra of other sets are not read: a damaged one must not stop the chosen sets.
-        files.retain(|set, _| wanted.contains(set));
-    }
-    let mut scored = Vec::new();
-    for (&set, path) in &files {
-        let truth = read_truth(&data.truth(set), &reading_of(data, set)?)?;
-        let simulated = kind_of(data, set).is_some();
-        scored.push(score_spectrum(
-            set, simulated, truth, path, manifest, options,
-        )?);
-    }
-    let (records, zero): (Vec<SetRecord>, Vec<f64>) = scored.into_iter().unzip();
-    let title = format!("Scores of the power spectra of {}", place.display());
-    let table = spectra(&records, &zero, &title, options.definition);
-    arguments.printing.print(&table)?;
-    Ok(records)
-}
-
-// With Q of a spectrum of zeros, the value that a method without any signal reaches.
-fn score_spectrum(
-    set: u32,
-    simulated: bool,
-    ReadTruth { grid, shear, .. }: ReadTruth,
-    path: &Path,
-    manifest: Option<&Manifest>,
-    options: Options,
-) -> anyhow::Result<(SetRecord, f64)> {
-    let powers = read_bandpowers(path, &grid)?;
-    // A bandpower alone has no error. `pack` stores the covariance of cross-spectra from eight images on.
-    let covariance =
-        manifest.and_then(|manifest| manifest.covariances.get(path.file_name()?.to_str()?));
-    let score = SetScorer::new(grid, shear, options)?.score_spectrum(&powers, covariance)?;
-    let record = SetRecord::of_spectrum(set, simulated, Vec::new(), &score);
-    Ok((record, score.zero_q))
-}
-
-fn plain_reading(arguments: &Arguments) -> Reading {
-    Reading {
-        // The field and the stamps of GREAT10.
-        field: Degrees(arguments.field.unwrap_or(10.0)),
-        stamp: Pixels(arguments.stamp.unwrap_or(48.0)),
-        sign: arguments.truth_sign,
-    }
 }
 
 fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Result<()> {
@@ -410,7 +373,13 @@ fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Resul
         );
     }
     let catalogues = Catalogues::plain(&arguments.catalogues, described);
-    let (reading, threads) = (plain_reading(arguments), arguments.threads.number());
+    let reading = Reading {
+        // The field and the stamps of GREAT10.
+        field: Degrees(arguments.field.unwrap_or(10.0)),
+        stamp: Pixels(arguments.stamp.unwrap_or(48.0)),
+        sign: arguments.truth_sign,
+    };
+    let threads = arguments.threads.number();
     let scored = [score_files(truth, &catalogues, &reading, options, threads)?];
     if arguments.aperture_mass {
         let masses = aperture::masses(

@@ -2,8 +2,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use crate::arguments::Form;
-use crate::choices::named;
+use crate::arguments::{Form, named};
 use crate::tell;
 use shearq_files::table::{self, FileFormat};
 use shearq_render::table::{Cell, Heading, Table};

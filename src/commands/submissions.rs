@@ -3,8 +3,7 @@ use std::path::PathBuf;
 use clap::{Args, Subcommand};
 use shearq_submissions::{Configuration, PsfForm, Published, Registry, Template};
 
-use crate::arguments::Form;
-use crate::choices::named;
+use crate::arguments::{Form, named};
 use crate::{print, tell};
 use shearq_files::atomic;
 use shearq_render::table::{Cell, Table};
