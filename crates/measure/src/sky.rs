@@ -668,6 +668,85 @@ mod tests {
     }
 
     #[test]
+    fn wings_within_three_errors_bound_the_level() {
+        let (cells, wing) = (SkyCells::new(N), Wing { p: 4.0, q: 0.0 });
+        let of = |weight: f64| -> Vec<CellLevel> {
+            let levels = cells.places().map(|place| {
+                let [light, _] = wing.at(place[0].hypot(place[1]) / (WING_RADIUS * N as f64));
+                CellLevel {
+                    place,
+                    level: 5.0 + light,
+                    weight,
+                }
+            });
+            levels.collect()
+        };
+        let shapes = WING_STEEPENINGS.map(|q| WING_SLOPES.map(|p| Wing { p, q }));
+        let fits = shapes.as_flattened().iter();
+        let fits = fits.filter_map(|wing| fit(&of(1.0), N, Some(*wing)));
+        let positive = fits.filter(|fit| fit.values[PLANE_TERMS] > 0.0);
+        let lowest = positive.min_by(|a, b| a.values[0].total_cmp(&b.values[0]));
+        let lowest = lowest.unwrap();
+        for (chi2, is_allowed) in [(7.0, true), (12.0, false)] {
+            let found = BoundedPlane::fit(&of(chi2 / lowest.chi2), N).unwrap();
+            let is_bound = (found.least[0] - lowest.values[0]).abs() < 1e-9;
+            assert_eq!(is_bound, is_allowed, "{chi2}: {found:?} {lowest:?}");
+        }
+    }
+
+    #[test]
+    fn skies_are_subtracted_from_five_errors_and_one_percent_on() {
+        let (cells, count) = (SkyCells::new(N), 80);
+        let mut rng = ChaCha8Rng::seed_from_u64(3);
+        let places: Vec<[f64; 2]> = cells.places().collect();
+        let noise: Vec<f64> = (0..count * places.len())
+            .map(|_| rng.random_range(-0.5..0.5))
+            .collect();
+        let levels = |level: f64, slope: f64| -> Vec<f32> {
+            let places = places.iter().cycle();
+            let pixels = noise.iter().zip(places);
+            pixels
+                .map(|(noise, [x, _])| (noise + level + slope * x) as f32)
+                .collect()
+        };
+        let sky = |level: f64, slope: f64, flux: f64| {
+            let survey = SkyLevels {
+                levels: levels(level, slope),
+                fluxes: vec![flux; count],
+            };
+            survey.sky(&cells, |_, _| false)
+        };
+        // The least level with any allowed wing, as far as it is from the level without noise, and the error of the level.
+        let error = sky(100.0, 0.0, 0.0).unwrap().level_error;
+        let each = places.iter().enumerate().filter_map(|(at, place)| {
+            let own = levels(0.0, 0.0);
+            let mut own: Vec<f64> = own
+                .iter()
+                .skip(at)
+                .step_by(places.len())
+                .map(|v| f64::from(*v))
+                .collect();
+            CellLevel::of(&mut own, *place)
+        });
+        let each: Vec<CellLevel> = each
+            .map(|cell| CellLevel {
+                level: cell.level + 100.0,
+                ..cell
+            })
+            .collect();
+        let least = BoundedPlane::fit(&each, N).unwrap().least[0] - 100.0;
+        for (errors, expected) in [(4.0, false), (6.0, true)] {
+            let found = sky(errors * error - least, 0.0, 0.0);
+            assert_eq!(found.is_some(), expected, "{errors}: {found:?}");
+        }
+        // A gradient, by its light over 8 px in units of the galaxy's.
+        for (share, expected) in [(0.007, false), (0.014, true)] {
+            let found = sky(0.0, 0.1, 0.1 * INNER_RADIUS * INNER_AREA / share);
+            assert_eq!(found.is_some(), expected, "{share}: {found:?}");
+        }
+    }
+
+    #[test]
     fn each_stamp_loses_its_own_plane() {
         let mut full = FullStamp::new(N);
         full.subtraction = SkySubtraction::EachStamp;

@@ -344,6 +344,13 @@ fn jacobians_turn_and_shear_the_moments() {
     let ([e1, e2], [t1, t2]) = (psf.ellipticity(), turned.ellipticity());
     assert!((t1 + e1).abs() < 1e-12 && (t2 + e2).abs() < 1e-12);
     assert!((turned.sigma() - psf.sigma()).abs() < 1e-12);
+    // By 30 degrees, and so ellipticities by 60.
+    let (cos, sin) = (0.2 * 0.75f64.sqrt(), 0.1);
+    let [t1, t2] = psf
+        .on_sky(&Jacobian::new([[cos, -sin], [sin, cos]]).unwrap())
+        .ellipticity();
+    let (cos, sin) = (0.5, 0.75f64.sqrt());
+    assert!((t1 - cos * e1 + sin * e2).abs() < 1e-12 && (t2 - sin * e1 - cos * e2).abs() < 1e-12);
     let sheared = psf.on_sky(&Jacobian::new([[0.22, 0.0], [0.0, 0.2]]).unwrap());
     assert!(sheared.ellipticity()[0] > e1 + 0.04);
     let mean = PsfShape::mean([(psf, 1.0, 1.0), (turned, 1.0, 1.0)].into_iter());

@@ -238,6 +238,31 @@ fn wrong_shapes_and_numbers_name_what_was_expected() {
 }
 
 #[test]
+fn noise_taken_as_white_is_tested_up_to_two_pixels() {
+    let text = "extends = \"48/linear/star\"\n[noise]\ncorrelation = 0\n";
+    let measurer = Measurer::new(&text.parse().unwrap(), 48).unwrap();
+    let star = moffat(0.0).stamp(48);
+    let mut state = 5;
+    // The mean of pixels so far apart along x.
+    let mut warns = |distance: usize| {
+        let mut noise = Array3::from_shape_fn((40, 48, 51), |_| {
+            crate::spectral::uniform(&mut state) as f32 - 0.5
+        });
+        let other = noise.clone();
+        let width = 51 - distance;
+        let mut own = noise.slice_mut(s![.., .., ..width]);
+        own += &other.slice(s![.., .., distance..]);
+        let stamps = stamps(40, 48) * 0.1 + noise.slice(s![.., .., ..48]);
+        let psfs = Psfs::star(star.view());
+        let mut source = ArraySource::new(&measurer, stamps.view(), &psfs).unwrap();
+        let session = Session::open(&measurer, &mut source, KnownNoise::Unknown, &OneThread);
+        let warning = session.unwrap().correlated_noise(&mut source, &OneThread);
+        warning.unwrap().is_some()
+    };
+    assert_eq!([2, 3].map(&mut warns), [true, false]);
+}
+
+#[test]
 fn stated_noise_may_differ_by_one_percent() {
     for (difference, expected) in [(0.008, false), (0.012, true)] {
         let found = stated_noise(1.0 / (1.0 + difference), &StampNoise::white(1.0));
