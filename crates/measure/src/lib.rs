@@ -93,7 +93,7 @@ pub mod parts {
     pub use crate::shape::{
         AdaptiveMoments, AdaptiveScratch, AdaptiveShape, ClippedAcf, ClippedAcfScratch, Moments,
     };
-    pub use crate::spectral::{Lags, ModeNoise, Spectral, SpectralPsf, SpectralScratch};
+    pub use crate::spectral::{Lags, Light, ModeNoise, Spectral, SpectralPsf, SpectralScratch};
     pub use crate::stamp::frame;
     pub use crate::transform::HexLattice;
 }

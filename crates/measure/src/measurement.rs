@@ -292,66 +292,96 @@ impl Observables {
             flux,
             flux_error,
             size,
-            flux_response: [f1, f2],
-            size_response: [s1, s2],
+            flux_response: [flux_g1, flux_g2],
+            size_response: [size_g1, size_g2],
             ring,
-            ring_response: [r1, r2],
-            coupling:
-                Coupling {
-                    shear,
-                    turned,
-                    ring_shear,
-                    ring_turned,
-                },
+            ring_response: [ring_g1, ring_g2],
+            coupling,
         } = *self;
-        let mut all = [0.0; 41];
-        all[..7].copy_from_slice(&[flux, size, flux_error, f1, f2, s1, s2]);
-        all[7..12].copy_from_slice(&shear[0]);
-        all[12..17].copy_from_slice(&shear[1]);
-        all[17..25].copy_from_slice(&turned);
-        all[25..28].copy_from_slice(&[ring, r1, r2]);
-        all[28..36].copy_from_slice(ring_shear.as_flattened());
-        all[36..].copy_from_slice(&ring_turned);
-        all
+        let Coupling {
+            sheared_e: [[n1_ef, n1_es, n1_er], [n2_ef, n2_es, n2_er]],
+            sheared:
+                [
+                    [[n1_ff, n1_fs, n1_fr], [_, n1_ss, n1_sr], [.., n1_rr]],
+                    [[n2_ff, n2_fs, n2_fr], [_, n2_ss, n2_sr], [.., n2_rr]],
+                ],
+            turned_e: [[t_e1f, t_e1s, t_e1r], [t_e2f, t_e2s, t_e2r]],
+            turned: [[t_ff, t_fs, t_fr], [_, t_ss, t_sr], [.., t_rr]],
+            turned_size: t_s,
+        } = coupling;
+        [
+            flux, size, flux_error, flux_g1, flux_g2, size_g1, size_g2, n1_ef, n1_es, n1_ff, n1_fs,
+            n1_ss, n2_ef, n2_es, n2_ff, n2_fs, n2_ss, t_e1f, t_e1s, t_e2f, t_e2s, t_ff, t_fs, t_ss,
+            t_s, ring, ring_g1, ring_g2, n1_er, n1_fr, n1_sr, n1_rr, n2_er, n2_fr, n2_sr, n2_rr,
+            t_e1r, t_e2r, t_fr, t_sr, t_rr,
+        ]
     }
 
     /// Observables with these values, in the order of [`Observables::COLUMNS`].
     pub fn from_array(all: &[f64; 41]) -> Self {
-        let five = |first: usize| std::array::from_fn(|k| all[first + k]);
+        fn next<const K: usize>(rest: &mut impl Iterator<Item = f64>) -> [f64; K] {
+            std::array::from_fn(|_| rest.next().unwrap_or(f64::NAN))
+        }
+        let rest = &mut all.iter().copied();
+        let [flux, size, flux_error, flux_g1, flux_g2, size_g1, size_g2] = next(rest);
+        let [n1_ef, n1_es, n1_ff, n1_fs, n1_ss] = next(rest);
+        let [n2_ef, n2_es, n2_ff, n2_fs, n2_ss] = next(rest);
+        let [t_e1f, t_e1s, t_e2f, t_e2s, t_ff, t_fs, t_ss, t_s] = next(rest);
+        let [ring, ring_g1, ring_g2] = next(rest);
+        let [n1_er, n1_fr, n1_sr, n1_rr] = next(rest);
+        let [n2_er, n2_fr, n2_sr, n2_rr] = next(rest);
+        let [t_e1r, t_e2r, t_fr, t_sr, t_rr] = next(rest);
         Observables {
-            flux: all[0],
-            size: all[1],
-            flux_error: all[2],
-            flux_response: [all[3], all[4]],
-            size_response: [all[5], all[6]],
-            ring: all[25],
-            ring_response: [all[26], all[27]],
+            flux,
+            flux_error,
+            size,
+            flux_response: [flux_g1, flux_g2],
+            size_response: [size_g1, size_g2],
+            ring,
+            ring_response: [ring_g1, ring_g2],
             coupling: Coupling {
-                shear: [five(7), five(12)],
-                turned: std::array::from_fn(|k| all[17 + k]),
-                ring_shear: [28, 32].map(|first| std::array::from_fn(|k| all[first + k])),
-                ring_turned: std::array::from_fn(|k| all[36 + k]),
+                sheared_e: [[n1_ef, n1_es, n1_er], [n2_ef, n2_es, n2_er]],
+                sheared: [
+                    [
+                        [n1_ff, n1_fs, n1_fr],
+                        [n1_fs, n1_ss, n1_sr],
+                        [n1_fr, n1_sr, n1_rr],
+                    ],
+                    [
+                        [n2_ff, n2_fs, n2_fr],
+                        [n2_fs, n2_ss, n2_sr],
+                        [n2_fr, n2_sr, n2_rr],
+                    ],
+                ],
+                turned_e: [[t_e1f, t_e1s, t_e1r], [t_e2f, t_e2s, t_e2r]],
+                turned: [[t_ff, t_fs, t_fr], [t_fs, t_ss, t_sr], [t_fr, t_sr, t_rr]],
+                turned_size: t_s,
             },
         }
     }
 }
 
-/// Mean products of the changes of ellipticity, flux and size by noise.
+pub(crate) const FLUX: usize = 0; // Place of the flux in the arrays of a coupling.
+pub(crate) const SIZE: usize = 1; // Place of the size.
+pub(crate) const RING: usize = 2; // Place of the light of the ring.
+pub(crate) const VARIABLES: usize = 3; // Counts them.
+
+/// Mean products of the changes by noise of the ellipticity and of three variables: flux, size and light of the ring, in this order.
 ///
 /// They are determined for one galaxy in eight, with eight times the weight, and zero for the others: only means enter.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 #[non_exhaustive]
 pub struct Coupling {
-    /// For the change of noise with γ1 and with γ2: products of e (of the same component) and flux, e and size, flux and flux,
-    /// flux and size, size and size.
-    pub shear: [[f64; 5]; 2],
-    /// For the difference to noise behind a PSF turned by 90 degrees: e1 and flux, e1 and size, e2 and flux, e2 and size, flux and
-    /// flux, flux and size, size and size; and the mean change of the size alone.
-    pub turned: [f64; 8],
-    /// For the change of noise with γ1 and with γ2: products of the light of the ring with e (of the same component), flux, size and itself.
-    pub ring_shear: [[f64; 4]; 2],
-    /// For the difference to noise behind a PSF turned by 90 degrees: the same with e1, e2, flux, size and itself.
-    pub ring_turned: [f64; 5],
+    /// Products of e1 with each variable for the change of noise with γ1, and of e2 for that with γ2.
+    pub sheared_e: [[f64; 3]; 2],
+    /// Products of the variables with each other for the change of noise with γ1, and with γ2. Symmetric.
+    pub sheared: [[[f64; 3]; 3]; 2],
+    /// Products of e1 and of e2 with each variable for the difference to noise behind a PSF turned by 90 degrees.
+    pub turned_e: [[f64; 3]; 2],
+    /// Products of the variables with each other for this difference. Symmetric.
+    pub turned: [[f64; 3]; 3],
+    /// Mean change of the size by this difference.
+    pub turned_size: f64,
 }
 
 #[cfg(test)]
@@ -368,8 +398,14 @@ mod tests {
             all[place.unwrap()]
         };
         assert_eq!(observables.size_response[1], at("size_g2"));
-        assert_eq!(observables.coupling.shear[1][3], at("n2_fs"));
-        assert_eq!(observables.coupling.turned[2], at("t_e2f"));
-        assert_eq!(observables.coupling.ring_shear[1][2], at("n2_sr"));
+        let coupling = observables.coupling;
+        assert_eq!(coupling.sheared_e[1][RING], at("n2_er"));
+        assert_eq!(coupling.turned_e[1][FLUX], at("t_e2f"));
+        for (a, b, name) in [(FLUX, SIZE, "fs"), (FLUX, RING, "fr"), (SIZE, RING, "sr")] {
+            for (products, noise) in [(coupling.sheared[1], "n2"), (coupling.turned, "t")] {
+                let expected = at(&format!("{noise}_{name}"));
+                assert_eq!([products[a][b], products[b][a]], [expected; 2], "{name}");
+            }
+        }
     }
 }

@@ -18,9 +18,9 @@ use crate::measurement::{
 use crate::network::{Network, NetworkScratch, Rule};
 use crate::noise::StampNoise;
 use crate::psf::ResidualProfiles;
-use crate::selection::{NoiseProducts, ShearSettings, ShearedCatalogues, sheared};
-use crate::shape::{ClippedAcf, ClippedAcfScratch};
-use crate::spectral::EpochPixels;
+use crate::selection::{Matrix, ShearSettings, ShearedCatalogues, sheared};
+use crate::shape::{ClippedAcf, ClippedAcfScratch, Size};
+use crate::spectral::{EpochPixels, Light, NoiseChanges};
 
 /// A method, planned for one size of cut stamps.
 pub(crate) enum MethodPlan {
@@ -134,7 +134,7 @@ pub(crate) struct Found {
     /// Response of the distortion, if the method determines it.
     response: Option<ResponseMatrix>,
     /// On the galaxies that the method determines it for.
-    noise_moments: Option<NoiseMoments>,
+    noise_moments: Option<NoiseChanges<NoiseMeans>>,
     observables: Option<FoundObservables>,
     flux: f64,
     radius: f64,
@@ -143,28 +143,14 @@ pub(crate) struct Found {
 
 /// Flux and size of a galaxy before the PSF.
 struct FoundObservables {
-    flux: f64,
+    flux: Light<f64>,
     flux_error: f64,
-    flux_response: [f64; 2],
     /// Response of T, from which the size follows.
     square_response: [f64; 2],
-    /// The size, and its first and second derivative with T.
-    size: [f64; 3],
-    /// Light of the ring, and its derivatives with γ₁ and γ₂.
-    ring: [f64; 3],
+    size: Size,
+    ring: Light<f64>,
     /// For sheared catalogues, if they are requested.
     sheared: Option<ShearSettings>,
-}
-
-/// Effects of the noise of a galaxy, in the mean over the noise.
-#[derive(Default)]
-struct NoiseMoments {
-    /// Of noise that changes with γ₁, and with γ₂.
-    sheared: [NoiseMeans; 2],
-    /// Of the difference to noise behind a PSF turned by 90 degrees.
-    turned: NoiseMeans,
-    /// Of noise as it is.
-    plain: NoiseMeans,
 }
 
 /// Mean products of the changes of two quantities by noise, and mean second derivatives. T is the mean square from which the
@@ -188,7 +174,7 @@ struct NoiseMeans {
     square_curvature: f64,
 }
 
-impl NoiseMoments {
+impl NoiseChanges<NoiseMeans> {
     /// Turns both components of χ, and both components of the shear that changes the noise.
     fn turn(&mut self, by: &Spin2) {
         let [first, second] = &mut self.sheared;
@@ -330,10 +316,13 @@ impl Found {
             noise.turn(by);
         }
         if let Some(found) = &mut self.observables {
-            found.flux_response = by.turn(found.flux_response);
-            found.square_response = by.turn(found.square_response);
-            let [_, first, second] = &mut found.ring;
-            [*first, *second] = by.turn([*first, *second]);
+            for response in [
+                &mut found.flux.response,
+                &mut found.square_response,
+                &mut found.ring.response,
+            ] {
+                *response = by.turn(*response);
+            }
         }
     }
 
@@ -406,64 +395,55 @@ impl Found {
     /// Flux and size with their couplings to the reported ellipticity.
     fn observables(&self, reported: Reported) -> Option<Observables> {
         let (chi, found) = (self.distortion.ok()?, self.observables.as_ref()?);
-        let [size, first, second] = found.size;
-        let mut size_response = found.square_response.map(|response| first * response);
+        let Size {
+            px: size,
+            slope,
+            curvature,
+        } = found.size;
+        let mut size_response = found.square_response.map(|response| slope * response);
         let mut coupling = Coupling::default();
         if let Some(noise) = &self.noise_moments {
             let jacobian = reported.response(chi, [[1.0, 0.0], [0.0, 1.0]]);
             let with_e = |products: [f64; 2]| {
                 jacobian.map(|row| row[0] * products[0] + row[1] * products[1])
             };
-            let with_e_and_size = |products: [f64; 2]| with_e(products).map(|value| first * value);
+            // Of e1 and of e2 with flux, size and ring.
+            let with_variables = |means: &NoiseMeans| {
+                let flux = with_e(means.chi_flux);
+                let size = with_e(means.chi_square).map(|value| slope * value);
+                let ring = with_e(means.ring_chi);
+                [0, 1].map(|k| [flux[k], size[k], ring[k]])
+            };
+            let among_variables = |means: &NoiseMeans| {
+                let size_flux = slope * means.square_flux;
+                let size_ring = slope * means.ring_square;
+                [
+                    [means.flux_flux, size_flux, means.ring_flux],
+                    [size_flux, slope * slope * means.square_square, size_ring],
+                    [means.ring_flux, size_ring, means.ring_ring],
+                ]
+            };
             // The size is not linear in T, and T not in the autocorrelation.
-            let curved =
-                |means: &NoiseMeans| first * means.square_curvature + second * means.square_square;
+            let change_of_size = |means: &NoiseMeans| {
+                slope * means.square_curvature + curvature * means.square_square
+            };
             for (k, means) in noise.sheared.iter().enumerate() {
-                coupling.shear[k] = [
-                    with_e(means.chi_flux)[k],
-                    with_e_and_size(means.chi_square)[k],
-                    means.flux_flux,
-                    first * means.square_flux,
-                    first * first * means.square_square,
-                ];
-                coupling.ring_shear[k] = [
-                    with_e(means.ring_chi)[k],
-                    means.ring_flux,
-                    first * means.ring_square,
-                    means.ring_ring,
-                ];
-                size_response[k] -= curved(means);
+                coupling.sheared_e[k] = with_variables(means)[k];
+                size_response[k] -= change_of_size(means);
             }
-            let means = &noise.turned;
-            let [e1_flux, e2_flux] = with_e(means.chi_flux);
-            let [e1_size, e2_size] = with_e_and_size(means.chi_square);
-            coupling.turned = [
-                e1_flux,
-                e1_size,
-                e2_flux,
-                e2_size,
-                means.flux_flux,
-                first * means.square_flux,
-                first * first * means.square_square,
-                curved(means),
-            ];
-            let [e1_ring, e2_ring] = with_e(means.ring_chi);
-            coupling.ring_turned = [
-                e1_ring,
-                e2_ring,
-                means.ring_flux,
-                first * means.ring_square,
-                means.ring_ring,
-            ];
+            coupling.sheared = noise.sheared.each_ref().map(among_variables);
+            coupling.turned_e = with_variables(&noise.turned);
+            coupling.turned = among_variables(&noise.turned);
+            coupling.turned_size = change_of_size(&noise.turned);
         }
         Some(Observables {
-            flux: found.flux,
+            flux: found.flux.value,
             flux_error: found.flux_error,
             size,
-            flux_response: found.flux_response,
+            flux_response: found.flux.response,
             size_response,
-            ring: found.ring[0],
-            ring_response: [found.ring[1], found.ring[2]],
+            ring: found.ring.value,
+            ring_response: found.ring.response,
             coupling,
         })
     }
@@ -485,9 +465,9 @@ impl Found {
             [a, b, 0.0, 0.0],
             [c, d, 0.0, 0.0],
             [0.0, 0.0, 0.0, 1.0],
-            [0.0, 0.0, found.size[1], 0.0],
+            [0.0, 0.0, found.size.slope, 0.0],
         ];
-        let matrix = |means: &NoiseMeans| {
+        let matrix = |means: &NoiseMeans| -> Matrix {
             let products = means.matrix();
             let product = |a: usize, b: usize| -> f64 {
                 let terms = (0..4).flat_map(|i| (0..4).map(move |j| [i, j]));
@@ -497,28 +477,22 @@ impl Found {
             };
             std::array::from_fn(|a| std::array::from_fn(|b| product(a, b)))
         };
-        let none = NoiseMoments::default();
-        let noise = self.noise_moments.as_ref().unwrap_or(&none);
-        let noise = NoiseProducts {
-            plain: matrix(&noise.plain),
-            sheared: noise.sheared.each_ref().map(matrix),
-            turned: matrix(&noise.turned),
-        };
+        let noise = self.noise_moments.as_ref();
+        let noise = noise.map_or_else(NoiseChanges::default, |noise| noise.map(matrix));
         let Observables {
             flux_response,
             size_response,
             ..
         } = *observables;
-        let [.., size_change] = observables.coupling.turned;
-        let size = observables.size + 0.5 * size_change;
+        let size = observables.size + 0.5 * observables.coupling.turned_size;
         let values = [e[0], e[1], observables.flux, size];
         let derivatives = [0, 1].map(|k| {
             let [e1, e2] = [response[0][k], response[1][k]];
             [e1, e2, flux_response[k], size_response[k]]
         });
-        let catalogues = |noise| sheared(values, derivatives, noise, &settings);
+        let catalogues = |noise: &_| sheared(values, derivatives, noise, &settings);
         Some(ShearedCatalogues {
-            each: catalogues(&noise).or_else(|| catalogues(&NoiseProducts::NONE))?,
+            each: catalogues(&noise).or_else(|| catalogues(&NoiseChanges::default()))?,
             flux_error: observables.flux_error,
         })
     }
@@ -730,18 +704,27 @@ mod tests {
             },
             distortion: Ok(Distortion::new(e1, e2)),
             response: Some([[r11, r12], [r21, r22]]),
-            noise_moments: Some(NoiseMoments {
+            noise_moments: Some(NoiseChanges {
                 sheared: [means(&mut next), means(&mut next)],
                 turned: means(&mut next),
                 plain: means(&mut next),
             }),
             observables: Some(FoundObservables {
-                flux: 10.0,
+                flux: Light {
+                    value: 10.0,
+                    response: [0.3, -0.1],
+                },
                 flux_error: 1.0,
-                flux_response: [0.3, -0.1],
                 square_response: [0.2, 0.5],
-                size: [2.0, 0.4, -0.1],
-                ring: [1.5, 0.6, -0.4],
+                size: Size {
+                    px: 2.0,
+                    slope: 0.4,
+                    curvature: -0.1,
+                },
+                ring: Light {
+                    value: 1.5,
+                    response: [0.6, -0.4],
+                },
                 sheared: Some(ShearSettings {
                     step: 0.02,
                     normals: [0.0; 4],
@@ -810,16 +793,19 @@ mod tests {
             let turned = turned.measurement(kind, 1.0);
             assert!((turned.e2 - plain.e1).abs() < 1e-12 && (turned.e1 + plain.e2).abs() < 1e-12);
             let [one, two] = [&plain, &turned].map(|galaxy| galaxy.observables.unwrap());
-            let ([first, second], [second_turned, first_turned]) =
-                (one.coupling.shear, two.coupling.shear);
-            for k in 2..5 {
-                assert!((first_turned[k] - first[k]).abs() < 1e-12, "{k}");
-                assert!((second_turned[k] + second[k]).abs() < 1e-12, "{k}");
-            }
+            let close = |found: &[f64], expected: &[f64], sign: f64| {
+                let mut pairs = found.iter().zip(expected);
+                assert!(pairs.all(|(a, b)| (a - sign * b).abs() < 1e-12));
+            };
             // Of e1 with γ1 and e2 with γ2, both signs change or none.
-            for k in 0..2 {
-                assert!((first_turned[k] - first[k]).abs() < 1e-12, "{k}");
-                assert!((second_turned[k] - second[k]).abs() < 1e-12, "{k}");
+            for (k, sign) in [(0, 1.0), (1, -1.0)] {
+                let [one, two] = [(&one.coupling, k), (&two.coupling, 1 - k)];
+                close(
+                    two.0.sheared[two.1].as_flattened(),
+                    one.0.sheared[one.1].as_flattened(),
+                    sign,
+                );
+                close(&two.0.sheared_e[two.1], &one.0.sheared_e[one.1], 1.0);
             }
         }
     }
@@ -849,22 +835,13 @@ mod tests {
             *response = [one * response[0], two * response[1]];
         }
         let Coupling {
-            shear,
-            turned,
-            ring_shear,
-            ring_turned,
+            sheared, turned_e, ..
         } = &mut observables.coupling;
-        for (row, sign) in ring_shear.iter_mut().zip([one, two]) {
-            row[1..].iter_mut().for_each(|value| *value *= sign);
-        }
-        for (value, sign) in ring_turned.iter_mut().zip([one, two]) {
-            *value *= sign;
-        }
-        for (row, sign) in shear.iter_mut().zip([one, two]) {
-            row[2..].iter_mut().for_each(|value| *value *= sign);
-        }
-        for (value, sign) in turned.iter_mut().zip([one, one, two, two]) {
-            *value *= sign;
+        for (k, sign) in [one, two].into_iter().enumerate() {
+            let products = sheared[k].as_flattened_mut().iter_mut();
+            products
+                .chain(&mut turned_e[k])
+                .for_each(|value| *value *= sign);
         }
         let sheared = galaxy.sheared.as_mut().unwrap();
         // Catalogues noshear, 1p, 1m, 2p, 2m: a negative sign exchanges p and m.

@@ -38,8 +38,9 @@ use std::sync::Arc;
 
 use shearq_quantities::linear::cholesky;
 
-use crate::measurement::{Coupling, Observables, ResponseMatrix};
+use crate::measurement::{Coupling, FLUX, Observables, RING, ResponseMatrix, SIZE, VARIABLES};
 use crate::method::isotropic;
+use crate::spectral::NoiseChanges;
 
 // In units of the noise of the S/N. At S/N 20, half widths of 0.25, 0.5 and 1 standard deviation of the size give errors of
 // m of 2.4, 1.8 and 1.4 (10⁻³) for 64,000 measurements.
@@ -122,10 +123,7 @@ pub struct Selected {
     pub weight: f64,
 }
 
-// Flux, size and the light of the ring.
-const VARIABLES: usize = 3;
-
-/// A weight and its derivatives with flux, size and the light of the ring.
+/// A weight and its derivatives with the variables of a [`Coupling`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Jet {
     value: f64,
@@ -200,41 +198,36 @@ impl Selection {
             return Selected::default();
         }
         let Coupling {
-            shear,
+            sheared_e,
+            sheared,
+            turned_e,
             turned,
-            ring_shear,
-            ring_turned,
+            turned_size,
         } = galaxy.coupling;
+        // Σ w_a x_a, and Σ w_ab C_ab.
         let along = |values: [f64; VARIABLES]| -> f64 {
             w.first.iter().zip(values).map(|(w, value)| w * value).sum()
         };
-        // Σ w_ab C_ab, from the products ff, fs and ss, and fr, sr and rr.
-        let curved = |[ff, fs, ss]: [f64; 3], [fr, sr, rr]: [f64; 3]| -> f64 {
-            let products = [[ff, fs, fr], [fs, ss, sr], [fr, sr, rr]];
+        let curved = |products: [[f64; VARIABLES]; VARIABLES]| -> f64 {
             let pairs = w.second.as_flattened().iter().zip(products.as_flattened());
             pairs.map(|(w, product)| w * product).sum()
         };
-        let [t_e1f, t_e1s, t_e2f, t_e2s, t_ff, t_fs, t_ss, t_s] = turned;
-        let [t_e1r, t_e2r, t_fr, t_sr, t_rr] = ring_turned;
-        let t_e = [[t_e1f, t_e1s, t_e1r], [t_e2f, t_e2s, t_e2r]];
-        let t_curved = curved([t_ff, t_fs, t_ss], [t_fr, t_sr, t_rr]) + w.first[1] * t_s;
+        let turned_weight = curved(turned) + w.first[SIZE] * turned_size;
         let mut selected = Selected {
             weight: w.value,
             ..Selected::default()
         };
         let mut trace = 0.0;
         for k in 0..2 {
-            let [e_f, e_s, ff, fs, ss] = shear[k];
-            let [e_r, fr, sr, rr] = ring_shear[k];
-            selected.e[k] = w.value * e[k] + along(t_e[k]) + 0.5 * e[k] * t_curved;
+            selected.e[k] = w.value * e[k] + along(turned_e[k]) + 0.5 * e[k] * turned_weight;
             let responses = [
                 galaxy.flux_response[k],
                 galaxy.size_response[k],
                 galaxy.ring_response[k],
             ];
             trace += w.value * response[k][k] + e[k] * along(responses)
-                - 2.0 * along([e_f, e_s, e_r])
-                - e[k] * curved([ff, fs, ss], [fr, sr, rr]);
+                - 2.0 * along(sheared_e[k])
+                - e[k] * curved(sheared[k]);
         }
         selected.response = isotropic(0.5 * trace);
         selected
@@ -265,16 +258,16 @@ impl Cut {
             second: [[0.0; VARIABLES]; VARIABLES],
         };
         match self.quantity {
-            Quantity::Snr => (place.value, place.first[0]) = (flux / error, 1.0 / error),
-            Quantity::Flux => (place.value, place.first[0]) = (flux, 1.0),
-            Quantity::Size => (place.value, place.first[1]) = (galaxy.size, 1.0),
+            Quantity::Snr => (place.value, place.first[FLUX]) = (flux / error, 1.0 / error),
+            Quantity::Flux => (place.value, place.first[FLUX]) = (flux, 1.0),
+            Quantity::Size => (place.value, place.first[SIZE]) = (galaxy.size, 1.0),
             Quantity::Neighbour => {
                 let ratio = galaxy.neighbour();
                 place.value = ratio;
-                (place.first[0], place.first[2]) = (-ratio / flux, 1.0 / flux);
+                (place.first[FLUX], place.first[RING]) = (-ratio / flux, 1.0 / flux);
                 let mixed = -1.0 / (flux * flux);
-                place.second[0] = [2.0 * ratio / (flux * flux), 0.0, mixed];
-                place.second[2][0] = mixed;
+                place.second[FLUX][FLUX] = 2.0 * ratio / (flux * flux);
+                (place.second[FLUX][RING], place.second[RING][FLUX]) = (mixed, mixed);
             }
         }
         let usual = self.quantity.usual_half_width(error);
@@ -366,7 +359,7 @@ fn numerical(weight: &dyn Fn(f64, f64, f64) -> f64, galaxy: &Observables) -> Jet
 // e1, e2, flux and size.
 const VALUES: usize = 4;
 /// A symmetric matrix of all values.
-type Matrix = [[f64; VALUES]; VALUES];
+pub(crate) type Matrix = [[f64; VALUES]; VALUES];
 
 // Of the noise. Against the rounding of covariances, which is 10⁻⁵ of them.
 const MARGIN: f64 = 1e-3;
@@ -424,34 +417,16 @@ pub(crate) struct ShearSettings {
     pub(crate) normals: [f64; 4],
 }
 
-/// Mean products of the changes of the values by noise.
-pub(crate) struct NoiseProducts {
-    /// Covariance C of the noise of the values.
-    pub(crate) plain: Matrix,
-    /// K for γ1 and for γ2.
-    pub(crate) sheared: [Matrix; 2],
-    /// T.
-    pub(crate) turned: Matrix,
-}
-
-impl NoiseProducts {
-    pub(crate) const NONE: NoiseProducts = NoiseProducts {
-        plain: [[0.0; VALUES]; VALUES],
-        sheared: [[[0.0; VALUES]; VALUES]; 2],
-        turned: [[0.0; VALUES]; VALUES],
-    };
-}
-
-/// The galaxy in each catalogue, from its values, their derivatives with γ1 and γ2, and its noise. `None` if the products
-/// are not products of noise.
+/// The galaxy in each catalogue, from its values, their derivatives with γ1 and γ2, and the mean products of their changes by
+/// noise: the covariance C, K for γ1 and for γ2, and T. `None` if the products are not products of noise.
 pub(crate) fn sheared(
     values: [f64; VALUES],
     derivatives: [[f64; VALUES]; 2],
-    products: &NoiseProducts,
+    products: &NoiseChanges<Matrix>,
     settings: &ShearSettings,
 ) -> Option<[ShearedGalaxy; 5]> {
     let &ShearSettings { step, normals } = settings;
-    let NoiseProducts {
+    let NoiseChanges {
         plain,
         sheared,
         turned,
@@ -575,10 +550,14 @@ mod tests {
             ring: 9.0,
             ring_response: [0.5, -0.3],
             coupling: Coupling {
-                shear: [[0.1, 0.2, 0.3, 0.4, 0.5], [0.6, 0.7, 0.8, 0.9, 1.0]],
-                turned: [0.1, -0.2, 0.3, -0.4, 0.5, 0.6, -0.7, 0.8],
-                ring_shear: [[0.1, 0.2, 0.3, 0.4], [0.5, 0.6, 0.7, 0.8]],
-                ring_turned: [0.1, -0.2, 0.3, -0.4, 0.5],
+                sheared_e: [[0.1, 0.2, 0.1], [0.6, 0.7, 0.5]],
+                sheared: [
+                    [[0.3, 0.4, 0.2], [0.4, 0.5, 0.3], [0.2, 0.3, 0.4]],
+                    [[0.8, 0.9, 0.6], [0.9, 1.0, 0.7], [0.6, 0.7, 0.8]],
+                ],
+                turned_e: [[0.1, -0.2, 0.1], [0.3, -0.4, -0.2]],
+                turned: [[0.5, 0.6, 0.3], [0.6, -0.7, -0.4], [0.3, -0.4, 0.5]],
+                turned_size: 0.8,
             },
         }
     }
@@ -702,8 +681,8 @@ mod tests {
         std::array::from_fn(|a| std::array::from_fn(|b| lower[a.max(b)][a.min(b)]))
     }
 
-    fn products() -> NoiseProducts {
-        NoiseProducts {
+    fn products() -> NoiseChanges<Matrix> {
+        NoiseChanges {
             plain: symmetric([
                 [0.09, 0.0, 0.0, 0.0],
                 [0.01, 0.08, 0.0, 0.0],
@@ -819,7 +798,7 @@ mod tests {
         let found = sheared(
             [0.0; 4],
             derivatives,
-            &NoiseProducts::NONE,
+            &NoiseChanges::default(),
             &settings(0.5, 9.0),
         )
         .unwrap();

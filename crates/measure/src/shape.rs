@@ -542,6 +542,24 @@ pub(crate) struct MeanSquare {
     divisor: f32,
 }
 
+/// A size r, and its first and second derivative with T.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Size {
+    pub(crate) px: f64,
+    pub(crate) slope: f64,
+    pub(crate) curvature: f64,
+}
+
+impl Size {
+    fn bound(px: f64) -> Self {
+        Size {
+            px,
+            slope: 0.0,
+            curvature: 0.0,
+        }
+    }
+}
+
 impl SizeMoments {
     /// For the lags of `lattice`, a target of `target` px and a window of `window` px.
     pub(crate) fn new(target: f64, window: f64, lattice: HexLattice) -> Self {
@@ -611,25 +629,25 @@ impl SizeMoments {
         4.0 / (self.rest + 1.0 / (r * r + self.target * self.target))
     }
 
-    /// The size r in px of a galaxy of this T, with its first and second derivative; both are zero beyond the bounds.
-    pub(crate) fn size(&self, square: f64) -> [f64; 3] {
+    /// The size of a galaxy of this T; the derivatives are zero beyond the bounds.
+    pub(crate) fn size(&self, square: f64) -> Size {
         let (least, most) = (SMALLEST_SIZE * self.target, LARGEST_SIZE * self.window);
         if square.is_nan() || square <= self.square_of(least) {
-            return [least, 0.0, 0.0];
+            return Size::bound(least);
         }
         if square >= self.square_of(most) {
-            return [most, 0.0, 0.0];
+            return Size::bound(most);
         }
         let compact = 4.0 / square - self.rest;
         let r = (1.0 / compact - self.target * self.target).sqrt();
         // r² = 1/κ − σ_Γ², dκ/dT = −4/T².
         let first = 4.0 / (square * square * compact * compact);
         let second = first * (2.0 * 4.0 / (square * square * compact) - 2.0 / square);
-        [
-            r,
-            first / (2.0 * r),
-            (second - first * first / (2.0 * r * r)) / (2.0 * r),
-        ]
+        Size {
+            px: r,
+            slope: first / (2.0 * r),
+            curvature: (second - first * first / (2.0 * r * r)) / (2.0 * r),
+        }
     }
 }
 
@@ -1158,17 +1176,18 @@ mod tests {
     #[test]
     fn the_size_of_a_gaussian_is_its_standard_deviation() {
         let moments = SizeMoments::new(TARGET, WINDOW, LATTICE);
-        // Two window widths at most, and a tenth of the target's width at least.
-        assert_eq!(moments.size(f64::INFINITY)[0], 2.0 * WINDOW);
-        assert_eq!(moments.size(0.0)[0], 0.1 * TARGET);
         for r in [1.0, 2.0, 3.0, 5.0, 8.0] {
             let found = moments.measure(&acf(r), 0.0, 0.0);
-            let [size, first, second] = moments.size(f64::from(found.square));
+            let Size {
+                px: size,
+                slope: first,
+                curvature: second,
+            } = moments.size(f64::from(found.square));
             // The lags end at 20 px, four standard deviations of the weight.
             assert!((size / r - 1.0).abs() < 0.01, "{r}: {size}");
             assert!((moments.square_of(size) / f64::from(found.square) - 1.0).abs() < 1e-9);
             let step = 1e-4 * f64::from(found.square);
-            let side = |by: f64| moments.size(f64::from(found.square) + by)[0];
+            let side = |by: f64| moments.size(f64::from(found.square) + by).px;
             let (plus, minus) = (side(step), side(-step));
             // Truncation and rounding of differences of 10⁻⁴.
             assert!(((plus - minus) / (2.0 * step) / first - 1.0).abs() < 1e-5);
@@ -1178,9 +1197,14 @@ mod tests {
                 "{r}"
             );
         }
-        assert_eq!(moments.size(0.0), [SMALLEST_SIZE * TARGET, 0.0, 0.0]);
-        assert_eq!(moments.size(1e9), [LARGEST_SIZE * WINDOW, 0.0, 0.0]);
-        assert_eq!(moments.size(f64::NAN), [SMALLEST_SIZE * TARGET, 0.0, 0.0]);
+        // A tenth of the target's width at least, and two window widths at most.
+        for (square, bound) in [
+            (0.0, 0.1 * TARGET),
+            (f64::NAN, 0.1 * TARGET),
+            (1e9, 2.0 * WINDOW),
+        ] {
+            assert_eq!(moments.size(square), Size::bound(bound));
+        }
     }
 
     #[test]

@@ -40,6 +40,8 @@ mod epochs;
 
 pub(crate) use self::epochs::{EpochPixels, EpochScratch, SpectralEpoch};
 
+use std::ops::Add;
+
 use multiversion::multiversion;
 use ndarray::ArrayView2;
 use shearq_fourier::Complex64;
@@ -161,10 +163,28 @@ pub struct Lags {
     pub shear1: Vec<f32>,
     /// Its derivative with respect to γ₂.
     pub shear2: Vec<f32>,
-    /// Sum of the windowed result, and its derivatives with respect to γ₁ and γ₂.
-    pub flux: [f32; 3],
-    /// Sum of the result under the ring, and its derivatives.
-    pub ring: [f32; 3],
+    /// Sum of the windowed result.
+    pub flux: Light<f32>,
+    /// Sum of the result under the ring.
+    pub ring: Light<f32>,
+}
+
+/// A sum over the image.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Light<T> {
+    /// The sum.
+    pub value: T,
+    /// Its derivatives with respect to γ₁ and γ₂.
+    pub response: [T; 2],
+}
+
+impl<T: Copy> Light<T> {
+    pub(crate) fn map<U>(self, of: impl Fn(T) -> U) -> Light<U> {
+        Light {
+            value: of(self.value),
+            response: self.response.map(of),
+        }
+    }
 }
 
 /// Noise as the linear network uses it: of level one, and white but for its power.
@@ -192,9 +212,42 @@ pub struct SpectralPsf {
     floor: Vec<f32>,
     /// Mean of −Re(conj(v̂)·δv̂) of windowed noise, in units of σ², by parity.
     noise_tilts: [Vec<f32>; 2],
-    /// Power of noise of σ = 1 before the window, of each mode and the modes that it stands for. It is multiplied by the change
-    /// with γ₁, by the change with γ₂, by the difference to noise behind the PSF turned by 90 degrees, and by one; by parity.
-    powers: [Vec<f32>; 4],
+    /// Power of noise of σ = 1 before the window, of each mode and the modes that it stands for, times each change; by parity.
+    powers: NoiseChanges<Vec<f32>>,
+}
+
+/// One value for each change tn of noise n, in units t of the noise of a mode, whose mean products a′(n)·b′(tn) are needed.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct NoiseChanges<T> {
+    /// The changes with γ₁ and with γ₂.
+    pub(crate) sheared: [T; 2],
+    /// What noise lacks to be that behind a PSF turned by 90 degrees.
+    pub(crate) turned: T,
+    /// The noise itself.
+    pub(crate) plain: T,
+}
+
+impl<T> NoiseChanges<T> {
+    pub(crate) fn map<U>(&self, of: impl Fn(&T) -> U) -> NoiseChanges<U> {
+        NoiseChanges {
+            sheared: self.sheared.each_ref().map(&of),
+            turned: of(&self.turned),
+            plain: of(&self.plain),
+        }
+    }
+}
+
+impl Add for NoiseChanges<f32> {
+    type Output = Self;
+
+    fn add(self, other: Self) -> Self {
+        let [first, second] = self.sheared;
+        NoiseChanges {
+            sheared: [first + other.sheared[0], second + other.sheared[1]],
+            turned: self.turned + other.turned,
+            plain: self.plain + other.plain,
+        }
+    }
 }
 
 impl SpectralPsf {
@@ -209,21 +262,24 @@ impl SpectralPsf {
     }
 }
 
-/// Means of a product for four kinds of noise: its change with γ₁, its change with γ₂, what it lacks to be that
-/// behind a PSF turned by 90 degrees, and the noise itself.
-pub(crate) type Kinds = [f32; 4];
-
-/// Mean products of the changes with noise of σ = 1 of χ₁, χ₂, the size's T and the flux, and those that their second
-/// derivatives consist of.
+/// Mean products of the changes with noise of σ = 1 of χ₁, χ₂, the size's T, the flux and the light of the ring, and those that
+/// their second derivatives consist of.
 pub(crate) struct Products {
-    /// Of pairs in the order 00, 01, 02, 03, 11, 12, 13, 22, 23, 33.
-    pub(crate) pairs: [Kinds; 10],
+    /// χ₁ and χ₁, χ₁ and χ₂, χ₂ and χ₂.
+    pub(crate) chi_chi: [NoiseChanges<f32>; 3],
+    pub(crate) chi_square: [NoiseChanges<f32>; 2],
+    pub(crate) chi_flux: [NoiseChanges<f32>; 2],
+    pub(crate) square_square: NoiseChanges<f32>,
+    pub(crate) square_flux: NoiseChanges<f32>,
+    pub(crate) flux_flux: NoiseChanges<f32>,
+    pub(crate) ring_chi: [NoiseChanges<f32>; 2],
+    pub(crate) ring_square: NoiseChanges<f32>,
+    pub(crate) ring_flux: NoiseChanges<f32>,
+    pub(crate) ring_ring: NoiseChanges<f32>,
     /// Σ_k χ′_k · ∂φ_i/∂χ_k of `AdaptiveMoments`.
-    pub(crate) distortion: [Kinds; 2],
+    pub(crate) chi_slope: [NoiseChanges<f32>; 2],
     /// T′ · P₀ of `SizeMoments`.
-    pub(crate) square: Kinds,
-    /// Of the light of the ring with χ₁, χ₂, T, the flux and itself.
-    pub(crate) ring: [Kinds; 5],
+    pub(crate) square_zero: NoiseChanges<f32>,
 }
 
 impl Spectral {
@@ -378,8 +434,8 @@ impl Spectral {
             acf: lags.clone(),
             shear1: lags.clone(),
             shear2: lags,
-            flux: [0.0; 3],
-            ring: [0.0; 3],
+            flux: Light::default(),
+            ring: Light::default(),
         }
     }
 
@@ -393,7 +449,11 @@ impl Spectral {
             field_tilts: [zeros(), zeros()],
             floor: zeros(),
             noise_tilts: [zeros(), zeros()],
-            powers: [zeros(), zeros(), zeros(), zeros()],
+            powers: NoiseChanges {
+                sheared: [zeros(), zeros()],
+                turned: zeros(),
+                plain: zeros(),
+            },
         }
     }
 
@@ -405,18 +465,18 @@ impl Spectral {
     /// The same for pixels of this shape.
     pub(crate) fn noise_on(&self, noise: &StampNoise, pixels: PixelShape) -> ModeNoise {
         let waves = self.waves[0].iter().zip(&self.waves[1]);
-        let modes: Vec<[f32; 3]> = waves
-            .map(|(&kx, &ky)| {
-                let (power, slopes) = noise.power([kx, ky].map(f64::from), pixels);
-                let [first, second] = slopes.map(|slope| (0.5 * slope / power) as f32);
-                [power as f32, first, second]
-            })
-            .collect();
-        let column = |k: usize| modes.iter().map(|mode| mode[k]).collect();
-        ModeNoise {
-            power: column(0),
-            tilts: [column(1), column(2)],
+        let mut out = ModeNoise {
+            power: Vec::with_capacity(self.counts.len()),
+            tilts: Default::default(),
+        };
+        for (&kx, &ky) in waves {
+            let (power, slopes) = noise.power([kx, ky].map(f64::from), pixels);
+            out.power.push(power as f32);
+            for (tilt, slope) in out.tilts.iter_mut().zip(slopes) {
+                tilt.push((0.5 * slope / power) as f32);
+            }
         }
+        out
     }
 
     /// |g|² of each mode over the plane's area in px², of a round Gaussian galaxy of flux one with a mean square of `extent`
@@ -553,16 +613,17 @@ impl Spectral {
             *out = if here > 0.0 { there / here - 1.0 } else { 0.0 };
         }
         let area = (self.plane.period * self.plane.period) as f32 * self.inside;
-        let mut weigh = |kind: &[f32], out: &mut [f32]| {
-            weighted(kind, power, &self.counts, area, even);
+        let mut weigh = |change: &[f32], out: &mut [f32]| {
+            weighted(change, power, &self.counts, area, even);
             even_parities(even, out);
         };
-        let [first, second, turned, plain] = &mut out.powers;
-        weigh(&out.field_tilts[0], first);
-        weigh(&out.field_tilts[1], second);
-        weigh(modes, turned);
+        let powers = &mut out.powers;
+        for (tilt, sheared) in out.field_tilts.iter().zip(&mut powers.sheared) {
+            weigh(tilt, sheared);
+        }
+        weigh(modes, &mut powers.turned);
         modes.fill(1.0);
-        weigh(modes, plain);
+        weigh(modes, &mut powers.plain);
     }
 
     /// Puts the window at `centre` and the origin of the shear at `origin`, (x, y) in pixels from the middle of the stamp, for the
@@ -619,7 +680,11 @@ impl Spectral {
             let [cc, ..] = spectrum.quarters();
             dot(cc, &self.ring_counts)
         };
-        out.ring = scratch.windowed.each_ref().map(ring);
+        let [v, first, second] = &scratch.windowed;
+        out.ring = Light {
+            value: ring(v),
+            response: [ring(first), ring(second)],
+        };
         self.apply_window(scratch);
         let SpectralScratch {
             windowed: [v, first, second],
@@ -629,7 +694,10 @@ impl Spectral {
             ..
         } = scratch;
         stamp.copy_from(v);
-        out.flux = [&*v, first, second].map(Spectrum::sum);
+        out.flux = Light {
+            value: v.sum(),
+            response: [first.sum(), second.sum()],
+        };
         let variance = noise * noise;
         v.power(even);
         subtract_noise(even, &self.scale, &psf.floor, variance);
@@ -811,27 +879,26 @@ impl Spectral {
         for gradient in &mut *gradients {
             self.window.apply(gradient, quarter);
         }
-        let [first, second, g11, g12, g21, g22, square, zero] = &*gradients;
-        let mean = |a: &Spectrum, b: &Spectrum| sums_of_products(a, b, &psf.powers);
-        let trace = |row: [&Spectrum; 2]| {
-            let [one, two] = [mean(first, row[0]), mean(second, row[1])];
-            std::array::from_fn(|kind| one[kind] + two[kind])
-        };
+        let [chi1, chi2, phi11, phi12, phi21, phi22, square, zero] = &*gradients;
         // The flux is the sum under the window.
-        let quantities = [first, second, square, &self.window_spectrum];
-        let mut pairs = [[0.0; 4]; 10];
-        let places = (0..4).flat_map(|a| (a..4).map(move |b| [a, b]));
-        for (found, [a, b]) in pairs.iter_mut().zip(places) {
-            *found = mean(quantities[a], quantities[b]);
-        }
+        let (flux, ring) = (&self.window_spectrum, &self.ring_spectrum);
+        let mean = |a: &Spectrum, b: &Spectrum| sums_of_products(a, b, &psf.powers);
         Products {
-            pairs,
-            distortion: [trace([g11, g12]), trace([g21, g22])],
-            square: mean(square, zero),
-            ring: std::array::from_fn(|at| {
-                let with = quantities.get(at).copied().unwrap_or(&self.ring_spectrum);
-                mean(with, &self.ring_spectrum)
-            }),
+            chi_chi: [mean(chi1, chi1), mean(chi1, chi2), mean(chi2, chi2)],
+            chi_square: [mean(chi1, square), mean(chi2, square)],
+            chi_flux: [mean(chi1, flux), mean(chi2, flux)],
+            square_square: mean(square, square),
+            square_flux: mean(square, flux),
+            flux_flux: mean(flux, flux),
+            ring_chi: [mean(chi1, ring), mean(chi2, ring)],
+            ring_square: mean(square, ring),
+            ring_flux: mean(flux, ring),
+            ring_ring: mean(ring, ring),
+            chi_slope: [
+                mean(chi1, phi11) + mean(chi2, phi12),
+                mean(chi1, phi21) + mean(chi2, phi22),
+            ],
+            square_zero: mean(square, zero),
         }
     }
 }
@@ -967,7 +1034,7 @@ struct Edges {
 /// Buffers for one thread. Their content between calls does not matter.
 #[derive(Debug, Clone)]
 struct EdgesScratch {
-    /// Left and right edge, the same times y, lower and upper edge, and the same times x.
+    /// The left, right, lower and upper edge for γ₁, and for γ₂.
     lines: Vec<f32>,
     /// Of each of them and each frequency along it, real and imaginary part.
     re: Vec<f32>,
@@ -1033,8 +1100,13 @@ impl Edges {
         to_modes.transform_lines(lines, transform, [re, im]);
         edge_phases(plane, half * skew, waves);
         let edges = re.chunks_exact_mut(width).zip(im.chunks_exact_mut(width));
-        for (line, (re, im)) in edges.enumerate().filter(|(line, _)| line % 4 >= 2) {
-            let sign = if line % 2 == 0 { 1.0 } else { -1.0 };
+        for (line, (re, im)) in edges.enumerate() {
+            let sign = match line % EDGES {
+                2 => 1.0,
+                3 => -1.0,
+                // The left and right edges are transformed below, with all of their pixels.
+                _ => continue,
+            };
             let phases = waves[0].iter().zip(&waves[1]);
             for ((re, im), (cos, sin)) in re.iter_mut().zip(im).zip(phases) {
                 let sin = sign * sin;
@@ -1044,7 +1116,7 @@ impl Edges {
         edge_phases(plane, half * stretch, waves);
         let mut changes = changes;
         for (which, change) in changes.iter_mut().enumerate() {
-            let line = |k: usize| &lines[(4 * which + k) * n..][..n];
+            let line = |edge: usize| &lines[(EDGES * which + edge) * n..][..n];
             let [cos, sin] = &*waves;
             to_modes.transform_sides([line(0), line(1)], [cos, sin], transform, spectrum);
             change.take_spectrum(spectrum);
@@ -1052,7 +1124,7 @@ impl Edges {
         edge_phases(plane, half / stretch, waves);
         let line = |k: usize| [&re[k * width..][..width], &im[k * width..][..width]];
         for (which, change) in changes.into_iter().enumerate() {
-            let levels = [line(4 * which + 2), line(4 * which + 3)];
+            let levels = [line(EDGES * which + 2), line(EDGES * which + 3)];
             self.add_rows(change, None, levels, waves);
         }
     }
@@ -1090,54 +1162,29 @@ impl Edges {
     fn take(
         &self,
         stamp: &[f32],
-        [x0, y0]: [f32; 2],
+        centre: [f32; 2],
         (to_modes, transform): (&ToModes, &mut TransformScratch),
         scratch: &mut EdgesScratch,
         changes: [&mut Modes; 2],
     ) {
-        let (n, width) = (self.n, self.width);
-        let middle = (n as f32 - 1.0) / 2.0;
-        // v·∇T on either edge, without the factor of the place along it.
-        let half = n as f32 / 2.0;
-        let factors = [
-            [-(half + x0), -(half - x0)],
-            [1.0, -1.0],
-            [half + y0, half - y0],
-            [1.0, -1.0],
-        ];
+        let width = self.width;
         let EdgesScratch { lines, re, im, .. } = scratch;
-        for at in 0..n {
-            // Half a pixel outwards, along a straight line.
-            let edge = |first: usize, step: usize| {
-                let beyond = |a: usize, b: usize| 1.5 * stamp[a] - 0.5 * stamp[b];
-                let last = first + (n - 1) * step;
-                [beyond(first, first + step), beyond(last, last - step)]
-            };
-            let (side, level) = (edge(at * n, 1), edge(at, n));
-            let place = at as f32 - middle;
-            let values = [
-                side,
-                side.map(|value| value * (place - y0)),
-                level,
-                level.map(|value| value * (place - x0)),
-            ];
-            for (line, (values, factors)) in values.iter().zip(factors).enumerate() {
-                for edge in 0..2 {
-                    lines[(2 * line + edge) * n + at] = values[edge] * factors[edge];
-                }
-            }
-        }
+        edge_lines(stamp, self.n, SHEARS, centre, lines);
         to_modes.transform_lines(lines, transform, [re, im]);
         let line = |k: usize| [&re[k * width..][..width], &im[k * width..][..width]];
         for (which, change) in changes.into_iter().enumerate() {
-            let sides = [line(2 * which), line(2 * which + 1)];
-            let levels = [line(2 * which + 4), line(2 * which + 5)];
+            let [left, right, lower, upper] = [0, 1, 2, 3].map(|edge| line(EDGES * which + edge));
             change.re.fill(0.0);
             change.im.fill(0.0);
-            self.add_rows(change, Some(sides), levels, &self.phase);
+            self.add_rows(change, Some([left, right]), [lower, upper], &self.phase);
         }
     }
 }
+
+// Matrices of γ₁ and γ₂: a shear moves light at x by γ V x.
+const SHEARS: [[[f64; 2]; 2]; 2] = [[[1.0, 0.0], [0.0, -1.0]], [[0.0, 1.0], [1.0, 0.0]]];
+// Left, right, lower and upper edge.
+const EDGES: usize = 4;
 
 // Writes I v·∇T of a stamp on its edges for two shears about (x0, y0), v = S (x − x0, y − y0) with a matrix S in pixels: for each
 // shear the left, right, lower and upper edge.
@@ -1167,7 +1214,7 @@ fn edge_lines(
                 -upper * (yx * (place - x0) + yy * (half - y0)),
             ];
             for (line, value) in values.into_iter().enumerate() {
-                lines[(4 * which + line) * n + at] = value;
+                lines[(EDGES * which + line) * n + at] = value;
             }
         }
     }
@@ -1241,14 +1288,14 @@ fn restore(spectra: &mut [Spectrum; 3], with: &Restoration<'_>) {
         }
         for k in 0..3 {
             let ([above_re, above_im], [below_re, below_im]) = (&above[k], &below[k]);
-            let mut out = [[0.0f32; LANES]; 4];
+            let [mut cc, mut cs, mut sc, mut ss] = [[0.0f32; LANES]; 4];
             for l in 0..LANES {
-                out[0][l] = 0.5 * (below_re[l] + above_re[l]);
-                out[1][l] = 0.5 * (above_im[l] - below_im[l]);
-                out[2][l] = 0.5 * (above_im[l] + below_im[l]);
-                out[3][l] = 0.5 * (below_re[l] - above_re[l]);
+                cc[l] = 0.5 * (below_re[l] + above_re[l]);
+                cs[l] = 0.5 * (above_im[l] - below_im[l]);
+                sc[l] = 0.5 * (above_im[l] + below_im[l]);
+                ss[l] = 0.5 * (below_re[l] - above_re[l]);
             }
-            store(spectra[k].quarters_mut(), at, out);
+            store(spectra[k].quarters_mut(), at, [cc, cs, sc, ss]);
         }
     }
 }
@@ -1274,16 +1321,12 @@ fn restore_half(
     let (kx, ky) = (lanes(&with.waves[0], at), lanes(&with.waves[1], at));
     let [[u_re, u_im], [first_re, first_im], [second_re, second_im]] = out;
     for l in 0..LANES {
-        let (ur, ui) = (u[0][l] + sign * u[3][l], u[2][l] - sign * u[1][l]);
-        let (xr, xi) = (
-            x[0][l] + sign * x[3][l] - x0 * ur,
-            x[2][l] - sign * x[1][l] - x0 * ui,
-        );
-        let (yr, yi) = (
-            y[0][l] + sign * y[3][l] - y0 * ur,
-            y[2][l] - sign * y[1][l] - y0 * ui,
-        );
-        let [[plus_re, plus_im], [cross_re, cross_im]] = sheared([xr, xi], [yr, yi], kx[l], ky[l]);
+        let [ur, ui] = mode_of(u, sign, l);
+        let [xr, xi] = mode_of(x, sign, l);
+        let [yr, yi] = mode_of(y, sign, l);
+        let about_origin = ([xr - x0 * ur, xi - x0 * ui], [yr - y0 * ur, yi - y0 * ui]);
+        let [[plus_re, plus_im], [cross_re, cross_im]] =
+            sheared(about_origin.0, about_origin.1, kx[l], ky[l]);
         let of_psf = |tilt: &[[f32; LANES]; 2]| {
             let (re, im) = (tilt[0][l], tilt[1][l]);
             (re * ur - im * ui, re * ui + im * ur)
@@ -1299,6 +1342,12 @@ fn restore_half(
         (first_re[l], first_im[l]) = (ar * re - ai * im, ar * im + ai * re);
         (second_re[l], second_im[l]) = (br * re - bi * im, br * im + bi * re);
     }
+}
+
+// The transform at a mode from the four parts of a spectrum, with the sign of ss in its real part.
+#[inline(always)]
+fn mode_of([cc, cs, sc, ss]: [&[f32; LANES]; 4], sign: f32, l: usize) -> [f32; 2] {
+    [cc[l] + sign * ss[l], sc[l] - sign * cs[l]]
 }
 
 // (k_x ∂_x − k_y ∂_y) and (k_y ∂_x + k_x ∂_y) of a transform, from the transforms of its image times x and y: ∂ of it is
@@ -1502,38 +1551,58 @@ fn twice_scaled(v: &Spectrum, real: &[f32], scale: &[f32], out: &mut Spectrum) {
     for at in (0..scale.len()).step_by(LANES) {
         let [cc, cs, sc, ss] = four_lanes(v.quarters(), at);
         let (even, odd, scale) = (lanes(even, at), lanes(odd, at), lanes(scale, at));
-        let mut products = [[0.0f32; LANES]; 4];
+        let [mut out_cc, mut out_cs, mut out_sc, mut out_ss] = [[0.0f32; LANES]; 4];
         for l in 0..LANES {
             let (even, odd) = (2.0 * scale[l] * even[l], 2.0 * scale[l] * odd[l]);
-            products[0][l] = cc[l] * even + ss[l] * odd;
-            products[1][l] = cs[l] * even - sc[l] * odd;
-            products[2][l] = sc[l] * even - cs[l] * odd;
-            products[3][l] = cc[l] * odd + ss[l] * even;
+            out_cc[l] = cc[l] * even + ss[l] * odd;
+            out_cs[l] = cs[l] * even - sc[l] * odd;
+            out_sc[l] = sc[l] * even - cs[l] * odd;
+            out_ss[l] = cc[l] * odd + ss[l] * even;
         }
-        store(out.quarters_mut(), at, products);
+        store(out.quarters_mut(), at, [out_cc, out_cs, out_sc, out_ss]);
     }
 }
 
-// Sums over the plane of Re(conj(a)·b) times each of four real even spectra.
+// Sums over the plane of Re(conj(a)·b) times a real even spectrum for each change of noise.
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn sums_of_products(a: &Spectrum, b: &Spectrum, kinds: &[Vec<f32>; 4]) -> Kinds {
+fn sums_of_products(
+    a: &Spectrum,
+    b: &Spectrum,
+    powers: &NoiseChanges<Vec<f32>>,
+) -> NoiseChanges<f32> {
     let (a, b) = (a.quarters(), b.quarters());
     let quarter = a[0].len();
-    let [mut first, mut second, mut third, mut fourth] = [[0.0f32; LANES]; 4];
+    let [mut first, mut second, mut turned, mut plain] = [[0.0f32; LANES]; 4];
     for at in (0..quarter).step_by(LANES) {
         let (a, b) = (four_lanes(a, at), four_lanes(b, at));
-        let kind = |k: usize| (lanes(&kinds[k], at), lanes(&kinds[k], quarter + at));
-        let kinds = [kind(0), kind(1), kind(2), kind(3)];
+        let [by_first, by_second] =
+            [&powers.sheared[0], &powers.sheared[1]].map(|p| parities(p, at));
+        let [by_turned, by_plain] = [&powers.turned, &powers.plain].map(|p| parities(p, at));
         for l in 0..LANES {
             let (even, odd) = (even_of_product(a, b, l), odd_of_product(a, b, l));
-            first[l] += even * kinds[0].0[l] + odd * kinds[0].1[l];
-            second[l] += even * kinds[1].0[l] + odd * kinds[1].1[l];
-            third[l] += even * kinds[2].0[l] + odd * kinds[2].1[l];
-            fourth[l] += even * kinds[3].0[l] + odd * kinds[3].1[l];
+            first[l] += even * by_first.0[l] + odd * by_first.1[l];
+            second[l] += even * by_second.0[l] + odd * by_second.1[l];
+            turned[l] += even * by_turned.0[l] + odd * by_turned.1[l];
+            plain[l] += even * by_plain.0[l] + odd * by_plain.1[l];
         }
     }
     // Of modes above and below: (e − o)(E − O) + (e + o)(E + O).
-    [first, second, third, fourth].map(|lanes| 2.0 * lanes.iter().sum::<f32>())
+    let [first, second, turned, plain] =
+        [first, second, turned, plain].map(|lanes| 2.0 * lanes.iter().sum::<f32>());
+    NoiseChanges {
+        sheared: [first, second],
+        turned,
+        plain,
+    }
+}
+
+// The parts cc and ss of a real even spectrum.
+#[inline(always)]
+fn parities(spectrum: &[f32], at: usize) -> (&[f32; LANES], &[f32; LANES]) {
+    (
+        lanes(spectrum, at),
+        lanes(spectrum, spectrum.len() / 2 + at),
+    )
 }
 
 // The part cc of Re(conj(a)·b) of modes.

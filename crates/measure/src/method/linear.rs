@@ -26,8 +26,7 @@ use shearq_submissions::limits::{MAX_TARGET, MIN_TARGET, WINDOWS};
 use shearq_submissions::{LinearDeconvolution, LinearMethod, PsfCut, ShearOrigin};
 
 use super::{
-    AdaptedSettings, CutEpoch, CutWorker, Found, FoundObservables, Images, NoiseMeans,
-    NoiseMoments, image,
+    AdaptedSettings, CutEpoch, CutWorker, Found, FoundObservables, Images, NoiseMeans, image,
 };
 use crate::error::MeasureError;
 use crate::measurement::{Descent, ResponseMatrix, Stop};
@@ -39,8 +38,8 @@ use crate::psf::{
 use crate::selection::ShearSettings;
 use crate::shape::{AdaptiveMoments, AdaptiveScratch, AdaptiveShape, MeanSquare, SizeMoments};
 use crate::spectral::{
-    EpochScratch, Lags, ModeNoise, Products, Spectral, SpectralEpoch, SpectralPsf, SpectralScratch,
-    uniform,
+    EpochScratch, Lags, ModeNoise, NoiseChanges, Spectral, SpectralEpoch, SpectralPsf,
+    SpectralScratch, uniform,
 };
 use crate::stamp::hash;
 use crate::stamp::{WeightedMoments, shear_origin};
@@ -275,7 +274,7 @@ impl LinearFamily {
     /// A worker for one thread.
     pub(super) fn worker(self: &Arc<Self>) -> LinearWorker {
         LinearWorker {
-            workers: vec![(CONFIGURED, PlanWorker::new(Arc::clone(&self.configured)))],
+            workers: vec![PlanWorker::new(CONFIGURED, Arc::clone(&self.configured))],
             current: 0,
             galaxy_variance: None,
             moments: WeightedMoments::default(),
@@ -292,7 +291,7 @@ impl LinearFamily {
 pub(super) struct LinearWorker {
     family: Arc<LinearFamily>,
     /// Workers of the plans that this thread has needed.
-    workers: Vec<(PlanIndex, PlanWorker)>,
+    workers: Vec<PlanWorker>,
     /// Place of the worker for the present PSF.
     current: usize,
     noise: StampNoise,
@@ -317,7 +316,7 @@ impl CutWorker for LinearWorker {
         // The noise of each mode takes as long as several galaxies, and rows of an image share it.
         if self.noise != *noise {
             self.noise = noise.clone();
-            for (_, worker) in &mut self.workers {
+            for worker in &mut self.workers {
                 worker.set_noise(noise, worker.noise_pixels);
             }
         }
@@ -344,7 +343,7 @@ impl CutWorker for LinearWorker {
         });
         let index = (width_step(psf, settings.reference_area), window);
         self.current = place_of(index, &mut self.workers, &self.family, &self.noise)?;
-        let worker = &mut self.workers[self.current].1;
+        let worker = &mut self.workers[self.current];
         worker.set_pixel_shape(self.pixels, &self.noise);
         worker.set_psf(psf)?;
         if self.gain.is_some() {
@@ -356,21 +355,18 @@ impl CutWorker for LinearWorker {
     }
 
     fn retake_psf(&mut self) {
-        let worker = &mut self.workers[self.current].1;
+        let worker = &mut self.workers[self.current];
         worker.set_pixel_shape(self.pixels, &self.noise);
         worker.retake_psf();
     }
 
     fn adapted(&self) -> Option<AdaptedSettings> {
-        Some(self.workers[self.current].1.plan.lengths)
+        Some(self.workers[self.current].plan.lengths)
     }
 
     fn measure_cut(&mut self, cut: &[f32], noise: f64) -> Result<Option<Found>, MeasureError> {
-        Ok((noise >= 0.0 && noise.is_finite()).then(|| {
-            self.workers[self.current]
-                .1
-                .measure_shape(cut, noise, self.gain)
-        }))
+        Ok((noise >= 0.0 && noise.is_finite())
+            .then(|| self.workers[self.current].measure_shape(cut, noise, self.gain)))
     }
 
     // The plan follows the PSFs, not the galaxy: Σp² is the weighted mean over the PSFs.
@@ -410,7 +406,7 @@ impl CutWorker for LinearWorker {
             window,
         );
         self.current = place_of(index, &mut self.workers, &self.family, &self.noise)?;
-        let worker = &mut self.workers[self.current].1;
+        let worker = &mut self.workers[self.current];
         worker.psf_variance = 1.0 / (4.0 * std::f64::consts::PI * squares);
         let level = total.sqrt().recip();
         let gain = (inverse_gain > 0.0).then(|| inverse_gain.recip());
@@ -420,23 +416,23 @@ impl CutWorker for LinearWorker {
     }
 
     fn images(&mut self, cut: &[f32], psf: ArrayView2<'_, f64>) -> Images {
-        self.workers[self.current].1.images(cut, psf)
+        self.workers[self.current].images(cut, psf)
     }
 }
 
 /// Place of the worker for a plan, which is made if it is new.
 fn place_of(
     index: PlanIndex,
-    workers: &mut Vec<(PlanIndex, PlanWorker)>,
+    workers: &mut Vec<PlanWorker>,
     family: &LinearFamily,
     noise: &StampNoise,
 ) -> Result<usize, MeasureError> {
-    if let Some(known) = workers.iter().position(|(of, _)| *of == index) {
+    if let Some(known) = workers.iter().position(|worker| worker.index == index) {
         return Ok(known);
     }
-    let mut worker = PlanWorker::new(family.plan(index)?);
+    let mut worker = PlanWorker::new(index, family.plan(index)?);
     worker.set_noise(noise, PixelShape::SQUARE);
-    workers.push((index, worker));
+    workers.push(worker);
     Ok(workers.len() - 1)
 }
 
@@ -457,6 +453,7 @@ impl EpochBuffers {
 
 /// Buffers of one thread for one plan.
 struct PlanWorker {
+    index: PlanIndex,
     plan: Arc<LinearPlan>,
     noise: ModeNoise,
     /// The shape of pixels that `noise` is for.
@@ -480,8 +477,9 @@ struct PlanWorker {
 }
 
 impl PlanWorker {
-    fn new(plan: Arc<LinearPlan>) -> Self {
+    fn new(index: PlanIndex, plan: Arc<LinearPlan>) -> Self {
         PlanWorker {
+            index,
             noise: plan.spectral.noise(&StampNoise::white(1.0)),
             noise_pixels: PixelShape::SQUARE,
             pixels: PixelShape::SQUARE,
@@ -561,11 +559,9 @@ impl PlanWorker {
             ..
         } = &*self.plan;
         let response = |change: &[f32]| f64::from(moments.response(mean_square, change));
-        let flux = self.lags.flux.map(|flux| aperture * f64::from(flux));
         FoundObservables {
-            flux: flux[0],
+            flux: self.lags.flux.map(|flux| aperture * f64::from(flux)),
             flux_error: aperture * f64::from(noise * self.psf.flux_error()),
-            flux_response: [flux[1], flux[2]],
             ring: self.lags.ring.map(f64::from),
             square_response: [response(&self.lags.shear1), response(&self.lags.shear2)],
             size: moments.size(f64::from(mean_square.square)),
@@ -582,7 +578,7 @@ impl PlanWorker {
         shape: &AdaptiveShape,
         mean_square: &MeanSquare,
         noise: f32,
-    ) -> NoiseMoments {
+    ) -> NoiseChanges<NoiseMeans> {
         let plan = &*self.plan;
         let curvature =
             plan.moments
@@ -591,12 +587,7 @@ impl PlanWorker {
         for ((out, zero), two) in self.square_gradient.iter_mut().zip(zero).zip(two) {
             *out = SizeMoments::combine(mean_square, [*zero, *two]);
         }
-        let Products {
-            pairs,
-            distortion,
-            square,
-            ring,
-        } = plan.spectral.products(
+        let products = plan.spectral.products(
             &self.psf,
             &self.gradients,
             [&self.square_gradient, zero],
@@ -606,36 +597,38 @@ impl PlanWorker {
         // The aperture corrects each factor of the flux.
         let [unit, with_flux, with_fluxes] =
             [0, 1, 2].map(|power| unit * plan.aperture.powi(power));
-        let means = |kind: usize| {
-            let [chi11, chi12, t1, f1, chi22, t2, f2, tt, tf, ff] = pairs.map(|pair| pair[kind]);
-            let curvature = shape.mean_second_derivative(
+        let means = |change: fn(NoiseChanges<f32>) -> f32| {
+            let of = |product| unit * f64::from(change(product));
+            let of_flux = |product| with_flux * f64::from(change(product));
+            let chi_curvature = shape.mean_second_derivative(
                 &curvature,
-                [chi11, chi12, chi22],
-                distortion.map(|mixed| mixed[kind]),
+                products.chi_chi.map(change),
+                products.chi_slope.map(change),
             );
-            let [ring1, ring2, ring_t, ring_f, ring_ring] = ring.map(|product| product[kind]);
-            let of = |value: f32| unit * f64::from(value);
-            let of_flux = |value: f32| with_flux * f64::from(value);
+            let square_curvature =
+                SizeMoments::mean_second_derivative(mean_square, change(products.square_zero));
             NoiseMeans {
-                chi_chi: [chi11, chi12, chi22].map(of),
-                chi_square: [t1, t2].map(of),
-                chi_flux: [f1, f2].map(of_flux),
-                square_square: of(tt),
-                square_flux: of_flux(tf),
-                flux_flux: with_fluxes * f64::from(ff),
-                ring_chi: [ring1, ring2].map(of),
-                ring_square: of(ring_t),
-                ring_flux: of_flux(ring_f),
-                ring_ring: of(ring_ring),
-                chi_curvature: curvature.map(|value| unit * value),
-                square_curvature: unit
-                    * SizeMoments::mean_second_derivative(mean_square, square[kind]),
+                chi_chi: products.chi_chi.map(of),
+                chi_square: products.chi_square.map(of),
+                chi_flux: products.chi_flux.map(of_flux),
+                square_square: of(products.square_square),
+                square_flux: of_flux(products.square_flux),
+                flux_flux: with_fluxes * f64::from(change(products.flux_flux)),
+                ring_chi: products.ring_chi.map(of),
+                ring_square: of(products.ring_square),
+                ring_flux: of_flux(products.ring_flux),
+                ring_ring: of(products.ring_ring),
+                chi_curvature: chi_curvature.map(|value| unit * value),
+                square_curvature: unit * square_curvature,
             }
         };
-        NoiseMoments {
-            sheared: [means(0), means(1)],
-            turned: means(2),
-            plain: means(3),
+        NoiseChanges {
+            sheared: [
+                means(|product| product.sheared[0]),
+                means(|product| product.sheared[1]),
+            ],
+            turned: means(|product| product.turned),
+            plain: means(|product| product.plain),
         }
     }
 
@@ -651,10 +644,10 @@ impl PlanWorker {
         let of_size = self.regularisation.size * noise * noise;
         let typical = plan.regularisation.typical_square;
         let mean_square = plan.size_moments.measure(&lags.acf, of_size, typical);
-        let [size, ..] = plan.size_moments.size(f64::from(mean_square.square));
+        let size = plan.size_moments.size(f64::from(mean_square.square)).px;
         let window = plan.lengths.window_sigma * plan.lengths.window_sigma;
         let of_galaxy = size * size;
-        let flux = f64::from(lags.flux[0]) * (1.0 + (of_galaxy + target * target) / window);
+        let flux = f64::from(lags.flux.value) * (1.0 + (of_galaxy + target * target) / window);
         let under = flux / (1.0 + 2.0 * (of_galaxy + self.psf_variance) / window);
         under.max(0.0) / (std::f64::consts::PI * window)
     }
@@ -756,7 +749,7 @@ impl PlanWorker {
             response: None,
             noise_moments: None,
             observables: None,
-            flux: plan.aperture * f64::from(lags.flux[0]),
+            flux: plan.aperture * f64::from(lags.flux.value),
             radius: plan.spectral.lattice().radius(),
             size: f64::NAN,
         };
@@ -771,7 +764,7 @@ impl PlanWorker {
                 found.noise_moments = Some(self.noise_moments(&shape, &mean_square, total_noise));
             }
             let observables = self.observables(&mean_square, total_noise, seed);
-            found.size = observables.size[0];
+            found.size = observables.size.px;
             found.observables = Some(observables);
         }
         found
@@ -1117,6 +1110,25 @@ mod tests {
             stamp > 1.5e-3 && centroid.abs() < 3e-4,
             "{stamp} {centroid}"
         );
+    }
+
+    #[test]
+    fn the_size_of_a_galaxy_of_snr_5_is_half_the_typical_one() {
+        let configuration = wide_psf(15.0);
+        let method = configuration.linear().unwrap();
+        let variance = LinearFamily::variance(method, CONFIGURED_WINDOW);
+        let plan = Arc::new(LinearPlan::new(method, 48, 48, variance).unwrap());
+        for fwhm in [2.4, 5.5] {
+            let mut worker = PlanWorker::new(CONFIGURED, Arc::clone(&plan));
+            worker.set_psf(gaussian(fwhm).stamp(48).view()).unwrap();
+            let stamp = stamp(variance, (fwhm / 2.354_82_f64).powi(2) + 1.0 / 12.0);
+            let light = stamp.iter().map(|v| v * v).sum::<f32>();
+            worker.measure_shape(stamp.as_slice().unwrap(), 0.0, None);
+            let [zero, _] = plan.size_moments.sums(&worker.lags.acf);
+            // The variance of the noise is the light over the square of the S/N.
+            let added = worker.regularisation.size * light / 25.0;
+            assert!((added / zero - 1.0).abs() < 0.03, "{fwhm}: {added} {zero}");
+        }
     }
 
     #[test]

@@ -314,10 +314,15 @@ fn hermite(functions: &mut Array2<f64>, centre: f64, scale: f64) {
     }
 }
 
-// Amplitude, centre (x, y), logarithm of the width w of s = r²/w², two ellipticities, κ and the wing.
-const PARAMETERS: usize = 8; // Counts them.
-const KAPPA: usize = 6; // Place of κ among the parameters.
+const AMPLITUDE: usize = 0; // Place of the amplitude among the parameters.
+const CENTRE_X: usize = 1; // Place of the centre along x.
+const CENTRE_Y: usize = 2; // Place of the centre along y.
+const LOG_WIDTH: usize = 3; // Place of the logarithm of the width w of s = r²/w².
+const E1: usize = 4; // Place of the first component of the ellipticity.
+const E2: usize = 5; // Place of the second component.
+const KAPPA: usize = 6; // Place of κ.
 const WING: usize = 7; // Place of the wing's amplitude, in units of the core's.
+const PARAMETERS: usize = 8; // Counts them.
 
 // κ = 1/β that is expected of a star, and its standard deviation.
 // β = 3 to 4.8 of Moffat and Kolmogorov profiles. Loose: a star of S/N 50 determines κ to about 0.06.
@@ -384,17 +389,12 @@ impl Moffat {
         let width = 0.5 * (2.0 * mean_square).ln();
         let sum = star.sum();
         let mut at = Moffat {
-            values: [
-                sum / (2.0 * std::f64::consts::PI * mean_square),
-                centre[0],
-                centre[1],
-                width,
-                0.0,
-                0.0,
-                KAPPA_PRIOR[0],
-                0.0,
-            ],
+            values: [0.0; PARAMETERS],
         };
+        at.values[AMPLITUDE] = sum / (2.0 * std::f64::consts::PI * mean_square);
+        [at.values[CENTRE_X], at.values[CENTRE_Y]] = centre;
+        at.values[LOG_WIDTH] = width;
+        at.values[KAPPA] = KAPPA_PRIOR[0];
         let mut chi2 = at.chi_square(star, centre, half_side, sigma);
         let mut damping = 1e-3;
         for _ in 0..MAX_STEPS {
@@ -409,9 +409,11 @@ impl Moffat {
             if kappa.abs() < 1e-3 {
                 *kappa = 1e-3;
             }
-            let ellipticity = next.values[4].hypot(next.values[5]);
-            let moved = (next.values[1] - centre[0]).hypot(next.values[2] - centre[1]);
-            let is_star = ellipticity < 0.9 && moved < 4.0 && (next.values[3] - width).abs() < 1.5;
+            let ellipticity = next.values[E1].hypot(next.values[E2]);
+            let moved =
+                (next.values[CENTRE_X] - centre[0]).hypot(next.values[CENTRE_Y] - centre[1]);
+            let is_star =
+                ellipticity < 0.9 && moved < 4.0 && (next.values[LOG_WIDTH] - width).abs() < 1.5;
             let found = is_star.then(|| next.chi_square(star, centre, half_side, sigma));
             match found {
                 Some(found) if found.value <= chi2.value => {
@@ -419,22 +421,23 @@ impl Moffat {
                     (at, chi2) = (next, found);
                     damping *= 0.1;
                     if gain < CONVERGED_CHI2 {
-                        return (at.values[0] > 0.0).then_some(at);
+                        return (at.values[AMPLITUDE] > 0.0).then_some(at);
                     }
                 }
                 _ => damping = (damping * 10.0).max(1e-3),
             }
         }
-        (at.values[0] > 0.0 && at.values.iter().all(|value| value.is_finite())).then_some(at)
+        (at.values[AMPLITUDE] > 0.0 && at.values.iter().all(|value| value.is_finite()))
+            .then_some(at)
     }
 
     pub(super) fn amplitude(&self) -> f64 {
-        self.values[0]
+        self.values[AMPLITUDE]
     }
 
     /// (x, y) in pixels from the first.
     pub(super) fn centre(&self) -> [f64; 2] {
-        [self.values[1], self.values[2]]
+        [self.values[CENTRE_X], self.values[CENTRE_Y]]
     }
 
     /// The form s at (x, y) in pixels from the first.
@@ -450,7 +453,7 @@ impl Moffat {
 
     /// Mean σ of the Gaussian that the profile is at its centre.
     pub(super) fn sigma(&self) -> f64 {
-        self.values[3].exp() * std::f64::consts::FRAC_1_SQRT_2
+        self.values[LOG_WIDTH].exp() * std::f64::consts::FRAC_1_SQRT_2
     }
 
     pub(super) fn draw(&self, mut to: ArrayViewMut2<'_, f64>) {
@@ -459,7 +462,7 @@ impl Moffat {
             for x in (0..n).step_by(LANES) {
                 let values = drawn(&single, x as f32, y as f32);
                 for (value, drawn) in row.iter_mut().skip(x).zip(values) {
-                    *value = self.values[0] * f64::from(drawn);
+                    *value = self.values[AMPLITUDE] * f64::from(drawn);
                 }
             }
         }
@@ -468,7 +471,7 @@ impl Moffat {
     /// In single precision, with the scale 1/w² in place of the logarithm of the width.
     fn single(&self) -> [f32; PARAMETERS] {
         let mut single = self.values.map(|value| value as f32);
-        single[3] = (-2.0 * self.values[3]).exp() as f32;
+        single[LOG_WIDTH] = (-2.0 * self.values[LOG_WIDTH]).exp() as f32;
         single
     }
 
@@ -491,7 +494,7 @@ impl Moffat {
             for x in columns.clone().step_by(LANES) {
                 let (mut values, mut weights) = ([0.0; LANES], [0.0; LANES]);
                 for lane in 0..LANES.min(columns.end - x) {
-                    values[lane] = (star[(y, x + lane)] / self.values[0]) as f32;
+                    values[lane] = (star[(y, x + lane)] / self.values[AMPLITUDE]) as f32;
                     weights[lane] = 1.0;
                 }
                 add(
@@ -505,7 +508,7 @@ impl Moffat {
         }
         let total = |lanes: [f32; LANES]| {
             let sum: f64 = lanes.into_iter().map(f64::from).sum();
-            sum * (self.values[0] / sigma).powi(2)
+            sum * (self.values[AMPLITUDE] / sigma).powi(2)
         };
         let mut chi2 = ChiSquare {
             value: total(products.square),
@@ -513,7 +516,13 @@ impl Moffat {
             curvature: [[0.0; PARAMETERS]; PARAMETERS],
         };
         // The derivative with the amplitude is in units of it.
-        let unit = |i: usize| if i == 0 { 1.0 / self.values[0] } else { 1.0 };
+        let unit = |i: usize| {
+            if i == AMPLITUDE {
+                1.0 / self.values[AMPLITUDE]
+            } else {
+                1.0
+            }
+        };
         for i in 0..PARAMETERS {
             chi2.gradient[i] *= unit(i);
             for j in 0..=i {
@@ -572,14 +581,14 @@ fn add(
         let slope = core_slope + wing * tail_slope;
         let weight = weights[lane];
         let mean = core * pixel(base, s, kappa, scale);
-        by[0][lane] = weight * (mean + wing * tail);
-        by[1][lane] = weight * slope * -2.0 * scale * ((1.0 - e1) * dx - e2 * dy);
-        by[2][lane] = weight * slope * -2.0 * scale * ((1.0 + e1) * dy - e2 * dx);
-        by[3][lane] = weight * -2.0 * slope * s;
-        by[4][lane] = weight * -slope * scale * across;
-        by[5][lane] = weight * -slope * scale * along;
-        by[6][lane] = weight * (core * log * inverse + s * core_slope) * inverse;
-        by[7][lane] = weight * tail;
+        by[AMPLITUDE][lane] = weight * (mean + wing * tail);
+        by[CENTRE_X][lane] = weight * slope * -2.0 * scale * ((1.0 - e1) * dx - e2 * dy);
+        by[CENTRE_Y][lane] = weight * slope * -2.0 * scale * ((1.0 + e1) * dy - e2 * dx);
+        by[LOG_WIDTH][lane] = weight * -2.0 * slope * s;
+        by[E1][lane] = weight * -slope * scale * across;
+        by[E2][lane] = weight * -slope * scale * along;
+        by[KAPPA][lane] = weight * (core * log * inverse + s * core_slope) * inverse;
+        by[WING][lane] = weight * tail;
         residual[lane] = weight * (values[lane] - mean - wing * tail);
     }
     let take = |sum: &mut [f32; LANES], a: &[f32; LANES], b: &[f32; LANES]| {
@@ -1162,15 +1171,8 @@ mod tests {
         };
         let values = std::array::from_fn(|k| {
             std::array::from_fn(|term| {
-                let (knot, after) = match term {
-                    0 => (k, 0),
-                    _ => (
-                        k / AZIMUTHAL_STRIDE * AZIMUTHAL_STRIDE,
-                        k % AZIMUTHAL_STRIDE,
-                    ),
-                };
-                let [from, to] = [knot, knot + AZIMUTHAL_STRIDE].map(|knot| wave(term, knot));
-                from + (to - from) * after as f64 / AZIMUTHAL_STRIDE as f64
+                let between = if term == 0 { 0 } else { k % 2 };
+                0.5 * (wave(term, k - between) + wave(term, k + between))
             })
         });
         let residual = ResidualProfile {
@@ -1198,6 +1200,43 @@ mod tests {
         assert_eq!(interval(0.75), (1, 0.5));
         assert_eq!(interval(17.75), (35, 0.5));
         assert_eq!(interval(40.0), (35, 1.0));
+    }
+
+    #[test]
+    fn azimuthal_terms_are_free_at_every_second_radius() {
+        let all = (0..RADII).flat_map(|at| (1..TERMS).map(move |term| (at, term)));
+        let mut free: Vec<usize> = all
+            .flat_map(|(at, term)| knots(at, term, TERMS).map(|(unknown, _)| unknown))
+            .collect();
+        free.sort_unstable();
+        free.dedup();
+        // Eighteen radii beyond the centre, of two orders with cosine and sine.
+        assert_eq!(free.len(), 72);
+    }
+
+    #[test]
+    fn azimuthal_terms_of_three_standard_deviations_are_kept() {
+        let star = drawn(MOFFAT, 3.4, Shear::ZERO, N);
+        let area = noise_equivalent_area(star.view());
+        let profile = Moffat::fit(star.view(), [23.5; 2], area, 1e-4).unwrap();
+        let halo = Array2::from_shape_fn((N, N), |(y, x)| {
+            let (x, y) = (x as f64 - 23.5, y as f64 - 23.5);
+            star[(23, 23)] * 1e-3 * azimuthal_terms(x, y)[1] * (-(x * x + y * y) / 72.0).exp()
+        });
+        let sums = ResidualSums::from_star((&star + &halo).view(), star.view(), &profile, 1e-4);
+        let gain = sums.solve(3).unwrap().1 - sums.solve(1).unwrap().1;
+        // Both terms of order 2 at every second of the radii with pixels.
+        let seen = sums.squares.iter().skip(1).filter(|pairs| pairs[0] > 0.0);
+        let freedom = seen.count() as f64;
+        let terms = |deviations: f64| {
+            let mut scaled = ResidualSums::default();
+            scaled.add(
+                &sums,
+                (freedom + deviations * (2.0 * freedom).sqrt()) / gain,
+            );
+            scaled.fit(MIN_STARS_AZIMUTHAL).unwrap().terms
+        };
+        assert_eq!([terms(2.5), terms(3.5)], [1, 3]);
     }
 
     #[test]

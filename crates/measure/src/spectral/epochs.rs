@@ -231,8 +231,7 @@ impl Spectral {
         let at_edges = self.contains_light(pixel, gradients);
         if at_edges {
             // M⁻¹ V M of both shears V.
-            let shears = [[[1.0, 0.0], [0.0, -1.0]], [[0.0, 1.0], [1.0, 0.0]]]
-                .map(|shear| product(inverse, product(shear, matrix)));
+            let shears = SHEARS.map(|shear| product(inverse, product(shear, matrix)));
             edge_lines(stamp, n, shears, origin_pixel.map(|at| at as f32), edges);
             stamps.transform_edges(edges, matrix, &self.plane, [edges1, edges2]);
         }

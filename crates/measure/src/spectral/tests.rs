@@ -355,6 +355,62 @@ fn edges_stay_where_they_are_while_the_light_is_sheared() {
 }
 
 #[test]
+fn edges_count_where_the_window_exceeds_a_fiftieth() {
+    // exp(−24²/2σ²) is 0.011, and 0.033.
+    for (window, counts) in [(8.0, false), (9.2, true)] {
+        let plan = Spectral::new(48, 11, &settings(1000, 1.5, window, 0.0)).unwrap();
+        let skewed = PixelShape {
+            stretch: 1.0,
+            skew: 1e-3,
+        };
+        for pixels in [PixelShape::SQUARE, skewed] {
+            assert_eq!(plan.sees_edges([0.0; 2], pixels), counts, "{window}");
+        }
+    }
+}
+
+#[test]
+fn planes_have_eight_free_pixels_in_steps_of_sixteen() {
+    let settings = settings(1000, 1.5, 8.0, 0.0);
+    let period = |n: usize| Spectral::new(n, 11, &settings).unwrap().plane.period;
+    assert_eq!([40, 44].map(period), [48, 64]);
+}
+
+#[test]
+fn the_ring_weighs_light_by_its_distance() {
+    // A radius of 1.5 σ of the window, and at most a quarter of the stamp's side.
+    for (n, window, radius) in [(64, 5.0, 7.5), (32, 8.0, 8.0)] {
+        let h = psf(11);
+        let (plan, own, mut scratch) = planned(n, &h, &settings(1000, 1.5, window, 0.0));
+        let mut lags = plan.lags();
+        for distance in [0.6, 1.0, 1.4].map(|share| share * radius) {
+            let middle = (n as f64 - 1.0) / 2.0;
+            // (x, y) and the light there of a galaxy of flux one and this variance.
+            let galaxy = |at: usize, variance: f64| {
+                let [x, y] = [at % n, at / n].map(|at| at as f64 - middle);
+                let square = (x - distance).powi(2) + y * y;
+                let light = (-0.5 * square / variance).exp() / (std::f64::consts::TAU * variance);
+                ((x * x + y * y) / (radius * radius), light)
+            };
+            let image = Array2::from_shape_fn((n, n), |(y, x)| galaxy(y * n + x, 1.0).1);
+            let image = convolve(image.view(), h.view());
+            let data: Vec<f32> = image.iter().map(|&v| v as f32).collect();
+            plan.autocorrelate(&own, &data, 0.0, &mut scratch, &mut lags);
+            // Behind the target, whose variance is 2.25 px².
+            let terms = (0..n * n).map(|at| {
+                let (square, light) = galaxy(at, 3.25);
+                square * square * (2.0 - 2.0 * square).exp() * light
+            });
+            let (found, expected) = (f64::from(lags.ring.value), terms.sum::<f64>());
+            assert!(
+                (found - expected).abs() < 0.01,
+                "{n} {distance}: {found} {expected}"
+            );
+        }
+    }
+}
+
+#[test]
 fn light_times_clarity_is_the_squared_signal_to_noise() {
     let (n, p, extent) = (44, 11, 7.0);
     let h = psf(p);
@@ -602,8 +658,10 @@ fn products_of_noise_on_the_stamp(
         }
     }
     let mut largest = 0.0f64;
-    for (sums, pair) in sums.into_iter().zip([0, 4]) {
-        let [first, second, _, plain] = found.pairs[pair].map(f64::from);
+    let [chi11, _, chi22] = found.chi_chi;
+    for (sums, found) in sums.into_iter().zip([chi11, chi22]) {
+        let [first, second] = found.sheared.map(f64::from);
+        let plain = f64::from(found.plain);
         largest = largest.max(first.abs().max(second.abs()) / plain);
         for ([mean, square], found) in sums.into_iter().zip([plain, first, second]) {
             let error = ((square - mean * mean) / f64::from(count)).sqrt();
@@ -635,8 +693,8 @@ fn turned_noise_is_the_geometric_mean_of_both_powers_less_one() {
             let pairs = (0..quarter).map(|at| [parities[at], parities[quarter + at]]);
             pairs.flat_map(|[cc, ss]| [cc - ss, cc + ss]).collect()
         };
-        let [lack, plain] = [2, 3].map(|kind| modes(&straight.powers[kind]));
-        let there = modes(&rotated.powers[3]);
+        let [lack, plain] = [&straight.powers.turned, &straight.powers.plain].map(|p| modes(p));
+        let there = modes(&rotated.powers.plain);
         let peak = plain.iter().fold(0.0f32, |most, value| most.max(*value));
         let largest = lack.iter().fold(0.0f32, |most, v| most.max(v.abs()));
         assert!(largest > 0.05 * peak, "{largest} {peak}");
@@ -714,6 +772,12 @@ fn take_change(plan: &Spectral, which: usize, scratch: &mut SpectralScratch, out
     plan.to_lags.lags(even, lags, out);
 }
 
+/// Those with γ₁, with γ₂, behind a turned PSF, and of noise itself.
+fn each<T>(changes: &NoiseChanges<T>) -> [&T; 4] {
+    let [first, second] = &changes.sheared;
+    [first, second, &changes.turned, &changes.plain]
+}
+
 /// Calls `visit` for fields of noise of one mode, real and imaginary: with the change of the lags of the stamp last given and
 /// of its flux by an amplitude of one, and with the mean square of amplitudes in noise of σ = 1, times the change with γ₁, the
 /// change with γ₂, the difference to noise behind a turned PSF, and one.
@@ -756,8 +820,8 @@ fn for_each_mode(
             take_change(plan, 0, scratch, &mut change);
             // Half of the power of a mode is that of its real part; but for the mean, which has no other.
             let share = if alone { 1.0 } else { 0.5 };
-            let powers = [0, 1, 2, 3].map(|kind: usize| {
-                let [cc, ss] = [0, quarter].map(|part| psf.powers[kind][part + at % quarter]);
+            let powers = each(&psf.powers).map(|power| {
+                let [cc, ss] = [0, quarter].map(|part| power[part + at % quarter]);
                 let power = if below { cc + ss } else { cc - ss };
                 share * f64::from(power / plan.counts[at])
             });
@@ -805,10 +869,27 @@ fn mean_products_are_sums_over_modes_of_what_each_changes() {
                 }
             }
         });
-        let [first, second] = found.distortion;
-        let found = found.pairs.into_iter().chain([first, second, found.square]);
-        for ((found, expected), size) in found.zip(expected).zip(sizes) {
-            for (found, expected) in found.iter().zip(expected) {
+        let ([c11, c12, c22], [s1, s2], [f1, f2]) =
+            (found.chi_chi, found.chi_square, found.chi_flux);
+        let (ss, sf, ff) = (found.square_square, found.square_flux, found.flux_flux);
+        let [slope1, slope2] = found.chi_slope;
+        let found = [
+            c11,
+            c12,
+            s1,
+            f1,
+            c22,
+            s2,
+            f2,
+            ss,
+            sf,
+            ff,
+            slope1,
+            slope2,
+            found.square_zero,
+        ];
+        for ((found, expected), size) in found.iter().zip(expected).zip(sizes) {
+            for (found, expected) in each(found).into_iter().zip(expected) {
                 // A thousand terms of both signs in single precision.
                 let difference = (f64::from(*found) - expected).abs();
                 assert!(difference < 1e-4 * size, "{found} {expected} {size}");
@@ -888,10 +969,11 @@ fn mean_second_derivatives_are_sums_of_differences_over_modes() {
             }
         });
         for kind in 0..4 {
-            let pairs = [0, 1, 4].map(|pair: usize| found.pairs[pair][kind]);
-            let mixed = found.distortion.map(|mixed| mixed[kind]);
-            let [e1, e2] = shape.mean_second_derivative(&curvature, pairs, mixed);
-            let square = SizeMoments::mean_second_derivative(&mean_square, found.square[kind]);
+            let of_kind = |product: NoiseChanges<f32>| *each(&product)[kind];
+            let (pairs, slopes) = (found.chi_chi.map(of_kind), found.chi_slope.map(of_kind));
+            let [e1, e2] = shape.mean_second_derivative(&curvature, pairs, slopes);
+            let zero = of_kind(found.square_zero);
+            let square = SizeMoments::mean_second_derivative(&mean_square, zero);
             for (k, found) in [e1, e2, square].into_iter().enumerate() {
                 let (expected, size) = (expected[kind][k], size[kind][k]);
                 // Third derivatives, and differences of f32.
