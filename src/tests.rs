@@ -101,141 +101,16 @@ fn every_command_has_examples_that_parse() {
 }
 
 // The ways to use each command, and the options that each way uses. Two options without a common way must be
-// refused.
-const WAYS: [(&str, &[&str]); 32] = [
-    ("quickstart", &["out threads wide"]),
-    (
-        "simulate",
-        &[
-            "sets images grid seed amplitude tilt out shard threads",
-            "sets images grid seed constant-shear opposite rotated out shard threads",
-            "challenge branch subfields galaxies opposite grid seed out threads",
-        ],
-    ),
-    (
-        "gather",
-        &[
-            "stamps positions table id carry square extension mask mask-extension mask-bits psf psf-extension noise frame gain set image out",
-            "stamps positions table id carry square extension mask mask-extension mask-bits psf psf-extension variance variance-extension frame gain set image out",
-            "stamps positions table id carry square extension mask mask-extension mask-bits psf psf-extension weight-map weight-extension frame gain set image out",
-            "exposure positions table first-pixel columns degrees id carry size extension mask mask-extension mask-bits psf psf-extension noise frame gain set image out",
-            "exposure positions table first-pixel columns degrees id carry size extension mask mask-extension mask-bits psf psf-extension variance variance-extension frame gain set image out",
-            "exposure positions table first-pixel columns degrees id carry size extension mask mask-extension mask-bits psf psf-extension weight-map weight-extension frame gain set image out",
-        ],
-    ),
-    (
-        "measure",
-        &["submission data out sets epochs stack-stars catalogue-format shard threads"],
-    ),
-    (
-        "run",
-        &[
-            "submission data sets out catalogue-format store report shard threads",
-            "submission simulate sets images grid seed amplitude tilt out catalogue-format store report shard threads",
-        ],
-    ),
-    ("merge", &["OUT sets images shards discard-damaged threads"]),
-    ("mean", &["measured sets where weight format threads"]),
-    ("select", &["measured where weight out"]),
-    ("shear", &["measured response treecorr out format"]),
-    (
-        "score",
-        &[
-            "data measured sets noise-var store format wide metrics report definition convention threads",
-            "data foreign sets noise-var store format wide metrics report definition convention threads",
-            "data packed sets noise-var store format wide metrics definition convention threads",
-            "truth CATALOGUE truth-sign stamp field columns ellipticity missing drop-missing max-modulus noise-var format wide metrics report definition convention threads",
-            "data measured sets aperture-mass format wide metrics convention threads",
-            "data foreign sets aperture-mass format wide metrics convention threads",
-            "truth CATALOGUE truth-sign stamp field columns ellipticity missing drop-missing max-modulus aperture-mass format wide metrics convention threads",
-            "challenge branch truth psf subfields CATALOGUE report format threads",
-        ],
-    ),
-    (
-        "compare",
-        &[
-            "OUT data foreign where sort plot format wide metrics report definition convention threads",
-            "store where sort plot format wide metrics report",
-            "OUT challenge branch truth psf subfields leaderboard format threads",
-        ],
-    ),
-    (
-        "bias",
-        &[
-            "CATALOGUE g1 g2 columns ellipticity truth-sign bins where design units drop-missing step fail-above sums shard plot format wide metrics report",
-            "CATALOGUE truth columns ellipticity truth-sign bins where design units drop-missing step fail-above sums shard plot format wide metrics report",
-            "CATALOGUE g1 g2 columns truth-sign bins where weight design units drop-missing fail-above sums shard plot format wide metrics report",
-            "CATALOGUE truth columns truth-sign bins where weight design units drop-missing fail-above sums shard plot format wide metrics report",
-            "CATALOGUE against g1 g2 columns ellipticity truth-sign bins where design units drop-missing step format wide metrics",
-            "CATALOGUE against truth columns ellipticity truth-sign bins where design units drop-missing step format wide metrics",
-            "merge fail-above plot format wide metrics report",
-            "plan",
-            "example",
-        ],
-    ),
-    (
-        "challenge new",
-        &[
-            "name kind public private sets images grid amplitude tilt seed metric spectra entries-per-team partial address opens closes contact data-version threads",
-            "name kind public private data truth-table metric spectra entries-per-team partial address opens closes contact data-version threads",
-        ],
-    ),
-    (
-        "challenge check",
-        &["ENTRY challenge truth team json threads"],
-    ),
-    (
-        "challenge rank",
-        &["INBOX challenge truth store reference report digits detail format threads"],
-    ),
-    (
-        "check",
-        &[
-            "PATH data grid stamp images json",
-            "PATH challenge branch subfields json",
-        ],
-    ),
-    (
-        "pack",
-        &[
-            "measured out method kind challenge team title contact entry",
-            "foreign data out method kind challenge team title contact entry",
-            "CATALOGUE challenge branch subfields grid whole-galaxies out",
-            "measured challenge branch subfields grid whole-galaxies out",
-        ],
-    ),
-    ("unpack", &["ARCHIVE out verify"]),
-    ("show", &["submission data galaxy out"]),
-    (
-        "calibrate",
-        &["submission galaxies seed out format threads"],
-    ),
-    (
-        "reproduce",
-        &["out images grid sets submission galaxies seed threads"],
-    ),
-    (
-        "study",
-        &["submission sets images pairs grid seed amplitude tilt out format threads"],
-    ),
-    ("bench", &["submission format threads"]),
-    ("submissions list", &["format"]),
-    ("submissions show", &["NAME|FILE"]),
-    ("submissions init", &["FILE method"]),
-    ("completions", &["SHELL"]),
-    // Only names are compared: the ways of these commands depend on more than two options.
-    (
-        NAMES_ONLY[0],
-        &["NAME data simulate submission sets images grid seed amplitude tilt folder threads"],
-    ),
-    (
-        NAMES_ONLY[1],
-        &["NAME data sigma update reason folder format threads"],
-    ),
-    ("help", &[]),
-    ("baseline help", &[]),
-    ("challenge help", &[]),
-];
+// refused. Only names are compared where the ways of a command depend on more than two options.
+const WAYS: &str = include_str!("ways.txt");
+
+// The ways of a command.
+fn ways(path: &str) -> Option<Vec<Vec<&'static str>>> {
+    let mut lines = WAYS.lines().skip_while(|line| *line != path);
+    lines.next()?;
+    let ways = lines.map_while(|line| line.strip_prefix("    "));
+    Some(ways.map(|way| way.split(' ').collect()).collect())
+}
 
 // Commands whose pairs are not compared.
 const NAMES_ONLY: [&str; 2] = ["baseline record", "baseline check"];
@@ -286,11 +161,10 @@ fn compare(path: &str, command: &Command, wrong: &mut Vec<String>) {
         }
         return;
     }
-    let Some((_, ways)) = WAYS.iter().find(|(name, _)| *name == path) else {
+    let Some(ways) = ways(path) else {
         wrong.push(format!("{path}: not in the table of ways"));
         return;
     };
-    let ways: Vec<Vec<&str>> = ways.iter().map(|way| way.split(' ').collect()).collect();
     let options: Vec<&Arg> = command
         .get_arguments()
         .filter(|a| !["help", "version"].contains(&a.get_id().as_str()))
