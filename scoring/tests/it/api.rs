@@ -15,22 +15,15 @@ fn grid(n: usize) -> Grid {
 }
 
 /// Images with the shear `response · g` and noise.
-fn images(shear: &Array2<Complex64>, count: u64, response: f64, noise: f64) -> SetImages {
-    let n = shear.nrows();
-    let arrays: Vec<[Array2<f64>; 2]> = (0..count)
-        .map(|image| {
-            let mut normal = Normal(image + 1);
-            let mut of = |part: fn(&Complex64) -> f64| {
-                shear.map(|g| response * part(g) + noise * normal.draw())
-            };
-            [of(|g| g.re), of(|g| g.im)]
-        })
-        .collect();
-    SetImages::of_arrays(
-        &grid(n),
-        arrays.iter().map(|[e1, e2]| [e1.view(), e2.view()]),
+fn images(shear: &Array2<Complex64>, count: usize, response: f64, noise: f64) -> SetImages {
+    let shear = shear.mapv(|g| response * g);
+    crate::common::images(
+        &grid(shear.nrows()),
+        &shear,
+        &vec![noise; count],
+        1,
+        |_, _| true,
     )
-    .unwrap()
 }
 
 fn is_shape<T>(result: Result<T, ScoringError>) -> bool {
@@ -42,31 +35,20 @@ fn arrays_of_another_grid_are_an_error() {
     let (small, large) = (grid(16), grid(20));
     let shear = field(&large, Content::E, 1);
     let others = images(&shear, 2, 1.0, 0.01);
-    let scorer = SetScorer::new(
-        small,
-        truth(&field(&small, Content::E, 1)),
-        Options::default(),
-    )
-    .unwrap();
+    let own_shear = field(&small, Content::E, 1);
+    let own = images(&own_shear, 2, 1.0, 0.01);
+    let scorer = SetScorer::new(small, truth(&own_shear), Options::default()).unwrap();
+    let score = scorer.score(&own).unwrap();
+    let standard = Convention::STANDARD;
     assert!(is_shape(scorer.score(&others)));
     assert!(is_shape(scorer.match_convention(&others)));
-    let own = images(&field(&small, Content::E, 1), 2, 1.0, 0.01);
-    let score = scorer.score(&own).unwrap();
-    assert!(is_shape(scorer.diagnose(
-        &others,
-        &score,
-        Convention::STANDARD
-    )));
+    assert!(is_shape(scorer.diagnose(&others, &score, standard)));
     assert!(is_shape(measured_bandpowers(
         &small,
         others.total(),
-        Convention::STANDARD
+        standard
     )));
-    assert!(is_shape(cross_spectrum(
-        &small,
-        &others,
-        Convention::STANDARD
-    )));
+    assert!(is_shape(cross_spectrum(&small, &others, standard)));
     assert!(is_shape(sign_by_modes(&small, &truth(&shear))));
     assert!(is_shape(sign_by_correlation(&truth(&shear), own.total())));
     let decomposer = Decomposer::new(small);
@@ -82,8 +64,17 @@ fn arrays_of_another_grid_are_an_error() {
     assert!(is_shape(bins.power(&mixed.e, &mixed.b)));
     assert!(is_shape(decomposer.compose(&mixed)));
     let (square, wide) = (Array2::zeros((16, 16)), Array2::zeros((16, 20)));
-    assert!(is_shape(Convention::STANDARD.apply(&square, &wide)));
-    assert!(is_shape(Convention::STANDARD.apply(&wide, &wide)));
+    assert!(is_shape(standard.apply(&square, &wide)));
+    assert!(is_shape(standard.apply(&wide, &wide)));
+    for (a, b) in [(&square, &wide), (&wide, &square)] {
+        assert!(is_shape(SetImages::of_arrays(
+            &small,
+            [[a.view(), b.view()]]
+        )));
+        let (g1, g2) = (a.clone(), b.clone());
+        let found = SetScorer::new(small, TrueShear { g1, g2 }, Options::default());
+        assert!(is_shape(found));
+    }
 }
 
 #[test]
@@ -114,22 +105,17 @@ fn only_single_images_of_the_grid_are_added() {
 #[test]
 fn without_images_nothing_is_scored() {
     let grid = grid(16);
-    let scorer = SetScorer::new(
-        grid,
-        truth(&field(&grid, Content::E, 1)),
-        Options::default(),
-    )
-    .unwrap();
+    let shear = field(&grid, Content::E, 1);
+    let scorer = SetScorer::new(grid, truth(&shear), Options::default()).unwrap();
     let none = SetImages::new(&grid);
-    assert_eq!(
-        scorer.match_convention(&none).unwrap_err(),
-        ScoringError::NoImages
-    );
+    let matched = scorer.match_convention(&none);
+    assert_eq!(matched.unwrap_err(), ScoringError::NoImages);
     assert_eq!(scorer.score(&none).unwrap_err(), ScoringError::NoImages);
-    assert_eq!(
-        cross_spectrum(&grid, &none, Convention::STANDARD).unwrap_err(),
-        ScoringError::TooFewImages(0)
-    );
+    for count in [0, 1] {
+        let set = images(&shear, count, 1.0, 0.01);
+        let found = cross_spectrum(&grid, &set, Convention::STANDARD);
+        assert_eq!(found.unwrap_err(), ScoringError::TooFewImages(count));
+    }
 }
 
 #[test]
@@ -152,8 +138,10 @@ fn metrics_are_unknown_where_the_data_do_not_determine_them() {
     );
     // One image does not determine its noise.
     let one = images(&shear, 1, 1.0, 0.001);
-    let found = unknown(&score(truth(&shear), &one, Noise::Measured));
-    assert_eq!(found, ["q_dn", "galaxy_noise"]);
+    let found = score(truth(&shear), &one, Noise::Measured);
+    assert_eq!(unknown(&found), ["q_dn", "galaxy_noise"]);
+    assert!(found.noise.is_none() && found.noise_variance.is_none());
+    assert!(found.replicates.is_empty());
 
     let constant = Array2::from_elem((16, 16), Complex64::new(0.02, 0.01));
     let constant = score(truth(&constant), &two, Noise::Measured);
@@ -227,13 +215,11 @@ fn shifted_rows_are_found_with_their_direction() {
         let scorer = SetScorer::new(grid, truth(&shear), options).unwrap();
         let score = scorer.score(&set).unwrap();
         let faults = scorer.diagnose(&set, &score, Convention::STANDARD).unwrap();
-        let found: Vec<(i32, i32)> = faults
-            .iter()
-            .filter_map(|fault| match fault {
-                Fault::Shifted { x, y, .. } => Some((*x, *y)),
-                _ => None,
-            })
-            .collect();
+        let shift = |fault: &Fault| match fault {
+            Fault::Shifted { x, y, .. } => Some((*x, *y)),
+            _ => None,
+        };
+        let found: Vec<(i32, i32)> = faults.iter().filter_map(shift).collect();
         assert_eq!(found, [(x, y)], "{faults:?}");
     }
 }

@@ -3,10 +3,7 @@
 use ndarray::Array2;
 use shearq_fourier::Complex64;
 use shearq_scoring::modes::{Decomposer, Modes};
-use shearq_scoring::{
-    Definition, Grid, Metrics, SCORED, SetImages, SetScorer,
-    resample::{PairedSet, paired_difference},
-};
+use shearq_scoring::{Definition, Grid, Metrics, SCORED, SetImages, SetScorer};
 
 use crate::common::{Content, Normal, add, field, standard, truth};
 
@@ -138,77 +135,6 @@ fn errors_of_one_image_are_known_but_for_its_noise() {
             // error, which is then up to half too large.
             let least = if name == "q_calibrated" { 0.6 } else { 0.8 };
             assert!((least..1.25).contains(&ratio), "{name} {ratio}");
-        }
-    }
-}
-
-/// Scatter over trials of the difference in a metric of two methods on the same images, over the mean of its
-/// error. Both see the same shapes; half of the variance of their noise is common.
-fn paired_coverage(metric: fn(&Metrics) -> f64, images: usize, m: [f64; 2]) -> f64 {
-    const TRIALS: usize = 200;
-    const NOISE: f64 = 0.03;
-    let grid = Grid::great10(20).unwrap();
-    let shear = field(&grid, Content::E, 5);
-    let options = standard(Definition::Leaderboard);
-    let scorer = SetScorer::new(grid, truth(&shear), options).unwrap();
-    let mut normal = Normal(78);
-    let noise = |normal: &mut Normal| {
-        let half = NOISE / 2.0f64.sqrt();
-        Array2::from_shape_fn((grid.n, grid.n), |_| {
-            Complex64::new(half * normal.draw(), half * normal.draw())
-        })
-    };
-    let found: Vec<(f64, f64)> = (0..TRIALS)
-        .map(|_| {
-            let mut measured = [SetImages::new(&grid), SetImages::new(&grid)];
-            for _ in 0..images {
-                let common = shapes(&grid, &mut normal);
-                let shared = noise(&mut normal);
-                for (measured, m) in measured.iter_mut().zip(m) {
-                    let own = &shared + &noise(&mut normal) + &common;
-                    let observed = &shear * Complex64::from(1.0 + m) + own;
-                    add(measured, &grid, &observed);
-                }
-            }
-            let [first, second] = measured.map(|images| {
-                let score = scorer.score(&images).unwrap();
-                let replicates: Vec<f64> = score.replicates.iter().map(metric).collect();
-                (metric(&score.metrics), replicates)
-            });
-            let set = PairedSet {
-                images,
-                first: first.0,
-                first_replicates: &first.1,
-                second: second.0,
-                second_replicates: &second.1,
-            };
-            let found = paired_difference(&[set]).unwrap();
-            (found.difference, found.error)
-        })
-        .collect();
-    let known: Vec<&(f64, f64)> = found.iter().filter(|found| found.0.is_finite()).collect();
-    assert!(known.len() > TRIALS * 9 / 10);
-    let mean = |of: &dyn Fn(&(f64, f64)) -> f64| {
-        known.iter().map(|found| of(found)).sum::<f64>() / known.len() as f64
-    };
-    let centre = mean(&|v| v.0);
-    mean(&|v| (v.0 - centre).powi(2)).sqrt() / mean(&|v| v.1)
-}
-
-#[test]
-fn errors_of_paired_differences_are_the_scatter_of_trials() {
-    for (name, metric) in [
-        ("q", (|f| f.q) as fn(&Metrics) -> f64),
-        ("q_calibrated", |f| f.q_calibrated),
-    ] {
-        for (images, m) in [(16, [0.0, 0.0]), (20, [-0.3, 0.0]), (20, [0.0, 0.05])] {
-            let ratio = paired_coverage(metric, images, m);
-            // Where products of two images' noise decide, the jackknife's variance is twice theirs; a scatter from
-            // 200 trials is good to 5 %, and Q is not linear in the noise.
-            assert!(
-                (0.65..1.25).contains(&ratio),
-                "{name} {images} {m:?} {ratio}"
-            );
         }
     }
 }
