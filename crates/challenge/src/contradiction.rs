@@ -260,22 +260,14 @@ mod tests {
             let one = |firsts: &mut Vec<First>| firsts[3].truth.g2 *= -1.0;
             has(constant, &one, "set 4: ", "contradict");
         }
-        has(
-            false,
-            &scaled(2.0),
-            "all sets: ",
-            "may be 2.2 times too large",
-        );
+        let factor = "may be 2.2 times too large";
+        has(false, &scaled(2.0), "all sets: ", factor);
         let exchange = |firsts: &mut Vec<First>| {
             let (a, b) = firsts.split_at_mut(3);
             std::mem::swap(&mut a[1].truth, &mut b[0].truth);
         };
-        has(
-            false,
-            &exchange,
-            "set 2: ",
-            "the true shear of set 4 fits set 2",
-        );
+        let other = "the true shear of set 4 fits set 2";
+        has(false, &exchange, "set 2: ", other);
         // With much noise, every sign is possible.
         assert_eq!(found(false, 30.0, &flip), "");
     }

@@ -267,11 +267,8 @@ mod tests {
             ("C", Some("C")),
             ("a.tar.gz", None),
             ("b.zip", None),
-        ];
-        let expected: Vec<_> = expected
-            .iter()
-            .map(|(path, team)| ((*path).to_owned(), team.map(str::to_owned)))
-            .collect();
+        ]
+        .map(|(path, team)| (path.to_owned(), team.map(str::to_owned)));
         assert_eq!(found, expected);
         assert!(find(&[root.path().join("absent")]).is_err());
     }

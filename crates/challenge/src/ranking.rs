@@ -405,9 +405,14 @@ pub(crate) mod tests {
         record
     }
 
-    const DAY: &str = "2026-11-24T10:00:00Z";
+    const DAY: &str = "2026-11-24";
 
-    pub(crate) fn entry(team: &str, received: &str, q: f64, replicates: &[f64]) -> Entry {
+    // An entry of a day, at ten o'clock, or of a moment.
+    fn entry(team: &str, received: &str, q: f64, replicates: &[f64]) -> Entry {
+        let received = match received.contains('T') {
+            true => received.to_owned(),
+            false => format!("{received}T10:00:00Z"),
+        };
         Entry {
             info: EntryInfo {
                 challenge: "c".into(),
@@ -458,136 +463,134 @@ pub(crate) mod tests {
         }
     }
 
-    // Board, rank and team of each standing.
-    fn found(leaderboard: &Leaderboard<'_>) -> Vec<(Board, Option<usize>, String)> {
-        let of = |s: &Standing<'_>| (s.board, s.rank, s.best.info().team.clone());
-        leaderboard.standings.iter().map(of).collect()
+    // Entries with one image.
+    fn entries<const N: usize>(of: [(&str, &str, f64); N]) -> [Entry; N] {
+        of.map(|(team, received, q)| entry(team, received, q, &[q]))
+    }
+
+    // Board, rank, team and value of each standing.
+    fn found<'a>(board: &'a Leaderboard<'_>) -> Vec<(Board, Option<usize>, &'a str, f64)> {
+        let of = |s: &'a Standing<'_>| (s.board, s.rank, s.best.info().team.as_str(), s.best.value);
+        board.standings.iter().map(of).collect()
+    }
+
+    fn ranks(entries: &[Entry], digits: usize) -> Vec<Option<usize>> {
+        let challenge = challenge();
+        let board = rank(entries, &challenge, None, digits);
+        board.standings.iter().map(|s| s.rank).collect()
+    }
+
+    fn reasons<'a>(board: &'a Leaderboard<'_>) -> Vec<&'a str> {
+        board
+            .excluded
+            .iter()
+            .map(|(_, reason)| reason.as_str())
+            .collect()
     }
 
     #[test]
     fn the_best_entry_counts_and_small_differences_share_a_rank() {
-        let common = |q: f64, own: f64| -> Vec<f64> {
-            // Noise of 10 that is common to all entries, and `own` noise.
-            let noise = |k: i32| f64::from(k % 2 * 2 - 1);
-            let third = |k: i32| f64::from(k % 3 - 1);
-            (0..10)
-                .map(|k| q + 10.0 * noise(k) + own * third(k))
-                .collect()
+        // Noise of 10 that is common to all entries, and `own` noise.
+        let with = |team, received, q: f64, own: f64| {
+            let [common, apart] = [2, 3].map(|n| move |k: i32| f64::from(k % n));
+            let image = |k| q + 10.0 * (2.0 * common(k) - 1.0) + own * (apart(k) - 1.0);
+            entry(team, received, q, &(0..10).map(image).collect::<Vec<_>>())
         };
         let entries = [
-            entry("A", "2026-11-20T10:00:00Z", 90.0, &common(90.0, 0.0)),
-            entry("A", "2026-11-21T10:00:00Z", 100.0, &common(100.0, 0.0)),
-            entry("A", "2026-11-22T10:00:00Z", 500.0, &common(500.0, 0.0)),
-            entry("B", DAY, 99.9, &common(99.9, 1.0)),
-            entry("C", DAY, 99.0, &common(99.0, 0.0)),
-            entry("D", "2026-12-01T00:00:00Z", 200.0, &common(200.0, 0.0)),
-            entry("ours", DAY, 99.5, &common(99.5, 0.0)),
+            with("A", "2026-11-20", 90.0, 0.0),
+            with("A", "2026-11-21", 100.0, 0.0),
+            with("A", "2026-11-22", 500.0, 0.0),
+            with("B", DAY, 99.9, 1.0),
+            with("C", DAY, 99.0, 0.0),
+            with("D", "2026-12-01T00:00:00Z", 200.0, 0.0),
+            with("ours", DAY, 99.5, 0.0),
         ];
-        let board = rank(&entries, &challenge(), None, 1);
-        let found: Vec<(Option<usize>, &str, f64, usize)> = board
-            .of(Board::Main)
-            .map(|s| {
-                (
-                    s.rank,
-                    s.best.info().team.as_str(),
-                    s.best.value,
-                    s.entries.len(),
-                )
-            })
-            .collect();
+        let challenge = challenge();
+        let board = rank(&entries, &challenge, None, 1);
         // The common noise of 10 does not matter; noise of its own makes B equal to A, but not C.
         let expected = [
-            (Some(1), "A", 100.0, 2),
-            (Some(1), "B", 99.9, 1),
-            (None, "ours", 99.5, 1),
-            (Some(3), "C", 99.0, 1),
+            (Board::Main, Some(1), "A", 100.0),
+            (Board::Main, Some(1), "B", 99.9),
+            (Board::Main, None, "ours", 99.5),
+            (Board::Main, Some(3), "C", 99.0),
+            (Board::Late, Some(1), "D", 200.0),
         ];
-        assert_eq!(found, expected);
-        let reasons: Vec<&str> = board.excluded.iter().map(|e| e.1.as_str()).collect();
-        assert_eq!(reasons, ["the team has 2 entries already"]);
-        let late: Vec<_> = board.of(Board::Late).collect();
-        assert_eq!((late.len(), late[0].rank), (1, Some(1)));
-    }
-
-    #[test]
-    fn without_errors_values_rank() {
-        let entries = [entry("A", DAY, 2.0, &[2.0]), entry("B", DAY, 1.0, &[1.0])];
-        let board = rank(&entries, &challenge(), None, 1);
-        let ranks: Vec<_> = board.standings.iter().map(|s| s.rank).collect();
-        assert_eq!(ranks, [Some(1), Some(2)]);
+        assert_eq!(found(&board), expected);
+        assert_eq!(board.standings[0].entries.len(), 2);
+        assert_eq!(reasons(&board), ["the team has 2 entries already"]);
     }
 
     #[test]
     fn an_error_of_its_own_does_not_buy_a_rank() {
-        // Found with shapes in one image and noise in seven: replicates of 3 to 900.
-        let (mut cheat, mut honest) = (
-            entry("A", DAY, 171.8, &[900.0, 3.0, 3.0, 3.0, 3.0, 3.0, 3.0, 3.0]),
-            entry(
-                "B",
-                DAY,
-                17.9,
-                &[18.0, 17.0, 18.0, 17.0, 18.0, 17.0, 18.0, 17.0],
-            ),
-        );
-        (cheat.sets[0].errors.q, honest.sets[0].errors.q) = (20.7, 1.7);
-        let ranks = |entries: &[Entry]| -> Vec<Option<usize>> {
-            let board = rank(entries, &challenge(), None, 1);
-            board.standings.iter().map(|s| s.rank).collect()
+        let with = |team, q, replicates: &[f64], error| {
+            let mut entry = entry(team, DAY, q, replicates);
+            entry.sets[0].errors.q = error;
+            entry
         };
-        assert_eq!(ranks(&[cheat, honest.clone()]), [Some(1), Some(2)]);
+        // Found with shapes in one image and noise in seven: replicates of 3 to 900.
+        let cheat = with(
+            "A",
+            171.8,
+            &[900.0, 3.0, 3.0, 3.0, 3.0, 3.0, 3.0, 3.0],
+            20.7,
+        );
+        let pairs = [18.0, 17.0, 18.0, 17.0, 18.0, 17.0, 18.0, 17.0];
+        let honest = with("B", 17.9, &pairs, 1.7);
+        assert_eq!(ranks(&[cheat, honest.clone()], 1), [Some(1), Some(2)]);
         // An entry with much noise does not share the first rank, one within the errors does.
-        let mut noisy = entry("C", DAY, 10.0, &[10.0]);
-        noisy.sets[0].errors.q = 15.0;
-        let mut near = entry("D", DAY, 16.0, &[16.0]);
-        near.sets[0].errors.q = 1.7;
-        assert_eq!(ranks(&[honest, noisy, near]), [Some(1), Some(1), Some(3)]);
+        let (noisy, near) = (
+            with("C", 10.0, &[10.0], 15.0),
+            with("D", 16.0, &[16.0], 1.7),
+        );
+        assert_eq!(
+            ranks(&[honest, noisy, near], 1),
+            [Some(1), Some(1), Some(3)]
+        );
     }
 
     #[test]
-    fn equal_printed_values_share_a_rank() {
-        let of = |team: &str, q: f64| entry(team, DAY, q, &[q]);
-        let entries = [of("A", 2.04), of("B", 1.96), of("C", 1.94), of("D", 1.94)];
-        let ranks = |digits| -> Vec<_> {
-            let board = rank(&entries, &challenge(), None, digits);
-            board.standings.iter().map(|s| s.rank.unwrap()).collect()
-        };
-        assert_eq!(ranks(1), [1, 1, 3, 3]);
-        assert_eq!(ranks(2), [1, 2, 3, 3]);
+    fn without_errors_printed_values_rank() {
+        let of = [
+            ("A", DAY, 2.04),
+            ("B", DAY, 1.96),
+            ("C", DAY, 1.94),
+            ("D", DAY, 1.94),
+        ];
+        assert_eq!(ranks(&entries(of), 1), [1, 1, 3, 3].map(Some));
+        assert_eq!(ranks(&entries(of), 2), [1, 2, 3, 3].map(Some));
     }
 
     #[test]
     fn deadlines_hold_to_the_second_and_in_far_years() {
-        let entries = [
-            entry("in time", "2026-11-30T23:59:59Z", 3.0, &[3.0]),
-            entry("late", "2026-12-01T00:00:00Z", 4.0, &[4.0]),
-            entry("far", "9999-12-30T00:00:00Z", 5.0, &[5.0]),
-            entry("early", "2026-10-31T23:59:59Z", 6.0, &[6.0]),
-        ];
+        let entries = entries([
+            ("in time", "2026-11-30T23:59:59Z", 3.0),
+            ("late", "2026-12-01T00:00:00Z", 4.0),
+            ("far", "9999-12-30T00:00:00Z", 5.0),
+            ("early", "2026-10-31T23:59:59Z", 6.0),
+        ]);
         let mut challenge = challenge();
         challenge.rules.opens = "2026-11-01".parse().ok();
         let board = rank(&entries, &challenge, None, 1);
         let expected = [
-            (Board::Main, Some(1), "in time".to_owned()),
-            (Board::Late, Some(1), "far".to_owned()),
-            (Board::Late, Some(2), "late".to_owned()),
+            (Board::Main, Some(1), "in time", 3.0),
+            (Board::Late, Some(1), "far", 5.0),
+            (Board::Late, Some(2), "late", 4.0),
         ];
         assert_eq!(found(&board), expected);
-        assert_eq!(
-            board.excluded[0].1,
-            "received before the challenge opened, 2026-11-01 (UTC)"
-        );
+        let early = "received before the challenge opened, 2026-11-01 (UTC)";
+        assert_eq!(reasons(&board), [early]);
     }
 
     #[test]
     fn only_entries_that_count_make_others_copies() {
-        let mut entries = [
-            entry("Early", "2026-10-31T10:00:00Z", 3.0, &[3.0]),
-            entry("Withdrawn", "2026-11-20T10:00:00Z", 3.0, &[3.0]),
-            entry("Owner", "2026-11-21T10:00:00Z", 3.0, &[3.0]),
-            entry("Copy", "2026-11-22T10:00:00Z", 3.0, &[3.0]),
-            entry("Owner", "2026-11-23T10:00:00Z", 3.0, &[3.0]),
-            entry("Owner", "2026-11-24T10:00:00Z", 4.0, &[4.0]),
-        ];
+        let mut entries = entries([
+            ("Early", "2026-10-31", 3.0),
+            ("Withdrawn", "2026-11-20", 3.0),
+            ("Owner", "2026-11-21", 3.0),
+            ("Copy", "2026-11-22", 3.0),
+            ("Owner", "2026-11-23", 3.0),
+            ("Owner", "2026-11-24", 4.0),
+        ]);
         for entry in &mut entries[..5] {
             entry.info.content = "same".into();
         }
@@ -595,31 +598,22 @@ pub(crate) mod tests {
         let mut challenge = challenge();
         challenge.rules.opens = "2026-11-01".parse().ok();
         let board = rank(&entries, &challenge, None, 1);
-        assert_eq!(found(&board), [(Board::Main, Some(1), "Owner".to_owned())]);
         // Two entries per team: the team's own copy is none of them.
-        assert_eq!(board.standings[0].best.value, 4.0);
+        assert_eq!(found(&board), [(Board::Main, Some(1), "Owner", 4.0)]);
+        let early = "received before the challenge opened, 2026-11-01 (UTC)";
         let copy = "identical content as the entry of Owner of 2026-11-21T10:00:00Z";
-        let reasons: Vec<&str> = board.excluded.iter().map(|e| e.1.as_str()).collect();
-        assert_eq!(
-            reasons,
-            [
-                "received before the challenge opened, 2026-11-01 (UTC)",
-                "withdrawn: a mistake",
-                copy,
-                copy
-            ]
-        );
+        assert_eq!(reasons(&board), [early, "withdrawn: a mistake", copy, copy]);
     }
 
     #[test]
     fn partial_entries_have_no_rank_and_withdrawn_ones_count() {
-        let mut entries = [
-            entry("A", "2026-11-20T10:00:00Z", 3.0, &[3.0]),
-            entry("A", "2026-11-21T10:00:00Z", 2.0, &[2.0]),
-            entry("A", "2026-11-22T10:00:00Z", 9.0, &[9.0]),
-            entry("B", "2026-11-23T10:00:00Z", 1.0, &[1.0]),
-            entry("C", "2026-11-24T10:00:00Z", 8.0, &[8.0]),
-        ];
+        let mut entries = entries([
+            ("A", "2026-11-20", 3.0),
+            ("A", "2026-11-21", 2.0),
+            ("A", "2026-11-22", 9.0),
+            ("B", "2026-11-23", 1.0),
+            ("C", "2026-11-24", 8.0),
+        ]);
         let mut challenge = challenge();
         challenge.data.sets = vec![2, 3];
         for entry in &mut entries[..4] {
@@ -630,30 +624,23 @@ pub(crate) mod tests {
         entries[0].withdrawn = Some("a mistake".into());
         let board = rank(&entries, &challenge, None, 1);
         let expected = [
-            (Board::Main, Some(1), "A".to_owned()),
-            (Board::Main, Some(2), "B".to_owned()),
-            (Board::Partial, None, "C".to_owned()),
+            (Board::Main, Some(1), "A", 2.0),
+            (Board::Main, Some(2), "B", 1.0),
+            (Board::Partial, None, "C", 8.0),
         ];
         assert_eq!(found(&board), expected);
-        assert_eq!(board.standings[0].best.value, 2.0);
-        let reasons: Vec<&str> = board.excluded.iter().map(|e| e.1.as_str()).collect();
+        let reasons = reasons(&board);
         assert_eq!(
             reasons,
             ["withdrawn: a mistake", "the team has 2 entries already"]
         );
     }
-}
-
-#[cfg(test)]
-mod copy_tests {
-    use super::tests::entry;
-    use super::*;
 
     #[test]
     fn another_scale_and_shift_in_each_set_hide_no_copy() {
         // The second component has a factor of its own.
         let of = |team: &str, scales: [f64; 2], second: f64, noise: f64| {
-            let mut entry = entry(team, "2026-11-24T10:00:00Z", 1.0, &[1.0]);
+            let mut entry = entry(team, DAY, 1.0, &[1.0]);
             for (set, scale) in (1..).zip(scales) {
                 let shapes = (0..64).map(|k| {
                     let value = (f64::from(k * set) * 1.7).sin() + noise * f64::from(k).cos();

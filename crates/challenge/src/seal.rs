@@ -368,47 +368,41 @@ fn refuse_link(path: &Path) -> Result<(), FileError> {
 mod tests {
     use super::*;
 
+    // A folder, a key, and a receipt for the content 1f.
+    fn signed() -> (tempfile::TempDir, Key, Receipt) {
+        let key = Key::new("pilot", 1, None);
+        let time = "2026-11-24T10:00:00Z".parse().unwrap();
+        let receipt = Receipt::sign(&key, "A", time, "1f");
+        (tempfile::tempdir().unwrap(), key, receipt)
+    }
+
     #[cfg(unix)]
     #[test]
     fn a_link_is_neither_read_nor_written() {
-        let folder = tempfile::tempdir().unwrap();
+        let (folder, key, receipt) = signed();
         let (entry, target) = (folder.path().join("a.tgz"), folder.path().join("target"));
-        let key = Key::new("pilot", 1, None);
-        let receipt = Receipt::sign(&key, "A", "2026-11-24T10:00:00Z".parse().unwrap(), "1f");
         std::fs::write(&target, toml::to_string(&receipt).unwrap()).unwrap();
         std::os::unix::fs::symlink(&target, Receipt::path(&entry)).unwrap();
-        assert!(
-            Receipt::read(&key, &entry, "1f")
-                .unwrap_err()
-                .message
-                .contains("link")
-        );
+        let error = Receipt::read(&key, &entry, "1f").unwrap_err();
+        assert!(error.message.contains("link"), "{error}");
         assert!(receipt.write(&entry).is_err());
     }
 
     #[test]
     fn only_the_signed_time_team_and_content_are_accepted() {
-        let folder = tempfile::tempdir().unwrap();
+        let (folder, key, receipt) = signed();
         let entry = folder.path().join("a.tar.gz");
-        let key = Key::new("pilot", 1, None);
-        let receipt = Receipt::sign(&key, "A", "2026-11-24T10:00:00Z".parse().unwrap(), "1f");
         assert_eq!(Receipt::read(&key, &entry, "1f").unwrap(), None);
         let path = receipt.write(&entry).unwrap();
         let read = |key: &Key| Receipt::read(key, &entry, "1f");
         assert_eq!(read(&key).unwrap(), Some(receipt.clone()));
         assert!(read(&Key::new("pilot", 1, None)).is_err());
         assert!(Receipt::read(&key, &entry, "2f").is_err());
-        for (from, to) in [
-            ("2026-11-24", "2026-11-23"),
-            ("\"A\"", "\"B\""),
-            ("pilot", "pirat"),
-        ] {
-            let text = toml::to_string(&receipt).unwrap();
+        let text = toml::to_string(&receipt).unwrap();
+        for (from, to) in [("-24T", "-23T"), ("\"A\"", "\"B\""), ("pilot", "pirat")] {
             std::fs::write(&path, text.replacen(from, to, 1)).unwrap();
-            assert!(
-                read(&key).unwrap_err().message.contains("not signed"),
-                "{to}"
-            );
+            let error = read(&key).unwrap_err();
+            assert!(error.message.contains("not signed"), "{to}: {error}");
         }
     }
 

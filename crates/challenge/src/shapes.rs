@@ -567,10 +567,8 @@ mod tests {
         let key = Key::new("pilot", 1, None);
         write_shapes(&path, &key, &images).unwrap();
         let bits = |images: ShapesOfImages| -> Vec<_> {
-            let bits = |shapes: Shapes| shapes.mapv(|shape| shape.map(f32::to_bits));
-            images
-                .into_iter()
-                .map(|(id, shapes)| (id, bits(shapes)))
+            let all = images.into_iter();
+            all.map(|(id, shapes)| (id, shapes.mapv(|shape| shape.map(f32::to_bits))))
                 .collect()
         };
         assert_eq!(bits(restored(&path, &key, 7, &grid).unwrap()), bits(images));
@@ -582,11 +580,8 @@ mod tests {
         let metadata =
             table::read_metadata(&path, FileFormat::Parquet, [SIGNATURE.to_owned()].iter());
         let mut edited = table::read(&path, None, table::MAX_ROWS).unwrap();
-        let e1: Vec<f64> = table::numbers(&edited, "e1", &path)
-            .unwrap()
-            .iter()
-            .map(|e| -e)
-            .collect();
+        let e1 = table::numbers(&edited, "e1", &path).unwrap();
+        let e1: Vec<f64> = e1.iter().map(|e| -e).collect();
         edited.with_column(Column::new("e1".into(), e1)).unwrap();
         table::write(&path, FileFormat::Parquet, &edited, &metadata.unwrap()).unwrap();
         assert!(refused(&key).contains("another signature"));
