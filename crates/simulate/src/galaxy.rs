@@ -377,7 +377,7 @@ mod tests {
     fn transforms_of_all_indices_agree_with_the_real_axis() {
         for twice in 1..=TABLES as i32 {
             let profile = Sersic::nearest(0.5 * f64::from(twice));
-            for k in [0.01, 0.1, 0.5, 1.0, 2.0, 5.0] {
+            for k in [1e-3, 0.01, 0.1, 0.5, 1.0, 2.0, 5.0] {
                 let (found, slow) = (profile.fourier(k * k), by_real_axis(twice, k));
                 assert!((found - slow).abs() < 2e-6, "{twice} {k}: {found} {slow}");
             }
@@ -406,22 +406,10 @@ mod tests {
     }
 
     #[test]
-    fn de_vaucouleurs_transform_agrees_with_two_other_ways() {
-        for k in [1e-3, 0.01, 0.03, 0.1, 0.3, 1.0, 2.0] {
-            let slow = by_real_axis(8, k);
-            assert!(
-                (table(k) - slow).abs() < 1e-6,
-                "k = {k}: {} {slow}",
-                table(k)
-            );
-        }
+    fn de_vaucouleurs_transform_agrees_with_its_series() {
         for k in [2.0, 5.0, 12.0, 30.0, 100.0, 1000.0] {
-            let slow = by_power_series(k);
-            assert!(
-                (table(k) / slow - 1.0).abs() < 1e-6,
-                "k = {k}: {} {slow}",
-                table(k)
-            );
+            let (found, slow) = (table(k), by_power_series(k));
+            assert!((found / slow - 1.0).abs() < 1e-6, "k = {k}: {found} {slow}");
         }
     }
 
@@ -471,17 +459,6 @@ mod tests {
         };
         assert!((above(8, DE_VAUCOULEURS_B) - 0.5).abs() < 1e-14);
         assert!((above(2, EXPONENTIAL_HALF_LIGHT) - 0.5).abs() < 1e-14);
-        for profile in [Sersic::Exponential, Sersic::DeVaucouleurs] {
-            // ∫₀¹ 2πr I dr with r = t⁴.
-            let half: f64 = composite_rule(0.0, 1.0, 8, 12)
-                .into_iter()
-                .map(|(t, w)| {
-                    let r = t.powi(4);
-                    w * 4.0 * t.powi(3) * 2.0 * PI * r * profile.brightness(r)
-                })
-                .sum();
-            assert!((half - 0.5).abs() < 1e-10, "{profile:?}: {half}");
-        }
     }
 
     #[test]
@@ -500,11 +477,9 @@ mod tests {
         let shape = Shear::new(0.8, 0.6);
         let result = Galaxy::bulge_and_disc(1.0, 0.5, 2.3, 4.8, shape);
         assert_eq!(result, Err(GalaxyError::Shape(shape)));
-        assert_eq!(make(1.0, 0.0, 2.3).unwrap().components().len(), 1);
-        assert_eq!(
-            make(1.0, 1.0, 2.3).unwrap().components()[0].profile,
-            Sersic::DeVaucouleurs
-        );
+        let alone = |share| make(1.0, share, 2.3).unwrap().components().to_vec();
+        let (disc, bulge) = (alone(0.0), alone(1.0));
+        assert_eq!((disc.len(), bulge[0].profile), (1, Sersic::DeVaucouleurs));
         assert_eq!(round.flux(), 1.0);
     }
 }

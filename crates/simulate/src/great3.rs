@@ -585,11 +585,9 @@ mod tests {
     fn moments(image: &[f32], size: usize) -> [f64; 3] {
         let mut sums = [0.0; 3];
         for (k, value) in image.iter().enumerate() {
-            for (sum, at) in sums
-                .iter_mut()
-                .zip([1.0, (k % size) as f64, (k / size) as f64])
-            {
-                *sum += f64::from(*value) * at;
+            let terms = [1.0, (k % size) as f64, (k / size) as f64];
+            for (sum, term) in sums.iter_mut().zip(terms) {
+                *sum += f64::from(*value) * term;
             }
         }
         [sums[0], sums[1] / sums[0], sums[2] / sums[0]]

@@ -62,18 +62,6 @@ fn cases() -> impl Iterator<Item = Case> {
     CASES.lines().skip(1).map(case)
 }
 
-/// A fiducial galaxy behind a round PSF.
-fn fiducial((e1, e2): (f64, f64), centre: (f64, f64)) -> Case {
-    let plain = case("| 0.5 2.3 4.8 | 0 0 | 0 0 | 3 3.4 0 0 | 0 0");
-    let shape = Shear::new(e1, e2);
-    let galaxy = Galaxy::bulge_and_disc(30.0, 0.5, 2.3, 4.8, shape).unwrap();
-    Case {
-        galaxy,
-        centre,
-        ..plain
-    }
-}
-
 fn fast(case: &Case, scratch: &mut RenderScratch) -> Vec<f32> {
     fast_on(STAMP, case, scratch)
 }
@@ -102,31 +90,14 @@ fn difference<'a>(a: impl IntoIterator<Item = &'a f32>, b: impl IntoIterator<Ite
     worst / peak
 }
 
-fn centroid(stamp: &[f32]) -> (f64, f64) {
-    let (mut sum, mut x, mut y) = (0.0, 0.0, 0.0);
-    for (index, value) in stamp.iter().enumerate() {
-        let value = f64::from(*value);
-        sum += value;
-        x += value * (index % STAMP) as f64;
-        y += value * (index / STAMP) as f64;
-    }
-    (x / sum, y / sum)
-}
-
 #[test]
 fn fast_path_agrees_with_the_reference() {
     let mut dirty = RenderScratch::new();
     for case in cases() {
         // Only the narrow PSFs leave light beyond 2π.
         let orders = if case.psf.fwhm < 3.0 { 4.0 } else { 2.0 };
-        let exact = render_reference(
-            STAMP,
-            &case.galaxy,
-            &case.psf,
-            case.centre,
-            6 * STAMP,
-            orders,
-        );
+        let (galaxy, psf) = (&case.galaxy, &case.psf);
+        let exact = render_reference(STAMP, galaxy, psf, case.centre, 6 * STAMP, orders);
         let clean = fast(&case, &mut RenderScratch::new());
         let error = difference(&clean, exact.iter().copied());
         println!("{:20} {error:.1e}", case.name);
@@ -135,18 +106,18 @@ fn fast_path_agrees_with_the_reference() {
         assert!(error < 1e-4, "{}: {error:e}", case.name);
         // Scratch left by another galaxy, PSF and transform size, and by NaN.
         let [above, below] = &mut dirty.lines;
-        for buffer in [
+        let planes = [
             above,
             below,
             &mut dirty.sums,
             &mut dirty.even,
             &mut dirty.odd,
-        ] {
-            buffer.fill(f32::NAN);
-        }
-        for buffer in &mut dirty.along_y {
-            buffer.fill(f32::NAN);
-        }
+        ];
+        planes.into_iter().for_each(|buffer| buffer.fill(f32::NAN));
+        dirty
+            .along_y
+            .iter_mut()
+            .for_each(|buffer| buffer.fill(f32::NAN));
         assert_eq!(fast(&case, &mut dirty), clean, "{}", case.name);
     }
 }
@@ -214,66 +185,24 @@ fn a_point_is_the_psf() {
 }
 
 #[test]
-fn shapes_and_shifts_go_where_they_should() {
-    let draw = |shape, centre| fast(&fiducial(shape, centre), &mut RenderScratch::new());
-    let at = |stamp: &[f32], dx: i64, dy: i64| stamp[((24 + dy) * STAMP as i64 + 24 + dx) as usize];
-    let along_x = draw((0.3, 0.0), (24.0, 24.0));
-    assert!(at(&along_x, 5, 0) > 1.5 * at(&along_x, 0, 5));
-    assert!((at(&along_x, 4, 4) / at(&along_x, 4, -4) - 1.0).abs() < 1e-3);
-    let diagonal = draw((0.0, 0.3), (24.0, 24.0));
-    assert!(at(&diagonal, 4, 4) > 1.5 * at(&diagonal, 4, -4));
-    assert!((at(&diagonal, 5, 0) / at(&diagonal, 0, 5) - 1.0).abs() < 1e-3);
-
-    // Moments over a stamp that the light leaves a little: hence not exact.
-    let middle = centroid(&draw((0.0, 0.0), (23.5, 23.5)));
-    assert!(
-        (middle.0 - 23.5).abs() < 1e-4 && (middle.1 - 23.5).abs() < 1e-4,
-        "{middle:?}"
-    );
-    for centre in [(24.0, 23.5), (23.5, 24.0)] {
-        let case = fiducial((0.0, 0.0), centre);
-        let exact = render_reference(STAMP, &case.galaxy, &case.psf, centre, 6 * STAMP, 2.0);
-        let exact = exact.mapv(|light| light as f32);
-        let [exact, found] = [
-            centroid(exact.as_slice().unwrap()),
-            centroid(&draw((0.0, 0.0), centre)),
-        ];
-        // The stamp loses a hundredth of the shift with the wings. Light that folds into one edge, 3e-5 of the peak in 48
-        // pixels at 24 px, is 7e-4 of the flux times pixels.
-        let apart = [exact.0 - found.0, exact.1 - found.1];
-        assert!(
-            apart.iter().all(|d| d.abs() < 1.5e-3),
-            "{exact:?} {found:?}"
-        );
-        // Along the other axis both sides are alike.
-        let along = if centre.0 == 23.5 { found.0 } else { found.1 };
-        assert!((along - 23.5).abs() < 1e-4, "{found:?}");
-    }
-}
-
-#[test]
 fn flux_is_conserved() {
-    // Discs keep their light inside the stamp; a small PSF does so as well.
-    let disc = case("| 0 2.3 2.6 | 0.2 0.1 | 0 0 | 5 3 0 0 | 23.4 23.7");
-    let sum: f64 = fast(&disc, &mut RenderScratch::new())
-        .iter()
-        .map(|&v| f64::from(v))
-        .sum();
-    assert!((sum / 30.0 - 1.0).abs() < 2e-4, "{sum}");
-    // A larger stamp catches what the wings of bulges carry away.
-    let bulge = Galaxy::bulge_and_disc(1.0, 0.5, 2.3, 4.8, Shear::ZERO).unwrap();
-    let transform = PsfTransform::new(MOFFAT).unwrap();
-    let psf = FunctionalPsf::new(MOFFAT, 3.4, Shear::ZERO).unwrap();
-    let mut out = vec![0.0; 240 * 240];
-    Renderer::new(240).render(
-        &bulge,
-        &transform.of(&psf).unwrap(),
-        (119.5, 119.5),
-        &mut RenderScratch::new(),
-        &mut out,
-    );
-    let sum: f64 = out.iter().map(|&v| f64::from(v)).sum();
-    assert!((sum - 1.0).abs() < 2e-3, "{sum}");
+    // Discs keep their light inside the stamp; a larger stamp catches what the wings of bulges carry away.
+    for (line, side, lost) in [
+        (
+            "| 0 2.3 2.6 | 0.2 0.1 | 0 0 | 5 3 0 0 | 23.4 23.7",
+            STAMP,
+            2e-4,
+        ),
+        (
+            "| 0.5 2.3 4.8 | 0 0 | 0 0 | 3 3.4 0 0 | 119.5 119.5",
+            240,
+            2e-3,
+        ),
+    ] {
+        let stamp = fast_on(side, &case(line), &mut RenderScratch::new());
+        let sum: f64 = stamp.iter().map(|&v| f64::from(v)).sum();
+        assert!((sum / 30.0 - 1.0).abs() < lost, "{line}: {sum}");
+    }
 }
 
 #[test]
@@ -282,11 +211,9 @@ fn small_and_odd_stamps_are_drawn_like_large_ones() {
         for fwhm in [1.5, 3.4] {
             let at = (side as f64 - 1.0) / 2.0 + 0.2;
             let plain = case("| 0.3 1.8 2.6 | 0.2 -0.1 | 0.4 -0.3 | 3 3.4 0.05 0 | 0 0");
-            let psf = FunctionalPsf { fwhm, ..plain.psf };
-            let centre = (at, at - 0.3);
             let case = Case {
-                psf,
-                centre,
+                psf: FunctionalPsf { fwhm, ..plain.psf },
+                centre: (at, at - 0.3),
                 ..plain
             };
             let exact = render_reference(side, &case.galaxy, &case.psf, case.centre, 180, 4.0);
