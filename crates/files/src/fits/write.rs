@@ -437,20 +437,13 @@ mod tests {
             assert_eq!(read.height(), rows);
             for name in names {
                 let bits = |frame: &DataFrame| -> Vec<u64> {
-                    let column = frame.column(name).unwrap();
-                    reals(column)
-                        .unwrap()
-                        .iter()
-                        .map(|value| value.to_bits())
-                        .collect()
+                    let values = reals(frame.column(name).unwrap()).unwrap().into_owned();
+                    values.into_iter().map(f64::to_bits).collect()
                 };
                 assert_eq!(bits(&read), bits(&table), "{name}");
             }
-            let keys = ["NOTE".to_owned()];
-            assert_eq!(
-                read_table_keys(&path, keys.iter()).unwrap()["NOTE"].trim_end(),
-                note.trim_end()
-            );
+            let keys = read_table_keys(&path, ["NOTE".to_owned()].iter()).unwrap();
+            assert_eq!(keys["NOTE"].trim_end(), note.trim_end());
         }
     }
 
