@@ -388,10 +388,8 @@ mod tests {
         let mut sets = whole.clone();
         sets.headings[1].key = "set";
         assert_eq!(sets.metrics(), ["m"]);
-        let csv = whole
-            .chosen(&["m".to_owned()])
-            .unwrap()
-            .render(TableFormat::Csv);
+        let chosen = whole.chosen(&["m".to_owned()]).unwrap();
+        let csv = chosen.render(TableFormat::Csv);
         assert!(csv.starts_with("name,m"), "{csv}");
     }
 }

@@ -56,20 +56,14 @@ fn line(title: &str) -> LinePlot {
 }
 
 #[test]
-fn a_line_plot() {
+fn a_line_plot_and_panels_that_share_labels_and_legend() {
     compare("line", &line("Shear power"));
-}
-
-#[test]
-fn panels_share_their_labels_and_legend() {
-    compare(
-        "panels",
-        &PanelGrid {
-            title: "Shear power spectra".into(),
-            columns: 2,
-            plots: ["set 2", "set 5", "set 8"].map(line).into(),
-        },
-    );
+    let panels = PanelGrid {
+        title: "Shear power spectra".into(),
+        columns: 2,
+        plots: ["set 2", "set 5", "set 8"].map(line).into(),
+    };
+    compare("panels", &panels);
 }
 
 #[test]
@@ -101,13 +95,8 @@ fn long_names_stand_below_each_other() {
         "48/linear/star",
         "a rather long name of a configuration",
     ];
-    let series = Series::new(
-        "",
-        vec![0.0, 1.0, 2.0],
-        vec![4.0, 3.0, 2.0],
-        Style::Points,
-        0,
-    );
+    let (x, y) = (vec![0.0, 1.0, 2.0], vec![4.0, 3.0, 2.0]);
+    let series = Series::new("", x, y, Style::Points, 0);
     let plot = LinePlot {
         y_label: "Q".into(),
         x_names: names.map(String::from).into(),
@@ -125,17 +114,16 @@ fn images_in_a_grid() {
         map,
         ..ImagePanel::default()
     };
-    compare(
-        "images",
-        &ImageGrid {
-            title: "Steps of one galaxy".into(),
-            rows: vec![ImageRow {
-                label: "S/N 20".into(),
-                panels: vec![
-                    panel("residual", ColourMap::Diverging),
-                    panel("deconvolved", ColourMap::Viridis),
-                ],
-            }],
-        },
-    );
+    let row = ImageRow {
+        label: "S/N 20".into(),
+        panels: vec![
+            panel("residual", ColourMap::Diverging),
+            panel("deconvolved", ColourMap::Viridis),
+        ],
+    };
+    let images = ImageGrid {
+        title: "Steps of one galaxy".into(),
+        rows: vec![row],
+    };
+    compare("images", &images);
 }

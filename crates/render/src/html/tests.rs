@@ -9,15 +9,10 @@ use crate::table::Heading;
 const NASTY: &str = "<script>alert(\"x\" + 'y')</script> & </style>";
 
 fn picture() -> Picture {
+    let (x, y) = (vec![1.0, 2.0, 3.0], vec![1.0, 4.0, 9.0]);
     let plot = LinePlot {
         title: "Power".into(),
-        series: vec![Series::new(
-            "true",
-            vec![1.0, 2.0, 3.0],
-            vec![1.0, 4.0, 9.0],
-            Style::Line,
-            0,
-        )],
+        series: vec![Series::new("true", x, y, Style::Line, 0)],
         ..LinePlot::default()
     };
     Picture::draw(&plot, "power", NASTY).unwrap()
@@ -49,24 +44,15 @@ fn table() -> Table {
 }
 
 fn report() -> Report {
+    let text = Block::Text(format!("{NASTY}\n\n{NASTY}"));
+    let tables = vec![text, Block::Table(table()), Block::Table(table())];
+    let figures = vec![Block::Figure(picture()), Block::Figure(picture())];
     Report {
         title: NASTY.into(),
         subtitle: NASTY.into(),
         sections: vec![
-            Section::new(
-                "scores",
-                NASTY,
-                vec![
-                    Block::Text(format!("{NASTY}\n\n{NASTY}")),
-                    Block::Table(table()),
-                    Block::Table(table()),
-                ],
-            ),
-            Section::new(
-                "scores",
-                "Again",
-                vec![Block::Figure(picture()), Block::Figure(picture())],
-            ),
+            Section::new("scores", NASTY, tables),
+            Section::new("scores", "Again", figures),
             Section::new("settings", "", Vec::new()),
             Section::new("\" onclick=\"", "", Vec::new()),
         ],
@@ -78,106 +64,53 @@ fn report() -> Report {
     }
 }
 
-// Elements as (name, attributes), after checking that they nest, that attributes are quoted and
-// that no bare `<`, `>` or `&` is in the text between.
-fn elements(page: &str) -> Vec<(String, Vec<(String, String)>)> {
-    const VOID: [&str; 3] = ["meta", "link", "img"];
-    let mut rest = page.strip_prefix("<!DOCTYPE html>").unwrap();
-    let (mut open, mut all) = (Vec::<String>::new(), Vec::new());
-    while let Some((text, after)) = rest.split_once('<') {
-        assert!(!text.contains('>'), "bare > in {text:?}");
-        for part in text.split('&').skip(1) {
-            let (entity, _) = part.split_once(';').expect("an entity");
-            assert!(["amp", "lt", "gt", "quot", "#39"].contains(&entity));
-        }
-        if let Some(closing) = after.strip_prefix('/') {
-            let (name, after) = closing.split_once('>').unwrap();
-            assert_eq!(open.pop().as_deref(), Some(name));
-            rest = after;
-            continue;
-        }
-        let end = after.find([' ', '>']).unwrap();
-        let name = after[..end].to_owned();
-        let mut tag = &after[end..];
-        let mut attributes = Vec::new();
-        while let Some(attribute) = tag.strip_prefix(' ') {
-            let end = attribute.find(['=', ' ', '>']).unwrap();
-            let key = attribute[..end].to_owned();
-            tag = &attribute[end..];
-            let mut value = String::new();
-            if let Some(quoted) = tag.strip_prefix("=\"") {
-                let (inside, after) = quoted.split_once('"').unwrap();
-                assert!(!inside.contains(['<', '>']));
-                value = inside.to_owned();
-                tag = after;
-            }
-            assert!(attributes.iter().all(|(other, _)| *other != key));
-            attributes.push((key, value));
-        }
-        rest = tag.strip_prefix('>').expect("the end of a tag");
-        if name == "style" || name == "script" {
-            rest = rest.split_once(&format!("</{name}>")).unwrap().1;
-        } else if !VOID.contains(&name.as_str()) {
-            open.push(name.clone());
-        }
-        all.push((name, attributes));
-    }
-    assert!(open.is_empty() && rest == "\n");
-    all
+// Values of an attribute. That elements nest and texts are escaped is a matter of maud; `escape.rs` counts the elements.
+fn values<'a>(page: &'a str, key: &str) -> Vec<&'a str> {
+    let start = format!(" {key}=\"");
+    let rests = page.split(&start).skip(1);
+    rests.map(|rest| rest.split('"').next().unwrap()).collect()
 }
 
 #[test]
-fn the_page_is_well_formed_whatever_the_words_are() {
+fn places_of_the_page_have_one_name_each_whatever_the_words_are() {
     let page = report().render();
-    let elements = elements(&page);
-    let count = |name: &str| elements.iter().filter(|(n, _)| n == name).count();
-    assert_eq!((count("script"), count("style"), count("h1")), (1, 1, 1));
-    assert_eq!((count("table"), count("img"), count("section")), (2, 2, 6));
-    let values = |key: &str| -> Vec<&str> {
-        elements
-            .iter()
-            .flat_map(|(_, attributes)| attributes)
-            .filter(|(k, _)| k == key)
-            .map(|(_, value)| value.as_str())
-            .collect()
-    };
-    let ids = values("id");
+    let ids = values(&page, "id");
     let unique: HashSet<&str> = ids.iter().copied().collect();
     assert_eq!(ids.len(), unique.len());
-    for href in values("href") {
-        if let Some(id) = href.strip_prefix('#') {
-            assert!(unique.contains(id), "{href}");
-        }
-    }
-    for id in values("aria-labelledby") {
+    let links = values(&page, "href").into_iter();
+    let links = links.filter_map(|href| href.strip_prefix('#'));
+    for id in links.chain(values(&page, "aria-labelledby")) {
         assert!(unique.contains(id), "{id}");
     }
-    assert!(values("onclick").is_empty());
-    for (name, attributes) in &elements {
-        let has = |key: &str| attributes.iter().any(|(k, v)| k == key && !v.is_empty());
-        assert!(name != "th" || has("scope"));
-        assert!(name != "img" || (has("alt") && has("width") && has("height")));
-    }
-    assert!(!page.contains("<script>alert"));
+    let count = |start: &str| page.matches(start).count();
+    assert_eq!((count("<script"), count("<h1"), count("<table")), (1, 1, 2));
+    assert_eq!((count("<section"), values(&page, "alt").len()), (6, 2));
+    assert_eq!(count("<th"), count("<thead") + values(&page, "scope").len());
+    assert!(values(&page, "onclick").is_empty());
     assert_eq!(page, report().render());
 }
 
 #[test]
 fn the_page_refers_to_nothing_outside() {
     let page = report().render();
-    assert!(!page.contains("http://") && !page.contains("https://") && !page.contains("url("));
-    assert!(!page.contains("@import") && !page.contains("href=\"//"));
+    for outside in ["http://", "https://", "url(", "@import", "href=\"//"] {
+        assert!(!page.contains(outside), "{outside}");
+    }
 }
 
 #[test]
 fn cells_sort_by_value_and_read_as_numbers() {
     let page = report().render();
-    assert!(page.contains("<td class=\"num\" data-value=\"-87.125\">−87.1 ± 1.5</td>"));
-    assert!(page.contains("data-value=\"0.00000095\">0.0 ± 1.0<"));
-    assert!(page.contains("data-value=\"NaN\">–<"));
-    assert!(page.contains("<td class=\"num detail\" data-value=\"Infinity\">∞</td>"));
-    assert!(page.contains("<th scope=\"col\" class=\"num detail\">m</th>"));
-    assert!(page.contains("<td class=\"num detail\"></td></tr>"));
+    for cell in [
+        "<td class=\"num\" data-value=\"-87.125\">−87.1 ± 1.5</td>",
+        "data-value=\"0.00000095\">0.0 ± 1.0<",
+        "data-value=\"NaN\">–<",
+        "<td class=\"num detail\" data-value=\"Infinity\">∞</td>",
+        "<th scope=\"col\" class=\"num detail\">m</th>",
+        "<td class=\"num detail\"></td></tr>",
+    ] {
+        assert!(page.contains(cell), "{cell}");
+    }
 }
 
 #[test]
@@ -200,6 +133,6 @@ fn a_report_is_written_and_an_empty_one_too() {
     let path = folder.path().join("new/report.html");
     report().save(&path).unwrap();
     assert_eq!(std::fs::read_to_string(path).unwrap(), report().render());
-    let empty = elements(&Report::default().render());
-    assert!(empty.iter().all(|(name, _)| name != "nav" && name != "h2"));
+    let empty = Report::default().render();
+    assert!(!empty.contains("<nav") && !empty.contains("<h2"));
 }
