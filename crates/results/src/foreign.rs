@@ -294,6 +294,11 @@ mod tests {
         let failed = |keys| rows(keys, "1,1,-10,0.2,0\n")[0].e1;
         assert_eq!(failed("ellipticity = \"shear\""), -10.0);
         assert!(failed("ellipticity = \"shear\"\ndrop_missing = true").is_nan());
+        let reported = rows(
+            "ellipticity = \"shear\"\nreport = \"distortion\"",
+            "1,1,0.2,0,0\n",
+        );
+        assert!((reported[0].e1 - 0.4 / 1.04).abs() < 1e-15);
         let described = Foreign {
             missing: Some(-99.0),
             max_modulus: Some(0.5),

@@ -222,29 +222,36 @@ mod tests {
 
     use super::*;
 
+    /// Writes a catalogue with responses along the diagonal and across it.
+    fn write(
+        path: &Path,
+        e: &[[f64; 2]],
+        [diagonal, across]: [&[f64]; 2],
+        metadata: &[(&str, &str)],
+    ) {
+        let column = |name: &str, of: &dyn Fn(usize) -> f64| {
+            let values: Vec<f64> = (0..e.len()).map(of).collect();
+            Column::new(name.into(), values)
+        };
+        let table = frame(vec![
+            column("e1", &|k| e[k][0]),
+            column("e2", &|k| e[k][1]),
+            column("flags", &|k| if e[k][0].is_nan() { 4.0 } else { 0.0 }),
+            column("R11", &|k| diagonal[k]),
+            column("R22", &|k| diagonal[k]),
+            column("R12", &|k| across[k]),
+            column("R21", &|k| -across[k]),
+        ]);
+        let own = |(key, value): &(&str, &str)| ((*key).to_owned(), (*value).to_owned());
+        let metadata = metadata.iter().map(own).collect();
+        table::write(path, FileFormat::Parquet, &table.unwrap(), &metadata).unwrap();
+    }
+
     /// Writes a catalogue of two good galaxies, of mean response 0.5, and one flagged.
     fn written(path: &Path, e: [f64; 2], metadata: &[(&str, &str)]) {
-        let column = |name: &str, values: [f64; 3]| Column::new(name.into(), values);
-        let e = |sign: f64| [sign * e[0], sign * e[1], f64::NAN];
-        let table = frame(vec![
-            column("e1", e(1.0)),
-            column("e2", e(-0.5)),
-            column("flags", [0.0, 0.0, 4.0]),
-            column("R11", [0.4, 0.6, f64::NAN]),
-            column("R22", [0.4, 0.6, f64::NAN]),
-            column("R12", [0.0, 0.0, f64::NAN]),
-            column("R21", [0.0, 0.0, f64::NAN]),
-        ]);
-        let metadata = metadata
-            .iter()
-            .map(|(key, value)| ((*key).to_owned(), (*value).to_owned()));
-        table::write(
-            path,
-            FileFormat::Parquet,
-            &table.unwrap(),
-            &metadata.collect(),
-        )
-        .unwrap();
+        let e = [[e[0], -0.5 * e[0]], [e[1], -0.5 * e[1]], [f64::NAN; 2]];
+        let diagonal = [0.4, 0.6, f64::NAN];
+        write(path, &e, [&diagonal, &[0.0, 0.0, f64::NAN]], metadata);
     }
 
     /// The mean of set 7 of these Parquet files, all of whose galaxies are selected.
@@ -295,22 +302,53 @@ mod tests {
         let path = |image: u32| folder.path().join(format!("{image}.parquet"));
         written(&path(1), [0.05, 0.2], &[]);
         // Galaxies of the other have hardly any response, and noise.
-        let column = |name: &str, value: f64| Column::new(name.into(), [value; 2]);
-        let table = frame(vec![
-            column("e1", 5e-3),
-            column("e2", 5e-3),
-            column("flags", 0.0),
-            column("R11", 1e-3),
-            column("R22", 1e-3),
-            column("R12", 0.0),
-            column("R21", 0.0),
-        ]);
-        let none = Default::default();
-        table::write(&path(2), FileFormat::Parquet, &table.unwrap(), &none).unwrap();
+        write(&path(2), &[[5e-3; 2]; 2], [&[1e-3; 2], &[0.0; 2]], &[]);
         let catalogues = [1, 2].map(|image| (image, path(image)));
         let mean = mean_of_files(&catalogues, true, true);
         let found = mean.unwrap().shear.unwrap().shear[0];
         assert!((found - (0.25 + 0.01) / 1.002).abs() < 1e-15, "{found}");
+    }
+
+    #[test]
+    fn the_whole_response_is_divided_out() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("catalogue-001.parquet");
+        let (diagonal, across) = ([0.4, 0.6, 0.7, 0.5], [0.1, 0.2, -0.1, 0.05]);
+        let e = [[0.05, 0.1], [0.2, -0.1], [-0.3, 0.2], [0.1, 0.0]];
+        write(&path, &e, [&diagonal, &across], &[]);
+        let found = mean_of_files(&[(1, path)], true, true).unwrap();
+        let found = found.shear.unwrap();
+        // By plain sums: R = [[a, b], [−b, a]].
+        let mean = |values: &dyn Fn(usize) -> f64| (0..4).map(values).sum::<f64>() / 4.0;
+        let (a, b) = (mean(&|k| diagonal[k]), mean(&|k| across[k]));
+        let solved = |e: [f64; 2]| {
+            let determinant = a * a + b * b;
+            [
+                (a * e[0] - b * e[1]) / determinant,
+                (b * e[0] + a * e[1]) / determinant,
+            ]
+        };
+        let shear = solved([mean(&|k| e[k][0]), mean(&|k| e[k][1])]);
+        for i in 0..2 {
+            // The error of a ratio of means contains the scatter of the responses.
+            let square = |k: usize| {
+                let (r, x) = (diagonal[k], across[k]);
+                let residual = [
+                    e[k][0] - r * shear[0] - x * shear[1],
+                    e[k][1] + x * shear[0] - r * shear[1],
+                ];
+                solved(residual)[i].powi(2)
+            };
+            let error = (mean(&square) / 3.0).sqrt();
+            assert!(
+                (found.shear[i] - shear[i]).abs() < 1e-14,
+                "{found:?} {shear:?}"
+            );
+            assert!(
+                (found.error()[i] - error).abs() < 1e-14,
+                "{found:?} {error}"
+            );
+        }
     }
 
     #[test]

@@ -424,20 +424,14 @@ mod tests {
     use super::*;
 
     fn catalogue(path: &Path, responses: &[f64], metadata: &[(&str, &str)]) {
-        let column = |name: &str, values: &[f64]| Column::new(name.into(), values.to_vec());
+        let column = |name: &str, of: fn(&f64) -> f64| {
+            let values: Vec<f64> = responses.iter().map(of).collect();
+            Column::new(name.into(), values)
+        };
         let table = frame(vec![
-            column("R11", responses),
-            column(
-                "R22",
-                &responses.iter().map(|r| 2.0 * r).collect::<Vec<_>>(),
-            ),
-            column(
-                "flags",
-                &responses
-                    .iter()
-                    .map(|r| f64::from(u8::from(r.is_nan())))
-                    .collect::<Vec<_>>(),
-            ),
+            column("R11", |r| *r),
+            column("R22", |r| 2.0 * r),
+            column("flags", |r| f64::from(r.is_nan())),
         ]);
         let metadata = metadata.iter();
         let metadata = metadata.map(|(key, value)| ((*key).to_owned(), (*value).to_owned()));

@@ -247,7 +247,7 @@ mod tests {
     }
 
     #[test]
-    fn counts_that_no_catalogues_have_are_refused() {
+    fn counts_and_names_that_no_run_has_are_refused() {
         let folder = tempfile::tempdir().unwrap();
         for (edit, expected) in [
             (
@@ -256,12 +256,19 @@ mod tests {
             ),
             (|run| run.sets[0].flagged = 65, "set 1: found "),
             (|run| run.sets.clear(), "the run has no sets"),
+            (
+                |run| run.configuration = "\u{1b}[2J".into(),
+                "without control characters",
+            ),
         ] {
             let mut own = run("a", &[(1, 3, 5.5)]);
             edit(&mut own);
             let path = write(folder.path(), &own).unwrap();
             let message = read(folder.path()).unwrap_err().to_string();
-            assert!(message.contains(expected), "{message}");
+            assert!(
+                message.contains(expected) && !message.contains('\u{1b}'),
+                "{message}"
+            );
             std::fs::remove_file(path).unwrap();
         }
     }

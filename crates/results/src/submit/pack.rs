@@ -407,11 +407,8 @@ mod tests {
         }
         writer.add("a", b"x").unwrap();
         writer.finish().unwrap();
-        let names: Vec<String> = read_archive(&path, None)
-            .unwrap()
-            .files
-            .into_keys()
-            .collect();
+        let files = read_archive(&path, None).unwrap().files;
+        let names: Vec<&String> = files.keys().collect();
         assert_eq!(names, ["a"]);
     }
 
