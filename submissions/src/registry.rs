@@ -625,56 +625,54 @@ mod tests {
         }
     }
 
+    // What a file of this text in `folder` is.
+    fn read(folder: &Path, name: &str, text: &str) -> Result<Entry, String> {
+        let path = write(folder, name, text);
+        let entry = Registry::embedded().unwrap().get(&path);
+        entry.map_err(|error| error.to_string())
+    }
+
     #[test]
     fn files_extend_names_and_files_without_published_figures() {
         let folder = tempfile::tempdir().unwrap();
-        write(
-            folder.path(),
-            "base.toml",
-            "extends = \"23/den/star\"\n[stamp]\nsize = 31\n",
+        let base = "extends = \"23/den/star\"\n[stamp]\nsize = 31\n";
+        write(folder.path(), "base.toml", base);
+        let own = "extends = \"base.toml\"\n[deconvolution]\nlambda = 0.5\n";
+        let entry = read(folder.path(), "own.toml", own).unwrap();
+        let configuration = entry.configuration;
+        assert_eq!(
+            (configuration.name.as_str(), configuration.stamp.size),
+            ("own", 31)
         );
-        let own = write(
-            folder.path(),
-            "own.toml",
-            "extends = \"base.toml\"\n[deconvolution]\nlambda = 0.5\n",
-        );
-        let entry = Registry::embedded().unwrap().get(&own).unwrap();
-        assert_eq!(entry.configuration.name, "own");
-        assert_eq!(entry.configuration.stamp.size, 31);
-        let network = entry.configuration.network().unwrap();
-        assert_eq!(network.deconvolution.lambda, 0.5);
-        assert!(entry.configuration.wavelet().is_some());
+        assert_eq!(configuration.network().unwrap().deconvolution.lambda, 0.5);
+        assert!(configuration.wavelet().is_some());
         assert_eq!(entry.published, None);
+        // A method without its settings.
+        let text = "extends = \"23/den/star\"\nmethod = \"linear\"\n";
+        let error = read(folder.path(), "own.toml", text).unwrap_err();
+        assert!(
+            error.contains("`deconvolution.reference_area` is set"),
+            "{error}"
+        );
     }
 
     #[test]
     fn files_of_a_known_name_have_its_settings() {
         let folder = tempfile::tempdir().unwrap();
-        let registry = Registry::embedded().unwrap();
-        let read = |file: &str, text: &str| {
-            let path = write(folder.path(), file, text);
-            registry.get(&path).map_err(|error| error.to_string())
-        };
+        let read = |file: &str, text: &str| read(folder.path(), file, text);
         let named = "name = \"48/linear/star\"\n";
-        let other = format!("{named}extends = \"23/raw/star\"\n");
-        let error = read("own.toml", &other).unwrap_err();
-        assert!(
-            error.contains("own.toml: the name `48/linear/star` is that of a known"),
-            "{error}"
-        );
+        let error = read("own.toml", &format!("{named}extends = \"23/raw/star\"\n")).unwrap_err();
+        let known = "own.toml: the name `48/linear/star` is that of a known";
+        assert!(error.contains(known), "{error}");
         let changed = format!("{named}extends = \"48/linear/star\"\n[stamp]\nsize = 40\n");
         let error = read("own.toml", &changed).unwrap_err();
-        assert!(
-            error.contains("(stamp.size: found 40, expected 48). Try: another"),
-            "{error}"
-        );
+        let size = "(stamp.size: found 40, expected 48). Try: another";
+        assert!(error.contains(size), "{error}");
         // The bases, which are not listed, have names too; a file without one has the name of its path.
         assert!(read("paper.toml", "extends = \"48/linear/star\"\n").is_err());
         let same = format!("{named}extends = \"48/linear/star\"\ndescription = \"mine\"\n");
-        assert_eq!(
-            read("own.toml", &same).unwrap().configuration.name,
-            "48/linear/star"
-        );
+        let same = read("own.toml", &same).unwrap();
+        assert_eq!(same.configuration.name, "48/linear/star");
     }
 
     #[test]
@@ -773,31 +771,8 @@ mod tests {
             let held = keys.map(|key| table["deconvolution"].get(key).is_some());
             assert_eq!(held, [linear, !linear], "{name}");
             let text = toml::to_string(&configuration).unwrap();
-            assert_eq!(
-                toml::from_str::<Configuration>(&text).unwrap(),
-                configuration
-            );
+            assert_eq!(text.parse::<Configuration>().unwrap(), configuration);
         }
-    }
-
-    #[test]
-    fn a_file_can_change_its_method_and_where_its_noise_comes_from() {
-        let folder = tempfile::tempdir().unwrap();
-        let registry = Registry::embedded().unwrap();
-        let own = write(
-            folder.path(),
-            "own.toml",
-            "extends = \"48/linear/star\"\n[noise]\nsource = \"border\"\n",
-        );
-        let noise = registry.get(&own).unwrap().configuration.noise;
-        assert_eq!(noise, NoiseSource::Border { border: 4 });
-        let text = "extends = \"23/den/star\"\nmethod = \"linear\"\n";
-        let own = write(folder.path(), "own.toml", text);
-        let message = registry.get(&own).unwrap_err().to_string();
-        assert!(
-            message.contains("`deconvolution.reference_area` is set"),
-            "{message}"
-        );
     }
 
     #[test]

@@ -409,17 +409,20 @@ mod tests {
 
     #[test]
     fn patterns_accept_plain_and_padded_numbers() {
-        assert_eq!(
-            fill("set{set:02}/galaxies-{image:03}.fits", 7, 12),
-            "set07/galaxies-012.fits"
-        );
-        assert_eq!(
-            fill("g10_v1_objs_{set}_{image}.me.dat", 7, 12),
-            "g10_v1_objs_7_12.me.dat"
-        );
-        assert_eq!(
-            fill("image-{set:03}-{image}.fits", 7, 0),
-            "image-007-0.fits"
-        );
+        for (pattern, image, expected) in [
+            (
+                "set{set:02}/galaxies-{image:03}.fits",
+                12,
+                "set07/galaxies-012.fits",
+            ),
+            (
+                "g10_v1_objs_{set}_{image}.me.dat",
+                12,
+                "g10_v1_objs_7_12.me.dat",
+            ),
+            ("image-{set:03}-{image}.fits", 0, "image-007-0.fits"),
+        ] {
+            assert_eq!(fill(pattern, 7, image), expected);
+        }
     }
 }

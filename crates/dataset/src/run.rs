@@ -589,17 +589,16 @@ mod tests {
     fn leftovers_are_removed_if_no_other_process_is_at_work() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("record.json");
-        let left = folder
-            .path()
-            .join("set01/.catalogue-001.fits.0123456789abcdef.part");
-        std::fs::create_dir(folder.path().join("set01")).unwrap();
-        std::fs::write(&left, "half").unwrap();
         // Branches of GREAT3 have images three folders below the record.
-        let deep = folder
-            .path()
-            .join("control/ground/constant/.image-000-0.fits.0123456789abcdef.part");
-        std::fs::create_dir_all(deep.parent().unwrap()).unwrap();
-        std::fs::write(&deep, "half").unwrap();
+        let [left, deep] = [
+            "set01/.catalogue-001.fits",
+            "control/ground/constant/.image-000-0.fits",
+        ]
+        .map(|name| folder.path().join(format!("{name}.0123456789abcdef.part")));
+        for path in [&left, &deep] {
+            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+            std::fs::write(path, "half").unwrap();
+        }
         let first = claim(&path, &1).unwrap();
         assert!(!left.exists() && !deep.exists());
         std::fs::write(&left, "being written").unwrap();
@@ -614,9 +613,8 @@ mod tests {
 
     #[test]
     fn important_differences_come_first_and_others_are_counted() {
-        let mut lines: Vec<String> = (0..34)
-            .map(|k| format!("submission.a.k{k}: 1 ≠ 2"))
-            .collect();
+        let line = |k| format!("submission.a.k{k}: 1 ≠ 2");
+        let mut lines: Vec<String> = (0..34).map(line).collect();
         lines.insert(0, "submission.description: \"a\" ≠ \"b\"".into());
         lines.push("submission.name: \"a\" ≠ \"b\"".into());
         lines.push("version: \"1\" ≠ \"2\"".into());
@@ -625,10 +623,8 @@ mod tests {
         assert!(shown[0].starts_with("version") && shown[1].starts_with("submission.name"));
         assert_eq!(shown[2], "submission.a.k0: 1 ≠ 2");
         assert_eq!(shown[MAX_DIFFERENCES], "and 31 more");
-        assert_eq!(
-            most_important(vec!["images: 1 ≠ 2".into()]),
-            ["images: 1 ≠ 2"]
-        );
+        let one = || vec!["images: 1 ≠ 2".to_owned()];
+        assert_eq!(most_important(one()), one());
     }
 
     #[test]

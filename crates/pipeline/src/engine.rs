@@ -207,66 +207,38 @@ mod tests {
     }
 
     #[test]
-    fn a_panic_of_one_worker_reaches_the_caller() {
-        let result = catch_unwind(|| {
-            ordered(
-                2,
-                |feeder| {
-                    for k in 0..1000 {
-                        if !feeder.push(k) {
-                            break;
-                        }
-                    }
-                    Ok(())
-                },
-                || (),
-                |(), k| if k == 20 { panic!("worker") } else { Ok(()) },
-                |()| Ok(()),
-            )
-        });
-        assert_eq!(result.unwrap_err().downcast_ref(), Some(&"worker"));
-    }
-
-    #[test]
-    fn an_error_anywhere_ends_the_work() {
-        let fail = |at: &str| {
-            let error = || PipelineError::Interrupted;
+    fn a_panic_or_an_error_anywhere_ends_the_work() {
+        let run = |at: &str| {
+            let fails = |place, k| match (at == place && k == 20, at) {
+                (true, "panic") => panic!("worker"),
+                (true, _) => Err(PipelineError::Interrupted),
+                _ => Ok(k),
+            };
             let mut written = 0;
             let result = ordered(
                 2,
                 |feeder| {
                     for k in 0..1000 {
-                        if at == "read" && k == 20 {
-                            return Err(error());
-                        }
-                        if !feeder.push(k) {
+                        if !feeder.push(fails("read", k)?) {
                             break;
                         }
                     }
                     Ok(())
                 },
                 || (),
-                |(), k| {
-                    if at == "work" && k == 20 {
-                        Err(error())
-                    } else {
-                        Ok(k)
-                    }
-                },
+                |(), k| fails(if at == "panic" { "panic" } else { "work" }, k),
                 |k| {
                     written += 1;
-                    if at == "write" && k == 20 {
-                        Err(error())
-                    } else {
-                        Ok(())
-                    }
+                    fails("write", k).map(|_| ())
                 },
             );
-            assert!(result.is_err(), "{at}");
             assert!(written <= 21, "{at}: {written}");
+            result
         };
-        fail("read");
-        fail("work");
-        fail("write");
+        for at in ["read", "work", "write"] {
+            assert!(run(at).is_err(), "{at}");
+        }
+        let panic = catch_unwind(|| run("panic")).unwrap_err();
+        assert_eq!(panic.downcast_ref(), Some(&"worker"));
     }
 }

@@ -636,13 +636,10 @@ mod tests {
 
     /// A header of right ascension and declination with this matrix, in units of the pixel scale.
     fn sky(matrix: [f64; 4]) -> Wcs {
-        let mut keys = vec![("CTYPE1", Value::Text("RA---TAN".into()))];
-        keys.extend(
-            CD_KEYS
-                .into_iter()
-                .zip(matrix.map(|value| real(value * DEGREES))),
-        );
-        wcs(&keys)
+        let matrix = matrix.map(|value| real(value * DEGREES));
+        let keys = CD_KEYS.into_iter().zip(matrix);
+        let kind = ("CTYPE1", Value::Text("RA---TAN".into()));
+        wcs(&[kind].into_iter().chain(keys).collect::<Vec<_>>())
     }
 
     #[test]
@@ -664,12 +661,11 @@ mod tests {
             let found = wcs(&header).scale.unwrap();
             assert!((found - 0.2).abs() < 1e-12, "{header:?}: {found}");
         }
-        let none = [
+        for header in [
             vec![],
             vec![("CDELT1", real(1.0)), ("CDELT2", real(1.0))],
             vec![("PIXSCALE", text("small"))],
-        ];
-        for header in none {
+        ] {
             assert_eq!(wcs(&header).scale, None, "{header:?}");
         }
     }
@@ -690,19 +686,18 @@ mod tests {
             // GalSim's ShearWCS of g1 = 0.1: the steps are 1 − g1 and 1 + g1.
             ([-0.9, 0.0, 0.0, 1.1], Some((0.0, false, 0.1))),
         ] {
-            let found = sky(matrix).frame();
-            let found = found.map(|warning| match warning {
-                Warning::PixelFrame(PixelFrame {
-                    angle,
-                    mirrored,
-                    shear,
-                }) => {
-                    // Rounding.
-                    assert!(shear[1].abs() < 1e-12);
-                    let rounded = |value: f64| (value * 1e9).round() / 1e9 + 0.0;
-                    (rounded(angle), mirrored, rounded(shear[0]))
-                }
-                other => panic!("{other}"),
+            let found = sky(matrix).frame().map(|warning| {
+                let Warning::PixelFrame(frame) = warning else {
+                    panic!("{warning}");
+                };
+                // Rounding.
+                assert!(frame.shear[1].abs() < 1e-12);
+                let rounded = |value: f64| (value * 1e9).round() / 1e9 + 0.0;
+                (
+                    rounded(frame.angle),
+                    frame.mirrored,
+                    rounded(frame.shear[0]),
+                )
             });
             assert_eq!(found, expected, "{matrix:?}");
         }
