@@ -8,7 +8,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use shearq_challenge::create::seed_of;
 
-use crate::support::{contents, printed, shell};
+use crate::support::{Folder, assert_has, contents};
 
 /// Name of the challenges.
 const NAME: &str = "pilot";
@@ -18,13 +18,10 @@ const SEED: u64 = 9_876_543_210_123_456_789;
 fn secrets(private: &Path, seeds: &[u64]) -> (HashSet<String>, HashSet<u64>) {
     let (mut texts, mut words) = (HashSet::new(), HashSet::new());
     let mut add = |bytes: [u8; 8]| {
-        words.insert(u64::from_be_bytes(bytes));
-        words.insert(u64::from_le_bytes(bytes));
+        words.extend([u64::from_be_bytes(bytes), u64::from_le_bytes(bytes)]);
     };
-    for (name, content) in contents(private) {
-        if !name.ends_with(".csv") {
-            continue;
-        }
+    let all = contents(private).into_iter();
+    for (_, content) in all.filter(|(name, _)| name.ends_with(".csv")) {
         let content = String::from_utf8(content).unwrap();
         let lines = content
             .lines()
@@ -42,8 +39,7 @@ fn secrets(private: &Path, seeds: &[u64]) -> (HashSet<String>, HashSet<u64>) {
     }
     assert!(texts.len() > 1000);
     for seed in seeds {
-        texts.insert(seed.to_string());
-        texts.insert(format!("{seed:x}"));
+        texts.extend([seed.to_string(), format!("{seed:x}")]);
         add(seed.to_be_bytes());
     }
     (texts, words)
@@ -74,13 +70,11 @@ fn leaks(public: &Path, (texts, words): &(HashSet<String>, HashSet<u64>)) -> Vec
 
 #[test]
 fn public_files_contain_no_true_shear_and_no_seed() {
-    let root = tempfile::tempdir().unwrap();
+    let folder = Folder::new();
     let size = "--sets 2,8 --images 8 --grid 12 --amplitude 100 --metric q --spectra";
-    let new = format!(
-        "shearq challenge new --name {NAME} {size} --seed {SEED} --public public --private private"
-    );
-    printed(root.path(), &new);
-    let (public, private) = (root.path().join("public"), root.path().join("private"));
+    let new = format!("challenge new --name {NAME} {size} --seed {SEED}");
+    folder.run(&format!("{new} --public public --private private"));
+    let (public, private) = (folder.at("public"), folder.at("private"));
     let secrets = secrets(&private, &[SEED, seed_of(NAME, 1, SEED)]);
     assert_eq!(leaks(&public, &secrets), Vec::<String>::new());
     // The search finds what an ordinary simulation reveals.
@@ -93,13 +87,13 @@ fn public_files_contain_no_true_shear_and_no_seed() {
     let secret = |name: &&str| name.contains("truth") || name.contains("intrinsic");
     assert!(!names.iter().any(secret), "{names:?}");
     for word in ["SEED", "KIND", "amplitude", "DATE"] {
-        let holds = |content: &[u8]| {
-            content
-                .windows(word.len())
-                .any(|part| part == word.as_bytes())
-        };
-        let found = files.iter().find(|file| holds(&file.1));
-        assert!(found.is_none(), "{word} in {:?}", found.map(|file| &file.0));
+        for (name, content) in &files {
+            let mut parts = content.windows(word.len());
+            assert!(
+                !parts.any(|part| part == word.as_bytes()),
+                "{word} in {name}"
+            );
+        }
     }
 }
 
@@ -123,23 +117,20 @@ fn guessed(public: &Path) -> Option<u64> {
 
 #[test]
 fn no_small_seed_regenerates_the_public_files() {
-    let root = tempfile::tempdir().unwrap();
-    let at = |name: &str| root.path().join(name);
-    let simulate = "shearq simulate --sets 2 --images 1 --grid 8 --seed 4321 --out data";
-    printed(root.path(), simulate);
-    assert_eq!(guessed(&at("data")), Some(4321));
+    let folder = Folder::new();
+    folder.run("simulate --sets 2 --images 1 --grid 8 --seed 4321 --out data");
+    assert_eq!(guessed(&folder.at("data")), Some(4321));
     let new = |name: &str, place: &str, more: &str| {
         let size = "--sets 2 --images 8 --grid 20 --amplitude 30";
         let folders = format!("--public {place} --private {place}-truth");
-        let line = format!("shearq challenge new --name {name} {size} {folders} {more}");
-        let output = shell(root.path(), &line);
-        assert!(output.status.success());
-        (at(place), String::from_utf8(output.stderr).unwrap())
+        let said = folder.said(&format!(
+            "challenge new --name {name} {size} {folders} {more}"
+        ));
+        (folder.at(place), said)
     };
     let (weak, warned) = new(NAME, "weak", "--seed 77");
     assert_eq!(guessed(&weak), Some(77));
-    let expected = "participants can find the seed by trying";
-    assert!(warned.contains(expected), "{warned}");
+    assert_has(&warned, "participants can find the seed by trying");
     let (strong, warned) = new(NAME, "strong", "");
     assert_eq!(guessed(&strong), None);
     assert!(!warned.contains("warning"), "{warned}");

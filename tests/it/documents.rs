@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use crate::support::{fits_image, floats, pixels_of, printed};
+use crate::support::{Folder, printed, stamps_of};
 
 /// The documents.
 pub(crate) fn pages() -> Vec<PathBuf> {
@@ -51,21 +51,14 @@ fn links_lead_to_files_and_the_summary_has_every_page() {
 }
 
 /// Simulated images instead of those that the tutorial's script renders.
-fn images(folder: &Path) {
-    let set = folder.join("challenge/set02");
-    let simulate = "shearq simulate --sets 2 --images 2 --grid 16 --out challenge";
-    printed(folder, simulate);
-    let (pixels, width) = pixels_of(&set.join("galaxies-001.fits"));
-    let stamps: Vec<f32> = (0..100)
-        .flat_map(|k| {
-            let (x, y) = (k % 16 * 48, k / 16 * 48);
-            (y..y + 48).flat_map(move |row| row * width + x..row * width + x + 48)
-        })
-        .map(|pixel| pixels[pixel])
-        .collect();
-    let cube = fits_image(-32, &[48, 48, 100], &[], &floats(&stamps));
-    fs::write(folder.join("field.fits"), cube).unwrap();
-    fs::copy(set.join("psf-001.fits"), folder.join("star.fits")).unwrap();
+fn images() -> Folder {
+    let folder = Folder::new();
+    folder.run("simulate --sets 2 --images 2 --grid 16 --out challenge");
+    let stamps = stamps_of(&folder.at("challenge/set02/galaxies-001.fits"), 48);
+    folder.image("field.fits", &[48, 48, 100], &[], &stamps[..100].concat());
+    let star = folder.at("challenge/set02/psf-001.fits");
+    fs::copy(star, folder.at("star.fits")).unwrap();
+    folder
 }
 
 /// Words with one blank between them, and no rules of tables: the width of a terminal and rules are not the page's.
@@ -111,11 +104,10 @@ fn written(folder: &Path, files: &[&str]) {
 
 #[test]
 fn own_images_are_measured_as_their_page_says() {
-    let root = tempfile::tempdir().unwrap();
-    images(root.path());
+    let folder = images();
     // The page shows GalSim's galaxies: python/tests/test_tutorial.py compares its output.
-    follow("own-images.md", root.path(), 4, false);
-    written(root.path(), &["galaxy.png"]);
+    follow("own-images.md", folder.root(), 4, false);
+    written(folder.root(), &["galaxy.png"]);
 }
 
 #[test]

@@ -1,9 +1,7 @@
 //! Wrong data through each entry point: the library's `batch`, `gather`, `measure` and `run`. Python has
 //! `python/tests/test_wrong_data.py`.
 
-use std::fs;
-use std::path::{Path, PathBuf};
-use std::process::Output;
+use std::path::Path;
 
 use ndarray::{Array2, Array3, s};
 use rand::SeedableRng;
@@ -14,7 +12,7 @@ use shearq_simulate::kinds::SetKind;
 use shearq_simulate::render::RenderScratch;
 use shearq_simulate::set::{STAMP, SetSimulator, SimulationSettings};
 
-use crate::support::{fits_image, floats, galsim_sets, printed, shell, text};
+use crate::support::{Folder, galsim_sets, mosaic, shell, text};
 
 /// Galaxies per axis of the images.
 const GRID: usize = 24;
@@ -57,13 +55,27 @@ impl Data {
         }
     }
 
-    /// The stamps side by side.
-    fn mosaic(&self) -> Vec<f32> {
-        let side = GRID * STAMP;
-        let places = (0..side * side).map(|k| (k / side, k % side));
-        places
-            .map(|(y, x)| self.stamps[(y / STAMP * GRID + x / STAMP, y % STAMP, x % STAMP)])
-            .collect()
+    /// Writes the image as a data folder and as a cube of stamps.
+    fn write(&self, folder: &Folder) {
+        let noise = format!("NOISESIG= {:?}", self.noise.unwrap_or(1.0));
+        let cards = [format!("STAMP   = {STAMP}"), noise];
+        let cards = cards.each_ref().map(String::as_str);
+        let stamps = self.stamps.as_standard_layout();
+        let (cube, star) = (stamps.as_slice().unwrap(), self.star.as_standard_layout());
+        let image = mosaic(cube, STAMP, GRID);
+        folder.image(
+            "data/set02/galaxies-001.fits",
+            &[GRID * STAMP; 2],
+            &cards,
+            &image,
+        );
+        folder.image(
+            "data/set02/psf-001.fits",
+            &[STAMP; 2],
+            &[],
+            star.as_slice().unwrap(),
+        );
+        folder.image("cube.fits", &[STAMP, STAMP, GRID * GRID], &[], cube);
     }
 }
 
@@ -220,16 +232,15 @@ struct Found {
 }
 
 impl Found {
-    /// Warnings and errors on standard error.
-    fn of(output: &Output) -> Self {
-        let said = String::from_utf8(output.stderr.clone()).unwrap();
+    /// Warnings and errors of a command with a new folder for its output.
+    fn of(folder: &Folder, command: &str) -> Self {
+        let line = format!("rm -rf out; shearq {command} --out out");
+        let output = shell(folder.root(), &line);
+        let said = String::from_utf8(output.stderr).unwrap();
         assert!(!said.contains("panicked"), "{said}");
-        let lines = said.lines();
+        let is_message = |line: &&str| line.starts_with("warning: ") || line.starts_with("error: ");
         Found {
-            messages: lines
-                .filter(|line| line.starts_with("warning: ") || line.starts_with("error: "))
-                .map(str::to_owned)
-                .collect(),
+            messages: said.lines().filter(is_message).map(str::to_owned).collect(),
             failed: !output.status.success(),
         }
     }
@@ -265,90 +276,33 @@ fn batch(data: &Data) -> Found {
     }
 }
 
-/// A folder with data of all forms.
-struct Folder {
-    root: tempfile::TempDir,
-}
-
-impl Folder {
-    fn new() -> Self {
-        let root = tempfile::tempdir().unwrap();
-        let simulate = "shearq simulate --sets 2 --images 1 --out data";
-        printed(
-            root.path(),
-            &format!("{simulate} --grid {GRID} --seed {SEED}"),
-        );
-        Folder { root }
-    }
-
-    fn at(&self, name: &str) -> PathBuf {
-        self.root.path().join(name)
-    }
-
-    /// Writes the image as a data folder and as a cube of stamps.
-    fn write(&self, data: &Data) {
-        let side = GRID * STAMP;
-        let noise = data.noise.unwrap_or(1.0);
-        let cards = [
-            format!("STAMP   = {STAMP:>20}"),
-            format!("NOISESIG= {noise:>20?}"),
-        ];
-        let cards = cards.each_ref().map(String::as_str);
-        let stamps = data.stamps.as_standard_layout();
-        let (cube, star) = (stamps.as_slice().unwrap(), data.star.as_standard_layout());
-        let star = star.as_slice().unwrap();
-        for (name, bytes) in [
-            (
-                "data/set02/galaxies-001.fits",
-                fits_image(-32, &[side, side], &cards, &floats(&data.mosaic())),
-            ),
-            (
-                "data/set02/psf-001.fits",
-                fits_image(-32, &[STAMP; 2], &[], &floats(star)),
-            ),
-            (
-                "cube.fits",
-                fits_image(-32, &[STAMP, STAMP, GRID * GRID], &[], &floats(cube)),
-            ),
-        ] {
-            fs::write(self.at(name), bytes).unwrap();
-        }
-    }
-
-    fn gather(&self, data: &Data) -> Found {
-        let noise = data.noise.map(|noise| format!("--noise {noise}"));
-        let noise = noise.unwrap_or_default();
-        self.run(&format!(
-            "gather --stamps cube.fits --psf data/set02/psf-001.fits {noise}"
-        ))
-    }
-
-    /// Runs a command with a new folder for its output.
-    fn run(&self, command: &str) -> Found {
-        let line = format!("rm -rf out; shearq {command} --out out");
-        Found::of(&shell(self.root.path(), &line))
-    }
-}
-
 #[test]
 fn every_entry_point_reports_wrong_data() {
     let (good, folder) = (Data::good(), Folder::new());
+    let simulate = "simulate --sets 2 --images 1 --out data";
+    folder.run(&format!("{simulate} --grid {GRID} --seed {SEED}"));
     let mut wrong = Vec::new();
     for line in CASES.lines().skip(1) {
         let (what, expected) = line.split_once("| ").unwrap();
         let (kind, words) = expected.split_once(": ").unwrap();
         let mut data = good.clone();
         data.spoil(what.trim_end());
-        folder.write(&data);
-        let on_folder =
-            |command| folder.run(&format!("{command} --data data --submission {LINEAR}"));
-        let found = [
+        data.write(&folder);
+        let noise = data.noise.map(|noise| format!("--noise {noise}"));
+        let gather = format!(
+            "gather --stamps cube.fits --psf data/set02/psf-001.fits {}",
+            noise.unwrap_or_default()
+        );
+        let on_folder = format!("--data data --submission {LINEAR}");
+        for (entry, found) in [
             ("batch", batch(&data)),
-            ("gather", folder.gather(&data)),
-            ("measure", on_folder("measure")),
-            ("run", on_folder("run")),
-        ];
-        for (entry, found) in found {
+            ("gather", Found::of(&folder, &gather)),
+            (
+                "measure",
+                Found::of(&folder, &format!("measure {on_folder}")),
+            ),
+            ("run", Found::of(&folder, &format!("run {on_folder}"))),
+        ] {
             if !found.fits(kind, words, entry == "gather") {
                 wrong.push(format!("{what}, {entry}: {:?}", found.messages));
             }
@@ -379,11 +333,7 @@ fn simulated_and_galsims_images_are_measured_silently() {
     }
     let folder = Folder::new();
     for line in lines {
-        let found = folder.run(&line);
-        assert!(
-            found.fits("silent", "", false),
-            "{line}: {:?}",
-            found.messages
-        );
+        let messages = Found::of(&folder, &line).messages;
+        assert!(messages.is_empty(), "{line}: {messages:?}");
     }
 }

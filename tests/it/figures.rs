@@ -41,7 +41,7 @@ fn lines(x: &[f64], y: &[f64], log: bool) -> LinePlot {
 }
 
 #[test]
-fn curves_of_any_data_are_drawn() {
+fn curves_names_and_bands_of_any_data_are_drawn() {
     let mut plots = Vec::new();
     for y in HARD {
         let x: Vec<f64> = (0..y.len()).map(|i| i as f64).collect();
@@ -52,53 +52,44 @@ fn curves_of_any_data_are_drawn() {
                 ..lines(y, y, log)
             });
         }
-    }
-    draw(&PanelGrid {
-        title: "Hard & <difficult>".into(),
-        columns: 0,
-        plots: vec![],
-    });
-    draw(&PanelGrid {
-        title: String::new(),
-        columns: 6,
-        plots,
-    });
-    draw(&LinePlot::default());
-}
-
-#[test]
-fn names_and_bands_of_any_data_are_drawn() {
-    for values in HARD {
-        let x: Vec<f64> = (0..values.len()).map(|i| i as f64).collect();
-        let bands = values.iter().map(|&value| Band {
+        let band = |&value: &f64| Band {
             label: "allowed".into(),
             low: value,
             high: 1.0,
-        });
-        draw(&LinePlot {
-            x_names: (0..values.len()).map(|i| format!("<name {i}>")).collect(),
-            bands: bands.collect(),
-            ..lines(&x, values, false)
+        };
+        plots.push(LinePlot {
+            x_names: (0..y.len()).map(|i| format!("<name {i}>")).collect(),
+            bands: y.iter().map(band).collect(),
+            ..lines(&x, y, false)
         });
     }
+    for (columns, plots) in [(0, vec![]), (6, plots)] {
+        draw(&PanelGrid {
+            title: "Hard & <difficult>".into(),
+            columns,
+            plots,
+        });
+    }
+    draw(&LinePlot::default());
 }
 
 #[test]
 fn images_of_any_data_are_drawn() {
     draw(&ImageGrid::default());
-    for values in HARD {
+    let rows = HARD.map(|values| {
         let image = Array2::from_shape_vec((1, values.len()), values.to_vec()).expect("one row");
-        let maps = [ColourMap::Viridis, ColourMap::Diverging];
         let panel = |map| ImagePanel {
             image: image.clone(),
             map,
             stretch: Stretch::Asinh,
             ..ImagePanel::default()
         };
-        let row = ImageRow {
+        ImageRow {
             label: "hard".into(),
-            panels: maps.map(panel).into(),
-        };
+            panels: [ColourMap::Viridis, ColourMap::Diverging].map(panel).into(),
+        }
+    });
+    for row in rows {
         draw(&ImageGrid {
             title: String::new(),
             rows: vec![row, ImageRow::default()],
@@ -107,41 +98,14 @@ fn images_of_any_data_are_drawn() {
 }
 
 #[test]
-fn files_are_written_by_extension_and_replaced() {
-    let folder = tempfile::tempdir().expect("temporary folder");
-    let plot = lines(&[1.0, 2.0], &[1.0, 2.0], false);
-    let png = folder.path().join("figure.PNG");
-    std::fs::write(&png, "old").expect("written");
-    plot.save(&png).expect("saved");
-    assert!(std::fs::read(&png).expect("there").starts_with(b"\x89PNG"));
-    plot.save(folder.path().join("figure.svg")).expect("saved");
-    // Nothing temporary is left.
-    assert_eq!(
-        std::fs::read_dir(folder.path()).expect("readable").count(),
-        2
-    );
-}
-
-#[test]
 fn errors_name_the_place_and_what_was_expected() {
     let plot = lines(&[1.0], &[1.0], false);
     let message = |path: &str| plot.save(path).expect_err("refused").to_string();
-    assert_eq!(
-        message("figure.pdf"),
-        "figure.pdf: found `.pdf` as the figure's format; expected the extension `.png` or `.svg`"
-    );
     assert!(message("figure").contains("found no extension"));
     // Below a file there can be no folder.
-    let refused = message("Cargo.toml/figures/figure.svg");
-    assert!(
-        refused.starts_with("Cargo.toml/figures: cannot make the folder"),
-        "{refused}"
-    );
-
-    let mut uneven = LinePlot {
-        title: "Bias".into(),
-        ..plot.clone()
-    };
+    assert!(message("Cargo.toml/figure.svg").starts_with("Cargo.toml: cannot make the folder"));
+    let mut uneven = plot.clone();
+    uneven.title = "Bias".into();
     uneven.series[1].y.push(2.0);
     assert_eq!(
         uneven
@@ -155,8 +119,6 @@ fn errors_name_the_place_and_what_was_expected() {
         columns: 2,
         plots: vec![plot; 2000],
     };
-    assert!(matches!(
-        many.render(PictureFormat::Svg),
-        Err(FigureError::TooLarge { .. })
-    ));
+    let error = many.render(PictureFormat::Svg).expect_err("too large");
+    assert!(matches!(error, FigureError::TooLarge { .. }));
 }

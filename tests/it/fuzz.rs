@@ -17,7 +17,7 @@ use shearq_results::foreign::Foreign;
 use shearq_results::submit::{Kind, read_spectrum};
 use shearq_submissions::{Configuration, Registry};
 
-use crate::support::{PACKED, Small, fits_image, gzip, pixels_of};
+use crate::support::{Folder, PACKED, fits_image, gzip, pixels_of};
 
 /// Inputs of each reader in the ordinary test.
 const INPUTS: u64 = 300;
@@ -188,7 +188,7 @@ fn mutate_fits(bytes: &mut Vec<u8>, random: &mut ChaCha8Rng) {
 
 /// Through `measure`'s reader: the image and its star, row by row.
 fn fuzz_images(count: u64) {
-    let small = Small::new("2");
+    let small = Folder::with_set(2);
     let data = small.at("data");
     let (pixels, side) = pixels_of(&data.join("set02/galaxies-001.fits"));
     // Every second pixel, for speed: 8 × 8 stamps of 24 pixels.
@@ -254,12 +254,12 @@ fn read_image(folder: &DataFolder, submission: &Configuration) -> bool {
 
 /// Through the readers of everything else.
 fn fuzz_others(count: u64) {
-    let small = Small::new("2");
-    let measure = ["--submission", "23/raw/star"];
-    small.measure(&[&measure[..], &["--catalogue-format", "fits"]].concat());
+    let small = Folder::with_set(2);
+    let measure = "--submission 23/raw/star";
+    small.measure(&format!("{measure} --catalogue-format fits"));
     let bytes = |name: &str| fs::read(small.at(name)).unwrap();
     let fits = bytes("out/set02/catalogue-001.fits");
-    small.measure(&measure);
+    small.measure(measure);
     let parquet = bytes("out/set02/catalogue-001.parquet");
     let text = |content: &str| vec![content.as_bytes().to_vec()];
     let table = |name: &str, seeds: &[Vec<u8>], mutate| {

@@ -1,280 +1,150 @@
 //! Stamps that lie otherwise than a challenge's: gathered from cubes, extensions, single files and exposures, they are
 //! measured as they were.
 
-use std::fs;
-use std::path::{Path, PathBuf};
-
 use serde_json::Value;
+use shearq_files::parquet;
 use shearq_quantities::{FunctionalPsf, PsfProfile, Shear};
 
 use crate::support::{
-    Small, fail, fits_image, floats, pixels_of, printed, shearq, shell, succeed, text,
+    Folder, assert_has, fits_extension, fits_image, floats, pixels_of, stamps_of,
 };
 
-const LINEAR: &str = "48/linear/star";
+const LINEAR: &str = "--submission 48/linear/star";
 
-/// The stamps of a mosaic, along its rows.
-fn stamps_of(path: &Path, side: usize) -> Vec<Vec<f32>> {
-    let (pixels, width) = pixels_of(path);
-    let n = width / side;
-    (0..n * n)
-        .map(|k| {
-            let (x, y) = (k % n * side, k / n * side);
-            let rows = (y..y + side).map(|row| &pixels[row * width + x..row * width + x + side]);
-            rows.flatten().copied().collect()
-        })
-        .collect()
+fn write_cube(folder: &Folder, name: &str, stamps: &[Vec<f32>]) {
+    let side = stamps[0].len().isqrt();
+    folder.image(name, &[side, side, stamps.len()], &[], &stamps.concat());
 }
 
-fn cube(stamps: &[Vec<f32>], side: usize) -> Vec<u8> {
-    fits_image(
-        -32,
-        &[side, side, stamps.len()],
-        &[],
-        &floats(&stamps.concat()),
-    )
-}
-
-/// A file of an empty primary header and one extension a stamp.
-fn extensions(stamps: &[Vec<f32>], side: usize) -> Vec<u8> {
-    let unnamed: Vec<(&str, &[f32])> = stamps.iter().map(|stamp| ("", &stamp[..])).collect();
-    named_extensions(&unnamed, side)
-}
-
-/// The same with names.
-fn named_extensions(stamps: &[(&str, &[f32])], side: usize) -> Vec<u8> {
+/// Writes a file of an empty primary header and extensions with names.
+fn write_extensions(folder: &Folder, name: &str, stamps: &[(&str, &[f32])]) {
     let mut file = fits_image(8, &[], &["EXTEND  =                    T"], &[]);
     for (name, stamp) in stamps {
         let name = format!("EXTNAME = '{name:<8}'");
-        let keys = [
-            "PCOUNT  =                    0",
-            "GCOUNT  =                    1",
-            &name,
-        ];
-        let mut image = fits_image(-32, &[side, side], &keys, &floats(stamp));
-        image[..80].copy_from_slice(format!("{:<80}", "XTENSION= 'IMAGE   '").as_bytes());
-        file.extend(image);
+        let sides = [stamp.len().isqrt(); 2];
+        file.extend(fits_extension(
+            "IMAGE",
+            -32,
+            &sides,
+            &[&name],
+            &floats(stamp),
+        ));
     }
-    file
+    folder.write(name, file);
 }
 
-/// Bits of e1, e2 and the flags of the first catalogue of set 1 or 19.
-fn measured(small: &Small, data: &Path, set: &str) -> Vec<Vec<u64>> {
-    let out = small.at("out");
-    let _ = fs::remove_dir_all(&out);
-    let measure = ["measure", "--submission", LINEAR, "--out", text(&out)];
-    succeed(&[&measure[..], &["--data", text(data)]].concat());
-    ["e1", "e2", "flags"]
-        .map(|column| {
-            let values = small.measured(set, column);
-            values.iter().map(|value| value.to_bits()).collect()
-        })
-        .into()
+/// Gathers into a new folder `data`.
+fn gather(folder: &Folder, from: &str) -> String {
+    folder.remove("data");
+    folder.said(&format!("gather {from} --out data"))
 }
 
-/// Gathers into `data`; what was printed on standard error, and whether it succeeded.
-fn gather(root: &Path, from: &str) -> (bool, String) {
-    let done = shell(
-        root,
-        &format!("rm -rf data; shearq gather {from} --out data"),
+fn refuse_to_gather(folder: &Folder, from: &str, words: &str) {
+    folder.remove("data");
+    folder.refuses(&format!("gather {from} --out data"), words);
+    assert!(
+        !folder.at("data/set01/galaxies-001.fits").exists(),
+        "{from}"
     );
-    (
-        done.status.success(),
-        String::from_utf8(done.stderr).unwrap(),
-    )
+}
+
+/// Measures a data folder into a new one, whose name ends in `-out`, and gives the standard error.
+fn measure(folder: &Folder, data: &str) -> String {
+    folder.remove(&format!("{data}-out"));
+    folder.said(&format!("measure {LINEAR} --data {data} --out {data}-out"))
+}
+
+/// Bits of e1, e2 and the flags of a catalogue.
+fn bits(folder: &Folder, name: &str) -> [Vec<u64>; 3] {
+    let columns = folder.numbers(name, ["e1", "e2", "flags"]);
+    columns.map(|values| values.iter().map(|value| value.to_bits()).collect())
 }
 
 #[test]
 fn stamps_of_all_kinds_of_files_are_measured_alike() {
-    let small = Small::new("19");
-    let at = |name: &str| small.at(name);
-    let set = at("data/set19");
-    fs::remove_file(set.join("galaxies-002.fits")).unwrap();
-    let expected = measured(&small, &at("data"), "19");
+    let folder = Folder::with_set(19);
+    let set = folder.at("data/set19");
+    folder.remove("data/set19/galaxies-002.fits");
+    folder.measure(LINEAR);
+    let expected = bits(&folder, "out/set19/catalogue-001.parquet");
     assert_eq!(expected[0].len(), 64);
     let galaxies = stamps_of(&set.join("galaxies-001.fits"), 48);
-    let stars = stamps_of(
-        &set.join("psf-001.fits"),
-        pixels_of(&set.join("psf-001.fits")).1 / 8,
-    );
-    let side = stars[0].len().isqrt();
+    let star = set.join("psf-001.fits");
+    let stars = stamps_of(&star, pixels_of(&star).1 / 8);
 
-    fs::write(at("cube.fits"), cube(&galaxies, 48)).unwrap();
-    fs::write(at("parts.fits"), extensions(&galaxies[1..], 48)).unwrap();
-    let one = fits_image(-32, &[48, 48], &[], &floats(&galaxies[0]));
-    fs::write(at("first.fits"), one).unwrap();
-    fs::write(at("stars.fits"), cube(&stars, side)).unwrap();
-    fs::write(at("stars-parts.fits"), extensions(&stars, side)).unwrap();
-    let mut positions = String::from("id,ra_pixel,dec_pixel\n");
-    for k in 0..64 {
-        let centre = |index: usize| index as f64 * 48.0 + 24.5;
-        // A position within half a pixel of the centre has the same stamp.
-        let (x, y) = (centre(k % 8) + 0.4, centre(k / 8) - 0.4);
-        positions += &format!("{k},{x},{y}\n");
-    }
-    fs::write(at("positions.csv"), positions).unwrap();
+    let extensions = |name: &str, stamps: &[Vec<f32>]| {
+        let unnamed: Vec<(&str, &[f32])> = stamps.iter().map(|stamp| ("", &stamp[..])).collect();
+        write_extensions(&folder, name, &unnamed);
+    };
+    write_cube(&folder, "cube.fits", &galaxies);
+    extensions("parts.fits", &galaxies[1..]);
+    folder.image("first.fits", &[48, 48], &[], &galaxies[0]);
+    write_cube(&folder, "stars.fits", &stars);
+    extensions("stars-parts.fits", &stars);
+    // A position within half a pixel of the centre has the same stamp.
+    let centre = |index: usize| index as f64 * 48.0 + 24.5;
+    let rows = (0..64).map(|k| format!("{k},{},{}\n", centre(k % 8) + 0.4, centre(k / 8) - 0.4));
+    let positions: String = ["id,ra_pixel,dec_pixel\n".to_owned()]
+        .into_iter()
+        .chain(rows)
+        .collect();
+    folder.write("positions.csv", positions);
 
-    let (cube, parts, first) = (at("cube.fits"), at("parts.fits"), at("first.fits"));
-    let (exposure, positions) = (set.join("galaxies-001.fits"), at("positions.csv"));
-    let ways: [(&str, Vec<&str>, PathBuf); 3] = [
-        ("cube", vec!["--stamps", text(&cube)], at("stars.fits")),
+    let exposure = "--exposure data/set19/galaxies-001.fits --positions positions.csv --columns ra_pixel,dec_pixel";
+    for (name, from, psf) in [
+        ("cube", "--stamps cube.fits", "stars.fits"),
         (
             "files",
-            vec!["--stamps", text(&first), text(&parts)],
-            at("stars-parts.fits"),
+            "--stamps first.fits parts.fits",
+            "stars-parts.fits",
         ),
-        (
-            "exposure",
-            vec![
-                "--exposure",
-                text(&exposure),
-                "--positions",
-                text(&positions),
-                "--columns",
-                "ra_pixel,dec_pixel",
-            ],
-            at("stars.fits"),
-        ),
-    ];
-    for (name, from, psf) in &ways {
-        let data = at(name);
-        let rest = ["--psf", text(psf), "--out", text(&data)];
-        succeed(&[&["gather"][..], from, &rest].concat());
-        assert_eq!(measured(&small, &data, "01"), expected, "{name}");
+        ("exposure", exposure, "stars.fits"),
+    ] {
+        folder.run(&format!("gather {from} --psf {psf} --out {name}"));
+        measure(&folder, name);
+        let catalogue = format!("{name}-out/set01/catalogue-001.parquet");
+        assert_eq!(bits(&folder, &catalogue), expected, "{name}");
     }
     // Stamps of an exposure have their places on it and the identities of the table; others have those of the image.
-    let catalogue = |name: &str, columns: &[&str]| {
-        let out = small.at("catalogue");
-        let _ = fs::remove_dir_all(&out);
-        let measure = ["measure", "--submission", LINEAR, "--out", text(&out)];
-        succeed(&[&measure[..], &["--data", text(&at(name))]].concat());
-        let path = out.join("set01/catalogue-001.parquet");
-        let table = shearq_files::parquet::read(&path, Some(columns), 64).unwrap();
-        let row = |k: usize| {
-            table
-                .columns()
-                .iter()
-                .map(move |c| c.get(k).unwrap().to_string())
-        };
-        [0, 2].map(|k| row(k).collect::<Vec<_>>().join(" "))
+    let third = |name: &str, columns: &[&str]| {
+        let table = parquet::read(folder.at(name), Some(columns), 64).unwrap();
+        let values = table
+            .columns()
+            .iter()
+            .map(|c| c.get(2).unwrap().to_string());
+        values.collect::<Vec<_>>().join(" ")
     };
-    assert_eq!(catalogue("files", &["x", "y"]), ["24.5 24.5", "120.5 24.5"]);
-    let expected = ["0 24.9 24.1", "2 120.9 24.1"];
-    assert_eq!(catalogue("exposure", &["id", "x", "y"]), expected);
-    let stamps = at("files").join("set01/stamps-001.parquet");
+    let found = third("files-out/set01/catalogue-001.parquet", &["x", "y"]);
+    assert_eq!(found, "120.5 24.5");
+    let found = third(
+        "exposure-out/set01/catalogue-001.parquet",
+        &["id", "x", "y"],
+    );
+    assert_eq!(found, "2 120.9 24.1");
     let names = ["tile_x", "tile_y", "file", "image", "plane"];
-    let table = shearq_files::parquet::read(&stamps, Some(&names), 64).unwrap();
-    let third = format!("120.5 24.5 {:?} 2 1", text(&parts));
-    let values = table
-        .columns()
-        .iter()
-        .map(|c| c.get(2).unwrap().to_string());
-    assert_eq!(values.collect::<Vec<_>>().join(" "), third);
+    let found = third("files/set01/stamps-001.parquet", &names);
+    assert_has(&found, "120.5 24.5 \"[..]parts.fits\" 2 1");
 
     // As many as do not fill a square, and one PSF by its parameters.
-    fs::write(at("few.fits"), self::cube(&galaxies[..5], 48)).unwrap();
-    let formula = "x,y,profile,beta,fwhm,e1,e2\n0,0,moffat,3,3,0.01,0.02\n";
-    fs::write(at("psf.csv"), formula).unwrap();
-    let (few, psf, data) = (at("few.fits"), at("psf.csv"), at("five"));
-    let gather = ["gather", "--stamps", text(&few), "--psf", text(&psf)];
-    let more = ["--noise", "1", "--out", text(&data)];
-    succeed(&[&gather[..], &more].concat());
-    let out = at("out");
-    let _ = fs::remove_dir_all(&out);
-    let measure = [
-        "measure",
-        "--submission",
-        "23/raw/func",
-        "--out",
-        text(&out),
-    ];
-    succeed(&[&measure[..], &["--data", text(&data)]].concat());
-    assert_eq!(small.measured("01", "x"), [24.5, 72.5, 120.5, 24.5, 72.5]);
-    let again = fail(&[&gather[..], &more].concat());
-    assert!(again.contains("the file is there already"), "{again}");
-    // They are no grid that has a spectrum.
-    let sent = at("sent");
-    let pack = ["pack", "--measured", text(&out), "--kind", "spectra"];
-    let message = fail(&[&pack[..], &["--out", text(&sent)]].concat());
-    assert!(
-        message.contains("5 rows; expected the square of the grid's side"),
-        "{message}"
+    write_cube(&folder, "few.fits", &galaxies[..5]);
+    folder.write(
+        "psf.csv",
+        "x,y,profile,beta,fwhm,e1,e2\n0,0,moffat,3,3,0.01,0.02\n",
     );
-}
-
-#[test]
-fn the_mean_of_a_field_is_that_of_its_catalogue() {
-    let small = Small::new("2");
-    small.measure(&["--submission", LINEAR]);
-    let out = small.at("out");
-    let mean = printed(small.root(), "shearq mean --measured out --format json");
-    let table: Value = serde_json::from_str(&mean).unwrap();
-    let row = &table["rows"][0];
-    let value = |key: &str| row[key].as_f64().unwrap();
-    let (mut flagged, mut galaxies) = (0, Vec::new());
-    for image in ["001", "002"] {
-        let from = out.join(format!("set02/catalogue-{image}.parquet"));
-        fs::rename(&from, out.join("set02/catalogue-001.parquet")).unwrap();
-        let columns =
-            ["e1", "e2", "R11", "R12", "R21", "R22"].map(|name| small.measured("02", name));
-        let good: Vec<usize> = (0..columns[0].len())
-            .filter(|k| columns[0][*k].is_finite())
-            .collect();
-        flagged += columns[0].len() - good.len();
-        galaxies.extend(good.iter().map(|k| {
-            let row: [f64; 6] = std::array::from_fn(|column| columns[column][*k]);
-            ([row[0], row[1]], [[row[2], row[3]], [row[4], row[5]]])
-        }));
-    }
-    let n = galaxies.len() as f64;
-    let mut e = [0.0; 2];
-    let mut r = [[0.0; 2]; 2];
-    for (own, response) in &galaxies {
-        for k in 0..2 {
-            e[k] += own[k] / n;
-            for j in 0..2 {
-                r[k][j] += response[k][j] / n;
-            }
-        }
-    }
-    let determinant = r[0][0] * r[1][1] - r[0][1] * r[1][0];
-    let solved = |e: [f64; 2]| {
-        [
-            (r[1][1] * e[0] - r[0][1] * e[1]) / determinant,
-            (r[0][0] * e[1] - r[1][0] * e[0]) / determinant,
-        ]
-    };
-    let shear = solved(e);
-    // Sums in another order.
-    let near = |found: f64, expected: f64| (found - expected).abs() < 1e-12;
-    assert!(near(value("g1"), shear[0]) && near(value("g2"), shear[1]));
-    // The error of a ratio of means contains the scatter of the responses.
-    let squares: f64 = galaxies
-        .iter()
-        .map(|(own, response)| {
-            let residual =
-                [0, 1].map(|k| own[k] - response[k][0] * shear[0] - response[k][1] * shear[1]);
-            solved(residual)[1].powi(2)
-        })
-        .sum();
-    assert!(near(value("g2_error"), (squares / (n * (n - 1.0))).sqrt()));
-    let square: f64 = galaxies
-        .iter()
-        .map(|(own, _)| (own[1] - e[1]).powi(2))
-        .sum();
-    assert!(near(
-        value("scatter2"),
-        (square / (n - 1.0)).sqrt() / r[1][1]
-    ));
-    assert_eq!(value("galaxies"), n);
-    assert_eq!(value("flagged"), flagged as f64);
+    let gather = "gather --stamps few.fits --psf psf.csv --noise 1 --out five";
+    folder.run(gather);
+    folder.run("measure --submission 23/raw/func --data five --out five-out");
+    let [x] = folder.numbers("five-out/set01/catalogue-001.parquet", ["x"]);
+    assert_eq!(x, [24.5, 72.5, 120.5, 24.5, 72.5]);
+    folder.refuses(gather, "the file is there already");
+    // They are no grid that has a spectrum.
+    let grid = "5 rows; expected the square of the grid's side";
+    folder.refuses("pack --measured five-out --kind spectra --out sent", grid);
 }
 
 #[test]
 fn several_stars_of_one_psf_are_averaged() {
-    const STARS: usize = 9;
-    let root = tempfile::tempdir().unwrap();
-    let at = |name: &str| root.path().join(name);
+    let folder = Folder::new();
     let profile = PsfProfile::Moffat { beta: 3.0 };
     let psf = FunctionalPsf::new(profile, 3.4, Shear::new(0.05, -0.02)).unwrap();
     let truth = psf.stamp(48);
@@ -285,31 +155,30 @@ fn several_stars_of_one_psf_are_averaged() {
         state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
         12f64.sqrt() * (f64::from(state >> 8) / f64::from(1 << 24) - 0.5) * power / 100.0
     };
-    let stars: Vec<Vec<f32>> = (0..STARS)
-        .map(|_| truth.iter().map(|v| (v + noise()) as f32).collect())
-        .collect();
-    let stamps: Vec<Vec<f32>> = (0..20)
-        .map(|_| {
+    let mut stamps = |count: usize, light: f64, level: f64| -> Vec<Vec<f32>> {
+        let mut stamp = |_| {
             truth
                 .iter()
-                .map(|v| (50.0 * v + 20.0 * noise()) as f32)
+                .map(|v| (light * v + level * noise()) as f32)
                 .collect()
-        })
-        .collect();
-    fs::write(at("stamps.fits"), cube(&stamps, 48)).unwrap();
-    fs::write(at("stars.fits"), cube(&stars, 48)).unwrap();
-    let (done, said) = gather(root.path(), "--stamps stamps.fits --psf stars.fits");
-    assert!(done, "{said}");
-    let expected = "stars.fits: 9 stars were averaged to one PSF for all galaxies";
-    assert!(said.contains(expected), "{said}");
-    let (average, side) = pixels_of(&at("data/set01/psf-001.fits"));
+        };
+        (0..count).map(&mut stamp).collect()
+    };
+    let stars = stamps(9, 1.0, 1.0);
+    write_cube(&folder, "stars.fits", &stars);
+    write_cube(&folder, "stamps.fits", &stamps(20, 50.0, 20.0));
+    let said = gather(&folder, "--stamps stamps.fits --psf stars.fits");
+    let note = "stars.fits: 9 stars were averaged to one PSF for all galaxies";
+    assert_has(&said, note);
+    let (average, side) = pixels_of(&folder.at("data/set01/psf-001.fits"));
     assert_eq!(side, 48);
     let off = |star: &[f32]| {
         let sum: f64 = star.iter().map(|v| f64::from(*v)).sum();
-        let each = star.iter().zip(&truth);
-        each.map(|(v, t)| (f64::from(*v) / sum - t).powi(2))
-            .sum::<f64>()
-            .sqrt()
+        let each = star
+            .iter()
+            .zip(&truth)
+            .map(|(v, t)| f64::from(*v) / sum - t);
+        each.map(|off| off * off).sum::<f64>().sqrt()
     };
     // Nine stars have a third of the noise of one; shifts by their measured places add to it.
     let ratio = off(&average) / off(&stars[0]);
@@ -317,121 +186,97 @@ fn several_stars_of_one_psf_are_averaged() {
 }
 
 #[test]
-fn correlated_noise_treated_as_white_and_padding_are_named() {
-    let small = Small::new("2");
-    let set = small.at("data/set02");
-    let galaxies = stamps_of(&set.join("galaxies-001.fits"), 48);
-    let settings = |name: &str, lines: &str| {
-        let text = format!("extends = \"{LINEAR}\"\n[noise]\n{lines}\n");
-        fs::write(small.at(name), text).unwrap();
-    };
-    settings("white.toml", "correlation = 0");
-    settings("border.toml", "source = \"border\"");
-    let measure = |name: &str, stamps: &[Vec<f32>], submission: &str| {
-        if !small.at(name).exists() {
-            fs::write(small.at("stamps.fits"), cube(stamps, 48)).unwrap();
-            let gather = "shearq gather --stamps stamps.fits --psf data/set02/psf-001.fits";
-            printed(small.root(), &format!("{gather} --out {name}"));
-        }
-        let measure = format!("shearq measure --submission {submission} --data {name} --out out");
-        let done = shell(small.root(), &format!("rm -rf out; {measure}"));
-        (
-            done.status.success(),
-            String::from_utf8(done.stderr).unwrap(),
-        )
-    };
-    let summed: Vec<Vec<f32>> = galaxies
-        .iter()
-        .map(|stamp| {
-            let at = |y: usize, x: usize| stamp[y % 48 * 48 + x % 48];
-            let sum = |y, x| at(y, x) + at(y + 1, x) + at(y, x + 1) + at(y + 1, x + 1);
-            (0..48 * 48).map(|k| sum(k / 48, k % 48)).collect()
-        })
-        .collect();
-    for (submission, told) in [(LINEAR, false), ("white.toml", true), ("border.toml", true)] {
-        let (_, said) = measure("plain", &galaxies, submission);
-        assert!(!said.contains("is treated as white"), "{said}");
-        let (well, said) = measure("summed", &summed, submission);
-        assert!(
-            well && said.contains("is treated as white") == told,
-            "{said}"
-        );
-    }
-    let mut padded = galaxies;
-    for (k, value) in padded.iter_mut().flatten().enumerate() {
-        let (y, x) = (k / 48 % 48, k % 48);
-        if y.min(x) < 3 || y.max(x) > 44 {
-            *value = 0.0;
+fn correlated_noise_that_is_treated_as_white_is_named() {
+    let folder = Folder::with_set(2);
+    let galaxies = stamps_of(&folder.at("data/set02/galaxies-001.fits"), 48);
+    let summed = galaxies.iter().map(|stamp| {
+        let at = |y: usize, x: usize| stamp[y % 48 * 48 + x % 48];
+        let sum = |y, x| at(y, x) + at(y + 1, x) + at(y, x + 1) + at(y + 1, x + 1);
+        (0..48 * 48).map(|k| sum(k / 48, k % 48)).collect()
+    });
+    write_cube(&folder, "summed.fits", &summed.collect::<Vec<_>>());
+    write_cube(&folder, "plain.fits", &galaxies);
+    for name in ["plain", "summed"] {
+        let psf = "data/set02/psf-001.fits";
+        folder.run(&format!(
+            "gather --stamps {name}.fits --psf {psf} --out {name}"
+        ));
+        for (noise, treats_as_white) in [
+            ("", false),
+            ("correlation = 0", true),
+            ("source = \"border\"", true),
+        ] {
+            folder.write(
+                "own.toml",
+                format!("extends = \"48/linear/star\"\n[noise]\n{noise}\n"),
+            );
+            folder.remove("out");
+            let said = folder.said(&format!(
+                "measure --submission own.toml --data {name} --out out"
+            ));
+            let is_named = said.contains("is treated as white");
+            assert_eq!(
+                is_named,
+                treats_as_white && name == "summed",
+                "{name} {noise}: {said}"
+            );
         }
     }
-    let (well, said) = measure("padded", &padded, LINEAR);
-    assert!(
-        !well && said.contains("expected two or more complete borders"),
-        "{said}"
-    );
 }
 
 /// Pixels of the stamps that were gathered, of which those that are missing are NaN.
-fn gathered(root: &Path, from: &str, side: usize) -> Vec<Vec<f32>> {
-    let (done, said) = gather(root, &format!("{from} --psf psf.fits"));
-    assert!(done, "{said}");
-    stamps_of(&root.join("data/set01/galaxies-001.fits"), side)
+fn gathered(folder: &Folder, from: &str, side: usize) -> Vec<Vec<f32>> {
+    gather(folder, &format!("{from} --psf psf.fits"));
+    stamps_of(&folder.at("data/set01/galaxies-001.fits"), side)
 }
 
 /// Places of missing pixels, stamp after stamp.
 fn lost(found: &[Vec<f32>]) -> Vec<usize> {
     let places = found.iter().flatten().enumerate();
-    let missing = places.filter(|(_, value)| value.is_nan());
-    missing.map(|(at, _)| at).collect()
+    places
+        .filter_map(|(at, value)| value.is_nan().then_some(at))
+        .collect()
 }
 
 #[test]
 fn extensions_are_chosen_by_name_and_masks_make_pixels_missing() {
-    let root = tempfile::tempdir().unwrap();
-    let at = |name: &str| root.path().join(name);
-    fs::write(at("psf.fits"), cube(&[vec![1.0; 400]], 20)).unwrap();
+    let folder = Folder::new();
+    write_cube(&folder, "psf.fits", &[vec![1.0; 400]]);
     let stamps: Vec<Vec<f32>> = (0..4).map(|k| vec![1.0 + k as f32; 576]).collect();
     let mut flags = vec![vec![0.0f32; 576]; 4];
     flags[2][24 * 3 + 5] = 4.0;
-    let mut parts: Vec<(&str, &[f32])> = Vec::new();
-    for (stamp, flag) in stamps.iter().zip(&flags) {
-        parts.extend([("SCI", &stamp[..]), ("ERR", flag), ("DQ", flag)]);
+    let pairs = stamps.iter().zip(&flags);
+    let parts = pairs.flat_map(|(stamp, flag)| [("SCI", &stamp[..]), ("ERR", flag), ("DQ", flag)]);
+    write_extensions(&folder, "parts.fits", &parts.collect::<Vec<_>>());
+    // What is called a mask may be one.
+    let called: Vec<(&str, &[f32])> = flags.iter().map(|flag| ("MASK", &flag[..])).collect();
+    write_extensions(&folder, "named.fits", &called);
+    write_cube(&folder, "masks.fits", &flags);
+    write_cube(&folder, "three.fits", &flags[..3]);
+    write_cube(&folder, "five.fits", &[&flags[..], &flags[..1]].concat());
+    // An exposure of the four side by side.
+    for (name, of) in [("wide.fits", &stamps), ("wide-mask.fits", &flags)] {
+        let rows = (0..24).flat_map(|y| of.iter().flat_map(move |s| s[24 * y..][..24].to_vec()));
+        folder.image(name, &[96, 24], &[], &rows.collect::<Vec<_>>());
     }
-    fs::write(at("parts.fits"), named_extensions(&parts, 24)).unwrap();
-    fs::write(at("masks.fits"), cube(&flags, 24)).unwrap();
+    folder.write(
+        "places.csv",
+        "x,y\n12.5,12.5\n36.5,12.5\n60.5,12.5\n84.5,12.5\n",
+    );
     let sky = "--stamps parts.fits --extension sci";
-    assert_eq!(gathered(root.path(), sky, 24), stamps);
-    for mask in ["--mask-extension DQ", "--mask masks.fits"] {
-        let found = gathered(root.path(), &format!("{sky} {mask}"), 24);
+    let cut = "--exposure wide.fits --positions places.csv --size 24";
+    assert_eq!(gathered(&folder, sky, 24), stamps);
+    for (from, mask) in [
+        (sky, "--mask-extension DQ"),
+        (sky, "--mask masks.fits"),
+        (sky, "--mask named.fits"),
+        (cut, "--mask wide-mask.fits"),
+    ] {
+        let found = gathered(&folder, &format!("{from} {mask}"), 24);
         assert_eq!(lost(&found), [2 * 576 + 24 * 3 + 5]);
         assert_eq!(found[3], stamps[3]);
     }
-
-    // An exposure of the four side by side, as its first image.
-    let wide = |of: &[Vec<f32>]| {
-        let rows =
-            (0..24).flat_map(|y| of.iter().flat_map(move |s| s[24 * y..24 * y + 24].to_vec()));
-        fits_image(-32, &[96, 24], &[], &floats(&rows.collect::<Vec<_>>()))
-    };
-    fs::write(at("wide.fits"), wide(&stamps)).unwrap();
-    fs::write(at("wide-mask.fits"), wide(&flags)).unwrap();
-    let positions = "x,y\n12.5,12.5\n36.5,12.5\n60.5,12.5\n84.5,12.5\n";
-    fs::write(at("places.csv"), positions).unwrap();
-    // What is called a mask may be one.
-    let called: Vec<(&str, &[f32])> = flags.iter().map(|flag| ("MASK", &flag[..])).collect();
-    fs::write(at("named.fits"), named_extensions(&called, 24)).unwrap();
-    let cut = "--exposure wide.fits --positions places.csv --size 24";
-    for masked in [
-        format!("{cut} --mask wide-mask.fits"),
-        format!("{sky} --mask named.fits"),
-    ] {
-        let found = gathered(root.path(), &masked, 24);
-        assert_eq!(lost(&found), [2 * 576 + 24 * 3 + 5]);
-    }
-    fs::write(at("three.fits"), cube(&flags[..3], 24)).unwrap();
-    let five = [&flags[..], &flags[..1]].concat();
-    fs::write(at("five.fits"), cube(&five, 24)).unwrap();
-    for (from, more, expected) in [
+    for (from, more, words) in [
         (
             "--stamps parts.fits",
             "",
@@ -446,11 +291,6 @@ fn extensions_are_chosen_by_name_and_masks_make_pixels_missing() {
             sky,
             "--mask parts.fits",
             "parts.fits: image 1, plane 1: the mask is the image itself; expected another (--mask-extension)",
-        ),
-        (
-            cut,
-            "--mask wide-mask.fits named.fits",
-            "named.fits: this is a second file",
         ),
         (
             sky,
@@ -469,6 +309,11 @@ fn extensions_are_chosen_by_name_and_masks_make_pixels_missing() {
         ),
         (
             cut,
+            "--mask wide-mask.fits named.fits",
+            "named.fits: this is a second file",
+        ),
+        (
+            cut,
             "--mask masks.fits",
             "masks.fits: image 1, plane 1: the image has 4 planes",
         ),
@@ -478,75 +323,41 @@ fn extensions_are_chosen_by_name_and_masks_make_pixels_missing() {
             "the mask is 20 × 20 pixels; the exposure has 96 × 24",
         ),
     ] {
-        let (done, message) = gather(root.path(), &format!("{from} {more} --psf psf.fits"));
-        assert!(!done && message.contains(expected), "{message}");
-        assert!(!at("data/set01/galaxies-001.fits").exists());
+        refuse_to_gather(&folder, &format!("{from} {more} --psf psf.fits"), words);
     }
 }
 
 #[test]
 fn compressed_cubes_are_read_plane_by_plane() {
-    let root = tempfile::tempdir().unwrap();
-    fs::write(root.path().join("psf.fits"), cube(&[vec![1.0; 400]], 20)).unwrap();
+    let folder = Folder::new();
+    write_cube(&folder, "psf.fits", &[vec![1.0; 400]]);
     // As astropy wrote it, in tiles of 24 × 10 pixels.
-    let bytes = fs::read("tests/data/cube.fits").unwrap();
-    fs::write(root.path().join("cube.fits"), &bytes).unwrap();
+    let cube = std::fs::read("tests/data/cube.fits").unwrap();
+    folder.write("cube.fits", cube);
     let value = |plane: usize, at: usize| {
         ((17 * (at % 24) + 31 * (at / 24) + 101 * plane) % 256) as f32 / 16.0
     };
-    let expected: Vec<Vec<f32>> = (0..3)
-        .map(|plane| (0..576).map(|at| value(plane, at)).collect())
-        .collect();
-    let found = gathered(root.path(), "--stamps cube.fits", 24);
+    let expected: [Vec<f32>; 3] =
+        [0, 1, 2].map(|plane| (0..576).map(|at| value(plane, at)).collect());
+    let found = gathered(&folder, "--stamps cube.fits", 24);
     assert_eq!(found[..3], expected);
 }
 
 #[test]
-fn psfs_of_other_pixels_or_wider_than_galaxies_are_reported() {
-    let small = Small::new("2");
-    let set = small.at("data/set02");
-    let galaxies = stamps_of(&set.join("galaxies-001.fits"), 48);
-    let (star, side) = pixels_of(&set.join("psf-001.fits"));
-    let scale = |arcsec: &str| format!("PIXSCALE= {arcsec:>20}");
-    let write = |name: &str, sides: &[usize], scale: &str, pixels: &[f32]| {
-        let file = fits_image(-32, sides, &[scale], &floats(pixels));
-        fs::write(small.at(name), file).unwrap();
-    };
-    let sides = [48, 48, galaxies.len()];
-    write("stamps.fits", &sides, &scale("0.2"), &galaxies.concat());
-    let gather = |psf: &str| gather(small.root(), &format!("--stamps stamps.fits --psf {psf}"));
-    write("good.fits", &[side; 2], &scale("0.2"), &star);
-    let (done, said) = gather("good.fits");
-    assert!(done && !said.contains("warning"), "{said}");
-    write("other.fits", &[side; 2], &scale("0.263"), &star);
-    let (done, said) = gather("other.fits");
-    let expected = "warning: set 01 image 001: the PSF image and the galaxy image have different pixel scales (found 0.263, expected 0.2 arcsec";
-    assert!(done && said.contains(expected), "{said}");
-    // A Gaussian of FWHM 14 px.
-    let wide: Vec<f32> = (0..side * side)
-        .map(|k| [k % side, k / side].map(|at| at as f32 - (side as f32 - 1.0) / 2.0))
-        .map(|[x, y]| (-(x * x + y * y) / 72.0).exp())
-        .collect();
-    write("wide.fits", &[side; 2], &scale("0.2"), &wide);
-    let (done, said) = gather("wide.fits");
-    let expected = "wide.fits: the PSF is broader than the galaxies";
-    assert!(!done && said.contains(expected), "{said}");
-    assert!(!small.at("data/set01").exists());
-}
-
-#[test]
 fn stamps_become_squares_of_the_largest_side_on_request() {
-    let root = tempfile::tempdir().unwrap();
-    let at = |name: &str| root.path().join(name);
-    fs::write(at("psf.fits"), cube(&[vec![1.0; 400]], 20)).unwrap();
+    let folder = Folder::new();
+    write_cube(&folder, "psf.fits", &[vec![1.0; 400]]);
     let value = |x: usize, y: usize| (100 * y + x) as f32;
-    let image = |name: &str, [columns, rows]: [usize; 2]| {
+    for (name, columns, rows) in [
+        ("wide.fits", 24, 20),
+        ("small.fits", 21, 21),
+        ("large.fits", 24, 24),
+    ] {
         let pixels: Vec<f32> = (0..columns * rows)
             .map(|at| value(at % columns, at / columns))
             .collect();
-        let file = fits_image(-32, &[columns, rows], &[], &floats(&pixels));
-        fs::write(at(name), file).unwrap();
-    };
+        folder.image(name, &[columns, rows], &[], &pixels);
+    }
     // Column 0 and row 0 of the stamp are at `first` in the file.
     let expected = |side: usize, [columns, rows]: [usize; 2], first: [i64; 2]| -> Vec<u32> {
         let pixel = |at: usize| {
@@ -559,375 +370,291 @@ fn stamps_become_squares_of_the_largest_side_on_request() {
         (0..side * side).map(pixel).collect()
     };
     let bits = |stamp: &[f32]| -> Vec<u32> { stamp.iter().map(|value| value.to_bits()).collect() };
-    image("wide.fits", [24, 20]);
-    image("small.fits", [21, 21]);
-    image("large.fits", [24, 24]);
     let wide = "--stamps wide.fits";
-    let (_, message) = gather(root.path(), &format!("{wide} --psf psf.fits"));
-    let explained = message.contains("24 × 20") && message.contains("--square crop");
-    assert!(explained, "{message}");
-    let square = |how: &str, side| {
-        let found = gathered(root.path(), &format!("{wide} --square {how}"), side);
-        bits(&found[0])
-    };
-    assert_eq!(square("crop", 20), expected(20, [24, 20], [2, 0]));
-    assert_eq!(square("pad", 24), expected(24, [24, 20], [0, -2]));
+    refuse_to_gather(
+        &folder,
+        &format!("{wide} --psf psf.fits"),
+        "24 × 20[..]--square crop",
+    );
+    for (how, side, first) in [("crop", 20, [2, 0]), ("pad", 24, [0, -2])] {
+        let found = gathered(&folder, &format!("{wide} --square {how}"), side);
+        assert_eq!(bits(&found[0]), expected(side, [24, 20], first));
+    }
     // A mask has the shape of its stamp.
-    let mut mask = vec![0.0f32; 480];
+    let mut mask = [0.0; 480];
     mask[24 * 5 + 7] = 1.0;
-    let mask = fits_image(-32, &[24, 20], &[], &floats(&mask));
-    fs::write(at("mask.fits"), mask).unwrap();
-    let masked = format!("{wide} --square crop --mask mask.fits");
-    assert_eq!(lost(&gathered(root.path(), &masked, 20)), [20 * 5 + 5]);
+    folder.image("mask.fits", &[24, 20], &[], &mask);
+    let found = gathered(
+        &folder,
+        &format!("{wide} --square crop --mask mask.fits"),
+        20,
+    );
+    assert_eq!(lost(&found), [20 * 5 + 5]);
     // Without a request: these are squares.
     let both = "--stamps small.fits large.fits large.fits large.fits";
-    let found = gathered(root.path(), both, 24);
+    let found = gathered(&folder, both, 24);
     assert_eq!(bits(&found[0]), expected(24, [21, 21], [-2, -2]));
     assert_eq!(bits(&found[1]), expected(24, [24, 24], [0, 0]));
-    let (_, said) = gather(root.path(), &format!("{both} --psf psf.fits"));
-    let note = "the stamps have sides of 21 to 24 px";
-    assert!(said.contains(note), "{said}");
+    let said = gather(&folder, &format!("{both} --psf psf.fits"));
+    assert_has(&said, "the stamps have sides of 21 to 24 px");
 }
 
 #[test]
 fn mask_bits_and_sextractors_blank_make_pixels_missing() {
-    let root = tempfile::tempdir().unwrap();
-    let at = |name: &str| root.path().join(name);
-    fs::write(at("psf.fits"), cube(&[vec![1.0; 400]], 20)).unwrap();
+    let folder = Folder::new();
+    write_cube(&folder, "psf.fits", &[vec![1.0; 400]]);
     let mut stamp = vec![1.0f32; 400];
-    stamp[9] = -1e30;
-    // Large, but a value.
-    stamp[10] = -1e29;
-    let mut mask = vec![0i32; 400];
-    // Single precision has no 2^30 + 1.
-    mask[3] = (1 << 30) + 1;
-    mask[4] = 1 << 30;
-    mask[5] = 6;
-    // All bits but the lowest.
-    mask[6] = -2;
+    // -1e29 is large, but a value.
+    (stamp[9], stamp[10]) = (-1e30, -1e29);
+    write_cube(&folder, "stamps.fits", &[stamp]);
+    let mut mask = [0i32; 400];
+    // Single precision has no 2^30 + 1. All bits of -2 but the lowest are set.
+    mask[3..7].copy_from_slice(&[(1 << 30) + 1, 1 << 30, 6, -2]);
     let bytes: Vec<u8> = mask.iter().flat_map(|value| value.to_be_bytes()).collect();
-    let mut half = vec![0.0f32; 400];
-    half[0] = 0.5;
-    fs::write(at("stamps.fits"), cube(&[stamp], 20)).unwrap();
-    fs::write(at("mask.fits"), fits_image(32, &[20, 20], &[], &bytes)).unwrap();
-    fs::write(at("half.fits"), cube(&[half], 20)).unwrap();
+    folder.write("mask.fits", fits_image(32, &[20, 20], &[], &bytes));
+    write_cube(&folder, "half.fits", &[vec![0.5; 400]]);
     for (more, expected) in [
         ("", &[9][..]),
         ("--mask mask.fits", &[3, 4, 5, 6, 9]),
         ("--mask mask.fits --mask-bits 0", &[3, 9]),
         ("--mask mask.fits --mask-bits 1,30", &[3, 4, 5, 6, 9]),
     ] {
-        let found = gathered(root.path(), &format!("--stamps stamps.fits {more}"), 20);
+        let found = gathered(&folder, &format!("--stamps stamps.fits {more}"), 20);
         assert_eq!(lost(&found), expected, "{more}");
     }
-    for (more, expected) in [
-        ("--mask half.fits", "the mask has the value 0.5"),
-        ("", "without a mask"),
-    ] {
-        let from = format!("--stamps stamps.fits --mask-bits 2 --psf psf.fits {more}");
-        let (done, message) = gather(root.path(), &from);
-        assert!(!done && message.contains(expected), "{message}");
-    }
+    let bits = "--stamps stamps.fits --mask-bits 2 --psf psf.fits";
+    refuse_to_gather(
+        &folder,
+        &format!("{bits} --mask half.fits"),
+        "the mask has the value 0.5",
+    );
+    refuse_to_gather(&folder, bits, "without a mask");
 }
 
 #[test]
 fn small_psfs_and_grids_of_stars_are_explained() {
-    let root = tempfile::tempdir().unwrap();
-    let at = |name: &str| root.path().join(name);
+    let folder = Folder::new();
     let profile = PsfProfile::Moffat { beta: 3.0 };
-    let psf = FunctionalPsf::new(profile, 3.4, Shear::new(0.0, 0.0)).unwrap();
+    let psf = FunctionalPsf::new(profile, 3.4, Shear::ZERO).unwrap();
     let star = |side: usize| -> Vec<f32> { psf.stamp(side).iter().map(|v| *v as f32).collect() };
     let one = star(48);
     // As GREAT3 has them.
-    let nine: Vec<f32> = (0..144 * 144)
-        .map(|at| one[at / 144 % 48 * 48 + at % 144 % 48])
+    let nine = (0..144 * 144)
+        .map(|at| one[at / 144 % 48 * 48 + at % 48])
         .collect();
-    for (name, stamps, side) in [
-        ("stamps.fits", vec![one.clone(); 4], 48),
-        ("three.fits", vec![one; 3], 48),
-        ("small.fits", vec![star(24)], 24),
-        ("nine.fits", vec![nine], 144),
-        ("large.fits", vec![star(144)], 144),
+    for (name, stamps) in [
+        ("stamps.fits", vec![one.clone(); 4]),
+        ("three.fits", vec![one; 3]),
+        ("small.fits", vec![star(24)]),
+        ("nine.fits", vec![nine]),
+        ("large.fits", vec![star(144)]),
     ] {
-        fs::write(at(name), cube(&stamps, side)).unwrap();
+        write_cube(&folder, name, &stamps);
     }
-    let said = |psf: &str| {
-        let line =
-            format!("rm -rf new; shearq gather --stamps stamps.fits --psf {psf} --out new/data");
-        let done = shell(root.path(), &line);
-        // A failure leaves no folder.
-        assert_eq!(at("new").exists(), done.status.success());
-        String::from_utf8(done.stderr).unwrap()
-    };
-    for (psf, expected) in [
+    for (psf, words) in [
         ("absent.fits", "absent.fits"),
         ("three.fits", "at least twice as many stamps"),
-        ("small.fits", "24 × 24 px (expected 32 × 32"),
-        ("small.fits", "psf.size = 24"),
-        ("nine.fits", "the image has 3 × 3 stars"),
-        ("nine.fits", "a cube of 9 stamps of 48 × 48 px"),
+        (
+            "nine.fits",
+            "the image has 3 × 3 stars[..]a cube of 9 stamps of 48 × 48 px",
+        ),
     ] {
-        let message = said(psf);
-        assert!(message.contains(expected), "{message}");
+        folder.refuses(
+            &format!("gather --stamps stamps.fits --psf {psf} --out new/data"),
+            words,
+        );
+        // A failure leaves no folder.
+        assert!(!folder.at("new").exists(), "{psf}");
     }
-    let message = said("large.fits");
-    let quiet = !message.contains("stars") && !message.contains("expected 32");
-    assert!(quiet, "{message}");
+    let said = gather(&folder, "--stamps stamps.fits --psf small.fits");
+    assert_has(&said, "24 × 24 px (expected 32 × 32[..]psf.size = 24");
+    let said = gather(&folder, "--stamps stamps.fits --psf large.fits");
+    assert!(
+        !said.contains("stars") && !said.contains("expected 32"),
+        "{said}"
+    );
 }
 
 #[test]
 fn pixel_axes_that_are_not_the_skys_are_stated() {
-    let small = Small::new("2");
-    let set = small.at("data/set02");
-    let galaxies = stamps_of(&set.join("galaxies-001.fits"), 48);
-    let (star, side) = pixels_of(&set.join("psf-001.fits"));
-    let header = |matrix: [f64; 4]| -> Vec<String> {
-        let names = ["CD1_1", "CD1_2", "CD2_1", "CD2_2"].into_iter();
-        let mut cards: Vec<_> = names
-            .zip(matrix)
-            .map(|(name, value)| format!("{name:<8}= {:>20.6E}", value * 7.3e-5))
-            .collect();
-        cards.extend(["CTYPE1  = 'RA---TAN'", "CTYPE2  = 'DEC--TAN'"].map(str::to_owned));
-        cards
-    };
+    let folder = Folder::with_set(2);
+    let galaxies = stamps_of(&folder.at("data/set02/galaxies-001.fits"), 48);
+    let (star, side) = pixels_of(&folder.at("data/set02/psf-001.fits"));
+    let stack = [48, 48, galaxies.len()];
     // DECam's x is to the south and its y to the east.
-    let [on_camera, on_sky] = [
+    for (name, matrix) in [
         ("camera", [0.0, 1.0, -1.0, 0.0]),
         ("sky", [-1.0, 0.0, 0.0, 1.0]),
-    ]
-    .map(|(name, matrix)| {
-        let cards = header(matrix);
-        let cards: Vec<&str> = cards.iter().map(String::as_str).collect();
-        let write = |name: String, sides: &[usize], pixels: &[f32]| {
-            let path = small.at(&name);
-            fs::write(&path, fits_image(-32, sides, &cards, &floats(pixels))).unwrap();
-            path
-        };
-        let stack = [48, 48, galaxies.len()];
-        (
-            write(format!("{name}.fits"), &stack, &galaxies.concat()),
-            write(format!("{name}-psf.fits"), &[side; 2], &star),
-        )
-    });
-    let said = |arguments: &[&str]| {
-        let done = shearq(arguments);
-        let said = String::from_utf8(done.stderr).unwrap();
-        assert!(done.status.success(), "{said}");
-        said
-    };
-    let gather = |stamps: &[&str], psf: &Path, [image, out, frame]: [&str; 3]| {
-        let out = small.at(out);
-        let rest = ["--psf", text(psf), "--image", image, "--out", text(&out)];
-        let frame = if frame.is_empty() {
-            &[][..]
-        } else {
-            &["--frame", frame]
-        };
-        said(&[&["gather", "--stamps"][..], stamps, &rest, frame].concat())
-    };
-    let measure = |data: &str| {
-        let (data, out) = (small.at(data), small.at(&format!("{data}-out")));
-        let measure = ["measure", "--submission", LINEAR, "--data", text(&data)];
-        said(&[&measure[..], &["--out", text(&out)]].concat())
-    };
-    let (camera, sky) = (text(&on_camera.0), text(&on_sky.0));
-    let message = gather(&[sky], &on_sky.1, ["1", "both", ""]);
-    assert!(
-        !message.contains("warning") && !message.contains("frame"),
-        "{message}"
-    );
-    let out = small.at("camera-out");
-    let stated = "e1 and e2 are along the pixel axes, which are not the sky's (found rotated by 90.0° from north to east, mirrored, sheared by (+0.0000, +0.0000)";
-    for message in [
-        gather(&[camera], &on_camera.1, ["1", "camera", "pixel"]),
-        measure("camera"),
-        said(&["mean", "--measured", text(&out)]),
     ] {
-        assert!(message.contains(stated), "{message}");
+        let keys = ["CD1_1", "CD1_2", "CD2_1", "CD2_2"].into_iter().zip(matrix);
+        let mut cards: Vec<_> = keys
+            .map(|(key, value)| format!("{key:<8}= {:>20.6E}", value * 7.3e-5))
+            .collect();
+        cards.extend(["CTYPE1  = 'RA---TAN'", "CTYPE2  = 'DEC--TAN'"].map(str::to_owned));
+        let cards: Vec<&str> = cards.iter().map(String::as_str).collect();
+        folder.image(&format!("{name}.fits"), &stack, &cards, &galaxies.concat());
+        folder.image(&format!("{name}-psf.fits"), &[side; 2], &cards, &star);
     }
+    write_cube(&folder, "plain.fits", &galaxies);
+    let gather = |stamps: &str, psf: &str, to: &str| {
+        folder.said(&format!(
+            "gather --stamps {stamps} --psf {psf} --image {to}"
+        ))
+    };
+    let camera = |to: &str| gather("camera.fits", "camera-psf.fits", to);
+    let sky = |to: &str| gather("sky.fits", "sky-psf.fits", to);
+    let said = sky("1 --out both");
+    assert!(
+        !said.contains("warning") && !said.contains("frame"),
+        "{said}"
+    );
+    let stated = "e1 and e2 are along the pixel axes, which are not the sky's (found rotated by 90.0° from north to east, mirrored, sheared by (+0.0000, +0.0000)";
+    assert_has(&camera("1 --out camera --frame pixel"), stated);
+    assert_has(&measure(&folder, "camera"), stated);
+    assert_has(&folder.said("mean --measured camera-out"), stated);
     // Without the option, ellipticities are along the sky's axes: those of x to the south and y to the east have the other
     // sign of e1.
-    let message = gather(&[camera], &on_camera.1, ["1", "turned", ""]);
     let frame = "frame: sky (e1 > 0 along east–west, e2 > 0 along north-west). The WCS of the first stamp: rotated by 90.0° from north to east, mirrored";
-    assert!(message.contains(frame), "{message}");
-    measure("turned");
-    let out = small.at("turned-out");
-    let message = said(&["mean", "--measured", text(&out)]);
-    assert!(!message.contains("pixel axes"), "{message}");
-    let shapes = |out: &str| {
-        let path = small.at(out).join("set01/catalogue-001.parquet");
-        let table = shearq_files::table::read(&path, Some(&["e1", "e2"]), 64).unwrap();
-        ["e1", "e2"].map(|name| {
-            shearq_files::table::numbers(&table, name, &path)
-                .unwrap()
-                .into_owned()
-        })
+    assert_has(&camera("1 --out turned"), frame);
+    measure(&folder, "turned");
+    let said = folder.said("mean --measured turned-out");
+    assert!(!said.contains("pixel axes"), "{said}");
+    let shapes = |data: &str| {
+        folder.numbers(
+            &format!("{data}-out/set01/catalogue-001.parquet"),
+            ["e1", "e2"],
+        )
     };
-    let ([along1, along2], [sky1, sky2]) = (shapes("camera-out"), shapes("turned-out"));
+    let ([along1, along2], [sky1, sky2]) = (shapes("camera"), shapes("turned"));
     for k in 0..along1.len() {
         let off = (along1[k] + sky1[k]).abs().max((along2[k] - sky2[k]).abs());
         // Noise of the correction for noise.
         assert!(off < 0.02 || along1[k].is_nan(), "{k}: {off}");
     }
-    gather(&[camera], &on_camera.1, ["2", "both", "pixel"]);
-    measure("both");
-    let out = small.at("both-out");
-    let message = fail(&["mean", "--measured", text(&out)]);
-    let expected = "catalogue-001.parquet and no common mean with them (found pixel axes rotated by 90.0° from north to east, mirrored, sheared by (+0.0000, +0.0000); expected pixel axes rotated by 0.0° from north to east, not mirrored";
-    assert!(message.contains(expected), "{message}");
+    camera("2 --out both --frame pixel");
+    measure(&folder, "both");
+    let other = "catalogue-001.parquet and no common mean with them (found pixel axes rotated by 90.0° from north to east, mirrored, sheared by (+0.0000, +0.0000); expected pixel axes rotated by 0.0° from north to east, not mirrored";
+    folder.refuses("mean --measured both-out", other);
     // Both are along the sky in one set: axes that are the sky's anyhow, and those that the WCS turns.
-    gather(&[sky], &on_sky.1, ["1", "all", ""]);
-    gather(&[camera], &on_camera.1, ["2", "all", ""]);
-    measure("all");
-    let json = |out: &str| -> Value {
-        let line = format!("shearq mean --measured {out}-out --format json");
-        let table: Value = serde_json::from_str(&printed(small.root(), &line)).unwrap();
-        table["rows"][0].clone()
-    };
-    let (mixed, turned, along) = (json("all"), json("turned"), json("camera"));
+    sky("1 --out all");
+    camera("2 --out all");
+    measure(&folder, "all");
+    let mean = |data: &str| folder.json(&format!("mean --measured {data}-out"))["rows"][0].clone();
+    let (mixed, turned, along) = (mean("all"), mean("turned"), mean("camera"));
     assert_eq!([&mixed["frame"], &along["frame"]], ["sky", "pixel"]);
-    let scored = |out: &str| {
-        let truth = small.at(out).join("set01/truth.csv");
-        fs::copy(small.at("data/set02/truth.csv"), truth).unwrap();
-        let line = format!(
-            "rm -r {out}-out; shearq measure --data {out} --submission {LINEAR} --out {out}-out; shearq score --measured {out}-out --format csv"
-        );
-        printed(small.root(), &line)
-    };
-    assert!(scored("turned").contains(",frame,") && scored("turned").contains(",sky,"));
-    assert!(!scored("camera").contains("frame"));
     // The stamps are the same, so that on the sky e1 of the two images differs in sign and e2 does not.
-    let [g2, turned2] = [&mixed, &turned].map(|row| row["g2"].as_f64().unwrap());
-    assert!((g2 - turned2).abs() < 0.005, "{g2} {turned2}");
-    assert!(mixed["g1"].as_f64().unwrap().abs() < 0.005, "{mixed}");
-    // Pixels without a WCS may lie in any orientation.
-    let plain = small.at("plain.fits");
-    let stack = [48, 48, galaxies.len()];
-    fs::write(
-        &plain,
-        fits_image(-32, &stack, &[], &floats(&galaxies.concat())),
-    )
-    .unwrap();
-    gather(&[camera], &on_camera.1, ["1", "open", ""]);
-    gather(
-        &[text(&plain)],
-        &set.join("psf-001.fits"),
-        ["2", "open", ""],
+    let number = |row: &Value, key: &str| row[key].as_f64().unwrap();
+    let off = (number(&mixed, "g2") - number(&turned, "g2")).abs();
+    assert!(
+        off < 0.005 && number(&mixed, "g1").abs() < 0.005,
+        "{mixed} {turned}"
     );
-    measure("open");
-    let message = fail(&["mean", "--measured", text(&small.at("open-out"))]);
-    let expected = "(found pixel axes without a WCS; expected the axes of the sky)";
-    assert!(message.contains(expected), "{message}");
-    let mixed = small.at("mixed");
-    let of = ["gather", "--stamps", sky, "--psf", text(&on_camera.1)];
-    let message = fail(&[&of[..], &["--out", text(&mixed)]].concat());
-    let expected =
+    let scored = |data: &str| {
+        let truth = folder.at(&format!("{data}/set01/truth.csv"));
+        std::fs::copy(folder.at("data/set02/truth.csv"), truth).unwrap();
+        measure(&folder, data);
+        folder.run(&format!("score --measured {data}-out --format csv"))
+    };
+    assert_has(&scored("turned"), ",frame,[..],sky,");
+    assert!(!scored("camera").contains("frame"));
+    // Pixels without a WCS may lie in any orientation.
+    camera("1 --out open");
+    gather("plain.fits", "data/set02/psf-001.fits", "2 --out open");
+    measure(&folder, "open");
+    let without = "(found pixel axes without a WCS; expected the axes of the sky)";
+    folder.refuses("mean --measured open-out", without);
+    let psf =
         "the PSF image and the galaxy image have pixel axes of different orientation or shear";
-    assert!(message.contains(expected), "{message}");
-    let message = gather(&[sky, camera], &on_sky.1, ["1", "two", "pixel"]);
-    let expected = "camera.fits: image 1, plane 1: the header states other pixel axes";
-    assert!(message.contains(expected), "{message}");
+    folder.refuses(
+        "gather --stamps sky.fits --psf camera-psf.fits --out mixed",
+        psf,
+    );
+    let said = gather(
+        "sky.fits camera.fits",
+        "sky-psf.fits",
+        "1 --out two --frame pixel",
+    );
+    assert_has(
+        &said,
+        "camera.fits: image 1, plane 1: the header states other pixel axes",
+    );
+}
+
+/// Positions of the 8 × 8 galaxies of an image.
+fn write_positions(folder: &Folder, within: f64) {
+    let at = |k: usize| (k * 48 + 24) as f64 + within;
+    let rows = (0..64).map(|k| format!("{k},{},{}\n", at(k % 8), at(k / 8)));
+    folder.write(
+        "positions.csv",
+        "id,x,y\n".to_owned() + &rows.collect::<String>(),
+    );
 }
 
 #[test]
 fn each_galaxy_has_the_noise_of_its_place_and_of_its_light() {
-    let small = Small::new("2");
-    let set = small.at("data/set02");
-    let (exposure, psf) = (set.join("galaxies-001.fits"), set.join("psf-001.fits"));
-    let width = pixels_of(&exposure).1;
-    let at = |k: usize| (k % 8 * 48 + 24, k / 8 * 48 + 24);
-    let rows = (0..64).map(|k| format!("{k},{}.5,{}.5\n", at(k).0, at(k).1));
-    let positions = small.at("positions.csv");
-    fs::write(
-        &positions,
-        "id,x,y\n".to_owned() + &rows.collect::<String>(),
-    )
-    .unwrap();
+    let folder = Folder::with_set(2);
+    let exposure = "data/set02/galaxies-001.fits";
+    let (pixels, width) = pixels_of(&folder.at(exposure));
+    write_positions(&folder, 0.5);
     // The map has the light of the galaxies, as maps of counts do, and another depth from column 180 on, which is on a stamp.
-    let variance: Vec<f32> = (0..width * width)
-        .map(|pixel| {
-            let [x, y] = [pixel % width, pixel / width];
-            let centre = (x % 48).abs_diff(24).max((y % 48).abs_diff(24));
-            let own = if centre < 8 { 5.0 } else { 0.0 };
-            own + if x < 180 { 1.0 } else { 4.0 }
-        })
-        .collect();
-    let write = |name: &str, values: Vec<f32>| {
-        let path = small.at(name);
-        fs::write(&path, fits_image(-32, &[width; 2], &[], &floats(&values))).unwrap();
-        path
+    let variance = |at: usize| {
+        let [x, y] = [at % width, at / width];
+        let centre = (x % 48).abs_diff(24).max((y % 48).abs_diff(24));
+        let own = if centre < 8 { 5.0 } else { 0.0 };
+        own + if x < 180 { 1.0 } else { 4.0 }
     };
-    let map = write("variance.fits", variance.clone());
-    let weight = write("weight.fits", variance.iter().map(|v| 1.0 / v).collect());
-    let of = |exposure: &Path, name: &str, options: &[&str]| {
-        let (data, out) = (small.at(name), small.at(&format!("{name}-out")));
-        let from = ["gather", "--exposure", text(exposure), "--psf", text(&psf)];
-        let to = ["--positions", text(&positions), "--out", text(&data)];
-        succeed(&[&from[..], &to, options].concat());
-        let measure = ["measure", "--submission", LINEAR, "--data", text(&data)];
-        succeed(&[&measure[..], &["--out", text(&out)]].concat());
-        let path = out.join("set01/catalogue-001.parquet");
-        let table = shearq_files::table::read(&path, None, 64).unwrap();
-        ["noise", "flux_error", "flux"].map(|name| {
-            let values = shearq_files::table::numbers(&table, name, &path);
-            values.unwrap().into_owned()
-        })
+    let write = |name: &str, of: &dyn Fn(usize) -> f32| {
+        let values: Vec<f32> = (0..width * width).map(of).collect();
+        folder.image(name, &[width; 2], &[], &values);
     };
-    let columns = |name: &str, options: &[&str]| of(&exposure, name, options);
-    for (name, option, file) in [
-        ("variance", "--variance", &map),
-        ("weight", "--weight-map", &weight),
-    ] {
-        let [noise, ..] = columns(name, &[option, text(file)]);
+    write("variance.fits", &variance);
+    write("weight.fits", &|at| 1.0 / variance(at));
+    write("raised.fits", &|at| pixels[at] + 30.0);
+    let columns = |exposure: &str, options: &str| {
+        let from = format!("gather --exposure {exposure} --psf data/set02/psf-001.fits");
+        folder.remove("own");
+        folder.run(&format!(
+            "{from} --positions positions.csv --out own {options}"
+        ));
+        measure(&folder, "own");
+        let catalogue = "own-out/set01/catalogue-001.parquet";
+        folder.numbers(catalogue, ["noise", "flux_error", "flux"])
+    };
+    let map = "--variance variance.fits";
+    let dark = columns(exposure, map);
+    for noise in [&dark[0], &columns(exposure, "--weight-map weight.fits")[0]] {
         for (k, found) in noise.iter().enumerate() {
             // Column 180 is right of the middle of the fourth stamp.
-            let expected = if at(k).0 <= 180 { 1.0 } else { 2.0 };
-            assert!((found - expected).abs() < 1e-6, "{name} {k}: {found}");
+            let expected = if k % 8 < 4 { 1.0 } else { 2.0 };
+            assert!((found - expected).abs() < 1e-6, "{k}: {found}");
         }
     }
-    let plain = columns("plain", &[]);
-    // With a map, too, the sky is subtracted.
-    let (pixels, _) = pixels_of(&exposure);
-    let raised = pixels.iter().map(|value| value + 30.0).collect();
-    let light = of(
-        &write("raised.fits", raised),
-        "light",
-        &["--variance", text(&map)],
-    );
-    let dark = columns("dark", &["--variance", text(&map)]);
-    for (k, (light, dark)) in light[2].iter().zip(&dark[2]).enumerate() {
-        // A sky of 30 on the hundred pixels of a window has thousands.
-        let off = (light - dark).abs();
-        assert!(off < 50.0 || dark.is_nan(), "{k}: {light} {dark}");
+    // With a map, too, the sky is subtracted: a sky of 30 on the hundred pixels of a window has thousands.
+    let light = columns("raised.fits", map);
+    for (light, dark) in light[2].iter().zip(&dark[2]) {
+        assert!(
+            (light - dark).abs() < 50.0 || dark.is_nan(),
+            "{light} {dark}"
+        );
     }
-    assert_eq!(columns("bright", &["--gain", "1e30"])[1..], plain[1..]);
+    let plain = columns(exposure, "");
+    assert_eq!(columns(exposure, "--gain 1e30")[1..], plain[1..]);
     // The light of a galaxy under the window adds to the variance: flux over gain and area, less what the window leaves out.
-    let own = columns("gain", &["--gain", "0.2"]);
-    for k in 0..64 {
+    let own = columns(exposure, "--gain 0.2");
+    for k in (0..64).filter(|k| plain[2][*k] >= 0.0) {
         let (noise, flux) = (plain[0][k], plain[2][k]);
-        if flux.is_nan() {
-            continue;
-        }
         let ratio = (own[1][k] / plain[1][k]).powi(2) - 1.0;
         let area = ratio.recip() * flux / 0.2 / (noise * noise);
         // π w² for windows of 6.7 to 9.5 px, and up to 1.6 times as much.
-        assert!((140.0..450.0).contains(&area) || flux < 0.0, "{k}: {area}");
+        assert!((140.0..450.0).contains(&area), "{k}: {area}");
     }
 }
 
 #[test]
 fn exposures_of_one_call_are_epochs_or_say_why_not() {
-    let small = Small::new("2");
-    let set = small.at("data/set02");
-    let (pixels, width) = pixels_of(&set.join("galaxies-001.fits"));
-    let psf = set.join("psf-001.fits");
-    let rows = (0..64).map(|k| format!("{k},{},{}\n", k % 8 * 48 + 24, k / 8 * 48 + 24));
-    let table = "id,x,y\n".to_owned() + &rows.collect::<String>();
-    fs::write(small.at("positions.csv"), table).unwrap();
-    let exposure = |name: &str, cards: &[&str]| {
-        let content = fits_image(-32, &[width; 2], cards, &floats(&pixels));
-        fs::write(small.at(name), content).unwrap();
-    };
+    let folder = Folder::with_set(2);
+    let (pixels, width) = pixels_of(&folder.at("data/set02/galaxies-001.fits"));
+    write_positions(&folder, 0.0);
     // Without places on the sky, which would be those of other galaxies.
     let linear = [
         "CTYPE1  = 'LINEAR'",
@@ -935,58 +662,39 @@ fn exposures_of_one_call_are_epochs_or_say_why_not() {
         "CUNIT1  = 'arcsec'",
         "CUNIT2  = 'arcsec'",
     ];
-    let along = ["CD1_1   = 0.26", "CD2_2   = 0.26"];
-    let turned = ["CD1_2   = -0.26", "CD2_1   = 0.26"];
-    let coarse = ["CD1_1   = 0.3", "CD2_2   = 0.3"];
-    exposure("along.fits", &[&linear[..], &along].concat());
-    exposure("turned.fits", &[&linear[..], &turned].concat());
-    exposure("coarse.fits", &[&linear[..], &coarse].concat());
-    exposure("plain.fits", &[]);
+    for (name, matrix) in [
+        ("along.fits", ["CD1_1   = 0.26", "CD2_2   = 0.26"]),
+        ("turned.fits", ["CD1_2   = -0.26", "CD2_1   = 0.26"]),
+        ("coarse.fits", ["CD1_1   = 0.3", "CD2_2   = 0.3"]),
+    ] {
+        folder.image(name, &[width; 2], &[&linear[..], &matrix].concat(), &pixels);
+    }
+    folder.image("plain.fits", &[width; 2], &[], &pixels);
     let gather = |exposures: &str, out: &str| {
-        let psfs = vec![text(&psf); exposures.split(' ').count()].join(" ");
-        format!(
-            "shearq gather --exposure {exposures} --psf {psfs} --positions positions.csv --out {out}"
-        )
+        let psfs = "data/set02/psf-001.fits ".repeat(exposures.split(' ').count());
+        format!("gather --exposure {exposures} --psf {psfs} --positions positions.csv --out {out}")
     };
     let measure = |data: &str| {
-        format!("shearq measure --epochs --data {data} --submission {LINEAR} --out {data}-out")
+        folder.remove(&format!("{data}-out"));
+        format!("measure --epochs --data {data} {LINEAR} --out {data}-out")
     };
     for (exposures, data) in [
         ("along.fits turned.fits along.fits", "three"),
         ("along.fits coarse.fits", "scales"),
     ] {
-        let line = format!("{} && {}", gather(exposures, data), measure(data));
-        let done = shell(small.root(), &line);
-        let said = String::from_utf8(done.stderr).unwrap();
-        assert!(
-            done.status.success() && said.contains("frame: sky"),
-            "{said}"
-        );
+        assert_has(&folder.said(&gather(exposures, data)), "frame: sky");
+        folder.run(&measure(data));
     }
-    let refused = |line: &str| {
-        let done = shell(small.root(), line);
-        assert!(!done.status.success());
-        String::from_utf8(done.stderr).unwrap()
-    };
-    let said = refused(&gather("along.fits plain.fits turned.fits", "none"));
-    assert!(
-        said.contains(
-            "plain.fits: the exposures have different pixels on the sky, and the header has no WCS"
-        ),
-        "{said}"
-    );
+    let none = gather("along.fits plain.fits turned.fits", "none");
+    let pixels =
+        "plain.fits: the exposures have different pixels on the sky, and the header has no WCS";
+    folder.refuses(&none, pixels);
     // Another call does not know the first one.
-    let line = format!("{} --image 4", gather("along.fits", "three"));
-    assert!(shell(small.root(), &line).status.success());
-    let said = refused(&format!("rm -r three-out; {}", measure("three")));
-    assert!(
-        said.contains("galaxies-004.fits: some epochs have Jacobians and others have none")
-            && said.contains("Try:"),
-        "{said}"
-    );
-    fs::remove_file(small.at("three/set01/galaxies-002.fits")).unwrap();
-    let said = refused(&measure("three"));
-    let expected =
+    folder.run(&format!("{} --image 4", gather("along.fits", "three")));
+    let some = "galaxies-004.fits: some epochs have Jacobians and others have none[..]Try:";
+    folder.refuses(&measure("three"), some);
+    folder.remove("three/set01/galaxies-002.fits");
+    let absent =
         "galaxies-002.fits: there is no such image (found 1, 3, 4 of set 1, expected 1 to 4";
-    assert!(said.contains(expected), "{said}");
+    folder.refuses(&measure("three"), absent);
 }

@@ -1,18 +1,10 @@
-//! Properties of any settings and any catalogue. The inputs differ from run to run; a failure prints the smallest
+//! Properties of any settings. The inputs differ from run to run; a failure prints the smallest
 //! input that fails.
 
-use std::fs;
-
 use proptest::collection::vec;
-use proptest::num::f64::{NEGATIVE, NORMAL, POSITIVE, QUIET_NAN, ZERO};
 use proptest::prelude::*;
-use shearq_files::frames::frame;
-use shearq_files::frames::polars::Column;
-use shearq_files::table::{self, FileFormat};
 use shearq_submissions::{Configuration, Registry};
 use toml::Value;
-
-const NAMES: [&str; 4] = ["x", "y", "e1", "e2"];
 
 fn config() -> ProptestConfig {
     ProptestConfig {
@@ -92,53 +84,4 @@ proptest! {
         }
     }
 
-    /// Catalogues are read back from files of both formats and from text. cfitsio reads subnormal numbers and −0 as 0.
-    #[test]
-    fn catalogues_are_read_back(
-        rows in vec(prop::array::uniform4(POSITIVE | NEGATIVE | NORMAL | ZERO | QUIET_NAN), 1..40),
-        separator in prop::sample::select(vec![",", ";", "\t", " "]),
-    ) {
-        let folder = tempfile::tempdir().unwrap();
-        let at = |ending: &str| folder.path().join(format!("table.{ending}"));
-        let columns = (0..4).map(|k| {
-            let values: Vec<f64> = rows.iter().map(|row| row[k]).collect();
-            Column::new(NAMES[k].into(), values)
-        });
-        let frame = frame(columns.collect()).unwrap();
-        for format in [FileFormat::Parquet, FileFormat::Fits] {
-            table::write(&at(format.extension()), format, &frame, &Default::default()).unwrap();
-        }
-        let line = |row: &[f64; 4]| row.map(|value| format!("{value:e}")).join(separator);
-        let lines: Vec<String> = rows.iter().map(line).collect();
-        fs::write(at("csv"), NAMES.join(separator) + "\n" + &lines.join("\n") + "\n").unwrap();
-        for ending in ["parquet", "fits", "csv"] {
-            let path = at(ending);
-            let read = table::read(&path, Some(&NAMES), table::MAX_ROWS).unwrap();
-            for (k, name) in NAMES.iter().enumerate() {
-                let found = table::numbers(&read, name, &path).unwrap();
-                prop_assert_eq!(found.len(), rows.len(), "{}", ending);
-                for (found, row) in found.iter().zip(&rows) {
-                    let same = *found == row[k] || (found.is_nan() && row[k].is_nan());
-                    prop_assert!(same, "{}, {}: {} {}", ending, name, found, row[k]);
-                }
-            }
-        }
-    }
-
-    /// Text tables of any cells are read or refused.
-    #[test]
-    fn text_tables_of_any_cells_are_read_or_refused(
-        cells in vec(vec("[-+0-9.eENaif\"#|, ]{0,12}", 0..6), 0..8),
-        head in prop::sample::select(&["x,y,e1,e2\n", "# x y e1 e2\n", "# 1 x\n# 2 y\n# 3 e1\n# 4 e2\n", "\n", ""][..]),
-        separator in prop::sample::select(vec![",", ";", "\t", " "]),
-    ) {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("table.csv");
-        let lines: Vec<String> = cells.iter().map(|cells| cells.join(separator)).collect();
-        fs::write(&path, head.to_owned() + &lines.join("\n")).unwrap();
-        match table::read(&path, Some(&NAMES), table::MAX_ROWS) {
-            Ok(read) => prop_assert!(read.height() <= cells.len()),
-            Err(error) => prop_assert!(error.to_string().contains("table.csv")),
-        }
-    }
 }

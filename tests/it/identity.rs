@@ -27,60 +27,41 @@ fn numbers(count: usize) -> Vec<f64> {
 #[test]
 fn every_number_is_read_as_it_was_written() {
     let folder = tempfile::tempdir().unwrap();
-    let numbers = numbers(40_000);
+    let all = numbers(40_000);
     let bits = |numbers: &[f64]| numbers.iter().map(|n| n.to_bits()).collect::<Vec<_>>();
     let path = folder.path().join("numbers.json");
-    write_record(&path, &numbers).unwrap();
+    write_record(&path, &all).unwrap();
     let read: Vec<f64> = read_record(&path).unwrap().unwrap();
-    assert!(bits(&read) == bits(&numbers), "JSON");
-    for some in numbers.chunks(1000) {
-        let table = toml::Table::from_iter([("n".to_owned(), some.to_vec().into())]);
-        let read: toml::Table = toml::to_string(&table).unwrap().parse().unwrap();
-        let read = read["n"]
-            .as_array()
-            .unwrap()
-            .iter()
-            .map(|n| n.as_float().unwrap());
-        assert!(bits(&read.collect::<Vec<_>>()) == bits(some), "TOML");
-    }
+    assert!(bits(&read) == bits(&all), "JSON");
     let table = Table {
         headings: vec![Heading::new("n", "N")],
-        rows: numbers.iter().map(|&n| vec![Cell::number(n, 2)]).collect(),
+        rows: all.iter().map(|&n| vec![Cell::number(n, 2)]).collect(),
         ..Table::default()
     };
     let csv = table.render(TableFormat::Csv);
-    let read: Vec<f64> = csv
-        .lines()
-        .skip(1)
-        .map(|line| line.parse().unwrap())
-        .collect();
-    assert!(bits(&read) == bits(&numbers), "CSV");
-}
-
-#[test]
-fn every_number_of_a_header_is_read_as_it_was_written() {
-    let folder = tempfile::tempdir().unwrap();
+    let read = csv.lines().skip(1).map(|line| line.parse().unwrap());
+    assert!(bits(&read.collect::<Vec<f64>>()) == bits(&all), "CSV");
     let path = folder.path().join("header.fits");
+    let names: Vec<String> = (0..1000).map(|k| format!("N{k}")).collect();
     // cfitsio reads what is below the normal numbers as zero.
-    let numbers: Vec<f64> = numbers(500)
+    let all = numbers(500)
         .into_iter()
-        .filter(|n| *n == 0.0 || n.is_normal())
-        .collect();
-    let names: Vec<String> = (0..numbers.len()).map(|k| format!("N{k}")).collect();
+        .filter(|n| *n == 0.0 || n.is_normal());
     let header: Vec<(&str, Value)> = names
         .iter()
         .map(String::as_str)
-        .zip(numbers.iter().map(|&n| Value::Real(n)))
+        .zip(all.map(Value::Real))
         .collect();
     let mut image = ImageWriter::create(&path, 1, 1, &header).unwrap();
     image.write_rows(&[0.0]).unwrap();
     image.finish().unwrap();
     let image = ImageReader::open(&path).unwrap();
-    for (name, number) in names.iter().zip(numbers) {
+    for (name, value) in header {
+        let Value::Real(number) = value else {
+            panic!("{name} is a number");
+        };
         let read = image.number(name).unwrap().unwrap();
-        assert!(
-            read.to_bits() == number.to_bits() || (read, number) == (0.0, 0.0),
-            "{number:e}: {read:e}"
-        );
+        let same = read.to_bits() == number.to_bits() || (read, number) == (0.0, 0.0);
+        assert!(same, "{number:e}: {read:e}");
     }
 }

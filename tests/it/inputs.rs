@@ -1,9 +1,9 @@
 //! Commands of the pages of `tests/cases` that make or show what no text can hold: images and tables of FITS.
 //!
 //! * `image FROM TO WHAT...`: an image of the pixels of another. WHAT is applied in order: `size=WxH` or other axes,
-//!   `pad=SIDE` (zeros around it), `pads=STAMP,SIDE` (zeros around each stamp), `cube=STAMP,SIDE` (the central pixels of the stamps of a mosaic), `copy=STAMP` (the first
+//!   `pads=STAMP,SIDE` (zeros around each stamp), `cube=STAMP,SIDE` (the central pixels of the stamps of a mosaic), `copy=STAMP` (the first
 //!   stamp everywhere), `number=SIDE` (of the square of pixels from 0), `shift=X,Y`, `scale=F`, `add=F`, `background=F` (of
-//!   the peak), `slope=STAMP,F` (light per pixel along x of each stamp), `snr=F` (adds noise), `pixel=X,Y,F` (from 1),
+//!   the peak), `snr=F` (adds noise), `pixel=X,Y,F` (from 1),
 //!   `bitpix=N`, or a card such as `STAMP=48` or `CTYPE1="RA---TAN"`.
 //! * `card FROM TO KEY=VALUE`: a copy with another value of a key. `card FROM TO KEY CARD`: a copy with any card in the
 //!   place of the last one of this key; `"` stands for `'`.
@@ -21,7 +21,7 @@ use shearq_files::frames::frame;
 use shearq_files::frames::polars::Column;
 use shearq_files::table;
 
-use crate::support::{contents, csv, fits_image, pixels_of, text};
+use crate::support::{contents, csv, fits_image, mosaic, pixels_of, stamps, text};
 
 /// Runs a command of this module in `root`, and gives what it prints; `None` if it is another.
 pub fn run(command: &str, root: &Path) -> Option<String> {
@@ -117,50 +117,42 @@ fn image(from: &Path, what: &[&str]) -> Vec<u8> {
             }
             "cube" => {
                 let [stamp, side] = numbers(value).map(|side| side as usize);
-                let (n, first) = (sides[0] / stamp, (stamp - side) / 2);
-                let corner = |k: usize| (k / n * stamp + first) * sides[0] + k % n * stamp + first;
-                let old = pixels.clone();
-                let row = |k: usize, y: usize| &old[corner(k) + y * sides[0]..][..side];
-                let rows = (0..n * n).flat_map(|k| (0..side).map(move |y| (k, y)));
-                pixels = rows.flat_map(|(k, y)| row(k, y).to_vec()).collect();
-                sides = vec![side, side, n * n];
-            }
-            "scale" => pixels
-                .iter_mut()
-                .for_each(|v| *v *= value.parse::<f32>().unwrap()),
-            "add" => pixels
-                .iter_mut()
-                .for_each(|v| *v += value.parse::<f32>().unwrap()),
-            "pad" => {
-                let (side, width) = (value.parse::<usize>().unwrap(), sides[0]);
-                let first = (side - width) / 2;
-                let mut padded = vec![0.0; side * side];
-                for (k, pixel) in pixels.iter().enumerate() {
-                    padded[(first + k / width) * side + first + k % width] = *pixel;
-                }
-                (pixels, sides) = (padded, vec![side; 2]);
+                let (first, all) = ((stamp - side) / 2, stamps(&pixels, sides[0], stamp));
+                let place = |k: usize| (first + k / side) * stamp + first + k % side;
+                let cut = |own: &Vec<f32>| (0..side * side).map(|k| own[place(k)]).collect();
+                pixels = all.iter().map(cut).collect::<Vec<Vec<f32>>>().concat();
+                sides = vec![side, side, all.len()];
             }
             "pads" => {
                 let [stamp, side] = numbers(value).map(|side| side as usize);
-                let (n, width) = (sides[0] / stamp, sides[0]);
-                let first = (side - stamp) / 2;
-                let mut padded = vec![0.0; n * side * n * side];
-                for (k, pixel) in pixels.iter().enumerate() {
-                    let at = |at: usize| at / stamp * side + first + at % stamp;
-                    padded[at(k / width) * n * side + at(k % width)] = *pixel;
-                }
-                (pixels, sides) = (padded, vec![n * side; 2]);
-            }
-            "slope" => {
-                let [side, slope] = numbers(value);
-                for (k, pixel) in pixels.iter_mut().enumerate() {
-                    *pixel += (slope * ((k % sides[0]) as f64 % side - (side - 1.0) / 2.0)) as f32;
-                }
+                let (first, n) = ((side - stamp) / 2, sides[0] / stamp);
+                let padded = stamps(&pixels, sides[0], stamp)
+                    .into_iter()
+                    .flat_map(|own| {
+                        let mut new = vec![0.0; side * side];
+                        for (k, row) in own.chunks(stamp).enumerate() {
+                            new[(first + k) * side + first..][..stamp].copy_from_slice(row);
+                        }
+                        new
+                    });
+                pixels = mosaic(&padded.collect::<Vec<_>>(), side, n);
+                sides = vec![n * side; 2];
             }
             "copy" => {
-                let (side, width) = (value.parse::<usize>().unwrap(), sides[0]);
-                let place = |k: usize| k / width % side * width + k % width % side;
-                pixels = (0..pixels.len()).map(|k| pixels[place(k)]).collect();
+                let all = stamps(&pixels, sides[0], value.parse().unwrap());
+                pixels = mosaic(
+                    &all[0].repeat(all.len()),
+                    value.parse().unwrap(),
+                    all.len().isqrt(),
+                );
+            }
+            "scale" => {
+                let factor: f32 = value.parse().unwrap();
+                pixels.iter_mut().for_each(|v| *v *= factor);
+            }
+            "add" => {
+                let light: f32 = value.parse().unwrap();
+                pixels.iter_mut().for_each(|v| *v += light);
             }
             "background" => {
                 let peak = pixels.iter().copied().fold(0.0, f32::max);

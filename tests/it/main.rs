@@ -34,4 +34,3 @@ mod scoring_cases;
 mod source;
 mod support;
 mod terminal;
-mod truth_sign;

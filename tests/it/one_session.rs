@@ -1,12 +1,9 @@
 //! Files, simulations in memory and arrays are measured alike, on data that take each way through a session.
 
-use std::path::Path;
-
-use shearq_files::table;
 use shearq_measure::ndarray::{Array3, Axis, s};
 use shearq_measure::{ArraySource, Batch, KnownNoise, Measurement, Measurer, OneThread, Psfs};
 
-use crate::support::{contents, fits_image, floats, pixels_of, printed, shell};
+use crate::support::{Folder, assert_has, contents, mosaic, shell, stamps_of};
 
 /// Galaxies along a side: more than are surveyed.
 const GRID: usize = 33;
@@ -27,40 +24,31 @@ fn noise(state: &mut u64) -> f32 {
     12f32.sqrt() * ((*state >> 40) as f32 / (1u64 << 24) as f32 - 0.5)
 }
 
-/// The stamps of a mosaic.
-fn cube(path: &Path) -> Array3<f32> {
-    let ((pixels, width), side) = (pixels_of(path), STAMP);
-    let n = width / side;
-    let rows = pixels.len() / width / side;
-    Array3::from_shape_fn((n * rows, side, side), |(k, y, x)| {
-        pixels[(k / n * side + y) * width + k % n * side + x]
-    })
-}
-
-/// A mosaic of stamps in rows of `n`.
-fn mosaic(stamps: &Array3<f32>, n: usize) -> Vec<f32> {
-    let (count, side, _) = stamps.dim();
-    let (width, height) = (n * side, count / n * side);
-    let at = |at: usize| {
-        let (x, y) = (at % width, at / width);
-        stamps[(y / side * n + x / side, y % side, x % side)]
-    };
-    (0..width * height).map(at).collect()
+/// The stamps of an image.
+fn cube(folder: &Folder, name: &str) -> Array3<f32> {
+    let stamps = stamps_of(&folder.at(name), STAMP);
+    let shape = (stamps.len(), STAMP, STAMP);
+    Array3::from_shape_vec(shape, stamps.concat()).unwrap()
 }
 
 impl Data {
-    fn write(&self, folder: &Path) {
-        let side = GRID * STAMP;
-        let mut cards = vec![format!("STAMP   = {STAMP:>20}")];
-        cards.extend(self.noise.map(|noise| format!("NOISESIG= {noise:>20?}")));
+    fn write(&self, folder: &Folder) {
+        let mut cards = vec![format!("STAMP   = {STAMP}")];
+        cards.extend(self.noise.map(|noise| format!("NOISESIG= {noise:?}")));
         let cards: Vec<&str> = cards.iter().map(String::as_str).collect();
-        let pixels = floats(&mosaic(&self.stamps, GRID));
-        let image = fits_image(-32, &[side; 2], &cards, &pixels);
-        std::fs::write(folder.join("set02/galaxies-001.fits"), image).unwrap();
         let along = if self.stars.dim().0 == 1 { 1 } else { GRID };
-        let stars = floats(&mosaic(&self.stars, along));
-        let image = fits_image(-32, &[along * STAMP; 2], &cards[..1], &stars);
-        std::fs::write(folder.join("set02/psf-001.fits"), image).unwrap();
+        for (name, cube, n, cards) in [
+            (
+                "data/set02/galaxies-001.fits",
+                &self.stamps,
+                GRID,
+                &cards[..],
+            ),
+            ("data/set02/psf-001.fits", &self.stars, along, &cards[..1]),
+        ] {
+            let pixels = mosaic(cube.as_slice().unwrap(), STAMP, n);
+            folder.image(name, &[n * STAMP; 2], cards, &pixels);
+        }
     }
 
     /// What the library makes of the arrays.
@@ -81,75 +69,69 @@ type Spoil = fn(&mut Data);
 /// The value of a column of the catalogue.
 type Column = fn(&Measurement) -> f64;
 
+const LINEAR: &str = "48/linear/star";
+const NETWORK: &str = "23/raw/star";
+
 /// Name, configuration, what is done to the data, and words of a warning or an error.
 const CASES: [(&str, &str, Spoil, &str); 10] = [
-    ("as simulated", "48/linear/star", |_| {}, ""),
-    ("a network", "23/raw/star", |_| {}, ""),
-    (
-        "sky",
-        "48/linear/star",
-        |data| sky(data),
-        "It was subtracted from all stamps",
-    ),
-    (
-        "noisy stars",
-        "48/linear/star",
-        |data| noisy_stars(data),
-        "the PSF is noisy",
-    ),
+    ("as simulated", LINEAR, |_| {}, ""),
+    ("a network", NETWORK, |_| {}, ""),
+    ("sky", LINEAR, sky, SUBTRACTED),
+    ("noisy stars", LINEAR, noisy_stars, "the PSF is noisy"),
     (
         "noisy stars and sky",
-        "48/linear/star",
-        |data| {
-            sky(data);
-            noisy_stars(data);
-        },
-        "It was subtracted from all stamps",
+        LINEAR,
+        noisy_stars_and_sky,
+        SUBTRACTED,
     ),
-    (
-        "missing pixels",
-        "48/linear/star",
-        |data| {
-            for (k, mut stamp) in data.stamps.outer_iter_mut().enumerate().step_by(3) {
-                stamp.slice_mut(s![k % 40..k % 40 + 3, ..4]).fill(f32::NAN);
-            }
-            data.stamps.index_axis_mut(Axis(0), 5).fill(f32::NAN);
-        },
-        "",
-    ),
+    ("missing pixels", LINEAR, missing_pixels, ""),
     (
         "no stamp to survey",
-        "48/linear/star",
+        LINEAR,
         |data| data.stamps.fill(f32::NAN),
         "cannot measure the noise: no stamp has enough pixels that differ",
     ),
     (
         "no stamp to survey for a network",
-        "23/raw/star",
+        NETWORK,
         |data| data.stamps.fill(f32::NAN),
         "pixels are missing",
     ),
     (
         "borders without noise",
-        "48/linear/star",
-        |data| {
-            data.stamps
-                .indexed_iter_mut()
-                .for_each(|((_, y, x), value)| {
-                    if y.min(x) < 12 || y.max(x) >= 36 {
-                        *value = 0.0;
-                    }
-                });
-        },
+        LINEAR,
+        blank_borders,
         "expected two or more complete borders",
     ),
     (
         "a stated noise that is wrong",
-        "48/linear/star",
+        LINEAR,
         |data| data.noise = Some(1.3),
         "NOISESIG disagrees with the measured noise",
     ),
 ];
+
+const SUBTRACTED: &str = "It was subtracted from all stamps";
+
+fn missing_pixels(data: &mut Data) {
+    for (k, mut stamp) in data.stamps.outer_iter_mut().enumerate().step_by(3) {
+        stamp.slice_mut(s![k % 40..k % 40 + 3, ..4]).fill(f32::NAN);
+    }
+    data.stamps.index_axis_mut(Axis(0), 5).fill(f32::NAN);
+}
+
+fn blank_borders(data: &mut Data) {
+    for ((_, y, x), value) in data.stamps.indexed_iter_mut() {
+        if y.min(x) < 12 || y.max(x) >= 36 {
+            *value = 0.0;
+        }
+    }
+}
+
+fn noisy_stars_and_sky(data: &mut Data) {
+    sky(data);
+    noisy_stars(data);
+}
 
 fn sky(data: &mut Data) {
     for ((_, y, x), value) in data.stamps.indexed_iter_mut() {
@@ -170,15 +152,19 @@ fn noisy_stars(data: &mut Data) {
 
 #[test]
 fn files_and_arrays_take_the_same_way_through_a_session() {
-    let root = tempfile::tempdir().unwrap();
-    let at = |name: &str| root.path().join(name);
-    let folder = at("data");
-    let simulate = format!("shearq simulate --sets 2 --images 1 --grid {GRID} --out data");
-    printed(root.path(), &simulate);
+    let folder = Folder::new();
+    folder.run(&format!(
+        "simulate --sets 2 --images 1 --grid {GRID} --out data"
+    ));
     let plain = Data {
-        stamps: cube(&folder.join("set02/galaxies-001.fits")),
-        stars: cube(&folder.join("set02/psf-001.fits")),
+        stamps: cube(&folder, "data/set02/galaxies-001.fits"),
+        stars: cube(&folder, "data/set02/psf-001.fits"),
         noise: Some(1.0),
+    };
+    // NaN is not equal to itself.
+    let bits = |value: f64| match value.is_nan() {
+        true => u64::MAX,
+        false => value.to_bits(),
     };
     for (name, configuration, spoil, expected) in CASES {
         let mut data = Data {
@@ -197,53 +183,41 @@ fn files_and_arrays_take_the_same_way_through_a_session() {
         ]
         .map(|command| {
             let out = command.replace(' ', "");
-            let options = format!("--data data --submission {configuration} --out {out}");
-            let output = shell(
-                root.path(),
-                &format!("rm -rf {out}; shearq {command} {options}"),
-            );
-            (at(&out), String::from_utf8(output.stderr).unwrap())
+            folder.remove(&out);
+            let line =
+                format!("shearq {command} --data data --submission {configuration} --out {out}");
+            let output = shell(folder.root(), &line);
+            (out, String::from_utf8(output.stderr).unwrap())
         });
-        let Ok(batch) = batch else {
-            let error = batch.unwrap_err();
-            assert!(error.contains(expected), "{name}: {error}");
-            for (_, said) in &outs {
-                assert!(said.contains(&error), "{name}: {said}");
+        let batch = match batch {
+            Ok(batch) => batch,
+            Err(error) => {
+                assert_has(&error, expected);
+                outs.iter().for_each(|(_, said)| assert_has(said, &error));
+                continue;
             }
-            continue;
         };
         let warnings: Vec<String> = batch.warnings.iter().map(ToString::to_string).collect();
         let silent = warnings.is_empty();
         assert_eq!(silent, expected.is_empty(), "{name}: {warnings:?}");
-        let all = warnings.join("\n");
-        assert!(all.contains(expected), "{name}: {all}");
+        assert_has(&warnings.join("\n"), expected);
         for (out, said) in &outs {
-            for warning in &warnings {
-                assert!(said.contains(warning), "{name}: {said}\n{warning}");
-            }
-            let path = out.join("set02/catalogue-001.parquet");
-            let read = table::read(&path, None, table::MAX_ROWS).unwrap();
-            let columns: [(&str, Column); 5] = [
-                ("e1", |g| g.e1),
-                ("e2", |g| g.e2),
-                ("noise", |g| g.noise),
-                ("R12", |g| g.response.map_or(f64::NAN, |r| r[0][1])),
-                ("flags", |g| f64::from(g.flags.bits())),
+            warnings
+                .iter()
+                .for_each(|warning| assert_has(said, warning));
+            let names = ["e1", "e2", "noise", "R12", "flags"];
+            let values: [Column; 5] = [
+                |g| g.e1,
+                |g| g.e2,
+                |g| g.noise,
+                |g| g.response.map_or(f64::NAN, |r| r[0][1]),
+                |g| f64::from(g.flags.bits()),
             ];
-            // NaN is not equal to itself.
-            let bits = |value: f64| {
-                if value.is_nan() {
-                    u64::MAX
-                } else {
-                    value.to_bits()
-                }
-            };
-            for (column, value) in columns {
-                let found = table::numbers(&read, column, &path).unwrap();
-                assert_eq!(found.len(), batch.galaxies.len());
-                for (found, galaxy) in found.iter().zip(&batch.galaxies) {
-                    assert_eq!(bits(*found), bits(value(galaxy)), "{name}: {column}");
-                }
+            let found = folder.numbers(&format!("{out}/set02/catalogue-001.parquet"), names);
+            for ((column, found), value) in names.iter().zip(found).zip(values) {
+                let found = found.into_iter().map(bits);
+                let expected = batch.galaxies.iter().map(|galaxy| bits(value(galaxy)));
+                assert!(found.eq(expected), "{name}: {column}");
             }
         }
     }
@@ -251,33 +225,31 @@ fn files_and_arrays_take_the_same_way_through_a_session() {
 
 #[test]
 fn simulated_images_are_measured_like_their_files() {
-    let root = tempfile::tempdir().unwrap();
+    let folder = Folder::new();
     let sets = "--sets 2,19 --images 2 --grid 34";
-    printed(root.path(), &format!("shearq simulate {sets} --out data"));
-    for name in ["48/linear/star", "48/linear/func", "23/den/star"] {
-        let measure = format!("shearq measure --submission {name} --data data --out files");
-        let run = format!("shearq run --submission {name} --simulate {sets} --out memory");
-        printed(
-            root.path(),
-            &format!("rm -rf files memory; {measure} && {run}"),
-        );
-        let catalogues = |folder: &str| -> Vec<Vec<String>> {
-            let folder = root.path().join(folder);
-            let all = contents(&folder).into_iter();
-            let all = all.filter(|(path, _)| path.ends_with(".parquet"));
-            let values = all.flat_map(|(path, _)| {
-                let path = folder.join(path);
-                let read = table::read(&path, None, table::MAX_ROWS).unwrap();
-                ["e1", "e2", "R11", "noise", "flags"].map(|name| {
-                    let column = table::numbers(&read, name, &path).unwrap();
-                    assert_eq!(column.len(), 34 * 34);
-                    column.iter().map(ToString::to_string).collect()
-                })
+    folder.run(&format!("simulate {sets} --out data"));
+    for name in [LINEAR, "48/linear/func", "23/den/star"] {
+        let catalogues = |command: &str| -> Vec<[Vec<String>; 5]> {
+            folder.remove("out");
+            folder.run(&format!("{command} --submission {name} --out out"));
+            let files = contents(&folder.at("out"))
+                .into_iter()
+                .map(|(path, _)| path);
+            let files = files.filter(|path| path.ends_with(".parquet"));
+            let columns = files.map(|path| {
+                let columns = folder.numbers(
+                    &format!("out/{path}"),
+                    ["e1", "e2", "R11", "noise", "flags"],
+                );
+                columns.map(|column| column.iter().map(ToString::to_string).collect())
             });
-            values.collect()
+            columns.collect()
         };
-        let files = catalogues("files");
-        assert_eq!(files.len(), 4 * 5);
-        assert!(files == catalogues("memory"), "{name}");
+        let files = catalogues("measure --data data");
+        assert_eq!((files.len(), files[0][0].len()), (4, 34 * 34));
+        assert!(
+            files == catalogues(&format!("run --simulate {sets}")),
+            "{name}"
+        );
     }
 }

@@ -7,7 +7,7 @@ use std::path::Path;
 use flate2::Compression;
 use flate2::write::GzEncoder;
 
-use crate::support::{contents, printed, refused, shell};
+use crate::support::{Folder, contents, shell};
 
 /// An archive in memory.
 type Builder = tar::Builder<GzEncoder<fs::File>>;
@@ -34,35 +34,29 @@ fn archive(path: &Path, files: &[(&str, &[u8])]) {
 
 #[test]
 fn changed_archives_are_refused_and_leave_nothing() {
-    let root = tempfile::tempdir().unwrap();
-    let (place, path) = (root.path().join("place"), root.path().join("bad.tar.gz"));
-    for line in [
-        "shearq simulate --sets 8 --images 3 --grid 16 --out data",
-        "shearq measure --submission 23/raw/star --data data --out out",
-        "shearq pack --measured out --method NN --out sent; mkdir place",
-    ] {
-        printed(root.path(), line);
-    }
-    let sent = contents(&root.path().join("sent"));
-    let files: Vec<(&str, &[u8])> = sent
+    let folder = Folder::new();
+    folder.run("simulate --sets 8 --images 3 --grid 16 --out data");
+    folder.run("measure --submission 23/raw/star --data data --out out");
+    folder.run("pack --measured out --method NN --out sent");
+    let (place, path) = (folder.at("place"), folder.at("bad.tar.gz"));
+    fs::create_dir(&place).unwrap();
+    let sent = contents(&folder.at("sent"));
+    let files = sent
         .iter()
-        .map(|(name, content)| (name.as_str(), content.as_slice()))
-        .collect();
+        .map(|(name, content)| (name.as_str(), content.as_slice()));
+    let files: Vec<(&str, &[u8])> = files.collect();
     let check = |expected: &str| {
         for more in ["--out place/never", "--verify"] {
-            let message = refused(root.path(), &format!("shearq unpack bad.tar.gz {more}"));
-            let named = message.contains("bad.tar.gz") && message.contains(expected);
-            assert!(named, "{message}");
+            let words = format!("bad.tar.gz[..]{expected}");
+            folder.refuses(&format!("unpack bad.tar.gz {more}"), &words);
         }
         assert_eq!(fs::read_dir(&place).unwrap().count(), 0, "{expected}");
-        let check = shell(
-            root.path(),
-            "shearq check bad.tar.gz --data data --images 3",
-        );
+        let check = "shearq check bad.tar.gz --data data --images 3";
+        let check = shell(folder.root(), check);
         assert_eq!(check.status.code(), Some(1), "{expected}");
     };
     archive(&path, &files);
-    printed(root.path(), "shearq unpack bad.tar.gz --verify");
+    folder.run("unpack bad.tar.gz --verify");
     let with = |name: &str, content: &[u8]| {
         let mut files = files.clone();
         match files.iter_mut().find(|file| file.0 == name) {
@@ -89,7 +83,7 @@ fn changed_archives_are_refused_and_leave_nothing() {
         (
             "manifest.json",
             b"{}",
-            "manifest.json is not the manifest of a submission",
+            "is not the manifest of a submission",
         ),
     ] {
         with(name, content);

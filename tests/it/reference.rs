@@ -2,23 +2,9 @@
 //!
 //! To write changed pages, run `SHEARQ_ACCEPT=1 cargo test --release --test it reference`.
 
-use std::fmt::Write;
 use std::fs;
 
-use crate::support::succeed;
-
-/// Compares a page with its expected text, or writes it if changes are accepted.
-fn same(page: &str, expected: &str) {
-    let found = fs::read_to_string(page).unwrap_or_default();
-    if found != expected && std::env::var_os("SHEARQ_ACCEPT").is_some() {
-        fs::write(page, expected).unwrap();
-        return;
-    }
-    assert!(
-        found == expected,
-        "{page} is out of date. Try: SHEARQ_ACCEPT=1 cargo test --release --test it reference"
-    );
-}
+use crate::support::{assert_page, succeed};
 
 /// The names of the commands in the help of `arguments`.
 fn commands(arguments: &[&str]) -> Vec<String> {
@@ -40,29 +26,23 @@ fn the_page_of_commands_equals_their_help() {
     let mut page =
         String::from("# Commands\n\nThis page is generated from `shearq COMMAND --help`.\n");
     for command in commands(&[]) {
-        write!(
-            page,
-            "\n## {command}\n\n```text\n{}```\n",
-            help(&[&command])
-        )
-        .unwrap();
+        let help = trimmed(&[&command, "--help"]);
+        page += &format!("\n## {command}\n\n```text\n{help}```\n");
         for sub in commands(&[&command]) {
-            write!(
-                page,
-                "\n### {command} {sub}\n\n```text\n{}```\n",
-                help(&[&command, &sub])
-            )
-            .unwrap();
+            let help = trimmed(&[&command, &sub, "--help"]);
+            page += &format!("\n### {command} {sub}\n\n```text\n{help}```\n");
         }
     }
-    same("docs/commands.md", &page);
+    assert_page("docs/commands.md", &page, "reference");
 }
 
-/// The help without blanks at the ends of lines.
-fn help(arguments: &[&str]) -> String {
-    let help = succeed(&[arguments, &["--help"]].concat());
-    help.lines()
-        .fold(String::new(), |text, line| text + line.trim_end() + "\n")
+/// What a command prints, without blanks at the ends of lines.
+fn trimmed(arguments: &[&str]) -> String {
+    let printed = succeed(arguments);
+    let lines = printed
+        .lines()
+        .map(|line| line.trim_end().to_owned() + "\n");
+    lines.collect()
 }
 
 #[test]
@@ -70,20 +50,14 @@ fn the_page_of_configurations_equals_their_templates() {
     let mut page = String::from(
         "# Configurations\n\nThis page is generated from `shearq submissions list` and the commented files of the two methods.\n\n```text\n",
     );
-    page += &succeed(&["submissions", "list"])
-        .lines()
-        .fold(String::new(), |text, line| text + line.trim_end() + "\n");
+    page += &trimmed(&["submissions", "list"]);
     page += "```\n";
     for (title, file) in [
         ("The linear method", "submissions/named/48-linear-star.toml"),
         ("The network of the paper", "submissions/named/paper.toml"),
     ] {
-        write!(
-            page,
-            "\n## {title}\n\n```toml\n{}```\n",
-            fs::read_to_string(file).unwrap()
-        )
-        .unwrap();
+        let text = fs::read_to_string(file).unwrap();
+        page += &format!("\n## {title}\n\n```toml\n{text}```\n");
     }
-    same("docs/configurations.md", &page);
+    assert_page("docs/configurations.md", &page, "reference");
 }

@@ -4,53 +4,39 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 
-// The crates from the lowest level up, with their folders. A crate uses crates of lower levels only.
-const LEVELS: [&[(&str, &str)]; 8] = [
-    &[
-        ("shearq-fourier", "crates/fourier"),
-        ("shearq-quantities", "crates/quantities"),
-        ("shearq-submissions", "submissions"),
-    ],
-    &[
-        ("shearq-bias", "crates/bias"),
-        ("shearq-scoring", "scoring"),
-        ("shearq-measure", "crates/measure"),
-        ("shearq-files", "crates/files"),
-    ],
-    &[
-        ("shearq-simulate", "crates/simulate"),
-        ("shearq-render", "crates/render"),
-    ],
-    &[("shearq-dataset", "crates/dataset")],
-    &[
-        ("shearq-pipeline", "crates/pipeline"),
-        ("shearq-results", "crates/results"),
-    ],
-    &[
-        ("shearq-studies", "crates/studies"),
-        ("shearq-challenge", "crates/challenge"),
-    ],
-    &[("shearq", ".")],
-    &[("shearq-python", "python"), ("shearq-benches", "benches")],
-];
+/// Folder and level of each crate, as the table of the page states them.
+fn levels() -> BTreeMap<String, usize> {
+    let page = fs::read_to_string("docs/architecture.md").unwrap();
+    let rows = page.lines().filter_map(|line| {
+        let mut cells = line.strip_prefix("| ")?.split(" | ");
+        let level = cells.next()?.parse().ok()?;
+        Some((cells.next()?.trim_matches('`').to_owned(), level))
+    });
+    rows.collect()
+}
 
 // Folders with code.
 const CODE: [&str; 5] = ["src", "crates", "scoring", "submissions", "python"];
 
 // Crates that use no files, data frames or threads.
 const PURE: [&str; 7] = [
-    "shearq-bias",
-    "shearq-fourier",
-    "shearq-quantities",
-    "shearq-submissions",
-    "shearq-scoring",
-    "shearq-measure",
-    "shearq-simulate",
+    "crates/bias",
+    "crates/fourier",
+    "crates/quantities",
+    "crates/measure",
+    "crates/simulate",
+    "scoring",
+    "submissions",
 ];
 
 fn manifest(folder: &str) -> toml::Table {
+    let folder = if folder == "src" { "." } else { folder };
     let path = Path::new(folder).join("Cargo.toml");
     fs::read_to_string(path).unwrap().parse().unwrap()
+}
+
+fn name(manifest: &toml::Table) -> &str {
+    manifest["package"]["name"].as_str().unwrap()
 }
 
 // Without dev-dependencies.
@@ -61,61 +47,50 @@ fn dependencies(manifest: &toml::Table) -> Vec<String> {
 
 #[test]
 fn crates_use_those_below_them() {
-    let levels: BTreeMap<&str, usize> = LEVELS
+    let levels = levels();
+    let mut present: Vec<String> = ["python", "scoring", "src", "submissions"]
+        .map(str::to_owned)
+        .into();
+    let inner = fs::read_dir("crates").unwrap().map(|entry| entry.unwrap());
+    present.extend(inner.map(|entry| format!("crates/{}", entry.file_name().to_string_lossy())));
+    present.sort_unstable();
+    let listed: Vec<&String> = levels.keys().collect();
+    assert_eq!(
+        listed,
+        present.iter().collect::<Vec<_>>(),
+        "each crate has a level"
+    );
+    let manifests = levels
         .iter()
-        .enumerate()
-        .flat_map(|(level, crates)| crates.iter().map(move |(name, _)| (*name, level)))
-        .collect();
-    for (level, crates) in LEVELS.iter().enumerate() {
-        for (name, folder) in *crates {
-            let manifest = manifest(folder);
-            assert_eq!(manifest["package"]["name"].as_str(), Some(*name));
-            for used in dependencies(&manifest) {
-                if used.starts_with("shearq") {
-                    let Some(below) = levels.get(used.as_str()) else {
-                        panic!("{name} uses {used}, which has no level");
-                    };
-                    assert!(*below < level, "{name} uses {used}, which is not below it");
-                }
+        .map(|(folder, level)| (manifest(folder), level));
+    let manifests: Vec<_> = manifests.collect();
+    for (own, level) in &manifests {
+        for used in dependencies(own) {
+            if used.starts_with("shearq") {
+                let below = manifests
+                    .iter()
+                    .find(|(other, _)| name(other) == used)
+                    .unwrap()
+                    .1;
+                assert!(
+                    below < level,
+                    "{} uses {used}, which is not below it",
+                    name(own)
+                );
             }
         }
     }
-    let folders = LEVELS.iter().flat_map(|crates| crates.iter());
-    let mut listed: Vec<&str> = folders.map(|(_, folder)| *folder).collect();
-    let inner = fs::read_dir("crates").unwrap().map(|entry| entry.unwrap());
-    let mut present: Vec<String> = inner
-        .map(|entry| format!("crates/{}", entry.file_name().to_string_lossy()))
-        .chain(["benches", "python", "scoring", "submissions", "."].map(str::to_owned))
-        .collect();
-    listed.sort_unstable();
-    present.sort_unstable();
-    assert_eq!(listed, present, "each crate has a level");
 }
 
 #[test]
 fn pure_crates_use_neither_files_nor_threads() {
-    for (name, folder) in LEVELS.iter().flat_map(|crates| crates.iter()) {
-        if !PURE.contains(name) {
-            continue;
-        }
+    for folder in PURE {
         let used = dependencies(&manifest(folder));
         for other in ["shearq-files", "fitsio", "polars", "rayon"] {
-            assert!(!used.iter().any(|one| one == other), "{name} uses {other}");
-        }
-    }
-}
-
-#[test]
-fn the_architecture_page_lists_every_crate_with_its_level() {
-    let page = fs::read_to_string("docs/architecture.md").unwrap();
-    for (level, crates) in LEVELS.iter().enumerate() {
-        for (_, folder) in *crates {
-            if *folder == "benches" {
-                continue;
-            }
-            let folder = if *folder == "." { "src" } else { *folder };
-            let row = format!("| {} | `{folder}` |", level + 1);
-            assert!(page.contains(&row), "{row}");
+            assert!(
+                !used.iter().any(|one| one == other),
+                "{folder} uses {other}"
+            );
         }
     }
 }

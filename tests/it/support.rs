@@ -1,11 +1,13 @@
-//! Helpers of several tests: the binary and a shell, images that GalSim rendered, numbers from CSV files.
+//! Helpers of several tests: the binary in a folder, images that GalSim rendered, numbers of tables.
 
+use std::fs;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
 use flate2::Compression;
 use flate2::write::GzEncoder;
+use serde_json::Value;
 use shearq_files::table;
 
 /// The images of `tests/data` that fpack made, one for each of its ways.
@@ -39,11 +41,6 @@ pub fn succeed(arguments: &[&str]) -> String {
     String::from_utf8(output.stdout).expect("UTF-8")
 }
 
-/// Runs the binary, which must fail with exit code 1 and one error, and gives that.
-pub fn fail(arguments: &[&str]) -> String {
-    one_error(shearq(arguments), &arguments)
-}
-
 /// Runs a line of a shell in a folder, where `shearq` is the binary.
 pub fn shell(root: &Path, line: &str) -> Output {
     let binary = Path::new(env!("CARGO_BIN_EXE_shearq")).parent().unwrap();
@@ -66,12 +63,9 @@ pub fn printed(root: &Path, line: &str) -> String {
 
 /// Runs a line of a shell, which must fail with exit code 1 and one error, and gives that.
 pub fn refused(root: &Path, line: &str) -> String {
-    one_error(shell(root, line), &line)
-}
-
-fn one_error(output: Output, command: &dyn std::fmt::Debug) -> String {
+    let output = shell(root, line);
     let message = String::from_utf8(output.stderr).expect("UTF-8");
-    assert_eq!(output.status.code(), Some(1), "{command:?}: {message}");
+    assert_eq!(output.status.code(), Some(1), "{line}: {message}");
     assert!(message.starts_with("error: "), "{message}");
     assert!(!message.contains("panicked"), "{message}");
     message
@@ -121,57 +115,109 @@ pub fn csv(path: &Path, names: &[&str]) -> Vec<Vec<f64>> {
     columns
 }
 
-/// A simulated set of two images of 8 × 8 galaxies, for tests that spoil one of its files.
-pub struct Small {
-    root: tempfile::TempDir,
-}
+/// A temporary folder in which the binary runs.
+pub struct Folder(tempfile::TempDir);
 
-impl Small {
-    /// Set 2, which has one PSF, or set 19, which has one per galaxy.
-    pub fn new(set: &str) -> Self {
-        let root = tempfile::tempdir().expect("a temporary folder");
-        let data = root.path().join("data");
-        let simulate = ["simulate", "--images", "2", "--grid", "8", "--seed", "5"];
-        succeed(&[&simulate[..], &["--sets", set, "--out", text(&data)]].concat());
-        Small { root }
+impl Folder {
+    pub fn new() -> Self {
+        Folder(tempfile::tempdir().expect("a temporary folder"))
     }
 
-    /// The temporary folder.
+    /// With `data`: two images of 8 × 8 galaxies of set 2, which has one PSF, or 19, which has one per galaxy.
+    pub fn with_set(set: u32) -> Self {
+        let folder = Folder::new();
+        let simulate = "simulate --images 2 --grid 8 --seed 5 --out data --sets";
+        folder.run(&format!("{simulate} {set}"));
+        folder
+    }
+
     pub fn root(&self) -> &Path {
-        self.root.path()
+        self.0.path()
     }
 
-    /// A path in the temporary folder.
     pub fn at(&self, name: &str) -> PathBuf {
-        self.root.path().join(name)
+        self.root().join(name)
     }
 
-    /// Measures `data` into a new folder `out`, as `settings` say.
-    fn measured_into_out(&self, settings: &[&str]) -> Output {
-        let line = "rm -rf out; shearq measure --data data --out out";
-        shell(self.root.path(), &format!("{line} {}", settings.join(" ")))
+    pub fn write(&self, name: &str, content: impl AsRef<[u8]>) {
+        let path = self.at(name);
+        fs::create_dir_all(path.parent().expect("a folder")).expect("a new folder");
+        fs::write(path, content).expect("written");
     }
 
-    /// The same, and must fail; gives the error.
-    pub fn fail_to_measure(&self, settings: &[&str]) -> String {
-        one_error(self.measured_into_out(settings), &settings)
+    /// Writes an image in single precision.
+    pub fn image(&self, name: &str, sides: &[usize], cards: &[&str], pixels: &[f32]) {
+        self.write(name, fits_image(-32, sides, cards, &floats(pixels)));
     }
 
-    /// The same, and must succeed; gives what was printed on standard error.
-    pub fn measure(&self, settings: &[&str]) -> String {
-        let output = self.measured_into_out(settings);
+    /// Removes a file or folder, if there is one.
+    pub fn remove(&self, name: &str) {
+        let _ = fs::remove_file(self.at(name));
+        let _ = fs::remove_dir_all(self.at(name));
+    }
+
+    /// Runs `shearq` with the words of a line, which must succeed, and gives its standard output.
+    pub fn run(&self, line: &str) -> String {
+        printed(self.root(), &format!("shearq {line}"))
+    }
+
+    /// The same, and gives its standard error.
+    pub fn said(&self, line: &str) -> String {
+        let output = shell(self.root(), &format!("shearq {line}"));
         let said = String::from_utf8(output.stderr).expect("UTF-8");
-        assert!(output.status.success(), "{said}");
+        assert!(output.status.success(), "{line}: {said}");
         said
     }
 
-    /// A column of the first image's catalogue in `out`.
-    pub fn measured(&self, set: &str, column: &str) -> Vec<f64> {
-        let path = self.at(&format!("out/set{set}/catalogue-001.parquet"));
-        let table = table::read(&path, None, table::MAX_ROWS).expect("a catalogue");
-        table::numbers(&table, column, &path)
-            .expect("a column of it")
-            .into_owned()
+    /// Runs a line that must fail with an error, of which `words` are a part.
+    pub fn refuses(&self, line: &str, words: &str) {
+        assert_has(&refused(self.root(), &format!("shearq {line}")), words);
+    }
+
+    pub fn json(&self, line: &str) -> Value {
+        let printed = self.run(&format!("{line} --format json"));
+        serde_json::from_str(&printed).expect("JSON")
+    }
+
+    /// Measures `data` into a new folder `out`, and gives the standard error.
+    pub fn measure(&self, options: &str) -> String {
+        self.remove("out");
+        self.said(&format!("measure --data data --out out {options}"))
+    }
+
+    /// Columns of a table.
+    pub fn numbers<const N: usize>(&self, name: &str, columns: [&str; N]) -> [Vec<f64>; N] {
+        let path = self.at(name);
+        let table = table::read(&path, None, table::MAX_ROWS).expect("a table");
+        columns.map(|column| {
+            let values = table::numbers(&table, column, &path);
+            values.expect("a column of it").into_owned()
+        })
+    }
+}
+
+/// A page of the documents is what generates it gives now; `SHEARQ_ACCEPT` writes it.
+pub fn assert_page(page: impl AsRef<Path>, expected: &str, test: &str) {
+    let page = page.as_ref();
+    let found = fs::read_to_string(page).unwrap_or_default();
+    if found != expected && std::env::var_os("SHEARQ_ACCEPT").is_some() {
+        return fs::write(page, expected).expect("written");
+    }
+    let page = page.display();
+    assert!(
+        found == expected,
+        "{page} is out of date. Try: SHEARQ_ACCEPT=1 cargo test --release --test it {test}"
+    );
+}
+
+/// A text contains the parts of `words` between `[..]`, one after the other.
+pub fn assert_has(text: &str, words: &str) {
+    let mut rest = text;
+    for part in words.split("[..]") {
+        let Some((_, after)) = rest.split_once(part) else {
+            panic!("expected {words}\nfound {text}");
+        };
+        rest = after;
     }
 }
 
@@ -200,11 +246,51 @@ pub fn fits_image(bitpix: i32, sides: &[usize], cards: &[&str], pixels: &[u8]) -
     bytes
 }
 
+/// The same as an extension of a file of several.
+pub fn fits_extension(
+    kind: &str,
+    bitpix: i32,
+    sides: &[usize],
+    cards: &[&str],
+    pixels: &[u8],
+) -> Vec<u8> {
+    let counts = ["PCOUNT  = 0", "GCOUNT  = 1"];
+    let mut bytes = fits_image(bitpix, sides, &[&counts, cards].concat(), pixels);
+    bytes[..80].copy_from_slice(format!("{:<80}", format!("XTENSION= '{kind:<8}'")).as_bytes());
+    bytes
+}
+
 /// All pixels of an image, and its side.
 pub fn pixels_of(path: &Path) -> (Vec<f32>, usize) {
     let mut image = shearq_files::fits::ImageReader::open(path).expect("an image");
     let side = image.width();
     (image.read_rows(side).expect("its pixels"), side)
+}
+
+/// The stamps of a mosaic, along its rows.
+pub fn stamps_of(path: &Path, side: usize) -> Vec<Vec<f32>> {
+    let (pixels, width) = pixels_of(path);
+    stamps(&pixels, width, side)
+}
+
+pub fn stamps(pixels: &[f32], width: usize, side: usize) -> Vec<Vec<f32>> {
+    let (n, rows) = (width / side, pixels.len() / width / side);
+    let stamp = |k: usize| {
+        let (x, y) = (k % n * side, k / n * side);
+        let rows = (y..y + side).map(|row| &pixels[row * width + x..][..side]);
+        rows.flatten().copied().collect()
+    };
+    (0..n * rows).map(stamp).collect()
+}
+
+/// The pixels of a mosaic of stamps in rows of `n`.
+pub fn mosaic(stamps: &[f32], side: usize, n: usize) -> Vec<f32> {
+    let pixel = |at: usize| {
+        let (x, y) = (at % (n * side), at / (n * side));
+        let stamp = y / side * n + x / side;
+        stamps[(stamp * side + y % side) * side + x % side]
+    };
+    (0..stamps.len()).map(pixel).collect()
 }
 
 /// Pixels as FITS stores them.
