@@ -27,7 +27,6 @@ mod ledger;
 mod one_session;
 mod orientation;
 mod packed;
-mod printed;
 mod reference;
 mod reproduced;
 mod scoring_cases;
