@@ -16,19 +16,12 @@ fn write_cube(folder: &Folder, name: &str, stamps: &[Vec<f32>]) {
     folder.image(name, &[side, side, stamps.len()], &[], &stamps.concat());
 }
 
-/// Writes a file of an empty primary header and extensions with names.
-fn write_extensions(folder: &Folder, name: &str, stamps: &[(&str, &[f32])]) {
-    let mut file = fits_image(8, &[], &["EXTEND  =                    T"], &[]);
-    for (name, stamp) in stamps {
-        let name = format!("EXTNAME = '{name:<8}'");
+/// Writes a file of an empty primary header and an extension for each stamp.
+fn write_extensions(folder: &Folder, name: &str, stamps: &[Vec<f32>]) {
+    let mut file = fits_image(8, &[], &["EXTEND  = T"], &[]);
+    for stamp in stamps {
         let sides = [stamp.len().isqrt(); 2];
-        file.extend(fits_extension(
-            "IMAGE",
-            -32,
-            &sides,
-            &[&name],
-            &floats(stamp),
-        ));
+        file.extend(fits_extension("IMAGE", -32, &sides, &[], &floats(stamp)));
     }
     folder.write(name, file);
 }
@@ -72,15 +65,11 @@ fn stamps_of_all_kinds_of_files_are_measured_alike() {
     let star = set.join("psf-001.fits");
     let stars = stamps_of(&star, pixels_of(&star).1 / 8);
 
-    let extensions = |name: &str, stamps: &[Vec<f32>]| {
-        let unnamed: Vec<(&str, &[f32])> = stamps.iter().map(|stamp| ("", &stamp[..])).collect();
-        write_extensions(&folder, name, &unnamed);
-    };
     write_cube(&folder, "cube.fits", &galaxies);
-    extensions("parts.fits", &galaxies[1..]);
+    write_extensions(&folder, "parts.fits", &galaxies[1..]);
     folder.image("first.fits", &[48, 48], &[], &galaxies[0]);
     write_cube(&folder, "stars.fits", &stars);
-    extensions("stars-parts.fits", &stars);
+    write_extensions(&folder, "stars-parts.fits", &stars);
     // A position within half a pixel of the centre has the same stamp.
     let centre = |index: usize| index as f64 * 48.0 + 24.5;
     let rows = (0..64).map(|k| format!("{k},{},{}\n", centre(k % 8) + 0.4, centre(k / 8) - 0.4));
@@ -239,95 +228,6 @@ fn lost(found: &[Vec<f32>]) -> Vec<usize> {
 }
 
 #[test]
-fn extensions_are_chosen_by_name_and_masks_make_pixels_missing() {
-    let folder = Folder::new();
-    write_cube(&folder, "psf.fits", &[vec![1.0; 400]]);
-    let stamps: Vec<Vec<f32>> = (0..4).map(|k| vec![1.0 + k as f32; 576]).collect();
-    let mut flags = vec![vec![0.0f32; 576]; 4];
-    flags[2][24 * 3 + 5] = 4.0;
-    let pairs = stamps.iter().zip(&flags);
-    let parts = pairs.flat_map(|(stamp, flag)| [("SCI", &stamp[..]), ("ERR", flag), ("DQ", flag)]);
-    write_extensions(&folder, "parts.fits", &parts.collect::<Vec<_>>());
-    // What is called a mask may be one.
-    let called: Vec<(&str, &[f32])> = flags.iter().map(|flag| ("MASK", &flag[..])).collect();
-    write_extensions(&folder, "named.fits", &called);
-    write_cube(&folder, "masks.fits", &flags);
-    write_cube(&folder, "three.fits", &flags[..3]);
-    write_cube(&folder, "five.fits", &[&flags[..], &flags[..1]].concat());
-    // An exposure of the four side by side.
-    for (name, of) in [("wide.fits", &stamps), ("wide-mask.fits", &flags)] {
-        let rows = (0..24).flat_map(|y| of.iter().flat_map(move |s| s[24 * y..][..24].to_vec()));
-        folder.image(name, &[96, 24], &[], &rows.collect::<Vec<_>>());
-    }
-    folder.write(
-        "places.csv",
-        "x,y\n12.5,12.5\n36.5,12.5\n60.5,12.5\n84.5,12.5\n",
-    );
-    let sky = "--stamps parts.fits --extension sci";
-    let cut = "--exposure wide.fits --positions places.csv --size 24";
-    assert_eq!(gathered(&folder, sky, 24), stamps);
-    for (from, mask) in [
-        (sky, "--mask-extension DQ"),
-        (sky, "--mask masks.fits"),
-        (sky, "--mask named.fits"),
-        (cut, "--mask wide-mask.fits"),
-    ] {
-        let found = gathered(&folder, &format!("{from} {mask}"), 24);
-        assert_eq!(lost(&found), [2 * 576 + 24 * 3 + 5]);
-        assert_eq!(found[3], stamps[3]);
-    }
-    for (from, more, words) in [
-        (
-            "--stamps parts.fits",
-            "",
-            "parts.fits: image 2, plane 1: the image is called ERR; expected an image of the sky or a PSF. Try: choose images by name with --extension",
-        ),
-        (
-            "--stamps parts.fits",
-            "--extension PRIMARY",
-            "there is no image called `PRIMARY`; found `SCI`, `ERR`, `DQ`, `SCI`",
-        ),
-        (
-            sky,
-            "--mask parts.fits",
-            "parts.fits: image 1, plane 1: the mask is the image itself; expected another (--mask-extension)",
-        ),
-        (
-            sky,
-            "--mask three.fits",
-            "image 10, plane 1: there is no mask for this stamp",
-        ),
-        (
-            sky,
-            "--mask five.fits",
-            "plane 5: there is no stamp for this mask",
-        ),
-        (
-            sky,
-            "--mask wide-mask.fits",
-            "wide-mask.fits: image 1, plane 1: the mask is 96 × 24 pixels; its stamp has 24 × 24",
-        ),
-        (
-            cut,
-            "--mask wide-mask.fits named.fits",
-            "named.fits: this is a second file",
-        ),
-        (
-            cut,
-            "--mask masks.fits",
-            "masks.fits: image 1, plane 1: the image has 4 planes",
-        ),
-        (
-            cut,
-            "--mask psf.fits",
-            "the mask is 20 × 20 pixels; the exposure has 96 × 24",
-        ),
-    ] {
-        refuse_to_gather(&folder, &format!("{from} {more} --psf psf.fits"), words);
-    }
-}
-
-#[test]
 fn compressed_cubes_are_read_plane_by_plane() {
     let folder = Folder::new();
     write_cube(&folder, "psf.fits", &[vec![1.0; 400]]);
@@ -341,62 +241,6 @@ fn compressed_cubes_are_read_plane_by_plane() {
         [0, 1, 2].map(|plane| (0..576).map(|at| value(plane, at)).collect());
     let found = gathered(&folder, "--stamps cube.fits", 24);
     assert_eq!(found[..3], expected);
-}
-
-#[test]
-fn stamps_become_squares_of_the_largest_side_on_request() {
-    let folder = Folder::new();
-    write_cube(&folder, "psf.fits", &[vec![1.0; 400]]);
-    let value = |x: usize, y: usize| (100 * y + x) as f32;
-    for (name, columns, rows) in [
-        ("wide.fits", 24, 20),
-        ("small.fits", 21, 21),
-        ("large.fits", 24, 24),
-    ] {
-        let pixels: Vec<f32> = (0..columns * rows)
-            .map(|at| value(at % columns, at / columns))
-            .collect();
-        folder.image(name, &[columns, rows], &[], &pixels);
-    }
-    // Column 0 and row 0 of the stamp are at `first` in the file.
-    let expected = |side: usize, [columns, rows]: [usize; 2], first: [i64; 2]| -> Vec<u32> {
-        let pixel = |at: usize| {
-            let (x, y) = ((at % side) as i64 + first[0], (at / side) as i64 + first[1]);
-            match (0..columns as i64).contains(&x) && (0..rows as i64).contains(&y) {
-                true => value(x as usize, y as usize).to_bits(),
-                false => f32::NAN.to_bits(),
-            }
-        };
-        (0..side * side).map(pixel).collect()
-    };
-    let bits = |stamp: &[f32]| -> Vec<u32> { stamp.iter().map(|value| value.to_bits()).collect() };
-    let wide = "--stamps wide.fits";
-    refuse_to_gather(
-        &folder,
-        &format!("{wide} --psf psf.fits"),
-        "24 × 20[..]--square crop",
-    );
-    for (how, side, first) in [("crop", 20, [2, 0]), ("pad", 24, [0, -2])] {
-        let found = gathered(&folder, &format!("{wide} --square {how}"), side);
-        assert_eq!(bits(&found[0]), expected(side, [24, 20], first));
-    }
-    // A mask has the shape of its stamp.
-    let mut mask = [0.0; 480];
-    mask[24 * 5 + 7] = 1.0;
-    folder.image("mask.fits", &[24, 20], &[], &mask);
-    let found = gathered(
-        &folder,
-        &format!("{wide} --square crop --mask mask.fits"),
-        20,
-    );
-    assert_eq!(lost(&found), [20 * 5 + 5]);
-    // Without a request: these are squares.
-    let both = "--stamps small.fits large.fits large.fits large.fits";
-    let found = gathered(&folder, both, 24);
-    assert_eq!(bits(&found[0]), expected(24, [21, 21], [-2, -2]));
-    assert_eq!(bits(&found[1]), expected(24, [24, 24], [0, 0]));
-    let said = gather(&folder, &format!("{both} --psf psf.fits"));
-    assert_has(&said, "the stamps have sides of 21 to 24 px");
 }
 
 #[test]
@@ -429,50 +273,6 @@ fn mask_bits_and_sextractors_blank_make_pixels_missing() {
         "the mask has the value 0.5",
     );
     refuse_to_gather(&folder, bits, "without a mask");
-}
-
-#[test]
-fn small_psfs_and_grids_of_stars_are_explained() {
-    let folder = Folder::new();
-    let profile = PsfProfile::Moffat { beta: 3.0 };
-    let psf = FunctionalPsf::new(profile, 3.4, Shear::ZERO).unwrap();
-    let star = |side: usize| -> Vec<f32> { psf.stamp(side).iter().map(|v| *v as f32).collect() };
-    let one = star(48);
-    // As GREAT3 has them.
-    let nine = (0..144 * 144)
-        .map(|at| one[at / 144 % 48 * 48 + at % 48])
-        .collect();
-    for (name, stamps) in [
-        ("stamps.fits", vec![one.clone(); 4]),
-        ("three.fits", vec![one; 3]),
-        ("small.fits", vec![star(24)]),
-        ("nine.fits", vec![nine]),
-        ("large.fits", vec![star(144)]),
-    ] {
-        write_cube(&folder, name, &stamps);
-    }
-    for (psf, words) in [
-        ("absent.fits", "absent.fits"),
-        ("three.fits", "at least twice as many stamps"),
-        (
-            "nine.fits",
-            "the image has 3 × 3 stars[..]a cube of 9 stamps of 48 × 48 px",
-        ),
-    ] {
-        folder.refuses(
-            &format!("gather --stamps stamps.fits --psf {psf} --out new/data"),
-            words,
-        );
-        // A failure leaves no folder.
-        assert!(!folder.at("new").exists(), "{psf}");
-    }
-    let said = gather(&folder, "--stamps stamps.fits --psf small.fits");
-    assert_has(&said, "24 × 24 px (expected 32 × 32[..]psf.size = 24");
-    let said = gather(&folder, "--stamps stamps.fits --psf large.fits");
-    assert!(
-        !said.contains("stars") && !said.contains("expected 32"),
-        "{said}"
-    );
 }
 
 #[test]

@@ -8,6 +8,8 @@
 //! * `card FROM TO KEY=VALUE`: a copy with another value of a key. `card FROM TO KEY CARD`: a copy with any card in the
 //!   place of the last one of this key; `"` stands for `'`.
 //! * `tables TO NAME=CSV...`: a file of tables, each from a CSV of numbers.
+//! * `extensions TO NAME=IMAGE...`: a file of named images.
+//! * `missing FROM`: prints the places of pixels that are NaN, from 1.
 //! * `stamps FROM SIDE`: prints the first pixel of each stamp of a mosaic.
 //! * `csv FROM TO COLUMN...`: writes columns of a catalogue as CSV, or prints why it cannot be read.
 //! * `sign PRIVATE ENTRY TEAM TIME`: writes a receipt for an entry of the past, with the key of a challenge.
@@ -21,7 +23,9 @@ use shearq_files::frames::frame;
 use shearq_files::frames::polars::Column;
 use shearq_files::table;
 
-use crate::support::{contents, csv, fits_image, mosaic, pixels_of, stamps, text};
+use crate::support::{
+    contents, csv, fits_extension, fits_image, floats, mosaic, pixels_of, stamps, text,
+};
 
 /// Runs a command of this module in `root`, and gives what it prints; `None` if it is another.
 pub fn run(command: &str, root: &Path) -> Option<String> {
@@ -62,6 +66,30 @@ pub fn run(command: &str, root: &Path) -> Option<String> {
                 file.extend(&bytes[if file.is_empty() { 0 } else { 2880 }..]);
             }
             fs::write(at(to), file).unwrap();
+        }
+        ["extensions", to, images @ ..] => {
+            let mut file = fits_image(8, &[], &["EXTEND  = T"], &[]);
+            for (name, from) in images.iter().filter_map(|image| image.split_once('=')) {
+                let (pixels, width) = pixels_of(&at(from));
+                let (sides, name) = (
+                    [width, pixels.len() / width],
+                    format!("EXTNAME = '{name:<8}'"),
+                );
+                file.extend(fits_extension(
+                    "IMAGE",
+                    -32,
+                    &sides,
+                    &[&name],
+                    &floats(&pixels),
+                ));
+            }
+            fs::write(at(to), file).unwrap();
+        }
+        ["missing", from] => {
+            let (pixels, width) = pixels_of(&at(from));
+            let places = (0..pixels.len()).filter(|k| pixels[*k].is_nan());
+            let places = places.map(|k| format!("{},{}", k % width + 1, k / width + 1));
+            return Some(places.collect::<Vec<_>>().join(" "));
         }
         ["stamps", from, side] => {
             let (pixels, width) = pixels_of(&at(from));
