@@ -15,7 +15,6 @@ mod commands {
     pub(crate) mod baseline;
     pub(crate) mod bench;
     pub(crate) mod bias;
-    pub(crate) mod calibrate;
     pub(crate) mod challenge;
     pub(crate) mod check;
     pub(crate) mod compare;
@@ -34,7 +33,6 @@ mod commands {
     pub(crate) mod shear;
     pub(crate) mod show;
     pub(crate) mod simulate;
-    pub(crate) mod study;
     pub(crate) mod submissions;
     pub(crate) mod unpack;
 }
@@ -45,9 +43,8 @@ use std::process::ExitCode;
 use clap::{Parser, Subcommand};
 
 use commands::{
-    baseline, bench, bias, calibrate, challenge, check, compare, completions, gather, mean,
-    measure, merge, pack, quickstart, reproduce, run, score, select, shear, show, simulate, study,
-    submissions, unpack,
+    baseline, bench, bias, challenge, check, compare, completions, gather, mean, measure, merge,
+    pack, quickstart, reproduce, run, score, select, shear, show, simulate, submissions, unpack,
 };
 use shearq_files::parquet::panic_is_caught;
 use shearq_render::escape::visible;
@@ -141,14 +138,8 @@ enum Command {
         after_help = "Example:\n  shearq show --submission 48/linear/star --data data --galaxy 7/1/42 --out galaxy.png"
     )]
     Show(show::Arguments),
-    #[command(
-        after_help = "Example:\n  shearq calibrate --submission 23/den/star --out calibration"
-    )]
-    Calibrate(calibrate::Arguments),
     #[command(after_help = "Example:\n  shearq reproduce --images 4 --out paper")]
     Reproduce(reproduce::Arguments),
-    #[command(after_help = "Example:\n  shearq study --sets 2,8 --images 10 --pairs 4 --out study")]
-    Study(study::Arguments),
     #[command(after_help = "Example:\n  shearq bench --submission 48/linear/star")]
     Bench(bench::Arguments),
     #[command(
@@ -226,9 +217,7 @@ pub fn run_with(arguments: impl IntoIterator<Item = OsString>) -> u8 {
         Command::Pack(arguments) => pack::run(&arguments),
         Command::Unpack(arguments) => unpack::run(&arguments),
         Command::Show(arguments) => show::run(&arguments),
-        Command::Calibrate(arguments) => calibrate::run(&arguments),
         Command::Reproduce(arguments) => reproduce::run(&arguments),
-        Command::Study(arguments) => study::run(&arguments),
         Command::Bench(arguments) => bench::run(&arguments),
         Command::Submissions(arguments) => submissions::run(&arguments),
         Command::Completions(arguments) => completions::run(&arguments),

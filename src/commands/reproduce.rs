@@ -1,23 +1,32 @@
+//! `shearq reproduce`.
+
+mod lambda;
+mod sets;
+
 use std::path::PathBuf;
 
 use anyhow::bail;
 use clap::Args;
 use shearq_submissions::{Configuration, Published, Registry};
 
+use self::sets::Plan;
 use crate::arguments::{SetList, Threads, given_once};
 use crate::progress::{Bar, mark_resumable};
 use crate::{made_by, print, print_table, tell};
 use shearq_dataset::layout::MAX_IMAGE;
+use shearq_dataset::run::claim;
+use shearq_pipeline::PipelineError;
+use shearq_pipeline::run::{measurers, simulated_steps};
+use shearq_pipeline::simulate::simulator;
+use shearq_render::figure::ImageRow;
 use shearq_render::page::Page;
+use shearq_results::views::pages::{steps_figure, steps_row};
 use shearq_simulate::set::SimulationSettings;
-use shearq_studies::calibration::{best_table, calibrate};
-use shearq_studies::exhibits;
-use shearq_studies::reproduce::{Plan, Study, run_sets};
 
 /// Reproduce the figures and tables of the paper on simulated data.
 ///
-/// Sect. 4: calibration of λ on synthetic galaxies (Figs 4 to 7). Sect. 5: the seven configurations of Table 1 on 24
-/// sets (Table 1, Figs 8 to 11), simulated and measured in memory.
+/// Sect. 4: the regularisation parameter λ on synthetic galaxies (Figs 4 to 7). Sect. 5: the seven configurations of
+/// Table 1 on 24 sets (Table 1, Figs 8 to 11), simulated and measured in memory.
 ///
 /// The command writes an HTML report, figures as PNG and SVG, and their data as CSV. Finished sets are
 /// kept, so the same command resumes a stopped run. The default takes minutes; --images 200, as in the challenge,
@@ -39,7 +48,7 @@ pub(crate) struct Arguments {
     /// Configuration of Table 1. May be given several times [default: all seven].
     #[arg(long, value_name = "NAME")]
     submission: Vec<String>,
-    /// Number of galaxies for the calibration; the paper has 10000.
+    /// Number of synthetic galaxies for λ; the paper has 10000.
     #[arg(long, value_name = "N", default_value_t = 200, value_parser = clap::value_parser!(u64).range(10..=1_000_000))]
     galaxies: u64,
     /// Seed of all random numbers.
@@ -48,6 +57,14 @@ pub(crate) struct Arguments {
     #[command(flatten)]
     threads: Threads,
 }
+
+// The paper shows these two in Figs 3 and 9 to 11.
+const RAW: &str = "23/raw/star";
+const DENOISED: &str = "23/den/star";
+
+const SECT_THREE: &str = "The network deconvolves a stamp. The ellipticity is measured on the autocorrelation (ACF) of the result, after subtracting the mean of its edge. The ACF is clipped at the radius that contains 89 % of the largest enclosed light.";
+const SECT_FOUR: &str = "Exponential galaxies are convolved with a Moffat PSF each and have white noise of 10 to 40 dB. Both updating rules deconvolve them with λ from 10⁻⁶ to 10⁶. All data are simulated.";
+const SECT_FIVE: &str = "Configurations of Table 1 on sets of Table 2. The images are simulated, not the challenge's. Unpublished properties are chosen here: distributions of S/N and size, PSF fields and shear spectra. Metrics are for the standard convention and the leaderboard definition. Errors come from the part of the ellipticities that the truth does not explain.";
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     mark_resumable();
@@ -63,26 +80,23 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let sets = arguments.sets.simulated()?;
     let registry = Registry::embedded()?;
     let configurations = of_table_one(&registry, &arguments.submission)?;
-    let names: Vec<String> = configurations
-        .iter()
-        .map(|(own, _)| own.name.clone())
-        .collect();
     let plan = Plan {
         version: shearq_dataset::VERSION.into(),
         simulation: SimulationSettings::new(*seed, usize::from(*grid)),
         images: *images,
         configurations: configurations.iter().map(|(own, _)| own.clone()).collect(),
     };
+    let claim = claim(&out.join("plan.json"), &plan)?;
     let total = sets.len() as u64 * u64::from(*images) * u64::from(*grid).pow(2);
     let mut bar = Bar::new("simulating and measuring", total);
-    let study = Study::open(&plan, out)?;
-    let results = run_sets(&study, &sets, threads, &mut bar)?;
+    let results = sets::score_sets(&plan, &sets, (out, &claim), threads, &mut bar)?;
     drop(bar);
-    let mut bar = Bar::new("calibrating", *galaxies);
-    // Sect. 4 calibrates one network; the configurations of Table 1 extend its settings.
+    let mut bar = Bar::new("deconvolving", *galaxies);
+    // Sect. 4 has one network; the configurations of Table 1 extend its settings.
     let base = registry.get("paper")?.configuration;
-    let curves = calibrate(&base, *galaxies, *seed, threads, &mut bar)?;
+    let curves = lambda::calibrate(&base, *galaxies, *seed, threads, &mut bar)?;
     drop(bar);
+    let steps = steps(&plan)?;
 
     let data = format!(
         "simulated: {} sets, {images} images of {grid} × {grid} galaxies",
@@ -91,37 +105,61 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let settings = made_by([
         ("Seed", seed.to_string()),
         ("Data", data),
-        ("Calibration", format!("{galaxies} synthetic galaxies")),
-        ("Settings of the calibration", toml::to_string(&base)?),
+        ("Galaxies of Sect. 4", galaxies.to_string()),
+        ("Settings of Sect. 4", toml::to_string(&base)?),
     ]);
     // The folder may have been removed during hours of work; a page without its results would be made there.
-    study.claim.check()?;
+    claim.check()?;
     let mut page = Page::new(
         out,
         "Hopfield Neural Network deconvolution, reproduced",
         "Figures and tables of Nurbaeva et al. from simulated data",
         settings,
     );
-    let table_one = exhibits::table_one(&results, &configurations);
-    let calibration = best_table(&curves, &base);
-    exhibits::exhibits(
-        &mut page,
-        exhibits::steps(&plan)?,
-        (&curves, &calibration),
-        &table_one,
-        &results,
-        &names,
-    )?;
-    study.claim.check()?;
+    page.section("The method (Sect. 3)", SECT_THREE);
+    if !steps.is_empty() {
+        page.figure(
+            "fig3-steps",
+            &steps_figure(RAW, steps),
+            "As Fig. 3 of the paper: from a stamp to its clipped autocorrelation, for a galaxy at S/N 10, 20 and 40.",
+        )?;
+    }
+    page.section("Choice of λ (Sect. 4)", SECT_FOUR);
+    lambda::figures(&mut page, &curves)?;
+    let best_lambda = lambda::best_table(&curves, *galaxies);
+    page.table("lambda", &best_lambda)?;
+    page.section("Configurations (Sect. 5)", SECT_FIVE);
+    let table_one = sets::table_one(&results, &configurations);
+    page.table("table1", &table_one)?;
+    sets::figures(&mut page, &results)?;
+    page.section("Every set", "The data of the figures per set.");
+    page.table("fig8-11-per-set", &sets::per_set_table(&results))?;
+    claim.check()?;
     page.save()?;
     print_table(&table_one)?;
     print("\n")?;
-    print_table(&calibration)?;
+    print_table(&best_lambda)?;
     tell(format_args!(
         "wrote report, figures and data to {}",
         out.display()
     ));
     Ok(())
+}
+
+// The steps of one galaxy at S/N 10, 20 and 40, as in Fig. 3, if the plan has the configuration of that figure.
+fn steps(plan: &Plan) -> Result<Vec<ImageRow>, PipelineError> {
+    let configuration = plan.configurations.iter().find(|own| own.name == RAW);
+    let measurers = measurers(configuration.map_or(&[][..], std::slice::from_ref))?;
+    let mut rows = Vec::new();
+    for measurer in &measurers {
+        for (set, snr) in [(5, 10), (2, 20), (8, 40)] {
+            let simulator = simulator(set, plan.simulation)?;
+            if let Some(steps) = simulated_steps(&simulator, measurer, 1, (1, 1))? {
+                rows.push(steps_row(&format!("S/N {snr}"), steps));
+            }
+        }
+    }
+    Ok(rows)
 }
 
 // The configurations of Table 1 with these names, in its order; all if `wanted` is empty.
@@ -135,7 +173,7 @@ fn of_table_one(
     // Only configurations of Table 1 have published values to compare with.
     if let Some(name) = wanted.iter().find(|name| !known.contains(name)) {
         bail!(
-            "--submission: not in Table 1 (found {name}, expected one of {}). Try: shearq study --submission {name}",
+            "--submission: not in Table 1 (found {name}, expected one of {}). Try: shearq run --simulate --submission {name}",
             known.join(", ")
         );
     }

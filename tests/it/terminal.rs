@@ -36,7 +36,6 @@ fn tables_fit_eighty_columns_and_wide_ones_are_asked_for() {
         "compare den linear",
         "compare --store store",
         "submissions list",
-        "study --sets 2 --images 2 --pairs 1 --grid 8 --out study",
         "run --simulate --sets 2 --images 2 --grid 8 --submission 23/raw/star --out run",
     ] {
         assert_narrow(&folder, command);

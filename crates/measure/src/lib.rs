@@ -86,7 +86,7 @@ pub use shearq_submissions::{Configuration, ConfigurationError, PsfCut};
 pub use sky::Sky;
 pub use stamp::{Pixel, Pixels};
 
-/// The parts of a measurement, for studies, benchmarks and simulations. Slices and buffers have to be of the sizes planned.
+/// The parts of a measurement, for benchmarks and simulations. Slices and buffers have to be of the sizes planned.
 pub mod parts {
     pub use crate::denoise::{DenoiseScratch, WaveletWiener, border_noise};
     pub use crate::network::{Network, NetworkScratch, Rule, Step, convolve, psf_factor};

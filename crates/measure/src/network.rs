@@ -494,7 +494,7 @@ pub fn psf_factor(psf: ArrayView2<'_, f64>, scale: PsfScale) -> Result<f64, Meas
     }
 }
 
-/// The convolution Hv of a square image, zero outside it, by plain sums. For studies, pictures and tests.
+/// The convolution Hv of a square image, zero outside it, by plain sums. For simulations, pictures and tests.
 pub fn convolve(image: ArrayView2<'_, f64>, kernel: ArrayView2<'_, f64>) -> Array2<f64> {
     let (cy, cx) = (kernel.nrows() / 2, kernel.ncols() / 2);
     Array2::from_shape_fn(image.dim(), |(y, x)| {

@@ -43,9 +43,6 @@ pub enum PipelineError {
     /// An image whose ellipticities would be wrong.
     #[error("set {:02} image {:03}: {warning}", id.set, id.image)]
     Fatal { id: ImageId, warning: Warning },
-    /// A method without the network that the work is about.
-    #[error("configuration {0} has method = \"linear\"; expected \"network\"")]
-    NoNetwork(String),
     #[error("the settings cannot be stored: {0}")]
     Settings(#[from] toml::ser::Error),
     /// The caller stopped the work.
