@@ -7,8 +7,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use ndarray::{ArcArray2, Ix3};
 use shearq_measure::{
-    Batch, KnownNoise, Lazy, LazyStamps, Measurement, Measurer, OneThread, Pixels, Psfs, Session,
-    StampRows, StampSource, Star, Steps, Threads, Worker,
+    Batch, KnownNoise, Lazy, LazyStamps, Measurer, OneThread, Pixels, Psfs, Session, StampRows,
+    StampSource, Star, Steps, Threads,
 };
 use shearq_quantities::Shear;
 use shearq_submissions::{Configuration, PsfForm};
@@ -25,9 +25,8 @@ use shearq_simulate::set::{
     ImageFields, NOISE_SIGMA, PsfField, STAMP, SetSimulator, SimulationSettings,
 };
 
-/// A simulated image as a source of stamps, for a configuration.
-#[derive(Debug)]
-pub struct SimulatedSource<'s> {
+// A simulated image as a source of stamps, for a configuration.
+struct SimulatedSource<'s> {
     set: &'s SetSimulator,
     fields: Arc<ImageFields>,
     form: PsfForm,
@@ -120,16 +119,15 @@ fn stamps<'s>(strip: Vec<f32>, n: usize) -> Pixels<'s, Ix3> {
     Pixels::strip(strip, n, STAMP).expect("as many pixels as drawn")
 }
 
-/// A simulated image that is being measured by several measurers.
-#[derive(Debug)]
-pub struct SimulatedSessions<'s> {
-    pub fields: Arc<ImageFields>,
+// A simulated image that is being measured by several measurers.
+struct SimulatedSessions<'s> {
+    fields: Arc<ImageFields>,
     sessions: Vec<(Arc<Session<'s>>, SimulatedSource<'s>)>,
 }
 
 impl<'s> SimulatedSessions<'s> {
-    /// Opens a session of each measurer. Rows that are surveyed are drawn once.
-    pub fn new(
+    // Opens a session of each measurer. Rows that are surveyed are drawn once.
+    fn new(
         set: &'s SetSimulator,
         image: u32,
         measurers: &[Measurer],
@@ -163,24 +161,6 @@ impl<'s> SimulatedSessions<'s> {
             head: Arc::clone(&self.fields),
             jobs,
         })
-    }
-
-    /// Measures a strip of stamps in the place of a row, before calibration.
-    pub fn measure(
-        &self,
-        workers: &mut [Worker],
-        row: usize,
-        pixels: Vec<f32>,
-    ) -> Result<Vec<Vec<Measurement>>, PipelineError> {
-        let stamps = Pixels::strip(pixels, self.fields.intrinsic.nrows(), STAMP)?;
-        let each = self.sessions.iter().zip(workers);
-        let measured = each.map(|((session, source), worker)| {
-            let psfs = source.row_psfs(row);
-            Ok(session
-                .measure_row(worker, row, &stamps, &psfs, None)?
-                .galaxies)
-        });
-        measured.collect()
     }
 }
 

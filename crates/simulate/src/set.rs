@@ -225,17 +225,6 @@ impl std::fmt::Debug for SetSimulator {
     }
 }
 
-/// A galaxy's properties that a study varies with all random numbers fixed: differences between versions are then free of
-/// shape noise and pixel noise.
-#[derive(Debug, Clone, Copy)]
-pub struct Version {
-    pub intrinsic: Shear,
-    pub shear: Shear,
-    /// Factor of its radii. Its flux stays the same.
-    pub size: f64,
-    pub noise: f32,
-}
-
 /// Intrinsic ellipticities and PSFs over the grid of one image.
 pub struct ImageFields {
     pub image: u32,
@@ -415,27 +404,20 @@ impl SetSimulator {
         scratch: &mut RenderScratch,
         out: &mut [f32],
     ) -> Shear {
-        let e = fields.intrinsic[(ix, iy)];
-        let version = Version {
-            intrinsic: Shear::new(e.re, e.im),
-            shear: self.shear_at(ix, iy),
-            size: 1.0,
-            noise: 1.0,
-        };
-        self.draw_as(fields, (ix, iy), version, scratch, out);
+        self.draw_with_noise(fields, (ix, iy), NOISE_SIGMA as f32, scratch, out);
         self.observed(fields, ix, iy)
     }
 
-    /// Draws galaxy `(ix, iy)` like [`SetSimulator::draw`], with all of its random numbers the same,
-    /// but as another version of it.
-    pub fn draw_as(
+    fn draw_with_noise(
         &self,
         fields: &ImageFields,
         (ix, iy): (usize, usize),
-        version: Version,
+        sigma: f32,
         scratch: &mut RenderScratch,
         out: &mut [f32],
     ) {
+        let e = fields.intrinsic[(ix, iy)];
+        let intrinsic = Shear::new(e.re, e.im);
         let mut rng = self
             .settings
             .stream(self.kind.set, fields.image, Purpose::Galaxy);
@@ -444,17 +426,15 @@ impl SetSimulator {
         let x = centre + rng.random_range(-0.5..0.5);
         let y = centre + rng.random_range(-0.5..0.5);
         let mut again = rng.clone();
-        let lensed = (version.shear, version.size);
-        let (galaxy, snr) = self.galaxy(version.intrinsic, lensed, &mut rng);
+        let (galaxy, snr) = self.galaxy(intrinsic, self.shear_at(ix, iy), &mut rng);
         let psf = self
             .transform
             .of(fields.psf.at(ix, iy))
             .expect("all PSFs of a set have one profile");
         self.renderer.render(&galaxy, &psf, (x, y), scratch, out);
         // The S/N is defined before lensing: it sets the flux, which shear does not change.
-        let (unlensed, _) = self.galaxy(version.intrinsic, (Shear::ZERO, 1.0), &mut again);
+        let (unlensed, _) = self.galaxy(intrinsic, Shear::ZERO, &mut again);
         let scale = (snr * NOISE_SIGMA / power(&unlensed, &psf).sqrt()) as f32;
-        let sigma = version.noise * NOISE_SIGMA as f32;
         add_noise(&mut rng, scale, sigma, out);
     }
 
@@ -481,8 +461,8 @@ impl SetSimulator {
         })
     }
 
-    /// A strip of the stamps that `draw` fills, for each column of the grid.
-    pub fn strip(&self, mut draw: impl FnMut(usize, &mut [f32])) -> Vec<f32> {
+    // The stamps that `draw` fills, for each column of the grid.
+    fn strip(&self, mut draw: impl FnMut(usize, &mut [f32])) -> Vec<f32> {
         let n = self.grid.n;
         let mut strip = vec![0.0; n * STAMP * STAMP];
         let mut stamp = vec![0.0; STAMP * STAMP];
@@ -502,13 +482,8 @@ impl SetSimulator {
         Shear::new(e.re, e.im).sheared_by(self.shear_at(ix, iy))
     }
 
-    // The galaxy and its S/N; radii are multiplied by `size`.
-    fn galaxy(
-        &self,
-        intrinsic: Shear,
-        (shear, size): (Shear, f64),
-        rng: &mut ChaCha8Rng,
-    ) -> (Galaxy, f64) {
+    // The galaxy and its S/N.
+    fn galaxy(&self, intrinsic: Shear, shear: Shear, rng: &mut ChaCha8Rng) -> (Galaxy, f64) {
         let shape = intrinsic.sheared_by(shear);
         // Half-light radii in pixels before the PSF. Chosen by hand.
         let (mut bulge, mut disc) = match self.kind.image {
@@ -546,7 +521,6 @@ impl SetSimulator {
             }
             _ => {}
         }
-        let (bulge, disc) = (size * bulge, size * disc);
         let galaxy = Galaxy::bulge_and_disc(1.0, fraction, bulge, disc, shape)
             .and_then(|galaxy| match offset {
                 Some((dx, dy)) => galaxy.with_bulge_offset(dx, dy),
@@ -593,15 +567,9 @@ mod tests {
                 FunctionalPsf::new(psf_profile(kind), PSF_FWHM_PX, Shear::new(0.0, 0.0)).unwrap();
             fields.psf = PsfField::One(round);
             let mut scratch = RenderScratch::new();
-            let version = |e: Complex64| Version {
-                intrinsic: Shear::new(e.re, e.im),
-                shear: set.shear_at(2, 5),
-                size: 1.0,
-                noise: 0.0,
-            };
             let mut out = vec![0.0; STAMP * STAMP];
             let e = fields.intrinsic[(2, 5)];
-            set.draw_as(&fields, (2, 5), version(e), &mut scratch, &mut out);
+            set.draw_with_noise(&fields, (2, 5), 0.0, &mut scratch, &mut out);
             // Quadrupole and centroid: [xx − yy, xy, x, y], by flux.
             let mut sums = [0.0; 5];
             for (at, value) in out.iter().enumerate() {
@@ -687,28 +655,20 @@ mod tests {
     #[test]
     fn flux_does_not_depend_on_orientation_and_shear() {
         // Small ones, of which the stamp holds nearly all light; one elliptical PSF.
-        let simulator = simulator(14, 5, 16);
-        let fields = simulator.image_fields(1);
+        let mut fields = simulator(14, 5, 16).image_fields(1);
         let long = fields.psf.at(3, 2).shape;
         let mut out = vec![0.0; STAMP * STAMP];
         let mut flux = |intrinsic: f64, shear: f64| {
-            let of = |size: f64| {
-                let scale = size / long.modulus();
-                Shear::new(scale * long.e1, scale * long.e2)
+            let along = |size: f64| [long.e1, long.e2].map(|e| e * size / long.modulus());
+            let [e1, e2] = along(intrinsic);
+            fields.intrinsic[(3, 2)] = Complex64::new(e1, e2);
+            let sheared = SimulationSettings {
+                constant_shear: Some(along(shear)),
+                ..settings(5, 16)
             };
-            let version = Version {
-                intrinsic: of(intrinsic),
-                shear: of(shear),
-                size: 1.0,
-                noise: 0.0,
-            };
-            simulator.draw_as(
-                &fields,
-                (3, 2),
-                version,
-                &mut RenderScratch::new(),
-                &mut out,
-            );
+            let set = SetSimulator::new(SetKind::of(14).unwrap(), sheared).unwrap();
+            let mut scratch = RenderScratch::new();
+            set.draw_with_noise(&fields, (3, 2), 0.0, &mut scratch, &mut out);
             out.iter().map(|v| f64::from(*v)).sum::<f64>()
         };
         let along = flux(0.3, 0.0);
