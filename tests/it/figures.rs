@@ -48,7 +48,7 @@ fn curves_names_and_bands_of_any_data_are_drawn() {
         for log in [false, true] {
             plots.push(lines(&x, y, log));
             plots.push(LinePlot {
-                y_range: Some((-1.0, 0.5)),
+                x_range: Some((-1.0, 0.5)),
                 ..lines(y, y, log)
             });
         }

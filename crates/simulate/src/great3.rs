@@ -84,6 +84,7 @@ pub struct Fit {
 }
 
 /// A branch and its random numbers.
+#[derive(Debug)]
 pub struct BranchSimulator {
     pub branch: Branch,
     pub seed: u64,
@@ -94,12 +95,6 @@ pub struct BranchSimulator {
     /// Galaxies are drawn from these; if it is empty, from the default distribution.
     fits: Vec<Fit>,
     renderer: Renderer,
-}
-
-impl std::fmt::Debug for BranchSimulator {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("BranchSimulator").finish_non_exhaustive()
-    }
 }
 
 /// Shear and intrinsic ellipticities on all nodes of a field with variable shear, and the offsets of its subfields in nodes.
@@ -132,6 +127,7 @@ impl Epoch {
 }
 
 /// What the galaxies of a subfield share, and which galaxy is where.
+#[derive(Debug)]
 pub struct Subfield {
     pub number: usize,
     /// Offset in its field, in nodes of the lattice.
@@ -143,12 +139,6 @@ pub struct Subfield {
     lensing: Vec<(Shear, Shear)>,
     /// Number of the galaxy in each place; 2p and 2p + 1 are a pair.
     galaxies: Vec<usize>,
-}
-
-impl std::fmt::Debug for Subfield {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Subfield").finish_non_exhaustive()
-    }
 }
 
 impl Subfield {

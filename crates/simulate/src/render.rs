@@ -45,18 +45,14 @@ const PERIODS_IN_THIRDS: [usize; 7] = [5, 6, 7, 8, 10, 12, 24];
 ///
 /// It holds the tables of cosines and sines and is shared between threads; what changes with a galaxy
 /// is in the caller's [`RenderScratch`].
+#[derive(Debug)]
 pub struct Renderer {
     stamp: usize,
     grids: Vec<Grid>,
 }
 
-impl std::fmt::Debug for Renderer {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Renderer").finish_non_exhaustive()
-    }
-}
-
 /// One period of the image, in pixels, and the wavenumbers 2πj/N that belong to it.
+#[derive(Debug)]
 struct Grid {
     /// N. It is even, and N/2 + 1 is a multiple of eight.
     size: usize,
@@ -80,7 +76,7 @@ struct Grid {
 
 /// Work space of [`Renderer::render`], for any renderer and any galaxy. Its contents do not
 /// influence the result.
-#[derive(Default)]
+#[derive(Debug, Default)]
 pub struct RenderScratch {
     /// Light at one ky and at its opposite.
     lines: [Vec<f32>; 2],
@@ -98,14 +94,8 @@ pub struct RenderScratch {
     phases: Phases,
 }
 
-impl std::fmt::Debug for RenderScratch {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("RenderScratch").finish_non_exhaustive()
-    }
-}
-
 /// PSF × pixel, of the PSF that was used last: galaxies of an image often share it.
-#[derive(Default)]
+#[derive(Debug, Default)]
 struct Transfer {
     of: Option<(FunctionalPsf, Option<Pupil>, usize)>,
     /// Wavenumbers along an axis. Lines of kx are at ky from 0, and after them at ky from 0 downwards.
@@ -151,7 +141,7 @@ impl Transfer {
 }
 
 /// e^{−ik·x} of a shift along both axes, of wavenumbers from 0.
-#[derive(Default)]
+#[derive(Debug, Default)]
 struct Phases {
     x_re: Vec<f32>,
     x_im: Vec<f32>,

@@ -209,6 +209,7 @@ impl PsfField {
     }
 }
 
+#[derive(Debug)]
 pub struct SetSimulator {
     kind: SetKind,
     settings: SimulationSettings,
@@ -219,24 +220,13 @@ pub struct SetSimulator {
     transform: PsfTransform,
 }
 
-impl std::fmt::Debug for SetSimulator {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("SetSimulator").finish_non_exhaustive()
-    }
-}
-
 /// Intrinsic ellipticities and PSFs over the grid of one image.
+#[derive(Debug)]
 pub struct ImageFields {
     pub image: u32,
     /// Unlensed shear-type ellipticities, `[ix, iy]`.
     pub intrinsic: Array2<Complex64>,
     pub psf: PsfField,
-}
-
-impl std::fmt::Debug for ImageFields {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("ImageFields").finish_non_exhaustive()
-    }
 }
 
 impl SetSimulator {

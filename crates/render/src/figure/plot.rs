@@ -119,8 +119,6 @@ pub struct LinePlot {
     pub y_log: bool,
     /// The ends of the horizontal axis; `None` to take them from the data.
     pub x_range: Option<(f64, f64)>,
-    /// The ends of the vertical axis; `None` to take them from the data.
-    pub y_range: Option<(f64, f64)>,
     pub bands: Vec<Band>,
     /// What is drawn, the last on top.
     pub series: Vec<Series>,
@@ -176,7 +174,7 @@ impl LinePlot {
         let [x_length, y_length] = self.turned([width, height]);
         self.turned([
             Axis::new(x, self.x_range, x_scale, x_length, self.is_turned()),
-            Axis::new(y, self.y_range, y_scale, y_length, !self.is_turned()),
+            Axis::new(y, None, y_scale, y_length, !self.is_turned()),
         ])
     }
 
