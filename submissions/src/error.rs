@@ -40,12 +40,12 @@ pub enum SettingError {
         expected: String,
     },
     /// A key that no file of the chain sets.
-    #[error(
-        "the key `{key}` is set neither here nor in what it extends; start from `extends = \"paper\"` or `extends = \"48/linear/star\"`"
-    )]
+    #[error("the key `{key}` is set neither here nor in what it extends; start from {bases}")]
     Missing {
         /// The key.
         key: String,
+        /// The lines that extend configurations with this key.
+        bases: &'static str,
     },
     /// A key that the method does not use.
     #[error("`{key}` is not used when {reason}; remove it")]
@@ -66,7 +66,7 @@ impl SettingError {
         match self {
             SettingError::UnknownKey { key, .. }
             | SettingError::Value { key, .. }
-            | SettingError::Missing { key }
+            | SettingError::Missing { key, .. }
             | SettingError::Unused { key, .. } => key,
             SettingError::OutOfRange(error) => error.key,
         }

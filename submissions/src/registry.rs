@@ -12,7 +12,7 @@ use toml::de::DeTable;
 use toml::{Table, Value};
 
 use crate::error::{ConfigurationError, SettingError};
-use crate::settings::Configuration;
+use crate::settings::{Configuration, Method};
 
 // The files with a comment on each key, from which `submissions init` makes a user's file. Together they have every key of
 // both methods, and so define which keys exist.
@@ -238,7 +238,10 @@ impl<'de> Deserialize<'de> for Configuration {
 fn configuration_of(mut table: Table) -> Result<Configuration, SettingError> {
     let mut own = Table::new();
     for key in ["name", "description"] {
-        let missing = || SettingError::Missing { key: key.into() };
+        let missing = || SettingError::Missing {
+            key: key.into(),
+            bases: "`extends = \"paper\"` or `extends = \"48/linear/star\"`",
+        };
         own.insert(key.into(), table.remove(key).ok_or_else(missing)?);
     }
     // Stored results contain these, but they do not change a measurement.
@@ -259,7 +262,13 @@ fn configuration_of(mut table: Table) -> Result<Configuration, SettingError> {
         let mut keys = std::iter::once("method".to_owned()).chain(keys);
         let missing = keys.find(|key| get(&table, key).is_none() && get(&own, key).is_none());
         let key = missing.unwrap_or_default();
-        return Err(SettingError::Missing { key });
+        // Of the two methods only one has the key, and the file may extend the other.
+        let bases = match (key.as_str(), &configuration.method) {
+            ("method", _) => "`extends = \"paper\"` or `extends = \"48/linear/star\"`",
+            (_, Method::Network(_)) => "`extends = \"paper\"`",
+            (_, Method::Linear(_)) => "`extends = \"48/linear/star\"`",
+        };
+        return Err(SettingError::Missing { key, bases });
     }
     configuration.validate()?;
     Ok(configuration)
