@@ -2,6 +2,7 @@
 
 pub mod great3;
 
+use std::path::Path;
 use std::sync::Arc;
 
 use super::PipelineError;
@@ -13,7 +14,7 @@ use shearq_dataset::run::{SIMULATION_FILE, SimulationRecord, claim};
 use shearq_dataset::threads::Progress;
 use shearq_dataset::truth;
 use shearq_files::atomic;
-use shearq_files::fits::{ImageWriter, Value};
+use shearq_files::fits::{ImageReader, ImageWriter, Value};
 use shearq_simulate::kinds::SetKind;
 use shearq_simulate::render::RenderScratch;
 use shearq_simulate::set::{
@@ -51,12 +52,13 @@ pub fn simulate_blind(
     progress: &mut dyn Progress,
 ) -> Result<(usize, usize), PipelineError> {
     let claim = claim(&private.root().join(SIMULATION_FILE), record)?;
-    // The galaxies of an image are written last, so that their file shows that the image is complete.
-    let todo: Vec<ImageId> = images
-        .iter()
-        .filter(|id| !public.galaxies(id.set, id.image).is_file())
-        .copied()
-        .collect();
+    let side = record.settings.grid * STAMP;
+    // The galaxies of an image are written last, so that their file shows that the image was completed.
+    let is_there = |id: &&ImageId| {
+        is_whole(&public.galaxies(id.set, id.image), side)
+            && ImageReader::open(public.psf_star(id.set, id.image)).is_ok()
+    };
+    let todo: Vec<ImageId> = images.iter().filter(|id| !is_there(id)).copied().collect();
     let already = images.len() - todo.len();
     let mut simulators = Vec::new();
     for of_set in todo.chunk_by(|a, b| a.set == b.set) {
@@ -126,6 +128,11 @@ fn feed<'s>(simulators: &'s [(SetSimulator, &[ImageId])], feeder: &mut Feeder<'_
             }
         }
     }
+}
+
+// An image that was cut off when a disk was full or a copy stopped has its name, but not its size.
+fn is_whole(path: &Path, side: usize) -> bool {
+    ImageReader::open(path).is_ok_and(|image| (image.width(), image.height()) == (side, side))
 }
 
 pub(super) fn write_truth(data: &DataFolder, set: &SetSimulator) -> Result<(), PipelineError> {

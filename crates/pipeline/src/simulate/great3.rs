@@ -22,6 +22,7 @@ use shearq_simulate::render::RenderScratch;
 
 use crate::PipelineError;
 use crate::engine;
+use crate::simulate::is_whole;
 
 /// What determines all subfields of a simulated branch. Their number does not: more can be added.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -74,14 +75,11 @@ pub fn simulate_branch(
     let claim = claim(&out.join(SIMULATION_FILE), record)?;
     let size = branch.stamp();
     let side = grid * size;
-    // An image that was cut off when a disk was full or a copy stopped has its name, but not its size.
-    let is_whole = |subfield, epoch| {
-        ImageReader::open(image(subfield, epoch))
-            .is_ok_and(|image| (image.width(), image.height()) == (side, side))
-    };
     let missing = |subfield| -> Arc<[usize]> {
         let epochs = 0..branch.epochs();
-        epochs.filter(|epoch| !is_whole(subfield, *epoch)).collect()
+        epochs
+            .filter(|epoch| !is_whole(&image(subfield, *epoch), side))
+            .collect()
     };
     let todo: Vec<_> = (0..subfields).map(missing).collect();
     let made = todo.iter().map(|epochs| epochs.len()).sum();
