@@ -290,12 +290,33 @@ pub fn read_record<R: DeserializeOwned>(path: &Path) -> Result<Option<R>, FileEr
 pub fn parse_record<R: DeserializeOwned>(path: &Path, text: &str) -> Result<R, FileError> {
     serde_json::from_str(text).map_err(|error| {
         // `is_data`: valid JSON, but with other keys or types.
-        let hint = match error.is_data() {
-            true => "; the record belongs to another version. Try: another folder",
-            false => "",
+        let [key, hint] = match error.is_data() {
+            true => [key_before(text, &error), other_version(text)].map(Option::unwrap_or_default),
+            false => [const { String::new() }; 2],
         };
-        FileError::new(path, format!("not a record of this kind: {error}{hint}"))
+        FileError::new(
+            path,
+            format!("not a record of this kind: {key}{error}{hint}"),
+        )
     })
+}
+
+// The key whose value serde refuses, which its error does not name. At the end of an object or a list a key is missing, or the
+// whole is wrong.
+fn key_before(text: &str, error: &serde_json::Error) -> Option<String> {
+    let line = text.lines().nth(error.line().checked_sub(1)?)?;
+    let before = line.get(..error.column())?;
+    let (start, _) = before.rsplit_once("\":")?;
+    let (_, key) = start.rsplit_once('"')?;
+    (!before.ends_with(['}', ']'])).then(|| format!("`{key}`: "))
+}
+
+fn other_version(text: &str) -> Option<String> {
+    let record: serde_json::Value = serde_json::from_str(text).ok()?;
+    let of_store = || record.get("run")?.get("version");
+    let version = record.get("version").or_else(of_store)?;
+    (version != crate::VERSION)
+        .then(|| format!("; the record belongs to version {version}. Try: another folder"))
 }
 
 pub fn write_record(path: &Path, record: &impl Serialize) -> Result<(), FileError> {
