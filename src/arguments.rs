@@ -20,7 +20,7 @@ use shearq_results::bias::columns::Shapes;
 use shearq_results::response::{Position, Shared};
 use shearq_results::submit::Contents;
 use shearq_results::views::pages;
-use shearq_scoring::{Choice, Convention, Definition, TruthSign};
+use shearq_scoring::{Choice, Definition, TruthSign};
 use shearq_simulate::field::ShearSpectrum;
 use shearq_simulate::kinds::SETS;
 use shearq_simulate::set::SimulationSettings;
@@ -304,7 +304,7 @@ pub(super) struct ScoreSettings {
     /// Convention of signs and axes: 1 to 8 (5 is the standard one), `matched` or `best`. `matched` correlates best
     /// with the truth of all sets; `best` has the highest Q of each set, as on the leaderboard [default: 5 for
     /// catalogues by shearq, matched for others].
-    #[arg(long, value_name = "WHICH", value_parser = parse_choice)]
+    #[arg(long, value_name = "WHICH")]
     pub(super) convention: Option<Choice>,
 }
 
@@ -343,19 +343,6 @@ pub(super) fn positive(text: &str) -> Result<f64, String> {
     number
         .filter(|number: &f64| number.is_finite() && *number > 0.0)
         .ok_or_else(|| "expected a positive number".into())
-}
-
-fn parse_choice(text: &str) -> Result<Choice, String> {
-    match text {
-        "matched" => Ok(Choice::Matched),
-        "best" => Ok(Choice::Best),
-        number => number
-            .parse()
-            .ok()
-            .and_then(|number: u8| Convention::try_from(number).ok())
-            .map(Choice::Insist)
-            .ok_or_else(|| "expected `matched`, `best` or a number from 1 to 8".into()),
-    }
 }
 
 // Clap's `ValueEnum` cannot be derived here: the types belong to crates without clap, so that libraries do not compile it.

@@ -40,16 +40,9 @@ fn definition(name: &str) -> PyResult<Definition> {
 }
 
 fn choice(name: &str) -> PyResult<Choice> {
-    let number = || Convention::try_from(name.parse::<u8>().ok()?).ok();
-    match name {
-        "matched" => Ok(Choice::Matched),
-        "best" => Ok(Choice::Best),
-        _ => number().map(Choice::Insist).ok_or_else(|| {
-            PyValueError::new_err(format!(
-                "convention: {name:?}; expected \"matched\", \"best\" or a number from 1 to 8"
-            ))
-        }),
-    }
+    name.parse().map_err(|expected| {
+        PyValueError::new_err(format!("convention: found {name:?}, {expected}"))
+    })
 }
 
 type Pair<'py> = (PyReadonlyArray1<'py, f64>, PyReadonlyArray1<'py, f64>);

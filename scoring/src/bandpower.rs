@@ -8,6 +8,7 @@
 //!
 //! Both have 20 bins of width Δ = (ℓ_max − ℓ_min)/19; bins 2 to 9 (1-based) are scored.
 
+use std::fmt::Display;
 use std::ops::Range;
 
 use ndarray::Array2;
@@ -33,6 +34,15 @@ pub enum Definition {
     Leaderboard,
     /// Azimuthal averages over fixed bins; cells are weighted by the number of images with a galaxy there.
     Corrected,
+}
+
+impl Display for Definition {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Definition::Leaderboard => "leaderboard",
+            Definition::Corrected => "corrected",
+        })
+    }
 }
 
 /// The bins of one grid under one definition.

@@ -1,5 +1,8 @@
 //! Scores of one set in every convention: noise, biases, null tests and their errors.
 
+use std::fmt::Display;
+use std::str::FromStr;
+
 use ndarray::Array2;
 #[cfg(feature = "serde")]
 use serde::Serialize;
@@ -33,6 +36,34 @@ pub enum Choice {
     Insist(Convention),
 }
 
+impl Display for Choice {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Choice::Matched => f.write_str("matched"),
+            Choice::Best => f.write_str("best"),
+            Choice::Insist(convention) => convention.number().fmt(f),
+        }
+    }
+}
+
+impl FromStr for Choice {
+    type Err = &'static str;
+
+    /// `matched`, `best` or the number of a convention.
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        let insisted = |number: u8| Some(Choice::Insist(Convention::try_from(number).ok()?));
+        match text {
+            "matched" => Ok(Choice::Matched),
+            "best" => Ok(Choice::Best),
+            _ => text
+                .parse()
+                .ok()
+                .and_then(insisted)
+                .ok_or("expected `matched`, `best` or a number from 1 to 8"),
+        }
+    }
+}
+
 /// Noise of the ellipticities, for Q_dn.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub enum Noise {
@@ -41,6 +72,30 @@ pub enum Noise {
     /// Measured from the scatter of the E modes between images of the set.
     #[default]
     Measured,
+}
+
+impl Display for Noise {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Noise::Given(variance) => variance.fmt(f),
+            Noise::Measured => f.write_str("measured"),
+        }
+    }
+}
+
+impl FromStr for Noise {
+    type Err = &'static str;
+
+    /// `measured`, or a variance.
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        match text.parse() {
+            _ if text == "measured" => Ok(Noise::Measured),
+            Ok(variance) if variance >= 0.0 && f64::is_finite(variance) => {
+                Ok(Noise::Given(variance))
+            }
+            _ => Err("expected `measured`, zero or a positive number"),
+        }
+    }
 }
 
 /// How to score.

@@ -13,7 +13,7 @@ use shearq_dataset::threads::{Pool, Progress};
 use shearq_files::{FileError, names_of};
 use shearq_render::escape::line;
 use shearq_results::published::MIN_SLOPE_SIGNIFICANCE;
-use shearq_results::record::{RunRecord, SetRecord, definition_word};
+use shearq_results::record::{RunRecord, SetRecord};
 use shearq_results::score::ScoreError;
 use shearq_results::store;
 use shearq_results::submit::check::{CheckedSet, Severity, check_sent};
@@ -21,7 +21,8 @@ use shearq_results::submit::{
     Contents, Entry as Team, Manifest, Packed, Sent, Submission, read_bandpowers,
 };
 use shearq_scoring::{
-    Choice, Convention, Fault, Grid, Line, Options, SCORED, ScoringError, SetScorer, TrueShear,
+    Choice, Convention, Fault, Grid, Line, Noise, Options, SCORED, ScoringError, SetScorer,
+    TrueShear,
 };
 use shearq_submissions::check_name;
 
@@ -443,9 +444,9 @@ impl Judge {
             version: shearq_dataset::VERSION.into(),
             settings,
             source: self.id.clone(),
-            definition: definition_word(self.challenge.rules.metric.definition()).into(),
-            choice: Convention::STANDARD.number().to_string(),
-            noise: "measured".into(),
+            definition: self.challenge.rules.metric.definition(),
+            choice: Choice::Insist(Convention::STANDARD),
+            noise: Noise::Measured,
             sets,
         };
         Ok((run, doubt.map(|doubt| (sending.path, doubt))))

@@ -1,11 +1,17 @@
 //! The record of a scored set, with the one list of its columns: conditions are met and tables printed by it.
 //! docs/files.md describes the columns, and the keys of the JSON, which are the fields of the structs.
 
-use serde::{Deserialize, Serialize};
+use std::collections::BTreeSet;
+use std::fmt::Display;
+use std::str::FromStr;
+
+use serde::de::Error;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use shearq_dataset::fingerprint::{self, Fingerprint};
-use shearq_dataset::layout::DataFolder;
+use shearq_dataset::layout::{DataFolder, MAX_SET};
 use shearq_dataset::run::{Source, nan_for_null};
 use shearq_files::FileError;
+use shearq_files::table::MAX_ROWS;
 use shearq_quantities::Frame;
 use shearq_render::table::Cell;
 use shearq_scoring::resample::mean_over_sets;
@@ -42,11 +48,11 @@ pub struct SetRecord {
     /// The highest Q of the eight conventions.
     #[serde(deserialize_with = "nan_for_null")]
     pub q_leaderboard: f64,
-    pub convention: u8,
+    pub convention: Convention,
     /// Whether the convention was given or clearly matched to the truth. Differences from other records are
     /// meaningless otherwise.
     pub convention_known: bool,
-    pub convention_leaderboard: u8,
+    pub convention_leaderboard: Convention,
 }
 
 fn is_pixel(frame: &Frame) -> bool {
@@ -81,9 +87,9 @@ impl SetRecord {
                 None => score.conventions[score.best.index()].quality.q,
                 Some(_) => f64::NAN,
             },
-            convention: score.chosen.number(),
+            convention: score.chosen,
             convention_known,
-            convention_leaderboard: score.best.number(),
+            convention_leaderboard: score.best,
             ..SetRecord::unknown(set)
         }
     }
@@ -101,7 +107,6 @@ impl SetRecord {
 
     /// A record without images and galaxies, whose metrics are unknown, in the standard convention.
     pub fn unknown(set: u32) -> Self {
-        let standard = Convention::STANDARD.number();
         SetRecord {
             set,
             simulated: false,
@@ -115,9 +120,9 @@ impl SetRecord {
             q_replicates: Vec::new(),
             q_calibrated_replicates: Vec::new(),
             q_leaderboard: f64::NAN,
-            convention: standard,
+            convention: Convention::STANDARD,
             convention_known: true,
-            convention_leaderboard: standard,
+            convention_leaderboard: Convention::STANDARD,
         }
     }
 }
@@ -134,19 +139,33 @@ pub struct RunRecord {
     pub settings: String,
     /// Settings of the simulation as JSON, or the fingerprint of a data folder.
     pub source: String,
-    pub definition: String,
-    /// `matched`, `best` or the number of a convention.
-    pub choice: String,
-    /// `measured`, or the given noise variance.
-    pub noise: String,
+    pub definition: Definition,
+    #[serde(with = "as_text")]
+    pub choice: Choice,
+    #[serde(with = "as_text")]
+    pub noise: Noise,
     /// In ascending order.
     pub sets: Vec<SetRecord>,
 }
 
-pub fn definition_word(definition: Definition) -> &'static str {
-    match definition {
-        Definition::Leaderboard => "leaderboard",
-        Definition::Corrected => "corrected",
+mod as_text {
+    use super::*;
+
+    pub fn serialize<T: Display, S: Serializer>(
+        value: &T,
+        serializer: S,
+    ) -> Result<S::Ok, S::Error> {
+        serializer.collect_str(value)
+    }
+
+    pub fn deserialize<'de, T, D>(deserializer: D) -> Result<T, D::Error>
+    where
+        T: FromStr<Err: Display>,
+        D: Deserializer<'de>,
+    {
+        let text = String::deserialize(deserializer)?;
+        let wrong = |expected| D::Error::custom(format_args!("found `{text}`, {expected}"));
+        text.parse().map_err(wrong)
     }
 }
 
@@ -163,16 +182,9 @@ impl RunRecord {
             version: shearq_dataset::VERSION.into(),
             settings: settings.to_owned(),
             source,
-            definition: definition_word(options.definition).into(),
-            choice: match options.choice {
-                Choice::Matched => "matched".into(),
-                Choice::Best => "best".into(),
-                Choice::Insist(convention) => convention.number().to_string(),
-            },
-            noise: match options.noise {
-                Noise::Measured => "measured".into(),
-                Noise::Given(variance) => variance.to_string(),
-            },
+            definition: options.definition,
+            choice: options.choice,
+            noise: options.noise,
             sets,
         }
     }
@@ -217,18 +229,52 @@ impl RunRecord {
             sets: _,
         } = self;
         let mut print = Fingerprint::default();
-        for part in [
-            configuration,
-            version,
-            settings,
-            source,
-            definition,
-            choice,
-            noise,
-        ] {
+        for part in [configuration, version, settings, source] {
             print.add(part);
         }
+        print.add(definition.to_string());
+        print.add(choice.to_string());
+        print.add(noise.to_string());
         print.finish()
+    }
+
+    /// Checks what no type excludes. Records are easily edited, and a mean over impossible values looks like any other.
+    pub fn check(&self) -> Result<(), String> {
+        if self.sets.is_empty() {
+            return Err("the run has no sets".into());
+        }
+        let mut numbers = BTreeSet::new();
+        for set in &self.sets {
+            let number = set.set;
+            if number > MAX_SET || !numbers.insert(number) {
+                return Err(format!(
+                    "found set {number} twice, or above {MAX_SET}; expected every set once"
+                ));
+            }
+            let images: BTreeSet<_> = set.images.iter().collect();
+            // Sums over sets would overflow with counts that no images can have.
+            let most = (images.len() * MAX_ROWS) as u64;
+            if set.galaxies > most || set.flagged > set.galaxies {
+                return Err(format!(
+                    "set {number}: found {} galaxies, {} of them flagged; expected at most {most}",
+                    set.galaxies, set.flagged
+                ));
+            }
+            if images.len() < set.images.len() {
+                return Err(format!(
+                    "set {number}: found an image twice; expected each once"
+                ));
+            }
+            let negative = |metric: &&Metric| (metric.value)(&set.errors) < 0.0;
+            if let Some(metric) = Metrics::ALL.iter().find(negative) {
+                return Err(format!(
+                    "set {number}: the error of {} is {}; expected zero or a positive number",
+                    metric.name,
+                    (metric.value)(&set.errors)
+                ));
+            }
+        }
+        Ok(())
     }
 }
 
@@ -300,9 +346,9 @@ const BEFORE_METRICS: [Column; 20] = [
     of_run("version", "Version", |run| run.version.clone()),
     of_run("settings", "Settings", |run| run.settings.clone()),
     of_run("source", "Source", |run| run.source.clone()),
-    of_run("definition", "Definition", |run| run.definition.clone()),
-    of_run("choice", "Choice", |run| run.choice.clone()),
-    of_run("noise", "Noise", |run| run.noise.clone()),
+    of_run("definition", "Definition", |run| run.definition.to_string()),
+    of_run("choice", "Choice", |run| run.choice.to_string()),
+    of_run("noise", "Noise", |run| run.noise.to_string()),
     count("set", "Set", |set| set.set.into()),
     text("data", "Data", |set| set.data.clone()),
     text("set_kind", "Kind", |set| kind(set, |k| k.image.label())),
@@ -327,12 +373,12 @@ const AFTER_METRICS: [Column; 4] = [
         "Q leaderboard",
         Value::Real(|set| set.q_leaderboard),
     ),
-    count("convention", "Conv.", |set| set.convention.into()),
+    count("convention", "Conv.", |set| set.convention.number().into()),
     count("convention_known", "Conv. known", |set| {
         set.convention_known.into()
     }),
     count("convention_leaderboard", "Conv. leaderboard", |set| {
-        set.convention_leaderboard.into()
+        set.convention_leaderboard.number().into()
     }),
 ];
 
@@ -453,9 +499,9 @@ mod tests {
             q_replicates: vec![7.0],
             q_calibrated_replicates: vec![8.0, 9.0],
             q_leaderboard: 10.0,
-            convention: 2,
+            convention: Convention::ALL[1],
             convention_known: false,
-            convention_leaderboard: 3,
+            convention_leaderboard: Convention::ALL[2],
         };
         assert_eq!(read(&record), record);
         let unknown = read(&SetRecord {

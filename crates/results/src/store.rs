@@ -9,9 +9,9 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 use shearq_dataset::fingerprint;
+use shearq_dataset::layout::check_folder;
 use shearq_dataset::run::{parse_record, record_text};
 use shearq_files::open::{DATA, read_to_string};
-use shearq_files::table::MAX_ROWS;
 use shearq_files::{FileError, atomic};
 
 use super::record::RunRecord;
@@ -41,10 +41,14 @@ impl Drop for Prepared {
 
 /// Makes the folder of a store before a long run, which would otherwise fail at its end.
 pub fn prepare(store: &Path) -> Result<Prepared, FileError> {
-    let absent = !store.exists();
+    if store.exists() {
+        // A record beside files that `files` refuses would be written in vain.
+        paths(store)?;
+        return Ok(Prepared(None));
+    }
     std::fs::create_dir_all(store)
         .map_err(FileError::doing(store, "cannot make the results store"))?;
-    Ok(Prepared(absent.then(|| store.to_owned())))
+    Ok(Prepared(Some(store.to_owned())))
 }
 
 pub fn write(store: &Path, run: &RunRecord) -> Result<PathBuf, FileError> {
@@ -89,34 +93,45 @@ fn read_run(path: &Path) -> Result<RunRecord, FileError> {
         );
         return Err(FileError::new(path, message));
     }
-    let print = fingerprint::of_bytes(text.as_bytes());
-    let stem = path.file_stem().unwrap_or_default().to_string_lossy();
-    // JSON is easily edited, and another `settings` or `definition` would be compared as a run that never was.
-    if !stem.ends_with(&format!("-{print}")) {
-        let message = format!(
-            "the file was changed or renamed after it was recorded (found content {print}, expected the end of its name). Try: remove it, and shearq score --measured OUT --store DIR"
-        );
-        return Err(FileError::new(path, message));
-    }
-    if run.sets.is_empty() {
-        return Err(FileError::new(path, "the run has no sets"));
-    }
-    for set in &run.sets {
-        // Sums over sets would overflow with counts that no images can have.
-        let most = (set.images.len() * MAX_ROWS) as u64;
-        if set.galaxies > most || set.flagged > set.galaxies {
-            let message = format!(
-                "set {}: found {} galaxies, {} of them flagged; expected at most {most}",
-                set.set, set.galaxies, set.flagged
-            );
-            return Err(FileError::new(path, message));
-        }
-    }
+    run.check().map_err(|error| FileError::new(path, error))?;
+    check_name(path, &file_name(&run, text.as_bytes()))?;
     Ok(run)
+}
+
+// JSON is easily edited, and other settings would be compared as a run that never was. A copy under another name would be
+// taken for other results of the same sets.
+fn check_name(path: &Path, expected: &str) -> Result<(), FileError> {
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    if name == expected {
+        return Ok(());
+    }
+    let hash = |name: &str| {
+        let (_, hash) = name.strip_suffix(".json")?.rsplit_once('-')?;
+        let is_hash = hash.len() == 16 && hash.bytes().all(|byte| byte.is_ascii_hexdigit());
+        is_hash.then(|| hash.to_owned())
+    };
+    let message = match (hash(&name), hash(expected)) {
+        (Some(own), Some(content)) if own != content => format!(
+            "the file was changed after it was recorded (found content {content}, expected {own} as in its name). Try: remove it, and shearq score --measured OUT --store DIR"
+        ),
+        _ => format!(
+            "the file was renamed or copied after it was recorded (expected the name {expected}). Try: that name; remove the file if it was edited, too, or if there is one of that name"
+        ),
+    };
+    Err(FileError::new(path, message))
 }
 
 /// The run of each file of a store, in order of the names.
 pub fn files(store: &Path) -> Result<Vec<(PathBuf, RunRecord)>, FileError> {
+    let paths = paths(store)?.into_iter();
+    paths
+        .map(|path| Ok((path.clone(), read_run(&path)?)))
+        .collect()
+}
+
+// The records of a store. Files of other kinds, such as notes or a printed table, may lie beside them.
+fn paths(store: &Path) -> Result<Vec<PathBuf>, FileError> {
+    check_folder(store, "the folder of a results store")?;
     let entries = std::fs::read_dir(store)
         .and_then(Iterator::collect::<std::io::Result<Vec<_>>>)
         .map_err(FileError::doing(store, "cannot read the results store"))?;
@@ -130,7 +145,11 @@ pub fn files(store: &Path) -> Result<Vec<(PathBuf, RunRecord)>, FileError> {
         .collect();
     // Folders are listed in any order, but warnings and tables must not depend on it.
     paths.sort();
-    let is = |path: &Path, ending| path.extension().is_some_and(|own| own == ending);
+    // Some file systems change the case of names.
+    let is = |path: &Path, ending| {
+        path.extension()
+            .is_some_and(|own| own.eq_ignore_ascii_case(ending))
+    };
     // Earlier versions wrote Parquet. Skipped, its runs would be absent from comparisons, and entries would be ranked as new.
     if let Some(old) = paths.iter().find(|path| is(path, "parquet")) {
         return Err(FileError::new(
@@ -139,10 +158,7 @@ pub fn files(store: &Path) -> Result<Vec<(PathBuf, RunRecord)>, FileError> {
         ));
     }
     paths.retain(|path| is(path, "json"));
-    paths
-        .into_iter()
-        .map(|path| Ok((path.clone(), read_run(&path)?)))
-        .collect()
+    Ok(paths)
 }
 
 /// All runs of a store, sorted by configuration and id, and warnings about them.
@@ -188,6 +204,7 @@ mod tests {
     use super::*;
     use crate::record::SetRecord;
     use shearq_quantities::Frame;
+    use shearq_scoring::{Choice, Convention, Definition, Noise};
 
     fn run(configuration: &str, sets: &[(u32, u32, f64)]) -> RunRecord {
         let record = |&(set, images, q): &(u32, u32, f64)| {
@@ -204,9 +221,9 @@ mod tests {
             version: "1".into(),
             settings: String::new(),
             source: "s".into(),
-            definition: "leaderboard".into(),
-            choice: "5".into(),
-            noise: "measured".into(),
+            definition: Definition::Leaderboard,
+            choice: Choice::Insist(Convention::STANDARD),
+            noise: Noise::Given(0.01),
             sets: sets.iter().map(record).collect(),
         }
     }
@@ -247,7 +264,7 @@ mod tests {
     }
 
     #[test]
-    fn counts_and_names_that_no_run_has_are_refused() {
+    fn values_and_names_that_no_run_has_are_refused() {
         let folder = tempfile::tempdir().unwrap();
         for (edit, expected) in [
             (
@@ -259,6 +276,22 @@ mod tests {
             (
                 |run| run.configuration = "\u{1b}[2J".into(),
                 "without control characters",
+            ),
+            (
+                |run| run.sets.push(run.sets[0].clone()),
+                "found set 1 twice",
+            ),
+            (
+                |run| run.sets[0].set = 10_000,
+                "found set 10000 twice, or above 9999",
+            ),
+            (
+                |run| run.sets[0].images.push(3),
+                "set 1: found an image twice",
+            ),
+            (
+                |run| run.sets[0].errors.m1 = -0.1,
+                "set 1: the error of m1 is -0.1; expected",
             ),
         ] {
             let mut own = run("a", &[(1, 3, 5.5)]);

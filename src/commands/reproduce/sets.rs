@@ -385,7 +385,7 @@ pub(super) fn per_set_table(results: &[SetScores]) -> Table {
     metric("q_calibrated", "Q calibrated", |f| f.q_calibrated, 2);
     metric("galaxy_noise", "Noise", |f| f.galaxy_noise, 4);
     table.column("conventions", "Conv. matched/best", &rows, |(_, own)| {
-        let best = own.score.convention_leaderboard;
+        let best = own.score.convention_leaderboard.number();
         Cell::text(format!("{}/{best}", own.convention_matched))
     });
     table.column("flagged", "Flagged", &rows, |(_, own)| {

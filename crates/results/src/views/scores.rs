@@ -12,7 +12,7 @@ use shearq_scoring::{
     Metrics, OddResponse, Repeated, RowCounts, SetScore,
 };
 
-use crate::record::{FRAME, SetRecord, columns_named, definition_word, mean};
+use crate::record::{FRAME, SetRecord, columns_named, mean};
 use crate::score::{Basis, OddImages, ScoredSet};
 use crate::views::pages::bins;
 
@@ -209,7 +209,9 @@ pub fn per_set(scored: &[ScoredSet], title: &str, definition: Definition) -> Tab
             // A number of a convention is a name, and has no mean.
             "convention" => {
                 for (k, row) in table.rows.iter_mut().enumerate() {
-                    let name = records.get(k).map(|set| set.convention.to_string());
+                    let name = records
+                        .get(k)
+                        .map(|set| set.convention.number().to_string());
                     row[place] = name.map_or(Cell::Empty, Cell::text);
                 }
                 true
@@ -302,7 +304,7 @@ pub fn spectra(
     let zero = zero_q.iter().sum::<f64>() / zero_q.len() as f64;
     table.notes = vec![format!(
         "Metrics: {} definition. {errors} √A in 10⁻⁴ for C_ℓ in steradian.{}",
-        definition_word(definition),
+        definition,
         kinds_note(records)
     )];
     let zero = zero_shear_line(zero, mean(records, |metrics| metrics.q).0);
