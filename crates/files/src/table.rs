@@ -401,10 +401,8 @@ pub fn write(
 ) -> Result<(), FileError> {
     match format {
         FileFormat::Parquet => {
-            let mut bytes = Vec::new();
-            parquet::write(&mut bytes, table, metadata)
-                .map_err(|error| FileError::new(path, error))?;
-            atomic::write(path, &bytes)
+            let bytes = parquet::encode(table, metadata);
+            atomic::write(path, &bytes.map_err(|error| FileError::new(path, error))?)
         }
         FileFormat::Fits => {
             let keys: Vec<(String, fits::Value)> = kept(metadata, format)

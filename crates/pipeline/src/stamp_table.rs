@@ -55,10 +55,8 @@ impl StampTable {
             (STAMP_TABLE_FIRST_PIXEL.to_owned(), first_pixel.to_string()),
         ]);
         metadata.extend(gain.map(|gain| (GAIN.to_owned(), gain.to_string())));
-        let mut bytes = Vec::new();
-        let written = parquet::write(&mut bytes, &self.columns, &metadata);
-        written.map_err(|error| FileError::new(path, error))?;
-        atomic::write(path, &bytes)
+        let bytes = parquet::encode(&self.columns, &metadata);
+        atomic::write(path, &bytes.map_err(|error| FileError::new(path, error))?)
     }
 
     /// The table of the stamps of a mosaic; `None` if they were not gathered.
