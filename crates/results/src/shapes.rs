@@ -299,3 +299,37 @@ impl MeasuredShapes {
         [e1, e2, r11, r22, r12, r21, self.weight.clone()]
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use shearq_files::frames::frame;
+    use shearq_files::frames::polars::Column;
+
+    use super::*;
+
+    #[test]
+    fn flags_and_applied_weights_decide_which_rows_count() {
+        let column = |name: &str, values: [f64; 4]| Column::new(name.into(), values);
+        // The second galaxy has a flag and an ellipticity, and the selection left out the third.
+        let table = frame(vec![
+            column("flags", [0.0, 4.0, 0.0, 0.0]),
+            column("e1", [0.1, 0.2, 0.0, 0.3]),
+            column("e2", [0.2, 0.1, 0.0, -0.3]),
+            column(WEIGHT, [0.5, 0.0, 0.0, 1.0]),
+            column("x", [1.0, f64::NAN, 2.0, 3.0]),
+        ]);
+        let (path, table) = (Path::new("c.parquet"), table.unwrap());
+        let mut shapes = MeasuredShapes::of_table(path, &table, false).unwrap();
+        assert!(shapes.e[1].iter().all(|e| e.is_nan()));
+        assert_eq!(shapes.weight, [0.5, 0.0, 0.0, 1.0]);
+        assert_eq!(shapes.response[0], [[1.0, 0.0], [0.0, 1.0]]);
+        let rows = Some(Expression::parse("x < 3").unwrap());
+        let selection = StatedSelection {
+            rows,
+            ..StatedSelection::default()
+        };
+        shapes.select(path, &table, Some(&selection)).unwrap();
+        assert_eq!(shapes.weight, [0.5, 0.0, 0.0, 0.0]);
+        assert_eq!((shapes.e[0], shapes.e[3]), ([0.1, 0.2], [0.0; 2]));
+    }
+}
