@@ -439,33 +439,21 @@ pub(crate) fn fits(pattern: &str, text: &str) -> bool {
     ends.any(|at| fits(rest, &text[at..]))
 }
 
-// Characters of the number that a text starts with, with its exponent.
+// Characters of the number that a text starts with, with its exponent: the longest part that is a number.
 fn number_length(text: &str) -> usize {
-    let bytes = text.as_bytes();
-    let digits = |from: usize| {
-        bytes[from..]
-            .iter()
-            .take_while(|b| b.is_ascii_digit())
-            .count()
+    // Rust reads `inf` and `nan`, too, which may be names of columns.
+    if !text.starts_with(|c: char| c.is_ascii_digit() || c == '.') {
+        return 0;
+    }
+    let ends = |&(at, c): &(usize, char)| match c {
+        '+' | '-' => !text[..at].ends_with(['e', 'E']),
+        c => !(c.is_ascii_digit() || ".eE".contains(c)),
     };
-    let mut length = digits(0);
-    if bytes.get(length) == Some(&b'.') {
-        let after = digits(length + 1);
-        if length + after == 0 {
-            return 0;
-        }
-        length += 1 + after;
-    }
-    if length > 0 && matches!(bytes.get(length), Some(b'e' | b'E')) {
-        let sign = usize::from(matches!(bytes.get(length + 1), Some(b'+' | b'-')));
-        let exponent = bytes
-            .get(length + 1 + sign..)
-            .map_or(0, |_| digits(length + 1 + sign));
-        if exponent > 0 {
-            length += 1 + sign + exponent;
-        }
-    }
-    length
+    let end = text.char_indices().find(ends);
+    let mut lengths = (1..=end.map_or(text.len(), |(at, _)| at)).rev();
+    lengths
+        .find(|length| text[..*length].parse::<f64>().is_ok())
+        .unwrap_or(0)
 }
 
 /// The values of an operand in each row of a table.
@@ -507,6 +495,7 @@ mod tests {
     #[test]
     fn operators_bind_as_usual() {
         assert_eq!(value("1 + 2*3^2 - 4/2", &[]), 17.0);
+        assert_eq!(value("2e-3-1e+2+.5-3.", &[]), 2e-3 - 100.0 + 0.5 - 3.0);
         assert_eq!(value("-2^2 + (1 - 3)", &[]), -6.0);
         assert_eq!(value("2e-3*10", &[]), 0.02);
         assert_eq!(value("8 - 2 - 1", &[]), 5.0);
