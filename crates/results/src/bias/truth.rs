@@ -433,20 +433,16 @@ pub fn expand(paths: &[PathBuf], mut truth: Truth) -> Result<Expanded, BiasFailu
             catalogues.extend(own.into_iter().map(Input::from));
         }
     }
-    if found.is_empty() {
-        return Ok(Expanded {
-            catalogues,
-            truth,
-            without_catalogue,
-        });
-    }
-    if let Some(path) = without {
-        let message = "its data have no true shear, but the data of other folders have one. Try: separate commands, or --truth FILE";
-        return Err(FileError::new(path, message).into());
+    if !found.is_empty() {
+        if let Some(path) = without {
+            let message = "its data have no true shear, but the data of other folders have one. Try: separate commands, or --truth FILE";
+            return Err(FileError::new(path, message).into());
+        }
+        truth = Truth::Data(found);
     }
     Ok(Expanded {
         catalogues,
-        truth: Truth::Data(found),
+        truth,
         without_catalogue,
     })
 }
