@@ -266,8 +266,9 @@ impl Layout {
         if !self.sheared {
             return Extra::default();
         }
-        // The sum of weights differs from catalogue to catalogue, because each selects and weights other galaxies. Four catalogues are needed
-        // because a selection responds to each component, and a one-sided difference has an error of first order in h.
+        // The sum of weights differs from catalogue to catalogue, because each selects and weights other galaxies. Four
+        // catalogues are needed because a selection responds to each component, and a one-sided difference has an error of
+        // first order in h.
         let mean = |catalogue: usize, at: usize| sums[at] / sums[SHEARED + 2 * catalogue + 1];
         let own = |k: usize| {
             let of = |catalogue: usize| mean(catalogue, SHEARED + 2 * catalogue);

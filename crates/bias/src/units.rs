@@ -28,8 +28,8 @@ pub struct UnitSums {
     layout: Layout,
     bins: usize,
     catalogues: usize,
-    // Number of bits by which keys are shifted: units have the same key afterwards. Sums of shards with different shifts join at the larger
-    // one, so that a unit contains the same galaxies in all.
+    // Number of bits by which keys are shifted: units have the same key afterwards. Sums of shards with different shifts join at
+    // the larger one, so that a unit contains the same galaxies in all.
     shift: u32,
     units: Vec<((u32, u64), Vec<f64>)>,
     #[serde(skip)]

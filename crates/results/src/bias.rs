@@ -30,14 +30,11 @@ use columns::{CATALOGUES, Names, Role, Shapes};
 use source::{Reading, Source, sources};
 use truth::{TrueSign, Truth};
 
-/// Why there is no result.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum BiasFailure {
-    /// A file.
     #[error(transparent)]
     File(#[from] FileError),
-    /// The data determine no bias.
     #[error(transparent)]
     Bias(#[from] BiasError),
     #[error("there is no catalogue")]
@@ -97,16 +94,13 @@ pub enum BiasFailure {
     Distortions([f64; 2]),
 }
 
-/// Bins of an expression of columns.
 #[derive(Debug, Clone)]
 pub struct Binning {
-    /// What is binned.
     pub of: Expression,
     /// The edges, or a number of bins with equally many galaxies.
     pub edges: Edges,
 }
 
-/// Edges of bins.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Edges {
     /// A number of bins with equally many galaxies.
@@ -116,7 +110,6 @@ pub enum Edges {
 }
 
 impl Edges {
-    /// Number of bins.
     pub fn count(&self) -> usize {
         match self {
             Edges::Equal(count) => *count,
@@ -139,7 +132,6 @@ pub enum Units {
     Column(String),
 }
 
-/// A catalogue: a file, or a table in memory.
 #[derive(Debug, Clone)]
 pub struct Input {
     /// The file, or the name of the table.
@@ -154,26 +146,18 @@ impl From<PathBuf> for Input {
     }
 }
 
-/// What is read, and how.
 #[derive(Debug, Clone)]
 pub struct Request {
-    /// Catalogues.
     pub catalogues: Vec<Input>,
-    /// Names of columns.
     pub names: Names,
-    /// True shear.
     pub truth: Truth,
     /// How ellipticities become shears; `None` if the names of the columns decide.
     pub shapes: Option<Shapes>,
-    /// Sign of the true g2.
     pub sign: TrueSign,
-    /// Bins.
     pub bins: Option<Binning>,
     /// Rows that count, and weights of catalogues of linear configurations, whose response to shear enters.
     pub selection: Option<StatedSelection>,
-    /// The design; recognised if `None`.
     pub design: Option<Design>,
-    /// Units of the errors.
     pub units: Units,
     /// Whether rows with missing numbers are left out.
     pub drop_missing: bool,
@@ -188,7 +172,6 @@ pub struct Request {
 pub struct About {
     version: String,
     pub catalogues: Vec<Catalogue>,
-    /// The program that wrote them.
     pub program: String,
     #[serde(default)]
     pub by_shearq: bool,
@@ -203,7 +186,6 @@ pub struct About {
     pub unit_column: Option<String>,
     design: Option<Design>,
     by_key: Option<bool>,
-    /// What the bins are bins of.
     pub binned: String,
     edges: Vec<f64>,
     /// Columns of `--where` or `--bins` without sheared versions: m contains how shear changes this choice.
@@ -239,14 +221,12 @@ impl About {
     }
 }
 
-/// Sums of catalogues.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub struct Summed {
     sums: UnitSums,
     about: About,
 }
 
-/// Estimates of one bin.
 #[derive(Debug, Clone)]
 pub struct BinResult {
     /// Lower and upper edge; `None` for all galaxies.
@@ -255,7 +235,6 @@ pub struct BinResult {
     pub estimate: Result<Estimate, BiasError>,
 }
 
-/// Estimates of all galaxies and of bins.
 #[derive(Debug, Clone)]
 #[non_exhaustive]
 pub struct BiasResult {
@@ -268,7 +247,6 @@ pub struct BiasResult {
 }
 
 impl BiasResult {
-    /// The estimates of all galaxies.
     pub fn all(&self) -> Result<&Estimate, BiasError> {
         let first = self.bins.first().map(|bin| bin.estimate.as_ref());
         first
@@ -281,7 +259,6 @@ impl BiasResult {
 // galaxies.
 const SAMPLE: usize = 1 << 20;
 
-/// Most bins.
 pub const MOST_BINS: usize = 100;
 
 /// Sums the catalogues of a request for which `part` holds, given their number.
@@ -633,7 +610,6 @@ impl Summed {
         Ok(())
     }
 
-    /// The estimates.
     pub fn result(&self) -> Result<BiasResult, BiasFailure> {
         let (design, grouping) = self.grouped()?;
         let all = grouping.all_bins().estimate(0, self.about.truth);

@@ -38,9 +38,7 @@ pub struct Catalogues {
     pub files: Files,
     /// The run of catalogues that shearq measured into a folder.
     pub run: Option<Run>,
-    /// How catalogues of another program are read.
     pub description: Option<Foreign>,
-    /// The archive or folder of a submission.
     sent: Option<Sent>,
     // Catalogues by shearq have its convention also after packing.
     by_shearq: bool,

@@ -8,7 +8,6 @@ use shearq_files::frames::polars::DataFrame;
 use shearq_files::table;
 use thiserror::Error;
 
-/// Why a text is no expression.
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
 #[non_exhaustive]
 pub enum ExpressionError {
@@ -73,7 +72,6 @@ enum Node {
     Step(Step),
 }
 
-/// The token of an operator, and what it does.
 type Binary = (&'static str, Operator);
 
 const FUNCTIONS: [(&str, Function); 6] = [
@@ -495,9 +493,9 @@ mod tests {
     #[test]
     fn operators_bind_as_usual() {
         assert_eq!(value("1 + 2*3^2 - 4/2", &[]), 17.0);
-        assert_eq!(value("2e-3-1e+2+.5-3.", &[]), 2e-3 - 100.0 + 0.5 - 3.0);
         assert_eq!(value("-2^2 + (1 - 3)", &[]), -6.0);
         assert_eq!(value("2e-3*10", &[]), 0.02);
+        assert_eq!(value("2e-3-1e+2+.5-3.", &[]), 2e-3 - 100.0 + 0.5 - 3.0);
         assert_eq!(value("8 - 2 - 1", &[]), 5.0);
         assert_eq!(value("log10(flux_2/err)", &[100.0, 1.0]), 2.0);
         assert_eq!(value("a > 1 and b <= 2 or not(a == a)", &[2.0, 2.0]), 1.0);

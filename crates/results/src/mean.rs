@@ -18,9 +18,7 @@ use crate::star_noise::{Stars, of_catalogue};
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
 pub struct SetMean {
-    /// The set.
     pub set: u32,
-    /// Images with a catalogue.
     pub images: Vec<u32>,
     /// Galaxies with an ellipticity.
     pub galaxies: usize,
@@ -44,7 +42,6 @@ pub struct SetMean {
     pub scatter: [f64; 2],
     /// Whether errors are for galaxies in pairs that are rotated by 90°, whose shapes cancel.
     pub rotated_pairs: bool,
-    /// The axes of the shear.
     pub axes: Axes,
 }
 

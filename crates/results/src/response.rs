@@ -86,9 +86,7 @@ fn check_significance(path: &Path, means: &[RunningMean; 2]) -> Result<(), FileE
 /// Which galaxies share a mean response.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Shared {
-    /// All.
     Survey,
-    /// Galaxies of a set.
     Set,
     /// Galaxies of an image, whose response is noisy: with 40 galaxies at S/N 10 it biases the shears by
     /// (7 ± 2)·10⁻³.
@@ -100,7 +98,6 @@ pub enum Shared {
 pub struct SharedResponse {
     /// `survey`, `set 02` or `set 02 image 001`.
     pub of: String,
-    /// Galaxies without a flag.
     pub galaxies: usize,
     /// Mean R11, R22, R12 and R21.
     pub mean: [f64; 4],
@@ -111,9 +108,7 @@ pub struct SharedResponse {
 /// The columns of a galaxy's position that TreeCorr shall read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Position {
-    /// `ra` and `dec`.
     Sky,
-    /// `x` and `y`.
     Pixel,
 }
 
@@ -123,7 +118,6 @@ pub struct Shears {
     pub table: DataFrame,
     pub metadata: Metadata,
     pub responses: Vec<SharedResponse>,
-    /// Galaxies with a shear.
     pub good: usize,
 }
 

@@ -21,19 +21,15 @@ pub enum Shapes {
     Responsivity,
 }
 
-/// What a column is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Role {
     E1,
     E2,
     Weight,
-    /// Response of e1 to g1.
     R11,
     R22,
-    /// Response of e1 to g2.
     R12,
     R21,
-    /// Derivatives of the weight with g1 and g2.
     Dw1,
     Dw2,
     /// Standard deviation of each component of the distortions of galaxies without measurement noise.
@@ -45,7 +41,6 @@ pub enum Role {
     KsbE2,
     /// Zero for good rows.
     Flag,
-    /// True shear.
     G1,
     G2,
     Psf1,
@@ -55,7 +50,6 @@ pub enum Role {
     /// Position in pixels.
     X,
     Y,
-    /// Independent unit.
     Unit,
     /// Name of the sheared catalogue of a row: noshear, 1p, 1m, 2p, 2m.
     ShearedCatalogue,
@@ -397,7 +391,6 @@ pub enum NameError {
 const SHARED: [[Role; 2]; 2] = [[Role::R11, Role::R22], [Role::Id, Role::Unit]];
 
 impl Names {
-    /// Adds `ROLE=COLUMN`.
     pub fn add(&mut self, text: &str) -> Result<(), NameError> {
         let (role, column) = match text.split_once('=') {
             Some((role, column)) if !column.is_empty() => (role, column),
@@ -519,7 +512,6 @@ impl Preset {
     }
 }
 
-/// The columns of a catalogue by role.
 #[derive(Debug, Clone)]
 pub struct Columns {
     columns: BTreeMap<Key, String>,

@@ -18,7 +18,6 @@ use super::columns::Places;
 use super::columns::{Role, names_of_role};
 use super::{BiasFailure, Input, identity};
 
-/// Where the true shear comes from.
 #[derive(Debug, Clone, Default)]
 pub enum Truth {
     /// From columns of the catalogues, if there are any.
@@ -42,7 +41,6 @@ pub enum TrueSign {
     /// Standard: shears of options, of columns of the catalogues, and of data folders.
     #[default]
     Convention,
-    /// It is known.
     Known(Sign),
     /// The catalogues must determine the sign of this file.
     OfCatalogues(PathBuf),
@@ -271,7 +269,6 @@ impl Entry {
     }
 }
 
-/// True shears at positions.
 #[derive(Debug, Clone, Default)]
 pub struct Positions {
     /// In the order of their cells.
@@ -379,7 +376,6 @@ pub(super) fn check([g1, g2]: [f64; 2]) -> Result<(), String> {
     ))
 }
 
-/// Catalogues of files and folders.
 #[derive(Debug)]
 pub struct Expanded {
     pub catalogues: Vec<Input>,
