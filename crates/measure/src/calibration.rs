@@ -387,24 +387,6 @@ mod tests {
     }
 
     #[test]
-    fn a_common_factor_changes_neither_shear_nor_error() {
-        let mut rng = ChaCha8Rng::seed_from_u64(3);
-        let [mut one, mut other] = [ShearSum::default(); 2];
-        for _ in 0..50 {
-            let (e, response, weight) = galaxy(&mut rng, true);
-            one.add(e, diagonal(response), weight);
-            // Powers of two scale without rounding.
-            let response = [4.0 * response[0], 0.5 * response[1]];
-            let e = [4.0 * e[0], 0.5 * e[1]];
-            other.add(e, diagonal(response), 8.0 * weight);
-        }
-        let (one, other) = (one.mean().unwrap(), other.mean().unwrap());
-        assert_eq!(one.shear, other.shear);
-        assert_eq!(one.covariance, other.covariance);
-        assert_eq!(one.response[0], other.response[0] / 4.0);
-    }
-
-    #[test]
     fn weights_of_zero_do_not_count() {
         let mut sum = ShearSum::default();
         assert_eq!(sum.mean(), Err(MeanShearError::NoGalaxies));

@@ -61,6 +61,8 @@ mod shape;
 mod sky;
 mod spectral;
 mod stamp;
+#[cfg(test)]
+mod testing;
 mod transform;
 
 pub use calibration::{MeanShear, MeanShearError, ShearSum, is_significant};

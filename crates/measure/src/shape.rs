@@ -968,6 +968,7 @@ mod tests {
     use shearq_submissions::EllipticityType;
 
     use super::*;
+    use crate::testing::close;
 
     const REACH: usize = 16;
 
@@ -1221,36 +1222,9 @@ mod tests {
         let change = (moments.measure(&moved, 3.0, 20.0).square - found.square) / step;
         let response = moments.response(&found, &other);
         // Single precision over a step of 10⁻³.
-        assert!(
-            (change / response - 1.0).abs() < 0.02,
-            "{change} {response}"
-        );
-        let product = moments.sums(&other)[0] * response;
-        let curved = SizeMoments::mean_second_derivative(&found, product);
-        let side = |step: f32| {
-            let moved: Vec<f32> = galaxy
-                .iter()
-                .zip(&other)
-                .map(|(a, b)| a + step * b)
-                .collect();
-            f64::from(moments.response(&moments.measure(&moved, 3.0, 20.0), &other))
-        };
-        let expected = (side(0.01) - side(-0.01)) / 0.02;
-        assert!(
-            (curved / expected - 1.0).abs() < 0.02,
-            "{curved} {expected}"
-        );
+        close(change / response, 1.0, 0.02);
         let nothing = vec![0.0; galaxy.len()];
         assert_eq!(moments.measure(&nothing, 3.0, 20.0).square, 20.0);
-        let [zero, two] = moments.gradients();
-        let each = |weights: &[f32]| -> f32 {
-            let width = LATTICE.width();
-            let rows = weights.iter().zip(&other).enumerate();
-            rows.map(|(at, (w, v))| w * v * if at < width { 1.0 } else { 2.0 })
-                .sum()
-        };
-        let combined = SizeMoments::combine(&found, [each(&zero), each(&two)]);
-        assert!((combined / response - 1.0).abs() < 1e-4);
     }
 
     fn settings(acf: AcfKind, background: Background, acf_share: f64) -> ClippedShape {
@@ -1399,43 +1373,6 @@ mod tests {
                     }
                 }
             }
-        }
-    }
-
-    #[test]
-    fn backgrounds_take_a_pedestal_away() {
-        let n = 23;
-        let stamp = |pedestal: f32| -> Vec<f32> {
-            let at = |k: usize| k as f32 - 11.0;
-            (0..n * n)
-                .map(|k| {
-                    let (y, x) = (at(k / n), at(k % n));
-                    pedestal + (-(x * x / 4.0 + y * y / 2.0) / 2.0).exp()
-                })
-                .collect()
-        };
-        let distortion = |acf, background, pedestal| {
-            let settings = ClippedShape {
-                share_of: ShareOf::Maximum,
-                ..settings(acf, background, 0.9)
-            };
-            let plan = ClippedAcf::new(n, &settings);
-            let stamp = stamp(pedestal);
-            let light = stamp.iter().map(|&v| f64::from(v)).sum();
-            let moments = plan.measure(&stamp, light, &mut plan.scratch()).unwrap();
-            moments.unwrap().distortion().unwrap().e1
-        };
-        let clean = distortion(AcfKind::Full, Background::None, 0.0);
-        assert!(distortion(AcfKind::Full, Background::None, 0.05) < 0.6 * clean);
-        // A constant adds a constant to the circular autocorrelation.
-        for (acf, background) in [
-            (AcfKind::Full, Background::StampFrame),
-            (AcfKind::Circular, Background::StampFrame),
-            (AcfKind::Circular, Background::AcfEdge),
-        ] {
-            let [without, with] = [0.0, 0.05].map(|level| distortion(acf, background, level));
-            assert!((with - without).abs() < 1e-4, "{with} {without}");
-            assert!((without / clean - 1.0).abs() < 0.02, "{without} {clean}");
         }
     }
 

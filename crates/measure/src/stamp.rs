@@ -819,6 +819,7 @@ mod tests {
     use rand_distr::{Distribution, StandardNormal};
 
     use super::*;
+    use crate::testing::close;
 
     const N: usize = 48;
 
@@ -1015,10 +1016,7 @@ mod tests {
         for square in [2.0, 6.0] {
             let psf = gaussian(square, [0.3, -0.2]);
             let core = psf_core_size(psf.view(), [0.3, -0.2], 0.0, 0.0).unwrap();
-            assert!(
-                (core.mean_square_radius / square - 1.0).abs() < 1e-3,
-                "{core:?}"
-            );
+            close(core.mean_square_radius / square, 1.0, 1e-3);
             // The mean square of errors is that of 300 fields of noise, to a tenth.
             let (sigma, mut rng) = (0.01, ChaCha8Rng::seed_from_u64(4));
             let square = (0..300).map(|_| {
@@ -1032,25 +1030,6 @@ mod tests {
             let square = square.sum::<f64>() / 300.0;
             assert!((0.7..1.4).contains(&square), "{square} {square}");
         }
-    }
-
-    #[test]
-    fn an_outlier_stamp_counts_like_a_few() {
-        let mut light = GalaxyMoments::default();
-        let stamp: Vec<f32> = gaussian(10.0, [0.0; 2]).iter().map(|v| *v as f32).collect();
-        for wild in [1e6, -1e6, 0.0] {
-            for _ in 0..333 {
-                light.add(&stamp, N);
-            }
-            // Where W r² is largest.
-            let mut stamp = stamp.clone();
-            stamp[24 * N + 31] = wild;
-            light.add(&stamp, N);
-            light.add(&vec![0.0; N * N], N);
-        }
-        // Four parts in a thousand of a light of r² = 56 in place of 20 px² move the square by 2 %, once each way.
-        let found = light.mean_square_radius().unwrap();
-        assert!((found / 10.0 - 1.0).abs() < 0.02, "{found}");
     }
 
     #[test]

@@ -4,6 +4,7 @@ use ndarray::Array2;
 
 use super::*;
 use crate::sky::Sky;
+use crate::testing::close;
 
 const N: usize = 48;
 
@@ -402,10 +403,7 @@ fn bright_stars_count_as_four_galaxies_in_the_core() {
     let q = 0.5 * (29.0 * 100.0 + 4.0 * 50.0) / (29.0 * 100.0 + 4.0 * 100.0);
     let expected = CoreSize::from_weighted(q, 0.0).unwrap();
     let found = core(30).unwrap();
-    assert!(
-        (found / expected.mean_square_radius - 1.0).abs() < 1e-12,
-        "{found}"
-    );
+    close(found / expected.mean_square_radius, 1.0, 1e-12);
 }
 
 #[test]

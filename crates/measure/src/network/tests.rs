@@ -211,28 +211,10 @@ fn run(network: &Network, rule: &Rule, u0: &Array2<f64>) -> (Vec<f32>, Descent) 
 #[test]
 fn states_are_those_of_the_matrices() {
     let mut rng = ChaCha8Rng::seed_from_u64(1);
-    let sizes = [
-        (3, 2),
-        (4, 48),
-        (5, 3),
-        (5, 4),
-        (5, 15),
-        (7, 25),
-        (11, 5),
-        (14, 6),
-        (16, 15),
-        (17, 16),
-        (19, 15),
-        (23, 15),
-        (23, 25),
-        (29, 15),
-        (32, 8),
-        (33, 21),
-        (48, 15),
-        (48, 25),
-    ];
+    let sides = [3, 4, 5, 7, 14, 16, 23, 33, 48];
+    let sizes = sides.into_iter().zip([2, 48, 4, 25, 6, 15, 25, 21, 15]);
     let mut stops = Vec::new();
-    for (k, (n, p)) in sizes.into_iter().enumerate() {
+    for (k, (n, p)) in sizes.enumerate() {
         let psf = psf(&mut rng, p);
         let u0 = stamp(&mut rng, n);
         let lambdas: &[f64] = if n > 30 { &[0.3] } else { &[0.0, 1e-4, 1.0] };
@@ -298,19 +280,6 @@ fn states_are_those_of_the_matrices() {
     for stop in [Stop::Stable, Stop::EnergyRise, Stop::MaxIterations] {
         assert!(stops.contains(&stop), "{stop:?}");
     }
-}
-
-#[test]
-fn momentum_reaches_a_lower_energy_in_as_many_iterations() {
-    let mut rng = ChaCha8Rng::seed_from_u64(7);
-    let network = network(23, &psf(&mut rng, 15), 1e-4);
-    let u0 = stamp(&mut rng, 23);
-    let energy = |step, most| run(&network, &rule(step, 1e-3, most), &u0).1.energy;
-    let (plain, fast) = (Step::Adaptive(1.0), Step::Accelerated(1.0));
-    assert!(energy(fast, 15) < energy(plain, 40));
-    // And both go to the same minimum: where the plain one is after 3000 iterations.
-    let (slow, quick) = (energy(plain, 3000), energy(fast, 300));
-    assert!((slow - quick).abs() < 1e-3 * slow.abs(), "{slow} {quick}");
 }
 
 #[test]

@@ -6,6 +6,7 @@ use rand_chacha::ChaCha8Rng;
 use ndarray::Array2;
 
 use super::*;
+use crate::testing::close;
 
 const SIDE: usize = 48;
 
@@ -39,10 +40,7 @@ fn survey(
 fn white_noise_has_its_level_and_no_correlation() {
     let found = survey(3, 400, |rng| noise(rng, false));
     // 8,000 blocks; uniform noise scatters less than the error says.
-    assert!(
-        (found.sigma() - 1.0).abs() < 3.0 * found.error(),
-        "{found:?}"
-    );
+    close(found.sigma(), 1.0, 3.0 * found.error());
     assert!(found.error() < 2e-3 && !found.is_correlated(), "{found:?}");
     let (power, _) = found.power([0.5, -0.8], PixelShape::SQUARE);
     // 24 lags of 1/√400,000 each, both ways: 1.5 %.
@@ -111,10 +109,7 @@ fn missing_pixels_cost_their_blocks_alone() {
         }
         stamp
     });
-    assert!(
-        (found.sigma() - 1.0).abs() < 3.0 * found.error(),
-        "{found:?}"
-    );
+    close(found.sigma(), 1.0, 3.0 * found.error());
     // Of 600 frames of 20 blocks of 64 pixels about half are whole: as of 300 frames without missing pixels.
     assert!(
         found.error() < 2.5e-3 && !found.is_correlated(),
@@ -211,10 +206,7 @@ fn galaxies_and_neighbours_do_not_raise_the_noise() {
         stamp
     });
     // The same noise, of which fewer blocks are left.
-    assert!(
-        (crowded.sigma() / plain.sigma() - 1.0).abs() < 4e-3,
-        "{crowded:?} {plain:?}"
-    );
+    close(crowded.sigma() / plain.sigma(), 1.0, 4e-3);
     assert!(!crowded.is_correlated(), "{crowded:?}");
 }
 

@@ -7,6 +7,7 @@ use rand_distr::{Distribution, StandardNormal};
 use shearq_quantities::PsfProfile;
 
 use super::*;
+use crate::testing::close;
 
 /// A star of sum one on a stamp of `side` pixels.
 pub(super) fn drawn(profile: PsfProfile, fwhm: f64, shear: Shear, side: usize) -> Array2<f64> {
@@ -42,11 +43,7 @@ fn noisy_stars_off_the_centre_average_to_the_psf() {
     let profile = PsfProfile::Moffat { beta: 3.0 };
     let psf = FunctionalPsf::new(profile, 3.4, Shear::new(0.05, -0.03)).unwrap();
     let expected = psf.stamp(48);
-    let cut = PsfCut {
-        size: 48,
-        least: 32,
-        centred: false,
-    };
+    let cut = limits(48, 32, false);
     let mut rng = ChaCha8Rng::seed_from_u64(3);
     for (snr, count, tolerance) in [(f64::INFINITY, 5, 2e-4), (200.0, 64, 4e-3)] {
         let mut stars = Array3::zeros((count, 48, 48));
@@ -73,11 +70,7 @@ fn noisy_stars_off_the_centre_average_to_the_psf() {
 fn a_star_that_cannot_be_averaged_is_named() {
     let mut stars = Array3::zeros((2, 32, 32));
     stars.slice_mut(s![0, 15..17, 15..17]).fill(1.0);
-    let cut = PsfCut {
-        size: 32,
-        least: 32,
-        centred: false,
-    };
+    let cut = limits(32, 32, false);
     let (number, error) = average_stars(stars.view(), cut).unwrap_err();
     assert_eq!(number, 2);
     assert!(error.to_string().contains("sum to 0"), "{error}");
@@ -86,6 +79,14 @@ fn a_star_that_cannot_be_averaged_is_named() {
 fn moffat(fwhm: f64) -> FunctionalPsf {
     let profile = PsfProfile::Moffat { beta: 3.0 };
     FunctionalPsf::new(profile, fwhm, Shear::new(0.05, -0.03)).unwrap()
+}
+
+fn limits(size: usize, least: usize, centred: bool) -> PsfCut {
+    PsfCut {
+        size,
+        least,
+        centred,
+    }
 }
 
 fn cut<P: Pixel>(stamp: ArrayView2<'_, P>, cut: impl Into<PsfCut>) -> Array2<f64> {
@@ -106,16 +107,12 @@ fn a_functional_psf_is_where_the_cut_of_a_star_is() {
 
 #[test]
 fn small_star_stamps_keep_their_centre() {
-    let limits = PsfCut {
-        size: 48,
-        least: 32,
-        centred: false,
-    };
+    let sides = limits(48, 32, false);
     let stamp = moffat(3.4).stamp(64);
     for (given, expected) in [(32, 32), (37, 36), (48, 48), (64, 48)] {
         let from = cut_start(64, given).unwrap();
         let star = stamp.slice(s![from..from + given, from..from + given]);
-        let taken = cut(star, limits);
+        let taken = cut(star, sides);
         assert_eq!(taken.dim(), (expected, expected), "{given}");
         assert!((taken.sum() - 1.0).abs() < 1e-12);
         // Where the parity is another, half a pixel early.
@@ -126,7 +123,7 @@ fn small_star_stamps_keep_their_centre() {
         let expected = at(29, 37) / at(32, 32);
         assert!((found - expected).abs() < 1e-12, "{given}");
     }
-    assert!(Star::cut(stamp.slice(s![..31, ..31]), limits).is_err());
+    assert!(Star::cut(stamp.slice(s![..31, ..31]), sides).is_err());
 }
 
 #[test]
@@ -143,10 +140,7 @@ fn stacked_stars_are_at_the_place_of_the_first() {
     let light = star.sum();
     for (found, expected) in stack.iter().zip(&star) {
         // Centroids are found to 10⁻³ px.
-        assert!(
-            (found - expected / light).abs() < 1e-4,
-            "{found} {expected}"
-        );
+        close(*found, expected / light, 1e-4);
     }
     assert!(Star::stack([star.view(), star.slice(s![1.., 1..])]).is_err());
     assert!(Star::stack(std::iter::empty::<ArrayView2<'_, f64>>()).is_err());
@@ -174,13 +168,9 @@ fn unusable_stars_are_refused_with_the_reason() {
 fn a_star_of_the_other_parity_is_drawn_on_the_cut() {
     let psf = moffat(4.0);
     for (given, size) in [(49, 48), (53, 48), (33, 32), (48, 47), (64, 49)] {
-        let limits = PsfCut {
-            size,
-            least: size,
-            centred: true,
-        };
-        let found = cut(psf.stamp(given).view(), limits);
-        let expected = cut(psf.stamp(size + 6).view(), limits);
+        let sides = limits(size, size, true);
+        let found = cut(psf.stamp(given).view(), sides);
+        let expected = cut(psf.stamp(size + 6).view(), sides);
         let peak = expected.iter().copied().fold(0.0, f64::max);
         let inner = s![8..size - 8, 8..size - 8];
         for (a, b) in found.slice(inner).iter().zip(expected.slice(inner)) {
@@ -189,14 +179,7 @@ fn a_star_of_the_other_parity_is_drawn_on_the_cut() {
         }
     }
     // Only one side is of the other parity.
-    let cut = Star::cut(
-        Array2::<f32>::ones((9, 8)).view(),
-        PsfCut {
-            size: 8,
-            least: 8,
-            centred: true,
-        },
-    );
+    let cut = Star::cut(Array2::<f32>::ones((9, 8)).view(), limits(8, 8, true));
     assert_eq!(cut.unwrap().psf.dim(), (8, 8));
 }
 
@@ -247,11 +230,7 @@ fn bright_stars_count_alike_in_the_average() {
     let mut stars = Array3::zeros((2, 48, 48));
     stars.slice_mut(s![0, .., ..]).assign(&narrow);
     stars.slice_mut(s![1, .., ..]).assign(&wide);
-    let cut = PsfCut {
-        size: 48,
-        least: 32,
-        centred: false,
-    };
+    let cut = limits(48, 32, false);
     let found = average_stars(stars.view(), cut).unwrap();
     let [found, narrow, wide] = [&found, &narrow, &wide].map(|psf| psf[(24, 24)] / psf.sum());
     // By its S/N of 1300, which is above 1000, the second would count less than the first, which has no noise.
