@@ -104,16 +104,6 @@ fn errors_name_the_place_and_what_was_expected() {
     assert!(message("figure").contains("found no extension"));
     // Below a file there can be no folder.
     assert!(message("Cargo.toml/figure.svg").starts_with("Cargo.toml: cannot make the folder"));
-    let mut uneven = plot.clone();
-    uneven.title = "Bias".into();
-    uneven.series[1].y.push(2.0);
-    assert_eq!(
-        uneven
-            .render(PictureFormat::Svg)
-            .expect_err("uneven")
-            .to_string(),
-        "figure `Bias`, series `hard`: found 2 values of y, expected 1"
-    );
     let many = PanelGrid {
         title: String::new(),
         columns: 2,

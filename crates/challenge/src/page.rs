@@ -337,11 +337,9 @@ impl View<'_> {
             })
             .collect();
         let mut plot = q_per_set(&rows);
-        for series in &mut plot.series {
-            let values = series.y.iter_mut();
-            values.for_each(|q| *q = rounded(*q, self.digits));
-            let errors = series.y_err.iter_mut().flatten();
-            errors.for_each(|error| *error = rounded_up(*error, self.digits));
+        for point in plot.series.iter_mut().flat_map(|series| &mut series.points) {
+            point.y = rounded(point.y, self.digits);
+            point.y_error = rounded_up(point.y_error, self.digits);
         }
         let caption =
             "Q of each set. Metrics of single sets reveal more of the true shear than their mean.";

@@ -36,7 +36,7 @@ use shearq_files::{FileError, atomic};
 use crate::escape;
 pub use colour::ColourMap;
 pub use image::{ImageGrid, ImagePanel, ImageRow, Stretch};
-pub use plot::{Band, LinePlot, PanelGrid, Series, Style};
+pub use plot::{Band, LinePlot, PanelGrid, Point, Series, Style};
 
 // The em of a figure's title, in points.
 const TITLE_SIZE: f64 = 15.0;
@@ -66,14 +66,6 @@ pub enum FigureError {
     Extension { path: PathBuf, found: String },
     #[error(transparent)]
     File(#[from] FileError),
-    #[error("figure `{figure}`, {place}: found {found} {what}, expected {expected}")]
-    Lengths {
-        figure: String,
-        place: String,
-        what: &'static str,
-        found: usize,
-        expected: usize,
-    },
     #[error(
         "the figure would be {width:.0} × {height:.0} points, expected at most {MAX_AREA:.0} \
          square points: put fewer panels into it"
@@ -112,11 +104,6 @@ type Drawn<B> = Result<(), DrawingAreaErrorKind<<B as DrawingBackend>::ErrorType
 
 /// A picture that can be drawn. Values that are not finite, or not positive on a logarithmic axis, are left out.
 pub trait Figure: Sized {
-    /// Refuses lengths that differ.
-    fn check(&self) -> Result<(), FigureError> {
-        Ok(())
-    }
-
     /// Width and height in points that it needs.
     fn extent(&self) -> (f64, f64);
 
@@ -130,7 +117,6 @@ pub trait Figure: Sized {
 
     /// The contents of a picture file. The same figure gives the same bytes.
     fn render(&self, format: PictureFormat) -> Result<Vec<u8>, FigureError> {
-        self.check()?;
         let (width, height) = self.size();
         if width * height > MAX_AREA {
             return Err(FigureError::TooLarge { width, height });

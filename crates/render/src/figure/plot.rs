@@ -8,8 +8,8 @@ use plotters::style::{Color, RGBColor, TRANSPARENT};
 use super::axis::{Axis, Scale, shown};
 use super::colour::{GREY, series_colour};
 use super::{
-    Canvas, Drawn, Figure, FigureError, INK, LABEL_SIZE, LEFT, LINE, MARGIN, MIDDLE, TICK_SIZE,
-    TITLE_SIZE, TO_CENTRE, font, frame, line, place, room, text_width, units, widest, write,
+    Canvas, Drawn, Figure, INK, LABEL_SIZE, LEFT, LINE, MARGIN, MIDDLE, TICK_SIZE, TITLE_SIZE,
+    TO_CENTRE, font, frame, line, place, room, text_width, units, widest, write,
 };
 
 // Width of curves and of error bars, and radius of points, in points.
@@ -39,14 +39,30 @@ pub enum Style {
     Dashed,
 }
 
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Point {
+    pub x: f64,
+    pub y: f64,
+    /// Half the length of its error bar.
+    pub y_error: f64,
+}
+
+impl Point {
+    // The ends of the error bar; the point itself if it has no error.
+    fn bar(&self) -> (f64, f64) {
+        let half = match self.y_error.abs() {
+            half if shown(half, false) => half,
+            _ => 0.0,
+        };
+        (self.y - half, self.y + half)
+    }
+}
+
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Series {
     /// Its name in the legend; without one it does not appear there.
     pub label: String,
-    pub x: Vec<f64>,
-    pub y: Vec<f64>,
-    /// Half the length of the error bar of each point.
-    pub y_err: Option<Vec<f64>>,
+    pub points: Vec<Point>,
     pub style: Style,
     /// Which colour of the palette of eight; the last is grey.
     pub colour: usize,
@@ -54,46 +70,29 @@ pub struct Series {
 
 impl Series {
     pub fn new(label: &str, x: Vec<f64>, y: Vec<f64>, style: Style, colour: usize) -> Self {
+        debug_assert_eq!(x.len(), y.len(), "points of {label}");
+        let points = x.into_iter().zip(y);
+        let y_error = 0.0;
         Self {
             label: label.into(),
-            x,
-            y,
-            y_err: None,
+            points: points.map(|(x, y)| Point { x, y, y_error }).collect(),
             style,
             colour,
         }
     }
 
-    /// The same series with error bars of half the length `y_err`.
-    pub fn with_errors(self, y_err: Vec<f64>) -> Self {
-        Self {
-            y_err: Some(y_err),
-            ..self
+    /// The same series with error bars of half the length `y_errors`.
+    pub fn with_errors(mut self, y_errors: Vec<f64>) -> Self {
+        debug_assert_eq!(
+            self.points.len(),
+            y_errors.len(),
+            "errors of {}",
+            self.label
+        );
+        for (point, y_error) in self.points.iter_mut().zip(y_errors) {
+            point.y_error = y_error;
         }
-    }
-
-    fn check(&self, figure: &str) -> Result<(), FigureError> {
-        let errors = self.y_err.as_ref().map_or(self.x.len(), Vec::len);
-        for (what, found) in [("values of y", self.y.len()), ("error bars", errors)] {
-            if found != self.x.len() {
-                return Err(FigureError::Lengths {
-                    figure: figure.into(),
-                    place: format!("series `{}`", self.label),
-                    what,
-                    found,
-                    expected: self.x.len(),
-                });
-            }
-        }
-        Ok(())
-    }
-
-    // The ends of the error bar at a point; the point itself if it has no error.
-    fn bar(&self, point: usize) -> (f64, f64) {
-        let errors = self.y_err.as_ref();
-        let half = errors.map_or(0.0, |errors| errors[point].abs());
-        let half = if shown(half, false) { half } else { 0.0 };
-        (self.y[point] - half, self.y[point] + half)
+        self
     }
 }
 
@@ -141,24 +140,23 @@ impl LinePlot {
         if self.is_turned() { [y, x] } else { [x, y] }
     }
 
-    // The points that can be shown, and where each is in its series.
-    fn points(&self) -> impl Iterator<Item = (&Series, usize)> {
-        let all = self.series.iter();
-        let all = all.flat_map(|series| (0..series.x.len()).map(move |i| (series, i)));
-        all.filter(|(series, i)| self.shows(series, *i))
+    // The points that can be shown.
+    fn points(&self) -> impl Iterator<Item = &Point> {
+        let all = self.series.iter().flat_map(|series| &series.points);
+        all.filter(|point| self.shows(point))
     }
 
-    fn shows(&self, series: &Series, i: usize) -> bool {
-        shown(series.x[i], self.x_log) && shown(series.y[i], self.y_log)
+    fn shows(&self, point: &Point) -> bool {
+        shown(point.x, self.x_log) && shown(point.y, self.y_log)
     }
 
     // The axes across and upwards of a frame of this size.
     fn axes(&self, (width, height): (f64, f64)) -> [Axis; 2] {
-        let x = self.points().map(|(series, i)| series.x[i]);
-        let y = self.points().flat_map(|(series, i)| {
-            let (low, high) = series.bar(i);
+        let x = self.points().map(|point| point.x);
+        let y = self.points().flat_map(|point| {
+            let (low, high) = point.bar();
             // On a logarithmic axis a bar down to zero has no end: it must not stretch the axis.
-            let end = if self.y_log { 0.3 * series.y[i] } else { low };
+            let end = if self.y_log { 0.3 * point.y } else { low };
             [low.max(end), high]
         });
         let y = y.chain(self.bands.iter().flat_map(|band| [band.low, band.high]));
@@ -237,22 +235,27 @@ impl LinePlot {
         let mut empty = true;
         for series in &self.series {
             // None where nothing can be shown, which interrupts a line.
-            let points = (0..series.x.len()).map(|i| {
-                let (px, py) = (x.at(series.x[i]), y.at(series.y[i]));
-                let seen = self.shows(series, i) && x.contains(px) && y.contains(py);
+            let places = series.points.iter().map(|point| {
+                let (px, py) = (x.at(point.x), y.at(point.y));
+                let seen = self.shows(point) && x.contains(px) && y.contains(py);
                 seen.then(|| at(px, py))
             });
-            let points: Vec<_> = points.collect();
-            empty &= points.iter().all(Option::is_none);
+            let places: Vec<_> = places.collect();
+            empty &= places.iter().all(Option::is_none);
             let colour = series_colour(series.colour);
-            for i in (0..points.len()).filter(|&i| points[i].is_some()) {
-                let (low, high) = series.bar(i);
+            for (point, _) in series
+                .points
+                .iter()
+                .zip(&places)
+                .filter(|(_, at)| at.is_some())
+            {
+                let (low, high) = point.bar();
                 if high > low {
-                    let ends = [low, high].map(|end| at(x.at(series.x[i]), y.clamped(end)));
+                    let ends = [low, high].map(|end| at(x.at(point.x), y.clamped(end)));
                     draw_error(canvas, ends, colour)?;
                 }
             }
-            draw_series(canvas, &points, series.style, series.colour)?;
+            draw_series(canvas, &places, series.style, series.colour)?;
         }
         for (axis, horizontal) in [(&across, true), (&up, false)] {
             for &value in &axis.minor {
@@ -336,11 +339,6 @@ fn draw_series<B: DrawingBackend>(
 }
 
 impl Figure for LinePlot {
-    fn check(&self) -> Result<(), FigureError> {
-        let mut series = self.series.iter();
-        series.try_for_each(|series| series.check(&self.title))
-    }
-
     fn extent(&self) -> (f64, f64) {
         PanelGrid::from(self).extent()
     }
@@ -479,10 +477,6 @@ fn entry_width(label: &str) -> f64 {
 }
 
 impl Figure for PanelGrid {
-    fn check(&self) -> Result<(), FigureError> {
-        self.plots.iter().try_for_each(LinePlot::check)
-    }
-
     fn extent(&self) -> (f64, f64) {
         self.layout().extent
     }
