@@ -100,12 +100,6 @@ fn summed(stamps: &Stamps, side: usize) -> Stamps {
     })
 }
 
-fn add_gradient(data: &mut Data, per_pixel: f32) {
-    for ((_, _, x), value) in data.stamps.indexed_iter_mut() {
-        *value += per_pixel * (x as f32 - 23.5);
-    }
-}
-
 /// Draws the star with a factor on its FWHM, and off the centre along x.
 fn draw_star(data: &mut Data, scale: f64, offset: f64) {
     let psf = FunctionalPsf {
@@ -115,13 +109,6 @@ fn draw_star(data: &mut Data, scale: f64, offset: f64) {
     let mut star = Array2::zeros((STAMP, STAMP));
     psf.draw_into(23.5 + offset, 23.5, star.view_mut());
     data.star = star.mapv(|value| value as f32);
-}
-
-/// Adds noise to the star, of S/N √(Σ p²)/σ.
-fn add_star_noise(data: &mut Data, snr: f32) {
-    let sigma = data.star.mapv(|v| v * v).sum().sqrt() / snr;
-    let noise = normal((1, STAMP, STAMP), 7);
-    data.star.scaled_add(sigma, &noise.slice(s![0, .., ..]));
 }
 
 /// What is done to the data, and what an entry point must do: warn with these words, when the galaxies are measured if not
@@ -174,14 +161,22 @@ impl Data {
         match words[..] {
             ["none"] => {}
             ["sky", level] => self.stamps += number(level) as f32,
-            ["slope", slope] => add_gradient(self, number(slope) as f32),
+            ["slope", slope] => {
+                for ((_, _, x), value) in self.stamps.indexed_iter_mut() {
+                    *value += number(slope) as f32 * (x as f32 - 23.5);
+                }
+            }
             ["psf", "background", share] => {
                 let peak = self.star.iter().copied().fold(0.0, f32::max);
                 self.star += number(share) as f32 * peak;
             }
             ["psf", "scale", scale] => draw_star(self, number(scale), 0.0),
             ["psf", "offset", offset] => draw_star(self, 1.0, number(offset)),
-            ["psf", "snr", snr] => add_star_noise(self, number(snr) as f32),
+            ["psf", "snr", snr] => {
+                let sigma = self.star.mapv(|v| v * v).sum().sqrt() / number(snr) as f32;
+                let noise = normal((1, STAMP, STAMP), 7);
+                self.star.scaled_add(sigma, &noise.slice(s![0, .., ..]));
+            }
             ["psf", "pixel"] => {
                 self.star.fill(0.0);
                 self.star[(STAMP / 2, STAMP / 2)] = 1.0;

@@ -13,8 +13,8 @@ use shearq_pipeline::simulate::simulator;
 use shearq_results::record::SetRecord;
 use shearq_scoring::modes::{Decomposer, Modes};
 use shearq_scoring::{
-    Bins, Choice, Complex64, Convention, Definition, FieldSum, Grid, Options, SCORED, SetImages,
-    SetScorer, TrueShear,
+    Bins, Choice, Complex64, Convention, Definition, Options, SCORED, SetImages, SetScorer,
+    TrueShear,
 };
 use shearq_simulate::field::ShearSpectrum;
 use shearq_simulate::set::{SetSimulator, SimulationSettings};
@@ -154,31 +154,20 @@ impl Attack {
         }
     }
 
-    fn grid(&self) -> Grid {
-        self.decomposer.grid()
-    }
-
     /// Q and calibrated Q after the modes of each bandpower are multiplied by its factor.
     fn score(&self, factor: impl Fn(usize) -> f64) -> [f64; 2] {
-        let n = self.grid().n;
+        let grid = self.decomposer.grid();
         let wave = |k: usize| {
-            let k = k as f64;
-            let side = n as f64;
-            self.grid().l_min().0 * if k > side / 2.0 { k - side } else { k }
+            let (k, side) = (k as f64, grid.n as f64);
+            grid.l_min().0 * if k > side / 2.0 { k - side } else { k }
         };
         let mut modes = self.modes.clone();
         for ((i, j), mode) in modes.e.indexed_iter_mut() {
             *mode *= factor(self.bins.nearest(wave(i).hypot(wave(j))));
         }
         let field = self.decomposer.compose(&modes).unwrap();
-        let sum = FieldSum {
-            e1: field.mapv(|e| e.re),
-            e2: field.mapv(|e| e.im),
-            count: Array2::from_elem((n, n), 1.0),
-            images: 1,
-        };
-        let mut images = SetImages::new(&self.grid());
-        images.add(&sum).unwrap();
+        let (e1, e2) = (field.mapv(|e| e.re), field.mapv(|e| e.im));
+        let images = SetImages::of_arrays(&grid, [[e1.view(), e2.view()]]).unwrap();
         let metrics = self.scorer.score(&images).unwrap().metrics;
         [metrics.q, metrics.q_calibrated]
     }

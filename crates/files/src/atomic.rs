@@ -435,14 +435,4 @@ mod tests {
             }
         });
     }
-
-    #[test]
-    fn of_two_that_make_a_new_file_one_is_told_so() {
-        let folder = tempfile::tempdir().unwrap();
-        let target = folder.path().join("baseline.toml");
-        let part = || written(&target, b"mine").unwrap();
-        let (one, two) = (part(), part());
-        assert!(one.finish_if_absent().unwrap() && !two.finish_if_absent().unwrap());
-        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1);
-    }
 }

@@ -918,26 +918,27 @@ mod tests {
     #[test]
     fn epochs_of_other_galaxies_are_refused() {
         let first = galaxies(Some(&["7", "8"]), &[[12.0, 1.0], [12.1, 1.0]]);
-        let message = |other: &Galaxies| find(&first, other).unwrap_err();
-        let text = message(&galaxies(Some(&["\"7\""]), &[]));
-        assert!(
-            text.contains("1 of 1 galaxies, such as id \"7\", are not in image 1"),
-            "{text}"
-        );
-        let text = message(&galaxies(Some(&["7"]), &[[12.1, 1.0]]));
-        assert!(
-            text.contains("id 7 is 359.9″ from the one of image 1"),
-            "{text}"
-        );
-        let text = message(&galaxies(Some(&["7", "7"]), &[]));
-        assert!(text.contains("the id 7 is in rows 1 and 2"), "{text}");
-        let text = message(&galaxies(None, &[]));
-        assert!(
-            text.contains("joined by the columns id, or ra and dec"),
-            "{text}"
-        );
         let twice = galaxies(None, &[[12.0, 1.0], [12.0, 1.000_05]]);
-        let text = find(&galaxies(None, &[[12.0, 1.0]]), &twice).unwrap_err();
-        assert!(text.contains("two galaxies are within 0.5″"), "{text}");
+        let alone = galaxies(None, &[[12.0, 1.0]]);
+        let of = |ids: &[&str], sky: &[[f64; 2]]| galaxies(Some(ids), sky);
+        let absent = "1 of 1 galaxies, such as id \"7\", are not in image 1";
+        for (first, other, words) in [
+            (&first, of(&["\"7\""], &[]), absent),
+            (
+                &first,
+                of(&["7"], &[[12.1, 1.0]]),
+                "id 7 is 359.9″ from the one of image 1",
+            ),
+            (&first, of(&["7", "7"], &[]), "the id 7 is in rows 1 and 2"),
+            (
+                &first,
+                galaxies(None, &[]),
+                "joined by the columns id, or ra and dec",
+            ),
+            (&alone, twice, "two galaxies are within 0.5″"),
+        ] {
+            let text = find(first, &other).unwrap_err();
+            assert!(text.contains(words), "{text}");
+        }
     }
 }
