@@ -720,7 +720,11 @@ mod tests {
         assert!(slope(&noisy).1);
         // Zeros, a template, and a template of random amplitude.
         assert!(!slope(&|_, _, _| 0.0).1 && !slope(&|_, b, _| smooth[b]).1);
-        assert!(!slope(&|set, b, _| smooth[b] * (1.0 + ((set * 8 + b) as f64 * 1.7).cos())).1);
+        // One of the two has a positive slope.
+        for sign in [1.0, -1.0] {
+            let amplitude = |k: usize| 1.0 + sign * (k as f64 * 1.7).cos();
+            assert!(!slope(&|set, b, _| smooth[b] * amplitude(set * 8 + b)).1);
+        }
         let (only, error) = slope_over_sets(&[(truth[0].clone(), truth[0].clone())]);
         assert!(!is_measurable(only, error));
     }
