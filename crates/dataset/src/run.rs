@@ -371,7 +371,6 @@ pub fn nan_for_null<'de, D: Deserializer<'de>, N: Numbers>(deserializer: D) -> R
 #[derive(Debug)]
 #[must_use]
 pub struct Claim {
-    /// The record, with a shared lock on it.
     record: File,
     path: PathBuf,
 }
@@ -425,7 +424,7 @@ impl Claim {
 }
 
 /// Claims the folder of `path` for `record`. Writes the record if there is none, and refuses a folder with a different
-/// record. Leftovers of killed processes are removed if no other process is at work.
+/// record. Leftovers of killed processes are removed.
 pub fn claim<R: Serialize + DeserializeOwned>(path: &Path, record: &R) -> Result<Claim, FileError> {
     let mut earlier: Option<R> = read_record(path)?;
     if earlier.is_none() {
@@ -445,17 +444,10 @@ pub fn claim<R: Serialize + DeserializeOwned>(path: &Path, record: &R) -> Result
             ),
         ));
     }
-    let file = open_to_lock(path).map_err(FileError::doing(path, "cannot open the record"))?;
-    // All processes at work hold a shared lock, so that an exclusive one shows that there are no others. Without this test, leftovers
-    // could be files that another process is just writing.
-    if file.try_lock().is_ok() {
-        atomic::remove_leftovers(folder)?;
-    }
-    // Shares the lock with other processes. On file systems without locks, leftovers stay and do no harm.
-    let _ = file.unlock();
-    let _ = file.lock_shared();
+    let record = File::open(path).map_err(FileError::doing(path, "cannot open the record"))?;
+    atomic::remove_leftovers(folder);
     Ok(Claim {
-        record: file,
+        record,
         path: path.to_owned(),
     })
 }
@@ -501,12 +493,6 @@ fn most_important(mut differences: Vec<String>) -> Vec<String> {
         differences.push(format!("and {more} more"));
     }
     differences
-}
-
-// Opens a record so that it can be locked. Over NFS an exclusive lock requires write permission.
-fn open_to_lock(path: &Path) -> std::io::Result<File> {
-    let writable = File::options().read(true).write(true).open(path);
-    writable.or_else(|_| File::open(path))
 }
 
 /// Differences of two records, as `key: first ≠ second`; a missing value is null.
@@ -607,7 +593,7 @@ mod tests {
     }
 
     #[test]
-    fn leftovers_are_removed_if_no_other_process_is_at_work() {
+    fn leftovers_are_removed_unless_a_process_holds_them() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("record.json");
         // Branches of GREAT3 have images three folders below the record.
@@ -620,14 +606,13 @@ mod tests {
             std::fs::create_dir_all(path.parent().unwrap()).unwrap();
             std::fs::write(path, "half").unwrap();
         }
-        let first = claim(&path, &1).unwrap();
+        let _first = claim(&path, &1).unwrap();
         assert!(!left.exists() && !deep.exists());
-        std::fs::write(&left, "being written").unwrap();
-        let second = claim(&path, &1).unwrap();
-        assert!(left.exists());
-        drop((first, second));
-        let _third = claim(&path, &1).unwrap();
-        assert!(!left.exists());
+        let target = folder.path().join("set01/catalogue-002.fits");
+        let (held, _) = atomic::PartFile::create(target).unwrap();
+        std::fs::write(&left, "half").unwrap();
+        let _second = claim(&path, &1).unwrap();
+        assert!(!left.exists() && held.path().exists());
         let message = claim(&path, &2).unwrap_err().to_string();
         assert!(message.contains(": 1 ≠ 2"), "{message}");
     }

@@ -1,8 +1,8 @@
 //! Files that are written completely or not at all.
 //!
-//! Until they are complete they have temporary names, `.NAME.RANDOM.part`. The next process removes the leftovers of a
-//! killed one: [`remove_leftovers`] in a folder that one process uses alone; elsewhere the first file that is written. A lock
-//! marks the files of a running process.
+//! Until they are complete they have temporary names, `.NAME.RANDOM.part`, and are locked by their process. The next process
+//! removes the leftovers of a killed one: below a folder of results by [`remove_leftovers`], elsewhere in the folder of the first file
+//! that it writes.
 
 use std::collections::BTreeSet;
 use std::ffi::OsString;
@@ -140,7 +140,7 @@ pub struct Scratch {
 impl Scratch {
     pub fn new() -> Result<Self, FileError> {
         let temporary = std::env::temp_dir();
-        sweep(&temporary);
+        sweep(&temporary, 0);
         let made = held_folder(&Names::of("shearq".as_ref()), &temporary, usual(0o700));
         let doing = "cannot make a temporary folder";
         let (folder, lock) = made.map_err(FileError::doing(&temporary, doing))?;
@@ -242,7 +242,7 @@ fn names_for(target: &Path) -> Result<(Names, PathBuf), FileError> {
     static SWEPT: Mutex<BTreeSet<PathBuf>> = Mutex::new(BTreeSet::new());
     let mut swept = SWEPT.lock().unwrap_or_else(PoisonError::into_inner);
     if swept.insert(folder.to_owned()) {
-        sweep(folder);
+        sweep(folder, 0);
     }
     Ok((Names::of(name), folder.to_owned()))
 }
@@ -255,42 +255,10 @@ pub fn folder_of(target: &Path) -> &Path {
     }
 }
 
-// Folders within folders that results are in, as EXPERIMENT/OBSERVATION/SHEAR of GREAT3. Deeper ones
-// are not searched, because links may form circles.
-const MAX_DEPTH: usize = 3;
-
-/// Removes the temporary files that killed processes left in `folder` and the folders in it. No other
-/// process may be writing there.
-pub fn remove_leftovers(folder: &Path) -> Result<(), FileError> {
-    remove_leftovers_to(folder, MAX_DEPTH)
-}
-
-fn remove_leftovers_to(folder: &Path, depth: usize) -> Result<(), FileError> {
-    for path in list(folder)? {
-        if !path.is_dir() {
-            remove_part(&path)?;
-        } else if depth > 0 {
-            remove_leftovers_to(&path, depth - 1)?;
-        }
-    }
-    Ok(())
-}
-
 fn list(folder: &Path) -> Result<Vec<PathBuf>, FileError> {
     fs::read_dir(folder)
         .and_then(|entries| entries.map(|entry| Ok(entry?.path())).collect())
         .map_err(FileError::doing(folder, "cannot list the folder"))
-}
-
-fn remove_part(path: &Path) -> Result<(), FileError> {
-    if !(is_part(path) && path.is_file()) {
-        return Ok(());
-    }
-    match fs::remove_file(path) {
-        // Another process that is about to claim the folder may have removed it.
-        Err(error) if error.kind() == ErrorKind::NotFound => Ok(()),
-        result => result.map_err(FileError::doing(path, "cannot remove the leftover")),
-    }
 }
 
 /// Whether a name is a temporary one. Other programs end their names in `.part`, too.
@@ -304,14 +272,26 @@ fn is_part(path: &Path) -> bool {
     })
 }
 
-/// Removes the temporary files and folders in `folder` that no running process has locked. Files without a known state
-/// or without permission stay, and do no harm.
-fn sweep(folder: &Path) {
+// Folders within folders that results are in, as EXPERIMENT/OBSERVATION/SHEAR of GREAT3. Deeper ones
+// are not searched, because links may form circles.
+const MAX_DEPTH: usize = 3;
+
+/// Removes the temporary files and folders that killed processes left in `folder` and the folders in it.
+pub fn remove_leftovers(folder: &Path) {
+    sweep(folder, MAX_DEPTH);
+}
+
+// A running process has locked its files. Files without a known state or without permission stay, and do no harm; so do all
+// on file systems without locks.
+fn sweep(folder: &Path, depth: usize) {
     for path in list(folder).unwrap_or_default() {
         let Ok(about) = path.symlink_metadata() else {
             continue;
         };
         if !is_part(&path) || !(about.is_file() || about.is_dir()) {
+            if depth > 0 && path.is_dir() {
+                sweep(&path, depth - 1);
+            }
             continue;
         }
         let Ok(file) = fs::File::open(&path) else {
@@ -389,11 +369,13 @@ mod tests {
         assert_eq!(fs::read(&target).unwrap(), b"two");
         assert!(!write_if_absent(&target, b"three").unwrap());
         assert_eq!(fs::read(&target).unwrap(), b"two");
-        let killed = part();
-        fs::write(killed.path(), "half").unwrap();
-        std::mem::forget(killed);
-        remove_leftovers(folder.path()).unwrap();
-        assert_eq!(fs::read_dir(target.parent().unwrap()).unwrap().count(), 1);
+        let (killed, living) = (
+            target.with_file_name(".truth.csv.0123456789abcdef.part"),
+            part(),
+        );
+        fs::write(&killed, "half").unwrap();
+        remove_leftovers(folder.path());
+        assert!(!killed.exists() && living.path().exists());
     }
 
     #[test]
@@ -409,7 +391,7 @@ mod tests {
         let (living, _file) = PartFile::create(at("out.csv")).unwrap();
         assert!(!at(left).exists() && !at(".out.fedcba9876543210.part").exists());
         let folder_of = PartFolder::new(at("packed")).unwrap();
-        sweep(folder.path());
+        sweep(folder.path(), 0);
         let mut names: Vec<PathBuf> = list(folder.path()).unwrap();
         names.sort();
         let mut expected = [
