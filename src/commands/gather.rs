@@ -5,8 +5,7 @@ use clap::Args;
 use crate::arguments::named;
 use crate::{count, tell};
 use shearq_dataset::images::ImageId;
-use shearq_dataset::layout::DataFolder;
-use shearq_dataset::layout::{MAX_IMAGE, MAX_SET};
+use shearq_dataset::layout::{DataFolder, MAX_IMAGE, MAX_SET};
 use shearq_pipeline::gather::{
     Content, Files, Gathered, Gathering, Masks, Square, Stamps, Table, gather,
 };
@@ -134,24 +133,6 @@ struct Cutouts {
     size: u16,
 }
 
-// An extension without a file means the files of the images: surveys store masks and weights beside the pixels.
-fn companion<'a>(
-    paths: &'a [PathBuf],
-    extension: Option<&'a String>,
-    content: Content,
-    images: &Files<'a>,
-) -> Option<Files<'a>> {
-    (!paths.is_empty() || extension.is_some()).then_some(Files {
-        paths: if paths.is_empty() {
-            images.paths
-        } else {
-            paths
-        },
-        extension: extension.map(String::as_str),
-        content,
-    })
-}
-
 fn two_columns(columns: Option<&[String]>) -> anyhow::Result<Option<[&str; 2]>> {
     match columns {
         None => Ok(None),
@@ -182,106 +163,13 @@ fn own<'a>(
     }
 }
 
-/// Images, masks, PSFs, variance and weight maps, and positions of exposure `at`, or of all stamps.
-fn own_files(arguments: &Arguments, at: usize) -> anyhow::Result<[&[PathBuf]; 6]> {
-    let Arguments {
-        exposure,
-        mask,
-        psf,
-        variance,
-        weight_map,
-        ..
-    } = arguments;
-    let place = (at, exposure.len());
-    let images = match exposure.is_empty() {
-        true => &arguments.stamps,
-        false => own(place, "exposure", exposure, false)?,
-    };
-    Ok([
-        images,
-        own(place, "mask", mask, false)?,
-        own(place, "psf", psf, false)?,
-        own(place, "variance", variance, false)?,
-        own(place, "weight-map", weight_map, false)?,
-        own(place, "positions", &arguments.positions, true)?,
-    ])
-}
-
-/// The stamps of files with the table of their identities, or those cut out at the positions.
-fn stamps_and_rows<'a>(
-    arguments: &'a Arguments,
-    images: Files<'a>,
-    positions: &'a [PathBuf],
-) -> anyhow::Result<(Stamps<'a>, Option<Table<'a>>)> {
-    anyhow::ensure!(
-        positions.len() <= 1,
-        "--positions names {} for one image (expected one)",
-        count(positions.len(), "file")
-    );
-    let Arguments {
-        table, id, carry, ..
-    } = arguments;
-    let Cutouts {
-        first_pixel,
-        columns,
-        degrees,
-        size,
-    } = &arguments.cutouts;
-    let columns = two_columns(columns.as_deref())?;
-    let table = positions.first().map(|path| Table {
-        path,
-        table: table.as_deref(),
-        columns,
-        degrees: *degrees,
-        id: id.as_deref(),
-        carry,
-    });
-    Ok(match table {
-        Some(positions) if !arguments.exposure.is_empty() => {
-            let cutouts = Stamps::Cutouts {
-                exposure: images,
-                positions,
-                first_pixel: *first_pixel,
-                side: usize::from(*size),
-            };
-            (cutouts, None)
-        }
-        rows => (Stamps::Files(images), rows),
-    })
-}
-
 /// What to gather from exposure `at`, from 0, or from all stamps.
-fn gathering(arguments: &Arguments, at: usize) -> anyhow::Result<Gathering<'_>> {
-    let Arguments {
-        stamps: _,
-        exposure: _,
-        extension,
-        mask: _,
-        mask_extension,
-        mask_bits,
-        positions: _,
-        table: _,
-        id: _,
-        carry: _,
-        cutouts: _,
-        square,
-        psf: _,
-        psf_extension,
-        variance: _,
-        variance_extension,
-        weight_map: _,
-        weight_extension,
-        frame,
-        gain,
-        noise,
-        set: _,
-        image: _,
-        out: _,
-    } = arguments;
-    // Destructured in full, so that the compiler finds an option that is not passed on. `own_files` takes the lists of files, and
-    // `stamps_and_rows` the options of tables and cut-outs.
-    let [own, mask, psf, variance, weight_map, positions] = own_files(arguments, at)?;
-    for (option, value) in [("noise", noise), ("gain", gain)] {
+fn gathering<'a>(arguments: &'a Arguments, at: usize) -> anyhow::Result<Gathering<'a>> {
+    let exposures = arguments.exposure.len();
+    let own = |option: &str, files: &'a [PathBuf], one_for_all: bool| {
+        own((at, exposures), option, files, one_for_all)
+    };
+    for (option, value) in [("noise", arguments.noise), ("gain", arguments.gain)] {
         anyhow::ensure!(
             // Not subnormal: noise is divided by, and 1/5e-324 is infinite.
             value.is_none_or(|value| value > 0.0 && value.is_normal()),
@@ -291,47 +179,89 @@ fn gathering(arguments: &Arguments, at: usize) -> anyhow::Result<Gathering<'_>> 
         );
     }
     let images = Files {
-        paths: own,
-        extension: extension.as_deref(),
+        paths: match exposures {
+            0 => arguments.stamps.as_slice(),
+            _ => own("exposure", &arguments.exposure, false)?,
+        },
+        extension: arguments.extension.as_deref(),
         content: Content::Sky,
     };
-    let masks = companion(mask, mask_extension.as_ref(), Content::Mask, &images);
+    // An extension without a file means the files of the images: surveys store masks and weights in one file with the pixels.
+    let companion = |paths: &'a [PathBuf], extension: Option<&'a str>, content| {
+        (!paths.is_empty() || extension.is_some()).then_some(Files {
+            paths: if paths.is_empty() {
+                images.paths
+            } else {
+                paths
+            },
+            extension,
+            content,
+        })
+    };
+    let masks = companion(
+        own("mask", &arguments.mask, false)?,
+        arguments.mask_extension.as_deref(),
+        Content::Mask,
+    );
     anyhow::ensure!(
         // Not by `requires` of clap, because either of two options gives a mask.
-        masks.is_some() || mask_bits.is_none(),
+        masks.is_some() || arguments.mask_bits.is_none(),
         "--mask-bits is given without a mask; expected --mask or --mask-extension"
     );
-    let bits = mask_bits
-        .as_ref()
-        .map(|bits| bits.iter().fold(0, |all, bit| all | 1u64 << bit));
-    let variance = companion(
-        variance,
-        variance_extension.as_ref(),
+    let bits = arguments.mask_bits.as_ref();
+    let bits = bits.map(|bits| bits.iter().fold(0, |all, bit| all | 1u64 << bit));
+    let variances = companion(
+        own("variance", &arguments.variance, false)?,
+        arguments.variance_extension.as_deref(),
         Content::Variance,
-        &images,
     );
-    let weight = companion(
-        weight_map,
-        weight_extension.as_ref(),
+    let weights = companion(
+        own("weight-map", &arguments.weight_map, false)?,
+        arguments.weight_extension.as_deref(),
         Content::Weight,
-        &images,
     );
-    let psfs = Files {
-        paths: psf,
-        extension: psf_extension.as_deref(),
-        content: Content::Psf,
+    let positions = own("positions", &arguments.positions, true)?;
+    anyhow::ensure!(
+        positions.len() <= 1,
+        "--positions names {} for one image (expected one)",
+        count(positions.len(), "file")
+    );
+    let cutouts = &arguments.cutouts;
+    let columns = two_columns(cutouts.columns.as_deref())?;
+    let table = positions.first().map(|path| Table {
+        path,
+        table: arguments.table.as_deref(),
+        columns,
+        degrees: cutouts.degrees,
+        id: arguments.id.as_deref(),
+        carry: &arguments.carry,
+    });
+    let (stamps, rows) = match table {
+        Some(positions) if exposures > 0 => {
+            let cutouts = Stamps::Cutouts {
+                exposure: images,
+                positions,
+                first_pixel: cutouts.first_pixel,
+                side: usize::from(cutouts.size),
+            };
+            (cutouts, None)
+        }
+        rows => (Stamps::Files(images), rows),
     };
-    let (stamps, rows) = stamps_and_rows(arguments, images, positions)?;
     Ok(Gathering {
         stamps,
         rows,
-        square: *square,
+        square: arguments.square,
         masks: masks.map(|files| Masks { files, bits }),
-        psfs,
-        noise: *noise,
-        variances: variance.or(weight),
-        gain: *gain,
-        frame: *frame,
+        psfs: Files {
+            paths: own("psf", &arguments.psf, false)?,
+            extension: arguments.psf_extension.as_deref(),
+            content: Content::Psf,
+        },
+        noise: arguments.noise,
+        variances: variances.or(weights),
+        gain: arguments.gain,
+        frame: arguments.frame,
     })
 }
 
