@@ -10,7 +10,7 @@ mod progress;
 #[cfg(test)]
 mod tests;
 
-// One file per command; `published` is shared by several.
+// One file per command.
 mod commands {
     pub(crate) mod baseline;
     pub(crate) mod bench;
@@ -24,7 +24,6 @@ mod commands {
     pub(crate) mod measure;
     pub(crate) mod merge;
     pub(crate) mod pack;
-    pub(crate) mod published;
     pub(crate) mod quickstart;
     pub(crate) mod reproduce;
     pub(crate) mod run;

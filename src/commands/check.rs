@@ -5,13 +5,13 @@ use clap::Args;
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_scoring::Grid;
 
-use super::published;
 use crate::{Findings, count, print, tell_unread};
 use shearq_dataset::grid;
 use shearq_dataset::layout::{DataFolder, Layout, MAX_IMAGE, read_rows};
 use shearq_dataset::truth::grid_of_set;
 use shearq_files::table::{MAX_ROWS, read_truth};
 use shearq_results::catalogues::COLUMNS;
+use shearq_results::published::PublicChallenge;
 use shearq_results::submit::check::{Expected, Finding, Severity, check_sent};
 use shearq_results::submit::{Kind, Sent};
 
@@ -58,8 +58,9 @@ pub(crate) struct Arguments {
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let path = &arguments.path;
     if let Some(challenge) = &arguments.challenge {
-        let branch = published::branch_of(challenge, arguments.branch.as_deref())?;
-        let findings = published::check(&*branch, path, arguments.subfields.map(usize::from));
+        let branch = PublicChallenge::named(challenge)?.branch(arguments.branch.as_deref())?;
+        let fault = branch.check(path, arguments.subfields.map(usize::from));
+        let findings: Vec<Finding> = fault.err().into_iter().map(Finding::unreadable).collect();
         return report(&findings, path, arguments.json);
     }
     let data = arguments.data.as_ref().map(DataFolder::open).transpose()?;

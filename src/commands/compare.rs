@@ -2,15 +2,15 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 
-use super::published;
 use crate::arguments::{Printing, ReportFile, ScoreSettings, Threads};
-use crate::score;
+use crate::{score, tell};
 use shearq_dataset::run::Run;
+use shearq_dataset::threads::Pool;
 use shearq_render::figure::{Figure, LinePlot};
 use shearq_render::table::Table;
 use shearq_results::compare::{Order, choose, chosen, score_all};
 use shearq_results::expression::Expression;
-use shearq_results::published::Truth;
+use shearq_results::published::{PublicBranch, PublicChallenge, Score, Truth, ranking};
 use shearq_results::store;
 use shearq_results::submit::is_packed;
 use shearq_results::views::comparison::{
@@ -18,6 +18,7 @@ use shearq_results::views::comparison::{
 };
 use shearq_results::views::pages;
 use shearq_scoring::Options;
+use shearq_scoring::great3::SUBFIELDS;
 
 /// Compare the metrics of several configurations.
 ///
@@ -103,7 +104,7 @@ struct Comparison {
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     if let Some(challenge) = &arguments.challenge {
-        let branch = published::branch_of(challenge, arguments.branch.as_deref())?;
+        let branch = PublicChallenge::named(challenge)?.branch(arguments.branch.as_deref())?;
         let psf = arguments.psf.as_deref();
         let truth = arguments.truth.as_deref();
         let truth = truth.map(|path| Truth {
@@ -112,7 +113,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             subfields: arguments.subfields.map(usize::from),
         });
         let threads = arguments.threads.number();
-        let table = published::leaderboard(&*branch, truth, &arguments.measured, threads)?;
+        let table = leaderboard(&*branch, truth, &arguments.measured, threads)?;
         return arguments.printing.print(&table);
     }
     let Comparison {
@@ -136,6 +137,46 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     arguments
         .report
         .save(title, sections, || made_by(arguments))
+}
+
+fn leaderboard(
+    branch: &dyn PublicBranch,
+    truth: Option<Truth<'_>>,
+    submissions: &[PathBuf],
+    threads: usize,
+) -> anyhow::Result<Table> {
+    anyhow::ensure!(
+        !branch.leaderboard().is_empty(),
+        "--leaderboard: no published entries of {} are known (expected --challenge great3)",
+        branch.title()
+    );
+    let pool = Pool::new(threads)?;
+    let mut own: Vec<(String, Score)> = Vec::new();
+    for submission in submissions {
+        let Some(truth) = truth else {
+            anyhow::bail!(
+                "{}: cannot be scored without the true shear. Try: --truth PATH",
+                submission.display()
+            );
+        };
+        let name = submission.display().to_string();
+        let score = branch.score(truth, submission, &pool)?;
+        // As in own challenges, a rank of an entry that measures no shear would be luck.
+        if let Some(refusal) = &score.refusal {
+            anyhow::bail!("{name}: not ranked: {refusal}");
+        }
+        for warning in &score.warnings {
+            tell(format_args!("warning: {name}: {warning}"));
+        }
+        own.push((name, score));
+    }
+    let mut table = ranking(branch, &own);
+    if let Some(subfields) = truth.and_then(|truth| truth.subfields) {
+        table.notes.push(format!(
+            "Your submissions have {subfields} subfields, the published ones {SUBFIELDS}: Q of fewer is noisier, and usually lower."
+        ));
+    }
+    Ok(table)
 }
 
 // Archives have no record of a run, so only their path can be stated.

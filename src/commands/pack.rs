@@ -1,19 +1,18 @@
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use anyhow::Context;
 use clap::Args;
-use shearq_files::open::{SETTINGS, read_to_string};
+use shearq_files::open::{SETTINGS, is_there, read_to_string};
 use shearq_submissions::check_name;
 
-use super::published;
 use crate::arguments::named;
 use crate::progress::Bar;
 use crate::{count, tell, tell_unread};
 use shearq_dataset::fingerprint;
 use shearq_dataset::run::{Run, open_data};
-use shearq_dataset::threads::ALL_CORES;
+use shearq_dataset::threads::{ALL_CORES, Pool};
 use shearq_results::catalogues::Catalogues;
-use shearq_results::published::{BranchCatalogues, Presubmitting};
+use shearq_results::published::{BranchCatalogues, Presubmitting, PublicBranch, PublicChallenge};
 use shearq_results::submit::pack::Packing;
 use shearq_results::submit::{Contents, Entry, is_archive};
 use shearq_scoring::great3::{GRID, SUBFIELDS};
@@ -22,7 +21,7 @@ use shearq_scoring::great3::{GRID, SUBFIELDS};
 const MAX_METHOD_BYTES: usize = 64;
 
 // A folder or a text with such a name would be mistaken for an archive.
-pub(super) const ARCHIVES: [&str; 8] = ["zip", "tar", "gz", "tgz", "bz2", "xz", "zst", "7z"];
+const ARCHIVES: [&str; 8] = ["zip", "tar", "gz", "tgz", "bz2", "xz", "zst", "7z"];
 
 /// Write catalogues as a submission: the files that the challenge accepts, with a manifest.
 ///
@@ -156,8 +155,8 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             grid: arguments.grid.map_or(GRID, usize::from),
             whole_galaxies: arguments.whole_galaxies,
         };
-        let branch = published::branch_of(challenge, Some(branch))?;
-        return published::pack(&*branch, &packing, out);
+        let branch = PublicChallenge::named(challenge)?.branch(Some(branch))?;
+        return presubmit(&*branch, &packing, out);
     }
     let entry = arguments.entry.entry()?;
     let ending = out.extension().unwrap_or_default().to_string_lossy();
@@ -205,5 +204,34 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         count(files, "file"),
         out.display()
     ));
+    Ok(())
+}
+
+fn presubmit(
+    branch: &dyn PublicBranch,
+    packing: &Presubmitting<'_>,
+    out: &Path,
+) -> anyhow::Result<()> {
+    // As of other submissions: an earlier one may have been sent.
+    anyhow::ensure!(
+        !is_there(out),
+        "--out {}: the file exists already; expected a new file",
+        out.display()
+    );
+    let ending = out.extension().unwrap_or_default().to_string_lossy();
+    anyhow::ensure!(
+        !ARCHIVES.contains(&ending.as_ref()),
+        "--out {}: a submission to {} is one text file (found .{ending}, expected a name such as entry.txt)",
+        out.display(),
+        branch.title()
+    );
+    let packed = branch.pack(packing, &Pool::new(ALL_CORES)?);
+    let Some(packed) = packed else {
+        anyhow::bail!("{} has no pre-submission of catalogues", branch.title());
+    };
+    // Written only after all checks, so that a faulty catalogue leaves no file.
+    let packed = packed?;
+    packed.write(out)?;
+    tell(format_args!("{}: {}", out.display(), packed.note));
     Ok(())
 }

@@ -7,20 +7,20 @@ use shearq_quantities::units::{Degrees, Pixels};
 use shearq_scoring::{Noise, Options, SetScorer, TruthSign};
 use shearq_submissions::EllipticityType;
 
-use super::published;
 use crate::arguments::{
     Printing, ReportFile, ScoreSettings, SetList, Threads, named, positive, sets_of,
 };
 use crate::{print, tell, tell_unread};
 use shearq_dataset::layout::DataFolder;
 use shearq_dataset::run::{Run, Source, kind_of};
+use shearq_dataset::threads::Pool;
 use shearq_dataset::truth::{ReadTruth, Reading, read_truth, reading_of};
 use shearq_files::atomic::folder_of;
 use shearq_render::table::TableFormat;
 use shearq_results::aperture;
 use shearq_results::catalogues::{COLUMNS, Catalogues};
 use shearq_results::foreign::Foreign;
-use shearq_results::published::Truth;
+use shearq_results::published::{PublicChallenge, Truth};
 use shearq_results::record::{RunRecord, SetRecord};
 use shearq_results::score::{ScoredSet, score_catalogues, score_files, unscored};
 use shearq_results::store;
@@ -150,21 +150,30 @@ const GREAT10_ONLY: [&str; 19] = [
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     if let (Some(challenge), Some(truth)) = (&arguments.challenge, &arguments.truth) {
-        let branch = published::branch_of(challenge, arguments.branch.as_deref())?;
+        let branch = PublicChallenge::named(challenge)?.branch(arguments.branch.as_deref())?;
         let truth = Truth {
             path: truth,
             psf: arguments.psf.as_deref(),
             subfields: arguments.subfields.map(usize::from),
         };
-        let (files, threads) = (&arguments.catalogues, arguments.threads.number());
-        let score = published::score(&*branch, truth, files, threads)?;
-        let title = format!("{}: {}", branch.title(), files[0].display());
+        let [submission] = arguments.catalogues.as_slice() else {
+            bail!(
+                "--challenge: found {} submissions, expected one",
+                arguments.catalogues.len()
+            );
+        };
+        let shown = submission.display();
+        let score = branch.score(truth, submission, &Pool::new(arguments.threads.number())?)?;
+        for warning in score.refusal.iter().chain(&score.warnings) {
+            tell(format_args!("warning: {shown}: {warning}"));
+        }
+        let title = format!("{}: {shown}", branch.title());
         match arguments.printing.format() {
             // One object with the challenge's names, not the rows of a table.
             TableFormat::Json => print(&(serde_json::to_string_pretty(&score.json())? + "\n"))?,
             _ => arguments.printing.print(&score.table(title.clone()))?,
         }
-        let made_by = [("Truth", truth.path), ("Submission", &*files[0])];
+        let made_by = [("Truth", truth.path), ("Submission", submission)];
         let made_by = made_by.map(|(what, path)| (what.to_owned(), path.display().to_string()));
         let sections = || Ok(vec![score.section(&title)?]);
         return arguments
