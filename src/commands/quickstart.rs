@@ -12,11 +12,12 @@ use shearq_dataset::run::{Run, Source};
 use shearq_files::table::FileFormat;
 use shearq_pipeline::run::run_folder;
 use shearq_render::terminal::wrapped;
-use shearq_results::catalogues::{Catalogues, OWN};
+use shearq_results::catalogues::OWN;
 use shearq_results::compare::score_all;
-use shearq_results::score::{ScoredSet, score_catalogues};
-use shearq_results::views::comparison::verdict_line;
-use shearq_results::views::comparison::{compact, compare, named, q_per_set, verdict};
+use shearq_results::score::ScoredSet;
+use shearq_results::views::comparison::{
+    compact, compare, named, q_per_set, verdict, verdict_line,
+};
 use shearq_results::views::pages;
 use shearq_results::views::scores::per_set;
 use shearq_simulate::set::SimulationSettings;
@@ -73,9 +74,12 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         let mut bar = Bar::new(name, galaxies);
         run_folder(&run, settings, &images, &folder, threads, &mut bar)?;
         drop(bar);
-        let truth = run.source.data(&folder)?;
-        let catalogues = Catalogues::measured(&run, &folder, &[])?;
-        let scored = score_catalogues(&truth, &catalogues, &[], options, threads)?;
+        made_by.push((name.to_owned(), toml::to_string(&run.configuration)?));
+        folders.push(folder);
+    }
+    let mut variants = score_all(&folders, &[], None, None, options, threads)?;
+    for variant in &mut variants {
+        let (name, scored) = (&variant.name, variant.scored());
         let title = format!("Scores of {name} (simulated data)");
         let mut table = per_set(&scored, &title, options.definition);
         table.notes.extend(verdict_line(name, &scored));
@@ -84,12 +88,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             false => tell(format_args!("{name}: {}", q_of(&scored))),
         }
         sections.push(pages::scores(name, &scored, table)?);
-        made_by.push((name.to_owned(), toml::to_string(&run.configuration)?));
-        folders.push(folder);
-    }
-    let mut variants = score_all(&folders, &[], None, None, options, threads)?;
-    for variant in &mut variants {
-        // Published metrics are means over 200 images of all sets, and would look like a failure beside these two sets.
+        // Published metrics are means over 200 images of all sets, and would look like a failure next to these two sets.
         variant.published = None;
     }
     let full = compare(&variants, options.definition);
