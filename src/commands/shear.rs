@@ -5,7 +5,7 @@ use clap::Args;
 use crate::arguments::{Form, named};
 use crate::tell;
 use shearq_files::table::{self, FileFormat};
-use shearq_render::table::{Cell, Heading, Table};
+use shearq_render::table::{Cell, Table};
 use shearq_results::response::{Position, Shared, shears};
 
 /// Write a shear for each galaxy of a survey.
@@ -57,34 +57,27 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         found.table.height(),
         found.good
     ));
-    let headings = ["of", "galaxies", "R11", "R22", "R12", "R21"];
-    let labels = ["Of", "Galaxies", "R11", "R22", "R12", "R21"];
-    let headings = headings.into_iter().zip(labels);
-    let rows = found.responses.iter().map(|own| {
-        let values = own.mean.iter().zip(own.error);
-        [Cell::text(&own.of), Cell::number(own.galaxies as f64, 0)]
-            .into_iter()
-            .chain(values.map(|(value, error)| Cell::with_error(*value, Some(error), 5)))
-            .collect()
+    let mut table = Table::titled("Mean response to shear");
+    let rows = &found.responses;
+    table.column("of", "Of", rows, |own| Cell::text(&own.of));
+    table.column("galaxies", "Galaxies", rows, |own| {
+        Cell::number(own.galaxies as f64, 0)
     });
+    for (k, name) in ["R11", "R22", "R12", "R21"].into_iter().enumerate() {
+        table.column(name, name, rows, |own| {
+            Cell::with_error(own.mean[k], Some(own.error[k]), 5)
+        });
+    }
     // TreeCorr has no default names of columns, so that the table states the call that reads it.
-    let mut notes = Vec::new();
     if let Some(position) = arguments.treecorr {
         let [first, second, units] = match position {
             Position::Sky => ["ra", "dec", ", ra_units='deg', dec_units='deg'"],
             Position::Pixel => ["x", "y", ""],
         };
-        notes.push(format!(
+        table.notes.push(format!(
             "treecorr.Catalog({:?}, {first}_col='{first}', {second}_col='{second}'{units}, g1_col='g1', g2_col='g2', w_col='w')",
             out.display().to_string()
         ));
     }
-    arguments.form.print(&Table {
-        title: "Mean response to shear".into(),
-        headings: headings
-            .map(|(key, label)| Heading::new(key, label))
-            .collect(),
-        rows: rows.collect(),
-        notes,
-    })
+    arguments.form.print(&table)
 }
