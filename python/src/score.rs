@@ -110,6 +110,15 @@ impl<'a> Rows<'a> {
         }
         Ok(())
     }
+
+    fn sum(&self, grid: &Grid) -> PyResult<(SetImages, RowCounts)> {
+        let (mut images, mut counts) = (SetImages::new(grid), RowCounts::default());
+        self.each(grid, |image, rows| {
+            counts += rows;
+            images.add(image).map_err(of_scoring)
+        })?;
+        Ok((images, counts))
+    }
 }
 
 // Ends messages about numbers that stand for failed measurements. Arrays have NaN where a measurement is missing.
@@ -169,11 +178,7 @@ pub(crate) fn score<'py>(
             Row { x, y, e1, e2 }
         });
         let standard = TrueShear::from_rows(&grid, TruthSign::Standard, truth).map_err(of_scoring)?;
-        let (mut images, mut counts) = (SetImages::new(&grid), RowCounts::default());
-        catalogue.each(&grid, |image, rows| {
-            counts += rows;
-            images.add(image).map_err(of_scoring)
-        })?;
+        let (images, counts) = catalogue.sum(&grid)?;
         if counts.used == 0 {
             return Err(PyValueError::new_err(format!(
                 "e1, e2: no galaxy has an ellipticity on the grid ({} are not finite, {} lie outside); expected numbers",
@@ -325,12 +330,7 @@ pub(crate) fn spectrum<'py>(
     let definition = self::definition(definition)?;
     let catalogue = Rows::new(&e, positions.as_ref(), lengths);
     let (all, modes) = py.detach(|| {
-        let mut images = SetImages::new(&grid);
-        let mut counts = RowCounts::default();
-        catalogue.each(&grid, |image, rows| {
-            counts += rows;
-            images.add(image).map_err(of_scoring)
-        })?;
+        let (images, counts) = catalogue.sum(&grid)?;
         // Other faults of rows are no errors here, because any field has a spectrum.
         let failed = (counts.sentinels > 0).then(|| foreign::fault_of_rows(&counts, &grid, ADVICE));
         if let Some(fault) = failed.flatten() {
