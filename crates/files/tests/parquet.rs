@@ -162,18 +162,16 @@ fn small_files_have_as_many_rows_as_the_caller_expects() {
 }
 
 #[test]
-fn a_wrong_byte_anywhere_is_noticed_or_changes_nothing() {
+fn a_wrong_bit_anywhere_is_noticed_or_changes_nothing() {
     let bytes = encode(&sample());
     for at in 0..bytes.len() {
-        for mask in [0x01, 0x80] {
-            let mut damaged = bytes.clone();
-            damaged[at] ^= mask;
-            // The first bytes and the mark of the checksums are not compared.
-            if let Ok(found) = read(&damaged, None, MOST) {
-                assert_same(&found, &sample());
-                let found = reading(&damaged, |path| parquet::metadata(path));
-                assert_eq!(found.unwrap(), metadata());
-            }
+        let mut damaged = bytes.clone();
+        damaged[at] ^= 1 << (at % 8);
+        // The first bytes and the mark of the checksums are not compared.
+        if let Ok(found) = read(&damaged, None, MOST) {
+            assert_same(&found, &sample());
+            let found = reading(&damaged, |path| parquet::metadata(path));
+            assert_eq!(found.unwrap(), metadata());
         }
     }
 }
