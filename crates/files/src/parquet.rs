@@ -31,6 +31,7 @@ use polars_parquet::parquet::page::CompressedPage;
 use polars_parquet::read::{
     BasicDecompressor, ColumnChunkMetadata, PageReader, column_iter_to_arrays,
 };
+use polars_parquet::write::{CompressionOptions, Encoding, Version, WriteOptions, row_group_iter};
 use serde_json::{Map, Value, json};
 
 use crate::FileError;
@@ -39,6 +40,8 @@ use crate::open;
 
 // Longest vector that becomes one column per number.
 const MAX_VECTOR: usize = 8;
+// Rows of a row group: polars' own number.
+const ROW_GROUP: usize = 512 * 512;
 // The key under which Parquet files keep the Arrow schema.
 const SCHEMA_KEY: &str = "ARROW:schema";
 
@@ -47,7 +50,7 @@ const SCHEMA_KEY: &str = "ARROW:schema";
 /// Equal frames give equal bytes, with checksums that [`read`] verifies. The metadata becomes the file's key-value metadata, in the order
 /// of the keys, and is repeated in the Arrow schema, where pandas and astropy read it. The data are not compressed: measured shears and sizes are noise in most of their
 /// bits, so that compression gains a few per cent of space and costs up to half of the reading
-/// speed. Repeated values still become small, by dictionaries.
+/// speed. Repeated integers and words still become small, by dictionaries.
 pub fn encode(frame: &DataFrame, metadata: &Metadata) -> PolarsResult<Vec<u8>> {
     if metadata.contains_key(SCHEMA_KEY) {
         let message =
@@ -61,21 +64,47 @@ pub fn encode(frame: &DataFrame, metadata: &Metadata) -> PolarsResult<Vec<u8>> {
     if !metadata.is_empty() {
         pairs.push((SCHEMA_KEY.into(), arrow_schema(frame, metadata)));
     }
+    // Nothing selects rows by minima and maxima, which cost a pass over the values.
+    let statistics = StatisticsOptions {
+        null_count: true,
+        ..StatisticsOptions::empty()
+    };
+    let options = WriteOptions {
+        statistics,
+        version: Version::V1,
+        compression: CompressionOptions::Uncompressed,
+        data_page_size: None,
+    };
     let mut bytes = Vec::new();
-    ParquetWriter::new(&mut bytes)
+    let mut writer = ParquetWriter::new(&mut bytes)
         .with_compression(ParquetCompression::Uncompressed)
-        // Nothing selects rows by minima and maxima, which cost a pass over the values.
-        .with_statistics(StatisticsOptions {
-            null_count: true,
-            ..StatisticsOptions::empty()
-        })
+        .with_statistics(statistics)
         .with_key_value_metadata(Some(KeyValueMetadata::from_static(pairs)))
-        .set_parallel(false)
-        .finish(&mut frame.clone())?;
+        .batched(frame.schema())?;
+    let encodings: Vec<_> = frame.columns().iter().map(encoding).collect();
+    let starts = (0..frame.height()).step_by(ROW_GROUP);
+    for start in starts {
+        let mut group = frame.slice(start as i64, ROW_GROUP);
+        group.rechunk_mut();
+        for batch in group.iter_chunks(CompatLevel::newest(), false) {
+            let fields = writer.parquet_schema().fields().to_vec();
+            let columns = row_group_iter(batch, encodings.clone().into(), fields, options);
+            writer.write_row_groups(vec![columns])?;
+        }
+    }
+    writer.finish()?;
     let sums = checksums(&bytes)?;
     let footer = bytes.len() - END_BYTES - footer_bytes(&bytes);
     bytes.splice(footer..footer, sums);
     Ok(bytes)
+}
+
+// polars would hash each number of a column to estimate whether a dictionary is smaller, and write it plainly in any case.
+fn encoding(column: &Column) -> Vec<Encoding> {
+    vec![match column.dtype().is_float() {
+        true => Encoding::Plain,
+        false => Encoding::RleDictionary,
+    }]
 }
 
 // Bytes after the footer: its length and `PAR1`.
