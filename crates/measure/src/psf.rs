@@ -472,16 +472,16 @@ pub(crate) fn noise_equivalent_area(psf: ArrayView2<'_, f64>) -> f64 {
     1.0 / sum
 }
 
-/// How many steps wider a PSF of sum one is than one of a noise-equivalent area of `reference` px²; 0 if that is zero.
+/// Mean square per axis in px² of the Gaussian with this noise-equivalent area: of mean square σ² it is 4πσ².
+pub(crate) fn gaussian_variance(area: f64) -> f64 {
+    area / (4.0 * std::f64::consts::PI)
+}
+
+/// How many steps wider a PSF of this noise-equivalent area is than one of `reference` px²; 0 if that is zero.
 ///
 /// Steps to wider PSFs are rounded. Those to narrower ones are rounded towards zero, less one, so that lengths first shrink
 /// where the PSF is 1/√2 as wide: sharp lengths bring noise into the response before they take any out of ellipticities.
-pub(crate) fn width_step(psf: ArrayView2<'_, f64>, reference: f64) -> i32 {
-    width_step_of_area(noise_equivalent_area(psf), reference)
-}
-
-/// The same for a noise-equivalent area in px².
-pub(crate) fn width_step_of_area(area: f64, reference: f64) -> i32 {
+pub(crate) fn width_step(area: f64, reference: f64) -> i32 {
     if reference == 0.0 {
         return 0;
     }
@@ -513,7 +513,7 @@ const COLUMN_LANES: usize = 8;
 impl PsfShape {
     /// Of the pixels of a PSF; NaN if the moments do not converge, as for a PSF that is mostly noise.
     pub(crate) fn from_psf(psf: ArrayView2<'_, f64>) -> Self {
-        let round = noise_equivalent_area(psf) / (4.0 * std::f64::consts::PI);
+        let round = gaussian_variance(noise_equivalent_area(psf));
         let (mut moments, mut centre) = ([round, 0.0, round], [0.0; 2]);
         for _ in 0..MAX_ITERATIONS {
             let Some((weighted, shift)) = weighted_moments(psf, moments, centre) else {

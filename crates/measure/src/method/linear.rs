@@ -32,8 +32,8 @@ use crate::error::MeasureError;
 use crate::measurement::{Descent, ResponseMatrix, Stop};
 use crate::noise::StampNoise;
 use crate::psf::{
-    ResidualProfiles, StarDenoiser, WIDTH_STEPS, noise_equivalent_area, width_factor, width_step,
-    width_step_of_area,
+    ResidualProfiles, StarDenoiser, WIDTH_STEPS, gaussian_variance, noise_equivalent_area,
+    width_factor, width_step,
 };
 use crate::selection::ShearSettings;
 use crate::shape::{AdaptiveMoments, AdaptiveScratch, AdaptiveShape, MeanSquare, SizeMoments};
@@ -341,17 +341,13 @@ impl CutWorker for LinearWorker {
         let window = known.map_or(CONFIGURED_WINDOW, |variance| {
             window_index(variance, settings.reference_extent)
         });
-        let index = (width_step(psf, settings.reference_area), window);
+        let area = noise_equivalent_area(psf);
+        let index = (width_step(area, settings.reference_area), window);
         self.current = place_of(index, &mut self.workers, &self.family, &self.noise)?;
         let worker = &mut self.workers[self.current];
         worker.set_pixel_shape(self.pixels, &self.noise);
-        worker.set_psf(psf)?;
-        if self.gain.is_some() {
-            // Only the galaxies' own noise needs it, and with a PSF per galaxy the sum takes 3 % of the time.
-            let squares: f64 = psf.iter().map(|value| value * value).sum();
-            worker.psf_variance = 1.0 / (4.0 * std::f64::consts::PI * squares);
-        }
-        Ok(())
+        worker.psf_variance = gaussian_variance(area);
+        worker.set_psf(psf)
     }
 
     fn retake_psf(&mut self) {
@@ -401,13 +397,11 @@ impl CutWorker for LinearWorker {
             true => window_index(variance / surveyed, settings.reference_extent),
             false => CONFIGURED_WINDOW,
         };
-        let index = (
-            width_step_of_area(1.0 / squares, settings.reference_area),
-            window,
-        );
+        let area = 1.0 / squares;
+        let index = (width_step(area, settings.reference_area), window);
         self.current = place_of(index, &mut self.workers, &self.family, &self.noise)?;
         let worker = &mut self.workers[self.current];
-        worker.psf_variance = 1.0 / (4.0 * std::f64::consts::PI * squares);
+        worker.psf_variance = gaussian_variance(area);
         let level = total.sqrt().recip();
         let gain = (inverse_gain > 0.0).then(|| inverse_gain.recip());
         let weights = &self.epoch_weights;
@@ -460,7 +454,7 @@ struct PlanWorker {
     noise_pixels: PixelShape,
     pixels: PixelShape,
     psf: SpectralPsf,
-    /// Mean square per axis in px² of the Gaussian with the Σp² of the PSF.
+    /// Mean square per axis in px² of the Gaussian with the noise-equivalent area of the PSF.
     psf_variance: f64,
     regularisation: RegularisationTerms,
     /// Of χ and of its slopes: weights of the lags.
@@ -1009,6 +1003,21 @@ mod tests {
             own.1,
             configuration.linear().unwrap().deconvolution.window_sigma
         );
+    }
+
+    #[test]
+    fn variances_of_psfs_are_without_the_noise_of_their_border() {
+        let configuration = configuration(50.0);
+        let (linear, cut) = (configuration.linear().unwrap(), configuration.psf_cut());
+        let family = Arc::new(LinearFamily::new(linear, 48, cut).unwrap());
+        let mut worker = family.worker();
+        worker.set_gain(Some(1.0));
+        let psf = moffat(3.4).stamp(cut.size) + 1e-3;
+        let psf = &psf / psf.sum();
+        worker.set_psf(psf.view()).unwrap();
+        let area = noise_equivalent_area(StarDenoiser::default().denoised(psf.view()));
+        let ratio = 4.0 * std::f64::consts::PI * worker.workers[worker.current].psf_variance / area;
+        assert!((ratio - 1.0).abs() < 1e-12, "{ratio}");
     }
 
     #[test]

@@ -24,7 +24,7 @@ use shearq_quantities::linear::cholesky;
 use shearq_quantities::statistics::{SCATTER, median, scatter};
 use shearq_submissions::PsfCut;
 
-use super::{Psfs, noise_equivalent_area, psf_offset, sum_of_squares};
+use super::{Psfs, gaussian_variance, noise_equivalent_area, psf_offset, sum_of_squares};
 
 // S/N between which the share of the raw star in the result grows from 0 to 1. The lower end is chosen by hand.
 // At 1000 the noise of one star changes m by 5·10⁻³.
@@ -383,8 +383,8 @@ impl Moffat {
         area: f64,
         sigma: f64,
     ) -> Option<Moffat> {
-        // A Gaussian of mean square σ² has an area of 4πσ², and s = r²/(2σ²).
-        let mean_square = area / (4.0 * std::f64::consts::PI);
+        // A Gaussian of mean square σ² has s = r²/(2σ²).
+        let mean_square = gaussian_variance(area);
         let half_side = FIT_HALF_SIDE * mean_square.sqrt();
         let width = 0.5 * (2.0 * mean_square).ln();
         let sum = star.sum();

@@ -248,16 +248,18 @@ fn steps_follow_the_width() {
     let expected = 3.78 * 6.0f64.powi(2);
     let found = noise_equivalent_area(moffat(6.0).view());
     assert!((found / expected - 1.0).abs() < 0.02, "{found}");
-    let steps = |fwhm| width_step(moffat(fwhm).view(), 50.0);
+    let step =
+        |psf: Array2<f64>, reference| width_step(noise_equivalent_area(psf.view()), reference);
+    let steps = |fwhm| step(moffat(fwhm), 50.0);
     let narrow = [0.5, 2.0, 2.3, 2.45, 2.55, 2.7, 3.06].map(steps);
     assert_eq!(narrow, [-3, -2, -1, -1, 0, 0, 0]);
     let wide = [3.4, 3.74, 4.5, 6.0, 20.0].map(steps);
     assert_eq!(wide, [0, 0, 1, 3, 6]);
-    assert_eq!(width_step(moffat(6.0).view(), 0.0), 0);
+    assert_eq!(step(moffat(6.0), 0.0), 0);
     // Noise of a star of S/N 30 alone would make it a step narrower.
     let star = noisy(&moffat(3.4), 30.0, &mut ChaCha8Rng::seed_from_u64(9));
-    assert_eq!(width_step(star.view(), 50.0), 0);
-    assert_eq!(width_step((moffat(6.0) * f64::NAN).view(), 50.0), 0);
+    assert_eq!(step(star, 50.0), 0);
+    assert_eq!(step(moffat(6.0) * f64::NAN, 50.0), 0);
     assert_eq!([-4, 0, 4].map(width_factor), [0.5, 1.0, 2.0]);
 }
 
