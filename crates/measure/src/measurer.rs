@@ -211,7 +211,7 @@ impl<'a> ImageNoise<'a> {
         }
     }
 
-    fn level(self) -> f64 {
+    pub(crate) fn level(self) -> f64 {
         match self {
             ImageNoise::Survey(survey) => survey.noise.sigma(),
             ImageNoise::Level(level) => level,
@@ -409,10 +409,12 @@ impl Worker {
         Ok(Ok(noise))
     }
 
-    /// Measures a galaxy on its epochs, whose input was checked.
+    /// Measures a galaxy on its epochs, whose input was checked. `stars` are the common profiles of the noisy stars of their
+    /// images.
     fn measure_epochs<T: Pixel>(
         &mut self,
         epochs: &[Epoch<'_, T>],
+        stars: &[Option<&Arc<ResidualProfiles>>],
     ) -> Result<Measurement, MeasureError> {
         let mut flagged = None;
         self.epochs.clear();
@@ -455,6 +457,7 @@ impl Worker {
                 offset: epoch.offset,
                 galaxy_variance: epoch.survey.and_then(|survey| survey.mean_square_radius),
                 gain: epoch.gain,
+                stars: stars.get(used[at]).copied().flatten(),
             }
         };
         let (mut found, noise) = self.method.measure_epochs(used.len(), &epoch)?;
@@ -544,9 +547,9 @@ impl ImageWorker<'_> {
     ///
     /// An epoch without usable pixels has no weight, and without usable epochs the galaxy is flagged. The window of each epoch
     /// is at its offset, and all light under it is measured. Stamps should have one flux: for several bands, the shape is measured on
-    /// the weighted sum of the images. One epoch with the galaxy in the centre of its stamp is measured as by
-    /// [`PsfWorker::measure`], with the same bits and the survey of the image of this worker. Noise of several epochs is treated
-    /// as white. The PSF of a [`PsfWorker`] has to be set again after it.
+    /// the weighted sum of the images. One epoch without survey and gain, with the galaxy in the centre of its stamp, is measured
+    /// as by [`PsfWorker::measure`], with the same bits and the survey of the image of this worker. Otherwise the noise of epochs
+    /// is treated as white. The PSF of a [`PsfWorker`] has to be set again after it.
     ///
     /// # Errors
     /// An [`EpochError`] if there are no epochs, a noise level is not above 0, an offset is beyond a quarter of the stamp, some
@@ -555,6 +558,15 @@ impl ImageWorker<'_> {
     pub fn measure_epochs<T: Pixel>(
         &mut self,
         epochs: &[Epoch<'_, T>],
+    ) -> Result<Measurement, MeasureError> {
+        self.measure_epochs_with_stars(epochs, &[])
+    }
+
+    /// The same for epochs of images whose noisy stars, one per galaxy, have common profiles: one entry per epoch, or none.
+    pub(crate) fn measure_epochs_with_stars<T: Pixel>(
+        &mut self,
+        epochs: &[Epoch<'_, T>],
+        stars: &[Option<&Arc<ResidualProfiles>>],
     ) -> Result<Measurement, MeasureError> {
         if self.worker.measurer.configuration().linear().is_none() {
             return Err(EpochError::Network.into());
@@ -583,13 +595,17 @@ impl ImageWorker<'_> {
                 self.check_shape(jacobian.factors().1)?;
             }
         }
-        if epochs.len() == 1 && one.offset == [0.0; 2] {
+        // What is known of an epoch's image would have to replace what is known of this worker's: all galaxies of a set with
+        // such epochs are measured in one way, also those with a single usable epoch.
+        let has_stars = stars.iter().any(Option::is_some);
+        let of_image = one.survey.is_some() || one.gain.is_some() || has_stars;
+        if epochs.len() == 1 && one.offset == [0.0; 2] && !of_image {
             self.set_jacobian(one.jacobian.as_ref())?;
             self.worker.method.set_psf(one.psf)?;
             self.worker.psf = PsfShape::from_psf(one.psf);
             return self.worker.measure_stamp(one.stamp, one.noise, true);
         }
-        self.worker.measure_epochs(epochs)
+        self.worker.measure_epochs(epochs, stars)
     }
 
     /// Measures stamps, one per galaxy along the first axis, without calibration, in the noise of the image.
@@ -755,6 +771,7 @@ mod tests {
     use rand_chacha::ChaCha8Rng;
 
     use super::*;
+    use crate::sky::Sky;
 
     const N: usize = 48;
 
@@ -782,6 +799,55 @@ mod tests {
         let mut worker = image.psf(psf.view()).unwrap();
         let found = worker.measure(pair.view()).unwrap();
         assert!(found.flags.is_empty() && found.e1 > 0.2, "{found:?}");
+    }
+
+    #[test]
+    fn a_single_epoch_counts_its_survey_and_gain_anywhere() {
+        let measurer = Measurer::named("48/linear/star", N).unwrap();
+        let psf = gaussian(32, 2.0, 2.1);
+        let psf = &psf / psf.sum();
+        let sky = Sky {
+            level: 0.5,
+            level_error: 0.01,
+            slope: [0.02, 0.0],
+            slope_error: 0.001,
+        };
+        let survey = Survey {
+            noise: StampNoise::white(0.5),
+            // Narrower galaxies than the configuration's.
+            mean_square_radius: Some(6.0),
+            sky: Some(sky),
+        };
+        let middle = (N as f64 - 1.0) / 2.0;
+        let plane = |(y, x)| sky.at(x as f64 - middle, y as f64 - middle);
+        let stamp = gaussian(N, 6.0, 5.0) * 300.0 + Array2::from_shape_fn((N, N), plane);
+        let mut worker = measurer.worker();
+        let mut image = worker.image(ImageNoise::Survey(&survey));
+        image.set_gain(Some(0.5));
+        let mut behind_psf = image.psf(psf.view()).unwrap();
+        let expected = behind_psf.measure(stamp.view()).unwrap();
+        let numbers = |found: &Measurement| {
+            let observables = found.observables.unwrap();
+            let [r11, r22] = found.response_diagonal();
+            let flux = found.flux / 300.0;
+            [found.e1, r11, r22, flux, found.size, observables.flux_error]
+        };
+        for x in [0.0, 1e-9] {
+            let epoch = Epoch {
+                stamp: stamp.view(),
+                psf: psf.view(),
+                noise: 0.5,
+                jacobian: None,
+                offset: [x, 0.0],
+                survey: Some(&survey),
+                gain: Some(0.5),
+            };
+            let mut image = worker.image(ImageNoise::Unknown);
+            let found = image.measure_epochs(&[epoch]).unwrap();
+            for (found, expected) in numbers(&found).iter().zip(numbers(&expected)) {
+                assert!((found / expected - 1.0).abs() < 1e-3, "{found} {expected}");
+            }
+        }
     }
 
     #[test]

@@ -113,6 +113,8 @@ pub(crate) struct CutEpoch<'a> {
     pub(crate) galaxy_variance: Option<f64>,
     /// Electrons per unit of the stamp.
     pub(crate) gain: Option<f64>,
+    /// The common profile of the image's noisy stars.
+    pub(crate) stars: Option<&'a Arc<ResidualProfiles>>,
 }
 
 /// Lengths of the linear method after their adaptation to the PSF and to the galaxies of a survey.

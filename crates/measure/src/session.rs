@@ -527,12 +527,15 @@ impl<'n> Session<'n> {
         Ok(self)
     }
 
-    /// The noise level of stamps for which none is given; `None` if it is unknown.
-    fn level(&self) -> Option<f64> {
+    /// The noise of stamps for which no level is given.
+    fn image_noise(&self) -> ImageNoise<'_> {
         match (&self.survey, &self.noise) {
-            (Some(survey), _) => Some(survey.noise.sigma()),
-            (None, KnownNoise::Given(level) | KnownNoise::Stated(level)) => Some(*level),
-            (None, _) => None,
+            (Some(survey), _) => ImageNoise::Survey(survey),
+            (None, KnownNoise::Given(level)) => ImageNoise::Level(*level),
+            (None, KnownNoise::Stated(level)) if self.noise_plan().is_none() => {
+                ImageNoise::Level(*level)
+            }
+            (None, _) => ImageNoise::Unknown,
         }
     }
 
@@ -559,15 +562,7 @@ impl<'n> Session<'n> {
 
     /// Prepares a worker for galaxies of this image.
     pub fn image<'w>(&self, worker: &'w mut Worker) -> ImageWorker<'w> {
-        let noise = match (&self.survey, &self.noise) {
-            (Some(survey), _) => ImageNoise::Survey(survey),
-            (None, KnownNoise::Given(level)) => ImageNoise::Level(*level),
-            (None, KnownNoise::Stated(level)) if self.noise_plan().is_none() => {
-                ImageNoise::Level(*level)
-            }
-            (None, _) => ImageNoise::Unknown,
-        };
-        let mut image = worker.image_with_stars(noise, self.stars.as_ref());
+        let mut image = worker.image_with_stars(self.image_noise(), self.stars.as_ref());
         image.set_gain(self.gain);
         image
     }
@@ -838,6 +833,7 @@ impl<'n> RowJob<'n> {
             });
             let own: Vec<_> = own.collect();
             let mut epochs = Vec::with_capacity(jobs.len());
+            let mut stars = Vec::with_capacity(jobs.len());
             let mut usable_psf = false;
             for (at, job) in jobs.iter().enumerate() {
                 // An epoch without PSF or noise has no weight, as one without pixels.
@@ -848,10 +844,12 @@ impl<'n> RowJob<'n> {
                 let session = &job.session;
                 let stamp = session.rows.stamps(job.row).start + k;
                 let levels = session.noise.levels();
-                let level = levels.map_or_else(|| session.level(), |levels| Some(levels[stamp]));
-                let Some(noise) = level.filter(|level| *level > 0.0) else {
+                // NaN if it is unknown.
+                let noise = levels.map_or_else(|| session.image_noise().level(), |all| all[stamp]);
+                if noise.is_nan() || noise <= 0.0 {
                     continue;
-                };
+                }
+                stars.push(session.stars.as_ref());
                 epochs.push(Epoch {
                     stamp: all[at].index_axis(Axis(0), k),
                     psf: psf.view(),
@@ -867,9 +865,11 @@ impl<'n> RowJob<'n> {
             } else {
                 Flag::BadPsf
             };
+            // The epochs bring the noise, the sky and the stars of their images.
+            let mut image = worker.image(ImageNoise::Unknown);
             galaxies.push(match epochs.is_empty() {
                 true => Measurement::flagged(flag),
-                false => worker.image(ImageNoise::Unknown).measure_epochs(&epochs)?,
+                false => image.measure_epochs_with_stars(&epochs, &stars)?,
             });
         }
         let examined = jobs.iter().zip(&all).map(|(job, stamps)| {

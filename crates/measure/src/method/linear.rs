@@ -382,7 +382,7 @@ impl CutWorker for LinearWorker {
             let epoch = epoch(k);
             self.family.check_side(epoch.psf)?;
             let (weight, pixel) = (precision(&epoch) / total, epoch.pixels.area());
-            let psf = self.denoiser.denoised(epoch.psf);
+            let psf = self.denoiser.denoised_with(epoch.psf, epoch.stars);
             squares += weight / (noise_equivalent_area(psf) * pixel);
             if let Some((seen, psf)) = epoch.galaxy_variance.zip(self.moments.psf_mean_square(psf))
             {
@@ -687,11 +687,13 @@ impl PlanWorker {
         let mut epochs = self.epochs.take().unwrap_or_else(new);
         let EpochBuffers { psfs, scratch } = &mut *epochs;
         for k in 0..weights.len() {
-            let CutEpoch { psf, pixels, .. } = epoch(k);
+            let CutEpoch {
+                psf, pixels, stars, ..
+            } = epoch(k);
             if psfs.len() <= k {
                 psfs.push(spectral.epoch());
             }
-            let psf = denoiser.denoised(psf);
+            let psf = denoiser.denoised_with(psf, stars);
             spectral.set_epoch_psf(psf, pixels, &mut self.buffers, scratch, &mut psfs[k])?;
         }
         let psfs = &mut psfs[..weights.len()];

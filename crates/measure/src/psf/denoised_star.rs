@@ -70,6 +70,15 @@ impl StarDenoiser {
 
     /// The denoised star of sum one; `psf` unchanged if its noise is negligible or no profile fits.
     pub(crate) fn denoised<'a>(&'a mut self, psf: ArrayView2<'a, f64>) -> ArrayView2<'a, f64> {
+        self.denoised_with(psf, None)
+    }
+
+    /// The same with residual profiles in place of those that were set: epochs of a galaxy have stars of several images.
+    pub(crate) fn denoised_with<'a>(
+        &'a mut self,
+        psf: ArrayView2<'a, f64>,
+        profiles: Option<&Arc<ResidualProfiles>>,
+    ) -> ArrayView2<'a, f64> {
         let Some(Fit {
             profile,
             sigma,
@@ -78,7 +87,7 @@ impl StarDenoiser {
         else {
             return psf;
         };
-        if let Some(profiles) = &self.residual_profiles {
+        if let Some(profiles) = profiles.or(self.residual_profiles.as_ref()) {
             profiles.at_snr(snr).add_to(self.star.view_mut(), &profile);
         }
         self.add_significant_residual(psf, &profile, sigma);

@@ -1,6 +1,8 @@
 //! Images from their stamps to rows and warnings.
 
 use ndarray::{Array3, s};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
 use shearq_quantities::{FunctionalPsf, PsfProfile, Shear};
 
 use super::*;
@@ -18,6 +20,36 @@ fn stamps(count: usize, side: usize) -> Array3<f32> {
         let (y, x) = (y as f32 - middle, x as f32 - middle);
         100.0 * (-(x * x / (9.0 + 0.5 * k as f32) + y * y / 9.0)).exp()
     })
+}
+
+/// Stars of S/N 100, one per galaxy. Uniform noise: enough for a test of who gets what.
+fn noisy_stars(count: usize) -> Array3<f32> {
+    let psf = FunctionalPsf::new(PsfProfile::Kolmogorov, 3.4, Shear::ZERO).unwrap();
+    let psf = psf.stamp(48).mapv(|v| v as f32);
+    let half = 3f32.sqrt() * psf.mapv(|v| v * v).sum().sqrt() / 100.0;
+    let mut rng = ChaCha8Rng::seed_from_u64(5);
+    Array3::from_shape_fn((count, 48, 48), |(_, y, x)| {
+        psf[(y, x)] + rng.random_range(-half..half)
+    })
+}
+
+/// The galaxies of an image and of its further epochs.
+fn with_epochs<'a>(
+    measurer: &Measurer,
+    [mut first, mut second]: [ArraySource<'a>; 2],
+    [noise, second_noise]: [KnownNoise<'a>; 2],
+) -> Batch {
+    let session = Session::open(measurer, &mut first, noise, &OneThread).unwrap();
+    let other = Session::open(measurer, &mut second, second_noise, &OneThread).unwrap();
+    let session = Arc::new(session.with_epochs(vec![other]).unwrap());
+    let mut image = Arc::clone(&session).begin().unwrap();
+    let mut worker = measurer.worker();
+    let others = std::slice::from_mut(&mut second);
+    for row in 0..session.rows().len() {
+        let job = session.read_epochs(&mut first, others, row).unwrap();
+        image.add(job.measure_row(&mut worker).unwrap());
+    }
+    image.finish()
 }
 
 fn message<T>(result: Result<T, MeasureError>, expected: &str) {
@@ -86,18 +118,8 @@ fn psfs_one_each_are_each_galaxys_own() {
 #[test]
 fn noisy_stars_one_each_share_what_they_have_in_common() {
     let measurer = Measurer::named("48/linear/star", 48).unwrap();
-    let psf = FunctionalPsf::new(PsfProfile::Kolmogorov, 3.4, Shear::ZERO).unwrap();
-    let psf = psf.stamp(48).mapv(|v| v as f32);
-    let count = 80;
-    let sigma = psf.mapv(|v| v * v).sum().sqrt() / 100.0;
-    // Uniform noise: enough for a test of who gets what.
-    let mut state = 5;
-    let mut noise = || {
-        let uniform = crate::spectral::uniform(&mut state) as f32;
-        12f32.sqrt() * (uniform - 0.5)
-    };
-    let stars = Array3::from_shape_fn((count, 48, 48), |(_, y, x)| psf[(y, x)] + sigma * noise());
-    let (stamps, psfs) = (stamps(count, 48), Psfs::stars(stars.view()));
+    let stars = noisy_stars(80);
+    let (stamps, psfs) = (stamps(80, 48), Psfs::stars(stars.view()));
     let batch = measurer.batch(stamps.view(), &psfs, Some(0.5)).unwrap();
     let mut worker = measurer.worker();
     let of = |mut image: ImageWorker<'_>| {
@@ -112,6 +134,55 @@ fn noisy_stars_one_each_share_what_they_have_in_common() {
     assert_eq!(of(session(&measurer).image(&mut worker)), of_batch);
     // The next image knows nothing of it.
     assert_ne!(of(worker.image(ImageNoise::Level(0.5))), of_batch);
+}
+
+#[test]
+fn noisy_stars_of_epochs_share_what_they_have_in_common() {
+    let measurer = Measurer::named("48/linear/star", 48).unwrap();
+    let (stamps, stars) = (stamps(80, 48), noisy_stars(80));
+    let psfs = Psfs::stars(stars.view());
+    let source = || ArraySource::new(&measurer, stamps.view(), &psfs).unwrap();
+    let noise = || KnownNoise::Given(0.5);
+    let epochs = with_epochs(&measurer, [source(), source()], [noise(), noise()]);
+    // Two equal epochs are an image of half the variance.
+    let level = 0.5 / 2f64.sqrt();
+    let image = measurer.batch(stamps.view(), &psfs, Some(level)).unwrap();
+    let mut worker = measurer.worker();
+    let mut alone = worker.image(ImageNoise::Level(level));
+    let alone = alone.measure_each(stamps.view(), &psfs).unwrap();
+    let distance = |galaxies: &[Measurement]| -> f64 {
+        let pairs = galaxies.iter().zip(&image.galaxies);
+        pairs
+            .map(|(a, b)| (a.response_diagonal()[0] - b.response_diagonal()[0]).abs())
+            .sum()
+    };
+    let (shared, alone) = (distance(&epochs.galaxies), distance(&alone));
+    assert!(shared < 0.1 * alone, "{shared} {alone}");
+}
+
+#[test]
+fn stated_noise_does_not_replace_a_failed_survey_of_an_epoch() {
+    let measurer = Measurer::named("48/linear/star", 64).unwrap();
+    let (stamps, star) = (stamps(4, 64), moffat(0.02).stamp(48));
+    let psfs = Psfs::star(star.view());
+    // Too many missing pixels for a survey, but none among the 48 that are cut.
+    let mut framed = Array3::from_elem((4, 64, 64), f32::NAN);
+    let inner = s![.., 8..56, 8..56];
+    framed.slice_mut(inner).assign(&stamps.slice(inner));
+    let source = |stamps| ArraySource::new(&measurer, stamps, &psfs).unwrap();
+    let found = with_epochs(
+        &measurer,
+        [source(stamps.view()), source(framed.view())],
+        [KnownNoise::Given(0.5), KnownNoise::Stated(0.5)],
+    );
+    let left_out = Warning::Epoch {
+        epoch: 2,
+        warning: Box::new(Warning::EpochNoNoise),
+    };
+    assert!(found.warnings.contains(&left_out), "{:?}", found.warnings);
+    for galaxy in &found.galaxies {
+        assert_eq!(galaxy.noise, 0.5);
+    }
 }
 
 #[test]
