@@ -212,7 +212,7 @@ pub(crate) fn better(metric: RankBy, a: f64, b: f64) -> bool {
 
 // Whether `other` is behind `best` by less than the error of the difference.
 //
-// This error is the smallest of three. The jackknife of the paired difference over the same images is right if both entries
+// This error is the smaller of two. The jackknife of the paired difference over the same images is right if both entries
 // respond to the images alike; for an entry with shapes in one of eight images, whose Q was
 // 171.8 ± 20.7, it exceeded the lead of 154 over 17.9 ± 1.7. The quadratic sum of both errors neglects common noise, so it is an upper limit. In that sum, the error of
 // `other` is limited to the error of `best`: otherwise an entry with much noise would share every rank.
@@ -227,7 +227,7 @@ fn equal(metric: RankBy, best: &Scored<'_>, other: &Scored<'_>) -> bool {
     gap == 0.0 || gap.abs() < paired.min(apart)
 }
 
-// Largest 1 - r of a near copy, with r the correlation of its shapes. Noise of a thousandth of the shapes has it.
+// Largest 1 - r of a near copy, with r the correlation of its shapes: that of noise of 0.14 % of their scatter.
 const DECORRELATION: f64 = 1e-6;
 
 #[derive(Debug, Clone)]

@@ -9,23 +9,29 @@ use crate::measurement::{Measurement, ResponseMatrix};
 // In standard errors. Chosen by hand.
 const MIN_RESPONSE_SIGNIFICANCE: f64 = 3.0;
 
-/// The mean responses R11 and R22 of the good galaxies, and whether each is positive by three standard errors. The response
-/// of a single galaxy has no error, and must only be positive.
+pub(crate) struct MeanResponse {
+    pub(crate) diagonal: [f64; 2],
+    /// Whether each is positive by three standard errors. The response of a single galaxy has no error, and must only be
+    /// positive.
+    pub(crate) is_significant: bool,
+}
+
+/// The mean responses R11 and R22 of the good galaxies.
 ///
 /// One galaxy's response is far too noisy to divide by, and correlated with its ellipticity. The mean over one image of 40
 /// to 400 galaxies at S/N 10 is too: ⟨1/R̂⟩ exceeds 1/⟨R⟩ by 17 to 1 in a thousand. So ellipticities stay as they are, and
 /// who averages them divides by the response of what is averaged.
-pub(crate) fn mean_response(galaxies: &[Measurement]) -> ([f64; 2], bool) {
+pub(crate) fn mean_response(galaxies: &[Measurement]) -> MeanResponse {
     let mut responses = [RunningMean::default(); 2];
     for galaxy in galaxies.iter().filter(|galaxy| galaxy.flags.is_empty()) {
         for (mean, response) in responses.iter_mut().zip(galaxy.response_diagonal()) {
             mean.add(response);
         }
     }
-    (
-        responses.map(|own| own.mean()),
-        responses.iter().all(is_significant),
-    )
+    MeanResponse {
+        diagonal: responses.map(|own| own.mean()),
+        is_significant: responses.iter().all(is_significant),
+    }
 }
 
 /// Whether a mean response can be divided by: positive by three standard errors. Otherwise the quotient is dominated by the
@@ -231,9 +237,10 @@ mod tests {
 
     #[test]
     fn mean_responses_are_those_of_good_galaxies() {
-        let (mean, significant) = mean_response(&row(&[0.4, 0.8, f64::NAN, 0.3]));
-        assert!((mean[0] - 0.5).abs() < 1e-12 && (mean[1] - 1.0).abs() < 1e-12);
-        assert!(significant);
+        let mean = mean_response(&row(&[0.4, 0.8, f64::NAN, 0.3]));
+        let [first, second] = mean.diagonal;
+        assert!((first - 0.5).abs() < 1e-12 && (second - 1.0).abs() < 1e-12);
+        assert!(mean.is_significant);
         // 0.1 ± 0.1 and, of others, 0.1 ± 0.03.
         let scatter = [0.19, 0.01, 0.17, 0.03];
         for (responses, significant) in [
@@ -244,7 +251,7 @@ mod tests {
             (&[f64::NAN], false),
         ] {
             assert_eq!(
-                mean_response(&row(responses)).1,
+                mean_response(&row(responses)).is_significant,
                 significant,
                 "{responses:?}"
             );

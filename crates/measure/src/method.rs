@@ -353,10 +353,8 @@ impl Found {
             e1: e[0],
             e2: e[1],
             flags: Flags::NONE,
-            // A shear of galaxies of all orientations sees the mean of R over rotations and reflections of the galaxy, half of
-            // its trace. The rest is noise that averages need not have: R11 and R22 correlate with −0.43, and with the mean of
-            // both the error of m is 1.5 times smaller. Sheared catalogues may be cut by e, and need all of R.
-            response: response.map(|[[r11, _], [_, r22]]| isotropic(0.5 * (r11 + r22))),
+            // Sheared catalogues may be cut by e, and need all of R.
+            response: response.map(|[[r11, _], [_, r22]]| isotropic(r11 + r22)),
             e_variance: self.e_variance(reported),
             observables,
             sheared: pair.and_then(|(observables, response)| {
@@ -500,8 +498,11 @@ impl Found {
     }
 }
 
-/// A response that is the same for both components.
-pub(crate) fn isotropic(response: f64) -> ResponseMatrix {
+/// The mean of a response R of this trace over rotations and reflections of the galaxy: the same for both components.
+pub(crate) fn isotropic(trace: f64) -> ResponseMatrix {
+    // A shear of galaxies of all orientations sees this mean. The rest of R is noise that averages need not have: R11 and R22
+    // correlate with −0.43, and with the mean of both the error of m is 1.5 times smaller.
+    let response = 0.5 * trace;
     [[response, 0.0], [0.0, response]]
 }
 

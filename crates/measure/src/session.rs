@@ -943,9 +943,11 @@ impl MeasuredImage<'_> {
             false => (session.epoch_warnings(&examined), None),
         };
         warnings.extend(Warning::of_galaxies(&galaxies));
-        if let Some((response, false)) = response
+        if let Some(mean) = &response
+            && !mean.is_significant
             && galaxies.iter().any(|galaxy| galaxy.flags.is_empty())
         {
+            let response = mean.diagonal;
             warnings.push(Warning::NoResponse { response });
         }
         let good = galaxies.iter().filter(|galaxy| galaxy.flags.is_empty());
@@ -954,7 +956,7 @@ impl MeasuredImage<'_> {
         let e_noise = [0, 1].map(|k| (variance(k) / count).sqrt());
         Batch {
             galaxies,
-            response: response.map(|(response, _)| response),
+            response: response.map(|mean| mean.diagonal),
             e_noise,
             warnings,
             psf_noise,

@@ -4,15 +4,16 @@
 //! pixel p/2, as the convolution of the paper.
 //!
 //! Without thresholds (Nurbaeva et al. 2015, Eq. 9) and clipping (Eq. 12), the adaptive update v ← v + c·f (Eqs. 10 and 11)
-//! from v = 0 is linear. On a plane without boundary each Fourier mode evolves alone, and after M iterations
+//! from v = 0 is linear. On a plane without boundary each Fourier mode evolves alone, and the shape is measured on the result of
+//! M iterations, convolved with a round Gaussian of σ:
 //!
 //! ```text
-//! v̂ = [1 − (1 − c w)^M] · conj(p)/w · û,    w = |p|² + λ d²,
+//! v̂ = Γ · [1 − (1 − c w)^M] · conj(p)/w · û,    w = |p|² + λ d²,
 //! ```
 //!
-//! with p and d the transforms of the PSF and of Sun's kernel. What the shape is measured on is v
-//! convolved with Γ: a round Gaussian of σ that falls to zero towards |k| = [`TARGET_CUT`]/σ. No mode enters that
-//! the PSF has destroyed, and what remains of the PSF is round. (A sharp cut would bring noise from afar.)
+//! with û, p and d the transforms of the stamp, of the PSF and of Sun's kernel. Γ is the transform of the Gaussian times a taper
+//! that falls to zero towards |k| = [`TARGET_CUT`]/σ. No mode enters that the PSF has destroyed, and what remains of the PSF is
+//! round. (A sharp cut would bring noise from afar.)
 //!
 //! The result is multiplied by a round Gaussian window, which keeps out most of the noise, before its
 //! autocorrelation is taken. (A window on the stamp itself would cut into the PSF, and what was then
@@ -62,8 +63,8 @@ use crate::transform::{
 const MARGIN_PX: usize = 8;
 // Period of the plane in multiples of this. Layout: sizes whose rows fill vectors.
 const PERIOD_STEP_PX: usize = 16;
-// Largest wave number of the target Γ, times its σ. Chosen by hand: Γ is 0.09 there, and noise outweighs the galaxy beyond
-// it.
+// Largest wave number of the target Γ, times its σ. Chosen by hand: the Gaussian alone is 0.09 there, and noise outweighs the
+// galaxy beyond it.
 const TARGET_CUT: f64 = 2.2;
 // Share of the largest wave number at which the taper of Γ begins. Chosen by hand.
 const TAPER_START: f64 = 0.75;
@@ -216,14 +217,15 @@ pub struct SpectralPsf {
     powers: NoiseChanges<Vec<f32>>,
 }
 
-/// One value for each change tn of noise n, in units t of the noise of a mode, whose mean products a′(n)·b′(tn) are needed.
+/// One value for each of four changes of noise n, whose mean products a′(n)·b′(tn) are needed: t(k) multiplies each mode of
+/// the noise.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct NoiseChanges<T> {
-    /// The changes with γ₁ and with γ₂.
+    /// The mean changes of a mode with γ₁ and with γ₂.
     pub(crate) sheared: [T; 2],
-    /// What noise lacks to be that behind a PSF turned by 90 degrees.
+    /// t = √(P⊥/P) − 1, with P the power behind the PSF and P⊥ that behind the PSF turned by 90 degrees.
     pub(crate) turned: T,
-    /// The noise itself.
+    /// t = 1.
     pub(crate) plain: T,
 }
 
@@ -290,8 +292,8 @@ impl Spectral {
     pub fn new(n: usize, p: usize, settings: &LinearDeconvolution) -> Result<Self, MeasureError> {
         check_sizes(n, p)?;
         let (sigma, window_sigma) = (settings.target_sigma, settings.window_sigma);
-        // Below the stamp's own Nyquist frequency, π.
-        let cut = (TARGET_CUT / sigma).min(3.0);
+        // At most 2.2, below the Nyquist frequency of the stamp, π: σ is at least 1 px.
+        let cut = TARGET_CUT / sigma;
         let period = (n + MARGIN_PX).max(p).next_multiple_of(PERIOD_STEP_PX);
         let samples = (cut * period as f64 / std::f64::consts::PI).ceil() as usize + 2;
         let samples = smooth_length(samples).min(period);
