@@ -633,7 +633,7 @@ mod tests {
         let e2 = -w * 0.2 + w_f * 0.3 - w_s * 0.4 - 0.5 * 0.2 * curved;
         // Rounding of second differences.
         close(found.response[0][0], 0.5 * (first + second), 1e-6);
-        assert_eq!(found.response, isotropic(found.response[0][0]));
+        assert_eq!(found.response, isotropic(2.0 * found.response[0][0]));
         close(found.e[0], e1, 1e-6);
         close(found.e[1], e2, 1e-6);
     }
