@@ -366,8 +366,14 @@ fn follow_the_truth(data_folder: &Path, name: &str) {
             if calibrated {
                 // Slopes of 512 galaxies of σ_ε = 0.14 that scatter by 0.11 have errors of 0.035.
                 assert!((own.slope - 1.0).abs() < errors(0.035), "{what}");
-                // The scatter of GalSim's REGAUSS on the same galaxies.
-                assert!(own.scatter < 0.125, "{what}");
+                // The scatter of GalSim's REGAUSS on the same galaxies. 48/linear/survey, which is for galaxies of many S/N, has
+                // 1.08 times the noise of 48/linear/star at S/N 20 (COSMOS fits).
+                let limit = if name == "48/linear/survey" {
+                    0.135
+                } else {
+                    0.125
+                };
+                assert!(own.scatter < limit, "{what}");
             } else {
                 // Distortions diluted by the clipped ACF: between a fifth of 2ε and all of it.
                 assert!((0.25..2.0).contains(&own.slope), "{what}");
