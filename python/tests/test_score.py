@@ -181,7 +181,7 @@ WRONG = [
     (dict(positions=(FIELD, FIELD), stamp=48), "images: not given; expected the number of images"),
     (dict(e1=FIELD - 99), "256 rows have a number that no measurement"),
     (dict(definition="mine"), 'definition: "mine"; expected "leaderboard" or "corrected"'),
-    (dict(convention=9), 'convention: "9"; expected "matched", "best" or a number'),
+    (dict(convention=9), 'convention: found "9", expected `matched`, `best` or a number from 1 to 8'),
     (dict(field_degrees=0), "field_degrees: found 0.0; expected a positive number, at most 360"),
     (dict(field_degrees=1e17), "field_degrees: found 1e"),
     (dict(noise_variance=-1), "noise_variance: found -1.0; expected a finite number, zero or more"),
