@@ -228,8 +228,9 @@ pub(crate) fn run(arguments: &Arguments, command_line: &str) -> anyhow::Result<(
         let difference = summed.difference(&other)?;
         let other = other.result()?;
         warn();
-        if let Some(chosen) = chosen_by_measurement(&other) {
-            tell(format_args!("warning: --against: {chosen}"));
+        let absent = other.about.without_catalogue.iter().cloned();
+        for warning in absent.chain(chosen_by_measurement(&other)) {
+            tell(format_args!("warning: --against: {warning}"));
         }
         let table = compared_table(&result, &other, &difference);
         return arguments.printing.print(&table);
