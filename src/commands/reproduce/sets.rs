@@ -71,7 +71,15 @@ pub(super) fn score_sets(
     let path = |set: u32| folder.join(format!("sets/set{set:02}.json"));
     let mut results = Vec::new();
     for &set in sets {
-        if let Some(scores) = read_record(&path(set))? {
+        if let Some(scores) = read_record::<SetScores>(&path(set))? {
+            anyhow::ensure!(
+                (scores.set, scores.images) == (set, plan.images),
+                "{}: these are scores of {} images of set {}; expected {} of set {set}. Try: remove the file",
+                path(set).display(),
+                scores.images,
+                scores.set,
+                plan.images
+            );
             progress.skip(u64::from(plan.images) * (plan.simulation.grid as u64).pow(2));
             results.push(scores);
             continue;
