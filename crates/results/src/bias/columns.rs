@@ -315,7 +315,7 @@ pub(super) fn counted_value(name: &str) -> Option<bool> {
 
 // Names of weights of shapes, in small letters and between underscores: lensfit's, inverse variances, and the coverage of
 // drizzled and coadded images (`AUTO_WHT`), which is a weight where nothing better is known.
-const WEIGHTS: &str = "*weight* *_w_* *_wt_* *_wgt_* *_wht_* *_ivar_* *_inv*var*";
+const WEIGHTS: &str = "*weight* *_w_* *_wt_* *_wgt_* *_wht_* *_ivar_* *_inv*var* *_inv*sig*2*";
 // Columns of real catalogues with such names that are no weights of shapes: derivatives and sheared catalogues, SExtractor's
 // FLAGS_WEIGHT, weighted means, and the inverse variances of fluxes, positions and profiles in the Legacy Surveys.
 const NO_WEIGHTS: &str = "*_dg1_ *_dg2_ *_1p_ *_1m_ *_2p_ *_2m_ *flag* *mask* *weighted* *psf* *_star_* *flux* *_mag_* \
@@ -323,7 +323,8 @@ const NO_WEIGHTS: &str = "*_dg1_ *_dg2_ *_1p_ *_1m_ *_2p_ *_2m_ *flag* *mask* *w
 
 /// Whether the name of a column suggests that it is a weight of shapes.
 pub(crate) fn looks_like_weight(name: &str) -> bool {
-    let name = format!("_{}_", name.to_ascii_lowercase());
+    // Elements of vectors have brackets: `ivar[0]`.
+    let name = format!("_{}_", name.to_ascii_lowercase()).replace(['.', '-', ' ', '[', ']'], "_");
     fits_any(WEIGHTS, &name) && !fits_any(NO_WEIGHTS, &name)
 }
 
@@ -999,7 +1000,8 @@ mod tests {
     #[test]
     fn weights_of_shapes_are_recognised_by_their_names() {
         let weights = "weight_lensfit ivar inverse_variance AUTO_WHT weightsum wht_sum weight_map WEIGHT_IMAGE my_weight wht \
-            w_iv w_des wt_a recal_weight_A SHE_LENSMC_WEIGHT invVar shape_e1_ivar ivar_e1 wgt lensWeight";
+            w_iv w_des wt_a recal_weight_A SHE_LENSMC_WEIGHT invVar shape_e1_ivar ivar_e1 wgt lensWeight ivar[0] w.lens w-lens \
+            inv_sigma2";
         for name in weights.split_whitespace() {
             assert!(looks_like_weight(name), "{name}");
         }
