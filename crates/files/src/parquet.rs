@@ -22,9 +22,9 @@ use base64::engine::general_purpose::STANDARD;
 use flate2::Crc;
 use polars::prelude::{
     ArrowDataType, ArrowField, ChunkFillNullValue, ChunkedArray, Column, CompatLevel, DataFrame,
-    DataType, FileMetadataRef, IntoSeries, KeyValueMetadata, NamedFrom, ParquetCompression,
-    ParquetReader, ParquetWriter, PolarsError, PolarsNumericType, PolarsResult, SchemaExt,
-    SerReader, Series, StatisticsOptions,
+    DataType, FileMetadataRef, IntoSeries, KeyValueMetadata, NamedFrom, ParquetReader,
+    ParquetWriter, PolarsError, PolarsNumericType, PolarsResult, SchemaExt, SerReader, Series,
+    StatisticsOptions,
 };
 use polars_arrow::io::ipc::write::{default_ipc_fields, schema_to_bytes};
 use polars_parquet::parquet::page::CompressedPage;
@@ -69,6 +69,7 @@ pub fn encode(frame: &DataFrame, metadata: &Metadata) -> PolarsResult<Vec<u8>> {
         null_count: true,
         ..StatisticsOptions::empty()
     };
+    // Row groups are encoded by these options, and the writer only puts them and the footer into the file.
     let options = WriteOptions {
         statistics,
         version: Version::V1,
@@ -77,13 +78,11 @@ pub fn encode(frame: &DataFrame, metadata: &Metadata) -> PolarsResult<Vec<u8>> {
     };
     let mut bytes = Vec::new();
     let mut writer = ParquetWriter::new(&mut bytes)
-        .with_compression(ParquetCompression::Uncompressed)
         .with_statistics(statistics)
         .with_key_value_metadata(Some(KeyValueMetadata::from_static(pairs)))
         .batched(frame.schema())?;
     let encodings: Vec<_> = frame.columns().iter().map(encoding).collect();
-    let starts = (0..frame.height()).step_by(ROW_GROUP);
-    for start in starts {
+    for start in (0..frame.height()).step_by(ROW_GROUP) {
         let mut group = frame.slice(start as i64, ROW_GROUP);
         group.rechunk_mut();
         for batch in group.iter_chunks(CompatLevel::newest(), false) {
