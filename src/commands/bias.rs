@@ -21,7 +21,8 @@ use shearq_results::bias::{Binning, Edges, MOST_BINS, Request, Summed, Units, su
 use shearq_results::expression::Expression;
 use shearq_results::select::selection;
 use shearq_results::views::bias::{
-    Limit, bias_plot, bias_table, check, chosen_by_measurement, compared_table, of_design, section,
+    Limit, bias_plot, bias_table, check, chosen_by_measurement, compared_table, of_design,
+    of_other_images, section,
 };
 use shearq_scoring::TruthSign;
 
@@ -68,7 +69,7 @@ struct Summing {
     /// FITS file.
     #[arg(value_name = "CATALOGUE", required_unless_present_any = ["merge", "plan", "example"])]
     catalogues: Vec<PathBuf>,
-    /// Catalogues of another program on the same galaxies, in the same order. The output contains both and the
+    /// Catalogues of another program on the same galaxies (the same images, if they state theirs), in the same order. The output contains both and the
     /// difference, with paired errors. A --truth table by catalogue contains those of both, or names of files that both
     /// have, in two folders.
     #[arg(long, value_name = "CATALOGUE", num_args = 1.., conflicts_with_all = ["sums", "shard", "fail_above", "plot", "report"])]
@@ -229,7 +230,8 @@ pub(crate) fn run(arguments: &Arguments, command_line: &str) -> anyhow::Result<(
         let other = other.result()?;
         warn();
         let absent = other.about.without_catalogue.iter().cloned();
-        for warning in absent.chain(chosen_by_measurement(&other)) {
+        let warnings = absent.chain(chosen_by_measurement(&other));
+        for warning in warnings.chain(of_other_images(&result, &other)) {
             tell(format_args!("warning: --against: {warning}"));
         }
         let table = compared_table(&result, &other, &difference);

@@ -101,6 +101,9 @@ pub struct Catalogue {
     /// The noise of the star that is the PSF of all its galaxies, if it is known.
     #[serde(default)]
     pub star: Option<StarNoise>,
+    /// The fingerprint of the image that it was measured on, if it is known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub image: Option<String>,
 }
 
 impl Catalogue {

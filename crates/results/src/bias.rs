@@ -9,18 +9,20 @@ mod read;
 mod source;
 pub mod truth;
 
+use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 use shearq_bias::{
     BiasError, Catalogue, Design, Estimate, Grouping, Layout, Range, UnitSums, difference, group,
 };
+use shearq_dataset::fingerprint::GALAXIES;
 use shearq_dataset::layout::stated_sign;
-use shearq_dataset::metadata::{CommonAxes, stated_axes};
+use shearq_dataset::metadata::{CATALOGUE_FRAME, CommonAxes, axes_of};
 use shearq_dataset::truth::{Sign, SignBasis, word};
 use shearq_files::FileError;
 use shearq_files::frames::polars::DataFrame;
-use shearq_files::table::FileFormat;
+use shearq_files::table::{self, FileFormat};
 use shearq_scoring::TruthSign;
 use thiserror::Error;
 
@@ -48,6 +50,10 @@ pub enum BiasFailure {
     Signs { catalogue: PathBuf, first: PathBuf },
     #[error("{}: its columns are not the columns of {} (expected the same columns for truth, response and PSF in all catalogues). Try: one command per kind of catalogue", catalogue.display(), first.display())]
     Columns { catalogue: PathBuf, first: PathBuf },
+    #[error(
+        "{second}: it was measured on the same image as {first} (expected one catalogue of each image). Try: leave one out, or measure again if it is a copy"
+    )]
+    SameImage { first: String, second: String },
     #[error("the sums do not belong together: they have different {0}")]
     Unlike(&'static str),
     #[error("{0}: the catalogue is in two files of sums")]
@@ -60,6 +66,10 @@ pub enum BiasFailure {
     BinsDiffer,
     #[error("the catalogues cannot be compared: e2 of one follows the true g2 of sign {}, of the other {}. Try: --truth-sign", word(*.0), word(*.1))]
     SignsDiffer(TruthSign, TruthSign),
+    #[error(
+        "the catalogues cannot be compared (found {own} beside {other}, expected the same images in the same order on both sides)"
+    )]
+    ImagesDiffer { own: String, other: String },
     #[error("the catalogues cannot be compared (found {} with {} and {} with {}, expected the same design and units). Try: --design and --units", .0.0.name(), .0.1, .1.0.name(), .1.1)]
     DesignsDiffer((Design, &'static str), (Design, &'static str)),
     #[error(
@@ -287,6 +297,9 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
     let response = first.has_response() || first.shapes != Shapes::Shear;
     let described = first.described(&reading);
     check_columns(request, &all)?;
+    let (frame, images) = frame_and_images(&all)?;
+    let named = request.catalogues.iter().zip(&images);
+    distinct_images(named.map(|(input, image)| (input.name.display().to_string(), image)))?;
     let edges = match &request.bins {
         None => Vec::new(),
         Some(bins) => match &bins.edges {
@@ -324,7 +337,7 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
         selection: request.selection.as_ref().map(|own| own.text.clone()),
         columns: described,
         sign,
-        frame: common_frame(&all)?,
+        frame,
         without_catalogue: request.without_catalogue.clone(),
     };
     let mut summed = Summed { sums, about };
@@ -338,6 +351,9 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
             (summed.sums, summed.about.catalogues) = found;
         }
         summed.about.sign = Some(sign);
+    }
+    for (catalogue, image) in summed.about.catalogues.iter_mut().zip(images) {
+        catalogue.image = image;
     }
     Ok(summed)
 }
@@ -458,17 +474,42 @@ fn check_columns(request: &Request, all: &[Vec<Source>]) -> Result<(), BiasFailu
     Ok(())
 }
 
-// The frame of catalogues by shearq. Others do not state theirs.
-fn common_frame(all: &[Vec<Source>]) -> Result<Option<String>, FileError> {
+// The frame of catalogues by shearq, and the fingerprint of the image of each. Others do not state theirs.
+fn frame_and_images(
+    all: &[Vec<Source>],
+) -> Result<(Option<String>, Vec<Option<String>>), FileError> {
     let mut axes = CommonAxes::default();
-    for source in all.iter().flatten() {
+    let mut images = vec![None; all.len()];
+    for (sources, image) in all.iter().zip(&mut images) {
+        // Only other programs write several tables for a catalogue.
+        let source = &sources[0];
         let path = &source.place.path;
         let own = source.columns.is_of_shearq() && source.frame.is_none();
         if let Some(format) = FileFormat::of(path).filter(|_| own) {
-            axes.add(path, stated_axes(path, format)?, true)?;
+            let keys = [CATALOGUE_FRAME, GALAXIES].map(str::to_owned);
+            let mut metadata = table::read_metadata(path, format, keys.iter())?;
+            axes.add(path, axes_of(path, &metadata)?, true)?;
+            *image = metadata.remove(GALAXIES);
         }
     }
-    Ok(axes.common().map(|axes| axes.frame().to_string()))
+    let frame = axes.common().map(|axes| axes.frame().to_string());
+    Ok((frame, images))
+}
+
+// Refuses two catalogues of one image: one that was copied between the arms of ±γ has the true shear of the other, which gave
+// m = −0.139.
+fn distinct_images<'c>(
+    catalogues: impl Iterator<Item = (String, &'c Option<String>)>,
+) -> Result<(), BiasFailure> {
+    let mut seen = HashMap::new();
+    for (second, image) in catalogues {
+        if let Some(image) = image
+            && let Some(first) = seen.insert(image, second.clone())
+        {
+            return Err(BiasFailure::SameImage { first, second });
+        }
+    }
+    Ok(())
 }
 
 fn known(truth: &Truth, source: &Source) -> bool {
@@ -571,6 +612,8 @@ impl Summed {
     pub fn append(&mut self, other: Summed) -> Result<(), BiasFailure> {
         self.check_options(&other)?;
         self.about.catalogues.extend(other.about.catalogues);
+        let named = self.about.catalogues.iter();
+        distinct_images(named.map(|own| (own.name.clone(), &own.image)))?;
         let remarks = other.about.without_catalogue;
         self.about.without_catalogue.extend(remarks);
         Ok(self.sums.append(other.sums)?)
@@ -673,6 +716,7 @@ impl Summed {
         {
             return Err(BiasFailure::SignsDiffer(own.of, theirs.of));
         }
+        self.check_images(other)?;
         let ((design, own), (their_design, theirs)) = (self.grouped()?, other.grouped()?);
         let designs = [(design, own.unit), (their_design, theirs.unit)];
         if designs[0] != designs[1] {
@@ -699,6 +743,27 @@ impl Summed {
             grouping,
             about,
         })
+    }
+
+    // Refuses images of both sides that are not in the same places. If the sides have no image in common, the same galaxies
+    // may have been cut out or drawn in two ways, and only the user knows.
+    fn check_images(&self, other: &Summed) -> Result<(), BiasFailure> {
+        let (own, theirs) = (&self.about.catalogues, &other.about.catalogues);
+        if !share_images(own, theirs) {
+            return Ok(());
+        }
+        let mut pairs =
+            (0..own.len().max(theirs.len())).map(|k| [own, theirs].map(|all| all.get(k)));
+        let image = |own: Option<&Catalogue>| own.and_then(|own| own.image.clone());
+        let name =
+            |own: Option<&Catalogue>| own.map_or("no catalogue".into(), |own| own.name.clone());
+        match pairs.find(|[a, b]| image(*a) != image(*b)) {
+            None => Ok(()),
+            Some([a, b]) => Err(BiasFailure::ImagesDiffer {
+                own: name(a),
+                other: name(b),
+            }),
+        }
     }
 
     fn check_responses(&self, all: &Estimate) -> Result<(), BiasFailure> {
@@ -770,6 +835,13 @@ impl Summed {
         }
         Ok(())
     }
+}
+
+/// Whether catalogues of one side of a comparison state an image that those of the other side state.
+pub fn share_images(own: &[Catalogue], theirs: &[Catalogue]) -> bool {
+    let theirs: HashSet<_> = theirs.iter().filter_map(|own| own.image.as_ref()).collect();
+    let mut own = own.iter().filter_map(|own| own.image.as_ref());
+    own.any(|image| theirs.contains(image))
 }
 
 // Significance at which an implausible response is refused, and at which the response of e2 determines the sign of g2: one

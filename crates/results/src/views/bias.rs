@@ -9,7 +9,7 @@ use shearq_render::figure::{Band, FigureError, LinePlot, PanelGrid, Series, Styl
 use shearq_render::html::{Block, Picture, Section};
 use shearq_render::table::{Cell, Heading, Table};
 
-use crate::bias::{BiasResult, BinResult};
+use crate::bias::{BiasResult, BinResult, share_images};
 use crate::foreign::shown;
 
 // Units above which Student's t differs from a normal distribution by less than 5 %.
@@ -184,6 +184,15 @@ pub fn chosen_by_measurement(result: &BiasResult) -> Option<String> {
     Some(format!(
         "m contains the effect of shear on a choice by `{column}`, which has no response here. Known sizes: −0.02 (S/N 20) to −0.1 (S/N 7) if the lowest 30 % in size are removed, −0.11 for the lowest 50 % in flux. Try: {remedy}"
     ))
+}
+
+/// A warning if both sides of a comparison state their images and have none in common.
+pub fn of_other_images(first: &BiasResult, second: &BiasResult) -> Option<String> {
+    let [first, second] = [first, second].map(|result| result.about.catalogues.as_slice());
+    let stated = |all: &[Catalogue]| all.iter().any(|own| own.image.is_some());
+    (stated(first) && stated(second) && !share_images(first, second)).then(|| {
+        "these catalogues were measured on other images, so that the noise does not cancel in the difference, and shapes only if the galaxies are the same".into()
+    })
 }
 
 // |m| above which catalogue and truth hardly belong together.
