@@ -62,9 +62,9 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             out.display()
         )
     })?;
-    // Other processes may still write to the folder, but none with other settings.
-    let _claim = claim(&path, &record)?;
     let data = DataFolder::open(out)?;
+    // Other processes may still write to the folder, but none with other settings.
+    let _claim = claim(&path, &record, &data.layout().galaxies)?;
     let results = Results::Images {
         record: &record,
         data: &data,
@@ -74,7 +74,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
 
 fn merge_run(arguments: &Arguments, run: &Run) -> anyhow::Result<()> {
     let out = &arguments.out;
-    let _claim = claim(&out.join(RUN_FILE), run)?;
+    let _claim = run.claim(out)?;
     let data = run.source.data(out)?;
     let sets = sets_of(arguments.sets.as_ref());
     let images = match &run.source {

@@ -261,6 +261,11 @@ impl Files {
         }
     }
 
+    pub fn first(&self) -> Option<&Path> {
+        let mut files = self.by_set.values().flat_map(BTreeMap::values);
+        files.next().map(|found| found.path.as_path())
+    }
+
     pub fn of_set(&self, set: u32) -> Vec<(u32, PathBuf)> {
         let files = self.by_set.get(&Some(set)).or(self.by_set.get(&None));
         let files = files.into_iter().flatten();

@@ -1,6 +1,6 @@
 //! Records of folders of results: `run.json`, which is written before the first result, and the claim of a folder by it.
 
-use std::fs::File;
+use std::fs::{File, TryLockError};
 use std::path::{Component, Path, PathBuf};
 
 use serde::de::DeserializeOwned;
@@ -13,7 +13,7 @@ use shearq_simulate::set::SimulationSettings;
 use shearq_submissions::Configuration;
 
 use crate::images::{self, Files, ImageId};
-use crate::layout::{DataFolder, Layout, check_folder, fill};
+use crate::layout::{DataFolder, Layout, check_folder, endings, fill};
 
 pub const RUN_FILE: &str = "run.json";
 
@@ -149,6 +149,11 @@ impl Run {
             _ => format!("there is no {RUN_FILE}; expected {EXPECTED}"),
         };
         Err(FileError::new(folder, message))
+    }
+
+    /// Claims a folder for the catalogues of this run.
+    pub fn claim(&self, folder: &Path) -> Result<Claim, FileError> {
+        claim(&folder.join(RUN_FILE), self, &self.pattern())
     }
 
     pub fn catalogue(&self, folder: &Path, set: u32, image: u32) -> PathBuf {
@@ -367,7 +372,7 @@ pub fn nan_for_null<'de, D: Deserializer<'de>, N: Numbers>(deserializer: D) -> R
 }
 
 /// A folder of results that this process writes to until it drops this. Other processes of the same settings may write to
-/// it too.
+/// it too, unless one is [alone](Claim::alone).
 #[derive(Debug)]
 #[must_use]
 pub struct Claim {
@@ -376,6 +381,20 @@ pub struct Claim {
 }
 
 impl Claim {
+    /// Refuses the folder to other processes that claim it alone, for results that the record does not determine.
+    pub fn alone(self) -> Result<Self, FileError> {
+        match self.record.try_lock() {
+            Err(TryLockError::WouldBlock) => {
+                let folder = self.path.parent().unwrap_or(&self.path);
+                let message =
+                    "another process writes to this folder. Try: wait for it, or another folder";
+                Err(FileError::new(folder, message))
+            }
+            // File systems without locks have none that could be taken by others.
+            _ => Ok(self),
+        }
+    }
+
     /// Checks that the record of the folder has not been removed or replaced.
     pub fn check(&self) -> Result<(), FileError> {
         if self.is_there() {
@@ -424,17 +443,35 @@ impl Claim {
 }
 
 /// Claims the folder of `path` for `record`. Writes the record if there is none, and refuses a folder with a different
-/// record. Leftovers of killed processes are removed.
-pub fn claim<R: Serialize + DeserializeOwned>(path: &Path, record: &R) -> Result<Claim, FileError> {
+/// record, or with results by the names of `pattern` and no record. Leftovers of killed processes are removed.
+pub fn claim<R: Serialize + DeserializeOwned>(
+    path: &Path,
+    record: &R,
+    pattern: &str,
+) -> Result<Claim, FileError> {
+    let folder = path.parent().unwrap_or(path);
+    if folder.exists() {
+        check_folder(folder, "a folder to write to")?;
+    }
     let mut earlier: Option<R> = read_record(path)?;
     if earlier.is_none() {
+        // Results whose record was lost would be kept as those of the new one.
+        let results = images::find(folder, pattern, endings(pattern), &[])?;
+        // Another process that is first has written its record before its results.
+        if let Some(found) = results.first().filter(|_| !is_there(path)) {
+            let message = format!(
+                "nothing states the settings of this file (found no {} in {}). Try: another folder, or remove the results",
+                path.file_name().unwrap_or_default().display(),
+                folder.display()
+            );
+            return Err(FileError::new(found, message));
+        }
         // If another process is first, its record is compared like any earlier record.
         let _ = atomic::write_if_absent(path, record_text(path, record)?.as_bytes())?;
         earlier = read_record(path)?;
     }
     let differences = differences(&earlier, &Some(record))
         .map_err(|error| FileError::new(path, format!("cannot compare records: {error}")))?;
-    let folder = path.parent().unwrap_or(path);
     if !differences.is_empty() {
         return Err(FileError::new(
             folder,
@@ -592,6 +629,8 @@ mod tests {
         }
     }
 
+    const PATTERN: &str = "set{set}";
+
     #[test]
     fn leftovers_are_removed_unless_a_process_holds_them() {
         let folder = tempfile::tempdir().unwrap();
@@ -606,14 +645,14 @@ mod tests {
             std::fs::create_dir_all(path.parent().unwrap()).unwrap();
             std::fs::write(path, "half").unwrap();
         }
-        let _first = claim(&path, &1).unwrap();
+        let _first = claim(&path, &1, PATTERN).unwrap();
         assert!(!left.exists() && !deep.exists());
         let target = folder.path().join("set01/catalogue-002.fits");
         let (held, _) = atomic::PartFile::create(target).unwrap();
         std::fs::write(&left, "half").unwrap();
-        let _second = claim(&path, &1).unwrap();
+        let _second = claim(&path, &1, PATTERN).unwrap();
         assert!(!left.exists() && held.path().exists());
-        let message = claim(&path, &2).unwrap_err().to_string();
+        let message = claim(&path, &2, PATTERN).unwrap_err().to_string();
         assert!(message.contains(": 1 ≠ 2"), "{message}");
     }
 
@@ -638,7 +677,7 @@ mod tests {
         let root = tempfile::tempdir().unwrap();
         let folder = root.path().join("out");
         let path = folder.join("record.json");
-        let claimed = claim(&path, &1).unwrap();
+        let claimed = claim(&path, &1, PATTERN).unwrap();
         let result = folder.join("result");
         std::fs::write(&result, "").unwrap();
         claimed.check_results([result.clone()]).unwrap();
@@ -647,7 +686,7 @@ mod tests {
         assert!(message.contains("was removed"), "{message}");
         std::fs::remove_dir_all(&folder).unwrap();
         assert!(claimed.check().is_err());
-        let _other = claim(&path, &1).unwrap();
+        let _other = claim(&path, &1, PATTERN).unwrap();
         let message = claimed.check().unwrap_err().to_string();
         assert!(
             message.contains("out: the folder was removed or replaced"),

@@ -51,7 +51,8 @@ pub fn simulate_blind(
     threads: usize,
     progress: &mut dyn Progress,
 ) -> Result<(usize, usize), PipelineError> {
-    let claim = claim(&private.root().join(SIMULATION_FILE), record)?;
+    let path = private.root().join(SIMULATION_FILE);
+    let claim = claim(&path, record, &public.layout().galaxies)?;
     let side = record.settings.grid * STAMP;
     // The galaxies of an image are written last, so that their file shows that the image was completed.
     let is_there = |id: &&ImageId| {

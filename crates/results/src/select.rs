@@ -4,7 +4,7 @@ use std::path::Path;
 
 use shearq_dataset::fingerprint::{PRINTS, verify_source};
 use shearq_dataset::metadata::KEYS;
-use shearq_dataset::run::{RUN_FILE, Run, Source, claim};
+use shearq_dataset::run::{Run, Source};
 use shearq_dataset::threads::ALL_CORES;
 use shearq_files::frames::frame;
 use shearq_files::frames::polars::{Column, DataFrame};
@@ -192,7 +192,7 @@ pub fn write_selected(
         selection: Some(stated.text.clone()),
         ..run.clone()
     };
-    let claim = claim(&to.join(RUN_FILE), &record)?;
+    let claim = record.claim(to)?;
     let keys: Vec<String> = KEYS
         .iter()
         .chain(&PRINTS)

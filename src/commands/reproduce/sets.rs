@@ -4,6 +4,7 @@ use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 use shearq_dataset::grid::Mosaic;
+use shearq_dataset::layout::fill;
 use shearq_dataset::run::{Claim, nan_for_null, read_record, write_record};
 use shearq_dataset::threads::Progress;
 use shearq_measure::Measurer;
@@ -22,6 +23,9 @@ use shearq_simulate::set::{STAMP, SimulationSettings};
 use shearq_submissions::{Configuration, PsfForm, Published};
 
 use super::{DENOISED, RAW};
+
+/// Names of the scores of a set.
+pub(super) const SCORES: &str = "sets/set{set:02}.json";
 
 /// What determines the results of a folder.
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
@@ -68,7 +72,7 @@ pub(super) fn score_sets(
     // The paper's Table 1 has two pairs of configurations that differ only in name.
     let (distinct, places) = distinct(&plan.configurations);
     let measurers = measurers(&distinct)?;
-    let path = |set: u32| folder.join(format!("sets/set{set:02}.json"));
+    let path = |set: u32| folder.join(fill(SCORES, set, 0));
     let mut results = Vec::new();
     for &set in sets {
         if let Some(scores) = read_record::<SetScores>(&path(set))? {
@@ -439,7 +443,7 @@ mod tests {
         let root = tempfile::tempdir().unwrap();
         let folder = root.path().join("paper");
         let plan = plan(&["23/raw/star"]);
-        let claimed = claim(&folder.join("plan.json"), &plan).unwrap();
+        let claimed = claim(&folder.join("plan.json"), &plan, SCORES).unwrap();
         let place = (folder.as_path(), &claimed);
         let error = score_sets(&plan, &[2], place, 1, &mut Remover(&folder)).unwrap_err();
         let message = error.to_string();
@@ -451,7 +455,7 @@ mod tests {
     fn results_are_kept_and_read_again() {
         let root = tempfile::tempdir().unwrap();
         let plan = plan(&["23/raw/star", "23/den/star"]);
-        let claimed = claim(&root.path().join("plan.json"), &plan).unwrap();
+        let claimed = claim(&root.path().join("plan.json"), &plan, SCORES).unwrap();
         let place = (root.path(), &claimed);
         let first = score_sets(&plan, &[2], place, 1, &mut Quiet).unwrap();
         assert_eq!(first[0].results.len(), 2);

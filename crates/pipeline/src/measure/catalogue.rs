@@ -20,7 +20,7 @@ use shearq_dataset::metadata::{
     CATALOGUE_FIRST_PIXEL, CATALOGUE_FRAME, E_NOISE, NOT_APPLIED, PSF_NOISE, RESPONSE, WARNINGS,
     frame_entry,
 };
-use shearq_dataset::run::{Claim, RUN_FILE, Run, claim};
+use shearq_dataset::run::{Claim, Run};
 use shearq_dataset::threads::Progress;
 
 #[derive(Debug, Clone, Copy)]
@@ -258,7 +258,7 @@ impl<'a> CatalogueWriter<'a> {
         out: &'a Path,
         images: &'a [ImageId],
     ) -> Result<Self, FileError> {
-        let claim = claim(&out.join(RUN_FILE), run)?;
+        let claim = run.claim(out)?;
         let (todo, done) = to_do(run, out, images);
         let great3 = run.source.layout().great3;
         let summary = Summary {

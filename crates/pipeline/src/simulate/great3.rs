@@ -11,7 +11,6 @@ use shearq_dataset::threads::Progress;
 use shearq_files::fits::{ImageReader, ImageWriter};
 use shearq_files::frames::polars::Column;
 use shearq_files::frames::{Metadata, frame};
-use shearq_files::open::is_there;
 use shearq_files::table::{self, FileFormat, MAX_ROWS};
 use shearq_files::{FileError, atomic};
 use shearq_quantities::Shear;
@@ -70,9 +69,8 @@ pub fn simulate_branch(
     let image = |subfield, epoch| folder.join(file_name(great3::GALAXIES, subfield, epoch));
     let image = &image;
     let images = |subfield| (0..branch.epochs()).map(move |epoch| image(subfield, epoch));
-    // Before the claim, which would write a record of this seed into a folder with images of another.
-    refuse_without_record(out, (0..subfields).flat_map(images))?;
-    let claim = claim(&out.join(SIMULATION_FILE), record)?;
+    let pattern = format!("{}/{}", branch.folder(), great3::GALAXIES);
+    let claim = claim(&out.join(SIMULATION_FILE), record, &pattern)?;
     let size = branch.stamp();
     let side = grid * size;
     let missing = |subfield| -> Arc<[usize]> {
@@ -145,22 +143,6 @@ pub fn simulate_branch(
     .map_err(|error| claim.explain(error))?;
     claim.check_results((0..subfields).flat_map(images))?;
     Ok(made)
-}
-
-fn refuse_without_record(
-    out: &Path,
-    mut images: impl Iterator<Item = PathBuf>,
-) -> Result<(), FileError> {
-    match images.find(|path| is_there(path)) {
-        Some(found) if !is_there(&out.join(SIMULATION_FILE)) => {
-            let message = format!(
-                "nothing states the settings of this image (found no {SIMULATION_FILE} in {}). Try: another folder, or remove the images",
-                out.display()
-            );
-            Err(FileError::new(found, message))
-        }
-        _ => Ok(()),
-    }
 }
 
 // Compares the first galaxy of the epochs that are not `new`.
