@@ -74,6 +74,10 @@ impl ColumnValue for u64 {
 const MAX_UNPACKED_BYTES: u64 = 1 << 30;
 // Bytes that are unpacked at a time, at least.
 const UNPACK_STEP_BYTES: u64 = 1 << 23;
+// Checksums of FITS are sums modulo this number, in ones' complement.
+const ONES: u64 = u32::MAX as u64;
+// Bytes that are summed at a time: they stay in the cache.
+const SUM_STEP_BYTES: usize = 1 << 18;
 
 struct Source {
     path: PathBuf,
@@ -162,12 +166,28 @@ impl Source {
     /// Bytes from `start`: `size`, or fewer at the end of the file.
     fn read_at(&mut self, start: u64, size: usize) -> Result<Vec<u8>, FileError> {
         self.size(start.saturating_add(size as u64))?;
-        let mut bytes = Vec::new();
+        let mut bytes = Vec::with_capacity(size);
         self.file
             .seek(SeekFrom::Start(start))
             .and_then(|_| (&mut self.file).take(size as u64).read_to_end(&mut bytes))
             .map_err(FileError::doing(&self.path, "cannot read the file"))?;
         Ok(bytes)
+    }
+
+    /// Checksum of the 32-bit words from byte `start` to `end`. Bytes that the file lacks are zeros.
+    fn sum(&mut self, start: u64, end: u64) -> Result<u64, FileError> {
+        let mut sum = 0;
+        for at in (start..end).step_by(SUM_STEP_BYTES) {
+            let size = SUM_STEP_BYTES.min((end - at) as usize);
+            let mut bytes = self.read_at(at, size)?;
+            bytes.resize(size, 0);
+            let (words, _) = bytes.as_chunks();
+            let words = words
+                .iter()
+                .map(|word| u64::from(u32::from_be_bytes(*word)));
+            sum = (sum + words.sum::<u64>()) % ONES;
+        }
+        Ok(sum)
     }
 
     fn check_end(&mut self) -> Result<(), FileError> {
@@ -445,7 +465,7 @@ impl File {
 
     /// Goes to the next header. Returns whether there is one.
     pub fn next(&mut self) -> Result<bool, FileError> {
-        let start = self.extent()?[1];
+        let [_, _, start] = self.extent()?;
         if !check_header(&mut self.source, start, self.content)? {
             return Ok(false);
         }
@@ -522,10 +542,10 @@ impl File {
         })
     }
 
-    /// First byte of the data here, and the first one after them.
-    fn extent(&self) -> Result<[u64; 2], FileError> {
+    /// First byte of the header and of the data here, and the first one after them.
+    fn extent(&self) -> Result<[u64; 3], FileError> {
         // SAFETY: the file is open, and the pointers are to live variables.
-        let [_, start, end] = self.find(
+        let [header, start, end] = self.find(
             "where the data are",
             |raw, found: &mut [i64; 3], status| unsafe {
                 let [header, start, end] = found;
@@ -537,8 +557,8 @@ impl File {
                 .ok()
                 .filter(|byte| byte % BLOCK as u64 == 0)
         };
-        match [place(start), place(end)] {
-            [Some(start), Some(end)] if start <= end => Ok([start, end]),
+        match [header, start, end].map(place) {
+            [Some(header), Some(start), Some(end)] if start <= end => Ok([header, start, end]),
             _ => Err(self.fault(format!(
                 "the header is damaged: its data are from byte {start} to {end}"
             ))),
@@ -547,20 +567,20 @@ impl File {
 
     /// Makes sure that the file has the first `bytes` bytes of the data here.
     pub fn need(&mut self, bytes: u64) -> Result<(), FileError> {
-        let wanted = self.extent()?[0].saturating_add(bytes);
+        let wanted = self.extent()?[1].saturating_add(bytes);
         self.need_first(wanted)
     }
 
     /// Makes sure that the file has all data of the current header. The padding of the last block may be absent.
     pub fn need_all(&mut self) -> Result<(), FileError> {
-        let [start, end] = self.extent()?;
+        let [_, start, end] = self.extent()?;
         self.need_first((end + 1).saturating_sub(BLOCK as u64).max(start))
     }
 
     /// Makes sure that the file can have the first `bytes` bytes of the data here. A gzip file is unpacked later, when
     /// they are read.
     pub fn expect(&mut self, bytes: u64) -> Result<(), FileError> {
-        let wanted = self.extent()?[0].saturating_add(bytes);
+        let wanted = self.extent()?[1].saturating_add(bytes);
         if self.source.packed.is_some() {
             self.source.allow(wanted)
         } else {
@@ -579,6 +599,42 @@ impl File {
             self.reopen()?;
         }
         Ok(())
+    }
+
+    /// Refuses an image that differs from the checksums in its header (FITS standard 4.0, appendix J).
+    pub fn check_sums(&mut self) -> Result<(), FileError> {
+        let datasum = self.text("DATASUM");
+        // A program that changes the header of a plain image often keeps CHECKSUM: so does `writeto` of astropy 8.0. The
+        // header of a compressed image states how to decode it; astropy leaves out both keys, and fpack computes them.
+        let has_checksum = self.is_compressed()? && !self.text("CHECKSUM").is_empty();
+        if datasum.is_empty() && !has_checksum {
+            return Ok(());
+        }
+        self.need_all()?;
+        let [header, start, end] = self.extent()?;
+        let data = self.source.sum(start, end)?;
+        if !datasum.is_empty() && datasum.parse().ok().map(|sum: u64| sum % ONES) != Some(data) {
+            return Err(self.wrong_sum("DATASUM", data, &datasum));
+        }
+        if has_checksum {
+            // CHECKSUM makes the sum of all zero.
+            let all = (self.source.sum(header, start)? + data) % ONES;
+            if all != 0 {
+                return Err(self.wrong_sum("CHECKSUM", all, "0"));
+            }
+        }
+        Ok(())
+    }
+
+    fn wrong_sum(&self, key: &str, found: u64, expected: &str) -> FileError {
+        let image = match self.number_of_extension() {
+            0 => "the primary image".to_owned(),
+            number => format!("the image of extension {number}"),
+        };
+        self.fault(format!(
+            "{image} differs from its checksum {key} (found the sum {found}, expected {expected}): it is damaged, or a program changed it and kept the key. Try: another copy; or, if its pixels are right, fitscheck --write --force {}",
+            self.path().display()
+        ))
     }
 
     /// Bytes of the file on disk.

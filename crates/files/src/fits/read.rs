@@ -68,6 +68,8 @@ pub struct ImageReader {
     /// Whether this is the last image that is read, so that a gzip file must be complete after it.
     last: bool,
     next_row: usize,
+    /// Whether the checksums of the header were compared.
+    checked: bool,
     /// BITPIX of an uncompressed image: bits per pixel, negative for floats. `None` for a compressed one.
     bits: Option<c_int>,
 }
@@ -196,6 +198,7 @@ impl ImageReader {
             planes,
             last: dimensions == Dimensions::Two,
             next_row: 0,
+            checked: false,
             bits,
         })
     }
@@ -295,8 +298,12 @@ impl ImageReader {
         Ok(pixels)
     }
 
-    /// Makes sure that the first `rows` rows are there.
+    /// Makes sure that the first `rows` rows are there, and once that the image has its checksums.
     fn need(&mut self, rows: usize) -> Result<(), FileError> {
+        if !self.checked {
+            self.file.check_sums()?;
+            self.checked = true;
+        }
         match self.bits {
             Some(bits) => self.file.need((rows * self.width) as u64 * bytes_of(bits)),
             None => Ok(()),
