@@ -2,6 +2,7 @@
 
 pub mod great3;
 
+use std::io::{Read, Seek, SeekFrom};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -13,9 +14,9 @@ use shearq_dataset::layout::DataFolder;
 use shearq_dataset::run::{SIMULATION_FILE, SimulationRecord, claim};
 use shearq_dataset::threads::Progress;
 use shearq_dataset::truth;
-use shearq_files::atomic;
 use shearq_files::fits::{ImageReader, ImageWriter, Value};
-use shearq_simulate::kinds::SetKind;
+use shearq_files::{atomic, open};
+use shearq_simulate::kinds::{SetKind, Variability};
 use shearq_simulate::render::RenderScratch;
 use shearq_simulate::set::{
     ImageFields, NOISE_SIGMA, PsfField, STAMP, SetSimulator, SimulationSettings,
@@ -55,19 +56,31 @@ pub fn simulate_blind(
     let claim = claim(&path, record, &public.layout().galaxies)?;
     let side = record.settings.grid * STAMP;
     // The galaxies of an image are written last, so that their file shows that the image was completed.
-    let is_there = |id: &&ImageId| {
-        is_whole(&public.galaxies(id.set, id.image), side)
-            && ImageReader::open(public.psf_star(id.set, id.image)).is_ok()
-    };
-    let todo: Vec<ImageId> = images.iter().filter(|id| !is_there(id)).copied().collect();
-    let already = images.len() - todo.len();
     let mut simulators = Vec::new();
-    for of_set in todo.chunk_by(|a, b| a.set == b.set) {
-        let simulator = simulator(of_set[0].set, record.settings)?;
+    for of_set in images.chunk_by(|a, b| a.set == b.set) {
+        let set = of_set[0].set;
+        let simulator = simulator(set, record.settings)?;
+        let grid = simulator.grid();
+        let last = grid.centre(grid.n - 1, grid.n - 1);
+        let last_psf = match simulator.kind().psf {
+            Variability::Fixed => grid.centre(0, 0),
+            Variability::Variable => last,
+        };
+        let is_there = |&ImageId { image, .. }: &ImageId| {
+            is_whole(&public.galaxies(set, image), side)
+                && ImageReader::open(public.psf_star(set, image)).is_ok()
+                && is_whole_table(&public.psf_functional(set, image), last_psf)
+                && is_whole_table(&private.intrinsic(set, image), last)
+        };
+        let todo: Vec<ImageId> = (of_set.iter().filter(|id| !is_there(id)).copied()).collect();
         // Before the images: one whose truth is missing cannot be scored, and a complete image is not simulated again.
-        write_truth(private, &simulator)?;
-        simulators.push((simulator, of_set));
+        if !todo.is_empty() || !is_whole_table(&private.truth(set), last) {
+            write_truth(private, &simulator)?;
+        }
+        simulators.push((simulator, todo));
     }
+    let todo: usize = simulators.iter().map(|(_, todo)| todo.len()).sum();
+    let already = images.len() - todo;
     let mut made = 0;
     let mut open: Option<OpenImage<'_>> = None;
     engine::ordered(
@@ -116,9 +129,9 @@ struct Row<'s> {
     iy: usize,
 }
 
-fn feed<'s>(simulators: &'s [(SetSimulator, &[ImageId])], feeder: &mut Feeder<'_, Row<'s>>) {
+fn feed<'s>(simulators: &'s [(SetSimulator, Vec<ImageId>)], feeder: &mut Feeder<'_, Row<'s>>) {
     for (set, images) in simulators {
-        for id in *images {
+        for id in images {
             // Shared by the rows, because they are drawn from one realisation of PSFs and intrinsic shapes.
             let fields = Arc::new(set.image_fields(id.image));
             for iy in 0..set.grid().n {
@@ -134,6 +147,26 @@ fn feed<'s>(simulators: &'s [(SetSimulator, &[ImageId])], feeder: &mut Feeder<'_
 // An image that was cut off when a disk was full or a copy stopped has its name, but not its size.
 fn is_whole(path: &Path, side: usize) -> bool {
     ImageReader::open(path).is_ok_and(|image| (image.width(), image.height()) == (side, side))
+}
+
+// A table that was cut off lacks its last line, which starts with the position of the last galaxy.
+fn is_whole_table(path: &Path, (x, y): (f64, f64)) -> bool {
+    // More than a line has.
+    const TAIL_BYTES: u64 = 512;
+    let tail = || -> std::io::Result<Vec<u8>> {
+        let mut file = open::open(path)?;
+        let length = file.metadata()?.len();
+        file.seek(SeekFrom::Start(length.saturating_sub(TAIL_BYTES)))?;
+        let mut tail = Vec::new();
+        file.read_to_end(&mut tail)?;
+        Ok(tail)
+    };
+    let starts = |line: &[u8]| line.starts_with(format!("{x},{y},").as_bytes());
+    tail().is_ok_and(|tail| {
+        let lines = tail.strip_suffix(b"\n");
+        let last = lines.and_then(|lines| lines.rsplit(|byte| *byte == b'\n').next());
+        last.is_some_and(starts)
+    })
 }
 
 pub(super) fn write_truth(data: &DataFolder, set: &SetSimulator) -> Result<(), PipelineError> {
