@@ -224,7 +224,7 @@ fn mean_distortions_are_divided_by_the_responsivity() {
 }
 
 /// Rows of metadetect as its own examples write them: the sheared catalogue as text, the ellipticity as a vector of two, and an
-/// identifier above 2⁵³.
+/// identifier above 2⁵³. A text is no weight.
 #[test]
 fn vectors_texts_and_long_integers_are_read() {
     let folder = Folder::new();
@@ -236,7 +236,7 @@ fn vectors_texts_and_long_integers_are_read() {
         for (sheared, shear) in NAMES.into_iter().zip(SHEARS) {
             for (id, [own, _]) in (first..).zip(&base) {
                 let e = [0, 1].map(|j| own[j] + 0.8 * shear[j]);
-                bytes.extend(format!("{sheared:<7}").into_bytes());
+                bytes.extend(format!("{sheared:<7}map").into_bytes());
                 bytes.extend(id.to_be_bytes());
                 bytes.extend([e[0], e[1], g, g].into_iter().flat_map(f64::to_be_bytes));
                 writeln!(flat, "{sheared},{id},{},{},{g},{g}", e[0], e[1]).unwrap();
@@ -246,9 +246,9 @@ fn vectors_texts_and_long_integers_are_read() {
             }
         }
         folder.write(&format!("{name}.csv"), flat);
-        let mut cards = vec!["TFIELDS =                    5".to_owned()];
-        let formats = ["7A", "K", "2D", "D", "D"];
-        let columns = ["shear_type", "ID", "g", "g1", "g2"]
+        let mut cards = vec!["TFIELDS =                    6".to_owned()];
+        let formats = ["7A", "3A", "K", "2D", "D", "D"];
+        let columns = ["shear_type", "WEIGHT_IMAGE", "ID", "g", "g1", "g2"]
             .into_iter()
             .zip(formats);
         for (k, (column, format)) in (1..).zip(columns) {
@@ -256,13 +256,14 @@ fn vectors_texts_and_long_integers_are_read() {
             cards.push(format!("TFORM{k}  = '{format:<8}'"));
         }
         let cards: Vec<&str> = cards.iter().map(String::as_str).collect();
-        let sides = [7 + 8 + 4 * 8, ids.len()];
+        let sides = [7 + 3 + 8 + 4 * 8, ids.len()];
         let primary = crate::support::fits_image(8, &[], &[], &[]);
         let table = fits_extension("BINTABLE", 8, &sides, &cards, &bytes);
         folder.write(&format!("{name}.fits"), [primary, table].concat());
         let count = ids.len();
         let table = frame(vec![
             Column::new("mdet_step".into(), names),
+            Column::new("WEIGHT_IMAGE".into(), vec!["map"; count]),
             Column::new("id".into(), ids),
             Column::new("wmom_g".into(), vectors),
             Column::new("g1".into(), vec![g; count]),

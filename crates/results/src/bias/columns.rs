@@ -313,13 +313,15 @@ pub(super) fn counted_value(name: &str) -> Option<bool> {
     Some(known.1)
 }
 
-// Names of weights of shapes, in small letters and between underscores: lensfit's, inverse variances, and the coverage of
-// drizzled and coadded images (`AUTO_WHT`), which is a weight where nothing better is known.
-const WEIGHTS: &str = "*weight* *_w_* *_wt_* *_wgt_* *_wht_* *_ivar_* *_inv*var* *_inv*sig*2*";
+// Names of weights of shapes, in small letters and between underscores: lensfit's, sums of weights, inverse variances, and the
+// coverage of drizzled and coadded images (`AUTO_WHT`), which is a weight where nothing better is known.
+const WEIGHTS: &str = "*weight* *_w_* *_wt_* *_wgt_* *_wht_* *_wtot_* *_sumw_* *_wsum_* *_ivar_* *_inv*var* *_inv*sig*2* \
+    *_precision_*";
 // Columns of real catalogues with such names that are no weights of shapes: derivatives and sheared catalogues, SExtractor's
-// FLAGS_WEIGHT, weighted means, and the inverse variances of fluxes, positions and profiles in the Legacy Surveys.
-const NO_WEIGHTS: &str = "*_dg1_ *_dg2_ *_1p_ *_1m_ *_2p_ *_2m_ *flag* *mask* *weighted* *psf* *_star_* *flux* *_mag_* \
-    *redshift* *photoz* *photo_z* *_ra_* *_dec_* *pmra_* *pmdec_* *parallax* *sersic* *_shape_r_* *_z_ivar_*";
+// FLAGS_WEIGHT, weighted means, numbers of weights, the dark energy w₀ of a mock catalogue, and the inverse variances of fluxes,
+// positions, redshifts and profiles, as in the Legacy Surveys. Weights by redshift are weights of galaxies in a mean shear.
+const NO_WEIGHTS: &str = "*_dg1_ *_dg2_ *_1p_ *_1m_ *_2p_ *_2m_ *flag* *mask* *weighted* _n_* _w_0_ *psf* *_star_* *flux* \
+    *_mag_* *redshift*var* *photoz*var* *photo_z*var* *_ra_* *_dec_* *pmra_* *pmdec_* *parallax* *sersic* *_shape_r_* *_z_ivar_*";
 
 /// Whether the name of a column suggests that it is a weight of shapes.
 pub(crate) fn looks_like_weight(name: &str) -> bool {
@@ -1001,12 +1003,12 @@ mod tests {
     fn weights_of_shapes_are_recognised_by_their_names() {
         let weights = "weight_lensfit ivar inverse_variance AUTO_WHT weightsum wht_sum weight_map WEIGHT_IMAGE my_weight wht \
             w_iv w_des wt_a recal_weight_A SHE_LENSMC_WEIGHT invVar shape_e1_ivar ivar_e1 wgt lensWeight ivar[0] w.lens w-lens \
-            inv_sigma2";
+            inv_sigma2 wtot sumw sum_w precision shape_precision photoz_weight weight_redshift w[0]";
         for name in weights.split_whitespace() {
             assert!(looks_like_weight(name), "{name}");
         }
         let others = "FLAGS_WEIGHT weight_mask weighted_x psf_weight star_weight flux_ivar_g fiberflux_ivar ra_ivar dec_ivar \
-            pmra_ivar shape_r_ivar sersic_ivar z_ivar mag_weight weight_1p w_dg1 w1mpro W2 wmom_g_1 wdm_r f814w_flux width";
+            pmra_ivar shape_r_ivar sersic_ivar z_ivar mag_weight weight_1p w_dg1 w1mpro W2 wmom_g_1 wdm_r f814w_flux width n_weight w_0 photoz_ivar";
         for name in others.split_whitespace() {
             assert!(!looks_like_weight(name), "{name}");
         }

@@ -225,11 +225,16 @@ impl<'a> TableRows<'a> {
         let (path, places) = (&source.place.path, &source.places);
         let truth = OfRows::new(catalogue, places, &reading.truth)?;
         let mut columns = Vec::new();
-        for wanted in &source.wanted {
+        let doubtful = places.all((Role::DoubtfulWeight, 0));
+        for (place, wanted) in source.wanted.iter().enumerate() {
             let is_text = wanted.pattern.is_none() && source.is_text(reading, &wanted.column);
-            columns.push(match is_text {
-                true => Cow::Borrowed(&[][..]),
-                false => operand_values(frame, wanted, path)?,
+            columns.push(match doubtful.contains(&place) {
+                // Texts are no weights: `WEIGHT_IMAGE` may have names of files.
+                true if texts_of(frame, &wanted.column).is_some() => {
+                    Cow::Owned(vec![1.0; frame.height()])
+                }
+                false if is_text => Cow::Borrowed(&[][..]),
+                _ => operand_values(frame, wanted, path)?,
             });
         }
         refuse_sheared_rows(frame, &source.columns, path)?;
