@@ -9,16 +9,18 @@ mod read;
 mod source;
 pub mod truth;
 
-use std::collections::{HashMap, HashSet};
+use std::collections::{BTreeSet, HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 use shearq_bias::{
     BiasError, Catalogue, Design, Estimate, Grouping, Layout, Range, UnitSums, difference, group,
 };
-use shearq_dataset::fingerprint::GALAXIES;
+use shearq_dataset::fingerprint::{GALAXIES, verify_source};
 use shearq_dataset::layout::stated_sign;
 use shearq_dataset::metadata::{CATALOGUE_FRAME, CommonAxes, axes_of};
+use shearq_dataset::run::Run;
+use shearq_dataset::threads::ALL_CORES;
 use shearq_dataset::truth::{Sign, SignBasis, word};
 use shearq_files::FileError;
 use shearq_files::frames::polars::DataFrame;
@@ -300,6 +302,7 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
     let (frame, images) = frame_and_images(&all)?;
     let named = request.catalogues.iter().zip(&images);
     distinct_images(named.map(|(input, image)| (input.name.display().to_string(), image)))?;
+    verify_data(&request.truth)?;
     let edges = match &request.bins {
         None => Vec::new(),
         Some(bins) => match &bins.edges {
@@ -508,6 +511,19 @@ fn distinct_images<'c>(
         {
             return Err(BiasFailure::SameImage { first, second });
         }
+    }
+    Ok(())
+}
+
+// Refuses catalogues that were measured on other images or another true shear than their data have now.
+fn verify_data(truth: &Truth) -> Result<(), FileError> {
+    let Truth::Data(catalogues) = truth else {
+        return Ok(());
+    };
+    // A catalogue is in the folder of its set.
+    let folders = catalogues.keys().filter_map(|path| path.ancestors().nth(2));
+    for folder in folders.collect::<BTreeSet<_>>() {
+        verify_source(folder, &Run::require(folder)?, &[], ALL_CORES)?;
     }
     Ok(())
 }
