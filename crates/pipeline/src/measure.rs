@@ -191,7 +191,7 @@ impl<'a> FolderMeasurement<'a> {
             let mut sources = open_epochs(self.data, &ids, measurer)?;
             let mut sessions = Vec::new();
             for (id, source) in ids.iter().zip(&mut sources) {
-                self.check_side(*id, source.image.mosaic(), measurer)?;
+                self.check_side(*id, source.mosaic(), measurer)?;
                 sessions.push(source.session(measurer, feeder.ahead())?);
             }
             let first = sessions.remove(0);
@@ -199,23 +199,20 @@ impl<'a> FolderMeasurement<'a> {
             let differs = sessions.iter().position(|one| one.frame() != first.frame());
             let odd = differs.map_or(0, |at| at + 1);
             let first = first.with_epochs(sessions);
-            let first = first.map_err(|error| sources[odd].image.named(error.into()))?;
+            let first = first.map_err(|error| sources[odd].named(error.into()))?;
             let correlated = match k {
-                0 => sources[0].image.correlated_noise(&first, feeder.ahead())?,
+                0 => sources[0].correlated_noise(&first, feeder.ahead())?,
                 _ => None,
             };
             let first = Arc::new(first);
-            let mosaic = sources[0].image.mosaic();
+            let mosaic = sources[0].mosaic();
             let head = Arc::new(ImageHead {
                 id,
                 mosaic,
                 run_warnings: correlated.into_iter().collect(),
-                table: sources[0].image.table.take(),
-                epochs: sources
-                    .iter()
-                    .map(|source| source.image.path.clone())
-                    .collect(),
-                aligned: sources.iter().all(|source| source.image.aligned),
+                table: sources[0].table.take(),
+                epochs: sources.iter().map(|source| source.path.clone()).collect(),
+                aligned: sources.iter().all(|source| source.aligned),
                 prints,
             });
             let (own, others) = sources.split_first_mut().expect("a set has an image");

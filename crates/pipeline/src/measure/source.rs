@@ -27,7 +27,7 @@ use shearq_dataset::layout::{DataFolder, Layout, MAX_STAMP, fill};
 // Several rows are in memory at a time: at most 64 MB of pixels each. Chosen by hand.
 const MAX_ROW_PIXELS: usize = 1 << 24;
 
-/// An open image with its PSFs.
+/// An open image with its PSFs. Further epochs are read in the order of the galaxies of the first.
 pub struct ImageSource {
     pub(super) path: PathBuf,
     mosaic: Mosaic,
@@ -39,6 +39,12 @@ pub struct ImageSource {
     gain: Option<f64>,
     pub(super) aligned: bool,
     warnings: Vec<Warning>,
+    rows: StampRows,
+    /// The stamp of each galaxy, if it has one.
+    tiles: Vec<Option<usize>>,
+    /// Of the galaxies; `None` of a single image, which is measured where its galaxies are.
+    offsets: Option<Vec<[f64; 2]>>,
+    has_common_flux: bool,
 }
 
 impl fmt::Debug for ImageSource {
@@ -129,6 +135,14 @@ impl ImageSource {
             jacobians,
             aligned,
             warnings,
+            rows: StampRows {
+                columns: mosaic.columns,
+                count: mosaic.galaxies,
+            },
+            tiles: (0..mosaic.galaxies).map(Some).collect(),
+            offsets: None,
+            // Exposures of a survey may have a zero point each.
+            has_common_flux: data.layout().great3.is_some(),
         })
     }
 
@@ -142,7 +156,12 @@ impl ImageSource {
         measurer: &Measurer,
         threads: &impl Threads,
     ) -> Result<Session<'static>, PipelineError> {
-        let noise = std::mem::take(&mut self.noise);
+        let noise = match std::mem::take(&mut self.noise) {
+            KnownNoise::StatedEach(levels) => {
+                KnownNoise::StatedEach(ordered(&self.tiles, &levels).into())
+            }
+            other => other,
+        };
         let session = Session::open(measurer, self, noise, threads);
         session.map_err(|error| self.named(error))
     }
@@ -163,12 +182,17 @@ impl ImageSource {
             other => other,
         }
     }
-}
 
-fn stamp_rows(mosaic: Mosaic) -> StampRows {
-    StampRows {
-        columns: mosaic.columns,
-        count: mosaic.galaxies,
+    fn tiles(&self, row: usize) -> &[Option<usize>] {
+        &self.tiles[self.rows.stamps(row)]
+    }
+
+    /// Whether a row of galaxies is the same row of the image.
+    fn is_whole(&self, row: usize) -> bool {
+        let columns = self.mosaic.columns;
+        let first = row * columns;
+        let mut here = self.tiles(row).iter().enumerate();
+        columns == self.rows.columns && here.all(|(k, tile)| *tile == Some(first + k))
     }
 }
 
@@ -176,28 +200,55 @@ impl StampSource<'static> for ImageSource {
     type Error = PipelineError;
 
     fn rows(&self) -> StampRows {
-        stamp_rows(self.mosaic)
+        self.rows
     }
 
     fn warnings(&self) -> Vec<Warning> {
         self.warnings.clone()
     }
 
+    fn stamps(&mut self, row: usize) -> Result<LazyStamps<'static>, PipelineError> {
+        let Mosaic { columns, stamp, .. } = self.mosaic;
+        if self.is_whole(row) {
+            return Ok(read_row(&mut self.image, self.mosaic, stamp, row)?.into());
+        }
+        let tiles = &self.tiles[self.rows.stamps(row)];
+        Ok(squares(&mut self.image, (columns, stamp), tiles, f64::NAN)?.into())
+    }
+
+    fn psfs(&mut self, row: usize) -> Result<Lazy<'static, Psfs<'static>>, PipelineError> {
+        let is_whole = self.is_whole(row);
+        let tiles = &self.tiles[self.rows.stamps(row)];
+        Ok(match &mut self.psfs {
+            // Whole rows, which are faster than squares.
+            PsfSource::Stars { image, side } if is_whole => {
+                Psfs::Stars(read_row(image, self.mosaic, *side, row)?)
+            }
+            psfs => psfs.of_tiles(self.mosaic.columns, tiles)?,
+        }
+        .into())
+    }
+
     fn jacobians(&mut self, row: usize) -> Result<Option<Vec<Jacobian>>, PipelineError> {
-        let range = self.rows().stamps(row);
-        Ok(self.jacobians.as_ref().map(|all| all[range].to_vec()))
+        let tiles = self.tiles(row);
+        let all = self.jacobians.as_ref();
+        Ok(all.map(|all| {
+            let of = |tile: &Option<usize>| all[tile.unwrap_or(0)];
+            tiles.iter().map(of).collect()
+        }))
+    }
+
+    fn offsets(&mut self, row: usize) -> Result<Option<Vec<[f64; 2]>>, PipelineError> {
+        let all = self.offsets.as_ref();
+        Ok(all.map(|all| all[self.rows.stamps(row)].to_vec()))
     }
 
     fn gain(&self) -> Option<f64> {
         self.gain
     }
 
-    fn stamps(&mut self, row: usize) -> Result<LazyStamps<'static>, PipelineError> {
-        Ok(read_row(&mut self.image, self.mosaic, self.mosaic.stamp, row)?.into())
-    }
-
-    fn psfs(&mut self, row: usize) -> Result<Lazy<'static, Psfs<'static>>, PipelineError> {
-        Ok(self.psfs.row(self.mosaic, row)?.into())
+    fn has_common_flux(&self) -> bool {
+        self.has_common_flux
     }
 }
 
@@ -248,18 +299,6 @@ enum PsfSource {
 }
 
 impl PsfSource {
-    fn row(&mut self, mosaic: Mosaic, row: usize) -> Result<Psfs<'static>, PipelineError> {
-        Ok(match self {
-            // Whole rows, which are faster than squares.
-            PsfSource::Stars { image, side } => Psfs::Stars(read_row(image, mosaic, *side, row)?),
-            PsfSource::Shared(_) | PsfSource::Cube { .. } | PsfSource::Functional(_) => {
-                let first = row * mosaic.columns;
-                let tiles: Vec<_> = (first..first + mosaic.of_row(row)).map(Some).collect();
-                self.of_tiles(mosaic.columns, &tiles)?
-            }
-        })
-    }
-
     /// PSFs of these stamps, of rows of `columns`; any of a galaxy without a stamp.
     fn of_tiles(
         &mut self,
@@ -580,59 +619,36 @@ const SAME_GALAXY_ARCSEC: f64 = 0.5;
 // Distance from which places of one identity are two galaxies. Chosen by hand.
 const OTHER_GALAXY_ARCSEC: f64 = 3.0;
 
-/// An image whose stamps are read in the order of the galaxies of the first epoch.
-pub(super) struct EpochSource {
-    pub(super) image: ImageSource,
-    rows: StampRows,
-    /// The stamp of each galaxy, if it has one.
-    tiles: Vec<Option<usize>>,
-    /// `None` of a single image, which is measured where its galaxies are.
-    offsets: Option<Vec<[f64; 2]>>,
-    is_great3: bool,
-}
-
 /// Opens an image, or those of several epochs.
 pub(super) fn open_epochs(
     data: &DataFolder,
     ids: &[ImageId],
     measurer: &Measurer,
-) -> Result<Vec<EpochSource>, PipelineError> {
-    let mut sources: Vec<EpochSource> = Vec::new();
+) -> Result<Vec<ImageSource>, PipelineError> {
+    let mut sources: Vec<ImageSource> = Vec::new();
     let mut first: Option<(ImageId, Galaxies)> = None;
     let most = measurer.max_epoch_offset();
     for &id in ids {
-        let image = ImageSource::open(data, id, measurer.configuration())?;
-        let (path, mosaic) = (data.stamps(id.set, id.image), image.mosaic());
+        let mut source = ImageSource::open(data, id, measurer.configuration())?;
         if ids.len() == 1 {
-            return Ok(vec![EpochSource {
-                rows: stamp_rows(mosaic),
-                offsets: None,
-                tiles: (0..mosaic.galaxies).map(Some).collect(),
-                image,
-                is_great3: false,
-            }]);
+            return Ok(vec![source]);
         }
-        let galaxies = Galaxies::read(&path, image.table.as_ref())?;
-        let tiles = match &first {
-            None => (0..mosaic.galaxies).map(Some).collect(),
-            Some((of, first)) => first.find_in(*of, &galaxies, &path)?,
-        };
-        let offsets = match (data.layout().great3, &image.table) {
+        let path = data.stamps(id.set, id.image);
+        let galaxies = Galaxies::read(&path, source.table.as_ref())?;
+        if let Some((of, first)) = &first {
+            source.tiles = first.find_in(*of, &galaxies, &path)?;
+            source.rows = sources[0].rows;
+        }
+        let offsets = match (data.layout().great3, &source.table) {
             (Some(_), _) => Some(vec![
                 great3::dither(data.root(), id.set, id.image, most)?;
-                mosaic.galaxies
+                source.mosaic.galaxies
             ]),
-            (None, Some(table)) => offsets(table, &path, mosaic.stamp)?,
+            (None, Some(table)) => offsets(table, &path, source.mosaic.stamp)?,
             (None, None) => None,
         };
-        let mosaic = sources.first().map_or(mosaic, |first| first.image.mosaic());
-        sources.push(EpochSource {
-            rows: stamp_rows(mosaic),
-            offsets: Some(ordered(&tiles, offsets.as_deref().unwrap_or(&[]))),
-            tiles,
-            image,
-            is_great3: data.layout().great3.is_some(),
-        });
+        source.offsets = Some(ordered(&source.tiles, offsets.as_deref().unwrap_or(&[])));
+        sources.push(source);
         first.get_or_insert((id, galaxies));
     }
     Ok(sources)
@@ -800,89 +816,6 @@ fn by_place(sky: &[Vec<f64>; 2], others: &[Vec<f64>; 2]) -> Result<Vec<Option<us
         }
     };
     (0..sky[0].len()).map(find).collect()
-}
-
-impl EpochSource {
-    /// The session of the image, for a measurer of the configuration that it was opened for.
-    pub(super) fn session(
-        &mut self,
-        measurer: &Measurer,
-        threads: &impl Threads,
-    ) -> Result<Session<'static>, PipelineError> {
-        let noise = match std::mem::take(&mut self.image.noise) {
-            KnownNoise::StatedEach(levels) => {
-                KnownNoise::StatedEach(ordered(&self.tiles, &levels).into())
-            }
-            other => other,
-        };
-        let session = Session::open(measurer, self, noise, threads);
-        session.map_err(|error| self.image.named(error))
-    }
-
-    fn tiles(&self, row: usize) -> &[Option<usize>] {
-        &self.tiles[self.rows.stamps(row)]
-    }
-
-    /// Whether a row of galaxies is the same row of the image.
-    fn is_whole(&self, row: usize) -> bool {
-        let Mosaic { columns, .. } = self.image.mosaic();
-        let first = row * columns;
-        let mut here = self.tiles(row).iter().enumerate();
-        columns == self.rows.columns && here.all(|(k, tile)| *tile == Some(first + k))
-    }
-}
-
-impl StampSource<'static> for EpochSource {
-    type Error = PipelineError;
-
-    fn rows(&self) -> StampRows {
-        self.rows
-    }
-
-    fn warnings(&self) -> Vec<Warning> {
-        self.image.warnings()
-    }
-
-    fn stamps(&mut self, row: usize) -> Result<LazyStamps<'static>, PipelineError> {
-        if self.is_whole(row) {
-            return self.image.stamps(row);
-        }
-        let Mosaic { columns, stamp, .. } = self.image.mosaic();
-        let tiles = self.tiles[self.rows.stamps(row)].to_vec();
-        Ok(squares(&mut self.image.image, (columns, stamp), &tiles, f64::NAN)?.into())
-    }
-
-    fn psfs(&mut self, row: usize) -> Result<Lazy<'static, Psfs<'static>>, PipelineError> {
-        if self.is_whole(row) {
-            return self.image.psfs(row);
-        }
-        let columns = self.image.mosaic().columns;
-        let tiles = self.tiles[self.rows.stamps(row)].to_vec();
-        Ok(self.image.psfs.of_tiles(columns, &tiles)?.into())
-    }
-
-    fn jacobians(&mut self, row: usize) -> Result<Option<Vec<Jacobian>>, PipelineError> {
-        let tiles = self.tiles(row);
-        let all = self.image.jacobians.as_ref();
-        Ok(all.map(|all| {
-            let of = |tile: &Option<usize>| all[tile.unwrap_or(0)];
-            tiles.iter().map(of).collect()
-        }))
-    }
-
-    fn offsets(&mut self, row: usize) -> Result<Option<Vec<[f64; 2]>>, PipelineError> {
-        let all = self.offsets.as_ref();
-        Ok(all.map(|all| all[self.rows.stamps(row)].to_vec()))
-    }
-
-    fn gain(&self) -> Option<f64> {
-        self.image.gain()
-    }
-
-    // Exposures of a survey may have a zero point each.
-    fn has_common_flux(&self) -> bool {
-        self.is_great3
-    }
 }
 
 #[cfg(test)]
