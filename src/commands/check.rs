@@ -7,10 +7,10 @@ use shearq_scoring::Grid;
 
 use crate::{Findings, count, print, tell_unread};
 use shearq_dataset::grid;
-use shearq_dataset::layout::{DataFolder, Layout, MAX_IMAGE, read_rows};
+use shearq_dataset::layout::{DataFolder, Layout, MAX_IMAGE};
 use shearq_dataset::truth::grid_of_set;
 use shearq_files::table::{MAX_ROWS, read_truth};
-use shearq_results::catalogues::COLUMNS;
+use shearq_results::catalogues::read_rows;
 use shearq_results::published::PublicChallenge;
 use shearq_results::submit::check::{Expected, Finding, Severity, check_sent};
 use shearq_results::submit::{Kind, Sent};
@@ -129,7 +129,7 @@ fn reach(sent: &Sent, stamp: f64) -> Option<usize> {
     let first = files
         .iter()
         .find(|file| !matches!(Kind::of(file), Some(Kind::Spectrum { .. })))?;
-    let rows = read_rows(first, &COLUMNS, MAX_ROWS).ok()?;
+    let rows = read_rows(first, MAX_ROWS).ok()?;
     let last = rows.iter().map(|row| row.x.max(row.y)).fold(0.0, f64::max);
     let side = ((last - 0.5) / stamp).ceil() as usize;
     // A wrong position must not enlarge the grid.

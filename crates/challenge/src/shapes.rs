@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use shearq_dataset::fingerprint::Fingerprint;
 use shearq_dataset::images::ImageId;
-use shearq_dataset::layout::{DataFolder, read_rows};
+use shearq_dataset::layout::DataFolder;
 use shearq_dataset::run::{Run, Source};
 use shearq_dataset::threads::{Progress, Quiet};
 use shearq_files::FileError;
@@ -17,7 +17,7 @@ use shearq_files::open::is_there;
 use shearq_files::table::{self, FileFormat, most_rows};
 use shearq_pipeline::PipelineError;
 use shearq_pipeline::measure::measure_folder;
-use shearq_results::catalogues::COLUMNS;
+use shearq_results::catalogues::read_rows;
 use shearq_results::response::response_of;
 use shearq_results::submit::check::{Finding, Severity};
 use shearq_results::submit::{Kind, Sent};
@@ -269,7 +269,7 @@ impl References {
     }
 
     fn read(&self, path: &Path) -> Result<FieldSum, FileError> {
-        let rows = read_rows(path, &COLUMNS, most_rows(self.grid.cells()))?;
+        let rows = read_rows(path, most_rows(self.grid.cells()))?;
         let mut sum = FieldSum::new(&self.grid);
         sum.add_image(&self.grid, rows);
         Ok(sum)

@@ -110,35 +110,12 @@ pub fn of_image(data: &DataFolder, path: &Path, image: &ImageReader) -> Result<M
     Ok(mosaic)
 }
 
-fn square(data: &DataFolder, path: &Path, mosaic: &Mosaic) -> Result<Grid, FileError> {
-    let (n, rows) = (mosaic.columns, mosaic.rows());
-    // Modes are Fourier transforms on a square grid.
-    if mosaic.galaxies != n * n {
-        let message = format!(
-            "there are {} stamps in {rows} rows of {n}; scoring expects as many rows as columns, all of them full",
-            mosaic.galaxies
-        );
-        return Err(FileError::new(path, message));
-    }
-    let field = Degrees(data.layout().field_degrees);
-    Grid::new(n, Pixels(mosaic.stamp as f64), field).map_err(|error| FileError::new(path, error))
-}
-
 /// Pixels a side of the stamps of a set, from its first image, or from the layout without images.
 pub fn stamp_of_set(data: &DataFolder, set: u32) -> Result<usize, FileError> {
     match data.images(&[set])?.of_set(set).first() {
         Some((_, path)) => stamp_of_image(data, path, &ImageReader::open(path)?),
         None => Ok(data.layout().stamp),
     }
-}
-
-pub(crate) fn of_first_image(data: &DataFolder, set: u32) -> Result<Option<Grid>, FileError> {
-    let images = data.images(&[set])?.of_set(set);
-    let first = images.first().map(|(_, path)| {
-        let image = ImageReader::open(path)?;
-        square(data, path, &of_image(data, path, &image)?)
-    });
-    first.transpose()
 }
 
 /// Grid of a catalogue of shearq, which has a row for every cell at its centre.

@@ -3,10 +3,9 @@
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
-use shearq_files::frames::polars::DataFrame;
 use shearq_files::open::is_there;
-use shearq_files::{FileError, open, table};
-use shearq_scoring::{Grid, Row, TrueShear, TruthSign};
+use shearq_files::{FileError, open};
+use shearq_scoring::{Grid, TruthSign};
 
 use crate::images::Files;
 use crate::{great3, images};
@@ -318,89 +317,6 @@ impl DataFolder {
         }
         Ok(truths.sets())
     }
-
-    pub fn read_truth(&self, set: u32, grid: &Grid) -> Result<TrueShear, FileError> {
-        let path = self.truth(set);
-        truth_is_there(&path)?;
-        let table = table::read_truth(&path, table::most_rows(grid.cells()))?;
-        let rows = truth_rows(&path, &table)?;
-        TrueShear::from_rows(grid, self.truth_sign(set)?, rows)
-            .map_err(|error| FileError::new(&path, error))
-    }
-
-    /// Sign of g2 in the truth of a set: the one that the file states, or else the layout's.
-    pub fn truth_sign(&self, set: u32) -> Result<TruthSign, FileError> {
-        let (path, layout) = (self.truth(set), self.layout.truth_sign);
-        match stated_sign(&path)? {
-            Some(TruthSign::Standard) if layout == TruthSign::Challenge => {
-                let message = format!(
-                    "the file states `{SIGN_KEY}: standard`, but `truth_sign` in {LAYOUT_FILE} is `challenge`; remove the wrong one"
-                );
-                Err(FileError::new(&path, message))
-            }
-            // A file of the standard sign in a folder of the challenge's is the only contradiction: the layout's default is no statement.
-            stated => Ok(stated.unwrap_or(layout)),
-        }
-    }
-}
-
-pub fn truth_is_there(path: &Path) -> Result<(), FileError> {
-    if is_there(path) {
-        return Ok(());
-    }
-    let message = "there is no true shear to score against. Try: shearq mean --measured OUT, for the mean shear of images of your own";
-    Err(FileError::new(path, message))
-}
-
-/// Key under which a truth file states the sign of its g2: `standard` or `challenge`.
-pub const SIGN_KEY: &str = "g2sign";
-
-/// The sign of g2, if a truth file states it.
-pub fn stated_sign(path: &Path) -> Result<Option<TruthSign>, FileError> {
-    match table::stated(path, SIGN_KEY)?.as_deref() {
-        None => Ok(None),
-        Some("standard") => Ok(Some(TruthSign::Standard)),
-        Some("challenge") => Ok(Some(TruthSign::Challenge)),
-        Some(other) => {
-            let message = format!("{SIGN_KEY} is `{other}`; expected `standard` or `challenge`");
-            Err(FileError::new(path, message))
-        }
-    }
-}
-
-/// Rows (x, y, g1, g2) of the table of a truth file. Each row is made when it is needed: all rows of the largest grid
-/// are 512 MB.
-pub fn truth_rows<'t>(
-    path: &Path,
-    table: &'t DataFrame,
-) -> Result<impl ExactSizeIterator<Item = Row> + use<'t>, FileError> {
-    rows_of(path, table, &table::TRUTH_COLUMNS)
-}
-
-/// Where to name other columns of catalogues that are scored.
-pub const HINT_OF_COLUMNS: &str = "`score --columns` (names, or numbers such as 2,3,4,5) or a description (--foreign) names others";
-
-/// Rows of a catalogue, at most `most`, from four named columns.
-pub fn read_rows(path: &Path, names: &[&str; 4], most: usize) -> Result<Vec<Row>, FileError> {
-    let table = table::read(path, Some(names), most);
-    let table = table.map_err(|error| error.hint_of_columns(HINT_OF_COLUMNS))?;
-    Ok(rows_of(path, &table, names)?.collect())
-}
-
-fn rows_of<'t>(
-    path: &Path,
-    table: &'t DataFrame,
-    names: &[&str; 4],
-) -> Result<impl ExactSizeIterator<Item = Row> + use<'t>, FileError> {
-    let column = |name: &str| table::numbers(table, name, path);
-    let (x, y) = (column(names[0])?, column(names[1])?);
-    let (e1, e2) = (column(names[2])?, column(names[3])?);
-    Ok((0..x.len()).map(move |k| Row {
-        x: x[k],
-        y: y[k],
-        e1: e1[k],
-        e2: e2[k],
-    }))
 }
 
 #[cfg(test)]

@@ -1,4 +1,4 @@
-//! The true shear of sets.
+//! The true shear of sets, the sign of its g2 and its grid.
 
 use std::path::Path;
 
@@ -7,9 +7,15 @@ use shearq_quantities::units::{Degrees, Pixels};
 use shearq_scoring::{Grid, Row, TrueShear, TruthSign, sign_by_modes};
 
 use crate::grid;
-use crate::layout::{DataFolder, SIGN_KEY, stated_sign, truth_is_there, truth_rows};
-use shearq_files::table::{self, MAX_ROWS};
+use crate::layout::{DataFolder, LAYOUT_FILE};
+use shearq_files::fits::ImageReader;
+use shearq_files::frames::polars::DataFrame;
+use shearq_files::open::is_there;
+use shearq_files::table::{self, MAX_ROWS, TRUTH_COLUMNS};
 use shearq_files::{FileError, atomic};
+
+/// Key under which a truth file states the sign of its g2: `standard` or `challenge`.
+const SIGN_KEY: &str = "g2sign";
 
 #[derive(Debug, Clone, Copy)]
 pub struct Reading {
@@ -108,6 +114,19 @@ impl Sign {
     }
 }
 
+/// The sign of g2, if a truth file states it.
+pub fn stated_sign(path: &Path) -> Result<Option<TruthSign>, FileError> {
+    match table::stated(path, SIGN_KEY)?.as_deref() {
+        None => Ok(None),
+        Some("standard") => Ok(Some(TruthSign::Standard)),
+        Some("challenge") => Ok(Some(TruthSign::Challenge)),
+        Some(other) => {
+            let message = format!("{SIGN_KEY} is `{other}`; expected `standard` or `challenge`");
+            Err(FileError::new(path, message))
+        }
+    }
+}
+
 pub fn word(sign: TruthSign) -> &'static str {
     match sign {
         TruthSign::Standard => "standard",
@@ -147,10 +166,25 @@ pub struct ReadTruth {
     pub sign: Option<Sign>,
 }
 
+// Rows (x, y, g1, g2). Each is made when it is needed: all rows of the largest grid are 512 MB.
+fn rows_of<'t>(
+    path: &Path,
+    table: &'t DataFrame,
+) -> Result<impl ExactSizeIterator<Item = Row> + use<'t>, FileError> {
+    let [x, y, g1, g2] = TRUTH_COLUMNS.map(|name| table::numbers(table, name, path));
+    let (x, y, g1, g2) = (x?, y?, g1?, g2?);
+    Ok((0..x.len()).map(move |k| Row {
+        x: x[k],
+        y: y[k],
+        e1: g1[k],
+        e2: g2[k],
+    }))
+}
+
 /// The true shear of a file on its grid, whose side is the square root of the number of rows.
 pub fn read_truth(truth: &Path, reading: &Reading) -> Result<ReadTruth, FileError> {
     let table = table::read_truth(truth, MAX_ROWS)?;
-    let rows = truth_rows(truth, &table)?;
+    let rows = rows_of(truth, &table)?;
     let side = grid::side(truth, rows.len())?;
     let bad = |error: shearq_scoring::ScoringError| FileError::new(truth, error);
     let grid = Grid::new(side, reading.stamp, reading.field).map_err(bad)?;
@@ -184,6 +218,40 @@ pub fn write_truth(path: &Path, grid: &Grid, truth: &TrueShear) -> Result<(), Fi
     atomic::write(path, text.as_bytes())
 }
 
+pub fn truth_is_there(path: &Path) -> Result<(), FileError> {
+    if is_there(path) {
+        return Ok(());
+    }
+    let message = "there is no true shear to score against. Try: shearq mean --measured OUT, for the mean shear of images of your own";
+    Err(FileError::new(path, message))
+}
+
+impl DataFolder {
+    /// The true shear of a set on a known grid.
+    pub fn read_truth(&self, set: u32, grid: &Grid) -> Result<TrueShear, FileError> {
+        let path = self.truth(set);
+        truth_is_there(&path)?;
+        let table = table::read_truth(&path, table::most_rows(grid.cells()))?;
+        TrueShear::from_rows(grid, self.truth_sign(set)?, rows_of(&path, &table)?)
+            .map_err(|error| FileError::new(&path, error))
+    }
+
+    /// Sign of g2 in the truth of a set: the one that the file states, or else the layout's.
+    pub fn truth_sign(&self, set: u32) -> Result<TruthSign, FileError> {
+        let (path, layout) = (self.truth(set), self.layout().truth_sign);
+        match stated_sign(&path)? {
+            Some(TruthSign::Standard) if layout == TruthSign::Challenge => {
+                let message = format!(
+                    "the file states `{SIGN_KEY}: standard`, but `truth_sign` in {LAYOUT_FILE} is `challenge`; remove the wrong one"
+                );
+                Err(FileError::new(&path, message))
+            }
+            // A file of the standard sign in a folder of the challenge's is the only contradiction: the layout's default is no statement.
+            stated => Ok(stated.unwrap_or(layout)),
+        }
+    }
+}
+
 /// How the truth of a set of a data folder is to be read.
 pub fn reading_of(data: &DataFolder, set: u32) -> Result<Reading, FileError> {
     truth_is_there(&data.truth(set))?;
@@ -196,8 +264,20 @@ pub fn reading_of(data: &DataFolder, set: u32) -> Result<Reading, FileError> {
 
 /// Grid of a set, from its first image, or from its true shear without images.
 pub fn grid_of_set(data: &DataFolder, set: u32) -> Result<Grid, FileError> {
-    match grid::of_first_image(data, set)? {
-        Some(grid) => Ok(grid),
-        None => Ok(read_truth(&data.truth(set), &reading_of(data, set)?)?.grid),
+    let images = data.images(&[set])?.of_set(set);
+    let Some((_, path)) = images.first() else {
+        return Ok(read_truth(&data.truth(set), &reading_of(data, set)?)?.grid);
+    };
+    let mosaic = grid::of_image(data, path, &ImageReader::open(path)?)?;
+    let (n, rows) = (mosaic.columns, mosaic.rows());
+    // Modes are Fourier transforms on a square grid.
+    if mosaic.galaxies != n * n {
+        let message = format!(
+            "there are {} stamps in {rows} rows of {n}; scoring expects as many rows as columns, all of them full",
+            mosaic.galaxies
+        );
+        return Err(FileError::new(path, message));
     }
+    let field = Degrees(data.layout().field_degrees);
+    Grid::new(n, Pixels(mosaic.stamp as f64), field).map_err(|error| FileError::new(path, error))
 }

@@ -17,11 +17,10 @@ use shearq_bias::{
     BiasError, Catalogue, Design, Estimate, Grouping, Layout, Range, UnitSums, difference, group,
 };
 use shearq_dataset::fingerprint::{GALAXIES, verify_source};
-use shearq_dataset::layout::stated_sign;
 use shearq_dataset::metadata::{CATALOGUE_FRAME, CommonAxes, axes_of};
 use shearq_dataset::run::Run;
 use shearq_dataset::threads::ALL_CORES;
-use shearq_dataset::truth::{Sign, SignBasis, word};
+use shearq_dataset::truth::{Sign, SignBasis, stated_sign, word};
 use shearq_files::FileError;
 use shearq_files::frames::polars::DataFrame;
 use shearq_files::table::{self, FileFormat};

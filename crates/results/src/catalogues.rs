@@ -5,13 +5,14 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use shearq_dataset::images::Files;
-use shearq_dataset::layout::{DataFolder, read_rows};
+use shearq_dataset::layout::DataFolder;
 use shearq_dataset::metadata::{Axes, CommonAxes, stated_axes};
 use shearq_dataset::run::{Run, Source};
 use shearq_files::FileError;
 use shearq_files::table::most_rows;
 use shearq_quantities::Frame;
 use shearq_scoring::{Choice, Convention, FieldSum, Grid, Row, RowCounts};
+use shearq_submissions::EllipticityType;
 
 use crate::foreign::{ADVICE_ON_SENTINELS, Foreign, fault_of_rows};
 use crate::response::response_of;
@@ -20,6 +21,11 @@ use shearq_files::atomic::folder_of;
 
 /// The scored columns of catalogues by shearq.
 pub const COLUMNS: [&str; 4] = ["x", "y", "e1", "e2"];
+
+/// The rows of a catalogue with these columns, at most `most`.
+pub fn read_rows(path: &Path, most: usize) -> Result<Vec<Row>, FileError> {
+    Foreign::of_columns(COLUMNS, EllipticityType::Shear).rows(path, most)
+}
 
 /// The convention of catalogues by shearq, which is the standard one by construction.
 pub const OWN: Choice = Choice::Insist(Convention::STANDARD);
@@ -173,7 +179,7 @@ impl Catalogues {
     ) -> Result<Vec<Row>, FileError> {
         let mut rows = match &self.description {
             Some(foreign) => foreign.rows(path, most)?,
-            None => read_rows(path, &COLUMNS, most)?,
+            None => read_rows(path, most)?,
         };
         for row in &mut rows {
             row.e1 /= response[0];

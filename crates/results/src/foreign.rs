@@ -8,7 +8,7 @@ use shearq_scoring::{Grid, Row, RowCounts, RowFault};
 use shearq_submissions::{EllipticityType, checked_name};
 
 use shearq_dataset::images::{self, Files};
-use shearq_dataset::layout::{HINT_OF_COLUMNS, IMAGE_PLACEHOLDERS, check_pattern};
+use shearq_dataset::layout::{IMAGE_PLACEHOLDERS, check_pattern};
 use shearq_files::FileError;
 use shearq_files::atomic::folder_of;
 use shearq_files::table::{self, Place};
@@ -176,7 +176,7 @@ impl Foreign {
         let place = Place::with_table(path, self.table.as_deref())?;
         let table = table::read_from(&place, Some(&names), most).map_err(|error| {
             let hint = match self.catalogues.is_empty() {
-                true => HINT_OF_COLUMNS,
+                true => "`score --columns` (names, or numbers such as 2,3,4,5) or a description (--foreign) names others",
                 false => "the description of the catalogues specifies the names",
             };
             error.hint_of_columns(hint)

@@ -6,9 +6,8 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use shearq_dataset::images::Files;
-use shearq_dataset::layout::stated_sign;
 use shearq_dataset::run::{RUN_FILE, Run};
-use shearq_dataset::truth::{Sign, SignBasis, sign_on_any_grid};
+use shearq_dataset::truth::{Sign, SignBasis, sign_on_any_grid, stated_sign};
 use shearq_files::open::is_there;
 use shearq_files::table::{self, MAX_ROWS, Place, TRUTH_COLUMNS};
 use shearq_files::{FileError, names_of};

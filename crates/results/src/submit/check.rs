@@ -11,10 +11,9 @@ use shearq_scoring::{
 use super::{
     Contents, FileSum, Kind, Manifest, Sent, SpectrumLine, read_spectrum, wrong_multipoles,
 };
-use crate::catalogues::{COLUMNS, OWN};
+use crate::catalogues::{OWN, read_rows};
 use crate::foreign::{ADVICE_ON_SENTINELS, fault_of_rows};
 use crate::views::scores::{odd_response, repeated_shapes, words};
-use shearq_dataset::layout::read_rows;
 use shearq_files::FileError;
 use shearq_files::table::most_rows;
 
@@ -344,7 +343,7 @@ fn check_catalogue(
     expected: &Expected,
     report: &mut Report,
 ) -> Option<(FieldSum, RowCounts)> {
-    let rows = match read_rows(path, &COLUMNS, most_rows(expected.grid.cells())) {
+    let rows = match read_rows(path, most_rows(expected.grid.cells())) {
         Ok(rows) => rows,
         Err(error) => {
             report.error(path, "readable", error.message);
