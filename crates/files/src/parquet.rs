@@ -112,6 +112,8 @@ const END_BYTES: usize = 8;
 const SUMS_MARK: [u8; 8] = *b"CRC-32 1";
 // Bytes of a checksum.
 const SUM_BYTES: usize = 4;
+// Bytes before the footer: its checksum and the mark.
+const MARKED_SUM_BYTES: usize = SUM_BYTES + SUMS_MARK.len();
 
 // The CRC-32 of each column chunk and of the footer, which are put before the footer. Parquet gives the places of everything else,
 // so that other readers skip them. polars neither writes nor compares Parquet's own checksums of pages. Without any, a bit that a disk
@@ -347,10 +349,26 @@ impl<'a> Source<'a> {
         let cannot = || FileError::doing(path, "cannot read the file");
         let mut file = open::open(path).map_err(cannot())?;
         let length = file.metadata().map_err(cannot())?.len();
+        // The last bytes of the file, or all of a shorter one.
+        let mut last = |bytes: usize| {
+            let mut tail = vec![0; usize::try_from(length).map_or(bytes, |all| all.min(bytes))];
+            file.seek(SeekFrom::End(-(tail.len() as i64)))
+                .and_then(|_| file.read_exact(&mut tail))
+                .map_err(cannot())?;
+            Ok::<_, FileError>(tail)
+        };
+        let size = footer_bytes(&last(END_BYTES)?) + END_BYTES;
+        let tail = last(MARKED_SUM_BYTES + size)?;
         // Before polars reads the footer, which may say anything if it is damaged.
-        let sums_end = checked_footer(path, &mut file, length)?;
+        let is_marked =
+            tail.len() == MARKED_SUM_BYTES + size && tail[SUM_BYTES..].starts_with(&SUMS_MARK);
+        if let (true, Some(sum)) = (is_marked, tail.first_chunk()) {
+            let footer = &tail[MARKED_SUM_BYTES..tail.len() - END_BYTES];
+            check_sum(footer, u32::from_le_bytes(*sum))
+                .map_err(|error| damaged(path, format!("footer: {error}")))?;
+        }
         let (footer, fields) = guarded(path, "footer", || {
-            let mut reader = ParquetReader::new(&mut file);
+            let mut reader = ParquetReader::new(Cursor::new(&tail));
             let fields = reader.schema()?.iter_values().cloned().collect();
             Ok((reader.get_metadata()?.clone(), fields))
         })?;
@@ -362,12 +380,13 @@ impl<'a> Source<'a> {
             fields,
             checksums: BTreeMap::new(),
         };
-        if let Some(end) = sums_end {
+        if is_marked {
             let groups = source.footer.row_groups.iter();
             let chunks = groups.flat_map(|group| group.parquet_columns());
             let starts: Vec<i64> = chunks.map(start_of).collect();
             let size = starts.len() * SUM_BYTES;
-            let sums = source.read_bytes(end as i64 - size as i64, size as i64);
+            let end = (length - tail.len() as u64) as i64;
+            let sums = source.read_bytes(end - size as i64, size as i64);
             let sums = sums.map_err(|error| damaged(path, error))?;
             let sums = sums
                 .as_chunks()
@@ -547,35 +566,6 @@ impl<'a> Source<'a> {
             .map_err(|error| error.to_string())?;
         Ok(bytes)
     }
-}
-
-// Where the checksums of the column chunks end, having compared that of the footer; `None` in files of other programs.
-fn checked_footer(path: &Path, file: &mut File, length: u64) -> Result<Option<u64>, FileError> {
-    let mut read = |start: u64, size: usize| {
-        let mut bytes = vec![0; size];
-        file.seek(SeekFrom::Start(start))
-            .and_then(|_| file.read_exact(&mut bytes))
-            .map_err(FileError::doing(path, "cannot read the file"))?;
-        Ok::<_, FileError>(bytes)
-    };
-    let Some(end) = length.checked_sub(END_BYTES as u64) else {
-        return Ok(None);
-    };
-    let footer = footer_bytes(&read(end, END_BYTES)?);
-    let Some(start) = end.checked_sub((footer + SUM_BYTES + SUMS_MARK.len()) as u64) else {
-        return Ok(None);
-    };
-    let sum = read(start, SUM_BYTES + SUMS_MARK.len())?;
-    let Some((&sum, mark)) = sum.split_first_chunk() else {
-        return Ok(None);
-    };
-    if mark != SUMS_MARK {
-        return Ok(None);
-    }
-    let footer = read(end - footer as u64, footer)?;
-    check_sum(&footer, u32::from_le_bytes(sum))
-        .map_err(|error| damaged(path, format!("footer: {error}")))?;
-    Ok(Some(start))
 }
 
 fn check_sum(bytes: &[u8], expected: u32) -> Result<(), String> {
