@@ -14,7 +14,7 @@ use shearq_dataset::layout::MAX_IMAGE;
 use shearq_dataset::run::{Run, Source, open_data, relative_path};
 use shearq_files::atomic::Scratch;
 use shearq_files::table::FileFormat;
-use shearq_pipeline::measure::measure_folder;
+use shearq_pipeline::measure::FolderMeasurement;
 use shearq_pipeline::run::run_folder;
 use shearq_render::table::TableFormat;
 use shearq_results::baseline::{
@@ -236,7 +236,8 @@ fn measured(
             let mut there = run.images(&data, &sets)?;
             there.retain(|id| images.contains(id));
             // An estimate: the grid of a folder is unknown until its images are opened.
-            measure_folder(&run, &data, out, &there, threads, &mut bar(100))?;
+            FolderMeasurement::open(&run, &data, out, &there)?
+                .write_catalogues(threads, &mut bar(100))?;
             data
         }
     };

@@ -16,7 +16,7 @@ use shearq_files::frames::{Metadata, frame};
 use shearq_files::open::is_there;
 use shearq_files::table::{self, FileFormat, most_rows};
 use shearq_pipeline::PipelineError;
-use shearq_pipeline::measure::measure_folder;
+use shearq_pipeline::measure::FolderMeasurement;
 use shearq_results::catalogues::read_rows;
 use shearq_results::response::response_of;
 use shearq_results::submit::check::{Finding, Severity};
@@ -213,7 +213,8 @@ impl References {
             .configuration;
         let source = Source::folder(data, folder.path())?;
         let run = Run::new(source, configuration, FileFormat::Parquet);
-        measure_folder(&run, data, folder.path(), ids, threads, progress)?;
+        FolderMeasurement::open(&run, data, folder.path(), ids)?
+            .write_catalogues(threads, progress)?;
         let path = |id: &ImageId| run.catalogue(folder.path(), id.set, id.image);
         let mut sets: BTreeMap<u32, Vec<ImageId>> = BTreeMap::new();
         for id in ids {

@@ -321,34 +321,26 @@ impl Worker {
         level: f64,
         usable_psf: bool,
     ) -> Result<Measurement, MeasureError> {
-        let mut found = self.measure_in_frame(stamp, level, usable_psf)?;
+        let mut measured = match self.cut(stamp, level, usable_psf)? {
+            Err(flagged) => flagged,
+            Ok(noise) => match self.method.measure_cut(&self.cut, noise)? {
+                None => Measurement {
+                    noise,
+                    ..Measurement::flagged(Flag::NoScale)
+                },
+                Some(mut found) => {
+                    if let Some(to_sky) = &self.to_sky {
+                        found.turn(to_sky);
+                    }
+                    found.measurement(Reported::of(self.measurer.configuration()), noise)
+                }
+            },
+        };
         if usable_psf {
             let psf = self.psf;
-            found.psf = self.jacobian.map_or(psf, |jacobian| psf.on_sky(&jacobian));
+            measured.psf = self.jacobian.map_or(psf, |jacobian| psf.on_sky(&jacobian));
         }
-        Ok(found)
-    }
-
-    fn measure_in_frame<T: Pixel>(
-        &mut self,
-        stamp: ArrayView2<'_, T>,
-        level: f64,
-        usable_psf: bool,
-    ) -> Result<Measurement, MeasureError> {
-        let noise = match self.cut(stamp, level, usable_psf)? {
-            Ok(noise) => noise,
-            Err(flagged) => return Ok(flagged),
-        };
-        let Some(mut found) = self.method.measure_cut(&self.cut, noise)? else {
-            return Ok(Measurement {
-                noise,
-                ..Measurement::flagged(Flag::NoScale)
-            });
-        };
-        if let Some(to_sky) = &self.to_sky {
-            found.turn(to_sky);
-        }
-        Ok(found.measurement(Reported::of(self.measurer.configuration()), noise))
+        Ok(measured)
     }
 
     /// Cuts a stamp and prepares its pixels. Returns the level of its noise, or the measurement if it is flagged before its shape is
@@ -608,20 +600,8 @@ impl ImageWorker<'_> {
         self.worker.measure_epochs(epochs, stars)
     }
 
-    /// Measures stamps, one per galaxy along the first axis, without calibration, in the noise of the image.
-    ///
-    /// # Errors
-    /// If sizes or numbers do not fit, or a PSF for all galaxies cannot be used. With PSFs per galaxy, a galaxy with an
-    /// unusable PSF is flagged.
-    pub fn measure_each<T: Pixel>(
-        &mut self,
-        stamps: ArrayView3<'_, T>,
-        psfs: &Psfs<'_>,
-    ) -> Result<Vec<Measurement>, MeasureError> {
-        self.measure_stamps(stamps, psfs, None, None)
-    }
-
-    /// The same for white noise with one level per stamp, and with one Jacobian per stamp, if there are any.
+    /// Measures stamps, one per galaxy along the first axis, without calibration, in the noise of the image, or in white noise
+    /// with one level per stamp. Jacobians are one per stamp. With PSFs per galaxy, a galaxy with an unusable PSF is flagged.
     pub(crate) fn measure_stamps<T: Pixel>(
         &mut self,
         stamps: ArrayView3<'_, T>,

@@ -638,28 +638,6 @@ impl<'n> Session<'n> {
         Ok(job)
     }
 
-    /// Measures the stamps of a row, before calibration, with one Jacobian per stamp in the frame of the sky.
-    ///
-    /// # Errors
-    /// If sizes or the frame do not fit, pixels are sheared too much, or a PSF for all galaxies cannot be used.
-    pub fn measure_row(
-        &self,
-        worker: &mut Worker,
-        row: usize,
-        stamps: &Pixels<'_, Ix3>,
-        psfs: &Psfs<'_>,
-        jacobians: Option<&[Jacobian]>,
-    ) -> Result<MeasuredRow, MeasureError> {
-        match stamps {
-            Pixels::Single(stamps) => {
-                self.measure_row_of(worker, row, stamps.view(), psfs, jacobians)
-            }
-            Pixels::Double(stamps) => {
-                self.measure_row_of(worker, row, stamps.view(), psfs, jacobians)
-            }
-        }
-    }
-
     /// Measures stamp `k` of a row before calibration, with all steps unless the method did not run. Levels of single stamps
     /// are not used.
     ///
@@ -686,37 +664,6 @@ impl<'n> Session<'n> {
             Pixels::Double(stamps) => {
                 worker.measure_with_steps(stamps.index_axis(Axis(0), k), psf)?
             }
-        })
-    }
-
-    fn measure_row_of<T: Pixel>(
-        &self,
-        worker: &mut Worker,
-        row: usize,
-        stamps: ArrayView3<'_, T>,
-        psfs: &Psfs<'_>,
-        jacobians: Option<&[Jacobian]>,
-    ) -> Result<MeasuredRow, MeasureError> {
-        let count = self.rows.stamps(row).len();
-        length("a row", stamps.len_of(Axis(0)), count)?;
-        // Results of two frames must not become one image.
-        let on_sky = match self.frame {
-            Frame::Pixel => 0,
-            Frame::Sky => count,
-        };
-        length(
-            "Jacobians of a row",
-            jacobians.map_or(0, <[_]>::len),
-            on_sky,
-        )?;
-        let levels = self.noise.levels();
-        let levels = levels.map(|levels| &levels[self.rows.stamps(row)]);
-        let mut image = self.image(worker);
-        let galaxies = image.measure_stamps(stamps, psfs, levels, jacobians)?;
-        Ok(MeasuredRow {
-            row,
-            galaxies,
-            examined: vec![self.examine(row, stamps, psfs, None)?],
         })
     }
 
@@ -785,17 +732,48 @@ impl<'n> Session<'n> {
 }
 
 impl<'n> RowJob<'n> {
-    /// The galaxies of the row before calibration.
+    /// The galaxies of the row before calibration, in the frame of the sky if there are Jacobians.
     ///
     /// # Errors
-    /// As [`Session::measure_row`].
+    /// If sizes or the frame do not fit, pixels are sheared too much, or a PSF for all galaxies cannot be used.
     pub fn measure_row(&self, worker: &mut Worker) -> Result<MeasuredRow, MeasureError> {
         if !self.epochs.is_empty() {
             return self.measure_epochs(worker);
         }
-        let jacobians = self.jacobians.as_deref();
-        self.session
-            .measure_row(worker, self.row, &self.stamps, &self.psfs, jacobians)
+        match &*self.stamps {
+            Pixels::Single(stamps) => self.measure_stamps(worker, stamps.view()),
+            Pixels::Double(stamps) => self.measure_stamps(worker, stamps.view()),
+        }
+    }
+
+    fn measure_stamps<T: Pixel>(
+        &self,
+        worker: &mut Worker,
+        stamps: ArrayView3<'_, T>,
+    ) -> Result<MeasuredRow, MeasureError> {
+        let (session, row) = (&self.session, self.row);
+        let (psfs, jacobians) = (&*self.psfs, self.jacobians.as_deref());
+        let count = session.rows.stamps(row).len();
+        length("a row", stamps.len_of(Axis(0)), count)?;
+        // Results of two frames must not become one image.
+        let on_sky = match session.frame {
+            Frame::Pixel => 0,
+            Frame::Sky => count,
+        };
+        length(
+            "Jacobians of a row",
+            jacobians.map_or(0, <[_]>::len),
+            on_sky,
+        )?;
+        let levels = session.noise.levels();
+        let levels = levels.map(|levels| &levels[session.rows.stamps(row)]);
+        let mut image = session.image(worker);
+        let galaxies = image.measure_stamps(stamps, psfs, levels, jacobians)?;
+        Ok(MeasuredRow {
+            row,
+            galaxies,
+            examined: vec![session.examine(row, stamps, psfs, None)?],
+        })
     }
 
     fn measure_epochs(&self, worker: &mut Worker) -> Result<MeasuredRow, MeasureError> {
@@ -1224,7 +1202,7 @@ impl Measurer {
     /// Measures an image of any source, whose stamps `threads` survey and this thread measures.
     ///
     /// # Errors
-    /// As [`Session::open`], [`Session::read`] and [`Session::measure_row`].
+    /// As [`Session::open`], [`Session::read`] and [`RowJob::measure_row`].
     pub fn measure_image<'n, S: StampSource<'n>>(
         &self,
         source: &mut S,

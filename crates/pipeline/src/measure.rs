@@ -250,14 +250,3 @@ impl<'a> FolderMeasurement<'a> {
         ))
     }
 }
-
-pub fn measure_folder(
-    run: &Run,
-    data: &DataFolder,
-    out: &Path,
-    images: &[ImageId],
-    threads: usize,
-    progress: &mut dyn Progress,
-) -> Result<Summary, PipelineError> {
-    FolderMeasurement::open(run, data, out, images)?.write_catalogues(threads, progress)
-}

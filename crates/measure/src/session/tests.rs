@@ -123,7 +123,9 @@ fn noisy_stars_one_each_share_what_they_have_in_common() {
     let batch = measurer.batch(stamps.view(), &psfs, Some(0.5)).unwrap();
     let mut worker = measurer.worker();
     let of = |mut image: ImageWorker<'_>| {
-        let found = image.measure_each(stamps.view(), &psfs).unwrap();
+        let found = image
+            .measure_stamps(stamps.view(), &psfs, None, None)
+            .unwrap();
         found.iter().map(|one| one.response).collect::<Vec<_>>()
     };
     let of_batch: Vec<_> = batch.galaxies.iter().map(|one| one.response).collect();
@@ -149,7 +151,9 @@ fn noisy_stars_of_epochs_share_what_they_have_in_common() {
     let image = measurer.batch(stamps.view(), &psfs, Some(level)).unwrap();
     let mut worker = measurer.worker();
     let mut alone = worker.image(ImageNoise::Level(level));
-    let alone = alone.measure_each(stamps.view(), &psfs).unwrap();
+    let alone = alone
+        .measure_stamps(stamps.view(), &psfs, None, None)
+        .unwrap();
     let distance = |galaxies: &[Measurement]| -> f64 {
         let pairs = galaxies.iter().zip(&image.galaxies);
         pairs
