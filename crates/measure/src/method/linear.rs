@@ -144,6 +144,18 @@ struct RegularisationTerms {
     size: f32,
 }
 
+impl AdaptedSettings {
+    /// The flux of a Gaussian of mean square `variance` px² per axis over the flux under the window, after convolution with the target.
+    fn aperture(self, variance: f64) -> f64 {
+        let AdaptedSettings {
+            target_sigma: target,
+            window_sigma: window,
+            ..
+        } = self;
+        1.0 + (variance + target * target) / (window * window)
+    }
+}
+
 /// The plan for one target, window and weight.
 struct LinearPlan {
     lengths: AdaptedSettings,
@@ -175,15 +187,16 @@ impl LinearPlan {
         let gradients = size_moments.gradients();
         let step = method.shape.sheared_step;
         let shear_step = (step > 0.0).then_some(step);
+        let lengths = AdaptedSettings {
+            target_sigma: target,
+            window_sigma: window,
+            weight_scale: scale,
+        };
         Ok(LinearPlan {
             noise_moments_interval: shear_step.map_or(NOISE_MOMENTS_INTERVAL, |_| 1),
             origin: method.shape.origin,
             shear_step,
-            lengths: AdaptedSettings {
-                target_sigma: target,
-                window_sigma: window,
-                weight_scale: scale,
-            },
+            lengths,
             iterations: u32::try_from(settings.max_iterations).unwrap_or(u32::MAX),
             regularisation: Regularisation::new(
                 method,
@@ -192,7 +205,7 @@ impl LinearPlan {
                 &moments,
                 &size_moments,
             ),
-            aperture: 1.0 + (variance + target * target) / (window * window),
+            aperture: lengths.aperture(variance),
             size_gradients: gradients.map(|weights| spectral.spectrum_of(&weights, &mut scratch)),
             size_moments,
             moments,
@@ -634,14 +647,14 @@ impl PlanWorker {
     /// so that positive noise of a pixel does not raise the variance there; the flux is noisy, by 1/ν.
     fn own_variance(&self, noise: f32) -> f64 {
         let plan = &*self.plan;
-        let (lags, target) = (&self.lags, plan.lengths.target_sigma);
+        let lags = &self.lags;
         let of_size = self.regularisation.size * noise * noise;
         let typical = plan.regularisation.typical_square;
         let mean_square = plan.size_moments.measure(&lags.acf, of_size, typical);
         let size = plan.size_moments.size(f64::from(mean_square.square)).px;
         let window = plan.lengths.window_sigma * plan.lengths.window_sigma;
         let of_galaxy = size * size;
-        let flux = f64::from(lags.flux.value) * (1.0 + (of_galaxy + target * target) / window);
+        let flux = f64::from(lags.flux.value) * plan.lengths.aperture(of_galaxy);
         let under = flux / (1.0 + 2.0 * (of_galaxy + self.psf_variance) / window);
         under.max(0.0) / (std::f64::consts::PI * window)
     }
