@@ -6,6 +6,7 @@ use std::path::Path;
 use shearq_files::fits::ImageReader;
 use shearq_files::table::{self, Place};
 use shearq_files::{FileError, atomic};
+use shearq_measure::StampRows;
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_quantities::{FunctionalPsf, PsfProfile, Shear, columns_of};
 use shearq_scoring::{Grid, Row, cell_at, centre_of};
@@ -40,15 +41,20 @@ impl Mosaic {
         }
     }
 
-    pub fn rows(&self) -> usize {
-        self.galaxies.div_ceil(self.columns)
+    pub fn stamp_rows(&self) -> StampRows {
+        StampRows {
+            columns: self.columns,
+            count: self.galaxies,
+        }
     }
 
-    // Saturating: rows beyond the last one have no stamps.
+    pub fn rows(&self) -> usize {
+        self.stamp_rows().len()
+    }
+
+    /// Stamps of a row; none of one beyond the last.
     pub fn of_row(&self, iy: usize) -> usize {
-        self.galaxies
-            .saturating_sub(iy * self.columns)
-            .min(self.columns)
+        self.stamp_rows().stamps(iy).len()
     }
 
     /// FITS pixel position of the centre of stamp `ix` of row `iy`, both from 0.

@@ -135,10 +135,7 @@ impl ImageSource {
             jacobians,
             aligned,
             warnings,
-            rows: StampRows {
-                columns: mosaic.columns,
-                count: mosaic.galaxies,
-            },
+            rows: mosaic.stamp_rows(),
             tiles: (0..mosaic.galaxies).map(Some).collect(),
             offsets: None,
             // Exposures of a survey may have a zero point each.
