@@ -62,6 +62,9 @@ impl<'a> Leaderboard<'a> {
     }
 }
 
+// The entries of each team by board. References, each a team by its hash, have no rank.
+type Teams<'a> = BTreeMap<(Board, bool, &'a str), Vec<Scored<'a>>>;
+
 /// Ranks entries, which are in order of arrival. On each board, a team has the rank of its best entry. A team shares the
 /// rank of a better team if the difference of both is below its error, or if both values have the same `digits` decimals.
 /// `constant` has the true shears of sets with one shear each.
@@ -74,7 +77,7 @@ pub fn rank<'a>(
     let rules = &challenge.rules;
     let metric = rules.metric;
     let mut leaderboard = Leaderboard::default();
-    let mut teams: BTreeMap<(Board, bool, &str), Vec<Scored<'a>>> = BTreeMap::new();
+    let mut teams = Teams::new();
     let mut numbers: BTreeMap<&str, usize> = BTreeMap::new();
     // Only entries that count make later ones copies, so that nobody can block others with an entry that does not.
     let mut firsts: BTreeMap<&str, &EntryInfo> = BTreeMap::new();
@@ -136,24 +139,29 @@ pub fn rank<'a>(
         };
         leaderboard.excluded.push((info, reason));
     }
-    leaderboard.standings = teams
-        .into_iter()
-        .filter_map(|((board, reference, _), entries)| {
-            // Of equal entries, the first counts.
-            let best = entries.iter().reduce(|best, other| {
-                match better(metric, other.value, best.value) {
+    leaderboard.standings = standings(teams, metric, digits);
+    leaderboard
+}
+
+// The standings of the teams by board, the best first.
+fn standings<'a>(teams: Teams<'a>, metric: RankBy, digits: usize) -> Vec<Standing<'a>> {
+    let standing = |((board, reference, _), entries): ((Board, bool, &str), Vec<Scored<'a>>)| {
+        // Of equal entries, the first counts.
+        let best =
+            entries.iter().reduce(
+                |best, other| match better(metric, other.value, best.value) {
                     true => other,
                     false => best,
-                }
-            })?;
-            Some(Standing {
-                board,
-                rank: (!reference && board != Board::Partial).then_some(0),
-                best: best.clone(),
-                entries,
-            })
+                },
+            )?;
+        Some(Standing {
+            board,
+            rank: (!reference && board != Board::Partial).then_some(0),
+            best: best.clone(),
+            entries,
         })
-        .collect();
+    };
+    let mut standings: Vec<Standing<'a>> = teams.into_iter().filter_map(standing).collect();
     // Of equal printed values the earlier entry leads, not the copy with a better seventh digit.
     let ahead = |a: &Standing<'_>, b: &Standing<'_>| {
         let [of_a, of_b] = [a, b].map(|standing| rounded(standing.best.value, digits));
@@ -164,14 +172,11 @@ pub fn rank<'a>(
         let by_arrival = a.best.info().received.cmp(&b.best.info().received);
         a.board.cmp(&b.board).then(by_value).then(by_arrival)
     };
-    leaderboard.standings.sort_by(ahead);
-    for of_board in leaderboard
-        .standings
-        .chunk_by_mut(|a, b| a.board == b.board)
-    {
+    standings.sort_by(ahead);
+    for of_board in standings.chunk_by_mut(|a, b| a.board == b.board) {
         number(of_board, metric, digits);
     }
-    leaderboard
+    standings
 }
 
 // Ranks the standings of a board, which are in order of their values.

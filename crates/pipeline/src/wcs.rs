@@ -282,20 +282,7 @@ impl Wcs {
         let plane = kind == "LINEAR";
         let gs_plane = plane && !text("GS_WCS").is_empty();
         let unit = arcsec_of(&text("CUNIT1"), gs_plane);
-        let steps = CDELT_KEYS.map(&number);
-        let matrix = cd(CD_KEYS.map(&number)).or_else(|| {
-            let [x, y] = [steps[0]?, steps[1]?];
-            let (sine, cosine) = number(ROTATION_KEY).unwrap_or(0.0).to_radians().sin_cos();
-            let [xx, xy, yx, yy] = PC_KEYS.map(&number);
-            Some(match [xx, xy, yx, yy].iter().any(Option::is_some) {
-                true => {
-                    let [xx, yy] = [xx, yy].map(|value| value.unwrap_or(1.0));
-                    let [xy, yx] = [xy, yx].map(|value| value.unwrap_or(0.0));
-                    [[xx * x, xy * x], [yx * y, yy * y]]
-                }
-                false => [[x * cosine, -y * sine], [x * sine, y * cosine]],
-            })
-        });
+        let matrix = cd(CD_KEYS.map(&number)).or_else(|| scaled_pc(&number));
         // Relative to its size: rounded numbers of parallel axes leave a small determinant. A header of zeros has no WCS.
         let size = |m: &Matrix2| m.iter().flatten().map(|v| v * v).sum::<f64>();
         let regular = |m: &Matrix2| determinant(*m).abs() > MIN_AREA_TO_SUM_OF_SQUARES * size(m);
@@ -502,6 +489,22 @@ fn cd([xx, xy, yx, yy]: [Option<f64>; 4]) -> Option<Matrix2> {
         return None;
     }
     Some([[xx, xy], [yx, yy]].map(|row| row.map(|value| value.unwrap_or(0.0))))
+}
+
+// PC with CDELT, or the older rotation with CDELT.
+fn scaled_pc(number: impl Fn(&str) -> Option<f64>) -> Option<Matrix2> {
+    let [x, y] = CDELT_KEYS.map(&number);
+    let (x, y) = (x?, y?);
+    let (sine, cosine) = number(ROTATION_KEY).unwrap_or(0.0).to_radians().sin_cos();
+    let [xx, xy, yx, yy] = PC_KEYS.map(&number);
+    Some(match [xx, xy, yx, yy].iter().any(Option::is_some) {
+        true => {
+            let [xx, yy] = [xx, yy].map(|value| value.unwrap_or(1.0));
+            let [xy, yx] = [xy, yx].map(|value| value.unwrap_or(0.0));
+            [[xx * x, xy * x], [yx * y, yy * y]]
+        }
+        false => [[x * cosine, -y * sine], [x * sine, y * cosine]],
+    })
 }
 
 /// The coefficients of an axis of SIP, `A` or `B`, of offsets from the reference pixel.

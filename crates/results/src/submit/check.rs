@@ -351,20 +351,48 @@ fn check_catalogue(
         }
     };
     let grid = &expected.grid;
-    let cells = grid.cells();
     let mut sum = FieldSum::new(grid);
     let counts = sum.add_image(grid, rows.iter().copied());
     if let Some(fault) = fault_of_rows(&counts, grid, ADVICE_ON_SENTINELS) {
         report.error(path, "values", fault);
     }
-    // Chosen by hand: a few galaxies fail in any measurement.
-    let more_than = |count: usize, share: usize, of: usize| match count * share > of {
+    for (count, severity, check, message) in row_findings(&counts, &rows, grid) {
+        if count > 0 {
+            report.add(path, severity, check, message);
+        }
+    }
+    let mut faults = ImageFaults::default();
+    faults.add(&sum);
+    if let Some((_, found)) = faults.repeated.first() {
+        // Such galaxies are as good as missing, and are limited like these.
+        let severity = more_than(found.rows, 10, found.of);
+        let message = format!(
+            "{}; expected measured values, which do not repeat, and no row for a galaxy that was not measured",
+            repeated_shapes(found)
+        );
+        report.add(path, severity, "constant", message);
+    }
+    Some((sum, counts))
+}
+
+// Severity of a fault of `count` galaxies of `of`. Chosen by hand: a few galaxies fail in any measurement.
+fn more_than(count: usize, share: usize, of: usize) -> Severity {
+    match count * share > of {
         true => Severity::Error,
         false => Severity::Warning,
-    };
+    }
+}
+
+// Numbers of rows with a fault, its severity, the name of the check and the message.
+fn row_findings(
+    counts: &RowCounts,
+    rows: &[Row],
+    grid: &Grid,
+) -> [(usize, Severity, &'static str, String); 7] {
+    let cells = grid.cells();
     let error = Severity::Error;
-    let (off_centre, [dx, dy]) = off_centre(&rows, grid);
-    let found = [
+    let (off_centre, [dx, dy]) = off_centre(rows, grid);
+    [
         (
             counts.excess,
             error,
@@ -424,24 +452,7 @@ fn check_catalogue(
             "range",
             format!("{} galaxies have |e| > 1", counts.above_one),
         ),
-    ];
-    for (count, severity, check, message) in found {
-        if count > 0 {
-            report.add(path, severity, check, message);
-        }
-    }
-    let mut faults = ImageFaults::default();
-    faults.add(&sum);
-    if let Some((_, found)) = faults.repeated.first() {
-        // Such galaxies are as good as missing, and are limited like these.
-        let severity = more_than(found.rows, 10, found.of);
-        let message = format!(
-            "{}; expected measured values, which do not repeat, and no row for a galaxy that was not measured",
-            repeated_shapes(found)
-        );
-        report.add(path, severity, "constant", message);
-    }
-    Some((sum, counts))
+    ]
 }
 
 // Number of positions that are not at the centres of their cells, and their mean offset.
