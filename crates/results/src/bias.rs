@@ -393,9 +393,9 @@ fn add_up(
             let mut add_sheared = |bin, catalogue: usize, weight| {
                 sums.add_sheared(number, item.key, bin, catalogue - 1, (scaled, weight));
             };
-            if item.catalogue > 0 {
+            if item.sheared > 0 {
                 if let Some(bin) = own {
-                    add_sheared(bin, item.catalogue, row.weight);
+                    add_sheared(bin, item.sheared, row.weight);
                 }
                 return;
             }
@@ -556,7 +556,7 @@ fn equal_edges(
     let (mut values, mut stride, mut number) = (Vec::new(), 1u64, 0u64);
     for (input, sources) in reading.request.catalogues.iter().zip(all) {
         read::rows(&input.name, reading, sources, |item| {
-            if let (0, Ok(value)) = (item.catalogue, item.selected.binned[0]) {
+            if let (0, Ok(value)) = (item.sheared, item.selected.binned[0]) {
                 if number % stride == 0 {
                     values.push(value);
                 }

@@ -25,8 +25,8 @@ use super::truth::{OfRows, check};
 // A row that counts, in the catalogue without artificial shear or in a sheared one.
 pub(super) struct SummedRow {
     pub(super) key: u64,
-    // Index of the sheared catalogue, with 0 for noshear.
-    pub(super) catalogue: usize,
+    // Index of the sheared catalogue that the row belongs to, 0 for noshear.
+    pub(super) sheared: usize,
     pub(super) row: Row,
     pub(super) selected: Selected,
 }
@@ -82,7 +82,7 @@ fn count(summary: &mut Catalogue, excluded: Exclusion) {
     } += 1;
 }
 
-// Calls `take` for each row that is neither flagged nor cut, and returns counts and means of the catalogue.
+// Calls `take` for each row of a user's catalogue that is neither flagged nor cut, and returns its counts and means.
 pub(super) fn rows(
     path: &Path,
     reading: &Reading<'_>,
@@ -105,7 +105,7 @@ pub(super) fn rows(
             (None, None) => None,
         };
     }
-    // Rows of each catalogue so far.
+    // Rows of noshear and of each sheared catalogue so far.
     let mut counts = [0u64; CATALOGUES];
     let mut repeats = Repeats::default();
     let mut largest = LargestResponse::default();
@@ -117,15 +117,15 @@ pub(super) fn rows(
             let checks = checks.get_or_insert_with(|| part.checks());
             repeats.look_for(&part);
             for at in 0..part.rows {
-                let catalogue = part.catalogue(at);
-                let index = counts[catalogue];
-                counts[catalogue] += 1;
+                let sheared = part.sheared(at);
+                let index = counts[sheared];
+                counts[sheared] += 1;
                 let selected = part.select(at);
                 let mut excluded = selected.binned[0].err();
                 if selected.binned.iter().any(Result::is_ok) {
                     match part.galaxy(at, index, selected, checks) {
                         Ok(item) => {
-                            if catalogue == 0 {
+                            if sheared == 0 {
                                 for k in 0..2 {
                                     summary.shear[k].add(item.row.g[k]);
                                     summary.ellipticity[k].add(item.row.e[k]);
@@ -146,7 +146,7 @@ pub(super) fn rows(
                         }
                     }
                 }
-                if let Some(reason) = excluded.filter(|_| catalogue == 0) {
+                if let Some(reason) = excluded.filter(|_| sheared == 0) {
                     count(&mut summary, reason);
                 }
             }
@@ -193,7 +193,7 @@ struct TableRows<'a> {
     weighted: Option<MeasuredShapes>,
     e: [usize; 2],
     responses: [[Response; 2]; 2],
-    catalogues: Option<Vec<usize>>,
+    sheared_of_rows: Option<Vec<usize>>,
     frame: &'a DataFrame,
     ids: Option<Vec<u64>>,
     units: Option<Vec<u64>>,
@@ -220,10 +220,10 @@ impl<'a> TableRows<'a> {
         source: &'a Source,
         reading: &'a Reading<'a>,
         frame: &'a DataFrame,
-        catalogue: &Path,
+        file: &Path,
     ) -> Result<Self, FileError> {
         let (path, places) = (&source.place.path, &source.places);
-        let truth = OfRows::new(catalogue, places, &reading.truth)?;
+        let truth = OfRows::new(file, places, &reading.truth)?;
         let mut columns = Vec::new();
         let doubtful = places.all((Role::DoubtfulWeight, 0));
         for (place, wanted) in source.wanted.iter().enumerate() {
@@ -240,8 +240,8 @@ impl<'a> TableRows<'a> {
         refuse_sheared_rows(frame, &source.columns, path)?;
         refuse_boolean_flags(frame, source, reading)?;
         let keys = |name: &str| identity::keys(frame, name, path);
-        let catalogues = source.columns.of(Role::ShearedCatalogue);
-        let catalogues = catalogues.map(|name| catalogues_of(frame, name, path));
+        let sheared_of_rows = source.columns.of(Role::ShearedCatalogue);
+        let sheared_of_rows = sheared_of_rows.map(|name| sheared_of(frame, name, path));
         let weighted = reading.weights().map(|selection| -> Result<_, FileError> {
             let column = |name: &str| table::numbers(frame, name, path);
             let mut shapes = MeasuredShapes::of(column, true)?;
@@ -254,7 +254,7 @@ impl<'a> TableRows<'a> {
             columns,
             e: places.pair(E_ROLES).unwrap_or_default(),
             responses: responses(source),
-            catalogues: catalogues.transpose()?,
+            sheared_of_rows: sheared_of_rows.transpose()?,
             ids: source.columns.of(Role::Id).map(keys).transpose()?,
             units: source.unit.as_deref().map(keys).transpose()?,
             source,
@@ -332,8 +332,8 @@ impl<'a> TableRows<'a> {
         let failures = source.places.all((Role::ShearedFailure, 0));
         let expected = "0, as for a version that was measured";
         add(failures, expected, shear, |flag, _| flag != 0.0);
-        for catalogue in 1..CATALOGUES {
-            let weights = source.places.all((Role::Weight, catalogue));
+        for sheared in 1..CATALOGUES {
+            let weights = source.places.all((Role::Weight, sheared));
             add(weights, "a weight", shear, |weight, _| {
                 weight.is_nan() || weight >= MIN_FAILED_WEIGHT
             });
@@ -375,48 +375,48 @@ impl<'a> TableRows<'a> {
         checks.find(|(column, check)| (check.fails)(self.value(*column, at), check.range))
     }
 
-    fn catalogue(&self, at: usize) -> usize {
-        match &self.catalogues {
-            Some(catalogues) => catalogues[at],
-            None => self.source.catalogue.unwrap_or(0),
+    fn sheared(&self, at: usize) -> usize {
+        match &self.sheared_of_rows {
+            Some(sheared_of_rows) => sheared_of_rows[at],
+            None => self.source.sheared.unwrap_or(0),
         }
     }
 
     // A sheared catalogue may choose a row that is left out without shear: these rows are the response of the selection.
     fn select(&self, at: usize) -> Selected {
         let places = &self.source.places;
-        let weights: [f64; CATALOGUES] = std::array::from_fn(|catalogue| {
-            let column = places.of((Role::Weight, catalogue));
+        let weights: [f64; CATALOGUES] = std::array::from_fn(|sheared| {
+            let column = places.of((Role::Weight, sheared));
             let column = column.or_else(|| self.of(Role::Weight));
             column.map_or(1.0, |weight| self.value(weight, at))
         });
-        let flagged = |catalogue: usize| {
-            let mut flags = places.all((Role::Flag, catalogue)).iter();
+        let flagged = |sheared: usize| {
+            let mut flags = places.all((Role::Flag, sheared)).iter();
             flags.any(|flag| self.value(*flag, at) != 0.0)
         };
         // Smooth steps of `--where` are zero far below their threshold. Such a row would add zeros to all sums.
         let stepped = self.weighted.as_ref().map(|selection| selection.weight[at]);
         let is_outside = stepped.is_some_and(|weight| weight <= 0.0);
-        let binned = std::array::from_fn(|catalogue| {
-            if flagged(catalogue) {
+        let binned = std::array::from_fn(|sheared| {
+            if flagged(sheared) {
                 Err(Exclusion::Flagged)
-            } else if !has_weight(weights[catalogue]) {
+            } else if !has_weight(weights[sheared]) {
                 Err(Exclusion::Unweighted)
             } else {
-                let binned = self.binned(at, catalogue).filter(|_| !is_outside);
+                let binned = self.binned(at, sheared).filter(|_| !is_outside);
                 binned.ok_or(Exclusion::Unselected)
             }
         });
         Selected { binned, weights }
     }
 
-    // The binned quantity in a catalogue if `--where` selects the row; NaN if a number is missing.
-    fn binned(&self, at: usize, catalogue: usize) -> Option<f64> {
+    // The binned quantity in a sheared catalogue (0 for noshear) if `--where` selects the row; NaN if a number is missing.
+    fn binned(&self, at: usize, sheared: usize) -> Option<f64> {
         let of = |expression: Option<&Expression>, role: Role, without: f64| {
             let Some(own) = expression else {
                 return Some(without);
             };
-            let places = self.source.places.all((role, catalogue));
+            let places = self.source.places.all((role, sheared));
             // A sheared catalogue without the columns of the expression selects nothing.
             let known = own.operands().len() == places.len();
             let value = known.then(|| own.value(&|k| self.value(places[k], at)));
@@ -430,7 +430,7 @@ impl<'a> TableRows<'a> {
         Some(if selected.is_nan() { f64::NAN } else { binned })
     }
 
-    // The row, the `index`-th of its catalogue, with its shape and its true shear.
+    // The row, the `index`-th of its sheared catalogue, with its shape and its true shear.
     fn galaxy(
         &self,
         at: usize,
@@ -452,7 +452,7 @@ impl<'a> TableRows<'a> {
         }
         Ok(SummedRow {
             key: self.key(at, index),
-            catalogue: self.catalogue(at),
+            sheared: self.sheared(at),
             row,
             selected,
         })
@@ -615,7 +615,7 @@ impl<'a> TableRows<'a> {
         })
     }
 
-    // The key of the unit of a row, the `index`-th of its catalogue.
+    // The key of the unit of a row, the `index`-th of its sheared catalogue.
     fn key(&self, at: usize, index: u64) -> u64 {
         let rotated_pairs = self.reading.rows_are_rotated_pairs();
         match (&self.units, &self.ids) {
@@ -640,7 +640,7 @@ fn sheared_columns(source: &Source) -> [Option<[[usize; 2]; 2]>; 2] {
 // Where R11, R12, R21 and R22 come from: sheared catalogues, else columns, else the ellipticities are shears already.
 fn responses(source: &Source) -> [[Response; 2]; 2] {
     let [own, other] = sheared_columns(source);
-    let own_catalogue = source.columns.is_of_shearq();
+    let is_of_shearq = source.columns.is_of_shearq();
     let diagonal = source.places.pair(RESPONSE_ROLES).is_some();
     let off_diagonal = source.places.pair(CROSS_RESPONSE_ROLES).is_some();
     [0, 1].map(|i| {
@@ -657,7 +657,7 @@ fn responses(source: &Source) -> [[Response; 2]; 2] {
                 (Some(_), None) => Response::Known(0.0),
                 (None, _) => match column {
                     None => Response::Known(without),
-                    Some(column) if own_catalogue => Response::ColumnOr(column, without),
+                    Some(column) if is_of_shearq => Response::ColumnOr(column, without),
                     Some(column) => Response::Column(column),
                 },
             }
@@ -987,8 +987,8 @@ fn refuse_boolean_flags(
     }
 }
 
-// The catalogues that a column of text names, 0 for the one without shear.
-fn catalogues_of(frame: &DataFrame, name: &str, path: &Path) -> Result<Vec<usize>, FileError> {
+// The sheared catalogues that a column of text names, 0 for the one without shear.
+fn sheared_of(frame: &DataFrame, name: &str, path: &Path) -> Result<Vec<usize>, FileError> {
     let fault = |found: &str, remedy: &str| {
         let expected = "noshear or ns, 1p, 1m, 2p or 2m";
         FileError::new(

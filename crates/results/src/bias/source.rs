@@ -79,8 +79,8 @@ const FIXED: &str = "*psf* *tile* *field* *patch* *seed* *true* *truth* *image* 
 pub(super) struct Source {
     pub(super) place: Place,
     pub(super) frame: Option<DataFrame>,
-    // The catalogue of all rows, if a FITS file has one table per sheared catalogue.
-    pub(super) catalogue: Option<usize>,
+    // The sheared catalogue of all rows, 0 for noshear, if a FITS file has one table for each.
+    pub(super) sheared: Option<usize>,
     pub(super) columns: Columns,
     pub(super) shapes: Shapes,
     pub(super) unit: Option<String>,
@@ -154,7 +154,7 @@ impl Source {
     }
 
     pub(super) fn has_sheared_rows(&self) -> bool {
-        self.catalogue.is_some() || self.columns.of(Role::ShearedCatalogue).is_some()
+        self.sheared.is_some() || self.columns.of(Role::ShearedCatalogue).is_some()
     }
 
     pub(super) fn has_response(&self) -> bool {
@@ -413,7 +413,7 @@ impl Wanted<'_> {
 
 fn source(
     place: Place,
-    catalogue: Option<usize>,
+    sheared: Option<usize>,
     names: &[String],
     reading: &Reading<'_>,
 ) -> Result<Source, FileError> {
@@ -492,7 +492,7 @@ fn source(
     let sheared_weight = places.of((Role::Weight, 1)).is_some();
     let chosen = reading.expressions().next().is_some() || sheared_flags || sheared_weight;
     Ok(Source {
-        catalogue,
+        sheared,
         shapes: reading.request.shapes.unwrap_or(match columns.distortion {
             true => Shapes::Responsivity,
             false => Shapes::Shear,
