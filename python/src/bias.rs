@@ -13,7 +13,7 @@ use shearq_render::table::TableFormat;
 use shearq_results::bias::columns::{Names, Shapes};
 use shearq_results::bias::truth::{TrueSign, Truth, expand};
 use shearq_results::bias::{
-    BiasFailure, Binning, Edges, Input, MOST_BINS, Request, Summed, Units, sum,
+    BiasFailure, Binning, Edges, Input, MAX_BINS, Request, Summed, Units, sum,
 };
 use shearq_results::expression::{Expression, ExpressionError};
 use shearq_results::views::bias::bias_table;
@@ -189,15 +189,15 @@ pub(crate) fn bias_sums(
         Some((of, count, edges)) => {
             let of = Expression::parse(&of).map_err(value("bins"))?;
             let edges = match count {
-                Some(count) if (2..=MOST_BINS).contains(&count) => Edges::Equal(count),
-                None if (2..=MOST_BINS + 1).contains(&edges.len())
+                Some(count) if (2..=MAX_BINS).contains(&count) => Edges::Equal(count),
+                None if (2..=MAX_BINS + 1).contains(&edges.len())
                     && edges.windows(2).all(|pair| pair[0] < pair[1]) =>
                 {
                     Edges::Given(edges)
                 }
                 _ => {
                     return Err(PyValueError::new_err(format!(
-                        "bins: expected 2 to {MOST_BINS} bins, or increasing edges"
+                        "bins: expected 2 to {MAX_BINS} bins, or increasing edges"
                     )));
                 }
             };

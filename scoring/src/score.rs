@@ -7,6 +7,7 @@ use ndarray::Array2;
 #[cfg(feature = "serde")]
 use serde::Serialize;
 use shearq_fourier::Complex64;
+use shearq_quantities::statistics::MIN_RESPONSE_SIGNIFICANCE;
 
 use crate::bandpower::{BINS, Bins, Definition, SCORED};
 use crate::catalogue::{FieldSum, SetImages, TrueShear};
@@ -20,9 +21,6 @@ use crate::quality::{
     BiasFits, Quality, ShearBias, bias_fits, calibrated_quality, quality, quality_error,
 };
 use crate::resample::jackknife_error;
-
-// Minimum significance (σ) of the response before dividing by it.
-const MIN_RESPONSE_SIGMA: f64 = 3.0;
 
 /// How to choose the convention of the metrics.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -315,7 +313,7 @@ impl SetScorer {
         let chosen_one = &conventions[chosen.index()];
         let (mut errors, ee_error) = self.errors(images, chosen_one, &metrics, &replicates);
         // Nothing can be divided by a response that is consistent with zero.
-        if 1.0 + metrics.m_cross < MIN_RESPONSE_SIGMA * errors.m_cross {
+        if 1.0 + metrics.m_cross < MIN_RESPONSE_SIGNIFICANCE * errors.m_cross {
             for of in [&mut metrics, &mut errors] {
                 (of.q_calibrated, of.galaxy_noise) = (f64::NAN, f64::NAN);
             }

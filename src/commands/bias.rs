@@ -17,7 +17,7 @@ use shearq_render::figure::{Figure, PictureFormat};
 use shearq_render::table::{Cell, Table};
 use shearq_results::bias::columns::{Names, Shapes, role_names};
 use shearq_results::bias::truth::{TrueSign, Truth, expand};
-use shearq_results::bias::{Binning, Edges, MOST_BINS, Request, Summed, Units, sum};
+use shearq_results::bias::{Binning, Edges, MAX_BINS, Request, Summed, Units, sum};
 use shearq_results::expression::Expression;
 use shearq_results::select::selection;
 use shearq_results::views::bias::{
@@ -179,15 +179,15 @@ fn parse_bins(text: &str) -> anyhow::Result<Binning> {
         Edges::Given(edges) if edges.len() < 2 || !edges.is_sorted_by(|a, b| a < b) => {
             Err(expected())
         }
-        edges if !(2..=MOST_BINS).contains(&edges.count()) => {
-            Err(anyhow!("expected 2 to {MOST_BINS} bins"))
+        edges if !(2..=MAX_BINS).contains(&edges.count()) => {
+            Err(anyhow!("expected 2 to {MAX_BINS} bins"))
         }
         _ => Ok(Binning { of, edges }),
     }
 }
 
 // Of a file of sums, which is read into memory. Chosen by hand.
-const MOST_BYTES: u64 = 1 << 31;
+const MAX_BYTES: u64 = 1 << 31;
 
 pub(crate) fn run(arguments: &Arguments, command_line: &str) -> anyhow::Result<()> {
     if let Some(error) = arguments.plan {
@@ -329,7 +329,7 @@ fn of_catalogues(summing: &Summing, catalogues: &[PathBuf]) -> anyhow::Result<Su
 
 fn merged(files: &[PathBuf]) -> anyhow::Result<Summed> {
     let read = |path: &Path| -> anyhow::Result<Summed> {
-        let bytes = open::read(path, MOST_BYTES)
+        let bytes = open::read(path, MAX_BYTES)
             .with_context(|| format!("{}: cannot read the sums", path.display()))?;
         let what = || format!("{}: these are no sums that --sums wrote", path.display());
         let summed: Summed = serde_json::from_slice(&bytes).with_context(what)?;

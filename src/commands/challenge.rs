@@ -225,7 +225,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
 }
 
 // Seeds below this can be found by trying all of them, because a seed determines every public image.
-const LEAST_SEED: u64 = 1 << 40;
+const MIN_SEED: u64 = 1 << 40;
 
 fn new(arguments: &NewArguments) -> anyhow::Result<()> {
     mark_resumable();
@@ -257,9 +257,9 @@ fn new(arguments: &NewArguments) -> anyhow::Result<()> {
                 tilt: arguments.tilt,
                 seed: arguments.seed,
             };
-            if let Some(seed) = arguments.seed.filter(|seed| *seed < LEAST_SEED) {
+            if let Some(seed) = arguments.seed.filter(|seed| *seed < MIN_SEED) {
                 tell(format_args!(
-                    "warning: participants can find the seed by trying (found {seed}, expected at least {LEAST_SEED}). Try: without --seed"
+                    "warning: participants can find the seed by trying (found {seed}, expected at least {MIN_SEED}). Try: without --seed"
                 ));
             }
             let galaxies =

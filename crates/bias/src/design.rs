@@ -250,7 +250,7 @@ impl Grouping {
 
 // Fewest groups of catalogues that serve as units. Below, the same rows of all catalogues form a unit: a jackknife of 20 units
 // determines an error to 16 %. Chosen by hand.
-const FEWEST_GROUPS: usize = 20;
+const MIN_GROUPS: usize = 20;
 
 /// Joins sums to the units of a design, which are as large as the galaxies that are not independent: the galaxy under all its
 /// shears, or all galaxies of catalogues with the same number.
@@ -272,7 +272,7 @@ pub fn group(
         true => missing(catalogues, &numbers),
         false => Vec::new(),
     };
-    if !by_key.unwrap_or(groups < FEWEST_GROUPS) {
+    if !by_key.unwrap_or(groups < MIN_GROUPS) {
         let stars = shared(&sums, &noises, Some(&numbers));
         let sums = sums.by_group(|catalogue| {
             let number = numbers.get(catalogue as usize);
@@ -324,7 +324,7 @@ pub fn group(
 // galaxy under opposite shears have its shape in common: they correlate by 0.3 if noise is 1.5 times the shapes, which is
 // three standard deviations of 400 numbers above the limit. A few rows before the first that is absent may correspond.
 const ENOUGH_TO_CORRELATE: usize = 400;
-const LEAST_CORRELATION: f64 = 0.15;
+const MIN_CORRELATION: f64 = 0.15;
 
 // The correlation of the ellipticities of units under opposite shears, if there are enough units and it is too small for the
 // same galaxies: the error of m is then too large by up to √2, because the shapes do not cancel.
@@ -355,7 +355,7 @@ fn correlation(sums: &UnitSums, catalogues: &[Catalogue], numbers: &[u32]) -> Op
         count += 2 * pairs.len();
     }
     let found = cross / (squares[0] * squares[1]).sqrt();
-    (count >= ENOUGH_TO_CORRELATE && found < LEAST_CORRELATION).then_some(found)
+    (count >= ENOUGH_TO_CORRELATE && found < MIN_CORRELATION).then_some(found)
 }
 
 fn missing(catalogues: &[Catalogue], numbers: &[u32]) -> Vec<Missing> {

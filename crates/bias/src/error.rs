@@ -54,11 +54,11 @@ pub enum BiasError {
 }
 
 // Chosen by hand. The relative bias of a ratio is the square of the relative error of its divisor: 4 % at 5σ.
-pub(crate) const MIN_SIGMA: f64 = 5.0;
+pub(crate) const MIN_FITTED_RESPONSE_SIGNIFICANCE: f64 = 5.0;
 
 fn response(component: usize, found: f64, error: f64) -> String {
-    let expected = format!("expected more than {MIN_SIGMA} standard errors");
-    if found < -MIN_SIGMA * error {
+    let expected = format!("expected more than {MIN_FITTED_RESPONSE_SIGNIFICANCE} standard errors");
+    if found < -MIN_FITTED_RESPONSE_SIGNIFICANCE * error {
         return format!(
             "the mean response R{component}{component} is negative (found {found:.4} ± {error:.4}, {expected}). Its sign is wrong, or the sheared catalogues of positive and negative shear are exchanged. Try: minus R{component}{component}, or exchange their columns"
         );

@@ -1,7 +1,7 @@
 //! Estimates with errors from a jackknife over units, which contain the correlation of galaxies within a unit.
 
 use crate::design::Grouping;
-use crate::error::{BiasError, MIN_SIGMA};
+use crate::error::{BiasError, MIN_FITTED_RESPONSE_SIGNIFICANCE};
 use crate::fit::{self, ESTIMATES, Estimates, Known, Plan, RESPONSE};
 use crate::stars::Behind;
 use crate::sums::{WEIGHT, WEIGHT2};
@@ -145,7 +145,7 @@ fn behind_stars(
     for (component, place) in (1..).zip(RESPONSE) {
         let (found, error) = (values[place], errors[place]);
         // Rounding leaves an error of 10⁻¹⁶ for a response of 1.
-        if !(found > MIN_SIGMA * error && found > 0.0) {
+        if !(found > MIN_FITTED_RESPONSE_SIGNIFICANCE * error && found > 0.0) {
             return Err(BiasError::Response {
                 component,
                 found,

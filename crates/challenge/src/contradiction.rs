@@ -13,7 +13,7 @@ const LARGEST_SLOPE: f64 = 1.6;
 const SLOPE_RANGE: std::ops::RangeInclusive<f64> = 1.0 / LARGEST_SLOPE..=LARGEST_SLOPE;
 // Standard errors by which a slope must be out of range. With three slopes of each of 24 sets, chance reaches this in one
 // of 400 challenges whose slopes are all at the limit, and in none whose slopes are near 1.
-const MIN_SLOPE_SIGNIFICANCE: f64 = 4.0;
+const MIN_CONTRADICTION_SIGNIFICANCE: f64 = 4.0;
 
 #[derive(Debug)]
 pub(crate) struct First {
@@ -29,13 +29,13 @@ type Slope = (f64, f64);
 type Group = (Line, Option<(f64, f64)>);
 
 fn is_wrong((slope, error): Slope) -> bool {
-    slope + MIN_SLOPE_SIGNIFICANCE * error < *SLOPE_RANGE.start()
-        || slope - MIN_SLOPE_SIGNIFICANCE * error > *SLOPE_RANGE.end()
+    slope + MIN_CONTRADICTION_SIGNIFICANCE * error < *SLOPE_RANGE.start()
+        || slope - MIN_CONTRADICTION_SIGNIFICANCE * error > *SLOPE_RANGE.end()
 }
 
 // Whether a slope is in range and clearly above zero.
 fn is_right((slope, error): Slope) -> bool {
-    slope > MIN_SLOPE_SIGNIFICANCE * error && SLOPE_RANGE.contains(&slope)
+    slope > MIN_CONTRADICTION_SIGNIFICANCE * error && SLOPE_RANGE.contains(&slope)
 }
 
 fn line(e: &Array2<f64>, count: &Array2<f64>, g: &Array2<f64>, sign: f64) -> Line {
@@ -168,7 +168,7 @@ pub(crate) fn contradiction(firsts: &[First]) -> Option<String> {
         .filter(|(found, _)| is_right(*found) && clearness(*found) > clearness(own))
         .max_by(|a, b| clearness(a.0).total_cmp(&clearness(b.0)))
         .map_or_else(
-            || match own.0 > MIN_SLOPE_SIGNIFICANCE * own.1 {
+            || match own.0 > MIN_CONTRADICTION_SIGNIFICANCE * own.1 {
                 true => format!("the true shear may be {:.1} times too large", 1.0 / own.0),
                 false => "positions, rows or sets may be exchanged".into(),
             },

@@ -12,7 +12,7 @@ use shearq_dataset::run::{Source, kind_of};
 use shearq_dataset::threads::{Pool, Progress};
 use shearq_files::{FileError, names_of};
 use shearq_render::escape::line;
-use shearq_results::published::MIN_SLOPE_SIGNIFICANCE;
+use shearq_results::published::MIN_ENTRY_SLOPE_SIGNIFICANCE;
 use shearq_results::record::{RunRecord, SetRecord};
 use shearq_results::score::ScoreError;
 use shearq_results::store;
@@ -628,7 +628,7 @@ impl Judge {
 
 // An error that cannot be determined (NaN) does not refuse an entry.
 fn is_measurable(slope: f64, error: f64) -> bool {
-    slope > 0.0 && (error.is_nan() || slope > MIN_SLOPE_SIGNIFICANCE * error)
+    slope > 0.0 && (error.is_nan() || slope > MIN_ENTRY_SLOPE_SIGNIFICANCE * error)
 }
 
 type Powers = (Vec<f64>, Vec<f64>);

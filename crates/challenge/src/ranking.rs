@@ -311,7 +311,7 @@ pub fn near_copies(entries: &[Entry]) -> Vec<NearCopy<'_>> {
 }
 
 // Fewest digits of an SHA-256 that name an entry.
-const LEAST_DIGITS: usize = 8;
+const MIN_DIGITS: usize = 8;
 
 #[derive(Debug, Clone, Default, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -339,7 +339,7 @@ impl Decisions {
                 None => (id.as_str(), None),
             };
             let names = |entry: &Entry| {
-                digits.len() >= LEAST_DIGITS
+                digits.len() >= MIN_DIGITS
                     && entry.info.sha256.starts_with(digits)
                     && team.is_none_or(|team| entry.info.team == team)
             };
@@ -353,7 +353,7 @@ impl Decisions {
                     })
                     .collect();
                 return Err(format!(
-                    "`withdrawn` names no single entry (found `{id}`, expected {LEAST_DIGITS} digits or more of an SHA-256: {})",
+                    "`withdrawn` names no single entry (found `{id}`, expected {MIN_DIGITS} digits or more of an SHA-256: {})",
                     known.join(", ")
                 ));
             };

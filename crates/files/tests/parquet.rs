@@ -9,7 +9,7 @@ use shearq_files::frames::{Metadata, frame, reals};
 use shearq_files::parquet::{self, columns};
 
 /// More rows than any of the files has.
-const MOST: usize = 10_000_000;
+const MAX_ROWS: usize = 10_000_000;
 
 /// Every type, a NaN, an infinity, extreme integers, and text beyond ASCII.
 fn sample() -> DataFrame {
@@ -71,7 +71,7 @@ fn assert_same(left: &DataFrame, right: &DataFrame) {
 #[test]
 fn every_type_and_the_metadata_survive() {
     let bytes = encode(&sample());
-    assert_same(&read(&bytes, None, MOST).unwrap(), &sample());
+    assert_same(&read(&bytes, None, MAX_ROWS).unwrap(), &sample());
     assert_eq!(
         reading(&bytes, |path| parquet::metadata(path)),
         Ok(metadata())
@@ -79,10 +79,10 @@ fn every_type_and_the_metadata_survive() {
     let names = ["g1", "size", "id", "flag", "name"].map(str::to_owned);
     assert_eq!(reading(&bytes, |path| columns(path)), Ok(names.into()));
     // In the order asked for.
-    let table = read(&bytes, Some(&["flag", "g1"]), MOST).unwrap();
+    let table = read(&bytes, Some(&["flag", "g1"]), MAX_ROWS).unwrap();
     assert_eq!(table.get_column_names(), ["flag", "g1"]);
     assert_eq!(table.column("flag").ok(), sample().column("flag").ok());
-    assert_eq!(read(&bytes, Some(&[]), MOST).unwrap().width(), 0);
+    assert_eq!(read(&bytes, Some(&[]), MAX_ROWS).unwrap().width(), 0);
 }
 
 #[test]
@@ -95,7 +95,7 @@ fn many_rows_in_several_row_groups_and_none_at_all() {
         let constant = vec![0.1; numbers.len()];
         let table =
             df!("x" => sines, "constant" => constant, "id" => ids, "kind" => kinds).unwrap();
-        assert_same(&read(&encode(&table), None, MOST).unwrap(), &table);
+        assert_same(&read(&encode(&table), None, MAX_ROWS).unwrap(), &table);
     }
 }
 
@@ -106,7 +106,7 @@ fn equal_tables_give_equal_bytes() {
 
 #[test]
 fn missing_columns_are_named_with_file_and_columns_present() {
-    let error = |wanted: &[&str]| read(&encode(&sample()), Some(wanted), MOST).unwrap_err();
+    let error = |wanted: &[&str]| read(&encode(&sample()), Some(wanted), MAX_ROWS).unwrap_err();
     assert_eq!(
         error(&["g1", "g2"]),
         "FILE: there is no column `g2`; columns found: g1, size, id, flag, name"
@@ -134,7 +134,7 @@ fn files_that_are_no_parquet_are_refused() {
     let made = std::process::Command::new("mkfifo").arg(&pipe).status();
     assert!(made.expect("mkfifo starts").success());
     for other in [&folder.path().join("absent.parquet"), folder.path(), &pipe] {
-        let error = parquet::read(other, None, MOST).expect_err("no file");
+        let error = parquet::read(other, None, MAX_ROWS).expect_err("no file");
         assert!(error.message.contains("cannot read the file"), "{error}");
     }
     let whole = encode(&sample());
@@ -143,7 +143,7 @@ fn files_that_are_no_parquet_are_refused() {
         .map(|length| &whole[..length])
         .chain(garbage)
     {
-        let error = read(bytes, None, MOST).unwrap_err();
+        let error = read(bytes, None, MAX_ROWS).unwrap_err();
         assert!(error.starts_with("FILE"), "{} bytes: {error}", bytes.len());
     }
 }
@@ -168,7 +168,7 @@ fn a_wrong_bit_anywhere_is_noticed_or_changes_nothing() {
         let mut damaged = bytes.clone();
         damaged[at] ^= 1 << (at % 8);
         // The first bytes and the mark of the checksums are not compared.
-        if let Ok(found) = read(&damaged, None, MOST) {
+        if let Ok(found) = read(&damaged, None, MAX_ROWS) {
             assert_same(&found, &sample());
             let found = reading(&damaged, |path| parquet::metadata(path));
             assert_eq!(found.unwrap(), metadata());
@@ -184,7 +184,7 @@ fn files_of_other_writers_are_converted() {
     let names = [
         "i8", "i16", "i32", "u64", "u8", "u16", "flag", "category", "f32", "f64",
     ];
-    let table = parquet::read(path, Some(&names), MOST).expect("readable");
+    let table = parquet::read(path, Some(&names), MAX_ROWS).expect("readable");
     let metadata = parquet::metadata(path).expect("readable");
     assert_eq!(metadata["written by"], "pyarrow");
     let expected = [
@@ -208,7 +208,7 @@ fn files_of_other_writers_are_converted() {
     assert_eq!(single.null_count() + double.null_count(), 0);
     let (single, double) = (reals(single).unwrap(), reals(double).unwrap());
     assert!(single[0] == 1.5 && single[1].is_nan() && double[0].is_nan() && double[1] == 2.5);
-    let beyond = parquet::read(path, Some(&["beyond"]), MOST).expect("readable");
+    let beyond = parquet::read(path, Some(&["beyond"]), MAX_ROWS).expect("readable");
     let beyond = reals(beyond.column("beyond").expect("it")).expect("numbers");
     assert_eq!(beyond[1], 9_223_372_036_854_775_808.0);
 
@@ -216,7 +216,7 @@ fn files_of_other_writers_are_converted() {
         ("gap", "column `gap` has 1 missing value(s)"),
         ("day", "column `day` has type Date32"),
     ] {
-        let error = parquet::read(path, Some(&[name]), MOST).expect_err(name);
+        let error = parquet::read(path, Some(&[name]), MAX_ROWS).expect_err(name);
         assert!(error.to_string().contains(words), "{error}");
     }
 }

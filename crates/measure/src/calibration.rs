@@ -1,13 +1,10 @@
 //! The mean response to shear, and the mean shear with an error that includes the error of the response.
 
 use shearq_quantities::linear::{determinant, inverse, solve};
-use shearq_quantities::statistics::RunningMean;
+use shearq_quantities::statistics::{MIN_RESPONSE_SIGNIFICANCE, RunningMean};
 use thiserror::Error;
 
 use crate::measurement::{Measurement, ResponseMatrix};
-
-// In standard errors. Chosen by hand.
-const MIN_RESPONSE_SIGNIFICANCE: f64 = 3.0;
 
 pub(crate) struct MeanResponse {
     pub(crate) diagonal: [f64; 2],

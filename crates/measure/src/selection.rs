@@ -51,7 +51,7 @@ const SIZE_HALF_WIDTH: f64 = 0.3;
 const NEIGHBOUR_HALF_WIDTH: f64 = 0.15;
 
 // Chosen by hand: one galaxy of some thousands lies within a step of 0.015 in S/N, and the error of the response is its own size.
-const LEAST_WIDTH_RATIO: f64 = 0.01;
+const MIN_WIDTH_RATIO: f64 = 0.01;
 
 /// A quantity that galaxies can be selected by.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -147,7 +147,7 @@ impl Cut {
     /// The least useful half width for a galaxy with this error of its flux. A narrower step is a sharp cut: its response to shear is
     /// the number of galaxies within it, divided by its width, and hardly any lies within it.
     pub fn least_half_width(&self, flux_error: f64) -> f64 {
-        LEAST_WIDTH_RATIO * self.quantity.usual_half_width(flux_error)
+        MIN_WIDTH_RATIO * self.quantity.usual_half_width(flux_error)
     }
 
     /// A cut; `None` if the threshold is not finite or the half width not positive.

@@ -70,7 +70,7 @@ const MAX_NEWTON_STEP: f32 = 0.3;
 // Change of χ at which the iteration ends. Resolution of sums of a few hundred single-precision terms.
 const CONVERGED_STEP: f32 = 3e-6;
 // Least determinant of 1 − ∂m/∂χ; near zero the moments follow the weight. Chosen by hand.
-const LEAST_DETERMINANT: f32 = 1e-3;
+const MIN_DETERMINANT: f32 = 1e-3;
 
 /// Moments for one size of weight.
 #[derive(Debug, Clone)]
@@ -220,7 +220,7 @@ impl AdaptiveMoments {
                 [-slope[1][0], 1.0 - slope[1][1]],
             ];
             let determinant = a * d - b * c;
-            if determinant.is_nan() || determinant.abs() < LEAST_DETERMINANT {
+            if determinant.is_nan() || determinant.abs() < MIN_DETERMINANT {
                 return Err(Flag::NoExtent);
             }
             let inverse = [

@@ -70,7 +70,7 @@ const TARGET_CUT: f64 = 2.2;
 const TAPER_START: f64 = 0.75;
 // Value of the window at the middle of an edge above which the edge correction is applied. Chosen by hand. Below it |m|
 // stays under 10⁻³ for the largest galaxies, and a tenth of the time is saved.
-const LEAST_EDGE_WINDOW: f64 = 0.02;
+const MIN_EDGE_WINDOW: f64 = 0.02;
 // Radius of the ring whose light over the flux is the column `neighbour`, in σ of the window. Chosen by hand: 12 px for a
 // window of 8 px.
 const RING_RADIUS: f64 = 1.5;
@@ -85,7 +85,7 @@ const LARGEST_LAG: f64 = 2.5;
 const LAGS_PER_SAMPLE: f64 = 1.5;
 // Least power of the PSF's transform; modes below it are left out as pure noise. Below 10⁻³, the least power in the
 // simulated sets, and within single precision.
-const LEAST_PSF_POWER: f32 = 1e-7;
+const MIN_PSF_POWER: f32 = 1e-7;
 
 /// The linear network for one stamp size.
 #[derive(Debug, Clone)]
@@ -777,7 +777,7 @@ impl Spectral {
             let half = self.stamp_size() as f64 / 2.0;
             let off = centre.into_iter().map(f32::abs).fold(0.0, f32::max);
             let away = (half - f64::from(off)) / self.window_sigma;
-            return (-0.5 * away * away).exp() > LEAST_EDGE_WINDOW;
+            return (-0.5 * away * away).exp() > MIN_EDGE_WINDOW;
         }
         let PixelShape { stretch, skew } = pixels;
         let gradients = [(1.0 / stretch).hypot(skew), stretch];
@@ -789,7 +789,7 @@ impl Spectral {
     fn contains_light(&self, [x, y]: [f64; 2], [sides, levels]: [f64; 2]) -> bool {
         let half = self.stamp_size() as f64 / 2.0;
         let away = ((half - x.abs()) / sides).min((half - y.abs()) / levels) / self.window_sigma;
-        (-0.5 * away * away).exp() > LEAST_EDGE_WINDOW
+        (-0.5 * away * away).exp() > MIN_EDGE_WINDOW
     }
 
     /// The deconvolved stamp itself, convolved with Γ and windowed, for pictures. It is moved by `shift` pixels along both axes.
@@ -1384,7 +1384,7 @@ fn take_psf(
         let mut field_tilts = [[0.0f32; LANES]; 2];
         let [mut clarity, mut power] = [[0.0f32; LANES]; 2];
         for l in 0..LANES {
-            let inverse = if squares[l] < LEAST_PSF_POWER {
+            let inverse = if squares[l] < MIN_PSF_POWER {
                 0.0
             } else {
                 1.0 / squares[l]
@@ -1456,7 +1456,7 @@ fn amplitudes([powers, rough, target]: [&[f32]; 3], step: f32, iterations: i32, 
         let modes = powers.iter().zip(rough).zip(target).zip(power_of_base);
         for (out, (((power, rough), target), power_of_base)) in out.iter_mut().zip(modes) {
             // A mode without signal is noise alone, for any λ.
-            *out = if *power < LEAST_PSF_POWER || *target == 0.0 {
+            *out = if *power < MIN_PSF_POWER || *target == 0.0 {
                 0.0
             } else {
                 target * (1.0 - power_of_base) as f32 / (power + rough)

@@ -166,7 +166,7 @@ pub struct JacobianError(pub Matrix2);
 
 // Ratio of the determinant to the square of the longer axis below which the axes of a pixel count as parallel.
 // Chosen by hand: rounding in the conversion of coordinates leaves 1e-10.
-const LEAST_RELATIVE_AREA: f64 = 1e-6;
+const MIN_RELATIVE_AREA: f64 = 1e-6;
 
 impl Jacobian {
     /// From `[[du/dx, du/dy], [dv/dx, dv/dy]]`.
@@ -178,7 +178,7 @@ impl Jacobian {
         let longest = a.hypot(c).max(b.hypot(d));
         let area = determinant(matrix).abs();
         // Not a number fails, too.
-        let usable = area.is_normal() && area > LEAST_RELATIVE_AREA * longest * longest;
+        let usable = area.is_normal() && area > MIN_RELATIVE_AREA * longest * longest;
         usable
             .then_some(Jacobian(matrix))
             .ok_or(JacobianError(matrix))

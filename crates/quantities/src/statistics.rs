@@ -71,6 +71,10 @@ pub fn scatter(values: &mut [f64]) -> Option<(f64, f64)> {
     Some((middle, FROM_MODULI * median(&mut moduli)?))
 }
 
+/// Standard errors by which a mean response to shear must exceed zero before anything is divided by it.
+// Chosen by hand.
+pub const MIN_RESPONSE_SIGNIFICANCE: f64 = 3.0;
+
 /// The range of a measured quantity. Numbers outside of it, such as −99 or 1e30, stand for a measurement that failed.
 ///
 /// Noise alone reaches far: ratios of noisy moments have tails like those of a Cauchy distribution, so that |e| of 20

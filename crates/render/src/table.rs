@@ -105,7 +105,7 @@ impl Cell {
 }
 
 // Most decimals that the error of a number can require.
-const MOST_DECIMALS: usize = 12;
+const MAX_DECIMALS: usize = 12;
 
 // Significant digits of a number with an unknown error.
 const UNSURE: i32 = 3;
@@ -127,10 +127,10 @@ fn decimals_for(number: f64, digits: i32) -> usize {
         .split_once('e')
         .map(|(_, exponent)| exponent.parse::<i32>());
     let Some(Ok(exponent)) = exponent else {
-        return MOST_DECIMALS;
+        return MAX_DECIMALS;
     };
     let decimals = digits - 1 - exponent;
-    usize::try_from(decimals).unwrap_or(0).min(MOST_DECIMALS)
+    usize::try_from(decimals).unwrap_or(0).min(MAX_DECIMALS)
 }
 
 #[derive(Debug, Clone, PartialEq, Eq)]

@@ -270,7 +270,7 @@ impl BiasResult {
 // galaxies.
 const SAMPLE: usize = 1 << 20;
 
-pub const MOST_BINS: usize = 100;
+pub const MAX_BINS: usize = 100;
 
 /// Sums the catalogues of a request for which `part` holds, given their number.
 pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, BiasFailure> {

@@ -300,7 +300,7 @@ pub fn ranking(branch: &dyn PublicBranch, own: &[(String, Score)]) -> Table {
 
 /// Standard errors by which the slope of an entry on the true shear must exceed zero: below, it contains no shear that could be
 /// ranked.
-pub const MIN_SLOPE_SIGNIFICANCE: f64 = 3.0;
+pub const MIN_ENTRY_SLOPE_SIGNIFICANCE: f64 = 3.0;
 // Least slope of an entry that measures shear: below, m < −0.9 is no bias of a method. `bias` has the same limit.
 const MIN_SHEAR_SLOPE: f64 = 0.1;
 
@@ -320,7 +320,7 @@ impl Slope {
     }
 
     fn differs_from(self, other: f64) -> bool {
-        (self.value - other).abs() > MIN_SLOPE_SIGNIFICANCE * self.error
+        (self.value - other).abs() > MIN_ENTRY_SLOPE_SIGNIFICANCE * self.error
     }
 
     // Whether it is above zero, and not below `least`.

@@ -290,7 +290,7 @@ fn combine(
                     // Times conj(p)/|p|².
                     let (re, im) = (p[0][l], -p[1][l]);
                     let square = re * re + im * im;
-                    let inverse = |of: f32| if of < LEAST_PSF_POWER { 0.0 } else { 1.0 / of };
+                    let inverse = |of: f32| if of < MIN_PSF_POWER { 0.0 } else { 1.0 / of };
                     let (own, all) = (inverse(square), weight * inverse(squares[l]));
                     let changes = sheared([x[0][l], x[1][l]], [y[0][l], y[1][l]], kx[l], ky[l]);
                     for (component, out) in [&mut first, &mut second].into_iter().enumerate() {

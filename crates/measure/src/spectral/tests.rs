@@ -205,7 +205,7 @@ fn the_autocorrelation_equals_plain_sums_on_dirty_scratch() {
         let used = |place: &[f64; 2]| plan.lattice().contains(*place);
         let pairs = lags.acf.iter().zip(&expected).zip(plan.lattice().places());
         for ((found, expected), _) in pairs.filter(|(_, place)| used(place)) {
-            // f32 transforms; modes below `LEAST_PSF_POWER`, which are left out, have none of the light.
+            // f32 transforms; modes below `MIN_PSF_POWER`, which are left out, have none of the light.
             let apart = (f64::from(*found) - expected).abs();
             assert!(apart < 1e-5 * peak, "{n} {p}: {found} {expected}");
         }

@@ -468,7 +468,7 @@ impl StampWriter {
                 })?;
                 let stated = level(&values, side);
                 self.levels.get_or_insert_default().push(stated);
-                if fit.residuals.len() < MOST_FITTED {
+                if fit.residuals.len() < MAX_FITTED {
                     let mut other = map.square::<f64>((x, height as f64 + 1.0 - y), side)?;
                     if map.content() == Content::Weight {
                         other.iter_mut().for_each(|value| *value = 1.0 / *value);
@@ -520,8 +520,8 @@ impl StampWriter {
 }
 
 // Stamps by which a map is compared with the noise. Chosen by hand: a map that halves the noise needs about ten.
-const MOST_FITTED: usize = 2000;
-const LEAST_FITTED: usize = 20;
+const MAX_FITTED: usize = 2000;
+const MIN_FITTED: usize = 20;
 // Standard errors by which the map turned upside down must fit better. Chosen by hand.
 const UPSIDE_DOWN_SIGNIFICANCE: f64 = 5.0;
 
@@ -550,7 +550,7 @@ impl MapFit {
 
     fn is_upside_down(&self) -> bool {
         let count = self.residuals.len() as f64;
-        if self.residuals.len() < LEAST_FITTED {
+        if self.residuals.len() < MIN_FITTED {
             return false;
         }
         let means = [0, 1].map(|k| self.residuals.iter().map(|of| of[k]).sum::<f64>() / count);

@@ -279,10 +279,10 @@ pub fn of_design(result: &BiasResult) -> Vec<String> {
             .grouping
             .missing
             .iter()
-            .take(MOST_MISSING)
+            .take(MAX_MISSING)
             .map(|missing| format!("g = {} beside {}", shown(missing.shear), missing.beside));
         let missing: Vec<String> = missing.collect();
-        let more = match result.grouping.missing.len().saturating_sub(MOST_MISSING) {
+        let more = match result.grouping.missing.len().saturating_sub(MAX_MISSING) {
             0 => String::new(),
             more => format!(", and {more} more"),
         };
@@ -310,7 +310,7 @@ pub fn of_design(result: &BiasResult) -> Vec<String> {
     lines
 }
 
-const MOST_MISSING: usize = 5;
+const MAX_MISSING: usize = 5;
 
 fn notes(result: &BiasResult) -> Vec<String> {
     let Ok(all) = result.all() else {

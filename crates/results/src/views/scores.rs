@@ -466,11 +466,11 @@ pub fn odd_images(odd: &OddImages) -> Vec<String> {
             more(odd.repeated.len())
         ));
     }
-    for (path, response) in odd.responses.iter().take(MOST_NAMED) {
+    for (path, response) in odd.responses.iter().take(MAX_NAMED) {
         lines.push(format!("{} {}", path.display(), odd_response(response)));
     }
-    if let Some(left) = odd.responses.len().checked_sub(MOST_NAMED + 1) {
-        let names = odd.responses[MOST_NAMED..].iter().map(|(path, _)| path);
+    if let Some(left) = odd.responses.len().checked_sub(MAX_NAMED + 1) {
+        let names = odd.responses[MAX_NAMED..].iter().map(|(path, _)| path);
         let names: Vec<String> = names.map(|path| path.display().to_string()).collect();
         lines.push(format!(
             "{} more images likewise: {}",
@@ -496,7 +496,7 @@ pub fn repeated_shapes(found: &Repeated<2>) -> String {
 }
 
 // Chosen by hand: more sentences hide the others.
-const MOST_NAMED: usize = 4;
+const MAX_NAMED: usize = 4;
 
 /// How an image differs from the others of its set, with the probable cause.
 pub fn odd_response(odd: &OddResponse) -> String {
