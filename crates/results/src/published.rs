@@ -414,6 +414,11 @@ struct Columns<'a> {
     unnamed: &'a [(usize, &'a [usize])],
 }
 
+// Programs write ID, id and Id.
+fn is_named(name: &str, aliases: &[&str]) -> bool {
+    aliases.iter().any(|own| name.eq_ignore_ascii_case(own))
+}
+
 impl Columns<'_> {
     fn read(&self, path: &Path) -> Result<Vec<Vec<f64>>, FileError> {
         Ok(self.read_all(path)?.0)
@@ -423,24 +428,10 @@ impl Columns<'_> {
     fn read_all(&self, path: &Path) -> Result<(Vec<Vec<f64>>, Vec<String>), FileError> {
         let mut place = Place::of(path);
         let found = table::columns(&place)?;
-        let is_named = |name: &String, aliases: &[&str]| {
-            // Programs write ID, id and Id.
-            aliases.iter().any(|own| name.eq_ignore_ascii_case(own))
-        };
-        // The place of each wanted column among `names`; `None` if one is missing.
-        let pick = |names: &[String]| -> Option<Vec<Option<usize>>> {
-            let picked = self.names.iter().zip(0..).map(|(aliases, k)| {
-                match names.iter().position(|name| is_named(name, aliases)) {
-                    None if k < self.required => None,
-                    place => Some(place),
-                }
-            });
-            picked.collect()
-        };
         // A FITS file may have several tables: the first with all columns is meant. Of a text, words of a comment name columns only
         // if they are as many, which the comments of the challenge's own files are not.
         let picked = found.named.iter().find_map(|named| {
-            let places = pick(&named.names)?;
+            let places = self.places_in(&named.names)?;
             Some((named, places))
         });
         let is_number = |word: &String| word.parse::<f64>().is_ok();
@@ -479,32 +470,7 @@ impl Columns<'_> {
                     ..FileError::new(path, message)
                 });
             }
-            (None, None) => {
-                let count = found.unnamed.len();
-                let places = self.unnamed.iter().find(|(n, _)| *n == count);
-                let Some((_, places)) = places else {
-                    let message = format!("found {count} columns, expected {}", self.described());
-                    return wrong(path, message);
-                };
-                // `# columns: ID g2 g1 w` and `# ID | g2 | g1 | w` state an order, too, but not which word is which column. One that begins
-                // with the order of the columns, such as `# index g1 g2 (true shear)`, agrees with it.
-                let agrees = |words: &[String]| {
-                    let mut pairs = self.names.iter().zip(*places);
-                    pairs.all(|(aliases, place)| is_named(&words[*place], aliases))
-                };
-                let states_names = |words: &&Vec<String>| {
-                    pick(words).is_some() && !(words.len() > count && agrees(words))
-                };
-                if let Some(words) = found.remarks.iter().find(states_names) {
-                    let message = format!(
-                        "found {count} columns below the comment {}, expected one word per column. Try: these names alone, or no comment of them",
-                        words.join(" ")
-                    );
-                    return wrong(path, message);
-                }
-                let number = |k: usize| places.get(k).map(|place| (place + 1).to_string());
-                (&[][..], (0..self.names.len()).map(number).collect())
-            }
+            (None, None) => (&[][..], self.unnamed(path, &found)?),
         };
         let wanted: Vec<&str> = chosen.iter().flatten().map(String::as_str).collect();
         let read = table::read_from(&place, Some(&wanted), MAX_ROWS)?;
@@ -519,6 +485,48 @@ impl Columns<'_> {
         let is_wanted = |name: &&String| self.names.iter().any(|own| is_named(name, own));
         let others = names.iter().filter(|name| !is_wanted(name)).cloned();
         Ok((columns, others.collect()))
+    }
+
+    // The place of each wanted column among `names`; `None` if one is missing.
+    fn places_in(&self, names: &[String]) -> Option<Vec<Option<usize>>> {
+        let picked = self.names.iter().zip(0..).map(|(aliases, k)| {
+            match names.iter().position(|name| is_named(name, aliases)) {
+                None if k < self.required => None,
+                place => Some(place),
+            }
+        });
+        picked.collect()
+    }
+
+    // The numbers of the wanted columns in a table without names.
+    fn unnamed(
+        &self,
+        path: &Path,
+        found: &table::Columns,
+    ) -> Result<Vec<Option<String>>, FileError> {
+        let count = found.unnamed.len();
+        let Some((_, places)) = self.unnamed.iter().find(|(n, _)| *n == count) else {
+            let message = format!("found {count} columns, expected {}", self.described());
+            return wrong(path, message);
+        };
+        // `# columns: ID g2 g1 w` and `# ID | g2 | g1 | w` state an order, too, but not which word is which column. One that begins
+        // with the order of the columns, such as `# index g1 g2 (true shear)`, agrees with it.
+        let agrees = |words: &[String]| {
+            let mut pairs = self.names.iter().zip(*places);
+            pairs.all(|(aliases, place)| is_named(&words[*place], aliases))
+        };
+        let states_names = |words: &&Vec<String>| {
+            self.places_in(words).is_some() && !(words.len() > count && agrees(words))
+        };
+        if let Some(words) = found.remarks.iter().find(states_names) {
+            let message = format!(
+                "found {count} columns below the comment {}, expected one word per column. Try: these names alone, or no comment of them",
+                words.join(" ")
+            );
+            return wrong(path, message);
+        }
+        let number = |k: usize| places.get(k).map(|place| (place + 1).to_string());
+        Ok((0..self.names.len()).map(number).collect())
     }
 
     fn described(&self) -> String {

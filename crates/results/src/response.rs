@@ -213,7 +213,31 @@ pub fn shears(
         check_significance(path, &[r11, r22])?;
         responses.insert(*group, sum.response(*group));
     }
-    // Catalogues are read a second time, so that only the columns that are written stay in memory.
+    let (table, good) = joined(images, &responses, treecorr)?;
+    let responses: Vec<SharedResponse> = responses.into_values().collect();
+    let lines = responses.iter().map(|own| {
+        let numbers = own.mean.iter().chain(&own.error);
+        let numbers: Vec<String> = numbers.map(|value| format!("{value:.6e}")).collect();
+        format!("{}: {}", own.of, numbers.join(" "))
+    });
+    let heading = "R11 R22 R12 R21 and their errors".to_owned();
+    let lines: Vec<String> = [heading].into_iter().chain(lines).collect();
+    metadata.insert(RESPONSE.into(), lines.join("\n"));
+    Ok(Shears {
+        table,
+        metadata,
+        responses,
+        good,
+    })
+}
+
+// The tables of all images with shears, and the number of galaxies that have one. Catalogues are read a second time, so that only
+// the columns that are written stay in memory.
+fn joined(
+    images: Vec<Image>,
+    responses: &BTreeMap<Group, SharedResponse>,
+    treecorr: Option<Position>,
+) -> Result<(DataFrame, usize), FileError> {
     let (mut whole, mut good) = (None::<DataFrame>, 0);
     for image in images {
         let (table, with_shear) = image.sheared(&responses[&image.group], treecorr)?;
@@ -229,23 +253,9 @@ pub fn shears(
             }
         }
     }
-    let responses: Vec<SharedResponse> = responses.into_values().collect();
-    let lines = responses.iter().map(|own| {
-        let numbers = own.mean.iter().chain(&own.error);
-        let numbers: Vec<String> = numbers.map(|value| format!("{value:.6e}")).collect();
-        format!("{}: {}", own.of, numbers.join(" "))
-    });
-    let heading = "R11 R22 R12 R21 and their errors".to_owned();
-    let lines: Vec<String> = [heading].into_iter().chain(lines).collect();
-    metadata.insert(RESPONSE.into(), lines.join("\n"));
     let mut table = whole.unwrap_or_default();
     table.align_chunks_par();
-    Ok(Shears {
-        table,
-        metadata,
-        responses,
-        good,
-    })
+    Ok((table, good))
 }
 
 // Refuses a second catalogue of an image: its galaxies would count twice, and errors would be too small by √2. An image is known by its
