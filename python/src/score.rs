@@ -15,7 +15,7 @@ use shearq_scoring::modes::Decomposer;
 use shearq_scoring::resample::{PairedSet, paired_difference};
 use shearq_scoring::{
     BINS, Bins, Choice, Convention, Definition, Fault, FieldSum, Grid, ImageFaults, Metrics, Noise,
-    Options, Row, RowCounts, SCORED, SetImages, SetScorer, TrueShear, TruthSign,
+    Options, Row, RowCounts, SCORED, SetImages, SetScore, SetScorer, TrueShear, TruthSign,
     sign_by_correlation, sign_by_modes,
 };
 
@@ -143,10 +143,6 @@ pub(crate) fn failed<'py>(
 /// fastest, or the images at positions. Returns all metrics, spectra and counts by name.
 #[pyfunction]
 #[expect(clippy::too_many_arguments, reason = "Python passes them by name")]
-#[allow(
-    clippy::too_many_lines,
-    reason = "the columns of a result, one after the other"
-)]
 pub(crate) fn score<'py>(
     py: Python<'py>,
     n: usize,
@@ -190,22 +186,7 @@ pub(crate) fn score<'py>(
         }
         let mut warnings = scores::oddities(&counts, "e1, e2");
         let by_modes = sign_by_modes(&grid, &standard).map_err(of_scoring)?;
-        let refused = |fault: SignFault| {
-            // Arrays have no line that states a sign, as files do.
-            let text = match fault {
-                SignFault::Unclear => "cannot determine the sign of g2 in the truth (found no E-mode field, and no slope of e2 on g2 of 5σ; expected one of them). Try: truth_sign=\"standard\" (g2 > 0 along x = y), or truth_sign=\"challenge\" (the other sign)".to_owned(),
-                other => other.to_string(),
-            };
-            PyValueError::new_err(format!("truth_g2: {text}"))
-        };
-        let sign = match Sign::of_truth(None, given, || by_modes).map_err(refused)? {
-            Some(sign) => sign,
-            None if standard.g2.iter().all(|g2| *g2 == 0.0) => Sign::ZERO,
-            None => {
-                let found = sign_by_correlation(&standard, images.total()).map_err(of_scoring)?;
-                Sign::of_catalogues(found).map_err(refused)?
-            }
-        };
+        let sign = sign_of_truth(&standard, given, by_modes, &images)?;
         if let Some(other) = by_modes.filter(|other| *other != sign.of) {
             warnings.push(format!(
                 "warning: truth_g2 seems to have the other sign: with it the shear is an E-mode field. Try: truth_sign=\"{}\"",
@@ -219,34 +200,13 @@ pub(crate) fn score<'py>(
         };
         let scorer = SetScorer::new(grid, truth, options).map_err(of_scoring)?;
         let scored = scorer.score(&images).map_err(of_scoring)?;
-        // A second pass, because images are compared with the truth in the convention that the first pass found.
-        let mut faults = ImageFaults::default();
-        catalogue.each(&grid, |image, _| {
-            faults.add(image);
-            faults.add_response(scorer.response(image, scored.chosen));
-            Ok(())
-        })?;
-        let odd = scores::odd_arrays(&faults).into_iter();
-        warnings.extend(odd.map(|line| format!("warning: {line}.")));
-        let faults_of_set = scorer.diagnose(&images, &scored, scored.chosen);
-        for fault in faults_of_set.map_err(of_scoring)? {
-            let told = match fault {
-                // The Python package words this one, with the name of its argument.
-                Fault::Convention { .. } => true,
-                Fault::Uncorrelated { .. } => !faults.copies.is_empty(),
-                _ => false,
-            };
-            if !told {
-                warnings.push(format!("warning: {}.", scores::words(&fault)));
-            }
-        }
+        warnings.extend(faults(&catalogue, &scorer, &images, &scored)?);
         PyResult::Ok((scored, warnings, challenge))
     })?;
     if scored.constant.is_some() {
         warnings.push("note: the true shear is the same everywhere, so that only `mean`, c1 and c2 are known; other metrics are NaN.".into());
     }
 
-    let spectra = scored.spectra();
     let found = PyDict::new(py);
     let names = Metrics::ALL.map(|metric| metric.name);
     let by_name = |metrics: &Metrics| {
@@ -263,22 +223,7 @@ pub(crate) fn score<'py>(
     let replicates = Array2::from_shape_vec((scored.replicates.len(), names.len()), replicates)
         .map_err(|error| PyValueError::new_err(error.to_string()))?;
     found.set_item("replicates", replicates.into_pyarray(py))?;
-    found.set_item("spectrum", bins(py, &scored.bins)?)?;
-    let spectrum = found.get_item("spectrum")?;
-    if let Some(spectrum) = spectrum {
-        let noise = scored.noise.unwrap_or([f64::NAN; BINS]);
-        for (name, powers) in [
-            ("ee", &spectra.ee),
-            ("ee_error", &scored.ee_error),
-            ("bb", &spectra.bb),
-            ("eb", &spectra.eb),
-            ("true_ee", &scored.true_ee),
-            ("true_bb", &scored.true_bb),
-            ("noise", &noise),
-        ] {
-            spectrum.set_item(name, powers.to_pyarray(py))?;
-        }
-    }
+    found.set_item("spectrum", spectrum_of(py, &scored)?)?;
     found.set_item("noise_variance", scored.noise_variance)?;
     found.set_item("images", scored.images)?;
     found.set_item("convention", scored.chosen.number())?;
@@ -287,7 +232,7 @@ pub(crate) fn score<'py>(
     found.set_item("matched_clearly", scored.matching.is_clear())?;
     let leaderboard = &scored.conventions[scored.best.index()];
     found.set_item("q_leaderboard", leaderboard.quality.q)?;
-    found.set_item("correlation", spectra.correlation)?;
+    found.set_item("correlation", scored.spectra().correlation)?;
     found.set_item(
         "truth_sign",
         if challenge { "challenge" } else { "standard" },
@@ -297,6 +242,74 @@ pub(crate) fn score<'py>(
         "constant",
         scored.constant.map(|mean| (mean.e, mean.error, mean.truth)),
     )?;
+    Ok(found)
+}
+
+fn sign_of_truth(
+    standard: &TrueShear,
+    given: Option<TruthSign>,
+    by_modes: Option<TruthSign>,
+    images: &SetImages,
+) -> PyResult<Sign> {
+    let refused = |fault: SignFault| {
+        // Arrays have no line that states a sign, as files do.
+        let text = match fault {
+            SignFault::Unclear => "cannot determine the sign of g2 in the truth (found no E-mode field, and no slope of e2 on g2 of 5σ; expected one of them). Try: truth_sign=\"standard\" (g2 > 0 along x = y), or truth_sign=\"challenge\" (the other sign)".to_owned(),
+            other => other.to_string(),
+        };
+        PyValueError::new_err(format!("truth_g2: {text}"))
+    };
+    match Sign::of_truth(None, given, || by_modes).map_err(refused)? {
+        Some(sign) => Ok(sign),
+        None if standard.g2.iter().all(|g2| *g2 == 0.0) => Ok(Sign::ZERO),
+        None => {
+            let found = sign_by_correlation(standard, images.total()).map_err(of_scoring)?;
+            Sign::of_catalogues(found).map_err(refused)
+        }
+    }
+}
+
+// Warnings about single images and about the set.
+fn faults(
+    catalogue: &Rows<'_>,
+    scorer: &SetScorer,
+    images: &SetImages,
+    scored: &SetScore,
+) -> PyResult<Vec<String>> {
+    // A second pass, because images are compared with the truth in the convention that the first pass found.
+    let mut faults = ImageFaults::default();
+    catalogue.each(&scored.grid, |image, _| {
+        faults.add(image);
+        faults.add_response(scorer.response(image, scored.chosen));
+        Ok(())
+    })?;
+    let faults_of_set = scorer.diagnose(images, scored, scored.chosen);
+    let faults_of_set = faults_of_set.map_err(of_scoring)?.into_iter();
+    let untold = faults_of_set.filter(|fault| match fault {
+        // The Python package words this one, with the name of its argument.
+        Fault::Convention { .. } => false,
+        Fault::Uncorrelated { .. } => faults.copies.is_empty(),
+        _ => true,
+    });
+    let odd = scores::odd_arrays(&faults).into_iter();
+    let lines = odd.chain(untold.map(|fault| scores::words(&fault)));
+    Ok(lines.map(|line| format!("warning: {line}.")).collect())
+}
+
+fn spectrum_of<'py>(py: Python<'py>, scored: &SetScore) -> PyResult<Bound<'py, PyDict>> {
+    let (found, spectra) = (bins(py, &scored.bins)?, scored.spectra());
+    let noise = scored.noise.unwrap_or([f64::NAN; BINS]);
+    for (name, powers) in [
+        ("ee", &spectra.ee),
+        ("ee_error", &scored.ee_error),
+        ("bb", &spectra.bb),
+        ("eb", &spectra.eb),
+        ("true_ee", &scored.true_ee),
+        ("true_bb", &scored.true_bb),
+        ("noise", &noise),
+    ] {
+        found.set_item(name, powers.to_pyarray(py))?;
+    }
     Ok(found)
 }
 
