@@ -8,9 +8,9 @@ type Pair = [(f64, f64); 2];
 
 // Largest slope of the measured on the true shear, or inverse. A reference measurement has an m of a few tenths at most,
 // and a truth of twice or half the scale has a slope of 0.5 or 2.
-const LARGEST_SLOPE: f64 = 1.6;
+const MAX_SLOPE: f64 = 1.6;
 // Slopes of a right truth.
-const SLOPE_RANGE: std::ops::RangeInclusive<f64> = 1.0 / LARGEST_SLOPE..=LARGEST_SLOPE;
+const SLOPE_RANGE: std::ops::RangeInclusive<f64> = 1.0 / MAX_SLOPE..=MAX_SLOPE;
 // Standard errors by which a slope must be out of range. With three slopes of each of 24 sets, chance reaches this in one
 // of 400 challenges whose slopes are all at the limit, and in none whose slopes are near 1.
 const MIN_CONTRADICTION_SIGNIFICANCE: f64 = 4.0;
@@ -175,7 +175,7 @@ pub(crate) fn contradiction(firsts: &[First]) -> Option<String> {
             |(_, cause)| cause,
         );
     Some(format!(
-        "{of}: the images contradict the true shear (found a slope of {value:.2} ± {error:.2} of the measured on the true shear, expected 0.6 to {LARGEST_SLOPE}); {cause}"
+        "{of}: the images contradict the true shear (found a slope of {value:.2} ± {error:.2} of the measured on the true shear, expected 0.6 to {MAX_SLOPE}); {cause}"
     ))
 }
 

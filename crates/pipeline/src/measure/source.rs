@@ -83,21 +83,7 @@ impl ImageSource {
             Some(table) => table.noise(&stamps)?,
             None => None,
         };
-        let stated = image.number("NOISESIG")?;
-        // Levels of single stamps, from a variance map, replace the one of the header.
-        let uses_header = configuration.noise == NoiseSource::Header && levels.is_none();
-        if uses_header && !stated.is_some_and(|sigma| sigma > 0.0 && sigma.is_finite()) {
-            let found = stated.map_or("absent".into(), |sigma| sigma.to_string());
-            let other = match configuration.linear() {
-                Some(_) => "image",
-                None => "border",
-            };
-            let message = format!(
-                "the header key NOISESIG is {found}; expected a positive number, which the configuration {} requires. Try: noise.source = \"{other}\", to measure the noise",
-                configuration.name
-            );
-            return Err(FileError::new(path, message).into());
-        }
+        let noise = known_noise(&path, &image, configuration, levels)?;
         let OpenPsfs {
             source: psfs,
             moved,
@@ -105,11 +91,6 @@ impl ImageSource {
             stated: stated_by_psf,
         } = open_psfs(data, id, configuration, &mosaic)?;
         let mut warnings: Vec<Warning> = moved.map(Warning::of_moved).into_iter().collect();
-        let noise = match (levels, stated) {
-            (Some(levels), _) => KnownNoise::StatedEach(levels.into()),
-            (None, Some(sigma)) => KnownNoise::Stated(sigma),
-            (None, None) => KnownNoise::Unknown,
-        };
         let wcs = Wcs::of_header(&image);
         warnings.extend(Wcs::disagreements(&psf_wcs, &wcs));
         let of_pixels = jacobians.is_none().then(|| wcs.frame()).flatten();
@@ -246,6 +227,36 @@ impl StampSource<'static> for ImageSource {
 
     fn has_common_flux(&self) -> bool {
         self.has_common_flux
+    }
+}
+
+// The noise that the table of stamps or the header states. Levels of single stamps, from a variance map, replace the one of the header.
+fn known_noise(
+    path: &Path,
+    image: &ImageReader,
+    configuration: &Configuration,
+    levels: Option<Vec<f64>>,
+) -> Result<KnownNoise<'static>, FileError> {
+    let stated = image.number("NOISESIG")?;
+    let is_level = |sigma: f64| sigma > 0.0 && sigma.is_finite();
+    match (levels, stated) {
+        (Some(levels), _) => Ok(KnownNoise::StatedEach(levels.into())),
+        (None, stated)
+            if configuration.noise == NoiseSource::Header && !stated.is_some_and(is_level) =>
+        {
+            let found = stated.map_or("absent".into(), |sigma| sigma.to_string());
+            let other = match configuration.linear() {
+                Some(_) => "image",
+                None => "border",
+            };
+            let message = format!(
+                "the header key NOISESIG is {found}; expected a positive number, which the configuration {} requires. Try: noise.source = \"{other}\", to measure the noise",
+                configuration.name
+            );
+            Err(FileError::new(path, message))
+        }
+        (None, Some(sigma)) => Ok(KnownNoise::Stated(sigma)),
+        (None, None) => Ok(KnownNoise::Unknown),
     }
 }
 

@@ -151,43 +151,55 @@ fn check_files(
     let numbers = catalogues.values().flatten().map(|(image, _)| *image);
     let most = numbers.max().unwrap_or(0).max(expected.images.unwrap_or(0));
     for (set, of_set) in catalogues {
-        let mut files: Option<SummedSet> = None;
-        for (image, file) in of_set {
-            // An unreadable catalogue is reported, and the others of its set are checked without it.
-            let Some((sum, counts)) = check_catalogue(file, expected, report) else {
-                continue;
-            };
-            let files = files.get_or_insert_with(|| SummedSet::new(expected, set));
-            files.add(&sum, counts, image, file);
-        }
-        if let Some(mut files) = files {
-            for (copy, first) in &files.faults.copies {
-                let message = format!(
-                    "the ellipticities are copies of {}; expected an independent measurement per image",
-                    name_of(&files.paths[*first])
-                );
-                report.error(&files.paths[*copy], "copies", message);
-            }
-            let odd = files.faults.odd();
-            // Of a secret truth, only `done` gets the numbers of such images: their response is the correlation with it.
-            if expected.truth.contains_key(&set) {
-                for odd in &odd {
-                    let message = format!("set {set}: the image {}", odd_response(odd));
-                    report.error(&files.paths[odd.place], "image", message);
-                }
-            }
-            let odd = odd.iter().map(|odd| files.numbers[odd.place]).collect();
-            check_images(set, &mut files, most, path, expected, report);
-            check_against_truth(set, &files, expected, report);
-            done(CheckedSet {
-                set,
-                images: &files.images,
-                numbers: &files.numbers,
-                rows: files.rows,
-                odd,
-            });
+        let Some((mut files, odd)) = sum_set(set, of_set, expected, report) else {
+            continue;
+        };
+        check_images(set, &mut files, most, path, expected, report);
+        check_against_truth(set, &files, expected, report);
+        done(CheckedSet {
+            set,
+            images: &files.images,
+            numbers: &files.numbers,
+            rows: files.rows,
+            odd,
+        });
+    }
+}
+
+// The readable catalogues of a set, with the numbers of the images that follow the truth differently.
+fn sum_set(
+    set: u32,
+    of_set: Vec<(u32, &PathBuf)>,
+    expected: &Expected,
+    report: &mut Report,
+) -> Option<(SummedSet, Vec<u32>)> {
+    let mut files: Option<SummedSet> = None;
+    for (image, file) in of_set {
+        // An unreadable catalogue is reported, and the others of its set are checked without it.
+        let Some((sum, counts)) = check_catalogue(file, expected, report) else {
+            continue;
+        };
+        let files = files.get_or_insert_with(|| SummedSet::new(expected, set));
+        files.add(&sum, counts, image, file);
+    }
+    let files = files?;
+    for (copy, first) in &files.faults.copies {
+        let message = format!(
+            "the ellipticities are copies of {}; expected an independent measurement per image",
+            name_of(&files.paths[*first])
+        );
+        report.error(&files.paths[*copy], "copies", message);
+    }
+    let odd = files.faults.odd();
+    // Of a secret truth, only `done` gets the numbers of such images: their response is the correlation with it.
+    if expected.truth.contains_key(&set) {
+        for odd in &odd {
+            let message = format!("set {set}: the image {}", odd_response(odd));
+            report.error(&files.paths[odd.place], "image", message);
         }
     }
+    let odd = odd.iter().map(|odd| files.numbers[odd.place]).collect();
+    Some((files, odd))
 }
 
 // Checks a catalogue whose name contains no set. A `single` file belongs to the only set.
