@@ -577,6 +577,15 @@ impl File {
         self.need_first((end + 1).saturating_sub(BLOCK as u64).max(start))
     }
 
+    /// Reads data of the current header, from their byte `first` on. They have to be there ([`File::need`]).
+    pub fn read_data(&mut self, first: u64, bytes: &mut [u8]) -> Result<(), FileError> {
+        let start = self.extent()?[1] + first;
+        let file = &mut self.source.file;
+        file.seek(SeekFrom::Start(start))
+            .and_then(|_| file.read_exact(bytes))
+            .map_err(FileError::doing(self.path(), "cannot read the file"))
+    }
+
     /// Makes sure that the file can have the first `bytes` bytes of the data here. A gzip file is unpacked later, when
     /// they are read.
     pub fn expect(&mut self, bytes: u64) -> Result<(), FileError> {

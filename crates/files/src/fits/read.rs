@@ -30,18 +30,20 @@ const TLONGLONG: c_int = 81;
 // The offset by which FITS stores unsigned 64-bit integers as signed ones.
 const UNSIGNED: f64 = 9_223_372_036_854_775_808.0;
 
-// Pixels that are read at a time: cfitsio swaps their bytes, and missing ones are looked for, which takes less time in the
-// cache.
+// Pixels that are read at a time: their bytes are swapped, and missing ones are looked for, which takes less time in the cache.
 const PIXELS_AT_A_TIME: usize = 1 << 14;
 
 // Most pixels per byte of a compressed file. A tile without noise takes a byte for a thousand; images of galaxies take one for
 // less than eight.
 const MAX_COMPRESSION: u64 = 1 << 11;
 
+// BITPIX of floats of 32 bits.
+const FLOAT_BITS: c_int = -32;
+
 // Pixels of this value are missing: SExtractor writes it, in single precision.
 const MISSING: f32 = -1e30;
 
-pub trait Pixel: Copy + Default + Into<f64> {
+pub trait Pixel: Copy + Default + From<f32> + Into<f64> {
     #[doc(hidden)]
     const CODE: c_int;
     #[doc(hidden)]
@@ -72,6 +74,10 @@ pub struct ImageReader {
     checked: bool,
     /// BITPIX of an uncompressed image: bits per pixel, negative for floats. `None` for a compressed one.
     bits: Option<c_int>,
+    /// Whether the pixels are floats of 32 bits without BSCALE and BZERO. They are read without cfitsio, in half the time.
+    plain: bool,
+    /// Bytes of plain pixels.
+    bytes: Vec<u8>,
 }
 
 impl std::fmt::Debug for ImageReader {
@@ -135,8 +141,10 @@ impl ImageReader {
 
     fn here(mut file: File, place: &str, dimensions: Dimensions) -> Result<Self, FileError> {
         // cfitsio leaves out those that are no numbers.
-        for key in ["BSCALE", "BZERO"] {
+        let mut plain = true;
+        for (key, neutral) in [("BSCALE", 1.0), ("BZERO", 0.0)] {
             let value = file.number(key)?;
+            plain &= value.is_none_or(|value| value == neutral);
             if let Some(value) = value.filter(|v| !v.is_finite() || key == "BSCALE" && *v == 0.0) {
                 return Err(file.fault(format!(
                     "the header key {key} is {value}; expected a finite number (for BSCALE not zero)"
@@ -199,7 +207,9 @@ impl ImageReader {
             last: dimensions == Dimensions::Two,
             next_row: 0,
             checked: false,
+            plain: plain && bits == Some(FLOAT_BITS),
             bits,
+            bytes: Vec::new(),
         })
     }
 
@@ -312,6 +322,17 @@ impl ImageReader {
 
     // Fills `pixels` from the image's pixel `first` on, counted from 0.
     fn fill<P: Pixel>(&mut self, first: usize, pixels: &mut [P]) -> Result<(), FileError> {
+        if self.plain {
+            self.bytes.resize(4 * pixels.len(), 0);
+            self.file.read_data(4 * first as u64, &mut self.bytes)?;
+            let (values, _) = self.bytes.as_chunks();
+            for (pixel, bytes) in pixels.iter_mut().zip(values) {
+                let value = f32::from_be_bytes(*bytes);
+                let missing = value == MISSING || !value.is_finite();
+                *pixel = if missing { P::MISSING } else { value.into() };
+            }
+            return Ok(());
+        }
         // cfitsio always writes to the second.
         let (mut blank, mut some_blank) = (P::MISSING, 0);
         if self.bits.is_some_and(|bits| bits < 0) {
