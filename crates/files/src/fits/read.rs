@@ -70,8 +70,6 @@ pub struct ImageReader {
     /// Whether this is the last image that is read, so that a gzip file must be complete after it.
     last: bool,
     next_row: usize,
-    /// Whether the checksums of the header were compared.
-    checked: bool,
     /// BITPIX of an uncompressed image: bits per pixel, negative for floats. `None` for a compressed one.
     bits: Option<c_int>,
     /// Whether the pixels are floats of 32 bits without BSCALE and BZERO. They are read without cfitsio, in half the time.
@@ -185,6 +183,7 @@ impl ImageReader {
             true => {
                 // Also the guard against memory for pixels that a damaged header claims and a file cannot have.
                 file.need_all()?;
+                file.check_sums()?;
                 let most = file.disk_size().saturating_mul(MAX_COMPRESSION);
                 if pixels > most {
                     return Err(file.fault(format!(
@@ -206,7 +205,6 @@ impl ImageReader {
             planes,
             last: dimensions == Dimensions::Two,
             next_row: 0,
-            checked: false,
             plain: plain && bits == Some(FLOAT_BITS),
             bits,
             bytes: Vec::new(),
@@ -308,12 +306,8 @@ impl ImageReader {
         Ok(pixels)
     }
 
-    /// Makes sure that the first `rows` rows are there, and once that the image has its checksums.
+    /// Makes sure that the first `rows` rows are there.
     fn need(&mut self, rows: usize) -> Result<(), FileError> {
-        if !self.checked {
-            self.file.check_sums()?;
-            self.checked = true;
-        }
         match self.bits {
             Some(bits) => self.file.need((rows * self.width) as u64 * bytes_of(bits)),
             None => Ok(()),
