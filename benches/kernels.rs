@@ -7,7 +7,8 @@ use ndarray::ArrayView2;
 use shearq_benches::{configuration, stamp};
 use shearq_measure::Measurer;
 use shearq_measure::parts::{
-    AdaptiveMoments, ClippedAcf, HexLattice, Network, Rule, Spectral, Step, WaveletWiener,
+    ClippedAcf, HexLattice, Network, RoundMoments, Rule, Spectral, Step, TypicalGalaxy,
+    WaveletWiener,
 };
 use shearq_quantities::Shear;
 use shearq_quantities::{FunctionalPsf, PsfProfile};
@@ -103,14 +104,18 @@ fn linear(c: &mut Criterion) {
         row_spacing: 2.0,
         reach: 10,
     };
-    let moments = AdaptiveMoments::new(method.shape.weight_scale, lattice);
+    let typical = TypicalGalaxy {
+        variance: settings.reference_extent,
+        target: settings.target_sigma,
+        window: settings.window_sigma,
+    };
+    let moments = RoundMoments::new(method.shape.weight_scale, typical, lattice);
     let acf: Vec<f32> = lattice
         .places()
         .map(|[x, y]| (-(x * x + y * y + 0.3 * x * y) / 20.0).exp() as f32)
         .collect();
-    let mut values = moments.scratch();
-    group.bench_function("adaptive moments", |b| {
-        b.iter(|| moments.measure(black_box(&acf), 0.0, &mut values));
+    group.bench_function("round moments", |b| {
+        b.iter(|| moments.measure(black_box(&acf), 0.0));
     });
     group.finish();
 }

@@ -327,8 +327,7 @@ impl ClippedShape {
     }
 }
 
-/// Shape from the autocorrelation of the deconvolved stamp, under a Moffat weight of the galaxy's own
-/// ellipticity.
+/// Shape from the autocorrelation of the deconvolved stamp, under a round Moffat weight.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct WeightedShape {
     /// Scale in pixels of the Moffat weight.
@@ -346,8 +345,6 @@ pub struct WeightedShape {
     /// Shear of the sheared catalogues (`1p`, `1m`, `2p`, `2m`): further columns of ellipticity, S/N, flux and size. Zero
     /// for none.
     pub sheared_step: f64,
-    /// Which ellipticity the catalogue reports as e1, e2.
-    pub ellipticity: EllipticityType,
     /// What ellipticities are divided by.
     pub calibration: Calibration,
 }
@@ -706,11 +703,12 @@ impl Configuration {
         }
     }
 
-    /// Type of the reported ellipticity.
+    /// Type of the reported ellipticity. That of the linear method is no function of the axis ratio, but its typical response is
+    /// that of ε.
     pub fn ellipticity(&self) -> EllipticityType {
         match &self.method {
             Method::Network(network) => network.shape.ellipticity,
-            Method::Linear(linear) => linear.shape.ellipticity,
+            Method::Linear(_) => EllipticityType::Shear,
         }
     }
 

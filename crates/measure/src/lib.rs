@@ -93,7 +93,7 @@ pub mod parts {
     pub use crate::denoise::{DenoiseScratch, WaveletWiener, border_noise};
     pub use crate::network::{Network, NetworkScratch, Rule, Step, convolve, psf_factor};
     pub use crate::shape::{
-        AdaptiveMoments, AdaptiveScratch, AdaptiveShape, ClippedAcf, ClippedAcfScratch, Moments,
+        ClippedAcf, ClippedAcfScratch, Moments, Ratio, RoundMoments, TypicalGalaxy,
     };
     pub use crate::spectral::{Lags, Light, ModeNoise, Spectral, SpectralPsf, SpectralScratch};
     pub use crate::stamp::frame;

@@ -13,7 +13,7 @@ use shearq_submissions::{Configuration, ConfigurationError, NoiseSource, Registr
 use crate::denoise::{DenoiseScratch, WaveletWiener, border_noise};
 use crate::error::{EpochError, MeasureError};
 use crate::measurement::{Flag, Measurement, PsfShape};
-use crate::method::{AdaptedSettings, CutEpoch, CutWorker, Images, MethodPlan, Reported};
+use crate::method::{AdaptedSettings, CutEpoch, CutWorker, Images, MethodPlan, Saturation};
 use crate::network::convolve;
 use crate::noise::{NoisePlan, StampNoise, Survey};
 use crate::psf::{Psfs, ResidualProfiles, Star, StarSurvey, cut_start};
@@ -332,7 +332,7 @@ impl Worker {
                     if let Some(to_sky) = &self.to_sky {
                         found.turn(to_sky);
                     }
-                    found.measurement(Reported::of(self.measurer.configuration()), noise)
+                    found.measurement(Saturation::of(self.measurer.configuration()), noise)
                 }
             },
         };
@@ -456,7 +456,7 @@ impl Worker {
         if let Some((orientation, _)) = &frame {
             found.turn(&orientation.spin2());
         }
-        let mut measured = found.measurement(Reported::of(self.measurer.configuration()), noise);
+        let mut measured = found.measurement(Saturation::of(self.measurer.configuration()), noise);
         let scale = epochs[first]
             .jacobian
             .map_or(1.0, |jacobian| jacobian.pixel_scale());

@@ -26,7 +26,7 @@ use crate::spectral::{EpochPixels, Light, NoiseChanges};
 pub(crate) enum MethodPlan {
     /// The network, and moments of the clipped autocorrelation.
     Network(Arc<NetworkPlan>),
-    /// The closed form of the network, and moments under an adaptive weight.
+    /// The closed form of the network, and moments under a round weight.
     Linear(Arc<LinearFamily>),
 }
 
@@ -129,11 +129,12 @@ pub struct AdaptedSettings {
     pub weight_scale: f64,
 }
 
-/// Results of a method on a stamp. Methods measure the distortion χ; a configuration reports χ or ε.
+/// Results of a method on a stamp.
 pub(crate) struct Found {
     descent: Descent,
-    distortion: Result<Distortion, Flag>,
-    /// Response of the distortion, if the method determines it.
+    /// Before saturation.
+    ellipticity: Result<[f64; 2], Flag>,
+    /// Response of the ellipticity, if the method determines it.
     response: Option<ResponseMatrix>,
     /// On the galaxies that the method determines it for.
     noise_moments: Option<NoiseChanges<NoiseMeans>>,
@@ -159,28 +160,28 @@ struct FoundObservables {
 /// size follows.
 #[derive(Default)]
 struct NoiseMeans {
-    /// χ₁ and χ₁, χ₁ and χ₂, χ₂ and χ₂.
-    chi_chi: [f64; 3],
-    /// χ₁ and T, χ₂ and T.
-    chi_square: [f64; 2],
-    chi_flux: [f64; 2],
+    /// e₁ and e₁, e₁ and e₂, e₂ and e₂, before saturation.
+    e_e: [f64; 3],
+    /// e₁ and T, e₂ and T.
+    e_square: [f64; 2],
+    e_flux: [f64; 2],
     square_square: f64,
     square_flux: f64,
     flux_flux: f64,
-    ring_chi: [f64; 2],
+    ring_e: [f64; 2],
     ring_square: f64,
     ring_flux: f64,
     ring_ring: f64,
-    /// Second derivatives of χ₁ and χ₂, and of T.
-    chi_curvature: [f64; 2],
+    /// Second derivatives of e₁ and e₂, and of T.
+    e_curvature: [f64; 2],
     square_curvature: f64,
 }
 
 impl NoiseChanges<NoiseMeans> {
-    /// Turns both components of χ, and both components of the shear that changes the noise.
+    /// Turns both components of e, and both components of the shear that changes the noise.
     fn turn(&mut self, by: &Spin2) {
         let [first, second] = &mut self.sheared;
-        let curvature = [0, 1].map(|i| [first.chi_curvature[i], second.chi_curvature[i]]);
+        let curvature = [0, 1].map(|i| [first.e_curvature[i], second.e_curvature[i]]);
         let [[first1, second1], [first2, second2]] = by.turn_response(curvature);
         for (first, second) in first.values_mut().into_iter().zip(second.values_mut()) {
             [*first, *second] = by.turn([*first, *second]);
@@ -188,47 +189,47 @@ impl NoiseChanges<NoiseMeans> {
         for means in [&mut *first, &mut *second, &mut self.turned, &mut self.plain] {
             means.turn(by);
         }
-        first.chi_curvature = [first1, first2];
-        second.chi_curvature = [second1, second2];
+        first.e_curvature = [first1, first2];
+        second.e_curvature = [second1, second2];
     }
 }
 
 impl NoiseMeans {
-    /// Turns both components of χ.
+    /// Turns both components of e.
     fn turn(&mut self, by: &Spin2) {
-        let [chi11, chi12, chi22] = self.chi_chi;
-        let [[chi11, chi12], [_, chi22]] = by.turn_response([[chi11, chi12], [chi12, chi22]]);
-        self.chi_chi = [chi11, chi12, chi22];
+        let [e11, e12, e22] = self.e_e;
+        let [[e11, e12], [_, e22]] = by.turn_response([[e11, e12], [e12, e22]]);
+        self.e_e = [e11, e12, e22];
         for vector in [
-            &mut self.chi_square,
-            &mut self.chi_flux,
-            &mut self.ring_chi,
-            &mut self.chi_curvature,
+            &mut self.e_square,
+            &mut self.e_flux,
+            &mut self.ring_e,
+            &mut self.e_curvature,
         ] {
             *vector = by.turn(*vector);
         }
     }
 
-    /// All but the second derivatives of χ, which turn with the shear as a matrix.
+    /// All but the second derivatives of e, which turn with the shear as a matrix.
     fn values_mut(&mut self) -> [&mut f64; 16] {
         let NoiseMeans {
-            chi_chi: [chi11, chi12, chi22],
-            chi_square: [square1, square2],
-            chi_flux: [flux1, flux2],
+            e_e: [e11, e12, e22],
+            e_square: [square1, square2],
+            e_flux: [flux1, flux2],
             square_square,
             square_flux,
             flux_flux,
-            ring_chi: [ring1, ring2],
+            ring_e: [ring1, ring2],
             ring_square,
             ring_flux,
             ring_ring,
-            chi_curvature: _,
+            e_curvature: _,
             square_curvature,
         } = self;
         [
-            chi11,
-            chi12,
-            chi22,
+            e11,
+            e12,
+            e22,
             square1,
             square2,
             flux1,
@@ -245,32 +246,31 @@ impl NoiseMeans {
         ]
     }
 
-    /// The products of χ₁, χ₂, T and the flux with each other.
+    /// The products of e₁, e₂, T and the flux with each other.
     fn matrix(&self) -> [[f64; 4]; 4] {
-        let [chi11, chi12, chi22] = self.chi_chi;
-        let ([t1, t2], [f1, f2]) = (self.chi_square, self.chi_flux);
+        let [e11, e12, e22] = self.e_e;
+        let ([t1, t2], [f1, f2]) = (self.e_square, self.e_flux);
         let (tt, tf, ff) = (self.square_square, self.square_flux, self.flux_flux);
         [
-            [chi11, chi12, t1, f1],
-            [chi12, chi22, t2, f2],
+            [e11, e12, t1, f1],
+            [e12, e22, t2, f2],
             [t1, t2, tt, tf],
             [f1, f2, tf, ff],
         ]
     }
 
-    /// Mean second derivative of the reported ellipticity.
-    fn curvature(&self, reported: Reported, chi: Distortion) -> [f64; 2] {
-        // With F of `Reported`, ∂²e_i/∂χ_j∂χ_k is 2F′(χ_i δ_jk + χ_j δ_ik + χ_k δ_ij) + 4F″ χ_i χ_j χ_k.
-        let [_, first, second] = reported.factors(chi);
-        let x = [chi.e1, chi.e2];
-        let [p11, p12, p22] = self.chi_chi;
-        let along = [p11 * x[0] + p12 * x[1], p12 * x[0] + p22 * x[1]];
-        let square = along[0] * x[0] + along[1] * x[1];
-        // A change of χ is like the response to one shear that changes both components.
-        let change = reported.response(chi, self.chi_curvature.map(|mean| [mean; 2]));
+    /// Mean second derivative of the saturated ellipticity.
+    fn curvature(&self, saturation: Saturation, e: [f64; 2]) -> [f64; 2] {
+        // With H of `Saturation`, the second derivative by e_j and e_k is 2H′(e_i δ_jk + e_j δ_ik + e_k δ_ij) + 4H″ e_i e_j e_k.
+        let [_, first, second] = saturation.factors(e);
+        let [p11, p12, p22] = self.e_e;
+        let along = [p11 * e[0] + p12 * e[1], p12 * e[0] + p22 * e[1]];
+        let square = along[0] * e[0] + along[1] * e[1];
+        // A change of e is like the response to one shear that changes both components.
+        let change = saturation.response(e, self.e_curvature.map(|mean| [mean; 2]));
         [0, 1].map(|i| {
-            let turned = x[i] * (p11 + p22) + 2.0 * along[i];
-            change[i][i] + 2.0 * first * turned + 4.0 * second * x[i] * square
+            let turned = e[i] * (p11 + p22) + 2.0 * along[i];
+            change[i][i] + 2.0 * first * turned + 4.0 * second * e[i] * square
         })
     }
 }
@@ -305,11 +305,10 @@ fn image(values: &[f32], n: usize) -> Array2<f64> {
 }
 
 impl Found {
-    /// Turns everything that refers to components of shear. It comes before ellipticities of type ε and sums over
-    /// components, which are not linear in them or keep only some.
+    /// Turns everything that refers to components of shear. It comes before sums over components, which keep only some.
     pub(crate) fn turn(&mut self, by: &Spin2) {
-        if let Ok(chi) = &mut self.distortion {
-            *chi = turned(by, *chi);
+        if let Ok(e) = &mut self.ellipticity {
+            *e = by.turn(*e);
         }
         if let Some(response) = &mut self.response {
             *response = by.turn_response(*response);
@@ -329,7 +328,7 @@ impl Found {
     }
 
     /// The measurement, before calibration.
-    pub(crate) fn measurement(&self, reported: Reported, noise: f64) -> Measurement {
+    pub(crate) fn measurement(&self, saturation: Saturation, noise: f64) -> Measurement {
         let measured = Measurement {
             descent: Some(self.descent),
             noise,
@@ -338,7 +337,7 @@ impl Found {
             size: self.size,
             ..Measurement::flagged(Flag::NoShear)
         };
-        let (e, response) = match self.ellipticity(reported) {
+        let (e, response) = match self.saturated(saturation) {
             Ok(found) => found,
             Err(flag) => {
                 return Measurement {
@@ -347,7 +346,7 @@ impl Found {
                 };
             }
         };
-        let observables = self.observables(reported);
+        let observables = self.observables(saturation);
         let pair = observables.as_ref().zip(response);
         Measurement {
             e1: e[0],
@@ -355,46 +354,50 @@ impl Found {
             flags: Flags::NONE,
             // Sheared catalogues may be cut by e, and need all of R.
             response: response.map(|[[r11, _], [_, r22]]| isotropic(r11 + r22)),
-            e_variance: self.e_variance(reported),
+            e_variance: self.e_variance(saturation),
             observables,
             sheared: pair.and_then(|(observables, response)| {
-                self.sheared_catalogues(reported, e, response, observables)
+                self.sheared_catalogues(saturation, e, response, observables)
             }),
             ..measured
         }
     }
 
-    /// The reported ellipticity, and its response if the method determines it.
-    fn ellipticity(&self, reported: Reported) -> Result<([f64; 2], Option<ResponseMatrix>), Flag> {
-        let chi = self.distortion?;
-        let mut e = reported.ellipticity(chi).ok_or(Flag::NoShear)?;
-        let mut response = self.response.map(|r| reported.response(chi, r));
+    /// The saturated ellipticity, and its response if the method determines it.
+    fn saturated(
+        &self,
+        saturation: Saturation,
+    ) -> Result<([f64; 2], Option<ResponseMatrix>), Flag> {
+        let plain = self.ellipticity?;
+        let [factor, ..] = saturation.factors(plain);
+        let mut e = plain.map(|e| e * factor);
+        let mut response = self.response.map(|r| saturation.response(plain, r));
         if let Some(noise) = &self.noise_moments {
             let [first, second] = &noise.sheared;
-            let of_shear = [first, second].map(|means| means.curvature(reported, chi));
+            let of_shear = [first, second].map(|means| means.curvature(saturation, plain));
             for (i, row) in response.iter_mut().flatten().enumerate() {
                 *row = [0, 1].map(|k| row[k] - of_shear[k][i]);
             }
-            let turned = noise.turned.curvature(reported, chi);
+            let turned = noise.turned.curvature(saturation, plain);
             e = [0, 1].map(|i| e[i] + 0.5 * turned[i]);
         }
         Ok((e, response))
     }
 
-    /// Variances of the reported ellipticity by noise, of the galaxies that they are determined for.
-    fn e_variance(&self, reported: Reported) -> [f64; 2] {
-        let (Ok(chi), Some(noise)) = (self.distortion, &self.noise_moments) else {
+    /// Variances of the saturated ellipticity by noise, of the galaxies that they are determined for.
+    fn e_variance(&self, saturation: Saturation) -> [f64; 2] {
+        let (Ok(e), Some(noise)) = (self.ellipticity, &self.noise_moments) else {
             return [0.0; 2];
         };
-        let [p11, p12, p22] = noise.plain.chi_chi;
-        reported
-            .response(chi, [[1.0, 0.0], [0.0, 1.0]])
+        let [p11, p12, p22] = noise.plain.e_e;
+        saturation
+            .response(e, [[1.0, 0.0], [0.0, 1.0]])
             .map(|[a, b]| a * a * p11 + 2.0 * a * b * p12 + b * b * p22)
     }
 
-    /// Flux and size with their couplings to the reported ellipticity.
-    fn observables(&self, reported: Reported) -> Option<Observables> {
-        let (chi, found) = (self.distortion.ok()?, self.observables.as_ref()?);
+    /// Flux and size with their couplings to the saturated ellipticity.
+    fn observables(&self, saturation: Saturation) -> Option<Observables> {
+        let (plain, found) = (self.ellipticity.ok()?, self.observables.as_ref()?);
         let Size {
             px: size,
             slope,
@@ -403,15 +406,15 @@ impl Found {
         let mut size_response = found.square_response.map(|response| slope * response);
         let mut coupling = Coupling::default();
         if let Some(noise) = &self.noise_moments {
-            let jacobian = reported.response(chi, [[1.0, 0.0], [0.0, 1.0]]);
+            let jacobian = saturation.response(plain, [[1.0, 0.0], [0.0, 1.0]]);
             let with_e = |products: [f64; 2]| {
                 jacobian.map(|row| row[0] * products[0] + row[1] * products[1])
             };
             // Of e1 and of e2 with flux, size and ring.
             let with_variables = |means: &NoiseMeans| {
-                let flux = with_e(means.chi_flux);
-                let size = with_e(means.chi_square).map(|value| slope * value);
-                let ring = with_e(means.ring_chi);
+                let flux = with_e(means.e_flux);
+                let size = with_e(means.e_square).map(|value| slope * value);
+                let ring = with_e(means.ring_e);
                 [0, 1].map(|k| [flux[k], size[k], ring[k]])
             };
             let among_variables = |means: &NoiseMeans| {
@@ -452,15 +455,15 @@ impl Found {
     /// effect of noise is unknown, it is not corrected.
     fn sheared_catalogues(
         &self,
-        reported: Reported,
+        saturation: Saturation,
         e: [f64; 2],
         response: ResponseMatrix,
         observables: &Observables,
     ) -> Option<ShearedCatalogues> {
-        let (chi, found) = (self.distortion.ok()?, self.observables.as_ref()?);
+        let (plain, found) = (self.ellipticity.ok()?, self.observables.as_ref()?);
         let settings = found.sheared?;
-        let [[a, b], [c, d]] = reported.response(chi, [[1.0, 0.0], [0.0, 1.0]]);
-        // Rows are e1, e2, flux and size; columns χ₁, χ₂, T and flux.
+        let [[a, b], [c, d]] = saturation.response(plain, [[1.0, 0.0], [0.0, 1.0]]);
+        // Rows are e1, e2, flux and size; columns e₁ and e₂ before saturation, T and flux.
         let rows = [
             [a, b, 0.0, 0.0],
             [c, d, 0.0, 0.0],
@@ -506,72 +509,38 @@ pub(crate) fn isotropic(trace: f64) -> ResponseMatrix {
     [[response, 0.0], [0.0, response]]
 }
 
-fn turned(by: &Spin2, Distortion { e1, e2 }: Distortion) -> Distortion {
-    let [e1, e2] = by.turn([e1, e2]);
-    Distortion::new(e1, e2)
-}
-
-/// What is reported of a distortion: e = χ F(|χ|²).
+/// What is reported of an ellipticity e: e H(|e|²), H(v) = (1 + v/a²)^(−1/2), with the modulus a; a = 0 to report e.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Reported {
-    kind: EllipticityType,
-    /// Modulus a of an ellipticity e that is reported as e/√(1 + |e|²/a²); zero to report e.
-    saturation: f64,
-}
+pub(crate) struct Saturation(f64);
 
-impl Reported {
+impl Saturation {
     pub(crate) fn of(configuration: &Configuration) -> Self {
-        Reported {
-            kind: configuration.ellipticity(),
-            saturation: match &configuration.method {
-                Method::Network(_) => 0.0,
-                Method::Linear(linear) => linear.shape.saturation,
-            },
-        }
+        Saturation(match &configuration.method {
+            Method::Network(_) => 0.0,
+            Method::Linear(linear) => linear.shape.saturation,
+        })
     }
 
-    /// F and its first and second derivative with u = |χ|².
-    fn factors(self, chi: Distortion) -> [f64; 3] {
-        let u = chi.e1 * chi.e1 + chi.e2 * chi.e2;
-        let [f, f1, f2] = match self.kind {
-            EllipticityType::Distortion => [1.0, 0.0, 0.0],
-            EllipticityType::Shear => {
-                // 1/(1 + s), s = √(1 − u).
-                let s = (1.0 - u).sqrt();
-                let f = 1.0 / (1.0 + s);
-                let g = f * f / s;
-                [f, 0.5 * g, 0.25 * g * (2.0 * f + 1.0 / s) / s]
-            }
-        };
-        if self.saturation == 0.0 {
-            return [f, f1, f2];
+    /// H and its first and second derivative.
+    fn factors(self, [e1, e2]: [f64; 2]) -> [f64; 3] {
+        let Saturation(modulus) = self;
+        if modulus == 0.0 {
+            return [1.0, 0.0, 0.0];
         }
-        // F H(v), H = (1 + v/a²)^(−1/2), v = u F² = |e|².
-        let per_square = self.saturation.powi(-2);
-        let v1 = f * f + 2.0 * u * f * f1;
-        let v2 = 4.0 * f * f1 + 2.0 * u * (f1 * f1 + f * f2);
-        let h = (1.0 + u * f * f * per_square).sqrt().recip();
-        let h1 = -0.5 * per_square * h.powi(3);
-        let h2 = 0.75 * per_square * per_square * h.powi(5);
+        let per_square = modulus.powi(-2);
+        let h = (1.0 + (e1 * e1 + e2 * e2) * per_square).sqrt().recip();
         [
-            f * h,
-            f1 * h + f * h1 * v1,
-            f2 * h + 2.0 * f1 * h1 * v1 + f * (h2 * v1 * v1 + h1 * v2),
+            h,
+            -0.5 * per_square * h.powi(3),
+            0.75 * per_square * per_square * h.powi(5),
         ]
     }
 
-    /// The ellipticity; `None` if the distortion exceeds 1 and has no shear-type ellipticity.
-    fn ellipticity(self, chi: Distortion) -> Option<[f64; 2]> {
-        let [f, ..] = self.factors(chi);
-        f.is_finite().then_some([chi.e1 * f, chi.e2 * f])
-    }
-
-    /// The response of the ellipticity, from the response of the distortion: ∂e_i/∂χ_j = F δ_ij + 2F′ χ_i χ_j.
-    fn response(self, chi: Distortion, r: ResponseMatrix) -> ResponseMatrix {
-        let [f, first, _] = self.factors(chi);
+    /// The response of what is reported, from that of e: its derivative with e_j is H δ_ij + 2H′ e_i e_j.
+    fn response(self, [e1, e2]: [f64; 2], r: ResponseMatrix) -> ResponseMatrix {
+        let [h, first, _] = self.factors([e1, e2]);
         let cross = |a: f64, b: f64| 2.0 * first * a * b;
-        let (own1, own2) = (f + cross(chi.e1, chi.e1), f + cross(chi.e2, chi.e2));
-        let other = cross(chi.e1, chi.e2);
+        let (own1, own2, other) = (h + cross(e1, e1), h + cross(e2, e2), cross(e1, e2));
         [
             [0, 1].map(|j| own1 * r[0][j] + other * r[1][j]),
             [0, 1].map(|j| own2 * r[1][j] + other * r[0][j]),
@@ -579,10 +548,22 @@ impl Reported {
     }
 }
 
+/// The components of an ellipticity of this type; none has a distortion above 1 as a shear.
+fn components(chi: Distortion, kind: EllipticityType) -> Result<[f64; 2], Flag> {
+    match kind {
+        EllipticityType::Distortion => Ok([chi.e1, chi.e2]),
+        EllipticityType::Shear => {
+            let shear = chi.to_shear().ok_or(Flag::NoShear)?;
+            Ok([shear.e1, shear.e2])
+        }
+    }
+}
+
 pub(crate) struct NetworkPlan {
     settings: NetworkDeconvolution,
     network: Network,
     acf: ClippedAcf,
+    ellipticity: EllipticityType,
 }
 
 impl NetworkPlan {
@@ -591,6 +572,7 @@ impl NetworkPlan {
         Ok(NetworkPlan {
             network: Network::plan(n, p, settings.printed_lambda(settings.lambda))?,
             acf: ClippedAcf::new(n, &method.shape),
+            ellipticity: method.shape.ellipticity,
             settings,
         })
     }
@@ -646,7 +628,7 @@ impl CutWorker for NetworkWorker {
         let distortion = measured.and_then(|moments| moments.distortion());
         Ok(Some(Found {
             descent,
-            distortion,
+            ellipticity: distortion.and_then(|chi| components(chi, plan.ellipticity)),
             response: None,
             noise_moments: None,
             observables: None,
@@ -682,7 +664,7 @@ mod tests {
 
     fn means(next: &mut impl FnMut() -> f64) -> NoiseMeans {
         let mut means = NoiseMeans {
-            chi_curvature: [next(), next()],
+            e_curvature: [next(), next()],
             ..NoiseMeans::default()
         };
         means
@@ -705,7 +687,7 @@ mod tests {
                 energy: 0.0,
                 updated: 0,
             },
-            distortion: Ok(Distortion::new(e1, e2)),
+            ellipticity: Ok([e1, e2]),
             response: Some([[r11, r12], [r21, r22]]),
             noise_moments: Some(NoiseChanges {
                 sheared: [means(&mut next), means(&mut next)],
@@ -739,34 +721,23 @@ mod tests {
         }
     }
 
-    const fn reported(kind: EllipticityType, saturation: f64) -> Reported {
-        Reported { kind, saturation }
-    }
-
-    const REPORTED: [Reported; 4] = [
-        reported(EllipticityType::Distortion, 0.0),
-        reported(EllipticityType::Shear, 0.0),
-        reported(EllipticityType::Distortion, 0.4),
-        reported(EllipticityType::Shear, 0.2),
-    ];
+    const SATURATIONS: [Saturation; 2] = [Saturation(0.0), Saturation(0.4)];
 
     #[test]
-    fn factors_of_reported_ellipticities_have_their_derivatives() {
-        for reported in REPORTED {
-            for u in [0.04f64, 0.3, 0.7] {
-                let at = |u: f64| reported.factors(Distortion::new(u.sqrt() * 0.6, u.sqrt() * 0.8));
-                let step = 1e-5;
-                let ([plus, first, ..], [minus, first_before, ..]) = (at(u + step), at(u - step));
-                let [_, slope, curvature] = at(u);
-                // Truncation and rounding of differences.
-                let slopes = [plus - minus, first - first_before].map(|apart| apart / (2.0 * step));
-                assert!((slopes[0] - slope).abs() < 1e-6, "{reported:?} {u}");
-                assert!((slopes[1] - curvature).abs() < 1e-5 * (1.0 + curvature.abs()));
-            }
+    fn saturation_has_its_derivatives() {
+        let saturation = SATURATIONS[1];
+        for u in [0.04f64, 0.3, 1.7] {
+            let at = |u: f64| saturation.factors([u.sqrt() * 0.6, u.sqrt() * 0.8]);
+            let step = 1e-5;
+            let ([plus, first, ..], [minus, first_before, ..]) = (at(u + step), at(u - step));
+            let [_, slope, curvature] = at(u);
+            // Truncation and rounding of differences.
+            let slopes = [plus - minus, first - first_before].map(|apart| apart / (2.0 * step));
+            assert!((slopes[0] - slope).abs() < 1e-6, "{u}");
+            assert!((slopes[1] - curvature).abs() < 1e-5 * (1.0 + curvature.abs()));
         }
-        let saturated = REPORTED[3].ellipticity(Distortion::new(0.0, 0.8)).unwrap();
-        // χ = 0.8 is ε = 0.5.
-        assert!((saturated[1] - 0.5 / 7.25f64.sqrt()).abs() < 1e-12 && saturated[0] == 0.0);
+        let [half, ..] = saturation.factors([0.0, 0.4]);
+        assert!((half - 0.5f64.sqrt()).abs() < 1e-12);
     }
 
     #[test]
@@ -774,13 +745,13 @@ mod tests {
         // A rotation by 90° changes the signs of spin-2 components and of nothing else; a reflection those of e2 and γ2.
         let quarter = [[0.0, -1.0], [1.0, 0.0]];
         let mirror = [[-1.0, 0.0], [0.0, 1.0]];
-        for kind in REPORTED {
-            let plain = found().measurement(kind, 1.0);
+        for saturation in SATURATIONS {
+            let plain = found().measurement(saturation, 1.0);
             for (matrix, signs) in [(quarter, [-1.0, -1.0]), (mirror, [1.0, -1.0])] {
                 let (orientation, _) = Jacobian::new(matrix).unwrap().factors();
                 let mut turned = found();
                 turned.turn(&orientation.spin2());
-                let turned = turned.measurement(kind, 1.0);
+                let turned = turned.measurement(saturation, 1.0);
                 let expected = expected(&plain, signs);
                 assert_eq!(all(&turned).len(), expected.len());
                 for (at, (found, expected)) in all(&turned).iter().zip(&expected).enumerate() {
@@ -793,7 +764,7 @@ mod tests {
             let mut turned = found();
             turned.turn(&orientation.spin2());
             turned.turn(&orientation.spin2());
-            let turned = turned.measurement(kind, 1.0);
+            let turned = turned.measurement(saturation, 1.0);
             assert!((turned.e2 - plain.e1).abs() < 1e-12 && (turned.e1 + plain.e2).abs() < 1e-12);
             let [one, two] = [&plain, &turned].map(|galaxy| galaxy.observables.unwrap());
             let close = |found: &[f64], expected: &[f64], sign: f64| {

@@ -2,36 +2,25 @@
 //!
 //! The autocorrelation of a stamp has the ellipticity of the stamp and is centred exactly on zero lag; its quadrupole moments
 //! give the distortion. The network follows the paper: moments inside the radius that encloses a share of the light
-//! ([`ClippedAcf`]). The linear method takes moments under a weight that adapts to the galaxy ([`AdaptiveMoments`]), and the
-//! size before the PSF from a round weight ([`SizeMoments`]).
+//! ([`ClippedAcf`]). The linear method takes moments under round weights, of an ellipticity ([`RoundMoments`]) and of the size
+//! before the PSF ([`SizeMoments`]).
 //!
-//! # Adaptive moments
+//! # Round moments
 //!
-//! The weight is a Moffat profile with the fixed scale r and the ellipticity χ of the galaxy itself,
-//!
-//! ```text
-//! W = (1 + q)^(−3/2),  q = [(1 − χ₁)x² + (1 + χ₁)y² − 2χ₂xy] / (√(1 − |χ|²) r²).
-//! ```
-//!
-//! Moments need the weights in proportion to how an autocorrelation changes with shear over how noisy
-//! it is; galaxies have cusps and wide wings, and so has this. A Gaussian loses some 3 % more.
-//!
-//! χ is where the weighted moments (Eqs. 13 and 14) have the ellipticity of the weight, found by
-//! Newton's method (Bernstein & Jarvis 2002 do this to images; an autocorrelation needs no centring,
-//! and the noise at zero lag does not enter). The same derivatives give the response of χ to a change
-//! of the autocorrelation.
-//!
-//! # Second derivatives of adaptive moments
-//!
-//! With the integrals L_T, L₁ and L₂ of the bases x² + y², x² − y² and 2xy, χ is where F_i(χ, A) = L_i − χ_i(L_T + s) = 0 for a
-//! regularisation s. F is linear in A, so that implicit differentiation along changes a and b of A gives
+//! With A₀, A₊ and A× the integrals of the autocorrelation and of it times x² − y² and 2xy under a round Moffat weight,
 //!
 //! ```text
-//! χ′(a) = K φ(a),   K = (−∂F/∂χ)⁻¹,   φ_i(a) = L_i(a) − χ_i L_T(a),
-//! χ″(a, b) = K [F_χχ(χ′(a), χ′(b)) + φ_χ(b) χ′(a) + φ_χ(a) χ′(b)].
+//! e = (A₊, A×)/(ρ (A₀ + s)),  W = (1 + (x² + y²)/r²)^(−3/2),
 //! ```
 //!
-//! The four φ_χ = ∂φ_i/∂χ_j are sums over lags, as φ is.
+//! where ρ makes the response of a round Gaussian galaxy of the typical size one, and s is a regularisation. Moments need
+//! weights in proportion to how an autocorrelation changes with shear over how noisy it is; galaxies have cusps and wide
+//! wings, and so has this weight.
+//!
+//! e is not a function of the axis ratio alone, as χ and ε are: its response to shear takes the place of a scale. It is a ratio
+//! of two sums over lags, so that its derivatives are exact and short. A weight of the galaxy's own ellipticity (Bernstein &
+//! Jarvis 2002) has 1 to 2 % less noise for round galaxies and 3 % more for those of the COSMOS survey, and its response twice
+//! as much noise.
 //!
 //! # Sizes
 //!
@@ -61,459 +50,177 @@ use crate::transform::{
     HexLattice, LagsScratch, Plane, Spectrum, ToLags, ToModes, TransformScratch,
 };
 
-// Chosen by hand.
-const MAX_NEWTON_STEPS: usize = 30;
-// Largest |χ| of a weight. Chosen by hand.
-const MAX_WEIGHT_MODULUS: f32 = 0.98;
-// Chosen by hand.
-const MAX_NEWTON_STEP: f32 = 0.3;
-// Change of χ at which the iteration ends. Resolution of sums of a few hundred single-precision terms.
-const CONVERGED_STEP: f32 = 3e-6;
-// Least determinant of 1 − ∂m/∂χ; near zero the moments follow the weight. Chosen by hand.
-const MIN_DETERMINANT: f32 = 1e-3;
+// Exponent of 1 + (x² + y²)/r² in the weight of an ellipticity. Least scatter of simulated galaxies among 1, 1.5 and 2.5, with the
+// best scale of each.
+const EXPONENT: f64 = -1.5;
 
-/// Moments for one size of weight.
-#[derive(Debug, Clone)]
-pub struct AdaptiveMoments {
-    square: f32,
-    /// Number of lags in half the plane.
-    lags: usize,
-    /// Where the lags within the circle are, row by row: first place and count. Of the first row those from zero on.
-    runs: Vec<(usize, usize)>,
-    /// Area in px² that a lag stands for, its opposite's too; zero for filling.
-    area: Vec<f32>,
-    /// x² + y², x² − y² and 2xy.
-    bases: [Vec<f32>; 3],
-}
-
-/// Buffers for one thread, for the moments that made them. Their content between calls does not matter.
-#[derive(Debug, Clone)]
-pub struct AdaptiveScratch {
-    /// Lags within the circle, filled up.
-    values: Vec<f32>,
-    /// Weights W of the lags times their area, for the ellipticity `chi`.
-    weights: Vec<f32>,
-    chi: [f32; 2],
-    /// Gradients on the same lags.
-    gradients: [Vec<f32>; 6],
-}
-
-/// What was found on an autocorrelation.
+/// A ratio of two sums over lags. What was added to the divisor is part of it.
 #[derive(Debug, Clone, Copy)]
-pub struct AdaptiveShape {
-    /// χ.
-    pub distortion: Distortion,
-    /// Ellipticity of the weight, which is χ.
-    chi: [f32; 2],
-    /// Weighted integral of x² + y², regularised.
-    trace: f32,
-    /// (1 − ∂m/∂χ)⁻¹.
-    inverse: [[f32; 2]; 2],
+pub struct Ratio {
+    pub(crate) value: f32,
+    divisor: f32,
 }
 
-/// F_χχ of both components in units of the trace: for χ₁ twice, for χ₁ and χ₂, for χ₂ twice.
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct Curvature([[f32; 3]; 2]);
+impl Ratio {
+    /// Its change with small changes of the divisor and of the dividend.
+    pub(crate) fn change(self, divisor: f32, dividend: f32) -> f32 {
+        (dividend - self.value * divisor) / self.divisor
+    }
 
-impl AdaptiveShape {
-    /// Mean of χ″(a, b) over changes a and b, from the means of the products χ′_j(a) χ′_k(b) for the pairs 11, 12 and 22, and of
-    /// Σ_k χ′_k(a) ∂φ_i(b)/∂χ_k, which is the same if a and b are exchanged, in units of the trace.
-    pub(crate) fn mean_second_derivative(
-        &self,
-        curvature: &Curvature,
-        products: [f32; 3],
-        mixed: [f32; 2],
-    ) -> [f64; 2] {
-        let Curvature(curvature) = curvature;
-        let along = [0, 1].map(|i| {
-            let terms = curvature[i].iter().zip([1.0, 2.0, 1.0]).zip(products);
-            terms.map(|((f, count), p)| f * count * p).sum::<f32>() + 2.0 * mixed[i]
-        });
-        self.inverse
-            .map(|row| f64::from(row[0] * along[0] + row[1] * along[1]))
+    /// Mean of its second derivative over changes a and b, from the mean product of its own change with a and the divisor's
+    /// with b, which is the same if a and b are exchanged.
+    pub(crate) fn mean_second_derivative(self, product: f32) -> f64 {
+        f64::from(-2.0 * product / self.divisor)
     }
 }
 
-/// Integrals over lags, weighted with W: the bases a, b, c; weighted with −2 ∂W/∂q: the products aa, ab,
-/// ac, bb, bc, cc.
-type WeightedSums = [f32; 9];
+/// Weights of the lags for N sums, laid out as `spectral::Lags`.
+#[derive(Debug, Clone)]
+struct LagWeights<const N: usize> {
+    /// Of both lags that each place stands for, times the area of a lag.
+    weights: [Vec<f32>; N],
+    width: usize,
+}
 
-impl AdaptiveMoments {
-    /// Plans for a weight of `scale` px and autocorrelations on `lattice`; lags within the circle count.
-    pub fn new(scale: f64, lattice: HexLattice) -> Self {
-        let mut moments = AdaptiveMoments {
-            square: (scale * scale) as f32,
-            lags: lattice.count(),
-            runs: Vec::new(),
-            area: Vec::new(),
-            bases: Default::default(),
-        };
-        let places: Vec<[f64; 2]> = lattice.places().collect();
-        for (row, places) in places.chunks_exact(lattice.width()).enumerate() {
-            let used = |&[x, y]: &[f64; 2]| lattice.contains([x, y]) && (y > 0.0 || x >= 0.0);
-            let first = places.iter().position(used).unwrap_or(0);
-            let before = moments.area.len();
-            for &[x, y] in places.iter().filter(|place| used(place)) {
-                let count = if x == 0.0 && y == 0.0 { 1.0 } else { 2.0 };
-                let bases = [x * x + y * y, x * x - y * y, 2.0 * x * y];
-                moments.push(
-                    (count * lattice.area()) as f32,
-                    bases.map(|basis| basis as f32),
-                );
+impl<const N: usize> LagWeights<N> {
+    /// Weights by place in px; lags beyond the circle of `lattice` have none.
+    fn new(lattice: HexLattice, of: impl Fn([f64; 2]) -> [f64; N]) -> Self {
+        let mut weights = [const { Vec::new() }; N];
+        for place in lattice.places() {
+            let within = f64::from(u8::from(lattice.contains(place)));
+            let count = within * lattice.area() * if place[1] == 0.0 { 1.0 } else { 2.0 };
+            for (weights, weight) in weights.iter_mut().zip(of(place)) {
+                weights.push((count * weight) as f32);
             }
-            let count = moments.area.len() - before;
-            moments.runs.push((row * lattice.width() + first, count));
         }
-        while !moments.area.len().is_multiple_of(LANES) {
-            moments.push(0.0, [0.0; 3]);
-        }
-        moments
-    }
-
-    fn push(&mut self, area: f32, bases: [f32; 3]) {
-        self.area.push(area);
-        for (basis, value) in self.bases.iter_mut().zip(bases) {
-            basis.push(value);
+        LagWeights {
+            weights,
+            width: lattice.width(),
         }
     }
 
-    /// Buffers that fit.
-    pub fn scratch(&self) -> AdaptiveScratch {
-        AdaptiveScratch {
-            values: vec![0.0; self.area.len()],
-            weights: vec![0.0; self.area.len()],
-            chi: [f32::NAN; 2],
-            gradients: [(); 6].map(|()| vec![0.0; self.area.len()]),
+    fn sums(&self, lags: &[f32]) -> [f32; N] {
+        sums(lags, self.weights.each_ref().map(Vec::as_slice))
+    }
+
+    /// Weights of the lags, each for itself, whose sum with a change of the autocorrelation is the change of a sum.
+    fn gradients(&self) -> [Vec<f32>; N] {
+        // Rows y > 0 stand for both signs.
+        self.weights.each_ref().map(|weights| {
+            let rows = weights.chunks_exact(self.width).enumerate();
+            rows.flat_map(|(y, row)| row.iter().map(move |w| if y == 0 { *w } else { 0.5 * w }))
+                .collect()
+        })
+    }
+}
+
+/// Round Gaussian galaxies of one size, as the autocorrelation shows them.
+#[derive(Debug, Clone, Copy)]
+pub struct TypicalGalaxy {
+    /// Mean square per axis in px², without the PSF.
+    pub variance: f64,
+    /// σ in pixels of the Gaussian that the deconvolved stamp is convolved with.
+    pub target: f64,
+    /// σ in pixels of the window.
+    pub window: f64,
+}
+
+impl TypicalGalaxy {
+    /// Mean square per axis behind the target, and also behind the window.
+    fn extents(self) -> [f64; 2] {
+        let deconvolved = self.variance + self.target * self.target;
+        let windowed = 1.0 / (1.0 / deconvolved + 1.0 / (self.window * self.window));
+        [deconvolved, windowed]
+    }
+
+    /// The autocorrelation of one of flux one at a lag of this square in px².
+    pub(crate) fn autocorrelation(self, square: f64) -> f64 {
+        let [deconvolved, windowed] = self.extents();
+        let peak = windowed / (4.0 * std::f64::consts::PI * deconvolved * deconvolved);
+        peak * (-square / (4.0 * windowed)).exp()
+    }
+
+    /// Derivative of its autocorrelation with respect to γ₁, in units of it.
+    fn slope(self, [x, y]: [f64; 2]) -> f64 {
+        let [deconvolved, _] = self.extents();
+        (x * x - y * y) * self.variance / (2.0 * deconvolved * deconvolved)
+    }
+}
+
+/// Weights of the ellipticity for one scale and one typical galaxy.
+#[derive(Debug, Clone)]
+pub struct RoundMoments {
+    /// Of A₀, A₊/ρ and A×/ρ.
+    lags: LagWeights<3>,
+    scale: f64,
+}
+
+impl RoundMoments {
+    /// For the lags of `lattice`, and a weight of `scale` px.
+    pub fn new(scale: f64, galaxy: TypicalGalaxy, lattice: HexLattice) -> Self {
+        let bases = |[x, y]: [f64; 2]| [1.0, x * x - y * y, 2.0 * x * y];
+        let (mut light, mut response) = (0.0, 0.0);
+        for place @ [x, y] in lattice.places().filter(|place| lattice.contains(*place)) {
+            let count = if y == 0.0 { 1.0 } else { 2.0 };
+            let square = x * x + y * y;
+            let weighted = count * weight(scale, square) * galaxy.autocorrelation(square);
+            light += weighted;
+            response += weighted * bases(place)[1] * galaxy.slope(place);
+        }
+        let rho = response / light;
+        let weights = |place @ [x, y]: [f64; 2]| {
+            let weight = weight(scale, x * x + y * y);
+            let [one, plus, cross] = bases(place);
+            [weight * one, weight * plus / rho, weight * cross / rho]
+        };
+        RoundMoments {
+            lags: LagWeights::new(lattice, weights),
+            scale,
         }
     }
 
-    /// Finds χ of `acf`, laid out as `spectral::Lags`.
-    ///
-    /// `regularisation`, in px⁴ times the unit of `acf`, is added to the integral of x² + y² by which the
-    /// moments are divided. Of an autocorrelation that is all noise that integral is anything; with a
-    /// few times its noise added, χ is smaller and less noisy.
+    /// A₀ and the dividends of e₁ and e₂, of an autocorrelation or of its change.
+    pub(crate) fn sums(&self, lags: &[f32]) -> [f32; 3] {
+        self.lags.sums(lags)
+    }
+
+    /// e₁ and e₂ of `acf`, laid out as `spectral::Lags`, with `regularisation` added to A₀.
     ///
     /// # Errors
-    /// Where no ellipticity matches: the weighted moments are not positive, or the iteration does not
-    /// settle.
-    pub fn measure(
-        &self,
-        acf: &[f32],
-        regularisation: f32,
-        scratch: &mut AdaptiveScratch,
-    ) -> Result<AdaptiveShape, Flag> {
-        debug_assert_eq!(acf.len(), self.lags);
-        self.gather(acf, &mut scratch.values);
-        let mut chi = [0.0f32; 2];
-        for _ in 0..MAX_NEWTON_STEPS {
-            let s = self.sums(scratch, chi);
-            let [extent, n1, n2, ..] = s;
-            let t = extent + regularisation;
-            if !(t > 0.0 && t.is_finite()) {
-                return Err(Flag::NoExtent);
-            }
-            let moment = [n1 / t, n2 / t];
-            let rest = [moment[0] - chi[0], moment[1] - chi[1]];
-            let slope = self.derivative(&s, chi, moment, t);
-            let [[a, b], [c, d]] = [
-                [1.0 - slope[0][0], -slope[0][1]],
-                [-slope[1][0], 1.0 - slope[1][1]],
-            ];
-            let determinant = a * d - b * c;
-            if determinant.is_nan() || determinant.abs() < MIN_DETERMINANT {
-                return Err(Flag::NoExtent);
-            }
-            let inverse = [
-                [d / determinant, -b / determinant],
-                [-c / determinant, a / determinant],
-            ];
-            let mut step = [
-                inverse[0][0] * rest[0] + inverse[0][1] * rest[1],
-                inverse[1][0] * rest[0] + inverse[1][1] * rest[1],
-            ];
-            let length = step[0].hypot(step[1]);
-            if length < CONVERGED_STEP {
-                return Ok(AdaptiveShape {
-                    distortion: Distortion::new(f64::from(chi[0]), f64::from(chi[1])),
-                    chi,
-                    trace: t,
-                    inverse,
-                });
-            }
-            let short = (MAX_NEWTON_STEP / length).min(1.0);
-            step = step.map(|s| s * short);
-            chi = [chi[0] + step[0], chi[1] + step[1]];
-            let modulus = chi[0].hypot(chi[1]);
-            if modulus > MAX_WEIGHT_MODULUS {
-                chi = chi.map(|e| e * MAX_WEIGHT_MODULUS / modulus);
-            }
+    /// Where the divisor is not positive: of an autocorrelation that is all noise, A₀ is anything.
+    pub fn measure(&self, acf: &[f32], regularisation: f32) -> Result<[Ratio; 2], Flag> {
+        let [zero, plus, cross] = self.sums(acf);
+        let divisor = zero + regularisation;
+        if !(divisor > 0.0 && divisor.is_finite() && plus.is_finite() && cross.is_finite()) {
+            return Err(Flag::NoExtent);
         }
-        Err(Flag::NoExtent)
+        Ok([plus, cross].map(|dividend| Ratio {
+            value: dividend / divisor,
+            divisor,
+        }))
     }
 
-    /// The regularisation that halves the effect of a small distortion of the round `acf`.
-    ///
-    /// The weight follows the galaxy: with m = aχ′ + bχ the moments of a galaxy of distortion χ′ under a weight of χ,
-    /// χ = aχ′/(1 − b) is aχ′T/((1 − b)T + s) after regularisation by s.
-    pub fn halving_regularisation(&self, acf: &[f32]) -> f32 {
-        let mut scratch = self.scratch();
-        self.gather(acf, &mut scratch.values);
-        let sums = self.sums(&mut scratch, [0.0; 2]);
-        let extent = sums[0];
-        let [[slope, _], _] = self.derivative(&sums, [0.0; 2], [0.0; 2], extent);
-        (1.0 - slope) * extent
+    /// Change of e₁ and e₂ with a change of the autocorrelation.
+    pub(crate) fn response(&self, found: &[Ratio; 2], change: &[f32]) -> [f64; 2] {
+        let [zero, plus, cross] = self.sums(change);
+        let [e1, e2] = found;
+        [e1.change(zero, plus), e2.change(zero, cross)].map(f64::from)
     }
 
-    /// Change of χ with a change `change` of the autocorrelation that `shape` was found on.
-    pub fn response(
-        &self,
-        shape: &AdaptiveShape,
-        change: &[f32],
-        scratch: &mut AdaptiveScratch,
-    ) -> [f64; 2] {
-        self.gather(change, &mut scratch.values);
-        self.weigh(shape, scratch);
-        let [a, b, c] = &self.bases;
-        let [t, n1, n2] = plain_sums(&scratch.values, &scratch.weights, [a, b, c]);
-        let moved = [
-            (n1 - shape.chi[0] * t) / shape.trace,
-            (n2 - shape.chi[1] * t) / shape.trace,
-        ];
-        shape
-            .inverse
-            .map(|row| f64::from(row[0] * moved[0] + row[1] * moved[1]))
+    /// Weights of the lags, each for itself, whose sum with a change of the autocorrelation is the change of A₀, or of a
+    /// dividend.
+    pub(crate) fn gradients(&self) -> [Vec<f32>; 3] {
+        self.lags.gradients()
     }
 
-    /// Writes the weights of the lags, each for itself, whose sums with a change of the autocorrelation are χ′₁, χ′₂ and, in
-    /// units of the trace, ∂φ₁/∂χ₁, ∂φ₁/∂χ₂, ∂φ₂/∂χ₁ and ∂φ₂/∂χ₂; laid out as `spectral::Lags`. Lags beyond the circle
-    /// are left as they are. Returns F_χχ on `acf`.
-    pub(crate) fn second_order(
-        &self,
-        shape: &AdaptiveShape,
-        acf: &[f32],
-        scratch: &mut AdaptiveScratch,
-        out: &mut [Vec<f32>; 6],
-    ) -> Curvature {
-        let AdaptiveScratch {
-            values, gradients, ..
-        } = scratch;
-        self.gather(acf, values);
-        let [a, b, c] = &self.bases;
-        let scale = self.scale(shape.chi);
-        let found = second_order_sums(values, &self.area, [a, b, c], shape, scale, gradients);
-        // Lags of the row y = 0 are stored with both signs, lags of other rows with one.
-        for (out, gradient) in out.iter_mut().zip(gradients) {
-            let mut from = 0;
-            for &(first, count) in &self.runs {
-                out[first..first + count].copy_from_slice(&gradient[from..from + count]);
-                from += count;
-            }
-            // Zero lag stands for itself alone, and so twice for half of it; but its bases are zero.
-            let (left, right) = out.split_at_mut(self.runs[0].0);
-            for (left, right) in left.iter_mut().rev().zip(&right[1..]) {
-                *left = *right;
-            }
-        }
-        let [first, second, [t1, t2, _]] = found.map(|sums| sums.map(|sum| sum / shape.trace));
-        // F_i = L_i − χ_i T: second derivatives of the weights, and of the product.
-        Curvature([
-            [first[0] - 2.0 * t1, first[1] - t2, first[2]],
-            [second[0], second[1] - t1, second[2] - 2.0 * t2],
-        ])
-    }
-
-    /// The weight W at lag (x, y), in pixels, that `shape` was found with.
-    pub fn weight(&self, shape: &AdaptiveShape, x: f64, y: f64) -> f64 {
-        let [chi1, chi2] = shape.chi.map(f64::from);
-        let q = f64::from(self.scale(shape.chi))
-            * ((1.0 - chi1) * x * x + (1.0 + chi1) * y * y - 2.0 * chi2 * x * y);
-        (1.0 + q).powf(-1.5)
-    }
-
-    // Takes the lags within the circle.
-    fn gather(&self, acf: &[f32], values: &mut [f32]) {
-        let mut to = 0;
-        for &(first, count) in &self.runs {
-            values[to..to + count].copy_from_slice(&acf[first..first + count]);
-            to += count;
-        }
-        values[to..].fill(0.0);
-    }
-
-    // Makes sure that the weights are those that `shape` was found with: it may not be the one that was found last.
-    fn weigh(&self, shape: &AdaptiveShape, scratch: &mut AdaptiveScratch) {
-        if scratch.chi != shape.chi {
-            self.sums(scratch, shape.chi);
-        }
-    }
-
-    // Sums over the values that were taken; leaves their weights.
-    fn sums(&self, scratch: &mut AdaptiveScratch, chi: [f32; 2]) -> WeightedSums {
-        let [a, b, c] = &self.bases;
-        let AdaptiveScratch {
-            values,
-            weights,
-            chi: of,
-            ..
-        } = scratch;
-        *of = chi;
-        weighted_sums(values, &self.area, [a, b, c], chi, self.scale(chi), weights)
-    }
-
-    // 1/(√(1 − |χ|²) r²).
-    fn scale(&self, chi: [f32; 2]) -> f32 {
-        let rest = 1.0 - chi[0] * chi[0] - chi[1] * chi[1];
-        1.0 / (rest.sqrt() * self.square)
-    }
-
-    // ∂m_i/∂χ_j of the moments' ellipticity m, whose divisor is `t`, with that of the weight.
-    fn derivative(
-        &self,
-        s: &WeightedSums,
-        chi: [f32; 2],
-        moment: [f32; 2],
-        t: f32,
-    ) -> [[f32; 2]; 2] {
-        let [_, _, _, aa, ab, ac, bb, bc, cc] = *s;
-        let k = self.scale(chi);
-        let rest = 1.0 - chi[0] * chi[0] - chi[1] * chi[1];
-        // Σ A V q·(a, b, c), for V = −2 ∂W/∂q and q = k(a − χ₁b − χ₂c).
-        let q = |xa: f32, xb: f32, xc: f32| k * (xa - chi[0] * xb - chi[1] * xc);
-        let (qa, qb, qc) = (q(aa, ab, ac), q(ab, bb, bc), q(ac, bc, cc));
-        // ∂W/∂χ_j = ½V[k·(b, c)_j − q χ_j/(1 − |χ|²)].
-        let with = [[ab, bb, bc], [ac, bc, cc]];
-        let mut slope = [[0.0; 2]; 2];
-        for j in 0..2 {
-            let turn = chi[j] / rest;
-            let dt = 0.5 * (k * with[j][0] - turn * qa);
-            let d1 = 0.5 * (k * with[j][1] - turn * qb);
-            let d2 = 0.5 * (k * with[j][2] - turn * qc);
-            slope[0][j] = (d1 - moment[0] * dt) / t;
-            slope[1][j] = (d2 - moment[1] * dt) / t;
-        }
-        slope
+    /// The weight W at a lag of this square in px².
+    pub(crate) fn weight(&self, square: f64) -> f64 {
+        weight(self.scale, square)
     }
 }
 
-#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn weighted_sums(
-    values: &[f32],
-    area: &[f32],
-    bases: [&[f32]; 3],
-    chi: [f32; 2],
-    scale: f32,
-    weights: &mut [f32],
-) -> WeightedSums {
-    let mut lanes = [[0.0f32; LANES]; 9];
-    let [a, b, c] = bases.map(|basis| basis.chunks_exact(LANES));
-    let chunks = values.chunks_exact(LANES).zip(area.chunks_exact(LANES));
-    let chunks = chunks.zip(a).zip(b).zip(c);
-    for (kept, ((((v, area), a), b), c)) in weights.chunks_exact_mut(LANES).zip(chunks) {
-        let (mut w, mut bend) = ([0.0f32; LANES], [0.0f32; LANES]);
-        for l in 0..LANES {
-            let inverse = 1.0 / (1.0 + scale * (a[l] - chi[0] * b[l] - chi[1] * c[l]));
-            kept[l] = area[l] * inverse * inverse.sqrt();
-            w[l] = v[l] * kept[l];
-            bend[l] = 3.0 * w[l] * inverse;
-        }
-        for l in 0..LANES {
-            lanes[0][l] += w[l] * a[l];
-            lanes[1][l] += w[l] * b[l];
-            lanes[2][l] += w[l] * c[l];
-            let (va, vb, vc) = (bend[l] * a[l], bend[l] * b[l], bend[l] * c[l]);
-            lanes[3][l] += va * a[l];
-            lanes[4][l] += va * b[l];
-            lanes[5][l] += va * c[l];
-            lanes[6][l] += vb * b[l];
-            lanes[7][l] += vb * c[l];
-            lanes[8][l] += vc * c[l];
-        }
-    }
-    lanes.map(|lane| lane.iter().sum())
-}
-
-// The first three of them, with weights that are known.
-#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn plain_sums(values: &[f32], weights: &[f32], bases: [&[f32]; 3]) -> [f32; 3] {
-    let mut lanes = [[0.0f32; LANES]; 3];
-    let [a, b, c] = bases.map(|basis| basis.chunks_exact(LANES));
-    let chunks = values.chunks_exact(LANES).zip(weights.chunks_exact(LANES));
-    for ((((v, w), a), b), c) in chunks.zip(a).zip(b).zip(c) {
-        for l in 0..LANES {
-            let weighted = v[l] * w[l];
-            lanes[0][l] += weighted * a[l];
-            lanes[1][l] += weighted * b[l];
-            lanes[2][l] += weighted * c[l];
-        }
-    }
-    lanes.map(|lane| lane.iter().sum())
-}
-
-// Sums over the values of φ₁ and φ₂ with the second derivatives of W for χ₁ twice, χ₁ and χ₂, and χ₂ twice; and of L_T with the
-// first derivatives. Writes gradients of the lags.
-#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn second_order_sums(
-    values: &[f32],
-    area: &[f32],
-    bases: [&[f32]; 3],
-    shape: &AdaptiveShape,
-    scale: f32,
-    out: &mut [Vec<f32>; 6],
-) -> [[f32; 3]; 3] {
-    let [chi1, chi2] = shape.chi;
-    let per_rest = 1.0 / (1.0 - chi1 * chi1 - chi2 * chi2);
-    let (turn1, turn2) = (chi1 * per_rest, chi2 * per_rest);
-    // ∂²q/∂χ_j∂χ_k in units of q, but for the terms with the bases.
-    let own1 = per_rest + 3.0 * turn1 * turn1;
-    let own2 = per_rest + 3.0 * turn2 * turn2;
-    let cross = 3.0 * turn1 * turn2;
-    // Each lag for itself: half of an area, which is of both.
-    let unit = 0.5 / shape.trace;
-    let [[i11, i12], [i21, i22]] = shape.inverse;
-    let mut lanes = [[0.0f32; LANES]; 8];
-    for at in (0..values.len()).step_by(LANES) {
-        let part =
-            |all: &'_ [f32]| -> [f32; LANES] { std::array::from_fn(|l| all[at..][..LANES][l]) };
-        let [values, area] = [values, area].map(part);
-        let [a, b, c] = bases.map(part);
-        let mut gradients = [[0.0f32; LANES]; 6];
-        for l in 0..LANES {
-            let q = scale * (a[l] - chi1 * b[l] - chi2 * c[l]);
-            let inverse = 1.0 / (1.0 + q);
-            // W, −∂W/∂q and ∂²W/∂q².
-            let weight = area[l] * inverse * inverse.sqrt();
-            let bend = 1.5 * weight * inverse;
-            let bend2 = 2.5 * bend * inverse;
-            // −∂q/∂χ_j.
-            let (p1, p2) = (scale * b[l] - q * turn1, scale * c[l] - q * turn2);
-            let (along, across) = (b[l] - chi1 * a[l], c[l] - chi2 * a[l]);
-            let (moved1, moved2) = (bend * p1, bend * p2);
-            gradients[0][l] = unit * weight * (i11 * along + i12 * across);
-            gradients[1][l] = unit * weight * (i21 * along + i22 * across);
-            gradients[2][l] = unit * (moved1 * along - weight * a[l]);
-            gradients[3][l] = unit * moved2 * along;
-            gradients[4][l] = unit * moved1 * across;
-            gradients[5][l] = unit * (moved2 * across - weight * a[l]);
-            let v = values[l];
-            let (tb, tc) = (scale * turn1, scale * turn2);
-            let w11 = v * (bend2 * p1 * p1 + bend * (2.0 * tb * b[l] - own1 * q));
-            let w12 = v * (bend2 * p1 * p2 + bend * (tc * b[l] + tb * c[l] - cross * q));
-            let w22 = v * (bend2 * p2 * p2 + bend * (2.0 * tc * c[l] - own2 * q));
-            lanes[0][l] += w11 * along;
-            lanes[1][l] += w12 * along;
-            lanes[2][l] += w22 * along;
-            lanes[3][l] += w11 * across;
-            lanes[4][l] += w12 * across;
-            lanes[5][l] += w22 * across;
-            lanes[6][l] += v * moved1 * a[l];
-            lanes[7][l] += v * moved2 * a[l];
-        }
-        for (out, gradient) in out.iter_mut().zip(gradients) {
-            out[at..][..LANES].copy_from_slice(&gradient);
-        }
-    }
-    let [s0, s1, s2, s3, s4, s5, t1, t2] = lanes.map(|lane| lane.iter().sum());
-    [[s0, s1, s2], [s3, s4, s5], [t1, t2, 0.0]]
+fn weight(scale: f64, square: f64) -> f64 {
+    (1.0 + square / (scale * scale)).powf(EXPONENT)
 }
 
 // Scale τ of the weight in units of the window's σ. Chosen by hand: wide enough that sizes up to 10 px differ.
@@ -523,23 +230,15 @@ const LARGEST_SIZE: f64 = 2.0;
 // Smallest size that is reported, in units of the target's σ. Far below the noise of a size, 0.24 px at S/N 20.
 const SMALLEST_SIZE: f64 = 0.1;
 
-/// Weights for one window and target.
+/// Weights of the size for one window and target.
 #[derive(Debug, Clone)]
 pub(crate) struct SizeMoments {
-    /// Of P₀ and P₂, laid out as `Lags`; of both lags that each place stands for.
-    weights: [Vec<f32>; 2],
+    /// Of P₀ and P₂.
+    lags: LagWeights<2>,
     target: f64,
     /// 2/τ² + 1/σ_W².
     rest: f64,
     window: f64,
-    width: usize,
-}
-
-#[derive(Debug, Clone, Copy)]
-pub(crate) struct MeanSquare {
-    pub(crate) square: f32,
-    /// P₀ + s.
-    divisor: f32,
 }
 
 /// A size r, and its first and second derivative with T.
@@ -564,64 +263,43 @@ impl SizeMoments {
     /// For the lags of `lattice`, a target of `target` px and a window of `window` px.
     pub(crate) fn new(target: f64, window: f64, lattice: HexLattice) -> Self {
         let tau = SIZE_WEIGHT_SCALE * window;
-        let mut weights = [Vec::new(), Vec::new()];
-        for [x, y] in lattice.places() {
+        let weights = |[x, y]: [f64; 2]| {
             let square = x * x + y * y;
-            let within = f64::from(u8::from(lattice.contains([x, y])));
-            let count = within * if y == 0.0 { 1.0 } else { 2.0 };
-            let weight = count * lattice.area() * (-0.5 * square / (tau * tau)).exp();
-            weights[0].push(weight as f32);
-            weights[1].push((weight * square) as f32);
-        }
+            let weight = (-0.5 * square / (tau * tau)).exp();
+            [weight, weight * square]
+        };
         SizeMoments {
-            weights,
+            lags: LagWeights::new(lattice, weights),
             target,
             rest: 2.0 / (tau * tau) + 1.0 / (window * window),
             window,
-            width: lattice.width(),
         }
     }
 
     /// P₀ and P₂ of an autocorrelation or of its change.
     pub(crate) fn sums(&self, lags: &[f32]) -> [f32; 2] {
-        let [zero, two] = &self.weights;
-        sums(lags, zero, two)
+        self.lags.sums(lags)
     }
 
     /// T of an autocorrelation, with `regularisation` and the typical T.
-    pub(crate) fn measure(&self, acf: &[f32], regularisation: f32, typical: f32) -> MeanSquare {
+    pub(crate) fn measure(&self, acf: &[f32], regularisation: f32, typical: f32) -> Ratio {
         let [zero, two] = self.sums(acf);
         let divisor = zero + regularisation;
-        MeanSquare {
-            square: (two + regularisation * typical) / divisor,
+        Ratio {
+            value: (two + regularisation * typical) / divisor,
             divisor,
         }
     }
 
     /// Change of T with a change of the autocorrelation.
-    pub(crate) fn response(&self, found: &MeanSquare, change: &[f32]) -> f32 {
-        Self::combine(found, self.sums(change))
+    pub(crate) fn response(&self, found: Ratio, change: &[f32]) -> f32 {
+        let [zero, two] = self.sums(change);
+        found.change(zero, two)
     }
 
     /// Weights of the lags, each for itself, whose sum with a change of the autocorrelation is the change of P₀, or of P₂.
     pub(crate) fn gradients(&self) -> [Vec<f32>; 2] {
-        // Rows y > 0 stand for both signs.
-        let each = |weights: &[f32]| {
-            let rows = weights.chunks_exact(self.width).enumerate();
-            rows.flat_map(|(y, row)| row.iter().map(move |w| if y == 0 { *w } else { 0.5 * w }))
-                .collect()
-        };
-        [each(&self.weights[0]), each(&self.weights[1])]
-    }
-
-    /// Mean of T″(a, b) over changes a and b, from the mean product of P₀(a) and T′(b), which is the same if a and b are exchanged.
-    pub(crate) fn mean_second_derivative(found: &MeanSquare, product: f32) -> f64 {
-        f64::from(-2.0 * product / found.divisor)
-    }
-
-    /// Gradient of T from the gradients of P₀ and P₂.
-    pub(crate) fn combine(found: &MeanSquare, [zero, two]: [f32; 2]) -> f32 {
-        (two - found.square * zero) / found.divisor
+        self.lags.gradients()
     }
 
     /// T of a round Gaussian galaxy of standard deviation `r` px per axis.
@@ -651,25 +329,25 @@ impl SizeMoments {
     }
 }
 
-// Sums of products with both weights.
+// Sums of products with each of the weights.
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn sums(lags: &[f32], zero: &[f32], two: &[f32]) -> [f32; 2] {
-    let mut lanes = [[0.0f32; LANES]; 2];
-    let chunks = lags.chunks_exact(LANES);
-    let at = lags.len() - chunks.remainder().len();
-    for ((v, a), b) in chunks
-        .zip(zero.chunks_exact(LANES))
-        .zip(two.chunks_exact(LANES))
-    {
-        for l in 0..LANES {
-            lanes[0][l] += v[l] * a[l];
-            lanes[1][l] += v[l] * b[l];
+fn sums<const N: usize>(lags: &[f32], weights: [&[f32]; N]) -> [f32; N] {
+    let whole = lags.len() - lags.len() % LANES;
+    let mut lanes = [[0.0f32; LANES]; N];
+    for at in (0..whole).step_by(LANES) {
+        let values = &lags[at..][..LANES];
+        for (lane, weights) in lanes.iter_mut().zip(weights) {
+            let weights = &weights[at..][..LANES];
+            for l in 0..LANES {
+                lane[l] += values[l] * weights[l];
+            }
         }
     }
     let mut sums = lanes.map(|lane| lane.iter().sum::<f32>());
-    for k in at..lags.len() {
-        sums[0] += lags[k] * zero[k];
-        sums[1] += lags[k] * two[k];
+    for k in whole..lags.len() {
+        for (sum, weights) in sums.iter_mut().zip(weights) {
+            *sum += lags[k] * weights[k];
+        }
     }
     sums
 }
@@ -979,8 +657,27 @@ mod tests {
         }
     }
 
-    fn moments(scale: f64) -> AdaptiveMoments {
-        AdaptiveMoments::new(scale, lattice(1.0))
+    const TYPICAL: TypicalGalaxy = TypicalGalaxy {
+        variance: 8.8,
+        target: TARGET,
+        window: WINDOW,
+    };
+
+    fn moments(scale: f64) -> RoundMoments {
+        RoundMoments::new(scale, TYPICAL, lattice(1.0))
+    }
+
+    fn values(found: [Ratio; 2]) -> [f32; 2] {
+        found.map(|ratio| ratio.value)
+    }
+
+    /// Sum over all lags of weights of each: those below the first row stand for two.
+    fn sum(weights: &[f32], lags: &[f32]) -> f32 {
+        let width = lattice(1.0).width();
+        let terms = weights.iter().zip(lags).enumerate();
+        terms
+            .map(|(at, (w, v))| w * v * if at < width { 1.0 } else { 2.0 })
+            .sum()
     }
 
     /// Autocorrelation of a Gaussian galaxy of distortion (e1, e2) and Qxx + Qyy = size, on rows of lags `spacing` apart.
@@ -999,60 +696,51 @@ mod tests {
     }
 
     #[test]
-    fn the_weight_is_that_of_the_moments() {
-        let (spacing, scale) = (1.5, 3.0);
-        let lattice = lattice(spacing);
-        let moments = AdaptiveMoments::new(scale, lattice);
-        let mut scratch = moments.scratch();
-        let acf = gaussian(spacing, 20.0, 0.3, -0.2);
-        let shape = moments.measure(&acf, 0.0, &mut scratch).unwrap();
-        let (mut extent, mut e2) = (0.0, 0.0);
-        for (&value, [x, y]) in acf.iter().zip(lattice.places()) {
-            if !lattice.contains([x, y]) {
-                continue;
-            }
-            // Rows beyond the first stand for both signs.
-            let count = if y == 0.0 { 1.0 } else { 2.0 };
-            let weighted = count * f64::from(value) * moments.weight(&shape, x, y);
-            extent += weighted * (x * x + y * y);
-            e2 += weighted * 2.0 * x * y;
-        }
-        // Sums of hundreds of f32 terms.
-        assert!((extent * lattice.area() / f64::from(shape.trace) - 1.0).abs() < 1e-5);
-        assert!((e2 / extent - shape.distortion.e2).abs() < 1e-5);
-    }
-
-    #[test]
-    fn the_distortion_of_a_gaussian_is_found_with_its_sign() {
-        for (spacing, scale) in [(1.0, 2.0), (1.5, 3.0)] {
-            let moments = AdaptiveMoments::new(scale, lattice(spacing));
-            let mut scratch = moments.scratch();
-            for size in [8.0, 16.0, 30.0] {
-                for (e1, e2) in [(0.0, 0.0), (0.3, 0.0), (-0.2, 0.4), (0.0, -0.4), (0.3, 0.3)] {
-                    scratch.values.fill(f32::NAN);
-                    let acf = gaussian(spacing, size, e1, e2);
-                    let shape = moments.measure(&acf, 0.0, &mut scratch).unwrap();
-                    // What the cut at 16 px leaves out of the largest, which the plain sums have too.
-                    let apart = (shape.distortion.e1 - e1).hypot(shape.distortion.e2 - e2);
-                    assert!(apart < 5e-3, "{size} {e1} {e2}: {:?}", shape.distortion);
-                }
+    fn the_typical_galaxy_responds_by_one() {
+        let TypicalGalaxy {
+            variance,
+            target,
+            window,
+        } = TYPICAL;
+        let windowed = |extent: f64| 1.0 / (1.0 / (extent + target * target) + window.powi(-2));
+        for scale in [1.5, 3.0] {
+            let moments = moments(scale);
+            let round = TypicalGalaxy::autocorrelation;
+            let lags = lattice(1.0).places();
+            let acf: Vec<f32> = lags
+                .map(|[x, y]| round(TYPICAL, x * x + y * y) as f32)
+                .collect();
+            // Single precision.
+            let round = values(moments.measure(&acf, 0.0).unwrap());
+            assert!(round.iter().all(|e| e.abs() < 1e-6), "{round:?}");
+            // A shear γ along an axis, and between axes, changes the mean squares along and across it by e^(±2γ).
+            let gamma = 0.005;
+            let [along, across] =
+                [2.0 * gamma, -2.0 * gamma].map(|by: f64| windowed(variance * by.exp()));
+            let distortion = (along - across) / (along + across);
+            for k in 0..2 {
+                let chi = [[distortion, 0.0], [0.0, distortion]][k];
+                let acf = gaussian(1.0, 2.0 * (along + across), chi[0], chi[1]);
+                let e = values(moments.measure(&acf, 0.0).unwrap());
+                // γ², and light beyond 16 px.
+                assert!((e[k] / gamma as f32 - 1.0).abs() < 5e-3, "{scale}: {e:?}");
+                assert!(e[1 - k].abs() < 1e-6, "{e:?}");
             }
         }
     }
 
     #[test]
-    fn distortions_along_an_axis_and_between_axes_are_the_same() {
+    fn ellipticities_along_an_axis_and_between_axes_are_the_same() {
         // As far apart for the weight as in the submissions, and farther.
         for spacing in [4.0 / 3.0, 2.0] {
-            let moments = AdaptiveMoments::new(1.5, lattice(spacing));
-            let mut scratch = moments.scratch();
+            let moments = RoundMoments::new(1.5, TYPICAL, lattice(spacing));
             // Six axes prefer one of two opposite distortions, to second order.
-            let mut response = |e1, e2| {
+            let response = |chi1, chi2| {
                 let [plus, minus] = [1.0, -1.0].map(|sign| {
-                    let acf = gaussian(spacing, 16.0, sign * e1, sign * e2);
-                    let Distortion { e1, e2 } =
-                        moments.measure(&acf, 0.0, &mut scratch).unwrap().distortion;
-                    e1 + e2
+                    let acf = gaussian(spacing, 16.0, sign * chi1, sign * chi2);
+                    values(moments.measure(&acf, 0.0).unwrap())
+                        .iter()
+                        .sum::<f32>()
                 });
                 plus - minus
             };
@@ -1063,97 +751,43 @@ mod tests {
     }
 
     #[test]
-    fn halving_leaves_half_of_a_small_distortion() {
+    fn derivatives_of_ellipticities_are_differences() {
         let moments = moments(1.5);
-        let mut scratch = moments.scratch();
-        for variance in [9.0, 16.0, 30.0] {
-            let halving = moments.halving_regularisation(&gaussian(1.0, variance, 0.0, 0.0));
-            for (e1, e2) in [(0.01, 0.0), (0.0, 0.01)] {
-                let acf = gaussian(1.0, variance, e1, e2);
-                let [hard, soft] = [0.0, halving].map(|regularisation| {
-                    let shape = moments.measure(&acf, regularisation, &mut scratch).unwrap();
-                    shape.distortion.e1 + shape.distortion.e2
-                });
-                // Of second order in the distortion.
-                assert!((soft / hard - 0.5).abs() < 1e-3, "{soft} of {hard}");
-            }
-        }
-    }
-
-    #[test]
-    fn the_response_is_the_finite_difference() {
-        let moments = moments(1.5);
-        let mut scratch = moments.scratch();
-        let acf = gaussian(1.0, 20.0, 0.3, -0.2);
-        let other = gaussian(1.0, 14.0, -0.1, 0.4);
+        let (acf, other) = (
+            gaussian(1.0, 20.0, 0.3, -0.2),
+            gaussian(1.0, 14.0, -0.1, 0.4),
+        );
         for regularisation in [0.0, 20.0] {
-            let shape = moments.measure(&acf, regularisation, &mut scratch).unwrap();
-            let response = moments.response(&shape, &other, &mut scratch);
-            let mut moved = |h: f32| {
-                let acf: Vec<f32> = acf.iter().zip(&other).map(|(a, o)| a + h * o).collect();
-                let shape = moments.measure(&acf, regularisation, &mut scratch);
-                shape.unwrap().distortion
-            };
-            let (plus, minus) = (moved(0.01), moved(-0.01));
-            let slope = [(plus.e1 - minus.e1) / 0.02, (plus.e2 - minus.e2) / 0.02];
-            for (found, expected) in response.iter().zip(slope) {
-                // f32 resolves χ to 3e-6, divided by 0.02; the third derivative is smaller.
-                assert!((found - expected).abs() < 5e-4, "{found} {expected}");
-            }
-        }
-    }
-
-    #[test]
-    fn second_derivatives_are_differences_of_responses() {
-        let moments = moments(1.5);
-        let mut scratch = moments.scratch();
-        let width = lattice(1.0).width();
-        // Over all lags: those below the first row stand for two.
-        let sum = |weights: &[f32], change: &[f32]| -> f32 {
-            let lags = weights.iter().zip(change).enumerate();
-            lags.map(|(at, (w, v))| w * v * if at < width { 1.0 } else { 2.0 })
-                .sum()
-        };
-        let other = gaussian(1.0, 14.0, -0.1, 0.4);
-        for (e1, e2, regularisation) in [(0.0, 0.0, 0.0), (0.3, -0.2, 20.0), (-0.1, 0.6, 0.0)] {
-            let acf = gaussian(1.0, 20.0, e1, e2);
-            let shape = moments.measure(&acf, regularisation, &mut scratch).unwrap();
-            let response = moments.response(&shape, &other, &mut scratch);
-            let mut gradients = [(); 6].map(|()| vec![0.0; acf.len()]);
-            let curvature = moments.second_order(&shape, &acf, &mut scratch, &mut gradients);
-            let [x1, x2, g11, g12, g21, g22] = gradients.map(|weights| sum(&weights, &other));
-            for (found, expected) in [x1, x2].into_iter().zip(response) {
-                assert!((f64::from(found) - expected).abs() < 1e-4 * (1.0 + expected.abs()));
-            }
-            let found = shape.mean_second_derivative(
-                &curvature,
-                [x1 * x1, x1 * x2, x2 * x2],
-                [x1 * g11 + x2 * g12, x1 * g21 + x2 * g22],
-            );
-            let mut moved = |h: f32| {
-                let acf: Vec<f32> = acf.iter().zip(&other).map(|(a, o)| a + h * o).collect();
-                let shape = moments.measure(&acf, regularisation, &mut scratch).unwrap();
-                moments.response(&shape, &other, &mut scratch)
-            };
-            let (plus, minus) = (moved(0.02), moved(-0.02));
+            let found = moments.measure(&acf, regularisation).unwrap();
+            let response = moments.response(&found, &other);
+            let moved =
+                |h: f32| -> Vec<f32> { acf.iter().zip(&other).map(|(a, o)| a + h * o).collect() };
+            let at = |h: f32| moments.measure(&moved(h), regularisation).unwrap();
+            let (plus, minus) = (at(0.01), at(-0.01));
+            let [light, divided @ ..] = moments.gradients().map(|weights| sum(&weights, &other));
             for k in 0..2 {
-                let expected = (plus[k] - minus[k]) / 0.04;
-                // f32 resolves responses to some 10⁻⁵, divided by 0.04.
+                let slope = f64::from(plus[k].value - minus[k].value) / 0.02;
+                // f32 resolves e to 10⁻⁶, divided by 0.02; the third derivative is smaller.
+                assert!((response[k] - slope).abs() < 1e-4, "{response:?} {slope}");
+                let change = found[k].change(light, divided[k]);
+                assert!((f64::from(change) - response[k]).abs() < 1e-5 * (1.0 + slope.abs()));
+                let bent = [plus, minus].map(|found| moments.response(&found, &other)[k]);
+                let expected = (bent[0] - bent[1]) / 0.02;
+                let curvature = found[k].mean_second_derivative(change * light);
                 assert!(
-                    (found[k] - expected).abs() < 2e-3 * (1.0 + expected.abs()),
-                    "{e1} {e2}: {found:?} {expected}"
+                    (curvature - expected).abs() < 2e-3 * (1.0 + expected.abs()),
+                    "{curvature} {expected}"
                 );
             }
         }
     }
 
     #[test]
-    fn an_autocorrelation_without_extent_is_refused() {
+    fn an_autocorrelation_without_light_is_refused() {
         let moments = moments(1.5);
         let lags = lattice(1.0).count();
-        let mut scratch = moments.scratch();
         for acf in [vec![0.0; lags], vec![-1.0; lags], vec![f32::NAN; lags]] {
-            assert!(moments.measure(&acf, 0.0, &mut scratch).is_err());
+            assert!(moments.measure(&acf, 0.0).is_err());
         }
     }
 
@@ -1183,12 +817,12 @@ mod tests {
                 px: size,
                 slope: first,
                 curvature: second,
-            } = moments.size(f64::from(found.square));
+            } = moments.size(f64::from(found.value));
             // The lags end at 20 px, four standard deviations of the weight.
             assert!((size / r - 1.0).abs() < 0.01, "{r}: {size}");
-            assert!((moments.square_of(size) / f64::from(found.square) - 1.0).abs() < 1e-9);
-            let step = 1e-4 * f64::from(found.square);
-            let side = |by: f64| moments.size(f64::from(found.square) + by).px;
+            assert!((moments.square_of(size) / f64::from(found.value) - 1.0).abs() < 1e-9);
+            let step = 1e-4 * f64::from(found.value);
+            let side = |by: f64| moments.size(f64::from(found.value) + by).px;
             let (plus, minus) = (side(step), side(-step));
             // Truncation and rounding of differences of 10⁻⁴.
             assert!(((plus - minus) / (2.0 * step) / first - 1.0).abs() < 1e-5);
@@ -1219,12 +853,12 @@ mod tests {
             .zip(&other)
             .map(|(a, b)| a + step * b)
             .collect();
-        let change = (moments.measure(&moved, 3.0, 20.0).square - found.square) / step;
-        let response = moments.response(&found, &other);
+        let change = (moments.measure(&moved, 3.0, 20.0).value - found.value) / step;
+        let response = moments.response(found, &other);
         // Single precision over a step of 10⁻³.
         close(change / response, 1.0, 0.02);
         let nothing = vec![0.0; galaxy.len()];
-        assert_eq!(moments.measure(&nothing, 3.0, 20.0).square, 20.0);
+        assert_eq!(moments.measure(&nothing, 3.0, 20.0).value, 20.0);
     }
 
     fn settings(acf: AcfKind, background: Background, acf_share: f64) -> ClippedShape {

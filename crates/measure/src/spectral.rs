@@ -135,7 +135,7 @@ pub struct SpectralScratch {
     psf_image: Vec<f32>,
     /// v̂ of the stamp behind the window.
     stamp: Spectrum,
-    gradients: [Spectrum; 8],
+    gradients: [Spectrum; 5],
     /// Real spectra, mode by mode.
     real: [Vec<f32>; 2],
     /// A real even spectrum by parity.
@@ -264,22 +264,22 @@ impl SpectralPsf {
     }
 }
 
-/// Mean products of the changes with noise of σ = 1 of χ₁, χ₂, the size's T, the flux and the light of the ring, and those that
+/// Mean products of the changes with noise of σ = 1 of e₁, e₂, the size's T, the flux and the light of the ring, and those that
 /// their second derivatives consist of.
 pub(crate) struct Products {
-    /// χ₁ and χ₁, χ₁ and χ₂, χ₂ and χ₂.
-    pub(crate) chi_chi: [NoiseChanges<f32>; 3],
-    pub(crate) chi_square: [NoiseChanges<f32>; 2],
-    pub(crate) chi_flux: [NoiseChanges<f32>; 2],
+    /// e₁ and e₁, e₁ and e₂, e₂ and e₂.
+    pub(crate) e_e: [NoiseChanges<f32>; 3],
+    pub(crate) e_square: [NoiseChanges<f32>; 2],
+    pub(crate) e_flux: [NoiseChanges<f32>; 2],
     pub(crate) square_square: NoiseChanges<f32>,
     pub(crate) square_flux: NoiseChanges<f32>,
     pub(crate) flux_flux: NoiseChanges<f32>,
-    pub(crate) ring_chi: [NoiseChanges<f32>; 2],
+    pub(crate) ring_e: [NoiseChanges<f32>; 2],
     pub(crate) ring_square: NoiseChanges<f32>,
     pub(crate) ring_flux: NoiseChanges<f32>,
     pub(crate) ring_ring: NoiseChanges<f32>,
-    /// Σ_k χ′_k · ∂φ_i/∂χ_k of `AdaptiveMoments`.
-    pub(crate) chi_slope: [NoiseChanges<f32>; 2],
+    /// e₁′ · A₀ and e₂′ · A₀ of `RoundMoments`.
+    pub(crate) e_light: [NoiseChanges<f32>; 2],
     /// T′ · P₀ of `SizeMoments`.
     pub(crate) square_zero: NoiseChanges<f32>,
 }
@@ -415,7 +415,7 @@ impl Spectral {
             windowed: [(); 3].map(|()| self.plane.spectrum()),
             psf_image: vec![0.0; p * p],
             stamp: self.plane.spectrum(),
-            gradients: [(); 8].map(|()| self.plane.spectrum()),
+            gradients: [(); 5].map(|()| self.plane.spectrum()),
             real: [zeros(2), zeros(2)],
             even: zeros(2),
             quarter: zeros(1),
@@ -849,8 +849,7 @@ impl Spectral {
         spectrum
     }
 
-    /// Mean products for the stamp last given. `distortion` has the weights of the lags of `AdaptiveMoments::second_order`;
-    /// `size` the spectra by parity of the weights of T and P₀.
+    /// Mean products for the stamp last given. `weights` are the spectra by parity of the weights of e₁, e₂, A₀, T and P₀.
     ///
     /// A quantity a that depends on the windowed result changes with noise n by a′(n) = Σ_k conj(h_a)·n̂, where n̂ is the
     /// deconvolved noise before the window and h_a the gradient of a, taken through the window. Modes of noise are
@@ -858,48 +857,37 @@ impl Spectral {
     pub(crate) fn products(
         &self,
         psf: &SpectralPsf,
-        distortion: &[Vec<f32>; 6],
-        size: [&[f32]; 2],
+        weights: [&[f32]; 5],
         scratch: &mut SpectralScratch,
     ) -> Products {
         let SpectralScratch {
             gradients,
             stamp,
-            even,
             quarter,
-            lags,
             ..
         } = scratch;
-        let (of_distortion, of_size) = gradients.split_at_mut(distortion.len());
-        for (weights, out) in distortion.iter().zip(of_distortion) {
-            self.to_lags.spectrum(weights, lags, even);
-            twice_scaled(stamp, even, &self.scale, out);
-        }
-        for (spectrum, out) in size.into_iter().zip(of_size) {
-            twice_scaled(stamp, spectrum, &self.scale, out);
+        for (weights, out) in weights.into_iter().zip(&mut *gradients) {
+            twice_scaled(stamp, weights, &self.scale, out);
         }
         for gradient in &mut *gradients {
             self.window.apply(gradient, quarter);
         }
-        let [chi1, chi2, phi11, phi12, phi21, phi22, square, zero] = &*gradients;
+        let [e1, e2, light, square, zero] = &*gradients;
         // The flux is the sum under the window.
         let (flux, ring) = (&self.window_spectrum, &self.ring_spectrum);
         let mean = |a: &Spectrum, b: &Spectrum| sums_of_products(a, b, &psf.powers);
         Products {
-            chi_chi: [mean(chi1, chi1), mean(chi1, chi2), mean(chi2, chi2)],
-            chi_square: [mean(chi1, square), mean(chi2, square)],
-            chi_flux: [mean(chi1, flux), mean(chi2, flux)],
+            e_e: [mean(e1, e1), mean(e1, e2), mean(e2, e2)],
+            e_square: [mean(e1, square), mean(e2, square)],
+            e_flux: [mean(e1, flux), mean(e2, flux)],
             square_square: mean(square, square),
             square_flux: mean(square, flux),
             flux_flux: mean(flux, flux),
-            ring_chi: [mean(chi1, ring), mean(chi2, ring)],
+            ring_e: [mean(e1, ring), mean(e2, ring)],
             ring_square: mean(square, ring),
             ring_flux: mean(flux, ring),
             ring_ring: mean(ring, ring),
-            chi_slope: [
-                mean(chi1, phi11) + mean(chi2, phi12),
-                mean(chi1, phi21) + mean(chi2, phi22),
-            ],
+            e_light: [mean(e1, light), mean(e2, light)],
             square_zero: mean(square, zero),
         }
     }

@@ -1,4 +1,4 @@
-//! The linear method: the closed form of the network, and moments under an adaptive weight.
+//! The linear method: the closed form of the network, and moments under a round weight.
 //!
 //! # Noise that is sheared along
 //!
@@ -6,7 +6,7 @@
 //! lensing shears have no noise yet. The mean effect of noise on the change of the autocorrelation is subtracted in
 //! `spectral.rs`. What remains is that the ellipticity is not linear in the autocorrelation: f″(δA, δA′), with δA the
 //! change by noise and δA′ the change by the shear of this noise. Both are linear in the noise, so that the mean follows from
-//! its power and from gradients of f and of its slopes ([`AdaptiveMoments::second_order`]). Fields of noise, added and
+//! its power and from the gradients of f and of its divisor ([`Ratio`]). Fields of noise, added and
 //! subtracted as in Sheldon & Huff (2017), have the same mean; each field took longer and scattered. One galaxy in
 //! [`NOISE_MOMENTS_INTERVAL`] is enough.
 //!
@@ -23,7 +23,7 @@ use std::sync::{Arc, OnceLock};
 use ndarray::{Array2, ArrayView2};
 use shearq_quantities::PixelShape;
 use shearq_submissions::limits::{MAX_TARGET, MIN_TARGET, WINDOWS};
-use shearq_submissions::{LinearDeconvolution, LinearMethod, PsfCut, ShearOrigin};
+use shearq_submissions::{LinearMethod, PsfCut, ShearOrigin};
 
 use super::{
     AdaptedSettings, CutEpoch, CutWorker, Found, FoundObservables, Images, NoiseMeans, image,
@@ -36,7 +36,7 @@ use crate::psf::{
     width_factor, width_step,
 };
 use crate::selection::ShearSettings;
-use crate::shape::{AdaptiveMoments, AdaptiveScratch, AdaptiveShape, MeanSquare, SizeMoments};
+use crate::shape::{Ratio, RoundMoments, SizeMoments, TypicalGalaxy};
 use crate::spectral::{
     EpochScratch, Lags, ModeNoise, NoiseChanges, Spectral, SpectralEpoch, SpectralPsf,
     SpectralScratch, uniform,
@@ -95,33 +95,23 @@ struct Regularisation {
 }
 
 impl Regularisation {
-    /// For round Gaussian galaxies of mean square `variance` px² per axis.
     fn new(
-        method: &LinearMethod,
-        variance: f64,
+        half_snr: f64,
+        galaxy: TypicalGalaxy,
         spectral: &Spectral,
-        moments: &AdaptiveMoments,
+        moments: &RoundMoments,
         size_moments: &SizeMoments,
     ) -> Self {
-        let LinearDeconvolution {
-            target_sigma,
-            window_sigma,
-            ..
-        } = method.deconvolution;
-        let deconvolved = variance + target_sigma * target_sigma;
-        let windowed = 1.0 / (1.0 / deconvolved + 1.0 / (window_sigma * window_sigma));
-        let peak = windowed / (4.0 * std::f64::consts::PI * deconvolved * deconvolved);
-        let lags = spectral.lattice().places().map(|[x, y]| {
-            let square = x * x + y * y;
-            (peak * (-square / (4.0 * windowed)).exp()) as f32
-        });
-        let acf: Vec<f32> = lags.collect();
+        let lags = spectral.lattice().places();
+        let acf: Vec<f32> = lags
+            .map(|[x, y]| galaxy.autocorrelation(x * x + y * y) as f32)
+            .collect();
+        let [light, ..] = moments.sums(&acf);
         let [zero, two] = size_moments.sums(&acf);
         Regularisation {
-            ellipticity: moments.halving_regularisation(&acf)
-                * method.shape.half_snr.powi(2) as f32,
+            ellipticity: light * half_snr.powi(2) as f32,
             size: zero * HALF_SIZE_SNR * HALF_SIZE_SNR,
-            galaxy: spectral.light(variance),
+            galaxy: spectral.light(galaxy.variance),
             typical_square: two / zero,
         }
     }
@@ -166,9 +156,11 @@ struct LinearPlan {
     shear_step: Option<f64>,
     regularisation: Regularisation,
     spectral: Spectral,
-    moments: AdaptiveMoments,
+    moments: RoundMoments,
     size_moments: SizeMoments,
-    /// Gradients of P₀ and P₂ of [`SizeMoments`].
+    /// Gradients of A₀, A₊ and A× of [`RoundMoments`], as spectra.
+    gradients: [Vec<f32>; 3],
+    /// Gradients of P₀ and P₂ of [`SizeMoments`], as spectra.
     size_gradients: [Vec<f32>; 2],
     /// Factor that corrects the flux for the light beyond the window.
     aperture: f64,
@@ -180,11 +172,16 @@ impl LinearPlan {
         let settings = &method.deconvolution;
         let spectral = Spectral::new(n, p, settings)?;
         let scale = method.shape.weight_scale;
-        let moments = AdaptiveMoments::new(scale, spectral.lattice());
         let (target, window) = (settings.target_sigma, settings.window_sigma);
+        let galaxy = TypicalGalaxy {
+            variance,
+            target,
+            window,
+        };
+        let moments = RoundMoments::new(scale, galaxy, spectral.lattice());
         let size_moments = SizeMoments::new(target, window, spectral.lattice());
         let mut scratch = spectral.scratch();
-        let gradients = size_moments.gradients();
+        let mut spectrum = |weights: Vec<f32>| spectral.spectrum_of(&weights, &mut scratch);
         let step = method.shape.sheared_step;
         let shear_step = (step > 0.0).then_some(step);
         let lengths = AdaptedSettings {
@@ -199,14 +196,15 @@ impl LinearPlan {
             lengths,
             iterations: u32::try_from(settings.max_iterations).unwrap_or(u32::MAX),
             regularisation: Regularisation::new(
-                method,
-                variance,
+                method.shape.half_snr,
+                galaxy,
                 &spectral,
                 &moments,
                 &size_moments,
             ),
             aperture: lengths.aperture(variance),
-            size_gradients: gradients.map(|weights| spectral.spectrum_of(&weights, &mut scratch)),
+            gradients: moments.gradients().map(&mut spectrum),
+            size_gradients: size_moments.gradients().map(&mut spectrum),
             size_moments,
             moments,
             spectral,
@@ -470,15 +468,10 @@ struct PlanWorker {
     /// Mean square per axis in px² of the Gaussian with the noise-equivalent area of the PSF.
     psf_variance: f64,
     regularisation: RegularisationTerms,
-    /// Of χ and of its slopes: weights of the lags.
-    gradients: [Vec<f32>; 6],
-    /// Of the size's T: the spectrum of weights of the lags.
-    square_gradient: Vec<f32>,
+    /// Of e₁, e₂ and the size's T, as spectra.
+    gradients: [Vec<f32>; 3],
     buffers: SpectralScratch,
     lags: Lags,
-    /// The shape last measured on `lags`.
-    shape: Option<AdaptiveShape>,
-    values: AdaptiveScratch,
     /// For galaxies with several stamps.
     epochs: Option<Box<EpochBuffers>>,
 }
@@ -493,12 +486,9 @@ impl PlanWorker {
             psf: plan.spectral.psf(),
             psf_variance: 0.0,
             regularisation: RegularisationTerms::default(),
-            gradients: [(); 6].map(|()| plan.spectral.lags().acf),
-            square_gradient: plan.size_gradients[0].clone(),
+            gradients: plan.gradients.clone(),
             buffers: plan.spectral.scratch(),
             lags: plan.spectral.lags(),
-            shape: None,
-            values: plan.moments.scratch(),
             epochs: None,
             plan,
         }
@@ -545,20 +535,15 @@ impl PlanWorker {
         self.regularisation = plan.regularisation.behind(&self.psf);
     }
 
-    /// Response of `shape` to a change of the autocorrelation by `lags.shear1` and `lags.shear2`.
-    fn response(
-        plan: &LinearPlan,
-        shape: &AdaptiveShape,
-        lags: &Lags,
-        values: &mut AdaptiveScratch,
-    ) -> ResponseMatrix {
-        let first = plan.moments.response(shape, &lags.shear1, values);
-        let second = plan.moments.response(shape, &lags.shear2, values);
+    /// Response of the ellipticity to a change of the autocorrelation by `lags.shear1` and `lags.shear2`.
+    fn response(&self, e: &[Ratio; 2]) -> ResponseMatrix {
+        let of = |change| self.plan.moments.response(e, change);
+        let (first, second) = (of(&self.lags.shear1), of(&self.lags.shear2));
         [[first[0], second[0]], [first[1], second[1]]]
     }
 
     /// Flux and size with their responses.
-    fn observables(&self, mean_square: &MeanSquare, noise: f32, seed: u64) -> FoundObservables {
+    fn observables(&self, mean_square: Ratio, noise: f32, seed: u64) -> FoundObservables {
         let LinearPlan {
             size_moments: moments,
             aperture,
@@ -571,7 +556,7 @@ impl PlanWorker {
             flux_error: aperture * f64::from(noise * self.psf.flux_error()),
             ring: self.lags.ring.map(f64::from),
             square_response: [response(&self.lags.shear1), response(&self.lags.shear2)],
-            size: moments.size(f64::from(mean_square.square)),
+            size: moments.size(f64::from(mean_square.value)),
             sheared: shear_step.map(|step| ShearSettings {
                 step,
                 normals: normals(seed),
@@ -582,22 +567,26 @@ impl PlanWorker {
     /// Mean effects of noise on the galaxy whose lags were measured last, with the weight of all galaxies that it stands for.
     fn noise_moments(
         &mut self,
-        shape: &AdaptiveShape,
-        mean_square: &MeanSquare,
+        [e1, e2]: [Ratio; 2],
+        mean_square: Ratio,
         noise: f32,
     ) -> NoiseChanges<NoiseMeans> {
         let plan = &*self.plan;
-        let curvature =
-            plan.moments
-                .second_order(shape, &self.lags.acf, &mut self.values, &mut self.gradients);
-        let [zero, two] = &plan.size_gradients;
-        for ((out, zero), two) in self.square_gradient.iter_mut().zip(zero).zip(two) {
-            *out = SizeMoments::combine(mean_square, [*zero, *two]);
+        let ([light, plus, cross], [zero, two]) = (&plan.gradients, &plan.size_gradients);
+        let parts = [
+            (e1, light, plus),
+            (e2, light, cross),
+            (mean_square, zero, two),
+        ];
+        for (out, (ratio, divisor, dividend)) in self.gradients.iter_mut().zip(parts) {
+            for ((out, divisor), dividend) in out.iter_mut().zip(divisor).zip(dividend) {
+                *out = ratio.change(*divisor, *dividend);
+            }
         }
+        let [of_e1, of_e2, of_square] = &self.gradients;
         let products = plan.spectral.products(
             &self.psf,
-            &self.gradients,
-            [&self.square_gradient, zero],
+            [of_e1, of_e2, light, of_square, zero],
             &mut self.buffers,
         );
         let unit = f64::from(noise * noise) * plan.noise_moments_interval as f64;
@@ -607,26 +596,22 @@ impl PlanWorker {
         let means = |change: fn(NoiseChanges<f32>) -> f32| {
             let of = |product| unit * f64::from(change(product));
             let of_flux = |product| with_flux * f64::from(change(product));
-            let chi_curvature = shape.mean_second_derivative(
-                &curvature,
-                products.chi_chi.map(change),
-                products.chi_slope.map(change),
-            );
-            let square_curvature =
-                SizeMoments::mean_second_derivative(mean_square, change(products.square_zero));
+            let of_ratio =
+                |ratio: Ratio, product| unit * ratio.mean_second_derivative(change(product));
+            let [light1, light2] = products.e_light;
             NoiseMeans {
-                chi_chi: products.chi_chi.map(of),
-                chi_square: products.chi_square.map(of),
-                chi_flux: products.chi_flux.map(of_flux),
+                e_e: products.e_e.map(of),
+                e_square: products.e_square.map(of),
+                e_flux: products.e_flux.map(of_flux),
                 square_square: of(products.square_square),
                 square_flux: of_flux(products.square_flux),
                 flux_flux: with_fluxes * f64::from(change(products.flux_flux)),
-                ring_chi: products.ring_chi.map(of),
+                ring_e: products.ring_e.map(of),
                 ring_square: of(products.ring_square),
                 ring_flux: of_flux(products.ring_flux),
                 ring_ring: of(products.ring_ring),
-                chi_curvature: chi_curvature.map(|value| unit * value),
-                square_curvature: unit * square_curvature,
+                e_curvature: [of_ratio(e1, light1), of_ratio(e2, light2)],
+                square_curvature: of_ratio(mean_square, products.square_zero),
             }
         };
         NoiseChanges {
@@ -651,7 +636,7 @@ impl PlanWorker {
         let of_size = self.regularisation.size * noise * noise;
         let typical = plan.regularisation.typical_square;
         let mean_square = plan.size_moments.measure(&lags.acf, of_size, typical);
-        let size = plan.size_moments.size(f64::from(mean_square.square)).px;
+        let size = plan.size_moments.size(f64::from(mean_square.value)).px;
         let window = plan.lengths.window_sigma * plan.lengths.window_sigma;
         let of_galaxy = size * size;
         let flux = f64::from(lags.flux.value) * plan.lengths.aperture(of_galaxy);
@@ -738,14 +723,10 @@ impl PlanWorker {
     /// `total_noise`. `stamp` decides for which galaxies the effects of noise are determined.
     fn measure_lags(&mut self, stamp: &[f32], sky_noise: f64, total_noise: f32) -> Found {
         let plan = Arc::clone(&self.plan);
-        let lags = &self.lags;
+        let acf = &self.lags.acf;
         let RegularisationTerms { ellipticity, size } = self.regularisation;
-        let shape = plan.moments.measure(
-            &lags.acf,
-            ellipticity * total_noise * total_noise,
-            &mut self.values,
-        );
-        self.shape = shape.as_ref().ok().copied();
+        let variance = total_noise * total_noise;
+        let e = plan.moments.measure(acf, ellipticity * variance);
         let mut found = Found {
             descent: Descent {
                 iterations: plan.iterations,
@@ -754,25 +735,23 @@ impl PlanWorker {
                 energy: f64::NAN,
                 updated: stamp.len() as u32,
             },
-            distortion: shape.map(|shape| shape.distortion),
+            ellipticity: e.map(|e| e.map(|ratio| f64::from(ratio.value))),
             response: None,
             noise_moments: None,
             observables: None,
-            flux: plan.aperture * f64::from(lags.flux.value),
+            flux: plan.aperture * f64::from(self.lags.flux.value),
             radius: plan.spectral.lattice().radius(),
             size: f64::NAN,
         };
-        if let Some(shape) = self.shape {
-            let response = Self::response(&plan, &shape, &self.lags, &mut self.values);
-            found.response = Some(response);
+        if let Ok(e) = e {
+            found.response = Some(self.response(&e));
             let seed = seed_of(stamp, total_noise);
             let typical = plan.regularisation.typical_square;
-            let of_size = size * total_noise * total_noise;
-            let mean_square = plan.size_moments.measure(&self.lags.acf, of_size, typical);
+            let mean_square = plan.size_moments.measure(acf, size * variance, typical);
             if sky_noise > 0.0 && seed.is_multiple_of(plan.noise_moments_interval) {
-                found.noise_moments = Some(self.noise_moments(&shape, &mean_square, total_noise));
+                found.noise_moments = Some(self.noise_moments(e, mean_square, total_noise));
             }
-            let observables = self.observables(&mean_square, total_noise, seed);
+            let observables = self.observables(mean_square, total_noise, seed);
             found.size = observables.size.px;
             found.observables = Some(observables);
         }
@@ -793,13 +772,13 @@ impl PlanWorker {
         let lattice = spectral.lattice();
         let acf = square_lags(&self.lags.acf, lattice);
         let lag = |place: usize| (place as f64 - lattice.reach as f64) * lattice.row_spacing;
-        let weight = self.shape.map(|shape| {
-            Array2::from_shape_fn(acf.dim(), |(y, x)| moments.weight(&shape, lag(x), lag(y)))
+        let weight = Array2::from_shape_fn(acf.dim(), |(y, x)| {
+            moments.weight(lag(x).powi(2) + lag(y).powi(2))
         });
         Images {
             deconvolved: image(&deconvolved, spectral.stamp_size()),
             acf,
-            weight,
+            weight: Some(weight),
             spacing: lattice.row_spacing,
         }
     }
@@ -1157,7 +1136,8 @@ mod tests {
 
     #[test]
     fn half_snr_halves_the_weight_behind_any_psf_and_window() {
-        let half_snr = 15.0;
+        // Bright, because the mean of noise is subtracted from stamps without noise.
+        let half_snr = 150.0;
         let mut workers =
             [half_snr, 0.0].map(|snr| Measurer::new(&wide_psf(snr), 48).unwrap().worker());
         let mut moments = WeightedMoments::default();
@@ -1186,10 +1166,9 @@ mod tests {
                     let mut worker = image.psf(psf.view()).unwrap();
                     worker.measure(stamp.view()).unwrap().e1
                 });
-                // The mean of noise is subtracted from a stamp without: its share of the light goes as 1/ν².
-                let tolerance = 0.02 * (half_snr / snr).powi(2);
+                // The noise that is left, 10⁻³ of the light at most, and the window's effect on the matched filter.
                 assert!(
-                    (soft / hard / share - 1.0).abs() < tolerance,
+                    (soft / hard / share - 1.0).abs() < 0.01,
                     "{fwhm} {window} {snr}: {soft} of {hard}"
                 );
             }

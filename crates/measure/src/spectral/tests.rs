@@ -6,7 +6,7 @@ use shearq_submissions::{LinearDeconvolution, Registry};
 use super::*;
 use crate::network::convolve;
 use crate::noise::StampNoise;
-use crate::shape::{AdaptiveMoments, SizeMoments};
+use crate::shape::{RoundMoments, SizeMoments, TypicalGalaxy};
 
 fn settings(iterations: usize, target: f64, window: f64, lambda: f64) -> LinearDeconvolution {
     let registry = Registry::embedded().unwrap();
@@ -603,14 +603,12 @@ fn products_of_noise_on_the_stamp(
     let data = observed_on(n, &h, pixels, 0.0, 0.0);
     let mut lags = plan.lags();
     plan.autocorrelate(&own, &data, 0.0, &mut scratch, &mut lags);
-    let weights: [Vec<f32>; 6] = std::array::from_fn(|_| even(&plan, rng));
-    let spectra = [0, 1].map(|k| plan.spectrum_of(&weights[k], &mut scratch));
-    let found = plan.products(
-        &own,
-        &weights,
-        spectra.each_ref().map(|s| &s[..]),
-        &mut scratch,
-    );
+    let weights: [Vec<f32>; 5] = std::array::from_fn(|_| even(&plan, rng));
+    let spectra = weights
+        .each_ref()
+        .map(|weights| plan.spectrum_of(weights, &mut scratch));
+    let spectra = spectra.each_ref().map(|spectrum| &spectrum[..]);
+    let found = plan.products(&own, spectra, &mut scratch);
     // Products of the first two quantities with themselves, of noise and of noise sheared, and their squares.
     let mut sums = [[[0.0f64; 2]; 3]; 2];
     let count = 12_000;
@@ -635,8 +633,8 @@ fn products_of_noise_on_the_stamp(
         }
     }
     let mut largest = 0.0f64;
-    let [chi11, _, chi22] = found.chi_chi;
-    for (sums, found) in sums.into_iter().zip([chi11, chi22]) {
+    let [e11, _, e22] = found.e_e;
+    for (sums, found) in sums.into_iter().zip([e11, e22]) {
         let [first, second] = found.sheared.map(f64::from);
         let plain = f64::from(found.plain);
         largest = largest.max(first.abs().max(second.abs()) / plain);
@@ -818,26 +816,20 @@ fn mean_products_are_sums_over_modes_of_what_each_changes() {
         let stamp = observed(32, &h, 0.0, 0.0);
         let mut lags = plan.lags();
         plan.autocorrelate(&psf, &stamp, 0.0, &mut scratch, &mut lags);
-        let distortion: [Vec<f32>; 6] = std::array::from_fn(|_| even(&plan, &mut rng));
-        let size = [(); 2].map(|()| even(&plan, &mut rng));
-        let spectra = size
+        let weights: [Vec<f32>; 5] = std::array::from_fn(|_| even(&plan, &mut rng));
+        let spectra = weights
             .each_ref()
             .map(|weights| plan.spectrum_of(weights, &mut scratch));
-        let found = plan.products(
-            &psf,
-            &distortion,
-            spectra.each_ref().map(|spectrum| &spectrum[..]),
-            &mut scratch,
-        );
+        let spectra = spectra.each_ref().map(|spectrum| &spectrum[..]);
+        let found = plan.products(&psf, spectra, &mut scratch);
         let mut expected = [[0.0f64; 4]; 13];
         let mut sizes = [0.0f64; 13];
         for_each_mode(&plan, &psf, &mut scratch, |change, flux, powers| {
             let of = |weights: &Vec<f32>| over_lags(&plan, weights, change);
-            let [a, b, aa, ab, ba, bb] = distortion.each_ref().map(of);
-            let [c, d] = size.each_ref().map(of);
+            let [a, b, light, c, d] = weights.each_ref().map(of);
             let quantities = [a, b, c, flux];
             let pairs = (0..4).flat_map(|k| quantities[k..].iter().map(move |q| quantities[k] * q));
-            let products = pairs.chain([a * aa + b * ab, a * ba + b * bb, c * d]);
+            let products = pairs.chain([a * light, b * light, c * d]);
             let rows = expected.iter_mut().zip(&mut sizes).zip(products);
             for ((expected, size), product) in rows {
                 for (sum, power) in expected.iter_mut().zip(powers) {
@@ -846,23 +838,22 @@ fn mean_products_are_sums_over_modes_of_what_each_changes() {
                 }
             }
         });
-        let ([c11, c12, c22], [s1, s2], [f1, f2]) =
-            (found.chi_chi, found.chi_square, found.chi_flux);
+        let ([e11, e12, e22], [s1, s2], [f1, f2]) = (found.e_e, found.e_square, found.e_flux);
         let (ss, sf, ff) = (found.square_square, found.square_flux, found.flux_flux);
-        let [slope1, slope2] = found.chi_slope;
+        let [light1, light2] = found.e_light;
         let found = [
-            c11,
-            c12,
+            e11,
+            e12,
             s1,
             f1,
-            c22,
+            e22,
             s2,
             f2,
             ss,
             sf,
             ff,
-            slope1,
-            slope2,
+            light1,
+            light2,
             found.square_zero,
         ];
         for ((found, expected), size) in found.iter().zip(expected).zip(sizes) {
@@ -885,7 +876,7 @@ fn mean_second_derivatives_are_sums_of_differences_over_modes() {
     });
     let round = &round / round.sum();
     let settings = settings(1000, 1.5, 5.0, 0.0);
-    // Noise of the stamp, whose galaxy has a peak of some 0.3, and the regularisation in units of the moments' trace.
+    // Noise of the stamp, whose galaxy has a peak of some 0.3, and the regularisation in units of the divisor.
     for (h, level, share) in [
         (psf(9), 0.0, 0.0),
         (psf(9), 0.02, 0.3),
@@ -893,7 +884,12 @@ fn mean_second_derivatives_are_sums_of_differences_over_modes() {
         (round, 0.03, 0.5),
     ] {
         let (plan, own, mut scratch) = planned(n, &h, &settings);
-        let moments = AdaptiveMoments::new(2.0, plan.lattice());
+        let typical = TypicalGalaxy {
+            variance: 4.0,
+            target: 1.5,
+            window: 5.0,
+        };
+        let moments = RoundMoments::new(2.0, typical, plan.lattice());
         let sizes = SizeMoments::new(1.5, 5.0, plan.lattice());
         let noise = noise(n, &mut rng);
         let stamp = observed(n, &h, 0.0, 0.0);
@@ -904,24 +900,27 @@ fn mean_second_derivatives_are_sums_of_differences_over_modes() {
             .collect();
         let mut lags = plan.lags();
         plan.autocorrelate(&own, &stamp, level, &mut scratch, &mut lags);
-        let mut values = moments.scratch();
-        let regularisation = share * moments.halving_regularisation(&lags.acf);
         let acf = lags.acf.clone();
-        let shape = moments.measure(&acf, regularisation, &mut values).unwrap();
+        let regularisation = share * moments.sums(&acf)[0];
+        let [e1, e2] = moments.measure(&acf, regularisation).unwrap();
         let floor = share * sizes.sums(&acf)[0];
         let mean_square = sizes.measure(&acf, floor, 20.0);
 
-        let mut gradients = [(); 6].map(|()| plan.lags().acf);
-        let curvature = moments.second_order(&shape, &acf, &mut values, &mut gradients);
-        let [zero, two] = sizes.gradients();
-        let square: Vec<f32> = zero
-            .iter()
-            .zip(&two)
-            .map(|(zero, two)| SizeMoments::combine(&mean_square, [*zero, *two]))
-            .collect();
-        let spectra = [square, zero].map(|weights| plan.spectrum_of(&weights, &mut scratch));
-        let spectra = spectra.each_ref().map(|spectrum| &spectrum[..]);
-        let found = plan.products(&own, &gradients, spectra, &mut scratch);
+        let mut spectrum = |weights: Vec<f32>| plan.spectrum_of(&weights, &mut scratch);
+        let [light, plus, cross] = moments.gradients().map(&mut spectrum);
+        let [zero, two] = sizes.gradients().map(&mut spectrum);
+        let parts = [
+            (e1, &light, plus),
+            (e2, &light, cross),
+            (mean_square, &zero, two),
+        ];
+        let [of_e1, of_e2, of_square] = parts.map(|(ratio, divisor, dividend)| {
+            let terms = divisor.iter().zip(dividend);
+            let change: Vec<f32> = terms.map(|(zero, top)| ratio.change(*zero, top)).collect();
+            change
+        });
+        let spectra = [&of_e1[..], &of_e2, &light, &of_square, &zero];
+        let found = plan.products(&own, spectra, &mut scratch);
 
         let mut expected = [[0.0f64; 3]; 4];
         let mut size = [[0.0f64; 3]; 4];
@@ -929,11 +928,11 @@ fn mean_second_derivatives_are_sums_of_differences_over_modes() {
         let peak = most(&acf);
         for_each_mode(&plan, &own, &mut scratch, |change, _, powers| {
             let step = 0.01 * peak / most(change);
-            let mut side = |step: f32| {
+            let side = |step: f32| {
                 let acf: Vec<f32> = acf.iter().zip(change).map(|(a, c)| a + step * c).collect();
-                let shape = moments.measure(&acf, regularisation, &mut values).unwrap();
-                let [e1, e2] = moments.response(&shape, change, &mut values);
-                let square = sizes.response(&sizes.measure(&acf, floor, 20.0), change);
+                let found = moments.measure(&acf, regularisation).unwrap();
+                let [e1, e2] = moments.response(&found, change);
+                let square = sizes.response(sizes.measure(&acf, floor, 20.0), change);
                 [e1, e2, f64::from(square)]
             };
             let (plus, minus) = (side(step), side(-step));
@@ -947,11 +946,10 @@ fn mean_second_derivatives_are_sums_of_differences_over_modes() {
         });
         for kind in 0..4 {
             let of_kind = |product: NoiseChanges<f32>| *each(&product)[kind];
-            let (pairs, slopes) = (found.chi_chi.map(of_kind), found.chi_slope.map(of_kind));
-            let [e1, e2] = shape.mean_second_derivative(&curvature, pairs, slopes);
-            let zero = of_kind(found.square_zero);
-            let square = SizeMoments::mean_second_derivative(&mean_square, zero);
-            for (k, found) in [e1, e2, square].into_iter().enumerate() {
+            let products = [found.e_light[0], found.e_light[1], found.square_zero].map(of_kind);
+            let ratios = [e1, e2, mean_square].into_iter().zip(products);
+            let found = ratios.map(|(ratio, product)| ratio.mean_second_derivative(product));
+            for (k, found) in found.enumerate() {
                 let (expected, size) = (expected[kind][k], size[kind][k]);
                 // Third derivatives, and differences of f32.
                 assert!(
