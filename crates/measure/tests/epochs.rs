@@ -107,16 +107,17 @@ fn one_epoch_has_the_bits_of_one_stamp() {
 fn equal_epochs_measure_as_their_mean() {
     let (galaxy, psf) = scene();
     let mut rng = ChaCha8Rng::seed_from_u64(2);
+    // So bright that the noise terms, which one galaxy in eight has for all eight, are far below the tolerance.
     for _ in 0..20 {
-        let stamps: Vec<_> = (0..4).map(|_| &galaxy + &noise(&mut rng, 1.0)).collect();
+        let stamps: Vec<_> = (0..4).map(|_| &galaxy + &noise(&mut rng, 0.4)).collect();
         let mean = stamps
             .iter()
             .fold(Array2::zeros((N, N)), |sum, stamp| sum + stamp)
             / 4.0;
-        let epochs: Vec<_> = stamps.iter().map(|stamp| epoch(stamp, &psf, 1.0)).collect();
+        let epochs: Vec<_> = stamps.iter().map(|stamp| epoch(stamp, &psf, 0.4)).collect();
         let found = measured(&epochs).unwrap();
-        assert!((found.noise - 0.5).abs() < 1e-12);
-        close(&found, &measured(&[epoch(&mean, &psf, 0.5)]).unwrap(), 1e-4);
+        assert!((found.noise - 0.2).abs() < 1e-12);
+        close(&found, &measured(&[epoch(&mean, &psf, 0.2)]).unwrap(), 1e-4);
     }
 }
 

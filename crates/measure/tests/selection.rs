@@ -246,7 +246,7 @@ fn saturation_limits_the_measured_ellipticity() {
         let mut image = worker.image(ImageNoise::Level(1.0));
         let psf = gaussian(48, PSF);
         let mut worker = image.psf(psf.view()).expect("a PSF of the planned size");
-        let found = measured(&mut worker, &(galaxy(6.0, [0.7, 0.3], 0.0) * 1e5));
+        let found = measured(&mut worker, &(galaxy(6.0, [0.8, 0.3], 0.0) * 1e5));
         [found.e1, found.e2]
     };
     let own = |name: &str, saturation: &str| {
