@@ -503,8 +503,7 @@ impl Found {
 
 /// The mean of a response R of this trace over rotations and reflections of the galaxy: the same for both components.
 pub(crate) fn isotropic(trace: f64) -> ResponseMatrix {
-    // A shear of galaxies of all orientations sees this mean. The rest of R is noise that averages need not have: R11 and R22
-    // correlate with −0.43, and with the mean of both the error of m is 1.5 times smaller.
+    // A shear of galaxies of all orientations sees this mean. The rest of R is noise that averages need not have.
     let response = 0.5 * trace;
     [[response, 0.0], [0.0, response]]
 }

@@ -18,9 +18,9 @@
 //! wings, and so has this weight.
 //!
 //! e is not a function of the axis ratio alone, as χ and ε are: its response to shear takes the place of a scale. It is a ratio
-//! of two sums over lags, so that its derivatives are exact and short. A weight of the galaxy's own ellipticity (Bernstein &
-//! Jarvis 2002) has 1 to 2 % less noise for round galaxies and 3 % more for those of the COSMOS survey, and its response twice
-//! as much noise.
+//! of two sums over lags, so that its derivatives are exact and short. χ under a weight of the galaxy's own ellipticity
+//! (Bernstein & Jarvis 2002) has 1 % less noise for galaxies like GREAT10's, and as much for those of the COSMOS survey, but the
+//! noise of its response is 1.7 times as large at S/N 20, and three times at S/N 100.
 //!
 //! # Sizes
 //!
@@ -50,8 +50,8 @@ use crate::transform::{
     HexLattice, LagsScratch, Plane, Spectrum, ToLags, ToModes, TransformScratch,
 };
 
-// Exponent of 1 + (x² + y²)/r² in the weight of an ellipticity. Least scatter of simulated galaxies among 1, 1.5 and 2.5, with the
-// best scale of each.
+// Exponent of 1 + (x² + y²)/r² in the weight of an ellipticity. Among 1, 1.5 and 2.5, with three scales of each, it has the least
+// scatter of GREAT10's and COSMOS galaxies at S/N 20, and the least noise of the response at equal scatter.
 const EXPONENT: f64 = -1.5;
 
 /// A ratio of two sums over lags. What was added to the divisor is part of it.
