@@ -93,7 +93,7 @@ class Configuration:
     @property
     def ellipticity(self) -> Literal["shear", "distortion"]:
         """The type of e1 and e2."""
-        ellipticity: Literal["shear", "distortion"] = self._settings["shape"]["ellipticity"]
+        ellipticity: Literal["shear", "distortion"] = self._settings["shape"].get("ellipticity", "shear")
         return ellipticity
 
     @property
