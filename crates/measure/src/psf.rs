@@ -669,7 +669,7 @@ const MAX_BACKGROUND: f64 = 0.1;
 const MAX_STATED_LEVEL: f64 = 100.0;
 // Light of a gradient that is extrapolated from the brighter edge, in units of the star's. Chosen by hand.
 const MAX_GRADIENT: f64 = 0.3;
-// At S/N 1000 the noise of one star changes m by 5.5·10⁻³: docs/limitations.md.
+// At S/N 1000 the noise of one star changes m by 3.1·10⁻³: docs/limitations.md.
 const MIN_SNR_SHARED: f64 = 1000.0;
 // Of a star per galaxy, the noise averages out. Chosen by hand.
 const MIN_SNR_EACH: f64 = 100.0;
