@@ -654,6 +654,7 @@ mod tests {
 
     use super::*;
     use crate::measurement::Stop;
+    use crate::testing::close;
 
     /// Numbers without a pattern, small enough for an ellipticity.
     fn numbers(state: &mut f64) -> f64 {
@@ -737,6 +738,60 @@ mod tests {
         }
         let [half, ..] = saturation.factors([0.0, 0.4]);
         assert!((half - 0.5f64.sqrt()).abs() < 1e-12);
+    }
+
+    #[test]
+    fn noise_of_saturated_ellipticities_follows_its_derivatives() {
+        let (saturation, galaxy) = (SATURATIONS[1], found());
+        let e = galaxy.ellipticity.unwrap();
+        let slope = |of: &dyn Fn([f64; 2]) -> [f64; 2], k: usize| {
+            let step = 1e-4;
+            let [plus, minus] = [step, -step].map(|by| {
+                let mut moved = e;
+                moved[k] += by;
+                of(moved)
+            });
+            [0, 1].map(|i| (plus[i] - minus[i]) / (2.0 * step))
+        };
+        let saturated = |e: [f64; 2]| e.map(|component| component * saturation.factors(e)[0]);
+        let columns = [0, 1].map(|j| slope(&saturated, j));
+        let column = |e, j: usize| {
+            saturation
+                .response(e, [[1.0, 0.0], [0.0, 1.0]])
+                .map(|row| row[j])
+        };
+        // Of e_j and e_k.
+        let bent = [0, 1].map(|j| [0, 1].map(|k| slope(&|e| column(e, j), k)));
+        let products = |[p11, p12, p22]: [f64; 3]| [[p11, p12], [p12, p22]];
+        let curvature = |means: &NoiseMeans| {
+            let p = products(means.e_e);
+            [0, 1].map(|i| {
+                let pairs = (0..2).flat_map(|j| (0..2).map(move |k| [j, k]));
+                let linear = (0..2)
+                    .map(|j| columns[j][i] * means.e_curvature[j])
+                    .sum::<f64>();
+                linear + pairs.map(|[j, k]| p[j][k] * bent[j][k][i]).sum::<f64>()
+            })
+        };
+        let noise = galaxy.noise_moments.as_ref().unwrap();
+        let [own, turned] = [saturated(e), curvature(&noise.turned)];
+        let ([e1, e2], response) = galaxy.saturated(saturation).unwrap();
+        let (r, p) = (galaxy.response.unwrap(), products(noise.plain.e_e));
+        let variance = galaxy.e_variance(saturation);
+        for i in 0..2 {
+            // Truncation of differences.
+            close([e1, e2][i], own[i] + 0.5 * turned[i], 1e-6);
+            let mut expected = 0.0;
+            for j in 0..2 {
+                let by_shear = columns[0][i] * r[0][j] + columns[1][i] * r[1][j];
+                let noisy = curvature(&noise.sheared[j])[i];
+                close(response.unwrap()[i][j], by_shear - noisy, 1e-6);
+                for k in 0..2 {
+                    expected += columns[j][i] * p[j][k] * columns[k][i];
+                }
+            }
+            close(variance[i], expected, 1e-6);
+        }
     }
 
     #[test]

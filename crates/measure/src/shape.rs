@@ -730,6 +730,50 @@ mod tests {
     }
 
     #[test]
+    fn round_moments_are_sums_over_all_lags_in_the_circle() {
+        let (scale, lattice) = (2.5, lattice(4.0 / 3.0));
+        let mut rng = ChaCha8Rng::seed_from_u64(16);
+        let acf: Vec<f32> = lattice
+            .places()
+            .map(|_| rng.random_range(0.1..1.0))
+            .collect();
+        // A₀, A₊, A×, and for ρ the light and the response of the typical galaxy.
+        let mut sums = [0.0f64; 5];
+        for (place, value) in lattice.places().zip(&acf) {
+            // Rows y > 0 stand for the half plane below them.
+            let signs: &[f64] = if place[1] > 0.0 { &[1.0, -1.0] } else { &[1.0] };
+            for [x, y] in signs.iter().map(|sign| place.map(|at| sign * at)) {
+                if lattice.contains([x, y]) {
+                    let square = x * x + y * y;
+                    let weight = (1.0 + square / (scale * scale)).powf(-1.5);
+                    let typical = weight * TYPICAL.autocorrelation(square);
+                    let lag = weight * f64::from(*value);
+                    let plus = x * x - y * y;
+                    let response = typical * plus * TYPICAL.slope([x, y]);
+                    let terms = [lag, lag * plus, lag * 2.0 * x * y, typical, response];
+                    for (sum, term) in sums.iter_mut().zip(terms) {
+                        *sum += term;
+                    }
+                }
+            }
+        }
+        let [zero, plus, cross, light, response] = sums;
+        let found = values(
+            RoundMoments::new(scale, TYPICAL, lattice)
+                .measure(&acf, 0.0)
+                .unwrap(),
+        );
+        for (found, moment) in found.into_iter().zip([plus, cross]) {
+            // Single precision, over sums of terms of both signs.
+            let expected = moment * light / (response * zero);
+            assert!(
+                (f64::from(found) - expected).abs() < 1e-5,
+                "{found} {expected}"
+            );
+        }
+    }
+
+    #[test]
     fn ellipticities_along_an_axis_and_between_axes_are_the_same() {
         // As far apart for the weight as in the submissions, and farther.
         for spacing in [4.0 / 3.0, 2.0] {

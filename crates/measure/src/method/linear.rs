@@ -45,8 +45,8 @@ use crate::stamp::hash;
 use crate::stamp::{WeightedMoments, shear_origin};
 use crate::transform::HexLattice;
 
-// Of the error of the mean response, the choice of galaxies makes less than 1 % (tests/stress: base, snr10, cosmos20). Sheared
-// catalogues need the noise of every galaxy.
+// In simulated pairs the choice of galaxies makes 7 % of the error of m, and half of it behind a PSF of ellipticity 0.1. All galaxies
+// would double the time. Sheared catalogues need the noise of every galaxy.
 const NOISE_MOMENTS_INTERVAL: u64 = 8;
 // S/N at which a size is the mean of the measured one and of the size of a typical galaxy. Chosen by hand: it shrinks sizes at S/N 20 by 6 %.
 const HALF_SIZE_SNR: f32 = 5.0;
