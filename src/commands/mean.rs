@@ -81,7 +81,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         }
         if mean.above_one > 0 {
             tell(format_args!(
-                "warning: set {set:02}: {} of {} galaxies have |e| of 1 or more, which no ellipse has, and count in the mean (expected 0). Try: check the catalogues, or measure again",
+                "warning: set {set:02}: {} of {} galaxies have |e| of 1 or more, and count in the mean (expected 0). Try: check the catalogues, or measure again with a larger shape.half_snr",
                 mean.above_one, mean.galaxies
             ));
         }

@@ -191,13 +191,15 @@ impl RoundMoments {
     pub fn measure(&self, acf: &[f32], regularisation: f32) -> Result<[Ratio; 2], Flag> {
         let [zero, plus, cross] = self.sums(acf);
         let divisor = zero + regularisation;
-        if !(divisor > 0.0 && divisor.is_finite() && plus.is_finite() && cross.is_finite()) {
-            return Err(Flag::NoExtent);
-        }
-        Ok([plus, cross].map(|dividend| Ratio {
+        let found = [plus, cross].map(|dividend| Ratio {
             value: dividend / divisor,
             divisor,
-        }))
+        });
+        let finite = found.iter().all(|ratio| ratio.value.is_finite());
+        match divisor > 0.0 && divisor.is_finite() && finite {
+            true => Ok(found),
+            false => Err(Flag::NoExtent),
+        }
     }
 
     /// Change of e₁ and e₂ with a change of the autocorrelation.

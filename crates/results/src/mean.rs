@@ -26,7 +26,7 @@ pub struct SetMean {
     pub flagged: usize,
     /// Galaxies with an ellipticity that the selection leaves out.
     pub cut: usize,
-    /// Galaxies whose ellipticity has a modulus of 1 or more, which no ellipse has. They count like the others, because a cut
+    /// Galaxies whose ellipticity has a modulus of 1 or more, which only noise makes. They count like the others, because a cut
     /// would bias the mean.
     pub above_one: usize,
     /// Galaxies with each of [`Flag::ALL`].
