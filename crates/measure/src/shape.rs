@@ -87,10 +87,9 @@ impl<const N: usize> LagWeights<N> {
     fn new(lattice: HexLattice, of: impl Fn([f64; 2]) -> [f64; N]) -> Self {
         let mut weights = [const { Vec::new() }; N];
         for place in lattice.places() {
-            let within = f64::from(u8::from(lattice.contains(place)));
-            let count = within * lattice.area() * if place[1] == 0.0 { 1.0 } else { 2.0 };
+            let area = lattice.multiplicity(place) * lattice.area();
             for (weights, weight) in weights.iter_mut().zip(of(place)) {
-                weights.push((count * weight) as f32);
+                weights.push((area * weight) as f32);
             }
         }
         LagWeights {
@@ -160,8 +159,8 @@ impl RoundMoments {
     pub fn new(scale: f64, galaxy: TypicalGalaxy, lattice: HexLattice) -> Self {
         let bases = |[x, y]: [f64; 2]| [1.0, x * x - y * y, 2.0 * x * y];
         let (mut light, mut response) = (0.0, 0.0);
-        for place @ [x, y] in lattice.places().filter(|place| lattice.contains(*place)) {
-            let count = if y == 0.0 { 1.0 } else { 2.0 };
+        for place @ [x, y] in lattice.places() {
+            let count = lattice.multiplicity(place);
             let square = x * x + y * y;
             let weighted = count * weight(scale, square) * galaxy.autocorrelation(square);
             light += weighted;

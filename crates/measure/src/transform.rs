@@ -928,6 +928,15 @@ impl HexLattice {
     pub fn contains(self, [x, y]: [f64; 2]) -> bool {
         x.hypot(y) <= self.radius() * (1.0 + 1e-12)
     }
+
+    /// For how many lags of the plane within the circle a place stands: rows y > 0 for both signs.
+    pub(crate) fn multiplicity(self, place @ [_, y]: [f64; 2]) -> f64 {
+        match self.contains(place) {
+            false => 0.0,
+            true if y == 0.0 => 1.0,
+            true => 2.0,
+        }
+    }
 }
 
 /// From real even spectra, given as cc and ss, to lags of autocorrelations, and the adjoint.
