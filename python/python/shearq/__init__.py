@@ -5,7 +5,7 @@
 >>> print(cat.mean_shear())                 # g1 = +0.0201 ± 0.0009, g2 = ...
 >>> cat.write("shapes.parquet")
 
-Measure    measure, measure_blocks, from_galsim, from_ngmix, FunctionalPsf, DataWarning, set_threads, get_threads
+Measure    measure, measure_blocks, from_galsim, from_ngmix, from_meds, from_exposure, FunctionalPsf, DataWarning, set_threads, get_threads
 Catalogues Catalogue, concatenate, mean_shear, MeanShear, Flag, read, read_all
 Score      score, compare, power_spectrum, aperture_mass, Score, METRICS
 Validate   bias, bias_sums, Bias, BiasSums, null_tests
@@ -26,6 +26,7 @@ from ._catalogue import (
     concatenate as concatenate,
     mean_shear as mean_shear,
 )
+from ._exposure import from_exposure as from_exposure
 from ._files import read as read, read_all as read_all
 from ._galsim import from_galsim as from_galsim
 from ._measure import (
@@ -40,4 +41,5 @@ from ._shearq import __version__ as __version__
 from ._simulate import SimulatedImage as SimulatedImage, Simulation as Simulation, simulate as simulate
 from ._submissions import Configuration as Configuration, submission as submission, submissions as submissions
 from ._threads import get_threads as get_threads, set_threads as set_threads
+from ._meds import from_meds as from_meds
 from .adapters import from_ngmix as from_ngmix

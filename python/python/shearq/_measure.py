@@ -8,7 +8,7 @@ from typing import Any, Union
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from . import _galsim, _schema, _shearq
+from . import _galsim, _psf_models, _schema, _shearq
 from ._arrays import callback, double, numeric, real, shaped, shown, whole, with_missing, without_sentinels
 from ._catalogue import Catalogue
 from ._galsim import GalSimImage, GalSimProfile
@@ -19,8 +19,8 @@ from ._wcs import WcsLike, jacobians
 
 StampsLike = Union[ArrayLike, GalSimImage, Sequence[GalSimImage]]
 """Stamps: an array, a sequence of arrays, or one or more GalSim images."""
-PsfLike = Union[ArrayLike, "FunctionalPsf", GalSimImage, GalSimProfile, Sequence[GalSimImage], Sequence[GalSimProfile]]
-"""PSFs: arrays, formulas, or images or profiles of GalSim."""
+PsfLike = Union[ArrayLike, "FunctionalPsf", GalSimImage, GalSimProfile, Sequence[GalSimImage], Sequence[GalSimProfile], Callable[..., Any], Any]
+"""PSFs: arrays, formulas, images or profiles of GalSim, or models of Piff, PSFEx and Rubin."""
 
 
 class DataWarning(UserWarning):
@@ -118,6 +118,7 @@ def measure(
     y: ArrayLike | None = None,
     ids: ArrayLike | None = None,
     wcs: WcsLike | None = None,
+    properties: Mapping[str, ArrayLike] | None = None,
     submission: SubmissionLike = "48/linear/star",
     threads: int | None = None,
     progress: Callable[[int], object] | None = None,
@@ -135,11 +136,13 @@ def measure(
     psf : array of shape (py, px) or (n, py, px), FunctionalPsf, or GalSim image or profile
         One PSF for all galaxies or one per galaxy, centred like the stamps, of even or odd size, and at least as large
         as the configuration requires (32 pixels by default). It is cut and normalised. Profiles of GalSim are drawn
-        on the pixels of GalSim stamps.
+        on the pixels of GalSim stamps. A model is drawn at each galaxy's ``x`` and ``y``, in the model's convention (the
+        first pixel is 1 for Piff and PSFEx): a ``piff.PSF``, a PSFEx file as ``galsim.des.DES_PSFEx``, a PSF of Rubin
+        (``computeKernelImage``), or a function of (x, y) that returns an image or a profile of GalSim.
     epochs : sequence of mappings, optional
         Instead of `stamps` and `psf`: several stamps of each galaxy, which a linear configuration combines in each Fourier mode
         with inverse-variance weights before it measures the shape. Each epoch has ``stamps`` and ``psf``, and perhaps
-        ``noise``, ``mask``, ``wcs``, ``x`` and ``y`` (for a WCS that varies), ``offsets`` of shape (n, 2): the galaxies from
+        ``noise``, ``mask``, ``wcs``, ``x`` and ``y`` (for a WCS or PSF that varies), ``properties``, ``offsets`` of shape (n, 2): the galaxies from
         the centres of their stamps along x and y in pixels, and ``flux``: that of the galaxies in relation to the other
         epochs, a number or (n,), for bands. Galaxy k is on stamp k of each epoch; stamps of NaN are absent. The noise of an
         epoch is taken as white. Each band counts with flux/noise², so that the fluxes are weights: they may be those of a
@@ -161,6 +164,9 @@ def measure(
         or per stamp; lists have a GalSim WCS per stamp. A WCS that varies over the image needs ``x`` and ``y`` in its own
         convention (the first pixel is 1 for GalSim, 0 for astropy). PSFs are on the pixels of their stamps: images,
         or formulas whose shapes refer to the pixel axes. Without a WCS, the frame is that of the pixels.
+    properties : mapping, optional
+        What else the model of the PSF depends on, such as ``{"chipnum": 4, "ri_color": colours}``: a value for all galaxies or
+        one for each.
     submission : str, path, mapping or Configuration
         The configuration: see :func:`submission`.
     threads : int, optional
@@ -214,9 +220,10 @@ def measure(
         for name, value in (("stamps", stamps), ("psf", psf)):
             if value is None:
                 raise TypeError(f"{name}: found none; expected stamps and their PSF, or epochs")
+        psf = _psf_models.at_galaxies(psf, stamps, x, y, wcs, properties)
         stamps, psf = _galsim.unpacked(stamps, psf, check=wcs is None)
         return _measure([_image(stamps, psf, noise, mask, wcs, x, y)], (ids, x, y), settings, count, done)
-    given = {"stamps": stamps, "psf": psf, "noise": noise, "mask": mask, "wcs": wcs}
+    given = {"stamps": stamps, "psf": psf, "noise": noise, "mask": mask, "wcs": wcs, "properties": properties}
     for name, value in given.items():
         if value is not None:
             raise TypeError(f"{name}: found with epochs; expected in each epoch")
@@ -234,6 +241,7 @@ def measure_blocks(
     y: ArrayLike | None = None,
     ids: ArrayLike | None = None,
     wcs: WcsLike | None = None,
+    properties: Mapping[str, ArrayLike] | None = None,
     submission: SubmissionLike = "48/linear/star",
     threads: int | None = None,
     progress: Callable[[int], object] | None = None,
@@ -244,7 +252,7 @@ def measure_blocks(
     ----------
     stamps : array, or anything with a shape (n, ny, nx) and slices
         Memory maps, and arrays of h5py, zarr or dask: each block is read when it is measured.
-    psf, noise, mask, x, y, ids, wcs, submission, threads, progress
+    psf, noise, mask, x, y, ids, wcs, properties, submission, threads, progress
         As for :func:`measure`.
     block : int
         Most stamps of a block. Blocks are as equal as possible. The noise and the galaxy size are measured on each: it
@@ -268,6 +276,7 @@ def measure_blocks(
     >>> print(shearq.mean_shear(blocks))
     g1 = ... ± ..., g2 = ... ± ... (400 galaxies, 0 flagged)
     """
+    psf = _psf_models.at_galaxies(psf, stamps, x, y, wcs, properties)
     stamps, psf = _galsim.unpacked(stamps, psf, check=wcs is None)
     most = whole("block", block, 1, 1 << 40)
     if isinstance(stamps, (list, tuple)):
@@ -299,7 +308,7 @@ def measure_blocks(
             one, level, missing, *columns = (part(name, start, end) for name in each)
             pixels = stamps[start:end]
             pixels = pixels if isinstance(pixels, np.ndarray) else np.asarray(pixels)
-            local = wcs if wcs is None or len(wcs) == 1 else wcs[start:end]
+            local = None if wcs is None else wcs[0] if len(wcs) == 1 else wcs[start:end]
             try:
                 image = _image(pixels, one, level, missing, local, *columns[1:])
                 yield _measure([image], tuple(columns), settings, count, done)
@@ -309,7 +318,7 @@ def measure_blocks(
     return measured()
 
 
-_EPOCH = ("stamps", "psf", "noise", "mask", "wcs", "x", "y", "offsets", "flux")
+_EPOCH = ("stamps", "psf", "noise", "mask", "wcs", "x", "y", "properties", "offsets", "flux")
 
 
 def _epoch(k: int, epoch: Mapping[str, Any]) -> dict[str, Any]:
@@ -319,7 +328,8 @@ def _epoch(k: int, epoch: Mapping[str, Any]) -> dict[str, Any]:
         if unknown or "stamps" not in epoch or "psf" not in epoch:
             raise ValueError(f"found {', '.join(epoch)}; expected stamps, psf and perhaps {', '.join(_EPOCH[2:])}")
         own = {name: epoch.get(name) for name in _EPOCH}
-        stamps, psf = _galsim.unpacked(own["stamps"], own["psf"], check=own["wcs"] is None)
+        psf = _psf_models.at_galaxies(own["psf"], own["stamps"], own["x"], own["y"], own["wcs"], own["properties"])
+        stamps, psf = _galsim.unpacked(own["stamps"], psf, check=own["wcs"] is None)
         noise = own["noise"]
         if own["flux"] is not None:
             flux = np.asarray(own["flux"], dtype=np.float64)

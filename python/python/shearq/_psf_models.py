@@ -1,0 +1,160 @@
+"""Models of a PSF that varies over an image, drawn at the galaxies."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ._arrays import double, shown
+from ._galsim import _is_profile
+from ._wcs import jacobians
+
+# What a model needs: the number of pixels on a side, x and y of the galaxy, the Jacobian of its pixels or None, and other
+# properties of the galaxy.
+_Draw = Callable[[int, float, float, Any, dict[str, Any]], Any]
+
+
+def _piff(psf: Any) -> _Draw:
+    # Piff knows whether its model contains the pixel, and the WCS of the chip.
+    return lambda side, x, y, _, properties: psf.draw(x=x, y=y, stamp_size=side, center=True, **properties).array
+
+
+def _psfex(psf: Any) -> _Draw:
+    import galsim
+
+    def draw(side: int, x: float, y: float, _: Any, properties: dict[str, Any]) -> Any:
+        place = galsim.PositionD(x, y)
+        # Without a WCS of its own, a profile of PSFEx is in pixels. It contains the pixel.
+        pixels = {"wcs": psf.wcs.local(place)} if psf.wcs else {"scale": 1.0}
+        return psf.getPSF(place).drawImage(nx=side, ny=side, method="no_pixel", dtype=np.float64, **pixels).array
+
+    return draw
+
+
+class _Point(NamedTuple):
+    x: float
+    y: float
+
+
+def _rubin(psf: Any) -> _Draw:
+    try:
+        from lsst.geom import Point2D  # type: ignore[import-not-found, unused-ignore]
+    except ImportError:
+        # Objects with the same methods outside Rubin's stack.
+        from collections import namedtuple
+
+        Point2D = namedtuple("Point2D", "x y")
+    # Centred on a pixel, where computeImage would draw the phase of the galaxy.
+    return lambda side, x, y, jacobian, properties: psf.computeKernelImage(Point2D(x, y)).array
+
+
+def _function(psf: Callable[..., Any]) -> _Draw:
+    def draw(side: int, x: float, y: float, jacobian: Any, properties: dict[str, Any]) -> Any:
+        found = psf(x, y, **properties)
+        if not _is_profile(found):
+            return found.array if hasattr(found, "bounds") else found
+        if jacobian is None:
+            raise TypeError(
+                "psf: the function returned a profile of GalSim, and the pixels have no WCS; expected one. Try: wcs=, or a function"
+                " that returns an image"
+            )
+        import galsim
+
+        local = galsim.JacobianWCS(*jacobian.ravel())
+        return found.drawImage(nx=side, ny=side, wcs=local, dtype=np.float64).array
+
+    return draw
+
+
+def _draw_of(psf: Any) -> _Draw | None:
+    """How a model is drawn; None for anything that is no model."""
+    if hasattr(psf, "interp_property_names") and hasattr(psf, "draw"):
+        return _piff(psf)
+    if hasattr(psf, "getPSF") and hasattr(psf, "getPSFArray"):
+        return _psfex(psf)
+    if hasattr(psf, "computeKernelImage"):
+        return _rubin(psf)
+    if callable(psf) and not _is_profile(psf) and not isinstance(psf, type):
+        return _function(psf)
+    return None
+
+
+class PsfsOfModel:
+    """The PSFs of a model at galaxies as an array of shape (n, py, px) that is drawn when its rows are read."""
+
+    ndim = 3
+    dtype = np.dtype(np.float64)
+
+    def __init__(self, draw: _Draw, side: int, places: NDArray[np.float64], matrices: Any, properties: Mapping[str, Any]) -> None:
+        self._draw, self._side, self._places = draw, side, places
+        self._matrices, self._properties = matrices, properties
+        # The size is the model's own for Rubin's and for images of functions.
+        first = self._one(0)
+        self.shape = (len(places), *first.shape)
+
+    def _one(self, k: int) -> NDArray[np.float64]:
+        properties = {name: value if np.ndim(value) == 0 else value[k] for name, value in self._properties.items()}
+        matrix = None if self._matrices is None else self._matrices[k if len(self._matrices) > 1 else 0]
+        x, y = map(float, self._places[k])
+        try:
+            found = np.asarray(self._draw(self._side, x, y, matrix, properties), dtype=np.float64)
+        except Exception as error:
+            raise ValueError(f"psf: the model has no PSF at x = {x:.6g}, y = {y:.6g} (galaxy {k}): {error}") from error
+        if found.ndim != 2:
+            raise ValueError(f"psf: the model returned an array of shape {shown(found.shape)}; expected (py, px)")
+        return found
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def __getitem__(self, rows: slice) -> NDArray[np.float64]:
+        drawn = [self._one(k) for k in range(*rows.indices(len(self)))]
+        for k, one in enumerate(drawn):
+            if one.shape != self.shape[1:]:
+                raise ValueError(
+                    f"psf: the model returned images of shapes {shown(self.shape[1:])} and {shown(one.shape)} (galaxy {k}); expected one shape"
+                )
+        return np.stack(drawn) if drawn else np.empty((0, *self.shape[1:]))
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        return np.asarray(self[:], dtype=dtype)
+
+
+def at_galaxies(
+    psf: Any, stamps: Any, x: Any, y: Any, wcs: Any, properties: Mapping[str, ArrayLike] | None
+) -> Any:
+    """The PSFs of a model at the galaxies; anything else as it is."""
+    draw = _draw_of(psf)
+    if draw is None:
+        if properties is not None:
+            raise TypeError(f"properties: found with a PSF of type {type(psf).__name__}; expected a model of Piff, or a function")
+        return psf
+    count = len(stamps)
+    side = np.shape(stamps[0] if count else stamps)[-1] if not hasattr(stamps, "shape") else stamps.shape[-1]
+    if count == 0:
+        raise ValueError("stamps: found none; expected one or more")
+    if x is None or y is None:
+        raise ValueError("psf: found a model, and no places of the galaxies. Try: x=, y=, in pixels of the image from which the stamps were cut")
+    places = []
+    for name, value in (("x", x), ("y", y)):
+        column = double(name, value)
+        if column.shape != (count,):
+            raise ValueError(f"{name}: found an array of shape {shown(column.shape)}; expected ({count},), one for each stamp")
+        places.append(column)
+    given = dict(properties or {})
+    for name, value in given.items():
+        if np.ndim(value) and len(value) != count:  # type: ignore[arg-type]
+            raise ValueError(f"properties: {name} has {len(value)} values; expected one, or {count}")  # type: ignore[arg-type]
+    matrices = None if wcs is None else jacobians(wcs, count, x, y)
+    return PsfsOfModel(draw, side, np.stack(places, axis=-1), matrices, given)
+
+
+def one(model: Any, side: int, x: float, y: float, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The PSF of a model at one place, on pixels with a Jacobian."""
+    draw = _draw_of(model)
+    if draw is None:
+        raise TypeError(f"psf: found {type(model).__name__}; expected a model of Piff, PSFEx or Rubin, or a function of (x, y)")
+    return PsfsOfModel(draw, side, np.array([[x, y]]), matrix[np.newaxis], {})[:][0]
