@@ -9,7 +9,7 @@ from typing import Any, Literal, Union
 
 import numpy as np
 
-from . import _display, _shearq
+from . import _display, _hdf5, _shearq
 from ._tables import _EXACT, is_missing, named_columns
 
 Design = Literal["single", "pairs", "arms", "fields", "galaxies", "rotated"]
@@ -140,8 +140,9 @@ def bias(
     ----------
     catalogues
         A table or a list of tables: mappings of columns, structured arrays, ``shearq.Catalogue``, astropy tables, pandas
-        or polars frames, Arrow tables or record batches, or paths of files and of folders that ``measure`` wrote. Columns
-        are ``e1 e2``, optionally ``w R11 R22 flag id snr ...`` and the true shear ``g1 g2``. Columns of GalSim's HSM,
+        or polars frames, Arrow tables or record batches, groups of h5py, or paths of files and of folders that ``measure``
+        wrote. ``FILE:GROUP`` names a group of an HDF5 file whose datasets are columns; groups ``noshear`` (``ns``, ``00``), ``1p``,
+        ``1m``, ``2p`` and ``2m`` in it are sheared catalogues. Columns are ``e1 e2``, optionally ``w R11 R22 flag id snr ...`` and the true shear ``g1 g2``. Columns of GalSim's HSM,
         ngmix metacal, metadetect and AnaCal are recognised.
     g1, g2 : float or sequence of float
         True shear of all catalogues, or of each. By default it is in the columns g1 and g2.
@@ -276,7 +277,12 @@ def _several(catalogues: Any) -> Iterable[Any]:
 def _catalogue(name: str, table: Any) -> str | tuple[str, list[tuple[str, Any]]]:
     """A path, or a name with columns of float64 or of text."""
     if isinstance(table, (str, os.PathLike)):
-        return os.fspath(table)
+        path = os.fspath(table)
+        if not _hdf5.is_hdf5(path):
+            return path
+        name, table = path, _hdf5.table(path, path)
+    elif _hdf5.is_group(table):
+        table = _hdf5.table(table, name)
     try:
         given = named_columns(table)
     except TypeError:

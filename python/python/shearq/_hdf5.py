@@ -1,0 +1,135 @@
+"""Tables in HDF5 files, whose columns are the datasets of a group. Needs h5py."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+# The column by which metadetect itself names the step of a row.
+_STEP = "mdet_step"
+# Names of the groups of metadetect's artificial shears, and what metadetect calls them.
+_STEPS = {
+    "noshear": ("noshear", "ns", "00", "unsheared"),
+    "1p": ("1p",),
+    "1m": ("1m",),
+    "2p": ("2p",),
+    "2m": ("2m",),
+}
+
+
+def is_hdf5(path: str) -> bool:
+    """Whether a file, or FILE of FILE:GROUP, is one of HDF5, whatever its name."""
+    try:
+        with open(_parts(path)[0], "rb") as file:
+            return file.read(len(_SIGNATURE)) == _SIGNATURE
+    except OSError:
+        return False
+
+
+def is_group(value: Any) -> bool:
+    """Whether an object is a group of h5py, without importing it."""
+    return hasattr(value, "visititems") and hasattr(value, "attrs")
+
+
+def _parts(path: str) -> tuple[str, str]:
+    """The file and the group of FILE or FILE:GROUP."""
+    if os.path.exists(path) or ":" not in path:
+        return path, ""
+    file, group = path.rsplit(":", 1)
+    return file, group
+
+
+class Hdf5Table(Mapping[str, Any]):
+    """The columns of a group, each read when it is asked for."""
+
+    def __init__(self, group: Any, name: str) -> None:
+        self.name = name
+        self._steps = _steps(group)
+        tables = list(self._steps.values()) if self._steps else [group]
+        columns = [_datasets(table) for table in tables]
+        shared = [key for key in columns[0] if all(key in other for other in columns)]
+        self._columns = {key: [column[key] for column in columns] for key in shared}
+        lengths = {key: tuple(len(part) for part in parts) for key, parts in self._columns.items()}
+        first = next(iter(lengths.values()), None)
+        if first is None:
+            raise ValueError(f"{name}: has no datasets; expected columns of a table{_listing(group)}")
+        others = [key for key, length in lengths.items() if length != first]
+        if others:
+            raise ValueError(f"{name}: {others[0]} has {sum(lengths[others[0]])} rows and {shared[0]} {sum(first)}; expected one length")
+        self._rows = first
+
+    def __getitem__(self, key: str) -> Any:
+        if self._steps and key == _STEP:
+            return np.repeat(np.array(list(self._steps)), self._rows)
+        return np.concatenate([_native(part[:]) for part in self._columns[key]])
+
+    def __iter__(self) -> Any:
+        return iter([*self._columns, *([_STEP] if self._steps else [])])
+
+    def __len__(self) -> int:
+        return len(self._columns) + bool(self._steps)
+
+
+def _datasets(group: Any) -> dict[str, Any]:
+    return {key: value for key, value in group.items() if hasattr(value, "dtype") and value.ndim in (1, 2)}
+
+
+def _native(values: Any) -> Any:
+    # Datasets of bytes are texts.
+    return np.char.decode(values, "utf-8") if values.dtype.kind == "S" else values
+
+
+def _steps(group: Any) -> dict[str, Any]:
+    """The groups of metadetect's artificial shears; none for the group of one table."""
+    found: dict[str, Any] = {}
+    for step, names in _STEPS.items():
+        for name in names:
+            if name in group and hasattr(group[name], "keys"):
+                found[step] = group[name]
+                break
+    return found if len(found) >= 3 else {}
+
+
+def _listing(group: Any) -> str:
+    tables: list[str] = []
+
+    def visit(name: str, value: Any) -> None:
+        if hasattr(value, "keys") and (_datasets(value) or _steps(value)):
+            tables.append(name)
+
+    group.visititems(visit)
+    return f". Try: FILE:GROUP with one of {', '.join(tables[:8])}" if tables else ""
+
+
+def table(source: Any, name: str) -> Hdf5Table:
+    """The table of a group of h5py, or of FILE or FILE:GROUP: the only group of the file with columns if none is named."""
+    try:
+        import h5py  # type: ignore[import-untyped, unused-ignore]
+    except ImportError:
+        raise ImportError(f"{name}: is an HDF5 file, which h5py reads. Try: pip install h5py") from None
+    if not isinstance(source, str):
+        group, given = source, ""
+    else:
+        path, given = _parts(source)
+        file = h5py.File(path, "r")
+        try:
+            group = file[given] if given else file
+        except KeyError:
+            raise ValueError(f"{path}: has no group {given}{_listing(file)}") from None
+    if not given and not _datasets(group) and not _steps(group):
+        candidates = [value for value in _groups(group) if _datasets(value) or _steps(value)]
+        inner = [one for one in candidates if not any(one.name.startswith(f"{other.name}/") and _steps(other) for other in candidates)]
+        if len(inner) != 1:
+            raise ValueError(f"{name}: found {len(inner)} tables; expected one{_listing(group)}")
+        group = inner[0]
+    return Hdf5Table(group, name)
+
+
+def _groups(group: Any) -> list[Any]:
+    found: list[Any] = []
+    group.visititems(lambda _, value: found.append(value) if hasattr(value, "keys") else None)
+    return found

@@ -1,0 +1,70 @@
+"""Catalogues in HDF5 files, as DES and DESC write them."""
+
+import numpy as np
+import pytest
+
+import shearq
+
+h5py = pytest.importorskip("h5py", reason="HDF5 files are read by h5py")
+
+
+def columns(rng, n, shear, step=(0.0, 0.0), response=0.7):
+    e = rng.normal(0, 0.2, (n, 2))
+    return {
+        "wmom_g_1": e[:, 0] + response * (shear[0] + step[0]),
+        "wmom_g_2": e[:, 1] + response * (shear[1] + step[1]),
+        "wmom_flags": np.zeros(n, int),
+    }
+
+
+STEPS = {"ns": (0, 0), "1p": (0.01, 0), "1m": (-0.01, 0), "2p": (0, 0.01), "2m": (0, -0.01)}
+
+
+def write(path, shear, groups=STEPS, seed=1, inside="shear"):
+    with h5py.File(path, "w") as file:
+        for name, step in groups.items():
+            rng = np.random.default_rng(seed)
+            group = file.create_group(f"{inside}/{name}")
+            for key, value in columns(rng, 4000, shear, step).items():
+                group[key] = value
+
+
+def test_groups_of_metadetect_are_sheared_catalogues(tmp_path):
+    write(tmp_path / "plus.h5", (0.02, 0.0))
+    # Known by its first bytes, and one table without a name.
+    write(tmp_path / "minus.dat", (-0.02, 0.0))
+    paths = [tmp_path / "plus.h5", tmp_path / "minus.dat"]
+    found = shearq.bias(paths, g1=[0.02, -0.02], g2=[0, 0])
+    # The same shapes under both signs, so that m1 is exact but for their mean in the response.
+    assert found["m1"] == pytest.approx(0.0, abs=1e-9)
+    named = shearq.bias([f"{path}:shear" for path in paths], g1=[0.02, -0.02], g2=[0, 0])
+    assert named["m1"] == found["m1"]
+    with h5py.File(paths[0]) as plus, h5py.File(paths[1]) as minus:
+        groups = shearq.bias([plus["shear"], minus["shear"]], g1=[0.02, -0.02], g2=[0, 0])
+    assert groups["m1"] == found["m1"]
+
+
+def test_a_group_is_a_table_of_its_datasets(tmp_path):
+    rng = np.random.default_rng(2)
+    e = rng.normal(0, 0.2, (1000, 2))
+    for name, sign in (("plus", 1), ("minus", -1)):
+        with h5py.File(tmp_path / f"{name}.hdf5", "w") as file:
+            group = file.create_group("catalog/unsheared")
+            group["e_1"], group["e_2"] = e[:, 0] + sign * 0.02 * 0.5, e[:, 1]
+            group["R11"], group["R22"] = np.full(1000, 0.5), np.full(1000, 0.5)
+            file.create_group("catalog/other")["ra"] = rng.uniform(0, 1, 1000)
+    paths = [tmp_path / "plus.hdf5", tmp_path / "minus.hdf5"]
+    with pytest.raises(ValueError, match="found 2 tables; expected one. Try: FILE:GROUP with one of catalog/other, catalog/unsheared"):
+        shearq.bias(paths, g1=[0.02, -0.02], g2=[0, 0])
+    named = {"e1": "e_1", "e2": "e_2"}
+    found = shearq.bias([f"{path}:catalog/unsheared" for path in paths], g1=[0.02, -0.02], g2=[0, 0], columns=named)
+    assert found["m1"] == pytest.approx(0.0, abs=1e-9)
+    with pytest.raises(ValueError, match="has no group catalog/sheared_1p"):
+        shearq.bias(f"{paths[0]}:catalog/sheared_1p", g1=0.02, g2=0)
+
+
+def test_columns_of_unlike_lengths_are_refused(tmp_path):
+    with h5py.File(tmp_path / "odd.h5", "w") as file:
+        file["e1"], file["e2"] = np.zeros(3), np.zeros(4)
+    with pytest.raises(ValueError, match="odd.h5: e2 has 4 rows and e1 3; expected one length"):
+        shearq.bias(tmp_path / "odd.h5", g1=0.02, g2=0)
