@@ -7,6 +7,7 @@ import sys
 
 import numpy as np
 import pytest
+from test_survey import DOCS, blocks
 
 import shearq
 
@@ -14,31 +15,15 @@ pytest.importorskip("ceci", reason="ceci is not installed")
 pytest.importorskip("h5py", reason="HDF5 files are read by h5py")
 fits = pytest.importorskip("astropy.io.fits")
 
-PIPELINE = """
-modules: shearq.ceci
-launcher: {name: mini, interval: 0.5}
-site: {name: local, max_threads: 1}
-stages:
-  - {name: ShearMeasure, nprocess: 1}
-  - {name: ShearBias, nprocess: 1}
-inputs: {stamps: stamps.fits, psf: psf.fits}
-config: config.yml
-resume: false
-output_dir: out
-log_dir: logs
-"""
-CONFIG = """
-ShearMeasure: {submission: 48/linear/star, threads: 1}
-ShearBias: {g1: [0.02], g2: [0.0]}
-"""
+PAGE = (DOCS / "from-your-pipeline.md").read_text()
 
 
 def test_a_pipeline_measures_and_finds_the_bias(tmp_path):
     image = shearq.simulate(set=8, grid=16)[0]
     fits.writeto(tmp_path / "stamps.fits", np.asarray(image.stamps))
     fits.writeto(tmp_path / "psf.fits", np.asarray(image.psf))
-    (tmp_path / "pipeline.yml").write_text(PIPELINE)
-    (tmp_path / "config.yml").write_text(CONFIG)
+    for name, text in zip(("pipeline.yml", "config.yml"), blocks(PAGE, "yaml")):
+        (tmp_path / name).write_text(text)
     # ceci starts `python3`, which is that of the environment.
     path = os.pathsep.join([os.path.dirname(sys.executable), os.environ["PATH"]])
     done = subprocess.run([os.path.join(os.path.dirname(sys.executable), "ceci"), "pipeline.yml"], cwd=tmp_path, env={**os.environ, "PATH": path}, capture_output=True, text=True)

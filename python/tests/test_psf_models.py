@@ -92,10 +92,9 @@ def test_a_psf_that_piff_fitted_has_the_exact_shear(field, tmp_path):
     assert found.g1 == pytest.approx(0.02, abs=0.001) and found.g2 == pytest.approx(-0.01, abs=0.001)
 
 
-def test_psfex_files_are_drawn_without_another_pixel(tmp_path):
+def write_psfex(path):
+    """A PSFEx file of a Gaussian that grows along x, sampled at half a pixel, the pixel included."""
     fits = pytest.importorskip("astropy.io.fits")
-    des = pytest.importorskip("galsim.des")
-    # A Gaussian that grows along x, sampled at half a pixel, the pixel included.
     side, step = 63, 0.5
     rows, columns = (np.indices((side, side)) - (side - 1) / 2) * step
 
@@ -110,7 +109,12 @@ def test_psfex_files_are_drawn_without_another_pixel(tmp_path):
     keys = {"POLNAXIS": 2, "POLNGRP": 1, "POLGRP1": 1, "POLGRP2": 1, "POLNAME1": "X_IMAGE", "POLNAME2": "Y_IMAGE", "POLZERO1": 500.0, "POLZERO2": 500.0}
     keys |= {"POLSCAL1": 500.0, "POLSCAL2": 1000.0, "POLDEG1": 1, "PSFNAXIS": 3, "PSFAXIS1": side, "PSFAXIS2": side, "PSFAXIS3": 3, "PSF_SAMP": step}
     table.header.update(keys)
-    fits.HDUList([fits.PrimaryHDU(), table]).writeto(tmp_path / "model.psf")
+    fits.HDUList([fits.PrimaryHDU(), table]).writeto(path)
+
+
+def test_psfex_files_are_drawn_without_another_pixel(tmp_path):
+    des = pytest.importorskip("galsim.des")
+    write_psfex(tmp_path / "model.psf")
     psf = des.DES_PSFEx(str(tmp_path / "model.psf"))
     rng = np.random.default_rng(3)
     y, x = np.indices((SIDE, SIDE)) - (SIDE - 1) / 2
