@@ -17,7 +17,7 @@ use multiversion::multiversion;
 use shearq_quantities::statistics::{SCATTER, median};
 use shearq_submissions::Wavelet;
 
-use crate::stamp::frame;
+use crate::pixels::frame;
 
 /// Filter for one stamp size; serial, allocates nothing per stamp.
 #[derive(Debug, Clone)]

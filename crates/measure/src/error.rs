@@ -4,7 +4,7 @@ use shearq_quantities::{JacobianError, ProfileError};
 use shearq_submissions::ConfigurationError;
 use thiserror::Error;
 
-use crate::examine::Warning;
+use crate::warning::Warning;
 
 /// What can be wrong with stamps, PSFs or settings. A galaxy that cannot be measured is no error: it has
 /// [`Flags`](crate::Flags).

@@ -52,9 +52,13 @@ mod examine;
 mod measurement;
 mod measurer;
 mod method;
+mod missing;
+mod moments;
 mod network;
 mod noise;
+mod pixels;
 mod psf;
+mod random;
 mod selection;
 mod session;
 mod shape;
@@ -64,19 +68,22 @@ mod stamp;
 #[cfg(test)]
 mod testing;
 mod transform;
+mod warning;
 
 pub use calibration::{MeanShear, MeanShearError, ShearSum, is_significant};
 pub use error::{EpochError, MeasureError};
-pub use examine::{EXAMINED_PSFS, Examination, ExaminedPsfs, PixelFrame, Warning, examined_rows};
+pub use examine::{EXAMINED_PSFS, Examination, examined_rows};
 pub use measurement::{
-    Coupling, Descent, Flag, Flags, Measurement, Observables, PsfShape, ResponseMatrix, Stop,
+    Coupling, Descent, Flag, Flags, Measurement, Observables, PsfShape, ResponseMatrix,
+    ShearedCatalogues, ShearedGalaxy, Stop,
 };
 pub use measurer::{Epoch, ImageNoise, ImageWorker, Measurer, PsfWorker, Steps, Worker};
 pub use method::AdaptedSettings;
 pub use ndarray;
 pub use noise::{StampNoise, Survey};
+pub use pixels::{Pixel, Pixels};
 pub use psf::{Psfs, Star, average_stars};
-pub use selection::{Cut, Quantity, Selected, Selection, ShearedCatalogues, ShearedGalaxy};
+pub use selection::{Cut, Quantity, Selected, Selection};
 pub use session::{
     ArraySource, Batch, KnownNoise, Lazy, LazyStamps, MeasuredImage, MeasuredRow, OneThread,
     RowJob, Session, StampRows, StampSource, Threads,
@@ -86,17 +93,17 @@ pub use shearq_quantities::{
 };
 pub use shearq_submissions::{Configuration, ConfigurationError, PsfCut};
 pub use sky::Sky;
-pub use stamp::{Pixel, Pixels};
+pub use warning::{ExaminedPsfs, PixelFrame, Warning};
 
 /// The parts of a measurement, for benchmarks and simulations. Slices and buffers have to be of the sizes planned.
 pub mod parts {
     pub use crate::denoise::{DenoiseScratch, WaveletWiener, border_noise};
     pub use crate::network::{Network, NetworkScratch, Rule, Step, convolve, psf_factor};
+    pub use crate::pixels::frame;
     pub use crate::shape::{
         ClippedAcf, ClippedAcfScratch, Moments, Ratio, RoundMoments, TypicalGalaxy,
     };
     pub use crate::spectral::{Lags, Light, ModeNoise, Spectral, SpectralPsf, SpectralScratch};
-    pub use crate::stamp::frame;
     pub use crate::transform::HexLattice;
 }
 

@@ -4,8 +4,6 @@ use std::fmt;
 
 use thiserror::Error;
 
-use crate::selection::ShearedCatalogues;
-
 /// The adaptive moments of a PSF, pixels included: the moments of the elliptical Gaussian M that is the best weight,
 /// M = 2 Σ W x xᵀ p / Σ W p with W = exp(−½ xᵀ M⁻¹ x) about the centroid under W (Bernstein & Jarvis 2002, AJ 123, 583;
 /// Hirata & Seljak 2003, MNRAS 343, 459). GalSim's `FindAdaptiveMom` has the same `observed_shape` and `moments_sigma`.
@@ -382,6 +380,57 @@ pub struct Coupling {
     pub turned: [[f64; 3]; 3],
     /// Mean change of the size by this difference.
     pub turned_size: f64,
+}
+
+/// The mean of a response R of this trace over rotations and reflections of the galaxy: the same for both components.
+pub(crate) fn isotropic(trace: f64) -> ResponseMatrix {
+    // A shear of galaxies of all orientations sees this mean. The rest of R is noise that averages need not have.
+    let response = 0.5 * trace;
+    [[response, 0.0], [0.0, response]]
+}
+
+/// The values of a galaxy in one catalogue.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
+pub struct ShearedGalaxy {
+    /// First component of the ellipticity.
+    pub e1: f64,
+    /// Second component.
+    pub e2: f64,
+    /// As [`Observables::flux`](crate::Observables::flux).
+    pub flux: f64,
+    /// As [`Observables::size`](crate::Observables::size).
+    pub size: f64,
+}
+
+/// A galaxy without shear, under γ1 = ±h and under γ2 = ±h, in the order of [`ShearedCatalogues::NAMES`].
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
+pub struct ShearedCatalogues {
+    /// The galaxy in each catalogue.
+    pub each: [ShearedGalaxy; 5],
+    /// Standard deviation of the flux in each catalogue.
+    pub flux_error: f64,
+}
+
+impl ShearedCatalogues {
+    /// Names of the catalogues.
+    pub const NAMES: [&'static str; 5] = ["noshear", "1p", "1m", "2p", "2m"];
+
+    /// Names of the values in each catalogue.
+    pub const QUANTITIES: [&'static str; 5] = ["e1", "e2", "snr", "flux", "size"];
+
+    /// The names of all columns, catalogue by catalogue: `e1_noshear`, `e2_noshear`, …
+    pub fn columns() -> impl Iterator<Item = String> {
+        let columns = |name| Self::QUANTITIES.map(|quantity| format!("{quantity}_{name}"));
+        Self::NAMES.into_iter().flat_map(columns)
+    }
+
+    /// The values in a catalogue, in the order of [`ShearedCatalogues::QUANTITIES`].
+    pub fn values(&self, catalogue: usize) -> [f64; 5] {
+        let ShearedGalaxy { e1, e2, flux, size } = self.each[catalogue];
+        [e1, e2, flux / self.flux_error, flux, size]
+    }
 }
 
 #[cfg(test)]

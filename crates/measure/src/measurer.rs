@@ -14,14 +14,13 @@ use crate::denoise::{DenoiseScratch, WaveletWiener, border_noise};
 use crate::error::{EpochError, MeasureError};
 use crate::measurement::{Flag, Measurement, PsfShape};
 use crate::method::{AdaptedSettings, CutEpoch, CutWorker, Images, MethodPlan, Saturation};
+use crate::missing::{MissingPixels, mark_padding_missing};
 use crate::network::convolve;
 use crate::noise::{NoisePlan, StampNoise, Survey};
+use crate::pixels::{PEAK_RANGE, Pixel, all_finite, highest, is_level};
 use crate::psf::{Psfs, ResidualProfiles, Star, StarSurvey, cut_start};
 use crate::spectral::EpochPixels;
-use crate::stamp::{
-    FullStamp, MissingPixels, PEAK_RANGE, Pixel, SkySubtraction, all_finite, highest, is_level,
-    mark_padding_missing,
-};
+use crate::stamp::{FullStamp, SkySubtraction};
 
 // Pixels are then 1.22 times as far apart as square ones, so that the largest wave number of the sharpest target, 2.2 per
 // pixel, is still below the Nyquist frequency. Chosen by hand: cameras are below 0.02.

@@ -26,7 +26,7 @@ use shearq_submissions::{
 
 use crate::error::{MeasureError, length};
 use crate::measurement::{Descent, Stop};
-use crate::stamp::{check_psf, check_sizes};
+use crate::pixels::{check_psf, check_sizes};
 use crate::transform::{Plane, Spectrum, ToModes, ToPixels, TransformScratch};
 
 // High-pass kernel D of the regularisation; its elements sum to zero. Nurbaeva et al., Sect. 3.1.

@@ -29,14 +29,13 @@ use shearq_quantities::statistics::{SCATTER, median};
 use shearq_submissions::SkySource;
 
 use crate::error::MeasureError;
-use crate::examine::Warning;
 use crate::examine::enough;
+use crate::missing::{MissingPixels, padding, rotation_sum};
+use crate::moments::{GalaxyMoments, galaxy_centroid};
+use crate::pixels::{PEAK_RANGE, Pixel, all_finite, highest};
 use crate::sky::{Sky, SkyLevels, inner_light};
-use crate::stamp::{
-    FullStamp, MissingPixels, PEAK_RANGE, Pixel, SkySubtraction, all_finite, highest, padding,
-    rotation_sum,
-};
-use crate::stamp::{GalaxyMoments, galaxy_centroid};
+use crate::stamp::{FullStamp, SkySubtraction};
+use crate::warning::Warning;
 
 // In pixels. Chosen by hand.
 const BLOCK_SIDE: usize = 8;

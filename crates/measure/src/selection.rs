@@ -38,8 +38,9 @@ use std::sync::Arc;
 
 use shearq_quantities::linear::cholesky;
 
-use crate::measurement::{Coupling, FLUX, Observables, RING, ResponseMatrix, SIZE, VARIABLES};
-use crate::method::isotropic;
+use crate::measurement::{
+    Coupling, FLUX, Observables, RING, ResponseMatrix, SIZE, ShearedGalaxy, VARIABLES, isotropic,
+};
 use crate::spectral::NoiseChanges;
 
 // In standard deviations of the S/N, which are 1. Chosen by hand.
@@ -49,7 +50,6 @@ const SNR_HALF_WIDTH: f64 = 1.5;
 const SIZE_HALF_WIDTH: f64 = 0.3;
 // Chosen by hand: the noise of the light of the ring is 0.12 of the flux at S/N 20.
 const NEIGHBOUR_HALF_WIDTH: f64 = 0.15;
-
 // Chosen by hand: one galaxy of some thousands lies within a step of 0.015 in S/N, and the error of the response is its own size.
 const MIN_WIDTH_RATIO: f64 = 0.01;
 
@@ -358,6 +358,7 @@ fn numerical(weight: &dyn Fn(f64, f64, f64) -> f64, galaxy: &Observables) -> Jet
 
 // e1, e2, flux and size.
 const VALUES: usize = 4;
+
 /// A symmetric matrix of all values.
 pub(crate) type Matrix = [[f64; VALUES]; VALUES];
 
@@ -365,50 +366,6 @@ pub(crate) type Matrix = [[f64; VALUES]; VALUES];
 const MARGIN: f64 = 1e-3;
 // The added share of the noise is then at most 1/256 of its bound too large.
 const BISECTIONS: usize = 8;
-
-/// The values of a galaxy in one catalogue.
-#[derive(Debug, Clone, Copy, PartialEq)]
-#[non_exhaustive]
-pub struct ShearedGalaxy {
-    /// First component of the ellipticity.
-    pub e1: f64,
-    /// Second component.
-    pub e2: f64,
-    /// As [`Observables::flux`](crate::Observables::flux).
-    pub flux: f64,
-    /// As [`Observables::size`](crate::Observables::size).
-    pub size: f64,
-}
-
-/// A galaxy without shear, under γ1 = ±h and under γ2 = ±h, in the order of [`ShearedCatalogues::NAMES`].
-#[derive(Debug, Clone, Copy, PartialEq)]
-#[non_exhaustive]
-pub struct ShearedCatalogues {
-    /// The galaxy in each catalogue.
-    pub each: [ShearedGalaxy; 5],
-    /// Standard deviation of the flux in each catalogue.
-    pub flux_error: f64,
-}
-
-impl ShearedCatalogues {
-    /// Names of the catalogues.
-    pub const NAMES: [&'static str; 5] = ["noshear", "1p", "1m", "2p", "2m"];
-
-    /// Names of the values in each catalogue.
-    pub const QUANTITIES: [&'static str; 5] = ["e1", "e2", "snr", "flux", "size"];
-
-    /// The names of all columns, catalogue by catalogue: `e1_noshear`, `e2_noshear`, …
-    pub fn columns() -> impl Iterator<Item = String> {
-        let columns = |name| Self::QUANTITIES.map(|quantity| format!("{quantity}_{name}"));
-        Self::NAMES.into_iter().flat_map(columns)
-    }
-
-    /// The values in a catalogue, in the order of [`ShearedCatalogues::QUANTITIES`].
-    pub fn values(&self, catalogue: usize) -> [f64; 5] {
-        let ShearedGalaxy { e1, e2, flux, size } = self.each[catalogue];
-        [e1, e2, flux / self.flux_error, flux, size]
-    }
-}
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct ShearSettings {

@@ -19,12 +19,13 @@ use shearq_submissions::{Calibration, Configuration, NoiseSource};
 
 use crate::calibration::mean_response;
 use crate::error::{EpochError, MeasureError, length};
-use crate::examine::{EXAMINED_PSFS, Estimate, Examination, Warning, enough, examined_rows};
+use crate::examine::{EXAMINED_PSFS, Estimate, Examination, enough, examined_rows};
 use crate::measurement::{Flag, Measurement};
 use crate::measurer::{Epoch, ImageNoise, ImageWorker, Measurer, Steps, Worker};
 use crate::noise::{NoisePlan, NoiseSurvey, StampNoise, Survey};
+use crate::pixels::{Pixel, Pixels, is_level};
 use crate::psf::{Psfs, ResidualProfiles, Star};
-use crate::stamp::{Pixel, Pixels, is_level};
+use crate::warning::Warning;
 
 /// The noise of an image before it is measured, as far as it is known.
 #[derive(Debug, Clone, Default)]

@@ -11,7 +11,7 @@ use std::f64::consts::PI;
 use shearq_quantities::linear::cholesky;
 use shearq_quantities::statistics::{FROM_MODULI, OF_MEDIAN, median, scatter};
 
-use crate::stamp::padding;
+use crate::missing::padding;
 
 // Radius in pixels within which a galaxy's light is summed. Chosen by hand.
 pub(crate) const INNER_RADIUS: f64 = 8.0;

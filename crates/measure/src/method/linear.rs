@@ -4,7 +4,7 @@
 //!
 //! The response of a galaxy is computed on its noisy image, and shears the noise along with the galaxy. The galaxies that
 //! lensing shears have no noise yet. The mean effect of noise on the change of the autocorrelation is subtracted in
-//! `spectral.rs`. What remains is that the ellipticity is not linear in the autocorrelation: f″(δA, δA′), with δA the
+//! `spectral/noise.rs`. What remains is that the ellipticity is not linear in the autocorrelation: f″(δA, δA′), with δA the
 //! change by noise and δA′ the change by the shear of this noise. Both are linear in the noise, so that the mean follows from
 //! its power and from the gradients of f and of its divisor ([`Ratio`]). Fields of noise, added and
 //! subtracted as in Sheldon & Huff (2017), have the same mean; each field took longer and scattered. One galaxy in
@@ -25,24 +25,24 @@ use shearq_quantities::PixelShape;
 use shearq_submissions::limits::{MAX_TARGET, MIN_TARGET, WINDOWS};
 use shearq_submissions::{LinearMethod, PsfCut, ShearOrigin};
 
-use super::{
-    AdaptedSettings, CutEpoch, CutWorker, Found, FoundObservables, Images, NoiseMeans, image,
-};
+use super::found::{Found, FoundObservables, NoiseMeans};
+use super::worker::{AdaptedSettings, CutEpoch, CutWorker, Images, image};
 use crate::error::MeasureError;
 use crate::measurement::{Descent, ResponseMatrix, Stop};
+use crate::moments::{WeightedMoments, shear_origin};
 use crate::noise::StampNoise;
 use crate::psf::{
     ResidualProfiles, StarDenoiser, WIDTH_STEPS, gaussian_variance, noise_equivalent_area,
     width_factor, width_step,
 };
+use crate::random::hash;
+use crate::random::uniform;
 use crate::selection::ShearSettings;
 use crate::shape::{Ratio, RoundMoments, SizeMoments, TypicalGalaxy};
 use crate::spectral::{
     EpochScratch, Lags, ModeNoise, NoiseChanges, Spectral, SpectralEpoch, SpectralPsf,
-    SpectralScratch, uniform,
+    SpectralScratch,
 };
-use crate::stamp::hash;
-use crate::stamp::{WeightedMoments, shear_origin};
 use crate::transform::HexLattice;
 
 // In simulated pairs the choice of galaxies makes 7 % of the error of m, and half of it behind a PSF of ellipticity 0.1. All galaxies

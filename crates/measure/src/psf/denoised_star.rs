@@ -24,7 +24,9 @@ use shearq_quantities::linear::cholesky;
 use shearq_quantities::statistics::{SCATTER, median, scatter};
 use shearq_submissions::PsfCut;
 
-use super::{Psfs, gaussian_variance, noise_equivalent_area, psf_offset, sum_of_squares};
+use super::psfs::Psfs;
+use super::star::{psf_offset, sum_of_squares};
+use super::width::{gaussian_variance, noise_equivalent_area};
 
 // S/N between which the share of the raw star in the result grows from 0 to 1. The lower end is chosen by hand.
 // At 1000 the noise of one star changes m by 5·10⁻³.
@@ -1042,7 +1044,7 @@ mod tests {
     use rand_chacha::ChaCha8Rng;
     use shearq_quantities::{FunctionalPsf, PsfProfile, Shear};
 
-    use super::super::tests::{drawn, noisy, power};
+    use super::super::testing::{drawn, noisy, power};
     use super::*;
 
     const MOFFAT: PsfProfile = PsfProfile::Moffat { beta: 3.0 };

@@ -316,7 +316,7 @@ fn noise_taken_as_white_is_tested_up_to_two_pixels() {
     // Correlated by 0.08 at a distance along x: so little that the polynomials, which spread it to other lags, do not matter.
     let mut warns = |distance: usize| {
         let mut noise = Array3::from_shape_fn((40, 48, 51), |_| {
-            crate::spectral::uniform(&mut state) as f32 - 0.5
+            crate::random::uniform(&mut state) as f32 - 0.5
         });
         let other = noise.clone();
         let width = 51 - distance;

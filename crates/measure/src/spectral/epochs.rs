@@ -16,10 +16,19 @@
 //! Stamps may be turned against each other. Modes are along common axes, and turned stamps are transformed at
 //! these modes ([`ToTurnedModes`]) without interpolation. The window is at the same place of the sky in all of them.
 
-use shearq_quantities::linear::{Matrix2, apply, determinant, inverse, product};
+use shearq_quantities::linear::{LANES, Matrix2, ROWS, apply, determinant, inverse, product};
 
-use super::*;
+use super::deconvolution::{
+    Lags, MIN_PSF_POWER, Restoration, Spectral, SpectralPsf, SpectralScratch, multiply_modes,
+    restore, sheared,
+};
+use super::edges::{SHEARS, edge_lines};
+use crate::error::MeasureError;
 use crate::transform::ToTurnedModes;
+use crate::transform::{Modes, Spectrum, lanes, store};
+use multiversion::multiversion;
+use ndarray::ArrayView2;
+use shearq_quantities::PixelShape;
 
 // Difference of matrices that single precision does not resolve.
 const SAME: f64 = 1e-7;
@@ -278,7 +287,7 @@ fn combine(
         let (kx, ky) = (lanes(&plan.waves[0], at), lanes(&plan.waves[1], at));
         let mut amplitudes = [0.0; LANES];
         let of_modes = [&squares[..], rough, target];
-        super::amplitudes(of_modes, plan.step, plan.iterations, &mut amplitudes);
+        super::deconvolution::amplitudes(of_modes, plan.step, plan.iterations, &mut amplitudes);
         let mut power = [0.0f32; LANES];
         let mut mean_tilts = [[0.0f32; LANES]; 2];
         for (epoch, weight) in epochs.iter_mut().zip(weights) {

@@ -1,10 +1,15 @@
 use ndarray::{Array2, ArrayView2};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use shearq_fourier::Complex64;
+use shearq_quantities::PixelShape;
 use shearq_submissions::{LinearDeconvolution, Registry};
 
-use super::*;
+use super::deconvolution::*;
+use super::noise::*;
+use super::window::*;
 use crate::network::convolve;
+use crate::network::high_pass;
 use crate::noise::StampNoise;
 use crate::shape::{RoundMoments, SizeMoments, TypicalGalaxy};
 

@@ -1,0 +1,491 @@
+//! Texts of the warnings about data. Those that are fatal stop the work.
+//!
+//! Their conditions are in `examine.rs`, `psf/quality.rs`, `noise.rs` and `session.rs`, and in `wcs.rs` and `measure/source.rs` of the pipeline.
+
+use std::fmt;
+
+use shearq_submissions::limits::MIN_PSF;
+use strum_macros::IntoStaticStr;
+use thiserror::Error;
+
+use crate::measurement::{Flag, Measurement};
+
+/// Something in the data of an image that biases shears, or is likely a mistake.
+///
+/// The text of [`Display`](fmt::Display) is one line without the name of the image.
+#[derive(Debug, Clone, PartialEq, Error, IntoStaticStr)]
+#[strum(serialize_all = "kebab-case")]
+#[non_exhaustive]
+#[expect(
+    missing_docs,
+    reason = "the text of a variant states what its fields are"
+)]
+pub enum Warning {
+    /// The corners of the stamps are brighter or darker than zero.
+    #[error("the stamps contain sky {}", sky(*level, *error, *noise, *share, *subtracted))]
+    Sky {
+        /// Mean level in image units.
+        level: f64,
+        error: f64,
+        /// Noise of a pixel in image units.
+        noise: f64,
+        /// Light of this sky within 8 px of a galaxy, in units of the galaxy's.
+        share: f64,
+        /// Whether it was subtracted from the stamps before they were measured.
+        subtracted: bool,
+    },
+    /// The level of the stamps' corners changes along x or y.
+    #[error("the sky has a gradient {}", gradient(*slope, *error, *noise, *subtracted))]
+    Gradient {
+        /// Change per pixel along x and y, in image units.
+        slope: [f64; 2],
+        error: f64,
+        /// Noise of a pixel in image units.
+        noise: f64,
+        /// Whether it was subtracted from the stamps before they were measured.
+        subtracted: bool,
+    },
+    /// The galaxies are not in the middle of their stamps.
+    #[error(
+        "the galaxies are off the centre of their stamps (found a median of {:+.2} px along x and {:+.2} px along y, ± {error:.2}; expected the middle). Try: cut the stamps around the galaxies",
+        offset[0], offset[1]
+    )]
+    OffCentre {
+        /// Median of their centroids from the middle, along x and y in pixels.
+        offset: [f64; 2],
+        error: f64,
+    },
+    /// The galaxies are at different places of their stamps.
+    #[error(
+        "the galaxies are scattered over their stamps (found {:.1} px along x and {:.1} px along y; expected less than 2 px). Try: cut the stamps around the galaxies",
+        scatter[0], scatter[1]
+    )]
+    PositionScatter {
+        /// Scatter of their centroids along x and y in pixels.
+        scatter: [f64; 2],
+    },
+    /// Most galaxies are darker than their surroundings.
+    #[error(
+        "galaxies are darker than their surroundings (found negative flux on {count} of {of} stamps; expected positive flux). Try: check the sign of the image"
+    )]
+    Negative { count: usize, of: usize },
+    /// The noise differs from stamp to stamp.
+    #[error(
+        "the noise differs between stamps (found a scatter of {:.0} %; expected one level). Try: give the noise of each stamp (gather --variance or --weight-map, `noise` in Python), or put stamps of one depth into an image",
+        100.0 * scatter
+    )]
+    Depths {
+        /// Scatter of the stamps' noise, in units of their median.
+        scatter: f64,
+    },
+    /// Noise is correlated over more pixels than can be measured.
+    #[error(
+        "the noise is correlated over more than 3 px (found {correlation:.2} for pixels 4 and 5 px apart; expected 0). The response is corrected for shorter correlations only. Try: use images before resampling or smoothing"
+    )]
+    LongCorrelation {
+        /// Mean correlation of pixels four and five apart along an axis.
+        correlation: f64,
+    },
+    /// The network stopped before its first iteration on most galaxies.
+    #[error(
+        "the network makes no iteration (found {count} of {of} galaxies). Their images are not deconvolved. Try: other values of deconvolution.step and deconvolution.lambda"
+    )]
+    Idle { count: usize, of: usize },
+    /// The mean response of the galaxies is not positive by three standard errors.
+    #[error(
+        "the mean response to shear is not positive by 3 standard errors (found {:.3}, {:.3}). Try: check that the PSF has the pixel scale of the galaxies, and that there are galaxies", response[0], response[1]
+    )]
+    NoResponse { response: [f64; 2] },
+    /// Stamps are copies of other stamps.
+    #[error(
+        "stamps are copies of each other (found {count} of {of}; expected none). Copies make errors too small. Try: remove repeated galaxies"
+    )]
+    Copies { count: usize, of: usize },
+    /// All pixels of a stamp are equal, on every stamp examined.
+    #[error(
+        "the stamps are blank (found equal pixels on each of {of} stamps; expected a galaxy and noise). Try: check the file and its extension"
+    )]
+    Blank { of: usize },
+    /// Pixel values are too small or large for single precision.
+    #[error(
+        "pixel values are out of range (found brightest pixels of about {peak:.1e}; expected 1e-18 to 1e17). Try: divide the image and its noise by a constant"
+    )]
+    Brightness {
+        /// Median of the stamps' brightest pixels.
+        peak: f64,
+    },
+    /// The noise of the stamps disagrees with the header.
+    #[error(
+        "NOISESIG disagrees with the measured noise (found {}, expected {}): {} is used",
+        significant(*given, 5), significant(*measured, 5),
+        if *used { "the measured noise" } else { "NOISESIG" }
+    )]
+    NoiseLevel {
+        given: f64,
+        measured: f64,
+        used: bool,
+    },
+    /// The noise of the stamps disagrees with the one in the call.
+    #[error(
+        "the given noise disagrees with the noise of the stamps (found {}, expected {}), which biases shears. Try: leave out the noise, so that it is measured",
+        significant(*given, 5), significant(*measured, 5)
+    )]
+    GivenNoise { given: f64, measured: f64 },
+    /// Noise is correlated, and the configuration treats it as white.
+    #[error(
+        "the noise of neighbouring pixels is correlated, but is treated as white (found {:.2} along x and {:.2} along y, expected 0). Try: set noise.source to \"image\" and noise.correlation above 0",
+        correlation[0], correlation[1]
+    )]
+    CorrelatedNoise {
+        /// Correlation of neighbours along x and y.
+        correlation: [f64; 2],
+    },
+    /// A warning about one of several epochs.
+    #[error("epoch {epoch}: {warning}")]
+    Epoch {
+        /// The epoch, from 1.
+        epoch: usize,
+        warning: Box<Warning>,
+    },
+    /// Noise of an epoch is correlated, and all epochs are combined as white noise.
+    #[error(
+        "the noise of neighbouring pixels is correlated, but epochs are combined as if it were white (found {:.2} along x and {:.2} along y, expected 0). Try: exposures that were not resampled",
+        correlation[0], correlation[1]
+    )]
+    EpochNoise {
+        /// Correlation of neighbours along x and y.
+        correlation: [f64; 2],
+    },
+    /// The noise of an epoch cannot be measured.
+    #[error(
+        "cannot measure the noise: no stamp has enough pixels that differ (expected galaxies and noise). The epoch is left out. Try: check the file and its extension"
+    )]
+    EpochNoNoise,
+    /// The galaxies of an epoch are not where its offsets and its PSF place them.
+    #[error(
+        "the galaxies are displaced from {} (found {:+.2} px along x and {:+.2} px along y, ± {error:.2}; expected 0), which blurs the combined galaxies. Try: check sign, order and axes of the dithers or positions, and that the PSF is centred on its stamp",
+        if *from_first { "those of the first epoch, beyond offsets and PSFs" } else { "the offsets that are stated" },
+        offset[0], offset[1]
+    )]
+    EpochOffset {
+        /// Median displacement along x and y in pixels.
+        offset: [f64; 2],
+        error: f64,
+        /// Whether it is that from the galaxies of the first epoch, and not from the offsets alone.
+        from_first: bool,
+    },
+    /// The galaxies of an epoch have another flux than in the first one.
+    #[error(
+        "the galaxies have {ratio:.2} ± {error:.2} times the flux of the first epoch (expected 1): weights and leakage of the PSF are those of one flux. Try: scale image, noise and gain to one zero point"
+    )]
+    EpochFlux { ratio: f64, error: f64 },
+    /// An epoch has no light at the stated places of the galaxies, or the first epoch has none.
+    #[error(
+        "{} at the stated places (found no significant light there; expected the galaxies that {} shows). Try: check that image, WCS and dither belong together",
+        if *from_first { "the first epoch has no galaxies" } else { "there are no galaxies" },
+        if *from_first { "this epoch" } else { "the first epoch" }
+    )]
+    EpochWithoutGalaxies { from_first: bool },
+    /// An epoch contains other galaxies than the first one.
+    #[error(
+        "{count} of {of} galaxies are not those of the first epoch (found stamps that are blank, or differ in brightness by a factor of 2 and 5 standard errors; expected the same galaxies). Try: check that files and rows of the epochs belong together. Bands of galaxies with various colours may have this warning, too"
+    )]
+    EpochGalaxies { count: usize, of: usize },
+    /// Stamps of an epoch are copies of stamps of an earlier one.
+    #[error(
+        "stamps are copies of those of an earlier epoch (found {count} of {of}; expected none), so that their noise does not average. Try: remove one of the epochs"
+    )]
+    EpochCopies { count: usize, of: usize },
+    /// No stamp is good enough to measure the noise on.
+    #[error(
+        "cannot measure the noise: no stamp has enough pixels that differ. All galaxies are flagged. Try: set noise.source to \"header\" to use NOISESIG"
+    )]
+    NoNoise,
+    /// The star was not in the middle of its stamp, and was cut around itself.
+    #[error(
+        "the star is off the centre of its stamp (found ({:+.1}, {:+.1}) px{of}; expected at most 1 px). It was moved to the centre by whole pixels",
+        offset[0], offset[1]
+    )]
+    PsfOffCentre {
+        /// Offset along x and y in pixels.
+        offset: [f64; 2],
+        of: ExaminedPsfs,
+    },
+    /// The PSF image contains a background.
+    #[error(
+        "the PSF contains a background (found {} % of its peak{of}; expected 0). It changes the star's light by {:+.0} % and biases shears. Try: subtract the background, or use a larger PSF stamp if the PSF fills it",
+        significant(100.0 * level, 3), 100.0 * share
+    )]
+    PsfBackground {
+        /// Level in units of the peak.
+        level: f64,
+        /// Its light in units of the star's.
+        share: f64,
+        of: ExaminedPsfs,
+    },
+    /// The background of the PSF image changes along x or y.
+    #[error(
+        "the background of the PSF has a gradient (found {:.3} % of the peak per pixel along x and {:.3} % along y{of}; expected 0). It biases shears. Try: subtract the background",
+        100.0 * slope[0], 100.0 * slope[1]
+    )]
+    PsfGradient {
+        /// Change per pixel along x and y in units of the peak.
+        slope: [f64; 2],
+        of: ExaminedPsfs,
+    },
+    /// The noise of the star biases shears.
+    #[error(
+        "the PSF is noisy (found S/N {snr:.0}{of}; expected more than {enough:.0}). {}",
+        effect.map_or_else(
+            || "With a star of S/N 50 for each galaxy, m is right to 0.003 behind Moffat and Kolmogorov PSFs, and to 0.01 behind others. Try: a model of the PSF, fitted to all stars".to_owned(),
+            |[m, c]| format!("The noise of one star changes m by about {m:.3} and c by about {c:.3}. Try: average several stars, or fit a model"),
+        )
+    )]
+    PsfNoise {
+        /// √(Σ p²)/σ.
+        snr: f64,
+        enough: f64,
+        /// Standard deviations of m and c by the noise of one star for all galaxies.
+        effect: Option<[f64; 2]>,
+        of: ExaminedPsfs,
+    },
+    /// The PSF is narrower than pixels can show.
+    #[error(
+        "the PSF is narrower than the pixels can show (found light on {area:.1} px{of}; expected 6 px or more, a FWHM of about 1 px). Try: check that the file is a PSF with the pixel scale of the galaxies"
+    )]
+    PsfNarrow {
+        /// Noise-equivalent area in px².
+        area: f64,
+        of: ExaminedPsfs,
+    },
+    /// The PSF is broader than the galaxies that were blurred by it.
+    #[error(
+        "the PSF is {} the galaxies (found a FWHM of {psf:.2} px in the core, expected {} the {galaxies:.2} px of the galaxies). A PSF sampled with another pixel scale biases m by up to 10. Try: check the sampling of the PSF, and that the objects are not stars",
+        if *fatal { "broader than" } else { "nearly as broad as" },
+        if *fatal { "less than" } else { "clearly less than" }
+    )]
+    PsfBroad {
+        /// FWHM of its core in pixels.
+        psf: f64,
+        /// FWHM of the core of the galaxies in pixels.
+        galaxies: f64,
+        /// Whether the difference is too large for stars that are measured as galaxies.
+        fatal: bool,
+    },
+    /// The headers of the PSF image and of the galaxy image state different pixel scales.
+    #[error(
+        "the PSF image and the galaxy image have different pixel scales (found {}, expected {} arcsec per pixel). This can bias m by 0.1 or more. Try: resample the PSF to the pixels of the galaxies, or correct its header",
+        six_digits(*psf), six_digits(*galaxies)
+    )]
+    PixelScale {
+        /// Arcseconds per pixel of the PSF image.
+        psf: f64,
+        /// Arcseconds per pixel of the galaxy image.
+        galaxies: f64,
+    },
+    /// The header of a file states the set and image of another file.
+    #[error(
+        "the header of the {of} states another image (found SET = {} and IMAGE = {}, expected {} and {}). With galaxies or a PSF of another image shears are wrong. Try: put the files back, or correct the header",
+        stated[0], stated[1], expected[0], expected[1]
+    )]
+    OtherImage {
+        /// The content of the file: galaxies, or the PSF.
+        of: &'static str,
+        /// SET and IMAGE of the header.
+        stated: [u32; 2],
+        /// Set and image of the path.
+        expected: [u32; 2],
+    },
+    /// Ellipticities are along pixel axes that the header rotates, mirrors or shears against the sky's.
+    #[error(
+        "e1 and e2 are along the pixel axes, which are not the sky's (found {0}; expected 0°, not mirrored, no shear). Try: transform e1 and e2 with the WCS, or compare them with shears along the pixel axes"
+    )]
+    PixelFrame(PixelFrame),
+    /// The headers of the PSF image and of the galaxy image state pixel axes of different orientation or shear.
+    #[error(
+        "the PSF image and the galaxy image have pixel axes of different orientation or shear (found {psf}; expected {galaxies}). The PSF is deconvolved in the wrong orientation. Try: draw the PSF with the WCS of the galaxies, or correct its header"
+    )]
+    PsfFrame {
+        psf: PixelFrame,
+        galaxies: PixelFrame,
+    },
+    /// The configuration uses so little of the PSF that its wings are missing.
+    #[error(
+        "psf.size is {size} (expected {MIN_PSF} or more). The wings of the PSF that are cut off bias m, by about 0.002 at 20 px and 0.01 at 16 px for a FWHM of 3.4 px. Try: psf.size = {MIN_PSF}"
+    )]
+    PsfSize {
+        /// Pixels a side that are used.
+        size: usize,
+    },
+    /// Most galaxies could not be measured.
+    #[error(
+        "{count} of {of} galaxies are flagged (most frequent reason: {flag}). Try: {}",
+        advice(*flag)
+    )]
+    Flagged { flag: Flag, count: usize, of: usize },
+}
+
+/// The pixel axes of an image against the sky's: +x to the west, +y to the north.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct PixelFrame {
+    /// Position angle of +y in degrees, from north through east, without the shear.
+    pub angle: f64,
+    /// Whether +x is to the east where +y is to the north.
+    pub mirrored: bool,
+    /// Reduced shear that an object that is round on the sky has along the pixel axes.
+    pub shear: [f64; 2],
+}
+
+impl fmt::Display for PixelFrame {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        // Adding zero removes the sign of a negative zero.
+        let angle = (self.angle * 10.0).round() / 10.0 + 0.0;
+        let not = if self.mirrored { "" } else { "not " };
+        let [g1, g2] = self.shear.map(|g| (g * 1e4).round() / 1e4 + 0.0);
+        write!(
+            f,
+            "rotated by {angle:.1}° from north to east, {not}mirrored, sheared by ({g1:+.4}, {g2:+.4})"
+        )
+    }
+}
+
+/// How many of the examined PSFs a warning is about.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ExaminedPsfs {
+    /// Their number.
+    pub count: usize,
+    /// PSFs examined.
+    pub of: usize,
+}
+
+impl fmt::Display for ExaminedPsfs {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            ExaminedPsfs { of: 1, .. } => Ok(()),
+            ExaminedPsfs { count, of } => write!(f, " on {count} of {of} PSFs examined"),
+        }
+    }
+}
+
+impl Warning {
+    /// A warning about the star for all galaxies, which was at the offset `moved` in pixels before it was centred.
+    pub fn of_moved(moved: [f64; 2]) -> Warning {
+        Warning::PsfOffCentre {
+            offset: moved,
+            of: ExaminedPsfs { count: 1, of: 1 },
+        }
+    }
+
+    /// Warnings about the galaxies of an image.
+    pub(crate) fn of_galaxies(galaxies: &[Measurement]) -> impl Iterator<Item = Warning> {
+        let flagged = galaxies.iter().filter(|g| !g.flags.is_empty()).count();
+        let with = |flag: Flag| galaxies.iter().filter(|g| g.flags.contains(flag)).count();
+        let flags = Warning::of_counts(Flag::ALL.map(with), flagged, galaxies.len());
+        flags.into_iter().chain(Warning::of_idle(galaxies))
+    }
+
+    /// A warning if the network made no iteration on more than half of the galaxies that it ran on.
+    fn of_idle(galaxies: &[Measurement]) -> Option<Warning> {
+        let (mut count, mut of) = (0, 0);
+        for descent in galaxies.iter().filter_map(|galaxy| galaxy.descent.as_ref()) {
+            count += usize::from(descent.iterations == 0);
+            of += 1;
+        }
+        (2 * count > of).then_some(Warning::Idle { count, of })
+    }
+
+    /// A warning if `count` of `of` galaxies are flagged and these are more than half. `with` has the galaxies
+    /// with each of [`Flag::ALL`].
+    pub fn of_counts(with: [usize; Flag::ALL.len()], count: usize, of: usize) -> Option<Warning> {
+        let counts = || Flag::ALL.into_iter().zip(with);
+        let explains = |(_, with): &(Flag, usize)| 2 * with > of;
+        // Of equal numbers the first reason.
+        let most = || counts().rev().max_by_key(|(_, with)| *with);
+        let (flag, _) = counts().find(explains).or_else(most)?;
+        (2 * count > of).then_some(Warning::Flagged { flag, count, of })
+    }
+
+    /// The warning itself, if it is about an epoch.
+    pub fn inner(&self) -> &Warning {
+        match self {
+            Warning::Epoch { warning, .. } => warning,
+            other => other,
+        }
+    }
+
+    /// A name for each kind of warning, for counting: the name of the variant, such as `psf-noise`.
+    pub fn kind(&self) -> &'static str {
+        self.inner().into()
+    }
+
+    /// Whether no result should be made from such data.
+    pub fn is_fatal(&self) -> bool {
+        matches!(self.inner(), Warning::PsfBroad { fatal: true, .. })
+    }
+}
+
+fn sky(level: f64, error: f64, noise: f64, share: f64, subtracted: bool) -> String {
+    let decimals = if subtracted { 3 } else { 2 };
+    let in_noise = match noise > 0.0 {
+        true => format!(", or {:.decimals$} of the noise", level / noise),
+        false => String::new(),
+    };
+    let (level, error) = (significant(level, 3), significant(error, 3));
+    match subtracted {
+        true => format!(
+            "(found {level} ± {error}{in_noise}; expected 0). It was subtracted from all stamps"
+        ),
+        false => format!(
+            "(found {level} ± {error} in their corners{in_noise}; expected 0). Its light within 8 px of a galaxy is {:.0} % of the galaxy's, which biases shears. Try: subtract the sky",
+            100.0 * share
+        ),
+    }
+}
+
+fn gradient(slope: [f64; 2], error: f64, noise: f64, subtracted: bool) -> String {
+    let (unit, name) = match noise > 0.0 {
+        true => (noise, "the noise"),
+        false => (1.0, "the image"),
+    };
+    let ([x, y], error) = (slope.map(|slope| slope / unit), error / unit);
+    let end = match subtracted {
+        true => ". It was subtracted from all stamps",
+        false => ", which biases shears. Try: subtract the sky",
+    };
+    format!(
+        "(found {x:+.4} along x and {y:+.4} along y, ± {error:.4}, in units of {name} per pixel; expected 0){end}"
+    )
+}
+
+/// A number with `digits` significant digits, in whatever unit pixels have.
+fn significant(value: f64, digits: i32) -> String {
+    if value == 0.0 {
+        return "0".into();
+    }
+    let decimals = digits - 1;
+    if !(1e-3..1e5).contains(&value.abs()) {
+        return format!("{value:.*e}", decimals as usize);
+    }
+    let decimals = decimals - value.abs().log10().floor() as i32;
+    format!("{value:.*}", decimals.max(0) as usize)
+}
+
+/// A pixel scale to six digits, without trailing zeros.
+fn six_digits(scale: f64) -> f64 {
+    if !(scale.is_finite() && scale > 0.0) {
+        return scale;
+    }
+    let unit = 10f64.powf(5.0 - scale.log10().floor());
+    (scale * unit).round() / unit
+}
+
+/// What to check if most galaxies have this flag.
+fn advice(flag: Flag) -> &'static str {
+    match flag {
+        Flag::NotFinite => "check masks, and positions outside the image (are they degrees?)",
+        Flag::BadPsf => "check the PSF stamps: sum, centre and finite pixels",
+        Flag::NoScale => "check that the stamps are not blank and that the noise is known",
+        Flag::NoLight | Flag::NoExtent => "check the sky, the sign of the image and its units",
+        Flag::NoShear => "check that there is a galaxy on the stamps",
+    }
+}
