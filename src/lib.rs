@@ -67,7 +67,7 @@ use shearq_render::terminal::fitted;
 /// `run` measures and scores in one step. `merge` completes a run that was split over a cluster.
 /// A configuration is a named list of settings of the method: see `shearq submissions list`.
 #[derive(Debug, Parser)]
-#[command(name = "shearq", version, propagate_version = true)]
+#[command(name = "shearq", version = version_and_commit(), propagate_version = true)]
 struct Cli {
     #[command(subcommand)]
     command: Command,
@@ -285,6 +285,16 @@ fn tell_unread(unread: Vec<String>) {
     for line in unread {
         tell(format_args!("warning: {line}"));
     }
+}
+
+// The commit is that of release builds, which set the variable: asking git in a build script would build the program again after
+// each commit.
+fn version_and_commit() -> &'static str {
+    static TEXT: std::sync::LazyLock<String> = std::sync::LazyLock::new(|| {
+        let commit = option_env!("SHEARQ_COMMIT").map(|commit| format!(" ({commit})"));
+        format!("{}{}", shearq_dataset::VERSION, commit.unwrap_or_default())
+    });
+    &TEXT
 }
 
 // For the head of a report, so that its results can be repeated.

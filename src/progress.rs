@@ -1,9 +1,11 @@
-//! Progress of long work: a bar on standard error if it is a terminal, and a line when Ctrl-C stops the work.
+//! Progress of long work on standard error: a bar on a terminal, a line each minute in a log file, and a line when Ctrl-C stops the
+//! work.
 
 use std::fmt::Write;
 use std::io::IsTerminal;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::time::{Duration, Instant};
 
 use indicatif::{
     HumanCount, HumanDuration, ProgressBar, ProgressDrawTarget, ProgressState, ProgressStyle,
@@ -12,23 +14,32 @@ use indicatif::{
 use crate::tell;
 use shearq_dataset::threads::Progress;
 
+// Between two lines of a log file: a job of hours writes a few hundred.
+const LOG_INTERVAL: Duration = Duration::from_secs(60);
+
 pub(super) struct Bar {
     bar: ProgressBar,
+    // When a log file gets its next line; none on a terminal.
+    next_line: Option<Instant>,
     // Galaxies of an earlier call, without which the rate would be far too high after a resumption.
     skipped: Arc<AtomicU64>,
 }
 
 impl Bar {
     pub(super) fn new(what: &'static str, galaxies: u64) -> Self {
-        let target = if std::io::stderr().is_terminal() {
-            ProgressDrawTarget::stderr_with_hz(5)
+        let (target, next_line) = if std::io::stderr().is_terminal() {
+            (ProgressDrawTarget::stderr_with_hz(5), None)
         } else {
             // In log files a bar would be thousands of lines.
-            ProgressDrawTarget::hidden()
+            (
+                ProgressDrawTarget::hidden(),
+                Some(Instant::now() + LOG_INTERVAL),
+            )
         };
         let bar = ProgressBar::with_draw_target(Some(galaxies), target);
         let skipped = Arc::new(AtomicU64::new(0));
-        let template = "{prefix} {wide_bar} {percent}% of {human_len} galaxies{pace}{msg}";
+        // On 80 columns a name of 24 leaves the bar 10.
+        let template = "{prefix} {wide_bar} {percent}% of {human_len}{pace}{msg}";
         if let Ok(style) = ProgressStyle::with_template(template) {
             let skipped = Arc::clone(&skipped);
             let pace = move |state: &ProgressState, out: &mut dyn Write| {
@@ -40,7 +51,32 @@ impl Bar {
             bar.set_style(style.with_key("pace", pace));
         }
         bar.set_prefix(what);
-        Bar { bar, skipped }
+        Bar {
+            bar,
+            next_line,
+            skipped,
+        }
+    }
+
+    fn log(&mut self) {
+        let now = Instant::now();
+        if self.next_line.is_none_or(|next| now < next) {
+            return;
+        }
+        self.next_line = Some(now + LOG_INTERVAL);
+        let (done, all) = (self.bar.position(), self.bar.length().unwrap_or(0));
+        let new = done.saturating_sub(self.skipped.load(Ordering::Relaxed));
+        tell(format_args!(
+            "{}: {}% of {} galaxies{}",
+            self.bar.prefix(),
+            100 * done / all.max(1),
+            HumanCount(all),
+            pace(
+                new,
+                all.saturating_sub(done),
+                self.bar.elapsed().as_secs_f64()
+            )
+        ));
     }
 }
 
@@ -50,9 +86,9 @@ fn pace(done: u64, left: u64, seconds: f64) -> String {
         return String::new();
     }
     let rate = done as f64 / seconds;
-    let time = std::time::Duration::from_secs_f64((left as f64 / rate).min(1e9));
+    let time = Duration::from_secs_f64((left as f64 / rate).min(1e9));
     format!(
-        ", {}/s, {} left",
+        ", {}/s, {:#} left",
         HumanCount(rate.round() as u64),
         HumanDuration(time)
     )
@@ -61,6 +97,7 @@ fn pace(done: u64, left: u64, seconds: f64) -> String {
 impl Progress for Bar {
     fn advance(&mut self, galaxies: u64) {
         self.bar.inc(galaxies);
+        self.log();
     }
 
     fn skip(&mut self, galaxies: u64) {
@@ -118,6 +155,6 @@ mod tests {
     #[test]
     fn the_rate_counts_new_galaxies_only() {
         assert_eq!(pace(0, 10, 1.0), "");
-        assert_eq!(pace(5506, 11012, 1.0), ", 5,506/s, 2 seconds left");
+        assert_eq!(pace(5506, 11012, 1.0), ", 5,506/s, 2s left");
     }
 }

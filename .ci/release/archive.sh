@@ -11,6 +11,9 @@ host=$(rustc -vV | sed -n 's/^host: //p')
 export SOURCE_DATE_EPOCH=${SOURCE_DATE_EPOCH:-$(git log -1 --format=%ct)}
 # No path of this machine in the binary.
 export RUSTFLAGS="--remap-path-prefix=$PWD=. --remap-path-prefix=${CARGO_HOME:-$HOME/.cargo}=cargo ${RUSTFLAGS:-}"
+# `shearq --version` says it.
+SHEARQ_COMMIT=$(git rev-parse --short=12 HEAD)
+export SHEARQ_COMMIT
 [ -n "${SHEARQ:-}" ] || cargo build --release --locked
 binary=${SHEARQ:-${CARGO_TARGET_DIR:-target}/release/shearq}
 
