@@ -6,16 +6,15 @@ use numpy::PyReadonlyArray1;
 use pyo3::exceptions::{PyFileNotFoundError, PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use shearq_bias::Design;
+use shearq_catalogue::columns::{Names, Shapes};
+use shearq_catalogue::expression::{Expression, ExpressionError};
+use shearq_catalogue::request::{Binning, Edges, Input, MAX_BINS, Request, Units};
+use shearq_catalogue::truth::{TrueSign, Truth, expand};
 use shearq_files::frames::frame;
 use shearq_files::frames::polars::Column;
 use shearq_files::table::Place;
 use shearq_render::table::TableFormat;
-use shearq_results::bias::columns::{Names, Shapes};
-use shearq_results::bias::truth::{TrueSign, Truth, expand};
-use shearq_results::bias::{
-    BiasFailure, Binning, Edges, Input, MAX_BINS, Request, Summed, Units, sum,
-};
-use shearq_results::expression::{Expression, ExpressionError};
+use shearq_results::bias::{BiasFailure, Summed, sum};
 use shearq_results::views::bias::bias_table;
 use shearq_scoring::TruthSign;
 
@@ -229,7 +228,7 @@ pub(crate) fn bias_sums(
             Given::Table(name, columns) => inputs.push(table_of(&name, columns)?),
             Given::Path(path) => {
                 require(&path)?;
-                let found = expand(&[path], truth).map_err(of_bias)?;
+                let found = expand(&[path], truth).map_err(|error| of_bias(error.into()))?;
                 inputs.extend(found.catalogues);
                 truth = found.truth;
                 without_catalogue.extend(found.without_catalogue);
@@ -243,7 +242,7 @@ pub(crate) fn bias_sums(
         shapes: ellipticity.map(shapes_of).transpose()?,
         sign,
         bins,
-        selection: shearq_results::select::selection(condition, weight)
+        selection: shearq_catalogue::select::selection(condition, weight)
             .map_err(|fault| PyValueError::new_err(fault.to_string()))?,
         design: design.map(design_of).transpose()?,
         units: match units.as_deref() {

@@ -8,6 +8,7 @@ use numpy::{IntoPyArray, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
+use shearq_catalogue::star_noise::{StarNoise, Stars};
 use shearq_measure::{
     ArraySource, Batch, Flag, FunctionalPsf, Jacobian, JacobianError, KnownNoise, MeanShear,
     MeanShearError, MeasureError, Measurement, Measurer, PsfProfile, Psfs, Session, ShearSum,
@@ -16,7 +17,6 @@ use shearq_measure::{
 use shearq_pipeline::PipelineError;
 use shearq_pipeline::measure::{COLUMNS, ImageRow, Measured, Value, measure_images, more_columns};
 use shearq_quantities::Shear;
-use shearq_results::star_noise::{StarNoise, Stars};
 
 use crate::errors::of_measuring;
 use crate::stamps::{Borrowed, Stamps};

@@ -7,10 +7,10 @@ use std::path::Path;
 use numpy::{IntoPyArray, PyArray1, PyReadonlyArray1};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
+use shearq_catalogue::expression::Operand;
+use shearq_catalogue::select::smooth_selection;
+use shearq_catalogue::shapes::MeasuredShapes;
 use shearq_files::FileError;
-use shearq_results::expression::Operand;
-use shearq_results::select::smooth_selection;
-use shearq_results::shapes::MeasuredShapes;
 
 // e1, e2, R11, R22, R12 and R21 before calibration, and the weight.
 type Selected<'py> = [Bound<'py, PyArray1<f64>>; 7];

@@ -11,15 +11,16 @@ use shearq_bias::Design;
 
 use crate::arguments::{Printing, ReportFile, named, positive};
 use crate::{Findings, made_by, tell};
+use shearq_catalogue::columns::{Names, Shapes, role_names};
+use shearq_catalogue::expression::Expression;
+use shearq_catalogue::request::{Binning, Edges, MAX_BINS, Request, Units};
+use shearq_catalogue::select::selection;
+use shearq_catalogue::truth::{TrueSign, Truth, expand};
 use shearq_dataset::images::Shard;
 use shearq_files::{atomic, open};
 use shearq_render::figure::{Figure, PictureFormat};
 use shearq_render::table::{Cell, Table};
-use shearq_results::bias::columns::{Names, Shapes, role_names};
-use shearq_results::bias::truth::{TrueSign, Truth, expand};
-use shearq_results::bias::{Binning, Edges, MAX_BINS, Request, Summed, Units, sum};
-use shearq_results::expression::Expression;
-use shearq_results::select::selection;
+use shearq_results::bias::{Summed, sum};
 use shearq_results::views::bias::{
     Limit, bias_plot, bias_table, check, chosen_by_measurement, compared_table, of_design,
     of_other_images, section,

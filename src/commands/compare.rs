@@ -4,12 +4,12 @@ use clap::Args;
 
 use crate::arguments::{Printing, ReportFile, ScoreSettings, Threads};
 use crate::{score, tell};
+use shearq_catalogue::expression::Expression;
 use shearq_dataset::run::Run;
 use shearq_dataset::threads::Pool;
 use shearq_render::figure::{Figure, LinePlot};
 use shearq_render::table::Table;
 use shearq_results::compare::{Order, choose, chosen, score_all};
-use shearq_results::expression::Expression;
 use shearq_results::published::{PublicBranch, PublicChallenge, Score, Truth, ranking};
 use shearq_results::store;
 use shearq_results::submit::is_packed;

@@ -4,6 +4,7 @@ use clap::Args;
 
 use crate::arguments::{Form, SetList, Threads, sets_of};
 use crate::tell;
+use shearq_catalogue::select::smooth_selection;
 use shearq_dataset::fingerprint;
 use shearq_dataset::metadata::Axes;
 use shearq_dataset::run::Run;
@@ -11,7 +12,6 @@ use shearq_measure::{PixelFrame, Warning};
 use shearq_render::table::TableFormat;
 use shearq_results::mean::mean_shears;
 use shearq_results::score::without_catalogue;
-use shearq_results::select::smooth_selection;
 use shearq_results::views::mean::mean_table;
 
 /// Mean shear of each set, for fields of constant shear.

@@ -11,6 +11,7 @@ use crate::arguments::{
     Printing, ReportFile, ScoreSettings, SetList, Threads, named, positive, sets_of,
 };
 use crate::{print, tell, tell_unread};
+use shearq_catalogue::foreign::Foreign;
 use shearq_dataset::layout::DataFolder;
 use shearq_dataset::run::{Run, Source, kind_of};
 use shearq_dataset::threads::Pool;
@@ -19,7 +20,6 @@ use shearq_files::atomic::folder_of;
 use shearq_render::table::TableFormat;
 use shearq_results::aperture;
 use shearq_results::catalogues::{COLUMNS, Catalogues};
-use shearq_results::foreign::Foreign;
 use shearq_results::published::{PublicChallenge, Truth};
 use shearq_results::record::{RunRecord, SetRecord};
 use shearq_results::score::{ScoredSet, score_catalogues, score_files, unscored};

@@ -3,8 +3,8 @@ use std::path::PathBuf;
 use clap::Args;
 
 use crate::tell;
+use shearq_catalogue::select::{smooth_selection, write_selected};
 use shearq_dataset::run::Run;
-use shearq_results::select::{smooth_selection, write_selected};
 
 /// Write catalogues with cuts and weights that keep the shear calibrated.
 ///

@@ -7,13 +7,13 @@ use std::time::{Duration, Instant};
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use shearq_catalogue::foreign::Foreign;
 use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::DataFolder;
 use shearq_dataset::run::Run;
 use shearq_files::table;
 use shearq_measure::StampSource;
 use shearq_pipeline::measure::ImageSource;
-use shearq_results::foreign::Foreign;
 use shearq_results::submit::{Kind, read_spectrum};
 use shearq_submissions::{Configuration, Registry};
 

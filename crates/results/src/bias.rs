@@ -3,12 +3,6 @@
 //! [`Request`] specifies catalogues and options. [`sum`] reads the catalogues into sums that merge ([`Summed`]), and
 //! [`Summed::result`] estimates.
 
-pub mod columns;
-mod identity;
-mod read;
-mod source;
-pub mod truth;
-
 use std::collections::{BTreeSet, HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
@@ -16,22 +10,21 @@ use serde::{Deserialize, Serialize};
 use shearq_bias::{
     BiasError, Catalogue, Design, Estimate, Grouping, Layout, Range, UnitSums, difference, group,
 };
+use shearq_catalogue::columns::{CATALOGUES, Role, Shapes};
+use shearq_catalogue::expression::Expression;
+use shearq_catalogue::request::{Edges, Input, Request, Units};
+use shearq_catalogue::rows::{distinct, rows};
+use shearq_catalogue::source::{Reading, Source, sources};
+use shearq_catalogue::truth::{TrueSign, Truth};
 use shearq_dataset::fingerprint::{GALAXIES, verify_source};
 use shearq_dataset::metadata::{CATALOGUE_FRAME, CommonAxes, axes_of};
 use shearq_dataset::run::Run;
 use shearq_dataset::threads::ALL_CORES;
 use shearq_dataset::truth::{Sign, SignBasis, stated_sign, word};
 use shearq_files::FileError;
-use shearq_files::frames::polars::DataFrame;
 use shearq_files::table::{self, FileFormat};
 use shearq_scoring::TruthSign;
 use thiserror::Error;
-
-use crate::expression::Expression;
-use crate::select::StatedSelection;
-use columns::{CATALOGUES, Names, Role, Shapes};
-use source::{Reading, Source, sources};
-use truth::{TrueSign, Truth};
 
 #[derive(Debug, Error)]
 #[non_exhaustive]
@@ -103,79 +96,6 @@ pub enum BiasFailure {
         "the ellipticities look like distortions (found slopes of {:.3} and {:.3}, expected about 1). Try: --ellipticity distortion, or --ellipticity shear to keep them", .0[0], .0[1]
     )]
     Distortions([f64; 2]),
-}
-
-#[derive(Debug, Clone)]
-pub struct Binning {
-    pub of: Expression,
-    /// The edges, or a number of bins with equally many galaxies.
-    pub edges: Edges,
-}
-
-#[derive(Debug, Clone, PartialEq)]
-pub enum Edges {
-    /// A number of bins with equally many galaxies.
-    Equal(usize),
-    /// Increasing edges. The last bin contains its upper edge.
-    Given(Vec<f64>),
-}
-
-impl Edges {
-    pub fn count(&self) -> usize {
-        match self {
-            Edges::Equal(count) => *count,
-            Edges::Given(edges) => edges.len().saturating_sub(1),
-        }
-    }
-}
-
-/// Which galaxies form an independent unit.
-#[derive(Debug, Clone, Default, PartialEq)]
-pub enum Units {
-    /// Recognised from the columns and the design.
-    #[default]
-    Recognised,
-    /// The same rows of all catalogues.
-    Rows,
-    /// Whole catalogues, or groups of them.
-    Catalogues,
-    /// Galaxies with the same value in this column.
-    Column(String),
-}
-
-#[derive(Debug, Clone)]
-pub struct Input {
-    /// The file, or the name of the table.
-    pub name: PathBuf,
-    /// The table, if it is in memory.
-    pub frame: Option<DataFrame>,
-}
-
-impl From<PathBuf> for Input {
-    fn from(name: PathBuf) -> Self {
-        Input { name, frame: None }
-    }
-}
-
-#[derive(Debug, Clone)]
-pub struct Request {
-    pub catalogues: Vec<Input>,
-    pub names: Names,
-    pub truth: Truth,
-    /// How ellipticities become shears; `None` if the names of the columns decide.
-    pub shapes: Option<Shapes>,
-    pub sign: TrueSign,
-    pub bins: Option<Binning>,
-    /// Rows that count, and weights of catalogues of linear configurations, whose response to shear enters.
-    pub selection: Option<StatedSelection>,
-    pub design: Option<Design>,
-    pub units: Units,
-    /// Whether rows with missing numbers are left out.
-    pub drop_missing: bool,
-    /// Artificial shear of metacalibration.
-    pub step: f64,
-    /// Remarks about images of the data that have no catalogue.
-    pub without_catalogue: Vec<String>,
 }
 
 /// What sums of catalogues are sums of.
@@ -270,11 +190,9 @@ impl BiasResult {
 // galaxies.
 const SAMPLE: usize = 1 << 20;
 
-pub const MAX_BINS: usize = 100;
-
 /// Sums the catalogues of a request for which `part` holds, given their number.
 pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, BiasFailure> {
-    read::distinct(&request.catalogues)?;
+    distinct(&request.catalogues)?;
     let paths = request.catalogues.iter().map(|input| input.name.as_path());
     let mut reading = Reading {
         request,
@@ -382,7 +300,7 @@ fn add_up(
         }
         let selects = sources[0].selects;
         let number = number as u32;
-        catalogues.push(read::rows(name, reading, sources, |item| {
+        catalogues.push(rows(name, reading, sources, |item| {
             let bin = |catalogue: usize| {
                 let value = item.selected.binned[catalogue].ok()?;
                 bin_of(edges, value)
@@ -555,7 +473,7 @@ fn equal_edges(
 ) -> Result<Vec<f64>, BiasFailure> {
     let (mut values, mut stride, mut number) = (Vec::new(), 1u64, 0u64);
     for (input, sources) in reading.request.catalogues.iter().zip(all) {
-        read::rows(&input.name, reading, sources, |item| {
+        rows(&input.name, reading, sources, |item| {
             if let (0, Ok(value)) = (item.sheared, item.selected.binned[0]) {
                 if number % stride == 0 {
                     values.push(value);

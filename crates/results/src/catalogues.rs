@@ -14,9 +14,9 @@ use shearq_quantities::Frame;
 use shearq_scoring::{Choice, Convention, FieldSum, Grid, Row, RowCounts};
 use shearq_submissions::EllipticityType;
 
-use crate::foreign::{ADVICE_ON_SENTINELS, Foreign, fault_of_rows};
 use crate::response::response_of;
 use crate::submit::{Packed, Sent, Submission, settings_of};
+use shearq_catalogue::foreign::{ADVICE_ON_SENTINELS, Foreign, fault_of_rows};
 use shearq_files::atomic::folder_of;
 
 /// The scored columns of catalogues by shearq.

@@ -17,10 +17,10 @@ use shearq_submissions::{Published, Registry};
 use thiserror::Error;
 
 use crate::catalogues::Catalogues;
-use crate::expression::{Expression, Operand, fits};
 use crate::record::{Column, RunRecord, SetRecord, columns_named, compared};
 use crate::score::{ScoreError, ScoredSet, score_variants, unscored};
 use crate::submit::{Sent, Submission, is_packed};
+use shearq_catalogue::expression::{Expression, Operand, fits};
 
 /// A method in a comparison.
 #[derive(Debug, Clone)]

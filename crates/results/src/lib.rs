@@ -1,13 +1,10 @@
 //! From catalogues to scores, comparisons and submissions to challenges.
 //!
-//! * [`catalogues`] are those of one method: of shearq, of another program ([`foreign`]), or of a submission. [`score`]
+//! * [`catalogues`] are those of one method: of shearq, of another program, or of a submission. [`score`]
 //!   scores them against a true shear field.
 //! * [`bias`] estimates m and c of catalogues of any program.
-//! * [`shapes`] reads the shapes of catalogues by shearq, for all below.
-//! * [`select`] applies cuts and weights to catalogues without a bias; [`expression`] reads formulas of columns.
 //! * [`mean`] averages catalogues to one shear per set.
 //! * [`response`] is what ellipticities of many catalogues are divided by, for scores and for a shear per galaxy.
-//! * [`star_noise`] adds the noise of stars to the error of a mean shear.
 //! * [`record`] is the record of a scored set with the list of its columns, and [`store`] keeps records in Parquet files.
 //! * [`compare`] chooses, sorts and compares records.
 //! * [`baseline`] compares metrics with stored metrics.
@@ -21,16 +18,11 @@ pub mod baseline;
 pub mod bias;
 pub mod catalogues;
 pub mod compare;
-pub mod expression;
-pub mod foreign;
 pub mod mean;
 pub mod published;
 pub mod record;
 pub mod response;
 pub mod score;
-pub mod select;
-pub mod shapes;
-pub mod star_noise;
 pub mod store;
 pub mod submit;
 pub mod views;

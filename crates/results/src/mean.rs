@@ -10,9 +10,9 @@ use shearq_measure::{Flag, Flags, MeanShear, ShearSum, Warning};
 use shearq_quantities::statistics::RunningMean;
 use shearq_submissions::Calibration;
 
-use crate::select::StatedSelection;
-use crate::shapes::MeasuredShapes;
-use crate::star_noise::{Stars, of_catalogue};
+use shearq_catalogue::select::StatedSelection;
+use shearq_catalogue::shapes::MeasuredShapes;
+use shearq_catalogue::star_noise::{Stars, of_catalogue};
 
 /// The mean shear of the galaxies of a set.
 #[derive(Debug, Clone, PartialEq)]

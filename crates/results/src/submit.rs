@@ -28,7 +28,7 @@ use shearq_scoring::{Bins, Definition, Grid, SCORED, SpectrumCovariance};
 use shearq_submissions::{check_name, checked_name};
 use tar::Archive;
 
-use crate::foreign::Foreign;
+use shearq_catalogue::foreign::Foreign;
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SpectrumLine {

@@ -12,8 +12,8 @@ use super::{
     Contents, FileSum, Kind, Manifest, Sent, SpectrumLine, read_spectrum, wrong_multipoles,
 };
 use crate::catalogues::{OWN, read_rows};
-use crate::foreign::{ADVICE_ON_SENTINELS, fault_of_rows};
 use crate::views::scores::{odd_response, repeated_shapes, words};
+use shearq_catalogue::foreign::{ADVICE_ON_SENTINELS, fault_of_rows};
 use shearq_files::FileError;
 use shearq_files::table::most_rows;
 

@@ -15,7 +15,7 @@ use shearq_scoring::{
 
 use super::{Contents, Entry, FileSum, Kind, MANIFEST_FILE, MAX_FILES, Manifest, is_archive};
 use crate::catalogues::Catalogues;
-use crate::foreign::Foreign;
+use shearq_catalogue::foreign::Foreign;
 use shearq_dataset::layout::DataFolder;
 use shearq_dataset::run::record_text;
 use shearq_dataset::threads::Progress;

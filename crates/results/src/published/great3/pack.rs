@@ -15,8 +15,8 @@ use shearq_scoring::{Repeated, repeated};
 
 use super::super::{BranchCatalogues, Columns, Presubmission, Presubmitting, wrong};
 use super::{EQUAL_SHEARS, NOT_AVERAGED, NOT_CORRELATED, lattice, more, not_an_identity, zero};
-use crate::bias::columns::looks_like_weight;
 use crate::response::{Shared, shears};
+use shearq_catalogue::columns::looks_like_weight;
 
 // Share of the galaxies of a branch above which equal shears are placeholders. Chosen by hand.
 const MIN_PLACEHOLDER_SHARE: f64 = 0.1;

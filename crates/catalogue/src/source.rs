@@ -13,29 +13,30 @@ use shearq_measure::{Observables, Selection};
 use crate::expression::{Expression, Operand};
 use crate::shapes::{SHAPE_COLUMNS, changes_with_shear, require_responses};
 
-use super::columns::{
+use crate::columns::{
     CATALOGUES, Columns, Places, Preset, Role, Shapes, base, fits_any, sheared_column,
 };
-use super::truth::Truth;
-use super::{Input, Request, Units};
+use crate::request::{Input, Request, Units};
+use crate::truth::Truth;
 
-// How catalogues are read: a request with the true shears of its catalogues.
-pub(super) struct Reading<'r> {
-    pub(super) request: &'r Request,
-    pub(super) truth: Truth,
-    pub(super) flip_g2: bool,
+/// How catalogues are read: a request with the true shears of its catalogues.
+#[derive(Debug)]
+pub struct Reading<'r> {
+    pub request: &'r Request,
+    pub truth: Truth,
+    pub flip_g2: bool,
 }
 
 impl Reading<'_> {
-    pub(super) fn condition(&self) -> Option<&Expression> {
+    pub fn condition(&self) -> Option<&Expression> {
         self.request.selection.as_ref()?.rows.as_ref()
     }
 
-    pub(super) fn weights(&self) -> Option<&Selection> {
+    pub fn weights(&self) -> Option<&Selection> {
         self.request.selection.as_ref()?.weights.as_ref()
     }
 
-    pub(super) fn binned(&self) -> Option<&Expression> {
+    pub fn binned(&self) -> Option<&Expression> {
         self.request.bins.as_ref().map(|bins| &bins.of)
     }
 
@@ -51,8 +52,8 @@ impl Reading<'_> {
         self.expressions().flat_map(|(_, own)| own.columns())
     }
 
-    // Whether rows 2k and 2k + 1 are a galaxy and its rotated image, which form a unit.
-    pub(super) fn rows_are_rotated_pairs(&self) -> bool {
+    /// Whether rows 2k and 2k + 1 are a galaxy and its rotated image, which form a unit.
+    pub fn rows_are_rotated_pairs(&self) -> bool {
         self.request.design == Some(Design::Rotated) && self.request.catalogues.len() == 1
     }
 
@@ -76,32 +77,33 @@ const UNITS: &str = "tile tile_id tileid tilename tile_name field field_id patch
 const FIXED: &str = "*psf* *tile* *field* *patch* *seed* *true* *truth* *image* *ccd* *exp* *airmass* *seeing* *depth* \
     *zbin* *z_bin* *primary* *inner* ra dec x y z number row alpha delta set";
 
-pub(super) struct Source {
-    pub(super) place: Place,
-    pub(super) frame: Option<DataFrame>,
-    // The sheared catalogue of all rows, 0 for noshear, if a FITS file has one table for each.
-    pub(super) sheared: Option<usize>,
-    pub(super) columns: Columns,
-    pub(super) shapes: Shapes,
-    pub(super) unit: Option<String>,
-    // A column without a role that looks like independent units.
-    pub(super) unit_column: Option<String>,
-    // All that is read, each once.
-    pub(super) wanted: Vec<Operand>,
-    pub(super) places: Places,
+#[derive(Debug)]
+pub struct Source {
+    pub place: Place,
+    pub frame: Option<DataFrame>,
+    /// The sheared catalogue of all rows, 0 for noshear, if a FITS file has one table for each.
+    pub sheared: Option<usize>,
+    pub columns: Columns,
+    pub shapes: Shapes,
+    pub unit: Option<String>,
+    /// A column without a role that looks like independent units.
+    pub unit_column: Option<String>,
+    /// All that is read, each once.
+    pub wanted: Vec<Operand>,
+    pub places: Places,
     // Columns of expressions that shear changes by an unknown amount.
     unanswered: Vec<String>,
     // Whether sheared catalogues have flags, which then give the response of the selection.
     sheared_flags: bool,
-    // Whether each sheared catalogue selects galaxies by its columns, so that the response of the selection follows.
-    pub(super) selects: bool,
+    /// Whether each sheared catalogue selects galaxies by its columns, so that the response of the selection follows.
+    pub selects: bool,
     declines_matrix: bool,
     has_weights: bool,
 }
 
 impl Source {
-    // Columns of `--where` and `--bins` by which shear changes the choice of galaxies, without a response of the choice.
-    pub(super) fn unanswered(&self) -> &[String] {
+    /// Columns of `--where` and `--bins` by which shear changes the choice of galaxies, without a response of the choice.
+    pub fn unanswered(&self) -> &[String] {
         match self.has_sheared_rows() {
             // Rows of each sheared catalogue are selected by sheared quantities.
             true => &[],
@@ -109,7 +111,7 @@ impl Source {
         }
     }
 
-    pub(super) fn described(&self, reading: &Reading<'_>) -> Vec<String> {
+    pub fn described(&self, reading: &Reading<'_>) -> Vec<String> {
         let responsivity = self.shapes == Shapes::Responsivity;
         let read = |role: Role| match role {
             Role::Unit => self.unit.is_some(),
@@ -149,21 +151,21 @@ impl Source {
         lines
     }
 
-    pub(super) fn name(&self, place: usize) -> &str {
+    pub fn name(&self, place: usize) -> &str {
         &self.wanted[place].column
     }
 
-    pub(super) fn has_sheared_rows(&self) -> bool {
+    pub fn has_sheared_rows(&self) -> bool {
         self.sheared.is_some() || self.columns.of(Role::ShearedCatalogue).is_some()
     }
 
-    pub(super) fn has_response(&self) -> bool {
+    pub fn has_response(&self) -> bool {
         let by_columns = [Preset::Metacal, Preset::Sheared].contains(&self.columns.preset);
         self.has_sheared_rows() || by_columns || self.columns.have(&[Role::R11])
     }
 
-    // Whether the responses of each component to the other one are known.
-    pub(super) fn has_matrix(&self) -> bool {
+    /// Whether the responses of each component to the other one are known.
+    pub fn has_matrix(&self) -> bool {
         let of_rows = match self.columns.preset {
             Preset::Metacal | Preset::Sheared => self.columns.have_other_sheared(),
             _ => self.columns.have(&[Role::R12, Role::R21]),
@@ -171,11 +173,11 @@ impl Source {
         (of_rows || self.has_weights || self.has_sheared_rows()) && !self.declines_matrix
     }
 
-    pub(super) fn has_psf(&self) -> bool {
+    pub fn has_psf(&self) -> bool {
         self.columns.have(&[Role::Psf1, Role::Psf2])
     }
 
-    pub(super) fn parts(
+    pub fn parts(
         &self,
         reading: &Reading<'_>,
         mut take: impl FnMut(DataFrame) -> Result<(), FileError>,
@@ -190,8 +192,8 @@ impl Source {
         table::read_parts(&self.place, &names, &texts, take)
     }
 
-    // Whether a column may be a text: identifiers, names of sheared catalogues, and what is compared with a pattern.
-    pub(super) fn is_text(&self, reading: &Reading<'_>, name: &str) -> bool {
+    /// Whether a column may be a text: identifiers, names of sheared catalogues, and what is compared with a pattern.
+    pub fn is_text(&self, reading: &Reading<'_>, name: &str) -> bool {
         let mut operands = reading.expressions().flat_map(|(_, own)| own.operands());
         match operands.find(|own| own.column == name || own.column == base(name)) {
             Some(operand) => operand.pattern.is_some(),
@@ -205,7 +207,7 @@ impl Source {
     }
 }
 
-pub(super) fn sources(input: &Input, reading: &Reading<'_>) -> Result<Vec<Source>, FileError> {
+pub fn sources(input: &Input, reading: &Reading<'_>) -> Result<Vec<Source>, FileError> {
     let path = input.name.as_path();
     if let Some(frame) = &input.frame {
         let place = Place {
@@ -528,8 +530,8 @@ fn unsheared_name(name: &str) -> Option<&str> {
     names.find_map(|(sheared, _)| name.strip_suffix(sheared)?.strip_suffix('_'))
 }
 
-// The catalogue of a name, 0 for that without shear: `ns` in metadetection of LSST, `00` in TXPipe.
-pub(super) fn catalogue_named(name: &str) -> Option<usize> {
+/// The catalogue of a name, 0 for that without shear: `ns` in metadetection of LSST, `00` in TXPipe.
+pub fn catalogue_named(name: &str) -> Option<usize> {
     let name = name.trim().to_ascii_lowercase();
     if ["noshear", "ns", "00"].contains(&name.as_str()) {
         return Some(0);

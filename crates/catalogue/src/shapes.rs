@@ -13,13 +13,13 @@ use crate::expression::{Expression, Operand, operand_values};
 use crate::select::{StatedSelection, refuse_sharp};
 
 /// The columns of a [`MeasuredShapes`]. A selection also reads those of [`Observables`].
-pub(crate) const SHAPE_COLUMNS: [&str; 7] = ["e1", "e2", "flags", "R11", "R22", "R12", "R21"];
+pub const SHAPE_COLUMNS: [&str; 7] = ["e1", "e2", "flags", "R11", "R22", "R12", "R21"];
 
 /// The column with the weights of a selection that was applied, in catalogues of `select`.
-pub(crate) const WEIGHT: &str = "selection";
+pub const WEIGHT: &str = "selection";
 
 /// Whether shear changes a column.
-pub(crate) fn changes_with_shear(name: &str) -> bool {
+pub fn changes_with_shear(name: &str) -> bool {
     let of_shape = SHAPE_COLUMNS.contains(&name) && name != "flags";
     of_shape
         || Observables::COLUMNS.contains(&name)
@@ -27,7 +27,7 @@ pub(crate) fn changes_with_shear(name: &str) -> bool {
 }
 
 /// Whether a column was measured on the stamps.
-pub(crate) fn is_measured(name: &str) -> bool {
+pub fn is_measured(name: &str) -> bool {
     const OTHERS: [&str; 8] = [
         "flags",
         "iterations",
@@ -45,7 +45,7 @@ pub(crate) fn is_measured(name: &str) -> bool {
 
 /// Refuses catalogues of earlier versions, whose ellipticities were divided by `divisor1` and `divisor2`: Σ e / Σ R would be
 /// too large by 1/R.
-pub(crate) fn refuse_divided(path: &Path, names: &[String]) -> Result<(), FileError> {
+pub fn refuse_divided(path: &Path, names: &[String]) -> Result<(), FileError> {
     if names.iter().any(|name| name == "divisor1") {
         let message = "an earlier version of shearq measured this catalogue and divided e1 and e2 by their mean response (found the column `divisor1`; expected ellipticities before the division). Try: shearq measure, or multiply e1 by divisor1 and e2 by divisor2 and remove these columns";
         return Err(FileError::new(path, message));
@@ -54,7 +54,7 @@ pub(crate) fn refuse_divided(path: &Path, names: &[String]) -> Result<(), FileEr
 }
 
 /// Checks that a catalogue with columns of these names has what a selection requires, and no selection yet.
-pub(crate) fn require_responses(path: &Path, names: &[String]) -> Result<(), FileError> {
+pub fn require_responses(path: &Path, names: &[String]) -> Result<(), FileError> {
     refuse_divided(path, names)?;
     let has = |name: &str| names.iter().any(|own| own == name);
     if has(WEIGHT) {
@@ -82,14 +82,14 @@ fn names_of_columns(path: &Path) -> Result<Vec<String>, FileError> {
 }
 
 /// The names of the columns of a catalogue that is not divided by its response.
-pub(crate) fn undivided_columns(path: &Path) -> Result<Vec<String>, FileError> {
+pub fn undivided_columns(path: &Path) -> Result<Vec<String>, FileError> {
     let names = names_of_columns(path)?;
     refuse_divided(path, &names)?;
     Ok(names)
 }
 
 /// The weights of the selection that was applied to a table, or 1.
-pub(crate) fn applied_weights(path: &Path, table: &DataFrame) -> Result<Vec<f64>, FileError> {
+pub fn applied_weights(path: &Path, table: &DataFrame) -> Result<Vec<f64>, FileError> {
     match table.column(WEIGHT) {
         Ok(_) => Ok(table::numbers(table, WEIGHT, path)?.into_owned()),
         Err(_) => Ok(vec![1.0; table.height()]),
@@ -148,7 +148,7 @@ impl MeasuredShapes {
     }
 
     /// The shapes of a table with the weights of the selection that it contains.
-    pub(crate) fn of_table(
+    pub fn of_table(
         path: &Path,
         table: &DataFrame,
         with_response: bool,
@@ -164,7 +164,7 @@ impl MeasuredShapes {
     ///
     /// # Errors
     /// If the file or a column cannot be read, or a selection cannot be applied.
-    pub(crate) fn read(
+    pub fn read(
         path: &Path,
         selection: Option<&StatedSelection>,
         with_response: bool,
@@ -198,7 +198,7 @@ impl MeasuredShapes {
     }
 
     /// Applies a selection by the columns of the same table.
-    pub(crate) fn select(
+    pub fn select(
         &mut self,
         path: &Path,
         table: &DataFrame,

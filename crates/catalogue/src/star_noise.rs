@@ -21,7 +21,7 @@ const CREATOR: (&str, &str) = ("creator", "shearq ");
 const COLUMNS: [&str; 3] = ["psf_id", "psf_m", "psf_c"];
 
 // The noise of the star of a catalogue of any program; `None` unless shearq wrote it and states the noise.
-pub(crate) fn of_any(path: &Path, format: FileFormat) -> Result<Option<StarNoise>, FileError> {
+pub fn of_any(path: &Path, format: FileFormat) -> Result<Option<StarNoise>, FileError> {
     let (key, start) = CREATOR;
     let keys = [key, PSF_NOISE, PSF].map(str::to_owned);
     let metadata = table::read_metadata(path, format, keys.iter())?;
@@ -33,7 +33,7 @@ pub(crate) fn of_any(path: &Path, format: FileFormat) -> Result<Option<StarNoise
 
 // The noise of the star of a table in memory; `None` if it has no such columns, no noise, or galaxies behind several
 // stars.
-pub(crate) fn of_table(table: &DataFrame, name: &Path) -> Option<StarNoise> {
+pub fn of_table(table: &DataFrame, name: &Path) -> Option<StarNoise> {
     let [star, m, c] = COLUMNS.map(|column| {
         let values = table::numbers(table, column, name).ok()?;
         let first = *values.first()?;
@@ -52,10 +52,7 @@ pub(crate) fn of_table(table: &DataFrame, name: &Path) -> Option<StarNoise> {
 }
 
 // The noise of the star of a catalogue of shearq; `None` if the catalogue does not state it.
-pub(crate) fn of_catalogue(
-    path: &Path,
-    format: FileFormat,
-) -> Result<Option<StarNoise>, FileError> {
+pub fn of_catalogue(path: &Path, format: FileFormat) -> Result<Option<StarNoise>, FileError> {
     let keys = [PSF_NOISE, PSF].map(str::to_owned);
     stated(path, table::read_metadata(path, format, keys.iter())?)
 }

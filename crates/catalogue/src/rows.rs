@@ -16,32 +16,34 @@ use crate::foreign::shown;
 use crate::shapes::MeasuredShapes;
 use crate::star_noise;
 
-use super::Input;
-use super::columns::{CATALOGUES, Columns, RESPONSES, Role, Shapes, counted_value, sheared_pair};
-use super::identity;
-use super::source::{Reading, Source, catalogue_named};
-use super::truth::{OfRows, check};
+use crate::columns::{CATALOGUES, Columns, RESPONSES, Role, Shapes, counted_value, sheared_pair};
+use crate::identity;
+use crate::request::Input;
+use crate::source::{Reading, Source, catalogue_named};
+use crate::truth::{OfRows, check};
 
-// A row that counts, in the catalogue without artificial shear or in a sheared one.
-pub(super) struct SummedRow {
-    pub(super) key: u64,
-    // Index of the sheared catalogue that the row belongs to, 0 for noshear.
-    pub(super) sheared: usize,
-    pub(super) row: Row,
-    pub(super) selected: Selected,
+/// A row that counts, in the catalogue without artificial shear or in a sheared one.
+#[derive(Debug)]
+pub struct SummedRow {
+    pub key: u64,
+    /// Index of the sheared catalogue that the row belongs to, 0 for noshear.
+    pub sheared: usize,
+    pub row: Row,
+    pub selected: Selected,
 }
 
-// Whether a row counts in noshear and in each sheared catalogue, by its flags, weights, `--where` and `--bins`. A shear may move
-// a galaxy over a cut, which is the response of the selection.
-pub(super) struct Selected {
-    // The binned quantity where the row is selected: 0 without bins, NaN if a number is missing.
-    pub(super) binned: [Result<f64, Exclusion>; CATALOGUES],
-    pub(super) weights: [f64; CATALOGUES],
+/// Whether a row counts in noshear and in each sheared catalogue, by its flags, weights, `--where` and `--bins`. A shear may move
+/// a galaxy over a cut, which is the response of the selection.
+#[derive(Debug)]
+pub struct Selected {
+    /// The binned quantity where the row is selected: 0 without bins, NaN if a number is missing.
+    pub binned: [Result<f64, Exclusion>; CATALOGUES],
+    pub weights: [f64; CATALOGUES],
 }
 
-// Why a row does not count.
-#[derive(Clone, Copy)]
-pub(super) enum Exclusion {
+/// Why a row does not count.
+#[derive(Debug, Clone, Copy)]
+pub enum Exclusion {
     Flagged,
     Unweighted,
     Unselected,
@@ -82,8 +84,8 @@ fn count(summary: &mut Catalogue, excluded: Exclusion) {
     } += 1;
 }
 
-// Calls `take` for each row of a user's catalogue that is neither flagged nor cut, and returns its counts and means.
-pub(super) fn rows(
+/// Calls `take` for each row of a user's catalogue that is neither flagged nor cut, and returns its counts and means.
+pub fn rows(
     path: &Path,
     reading: &Reading<'_>,
     sources: &[Source],
@@ -1017,7 +1019,7 @@ fn sheared_of(frame: &DataFrame, name: &str, path: &Path) -> Result<Vec<usize>, 
     texts.map(known).collect()
 }
 
-pub(super) fn distinct(inputs: &[Input]) -> Result<(), FileError> {
+pub fn distinct(inputs: &[Input]) -> Result<(), FileError> {
     let mut seen = HashSet::new();
     match inputs.iter().find(|input| !seen.insert(&input.name)) {
         None => Ok(()),

@@ -13,9 +13,10 @@ use shearq_files::table::{self, MAX_ROWS, Place, TRUTH_COLUMNS};
 use shearq_files::{FileError, names_of};
 use shearq_scoring::{Row, TruthSign};
 
-use super::columns::Places;
-use super::columns::{Role, names_of_role};
-use super::{BiasFailure, Input, identity};
+use crate::columns::Places;
+use crate::columns::{Role, names_of_role};
+use crate::identity;
+use crate::request::Input;
 
 #[derive(Debug, Clone, Default)]
 pub enum Truth {
@@ -129,8 +130,8 @@ impl Truth {
         })
     }
 
-    // The same with the shear of each of `catalogues` by its path, if catalogues have a shear each.
-    pub(super) fn of_paths<'p>(
+    /// The same with the shear of each of `catalogues` by its path, if catalogues have a shear each.
+    pub fn of_paths<'p>(
         &self,
         catalogues: impl IntoIterator<Item = &'p Path>,
     ) -> Result<Self, FileError> {
@@ -154,8 +155,8 @@ impl Truth {
     }
 }
 
-#[derive(Clone, Copy)]
-pub(super) enum OfRows<'a> {
+#[derive(Debug, Clone, Copy)]
+pub enum OfRows<'a> {
     // Zero without a true shear.
     Constant([f64; 2]),
     Identifiers(&'a HashMap<u64, [f64; 2]>),
@@ -164,7 +165,7 @@ pub(super) enum OfRows<'a> {
 }
 
 impl<'a> OfRows<'a> {
-    pub(super) fn new(path: &Path, places: &Places, truth: &'a Truth) -> Result<Self, FileError> {
+    pub fn new(path: &Path, places: &Places, truth: &'a Truth) -> Result<Self, FileError> {
         let absent = |what: &str, option: &str| {
             let message = format!(
                 "the catalogue has no {what} to find the true shear with. Try: --columns {option}"
@@ -201,7 +202,7 @@ impl<'a> OfRows<'a> {
         }
     }
 
-    pub(super) fn may_lack_rows(self) -> bool {
+    pub fn may_lack_rows(self) -> bool {
         matches!(self, OfRows::Identifiers(..) | OfRows::Positions(..))
     }
 }
@@ -336,8 +337,8 @@ impl Positions {
         sign_on_any_grid(&rows.collect::<Vec<_>>())
     }
 
-    // The shear of the nearest place within [`RADIUS`].
-    pub(super) fn at(&self, [x, y]: [f64; 2]) -> Result<[f64; 2], String> {
+    /// The shear of the nearest place within [`RADIUS`].
+    pub fn at(&self, [x, y]: [f64; 2]) -> Result<[f64; 2], String> {
         let own = Entry {
             x,
             y,
@@ -365,7 +366,7 @@ impl Positions {
     }
 }
 
-pub(super) fn check([g1, g2]: [f64; 2]) -> Result<(), String> {
+pub fn check([g1, g2]: [f64; 2]) -> Result<(), String> {
     // Without the square root: this is checked in every row.
     if g1 * g1 + g2 * g2 < 1.0 {
         return Ok(());
@@ -385,7 +386,7 @@ pub struct Expanded {
 
 /// Replaces folders of results by their catalogues, in the order of sets and images. Unless `truth` states the true
 /// shear, it is read from the data folders, if they have one.
-pub fn expand(paths: &[PathBuf], mut truth: Truth) -> Result<Expanded, BiasFailure> {
+pub fn expand(paths: &[PathBuf], mut truth: Truth) -> Result<Expanded, FileError> {
     let (mut catalogues, mut without_catalogue) = (Vec::new(), Vec::new());
     let mut found = match &mut truth {
         Truth::Data(found) => std::mem::take(found),
@@ -403,11 +404,11 @@ pub fn expand(paths: &[PathBuf], mut truth: Truth) -> Result<Expanded, BiasFailu
                 "this folder has no {RUN_FILE} (expected catalogues, or a folder that `measure` or `run` wrote). Try: {}/*",
                 path.display()
             );
-            return Err(FileError::new(path, message).into());
+            return Err(FileError::new(path, message));
         };
         let files = run.catalogues(path, &[])?;
         if files.is_empty() {
-            return Err(FileError::new(path, "there is no catalogue in this folder").into());
+            return Err(FileError::new(path, "there is no catalogue in this folder"));
         }
         without_catalogue.extend(images_without_catalogue(&run, path, &files)?);
         for set in files.sets() {
@@ -431,7 +432,7 @@ pub fn expand(paths: &[PathBuf], mut truth: Truth) -> Result<Expanded, BiasFailu
     if !found.is_empty() {
         if let Some(path) = without {
             let message = "its data have no true shear, but the data of other folders have one. Try: separate commands, or --truth FILE";
-            return Err(FileError::new(path, message).into());
+            return Err(FileError::new(path, message));
         }
         truth = Truth::Data(found);
     }

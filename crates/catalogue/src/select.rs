@@ -127,7 +127,7 @@ fn cut(step: &Step) -> Result<Cut, SelectionError> {
 }
 
 // A step may state a width; without one it is wide enough.
-pub(crate) fn refuse_sharp(selection: &Selection, flux_error: f64) -> Result<(), SelectionError> {
+pub fn refuse_sharp(selection: &Selection, flux_error: f64) -> Result<(), SelectionError> {
     let mut stated = selection
         .cuts()
         .iter()

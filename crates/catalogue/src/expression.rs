@@ -425,7 +425,7 @@ impl<'a> Parser<'a> {
 }
 
 /// Whether `text` is `pattern`, in which `*` stands for any characters.
-pub(crate) fn fits(pattern: &str, text: &str) -> bool {
+pub fn fits(pattern: &str, text: &str) -> bool {
     let Some((first, rest)) = pattern.split_once('*') else {
         return pattern == text;
     };
@@ -455,7 +455,7 @@ fn number_length(text: &str) -> usize {
 }
 
 /// The values of an operand in each row of a table.
-pub(crate) fn operand_values<'f>(
+pub fn operand_values<'f>(
     frame: &'f DataFrame,
     Operand { column, pattern }: &Operand,
     path: &Path,
@@ -475,7 +475,7 @@ pub(crate) fn operand_values<'f>(
     Ok(Cow::Owned(values.collect()))
 }
 
-pub(crate) fn texts_of<'f>(
+pub fn texts_of<'f>(
     frame: &'f DataFrame,
     name: &str,
 ) -> Option<impl Iterator<Item = Option<&'f str>> + use<'f>> {

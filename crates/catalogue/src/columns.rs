@@ -65,19 +65,19 @@ pub enum Role {
     DoubtfulWeight,
 }
 
-// A role in one catalogue: 0 is the one without artificial shear, k the k-th of [`SHEARED_CATALOGUES`].
-pub(super) type Key = (Role, usize);
+/// A role in one catalogue: 0 is the one without artificial shear, k the k-th of [`SHEARED_CATALOGUES`].
+pub type Key = (Role, usize);
 
-// Catalogues: the one without artificial shear and [`SHEARED_CATALOGUES`].
-pub(super) const CATALOGUES: usize = 1 + SHEARED_CATALOGUES.len();
-pub(super) const ROLES: usize = Role::DoubtfulWeight as usize + 1;
+/// Catalogues: the one without artificial shear and [`SHEARED_CATALOGUES`].
+pub const CATALOGUES: usize = 1 + SHEARED_CATALOGUES.len();
+pub const ROLES: usize = Role::DoubtfulWeight as usize + 1;
 
-// The responses R11, R12, R21 and R22: of e1 and e2 by rows, to g1 and g2.
-pub(super) const RESPONSES: [[Role; 2]; 2] = [[Role::R11, Role::R12], [Role::R21, Role::R22]];
+/// The responses R11, R12, R21 and R22: of e1 and e2 by rows, to g1 and g2.
+pub const RESPONSES: [[Role; 2]; 2] = [[Role::R11, Role::R12], [Role::R21, Role::R22]];
 
-// The ellipticity component `of` in the catalogues with a positive and a negative artificial shear of the component
-// `sheared`, whose difference is a response.
-pub(super) fn sheared_pair(of: usize, sheared: usize) -> [Key; 2] {
+/// The ellipticity component `of` in the catalogues with a positive and a negative artificial shear of the component
+/// `sheared`, whose difference is a response.
+pub fn sheared_pair(of: usize, sheared: usize) -> [Key; 2] {
     let role = [Role::E1, Role::E2][of];
     [(role, 1 + 2 * sheared), (role, 2 + 2 * sheared)]
 }
@@ -141,7 +141,7 @@ fn named(name: &str) -> Option<Key> {
     keys().find(|key| name_of(*key) == name)
 }
 
-pub(super) fn names_of_role(role: Role) -> impl Iterator<Item = &'static str> {
+pub fn names_of_role(role: Role) -> impl Iterator<Item = &'static str> {
     let names = TABLE[role as usize].3.split_whitespace();
     names.map(|name| name.trim_start_matches('χ'))
 }
@@ -306,8 +306,8 @@ const CUT_COLUMNS: [(&str, bool); 7] = [
     ("refextendedness", true),
 ];
 
-// Whether rows count that have 1 in a column of this name, rather than 0; `None` for a column that makes no choice.
-pub(super) fn counted_value(name: &str) -> Option<bool> {
+/// Whether rows count that have 1 in a column of this name, rather than 0; `None` for a column that makes no choice.
+pub fn counted_value(name: &str) -> Option<bool> {
     let mut known = CUT_COLUMNS.iter();
     let known = known.find(|(known, _)| known.eq_ignore_ascii_case(name))?;
     Some(known.1)
@@ -324,7 +324,7 @@ const NO_WEIGHTS: &str = "*_dg1_ *_dg2_ *_1p_ *_1m_ *_2p_ *_2m_ *flag* *mask* *w
     *_mag_* *redshift*var* *photoz*var* *photo_z*var* *_ra_* *_dec_* *pmra_* *pmdec_* *parallax* *sersic* *_shape_r_* *_z_ivar_*";
 
 /// Whether the name of a column suggests that it is a weight of shapes.
-pub(crate) fn looks_like_weight(name: &str) -> bool {
+pub fn looks_like_weight(name: &str) -> bool {
     // Elements of vectors have brackets: `ivar[0]`.
     let name = format!("_{}_", name.to_ascii_lowercase()).replace(['.', '-', ' ', '[', ']'], "_");
     fits_any(WEIGHTS, &name) && !fits_any(NO_WEIGHTS, &name)
@@ -348,8 +348,8 @@ fn is_like_a_role(name: &str) -> bool {
         || fits_any(OTHER_ROLES, &name.to_ascii_lowercase())
 }
 
-// Whether a text has one of several patterns with blanks between them.
-pub(super) fn fits_any(patterns: &str, text: &str) -> bool {
+/// Whether a text has one of several patterns with blanks between them.
+pub fn fits_any(patterns: &str, text: &str) -> bool {
     patterns.split(' ').any(|pattern| fits(pattern, text))
 }
 
@@ -357,19 +357,15 @@ fn same_name<'a>(found: &'a [String], name: &str) -> Option<&'a String> {
     found.iter().find(|own| own.eq_ignore_ascii_case(name))
 }
 
-// The column of a sheared catalogue, in any case: `foo_g1_1p` belongs to `foo_g1` and to `foo_g1_noshear`.
-pub(super) fn sheared_column<'f>(
-    found: &'f [String],
-    name: &str,
-    catalogue: usize,
-) -> Option<&'f String> {
+/// The column of a sheared catalogue, in any case: `foo_g1_1p` belongs to `foo_g1` and to `foo_g1_noshear`.
+pub fn sheared_column<'f>(found: &'f [String], name: &str, catalogue: usize) -> Option<&'f String> {
     let sheared = SHEARED_CATALOGUES[catalogue - 1].0;
     let name = name.to_ascii_lowercase();
     same_name(found, &format!("{}_{sheared}", base(&name)))
 }
 
-// The name of a column without the name of the unsheared catalogue.
-pub(super) fn base(name: &str) -> &str {
+/// The name of a column without the name of the unsheared catalogue.
+pub fn base(name: &str) -> &str {
     name.strip_suffix("_noshear").unwrap_or(name)
 }
 
@@ -409,8 +405,8 @@ impl Names {
         }
     }
 
-    // Whether the responses of each component to the other one are not to be used, in columns or by sheared catalogues.
-    pub(super) fn decline_matrix(&self) -> bool {
+    /// Whether the responses of each component to the other one are not to be used, in columns or by sheared catalogues.
+    pub fn decline_matrix(&self) -> bool {
         let mut roles = [Role::R12, Role::R21].into_iter();
         roles.any(|role| self.0.get(&(role, 0)).is_some_and(|own| own == "none"))
     }
@@ -420,7 +416,7 @@ impl Names {
         given.find_map(|(key, own)| (own == column && own != "none").then_some(*key))
     }
 
-    pub(super) fn is_given(&self, role: Role) -> bool {
+    pub fn is_given(&self, role: Role) -> bool {
         self.0.contains_key(&(role, 0))
     }
 
@@ -441,8 +437,8 @@ impl Names {
         Ok(())
     }
 
-    // Refuses columns with names of true shears that are given as something else, if nothing else states the true shear.
-    pub(super) fn check_true_shear(&self, path: &Path) -> Result<(), FileError> {
+    /// Refuses columns with names of true shears that are given as something else, if nothing else states the true shear.
+    pub fn check_true_shear(&self, path: &Path) -> Result<(), FileError> {
         if self.is_given(Role::G1) || self.is_given(Role::G2) {
             return Ok(());
         }
@@ -661,8 +657,8 @@ impl Columns {
         self.survey.unwrap_or(self.preset.name())
     }
 
-    // Each column that is used, as in `--columns`. Roles that are not `read` are left out.
-    pub(super) fn used(&self, read: impl Fn(Role) -> bool) -> String {
+    /// Each column that is used, as in `--columns`. Roles that are not `read` are left out.
+    pub fn used(&self, read: impl Fn(Role) -> bool) -> String {
         let used = keys().filter(|key| read(key.0) && self.columns.contains_key(key));
         let named = used.map(|key| match key.0 {
             Role::Flag => format!("flag={}", self.flags.join("+")),
@@ -687,9 +683,9 @@ impl Columns {
         })
     }
 
-    // Of a catalogue of shearq with sheared catalogues, takes these if a selection requires them, and otherwise the columns
-    // without them, which have less noise.
-    pub(super) fn choose_sheared(&mut self, found: &[String], required: bool) {
+    /// Of a catalogue of shearq with sheared catalogues, takes these if a selection requires them, and otherwise the columns
+    /// without them, which have less noise.
+    pub fn choose_sheared(&mut self, found: &[String], required: bool) {
         if self.preset != Preset::Shearq || self.of_sheared((Role::E1, 1)).is_none() {
             return;
         }
@@ -711,28 +707,28 @@ impl Columns {
         }
     }
 
-    pub(super) fn of(&self, role: Role) -> Option<&str> {
+    pub fn of(&self, role: Role) -> Option<&str> {
         self.of_sheared((role, 0))
     }
 
-    pub(super) fn of_sheared(&self, key: Key) -> Option<&str> {
+    pub fn of_sheared(&self, key: Key) -> Option<&str> {
         self.columns.get(&key).map(String::as_str)
     }
 
-    pub(super) fn have(&self, roles: &[Role]) -> bool {
+    pub fn have(&self, roles: &[Role]) -> bool {
         roles.iter().all(|role| self.of(*role).is_some())
     }
 
-    // Whether the ellipticities of each component under shears of the other one are there.
-    pub(super) fn have_other_sheared(&self) -> bool {
+    /// Whether the ellipticities of each component under shears of the other one are there.
+    pub fn have_other_sheared(&self) -> bool {
         let mut keys = [sheared_pair(0, 1), sheared_pair(1, 0)]
             .into_iter()
             .flatten();
         keys.all(|key| self.columns.contains_key(&key))
     }
 
-    // Whether sheared columns of cuts and weights give the response of the selection.
-    pub(super) fn give_selection_response(&self) -> bool {
+    /// Whether sheared columns of cuts and weights give the response of the selection.
+    pub fn give_selection_response(&self) -> bool {
         match self.preset {
             Preset::Metacal | Preset::Sheared => true,
             Preset::Shearq | Preset::Anacal | Preset::Metadetect => false,
@@ -742,11 +738,11 @@ impl Columns {
         }
     }
 
-    pub(super) fn is_of_shearq(&self) -> bool {
+    pub fn is_of_shearq(&self) -> bool {
         [Preset::Shearq, Preset::Sheared].contains(&self.preset)
     }
 
-    pub(super) fn all(&self) -> impl Iterator<Item = (Key, &str)> {
+    pub fn all(&self) -> impl Iterator<Item = (Key, &str)> {
         self.columns.iter().map(|(key, name)| (*key, name.as_str()))
     }
 }
@@ -824,26 +820,26 @@ fn in_vector(name: &str) -> Option<String> {
     first.or_else(|| name.strip_suffix("_2").map(|vector| format!("{vector}[1]")))
 }
 
-// What is read of a row by sheared catalogue and role, as places in [`Source::wanted`]. A role may have several columns (flags,
-// operands), or in sheared catalogues the column without artificial shear.
-#[derive(Default)]
-pub(super) struct Places(pub(super) [[Vec<usize>; ROLES]; CATALOGUES]);
+/// What is read of a row by sheared catalogue and role, as places in [`Source::wanted`]. A role may have several columns (flags,
+/// operands), or in sheared catalogues the column without artificial shear.
+#[derive(Debug, Default)]
+pub struct Places(pub [[Vec<usize>; ROLES]; CATALOGUES]);
 
 impl Places {
-    pub(super) fn all(&self, (role, catalogue): Key) -> &[usize] {
+    pub fn all(&self, (role, catalogue): Key) -> &[usize] {
         &self.0[catalogue][role as usize]
     }
 
-    pub(super) fn of(&self, key: Key) -> Option<usize> {
+    pub fn of(&self, key: Key) -> Option<usize> {
         self.all(key).first().copied()
     }
 
-    // Of two roles in the catalogue without artificial shear, if both have a column.
-    pub(super) fn pair(&self, [a, b]: [Role; 2]) -> Option<[usize; 2]> {
+    /// Of two roles in the catalogue without artificial shear, if both have a column.
+    pub fn pair(&self, [a, b]: [Role; 2]) -> Option<[usize; 2]> {
         Some([self.of((a, 0))?, self.of((b, 0))?])
     }
 
-    pub(super) fn set(&mut self, (role, catalogue): Key, places: Vec<usize>) {
+    pub fn set(&mut self, (role, catalogue): Key, places: Vec<usize>) {
         self.0[catalogue][role as usize] = places;
     }
 }

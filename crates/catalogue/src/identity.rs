@@ -11,8 +11,8 @@ use shearq_files::table;
 // Integers that floats do not contain have other bits than the float with the same ones.
 const INTEGER: u64 = 0x5bd1_e995_9d1b_58d3;
 
-// Keys of the identifiers in a column: equal for equal numbers of any type, and for a text that is such a number.
-pub(super) fn keys(frame: &DataFrame, name: &str, path: &Path) -> Result<Vec<u64>, FileError> {
+/// Keys of the identifiers in a column: equal for equal numbers of any type, and for a text that is such a number.
+pub fn keys(frame: &DataFrame, name: &str, path: &Path) -> Result<Vec<u64>, FileError> {
     let column = frame.column(name).ok();
     let series = column.map(|own| own.as_materialized_series());
     // Galaxies without an identity would be one galaxy.
@@ -45,8 +45,8 @@ pub(super) fn keys(frame: &DataFrame, name: &str, path: &Path) -> Result<Vec<u64
     Ok(numbers.iter().map(|own| hash(own.to_bits())).collect())
 }
 
-// An identifier as messages show it.
-pub(super) fn text(frame: &DataFrame, name: &str, at: usize) -> String {
+/// An identifier as messages show it.
+pub fn text(frame: &DataFrame, name: &str, at: usize) -> String {
     let column = frame.column(name).ok();
     if let Some(texts) = column.and_then(|own| own.str().ok()) {
         return texts.get(at).unwrap_or_default().to_owned();

@@ -1,0 +1,86 @@
+//! What to read of which catalogues: the true shear, columns, selection, bins and units that the user states.
+
+use std::path::PathBuf;
+
+use shearq_bias::Design;
+use shearq_files::frames::polars::DataFrame;
+
+use crate::columns::{Names, Shapes};
+use crate::expression::Expression;
+use crate::select::StatedSelection;
+use crate::truth::{TrueSign, Truth};
+
+pub const MAX_BINS: usize = 100;
+
+#[derive(Debug, Clone)]
+pub struct Binning {
+    pub of: Expression,
+    /// The edges, or a number of bins with equally many galaxies.
+    pub edges: Edges,
+}
+
+#[derive(Debug, Clone, PartialEq)]
+pub enum Edges {
+    /// A number of bins with equally many galaxies.
+    Equal(usize),
+    /// Increasing edges. The last bin contains its upper edge.
+    Given(Vec<f64>),
+}
+
+impl Edges {
+    pub fn count(&self) -> usize {
+        match self {
+            Edges::Equal(count) => *count,
+            Edges::Given(edges) => edges.len().saturating_sub(1),
+        }
+    }
+}
+
+/// Which galaxies form an independent unit.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub enum Units {
+    /// Recognised from the columns and the design.
+    #[default]
+    Recognised,
+    /// The same rows of all catalogues.
+    Rows,
+    /// Whole catalogues, or groups of them.
+    Catalogues,
+    /// Galaxies with the same value in this column.
+    Column(String),
+}
+
+#[derive(Debug, Clone)]
+pub struct Input {
+    /// The file, or the name of the table.
+    pub name: PathBuf,
+    /// The table, if it is in memory.
+    pub frame: Option<DataFrame>,
+}
+
+impl From<PathBuf> for Input {
+    fn from(name: PathBuf) -> Self {
+        Input { name, frame: None }
+    }
+}
+
+#[derive(Debug, Clone)]
+pub struct Request {
+    pub catalogues: Vec<Input>,
+    pub names: Names,
+    pub truth: Truth,
+    /// How ellipticities become shears; `None` if the names of the columns decide.
+    pub shapes: Option<Shapes>,
+    pub sign: TrueSign,
+    pub bins: Option<Binning>,
+    /// Rows that count, and weights of catalogues of linear configurations, whose response to shear enters.
+    pub selection: Option<StatedSelection>,
+    pub design: Option<Design>,
+    pub units: Units,
+    /// Whether rows with missing numbers are left out.
+    pub drop_missing: bool,
+    /// Artificial shear of metacalibration.
+    pub step: f64,
+    /// Remarks about images of the data that have no catalogue.
+    pub without_catalogue: Vec<String>,
+}
