@@ -10,18 +10,27 @@ set -eu
 cd "$(dirname "$0")"
 dist=$PWD/../dist
 mkdir -p "$dist"
+# cfitsio's and LZ4's notices must be in all copies.
+python3 ../.ci/release/licences.py shearq-python > LICENCES-OF-DEPENDENCIES.txt
+trap 'rm -f LICENCES-OF-DEPENDENCIES.txt' EXIT
+# No path of this machine in the module.
+export RUSTFLAGS="--remap-path-prefix=$(dirname "$PWD")=. --remap-path-prefix=${CARGO_HOME:-$HOME/.cargo}=cargo ${RUSTFLAGS:-}"
 for target in "${@:-x86_64-unknown-linux-gnu}"; do
-    maturin build --release --zig --compatibility manylinux2014 --target "$target" --out "$dist"
+    case $target in
+        *-linux-*) maturin build --release --zig --compatibility manylinux2014 --target "$target" --out "$dist" ;;
+        *) maturin build --release --target "$target" --out "$dist" ;;
+    esac
 done
 maturin sdist --out "$dist"
 twine check "$dist"/*
-for wheel in "$dist"/*.whl; do
-    auditwheel show "$wheel"
+for wheel in "$dist"/*linux*.whl; do
+    [ ! -e "$wheel" ] || auditwheel show "$wheel"
 done
 # The wheel of this machine must measure in an empty environment.
 own=$(ls "$dist"/*"$(uname -m)".whl)
+unzip -l "$own" | grep -q LICENCES-OF-DEPENDENCIES || { echo "error: $own: has no licences of dependencies" >&2; exit 1; }
 empty=$(mktemp -d)
-trap 'rm -rf "$empty"' EXIT
+trap 'rm -rf "$empty" "$dist"/../python/LICENCES-OF-DEPENDENCIES.txt' EXIT
 python3 -m venv "$empty"
 "$empty/bin/pip" install --quiet "$own"
 cd "$empty"

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Licences of all that a release of shearq is made of, as one text: crates by what cargo knows of them, with the files
+"""Licences of all that a release of shearq is made of (of the package named, by default the program), as one text: crates by what cargo knows of them, with the files
 that they bring, and the cfitsio and DejaVu that are built in. Fails where a crate has no licence."""
 
 import json
@@ -21,11 +21,11 @@ def metadata():
     return json.loads(subprocess.check_output(command, cwd=ROOT))
 
 
-def needed(data):
-    """Packages that the binary is built with, those of its tests left out."""
+def needed(data, name):
+    """Packages that the package `name` is built with, those of its tests left out."""
     nodes = {node["id"]: node for node in data["resolve"]["nodes"]}
     packages = {package["id"]: package for package in data["packages"]}
-    start = next(p["id"] for p in data["packages"] if p["name"] == "shearq")
+    start = next(p["id"] for p in data["packages"] if p["name"] == name)
     seen, todo = set(), [start]
     while todo:
         here = todo.pop()
@@ -40,16 +40,14 @@ def needed(data):
 
 
 def texts(folder):
-    """Licence files of a crate, and of what its folder `ext` brings."""
-    folders = [folder, *(path for path in folder.glob("ext/*") if path.is_dir())]
-    for place in folders:
-        for path in sorted(place.iterdir()):
-            if path.is_file() and path.name.lower().startswith(FILES):
-                yield path
+    """Licence files of a crate, and of the C sources that it brings (cfitsio, LZ4, zstd)."""
+    for path in sorted(folder.rglob("*")):
+        if path.is_file() and path.name.lower().startswith(FILES) and path.suffix not in (".rs", ".c", ".h", ".py"):
+            yield path
 
 
 def main():
-    packages = needed(metadata())
+    packages = needed(metadata(), sys.argv[1] if len(sys.argv) > 1 else "shearq")
     bare = [p["name"] for p in packages if not (p["license"] or p["license_file"])]
     if bare:
         sys.exit(f"crates without a licence: {', '.join(bare)}")
