@@ -140,7 +140,7 @@ def bias(
     ----------
     catalogues
         A table or a list of tables: mappings of columns, structured arrays, ``shearq.Catalogue``, astropy tables, pandas
-        or polars frames, Arrow tables or record batches, groups of h5py, or paths of files and of folders that ``measure``
+        or polars frames, tables, datasets and streams of Arrow (duckdb), HDUs, catalogues of GalSim and TreeCorr, groups of h5py, or paths of files and of folders that ``measure``
         wrote. ``FILE:GROUP`` names a group of an HDF5 file whose datasets are columns; groups ``noshear`` (``ns``, ``00``), ``1p``,
         ``1m``, ``2p`` and ``2m`` in it are sheared catalogues. Columns are ``e1 e2``, optionally ``w R11 R22 flag id snr ...`` and the true shear ``g1 g2``. Columns of GalSim's HSM,
         ngmix metacal, metadetect and AnaCal are recognised.
@@ -269,7 +269,8 @@ def _several(catalogues: Any) -> Iterable[Any]:
     if isinstance(catalogues, (str, os.PathLike, Mapping, np.ndarray)) or not isinstance(catalogues, Iterable):
         return [catalogues]
     # Of the class, because a LazyFrame warns if it is asked for its columns.
-    if any(hasattr(type(catalogues), name) for name in ("columns", "colnames", "schema")):
+    tables = ("columns", "colnames", "schema", "__arrow_c_stream__", "npartitions", "header", "names")
+    if any(hasattr(type(catalogues), name) for name in tables) or hasattr(catalogues, "writeto"):
         return [catalogues]
     return catalogues
 
@@ -285,7 +286,9 @@ def _catalogue(name: str, table: Any) -> str | tuple[str, list[tuple[str, Any]]]
         table = _hdf5.table(table, name)
     try:
         given = named_columns(table)
-    except TypeError:
+    except TypeError as error:
+        if "Try: " in str(error):
+            raise TypeError(f"{name}: {error}") from None
         given = []
     columns = [(label, values) for label, own in given if (values := _values(own)) is not None]
     if not columns:

@@ -68,8 +68,7 @@ def named_columns(table: Any) -> list[tuple[str, Any]]:
     Raises TypeError for anything that is no table.
     """
     found: list[tuple[Any, Any]] = []
-    if type(table).__name__ == "LazyFrame":
-        table = table.collect()
+    table = _plain_table(table)
     if isinstance(table, np.ndarray):
         if table.dtype.names is None:
             raise TypeError("table: found an array without fields; expected a structured array")
@@ -93,6 +92,54 @@ def named_columns(table: Any) -> list[tuple[str, Any]]:
         found = [(name, index.get_level_values(name)) for name in own]
         found += [(name, table[name]) for name in names]
     return [part for name, column in found for part in _components(str(name), _in_memory(column))]
+
+
+def _plain_table(table: Any) -> Any:
+    """A table whose columns can be asked for by name, for objects that have or make one."""
+    kind = type(table).__name__
+    if kind == "LazyFrame":
+        return table.collect()
+    if hasattr(table, "npartitions"):
+        raise TypeError(
+            f"table: found a {kind} of dask in {table.npartitions} partitions; expected one in memory."
+            " Try: parts = [dask.delayed(shearq.bias_sums)(part) for part in frame.to_delayed()], then shearq.BiasSums.merge"
+        )
+    if isinstance(table, list) and table and all(hasattr(one, "header") and hasattr(one, "data") for one in table):
+        # An HDUList of astropy.
+        table = [one for one in table if getattr(one, "columns", None) is not None]
+        if len(table) != 1:
+            raise TypeError(f"table: found an HDUList with {len(table)} tables; expected one. Try: hdus['NAME'].data")
+        table = table[0]
+    if hasattr(table, "header") and hasattr(table, "data") and hasattr(table, "columns"):
+        return np.asarray(table.data)
+    if hasattr(table, "makeData") or (hasattr(table, "names") and hasattr(table, "nobjects")):
+        # GalSim's OutputCatalog and Catalog.
+        return table.makeData() if hasattr(table, "makeData") else _of_galsim(table)
+    if hasattr(table, "ntot") and hasattr(table, "g1"):
+        return _of_treecorr(table)
+    if hasattr(table, "scanner") and hasattr(table, "to_table"):
+        # A dataset of Arrow in several files.
+        return table.to_table()
+    if hasattr(table, "__arrow_c_stream__") and not hasattr(table, "num_columns") and not hasattr(type(table), "__array__"):
+        # The protocol of readers of record batches, and of relations of duckdb.
+        import pyarrow
+
+        return pyarrow.table(table)
+    return table
+
+
+def _of_galsim(catalogue: Any) -> dict[str, Any]:
+    rows = range(catalogue.nobjects)
+    return {str(name): np.array([catalogue.get(row, name) for row in rows]) for name in catalogue.names}
+
+
+def _of_treecorr(catalogue: Any) -> dict[str, Any]:
+    """Of a catalogue of TreeCorr, whose g1 and g2 are measured."""
+    names = {"e1": "g1", "e2": "g2", "w": "w", "x": "x", "y": "y", "ra": "ra", "dec": "dec"}
+    if catalogue.g1 is None:
+        raise TypeError("table: found a Catalog of TreeCorr without g1 and g2; expected shears")
+    found = {own: getattr(catalogue, name, None) for own, name in names.items()}
+    return {own: np.asarray(values) for own, values in found.items() if values is not None}
 
 
 def _in_memory(column: Any) -> Any:

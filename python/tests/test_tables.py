@@ -1,0 +1,76 @@
+"""Tables of other packages."""
+
+import numpy as np
+import pytest
+
+import shearq
+
+RNG = np.random.default_rng(11)
+E = RNG.normal(0, 0.2, (500, 2))
+COLUMNS = {"e1": E[:, 0] + 0.02, "e2": E[:, 1], "w": RNG.uniform(0.5, 1, 500)}
+TRUTH = {"g1": 0.02, "g2": 0.0}
+
+
+@pytest.fixture(scope="module")
+def expected():
+    return shearq.bias(COLUMNS, **TRUTH)
+
+
+def equal(found, expected):
+    assert found["m1"] == pytest.approx(expected["m1"], abs=1e-12) and found["m1_error"] == pytest.approx(expected["m1_error"])
+
+
+def test_streams_and_datasets_of_arrow(expected, tmp_path):
+    pyarrow = pytest.importorskip("pyarrow", reason="needs pyarrow")
+    import pyarrow.dataset
+    import pyarrow.parquet
+
+    table = pyarrow.table(COLUMNS)
+    equal(shearq.bias(table, **TRUTH), expected)
+    equal(shearq.bias(pyarrow.RecordBatchReader.from_batches(table.schema, table.to_batches(100)), **TRUTH), expected)
+    for k, part in enumerate((table[:200], table[200:])):
+        pyarrow.parquet.write_table(part, tmp_path / f"{k}.parquet")
+    equal(shearq.bias(pyarrow.dataset.dataset(tmp_path), **TRUTH), expected)
+
+
+def test_relations_of_duckdb(expected):
+    duckdb = pytest.importorskip("duckdb", reason="needs duckdb")
+    pytest.importorskip("pyarrow", reason="needs pyarrow")
+    pandas = pytest.importorskip("pandas", reason="needs pandas")
+    frame = pandas.DataFrame(COLUMNS)
+    assert len(frame) == 500
+    equal(shearq.bias(duckdb.sql("SELECT e1, e2, w FROM frame"), **TRUTH), expected)
+
+
+def test_hdus_of_astropy(expected):
+    fits = pytest.importorskip("astropy.io.fits", reason="needs astropy")
+    hdu = fits.BinTableHDU.from_columns([fits.Column(name, "D", array=column) for name, column in COLUMNS.items()])
+    equal(shearq.bias(hdu, **TRUTH), expected)
+    equal(shearq.bias(hdu.data, **TRUTH), expected)
+    equal(shearq.bias(fits.HDUList([fits.PrimaryHDU(), hdu]), **TRUTH), expected)
+    with pytest.raises(TypeError, match="an HDUList with 2 tables; expected one"):
+        shearq.bias(fits.HDUList([fits.PrimaryHDU(), hdu, hdu.copy()]), **TRUTH)
+
+
+def test_catalogues_of_galsim_and_treecorr(expected, tmp_path):
+    galsim = pytest.importorskip("galsim", reason="needs galsim")
+    output = galsim.OutputCatalog(["e1", "e2", "w"], [float, float, float])
+    for row in zip(*COLUMNS.values()):
+        output.addRow(list(map(float, row)))
+    equal(shearq.bias(output, **TRUTH), expected)
+    treecorr = pytest.importorskip("treecorr", reason="needs treecorr")
+    x, y = RNG.uniform(0, 1, (2, 500))
+    catalogue = treecorr.Catalog(x=x, y=y, g1=COLUMNS["e1"], g2=COLUMNS["e2"], w=COLUMNS["w"])
+    equal(shearq.bias(catalogue, **TRUTH), expected)
+
+
+def test_frames_of_dask_say_how(expected):
+    pandas = pytest.importorskip("pandas", reason="needs pandas")
+    dask = pytest.importorskip("dask.dataframe", reason="needs dask")
+    frame = dask.from_pandas(pandas.DataFrame(COLUMNS), npartitions=3)
+    with pytest.raises(TypeError, match="a DataFrame of dask in 3 partitions; expected one in memory. Try: parts"):
+        shearq.bias(frame, **TRUTH)
+    import dask as engine
+
+    parts = engine.compute(*[engine.delayed(shearq.bias_sums)(part, **TRUTH) for part in frame.to_delayed()])
+    assert shearq.BiasSums.merge(parts).result()["m1"] == pytest.approx(expected["m1"], abs=1e-12)
