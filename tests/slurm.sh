@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Runs the array job of docs/survey.md on a Slurm cluster of one node, set up for this in a temporary
+# Runs the array job of docs/large-jobs.md on a Slurm cluster of one node, set up for this in a temporary
 # folder, and compares what it leaves with what one process leaves.
 #
 #   tests/slurm.sh SHEARQ [--install]
@@ -91,11 +91,11 @@ echo "Slurm $version, node $node is up"
 shards=5
 what="--sets 1,7,19 --images 4"
 grid="--grid 16"
-sed -n '/^#!\/bin\/bash/,/^```/{/^```/!p}' "$project/docs/survey.md" | sed \
+sed -n '/^#!\/bin\/bash/,/^```/{/^```/!p}' "$project/docs/large-jobs.md" | sed \
   -e "s/--array=1-120/--array=1-$shards/" -e "s/shards=120/shards=$shards/" \
   -e "s/--cpus-per-task=4/--cpus-per-task=1/" -e "s/--mem=2G/--mem=200M/" \
   -e "s/--sets all --images 200/$what $grid/" >"$place/work/shearq.sh"
-grep -q -- "$what" "$place/work/shearq.sh" || { echo "docs/survey.md has no job to run"; exit 1; }
+grep -q -- "$what" "$place/work/shearq.sh" || { echo "docs/large-jobs.md has no job to run"; exit 1; }
 mkdir "$place/bin"
 ln -s "$shearq" "$place/bin/shearq"
 PATH=$place/bin:$PATH

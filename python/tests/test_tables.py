@@ -74,3 +74,18 @@ def test_frames_of_dask_say_how(expected):
 
     parts = engine.compute(*[engine.delayed(shearq.bias_sums)(part, **TRUTH) for part in frame.to_delayed()])
     assert shearq.BiasSums.merge(parts).result()["m1"] == pytest.approx(expected["m1"], abs=1e-12)
+
+
+def test_the_block_of_dask_runs(tmp_path, capsys):
+    pytest.importorskip("dask", reason="needs dask")
+    from test_survey import DOCS, blocks
+
+    paths = []
+    for k, sign in enumerate((1, -1)):
+        rows = zip(E[:, 0] + sign * 0.02, E[:, 1])
+        path = tmp_path / f"{k}.csv"
+        path.write_text("e1,e2,g1,g2\n" + "".join(f"{a},{b},{sign * 0.02},0\n" for a, b in rows))
+        paths.append(str(path))
+    (block,) = [one for one in blocks((DOCS / "large-jobs.md").read_text(), "python") if "dask" in one]
+    exec(block, {"paths": paths})
+    assert "m1" in capsys.readouterr().out
