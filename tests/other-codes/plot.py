@@ -39,7 +39,7 @@ def main():
     # Fixed identifiers, and no date: the same results give the same file.
     plt.rcParams.update({"svg.hashsalt": "shearq", "svg.fonttype": "none", "font.size": 13, "font.family": "sans-serif"})
     figure, (left, right) = plt.subplots(1, 2, figsize=(13, 5), facecolor="white")
-    bars = []
+    points = []
     for (method, variant), (label, colour, marker) in DRAWN.items():
         rows = [r for r in results["rows"] if (r["method"], r["variant"]) == (method, variant)]
         snr = np.array([r["snr"] for r in rows])
@@ -50,7 +50,7 @@ def main():
         left.errorbar(snr, noise, error, label=label, capsize=2, **look)
         row = next(r for r in rows if r["snr"] == 20)
         m = np.hypot(row["m1"], row["m2"]) / np.sqrt(2)
-        bars.append((label, colour, m, np.hypot(row["m1_error"], row["m2_error"]) / np.sqrt(2)))
+        points.append((label, colour, m, np.hypot(row["m1_error"], row["m2_error"]) / np.sqrt(2)))
     left.set(xscale="log", yscale="log", ylim=(0.93, 7), xlabel="S/N", title="Noise of ε over the Cramér–Rao bound")
     left.set_xticks([7, 10, 20, 40, 100], ["7", "10", "20", "40", "100"])
     left.set_yticks([1, 1.2, 1.5, 2, 3, 4, 6], ["1", "1.2", "1.5", "2", "3", "4", "6"])
@@ -58,17 +58,20 @@ def main():
     left.grid(color="#cccccc", linewidth=0.6)
     left.axhline(1.0, color=DARK, linestyle="--", linewidth=1.2)
     left.legend(fontsize=10.5, loc="upper right", framealpha=1)
-    # A bar that is below twice its error is an upper limit.
-    for k, (label, colour, m, error) in enumerate(bars[::-1]):
+    # A value below twice its error is an upper limit of two errors.
+    for k, (label, colour, m, error) in enumerate(points[::-1]):
         limit = m < 2 * error
-        length = 2 * error if limit else m
-        right.barh(k, length, color="white" if limit else colour, edgecolor=colour, hatch="///" if limit else None, height=0.6)
-        value = f"< {length:.1g}" if limit else f"{m:.2g}"
-        right.text(length * 1.2, k, value, color=DARK, va="center", fontsize=11, bbox=dict(facecolor="white", edgecolor="none", pad=1))
+        place = 2 * error if limit else m
+        if limit:
+            right.errorbar(place, k, xerr=0.45 * place, xuplims=True, color=colour, marker="|", markersize=12, capsize=4)
+        else:
+            right.errorbar(m, k, xerr=error, color=colour, marker="o", markersize=7, capsize=3)
+        value = f"< {place:.1g}" if limit else f"{m:.2g}"
+        right.text(place * 1.35, k, value, color=DARK, va="center", fontsize=11, bbox=dict(facecolor="white", edgecolor="none", pad=1))
     right.set(xscale="log", xlim=(3e-5, 1), ylim=(-0.9, 6.6), xlabel="r.m.s. of m1 and m2", title="|m| at S/N 20")
-    right.set_yticks(range(len(bars)), [bar[0] for bar in bars[::-1]])
+    right.set_yticks(range(len(points)), [point[0] for point in points[::-1]])
     right.axvline(REQUIRED, color=DARK, linestyle="--", linewidth=1.2)
-    right.text(REQUIRED * 1.1, -0.62, "required", color=DARK, va="center", fontsize=11)
+    right.text(REQUIRED * 1.1, -0.62, "required by Euclid and LSST", color=DARK, va="center", fontsize=11)
     right.minorticks_off()
     right.set_axisbelow(True)
     right.grid(axis="x", color="#cccccc", linewidth=0.6)
