@@ -14,8 +14,8 @@ use shearq_scoring::aperture::{Lattice, LatticeShear};
 use shearq_scoring::modes::Decomposer;
 use shearq_scoring::resample::{PairedSet, paired_difference};
 use shearq_scoring::{
-    BINS, Bins, Choice, Convention, Definition, Fault, FieldSum, Grid, ImageFaults, Metrics, Noise,
-    Options, Row, RowCounts, SCORED, SetImages, SetScore, SetScorer, TrueShear, TruthSign,
+    AddedImages, BINS, Bins, Choice, Convention, Definition, Fault, FieldSum, Grid, Metrics, Noise,
+    Options, Row, SCORED, ScoredImages, SetScore, SetSession, TrueShear, TruthSign,
     sign_by_correlation, sign_by_modes,
 };
 
@@ -66,11 +66,7 @@ impl<'a> Rows<'a> {
     }
 
     // One image on the grid at a time: all images of a set would take gigabytes.
-    fn each(
-        &self,
-        grid: &Grid,
-        mut take: impl FnMut(&FieldSum, RowCounts) -> PyResult<()>,
-    ) -> PyResult<()> {
+    fn add_up<'s>(&self, session: &'s SetSession) -> PyResult<AddedImages<'s>> {
         // The sum is checked for overflow, because the lengths come from the caller and index the arrays below.
         let count = self.e1.len();
         let fits = self
@@ -87,6 +83,8 @@ impl<'a> Rows<'a> {
                 "e1, e2, positions: lengths that differ",
             ));
         }
+        let grid = session.grid();
+        let mut images = session.begin();
         let mut start = 0;
         for length in &self.lengths {
             let mut sum = FieldSum::new(grid);
@@ -105,19 +103,29 @@ impl<'a> Rows<'a> {
                     }
                 }),
             );
-            take(&sum, counts)?;
+            session
+                .examine(sum, counts)
+                .and_then(|image| images.add(&image))
+                .map_err(of_scoring)?;
             start += length;
         }
-        Ok(())
+        Ok(images)
     }
 
-    fn sum(&self, grid: &Grid) -> PyResult<(SetImages, RowCounts)> {
-        let (mut images, mut counts) = (SetImages::new(grid), RowCounts::default());
-        self.each(grid, |image, rows| {
-            counts += rows;
-            images.add(image).map_err(of_scoring)
-        })?;
-        Ok((images, counts))
+    // As [`Rows::add_up`], of ellipticities that can be scored.
+    fn measured<'s>(&self, session: &'s SetSession) -> PyResult<AddedImages<'s>> {
+        let images = self.add_up(session)?;
+        let counts = images.rows();
+        if counts.used == 0 {
+            return Err(PyValueError::new_err(format!(
+                "e1, e2: no galaxy has an ellipticity on the grid ({} are not finite, {} lie outside); expected numbers",
+                counts.not_finite, counts.outside
+            )));
+        }
+        match foreign::fault_of_rows(counts, session.grid(), ADVICE) {
+            Some(fault) => Err(of_rows(&fault)),
+            None => Ok(images),
+        }
     }
 }
 
@@ -174,34 +182,35 @@ pub(crate) fn score<'py>(
             Row { x, y, e1, e2 }
         });
         let standard = TrueShear::from_rows(&grid, TruthSign::Standard, truth).map_err(of_scoring)?;
-        let (images, counts) = catalogue.sum(&grid)?;
-        if counts.used == 0 {
-            return Err(PyValueError::new_err(format!(
-                "e1, e2: no galaxy has an ellipticity on the grid ({} are not finite, {} lie outside); expected numbers",
-                counts.not_finite, counts.outside
-            )));
-        }
-        if let Some(fault) = foreign::fault_of_rows(&counts, &grid, ADVICE) {
-            return Err(of_rows(&fault));
-        }
-        let mut warnings = scores::oddities(&counts, "e1, e2");
         let by_modes = sign_by_modes(&grid, &standard).map_err(of_scoring)?;
-        let sign = sign_of_truth(&standard, given, by_modes, &images)?;
+        let sign = sign_of_truth(&standard, given, by_modes, || {
+            let session = SetSession::new(grid, None, options).map_err(of_scoring)?;
+            let images = catalogue.measured(&session)?;
+            sign_by_correlation(&standard, images.images().total()).map_err(of_scoring)
+        })?;
+        let challenge = sign.of == TruthSign::Challenge;
+        let truth = match challenge {
+            true => standard.flipped(),
+            false => standard,
+        };
+        let session = SetSession::new(grid, Some(truth), options).map_err(of_scoring)?;
+        let ScoredImages { score, rows, findings, odd, .. } =
+            catalogue.measured(&session)?.finish().map_err(of_scoring)?;
+        let mut warnings = scores::oddities(&rows, "e1, e2");
         if let Some(other) = by_modes.filter(|other| *other != sign.of) {
             warnings.push(format!(
                 "warning: truth_g2 seems to have the other sign: with it the shear is an E-mode field. Try: truth_sign=\"{}\"",
                 word(other)
             ));
         }
-        let challenge = sign.of == TruthSign::Challenge;
-        let truth = match challenge {
-            true => standard.flipped(),
-            false => standard,
-        };
-        let scorer = SetScorer::new(grid, truth, options).map_err(of_scoring)?;
-        let scored = scorer.score(&images).map_err(of_scoring)?;
-        warnings.extend(faults(&catalogue, &scorer, &images, &scored)?);
-        PyResult::Ok((scored, warnings, challenge))
+        let odd = scores::odd_images(&odd, &|place| format!("image {}", place + 1));
+        // The Python package words a wrong convention, with the name of its argument.
+        let told = findings
+            .iter()
+            .filter(|fault| !matches!(fault, Fault::Convention { .. }));
+        let lines = odd.into_iter().chain(told.map(scores::words));
+        warnings.extend(lines.map(|line| format!("warning: {line}.")));
+        PyResult::Ok((score, warnings, challenge))
     })?;
     if scored.constant.is_some() {
         warnings.push("note: the true shear is the same everywhere, so that only `mean`, c1 and c2 are known; other metrics are NaN.".into());
@@ -249,7 +258,7 @@ fn sign_of_truth(
     standard: &TrueShear,
     given: Option<TruthSign>,
     by_modes: Option<TruthSign>,
-    images: &SetImages,
+    by_correlation: impl FnOnce() -> PyResult<Option<TruthSign>>,
 ) -> PyResult<Sign> {
     let refused = |fault: SignFault| {
         // Arrays have no line that states a sign, as files do.
@@ -262,38 +271,8 @@ fn sign_of_truth(
     match Sign::of_truth(None, given, || by_modes).map_err(refused)? {
         Some(sign) => Ok(sign),
         None if standard.g2.iter().all(|g2| *g2 == 0.0) => Ok(Sign::ZERO),
-        None => {
-            let found = sign_by_correlation(standard, images.total()).map_err(of_scoring)?;
-            Sign::of_catalogues(found).map_err(refused)
-        }
+        None => Sign::of_catalogues(by_correlation()?).map_err(refused),
     }
-}
-
-// Warnings about single images and about the set.
-fn faults(
-    catalogue: &Rows<'_>,
-    scorer: &SetScorer,
-    images: &SetImages,
-    scored: &SetScore,
-) -> PyResult<Vec<String>> {
-    // A second pass, because images are compared with the truth in the convention that the first pass found.
-    let mut faults = ImageFaults::default();
-    catalogue.each(&scored.grid, |image, _| {
-        faults.add(image);
-        faults.add_response(scorer.response(image, scored.chosen));
-        Ok(())
-    })?;
-    let faults_of_set = scorer.diagnose(images, scored, scored.chosen);
-    let faults_of_set = faults_of_set.map_err(of_scoring)?.into_iter();
-    let untold = faults_of_set.filter(|fault| match fault {
-        // The Python package words this one, with the name of its argument.
-        Fault::Convention { .. } => false,
-        Fault::Uncorrelated { .. } => faults.copies.is_empty(),
-        _ => true,
-    });
-    let odd = scores::odd_arrays(&faults).into_iter();
-    let lines = odd.chain(untold.map(|fault| scores::words(&fault)));
-    Ok(lines.map(|line| format!("warning: {line}.")).collect())
 }
 
 fn spectrum_of<'py>(py: Python<'py>, scored: &SetScore) -> PyResult<Bound<'py, PyDict>> {
@@ -343,13 +322,15 @@ pub(crate) fn spectrum<'py>(
     let definition = self::definition(definition)?;
     let catalogue = Rows::new(&e, positions.as_ref(), lengths);
     let (all, modes) = py.detach(|| {
-        let (images, counts) = catalogue.sum(&grid)?;
+        let session = SetSession::new(grid, None, Options::default()).map_err(of_scoring)?;
+        let images = catalogue.add_up(&session)?;
+        let counts = images.rows();
         // Other faults of rows are no errors here, because any field has a spectrum.
-        let failed = (counts.sentinels > 0).then(|| foreign::fault_of_rows(&counts, &grid, ADVICE));
+        let failed = (counts.sentinels > 0).then(|| foreign::fault_of_rows(counts, &grid, ADVICE));
         if let Some(fault) = failed.flatten() {
             return Err(of_rows(&fault));
         }
-        let total = images.total();
+        let total = images.images().total();
         let scale = 1.0 / total.images.max(1) as f64;
         let standard = Convention::STANDARD;
         let field = standard

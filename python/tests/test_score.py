@@ -279,6 +279,42 @@ def test_probable_faults_are_warned_of():
         shearq.score(e1, e2, g1, -g2, truth_sign="standard")
 
 
+# What commands say of the choice of a convention, which Python words with the names of its arguments.
+OF_CONVENTIONS = ("the leaderboard uses", "cannot determine the sign", "match the truth in convention")
+
+
+@pytest.mark.parametrize("convention", ["5", "best", "matched"])
+@pytest.mark.parametrize("fault", ["constant", "copied", "exchanged"])
+def test_findings_are_those_of_the_command_line(command, tmp_path, fault, convention):
+    e1, e2, g1, g2 = _images()
+    if fault == "constant":
+        # Of most images, so that m is far from zero.
+        e1[:3], e2[:3] = 0.1, 0.2
+    elif fault == "copied":
+        e1[1:], e2[1:] = e1[0], e2[0]
+    else:
+        e1[2], e2[2] = e2[2].copy(), e1[2].copy()
+    y, x = 48 * np.indices(g1.shape) + 24.5
+
+    def write(name, header, *columns):
+        np.savetxt(tmp_path / name, np.stack(columns).reshape(4, -1).T, "%.17g", ",", header=header, comments="")
+        return tmp_path / name
+
+    truth = write("truth.csv", "x,y,g1,g2", x, y, g1, g2)
+    paths = [write(f"{k}.csv", "x,y,e1,e2", x, y, *e) for k, e in enumerate(zip(e1, e2), 1)]
+    options = ("--truth-sign", "standard", "--convention", convention, "--format", "csv")
+    said = command("score", "--truth", truth, *paths, *options, stream="stderr")
+    for k, path in enumerate(paths, 1):
+        said = said.replace(str(path), f"image {k}")
+
+    def findings(lines):
+        return [line for line in lines if line.startswith("warning: ") and not any(words in line for words in OF_CONVENTIONS)]
+
+    with pytest.warns(UserWarning):
+        scored = shearq.score(e1, e2, g1, g2, truth_sign="standard", convention=convention)
+    assert findings(scored.notes) == findings(said.splitlines()) != []
+
+
 def test_nothing_to_score_is_an_error_and_a_constant_truth_is_noted():
     e1, e2, g1, g2 = _images()
     with pytest.raises(ValueError, match="no galaxy has an ellipticity"):

@@ -195,6 +195,12 @@ impl FieldSum {
         counts
     }
 
+    pub(crate) fn check_shape(&self, side: usize) -> Result<(), ScoringError> {
+        check_shape("e1 of an image", &self.e1, side)?;
+        check_shape("e2 of an image", &self.e2, side)?;
+        check_shape("the count of an image", &self.count, side)
+    }
+
     pub(crate) fn merge(&mut self, other: &FieldSum) {
         self.e1 += &other.e1;
         self.e2 += &other.e2;
@@ -372,10 +378,7 @@ impl SetImages {
         if image.images != 1 {
             return Err(ScoringError::NotOneImage(image.images));
         }
-        let side = self.total.e1.nrows();
-        check_shape("e1 of an image", &image.e1, side)?;
-        check_shape("e2 of an image", &image.e2, side)?;
-        check_shape("the count of an image", &image.count, side)?;
+        image.check_shape(self.total.e1.nrows())?;
         let group = self.total.images % MAX_GROUPS;
         if group == self.groups.len() {
             self.groups.push(image.clone());

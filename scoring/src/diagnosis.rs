@@ -1,9 +1,7 @@
 //! Probable faults of ellipticities that disagree with the true shear: order of rows, components, type of
 //! ellipticity, copies. The caller words the findings.
 
-use std::collections::HashMap;
 use std::f64::consts::PI;
-use std::hash::{DefaultHasher, Hash, Hasher};
 
 use ndarray::{Array2, Zip};
 use shearq_fourier::Complex64;
@@ -30,14 +28,6 @@ const LARGE_M_SIGMA: f64 = 3.0;
 const MIN_M_OF_DISTORTION: f64 = 0.5;
 // A shear field whose rms exceeds this is not weak lensing.
 const MAX_WEAK_SHEAR_RMS: f64 = 0.3;
-// Chance that an image of a set is reported whose response differs by noise only. Over the 24 sets of the challenge
-// this is at most 2 %, and less in fact, because the bound of the normal distribution below is not tight.
-const FALSE_ALARM_PROBABILITY: f64 = 1e-3;
-// Least relative difference of an image's response from that of the others. Images of one set with other PSFs or
-// noise respond differently too, in S/N 10 against 20 by 0.2; a wrong order, sign or type changes it by 1 or more.
-const MIN_RELATIVE_SLOPE_CHANGE: f64 = 0.4;
-// Standard deviation of a normal distribution in median absolute deviations.
-const SIGMA_OF_MAD: f64 = 1.4826;
 // Difference of the shares of B modes that determines the sign of g₂. A pure E-mode field has a share of 0 in
 // the right sign and of about one half in the other.
 const MIN_B_SHARE_DIFFERENCE: f64 = 0.2;
@@ -112,31 +102,6 @@ pub struct ImageResponse {
     pub error: f64,
     /// Correlation with the true shear, −1 to 1.
     pub correlation: f64,
-}
-
-/// An image that follows the true shear differently from the other images of its set.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct OddResponse {
-    /// Place of the image, from 0.
-    pub place: usize,
-    /// Its response.
-    pub response: ImageResponse,
-    /// Median slope of all images.
-    pub slope: f64,
-    /// Median correlation of all images.
-    pub correlation: f64,
-}
-
-/// Faults of single images, found while they are added one after the other.
-#[derive(Debug, Clone, Default)]
-pub struct ImageFaults {
-    seen: HashMap<u64, usize>,
-    images: usize,
-    responses: Vec<(usize, ImageResponse)>,
-    /// Places of images with the ellipticities of an earlier one, and the place of that one, from 0.
-    pub copies: Vec<(usize, usize)>,
-    /// Places of images in which galaxies share ellipticities that no measurement repeats.
-    pub repeated: Vec<(usize, Repeated<2>)>,
 }
 
 /// Rows that share a value, as placeholders of galaxies that were not measured do.
@@ -216,114 +181,6 @@ pub fn repeated<const N: usize>(rows: &[[f64; N]], step: f64) -> Option<Repeated
             true => own,
             false => worst,
         })
-}
-
-impl ImageFaults {
-    /// Number of images examined.
-    pub fn images(&self) -> usize {
-        self.images
-    }
-
-    /// Examines the next image. Images without any galaxy are not compared.
-    pub fn add(&mut self, image: &FieldSum) {
-        let place = self.images;
-        self.images += 1;
-        let shapes = shapes(image);
-        if shapes.is_empty() {
-            return;
-        }
-        if let Some(repeated) = repeated(&shapes, EQUAL_SHAPES) {
-            self.repeated.push((place, repeated));
-            // Images of one value are no copies of each other.
-            if repeated.is_constant() {
-                return;
-            }
-        }
-        let mut hasher = DefaultHasher::new();
-        for values in [&image.e1, &image.e2, &image.count] {
-            // Adding zero removes the sign of a negative zero.
-            values
-                .iter()
-                .for_each(|v| (v + 0.0).to_bits().hash(&mut hasher));
-        }
-        let first = *self.seen.entry(hasher.finish()).or_insert(place);
-        if first != place {
-            self.copies.push((place, first));
-        }
-    }
-
-    /// Adds what [`SetScorer::response`] found for the image that was added last.
-    pub fn add_response(&mut self, response: Option<ImageResponse>) {
-        if let (Some(response), Some(place)) = (response, self.images.checked_sub(1)) {
-            self.responses.push((place, response));
-        }
-    }
-
-    /// Images that follow the true shear differently from the others of the set, in order. Images with repeated
-    /// ellipticities are not among them.
-    ///
-    /// An image differs if its slope s is farther from the median s₀ than `MIN_RELATIVE_SLOPE_CHANGE` × |s₀| and than
-    /// √(2 ln(K/p)) σ for K images and a chance p of a false alarm, because 2Q(z) ≤ exp(−z²/2). σ contains the errors of s and
-    /// s₀, or the scatter of all slopes if that is larger.
-    pub fn odd(&self) -> Vec<OddResponse> {
-        let all = &self.responses;
-        if all.len() < 2 {
-            return Vec::new();
-        }
-        let of = |value: fn(&ImageResponse) -> f64| all.iter().map(move |(_, own)| value(own));
-        let slope = median(of(|own| own.slope), 1.0);
-        let correlation = median(of(|own| own.correlation), 1.0);
-        let apart = of(|own| own.slope).map(|own| (own - slope).abs());
-        let images = all.len() as f64;
-        // The median deviation of few images is noisy: its relative error is 1.17/√K (Rousseeuw & Croux 1993). Only what
-        // exceeds twice this error is scatter that the noise of the images does not explain.
-        let scatter = SIGMA_OF_MAD * median(apart, 0.0) / (1.0 + 2.0 * 1.17 / images.sqrt());
-        // The variance of a median is π/2 times that of a mean; of two slopes it is that of one.
-        let error = median(of(|own| own.error), 0.0);
-        let of_median = error * (0.5 * PI / (images - 1.0)).sqrt().min(1.0);
-        let clear = (2.0 * (images / FALSE_ALARM_PROBABILITY).ln()).sqrt();
-        let differs = |(place, own): &&(usize, ImageResponse)| {
-            let sigma = own.error.hypot(of_median).max(scatter);
-            let apart = (own.slope - slope).abs();
-            apart > MIN_RELATIVE_SLOPE_CHANGE * slope.abs()
-                && apart > clear * sigma
-                && !self.repeated.iter().any(|(repeated, _)| repeated == place)
-        };
-        let odd = all
-            .iter()
-            .filter(differs)
-            .map(|&(place, response)| OddResponse {
-                place,
-                response,
-                slope,
-                correlation,
-            });
-        odd.collect()
-    }
-}
-
-// The median; of the two middle values of an even number the one nearer to `expected`, so that two images of which one is
-// wrong do not meet halfway.
-fn median(values: impl Iterator<Item = f64>, expected: f64) -> f64 {
-    let mut values: Vec<f64> = values.collect();
-    values.sort_unstable_by(f64::total_cmp);
-    let (below, above) = (values[(values.len() - 1) / 2], values[values.len() / 2]);
-    match (below - expected).abs() < (above - expected).abs() {
-        true => below,
-        false => above,
-    }
-}
-
-// Side of the cells within which ellipticities count as equal. Chosen by hand: 1 % of the least scatter of a shape, 0.01.
-const EQUAL_SHAPES: f64 = 1e-4;
-
-// Ellipticities of the galaxies of an image.
-fn shapes(image: &FieldSum) -> Vec<[f64; 2]> {
-    let cells = image.e1.iter().zip(&image.e2).zip(&image.count);
-    let filled = cells.filter(|(_, count)| **count > 0.0);
-    filled
-        .map(|((e1, e2), count)| [e1 / count, e2 / count])
-        .collect()
 }
 
 impl SetScorer {
@@ -588,38 +445,8 @@ fn sign_where(value: f64, clear: f64) -> Option<TruthSign> {
 mod tests {
     use super::*;
 
-    fn image(value: impl Fn(usize) -> (f64, f64)) -> FieldSum {
-        let grid = Grid::great10(8).unwrap();
-        let mut sum = FieldSum::new(&grid);
-        sum.images = 1;
-        for k in 0..64 {
-            let at = (k % 8, k / 8);
-            (sum.e1[at], sum.e2[at]) = value(k);
-            sum.count[at] = 1.0;
-        }
-        sum
-    }
-
-    #[test]
-    fn copies_and_constant_images_are_found() {
-        let mut faults = ImageFaults::default();
-        let varied = |k: usize| (k as f64, -(k as f64));
-        let blank = FieldSum::new(&Grid::great10(8).unwrap());
-        for sum in [
-            image(varied),
-            blank.clone(),
-            image(|_| (0.0, 0.0)),
-            image(|k| (-(k as f64), k as f64)),
-            image(varied),
-            blank,
-            image(|_| (0.1, 0.2)),
-        ] {
-            faults.add(&sum);
-        }
-        assert_eq!(faults.copies, [(4, 0)]);
-        let places: Vec<usize> = faults.repeated.iter().map(|(place, _)| *place).collect();
-        assert_eq!(places, [2, 6]);
-    }
+    // As of ellipticities.
+    const STEP: f64 = 1e-4;
 
     #[test]
     fn placeholders_repeat_and_rounded_shapes_do_not() {
@@ -630,7 +457,7 @@ mod tests {
             (0..2500).map(|k| edit(k, shape(k))).collect()
         };
         let found = |edit: &dyn Fn(usize, [f64; 2]) -> [f64; 2]| {
-            repeated(&shapes(edit), EQUAL_SHAPES).map(|own| (own.rows, own.first, own.component))
+            repeated(&shapes(edit), STEP).map(|own| (own.rows, own.first, own.component))
         };
         for digits in [2, 3, 4, 9] {
             let scale = 10f64.powi(digits);
@@ -646,8 +473,8 @@ mod tests {
         assert_eq!(found(&|_, e| e.map(|e| 1e-300 * e)), Some((2500, 0, None)));
         let first = |k: usize, [e1, e2]: [f64; 2]| [if k.is_multiple_of(3) { 0.1 } else { e1 }, e2];
         assert_eq!(found(&first), Some((834, 0, Some(0))));
-        assert_eq!(repeated(&[[0.1, 0.2]], EQUAL_SHAPES), None);
-        assert!(repeated(&[[0.1, 0.2]; 2], EQUAL_SHAPES).is_some());
+        assert_eq!(repeated(&[[0.1, 0.2]], STEP), None);
+        assert!(repeated(&[[0.1, 0.2]; 2], STEP).is_some());
     }
 
     #[test]

@@ -79,6 +79,9 @@ pub enum ScoringError {
     /// No image was added.
     #[error("no image to score")]
     NoImages,
+    /// A set without a true shear was to be scored.
+    #[error("the set has no true shear to be scored against")]
+    NoTruth,
     /// A sum that should contain one image contains none or several.
     #[error("the sum contains {0} images; expected 1")]
     NotOneImage(usize),

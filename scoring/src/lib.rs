@@ -17,8 +17,8 @@
 //! ```
 //!
 //! For catalogues with positions, make [`Row`]s and add them with [`FieldSum::add_image`], which also counts odd
-//! rows. Add images to [`SetImages`] one at a time: the memory is that of some twenty grids for any number of
-//! images.
+//! rows. A [`SetSession`] takes one image at a time and finds copies, placeholders, and images that do not follow the shear as
+//! the others do: the memory is that of some twenty grids for any number of images.
 //!
 //! # A spectrum
 //!
@@ -52,15 +52,13 @@ pub mod modes;
 pub mod quality;
 pub mod resample;
 mod score;
+mod session;
 
 pub use bandpower::{BINS, Bins, Definition, SCORED};
 pub use catalogue::{FieldSum, OddRow, Row, RowCounts, RowFault, SetImages, TrueShear, TruthSign};
 pub use convention::{Convention, ConventionClass, ConventionMatch};
 pub use cross::{CrossSpectrum, cross_spectrum};
-pub use diagnosis::{
-    Fault, ImageFaults, ImageResponse, OddResponse, Repeated, repeated, sign_by_correlation,
-    sign_by_modes,
-};
+pub use diagnosis::{Fault, ImageResponse, Repeated, repeated, sign_by_correlation, sign_by_modes};
 pub use error::ScoringError;
 pub use grid::{Grid, cell_at, centre_of};
 pub use line::{Line, common_slope};
@@ -72,6 +70,7 @@ pub use score::{
     Choice, ConventionScore, MeanShear, Noise, Options, SetScore, SetScorer, SpectrumCovariance,
     SpectrumScore, measured_bandpowers,
 };
+pub use session::{AddedImages, ExaminedImage, OddImages, OddResponse, ScoredImages, SetSession};
 pub use shearq_fourier::Complex64;
 
 /// The examples of README.md.

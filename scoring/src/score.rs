@@ -359,6 +359,10 @@ impl SetScorer {
         Ok(ConventionMatch::new(correlations, self.scored_modes()))
     }
 
+    pub(crate) fn choice(&self) -> Choice {
+        self.options.choice
+    }
+
     pub(crate) fn truth(&self) -> &TrueShear {
         &self.truth
     }

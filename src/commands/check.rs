@@ -3,7 +3,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use shearq_quantities::units::{Degrees, Pixels};
-use shearq_scoring::Grid;
+use shearq_scoring::{Definition, Grid};
 
 use crate::{Findings, count, print, tell_unread};
 use shearq_dataset::grid;
@@ -109,6 +109,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     }
     let expected = Expected {
         grid,
+        definition: Definition::Leaderboard,
         truth,
         secret_truth: BTreeMap::new(),
         images: arguments.images,

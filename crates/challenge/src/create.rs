@@ -17,7 +17,7 @@ use shearq_pipeline::simulate::simulate_blind;
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_results::record::SetRecord;
 use shearq_results::score::ScoreError;
-use shearq_scoring::{Choice, Convention, Options, RowCounts, SetImages, SetScorer, TrueShear};
+use shearq_scoring::{Choice, Convention, Options, RowCounts, ScoredImages, SetSession, TrueShear};
 use shearq_simulate::field::ShearSpectrum;
 use shearq_simulate::set::{STAMP, SimulationSettings};
 use thiserror::Error;
@@ -396,12 +396,15 @@ fn expected_scores(
             set: Some(set),
             source,
         };
-        let scorer = SetScorer::new(grid, truth, options).map_err(wrong)?;
-        let mut sum = SetImages::new(&grid);
+        let session = SetSession::new(grid, Some(truth), options).map_err(wrong)?;
+        let mut first = session.begin();
         if let Some(shapes) = references.of(set, 1) {
-            sum.add(&shapes).map_err(wrong)?;
+            let examined = session.examine(shapes, RowCounts::default());
+            first.add(&examined.map_err(wrong)?).map_err(wrong)?;
         }
-        let mut score = scorer.score(&sum).map_err(wrong)?;
+        let ScoredImages {
+            mut score, rows, ..
+        } = first.finish().map_err(wrong)?;
         // Noise averages down; its power, which dominates Q, by the number of images.
         score.metrics.q *= images;
         // What c scatters between constant shears is noise, too.
@@ -415,7 +418,6 @@ fn expected_scores(
             *error /= images.sqrt();
         }
         zero += score.zero_quality().q / data.sets.len() as f64;
-        let rows = RowCounts::default();
         scored.push(SetRecord::new(set, false, vec![1], &score, &rows, true));
     }
     Ok((scored, zero))

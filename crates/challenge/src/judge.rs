@@ -543,11 +543,9 @@ impl Judge {
         let (mut sets, mut odd, mut failed) = (Vec::new(), Vec::new(), None);
         self.check(sent, sending, references, &mut |checked: CheckedSet<'_>| {
             let set = checked.set;
-            let of_set = checked.odd.iter();
-            odd.extend(of_set.map(|image| format!("{image} of set {set}")));
-            match self.score_set(&checked) {
+            match self.score_set(&checked, &mut odd) {
                 Ok(record) => {
-                    let shapes = sketch(checked.images.total());
+                    let shapes = sketch(checked.images.images().total());
                     info.shapes.insert(set.to_string(), shapes);
                     sets.extend(record);
                 }
@@ -592,21 +590,22 @@ impl Judge {
         Ok((sets, all))
     }
 
-    // The record of a set of catalogues. `None` if the set does not belong to the challenge.
-    fn score_set(&self, checked: &CheckedSet<'_>) -> Result<Option<SetRecord>, String> {
-        let CheckedSet {
-            set, images, rows, ..
-        } = checked;
-        let Some(truth) = self.truths.get(set) else {
+    // The record of a set of catalogues, and in `odd` its images that do not follow the shear as the others do. `None` if the
+    // set does not belong to the challenge.
+    fn score_set(
+        &self,
+        checked: &CheckedSet<'_>,
+        odd: &mut Vec<String>,
+    ) -> Result<Option<SetRecord>, String> {
+        let (set, numbers) = (checked.set, checked.numbers);
+        let Some(truth) = self.truths.get(&set) else {
             return Ok(None);
         };
-        let wrong = |error: ScoringError| error.to_string();
-        let score = truth.scorer.score(images).map_err(wrong)?;
-        let faults = truth
-            .scorer
-            .diagnose(images, &score, Convention::STANDARD)
-            .map_err(wrong)?;
-        for fault in faults {
+        let scored = checked.images.finish();
+        let scored = scored.map_err(|error| error.to_string())?;
+        let responses = scored.odd.responses.iter();
+        odd.extend(responses.map(|own| format!("{} of set {set}", numbers[own.place])));
+        for fault in scored.findings {
             // Without numbers, because correlations with the truth are secret.
             return Err(match fault {
                 Fault::Convention { better, .. } => format!(
@@ -619,8 +618,8 @@ impl Judge {
                 _ => continue,
             });
         }
-        let numbers = checked.numbers.to_vec();
-        let record = SetRecord::new(*set, truth.simulated, numbers, &score, rows, true);
+        let (score, rows) = (&scored.score, &scored.rows);
+        let record = SetRecord::new(set, truth.simulated, numbers.to_vec(), score, rows, true);
         let data = truth.print.clone();
         Ok(Some(SetRecord { data, ..record }))
     }

@@ -146,6 +146,7 @@ impl Challenge {
         let grid = self.data.grid();
         Ok(Expected {
             grid: grid.map_err(|error| FileError::new(CHALLENGE_FILE, error))?,
+            definition: self.rules.metric.definition(),
             truth: BTreeMap::new(),
             secret_truth: BTreeMap::new(),
             images: Some(*images),

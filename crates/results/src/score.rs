@@ -11,13 +11,13 @@ use shearq_dataset::truth::{ReadTruth, Reading, Sign, read_truth, reading_of};
 use shearq_files::FileError;
 use shearq_quantities::Frame;
 use shearq_scoring::{
-    Choice, Convention, ConventionMatch, Fault, Grid, ImageFaults, OddResponse, Options, Repeated,
-    RowCounts, ScoringError, SetImages, SetScore, SetScorer, TruthSign, sign_by_correlation,
+    AddedImages, Choice, ConventionMatch, Fault, Grid, OddImages, Options, RowCounts, ScoredImages,
+    ScoringError, SetScore, SetSession, TruthSign, sign_by_correlation,
 };
 use shearq_submissions::ConfigurationError;
 use thiserror::Error;
 
-use crate::catalogues::{Catalogues, PLAIN_SET};
+use crate::catalogues::{Catalogues, OWN, PLAIN_SET};
 use crate::record::SetRecord;
 
 /// Why catalogues cannot be scored or compared.
@@ -61,6 +61,8 @@ pub struct ScoredSet {
     pub sign: Option<Sign>,
     pub findings: Vec<Fault>,
     pub odd_images: OddImages,
+    /// Names of the catalogues, in the order of their images.
+    pub names: Vec<PathBuf>,
 }
 
 impl ScoredSet {
@@ -92,36 +94,6 @@ impl Basis {
     }
 }
 
-/// Catalogues of a set with faults that the sum over images does not show.
-#[derive(Debug, Clone, Default, PartialEq)]
-pub struct OddImages {
-    /// Pairs of catalogues with equal ellipticities: the copy, and the first.
-    pub copies: Vec<(PathBuf, PathBuf)>,
-    /// Catalogues in which galaxies share ellipticities.
-    pub repeated: Vec<(PathBuf, Repeated<2>)>,
-    /// Catalogues that follow the true shear differently from the others of the set.
-    // One catalogue of several with x and y exchanged, or of another set, changed m by 0.17 to 0.33 without a warning.
-    pub responses: Vec<(PathBuf, OddResponse)>,
-}
-
-impl OddImages {
-    /// The images of `faults` were added in the order of `names`.
-    pub fn new(faults: &ImageFaults, names: &[PathBuf]) -> Self {
-        let name = |place: usize| names[place].clone();
-        let (copies, repeated) = (faults.copies.iter(), faults.repeated.iter());
-        let responses = faults.odd().into_iter();
-        OddImages {
-            copies: copies
-                .map(|&(copy, first)| (name(copy), name(first)))
-                .collect(),
-            repeated: repeated
-                .map(|&(place, found)| (name(place), found))
-                .collect(),
-            responses: responses.map(|odd| (name(odd.place), odd)).collect(),
-        }
-    }
-}
-
 struct SetFiles<'a> {
     // `None` for plain files.
     set: Option<u32>,
@@ -132,13 +104,6 @@ struct SetFiles<'a> {
     // Of the whole set: that of one image of few galaxies is noisy, and ⟨1/R̂⟩ exceeds 1/⟨R⟩.
     response: [f64; 2],
     pool: &'a Pool,
-}
-
-struct Added {
-    images: SetImages,
-    rows: RowCounts,
-    odd_images: OddImages,
-    compared: bool,
 }
 
 impl<'a> SetFiles<'a> {
@@ -171,83 +136,61 @@ impl<'a> SetFiles<'a> {
         move |source| ScoreError::Scoring { set, source }
     }
 
-    // Reads catalogues in parallel and adds them in order, so that results do not depend on threads. Each is compared
-    // with the true shear of `compared` in its convention.
-    fn add_up(
-        &self,
-        grid: &Grid,
-        compared: Option<(&SetScorer, Convention)>,
-    ) -> Result<Added, ScoreError> {
-        let mut faults = ImageFaults::default();
-        let mut images = SetImages::new(grid);
-        let mut rows = RowCounts::default();
-        let read = self.pool.in_order(&self.paths, |path| {
+    // Reads catalogues in parallel and adds them in order, so that results do not depend on threads.
+    fn add_up<'s>(&self, session: &'s SetSession) -> Result<AddedImages<'s>, ScoreError> {
+        let grid = session.grid();
+        let mut images = session.begin();
+        let examined = self.pool.in_order(&self.paths, |path| {
             let (mut sum, rows) = self.catalogues.sum(grid, path)?;
             sum.e1 /= self.response[0];
             sum.e2 /= self.response[1];
-            let response = compared.and_then(|(scorer, own)| scorer.response(&sum, own));
-            Ok::<_, FileError>((sum, rows, response))
+            session.examine(sum, rows).map_err(self.wrong())
         });
-        for image in read {
-            let (sum, more, response) = image?;
-            faults.add(&sum);
-            faults.add_response(response);
-            images.add(&sum).map_err(self.wrong())?;
-            rows += more;
+        for image in examined {
+            images.add(&image?).map_err(self.wrong())?;
         }
         // Without galaxies, the score would be the score of a method that measures no shear.
         let names = self.names();
-        if let (0, Some(first)) = (rows.used, names.first()) {
-            let message = nothing_used(&rows, names.len(), grid);
+        if let (0, Some(first)) = (images.rows().used, names.first()) {
+            let message = nothing_used(images.rows(), names.len(), grid);
             return Err(FileError::new(first, message).into());
         }
-        Ok(Added {
-            images,
-            rows,
-            odd_images: OddImages::new(&faults, &names),
-            compared: compared.is_some(),
-        })
+        Ok(images)
     }
 
-    // Scores the added catalogues and looks for probable faults. `matched` has the convention of all sets together, if
-    // it was matched.
+    // Scores the catalogues and looks for probable faults. `matched` has the convention of all sets together, if it was
+    // matched.
     fn score(
         &self,
-        scorer: &SetScorer,
-        mut added: Added,
+        session: &SetSession,
         choice: Choice,
         matched: Option<ConventionMatch>,
     ) -> Result<ScoredSet, ScoreError> {
-        let score = scorer.score(&added.images).map_err(self.wrong())?;
+        let ScoredImages {
+            score,
+            rows,
+            findings,
+            odd: odd_images,
+            ..
+        } = self.add_up(session)?.finish().map_err(self.wrong())?;
         let basis = match (matched, choice) {
             (Some(matching), _) => Basis::Matched(matching),
             (None, Choice::Matched) => Basis::Matched(score.matching),
             (None, Choice::Best) => Basis::HighestQ,
             (None, Choice::Insist(_)) => Basis::Given,
         };
-        // The convention with the highest Q may be wrong, so that faults are sought in the matched one.
-        let convention = match choice {
-            Choice::Best => score.matching.convention(),
-            Choice::Matched | Choice::Insist(_) => score.chosen,
-        };
-        // If the convention was unknown, single images are compared with the truth in a second pass. Keeping all images
-        // of a set would need gigabytes.
-        if !added.compared && self.paths.len() > 1 {
-            let compared = Some((scorer, convention));
-            added.odd_images = self.add_up(&score.grid, compared)?.odd_images;
-        }
-        let findings = scorer.diagnose(&added.images, &score, convention);
         let (set, images) = (self.set.unwrap_or(PLAIN_SET), self.images.clone());
         let known = basis.is_certain();
-        let record = SetRecord::new(set, self.simulated, images, &score, &added.rows, known);
+        let record = SetRecord::new(set, self.simulated, images, &score, &rows, known);
         Ok(ScoredSet {
             record,
-            findings: findings.map_err(self.wrong())?,
+            findings,
             score,
-            rows: added.rows,
+            rows,
             basis,
             sign: None,
-            odd_images: added.odd_images,
+            odd_images,
+            names: self.names(),
         })
     }
 }
@@ -267,11 +210,13 @@ pub fn score_files(
     } = read_truth(truth, reading)?;
     let pool = Pool::new(threads)?;
     let files = SetFiles::new(catalogues, PLAIN_SET, false, &pool)?;
-    let added = files.add_up(&grid, None)?;
+    let wrong = files.wrong();
     let sign = match sign {
         Some(sign) => sign,
         None => {
-            let found = sign_by_correlation(&shear, added.images.total()).map_err(files.wrong())?;
+            let session = SetSession::new(grid, None, options).map_err(&wrong)?;
+            let added = files.add_up(&session)?;
+            let found = sign_by_correlation(&shear, added.images().total()).map_err(&wrong)?;
             let sign = Sign::of_catalogues(found).map_err(|fault| FileError::new(truth, fault))?;
             if sign.of == TruthSign::Challenge {
                 shear = shear.flipped();
@@ -279,8 +224,8 @@ pub fn score_files(
             sign
         }
     };
-    let scorer = SetScorer::new(grid, shear, options).map_err(files.wrong())?;
-    let scored = files.score(&scorer, added, options.choice, None)?;
+    let session = SetSession::new(grid, Some(shear), options).map_err(&wrong)?;
+    let scored = files.score(&session, options.choice, None)?;
     Ok(ScoredSet {
         sign: Some(sign),
         ..scored
@@ -333,10 +278,9 @@ fn score_sets(
     let frames = sets.iter().map(|&set| catalogues.frame(set));
     let frames: Vec<Frame> = frames.collect::<Result<_, _>>()?;
     let files = |set| SetFiles::new(catalogues, set, kind_of(data, set).is_some(), pool);
-    let scorer = |files: &SetFiles<'_>, set: u32, options| -> Result<_, ScoreError> {
+    let session = |files: &SetFiles<'_>, set: u32, options| -> Result<_, ScoreError> {
         let ReadTruth { grid, shear, .. } = read_truth(&data.truth(set), &reading_of(data, set)?)?;
-        let scorer = SetScorer::new(grid, shear, options).map_err(files.wrong())?;
-        Ok((grid, scorer))
+        SetSession::new(grid, Some(shear), options).map_err(files.wrong())
     };
     let mut options = Options { choice, ..options };
     let mut matched = None;
@@ -344,9 +288,14 @@ fn score_sets(
         let mut all = ConventionMatch::default();
         for &set in sets {
             let files = files(set)?;
-            let (grid, scorer) = scorer(&files, set, Options::default())?;
-            let images = files.add_up(&grid, None)?.images;
-            all.merge(&scorer.match_convention(&images).map_err(files.wrong())?);
+            // Only summed in this pass, whose convention does not matter.
+            let summing = Options {
+                choice: OWN,
+                ..Options::default()
+            };
+            let session = session(&files, set, summing)?;
+            let added = files.add_up(&session)?;
+            all.merge(&added.match_convention().map_err(files.wrong())?);
         }
         // One convention for all sets: noisy sets would choose others by chance.
         matched = Some(all);
@@ -355,13 +304,8 @@ fn score_sets(
     let mut scored = Vec::new();
     for (&set, frame) in sets.iter().zip(frames) {
         let files = files(set)?;
-        let (grid, scorer) = scorer(&files, set, options)?;
-        let compared = match options.choice {
-            Choice::Insist(convention) => Some((&scorer, convention)),
-            Choice::Matched | Choice::Best => None,
-        };
-        let added = files.add_up(&grid, compared)?;
-        let mut one = files.score(&scorer, added, options.choice, matched)?;
+        let session = session(&files, set, options)?;
+        let mut one = files.score(&session, options.choice, matched)?;
         one.record.frame = frame;
         scored.push(one);
     }

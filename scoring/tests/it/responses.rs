@@ -2,7 +2,7 @@
 use ndarray::Array2;
 use shearq_fourier::Complex64;
 use shearq_scoring::{
-    Convention, FieldSum, Grid, ImageFaults, OddResponse, Options, SetScorer, TrueShear,
+    Choice, Convention, FieldSum, Grid, OddResponse, Options, SetScorer, SetSession, TrueShear,
 };
 
 use crate::common::{Content, Normal, field, rows, sum_of, truth};
@@ -21,15 +21,17 @@ fn noisy(shear: &Array2<Complex64>, count: usize, noise: f64, seed: u64) -> Vec<
 }
 
 fn odd(truth: TrueShear, images: &[Array2<Complex64>]) -> Vec<OddResponse> {
-    let grid = grid();
-    let scorer = SetScorer::new(grid, truth, Options::default()).unwrap();
-    let mut faults = ImageFaults::default();
+    let options = Options {
+        choice: Choice::Insist(Convention::STANDARD),
+        ..Options::default()
+    };
+    let session = SetSession::new(grid(), Some(truth), options).unwrap();
+    let mut added = session.begin();
     for image in images {
-        let (sum, _) = sum_of(&grid, &rows(&grid, image));
-        faults.add(&sum);
-        faults.add_response(scorer.response(&sum, Convention::STANDARD));
+        let (sum, counts) = sum_of(&grid(), &rows(&grid(), image));
+        added.add(&session.examine(sum, counts).unwrap()).unwrap();
     }
-    faults.odd()
+    added.odd(Convention::STANDARD).responses
 }
 
 /// The cells in another order.

@@ -17,7 +17,7 @@ use shearq_render::table::{Cell, Table};
 use shearq_results::catalogues::OWN;
 use shearq_results::record::SetRecord;
 use shearq_results::views::pages::{bins, spectrum_panel};
-use shearq_scoring::{BINS, FieldSum, Metrics, Options, Row, RowCounts, SetImages, SetScorer};
+use shearq_scoring::{BINS, FieldSum, Metrics, Options, Row, ScoredImages, SetSession};
 use shearq_simulate::kinds::{SetKind, shares};
 use shearq_simulate::set::{STAMP, SimulationSettings};
 use shearq_submissions::{Configuration, PsfForm, Published};
@@ -120,7 +120,12 @@ fn score_set(
     let grid = simulator.grid();
     let mosaic = Mosaic::square(grid.n, STAMP);
     let images: Vec<u32> = (1..=plan.images).collect();
-    let mut sums = vec![(SetImages::new(&grid), RowCounts::default()); measurers.len()];
+    let options = Options {
+        choice: OWN,
+        ..Options::default()
+    };
+    let session = SetSession::new(grid, Some(simulator.truth()), options).map_err(scoring)?;
+    let mut sums = vec![session.begin(); measurers.len()];
     run_set(
         &simulator,
         &images,
@@ -128,11 +133,11 @@ fn score_set(
         threads,
         progress,
         |image, _| {
-            for ((fields, rows), batch) in sums.iter_mut().zip(image.batches) {
+            for (added, batch) in sums.iter_mut().zip(image.batches) {
                 let mut field = FieldSum::new(&grid);
                 let galaxies = batch.galaxies.iter().enumerate();
                 // Ellipticities of flagged galaxies are NaN, which counts as missing. Networks have no response to divide by.
-                *rows += field.add_image(
+                let rows = field.add_image(
                     &grid,
                     galaxies.map(|(place, galaxy)| {
                         let (x, y) = mosaic.position(place);
@@ -140,16 +145,12 @@ fn score_set(
                         Row { x, y, e1, e2 }
                     }),
                 );
-                fields.add(&field).map_err(scoring)?;
+                let examined = session.examine(field, rows).map_err(scoring)?;
+                added.add(&examined).map_err(scoring)?;
             }
             Ok(())
         },
     )?;
-    let options = Options {
-        choice: OWN,
-        ..Options::default()
-    };
-    let scorer = SetScorer::new(grid, simulator.truth(), options).map_err(scoring)?;
     let mut scores = SetScores {
         set,
         images: plan.images,
@@ -157,13 +158,13 @@ fn score_set(
         true_ee: [0.0; BINS],
         results: Vec::new(),
     };
-    for (fields, rows) in &sums {
-        let score = scorer.score(fields).map_err(scoring)?;
+    for added in &sums {
+        let ScoredImages { score, rows, .. } = added.finish().map_err(scoring)?;
         (scores.l, scores.true_ee) = (score.bins.l, score.true_ee);
         scores.results.push(ConfigurationScore {
             configuration: String::new(),
             // The settings of the plan identify simulated data, so there is no fingerprint.
-            score: SetRecord::new(set, true, images.clone(), &score, rows, true),
+            score: SetRecord::new(set, true, images.clone(), &score, &rows, true),
             convention_matched: score.matching.best().number(),
             ee: score.spectra().ee,
             ee_error: score.ee_error,

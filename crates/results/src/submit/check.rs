@@ -4,8 +4,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use shearq_scoring::{
-    Bins, Convention, Definition, Fault, FieldSum, Grid, ImageFaults, Options, Row, RowCounts,
-    SCORED, SetImages, SetScorer, TrueShear,
+    AddedImages, Bins, Convention, Definition, ExaminedImage, Fault, FieldSum, Grid, Options, Row,
+    RowCounts, SCORED, ScoredImages, SetScorer, SetSession, TrueShear,
 };
 
 use super::{
@@ -17,8 +17,8 @@ use shearq_catalogue::foreign::{ADVICE_ON_SENTINELS, fault_of_rows};
 use shearq_files::FileError;
 use shearq_files::table::most_rows;
 
-// Each catalogue is read as one image on the expected grid.
-const ONE_IMAGE: &str = "one image on the expected grid";
+// Catalogues and true shears are read onto this grid.
+const ON_GRID: &str = "one image on the expected grid";
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, serde::Serialize)]
 #[serde(rename_all = "lowercase")]
@@ -40,6 +40,8 @@ pub struct Finding {
 #[derive(Debug, Clone)]
 pub struct Expected {
     pub grid: Grid,
+    /// Definition of the bandpowers that sets are compared in.
+    pub definition: Definition,
     /// True shear by set, if known, to check conventions and type of ellipticity.
     pub truth: BTreeMap<u32, TrueShear>,
     /// True shear that findings must not reveal: only images that do not follow it as the others do are told, to `done`.
@@ -55,14 +57,28 @@ pub struct Expected {
 // 0.48 px of the challenge's stamps, so that 0-based positions, which are off by 1 px, are found.
 const POSITION_TOLERANCE: f64 = 0.01;
 
+/// A set of catalogues, which [`AddedImages::finish`] scores.
 #[derive(Debug)]
 pub struct CheckedSet<'a> {
     pub set: u32,
-    pub images: &'a SetImages,
+    pub images: &'a AddedImages<'a>,
+    /// Numbers of the images, in ascending order.
     pub numbers: &'a [u32],
-    pub rows: RowCounts,
-    /// Image numbers of those that follow the true shear differently from the others.
-    pub odd: Vec<u32>,
+}
+
+impl Expected {
+    fn session(&self, set: Option<u32>) -> SetSession {
+        let truth = set.and_then(|set| {
+            let open = self.truth.get(&set);
+            open.or_else(|| self.secret_truth.get(&set)).cloned()
+        });
+        let options = Options {
+            choice: OWN,
+            definition: self.definition,
+            ..Options::default()
+        };
+        SetSession::new(self.grid, truth, options).expect(ON_GRID)
+    }
 }
 
 impl Finding {
@@ -150,70 +166,66 @@ fn check_files(
     }
     let numbers = catalogues.values().flatten().map(|(image, _)| *image);
     let most = numbers.max().unwrap_or(0).max(expected.images.unwrap_or(0));
-    for (set, of_set) in catalogues {
-        let Some((mut files, odd)) = sum_set(set, of_set, expected, report) else {
+    for (set, mut of_set) in catalogues {
+        // In the order in which `score` adds them, whose groups of the jackknife depend on it.
+        of_set.sort_by_key(|(image, _)| *image);
+        let session = expected.session(Some(set));
+        let mut files = SetFiles::new(&session);
+        for (image, file) in of_set {
+            // An unreadable catalogue is reported, and the others of its set are checked without it.
+            if let Some(examined) = check_catalogue(file, &session, report) {
+                files.add(&examined, image, file);
+            }
+        }
+        if files.paths.is_empty() {
             continue;
-        };
-        check_images(set, &mut files, most, path, expected, report);
+        }
+        check_each(set, &files, expected, report);
+        check_images(set, &files, most, path, expected, report);
         check_against_truth(set, &files, expected, report);
         done(CheckedSet {
             set,
             images: &files.images,
             numbers: &files.numbers,
-            rows: files.rows,
-            odd,
         });
     }
 }
 
-// The readable catalogues of a set, with the numbers of the images that follow the truth differently.
-fn sum_set(
-    set: u32,
-    of_set: Vec<(u32, &PathBuf)>,
-    expected: &Expected,
-    report: &mut Report,
-) -> Option<(SummedSet, Vec<u32>)> {
-    let mut files: Option<SummedSet> = None;
-    for (image, file) in of_set {
-        // An unreadable catalogue is reported, and the others of its set are checked without it.
-        let Some((sum, counts)) = check_catalogue(file, expected, report) else {
-            continue;
-        };
-        let files = files.get_or_insert_with(|| SummedSet::new(expected, set));
-        files.add(&sum, counts, image, file);
-    }
-    let files = files?;
-    for (copy, first) in &files.faults.copies {
+// Compares the images of a set with each other.
+fn check_each(set: u32, files: &SetFiles<'_>, expected: &Expected, report: &mut Report) {
+    let odd = files.images.odd(Convention::STANDARD);
+    for (copy, first) in odd.copies {
         let message = format!(
             "the ellipticities are copies of {}; expected an independent measurement per image",
-            name_of(&files.paths[*first])
+            name_of(&files.paths[first])
         );
-        report.error(&files.paths[*copy], "copies", message);
+        report.error(&files.paths[copy], "copies", message);
     }
-    let odd = files.faults.odd();
-    // Of a secret truth, only `done` gets the numbers of such images: their response is the correlation with it.
+    // The response to a secret truth is the correlation with it.
     if expected.truth.contains_key(&set) {
-        for odd in &odd {
-            let message = format!("set {set}: the image {}", odd_response(odd));
+        for odd in odd.responses {
+            let message = format!("set {set}: the image {}", odd_response(&odd));
             report.error(&files.paths[odd.place], "image", message);
         }
     }
-    let odd = odd.iter().map(|odd| files.numbers[odd.place]).collect();
-    Some((files, odd))
 }
 
 // Checks a catalogue whose name contains no set. A `single` file belongs to the only set.
 fn check_unnamed(file: &Path, single: bool, expected: &Expected, report: &mut Report) {
-    let Some((sum, counts)) = check_catalogue(file, expected, report) else {
+    let sets: Vec<u32> = expected.truth.keys().copied().collect();
+    let set = match sets[..] {
+        [set] if single => Some(set),
+        _ => None,
+    };
+    let session = expected.session(set);
+    let Some(examined) = check_catalogue(file, &session, report) else {
         return;
     };
-    if single && expected.truth.len() == 1 {
-        for set in expected.truth.keys() {
-            let mut entry = SummedSet::new(expected, *set);
-            entry.add(&sum, counts, 1, file);
-            check_against_truth(*set, &entry, expected, report);
-        }
-    } else if !expected.truth.is_empty() {
+    if let Some(set) = set {
+        let mut entry = SetFiles::new(&session);
+        entry.add(&examined, 1, file);
+        check_against_truth(set, &entry, expected, report);
+    } else if !sets.is_empty() {
         let message = "not compared with the true shear, because the name contains no set number";
         report.warn(file, "truth", message.into());
     }
@@ -250,41 +262,24 @@ fn check_sets(path: &Path, found: &BTreeSet<u32>, expected: &Expected, report: &
     }
 }
 
-struct SummedSet {
-    scorer: Option<SetScorer>,
-    images: SetImages,
-    faults: ImageFaults,
+// The readable catalogues of a set.
+struct SetFiles<'s> {
+    images: AddedImages<'s>,
     paths: Vec<PathBuf>,
     numbers: Vec<u32>,
-    rows: RowCounts,
 }
 
-impl SummedSet {
-    fn new(expected: &Expected, set: u32) -> Self {
-        let open = expected.truth.get(&set);
-        let truth = open.or_else(|| expected.secret_truth.get(&set));
-        let options = Options {
-            choice: OWN,
-            ..Options::default()
-        };
-        let scorer = |truth: &TrueShear| SetScorer::new(expected.grid, truth.clone(), options).ok();
-        SummedSet {
-            scorer: truth.and_then(scorer),
-            images: SetImages::new(&expected.grid),
-            faults: ImageFaults::default(),
+impl<'s> SetFiles<'s> {
+    fn new(session: &'s SetSession) -> Self {
+        SetFiles {
+            images: session.begin(),
             paths: Vec::new(),
             numbers: Vec::new(),
-            rows: RowCounts::default(),
         }
     }
 
-    fn add(&mut self, sum: &FieldSum, rows: RowCounts, image: u32, file: &Path) {
-        self.rows += rows;
-        self.faults.add(sum);
-        let scorer = self.scorer.as_ref();
-        let response = scorer.and_then(|scorer| scorer.response(sum, Convention::STANDARD));
-        self.faults.add_response(response);
-        self.images.add(sum).expect(ONE_IMAGE);
+    fn add(&mut self, examined: &ExaminedImage, image: u32, file: &Path) {
+        self.images.add(examined).expect(ON_GRID);
         self.numbers.push(image);
         self.paths.push(file.to_owned());
     }
@@ -348,21 +343,20 @@ fn looks_like_spectrum(path: &Path) -> bool {
     read_spectrum(path).is_ok_and(|lines| !lines.is_empty() && lines.len() <= MAX_SPECTRUM_LINES)
 }
 
-// Checks the rows of a catalogue. Returns their sum on the grid and how they were used, or `None` if the file is not
-// readable.
+// Checks the rows of a catalogue. `None` if the file is not readable.
 fn check_catalogue(
     path: &Path,
-    expected: &Expected,
+    session: &SetSession,
     report: &mut Report,
-) -> Option<(FieldSum, RowCounts)> {
-    let rows = match read_rows(path, most_rows(expected.grid.cells())) {
+) -> Option<ExaminedImage> {
+    let grid = session.grid();
+    let rows = match read_rows(path, most_rows(grid.cells())) {
         Ok(rows) => rows,
         Err(error) => {
             report.error(path, "readable", error.message);
             return None;
         }
     };
-    let grid = &expected.grid;
     let mut sum = FieldSum::new(grid);
     let counts = sum.add_image(grid, rows.iter().copied());
     if let Some(fault) = fault_of_rows(&counts, grid, ADVICE_ON_SENTINELS) {
@@ -373,9 +367,8 @@ fn check_catalogue(
             report.add(path, severity, check, message);
         }
     }
-    let mut faults = ImageFaults::default();
-    faults.add(&sum);
-    if let Some((_, found)) = faults.repeated.first() {
+    let examined = session.examine(sum, counts).expect(ON_GRID);
+    if let Some(found) = examined.repeated() {
         // Such galaxies are as good as missing, and are limited like these.
         let severity = more_than(found.rows, 10, found.of);
         let message = format!(
@@ -384,7 +377,7 @@ fn check_catalogue(
         );
         report.add(path, severity, "constant", message);
     }
-    Some((sum, counts))
+    Some(examined)
 }
 
 // Severity of a fault of `count` galaxies of `of`. Chosen by hand: a few galaxies fail in any measurement.
@@ -494,13 +487,12 @@ fn name_of(path: &Path) -> String {
 
 fn check_images(
     set: u32,
-    files: &mut SummedSet,
+    files: &SetFiles<'_>,
     last: u32,
     path: &Path,
     expected: &Expected,
     report: &mut Report,
 ) {
-    files.numbers.sort_unstable();
     let missing: Vec<String> = (1..=last)
         .filter(|image| files.numbers.binary_search(image).is_err())
         .map(|image| image.to_string())
@@ -527,39 +519,22 @@ fn check_images(
     }
 }
 
-fn check_against_truth(set: u32, files: &SummedSet, expected: &Expected, report: &mut Report) {
-    let SummedSet {
-        scorer: Some(scorer),
-        images,
-        faults,
-        paths,
-        ..
-    } = files
-    else {
-        return;
-    };
-    let Some(path) = paths.first() else {
+fn check_against_truth(set: u32, files: &SetFiles<'_>, expected: &Expected, report: &mut Report) {
+    let Some(path) = files.paths.first() else {
         return;
     };
     // Without galaxies each catalogue has its finding already.
-    let absent = images.total().count.iter().all(|count| *count == 0.0);
-    if absent || !expected.truth.contains_key(&set) {
+    if files.images.rows().used == 0 || !expected.truth.contains_key(&set) {
         return;
     }
     let before = report.findings.len();
-    let Ok(score) = scorer.score(images) else {
+    let Ok(ScoredImages {
+        score, findings, ..
+    }) = files.images.finish()
+    else {
         return;
     };
-    // Copies appear to have no noise, and repeated ellipticities no response. Both are reported already.
-    let explained = |fault: &Fault| match fault {
-        Fault::Uncorrelated { .. } => !faults.copies.is_empty(),
-        Fault::Biased { .. } => faults.repeated.iter().any(|(_, found)| found.is_constant()),
-        _ => false,
-    };
-    let Ok(found) = scorer.diagnose(images, &score, Convention::STANDARD) else {
-        return;
-    };
-    for finding in found.into_iter().filter(|fault| !explained(fault)) {
+    for finding in findings {
         let (check, severity) = match finding {
             Fault::StrongTruth { .. } => ("truth", Severity::Warning),
             Fault::Convention { .. } | Fault::Swapped { .. } => ("convention", Severity::Error),

@@ -10,11 +10,11 @@ use flate2::{Compression, GzBuilder};
 use shearq_quantities::units::Degrees;
 use shearq_scoring::{
     Convention, ConventionMatch, FieldSum, Grid, Options, Row, SCORED, ScoringError, SetImages,
-    SetScorer, SpectrumCovariance, cross_spectrum, measured_bandpowers,
+    SetSession, SpectrumCovariance, cross_spectrum, measured_bandpowers,
 };
 
 use super::{Contents, Entry, FileSum, Kind, MANIFEST_FILE, MAX_FILES, Manifest, is_archive};
-use crate::catalogues::Catalogues;
+use crate::catalogues::{Catalogues, OWN};
 use shearq_catalogue::foreign::Foreign;
 use shearq_dataset::layout::DataFolder;
 use shearq_dataset::run::record_text;
@@ -62,21 +62,16 @@ impl Packing<'_> {
         Ok(((1 + all.count()) * rows) as u64)
     }
 
-    // How well each convention agrees with the true shear of a set, for another program's catalogues if the truth is
-    // known.
-    fn matching(
-        &self,
-        set: u32,
-        images: &SetImages,
-        grid: &Grid,
-    ) -> Result<ConventionMatch, FileError> {
-        let Some(data) = self.data.filter(|data| is_there(&data.truth(set))) else {
-            return Ok(ConventionMatch::default());
+    // With the true shear, for another program's catalogues if it is known.
+    fn session(&self, set: u32, grid: Grid) -> Result<SetSession, FileError> {
+        let data = self.data.filter(|data| is_there(&data.truth(set)));
+        let truth = data.map(|data| data.read_truth(set, &grid)).transpose()?;
+        let options = Options {
+            choice: OWN,
+            ..Options::default()
         };
-        let truth = data.read_truth(set, grid)?;
-        SetScorer::new(*grid, truth, Options::default())
-            .and_then(|scorer| scorer.match_convention(images))
-            .map_err(|error| FileError::new(data.truth(set), error))
+        SetSession::new(grid, truth, options)
+            .map_err(|error| FileError::new(&self.catalogues.path, error))
     }
 
     fn grid(&self, set: u32, catalogue: &Path) -> Result<Grid, FileError> {
@@ -177,26 +172,30 @@ impl Packing<'_> {
     ) -> Result<(String, Option<SpectrumCovariance>), FileError> {
         let first = &catalogues[0].1;
         let grid = self.grid(set, first)?;
-        let mut images = SetImages::new(&grid);
+        let session = self.session(set, grid)?;
+        let mut images = session.begin();
         let response = self.catalogues.response(set)?;
-        let mut used = 0;
         for (_, path) in catalogues {
             let mut sum = FieldSum::new(&grid);
             let rows = self
                 .catalogues
                 .rows(path, response, most_rows(grid.cells()))?;
             progress.advance(rows.len() as u64);
-            used += sum.add_image(&grid, rows).used;
-            images
-                .add(&sum)
+            let counts = sum.add_image(&grid, rows);
+            session
+                .examine(sum, counts)
+                .and_then(|image| images.add(&image))
                 .map_err(|error| FileError::new(path, error))?;
         }
-        if used == 0 {
+        if images.rows().used == 0 {
             let message = "no catalogue of the set has an ellipticity on the grid";
             return Err(FileError::new(first, message));
         }
-        matching.merge(&self.matching(set, &images, &grid)?);
-        spectrum_text(&grid, &images, self.contents).map_err(|error| FileError::new(first, error))
+        let wrong = |error| FileError::new(first, error);
+        if session.scorer().is_some() {
+            matching.merge(&images.match_convention().map_err(wrong)?);
+        }
+        spectrum_text(&grid, images.images(), self.contents).map_err(wrong)
     }
 }
 

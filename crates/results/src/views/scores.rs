@@ -1,19 +1,18 @@
 //! Scores as tables, as JSON and as warnings about probable faults of catalogues and of the true shear.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::PathBuf;
 
 use serde_json::{Value, json};
 use shearq_dataset::truth::Sign;
 use shearq_quantities::Frame;
 use shearq_render::table::{Cell, Table};
 use shearq_scoring::{
-    BINS, Bias, BiasFits, ConventionClass, ConventionScore, Definition, Fault, ImageFaults,
-    Metrics, OddResponse, Repeated, RowCounts, SetScore,
+    BINS, Bias, BiasFits, ConventionClass, ConventionScore, Definition, Fault, Metrics, OddImages,
+    OddResponse, Repeated, RowCounts, SetScore,
 };
 
 use crate::record::{FRAME, SetRecord, columns_named, mean};
-use crate::score::{Basis, OddImages, ScoredSet};
+use crate::score::{Basis, ScoredSet};
 use crate::views::pages::bins;
 
 fn kind_cell(record: &SetRecord) -> Cell {
@@ -75,7 +74,8 @@ pub fn notes(scored: &[ScoredSet]) -> Vec<String> {
     lines.extend(signs);
     for own in scored {
         let (set, score) = (own.number(), &own.score);
-        let odd = odd_images(&own.odd_images).into_iter();
+        let name_of = |place: usize| own.names[place].display().to_string();
+        let odd = odd_images(&own.odd_images, &name_of).into_iter();
         lines.extend(odd.map(|odd| format!("{}{odd}.", prefix(set))));
         let name = set.map_or_else(|| "this set".to_owned(), |set| format!("set {set}"));
         if let Some(mean) = &score.constant {
@@ -105,9 +105,8 @@ pub fn notes(scored: &[ScoredSet]) -> Vec<String> {
         }
         lines.extend(oddities(&own.rows, &name));
     }
-    lines.extend(of_sets(
-        scored.iter().map(|set| (set.number(), believable(set))),
-    ));
+    let findings = scored.iter().map(|set| (set.number(), &*set.findings));
+    lines.extend(of_sets(findings));
     lines.extend(zero_shear_note(scored));
     let blank = |set: &&ScoredSet| {
         set.score.constant.is_none() && set.rows.used > 0 && set.score.metrics.q_calibrated.is_nan()
@@ -144,17 +143,6 @@ fn zero_shear_line(zero: f64, own: f64) -> Option<String> {
     };
     zero.is_finite()
         .then(|| format!("note: without any image, zero shear has Q = {zero:.2}{verdict}."))
-}
-
-// Findings of a set that odd images do not explain. Copies appear to have no noise, and repeated ellipticities no
-// response.
-fn believable(set: &ScoredSet) -> &[Fault] {
-    let odd = &set.odd_images;
-    match set.findings.as_slice() {
-        [Fault::Uncorrelated { .. }] if !odd.copies.is_empty() => &[],
-        [Fault::Biased { .. }] if odd.repeated.iter().any(|(_, found)| found.is_constant()) => &[],
-        all => all,
-    }
 }
 
 fn set_cell(record: &SetRecord) -> Cell {
@@ -436,42 +424,40 @@ pub fn words(finding: &Fault) -> String {
     }
 }
 
-/// Faults of arrays of images, one sentence each; images count from 1.
-pub fn odd_arrays(faults: &ImageFaults) -> Vec<String> {
-    let name = |place: usize| PathBuf::from(format!("image {}", place + 1));
-    let images: Vec<PathBuf> = (0..faults.images()).map(name).collect();
-    odd_images(&OddImages::new(faults, &images))
-}
-
-pub fn odd_images(odd: &OddImages) -> Vec<String> {
+/// Faults of single images, one sentence each.
+pub fn odd_images(odd: &OddImages, name: &dyn Fn(usize) -> String) -> Vec<String> {
     let mut lines = Vec::new();
     let more = |count: usize| match count {
         1 => String::new(),
         2 => ", and 1 more likewise".to_owned(),
         _ => format!(", and {} more likewise", count - 1),
     };
-    if let Some((copy, first)) = odd.copies.first() {
+    if let Some(&(copy, first)) = odd.copies.first() {
         lines.push(format!(
             "{} has the ellipticities of {}{}; expected an independent measurement per image. Noise, Q_dn and errors are wrong",
-            copy.display(),
-            first.display(),
+            name(copy),
+            name(first),
             more(odd.copies.len())
         ));
     }
-    if let Some((path, found)) = odd.repeated.first() {
+    if let Some((place, found)) = odd.repeated.first() {
         lines.push(format!(
             "{}: {}{}; expected measured values, which do not repeat. Check the column names, and leave out galaxies that were not measured",
-            path.display(),
+            name(*place),
             repeated_shapes(found),
             more(odd.repeated.len())
         ));
     }
-    for (path, response) in odd.responses.iter().take(MAX_NAMED) {
-        lines.push(format!("{} {}", path.display(), odd_response(response)));
+    for response in odd.responses.iter().take(MAX_NAMED) {
+        lines.push(format!(
+            "{} {}",
+            name(response.place),
+            odd_response(response)
+        ));
     }
     if let Some(left) = odd.responses.len().checked_sub(MAX_NAMED + 1) {
-        let names = odd.responses[MAX_NAMED..].iter().map(|(path, _)| path);
-        let names: Vec<String> = names.map(|path| path.display().to_string()).collect();
+        let others = odd.responses[MAX_NAMED..].iter();
+        let names: Vec<String> = others.map(|own| name(own.place)).collect();
         lines.push(format!(
             "{} more images likewise: {}",
             left + 1,
