@@ -6,12 +6,12 @@ use shearq_quantities::units::{Degrees, Pixels};
 use shearq_scoring::{Definition, Grid};
 
 use crate::{Findings, count, print, tell_unread};
+use shearq_challenges::PublicChallenge;
 use shearq_dataset::grid;
 use shearq_dataset::layout::{DataFolder, Layout, MAX_IMAGE};
 use shearq_dataset::truth::grid_of_set;
 use shearq_files::table::{MAX_ROWS, read_truth};
 use shearq_results::catalogues::read_rows;
-use shearq_results::published::PublicChallenge;
 use shearq_results::submit::check::{Expected, Finding, Severity, check_sent};
 use shearq_results::submit::{Kind, Sent};
 

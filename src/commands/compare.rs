@@ -5,12 +5,12 @@ use clap::Args;
 use crate::arguments::{Printing, ReportFile, ScoreSettings, Threads};
 use crate::{score, tell};
 use shearq_catalogue::expression::Expression;
+use shearq_challenges::{PublicBranch, PublicChallenge, Score, Truth, ranking};
 use shearq_dataset::run::Run;
 use shearq_dataset::threads::Pool;
 use shearq_render::figure::{Figure, LinePlot};
 use shearq_render::table::Table;
 use shearq_results::compare::{Order, choose, chosen, score_all};
-use shearq_results::published::{PublicBranch, PublicChallenge, Score, Truth, ranking};
 use shearq_results::store;
 use shearq_results::submit::is_packed;
 use shearq_results::views::comparison::{
@@ -18,7 +18,6 @@ use shearq_results::views::comparison::{
 };
 use shearq_results::views::pages;
 use shearq_scoring::Options;
-use shearq_scoring::great3::SUBFIELDS;
 
 /// Compare the metrics of several configurations.
 ///
@@ -171,9 +170,11 @@ fn leaderboard(
         own.push((name, score));
     }
     let mut table = ranking(branch, &own);
-    if let Some(subfields) = truth.and_then(|truth| truth.subfields) {
+    if let (Some(subfields), Some(published)) =
+        (truth.and_then(|truth| truth.subfields), branch.subfields())
+    {
         table.notes.push(format!(
-            "Your submissions have {subfields} subfields, the published ones {SUBFIELDS}: Q of fewer is noisier, and usually lower."
+            "Your submissions have {subfields} subfields, the published ones {published}: Q of fewer is noisier, and usually lower."
         ));
     }
     Ok(table)

@@ -8,14 +8,13 @@ use shearq_submissions::check_name;
 use crate::arguments::named;
 use crate::progress::Bar;
 use crate::{count, tell, tell_unread};
+use shearq_challenges::{BranchCatalogues, Presubmitting, PublicBranch, PublicChallenge};
 use shearq_dataset::fingerprint;
 use shearq_dataset::run::{Run, open_data};
 use shearq_dataset::threads::{ALL_CORES, Pool};
 use shearq_results::catalogues::Catalogues;
-use shearq_results::published::{BranchCatalogues, Presubmitting, PublicBranch, PublicChallenge};
 use shearq_results::submit::pack::Packing;
 use shearq_results::submit::{Contents, Entry, is_archive};
-use shearq_scoring::great3::{GRID, SUBFIELDS};
 
 // Longest name of a method in bytes: a tar header has 100 for a file name.
 const MAX_METHOD_BYTES: usize = 64;
@@ -151,8 +150,8 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
                 Some(folder) => BranchCatalogues::Measured(folder),
                 None => BranchCatalogues::Files(&arguments.catalogues),
             },
-            subfields: arguments.subfields.map_or(SUBFIELDS, usize::from),
-            grid: arguments.grid.map_or(GRID, usize::from),
+            subfields: arguments.subfields.map(usize::from),
+            grid: arguments.grid.map(usize::from),
             whole_galaxies: arguments.whole_galaxies,
         };
         let branch = PublicChallenge::named(challenge)?.branch(Some(branch))?;

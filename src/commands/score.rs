@@ -12,6 +12,7 @@ use crate::arguments::{
 };
 use crate::{print, tell, tell_unread};
 use shearq_catalogue::foreign::Foreign;
+use shearq_challenges::{PublicChallenge, Truth};
 use shearq_dataset::layout::DataFolder;
 use shearq_dataset::run::{Run, Source, kind_of};
 use shearq_dataset::threads::Pool;
@@ -20,7 +21,6 @@ use shearq_files::atomic::folder_of;
 use shearq_render::table::TableFormat;
 use shearq_results::aperture;
 use shearq_results::catalogues::{COLUMNS, Catalogues};
-use shearq_results::published::{PublicChallenge, Truth};
 use shearq_results::record::{RunRecord, SetRecord};
 use shearq_results::score::{ScoredSet, score_catalogues, score_files, unscored};
 use shearq_results::store;

@@ -1,17 +1,17 @@
 use std::path::PathBuf;
 
+use clap::builder::PossibleValuesParser;
 use clap::{ArgGroup, Args};
+use shearq_challenges::{CHALLENGES, PublicChallenge, Simulated, Simulation};
 
 use crate::arguments::{SetList, Sharding, SimulationArguments, Threads};
 use crate::progress::{Bar, mark_resumable};
 use crate::tell;
-use shearq_dataset::fingerprint;
 use shearq_dataset::images;
 use shearq_dataset::layout::{DataFolder, MAX_IMAGE};
 use shearq_dataset::run::SimulationRecord;
-use shearq_pipeline::simulate::{great3, simulate_folder};
-use shearq_scoring::great3::{Branch, GRID, SUBFIELDS};
-use shearq_simulate::great3::{BranchSimulator, simulated_branches};
+use shearq_dataset::threads::Progress;
+use shearq_pipeline::simulate::simulate_folder;
 use shearq_simulate::set::SimulationSettings;
 
 /// Write simulated GREAT10-like sets: images, PSFs, true shear and intrinsic shapes.
@@ -50,11 +50,11 @@ pub(crate) struct Arguments {
     #[arg(long, requires = "constant_shear", conflicts_with_all = ["amplitude", "tilt"])]
     rotated: bool,
     /// Simulate a branch of this challenge: great3.
-    #[arg(long, value_parser = ["great3"], requires = "branch", conflicts_with_all = GREAT10_ONLY)]
+    #[arg(long, value_parser = simulated(), requires = "branch", conflicts_with_all = GREAT10_ONLY)]
     challenge: Option<String>,
     /// Branch: control or multiepoch, ground or space, constant or variable, such as control-ground-constant.
     #[arg(long, value_name = "NAME", requires = "challenge", conflicts_with_all = GREAT10_ONLY, value_parser = branch)]
-    branch: Option<Branch>,
+    branch: Option<String>,
     /// Subfields of the branch [default: 200].
     #[arg(long, value_name = "N", requires = "branch", conflicts_with_all = GREAT10_ONLY, value_parser = clap::value_parser!(u16).range(1..=1000))]
     subfields: Option<u16>,
@@ -82,12 +82,23 @@ const GREAT10_ONLY: [&str; 7] = [
     "shard",
 ];
 
-fn branch(name: &str) -> Result<Branch, String> {
-    let found = simulated_branches().find(|branch| branch.to_string() == name);
-    found.ok_or_else(|| {
-        let names: Vec<String> = simulated_branches().map(|own| own.to_string()).collect();
-        format!("expected one of {}", names.join(", "))
-    })
+// Names of the challenges of which branches can be simulated.
+fn simulated() -> PossibleValuesParser {
+    let simulated = CHALLENGES
+        .iter()
+        .filter(|own| !(own.simulated)().is_empty());
+    PossibleValuesParser::new(simulated.map(|own| own.name))
+}
+
+fn branch(name: &str) -> Result<String, String> {
+    let names: Vec<String> = CHALLENGES
+        .iter()
+        .flat_map(|own| (own.simulated)())
+        .collect();
+    match names.iter().any(|own| own == name) {
+        true => Ok(name.to_owned()),
+        false => Err(format!("expected one of {}", names.join(", "))),
+    }
 }
 
 fn parse_shear(text: &str) -> Result<[f64; 2], String> {
@@ -136,59 +147,44 @@ fn versions(arguments: &Arguments) -> anyhow::Result<Vec<(SimulationSettings, Pa
     })
 }
 
-fn run_branch(arguments: &Arguments, branch: Branch) -> anyhow::Result<()> {
+fn run_branch(arguments: &Arguments, challenge: &str, branch: &str) -> anyhow::Result<()> {
     let settings = arguments.simulation.settings()?;
-    anyhow::ensure!(
-        settings.grid <= GRID,
-        "--grid: found {}, expected at most {GRID} for a branch of GREAT3",
-        settings.grid
-    );
-    let fits = match &arguments.galaxies {
-        Some(path) => great3::read_fits(path)?,
-        None => Vec::new(),
+    let simulation = Simulation {
+        seed: settings.seed,
+        grid: settings.grid,
+        subfields: arguments.subfields.map(usize::from),
+        galaxies: arguments.galaxies.as_deref(),
+        opposite: arguments.opposite,
+        out: &arguments.out,
     };
-    let print = arguments.galaxies.as_deref().map(fingerprint::of_file);
-    let print = print.transpose()?;
-    let mut simulator = BranchSimulator::new(branch, settings.seed, settings.grid, fits)?;
-    let subfields = arguments.subfields.map_or(SUBFIELDS, usize::from);
-    let mut folders = vec![(arguments.out.clone(), false)];
-    if arguments.opposite {
-        folders.push((arguments.out.join("opposite"), true));
-    }
-    let images = folders.len() * subfields * branch.epochs();
-    let mut bar = Bar::new(
-        "simulating",
-        (images * settings.grid * settings.grid) as u64,
-    );
     let threads = arguments.threads.number();
-    let mut made = 0;
-    for (out, opposite) in folders {
-        simulator.opposite = opposite;
-        let record = great3::Record {
-            version: shearq_dataset::VERSION.into(),
-            branch: branch.folder(),
-            seed: settings.seed,
-            grid: settings.grid,
-            opposite,
-            galaxies: print.clone(),
-        };
-        made += great3::simulate_branch(&simulator, &record, subfields, &out, threads, &mut bar)?;
-    }
-    drop(bar);
+    let start = |galaxies: u64| -> Box<dyn Progress> { Box::new(Bar::new("simulating", galaxies)) };
+    let branch = PublicChallenge::named(challenge)?.branch(Some(branch))?;
+    let Some(simulated) = branch.simulate(&simulation, threads, &start) else {
+        anyhow::bail!("{} cannot be simulated", branch.title());
+    };
+    let Simulated {
+        made,
+        images,
+        folder,
+        truth,
+    } = simulated?;
     tell(format_args!(
         "{made} images simulated, {} there already, in {}; truth in {}",
         images - made,
-        arguments.out.join(branch.folder()).display(),
-        great3::truth_folder(&arguments.out, branch).display()
+        folder.display(),
+        truth.display()
     ));
     Ok(())
 }
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     mark_resumable();
-    let (sets, images) = match (arguments.branch, &arguments.sets, arguments.images) {
-        (Some(branch), ..) => return run_branch(arguments, branch),
-        (None, Some(sets), Some(images)) => (sets, images),
+    if let (Some(challenge), Some(branch)) = (&arguments.challenge, &arguments.branch) {
+        return run_branch(arguments, challenge, branch);
+    }
+    let (sets, images) = match (&arguments.sets, arguments.images) {
+        (Some(sets), Some(images)) => (sets, images),
         _ => anyhow::bail!("expected --sets and --images, or --challenge and --branch"),
     };
     let images = images::of_simulation(&sets.simulated()?, images);

@@ -7,11 +7,11 @@ use std::path::Path;
 
 use flate2::read::GzDecoder;
 use serde_json::Value;
+use shearq_challenges::{CHALLENGES, PublicChallenge};
 use shearq_files::frames::polars::Column;
 use shearq_files::frames::{Metadata, frame};
 use shearq_files::table::{self, FileFormat};
 use shearq_quantities::Shear;
-use shearq_results::published::{CHALLENGES, PublicChallenge};
 use shearq_scoring::aperture::{Lattice, LatticeShear};
 use shearq_scoring::great3::Observation;
 

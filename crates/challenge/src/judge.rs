@@ -6,13 +6,13 @@ use std::path::{Path, PathBuf};
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
+use shearq_challenges::MIN_ENTRY_SLOPE_SIGNIFICANCE;
 use shearq_dataset::fingerprint;
 use shearq_dataset::layout::DataFolder;
 use shearq_dataset::run::{Source, kind_of};
 use shearq_dataset::threads::{Pool, Progress};
 use shearq_files::{FileError, names_of};
 use shearq_render::escape::line;
-use shearq_results::published::MIN_ENTRY_SLOPE_SIGNIFICANCE;
 use shearq_results::record::{RunRecord, SetRecord};
 use shearq_results::score::ScoreError;
 use shearq_results::store;

@@ -1,7 +1,5 @@
 //! Simulating sets into a data folder.
 
-pub mod great3;
-
 use std::io::{Read, Seek, SeekFrom};
 use std::path::Path;
 use std::sync::Arc;
@@ -145,7 +143,7 @@ fn feed<'s>(simulators: &'s [(SetSimulator, Vec<ImageId>)], feeder: &mut Feeder<
 }
 
 // An image that was cut off when a disk was full or a copy stopped has its name, but not its size.
-fn is_whole(path: &Path, side: usize) -> bool {
+pub fn is_whole(path: &Path, side: usize) -> bool {
     ImageReader::open(path).is_ok_and(|image| (image.width(), image.height()) == (side, side))
 }
 

@@ -9,7 +9,7 @@
 //! * [`compare`] chooses, sorts and compares records.
 //! * [`baseline`] compares metrics with stored metrics.
 //! * [`aperture`] estimates aperture masses.
-//! * [`submit`] packs and checks a submission to a challenge; [`published`] has those that others ran.
+//! * [`submit`] packs and checks a submission to a challenge.
 //! * [`views`] makes tables, plots and pages.
 #![forbid(unsafe_code)]
 
@@ -19,7 +19,6 @@ pub mod bias;
 pub mod catalogues;
 pub mod compare;
 pub mod mean;
-pub mod published;
 pub mod record;
 pub mod response;
 pub mod score;

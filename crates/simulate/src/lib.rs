@@ -1,21 +1,21 @@
-//! GREAT10-like sets and GREAT3-like branches, simulated.
+//! GREAT10-like sets, simulated.
 //!
 //! * [`kinds`]: what distinguishes the 24 sets (the paper's Table 2).
 //! * [`field`]: shear, intrinsic and PSF ellipticity fields as Gaussian random fields.
 //! * [`set`]: one set: its fields, and each galaxy from a random stream of its own.
-//! * [`great3`]: branches of a challenge like GREAT3.
 //! * [`galaxy`], [`render`]: profiles and their drawing; [`signal`]: the light that S/N counts.
 //!
 //! What GREAT10 did not publish is chosen here and documented at each choice.
 
 pub mod field;
 pub mod galaxy;
-pub mod great3;
 pub mod kinds;
 mod noise;
 pub mod render;
 pub mod set;
 pub mod signal;
+
+pub use noise::add_noise;
 
 /// The examples of README.md.
 #[cfg(doctest)]

@@ -17,7 +17,7 @@ const BLOCKS: usize = 8;
 ///
 /// The noise depends on the state of `rng` and the number of values only. No number exceeds 6.7 standard deviations,
 /// which Gaussian noise does once in 4·10¹⁰ numbers.
-pub(crate) fn add_noise(rng: &mut impl Rng, scale: f32, sigma: f32, values: &mut [f32]) {
+pub fn add_noise(rng: &mut impl Rng, scale: f32, sigma: f32, values: &mut [f32]) {
     const WORD: usize = size_of::<u32>();
     let mut bytes = [0; WORD * BLOCK * BLOCKS];
     let mut words = [0; BLOCK * BLOCKS];

@@ -36,7 +36,7 @@ pub const NOISE_SIGMA: f64 = 1.0;
 // Per component, by default. Chosen by hand: GREAT10 did not publish it.
 const DEFAULT_INTRINSIC_SIGMA: f64 = 0.14;
 // Larger intrinsic ellipticities are scaled back to this modulus. Chosen by hand.
-pub(crate) const MAX_INTRINSIC_MODULUS: f64 = 0.7;
+pub const MAX_INTRINSIC_MODULUS: f64 = 0.7;
 // Beyond it shears are not weak, and with intrinsic shapes ellipticities could exceed 1.
 const MAX_SHEAR: f64 = 0.5;
 // Of PSFs, where it does not vary. Chosen by hand.
@@ -180,7 +180,7 @@ impl SimulationSettings {
 }
 
 /// Random numbers that depend on these words alone.
-pub(crate) fn stream(words: [u64; 4]) -> ChaCha8Rng {
+pub fn stream(words: [u64; 4]) -> ChaCha8Rng {
     let mut key = [0; 32];
     for (bytes, word) in key.chunks_exact_mut(8).zip(words) {
         bytes.copy_from_slice(&word.to_le_bytes());
@@ -523,7 +523,7 @@ impl SetSimulator {
 
 /// Share of the grid's modes inside the circle of the axes' Nyquist multipole, which random fields
 /// fill: π/4.
-pub(crate) const NYQUIST_SHARE: f64 = std::f64::consts::FRAC_PI_4;
+pub const NYQUIST_SHARE: f64 = std::f64::consts::FRAC_PI_4;
 
 fn psf_profile(kind: SetKind) -> PsfProfile {
     match kind.image {

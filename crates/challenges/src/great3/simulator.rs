@@ -10,7 +10,6 @@ use rand::RngExt;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
-use shearq_fourier::Complex64;
 use shearq_quantities::{FunctionalPsf, PsfProfile, PsfTransform, Pupil, Shear, TransformedPsf};
 use shearq_scoring::aperture::Lattice;
 use shearq_scoring::great3::{
@@ -18,14 +17,14 @@ use shearq_scoring::great3::{
     SUBFIELDS_PER_FIELD,
 };
 use shearq_scoring::modes::Decomposer;
-use shearq_scoring::{Grid, ScoringError};
+use shearq_scoring::{Complex64, Grid, ScoringError};
 
-use crate::field::{Content, ShearSpectrum, random_field};
-use crate::galaxy::{Component, Galaxy, GalaxyError, Sersic};
-use crate::noise::add_noise;
-use crate::render::{RenderScratch, Renderer};
-use crate::set::{MAX_INTRINSIC_MODULUS, NYQUIST_SHARE, stream};
-use crate::signal::power;
+use shearq_simulate::add_noise;
+use shearq_simulate::field::{Content, ShearSpectrum, random_field};
+use shearq_simulate::galaxy::{Component, Galaxy, GalaxyError, Sersic};
+use shearq_simulate::render::{RenderScratch, Renderer};
+use shearq_simulate::set::{MAX_INTRINSIC_MODULUS, NYQUIST_SHARE, stream};
+use shearq_simulate::signal::power;
 
 // Galaxies, epochs and stars are off the centres of their stamps by up to this on each axis.
 const MAX_OFFSET_PX: f64 = 1.0;

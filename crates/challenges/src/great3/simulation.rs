@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
+use shearq_dataset::fingerprint;
 use shearq_dataset::great3::{self, file_name};
 use shearq_dataset::run::{SIMULATION_FILE, claim};
 use shearq_dataset::threads::Progress;
@@ -13,33 +14,88 @@ use shearq_files::frames::polars::Column;
 use shearq_files::frames::{Metadata, frame};
 use shearq_files::table::{self, FileFormat, MAX_ROWS};
 use shearq_files::{FileError, atomic};
+use shearq_pipeline::simulate::is_whole;
+use shearq_pipeline::{PipelineError, engine};
 use shearq_quantities::Shear;
-use shearq_scoring::great3::{Branch, STARS_PER_SIDE};
+use shearq_scoring::great3::{Branch, GRID, STARS_PER_SIDE, SUBFIELDS};
 use shearq_simulate::galaxy::Sersic;
-use shearq_simulate::great3::{BranchSimulator, Fit, FitComponent, Subfield};
 use shearq_simulate::render::RenderScratch;
 
-use crate::PipelineError;
-use crate::engine;
-use crate::simulate::is_whole;
+use super::simulator::{BranchSimulator, Fit, FitComponent, Subfield};
+use crate::{Simulated, Simulation, SimulationError};
 
 /// What determines all subfields of a simulated branch. Their number does not: more can be added.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Record {
-    pub version: String,
-    pub branch: String,
-    pub seed: u64,
-    pub grid: usize,
+struct Record {
+    version: String,
+    branch: String,
+    seed: u64,
+    grid: usize,
     /// Whether all shears have the opposite sign.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
-    pub opposite: bool,
+    opposite: bool,
     /// Fingerprint of the table of fits to galaxies. Its path does not change when the table is edited.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub galaxies: Option<String>,
+    galaxies: Option<String>,
+}
+
+/// Simulates a branch, and its galaxies under the opposite shear, if asked for.
+pub(super) fn simulate(
+    branch: Branch,
+    simulation: &Simulation<'_>,
+    threads: usize,
+    start: &dyn Fn(u64) -> Box<dyn Progress>,
+) -> Result<Simulated, SimulationError> {
+    let &Simulation {
+        seed, grid, out, ..
+    } = simulation;
+    if grid > GRID {
+        return Err(SimulationError::Grid {
+            found: grid,
+            most: GRID,
+            branch: "a branch of GREAT3",
+        });
+    }
+    let fits = simulation.galaxies.map(read_fits).transpose()?;
+    let print = simulation.galaxies.map(fingerprint::of_file).transpose()?;
+    let mut simulator = BranchSimulator::new(branch, seed, grid, fits.unwrap_or_default())?;
+    let subfields = simulation.subfields.unwrap_or(SUBFIELDS);
+    let mut folders = vec![(out.to_owned(), false)];
+    if simulation.opposite {
+        folders.push((out.join("opposite"), true));
+    }
+    let images = folders.len() * subfields * branch.epochs();
+    let mut progress = start((images * grid * grid) as u64);
+    let mut made = 0;
+    for (out, opposite) in folders {
+        simulator.opposite = opposite;
+        let record = Record {
+            version: shearq_dataset::VERSION.into(),
+            branch: branch.folder(),
+            seed,
+            grid,
+            opposite,
+            galaxies: print.clone(),
+        };
+        made += simulate_branch(
+            &simulator,
+            &record,
+            subfields,
+            &out,
+            threads,
+            &mut *progress,
+        )?;
+    }
+    Ok(Simulated {
+        made,
+        images,
+        folder: out.join(branch.folder()),
+        truth: truth_folder(out, branch),
+    })
 }
 
 /// Where the truth of a branch is, in a folder that holds its data.
-pub fn truth_folder(out: &Path, branch: Branch) -> PathBuf {
+fn truth_folder(out: &Path, branch: Branch) -> PathBuf {
     out.join("truth").join(branch.folder())
 }
 
@@ -55,7 +111,7 @@ const MAX_REDRAWN_DIFFERENCE: f32 = 0.1;
 
 /// Simulates subfields from 0 into `out`, and returns the number of new images. Whole images are kept if their first galaxy is the
 /// one that `simulator` draws; the others are not compared, which would take as long as drawing them.
-pub fn simulate_branch(
+fn simulate_branch(
     simulator: &BranchSimulator,
     record: &Record,
     subfields: usize,
@@ -254,7 +310,7 @@ fn write_tables(
 }
 
 /// Reads fits to galaxies: `n r_e q`, and perhaps `flux`, `bulge_r_e bulge_q bulge_flux` and `snr`.
-pub fn read_fits(path: &Path) -> Result<Vec<Fit>, FileError> {
+fn read_fits(path: &Path) -> Result<Vec<Fit>, FileError> {
     let read = table::read(path, None, MAX_ROWS)?;
     let column = |name: &str| Ok(table::numbers(&read, name, path)?.into_owned());
     let optional = |name: &str| read.column(name).is_ok().then(|| column(name)).transpose();

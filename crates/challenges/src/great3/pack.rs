@@ -5,18 +5,20 @@ use std::fmt::Write;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
+use shearq_catalogue::columns::looks_like_weight;
 use shearq_dataset::run::Run;
 use shearq_dataset::threads::Pool;
 use shearq_files::{FileError, names_of, table};
 use shearq_quantities::Shear;
+use shearq_results::response::{Shared, shears};
 use shearq_scoring::aperture::{ApertureMass, SEPARATION_BINS};
-use shearq_scoring::great3::{Branch, Identity, NODES_PER_GALAXY};
+use shearq_scoring::great3::{Branch, GRID, Identity, NODES_PER_GALAXY, SUBFIELDS};
 use shearq_scoring::{Repeated, repeated};
 
-use super::super::{BranchCatalogues, Columns, Presubmission, Presubmitting, wrong};
-use super::{EQUAL_SHEARS, NOT_AVERAGED, NOT_CORRELATED, lattice, more, not_an_identity, zero};
-use crate::response::{Shared, shears};
-use shearq_catalogue::columns::looks_like_weight;
+use super::files::{EQUAL_SHEARS, lattice};
+use super::{NOT_AVERAGED, NOT_CORRELATED, more, not_an_identity, zero};
+use crate::columns::{Columns, wrong};
+use crate::{BranchCatalogues, Presubmission, Presubmitting};
 
 // Share of the galaxies of a branch above which equal shears are placeholders. Chosen by hand.
 const MIN_PLACEHOLDER_SHARE: f64 = 0.1;
@@ -32,6 +34,14 @@ fn unmeasured(field: usize) -> String {
     format!(
         "field {field} has no measured galaxy with a weight, so that it has no shear. Try: a smaller cut on quality"
     )
+}
+
+fn subfields(packing: &Presubmitting<'_>) -> usize {
+    packing.subfields.unwrap_or(SUBFIELDS)
+}
+
+fn grid(packing: &Presubmitting<'_>) -> usize {
+    packing.grid.unwrap_or(GRID)
 }
 
 // A row of a catalogue.
@@ -125,15 +135,15 @@ impl Galaxies {
                 return wrong(path, not_an_identity(k, found));
             };
             let wrong = |fault: String| wrong(path, format!("galaxy {id}: {fault}"));
-            if id.subfield() >= packing.subfields {
+            if id.subfield() >= subfields(packing) {
                 return wrong(format!(
                     "subfield {} does not exist in {branch} (expected 0 to {}). Try: only the catalogues of one branch",
                     id.subfield(),
-                    packing.subfields - 1
+                    subfields(packing) - 1
                 ));
             }
             let (x, y) = id.place();
-            let last = packing.grid * self.step() - 1;
+            let last = grid(packing) * self.step() - 1;
             if x.max(y) > last {
                 return wrong(format!(
                     "column {x} and row {y} are outside of the grid (expected 0 to {last}). Try: --branch with the branch of these identities"
@@ -186,7 +196,7 @@ impl Galaxies {
             .files
             .last()
             .map_or(Path::new("catalogues"), PathBuf::as_path);
-        let lacking: Vec<usize> = (0..packing.subfields)
+        let lacking: Vec<usize> = (0..subfields(packing))
             .filter(|k| !there.contains(k))
             .collect();
         if !lacking.is_empty() {
@@ -196,7 +206,7 @@ impl Galaxies {
             let message = format!(
                 "{} of {} subfields are missing: {which}. Try: the catalogues of all subfields in one command",
                 lacking.len(),
-                packing.subfields
+                subfields(packing)
             );
             return wrong(last, message);
         }
@@ -245,11 +255,11 @@ impl Galaxies {
             );
             return wrong(file(first), message);
         }
-        let count = packing.grid * packing.grid;
+        let count = grid(packing) * grid(packing);
         let found = galaxies.len();
         if found != count {
             let there: BTreeSet<Identity> = galaxies.iter().map(|own| own.id).collect();
-            let nodes = |offset: usize| (0..packing.grid).map(move |k| step * k + offset);
+            let nodes = |offset: usize| (0..grid(packing)).map(move |k| step * k + offset);
             let all = nodes(expected.0).flat_map(|x| nodes(expected.1).map(move |y| (x, y)));
             let mut all = all.map(|place| Identity::new(subfield, place));
             let id = all.find(|id| !there.contains(id)).unwrap_or(first.id);
@@ -267,7 +277,7 @@ impl Galaxies {
         packing: &Presubmitting<'_>,
         pool: &Pool,
     ) -> Result<Presubmission, FileError> {
-        let size = self.branch.subfields_per_field() * packing.grid * packing.grid;
+        let size = self.branch.subfields_per_field() * grid(packing) * grid(packing);
         let fields: Vec<Range<usize>> = (0..self.galaxies.len())
             .step_by(size)
             .map(|start| start..(start + size).min(self.galaxies.len()))

@@ -3,19 +3,31 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-use shearq_dataset::threads::Pool;
+use shearq_dataset::threads::{Pool, Progress};
 use shearq_files::FileError;
 use shearq_files::table::{self, Place};
 use shearq_quantities::Shear;
 use shearq_scoring::great08;
 
-use super::{
-    Columns, Entry, Figure, Presubmission, Presubmitting, PublicBranch, Score, Truth, disagreement,
-    whole, wrong,
+use crate::agreement::disagreement;
+use crate::columns::{Columns, whole, wrong};
+use crate::{
+    Entry, Figure, Presubmission, Presubmitting, PublicBranch, PublicChallenge, Score, Simulated,
+    Simulation, SimulationError, Truth,
+};
+
+pub(crate) const CHALLENGE: PublicChallenge = PublicChallenge {
+    name: "great08",
+    branches: Vec::new,
+    simulated: Vec::new,
+    branch: |name| match name {
+        None => Some(Box::new(Great08)),
+        Some(_) => None,
+    },
 };
 
 #[derive(Debug)]
-pub struct Great08;
+struct Great08;
 
 // More images than the challenge had (2700), so that a wrong column is noticed.
 const MAX_IMAGES: usize = 1_000_000;
@@ -113,6 +125,10 @@ impl PublicBranch for Great08 {
         "GREAT08".into()
     }
 
+    fn subfields(&self) -> Option<usize> {
+        None
+    }
+
     // Truth: `image set g1 g2`, or `index g1 g2` where rows with the same true shear are a set. The submission has a row per image
     // or per set.
     fn score(&self, truth: Truth<'_>, submission: &Path, _: &Pool) -> Result<Score, FileError> {
@@ -195,6 +211,15 @@ impl PublicBranch for Great08 {
     }
 
     fn pack(&self, _: &Presubmitting<'_>, _: &Pool) -> Option<Result<Presubmission, FileError>> {
+        None
+    }
+
+    fn simulate(
+        &self,
+        _: &Simulation<'_>,
+        _: usize,
+        _: &dyn Fn(u64) -> Box<dyn Progress>,
+    ) -> Option<Result<Simulated, SimulationError>> {
         None
     }
 
