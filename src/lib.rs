@@ -74,7 +74,7 @@ struct Cli {
 }
 
 #[derive(Debug, Subcommand)]
-enum Command {
+pub(crate) enum Command {
     #[command(after_help = "Example:\n  shearq quickstart --out first")]
     Quickstart(quickstart::Arguments),
     #[command(
@@ -229,6 +229,19 @@ pub fn run_with(arguments: impl IntoIterator<Item = OsString>) -> u8 {
             EXIT_FAILED
         }
     }
+}
+
+// A command with its arguments, without the program's name.
+fn parse(command: &[String]) -> anyhow::Result<Command> {
+    let words = std::iter::once("shearq").chain(command.iter().map(String::as_str));
+    let parsed = Cli::try_parse_from(words).map_err(|error| {
+        let text = error.to_string();
+        let text = text.strip_prefix("error: ").unwrap_or(&text);
+        // Without the usage of the command.
+        let text = text.split("\n\n").next().unwrap_or(text);
+        anyhow::anyhow!("{}: {text}", command.join(" "))
+    })?;
+    Ok(parsed.command)
 }
 
 // As a shell reads it, for the head of a report.

@@ -1,12 +1,11 @@
 use std::path::{Path, PathBuf};
 
-use anyhow::Context;
+use anyhow::{Context, anyhow};
 use clap::{ArgGroup, Args, Subcommand};
 use shearq_submissions::{Configuration, Registry};
 
-use crate::arguments::{
-    Form, SetList, SimulationArguments, Threads, given_once, positive, sets_of,
-};
+use crate::arguments::{Form, SetList, SimulationArguments, Threads, given_once, sets_of};
+use crate::commands::{bias, score};
 use crate::progress::Bar;
 use crate::{print, tell};
 use shearq_dataset::images::{self, ImageId};
@@ -17,14 +16,15 @@ use shearq_files::table::FileFormat;
 use shearq_pipeline::measure::FolderMeasurement;
 use shearq_pipeline::run::run_folder;
 use shearq_render::table::TableFormat;
+use shearq_results::baseline::catalogues::{CatalogueBaseline, CatalogueError, Tolerance, Units};
 use shearq_results::baseline::{
-    self, Baseline, BaselineConfiguration, BaselineSet, Change, Checked, metrics_of, shift_table,
+    self, Baseline, BaselineConfiguration, BaselineSet, Checked, metrics_of, shift_table,
 };
 
 /// Store metrics as a baseline and check later whether they moved.
 ///
-/// A baseline is a TOML file. It contains the metrics of each set with errors, the scatter of the ellipticities,
-/// and what they were measured with: settings, data, seed and version.
+/// A baseline is a TOML file, of configurations of shearq or of catalogues of any code. It contains metrics with errors, and what
+/// they were measured with: settings, data and seed, or a command with its tolerance. docs/regression.md has a workflow for CI.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
     #[command(subcommand)]
@@ -34,20 +34,21 @@ pub(crate) struct Arguments {
 #[derive(Debug, Subcommand)]
 enum Command {
     #[command(
-        after_help = "Examples:\n  shearq baseline record mine --data data --submission 48/linear/star\n  shearq baseline record mine --simulate --sets 2,8 --images 4 --submission own.toml"
+        after_help = "Examples:\n  shearq baseline record mine --data data --submission 48/linear/star\n  shearq baseline record mine --simulate --sets 2,8 --images 4 --submission own.toml\n  shearq baseline record mycode -- bias plus.csv minus.csv\n  shearq baseline record mycode -- score --data data --foreign mycode.toml"
     )]
     Record(RecordArguments),
     #[command(
-        after_help = "Examples:\n  shearq baseline check mine\n  shearq baseline check mine --update --reason \"new window\""
+        after_help = "Examples:\n  shearq baseline check mine\n  shearq baseline check mine --update\n  shearq baseline check mycode --format markdown"
     )]
     Check(CheckArguments),
 }
 
 /// Store metrics as a new baseline.
 ///
-/// The metrics are measured on a data folder (--data) or on simulated sets (--simulate).
+/// The metrics are measured by configurations of shearq on a data folder (--data) or on simulated sets (--simulate), or those of
+/// any code's catalogues, as `score` or `bias` with its arguments prints them.
 #[derive(Debug, Args)]
-#[command(group = ArgGroup::new("input").required(true).args(["data", "simulate"]))]
+#[command(group = ArgGroup::new("input").required(true).args(["data", "simulate", "command"]))]
 struct RecordArguments {
     /// Name of the baseline; it must be new.
     #[arg(value_name = "NAME", value_parser = file_stem)]
@@ -70,6 +71,14 @@ struct RecordArguments {
     images: Option<u32>,
     #[command(flatten)]
     simulation: SimulationArguments,
+    /// `score` or `bias` with its arguments: catalogues of any code with their true shear, or of paired shears. A check repeats it
+    /// from the folder in which it is started.
+    #[arg(last = true, value_name = "COMMAND", conflicts_with_all = ["submission", "sets", "images"])]
+    command: Vec<String>,
+    /// Largest accepted shift of catalogues: `sigma=3` standard errors of the paired difference, or `m=5e-4`, `c=5e-5`,
+    /// `alpha=1e-3` or `relative=0.01` of other metrics, whichever is larger. May be given several times.
+    #[arg(long, value_name = "NAME=NUMBER", requires = "command")]
+    tolerance: Vec<String>,
     #[command(flatten)]
     place: Place,
     #[command(flatten)]
@@ -78,29 +87,26 @@ struct RecordArguments {
 
 /// Measure baselines again and compare the metrics.
 ///
-/// Each configuration is measured with its present settings, and changed settings are listed.
+/// Each configuration is measured with its present settings, and changed settings are listed. Compared are Q, Q calibrated, M/2,
+/// √A, m (cross), the noise and the scatter of e1 and e2, which must agree up to rounding.
 ///
-/// Compared are Q, M/2, √A and the scatter of e1 and e2. On the same data they must agree up to rounding, on other
-/// data (--data) within the noise. CSV and JSON list every metric, the other formats the moved ones.
+/// For catalogues of any code, the command of the baseline is repeated: their metrics may differ within the baseline's tolerance.
+/// Differences are paired by images or galaxies, so that small changes exceed their errors.
 ///
-/// Exit code 0: all agree; 1: a metric or a setting moved.
+/// CSV, JSON and Markdown list every metric, the other formats the moved ones.
+///
+/// Exit code 0: all agree; 1: a metric or a setting moved, or cannot be compared; 2: wrong usage.
 #[derive(Debug, Args)]
 struct CheckArguments {
     /// Names of the baselines [default: all in the folder].
     #[arg(value_name = "NAME")]
     names: Vec<String>,
-    /// Data folder to measure instead of the recorded one.
-    #[arg(long, value_name = "DIR")]
-    data: Option<PathBuf>,
-    /// Largest accepted shift on other data, in standard errors.
-    #[arg(long, value_name = "K", default_value_t = 3.0, value_parser = positive)]
-    sigma: f64,
-    /// Replace the baseline if anything moved. It keeps the reason and a list of changes.
-    #[arg(long, requires = "reason")]
+    /// Replace the baseline if anything moved.
+    #[arg(long)]
     update: bool,
-    /// Why the baseline changes.
-    #[arg(long, value_name = "TEXT", requires = "update")]
-    reason: Option<String>,
+    /// `score` or `bias` with its arguments, instead of those that the baseline states: the same galaxies in other files.
+    #[arg(last = true, value_name = "COMMAND", requires = "names")]
+    command: Vec<String>,
     #[command(flatten)]
     place: Place,
     #[command(flatten)]
@@ -141,6 +147,26 @@ fn record(arguments: &RecordArguments) -> anyhow::Result<()> {
     if path.exists() {
         return Err(Baseline::exists(&path).into());
     }
+    if !arguments.command.is_empty() {
+        arguments.simulation.must_be_unused()?;
+        let mut tolerance = Tolerance::default();
+        for text in &arguments.tolerance {
+            tolerance
+                .set(text)
+                .map_err(|message| anyhow!("--tolerance: {message}"))?;
+        }
+        let (units, catalogues) = units_of(&arguments.command)?;
+        CatalogueBaseline::write(
+            &path,
+            &arguments.command,
+            tolerance,
+            &units,
+            &catalogues,
+            false,
+        )?;
+        tell(format_args!("recorded {}", path.display()));
+        return Ok(());
+    }
     let sets = sets_of(arguments.sets.as_ref());
     let (source, images) = match &arguments.data {
         None => {
@@ -176,7 +202,7 @@ fn record(arguments: &RecordArguments) -> anyhow::Result<()> {
             set.images
         );
     }
-    Baseline::new(source, Vec::new(), configurations).create(&path)?;
+    Baseline::new(source, configurations).create(&path)?;
     tell(format_args!("recorded {}", path.display()));
     Ok(())
 }
@@ -220,10 +246,10 @@ fn measured(
         configuration.clone(),
         FileFormat::default(),
     );
-    let bar = |grid: usize| Bar::new("measuring", (images.len() * grid.pow(2)) as u64);
     let data = match source {
         Source::Simulated(settings) => {
-            let mut bar = bar(settings.grid);
+            let galaxies = images.len() * settings.grid.pow(2);
+            let mut bar = Bar::new("measuring", galaxies as u64);
             run_folder(&run, *settings, images, out, threads, &mut bar)?;
             run.source.data(out)?
         }
@@ -235,9 +261,9 @@ fn measured(
             // Other data may have fewer images.
             let mut there = run.images(&data, &sets)?;
             there.retain(|id| images.contains(id));
-            // An estimate: the grid of a folder is unknown until its images are opened.
-            FolderMeasurement::open(&run, &data, out, &there)?
-                .write_catalogues(threads, &mut bar(100))?;
+            let work = FolderMeasurement::open(&run, &data, out, &there)?;
+            let mut bar = Bar::new("measuring", work.galaxies());
+            work.write_catalogues(threads, &mut bar)?;
             data
         }
     };
@@ -256,13 +282,21 @@ fn check(arguments: &CheckArguments) -> anyhow::Result<()> {
         "{}: found no baseline in this folder. Try: shearq baseline record NAME",
         folder.display()
     );
+    anyhow::ensure!(
+        arguments.command.is_empty() || names.len() == 1,
+        "--: found {} baselines, expected one for a command",
+        names.len()
+    );
     let mut checks = Vec::new();
     for name in &names {
         let path = Baseline::path(folder, name);
         checks.extend(check_one(arguments, name, &path)?);
     }
     // Programs compare every metric; people want to see those that moved.
-    let all = matches!(arguments.form.format, TableFormat::Csv | TableFormat::Json);
+    let all = matches!(
+        arguments.form.format,
+        TableFormat::Csv | TableFormat::Json | TableFormat::Markdown
+    );
     let table = shift_table(&checks, all);
     // A table without rows would show headings only.
     if table.rows.is_empty() && arguments.form.format == TableFormat::Table {
@@ -270,10 +304,7 @@ fn check(arguments: &CheckArguments) -> anyhow::Result<()> {
     } else {
         arguments.form.print(&table)?;
     }
-    let failed = checks
-        .iter()
-        .filter(|check| !check.moved().is_empty())
-        .count();
+    let failed = checks.iter().filter(|check| check.has_moved()).count();
     anyhow::ensure!(
         // An update accepts the moved metrics.
         failed == 0 || arguments.update,
@@ -284,36 +315,95 @@ fn check(arguments: &CheckArguments) -> anyhow::Result<()> {
 }
 
 fn check_one(arguments: &CheckArguments, name: &str, path: &Path) -> anyhow::Result<Vec<Checked>> {
+    if let Some(found) = CatalogueBaseline::read(path)? {
+        return Ok(vec![check_catalogues(arguments, name, path, found)?]);
+    }
+    anyhow::ensure!(
+        arguments.command.is_empty(),
+        "{}: a baseline of configurations is measured again by its settings. Try: without --",
+        path.display()
+    );
     let baseline = Baseline::read(path)?;
     let beside = &arguments.place.folder;
-    let source = match &arguments.data {
-        Some(data) => Source::folder(&open_data(data)?, beside)?,
-        None => baseline.source.clone(),
-    };
+    let source = &baseline.source;
     let threads = arguments.threads.number();
     let measure = |configuration: &Configuration, images: &[ImageId]| {
-        measured(&source, beside, configuration, images, threads)
+        measured(source, beside, configuration, images, threads)
     };
     let (checks, configurations) =
-        baseline::check(name, &baseline, arguments.sigma, beside, measure)
+        baseline::check(name, &baseline, arguments.update, beside, measure)
             .with_context(|| path.display().to_string())?;
-    let moved: Vec<String> = checks.iter().flat_map(Checked::moved).collect();
-    if let (true, Some(reason)) = (arguments.update, &arguments.reason) {
-        if moved.is_empty() && checks.iter().all(|check| check.notes.is_empty()) {
-            tell(format_args!(
-                "{}: unchanged, because nothing moved",
-                path.display()
-            ));
-        } else {
-            let mut history = baseline.history.clone();
-            history.push(Change {
-                reason: reason.clone(),
-                from_version: baseline.version.clone(),
-                moved,
-            });
-            Baseline::new(source, history, configurations).replace(path)?;
+    let changed = |check: &Checked| check.has_moved() || !check.notes.is_empty();
+    updated(arguments, path, checks.iter().any(changed), || {
+        Ok(Baseline::new(baseline.source.clone(), configurations).replace(path)?)
+    })?;
+    Ok(checks)
+}
+
+fn check_catalogues(
+    arguments: &CheckArguments,
+    name: &str,
+    path: &Path,
+    (baseline, before): (CatalogueBaseline, Units),
+) -> anyhow::Result<Checked> {
+    let command = match arguments.command.as_slice() {
+        [] => &baseline.command,
+        given => given,
+    };
+    let (now, catalogues) = units_of(command).with_context(|| path.display().to_string())?;
+    let write = || {
+        let tolerance = baseline.tolerance;
+        CatalogueBaseline::write(path, command, tolerance, &now, &catalogues, true)?;
+        Ok(())
+    };
+    let checked = match baseline.check(name, &before, &now) {
+        // Nothing to compare, but what a new baseline is recorded for.
+        Err(CatalogueError::OtherGalaxies { .. }) if arguments.update => {
+            updated(arguments, path, true, write)?;
+            return Ok(baseline.check(name, &now, &now)?);
+        }
+        checked => checked.with_context(|| path.display().to_string())?,
+    };
+    updated(arguments, path, checked.has_moved(), write)?;
+    Ok(checked)
+}
+
+// With --update, replaces a baseline from which anything moved.
+fn updated(
+    arguments: &CheckArguments,
+    path: &Path,
+    moved: bool,
+    replace: impl FnOnce() -> anyhow::Result<()>,
+) -> anyhow::Result<()> {
+    match (arguments.update, moved) {
+        (false, _) => {}
+        (true, false) => tell(format_args!(
+            "{}: unchanged, because nothing moved",
+            path.display()
+        )),
+        (true, true) => {
+            replace()?;
             tell(format_args!("updated {}", path.display()));
         }
     }
-    Ok(checks)
+    Ok(())
+}
+
+// What `score` or `bias` measures with these arguments, and the catalogues that it reads.
+fn units_of(command: &[String]) -> anyhow::Result<(Units, Vec<PathBuf>)> {
+    let expected = || {
+        anyhow!(
+            "--: found `{}`, expected `score` or `bias` with its arguments",
+            command.join(" ")
+        )
+    };
+    // Before other commands are parsed, whose messages would not say that they have no baselines.
+    if !matches!(command.first().map(String::as_str), Some("score" | "bias")) {
+        return Err(expected());
+    }
+    match crate::parse(command)? {
+        crate::Command::Score(arguments) => score::units(&arguments),
+        crate::Command::Bias(arguments) => bias::units(&arguments),
+        _ => Err(expected()),
+    }
 }

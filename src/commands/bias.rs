@@ -20,6 +20,7 @@ use shearq_dataset::images::Shard;
 use shearq_files::{atomic, open};
 use shearq_render::figure::{Figure, PictureFormat};
 use shearq_render::table::{Cell, Table};
+use shearq_results::baseline::catalogues::Units as BaselineUnits;
 use shearq_results::bias::{Summed, sum};
 use shearq_results::views::bias::{
     Limit, bias_plot, bias_table, check, chosen_by_measurement, compared_table, of_design,
@@ -259,6 +260,27 @@ pub(crate) fn run(arguments: &Arguments, command_line: &str) -> anyhow::Result<(
         true => Ok(()),
         false => Err(Findings.into()),
     }
+}
+
+/// The sums of a baseline, and the catalogues.
+pub(super) fn units(arguments: &Arguments) -> anyhow::Result<(BaselineUnits, Vec<PathBuf>)> {
+    let summing = &arguments.summing;
+    anyhow::ensure!(
+        !summing.catalogues.is_empty() && summing.against.is_empty() && summing.shard.is_none(),
+        "bias: a baseline is of catalogues alone. Try: without --against, --shard, --merge, --plan and --example"
+    );
+    let summed = of_catalogues(summing, &summing.catalogues)?;
+    let result = summed.result()?;
+    for warning in of_design(&result)
+        .into_iter()
+        .chain(chosen_by_measurement(&result))
+    {
+        tell(format_args!("warning: {warning}"));
+    }
+    // Folders and tables within files have no fingerprint of one file.
+    let files = summing.catalogues.iter().filter(|path| path.is_file());
+    let files = files.cloned().collect();
+    Ok((BaselineUnits::Bias(Box::new(summed)), files))
 }
 
 fn of_catalogues(summing: &Summing, catalogues: &[PathBuf]) -> anyhow::Result<Summed> {

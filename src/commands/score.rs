@@ -1,4 +1,4 @@
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
@@ -20,6 +20,7 @@ use shearq_dataset::truth::{ReadTruth, Reading, read_truth, reading_of};
 use shearq_files::atomic::folder_of;
 use shearq_render::table::TableFormat;
 use shearq_results::aperture;
+use shearq_results::baseline::catalogues::{ScoredUnits, Units};
 use shearq_results::catalogues::{COLUMNS, Catalogues};
 use shearq_results::record::{RunRecord, SetRecord};
 use shearq_results::score::{ScoredSet, score_catalogues, score_files, unscored};
@@ -27,7 +28,7 @@ use shearq_results::store;
 use shearq_results::submit::{Packed, Sent, Submission, read_bandpowers};
 use shearq_results::views::comparison::verdict_line;
 use shearq_results::views::pages;
-use shearq_results::views::scores::{SetInput, one_set_json, per_set, spectra};
+use shearq_results::views::scores::{SetInput, notes, one_set_json, per_set, spectra};
 
 /// Score ellipticities against a known shear field: Q, Q_dn, M/2, √A and more.
 ///
@@ -180,11 +181,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             .report
             .save(&title, sections, || Ok(made_by.into()));
     }
-    let options = Options {
-        definition: arguments.settings.definition,
-        noise: arguments.noise_var.map_or(Noise::Measured, Noise::Given),
-        choice: arguments.settings.convention.unwrap_or_default(),
-    };
+    let options = options_of(arguments);
     let data = arguments.data.as_ref().map(DataFolder::open).transpose()?;
     match &arguments.truth {
         Some(truth) => files(arguments, truth, options),
@@ -192,14 +189,63 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     }
 }
 
-fn catalogues(
-    arguments: &Arguments,
-    data: Option<DataFolder>,
-    options: Options,
-) -> anyhow::Result<()> {
-    let store = arguments.store.as_deref();
-    // Before scoring: a store that cannot be written is an error at once.
-    let _prepared = store.map(store::prepare).transpose()?;
+fn options_of(arguments: &Arguments) -> Options {
+    Options {
+        definition: arguments.settings.definition,
+        noise: arguments.noise_var.map_or(Noise::Measured, Noise::Given),
+        choice: arguments.settings.convention.unwrap_or_default(),
+    }
+}
+
+/// The scored sets of a baseline, and the catalogues.
+pub(super) fn units(arguments: &Arguments) -> anyhow::Result<(Units, Vec<PathBuf>)> {
+    anyhow::ensure!(
+        arguments.challenge.is_none() && arguments.store.is_none() && !arguments.aperture_mass,
+        "score: a baseline is of catalogues of a set. Try: without --challenge, --store and --aperture-mass"
+    );
+    let options = options_of(arguments);
+    let of = |scored: &[ScoredSet], truth: &dyn Fn(u32) -> PathBuf| -> anyhow::Result<_> {
+        for note in notes(scored) {
+            if note.starts_with("warning: ") {
+                tell(format_args!("{note}"));
+            }
+        }
+        let units = scored
+            .iter()
+            .map(|own| ScoredUnits::new(own, &truth(own.record.set)));
+        Ok(Units::Score(units.collect::<Result<_, _>>()?))
+    };
+    if let Some(truth) = &arguments.truth {
+        let (_, _, scored) = scored_files(arguments, truth, options)?;
+        return Ok((
+            of(&scored, &|_| truth.clone())?,
+            arguments.catalogues.clone(),
+        ));
+    }
+    let data = arguments.data.as_ref().map(DataFolder::open).transpose()?;
+    let Found::Catalogues(catalogues, data) = found(arguments, data)? else {
+        bail!("score: a baseline is of catalogues (found power spectra)");
+    };
+    let (scored, _) = scored_catalogues(arguments, &catalogues, &data, options)?;
+    let of_set = |own: &ScoredSet| catalogues.files.of_set(own.record.set);
+    // Files of an archive are in a temporary folder.
+    let files = match &arguments.packed {
+        Some(path) => Vec::from_iter(path.is_file().then(|| path.clone())),
+        None => scored
+            .iter()
+            .flat_map(of_set)
+            .map(|(_, path)| path)
+            .collect(),
+    };
+    Ok((of(&scored, &|set| data.truth(set))?, files))
+}
+
+enum Found {
+    Catalogues(Box<Catalogues>, DataFolder),
+    Spectra(Sent, Box<Submission>, DataFolder),
+}
+
+fn found(arguments: &Arguments, data: Option<DataFolder>) -> anyhow::Result<Found> {
     let sets = sets_of(arguments.sets.as_ref());
     let (catalogues, data) = match (&arguments.measured, &arguments.foreign, data) {
         (Some(folder), _, data) => {
@@ -222,29 +268,58 @@ fn catalogues(
             let path = path.context("--packed: expected a folder or an archive")?;
             let sent = Sent::open(path)?;
             let submission = Submission::read(&sent)?;
-            if let Packed::Spectra(files) = &submission.packed {
-                let files = files.clone();
-                return packed_spectra(arguments, &data, &sent, &submission, files, options);
+            if let Packed::Spectra(_) = &submission.packed {
+                return Ok(Found::Spectra(sent, Box::new(submission), data));
             }
             (Catalogues::packed(sent, submission, &data)?, data)
         }
         (None, _, None) => unreachable!("clap requires --data"),
     };
+    Ok(Found::Catalogues(Box::new(catalogues), data))
+}
+
+// Also the options with the convention of the catalogues.
+fn scored_catalogues(
+    arguments: &Arguments,
+    catalogues: &Catalogues,
+    data: &DataFolder,
+    options: Options,
+) -> anyhow::Result<(Vec<ScoredSet>, Options)> {
+    let sets = sets_of(arguments.sets.as_ref());
     let options = Options {
         // Catalogues of shearq have the standard convention. That of other programs is determined from the data.
         choice: arguments.settings.convention.unwrap_or(catalogues.choice()),
         ..options
     };
-    let threads = arguments.threads.number();
-    let scored = score_catalogues(&data, &catalogues, sets, options, threads);
+    let scored = score_catalogues(data, catalogues, sets, options, arguments.threads.number());
     let scored = match &catalogues.description {
         // The cause of an error in a catalogue may be its description, so the message names both.
         Some(_) => scored.with_context(|| catalogues.path.display().to_string())?,
         None => scored?,
     };
+    Ok((scored, options))
+}
+
+fn catalogues(
+    arguments: &Arguments,
+    data: Option<DataFolder>,
+    options: Options,
+) -> anyhow::Result<()> {
+    let store = arguments.store.as_deref();
+    // Before scoring: a store that cannot be written is an error at once.
+    let _prepared = store.map(store::prepare).transpose()?;
+    let sets = sets_of(arguments.sets.as_ref());
+    let (catalogues, data) = match found(arguments, data)? {
+        Found::Catalogues(catalogues, data) => (catalogues, data),
+        Found::Spectra(sent, submission, data) => {
+            return packed_spectra(arguments, &data, &sent, &submission, options);
+        }
+    };
+    let (scored, options) = scored_catalogues(arguments, &catalogues, &data, options)?;
     let name = &catalogues.name;
     if arguments.aperture_mass {
         let truth = |set: u32| read_truth(&data.truth(set), &reading_of(&data, set)?);
+        let threads = arguments.threads.number();
         let masses = aperture::masses(&catalogues, &scored, truth, threads)?;
         let title = format!("Aperture masses of {name}");
         return arguments.printing.print(&aperture::table(title, &masses));
@@ -310,9 +385,12 @@ fn packed_spectra(
     data: &DataFolder,
     sent: &Sent,
     submission: &Submission,
-    mut files: BTreeMap<u32, PathBuf>,
     options: Options,
 ) -> anyhow::Result<()> {
+    let Packed::Spectra(files) = &submission.packed else {
+        unreachable!("the caller distinguishes them");
+    };
+    let mut files = files.clone();
     let path = sent.as_given(sent.path());
     anyhow::ensure!(
         arguments.noise_var.is_none(),
@@ -354,7 +432,12 @@ fn packed_spectra(
     write_record(store, run, &Source::folder(data, folder_of(&path))?, data)
 }
 
-fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Result<()> {
+// Plain files of one set, and how they are read.
+fn scored_files(
+    arguments: &Arguments,
+    truth: &Path,
+    options: Options,
+) -> anyhow::Result<(Catalogues, Reading, [ScoredSet; 1])> {
     let columns: Vec<&str> = match &arguments.columns {
         Some(given) => given.iter().map(String::as_str).collect(),
         None => COLUMNS.to_vec(),
@@ -390,6 +473,12 @@ fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Resul
     };
     let threads = arguments.threads.number();
     let scored = [score_files(truth, &catalogues, &reading, options, threads)?];
+    Ok((catalogues, reading, scored))
+}
+
+fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Result<()> {
+    let threads = arguments.threads.number();
+    let (catalogues, reading, scored) = scored_files(arguments, truth, options)?;
     if arguments.aperture_mass {
         let masses = aperture::masses(
             &catalogues,

@@ -3,7 +3,7 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use crate::support::{Folder, printed, stamps_of};
+use crate::support::{Folder, printed, shell, stamps_of};
 
 /// The documents.
 pub(crate) fn pages() -> Vec<PathBuf> {
@@ -130,10 +130,79 @@ fn commands_of_the_pages_run() {
             ],
         ),
         ("files.md", 10, &["parts/scores.csv"]),
+        ("regression.md", 7, &["baselines/mycode.units.json"]),
         ("install.md", 1, &["shearq-quickstart/report.html"]),
     ] {
         let root = tempfile::tempdir().unwrap();
         follow(page, root.path(), commands, true);
         written(root.path(), files);
     }
+}
+
+/// The commands of the steps of the workflow in docs/regression.yml, but for the installation.
+fn workflow() -> Vec<String> {
+    let text = fs::read_to_string("docs/regression.yml").unwrap();
+    let steps = text.split("- name: ").skip(1);
+    let steps = steps.filter(|step| !step.starts_with("Install"));
+    let commands = steps.map(|step| {
+        let (_, command) = step.split_once("run: ").unwrap();
+        command
+            .trim_start_matches('|')
+            .trim()
+            .replace("\n          ", "\n")
+    });
+    commands.collect()
+}
+
+#[test]
+fn workflow_of_a_toy_code_fails_on_a_changed_m() {
+    let folder = Folder::new();
+    let code = fs::read_to_string("docs/regression-measure.py").unwrap();
+    // Prints of each run, and its exit code.
+    let run = || {
+        let steps = workflow().join("\n");
+        let line = format!("export GITHUB_STEP_SUMMARY=summary.md\nset -e\n{steps}");
+        fs::write(folder.at("steps.sh"), line).unwrap();
+        let output = shell(folder.root(), "bash steps.sh");
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        let summary = fs::read_to_string(folder.at("summary.md")).unwrap_or_default();
+        fs::remove_file(folder.at("summary.md")).unwrap();
+        (output.status.code(), summary, said)
+    };
+    folder.write("measure.py", &code);
+    assert!(shell(folder.root(), "python3 measure.py").status.success());
+    folder.run("baseline record mycode --folder baselines -- bias plus.csv minus.csv");
+    let (status, summary, said) = run();
+    assert_eq!(status, Some(0), "{summary} {said}");
+    assert!(
+        summary.contains("| m1 ") && summary.contains("0.0005 (m)"),
+        "{summary}"
+    );
+    // By a tenth of the error of m1 of these galaxies, whose noise is in both measurements.
+    folder.write(
+        "measure.py",
+        code.replace("M = 0.02, 0.010", "M = 0.02, 0.012"),
+    );
+    let (status, summary, said) = run();
+    assert_eq!(status, Some(1), "{summary} {said}");
+    let row = |name: &str| {
+        summary
+            .lines()
+            .find(|line| line.contains(&format!("| {name} ")))
+            .unwrap()
+    };
+    assert!(
+        row("m1").contains("yes") && row("c1").contains("no"),
+        "{summary}"
+    );
+    // An accepted change passes.
+    folder.run("baseline check mycode --folder baselines --update");
+    assert_eq!(run().0, Some(0));
+    // Of other galaxies, nothing can be said.
+    folder.write("measure.py", code.replace("range(5000)", "range(4000)"));
+    let (status, _, said) = run();
+    assert!(
+        status == Some(1) && said.contains("needs the same galaxies"),
+        "{said}"
+    );
 }
