@@ -9,7 +9,7 @@ version=$(sed -n 's/^version = "\(.*\)"/\1/p' Cargo.toml | head -1)
 fail() { echo "error: $*" >&2; exit 1; }
 
 # The other crates have `publish = false`.
-published=(-p shearq-quantities -p shearq-fourier -p shearq-submissions -p shearq-bias -p shearq-scoring -p shearq-measure)
+published=(-p shearq-quantities -p shearq-submissions -p shearq-bias -p shearq-scoring -p shearq-measure)
 
 [ -z "$(git status --porcelain)" ] || fail "uncommitted changes. Try: git stash"
 git rev-parse -q --verify "refs/tags/v$version" > /dev/null && fail "the tag v$version exists. Try: a new version in Cargo.toml"

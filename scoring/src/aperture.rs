@@ -9,8 +9,8 @@ use std::ops::AddAssign;
 use ndarray::{Array2, ArrayView2};
 #[cfg(feature = "serde")]
 use serde::Serialize;
-use shearq_fourier::{Complex64, Plan64, Planner64};
 use shearq_quantities::Shear;
+use shearq_quantities::fourier::{Complex64, Plan64, Planner64};
 use shearq_quantities::units::Degrees;
 
 use crate::error::ScoringError;

@@ -4,7 +4,7 @@
 use ndarray::Array2;
 #[cfg(feature = "serde")]
 use serde::{Deserialize, Serialize};
-use shearq_fourier::Complex64;
+use shearq_quantities::fourier::Complex64;
 
 use crate::error::ScoringError;
 use crate::grid::check_shape;

@@ -27,7 +27,7 @@
 //! give twice the variance if noise × noise dominates.)
 
 use ndarray::{Array2, Zip};
-use shearq_fourier::Complex64;
+use shearq_quantities::fourier::Complex64;
 
 use crate::bandpower::{BINS, Bins, Definition, SCORED};
 use crate::catalogue::{FieldSum, SetImages};

@@ -4,7 +4,7 @@
 use std::f64::consts::PI;
 
 use ndarray::{Array2, Zip};
-use shearq_fourier::Complex64;
+use shearq_quantities::fourier::Complex64;
 
 use crate::bandpower::{Bins, SCORED};
 use crate::catalogue::{FieldSum, SetImages, TrueShear, TruthSign};

@@ -20,7 +20,7 @@
 //! modes, E and B are ambiguous, and the mean of both powers is used.
 
 use ndarray::Array2;
-use shearq_fourier::Complex64;
+use shearq_quantities::fourier::Complex64;
 
 use crate::bandpower::{BINS, Bins, SCORED};
 use crate::grid::Grid;

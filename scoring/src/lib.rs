@@ -71,7 +71,7 @@ pub use score::{
     SpectrumScore, measured_bandpowers,
 };
 pub use session::{AddedImages, ExaminedImage, OddImages, OddResponse, ScoredImages, SetSession};
-pub use shearq_fourier::Complex64;
+pub use shearq_quantities::fourier::Complex64;
 
 /// The examples of README.md.
 #[cfg(doctest)]

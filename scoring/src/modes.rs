@@ -4,7 +4,7 @@
 //! `IFFT` carries 1/n². A mode's power per steradian is |FFT|²·L²/n⁴.
 
 use ndarray::Array2;
-use shearq_fourier::{Complex64, Plan64, Planner64};
+use shearq_quantities::fourier::{Complex64, Plan64, Planner64};
 
 use crate::error::ScoringError;
 use crate::grid::{Grid, check_shape};

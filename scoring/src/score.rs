@@ -6,7 +6,7 @@ use std::str::FromStr;
 use ndarray::Array2;
 #[cfg(feature = "serde")]
 use serde::Serialize;
-use shearq_fourier::Complex64;
+use shearq_quantities::fourier::Complex64;
 use shearq_quantities::statistics::MIN_RESPONSE_SIGNIFICANCE;
 
 use crate::bandpower::{BINS, Bins, Definition, SCORED};

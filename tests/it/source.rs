@@ -19,9 +19,8 @@ fn levels() -> BTreeMap<String, usize> {
 const CODE: [&str; 5] = ["src", "crates", "scoring", "submissions", "python"];
 
 // Crates that use no files, data frames or threads.
-const PURE: [&str; 7] = [
+const PURE: [&str; 6] = [
     "crates/bias",
-    "crates/fourier",
     "crates/quantities",
     "crates/measure",
     "crates/simulate",

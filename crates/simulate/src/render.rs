@@ -12,7 +12,7 @@
 use std::f64::consts::{PI, TAU};
 
 use ndarray::Array2;
-use shearq_fourier::{Complex32, Complex64};
+use shearq_quantities::fourier::{Complex32, Complex64};
 use shearq_quantities::linear::{LANES, Matrix, ROWS, multiply};
 use shearq_quantities::radial::{QuadraticForm, SingleTable};
 use shearq_quantities::{FunctionalPsf, Pupil, TransformedPsf};

@@ -1,6 +1,6 @@
 //! Fields and random numbers that tests of the scoring share.
 use ndarray::Array2;
-use shearq_fourier::Complex64;
+use shearq_quantities::fourier::Complex64;
 use shearq_scoring::modes::{Decomposer, Modes};
 use shearq_scoring::{
     Choice, Convention, Definition, FieldSum, Grid, Options, Row, RowCounts, SetImages, SetScore,

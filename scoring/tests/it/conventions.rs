@@ -1,7 +1,7 @@
 //! A catalogue's metrics are the same in whichever convention it comes.
 
 use ndarray::Array2;
-use shearq_fourier::Complex64;
+use shearq_quantities::fourier::Complex64;
 use shearq_scoring::{
     Choice, Convention, Definition, FieldSum, Grid, Metrics, Noise, Options, Row, SetImages,
     SetScore, SetScorer,

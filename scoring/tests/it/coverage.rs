@@ -1,7 +1,7 @@
 //! The errors of a set's metrics against the scatter of repeated trials.
 
 use ndarray::Array2;
-use shearq_fourier::Complex64;
+use shearq_quantities::fourier::Complex64;
 use shearq_scoring::modes::{Decomposer, Modes};
 use shearq_scoring::{Definition, Grid, Metrics, SCORED, SetImages, SetScorer};
 

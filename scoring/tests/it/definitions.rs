@@ -1,6 +1,6 @@
 //! The corrected definition, null tests, masks, noise and errors, on fields made for the purpose.
 
-use shearq_fourier::Complex64;
+use shearq_quantities::fourier::Complex64;
 use shearq_scoring::{Bins, Convention, Definition, Grid, Options, SCORED, cross_spectrum};
 
 use crate::common::{Content, Normal, field, images, score, standard, truth};

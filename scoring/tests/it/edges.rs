@@ -1,7 +1,7 @@
 //! Cases at the edges of what is scored: gaps, nothing at all, a constant shear, the fewest images.
 
 use ndarray::Array2;
-use shearq_fourier::Complex64;
+use shearq_quantities::fourier::Complex64;
 use shearq_scoring::modes::Decomposer;
 use shearq_scoring::quality::quality;
 use shearq_scoring::{

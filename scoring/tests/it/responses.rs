@@ -1,8 +1,9 @@
 //! Images that follow the true shear differently from the others of their set.
 use ndarray::Array2;
-use shearq_fourier::Complex64;
+use shearq_quantities::fourier::Complex64;
 use shearq_scoring::{
-    Choice, Convention, FieldSum, Grid, OddResponse, Options, SetScorer, SetSession, TrueShear,
+    AddedImages, Choice, Convention, Fault, FieldSum, Grid, OddResponse, Options, ScoredImages,
+    SetScorer, SetSession, TrueShear,
 };
 
 use crate::common::{Content, Normal, field, rows, sum_of, truth};
@@ -21,17 +22,10 @@ fn noisy(shear: &Array2<Complex64>, count: usize, noise: f64, seed: u64) -> Vec<
 }
 
 fn odd(truth: TrueShear, images: &[Array2<Complex64>]) -> Vec<OddResponse> {
-    let options = Options {
-        choice: Choice::Insist(Convention::STANDARD),
-        ..Options::default()
-    };
-    let session = SetSession::new(grid(), Some(truth), options).unwrap();
-    let mut added = session.begin();
-    for image in images {
-        let (sum, counts) = sum_of(&grid(), &rows(&grid(), image));
-        added.add(&session.examine(sum, counts).unwrap()).unwrap();
-    }
-    added.odd(Convention::STANDARD).responses
+    let standard = Choice::Insist(Convention::STANDARD);
+    of_set(truth, images, standard, |added| {
+        added.odd(Convention::STANDARD).responses
+    })
 }
 
 /// The cells in another order.
@@ -136,4 +130,76 @@ fn images_with_gaps_have_the_response_of_their_galaxies() {
         ..FieldSum::new(&grid())
     };
     assert_eq!(scorer.response(&blank, Convention::STANDARD), None);
+}
+
+/// What `read` finds in a set of images.
+fn of_set<T>(
+    truth: TrueShear,
+    images: &[Array2<Complex64>],
+    choice: Choice,
+    read: impl FnOnce(&AddedImages<'_>) -> T,
+) -> T {
+    let options = Options {
+        choice,
+        ..Options::default()
+    };
+    let session = SetSession::new(grid(), Some(truth), options).unwrap();
+    let mut added = session.begin();
+    for image in images {
+        let (sum, counts) = sum_of(&grid(), &rows(&grid(), image));
+        added.add(&session.examine(sum, counts).unwrap()).unwrap();
+    }
+    read(&added)
+}
+
+fn scored(truth: TrueShear, images: &[Array2<Complex64>], choice: Choice) -> ScoredImages {
+    of_set(truth, images, choice, |added| added.finish().unwrap())
+}
+
+#[test]
+fn odd_images_are_sought_in_the_matched_convention() {
+    // All images have the other sign of e2, and one has not.
+    let shear = field(&grid(), Content::E, 3);
+    let mut images = noisy(&shear, 6, 0.01, 5);
+    images
+        .iter_mut()
+        .skip(1)
+        .for_each(|image| image.mapv_inplace(|e| e.conj()));
+    for choice in [Choice::Matched, Choice::Best] {
+        let found = scored(truth(&shear), &images, choice);
+        let places: Vec<usize> = found.odd.responses.iter().map(|own| own.place).collect();
+        assert_eq!(places, [0], "{choice}");
+    }
+}
+
+#[test]
+fn odd_images_explain_faults_of_the_set() {
+    let shear = field(&grid(), Content::E, 3);
+    let standard = Choice::Insist(Convention::STANDARD);
+    let is_biased = |fault: &Fault| matches!(fault, Fault::Biased { .. });
+    // Half of the response is missing, in all images or because half of them have one value.
+    let half: Vec<_> = noisy(&shear, 6, 0.01, 5)
+        .iter()
+        .map(|e| e.mapv(|e| 0.5 * e))
+        .collect();
+    let found = scored(truth(&shear), &half, standard);
+    assert!(found.findings.iter().any(is_biased), "{:?}", found.findings);
+    let mut constant = noisy(&shear, 6, 0.01, 5);
+    constant[..3]
+        .iter_mut()
+        .for_each(|image| image.fill(Complex64::new(0.1, 0.2)));
+    let found = scored(truth(&shear), &constant, standard);
+    assert_eq!((found.odd.repeated.len(), found.findings), (3, vec![]));
+    // Noise that all images share looks like faults of the order, unless they are copies.
+    let noise = noisy(&Array2::zeros((N, N)), 1, 0.05, 7);
+    let copies = vec![noise[0].clone(); 6];
+    let found = scored(truth(&shear), &copies, standard);
+    assert_eq!((found.odd.copies.len(), found.findings), (5, vec![]));
+    let others = noisy(&noise[0], 6, 0.001, 8);
+    let found = scored(truth(&shear), &others, standard);
+    assert!(
+        matches!(found.findings[..], [Fault::Uncorrelated { .. }]),
+        "{:?}",
+        found.findings
+    );
 }

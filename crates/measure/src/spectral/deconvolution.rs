@@ -39,8 +39,8 @@
 
 use multiversion::multiversion;
 use ndarray::ArrayView2;
-use shearq_fourier::Complex64;
 use shearq_quantities::PixelShape;
+use shearq_quantities::fourier::Complex64;
 use shearq_quantities::linear::LANES;
 use shearq_submissions::LinearDeconvolution;
 

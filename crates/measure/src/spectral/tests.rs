@@ -1,8 +1,8 @@
 use ndarray::{Array2, ArrayView2};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use shearq_fourier::Complex64;
 use shearq_quantities::PixelShape;
+use shearq_quantities::fourier::Complex64;
 use shearq_submissions::{LinearDeconvolution, Registry};
 
 use super::deconvolution::*;

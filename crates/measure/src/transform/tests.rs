@@ -2,7 +2,7 @@
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use shearq_fourier::Complex64;
+use shearq_quantities::fourier::Complex64;
 
 use super::*;
 

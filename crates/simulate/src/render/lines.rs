@@ -3,8 +3,8 @@
 use std::ops::Range;
 
 use multiversion::multiversion;
-use shearq_fourier::Complex32;
 use shearq_quantities::Shear;
+use shearq_quantities::fourier::Complex32;
 use shearq_quantities::radial::{QuadraticForm, SingleTable};
 
 use super::Phases;
