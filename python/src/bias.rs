@@ -14,7 +14,7 @@ use shearq_files::frames::frame;
 use shearq_files::frames::polars::Column;
 use shearq_files::table::Place;
 use shearq_render::table::TableFormat;
-use shearq_results::bias::{BiasFailure, Summed, sum};
+use shearq_results::bias::{BiasFailure, Summed, joined, sum};
 use shearq_results::views::bias::bias_table;
 use shearq_scoring::TruthSign;
 
@@ -129,10 +129,12 @@ impl BiasSums {
             .map_err(|error| PyValueError::new_err(error.to_string()))
     }
 
-    /// The sums of these catalogues and of others.
-    fn append(&self, other: &BiasSums) -> PyResult<Self> {
-        let mut summed = self.summed.clone();
-        summed.append(other.summed.clone()).map_err(of_bias)?;
+    /// The sums of these catalogues and of others, in this order.
+    fn append(&self, others: Vec<PyRef<'_, BiasSums>>) -> PyResult<Self> {
+        let others = others.iter().map(|own| own.summed.clone());
+        let parts = std::iter::once(self.summed.clone()).chain(others);
+        let all = joined(parts.map(Ok), Summed::append).map_err(of_bias)?;
+        let summed = all.unwrap_or_else(|| self.summed.clone());
         Ok(BiasSums { summed })
     }
 

@@ -13,6 +13,7 @@ use crate::arguments::{Printing, ReportFile, named, positive};
 use crate::{Findings, made_by, tell};
 use shearq_catalogue::columns::{Names, Shapes, role_names};
 use shearq_catalogue::expression::Expression;
+use shearq_catalogue::recognition::read_presets;
 use shearq_catalogue::request::{Binning, Edges, MAX_BINS, Request, Units};
 use shearq_catalogue::select::selection;
 use shearq_catalogue::truth::{TrueSign, Truth, expand};
@@ -21,7 +22,7 @@ use shearq_files::{atomic, open};
 use shearq_render::figure::{Figure, PictureFormat};
 use shearq_render::table::{Cell, Table};
 use shearq_results::baseline::catalogues::Units as BaselineUnits;
-use shearq_results::bias::{Summed, sum};
+use shearq_results::bias::{Summed, joined, sum};
 use shearq_results::views::bias::{
     Limit, bias_plot, bias_table, check, chosen_by_measurement, compared_table, of_design,
     of_other_images, section,
@@ -106,7 +107,12 @@ struct Summing {
         value_delimiter = ','
     )]
     columns: Vec<String>,
-    /// Type of the ellipticities [default: responsivity for columns of HSM that are distortions, else shear].
+    /// Also recognise the surveys that this file describes, as `[[survey]]` in TOML: name, ellipticity (shear or distortion),
+    /// required (columns that it must have) and columns (by role).
+    #[arg(long, value_name = "FILE")]
+    preset: Vec<PathBuf>,
+    /// Type of the ellipticities [default: shear if they have a response, else responsivity for columns of HSM that are
+    /// distortions, else shear].
     #[arg(long, value_parser = named::<Shapes>())]
     ellipticity: Option<Shapes>,
     /// Sign of the true g2 [default: as the file of --truth states; else, for x, y, g1, g2, the sign in which the shear is
@@ -153,7 +159,7 @@ const DEFAULT_STEP: f64 = 0.01;
 
 fn columns_help() -> String {
     format!(
-        "Names of columns, such as `e1=g_1,e2=g_2,w=weight` or `e1=g1,e2=g2,e1_1p=g1_1p,e1_1m=g1_1m,e2_2p=g2_2p,e2_2m=g2_2m`; `ROLE=none` ignores a column that would be recognised. Roles: {}",
+        "Names of columns or formulas of them, such as `e1=g_1,e2=-g_2,w=weight`, `flag=flags & 4` or `e1=g1,e2=g2,e1_1p=g1_1p,e1_1m=g1_1m,e2_2p=g2_2p,e2_2m=g2_2m`; `ROLE=none` ignores a column that would be recognised. Roles: {}",
         role_names()
     )
 }
@@ -288,6 +294,9 @@ fn of_catalogues(summing: &Summing, catalogues: &[PathBuf]) -> anyhow::Result<Su
     for text in &summing.columns {
         names.add(text)?;
     }
+    for path in &summing.preset {
+        names.add_presets(read_presets(path)?);
+    }
     let specified = summing.truth_sign;
     let mut sign = TrueSign::or_standard(specified);
     let truth = match (&summing.truth, summing.g1.zip(summing.g2)) {
@@ -358,13 +367,13 @@ fn merged(files: &[PathBuf]) -> anyhow::Result<Summed> {
         let summed: Summed = serde_json::from_slice(&bytes).with_context(what)?;
         summed.checked().with_context(what)
     };
-    // The other files are compared with the first, and the message names the file that differs.
-    let mut all = read(&files[0])?;
-    for path in &files[1..] {
-        let more = read(path)?;
-        all.merge(more)
-            .with_context(|| path.display().to_string())?;
-    }
+    // The message names the file that differs from those before it.
+    let parts = files.iter().map(|path| Ok((read(path)?, path)));
+    let all = joined(parts, |all: &mut (Summed, &PathBuf), (more, path)| {
+        let union = all.0.merge(more);
+        union.with_context(|| path.display().to_string())
+    })?;
+    let (all, _) = all.context("--merge: found no files")?;
     // Sums of some shards would give an estimate without a sign that galaxies are missing.
     let absent = all.absent();
     anyhow::ensure!(

@@ -91,6 +91,11 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
                 "warning: set {set:02}: all {} galaxies have the same ellipticity (found a scatter of 0, expected noise), so the error is meaningless. Try: check the stamps for copies",
                 mean.galaxies
             ));
+        } else if mean.repeated > 0 {
+            tell(format_args!(
+                "warning: set {set:02}: {} of {} galaxies have the ellipticity of an earlier one of their image; expected measured values, which do not repeat. Try: each galaxy once, and a flag for those that were not measured",
+                mean.repeated, mean.galaxies
+            ));
         }
     }
     let name = measured.display().to_string();

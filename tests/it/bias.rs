@@ -365,3 +365,192 @@ fn sheared_flags_and_weights_give_their_response() {
         }
     }
 }
+
+/// Distortions of a method that responds by 0.8 m, of the same galaxies with each artificial shear: e1 and e2 by sheared catalogue.
+fn sheared_distortions(g: f64, normal: &mut Normal) -> Vec<[[f64; 2]; 5]> {
+    let galaxy = |_| {
+        let [s1, s2] = normal.pair(0.2);
+        SHEARS.map(|[a1, a2]| {
+            let shear = Shear::new(g * (1.0 + M[0]) + a1, a2 - g * (1.0 + M[1]));
+            let chi = Shear::new(s1, s2).sheared_by(shear).to_distortion();
+            [0.8 * chi.e1, 0.8 * chi.e2]
+        })
+    };
+    (0..GALAXIES).map(galaxy).collect()
+}
+
+/// ⟨χ⟩/⟨R⟩ needs no conversion: half of it was m of −0.5, without a word.
+#[test]
+fn distortions_are_divided_by_the_response_that_they_have() {
+    let folder = Folder::new();
+    let tables = |name: &str, head: &str, row: &dyn Fn(&[[f64; 2]; 5]) -> String| {
+        pair(&folder, name, 0.02, |g, normal| {
+            let start = format!("{head},g1,g2\n");
+            sheared_distortions(g, normal)
+                .iter()
+                .fold(start, |text, own| {
+                    text + &format!("{},{g},{}\n", row(own), -g)
+                })
+        })
+    };
+    let response = |own: &[[f64; 2]; 5], k: usize| (own[1 + 2 * k][k] - own[2 + 2 * k][k]) / 0.02;
+    let with_response = |names: &str| {
+        let head = format!("{names},R11,R22");
+        tables("r", &head, &|own| {
+            let [e1, e2] = own[0];
+            format!("{e1},{e2},{},{}", response(own, 0), response(own, 1))
+        })
+    };
+    let in_columns = |first: &str| {
+        let head: Vec<String> = NAMES
+            .iter()
+            .flat_map(|name| {
+                let end = if *name == "noshear" { "" } else { name };
+                let joint = if end.is_empty() { "" } else { "_" };
+                [1, 2].map(|k| format!("{first}e{k}{joint}{end}"))
+            })
+            .collect();
+        tables("s", &head.join(","), &|own| {
+            let all: Vec<String> = own.iter().flatten().map(f64::to_string).collect();
+            all.join(",")
+        })
+    };
+    // 2000 galaxies whose responses scatter by a tenth, of both numerator and denominator.
+    let tolerance = 2e-3;
+    for names in ["corrected_e1,corrected_e2", "e1,e2"] {
+        let files = with_response(names);
+        assert_m(&rows(&folder, &files)[0], M, tolerance);
+        for option in ["distortion", "responsivity"] {
+            let line = format!("bias {files} --ellipticity {option}");
+            folder.refuses(&line, "`R11`[..]this response is not used");
+        }
+    }
+    for first in ["corrected_", ""] {
+        let files = in_columns(first);
+        assert_m(&rows(&folder, &files)[0], M, tolerance);
+        // The sheared distortions are converted like the others.
+        let line = format!("{files} --ellipticity distortion");
+        assert_m(&rows(&folder, &line)[0], M, tolerance);
+        let line = format!("bias {files} --ellipticity responsivity");
+        folder.refuses(&line, "this response is not used");
+    }
+}
+
+#[test]
+fn measured_shears_are_not_taken_for_true_ones() {
+    let folder = Folder::new();
+    let table = |name: &str, head: &str, g: fn(f64, f64) -> f64| {
+        let mut normal = normal(5);
+        let mut text = format!("e1,e2,{head}\n");
+        for _ in 0..GALAXIES {
+            let ([e1, e2], [n1, n2]) = (normal.pair(0.25), normal.pair(0.03));
+            writeln!(text, "{},{},{},{}", e1 + n1, e2 + n2, g(e1, n1), g(e2, n2)).unwrap();
+        }
+        folder.write(name, text);
+    };
+    table("a.csv", "gamma1,gamma2", |e, n| (e + n) / 1.35);
+    folder.refuses("bias a.csv", "look like measured shears[..]g1=none,g2=none");
+    table("b.csv", "g1,g2", |e, n| 0.9 * e - n);
+    folder.refuses("bias b.csv", "look like measured shears");
+    assert!(rows(&folder, "b.csv --columns g1=none,g2=none")[0]["m1"].is_null());
+    // Stated by the user, or scattering like true shears.
+    let stated = rows(&folder, "b.csv --columns g1=g1,g2=g2");
+    assert!(stated[0]["m1"].is_number());
+    table("c.csv", "gamma1,gamma2", |_, n| n);
+    assert!(rows(&folder, "c.csv")[0]["m1"].is_number());
+}
+
+#[test]
+fn catalogues_of_one_list_have_the_same_columns() {
+    let folder = Folder::new();
+    let table = |name: &str, head: &str| {
+        let mut text = format!("{head}\n");
+        for (id, galaxy) in galaxies(3, [0.02; 2]).iter().enumerate() {
+            let values = head.split(',').map(|name| match name {
+                "id" | "seed" => id as f64,
+                "e1" | "e_1" => galaxy[0][0],
+                "e2" | "e_2" => galaxy[0][1],
+                "flag" => f64::from(u8::from(id % 10 == 0)),
+                "psf_e1" | "psf_e2" => 0.01 * (id % 7) as f64,
+                _ => 1.0 + (id % 3) as f64,
+            });
+            let values: Vec<String> = values.map(|own| own.to_string()).collect();
+            text += &(values.join(",") + "\n");
+        }
+        folder.write(name, text);
+    };
+    table("plain.csv", "id,e1,e2");
+    folder.write(
+        "t.csv",
+        "catalogue,g1,g2\nplain.csv,0.02,0.02\nother.csv,-0.02,-0.02\n",
+    );
+    for (head, role) in [
+        ("id,e1,e2,w", "w"),
+        ("id,e1,e2,R11,R22", "R11"),
+        ("id,e1,e2,flag", "flag"),
+        ("e1,e2", "id"),
+        ("id,e_1,e_2", "e1"),
+        ("id,e1,e2,psf_e1,psf_e2", "psf_e1"),
+        ("id,e1,e2,seed", "units"),
+    ] {
+        table("other.csv", head);
+        let expected = format!("not the columns of plain.csv (found `[..]` for {role}, expected");
+        let list = "bias plain.csv other.csv --truth t.csv";
+        folder.refuses(list, &expected);
+    }
+}
+
+#[test]
+fn repeated_rows_values_and_identifiers_are_named() {
+    let folder = Folder::new();
+    let all = |_: usize| 1;
+    let notes = |copies: &dyn Fn(usize) -> usize, id: &dyn Fn(usize) -> usize, zero: usize| {
+        let files = pair(&folder, "c", 0.02, |g, _| {
+            let mut text = "id,e1,e2,g1,g2\n".to_owned();
+            for (row, [[e1, e2], _]) in galaxies(3, [g; 2]).into_iter().enumerate() {
+                let (e1, e2) = if row < zero { (0.0, 0.0) } else { (e1, e2) };
+                for _ in 0..copies(row) {
+                    writeln!(text, "{},{e1},{e2},{g},{g}", id(row)).unwrap();
+                }
+            }
+            text
+        });
+        folder.json(&format!("bias {files}"))["notes"].to_string()
+    };
+    let plain = notes(&all, &|row| row, 0);
+    assert!(!plain.contains("Repeated"), "{plain}");
+    assert_has(
+        &notes(&all, &|row| row, 100),
+        "Repeated values: `e1` and `e2` are exactly 0 and 0 in 200 of 4000 rows",
+    );
+    assert_has(
+        &notes(&|_| 4, &|row| row, 0),
+        "Repeated rows: 12000 of 16000",
+    );
+    assert_has(
+        &notes(&all, &|row| row / 2, 0),
+        "Repeated identifiers: 2000 of 4000",
+    );
+    let half = notes(&all, &|row| if row % 2 == 0 { 0 } else { row }, 0);
+    assert_has(&half, "Repeated identifiers: 1998 of 4000");
+}
+
+#[test]
+fn formulas_and_bits_of_flags_make_columns() {
+    let folder = Folder::new();
+    let files = pair(&folder, "q", 0.02, |g, _| {
+        let mut text = "P,Q1,Q2,bits,g1,g2\n".to_owned();
+        for (row, [[e1, e2], _]) in galaxies(3, [g; 2]).into_iter().enumerate() {
+            let (p, bad) = (1.0 + (row % 5) as f64, row % 10 == 0);
+            let shift = if bad { 1.0 } else { 0.0 };
+            let bits = if bad { 6 } else { 8 * (row % 2) };
+            writeln!(text, "{p},{},{},{bits},{g},{g}", (e1 + shift) * p, -e2 * p).unwrap();
+        }
+        text
+    });
+    let line = format!("{files} --columns 'e1=Q1/P,e2=-Q2/P,flag=bits & 4'");
+    let expected = [0, 1].map(|k| 0.8 * (1.0 + M[k]) - 1.0);
+    assert_m(&rows(&folder, &line)[0], expected, 1e-9);
+    let line = format!("bias {files} --columns e1=Q1/R,e2=Q2");
+    folder.refuses(&line, "there is no column `R`");
+}

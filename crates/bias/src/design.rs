@@ -91,6 +91,15 @@ pub struct Catalogue {
     /// Pairs of numbers that many rows share exactly.
     #[serde(default)]
     pub repeated: Vec<Repeated>,
+    /// Rows that have the numbers of an earlier row, if these are not few.
+    #[serde(default)]
+    pub copies: u64,
+    /// Rows that have the identifier of an earlier row, if these are not few.
+    #[serde(default)]
+    pub shared_identifiers: u64,
+    /// A sum over the rows that count that no other galaxies have; 0 without rows.
+    #[serde(default)]
+    pub content: u64,
     /// A row with much of the response.
     #[serde(default)]
     pub dominant: Option<Dominant>,

@@ -5,20 +5,32 @@ use std::path::Path;
 
 use shearq_bias::SHEARED_CATALOGUES;
 use shearq_files::{FileError, names_of};
+use shearq_submissions::EllipticityType;
 
-use crate::expression::fits;
+use crate::recognition::{Patterns, Survey, fits_any, recognition};
 use crate::shapes::refuse_divided;
 
 /// How ellipticities become shears.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Shapes {
-    /// They are shears (1 − q)/(1 + q).
+    /// They are shears (1 − q)/(1 + q), or of any type and divided by their response.
     Shear,
     /// Distortions (1 − q²)/(1 + q²), each converted to a shear. Moduli above 1 have none and are left out.
     Converted,
     /// Distortions, whose mean is divided by 2ℛ. ℛ = 1 − ⟨w e_rms²⟩/⟨w⟩ with the standard deviation e_rms of a component
     /// (Bernstein & Jarvis 2002, equation 5.33; Mandelbaum et al. 2018, equation 10).
     Responsivity,
+}
+
+impl Shapes {
+    /// Its name in `--ellipticity`.
+    pub fn name(self) -> &'static str {
+        match self {
+            Shapes::Shear => "shear",
+            Shapes::Converted => "distortion",
+            Shapes::Responsivity => "responsivity",
+        }
+    }
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -57,7 +69,7 @@ pub enum Role {
     /// Operands of `--where`, and of `--bins`.
     Condition,
     Binned,
-    /// Columns of [`CUT_COLUMNS`] that no condition names.
+    /// Columns of cuts that no condition names.
     Choice,
     /// Flags of failed measurements of sheared catalogues.
     ShearedFailure,
@@ -82,39 +94,32 @@ pub fn sheared_pair(of: usize, sheared: usize) -> [Key; 2] {
     [(role, 1 + 2 * sheared), (role, 2 + 2 * sheared)]
 }
 
-// In the order of `Role`s: the role, its name in --columns, the role without which it is incomplete, and the names of
-// columns that are recognised in any case, the preferred one first. χ marks ellipticities that are distortions: GalSim's
-// and LSST's HSM documents e = (1 − q²)/(1 + q²) for all its methods but KSB.
-#[rustfmt::skip]
-const TABLE: [(Role, &str, Option<Role>, &str); 24] = [
-    (Role::E1, "e1", Some(Role::E2), "e1 e_1 e1_noshear g1_noshear g[0] ngmix_ell_noshear[0] wmom_g_1 wmom_g1 gauss_g1 \
-        pgauss_g1 gauss_g_1 pgauss_g_1 mdet_g_1 mcal_g_1 fpfs_e1 fpfs1_e1 χregauss_e1 χcorrected_e1 \
-        χext_shapehsm_hsmshaperegauss_e1 corrected_g1"),
-    (Role::E2, "e2", Some(Role::E1), "e2 e_2 e2_noshear g2_noshear g[1] ngmix_ell_noshear[1] wmom_g_2 wmom_g2 gauss_g2 \
-        pgauss_g2 gauss_g_2 pgauss_g_2 mdet_g_2 mcal_g_2 fpfs_e2 fpfs1_e2 χregauss_e2 χcorrected_e2 \
-        χext_shapehsm_hsmshaperegauss_e2 corrected_g2"),
-    (Role::Weight, "w", None, "w weight weights wt shear_weight wdet wsel fpfs_w"),
-    (Role::R11, "R11", Some(Role::R22), "r11 de1_dg1 e1_g1 fpfs_de1_dg1 fpfs1_de1_dg1 r_11 mcal_r11"),
-    (Role::R22, "R22", Some(Role::R11), "r22 de2_dg2 e2_g2 fpfs_de2_dg2 fpfs1_de2_dg2 r_22 mcal_r22"),
-    (Role::R12, "R12", Some(Role::R21), "r12 de1_dg2 e1_g2 fpfs_de1_dg2 fpfs1_de1_dg2 r_12 mcal_r12"),
-    (Role::R21, "R21", Some(Role::R12), "r21 de2_dg1 e2_g1 fpfs_de2_dg1 fpfs1_de2_dg1 r_21 mcal_r21"),
-    (Role::Dw1, "dw1", Some(Role::Dw2), "dw_dg1 w_g1 dweight_dg1 dwdet_dg1 wdet_g1 dwsel_dg1 wsel_g1 fpfs_dw_dg1 weight_dg1"),
-    (Role::Dw2, "dw2", Some(Role::Dw1), "dw_dg2 w_g2 dweight_dg2 dwdet_dg2 wdet_g2 dwsel_dg2 wsel_g2 fpfs_dw_dg2 weight_dg2"),
-    (Role::RmsE, "rms_e", None, "rms_e"),
-    (Role::SigmaE, "sigma_e", None, "sigma_e"),
-    (Role::KsbE1, "ksb_e1", Some(Role::KsbE2), "corrected_g1"),
-    (Role::KsbE2, "ksb_e2", Some(Role::KsbE1), "corrected_g2"),
-    (Role::Flag, "flag", None, "flag flags flags_select wmom_flags mdet_flags ext_shapehsm_hsmshaperegauss_flag error_flag"),
-    (Role::G1, "g1", Some(Role::G2), "g1 g1_true true_g1 g1_truth gamma1 shear1"),
-    (Role::G2, "g2", Some(Role::G1), "g2 g2_true true_g2 g2_truth gamma2 shear2"),
-    (Role::Psf1, "psf_e1", None, "psf_e1 e1_psf psf_g1 g1_psf psf_g_1 psfrec_g_1"),
-    (Role::Psf2, "psf_e2", None, "psf_e2 e2_psf psf_g2 g2_psf psf_g_2 psfrec_g_2"),
-    (Role::PsfSize, "psf_size", None, "psf_size psf_t t_psf psf_fwhm psf_sigma psfrec_t"),
-    (Role::Id, "id", None, "id galaxy_id gal_id object_id objectid coadd_object_id coadd_objects_id source_id number"),
-    (Role::X, "x", None, "x x_image xwin_image x_pix"),
-    (Role::Y, "y", None, "y y_image ywin_image y_pix"),
-    (Role::Unit, "unit", None, "pair pair_id seed patch"),
-    (Role::ShearedCatalogue, "version", None, "mdet_step metastep shear_type metacal_step shear"),
+// In the order of `Role`s: the role, its name in --columns, and the role without which it is incomplete.
+const TABLE: [(Role, &str, Option<Role>); 24] = [
+    (Role::E1, "e1", Some(Role::E2)),
+    (Role::E2, "e2", Some(Role::E1)),
+    (Role::Weight, "w", None),
+    (Role::R11, "R11", Some(Role::R22)),
+    (Role::R22, "R22", Some(Role::R11)),
+    (Role::R12, "R12", Some(Role::R21)),
+    (Role::R21, "R21", Some(Role::R12)),
+    (Role::Dw1, "dw1", Some(Role::Dw2)),
+    (Role::Dw2, "dw2", Some(Role::Dw1)),
+    (Role::RmsE, "rms_e", None),
+    (Role::SigmaE, "sigma_e", None),
+    (Role::KsbE1, "ksb_e1", Some(Role::KsbE2)),
+    (Role::KsbE2, "ksb_e2", Some(Role::KsbE1)),
+    (Role::Flag, "flag", None),
+    (Role::G1, "g1", Some(Role::G2)),
+    (Role::G2, "g2", Some(Role::G1)),
+    (Role::Psf1, "psf_e1", None),
+    (Role::Psf2, "psf_e2", None),
+    (Role::PsfSize, "psf_size", None),
+    (Role::Id, "id", None),
+    (Role::X, "x", None),
+    (Role::Y, "y", None),
+    (Role::Unit, "unit", None),
+    (Role::ShearedCatalogue, "version", None),
 ];
 
 // All columns that `--columns` can name, in its order: the roles, then ellipticities under artificial shears of the own
@@ -137,13 +142,13 @@ pub fn role_names() -> String {
     keys().map(name_of).collect::<Vec<_>>().join(", ")
 }
 
-fn named(name: &str) -> Option<Key> {
+pub fn named(name: &str) -> Option<Key> {
     keys().find(|key| name_of(*key) == name)
 }
 
 pub fn names_of_role(role: Role) -> impl Iterator<Item = &'static str> {
-    let names = TABLE[role as usize].3.split_whitespace();
-    names.map(|name| name.trim_start_matches('χ'))
+    let names = recognition().names.get(TABLE[role as usize].1);
+    names.into_iter().flatten().map(String::as_str)
 }
 
 fn recognised((role, catalogue): Key) -> Vec<String> {
@@ -178,99 +183,9 @@ fn diagonal((role, catalogue): Key) -> Option<Key> {
     }
 }
 
-// Whether the name of e1, in small letters, says that it is a distortion.
-fn is_distortion(e1: &str) -> bool {
-    let mut names = TABLE[Role::E1 as usize].3.split_whitespace();
-    names.any(|name| name.strip_prefix('χ') == Some(e1))
-}
-
-// A public catalogue or a program's output, whose columns are known by its documentation.
-struct Survey {
-    name: &'static str,
-    distortion: bool,
-    // The columns by role, in any case. The catalogue must have e1, e2 and the columns with a plus; others may be absent.
-    // `none` for a role that has no column although a general name is there.
-    columns: &'static str,
-}
-
-const fn survey(name: &'static str, distortion: bool, columns: &'static str) -> Survey {
-    Survey {
-        name,
-        distortion,
-        columns,
-    }
-}
-
-const SHEAR: bool = false;
-const DISTORTION: bool = true;
-
-// From the column lists in tests/data/columns. The first that fits is used. Regauss of HSC and LSST are distortions; their
-// columns of a calibration of the shear bias (`derived_shear_bias_m`, `_c1`, `_c2`) have no role, because m and c are to be
-// found before it.
-#[rustfmt::skip]
-const SURVEYS: [Survey; 23] = [
-    survey("KiDS, internal", SHEAR, "e1=autocal_e1_A e2=autocal_e2_A w=recal_weight_A psf_e1=PSF_e1 psf_e2=PSF_e2"),
-    survey("KV450", SHEAR, "e1=bias_corrected_e1 e2=bias_corrected_e2 w=recal_weight psf_e1=PSF_e1 psf_e2=PSF_e2"),
-    survey("KiDS", SHEAR, "e1=e1 e2=e2 +w=weight +model_SNratio psf_e1=PSF_e1 psf_e2=PSF_e2"),
-    survey("HSC Y1", DISTORTION, "e1=ishape_hsm_regauss_e1 e2=ishape_hsm_regauss_e2 \
-        w=ishape_hsm_regauss_derived_shape_weight rms_e=ishape_hsm_regauss_derived_rms_e flag=ishape_hsm_regauss_flags"),
-    survey("HSC Y1", DISTORTION, "e1=ishape_hsm_regauss_e1 e2=ishape_hsm_regauss_e2 w=ishape_hsm_regauss_derived_weight \
-        rms_e=ishape_hsm_regauss_derived_rms_e flag=ishape_hsm_regauss_flags"),
-    // Any of the two derived columns: LSST has neither, and its table of objects the same names of ellipticities.
-    survey("HSC Y3", DISTORTION, "e1=i_hsmshaperegauss_e1 e2=i_hsmshaperegauss_e2 +w=i_hsmshaperegauss_derived_weight \
-        rms_e=i_hsmshaperegauss_derived_rms_e flag=i_hsmshaperegauss_flag"),
-    survey("HSC Y3", DISTORTION, "e1=i_hsmshaperegauss_e1 e2=i_hsmshaperegauss_e2 \
-        +rms_e=i_hsmshaperegauss_derived_rms_e flag=i_hsmshaperegauss_flag"),
-    survey("LSST", DISTORTION, "e1=i_hsmShapeRegauss_e1 e2=i_hsmShapeRegauss_e2 flag=i_hsmShapeRegauss_flag"),
-    survey("LSST", DISTORTION, "e1=r_hsmShapeRegauss_e1 e2=r_hsmShapeRegauss_e2 flag=r_hsmShapeRegauss_flag"),
-    survey("LSST", DISTORTION, "e1=ext_shapeHSM_HsmShapeRegauss_e1 e2=ext_shapeHSM_HsmShapeRegauss_e2 \
-        flag=ext_shapeHSM_HsmShapeRegauss_flag"),
-    survey("DES Y1", SHEAR, "e1=e1 e2=e2 +R11=R11 R22=R22 R12=R12 R21=R21 +flag=flags_select id=coadd_objects_id"),
-    survey("DES Y3", SHEAR, "e1=e_1 e2=e_2 +R11=R11 R22=R22 R12=R12 R21=R21 w=weight flag=flags"),
-    survey("DES Y6", SHEAR, "e1=gauss_g_1 e2=gauss_g_2 +version=mdet_step w=w flag=mdet_flags"),
-    survey("metadetect", SHEAR, "e1=wmom_g_1 e2=wmom_g_2 +version=shear flag=wmom_flags psf_e1=psfrec_g_1 psf_e2=psfrec_g_2"),
-    // Already divided by the mean response.
-    survey("UNIONS", SHEAR, "e1=e1 e2=e2 +w=w_des R11=none R22=none psf_e1=e1_PSF psf_e2=e2_PSF"),
-    survey("UNIONS", SHEAR, "e1=e1 e2=e2 +w=w_iv R11=none R22=none psf_e1=e1_PSF psf_e2=e2_PSF"),
-    survey("UNIONS, uncalibrated", SHEAR, "e1=e1_uncal e2=e2_uncal R11=R_g11 R12=R_g12 R21=R_g21 R22=R_g22 w=w_des \
-        psf_e1=e1_PSF psf_e2=e2_PSF"),
-    survey("ShapePipe", SHEAR, "e1=NGMIX_G1_NOSHEAR e2=NGMIX_G2_NOSHEAR flag=NGMIX_MCAL_FLAGS e1_1p=NGMIX_G1_1P \
-        e1_1m=NGMIX_G1_1M e2_2p=NGMIX_G2_2P e2_2m=NGMIX_G2_2M e1_2p=NGMIX_G1_2P e1_2m=NGMIX_G1_2M e2_1p=NGMIX_G2_1P \
-        e2_1m=NGMIX_G2_1M"),
-    survey("Euclid, LensMC", SHEAR, "e1=SHE_LENSMC_E1 e2=SHE_LENSMC_E2 w=SHE_LENSMC_WEIGHT"),
-    survey("TXPipe", SHEAR, "e1=mcal_g1 e2=mcal_g2 flag=mcal_flags psf_e1=mcal_psf_g1 psf_e2=mcal_psf_g2 e1_1p=mcal_g1_1p \
-        e1_1m=mcal_g1_1m e2_2p=mcal_g2_2p e2_2m=mcal_g2_2m e1_2p=mcal_g1_2p e1_2m=mcal_g1_2m e2_1p=mcal_g2_1p \
-        e2_1m=mcal_g2_1m"),
-    // Shapes of a model by default; shapes of FPFS have other responses. The weight of the selection contains the weight of
-    // the detection.
-    survey("AnaCal task", SHEAR, "e1=e1 e2=e2 +fpfs_e1 +R11=de1_dg1 R12=de1_dg2 R21=de2_dg1 R22=de2_dg2 +w=wsel \
-        dw1=dwsel_dg1 dw2=dwsel_dg2"),
-    survey("AnaCal task", SHEAR, "e1=e1 e2=e2 +fpfs_e1 +R11=de1_dg1 R12=de1_dg2 R21=de2_dg1 R22=de2_dg2 w=wdet dw1=dwdet_dg1 \
-        dw2=dwdet_dg2"),
-    survey("AnaCal FPFS", SHEAR, "e1=fpfs_e1 e2=fpfs_e2 R11=fpfs_de1_dg1 R12=fpfs_de1_dg2 R21=fpfs_de2_dg1 R22=fpfs_de2_dg2 \
-        +w=wsel dw1=dwsel_dg1 dw2=dwsel_dg2"),
-];
-
 impl Survey {
-    // Each column with its role, and whether the catalogue must have it.
-    fn parts(&self) -> impl Iterator<Item = (Option<Key>, &'static str, bool)> {
-        self.columns.split(' ').map(|part| {
-            let (required, part) = match part.strip_prefix('+') {
-                Some(part) => (true, part),
-                None => (false, part),
-            };
-            let (role, column) = part.split_once('=').unwrap_or(("", part));
-            (
-                named(role),
-                column,
-                required || ["e1", "e2"].contains(&role),
-            )
-        })
-    }
-
-    fn of(&self, key: Key) -> Option<&'static str> {
-        let mut parts = self.parts();
-        parts.find_map(|(own, column, _)| (own == Some(key)).then_some(column))
+    fn of(&self, key: Key) -> Option<&str> {
+        self.columns.get(&key).map(String::as_str)
     }
 
     // Whether a catalogue with the columns `found` is of this survey. Names of e1 and e2 that the user gives must be the
@@ -279,65 +194,55 @@ impl Survey {
     fn is_of(&self, found: &[String], names: &Names) -> bool {
         const WEIGHT: Key = (Role::Weight, 0);
         let there = |column: &str| found.iter().any(|own| own.eq_ignore_ascii_case(column));
+        let own_weight = self.of(WEIGHT);
+        let is_own_weight = |own: &str| Some(own) == own_weight;
         let is_renamed = names.is_given(Role::Weight)
             && self
-                .parts()
-                .any(|(key, column, required)| key == Some(WEIGHT) && required && !there(column));
-        self.parts().all(|(key, column, required)| {
-            match (key, key.and_then(|key| names.0.get(&key))) {
-                (Some((Role::E1 | Role::E2, 0)), Some(given)) => given.eq_ignore_ascii_case(column),
-                (Some(WEIGHT), _) if is_renamed => true,
-                // `none` is no column.
-                _ => !(required || is_renamed) || there(column),
-            }
-        })
+                .required
+                .iter()
+                .any(|own| is_own_weight(own) && !there(own));
+        let known = |key: &Key, column: &str| match (key, names.given.get(key)) {
+            ((Role::E1 | Role::E2, 0), Some(given)) => given.eq_ignore_ascii_case(column),
+            ((Role::E1 | Role::E2, 0), None) => there(column),
+            (key, _) => !is_renamed || *key == WEIGHT || there(column),
+        };
+        let mut columns = self.columns.iter();
+        let mut required = self.required.iter();
+        columns.all(|(key, column)| known(key, column))
+            && required.all(|own| there(own) || is_renamed && is_own_weight(own))
     }
 }
 
-// Columns that state which rows count, and whether rows of value 1 do. Rows in the overlap of tiles occur twice; stars and
-// blends that were not separated have no shape of a galaxy.
-const CUT_COLUMNS: [(&str, bool); 7] = [
-    ("is_primary", true),
-    ("is_inner", true),
-    ("primary", true),
-    ("inner", true),
-    ("detect_isprimary", true),
-    ("deblend_failed", false),
-    ("refextendedness", true),
-];
-
-/// Whether rows count that have 1 in a column of this name, rather than 0; `None` for a column that makes no choice.
+// Whether rows count that have 1 in a column of this name, rather than 0; `None` for a column that makes no choice.
 pub fn counted_value(name: &str) -> Option<bool> {
-    let mut known = CUT_COLUMNS.iter();
-    let known = known.find(|(known, _)| known.eq_ignore_ascii_case(name))?;
-    Some(known.1)
+    let known = recognition().cuts.get(&name.to_ascii_lowercase())?;
+    Some(*known)
 }
-
-// Names of weights of shapes, in small letters and between underscores: lensfit's, sums of weights, inverse variances, and the
-// coverage of drizzled and coadded images (`AUTO_WHT`), which is a weight where nothing better is known.
-const WEIGHTS: &str = "*weight* *_w_* *_wt_* *_wgt_* *_wht_* *_wtot_* *_sumw_* *_wsum_* *_ivar_* *_inv*var* *_inv*sig*2* \
-    *_precision_*";
-// Columns of real catalogues with such names that are no weights of shapes: derivatives and sheared catalogues, SExtractor's
-// FLAGS_WEIGHT, weighted means, numbers of weights, the dark energy w₀ of a mock catalogue, and the inverse variances of fluxes,
-// positions, redshifts and profiles, as in the Legacy Surveys. Weights by redshift are weights of galaxies in a mean shear.
-const NO_WEIGHTS: &str = "*_dg1_ *_dg2_ *_1p_ *_1m_ *_2p_ *_2m_ *flag* *mask* *weighted* _n_* _w_0_ *psf* *_star_* *flux* \
-    *_mag_* *redshift*var* *photoz*var* *photo_z*var* *_ra_* *_dec_* *pmra_* *pmdec_* *parallax* *sersic* *_shape_r_* *_z_ivar_*";
 
 /// Whether the name of a column suggests that it is a weight of shapes.
 pub fn looks_like_weight(name: &str) -> bool {
     // Elements of vectors have brackets: `ivar[0]`.
     let name = format!("_{}_", name.to_ascii_lowercase()).replace(['.', '-', ' ', '[', ']'], "_");
-    fits_any(WEIGHTS, &name) && !fits_any(NO_WEIGHTS, &name)
+    let Patterns {
+        weight, no_weight, ..
+    } = &recognition().patterns;
+    fits_any(weight, &name) && !fits_any(no_weight, &name)
 }
 
-// Calibrations of the shear, which m and c are to be found before.
-const CALIBRATIONS: &str = "*shear_bias*";
-// Names in small letters of derivatives, sheared catalogues, flags, responses and errors of shapes.
-const OTHER_ROLES: &str = "*_dg1 *_dg2 *_1p *_1m *_2p *_2m *flag* *mask* r11 r12 r21 r22 r_11 r_12 r_21 r_22 *_g11 *_g12 \
-    *_g21 *_g22 *_r11 *_r12 *_r21 *_r22 *response* *rms_e* *sigma_e* *regauss_sigma* *shape_err*";
-
 fn is_like_a_calibration(name: &str) -> bool {
-    fits_any(CALIBRATIONS, &name.to_ascii_lowercase())
+    fits_any(&recognition().patterns.calibration, name)
+}
+
+fn is_like_a_response(name: &str) -> bool {
+    let known = &recognition().patterns;
+    known.response_in_capitals.iter().any(|own| own == name)
+        || fits_any(&known.response, name) && !fits_any(&known.no_response, name)
+}
+
+// Whether the name of a column suggests that it states which rows are good.
+fn is_like_a_choice(name: &str) -> bool {
+    let Patterns { flag, choice, .. } = &recognition().patterns;
+    fits_any(flag, name) || fits_any(choice, name)
 }
 
 // Whether the name of a column suggests a role that changes the result.
@@ -345,12 +250,8 @@ fn is_like_a_role(name: &str) -> bool {
     counted_value(name).is_some()
         || looks_like_weight(name)
         || is_like_a_calibration(name)
-        || fits_any(OTHER_ROLES, &name.to_ascii_lowercase())
-}
-
-/// Whether a text has one of several patterns with blanks between them.
-pub fn fits_any(patterns: &str, text: &str) -> bool {
-    patterns.split(' ').any(|pattern| fits(pattern, text))
+        || is_like_a_response(name)
+        || is_like_a_choice(name)
 }
 
 fn same_name<'a>(found: &'a [String], name: &str) -> Option<&'a String> {
@@ -369,9 +270,12 @@ pub fn base(name: &str) -> &str {
     name.strip_suffix("_noshear").unwrap_or(name)
 }
 
-/// Columns that were given for roles, or `none`.
+/// Columns that were given for roles, or `none`, and surveys that were described.
 #[derive(Debug, Clone, Default)]
-pub struct Names(BTreeMap<Key, String>);
+pub struct Names {
+    given: BTreeMap<Key, String>,
+    presets: Vec<Survey>,
+}
 
 /// Why `--columns` cannot be used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -399,30 +303,41 @@ impl Names {
         let is_recognised = |key: &Key| recognised(*key).iter().any(|own| own == role);
         let key = named(role).or_else(|| keys().find(is_recognised));
         let key = key.ok_or_else(|| NameError::Role(role.to_owned()))?;
-        match self.0.insert(key, column.to_owned()) {
+        match self.given.insert(key, column.to_owned()) {
             Some(_) => Err(NameError::Twice(role.to_owned())),
             None => Ok(()),
         }
     }
 
+    /// Adds surveys, which are preferred to the known ones.
+    pub fn add_presets(&mut self, surveys: Vec<Survey>) {
+        self.presets.extend(surveys);
+    }
+
+    /// The columns and formulas that were given.
+    pub fn columns(&self) -> impl Iterator<Item = (Role, &str)> {
+        let given = self.given.iter();
+        given.map(|((role, _), column)| (*role, column.as_str()))
+    }
+
     /// Whether the responses of each component to the other one are not to be used, in columns or by sheared catalogues.
     pub fn decline_matrix(&self) -> bool {
         let mut roles = [Role::R12, Role::R21].into_iter();
-        roles.any(|role| self.0.get(&(role, 0)).is_some_and(|own| own == "none"))
+        roles.any(|role| self.given.get(&(role, 0)).is_some_and(|own| own == "none"))
     }
 
     fn key_of(&self, column: &str) -> Option<Key> {
-        let mut given = self.0.iter();
+        let mut given = self.given.iter();
         given.find_map(|(key, own)| (own == column && own != "none").then_some(*key))
     }
 
     pub fn is_given(&self, role: Role) -> bool {
-        self.0.contains_key(&(role, 0))
+        self.given.contains_key(&(role, 0))
     }
 
     // Refuses a column with two roles: measured shears that are also the true ones have m = 0.
     fn check_single_roles(&self, path: &Path) -> Result<(), FileError> {
-        for (key, column) in &self.0 {
+        for (key, column) in &self.given {
             let first = self.key_of(column).unwrap_or(*key);
             if first != *key && !SHARED.contains(&[first.0, key.0]) {
                 let (first, role) = (name_of(first), name_of(*key));
@@ -443,7 +358,7 @@ impl Names {
             return Ok(());
         }
         for name in [Role::G1, Role::G2].into_iter().flat_map(names_of_role) {
-            let mut given = self.0.iter();
+            let mut given = self.given.iter();
             if let Some((key, _)) = given.find(|(_, own)| own.eq_ignore_ascii_case(name)) {
                 return Err(FileError::new(
                     path,
@@ -502,7 +417,7 @@ impl Preset {
         match self {
             Preset::Plain => "plain columns",
             Preset::Shearq => "shearq",
-            Preset::Sheared => "shearq, sheared versions",
+            Preset::Sheared => "shearq, sheared catalogues",
             Preset::Hsm => "HSM",
             Preset::Metacal => "ngmix metacal",
             Preset::Metadetect => "metadetect",
@@ -516,7 +431,7 @@ pub struct Columns {
     columns: BTreeMap<Key, String>,
     pub preset: Preset,
     /// The public catalogue or the output of a program that its columns are known from.
-    survey: Option<&'static str>,
+    survey: Option<String>,
     /// Whether the names say that ellipticities are distortions.
     pub distortion: bool,
     /// Columns that look like a weight, if none has this role and it was not declined.
@@ -534,7 +449,8 @@ impl Columns {
     /// Finds the columns of the catalogue `path`, which has the columns `found`.
     pub fn find(path: &Path, found: &[String], names: &Names) -> Result<Self, FileError> {
         names.check_single_roles(path)?;
-        let survey = SURVEYS.iter().find(|survey| survey.is_of(found, names));
+        let mut surveys = names.presets.iter().chain(&recognition().surveys);
+        let survey = surveys.find(|survey| survey.is_of(found, names));
         // A column called g1 that is given as e1 is not the true shear, too.
         let free = |name: &str| {
             let vector = in_vector(name);
@@ -549,7 +465,10 @@ impl Columns {
         };
         let mut columns = BTreeMap::new();
         for key in keys().filter(|(role, _)| *role != Role::Flag) {
-            let column = match (names.0.get(&key), survey.and_then(|survey| survey.of(key))) {
+            let column = match (
+                names.given.get(&key),
+                survey.and_then(|survey| survey.of(key)),
+            ) {
                 (Some(none), _) if none == "none" => None,
                 (Some(given), _) if found.contains(given) => Some(given),
                 (Some(given), _) => return Err(FileError::no_column(path, given, found)),
@@ -566,6 +485,11 @@ impl Columns {
         // A role without its partner is refused below, so KSB's shears are forgotten without distortions.
         // HSM has both in one table: shears of KSB, and distortions of all other methods.
         if name_of_e1(&columns).is_none_or(|e1| e1 != "corrected_e1") {
+            columns.retain(|(role, _), _| ![Role::KsbE1, Role::KsbE2].contains(role));
+        }
+        // Responses are those of the distortions, and no shear of KSB has one.
+        let has_response = columns.contains_key(&(Role::R11, 0));
+        if has_response || columns.contains_key(&(Role::ShearedCatalogue, 0)) {
             columns.retain(|(role, _), _| ![Role::KsbE1, Role::KsbE2].contains(role));
         }
         let flags = find_flags(path, found, names, survey, name_of_e1(&columns))?;
@@ -599,7 +523,8 @@ impl Columns {
                 ));
             }
         }
-        let distortion = is_distortion(&e1) || survey.is_some_and(|survey| survey.distortion);
+        let distortion = recognition().ellipticity.distortion.contains(&e1)
+            || survey.is_some_and(|survey| survey.ellipticity == EllipticityType::Distortion);
         let preset = Preset::of_columns(&columns, distortion || e1 == "corrected_g1", found);
         if preset == Preset::Shearq {
             refuse_divided(path, found)?;
@@ -607,7 +532,7 @@ impl Columns {
         let mut columns = Columns {
             columns,
             preset,
-            survey: survey.map(|survey| survey.name),
+            survey: survey.map(|survey| survey.name.clone()),
             distortion,
             doubtful_weights: Vec::new(),
             unused: Vec::new(),
@@ -642,8 +567,7 @@ impl Columns {
             .filter_map(|name| counted_value(name).map(|_| (*name).clone()));
         let choices = choices.collect();
         if self.of(Role::ShearedCatalogue).is_none() && !names.is_given(Role::ShearedCatalogue) {
-            self.steps =
-                all(&|name| fits_any("*step* *shear_type* shear", &name.to_ascii_lowercase()));
+            self.steps = all(&|name| fits_any(&recognition().patterns.step, name));
         }
         if self.of(Role::Weight).is_none() && !names.is_given(Role::Weight) {
             self.doubtful_weights = all(&looks_like_weight);
@@ -653,18 +577,25 @@ impl Columns {
     }
 
     /// The public catalogue or the program that wrote it.
-    pub fn program(&self) -> &'static str {
-        self.survey.unwrap_or(self.preset.name())
+    pub fn program(&self) -> &str {
+        self.survey.as_deref().unwrap_or(self.preset.name())
     }
 
     /// Each column that is used, as in `--columns`. Roles that are not `read` are left out.
     pub fn used(&self, read: impl Fn(Role) -> bool) -> String {
+        let roles = self.roles(read).into_iter();
+        let named = roles.map(|(role, column)| format!("{role}={column}"));
+        named.collect::<Vec<_>>().join(", ")
+    }
+
+    /// The roles that are `read`, by their names in `--columns`, with their columns.
+    pub fn roles(&self, read: impl Fn(Role) -> bool) -> Vec<(String, String)> {
         let used = keys().filter(|key| read(key.0) && self.columns.contains_key(key));
         let named = used.map(|key| match key.0 {
-            Role::Flag => format!("flag={}", self.flags.join("+")),
-            _ => format!("{}={}", name_of(key), self.columns[&key]),
+            Role::Flag => (name_of(key), self.flags.join("+")),
+            _ => (name_of(key), self.columns[&key].clone()),
         });
-        named.collect::<Vec<_>>().join(", ")
+        named.collect()
     }
 
     /// Columns that look like one of a role but have none, unless they are `read` for another reason.
@@ -672,7 +603,7 @@ impl Columns {
         let unused = self.unused.iter().filter(|name| !read.contains(name));
         let unused: Vec<&String> = unused.collect();
         let calibration = match unused.iter().find(|name| is_like_a_calibration(name)) {
-            Some(name) => format!(" m and c are those before the calibration by `{name}`."),
+            Some(name) => format!(" m and c are those before a calibration by `{name}`."),
             None => String::new(),
         };
         (!unused.is_empty()).then(|| {
@@ -680,6 +611,20 @@ impl Columns {
                 "Not used: {}. Try: --columns ROLE=NAME if the result needs one.{calibration}",
                 names_of(&unused)
             )
+        })
+    }
+
+    /// Forgets the column of identifiers.
+    pub fn decline_identity(&mut self) {
+        self.columns.remove(&(Role::Id, 0));
+    }
+
+    /// What excludes rows by a column that looks like a flag or a choice and is not used.
+    pub fn remedy_of_choice(&self) -> Option<String> {
+        let name = self.unused.iter().find(|name| is_like_a_choice(name))?;
+        Some(match fits_any(&recognition().patterns.flag, name) {
+            true => format!("--columns flag={name} if it is 0 in good rows"),
+            false => format!("--where {name} if it is true in good rows"),
         })
     }
 
@@ -756,7 +701,7 @@ fn find_sheared(columns: &mut BTreeMap<Key, String>, found: &[String], names: &N
         let sheared = (1..CATALOGUES).map(|catalogue| sheared_column(found, &name, catalogue));
         let sheared: Option<Vec<_>> = sheared.collect();
         for (catalogue, column) in (1..).zip(sheared.into_iter().flatten()) {
-            if !names.0.contains_key(&(role, catalogue)) {
+            if !names.given.contains_key(&(role, catalogue)) {
                 let own = columns.entry((role, catalogue));
                 own.or_insert_with(|| column.clone());
             }
@@ -773,7 +718,7 @@ fn find_flags(
     survey: Option<&Survey>,
     e1: Option<String>,
 ) -> Result<Vec<String>, FileError> {
-    match names.0.get(&(Role::Flag, 0)) {
+    match names.given.get(&(Role::Flag, 0)) {
         None => {}
         Some(none) if none == "none" => return Ok(Vec::new()),
         Some(given) if found.contains(given) => return Ok(vec![given.clone()]),
@@ -992,7 +937,80 @@ mod tests {
         assert_eq!(several.doubtful_weights, ["wht", "ivar"]);
         let declined = found("e1 e2 my_weight", &["w=none"]).unwrap();
         assert!(declined.doubtful_weights.is_empty());
-        assert!(found("e1 e2 w mag T", &[]).unwrap().unused(&[]).is_none());
+        let others =
+            "e1 e2 w mag T r z respond_id correspondence ra flux1 size sersic_r1 snr chi2 mode";
+        let unused = found(others, &[]).unwrap().unused(&[]);
+        assert!(
+            unused
+                .clone()
+                .is_none_or(|own| own.starts_with("Not used: respond_id.")),
+            "{unused:?}"
+        );
+        for name in [
+            "Resp11",
+            "resp1",
+            "R1",
+            "Rg1",
+            "e1_resp",
+            "de1dg1",
+            "R",
+            "vis_det",
+            "FIT_CLASS",
+            "good",
+            "is_star",
+            "shape_select",
+            "m",
+            "m1",
+            "c1",
+            "m11",
+            "e1_corrected",
+            "w_1p",
+            "BadFlag",
+            "b_mode_mask",
+        ] {
+            let columns = found(&format!("e1 e2 w {name}"), &[]).unwrap();
+            let unused = columns.unused(&[]).unwrap_or_default();
+            assert!(
+                unused.contains(&format!("Not used: {name}.")),
+                "{name}: {unused}"
+            );
+        }
+        let flagged = found("e1 e2 w BadFlag", &[]).unwrap().remedy_of_choice();
+        assert_eq!(
+            flagged.unwrap(),
+            "--columns flag=BadFlag if it is 0 in good rows"
+        );
+    }
+
+    #[test]
+    fn a_weight_alone_is_no_survey() {
+        for weight in ["w_des", "w_iv"] {
+            let own = found(&format!("e1 e2 {weight} R11 R22"), &[]).unwrap();
+            assert_eq!(
+                (own.program(), own.of(Role::R11)),
+                ("plain columns", Some("R11"))
+            );
+            assert_eq!(own.doubtful_weights, [weight]);
+        }
+    }
+
+    #[test]
+    fn surveys_of_the_user_come_first() {
+        let text = "[[survey]]\nname = \"Own\"\n[survey.columns]\ne1 = \"e1\"\ne2 = \"e2\"\nw = \"wl\"\nR11 = \"none\"\n";
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("own.toml");
+        std::fs::write(&path, text).unwrap();
+        let mut names = Names::default();
+        names.add_presets(crate::recognition::read_presets(&path).unwrap());
+        let columns = ["e1", "e2", "w", "wl", "R22"].map(str::to_owned);
+        let found = Columns::find(Path::new("c"), &columns, &names);
+        // R22 has no partner, because the survey has no R11.
+        assert!(found.unwrap_err().to_string().contains("none for R11"));
+        let found = Columns::find(Path::new("c"), &columns[..4], &names).unwrap();
+        assert_eq!(
+            (found.program(), found.of(Role::Weight)),
+            ("Own", Some("wl"))
+        );
     }
 
     #[test]

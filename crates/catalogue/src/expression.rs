@@ -74,19 +74,21 @@ enum Node {
 
 type Binary = (&'static str, Operator);
 
-const FUNCTIONS: [(&str, Function); 6] = [
+const FUNCTIONS: [(&str, Function); 8] = [
     ("abs", f64::abs),
     ("sqrt", f64::sqrt),
     ("exp", f64::exp),
     ("log", f64::ln),
     ("log10", f64::log10),
+    ("cos", f64::cos),
+    ("sin", f64::sin),
     ("not", |a| compared(a, a, a == 0.0)),
 ];
 
 const POWER: Binary = ("^", f64::powf);
 
 // From the loosest to the tightest. Within a level the left one is applied first.
-const OPERATORS: [&[Binary]; 5] = [
+const OPERATORS: [&[Binary]; 6] = [
     &[("or", |a, b| {
         let certain = [a, b].iter().any(|own| *own != 0.0 && !own.is_nan());
         if certain { 1.0 } else { compared(a, b, false) }
@@ -104,12 +106,22 @@ const OPERATORS: [&[Binary]; 5] = [
         ("<", |a, b| compared(a, b, a < b)),
         (">", |a, b| compared(a, b, a > b)),
     ],
+    &[("&", common_bits)],
     &[("+", |a, b| a + b), ("-", |a, b| a - b)],
     &[("*", |a, b| a * b), ("/", |a, b| a / b)],
 ];
 
 fn truth(of: bool) -> f64 {
     f64::from(u8::from(of))
+}
+
+// The bits that two whole numbers have in common, as numpy's `&`. NaN of other numbers.
+fn common_bits(a: f64, b: f64) -> f64 {
+    let is_whole = |own: f64| own.fract() == 0.0;
+    match is_whole(a) && is_whole(b) {
+        true => (a as i64 & b as i64) as f64,
+        false => f64::NAN,
+    }
 }
 
 // NaN with a missing number: a row that neither holds nor fails a condition has to be noticed.
@@ -124,8 +136,9 @@ fn compared(a: f64, b: f64, holds: bool) -> f64 {
 const DEEPEST: usize = 100;
 
 impl Expression {
-    /// Parses an expression: numbers, columns, `+ - * / ^`, comparisons of numbers, `==` and `!=` of a column with a text
-    /// in quotation marks, `and`, `or`, and `abs`, `sqrt`, `exp`, `log`, `log10`, `not` of an expression in brackets.
+    /// Parses an expression: numbers, columns, `+ - * / ^`, `&` (the bits that whole numbers have in common), comparisons of
+    /// numbers, `==` and `!=` of a column with a text in quotation marks, `and`, `or`, and `abs`, `sqrt`, `exp`, `log`, `log10`,
+    /// `cos`, `sin` (of radians), `not` of an expression in brackets.
     pub fn parse(text: &str) -> Result<Self, ExpressionError> {
         let condition = Condition::parse(text)?;
         match condition.rows {
@@ -284,8 +297,8 @@ impl<'a> Parser<'a> {
         };
         let mut node = self.level(level + 1)?;
         while let Some(operator) = operators.iter().find(|(token, _)| self.take(token)) {
-            // The loosest three levels compare.
-            self.sharp |= level < 3;
+            // The loosest three levels compare, and bits jump.
+            self.sharp |= level < 4;
             let right = self.level(level + 1)?;
             node = Node::Binary(operator, Box::new(node), Box::new(right));
         }
@@ -497,6 +510,11 @@ mod tests {
         assert_eq!(value("2e-3*10", &[]), 0.02);
         assert_eq!(value("2e-3-1e+2+.5-3.", &[]), 2e-3 - 100.0 + 0.5 - 3.0);
         assert_eq!(value("8 - 2 - 1", &[]), 5.0);
+        assert_eq!(value("flag & 4 == 0", &[13.0]), 0.0);
+        assert_eq!(value("flag & 3 + 8 == 8 and flag & 2 == 0", &[12.0]), 1.0);
+        assert!(value("flag & 4", &[0.5]).is_nan());
+        assert!(value("flag & 4", &[f64::NAN]).is_nan());
+        assert!((value("0.3*cos(2*phi)", &[0.5]) - 0.3 * 1f64.cos()).abs() < 1e-16);
         assert_eq!(value("log10(flux_2/err)", &[100.0, 1.0]), 2.0);
         assert_eq!(value("a > 1 and b <= 2 or not(a == a)", &[2.0, 2.0]), 1.0);
         assert_eq!(value("android + stepper", &[7.0, 1.0]), 8.0);

@@ -87,9 +87,9 @@ fn of_text(text: &str) -> u64 {
     hasher.finish()
 }
 
-// A number with evenly distributed bits (the finaliser of SplitMix64): units join neighbouring keys by their upper bits, and
-// 4000 identifiers from 10¹⁸ on were 32 units, with an error of m of 0.0207 instead of 0.029.
-fn hash(bits: u64) -> u64 {
+/// A number with evenly distributed bits (the finaliser of SplitMix64): units join neighbouring keys by their upper bits, and
+/// 4000 identifiers from 10¹⁸ on were 32 units, with an error of m of 0.0207 instead of 0.029.
+pub fn hash(bits: u64) -> u64 {
     let mut bits = bits.wrapping_add(0x9e37_79b9_7f4a_7c15);
     bits = (bits ^ (bits >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
     bits = (bits ^ (bits >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);

@@ -1,8 +1,8 @@
 //! Tables of any program as shapes with roles.
 //!
-//! * [`columns`] recognises which column has which role, by names or by what the user states.
+//! * [`columns`] finds which column has which role, by what the user states or by [`recognition`] of names.
 //! * [`request`] is what to read of which catalogues; [`source`] the tables of a catalogue with the columns that are read,
-//!   and [`rows`] gives their rows, with the failures that no row may have.
+//!   and [`rows`] gives their rows. [`failures`] are numbers and rows that stand for failed measurements.
 //! * [`truth`] is the true shear of catalogues or galaxies, and [`identity`] what names a galaxy.
 //! * [`foreign`] reads catalogues that a description states, and [`shapes`] catalogues by shearq.
 //! * [`select`] applies cuts and weights; [`expression`] is the language of formulas and conditions of columns.
@@ -11,8 +11,10 @@
 
 pub mod columns;
 pub mod expression;
+pub mod failures;
 pub mod foreign;
 pub mod identity;
+pub mod recognition;
 pub mod request;
 pub mod rows;
 pub mod select;

@@ -2,16 +2,19 @@
 //! row adds to the sums of the bias.
 
 use std::borrow::Cow;
-use std::collections::{HashMap, HashSet};
+use std::collections::HashSet;
 use std::path::Path;
 
-use shearq_bias::{Catalogue, Dominant, Repeated, Row};
-use shearq_files::FileError;
+use shearq_bias::{Catalogue, Row};
 use shearq_files::frames::polars::{DataFrame, DataType};
 use shearq_files::table::{self, FileFormat};
+use shearq_files::{FileError, names_of};
 use shearq_quantities::{Distortion, MeasuredRange};
 
 use crate::expression::{Expression, operand_values, texts_of};
+use crate::failures::{
+    Check, Copies, LargestResponse, MIN_FAILED_WEIGHT, RepeatKind, Repeats, TrueShears,
+};
 use crate::foreign::shown;
 use crate::shapes::MeasuredShapes;
 use crate::star_noise;
@@ -109,15 +112,14 @@ pub fn rows(
     }
     // Rows of noshear and of each sheared catalogue so far.
     let mut counts = [0u64; CATALOGUES];
-    let mut repeats = Repeats::default();
-    let mut largest = LargestResponse::default();
+    let mut found = Found::default();
     for source in sources {
         let (mut first, mut checks) = (0, None::<Vec<Check>>);
         source.parts(reading, |frame| {
             let part = TableRows::new(source, reading, &frame, path)?;
             // Ranges follow from the first part, so that a file is judged in the same way however it is split.
             let checks = checks.get_or_insert_with(|| part.checks());
-            repeats.look_for(&part);
+            found.look_for(&part);
             for at in 0..part.rows {
                 let sheared = part.sheared(at);
                 let index = counts[sheared];
@@ -133,8 +135,7 @@ pub fn rows(
                                     summary.ellipticity[k].add(item.row.e[k]);
                                 }
                                 if excluded.is_none() {
-                                    repeats.add(&part, at);
-                                    largest.add((first + at + 1) as u64, &item.row);
+                                    found.add(&part, at, (first + at + 1) as u64, &item.row);
                                 }
                             }
                             take(&item);
@@ -157,11 +158,18 @@ pub fn rows(
         })?;
     }
     summary.rows = counts[0];
+    if sources.iter().any(Source::has_sheared_rows) {
+        require_sheared(path, &counts)?;
+    }
     if let Some(first) = sources.first() {
         check_share(path, first, reading, &summary)?;
-        repeats.refuse_unused_cuts(path, first)?;
-        summary.repeated = repeats.found(first);
-        summary.dominant = largest.found();
+        found.refuse_unused_cuts(path, first)?;
+        found.refuse_measured_shears(path, first, reading)?;
+        summary.repeated = found.repeats.found();
+        summary.dominant = found.largest.found();
+        summary.content = found.content;
+        summary.copies = found.copies.rows().unwrap_or_default();
+        summary.shared_identifiers = found.copies.identifiers().unwrap_or_default();
     }
     Ok(summary)
 }
@@ -173,19 +181,8 @@ const CROSS_RESPONSE_ROLES: [Role; 2] = [Role::R12, Role::R21];
 const WEIGHT_DERIVATIVE_ROLES: [Role; 2] = [Role::Dw1, Role::Dw2];
 const KSB_ROLES: [Role; 2] = [Role::KsbE1, Role::KsbE2];
 
-// Inverse variances in any unit are smaller; programs write 1e20, 1e30 or the largest float for a failure.
-const MIN_FAILED_WEIGHT: f64 = 1e20;
 // Values of a column that determine its range. A sample is enough for an order of magnitude. Chosen by hand.
 const SAMPLED_VALUES: usize = 1 << 16;
-
-// A test of a column for numbers that stand for failed measurements. HSM's −10 in one row of a hundred gave c = −0.096, and 1e30
-// m = 3.5·10¹², without a word.
-struct Check {
-    column: usize,
-    expected: &'static str,
-    range: MeasuredRange,
-    fails: fn(f64, MeasuredRange) -> bool,
-}
 
 struct TableRows<'a> {
     source: &'a Source,
@@ -194,6 +191,10 @@ struct TableRows<'a> {
     columns: Vec<Cow<'a, [f64]>>,
     weighted: Option<MeasuredShapes>,
     e: [usize; 2],
+    // Whose numbers tell rows apart.
+    compared: Vec<usize>,
+    // Of each sheared catalogue, if its distortions are converted.
+    converted: Option<[[usize; 2]; CATALOGUES - 1]>,
     responses: [[Response; 2]; 2],
     sheared_of_rows: Option<Vec<usize>>,
     frame: &'a DataFrame,
@@ -255,6 +256,10 @@ impl<'a> TableRows<'a> {
             rows: frame.height(),
             columns,
             e: places.pair(E_ROLES).unwrap_or_default(),
+            converted: converted_columns(source),
+            compared: ([Role::E1, Role::E2, Role::Weight, Role::R11].iter())
+                .filter_map(|role| places.of((*role, 0)))
+                .collect(),
             responses: responses(source),
             sheared_of_rows: sheared_of_rows.transpose()?,
             ids: source.columns.of(Role::Id).map(keys).transpose()?,
@@ -332,7 +337,7 @@ impl<'a> TableRows<'a> {
             });
         }
         let failures = source.places.all((Role::ShearedFailure, 0));
-        let expected = "0, as for a version that was measured";
+        let expected = "0, as in sheared catalogues that were measured";
         add(failures, expected, shear, |flag, _| flag != 0.0);
         for sheared in 1..CATALOGUES {
             let weights = source.places.all((Role::Weight, sheared));
@@ -357,6 +362,39 @@ impl<'a> TableRows<'a> {
             weight >= MIN_FAILED_WEIGHT
         });
         checks
+    }
+
+    // What is looked for in the columns.
+    fn repeats(&self) -> Repeats {
+        let source = self.source;
+        let mut all = Repeats::default();
+        let name = |column: usize| source.name(column).to_owned();
+        let mut watch = |kind, columns: [usize; 2]| all.watch(kind, columns, columns.map(name));
+        watch(RepeatKind::Ellipticities, self.e);
+        for roles in [RESPONSE_ROLES, PSF_ROLES] {
+            if let Some(own) = self.roles(roles) {
+                watch(RepeatKind::Zeros, own);
+            }
+        }
+        if source.columns.is_of_shearq() {
+            return all;
+        }
+        let mut numbers = |columns: &[usize], or_zero| {
+            let kind = RepeatKind::Number { or_zero };
+            columns.iter().for_each(|column| watch(kind, [*column; 2]));
+        };
+        if self.roles(KSB_ROLES).is_none() {
+            numbers(&self.e, true);
+        }
+        numbers(self.roles(RESPONSE_ROLES).as_slice().as_flattened(), true);
+        let sheared = sheared_columns(source).into_iter().flatten().flatten();
+        numbers(&sheared.flatten().collect::<Vec<_>>(), true);
+        let no_rms = source.shapes == Shapes::Responsivity && self.of(Role::RmsE).is_none();
+        let sigma = self.of(Role::SigmaE).filter(|_| no_rms);
+        numbers(sigma.as_slice(), true);
+        let derivatives = self.roles(WEIGHT_DERIVATIVE_ROLES);
+        numbers(derivatives.as_slice().as_flattened(), false);
+        all
     }
 
     // The columns of the ellipticity of a row. GalSim's HSM writes −10 into those that its method does not determine.
@@ -485,9 +523,9 @@ impl<'a> TableRows<'a> {
         let of_psf = of_psf.any(|role| self.of(role) == Some(column));
         // A PSF of 2 in all rows is another quantity, rather than a failure in each.
         let all_equal = || self.columns[column].iter().all(|other| *other == value);
-        let remedy = match of_psf && all_equal() {
+        let remedy: &str = match of_psf && all_equal() {
             true => "--columns psf_e1=none,psf_e2=none,psf_size=none",
-            false => "--drop-missing",
+            false => &self.remedy_for_failures(),
         };
         Err(Rejected::Invalid(format!(
             "column `{}` is {} in a row without a flag, which stands for a failed measurement (expected {}). Try: {remedy}",
@@ -495,6 +533,13 @@ impl<'a> TableRows<'a> {
             shown(value),
             check.expected
         )))
+    }
+
+    // A column that looks like a flag comes first, because it also excludes failures whose numbers look like measurements.
+    fn remedy_for_failures(&self) -> String {
+        let choice = self.source.columns.remedy_of_choice();
+        let choice = choice.map(|choice| format!("{choice}, or "));
+        choice.unwrap_or_default() + "--drop-missing"
     }
 
     // A row with a true shear of zero.
@@ -533,7 +578,8 @@ impl<'a> TableRows<'a> {
             None => Ok(()),
             Some(_) if self.reading.request.drop_missing => Err(Exclusion::Missing.into()),
             Some((what, value)) => Err(Rejected::Invalid(format!(
-                "{what} is {value} in a row without a flag (expected a number). Try: --drop-missing"
+                "{what} is {value} in a row without a flag (expected a number). Try: {}",
+                self.remedy_for_failures()
             ))),
         }
     }
@@ -547,14 +593,18 @@ impl<'a> TableRows<'a> {
         }
         let columns = self.shape_columns(at);
         let mut e = self.pair(columns, at);
+        let dw = self
+            .roles(WEIGHT_DERIVATIVE_ROLES)
+            .map_or([0.0; 2], |dw| self.pair(dw, at));
+        // d(w e_i)/dg_j = w R_ij + e_i dw/dg_j: weights of AnaCal change with shear.
+        let weighted = |e: [f64; 2], response: [[f64; 2]; 2]| {
+            [0, 1].map(|i| [0, 1].map(|j| weight * response[i][j] + e[i] * dw[j]))
+        };
         match self.source.shapes {
             // KSB's are shears.
             _ if columns != self.e => {}
-            Shapes::Converted if e.iter().all(|e| e.is_finite()) => {
-                let shear = Distortion::new(e[0], e[1]).to_shear()?;
-                e = [shear.e1, shear.e2];
-            }
-            Shapes::Shear | Shapes::Converted => {}
+            Shapes::Converted => e = converted(e)?,
+            Shapes::Shear => {}
             Shapes::Responsivity => {
                 let value = |role| self.of(role).map(|place| self.value(place, at));
                 let square = match (value(Role::RmsE), value(Role::SigmaE)) {
@@ -564,22 +614,25 @@ impl<'a> TableRows<'a> {
                         0.5 * (e[0] * e[0] + e[1] * e[1]) - sigma.map_or(0.0, |sigma| sigma * sigma)
                     }
                 };
-                let response = 2.0 * weight * (1.0 - square);
-                return Some((e, [[response, 0.0], [0.0, response]]));
+                let response = 2.0 * (1.0 - square);
+                return Some((e, weighted(e, [[response, 0.0], [0.0, response]])));
             }
         }
         if self.source.has_sheared_rows() {
             // The response follows from the means of the sheared catalogues.
             return Some((e, [[0.0; 2]; 2]));
         }
-        let dw = self
-            .roles(WEIGHT_DERIVATIVE_ROLES)
-            .map_or([0.0; 2], |dw| self.pair(dw, at));
-        // d(w e_i)/dg_j = w R_ij + e_i dw/dg_j: weights of AnaCal change with shear.
-        let response = [0, 1].map(|i| {
-            [0, 1].map(|j| weight * self.response(&self.responses[i][j], at) + e[i] * dw[j])
-        });
-        Some((e, response))
+        if let Some(sheared) = &self.converted {
+            let mut all = [[0.0; 2]; CATALOGUES - 1];
+            for (own, columns) in all.iter_mut().zip(sheared) {
+                *own = converted(self.pair(*columns, at))?;
+            }
+            let step = 2.0 * self.reading.request.step;
+            let of = |i: usize, j: usize| (all[2 * j][i] - all[2 * j + 1][i]) / step;
+            return Some((e, weighted(e, [0, 1].map(|i| [0, 1].map(|j| of(i, j))))));
+        }
+        let response = |own: &[Response; 2]| [0, 1].map(|j| self.response(&own[j], at));
+        Some((e, weighted(e, [0, 1].map(|i| response(&self.responses[i])))))
     }
 
     fn response(&self, of: &Response, at: usize) -> f64 {
@@ -639,6 +692,25 @@ fn sheared_columns(source: &Source) -> [Option<[[usize; 2]; 2]>; 2] {
     })
 }
 
+// The columns of both components in each sheared catalogue, if their distortions are converted like those of e1 and e2.
+fn converted_columns(source: &Source) -> Option<[[usize; 2]; CATALOGUES - 1]> {
+    let mut all = [[0; 2]; CATALOGUES - 1];
+    for (catalogue, own) in (1..).zip(&mut all) {
+        let [e1, e2] = E_ROLES.map(|role| source.places.of((role, catalogue)));
+        *own = [e1?, e2?];
+    }
+    (source.shapes == Shapes::Converted).then_some(all)
+}
+
+// The shear of a distortion, if it has one. A missing number stays one.
+fn converted(e: [f64; 2]) -> Option<[f64; 2]> {
+    if !e.iter().all(|e| e.is_finite()) {
+        return Some(e);
+    }
+    let shear = Distortion::new(e[0], e[1]).to_shear()?;
+    Some([shear.e1, shear.e2])
+}
+
 // Where R11, R12, R21 and R22 come from: sheared catalogues, else columns, else the ellipticities are shears already.
 fn responses(source: &Source) -> [[Response; 2]; 2] {
     let [own, other] = sheared_columns(source);
@@ -667,210 +739,51 @@ fn responses(source: &Source) -> [[Response; 2]; 2] {
     })
 }
 
-// A row is reported if it changes the mean response, and with it m, by half of the requirement of 2·10⁻³.
-const MIN_DOMINANT_SHARE: f64 = 1e-3;
-// Least ratio of its response to the mean, so that rows of small catalogues are not reported. Chosen by hand: responses of
-// metacalibration at S/N 10 scatter by about twice the mean.
-const MIN_DOMINANT_RATIO: f64 = 10.0;
-
-// The row with the largest response of each component, and the sum of all. An R11 of 12 in one of
-// 2000 rows, below the numbers that count as failures, changed m by 0.007 without a word.
+// What the rows that count have that measurements do not have.
 #[derive(Default)]
-struct LargestResponse {
-    rows: u64,
-    sums: [f64; 2],
-    largest: [(u64, f64); 2],
-}
-
-impl LargestResponse {
-    fn add(&mut self, number: u64, row: &Row) {
-        self.rows += 1;
-        for k in 0..2 {
-            let response = row.response[k][k];
-            self.sums[k] += response;
-            if response.abs() > self.largest[k].1.abs() {
-                self.largest[k] = (number, response);
-            }
-        }
-    }
-
-    fn found(&self) -> Option<Dominant> {
-        let of_component = |component: usize| {
-            let (row, response) = self.largest[component];
-            // Without the row, because it may be most of the sum.
-            let rest = self.sums[component] - response;
-            let mean = rest / (self.rows - 1) as f64;
-            let share = response.abs() / self.sums[component].abs();
-            let is_dominant =
-                share > MIN_DOMINANT_SHARE && response.abs() > MIN_DOMINANT_RATIO * mean.abs();
-            is_dominant.then_some(Dominant {
-                row,
-                component,
-                response,
-                mean,
-                share,
-            })
-        };
-        if self.rows < 2 {
-            return None;
-        }
-        (0..2).find_map(of_component)
-    }
-}
-
-// Rows of a part that are sampled for repeated numbers; only those are then counted in all rows. Chosen by hand.
-const SEARCHED_ROWS: usize = 4096;
-
-// Many rows share numbers that were rounded to few digits, but a distribution is flat around its maximum, so that the ten most
-// frequent numbers are about equally frequent. A number ten times as frequent as the tenth marks a failure or a default.
-const REFERENCE_RANK: usize = 10;
-const OUTSTANDING_RATIO: u64 = 10;
-// A column of fewer different numbers is one of classes, whose frequencies differ. Chosen by hand.
-const MAX_CLASSES: usize = 10;
-
-#[derive(Clone, Copy, PartialEq)]
-enum RepeatKind {
-    // Pairs of ellipticities, if a row in a thousand has them: with two digits, 10⁴ galaxies share one in ten rows at most.
-    Ellipticities,
-    // Zeros of both columns, if not all rows have them.
-    Zeros,
-    // The number that stands out in one column, other than zero for derivatives: a smooth cut far away has none.
-    Number { or_zero: bool },
-}
-
-// Numbers that several rows share exactly in two columns, or in one that is named twice.
-struct Repeat {
-    kind: RepeatKind,
-    columns: [usize; 2],
-    counts: HashMap<[u64; 2], u64>,
-    different: usize,
-}
-
-// Counts of repeated numbers: zeros and other plain numbers often stand for failures that no flag states.
-#[derive(Default)]
-struct Repeats {
+struct Found {
+    repeats: Repeats,
+    copies: Copies,
+    largest: LargestResponse,
+    shears: TrueShears,
     used: u64,
+    // A sum of the keys of the rows.
+    content: u64,
     // Rows that count although a column of [`Role::Choice`] excludes them.
     excluded: Vec<u64>,
-    all: Vec<Repeat>,
+    begun: bool,
 }
 
-impl Repeat {
-    fn new(kind: RepeatKind, columns: [usize; 2]) -> Self {
-        let zeros = (kind == RepeatKind::Zeros).then_some(([0, 0], 0));
-        Repeat {
-            kind,
-            columns,
-            counts: zeros.into_iter().collect(),
-            different: 0,
-        }
-    }
-
-    // Zeros with either sign are equal.
-    fn key(&self, part: &TableRows<'_>, at: usize) -> [u64; 2] {
-        part.pair(self.columns, at)
-            .map(|value| (value + 0.0).to_bits())
-    }
-
+impl Found {
     fn look_for(&mut self, part: &TableRows<'_>) {
-        let (searched, or_zero) = match self.kind {
-            RepeatKind::Zeros => return,
-            RepeatKind::Ellipticities => (SEARCHED_ROWS, true),
-            // Half of the failures in one of 1000 rows of a small catalogue are enough.
-            RepeatKind::Number { or_zero } => (4 * SEARCHED_ROWS, or_zero),
-        };
-        let mut seen = HashSet::new();
-        for at in (0..part.rows).step_by(part.rows.div_ceil(searched).max(1)) {
-            let values = part.pair(self.columns, at);
-            let counts = values.iter().all(|value| value.is_finite());
-            let key = self.key(part, at);
-            if counts && (or_zero || values[0] != 0.0) && !seen.insert(key) {
-                self.counts.entry(key).or_default();
-            }
+        if !self.begun {
+            self.begun = true;
+            self.repeats = part.repeats();
         }
-        self.different = self.different.max(seen.len());
+        self.repeats.look_for(&part.columns);
+        self.copies
+            .look_for(&part.columns, part.e, part.ids.as_deref());
     }
 
-    // The most frequent numbers of the `used` rows, if coincidence does not explain their frequency.
-    fn found(&self, used: u64) -> Option<([f64; 2], u64)> {
-        let mut counts: Vec<(u64, [u64; 2])> = self.counts.iter().map(|(v, n)| (*n, *v)).collect();
-        counts.sort_unstable_by(|a, b| b.cmp(a));
-        let (most, values) = *counts.first()?;
-        let worth = match self.kind {
-            RepeatKind::Ellipticities => most >= 3.max(used.div_ceil(1000)),
-            RepeatKind::Zeros => most >= 3 && most < used,
-            RepeatKind::Number { or_zero } => {
-                let tenth = counts
-                    .get(REFERENCE_RANK - 1)
-                    .map_or(1, |(count, _)| *count);
-                let stands_out = most > OUTSTANDING_RATIO * tenth.max(1) && most < used;
-                stands_out && (self.different > MAX_CLASSES || !or_zero)
-            }
-        };
-        worth.then(|| (values.map(f64::from_bits), most))
-    }
-}
-
-impl Repeats {
-    fn look_for(&mut self, part: &TableRows<'_>) {
-        if self.all.is_empty() {
-            self.all = Self::of(part);
-        }
-        self.all.iter_mut().for_each(|repeat| repeat.look_for(part));
-    }
-
-    fn of(part: &TableRows<'_>) -> Vec<Repeat> {
-        let source = part.source;
-        let mut all = vec![Repeat::new(RepeatKind::Ellipticities, part.e)];
-        for roles in [RESPONSE_ROLES, PSF_ROLES] {
-            all.extend(
-                part.roles(roles)
-                    .map(|own| Repeat::new(RepeatKind::Zeros, own)),
-            );
-        }
-        if source.columns.is_of_shearq() {
-            return all;
-        }
-        let mut number = |columns: &[usize], or_zero| {
-            let columns = columns.iter().map(|column| [*column; 2]);
-            all.extend(columns.map(|own| Repeat::new(RepeatKind::Number { or_zero }, own)));
-        };
-        if part.roles(KSB_ROLES).is_none() {
-            number(&part.e, true);
-        }
-        number(part.roles(RESPONSE_ROLES).as_slice().as_flattened(), true);
-        let sheared = sheared_columns(source).into_iter().flatten().flatten();
-        number(&sheared.flatten().collect::<Vec<_>>(), true);
-        let no_rms = source.shapes == Shapes::Responsivity && part.of(Role::RmsE).is_none();
-        let sigma = part.of(Role::SigmaE).filter(|_| no_rms);
-        number(sigma.as_slice(), true);
-        number(
-            part.roles(WEIGHT_DERIVATIVE_ROLES)
-                .as_slice()
-                .as_flattened(),
-            false,
-        );
-        all
-    }
-
-    fn add(&mut self, part: &TableRows<'_>, at: usize) {
+    fn add(&mut self, part: &TableRows<'_>, at: usize, number: u64, row: &Row) {
         self.used += 1;
+        self.largest.add(number, row);
+        if let OfRows::Columns(_) = part.truth {
+            self.shears.add(row);
+        }
         let choices = part.source.places.all((Role::Choice, 0));
         self.excluded.resize(choices.len(), 0);
         for (count, column) in self.excluded.iter_mut().zip(choices) {
             let good = counted_value(part.source.name(*column)) == Some(true);
             *count += u64::from((part.value(*column, at) != 0.0) != good);
         }
-        for repeat in self
-            .all
-            .iter_mut()
-            .filter(|repeat| !repeat.counts.is_empty())
-        {
-            let key = repeat.key(part, at);
-            if let Some(count) = repeat.counts.get_mut(&key) {
-                *count += 1;
-            }
-        }
+        // A shared ellipticity is reported by itself.
+        let shared = self.repeats.add(&part.columns, at);
+        let own = part.compared.iter().map(|column| part.value(*column, at));
+        let own = own.fold(0, |key, value| identity::hash(key ^ value.to_bits()));
+        self.content = self.content.wrapping_add(own);
+        let id = part.ids.as_ref().map(|ids| ids[at]);
+        self.copies.add((!shared).then_some(own), id);
     }
 
     // If a column for cuts that the user did not choose excludes some rows and not others, the catalogue needs a decision: its
@@ -898,24 +811,49 @@ impl Repeats {
         ))
     }
 
-    fn found(&self, source: &Source) -> Vec<Repeated> {
-        let mut all: Vec<Repeated> = Vec::new();
-        for repeat in &self.all {
-            let columns = repeat.columns.map(|column| source.name(column).to_owned());
-            // A pair explains its columns.
-            let known = all.iter().any(|pair| pair.columns.contains(&columns[0]));
-            let is_number = matches!(repeat.kind, RepeatKind::Number { .. });
-            if let Some((values, rows)) = repeat.found(self.used).filter(|_| !(is_number && known))
-            {
-                all.push(Repeated {
-                    columns,
-                    values,
-                    rows,
-                });
-            }
+    // Refuses columns that the user did not name as true shears and that look like measured ones.
+    fn refuse_measured_shears(
+        &self,
+        path: &Path,
+        source: &Source,
+        reading: &Reading<'_>,
+    ) -> Result<(), FileError> {
+        let [g1, g2] = [Role::G1, Role::G2].map(|role| source.columns.of(role).unwrap_or_default());
+        let is_stated =
+            reading.request.names.is_given(Role::G1) || g1.to_ascii_lowercase().contains("tru");
+        match self.shears.fault().filter(|_| !is_stated) {
+            None => Ok(()),
+            Some(fault) => Err(FileError::new(
+                path,
+                format!(
+                    "`{g1}` and `{g2}` look like measured shears ({fault}). Try: --columns g1=none,g2=none for c alone, --truth FILE, or --columns g1={g1},g2={g2} if they are the true shears"
+                ),
+            )),
         }
-        all
     }
+}
+
+// Without one of the sheared catalogues, the response is unknown: it was NaN, and the message named R11.
+fn require_sheared(path: &Path, counts: &[u64; CATALOGUES]) -> Result<(), FileError> {
+    let names = ["noshear", "1p", "1m", "2p", "2m"];
+    let with = |has_rows: bool| -> Vec<&str> {
+        let all = names.iter().zip(counts);
+        let chosen = all.filter(|(_, count)| (**count > 0) == has_rows);
+        chosen.map(|(name, _)| *name).collect()
+    };
+    let (found, absent) = (with(true), with(false));
+    // A table without rows is reported as such.
+    if absent.is_empty() || found.is_empty() {
+        return Ok(());
+    }
+    Err(FileError::new(
+        path,
+        format!(
+            "there is no row of {} (found {}, expected rows of all sheared catalogues, whose differences are the response). Try: the table with all of them, or --columns version=none if the ellipticities are calibrated",
+            names_of(&absent),
+            names_of(&found)
+        ),
+    ))
 }
 
 fn is_sheared(text: Option<&str>) -> bool {

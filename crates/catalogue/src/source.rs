@@ -1,21 +1,23 @@
 //! Tables of a catalogue, and which of their columns are read as what.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeSet, HashSet};
 use std::path::Path;
 
 use shearq_bias::{Design, SHEARED_CATALOGUES};
 use shearq_files::fits::TableHead;
-use shearq_files::frames::polars::DataFrame;
+use shearq_files::frames::polars::{Column, DataFrame};
 use shearq_files::table::{self, FileFormat, Place};
 use shearq_files::{FileError, names_of};
 use shearq_measure::{Observables, Selection};
 
-use crate::expression::{Expression, Operand};
+use crate::expression::{Expression, Operand, operand_values};
+use crate::recognition::{fits_any, recognition};
 use crate::shapes::{SHAPE_COLUMNS, changes_with_shear, require_responses};
 
 use crate::columns::{
-    CATALOGUES, Columns, Places, Preset, Role, Shapes, base, fits_any, sheared_column,
+    CATALOGUES, Columns, Names, Places, Preset, Role, Shapes, base, sheared_column,
 };
+use crate::identity;
 use crate::request::{Input, Request, Units};
 use crate::truth::Truth;
 
@@ -67,16 +69,6 @@ impl Reading<'_> {
     }
 }
 
-// Columns of surveys and simulations that look like independent units. They are suggested, not used: a field or seed may
-// also be the same in all rows.
-const UNITS: &str = "tile tile_id tileid tilename tile_name field field_id patch patch_id seed tract pointing exposure \
-    exp_id ccd chip healpix realisation";
-
-// Columns that shear does not change, by their names in small letters. Any other column needs sheared catalogues if
-// galaxies are chosen by it: a cut at S/N 7 biases m by −0.1 (docs/limitations.md).
-const FIXED: &str = "*psf* *tile* *field* *patch* *seed* *true* *truth* *image* *ccd* *exp* *airmass* *seeing* *depth* \
-    *zbin* *z_bin* *primary* *inner* ra dec x y z number row alpha delta set";
-
 #[derive(Debug)]
 pub struct Source {
     pub place: Place,
@@ -88,6 +80,8 @@ pub struct Source {
     pub unit: Option<String>,
     /// A column without a role that looks like independent units.
     pub unit_column: Option<String>,
+    /// Columns that are computed from others, with the formula as their name.
+    pub formulas: Vec<Expression>,
     /// All that is read, each once.
     pub wanted: Vec<Operand>,
     pub places: Places,
@@ -111,15 +105,44 @@ impl Source {
         }
     }
 
-    pub fn described(&self, reading: &Reading<'_>) -> Vec<String> {
-        let responsivity = self.shapes == Shapes::Responsivity;
-        let read = |role: Role| match role {
+    // Whether the column of a role enters the result.
+    fn reads(&self, reading: &Reading<'_>, role: Role) -> bool {
+        match role {
             Role::Unit => self.unit.is_some(),
             Role::R12 | Role::R21 => self.has_matrix(),
-            Role::RmsE | Role::SigmaE => responsivity,
+            Role::RmsE | Role::SigmaE => self.shapes == Shapes::Responsivity,
             role => !reading.skips(role),
+        }
+    }
+
+    /// What catalogues of one list must have in common: columns by role, and what becomes of them.
+    pub fn kind(&self, reading: &Reading<'_>) -> Vec<(String, String)> {
+        let mut kind = self.columns.roles(|role| self.reads(reading, role));
+        if let Some(unit) = &self.unit {
+            kind.retain(|(role, _)| role != "unit");
+            kind.push(("units".into(), unit.clone()));
+        }
+        let step = match self.has_sheared_rows() || self.has_sheared_columns() {
+            true => reading.request.step.to_string(),
+            false => "none".into(),
         };
-        let mut lines = vec![format!("Used: {}.", self.columns.used(read))];
+        let of = |name: &str, value: &str| (name.to_owned(), value.to_owned());
+        kind.extend([
+            of("the type of ellipticities", self.shapes.name()),
+            of("the shear of sheared catalogues", &step),
+            of(
+                "sheared columns of cuts",
+                if self.selects { "some" } else { "none" },
+            ),
+            of("the program", self.columns.program()),
+        ]);
+        kind
+    }
+
+    pub fn described(&self, reading: &Reading<'_>) -> Vec<String> {
+        let responsivity = self.shapes == Shapes::Responsivity;
+        let used = self.columns.used(|role| self.reads(reading, role));
+        let mut lines = vec![format!("Used: {used}.")];
         let doubtful = &self.columns.doubtful_weights;
         let read = self.wanted.iter().map(|own| own.column.clone());
         let read: Vec<String> = read.filter(|name| !doubtful.contains(name)).collect();
@@ -132,10 +155,11 @@ impl Source {
         if !sheared.is_empty() {
             let names: Vec<&str> = sheared.iter().map(|place| self.name(*place)).collect();
             lines.push(format!(
-                "Response of the choice and the weights: from {} and the other versions.",
+                "Selection response, with that of the weights: from {} and the other sheared catalogues.",
                 names.join(", ")
             ));
         }
+        lines.extend(self.converted());
         if responsivity {
             let rms = match (self.columns.of(Role::RmsE), self.columns.of(Role::SigmaE)) {
                 (Some(rms), _) => format!("e_rms from {rms}"),
@@ -149,6 +173,25 @@ impl Source {
             ));
         }
         lines
+    }
+
+    // What becomes of distortions, apart from ℛ.
+    fn converted(&self) -> Option<String> {
+        let text = match self.shapes {
+            Shapes::Shear if self.columns.distortion => {
+                "Distortions, divided by their response and not converted."
+            }
+            Shapes::Converted if self.has_sheared_rows() || self.has_sheared_columns() => {
+                "Distortions, each converted to a shear, with those of the sheared catalogues."
+            }
+            Shapes::Converted => "Distortions, each converted to a shear.",
+            Shapes::Shear | Shapes::Responsivity => return None,
+        };
+        Some(text.to_owned())
+    }
+
+    fn has_sheared_columns(&self) -> bool {
+        self.columns.of_sheared((Role::E1, 1)).is_some()
     }
 
     pub fn name(&self, place: usize) -> &str {
@@ -182,19 +225,42 @@ impl Source {
         reading: &Reading<'_>,
         mut take: impl FnMut(DataFrame) -> Result<(), FileError>,
     ) -> Result<(), FileError> {
+        let mut take = |part: DataFrame| take(self.with_formulas(part)?);
         if let Some(frame) = &self.frame {
             return take(frame.clone());
         }
-        let names: BTreeSet<&str> = self.wanted.iter().map(|own| own.column.as_str()).collect();
+        let computed = |name: &str| self.formulas.iter().any(|own| own.text() == name);
+        let read = self.wanted.iter().map(|own| own.column.as_str());
+        let read = read.filter(|name| !computed(name));
+        let operands = self.formulas.iter().flat_map(Expression::columns);
+        let names: BTreeSet<&str> = read.chain(operands).collect();
         let names: Vec<&str> = names.into_iter().collect();
         let mut texts = names.clone();
         texts.retain(|name| self.is_text(reading, name));
         table::read_parts(&self.place, &names, &texts, take)
     }
 
+    // Adds the columns that formulas give.
+    fn with_formulas(&self, mut part: DataFrame) -> Result<DataFrame, FileError> {
+        let path = &self.place.path;
+        for formula in &self.formulas {
+            let operands = formula.operands().iter();
+            let operands = operands.map(|own| operand_values(&part, own, path));
+            let operands: Vec<_> = operands.collect::<Result<_, _>>()?;
+            let values = (0..part.height()).map(|at| formula.value(&|k| operands[k][at]));
+            let values: Vec<f64> = values.collect();
+            let column = Column::new(formula.text().into(), values);
+            part.with_column(column)
+                .map_err(|error| FileError::new(path, error.to_string()))?;
+        }
+        Ok(part)
+    }
+
     /// Whether a column may be a text: identifiers, names of sheared catalogues, and what is compared with a pattern.
     pub fn is_text(&self, reading: &Reading<'_>, name: &str) -> bool {
-        let mut operands = reading.expressions().flat_map(|(_, own)| own.operands());
+        let chosen = reading.expressions().flat_map(|(_, own)| own.operands());
+        let computed = self.formulas.iter().flat_map(Expression::operands);
+        let mut operands = chosen.chain(computed);
         match operands.find(|own| own.column == name || own.column == base(name)) {
             Some(operand) => operand.pattern.is_some(),
             None => {
@@ -219,7 +285,7 @@ pub fn sources(input: &Input, reading: &Reading<'_>) -> Result<Vec<Source>, File
             .collect();
         let source = Source {
             frame: Some(frame.clone()),
-            ..source(place, None, &names, reading)?
+            ..source(place, None, (&names, Some(frame)), reading)?
         };
         return Ok(vec![source]);
     }
@@ -237,7 +303,12 @@ pub fn sources(input: &Input, reading: &Reading<'_>) -> Result<Vec<Source>, File
                 continue;
             };
             if let Some(catalogue) = catalogue_named(&head.name) {
-                let own = source(table(head.number), Some(catalogue), &list.names, reading)?;
+                let own = source(
+                    table(head.number),
+                    Some(catalogue),
+                    (&list.names, None),
+                    reading,
+                )?;
                 tables.push(own);
             }
         }
@@ -250,7 +321,10 @@ pub fn sources(input: &Input, reading: &Reading<'_>) -> Result<Vec<Source>, File
         .collect();
     let names = &reading.request.names;
     let good: Vec<_> = (lists.iter().copied())
-        .filter(|list| Columns::find(path, &list.names, names).is_ok())
+        .filter(|list| {
+            let all = with_formulas(path, &list.names, names);
+            all.is_ok_and(|(all, _)| Columns::find(path, &all, names).is_ok())
+        })
         .collect();
     let tables: Vec<&TableHead> = good.iter().filter_map(|list| list.table.as_ref()).collect();
     if let [first, others @ ..] = &tables[..]
@@ -287,7 +361,7 @@ pub fn sources(input: &Input, reading: &Reading<'_>) -> Result<Vec<Source>, File
         (None, Some(head)) => table(head.number),
         _ => place,
     };
-    Ok(vec![source(own, None, &list.names, reading)?])
+    Ok(vec![source(own, None, (&list.names, None), reading)?])
 }
 
 // The columns that are read of a table with these names, each once.
@@ -416,12 +490,21 @@ impl Wanted<'_> {
 fn source(
     place: Place,
     sheared: Option<usize>,
-    names: &[String],
+    (names, frame): (&[String], Option<&DataFrame>),
     reading: &Reading<'_>,
 ) -> Result<Source, FileError> {
     let path = &place.path;
     let given = &reading.request.names;
+    let (names, formulas) = with_formulas(path, names, given)?;
+    let names = names.as_slice();
     let mut columns = Columns::find(path, names, given)?;
+    if let Some(id) = columns.of(Role::Id)
+        && id.eq_ignore_ascii_case(COUNTER)
+        && !given.is_given(Role::Id)
+        && !is_identity(&place, frame, id)?
+    {
+        columns.decline_identity();
+    }
     if matches!(reading.truth, Truth::Columns) && !columns.have(&[Role::G1]) {
         given.check_true_shear(path)?;
     }
@@ -490,15 +573,13 @@ fn source(
         })
         .collect();
     let mut like_unit = names.iter();
-    let like_unit = like_unit.find(|name| fits_any(UNITS, &name.to_ascii_lowercase()));
+    let like_unit = like_unit.find(|name| fits_any(&recognition().patterns.unit, name));
     let sheared_weight = places.of((Role::Weight, 1)).is_some();
     let chosen = reading.expressions().next().is_some() || sheared_flags || sheared_weight;
     Ok(Source {
         sheared,
-        shapes: reading.request.shapes.unwrap_or(match columns.distortion {
-            true => Shapes::Responsivity,
-            false => Shapes::Shear,
-        }),
+        shapes: conversion(path, reading.request.shapes, &columns, sheared.is_some())?,
+        formulas,
         unit: unit.map(str::to_owned),
         unit_column: like_unit.cloned(),
         unanswered: unanswered.into_iter().map(str::to_owned).collect(),
@@ -514,6 +595,99 @@ fn source(
     })
 }
 
+// SExtractor's name of a running number, which other programs use for counts.
+const COUNTER: &str = "number";
+// Rows that share an identifier in catalogues of several measurements of each galaxy, at most. Chosen by hand: metadetection
+// has five.
+const MAX_SHARING: usize = 20;
+// So many different numbers are no counts.
+const MAX_COUNTED: usize = 1 << 16;
+
+// Whether a column names galaxies: a number of exposures has few values.
+fn is_identity(place: &Place, frame: Option<&DataFrame>, name: &str) -> Result<bool, FileError> {
+    let (mut keys, mut rows) = (HashSet::new(), 0);
+    let mut add = |part: &DataFrame| -> Result<(), FileError> {
+        rows += part.height();
+        if keys.len() < MAX_COUNTED {
+            keys.extend(identity::keys(part, name, &place.path)?);
+        }
+        Ok(())
+    };
+    match frame {
+        Some(frame) => add(frame)?,
+        None => table::read_parts(place, &[name], &[], |part| add(&part))?,
+    }
+    Ok(keys.len() >= MAX_COUNTED || keys.len() * MAX_SHARING >= rows)
+}
+
+// The names of all columns, and the formulas among those that the user gives for roles, whose texts are names, too. A plus between
+// columns of flags is no sum.
+fn with_formulas(
+    path: &Path,
+    names: &[String],
+    given: &Names,
+) -> Result<(Vec<String>, Vec<Expression>), FileError> {
+    let there = |name: &str| name == "none" || names.iter().any(|own| own == name);
+    let is_list = |role: Role, text: &str| role == Role::Flag && text.split('+').all(there);
+    let mut found: Vec<Expression> = Vec::new();
+    for (role, text) in given.columns() {
+        // A name with a minus or a dot may be the name of a column.
+        if there(text) || is_list(role, text) || found.iter().any(|own| own.text() == text) {
+            continue;
+        }
+        let Ok(formula) = Expression::parse(text) else {
+            continue;
+        };
+        // A column that is absent is reported as such.
+        if formula.columns().any(|name| name == text) || formula.operands().is_empty() {
+            continue;
+        }
+        if let Some(absent) = formula.columns().find(|name| !there(name)) {
+            return Err(FileError::no_column(path, absent, names));
+        }
+        found.push(formula);
+    }
+    let computed = found.iter().map(|own| own.text().to_owned());
+    Ok((names.iter().cloned().chain(computed).collect(), found))
+}
+
+// How ellipticities become shears, as the user states or as the columns have it. A response of the ellipticities themselves
+// replaces a conversion: with the names of HSM, `R11` was listed and not used, which gave m = −0.233 for 0.031.
+fn conversion(
+    path: &Path,
+    stated: Option<Shapes>,
+    columns: &Columns,
+    has_sheared_tables: bool,
+) -> Result<Shapes, FileError> {
+    let in_rows = has_sheared_tables || columns.of(Role::ShearedCatalogue).is_some();
+    let in_columns = columns.of_sheared((Role::E1, 1));
+    let response = columns.of(Role::R11).or(in_columns);
+    let response = response.or(columns.of(Role::ShearedCatalogue));
+    let has_response = in_rows || response.is_some();
+    let (option, why) = match stated {
+        None if columns.distortion && !has_response => return Ok(Shapes::Responsivity),
+        None => return Ok(Shapes::Shear),
+        Some(Shapes::Responsivity) if has_response => ("responsivity", "2ℛ replaces it"),
+        Some(Shapes::Converted) if columns.of(Role::R11).is_some() => (
+            "distortion",
+            "it is the response of the distortions that are converted",
+        ),
+        // Sheared ellipticities are converted like the others, for which both components are required.
+        Some(Shapes::Converted) if in_columns.is_some() && !columns.have_other_sheared() => (
+            "distortion",
+            "the other component of the sheared distortions is missing",
+        ),
+        Some(shapes) => return Ok(shapes),
+    };
+    let named = response.unwrap_or("the sheared catalogues");
+    Err(FileError::new(
+        path,
+        format!(
+            "`{named}`: with --ellipticity {option}, this response is not used, because {why}. Try: --ellipticity shear, which divides the ellipticities by their response whatever their type, or R11=none,R22=none in --columns without it"
+        ),
+    ))
+}
+
 // Whether shear does not change a column, judged by its role and name.
 fn is_fixed(name: &str, columns: &Columns) -> bool {
     use Role::{Flag, G1, G2, Id, Psf1, Psf2, PsfSize, Unit, X, Y};
@@ -521,7 +695,7 @@ fn is_fixed(name: &str, columns: &Columns) -> bool {
     let mut flags = columns.flags.iter();
     roles.iter().any(|role| columns.of(*role) == Some(name))
         || flags.any(|flag| flag.eq_ignore_ascii_case(name))
-        || fits_any(FIXED, &name.to_ascii_lowercase())
+        || fits_any(&recognition().patterns.fixed, name)
 }
 
 // The name of a column of one sheared catalogue, without the name of the shear.

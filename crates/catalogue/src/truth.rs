@@ -400,9 +400,14 @@ pub fn expand(paths: &[PathBuf], mut truth: Truth) -> Result<Expanded, FileError
             continue;
         }
         let Some(run) = Run::read(path)? else {
+            // Of HATS, whose files are in folders of orders and pixels.
+            let hats = path.join("dataset");
+            let files = match hats.is_dir() {
+                true => format!("{}/*/*/*.parquet", hats.display()),
+                false => format!("{}/*", path.display()),
+            };
             let message = format!(
-                "this folder has no {RUN_FILE} (expected catalogues, or a folder that `measure` or `run` wrote). Try: {}/*",
-                path.display()
+                "this folder has no {RUN_FILE} (expected catalogues, or a folder that `measure` or `run` wrote). Try: {files}"
             );
             return Err(FileError::new(path, message));
         };

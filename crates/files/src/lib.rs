@@ -10,6 +10,7 @@ use std::path::{Path, PathBuf};
 use thiserror::Error;
 
 pub mod atomic;
+mod content;
 pub mod fits;
 pub mod frames;
 pub mod open;

@@ -1,23 +1,22 @@
-//! Tables of named columns, read and written by the file's ending.
+//! Tables of named columns. Files are read by their first bytes and written by their ending.
 //!
-//! | ending | format |
+//! | file | format |
 //! |---|---|
-//! | `.fits`, `.fit`, these with `.gz`, `.fits.fz` | FITS binary table |
-//! | `.parquet`, `.pq` | Parquet |
-//! | anything else that starts like a FITS file (`.cat`, `.ldac`) | FITS binary table |
+//! | starts like a FITS file, plain or compressed by gzip, whatever its name (`.fits`, `.cat`, `.ldac`, `.ftz`) | FITS table |
+//! | starts like a Parquet file, whatever its name (`.parquet`, `.parq`, `.pq`) | Parquet |
 //! | anything else (`.csv`, `.dat`, `.txt`, `.cat`, `.csv.gz`) | text, plain or compressed by gzip: numbers between commas, semicolons, tabs or blanks, as the content has them; columns `x y e1 e2` unless a header or the comments of SExtractor name them |
 //!
 //! `FILE[TABLE]` is a table of a FITS file, by name or number.
 
 use std::borrow::Cow;
-use std::io::Read;
 use std::path::{Path, PathBuf};
 
 use crate::frames::polars::DataFrame;
 use crate::frames::{Metadata, reals};
 
 use crate::FileError;
-use crate::open::{is_there, open};
+use crate::content::Content;
+use crate::open::is_there;
 
 use crate::fits::TableHead;
 use crate::{atomic, fits, parquet, text};
@@ -72,7 +71,13 @@ enum Ending {
 }
 
 impl Ending {
+    // By the first bytes; by the name of a file that is damaged, or still to be written.
     fn of(path: &Path) -> Self {
+        match Content::of(path) {
+            Content::Parquet => return Ending::Parquet,
+            Content::Fits => return Ending::Fits,
+            Content::Text | Content::Other(..) => {}
+        }
         let name = path.to_string_lossy().to_ascii_lowercase();
         let ends = |endings: &[&str]| endings.iter().any(|end| name.ends_with(end));
         if ends(&[".parquet", ".pq"]) {
@@ -80,18 +85,7 @@ impl Ending {
         } else if ends(&[".fits", ".fit", ".fits.gz", ".fit.gz", ".fits.fz"]) {
             Ending::Fits
         } else {
-            Ending::of_content(path)
-        }
-    }
-
-    // Format of a file by its first bytes: SExtractor writes FITS into `.cat` and `.ldac`. A file that cannot be opened
-    // is reported when it is read.
-    fn of_content(path: &Path) -> Self {
-        let mut start = [0; 9];
-        let read = open(path).and_then(|mut file| file.read_exact(&mut start));
-        match read {
-            Ok(()) if start == *b"SIMPLE  =" => Ending::Fits,
-            _ => Ending::Text,
+            Ending::Text
         }
     }
 }
@@ -146,8 +140,9 @@ impl Place {
         Ok(place)
     }
 
-    /// Refuses a table of a file that has only one.
+    /// Refuses a format that is not read, and a table of a file that has only one.
     fn check(&self) -> Result<(), FileError> {
+        Content::of(&self.path).check(&self.path)?;
         match (&self.table, Ending::of(&self.path)) {
             (Some(table), Ending::Text | Ending::Parquet) => {
                 let message = format!(
@@ -224,7 +219,7 @@ pub fn columns(place: &Place) -> Result<Columns, FileError> {
     })
 }
 
-/// Reads the columns `wanted` (all, if `None`) as real numbers; the format follows from the ending. A
+/// Reads the columns `wanted` (all, if `None`) as real numbers. A
 /// table of text or in Parquet has at most `most_rows`. Columns of a text table without names have numbers, from 1.
 pub fn read(
     path: &Path,

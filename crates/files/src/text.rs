@@ -9,6 +9,7 @@ use flate2::bufread::MultiGzDecoder;
 
 use crate::frames::polars::{Column, DataFrame};
 
+use crate::content::GZIP_MAGIC;
 use crate::open;
 use crate::{FileError, names_of};
 
@@ -25,9 +26,6 @@ const MIN_ROW_LIMIT: usize = 1 << 20;
 const BUFFER_BYTES: usize = 1 << 15;
 // Of a field in a message: a damaged field may be a megabyte. Chosen by hand.
 const MAX_FIELD_CHARS: usize = 40;
-// RFC 1952, Sect. 2.3.1. The content decides, not the ending of the name.
-const GZIP_MAGIC: [u8; 2] = [0x1f, 0x8b];
-
 /// Start of a cell of CSV that keeps a spreadsheet from interpreting `text` as a formula.
 pub fn formula_mark(text: &str) -> &'static str {
     match text.starts_with(['=', '+', '-', '@', '\t', '\r']) {
@@ -192,24 +190,26 @@ fn read_rows(
 
 // Formats that are text but no tables, by the start of their first line, so that the message names the format instead of a
 // field that is not a number.
-const OTHER_FORMATS: [(&str, &str); 2] = [
-    ("<?xml", "XML, such as a VOTable"),
-    ("<VOTABLE", "a VOTable"),
+const OTHER_FORMATS: [(&str, &str, &str); 4] = [
+    ("<?xml", "XML, such as a VOTable", "votable"),
+    ("<VOTABLE", "a VOTable", "votable"),
+    ("Title:", "a machine-readable table of CDS or AAS", "mrt"),
+    ("Byte-by-byte", "a machine-readable table of CDS", "mrt"),
 ];
 
-// The signature of HDF5. Astronomers pass such catalogues, and "not UTF-8" would not help them.
-const HDF5_MAGIC: [u8; 8] = *b"\x89HDF\r\n\x1a\n";
+// Types of IPAC tables, in the line below the names.
+const IPAC_TYPES: [&str; 5] = ["double|", "long|", "int|", "char|", "real|"];
 
 fn check_format(path: &Path, line: &str) -> Result<(), FileError> {
-    match OTHER_FORMATS.iter().find(|(start, _)| {
+    match OTHER_FORMATS.iter().find(|(start, ..)| {
         let first = line.get(..start.len());
         first.is_some_and(|first| first.eq_ignore_ascii_case(start))
     }) {
         None => Ok(()),
-        Some((_, format)) => Err(FileError::new(
+        Some((_, format, name)) => Err(FileError::new(
             path,
             format!(
-                "the file is {format}, which is not read; expected a text, FITS or Parquet table. Try: stilts tcopy ifmt=votable in={} out=table.fits",
+                "the file is {format}, which is not read; expected a text, FITS or Parquet table. Try: stilts tcopy ifmt={name} in={} out=table.fits",
                 path.display()
             ),
         )),
@@ -217,14 +217,6 @@ fn check_format(path: &Path, line: &str) -> Result<(), FileError> {
 }
 
 fn not_text(path: &Path, line: u64) -> FileError {
-    let mut start = [0; HDF5_MAGIC.len()];
-    let read = std::fs::File::open(path).and_then(|mut file| file.read_exact(&mut start));
-    if read.is_ok() && start == HDF5_MAGIC {
-        return FileError::new(
-            path,
-            "the file is HDF5, which is not read; expected a text, FITS or Parquet table. Try: pandas or astropy to write Parquet or FITS",
-        );
-    }
     FileError::new(
         path,
         format!("this is not a text table: line {line} is not UTF-8"),
@@ -343,6 +335,16 @@ impl Head {
             } else if head.header.is_none() && is_header(text) {
                 head.header = Some(text.to_owned());
             } else if !text.is_empty() {
+                let bars = head.header.as_ref().is_some_and(|own| own.starts_with('|'));
+                if bars && IPAC_TYPES.iter().any(|own| text.contains(own)) {
+                    return Err(FileError::new(
+                        path,
+                        format!(
+                            "the file is an IPAC table, which is not read; expected a text, FITS or Parquet table. Try: stilts tcopy ifmt=ipac in={} out=table.fits",
+                            path.display()
+                        ),
+                    ));
+                }
                 head.first = Some(line);
                 return Ok(head);
             }
@@ -476,7 +478,7 @@ impl Values {
         let exact = |value: &f64| value.abs() <= MAX_EXACT_INTEGER;
         match self {
             Values::Numbers(values) => {
-                let value = number(field);
+                let value = value(field);
                 values.push(value.unwrap_or(f64::NAN));
                 return value.is_some();
             }
@@ -569,7 +571,12 @@ impl<'a> Rows<'a> {
             Some(Values::Identities(_)) => "an identity",
             _ => "a number",
         };
-        let message = format!("line {line}: `{field}` in column `{name}` is not {expected}");
+        let mut message = format!("line {line}: `{field}` in column `{name}` is not {expected}");
+        // VizieR's tables have lines of units and of dashes.
+        if self.rows == 1 {
+            message +=
+                ". If it is one of units or dashes below the names, try: the table without it";
+        }
         FileError::new(self.path, message)
     }
 
@@ -590,6 +597,28 @@ impl<'a> Rows<'a> {
             .collect();
         crate::frames::frame(columns).map_err(|error| FileError::new(self.path, error.to_string()))
     }
+}
+
+// Missing numbers and truth values, in the words of pandas, SQL, R and astropy.
+const MISSING: [&str; 7] = ["null", "na", "n/a", "none", "--", "\\n", "<na>"];
+const WORDS_OF_TRUTH: [(&str, f64); 4] = [("true", 1.0), ("false", 0.0), ("t", 1.0), ("f", 0.0)];
+
+// A number, a truth value as 1 or 0, or a missing number.
+fn value(field: &str) -> Option<f64> {
+    number(field).or_else(|| {
+        let word = field.trim().trim_matches('"');
+        let is = |own: &&str| own.eq_ignore_ascii_case(word);
+        let truth = || {
+            WORDS_OF_TRUTH
+                .iter()
+                .find(|(own, _)| is(own))
+                .map(|own| own.1)
+        };
+        match MISSING.iter().any(|own| is(&own)) {
+            true => Some(f64::NAN),
+            false => truth(),
+        }
+    })
 }
 
 // Trimmed only if that fails, because fields rarely contain blanks. An empty field is a missing value.

@@ -42,14 +42,26 @@ pub enum BiasFailure {
     SignOfFolders,
     #[error("{}: it does not state the same sign of g2 as {}. Try: --truth-sign, or the same statement in all", catalogue.display(), first.display())]
     Signs { catalogue: PathBuf, first: PathBuf },
-    #[error("{}: its columns are not the columns of {} (expected the same columns for truth, response and PSF in all catalogues). Try: one command per kind of catalogue", catalogue.display(), first.display())]
-    Columns { catalogue: PathBuf, first: PathBuf },
+    #[error("{}: its columns are not the columns of {} (found {}). Try: --columns with the same columns for all, or one command per kind of catalogue", catalogue.display(), first.display(), difference)]
+    Columns {
+        catalogue: PathBuf,
+        first: PathBuf,
+        difference: String,
+    },
     #[error(
         "{second}: it was measured on the same image as {first} (expected one catalogue of each image). Try: leave one out, or measure again if it is a copy"
     )]
     SameImage { first: String, second: String },
     #[error("the sums do not belong together: they have different {0}")]
     Unlike(&'static str),
+    #[error(
+        "the sums do not belong together (found {0}). Try: the same columns and options for all"
+    )]
+    UnlikeColumns(String),
+    #[error(
+        "{second}: it contains the same galaxies as {first}, which would count twice (expected other galaxies). Try: each part once, also of tasks that were repeated"
+    )]
+    SameContent { first: String, second: String },
     #[error("{0}: the catalogue is in two files of sums")]
     InTwoFiles(String),
     #[error(
@@ -115,6 +127,9 @@ pub struct About {
     matched: bool,
     /// A column that is not used and looks like independent units.
     pub unit_column: Option<String>,
+    // Columns by role and what becomes of them, in which all catalogues agree.
+    #[serde(default)]
+    kind: Vec<(String, String)>,
     design: Option<Design>,
     by_key: Option<bool>,
     pub binned: String,
@@ -215,7 +230,7 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
     let truth = known(&request.truth, first);
     let response = first.has_response() || first.shapes != Shapes::Shear;
     let described = first.described(&reading);
-    check_columns(request, &all)?;
+    let kind = check_columns(&reading, &all)?;
     let (frame, images) = frame_and_images(&all)?;
     let named = request.catalogues.iter().zip(&images);
     distinct_images(named.map(|(input, image)| (input.name.display().to_string(), image)))?;
@@ -242,6 +257,7 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
         response_column: first.columns.have(&[Role::R11]),
         matched: named_unit || first.columns.of(Role::Id).is_some(),
         unit_column: first.unit_column.clone().filter(|_| !named_unit),
+        kind,
         design: request.design,
         by_key: match request.units {
             Units::Rows | Units::Column(_) => Some(true),
@@ -370,28 +386,46 @@ fn known_sign(request: &Request, all: &[Vec<Source>]) -> Result<Option<Sign>, Bi
     }
 }
 
-// Refuses catalogues with other columns than the first one.
-fn check_columns(request: &Request, all: &[Vec<Source>]) -> Result<(), BiasFailure> {
-    let kind = |source: &Source| {
-        (
-            known(&request.truth, source),
-            source.has_response(),
-            source.has_psf(),
-            source.has_matrix(),
-            source.selects,
-            source.columns.preset,
-        )
-    };
-    let first = all[0].first().map(kind);
-    for (input, sources) in request.catalogues.iter().zip(all) {
-        if !sources.iter().all(|source| Some(kind(source)) == first) {
-            return Err(BiasFailure::Columns {
-                catalogue: input.name.clone(),
-                first: request.catalogues[0].name.clone(),
-            });
+// Columns by role and what becomes of them. Refuses catalogues in which they differ: a weight in one of two catalogues gave a
+// mixture of two estimates without a word.
+fn check_columns(
+    reading: &Reading<'_>,
+    all: &[Vec<Source>],
+) -> Result<Vec<(String, String)>, BiasFailure> {
+    let catalogues = &reading.request.catalogues;
+    let known = |source: &Source| known(&reading.request.truth, source);
+    let first = &all[0][0];
+    let kind = first.kind(reading);
+    for (input, sources) in catalogues.iter().zip(all) {
+        for source in sources {
+            let mut difference = unlike(&source.kind(reading), &kind);
+            if difference.is_none() && known(source) != known(first) {
+                difference = Some("a true shear in one of them".into());
+            }
+            if let Some(difference) = difference {
+                return Err(BiasFailure::Columns {
+                    catalogue: input.name.clone(),
+                    first: catalogues[0].name.clone(),
+                    difference,
+                });
+            }
         }
     }
-    Ok(())
+    Ok(kind)
+}
+
+// The first role or use in which two catalogues differ.
+fn unlike(own: &[(String, String)], expected: &[(String, String)]) -> Option<String> {
+    let of = |all: &[(String, String)], role: &str| {
+        let found = all.iter().find(|(known, _)| known == role);
+        found.map_or("none".to_owned(), |(_, column)| column.clone())
+    };
+    let mut roles = expected.iter().chain(own).map(|(role, _)| role);
+    roles.find_map(|role| {
+        let (found, expected) = (of(own, role), of(expected, role));
+        (!found.eq_ignore_ascii_case(&expected))
+            .then(|| format!("`{found}` for {role}, expected `{expected}`"))
+    })
 }
 
 // The frame of catalogues by shearq, and the fingerprint of the image of each. Others do not state theirs.
@@ -427,6 +461,20 @@ fn distinct_images<'c>(
             && let Some(first) = seen.insert(image, second.clone())
         {
             return Err(BiasFailure::SameImage { first, second });
+        }
+    }
+    Ok(())
+}
+
+// Refuses sums of the same galaxies: a task that was repeated counts twice, and errors are too small by √2.
+fn distinct_content(catalogues: &[Catalogue]) -> Result<(), BiasFailure> {
+    let mut seen = HashMap::new();
+    for own in catalogues.iter().filter(|own| own.content != 0) {
+        if let Some(first) = seen.insert(own.content, &own.name) {
+            return Err(BiasFailure::SameContent {
+                first: first.clone(),
+                second: own.name.clone(),
+            });
         }
     }
     Ok(())
@@ -547,6 +595,7 @@ impl Summed {
         self.about.catalogues.extend(other.about.catalogues);
         let named = self.about.catalogues.iter();
         distinct_images(named.map(|own| (own.name.clone(), &own.image)))?;
+        distinct_content(&self.about.catalogues)?;
         let remarks = other.about.without_catalogue;
         self.about.without_catalogue.extend(remarks);
         Ok(self.sums.append(other.sums)?)
@@ -576,6 +625,9 @@ impl Summed {
         if options(&self.about) != options(&other.about) || rows(&self.about) != rows(&other.about)
         {
             return Err(BiasFailure::Unlike("options"));
+        }
+        if let Some(difference) = unlike(&other.about.kind, &self.about.kind) {
+            return Err(BiasFailure::UnlikeColumns(difference));
         }
         if self.about.sign.map(|sign| sign.of) != other.about.sign.map(|sign| sign.of) {
             return Err(BiasFailure::Unlike("signs of g2"));
@@ -770,6 +822,34 @@ impl Summed {
     }
 }
 
+/// Joins parts in their order, each time two that contain about equally many, so that n parts take a time of n log n rather than
+/// n²: a union looks at all that it contains.
+pub fn joined<P, E>(
+    parts: impl IntoIterator<Item = Result<P, E>>,
+    join: impl Fn(&mut P, P) -> Result<(), E>,
+) -> Result<Option<P>, E> {
+    // Unions with the number of their parts, the later ones smaller.
+    let mut unions: Vec<(usize, P)> = Vec::new();
+    let union = |unions: &mut Vec<(usize, P)>, most: usize| -> Result<(), E> {
+        while let [.., (before, _), (count, _)] = &unions[..]
+            && *before <= most.max(*count)
+        {
+            let last = unions.pop();
+            if let (Some((more, last)), Some((count, first))) = (last, unions.last_mut()) {
+                join(first, last)?;
+                *count += more;
+            }
+        }
+        Ok(())
+    };
+    for part in parts {
+        unions.push((1, part?));
+        union(&mut unions, 0)?;
+    }
+    union(&mut unions, usize::MAX)?;
+    Ok(unions.pop().map(|(_, all)| all))
+}
+
 /// Whether catalogues of one side of a comparison state an image that those of the other side state.
 pub fn share_images(own: &[Catalogue], theirs: &[Catalogue]) -> bool {
     let theirs: HashSet<_> = theirs.iter().filter_map(|own| own.image.as_ref()).collect();
@@ -890,6 +970,23 @@ fn check_responses(
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn parts_are_joined_in_their_order_with_few_copies() {
+        let copied = std::cell::Cell::new(0);
+        let join = |all: &mut Vec<usize>, more: Vec<usize>| {
+            copied.set(copied.get() + all.len() + more.len());
+            all.extend(more);
+            Ok::<(), ()>(())
+        };
+        for count in [1, 2, 3, 7, 1000] {
+            copied.set(0);
+            let all = joined((0..count).map(|k| Ok(vec![k])), join).unwrap();
+            assert_eq!(all, Some((0..count).collect()));
+            assert!(copied.get() <= 12 * count, "{}", copied.get());
+        }
+        assert_eq!(joined([] as [Result<_, ()>; 0], join), Ok(None));
+    }
 
     #[test]
     fn bins_contain_their_lower_edges_and_the_last_its_upper_edge() {

@@ -10,6 +10,7 @@ use shearq_measure::{Flag, Flags, MeanShear, ShearSum, Warning};
 use shearq_quantities::statistics::RunningMean;
 use shearq_submissions::Calibration;
 
+use shearq_catalogue::failures::repeated_ellipticities;
 use shearq_catalogue::select::StatedSelection;
 use shearq_catalogue::shapes::MeasuredShapes;
 use shearq_catalogue::star_noise::{Stars, of_catalogue};
@@ -29,6 +30,8 @@ pub struct SetMean {
     /// Galaxies whose ellipticity has a modulus of 1 or more, which only noise makes. They count like the others, because a cut
     /// would bias the mean.
     pub above_one: usize,
+    /// Galaxies with the ellipticity of an earlier one of their image, if these are not few.
+    pub repeated: u64,
     /// Galaxies with each of [`Flag::ALL`].
     pub flags: [usize; Flag::ALL.len()],
     /// Mean shear: the sum of ellipticities over the sum of responses. Errors include the error of the mean
@@ -114,6 +117,7 @@ fn mean_of(
     let mut axes = CommonAxes::default();
     let (mut noise, mut in_pairs) = ([0.0; 2], pairs);
     let mut responses = [RunningMean::default(); 2];
+    let mut repeated = 0;
     for (_, path) in catalogues {
         let stated = if in_pairs {
             e_noise(path, format)?
@@ -128,6 +132,9 @@ fn mean_of(
                 *count += usize::from(Flags::from_bits(bits as u32).contains(flag));
             }
         }
+        let counted = shapes.e.iter().zip(&shapes.weight);
+        let counted = counted.filter(|(e, weight)| e[0].is_finite() && **weight != 0.0);
+        repeated += repeated_ellipticities(counted.map(|(e, _)| *e));
         let mut share = [0.0; 2];
         for (row, (&e, &response)) in shapes.e.iter().zip(&shapes.response).enumerate() {
             if !e.iter().all(|e| e.is_finite()) {
@@ -169,6 +176,7 @@ fn mean_of(
         flagged,
         cut,
         above_one,
+        repeated,
         flags,
         shear,
         psf_error,

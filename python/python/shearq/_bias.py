@@ -89,15 +89,13 @@ class BiasSums:
         self._sums = sums
 
     def __add__(self, other: BiasSums) -> BiasSums:
-        return BiasSums(self._sums.append(other._sums))
+        return BiasSums(self._sums.append([other._sums]))
 
     @staticmethod
     def merge(parts: Iterable[BiasSums]) -> BiasSums:
         """The sums of all parts, in their order."""
         first, *others = parts
-        for part in others:
-            first = first + part
-        return first
+        return BiasSums(first._sums.append([part._sums for part in others]))
 
     def __radd__(self, other: int) -> BiasSums:
         # sum() begins with 0.
@@ -150,7 +148,8 @@ def bias(
         Table of true shears with the columns id, g1, g2 or x, y, g1, g2.
     columns : mapping
         Names of columns by role, such as ``{"e1": "g_1", "w": "weight"}``; ``"none"`` ignores a column, and ``"g[0]"`` is
-        the first number of a vector. No column may have two roles. Roles:
+        the first number of a vector. Formulas such as ``"Q1/P"`` or ``"flags & 4"`` make columns. No column may have two
+        roles. Roles:
 
         * ``e1 e2`` ellipticity, ``w`` weight, ``flag`` (0 for good rows), ``id`` of the galaxy, ``unit`` of the errors;
         * ``R11 R22 R12 R21`` response, R12 that of e1 to g2; ``dw1 dw2`` derivatives of the weight;

@@ -1,7 +1,7 @@
 //! Reading images and tables with cfitsio. The values of a header are checked before they are used.
 
 use std::collections::BTreeMap;
-use std::ffi::{c_char, c_int};
+use std::ffi::{CString, c_char, c_int};
 use std::ops::Range;
 use std::path::Path;
 use std::ptr;
@@ -598,7 +598,14 @@ fn choose_columns(
         let text = texts && found.kind == TSTRING;
         let number = found.is_number() && (found.repeat == 1 || found.name.ends_with(']'));
         if !(number || text) {
-            return Err(file.fault(format!("column `{name}` does not hold one number per row")));
+            let by_column = found.repeat > MAX_VECTOR && file.rows()? == 1;
+            return Err(file.fault(match by_column {
+                true => format!(
+                    "column `{name}` holds all its values in one row, as in colfits, which is not read (expected one number per row). Try: stilts tcopy in={} out=table.fits ofmt=fits",
+                    path.display()
+                ),
+                false => format!("column `{name}` does not hold one number per row"),
+            }));
         }
         chosen.push(found);
     }
@@ -717,7 +724,8 @@ fn read_column(
         let values = values_of(file, description, rows, MISSING)?;
         values.into_iter().map(real).collect()
     } else {
-        values_of(file, description, rows, f64::NAN)?
+        let values = values_of(file, description, rows, f64::NAN);
+        values.or_else(|error| values_with_nan(file, description, rows).ok_or(error))?
     };
     let own: Vec<f64> = match repeat {
         1 => values,
@@ -727,6 +735,37 @@ fn read_column(
         }
     };
     Ok(Column::new(description.name.as_str().into(), own))
+}
+
+// Words for NaN in ASCII tables, which cfitsio does not read: astropy's first.
+const NAN_WORDS: [&str; 3] = ["NAN", "nan", "NaN"];
+
+// The numbers of a column of an ASCII table that has a word for NaN: cfitsio compares a field with the text for missing values
+// from its first character, so that the word is stated with the blanks before it.
+fn values_with_nan(
+    file: &File,
+    description: &Description,
+    rows: &Range<usize>,
+) -> Option<Vec<f64>> {
+    if file.text("XTENSION").trim() != "TABLE" {
+        return None;
+    }
+    let format = file.text(&format!("TFORM{}", description.number));
+    let width = format
+        .trim()
+        .trim_start_matches(|c: char| !c.is_ascii_digit());
+    let width: usize = width.split('.').next()?.parse().ok()?;
+    let aligned = |word: &&str| [format!("{word:>width$}"), (*word).to_owned()];
+    NAN_WORDS.iter().flat_map(aligned).find_map(|word| {
+        let word = CString::new(word).ok()?;
+        let doing = || format!("cannot read column `{}`", description.name);
+        // SAFETY: the file is open, and the word, which cfitsio copies, ends in a zero byte.
+        let stated = file.call(doing, |raw, status| unsafe {
+            sys::ffsnul(raw, description.number, word.as_ptr().cast_mut(), status);
+        });
+        stated.ok()?;
+        values_of(file, description, rows, f64::NAN).ok()
+    })
 }
 
 // Rows of a column of 64-bit integers as such, if it has neither a scale nor missing values.

@@ -174,3 +174,18 @@ fn mistakes_are_named_with_their_line() {
         assert!(error.contains(expected), "{expected}: {error}");
     }
 }
+
+#[test]
+fn words_of_databases_are_truth_values_and_missing_numbers() {
+    let words = "a,b\nTrue,NULL\nf,NA\nFALSE,--\nt,None\n\"true\",\\N\nF,N/A\n1,nan\n";
+    let read = table(words, Some(&["a", "b"])).unwrap();
+    assert_eq!(column(&read, "a"), [1.0, 0.0, 0.0, 1.0, 1.0, 0.0, 1.0]);
+    assert!(column(&read, "b").iter().all(|value| value.is_nan()));
+    // A name is no row, and a line of units no value.
+    assert_eq!(
+        column(&table("T,e1\n2,3\n", Some(&["T"])).unwrap(), "T"),
+        [2.0]
+    );
+    let error = table("e1,e2\ndeg,deg\n1,2\n", Some(&["e1"])).unwrap_err();
+    assert!(error.contains("units"), "{error}");
+}

@@ -415,16 +415,30 @@ fn repeated(catalogues: &[Catalogue]) -> Vec<String> {
         let ([a, b], [first, second]) = (&own.columns, own.values.map(shown));
         if a == b {
             return format!(
-                "`{a}` is exactly {first} in {} of {rows} rows, which count. If this stands for a failure, try: --where '{a} != {first}'",
+                "Repeated values: `{a}` is exactly {first} in {} of {rows} rows, which count; measured values do not repeat. If this stands for a failure, try: --where '{a} != {first}'",
                 own.rows
             );
         }
         format!(
-            "`{a}` and `{b}` are exactly {first} and {second} in {} of {rows} rows, which count. If this stands for a failure, try: --where '{a} != {first}'",
+            "Repeated values: `{a}` and `{b}` are exactly {first} and {second} in {} of {rows} rows, which count; measured values do not repeat. If this stands for a failure, try: --where '{a} != {first}'",
             own.rows
         )
     };
-    all.iter().map(line).collect()
+    let mut lines: Vec<String> = all.iter().map(line).collect();
+    let sum = |of: fn(&Catalogue) -> u64| catalogues.iter().map(of).sum::<u64>();
+    let copies = sum(|own| own.copies);
+    if copies > 0 {
+        lines.push(format!(
+            "Repeated rows: {copies} of {rows} rows have the numbers of an earlier row of their catalogue, so that galaxies count several times and the errors are too small. Try: a catalogue with each galaxy once."
+        ));
+    }
+    let shared = sum(|own| own.shared_identifiers);
+    if shared > 0 {
+        lines.push(format!(
+            "Repeated identifiers: {shared} of {rows} rows have the identifier of an earlier row of their catalogue, and galaxies that share one form one unit of the errors. Try: --columns id=NAME, or id=none if they do not name galaxies."
+        ));
+    }
+    lines
 }
 
 // A quantity compared with the requirements that have one limit.
