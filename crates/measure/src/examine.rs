@@ -125,6 +125,8 @@ pub struct Examination {
     added: usize,
     blank: usize,
     psfs: Vec<PsfQuality>,
+    /// Of PSFs of one galaxy each: their centroid, and that of the galaxy from its expected place.
+    pairs: Vec<[[f64; 2]; 2]>,
     /// Whether there is a PSF per galaxy.
     each: bool,
 }
@@ -165,6 +167,7 @@ impl Examination {
             added: 0,
             blank: 0,
             psfs: Vec::new(),
+            pairs: Vec::new(),
             each: false,
         }
     }
@@ -191,11 +194,17 @@ impl Examination {
     pub fn add_psfs(&mut self, psfs: &Psfs<'_>, cut: PsfCut, most: usize) {
         let count = psfs.count();
         self.each |= count.is_some();
+        // The stamps of these PSFs were added before.
+        let first = count.and_then(|count| self.added.checked_sub(count));
         let count = count.unwrap_or(1);
         let some = most.min(count);
         for at in (0..some).map(|k| (2 * k + 1) * count / (2 * some)) {
             if let Ok(Star { psf, moved }) = psfs.at(at, cut, self.stamp.side) {
                 self.add_psf(psf.view(), moved);
+                let stamp = first.and_then(|first| self.of(first + at));
+                let both = stamp.zip(self.psfs.last());
+                self.pairs
+                    .extend(both.map(|(stamp, psf)| [psf.offset, stamp.place]));
             }
         }
     }
@@ -306,6 +315,7 @@ impl Examination {
         self.added += other.added;
         self.blank += other.blank;
         self.psfs.extend_from_slice(&other.psfs);
+        self.pairs.extend_from_slice(&other.pairs);
         self.each |= other.each;
     }
 
@@ -650,6 +660,37 @@ impl Examination {
             error: away.error,
             from_first: true,
         })
+    }
+
+    /// A warning if PSFs of one galaxy each are at several places of their stamps, and the galaxies do not follow them: deconvolution
+    /// moves each galaxy with its PSF. PSFs that are drawn at the phase of a galaxy (as in MEDS) do so unless the expected place is
+    /// that from the PSF's.
+    pub(crate) fn scattered_psfs(&self) -> Option<Warning> {
+        let is_known = |pair: &&[[f64; 2]; 2]| pair.as_flattened().iter().all(|at| at.is_finite());
+        let pairs: Vec<_> = self.pairs.iter().filter(is_known).collect();
+        let count = pairs.len() as f64;
+        let mean = |of: usize, k: usize| pairs.iter().map(|pair| pair[of][k]).sum::<f64>() / count;
+        let means = [0, 1].map(|of| [0, 1].map(|k| mean(of, k)));
+        let centred = pairs
+            .iter()
+            .flat_map(|pair| [0, 1].map(|k| [0, 1].map(|of| pair[of][k] - means[of][k])));
+        let centred: Vec<[f64; 2]> = centred.collect();
+        let of_psfs: f64 = centred.iter().map(|[psf, _]| psf * psf).sum();
+        let scatter = (of_psfs / centred.len() as f64).sqrt();
+        let slope = centred.iter().map(|[psf, place]| psf * place).sum::<f64>() / of_psfs;
+        let residuals = centred
+            .iter()
+            .map(|[psf, place]| (place - slope * psf).powi(2));
+        let error = (residuals.sum::<f64>() / centred.len() as f64 / of_psfs).sqrt();
+        let follow = Estimate {
+            value: slope - 1.0,
+            error,
+        };
+        let found = pairs.len() >= MIN_GALAXIES_EPOCHS
+            && scatter > EPOCH_OFFSET
+            && slope < 0.5
+            && follow.is_significant();
+        found.then_some(Warning::ScatteredPsfs { scatter })
     }
 
     /// Median offset of the PSFs from the centres of their stamps.

@@ -195,6 +195,7 @@ pub struct ArraySource<'a, E = MeasureError> {
     stamps: Slices<'a, Pixels<'a, Ix3>, E>,
     psfs: Slices<'a, Psfs<'a>, E>,
     moved: Option<[f64; 2]>,
+    is_psf_shared: bool,
     /// One for all stamps or one per stamp.
     jacobians: Option<Cow<'a, [Jacobian]>>,
     offsets: Option<Cow<'a, [[f64; 2]]>>,
@@ -233,6 +234,7 @@ impl<'a> ArraySource<'a> {
             }
             _ => (None, None),
         };
+        let is_shared = shared.is_some();
         let stamps = move |range| {
             let mut some = stamps;
             some.slice_axis_inplace(Axis(0), Slice::from(range));
@@ -242,7 +244,11 @@ impl<'a> ArraySource<'a> {
             let shared = shared.clone().map(Psfs::Prepared);
             Ok(shared.unwrap_or_else(|| psfs.slice(range)))
         };
-        Ok(ArraySource::from_fn(count, stamps, psfs, moved))
+        let source = ArraySource::from_fn(count, stamps, psfs, moved);
+        Ok(match is_shared {
+            true => source.with_shared_psf(),
+            false => source,
+        })
     }
 }
 
@@ -260,9 +266,17 @@ impl<'a, E> ArraySource<'a, E> {
             stamps: Box::new(stamps),
             psfs: Box::new(psfs),
             moved,
+            is_psf_shared: false,
             jacobians: None,
             offsets: None,
         }
+    }
+
+    /// The same stamps, of which all have one PSF.
+    #[must_use]
+    pub fn with_shared_psf(mut self) -> Self {
+        self.is_psf_shared = true;
+        self
     }
 
     /// The same stamps with their galaxies at these offsets (x, y) from their centres in pixels, one per stamp.
@@ -307,7 +321,13 @@ impl<'a, E: From<MeasureError> + Send> StampSource<'a> for ArraySource<'a, E> {
     }
 
     fn warnings(&self) -> Vec<Warning> {
-        self.moved.map(Warning::of_moved).into_iter().collect()
+        let moved = self.moved.map(Warning::of_moved);
+        let pixels = self.jacobians.as_deref().filter(|_| self.is_psf_shared);
+        let pixels = pixels.unwrap_or_default().iter().map(Jacobian::matrix);
+        moved
+            .into_iter()
+            .chain(Warning::of_shared_psf(pixels))
+            .collect()
     }
 
     fn stamps(&mut self, row: usize) -> Result<LazyStamps<'a>, E> {
@@ -963,6 +983,7 @@ impl Session<'_> {
             if let Some(Examined { stamps, .. }) = examined {
                 let axes = image.axes_from(self);
                 own.extend(stamps.contradictions(&earlier, axes, image.common_flux));
+                own.extend(stamps.scattered_psfs());
                 earlier.push(stamps);
             }
             warnings.extend(image.of_epoch(own).map(|warning| {

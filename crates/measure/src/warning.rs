@@ -4,6 +4,7 @@
 
 use std::fmt;
 
+use shearq_quantities::linear::{Matrix2, determinant, inverse, product};
 use shearq_submissions::limits::MIN_PSF;
 use strum_macros::IntoStaticStr;
 use thiserror::Error;
@@ -174,6 +175,14 @@ pub enum Warning {
         /// Whether it is that from the galaxies of the first epoch, and not from the offsets alone.
         from_first: bool,
     },
+    /// PSFs of one galaxy each have their centroids at several places, from which the galaxies are not counted.
+    #[error(
+        "the PSFs are at several places of their stamps (found a scatter of {scatter:.2} px, which the galaxies do not have beyond their offsets; expected PSFs in the middle). Deconvolution moves each galaxy with its PSF, which blurs the combined galaxies. Try: PSFs in the middle of their stamps, or offsets of the galaxies less those of their PSFs"
+    )]
+    ScatteredPsfs {
+        /// Root mean square in pixels along an axis.
+        scatter: f64,
+    },
     /// The galaxies of an epoch have another flux than in the first one.
     #[error(
         "the galaxies have {ratio:.2} ± {error:.2} times the flux of the first epoch (expected 1): weights and leakage of the PSF are those of one flux. Try: scale image, noise and gain to one zero point"
@@ -309,6 +318,17 @@ pub enum Warning {
         psf: PixelFrame,
         galaxies: PixelFrame,
     },
+    /// One PSF is deconvolved from stamps whose pixels differ on the sky.
+    #[error(
+        "one PSF is for all stamps, whose pixels differ on the sky (found {first} at {:.4} arcsec per pixel, and {other} at {:.4}; expected a PSF per stamp). This is right only for a PSF that turns with the pixels. Try: a PSF on the pixels of each stamp",
+        scales[0], scales[1]
+    )]
+    SharedPsf {
+        first: PixelFrame,
+        other: PixelFrame,
+        /// Arcseconds per pixel of both.
+        scales: [f64; 2],
+    },
     /// The configuration uses so little of the PSF that its wings are missing.
     #[error(
         "psf.size is {size} (expected {MIN_PSF} or more). The wings of the PSF that are cut off bias m, by about 0.002 at 20 px and 0.01 at 16 px for a FWHM of 3.4 px. Try: psf.size = {MIN_PSF}"
@@ -334,6 +354,40 @@ pub struct PixelFrame {
     pub mirrored: bool,
     /// Reduced shear that an object that is round on the sky has along the pixel axes.
     pub shear: [f64; 2],
+}
+
+// Least rotation in degrees, shear, and relative difference of scales, of pixels that differ: a difference of scales by 1 % changes m
+// by about 0.01.
+const MIN_ROTATION_DEGREES: f64 = 1.0;
+const MIN_PIXEL_DIFFERENCE: f64 = 0.01;
+
+impl PixelFrame {
+    /// Of the Jacobian ((du/dx, du/dy), (dv/dx, dv/dy)) of pixels, u to the west and v to the north.
+    pub fn from_jacobian(jacobian: Matrix2) -> Self {
+        let [[ux, uy], [vx, vy]] = jacobian;
+        let all = determinant(jacobian);
+        // A round object has the second moments J⁻¹ J⁻ᵀ in pixels; this is their ellipticity (Bartelmann & Schneider 2001,
+        // eq. 4.10).
+        let (xx, yy, xy) = (vy * vy + uy * uy, vx * vx + ux * ux, -(vx * vy + ux * uy));
+        let size = xx + yy + 2.0 * all.abs();
+        // The rotation of the polar decomposition, with +x mirrored where it is to the east.
+        let parity = all.signum();
+        PixelFrame {
+            angle: (parity * vx - uy).atan2(parity * ux + vy).to_degrees(),
+            mirrored: all < 0.0,
+            shear: [(xx - yy) / size, 2.0 * xy / size],
+        }
+    }
+
+    /// Whether pixels of these Jacobians differ in orientation, parity or shear.
+    pub fn differ(first: Matrix2, other: Matrix2) -> bool {
+        let PixelFrame {
+            angle,
+            mirrored,
+            shear: [g1, g2],
+        } = PixelFrame::from_jacobian(product(inverse(first), other));
+        mirrored || angle.abs() > MIN_ROTATION_DEGREES || g1.hypot(g2) > MIN_PIXEL_DIFFERENCE
+    }
 }
 
 impl fmt::Display for PixelFrame {
@@ -374,6 +428,23 @@ impl Warning {
             offset: moved,
             of: ExaminedPsfs { count: 1, of: 1 },
         }
+    }
+
+    /// A warning if one PSF is for stamps with these Jacobians, which differ.
+    pub fn of_shared_psf(pixels: impl IntoIterator<Item = Matrix2>) -> Option<Warning> {
+        let mut pixels = pixels.into_iter();
+        let first = pixels.next()?;
+        let scale = |matrix: Matrix2| determinant(matrix).abs().sqrt();
+        let differs = |other: &Matrix2| {
+            let is_larger = (scale(*other) / scale(first) - 1.0).abs() > MIN_PIXEL_DIFFERENCE;
+            is_larger || PixelFrame::differ(first, *other)
+        };
+        let other = pixels.find(differs)?;
+        Some(Warning::SharedPsf {
+            first: PixelFrame::from_jacobian(first),
+            other: PixelFrame::from_jacobian(other),
+            scales: [first, other].map(scale),
+        })
     }
 
     /// Warnings about the galaxies of an image.

@@ -155,6 +155,41 @@ fn epoch(centre: [f32; 2], place: [f64; 2], of_psf: [f32; 2], order: [usize; 2])
 }
 
 #[test]
+fn psfs_that_galaxies_do_not_follow_are_named() {
+    let places = |k: usize| {
+        [
+            (k * 7 % 40) as f32 / 40.0 - 0.5,
+            (k * 13 % 40) as f32 / 40.0 - 0.5,
+        ]
+    };
+    let found = |of_psf: f32, of_galaxy: f32, stated: f32| {
+        let mut epoch = Examination::new(N, 40);
+        let mut stars = ndarray::Array3::zeros((40, N, N));
+        for k in 0..40 {
+            let at = |factor: f32| places(k).map(|place| factor * place);
+            let noise = |at: usize| ((at * at * (k + 1)) % 97) as f32 / 970.0;
+            let mut galaxy = stamp(0.0, [0.0; 2], at(of_galaxy));
+            galaxy
+                .iter_mut()
+                .enumerate()
+                .for_each(|(at, value)| *value += noise(at));
+            epoch
+                .add_at(galaxy.view(), at(stated).map(f64::from))
+                .unwrap();
+            let star = stamp(0.0, [0.0; 2], at(of_psf)).mapv(f64::from);
+            stars.index_axis_mut(ndarray::Axis(0), k).assign(&star);
+        }
+        epoch.add_psfs(&Psfs::stars(stars), N.into(), 40);
+        epoch.scattered_psfs().map(|warning| warning.kind())
+    };
+    // PSFs and galaxies at their phases, of which the offsets may be stated alone, or those from the PSFs.
+    assert_eq!(found(1.0, 1.0, 1.0), Some("scattered-psfs"));
+    assert_eq!(found(1.0, 1.0, 0.0), None);
+    assert_eq!(found(0.0, 1.0, 1.0), None);
+    assert_eq!(found(1.0, 0.0, 0.0), Some("scattered-psfs"));
+}
+
+#[test]
 fn epochs_that_contradict_the_first_are_named() {
     const SAME: Matrix2 = [[1.0, 0.0], [0.0, 1.0]];
     let dither = [0.5, -0.25];

@@ -13,15 +13,37 @@ const RADIUS_SIGMAS: f64 = 5.0;
 // Change of the moments, in units of their trace, below which they count as found. Chosen by hand: what remains is below 4·10⁻⁷
 // of an ellipticity, because steps of Moffat profiles fall by factors of 4 to 6, of others faster.
 const CONVERGED: f64 = 1e-6;
+// Variances in px² of the Gaussian of the same noise-equivalent area below which a PSF is too narrow for weights of its own size, and
+// of the weight that it gets. Chosen by hand: weights of less than a pixel see no neighbour.
+const NARROW_VARIANCE: f64 = 0.5;
+const WIDE_VARIANCE: f64 = 1.0;
 // Moffat profiles need about eight. Chosen by hand.
 const MAX_ITERATIONS: usize = 100;
 // A vector of AVX-512 in double precision.
 const COLUMN_LANES: usize = 8;
 
 impl PsfShape {
-    /// Of the pixels of a PSF; NaN if the moments do not converge, as for a PSF that is mostly noise.
+    /// Of the pixels of a PSF; NaN if the moments do not converge, as for a PSF that is mostly noise. A PSF that is narrower than a
+    /// pixel has those under a fixed weight.
     pub(crate) fn from_psf(psf: ArrayView2<'_, f64>) -> Self {
         let round = gaussian_variance(noise_equivalent_area(psf));
+        let fixed = || {
+            let weight = [WIDE_VARIANCE, 0.0, WIDE_VARIANCE];
+            (round < NARROW_VARIANCE).then(|| Self::under_weight(psf, weight))?
+        };
+        let found = Self::adaptive(psf, round).or_else(fixed);
+        found.unwrap_or(PsfShape::UNKNOWN)
+    }
+
+    /// As a Gaussian would have them that has the moments under a weight.
+    fn under_weight(psf: ArrayView2<'_, f64>, weight: [f64; 3]) -> Option<Self> {
+        let (weighted, _) = weighted_moments(psf, weight, [0.0; 2])?;
+        let (seen, own) = (inverse(weighted)?, inverse(weight)?);
+        let moments = inverse([0, 1, 2].map(|k| seen[k] - own[k]))?;
+        Some(PsfShape { moments })
+    }
+
+    fn adaptive(psf: ArrayView2<'_, f64>, round: f64) -> Option<Self> {
         let (mut moments, mut centre) = ([round, 0.0, round], [0.0; 2]);
         for _ in 0..MAX_ITERATIONS {
             let Some((weighted, shift)) = weighted_moments(psf, moments, centre) else {
@@ -40,10 +62,10 @@ impl PsfShape {
             moments = next;
             centre = [0, 1].map(|axis| centre[axis] + 2.0 * shift[axis]);
             if change < CONVERGED {
-                return PsfShape { moments };
+                return Some(PsfShape { moments });
             }
         }
-        PsfShape::UNKNOWN
+        None
     }
 
     /// In the frame of the sky, for pixels with this Jacobian. Adaptive moments follow linear maps, so that they need not be
@@ -207,6 +229,26 @@ mod tests {
         let noise = noisy(&wide, 0.02, &mut ChaCha8Rng::seed_from_u64(4));
         let sigma = PsfShape::from_psf(noise.view()).sigma();
         assert!(sigma.is_nan() || sigma > 0.0);
+    }
+
+    #[test]
+    fn psfs_narrower_than_a_pixel_have_a_shape() {
+        for fwhm in [0.3, 0.5, 0.8, 1.2] {
+            let psf = drawn(
+                PsfProfile::Moffat { beta: 3.0 },
+                fwhm,
+                Shear::new(0.1, 0.0),
+                32,
+            );
+            let found = PsfShape::from_psf(psf.view());
+            let [e1, e2] = found.ellipticity();
+            assert!(e1.abs() < 0.2 && e2.abs() < 1e-6, "{fwhm}: {e1} {e2}");
+            assert!(
+                (0.05..1.2).contains(&found.sigma()),
+                "{fwhm}: {}",
+                found.sigma()
+            );
+        }
     }
 
     #[test]
