@@ -28,12 +28,14 @@ pub(crate) struct Arguments {
     /// FITS files of stamps, in the order of the galaxies.
     #[arg(long, value_name = "FILE", num_args = 1.., required_unless_present = "exposure", conflicts_with_all = ["exposure", "first_pixel", "columns", "degrees", "size"])]
     stamps: Vec<PathBuf>,
-    /// Image to cut stamps out of: the first of its file. Several exposures of the same galaxies become images of consecutive
+    /// Image to cut stamps out of: the first of its file, or the one of `FILE[SCI,2]`. Rows of the positions that are on none of
+    /// the exposures are left out. Several exposures of the same galaxies become images of consecutive
     /// numbers, each with the PSF, map and mask at its place in the lists, for `measure --epochs`.
     #[arg(long, value_name = "FILE", num_args = 1.., requires = "positions")]
     exposure: Vec<PathBuf>,
-    /// Use only images of this name (EXTNAME), such as SCI.
-    #[arg(long, value_name = "NAME")]
+    /// Use only these images of files: by name (EXTNAME) `SCI`, with version (EXTVER) `SCI,2`, or by number `4`. `plane=2` is one
+    /// plane of cubes, `SCI,2,plane=3` one of this image; `plane=all` says that planes are galaxies, not bands.
+    #[arg(long, value_name = "NAME|NUMBER")]
     extension: Option<String>,
     /// Masks of the stamps in the same order, or of the exposure. A pixel is missing if its mask is not zero.
     #[arg(long, value_name = "FILE", num_args = 1..)]
@@ -41,7 +43,7 @@ pub(crate) struct Arguments {
     /// Bits of the masks, from 0 for the lowest: a pixel is missing if one of them is set [default: all].
     #[arg(long, value_name = "BITS", value_delimiter = ',', num_args = 1, value_parser = clap::value_parser!(u8).range(0..=52))]
     mask_bits: Option<Vec<u8>>,
-    /// Use only masks of this name [default files: the stamps or the exposure].
+    /// Use only masks of this name or number, like --extension [default files: the stamps or the exposure].
     #[arg(long, value_name = "NAME")]
     mask_extension: Option<String>,
     /// Table of positions on the exposure: text, FITS or Parquet, in FITS pixels (the centre of the first pixel is 1), or in
@@ -72,7 +74,6 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "HOW", value_parser = named::<Square>(), conflicts_with_all = ["exposure", "first_pixel", "columns", "degrees", "size"])]
     square: Option<Square>,
     /// FITS files of PSF stamps, or one table of functional PSFs (.csv): one PSF for all galaxies, or one per galaxy.
-    /// Several stars, at most half as many as galaxies, are averaged to one PSF.
     #[arg(long, value_name = "FILE", num_args = 1.., required = true)]
     psf: Vec<PathBuf>,
     /// Use only PSFs of this name (EXTNAME).

@@ -132,49 +132,6 @@ fn stamps_of_all_kinds_of_files_are_measured_alike() {
 }
 
 #[test]
-fn several_stars_of_one_psf_are_averaged() {
-    let folder = Folder::new();
-    let profile = PsfProfile::Moffat { beta: 3.0 };
-    let psf = FunctionalPsf::new(profile, 3.4, Shear::new(0.05, -0.02)).unwrap();
-    let truth = psf.stamp(48);
-    let power = truth.iter().map(|v| v * v).sum::<f64>().sqrt();
-    // A fixed sequence of numbers of mean zero and variance one: the stars have S/N 100.
-    let mut state = 7u32;
-    let mut noise = || {
-        state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
-        12f64.sqrt() * (f64::from(state >> 8) / f64::from(1 << 24) - 0.5) * power / 100.0
-    };
-    let mut stamps = |count: usize, light: f64, level: f64| -> Vec<Vec<f32>> {
-        let mut stamp = |_| {
-            truth
-                .iter()
-                .map(|v| (light * v + level * noise()) as f32)
-                .collect()
-        };
-        (0..count).map(&mut stamp).collect()
-    };
-    let stars = stamps(9, 1.0, 1.0);
-    write_cube(&folder, "stars.fits", &stars);
-    write_cube(&folder, "stamps.fits", &stamps(20, 50.0, 20.0));
-    let said = gather(&folder, "--stamps stamps.fits --psf stars.fits");
-    let note = "stars.fits: 9 stars were averaged to one PSF for all galaxies";
-    assert_has(&said, note);
-    let (average, side) = pixels_of(&folder.at("data/set01/psf-001.fits"));
-    assert_eq!(side, 48);
-    let off = |star: &[f32]| {
-        let sum: f64 = star.iter().map(|v| f64::from(*v)).sum();
-        let each = star
-            .iter()
-            .zip(&truth)
-            .map(|(v, t)| f64::from(*v) / sum - t);
-        each.map(|off| off * off).sum::<f64>().sqrt()
-    };
-    // Nine stars have a third of the noise of one; shifts by their measured places add to it.
-    let ratio = off(&average) / off(&stars[0]);
-    assert!(ratio < 0.5, "{ratio}");
-}
-
-#[test]
 fn correlated_noise_that_is_treated_as_white_is_named() {
     let folder = Folder::with_set(2);
     let galaxies = stamps_of(&folder.at("data/set02/galaxies-001.fits"), 48);

@@ -10,6 +10,7 @@
 mod bias;
 mod cases;
 mod challenge;
+mod chosen_images;
 mod damaged;
 mod documents;
 mod entry_points;

@@ -1,30 +1,36 @@
 //! Gathering stamps into an image of a data folder: cubes, files of one or several images each, and cut-outs of an
 //! exposure.
 
+mod array;
+mod exposure;
+mod files;
+mod maps;
+mod mosaic;
 mod positions;
-mod stamps;
+mod psfs;
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
-use shearq_measure::{Examination, Warning};
+use shearq_measure::{Examination, PixelFrame, Warning};
 use shearq_quantities::linear::Matrix2;
 use shearq_quantities::statistics::upper_median;
 use shearq_quantities::{Frame, Jacobian};
 
+pub use self::array::{GatheredPixels, HeaderPixels, is_aligned, pixel_difference};
+use self::exposure::Exposure;
+pub(crate) use self::exposure::subpixel_offset;
+pub use self::files::{Content, Files};
+use self::files::{Images, shown};
+use self::mosaic::{Origins, Rows, StampWriter, already};
 pub use self::positions::Table;
 use self::positions::{Positions, rows_of_stamps};
-pub(crate) use self::stamps::subpixel_offset;
-pub use self::stamps::{Content, Files};
-use self::stamps::{
-    Exposure, GatheredPsfs, Images, Origins, PsfFile, Rows, StampWriter, already, gather_psfs,
-    shown,
-};
+use self::psfs::{GatheredPsfs, PsfFile, gather_psfs};
 use super::PipelineError;
 use super::measure::check_strip;
 use crate::stamp_table::{self, Head, StampTable};
-use crate::wcs::{self, Wcs, aligned};
+use crate::wcs::{Wcs, aligned};
 use shearq_dataset::grid::Mosaic;
 use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::{DataFolder, MAX_STAMP};
@@ -60,7 +66,14 @@ pub enum Stamps<'a> {
     },
 }
 
-impl Stamps<'_> {
+impl<'a> Stamps<'a> {
+    fn positions(&self) -> Option<Table<'a>> {
+        match self {
+            Stamps::Files(_) => None,
+            Stamps::Cutouts { positions, .. } => Some(*positions),
+        }
+    }
+
     /// Coordinate of the centre of the first pixel in catalogues.
     fn first_pixel(&self) -> u8 {
         match self {
@@ -178,13 +191,40 @@ fn gather_alone(
     // All files have temporary names until the last exposure is read: with some of them in the folder, the user could neither repeat
     // the command nor see which exposures were lost.
     let plans = all.iter().map(|one| Plan::of(&one.stamps, one.square));
-    let plans: Vec<Plan> = plans.collect::<Result<_, _>>()?;
+    let mut plans: Vec<Plan> = plans.collect::<Result<_, _>>()?;
+    leave_out_elsewhere(&mut plans, all)?;
     let jacobians = jacobians_of_all(&plans, all)?;
     let prepared = ids.zip(all).zip(plans.into_iter().zip(jacobians));
     let prepared = prepared
         .map(|((id, one), (plan, jacobians))| prepare(data, id, one, plan, jacobians.as_deref()));
     let prepared: Vec<Prepared> = prepared.collect::<Result<_, _>>()?;
     prepared.into_iter().map(Prepared::finish).collect()
+}
+
+// Galaxies that are on another exposure of the same table are kept, so that epochs have the same rows.
+fn leave_out_elsewhere(plans: &mut [Plan], all: &[Gathering<'_>]) -> Result<(), FileError> {
+    let tables: Vec<Option<Table<'_>>> = all.iter().map(|one| one.stamps.positions()).collect();
+    let kept = |at: usize| {
+        let mut kept = plans[at].inside.clone();
+        for other in (0..plans.len()).filter(|other| tables[*other] == tables[at]) {
+            let inside = &plans[other].inside;
+            kept.iter_mut()
+                .zip(inside)
+                .for_each(|(kept, inside)| *kept |= inside);
+        }
+        kept
+    };
+    let kept: Vec<Vec<bool>> = (0..plans.len()).map(kept).collect();
+    for (plan, kept) in plans.iter_mut().zip(kept) {
+        let Some(positions) = &mut plan.positions else {
+            continue;
+        };
+        plan.messages.extend(positions.keep(&kept)?);
+        plan.stack.count = positions.all.len();
+        let mut row = kept.iter();
+        plan.inside.retain(|_| row.next() == Some(&true));
+    }
+    Ok(())
 }
 
 /// The files of an image, which have temporary names or are in memory.
@@ -332,6 +372,8 @@ fn remove_leftovers(data: &DataFolder, id: ImageId) -> Result<(), FileError> {
 struct Plan {
     /// Where they are cut out of an exposure.
     positions: Option<Positions>,
+    /// Whether these are on the exposure.
+    inside: Vec<bool>,
     stack: Stack,
     messages: Vec<String>,
 }
@@ -353,6 +395,18 @@ impl Plan {
         self.positions.as_ref().map_or(&[], |found| &found.all)
     }
 
+    /// Jacobians of the stamps, of those whose header has a WCS.
+    fn pixels(&self) -> Vec<Option<Matrix2>> {
+        match &self.positions {
+            Some(found) => {
+                let each = found.all.iter();
+                each.map(|&(x, y)| self.stack.wcs.jacobian([x, y]))
+                    .collect()
+            }
+            None => self.stack.pixels(),
+        }
+    }
+
     // `None` if ellipticities stay on the pixel axes, as `frame` says, or without it the WCS.
     fn jacobians(
         &self,
@@ -369,20 +423,7 @@ impl Plan {
         if frame == Some(Frame::Pixel) {
             return Ok(None);
         }
-        let all: Option<Vec<Matrix2>> = match &self.positions {
-            Some(found) => {
-                let each = found
-                    .all
-                    .iter()
-                    .map(|&(x, y)| self.stack.wcs.jacobian([x, y]));
-                each.collect()
-            }
-            None => {
-                let each = self.stack.of_images.iter();
-                let each = each.flat_map(|&(count, jacobian)| std::iter::repeat_n(jacobian, count));
-                each.collect()
-            }
-        };
+        let all: Option<Vec<Matrix2>> = self.pixels().into_iter().collect();
         let Some(all) = all else {
             if let Some(error) = self.stack.wcs.fault() {
                 return fault(format!(
@@ -479,6 +520,7 @@ impl Plan {
         }
         Ok(Plan {
             positions: None,
+            inside: Vec::new(),
             stack,
             messages,
         })
@@ -493,9 +535,13 @@ impl Plan {
         let path = &exposure.paths[0];
         let mut exposure = Exposure::open(exposure)?;
         let wcs = exposure.wcs()?;
+        let mut messages: Vec<String> = exposure.note.take().into_iter().collect();
+        messages.extend(exposure.is_asinh()?.then(|| asinh_line(path)));
         let positions = Positions::read(positions, path, &wcs, first_pixel)?;
-        let mut messages: Vec<String> = positions.note.clone().into_iter().collect();
-        messages.extend(positions.examine(path, &wcs, exposure.sides()?)?);
+        messages.extend(positions.note.clone());
+        messages.extend(doubts(path, &wcs));
+        let sides = exposure.sides()?;
+        messages.extend(positions.examine(path, &wcs, sides)?);
         Ok(Plan {
             stack: Stack {
                 count: positions.all.len(),
@@ -504,6 +550,7 @@ impl Plan {
                 of_images: Vec::new(),
                 differs: None,
             },
+            inside: positions.inside(sides),
             positions: Some(positions),
             messages,
         })
@@ -522,6 +569,13 @@ struct Stack {
 }
 
 impl Stack {
+    /// Jacobians of the stamps.
+    fn pixels(&self) -> Vec<Option<Matrix2>> {
+        let each = self.of_images.iter();
+        let each = each.flat_map(|&(count, jacobian)| std::iter::repeat_n(jacobian, count));
+        each.collect()
+    }
+
     fn of(files: Files<'_>, square: Option<Square>) -> Result<(Self, Vec<String>), FileError> {
         let (mut count, mut first, mut messages) = (0usize, None, Vec::new());
         let (mut of_images, mut differs) = (Vec::new(), None);
@@ -549,7 +603,11 @@ impl Stack {
                 (Content::Sky, Some(Square::Pad)) => width.max(height),
                 _ => width.min(height),
             };
-            let wcs = Wcs::of_header(image);
+            let wcs = Wcs::of_header(image)?;
+            if first.is_none() {
+                messages.extend(doubts(origin.file, &wcs));
+                messages.extend(image.is_asinh().then(|| asinh_line(origin.file)));
+            }
             let centre = [width, height].map(|side| (side as f64 + 1.0) / 2.0);
             of_images.push((image.planes(), wcs.jacobian(centre)));
             let (expected, first_wcs) = &*first.get_or_insert_with(|| (side, wcs.clone()));
@@ -593,9 +651,21 @@ impl Stack {
     }
 }
 
+fn asinh_line(path: &Path) -> String {
+    format!(
+        "note: {}: the pixels are asinh magnitudes (BSOFTEN), which are converted to fluxes",
+        path.display()
+    )
+}
+
+fn doubts(path: &Path, wcs: &Wcs) -> impl Iterator<Item = String> {
+    let doubts = wcs.doubts().iter();
+    doubts.map(move |doubt| format!("warning: {}: {doubt}", path.display()))
+}
+
 // A user who did not ask for a frame must learn that the components differ from those on the pixels.
 fn frame_line(jacobians: &[Matrix2]) -> String {
-    let pixels = wcs::frame(&jacobians[0]);
+    let pixels = PixelFrame::from_jacobian(jacobians[0]);
     format!(
         "frame: sky (e1 > 0 along east–west, e2 > 0 along north-west). The WCS of the first stamp: {pixels}. --frame pixel keeps the pixel axes"
     )
@@ -607,13 +677,39 @@ fn check_psf(
     plan: &Plan,
     jacobians: Option<&[Matrix2]>,
 ) -> Result<Vec<Warning>, FileError> {
-    // The stars of a field have the pixels of its middle, from which distortions differ by less than what is refused.
-    let typical = jacobians.map(|all| Wcs::of_jacobian(all[all.len() / 2]));
-    let galaxies = typical.as_ref().unwrap_or(&plan.stack.wcs);
-    let warnings: Vec<Warning> = Wcs::disagreements(&psfs.wcs, galaxies).collect();
+    // Each PSF is compared with its stamp. The stars of a field have the pixels of its middle, from which distortions differ by less
+    // than what is refused.
+    let pixels = plan.pixels();
+    let (psf_pixels, wcs) = (&psfs.pixels, &plan.stack.wcs);
+    let mut warnings = Vec::new();
+    if psf_pixels.len() == pixels.len() && pixels.len() > 1 {
+        for (row, both) in psf_pixels.iter().zip(&pixels).enumerate() {
+            if let (Some(psf), Some(stamp)) = both {
+                let [psf, stamp] = [psf, stamp].map(|matrix| Wcs::of_jacobian(*matrix));
+                if let Some(warning) = Wcs::disagreements(&psf, &stamp).next() {
+                    let row = row + 1;
+                    return Err(FileError::new(
+                        &psfs.first,
+                        format!("stamp {row}: {warning}"),
+                    ));
+                }
+            }
+        }
+    } else {
+        let typical = jacobians.map(|all| Wcs::of_jacobian(all[all.len() / 2]));
+        warnings.extend(Wcs::disagreements(
+            &psfs.wcs,
+            typical.as_ref().unwrap_or(wcs),
+        ));
+        let all: Option<Vec<Matrix2>> = pixels.into_iter().collect();
+        warnings.extend(Warning::of_shared_psf(all.unwrap_or_default()));
+    }
     // A pixel scale in a header key is often copied from another image, so it only warns. Axes come from a CD matrix, and are refused.
-    let refused =
-        |warning: &&Warning| jacobians.is_some() || matches!(warning, Warning::PsfFrame { .. });
+    let refused = |warning: &&Warning| match warning {
+        Warning::PsfFrame { .. } => true,
+        Warning::SharedPsf { .. } => false,
+        _ => jacobians.is_some(),
+    };
     match warnings.iter().find(refused) {
         Some(warning) => Err(FileError::new(&psfs.first, warning)),
         None => Ok(warnings),

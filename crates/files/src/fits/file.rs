@@ -1,6 +1,7 @@
 //! An open FITS file, plain or compressed by gzip. Values that cfitsio does not check are checked before its functions are
 //! called.
 
+use std::collections::BTreeMap;
 use std::ffi::{CStr, CString, c_char, c_int};
 use std::fs;
 use std::io::{BufReader, Read, Seek, SeekFrom};
@@ -647,6 +648,15 @@ impl File {
     /// Makes sure that a gzip file is complete. Call it after the last data are read.
     pub fn check_end(&mut self) -> Result<(), FileError> {
         self.source.check_end()
+    }
+
+    /// Keys and values of the header here. Texts keep their quotes; of keys that repeat, the last one counts.
+    pub fn cards(&mut self) -> Result<BTreeMap<String, String>, FileError> {
+        let [header, start, _] = self.extent()?;
+        let bytes = self.source.read_at(header, (start - header) as usize)?;
+        let cards = bytes.chunks_exact(CARD);
+        let cards = cards.take_while(|card| !card.starts_with(b"END     "));
+        Ok(cards.filter_map(parse).collect())
     }
 
     /// A numeric header value; `None` if the key is absent or has no value.

@@ -9,6 +9,7 @@ use std::ptr;
 use fitsio::sys;
 
 use super::file::{ColumnValue, Content, File, plain};
+use super::selection::ImageHead;
 use crate::frames::element_name;
 use crate::frames::polars::{Column, DataFrame};
 use crate::{FileError, MAX_ROWS, MAX_SIDE, names_of};
@@ -67,11 +68,14 @@ pub struct ImageReader {
     height: usize,
     /// Images of a cube; 1 for a plain image.
     planes: usize,
+    /// Rows of the cube before the only plane that is read.
+    first_row: usize,
     /// Whether this is the last image that is read, so that a gzip file must be complete after it.
     last: bool,
     next_row: usize,
     /// BITPIX of an uncompressed image: bits per pixel, negative for floats. `None` for a compressed one.
     bits: Option<c_int>,
+    asinh: Option<AsinhScale>,
     /// Whether the pixels are floats of 32 bits without BSCALE and BZERO. They are read without cfitsio, in half the time.
     plain: bool,
     /// Bytes of plain pixels.
@@ -81,6 +85,34 @@ pub struct ImageReader {
 impl std::fmt::Debug for ImageReader {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
         f.debug_struct("ImageReader").finish_non_exhaustive()
+    }
+}
+
+/// Pixels that are asinh magnitudes v, as of Pan-STARRS: the flux is BOFFSET + 2 BSOFTEN sinh(0.4 ln(10) v) (Waters et al. 2020,
+/// ApJS 251, 4).
+#[derive(Debug, Clone, Copy)]
+struct AsinhScale {
+    offset: f64,
+    softening: f64,
+}
+
+impl AsinhScale {
+    fn here(file: &File) -> Result<Option<Self>, FileError> {
+        let Some(softening) = file.number("BSOFTEN")? else {
+            return Ok(None);
+        };
+        let offset = file.number("BOFFSET")?.unwrap_or(0.0);
+        if !(softening > 0.0 && softening.is_finite() && offset.is_finite()) {
+            return Err(file.fault(format!(
+                "the header keys BSOFTEN and BOFFSET are {softening} and {offset}; expected finite numbers, BSOFTEN positive"
+            )));
+        }
+        Ok(Some(AsinhScale { offset, softening }))
+    }
+
+    fn flux(self, magnitude: f64) -> f64 {
+        let angle = 0.4 * std::f64::consts::LN_10 * magnitude;
+        self.offset + 2.0 * self.softening * angle.sinh()
     }
 }
 
@@ -178,6 +210,7 @@ impl ImageReader {
         let Some(planes) = planes.filter(|planes| (1..=MAX_ROWS).contains(planes)) else {
             return Err(file.fault(format!("the cube has {z} planes; expected 1 to {MAX_ROWS}")));
         };
+        let asinh = AsinhScale::here(&file)?;
         let pixels = (width as u64 * height as u64).saturating_mul(planes as u64);
         let bits = match file.is_compressed()? {
             true => {
@@ -203,17 +236,37 @@ impl ImageReader {
             width,
             height,
             planes,
+            first_row: 0,
             last: dimensions == Dimensions::Two,
             next_row: 0,
-            plain: plain && bits == Some(FLOAT_BITS),
+            plain: plain && bits == Some(FLOAT_BITS) && asinh.is_none(),
+            asinh,
             bits,
             bytes: Vec::new(),
         })
     }
 
-    /// Its name, EXTNAME; empty if it has none.
-    pub fn name(&self) -> String {
-        self.file.text("EXTNAME")
+    /// Its name and its place in the file.
+    pub fn head(&self) -> Result<ImageHead, FileError> {
+        ImageHead::here(&self.file)
+    }
+
+    /// Reads only the plane of this number, from 1, as an image.
+    pub fn only_plane(&mut self, number: usize) -> Result<(), FileError> {
+        if number > self.planes {
+            return Err(self.file.fault(format!(
+                "there is no plane {number} (found {} planes)",
+                self.planes
+            )));
+        }
+        self.first_row = (number - 1) * self.height;
+        self.planes = 1;
+        Ok(())
+    }
+
+    /// Whether the pixels of the file are asinh magnitudes, which are read as fluxes.
+    pub fn is_asinh(&self) -> bool {
+        self.asinh.is_some()
     }
 
     pub fn width(&self) -> usize {
@@ -231,6 +284,11 @@ impl ImageReader {
 
     fn rows(&self) -> usize {
         self.height * self.planes
+    }
+
+    /// Keys and values of the header. Texts keep their quotes; of keys that repeat, the last one counts.
+    pub fn cards(&mut self) -> Result<BTreeMap<String, String>, FileError> {
+        self.file.cards()
     }
 
     /// A numeric header value; `None` if absent.
@@ -309,13 +367,17 @@ impl ImageReader {
     /// Makes sure that the first `rows` rows are there.
     fn need(&mut self, rows: usize) -> Result<(), FileError> {
         match self.bits {
-            Some(bits) => self.file.need((rows * self.width) as u64 * bytes_of(bits)),
+            Some(bits) => {
+                let pixels = (self.first_row + rows) * self.width;
+                self.file.need(pixels as u64 * bytes_of(bits))
+            }
             None => Ok(()),
         }
     }
 
     // Fills `pixels` from the image's pixel `first` on, counted from 0.
     fn fill<P: Pixel>(&mut self, first: usize, pixels: &mut [P]) -> Result<(), FileError> {
+        let first = self.first_row * self.width + first;
         if self.plain {
             self.bytes.resize(4 * pixels.len(), 0);
             self.file.read_data(4 * first as u64, &mut self.bytes)?;
@@ -334,7 +396,7 @@ impl ImageReader {
             blank = P::default();
         }
         let start = (first + 1) as i64;
-        let (width, rows) = (self.width, self.rows());
+        let (width, rows) = (self.width, self.first_row + self.rows());
         let last = (first + pixels.len()).div_ceil(width);
         self.file.call(
             || format!("cannot read rows {} to {last} of {rows}", first / width + 1),
@@ -352,6 +414,18 @@ impl ImageReader {
                 );
             },
         )?;
+        if let Some(asinh) = self.asinh {
+            for pixel in pixels.iter_mut() {
+                let flux = asinh.flux((*pixel).into()) as f32;
+                if flux.is_infinite() {
+                    let magnitude: f64 = (*pixel).into();
+                    return Err(self.file.fault(format!(
+                        "a pixel is {magnitude}, and the header has BSOFTEN (expected asinh magnitudes, as of Pan-STARRS). Try: remove BSOFTEN if the pixels are fluxes already"
+                    )));
+                }
+                *pixel = flux.into();
+            }
+        }
         for pixel in pixels {
             let value: f64 = (*pixel).into();
             *pixel = if value as f32 == MISSING || !value.is_finite() {

@@ -41,7 +41,7 @@ const SAME_GALAXY_PX: f64 = 0.5;
 // by less.
 const OTHER_GALAXY_PX: f64 = 3.0;
 
-#[derive(Debug, Clone, Copy, serde::Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize)]
 pub struct Table<'a> {
     /// The file, with `[TABLE]` behind its name if one of its tables is meant.
     #[serde(serialize_with = "super::shown")]
@@ -61,12 +61,14 @@ pub struct Table<'a> {
 
 pub(super) struct Positions {
     place: Place,
-    /// In FITS pixels: the centre of the first is at 1.
+    /// In FITS pixels: the centre of the first is at 1. [`ELSEWHERE`] where the WCS does not reach.
     pub(super) all: Vec<(f64, f64)>,
     /// In degrees, if the table or the WCS has them.
     pub(super) sky: Option<[Vec<f64>; 2]>,
     pub(super) id: Option<Column>,
     pub(super) carried: Vec<Column>,
+    /// Whether the table has them in degrees.
+    degrees: bool,
     /// Which columns they are, if the user did not name them.
     pub(super) note: Option<String>,
 }
@@ -156,8 +158,52 @@ impl Positions {
             sky,
             id,
             carried,
+            degrees,
             note: note.flatten(),
         })
+    }
+
+    /// Whether the centres are on an exposure of this size.
+    pub(super) fn inside(&self, [width, height]: [usize; 2]) -> Vec<bool> {
+        let within = |at: f64, side: usize| at >= 0.5 && at < side as f64 + 0.5;
+        let inside = self
+            .all
+            .iter()
+            .map(|&(x, y)| within(x, width) && within(y, height));
+        inside.collect()
+    }
+
+    /// Leaves out rows that are not to be kept, and returns what is said about them. Catalogues of a field are larger than the
+    /// exposure, and stamps without pixels would fill the folder.
+    pub(super) fn keep(&mut self, kept: &[bool]) -> Result<Option<String>, FileError> {
+        let (count, left_out) = (kept.len(), kept.iter().filter(|kept| !**kept).count());
+        if left_out == 0 {
+            return Ok(None);
+        }
+        fn chosen<T: Copy>(all: &[T], kept: &[bool]) -> Vec<T> {
+            let both = all.iter().zip(kept);
+            both.filter_map(|(value, kept)| kept.then_some(*value))
+                .collect()
+        }
+        self.all = chosen(&self.all, kept);
+        if let Some(sky) = &mut self.sky {
+            sky.iter_mut().for_each(|axis| *axis = chosen(axis, kept));
+        }
+        let mask = kept.iter().copied().collect();
+        let path = &self.place.path;
+        for column in self.id.iter_mut().chain(&mut self.carried) {
+            *column = column
+                .filter(&mask)
+                .map_err(|error| FileError::new(path, error))?;
+        }
+        let (kind, hint) = match !self.degrees && 10 * left_out > count {
+            true => ("warning", ". Try: check --columns and --exposure"),
+            false => ("note", ""),
+        };
+        Ok(Some(format!(
+            "{kind}: {}: {left_out} of {count} positions are outside the exposure and left out{hint}",
+            path.display()
+        )))
     }
 
     /// Warnings about the positions on an exposure of this WCS and size.
@@ -169,18 +215,21 @@ impl Positions {
     ) -> Result<Vec<String>, FileError> {
         let path = &self.place.path;
         let count = self.all.len();
-        let within = |at: f64, side: usize| at >= 0.5 && at < side as f64 + 0.5;
-        let outside = |&(x, y): &(f64, f64)| !within(x, width) || !within(y, height);
-        let beyond = self.all.iter().filter(|at| outside(at)).count();
-        let (repeated, first) = self.repeated();
-        let degrees = self
-            .all
-            .iter()
-            .all(|(x, y)| (0.0..=360.0).contains(x) && y.abs() <= 90.0);
-        let (x, y) = self.all[0];
+        let inside = self.inside([width, height]);
+        let beyond = inside.iter().filter(|inside| !**inside).count();
+        let (repeated, first) = self.repeated(&inside);
+        let degrees = !self.degrees
+            && self
+                .all
+                .iter()
+                .all(|(x, y)| (0.0..=360.0).contains(x) && y.abs() <= 90.0);
+        let first_place = match &self.sky {
+            Some([ra, dec]) if self.degrees => format!("ra {}, dec {}", ra[0], dec[0]),
+            _ => format!("{:?}", self.all[0]),
+        };
         // Degrees that are read as pixels all lie within a few pixels of each other, even if these are on the exposure.
         if beyond == count || degrees && count > 2 && 2 * repeated > count {
-            let cause = match degrees {
+            let cause = match degrees && !self.degrees {
                 true => {
                     "Are these degrees (right ascension and declination)? Try: --degrees, which uses the WCS of the exposure"
                 }
@@ -195,19 +244,13 @@ impl Positions {
                 ),
             };
             let message = format!(
-                "{what} (found ({x}, {y}) first, expected FITS pixels of {}, 1 to {width} and 1 to {height}). {cause}",
+                "{what} (found {first_place} first, expected FITS pixels of {}, 1 to {width} and 1 to {height}). {cause}",
                 exposure.display()
             );
             return Err(FileError::new(path, message));
         }
-        self.check_sky(exposure, wcs, |at| !outside(at))?;
+        self.check_sky(exposure, wcs, &inside)?;
         let mut doubts = Vec::new();
-        if 10 * beyond > count {
-            doubts.push(format!(
-                "warning: {}: {beyond} of {count} positions are outside the exposure of {width} × {height} px. Try: check --columns and --exposure",
-                path.display()
-            ));
-        }
         if let Some((earlier, later)) = first {
             let (x, y) = self.all[later];
             doubts.push(format!(
@@ -222,17 +265,12 @@ impl Positions {
 
     /// Refuses positions in pixels that differ from ra and dec on the exposure, as in a table of another exposure or of a coadd,
     /// or with rows in another order. Epochs are joined by ra and dec, and shears are averaged by them.
-    fn check_sky(
-        &self,
-        exposure: &Path,
-        wcs: &Wcs,
-        is_inside: impl Fn(&(f64, f64)) -> bool,
-    ) -> Result<(), FileError> {
+    fn check_sky(&self, exposure: &Path, wcs: &Wcs, inside: &[bool]) -> Result<(), FileError> {
         let Some([ra, dec]) = self.sky.as_ref().filter(|_| wcs.has_sky()) else {
             return Ok(());
         };
-        let inside = self.all.iter().enumerate().filter(|(_, at)| is_inside(at));
-        let apart = inside.filter_map(|(row, &(x, y))| {
+        let rows = self.all.iter().enumerate().filter(|(row, _)| inside[*row]);
+        let apart = rows.filter_map(|(row, &(x, y))| {
             let sky = [ra[row], dec[row]];
             if sky.iter().any(|degrees| degrees.is_nan()) {
                 return None;
@@ -258,13 +296,13 @@ impl Positions {
     }
 
     // A galaxy that is measured twice counts twice in the mean, as if its noise were independent.
-    fn repeated(&self) -> (usize, Option<(usize, usize)>) {
+    fn repeated(&self, inside: &[bool]) -> (usize, Option<(usize, usize)>) {
         // Two positions in one cell are nearer than SAME_GALAXY_PX. So a cell has at most one that is no repetition, and others
         // of it lie at most two cells away.
         let side = SAME_GALAXY_PX / std::f64::consts::SQRT_2;
         let mut kept: HashMap<(i64, i64), usize> = HashMap::with_capacity(self.all.len());
         let (mut count, mut first) = (0, None);
-        for (k, &(x, y)) in self.all.iter().enumerate() {
+        for (k, &(x, y)) in self.all.iter().enumerate().filter(|(k, _)| inside[*k]) {
             let cell = ((x / side).floor() as i64, (y / side).floor() as i64);
             let near = (-2..=2).flat_map(|dx| (-2..=2).map(move |dy| (dx, dy)));
             let mut others = near.filter_map(|(dx, dy)| kept.get(&(cell.0 + dx, cell.1 + dy)));
@@ -444,18 +482,27 @@ fn on_exposure(
     exposure: &Path,
     wcs: &Wcs,
 ) -> Result<(f64, f64), FileError> {
-    if let Some([x, y]) = wcs.pixel([ra, dec]).filter(|_| dec.abs() <= 90.0) {
-        return Ok((x, y));
+    if !wcs.has_sky() {
+        return no_sky(path, exposure, wcs);
     }
-    let (row, shown) = (row + 1, exposure.display());
-    let message = match wcs.has_sky() {
-        true => format!(
-            "row {row}: the WCS of {shown} does not reach ({ra}, {dec}); expected right ascension and declination in degrees near the exposure"
-        ),
-        false => return no_sky(path, exposure, wcs),
-    };
-    Err(FileError::new(path, message))
+    if !(ra.is_finite() && dec.abs() <= 90.0) {
+        let row = row + 1;
+        let message = format!(
+            "row {row}: the position is ({ra}, {dec}); expected right ascension and declination in degrees"
+        );
+        return Err(FileError::new(path, message));
+    }
+    // Far from the exposure the projection ends.
+    let most = f64::from(i32::MAX);
+    let pixel = wcs
+        .pixel([ra, dec])
+        .filter(|at| at.iter().all(|at| at.abs() < most));
+    Ok(pixel.map_or(ELSEWHERE, |[x, y]| (x, y)))
 }
+
+// The place of a galaxy that is not on the pixels of an exposure, or its projection.
+// Finite, because stamps are cut there, too, if another exposure has the galaxy.
+const ELSEWHERE: (f64, f64) = (-1e9, -1e9);
 
 fn given(place: &Place, columns: &Columns, names: [&str; 2]) -> Result<[String; 2], FileError> {
     let owned = names.map(str::to_owned);
@@ -690,13 +737,14 @@ mod tests {
             sky: None,
             id: None,
             carried: Vec::new(),
+            degrees: false,
             note: None,
         }
     }
 
     #[test]
     fn positions_within_half_a_pixel_of_an_earlier_one_are_counted() {
-        let of = |all| positions(all).repeated();
+        let of = |all: &[(f64, f64)]| positions(all).repeated(&vec![true; all.len()]);
         assert_eq!(of(&[(1.0, 1.0), (1.6, 1.0), (-3.0, 2.0)]), (0, None));
         let found = of(&[(1.0, 1.0), (9.0, 1.0), (1.35, 1.35), (1.0, 1.0), (9.0, 0.5)]);
         assert_eq!(found, (3, Some((0, 2))));

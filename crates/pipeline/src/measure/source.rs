@@ -64,7 +64,7 @@ impl ImageSource {
         configuration: &Configuration,
     ) -> Result<Self, PipelineError> {
         let path = data.galaxies(id.set, id.image);
-        let (image, mosaic) = open_galaxies(data, id)?;
+        let (mut image, mosaic) = open_galaxies(data, id)?;
         let stamp = mosaic.stamp;
         // Larger stamps are cut to the size of the configuration; smaller ones have no pixels to fill it with.
         if stamp < configuration.stamp.size {
@@ -91,7 +91,10 @@ impl ImageSource {
             stated: stated_by_psf,
         } = open_psfs(data, id, configuration, &mosaic)?;
         let mut warnings: Vec<Warning> = moved.map(Warning::of_moved).into_iter().collect();
-        let wcs = Wcs::of_header(&image);
+        if let (Some(all), PsfSource::Shared(_)) = (&jacobians, &psfs) {
+            warnings.extend(Warning::of_shared_psf(all.iter().map(Jacobian::matrix)));
+        }
+        let wcs = Wcs::of_header(&mut image)?;
         warnings.extend(Wcs::disagreements(&psf_wcs, &wcs));
         let of_pixels = jacobians.is_none().then(|| wcs.frame()).flatten();
         let aligned = jacobians.is_none() && of_pixels.is_none() && wcs.states_axes();
@@ -528,7 +531,7 @@ fn open_functional(path: &Path, cut: PsfCut, mosaic: &Mosaic) -> Result<PsfSourc
 fn open_stars(path: &Path, cut: PsfCut, mosaic: &Mosaic) -> Result<OpenPsfs, FileError> {
     let least = cut.least;
     let mut image = ImageReader::open(path)?;
-    let (wcs, stated) = (Wcs::of_header(&image), stated_image(&image));
+    let (wcs, stated) = (Wcs::of_header(&mut image)?, stated_image(&image));
     let (width, height) = (image.width(), image.height());
     let (columns, rows) = (mosaic.columns, mosaic.rows());
     let side = match whole(&image, path, "STAMP", MAX_STAMP)? {

@@ -1,0 +1,108 @@
+//! Masks and variances of pixels.
+
+use shearq_files::FileError;
+use shearq_files::table::Place;
+use shearq_quantities::statistics::upper_median;
+
+use super::files::{Content, Origin};
+
+// Without --mask-extension, the image itself would be read as its mask, and all bright pixels would be missing.
+pub(super) fn another(
+    map: &Origin<'_>,
+    image: &Origin<'_>,
+    content: Content,
+) -> Result<(), FileError> {
+    let [own, of_image] = [map, image].map(|origin| Place::of(origin.file).path);
+    if own == of_image && map.image == image.image {
+        let (noun, option) = (content.noun(), content.option());
+        let message = format!("the {noun} is the image itself; expected another ({option})");
+        return Err(map.fault(&message));
+    }
+    Ok(())
+}
+
+// Maps may have any value where the pixel is missing already.
+pub(super) fn variance(
+    pixels: &mut [f32],
+    values: &mut [f64],
+    content: Content,
+) -> Result<(), String> {
+    for (pixel, value) in pixels.iter_mut().zip(values) {
+        let stated = *value;
+        if content == Content::Weight {
+            *value = 1.0 / stated;
+        }
+        // The weight 0, or an infinite variance, marks bad pixels in the maps of most surveys.
+        if *value == f64::INFINITY {
+            *pixel = f32::NAN;
+        }
+        if pixel.is_finite() && (value.is_nan() || *value <= 0.0) {
+            let what = match content {
+                Content::Weight => {
+                    "the weight is {stated}; expected a positive number, or 0 for a bad pixel"
+                }
+                _ => {
+                    "the variance is {stated}; expected a positive number, or infinity for a bad pixel"
+                }
+            };
+            return Err(what.replace("{stated}", &stated.to_string()));
+        }
+        if !pixel.is_finite() {
+            *value = f64::NAN;
+        }
+    }
+    Ok(())
+}
+
+// The median over the pixels outside a circle around the galaxy.
+//
+// Variance maps of many surveys contain the Poisson noise of the counts themselves. A level from pixels of the galaxy would be
+// high where its noise is positive, and the subtracted noise power would correlate with the data. If two depths meet on the
+// stamp, the galaxy in the centre lies on the larger part, whose level the median takes; a gradient cancels. The galaxy's own
+// Poisson noise is added by `gain`.
+pub(super) fn level(variances: &[f64], side: usize) -> f64 {
+    let finite = |at: &usize| variances[*at].is_finite();
+    let chosen = (0..variances.len())
+        .filter(finite)
+        .filter(|&at| is_outside(at, side));
+    let mut chosen: Vec<f64> = chosen.map(|at| variances[at]).collect();
+    if chosen.is_empty() {
+        chosen = variances
+            .iter()
+            .copied()
+            .filter(|v| v.is_finite())
+            .collect();
+    }
+    upper_median(&mut chosen).map_or(f64::NAN, f64::sqrt)
+}
+
+// Whether a pixel of a stamp is beyond the galaxy.
+fn is_outside(at: usize, side: usize) -> bool {
+    let middle = (side as f64 - 1.0) / 2.0;
+    // Chosen by hand: 12 px of 48, where most galaxies of a stamp of this size have no light.
+    let radius = side as f64 / 4.0;
+    let [x, y] = [at % side, at / side].map(|k| k as f64 - middle);
+    x.hypot(y) > radius
+}
+
+// Makes the pixels of a stamp missing whose `mask` is not zero, or has one of these bits.
+pub(super) fn lose(pixels: &mut [f32], mask: &[f64], bits: Option<u64>) -> Result<(), String> {
+    for (pixel, mask) in pixels.iter_mut().zip(mask) {
+        let bad = match bits {
+            Some(bits) if mask.is_finite() => {
+                if mask.fract() != 0.0 {
+                    return Err(format!(
+                        "the mask has the value {mask}; expected whole numbers, of which --mask-bits takes bits"
+                    ));
+                }
+                // Negative numbers are in two's complement, as in the file.
+                (*mask as i64) as u64 & bits != 0
+            }
+            _ => *mask != 0.0,
+        };
+        if bad {
+            *pixel = f32::NAN;
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,171 @@
+//! PSFs of the stamps: one for all, one per galaxy, or a table of functional ones.
+
+use std::path::{Path, PathBuf};
+
+use ndarray::ArrayView2;
+use shearq_dataset::grid::{Mosaic, psfs_text, read_psfs};
+use shearq_dataset::images::ImageId;
+use shearq_dataset::layout::DataFolder;
+use shearq_files::{FileError, atomic};
+use shearq_measure::{EXAMINED_PSFS, Examination, Psfs, Star, Warning};
+use shearq_quantities::linear::Matrix2;
+use shearq_submissions::PsfCut;
+use shearq_submissions::limits::MIN_PSF;
+
+use super::files::{Files, PlaneReader};
+use super::mosaic::{Rows, central, first};
+use super::{Square, Stack};
+use crate::wcs::Wcs;
+
+// Central pixels of a PSF that are examined, along each axis: those that configurations use.
+const EXAMINED_SIDE_PX: usize = 48;
+pub(super) struct GatheredPsfs {
+    pub(super) file: PsfFile,
+    pub(super) examination: Examination,
+    pub(super) messages: Vec<String>,
+    /// Of the first PSF, and the Jacobians of all.
+    pub(super) wcs: Wcs,
+    pub(super) pixels: Vec<Option<Matrix2>>,
+    pub(super) first: PathBuf,
+}
+
+pub(super) fn gather_psfs(
+    data: &DataFolder,
+    id: ImageId,
+    files: Files<'_>,
+    square: Option<Square>,
+    mosaic: &Mosaic,
+) -> Result<GatheredPsfs, FileError> {
+    if let [table] = files.paths
+        && table
+            .extension()
+            .is_some_and(|ending| ending.eq_ignore_ascii_case("csv"))
+    {
+        return functional(data.psf_functional(id.set, id.image), table, mosaic);
+    }
+    let (stack, mut messages) = Stack::of(files, square)?;
+    let &Stack {
+        count,
+        side,
+        ref wcs,
+        ..
+    } = &stack;
+    messages.extend(small(&files.paths[0], side));
+    let path = data.psf_star(id.set, id.image);
+    check_count(&files.paths[0], count, mosaic)?;
+    // One, or one per galaxy in the same places.
+    let mut image = Rows::create(&path, Mosaic::of(count, side), &wcs.keys())?;
+    let mut planes = PlaneReader::of(files);
+    let mut examination = Examination::new(side, 0);
+    if count > 1 {
+        examination = examination.with_psf_of_each();
+    }
+    let mut dark = 0;
+    while let Some((origin, pixels)) = planes.next()? {
+        let pixels = central(pixels, planes.sides(), side);
+        let light: f64 = pixels.iter().map(|&value| f64::from(value)).sum();
+        if !(light > 0.0 && light.is_finite()) {
+            if count == 1 {
+                let message =
+                    format!("the pixels of the PSF add up to {light}; expected a positive sum");
+                return Err(origin.fault(&message));
+            }
+            dark += 1;
+        }
+        if let Ok(stamp) = ArrayView2::from_shape((side, side), &pixels)
+            && let Ok(Star { psf, moved }) = Star::cut(stamp, examined_cut(side))
+        {
+            examination.add_psf(psf.view(), moved);
+        }
+        image.add(&pixels)?;
+    }
+    messages.extend(named(&examination, &files.paths[0]));
+    if dark > 0 {
+        messages.push(format!(
+            "warning: {dark} of {count} PSFs have no positive sum of pixels. Their galaxies will be flagged"
+        ));
+    }
+    Ok(GatheredPsfs {
+        file: PsfFile::Stars(Box::new(image)),
+        examination,
+        messages,
+        wcs: wcs.clone(),
+        pixels: stack.pixels(),
+        first: files.paths[0].clone(),
+    })
+}
+
+// Named configurations refuse such PSF stamps. Users should learn it before they have gathered all images.
+fn small(path: &Path, side: usize) -> Option<String> {
+    let shown = path.display();
+    (side < MIN_PSF).then(|| {
+        format!(
+            "warning: {shown}: the PSF stamps are {side} × {side} px (expected {MIN_PSF} × {MIN_PSF} or more, which configurations of 48 px require). Try: larger PSF stamps; or, if no light is beyond them, --submission own.toml with the file own.toml of these lines:\n  extends = \"48/linear/star\"\n  psf.size = {side}"
+        )
+    })
+}
+
+fn check_count(path: &Path, found: usize, mosaic: &Mosaic) -> Result<(), FileError> {
+    if found == 1 || found == mosaic.galaxies {
+        return Ok(());
+    }
+    let message = format!(
+        "there are {found} PSFs; expected one, or one for each of the {} stamps. Try: average stars before, as average_stars of the crate shearq-measure does",
+        mosaic.galaxies
+    );
+    Err(FileError::new(path, message))
+}
+
+fn examined_cut(side: usize) -> PsfCut {
+    let size = side - side.saturating_sub(EXAMINED_SIDE_PX).next_multiple_of(2);
+    PsfCut {
+        size,
+        // So that a star off the centre can be cut around itself.
+        least: size - (size / 3).next_multiple_of(2),
+        centred: false,
+    }
+}
+
+// In the order of the galaxies, like stars. Positions in the mosaic replace the positions of the table, which are on another image.
+fn functional(path: PathBuf, table: &Path, mosaic: &Mosaic) -> Result<GatheredPsfs, FileError> {
+    let mut rows = read_psfs(table)?;
+    check_count(table, rows.len(), mosaic)?;
+    for (place, (position, _)) in rows.iter_mut().enumerate() {
+        *position = mosaic.position(place);
+    }
+    let mut examination = Examination::new(mosaic.stamp, 0);
+    let psfs: Vec<_> = rows.iter().map(|(_, psf)| *psf).collect();
+    let cut = examined_cut(mosaic.stamp);
+    examination.add_psfs(&Psfs::functional(psfs), cut, EXAMINED_PSFS);
+    Ok(GatheredPsfs {
+        file: PsfFile::Table(path, psfs_text(&rows)),
+        examination,
+        messages: Vec::new(),
+        wcs: Wcs::default(),
+        pixels: Vec::new(),
+        first: table.to_owned(),
+    })
+}
+
+/// The warnings of an examination, with the file that they are about.
+fn named(examination: &Examination, path: &Path) -> Vec<String> {
+    let found = examination.warnings();
+    let line = |warning: &Warning| format!("warning: {}: {warning}", path.display());
+    found.iter().map(line).collect()
+}
+
+pub(super) enum PsfFile {
+    Stars(Box<Rows>),
+    Table(PathBuf, String),
+}
+
+impl PsfFile {
+    pub(super) fn finish(self) -> Result<(), FileError> {
+        match self {
+            PsfFile::Stars(image) => image.finish(),
+            PsfFile::Table(path, text) => {
+                first(atomic::write_if_absent(&path, text.as_bytes())?, path)
+            }
+        }
+    }
+}

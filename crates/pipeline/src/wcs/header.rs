@@ -1,0 +1,452 @@
+//! The keys of a header that state its WCS. Each key of a rotation or distortion is used or named.
+
+use std::cell::RefCell;
+use std::collections::{BTreeMap, BTreeSet};
+
+use shearq_files::names_of;
+use shearq_quantities::linear::{Matrix2, determinant};
+
+use super::Wcs;
+use super::map::{ARCSEC_PER_RADIAN, Map, Polynomial, Projection};
+
+// Keys with the pixel scale in arcseconds: of surveys, and of GalSim.
+const PIXEL_SCALE_KEYS: [&str; 2] = ["PIXSCALE", "GS_SCALE"];
+// Largest order of SIP (Shupe et al. 2005, ASPC 347, 491): headers with more are damaged.
+const MAX_SIP_ORDER: i32 = 9;
+// Largest number of a coefficient PVi_m of TPV.
+const MAX_TPV: usize = 39;
+// Powers of x and y, or of r, of the coefficients of TPV for the first axis. The second axis has x and y exchanged
+// (https://fits.gsfc.nasa.gov/registry/tpvwcs/tpv.html).
+const TPV_ORDERS: i32 = 7;
+// Least number m of a key PVi_m that only TPV has: for TAN, the standard has 0 to 4 on the axis of longitudes.
+const MIN_TPV_ONLY: usize = 5;
+// Ratio of the determinant to the sum of squares below which axes count as parallel. Chosen by hand; `Jacobian::new` compares with
+// the longer axis alone.
+const MIN_AREA_TO_SUM_OF_SQUARES: f64 = 1e-6;
+// Largest difference of CD from PC with CDELT in units of their size: what writers round.
+const MAX_MATRIX_DIFFERENCE: f64 = 1e-5;
+// Most keys that a message lists.
+const MAX_NAMED_KEYS: usize = 4;
+// Plausible scales in arcseconds. Headers without a sky have scales such as 1 degree per pixel.
+const PLAUSIBLE_ARCSEC: std::ops::RangeInclusive<f64> = 1e-3..=60.0;
+
+/// Values of the keys of a header as its cards have them, texts with their quotes.
+pub(crate) struct Keys {
+    values: BTreeMap<String, String>,
+    used: RefCell<BTreeSet<String>>,
+    /// The first key of a text where a number is needed.
+    unreadable: RefCell<Option<String>>,
+}
+
+impl Keys {
+    pub(crate) fn new(values: BTreeMap<String, String>) -> Self {
+        Keys {
+            values,
+            used: RefCell::default(),
+            unreadable: RefCell::default(),
+        }
+    }
+
+    fn number(&self, key: &str) -> Option<f64> {
+        let value = self.values.get(key).filter(|value| !value.is_empty())?;
+        // FITS writes exponents of double precision as D.
+        let number = value.replace(['D', 'd'], "E").parse().ok();
+        match number {
+            Some(_) => drop(self.used.borrow_mut().insert(key.to_owned())),
+            // Other programs use PIXSCALE for text.
+            None if PIXEL_SCALE_KEYS.contains(&key) => {}
+            None => drop(self.unreadable.borrow_mut().get_or_insert(key.to_owned())),
+        }
+        number
+    }
+
+    fn text(&self, key: &str) -> String {
+        let value = self.values.get(key).map_or("", String::as_str);
+        value.trim_matches('\'').trim().to_ascii_uppercase()
+    }
+
+    /// Marks keys whose value another key states, or replaces by the standard.
+    fn settle(&self, keys: [&String; 2]) {
+        self.used.borrow_mut().extend(keys.map(String::clone));
+    }
+
+    fn has(&self, key: &str) -> bool {
+        self.values.contains_key(key)
+    }
+
+    /// An element of the matrices CD and PC, also by its name before the standard, such as PC001002 (Pan-STARRS).
+    fn element(&self, matrix: &str, [i, j]: [usize; 2]) -> Option<f64> {
+        let found = self.number(&format!("{matrix}{i}_{j}"));
+        found.or_else(|| self.number(&format!("{matrix}{i:03}{j:03}")))
+    }
+
+    /// The elements of CD or PC; without all of them, `None`.
+    fn matrix(&self, name: &str, diagonal: f64) -> Option<Matrix2> {
+        let found = [1, 2].map(|i| [1, 2].map(|j| self.element(name, [i, j])));
+        let is_there = found.iter().flatten().any(Option::is_some);
+        let absent = |i, j| if i == j { diagonal } else { 0.0 };
+        is_there.then(|| [0, 1].map(|i| [0, 1].map(|j| found[i][j].unwrap_or(absent(i, j)))))
+    }
+
+    /// Keys of rotations and distortions that are not used, although they are not zero.
+    fn unused(&self) -> Vec<String> {
+        let used = self.used.borrow();
+        let unused = self.values.iter().filter(|(key, value)| {
+            let is_zero = value.parse::<f64>().is_ok_and(|value| value == 0.0);
+            is_distortion(key) && !used.contains(*key) && !is_zero
+        });
+        unused.map(|(key, _)| key.clone()).collect()
+    }
+
+    /// What is said of these keys.
+    fn unused_text(&self, has_sip: bool) -> Option<String> {
+        let unused = self.unused();
+        let named = match unused.as_slice() {
+            [] => return None,
+            [first, .., last] if unused.len() > MAX_NAMED_KEYS => {
+                format!("{first} to {last} ({} keys)", unused.len())
+            }
+            few => names_of(few),
+        };
+        if has_sip && unused.iter().all(|key| key.starts_with("PV")) {
+            return Some(format!(
+                "{named} of the WCS are not used, because the header states the distortion by SIP, too"
+            ));
+        }
+        // Tables state their largest displacement.
+        let keys = ["CPERR1", "CPERR2", "D2IMERR1", "D2IMERR2"];
+        let stated = keys.into_iter().filter_map(|key| self.number(key));
+        let error = stated.reduce(f64::max);
+        let error = error.map_or_else(String::new, |error| format!(", up to {error:.2} px,"));
+        Some(format!(
+            "the WCS has {named}, whose distortion{error} is not read (expected TAN, TAN-SIP or TPV). Places of ra and dec and the axes of ellipticities lack it"
+        ))
+    }
+}
+
+// Whether a key, of the coordinates that have no letter, changes where pixels are on the sky.
+fn is_distortion(key: &str) -> bool {
+    let digits = |text: &str| !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_digit());
+    let axis = |text: &str| ["1", "2"].contains(&text);
+    let pair = |text: &str| {
+        text.split_once('_')
+            .is_some_and(|(i, j)| digits(i) && digits(j))
+    };
+    let after = |names: &[&str]| names.iter().find_map(|name| key.strip_prefix(name));
+    after(&["CROTA", "CPDIS", "CQDIS", "D2IMDIS", "AXISCORR"]).is_some_and(axis)
+        || after(&["PV1_", "PV2_", "AMDX", "AMDY", "PROJP"]).is_some_and(digits)
+        || after(&["A_", "B_"]).is_some_and(pair)
+        || ["A_ORDER", "B_ORDER", "D2IMARR"].contains(&key)
+}
+
+/// Arcseconds of a unit; `None` if it is unknown. Without a unit they are degrees, as the standard prescribes, or arcseconds in the
+/// planes of GalSim.
+fn arcsec_of(unit: &str, gs_plane: bool) -> Option<f64> {
+    Some(match unit {
+        "" if gs_plane => 1.0,
+        "" => 3600.0,
+        _ if unit.starts_with("DEG") => 3600.0,
+        "ARCSEC" | "ARCSECS" => 1.0,
+        "ARCMIN" => 60.0,
+        "MAS" => 1e-3,
+        "RAD" => ARCSEC_PER_RADIAN,
+        _ => return None,
+    })
+}
+
+impl Wcs {
+    pub(crate) fn of_keys(keys: &Keys) -> Self {
+        let wcs = Wcs::of_readable(keys);
+        let unreadable = keys.unreadable.borrow().clone();
+        // Without this key, the others would place galaxies elsewhere on the sky.
+        match unreadable {
+            None => wcs,
+            Some(key) => wcs.damaged(format!(
+                "the WCS has {key} = '{}' (expected a number)",
+                keys.values[&key].trim_matches(['\'', ' '])
+            )),
+        }
+    }
+
+    fn damaged(self, damage: String) -> Self {
+        Wcs {
+            scale: self.scale,
+            damage: Some(damage),
+            ..Wcs::default()
+        }
+    }
+
+    fn of_readable(keys: &Keys) -> Self {
+        let kinds = ["CTYPE1", "CTYPE2"].map(|key| keys.text(key));
+        let kind = kinds[0].as_str();
+        let plane = kind == "LINEAR";
+        let gs_plane = plane && !keys.text("GS_WCS").is_empty();
+        let latitude_first = kind.starts_with("DEC") || kind.get(1..4) == Some("LAT");
+        let named = latitude_first || kind.starts_with("RA") || kind.get(1..4) == Some("LON");
+        let equatorial = kind.starts_with("DEC") || kind.starts_with("RA");
+        let longitude = usize::from(latitude_first);
+
+        let stated = PIXEL_SCALE_KEYS
+            .into_iter()
+            .find_map(|key| keys.number(key));
+        let mut units = ["CUNIT1", "CUNIT2"].map(|key| keys.text(key));
+        if units[1].is_empty() {
+            units[1] = units[0].clone();
+        }
+        // Images without a sky have other units, and no scale.
+        let arcsec = units.each_ref().map(|unit| arcsec_of(unit, gs_plane));
+        let matrix = matrix(keys, 2 - longitude);
+        let only_scale = |matrix: Option<Matrix2>| Wcs {
+            scale: stated
+                .or(matrix.map(|matrix| determinant(matrix).abs().sqrt()))
+                .filter(|scale| PLAUSIBLE_ARCSEC.contains(scale)),
+            ..Wcs::default()
+        };
+        let matrix = match matrix {
+            Ok(None) => return only_scale(None),
+            Ok(Some(matrix)) => matrix,
+            Err(damage) => return only_scale(None).damaged(damage),
+        };
+        let [Some(first), Some(second)] = arcsec else {
+            let unit = units[usize::from(arcsec[0].is_some())].to_lowercase();
+            let expected = "expected deg, arcmin, arcsec, mas or rad";
+            return match named {
+                true => {
+                    only_scale(None).damaged(format!("the unit of the WCS is {unit} ({expected})"))
+                }
+                false => only_scale(None),
+            };
+        };
+        let units = [first, second];
+        let [first, second] = [0, 1].map(|i| matrix[i].map(|value| value * units[i]));
+        let Wcs { scale, .. } = only_scale(Some([first, second]));
+        let projections = kinds
+            .each_ref()
+            .map(|kind| kind.get(5..8).unwrap_or_default());
+        if named && !kinds[1].is_empty() && projections[0] != projections[1] {
+            return only_scale(None).damaged(format!(
+                "the axes have the projections {} and {} (expected one)",
+                kinds[0], kinds[1]
+            ));
+        }
+        let origin = ["CRPIX1", "CRPIX2"].map(|key| keys.number(key).unwrap_or(0.0));
+        if !(equatorial && ["TAN", "TPV"].contains(&projections[0])) {
+            let west = |row: [f64; 2]| row.map(|value| -value);
+            let matrix = match (plane, latitude_first) {
+                (true, _) => [first, second],
+                (_, true) => [west(second), first],
+                // Unnamed axes are right ascension and declination if one of them is reversed.
+                _ if named || determinant(matrix) < 0.0 => [west(first), second],
+                _ => [first, second],
+            };
+            return Wcs {
+                scale,
+                map: Some(Map {
+                    origin,
+                    sip: None,
+                    matrix,
+                    projection: Projection::Plane,
+                }),
+                unread: named.then(|| kind.to_owned()),
+                damage: None,
+                // Of projections that are not read, none is.
+                doubts: match named {
+                    true => Vec::new(),
+                    false => keys.unused_text(false).into_iter().collect(),
+                },
+            };
+        }
+        let degrees = |row: [f64; 2]| row.map(|value| value / 3600.0);
+        let centre = [0, 1].map(|i| {
+            let value = keys.number(["CRVAL1", "CRVAL2"][i]).unwrap_or(0.0);
+            value * units[i] / 3600.0
+        });
+        let (ra, dec) = (centre[longitude], centre[1 - longitude]);
+        let distortion = match Distortion::of(keys, &kinds, longitude) {
+            Ok(distortion) => distortion,
+            Err(damage) => return only_scale(None).damaged(damage),
+        };
+        // The default of LONPOLE for zenithal projections; PVi_3 of the axis of longitudes replaces the key (Calabretta & Greisen
+        // 2002).
+        let default = if dec >= 90.0 { 0.0 } else { 180.0 };
+        let by_pv = match distortion.tpv {
+            None => keys.number(&format!("PV{}_3", longitude + 1)),
+            Some(_) => None,
+        };
+        let lonpole = by_pv.or_else(|| keys.number("LONPOLE"));
+        let Distortion {
+            sip,
+            tpv,
+            mut doubts,
+        } = distortion;
+        doubts.extend(keys.unused_text(sip.is_some()));
+        Wcs {
+            scale,
+            map: Some(Map {
+                origin,
+                sip,
+                matrix: match latitude_first {
+                    true => [degrees(second), degrees(first)],
+                    false => [degrees(first), degrees(second)],
+                },
+                projection: Projection::Tangent {
+                    ra,
+                    dec,
+                    lonpole: lonpole.unwrap_or(default).to_radians(),
+                    tpv,
+                },
+            }),
+            unread: None,
+            damage: None,
+            doubts,
+        }
+    }
+}
+
+/// The matrix from pixels to the units of the axes. A header of zeros has none.
+fn matrix(keys: &Keys, latitude: usize) -> Result<Option<Matrix2>, String> {
+    let size = |m: &Matrix2| m.iter().flatten().map(|v| v * v).sum::<f64>();
+    let cd = keys.matrix("CD", 0.0).filter(|matrix| size(matrix) > 0.0);
+    if cd.is_some() {
+        keys.settle([&"CROTA1".into(), &"CROTA2".into()]);
+    }
+    let scaled = scaled(keys, latitude).filter(|(matrix, _)| size(matrix) > 0.0);
+    let found = match (cd, scaled) {
+        (Some(cd), Some((pc, true))) => {
+            let difference: Matrix2 = [0, 1].map(|i| [0, 1].map(|j| cd[i][j] - pc[i][j]));
+            if size(&difference) > MAX_MATRIX_DIFFERENCE.powi(2) * size(&cd) {
+                return Err(format!(
+                    "the WCS has two matrices, CD of {} and PC with CDELT of {} (expected one)",
+                    listed(cd),
+                    listed(pc)
+                ));
+            }
+            Some(cd)
+        }
+        (Some(cd), _) => Some(cd),
+        (None, scaled) => scaled.map(|(matrix, _)| matrix),
+    };
+    match found {
+        // Relative to its size: rounded numbers of parallel axes leave a small determinant.
+        Some(matrix) if determinant(matrix).abs() <= MIN_AREA_TO_SUM_OF_SQUARES * size(&matrix) => {
+            Err(format!(
+                "the matrix of the WCS, CD or PC with CDELT, is singular (found {}; expected one with an inverse)",
+                listed(matrix)
+            ))
+        }
+        found => Ok(found),
+    }
+}
+
+fn listed([[a, b], [c, d]]: Matrix2) -> String {
+    format!("{a}, {b}, {c}, {d}")
+}
+
+/// PC with CDELT, and that there is a PC; or the older rotation with CDELT.
+fn scaled(keys: &Keys, latitude: usize) -> Option<(Matrix2, bool)> {
+    let steps = ["CDELT1", "CDELT2"].map(|key| keys.number(key));
+    // Before there was a matrix, the axis of latitudes had the angle, from it to the axis of longitudes; many programs wrote it for
+    // both axes (Calabretta & Greisen 2002, eq. 189).
+    let [angle, other] = [latitude, 3 - latitude].map(|axis| format!("CROTA{axis}"));
+    let pc = keys.matrix("PC", 1.0);
+    if pc.is_some() || keys.values.get(&angle) == keys.values.get(&other) {
+        keys.settle([&angle, &other]);
+    }
+    if let Some(pc) = pc {
+        let scaled = [0, 1].map(|i| pc[i].map(|value| value * steps[i].unwrap_or(1.0)));
+        return Some((scaled, true));
+    }
+    let [Some(x), Some(y)] = steps else {
+        return None;
+    };
+    let (sine, cosine) = keys.number(&angle).unwrap_or(0.0).to_radians().sin_cos();
+    let sine = if latitude == 1 { -sine } else { sine };
+    Some(([[x * cosine, -y * sine], [x * sine, y * cosine]], false))
+}
+
+struct Distortion {
+    sip: Option<[Polynomial; 2]>,
+    tpv: Option<[Polynomial; 2]>,
+    doubts: Vec<String>,
+}
+
+impl Distortion {
+    // Headers with both kinds state one distortion twice. The name of the axes decides, as in astropy.
+    fn of(keys: &Keys, kinds: &[String; 2], longitude: usize) -> Result<Self, String> {
+        let has_suffix = kinds.iter().any(|kind| kind.ends_with("-SIP"));
+        let is_tpv = kinds[0].get(5..8) == Some("TPV");
+        // SCAMP wrote distortions of TPV under the name TAN.
+        let scamp = || {
+            let mut only_tpv = MIN_TPV_ONLY..=MAX_TPV;
+            only_tpv.any(|m| [1, 2].iter().any(|i| keys.has(&format!("PV{i}_{m}"))))
+        };
+        if is_tpv || !has_suffix && scamp() {
+            let axes = [longitude, 1 - longitude];
+            return Ok(Distortion {
+                sip: None,
+                tpv: Some(axes.map(|axis| tpv_of(keys, axis, axis == longitude))),
+                doubts: Vec::new(),
+            });
+        }
+        let orders = ["A_ORDER", "B_ORDER"].map(|key| keys.number(key));
+        let (sip, mut doubts) = match orders {
+            [Some(a), Some(b)] => {
+                let axes = [("A", a), ("B", b)];
+                (
+                    Some(axes.map(|(name, order)| sip(keys, name, order))),
+                    Vec::new(),
+                )
+            }
+            [None, None] => (None, Vec::new()),
+            _ => return Err("the WCS has one of A_ORDER and B_ORDER (expected both)".to_owned()),
+        };
+        if sip.is_some() && !has_suffix {
+            doubts.push(format!(
+                "the WCS has SIP coefficients (A_ORDER, B_ORDER), and CTYPE1 is {} (expected RA---TAN-SIP). They are used. Try: remove them if the image is resampled",
+                kinds[0]
+            ));
+        }
+        Ok(Distortion {
+            sip,
+            tpv: None,
+            doubts,
+        })
+    }
+}
+
+/// The coefficients of an axis of SIP, `A` or `B`, of offsets from the reference pixel.
+fn sip(keys: &Keys, name: &str, order: f64) -> Polynomial {
+    let order = (order as i32).min(MAX_SIP_ORDER);
+    let powers = (0..=order).flat_map(|i| (0..=order - i).map(move |j| [i, j]));
+    let terms =
+        powers.filter_map(|[i, j]| Some(([i, j], keys.number(&format!("{name}_{i}_{j}"))?)));
+    Polynomial {
+        terms: terms.collect(),
+        radial: Vec::new(),
+    }
+}
+
+/// The coefficients of an axis of TPV, from 0, in degrees, by longitude and latitude.
+fn tpv_of(keys: &Keys, axis: usize, is_longitude: bool) -> Polynomial {
+    let factor = |m: usize| keys.number(&format!("PV{}_{m}", axis + 1));
+    let (mut terms, mut radial) = (Vec::new(), Vec::new());
+    let mut m = 0;
+    for order in 0..=TPV_ORDERS {
+        for j in 0..=order {
+            // Without PVi_1 the coordinate itself, as the convention prescribes.
+            let factor = factor(m).or((m == 1).then_some(1.0));
+            let powers = if is_longitude {
+                [order - j, j]
+            } else {
+                [j, order - j]
+            };
+            terms.extend(factor.map(|factor| (powers, factor)));
+            m += 1;
+        }
+        if order % 2 == 1 {
+            radial.extend(factor(m).map(|factor| (order, factor)));
+            m += 1;
+        }
+    }
+    Polynomial { terms, radial }
+}
