@@ -40,6 +40,16 @@ pub(crate) struct Arguments {
     /// "x < 1280".
     #[arg(long = "where", value_name = "CONDITION")]
     condition: Option<String>,
+    /// Carried columns in conditions that shear does not change, because they were not measured on images of the galaxies, such as
+    /// z,tile.
+    #[arg(
+        long,
+        value_name = "NAMES",
+        value_delimiter = ',',
+        num_args = 1,
+        requires = "condition"
+    )]
+    unsheared: Vec<String>,
     /// Weight as a formula of snr, flux and size, such as "snr^2/(snr^2 + 100)".
     #[arg(long, value_name = "FORMULA")]
     weight: Option<String>,
@@ -52,7 +62,11 @@ pub(crate) struct Arguments {
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let (measured, sets) = (&arguments.measured, sets_of(arguments.sets.as_ref()));
     let (condition, weight) = (&arguments.condition, &arguments.weight);
-    let selection = smooth_selection(condition.as_deref(), weight.as_deref())?;
+    let selection = smooth_selection(
+        condition.as_deref(),
+        weight.as_deref(),
+        &arguments.unsheared,
+    )?;
     let run = Run::require(measured)?;
     let data = fingerprint::verify_source(measured, &run, sets, arguments.threads.number())?;
     let means = mean_shears(&run, measured, sets, selection.as_ref())?;

@@ -29,6 +29,16 @@ pub(crate) struct Arguments {
         required_unless_present = "weight"
     )]
     condition: Option<String>,
+    /// Carried columns in conditions that shear does not change, because they were not measured on images of the galaxies, such as
+    /// z,tile.
+    #[arg(
+        long,
+        value_name = "NAMES",
+        value_delimiter = ',',
+        num_args = 1,
+        requires = "condition"
+    )]
+    unsheared: Vec<String>,
     /// Weight as a formula of snr, flux and size, such as "snr^2/(snr^2 + 100)".
     #[arg(long, value_name = "FORMULA")]
     weight: Option<String>,
@@ -41,7 +51,12 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let (condition, weight) = (&arguments.condition, &arguments.weight);
     let run = Run::require(&arguments.measured)?;
     // Clap requires one of both options, so that there is a selection.
-    let Some(selection) = smooth_selection(condition.as_deref(), weight.as_deref())? else {
+    let Some(selection) = smooth_selection(
+        condition.as_deref(),
+        weight.as_deref(),
+        &arguments.unsheared,
+    )?
+    else {
         return Ok(());
     };
     let (kept, good) = write_selected(&run, &arguments.measured, &arguments.out, &selection)?;

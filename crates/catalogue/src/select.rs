@@ -41,6 +41,10 @@ pub enum SelectionError {
     )]
     Condition(String),
     #[error(
+        "`{condition}` is a condition on the column {column}, which shear may change, so that the mean shear would be biased (expected positions, identities, PSF columns, and steps, such as `step(snr, 10)`). Try: --unsheared {column} if it was not measured on these galaxies' images, as a tile or a redshift of a survey"
+    )]
+    Carried { condition: String, column: String },
+    #[error(
         "a weight cannot depend on `{0}`, whose response to shear is not known (expected snr, flux or size)"
     )]
     WeightColumn(String),
@@ -102,18 +106,46 @@ pub fn selection(
     Ok((condition.is_some() || weight.is_some()).then_some(stated))
 }
 
-/// The selection of `--where` and `--weight` by steps, weights, and conditions on columns that shear does not change, such as
-/// positions: all keep a mean shear calibrated.
+/// Columns that shear does not change.
+const UNSHEARED: [&str; 12] = [
+    "id",
+    "x",
+    "y",
+    "ra",
+    "dec",
+    "tile_x",
+    "tile_y",
+    "set",
+    "file",
+    "image",
+    "plane",
+    "submission",
+];
+
+/// The selection of `--where` and `--weight` by steps, weights, and conditions on columns that shear does not change: positions and
+/// those that the user declares as `unsheared`. All keep a mean shear calibrated.
+// Carried columns of fluxes, sizes and flags were measured on images of the galaxies: cuts on them cost m of −0.015 to −0.03.
 pub fn smooth_selection(
     condition: Option<&str>,
     weight: Option<&str>,
+    unsheared: &[String],
 ) -> Result<Option<StatedSelection>, SelectionError> {
     let stated = selection(condition, weight)?;
-    match stated.as_ref().and_then(|stated| stated.rows.as_ref()) {
-        Some(rows) if rows.columns().any(is_measured) => {
-            Err(SelectionError::Condition(rows.text().to_owned()))
-        }
-        _ => Ok(stated),
+    let Some(rows) = stated.as_ref().and_then(|stated| stated.rows.as_ref()) else {
+        return Ok(stated);
+    };
+    let condition = rows.text().to_owned();
+    if rows.columns().any(is_measured) {
+        return Err(SelectionError::Condition(condition));
+    }
+    let is_known = |name: &&str| {
+        let declared = unsheared.iter().any(|own| own == name);
+        declared || UNSHEARED.contains(name) || name.starts_with("psf_")
+    };
+    let carried = rows.columns().find(|name| !is_known(name));
+    match carried.map(str::to_owned) {
+        Some(column) => Err(SelectionError::Carried { condition, column }),
+        None => Ok(stated),
     }
 }
 
