@@ -6,6 +6,7 @@
 mod bias;
 mod command;
 mod errors;
+mod images;
 mod measure;
 mod score;
 mod select;
@@ -25,6 +26,8 @@ mod _shearq {
     use super::bias::{BiasSums, bias_sums};
     #[pymodule_export]
     use super::command::run_command;
+    #[pymodule_export]
+    use super::images::{are_aligned, header_pixels, pixel_difference_of, read_images};
     #[pymodule_export]
     use super::measure::{flags, mean_shear, measure};
     #[pymodule_export]

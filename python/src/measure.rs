@@ -107,9 +107,9 @@ fn source<'a>(
         each.map_err(|error| PyValueError::new_err(format!("wcs: {error}")))
     });
     let jacobians = jacobians.transpose()?;
-    let moved = match psfs {
-        AllPsfs::Shared { moved, .. } => moved,
-        AllPsfs::Stars(_) | AllPsfs::Formulas(_) => None,
+    let (is_shared, moved) = match psfs {
+        AllPsfs::Shared { moved, .. } => (true, moved),
+        AllPsfs::Stars(_) | AllPsfs::Formulas(_) => (false, None),
     };
     let stamps = arrays.stamps.shared();
     let mut source = ArraySource::from_fn(
@@ -118,6 +118,9 @@ fn source<'a>(
         move |range| psfs.slice(range).map_err(|error| failed.keep(error)),
         moved,
     );
+    if is_shared {
+        source = source.with_shared_psf();
+    }
     if let Some(jacobians) = jacobians {
         source = source.with_jacobians(jacobians).map_err(of_measuring)?;
     }

@@ -24,7 +24,7 @@ pub(crate) fn select<'py>(
     weight: Option<&str>,
 ) -> PyResult<Selected<'py>> {
     let fault = |error: &dyn std::fmt::Display| PyValueError::new_err(error.to_string());
-    let selection = smooth_selection(condition, weight).map_err(|error| fault(&error))?;
+    let selection = smooth_selection(condition, weight, &[]).map_err(|error| fault(&error))?;
     // Stands for the file in messages.
     let path = Path::new("catalogue");
     let column = |name: &str| {

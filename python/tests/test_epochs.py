@@ -131,3 +131,32 @@ def test_wrong_epochs_are_one_error_each():
             shearq.measure(epochs=[good, other])
     with pytest.raises(TypeError, match="noise: found with epochs"):
         shearq.measure(epochs=[good], noise=1.0)
+
+
+def test_psfs_at_the_phases_of_galaxies_need_their_offsets():
+    rng = np.random.default_rng(11)
+    shapes = galaxies(rng, 60)
+    epochs = [epoch(rng, shapes, angle, noise=0.01) for angle in (0.0, 0.7)]
+    expected = shearq.measure(epochs=epochs)
+    star = np.array((0.09, 0.004, 0.08))
+    drawn = [{**one, "psf": np.array([gaussian(32, star, one["wcs"], at, 1.0) for at in one["offsets"]])} for one in epochs]
+    with pytest.warns(shearq.DataWarning, match="the PSFs are at several places of their stamps"):
+        shearq.measure(epochs=drawn)
+    found = shearq.measure(epochs=[{**one, "psf_offsets": one["offsets"]} for one in drawn])
+    for name in ("e1", "e2", "R11"):
+        assert np.allclose(found[name], expected[name], atol=3e-3), name
+    with pytest.raises(ValueError, match="psf_offsets: found shape"):
+        shearq.measure(epochs=[{**epochs[0], "psf_offsets": [1.0]}])
+
+    def observed(k):
+        lists_of = lists(drawn, k)
+        for one, of in zip(lists_of, drawn):
+            one.psf.image = of["psf"][k]
+            row, column = 15.5 + of["offsets"][k][1], 15.5 + of["offsets"][k][0]
+            one.psf.jacobian.get_cen = lambda place=(row, column): place
+        return lists_of
+
+    # Observations of ngmix have the centres of both.
+    same = shearq.measure(**adapters.from_ngmix([observed(k) for k in range(60)]))
+    for name in ("e1", "e2", "R11"):
+        assert np.allclose(same[name], found[name], atol=1e-9), name

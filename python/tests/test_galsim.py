@@ -137,3 +137,24 @@ def test_profiles_are_drawn_on_the_pixels_of_the_stamps():
         shearq.measure(stamps, profile)
     with pytest.raises(TypeError, match="images: found ndarray"):
         shearq.from_galsim(stamps, profile)
+
+
+def test_profiles_that_contain_the_pixel_are_drawn_without_it():
+    galsim = pytest.importorskip("galsim", reason="profiles of GalSim")
+    psf, pixel = galsim.Moffat(beta=3, fwhm=0.68), galsim.Pixel(0.2)
+    stamps = []
+    for k in range(40):
+        galaxy = galsim.Exponential(half_light_radius=0.5).shear(g1=0.2 * np.cos(k), g2=0.2 * np.sin(k))
+        stamps.append(galsim.Convolve(galaxy, psf).drawImage(nx=48, ny=48, scale=0.2))
+    effective = galsim.InterpolatedImage(psf.drawImage(nx=64, ny=64, scale=0.2), x_interpolant="lanczos15")
+    expected = shearq.measure(stamps, psf, noise=1e-4)
+    for profile, kind in ((effective, "InterpolatedImage"), (galsim.Convolve(psf, pixel), "Pixel"), (effective.rotate(0 * galsim.degrees) * 2, "Interp")):
+        with pytest.warns(shearq.DataWarning, match=f"psf: the profile has a part of type {kind}"):
+            broad = shearq.measure(stamps, profile, noise=1e-4)
+        included = shearq.measure(stamps, profile, noise=1e-4, pixel="included")
+        assert np.allclose(included["e1"], expected["e1"], atol=1e-3)
+        assert np.abs(broad["R11"] / expected["R11"] - 1).mean() > 0.005
+    with pytest.raises(ValueError, match="pixel: found 'yes'"):
+        shearq.measure(stamps, psf, pixel="yes")
+    with pytest.raises(TypeError, match="pixel: found with PSFs that are no profiles"):
+        shearq.measure(stamps, psf.drawImage(nx=48, ny=48, scale=0.2), pixel="included")

@@ -44,7 +44,7 @@ class MeanShear:
     Attributes
     ----------
     g1, g2 : float
-        Components of the mean shear; g1 > 0 along +x, g2 > 0 along x = y.
+        Components of the mean shear; g1 > 0 along +x, g2 > 0 along x = y of the frame.
     g1_error, g2_error : float
         Standard errors. They include the errors of the mean responses.
     covariance : tuple of tuple of float
@@ -55,6 +55,8 @@ class MeanShear:
         Galaxies without a flag and with a positive weight.
     flagged : int
         Galaxies with a flag and a positive weight.
+    frame : {'pixel', 'sky'} or None
+        Axes of g1 and g2: those of the pixels, or of the sky (g1 > 0 along east–west); None if the catalogues do not state it.
     """
 
     g1: float
@@ -65,6 +67,7 @@ class MeanShear:
     response: tuple[float, float] | None
     galaxies: int
     flagged: int
+    frame: str | None = None
 
     def __iter__(self) -> Iterator[float]:
         return iter((self.g1, self.g2))
@@ -72,7 +75,8 @@ class MeanShear:
     def __str__(self) -> str:
         pairs = (("g1", self.g1, self.g1_error), ("g2", self.g2, self.g2_error))
         means = ", ".join(f"{name} = {with_error(value, error)}" for name, value, error in pairs)
-        return f"{means} ({self.galaxies} galaxies, {self.flagged} flagged)"
+        frame = f", {self.frame} frame" if self.frame else ""
+        return f"{means} ({self.galaxies} galaxies, {self.flagged} flagged{frame})"
 
     def __repr__(self) -> str:
         return f"<shearq.MeanShear {self}>"
@@ -523,6 +527,7 @@ def mean_shear(catalogues: Catalogue | Iterable[Catalogue], weights: ArrayLike |
     stars: list[tuple[list[list[float]], NDArray[np.int64]]] = []
     goods: list[NDArray[np.bool_]] = []
     calibrated = False
+    frames: set[str] = set()
     for rows in [catalogues] if isinstance(catalogues, Catalogue) else catalogues:
         missing = [name for name in _schema.NEEDED if name not in (rows.dtype.names or ())]
         if missing:
@@ -533,6 +538,9 @@ def mean_shear(catalogues: Catalogue | Iterable[Catalogue], weights: ArrayLike |
         stars.append(_stars(rows))
         goods.append(rows.good)
         calibrated = calibrated or bool(np.isfinite(rows["R11"]).any())
+        frames.update(rows.attrs[name] for name in ("frame",) if name in rows.attrs)
+        if len(frames) > 1:
+            raise ValueError("catalogues: found ellipticities in the frames of pixels and of the sky; expected one frame")
     if not parts:
         raise ValueError("catalogues: found none; expected one or more")
     good = np.concatenate(goods)
@@ -563,6 +571,7 @@ def mean_shear(catalogues: Catalogue | Iterable[Catalogue], weights: ArrayLike |
         (response[0], response[1]) if calibrated else None,
         galaxies,
         int((weight[~good] > 0).sum()),
+        next(iter(frames), None),
     )
 
 

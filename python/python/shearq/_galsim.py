@@ -8,6 +8,12 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from ._warn import DataWarning, warn
+
+PixelOfPsf = Literal["included", "convolve"]
+# Profiles that are made of images of stars or of pixels, so that they contain the pixel already.
+_WITH_PIXEL = ("InterpolatedImage", "InterpolatedKImage", "Pixel")
+
 # Shear of pixels, and difference of pixel scales, that is tolerated: shears have this error then.
 SAME = 1e-4
 
@@ -42,6 +48,40 @@ def _many(value: Any, kind: Any) -> list[Any] | None:
     if isinstance(value, (list, tuple)) and value and any(map(kind, value)):
         return list(value)
     return None
+
+
+def _parts(profile: Any) -> list[Any]:
+    """A profile and all profiles of which it is a sum, convolution or transformation."""
+    inner = list(getattr(profile, "obj_list", ()))
+    inner += [getattr(profile, name) for name in ("original", "orig_obj") if hasattr(profile, name)]
+    return [profile, *(part for one in inner for part in _parts(one))]
+
+
+def drawn(profiles: list[Any], side: int, pixels: list[dict[str, Any]], pixel: PixelOfPsf | None) -> list[NDArray[np.float64]]:
+    """PSFs of profiles on stamps of ``side`` pixels, each with its ``pixels`` as drawImage takes them."""
+    if pixel not in (None, "included", "convolve"):
+        raise ValueError(f"pixel: found {pixel!r}; expected 'included' or 'convolve'")
+    if pixel is None:
+        kinds = {type(part).__name__ for profile in profiles for part in _parts(profile)}
+        doubtful = sorted(kinds.intersection(_WITH_PIXEL))
+        if doubtful:
+            warn(
+                f"psf: the profile has a part of type {', '.join(doubtful)}, which usually contains the pixel, and is convolved with the"
+                " pixel (expected a profile without it). A pixel too many gives m of 0.016 at a FWHM of 3.4 px."
+                " Try: pixel='included', or pixel='convolve' if it has none",
+                DataWarning,
+            )
+    method = "no_pixel" if pixel == "included" else "auto"
+    return [
+        profile.drawImage(nx=side, ny=side, dtype=np.float64, method=method, **how).array
+        for profile, how in zip(profiles, pixels)
+    ]
+
+
+def no_pixel(pixel: PixelOfPsf | None) -> None:
+    """Refuses a statement about the pixel of a PSF that is no profile."""
+    if pixel is not None:
+        raise TypeError("pixel: found with PSFs that are no profiles of GalSim; expected none, because images contain the pixel")
 
 
 def square_pixels(name: str, jacobian: tuple[float, float, float, float], remedy: str) -> float:
@@ -112,6 +152,7 @@ def from_galsim(
     psf: GalSimImage | GalSimProfile | Sequence[GalSimImage] | Sequence[GalSimProfile],
     *,
     wcs: Literal["check", "ignore", "sky"] = "check",
+    pixel: PixelOfPsf | None = None,
 ) -> dict[str, NDArray[Any]]:
     """Arguments of :func:`measure` for stamps and PSFs of GalSim.
 
@@ -126,6 +167,9 @@ def from_galsim(
         ``'check'`` refuses pixels that are flipped, rotated or sheared, and PSF images of another scale. ``'ignore'``
         measures shears along the pixel axes. ``'sky'`` measures any pixels in the frame of the sky, by the WCS of each image, and
         refuses PSF images on other pixels.
+    pixel : {'included', 'convolve'}, optional
+        Whether profiles contain the pixel, as those do that are interpolated from images of stars (``InterpolatedImage``,
+        PSFEx) or convolved with a ``Pixel``. By default they are convolved with it, with a warning for such profiles.
 
     Returns
     -------
@@ -154,7 +198,7 @@ def from_galsim(
             own, of_stamps = _jacobian("psf", k, image), matrices[k] if k < len(matrices) else matrices[0]
             if np.abs(own - of_stamps).max() > SAME * np.abs(of_stamps).max():
                 raise ValueError(f"psf: image {k} has the Jacobian {own.tolist()} and its stamp {of_stamps.tolist()}; expected one")
-        return {**from_galsim(images, psf, wcs="ignore"), "wcs": matrices}
+        return {**from_galsim(images, psf, wcs="ignore", pixel=pixel), "wcs": matrices}
     pixels = _array("stamps", stamps)
     scale = _common("stamps", stamps) if wcs == "check" else None
     profiles = _many(psf, _is_profile)
@@ -164,13 +208,11 @@ def from_galsim(
         shared = len(profiles) == 1 and len({repr(_local(image)) for image in stamps}) > 1
         profiles = profiles * len(stamps) if shared else profiles
         places = stamps if len(profiles) == len(stamps) else stamps[:1]
-        drawn = []
-        for k, profile in enumerate(profiles):
-            place = places[k if len(places) > 1 else 0]
-            local = _local(place)
-            how = {"scale": 1.0} if local is None else {"wcs": local}
-            drawn.append(profile.drawImage(nx=side, ny=side, dtype=np.float64, **how).array)
-        return {"stamps": pixels, "psf": drawn[0] if _is_profile(psf) and not shared else np.stack(drawn)}
+        local = [_local(places[k if len(places) > 1 else 0]) for k in range(len(profiles))]
+        pixels_of = [{"scale": 1.0} if one is None else {"wcs": one} for one in local]
+        found = drawn(profiles, side, pixels_of, pixel)
+        return {"stamps": pixels, "psf": found[0] if _is_profile(psf) and not shared else np.stack(found)}
+    no_pixel(pixel)
     stars = _many(psf, _is_image)
     if stars is None:
         return {"stamps": pixels, "psf": np.asarray(psf)}
@@ -180,22 +222,24 @@ def from_galsim(
     return {"stamps": pixels, "psf": stars[0].array if _is_image(psf) else _array("psf", stars)}
 
 
-def unpacked(stamps: Any, psf: Any, *, check: bool) -> tuple[Any, Any]:
+def unpacked(stamps: Any, psf: Any, *, check: bool, pixel: PixelOfPsf | None = None) -> tuple[Any, Any]:
     """Stamps and PSFs, of which GalSim's become arrays; with ``check``, pixels are square and along the axes."""
     if _many(stamps, _is_image) is not None:
         if hasattr(psf, "fwhm") and not _is_profile(psf):
             # Formulas in pixels.
+            no_pixel(pixel)
             images = _many(stamps, _is_image) or []
             if check:
                 _common("stamps", images)
             return _array("stamps", images), psf
-        found = from_galsim(stamps, psf, wcs="check" if check else "ignore")
+        found = from_galsim(stamps, psf, wcs="check" if check else "ignore", pixel=pixel)
         return found["stamps"], found["psf"]
     if _many(psf, _is_profile) is not None:
         raise TypeError(
             "psf: found a profile of GalSim with stamps that have no WCS; expected pixels."
             " Try: psf.drawImage(nx=48, ny=48, scale=SCALE), with the pixel scale of the stamps"
         )
+    no_pixel(pixel)
     stars = _many(psf, _is_image)
     if stars is not None:
         if check:

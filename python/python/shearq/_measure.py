@@ -2,29 +2,27 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Union
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from . import _galsim, _psf_models, _schema, _shearq
+from . import _galsim, _images, _psf_models, _schema, _shearq
 from ._arrays import callback, double, numeric, real, shaped, shown, whole, with_missing, without_sentinels
 from ._catalogue import Catalogue
-from ._galsim import GalSimImage, GalSimProfile
+from ._galsim import GalSimImage, GalSimProfile, PixelOfPsf
+from ._images import Hdu
 from ._submissions import Configuration, SubmissionLike, submission as resolve
 from ._threads import thread_count
-from ._warn import warn
+from ._warn import DataWarning as DataWarning, warn
 from ._wcs import WcsLike, jacobians
 
-StampsLike = Union[ArrayLike, GalSimImage, Sequence[GalSimImage]]
-"""Stamps: an array, a sequence of arrays, or one or more GalSim images."""
+StampsLike = Union[ArrayLike, GalSimImage, Sequence[GalSimImage], str, "os.PathLike[str]", Hdu]
+"""Stamps: an array, a sequence of arrays, one or more GalSim images, a FITS file, or an HDU of astropy."""
 PsfLike = Union[ArrayLike, "FunctionalPsf", GalSimImage, GalSimProfile, Sequence[GalSimImage], Sequence[GalSimProfile], Callable[..., Any], Any]
 """PSFs: arrays, formulas, images or profiles of GalSim, or models of Piff, PSFEx and Rubin."""
-
-
-class DataWarning(UserWarning):
-    """Stamps or PSFs that are measured, although they bias shears or are likely a mistake."""
 
 
 class FunctionalPsf:
@@ -119,6 +117,7 @@ def measure(
     ids: ArrayLike | None = None,
     wcs: WcsLike | None = None,
     properties: Mapping[str, ArrayLike] | None = None,
+    pixel: PixelOfPsf | None = None,
     submission: SubmissionLike = "48/linear/star",
     threads: int | None = None,
     progress: Callable[[int], object] | None = None,
@@ -131,7 +130,8 @@ def measure(
         Square postage stamps in any unit, of even or odd size, at least as large as the configuration requires (48
         pixels by default). Each has its galaxy near the middle. The sky must be subtracted. float32 and float64 are
         read without a copy, memory maps included; other types are converted in pieces. Lists of 2-D arrays or GalSim
-        images are accepted. Pixels that are masked, not finite or −1e30 are missing: the network flags such a galaxy, the
+        images are accepted, and a FITS file (a path, ``FILE[SCI,2]`` for one of its images) or an image HDU of astropy, whose header
+        then states the WCS as for `gather`. Pixels that are masked, not finite or −1e30 are missing: the network flags such a galaxy, the
         linear method flags it if many are missing.
     psf : array of shape (py, px) or (n, py, px), FunctionalPsf, or GalSim image or profile
         One PSF for all galaxies or one per galaxy, centred like the stamps, of even or odd size, and at least as large
@@ -142,8 +142,9 @@ def measure(
     epochs : sequence of mappings, optional
         Instead of `stamps` and `psf`: several stamps of each galaxy, which a linear configuration combines in each Fourier mode
         with inverse-variance weights before it measures the shape. Each epoch has ``stamps`` and ``psf``, and perhaps
-        ``noise``, ``mask``, ``wcs``, ``x`` and ``y`` (for a WCS or PSF that varies), ``properties``, ``offsets`` of shape (n, 2): the galaxies from
-        the centres of their stamps along x and y in pixels, and ``flux``: that of the galaxies in relation to the other
+        ``noise``, ``mask``, ``wcs``, ``x`` and ``y`` (for a WCS or PSF that varies), ``properties``, ``pixel``, ``offsets`` of shape (n, 2): the
+        galaxies from the centres of their stamps along x and y in pixels, ``psf_offsets`` of shape (2,) or (n, 2): the PSFs from the
+        centres of theirs, for PSFs drawn at the phases of the galaxies as in MEDS, and ``flux``: that of the galaxies in relation to the other
         epochs, a number or (n,), for bands. Galaxy k is on stamp k of each epoch; stamps of NaN are absent. The noise of an
         epoch is taken as white. Each band counts with flux/noise², so that the fluxes are weights: they may be those of a
         typical galaxy, and should not be measured on the noise of the galaxy itself.
@@ -162,11 +163,14 @@ def measure(
         east–west, e2 > 0 along north-west. Rotated, mirrored and sheared pixels are measured exactly. Arrays are
         Jacobians ((du/dx, du/dy), (dv/dx, dv/dy)) in arcsec per pixel, u to the west and v to the north, for all stamps
         or per stamp; lists have a GalSim WCS per stamp. A WCS that varies over the image needs ``x`` and ``y`` in its own
-        convention (the first pixel is 1 for GalSim, 0 for astropy). PSFs are on the pixels of their stamps: images,
+        convention (the first pixel is 1 for GalSim, 0 for astropy), unless it is that of an image of the stamps' size. PSFs are on the pixels of their stamps: images,
         or formulas whose shapes refer to the pixel axes. Without a WCS, the frame is that of the pixels.
     properties : mapping, optional
         What else the model of the PSF depends on, such as ``{"chipnum": 4, "ri_color": colours}``: a value for all galaxies or
         one for each.
+    pixel : {'included', 'convolve'}, optional
+        Whether profiles of GalSim contain the pixel, as those interpolated from images of stars do. By default they are convolved
+        with it, with a warning for such profiles.
     submission : str, path, mapping or Configuration
         The configuration: see :func:`submission`.
     threads : int, optional
@@ -212,7 +216,7 @@ def measure(
     >>> cat
     <shearq.Catalogue of 400 galaxies, 0 flagged: e1, e2, ...>
     >>> print(cat.mean_shear())
-    g1 = ... ± ..., g2 = ... ± ... (400 galaxies, 0 flagged)
+    g1 = ... ± ..., g2 = ... ± ... (400 galaxies, 0 flagged, pixel frame)
     >>> cat.write("shapes.parquet", overwrite=True)
     """
     settings, count, done = resolve(submission), thread_count(threads), callback(progress)
@@ -220,10 +224,11 @@ def measure(
         for name, value in (("stamps", stamps), ("psf", psf)):
             if value is None:
                 raise TypeError(f"{name}: found none; expected stamps and their PSF, or epochs")
-        psf = _psf_models.at_galaxies(psf, stamps, x, y, wcs, properties)
-        stamps, psf = _galsim.unpacked(stamps, psf, check=wcs is None)
+        stamps, psf, wcs = _images.opened(stamps, psf, wcs)
+        psf = _psf_models.at_galaxies(psf, stamps, x, y, wcs, properties, pixel)
+        stamps, psf = _galsim.unpacked(stamps, psf, check=wcs is None, pixel=_pixel_of(psf, pixel))
         return _measure([_image(stamps, psf, noise, mask, wcs, x, y)], (ids, x, y), settings, count, done)
-    given = {"stamps": stamps, "psf": psf, "noise": noise, "mask": mask, "wcs": wcs, "properties": properties}
+    given = {"stamps": stamps, "psf": psf, "noise": noise, "mask": mask, "wcs": wcs, "properties": properties, "pixel": pixel}
     for name, value in given.items():
         if value is not None:
             raise TypeError(f"{name}: found with epochs; expected in each epoch")
@@ -242,6 +247,7 @@ def measure_blocks(
     ids: ArrayLike | None = None,
     wcs: WcsLike | None = None,
     properties: Mapping[str, ArrayLike] | None = None,
+    pixel: PixelOfPsf | None = None,
     submission: SubmissionLike = "48/linear/star",
     threads: int | None = None,
     progress: Callable[[int], object] | None = None,
@@ -252,7 +258,7 @@ def measure_blocks(
     ----------
     stamps : array, or anything with a shape (n, ny, nx) and slices
         Memory maps, and arrays of h5py, zarr or dask: each block is read when it is measured.
-    psf, noise, mask, x, y, ids, wcs, properties, submission, threads, progress
+    psf, noise, mask, x, y, ids, wcs, properties, pixel, submission, threads, progress
         As for :func:`measure`.
     block : int
         Most stamps of a block. Blocks are as equal as possible. The noise and the galaxy size are measured on each: it
@@ -274,10 +280,11 @@ def measure_blocks(
     >>> image = shearq.simulate(set=8, grid=20)[0]
     >>> blocks = shearq.measure_blocks(image.stamps, image.psf, block=200)
     >>> print(shearq.mean_shear(blocks))
-    g1 = ... ± ..., g2 = ... ± ... (400 galaxies, 0 flagged)
+    g1 = ... ± ..., g2 = ... ± ... (400 galaxies, 0 flagged, pixel frame)
     """
-    psf = _psf_models.at_galaxies(psf, stamps, x, y, wcs, properties)
-    stamps, psf = _galsim.unpacked(stamps, psf, check=wcs is None)
+    stamps, psf, wcs = _images.opened(stamps, psf, wcs)
+    psf = _psf_models.at_galaxies(psf, stamps, x, y, wcs, properties, pixel)
+    stamps, psf = _galsim.unpacked(stamps, psf, check=wcs is None, pixel=_pixel_of(psf, pixel))
     most = whole("block", block, 1, 1 << 40)
     if isinstance(stamps, (list, tuple)):
         stamps = numeric("stamps", stamps)
@@ -286,7 +293,7 @@ def measure_blocks(
         raise ValueError(f"stamps: found an array of shape {shown(shape)}; expected (n, ny, nx)")
     each: dict[str, Any] = {"psf": psf, "noise": noise, "mask": mask, "ids": ids, "x": x, "y": y}
     if wcs is not None:
-        wcs = jacobians(wcs, shape[0], x, y)
+        wcs = jacobians(wcs, shape[0], x, y, shape[2])
     per_galaxy = {"psf": 3, "noise": 1, "mask": 3, "ids": 1, "x": 1, "y": 1}
     for name, value in each.items():
         if value is not None and not isinstance(value, FunctionalPsf) and not hasattr(value, "shape"):
@@ -318,7 +325,12 @@ def measure_blocks(
     return measured()
 
 
-_EPOCH = ("stamps", "psf", "noise", "mask", "wcs", "x", "y", "properties", "offsets", "flux")
+_EPOCH = ("stamps", "psf", "noise", "mask", "wcs", "x", "y", "properties", "pixel", "offsets", "psf_offsets", "flux")
+
+
+def _pixel_of(psf: Any, pixel: PixelOfPsf | None) -> PixelOfPsf | None:
+    """What is said of the pixel of PSFs that are still profiles; models have drawn them with it."""
+    return None if isinstance(psf, _psf_models.PsfsOfModel) else pixel
 
 
 def _epoch(k: int, epoch: Mapping[str, Any]) -> dict[str, Any]:
@@ -328,8 +340,9 @@ def _epoch(k: int, epoch: Mapping[str, Any]) -> dict[str, Any]:
         if unknown or "stamps" not in epoch or "psf" not in epoch:
             raise ValueError(f"found {', '.join(epoch)}; expected stamps, psf and perhaps {', '.join(_EPOCH[2:])}")
         own = {name: epoch.get(name) for name in _EPOCH}
-        psf = _psf_models.at_galaxies(own["psf"], own["stamps"], own["x"], own["y"], own["wcs"], own["properties"])
-        stamps, psf = _galsim.unpacked(own["stamps"], psf, check=own["wcs"] is None)
+        own["stamps"], own["psf"], own["wcs"] = _images.opened(own["stamps"], own["psf"], own["wcs"])
+        psf = _psf_models.at_galaxies(own["psf"], own["stamps"], own["x"], own["y"], own["wcs"], own["properties"], own["pixel"])
+        stamps, psf = _galsim.unpacked(own["stamps"], psf, check=own["wcs"] is None, pixel=_pixel_of(psf, own["pixel"]))
         noise = own["noise"]
         if own["flux"] is not None:
             flux = np.asarray(own["flux"], dtype=np.float64)
@@ -343,11 +356,18 @@ def _epoch(k: int, epoch: Mapping[str, Any]) -> dict[str, Any]:
             stamps = stamps / flux.reshape(-1, 1, 1)
             noise = None if noise is None else np.asarray(noise) / flux
         image = _image(stamps, psf, noise, own["mask"], own["wcs"], own["x"], own["y"])
+        count = len(image["stamps"])
         if own["offsets"] is not None:
-            offsets = double("offsets", own["offsets"])
-            if offsets.shape != (len(image["stamps"]), 2):
-                raise ValueError(f"offsets: found shape {shown(offsets.shape)}; expected ({len(image['stamps'])}, 2)")
-            image["offsets"] = offsets
+            image["offsets"] = offsets = double("offsets", own["offsets"])
+            if offsets.shape != (count, 2):
+                raise ValueError(f"offsets: found shape {shown(offsets.shape)}; expected ({count}, 2)")
+        if own["psf_offsets"] is not None:
+            of_psfs = double("psf_offsets", own["psf_offsets"])
+            if of_psfs.shape not in ((2,), (count, 2)):
+                raise ValueError(f"psf_offsets: found shape {shown(of_psfs.shape)}; expected (2,), or ({count}, 2)")
+            # Deconvolution moves a galaxy by the place of its PSF.
+            offsets = np.zeros((count, 2)) if image["offsets"] is None else image["offsets"]
+            image["offsets"] = np.ascontiguousarray(offsets - of_psfs)
         return image
     except (ValueError, TypeError) as error:
         raise type(error)(f"epochs: epoch {k}: {error}") from None
@@ -363,7 +383,7 @@ def _image(stamps: Any, psf: Any, noise: Any, mask: Any, wcs: Any, x: Any, y: An
         raise ValueError(f"stamps: found an array of shape {shown(stamps.shape)}; expected squares, ny = nx")
     image: dict[str, Any] = dict.fromkeys(("star", "stars", "formulas", "noise", "noises", "offsets"))
     image["stamps"] = stamps
-    image["jacobians"] = None if wcs is None else jacobians(wcs, count, x, y)
+    image["jacobians"] = None if wcs is None else jacobians(wcs, count, x, y, sides)
     if isinstance(psf, FunctionalPsf):
         image["formulas"] = psf._rows
     else:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ._arrays import double, shown
-from ._galsim import _is_profile
+from ._galsim import PixelOfPsf, _is_profile, drawn, no_pixel
 from ._wcs import jacobians
 
 # What a model needs: the number of pixels on a side, x and y of the galaxy, the Jacobian of its pixels or None, and other
@@ -51,7 +51,9 @@ def _rubin(psf: Any) -> _Draw:
     return lambda side, x, y, jacobian, properties: psf.computeKernelImage(Point2D(x, y)).array
 
 
-def _function(psf: Callable[..., Any]) -> _Draw:
+def _function(psf: Callable[..., Any], pixel: PixelOfPsf | None) -> _Draw:
+    stated = [pixel]
+
     def draw(side: int, x: float, y: float, jacobian: Any, properties: dict[str, Any]) -> Any:
         found = psf(x, y, **properties)
         if not _is_profile(found):
@@ -64,21 +66,24 @@ def _function(psf: Callable[..., Any]) -> _Draw:
         import galsim
 
         local = galsim.JacobianWCS(*jacobian.ravel())
-        return found.drawImage(nx=side, ny=side, wcs=local, dtype=np.float64).array
+        image = drawn([found], side, [{"wcs": local}], stated[0])[0]
+        # One warning is enough.
+        stated[0] = stated[0] or "convolve"
+        return image
 
     return draw
 
 
-def _draw_of(psf: Any) -> _Draw | None:
+def _draw_of(psf: Any, pixel: PixelOfPsf | None = None) -> _Draw | None:
     """How a model is drawn; None for anything that is no model."""
-    if hasattr(psf, "interp_property_names") and hasattr(psf, "draw"):
-        return _piff(psf)
-    if hasattr(psf, "getPSF") and hasattr(psf, "getPSFArray"):
-        return _psfex(psf)
-    if hasattr(psf, "computeKernelImage"):
-        return _rubin(psf)
+    models = {("interp_property_names", "draw"): _piff, ("getPSF", "getPSFArray"): _psfex, ("computeKernelImage",): _rubin}
+    for methods, drawer in models.items():
+        if all(hasattr(psf, method) for method in methods):
+            # These models know whether they contain the pixel.
+            no_pixel(pixel)
+            return drawer(psf)
     if callable(psf) and not _is_profile(psf) and not isinstance(psf, type):
-        return _function(psf)
+        return _function(psf, pixel)
     return None
 
 
@@ -124,10 +129,10 @@ class PsfsOfModel:
 
 
 def at_galaxies(
-    psf: Any, stamps: Any, x: Any, y: Any, wcs: Any, properties: Mapping[str, ArrayLike] | None
+    psf: Any, stamps: Any, x: Any, y: Any, wcs: Any, properties: Mapping[str, ArrayLike] | None, pixel: PixelOfPsf | None = None
 ) -> Any:
     """The PSFs of a model at the galaxies; anything else as it is."""
-    draw = _draw_of(psf)
+    draw = _draw_of(psf, pixel)
     if draw is None:
         if properties is not None:
             raise TypeError(f"properties: found with a PSF of type {type(psf).__name__}; expected a model of Piff, or a function")

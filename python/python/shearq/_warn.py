@@ -9,6 +9,10 @@ import warnings
 _PACKAGE = os.path.dirname(os.path.abspath(__file__)) + os.sep
 
 
+class DataWarning(UserWarning):
+    """Stamps or PSFs that are measured, although they bias shears or are likely a mistake."""
+
+
 def warn(message: str, category: type[Warning]) -> None:
     """Warns at the first frame outside this package; the category replaces the prefix ``warning:``."""
     level, frame = 1, sys._getframe(0)

@@ -36,8 +36,11 @@ def _is_galsim(wcs: Any) -> bool:
     return hasattr(wcs, "isUniform") and hasattr(wcs, "jacobian")
 
 
-def jacobians(wcs: Any, count: int, x: Any, y: Any) -> NDArray[np.float64]:
-    """The matrices (∂u/∂x, ∂u/∂y), (∂v/∂x, ∂v/∂y) of ``count`` stamps at x, y, of shape (1, 2, 2) or (count, 2, 2)."""
+def jacobians(wcs: Any, count: int, x: Any, y: Any, side: int | None = None) -> NDArray[np.float64]:
+    """The matrices (∂u/∂x, ∂u/∂y), (∂v/∂x, ∂v/∂y) of ``count`` stamps at x, y, of shape (1, 2, 2) or (count, 2, 2).
+
+    A WCS of astropy whose image has ``side`` × ``side`` pixels is that of the stamps themselves, and is used in their middle.
+    """
     many = isinstance(wcs, (list, tuple)) and bool(wcs) and all(map(_is_galsim, wcs))
     if _is_galsim(wcs) or many:
         each = list(wcs) if many else [wcs]
@@ -49,6 +52,8 @@ def jacobians(wcs: Any, count: int, x: Any, y: Any) -> NDArray[np.float64]:
         each = each * count if len(each) == 1 else each
         return np.array([_local(one, place) for one, place in zip(each, places)]).reshape(-1, 2, 2)
     if hasattr(wcs, "pixel_to_world_values"):
+        if x is None and y is None and side is not None and tuple(getattr(wcs, "pixel_shape", None) or ())[:2] == (side, side):
+            return _on_sphere(wcs, np.full((1, 2), (side - 1) / 2))
         return _on_sphere(wcs, _places(count, x, y))
     matrices = double("wcs", numeric("wcs", wcs))
     if matrices.shape not in ((2, 2), (count, 2, 2)):

@@ -20,16 +20,12 @@ _OFF_CENTRE = 1.0
 _FLUX_SIGMA = 3.0
 
 
-def _position(jacobian: Any, shape: tuple[int, int], k: int) -> None:
-    """Refuses a centre that is not near the middle of the stamp."""
-    if not hasattr(jacobian, "get_cen"):
-        return
-    row, column = jacobian.get_cen()
-    off = max(abs(row - (shape[0] - 1) / 2), abs(column - (shape[1] - 1) / 2))
-    if off > _OFF_CENTRE:
+def _check_centre(offset: tuple[float, float], k: int) -> None:
+    """Refuses a galaxy that is not near the middle of its stamp, counted from its PSF's place."""
+    if max(map(abs, offset)) > _OFF_CENTRE:
         raise ValueError(
-            f"observations: the centre of observation {k} is ({row:.6g}, {column:.6g}) (row, column); expected the middle"
-            f" of its {shape[0]} × {shape[1]} pixels. Try: cut the image around the galaxy"
+            f"observations: the galaxy of observation {k} is ({offset[0]:+.3g}, {offset[1]:+.3g}) px from the middle of its pixels, beyond"
+            f" its PSF; expected at most {_OFF_CENTRE:g} px. Try: cut the image around the galaxy, or an ObsList for each galaxy"
         )
 
 
@@ -83,7 +79,7 @@ def from_ngmix(observations: Any, fluxes: Any = None) -> dict[str, Any]:
                 scales.append(square_pixels(f"observations: {what} {k}", matrix, remedy))
         if max(scales) - min(scales) > SAME * min(scales):
             raise ValueError(f"observations: observation {k} has the pixel scales {scales} (image, PSF); expected one scale")
-        _position(observation.jacobian, (image.shape[0], image.shape[1]), k)
+        _check_centre(_galaxy_offset(observation, image, psf), k)
         parts.append((image, psf, noise, missing))
     stamps, psfs, noise, masks = zip(*parts)
     for name, images in (("image", stamps), ("PSF image", psfs)):
@@ -119,6 +115,20 @@ def _arrays(what: str, observation: Any) -> tuple[Any, Any, float, Any, list[Any
     if getattr(observation, "bmask", None) is not None:
         missing |= np.asarray(observation.bmask) != 0
     return image, np.asarray(star.image), float(1 / np.sqrt(np.median(positive))), missing, matrices
+
+
+def _offset(jacobian: Any, image: NDArray[Any]) -> tuple[float, float]:
+    """The centre (x, y) of an observation from the middle of its pixels; zero if it states none."""
+    if not hasattr(jacobian, "get_cen"):
+        return (0.0, 0.0)
+    row, column = jacobian.get_cen()
+    return (column - (image.shape[1] - 1) / 2, row - (image.shape[0] - 1) / 2)
+
+
+def _galaxy_offset(observation: Any, image: NDArray[Any], psf: NDArray[Any]) -> tuple[float, float]:
+    """Where the galaxy is without its PSF: deconvolution moves it by the place of the PSF, which MEDS draws at the galaxy's phase."""
+    own, of_psf = _offset(observation.jacobian, image), _offset(getattr(observation.psf, "jacobian", None), psf)
+    return (own[0] - of_psf[0], own[1] - of_psf[1])
 
 
 def _bands(k: int, galaxy: Any) -> list[list[Any]]:
@@ -166,8 +176,7 @@ def _epoch_of(galaxies: list[list[list[Any]]], band: int, number: int) -> dict[s
             image, psf, noise, missing, (own, of_psf) = _arrays(what, observation)
             if of_psf is not None and not np.allclose(own, of_psf, rtol=0, atol=SAME * np.max(np.abs(own))):
                 raise ValueError(f"observations: the PSF of {what} has another Jacobian; expected the pixels of its image")
-            row, column = observation.jacobian.get_cen()
-            offset = (column - (image.shape[1] - 1) / 2, row - (image.shape[0] - 1) / 2)
+            offset = _galaxy_offset(observation, image, psf)
             parts[k] = np.where(missing, np.nan, image), psf, noise, np.reshape(own, (2, 2)), offset
     for name, place in (("image", 0), ("PSF image", 1)):
         shapes = {np.shape(part[place]) for part in parts.values()}

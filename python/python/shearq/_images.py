@@ -1,0 +1,67 @@
+"""Images of FITS files and of astropy, with the pixels that their headers state."""
+
+from __future__ import annotations
+
+import os
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from . import _shearq
+from ._arrays import shown
+from ._warn import DataWarning, warn
+
+
+class Hdu(Protocol):
+    """An image HDU of astropy."""
+
+    @property
+    def data(self) -> Any: ...
+    @property
+    def header(self) -> Any: ...
+
+
+def _is_hdu(value: Any) -> bool:
+    return hasattr(value, "header") and hasattr(value, "data") and hasattr(value.header, "cards")
+
+
+def _opened(name: str, value: Any) -> tuple[Any, NDArray[np.float64] | None]:
+    """The pixels of a path or HDU and the Jacobians of its images; anything else as it is, without."""
+    if isinstance(value, (str, os.PathLike)):
+        pixels, matrices, messages = _shearq.read_images(os.fspath(value), name == "psf")
+    elif _is_hdu(value):
+        pixels = value.data
+        if pixels is None or np.ndim(pixels) not in (2, 3):
+            found = "no pixels" if pixels is None else f"an array of shape {shown(np.shape(pixels))}"
+            raise ValueError(f"{name}: found an HDU with {found}; expected (ny, nx) or (n, ny, nx)")
+        if "BSOFTEN" in value.header:
+            raise ValueError(f"{name}: found asinh magnitudes (BSOFTEN); expected fluxes. Try: the path of the file, whose pixels are converted")
+        cards = {card.keyword: f"'{card.value}'" if isinstance(card.value, str) else str(card.value) for card in value.header.cards if card.keyword}
+        rows, columns = np.shape(pixels)[-2:]
+        matrix, messages = _shearq.header_pixels(cards, columns, rows)
+        matrices = None if matrix is None else np.array([matrix])
+    else:
+        return value, None
+    for message in messages:
+        warn(f"{name}: {message}", DataWarning)
+    if name == "psf":
+        pixels = pixels[0] if pixels.ndim == 3 and len(pixels) == 1 else pixels
+    elif pixels.ndim == 2:
+        pixels = pixels[np.newaxis]
+    return pixels, matrices
+
+
+def opened(stamps: Any, psf: Any, wcs: Any) -> tuple[Any, Any, Any]:
+    """Stamps, PSFs and their WCS, of which paths and HDUs become arrays, and their headers the WCS that is not given."""
+    stamps, own = _opened("stamps", stamps)
+    psf, of_psf = _opened("psf", psf)
+    if own is not None:
+        if of_psf is not None:
+            found = _shearq.pixel_difference(of_psf, own)
+            if found is not None:
+                raise ValueError(f"psf: {found}")
+        # As `gather` has it: pixels along the axes of the sky need no Jacobians.
+        if wcs is None and not _shearq.are_aligned(own):
+            wcs = own[0] if len(own) == 1 else own
+    return stamps, psf, wcs

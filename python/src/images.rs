@@ -1,0 +1,86 @@
+//! Images of files, and what headers state of their pixels.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+use numpy::{IntoPyArray, PyArray3, PyReadonlyArray3};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use shearq_pipeline::gather::{
+    Content, GatheredPixels, HeaderPixels, is_aligned, pixel_difference,
+};
+
+type Matrix2 = [[f64; 2]; 2];
+// Pixels (n, ny, nx), Jacobians (n, 2, 2) if the headers have them, and messages.
+type Images<'py> = (
+    Bound<'py, PyArray3<f32>>,
+    Option<Bound<'py, PyArray3<f64>>>,
+    Vec<String>,
+);
+
+fn stacked<'py>(py: Python<'py>, matrices: Vec<Matrix2>) -> PyResult<Bound<'py, PyArray3<f64>>> {
+    let count = matrices.len();
+    let all: Vec<f64> = matrices.into_iter().flatten().flatten().collect();
+    let array = ndarray::Array3::from_shape_vec((count, 2, 2), all);
+    let array = array.map_err(|error| PyValueError::new_err(error.to_string()))?;
+    Ok(array.into_pyarray(py))
+}
+
+fn matrices(array: &PyReadonlyArray3<'_, f64>) -> Vec<Matrix2> {
+    let rows = array.as_array();
+    let of = |m: ndarray::ArrayView2<'_, f64>| [[m[(0, 0)], m[(0, 1)]], [m[(1, 0)], m[(1, 1)]]];
+    rows.outer_iter().map(of).collect()
+}
+
+/// The images of a file, as `gather` reads stamps, or PSFs.
+#[pyfunction]
+pub(crate) fn read_images<'py>(
+    py: Python<'py>,
+    path: PathBuf,
+    psfs: bool,
+) -> PyResult<Images<'py>> {
+    let content = if psfs { Content::Psf } else { Content::Sky };
+    let found = py
+        .detach(|| GatheredPixels::read(&path, content))
+        .map_err(|error| PyValueError::new_err(error.to_string()))?;
+    let GatheredPixels {
+        pixels,
+        side,
+        jacobians,
+        messages,
+    } = found;
+    let count = pixels.len() / (side * side);
+    let pixels = ndarray::Array3::from_shape_vec((count, side, side), pixels);
+    let pixels = pixels.map_err(|error| PyValueError::new_err(error.to_string()))?;
+    let jacobians = jacobians.map(|all| stacked(py, all)).transpose()?;
+    Ok((pixels.into_pyarray(py), jacobians, messages))
+}
+
+/// The Jacobian in the middle of an image with a header of these cards, if it states one, and what of it is not used.
+#[pyfunction]
+pub(crate) fn header_pixels(
+    cards: BTreeMap<String, String>,
+    width: usize,
+    height: usize,
+) -> PyResult<(Option<Matrix2>, Vec<String>)> {
+    let HeaderPixels { jacobian, doubts } =
+        HeaderPixels::from_cards(cards, [width, height]).map_err(PyValueError::new_err)?;
+    Ok((jacobian, doubts))
+}
+
+/// What is wrong with PSFs of these Jacobians for stamps of those.
+#[pyfunction]
+#[pyo3(name = "pixel_difference")]
+pub(crate) fn pixel_difference_of(
+    psfs: PyReadonlyArray3<'_, f64>,
+    stamps: PyReadonlyArray3<'_, f64>,
+) -> Option<String> {
+    let found = pixel_difference(&matrices(&psfs), &matrices(&stamps));
+    found.map(|warning| warning.to_string())
+}
+
+/// Whether pixels of all these Jacobians are along the axes of the sky.
+#[pyfunction]
+pub(crate) fn are_aligned(jacobians: PyReadonlyArray3<'_, f64>) -> bool {
+    matrices(&jacobians).iter().all(is_aligned)
+}
