@@ -3,7 +3,6 @@
 
 use serde_json::Value;
 use shearq_files::parquet;
-use shearq_quantities::{FunctionalPsf, PsfProfile, Shear};
 
 use crate::support::{
     Folder, assert_has, fits_extension, fits_image, floats, pixels_of, stamps_of,
