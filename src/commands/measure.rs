@@ -161,6 +161,12 @@ pub(super) fn report(
             .collect();
         tell(format_args!("flagged: {}", reasons.join(", ")));
     }
+    if summary.with_defects > 0 {
+        tell(format_args!(
+            "no light: {} pixels on the stamps of {} galaxies count as missing",
+            summary.defects, summary.with_defects
+        ));
+    }
     // If the command only resumed a finished run, the reasons are in the catalogues of the earlier call.
     let earlier = match summary.images {
         0 => all_flagged(run, out)?,

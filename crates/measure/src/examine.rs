@@ -61,6 +61,8 @@ const EPOCH_OFFSET: f64 = 0.1;
 const EPOCH_FLUX: f64 = 0.2;
 // Share of galaxies whose brightness differs by a factor of 2. Chosen by hand: cosmic rays, masks and variable objects are fewer.
 const OTHER_GALAXIES: f64 = 0.1;
+// Stamps with the largest peak in units of those with any other one. Chosen by hand.
+const MIN_SATURATED: usize = 5;
 // Light per noise of an epoch in units of the first epoch's, from which its galaxies must be visible. Chosen by hand: exposures of
 // a set rarely have sixteen times less weight, and those that have need not be told from exposures without galaxies.
 const MIN_EPOCH_DEPTH: f64 = 0.25;
@@ -360,6 +362,7 @@ impl Examination {
         }
         found.extend(self.depths());
         found.extend(self.copies(examined));
+        found.extend(self.saturated(examined));
         let galaxies = self.core().filter(|_| lit && flux > 0.0);
         found.extend(self.psfs(galaxies));
         found
@@ -536,7 +539,8 @@ impl Examination {
             error: scatter / count.sqrt(),
         };
         let correlation = found.value;
-        (found.is_significant() && correlation > LONG_CORRELATION)
+        // Wings of galaxies without noise have more power than the fits that remove them leave for noise.
+        (found.is_significant() && (LONG_CORRELATION..1.0).contains(&correlation))
             .then_some(Warning::LongCorrelation { correlation })
     }
 
@@ -545,6 +549,17 @@ impl Examination {
         traces.sort_unstable();
         let count = traces.windows(2).filter(|pair| pair[0] == pair[1]).count();
         (count > 0).then_some(Warning::Copies { count, of })
+    }
+
+    /// A warning if the largest of all peaks occurs much more often than any other value: whole numbers repeat, too.
+    fn saturated(&self, of: usize) -> Option<Warning> {
+        let mut peaks: Vec<f64> = self.stamps.iter().map(|stamp| stamp.peak).collect();
+        peaks.sort_by(f64::total_cmp);
+        let mut counts = peaks.chunk_by(|a, b| a == b).map(<[f64]>::len);
+        let count = counts.next_back()?;
+        let most = MIN_SATURATED * counts.max().unwrap_or(1);
+        let level = *peaks.last()?;
+        (count > most).then_some(Warning::Saturated { level, count, of })
     }
 
     /// Median of a number over stamps. Each stamp has an error of at least `floor`.

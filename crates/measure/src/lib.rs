@@ -46,6 +46,7 @@
 #![warn(missing_docs, clippy::missing_errors_doc)]
 
 mod calibration;
+mod defects;
 mod denoise;
 mod error;
 mod examine;
@@ -71,6 +72,7 @@ mod transform;
 mod warning;
 
 pub use calibration::{MeanShear, MeanShearError, ShearSum, is_significant};
+pub use defects::DefectCounts;
 pub use error::{EpochError, MeasureError};
 pub use examine::{EXAMINED_PSFS, Examination, examined_rows};
 pub use measurement::{
@@ -82,7 +84,7 @@ pub use method::AdaptedSettings;
 pub use ndarray;
 pub use noise::{StampNoise, Survey};
 pub use pixels::{Pixel, Pixels};
-pub use psf::{Psfs, Star, average_stars};
+pub use psf::{Psfs, Star, average_stars, from_oversampled};
 pub use selection::{Cut, Quantity, Selected, Selection};
 pub use session::{
     ArraySource, Batch, KnownNoise, Lazy, LazyStamps, MeasuredImage, MeasuredRow, OneThread,

@@ -4,6 +4,8 @@ use std::fmt;
 
 use thiserror::Error;
 
+use crate::defects::DefectCounts;
+
 /// The adaptive moments of a PSF, pixels included: the moments of the elliptical Gaussian M that is the best weight,
 /// M = 2 Σ W x xᵀ p / Σ W p with W = exp(−½ xᵀ M⁻¹ x) about the centroid under W (Bernstein & Jarvis 2002, AJ 123, 583;
 /// Hirata & Seljak 2003, MNRAS 343, 459). GalSim's `FindAdaptiveMom` has the same `observed_shape` and `moments_sigma`.
@@ -82,6 +84,8 @@ pub struct Measurement {
     /// The PSF in the frame of the ellipticity; of epochs, the mean of their moments with inverse-variance weights. NaN if the PSF
     /// cannot be used. Sigma is in pixels, on the sky in sides of a square of a pixel's area.
     pub psf: PsfShape,
+    /// Pixels under the linear methods that hold no light and became missing, on all epochs.
+    pub defects: DefectCounts,
 }
 
 impl Measurement {
@@ -107,6 +111,7 @@ impl Measurement {
             radius: f64::NAN,
             size: f64::NAN,
             psf: PsfShape::UNKNOWN,
+            defects: DefectCounts::default(),
         }
     }
 }

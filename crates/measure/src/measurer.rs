@@ -10,6 +10,7 @@ use ndarray::{Array2, ArrayView2, ArrayView3};
 use shearq_quantities::{Jacobian, PixelShape, Spin2};
 use shearq_submissions::{Configuration, ConfigurationError, NoiseSource, Registry};
 
+use crate::defects::{DefectCounts, Defects, LightLimits};
 use crate::denoise::{DenoiseScratch, WaveletWiener, border_noise};
 use crate::error::{EpochError, MeasureError};
 use crate::measurement::{Flag, Measurement, PsfShape};
@@ -141,6 +142,9 @@ impl Measurer {
             cut: vec![0.0; n * n],
             border: Vec::with_capacity(plan.full * plan.full),
             missing: MissingPixels::new(n),
+            defects: Defects::new(n),
+            found_defects: DefectCounts::default(),
+            light: LightLimits::default(),
             to_sky: None,
             jacobian: None,
             psf: PsfShape::UNKNOWN,
@@ -229,6 +233,11 @@ pub struct Worker {
     cut: Vec<f32>,
     border: Vec<f32>,
     missing: MissingPixels,
+    defects: Defects,
+    /// On the last stamp that was cut.
+    found_defects: DefectCounts,
+    /// Behind the present PSF.
+    light: LightLimits,
     /// What turns ellipticities to the frame of the sky, if they are measured there.
     to_sky: Option<Spin2>,
     jacobian: Option<Jacobian>,
@@ -313,6 +322,13 @@ impl Worker {
         }
     }
 
+    fn set_psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<(), MeasureError> {
+        self.method.set_psf(psf)?;
+        self.psf = PsfShape::from_psf(psf);
+        self.light = LightLimits::from_psf(psf);
+        Ok(())
+    }
+
     /// Measures a galaxy in noise of `level`, without calibration. Without a usable PSF it is flagged.
     fn measure_stamp<T: Pixel>(
         &mut self,
@@ -335,6 +351,7 @@ impl Worker {
                 }
             },
         };
+        measured.defects = self.found_defects;
         if usable_psf {
             let psf = self.psf;
             measured.psf = self.jacobian.map_or(psf, |jacobian| psf.on_sky(&jacobian));
@@ -353,6 +370,7 @@ impl Worker {
         let plan = Arc::clone(&self.measurer.0);
         let n = plan.configuration.stamp.size;
         let linear = plan.configuration.linear().is_some();
+        self.found_defects = DefectCounts::default();
         self.full.read(stamp)?;
         let mut whole = all_finite(&self.full.pixels);
         if linear && mark_padding_missing(&mut self.full.pixels, plan.full) {
@@ -388,6 +406,10 @@ impl Worker {
                 row.copy_from_slice(&pixels[from..from + n]);
             }
         }
+        if linear {
+            self.found_defects = (self.defects).remove(&mut self.cut, n, noise as f32, &self.light);
+            whole &= self.found_defects.is_empty();
+        }
         if !whole && !self.missing.fill(&mut self.cut, n) {
             return Ok(Err(Measurement::flagged(Flag::NotFinite)));
         }
@@ -407,12 +429,15 @@ impl Worker {
         epochs: &[Epoch<'_, T>],
         stars: &[Option<&Arc<ResidualProfiles>>],
     ) -> Result<Measurement, MeasureError> {
-        let mut flagged = None;
+        let (mut flagged, mut defects) = (None, DefectCounts::default());
         self.epochs.clear();
         self.used.clear();
         for (k, epoch) in epochs.iter().enumerate() {
             self.full.subtraction = self.measurer.subtraction(epoch.survey);
-            match self.cut(epoch.stamp, epoch.noise, true)? {
+            self.light = LightLimits::from_psf(epoch.psf);
+            let cut = self.cut(epoch.stamp, epoch.noise, true)?;
+            defects += self.found_defects;
+            match cut {
                 Ok(_) => {
                     self.epochs.extend_from_slice(&self.cut);
                     self.used.push(k);
@@ -421,7 +446,8 @@ impl Worker {
             }
         }
         let (Some(&first), size) = (self.used.first(), self.cut.len()) else {
-            return Ok(flagged.unwrap_or(Measurement::flagged(Flag::NoScale)));
+            let flagged = flagged.unwrap_or(Measurement::flagged(Flag::NoScale));
+            return Ok(Measurement { defects, ..flagged });
         };
         let frame = epochs[first].jacobian.map(|jacobian| {
             let (orientation, _) = jacobian.factors();
@@ -471,6 +497,7 @@ impl Worker {
             (psf, area, area / (epoch.noise * epoch.noise))
         });
         measured.psf = PsfShape::mean(psfs);
+        measured.defects = defects;
         Ok(measured)
     }
 }
@@ -482,8 +509,7 @@ impl ImageWorker<'_> {
     /// # Errors
     /// If the PSF has another size, or a pixel that is not finite.
     pub fn psf(&mut self, psf: ArrayView2<'_, f64>) -> Result<PsfWorker<'_>, MeasureError> {
-        self.worker.method.set_psf(psf)?;
-        self.worker.psf = PsfShape::from_psf(psf);
+        self.worker.set_psf(psf)?;
         Ok(PsfWorker {
             worker: self.worker,
             level: self.level,
@@ -592,8 +618,7 @@ impl ImageWorker<'_> {
         let of_image = one.survey.is_some() || one.gain.is_some() || has_stars;
         if epochs.len() == 1 && one.offset == [0.0; 2] && !of_image {
             self.set_jacobian(one.jacobian.as_ref())?;
-            self.worker.method.set_psf(one.psf)?;
-            self.worker.psf = PsfShape::from_psf(one.psf);
+            self.worker.set_psf(one.psf)?;
             return self.worker.measure_stamp(one.stamp, one.noise, true);
         }
         self.worker.measure_epochs(epochs, stars)
@@ -622,9 +647,6 @@ impl ImageWorker<'_> {
             Some(_) => None,
             None => Some(psfs.at(0, cut, full)?.psf),
         };
-        if let Some(psf) = &shared {
-            self.worker.psf = PsfShape::from_psf(psf.view());
-        }
         let mut last = None;
         let stamps = stamps.outer_iter().enumerate();
         let measured = stamps.map(|(k, stamp)| {
@@ -638,18 +660,16 @@ impl ImageWorker<'_> {
             let usable_psf = match &shared {
                 Some(psf) => {
                     match (k, new) {
-                        (0, _) => self.worker.method.set_psf(psf.view())?,
+                        (0, _) => self.worker.set_psf(psf.view())?,
                         (_, true) => self.worker.method.retake_psf(),
                         (_, false) => {}
                     }
                     true
                 }
                 None => {
-                    let psf = psfs.at(k, cut, full).and_then(|Star { psf, .. }| {
-                        self.worker.method.set_psf(psf.view())?;
-                        self.worker.psf = PsfShape::from_psf(psf.view());
-                        Ok(())
-                    });
+                    let psf = psfs
+                        .at(k, cut, full)
+                        .and_then(|Star { psf, .. }| self.worker.set_psf(psf.view()));
                     psf.is_ok()
                 }
             };

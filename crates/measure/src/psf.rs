@@ -2,6 +2,7 @@
 
 mod average;
 mod denoised_star;
+mod oversampled;
 mod psfs;
 mod quality;
 mod shape;
@@ -12,6 +13,7 @@ mod width;
 
 pub use self::average::average_stars;
 pub(crate) use self::denoised_star::{ResidualProfiles, StarDenoiser, StarSurvey};
+pub use self::oversampled::from_oversampled;
 pub use self::psfs::Psfs;
 pub(crate) use self::quality::{PsfQuality, psf_warnings};
 pub use self::star::Star;

@@ -9,6 +9,7 @@ use shearq_submissions::limits::MIN_PSF;
 use strum_macros::IntoStaticStr;
 use thiserror::Error;
 
+use crate::defects::DefectCounts;
 use crate::measurement::{Flag, Measurement};
 
 /// Something in the data of an image that biases shears, or is likely a mistake.
@@ -128,8 +129,8 @@ pub enum Warning {
     },
     /// The noise of the stamps disagrees with the one in the call.
     #[error(
-        "the given noise disagrees with the noise of the stamps (found {}, expected {}), which biases shears. Try: leave out the noise, so that it is measured",
-        significant(*given, 5), significant(*measured, 5)
+        "the given noise disagrees with the noise of the stamps (found {}, expected {}), which biases shears. {}",
+        significant(*given, 5), significant(*measured, 5), noise_advice(*given, *measured)
     )]
     GivenNoise { given: f64, measured: f64 },
     /// Noise is correlated, and the configuration treats it as white.
@@ -242,6 +243,24 @@ pub enum Warning {
         slope: [f64; 2],
         of: ExaminedPsfs,
     },
+    /// Pixels hold no light and became missing.
+    #[error(
+        "pixels hold no light (found {} on {stamps} of {of} stamps: {} in areas of one value, {} far below the sky, {} brighter than the PSF allows; expected none). They count as missing; {flagged} of these galaxies are flagged. Try: replace such pixels by NaN, and cut stamps before a deblender fills them",
+        counts.total(), counts.repeated, counts.dark, counts.bright
+    )]
+    Defects {
+        counts: DefectCounts,
+        /// Stamps with such pixels.
+        stamps: usize,
+        flagged: usize,
+        of: usize,
+    },
+    /// The brightest pixels of many stamps have one value.
+    #[error(
+        "the brightest pixel is {} on {count} of {of} stamps (expected different values), as if light above it were cut off, which biases shears. Try: replace saturated pixels by NaN",
+        significant(*level, 5)
+    )]
+    Saturated { level: f64, count: usize, of: usize },
     /// The noise of the star biases shears.
     #[error(
         "the PSF is noisy (found S/N {snr:.0}{of}; expected more than {enough:.0}). {}",
@@ -260,11 +279,12 @@ pub enum Warning {
     },
     /// The PSF is narrower than pixels can show.
     #[error(
-        "the PSF is narrower than the pixels can show (found light on {area:.1} px{of}; expected 6 px or more, a FWHM of about 1 px). Try: check that the file is a PSF with the pixel scale of the galaxies"
+        "the PSF is narrower than the pixels can show (found a transform of {power:.2} at 2 rad/px{of}). Aliased light changes m by about {effect:+.3}, to a factor of 3. Try: check that the file is a PSF with the pixel scale of the galaxies"
     )]
     PsfNarrow {
-        /// Noise-equivalent area in px².
-        area: f64,
+        /// Modulus of the transform, of sum one.
+        power: f64,
+        effect: f64,
         of: ExaminedPsfs,
     },
     /// The PSF is broader than the galaxies that were blurred by it.
@@ -344,6 +364,9 @@ pub enum Warning {
     )]
     Flagged { flag: Flag, count: usize, of: usize },
 }
+
+// Relative difference of a noise level from a power of another one that is taken for it. Chosen by hand.
+const POWER_OF_NOISE: f64 = 0.1;
 
 /// The pixel axes of an image against the sky's: +x to the west, +y to the north.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -452,7 +475,25 @@ impl Warning {
         let flagged = galaxies.iter().filter(|g| !g.flags.is_empty()).count();
         let with = |flag: Flag| galaxies.iter().filter(|g| g.flags.contains(flag)).count();
         let flags = Warning::of_counts(Flag::ALL.map(with), flagged, galaxies.len());
-        flags.into_iter().chain(Warning::of_idle(galaxies))
+        let defects = Warning::of_defects(galaxies);
+        let flags = flags.into_iter().chain(defects);
+        flags.chain(Warning::of_idle(galaxies))
+    }
+
+    fn of_defects(galaxies: &[Measurement]) -> Option<Warning> {
+        let mut counts = DefectCounts::default();
+        let (mut stamps, mut flagged) = (0, 0);
+        for galaxy in galaxies.iter().filter(|galaxy| !galaxy.defects.is_empty()) {
+            counts += galaxy.defects;
+            stamps += 1;
+            flagged += usize::from(!galaxy.flags.is_empty());
+        }
+        (stamps > 0).then_some(Warning::Defects {
+            counts,
+            stamps,
+            flagged,
+            of: galaxies.len(),
+        })
     }
 
     /// A warning if the network made no iteration on more than half of the galaxies that it ran on.
@@ -528,6 +569,22 @@ fn gradient(slope: [f64; 2], error: f64, noise: f64, subtracted: bool) -> String
     )
 }
 
+/// What may be wrong with a given noise level: a map of standard deviations, or of squared variances, in place of variances.
+fn noise_advice(given: f64, measured: f64) -> &'static str {
+    // Near one, a number and its square are alike.
+    let is = |level: f64| {
+        (measured / level - 1.0).abs() < POWER_OF_NOISE
+            && (level / given).ln().abs() > POWER_OF_NOISE
+    };
+    if is(given * given) {
+        "It is the square root of it: a map of variances may hold standard deviations. Try: square the map"
+    } else if is(given.sqrt()) {
+        "It is the square of it: variances may be squared twice, or given as standard deviations. Try: take the square root"
+    } else {
+        "Try: leave out the noise, so that it is measured"
+    }
+}
+
 /// A number with `digits` significant digits, in whatever unit pixels have.
 fn significant(value: f64, digits: i32) -> String {
     if value == 0.0 {
@@ -553,7 +610,9 @@ fn six_digits(scale: f64) -> f64 {
 /// What to check if most galaxies have this flag.
 fn advice(flag: Flag) -> &'static str {
     match flag {
-        Flag::NotFinite => "check masks, and positions outside the image (are they degrees?)",
+        Flag::NotFinite => {
+            "check that masks leave the galaxies, that deblenders leave the sky, and that positions are pixels inside the image"
+        }
         Flag::BadPsf => "check the PSF stamps: sum, centre and finite pixels",
         Flag::NoScale => "check that the stamps are not blank and that the noise is known",
         Flag::NoLight | Flag::NoExtent => "check the sky, the sign of the image and its units",

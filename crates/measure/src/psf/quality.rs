@@ -5,12 +5,12 @@
 //! alone does not show a background: wings are not negative and fall at least like r^(−2.5), and only what lies outside
 //! these bounds counts as a background.
 
-use ndarray::ArrayView2;
+use ndarray::{ArrayView2, Axis};
 use shearq_quantities::statistics::upper_median;
 
 use super::denoised_star::{MIN_DENOISED_SIDE, UNCHANGED_SNR, noise_level};
 use super::star::psf_offset;
-use super::width::{BORDER, noise_equivalent_area};
+use super::width::BORDER;
 use crate::moments::{CoreSize, psf_core_size};
 use crate::warning::{ExaminedPsfs, Warning};
 
@@ -30,8 +30,21 @@ const MAX_GRADIENT: f64 = 0.3;
 const MIN_SNR_SHARED: f64 = 1000.0;
 // Of a star per galaxy, the noise averages out. Chosen by hand.
 const MIN_SNR_EACH: f64 = 100.0;
-// Noise-equivalent area in px² of the narrowest PSF that pixels sample. A FWHM of about 1 px.
-const MIN_AREA: f64 = 6.0;
+// Wave number in radians per pixel at which the transform of a PSF is compared with the limits below.
+const SAMPLED_WAVE_NUMBER: f64 = 2.0;
+// Where the transform of a PSF from finer pixels is zero, and the power of rounding.
+const FILTERED_WAVE_NUMBER: f64 = 3.0;
+const MAX_FILTERED_POWER: f64 = 1e-5;
+// ln P(2)/ln P(1) of Gaussians is 4, of Moffat and Kolmogorov PSFs 3.3 to 3.6, of optics with any obscuration, jitter or charge diffusion 2.2 to 2.4.
+const MIN_INDEX_TURBULENCE: f64 = 2.8;
+// P(2) from which m departs from zero, and how m then grows with it. 400 galaxies of half-light radii 1.5 to 3.5 px at S/N 200 behind 25
+// PSFs: m is 0.6 to 1.2 times P(2π − 1), the light that is aliased to one radian per pixel, which the pixels do not show.
+// Optics: P(2) = 0.28 (Euclid VIS) has m = 0, 0.29 (Roman J129) 0.008, 0.34 (Roman Y106) 0.032, 0.45 (Euclid NISP J) 0.041.
+// Turbulence: P(2) = 0.35 has m = 0.004, 0.53 0.014, 0.67 0.023.
+const OPTICS: [f64; 2] = [0.285, 0.3];
+const TURBULENCE: [f64; 2] = [0.3, 0.055];
+// Effect on m of aliasing above which a warning is due.
+const MAX_ALIASING: f64 = 0.002;
 // Mean square radius of the PSF's core in units of the galaxies', above which a warning is due. Simulated galaxies, PSF of
 // FWHM 3.4 px: 0.48 to 0.53; PSF 1.3 times too wide: 0.75; 1.4 times: 0.86 to 0.93. Command and seed not recorded.
 const MAX_CORE_RATIO: f64 = 0.83;
@@ -55,7 +68,9 @@ pub(crate) struct PsfQuality {
     /// Gradient of the background: change per pixel in units of the peak, light in units of the star's.
     slope: [f64; 2],
     gradient: f64,
-    area: f64,
+    /// Modulus of the transform at [`SAMPLED_WAVE_NUMBER`], and the effect on m of light that is aliased.
+    power: f64,
+    aliasing: f64,
     core: Option<CoreSize>,
     moved: Option<[f64; 2]>,
     /// Centroid from the centre of the pixels that are used.
@@ -149,7 +164,10 @@ impl PsfQuality {
             }
         }
         let peak = (peak - border.mean()).max(f64::MIN_POSITIVE);
-        let area = noise_equivalent_area(psf);
+        let [low, sampled] = [0.5, 1.0].map(|share| {
+            let square = axis_power(psf, share * SAMPLED_WAVE_NUMBER);
+            (square - pixels * sigma * sigma).max(0.0).sqrt()
+        });
         let offset = psf_offset(psf);
         Some(PsfQuality {
             side: n,
@@ -158,17 +176,44 @@ impl PsfQuality {
             background: level * pixels / star,
             slope: slope.map(|slope| slope / peak),
             gradient: steep * 0.5 * n as f64 * pixels / star,
-            // More noise than light, or light without end, has no area.
-            area: if area > 0.0 && area < pixels {
-                area
-            } else {
-                f64::INFINITY
+            power: sampled,
+            aliasing: match axis_power(psf, FILTERED_WAVE_NUMBER) < MAX_FILTERED_POWER {
+                // From finer pixels, and without aliases.
+                true => 0.0,
+                // Less the noise of the transform.
+                false => aliasing(low, sampled - 2.0 * sigma * n as f64),
             },
             core: psf_core_size(psf, offset, border.mean(), sigma),
             moved,
             offset,
         })
     }
+}
+
+/// Mean of |p̂|² at a wave number along x and along y.
+fn axis_power(psf: ArrayView2<'_, f64>, wave_number: f64) -> f64 {
+    let of_axis = |axis: Axis| {
+        let lines = psf.axis_iter(axis).map(|line| line.sum());
+        let (cos, sin) = lines
+            .enumerate()
+            .fold((0.0, 0.0), |(cos, sin), (at, light)| {
+                let (s, c) = (wave_number * at as f64).sin_cos();
+                (cos + c * light, sin + s * light)
+            });
+        cos * cos + sin * sin
+    };
+    0.5 * (of_axis(Axis(0)) + of_axis(Axis(1)))
+}
+
+/// About how much m changes by light that pixels alias, of a PSF with these moduli at half of [`SAMPLED_WAVE_NUMBER`] and there.
+fn aliasing(low: f64, power: f64) -> f64 {
+    // NaN of a PSF of one pixel, which has all wave numbers.
+    let index = power.ln() / low.ln();
+    let [least, slope] = match index > MIN_INDEX_TURBULENCE {
+        true => TURBULENCE,
+        false => OPTICS,
+    };
+    slope * (power - least).max(0.0)
 }
 
 /// Means over pixels: of their values, and of their distances from the centre.
@@ -257,9 +302,10 @@ pub(crate) fn psf_warnings(
             of: psfs.of,
         });
     }
-    if let Some(psfs) = Defective::among(all, |psf| psf.area < MIN_AREA) {
+    if let Some(psfs) = Defective::among(all, |psf| psf.aliasing > MAX_ALIASING) {
         found.push(Warning::PsfNarrow {
-            area: psfs.median(|psf| psf.area),
+            power: psfs.median(|psf| psf.power),
+            effect: psfs.median(|psf| psf.aliasing),
             of: psfs.of,
         });
     }
@@ -397,7 +443,9 @@ mod tests {
         let mut delta = Array2::zeros((48, 48));
         delta[(24, 23)] = 3.0;
         assert_eq!(kinds(&delta), ["psf-narrow"]);
-        assert_eq!(kinds(&sheared(MOFFAT, 0.3, 48)), ["psf-narrow"]);
+        for (profile, fwhm) in [(MOFFAT, 0.3), (MOFFAT, 1.0), (PsfProfile::Kolmogorov, 1.0)] {
+            assert_eq!(kinds(&sheared(profile, fwhm, 48)), ["psf-narrow"], "{fwhm}");
+        }
     }
 
     #[test]
@@ -431,6 +479,31 @@ mod tests {
     }
 
     #[test]
+    fn undersampled_optics_are_told_from_sampled_ones() {
+        // |P̂| at 1 and 2 rad/px and m of the study above.
+        for (low, power, m) in [
+            (0.633, 0.337, 0.015),
+            (0.573, 0.294, 0.008),
+            (0.618, 0.341, 0.032),
+            (0.709, 0.454, 0.041),
+            (0.557, 0.276, 0.0),
+            (0.520, 0.261, 0.0),
+            (0.539, 0.214, 0.0),
+            (0.839, 0.534, 0.015),
+            (0.785, 0.436, 0.008),
+            (0.638, 0.242, 0.001),
+            (0.497, 0.124, 0.0),
+            (0.905, 0.668, 0.023),
+        ] {
+            let found = aliasing(low, power);
+            assert_eq!(found > MAX_ALIASING, m > MAX_ALIASING, "{power}: {found}");
+            // To a factor of three.
+            assert!(found < 3.0 * m || m < 0.002, "{power}: {found}");
+            assert!(found > m / 3.0 || m < 0.002, "{power}: {found}");
+        }
+    }
+
+    #[test]
     fn warnings_begin_at_their_limits() {
         let good = PsfQuality {
             snr: 1e6,
@@ -454,7 +527,10 @@ mod tests {
         });
         begins("psf-noise", true, 1000.0, &|snr| PsfQuality { snr, ..good });
         begins("psf-noise", false, 100.0, &|snr| PsfQuality { snr, ..good });
-        begins("psf-narrow", true, 6.0, &|area| PsfQuality { area, ..good });
+        begins("psf-narrow", true, 0.002, &|aliasing| PsfQuality {
+            aliasing,
+            ..good
+        });
         let core = |mean_square_radius| CoreSize {
             mean_square_radius,
             error: 0.0,

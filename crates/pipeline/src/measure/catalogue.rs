@@ -206,6 +206,9 @@ pub struct Summary {
     pub on_sky: usize,
     /// Galaxies measured now with each of [`Flag::ALL`].
     pub flags: [u64; Flag::ALL.len()],
+    /// Galaxies measured now with pixels that hold no light, and the number of these pixels.
+    pub with_defects: u64,
+    pub defects: u64,
 }
 
 impl Summary {
@@ -221,7 +224,11 @@ impl Summary {
 
     fn count(&mut self, galaxies: &[Measurement]) {
         self.images += 1;
-        galaxies.iter().for_each(|galaxy| self.add(galaxy.flags));
+        for galaxy in galaxies {
+            self.add(galaxy.flags);
+            self.with_defects += u64::from(!galaxy.defects.is_empty());
+            self.defects += u64::from(galaxy.defects.total());
+        }
     }
 
     fn add(&mut self, flags: Flags) {

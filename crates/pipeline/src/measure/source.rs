@@ -546,8 +546,11 @@ fn open_stars(path: &Path, cut: PsfCut, mosaic: &Mosaic) -> Result<OpenPsfs, Fil
         None => width,
     };
     if side < least {
+        // The linear method requires one parity.
+        let odd = usize::from(cut.centred) * (least - side) % 2;
+        let size = side - odd;
         let message = format!(
-            "the PSF stamp has {side} pixels a side; the configuration requires {least}. Try: larger PSF stamps, or psf.size = {side} in a settings file"
+            "the PSF stamp has {side} pixels a side; the configuration requires {least}. Try: larger PSF stamps, or psf.size = {size} in a settings file"
         );
         return Err(FileError::new(path, message));
     }

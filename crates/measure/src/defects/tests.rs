@@ -1,0 +1,284 @@
+use ndarray::Array2;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, Poisson, StandardNormal};
+use shearq_quantities::{FunctionalPsf, PsfProfile, Shear};
+
+use super::*;
+
+const N: usize = 48;
+
+fn psf(fwhm: f64) -> Array2<f64> {
+    let shape = Shear::new(0.05, -0.03);
+    let psf = FunctionalPsf::new(PsfProfile::Moffat { beta: 3.0 }, fwhm, shape).unwrap();
+    psf.stamp(N)
+}
+
+fn limits(fwhm: f64) -> LightLimits {
+    LightLimits::from_psf(psf(fwhm).view())
+}
+
+/// A galaxy no larger than its PSF, of a peak of `peak` in noise of one.
+fn galaxy(fwhm: f64, n: usize, peak: f32, rng: &mut ChaCha8Rng) -> Vec<f32> {
+    let scale = (n as f64 - 1.0) / 2.0;
+    let centre = [0, 1].map(|_| scale + rng.random_range(-0.7..0.7));
+    // A Moffat of β = 3 without its pixel, which is narrower than the PSF.
+    let alpha = fwhm / (2.0 * (2f64.powf(1.0 / 3.0) - 1.0).sqrt());
+    (0..n * n)
+        .map(|at| {
+            let square = (((at % n) as f64 - centre[0]).powi(2)
+                + ((at / n) as f64 - centre[1]).powi(2))
+                / (alpha * alpha);
+            let noise: f32 = StandardNormal.sample(rng);
+            peak * (1.0 + square as f32).powi(-3) + noise
+        })
+        .collect()
+}
+
+/// The pixels that become missing, and their number by cause.
+fn found(stamp: &[f32], n: usize, noise: f32, limits: &LightLimits) -> (Vec<usize>, DefectCounts) {
+    let mut cleaned = stamp.to_vec();
+    // What was found before does not matter.
+    let mut dirty = Defects::new(n);
+    let mut other: Vec<f32> = (0..81)
+        .map(|at| if at % 2 == 0 { 1e9 } else { -1e9 })
+        .collect();
+    dirty.remove(&mut other, 9, 1.0, limits);
+    let counts = dirty.remove(&mut cleaned, n, noise, limits);
+    let places: Vec<usize> = (0..stamp.len())
+        .filter(|&at| cleaned[at].is_nan() && !stamp[at].is_nan())
+        .collect();
+    assert_eq!(places.len() as u32, counts.total());
+    for at in (0..stamp.len()).filter(|at| !places.contains(at)) {
+        assert_eq!(cleaned[at].to_bits(), stamp[at].to_bits());
+    }
+    (places, counts)
+}
+
+#[test]
+fn clean_stamps_of_any_brightness_keep_their_pixels() {
+    let mut rng = ChaCha8Rng::seed_from_u64(1);
+    for fwhm in [1.5, 2.0, 3.4, 5.0] {
+        let limits = limits(fwhm);
+        for peak in [0.0, 1.0, 10.0, 100.0, 1000.0, 1e4, 1e6] {
+            for n in [24, 47, 48, 64] {
+                let stamp = galaxy(fwhm, n, peak, &mut rng);
+                for noise in [1.0, 0.5, 0.0] {
+                    let (places, _) = found(&stamp, n, noise, &limits);
+                    assert!(places.is_empty(), "{fwhm} {peak} {n} {noise}: {places:?}");
+                }
+                for quantum in [0.2, 1.0, 2.0] {
+                    let whole: Vec<f32> = stamp.iter().map(|v| (v / quantum).round()).collect();
+                    let noise = 1f32.max(1.0 / quantum);
+                    let (places, _) = found(&whole, n, noise, &limits);
+                    assert!(
+                        places.is_empty(),
+                        "{fwhm} {peak} {n} /{quantum}: {places:?}"
+                    );
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn counts_of_few_photons_keep_their_pixels() {
+    let mut rng = ChaCha8Rng::seed_from_u64(2);
+    let limits = limits(3.4);
+    for sky in [1.0, 10.0] {
+        for peak in [1.0, 10.0, 100.0, 1000.0] {
+            let light = galaxy(3.4, N, peak, &mut rng);
+            let counts: Vec<f32> = light
+                .iter()
+                .map(|v| {
+                    let mean = f64::from(v.max(0.0)) + sky;
+                    Poisson::new(mean).unwrap().sample(&mut rng) as f32 - sky as f32
+                })
+                .collect();
+            let (places, _) = found(&counts, N, (sky as f32).sqrt(), &limits);
+            assert!(places.is_empty(), "{sky} {peak}: {places:?}");
+        }
+    }
+}
+
+#[test]
+fn stamps_without_noise_keep_zeros_beyond_their_light() {
+    let limits = limits(3.4);
+    let mut rng = ChaCha8Rng::seed_from_u64(3);
+    let stamp: Vec<f32> = galaxy(3.4, N, 1e9, &mut rng)
+        .iter()
+        .map(|v| if *v < 3e4 { 0.0 } else { *v })
+        .collect();
+    for noise in [0.0, 1.0] {
+        assert!(found(&stamp, N, noise, &limits).0.is_empty());
+    }
+    // Counts without a sky.
+    let sparse: Vec<f32> = (0..N * N)
+        .map(|_| f32::from(u8::from(rng.random_bool(0.02))))
+        .collect();
+    assert!(found(&sparse, N, 0.1, &limits).0.is_empty());
+}
+
+/// A stamp at S/N of about 100 with defects.
+fn damaged(defects: &[(usize, usize)], value: impl Fn(f32) -> f32) -> Vec<f32> {
+    let mut stamp = galaxy(3.4, N, 20.0, &mut ChaCha8Rng::seed_from_u64(4));
+    for &(x, y) in defects {
+        stamp[y * N + x] = value(stamp[y * N + x]);
+    }
+    stamp
+}
+
+#[test]
+fn fill_values_of_any_size_become_missing() {
+    let disc: Vec<(usize, usize)> = (0..7)
+        .flat_map(|y| (0..7).map(move |x| (x, y)))
+        .filter(|(x, y)| (*x as i32 - 3).pow(2) + (*y as i32 - 3).pow(2) <= 10)
+        .collect();
+    for corner in [(0, 0), (30, 10), (41, 41)] {
+        let places: Vec<_> = disc
+            .iter()
+            .map(|(x, y)| (x + corner.0, y + corner.1))
+            .collect();
+        for fill in [0.0, 0.3, -20.0, -9999.0, -1e16, 65535.0, 1e18] {
+            let stamp = damaged(&places, |_| fill);
+            let (missing, counts) = found(&stamp, N, 1.0, &limits(3.4));
+            // Ends of rows of equal pixels are narrower than the smallest area.
+            let least = if fill.abs() < 5.0 {
+                places.len() - 8
+            } else {
+                places.len()
+            };
+            assert!(missing.len() >= least, "{fill}: {counts:?}");
+            assert!(
+                missing.iter().all(|at| places.contains(&(at % N, at / N))),
+                "{fill}"
+            );
+        }
+    }
+    let column: Vec<_> = (0..N).map(|y| (20, y)).collect();
+    let (missing, counts) = found(&damaged(&column, |_| 0.0), N, 1.0, &limits(3.4));
+    assert_eq!((missing.len(), counts.repeated), (N, N as u32));
+}
+
+#[test]
+fn hot_pixels_and_rays_become_missing() {
+    let shapes: [&[(usize, usize)]; 6] = [
+        &[(30, 11)],
+        &[(0, 0)],
+        &[(47, 20)],
+        &[(9, 30), (10, 30), (11, 30)],
+        &[(36, 36), (37, 36), (36, 37), (37, 37)],
+        &[(5, 5), (6, 6), (7, 7), (8, 8), (9, 9)],
+    ];
+    for shape in shapes {
+        for charge in [100.0, 1000.0, 1e4, 1e18] {
+            let stamp = damaged(shape, |value| value + charge);
+            let (missing, counts) = found(&stamp, N, 1.0, &limits(3.4));
+            let mut expected: Vec<usize> = shape.iter().map(|(x, y)| y * N + x).collect();
+            expected.sort_unstable();
+            assert_eq!(missing, expected, "{charge}: {counts:?}");
+            assert_eq!(counts.bright, missing.len() as u32);
+        }
+    }
+    // Behind a PSF of one pixel, a bright pixel may be a star.
+    let stamp = damaged(&[(30, 11)], |value| value + 30.0);
+    assert!(found(&stamp, N, 1.0, &limits(0.8)).0.is_empty());
+}
+
+#[test]
+fn neighbours_of_defects_keep_their_light() {
+    // In the core, where a fill value makes the mean of pairs negative.
+    let stamp = damaged(&[(24, 24)], |_| -1e5);
+    assert_eq!(found(&stamp, N, 1.0, &limits(3.4)).0, [24 * N + 24]);
+    // Missing pixels stay missing, and are not counted.
+    let stamp = damaged(&[(24, 24), (30, 30)], |_| f32::NAN);
+    assert_eq!(
+        found(&stamp, N, 1.0, &limits(3.4)).1,
+        DefectCounts::default()
+    );
+}
+
+#[test]
+fn a_sky_that_was_not_subtracted_is_no_defect() {
+    for sky in [-30.0, 30.0] {
+        let stamp: Vec<f32> = galaxy(3.4, N, 30.0, &mut ChaCha8Rng::seed_from_u64(5))
+            .iter()
+            .map(|v| v + sky)
+            .collect();
+        assert!(found(&stamp, N, 1.0, &limits(3.4)).0.is_empty(), "{sky}");
+    }
+}
+
+#[test]
+fn fast_loops_agree_with_plain_ones() {
+    let mut rng = ChaCha8Rng::seed_from_u64(6);
+    for n in [3, 7, 8, 9, 16, 17, 18, 33, 48, 63, 64] {
+        let mut stamp: Vec<f32> = (0..n * n).map(|_| rng.random_range(-3..4) as f32).collect();
+        stamp[0] = f32::NAN;
+        stamp[n] = f32::INFINITY;
+        stamp[n * n - 1] = f32::NEG_INFINITY;
+        let numbers = || stamp.iter().copied().filter(|v| !v.is_nan());
+        let is_repeated = |&at: &usize| stamp[at] == stamp[at + 1] || stamp[at] == stamp[at + n];
+        assert_eq!(
+            Screening::of(&stamp, n),
+            Screening {
+                low: numbers().fold(f32::INFINITY, f32::min),
+                high: numbers().fold(f32::NEG_INFINITY, f32::max),
+                equal: (0..n * n - n).filter(is_repeated).count() as u32,
+            },
+            "{n}"
+        );
+    }
+}
+
+#[test]
+fn areas_are_squares_and_lines_of_equal_pixels() {
+    // Against the definition: a pixel is in an area if some square of this side, or line of as many pixels, around it is of one value.
+    let mut rng = ChaCha8Rng::seed_from_u64(7);
+    for (n, side) in [(9, 3), (24, 3), (31, 4)] {
+        for share in [0.05, 0.2] {
+            let stamp: Vec<f32> = (0..n * n)
+                .map(|_| if rng.random_bool(share) { 2.0 } else { 1.0 })
+                .collect();
+            let mut defects = Defects::new(n);
+            defects.marks.resize(n * n, false);
+            defects.mark_areas(&stamp, n, side, 0.0);
+            let mut expected = vec![false; n * n];
+            for (height, width) in [(side, side), (1, side * side), (side * side, 1)] {
+                for y in 0..(n + 1).saturating_sub(height) {
+                    for x in 0..(n + 1).saturating_sub(width) {
+                        let all = || {
+                            (y..y + height)
+                                .flat_map(|row| (x..x + width).map(move |column| row * n + column))
+                        };
+                        if all().all(|at| stamp[at] == stamp[y * n + x]) {
+                            all().for_each(|at| expected[at] = true);
+                        }
+                    }
+                }
+            }
+            assert_eq!(defects.marks, expected, "{n} {side} {share}");
+        }
+    }
+}
+
+#[test]
+fn bounds_contain_stars_at_any_pixel_phase() {
+    for fwhm in [1.2, 1.5, 2.0, 3.4] {
+        let limits = limits(fwhm);
+        for phase in [[0.0, 0.0], [0.5, 0.0], [0.5, 0.5], [0.25, -0.4]] {
+            let alpha = fwhm / (2.0 * (2f64.powf(1.0 / 3.0) - 1.0).sqrt());
+            // A star as wide as the PSF is without its pixel: narrower than any light behind it.
+            let star = |x: isize, y: isize| {
+                let square = (x as f64 - phase[0]).powi(2) + (y as f64 - phase[1]).powi(2);
+                (1.0 + square / (alpha * alpha)).powi(-3) as f32
+            };
+            for (ratio, (dx, dy)) in limits.ratios.iter().zip(PAIRS) {
+                for (x, y) in (-4..5).flat_map(|y| (-4..5).map(move |x| (x, y))) {
+                    let mean = 0.5 * (star(x + dx, y + dy) + star(x - dx, y - dy));
+                    assert!(star(x, y) - FAINT_SHARE <= ratio * mean, "{fwhm} {phase:?}");
+                }
+            }
+        }
+    }
+}
