@@ -1,11 +1,14 @@
 //! How catalogues belong together.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
 use strum_macros::IntoStaticStr;
 
+use crate::arms::Units;
+use crate::names;
 use crate::stars::{Behind, StarNoise, shared};
+use crate::sums::Layout;
 use crate::units::UnitSums;
 
 /// Smallest and largest value.
@@ -117,7 +120,7 @@ pub struct Catalogue {
 
 impl Catalogue {
     /// The true shear, if all galaxies have the same.
-    fn constant(&self) -> Option<[f64; 2]> {
+    pub(crate) fn constant(&self) -> Option<[f64; 2]> {
         let [a, b] = self.shear.map(Range::constant);
         Some([a?, b?])
     }
@@ -134,7 +137,7 @@ pub enum Design {
     Single,
     /// Paired shears +γ and −γ of the same galaxies, whose shapes cancel in m.
     Pairs,
-    /// Several paired shears, ±g1, ±g2 and possibly zero with other PSFs.
+    /// The same galaxies under several test shears, such as ±g1 and ±g2, or γ and 0.
     Arms,
     /// Catalogues with a shear each, of different galaxies.
     Fields,
@@ -157,7 +160,7 @@ impl Design {
             Design::Null => "no true shear",
             Design::Single => "one true shear",
             Design::Pairs => "pairs of shears +γ and −γ",
-            Design::Arms => "arms of shears ±g1 and ±g2",
+            Design::Arms => "the same galaxies under several test shears",
             Design::Fields => "one true shear per catalogue",
             Design::Galaxies => "true shears that vary within catalogues",
             Design::Rotated => "pairs of galaxies rotated by 90 degrees",
@@ -181,14 +184,18 @@ impl Design {
         let equal = kinds
             .iter()
             .all(|&kind| count(opposite(kind)) == count(kind));
-        let both = || kinds.iter().all(|&kind| count(opposite(kind)) > 0);
+        let both = kinds.iter().all(|&kind| count(opposite(kind)) > 0);
         // Catalogues of one shear may be missing if the names state which belong together.
-        let paired = equal || both() && by_name(catalogues).is_some();
+        let paired = equal || both && names::groups(catalogues).is_some();
         match (kinds.len(), paired) {
             (0 | 1, _) => Design::Single,
             (2, true) => Design::Pairs,
             (_, true) => Design::Arms,
-            (_, false) => Design::Fields,
+            // Shears such as 0.02 and 0, or 0.08 and −0.02. Fields with a shear each have as many shears as catalogues.
+            (count, false) => match names::groups(catalogues) {
+                Some(groups) if names::count(&groups) >= count.max(2) => Design::Arms,
+                _ => Design::Fields,
+            },
         }
     }
 }
@@ -197,7 +204,7 @@ impl Design {
 // tables of double precision.
 const ROUNDING: f64 = 1e-6;
 
-fn same(a: [f64; 2], b: [f64; 2]) -> bool {
+pub(crate) fn same(a: [f64; 2], b: [f64; 2]) -> bool {
     let modulus = a[0].hypot(a[1]).max(b[0].hypot(b[1]));
     (a[0] - b[0]).hypot(a[1] - b[1]) <= ROUNDING * modulus
 }
@@ -222,26 +229,43 @@ pub struct Missing {
     pub shear: [f64; 2],
 }
 
+/// Galaxies that count under one of two opposite shears only.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct WithoutPartner {
+    /// Their number: exact if units are galaxies, else estimated from the scatter of the numbers of galaxies in units.
+    pub galaxies: f64,
+    /// Galaxies under both signs together.
+    pub of: f64,
+    /// The part of the variances of m1 and m2 that is due to their shapes, which do not cancel. NaN for a component without
+    /// true shear.
+    pub share: [f64; 2],
+}
+
 /// Units of the errors, and what is wrong with them.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Grouping {
     /// The sums by unit.
-    pub sums: UnitSums,
+    pub units: Units,
     /// The galaxies of noisy stars that several units share.
     pub stars: Vec<Behind>,
     /// What a unit is, in words.
     pub unit: &'static str,
     /// Whether galaxies under different shears may be in different units: their numbers differ. The error of m is then too
-    /// large, and the error of c too small, by up to √2.
+    /// large, and the error of c too small.
     pub misaligned: bool,
     /// The correlation of the ellipticities in units under opposite shears, if it shows that they are not the same
     /// galaxies. Errors are wrong as above if they are the same in another order.
     pub uncorrelated: Option<f64>,
+    /// Galaxies that count under one of two opposite shears only.
+    pub without_partner: Option<WithoutPartner>,
     /// Catalogues that are absent.
     pub missing: Vec<Missing>,
     /// A shear and the numbers of catalogues under it and under the opposite one, if these differ and names do not state
     /// which belong together. The catalogues are then independent units, and errors contain shapes that pairs cancel.
     pub unpaired: Option<([f64; 2], [usize; 2])>,
+    /// Whether several catalogues have the same shear and neither names nor keys state whether they contain the same
+    /// galaxies: they count as different ones.
+    pub assumed_different: bool,
 }
 
 impl Grouping {
@@ -249,7 +273,7 @@ impl Grouping {
     #[must_use]
     pub fn all_bins(&self) -> Self {
         Grouping {
-            sums: self.sums.all_bins(),
+            units: self.units.all_bins(),
             stars: self.stars.iter().map(Behind::all_bins).collect(),
             missing: self.missing.clone(),
             ..*self
@@ -261,8 +285,20 @@ impl Grouping {
 // determines an error to 16 %. Chosen by hand.
 const MIN_GROUPS: usize = 20;
 
+/// The arm of each catalogue: those of one true shear are an arm, and all with varying shear.
+pub(crate) fn arms(catalogues: &[Catalogue]) -> Vec<u32> {
+    let shears: Vec<[f64; 2]> = catalogues.iter().filter_map(Catalogue::constant).collect();
+    let kinds = kinds(&shears);
+    let arm = |own: &Catalogue| {
+        let shear = own.constant();
+        let kind = shear.and_then(|shear| kinds.iter().position(|kind| same(*kind, shear)));
+        kind.unwrap_or(kinds.len()) as u32
+    };
+    catalogues.iter().map(arm).collect()
+}
+
 /// Joins sums to the units of a design, which are as large as the galaxies that are not independent: the galaxy under all its
-/// shears, or all galaxies of catalogues with the same number.
+/// shears and versions, or all galaxies of catalogues that contain the same galaxies by their names or order.
 ///
 /// `by_key` forces units of the same keys in all catalogues (`true`), or of whole catalogues; by default the latter if there
 /// are 20 groups or more. `matched` states that keys are identifiers of galaxies rather than numbers of rows.
@@ -273,35 +309,23 @@ pub fn group(
     by_key: Option<bool>,
     matched: bool,
 ) -> Grouping {
-    let numbers = numbers(catalogues, design);
+    let (numbers, named) = numbers(catalogues, design);
+    let arms = arms(catalogues);
+    let arm = |catalogue: u32| arms.get(catalogue as usize).copied().unwrap_or(0);
     let noises: Vec<Option<&StarNoise>> = catalogues.iter().map(|own| own.star.as_ref()).collect();
-    let groups = numbers.iter().max().map_or(0, |last| *last as usize + 1);
+    let groups = names::count(&numbers);
     let paired = matches!(design, Design::Pairs | Design::Arms);
     let missing = match paired {
         true => missing(catalogues, &numbers),
         false => Vec::new(),
     };
-    if !by_key.unwrap_or(groups < MIN_GROUPS) {
-        let stars = shared(&sums, &noises, Some(&numbers));
-        let sums = sums.by_group(|catalogue| {
-            let number = numbers.get(catalogue as usize);
-            number.copied().unwrap_or(catalogue)
-        });
-        let unit = match design {
-            Design::Pairs | Design::Rotated => "pairs of catalogues",
-            Design::Arms => "sets of catalogues with one catalogue per shear",
-            _ => "catalogues",
-        };
-        return Grouping {
-            sums,
-            stars,
-            unit,
-            misaligned: false,
-            uncorrelated: None,
-            missing,
-            unpaired: unpaired(catalogues, design),
-        };
-    }
+    let several = match design {
+        Design::Pairs | Design::Arms => groups > 1,
+        Design::Fields => groups > names::count(&arms),
+        _ => false,
+    };
+    // Identifiers state which galaxies are the same, where names do not.
+    let by_key = by_key.unwrap_or(groups < MIN_GROUPS || matched && several && !named);
     let rotated = design == Design::Rotated;
     // Tiles differ in their galaxies, but not under another shear.
     let differ = |(number, own): (&u32, &Catalogue)| {
@@ -310,22 +334,47 @@ pub fn group(
         group.any(|(_, other)| other.rows != own.rows)
     };
     let differ = numbers.iter().zip(catalogues).any(differ);
-    let correlation = match paired {
-        true => correlation(&sums, catalogues, &numbers),
-        false => None,
+    let misaligned = by_key && (paired || rotated) && !matched && differ;
+    let pairs = match paired {
+        true => opposite_pairs(catalogues, &numbers),
+        false => Vec::new(),
     };
+    let correlation = correlation(&sums, &pairs).filter(|_| by_key);
+    let without_partner = match misaligned || correlation.is_some() {
+        true => None,
+        false => without_partner(&sums, &pairs),
+    };
+    let group = |catalogue: u32| {
+        let number = numbers.get(catalogue as usize);
+        number.copied().unwrap_or(catalogue)
+    };
+    let stars = shared(&sums, &noises, (!by_key).then_some(&numbers), arm);
     Grouping {
-        stars: shared(&sums, &noises, None),
+        stars,
+        unit: match (by_key, matched, catalogues.len()) {
+            (true, true, _) => "galaxies with the same identifier",
+            (true, false, 1) => "galaxies in blocks of neighbouring rows",
+            (true, false, _) => "the same rows of all catalogues",
+            (false, ..) if groups == catalogues.len() => "catalogues",
+            (false, ..) => match design {
+                Design::Pairs if 2 * groups >= catalogues.len() => "pairs of catalogues",
+                Design::Rotated => "pairs of catalogues",
+                Design::Arms if groups * names::count(&arms) >= catalogues.len() => {
+                    "sets of catalogues with one catalogue per shear"
+                }
+                _ => "sets of catalogues of the same galaxies",
+            },
+        },
+        misaligned,
         uncorrelated: correlation,
+        without_partner,
         missing,
         unpaired: unpaired(catalogues, design),
-        sums: sums.by_key(),
-        unit: match (matched, catalogues.len()) {
-            (true, _) => "galaxies with the same identifier",
-            (false, 1) => "galaxies in blocks of neighbouring rows",
-            (false, _) => "the same rows of all catalogues",
+        assumed_different: several && !named && !by_key,
+        units: match by_key {
+            true => sums.by_key(arm),
+            false => sums.by_group(arm, group),
         },
-        misaligned: (paired || rotated) && !matched && differ,
     }
 }
 
@@ -335,20 +384,41 @@ pub fn group(
 const ENOUGH_TO_CORRELATE: usize = 400;
 const MIN_CORRELATION: f64 = 0.15;
 
-// The correlation of the ellipticities of units under opposite shears, if there are enough units and it is too small for the
-// same galaxies: the error of m is then too large by up to √2, because the shapes do not cancel.
-fn correlation(sums: &UnitSums, catalogues: &[Catalogue], numbers: &[u32]) -> Option<f64> {
+// Catalogues of one group under opposite shears.
+fn opposite_pairs(catalogues: &[Catalogue], numbers: &[u32]) -> Vec<[u32; 2]> {
     let shears: Vec<Option<[f64; 2]>> = catalogues.iter().map(Catalogue::constant).collect();
-    let opposite = |k: usize| {
-        let [a, b] = shears[k]?;
-        let own = (a, b) > (0.0, 0.0);
-        let mut others = (0..catalogues.len()).filter(|other| numbers[*other] == numbers[k]);
-        let partner = others.find(|other| shears[*other].is_some_and(|g| same(g, [-a, -b])));
-        partner.filter(|partner| own && *partner != k)
-    };
+    let mut of_group: BTreeMap<u32, Vec<usize>> = BTreeMap::new();
+    for (k, number) in numbers.iter().enumerate() {
+        of_group.entry(*number).or_default().push(k);
+    }
+    let mut pairs = Vec::new();
+    for group in of_group.values() {
+        // The k-th catalogue of a shear with the k-th of the opposite one: versions are listed in the same order.
+        let mut free: Vec<usize> = group.clone();
+        for &k in group {
+            let Some([a, b]) = shears[k].filter(|shear| (shear[0], shear[1]) > (0.0, 0.0)) else {
+                continue;
+            };
+            let partner = free
+                .iter()
+                .position(|other| shears[*other].is_some_and(|g| same(g, [-a, -b])));
+            pairs.extend(partner.map(|at| [k as u32, free.remove(at) as u32]));
+        }
+    }
+    pairs
+}
+
+// The correlation of the ellipticities of units under opposite shears, if there are enough units and it is too small for the
+// same galaxies: the error of m is then too large, because the shapes do not cancel.
+fn correlation(sums: &UnitSums, pairs: &[[u32; 2]]) -> Option<f64> {
     let (mut count, mut cross, mut squares) = (0, 0.0, [0.0; 2]);
-    for (k, partner) in (0..catalogues.len()).filter_map(|k| Some((k, opposite(k)?))) {
-        let pairs = sums.mean_pairs(k as u32, partner as u32);
+    for [a, b] in pairs {
+        let pairs: Vec<[[f64; 2]; 2]> = sums
+            .pairs(*a, *b, |layout, all| layout.mean(all))
+            .into_iter()
+            .filter_map(|[a, b]| Some([a?, b?]))
+            .filter(|pair| pair.iter().flatten().all(|e| e.is_finite()))
+            .collect();
         for component in 0..2 {
             let mean = |of: usize| {
                 let values = pairs.iter().map(|pair| pair[of][component]);
@@ -365,6 +435,39 @@ fn correlation(sums: &UnitSums, catalogues: &[Catalogue], numbers: &[u32]) -> Op
     }
     let found = cross / (squares[0] * squares[1]).sqrt();
     (count >= ENOUGH_TO_CORRELATE && found < MIN_CORRELATION).then_some(found)
+}
+
+// If galaxies without partner are drawn at random, the difference of the numbers of galaxies in a unit under the two shears has
+// the variance of a Poisson distribution of their number. m follows from the sums of w e g. What the shapes of galaxies without
+// partner add to their variance is their share of Σ (w e g)², which is the variance between units of the sums under one shear.
+fn without_partner(sums: &UnitSums, pairs: &[[u32; 2]]) -> Option<WithoutPartner> {
+    type Numbers = (f64, [f64; 2]);
+    let (mut galaxies, mut of) = (0.0, 0.0);
+    let (mut of_shapes, mut of_all) = ([0.0; 2], [0.0; 2]);
+    for [a, b] in pairs {
+        let units = sums.pairs(*a, *b, Layout::counts_and_slopes).into_iter();
+        let units: Vec<[Numbers; 2]> = units
+            .map(|pair| pair.map(Option::unwrap_or_default))
+            .collect();
+        let total: f64 = units.iter().map(|[a, b]| a.0 + b.0).sum();
+        // Units have different numbers of galaxies, to which sums are proportional.
+        let variance = |value: &dyn Fn(&[Numbers; 2]) -> f64| {
+            let mean = units.iter().map(value).sum::<f64>() / total;
+            let residual = |unit: &[Numbers; 2]| value(unit) - mean * (unit[0].0 + unit[1].0);
+            units.iter().map(|unit| residual(unit).powi(2)).sum::<f64>()
+        };
+        of += total;
+        galaxies += variance(&|[a, b]| a.0 - b.0);
+        for k in 0..2 {
+            of_shapes[k] += variance(&|[a, _]| a.1[k]) + variance(&|[_, b]| b.1[k]);
+            of_all[k] += variance(&|[a, b]| a.1[k] + b.1[k]);
+        }
+    }
+    (galaxies > 0.0).then_some(WithoutPartner {
+        galaxies,
+        of,
+        share: [0, 1].map(|k| (galaxies / of * of_shapes[k] / of_all[k]).min(1.0)),
+    })
 }
 
 fn missing(catalogues: &[Catalogue], numbers: &[u32]) -> Vec<Missing> {
@@ -406,94 +509,27 @@ fn unpaired(catalogues: &[Catalogue], design: Design) -> Option<([f64; 2], [usiz
     all.find(|(_, [own, opposite])| *opposite > 0 && own != opposite)
 }
 
-// The words, numbers and signs of a name: `cat_g1+0.02_7` states its shear by a sign.
-fn parts(name: &str) -> Vec<&str> {
-    let kind = |c: char| match c {
-        c if c.is_ascii_digit() => 1,
-        c if c.is_alphabetic() => 2,
-        '+' | '-' => 3,
-        _ => 0,
-    };
-    let ends = name.char_indices().zip(name.chars().skip(1));
-    let ends = ends.filter(|((_, a), b)| kind(*a) != kind(*b));
-    let mut start = 0;
-    let ends: Vec<usize> = ends.map(|((at, a), _)| at + a.len_utf8()).collect();
-    let mut parts = Vec::new();
-    for end in ends.into_iter().chain([name.len()]) {
-        let part = &name[start..end];
-        if part.chars().all(|c| kind(c) != 0) && !part.is_empty() {
-            parts.push(part);
-        }
-        start = end;
+// The group of each catalogue, and whether names state it. Without names, the k-th catalogues of each shear belong together,
+// as files are listed.
+fn numbers(catalogues: &[Catalogue], design: Design) -> (Vec<u32>, bool) {
+    let arms = arms(catalogues);
+    // Fields with a shear each: versions of a field have its shear.
+    if design == Design::Fields && names::count(&arms) >= MIN_GROUPS {
+        return (arms, true);
     }
-    parts
-}
-
-// The group of each catalogue by the parts of its name that do not follow from its shear, such as `tile03` of
-// `plus/tile03.fits` and `minus/tile03.fits`. `None` if names do not state it: they have different numbers of parts, the
-// names of one shear are not distinct, or less than half of the groups are complete. Without names, four shears of 24 tiles,
-// two of them missing, became 94 independent catalogues, and m = 0.043 ± 0.089 instead of ± 0.022.
-fn by_name(catalogues: &[Catalogue]) -> Option<Vec<u32>> {
-    let shears: Vec<[f64; 2]> = catalogues
-        .iter()
-        .map(Catalogue::constant)
-        .collect::<Option<_>>()?;
-    let names: Vec<Vec<&str>> = catalogues.iter().map(|own| parts(&own.name)).collect();
-    let length = names.first()?.len();
-    if names.iter().any(|parts| parts.len() != length) {
-        return None;
-    }
-    let kinds = kinds(&shears);
-    let kind_of = |k: usize| kinds.iter().position(|kind| same(*kind, shears[k]));
-    let kind_of: Vec<usize> = (0..shears.len()).map(kind_of).collect::<Option<_>>()?;
-    // A part states the shear if all catalogues of a shear have it, and not all catalogues.
-    let states_shear = |part: usize| {
-        let mut of_kind: Vec<Option<&str>> = vec![None; kinds.len()];
-        let constant = names
-            .iter()
-            .zip(&kind_of)
-            .all(|(parts, kind)| *of_kind[*kind].get_or_insert(parts[part]) == parts[part]);
-        constant && of_kind.iter().any(|own| *own != of_kind[0])
-    };
-    let kept: Vec<usize> = (0..length).filter(|part| !states_shear(*part)).collect();
-    let mut groups: BTreeMap<Vec<&str>, u32> = BTreeMap::new();
-    let (mut numbers, mut seen) = (Vec::new(), BTreeSet::new());
-    for (parts, kind) in names.iter().zip(&kind_of) {
-        let key: Vec<&str> = kept.iter().map(|part| parts[*part]).collect();
-        let next = groups.len() as u32;
-        let number = *groups.entry(key).or_insert(next);
-        if !seen.insert((number, *kind)) {
-            return None;
-        }
-        numbers.push(number);
-    }
-    let of_group = |number: u32| numbers.iter().filter(|own| **own == number).count();
-    let complete = (0..groups.len() as u32).filter(|number| of_group(*number) == kinds.len());
-    (2 * complete.count() >= groups.len()).then_some(numbers)
-}
-
-// The group of each catalogue: by name, or else the k-th catalogues of each shear belong together, as files are listed.
-fn numbers(catalogues: &[Catalogue], design: Design) -> Vec<u32> {
-    if matches!(design, Design::Pairs | Design::Arms)
-        && let Some(numbers) = by_name(catalogues)
+    if design != Design::Rotated
+        && let Some(numbers) = names::groups(catalogues)
+        && (design != Design::Fields || names::count(&numbers) > 1)
     {
-        return numbers;
+        return (numbers, true);
     }
-    let number = |k: usize| -> usize {
-        match design {
-            Design::Pairs | Design::Arms => {
-                let own = catalogues[k].constant();
-                let alike = |other: &&Catalogue| match (other.constant(), own) {
-                    (Some(other), Some(own)) => same(other, own),
-                    (other, own) => other == own,
-                };
-                catalogues[..k].iter().filter(alike).count()
-            }
-            Design::Rotated => k / 2,
-            _ => k,
-        }
+    let number = |k: usize| match design {
+        Design::Pairs | Design::Arms => arms[..k].iter().filter(|arm| **arm == arms[k]).count(),
+        Design::Rotated => k / 2,
+        _ => k,
     };
-    (0..catalogues.len()).map(|k| number(k) as u32).collect()
+    let numbers = (0..catalogues.len()).map(|k| number(k) as u32).collect();
+    (numbers, false)
 }
 
 #[cfg(test)]
@@ -532,9 +568,9 @@ mod tests {
     fn the_same_catalogue_of_each_shear_belongs_to_a_group() {
         let (plus, minus) = ([0.02, 0.0], [-0.02, 0.0]);
         let shears = catalogues(&[plus, plus, minus, minus]);
-        assert_eq!(numbers(&shears, Design::Pairs), [0, 1, 0, 1]);
-        assert_eq!(numbers(&shears, Design::Rotated), [0, 0, 1, 1]);
-        assert_eq!(numbers(&shears, Design::Fields), [0, 1, 2, 3]);
+        assert_eq!(numbers(&shears, Design::Pairs).0, [0, 1, 0, 1]);
+        assert_eq!(numbers(&shears, Design::Rotated).0, [0, 0, 1, 1]);
+        assert_eq!(numbers(&shears, Design::Fields).0, [0, 1, 2, 3]);
     }
 
     fn named(of: &[(&str, [f64; 2])]) -> Vec<Catalogue> {
@@ -559,7 +595,7 @@ mod tests {
             ("1m2z/tile02.fits", minus),
         ]);
         assert_eq!(Design::of(&tiles, true), Design::Pairs);
-        let numbers = numbers(&tiles, Design::Pairs);
+        let numbers = numbers(&tiles, Design::Pairs).0;
         assert_eq!(numbers, [0, 1, 2, 2, 3, 0, 1]);
         let expected = Missing {
             beside: "1m2z/tile03.fits".into(),
@@ -573,7 +609,7 @@ mod tests {
             ("cat_g1-0.02_9.csv", minus),
             ("cat_g1-0.02_7.csv", minus),
         ]);
-        assert_eq!(by_name(&signs), Some(vec![0, 1, 1, 0]));
+        assert_eq!(names::groups(&signs), Some(vec![0, 1, 1, 0]));
         // Numbers that go on do not pair; the order does.
         let runs = named(&[
             ("run1", plus),
@@ -581,8 +617,11 @@ mod tests {
             ("run3", minus),
             ("run4", minus),
         ]);
-        assert_eq!(by_name(&runs), None);
-        assert_eq!(super::numbers(&runs, Design::Pairs), [0, 1, 0, 1]);
+        assert_eq!(names::groups(&runs), None);
+        assert_eq!(
+            super::numbers(&runs, Design::Pairs),
+            (vec![0, 1, 0, 1], false)
+        );
         let three = named(&[("a1", plus), ("b2", plus), ("c3", minus)]);
         assert_eq!(Design::of(&three, true), Design::Fields);
     }

@@ -1,11 +1,12 @@
 //! Estimates with errors from a jackknife over units, which contain the correlation of galaxies within a unit.
 
+use crate::arms::{Totals, Unit, Units};
 use crate::design::Grouping;
 use crate::error::{BiasError, MIN_FITTED_RESPONSE_SIGNIFICANCE};
-use crate::fit::{self, ESTIMATES, Estimates, Known, Plan, RESPONSE};
+use crate::fit::{self, ESTIMATES, Estimates, Known, M, MEAN_M, Plan, RESPONSE};
 use crate::stars::Behind;
 use crate::sums::{WEIGHT, WEIGHT2};
-use crate::units::{UnitSums, add};
+use crate::units::add;
 
 /// A quantity that is estimated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -56,6 +57,12 @@ pub const QUANTITIES: [Quantity; ESTIMATES] = [
     quantity("r2", "⟨R22⟩", "mean response of component 2"),
     quantity("r12", "⟨R12⟩", "mean response of e1 to g2"),
     quantity("r21", "⟨R21⟩", "mean response of e2 to g1"),
+    quantity(
+        "m_mean",
+        "(m1+m2)/2",
+        "mean multiplicative bias (m1 + m2)/2",
+    ),
+    quantity("r_mean", "⟨R⟩", "mean response (R11 + R22)/2"),
 ];
 
 /// A value with its standard error.
@@ -91,16 +98,24 @@ impl Estimate {
         let (value, error) = (self.values[place], self.errors[place]);
         value.is_finite().then_some(Measured { value, error })
     }
+
+    /// Covariance of m1 and m2; `None` if the data do not determine both.
+    pub fn covariance(&self) -> Option<f64> {
+        // Of the variances of m1, m2 and (m1 + m2)/2, which contain the noise of stars, too.
+        let variance = |place: usize| self.errors[place] * self.errors[place];
+        let covariance = 2.0 * variance(MEAN_M) - (variance(M[0]) + variance(M[1])) / 2.0;
+        covariance.is_finite().then_some(covariance)
+    }
 }
 
-/// Estimates of the units of a `bin`, with `truth` whether the true shears are known; without, only c, α and responses follow.
+/// Estimates of a `bin`, with `truth` whether the true shears are known; without, only c, α and responses follow.
 /// Errors do not contain the noise of stars; see [`Grouping::estimate`].
 ///
 /// # Errors
 /// [`BiasError::NoGalaxies`] or [`BiasError::FewUnits`] if no galaxy or only one unit was added to the bin, and
 /// [`BiasError::Response`] if a mean response is below five standard errors.
-pub fn estimate(sums: &UnitSums, bin: usize, truth: bool) -> Result<Estimate, BiasError> {
-    behind_stars(sums, &[], bin, truth)
+pub fn estimate(units: &Units, bin: usize, truth: bool) -> Result<Estimate, BiasError> {
+    behind_stars((units, &[]), (bin, None), truth)
 }
 
 impl Grouping {
@@ -109,35 +124,48 @@ impl Grouping {
     /// # Errors
     /// As [`estimate`].
     pub fn estimate(&self, bin: usize, truth: bool) -> Result<Estimate, BiasError> {
-        behind_stars(&self.sums, &self.stars, bin, truth)
+        behind_stars((&self.units, &self.stars), (bin, None), truth)
+    }
+
+    /// Estimates for another population, in which the weights of the galaxies of bin k have the share `shares[k]`: the
+    /// galaxies of each bin are weighted by `shares[k]`/Σ w of the bin. Errors are those of the weighted galaxies; the
+    /// shares are known exactly. Bins without galaxies have to have no share.
+    ///
+    /// # Errors
+    /// As [`estimate`].
+    pub fn estimate_like(&self, shares: &[f64], truth: bool) -> Result<Estimate, BiasError> {
+        behind_stars((&self.units, &self.stars), (0, Some(shares)), truth)
     }
 }
 
 fn behind_stars(
-    sums: &UnitSums,
-    stars: &[Behind],
-    bin: usize,
+    (units, stars): (&Units, &[Behind]),
+    (bin, shares): (usize, Option<&[f64]>),
     truth: bool,
 ) -> Result<Estimate, BiasError> {
-    let units = sums.of_bin(bin);
-    let mut total = vec![0.0; sums.layout().len()];
-    for unit in &units {
-        add(&mut total, unit);
-    }
-    if fit::count(&total) == 0.0 {
+    let count = shares.map_or(1, <[f64]>::len);
+    let layout = units.layout();
+    let units = units.of_bins(bin, count);
+    let totals = Totals::new(layout, &units, shares);
+    let total = &totals.all;
+    if fit::count(total) == 0.0 {
         return Err(BiasError::NoGalaxies);
     }
     if units.len() < 2 {
         return Err(BiasError::FewUnits { found: units.len() });
     }
-    let plan = Plan::new(sums.layout(), &total, truth);
-    let values = plan.estimates(&total);
     // The bins and terms that all units determine are estimated from each part of them: a unit that is left out changes
     // values, not their meaning.
-    let mut errors = jackknife(&plan, &total, &units);
+    let plan = Plan::new(layout.with_response(), total, truth);
+    let values = plan.estimates(total);
+    let left_out = units
+        .iter()
+        .map(|unit| plan.estimates(&totals.without(unit)));
+    let mut errors = jackknife(&left_out.collect::<Vec<_>>());
     for star in stars {
-        let units = (star.sums.of_bin(bin), units.len());
-        let more = variances(&plan, (&total, &values), star, units);
+        let behind = star.units.of_bins(bin, count);
+        let sums = behind.iter().map(|unit| totals.of_unit(unit)).collect();
+        let more = variances(&plan, (total, &values), star, (sums, units.len()));
         for (error, more) in errors.iter_mut().zip(more) {
             *error = error.hypot(more.sqrt());
         }
@@ -170,43 +198,39 @@ fn behind_stars(
 /// # Errors
 /// As [`estimate`], of either program.
 pub fn difference(
-    sums: &UnitSums,
-    other: &UnitSums,
+    units: &Units,
+    other: &Units,
     bin: usize,
     truth: bool,
 ) -> Result<Estimate, BiasError> {
-    let first = estimate(sums, bin, truth)?;
+    let first = estimate(units, bin, truth)?;
     let second = estimate(other, bin, truth)?;
-    let units = sums.pairs_with(other, bin);
-    let plan_of = |place: usize, sums: &UnitSums| {
-        let mut total = vec![0.0; sums.layout().len()];
-        for unit in units.iter().filter_map(|pair| pair[place].as_deref()) {
-            add(&mut total, unit);
-        }
-        (Plan::new(sums.layout(), &total, truth), total)
-    };
-    let both = [plan_of(0, sums), plan_of(1, other)];
-    let without = |pair: Option<&[Option<Vec<f64>>; 2]>| -> Estimates {
-        let [a, b] = [0, 1].map(|place| {
-            let (plan, total) = &both[place];
-            let mut rest = total.clone();
-            if let Some(unit) = pair.and_then(|pair| pair[place].as_ref()) {
-                for (rest, unit) in rest.iter_mut().zip(unit) {
-                    *rest -= unit;
-                }
+    let sides = units.aligned(other);
+    let pairs = Units::pairs(&sides, bin);
+    let totals = [0, 1].map(|side| {
+        let layout = sides[side].layout();
+        let own: Vec<Unit<'_>> = pairs.iter().filter_map(|pair| pair[side].clone()).collect();
+        let totals = Totals::new(layout, &own, None);
+        let plan = Plan::new(layout.with_response(), &totals.all, truth);
+        (plan, totals)
+    });
+    let without = |pair: &[Option<Unit<'_>>; 2]| -> Estimates {
+        let [a, b] = [0, 1].map(|side| {
+            let (plan, totals) = &totals[side];
+            match &pair[side] {
+                None => plan.estimates(&totals.all),
+                Some(unit) => plan.estimates(&totals.without(unit)),
             }
-            plan.estimates(&rest)
         });
         std::array::from_fn(|k| a[k] - b[k])
     };
-    let left_out: Vec<Estimates> = units.iter().map(|pair| without(Some(pair))).collect();
-    let n = units.len() as f64;
+    let left_out: Vec<Estimates> = pairs.iter().map(without).collect();
     Ok(Estimate {
         galaxies: first.galaxies.min(second.galaxies),
         effective: first.effective.min(second.effective),
-        units: units.len(),
-        values: without(None),
-        errors: squares(&left_out).map(|sum| ((n - 1.0) / n * sum).sqrt()),
+        units: pairs.len(),
+        values: without(&[None, None]),
+        errors: jackknife(&left_out),
         assumes_no_c: [0, 1].map(|k| first.assumes_no_c[k] || second.assumes_no_c[k]),
     })
 }
@@ -220,7 +244,7 @@ fn variances(
     plan: &Plan,
     (total, values): (&[f64], &Estimates),
     star: &Behind,
-    (units, n): (Vec<&[f64]>, usize),
+    (units, n): (Vec<Vec<f64>>, usize),
 ) -> Estimates {
     let mut own = vec![0.0; total.len()];
     for unit in &units {
@@ -257,23 +281,12 @@ fn variances(
 }
 
 // σ² = (n − 1)/n Σ (θ₍ᵢ₎ − ⟨θ₍ᵢ₎⟩)² (Efron & Stein 1981, Annals of Statistics 9, 586).
-fn jackknife(plan: &Plan, total: &[f64], units: &[&[f64]]) -> Estimates {
-    let mut rest = vec![0.0; total.len()];
-    let left_out = units.iter().map(|unit| {
-        // Subtracting a unit and adding it cost the same: n units need n estimates instead of n² sums.
-        for ((rest, total), unit) in rest.iter_mut().zip(total).zip(*unit) {
-            *rest = total - unit;
-        }
-        plan.estimates(&rest)
-    });
-    let n = units.len() as f64;
-    squares(&left_out.collect::<Vec<_>>()).map(|sum| ((n - 1.0) / n * sum).sqrt())
-}
-
-fn squares(all: &[Estimates]) -> Estimates {
+fn jackknife(left_out: &[Estimates]) -> Estimates {
+    let n = left_out.len() as f64;
     // In two passes: the squares of m would lose digits if its error is 10⁻⁸.
     std::array::from_fn(|k| {
-        let mean = all.iter().map(|values| values[k]).sum::<f64>() / all.len() as f64;
-        all.iter().map(|values| (values[k] - mean).powi(2)).sum()
+        let mean = left_out.iter().map(|values| values[k]).sum::<f64>() / n;
+        let squares = left_out.iter().map(|values| (values[k] - mean).powi(2));
+        ((n - 1.0) / n * squares.sum::<f64>()).sqrt()
     })
 }

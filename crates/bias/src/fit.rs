@@ -18,8 +18,11 @@ pub(crate) const CROSS: [usize; 2] = [14, 15];
 pub(crate) const RESPONSE: [usize; 2] = [16, 17];
 /// R12 and R21.
 pub(crate) const OTHER_RESPONSE: [usize; 2] = [18, 19];
+/// (m1 + m2)/2 and (R11 + R22)/2.
+pub(crate) const MEAN_M: usize = 20;
+pub(crate) const MEAN_RESPONSE: usize = 21;
 /// Number of estimates.
-pub(crate) const ESTIMATES: usize = 20;
+pub(crate) const ESTIMATES: usize = 22;
 
 /// Estimates; NaN for those that the data do not determine.
 pub(crate) type Estimates = [f64; ESTIMATES];
@@ -51,9 +54,9 @@ pub(crate) struct Plan {
 }
 
 impl Plan {
-    // Of the sums of all units: parts of them, from which errors follow, have to be estimated with the same terms.
+    /// Of the sums of all units, with the response of sheared catalogues ([`Layout::with_response`]). Parts of them, from
+    /// which errors follow, are estimated with the same terms.
     pub(crate) fn new(layout: Layout, sums: &[f64], truth: bool) -> Self {
-        let extra = layout.extra(sums).own;
         let mut plan = Plan {
             layout,
             truth,
@@ -65,24 +68,22 @@ impl Plan {
         };
         for k in 0..layout.components() {
             let of = layout.of(sums, k);
-            let extra = extra[k];
             // One shear of zero determines c, and one other shear m if c is zero.
-            let zero = of.response(OWN, OWN, extra) == 0.0;
-            plan.known[k] = match (truth && !zero, solve(&of, &[ONE, OWN], extra)) {
+            let zero = of.response(OWN, OWN) == 0.0;
+            plan.known[k] = match (truth && !zero, solve(&of, &[ONE, OWN])) {
                 (false, _) => Known::OnlyC,
                 (true, Some(_)) => Known::Both,
                 (true, None) => Known::OnlyM,
             };
             if k < 2 && plan.known[k] == Known::Both {
-                plan.quadratic[k] = solve(&of, &[ONE, OWN, SQUARE], extra).is_some();
-                plan.cross[k] = solve(&of, &[ONE, OWN, OTHER], extra).is_some();
+                plan.quadratic[k] = solve(&of, &[ONE, OWN, SQUARE]).is_some();
+                plan.cross[k] = solve(&of, &[ONE, OWN, OTHER]).is_some();
             }
         }
         if layout.psf {
             let of = |k| layout.of(sums, k);
-            let all = |terms: &[usize]| {
-                (0..2).all(|k| solve(&of(k), &plan.with(k, terms), extra[k]).is_some())
-            };
+            let all =
+                |terms: &[usize]| (0..2).all(|k| solve(&of(k), &plan.with(k, terms)).is_some());
             let (leakage, size_leakage) = (all(&[PSF]), all(&[PSF, PSF_SIZE]));
             plan.leakage = leakage;
             plan.size_leakage = leakage && size_leakage;
@@ -115,23 +116,17 @@ impl Plan {
     fn solve(&self, sums: &[f64], k: usize, terms: &[usize], others: &[usize]) -> Option<Solution> {
         match self.layout.matrix {
             true => solve_both(self.layout, sums, k, [terms, others]),
-            false => solve(
-                &self.layout.of(sums, k),
-                terms,
-                self.layout.extra(sums).own[k],
-            ),
+            false => solve(&self.layout.of(sums, k), terms),
         }
     }
 
     /// The estimates of sums.
     pub(crate) fn estimates(&self, sums: &[f64]) -> Estimates {
         let layout = self.layout;
-        let extra = layout.extra(sums);
         let mut found = [f64::NAN; ESTIMATES];
         for k in 0..layout.components() {
             let terms = self.main_terms(k);
             let of = layout.of(sums, k);
-            let own = extra.own[k];
             let solved = match (layout.matrix, self.known[k]) {
                 (true, _) | (false, Known::Both) => {
                     self.solve(sums, k, terms, self.main_terms(k ^ 1))
@@ -139,7 +134,7 @@ impl Plan {
                 // One unknown is a ratio.
                 (false, Known::OnlyM | Known::OnlyC) => {
                     let mut x = [0.0; MAX_TERMS];
-                    x[0] = of.with_e[terms[0]] / of.response(terms[0], terms[0], own);
+                    x[0] = of.with_e[terms[0]] / of.response(terms[0], terms[0]);
                     Some(x)
                 }
             };
@@ -154,9 +149,9 @@ impl Plan {
         }
         for k in 0..2 {
             let of = layout.of(sums, k);
-            found[RESPONSE[k]] = of.response(ONE, ONE, extra.own[k]) / sums[WEIGHT];
+            found[RESPONSE[k]] = of.response(ONE, ONE) / sums[WEIGHT];
             if let Some(mixed) = layout.mixed(sums, k) {
-                found[OTHER_RESPONSE[k]] = mixed.response(ONE, ONE, extra.other[k]) / sums[WEIGHT];
+                found[OTHER_RESPONSE[k]] = mixed.response(ONE, ONE) / sums[WEIGHT];
             }
             let last = |terms: &[usize], others: &[usize]| {
                 let solved = self.solve(sums, k, terms, others);
@@ -178,6 +173,9 @@ impl Plan {
                 found[LEAKAGE_OF[k]] = last(&self.with(k, &[PSF]), &self.with(k ^ 1, &[PSF]));
             }
         }
+        for (mean, [a, b]) in [(MEAN_M, [M[0], M[1]]), (MEAN_RESPONSE, RESPONSE)] {
+            found[mean] = (found[a] + found[b]) / 2.0;
+        }
         if self.leakage {
             found[LEAKAGE] = self.joint(sums, &[PSF]);
         }
@@ -193,8 +191,7 @@ impl Plan {
     /// difference of m, and of c for each component.
     pub(crate) fn shifted(&self, sums: &[f64], own: &[f64], change: (f64, [f64; 4])) -> Estimates {
         let mut changed = sums.to_vec();
-        let extra = self.layout.extra(sums);
-        self.layout.shift(&mut changed, own, extra, change);
+        self.layout.shift(&mut changed, own, change);
         self.estimates(&changed)
     }
 
@@ -202,9 +199,9 @@ impl Plan {
     // Tangential and cross components entered at first, too, and α was 0.073 instead of 0.08.
     fn joint(&self, sums: &[f64], more: &[usize]) -> f64 {
         let (mut sum, mut weight) = (0.0, 0.0);
-        for (k, extra) in self.layout.extra(sums).own.into_iter().take(2).enumerate() {
+        for k in 0..2 {
             let terms = self.with(k, more);
-            let alone = last_of(&self.layout.of(sums, k), &terms, extra);
+            let alone = last_of(&self.layout.of(sums, k), &terms);
             let Some((mut x, pivot)) = alone else {
                 continue;
             };
@@ -227,30 +224,30 @@ pub(crate) fn count(sums: &[f64]) -> f64 {
 type Solution = [f64; MAX_TERMS];
 
 /// Solves Σ_t x_t Σ w R z_s z_t = Σ w e z_s over the given terms; `None` if the terms are not independent.
-fn solve(of: &Component<'_>, terms: &[usize], extra: f64) -> Option<Solution> {
-    eliminate(of, terms, extra).map(|(x, _)| x)
+fn solve(of: &Component<'_>, terms: &[usize]) -> Option<Solution> {
+    eliminate(of, terms).map(|(x, _)| x)
 }
 
 /// The last unknown with its pivot, which is its weight in a mean.
-fn last_of(of: &Component<'_>, terms: &[usize], extra: f64) -> Option<(f64, f64)> {
-    eliminate(of, terms, extra).map(|(x, pivot)| (x[terms.len() - 1], pivot))
+fn last_of(of: &Component<'_>, terms: &[usize]) -> Option<(f64, f64)> {
+    eliminate(of, terms).map(|(x, pivot)| (x[terms.len() - 1], pivot))
 }
 
 // Gaussian elimination of a symmetric matrix without exchange of rows, after scaling its diagonal to ±1: shears of 10⁻² have
 // squares of 10⁻⁸ of the constant's, and one threshold for pivots serves all terms.
-fn eliminate(of: &Component<'_>, terms: &[usize], extra: f64) -> Option<(Solution, f64)> {
+fn eliminate(of: &Component<'_>, terms: &[usize]) -> Option<(Solution, f64)> {
     let n = terms.len();
     let mut a = [[0.0; MAX_TERMS + 1]; MAX_TERMS];
     let mut scale = [0.0; MAX_TERMS];
     for (i, &s) in terms.iter().enumerate() {
-        scale[i] = of.response(s, s, extra).abs().sqrt();
+        scale[i] = of.response(s, s).abs().sqrt();
         if !(scale[i] > 0.0 && scale[i].is_finite()) {
             return None;
         }
     }
     for (i, &s) in terms.iter().enumerate() {
         for (j, &t) in terms.iter().enumerate() {
-            a[i][j] = of.response(s, t, extra) / (scale[i] * scale[j]);
+            a[i][j] = of.response(s, t) / (scale[i] * scale[j]);
         }
         a[i][n] = of.with_e[s] / scale[i];
     }
@@ -275,7 +272,6 @@ fn solve_both(
     k: usize,
     [terms, others]: [&[usize]; 2],
 ) -> Option<Solution> {
-    let extra = layout.extra(sums);
     let unknowns = || {
         let own = terms.iter().map(|t| (k, *t));
         own.chain(others.iter().map(|t| (k ^ 1, *t)))
@@ -285,8 +281,8 @@ fn solve_both(
     let response = |(a, s): (usize, usize), (b, t): (usize, usize)| {
         let (_, alone, mixed) = of(a);
         match (a == b, mixed) {
-            (true, _) => alone.response(s, t, extra.own[a]),
-            (false, Some(mixed)) => mixed.response(s, t, extra.other[a]),
+            (true, _) => alone.response(s, t),
+            (false, Some(mixed)) => mixed.response(s, t),
             (false, None) => 0.0,
         }
     };

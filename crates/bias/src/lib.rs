@@ -17,6 +17,7 @@
 //! this is (⟨e⟩₊/⟨R⟩₊ − ⟨e⟩₋/⟨R⟩₋)/2γ − 1. Weights enter both sides. If the weight depends on the shear, w R is
 //! replaced by d(w e)/dg = w R + e dw/dg. If galaxies are selected by measured quantities, the mean response R_S of the
 //! selection adds to R, from catalogues that were selected after shearing the images (Sheldon & Huff 2017, ApJ 841, 24).
+//! It is a difference of weighted means, and each arm (the catalogues under one test shear) has its own ([`Units`]).
 //!
 //! With R12 and R21 ([`Layout::matrix`]) e_k also contains R_kj times the shear that the fit gives to the other component j,
 //! and Σ_t x_jt Σ w R_kj z_ks z_jt adds to the left side. Both components are then solved together, so that for m and c
@@ -24,6 +25,7 @@
 //!
 //! * [`Row`] and [`Layout`]: one galaxy, and the terms that are summed.
 //! * [`UnitSums`]: sums per unit and bin, in bounded memory; they merge.
+//! * [`Units`]: sums of the units of a jackknife, by arm.
 //! * [`Design`]: how catalogues belong together, recognised from their true shears.
 //! * [`StarNoise`]: an error of m and c that all galaxies behind one star have in common.
 //! * [`estimate`] and [`Grouping::estimate`]: values with errors; [`Verdict`]: comparison with a requirement.
@@ -31,16 +33,21 @@
 #![warn(missing_docs, clippy::missing_errors_doc)]
 #![forbid(unsafe_code)]
 
+mod arms;
 mod design;
 mod error;
 mod estimate;
 mod fit;
+mod names;
 mod stars;
 mod sums;
 mod units;
 mod verdict;
 
-pub use design::{Catalogue, Design, Dominant, Grouping, Missing, Range, Repeated, group};
+pub use arms::Units;
+pub use design::{
+    Catalogue, Design, Dominant, Grouping, Missing, Range, Repeated, WithoutPartner, group,
+};
 pub use error::BiasError;
 pub use estimate::{Estimate, Measured, QUANTITIES, Quantity, difference, estimate};
 pub use stars::{Behind, StarNoise};

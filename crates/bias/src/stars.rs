@@ -6,6 +6,7 @@ use std::collections::{BTreeMap, BTreeSet};
 
 use serde::{Deserialize, Serialize};
 
+use crate::arms::Units;
 use crate::units::UnitSums;
 
 /// The noise of the star that is the PSF of all galaxies of a catalogue.
@@ -26,7 +27,7 @@ pub struct Behind {
     pub(crate) m: f64,
     pub(crate) c: f64,
     /// Their sums: by unit, or in one if every unit has galaxies of all catalogues.
-    pub(crate) sums: UnitSums,
+    pub(crate) units: Units,
     pub(crate) by_unit: bool,
 }
 
@@ -34,7 +35,7 @@ impl Behind {
     /// The same galaxies with all bins joined to one.
     pub(crate) fn all_bins(&self) -> Self {
         Behind {
-            sums: self.sums.all_bins(),
+            units: self.units.all_bins(),
             ..*self
         }
     }
@@ -46,6 +47,7 @@ pub(crate) fn shared(
     sums: &UnitSums,
     noises: &[Option<&StarNoise>],
     units: Option<&[u32]>,
+    arm: impl Fn(u32) -> u32 + Copy,
 ) -> Vec<Behind> {
     let mut stars: BTreeMap<&str, (BTreeSet<u32>, [f64; 2])> = BTreeMap::new();
     for (catalogue, noise) in (0..).zip(noises) {
@@ -63,13 +65,13 @@ pub(crate) fn shared(
     let behind = stars.into_values().map(|(catalogues, [m, c])| Behind {
         m,
         c,
-        sums: sums
+        units: sums
             .of_catalogues(|catalogue| catalogues.contains(&catalogue))
-            .by_group(unit),
+            .by_group(arm, unit),
         by_unit: units.is_some(),
     });
     // A star in one unit differs from unit to unit, and is in the jackknife.
     behind
-        .filter(|star| !star.by_unit || star.sums.count() > 1)
+        .filter(|star| !star.by_unit || star.units.count() > 1)
         .collect()
 }

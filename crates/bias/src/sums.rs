@@ -256,16 +256,29 @@ impl Layout {
         }
     }
 
+    /// Adds `sums` to `into` as if the weight of each galaxy were multiplied by `factor`.
+    pub(crate) fn add_weighted(into: &mut [f64], sums: &[f64], factor: f64) {
+        for (at, (into, value)) in into.iter_mut().zip(sums).enumerate() {
+            *into += match at {
+                COUNT => *value,
+                WEIGHT2 => factor * factor * value,
+                _ => factor * value,
+            };
+        }
+    }
+
     /// Mean ellipticity.
     pub(crate) fn mean(self, sums: &[f64]) -> [f64; 2] {
         [0, 1].map(|k| self.of(sums, k).with_e[ONE] / sums[WEIGHT])
     }
 
-    /// Mean response from sheared catalogues; zero without them.
-    pub(crate) fn extra(self, sums: &[f64]) -> Extra {
-        if !self.sheared {
-            return Extra::default();
-        }
+    /// Number of galaxies, and Σ w e g of both components.
+    pub(crate) fn counts_and_slopes(self, sums: &[f64]) -> (f64, [f64; 2]) {
+        (sums[COUNT], [0, 1].map(|k| self.of(sums, k).with_e[OWN]))
+    }
+
+    /// Mean response from the sheared catalogues of these sums; NaN if one of them has no galaxy.
+    pub(crate) fn mean_response(self, sums: &[f64]) -> MeanResponse {
         // The sum of weights differs from catalogue to catalogue, because each selects and weights other galaxies. Four
         // catalogues are needed because a selection responds to each component, and a one-sided difference has an error of
         // first order in h.
@@ -275,7 +288,7 @@ impl Layout {
             of(2 * k) - of(2 * k + 1)
         };
         let [a, b] = [own(0), own(1)];
-        let mut extra = Extra {
+        let mut response = MeanResponse {
             own: [a, b, (a + b) / 2.0, (a + b) / 2.0],
             other: [0.0; 4],
         };
@@ -287,31 +300,68 @@ impl Layout {
             };
             let [a, b] = [other(0), other(1)];
             // In a frame of random directions only the antisymmetric part is left.
-            extra.other = [a, b, (a - b) / 2.0, (b - a) / 2.0];
+            response.other = [a, b, (a - b) / 2.0, (b - a) / 2.0];
         }
-        extra
+        response
+    }
+
+    /// The layout of sums with the mean response of sheared catalogues in the response of each row.
+    pub(crate) fn with_response(self) -> Self {
+        Layout {
+            sheared: false,
+            ..self
+        }
+    }
+
+    /// Adds `sums` to `into`, sums of the layout [`Layout::with_response`], with the mean response of the sheared catalogues
+    /// added to the response of each row: Σ w (R + mean) z z'.
+    pub(crate) fn add_with_response(self, into: &mut [f64], sums: &[f64], mean: &MeanResponse) {
+        let mut add = |at: usize, value: f64| into[at] += value;
+        (0..HEAD).for_each(|at| add(at, sums[at]));
+        let (target, n) = (self.with_response(), self.terms());
+        let with_weight = if self.sheared { triangle(n) } else { 0 };
+        for k in 0..self.components() {
+            let own = &sums[HEAD + k * self.of_component()..];
+            let start = HEAD + k * target.of_component();
+            for (at, value) in own[..target.of_component()].iter().enumerate() {
+                add(start + at, *value);
+            }
+            let weights = &own[target.of_component()..][..with_weight];
+            for (at, weight) in weights.iter().enumerate() {
+                add(start + n + at, mean.own[k] * weight);
+            }
+        }
+        for pair in 0..self.components() / 2 {
+            let start = self.matrix_start() + self.of_other_components() + pair * self.of_pair();
+            let own = &sums[start..start + self.of_pair()];
+            let start = target.matrix_start() + pair * target.of_pair();
+            let (responses, weights) = own.split_at(target.of_pair());
+            for (at, value) in responses.iter().enumerate() {
+                add(start + at, *value);
+            }
+            // Of the first component with the second one: the response R21 has the terms in the other order.
+            for (at, weight) in weights.iter().enumerate() {
+                let transposed = at % n * n + at / n;
+                add(start + at, mean.other[2 * pair] * weight);
+                add(
+                    start + n * n + transposed,
+                    mean.other[2 * pair + 1] * weight,
+                );
+            }
+        }
     }
 
     // Changes `sums` as if some of their galaxies, which have the sums `own`, had a larger m and c: e becomes e + R (m g + c),
-    // because a wrong PSF changes the shear before the response. R is the response of the row plus `extra`.
-    pub(crate) fn shift(
-        self,
-        sums: &mut [f64],
-        own: &[f64],
-        extra: Extra,
-        (m, c): (f64, [f64; 4]),
-    ) {
+    // because a wrong PSF changes the shear before the response.
+    pub(crate) fn shift(self, sums: &mut [f64], own: &[f64], (m, c): (f64, [f64; 4])) {
         for k in 0..self.components() {
             let of = self.of(own, k);
             let mixed = self.mixed(own, k);
             let start = HEAD + k * self.of_component();
             for (s, with_e) in sums[start..][..self.terms()].iter_mut().enumerate() {
-                let by = extra.own[k];
-                *with_e += m * of.response(s, OWN, by) + c[k] * of.response(s, ONE, by);
+                *with_e += m * of.response(s, OWN) + c[k] * of.response(s, ONE);
                 if let Some(mixed) = &mixed {
-                    let (by, other) = (extra.other[k], k ^ 1);
-                    *with_e +=
-                        m * mixed.response(s, OWN, by) + c[other] * mixed.response(s, ONE, by);
+                    *with_e += m * mixed.response(s, OWN) + c[k ^ 1] * mixed.response(s, ONE);
                 }
             }
         }
@@ -323,15 +373,13 @@ impl Layout {
             return None;
         }
         let n = self.terms();
-        let (pair, transposed) = (component / 2, component % 2 == 1);
-        let start = self.matrix_start() + self.of_other_components() + pair * self.of_pair();
-        let (responses, weights) = sums[start..start + self.of_pair()].split_at(2 * n * n);
-        let (first, second) = responses.split_at(n * n);
+        let start = self.matrix_start()
+            + self.of_other_components()
+            + component / 2 * self.of_pair()
+            + component % 2 * n * n;
         Some(Mixed {
-            with_response: if transposed { second } else { first },
-            with_weight: weights,
+            with_response: &sums[start..start + n * n],
             terms: n,
-            transposed,
         })
     }
 
@@ -340,12 +388,10 @@ impl Layout {
         let n = self.terms();
         let start = HEAD + component * self.of_component();
         let own = &sums[start..start + self.of_component()];
-        let (with_e, matrices) = own.split_at(n);
-        let (with_response, with_weight) = matrices.split_at(triangle(n));
+        let (with_e, with_response) = own.split_at(n);
         Component {
             with_e,
             with_response,
-            with_weight,
         }
     }
 }
@@ -353,32 +399,28 @@ impl Layout {
 /// Mean responses from sheared catalogues of the four components: to the own component of shear, and to the other one of
 /// the pair.
 #[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct Extra {
-    pub(crate) own: [f64; 4],
-    pub(crate) other: [f64; 4],
+pub(crate) struct MeanResponse {
+    own: [f64; 4],
+    other: [f64; 4],
+}
+
+impl MeanResponse {
+    pub(crate) fn is_finite(self) -> bool {
+        self.own.iter().chain(&self.other).all(|r| r.is_finite())
+    }
 }
 
 /// Sums of a component k and the other one j of its pair.
 pub(crate) struct Mixed<'a> {
     /// Σ w R_kj z_k z_j by rows.
     with_response: &'a [f64],
-    /// Σ w z z of the first with the second component of the pair by rows; empty without such a sum.
-    with_weight: &'a [f64],
     terms: usize,
-    /// Whether k is the second component.
-    transposed: bool,
 }
 
 impl Mixed<'_> {
-    /// Σ w (R_kj + extra) z_ks z_jt.
-    pub(crate) fn response(&self, s: usize, t: usize, extra: f64) -> f64 {
-        let at = if self.transposed {
-            t * self.terms + s
-        } else {
-            s * self.terms + t
-        };
-        let more = self.with_weight.get(at).map_or(0.0, |w| extra * w);
-        self.with_response[s * self.terms + t] + more
+    /// Σ w R_kj z_ks z_jt.
+    pub(crate) fn response(&self, s: usize, t: usize) -> f64 {
+        self.with_response[s * self.terms + t]
     }
 }
 
@@ -388,16 +430,12 @@ pub(crate) struct Component<'a> {
     pub(crate) with_e: &'a [f64],
     /// Σ w R z z, the lower triangle by rows.
     with_response: &'a [f64],
-    /// Σ w z z; empty without such a sum.
-    with_weight: &'a [f64],
 }
 
 impl Component<'_> {
-    /// Σ w (R + extra) z_s z_t.
-    pub(crate) fn response(&self, s: usize, t: usize, extra: f64) -> f64 {
-        let at = triangle(s.max(t)) + s.min(t);
-        let more = self.with_weight.get(at).map_or(0.0, |w| extra * w);
-        self.with_response[at] + more
+    /// Σ w R z_s z_t.
+    pub(crate) fn response(&self, s: usize, t: usize) -> f64 {
+        self.with_response[triangle(s.max(t)) + s.min(t)]
     }
 }
 

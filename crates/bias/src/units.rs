@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, HashMap};
 
 use serde::{Deserialize, Serialize};
 
+use crate::arms::Units;
 use crate::error::BiasError;
 use crate::sums::{Layout, Row};
 
@@ -200,22 +201,31 @@ impl UnitSums {
         self.merge(other)
     }
 
-    /// The same sums with a unit for each key, whatever the catalogue: the same row or identifier in all catalogues. The shape
-    /// of a galaxy under +γ and −γ is then left out together, and cancels in the error of m.
-    pub fn by_key(mut self) -> Self {
-        self.renamed(|(_, key)| (0, key));
-        self
+    /// The sums by key, whatever the catalogue: the same row or identifier in all catalogues is a unit. The shape of a galaxy
+    /// under +γ and −γ is then left out together, and cancels in the error of m. `arm` is the arm of a catalogue, see
+    /// [`Units`].
+    pub fn by_key(self, arm: impl Fn(u32) -> u32) -> Units {
+        self.units(arm, |(_, key)| (0, key))
     }
 
-    /// The same sums with a unit for each group of catalogues.
-    pub fn by_group(mut self, group: impl Fn(u32) -> u32) -> Self {
-        self.renamed(|(catalogue, _)| (group(catalogue), 0));
-        self
+    /// The sums by group of catalogues, with the arm of each catalogue.
+    pub fn by_group(self, arm: impl Fn(u32) -> u32, group: impl Fn(u32) -> u32) -> Units {
+        self.units(arm, |(catalogue, _)| (group(catalogue), 0))
     }
 
-    /// Number of units.
-    pub(crate) fn count(&self) -> usize {
-        self.units.len()
+    fn units(self, arm: impl Fn(u32) -> u32, unit: impl Fn((u32, u64)) -> (u32, u64)) -> Units {
+        let UnitSums {
+            layout,
+            bins,
+            shift,
+            units,
+            ..
+        } = self;
+        // Without sheared catalogues all sums are linear, so that arms make no difference.
+        let arm = |catalogue| if layout.sheared { arm(catalogue) } else { 0 };
+        let named = units.into_iter();
+        let named = named.map(|(name, sums)| (unit(name), arm(name.0), sums));
+        Units::new((layout, bins, shift), named)
     }
 
     pub(crate) fn of_catalogues(&self, wanted: impl Fn(u32) -> bool) -> Self {
@@ -229,77 +239,31 @@ impl UnitSums {
         }
     }
 
-    pub(crate) fn mean_pairs(&self, a: u32, b: u32) -> Vec<[[f64; 2]; 2]> {
+    /// What `of` makes of the sums over all bins of each unit of two catalogues; `None` where a catalogue has no galaxy of it.
+    pub(crate) fn pairs<T>(
+        &self,
+        a: u32,
+        b: u32,
+        of: impl Fn(Layout, &[f64]) -> T,
+    ) -> Vec<[Option<T>; 2]> {
         let length = self.layout.len();
-        let mean = |unit: &[f64]| {
+        let mut pairs: BTreeMap<u64, [Option<T>; 2]> = BTreeMap::new();
+        for ((catalogue, key), sums) in &self.units {
             let mut all = vec![0.0; length];
-            unit.chunks_exact(length).for_each(|bin| add(&mut all, bin));
-            let own = self.layout.mean(&all);
-            own.iter().all(|e| e.is_finite()).then_some(own)
-        };
-        let of = |catalogue: u32| {
-            let units = self.units.iter();
-            let own = units.filter(move |((own, _), _)| *own == catalogue);
-            own.filter_map(move |((_, key), sums)| Some((*key, mean(sums)?)))
-        };
-        let first: BTreeMap<u64, [f64; 2]> = of(a).collect();
-        let pair = |(key, own): (u64, [f64; 2])| Some([*first.get(&key)?, own]);
-        of(b).filter_map(pair).collect()
-    }
-
-    // Units without a galaxy in the bin are no units of it: they would make the factor (n − 1)/n of the jackknife too large.
-    pub(crate) fn of_bin(&self, bin: usize) -> Vec<&[f64]> {
-        let length = self.layout.len();
-        let of_bin = |sums: &'_ [f64]| bin * length..(bin + 1) * length.min(sums.len());
-        let all = self.units.iter().map(|(_, sums)| &sums[of_bin(sums)]);
-        all.filter(|sums| sums.iter().any(|sum| *sum != 0.0))
-            .collect()
-    }
-
-    /// The sums of each unit of a bin in these and other sums, whose units have the same names. `None` if a unit has no
-    /// galaxy.
-    pub(crate) fn pairs_with(&self, other: &UnitSums, bin: usize) -> Vec<[Option<Vec<f64>>; 2]> {
-        let shift = self.shift.max(other.shift);
-        let mut pairs: BTreeMap<(u32, u64), [Option<Vec<f64>>; 2]> = BTreeMap::new();
-        for (place, sums) in [self, other].into_iter().enumerate() {
-            let mut sums = sums.clone();
-            sums.coarsen(shift);
-            let length = sums.layout.len();
-            for (unit, all) in &sums.units {
-                let own = &all[bin * length..(bin + 1) * length];
-                if own.iter().any(|sum| *sum != 0.0) {
-                    pairs.entry(*unit).or_default()[place] = Some(own.to_vec());
-                }
+            sums.chunks_exact(length).for_each(|bin| add(&mut all, bin));
+            for (place, _) in [a, b]
+                .iter()
+                .enumerate()
+                .filter(|(_, own)| *own == catalogue)
+            {
+                pairs.entry(*key).or_default()[place] = Some(of(self.layout, &all));
             }
         }
         pairs.into_values().collect()
     }
-
-    /// The same sums with all bins joined to one.
-    pub fn all_bins(&self) -> Self {
-        let length = self.layout.len();
-        let joined = |sums: &Vec<f64>| {
-            let mut all = vec![0.0; length];
-            for bin in sums.chunks_exact(length) {
-                add(&mut all, bin);
-            }
-            all
-        };
-        UnitSums {
-            bins: 1,
-            units: self
-                .units
-                .iter()
-                .map(|(unit, sums)| (*unit, joined(sums)))
-                .collect(),
-            places: self.places.clone(),
-            last: None,
-            ..*self
-        }
-    }
 }
 
-fn shifted(key: u64, shift: u32) -> u64 {
+pub(crate) fn shifted(key: u64, shift: u32) -> u64 {
     // A shift by 64 bits or more overflows, and means one unit.
     key.checked_shr(shift).unwrap_or(0)
 }

@@ -5,7 +5,7 @@
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use shearq_bias::{Catalogue, Design, Layout, Range, Row, StarNoise, UnitSums, group};
+use shearq_bias::{Catalogue, Design, Layout, Range, Row, StarNoise, UnitSums, Units, group};
 use shearq_bias::{Estimate, estimate};
 
 type Matrix = [[f64; 2]; 2];
@@ -66,7 +66,7 @@ fn sample(seed: u64, sheared: bool, matrix: bool) -> Sample {
 }
 
 impl Sample {
-    fn sums(&self, layout: Layout) -> UnitSums {
+    fn sums(&self, layout: Layout) -> Units {
         let mut sums = UnitSums::new(layout, 1, 1);
         for (key, row) in (0..).zip(&self.rows) {
             sums.add(0, key, 0, row);
@@ -76,7 +76,7 @@ impl Sample {
                 sums.add_sheared(0, key, 0, catalogue, (*e, *weight));
             }
         }
-        sums.by_key()
+        sums.by_key(|_| 0)
     }
 
     /// ⟨e_i⟩ of the catalogue with a positive shear of component j, minus that with negative shear.
@@ -175,7 +175,7 @@ fn gauss(a: &[Vec<f64>]) -> Vec<f64> {
     (0..n).map(|k| a[k][n] / a[k][k]).collect()
 }
 
-fn of(sums: &UnitSums, truth: bool) -> Estimate {
+fn of(sums: &Units, truth: bool) -> Estimate {
     estimate(sums, 0, truth).unwrap()
 }
 

@@ -194,7 +194,7 @@ fn pulls(
             catalogues,
         } = draw(design, &mut galaxies, count);
         let grouping = group(units, &catalogues, design, None, false);
-        let found = estimate(&grouping.sums, 0, design != Design::Null).unwrap();
+        let found = estimate(&grouping.units, 0, design != Design::Null).unwrap();
         for (sums, (key, expected)) in sums.iter_mut().zip(expected) {
             let measured = found.value(key).unwrap();
             let pull = (measured.value - expected) / measured.error;
@@ -285,7 +285,7 @@ fn many_units_are_joined_and_shards_merge_to_the_same_sums() {
     let [mut merged, other] = parts;
     merged.merge(other).unwrap();
     let [a, b] = [whole, merged].map(|sums| {
-        let sums = sums.by_key();
+        let sums = sums.by_key(|_| 0);
         let all = estimate(&sums.all_bins(), 0, true).unwrap();
         assert!((512..=2048).contains(&all.units), "{}", all.units);
         (all, estimate(&sums, 1, true).unwrap())
@@ -304,7 +304,7 @@ fn many_units_are_joined_and_shards_merge_to_the_same_sums() {
 #[test]
 fn without_galaxies_units_or_response_there_is_an_error() {
     let mut sums = UnitSums::new(Layout::default(), 1, 1);
-    let of = |sums: &UnitSums| estimate(sums, 0, false).unwrap_err();
+    let of = |sums: &UnitSums| estimate(&sums.clone().by_key(|_| 0), 0, false).unwrap_err();
     assert!(of(&sums).to_string().contains("no galaxy"));
     let mut row = Row {
         e: [0.1, 0.2],

@@ -707,7 +707,7 @@ impl Summed {
         if designs[0] != designs[1] {
             return Err(BiasFailure::DesignsDiffer(designs[0], designs[1]));
         }
-        let (a, b, truth) = (&own.sums, &theirs.sums, self.about.truth);
+        let (a, b, truth) = (&own.units, &theirs.units, self.about.truth);
         let all = difference(&a.all_bins(), &b.all_bins(), 0, truth)?;
         let bins = self.bins(all, |bin| difference(a, b, bin, truth));
         let about = About {
@@ -719,6 +719,7 @@ impl Summed {
         let grouping = Grouping {
             misaligned: own.misaligned || theirs.misaligned,
             uncorrelated: None,
+            without_partner: None,
             stars: Vec::new(),
             ..own
         };

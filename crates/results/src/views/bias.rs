@@ -273,6 +273,8 @@ pub fn of_design(result: &BiasResult) -> Vec<String> {
         Some(column) => format!("--units {column}"),
         None => "--columns id=NAME with identifiers, or --units COLUMN".into(),
     };
+    // Without shape noise, only pixel noise cancels: errors of m were 54 times too large.
+    let wrong = "the error of m is too large by the ratio of total scatter to measurement noise, and that of c too small";
     let shown = |[g1, g2]: [f64; 2]| format!("({g1}, {g2})");
     if !result.grouping.missing.is_empty() {
         let missing = result
@@ -287,17 +289,16 @@ pub fn of_design(result: &BiasResult) -> Vec<String> {
             more => format!(", and {more} more"),
         };
         lines.push(format!(
-            "catalogues are missing: {}{more}. The others are paired by their names",
+            "catalogues are missing: {}{more}. The others are paired by their names, and the shapes of a catalogue without partner do not cancel in m. Try: leave out the partner, too",
             missing.join(", ")
         ));
     }
     if let Some((shear, [own, opposite])) = result.grouping.unpaired {
         lines.push(format!(
-            "the catalogues of opposite shears do not pair (found {own} with g = {} and {opposite} with minus g, and no names that state which belong together), so that each is a unit. If they contain the same galaxies, the error of m is too large, and that of c too small by up to √2. Try: {units}",
+            "the catalogues of opposite shears do not pair (found {own} with g = {} and {opposite} with minus g, and no names that state which belong together), so that each is a unit. If they contain the same galaxies, {wrong}. Try: {units}, or leave out the catalogues without partner",
             shown(shear)
         ));
     }
-    let wrong = "the error of m is too large, and that of c too small by up to √2";
     match result.grouping.uncorrelated {
         Some(correlation) => lines.push(format!(
             "rows of catalogues with opposite shears are different galaxies (their ellipticities correlate by {correlation:.2}). If both catalogues contain the same galaxies in another order, {wrong}. Try: {units}"
@@ -307,7 +308,29 @@ pub fn of_design(result: &BiasResult) -> Vec<String> {
         )),
         None => {}
     }
+    if result.grouping.assumed_different {
+        lines.push(format!(
+            "names do not state which catalogues of a shear contain the same galaxies as others, such as rotations, noise realisations or bands: the k-th catalogues of each shear are a unit. If catalogues of one shear contain the same galaxies, errors are wrong. Try: {units}, or names that have the same number under each shear"
+        ));
+    }
+    lines.extend(without_partner(result));
     lines
+}
+
+// Part of a variance from which galaxies without partner matter: σ(m) is √2 times as large as without them.
+const MANY_WITHOUT_PARTNER: f64 = 0.5;
+
+fn without_partner(result: &BiasResult) -> Option<String> {
+    let own = result.grouping.without_partner?;
+    let share = own.share.into_iter().fold(0.0, f64::max);
+    (share > MANY_WITHOUT_PARTNER).then(|| {
+        format!(
+            "about {:.0} of {:.0} galaxies count under one of two opposite shears only. Their shapes do not cancel and make σ(m) about {:.1} times as large. Try: --paired",
+            own.galaxies.max(1.0),
+            own.of,
+            (1.0 - share).max(1e-6).sqrt().recip()
+        )
+    })
 }
 
 const MAX_MISSING: usize = 5;
