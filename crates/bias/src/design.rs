@@ -634,4 +634,62 @@ mod tests {
         let other = catalogues(&[plus, [-0.02002, 0.015]]);
         assert_eq!(Design::of(&other, true), Design::Fields);
     }
+
+    #[test]
+    fn other_shears_of_the_same_names_are_arms() {
+        let of = |shears: &[[f64; 2]], name: &dyn Fn(usize, usize) -> String| {
+            let of: Vec<(String, [f64; 2])> = (0..30)
+                .flat_map(|seed| (0..shears.len()).map(move |arm| (arm, seed)))
+                .map(|(arm, seed)| (name(arm, seed), shears[arm]))
+                .collect();
+            let of: Vec<_> = of.iter().map(|(name, g)| (name.as_str(), *g)).collect();
+            let all = named(&of);
+            let design = Design::of(&all, true);
+            (design, names::count(&numbers(&all, design).0))
+        };
+        let (large, small, zero) = ([0.08, 0.0], [-0.02, 0.0], [0.0; 2]);
+        let folders = |arm: usize, seed: usize| format!("arm{arm}/seed{seed:03}.fits");
+        assert_eq!(of(&[large, small], &folders), (Design::Arms, 30));
+        assert_eq!(of(&[large, zero], &folders), (Design::Arms, 30));
+        assert_eq!(
+            of(&[small, [0.02, 0.0], zero], &folders),
+            (Design::Arms, 30)
+        );
+        // Other seeds under each shear.
+        let other = |arm: usize, seed: usize| format!("seed{:03}.fits", 30 * arm + seed);
+        assert_eq!(of(&[large, small], &other), (Design::Fields, 60));
+    }
+
+    #[test]
+    fn versions_of_the_same_galaxies_belong_to_a_group() {
+        let groups = |shears: &[[f64; 2]], name: &dyn Fn(usize, usize, usize) -> String| {
+            let mut all = Vec::new();
+            for tile in 0..24 {
+                for version in 0..2 {
+                    for (arm, g) in shears.iter().enumerate() {
+                        all.push((name(arm, version, tile), *g));
+                    }
+                }
+            }
+            let all: Vec<_> = all.iter().map(|(name, g)| (name.as_str(), *g)).collect();
+            names::groups(&named(&all)).map(|groups| names::count(&groups))
+        };
+        let pair = [[0.02, 0.0], [-0.02, 0.0]];
+        let rotation = |version| 90 * version;
+        let folders = |a, v, t| format!("out/{}_rot{}/tile{t:02}.fits", ["p", "q"][a], rotation(v));
+        let files = |a, v, t| format!("{}_rot{}_tile{t:02}.fits", ["p", "q"][a], rotation(v));
+        let suffix =
+            |a, v: usize, t| format!("{}/tile{t:02}{}.fits", ["p", "q"][a], ["", "_rot"][v]);
+        let prefix =
+            |a, v: usize, t| format!("{}{}/{t:02}.fits", ["p", "q"][a], ["", "-turned"][v]);
+        let shapes: [&dyn Fn(usize, usize, usize) -> String; 4] =
+            [&folders, &files, &suffix, &prefix];
+        for name in shapes {
+            assert_eq!(groups(&pair, name), Some(24), "{}", name(0, 1, 3));
+            assert_eq!(groups(&pair[..1], name), Some(24), "{}", name(0, 1, 3));
+        }
+        // Twenty-four seeds of two tiles are other galaxies, or two versions: one unit is right for both.
+        let seeds = |a, v, t| format!("{}/seed{t}/tile{v}.fits", ["p", "q"][a]);
+        assert_eq!(groups(&pair, &seeds), Some(24));
+    }
 }

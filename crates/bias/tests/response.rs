@@ -363,3 +363,204 @@ fn the_noise_of_a_star_changes_shear_before_the_response() {
         }
     }
 }
+
+/// Galaxies without noise of two arms with other responses: e = R ((1 + m) g + c).
+#[test]
+fn each_arm_has_its_own_response() {
+    const M: f64 = 0.05;
+    const C: f64 = 0.002;
+    let layout = Layout {
+        sheared: true,
+        ..Layout::default()
+    };
+    let shears = [[0.04, -0.03], [-0.04, 0.03]];
+    let responses = [[0.3, 0.5], [0.6, 0.4]];
+    let mut sums = UnitSums::new(layout, 1, 2);
+    let mut rng = ChaCha8Rng::seed_from_u64(2);
+    for key in 0..50 {
+        for (arm, (g, r)) in shears.into_iter().zip(responses).enumerate() {
+            let weight = rng.random_range(0.5..2.0);
+            let row = Row {
+                e: [0, 1].map(|k| r[k] * ((1.0 + M) * g[k] + C)),
+                weight,
+                g,
+                ..Row::default()
+            };
+            sums.add(arm as u32, key, 0, &row);
+            // The sums of weights differ from arm to arm and from catalogue to catalogue.
+            for catalogue in 0..4 {
+                let sign = if catalogue % 2 == 0 { 0.5 } else { -0.5 };
+                let e = r.map(|r| sign * r + 0.1);
+                sums.add_sheared(arm as u32, key, 0, catalogue, (e, weight));
+            }
+        }
+    }
+    let catalogues = shears.map(|g| Catalogue {
+        rows: 50,
+        shear: g.map(|g| Range { low: g, high: g }),
+        ..Catalogue::default()
+    });
+    let found = |sums: UnitSums| {
+        let grouping = group(sums, &catalogues, Design::Pairs, None, true);
+        grouping.estimate(0, true).unwrap()
+    };
+    let own = found(sums.clone());
+    for (key, expected) in [("m1", M), ("m2", M), ("c1", C), ("c2", C)] {
+        let own = own.value(key).unwrap();
+        assert!((own.value - expected).abs() < ROUNDING, "{key}: {own:?}");
+        assert!(own.error < ROUNDING, "{key}: {own:?}");
+    }
+    // With one response for both, the difference of the responses would be a c.
+    let pooled = of(&sums.clone().by_key(|_| 0), true);
+    assert!((pooled.value("c1").unwrap().value - C).abs() > 0.01);
+    // An arm without galaxies in a sheared catalogue has the response of all.
+    let mut lacking = UnitSums::new(layout, 1, 3);
+    lacking.append(sums).unwrap();
+    let g = [0.0; 2];
+    let row = Row {
+        e: [0.001; 2],
+        weight: 1e-3,
+        g,
+        ..Row::default()
+    };
+    lacking.add(2, 7, 0, &row);
+    assert!(of(&lacking.by_key(|arm| arm), true).value("m1").is_some());
+}
+
+/// m of shapes with a weight w(|e|) under ±γ, from sheared catalogues of each arm.
+#[test]
+fn weights_that_depend_on_shape_bias_m_alike_in_both_arms() {
+    type Complex = [f64; 2];
+    const STEP: f64 = 0.01;
+    let times = |a: Complex, b: Complex| [a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]];
+    // (e + g)/(1 + g* e)
+    let sheared = |e: Complex, g: Complex| {
+        let below = times([g[0], -g[1]], e);
+        let below = [1.0 + below[0], below[1]];
+        let square = below[0] * below[0] + below[1] * below[1];
+        times(
+            [e[0] + g[0], e[1] + g[1]],
+            [below[0] / square, -below[1] / square],
+        )
+    };
+    let weight = |e: Complex| 1.0 / (0.07 + e[0] * e[0] + e[1] * e[1]);
+    let layout = Layout {
+        sheared: true,
+        ..Layout::default()
+    };
+    let arms = [[0.05, -0.05], [-0.05, 0.05]];
+    let steps = [[STEP, 0.0], [-STEP, 0.0], [0.0, STEP], [0.0, -STEP]];
+    let mut rng = ChaCha8Rng::seed_from_u64(4);
+    let mut sums = UnitSums::new(layout, 1, 2);
+    // Σ w e, Σ w of each arm under each added shear, with plain loops.
+    let mut plain = [[([0.0; 2], 0.0); 5]; 2];
+    for key in 0..500 {
+        let modulus = rng.random_range(0.0..0.6);
+        let angle = rng.random_range(0.0..std::f64::consts::TAU);
+        // Four orientations, so that shapes cancel.
+        for turn in 0..4 {
+            let angle = angle + f64::from(turn) * std::f64::consts::FRAC_PI_2;
+            let shape = [modulus * angle.cos(), modulus * angle.sin()];
+            for (arm, g) in arms.into_iter().enumerate() {
+                for (k, step) in [[0.0; 2]].into_iter().chain(steps).enumerate() {
+                    let e = sheared(shape, [g[0] + step[0], g[1] + step[1]]);
+                    let w = weight(e);
+                    let own = &mut plain[arm][k];
+                    own.1 += w;
+                    own.0 = [own.0[0] + w * e[0], own.0[1] + w * e[1]];
+                    match k.checked_sub(1) {
+                        None => {
+                            let row = Row {
+                                e,
+                                weight: w,
+                                g,
+                                ..Row::default()
+                            };
+                            sums.add(arm as u32, key, 0, &row);
+                        }
+                        Some(catalogue) => {
+                            let e = e.map(|e| e / (2.0 * STEP));
+                            sums.add_sheared(arm as u32, key, 0, catalogue, (e, w));
+                        }
+                    }
+                }
+            }
+        }
+    }
+    let m = |component: usize| {
+        let mean = |arm: usize, k: usize| plain[arm][k].0[component] / plain[arm][k].1;
+        let response = |arm: usize| {
+            (mean(arm, 1 + 2 * component) - mean(arm, 2 + 2 * component)) / (2.0 * STEP)
+        };
+        let [plus, minus] = [0, 1].map(|arm| mean(arm, 0) / response(arm));
+        (plus - minus) / (2.0 * arms[0][component]) - 1.0
+    };
+    let catalogues = arms.map(|g| Catalogue {
+        rows: 2000,
+        shear: g.map(|g| Range { low: g, high: g }),
+        ..Catalogue::default()
+    });
+    let grouping = group(sums.clone(), &catalogues, Design::Pairs, None, true);
+    let found = grouping.estimate(0, true).unwrap();
+    let pooled = of(&sums.by_key(|_| 0), true);
+    for (component, key) in ["m1", "m2"].into_iter().enumerate() {
+        let own = found.value(key).unwrap().value;
+        // The responses of both arms are equal only within the scatter of the shapes.
+        assert!((own - m(component)).abs() < 1e-6, "{key}: {own}");
+        // A common response is wrong by 2kγ², with k of about −4 here.
+        let pooled = pooled.value(key).unwrap().value;
+        assert!((pooled - own).abs() > 0.01, "{key}: {pooled} {own}");
+    }
+}
+
+#[test]
+fn bins_are_weighted_to_the_shares_of_another_population() {
+    const SHARES: [f64; 3] = [0.2, 0.5, 0.3];
+    for sheared in [false, true] {
+        let layout = Layout {
+            sheared,
+            ..Layout::default()
+        };
+        let sample = sample(6, sheared, false);
+        let bin_of = |key: usize| key % 3;
+        let weight = |bin: usize| -> f64 {
+            let all = sample.rows.iter().enumerate();
+            let own = all.filter(|(key, _)| bin_of(*key) == bin);
+            own.map(|(_, row)| row.weight).sum()
+        };
+        let weights = [0, 1, 2].map(weight);
+        let (mut binned, mut weighted) = (UnitSums::new(layout, 3, 1), UnitSums::new(layout, 1, 1));
+        for (key, row) in sample.rows.iter().enumerate() {
+            let bin = bin_of(key);
+            let factor = SHARES[bin] / weights[bin];
+            binned.add(0, key as u64, bin, row);
+            let own = Row {
+                weight: factor * row.weight,
+                response: row.response.map(|row| row.map(|r| factor * r)),
+                ..*row
+            };
+            weighted.add(0, key as u64, 0, &own);
+            for (which, (e, weight)) in sample.sheared.get(key).into_iter().flatten().enumerate() {
+                binned.add_sheared(0, key as u64, bin, which, (*e, *weight));
+                weighted.add_sheared(0, key as u64, 0, which, (*e, factor * weight));
+            }
+        }
+        let grouping = group(
+            binned,
+            &[Catalogue::default()],
+            Design::Galaxies,
+            None,
+            false,
+        );
+        let found = grouping.estimate_like(&SHARES, true).unwrap();
+        let expected = of(&weighted.by_key(|_| 0), true);
+        assert_eq!(found.galaxies, 60);
+        assert!((found.effective / expected.effective - 1.0).abs() < ROUNDING);
+        for key in ["m1", "m2", "c1", "c2", "r1"] {
+            let [found, expected] = [&found, &expected].map(|own| own.value(key).unwrap());
+            assert!((found.value - expected.value).abs() < 1e-9 * expected.value.abs().max(1.0));
+            // The factors follow from the galaxies, so that errors differ by a term of the order of 1/n.
+            assert!((found.error / expected.error - 1.0).abs() < 0.2, "{key}");
+        }
+    }
+}

@@ -30,6 +30,14 @@ struct Galaxies {
 }
 
 impl Galaxies {
+    fn new(weights: Weights, gamma: f64) -> Self {
+        Galaxies {
+            rng: ChaCha8Rng::seed_from_u64(5),
+            weights,
+            gamma,
+        }
+    }
+
     fn normal(&mut self) -> f64 {
         StandardNormal.sample(&mut self.rng)
     }
@@ -69,7 +77,7 @@ impl Galaxies {
 
 /// Shear for so many galaxies. With weights that depend on shape the response has terms of second order in the shear,
 /// about γ²/σ², which must stay below the errors.
-fn gamma(weights: Weights, count: usize) -> f64 {
+fn gamma_of(weights: Weights, count: usize) -> f64 {
     match (weights, count > 10_000) {
         (Weights::Equal, _) => GAMMA,
         (_, false) => 0.01,
@@ -177,22 +185,13 @@ fn draw(design: Design, galaxies: &mut Galaxies, count: usize) -> Draw {
 
 /// Mean and standard deviation of the pulls of each quantity with its expectation.
 fn pulls(
-    design: Design,
-    weights: Weights,
-    (draws, count): (usize, usize),
+    draws: usize,
     expected: &[(&str, f64)],
+    mut draw: impl FnMut() -> (UnitSums, Vec<Catalogue>, Design),
 ) -> Vec<[f64; 2]> {
-    let mut galaxies = Galaxies {
-        rng: ChaCha8Rng::seed_from_u64(5),
-        weights,
-        gamma: gamma(weights, count),
-    };
     let mut sums = vec![[0.0; 2]; expected.len()];
     for _ in 0..draws {
-        let Draw {
-            sums: units,
-            catalogues,
-        } = draw(design, &mut galaxies, count);
+        let (units, catalogues, design) = draw();
         let grouping = group(units, &catalogues, design, None, false);
         let found = estimate(&grouping.units, 0, design != Design::Null).unwrap();
         for (sums, (key, expected)) in sums.iter_mut().zip(expected) {
@@ -213,7 +212,7 @@ const MC: [(&str, f64); 4] = [("m1", M[0]), ("m2", M[1]), ("c1", C[0]), ("c2", C
 fn check(draws: usize, count: usize) {
     for weights in [Weights::Equal, Weights::OfShape] {
         let leakage = [MC.as_slice(), &[("alpha", ALPHA)]].concat();
-        let gamma = gamma(weights, count);
+        let gamma = gamma_of(weights, count);
         // A single shear determines m if c is zero.
         let single = [0, 1].map(|k| (MC[k].0, M[k] + C[k] / gamma));
         for (design, expected) in [
@@ -231,26 +230,135 @@ fn check(draws: usize, count: usize) {
             } else {
                 count
             };
-            let found = pulls(design, weights, (draws, count), expected);
-            for ([pull, deviation], (key, _)) in found.iter().zip(expected) {
-                // Four standard errors of the mean, and a ratio's bias of about its relative error squared.
-                let tolerance = 4.0 / (draws as f64).sqrt() + 0.05;
-                assert!(pull.abs() < tolerance, "{design:?} {key}: mean pull {pull}");
-                // 10 %, as required, with four standard errors of the deviation.
-                let tolerance = 0.1 + 4.0 / (2.0 * draws as f64).sqrt();
-                let off = (deviation - 1.0).abs();
-                assert!(
-                    off < tolerance,
-                    "{design:?} {key}: pulls scatter by {deviation}"
-                );
-            }
+            let mut galaxies = Galaxies::new(weights, gamma_of(weights, count));
+            let found = pulls(draws, expected, || {
+                let Draw { sums, catalogues } = draw(design, &mut galaxies, count);
+                (sums, catalogues, design)
+            });
+            check_pulls(&format!("{design:?}"), draws, &found, expected);
         }
     }
 }
 
+/// The standard deviation of pulls is 1 within 10 %, and their mean is 0.
+fn check_pulls(what: &str, draws: usize, found: &[[f64; 2]], expected: &[(&str, f64)]) {
+    for ([pull, deviation], (key, _)) in found.iter().zip(expected) {
+        // Four standard errors of the mean, and a ratio's bias of about its relative error squared.
+        let tolerance = 4.0 / (draws as f64).sqrt() + 0.05;
+        assert!(pull.abs() < tolerance, "{what} {key}: mean pull {pull}");
+        assert!(
+            (0.9..1.1).contains(deviation),
+            "{what} {key}: pulls scatter by {deviation}"
+        );
+    }
+}
+
+// The scatter of 800 pulls has a standard error of 2.5 %, so that 10 % are four of them.
+const DRAWS: usize = 800;
+
 #[test]
 fn estimates_are_unbiased_and_errors_right_in_every_design() {
-    check(400, 300);
+    check(DRAWS, 150);
+}
+
+/// Forty tiles of five galaxies, each also rotated by 90 degrees with the same noise, in catalogues of their own.
+fn draw_versions(design: Design, galaxies: &mut Galaxies) -> Draw {
+    let gamma = galaxies.gamma;
+    let shears = match design {
+        Design::Pairs => vec![[gamma, gamma], [-gamma, -gamma]],
+        Design::Arms => vec![[gamma, 0.0], [0.0, gamma], [0.0, 0.0]],
+        Design::Null => vec![[0.0; 2]],
+        _ => vec![[gamma, gamma]],
+    };
+    let tiles = 40;
+    let mut draw = Draw::new(tiles * 2 * shears.len(), false);
+    for tile in 0..tiles {
+        let own = [0; 2].map(|_| gamma * galaxies.rng.random_range(-1.0..1.0));
+        for key in 0..5 {
+            let [noise, intrinsic, response] = galaxies.galaxy();
+            for (arm, shear) in shears.iter().enumerate() {
+                let shear = if design == Design::Fields {
+                    own
+                } else {
+                    *shear
+                };
+                for (version, shape) in [intrinsic, intrinsic.map(|e| -e)].into_iter().enumerate() {
+                    let catalogue = (arm * 2 + version) * tiles + tile;
+                    let suffix = ["", "_rot90"][version];
+                    draw.catalogues[catalogue].name =
+                        format!("arm{arm}{suffix}/tile{tile:02}.fits");
+                    draw.add(
+                        catalogue,
+                        key,
+                        &galaxies.row([noise, shape, response], shear, [0.0; 2]),
+                    );
+                }
+            }
+        }
+    }
+    draw
+}
+
+#[test]
+fn errors_are_right_with_versions_of_the_same_galaxies() {
+    let single = [0, 1].map(|k| (MC[k].0, M[k] + C[k] / GAMMA));
+    for (design, expected) in [
+        (Design::Pairs, &MC[..]),
+        (Design::Arms, &MC),
+        (Design::Fields, &MC),
+        (Design::Single, &single),
+        (Design::Null, &MC[2..]),
+    ] {
+        let mut galaxies = Galaxies::new(Weights::Equal, GAMMA);
+        let found = pulls(DRAWS, expected, || {
+            let Draw { sums, catalogues } = draw_versions(design, &mut galaxies);
+            let recognised = Design::of(&catalogues, design != Design::Null);
+            assert_eq!(recognised, design);
+            (sums, catalogues, design)
+        });
+        check_pulls(&format!("{design:?} in versions"), DRAWS, &found, expected);
+    }
+}
+
+#[test]
+fn galaxies_without_partner_are_counted_with_their_cost() {
+    let mut galaxies = Galaxies::new(Weights::Equal, GAMMA);
+    let shears = [[GAMMA; 2], [-GAMMA; 2]];
+    let (mut draw, mut paired, mut alone) = (Draw::new(2, false), Draw::new(2, false), 0.0);
+    for key in 0..20_000 {
+        // One noise for both signs, so that only responses scatter.
+        let galaxy = galaxies.galaxy();
+        let is_paired = galaxies.rng.random_range(0.0..1.0) > 0.01;
+        alone += f64::from(!is_paired);
+        for (catalogue, g) in shears.into_iter().enumerate() {
+            let row = galaxies.row(galaxy, g, [0.0; 2]);
+            if catalogue == 0 || is_paired {
+                draw.add(catalogue, key, &row);
+            }
+            if is_paired {
+                paired.add(catalogue, key, &row);
+            }
+        }
+    }
+    let errors = [draw, paired].map(|draw| {
+        let grouping = group(draw.sums, &draw.catalogues, Design::Pairs, None, true);
+        let found = grouping.estimate(0, true).unwrap();
+        (grouping.without_partner, found.value("m1").unwrap().error)
+    });
+    let (found, with) = errors[0];
+    let found = found.unwrap();
+    assert!(errors[1].0.is_none());
+    // The variance of the numbers in 1250 units of 16 keys has a relative error of √(2/1250) = 4 %.
+    assert!(
+        (found.galaxies / alone - 1.0).abs() < 0.2,
+        "{found:?} {alone}"
+    );
+    assert_eq!(found.of, 40_000.0 - alone);
+    let (expected, stated) = (with / errors[1].1, (1.0 - found.share[0]).sqrt().recip());
+    assert!(
+        (stated / expected - 1.0).abs() < 0.3,
+        "σ(m) is {expected} times as large, stated {stated}"
+    );
 }
 
 /// The same for 100 to 1,000,000 galaxies and 1,000 draws where that takes minutes.
