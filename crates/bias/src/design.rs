@@ -441,7 +441,7 @@ fn correlation(sums: &UnitSums, pairs: &[[u32; 2]]) -> Option<f64> {
 // the variance of a Poisson distribution of their number. m follows from the sums of w e g. What the shapes of galaxies without
 // partner add to their variance is their share of Σ (w e g)², which is the variance between units of the sums under one shear.
 fn without_partner(sums: &UnitSums, pairs: &[[u32; 2]]) -> Option<WithoutPartner> {
-    type Numbers = (f64, [f64; 2]);
+    type Numbers = (f64, [[f64; 2]; 2]);
     let (mut galaxies, mut of) = (0.0, 0.0);
     let (mut of_shapes, mut of_all) = ([0.0; 2], [0.0; 2]);
     for [a, b] in pairs {
@@ -450,17 +450,25 @@ fn without_partner(sums: &UnitSums, pairs: &[[u32; 2]]) -> Option<WithoutPartner
             .map(|pair| pair.map(Option::unwrap_or_default))
             .collect();
         let total: f64 = units.iter().map(|[a, b]| a.0 + b.0).sum();
-        // Units have different numbers of galaxies, to which sums are proportional.
-        let variance = |value: &dyn Fn(&[Numbers; 2]) -> f64| {
-            let mean = units.iter().map(value).sum::<f64>() / total;
-            let residual = |unit: &[Numbers; 2]| value(unit) - mean * (unit[0].0 + unit[1].0);
+        // The variance of what a value differs from its expectation, which is proportional to `scale`.
+        type Value<'a> = &'a dyn Fn(&[Numbers; 2]) -> f64;
+        let variance = |value: Value<'_>, scale: Value<'_>| {
+            let sum = |of: Value<'_>| units.iter().map(of).sum::<f64>();
+            let mean = sum(value) / sum(scale);
+            let residual = |unit: &[Numbers; 2]| value(unit) - mean * scale(unit);
             units.iter().map(|unit| residual(unit).powi(2)).sum::<f64>()
         };
+        let count: Value<'_> = &|[a, b]| a.0 + b.0;
         of += total;
-        galaxies += variance(&|[a, b]| a.0 - b.0);
+        galaxies += variance(&|[a, b]| a.0 - b.0, count);
         for k in 0..2 {
-            of_shapes[k] += variance(&|[a, _]| a.1[k]) + variance(&|[_, b]| b.1[k]);
-            of_all[k] += variance(&|[a, b]| a.1[k] + b.1[k]);
+            let shapes = |at: usize| variance(&|unit| unit[at].1[0][k], count);
+            of_shapes[k] += shapes(0) + shapes(1);
+            // The response of sheared catalogues is in no row.
+            let response: Value<'_> = &|[a, b]| a.1[1][k] + b.1[1][k];
+            let has_response = units.iter().any(|unit| response(unit) != 0.0);
+            let scale = if has_response { response } else { count };
+            of_all[k] += variance(&|[a, b]| a.1[0][k] + b.1[0][k], scale);
         }
     }
     (galaxies > 0.0).then_some(WithoutPartner {

@@ -272,9 +272,14 @@ impl Layout {
         [0, 1].map(|k| self.of(sums, k).with_e[ONE] / sums[WEIGHT])
     }
 
-    /// Number of galaxies, and Σ w e g of both components.
-    pub(crate) fn counts_and_slopes(self, sums: &[f64]) -> (f64, [f64; 2]) {
-        (sums[COUNT], [0, 1].map(|k| self.of(sums, k).with_e[OWN]))
+    /// Number of galaxies, and Σ w e g and Σ w R g² of both components.
+    pub(crate) fn counts_and_slopes(self, sums: &[f64]) -> (f64, [[f64; 2]; 2]) {
+        let of = [0, 1].map(|k| self.of(sums, k));
+        let slopes = [
+            of.each_ref().map(|of| of.with_e[OWN]),
+            of.each_ref().map(|of| of.response(OWN, OWN)),
+        ];
+        (sums[COUNT], slopes)
     }
 
     /// Mean response from the sheared catalogues of these sums; NaN if one of them has no galaxy.
