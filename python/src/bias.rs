@@ -8,7 +8,9 @@ use pyo3::prelude::*;
 use shearq_bias::Design;
 use shearq_catalogue::columns::{Names, Shapes};
 use shearq_catalogue::expression::{Expression, ExpressionError};
-use shearq_catalogue::request::{Binning, Edges, Input, MAX_BINS, Request, Units};
+use shearq_catalogue::request::{
+    Binning, Edges, Input, MAX_AXES, MAX_BINS, Request, Survey, Units,
+};
 use shearq_catalogue::truth::{TrueSign, Truth, expand};
 use shearq_files::frames::frame;
 use shearq_files::frames::polars::Column;
@@ -150,7 +152,7 @@ impl BiasSums {
             // The table's own JSON, so that Python and the command line have the same keys.
             let mut json = table.json();
             // The label of an axis.
-            json["binned"] = result.about.binned.as_str().into();
+            json["binned"] = result.about.cells.names().into();
             Ok((json.to_string(), table.narrow().render(TableFormat::Table)))
         })
         .map_err(of_bias)
@@ -167,11 +169,14 @@ pub(crate) fn bias_sums(
     truth: Option<GivenTruth>,
     ellipticity: Option<&str>,
     truth_sign: Option<&str>,
-    bins: Option<(String, Option<usize>, Vec<f64>)>,
+    bins: Vec<(String, Option<usize>, Vec<f64>)>,
+    like: Option<Given<'_>>,
+    tomography: Option<String>,
     condition: Option<&str>,
     weight: Option<&str>,
     design: Option<&str>,
     units: Option<String>,
+    paired: bool,
     drop_missing: bool,
     step: f64,
 ) -> PyResult<BiasSums> {
@@ -185,26 +190,45 @@ pub(crate) fn bias_sums(
             .add(text)
             .map_err(|fault| PyValueError::new_err(in_python(&fault.to_string())))?;
     }
-    let bins = match bins {
-        None => None,
-        Some((of, count, edges)) => {
-            let of = Expression::parse(&of).map_err(value("bins"))?;
-            let edges = match count {
-                Some(count) if (2..=MAX_BINS).contains(&count) => Edges::Equal(count),
-                None if (2..=MAX_BINS + 1).contains(&edges.len())
-                    && edges.windows(2).all(|pair| pair[0] < pair[1]) =>
-                {
-                    Edges::Given(edges)
-                }
-                _ => {
-                    return Err(PyValueError::new_err(format!(
-                        "bins: expected 2 to {MAX_BINS} bins, or increasing edges"
-                    )));
-                }
-            };
-            Some(Binning { of, edges })
-        }
-    };
+    if bins.len() > MAX_AXES {
+        return Err(PyValueError::new_err(format!(
+            "bins: found {} quantities; expected at most {MAX_AXES}",
+            bins.len()
+        )));
+    }
+    let bins = bins.into_iter().map(|(of, count, edges)| {
+        let of = Expression::parse(&of).map_err(value("bins"))?;
+        let edges = match count {
+            Some(count) if (2..=MAX_BINS).contains(&count) => Edges::Equal(count),
+            None if edges.is_empty() => Edges::Values,
+            None if (2..=MAX_BINS + 1).contains(&edges.len())
+                && edges.windows(2).all(|pair| pair[0] < pair[1]) =>
+            {
+                Edges::Given(edges)
+            }
+            _ => {
+                return Err(PyValueError::new_err(format!(
+                    "bins: expected 2 to {MAX_BINS} bins, or increasing edges"
+                )));
+            }
+        };
+        Ok(Binning { of, edges })
+    });
+    let bins = bins.collect::<PyResult<Vec<_>>>()?;
+    let like = like.map(|given| -> PyResult<Survey> {
+        let catalogue = match given {
+            Given::Table(name, columns) => table_of(&name, columns)?,
+            Given::Path(path) => {
+                require(&path)?;
+                path.into()
+            }
+        };
+        Ok(Survey {
+            catalogue,
+            tomography,
+        })
+    });
+    let like = like.transpose()?;
     let specified = truth_sign.map(sign_of).transpose()?;
     let mut sign = TrueSign::or_standard(specified);
     let truth = match truth {
@@ -244,6 +268,8 @@ pub(crate) fn bias_sums(
         shapes: ellipticity.map(shapes_of).transpose()?,
         sign,
         bins,
+        like,
+        paired,
         selection: shearq_catalogue::select::selection(condition, weight)
             .map_err(|fault| PyValueError::new_err(fault.to_string()))?,
         design: design.map(design_of).transpose()?,

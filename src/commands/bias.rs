@@ -14,7 +14,7 @@ use crate::{Findings, made_by, tell};
 use shearq_catalogue::columns::{Names, Shapes, role_names};
 use shearq_catalogue::expression::Expression;
 use shearq_catalogue::recognition::read_presets;
-use shearq_catalogue::request::{Binning, Edges, MAX_BINS, Request, Units};
+use shearq_catalogue::request::{Binning, Edges, MAX_AXES, MAX_BINS, Request, Survey, Units};
 use shearq_catalogue::select::selection;
 use shearq_catalogue::truth::{TrueSign, Truth, expand};
 use shearq_dataset::images::Shard;
@@ -24,8 +24,8 @@ use shearq_render::table::{Cell, Table};
 use shearq_results::baseline::catalogues::Units as BaselineUnits;
 use shearq_results::bias::{Summed, joined, sum};
 use shearq_results::views::bias::{
-    Limit, bias_plot, bias_table, check, chosen_by_measurement, compared_table, of_design,
-    of_other_images, section,
+    Checked, Limit, bias_plot, bias_table, check, chosen_by_measurement, compared_table, of_design,
+    of_other_images, section, with_failures,
 };
 use shearq_scoring::TruthSign;
 
@@ -42,8 +42,8 @@ use shearq_scoring::TruthSign;
 pub(crate) struct Arguments {
     #[command(flatten)]
     summing: Summing,
-    /// Exit with code 1 if |m| or |c| exceeds a limit, such as `m=2e-3@3sigma`: by three standard errors. May be given
-    /// several times.
+    /// Exit with code 1 if |m| or |c| of all galaxies or of a bin exceeds a limit, such as `m=2e-3@3sigma`: by three standard
+    /// errors. With --against, the limit is one of the difference. May be given several times.
     #[arg(long, value_name = "LIMIT")]
     fail_above: Vec<Limit>,
     /// Merge files that --sums wrote for shards of one list of catalogues.
@@ -75,7 +75,7 @@ struct Summing {
     /// Catalogues of another program on the same galaxies (the same images, if they state theirs), in the same order. The output contains both and the
     /// difference, with paired errors. A --truth table by catalogue contains those of both, or names of files that both
     /// have, in two folders.
-    #[arg(long, value_name = "CATALOGUE", num_args = 1.., conflicts_with_all = ["sums", "shard", "fail_above", "plot", "report"])]
+    #[arg(long, value_name = "CATALOGUE", num_args = 1.., conflicts_with_all = ["sums", "shard", "plot", "report"])]
     against: Vec<PathBuf>,
     /// True g1 of all catalogues.
     #[arg(
@@ -121,9 +121,17 @@ struct Summing {
     #[arg(long, value_parser = named::<TruthSign>())]
     truth_sign: Option<TruthSign>,
     /// Also estimate in bins of a column or expression: `snr:5` has five bins with equally many galaxies,
-    /// `flux/flux_error:5,10,20` has these edges.
-    #[arg(long, value_name = "EXPRESSION:BINS", value_parser = parse_bins)]
-    bins: Option<Binning>,
+    /// `flux/flux_error:5,10,20` has these edges (each bin contains its lower edge), and `TOMOBIN` a bin for each number or
+    /// text. Up to three times, for bins of several quantities together.
+    #[arg(long, value_name = "EXPRESSION[:BINS]", value_parser = parse_bins)]
+    bins: Vec<Binning>,
+    /// Weight simulated galaxies so that their distribution in the bins is that of this catalogue of a survey, and print m
+    /// and c of the survey. Bins without simulated galaxies are named.
+    #[arg(long, value_name = "CATALOGUE", requires = "bins", conflicts_with_all = ["against", "sums", "shard"])]
+    like: Option<PathBuf>,
+    /// Column of the survey's tomographic bins, for m and c of each [default: a column such as TOMOBIN or zbin].
+    #[arg(long, value_name = "COLUMN", requires = "like")]
+    tomography: Option<String>,
     /// Use only galaxies for which this holds, such as "snr > 10 and size < 4". Catalogues of linear configurations can
     /// also be cut by steps, such as "step(snr, 10, 1.5) and step(size, 2.5)", whose response to shear enters (see
     /// `select`). The response of other conditions on measured quantities needs sheared catalogues.
@@ -140,6 +148,10 @@ struct Summing {
     /// patch; else groups of catalogues if there are 20 or more; else rows].
     #[arg(long, value_name = "UNIT")]
     units: Option<String>,
+    /// Use only galaxies that count under all test shears. The error of m is then small, and m does not contain how shear
+    /// changes which galaxies are selected. Reads each catalogue several times, and keeps the identifiers of one in memory.
+    #[arg(long)]
+    paired: bool,
     /// Leave out rows with missing numbers or without a true shear.
     #[arg(long)]
     drop_missing: bool,
@@ -166,32 +178,32 @@ fn columns_help() -> String {
 
 // Split at the last colon, because an expression may contain others in names of columns.
 fn parse_bins(text: &str) -> anyhow::Result<Binning> {
-    let expected =
-        || anyhow!("expected EXPRESSION:N, or EXPRESSION:EDGE,EDGE,... with increasing edges");
-    let (of, bins) = text.rsplit_once(':').ok_or_else(expected)?;
+    let expected = || {
+        anyhow!(
+            "expected EXPRESSION:N, EXPRESSION:EDGE,EDGE,... with increasing edges, or EXPRESSION for a bin per value"
+        )
+    };
+    let Some((of, bins)) = text.rsplit_once(':') else {
+        return Ok(Binning {
+            of: Expression::parse(text)?,
+            edges: Edges::Values,
+        });
+    };
     let of = Expression::parse(of)?;
     let edges = match bins.trim().parse::<usize>() {
-        Ok(count) => Edges::Equal(count),
+        Ok(count) if (2..=MAX_BINS).contains(&count) => Edges::Equal(count),
+        Ok(_) => return Err(anyhow!("expected 2 to {MAX_BINS} bins")),
         Err(_) => {
             let edge = |text: &str| {
-                text.trim()
-                    .parse::<f64>()
-                    .ok()
-                    .filter(|edge| edge.is_finite())
+                let edge = text.trim().parse::<f64>().ok();
+                edge.filter(|edge| edge.is_finite())
             };
             let edges: Option<Vec<f64>> = bins.split(',').map(edge).collect();
+            let edges = edges.filter(|edges| edges.len() > 2 && edges.is_sorted_by(|a, b| a < b));
             Edges::Given(edges.ok_or_else(expected)?)
         }
     };
-    match &edges {
-        Edges::Given(edges) if edges.len() < 2 || !edges.is_sorted_by(|a, b| a < b) => {
-            Err(expected())
-        }
-        edges if !(2..=MAX_BINS).contains(&edges.count()) => {
-            Err(anyhow!("expected 2 to {MAX_BINS} bins"))
-        }
-        _ => Ok(Binning { of, edges }),
-    }
+    Ok(Binning { of, edges })
 }
 
 // Of a file of sums, which is read into memory. Chosen by hand.
@@ -242,22 +254,35 @@ pub(crate) fn run(arguments: &Arguments, command_line: &str) -> anyhow::Result<(
         for warning in warnings.chain(of_other_images(&result, &other)) {
             tell(format_args!("warning: --against: {warning}"));
         }
-        let table = compared_table(&result, &other, &difference);
-        return arguments.printing.print(&table);
+        let mut table = compared_table(&result, &other, &difference);
+        let checks = check(&difference, &arguments.fail_above);
+        if !checks.is_empty() {
+            table
+                .notes
+                .push("--fail-above: limits of the rows `difference`.".into());
+        }
+        arguments.printing.print(&table)?;
+        return fail(&checks);
     }
     warn();
-    let table = bias_table(&result);
+    let mut table = bias_table(&result);
+    let checks = check(&result, &arguments.fail_above);
+    if !checks.is_empty() {
+        with_failures(&mut table, "bin", &checks);
+    }
     arguments.printing.check(&table)?;
     if let Some(plot) = &arguments.plot {
         bias_plot(&result).save(plot)?;
     }
-    // Of all galaxies, not of bins, of which some exceed a limit by chance.
-    let checks = check(result.all()?, &arguments.fail_above);
     arguments.printing.print(&table)?;
     let sections = || Ok(vec![section(&result, table)?]);
     arguments.report.save("Shear bias", sections, || {
         Ok(made_by([("Command", command_line.to_owned())]))
     })?;
+    fail(&checks)
+}
+
+fn fail(checks: &[Checked]) -> anyhow::Result<()> {
     let failed: Vec<_> = checks.iter().filter(|check| check.failed).collect();
     for check in &failed {
         tell(format_args!("error: {}", check.text));
@@ -316,9 +341,8 @@ fn of_catalogues(summing: &Summing, catalogues: &[PathBuf]) -> anyhow::Result<Su
         (None, None) => Truth::Columns,
     };
     let shard = summing.shard.unwrap_or(Shard::WHOLE);
-    if let (Some(_), Some(Edges::Equal(_))) =
-        (summing.shard, summing.bins.as_ref().map(|bins| &bins.edges))
-    {
+    let is_open = |bins: &Binning| !matches!(bins.edges, Edges::Given(_));
+    if summing.shard.is_some() && summing.bins.iter().any(is_open) {
         anyhow::bail!(
             "--shard: all shards need the same bins (found a number of bins, expected edges). Try: --bins 'snr:5,10,20'"
         );
@@ -335,6 +359,11 @@ fn of_catalogues(summing: &Summing, catalogues: &[PathBuf]) -> anyhow::Result<Su
             anyhow::bail!("{option}: cannot be used with step() in --where");
         }
     }
+    anyhow::ensure!(
+        summing.bins.len() <= MAX_AXES,
+        "--bins: found {} quantities, expected at most {MAX_AXES}",
+        summing.bins.len()
+    );
     let found = expand(catalogues, truth)?;
     let request = Request {
         catalogues: found.catalogues,
@@ -344,6 +373,11 @@ fn of_catalogues(summing: &Summing, catalogues: &[PathBuf]) -> anyhow::Result<Su
         shapes: summing.ellipticity,
         sign,
         bins: summing.bins.clone(),
+        like: summing.like.clone().map(|catalogue| Survey {
+            catalogue: catalogue.into(),
+            tomography: summing.tomography.clone(),
+        }),
+        paired: summing.paired,
         selection,
         design: summing.design,
         units: match summing.units.as_deref() {

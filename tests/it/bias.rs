@@ -11,7 +11,7 @@ use shearq_files::frames::polars::{Column, NamedFrom, Series};
 use shearq_files::table::{self, FileFormat};
 use shearq_quantities::Shear;
 
-use crate::support::{Folder, assert_has, fits_extension};
+use crate::support::{Folder, assert_has, fits_extension, shell};
 
 const M: [f64; 2] = [0.02, -0.03];
 const C: [f64; 2] = [1e-3, -2e-3];
@@ -341,23 +341,26 @@ fn sheared_flags_and_weights_give_their_response() {
             }
             text
         });
-        // ⟨e⟩ of each catalogue with its own choice and weights, over both catalogues.
-        let mean = |catalogue: usize, k: usize| {
+        // ⟨e⟩ of each catalogue with its own choice and weights in an arm, and the sum of weights.
+        let mean = |g: f64, catalogue: usize, k: usize| {
             let mut sums = [0.0; 2];
-            for g in [0.02, -0.02] {
-                for (id, shape) in shapes.iter().enumerate().filter(|(id, _)| !failed(*id)) {
-                    let size = size(id, shape, g, SHEARS[catalogue]);
-                    if size >= 0.7 {
-                        sums[0] += weight(size) * (shape[k] + g);
-                        sums[1] += weight(size);
-                    }
+            for (id, shape) in shapes.iter().enumerate().filter(|(id, _)| !failed(*id)) {
+                let size = size(id, shape, g, SHEARS[catalogue]);
+                if size >= 0.7 {
+                    sums[0] += weight(size) * (shape[k] + g);
+                    sums[1] += weight(size);
                 }
             }
-            sums[0] / sums[1]
+            (sums[0] / sums[1], sums[1])
         };
         let found = &rows(&folder, &files)[0];
         for k in 0..2 {
-            let expected = 1.0 + (mean(1 + 2 * k, k) - mean(2 + 2 * k, k)) / 0.02;
+            // Each arm has its own response.
+            let [plus, minus] = [0.02, -0.02].map(|g| {
+                let [plus, minus] = [1, 2].map(|catalogue| mean(g, catalogue + 2 * k, k).0);
+                ((plus - minus) / 0.02, mean(g, 0, k).1)
+            });
+            let expected = 1.0 + (plus.0 * plus.1 + minus.0 * minus.1) / (plus.1 + minus.1);
             let r = number(found, &format!("r{}", k + 1));
             assert!((r - expected).abs() < 1e-9, "{name}: {r}, {expected}");
             // The choice matters.
@@ -553,4 +556,124 @@ fn formulas_and_bits_of_flags_make_columns() {
     assert_m(&rows(&folder, &line)[0], expected, 1e-9);
     let line = format!("bias {files} --columns e1=Q1/R,e2=Q2");
     folder.refuses(&line, "there is no column `R`");
+}
+
+/// S/N, size and m of simulated galaxies, and their number.
+const KINDS: [(f64, f64, f64, usize); 4] = [
+    (8.0, 1.0, -0.10, 400),
+    (8.0, 2.0, -0.06, 300),
+    (20.0, 1.0, -0.03, 200),
+    (20.0, 2.0, 0.01, 100),
+];
+
+#[test]
+fn simulated_galaxies_are_weighted_to_those_of_a_survey() {
+    let folder = Folder::new();
+    let files = pair(&folder, "sim", 0.02, |g, normal| {
+        let mut text = String::from("id,e1,e2,w,snr,size,g1,g2\n");
+        let kinds = KINDS.iter().flat_map(|own| std::iter::repeat_n(own, own.3));
+        for (id, (snr, size, m, _)) in kinds.enumerate() {
+            let [a, b] = normal.pair(0.2).map(|shape| shape + (1.0 + m) * g);
+            writeln!(text, "{id},{a},{b},{},{snr},{size},{g},{g}", 1 + id % 3).unwrap();
+        }
+        text
+    });
+    // Weights per kind in two tomographic bins, and galaxies that no simulation has.
+    let shares = [("1", [4.0, 1.0, 2.0, 1.0]), ("low", [1.0, 1.0, 3.0, 5.0])];
+    let mut survey = String::from("snr,size,shape_weight,TOMOBIN\n");
+    for (bin, weights) in shares {
+        for ((snr, size, ..), weight) in KINDS.iter().zip(weights) {
+            for _ in 0..2 {
+                writeln!(survey, "{snr},{size},{},{bin}", weight / 2.0).unwrap();
+            }
+        }
+    }
+    survey.push_str("60,1,2,low\n20,9,0,low\n");
+    folder.write("survey.csv", survey);
+    let command = format!("bias {files} --bins snr:5,10,50,90 --bins size:0.5,1.5,2.5");
+    let found = folder.json(&format!("{command} --like survey.csv"));
+    let rows = found["rows"].as_array().unwrap();
+    let mean = |weights: [f64; 4]| {
+        let sum: f64 = KINDS.iter().zip(weights).map(|(own, w)| w * own.2).sum();
+        sum / weights.iter().sum::<f64>()
+    };
+    let all = [0, 1, 2, 3].map(|k| shares[0].1[k] + shares[1].1[k]);
+    let expected = [
+        ("like survey.csv", mean(all)),
+        ("like survey.csv, TOMOBIN 1", mean(shares[0].1)),
+        ("like survey.csv, TOMOBIN low", mean(shares[1].1)),
+    ];
+    assert_eq!(rows.len(), 4);
+    for (row, (label, m)) in rows[1..].iter().zip(expected) {
+        assert_eq!(row["bin"], label);
+        // The shapes cancel, whatever the weights.
+        assert_m(row, [m; 2], 1e-9);
+        assert_eq!(number(row, "n"), 2000.0);
+    }
+    // As they are, the simulated galaxies have another m.
+    assert!((number(&rows[0], "m1") - expected[0].1).abs() > 0.01);
+    let notes = found["notes"].to_string();
+    assert_has(&notes, "snr 50 to 90, size 0.5 to 1.5 (10.00 %)");
+    assert_has(&notes, "w=shape_weight, tomographic bin=TOMOBIN");
+    // Without a survey, bins without galaxies are a mistake.
+    folder.refuses(&command, "no galaxy that counts has snr 50 to 90");
+}
+
+#[test]
+fn paired_galaxies_have_the_error_of_pairs() {
+    let folder = Folder::new();
+    let files = pair(&folder, "own", 0.02, |g, normal| {
+        let mut text = String::from("id,e1,e2,flag,g1,g2\n");
+        for id in 0..GALAXIES {
+            let [a, b] = normal.pair(0.3);
+            // One in a hundred fails under one sign only.
+            let flag = u8::from(id % 100 == if g > 0.0 { 3 } else { 53 });
+            writeln!(text, "{id},{},{},{flag},{g},{g}", a + 1.1 * g, b + 0.9 * g).unwrap();
+        }
+        text
+    });
+    let [all, paired] = ["", " --paired"].map(|option| {
+        let line = format!("{files}{option}");
+        (folder.run(&format!("bias {line}")), rows(&folder, &line))
+    });
+    assert_has(&all.0, "count under one of two opposite shears only");
+    assert!(number(&all.1[0], "m1_error") > 0.02, "{}", all.1[0]);
+    assert_has(&paired.0, "40 rows have no partner");
+    assert_m(&paired.1[0], [0.1, -0.1], 1e-9);
+    assert!(number(&paired.1[0], "m1_error") < 1e-9);
+    assert_eq!(number(&paired.1[0], "n"), 2.0 * 0.98 * GALAXIES as f64);
+    folder.refuses(
+        "bias own-plus.csv --g1 0.02 --g2 0.02 --paired",
+        "--paired needs the same galaxies",
+    );
+}
+
+#[test]
+fn limits_are_tested_in_each_bin() {
+    let folder = Folder::new();
+    let files = pair(&folder, "own", 0.02, |g, normal| {
+        let mut text = String::from("id,e1,e2,kind,g1,g2\n");
+        for id in 0..300 {
+            let [a, b] = normal.pair(0.3);
+            let (kind, m) = [("disc", 0.0), ("bulge", 0.05), ("star's", 0.0)][id % 3];
+            let e = [a, b].map(|shape| shape + (1.0 + m) * g);
+            writeln!(text, "{id},{},{},{kind},{g},{g}", e[0], e[1]).unwrap();
+        }
+        text
+    });
+    let line = format!("bias {files} --bins kind --fail-above m=0.02");
+    let output = shell(folder.root(), &format!("shearq {line}"));
+    let [printed, told] =
+        [&output.stdout, &output.stderr].map(|text| String::from_utf8_lossy(text));
+    assert_eq!(output.status.code(), Some(1));
+    assert_has(&told, "kind bulge: |m1| exceeds its limit");
+    assert!(!told.contains("disc") && !told.contains("all:"), "{told}");
+    assert_has(&printed, "Exceeds its limit");
+    let found = rows(&folder, &format!("{files} --bins kind"));
+    let bins: Vec<&str> = found
+        .iter()
+        .map(|row| row["bin"].as_str().unwrap())
+        .collect();
+    assert_eq!(bins, ["all", "kind bulge", "kind disc", "kind star's"]);
+    assert_m(&found[1], [0.05; 2], 1e-9);
 }

@@ -154,6 +154,8 @@ pub(crate) struct Totals<'a> {
     // The mean response of all arms, for arms without galaxies in one of their sheared catalogues.
     response: MeanResponse,
     pub(crate) all: Vec<f64>,
+    /// A sheared catalogue without galaxies in all arms.
+    pub(crate) lacking: Option<&'static str>,
 }
 
 impl<'a> Totals<'a> {
@@ -171,12 +173,14 @@ impl<'a> Totals<'a> {
             shares,
             response: MeanResponse::default(),
             all: Vec::new(),
+            lacking: None,
         };
         let factors = totals.factors(None);
         let mut pooled = vec![0.0; layout.len()];
         for sums in totals.arms.values() {
             add(&mut pooled, &totals.weighted(sums, &factors));
         }
+        totals.lacking = layout.without_galaxies(&pooled);
         totals.response = totals.mean_response(&pooled);
         totals.all = totals.reduced(None, &factors);
         totals

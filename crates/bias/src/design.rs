@@ -91,6 +91,12 @@ pub struct Catalogue {
     /// Rows with a distortion above 1, to which no shear belongs. Noise makes them.
     #[serde(default)]
     pub above_one: u64,
+    /// Rows that do not count because the galaxy does not count under all test shears.
+    #[serde(default)]
+    pub without_partner: u64,
+    /// Rows that count with |e| above 1, and above 2.
+    #[serde(default)]
+    pub beyond: [u64; 2],
     /// Pairs of numbers that many rows share exactly.
     #[serde(default)]
     pub repeated: Vec<Repeated>,
@@ -279,6 +285,11 @@ impl Grouping {
             ..*self
         }
     }
+}
+
+/// The group of each catalogue of a design: those of one group contain the same galaxies, by their names or order.
+pub fn same_galaxies(catalogues: &[Catalogue], design: Design) -> Vec<u32> {
+    numbers(catalogues, design).0
 }
 
 // Fewest groups of catalogues that serve as units. Below, the same rows of all catalogues form a unit: a jackknife of 20 units

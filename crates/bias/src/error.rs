@@ -17,6 +17,12 @@ pub enum BiasError {
         /// Units with a galaxy.
         found: usize,
     },
+    /// A sheared catalogue has no galaxy, so that there is no response.
+    #[error("no row of the sheared catalogue {name} counts (expected rows of 1p, 1m, 2p and 2m)")]
+    Sheared {
+        /// Its name.
+        name: &'static str,
+    },
     /// The mean response is not positive by five standard errors. A ratio with such a divisor has no finite variance.
     #[error("{}", response(*component, *found, *error))]
     Response {

@@ -112,7 +112,8 @@ impl Estimate {
 /// Errors do not contain the noise of stars; see [`Grouping::estimate`].
 ///
 /// # Errors
-/// [`BiasError::NoGalaxies`] or [`BiasError::FewUnits`] if no galaxy or only one unit was added to the bin, and
+/// [`BiasError::NoGalaxies`] or [`BiasError::FewUnits`] if no galaxy or only one unit was added to the bin,
+/// [`BiasError::Sheared`] if a sheared catalogue lacks, and
 /// [`BiasError::Response`] if a mean response is below five standard errors.
 pub fn estimate(units: &Units, bin: usize, truth: bool) -> Result<Estimate, BiasError> {
     behind_stars((units, &[]), (bin, None), truth)
@@ -150,6 +151,9 @@ fn behind_stars(
     let total = &totals.all;
     if fit::count(total) == 0.0 {
         return Err(BiasError::NoGalaxies);
+    }
+    if let Some(name) = totals.lacking {
+        return Err(BiasError::Sheared { name });
     }
     if units.len() < 2 {
         return Err(BiasError::FewUnits { found: units.len() });

@@ -47,6 +47,7 @@ mod verdict;
 pub use arms::Units;
 pub use design::{
     Catalogue, Design, Dominant, Grouping, Missing, Range, Repeated, WithoutPartner, group,
+    same_galaxies,
 };
 pub use error::BiasError;
 pub use estimate::{Estimate, Measured, QUANTITIES, Quantity, difference, estimate};

@@ -282,6 +282,13 @@ impl Layout {
         (sums[COUNT], slopes)
     }
 
+    /// The first sheared catalogue without galaxies, if there are sheared catalogues.
+    pub(crate) fn without_galaxies(self, sums: &[f64]) -> Option<&'static str> {
+        let mut names = SHEARED_CATALOGUES.iter().enumerate();
+        let found = names.find(|(at, _)| sums[SHEARED + 2 * at + 1] == 0.0);
+        found.filter(|_| self.sheared).map(|(_, (name, _))| *name)
+    }
+
     /// Mean response from the sheared catalogues of these sums; NaN if one of them has no galaxy.
     pub(crate) fn mean_response(self, sums: &[f64]) -> MeanResponse {
         // The sum of weights differs from catalogue to catalogue, because each selects and weights other galaxies. Four

@@ -10,12 +10,14 @@ use crate::expression::Expression;
 use crate::select::StatedSelection;
 use crate::truth::{TrueSign, Truth};
 
-pub const MAX_BINS: usize = 100;
+/// Bins of all quantities together. KiDS calibrates in 20 × 20 bins of S/N and size (Fenech Conti et al. 2017, MNRAS 467, 1627).
+pub const MAX_BINS: usize = 400;
+/// Quantities that are binned at the same time.
+pub const MAX_AXES: usize = 3;
 
 #[derive(Debug, Clone)]
 pub struct Binning {
     pub of: Expression,
-    /// The edges, or a number of bins with equally many galaxies.
     pub edges: Edges,
 }
 
@@ -23,17 +25,18 @@ pub struct Binning {
 pub enum Edges {
     /// A number of bins with equally many galaxies.
     Equal(usize),
-    /// Increasing edges. The last bin contains its upper edge.
+    /// Increasing edges of half-open bins, which contain their lower edge.
     Given(Vec<f64>),
+    /// A bin for each different number or text.
+    Values,
 }
 
-impl Edges {
-    pub fn count(&self) -> usize {
-        match self {
-            Edges::Equal(count) => *count,
-            Edges::Given(edges) => edges.len().saturating_sub(1),
-        }
-    }
+/// A catalogue of a survey, to whose galaxies simulated ones are weighted.
+#[derive(Debug, Clone)]
+pub struct Survey {
+    pub catalogue: Input,
+    /// Column of its tomographic bins.
+    pub tomography: Option<String>,
 }
 
 /// Which galaxies form an independent unit.
@@ -72,11 +75,15 @@ pub struct Request {
     /// How ellipticities become shears; `None` if the names of the columns decide.
     pub shapes: Option<Shapes>,
     pub sign: TrueSign,
-    pub bins: Option<Binning>,
+    /// At most [`MAX_AXES`].
+    pub bins: Vec<Binning>,
+    pub like: Option<Survey>,
     /// Rows that count, and weights of catalogues of linear configurations, whose response to shear enters.
     pub selection: Option<StatedSelection>,
     pub design: Option<Design>,
     pub units: Units,
+    /// Whether only galaxies count that count under all test shears.
+    pub paired: bool,
     /// Whether rows with missing numbers are left out.
     pub drop_missing: bool,
     /// Artificial shear of metacalibration.

@@ -21,14 +21,17 @@ use crate::star_noise;
 
 use crate::columns::{CATALOGUES, Columns, RESPONSES, Role, Shapes, counted_value, sheared_pair};
 use crate::identity;
-use crate::request::Input;
+use crate::request::{Input, MAX_AXES};
 use crate::source::{Reading, Source, catalogue_named};
 use crate::truth::{OfRows, check};
 
 /// A row that counts, in the catalogue without artificial shear or in a sheared one.
 #[derive(Debug)]
 pub struct SummedRow {
+    /// The key of its unit.
     pub key: u64,
+    /// The identifier of the galaxy, or the number of the row.
+    pub galaxy: u64,
     /// Index of the sheared catalogue that the row belongs to, 0 for noshear.
     pub sheared: usize,
     pub row: Row,
@@ -39,8 +42,8 @@ pub struct SummedRow {
 /// a galaxy over a cut, which is the response of the selection.
 #[derive(Debug)]
 pub struct Selected {
-    /// The binned quantity where the row is selected: 0 without bins, NaN if a number is missing.
-    pub binned: [Result<f64, Exclusion>; CATALOGUES],
+    /// The binned quantities where the row is selected: 0 without bins, NaN if a number is missing.
+    pub binned: [Result<[f64; MAX_AXES], Exclusion>; CATALOGUES],
     pub weights: [f64; CATALOGUES],
 }
 
@@ -134,6 +137,10 @@ pub fn rows(
                                     summary.shear[k].add(item.row.g[k]);
                                     summary.ellipticity[k].add(item.row.e[k]);
                                 }
+                                let [a, b] = item.row.e;
+                                for (count, limit) in summary.beyond.iter_mut().zip([1.0, 2.0]) {
+                                    *count += u64::from(a * a + b * b > limit * limit);
+                                }
                                 if excluded.is_none() {
                                     found.add(&part, at, (first + at + 1) as u64, &item.row);
                                 }
@@ -181,6 +188,8 @@ const CROSS_RESPONSE_ROLES: [Role; 2] = [Role::R12, Role::R21];
 const WEIGHT_DERIVATIVE_ROLES: [Role; 2] = [Role::Dw1, Role::Dw2];
 const KSB_ROLES: [Role; 2] = [Role::KsbE1, Role::KsbE2];
 
+// Programs write 1e20, 1e30 or the largest float for a failure.
+const MIN_FAILED_NUMBER: f64 = 1e20;
 // Values of a column that determine its range. A sample is enough for an order of magnitude. Chosen by hand.
 const SAMPLED_VALUES: usize = 1 << 16;
 
@@ -357,6 +366,15 @@ impl<'a> TableRows<'a> {
         add(size, expected, range(size), |size, range| {
             size <= 0.0 || range.excludes(size)
         });
+        // Bins of −99 or 1e20 would be bins of failures. Other large numbers are fluxes of bright galaxies.
+        let binned = source.places.all((Role::Binned, 0)).iter().copied();
+        let binned = binned.filter(|place| source.wanted[*place].pattern.is_none());
+        for column in binned.collect::<Vec<_>>() {
+            let expected = "a number that can be binned";
+            add(&[column], expected, range(&[column]), |value, range| {
+                value < 0.0 && range.excludes(value) || value.abs() >= MIN_FAILED_NUMBER
+            });
+        }
         let weight = source.places.all((Role::Weight, 0));
         add(weight, "a weight", shear, |weight, _| {
             weight >= MIN_FAILED_WEIGHT
@@ -450,24 +468,34 @@ impl<'a> TableRows<'a> {
         Selected { binned, weights }
     }
 
-    // The binned quantity in a sheared catalogue (0 for noshear) if `--where` selects the row; NaN if a number is missing.
-    fn binned(&self, at: usize, sheared: usize) -> Option<f64> {
-        let of = |expression: Option<&Expression>, role: Role, without: f64| {
-            let Some(own) = expression else {
-                return Some(without);
-            };
-            let places = self.source.places.all((role, sheared));
-            // A sheared catalogue without the columns of the expression selects nothing.
-            let known = own.operands().len() == places.len();
-            let value = known.then(|| own.value(&|k| self.value(places[k], at)));
-            value.filter(|value| !value.is_infinite())
+    // The binned quantities in a sheared catalogue (0 for noshear) if `--where` selects the row; NaN if a number is missing.
+    fn binned(&self, at: usize, sheared: usize) -> Option<[f64; MAX_AXES]> {
+        let mut values = [0.0; MAX_AXES];
+        // A sheared catalogue without the columns of the expression selects nothing.
+        let value = |expression: &Expression, places: Option<&[usize]>| {
+            let places = places?;
+            let value = expression.value(&|k| self.value(places[k], at));
+            (!value.is_infinite()).then_some(value)
         };
-        let selected = of(self.reading.condition(), Role::Condition, 1.0)?;
+        let mut selected = 1.0;
+        if let Some(condition) = self.reading.condition() {
+            let places = self.source.places.all((Role::Condition, sheared));
+            let places = (places.len() == condition.operands().len()).then_some(places);
+            selected = value(condition, places)?;
+        }
         if selected == 0.0 {
             return None;
         }
-        let binned = of(self.reading.binned(), Role::Binned, 0.0)?;
-        Some(if selected.is_nan() { f64::NAN } else { binned })
+        let mut places = self.source.places.all((Role::Binned, sheared));
+        for (own, expression) in values.iter_mut().zip(self.reading.binned()) {
+            let (first, rest) = places.split_at_checked(expression.operands().len())?;
+            *own = value(expression, Some(first))?;
+            places = rest;
+        }
+        Some(match selected.is_nan() {
+            true => [f64::NAN; MAX_AXES],
+            false => values,
+        })
     }
 
     // The row, the `index`-th of its sheared catalogue, with its shape and its true shear.
@@ -492,6 +520,7 @@ impl<'a> TableRows<'a> {
         }
         Ok(SummedRow {
             key: self.key(at, index),
+            galaxy: self.ids.as_ref().map_or(index, |ids| ids[at]),
             sheared: self.sheared(at),
             row,
             selected,
@@ -571,7 +600,7 @@ impl<'a> TableRows<'a> {
             ),
             (
                 "the expression of --where or --bins",
-                selected.binned[0].unwrap_or(0.0),
+                selected.binned[0].map_or(0.0, |values| values.iter().sum()),
             ),
         ];
         match checked.iter().find(|(_, value)| !value.is_finite()) {

@@ -38,16 +38,14 @@ impl Reading<'_> {
         self.request.selection.as_ref()?.weights.as_ref()
     }
 
-    pub fn binned(&self) -> Option<&Expression> {
-        self.request.bins.as_ref().map(|bins| &bins.of)
+    pub fn binned(&self) -> impl Iterator<Item = &Expression> + Clone {
+        self.request.bins.iter().map(|bins| &bins.of)
     }
 
     fn expressions(&self) -> impl Iterator<Item = (Role, &Expression)> + Clone {
-        let all = [
-            (Role::Condition, self.condition()),
-            (Role::Binned, self.binned()),
-        ];
-        all.into_iter().filter_map(|(role, own)| Some((role, own?)))
+        let condition = self.condition().into_iter();
+        let condition = condition.map(|own| (Role::Condition, own));
+        condition.chain(self.binned().map(|own| (Role::Binned, own)))
     }
 
     fn chosen_by(&self) -> impl Iterator<Item = &str> + Clone {
@@ -432,7 +430,10 @@ impl Wanted<'_> {
             let operands = self.operands(expression, by_catalogue)?;
             for (catalogue, own) in operands.into_iter().enumerate() {
                 known &= own.len() == expression.operands().len();
-                places.set((role, catalogue), own);
+                // Several quantities may be binned.
+                let key = (role, catalogue);
+                let all = [places.all(key), &own].concat();
+                places.set(key, all);
             }
         }
         let weight = weight.filter(|_| known);

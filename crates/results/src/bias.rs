@@ -3,16 +3,20 @@
 //! [`Request`] specifies catalogues and options. [`sum`] reads the catalogues into sums that merge ([`Summed`]), and
 //! [`Summed::result`] estimates.
 
+mod cells;
+mod like;
+mod partners;
+
 use std::collections::{BTreeSet, HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 use shearq_bias::{
     BiasError, Catalogue, Design, Estimate, Grouping, Layout, Range, UnitSums, difference, group,
+    same_galaxies,
 };
 use shearq_catalogue::columns::{CATALOGUES, Role, Shapes};
-use shearq_catalogue::expression::Expression;
-use shearq_catalogue::request::{Edges, Input, Request, Units};
+use shearq_catalogue::request::{Input, MAX_BINS, Request, Units};
 use shearq_catalogue::rows::{distinct, rows};
 use shearq_catalogue::source::{Reading, Source, sources};
 use shearq_catalogue::truth::{TrueSign, Truth};
@@ -25,6 +29,10 @@ use shearq_files::FileError;
 use shearq_files::table::{self, FileFormat};
 use shearq_scoring::TruthSign;
 use thiserror::Error;
+
+pub use cells::{Axis, Cells};
+pub use like::Population;
+use partners::Partners;
 
 #[derive(Debug, Error)]
 #[non_exhaustive]
@@ -65,9 +73,34 @@ pub enum BiasFailure {
     #[error("{0}: the catalogue is in two files of sums")]
     InTwoFiles(String),
     #[error(
-        "--bins: `{of}` has too few different values for {bins} bins with equally many galaxies. Try: fewer bins or given edges"
+        "--bins: `{of}` has {different} different values (expected more for {bins} bins with equally many galaxies). Try: --bins '{of}' for a bin per value, or edges"
     )]
-    FewValues { of: String, bins: usize },
+    FewValues {
+        of: String,
+        bins: usize,
+        different: usize,
+    },
+    #[error(
+        "--bins: `{of}` has more than {MAX_BINS} different values (expected a bin per value). Try: --bins '{of}:5', or edges"
+    )]
+    ManyValues { of: String },
+    #[error("--bins: found {0} bins of all quantities together, expected at most {MAX_BINS}")]
+    ManyBins(usize),
+    #[error("--bins: no galaxy that counts has {0}. Try: other edges")]
+    EmptyBin(String),
+    #[error(
+        "--paired needs the same galaxies under several test shears (found the design {}). Try: --design arms if they are the same",
+        .0.name()
+    )]
+    NothingPairs(Design),
+    #[error(
+        "--paired: the galaxies of sheared catalogues are detected again in each, and have no partner in another (expected responses in columns). Try: omit --paired; each arm then has its own response"
+    )]
+    PairedSheared,
+    #[error("--like needs bins of both catalogues. Try: --bins 'snr:10' --bins 'size:5'")]
+    LikeWithoutBins,
+    #[error("{}: no galaxy of the survey is in a bin with simulated galaxies", .0.display())]
+    NothingAlike(PathBuf),
     #[error("the catalogues cannot be compared: truth or bins differ. Try: bins with edges")]
     BinsDiffer,
     #[error("the catalogues cannot be compared: e2 of one follows the true g2 of sign {}, of the other {}. Try: --truth-sign", word(*.0), word(*.1))]
@@ -83,6 +116,10 @@ pub enum BiasFailure {
         .0.rows, .0.flagged, .0.unweighted, .0.unselected, .0.missing, .0.failed, .0.above_one
     )]
     NoGalaxy(Box<Catalogue>),
+    #[error(
+        "{rows} of {used} rows have |e| above 2, so that e1 and e2 are no ellipticities (expected moduli below 1). Try: --columns with their names, or with the responses R11 and R22 of ellipticities in other units"
+    )]
+    Beyond { rows: u64, used: u64 },
     #[error("e{component} is {value} in all {rows} rows (expected different values)")]
     Constant {
         component: usize,
@@ -101,7 +138,7 @@ pub enum BiasFailure {
     #[error("e2 follows minus the true g2 (found a slope of {response:.3}, expected about 1). Try: {}", other_sign(*sign))]
     MinusG2 { response: f64, sign: Option<Sign> },
     #[error(
-        "the ellipticities do not follow the true shear (found slopes of {:.3} and {:.3}, expected about 1). Try: check the order of the rows and of e1 and e2, or join by id", .0[0], .0[1]
+        "the ellipticities do not follow the true shear (found slopes of {:.3} and {:.3}, expected about 1). Try: check the order of the rows and of e1 and e2, whether the mean was subtracted, or join by id", .0[0], .0[1]
     )]
     Unrelated([f64; 2]),
     #[error(
@@ -120,7 +157,7 @@ pub struct About {
     pub by_shearq: bool,
     truth: bool,
     /// Whether responses were read, or the type of the ellipticities was given.
-    response: bool,
+    pub response: bool,
     /// Whether rows have a response that `--columns R11=none` leaves out.
     pub response_column: bool,
     /// Whether units are named by identifiers.
@@ -132,8 +169,11 @@ pub struct About {
     kind: Vec<(String, String)>,
     design: Option<Design>,
     by_key: Option<bool>,
-    pub binned: String,
-    edges: Vec<f64>,
+    pub cells: Cells,
+    /// The column by whose values galaxies are a unit.
+    pub named_unit: Option<String>,
+    /// Whether only galaxies count that count under all test shears.
+    pub paired: bool,
     /// Columns of `--where` or `--bins` without sheared versions: m contains how shear changes this choice.
     pub measured: Vec<String>,
     /// The texts of the options that select and weight rows, such as `where: snr > 10`.
@@ -162,6 +202,10 @@ impl About {
             total.missing += own.missing;
             total.failed += own.failed;
             total.above_one += own.above_one;
+            total.without_partner += own.without_partner;
+            for (total, own) in total.beyond.iter_mut().zip(own.beyond) {
+                *total += own;
+            }
         }
         total
     }
@@ -171,12 +215,17 @@ impl About {
 pub struct Summed {
     sums: UnitSums,
     about: About,
+    // Of surveys, whose catalogues are not summed.
+    #[serde(skip)]
+    populations: Vec<Population>,
 }
 
 #[derive(Debug, Clone)]
 pub struct BinResult {
-    /// Lower and upper edge; `None` for all galaxies.
-    pub edges: Option<[f64; 2]>,
+    /// `all`, the bins, or the survey to whose galaxies the simulated ones are weighted.
+    pub label: String,
+    /// Lower and upper edge of each binned quantity; empty for all galaxies.
+    pub ranges: Vec<[f64; 2]>,
     /// The estimates, or why there are none.
     pub estimate: Result<Estimate, BiasError>,
 }
@@ -190,6 +239,10 @@ pub struct BiasResult {
     /// The units of the errors, and what is wrong with them.
     pub grouping: Grouping,
     pub about: About,
+    /// Galaxies outside of all bins, which count in the row of all.
+    pub outside: usize,
+    /// The surveys to whose galaxies the simulated ones are weighted.
+    pub populations: Vec<Population>,
 }
 
 impl BiasResult {
@@ -201,10 +254,6 @@ impl BiasResult {
     }
 }
 
-// Values from which the edges of bins with equally many galaxies are determined, at most: 8 MB, and edges to 0.1 % of the
-// galaxies.
-const SAMPLE: usize = 1 << 20;
-
 /// Sums the catalogues of a request for which `part` holds, given their number.
 pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, BiasFailure> {
     distinct(&request.catalogues)?;
@@ -214,6 +263,12 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
         truth: request.truth.of_paths(paths)?,
         flip_g2: false,
     };
+    let numbered = cells::with_numbers(request, &reading)?;
+    let (request, of_texts) = match &numbered {
+        Some((request, axes)) => (request, axes.as_slice()),
+        None => (request, &[][..]),
+    };
+    reading.request = request;
     let mut all: Vec<Vec<Source>> = Vec::new();
     for input in &request.catalogues {
         all.push(sources(input, &reading)?);
@@ -235,16 +290,15 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
     let named = request.catalogues.iter().zip(&images);
     distinct_images(named.map(|(input, image)| (input.name.display().to_string(), image)))?;
     verify_data(&request.truth)?;
-    let edges = match &request.bins {
-        None => Vec::new(),
-        Some(bins) => match &bins.edges {
-            Edges::Given(edges) => edges.clone(),
-            Edges::Equal(count) => equal_edges(&reading, &all, *count)?,
-        },
-    };
+    let mut cells = cells::cells(&reading, &all)?;
+    for (axis, of_texts) in cells.axes.iter_mut().zip(of_texts) {
+        if let Some(own) = of_texts {
+            *axis = own.clone();
+        }
+    }
     let sign = known_sign(request, &all)?.filter(|_| truth);
     reading.flip_g2 = sign.is_some_and(|sign| sign.of == TruthSign::Challenge);
-    let (sums, catalogues) = add_up(&reading, &all, (layout, &edges), part)?;
+    let (sums, catalogues) = add_up(&reading, &all, (layout, &cells), part, None)?;
     let named_unit = matches!(request.units, Units::Column(_))
         || request.units == Units::Recognised && first.columns.of(Role::Unit).is_some();
     let about = About {
@@ -264,11 +318,9 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
             Units::Catalogues => Some(false),
             Units::Recognised => named_unit.then_some(true),
         },
-        binned: request
-            .bins
-            .as_ref()
-            .map_or_else(String::new, |bins| bins.of.text().to_owned()),
-        edges,
+        named_unit: first.unit.clone().filter(|_| named_unit),
+        paired: request.paired,
+        cells,
         measured,
         selection: request.selection.as_ref().map(|own| own.text.clone()),
         columns: described,
@@ -276,17 +328,36 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
         frame,
         without_catalogue: request.without_catalogue.clone(),
     };
-    let mut summed = Summed { sums, about };
+    let mut summed = Summed {
+        sums,
+        about,
+        populations: Vec::new(),
+    };
     // The catalogues are read again rather than the sums changed: g2 enters them in products of all terms.
     if let TrueSign::OfCatalogues(truth) = &request.sign {
         let sign = summed.sign_of_catalogues(truth)?;
         if sign.of == TruthSign::Challenge {
             reading.flip_g2 = true;
-            let (layout, edges) = (summed.sums.layout(), &summed.about.edges);
-            let found = add_up(&reading, &all, (layout, edges), part)?;
+            let found = add_up(&reading, &all, (layout, &summed.about.cells), part, None)?;
             (summed.sums, summed.about.catalogues) = found;
         }
         summed.about.sign = Some(sign);
+    }
+    if request.paired {
+        if first.has_sheared_rows() {
+            return Err(BiasFailure::PairedSheared);
+        }
+        let design = summed.design();
+        let partners = Partners::new(&reading, &all, design, &summed.about.catalogues)?;
+        let cells = &summed.about.cells;
+        let found = add_up(&reading, &all, (layout, cells), part, Some(&partners))?;
+        (summed.sums, summed.about.catalogues) = found;
+    }
+    if let Some(survey) = &request.like {
+        if summed.about.cells.axes.is_empty() {
+            return Err(BiasFailure::LikeWithoutBins);
+        }
+        summed.populations = like::populations(survey, request, &summed.about.cells)?;
     }
     for (catalogue, image) in summed.about.catalogues.iter_mut().zip(images) {
         catalogue.image = image;
@@ -298,13 +369,13 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
 fn add_up(
     reading: &Reading<'_>,
     all: &[Vec<Source>],
-    (layout, edges): (Layout, &[f64]),
+    (layout, cells): (Layout, &Cells),
     part: &dyn Fn(usize) -> bool,
+    partners: Option<&Partners<'_>>,
 ) -> Result<(UnitSums, Vec<Catalogue>), BiasFailure> {
     let request = reading.request;
-    // The last bin is of galaxies outside of the edges.
-    let bins = edges.len().max(1);
-    let mut sums = UnitSums::new(layout, bins, request.catalogues.len());
+    // The last cell is of galaxies outside of the edges.
+    let mut sums = UnitSums::new(layout, cells.count() + 1, request.catalogues.len());
     let mut catalogues = Vec::new();
     for (number, (Input { name, .. }, sources)) in request.catalogues.iter().zip(all).enumerate() {
         if !part(number) {
@@ -316,10 +387,12 @@ fn add_up(
         }
         let selects = sources[0].selects;
         let number = number as u32;
-        catalogues.push(rows(name, reading, sources, |item| {
+        let paired = partners.map(|all| all.of(number as usize)).transpose()?;
+        let mut alone = 0;
+        let mut catalogue = rows(name, reading, sources, |item| {
             let bin = |catalogue: usize| {
-                let value = item.selected.binned[catalogue].ok()?;
-                bin_of(edges, value)
+                let values = item.selected.binned[catalogue].ok()?;
+                cells.of(&values)
             };
             let (row, own) = (&item.row, bin(0));
             // Differences of 1p and 1m are then derivatives.
@@ -333,7 +406,19 @@ fn add_up(
                 }
                 return;
             }
-            if selects {
+            if let Some(paired) = &paired {
+                let counts = item.selected.binned[0].is_ok();
+                if !paired.contains(&item.galaxy) {
+                    alone += u64::from(counts);
+                    return;
+                }
+                // The same galaxies under all shears, so that the choice has no response; weights have one.
+                if let Some(bin) = own.filter(|_| selects) {
+                    for catalogue in 1..CATALOGUES {
+                        add_sheared(bin, catalogue, item.selected.weights[catalogue]);
+                    }
+                }
+            } else if selects {
                 // The ellipticity without artificial shear of the galaxies that each sheared catalogue selects, with its
                 // weights: the selection response R_S of Sheldon & Huff (2017, ApJ 841, 24). It needs all four catalogues,
                 // because a cut by S/N responds to both components.
@@ -346,7 +431,9 @@ fn add_up(
             if let Some(bin) = own {
                 sums.add(number, item.key, bin, row);
             }
-        })?);
+        })?;
+        catalogue.without_partner = alone;
+        catalogues.push(catalogue);
     }
     Ok((sums, catalogues))
 }
@@ -497,73 +584,10 @@ fn known(truth: &Truth, source: &Source) -> bool {
     !matches!(truth, Truth::Columns) || source.columns.have(&[Role::G1, Role::G2])
 }
 
-// The bin of a value; the last one is outside of all edges. `None` if a number is missing.
-fn bin_of(edges: &[f64], value: f64) -> Option<usize> {
-    if value.is_nan() {
-        return None;
-    }
-    let Some((last, _)) = edges.split_last() else {
-        return Some(0);
-    };
-    let outside = edges.len() - 1;
-    if value == *last {
-        return Some(outside - 1);
-    }
-    let above = edges.partition_point(|edge| *edge <= value);
-    Some(if above == 0 { outside } else { above - 1 })
-}
-
-// Edges of bins with equally many galaxies without artificial shear, from a sample of the catalogues.
-fn equal_edges(
-    reading: &Reading<'_>,
-    all: &[Vec<Source>],
-    count: usize,
-) -> Result<Vec<f64>, BiasFailure> {
-    let (mut values, mut stride, mut number) = (Vec::new(), 1u64, 0u64);
-    for (input, sources) in reading.request.catalogues.iter().zip(all) {
-        rows(&input.name, reading, sources, |item| {
-            if let (0, Ok(value)) = (item.sheared, item.selected.binned[0]) {
-                if number % stride == 0 {
-                    values.push(value);
-                }
-                number += 1;
-            }
-            if values.len() > SAMPLE {
-                // Every second value of the sample remains.
-                let mut odd = false;
-                values.retain(|_| {
-                    odd = !odd;
-                    odd
-                });
-                stride *= 2;
-            }
-        })?;
-    }
-    values.sort_unstable_by(f64::total_cmp);
-    let (Some(low), Some(high)) = (values.first(), values.last()) else {
-        return Err(BiasError::NoGalaxies.into());
-    };
-    let mut edges = vec![*low];
-    edges.extend((1..count).map(|k| values[k * values.len() / count]));
-    edges.push(*high);
-    if !edges.windows(2).all(|pair| pair[0] < pair[1]) {
-        return Err(BiasFailure::FewValues {
-            of: reading.binned().map_or("", Expression::text).to_owned(),
-            bins: count,
-        });
-    }
-    // A sample may lack the extreme values.
-    if stride > 1 {
-        edges[0] = f64::MIN;
-        edges[count] = f64::MAX;
-    }
-    Ok(edges)
-}
-
 impl Summed {
     /// Checks sums that were read from a file.
     pub fn checked(mut self) -> Result<Self, BiasFailure> {
-        let bins = self.about.edges.len().max(1);
+        let bins = self.about.cells.count() + 1;
         let mut sums = UnitSums::new(self.sums.layout(), bins, self.about.catalogues.len());
         sums.merge(self.sums)?;
         self.sums = sums;
@@ -621,7 +645,7 @@ impl Summed {
             } = *of;
             (truth, matched, design, by_key)
         };
-        let rows = |of: &About| (of.binned.clone(), of.edges.clone(), of.selection.clone());
+        let rows = |of: &About| (of.cells.clone(), of.paired, of.selection.clone());
         if options(&self.about) != options(&other.about) || rows(&self.about) != rows(&other.about)
         {
             return Err(BiasFailure::Unlike("options"));
@@ -648,11 +672,39 @@ impl Summed {
             error => error.into(),
         })?;
         self.check_responses(&all)?;
+        let cells = &self.about.cells;
+        // A survey has cells without simulated galaxies, which are named.
+        let is_empty = |cell: &usize| grouping.units.galaxies(*cell) == 0;
+        let empty = (0..cells.count()).find(is_empty);
+        if let Some(cell) = empty.filter(|_| cells.are_stated() && self.populations.is_empty()) {
+            return Err(BiasFailure::EmptyBin(cells.label(cell)));
+        }
+        let outside = match cells.count() {
+            0 => 0,
+            count => grouping.units.galaxies(count),
+        };
+        let mut bins = self.bins(all, |bin| grouping.estimate(bin, self.about.truth));
+        let mut populations = self.populations.clone();
+        if !populations.is_empty() {
+            // The survey instead of up to 400 bins.
+            bins.truncate(1);
+        }
+        for population in &mut populations {
+            let counts = (0..cells.count()).map(|cell| grouping.units.galaxies(cell));
+            let shares = population.covered(&counts.collect::<Vec<_>>(), cells)?;
+            bins.push(BinResult {
+                label: population.label.clone(),
+                ranges: Vec::new(),
+                estimate: grouping.estimate_like(&shares, self.about.truth),
+            });
+        }
         Ok(BiasResult {
-            bins: self.bins(all, |bin| grouping.estimate(bin, self.about.truth)),
+            bins,
             design,
             grouping,
             about: self.about.clone(),
+            outside,
+            populations,
         })
     }
 
@@ -662,23 +714,27 @@ impl Summed {
         estimate: impl Fn(usize) -> Result<Estimate, BiasError>,
     ) -> Vec<BinResult> {
         let all = BinResult {
-            edges: None,
+            label: "all".into(),
+            ranges: Vec::new(),
             estimate: Ok(all),
         };
-        let bins = self.about.edges.windows(2).enumerate();
-        let bins = bins.map(|(bin, edges)| BinResult {
-            edges: Some([edges[0], edges[1]]),
-            estimate: estimate(bin),
+        let cells = &self.about.cells;
+        let bins = (0..cells.count()).map(|cell| BinResult {
+            label: cells.label(cell),
+            ranges: cells.ranges(cell),
+            estimate: estimate(cell),
         });
         [all].into_iter().chain(bins).collect()
     }
 
+    fn design(&self) -> Design {
+        let recognised = || Design::of(&self.about.catalogues, self.about.truth);
+        self.about.design.unwrap_or_else(recognised)
+    }
+
     fn grouped(&self) -> Result<(Design, Grouping), BiasFailure> {
         self.check_values()?;
-        let design = self
-            .about
-            .design
-            .unwrap_or_else(|| Design::of(&self.about.catalogues, self.about.truth));
+        let design = self.design();
         let grouping = group(
             self.sums.clone(),
             &self.about.catalogues,
@@ -691,9 +747,7 @@ impl Summed {
 
     /// Differences of the estimates from `other`, of another program on the same galaxies, with paired errors.
     pub fn difference(&self, other: &Summed) -> Result<BiasResult, BiasFailure> {
-        if (&self.about.binned, &self.about.edges, self.about.truth)
-            != (&other.about.binned, &other.about.edges, other.about.truth)
-        {
+        if (&self.about.cells, self.about.truth) != (&other.about.cells, other.about.truth) {
             return Err(BiasFailure::BinsDiffer);
         }
         if let (Some(own), Some(theirs)) = (self.about.sign, other.about.sign)
@@ -728,6 +782,8 @@ impl Summed {
             design,
             grouping,
             about,
+            outside: 0,
+            populations: Vec::new(),
         })
     }
 
@@ -799,7 +855,12 @@ impl Summed {
     fn check_values(&self) -> Result<(), BiasFailure> {
         let total = self.about.total();
         let left_out = [total.flagged, total.unweighted, total.unselected];
-        let failed = [total.missing, total.failed, total.above_one];
+        let failed = [
+            total.missing,
+            total.failed,
+            total.above_one,
+            total.without_partner,
+        ];
         let left_out: u64 = left_out.iter().chain(&failed).sum();
         let used = total.rows.saturating_sub(left_out);
         if used == 0 {
@@ -818,6 +879,13 @@ impl Summed {
                     rows: used,
                 });
             }
+        }
+        // Ellipticities with a response may have any scale. Magnitudes, angles in degrees and percent are beyond 2 in most rows.
+        if !self.about.response && 2 * total.beyond[1] > used {
+            return Err(BiasFailure::Beyond {
+                rows: total.beyond[1],
+                used,
+            });
         }
         Ok(())
     }
@@ -987,14 +1055,5 @@ mod tests {
             assert!(copied.get() <= 12 * count, "{}", copied.get());
         }
         assert_eq!(joined([] as [Result<_, ()>; 0], join), Ok(None));
-    }
-
-    #[test]
-    fn bins_contain_their_lower_edges_and_the_last_its_upper_edge() {
-        let edges = [1.0, 2.0, 4.0];
-        let bins = [0.5, 1.0, 1.9, 2.0, 4.0, 4.1].map(|value| bin_of(&edges, value));
-        assert_eq!(bins, [2, 0, 0, 1, 1, 2].map(Some));
-        assert_eq!(bin_of(&[], 3.0), Some(0));
-        assert_eq!(bin_of(&edges, f64::NAN), None);
     }
 }

@@ -13,7 +13,7 @@ from . import _display, _hdf5, _shearq
 from ._tables import _EXACT, is_missing, named_columns
 
 Design = Literal["single", "pairs", "arms", "fields", "galaxies", "rotated"]
-Bins = tuple[str, Union[int, Sequence[float]]]
+Bins = Union[str, tuple[str, Union[int, Sequence[float]]]]
 
 
 class Bias:
@@ -124,11 +124,14 @@ def bias(
     columns: Mapping[str, str] | None = None,
     ellipticity: Literal["shear", "distortion", "responsivity"] | None = None,
     truth_sign: Literal["standard", "challenge"] | None = None,
-    bins: Bins | None = None,
+    bins: Bins | Sequence[Bins] | None = None,
+    like: Any = None,
+    tomography: str | None = None,
     where: str | None = None,
     weight: str | None = None,
     design: Design | None = None,
     units: str | None = None,
+    paired: bool = False,
     drop_missing: bool = False,
     step: float = 0.01,
 ) -> Bias:
@@ -165,9 +168,15 @@ def bias(
         Sign of the true g2. By default, for a table with a shear per galaxy: as the file states, else (for x, y, g1, g2)
         the sign in which the shear is an E-mode field, else the sign that e2 follows by 5σ; required if these are unclear.
         Other shears are standard.
-    bins : (str, int or sequence of float)
+    bins : str, (str, int or sequence of float), or a list of up to three
         Also estimate in bins of a column or expression: ``("snr", 5)`` has five bins with equally many galaxies,
-        ``("flux / flux_error", [5, 10, 20])`` has these edges. The response is that of each bin.
+        ``("flux / flux_error", [5, 10, 20])`` has these edges (each bin contains its lower edge), and ``"TOMOBIN"`` a bin
+        for each number or text. Several quantities are binned together. The response is that of each bin.
+    like : table or path
+        A survey with the binned columns: the simulated galaxies are weighted to its distribution in the bins, and the rows
+        after the first are those of the survey.
+    tomography : str
+        Column of the survey's tomographic bins, for a row of each; by default a column such as TOMOBIN or zbin.
     where : str
         Use only galaxies for which this holds, such as ``"snr > 10 and size < 4"``. Catalogues of shearq's linear
         configurations can also be cut by steps, such as ``"step(snr, 10) and step(size, 2.5)"``, as for
@@ -178,6 +187,9 @@ def bias(
         How catalogues belong together; recognised from the true shears.
     units : str
         Independent units of the errors: ``"rows"``, ``"catalogues"`` or a column.
+    paired : bool
+        Use only galaxies that count under all test shears. m then does not contain how shear changes which galaxies are
+        selected.
     drop_missing : bool
         Leave out rows with missing numbers, with numbers that stand for a failed measurement (−10, −99, 1e30), or without
         a true shear. The notes count them.
@@ -200,10 +212,13 @@ def bias(
         ellipticity=ellipticity,
         truth_sign=truth_sign,
         bins=bins,
+        like=like,
+        tomography=tomography,
         where=where,
         weight=weight,
         design=design,
         units=units,
+        paired=paired,
         drop_missing=drop_missing,
         step=step,
     )
@@ -219,11 +234,14 @@ def bias_sums(
     columns: Mapping[str, str] | None = None,
     ellipticity: Literal["shear", "distortion", "responsivity"] | None = None,
     truth_sign: Literal["standard", "challenge"] | None = None,
-    bins: Bins | None = None,
+    bins: Bins | Sequence[Bins] | None = None,
+    like: Any = None,
+    tomography: str | None = None,
     where: str | None = None,
     weight: str | None = None,
     design: Design | None = None,
     units: str | None = None,
+    paired: bool = False,
     drop_missing: bool = False,
     step: float = 0.01,
 ) -> BiasSums:
@@ -254,10 +272,13 @@ def bias_sums(
             ellipticity,
             truth_sign,
             _bins(bins),
+            None if like is None else _catalogue("like", like),
+            tomography,
             where,
             weight,
             design,
             units,
+            paired,
             drop_missing,
             float(step),
         )
@@ -355,9 +376,22 @@ def _truth(g1: Any, g2: Any, truth: Any, given: list[Any]) -> Any:
     return [(name, float(a), float(b)) for name, a, b in zip(names, *both)]
 
 
-def _bins(bins: Any) -> tuple[str, int | None, list[float]] | None:
+def _bins(bins: Any) -> list[tuple[str, int | None, list[float]]]:
+    """Each quantity with a number of bins or edges; without both, a bin for each value."""
     if bins is None:
-        return None
+        return []
+    if isinstance(bins, str):
+        return [(bins, None, [])]
+    # A list of quantities, or one as a pair of a name and a number or edges.
+    is_list = isinstance(bins, (list, tuple)) and all(
+        isinstance(own, str) or isinstance(own, tuple) and own and isinstance(own[0], str) for own in bins
+    )
+    return [_axis(own) for own in (bins if is_list else [bins])]
+
+
+def _axis(bins: Any) -> tuple[str, int | None, list[float]]:
+    if isinstance(bins, str):
+        return bins, None, []
     try:
         of, edges = bins
     except (TypeError, ValueError):

@@ -15,6 +15,9 @@ use shearq_catalogue::foreign::shown;
 // Units above which Student's t differs from a normal distribution by less than 5 %.
 const MANY_UNITS: usize = 30;
 
+// Units below which a standard error is itself uncertain by more than 16 %.
+const FEW_UNITS: usize = 20;
+
 const MAIN: [&str; 4] = ["m1", "m2", "c1", "c2"];
 
 // A column of the table: its key, heading, whether only the wide table has it, and its cell of a bin.
@@ -26,30 +29,38 @@ type BinColumn = (
 );
 
 // The quantities of the estimate follow.
-const COLUMNS: [BinColumn; 7] = [
-    ("bin", "Bin", false, |result, bin| {
-        Cell::text(label(result, bin.edges))
-    }),
+const COLUMNS: [BinColumn; 12] = [
+    ("bin", "Bin", false, |_, bin| Cell::text(&bin.label)),
     ("n", "Galaxies", false, |_, bin| {
         count(bin, |found| found.galaxies as f64)
     }),
-    ("low", "From", true, |_, bin| {
-        Cell::number(bin.edges.map_or(f64::NAN, |e| e[0]), 4)
-    }),
-    ("high", "To", true, |_, bin| {
-        Cell::number(bin.edges.map_or(f64::NAN, |e| e[1]), 4)
-    }),
+    ("low", "From", true, |_, bin| edge(bin, 0, 0)),
+    ("high", "To", true, |_, bin| edge(bin, 0, 1)),
+    ("low_2", "From (2)", true, |_, bin| edge(bin, 1, 0)),
+    ("high_2", "To (2)", true, |_, bin| edge(bin, 1, 1)),
+    ("low_3", "From (3)", true, |_, bin| edge(bin, 2, 0)),
+    ("high_3", "To (3)", true, |_, bin| edge(bin, 2, 1)),
     ("n_effective", "Effective", true, |_, bin| {
         count(bin, |found| found.effective)
     }),
     ("units", "Units", true, |_, bin| {
         count(bin, |found| found.units as f64)
     }),
+    ("m_covariance", "cov(m1, m2)", true, |_, bin| {
+        let found = bin.estimate.as_ref().ok();
+        let covariance = found.and_then(Estimate::covariance);
+        Cell::number(covariance.unwrap_or(f64::NAN), 12)
+    }),
     ("frame", "Frame", true, |result, _| {
         let frame = result.about.frame.as_ref();
         frame.map_or(Cell::Empty, Cell::text)
     }),
 ];
+
+fn edge(bin: &BinResult, axis: usize, side: usize) -> Cell {
+    let range = bin.ranges.get(axis);
+    Cell::number(range.map_or(f64::NAN, |range| range[side]), 4)
+}
 
 fn count(bin: &BinResult, of: fn(&Estimate) -> f64) -> Cell {
     Cell::number(bin.estimate.as_ref().map_or(0.0, of), 0)
@@ -76,11 +87,13 @@ pub fn bias_table(result: &BiasResult) -> Table {
         heading => heading,
     };
     // Programs other than shearq do not state a frame.
-    let columns = || {
-        COLUMNS
-            .iter()
-            .filter(|own| own.0 != "frame" || result.about.frame.is_some())
+    let is_used = |key: &str| match key {
+        "frame" => result.about.frame.is_some(),
+        "low_2" | "high_2" => result.about.cells.axes.len() > 1,
+        "low_3" | "high_3" => result.about.cells.axes.len() > 2,
+        _ => true,
     };
+    let columns = || COLUMNS.iter().filter(|own| is_used(own.0));
     let headings = columns().map(|(key, label, detail, _)| heading(key, *label, *detail));
     let of_quantities = quantities.iter().map(|own| {
         let detail = !MAIN.contains(&own.key) && own.key != "alpha";
@@ -89,10 +102,7 @@ pub fn bias_table(result: &BiasResult) -> Table {
     let mut notes = notes(result);
     let rows = result.bins.iter().map(|bin| {
         if let Err(error) = &bin.estimate {
-            notes.push(format!(
-                "No estimate of {}: {error}.",
-                label(result, bin.edges)
-            ));
+            notes.push(format!("No estimate of {}: {error}.", bin.label));
         }
         let cells = columns().map(|(.., cell)| cell(result, bin));
         let quantity = |own: &&Quantity| {
@@ -144,6 +154,10 @@ pub fn compared_table(first: &BiasResult, second: &BiasResult, difference: &Bias
         }
     }
     let [(_, mut table), _, _] = tables;
+    let columns = second.about.columns.iter();
+    table
+        .notes
+        .extend(columns.map(|line| format!("--against: {line}")));
     table.notes.push(format!(
         "Difference: {}, with errors from leaving out the same units of both.",
         difference.about.program
@@ -152,22 +166,6 @@ pub fn compared_table(first: &BiasResult, second: &BiasResult, difference: &Bias
         headings,
         rows,
         ..table
-    }
-}
-
-fn label(result: &BiasResult, edges: Option<[f64; 2]>) -> String {
-    let Some([low, high]) = edges else {
-        return "all".into();
-    };
-    // Four significant digits.
-    let edge = |edge: f64| {
-        let rounded = format!("{edge:.3e}").parse::<f64>();
-        rounded.unwrap_or(edge).to_string()
-    };
-    match (low == f64::MIN, high == f64::MAX) {
-        (true, _) => format!("{} below {}", result.about.binned, edge(high)),
-        (false, true) => format!("{} from {}", result.about.binned, edge(low)),
-        _ => format!("{} {} to {}", result.about.binned, edge(low), edge(high)),
     }
 }
 
@@ -274,7 +272,7 @@ pub fn of_design(result: &BiasResult) -> Vec<String> {
         None => "--columns id=NAME with identifiers, or --units COLUMN".into(),
     };
     // Without shape noise, only pixel noise cancels: errors of m were 54 times too large.
-    let wrong = "the error of m is too large by the ratio of total scatter to measurement noise, and that of c too small";
+    let wrong = "the error of m is too large by the ratio of total scatter to measurement noise, and that of c too small by up to √2";
     let shown = |[g1, g2]: [f64; 2]| format!("({g1}, {g2})");
     if !result.grouping.missing.is_empty() {
         let missing = result
@@ -308,7 +306,7 @@ pub fn of_design(result: &BiasResult) -> Vec<String> {
         )),
         None => {}
     }
-    if result.grouping.assumed_different {
+    if result.grouping.assumed_different && result.grouping.unpaired.is_none() {
         lines.push(format!(
             "names do not state which catalogues of a shear contain the same galaxies as others, such as rotations, noise realisations or bands: the k-th catalogues of each shear are a unit. If catalogues of one shear contain the same galaxies, errors are wrong. Try: {units}, or names that have the same number under each shear"
         ));
@@ -319,18 +317,25 @@ pub fn of_design(result: &BiasResult) -> Vec<String> {
 
 // Part of a variance from which galaxies without partner matter: σ(m) is √2 times as large as without them.
 const MANY_WITHOUT_PARTNER: f64 = 0.5;
+// Above it, the estimate of this part does not determine how much larger σ(m) is.
+const MOST_OF_VARIANCE: f64 = 0.999;
 
 fn without_partner(result: &BiasResult) -> Option<String> {
     let own = result.grouping.without_partner?;
     let share = own.share.into_iter().fold(0.0, f64::max);
-    (share > MANY_WITHOUT_PARTNER).then(|| {
-        format!(
-            "about {:.0} of {:.0} galaxies count under one of two opposite shears only. Their shapes do not cancel and make σ(m) about {:.1} times as large. Try: --paired",
-            own.galaxies.max(1.0),
-            own.of,
-            (1.0 - share).max(1e-6).sqrt().recip()
-        )
-    })
+    let cost = match share {
+        share if share < MANY_WITHOUT_PARTNER => return None,
+        share if share > MOST_OF_VARIANCE => "most of the variance of m is theirs".to_owned(),
+        share => format!(
+            "σ(m) is about {:.1} times as large",
+            (1.0 - share).sqrt().recip()
+        ),
+    };
+    Some(format!(
+        "about {:.0} of {:.0} galaxies count under one of two opposite shears only. Their shapes do not cancel: {cost}. Try: --paired for the galaxies that count under both, whose m contains no selection",
+        own.galaxies.max(1.0),
+        own.of,
+    ))
 }
 
 const MAX_MISSING: usize = 5;
@@ -346,11 +351,35 @@ fn notes(result: &BiasResult) -> Vec<String> {
             result.design.meaning(),
             result.about.program
         ),
-        format!(
-            "Errors are from {} units: {}.",
-            all.units, result.grouping.unit
-        ),
+        match &result.about.named_unit {
+            Some(column) => format!(
+                "Errors are from {} units: galaxies with the same `{column}`.",
+                all.units
+            ),
+            None => format!(
+                "Errors are from {} units: {}.",
+                all.units, result.grouping.unit
+            ),
+        },
     ];
+    if let Some(column) = &result.about.unit_column {
+        notes.push(format!(
+            "`{column}` looks like independent units, and is not used. Errors miss the scatter between them. Try: --units {column}"
+        ));
+    }
+    if result.about.paired {
+        notes.push(format!(
+            "Only galaxies that count under all test shears are used: {} rows have no partner. m does not contain how shear changes which galaxies are selected.",
+            result.about.total().without_partner
+        ));
+    }
+    if result.outside > 0 {
+        notes.push(format!(
+            "{} galaxies are outside of the bins, and count in the row of all.",
+            result.outside
+        ));
+    }
+    notes.extend(populations(result));
     notes.extend(result.about.columns.iter().cloned());
     notes.extend(result.about.without_catalogue.iter().cloned());
     notes.extend(result.about.sign.and_then(Sign::line));
@@ -365,8 +394,16 @@ fn notes(result: &BiasResult) -> Vec<String> {
         notes.push(format!("Selection: {selection}."));
     }
     if all.units < MANY_UNITS {
+        // The two-sided probability of one standard deviation of a normal distribution.
+        let one_sigma = student_t(0.841_345, all.units - 1);
+        let first = match all.units < FEW_UNITS {
+            true => {
+                format!("the errors are {one_sigma:.2} times as large at 68 % confidence, and ")
+            }
+            false => String::new(),
+        };
         notes.push(format!(
-            "With {} units, 95 % confidence is {:.2} standard errors (Student's t).",
+            "With {} units, {first}95 % confidence is {:.2} standard errors (Student's t).",
             all.units,
             student_t(0.975, all.units - 1)
         ));
@@ -406,13 +443,102 @@ fn notes(result: &BiasResult) -> Vec<String> {
             ));
         }
     }
+    notes.extend(no_ellipticities(result, all));
     match result.design {
         Design::Null => notes.push(
             "Without a true shear, c is the mean shear. It is a bias only if the galaxies have no mean shear.".into(),
         ),
-        _ => notes.extend(verdicts(all)),
+        _ => {
+            notes.extend(verdicts(all));
+            notes.extend(verdicts_in_bins(result));
+        }
     }
     notes
+}
+
+// What the survey of `--like` has that the simulated galaxies do not have.
+fn populations(result: &BiasResult) -> Vec<String> {
+    let Some(survey) = result.populations.first() else {
+        return Vec::new();
+    };
+    let mut lines = vec![format!(
+        "Rows `like` are of the simulated galaxies with weights by which their share in each of the {} bins of {} is that of the survey ({} galaxies, {}). Errors are those of the simulated galaxies.",
+        result.about.cells.count(),
+        result.about.cells.names(),
+        survey.galaxies,
+        survey.columns
+    )];
+    for own in &result.populations {
+        let total: f64 = own.uncovered.iter().map(|(_, share)| share).sum();
+        if total == 0.0 {
+            continue;
+        }
+        let first = own.uncovered.iter().take(MAX_MISSING);
+        let first: Vec<String> = first
+            .map(|(label, share)| format!("{label} ({:.2} %)", 100.0 * share))
+            .collect();
+        let more = match own.uncovered.len().saturating_sub(MAX_MISSING) {
+            0 => String::new(),
+            more => format!(", and {more} more"),
+        };
+        lines.push(format!(
+            "{}: {:.2} % of the weights of the survey have no simulated galaxies, and m of them is unknown: {}{more}.",
+            own.label,
+            100.0 * total,
+            first.join(", ")
+        ));
+    }
+    lines
+}
+
+// Share of rows with |e| above 1 from which e1 and e2 are hardly shear-type ellipticities: noise of 0.3 per component makes
+// 0.4 % of them.
+const MANY_BEYOND: f64 = 0.005;
+// Mean of an ellipticity without a true shear that no PSF residual explains. Chosen by hand.
+const LARGE_MEAN: f64 = 0.1;
+// Rows from which components of one sign are no coincidence: 2⁻⁵⁰.
+const MANY_OF_ONE_SIGN: u64 = 50;
+
+// Lines about numbers that are no ellipticities: moduli and angles, percent, degrees, magnitudes. A response allows any scale.
+fn no_ellipticities(result: &BiasResult, all: &Estimate) -> Vec<String> {
+    if result.about.response {
+        return Vec::new();
+    }
+    let total = result.about.total();
+    let used = all.galaxies as f64;
+    let mut lines = Vec::new();
+    for (rows, limit) in total.beyond.iter().zip([1, 2]).rev() {
+        let share = *rows as f64 / used;
+        if share > MANY_BEYOND && lines.is_empty() {
+            lines.push(format!(
+                "{:.1} % of the rows have |e| above {limit}, which no ellipticity of shear type has. Percent, degrees, or noise? Try: --columns with other columns, or --where to leave failed rows out",
+                100.0 * share
+            ));
+        }
+    }
+    for k in 0..2 {
+        let low = result.about.catalogues.iter().filter(|own| own.rows > 0);
+        let low = low
+            .map(|own| own.ellipticity[k].low)
+            .fold(f64::MAX, f64::min);
+        if low >= 0.0 && all.galaxies as u64 >= MANY_OF_ONE_SIGN {
+            lines.push(format!(
+                "e{0} is never negative. Is it the modulus |e|, with an angle in another column? Try: --columns with the columns of e1 and e2",
+                k + 1
+            ));
+        }
+        let c = all.value(["c1", "c2"][k]);
+        if let Some(c) =
+            c.filter(|c| c.value.abs() > LARGE_MEAN + IMPLAUSIBLE_SIGNIFICANCE * c.error)
+        {
+            lines.push(format!(
+                "c{} is {:+.2}, which no method of measuring shapes leaves (expected a modulus below {LARGE_MEAN}). Is the column an ellipticity?",
+                k + 1,
+                c.value
+            ));
+        }
+    }
+    lines
 }
 
 fn sentence(line: &str) -> String {
@@ -533,6 +659,65 @@ fn verdicts(all: &Estimate) -> Vec<String> {
     lines.collect()
 }
 
+// The comparison with requirements in each bin, a line per limit: which bins do not meet it, are undecided or meet it.
+fn verdicts_in_bins(result: &BiasResult) -> Vec<String> {
+    type Bins = Vec<(String, Vec<String>)>;
+    type OfLimit = (String, [Bins; 3]);
+    let mut lines: Vec<OfLimit> = Vec::new();
+    for bin in &result.bins[1..] {
+        let Ok(found) = &bin.estimate else {
+            continue;
+        };
+        for own in compared(found) {
+            let title = format!(
+                "{}: |{}| below {:e}",
+                own.names.join(", "),
+                own.of,
+                own.limit
+            );
+            let at = lines.iter().position(|(known, _)| *known == title);
+            let at = at.unwrap_or_else(|| {
+                lines.push((title, Default::default()));
+                lines.len() - 1
+            });
+            let kind = match own.verdict {
+                Verdict::NotMet => 0,
+                Verdict::Undecided { .. } => 1,
+                Verdict::Met => 2,
+            };
+            let bins = &mut lines[at].1[kind];
+            match bins.last_mut().filter(|(label, _)| *label == bin.label) {
+                Some((_, keys)) => keys.push(own.key),
+                None => bins.push((bin.label.clone(), vec![own.key])),
+            }
+        }
+    }
+    let line = |(title, bins): OfLimit| {
+        let kinds = ["not met in", "undecided in", "met in"]
+            .into_iter()
+            .zip(bins);
+        let parts = kinds.filter(|(_, bins)| !bins.is_empty());
+        let parts = parts.map(|(kind, bins)| {
+            let more = match bins.len().saturating_sub(MAX_NAMED_BINS) {
+                0 => String::new(),
+                more => format!(" and {more} more"),
+            };
+            let first = bins.into_iter().take(MAX_NAMED_BINS);
+            let first: Vec<String> = first
+                .map(|(label, keys)| format!("{label} ({})", keys.join(", ")))
+                .collect();
+            format!("{kind} {}{more}", first.join(", "))
+        });
+        format!(
+            "In bins, {title}: {}.",
+            parts.collect::<Vec<_>>().join("; ")
+        )
+    };
+    lines.into_iter().map(line).collect()
+}
+
+const MAX_NAMED_BINS: usize = 12;
+
 // The comparison with requirements, a row per quantity and limit.
 fn requirement_table(all: &Estimate) -> Table {
     let rows = compared(all).into_iter().map(|own| {
@@ -609,6 +794,8 @@ impl std::str::FromStr for Limit {
 /// A quantity checked against a limit.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Checked {
+    /// The bin.
+    pub bin: String,
     /// The quantity.
     pub key: String,
     /// What was found and expected, in words.
@@ -617,62 +804,116 @@ pub struct Checked {
     pub failed: bool,
 }
 
-/// Checks the estimates of all galaxies. A limit of `m` or `c` applies to the components that are known.
-pub fn check(all: &Estimate, limits: &[Limit]) -> Vec<Checked> {
+/// Checks the estimates of all galaxies and of each bin. A limit of `m` or `c` applies to the components that are known.
+pub fn check(result: &BiasResult, limits: &[Limit]) -> Vec<Checked> {
     let mut checks = Vec::new();
-    for limit in limits {
-        let keys: Vec<String> = match limit.of.as_str() {
-            of @ ("m" | "c") => [1, 2]
-                .map(|k| format!("{of}{k}"))
-                .into_iter()
-                .filter(|key| all.value(key).is_some())
-                .collect(),
-            of => vec![of.to_owned()],
-        };
-        if keys.is_empty() {
-            checks.push(unknown(&limit.of));
+    for bin in &result.bins {
+        for limit in limits {
+            match &bin.estimate {
+                Ok(found) => check_bin(&mut checks, &bin.label, found, limit),
+                Err(error) => checks.push(Checked {
+                    bin: bin.label.clone(),
+                    key: limit.of.clone(),
+                    text: format!("{} cannot be compared with its limit: {error}", limit.of),
+                    failed: true,
+                }),
+            }
         }
-        for key in keys {
-            let Some(Measured { value, error }) = all.value(&key) else {
-                checks.push(unknown(&key));
-                continue;
-            };
-            // An unknown error fails, too: without it, a value cannot be distinguished from the limit.
-            let passed = value.abs() - limit.sigma * error <= limit.limit;
-            let text = match error.is_nan() {
-                true => format!(
-                    "|{key}| cannot be compared with its limit, because its standard error is unknown (found {value:.2e}, expected at most {:e}). Try: more catalogues or galaxies",
-                    limit.limit
-                ),
-                false => format!(
-                    "|{key}| exceeds its limit (found {value:.2e} ± {error:.1e}, expected at most {:e} within {} standard errors)",
-                    limit.limit, limit.sigma
-                ),
-            };
-            checks.push(Checked {
-                text,
-                key,
-                failed: !passed,
-            });
+    }
+    // All galaxies need no name if there are no bins.
+    if result.bins.len() > 1 {
+        for check in &mut checks {
+            check.text = format!("{}: {}", check.bin, check.text);
         }
     }
     checks
 }
 
-fn unknown(key: &str) -> Checked {
-    Checked {
+fn check_bin(checks: &mut Vec<Checked>, bin: &str, found: &Estimate, limit: &Limit) {
+    let keys: Vec<String> = match limit.of.as_str() {
+        of @ ("m" | "c") => [1, 2]
+            .map(|k| format!("{of}{k}"))
+            .into_iter()
+            .filter(|key| found.value(key).is_some())
+            .collect(),
+        of => vec![of.to_owned()],
+    };
+    let unknown = |key: &str| Checked {
+        bin: bin.to_owned(),
         key: key.to_owned(),
         text: format!("{key} is unknown (expected a true shear that determines it)"),
         failed: true,
+    };
+    if keys.is_empty() {
+        checks.push(unknown(&limit.of));
+    }
+    for key in keys {
+        let Some(Measured { value, error }) = found.value(&key) else {
+            checks.push(unknown(&key));
+            continue;
+        };
+        // An unknown error fails, too: without it, a value cannot be distinguished from the limit.
+        let passed = value.abs() - limit.sigma * error <= limit.limit;
+        let text = match error.is_nan() {
+            true => format!(
+                "|{key}| cannot be compared with its limit, because its standard error is unknown (found {value:.2e}, expected at most {:e}). Try: more catalogues or galaxies",
+                limit.limit
+            ),
+            false => format!(
+                "|{key}| exceeds its limit (found {value:.2e} ± {error:.1e}, expected at most {:e} within {} standard errors)",
+                limit.limit, limit.sigma
+            ),
+        };
+        checks.push(Checked {
+            bin: bin.to_owned(),
+            text,
+            key,
+            failed: !passed,
+        });
+    }
+}
+
+/// Adds a column of the quantities that exceed their limits to the table of a result, whose first column is named `of`.
+pub fn with_failures(table: &mut Table, of: &'static str, checks: &[Checked]) {
+    let Some(place) = table.place(of) else {
+        return;
+    };
+    table
+        .headings
+        .push(Heading::new("exceeds", "Exceeds its limit"));
+    for row in &mut table.rows {
+        let Cell::Text(bin) = &row[place] else {
+            row.push(Cell::Empty);
+            continue;
+        };
+        let failed = checks.iter().filter(|own| own.failed && own.bin == *bin);
+        let keys: Vec<&str> = failed.map(|own| own.key.as_str()).collect();
+        row.push(Cell::text(match keys.is_empty() {
+            true => "none".to_owned(),
+            false => keys.join(" "),
+        }));
     }
 }
 
 /// Plots of m and c in bins, or of all galaxies, with the tightest published requirement as a band.
 pub fn bias_plot(result: &BiasResult) -> PanelGrid {
-    let shown = || result.bins.iter().filter(|bin| is_shown(result, bin.edges));
-    let binned = shown().any(|bin| bin.edges.is_some());
+    let shown = || {
+        result
+            .bins
+            .iter()
+            .filter(|bin| is_shown(result, bin))
+            .enumerate()
+    };
+    let binned = result.bins.len() > 1;
+    // Bins of several quantities, of texts and of surveys stand at their numbers.
+    let cells = &result.about.cells;
+    let by_number = cells.axes.len() > 1 || !cells.are_stated() || !result.populations.is_empty();
+    let middle = |(number, bin): (usize, &BinResult)| match by_number {
+        true => number as f64,
+        false => middle(&bin.ranges),
+    };
     let (first, last) = shown().fold((f64::MAX, f64::MIN), |(first, last), bin| {
-        let at = middle(bin.edges);
+        let at = middle(bin);
         (first.min(at), last.max(at))
     });
     // Points of both components stand side by side.
@@ -689,11 +930,11 @@ pub fn bias_plot(result: &BiasResult) -> PanelGrid {
             if !binned {
                 names.push(key.clone());
             }
-            for bin in shown() {
+            for (number, bin) in shown() {
                 let found = bin.estimate.as_ref().ok();
                 if let Some(Measured { value, error }) = found.and_then(|found| found.value(&key)) {
                     x.push(match binned {
-                        true => middle(bin.edges) + (f64::from(component) - 1.5) * apart,
+                        true => middle((number, bin)) + (f64::from(component) - 1.5) * apart,
                         false => f64::from(component) - 1.0,
                     });
                     y.push(value);
@@ -714,7 +955,10 @@ pub fn bias_plot(result: &BiasResult) -> PanelGrid {
                 'm' => "Multiplicative bias".into(),
                 _ => "Additive bias".into(),
             },
-            x_label: result.about.binned.clone(),
+            x_label: match by_number && binned {
+                true => format!("bins of {}, in the order of the table", cells.names()),
+                false => cells.names(),
+            },
             x_names: names,
             y_label: of.into(),
             bands: vec![Band {
@@ -738,16 +982,16 @@ pub fn bias_plot(result: &BiasResult) -> PanelGrid {
 }
 
 // Bins are shown, and all galaxies if there are no bins.
-fn is_shown(result: &BiasResult, edges: Option<[f64; 2]>) -> bool {
-    edges.is_some() || result.bins.len() == 1
+fn is_shown(result: &BiasResult, bin: &BinResult) -> bool {
+    result.bins.len() == 1 || bin.label != "all"
 }
 
-fn middle(edges: Option<[f64; 2]>) -> f64 {
-    match edges {
-        None => 0.0,
-        Some([f64::MIN, high]) => high,
-        Some([low, f64::MAX]) => low,
-        Some([low, high]) => 0.5 * (low + high),
+fn middle(ranges: &[[f64; 2]]) -> f64 {
+    match ranges {
+        [] => 0.0,
+        [[f64::MIN, high], ..] => *high,
+        [[low, f64::MAX], ..] => *low,
+        [[low, high], ..] => 0.5 * (low + high),
     }
 }
 

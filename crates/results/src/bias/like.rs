@@ -1,0 +1,233 @@
+//! Weighting simulated galaxies to the galaxies of a survey (`--like`).
+//!
+//! A survey measures ⟨w e⟩/⟨w R⟩ over its own galaxies. If m depends on S/N and size, the m of its mean shear is that of
+//! simulated galaxies with the survey's distribution of both (Fenech Conti et al. 2017, MNRAS 467, 1627; Mandelbaum et al. 2018,
+//! MNRAS 481, 3170; Li et al. 2023, A&A 670, A100). The simulated galaxies of each cell of the bins are weighted so that their
+//! weights have the share that the weights of the survey's galaxies have in this cell.
+
+use std::collections::BTreeMap;
+
+use shearq_catalogue::columns::{Columns, Role};
+use shearq_catalogue::expression::{Operand, operand_values, texts_of};
+use shearq_catalogue::request::{MAX_AXES, MAX_BINS, Request, Survey};
+use shearq_files::FileError;
+use shearq_files::frames::polars::DataFrame;
+use shearq_files::table::{self, Place};
+
+use super::{BiasFailure, Cells};
+
+/// Galaxies of a survey, or of one of its tomographic bins.
+#[derive(Debug, Clone)]
+pub struct Population {
+    pub label: String,
+    /// Galaxies with a positive weight and without a flag.
+    pub galaxies: u64,
+    /// Σ w of each cell; the last is outside of all bins.
+    weights: Vec<f64>,
+    /// Columns that were used.
+    pub columns: String,
+    /// The part of the weights in cells without simulated galaxies, by cell, with the largest first.
+    pub uncovered: Vec<(String, f64)>,
+}
+
+impl Population {
+    /// The shares of the cells with simulated galaxies, of which there are `counts`.
+    pub(super) fn covered(
+        &mut self,
+        counts: &[usize],
+        cells: &Cells,
+    ) -> Result<Vec<f64>, BiasFailure> {
+        let total: f64 = self.weights.iter().sum();
+        let mut shares = vec![0.0; counts.len()];
+        for (cell, weight) in self.weights.iter().enumerate() {
+            match counts.get(cell) {
+                Some(1..) => shares[cell] = *weight,
+                _ if *weight == 0.0 => {}
+                Some(0) => self.uncovered.push((cells.label(cell), weight / total)),
+                None => {
+                    let label = format!("outside of the bins of {}", cells.names());
+                    self.uncovered.push((label, weight / total));
+                }
+            }
+        }
+        self.uncovered.sort_by(|a, b| b.1.total_cmp(&a.1));
+        let covered: f64 = shares.iter().sum();
+        if covered == 0.0 {
+            return Err(BiasFailure::NothingAlike(self.label.clone().into()));
+        }
+        shares.iter_mut().for_each(|share| *share /= covered);
+        Ok(shares)
+    }
+}
+
+// Columns of tomographic bins: KiDS, HSC, DES and others.
+const TOMOGRAPHY: [&str; 9] = [
+    "tomobin",
+    "tomo_bin",
+    "tomographic_bin",
+    "tomography_bin",
+    "zbin",
+    "z_bin",
+    "hsc_y3_zbin",
+    "bhat",
+    "tom_bin_id",
+];
+
+// Without a recognised table of ellipticities.
+const WEIGHTS: [&str; 5] = ["w", "weight", "shape_weight", "lensfit_weight", "weights"];
+
+fn unknown(place: &Place, name: &str, known: &[String]) -> FileError {
+    FileError::no_column(&place.path, name, known)
+}
+
+/// The whole survey, then its tomographic bins.
+pub(super) fn populations(
+    survey: &Survey,
+    request: &Request,
+    cells: &Cells,
+) -> Result<Vec<Population>, BiasFailure> {
+    let place = Place::of(&survey.catalogue.name);
+    let path = &place.path;
+    let frame = survey.catalogue.frame.as_ref();
+    let known: Vec<String> = match frame {
+        Some(frame) => (frame.columns().iter())
+            .map(|own| own.name().to_string())
+            .collect(),
+        None => match table::columns(&place)?.named.into_iter().next() {
+            Some(list) => list.names,
+            None => Vec::new(),
+        },
+    };
+    let there = |name: &str| -> Option<String> {
+        let mut known = known.iter();
+        known.find(|own| own.eq_ignore_ascii_case(name)).cloned()
+    };
+    // A survey may be a table of S/N and size alone.
+    let columns = Columns::find(path, &known, &request.names).ok();
+    let weight = match &columns {
+        Some(columns) => columns.of(Role::Weight).map(str::to_owned),
+        None => WEIGHTS.iter().find_map(|name| there(name)),
+    };
+    let flags = columns.map_or_else(Vec::new, |columns| columns.flags.clone());
+    let tomography = match &survey.tomography {
+        Some(name) => Some(there(name).ok_or_else(|| unknown(&place, name, &known))?),
+        None => TOMOGRAPHY.iter().find_map(|name| there(name)),
+    };
+    let operands: Vec<&Operand> = request
+        .bins
+        .iter()
+        .flat_map(|own| own.of.operands())
+        .collect();
+    for operand in &operands {
+        if !known.contains(&operand.column) {
+            return Err(unknown(&place, &operand.column, &known).into());
+        }
+    }
+    let mut wanted: Vec<&str> = operands.iter().map(|own| own.column.as_str()).collect();
+    wanted.extend(
+        weight
+            .iter()
+            .chain(&flags)
+            .chain(&tomography)
+            .map(String::as_str),
+    );
+    wanted.sort_unstable();
+    wanted.dedup();
+    let texts = operands.iter().filter(|own| own.pattern.is_some());
+    let mut texts: Vec<&str> = texts.map(|own| own.column.as_str()).collect();
+    texts.extend(tomography.as_deref());
+    let mut found: BTreeMap<Option<String>, (u64, Vec<f64>)> = BTreeMap::new();
+    let mut add = |frame: &DataFrame| -> Result<(), FileError> {
+        let column = |name: &str| table::numbers(frame, name, path);
+        let weights = weight.as_deref().map(column).transpose()?;
+        let flags = flags
+            .iter()
+            .map(|name| column(name))
+            .collect::<Result<Vec<_>, _>>()?;
+        let values = operands.iter().map(|own| operand_values(frame, own, path));
+        let values = values.collect::<Result<Vec<_>, _>>()?;
+        let bins = tomography
+            .as_ref()
+            .map(|name| -> Result<Vec<String>, FileError> {
+                match texts_of(frame, name) {
+                    Some(texts) => Ok(texts
+                        .map(|text| text.unwrap_or_default().trim().to_owned())
+                        .collect()),
+                    None => Ok(column(name)?.iter().map(f64::to_string).collect()),
+                }
+            });
+        let bins = bins.transpose()?;
+        for at in 0..frame.height() {
+            let weight = weights.as_ref().map_or(1.0, |weights| weights[at]);
+            // NaN is no weight either.
+            let is_used = weight > 0.0 && flags.iter().all(|flag| flag[at] == 0.0);
+            if !is_used {
+                continue;
+            }
+            let (mut own, mut first) = ([0.0; MAX_AXES], 0);
+            for (own, binning) in own.iter_mut().zip(&request.bins) {
+                *own = binning.of.value(&|k| values[first + k][at]);
+                first += binning.of.operands().len();
+            }
+            let cell = cells.of(&own).unwrap_or(cells.outside());
+            let mut add = |name: Option<String>| {
+                let (count, weights) = found
+                    .entry(name)
+                    .or_insert_with(|| (0, vec![0.0; cells.count() + 1]));
+                *count += 1;
+                weights[cell] += weight;
+            };
+            add(None);
+            if let Some(bins) = &bins {
+                add(Some(bins[at].clone()));
+            }
+        }
+        match found.len() > MAX_BINS {
+            true => Err(FileError::new(
+                path,
+                format!(
+                    "column `{}` has more than {MAX_BINS} different values (expected tomographic bins). Try: --tomography NAME",
+                    tomography.as_deref().unwrap_or_default()
+                ),
+            )),
+            false => Ok(()),
+        }
+    };
+    match frame {
+        Some(frame) => add(frame)?,
+        None => table::read_parts(&place, &wanted, &texts, |frame| add(&frame))?,
+    }
+    let name = survey.catalogue.name.display();
+    let mut roles: Vec<String> = weight.iter().map(|own| format!("w={own}")).collect();
+    roles.extend(flags.iter().map(|own| format!("flag={own}")));
+    roles.extend(
+        tomography
+            .iter()
+            .map(|own| format!("tomographic bin={own}")),
+    );
+    let columns = match roles.is_empty() {
+        true => "no weight".to_owned(),
+        false => roles.join(", "),
+    };
+    // A number where there is one, so that bin 10 comes after bin 9.
+    let mut all: Vec<_> = found.into_iter().collect();
+    let order = |name: &Option<String>| {
+        let name = name.as_ref()?;
+        Some((
+            name.parse::<f64>().map_or(u64::MAX, super::cells::key),
+            name.clone(),
+        ))
+    };
+    all.sort_by_key(|(name, _)| order(name));
+    let population = |(bin, (galaxies, weights)): (Option<String>, (u64, Vec<f64>))| Population {
+        label: match (bin, &tomography) {
+            (Some(bin), Some(column)) => format!("like {name}, {column} {bin}"),
+            _ => format!("like {name}"),
+        },
+        galaxies,
+        weights,
+        columns: columns.clone(),
+        uncovered: Vec::new(),
+    };
+    Ok(all.into_iter().map(population).collect())
+}

@@ -1,0 +1,60 @@
+//! Galaxies that count under all test shears (`--paired`).
+
+use std::collections::HashSet;
+
+use shearq_bias::{Catalogue, Design};
+use shearq_catalogue::rows::rows;
+use shearq_catalogue::source::{Reading, Source};
+use shearq_files::FileError;
+
+use super::{BiasFailure, same_galaxies};
+
+/// The catalogues that contain the same galaxies. Their rows are read once more for each catalogue, so that memory contains the
+/// galaxies of one catalogue and not of all.
+pub(super) struct Partners<'a> {
+    reading: &'a Reading<'a>,
+    all: &'a [Vec<Source>],
+    groups: Vec<u32>,
+}
+
+impl<'a> Partners<'a> {
+    pub(super) fn new(
+        reading: &'a Reading<'a>,
+        all: &'a [Vec<Source>],
+        design: Design,
+        catalogues: &[Catalogue],
+    ) -> Result<Self, BiasFailure> {
+        match design {
+            Design::Pairs | Design::Arms => Ok(Partners {
+                reading,
+                all,
+                groups: same_galaxies(catalogues, design),
+            }),
+            other => Err(BiasFailure::NothingPairs(other)),
+        }
+    }
+
+    /// The galaxies that count in all other catalogues of the same galaxies.
+    pub(super) fn of(&self, number: usize) -> Result<HashSet<u64>, FileError> {
+        let mut found: Option<HashSet<u64>> = None;
+        for (other, sources) in self.all.iter().enumerate() {
+            if other == number || self.groups[other] != self.groups[number] {
+                continue;
+            }
+            let mut good = HashSet::new();
+            let name = &self.reading.request.catalogues[other].name;
+            rows(name, self.reading, sources, |item| {
+                let counts = item.sheared == 0 && item.selected.binned[0].is_ok();
+                if counts
+                    && found
+                        .as_ref()
+                        .is_none_or(|known| known.contains(&item.galaxy))
+                {
+                    good.insert(item.galaxy);
+                }
+            })?;
+            found = Some(good);
+        }
+        Ok(found.unwrap_or_default())
+    }
+}
