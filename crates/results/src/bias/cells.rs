@@ -128,9 +128,10 @@ impl Cells {
 // Values from which the edges of bins with equally many galaxies are determined, at most: 8 MB, and edges to 0.1 % of the
 // galaxies.
 const SAMPLE: usize = 1 << 20;
-// A column of fewer different values is one of classes, such as tomographic bins, which have different numbers of galaxies.
-// Chosen by hand.
+// A column of fewer different whole numbers below 100 is one of classes, such as tomographic bins, which have different numbers
+// of galaxies. Positions of stamps have few values, too. Chosen by hand.
 const MAX_CLASSES: usize = 20;
+const MAX_CLASS_NUMBER: f64 = 100.0;
 
 // The different values of a quantity, and a sample of all.
 #[derive(Default)]
@@ -238,7 +239,10 @@ fn axis(binning: &Binning, mut values: Values, is_sample: bool) -> Result<Axis, 
     };
     let sample = &mut values.sample;
     sample.sort_unstable_by(f64::total_cmp);
-    let few = different <= MAX_CLASSES && sample.len() >= MAX_CLASSES * different;
+    let is_class = |value: f64| value.fract() == 0.0 && value.abs() < MAX_CLASS_NUMBER;
+    let few = different <= MAX_CLASSES
+        && sample.len() >= MAX_CLASSES * different
+        && values.different.iter().all(|key| is_class(of_key(*key)));
     let mut edges = vec![sample[0]];
     edges.extend((1..count).map(|k| sample[k * sample.len() / count]));
     edges.extend(sample.last().copied().map(f64::next_up));
