@@ -207,7 +207,7 @@ fn validate_rule(step: f64, lambda: f64, max_iterations: usize) -> Result<(), Ou
 pub struct NetworkDeconvolution {
     /// How much a neuron changes when it is updated.
     pub update: Update,
-    /// Step c of the adaptive rule (Eq. 10), as `step_scale` reads it.
+    /// Step c of the adaptive rule (Eq. 12), as `step_scale` reads it.
     pub step: f64,
     /// What `step` is a multiple of.
     pub step_scale: StepScale,
@@ -220,18 +220,18 @@ pub struct NetworkDeconvolution {
     pub max_iterations: usize,
     /// State of the neurons before the first iteration.
     pub start: Start,
-    /// When negative neurons are set to zero (Eq. 12).
+    /// When negative neurons are set to zero (Eq. 14).
     pub clipping: Clipping,
     /// Which state is kept where the energy rises.
     pub kept: Kept,
-    /// What one unit of brightness is, to which the thresholds (Eq. 9) refer.
+    /// What one unit of brightness is, to which the thresholds (Eq. 11) refer.
     pub brightness_unit: BrightnessUnit,
     /// The unit is `brightness_unit` divided by this.
     pub unit_divisor: f64,
     /// What the PSF is divided by before H is made of it.
     pub psf_scale: PsfScale,
     /// Divisor of the high-pass kernel d (Sect. 3.1), printed as 100. λ acts through G = DᵀD, so that
-    /// a divisor of 1 moves its axis by 10⁴.
+    /// a divisor of 1 moves its axis by 10⁴, and one of 0.1, that of `paper`, by 10⁶.
     pub high_pass_divisor: f64,
 }
 
@@ -260,11 +260,11 @@ impl NetworkDeconvolution {
 /// Divisor of d as Sect. 3.1 prints it.
 const PRINTED_DIVISOR: f64 = 100.0;
 
-/// The linear network: the adaptive rule without thresholds (Eq. 9) and clipping (Eq. 12), from zero
+/// The linear network: the adaptive rule without thresholds (Eq. 11) and clipping (Eq. 14), from zero
 /// and on a plane without boundary, all M iterations in closed form.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct LinearDeconvolution {
-    /// Step c of the adaptive rule (Eq. 10).
+    /// Step c of the adaptive rule (Eq. 12).
     pub step: f64,
     /// Tikhonov parameter λ.
     pub lambda: f64,
@@ -374,7 +374,7 @@ pub enum PsfForm {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Update {
-    /// Proportional to the energy's gradient (Eq. 10).
+    /// Proportional to the energy's gradient (Eq. 12).
     Adaptive,
     /// A constant (Eq. 6).
     Constant,
@@ -407,7 +407,7 @@ pub enum Start {
     Zero,
 }
 
-/// When neurons below zero are set to zero (Eq. 12).
+/// When neurons below zero are set to zero (Eq. 14).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Clipping {
@@ -512,7 +512,7 @@ pub enum ShearOrigin {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum EllipticityType {
-    /// χ = (1 − q²)/(1 + q²): the moments' own (Eq. 13).
+    /// χ = (1 − q²)/(1 + q²): the moments' own (Eq. 15).
     Distortion,
     /// ε = (1 − q)/(1 + q): that of shear.
     Shear,

@@ -7,8 +7,8 @@
 //! ```
 //!
 //! where H is the convolution with the PSF under a zero boundary and D the high-pass of Sun (2000).
-//! One iteration takes the negative gradient f = Q − (W + λG)v (Eq. 11), changes the neurons whose
-//! |f_i| exceeds the threshold TH_i = ½|W_ii + λG_ii| (Eqs. 6 and 9), and clips at zero (Eq. 12).
+//! One iteration takes the negative gradient f = Q − (W + λG)v (Eq. 13), changes the neurons whose
+//! |f_i| exceeds the threshold TH_i = ½|W_ii + λG_ii| (Eqs. 6 and 11), and clips at zero (Eq. 14).
 //! It stops when there is no neuron to update, when the energy no longer falls, or after M
 //! iterations.
 //!
@@ -48,7 +48,7 @@ pub(crate) fn high_pass(kx: f64, ky: f64) -> f64 {
 /// How far an updated neuron moves.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Step {
-    /// Δv_i = c·|f_i| (Eq. 10), c without unit.
+    /// Δv_i = c·|f_i| (Eq. 12), c without unit.
     Adaptive(f64),
     /// The same with momentum.
     Accelerated(f64),
@@ -143,7 +143,7 @@ pub struct Network {
     transfer_transposed: Spectrum,
     centred_psf: Vec<f32>,
     psf_scratch: TransformScratch,
-    /// TH_i for a unit of brightness of one (Eq. 9), and infinite behind the image: the state has to stay zero there.
+    /// TH_i for a unit of brightness of one (Eq. 11), and infinite behind the image: the state has to stay zero there.
     thresholds: Vec<f32>,
 }
 
@@ -235,7 +235,7 @@ impl Network {
         Ok(factor)
     }
 
-    // TH_i = ½|W_ii + λG_ii| (Eq. 9): W_ii is the sum of h² over the part of the PSF that falls inside the
+    // TH_i = ½|W_ii + λG_ii| (Eq. 11): W_ii is the sum of h² over the part of the PSF that falls inside the
     // stamp when centred on pixel i, times `square`, and G_ii the same for d.
     fn set_thresholds(&mut self, psf: ArrayView2<'_, f64>, square: f64) {
         let Network { n, p, .. } = *self;
@@ -455,8 +455,8 @@ impl Network {
         self.to_pixels.transform(modes, transform, out);
     }
 
-    // Takes f = Hᵀ(u₀ − Hv) − λD(Dv) (Eq. 11; D is symmetric), updates every neuron beyond its
-    // threshold (Eq. 6) and clips at zero (Eq. 12) where that comes first; returns how many were beyond.
+    // Takes f = Hᵀ(u₀ − Hv) − λD(Dv) (Eq. 13; D is symmetric), updates every neuron beyond its
+    // threshold (Eq. 6) and clips at zero (Eq. 14) where that comes first; returns how many were beyond.
     fn update(&self, rule: &Rule, b: &mut NetworkScratch) -> u32 {
         let transposed = &self.transfer_transposed;
         self.convolve(
@@ -581,7 +581,7 @@ fn update_neurons(
     updated.iter().sum()
 }
 
-// Sets negative neurons of the candidate to zero (Eq. 12); returns whether there were any.
+// Sets negative neurons of the candidate to zero (Eq. 14); returns whether there were any.
 fn clip(next: &mut [f32]) -> bool {
     let mut negative = false;
     for value in next {

@@ -356,7 +356,7 @@ fn sums<const N: usize>(lags: &[f32], weights: [&[f32]; N]) -> [f32; N] {
 // Chosen by hand.
 const BORDER_PX: usize = 3;
 
-/// Quadrupole moments of the clipped autocorrelation (Eq. 14), in px² relative to its light.
+/// Quadrupole moments of the clipped autocorrelation (Eq. 16), in px² relative to its light.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Moments {
     /// Qxx.
@@ -370,7 +370,7 @@ pub struct Moments {
 }
 
 impl Moments {
-    /// (Qxx − Qyy)/(Qxx + Qyy) and 2Qxy/(Qxx + Qyy) (Eq. 13): a distortion χ.
+    /// (Qxx − Qyy)/(Qxx + Qyy) and 2Qxy/(Qxx + Qyy) (Eq. 15): a distortion χ.
     ///
     /// # Errors
     /// Where Qxx + Qyy is not positive.

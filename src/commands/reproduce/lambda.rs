@@ -3,10 +3,10 @@
 //! A galaxy is an exponential (Sérsic n = 1) profile u on a stamp; the observed stamp is u₀ = Hu + n with a Moffat PSF
 //! (β = 3) of the galaxy's own and white noise of S/N = 10 log₁₀(σ_S²/σ²) dB, σ_S² being the variance of Hu over the stamp.
 //!
-//! * CTR = K_c/K_t (Eq. 15): of all changes of a neuron's state, the share that brings it nearer to u. The update that
+//! * CTR = K_c/K_t (Eq. 17): of all changes of a neuron's state, the share that brings it nearer to u. The update that
 //!   raises the energy and ends the run counts as attempted.
-//! * dSNR = 10 log₁₀(‖u₀ − u‖²/‖u* − u‖²) (Eq. 16), mean over galaxies.
-//! * 1/RMSD = √(2N/Σ|e − e*|²) (Eq. 17), distortions, over the galaxies that could be measured.
+//! * dSNR = 10 log₁₀(‖u₀ − u‖²/‖u* − u‖²) (Eq. 18), mean over galaxies.
+//! * 1/RMSD = √(2N/Σ|e − e*|²) (Eq. 19), distortions, over the galaxies that could be measured.
 
 use std::ops::Range;
 

@@ -3,7 +3,7 @@
 //! A PSF has its centre at (p − 1)/2, as stamps have it, because the window is fixed at the stamp's middle; the network has it at
 //! pixel p/2, as the convolution of the paper.
 //!
-//! Without thresholds (Nurbaeva et al. 2015, Eq. 9) and clipping (Eq. 12), the adaptive update v ← v + c·f (Eqs. 10 and 11)
+//! Without thresholds (Nurbaeva et al. 2015, Eq. 11) and clipping (Eq. 14), the adaptive update v ← v + c·f (Eqs. 12 and 13)
 //! from v = 0 is linear. On a plane without boundary each Fourier mode evolves alone, and the shape is measured on the result of
 //! M iterations, convolved with a round Gaussian of σ:
 //!
