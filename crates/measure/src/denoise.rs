@@ -14,7 +14,7 @@
 //! level σ, and k = 1 for the Wiener filter. The smooth remainder is kept as it is.
 
 use multiversion::multiversion;
-use shearq_quantities::statistics::{SCATTER, median};
+use shearq_quantities::statistics::{SCATTER, midpoint_median};
 use shearq_submissions::Wavelet;
 
 use crate::pixels::frame;
@@ -237,11 +237,11 @@ pub fn border_noise(stamp: &[f32], n: usize, border: usize, buffer: &mut Vec<f32
     if 2 * buffer.len() < all {
         return None;
     }
-    let middle = median(buffer)?;
+    let middle = midpoint_median(buffer)?;
     for value in buffer.iter_mut() {
         *value = (*value - middle).abs();
     }
-    Some(median(buffer)? * SCATTER)
+    Some(midpoint_median(buffer)? * SCATTER)
 }
 
 #[cfg(test)]
@@ -326,6 +326,34 @@ mod tests {
         // Faint negative rings around a blob are removed: a tenth of the noise per pixel.
         let change = (blob.iter().sum::<f32>() - flux) / (n * n) as f32;
         assert!(change.abs() < 0.15, "{change}");
+    }
+
+    #[test]
+    fn border_noise_is_the_median_deviation_of_sorted_pixels() {
+        let mut rng = ChaCha8Rng::seed_from_u64(5);
+        let usual = |values: &mut Vec<f64>| {
+            values.sort_by(f64::total_cmp);
+            let half = values.len() / 2;
+            0.5 * (values[half] + values[values.len() - 1 - half])
+        };
+        for (n, missing) in [(48, 0), (23, 0), (48, 1), (9, 3)] {
+            let mut stamp = noise(&mut rng, n);
+            stamp[..missing].fill(f32::NAN);
+            let border = |at: usize| at < 4 || at + 4 >= n;
+            let pixels = stamp.iter().enumerate();
+            let pixels =
+                pixels.filter(|(at, v)| (border(at / n) || border(at % n)) && v.is_finite());
+            let mut pixels: Vec<f64> = pixels.map(|(_, v)| f64::from(*v)).collect();
+            let middle = usual(&mut pixels);
+            let mut moduli = pixels.iter().map(|v| (v - middle).abs()).collect();
+            let expected = f64::from(SCATTER) * usual(&mut moduli);
+            let found = border_noise(&stamp, n, 4, &mut Vec::new()).unwrap();
+            // Single precision.
+            assert!(
+                (f64::from(found) / expected - 1.0).abs() < 1e-6,
+                "{n} {missing}"
+            );
+        }
     }
 
     #[test]

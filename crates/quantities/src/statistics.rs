@@ -58,6 +58,18 @@ pub fn upper_median<T: Copy + Into<f64>>(values: &mut [T]) -> Option<T> {
     (!values.is_empty()).then(|| ranked(values, values.len() / 2))
 }
 
+/// The usual median of finite values, the mean of the two middle ones of an even number; reorders them. `None` without values.
+pub fn midpoint_median(values: &mut [f32]) -> Option<f32> {
+    let upper = upper_median(values)?;
+    let half = values.len() / 2;
+    if values.len() % 2 == 1 {
+        return Some(upper);
+    }
+    // Ranking left the lower half before it.
+    let lower = values[..half].iter().copied().fold(f32::MIN, f32::max);
+    Some(0.5 * (lower + upper))
+}
+
 fn ranked<T: Copy + Into<f64>>(values: &mut [T], rank: usize) -> T {
     let by_value = |a: &T, b: &T| Into::<f64>::into(*a).total_cmp(&(*b).into());
     *values.select_nth_unstable_by(rank, by_value).1
@@ -159,6 +171,9 @@ mod tests {
         assert_eq!(upper_median(&mut [3.0f32, 1.0, 2.0, 4.0]), Some(3.0));
         assert_eq!(upper_median(&mut [-3.0f64, 1.0, -2.0]), Some(-2.0));
         assert_eq!(upper_median::<f64>(&mut []), None);
+        assert_eq!(midpoint_median(&mut [3.0, 1.0, 2.0, 4.0]), Some(2.5));
+        assert_eq!(midpoint_median(&mut [-3.0, 1.0, -2.0]), Some(-2.0));
+        assert_eq!(midpoint_median(&mut []), None);
         assert_eq!(SCATTER, 1.482_602_2f32);
     }
 
