@@ -23,7 +23,7 @@ use shearq_results::views::pages;
 use shearq_scoring::{Choice, Definition, TruthSign};
 use shearq_simulate::field::ShearSpectrum;
 use shearq_simulate::kinds::SETS;
-use shearq_simulate::set::SimulationSettings;
+use shearq_simulate::set::{FixedPsf, SimulationSettings};
 use shearq_submissions::{Configuration, EllipticityType, Registry, Template};
 
 use crate::{print, print_table, tell};
@@ -238,6 +238,17 @@ pub(super) struct SimulationArguments {
         allow_hyphen_values = true
     )]
     tilt: f64,
+    /// PSFs of sets whose PSFs are fixed (2, 5, 8, …): `field`, a field over the image that is the same in all images, as in
+    /// GREAT10; `one`, one PSF of all galaxies, with which the data are half as large.
+    #[arg(long, value_name = "WHAT", default_value = "field", value_parser = fixed_psf())]
+    fixed_psf: FixedPsf,
+}
+
+fn fixed_psf() -> impl TypedValueParser<Value = FixedPsf> {
+    PossibleValuesParser::new(["field", "one"]).map(|name| match name.as_str() {
+        "one" => FixedPsf::One,
+        _ => FixedPsf::Field,
+    })
 }
 
 impl SimulationArguments {
@@ -249,6 +260,7 @@ impl SimulationArguments {
         };
         let settings = SimulationSettings {
             spectrum,
+            fixed_psf: self.fixed_psf,
             ..SimulationSettings::new(self.seed, usize::from(self.grid))
         };
         settings.validate()?;
@@ -259,7 +271,7 @@ impl SimulationArguments {
     pub(super) fn must_be_unused(&self) -> anyhow::Result<()> {
         anyhow::ensure!(
             self.settings()? == SimulationSettings::new(SEED, usize::from(GRID)),
-            "--grid, --seed, --amplitude and --tilt apply to simulated data only. Try: without them"
+            "--grid, --seed, --amplitude, --tilt and --fixed-psf apply to simulated data only. Try: without them"
         );
         Ok(())
     }

@@ -26,7 +26,7 @@ expect_error() {
   grep -q "$wanted" <<<"$message" || bad "expected: $wanted"
   grep -q panicked <<<"$message" && bad "a panic"
 }
-run() { "$shearq" run --simulate --sets 2 --images 6 --grid 24 --submission 23/raw/star --threads 2 "$@"; }
+run() { "$shearq" run --simulate --fixed-psf one --sets 2 --images 6 --grid 24 --submission 23/raw/star --threads 2 "$@"; }
 run --out "$work/whole" >/dev/null 2>&1 || bad "undisturbed run"
 
 echo "a full disk:"
@@ -44,7 +44,7 @@ expect_error "Read-only file system" run --out "$disk/other"
 mount -o remount,rw "$disk"
 
 echo "input that vanishes:"
-"$shearq" simulate --sets 2 --images 6 --grid 24 --out "$work/data" 2>/dev/null || bad "simulate"
+"$shearq" simulate --fixed-psf one --sets 2 --images 6 --grid 24 --out "$work/data" 2>/dev/null || bad "simulate"
 mv "$work/data/set02/psf-004.fits" "$work/psf"
 expect_error "psf-004.fits" "$shearq" measure --submission 23/raw/star --data "$work/data" --out "$work/measured" --threads 1
 [ "$(ls "$work"/measured/set02 | grep -c catalogue)" = 3 ] || bad "three images should be there"

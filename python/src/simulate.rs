@@ -13,7 +13,7 @@ use shearq_quantities::{FunctionalPsf, PsfProfile};
 use shearq_simulate::field::ShearSpectrum;
 use shearq_simulate::render::RenderScratch;
 use shearq_simulate::set::{
-    ImageFields, NOISE_SIGMA, PsfField, STAMP, SetSimulator, SimulationSettings,
+    FixedPsf, ImageFields, NOISE_SIGMA, PsfField, STAMP, SetSimulator, SimulationSettings,
 };
 
 use crate::errors::{no_memory, of_pipeline};
@@ -42,6 +42,7 @@ pub(crate) fn simulate<'py>(
     amplitude: f64,
     tilt: f64,
     intrinsic_sigma: Option<f64>,
+    psf_fields: bool,
     threads_asked: Option<u16>,
     progress: Option<Py<PyAny>>,
 ) -> PyResult<Bound<'py, PyDict>> {
@@ -53,6 +54,10 @@ pub(crate) fn simulate<'py>(
             ..ShearSpectrum::default()
         },
         intrinsic_sigma: intrinsic_sigma.unwrap_or(usual.intrinsic_sigma),
+        fixed_psf: match psf_fields {
+            true => FixedPsf::Field,
+            false => FixedPsf::One,
+        },
         ..usual
     };
     settings

@@ -19,7 +19,7 @@ SUBMISSIONS = ["48/linear/star", "48/linear/func", "23/den/star", "23/raw/func"]
 def data(command, tmp_path_factory):
     folder = tmp_path_factory.mktemp("cli") / "data"
     sets = ",".join(map(str, SETS))
-    command("simulate", "--sets", sets, "--images", IMAGES, "--grid", GRID, "--seed", SEED, "--out", folder)
+    command("simulate", "--sets", sets, "--images", IMAGES, "--grid", GRID, "--seed", SEED, "--fixed-psf", "one", "--out", folder)
     return folder
 
 

@@ -12,7 +12,7 @@ use shearq_pipeline::simulate::simulator;
 use shearq_quantities::statistics::median;
 use shearq_render::table::{Cell, Table};
 use shearq_simulate::render::RenderScratch;
-use shearq_simulate::set::{NOISE_SIGMA, STAMP, SetSimulator, SimulationSettings};
+use shearq_simulate::set::{FixedPsf, NOISE_SIGMA, STAMP, SetSimulator, SimulationSettings};
 use shearq_submissions::Configuration;
 
 use crate::arguments::{Form, Threads, configurations};
@@ -57,7 +57,12 @@ struct Speed {
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let threads = arguments.threads.number();
-    let set = simulator(FIDUCIAL_SET, SimulationSettings::new(1, GRID_SIDE))?;
+    // Setting a PSF is measured by itself.
+    let settings = SimulationSettings {
+        fixed_psf: FixedPsf::One,
+        ..SimulationSettings::new(1, GRID_SIDE)
+    };
+    let set = simulator(FIDUCIAL_SET, settings)?;
     let configurations = configurations(&arguments.submission)?;
     let rows = configurations.iter().map(|own| speed(own, &set, threads));
     let rows: Vec<Speed> = rows.collect::<Result<_, PipelineError>>()?;

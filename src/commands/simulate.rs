@@ -72,11 +72,12 @@ pub(crate) struct Arguments {
 }
 
 // Options without a meaning for branches of GREAT3.
-const GREAT10_ONLY: [&str; 7] = [
+const GREAT10_ONLY: [&str; 8] = [
     "sets",
     "images",
     "amplitude",
     "tilt",
+    "fixed_psf",
     "constant_shear",
     "rotated",
     "shard",

@@ -53,7 +53,7 @@ fn links_lead_to_files_and_the_summary_has_every_page() {
 /// Simulated images instead of those that the tutorial's script renders.
 fn images() -> Folder {
     let folder = Folder::new();
-    folder.run("simulate --sets 2 --images 2 --grid 16 --out challenge");
+    folder.run("simulate --fixed-psf one --sets 2 --images 2 --grid 16 --out challenge");
     let stamps = stamps_of(&folder.at("challenge/set02/galaxies-001.fits"), 48);
     folder.image("field.fits", &[48, 48, 100], &[], &stamps[..100].concat());
     let star = folder.at("challenge/set02/psf-001.fits");

@@ -10,7 +10,7 @@ use rand_distr::{Distribution, StandardNormal};
 use shearq_measure::{FunctionalPsf, Measurer, Psfs};
 use shearq_simulate::kinds::SetKind;
 use shearq_simulate::render::RenderScratch;
-use shearq_simulate::set::{STAMP, SetSimulator, SimulationSettings};
+use shearq_simulate::set::{FixedPsf, STAMP, SetSimulator, SimulationSettings};
 
 use crate::support::{Folder, galsim_sets, mosaic, shell, text};
 
@@ -35,9 +35,11 @@ struct Data {
 impl Data {
     /// An image of simulated set 2.
     fn good() -> Self {
-        let simulator =
-            SetSimulator::new(SetKind::of(2).unwrap(), SimulationSettings::new(SEED, GRID))
-                .unwrap();
+        let settings = SimulationSettings {
+            fixed_psf: FixedPsf::One,
+            ..SimulationSettings::new(SEED, GRID)
+        };
+        let simulator = SetSimulator::new(SetKind::of(2).unwrap(), settings).unwrap();
         let fields = simulator.image_fields(1);
         let mut stamps = Stamps::zeros((GRID * GRID, STAMP, STAMP));
         let mut scratch = RenderScratch::new();
@@ -274,7 +276,7 @@ fn batch(data: &Data) -> Found {
 #[test]
 fn every_entry_point_reports_wrong_data() {
     let (good, folder) = (Data::good(), Folder::new());
-    let simulate = "simulate --sets 2 --images 1 --out data";
+    let simulate = "simulate --fixed-psf one --sets 2 --images 1 --out data";
     folder.run(&format!("{simulate} --grid {GRID} --seed {SEED}"));
     let mut wrong = Vec::new();
     for line in CASES.lines().skip(1) {
@@ -314,7 +316,9 @@ fn simulated_and_galsims_images_are_measured_silently() {
         ("2,5,8,20", "23/raw/star"),
     ]
     .map(|(sets, name)| {
-        format!("run --simulate --images 1 --grid 16 --sets {sets} --submission {name}")
+        format!(
+            "run --simulate --fixed-psf one --images 1 --grid 16 --sets {sets} --submission {name}"
+        )
     })
     .into();
     let cosmos = Path::new("tests/data/galsim/cosmos").to_owned();

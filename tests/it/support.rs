@@ -126,7 +126,7 @@ impl Folder {
     /// With `data`: two images of 8 × 8 galaxies of set 2, which has one PSF, or 19, which has one per galaxy.
     pub fn with_set(set: u32) -> Self {
         let folder = Folder::new();
-        let simulate = "simulate --images 2 --grid 8 --seed 5 --out data --sets";
+        let simulate = "simulate --fixed-psf one --images 2 --grid 8 --seed 5 --out data --sets";
         folder.run(&format!("{simulate} {set}"));
         folder
     }

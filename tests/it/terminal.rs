@@ -10,7 +10,7 @@ use crate::support::{Folder, assert_has, printed, refused};
 fn runs() -> Folder {
     let folder = Folder::new();
     for (submission, out) in [("23/den/star", "den"), ("48/linear/star", "linear")] {
-        let run = "run --simulate --sets 2,8 --images 3 --grid 12 --store store";
+        let run = "run --simulate --fixed-psf one --sets 2,8 --images 3 --grid 12 --store store";
         folder.run(&format!("{run} --submission {submission} --out {out}"));
     }
     folder
@@ -36,7 +36,7 @@ fn tables_fit_eighty_columns_and_wide_ones_are_asked_for() {
         "compare den linear",
         "compare --store store",
         "submissions list",
-        "run --simulate --sets 2 --images 2 --grid 8 --submission 23/raw/star --out run",
+        "run --simulate --fixed-psf one --sets 2 --images 2 --grid 8 --submission 23/raw/star --out run",
     ] {
         assert_narrow(&folder, command);
     }
@@ -72,7 +72,7 @@ fn pages_hold_the_table_the_figures_and_what_made_them() {
         folder.run(&format!("{command} --report page.html"));
         fs::read_to_string(folder.at("page.html")).unwrap()
     };
-    let run = "run --simulate --sets 2,8 --images 3 --grid 12";
+    let run = "run --simulate --fixed-psf one --sets 2,8 --images 3 --grid 12";
     let made = report(&format!("{run} --out linear --submission 48/linear/star"));
     for words in [
         "Scores of 48/linear/star",

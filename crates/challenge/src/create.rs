@@ -19,7 +19,7 @@ use shearq_results::record::SetRecord;
 use shearq_results::score::ScoreError;
 use shearq_scoring::{Choice, Convention, Options, RowCounts, ScoredImages, SetSession, TrueShear};
 use shearq_simulate::field::ShearSpectrum;
-use shearq_simulate::set::{STAMP, SimulationSettings};
+use shearq_simulate::set::{FixedPsf, STAMP, SimulationSettings};
 use thiserror::Error;
 
 use crate::contradiction::{First, contradiction};
@@ -247,6 +247,8 @@ pub fn simulated(
                 .unwrap_or_else(|| TILT * (2.0 * drawn(secret, "tilt") - 1.0)),
             scatter: SCATTER,
         },
+        // Participants download half as much as with a star for each galaxy.
+        fixed_psf: FixedPsf::One,
         ..SimulationSettings::new(secret, simulation.grid)
     };
     settings.validate()?;

@@ -294,6 +294,7 @@ pub fn simulated_steps(
 #[cfg(test)]
 mod tests {
     use shearq_files::table::FileFormat;
+    use shearq_simulate::set::FixedPsf;
     use shearq_submissions::Registry;
 
     use super::*;
@@ -324,7 +325,10 @@ mod tests {
         let mut configuration = registry.get("48/linear/star").unwrap().configuration;
         // Too little of the PSF: a warning for each image.
         configuration.psf.size = 24;
-        let settings = SimulationSettings::new(1, 8);
+        let settings = SimulationSettings {
+            fixed_psf: FixedPsf::One,
+            ..SimulationSettings::new(1, 8)
+        };
         let run = Run::new(
             Source::Simulated(settings),
             configuration,

@@ -14,7 +14,7 @@ use shearq_dataset::threads::Progress;
 use shearq_dataset::truth;
 use shearq_files::fits::{ImageReader, ImageWriter, Value};
 use shearq_files::{atomic, open};
-use shearq_simulate::kinds::{SetKind, Variability};
+use shearq_simulate::kinds::SetKind;
 use shearq_simulate::render::RenderScratch;
 use shearq_simulate::set::{
     ImageFields, NOISE_SIGMA, PsfField, STAMP, SetSimulator, SimulationSettings,
@@ -60,9 +60,9 @@ pub fn simulate_blind(
         let simulator = simulator(set, record.settings)?;
         let grid = simulator.grid();
         let last = grid.centre(grid.n - 1, grid.n - 1);
-        let last_psf = match simulator.kind().psf {
-            Variability::Fixed => grid.centre(0, 0),
-            Variability::Variable => last,
+        let last_psf = match simulator.has_one_psf() {
+            true => grid.centre(0, 0),
+            false => last,
         };
         let is_there = |&ImageId { image, .. }: &ImageId| {
             is_whole(&public.galaxies(set, image), side)

@@ -41,11 +41,11 @@ pub const MAX_INTRINSIC_MODULUS: f64 = 0.7;
 const MAX_SHEAR: f64 = 0.5;
 // Of PSFs, where it does not vary. Chosen by hand.
 const PSF_FWHM_PX: f64 = 3.4;
-// Relative amplitude of the FWHM over the field of a variable PSF. Chosen by hand.
+// Relative amplitude of the FWHM over a field of PSFs. Chosen by hand.
 const PSF_FWHM_VARIATION: f64 = 0.1;
-// |ε| of fixed PSFs, and of variable Moffat PSFs, which cancel partly over the field. Chosen by hand.
-const FIXED_PSF_ELLIPTICITY: f64 = 0.025;
-const VARIABLE_PSF_ELLIPTICITY: f64 = 0.05;
+// |ε| of one PSF for all galaxies, and of fields of Moffat PSFs, which cancel partly over the image. Chosen by hand.
+const ONE_PSF_ELLIPTICITY: f64 = 0.025;
+const PSF_FIELD_ELLIPTICITY: f64 = 0.05;
 // |ε| of turbulent PSFs: rms over the field, and the largest value. Chosen by hand.
 const TURBULENT_PSF_RMS: f64 = 0.03;
 const MAX_TURBULENT_PSF_ELLIPTICITY: f64 = 0.2;
@@ -76,9 +76,29 @@ pub struct SimulationSettings {
     /// The shear [g1, g2] of all galaxies, instead of a field drawn from `spectrum`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub constant_shear: Option<[f64; 2]>,
+    /// What images of sets with fixed PSFs share.
+    #[serde(default, skip_serializing_if = "FixedPsf::is_one")]
+    pub fixed_psf: FixedPsf,
     /// Whether all galaxies are turned by 90 degrees before lensing. Noise and centres stay as they are.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub rotated: bool,
+}
+
+/// What all images of a set with fixed PSFs share.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum FixedPsf {
+    /// A PSF field that varies over the image, as in GREAT10: Nurbaeva et al., Table 2 and Sects. 5.1 and 5.3.
+    Field,
+    /// One PSF of all galaxies. Records without the setting mean this one.
+    #[default]
+    One,
+}
+
+impl FixedPsf {
+    fn is_one(&self) -> bool {
+        *self == FixedPsf::One
+    }
 }
 
 impl Serialize for SimulationSettings {
@@ -116,6 +136,7 @@ impl SimulationSettings {
             spectrum: ShearSpectrum::default(),
             intrinsic_sigma: DEFAULT_INTRINSIC_SIGMA,
             constant_shear: None,
+            fixed_psf: FixedPsf::Field,
             rotated: false,
         }
     }
@@ -132,6 +153,7 @@ impl SimulationSettings {
                 },
             intrinsic_sigma,
             constant_shear,
+            fixed_psf: _,
             rotated: _,
         } = self;
         if let Some([g1, g2]) = constant_shear {
@@ -336,9 +358,13 @@ impl SetSimulator {
         }
     }
 
-    // A fixed PSF has one small ellipticity in a random direction. Variable PSFs have an ellipticity that rotates over the
-    // field and a FWHM that varies, with random phases. Kolmogorov PSFs have a random field of ellipticity with the power
-    // ∝ ℓ^(−11/3) of turbulence instead.
+    /// Whether all galaxies of the set have one PSF.
+    pub fn has_one_psf(&self) -> bool {
+        self.kind.psf == Variability::Fixed && self.settings.fixed_psf == FixedPsf::One
+    }
+
+    // One PSF has a small ellipticity in a random direction. Fields have an ellipticity that rotates over the image and a FWHM that
+    // varies, with random phases. Kolmogorov PSFs have a random field of ellipticity with the power ∝ ℓ^(−11/3) of turbulence instead.
     fn psf_field(&self, rng: &mut ChaCha8Rng) -> PsfField {
         let profile = psf_profile(self.kind);
         let tau = std::f64::consts::TAU;
@@ -346,11 +372,11 @@ impl SetSimulator {
             FunctionalPsf::new(profile, fwhm, Shear::new(e.re, e.im))
                 .expect("the PSFs drawn here are within range")
         };
-        if self.kind.psf == Variability::Fixed {
+        if self.has_one_psf() {
             let angle = rng.random_range(0.0..tau);
             return PsfField::One(psf(
                 PSF_FWHM_PX,
-                Complex64::from_polar(FIXED_PSF_ELLIPTICITY, angle),
+                Complex64::from_polar(ONE_PSF_ELLIPTICITY, angle),
             ));
         }
         let n = self.grid.n;
@@ -376,9 +402,7 @@ impl SetSimulator {
                 PSF_FWHM_PX * (1.0 + PSF_FWHM_VARIATION * wave(phases[0], ix, iy, 1.0).sin());
             let e = match &turbulence {
                 Some(field) => field[(ix, iy)],
-                None => {
-                    Complex64::from_polar(VARIABLE_PSF_ELLIPTICITY, wave(phases[1], ix, iy, 1.5))
-                }
+                None => Complex64::from_polar(PSF_FIELD_ELLIPTICITY, wave(phases[1], ix, iy, 1.5)),
             };
             psf(fwhm, e)
         }))
@@ -535,6 +559,7 @@ fn psf_profile(kind: SetKind) -> PsfProfile {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::galaxy::Component;
 
     fn settings(seed: u64, grid: usize) -> SimulationSettings {
         SimulationSettings::new(seed, grid)
@@ -615,6 +640,46 @@ mod tests {
         assert_eq!(same(1), (false, false));
         assert_eq!(same(2), (false, true));
         assert_eq!(same(3), (true, false));
+        assert_eq!(same(20), (false, true));
+    }
+
+    #[test]
+    fn fixed_psfs_are_a_field_unless_one_is_asked_for() {
+        let psf = |set: u32, fixed_psf| {
+            let settings = SimulationSettings {
+                fixed_psf,
+                ..settings(7, 16)
+            };
+            let kind = SetKind::of(set).unwrap();
+            SetSimulator::new(kind, settings)
+                .unwrap()
+                .image_fields(1)
+                .psf
+        };
+        for set in [1, 2, 3, 20] {
+            let field = psf(set, FixedPsf::Field);
+            let PsfField::PerGalaxy(each) = &field else {
+                panic!("set {set}: one PSF");
+            };
+            let differ = |of: fn(&FunctionalPsf) -> f64| {
+                let values = each.iter().map(of);
+                let (least, most) = (
+                    values.clone().fold(f64::INFINITY, f64::min),
+                    values.fold(f64::NEG_INFINITY, f64::max),
+                );
+                most - least
+            };
+            // The FWHM varies by 10 % to both sides of 3.4 px, the ellipticity turns.
+            assert!(differ(|psf| psf.fwhm) > 0.5, "set {set}");
+            assert!(differ(|psf| psf.shape.e1) > 0.05, "set {set}");
+            let is_one = matches!(psf(set, FixedPsf::One), PsfField::One(_));
+            assert_eq!(is_one, [2, 20].contains(&set), "set {set}");
+        }
+        let turbulent = psf(20, FixedPsf::Field);
+        let squares = (0..256).map(|k| turbulent.at(k % 16, k / 16).shape.modulus().powi(2));
+        let rms = (squares.sum::<f64>() / 256.0).sqrt();
+        // Limited at 0.2, which no galaxy of a field of rms 0.03 reaches.
+        assert!((rms / TURBULENT_PSF_RMS - 1.0).abs() < 1e-9, "{rms}");
     }
 
     #[test]
@@ -670,6 +735,83 @@ mod tests {
                 "{intrinsic} {shear}: {}",
                 other / along - 1.0
             );
+        }
+    }
+
+    /// Largest distance of the numbers' distribution from the one with this share below and at a number, which rises between its steps.
+    fn farthest(mut values: Vec<f64>, below: impl Fn(f64) -> f64) -> f64 {
+        values.sort_by(f64::total_cmp);
+        let count = values.len() as f64;
+        let ends = values.chunk_by(|a, b| a == b);
+        let mut seen = 0.0;
+        let distances = ends.map(|equal| {
+            seen += equal.len() as f64;
+            (seen / count - below(equal[0])).abs()
+        });
+        distances.fold(0.0, f64::max)
+    }
+
+    #[test]
+    fn drawn_galaxies_have_the_distributions_stated() {
+        const COUNT: u32 = 100_000;
+        // Kolmogorov's limit that chance passes once in 10,000. Widths and modes that are off by 4 % are farther away.
+        let limit = 2.23 / f64::from(COUNT).sqrt();
+        let draw = |set: u32, of: &dyn Fn(&Galaxy, f64) -> f64| -> Vec<f64> {
+            let simulator = simulator(set, 1, 8);
+            let mut rng = stream([u64::from(set), 0, 0, 0]);
+            let galaxies = (0..COUNT).map(|_| {
+                let (galaxy, snr) = simulator.galaxy(Shear::ZERO, Shear::ZERO, &mut rng);
+                of(&galaxy, snr)
+            });
+            galaxies.collect()
+        };
+        let normal = |x: f64| 0.5 * puruspe::erfc(-x / 2f64.sqrt());
+        for set in [10, 11, 12] {
+            let snr = draw(set, &|_, snr| snr);
+            assert!(snr.iter().all(|snr| (10.0..=80.0).contains(snr)));
+            let rayleigh = |snr: f64| match snr {
+                80.0 => 1.0,
+                _ => 1.0 - (-snr * snr / (2.0 * 20.0 * 20.0)).exp(),
+            };
+            let apart = farthest(snr, rayleigh);
+            assert!(apart < limit, "S/N of set {set}: {apart}");
+        }
+        for set in [17, 18] {
+            for (component, usual) in [(0, 2.3), (1, 4.8)] {
+                let size = |galaxy: &Galaxy, _| galaxy.components()[component].half_light_radius;
+                let apart = farthest(draw(set, &size), |size| normal((size / usual).ln() / 0.2));
+                assert!(apart < limit, "sizes of set {set}: {apart}");
+            }
+        }
+        for set in [21, 22] {
+            let fraction = |galaxy: &Galaxy, _| galaxy.components()[0].flux;
+            let apart = farthest(draw(set, &fraction), |fraction| fraction);
+            assert!(apart < limit, "bulge fractions of set {set}: {apart}");
+        }
+        for set in [23, 24] {
+            let offsets: [fn(&Component) -> f64; 2] = [|bulge| bulge.dx, |bulge| bulge.dy];
+            for offset in offsets {
+                let of_bulge = |galaxy: &Galaxy, _| offset(&galaxy.components()[0]);
+                let apart = farthest(draw(set, &of_bulge), normal);
+                assert!(apart < limit, "bulge offsets of set {set}: {apart}");
+            }
+        }
+        for (set, snr, bulge, disc) in [
+            (1, 20.0, 2.3, 4.8),
+            (5, 10.0, 2.3, 4.8),
+            (9, 40.0, 2.3, 4.8),
+            (13, 20.0, 1.8, 2.6),
+            (16, 20.0, 3.4, 10.0),
+            (19, 20.0, 2.3, 4.8),
+        ] {
+            let (galaxy, found) =
+                simulator(set, 1, 8).galaxy(Shear::ZERO, Shear::ZERO, &mut stream([0; 4]));
+            let [first, second] = galaxy.components() else {
+                panic!("set {set}: not a bulge and a disc");
+            };
+            let sizes = [first.half_light_radius, second.half_light_radius];
+            assert_eq!((found, sizes), (snr, [bulge, disc]), "set {set}");
+            assert_eq!((first.flux, second.flux), (0.5, 0.5), "set {set}");
         }
     }
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,15 +95,16 @@ def simulate(
     amplitude: float = 1.0,
     tilt: float = 0.0,
     intrinsic_sigma: float | None = None,
+    fixed_psf: Literal["one", "field"] = "one",
     threads: int | None = None,
     progress: Callable[[int], object] | None = None,
 ) -> Simulation:
-    """Simulate images of a GREAT10-like set, the same as the command line writes with the same settings.
+    """Simulate images of a GREAT10-like set, the same as the command line writes with the same settings, `--fixed-psf` among them.
 
     Parameters
     ----------
     set : int
-        1 to 24, those of GREAT10: 2, 5, 8 have one PSF for all galaxies of S/N 20, 10, 40.
+        1 to 24, those of GREAT10: 2, 5, 8 have fixed PSFs, and galaxies of S/N 20, 10, 40.
     images : int
         How many. One takes 9 kB for each of its `grid`² galaxies.
     seed : int
@@ -113,6 +115,9 @@ def simulate(
         Factor on the shear power spectrum, and its extra slope about ℓ = 1000.
     intrinsic_sigma : float, optional
         Standard deviation per component of the galaxies' own shear-type ellipticities; 0.14 by default.
+    fixed_psf : {"one", "field"}
+        PSFs of sets whose PSFs are fixed: one of all galaxies, or a field over the image that is the same in all images, with a
+        star for each galaxy, as in GREAT10.
     threads, progress
         As for :func:`measure`.
 
@@ -120,6 +125,8 @@ def simulate(
     -------
     Simulation
     """
+    if fixed_psf not in ("one", "field"):
+        raise ValueError(f"fixed_psf is {fixed_psf!r}; expected 'one' or 'field'")
     expected = "a finite number, not negative"
     grid = whole("grid", grid, 8, 400)
     set, images = whole("set", set, 1, _SETS), whole("images", images, 1, _MOST_IMAGES)
@@ -132,6 +139,7 @@ def simulate(
         real("amplitude", amplitude, expected, least=0.0),
         real("tilt", tilt, "a finite number"),
         None if intrinsic_sigma is None else real("intrinsic_sigma", intrinsic_sigma, expected, least=0.0),
+        fixed_psf == "field",
         thread_count(threads),
         callback(progress),
     )

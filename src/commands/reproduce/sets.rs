@@ -277,10 +277,12 @@ pub(super) fn figures(page: &mut Page<'_>, results: &[SetScores]) -> Result<(), 
         .collect();
     let all: Vec<(usize, &str)> = names.iter().copied().enumerate().collect();
     let title = "Quality factor per set";
+    let mut plot = metric_per_set(results, &all, |f| f.q, title, "Q");
+    plot.series.extend(lines_of_means(results, &all, |f| f.q));
     page.figure(
         "fig8-q-per-set",
-        &metric_per_set(results, &all, |f| f.q, title, "Q"),
-        "As Fig. 8 of the paper: quality factor per set and configuration.",
+        &plot,
+        "As Fig. 8 of the paper: quality factor per set and configuration; lines: means over the challenge's 24 sets.",
     )?;
     let [raw, denoised] = [RAW, DENOISED].map(|name| names.iter().position(|own| *own == name));
     if let (Some(raw), Some(denoised)) = (raw, denoised) {
@@ -295,17 +297,24 @@ pub(super) fn figures(page: &mut Page<'_>, results: &[SetScores]) -> Result<(), 
             &caption,
         )?;
         page.data("fig9-power-spectra", &spectra_table(results, denoised))?;
-        let title = "Multiplicative bias per set";
+        // Two panels, as the paper has them.
+        let panels = |title: &str, metric: Metric, label| PanelGrid {
+            title: title.into(),
+            columns: 2,
+            plots: both
+                .iter()
+                .map(|one| metric_per_set(results, &[*one], metric, one.1, label))
+                .collect(),
+        };
         page.figure(
             "fig10-multiplicative",
-            &metric_per_set(results, &both, |f| f.m_half, title, "M/2"),
-            "As Fig. 10 of the paper: multiplicative bias per set.",
+            &panels("Multiplicative bias per set", |f| f.m_half, "M/2"),
+            "As Fig. 10 of the paper: multiplicative bias per set, raw and denoised.",
         )?;
-        let title = "Additive bias per set";
         page.figure(
             "fig11-additive",
-            &metric_per_set(results, &both, |f| f.sqrt_a, title, "√A × 10⁴"),
-            "As Fig. 11 of the paper: additive bias per set.",
+            &panels("Additive bias per set", |f| f.sqrt_a, "√A × 10⁴"),
+            "As Fig. 11 of the paper: additive bias per set, raw and denoised.",
         )?;
     }
     Ok(())
@@ -334,6 +343,20 @@ fn metric_per_set(
         series: series.collect(),
         ..LinePlot::default()
     }
+}
+
+// The mean over the challenge's sets of each configuration as a line over all sets, in its colour and without a place in the legend.
+fn lines_of_means(results: &[SetScores], places: &[(usize, &str)], metric: Metric) -> Vec<Series> {
+    let sets = results.iter().map(|set| f64::from(set.set));
+    let ends = [
+        sets.clone().fold(f64::INFINITY, f64::min) - 0.5,
+        sets.fold(f64::NEG_INFINITY, f64::max) + 0.5,
+    ];
+    let lines = places.iter().enumerate().map(|(k, &(place, _))| {
+        let (mean, _) = mean_of_24(results, place, metric);
+        Series::new("", ends.to_vec(), vec![mean; 2], Style::Line, k)
+    });
+    lines.collect()
 }
 
 fn power_spectra(results: &[SetScores], place: usize) -> PanelGrid {
