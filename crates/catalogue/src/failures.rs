@@ -82,6 +82,8 @@ const SEARCHED_ROWS: usize = 4096;
 // frequent numbers are about equally frequent. A number ten times as frequent as the tenth marks a failure or a default.
 const REFERENCE_RANK: usize = 10;
 const OUTSTANDING_RATIO: u64 = 10;
+// Copies of a galaxy are fewer. Chosen by hand.
+const MIN_SHARED_ROWS: u64 = 16;
 // A column of fewer different numbers is one of classes, whose frequencies differ. Chosen by hand.
 const MAX_CLASSES: usize = 10;
 
@@ -181,7 +183,7 @@ impl Repeats {
         self.all.iter_mut().for_each(|repeat| repeat.look_for(part));
     }
 
-    /// Adds a row that counts, and returns whether its ellipticity is one that several rows share.
+    /// Adds a row that counts, and returns whether its ellipticity is one that many rows share.
     pub fn add(&mut self, part: &Part<'_>, at: usize) -> bool {
         self.used += 1;
         let mut shared = false;
@@ -193,7 +195,9 @@ impl Repeats {
             let key = repeat.key(part, at);
             if let Some(count) = repeat.counts.get_mut(&key) {
                 *count += 1;
-                shared |= repeat.kind == RepeatKind::Ellipticities;
+                // Of a few rows, these are copies rather than a failure.
+                let many = *count > MIN_SHARED_ROWS && *count * 1000 > self.used;
+                shared |= many && repeat.kind == RepeatKind::Ellipticities;
             }
         }
         shared
