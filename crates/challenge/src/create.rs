@@ -7,98 +7,26 @@ use shearq_dataset::grid::{read_psfs, write_psfs};
 use shearq_dataset::images::{self, ImageId};
 use shearq_dataset::layout::{DataFolder, LAYOUT_FILE, Layout, fill};
 use shearq_dataset::run::SimulationRecord;
-use shearq_dataset::threads::{Progress, Quiet, ThreadError};
+use shearq_dataset::threads::{Progress, Quiet};
 use shearq_dataset::truth::{ReadTruth, Reading, grid_of_set, read_truth, reading_of, write_truth};
 use shearq_files::fits::{ImageReader, ImageWriter, Value};
 use shearq_files::open::is_there;
 use shearq_files::{FileError, atomic, names_of};
-use shearq_pipeline::PipelineError;
 use shearq_pipeline::simulate::simulate_blind;
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_results::record::SetRecord;
 use shearq_results::score::ScoreError;
 use shearq_scoring::{Choice, Convention, Options, RowCounts, ScoredImages, SetSession, TrueShear};
 use shearq_simulate::field::ShearSpectrum;
-use shearq_simulate::set::{FixedPsf, STAMP, SimulationSettings};
-use thiserror::Error;
+use shearq_simulate::set::{STAMP, SimulationSettings};
 
 use crate::contradiction::{First, contradiction};
-use crate::judge::unscored;
+use crate::error::{ChallengeError, EXPECTED_RESPONSE, unscored};
 use crate::kind::{ConstantShears, Kind, RankBy, response};
 use crate::page::readme;
 use crate::seal::{Key, close, names, seal_public, sums};
 use crate::shapes::References;
 use crate::terms::{CHALLENGE_FILE, Challenge, Data, Deadline, Rules};
-
-// Significance of the response that a method of ordinary noise must expect. Entries need 3; two more make a refusal by
-// chance unlikely.
-const EXPECTED_RESPONSE: f64 = 5.0;
-
-/// Failure to make a challenge: a file or a measurement, or data and rules by which entries could not be ranked.
-#[derive(Debug, Error)]
-#[non_exhaustive]
-pub enum ChallengeError {
-    #[error(transparent)]
-    File(#[from] FileError),
-    #[error(transparent)]
-    Score(#[from] ScoreError),
-    /// Reference images that cannot be simulated or measured.
-    #[error(transparent)]
-    Pipeline(#[from] PipelineError),
-    #[error(transparent)]
-    Threads(#[from] ThreadError),
-    #[error(transparent)]
-    Simulation(#[from] shearq_simulate::set::SettingsError),
-    #[error(
-        "--amplitude 0: without shear, entries cannot be ranked (found 0, expected a positive number)"
-    )]
-    NoShear,
-    #[error(
-        "--closes: the last day is before the first one (found {closes}, expected {opens} or later)"
-    )]
-    ClosesFirst { opens: Deadline, closes: Deadline },
-    #[error("--spectra: {metric} is not defined for power spectra. Try: --metric q or q-corrected")]
-    NotOfSpectra { metric: &'static str },
-    #[error(
-        "--spectra: the response of power spectra follows from differences between sets (found 1 set, expected at least 2)"
-    )]
-    OneSpectrum,
-    #[error("the true shear {}, so {metric} is not defined. Try: --metric {}",
-        if *constant { "is the same for all galaxies of a set" } else { "varies within the sets" },
-        if *constant { "qc, m or c" } else { "q-calibrated, m or c" }
-    )]
-    Undefined {
-        metric: &'static str,
-        constant: bool,
-    },
-    #[error("{0}")]
-    Shears(String),
-    #[error(
-        "noise is measured between images (found 1 image per set, expected at least 2). Try: --images 8"
-    )]
-    OneImage,
-    #[error("{0}. Try: the same command with the right true shear")]
-    Contradiction(String),
-    #[error(
-        "the data are too small to rank entries by {metric}: {of} is expected to be {found:.1}σ from zero (expected at least {EXPECTED_RESPONSE}). Try: {images} images per set, or more galaxies per image"
-    )]
-    SmallResponse {
-        metric: &'static str,
-        of: String,
-        found: f64,
-        // Images that would do.
-        images: f64,
-    },
-    #[error(
-        "the data are too small to rank entries by {metric}: a spectrum without images reaches {template:.0}, a catalogue with the noise of these images about {catalogue:.0}. Try: --metric q-calibrated, or {images} images per set"
-    )]
-    BehindTemplate {
-        metric: &'static str,
-        template: f64,
-        catalogue: f64,
-        images: f64,
-    },
-}
 
 #[derive(Debug, Clone)]
 pub struct Plan {

@@ -14,7 +14,6 @@ use shearq_dataset::threads::{Pool, Progress};
 use shearq_files::{FileError, names_of};
 use shearq_render::escape::line;
 use shearq_results::record::{RunRecord, SetRecord};
-use shearq_results::score::ScoreError;
 use shearq_results::store;
 use shearq_results::submit::check::{CheckedSet, Severity, check_sent};
 use shearq_results::submit::{
@@ -26,52 +25,13 @@ use shearq_scoring::{
 };
 use shearq_submissions::check_name;
 
-use crate::create::ChallengeError;
+use crate::entry::{Entry, EntryInfo, Refused};
+use crate::error::{ChallengeError, unscored};
 use crate::inbox::{Content, Sending, content, identify};
 use crate::kind::{ConstantShears, response};
 use crate::seal::{Key, Receipt, verify, verify_public};
 use crate::shapes::{References, sketch, sketch_of_spectra};
 use crate::terms::{Challenge, now};
-
-/// What identifies a scored entry. The store keeps it with its scores, so the names are part of the format.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct EntryInfo {
-    pub challenge: String,
-    pub team: String,
-    pub method: String,
-    /// One line about the entry; may be empty.
-    pub title: String,
-    /// Address for questions; may be empty. The leaderboard does not show it.
-    pub contact: String,
-    /// Time of arrival: of the receipt, or of the first `rank` that scored the entry.
-    pub received: Timestamp,
-    pub receipt: bool,
-    pub file: String,
-    pub sha256: String,
-    /// SHA-256 of sets, images and files.
-    pub content: String,
-    pub files: Vec<String>,
-    /// Means of ellipticities over parts of each set ([`sketch`]), or the spectra under [`SPECTRA`], by which copies of another
-    /// entry are found.
-    pub shapes: BTreeMap<String, Vec<i32>>,
-    pub contents: Contents,
-    pub reference: bool,
-}
-
-impl EntryInfo {
-    /// The first digits of the SHA-256, which name the entry.
-    pub fn short_id(&self) -> &str {
-        &self.sha256[..self.sha256.len().min(8)]
-    }
-}
-
-#[derive(Debug, Clone)]
-pub struct Entry {
-    pub info: EntryInfo,
-    pub sets: Vec<SetRecord>,
-    /// Why the organiser withdrew it.
-    pub withdrawn: Option<String>,
-}
 
 /// Key of the sketch of spectra, of all sets together: the eight numbers of one set cannot identify a copy.
 pub const SPECTRA: &str = "spectra";
@@ -82,13 +42,6 @@ const ENTRY_SETTINGS_PREFIX: &str = "[entry]\n";
 #[derive(Serialize, Deserialize)]
 struct Stored {
     entry: EntryInfo,
-}
-
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Refused {
-    pub path: PathBuf,
-    pub team: String,
-    pub reason: String,
 }
 
 #[derive(Debug, Default)]
@@ -646,10 +599,6 @@ fn slope_over_sets(sets: &[Powers]) -> (f64, f64) {
     });
     let line = Line::through(&rows.collect::<Vec<_>>());
     (line.slope, line.slope_error())
-}
-
-pub(crate) fn unscored(source: ScoringError) -> ChallengeError {
-    ChallengeError::Score(ScoreError::Scoring { set: None, source })
 }
 
 // Lists of refused entries state the path of the entry before the reason, so it is removed here.

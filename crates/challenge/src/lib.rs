@@ -1,6 +1,7 @@
 //! Blind challenges of shape measurement.
 //!
 //! * [`kind`] has the rules of each kind of challenge, and the metrics that rank entries.
+//! * [`entry`] is what is known of an entry, and [`error`] why a challenge cannot be made or ranked.
 //! * [`terms`] is the machine-readable description of a challenge, `challenge.toml`.
 //! * [`create`] writes the public and the private folder; [`seal`] ties them together and signs arrivals.
 //! * [`shapes`] compares an entry with the public images, without the true shear.
@@ -10,6 +11,8 @@
 
 mod contradiction;
 pub mod create;
+pub mod entry;
+pub mod error;
 pub mod inbox;
 pub mod judge;
 pub mod kind;

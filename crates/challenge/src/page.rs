@@ -10,7 +10,7 @@ use shearq_render::table::{Cell, Table, TableFormat};
 use shearq_results::submit::Kind as FileKind;
 use shearq_results::views::comparison::q_per_set;
 
-use crate::judge::{EntryInfo, Refused};
+use crate::entry::{EntryInfo, Refused};
 use crate::kind::{ConstantShears, RankBy};
 use crate::ranking::{Board, Leaderboard, NearCopy, Standing, better, rounded};
 use crate::terms::Challenge;

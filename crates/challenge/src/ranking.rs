@@ -7,7 +7,7 @@ use serde::Deserialize;
 use shearq_files::FileError;
 use shearq_results::compare::difference;
 
-use crate::judge::{Entry, EntryInfo};
+use crate::entry::{Entry, EntryInfo};
 use crate::kind::{ConstantShears, RankBy};
 use crate::seal::{BOARD_FILE, Key, read_toml};
 use crate::terms::{Challenge, Deadline};

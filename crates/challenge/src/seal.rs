@@ -17,7 +17,7 @@ use shearq_dataset::threads::Pool;
 use shearq_files::{FileError, atomic, open};
 use shearq_results::submit::FileSum;
 
-use crate::create::ChallengeError;
+use crate::error::ChallengeError;
 use crate::terms::{CHALLENGE_FILE, Challenge};
 
 /// Checksums of the public files, in the format of `sha256sum`.

@@ -1,0 +1,84 @@
+//! Why a challenge cannot be made or ranked.
+
+use shearq_dataset::threads::ThreadError;
+use shearq_files::FileError;
+use shearq_pipeline::PipelineError;
+use shearq_results::score::ScoreError;
+use shearq_scoring::ScoringError;
+use thiserror::Error;
+
+use crate::terms::Deadline;
+
+// Significance of the response that a method of ordinary noise must expect. Entries need 3; two more make a refusal by
+// chance unlikely.
+pub(crate) const EXPECTED_RESPONSE: f64 = 5.0;
+
+/// Failure to make a challenge: a file or a measurement, or data and rules by which entries could not be ranked.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum ChallengeError {
+    #[error(transparent)]
+    File(#[from] FileError),
+    #[error(transparent)]
+    Score(#[from] ScoreError),
+    /// Reference images that cannot be simulated or measured.
+    #[error(transparent)]
+    Pipeline(#[from] PipelineError),
+    #[error(transparent)]
+    Threads(#[from] ThreadError),
+    #[error(transparent)]
+    Simulation(#[from] shearq_simulate::set::SettingsError),
+    #[error(
+        "--amplitude 0: without shear, entries cannot be ranked (found 0, expected a positive number)"
+    )]
+    NoShear,
+    #[error(
+        "--closes: the last day is before the first one (found {closes}, expected {opens} or later)"
+    )]
+    ClosesFirst { opens: Deadline, closes: Deadline },
+    #[error("--spectra: {metric} is not defined for power spectra. Try: --metric q or q-corrected")]
+    NotOfSpectra { metric: &'static str },
+    #[error(
+        "--spectra: the response of power spectra follows from differences between sets (found 1 set, expected at least 2)"
+    )]
+    OneSpectrum,
+    #[error("the true shear {}, so {metric} is not defined. Try: --metric {}",
+        if *constant { "is the same for all galaxies of a set" } else { "varies within the sets" },
+        if *constant { "qc, m or c" } else { "q-calibrated, m or c" }
+    )]
+    Undefined {
+        metric: &'static str,
+        constant: bool,
+    },
+    #[error("{0}")]
+    Shears(String),
+    #[error(
+        "noise is measured between images (found 1 image per set, expected at least 2). Try: --images 8"
+    )]
+    OneImage,
+    #[error("{0}. Try: the same command with the right true shear")]
+    Contradiction(String),
+    #[error(
+        "the data are too small to rank entries by {metric}: {of} is expected to be {found:.1}σ from zero (expected at least {EXPECTED_RESPONSE}). Try: {images} images per set, or more galaxies per image"
+    )]
+    SmallResponse {
+        metric: &'static str,
+        of: String,
+        found: f64,
+        // Images that would do.
+        images: f64,
+    },
+    #[error(
+        "the data are too small to rank entries by {metric}: a spectrum without images reaches {template:.0}, a catalogue with the noise of these images about {catalogue:.0}. Try: --metric q-calibrated, or {images} images per set"
+    )]
+    BehindTemplate {
+        metric: &'static str,
+        template: f64,
+        catalogue: f64,
+        images: f64,
+    },
+}
+
+pub(crate) fn unscored(source: ScoringError) -> ChallengeError {
+    ChallengeError::Score(ScoreError::Scoring { set: None, source })
+}
