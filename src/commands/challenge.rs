@@ -6,7 +6,7 @@ use shearq_challenge::inbox;
 use shearq_challenge::judge::Judge;
 use shearq_challenge::kind::{ENTRIES_PER_TEAM, Kind, RankBy};
 use shearq_challenge::page::View;
-use shearq_challenge::ranking::{Decisions, near_copies, rank as ranked};
+use shearq_challenge::ranking::{Decisions, rank as ranked};
 use shearq_challenge::seal::{BOARD_FILE, is_open_to_others, verify_public};
 use shearq_challenge::shapes::References;
 use shearq_challenge::terms::{Challenge, Deadline, TUNING_ENTRIES};
@@ -398,7 +398,6 @@ fn rank(arguments: &RankArguments) -> anyhow::Result<()> {
         .digits
         .map_or(rules.metric.decimals(), usize::from);
     let board = ranked(&entries, &judge.challenge, judge.constant.as_ref(), digits);
-    let copies = near_copies(&entries);
     let view = View {
         challenge: &judge.challenge,
         board: &board,
@@ -407,7 +406,6 @@ fn rank(arguments: &RankArguments) -> anyhow::Result<()> {
             true => &[],
             false => &round.refused,
         },
-        copies: &copies,
         zero_shear: judge.zero_shear(),
         constant: judge.constant.as_ref(),
         digits,
@@ -430,16 +428,6 @@ fn rank(arguments: &RankArguments) -> anyhow::Result<()> {
         tell(format_args!(
             "warning: the entry of {} of {} does not count: {reason}",
             info.team, info.received
-        ));
-    }
-    for copy in &copies {
-        tell(format_args!(
-            "warning: {} of {} is a near copy of {} of {}: {}",
-            copy.entry.file,
-            copy.entry.team,
-            copy.earlier.file,
-            copy.earlier.team,
-            copy.reason()
         ));
     }
     tell(format_args!(

@@ -1,6 +1,5 @@
 //! What a challenge knows of an entry.
 
-use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use jiff::Timestamp;
@@ -25,10 +24,6 @@ pub struct EntryInfo {
     pub sha256: String,
     /// SHA-256 of sets, images and files.
     pub content: String,
-    pub files: Vec<String>,
-    /// Means of ellipticities over parts of each set ([`sketch`]), or the spectra under [`SPECTRA`], by which copies of another
-    /// entry are found.
-    pub shapes: BTreeMap<String, Vec<i32>>,
     pub contents: Contents,
     pub reference: bool,
 }

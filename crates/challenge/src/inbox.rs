@@ -15,12 +15,6 @@ const DEPTH: usize = 3;
 // Endings of archives that cannot be read.
 const OTHER_ARCHIVES: [&str; 7] = ["zip", "tar", "gz", "bz2", "xz", "zst", "7z"];
 
-// Digits of a file's checksum that a store keeps. Two of a million files agree by chance once in 10⁷ challenges.
-const FILE_DIGITS: usize = 16;
-
-// How the names of files that are neither catalogues nor spectra start in the list of an entry's content.
-const OTHER_FILE: &str = "other ";
-
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Sending {
     /// Archive, or folder of files.
@@ -164,7 +158,6 @@ pub struct Content {
     /// SHA-256 of sets, images and checksums of all files but the manifest. It depends neither on the name of the method nor on the
     /// compression.
     pub sha256: String,
-    pub files: Vec<String>,
     /// Team and challenge, if a manifest states them.
     pub entry: Option<Entry>,
 }
@@ -193,7 +186,7 @@ pub fn content(sending: &Sending) -> Result<Content, FileError> {
                 Some(Kind::Catalogue { set, image, .. }) => format!("{set} {image}"),
                 Some(Kind::Spectrum { set, .. }) => format!("{set}"),
                 // Checks see these files, so an entry with them is another entry.
-                None => format!("{OTHER_FILE}{name}"),
+                None => format!("other {name}"),
             };
             Some((name, sum))
         })
@@ -201,12 +194,6 @@ pub fn content(sending: &Sending) -> Result<Content, FileError> {
     sums.sort_by(|a, b| a.0.cmp(&b.0));
     Ok(Content {
         sha256: sha256(&list_of(&sums)),
-        // Two teams may add the same licence.
-        files: sums
-            .iter()
-            .filter(|(name, _)| !name.starts_with(OTHER_FILE))
-            .map(|(_, sum)| sum.sha256[..FILE_DIGITS].to_owned())
-            .collect(),
         entry: manifest.and_then(|manifest| manifest.entry),
     })
 }
@@ -231,7 +218,6 @@ mod tests {
         let more = of("c", &["g10_v1_objs_1_1.M.dat", "LICENSE"]);
         assert_eq!(plain.sha256, renamed.sha256);
         assert_ne!(plain.sha256, more.sha256);
-        assert_eq!((more.files.len(), &more.files), (1, &plain.files));
     }
 
     #[test]

@@ -30,11 +30,8 @@ use crate::error::{ChallengeError, unscored};
 use crate::inbox::{Content, Sending, content, identify};
 use crate::kind::{ConstantShears, response};
 use crate::seal::{Key, Receipt, verify, verify_public};
-use crate::shapes::{References, sketch, sketch_of_spectra};
+use crate::shapes::References;
 use crate::terms::{Challenge, now};
-
-/// Key of the sketch of spectra, of all sets together: the eight numbers of one set cannot identify a copy.
-pub const SPECTRA: &str = "spectra";
 
 // A store keeps entries and runs in one format. Only the settings of an entry start with this.
 const ENTRY_SETTINGS_PREFIX: &str = "[entry]\n";
@@ -378,8 +375,6 @@ impl Judge {
             file: file_name(&sending.path),
             sha256: arrival.sha256,
             content: content.sha256,
-            files: content.files,
-            shapes: BTreeMap::new(),
             contents: Contents::Catalogues,
             reference,
         };
@@ -426,14 +421,12 @@ impl Judge {
         let submission = Submission::read(&sent).map_err(plain)?;
         info.contents = rules.accept(&submission)?;
         let (mut sets, doubt) = match &submission.packed {
-            Packed::Catalogues(_) => self.catalogues(&sent, sending, references, info)?,
+            Packed::Catalogues(_) => self.catalogues(&sent, sending, references)?,
             Packed::Spectra(files) => {
                 self.check(&sent, sending, references, &mut |_| {})?;
                 let (sets, powers) = self
                     .spectra(files, submission.manifest.as_ref())
                     .map_err(|error| plain(sent.named(error)))?;
-                let sent: Vec<f64> = powers.iter().flat_map(|(_, sent)| sent.clone()).collect();
-                info.shapes.insert(SPECTRA.into(), sketch_of_spectra(&sent));
                 let (slope, error) = slope_over_sets(&powers);
                 if !is_measurable(slope, error) {
                     return Err("the spectra do not follow the differences of the true spectra between sets, so they contain no measurable shear".into());
@@ -491,17 +484,14 @@ impl Judge {
         sent: &Sent,
         sending: &Sending,
         references: &References,
-        info: &mut EntryInfo,
     ) -> Result<Scores, String> {
         let (mut sets, mut odd, mut failed) = (Vec::new(), Vec::new(), None);
         self.check(sent, sending, references, &mut |checked: CheckedSet<'_>| {
             let set = checked.set;
-            match self.score_set(&checked, &mut odd) {
-                Ok(record) => {
-                    let shapes = sketch(checked.images.images().total());
-                    info.shapes.insert(set.to_string(), shapes);
-                    sets.extend(record);
-                }
+            let of_set = checked.odd.iter();
+            odd.extend(of_set.map(|image| format!("{image} of set {set}")));
+            match self.score_set(&checked) {
+                Ok(record) => sets.extend(record),
                 Err(reason) => failed = failed.take().or(Some(format!("set {set}: {reason}"))),
             }
         })?;

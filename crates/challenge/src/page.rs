@@ -12,7 +12,7 @@ use shearq_results::views::comparison::q_per_set;
 
 use crate::entry::{EntryInfo, Refused};
 use crate::kind::{ConstantShears, RankBy};
-use crate::ranking::{Board, Leaderboard, NearCopy, Standing, better, rounded};
+use crate::ranking::{Board, Leaderboard, Standing, better, rounded};
 use crate::terms::Challenge;
 
 // The palette has eight colours.
@@ -27,7 +27,6 @@ pub struct View<'a> {
     pub zero_shear: Option<f64>,
     /// The true shears of sets with one shear each.
     pub constant: Option<&'a ConstantShears>,
-    pub copies: &'a [NearCopy<'a>],
     /// Decimals of the metric. More of them reveal more of the true shear.
     pub digits: usize,
     pub detail: bool,
@@ -176,18 +175,6 @@ impl View<'_> {
         table
     }
 
-    fn copies(&self) -> Table {
-        let name = |info: &EntryInfo| Cell::text(format!("{}: {}", info.team, info.method));
-        let mut table = Table::titled("Near copies");
-        let copies = self.copies;
-        table.column("entry", "entry", copies, |copy| name(copy.entry));
-        table.column("earlier", "earlier entry", copies, |copy| {
-            name(copy.earlier)
-        });
-        table.column("reason", "reason", copies, |copy| Cell::text(copy.reason()));
-        table
-    }
-
     // Q of zero shear on boards of other metrics, too: whoever reads Q elsewhere must see it.
     fn zero_note(&self) -> Option<String> {
         let q = Cell::with_error(rounded(self.zero_shear?, 1), Some(f64::NAN), 2)
@@ -290,7 +277,6 @@ impl View<'_> {
         for (id, table) in [
             ("late", of_board(Board::Late, "Late entries")),
             ("partial", of_board(Board::Partial, "Entries of some sets")),
-            ("copies", self.copies()),
             ("failures", self.failures()),
         ] {
             if !table.rows.is_empty() {
@@ -387,7 +373,7 @@ fn rules(challenge: &Challenge) -> Vec<String> {
     ));
     all.push("The shapes of every image must agree with the image, with one scale in all images of a set, and their response to the shear must be at least 3σ from zero.".into());
     all.push("Entries whose difference is below its error share a rank.".into());
-    all.push("Symbolic links are not accepted. Entries that share files or shapes with an earlier entry are listed.".into());
+    all.push("Symbolic links are not accepted.".into());
     if let Some(most) = rules.entries_per_team {
         all.push(format!(
             "Each team may send at most {most} entries, because published values reveal the true shear entry by entry."

@@ -1,4 +1,4 @@
-//! The board of a challenge: ranks, near copies, and what the organiser decides about entries.
+//! The board of a challenge: ranks, and what the organiser decides about entries.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
@@ -232,84 +232,6 @@ fn equal(metric: RankBy, best: &Scored<'_>, other: &Scored<'_>) -> bool {
     gap == 0.0 || gap.abs() < paired.min(apart)
 }
 
-// Largest 1 - r of a near copy, with r the correlation of its shapes: that of noise of 0.14 % of their scatter.
-const DECORRELATION: f64 = 1e-6;
-
-#[derive(Debug, Clone)]
-pub struct NearCopy<'a> {
-    pub entry: &'a EntryInfo,
-    pub earlier: &'a EntryInfo,
-    pub files: usize,
-    /// 1 - r, with r the correlation of the shapes; NaN without common sets of catalogues.
-    pub decorrelation: f64,
-}
-
-impl NearCopy<'_> {
-    pub fn reason(&self) -> String {
-        let of = self.entry.files.len();
-        format!(
-            "{} of {of} files are identical, 1 - correlation of the shapes is {:.0e}",
-            self.files, self.decorrelation
-        )
-    }
-}
-
-// Smallest 1 - r of a component of the shapes of two entries in a common set: a copy may have another scale and shift in each set
-// and component. Of both components together, a factor of 0.99 on one of them alone leaves 1 - r = 10⁻⁵.
-fn decorrelation(a: &EntryInfo, b: &EntryInfo) -> f64 {
-    let of_set = |(set, shapes): (&String, &Vec<i32>)| {
-        let other = b.shapes.get(set)?;
-        let of_component = |k: usize| {
-            let (a, b) = (centred(shapes, k), centred(other, k));
-            let product = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
-            let r = product(&a, &b) / (product(&a, &a) * product(&b, &b)).sqrt();
-            (1.0 - r).clamp(0.0, 2.0)
-        };
-        Some(of_component(0).min(of_component(1)))
-    };
-    // NaN, which shapes without scatter have, is left out.
-    a.shapes.iter().filter_map(of_set).fold(f64::NAN, f64::min)
-}
-
-// A component relative to its mean.
-fn centred(shapes: &[i32], component: usize) -> Vec<f64> {
-    let own = shapes.iter().skip(component).step_by(2);
-    let own: Vec<f64> = own.map(|e| f64::from(*e)).collect();
-    let mean = own.iter().sum::<f64>() / own.len() as f64;
-    own.iter().map(|e| e - mean).collect()
-}
-
-/// For each of `entries`, which are in order of arrival, the first earlier entry with a common file or equal shapes.
-pub fn near_copies(entries: &[Entry]) -> Vec<NearCopy<'_>> {
-    let mut owners: BTreeMap<&str, usize> = BTreeMap::new();
-    let mut copies = Vec::new();
-    for (own, Entry { info, .. }) in entries.iter().enumerate() {
-        let of_files = info.files.iter().filter_map(|file| owners.get(&**file));
-        let of_shapes = || {
-            let near = |other: &Entry| decorrelation(info, &other.info) < DECORRELATION;
-            entries[..own].iter().position(near)
-        };
-        if let Some(first) = of_files.min().copied().or_else(of_shapes) {
-            let earlier = &entries[first].info;
-            let theirs: BTreeSet<&String> = earlier.files.iter().collect();
-            copies.push(NearCopy {
-                entry: info,
-                earlier,
-                files: info
-                    .files
-                    .iter()
-                    .filter(|file| theirs.contains(file))
-                    .count(),
-                decorrelation: decorrelation(info, earlier),
-            });
-        }
-        for file in &info.files {
-            owners.entry(file).or_insert(own);
-        }
-    }
-    copies
-}
-
 // Fewest digits of an SHA-256 that name an entry.
 const MIN_DIGITS: usize = 8;
 
@@ -430,8 +352,6 @@ pub(crate) mod tests {
                 file: String::new(),
                 sha256: format!("{team}{received}"),
                 content: format!("{team}{received}"),
-                files: Vec::new(),
-                shapes: BTreeMap::new(),
                 contents: Contents::Catalogues,
                 reference: team.starts_with("our"),
             },
@@ -639,31 +559,5 @@ pub(crate) mod tests {
             reasons,
             ["withdrawn: a mistake", "the team has 2 entries already"]
         );
-    }
-
-    #[test]
-    fn another_scale_and_shift_in_each_set_hide_no_copy() {
-        // The second component has a factor of its own.
-        let of = |team: &str, scales: [f64; 2], second: f64, noise: f64| {
-            let mut entry = entry(team, DAY, 1.0, &[1.0]);
-            for (set, scale) in (1..).zip(scales) {
-                let shapes = (0..64).map(|k| {
-                    let value = (f64::from(k * set) * 1.7).sin() + noise * f64::from(k).cos();
-                    let scale = if k % 2 == 1 { second * scale } else { scale };
-                    (1e6 * (scale * value + 0.1 * scale)).round() as i32
-                });
-                entry.info.shapes.insert(set.to_string(), shapes.collect());
-            }
-            entry
-        };
-        let entries = [
-            of("Owner", [1.0, 1.0], 1.0, 0.0),
-            of("Copy", [1.5, 1.01], 1.0, 0.0),
-            of("Scaled", [0.99, 0.99], 0.9, 0.0),
-            of("Other", [1.0, 1.0], 1.0, 0.1),
-        ];
-        let copies = near_copies(&entries);
-        let teams: Vec<&str> = copies.iter().map(|copy| copy.entry.team.as_str()).collect();
-        assert_eq!(teams, ["Copy", "Scaled"]);
     }
 }
