@@ -29,8 +29,7 @@ use crate::entry::{Entry, EntryInfo, Refused};
 use crate::error::{ChallengeError, unscored};
 use crate::inbox::{Content, Sending, content, identify};
 use crate::kind::{ConstantShears, response};
-use crate::seal::{Key, Receipt, verify, verify_public};
-use crate::shapes::References;
+use crate::seal::{Key, Receipt, verify};
 use crate::terms::{Challenge, now};
 
 // A store keeps entries and runs in one format. Only the settings of an entry start with this.
@@ -61,7 +60,6 @@ pub struct Judge {
     pub challenge: Challenge,
     pub key: Key,
     id: String,
-    public: PathBuf,
     grid: Grid,
     truths: BTreeMap<u32, Truth>,
     /// The true shears, if the shear is constant over each set.
@@ -122,7 +120,6 @@ impl Judge {
             challenge,
             key,
             id,
-            public: public.to_owned(),
             grid,
             truths,
             constant,
@@ -206,15 +203,9 @@ impl Judge {
         if candidates.is_empty() {
             return Ok(round);
         }
-        verify_public(&self.public, threads)?;
-        let public = DataFolder::open(&self.public)?;
-        let ids = References::ids(&public, &self.challenge.data.sets)?;
-        let references = References::kept(
-            store, &self.key, &self.id, &public, &ids, self.grid, threads,
-        )?;
         let pool = Pool::new(threads)?;
         // Stored one by one, so that an interrupted command keeps the entries that it scored.
-        for result in pool.in_order(candidates, |candidate| self.judge(candidate, &references)) {
+        for result in pool.in_order(candidates, |candidate| self.judge(candidate)) {
             progress.advance(self.challenge.data.galaxies());
             match result {
                 Ok((run, doubts)) => {
@@ -349,7 +340,6 @@ impl Judge {
     fn judge(
         &self,
         candidate: Candidate,
-        references: &References,
     ) -> Result<(RunRecord, Option<(PathBuf, String)>), Refused> {
         let Candidate {
             sending,
@@ -378,9 +368,7 @@ impl Judge {
             contents: Contents::Catalogues,
             reference,
         };
-        let (sets, doubt) = self
-            .score(&sending, stated, references, &mut info)
-            .map_err(refuse)?;
+        let (sets, doubt) = self.score(&sending, stated, &mut info).map_err(refuse)?;
         for name in [&info.team, &info.method] {
             check_name(name).map_err(|error| refuse(error.to_string()))?;
         }
@@ -404,7 +392,6 @@ impl Judge {
         &self,
         sending: &Sending,
         entry: Option<&Team>,
-        references: &References,
         info: &mut EntryInfo,
     ) -> Result<Scores, String> {
         let rules = &self.challenge.rules;
@@ -421,9 +408,9 @@ impl Judge {
         let submission = Submission::read(&sent).map_err(plain)?;
         info.contents = rules.accept(&submission)?;
         let (mut sets, doubt) = match &submission.packed {
-            Packed::Catalogues(_) => self.catalogues(&sent, sending, references)?,
+            Packed::Catalogues(_) => self.catalogues(&sent, sending)?,
             Packed::Spectra(files) => {
-                self.check(&sent, sending, references, &mut |_| {})?;
+                self.check(&sent, sending, &mut |_| {})?;
                 let (sets, powers) = self
                     .spectra(files, submission.manifest.as_ref())
                     .map_err(|error| plain(sent.named(error)))?;
@@ -458,7 +445,6 @@ impl Judge {
         &self,
         sent: &Sent,
         sending: &Sending,
-        references: &References,
         done: &mut dyn FnMut(CheckedSet<'_>),
     ) -> Result<(), String> {
         let plain = |error: FileError| reason_of(&error.path, &error.message, sending);
@@ -466,7 +452,6 @@ impl Judge {
         let truths = self.truths.iter();
         expected.secret_truth = truths.map(|(set, own)| (*set, own.shear.clone())).collect();
         let mut findings = check_sent(sent, &expected, done);
-        findings.extend(references.findings(sent).map_err(plain)?);
         findings.retain(|finding| finding.severity == Severity::Error);
         let Some(first) = findings.first() else {
             return Ok(());
@@ -479,14 +464,9 @@ impl Judge {
     }
 
     // Checks and scores the catalogues of an entry; also names images that do not follow the shear as the others do.
-    fn catalogues(
-        &self,
-        sent: &Sent,
-        sending: &Sending,
-        references: &References,
-    ) -> Result<Scores, String> {
+    fn catalogues(&self, sent: &Sent, sending: &Sending) -> Result<Scores, String> {
         let (mut sets, mut odd, mut failed) = (Vec::new(), Vec::new(), None);
-        self.check(sent, sending, references, &mut |checked: CheckedSet<'_>| {
+        self.check(sent, sending, &mut |checked: CheckedSet<'_>| {
             let set = checked.set;
             let of_set = checked.odd.iter();
             odd.extend(of_set.map(|image| format!("{image} of set {set}")));

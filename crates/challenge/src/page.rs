@@ -371,7 +371,7 @@ fn rules(challenge: &Challenge) -> Vec<String> {
         rules.metric.label(),
         rules.metric.meaning()
     ));
-    all.push("The shapes of every image must agree with the image, with one scale in all images of a set, and their response to the shear must be at least 3σ from zero.".into());
+    all.push("The response of an entry to the shear must be at least 3σ from zero.".into());
     all.push("Entries whose difference is below its error share a rank.".into());
     all.push("Symbolic links are not accepted.".into());
     if let Some(most) = rules.entries_per_team {

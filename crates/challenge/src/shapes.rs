@@ -4,17 +4,13 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use shearq_dataset::fingerprint::Fingerprint;
 use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::DataFolder;
 use shearq_dataset::run::{Run, Source};
-use shearq_dataset::threads::{Progress, Quiet};
+use shearq_dataset::threads::Progress;
 use shearq_files::FileError;
 use shearq_files::atomic::Scratch;
-use shearq_files::frames::polars::Column;
-use shearq_files::frames::{Metadata, frame};
-use shearq_files::open::is_there;
-use shearq_files::table::{self, FileFormat, most_rows};
+use shearq_files::table::{FileFormat, most_rows};
 use shearq_pipeline::PipelineError;
 use shearq_pipeline::measure::FolderMeasurement;
 use shearq_results::catalogues::read_rows;
@@ -24,8 +20,6 @@ use shearq_results::submit::{Kind, Sent};
 use shearq_scoring::ndarray::Array2;
 use shearq_scoring::{Convention, FieldSum, Grid};
 use shearq_submissions::Registry;
-
-use crate::seal::Key;
 
 const REFERENCE: &str = "48/linear/star";
 // Required difference of two correlations, in standard deviations of chance correlations.
@@ -157,41 +151,6 @@ pub struct References {
 }
 
 impl References {
-    /// The reference measurement of images that do not change, as their fingerprint `print` states. It is kept in `folder`,
-    /// a table per set, because it takes longer than to score an entry.
-    ///
-    /// # Errors
-    /// If a kept table is not the one that was signed with the `key` when the images were measured.
-    pub fn kept(
-        folder: &Path,
-        key: &Key,
-        print: &str,
-        data: &DataFolder,
-        ids: &[ImageId],
-        grid: Grid,
-        threads: usize,
-    ) -> Result<Self, PipelineError> {
-        let mut references = References {
-            grid,
-            images: BTreeMap::new(),
-        };
-        for of_set in ids.chunk_by(|a, b| a.set == b.set) {
-            // Hidden, so that a results store does not take it for a run. Another version may measure other shapes.
-            let (version, set) = (shearq_dataset::VERSION, of_set[0].set);
-            let path = folder.join(format!(".reference-{version}-{print}-set{set:02}.parquet"));
-            let images = match is_there(&path) {
-                true => restored(&path, key, set, &grid)?,
-                false => {
-                    let measured = References::measure(data, of_set, grid, threads, &mut Quiet)?;
-                    write_shapes(&path, key, &measured.images)?;
-                    measured.images
-                }
-            };
-            references.images.extend(images);
-        }
-        Ok(references)
-    }
-
     pub fn measure(
         data: &DataFolder,
         ids: &[ImageId],
@@ -307,66 +266,6 @@ impl References {
 }
 
 type ShapesOfImages = BTreeMap<(u32, u32), Shapes>;
-
-const KEPT_COLUMNS: [&str; 3] = ["image", "e1", "e2"];
-
-// A team whose entry is judged by shapes that somebody edited gains or loses by it, so that their content is signed.
-const SIGNATURE: &str = "signature";
-
-// The signature of the name of the file, which has version, images and set, and of all rows.
-fn signed(path: &Path, key: &Key, columns: [&[f64]; 3]) -> String {
-    let mut sum = Fingerprint::default();
-    for column in columns {
-        let bytes = column
-            .iter()
-            .flat_map(|value| value.to_bits().to_le_bytes());
-        sum.add(bytes.collect::<Vec<u8>>());
-    }
-    let name = path.file_name().unwrap_or_default().to_string_lossy();
-    key.sign("reference", &[&name, &sum.finish()])
-}
-
-// One row per cell, image by image.
-fn write_shapes(path: &Path, key: &Key, images: &ShapesOfImages) -> Result<(), FileError> {
-    let mut columns: [Vec<f64>; 3] = Default::default();
-    for ((_, image), shapes) in images {
-        for [e1, e2] in shapes {
-            let values = [f64::from(*image), f64::from(*e1), f64::from(*e2)];
-            columns.iter_mut().zip(values).for_each(|(c, v)| c.push(v));
-        }
-    }
-    let signature = signed(path, key, columns.each_ref().map(Vec::as_slice));
-    let columns = KEPT_COLUMNS.into_iter().zip(columns);
-    let columns = columns.map(|(name, values)| Column::new(name.into(), values));
-    let table = frame(columns.collect()).map_err(|error| FileError::new(path, error))?;
-    let metadata = Metadata::from([(SIGNATURE.to_owned(), signature)]);
-    table::write(path, FileFormat::Parquet, &table, &metadata)
-}
-
-fn restored(path: &Path, key: &Key, set: u32, grid: &Grid) -> Result<ShapesOfImages, FileError> {
-    let read = table::read(path, Some(&KEPT_COLUMNS), table::MAX_ROWS)?;
-    let [numbers, e1, e2] = KEPT_COLUMNS.map(|name| table::numbers(&read, name, path));
-    let (numbers, e1, e2) = (numbers?, e1?, e2?);
-    let name = SIGNATURE.to_owned();
-    let stated = table::read_metadata(path, FileFormat::Parquet, std::iter::once(&name))?;
-    if stated.get(SIGNATURE) != Some(&signed(path, key, [&numbers, &e1, &e2])) {
-        let message = "the shapes were changed, or measured for another challenge or by another build of this version (found another signature or none, expected that of the private folder). Try: remove the file, and the images are measured again";
-        return Err(FileError::new(path, message));
-    }
-    let cells = grid.cells();
-    let mut images = BTreeMap::new();
-    for (number, (e1, e2)) in numbers
-        .chunks(cells)
-        .zip(e1.chunks(cells).zip(e2.chunks(cells)))
-    {
-        let shapes = e1.iter().zip(e2).map(|(e1, e2)| [*e1 as f32, *e2 as f32]);
-        let shapes = Array2::from_shape_vec((grid.n, grid.n), shapes.collect());
-        let message = "not the shapes of whole images. Try: remove the file";
-        let shapes = shapes.map_err(|_| FileError::new(path, message))?;
-        images.insert((set, number[0] as u32), shapes);
-    }
-    Ok(images)
-}
 
 // What is wrong in a set, each with the numbers of the images.
 fn faults(mut compared: Vec<(u32, Option<Fault>, f64)>) -> Vec<(Fault, Vec<u32>)> {
@@ -524,37 +423,5 @@ mod tests {
         );
         assert_eq!(set(&[distortion(1.9), distortion(1.8)])[0].1, [1, 2]);
         assert_eq!(ranges(&[1, 2, 3, 7, 9, 10]), "1-3,7,9-10");
-    }
-
-    #[test]
-    fn a_kept_measurement_is_read_back_bit_for_bit() {
-        let grid = Grid::new(16, Pixels(48.0), Degrees(10.0)).unwrap();
-        let mut shapes = shapes_of(&field(|a, b| (a, b)));
-        shapes[(3, 4)] = [f32::NAN; 2];
-        let images =
-            ShapesOfImages::from([((7, 1), shapes.clone()), ((7, 3), shapes.t().to_owned())]);
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("kept.parquet");
-        let key = Key::new("pilot", 1, None);
-        write_shapes(&path, &key, &images).unwrap();
-        let bits = |images: ShapesOfImages| -> Vec<_> {
-            let all = images.into_iter();
-            all.map(|(id, shapes)| (id, shapes.mapv(|shape| shape.map(f32::to_bits))))
-                .collect()
-        };
-        assert_eq!(bits(restored(&path, &key, 7, &grid).unwrap()), bits(images));
-        let other = Grid::new(15, Pixels(48.0), Degrees(10.0)).unwrap();
-        assert!(restored(&path, &key, 7, &other).is_err());
-        // Neither an edited table with the old signature nor one of another challenge is used.
-        let refused = |key: &Key| restored(&path, key, 7, &grid).unwrap_err().message;
-        assert!(refused(&Key::new("pilot", 1, None)).contains("another signature"));
-        let metadata =
-            table::read_metadata(&path, FileFormat::Parquet, [SIGNATURE.to_owned()].iter());
-        let mut edited = table::read(&path, None, table::MAX_ROWS).unwrap();
-        let e1 = table::numbers(&edited, "e1", &path).unwrap();
-        let e1: Vec<f64> = e1.iter().map(|e| -e).collect();
-        edited.with_column(Column::new("e1".into(), e1)).unwrap();
-        table::write(&path, FileFormat::Parquet, &edited, &metadata.unwrap()).unwrap();
-        assert!(refused(&key).contains("another signature"));
     }
 }
