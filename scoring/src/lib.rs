@@ -61,7 +61,7 @@ pub use cross::{CrossSpectrum, cross_spectrum};
 pub use diagnosis::{Fault, ImageResponse, Repeated, repeated, sign_by_correlation, sign_by_modes};
 pub use error::ScoringError;
 pub use grid::{Grid, cell_at, centre_of};
-pub use line::{Line, common_slope};
+pub use line::Line;
 pub use metrics::{Metric, Metrics};
 pub use ndarray;
 pub use quality::{Bias, BiasFits, Quality};

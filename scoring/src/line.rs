@@ -90,23 +90,6 @@ impl Line {
     }
 }
 
-/// The slope that several groups of points have in common, and its standard error by the scatter of each group around its
-/// own line.
-///
-/// A group is a line with the point that the common line passes through; by default the means of the group, so that groups
-/// may have different intercepts. Groups of a single x have a slope only with such a point.
-pub fn common_slope(groups: &[(Line, Option<(f64, f64)>)]) -> (f64, f64) {
-    let (mut cross, mut square, mut variance) = (0.0, 0.0, 0.0);
-    for (line, through) in groups {
-        let (x, y) = through.map_or((0.0, 0.0), |(x, y)| (line.mean.0 - x, line.mean.1 - y));
-        let own = line.count * (line.square + x * x);
-        square += own;
-        cross += line.count * (line.cross + x * y);
-        variance += own * line.variance();
-    }
-    (cross / square, variance.sqrt() / square)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -121,17 +104,6 @@ mod tests {
         assert!((line.slope_error() - (residuals / 2.0 / 14.0_f64).sqrt()).abs() < 1e-15);
         assert!((line.correlation() - 13.0 / 14.0).abs() < 1e-15);
         assert!((line.derivatives(6.0)[1] - 3.0 / 14.0).abs() < 1e-15);
-        let (slope, error) = common_slope(&[(line, None)]);
-        assert!((slope - line.slope).abs() < 1e-15 && (error - line.slope_error()).abs() < 1e-15);
-        // Two groups of one x each, through a common point.
-        let groups = [1.0, 2.0].map(|x| {
-            let points = [(x, 2.0 * x - 0.1), (x, 2.0 * x), (x, 2.0 * x + 0.1)];
-            (Line::through(&points), Some((0.0, 0.0)))
-        });
-        let (slope, error) = common_slope(&groups);
-        assert!((slope - 2.0).abs() < 1e-15);
-        // Variances of a point are 0.02/1.
-        assert!((error - (0.02_f64 / 15.0).sqrt()).abs() < 1e-15, "{error}");
     }
 
     #[test]

@@ -20,7 +20,6 @@ use shearq_scoring::{Choice, Convention, Options, RowCounts, ScoredImages, SetSe
 use shearq_simulate::field::ShearSpectrum;
 use shearq_simulate::set::{STAMP, SimulationSettings};
 
-use crate::contradiction::{First, contradiction};
 use crate::error::{ChallengeError, EXPECTED_RESPONSE, unscored};
 use crate::kind::{ConstantShears, Kind, RankBy, response};
 use crate::page::readme;
@@ -284,36 +283,18 @@ impl Plan {
     }
 }
 
-// Scores that entries with the noise of a reference measurement can expect, and the mean Q of zero shear. The noise of the
-// first image of each set is scaled to all images. A true shear of `foreign` images that these contradict is an error.
-fn expected_scores(
+// Scores of a reference measurement of the first image of each set, and the mean Q of zero shear.
+fn first_scores(
     data: &Data,
     public: &DataFolder,
     truths: Vec<(u32, TrueShear)>,
     metric: RankBy,
-    foreign: bool,
     threads: usize,
 ) -> Result<(Vec<SetRecord>, f64), ChallengeError> {
     let grid = data.grid().map_err(unscored)?;
     let first = data.sets.iter().map(|&set| ImageId { set, image: 1 });
     let first: Vec<ImageId> = first.collect();
     let references = References::measure(public, &first, grid, threads, &mut Quiet)?;
-    if foreign {
-        let firsts: Vec<First> = truths
-            .iter()
-            .filter_map(|(set, truth)| {
-                Some(First {
-                    set: *set,
-                    measured: references.of(*set, 1)?,
-                    truth: truth.clone(),
-                })
-            })
-            .collect();
-        if let Some(message) = contradiction(&firsts) {
-            return Err(ChallengeError::Contradiction(message));
-        }
-    }
-    let images = f64::from(data.images);
     let mut scored = Vec::new();
     let mut zero = 0.0;
     for (set, truth) in truths {
@@ -332,25 +313,66 @@ fn expected_scores(
             let examined = session.examine(shapes, RowCounts::default());
             first.add(&examined.map_err(wrong)?).map_err(wrong)?;
         }
-        let ScoredImages {
-            mut score, rows, ..
-        } = first.finish().map_err(wrong)?;
-        // Noise averages down; its power, which dominates Q, by the number of images.
-        score.metrics.q *= images;
-        // What c scatters between constant shears is noise, too.
-        score.metrics.c1 /= images.sqrt();
-        score.metrics.c2 /= images.sqrt();
-        for error in [
-            &mut score.errors.m_cross,
-            &mut score.errors.c1,
-            &mut score.errors.c2,
-        ] {
-            *error /= images.sqrt();
-        }
+        let score = scorer.score(&sum).map_err(wrong)?;
         zero += score.zero_quality().q / data.sets.len() as f64;
         scored.push(SetRecord::new(set, false, vec![1], &score, &rows, true));
     }
     Ok((scored, zero))
+}
+
+// The noise of a first image becomes that of the mean of all images.
+fn average_images(of_first: &mut SetRecord, images: u32) {
+    let images = f64::from(images);
+    let SetRecord {
+        metrics, errors, ..
+    } = of_first;
+    // The power of the noise, which dominates Q, averages down by their number.
+    metrics.q *= images;
+    // What c scatters between constant shears is noise, too.
+    for noise in [
+        &mut metrics.c1,
+        &mut metrics.c2,
+        &mut errors.m_cross,
+        &mut errors.c1,
+        &mut errors.c2,
+    ] {
+        *noise /= images.sqrt();
+    }
+}
+
+// Largest response of a reference measurement to the true shear, or inverse. Its m is a few tenths at most, and a true shear of
+// twice or half the scale has a response of 0.5 or 2; one of another sign, order or set has a response near 0.
+const MAX_RESPONSE: f64 = 1.6;
+// Standard errors by which a response must be out of range. Of the 25 responses of 24 sets, chance reaches this in one of 1,200
+// challenges whose responses are all at the limit, and in none whose responses are near 1.
+const MIN_CONTRADICTION_SIGNIFICANCE: f64 = 4.0;
+
+// A true shear that the images contradict: the organiser would find out when entries arrive.
+fn contradiction(
+    scored: &[SetRecord],
+    constant: Option<&ConstantShears>,
+) -> Result<(), ChallengeError> {
+    // One constant shear has no response.
+    let each = scored.chunks(1).filter(|_| constant.is_none());
+    for sets in std::iter::once(scored).chain(each) {
+        let (response, error) = response(sets, constant);
+        let margin = MIN_CONTRADICTION_SIGNIFICANCE * error;
+        if response + margin < 1.0 / MAX_RESPONSE || response - margin > MAX_RESPONSE {
+            return Err(ChallengeError::Contradiction {
+                of: sets_in_words(sets),
+                response,
+                error,
+            });
+        }
+    }
+    Ok(())
+}
+
+fn sets_in_words(sets: &[SetRecord]) -> String {
+    match sets {
+        [one] => format!("set {}", one.set),
+        _ => "all sets".into(),
+    }
 }
 
 // The metric of a challenge, if entries can be ranked by it.
@@ -388,9 +410,15 @@ fn rankable(
         return Err(ChallengeError::OneImage);
     }
     progress.note("measuring the first images");
-    let (scored, zero) = expected_scores(data, public, truths, metric, foreign, threads)?;
-    let images = f64::from(data.images);
+    let (mut scored, zero) = first_scores(data, public, truths, metric, threads)?;
     let constant = constant.as_ref();
+    if foreign {
+        contradiction(&scored, constant)?;
+    }
+    for of_first in &mut scored {
+        average_images(of_first, data.images);
+    }
+    let images = f64::from(data.images);
     let groups: Vec<&[SetRecord]> = match metric.needs_the_response_of_each_set() {
         true => scored.chunks(1).collect(),
         false => vec![&scored],
@@ -399,13 +427,9 @@ fn rankable(
         // The response itself is one; measured on a single image, it scatters too much.
         let (_, error) = response(sets, constant);
         if error * EXPECTED_RESPONSE > 1.0 || error.is_nan() {
-            let of = match sets {
-                [one] => format!("the response of set {}", one.set),
-                _ => "the response".into(),
-            };
             return Err(ChallengeError::SmallResponse {
                 metric: label,
-                of,
+                of: sets_in_words(sets),
                 found: 1.0 / error,
                 images: (images * (error * EXPECTED_RESPONSE).powi(2)).ceil(),
             });

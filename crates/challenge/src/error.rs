@@ -56,10 +56,16 @@ pub enum ChallengeError {
         "noise is measured between images (found 1 image per set, expected at least 2). Try: --images 8"
     )]
     OneImage,
-    #[error("{0}. Try: the same command with the right true shear")]
-    Contradiction(String),
     #[error(
-        "the data are too small to rank entries by {metric}: {of} is expected to be {found:.1}σ from zero (expected at least {EXPECTED_RESPONSE}). Try: {images} images per set, or more galaxies per image"
+        "the images contradict the true shear of {of}: sign, order, scale, positions or sets differ (found a response of {response:.2} ± {error:.2}, expected 0.6 to 1.6). Try: the same command with the right true shear"
+    )]
+    Contradiction {
+        of: String,
+        response: f64,
+        error: f64,
+    },
+    #[error(
+        "the data are too small to rank entries by {metric}: the response of {of} is expected to be {found:.1}σ from zero (expected at least {EXPECTED_RESPONSE}). Try: {images} images per set, or more galaxies per image"
     )]
     SmallResponse {
         metric: &'static str,

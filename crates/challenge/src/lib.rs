@@ -9,7 +9,6 @@
 //!   leaderboard.
 #![forbid(unsafe_code)]
 
-mod contradiction;
 pub mod create;
 pub mod entry;
 pub mod error;
