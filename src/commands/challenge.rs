@@ -106,7 +106,7 @@ struct NewArguments {
     /// Metric that ranks entries [default: q-calibrated, or qc if each set has one shear].
     ///
     /// Neither default rewards shrunk ellipticities or entries without images. `q` does while noise dominates it, `m`
-    /// can be tuned with two entries, and `c` and `noise` measure one property only.
+    /// can be tuned with two entries, and `c` measures one property only.
     #[arg(long, value_parser = named::<RankBy>())]
     metric: Option<RankBy>,
     /// Accept power spectra, too, with `--metric q` or `q-corrected`.

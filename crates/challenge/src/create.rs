@@ -406,9 +406,6 @@ fn rankable(
     if plan.spectra && data.sets.len() < 2 {
         return Err(ChallengeError::OneSpectrum);
     }
-    if metric == RankBy::Noise && data.images < 2 {
-        return Err(ChallengeError::OneImage);
-    }
     progress.note("measuring the first images");
     let (mut scored, zero) = first_scores(data, public, truths, metric, threads)?;
     let constant = constant.as_ref();

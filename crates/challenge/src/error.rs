@@ -53,10 +53,6 @@ pub enum ChallengeError {
     #[error("{0}")]
     Shears(String),
     #[error(
-        "noise is measured between images (found 1 image per set, expected at least 2). Try: --images 8"
-    )]
-    OneImage,
-    #[error(
         "the images contradict the true shear of {of}: sign, order, scale, positions or sets differ (found a response of {response:.2} ± {error:.2}, expected 0.6 to 1.6). Try: the same command with the right true shear"
     )]
     Contradiction {

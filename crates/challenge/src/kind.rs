@@ -21,7 +21,6 @@ pub enum RankBy {
     /// c, the modulus of the additive bias, divided by the response: otherwise shrunk shapes have less of it.
     C,
     Qc,
-    Noise,
 }
 
 impl RankBy {
@@ -40,7 +39,6 @@ impl RankBy {
             RankBy::M => "|m|",
             RankBy::C => "c",
             RankBy::Qc => "Q_c",
-            RankBy::Noise => "noise",
         }
     }
 
@@ -62,9 +60,6 @@ impl RankBy {
             RankBy::Qc => {
                 "Q_c is GREAT3's quality factor of constant shear, 2464/√(Σ (m/0.002)² + Σ (c/0.0002)² + 4) over both components."
             }
-            RankBy::Noise => {
-                "Noise is the scatter of one galaxy's ellipticity per component, divided by the response."
-            }
         }
     }
 
@@ -79,7 +74,7 @@ impl RankBy {
     pub fn decimals(self) -> usize {
         match self {
             RankBy::Q | RankBy::QCorrected | RankBy::QCalibrated | RankBy::Qc => 1,
-            RankBy::M | RankBy::Noise => 4,
+            RankBy::M => 4,
             RankBy::C => 5,
         }
     }
@@ -93,13 +88,13 @@ impl RankBy {
         match self {
             RankBy::M | RankBy::C => true,
             RankBy::Qc => constant,
-            RankBy::Q | RankBy::QCorrected | RankBy::QCalibrated | RankBy::Noise => !constant,
+            RankBy::Q | RankBy::QCorrected | RankBy::QCalibrated => !constant,
         }
     }
 
     /// Whether the metric is unknown for a set without a measurable response, not only for all sets together.
     pub fn needs_the_response_of_each_set(self) -> bool {
-        matches!(self, RankBy::QCalibrated | RankBy::Noise)
+        self == RankBy::QCalibrated
     }
 
     /// Value and standard error over all sets. `constant` has the true shears of sets with one shear each.
@@ -127,7 +122,6 @@ impl RankBy {
                 (modulus / response, error / response)
             }
             RankBy::Qc => constant.map_or((f64::NAN, f64::NAN), |shears| shears.q_c(sets)),
-            RankBy::Noise => mean(|metrics| metrics.galaxy_noise),
         }
     }
 
@@ -138,7 +132,7 @@ impl RankBy {
             RankBy::Q | RankBy::QCorrected => q,
             RankBy::M => 1.0,
             RankBy::Qc => Observation::Ground.q_c([[0.0, -1.0]; 2]),
-            RankBy::QCalibrated | RankBy::C | RankBy::Noise => f64::NAN,
+            RankBy::QCalibrated | RankBy::C => f64::NAN,
         }
     }
 
@@ -146,7 +140,7 @@ impl RankBy {
         match self {
             RankBy::Q | RankBy::QCorrected => Some(Paired::Q),
             RankBy::QCalibrated => Some(Paired::Calibrated),
-            RankBy::M | RankBy::C | RankBy::Qc | RankBy::Noise => None,
+            RankBy::M | RankBy::C | RankBy::Qc => None,
         }
     }
 }

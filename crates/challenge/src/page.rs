@@ -41,7 +41,6 @@ fn key(metric: RankBy) -> (&'static str, &'static str) {
         RankBy::M => ("m", "m_error"),
         RankBy::C => ("c", "c_error"),
         RankBy::Qc => ("qc", "qc_error"),
-        RankBy::Noise => ("noise", "noise_error"),
     }
 }
 
