@@ -13,8 +13,11 @@ use shearq_dataset::fingerprint;
 use shearq_dataset::run::{Run, open_data};
 use shearq_dataset::threads::{ALL_CORES, Pool};
 use shearq_results::catalogues::Catalogues;
+use shearq_results::published::{BranchCatalogues, Presubmitting, PublicBranch, PublicChallenge};
+use shearq_results::submit::archive::is_tar_gz;
 use shearq_results::submit::pack::Packing;
-use shearq_results::submit::{Contents, Entry, is_archive};
+use shearq_results::submit::{Contents, Entry};
+use shearq_scoring::great3::{GRID, SUBFIELDS};
 
 // Longest name of a method in bytes: a tar header has 100 for a file name.
 const MAX_METHOD_BYTES: usize = 64;
@@ -160,7 +163,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let entry = arguments.entry.entry()?;
     let ending = out.extension().unwrap_or_default().to_string_lossy();
     anyhow::ensure!(
-        is_archive(out) || !ARCHIVES.contains(&ending.as_ref()),
+        is_tar_gz(out) || !ARCHIVES.contains(&ending.as_ref()),
         "--out {}: unsupported archive (found .{ending}, expected a folder, .tar.gz or .tgz)",
         out.display()
     );

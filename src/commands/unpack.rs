@@ -3,7 +3,8 @@ use std::path::PathBuf;
 use clap::Args;
 
 use crate::{count, tell};
-use shearq_results::submit::{MANIFEST_FILE, read_archive, unpack};
+use shearq_results::submit::MANIFEST_FILE;
+use shearq_results::submit::archive::{read_archive, unpack};
 
 /// Unpack an archive that `pack` wrote, and verify its files.
 ///
@@ -26,7 +27,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let unpacked = match &arguments.out {
         Some(out) => unpack(archive, out, verify)?,
         None => {
-            let read = read_archive(archive, None)?;
+            let read = read_archive(archive, None, None)?;
             read.verify(archive, verify)?;
             read
         }

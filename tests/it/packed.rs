@@ -68,7 +68,7 @@ fn changed_archives_are_refused_and_leave_nothing() {
     let (first, bytes) = files[0];
     let mut changed = bytes.to_vec();
     changed[20] ^= 1;
-    let plain = "expected plain files without folders";
+    let plain = "expected plain files, all in one folder or in none";
     for (name, content, expected) in [
         (first, &changed[..], "the file was changed (found SHA-256"),
         (first, &bytes[..bytes.len() - 1], "the file was changed"),

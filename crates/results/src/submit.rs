@@ -6,28 +6,27 @@
 //!
 //! [`pack`] writes submissions and [`check`] looks for their faults.
 
+pub mod archive;
 pub mod check;
 pub mod pack;
 
 use std::collections::BTreeMap;
-use std::fs::File;
-use std::io::{BufReader, Read, Write};
+use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
 
-use flate2::bufread::GzDecoder;
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize};
 use sha2::{Digest, Sha256};
 use shearq_dataset::fingerprint::hex;
 use shearq_dataset::layout::{DataFolder, MAX_IMAGE, MAX_SET, check_folder};
 use shearq_dataset::run::{Run, read_record, relative_path};
-use shearq_files::atomic::{PartFolder, Scratch};
+use shearq_files::atomic::Scratch;
 use shearq_files::open::{is_there, open};
 use shearq_files::{FileError, table};
 use shearq_scoring::{Bins, Definition, Grid, SCORED, SpectrumCovariance};
 use shearq_submissions::{check_name, checked_name};
-use tar::Archive;
 
+use archive::{is_archive, read_archive};
 use shearq_catalogue::foreign::Foreign;
 
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -305,191 +304,6 @@ impl Manifest {
     }
 }
 
-// Largest accepted manifest in bytes: about 200 per file, with room for covariances.
-const MAX_MANIFEST_BYTES: u64 = 1 << 26;
-
-// Largest accepted compression ratio beyond the first [`FREE_BYTES`] bytes. ASCII numbers reach 3, blank catalogues
-// about 100.
-const MAX_RATIO: u64 = 300;
-// Unpacked bytes that any archive may have.
-const FREE_BYTES: u64 = 1 << 24;
-// Bytes counted per file in addition to its content, about its cost on disk.
-const BYTES_PER_FILE: u64 = 1 << 12;
-// Most files, including the manifest: more than 8,000 images in each of 24 sets.
-pub const MAX_FILES: u64 = 200_000;
-
-pub fn is_archive(path: &Path) -> bool {
-    let name = path.to_string_lossy();
-    name.ends_with(".tar.gz") || name.ends_with(".tgz")
-}
-
-/// The manifest of an archive, and the checksums of its other files.
-#[derive(Debug, Clone, Default)]
-pub struct Unpacked {
-    pub manifest: Option<Manifest>,
-    pub files: BTreeMap<String, FileSum>,
-}
-
-impl Unpacked {
-    /// Compares the files with the manifest, which must exist if it is `required`.
-    pub fn verify(&self, archive: &Path, required: bool) -> Result<(), FileError> {
-        match &self.manifest {
-            Some(manifest) => manifest.verify(&self.files, archive),
-            None if required => {
-                let message =
-                    format!("cannot verify the files, because there is no {MANIFEST_FILE}");
-                Err(FileError::new(archive, message))
-            }
-            None => Ok(()),
-        }
-    }
-}
-
-/// Unpacks the archive at `path` into the new folder `out`. After an error no folder remains. The manifest must exist if
-/// it is `required`.
-pub fn unpack(path: &Path, out: &Path, required: bool) -> Result<Unpacked, FileError> {
-    let part = PartFolder::new(out)?;
-    let unpacked = read_archive(path, Some(part.path()))?;
-    unpacked.verify(path, required)?;
-    part.finish()?;
-    Ok(unpacked)
-}
-
-/// Reads a whole archive and writes its files to the folder `into`, if given.
-pub fn read_archive(path: &Path, into: Option<&Path>) -> Result<Unpacked, FileError> {
-    let cannot_read = || FileError::doing::<std::io::Error>(path, "cannot read the archive");
-    let file = open(path).map_err(cannot_read())?;
-    let most = FREE_BYTES + MAX_RATIO * file.metadata().map_err(cannot_read())?.len();
-    let mut files = 0;
-    let mut archive = Archive::new(Bounded {
-        decoder: GzDecoder::new(BufReader::new(file)),
-        read: 0,
-        most,
-    });
-    let mut unpacked = Unpacked::default();
-    // Raw: extensions of tar, such as names of any length, are entries that are not plain files.
-    for entry in archive.entries().map_err(cannot_read())?.raw(true) {
-        let mut entry = entry.map_err(cannot_read())?;
-        // Python's tarfile writes PAX headers for times and long names. Names and sizes here are those of the plain headers.
-        let kind = entry.header().entry_type();
-        if kind.is_pax_global_extensions() || kind.is_pax_local_extensions() {
-            continue;
-        }
-        let name = String::from_utf8_lossy(&entry.path_bytes()).into_owned();
-        // `tar czf … -C folder .` starts with the folder itself.
-        if name == "./" && entry.header().entry_type().is_dir() {
-            continue;
-        }
-        let name = match name.strip_prefix("./") {
-            Some(rest) if is_plain_name(rest) => rest.to_owned(),
-            _ => name,
-        };
-        if !entry.header().entry_type().is_file() || !is_plain_name(&name) {
-            let message = format!(
-                "unsupported member (found `{name}`, expected plain files without folders)"
-            );
-            return Err(FileError::new(path, message));
-        }
-        let is_manifest = name == MANIFEST_FILE;
-        if unpacked.files.contains_key(&name) || (is_manifest && unpacked.manifest.is_some()) {
-            let message = format!("the archive contains `{name}` twice");
-            return Err(FileError::new(path, message));
-        }
-        files += 1;
-        if files > MAX_FILES.min(most / BYTES_PER_FILE) {
-            let message = format!("too many files (found more than {})", files - 1);
-            return Err(FileError::new(path, message));
-        }
-        let mut bytes = Vec::new();
-        let mut target: Box<dyn Write> = match into {
-            _ if is_manifest => Box::new(&mut bytes),
-            None => Box::new(std::io::sink()),
-            Some(folder) => {
-                let target = folder.join(&name);
-                Box::new(
-                    File::create_new(&target).map_err(FileError::doing(&target, "cannot write"))?,
-                )
-            }
-        };
-        if is_manifest && entry.size() > MAX_MANIFEST_BYTES {
-            let message = format!(
-                "{MANIFEST_FILE} is too large (found {} bytes, expected at most {MAX_MANIFEST_BYTES})",
-                entry.size()
-            );
-            return Err(FileError::new(path, message));
-        }
-        let sum = FileSum::copying(&mut entry, &mut target)
-            .map_err(|error| FileError::new(path, format!("cannot unpack `{name}`: {error}")))?;
-        drop(target);
-        if !is_manifest {
-            unpacked.files.insert(name, sum);
-            continue;
-        }
-        let manifest: Manifest = serde_json::from_slice(&bytes).map_err(|error| {
-            FileError::new(
-                path,
-                format!("{MANIFEST_FILE} is not the manifest of a submission: {error}"),
-            )
-        })?;
-        unpacked.manifest = Some(manifest);
-        if let Some(folder) = into {
-            std::fs::write(folder.join(MANIFEST_FILE), &bytes)
-                .map_err(FileError::doing(folder, "cannot write the manifest"))?;
-        }
-    }
-    check_end(archive.into_inner()).map_err(cannot_read())?;
-    Ok(unpacked)
-}
-
-struct Bounded {
-    decoder: GzDecoder<BufReader<File>>,
-    read: u64,
-    most: u64,
-}
-
-impl Read for Bounded {
-    fn read(&mut self, buffer: &mut [u8]) -> std::io::Result<usize> {
-        let found = self.decoder.read(buffer)?;
-        self.read += found as u64;
-        if self.read > self.most {
-            let most = self.most;
-            let message = format!("it unpacks to more than {most} bytes");
-            return Err(std::io::Error::new(
-                std::io::ErrorKind::FileTooLarge,
-                message,
-            ));
-        }
-        Ok(found)
-    }
-}
-
-// Checks that only blank blocks and the checksum of gzip follow the last file.
-fn check_end(mut archive: Bounded) -> std::io::Result<()> {
-    let wrong = |what| Err(std::io::Error::new(std::io::ErrorKind::InvalidData, what));
-    // No checksum covers what follows the last file, so it could carry anything.
-    let mut buffer = [0; 4096];
-    loop {
-        let read = archive.read(&mut buffer)?;
-        if read == 0 {
-            break;
-        }
-        if buffer[..read].iter().any(|byte| *byte != 0) {
-            return wrong("found data after the end");
-        }
-    }
-    if archive.decoder.into_inner().read(&mut buffer)? > 0 {
-        return wrong("found data after the end");
-    }
-    Ok(())
-}
-
-fn is_plain_name(name: &str) -> bool {
-    // A name with a separator could leave the folder that it is unpacked to.
-    !name.is_empty()
-        && !name.starts_with('.')
-        && !name.contains(|c: char| "/\\:".contains(c) || c.is_control())
-}
-
 /// A given folder or file, or the temporary folder of an unpacked archive.
 #[derive(Debug)]
 pub struct Sent {
@@ -499,22 +313,30 @@ pub struct Sent {
 }
 
 impl Sent {
-    /// Opens a submission, and unpacks it if it has the ending of an archive.
+    /// Opens a submission, and unpacks it if it has the name of an archive.
     pub fn open(given: &Path) -> Result<Self, FileError> {
-        // A folder or file is read in place.
-        let given = given.to_owned();
-        if !is_archive(&given) {
-            return Ok(Sent {
-                path: given.clone(),
-                given,
-                _unpacked: None,
-            });
+        match is_archive(given) && !given.is_dir() {
+            true => Sent::unpacked(given, None),
+            false => Ok(Sent::in_place(given)),
         }
+    }
+
+    /// A folder or a file that is read where it is.
+    pub fn in_place(given: &Path) -> Self {
+        Sent {
+            path: given.to_owned(),
+            given: given.to_owned(),
+            _unpacked: None,
+        }
+    }
+
+    /// Unpacks an archive of any name, to `most` bytes ([`read_archive`]).
+    pub fn unpacked(given: &Path, most: Option<u64>) -> Result<Self, FileError> {
         let folder = Scratch::new()?;
-        read_archive(&given, Some(folder.path()))?;
+        read_archive(given, Some(folder.path()), most)?;
         Ok(Sent {
             path: folder.path().to_owned(),
-            given,
+            given: given.to_owned(),
             _unpacked: Some(folder),
         })
     }

@@ -13,8 +13,9 @@ use shearq_scoring::{
     SetSession, SpectrumCovariance, cross_spectrum, measured_bandpowers,
 };
 
-use super::{Contents, Entry, FileSum, Kind, MANIFEST_FILE, MAX_FILES, Manifest, is_archive};
-use crate::catalogues::{Catalogues, OWN};
+use super::archive::{MAX_FILES, is_tar_gz};
+use super::{Contents, Entry, FileSum, Kind, MANIFEST_FILE, Manifest};
+use crate::catalogues::Catalogues;
 use shearq_catalogue::foreign::Foreign;
 use shearq_dataset::layout::DataFolder;
 use shearq_dataset::run::record_text;
@@ -250,7 +251,7 @@ enum Destination {
 
 impl Destination {
     fn create(out: &Path) -> Result<Self, FileError> {
-        if is_archive(out) {
+        if is_tar_gz(out) {
             let archive = Box::new(ArchiveWriter::create(out)?);
             return Ok(Destination::Archive(archive));
         }
@@ -344,7 +345,7 @@ fn cannot_write(path: &Path) -> impl FnOnce(std::io::Error) -> FileError {
 mod tests {
     use std::io::Read;
 
-    use super::super::read_archive;
+    use super::super::archive::read_archive;
     use super::*;
 
     #[test]
@@ -370,7 +371,7 @@ mod tests {
         let zeros = std::io::repeat(0).take(after);
         std::io::copy(&mut { zeros }, writer.builder.get_mut()).unwrap();
         writer.finish().unwrap();
-        read_archive(&path, None)
+        read_archive(&path, None, None)
             .err()
             .map_or_else(String::new, |e| e.message)
     }
@@ -406,7 +407,7 @@ mod tests {
         }
         writer.add("a", b"x").unwrap();
         writer.finish().unwrap();
-        let files = read_archive(&path, None).unwrap().files;
+        let files = read_archive(&path, None, None).unwrap().files;
         let names: Vec<&String> = files.keys().collect();
         assert_eq!(names, ["a"]);
     }
