@@ -2,20 +2,21 @@ use std::path::PathBuf;
 
 use clap::{ArgGroup, Args, Subcommand};
 use shearq_challenge::create::{Folders, Plan, Simulation, of_images, simulated};
+use shearq_challenge::entry::Entry;
 use shearq_challenge::inbox;
-use shearq_challenge::judge::Judge;
+use shearq_challenge::judge::{Arrivals, Judge};
 use shearq_challenge::kind::{ENTRIES_PER_TEAM, Kind, RankBy};
 use shearq_challenge::page::View;
-use shearq_challenge::ranking::{Decisions, rank as ranked};
+use shearq_challenge::ranking::{Board, Decisions, rank as ranked};
 use shearq_challenge::seal::{BOARD_FILE, is_open_to_others, verify_public};
 use shearq_challenge::shapes::References;
-use shearq_challenge::terms::{Challenge, Deadline, TUNING_ENTRIES};
+use shearq_challenge::terms::{Challenge, Deadline, TUNING_ENTRIES, now};
 use shearq_dataset::layout::{DataFolder, MAX_IMAGE};
 use shearq_files::FileError;
 use shearq_files::open::is_there;
 use shearq_render::escape::line;
+use shearq_results::submit::Submission;
 use shearq_results::submit::check::{Finding, Severity, check_sent};
-use shearq_results::submit::{Sent, Submission};
 
 use super::check::report;
 use crate::arguments::{Form, SetList, Threads, named, page};
@@ -198,16 +199,25 @@ struct RankArguments {
     /// Write the leaderboard to this HTML file, and as CSV and JSON with the same name.
     #[arg(long, value_name = "FILE", value_parser = page)]
     report: Option<PathBuf>,
-    /// Decimals of published metrics. More decimals reveal more of the true shear [default: as the metric].
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(0..=12))]
-    digits: Option<u8>,
-    /// Also publish the metric of each set.
+    /// Make table, page and messages for you alone: with all metrics, those of single sets, and what the comparison with the true
+    /// shear showed. Only you can read the files.
     #[arg(long)]
     detail: bool,
+    /// When entries without a receipt arrived: a day in UTC, a moment with its zone, or `files` for the time of each file
+    /// [default: when `rank` first scores them].
+    #[arg(long, value_name = "TIME", value_parser = arrivals)]
+    received: Option<Arrivals>,
     #[command(flatten)]
     form: Form,
     #[command(flatten)]
     threads: Threads,
+}
+
+fn arrivals(text: &str) -> Result<Arrivals, String> {
+    match text {
+        "files" => Ok(Arrivals::OfFiles),
+        time => time.parse::<Deadline>().map(|time| Arrivals::At(time.last)),
+    }
 }
 
 fn name(text: &str) -> Result<String, String> {
@@ -314,7 +324,7 @@ fn check_entry(arguments: &CheckArguments) -> anyhow::Result<()> {
     if is_there(entry) {
         inbox::refuse_links(entry)?;
     }
-    let sent = match Sent::open(entry) {
+    let sent = match challenge.open(entry) {
         Ok(sent) => sent,
         Err(error) => return report(&[Finding::unreadable(error)], entry, *json),
     };
@@ -376,14 +386,17 @@ fn rank(arguments: &RankArguments) -> anyhow::Result<()> {
             arguments.truth.display()
         ));
     }
-    let mut sendings = Vec::new();
+    let (mut sendings, mut remarks) = (Vec::new(), Vec::new());
     for (paths, reference) in [(&arguments.inbox, false), (&arguments.reference, true)] {
         let found = inbox::find(paths)?;
-        sendings.extend(found.into_iter().map(|sending| (sending, reference)));
+        sendings.extend(found.sendings.into_iter().map(|own| (own, reference)));
+        remarks.extend(found.remarks);
     }
     let galaxies = judge.challenge.data.galaxies() * sendings.len() as u64;
     let mut bar = Bar::new("scoring", galaxies);
-    let round = judge.round(&sendings, &arguments.store, threads, &mut bar)?;
+    let arrivals = arguments.received.unwrap_or(Arrivals::Now);
+    let round = judge.round(&sendings, arrivals, &arguments.store, threads, &mut bar)?;
+    remarks.extend(round.remarks);
     drop(bar);
     let mut entries = match arguments.store.is_dir() {
         true => judge.entries(&arguments.store)?,
@@ -394,10 +407,8 @@ fn rank(arguments: &RankArguments) -> anyhow::Result<()> {
     decisions
         .apply(&mut entries, &judge.key)
         .map_err(|message| FileError::new(path, message))?;
-    let digits = arguments
-        .digits
-        .map_or(rules.metric.decimals(), usize::from);
-    let board = ranked(&entries, &judge.challenge, judge.constant.as_ref(), digits);
+    let noise = judge.key.noise.unwrap_or_default();
+    let board = ranked(&entries, &judge.challenge, judge.constant.as_ref(), &noise);
     let view = View {
         challenge: &judge.challenge,
         board: &board,
@@ -408,7 +419,8 @@ fn rank(arguments: &RankArguments) -> anyhow::Result<()> {
         },
         zero_shear: judge.zero_shear(),
         constant: judge.constant.as_ref(),
-        digits,
+        noise: &noise,
+        open: rules.is_open(now()),
         detail: arguments.detail,
     };
     // The table first: warnings are for the organiser, and must not delay or replace the board.
@@ -420,9 +432,9 @@ fn rank(arguments: &RankArguments) -> anyhow::Result<()> {
             refused.reason
         ));
     }
-    for (path, doubt) in &round.doubtful {
+    for (path, remark) in &remarks {
         let path = line(&path.to_string_lossy());
-        tell(format_args!("warning: {path}: {doubt}"));
+        tell(format_args!("warning: {path}: {remark}"));
     }
     for (info, reason) in &board.excluded {
         tell(format_args!(
@@ -430,11 +442,29 @@ fn rank(arguments: &RankArguments) -> anyhow::Result<()> {
             info.team, info.received
         ));
     }
+    let with_findings = entries
+        .iter()
+        .filter(|entry| !entry.info.findings.is_empty());
+    for Entry { info, .. } in with_findings.filter(|_| arguments.detail) {
+        let findings = info.findings.join("; ");
+        tell(format_args!("{} of {}: {findings}", info.file, info.team));
+    }
+    let late = board.of(Board::Late).flat_map(|standing| &standing.entries);
+    let unsigned = late.filter(|entry| !entry.info().receipt).count();
+    if unsigned > 0 {
+        tell(format_args!(
+            "warning: {} late, because without a receipt entries arrive when `rank` first scores them. Try: --received files, or --received TIME",
+            match unsigned {
+                1 => "1 entry is".to_owned(),
+                _ => format!("{unsigned} entries are"),
+            }
+        ));
+    }
     tell(format_args!(
         "entries: {} scored, {} scored earlier, {} not scored",
         round.scored,
         round.known,
-        round.refused.len()
+        round.refused.len() + round.unscored
     ));
     if let Some(path) = &arguments.report {
         view.save(path)?;

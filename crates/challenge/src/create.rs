@@ -21,7 +21,7 @@ use shearq_simulate::field::ShearSpectrum;
 use shearq_simulate::set::{STAMP, SimulationSettings};
 
 use crate::error::{ChallengeError, EXPECTED_RESPONSE, unscored};
-use crate::kind::{ConstantShears, Kind, RankBy, response};
+use crate::kind::{ConstantShears, Kind, Noise, RankBy, additive_bias, response};
 use crate::page::readme;
 use crate::seal::{Key, close, names, seal_public, sums};
 use crate::shapes::References;
@@ -198,10 +198,10 @@ pub fn simulated(
     // One image of each set shows whether entries can be ranked, before hours of simulation.
     let first = images::of_simulation(&data.sets, 1);
     simulate_blind(&record, &first, &public, &private, threads, progress)?;
-    let metric = rankable(plan, &data, &public, &private, false, threads, progress)?;
+    let rankable = rankable(plan, &data, &public, &private, false, threads, progress)?;
     let ids = images::of_simulation(&data.sets, data.images);
     simulate_blind(&record, &ids, &public, &private, threads, progress)?;
-    finish(plan, metric, data, folders, key, threads)
+    finish(plan, rankable, data, folders, key, threads)
 }
 
 /// Writes a challenge of the images in `data`, which another program made. New headers are written, because the old headers
@@ -252,7 +252,7 @@ pub fn of_images(
         write_truth(&private.truth(set), &grid, &shear)?;
         copy_image(data, &public, ImageId { set, image: 1 }, &about)?;
     }
-    let metric = rankable(plan, &about, &public, &private, true, threads, progress)?;
+    let rankable = rankable(plan, &about, &public, &private, true, threads, progress)?;
     for &set in &about.sets {
         for image in 1..=about.images {
             if image > 1 {
@@ -261,7 +261,7 @@ pub fn of_images(
             progress.advance((about.grid * about.grid) as u64);
         }
     }
-    finish(plan, metric, about, folders, key, threads)
+    finish(plan, rankable, about, folders, key, threads)
 }
 
 impl Plan {
@@ -375,7 +375,7 @@ fn sets_in_words(sets: &[SetRecord]) -> String {
     }
 }
 
-// The metric of a challenge, if entries can be ranked by it.
+// The metric of a challenge and the errors of a measurement with the noise of the images, if entries can be ranked by it.
 fn rankable(
     plan: &Plan,
     data: &Data,
@@ -384,7 +384,7 @@ fn rankable(
     foreign: bool,
     threads: usize,
     progress: &mut dyn Progress,
-) -> Result<RankBy, ChallengeError> {
+) -> Result<(RankBy, Noise), ChallengeError> {
     let grid = data.grid().map_err(unscored)?;
     let truths = data.sets.iter().map(|&set| {
         let truth = private.read_truth(set, &grid)?;
@@ -416,6 +416,10 @@ fn rankable(
         average_images(of_first, data.images);
     }
     let images = f64::from(data.images);
+    let noise = Noise {
+        response: response(&scored, constant).1,
+        c: additive_bias(&scored, constant).1,
+    };
     let groups: Vec<&[SetRecord]> = match metric.needs_the_response_of_each_set() {
         true => scored.chunks(1).collect(),
         false => vec![&scored],
@@ -444,7 +448,7 @@ fn rankable(
             });
         }
     }
-    Ok(metric)
+    Ok((metric, noise))
 }
 
 // Sets, images and grid of a data folder, which must be the same for all sets.
@@ -543,7 +547,7 @@ fn copy_pixels(
 // Writes description, layout and page for participants, and seals the public folder.
 fn finish(
     plan: &Plan,
-    metric: RankBy,
+    (metric, noise): (RankBy, Noise),
     data: Data,
     folders: Folders<'_>,
     mut key: Key,
@@ -571,6 +575,7 @@ fn finish(
     };
     let Folders { public, private } = folders;
     atomic::write(private.join(LAYOUT_FILE), layout.as_bytes())?;
+    key.noise = Some(noise);
     key.files = sums(private, names(private)?, threads)?;
     challenge.seal = key.seal();
     atomic::write(public.join(LAYOUT_FILE), layout.as_bytes())?;

@@ -1,4 +1,4 @@
-//! What a challenge knows of an entry.
+//! What a challenge knows of an entry and of its team.
 
 use std::path::PathBuf;
 
@@ -6,8 +6,10 @@ use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
 use shearq_results::record::SetRecord;
 use shearq_results::submit::Contents;
+use unicode_normalization::UnicodeNormalization;
 
-/// What identifies a scored entry. The store keeps it with its scores, so the names are part of the format.
+/// What identifies an entry that was compared with the true shear. The store keeps it with its scores, so the names are
+/// part of the format.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct EntryInfo {
     pub challenge: String,
@@ -17,7 +19,7 @@ pub struct EntryInfo {
     pub title: String,
     /// Address for questions; may be empty. The leaderboard does not show it.
     pub contact: String,
-    /// Time of arrival: of the receipt, or of the first `rank` that scored the entry.
+    /// Time of arrival: of the receipt, as the organiser stated it, or of the first `rank` that scored the entry.
     pub received: Timestamp,
     pub receipt: bool,
     pub file: String,
@@ -25,7 +27,14 @@ pub struct EntryInfo {
     /// SHA-256 of sets, images and files.
     pub content: String,
     pub contents: Contents,
+    /// The configuration of shearq by which it was measured, as its manifest states.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub configuration: Option<String>,
     pub reference: bool,
+    /// Whether the comparison with the true shear gave a score. It counts as an entry in any case.
+    pub scored: bool,
+    /// What the comparison showed besides the score. It depends on the truth, so it is for the organiser alone.
+    pub findings: Vec<String>,
 }
 
 impl EntryInfo {
@@ -43,9 +52,51 @@ pub struct Entry {
     pub withdrawn: Option<String>,
 }
 
+/// An entry that was not compared with the true shear.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Refused {
     pub path: PathBuf,
     pub team: String,
     pub reason: String,
+}
+
+/// What the spellings of a team's name have in common: compatible characters (NFKC), without case, blanks and characters
+/// that nobody sees.
+pub fn team_key(name: &str) -> String {
+    name.nfkc()
+        .filter(|c| !c.is_whitespace() && !is_invisible(*c))
+        .flat_map(char::to_uppercase)
+        .flat_map(char::to_lowercase)
+        .nfkc()
+        .collect()
+}
+
+// Unicode's Default_Ignorable_Code_Point, control characters, and the blank of Braille.
+fn is_invisible(c: char) -> bool {
+    c.is_control()
+        || matches!(u32::from(c),
+            0xAD | 0x34F | 0x61C | 0x115F..=0x1160 | 0x17B4..=0x17B5 | 0x180B..=0x180F
+            | 0x200B..=0x200F | 0x202A..=0x202E | 0x2060..=0x206F | 0x2800 | 0x3164
+            | 0xFE00..=0xFE0F | 0xFEFF | 0xFFA0 | 0xFFF0..=0xFFF8 | 0x1BCA0..=0x1BCA3
+            | 0x1D173..=0x1D17A | 0xE0000..=0xE0FFF)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn spellings_of_one_name_are_one_team() {
+        for name in [
+            "Shear Team",
+            "shear  team ",
+            "ＳＨＥＡＲ\u{a0}team",
+            "She\u{200b}ar T\u{ad}eam",
+        ] {
+            assert_eq!(team_key(name), "shearteam", "{name:?}");
+        }
+        assert_eq!(team_key("STRASSE é"), team_key("Straße e\u{301}"));
+        assert_ne!(team_key("Team 1"), team_key("Team 2"));
+        assert_eq!(team_key("\u{200b} \u{2800}"), "");
+    }
 }

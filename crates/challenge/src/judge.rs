@@ -1,7 +1,7 @@
 //! Checks entries, scores them against the true shear, and keeps them in a results store.
 
-use std::collections::BTreeMap;
 use std::collections::btree_map::Entry as Slot;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use jiff::Timestamp;
@@ -25,12 +25,12 @@ use shearq_scoring::{
 };
 use shearq_submissions::check_name;
 
-use crate::entry::{Entry, EntryInfo, Refused};
+use crate::entry::{Entry, EntryInfo, Refused, team_key};
 use crate::error::{ChallengeError, unscored};
-use crate::inbox::{Content, Sending, content, identify};
+use crate::inbox::{Content, Sending, content, identify, modified};
 use crate::kind::{ConstantShears, response};
-use crate::seal::{Key, Receipt, verify};
-use crate::terms::{Challenge, now};
+use crate::seal::{Key, Receipt, close, verify};
+use crate::terms::{Challenge, Deadline, now};
 
 // A store keeps entries and runs in one format. Only the settings of an entry start with this.
 const ENTRY_SETTINGS_PREFIX: &str = "[entry]\n";
@@ -40,13 +40,24 @@ struct Stored {
     entry: EntryInfo,
 }
 
+/// When entries without a receipt arrived.
+#[derive(Debug, Clone, Copy)]
+pub enum Arrivals {
+    /// At the first `rank` that scores them.
+    Now,
+    At(Timestamp),
+    /// When their files were changed last.
+    OfFiles,
+}
+
 #[derive(Debug, Default)]
 pub struct Round {
     pub scored: usize,
+    /// Entries that were compared with the true shear and have no score.
+    pub unscored: usize,
     pub known: usize,
     pub refused: Vec<Refused>,
-    /// Scored entries with a probable fault, and the fault.
-    pub doubtful: Vec<(PathBuf, String)>,
+    pub remarks: Vec<(PathBuf, String)>,
 }
 
 struct Truth {
@@ -87,8 +98,13 @@ struct Candidate {
     content: Content,
 }
 
-// The records of the sets of an entry, and a probable fault.
-type Scores = (Vec<SetRecord>, Option<String>);
+// What the comparison of an entry with the true shear gives.
+#[derive(Default)]
+struct Verdict {
+    sets: Vec<SetRecord>,
+    scored: bool,
+    findings: Vec<String>,
+}
 
 impl Judge {
     pub fn open(public: &Path, private: &Path, threads: usize) -> Result<Self, ChallengeError> {
@@ -140,12 +156,6 @@ impl Judge {
         Some(sum / self.truths.len() as f64)
     }
 
-    // An entry may be sent before the challenge accepts entries, and then again: of two arrivals the one that sorts first
-    // counts, and arrivals that are too early sort last.
-    fn order(&self, received: Timestamp) -> (bool, Timestamp) {
-        (self.challenge.rules.is_early(received), received)
-    }
-
     /// The entries of this challenge in a store, in order of their arrival.
     pub fn entries(&self, store: &Path) -> Result<Vec<Entry>, FileError> {
         let mut entries: BTreeMap<(String, String), Entry> = BTreeMap::new();
@@ -172,10 +182,9 @@ impl Judge {
             };
             // Two processes may score one entry at the same time, and a receipt may be found later. Teams that sent the same
             // archive have an entry each.
-            match entries.entry((entry.info.sha256.clone(), entry.info.team.clone())) {
+            match entries.entry((entry.info.sha256.clone(), team_key(&entry.info.team))) {
                 Slot::Occupied(mut slot) => {
-                    let earlier = self.order(slot.get().info.received);
-                    if self.order(entry.info.received) < earlier {
+                    if entry.info.received < slot.get().info.received {
                         slot.insert(entry);
                     }
                 }
@@ -184,6 +193,12 @@ impl Judge {
         }
         let mut entries: Vec<Entry> = entries.into_values().collect();
         entries.sort_by_cached_key(|entry| (entry.info.received, entry.info.file.clone()));
+        // All entries of a team have its first spelling.
+        let mut names: BTreeMap<String, String> = BTreeMap::new();
+        for Entry { info, .. } in &mut entries {
+            let first = names.entry(team_key(&info.team));
+            info.team = first.or_insert_with(|| info.team.clone()).clone();
+        }
         Ok(entries)
     }
 
@@ -192,6 +207,7 @@ impl Judge {
     pub fn round(
         &self,
         sendings: &[(Sending, bool)],
+        arrivals: Arrivals,
         store: &Path,
         threads: usize,
         progress: &mut dyn Progress,
@@ -199,19 +215,18 @@ impl Judge {
         let _prepared = store::prepare(store)?;
         let known = self.entries(store)?;
         let mut round = Round::default();
-        let candidates = self.candidates(sendings, &known, threads, &mut round)?;
-        if candidates.is_empty() {
-            return Ok(round);
-        }
-        let pool = Pool::new(threads)?;
+        let pool = Pool::new(threads.min(sendings.len()).max(1))?;
+        let candidates = self.candidates(sendings, arrivals, &known, &pool, &mut round)?;
+        // Scores of single sets reveal the truth.
+        close(store)?;
         // Stored one by one, so that an interrupted command keeps the entries that it scored.
         for result in pool.in_order(candidates, |candidate| self.judge(candidate)) {
             progress.advance(self.challenge.data.galaxies());
             match result {
-                Ok((run, doubts)) => {
-                    store::write(store, &run)?;
-                    round.doubtful.extend(doubts);
-                    round.scored += 1;
+                Ok((run, scored)) => {
+                    close(&store::write(store, &run)?)?;
+                    round.scored += usize::from(scored);
+                    round.unscored += usize::from(!scored);
                 }
                 Err(refused) => round.refused.push(refused),
             }
@@ -219,128 +234,191 @@ impl Judge {
         Ok(round)
     }
 
-    // When an entry arrived, without a receipt `now`.
-    fn arrival(&self, sending: &Sending, now: Timestamp) -> Result<Arrival, FileError> {
-        let sha256 = identify(&sending.path)?;
-        let receipt = Receipt::read(&self.key, &sending.path, &sha256)?;
-        if let (Some(receipt), Some(team)) = (&receipt, &sending.team)
-            && receipt.team != *team
-        {
-            let message = format!(
-                "the receipt is of another team (found `{0}`, expected the folder's `{team}`). Try: move both into the folder `{0}`, or sign again by shearq challenge check --truth DIR --team \"{team}\"",
-                receipt.team
-            );
-            return Err(FileError::new(Receipt::path(&sending.path), message));
-        }
-        Ok(Arrival {
+    // When an entry arrived, and a remark on a receipt that is not of this entry.
+    fn arrival(
+        &self,
+        sending: &Sending,
+        arrivals: Arrivals,
+        now: Timestamp,
+    ) -> Result<(Arrival, Option<String>), FileError> {
+        let path = &sending.path;
+        let sha256 = identify(path, self.challenge.data.largest_entry())?;
+        let receipt = Receipt::read(&self.key, path, &sha256).and_then(|receipt| {
+            match (&receipt, &sending.team) {
+                (Some(receipt), Some(team)) if team_key(&receipt.team) != team_key(team) => {
+                    let message = format!(
+                        "the receipt is of another team (found `{0}`, expected the folder's `{team}`). Try: move both into the folder `{0}`, or sign again by shearq challenge check --truth DIR --team \"{team}\"",
+                        receipt.team
+                    );
+                    Err(FileError::new(Receipt::path(path), message))
+                }
+                _ => Ok(receipt),
+            }
+        });
+        let (receipt, remark) = match receipt {
+            Ok(receipt) => (receipt, None),
+            Err(error) => (
+                None,
+                Some(format!("counts as without a receipt: {}", error.message)),
+            ),
+        };
+        let received = match (&receipt, arrivals) {
+            (Some(receipt), _) => receipt.received,
+            (None, Arrivals::Now) => now,
+            (None, Arrivals::At(time)) => time,
+            (None, Arrivals::OfFiles) => Timestamp::try_from(modified(path)?)
+                .ok()
+                .and_then(|time| Timestamp::from_second(time.as_second()).ok())
+                .unwrap_or(now),
+        };
+        let arrival = Arrival {
             sha256,
-            received: receipt.as_ref().map_or(now, |receipt| receipt.received),
+            received,
             receipt,
-        })
+        };
+        Ok((arrival, remark))
     }
 
     /// Signs the arrival of an entry, now, for `team` or the team in the manifest, and returns the file of the receipt. A
     /// receipt that the same content has already is kept, unless it is of a time before entries are accepted.
     pub fn sign(&self, entry: &Path, team: Option<&str>) -> Result<PathBuf, FileError> {
-        let sha256 = identify(entry)?;
+        let most = self.challenge.data.largest_entry();
+        let sha256 = identify(entry, most)?;
         let sending = Sending {
             path: entry.to_owned(),
             team: team.map(str::to_owned),
         };
-        let team = team_of(&sending, content(&sending)?.entry.as_ref(), None);
-        check_name(&team).map_err(|error| FileError::new(entry, error))?;
+        let team = team_of(&sending, Some(&content(&sending, most)?), None);
+        check_team(&team).map_err(|error| FileError::new(entry, error))?;
         let counts = |received| !self.challenge.rules.is_early(received);
         match Receipt::read(&self.key, entry, &sha256) {
-            Ok(Some(earlier)) if earlier.team == team && counts(earlier.received) => {
+            Ok(Some(earlier))
+                if team_key(&earlier.team) == team_key(&team) && counts(earlier.received) =>
+            {
                 Ok(Receipt::path(entry))
             }
             _ => Receipt::sign(&self.key, &team, now(), &sha256).write(entry),
         }
     }
 
-    // The entries that are not in the store yet, in order of arrival. Those in the store are only counted, because scoring is
-    // slow; unreadable entries and repeated archives are refused.
+    // The entries to compare with the true shear, in order of arrival. Those in the store are only counted, because scoring is
+    // slow. What is refused here was not compared, so it does not count towards the limit of its team.
     fn candidates(
         &self,
         sendings: &[(Sending, bool)],
+        arrivals: Arrivals,
         known: &[Entry],
-        threads: usize,
+        pool: &Pool,
         round: &mut Round,
     ) -> Result<Vec<Candidate>, ChallengeError> {
         let now = now();
-        let mut stored: BTreeMap<&str, Vec<&EntryInfo>> = BTreeMap::new();
-        for Entry { info, .. } in known {
-            stored.entry(&info.sha256).or_default().push(info);
-        }
         let is_scored = |team: &str, arrival: &Arrival| {
-            let same = stored.get(arrival.sha256.as_str()).into_iter().flatten();
-            let order = self.order(arrival.received);
-            same.into_iter()
-                .any(|info| info.team == team && self.order(info.received) <= order)
+            known.iter().any(|Entry { info, .. }| {
+                info.sha256 == arrival.sha256
+                    && team_key(&info.team) == team_key(team)
+                    && info.received <= arrival.received
+            })
         };
-        let pool = Pool::new(threads)?;
+        let most = self.challenge.data.largest_entry();
         let identified = pool.in_order(sendings, |(sending, reference)| {
-            let found = self.arrival(sending, now).and_then(|arrival| {
+            let found = self.arrival(sending, arrivals, now).and_then(|arrival| {
                 // Without a folder or a receipt, the manifest states the team.
-                let of_receipt = arrival.receipt.as_ref().map(|receipt| &receipt.team);
+                let of_receipt = arrival.0.receipt.as_ref().map(|receipt| &receipt.team);
                 let team = sending.team.as_ref().or(of_receipt);
-                let content = match team.is_some_and(|team| is_scored(team, &arrival)) {
+                let content = match team.is_some_and(|team| is_scored(team, &arrival.0)) {
                     true => None,
-                    false => Some(content(sending)?),
+                    false => Some(content(sending, most)?),
                 };
                 Ok((arrival, content))
             });
-            (sending.clone(), *reference, found)
+            (sending, *reference, found)
         });
         let mut readable = Vec::new();
         for (sending, reference, found) in identified {
             match found {
-                Ok((arrival, content)) => readable.push((sending, reference, arrival, content)),
+                Ok(((arrival, remark), content)) => {
+                    let remark = remark.map(|remark| (sending.path.clone(), remark));
+                    round.remarks.extend(remark);
+                    readable.push((sending, reference, arrival, content));
+                }
                 Err(error) => round.refused.push(Refused {
-                    team: team_of(&sending, None, None),
-                    reason: reason_of(&error.path, &error.message, &sending),
-                    path: sending.path,
+                    team: team_of(sending, None, None),
+                    reason: reason_of(&error.path, &error.message, sending),
+                    path: sending.path.clone(),
                 }),
             }
         }
         readable.sort_by(|a, b| (a.2.received, &a.0).cmp(&(b.2.received, &b.0)));
-        let mut archives: BTreeMap<(String, String, bool), PathBuf> = BTreeMap::new();
+        // Of each team, arrival and content of the entries that were or will be compared.
+        let mut compared: BTreeMap<String, Vec<(Timestamp, String)>> = BTreeMap::new();
+        for Entry { info, .. } in known.iter().filter(|entry| !entry.info.reference) {
+            let own = compared.entry(team_key(&info.team)).or_default();
+            own.push((info.received, info.content.clone()));
+        }
+        let rules = &self.challenge.rules;
         let mut candidates = Vec::new();
         for (sending, reference, arrival, content) in readable {
-            let entry = content.as_ref().and_then(|content| content.entry.as_ref());
-            let team = team_of(&sending, entry, arrival.receipt.as_ref());
-            let early = self.challenge.rules.is_early(arrival.received);
-            // The same content in another archive is handled by `ranking`, because which of them came first is known only when all
-            // are scored.
-            match archives.entry((arrival.sha256.clone(), team.clone(), early)) {
-                Slot::Occupied(first) => {
-                    round.refused.push(Refused {
-                        path: sending.path,
-                        team,
-                        reason: format!("identical content as {}", first.get().display()),
-                    });
-                    continue;
+            let team = team_of(sending, content.as_ref(), arrival.receipt.as_ref());
+            let Some(content) = content.filter(|_| !is_scored(&team, &arrival)) else {
+                round.known += 1;
+                continue;
+            };
+            let stated = content.manifest.as_ref().and_then(|own| own.entry.as_ref());
+            if let Some(stated) = stated
+                && team_key(&stated.team) != team_key(&team)
+            {
+                let remark = format!(
+                    "counts for {team}, the folder of the inbox or the receipt; its manifest states {}",
+                    stated.team
+                );
+                round.remarks.push((sending.path.clone(), remark));
+            }
+            let own = compared.entry(team_key(&team)).or_default();
+            let earlier = own.iter().filter(|(time, _)| *time <= arrival.received);
+            let earlier: BTreeSet<&str> = earlier.map(|(_, content)| &**content).collect();
+            let limit = rules.entries_per_team.map_or(usize::MAX, |n| n as usize);
+            let reason = match check_team(&team) {
+                Err(error) => Some(error),
+                Ok(()) if reference => None,
+                Ok(()) if rules.is_early(arrival.received) => Some(format!(
+                    "received before the challenge opened, {}",
+                    rules
+                        .opens
+                        .as_ref()
+                        .map_or_else(String::new, Deadline::to_string)
+                )),
+                Ok(()) if earlier.contains(&*content.sha256) => {
+                    Some("identical content as an earlier entry of the team".into())
                 }
-                Slot::Vacant(slot) => _ = slot.insert(sending.path.clone()),
-            }
-            match content.filter(|_| !is_scored(&team, &arrival)) {
-                None => round.known += 1,
-                Some(content) => candidates.push(Candidate {
-                    sending,
-                    reference,
+                Ok(()) if earlier.len() >= limit => {
+                    Some(format!("the team has {limit} entries already"))
+                }
+                Ok(()) => None,
+            };
+            if let Some(reason) = reason {
+                round.refused.push(Refused {
+                    path: sending.path.clone(),
                     team,
-                    arrival,
-                    content,
-                }),
+                    reason,
+                });
+                continue;
             }
+            if !reference {
+                own.push((arrival.received, content.sha256.clone()));
+            }
+            candidates.push(Candidate {
+                sending: sending.clone(),
+                reference,
+                team,
+                arrival,
+                content,
+            });
         }
         Ok(candidates)
     }
 
-    fn judge(
-        &self,
-        candidate: Candidate,
-    ) -> Result<(RunRecord, Option<(PathBuf, String)>), Refused> {
+    // The record of an entry, and whether it has a score.
+    fn judge(&self, candidate: Candidate) -> Result<(RunRecord, bool), Refused> {
         let Candidate {
             sending,
             reference,
@@ -353,7 +431,9 @@ impl Judge {
             team: team.clone(),
             reason,
         };
-        let stated = content.entry.as_ref();
+        let manifest = content.manifest.as_ref();
+        let stated = manifest.and_then(|manifest| manifest.entry.as_ref());
+        let run = manifest.and_then(|manifest| manifest.run.as_ref());
         let mut info = EntryInfo {
             challenge: self.challenge.name.clone(),
             team: team.clone(),
@@ -366,11 +446,21 @@ impl Judge {
             sha256: arrival.sha256,
             content: content.sha256,
             contents: Contents::Catalogues,
+            configuration: run.map(|run| run.configuration.name.clone()),
             reference,
+            scored: false,
+            findings: Vec::new(),
         };
-        let (sets, doubt) = self.score(&sending, stated, &mut info).map_err(refuse)?;
-        for name in [&info.team, &info.method] {
-            check_name(name).map_err(|error| refuse(error.to_string()))?;
+        let Verdict {
+            mut sets,
+            scored,
+            findings,
+        } = self.score(&sending, stated, &mut info).map_err(refuse)?;
+        check_name(&info.method).map_err(|error| refuse(error.to_string()))?;
+        (info.scored, info.findings) = (scored, findings);
+        if sets.is_empty() {
+            let all = &self.challenge.data.sets;
+            sets = all.iter().map(|set| SetRecord::unknown(*set)).collect();
         }
         let configuration = truncated(&format!("{}: {}", info.team, info.method));
         let settings =
@@ -385,15 +475,16 @@ impl Judge {
             noise: Noise::Measured,
             sets,
         };
-        Ok((run, doubt.map(|doubt| (sending.path, doubt))))
+        Ok((run, scored))
     }
 
+    // An error is a fault of the form, which does not depend on the truth.
     fn score(
         &self,
         sending: &Sending,
         entry: Option<&Team>,
         info: &mut EntryInfo,
-    ) -> Result<Scores, String> {
+    ) -> Result<Verdict, String> {
         let rules = &self.challenge.rules;
         if let Some(entry) = entry
             && entry.challenge != self.challenge.name
@@ -404,40 +495,41 @@ impl Judge {
             ));
         }
         let plain = |error: FileError| reason_of(&error.path, &error.message, sending);
-        let sent = Sent::open(&sending.path).map_err(plain)?;
+        let sent = self.challenge.open(&sending.path).map_err(plain)?;
         let submission = Submission::read(&sent).map_err(plain)?;
         info.contents = rules.accept(&submission)?;
-        let (mut sets, doubt) = match &submission.packed {
+        info.method = submission.method;
+        let mut verdict = match &submission.packed {
             Packed::Catalogues(_) => self.catalogues(&sent, sending)?,
             Packed::Spectra(files) => {
                 self.check(&sent, sending, &mut |_| {})?;
-                let (sets, powers) = self
-                    .spectra(files, submission.manifest.as_ref())
-                    .map_err(|error| plain(sent.named(error)))?;
-                let (slope, error) = slope_over_sets(&powers);
-                if !is_measurable(slope, error) {
-                    return Err("the spectra do not follow the differences of the true spectra between sets, so they contain no measurable shear".into());
-                }
-                (sets, None)
+                self.spectra(files, submission.manifest.as_ref())
+                    .map_err(|error| plain(sent.named(error)))?
             }
         };
+        let Verdict {
+            sets,
+            scored,
+            findings,
+        } = &mut verdict;
         sets.sort_by_key(|set| set.set);
-        if info.contents == Contents::Catalogues {
+        if *scored && info.contents == Contents::Catalogues {
             let constant = self.constant.as_ref();
-            // Without numbers, because they contain the correlation with the truth.
-            let (value, error) = response(&sets, constant);
+            let (value, error) = response(sets, constant);
             if !is_measurable(value, error) {
-                return Err("the response to the shear is consistent with zero".into());
-            }
-            if !rules.metric.of(&sets, constant).0.is_finite() {
-                return Err(format!(
+                findings.push(format!(
+                    "the response to the shear is consistent with zero (found {value:.3} ± {error:.3}, expected at least {MIN_ENTRY_SLOPE_SIGNIFICANCE}σ)"
+                ));
+                *scored = false;
+            } else if !rules.metric.of(sets, constant).0.is_finite() {
+                findings.push(format!(
                     "{} cannot be computed, because the response of a set is consistent with zero or the images do not determine the noise",
                     rules.metric.label()
                 ));
+                *scored = false;
             }
         }
-        info.method = submission.method;
-        Ok((sets, doubt))
+        Ok(verdict)
     }
 
     // Checks the files of an entry. `done` gets each set of catalogues.
@@ -464,53 +556,67 @@ impl Judge {
     }
 
     // Checks and scores the catalogues of an entry; also names images that do not follow the shear as the others do.
-    fn catalogues(&self, sent: &Sent, sending: &Sending) -> Result<Scores, String> {
-        let (mut sets, mut odd, mut failed) = (Vec::new(), Vec::new(), None);
+    fn catalogues(&self, sent: &Sent, sending: &Sending) -> Result<Verdict, String> {
+        let mut verdict = Verdict {
+            scored: true,
+            ..Verdict::default()
+        };
+        let mut odd = Vec::new();
         self.check(sent, sending, &mut |checked: CheckedSet<'_>| {
             let set = checked.set;
             let of_set = checked.odd.iter();
             odd.extend(of_set.map(|image| format!("{image} of set {set}")));
             match self.score_set(&checked) {
-                Ok(record) => sets.extend(record),
-                Err(reason) => failed = failed.take().or(Some(format!("set {set}: {reason}"))),
+                Ok(record) => verdict.sets.extend(record),
+                Err(finding) => {
+                    verdict.findings.push(format!("set {set}: {finding}"));
+                    verdict.scored = false;
+                }
             }
         })?;
-        // Without numbers, because correlations with the truth are secret.
-        let doubt = (!odd.is_empty()).then(|| {
-            format!(
+        if !odd.is_empty() {
+            verdict.findings.push(format!(
                 "image {} does not follow the shear as the others of the set do",
                 names_of(&odd)
-            )
-        });
-        failed.map_or(Ok((sets, doubt)), Err)
+            ));
+        }
+        Ok(verdict)
     }
 
     fn spectra(
         &self,
         files: &BTreeMap<u32, PathBuf>,
         manifest: Option<&Manifest>,
-    ) -> Result<(Vec<SetRecord>, Vec<Powers>), FileError> {
-        let (mut sets, mut all) = (Vec::new(), Vec::new());
+    ) -> Result<Verdict, FileError> {
+        let mut verdict = Verdict::default();
+        let mut powers = Vec::new();
         for (&set, path) in files {
             let Some(truth) = self.truths.get(&set) else {
                 continue;
             };
-            let powers = read_bandpowers(path, &self.grid)?;
+            let sent = read_bandpowers(path, &self.grid)?;
             let covariance =
                 manifest.and_then(|manifest| manifest.covariances.get(path.file_name()?.to_str()?));
             let score = truth
                 .scorer
-                .score_spectrum(&powers, covariance)
+                .score_spectrum(&sent, covariance)
                 .map_err(|error| FileError::new(path, error))?;
-            let truth_powers = truth.scorer.true_bandpowers();
-            all.push((truth_powers[SCORED].to_vec(), powers));
+            let true_powers = truth.scorer.true_bandpowers();
+            powers.push((true_powers[SCORED].to_vec(), sent));
             let images = (1..=self.challenge.data.images).collect();
-            sets.push(SetRecord {
+            verdict.sets.push(SetRecord {
                 data: truth.print.clone(),
                 ..SetRecord::of_spectrum(set, truth.simulated, images, &score)
             });
         }
-        Ok((sets, all))
+        let (slope, error) = slope_over_sets(&powers);
+        verdict.scored = is_measurable(slope, error);
+        if !verdict.scored {
+            verdict.findings.push(format!(
+                "the spectra do not follow the differences of the true spectra between sets (found a slope of {slope:.2} ± {error:.2}, expected at least {MIN_ENTRY_SLOPE_SIGNIFICANCE}σ)"
+            ));
+        }
+        Ok(verdict)
     }
 
     // The record of a set of catalogues, and in `odd` its images that do not follow the shear as the others do. `None` if the
@@ -524,12 +630,13 @@ impl Judge {
         let Some(truth) = self.truths.get(&set) else {
             return Ok(None);
         };
-        let scored = checked.images.finish();
-        let scored = scored.map_err(|error| error.to_string())?;
-        let responses = scored.odd.responses.iter();
-        odd.extend(responses.map(|own| format!("{} of set {set}", numbers[own.place])));
-        for fault in scored.findings {
-            // Without numbers, because correlations with the truth are secret.
+        let wrong = |error: ScoringError| error.to_string();
+        let score = truth.scorer.score(images).map_err(wrong)?;
+        let faults = truth
+            .scorer
+            .diagnose(images, &score, Convention::STANDARD)
+            .map_err(wrong)?;
+        for fault in faults {
             return Err(match fault {
                 Fault::Convention { better, .. } => format!(
                     "signs or axes are wrong (found convention {}, {}; expected 5, standard)",
@@ -581,18 +688,27 @@ fn reason_of(path: &Path, message: &str, sending: &Sending) -> String {
     }
 }
 
-// Team of an entry: its folder in the inbox, or as its receipt or its manifest (`entry`) states, or the name of the file.
-fn team_of(sending: &Sending, entry: Option<&Team>, receipt: Option<&Receipt>) -> String {
+// Team of an entry: its folder in the inbox, or as its receipt or its manifest states, or the name of the file.
+fn team_of(sending: &Sending, content: Option<&Content>, receipt: Option<&Receipt>) -> String {
+    let stated = content.and_then(|content| content.manifest.as_ref()?.entry.as_ref());
     let folder = sending.team.clone();
     folder
         .or_else(|| receipt.map(|receipt| receipt.team.clone()))
-        .or_else(|| entry.map(|entry| entry.team.clone()))
+        .or_else(|| stated.map(|entry| entry.team.clone()))
         .unwrap_or_else(|| {
             let name = file_name(&sending.path);
-            let endings = [".tar.gz", ".tgz"];
+            let endings = [".tar.gz", ".tgz", ".zip"];
             let stem = endings.iter().find_map(|ending| name.strip_suffix(ending));
             stem.unwrap_or(&name).to_owned()
         })
+}
+
+fn check_team(name: &str) -> Result<(), String> {
+    check_name(name).map_err(|error| error.to_string())?;
+    match team_key(name).is_empty() {
+        true => Err("the name of the team has no visible character".into()),
+        false => Ok(()),
+    }
 }
 
 fn file_name(path: &Path) -> String {

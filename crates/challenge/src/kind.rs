@@ -8,7 +8,7 @@ use shearq_results::compare::Paired;
 use shearq_results::record::{SetRecord, mean};
 use shearq_results::submit::Contents;
 use shearq_scoring::great3::{Observation, REQUIRED_C, REQUIRED_M};
-use shearq_scoring::{Definition, Line, TrueShear};
+use shearq_scoring::{Definition, Line, Metrics, TrueShear};
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
@@ -70,15 +70,6 @@ impl RankBy {
         )
     }
 
-    /// Decimals of a leaderboard, unless the organiser chooses other.
-    pub fn decimals(self) -> usize {
-        match self {
-            RankBy::Q | RankBy::QCorrected | RankBy::QCalibrated | RankBy::Qc => 1,
-            RankBy::M => 4,
-            RankBy::C => 5,
-        }
-    }
-
     pub fn is_of_spectra(self) -> bool {
         matches!(self, RankBy::Q | RankBy::QCorrected)
     }
@@ -108,21 +99,44 @@ impl RankBy {
                 ((response - 1.0).abs(), error)
             }
             RankBy::C => {
-                let (c1, c2) = match constant {
-                    None => (mean(|metrics| metrics.c1), mean(|metrics| metrics.c2)),
-                    Some(shears) => {
-                        let [(_, c1), (_, c2)] = shears.biases(sets);
-                        (c1, c2)
-                    }
-                };
-                let modulus = c1.0.hypot(c2.0);
-                // The error along the direction of c.
-                let error = (c1.0 * c1.1).hypot(c2.0 * c2.1) / modulus;
+                let (modulus, error) = additive_bias(sets, constant);
                 let (response, _) = response(sets, constant);
                 (modulus / response, error / response)
             }
             RankBy::Qc => constant.map_or((f64::NAN, f64::NAN), |shears| shears.q_c(sets)),
         }
+    }
+
+    /// Smallest error with which a value is published: that of a measurement with the noise of the images. An entry chooses its
+    /// own error, for example by the same ellipticities with little noise in all images of a set.
+    pub fn least_error(self, value: f64, noise: &Noise) -> f64 {
+        match self {
+            // Q is the inverse of a power, which has the square of the response.
+            RankBy::Q | RankBy::QCorrected | RankBy::QCalibrated => 2.0 * value * noise.response,
+            RankBy::M => noise.response,
+            RankBy::C => noise.c,
+            RankBy::Qc => {
+                // Q = Q₀/√(S/4 + 1), with S the sum of the squares of m and c in units of the requirements. Errors u of m and c in
+                // these units add up to 2u√S + u² to S.
+                let perfect = Observation::Ground.q_c([[0.0; 2]; 2]);
+                let sum = 4.0 * ((perfect / value).powi(2) - 1.0).max(0.0);
+                let u = (noise.response / REQUIRED_M).hypot(noise.c / REQUIRED_C);
+                let more = sum + 2.0 * u * sum.sqrt() + u * u;
+                value - perfect / (more / 4.0 + 1.0).sqrt()
+            }
+        }
+    }
+
+    /// Value and error over all sets, as they are published.
+    pub fn published(
+        self,
+        sets: &[SetRecord],
+        constant: Option<&ConstantShears>,
+        noise: &Noise,
+    ) -> Published {
+        let (value, error) = self.of(sets, constant);
+        // `max` of an unknown error is the other one.
+        Published::new(value, error.max(self.least_error(value, noise)))
     }
 
     /// Value of an entry of zeros, whose mean Q is `q`: its m is −1 and its c is 0. NaN where the metric divides by the
@@ -143,6 +157,69 @@ impl RankBy {
             RankBy::M | RankBy::C | RankBy::Qc => None,
         }
     }
+}
+
+/// Modulus of the mean additive bias of all sets, and its standard error along its direction.
+pub fn additive_bias(sets: &[SetRecord], constant: Option<&ConstantShears>) -> (f64, f64) {
+    let [c1, c2] = match constant {
+        None => [|m: &Metrics| m.c1, |m: &Metrics| m.c2].map(|metric| mean(sets, metric)),
+        Some(shears) => shears.biases(sets).map(|(_, c)| c),
+    };
+    let modulus = c1.0.hypot(c2.0);
+    (modulus, (c1.0 * c1.1).hypot(c2.0 * c2.1) / modulus)
+}
+
+/// Errors of a reference measurement of all images, without bias: of the response, and of c.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct Noise {
+    pub response: f64,
+    pub c: f64,
+}
+
+/// A value as it is published: the nearest multiple of a round step, which is the smallest one of 1, 2 or 5 times a power of
+/// ten that is not below the error. A team that sends shifted and scaled entries learns no more than the noise of its images
+/// hides.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Published {
+    pub value: f64,
+    pub step: f64,
+    pub decimals: usize,
+}
+
+impl Published {
+    pub fn new(value: f64, error: f64) -> Self {
+        // Without any error, one digit.
+        let error = match error {
+            known if known.is_normal() && known > 0.0 => known,
+            _ => value.abs().max(f64::MIN_POSITIVE),
+        };
+        // Printed and parsed, because the logarithm of 0.001 is not exactly −3.
+        let text = format!("{error:e}");
+        let (digits, exponent) = text.split_once('e').unwrap_or(("1", "0"));
+        let digits: f64 = digits.parse().unwrap_or(1.0);
+        let exponent: i32 = exponent.parse().unwrap_or(0);
+        let (first, more) = match digits {
+            d if d <= 1.0 => (1, 0),
+            d if d <= 2.0 => (2, 0),
+            d if d <= 5.0 => (5, 0),
+            _ => (1, 1),
+        };
+        let power = exponent + more;
+        let step = format!("{first}e{power}").parse().unwrap_or(error);
+        let decimals = usize::try_from(-power).unwrap_or(0);
+        Published {
+            value: rounded((value / step).round() * step, decimals),
+            step,
+            decimals,
+        }
+    }
+}
+
+// Printing rounds exactly; a product with a power of ten does not.
+fn rounded(value: f64, decimals: usize) -> f64 {
+    let nearest: f64 = format!("{value:.decimals$}").parse().unwrap_or(value);
+    // Without the sign of −0.
+    nearest + 0.0
 }
 
 /// Mean response 1 + m of all sets and both components, and its standard error.
@@ -303,7 +380,7 @@ impl ConstantShears {
         let (mut points, mut errors) = (Vec::new(), Vec::new());
         for set in sets {
             if let Some(g) = self.0.get(&set.set) {
-                let of = |metrics: &shearq_scoring::Metrics| [metrics.c1, metrics.c2][k];
+                let of = |metrics: &Metrics| [metrics.c1, metrics.c2][k];
                 points.push((g[k], of(&set.metrics)));
                 errors.push(of(&set.errors));
             }
@@ -354,7 +431,6 @@ impl ConstantShears {
 mod tests {
     use super::*;
     use ndarray::Array2;
-    use shearq_scoring::Metrics;
 
     fn shear(g1: f64, g2: f64) -> TrueShear {
         let all = |g| Array2::from_elem((8, 8), g);
@@ -386,6 +462,37 @@ mod tests {
             }
         };
         (1..).zip(SHEARS).map(set).collect()
+    }
+
+    #[test]
+    fn published_values_are_multiples_of_a_step_above_the_error() {
+        let of = |value, error| {
+            let own = Published::new(value, error);
+            (own.value, own.step, own.decimals)
+        };
+        assert_eq!(of(16.23, 1.7), (16.0, 2.0, 0));
+        assert_eq!(of(123.456, 34.0), (100.0, 50.0, 0));
+        assert_eq!(of(123.456, 68.0), (100.0, 100.0, 0));
+        assert_eq!(of(0.03346, 0.04), (0.05, 0.05, 2));
+        assert_eq!(of(-0.02, 0.1), (0.0, 0.1, 1));
+        assert_eq!(of(0.123_456, 0.001), (0.123, 0.001, 3));
+        // Without an error, one digit.
+        assert_eq!(of(16.2, f64::NAN), (20.0, 20.0, 0));
+    }
+
+    #[test]
+    fn errors_of_an_entry_do_not_add_digits() {
+        let noise = Noise {
+            response: 0.02,
+            c: 3e-4,
+        };
+        let step =
+            |metric: RankBy, value| Published::new(value, metric.least_error(value, &noise)).step;
+        assert_eq!(step(RankBy::QCalibrated, 100.0), 5.0);
+        assert_eq!((step(RankBy::M, 0.01), step(RankBy::C, 1e-5)), (0.02, 5e-4));
+        // Errors of 10 requirements, without a bias and with one of 20 requirements.
+        assert_eq!(step(RankBy::Qc, 1232.0), 1000.0);
+        assert_eq!(step(RankBy::Qc, 123.0), 50.0);
     }
 
     #[test]

@@ -11,8 +11,9 @@ use shearq_results::submit::Kind as FileKind;
 use shearq_results::views::comparison::q_per_set;
 
 use crate::entry::{EntryInfo, Refused};
-use crate::kind::{ConstantShears, RankBy};
-use crate::ranking::{Board, Leaderboard, Standing, better, rounded};
+use crate::kind::{ConstantShears, Noise, Published, RankBy};
+use crate::ranking::{Board, Leaderboard, Scored, Standing, better};
+use crate::seal::close;
 use crate::terms::Challenge;
 
 // The palette has eight colours.
@@ -27,8 +28,11 @@ pub struct View<'a> {
     pub zero_shear: Option<f64>,
     /// The true shears of sets with one shear each.
     pub constant: Option<&'a ConstantShears>,
-    /// Decimals of the metric. More of them reveal more of the true shear.
-    pub digits: usize,
+    pub noise: &'a Noise,
+    /// Whether entries are still accepted. Until then, the board has the metric alone.
+    pub open: bool,
+    /// Whether the page is for the organiser: all numbers, those of single sets, and what the comparison with the true shear
+    /// showed.
     pub detail: bool,
 }
 
@@ -42,27 +46,6 @@ fn key(metric: RankBy) -> (&'static str, &'static str) {
         RankBy::C => ("c", "c_error"),
         RankBy::Qc => ("qc", "qc_error"),
     }
-}
-
-// Rounded up to this number of decimals, so that no error becomes zero.
-fn rounded_up(error: f64, digits: usize) -> f64 {
-    let least = 0.5 * 10f64.powi(-(digits as i32));
-    match error > 0.0 {
-        true => rounded((error + least).max(2.0 * least), digits),
-        false => error,
-    }
-}
-
-// A number with the decimals that its error determines, at most `most`, and their number. More decimals would show how an
-// entry with one known mode follows the true shear: over 10 such modes, the correlation of |m| with the truth was
-// 0.9999998. `None` without an error.
-fn rounded_to_error(value: f64, error: f64, most: usize) -> Option<(f64, usize)> {
-    let error = Some(error.abs()).filter(|error| error.is_normal())?;
-    // Printing rounds 0.096 to 1e-1, so that it has one decimal.
-    let exponent: i32 = format!("{error:.0e}").split_once('e')?.1.parse().ok()?;
-    let step = 10f64.powi(exponent.max(0));
-    let digits = usize::try_from(-exponent).unwrap_or(0).min(most);
-    Some((rounded(value / step, digits) * step, digits))
 }
 
 // Shift of a team's points. First entries of equal quality would hide each other.
@@ -81,15 +64,17 @@ impl View<'_> {
     }
 
     fn table_of(&self, boards: &[Board]) -> Table {
-        let (metric, digits) = (self.metric(), self.digits);
+        let metric = self.metric();
         let zero = metric.of_zero_shear(self.zero_shear.unwrap_or(f64::NAN));
+        let zero = Published::new(zero, metric.least_error(zero, self.noise));
         let standings = boards.iter().flat_map(|board| self.board.of(*board));
         // A row without standing is an entry of zeros: whoever is below it has measured nothing.
         let mut rows: Vec<Option<&Standing<'_>>> = standings.map(Some).collect();
         if boards.contains(&Board::Main) {
             let behind = |row: &Option<&Standing<'_>>| {
                 row.is_none_or(|standing| {
-                    standing.board != Board::Main || better(metric, zero, standing.best.value)
+                    standing.board != Board::Main
+                        || better(metric, zero.value, standing.best.published.value)
                 })
             };
             let place = rows.iter().position(behind).unwrap_or(rows.len());
@@ -106,46 +91,48 @@ impl View<'_> {
         };
         let number = |value: usize| Cell::number(value as f64, 0);
         add("rank", "rank", Cell::Empty, &|standing| {
-            standing.rank.map_or(Cell::Empty, number)
+            let shared = if standing.shared { "=" } else { "" };
+            let rank = |rank| Cell::text(format!("{rank}{shared}"));
+            standing.rank.map_or(Cell::Empty, rank)
         });
         // Teams may have this name, too, but they have a rank.
         let team = info(|info| info.team.clone());
         add("team", "team", Cell::text("zero shear"), &team);
         let method = info(|info| info.method.clone());
         add("method", "method", Cell::text("no image"), &method);
-        let title = info(|info| match (info.reference, info.title.is_empty()) {
-            (true, true) => "reference".into(),
-            (true, false) => format!("reference: {}", info.title),
-            (false, _) => info.title.clone(),
-        });
         let of_zeros = Cell::text("reference: an entry of zeros");
-        add("title", "title", of_zeros, &title);
+        add("title", "title", of_zeros, &|standing| {
+            let info = standing.best.info();
+            let reference = if info.reference { "reference" } else { "" };
+            let same = standing.same_as.as_deref().unwrap_or_default();
+            let mut parts = vec![reference, &info.title, same];
+            parts.retain(|part| !part.is_empty());
+            Cell::text(parts.join(": "))
+        });
         let files = info(|info| match info.contents.is_spectra() {
             true => "spectra".into(),
             false => "catalogues".into(),
         });
         add("files", "files", Cell::Empty, &files);
-        // One cell would give the error two digits, and the value the same decimals.
-        let value = |value: f64| Cell::number(rounded(value, digits), digits);
+        let value = |own: Published| Cell::number(own.value, own.decimals);
         let (of_value, of_error) = key(metric);
         add(of_value, metric.label(), value(zero), &|standing| {
-            value(standing.best.value)
+            value(standing.best.published)
         });
         add(of_error, "± error", Cell::Empty, &|standing| {
-            Cell::number(rounded_up(standing.best.error, digits), digits)
+            let own = standing.best.published;
+            Cell::number(own.step, own.decimals)
         });
         for other in [RankBy::QCalibrated, RankBy::M, RankBy::C] {
-            if other == metric || !other.suits(self.constant.is_some()) {
+            let is_secret = self.open && !self.detail;
+            if is_secret || other == metric || !other.suits(self.constant.is_some()) {
                 continue;
             }
-            // No more decimals than the organiser's, where he chose fewer than the metric's.
-            let fewer = metric.decimals().saturating_sub(digits);
-            let most = other.decimals().saturating_sub(fewer);
             add(key(other).0, other.label(), Cell::Empty, &|standing| {
-                let (value, error) = other.of(&standing.best.entry.sets, self.constant);
-                match rounded_to_error(value, error, most) {
-                    Some((value, digits)) => Cell::number(value, digits),
-                    None => Cell::Empty,
+                let sets = &standing.best.entry.sets;
+                match other.of(sets, self.constant).0.is_finite() {
+                    true => value(other.published(sets, self.constant, self.noise)),
+                    false => Cell::Empty,
                 }
             });
         }
@@ -168,7 +155,7 @@ impl View<'_> {
         }
         table.notes = vec![
             metric.meaning().to_owned(),
-            "Each team is ranked by its best entry. Teams share a rank if their difference is below its error or not printed.".into(),
+            "Each team is ranked by its best entry. Teams share a rank (=) if their difference is below its error or not printed. Values are rounded to their errors.".into(),
         ];
         table.notes.extend(self.zero_note());
         table
@@ -176,9 +163,12 @@ impl View<'_> {
 
     // Q of zero shear on boards of other metrics, too: whoever reads Q elsewhere must see it.
     fn zero_note(&self) -> Option<String> {
-        let q = Cell::with_error(rounded(self.zero_shear?, 1), Some(f64::NAN), 2)
-            .digits()?
-            .0;
+        // On a board of Q it is a line.
+        if self.open && !self.detail {
+            return None;
+        }
+        let q = self.zero_shear?;
+        let q = Published::new(q, RankBy::Q.least_error(q, self.noise)).value;
         let why = match self.metric().of_zero_shear(1.0).is_nan() {
             true => format!(
                 " It has no {}, because it does not respond to the shear.",
@@ -206,8 +196,31 @@ impl View<'_> {
         table
     }
 
+    // What the comparison with the true shear showed.
+    fn findings(&self) -> Table {
+        let of = |info: &'_ EntryInfo| {
+            info.findings
+                .iter()
+                .map(|found| (info.clone(), found.clone()))
+                .collect::<Vec<_>>()
+        };
+        let standings = self
+            .board
+            .standings
+            .iter()
+            .flat_map(|standing| &standing.entries);
+        let excluded = self.board.excluded.iter().map(|(info, _)| *info);
+        let all = standings.map(Scored::info).chain(excluded);
+        let rows: Vec<(EntryInfo, String)> = all.flat_map(of).collect();
+        let mut table = Table::titled("Findings for the organiser");
+        table.column("entry", "entry", &rows, |row| Cell::text(&row.0.file));
+        table.column("team", "team", &rows, |row| Cell::text(&row.0.team));
+        table.column("finding", "finding", &rows, |row| Cell::text(&row.1));
+        table
+    }
+
     fn history(&self) -> LinePlot {
-        let (digits, metric) = (self.digits, self.metric());
+        let metric = self.metric();
         let plotted: Vec<&Standing<'_>> = self
             .board
             .of(Board::Main)
@@ -226,11 +239,8 @@ impl View<'_> {
             let aside = aside(colour, plotted.len());
             let x = entries.iter().map(|entry| entry.number as f64 + aside);
             let x: Vec<f64> = x.collect();
-            let y: Vec<f64> = entries.iter().map(|e| rounded(e.value, digits)).collect();
-            let errors = entries
-                .iter()
-                .map(|e| rounded_up(e.error, digits))
-                .collect();
+            let y: Vec<f64> = entries.iter().map(|e| e.published.value).collect();
+            let errors = entries.iter().map(|e| e.published.step).collect();
             let name = &standing.best.info().team;
             series.push(Series::new("", x.clone(), y.clone(), Style::Line, colour));
             series.push(Series::new(name, x, y, Style::Points, colour).with_errors(errors));
@@ -256,7 +266,9 @@ impl View<'_> {
             ..
         } = self.challenge;
         let mut blocks = vec![Block::Filtered(self.table_of(&[Board::Main]))];
-        if !self.board.standings.is_empty() {
+        let several = |standing: &Standing<'_>| standing.entries.len() > 1;
+        // One point per team shows nothing that the table does not.
+        if self.board.of(Board::Main).any(several) {
             let caption = format!(
                 "{} of each entry, with its error, for the first {PLOTTED} teams at most.",
                 terms.metric.label()
@@ -267,6 +279,13 @@ impl View<'_> {
         let mut sections = vec![Section::new("leaderboard", "Leaderboard", blocks)];
         if self.detail {
             sections.push(self.every_set()?);
+            let table = self.findings();
+            let title = table.title.clone();
+            sections.push(Section::new(
+                "findings",
+                title,
+                vec![Block::Filtered(table)],
+            ));
         }
         let of_board = |board, title: &str| Table {
             title: title.into(),
@@ -296,7 +315,6 @@ impl View<'_> {
             ("Kind", kind.title().to_owned()),
             ("Data", about_data),
             ("Metric", terms.metric.label().to_owned()),
-            ("Decimals", self.digits.to_string()),
             ("Program", format!("shearq {}", shearq_dataset::VERSION)),
         ];
         Ok(Report {
@@ -321,14 +339,8 @@ impl View<'_> {
                 (name, standing.best.entry.sets.as_slice())
             })
             .collect();
-        let mut plot = q_per_set(&rows);
-        for point in plot.series.iter_mut().flat_map(|series| &mut series.points) {
-            point.y = rounded(point.y, self.digits);
-            point.y_error = rounded_up(point.y_error, self.digits);
-        }
-        let caption =
-            "Q of each set. Metrics of single sets reveal more of the true shear than their mean.";
-        let picture = Picture::draw(&plot, "q-per-set", caption)?;
+        let caption = "Q of each set.";
+        let picture = Picture::draw(&q_per_set(&rows), "q-per-set", caption)?;
         Ok(Section::new(
             "sets",
             "Metric of each set",
@@ -336,17 +348,23 @@ impl View<'_> {
         ))
     }
 
-    /// Writes the page to `path`, and the table as CSV and JSON with the same name.
+    /// Writes the page to `path`, and the table as CSV and JSON with the same name. A page for the organiser is for its owner
+    /// alone.
     pub fn save(&self, path: &Path) -> Result<(), PageError> {
         let table = self.table();
         self.report()?.save(path)?;
+        let mut written = vec![path.to_owned()];
         for (ending, format) in [("csv", TableFormat::Csv), ("json", TableFormat::Json)] {
             let beside = path.with_extension(ending);
             if beside == path {
                 let message = "expected a name that ends in .html";
                 return Err(FileError::new(path, message).into());
             }
-            atomic::write(beside, table.render(format).as_bytes())?;
+            atomic::write(&beside, table.render(format).as_bytes())?;
+            written.push(beside);
+        }
+        if self.detail {
+            written.iter().try_for_each(|path| close(path))?;
         }
         Ok(())
     }
@@ -371,7 +389,7 @@ fn rules(challenge: &Challenge) -> Vec<String> {
         rules.metric.meaning()
     ));
     all.push("The response of an entry to the shear must be at least 3σ from zero.".into());
-    all.push("Entries whose difference is below its error share a rank.".into());
+    all.push("Entries whose difference is below its error share a rank. Values are rounded to their errors.".into());
     all.push("Symbolic links are not accepted.".into());
     if let Some(most) = rules.entries_per_team {
         all.push(format!(
@@ -464,21 +482,5 @@ mod tests {
         let places: Vec<f64> = (0..6).map(|team| aside(team, 6)).collect();
         assert!(places.windows(2).all(|pair| pair[1] - pair[0] > 0.09));
         assert!(places[0] > -0.5 && places[5] < 0.5 && aside(0, 1) == 0.0);
-    }
-
-    #[test]
-    fn published_numbers_have_the_decimals_of_the_organiser() {
-        assert_eq!(rounded(123.456, 1), 123.5);
-        assert_eq!(rounded(123.456, 0), 123.0);
-        // An error is rounded up and never to zero.
-        assert_eq!(rounded_up(0.0004, 1), 0.1);
-        assert_eq!(rounded_up(0.12, 1), 0.2);
-        assert!(rounded_up(f64::NAN, 1).is_nan());
-        // One digit of the error decides the last one of the value.
-        assert_eq!(rounded_to_error(0.123456, 0.0234, 4), Some((0.12, 2)));
-        assert_eq!(rounded_to_error(0.123456, 0.096, 4), Some((0.1, 1)));
-        assert_eq!(rounded_to_error(0.123456, 0.00002, 4), Some((0.1235, 4)));
-        assert_eq!(rounded_to_error(1234.56, 34.0, 1), Some((1230.0, 0)));
-        assert_eq!(rounded_to_error(0.123456, f64::NAN, 4), None);
     }
 }

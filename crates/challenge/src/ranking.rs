@@ -7,8 +7,8 @@ use serde::Deserialize;
 use shearq_files::FileError;
 use shearq_results::compare::difference;
 
-use crate::entry::{Entry, EntryInfo};
-use crate::kind::{ConstantShears, RankBy};
+use crate::entry::{Entry, EntryInfo, team_key};
+use crate::kind::{ConstantShears, Noise, Published, RankBy};
 use crate::seal::{BOARD_FILE, Key, read_toml};
 use crate::terms::{Challenge, Deadline};
 
@@ -19,6 +19,8 @@ pub struct Scored<'a> {
     pub number: usize,
     pub value: f64,
     pub error: f64,
+    /// The value as boards print it.
+    pub published: Published,
 }
 
 impl Scored<'_> {
@@ -33,6 +35,10 @@ pub struct Standing<'a> {
     /// Rank of a team, from 1. References and partial entries have none.
     pub rank: Option<usize>,
     pub best: Scored<'a>,
+    /// Whether others have the rank as well.
+    pub shared: bool,
+    /// Another team or reference whose best entry has the same content, in words.
+    pub same_as: Option<String>,
     /// All entries that count, in order of arrival.
     pub entries: Vec<Scored<'a>>,
 }
@@ -65,22 +71,25 @@ impl<'a> Leaderboard<'a> {
 // The entries of each team by board. References, each a team by its hash, have no rank.
 type Teams<'a> = BTreeMap<(Board, bool, &'a str), Vec<Scored<'a>>>;
 
+/// Why an entry that was compared with the true shear has no rank, in the words for its team: what the comparison showed depends
+/// on the truth.
+pub const UNSCORED: &str = "no score after the comparison with the true shear. Try: shearq challenge check before the next entry";
+
 /// Ranks entries, which are in order of arrival. On each board, a team has the rank of its best entry. A team shares the
-/// rank of a better team if the difference of both is below its error, or if both values have the same `digits` decimals.
-/// `constant` has the true shears of sets with one shear each.
+/// rank of a better team if the difference of both is below its error, or if both values are printed alike. `constant` has the
+/// true shears of sets with one shear each, `noise` the errors of a measurement with the noise of the images.
 pub fn rank<'a>(
     entries: &'a [Entry],
     challenge: &Challenge,
     constant: Option<&ConstantShears>,
-    digits: usize,
+    noise: &Noise,
 ) -> Leaderboard<'a> {
     let rules = &challenge.rules;
     let metric = rules.metric;
     let mut leaderboard = Leaderboard::default();
     let mut teams = Teams::new();
-    let mut numbers: BTreeMap<&str, usize> = BTreeMap::new();
-    // Only entries that count make later ones copies, so that nobody can block others with an entry that does not.
-    let mut firsts: BTreeMap<&str, &EntryInfo> = BTreeMap::new();
+    // Contents by team.
+    let mut compared: BTreeMap<&str, BTreeSet<&str>> = BTreeMap::new();
     for entry in entries {
         let info = &entry.info;
         let (value, error) = metric.of(&entry.sets, constant);
@@ -89,41 +98,26 @@ pub fn rank<'a>(
             number: 1,
             value,
             error,
+            published: metric.published(&entry.sets, constant, noise),
         };
-        if info.reference && entry.withdrawn.is_none() {
+        if info.reference && info.scored && entry.withdrawn.is_none() {
             // Each reference has a line.
-            firsts.entry(&info.content).or_insert(info);
             let own = teams.entry((Board::Main, true, info.sha256.as_str()));
             own.or_default().push(result);
             continue;
         }
-        if let Some(opens) = &rules.opens
-            && rules.is_early(info.received)
-        {
-            let reason = format!("received before the challenge opened, {opens}");
-            leaderboard.excluded.push((info, reason));
-            continue;
-        }
-        if let Some(first) = firsts.get(info.content.as_str())
-            && entry.withdrawn.is_none()
-        {
-            let reason = format!(
-                "identical content as the entry of {} of {}",
-                first.team, first.received
-            );
-            leaderboard.excluded.push((info, reason));
-            continue;
-        }
-        // Withdrawn and late entries were scored as well, so they count towards the limit, which protects the truth.
-        let count = numbers.entry(&info.team).or_default();
-        *count += 1;
-        result.number = *count;
+        let own = compared.entry(&info.team).or_default();
+        let is_new = own.insert(&info.content);
+        // Entries that are withdrawn, late or without a score count towards the limit, which protects the truth.
+        result.number = own.len();
         let most = rules
             .entries_per_team
-            .filter(|most| *count > *most as usize);
+            .filter(|most| result.number > *most as usize);
         let reason = match (&entry.withdrawn, most) {
+            _ if !is_new => "identical content as an earlier entry of the team".into(),
             (Some(reason), _) => format!("withdrawn: {reason}"),
             (None, Some(most)) => format!("the team has {most} entries already"),
+            (None, None) if !info.scored => UNSCORED.into(),
             (None, None) => {
                 let late = |closes: &Deadline| info.received > closes.last;
                 let board = match rules.closes.as_ref().is_some_and(late) {
@@ -131,7 +125,6 @@ pub fn rank<'a>(
                     true => Board::Late,
                     false => Board::Main,
                 };
-                firsts.insert(&info.content, info);
                 let team = teams.entry((board, false, info.team.as_str()));
                 team.or_default().push(result);
                 continue;
@@ -139,12 +132,12 @@ pub fn rank<'a>(
         };
         leaderboard.excluded.push((info, reason));
     }
-    leaderboard.standings = standings(teams, metric, digits);
+    leaderboard.standings = standings(teams, metric);
     leaderboard
 }
 
 // The standings of the teams by board, the best first.
-fn standings<'a>(teams: Teams<'a>, metric: RankBy, digits: usize) -> Vec<Standing<'a>> {
+fn standings<'a>(teams: Teams<'a>, metric: RankBy) -> Vec<Standing<'a>> {
     let standing = |((board, reference, _), entries): ((Board, bool, &str), Vec<Scored<'a>>)| {
         // Of equal entries, the first counts.
         let best =
@@ -158,38 +151,82 @@ fn standings<'a>(teams: Teams<'a>, metric: RankBy, digits: usize) -> Vec<Standin
             board,
             rank: (!reference && board != Board::Partial).then_some(0),
             best: best.clone(),
+            shared: false,
+            same_as: None,
             entries,
         })
     };
     let mut standings: Vec<Standing<'a>> = teams.into_iter().filter_map(standing).collect();
-    // Of equal printed values the earlier entry leads, not the copy with a better seventh digit.
+    // Of equal printed values the entry with the earlier receipt leads. Without receipts, times are those of the first `rank`,
+    // and the names of the teams decide who is printed first.
+    let arrival = |of: &Standing<'_>| {
+        let info = of.best.info();
+        (
+            !info.receipt,
+            info.receipt.then_some(info.received),
+            info.team.clone(),
+        )
+    };
     let ahead = |a: &Standing<'_>, b: &Standing<'_>| {
-        let [of_a, of_b] = [a, b].map(|standing| rounded(standing.best.value, digits));
+        let [of_a, of_b] = [a, b].map(|standing| standing.best.published.value);
         let by_value = match metric.larger_is_better() {
             true => of_b.total_cmp(&of_a),
             false => of_a.total_cmp(&of_b),
         };
-        let by_arrival = a.best.info().received.cmp(&b.best.info().received);
-        a.board.cmp(&b.board).then(by_value).then(by_arrival)
+        let by_arrival = || arrival(a).cmp(&arrival(b));
+        a.board.cmp(&b.board).then(by_value).then_with(by_arrival)
     };
     standings.sort_by(ahead);
     for of_board in standings.chunk_by_mut(|a, b| a.board == b.board) {
-        number(of_board, metric, digits);
+        number(of_board, metric);
+        for (standing, same) in same_entries(of_board) {
+            of_board[standing].same_as = Some(same);
+        }
     }
     standings
 }
 
+// Standings with the content of another one, and the words for it. Methods and images determine an entry, so that nobody needs to
+// have copied it.
+fn same_entries(standings: &[Standing<'_>]) -> Vec<(usize, String)> {
+    let mut same = Vec::new();
+    for (k, own) in standings.iter().enumerate() {
+        let info = own.best.info();
+        let mut others = standings
+            .iter()
+            .enumerate()
+            .filter(|(other, _)| *other != k);
+        let Some((_, other)) = others.find(|(_, other)| other.best.info().content == info.content)
+        else {
+            continue;
+        };
+        let other = other.best.info();
+        let first = match info.receipt && other.receipt && other.received < info.received {
+            true => ", which has the earlier receipt",
+            false => "",
+        };
+        let by = match &info.configuration {
+            Some(name) if other.configuration.as_ref() == Some(name) => {
+                format!(", both by shearq's configuration {name}")
+            }
+            _ => String::new(),
+        };
+        same.push((k, format!("same entry as {}{first}{by}", other.team)));
+    }
+    same
+}
+
 // Ranks the standings of a board, which are in order of their values.
-fn number(standings: &mut [Standing<'_>], metric: RankBy, digits: usize) {
+fn number(standings: &mut [Standing<'_>], metric: RankBy) {
     let mut leader: Option<(usize, Scored<'_>)> = None;
     let mut printed = None;
     let mut place = 0;
-    for standing in standings {
+    for standing in standings.iter_mut() {
         let Some(rank) = &mut standing.rank else {
             continue;
         };
         place += 1;
-        let own = Some(rounded(standing.best.value, digits));
+        let own = Some(standing.best.published.value);
         match &leader {
             Some((first, best)) if own == printed || equal(metric, best, &standing.best) => {
                 *rank = *first;
@@ -201,11 +238,14 @@ fn number(standings: &mut [Standing<'_>], metric: RankBy, digits: usize) {
         }
         printed = own;
     }
-}
-
-pub(crate) fn rounded(value: f64, digits: usize) -> f64 {
-    // Printing rounds exactly; a product with a power of ten does not.
-    format!("{value:.digits$}").parse().unwrap_or(value)
+    let ranks: Vec<usize> = standings
+        .iter()
+        .filter_map(|standing| standing.rank)
+        .collect();
+    for standing in standings {
+        let own = ranks.iter().filter(|rank| Some(**rank) == standing.rank);
+        standing.shared = own.count() > 1;
+    }
 }
 
 pub(crate) fn better(metric: RankBy, a: f64, b: f64) -> bool {
@@ -263,7 +303,7 @@ impl Decisions {
             let names = |entry: &Entry| {
                 digits.len() >= MIN_DIGITS
                     && entry.info.sha256.starts_with(digits)
-                    && team.is_none_or(|team| entry.info.team == team)
+                    && team.is_none_or(|team| team_key(&entry.info.team) == team_key(team))
             };
             let named: Vec<usize> = (0..entries.len()).filter(|k| names(&entries[*k])).collect();
             let [entry] = named.as_slice() else {
@@ -286,7 +326,14 @@ impl Decisions {
             .filter(|entry| !entry.info.reference)
             .map(|entry| entry.info.team.clone())
             .collect();
-        if let Some(unknown) = self.aliases.keys().find(|team| !teams.contains(*team)) {
+        let aliases: BTreeMap<String, &String> = self
+            .aliases
+            .iter()
+            .map(|(team, alias)| (team_key(team), alias))
+            .collect();
+        let keys: BTreeSet<String> = teams.iter().map(|team| team_key(team)).collect();
+        let mut named = self.aliases.keys();
+        if let Some(unknown) = named.find(|team| !keys.contains(&team_key(team))) {
             let known: Vec<&str> = teams.iter().map(String::as_str).collect();
             return Err(format!(
                 "`aliases` has an unknown team (found `{unknown}`, expected one of {})",
@@ -295,8 +342,8 @@ impl Decisions {
         }
         let mut names: BTreeMap<String, String> = BTreeMap::new();
         for team in &teams {
-            let name = match (self.aliases.get(team), self.anonymous) {
-                (Some(alias), _) => alias.clone(),
+            let name = match (aliases.get(&team_key(team)), self.anonymous) {
+                (Some(alias), _) => (*alias).clone(),
                 // The name depends neither on the order of arrival nor on the rank, and is the same on every board.
                 (None, true) => format!("team {}", &key.sign("team", &[team])[..6]),
                 (None, false) => team.clone(),
@@ -311,6 +358,7 @@ impl Decisions {
             if self.anonymous {
                 info.method.clear();
                 info.title.clear();
+                info.configuration = None;
             }
         }
         Ok(())
@@ -353,7 +401,10 @@ pub(crate) mod tests {
                 sha256: format!("{team}{received}"),
                 content: format!("{team}{received}"),
                 contents: Contents::Catalogues,
+                configuration: None,
                 reference: team.starts_with("our"),
+                scored: true,
+                findings: Vec::new(),
             },
             sets: vec![record(2, q, replicates)],
             withdrawn: None,
@@ -399,9 +450,15 @@ pub(crate) mod tests {
         board.standings.iter().map(of).collect()
     }
 
-    fn ranks(entries: &[Entry], digits: usize) -> Vec<Option<usize>> {
+    // Values are published to two digits.
+    const NOISE: Noise = Noise {
+        response: 0.005,
+        c: 0.0,
+    };
+
+    fn ranks(entries: &[Entry]) -> Vec<Option<usize>> {
         let challenge = challenge();
-        let board = rank(entries, &challenge, None, digits);
+        let board = rank(entries, &challenge, None, &NOISE);
         board.standings.iter().map(|s| s.rank).collect()
     }
 
@@ -431,7 +488,7 @@ pub(crate) mod tests {
             with("ours", DAY, 99.5, 0.0),
         ];
         let challenge = challenge();
-        let board = rank(&entries, &challenge, None, 1);
+        let board = rank(&entries, &challenge, None, &NOISE);
         // The common noise of 10 does not matter; noise of its own makes B equal to A, but not C.
         let expected = [
             (Board::Main, Some(1), "A", 100.0),
@@ -461,28 +518,24 @@ pub(crate) mod tests {
         );
         let pairs = [18.0, 17.0, 18.0, 17.0, 18.0, 17.0, 18.0, 17.0];
         let honest = with("B", 17.9, &pairs, 1.7);
-        assert_eq!(ranks(&[cheat, honest.clone()], 1), [Some(1), Some(2)]);
+        assert_eq!(ranks(&[cheat, honest.clone()]), [Some(1), Some(2)]);
         // An entry with much noise does not share the first rank, one within the errors does.
         let (noisy, near) = (
             with("C", 10.0, &[10.0], 15.0),
             with("D", 16.0, &[16.0], 1.7),
         );
-        assert_eq!(
-            ranks(&[honest, noisy, near], 1),
-            [Some(1), Some(1), Some(3)]
-        );
+        assert_eq!(ranks(&[honest, noisy, near]), [Some(1), Some(1), Some(3)]);
     }
 
     #[test]
     fn without_errors_printed_values_rank() {
         let of = [
             ("A", DAY, 2.04),
-            ("B", DAY, 1.96),
-            ("C", DAY, 1.94),
-            ("D", DAY, 1.94),
+            ("B", DAY, 2.03),
+            ("C", DAY, 1.91),
+            ("D", DAY, 1.9),
         ];
-        assert_eq!(ranks(&entries(of), 1), [1, 1, 3, 3].map(Some));
-        assert_eq!(ranks(&entries(of), 2), [1, 2, 3, 3].map(Some));
+        assert_eq!(ranks(&entries(of)), [1, 1, 3, 3].map(Some));
     }
 
     #[test]
@@ -491,43 +544,70 @@ pub(crate) mod tests {
             ("in time", "2026-11-30T23:59:59Z", 3.0),
             ("late", "2026-12-01T00:00:00Z", 4.0),
             ("far", "9999-12-30T00:00:00Z", 5.0),
-            ("early", "2026-10-31T23:59:59Z", 6.0),
         ]);
-        let mut challenge = challenge();
-        challenge.rules.opens = "2026-11-01".parse().ok();
-        let board = rank(&entries, &challenge, None, 1);
+        let challenge = challenge();
+        let board = rank(&entries, &challenge, None, &NOISE);
         let expected = [
             (Board::Main, Some(1), "in time", 3.0),
             (Board::Late, Some(1), "far", 5.0),
             (Board::Late, Some(2), "late", 4.0),
         ];
         assert_eq!(found(&board), expected);
-        let early = "received before the challenge opened, 2026-11-01 (UTC)";
-        assert_eq!(reasons(&board), [early]);
     }
 
     #[test]
-    fn only_entries_that_count_make_others_copies() {
+    fn identical_content_shares_a_rank() {
         let mut entries = entries([
-            ("Early", "2026-10-31", 3.0),
             ("Withdrawn", "2026-11-20", 3.0),
             ("Owner", "2026-11-21", 3.0),
-            ("Copy", "2026-11-22", 3.0),
+            ("Other", "2026-11-22", 3.0),
             ("Owner", "2026-11-23", 3.0),
-            ("Owner", "2026-11-24", 4.0),
         ]);
-        for entry in &mut entries[..5] {
+        for entry in &mut entries {
             entry.info.content = "same".into();
+            entry.info.configuration = Some("48/linear/star".into());
         }
-        entries[1].withdrawn = Some("a mistake".into());
-        let mut challenge = challenge();
-        challenge.rules.opens = "2026-11-01".parse().ok();
-        let board = rank(&entries, &challenge, None, 1);
-        // Two entries per team: the team's own copy is none of them.
-        assert_eq!(found(&board), [(Board::Main, Some(1), "Owner", 4.0)]);
-        let early = "received before the challenge opened, 2026-11-01 (UTC)";
-        let copy = "identical content as the entry of Owner of 2026-11-21T10:00:00Z";
-        assert_eq!(reasons(&board), [early, "withdrawn: a mistake", copy, copy]);
+        entries[0].withdrawn = Some("a mistake".into());
+        let challenge = challenge();
+        let same = |entries: &[Entry]| -> Vec<String> {
+            let board = rank(entries, &challenge, None, &NOISE);
+            let reasons = reasons(&board);
+            let own = "identical content as an earlier entry of the team";
+            assert_eq!(reasons, ["withdrawn: a mistake", own]);
+            let of = |s: &Standing<'_>| {
+                assert_eq!((s.rank, s.shared), (Some(1), true));
+                format!("{}: {}", s.best.info().team, s.same_as.clone().unwrap())
+            };
+            board.standings.iter().map(of).collect()
+        };
+        let by = ", both by shearq's configuration 48/linear/star";
+        // Without receipts the name decides who is printed first, and not the time of `rank`.
+        let other = format!("Other: same entry as Owner{by}");
+        let owner = format!("Owner: same entry as Other{by}");
+        assert_eq!(same(&entries), [other.clone(), owner.clone()]);
+        for entry in &mut entries {
+            entry.info.receipt = true;
+        }
+        let later = format!("Other: same entry as Owner, which has the earlier receipt{by}");
+        assert_eq!(same(&entries), [owner, later]);
+    }
+
+    #[test]
+    fn entries_without_a_score_count_towards_the_limit() {
+        let mut entries = entries([
+            ("A", "2026-11-20", 3.0),
+            ("A", "2026-11-21", 2.0),
+            ("A", "2026-11-22", 9.0),
+        ]);
+        for entry in &mut entries[..2] {
+            entry.info.scored = false;
+            entry.info.findings = vec!["secret".into()];
+        }
+        let challenge = challenge();
+        let board = rank(&entries, &challenge, None, &NOISE);
+        assert!(board.standings.is_empty());
+        let limit = "the team has 2 entries already";
+        assert_eq!(reasons(&board), [UNSCORED, UNSCORED, limit]);
     }
 
     #[test]
@@ -547,7 +627,7 @@ pub(crate) mod tests {
             entry.sets.push(more);
         }
         entries[0].withdrawn = Some("a mistake".into());
-        let board = rank(&entries, &challenge, None, 1);
+        let board = rank(&entries, &challenge, None, &NOISE);
         let expected = [
             (Board::Main, Some(1), "A", 2.0),
             (Board::Main, Some(2), "B", 1.0),

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 
 use hmac::{Hmac, KeyInit, Mac};
 use jiff::Timestamp;
-use serde::de::{DeserializeOwned, IgnoredAny};
+use serde::de::DeserializeOwned;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use shearq_dataset::fingerprint::hex;
@@ -18,6 +18,7 @@ use shearq_files::{FileError, atomic, open};
 use shearq_results::submit::FileSum;
 
 use crate::error::ChallengeError;
+use crate::kind::Noise;
 use crate::terms::{CHALLENGE_FILE, Challenge};
 
 /// Checksums of the public files, in the format of `sha256sum`.
@@ -42,9 +43,9 @@ pub struct Key {
     /// SHA-256 of [`SUMS_FILE`] in the public folder; absent until that folder is complete.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub public: Option<String>,
-    // Keys of version 0.2 and earlier have it, and it is not used any more.
-    #[serde(default, skip_serializing)]
-    expected: IgnoredAny,
+    /// Errors below which no value is published; absent until the images were measured.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub noise: Option<Noise>,
     #[serde(default)]
     pub files: Sums,
 }
@@ -57,7 +58,7 @@ impl Key {
             seed: seed.map(|seed| seed.to_string()),
             secret: hex(&rand::random::<[u8; 32]>()),
             public: None,
-            expected: IgnoredAny,
+            noise: None,
             files: Sums::new(),
         }
     }
@@ -320,10 +321,18 @@ impl Receipt {
         )
     }
 
+    const ENDING: &str = ".receipt.toml";
+
     pub fn path(entry: &Path) -> PathBuf {
         let mut name = entry.file_name().unwrap_or_default().to_owned();
-        name.push(".receipt.toml");
+        name.push(Receipt::ENDING);
         entry.with_file_name(name)
+    }
+
+    /// The entry whose receipt has this path.
+    pub fn entry_of(receipt: &Path) -> Option<PathBuf> {
+        let name = receipt.file_name()?.to_str()?;
+        Some(receipt.with_file_name(name.strip_suffix(Receipt::ENDING)?))
     }
 
     pub fn read(key: &Key, entry: &Path, sha256: &str) -> Result<Option<Self>, FileError> {

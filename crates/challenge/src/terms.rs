@@ -9,10 +9,11 @@ use jiff::civil::Date;
 use jiff::tz::TimeZone;
 use jiff::{Timestamp, ZonedDateTime};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
+use shearq_dataset::layout::{MAX_IMAGE, MAX_SET};
 use shearq_files::{FileError, open};
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_results::submit::check::Expected;
-use shearq_results::submit::{Contents, Packed, Submission};
+use shearq_results::submit::{Contents, Packed, Sent, Submission};
 use shearq_scoring::Grid;
 use shearq_submissions::{check_name, checked_name};
 
@@ -51,8 +52,19 @@ pub struct Data {
 }
 
 impl Data {
+    fn files(&self) -> u64 {
+        self.sets.len() as u64 * u64::from(self.images)
+    }
+
     pub fn galaxies(&self) -> u64 {
-        self.sets.len() as u64 * u64::from(self.images) * (self.grid as u64).pow(2)
+        self.files()
+            .saturating_mul((self.grid as u64).saturating_pow(2))
+    }
+
+    /// Bytes of the largest valid entry, unpacked.
+    pub fn largest_entry(&self) -> u64 {
+        let rows = self.galaxies().saturating_mul(BYTES_PER_ROW);
+        (FREE_BYTES + self.files() * BYTES_PER_FILE).saturating_add(rows)
     }
 
     pub fn grid(&self) -> Result<Grid, shearq_scoring::ScoringError> {
@@ -63,6 +75,13 @@ impl Data {
         )
     }
 }
+
+// Four numbers of 24 characters, which is the longest that a 64-bit number has, and four separators, rounded up.
+const BYTES_PER_ROW: u64 = 128;
+// A header, its line in the manifest, and what tar adds; a spectrum with its covariances. Chosen by hand.
+const BYTES_PER_FILE: u64 = 1 << 12;
+// Licences and notes beside the files. Chosen by hand.
+const FREE_BYTES: u64 = 1 << 20;
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -93,6 +112,11 @@ impl Rules {
             None => Some("any number".into()),
             Some(most) => (most >= TUNING_ENTRIES).then(|| most.to_string()),
         }
+    }
+
+    /// Whether entries are still accepted, so that the truth has to stay secret.
+    pub fn is_open(&self, now: Timestamp) -> bool {
+        self.closes.as_ref().is_none_or(|closes| now <= closes.last)
     }
 
     pub fn is_early(&self, received: Timestamp) -> bool {
@@ -141,6 +165,14 @@ impl Challenge {
         Ok(challenge)
     }
 
+    /// Opens an entry: a folder, or an archive that unpacks to the size of the largest entry at most.
+    pub fn open(&self, entry: &Path) -> Result<Sent, FileError> {
+        match entry.is_dir() {
+            true => Ok(Sent::in_place(entry)),
+            false => Sent::unpacked(entry, Some(self.data.largest_entry())),
+        }
+    }
+
     pub fn expected(&self) -> Result<Expected, FileError> {
         let Data { sets, images, .. } = &self.data;
         let grid = self.data.grid();
@@ -157,8 +189,19 @@ impl Challenge {
 
     fn check(&self) -> Result<(), String> {
         let Data { sets, images, .. } = &self.data;
-        if sets.is_empty() || !sets.is_sorted_by(|a, b| a < b) || *images == 0 {
-            return Err("`data`: expected ascending `sets` and at least one image".into());
+        if sets.is_empty() || !sets.is_sorted_by(|a, b| a < b) {
+            return Err("`data.sets`: expected ascending numbers".into());
+        }
+        // Names of files have no larger ones.
+        for (name, found, most) in [
+            ("sets", sets[sets.len() - 1], MAX_SET),
+            ("images", *images, MAX_IMAGE),
+        ] {
+            if found > most || found == 0 {
+                return Err(format!(
+                    "`data.{name}`: found {found}, expected 1 to {most}"
+                ));
+            }
         }
         self.data
             .grid()
