@@ -53,8 +53,8 @@ enum Command {
 /// the true shear, the intrinsic shapes, the seed and the settings. The public folder does not determine the private
 /// folder.
 ///
-/// The images are simulated (--sets), or copied from another simulator (--data). The same command resumes a stopped
-/// simulation.
+/// The images are simulated (--sets), with a seed of 128 bits that is drawn and kept in the private folder, or copied from
+/// another simulator (--data). The same command resumes a stopped simulation.
 #[derive(Debug, Args)]
 #[command(group = ArgGroup::new("source").required(true).args(["sets", "data"]))]
 struct NewArguments {
@@ -95,14 +95,11 @@ struct NewArguments {
         allow_hyphen_values = true
     )]
     tilt: Option<f64>,
-    /// Seed of all random numbers [default: from the operating system].
-    #[arg(long, value_name = "SEED", conflicts_with = "data")]
-    seed: Option<u64>,
     /// Data folder with images and PSFs of another simulator. Pixels are copied under new headers.
     #[arg(long, value_name = "DIR")]
     data: Option<PathBuf>,
     /// Tables of the true shear of --data: x, y, g1, g2, with `{set}` for the set number [default: as in the data folder].
-    #[arg(long, value_name = "PATTERN", requires = "data", conflicts_with_all = ["sets", "images", "grid", "amplitude", "tilt", "seed"])]
+    #[arg(long, value_name = "PATTERN", requires = "data", conflicts_with_all = ["sets", "images", "grid", "amplitude", "tilt"])]
     truth_table: Option<String>,
     /// Metric that ranks entries [default: q-calibrated, or qc if each set has one shear].
     ///
@@ -234,9 +231,6 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     }
 }
 
-// Seeds below this can be found by trying all of them, because a seed determines every public image.
-const MIN_SEED: u64 = 1 << 40;
-
 fn new(arguments: &NewArguments) -> anyhow::Result<()> {
     mark_resumable();
     let plan = Plan {
@@ -265,13 +259,7 @@ fn new(arguments: &NewArguments) -> anyhow::Result<()> {
                 grid: arguments.grid.map_or(100, usize::from),
                 amplitude: arguments.amplitude,
                 tilt: arguments.tilt,
-                seed: arguments.seed,
             };
-            if let Some(seed) = arguments.seed.filter(|seed| *seed < MIN_SEED) {
-                tell(format_args!(
-                    "warning: participants can find the seed by trying (found {seed}, expected at least {MIN_SEED}). Try: without --seed"
-                ));
-            }
             let galaxies =
                 u64::from(images) * (simulation.sets.len() * simulation.grid.pow(2)) as u64;
             let mut bar = Bar::new("simulating", galaxies);
@@ -287,6 +275,13 @@ fn new(arguments: &NewArguments) -> anyhow::Result<()> {
         _ => anyhow::bail!("cannot determine the data. Try: --sets LIST --images N, or --data DIR"),
     };
     let (data, rules) = (&challenge.data, &challenge.rules);
+    if let Some(closes) = &rules.closes
+        && !rules.is_open(now())
+    {
+        tell(format_args!(
+            "warning: --closes {closes} is in the past, so that all entries without an earlier receipt are late"
+        ));
+    }
     if let Some(found) = rules.tunable_entries() {
         tell(format_args!(
             "warning: a team can tune {} to the truth with {TUNING_ENTRIES} entries (found {found} per team). Try: --entries-per-team {}",

@@ -6,13 +6,19 @@ use std::path::Path;
 
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use shearq_challenge::create::seed_of;
 
 use crate::support::{Folder, assert_has, contents};
 
 /// Name of the challenges.
 const NAME: &str = "pilot";
-const SEED: u64 = 9_876_543_210_123_456_789;
+const SEED: u128 = 0x8912_3f0c_77aa_5e13_0d5b_9c41_e862_f3b7;
+
+/// Leaves a private folder with a seed, as a `challenge new` that was stopped.
+fn with_seed(private: &Path, seed: u128) {
+    fs::create_dir(private).unwrap();
+    let key = format!("name = {NAME:?}\nversion = 1\nseed = \"{seed}\"\nsecret = \"00\"\n");
+    fs::write(private.join("key.toml"), key).unwrap();
+}
 
 /// Every way in which a file could contain these numbers: texts, and pairs of 32-bit words.
 fn secrets(private: &Path, seeds: &[u64]) -> (HashSet<String>, HashSet<u64>) {
@@ -72,10 +78,11 @@ fn leaks(public: &Path, (texts, words): &(HashSet<String>, HashSet<u64>)) -> Vec
 fn public_files_contain_no_true_shear_and_no_seed() {
     let folder = Folder::new();
     let size = "--sets 2,8 --images 8 --grid 12 --amplitude 100 --metric q --spectra";
-    let new = format!("challenge new --name {NAME} {size} --seed {SEED}");
+    with_seed(&folder.at("private"), SEED);
+    let new = format!("challenge new --name {NAME} {size}");
     folder.run(&format!("{new} --public public --private private"));
     let (public, private) = (folder.at("public"), folder.at("private"));
-    let secrets = secrets(&private, &[SEED, seed_of(NAME, 1, SEED)]);
+    let secrets = secrets(&private, &[SEED as u64, (SEED >> 64) as u64]);
     assert_eq!(leaks(&public, &secrets), Vec::<String>::new());
     // The search finds what an ordinary simulation reveals.
     assert!(leaks(&private, &secrets).len() > 10);
@@ -97,7 +104,7 @@ fn public_files_contain_no_true_shear_and_no_seed() {
     }
 }
 
-/// The seed below a million with which `simulate` makes the PSF of set 2, tried as it is and as a challenge derives it.
+/// The seed below a million with which `simulate` makes the PSF of set 2.
 fn guessed(public: &Path) -> Option<u64> {
     let table = fs::read_to_string(public.join("set02/psf-001.csv")).unwrap();
     let row: Vec<&str> = table.lines().nth(1).unwrap().split(',').collect();
@@ -112,7 +119,7 @@ fn guessed(public: &Path) -> Option<u64> {
         let drawn: f64 = ChaCha8Rng::from_seed(key).random_range(0.0..std::f64::consts::TAU);
         (drawn - angle).abs() < 1e-9
     };
-    (0..1_000_000).find(|&seed| agrees(seed) || agrees(seed_of(NAME, 1, seed)))
+    (0..1_000_000).find(|&seed| agrees(seed))
 }
 
 #[test]
@@ -120,22 +127,18 @@ fn no_small_seed_regenerates_the_public_files() {
     let folder = Folder::new();
     folder.run("simulate --fixed-psf one --sets 2 --images 1 --grid 8 --seed 4321 --out data");
     assert_eq!(guessed(&folder.at("data")), Some(4321));
-    let new = |name: &str, place: &str, more: &str| {
+    // 64 bits alone, as earlier versions drew them, and both halves.
+    let image = |place: &str, seed: u128| {
+        with_seed(&folder.at(&format!("{place}-truth")), seed);
         let size = "--sets 2 --images 8 --grid 20 --amplitude 30";
         let folders = format!("--public {place} --private {place}-truth");
-        let said = folder.said(&format!(
-            "challenge new --name {name} {size} {folders} {more}"
-        ));
-        (folder.at(place), said)
+        folder.run(&format!("challenge new --name {NAME} {size} {folders}"));
+        let first = fs::read(folder.at(place).join("set02/galaxies-001.fits")).unwrap();
+        (guessed(&folder.at(place)), first)
     };
-    let (weak, warned) = new(NAME, "weak", "--seed 77");
-    assert_eq!(guessed(&weak), Some(77));
-    assert_has(&warned, "participants can find the seed by trying");
-    let (strong, warned) = new(NAME, "strong", "");
-    assert_eq!(guessed(&strong), None);
-    assert!(!warned.contains("warning"), "{warned}");
-    // Two challenges without a seed, and two with one seed and other names, have different noise.
-    let image = |folder: &Path| fs::read(folder.join("set02/galaxies-001.fits")).unwrap();
-    assert_ne!(image(&strong), image(&new(NAME, "other", "").0));
-    assert_ne!(image(&weak), image(&new("second", "second", "--seed 77").0));
+    let (low, of_low) = image("low", 77);
+    let (high, of_high) = image("high", 77 | 1 << 64);
+    let (highest, of_highest) = image("highest", 77 | 1 << 127);
+    assert_eq!([low, high, highest], [Some(77), None, None]);
+    assert!(of_low != of_high && of_high != of_highest && of_low != of_highest);
 }

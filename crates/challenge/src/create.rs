@@ -6,7 +6,7 @@ use sha2::{Digest, Sha256};
 use shearq_dataset::grid::{read_psfs, write_psfs};
 use shearq_dataset::images::{self, ImageId};
 use shearq_dataset::layout::{DataFolder, LAYOUT_FILE, Layout, fill};
-use shearq_dataset::run::SimulationRecord;
+use shearq_dataset::run::{SIMULATION_FILE, SimulationRecord};
 use shearq_dataset::threads::{Progress, Quiet};
 use shearq_dataset::truth::{ReadTruth, Reading, grid_of_set, read_truth, reading_of, write_truth};
 use shearq_files::fits::{ImageReader, ImageWriter, Value};
@@ -52,7 +52,6 @@ pub struct Simulation {
     pub amplitude: Option<f64>,
     /// Extra slope of the shear power; `None` to draw it from the seed.
     pub tilt: Option<f64>,
-    pub seed: Option<u64>,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -122,20 +121,13 @@ impl Folders<'_> {
     }
 }
 
-/// The seed of a simulation. It depends on name and version, so that two challenges with one seed have different noise.
-///
-/// The first 64 bits of SHA-256("shearq challenge", name, version, seed), with a zero byte after each part.
-pub fn seed_of(name: &str, version: u32, seed: u64) -> u64 {
-    let text = format!("shearq challenge\0{name}\0{version}\0{seed}\0");
-    let digest = Sha256::digest(text.as_bytes());
-    digest[..8]
+// A number between 0 and 1 that a seed determines, for each purpose: from the first 64 bits of a SHA-256.
+fn drawn(seed: u128, purpose: &str) -> f64 {
+    let digest = Sha256::digest(format!("shearq challenge\0{purpose}\0{seed}\0"));
+    let bits = digest[..8]
         .iter()
-        .fold(0, |seed, byte| seed << 8 | u64::from(*byte))
-}
-
-// A number between 0 and 1 that a seed determines, for each purpose.
-fn drawn(seed: u64, purpose: &str) -> f64 {
-    seed_of(purpose, 0, seed) as f64 / 2f64.powi(64)
+        .fold(0, |bits, byte| bits << 8 | u64::from(*byte));
+    bits as f64 / 2f64.powi(64)
 }
 
 /// Writes a challenge of simulated images. The same command resumes a stopped one. Returns the description.
@@ -150,33 +142,30 @@ pub fn simulated(
     if simulation.amplitude == Some(0.0) {
         return Err(ChallengeError::NoShear);
     }
+    let one_shear_per_set = plan.kind == Kind::Great3;
+    if one_shear_per_set && (simulation.amplitude.is_some() || simulation.tilt.is_some()) {
+        return Err(ChallengeError::NoSpectrum);
+    }
     let earlier = folders.prepare(plan)?;
     let kept = earlier
         .as_ref()
         .and_then(|key| key.seed.as_ref()?.parse().ok());
-    if let (Some(kept), Some(seed)) = (kept, simulation.seed)
-        && kept != seed
-    {
-        let message = "the key has another seed. Try: without --seed, or another folder";
-        return Err(FileError::new(folders.private, message).into());
-    }
-    let seed: u64 = kept.or(simulation.seed).unwrap_or_else(rand::random);
+    let seed: u128 = kept.unwrap_or_else(rand::random);
     let key = earlier.unwrap_or_else(|| Key::new(&plan.name, plan.version, Some(seed)));
-    let secret = seed_of(&plan.name, plan.version, seed);
     let (least, most) = AMPLITUDES;
     let settings = SimulationSettings {
+        seed_high: (seed >> 64) as u64,
         spectrum: ShearSpectrum {
             amplitude: simulation
                 .amplitude
-                .unwrap_or_else(|| least * (most / least).powf(drawn(secret, "amplitude"))),
+                .unwrap_or_else(|| least * (most / least).powf(drawn(seed, "amplitude"))),
             tilt: simulation
                 .tilt
-                .unwrap_or_else(|| TILT * (2.0 * drawn(secret, "tilt") - 1.0)),
+                .unwrap_or_else(|| TILT * (2.0 * drawn(seed, "tilt") - 1.0)),
             scatter: SCATTER,
         },
-        // Participants download half as much as with a star for each galaxy.
-        fixed_psf: FixedPsf::One,
-        ..SimulationSettings::new(secret, simulation.grid)
+        one_shear_per_set,
+        ..SimulationSettings::new(seed as u64, simulation.grid)
     };
     settings.validate()?;
     key.write(folders.private)?;
@@ -217,6 +206,13 @@ pub fn of_images(
 ) -> Result<Challenge, ChallengeError> {
     plan.check()?;
     let about = about(data)?;
+    let first = data.galaxies(about.sets[0], 1);
+    if is_there(&data.root().join(SIMULATION_FILE))
+        || ImageReader::open(&first)?.number("SEED")?.is_some()
+    {
+        let message = "these images were made by `simulate`; their noise is a function of a seed that participants can find by trying, and with it the shear. Try: --sets LIST --images N in place of --data, which draws 128 bits";
+        return Err(FileError::new(first, message).into());
+    }
     let earlier = folders.prepare(plan)?;
     let key = earlier.unwrap_or_else(|| Key::new(&plan.name, plan.version, None));
     key.write(folders.private)?;

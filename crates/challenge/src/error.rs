@@ -33,6 +33,10 @@ pub enum ChallengeError {
     )]
     NoShear,
     #[error(
+        "--amplitude and --tilt are those of a field of shears, but --kind great3 has one shear per set. Try: without them"
+    )]
+    NoSpectrum,
+    #[error(
         "--closes: the last day is before the first one (found {closes}, expected {opens} or later)"
     )]
     ClosesFirst { opens: Deadline, closes: Deadline },

@@ -35,7 +35,7 @@ pub type Sums = BTreeMap<String, String>;
 pub struct Key {
     pub name: String,
     pub version: u32,
-    /// Seed as text, because TOML has no 64-bit unsigned numbers; absent for images of another simulator.
+    /// 128 random bits as text, because TOML has no such numbers; absent for images of another simulator.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub seed: Option<String>,
     /// 256 random bits in hexadecimal digits, which sign receipts and the private checksums.
@@ -51,7 +51,7 @@ pub struct Key {
 }
 
 impl Key {
-    pub fn new(name: &str, version: u32, seed: Option<u64>) -> Self {
+    pub fn new(name: &str, version: u32, seed: Option<u128>) -> Self {
         Key {
             name: name.into(),
             version,

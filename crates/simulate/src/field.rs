@@ -1,5 +1,7 @@
 //! Gaussian random ellipticity fields on a grid, from E- and B-mode power spectra.
 
+use std::f64::consts::TAU;
+
 use ndarray::Array2;
 use rand::{Rng, RngExt};
 use rand_distr::{Distribution, StandardNormal};
@@ -24,8 +26,18 @@ const FIDUCIAL: [(f64, f64); 12] = [
     (5000.0, 7.71e-5),
 ];
 
+// Moduli of constant shears in GREAT3.
+const SHEARS: (f64, f64) = (0.01, 0.05);
+
 // Multipole whose power a tilt leaves unchanged. Chosen by hand.
 const PIVOT: f64 = 1000.0;
+
+/// A shear for all galaxies, uniform over the ring of GREAT3.
+pub(crate) fn random_shear(rng: &mut impl Rng) -> Complex64 {
+    let (low, high) = SHEARS;
+    let modulus = rng.random_range(low * low..high * high).sqrt();
+    Complex64::from_polar(modulus, rng.random_range(0.0..TAU))
+}
 
 /// The shear power spectrum of a set: the fiducial one times amplitude·(ℓ/1000)^tilt, and in each bandpower of the scoring
 /// times a random factor.

@@ -18,7 +18,7 @@ use shearq_quantities::{FunctionalPsf, PsfProfile};
 use shearq_scoring::modes::Decomposer;
 use shearq_scoring::{Bins, Definition, Grid, TrueShear};
 
-use super::field::{Content, ShearSpectrum, random_field};
+use super::field::{Content, ShearSpectrum, random_field, random_shear};
 use super::galaxy::Galaxy;
 use super::kinds::{ImageType, SetKind, Variability};
 use super::noise::add_noise;
@@ -69,6 +69,9 @@ const SCATTERS: RangeInclusive<f64> = 1.0..=100.0;
 #[serde(remote = "Self", deny_unknown_fields)]
 pub struct SimulationSettings {
     pub seed: u64,
+    /// 64 more bits of the seed of a blind challenge, so that nobody finds it by trying.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub seed_high: u64,
     pub grid: usize,
     pub spectrum: ShearSpectrum,
     /// Standard deviation of each component of the intrinsic ellipticities (shear-type).
@@ -76,29 +79,16 @@ pub struct SimulationSettings {
     /// The shear [g1, g2] of all galaxies, instead of a field drawn from `spectrum`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub constant_shear: Option<[f64; 2]>,
-    /// What images of sets with fixed PSFs share.
-    #[serde(default, skip_serializing_if = "FixedPsf::is_one")]
-    pub fixed_psf: FixedPsf,
+    /// Whether each set has one shear, drawn as in GREAT3, instead of a field.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub one_shear_per_set: bool,
     /// Whether all galaxies are turned by 90 degrees before lensing. Noise and centres stay as they are.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub rotated: bool,
 }
 
-/// What all images of a set with fixed PSFs share.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum FixedPsf {
-    /// A PSF field that varies over the image, as in GREAT10: Nurbaeva et al., Table 2 and Sects. 5.1 and 5.3.
-    Field,
-    /// One PSF of all galaxies. Records without the setting mean this one.
-    #[default]
-    One,
-}
-
-impl FixedPsf {
-    fn is_one(&self) -> bool {
-        *self == FixedPsf::One
-    }
+fn is_zero(number: &u64) -> bool {
+    *number == 0
 }
 
 impl Serialize for SimulationSettings {
@@ -132,11 +122,12 @@ impl SimulationSettings {
     pub fn new(seed: u64, grid: usize) -> Self {
         SimulationSettings {
             seed,
+            seed_high: 0,
             grid,
             spectrum: ShearSpectrum::default(),
             intrinsic_sigma: DEFAULT_INTRINSIC_SIGMA,
             constant_shear: None,
-            fixed_psf: FixedPsf::Field,
+            one_shear_per_set: false,
             rotated: false,
         }
     }
@@ -144,6 +135,7 @@ impl SimulationSettings {
     pub fn validate(&self) -> Result<(), SettingsError> {
         let &SimulationSettings {
             seed: _,
+            seed_high: _,
             grid,
             spectrum:
                 ShearSpectrum {
@@ -153,7 +145,7 @@ impl SimulationSettings {
                 },
             intrinsic_sigma,
             constant_shear,
-            fixed_psf: _,
+            one_shear_per_set: _,
             rotated: _,
         } = self;
         if let Some([g1, g2]) = constant_shear {
@@ -197,7 +189,11 @@ impl SimulationSettings {
     }
 
     fn stream(&self, set: u32, image: u32, purpose: Purpose) -> ChaCha8Rng {
-        stream([self.seed, u64::from(set), u64::from(image), purpose as u64])
+        // Numbers of sets and images have 32 bits.
+        let high = |number: u32, bits: u64| u64::from(number) | bits << 32;
+        let set = high(set, self.seed_high);
+        let image = high(image, self.seed_high >> 32);
+        stream([self.seed, set, image, purpose as u64])
     }
 }
 
@@ -261,6 +257,10 @@ impl SetSimulator {
         let decomposer = Decomposer::new(grid);
         let shear = match settings.constant_shear {
             Some([g1, g2]) => Array2::from_elem((grid.n, grid.n), Complex64::new(g1, g2)),
+            None if settings.one_shear_per_set => {
+                let mut rng = settings.stream(kind.set, WHOLE_SET, Purpose::Shear);
+                Array2::from_elem((grid.n, grid.n), random_shear(&mut rng))
+            }
             None => {
                 let mut rng = settings.stream(kind.set, WHOLE_SET, Purpose::Bandpowers);
                 // From a stream of their own: the field of a scatter of one is that of simulations without scatter.

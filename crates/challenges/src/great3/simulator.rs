@@ -19,16 +19,15 @@ use shearq_scoring::great3::{
 use shearq_scoring::modes::Decomposer;
 use shearq_scoring::{Complex64, Grid, ScoringError};
 
-use shearq_simulate::add_noise;
-use shearq_simulate::field::{Content, ShearSpectrum, random_field};
-use shearq_simulate::galaxy::{Component, Galaxy, GalaxyError, Sersic};
-use shearq_simulate::render::{RenderScratch, Renderer};
-use shearq_simulate::set::{MAX_INTRINSIC_MODULUS, NYQUIST_SHARE, stream};
-use shearq_simulate::signal::power;
+use crate::field::{Content, ShearSpectrum, random_field, random_shear};
+use crate::galaxy::{Component, Galaxy, GalaxyError, Sersic};
+use crate::noise::add_noise;
+use crate::render::{RenderScratch, Renderer};
+use crate::set::{MAX_INTRINSIC_MODULUS, NYQUIST_SHARE, stream};
+use crate::signal::power;
 
 // Galaxies, epochs and stars are off the centres of their stamps by up to this on each axis.
 const MAX_OFFSET_PX: f64 = 1.0;
-const SHEARS: (f64, f64) = (0.01, 0.05);
 // Doubled by the organisers, so that Q_v is more sensitive to m.
 const SPECTRUM_AMPLITUDE: f64 = 2.0;
 const SEEING_ARCSEC: (f64, f64) = (0.5, 0.85);
@@ -287,10 +286,7 @@ impl BranchSimulator {
                 .collect();
         } else {
             let mut rng = self.stream(number, 0, Purpose::Shear);
-            // Uniform over a ring.
-            let (low, high) = SHEARS;
-            let modulus = Self::uniform(&mut rng, (low * low, high * high)).sqrt();
-            let g = Complex64::from_polar(modulus, rng.random_range(0.0..TAU));
+            let g = random_shear(&mut rng);
             let g = if self.opposite { -g } else { g };
             constant_shear = Some(Shear::new(g.re, g.im));
             galaxies.shuffle(&mut self.stream(number, 0, Purpose::Places));
