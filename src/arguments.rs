@@ -446,7 +446,6 @@ choices! {
         M: "m", "Modulus of the multiplicative bias";
         C: "c", "Modulus of the additive bias, divided by the response";
         Qc: "qc", "GREAT3's Q_c, from m and c of sets with one shear each";
-        Noise: "noise", "Noise of one galaxy's ellipticity";
     }
     Contents {
         Catalogues: "catalogues", "Ellipticity catalogues";

@@ -139,7 +139,7 @@ struct NewArguments {
 
 /// Check an entry, without the true shear.
 ///
-/// ENTRY is an archive (.tar.gz) or a folder of catalogues or power spectra. Grid, sets and conventions come from
+/// ENTRY is an archive (.tar.gz, .zip) or a folder of catalogues or power spectra. Grid, sets and conventions come from
 /// challenge.toml. If the images are there, they are measured for comparison, in the time of `48/linear/star`. This finds
 /// swapped or flipped components, exchanged rows, images without measured shapes, and distortions that are given as
 /// shear. Images that differ from SHA256SUMS and symbolic links are refused.
@@ -168,14 +168,17 @@ struct CheckArguments {
 
 /// Check, score and rank entries.
 ///
-/// INBOX is an archive, a folder of catalogues or power spectra, or a folder of such. A folder in an inbox is the name of
-/// the team of all entries in it. An entry that cannot be scored is listed with the reason.
+/// INBOX is an archive (.tar.gz, .zip), a folder of catalogues or power spectra, or a folder of such. A folder in an inbox
+/// is the name of the team of all entries in it. Files that are no entries are listed.
 ///
-/// Every scored entry is kept in the results store. Later runs score only new entries, so a stopped run continues, and
-/// several processes may share a store. Without INBOX, the store alone is ranked.
+/// Every entry that is compared with the true shear counts towards the limit of its team and is kept in the results
+/// store. Later runs score only new entries, so a stopped run continues, and several processes may share a store.
+/// Without INBOX, the store alone is ranked. Until the challenge closes, the table has the rank metric alone, rounded to
+/// its error; --detail shows you more.
 ///
-/// The time of an entry is that of its receipt, which `check --truth` signs, or the time at which `rank` first scored it.
-/// board.toml in the private folder withdraws entries and names teams (docs/run-a-challenge.md).
+/// The time of an entry is that of its receipt, which `check --truth` signs, that of --received, or the time at which
+/// `rank` first scored it. board.toml in the private folder withdraws entries and names teams
+/// (docs/run-a-challenge.md).
 #[derive(Debug, Args)]
 struct RankArguments {
     /// Entries: archives, or folders of entries.
@@ -196,8 +199,8 @@ struct RankArguments {
     /// Write the leaderboard to this HTML file, and as CSV and JSON with the same name.
     #[arg(long, value_name = "FILE", value_parser = page)]
     report: Option<PathBuf>,
-    /// Make table, page and messages for you alone: with all metrics, those of single sets, and what the comparison with the true
-    /// shear showed. Only you can read the files.
+    /// Make table, page and messages for you alone: with all metrics, those of single sets, and what the comparison with
+    /// the true shear showed. Only you can read the files.
     #[arg(long)]
     detail: bool,
     /// When entries without a receipt arrived: a day in UTC, a moment with its zone, or `files` for the time of each file

@@ -13,11 +13,9 @@ use shearq_dataset::fingerprint;
 use shearq_dataset::run::{Run, open_data};
 use shearq_dataset::threads::{ALL_CORES, Pool};
 use shearq_results::catalogues::Catalogues;
-use shearq_results::published::{BranchCatalogues, Presubmitting, PublicBranch, PublicChallenge};
 use shearq_results::submit::archive::is_tar_gz;
 use shearq_results::submit::pack::Packing;
 use shearq_results::submit::{Contents, Entry};
-use shearq_scoring::great3::{GRID, SUBFIELDS};
 
 // Longest name of a method in bytes: a tar header has 100 for a file name.
 const MAX_METHOD_BYTES: usize = 64;

@@ -9,10 +9,10 @@ use shearq_results::submit::archive::{read_archive, unpack};
 /// Unpack an archive that `pack` wrote, and verify its files.
 ///
 /// The command compares every file with the checksums of the manifest. It refuses archives that are damaged, that
-/// contain changed, missing or additional files, or that contain links or folders. After a refusal no file remains.
+/// contain changed, missing or additional files, or that contain links or several folders. After a refusal no file remains.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
-    /// Archive to unpack (.tar.gz or .tgz).
+    /// Archive to unpack (.tar.gz or .zip).
     archive: PathBuf,
     /// New folder to write to.
     #[arg(long, value_name = "DIR", required_unless_present = "verify")]

@@ -7,7 +7,7 @@ use std::path::Path;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use crate::support::{Folder, assert_has, contents};
+use crate::support::{Folder, contents};
 
 /// Name of the challenges.
 const NAME: &str = "pilot";

@@ -18,7 +18,7 @@ use shearq_results::record::SetRecord;
 use shearq_results::score::ScoreError;
 use shearq_scoring::{Choice, Convention, Options, RowCounts, ScoredImages, SetSession, TrueShear};
 use shearq_simulate::field::ShearSpectrum;
-use shearq_simulate::set::{STAMP, SimulationSettings};
+use shearq_simulate::set::{FixedPsf, STAMP, SimulationSettings};
 
 use crate::error::{ChallengeError, EXPECTED_RESPONSE, unscored};
 use crate::kind::{ConstantShears, Kind, Noise, RankBy, additive_bias, response};
@@ -165,6 +165,8 @@ pub fn simulated(
             scatter: SCATTER,
         },
         one_shear_per_set,
+        // Participants download half as much as with a star for each galaxy.
+        fixed_psf: FixedPsf::One,
         ..SimulationSettings::new(seed as u64, simulation.grid)
     };
     settings.validate()?;
@@ -309,7 +311,7 @@ fn first_scores(
             let examined = session.examine(shapes, RowCounts::default());
             first.add(&examined.map_err(wrong)?).map_err(wrong)?;
         }
-        let score = scorer.score(&sum).map_err(wrong)?;
+        let ScoredImages { score, rows, .. } = first.finish().map_err(wrong)?;
         zero += score.zero_quality().q / data.sets.len() as f64;
         scored.push(SetRecord::new(set, false, vec![1], &score, &rows, true));
     }

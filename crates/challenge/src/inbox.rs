@@ -92,6 +92,8 @@ impl Found {
                     path,
                     "hidden, or a file of the operating system, and no entry",
                 );
+            } else if Kind::of(&path).is_some() && !path.is_dir() {
+                loose.push(path);
             } else if path.is_symlink() || (!path.is_dir() && looks_like_archive(&path)) {
                 archives.push(path);
             } else if path.is_dir() {
@@ -104,8 +106,10 @@ impl Found {
                 }
             }
         }
+        // `content` refuses a folder of `measure` as a whole.
+        let is_of_entry = |path: &PathBuf| Kind::of(path).is_some() || path.ends_with(RUN_FILE);
         let is_entry = archives.is_empty()
-            && loose.iter().any(|path| Kind::of(path).is_some())
+            && loose.iter().any(is_of_entry)
             && !folders.iter().any(|path| contains_entries(path, depth + 1));
         if is_entry {
             self.add(folder, team, depth);

@@ -20,8 +20,7 @@ use shearq_results::submit::{
     Contents, Entry as Team, Manifest, Packed, Sent, Submission, read_bandpowers,
 };
 use shearq_scoring::{
-    Choice, Convention, Fault, Grid, Line, Noise, Options, SCORED, ScoringError, SetScorer,
-    TrueShear,
+    Choice, Convention, Fault, Grid, Line, Noise, Options, SCORED, SetScorer, TrueShear,
 };
 use shearq_submissions::check_name;
 
@@ -564,9 +563,7 @@ impl Judge {
         let mut odd = Vec::new();
         self.check(sent, sending, &mut |checked: CheckedSet<'_>| {
             let set = checked.set;
-            let of_set = checked.odd.iter();
-            odd.extend(of_set.map(|image| format!("{image} of set {set}")));
-            match self.score_set(&checked) {
+            match self.score_set(&checked, &mut odd) {
                 Ok(record) => verdict.sets.extend(record),
                 Err(finding) => {
                     verdict.findings.push(format!("set {set}: {finding}"));
@@ -630,13 +627,11 @@ impl Judge {
         let Some(truth) = self.truths.get(&set) else {
             return Ok(None);
         };
-        let wrong = |error: ScoringError| error.to_string();
-        let score = truth.scorer.score(images).map_err(wrong)?;
-        let faults = truth
-            .scorer
-            .diagnose(images, &score, Convention::STANDARD)
-            .map_err(wrong)?;
-        for fault in faults {
+        let scored = checked.images.finish();
+        let scored = scored.map_err(|error| error.to_string())?;
+        let responses = scored.odd.responses.iter();
+        odd.extend(responses.map(|own| format!("{} of set {set}", numbers[own.place])));
+        for fault in scored.findings {
             return Err(match fault {
                 Fault::Convention { better, .. } => format!(
                     "signs or axes are wrong (found convention {}, {}; expected 5, standard)",

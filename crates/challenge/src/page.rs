@@ -14,7 +14,7 @@ use crate::entry::{EntryInfo, Refused};
 use crate::kind::{ConstantShears, Noise, Published, RankBy};
 use crate::ranking::{Board, Leaderboard, Scored, Standing, better};
 use crate::seal::close;
-use crate::terms::Challenge;
+use crate::terms::{Challenge, Data};
 
 // The palette has eight colours.
 const PLOTTED: usize = 6;
@@ -100,14 +100,16 @@ impl View<'_> {
         add("team", "team", Cell::text("zero shear"), &team);
         let method = info(|info| info.method.clone());
         add("method", "method", Cell::text("no image"), &method);
-        let of_zeros = Cell::text("reference: an entry of zeros");
-        add("title", "title", of_zeros, &|standing| {
+        add("title", "title", Cell::Empty, &|standing| {
             let info = standing.best.info();
             let reference = if info.reference { "reference" } else { "" };
             let same = standing.same_as.as_deref().unwrap_or_default();
             let mut parts = vec![reference, &info.title, same];
             parts.retain(|part| !part.is_empty());
-            Cell::text(parts.join(": "))
+            match parts.is_empty() {
+                true => Cell::Empty,
+                false => Cell::text(parts.join(": ")),
+            }
         });
         let files = info(|info| match info.contents.is_spectra() {
             true => "spectra".into(),
@@ -115,13 +117,24 @@ impl View<'_> {
         });
         add("files", "files", Cell::Empty, &files);
         let value = |own: Published| Cell::number(own.value, own.decimals);
+        let exact = |exact: f64, own: Published| match self.detail {
+            true => Cell::number(exact, own.decimals + 2),
+            false => value(own),
+        };
         let (of_value, of_error) = key(metric);
         add(of_value, metric.label(), value(zero), &|standing| {
-            value(standing.best.published)
+            exact(standing.best.value, standing.best.published)
         });
         add(of_error, "± error", Cell::Empty, &|standing| {
-            let own = standing.best.published;
-            Cell::number(own.step, own.decimals)
+            let Scored {
+                error,
+                published: own,
+                ..
+            } = standing.best;
+            match self.detail {
+                true => Cell::number(error, own.decimals + 2),
+                false => Cell::number(own.step, own.decimals),
+            }
         });
         for other in [RankBy::QCalibrated, RankBy::M, RankBy::C] {
             let is_secret = self.open && !self.detail;
@@ -130,9 +143,11 @@ impl View<'_> {
             }
             add(key(other).0, other.label(), Cell::Empty, &|standing| {
                 let sets = &standing.best.entry.sets;
-                match other.of(sets, self.constant).0.is_finite() {
-                    true => value(other.published(sets, self.constant, self.noise)),
-                    false => Cell::Empty,
+                match other.of(sets, self.constant).0 {
+                    of if of.is_finite() => {
+                        exact(of, other.published(sets, self.constant, self.noise))
+                    }
+                    _ => Cell::Empty,
                 }
             });
         }
@@ -153,11 +168,36 @@ impl View<'_> {
                 })
             });
         }
+        // Columns that say nothing are left out for people.
+        let contents = &self.challenge.rules.contents;
+        for heading in &mut table.headings {
+            heading.detail = heading.key == "files" && !contents.iter().any(|own| own.is_spectra());
+        }
         table.notes = vec![
             metric.meaning().to_owned(),
-            "Each team is ranked by its best entry. Teams share a rank (=) if their difference is below its error or not printed. Values are rounded to their errors.".into(),
+            "Each team is ranked by its best entry. Teams share a rank (=) if their difference is below its error or not printed. Values are rounded to their errors and ordered by their worse ends.".into(),
         ];
         table.notes.extend(self.zero_note());
+        table
+    }
+
+    // The table of a page: without empty columns, and with the numbers beside the team, where they are in sight on a phone.
+    fn for_page(&self, boards: &[Board]) -> Table {
+        let mut table = self.table_of(boards).narrow();
+        let place = |key: &str| match key {
+            "rank" | "team" => 0,
+            "method" | "title" | "files" => 2,
+            "received" | "entries" | "board" => 3,
+            _ => 1,
+        };
+        let mut order: Vec<usize> = (0..table.headings.len()).collect();
+        let is_empty = |k: &usize| table.rows.iter().all(|row| row[*k] == Cell::Empty);
+        order.retain(|k| !is_empty(k) || table.rows.is_empty());
+        order.sort_by_key(|k| place(table.headings[*k].key));
+        table.headings = order.iter().map(|k| table.headings[*k].clone()).collect();
+        for row in &mut table.rows {
+            *row = order.iter().map(|k| row[*k].clone()).collect();
+        }
         table
     }
 
@@ -196,26 +236,25 @@ impl View<'_> {
         table
     }
 
-    // What the comparison with the true shear showed.
+    // What the comparison with the true shear showed, on a page for the organiser.
     fn findings(&self) -> Table {
+        let standings = self.board.standings.iter();
+        let ranked = standings
+            .flat_map(|standing| &standing.entries)
+            .map(Scored::info);
+        let excluded = self.board.excluded.iter().map(|(info, _)| *info);
+        let all = ranked.chain(excluded).filter(|_| self.detail);
         let of = |info: &'_ EntryInfo| {
-            info.findings
-                .iter()
-                .map(|found| (info.clone(), found.clone()))
+            let found = info.findings.iter();
+            found
+                .map(|found| [&info.file, &info.team, found].map(String::clone))
                 .collect::<Vec<_>>()
         };
-        let standings = self
-            .board
-            .standings
-            .iter()
-            .flat_map(|standing| &standing.entries);
-        let excluded = self.board.excluded.iter().map(|(info, _)| *info);
-        let all = standings.map(Scored::info).chain(excluded);
-        let rows: Vec<(EntryInfo, String)> = all.flat_map(of).collect();
+        let rows: Vec<[String; 3]> = all.flat_map(of).collect();
         let mut table = Table::titled("Findings for the organiser");
-        table.column("entry", "entry", &rows, |row| Cell::text(&row.0.file));
-        table.column("team", "team", &rows, |row| Cell::text(&row.0.team));
-        table.column("finding", "finding", &rows, |row| Cell::text(&row.1));
+        for (k, heading) in ["entry", "team", "finding"].into_iter().enumerate() {
+            table.column(heading, heading, &rows, |row| Cell::text(&row[k]));
+        }
         table
     }
 
@@ -265,7 +304,7 @@ impl View<'_> {
             rules: terms,
             ..
         } = self.challenge;
-        let mut blocks = vec![Block::Filtered(self.table_of(&[Board::Main]))];
+        let mut blocks = vec![Block::Filtered(self.for_page(&[Board::Main]))];
         let several = |standing: &Standing<'_>| standing.entries.len() > 1;
         // One point per team shows nothing that the table does not.
         if self.board.of(Board::Main).any(several) {
@@ -279,36 +318,36 @@ impl View<'_> {
         let mut sections = vec![Section::new("leaderboard", "Leaderboard", blocks)];
         if self.detail {
             sections.push(self.every_set()?);
-            let table = self.findings();
-            let title = table.title.clone();
-            sections.push(Section::new(
-                "findings",
-                title,
-                vec![Block::Filtered(table)],
-            ));
         }
         let of_board = |board, title: &str| Table {
             title: title.into(),
             notes: Vec::new(),
-            ..self.table_of(&[board])
+            ..self.for_page(&[board])
         };
         for (id, table) in [
             ("late", of_board(Board::Late, "Late entries")),
             ("partial", of_board(Board::Partial, "Entries of some sets")),
             ("failures", self.failures()),
+            ("findings", self.findings()),
         ] {
             if !table.rows.is_empty() {
                 let title = table.title.clone();
                 sections.push(Section::new(id, title, vec![Block::Filtered(table)]));
             }
         }
-        let rules = Block::Text(rules(self.challenge).join("\n\n"));
-        sections.push(Section::new("rules", "Rules", vec![rules]));
+        for (id, title, paragraphs) in [
+            ("take-part", "Take part", take_part(self.challenge)),
+            ("rules", "Rules", rules(self.challenge)),
+        ] {
+            let text = Block::Text(paragraphs.join("\n\n"));
+            sections.push(Section::new(id, title, vec![text]));
+        }
         let about_data = format!(
-            "{} sets of {} images with {2} × {2} galaxies",
+            "{} sets of {} images with {2} × {2} galaxies, {3}",
             data.sets.len(),
             data.images,
-            data.grid
+            data.grid,
+            volume(data)
         );
         let settings = [
             ("Version of the data", version.to_string()),
@@ -372,13 +411,7 @@ impl View<'_> {
 
 // Rules of a challenge, one paragraph each.
 fn rules(challenge: &Challenge) -> Vec<String> {
-    let Challenge {
-        kind,
-        contact,
-        address,
-        rules,
-        ..
-    } = challenge;
+    let Challenge { kind, rules, .. } = challenge;
     let mut all: Vec<String> = kind.rules().map(String::from).into();
     if rules.partial {
         all.push("An entry may cover some sets only. It is listed without a rank.".into());
@@ -404,12 +437,46 @@ fn rules(challenge: &Challenge) -> Vec<String> {
             "Entries are accepted until {closes}. Later entries have their own board."
         ));
     }
-    for (what, place) in [("Data and rules", address), ("Contact", contact)] {
-        if !place.is_empty() {
-            all.push(format!("{what}: {place}"));
-        }
-    }
     all
+}
+
+// Where to get data and program, and where to send entries, one paragraph each.
+fn take_part(challenge: &Challenge) -> Vec<String> {
+    let Challenge {
+        data,
+        contact,
+        address,
+        ..
+    } = challenge;
+    let place = |place: &str, none: &str| match place.is_empty() {
+        true => none.to_owned(),
+        false => place.to_owned(),
+    };
+    vec![
+        format!(
+            "Data ({}): {}",
+            volume(data),
+            place(address, "ask the organiser")
+        ),
+        format!(
+            "Entries and questions: {}",
+            place(contact, "to the organiser")
+        ),
+        format!(
+            "Any program may measure the shapes. shearq ({}) measures, packs an entry, and checks it without the true shear: README.md beside the images has the commands.",
+            env!("CARGO_PKG_REPOSITORY")
+        ),
+    ]
+}
+
+// Bytes of the pixels of all galaxies, in words.
+fn volume(data: &Data) -> String {
+    let pixels = data.galaxies() as f64 * (data.stamp * data.stamp) as f64;
+    let megabytes = pixels * size_of::<f32>() as f64 / 1e6;
+    match megabytes < 1000.0 {
+        true => format!("{megabytes:.0} MB of images"),
+        false => format!("{:.1} GB of images", megabytes / 1000.0),
+    }
 }
 
 // The page for participants, as Markdown.
@@ -464,11 +531,15 @@ pub(crate) fn readme(challenge: &Challenge) -> String {
         ));
     }
     text.push_str(&format!(
-        "Put the files of an entry into one `.tar.gz` without folders. shearq does it for its own catalogues, and for yours if you describe them (`--foreign`):\n\n```sh\nshearq measure --data . --submission 48/linear/star --out ../catalogues\nshearq pack --measured ../catalogues --challenge \"{}\" --team TEAM --out ../entry.tar.gz\nshearq challenge check ../entry.tar.gz --challenge .\n```\n\nThe last command checks any entry, and needs no true shear. It finds missing and duplicate galaxies, swapped or flipped components, shapes that do not agree with their images, and distortions that are given as shear.\n\n## Rules\n\n",
+        "Put the files of an entry into one `.tar.gz` or `.zip`. shearq does it for its own catalogues, and for yours if you describe them (`--foreign`):\n\n```sh\nshearq measure --data . --submission 48/linear/star --out ../catalogues\nshearq pack --measured ../catalogues --challenge \"{}\" --team TEAM --out ../entry.tar.gz\nshearq challenge check ../entry.tar.gz --challenge .\n```\n\nThe last command checks any entry, and needs no true shear. It finds missing and duplicate galaxies, swapped or flipped components, shapes that do not agree with their images, and distortions that are given as shear.\n\n## Rules\n\n",
         name.replace(['"', '\\', '$', '`'], "")
     ));
     for rule in self::rules(challenge) {
         text.push_str(&format!("* {rule}\n"));
+    }
+    text.push_str("\n## Take part\n\n");
+    for place in take_part(challenge) {
+        text.push_str(&format!("* {place}\n"));
     }
     text
 }

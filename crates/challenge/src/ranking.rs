@@ -168,7 +168,12 @@ fn standings<'a>(teams: Teams<'a>, metric: RankBy) -> Vec<Standing<'a>> {
         )
     };
     let ahead = |a: &Standing<'_>, b: &Standing<'_>| {
-        let [of_a, of_b] = [a, b].map(|standing| standing.best.published.value);
+        // At the worse end of its error: otherwise an entry leads whose large error rounds it up.
+        let worse = |Published { value, step, .. }: Published| match metric.larger_is_better() {
+            true => value - step,
+            false => value + step,
+        };
+        let [of_a, of_b] = [a, b].map(|standing| worse(standing.best.published));
         let by_value = match metric.larger_is_better() {
             true => of_b.total_cmp(&of_a),
             false => of_a.total_cmp(&of_b),
@@ -533,7 +538,7 @@ pub(crate) mod tests {
             ("A", DAY, 2.04),
             ("B", DAY, 2.03),
             ("C", DAY, 1.91),
-            ("D", DAY, 1.9),
+            ("D", DAY, 1.915),
         ];
         assert_eq!(ranks(&entries(of)), [1, 1, 3, 3].map(Some));
     }

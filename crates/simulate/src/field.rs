@@ -33,7 +33,7 @@ const SHEARS: (f64, f64) = (0.01, 0.05);
 const PIVOT: f64 = 1000.0;
 
 /// A shear for all galaxies, uniform over the ring of GREAT3.
-pub(crate) fn random_shear(rng: &mut impl Rng) -> Complex64 {
+pub fn random_shear(rng: &mut impl Rng) -> Complex64 {
     let (low, high) = SHEARS;
     let modulus = rng.random_range(low * low..high * high).sqrt();
     Complex64::from_polar(modulus, rng.random_range(0.0..TAU))

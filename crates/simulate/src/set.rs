@@ -82,6 +82,9 @@ pub struct SimulationSettings {
     /// Whether each set has one shear, drawn as in GREAT3, instead of a field.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub one_shear_per_set: bool,
+    /// What images of sets with fixed PSFs share.
+    #[serde(default, skip_serializing_if = "FixedPsf::is_one")]
+    pub fixed_psf: FixedPsf,
     /// Whether all galaxies are turned by 90 degrees before lensing. Noise and centres stay as they are.
     #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub rotated: bool,
@@ -89,6 +92,23 @@ pub struct SimulationSettings {
 
 fn is_zero(number: &u64) -> bool {
     *number == 0
+}
+
+/// What all images of a set with fixed PSFs share.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
+pub enum FixedPsf {
+    /// A PSF field that varies over the image, as in GREAT10: Nurbaeva et al., Table 2 and Sects. 5.1 and 5.3.
+    Field,
+    /// One PSF of all galaxies. Records without the setting mean this one.
+    #[default]
+    One,
+}
+
+impl FixedPsf {
+    fn is_one(&self) -> bool {
+        *self == FixedPsf::One
+    }
 }
 
 impl Serialize for SimulationSettings {
@@ -128,6 +148,7 @@ impl SimulationSettings {
             intrinsic_sigma: DEFAULT_INTRINSIC_SIGMA,
             constant_shear: None,
             one_shear_per_set: false,
+            fixed_psf: FixedPsf::Field,
             rotated: false,
         }
     }
@@ -146,6 +167,7 @@ impl SimulationSettings {
             intrinsic_sigma,
             constant_shear,
             one_shear_per_set: _,
+            fixed_psf: _,
             rotated: _,
         } = self;
         if let Some([g1, g2]) = constant_shear {

@@ -19,12 +19,12 @@ use shearq_scoring::great3::{
 use shearq_scoring::modes::Decomposer;
 use shearq_scoring::{Complex64, Grid, ScoringError};
 
-use crate::field::{Content, ShearSpectrum, random_field, random_shear};
-use crate::galaxy::{Component, Galaxy, GalaxyError, Sersic};
-use crate::noise::add_noise;
-use crate::render::{RenderScratch, Renderer};
-use crate::set::{MAX_INTRINSIC_MODULUS, NYQUIST_SHARE, stream};
-use crate::signal::power;
+use shearq_simulate::add_noise;
+use shearq_simulate::field::{Content, ShearSpectrum, random_field, random_shear};
+use shearq_simulate::galaxy::{Component, Galaxy, GalaxyError, Sersic};
+use shearq_simulate::render::{RenderScratch, Renderer};
+use shearq_simulate::set::{MAX_INTRINSIC_MODULUS, NYQUIST_SHARE, stream};
+use shearq_simulate::signal::power;
 
 // Galaxies, epochs and stars are off the centres of their stamps by up to this on each axis.
 const MAX_OFFSET_PX: f64 = 1.0;

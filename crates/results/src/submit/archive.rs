@@ -193,14 +193,14 @@ impl Members<'_> {
 
     fn add(&mut self, full: &str, is_file: bool, content: &mut dyn Read) -> Result<(), FileError> {
         let wrong = |message: String| FileError::new(self.path, message);
-        let full = full.strip_prefix("./").unwrap_or(full);
-        if is_of_system(full) {
+        let inside = full.strip_prefix("./").unwrap_or(full);
+        if is_of_system(inside) {
             return Ok(());
         }
         // A folder that was packed as a whole.
-        let (folder, name) = match full.split_once('/') {
+        let (folder, name) = match inside.split_once('/') {
             Some((folder, name)) if is_plain_name(folder) => (Some(folder), name),
-            _ => (None, full),
+            _ => (None, inside),
         };
         let count = self.unpacked.files.len() + usize::from(self.unpacked.manifest.is_some());
         if count == 0 {

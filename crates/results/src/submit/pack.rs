@@ -15,7 +15,7 @@ use shearq_scoring::{
 
 use super::archive::{MAX_FILES, is_tar_gz};
 use super::{Contents, Entry, FileSum, Kind, MANIFEST_FILE, Manifest};
-use crate::catalogues::Catalogues;
+use crate::catalogues::{Catalogues, OWN};
 use shearq_catalogue::foreign::Foreign;
 use shearq_dataset::layout::DataFolder;
 use shearq_dataset::run::record_text;
