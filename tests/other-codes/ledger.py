@@ -17,7 +17,7 @@ SHOWN = [
     ("FPFS", "centred, not renoised, kernel 4.5 px", "FPFS, centred galaxies, not renoised", True),
     ("FPFS", "centred, renoised, kernel 4.5 px", "FPFS, centred galaxies, renoised", True),
     ("FPFS", "dithered, own detection, renoised", "FPFS, own detection, renoised", False),
-    ("REGAUSS", "dithered, responsivity", "REGAUSS, own responsivity", True),
+    ("REGAUSS", "dithered, responsivity", "REGAUSS, responsivity of intrinsic shapes", True),
     ("KSB", "dithered, uncalibrated", "KSB, not calibrated", True),
     ("metacal", "dithered, weighted moments", "metacal, matched weight", True),
 ]

@@ -163,11 +163,11 @@ impl Source {
                 (Some(rms), _) => format!("e_rms from {rms}"),
                 (None, Some(sigma)) => format!("e_rms² = ⟨χ²⟩/2 − {sigma}²"),
                 (None, None) => {
-                    "e_rms² = ⟨χ²⟩/2, with the measurement noise. Try: --columns rms_e=NAME or sigma_e=NAME".into()
+                    "e_rms² = ⟨χ²⟩/2, which contains the measurement noise. Try: --columns rms_e=NAME or sigma_e=NAME for the scatter of intrinsic shapes, with which m is lower".into()
                 }
             };
             lines.push(format!(
-                "Shears from distortions: ⟨χ⟩/2ℛ with ℛ = 1 − ⟨w e_rms²⟩/⟨w⟩, {rms}. Moduli above 1 count. Try: --ellipticity distortion to convert each galaxy."
+                "Shears from distortions: ⟨χ⟩/2ℛ with ℛ = 1 − ⟨w e_rms²⟩/⟨w⟩ (Bernstein & Jarvis 2002), {rms}. Moduli above 1 count. Try: --ellipticity distortion to convert each galaxy."
             ));
         }
         lines
