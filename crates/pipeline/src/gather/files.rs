@@ -242,8 +242,13 @@ impl<'a> Images<'a> {
             return Ok(());
         }
         let (path, text) = self.files.place(path)?;
+        let label = |head: &ImageHead| match head.shown(&self.others) {
+            // Names tell more where several images share one.
+            number if number == head.number.to_string() && !head.name.is_empty() => head.name.clone(),
+            shown => shown,
+        };
         let others = self.others.iter();
-        let names = others.map(|head| format!("`{}`", head.shown(&self.others)));
+        let names = others.map(|head| format!("`{}`", label(head)));
         let message = format!(
             "there is no image called `{}`; found {}",
             text.unwrap_or_default(),

@@ -223,30 +223,33 @@ impl Positions {
                 .all
                 .iter()
                 .all(|(x, y)| (0.0..=360.0).contains(x) && y.abs() <= 90.0);
-        let first_place = match &self.sky {
-            Some([ra, dec]) if self.degrees => format!("ra {}, dec {}", ra[0], dec[0]),
-            _ => format!("{:?}", self.all[0]),
-        };
         // Degrees that are read as pixels all lie within a few pixels of each other, even if these are on the exposure.
         if beyond == count || degrees && count > 2 && 2 * repeated > count {
-            let cause = match degrees && !self.degrees {
-                true => {
-                    "Are these degrees (right ascension and declination)? Try: --degrees, which uses the WCS of the exposure"
-                }
-                false => {
-                    "Are these positions of another image? Try: name the columns with --columns X,Y"
-                }
-            };
             let what = match beyond == count {
                 true => format!("all {count} positions are outside the exposure"),
                 false => format!(
                     "{repeated} of {count} positions are within {SAME_GALAXY_PX} px of an earlier one"
                 ),
             };
-            let message = format!(
-                "{what} (found {first_place} first, expected FITS pixels of {}, 1 to {width} and 1 to {height}). {cause}",
+            let (x, y) = self.all[0];
+            let pixels = format!(
+                "(found ({x}, {y}) first, expected FITS pixels of {}, 1 to {width} and 1 to {height})",
                 exposure.display()
             );
+            let message = match (&self.sky, degrees) {
+                (Some([ra, dec]), _) if self.degrees => format!(
+                    "{what} (found ra {}, dec {} first, expected places on {}). Try: check the positions and the WCS of the exposure",
+                    ra[0],
+                    dec[0],
+                    exposure.display()
+                ),
+                (_, true) => format!(
+                    "{what} {pixels}. Are these degrees (right ascension and declination)? Try: --degrees, which uses the WCS of the exposure"
+                ),
+                (_, false) => format!(
+                    "{what} {pixels}. Are these positions of another image? Try: name the columns with --columns X,Y"
+                ),
+            };
             return Err(FileError::new(path, message));
         }
         self.check_sky(exposure, wcs, &inside)?;
