@@ -244,7 +244,9 @@ impl<'a> Images<'a> {
         let (path, text) = self.files.place(path)?;
         let label = |head: &ImageHead| match head.shown(&self.others) {
             // Names tell more where several images share one.
-            number if number == head.number.to_string() && !head.name.is_empty() => head.name.clone(),
+            number if number == head.number.to_string() && !head.name.is_empty() => {
+                head.name.clone()
+            }
             shown => shown,
         };
         let others = self.others.iter();
