@@ -379,9 +379,9 @@ pub struct PixelFrame {
     pub shear: [f64; 2],
 }
 
-// Least rotation in degrees, shear, and relative difference of scales, of pixels that differ: a difference of scales by 1 % changes m
-// by about 0.01.
+// Least rotation of pixels that differ. Chosen by hand.
 const MIN_ROTATION_DEGREES: f64 = 1.0;
+// Least shear, and relative difference of scales, of pixels that differ: a difference of scales by 1 % changes m by about 0.01.
 const MIN_PIXEL_DIFFERENCE: f64 = 0.01;
 
 impl PixelFrame {

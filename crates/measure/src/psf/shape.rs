@@ -13,9 +13,10 @@ const RADIUS_SIGMAS: f64 = 5.0;
 // Change of the moments, in units of their trace, below which they count as found. Chosen by hand: what remains is below 4·10⁻⁷
 // of an ellipticity, because steps of Moffat profiles fall by factors of 4 to 6, of others faster.
 const CONVERGED: f64 = 1e-6;
-// Variances in px² of the Gaussian of the same noise-equivalent area below which a PSF is too narrow for weights of its own size, and
-// of the weight that it gets. Chosen by hand: weights of less than a pixel see no neighbour.
+// Variance in px² of the Gaussian of the same noise-equivalent area, below which a PSF may be too narrow for a weight of its own size.
+// Chosen by hand: such a weight sees no neighbour of the central pixel.
 const NARROW_VARIANCE: f64 = 0.5;
+// Variance in px² of the weight that it gets then. Chosen by hand: the neighbours count, and the noise beyond them does not.
 const WIDE_VARIANCE: f64 = 1.0;
 // Moffat profiles need about eight. Chosen by hand.
 const MAX_ITERATIONS: usize = 100;
