@@ -1,6 +1,7 @@
-//! The source code itself: a crate of the workspace uses only crates of lower levels, and `unsafe` stands where it is known.
+//! The source code itself: a crate of the workspace uses only crates of lower levels, a file only files that do not use it, and
+//! `unsafe` stands where it is known.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -106,7 +107,7 @@ fn files_that_the_architecture_page_names_exist() {
     assert!(named.len() > 30, "{} files", named.len());
 }
 
-fn files(folders: &[&str]) -> Vec<PathBuf> {
+pub(crate) fn files(folders: &[&str]) -> Vec<PathBuf> {
     let mut found = Vec::new();
     let mut folders: Vec<PathBuf> = folders.iter().map(PathBuf::from).collect();
     while let Some(folder) = folders.pop() {
@@ -149,4 +150,153 @@ fn unsafe_code_is_where_it_is_known() {
         found[place] = true;
     }
     assert_eq!(found, [true; KNOWN.len()], "{KNOWN:?}");
+}
+
+// Crates whose files still use each other in circles.
+const CIRCULAR: [&str; 5] = [
+    "crates/catalogue/src",
+    "crates/challenge/src",
+    "crates/pipeline/src",
+    "crates/results/src",
+    "src",
+];
+
+#[test]
+fn files_of_a_crate_use_each_other_without_circles() {
+    let crates = levels().into_keys().map(|folder| match folder.as_str() {
+        "src" => folder,
+        _ => folder + "/src",
+    });
+    for folder in crates.filter(|folder| !CIRCULAR.contains(&folder.as_str())) {
+        assert_eq!(circle(&folder), BTreeMap::new(), "{folder}");
+    }
+}
+
+#[test]
+fn a_circle_of_files_is_found() {
+    let root = tempfile::tempdir().unwrap();
+    for (name, code) in [
+        ("lib.rs", "mod above;\nmod below;"),
+        ("above.rs", "use crate::below::{Low, other::{self, Deep}};"),
+        (
+            "below.rs",
+            "mod other;\nuse self::other::Deep;\n#[cfg(test)]\nmod tests { use crate::above::*; }",
+        ),
+        ("below/other.rs", "// crate::above\npub struct Deep;"),
+    ] {
+        let path = root.path().join(name);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        fs::write(path, code).unwrap();
+    }
+    let folder = root.path().to_str().unwrap();
+    assert_eq!(circle(folder), BTreeMap::new());
+    for code in ["use super::super::above::High;", "use super::{Low, Lower};"] {
+        fs::write(root.path().join("below/other.rs"), code).unwrap();
+        assert!(circle(folder).len() >= 2, "{code}");
+    }
+}
+
+/// The files of a crate that use each other in circles, as modules, each with the others that it uses.
+fn circle(folder: &str) -> BTreeMap<Vec<String>, BTreeSet<Vec<String>>> {
+    let module = |path: &Path| -> Vec<String> {
+        let path = path.strip_prefix(folder).unwrap().with_extension("");
+        let names = path.iter().map(|name| name.to_string_lossy().into_owned());
+        names
+            .filter(|name| !["lib", "main"].contains(&name.as_str()))
+            .collect()
+    };
+    let paths = files(&[folder]);
+    let modules: BTreeSet<Vec<String>> = paths.iter().map(|path| module(path)).collect();
+    let mut uses: BTreeMap<_, BTreeSet<_>> = BTreeMap::new();
+    for path in paths.iter().filter(|path| !path.ends_with("tests.rs")) {
+        let (own, text) = (module(path), fs::read_to_string(path).unwrap());
+        let code = text.split("#[cfg(test)]\nmod tests").next().unwrap();
+        let lines = code.lines().map(|line| line.split("//").next().unwrap());
+        let used = used_paths(&lines.collect::<Vec<_>>().join("\n"))
+            .into_iter()
+            .map(|path| {
+                let (mut from, mut rest) = (own.clone(), &path[..]);
+                while let [first, others @ ..] = rest {
+                    match first.as_str() {
+                        "crate" => from.clear(),
+                        "super" => drop(from.pop()),
+                        "self" => {}
+                        _ => break,
+                    }
+                    rest = others;
+                }
+                from.extend_from_slice(rest);
+                while !modules.contains(&from) {
+                    from.pop();
+                }
+                from
+            });
+        // Names of the root are those of other files.
+        let used = used
+            .filter(|used| *used != own && !used.is_empty())
+            .collect();
+        if !own.is_empty() {
+            uses.insert(own, used);
+        }
+    }
+    // Without those that use no other or that no other uses, until all do both.
+    loop {
+        let count = uses.len();
+        let used: BTreeSet<_> = uses.values().flatten().cloned().collect();
+        uses.retain(|own, others| used.contains(own) && !others.is_empty());
+        let kept: BTreeSet<_> = uses.keys().cloned().collect();
+        uses.values_mut()
+            .for_each(|others| others.retain(|other| kept.contains(other)));
+        if uses.len() == count {
+            return uses;
+        }
+    }
+}
+
+/// The paths in code that begin with `crate`, `super` or `self`, or with a module that the code declares.
+fn used_paths(code: &str) -> Vec<Vec<String>> {
+    let is_name = |c: char| c.is_alphanumeric() || c == '_';
+    let declared = code.lines().filter_map(|line| {
+        let (before, name) = line.trim().strip_suffix(';')?.rsplit_once(' ')?;
+        before
+            .split(' ')
+            .next_back()
+            .filter(|word| *word == "mod")?;
+        Some(name)
+    });
+    let mut found = Vec::new();
+    for start in ["crate", "super", "self"].into_iter().chain(declared) {
+        for (at, _) in code.match_indices(&format!("{start}::")) {
+            if !code[..at].ends_with(|c| is_name(c) || c == ':') {
+                use_tree(&code[at..], &[], &mut found);
+            }
+        }
+    }
+    found
+}
+
+/// Adds each path of a tree such as `a::{b, c::{self, d}}`, and returns the code behind it.
+fn use_tree<'c>(code: &'c str, before: &[String], found: &mut Vec<Vec<String>>) -> &'c str {
+    let end = code.find(|c: char| !(c.is_alphanumeric() || c == '_'));
+    let (name, rest) = code.split_at(end.unwrap_or(code.len()));
+    let path = [before, &[name.to_owned()]].concat();
+    match rest.strip_prefix("::") {
+        Some(rest) if rest.starts_with(|c: char| c.is_alphanumeric() || c == '_') => {
+            use_tree(rest, &path, found)
+        }
+        Some(rest) if rest.starts_with('{') => {
+            let mut rest = rest[1..].trim_start();
+            while !rest.is_empty() && !rest.starts_with('}') {
+                rest = use_tree(rest, &path, found);
+                // Behind a name that ends or is renamed, or an asterisk.
+                let next = rest.find([',', '}']).unwrap_or(rest.len());
+                rest = rest[next..].trim_start_matches(',').trim_start();
+            }
+            rest.strip_prefix('}').unwrap_or(rest)
+        }
+        _ => {
+            found.push(path);
+            rest
+        }
+    }
 }

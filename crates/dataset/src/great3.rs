@@ -10,9 +10,9 @@ use shearq_files::open::{SETTINGS, is_there, read_to_string};
 use shearq_files::table::{self, MAX_ROWS};
 use shearq_scoring::great3::{Identity, NODES_PER_GALAXY};
 
-use crate::grid::Mosaic;
-use crate::images;
-use crate::layout::{MAX_STAMP, endings, fill};
+use crate::files::{self, Files};
+use crate::mosaic::{MAX_STAMP, Mosaic};
+use crate::pattern::{endings, fill};
 
 // Patterns of the names of released files.
 pub const GALAXIES: &str = "image-{set:03}-{image}.fits";
@@ -57,7 +57,7 @@ pub(crate) struct Found {
 
 /// `None` without images and catalogues of the branch.
 pub(crate) fn detect(root: &Path) -> Result<Option<Found>, FileError> {
-    let images = images::find(root, GALAXIES, endings(GALAXIES), &[])?;
+    let images = files::find(root, GALAXIES, endings(GALAXIES), &[])?;
     // Images alone may be anyone's.
     let first = images
         .sets()
@@ -70,7 +70,7 @@ pub(crate) fn detect(root: &Path) -> Result<Option<Found>, FileError> {
     // The first catalogue stands for all: the stamps of a branch have one side, and its shear is constant or varies in all subfields.
     let galaxies = GalaxyCatalogue::read(&path)?;
     // In the folder of the images, so that a folder of links to released files can have them.
-    let interpolated = images::find(root, PSF_IMAGES, endings(PSF_IMAGES), &[])?;
+    let interpolated = files::find(root, PSF_IMAGES, endings(PSF_IMAGES), &[])?;
     let psf_star = match interpolated.is_empty() {
         true => STAR_FIELDS,
         false => PSF_IMAGES,
@@ -126,11 +126,11 @@ pub fn dither(root: &Path, set: u32, image: u32, most: f64) -> Result<[f64; 2], 
 
 /// Files by subfield and epoch that show which images a branch should have: star fields, dithers and, with the number of the
 /// first epoch, catalogues.
-pub(crate) fn files_of_epochs(root: &Path) -> Result<[images::Files; 3], FileError> {
+pub(crate) fn files_of_epochs(root: &Path) -> Result<[Files; 3], FileError> {
     Ok([
-        images::find(root, STAR_FIELDS, endings(STAR_FIELDS), &[])?,
-        images::find(root, DITHERS, &[".yaml", ".txt"], &[])?,
-        images::find(root, GALAXY_CATALOGUES, endings(GALAXY_CATALOGUES), &[])?,
+        files::find(root, STAR_FIELDS, endings(STAR_FIELDS), &[])?,
+        files::find(root, DITHERS, &[".yaml", ".txt"], &[])?,
+        files::find(root, GALAXY_CATALOGUES, endings(GALAXY_CATALOGUES), &[])?,
     ])
 }
 

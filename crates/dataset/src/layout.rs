@@ -1,4 +1,4 @@
-//! Names of the files of a challenge, patterns of names with the numbers of sets and images, and conventions.
+//! Names of the files of a challenge, and its conventions.
 
 use std::path::{Path, PathBuf};
 
@@ -7,64 +7,14 @@ use shearq_files::open::is_there;
 use shearq_files::{FileError, open};
 use shearq_scoring::{Grid, TruthSign};
 
-use crate::images::Files;
-use crate::{great3, images};
-
-/// Largest side of a postage stamp, in pixels.
-pub const MAX_STAMP: usize = 1024;
-
-pub const MAX_SET: u32 = 9_999;
-pub const MAX_IMAGE: u32 = 999_999;
-
-/// The forms of a number: with at least 1, 2 and 3 digits.
-// Numbers in names of GREAT10 are not padded; shearq pads to 2 and 3 digits, subfields of GREAT3 to 3.
-pub(crate) const SET_PLACEHOLDERS: [&str; 3] = ["{set}", "{set:02}", "{set:03}"];
-pub const IMAGE_PLACEHOLDERS: [&str; 3] = ["{image}", "{image:02}", "{image:03}"];
-pub(crate) const PLACEHOLDERS: [[&str; 3]; 2] = [SET_PLACEHOLDERS, IMAGE_PLACEHOLDERS];
-
-pub fn fill(pattern: &str, set: u32, image: u32) -> String {
-    let mut filled = pattern.to_owned();
-    for (forms, number) in PLACEHOLDERS.into_iter().zip([set, image]) {
-        for (form, digits) in forms.into_iter().zip(1..) {
-            filled = filled.replace(form, &format!("{number:0digits$}"));
-        }
-    }
-    filled
-}
-
-// Further endings of the names of images: of gzip and fpack.
-pub(crate) fn endings(pattern: &str) -> &'static [&'static str] {
-    match pattern.ends_with(".fits") || pattern.ends_with(".fit") {
-        true => &["", ".gz", ".fz"],
-        false => &[""],
-    }
-}
-
-/// Checks that the pattern of `key` has a placeholder of each kind in `needed`, and no other braces.
-pub fn check_pattern(key: &str, pattern: &str, needed: &[[&str; 3]]) -> Result<(), String> {
-    for one_of in needed {
-        if !one_of.iter().any(|name| pattern.contains(name)) {
-            return Err(format!(
-                "`{key}` is \"{pattern}\"; expected a pattern with {}",
-                one_of.join(" or ")
-            ));
-        }
-    }
-    let filled = fill(pattern, 1, 1);
-    if filled.is_empty() || filled.contains(['{', '}']) {
-        return Err(format!(
-            "`{key}` is \"{pattern}\"; expected the name of a file, in which only {} stand for numbers",
-            PLACEHOLDERS.as_flattened().join(", ")
-        ));
-    }
-    Ok(())
-}
+use crate::files::{self, Files};
+use crate::great3;
+pub use crate::mosaic::MAX_STAMP;
+pub use crate::pattern::{IMAGE_PLACEHOLDERS, MAX_IMAGE, MAX_SET, check_pattern, fill};
+use crate::pattern::{PLACEHOLDERS, STAMPS, endings};
 
 /// Name of the layout file inside a data folder.
 pub const LAYOUT_FILE: &str = "layout.toml";
-
-// Name of the table of stamps of a gathered image.
-pub(crate) const STAMPS: &str = "set{set:02}/stamps-{image:03}.parquet";
 
 /// File-name patterns and conventions of a data folder. `{set}` and `{image}` stand for plain numbers, `{set:02}` and
 /// `{image:03}` for numbers with leading zeros. A layout is checked when it is read.
@@ -283,7 +233,7 @@ impl DataFolder {
     /// The galaxy images of `sets` (of all if empty) that are there.
     pub fn images(&self, sets: &[u32]) -> Result<Files, FileError> {
         let pattern = &self.layout.galaxies;
-        images::find(&self.root, pattern, endings(pattern), sets)
+        files::find(&self.root, pattern, endings(pattern), sets)
     }
 
     /// The data folder, if this is the folder of one of its sets.
@@ -294,13 +244,13 @@ impl DataFolder {
             .root
             .parent()
             .filter(|path| !path.as_os_str().is_empty());
-        let here = images::find(root.parent()?, first, &[""], &[]).ok()?;
+        let here = files::find(root.parent()?, first, &[""], &[]).ok()?;
         // Any folder with digits in its name may be a set; images of the layout in it decide.
         let is_set = here
             .sets()
             .into_iter()
             .any(|set| root.ends_with(fill(first, set, 0)));
-        let images = images::find(&root, rest, endings(rest), &[]).ok()?;
+        let images = files::find(&root, rest, endings(rest), &[]).ok()?;
         (is_set && !images.is_empty()).then(|| above.map_or_else(|| "..".into(), Path::to_owned))
     }
 
@@ -310,35 +260,11 @@ impl DataFolder {
         for form in IMAGE_PLACEHOLDERS {
             pattern = pattern.replace(form, &fill(form, 0, 0));
         }
-        let truths = images::find(&self.root, &pattern, &[""], &[])?;
+        let truths = files::find(&self.root, &pattern, &[""], &[])?;
         // The pattern has no {set}: one file may be the truth of a million sets.
         if truths.serve_all_sets() {
             return Ok(self.images(&[])?.sets());
         }
         Ok(truths.sets())
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn patterns_accept_plain_and_padded_numbers() {
-        for (pattern, image, expected) in [
-            (
-                "set{set:02}/galaxies-{image:03}.fits",
-                12,
-                "set07/galaxies-012.fits",
-            ),
-            (
-                "g10_v1_objs_{set}_{image}.me.dat",
-                12,
-                "g10_v1_objs_7_12.me.dat",
-            ),
-            ("image-{set:03}-{image}.fits", 0, "image-007-0.fits"),
-        ] {
-            assert_eq!(fill(pattern, 7, image), expected);
-        }
     }
 }

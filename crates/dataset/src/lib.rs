@@ -3,12 +3,15 @@
 //! Scoring a catalogue needs no more than this. [`threads`] works on many files at a time; nothing here measures.
 #![forbid(unsafe_code)]
 
+mod files;
 pub mod fingerprint;
 pub mod great3;
 pub mod grid;
 pub mod images;
 pub mod layout;
 pub mod metadata;
+mod mosaic;
+mod pattern;
 pub mod run;
 pub mod threads;
 pub mod truth;

@@ -13,7 +13,8 @@ use shearq_simulate::set::SimulationSettings;
 use shearq_submissions::Configuration;
 
 use crate::images::{self, Files, ImageId};
-use crate::layout::{DataFolder, Layout, check_folder, endings, fill};
+use crate::layout::{DataFolder, Layout, check_folder, fill};
+use crate::pattern::endings;
 
 pub const RUN_FILE: &str = "run.json";
 

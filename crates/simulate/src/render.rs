@@ -12,7 +12,7 @@
 use std::f64::consts::{PI, TAU};
 
 use ndarray::Array2;
-use shearq_quantities::fourier::{Complex32, Complex64};
+use shearq_quantities::fourier::Complex64;
 use shearq_quantities::linear::{LANES, Matrix, ROWS, multiply};
 use shearq_quantities::radial::{QuadraticForm, SingleTable};
 use shearq_quantities::{FunctionalPsf, Pupil, TransformedPsf};
@@ -20,11 +20,13 @@ use shearq_quantities::{FunctionalPsf, Pupil, TransformedPsf};
 use super::galaxy::{Component, Galaxy};
 
 mod lines;
+mod phases;
 
 use self::lines::{
     Wave, add_reversed, add_times, form_in_steps, shift, shine, tabulate, unfold_pixels,
     unfold_rows,
 };
+use self::phases::Phases;
 
 // Wavenumbers are dropped where galaxy × PSF × pixel is below this share of the flux. The image loses about
 // 1/(2π) ∫ k |F| dk over them; in a PSF's exponential tail near k = 3.5 that is a fifth of it, against a peak pixel of some
@@ -138,14 +140,6 @@ impl Transfer {
         }
         [above, below]
     }
-}
-
-/// e^{−ik·x} of a shift along both axes, of wavenumbers from 0.
-#[derive(Debug, Default)]
-struct Phases {
-    x_re: Vec<f32>,
-    x_im: Vec<f32>,
-    y: Vec<Complex32>,
 }
 
 impl RenderScratch {
@@ -419,25 +413,6 @@ impl Grid {
         multiply(re, cosines, modes, up, self.width);
         multiply(im, sines, modes, down, self.width);
         unfold_pixels(up, down, (self.width, stamp), out);
-    }
-}
-
-impl Phases {
-    fn set(&mut self, step: f64, count: usize, x: f64, y: f64) {
-        let powers = |shift: f64| {
-            let turn = Complex64::from_polar(1.0, -step * shift);
-            std::iter::successors(Some(Complex64::ONE), move |phase| Some(phase * turn))
-                .take(count)
-                .map(|phase| Complex32::new(phase.re as f32, phase.im as f32))
-        };
-        self.x_re.clear();
-        self.x_im.clear();
-        for phase in powers(x) {
-            self.x_re.push(phase.re);
-            self.x_im.push(phase.im);
-        }
-        self.y.clear();
-        self.y.extend(powers(y));
     }
 }
 

@@ -5,7 +5,7 @@ use std::ops::{Range, RangeInclusive};
 
 use plotters::coord::ranged1d::{KeyPointHint, NoDefaultFormatting, Ranged, ValueFormatter};
 
-use super::{TICK_SIZE, text_width};
+use super::canvas::{TICK_SIZE, text_width};
 use crate::escape::line;
 
 /// One axis of a plot, in the values themselves or, if it is logarithmic, their decimal logarithms.

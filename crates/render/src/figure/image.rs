@@ -6,11 +6,11 @@ use plotters::element::Rectangle;
 use plotters::style::Color;
 
 use super::axis::short;
-use super::colour::{ColourMap, position};
-use super::{
+use super::canvas::{
     Canvas, Drawn, Figure, LABEL_SIZE, LEFT, MARGIN, MIDDLE, RIGHT, TITLE_SIZE, frame, place, room,
     text_width, write,
 };
+use super::colour::{ColourMap, position};
 
 // The em of the numbers at colour bars.
 const NUMBER_SIZE: f64 = 9.5;

@@ -6,11 +6,11 @@ use plotters::element::{Circle, DashedPathElement, Polygon, Rectangle};
 use plotters::style::{Color, RGBColor, TRANSPARENT};
 
 use super::axis::{Axis, Scale, shown};
-use super::colour::{GREY, series_colour};
-use super::{
+use super::canvas::{
     Canvas, Drawn, Figure, INK, LABEL_SIZE, LEFT, LINE, MARGIN, MIDDLE, TICK_SIZE, TITLE_SIZE,
     TO_CENTRE, font, frame, line, place, room, text_width, units, widest, write,
 };
+use super::colour::{GREY, series_colour};
 
 // Width of curves and of error bars, and radius of points, in points.
 const CURVE: f64 = 1.75;

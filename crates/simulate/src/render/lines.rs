@@ -7,7 +7,7 @@ use shearq_quantities::Shear;
 use shearq_quantities::fourier::Complex32;
 use shearq_quantities::radial::{QuadraticForm, SingleTable};
 
-use super::Phases;
+use super::phases::Phases;
 use crate::galaxy::{Component, EXPONENTIAL_HALF_LIGHT, Galaxy, Sersic};
 
 /// A component in steps of wavenumbers.
