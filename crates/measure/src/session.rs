@@ -461,7 +461,8 @@ impl Batch {
 }
 
 impl<'n> Session<'n> {
-    /// Opens an image: surveys its stars and, unless its noise is given, its stamps.
+    /// Opens an image: surveys its stars and, unless its noise is given, its stamps. A configuration that treats noise as white
+    /// needs a second survey, which shows whether it is.
     ///
     /// If all stamps have too many missing pixels for a survey, the galaxies will be flagged: a stated level does not
     /// replace the measurement, because without a survey the window has another width and results another bias.
@@ -530,6 +531,8 @@ impl<'n> Session<'n> {
                     (Some(_), _) => None,
                 });
         }
+        let correlated = session.correlated_noise(source, threads)?;
+        session.warnings.extend(correlated);
         Ok(session)
     }
 
@@ -588,12 +591,8 @@ impl<'n> Session<'n> {
         image
     }
 
-    /// A warning if the configuration treats noise as white that is correlated. It takes a second survey, so that a run
-    /// tests one of its images.
-    ///
-    /// # Errors
-    /// If stamps cannot be read.
-    pub fn correlated_noise<S: StampSource<'n>>(
+    /// A warning if the configuration treats noise as white that is correlated.
+    fn correlated_noise<S: StampSource<'n>>(
         &self,
         source: &mut S,
         threads: &impl Threads,
@@ -1005,6 +1004,7 @@ impl Session<'_> {
         let is_displaced = warnings.iter().any(displaced);
         let own = move |warning| match warning {
             Warning::NoNoise => Some(Warning::EpochNoNoise),
+            Warning::CorrelatedNoise { correlation } => Some(Warning::EpochNoise { correlation }),
             Warning::OffCentre { .. } if is_displaced => None,
             Warning::OffCentre { offset, error } => Some(Warning::EpochOffset {
                 offset,

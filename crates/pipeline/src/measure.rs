@@ -6,43 +6,25 @@
 mod catalogue;
 mod source;
 
-use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::sync::Arc;
 
 use shearq_files::FileError;
-use shearq_measure::{Batch, MeasuredImage, Measurer, RowJob, Warning};
+use shearq_measure::{Batch, MeasuredImage, Measurer, RowJob};
 
-pub use self::catalogue::{COLUMNS, Summary, Value, all_flagged, more_columns};
+pub use self::catalogue::{COLUMNS, ImageHead, Summary, Value, all_flagged, more_columns};
 pub(crate) use self::catalogue::{CatalogueWriter, metadata};
 pub use self::source::ImageSource;
 use self::source::open_epochs;
 pub(crate) use self::source::{check_strip, open_galaxies};
 use crate::PipelineError;
 use crate::engine::{self, Feeder};
-use crate::stamp_table::StampTable;
 use shearq_dataset::fingerprint::Inputs;
 use shearq_dataset::grid::Mosaic;
 use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::DataFolder;
 use shearq_dataset::run::Run;
 use shearq_dataset::threads::{Pool, Progress};
-
-#[derive(Debug, Clone)]
-pub struct ImageHead {
-    pub id: ImageId,
-    pub mosaic: Mosaic,
-    /// Warnings about all images of the run, which were examined on this image.
-    pub run_warnings: Vec<Warning>,
-    /// The table of the stamps if they were gathered.
-    pub(crate) table: Option<StampTable>,
-    /// The files of its epochs.
-    pub(crate) epochs: Vec<PathBuf>,
-    /// Whether ellipticities are along pixel axes that a WCS states to be the sky's.
-    pub(crate) aligned: bool,
-    /// Fingerprints of the files that the image is measured from.
-    pub prints: BTreeMap<String, String>,
-}
 
 /// A row of stamps of an image, to be measured by each of several measurers.
 #[derive(Debug)]
@@ -185,7 +167,7 @@ impl<'a> FolderMeasurement<'a> {
         inputs: &Inputs<'_>,
         feeder: &mut Feeder<'_, ImageRow<'static, ImageHead>>,
     ) -> Result<(), PipelineError> {
-        for (k, &id) in todo.iter().enumerate() {
+        for &id in todo {
             let prints = inputs.prints(id)?;
             let ids = self.run.epochs_of(self.data, id)?;
             let mut sources = open_epochs(self.data, &ids, measurer)?;
@@ -200,16 +182,11 @@ impl<'a> FolderMeasurement<'a> {
             let odd = differs.map_or(0, |at| at + 1);
             let first = first.with_epochs(sessions);
             let first = first.map_err(|error| sources[odd].named(error.into()))?;
-            let correlated = match k {
-                0 => sources[0].correlated_noise(&first, feeder.ahead())?,
-                _ => None,
-            };
             let first = Arc::new(first);
             let mosaic = sources[0].mosaic();
             let head = Arc::new(ImageHead {
                 id,
                 mosaic,
-                run_warnings: correlated.into_iter().collect(),
                 table: sources[0].table.take(),
                 epochs: sources.iter().map(|source| source.path.clone()).collect(),
                 aligned: sources.iter().all(|source| source.aligned),

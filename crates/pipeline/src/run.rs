@@ -207,7 +207,6 @@ pub fn run_folder(
                         image: image.image,
                     },
                     mosaic: Mosaic::square(settings.grid, STAMP),
-                    run_warnings: Vec::new(),
                     table: None,
                     epochs: Vec::new(),
                     aligned: false,

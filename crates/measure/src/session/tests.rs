@@ -4,6 +4,7 @@ use ndarray::{Array3, s};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use shearq_quantities::{FunctionalPsf, PsfProfile, Shear};
+use shearq_submissions::Registry;
 
 use super::*;
 use crate::testing::close;
@@ -57,6 +58,52 @@ fn message<T>(result: Result<T, MeasureError>, expected: &str) {
         panic!("nothing wrong; expected {expected}")
     };
     assert!(error.to_string().contains(expected), "{error}");
+}
+
+#[test]
+fn noise_that_is_treated_as_white_is_tested_on_arrays() {
+    let mut rng = ChaCha8Rng::seed_from_u64(21);
+    let white = Array3::from_shape_fn((200, 49, 49), |_| rng.random_range(-1.0..1.0f32));
+    let summed = Array3::from_shape_fn((200, 48, 48), |(k, y, x)| {
+        white.slice(s![k, y..y + 2, x..x + 2]).sum()
+    });
+    let plain = white.slice(s![.., ..48, ..48]);
+    let star = moffat(0.0).stamp(48);
+    let registry = Registry::embedded().unwrap();
+    let named = registry.get("48/linear/star").unwrap().configuration;
+    let of_noise = |noise: NoiseSource| Configuration {
+        noise,
+        ..named.clone()
+    };
+    let correlation = |correlation: usize| match named.noise {
+        NoiseSource::Image { sky, .. } => of_noise(NoiseSource::Image { correlation, sky }),
+        _ => unreachable!("it measures noise on the stamps"),
+    };
+    for (configuration, treats_as_white) in [
+        (correlation(0), true),
+        (of_noise(NoiseSource::Header), true),
+        (correlation(2), false),
+    ] {
+        let measurer = Measurer::new(&configuration, 48).unwrap();
+        for (stamps, is_correlated) in [(plain, false), (summed.view(), true)] {
+            let batch = measurer
+                .batch(stamps, &Psfs::star(star.view()), Some(2.0))
+                .unwrap();
+            let found = batch.warnings.iter().find_map(|warning| match warning {
+                Warning::CorrelatedNoise { correlation } => Some(*correlation),
+                _ => None,
+            });
+            assert_eq!(
+                found.is_some(),
+                treats_as_white && is_correlated,
+                "{configuration:?}"
+            );
+            // Of sums of 2 × 2 pixels.
+            for of_neighbours in found.into_iter().flatten() {
+                close(of_neighbours, 0.5, 0.03);
+            }
+        }
+    }
 }
 
 #[test]

@@ -13,8 +13,9 @@ use shearq_measure::{
 use shearq_quantities::Frame;
 use shearq_submissions::{Calibration, Configuration, EllipticityType};
 
-use super::ImageHead;
 use crate::PipelineError;
+use crate::stamp_table::StampTable;
+use shearq_dataset::grid::Mosaic;
 use shearq_dataset::images::ImageId;
 use shearq_dataset::metadata::{
     CATALOGUE_FIRST_PIXEL, CATALOGUE_FRAME, E_NOISE, NOT_APPLIED, PSF_NOISE, RESPONSE, WARNINGS,
@@ -22,6 +23,20 @@ use shearq_dataset::metadata::{
 };
 use shearq_dataset::run::{Claim, Run};
 use shearq_dataset::threads::Progress;
+
+#[derive(Debug, Clone)]
+pub struct ImageHead {
+    pub id: ImageId,
+    pub mosaic: Mosaic,
+    /// The table of the stamps if they were gathered.
+    pub(crate) table: Option<StampTable>,
+    /// The files of its epochs.
+    pub(crate) epochs: Vec<PathBuf>,
+    /// Whether ellipticities are along pixel axes that a WCS states to be the sky's.
+    pub(crate) aligned: bool,
+    /// Fingerprints of the files that the image is measured from.
+    pub prints: BTreeMap<String, String>,
+}
 
 #[derive(Debug, Clone, Copy)]
 pub enum Value {
@@ -294,8 +309,7 @@ impl<'a> CatalogueWriter<'a> {
     ) -> Result<(), PipelineError> {
         let ImageId { set, image } = head.id;
         let found = &batch.warnings;
-        self.warned
-            .add(head, found.iter().chain(&head.run_warnings), progress)?;
+        self.warned.add(head, found, progress)?;
         // If a user removed the folder meanwhile, writing would create it again with the later catalogues only.
         self.claim.check()?;
         let path = self.run.catalogue(self.out, set, image);
@@ -358,10 +372,10 @@ struct Warned {
 }
 
 impl Warned {
-    fn add<'w>(
+    fn add(
         &mut self,
         head: &ImageHead,
-        warnings: impl IntoIterator<Item = &'w Warning>,
+        warnings: &[Warning],
         progress: &mut dyn Progress,
     ) -> Result<(), PipelineError> {
         for warning in warnings {

@@ -147,16 +147,6 @@ impl ImageSource {
         session.map_err(|error| self.named(error))
     }
 
-    /// A warning if noise is correlated that the configuration treats as white.
-    pub(super) fn correlated_noise(
-        &mut self,
-        session: &Session<'static>,
-        threads: &impl Threads,
-    ) -> Result<Option<Warning>, PipelineError> {
-        let found = session.correlated_noise(self, threads);
-        found.map_err(|error| self.named(error))
-    }
-
     pub(super) fn named(&self, error: PipelineError) -> PipelineError {
         match error {
             PipelineError::Measure(error) => FileError::new(&self.path, error).into(),
