@@ -87,17 +87,17 @@ impl StampNoise {
         }
     }
 
-    /// The noise that explains the mean products of `count` blocks, one per lag. `None` if the variance is not positive.
-    fn from_products(plan: &NoisePlan, means: &[f64], count: f64) -> Option<StampNoise> {
-        let rows = plan.matrix.rows().into_iter().zip(means);
-        let mut rows: Vec<Vec<f64>> = rows
-            .map(|(row, mean)| row.iter().chain([mean]).copied().collect())
-            .collect();
-        let mut covariance = vec![0.0; means.len()];
-        if !eliminate(&mut rows, Pivots::Largest, MIN_PIVOT) {
-            return None;
-        }
-        substitute(&rows, &mut covariance);
+    /// The noise that explains the products of blocks, one per lag. `None` if the variance is not positive.
+    fn from_products(plan: &NoisePlan, blocks: &[&[f32]]) -> Option<StampNoise> {
+        let count = blocks.len() as f64;
+        let mean = |lag| {
+            blocks
+                .iter()
+                .map(|block| f64::from(block[lag]))
+                .sum::<f64>()
+                / count
+        };
+        let covariance = solve(plan.matrix.view(), (0..plan.lags.len()).map(mean))?;
         let variance = covariance[0];
         if !(variance > 0.0 && variance.is_finite()) {
             return None;
@@ -113,12 +113,17 @@ impl StampNoise {
             }
         }
         let chi2 = count * white_chi2(&plan.matrix, &covariance) / (variance * variance);
-        // Noise that is correlated in patches of Σρ² pixels has as many independent squares as it has patches.
-        let patch = correlation.iter().map(|ratio| ratio * ratio).sum::<f64>() * 2.0;
-        let freedom = (BLOCK_PIXELS - POLYNOMIALS) as f64 * count;
+        // The variance is the mean of a sum of products of each block. Their scatter contains what correlation and lags that are
+        // fitted together add to the error, and how noise that is not Gaussian changes it.
+        let weights = solve(plan.matrix.t(), iter::once(1.0).chain(iter::repeat(0.0)))?;
+        let squares = blocks.iter().map(|block| {
+            let of_block = block.iter().zip(&weights).map(|(p, w)| f64::from(*p) * w);
+            (of_block.sum::<f64>() - variance).powi(2)
+        });
+        let of_variance = (squares.sum::<f64>() / (count * (count - 1.0))).sqrt();
         Some(StampNoise {
             sigma: variance.sqrt(),
-            error: (0.5 * patch.max(1.0) / freedom).sqrt(),
+            error: 0.5 * of_variance / variance,
             max_lag: plan.max_lag,
             correlation,
             chi2: (chi2, covariance.len() as f64 - 1.0),
@@ -180,6 +185,20 @@ impl StampNoise {
         }
         (power, slopes)
     }
+}
+
+/// The x of a matrix times x = `right`; `None` if the matrix is singular.
+fn solve(matrix: ArrayView2<'_, f64>, right: impl Iterator<Item = f64>) -> Option<Vec<f64>> {
+    let rows = matrix.rows().into_iter().zip(right);
+    let mut rows: Vec<Vec<f64>> = rows
+        .map(|(row, right)| row.iter().copied().chain([right]).collect())
+        .collect();
+    if !eliminate(&mut rows, Pivots::Largest, MIN_PIVOT) {
+        return None;
+    }
+    let mut out = vec![0.0; rows.len()];
+    substitute(&rows, &mut out);
+    Some(out)
 }
 
 /// χ² of a covariance against white noise of variance one, for one block.
@@ -697,21 +716,13 @@ impl NoiseSurvey {
         let lags = self.plan.lags.len();
         let ring = self.plan.blocks.len();
         let rejected = self.rejected_blocks(&vec![self.max_contrast()?; ring])?;
-        let mut sums = vec![0.0; lags];
-        let mut count = 0;
         let blocks = self.products.chunks_exact(lags).zip(rejected);
-        for (products, _) in blocks.filter(|(_, rejected)| !rejected) {
-            count += 1;
-            for (sum, product) in sums.iter_mut().zip(products) {
-                *sum += f64::from(*product);
-            }
-        }
-        if count < 2 * ring {
+        let kept = blocks.filter(|(_, rejected)| !rejected);
+        let kept: Vec<&[f32]> = kept.map(|(products, _)| products).collect();
+        if kept.len() < 2 * ring {
             return None;
         }
-        let count = count as f64;
-        let means: Vec<f64> = sums.iter().map(|sum| sum / count).collect();
-        StampNoise::from_products(&self.plan, &means, count)
+        StampNoise::from_products(&self.plan, &kept)
     }
 }
 

@@ -3,7 +3,8 @@
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use ndarray::Array2;
+use ndarray::{Array2, s};
+use rand_distr::{Distribution, StandardNormal};
 
 use super::*;
 use crate::testing::close;
@@ -34,6 +35,37 @@ fn survey(
         survey.add(stamp(&mut rng).view()).unwrap();
     }
     survey.noise().unwrap()
+}
+
+#[test]
+fn the_error_of_a_level_is_its_scatter() {
+    // The survey of few stamps, often: known to 1/√(2·300), 4 %.
+    let mut rng = ChaCha8Rng::seed_from_u64(31);
+    for correlated in [false, true] {
+        let gaussian = |rng: &mut ChaCha8Rng| {
+            let white = Array2::from_shape_fn((SIDE + 1, SIDE + 1), |_| -> f32 {
+                StandardNormal.sample(rng)
+            });
+            Array2::from_shape_fn((SIDE, SIDE), |(y, x)| match correlated {
+                true => 0.5 * white.slice(s![y..y + 2, x..x + 2]).sum(),
+                false => white[(y, x)],
+            })
+        };
+        let found = (0..300).map(|_| {
+            let mut survey = NoisePlan::new(SIDE, 3, None).unwrap().survey();
+            (0..6).for_each(|_| survey.add(gaussian(&mut rng).view()).unwrap());
+            let noise = survey.noise().unwrap();
+            (noise.sigma(), noise.error())
+        });
+        let (levels, errors): (Vec<f64>, Vec<f64>) = found.unzip();
+        let mean = |values: &[f64]| values.iter().sum::<f64>() / values.len() as f64;
+        let squares: Vec<f64> = levels
+            .iter()
+            .map(|level| (level - mean(&levels)).powi(2))
+            .collect();
+        let ratio = mean(&squares).sqrt() / (mean(&levels) * mean(&errors));
+        assert!((0.85..1.15).contains(&ratio), "{correlated}: {ratio}");
+    }
 }
 
 #[test]
