@@ -173,6 +173,60 @@ fn deeper_epochs_count_more() {
 }
 
 #[test]
+fn epochs_on_pixels_of_other_sizes_have_the_psf_of_the_first() {
+    let (own, star) = ([0.3, 0.05, 0.25], [0.09, -0.01, 0.08]);
+    let scenes = [1.0, 0.5, 1.6].map(|size| {
+        let jacobian = SQUARE.map(|row| row.map(|value| size * value));
+        let stamp = gaussian(N, [0, 1, 2].map(|k| own[k] + star[k]), jacobian, [0.0; 2]) * 1000.0;
+        (
+            jacobian,
+            stamp,
+            gaussian(32, star, jacobian, [0.0; 2]),
+            size,
+        )
+    });
+    let each = scenes.each_ref().map(|(jacobian, stamp, psf, size)| Epoch {
+        jacobian: Some(Jacobian::new(*jacobian).unwrap()),
+        // Of equal weights.
+        ..epoch(stamp, psf, 1e-3 * size)
+    });
+    let one = measured(&each[..1]).unwrap();
+    for other in &each[1..] {
+        let both = measured(&[each[0], *other]).unwrap();
+        // Samples of another distance, and lags on another lattice.
+        close(&both, &one, 2e-2);
+        let sigma = (star[0] * star[2] - star[1] * star[1]).powf(0.25) / 0.2;
+        assert!(
+            (both.psf.sigma() / sigma - 1.0).abs() < 5e-3,
+            "{:?}",
+            both.psf
+        );
+    }
+}
+
+#[test]
+fn photons_of_epochs_add_up() {
+    let (galaxy, psf) = scene();
+    let of = |levels: &[(f64, f64)]| {
+        let each = levels.iter().map(|&(noise, gain)| Epoch {
+            gain: Some(gain),
+            ..epoch(&galaxy, &psf, noise)
+        });
+        let found = measured(&each.collect::<Vec<_>>()).unwrap();
+        found.observables.unwrap().flux_error
+    };
+    // Two equal exposures are one of twice the electrons.
+    let twice = of(&[(0.5f64.sqrt(), 1.0)]);
+    assert!((of(&[(1.0, 0.5), (1.0, 0.5)]) / twice - 1.0).abs() < 1e-6);
+    // Exposures with weights of 0.8 and 0.2: their sum has the variance 0.8²/0.5 + 0.2²/2 per unit of light.
+    let sum = of(&[(0.8f64.sqrt() * 0.5, 1.0 / (0.64 / 0.5 + 0.04 / 2.0))]);
+    assert!((of(&[(0.5, 0.5), (1.0, 2.0)]) / sum - 1.0).abs() < 1e-6);
+    // The light matters: without it the error is that of the sky.
+    let sky = measured(&[epoch(&galaxy, &psf, 0.5f64.sqrt())]).unwrap();
+    assert!(twice > 1.1 * sky.observables.unwrap().flux_error);
+}
+
+#[test]
 fn wrong_epochs_are_typed_errors() {
     let (galaxy, psf) = scene();
     let good = epoch(&galaxy, &psf, 1.0);
