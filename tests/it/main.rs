@@ -11,6 +11,7 @@ mod bias;
 mod cases;
 mod challenge;
 mod chosen_images;
+mod constants;
 mod damaged;
 mod documents;
 mod entry_points;

@@ -5,7 +5,7 @@
 
 The constants are the numbers that `const` declares in crates/measure/src outside tests. A copy of the sources is built once,
 in which each of them is a function that reads its factor from the environment; the sources themselves have no hook. The page
-is made of the declarations, the comments beside them, which state the origin, and the measured changes.
+has the measured changes in its last column.
 """
 
 import argparse
@@ -58,7 +58,6 @@ class Constant:
     name: str
     type: str
     value: str
-    origin: str
 
     @property
     def key(self):
@@ -66,21 +65,17 @@ class Constant:
 
 
 def constants():
-    """The numeric constants, with the comment that precedes or follows each."""
+    """The numeric constants."""
     found = []
     for path in sorted(SOURCES.rglob("*.rs")):
         if path.name == "tests.rs" or "tests" in path.parts:
             continue
-        comment = []
         for number, line in enumerate(path.read_text().split("\n"), 1):
             if line.strip() == "#[cfg(test)]":
                 break
             if match := DECLARATION.match(line):
-                words = " ".join([*comment, match["tail"] or ""]).strip()
                 relative = str(path.relative_to(SOURCES))
-                found.append(Constant(relative, number, match["name"], match["type"], match["value"], words))
-            text = line.strip()
-            comment = [*comment, text.lstrip("/").strip()] if text.startswith("//") else []
+                found.append(Constant(relative, number, match["name"], match["type"], match["value"]))
     return found
 
 
@@ -231,31 +226,15 @@ def summary(key, rows, scanned):
     return ", ".join(words) or "small"
 
 
-PAGE = """# Constants
-
-<!-- Made by tests/stress/constants.py --page. Edit the comments beside the constants instead. -->
-
-The numeric constants of `crates/measure/src` that are not settings, with the origin that the comment beside each states.
-*Effect* is the largest change when the constant is multiplied by 0.7 or 1.4 and the same simulated galaxies are measured again:
-of m (if above 10⁻³ and three times its error), of the measurement noise (above 1 %), and of the flagged share (above 0.5 %).
-"Small" is below all three, "no change" leaves all catalogues as they are. {count} constants, of which {scanned} were scanned in
-{cases} cases of {galaxies} measurements each, seed {seed}.
-
-| constant | value | origin | effect |
-|---|---|---|---|
-"""
-
-
-def page(found, result, options):
-    rows = []
-    for c in found:
-        effect = summary(c.key, result["rows"], c.key in result["scanned"])
-        origin = c.origin.replace("|", "\\|") or "–"
-        rows.append(f"| `{c.path}` `{c.name}` | `{c.value}` | {origin} | {effect} |")
-    head = PAGE.format(
-        count=len(found), scanned=len(result["scanned"]), cases=len(SCANNED), galaxies=result["galaxies"], seed=result["seed"]
-    )
-    options.page.write_text(head + "\n".join(rows) + "\n")
+def page(result, options):
+    """Writes the effects into the page, whose other columns `cargo test` compares with the sources."""
+    row = re.compile(r"\| `(?P<path>[^`]+)` `(?P<name>[^`]+)` \|.* \| ")
+    lines = options.page.read_text().split("\n")
+    for index, line in enumerate(lines):
+        if match := row.match(line):
+            key = f"{match['path']}:{match['name']}"
+            lines[index] = f"{match[0]}{summary(key, result['rows'], key in result['scanned'])} |"
+    options.page.write_text("\n".join(lines))
 
 
 def main():
@@ -265,13 +244,12 @@ def main():
     words.add_argument("--seed", type=int, default=20261)
     words.add_argument("--work", type=Path, help="folder for the copy of the sources and the images")
     words.add_argument("--json", type=Path, default=ROOT / "tests/stress/constants.json", help="result of the scan")
-    words.add_argument("--page", type=Path, help="write this page from the result of an earlier scan, without scanning")
+    words.add_argument("--page", type=Path, help="write the effects of an earlier scan into this page, without scanning")
     options = words.parse_args()
-    found = constants()
     if options.page:
-        page(found, json.loads(options.json.read_text()), options)
+        page(json.loads(options.json.read_text()), options)
         return
-    result = scan([c for c in found if re.search(options.only, c.key)], options)
+    result = scan([c for c in constants() if re.search(options.only, c.key)], options)
     options.json.write_text(json.dumps(result, indent=0) + "\n")
 
 

@@ -367,7 +367,7 @@ impl Observables {
 pub(crate) const FLUX: usize = 0; // Place of the flux in the arrays of a coupling.
 pub(crate) const SIZE: usize = 1; // Place of the size.
 pub(crate) const RING: usize = 2; // Place of the light of the ring.
-pub(crate) const VARIABLES: usize = 3; // Counts them.
+pub(crate) const VARIABLES: usize = 3;
 
 /// Mean products of the changes by noise of the ellipticity and of three variables: flux, size and light of the ring, in this order.
 ///

@@ -333,7 +333,7 @@ const E1: usize = 4; // Place of the first component of the ellipticity.
 const E2: usize = 5; // Place of the second component.
 const KAPPA: usize = 6; // Place of κ.
 const WING: usize = 7; // Place of the wing's amplitude, in units of the core's.
-const PARAMETERS: usize = 8; // Counts them.
+const PARAMETERS: usize = 8;
 
 // κ = 1/β that is expected of a star, and its standard deviation.
 // β = 3 to 4.8 of Moffat and Kolmogorov profiles. Loose: a star of S/N 50 determines κ to about 0.06.
