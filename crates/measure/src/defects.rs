@@ -19,6 +19,7 @@ use multiversion::multiversion;
 use ndarray::ArrayView2;
 use shearq_quantities::statistics::{SCATTER, median};
 
+use crate::measurement::DefectCounts;
 use crate::pixels::frame;
 
 // Pixels ±d from a pixel, d = (x, y). Those two pixels away show clusters of hot pixels.
@@ -77,37 +78,6 @@ impl LightLimits {
             noise: ratios.map(|ratio| (1.0 + ratio * ratio / 8.0).sqrt()),
             lobe: LOBE_MARGIN * (-low / high) as f32,
         }
-    }
-}
-
-/// Pixels of a stamp that became missing, by what showed that they hold no light.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct DefectCounts {
-    /// In areas of one value.
-    pub repeated: u32,
-    /// Far below the sky.
-    pub dark: u32,
-    /// Brighter than their neighbours by more than the PSF allows.
-    pub bright: u32,
-}
-
-impl DefectCounts {
-    /// Whether there are none.
-    pub fn is_empty(&self) -> bool {
-        self.total() == 0
-    }
-
-    /// All of them.
-    pub fn total(&self) -> u32 {
-        self.repeated + self.dark + self.bright
-    }
-}
-
-impl std::ops::AddAssign for DefectCounts {
-    fn add_assign(&mut self, other: Self) {
-        self.repeated += other.repeated;
-        self.dark += other.dark;
-        self.bright += other.bright;
     }
 }
 

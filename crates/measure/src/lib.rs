@@ -72,12 +72,11 @@ mod transform;
 mod warning;
 
 pub use calibration::{MeanShear, MeanShearError, ShearSum, is_significant};
-pub use defects::DefectCounts;
 pub use error::{EpochError, MeasureError};
 pub use examine::{EXAMINED_PSFS, Examination, examined_rows};
 pub use measurement::{
-    Coupling, Descent, Flag, Flags, Measurement, Observables, PsfShape, ResponseMatrix,
-    ShearedCatalogues, ShearedGalaxy, Stop,
+    Coupling, DefectCounts, Descent, Flag, Flags, Measurement, Observables, PsfShape,
+    ResponseMatrix, ShearedCatalogues, ShearedGalaxy, Stop,
 };
 pub use measurer::{Epoch, ImageNoise, ImageWorker, Measurer, PsfWorker, Steps, Worker};
 pub use method::AdaptedSettings;

@@ -4,8 +4,6 @@ use std::fmt;
 
 use thiserror::Error;
 
-use crate::defects::DefectCounts;
-
 /// The adaptive moments of a PSF, pixels included: the moments of the elliptical Gaussian M that is the best weight,
 /// M = 2 Σ W x xᵀ p / Σ W p with W = exp(−½ xᵀ M⁻¹ x) about the centroid under W (Bernstein & Jarvis 2002, AJ 123, 583;
 /// Hirata & Seljak 2003, MNRAS 343, 459). GalSim's `FindAdaptiveMom` has the same `observed_shape` and `moments_sigma`.
@@ -202,6 +200,37 @@ impl fmt::Display for Flags {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let reasons: Vec<String> = self.iter().map(|flag| flag.to_string()).collect();
         f.write_str(&reasons.join(", "))
+    }
+}
+
+/// Pixels of a stamp that became missing, by what showed that they hold no light.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct DefectCounts {
+    /// In areas of one value.
+    pub repeated: u32,
+    /// Far below the sky.
+    pub dark: u32,
+    /// Brighter than their neighbours by more than the PSF allows.
+    pub bright: u32,
+}
+
+impl DefectCounts {
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.total() == 0
+    }
+
+    /// All of them.
+    pub fn total(&self) -> u32 {
+        self.repeated + self.dark + self.bright
+    }
+}
+
+impl std::ops::AddAssign for DefectCounts {
+    fn add_assign(&mut self, other: Self) {
+        self.repeated += other.repeated;
+        self.dark += other.dark;
+        self.bright += other.bright;
     }
 }
 

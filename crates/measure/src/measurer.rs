@@ -10,10 +10,10 @@ use ndarray::{Array2, ArrayView2, ArrayView3};
 use shearq_quantities::{Jacobian, PixelShape, Spin2};
 use shearq_submissions::{Configuration, ConfigurationError, NoiseSource, Registry};
 
-use crate::defects::{DefectCounts, Defects, LightLimits};
+use crate::defects::{Defects, LightLimits};
 use crate::denoise::{DenoiseScratch, WaveletWiener, border_noise};
 use crate::error::{EpochError, MeasureError};
-use crate::measurement::{Flag, Measurement, PsfShape};
+use crate::measurement::{DefectCounts, Flag, Measurement, PsfShape};
 use crate::method::{AdaptedSettings, CutEpoch, CutWorker, Images, MethodPlan, Saturation};
 use crate::missing::{MissingPixels, mark_padding_missing};
 use crate::network::convolve;

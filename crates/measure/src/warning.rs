@@ -9,8 +9,7 @@ use shearq_submissions::limits::MIN_PSF;
 use strum_macros::IntoStaticStr;
 use thiserror::Error;
 
-use crate::defects::DefectCounts;
-use crate::measurement::{Flag, Measurement};
+use crate::measurement::{DefectCounts, Flag, Measurement};
 
 /// Something in the data of an image that biases shears, or is likely a mistake.
 ///
