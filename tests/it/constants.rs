@@ -20,14 +20,20 @@ struct Constant {
     origin: String,
 }
 
-/// The constants of a file outside tests.
-fn constants(path: &Path) -> Vec<Constant> {
+/// A file without its tests.
+fn code(path: &Path) -> String {
     let text = fs::read_to_string(path).unwrap();
     let code = text.split("#[cfg(test)]\nmod tests").next().unwrap();
+    code.to_owned()
+}
+
+/// The constants of a file outside tests.
+fn constants(path: &Path) -> Vec<Constant> {
+    let code = code(path);
     let file = path.strip_prefix(SOURCES).unwrap().display().to_string();
     let mut found = Vec::new();
     let mut comment = Vec::new();
-    let mut rest = code;
+    let mut rest = &code[..];
     while let Some((line, next)) = rest.split_once('\n') {
         let declared = line.trim().trim_start_matches("pub(crate) ");
         let declared = declared
@@ -71,9 +77,7 @@ fn tuned() -> Vec<Constant> {
         |path: &&std::path::PathBuf| path.ends_with("tests.rs") || path.ends_with("testing.rs");
     let paths = paths.iter().filter(|path| !tests(path));
     let all: Vec<Constant> = paths.clone().flat_map(|path| constants(path)).collect();
-    let code: String = paths
-        .map(|path| fs::read_to_string(path).unwrap())
-        .collect();
+    let code: String = paths.map(|path| code(path)).collect();
     let lays_out = |name: &str| {
         let places = [
             format!("[{name}]"),

@@ -10,12 +10,13 @@ use ndarray::{Array2, ArrayView2};
 
 use crate::error::MeasureError;
 
-// Wave numbers in radians per pixel up to which the transform of the PSF is kept, and from which it is zero. The narrowest target of a
-// configuration ends at 2.2.
+// Wave number in radians per pixel up to which the transform of the PSF is kept. The narrowest target of a configuration ends at 2.2.
 const KEPT: f64 = 2.4;
+// Wave number from which it is zero.
 const ZERO: f64 = 2.9;
-// Fine pixels along a pixel of the galaxies, and pixels of the galaxies along the image. Chosen by hand.
+// Fine pixels along a pixel of the galaxies. Chosen by hand.
 const MAX_OVERSAMPLING: usize = 32;
+// Pixels of the galaxies along the image. Chosen by hand.
 const MAX_SIDE: usize = 512;
 
 /// The PSF on pixels of the galaxies, of a PSF whose image has `factor` × `factor` pixels for each of them, as simulators of optics

@@ -32,16 +32,17 @@ const MIN_SNR_SHARED: f64 = 1000.0;
 const MIN_SNR_EACH: f64 = 100.0;
 // Wave number in radians per pixel at which the transform of a PSF is compared with the limits below.
 const SAMPLED_WAVE_NUMBER: f64 = 2.0;
-// Where the transform of a PSF from finer pixels is zero, and the power of rounding.
+// Where the transform of a PSF from finer pixels is zero.
 const FILTERED_WAVE_NUMBER: f64 = 3.0;
+// Power of rounding there.
 const MAX_FILTERED_POWER: f64 = 1e-5;
 // ln P(2)/ln P(1) of Gaussians is 4, of Moffat and Kolmogorov PSFs 3.3 to 3.6, of optics with any obscuration, jitter or charge diffusion 2.2 to 2.4.
 const MIN_INDEX_TURBULENCE: f64 = 2.8;
 // P(2) from which m departs from zero, and how m then grows with it. 400 galaxies of half-light radii 1.5 to 3.5 px at S/N 200 behind 25
 // PSFs: m is 0.6 to 1.2 times P(2π − 1), the light that is aliased to one radian per pixel, which the pixels do not show.
 // Optics: P(2) = 0.28 (Euclid VIS) has m = 0, 0.29 (Roman J129) 0.008, 0.34 (Roman Y106) 0.032, 0.45 (Euclid NISP J) 0.041.
-// Turbulence: P(2) = 0.35 has m = 0.004, 0.53 0.014, 0.67 0.023.
 const OPTICS: [f64; 2] = [0.285, 0.3];
+// Turbulence: P(2) = 0.35 has m = 0.004, 0.53 0.014, 0.67 0.023.
 const TURBULENCE: [f64; 2] = [0.3, 0.055];
 // Effect on m of aliasing above which a warning is due.
 const MAX_ALIASING: f64 = 0.002;
