@@ -130,7 +130,7 @@ struct Summing {
     #[arg(long, value_name = "CATALOGUE", requires = "bins", conflicts_with_all = ["against", "sums", "shard"])]
     like: Option<PathBuf>,
     /// Column of the survey's tomographic bins, for m and c of each [default: a column such as TOMOBIN or zbin].
-    #[arg(long, value_name = "COLUMN", requires = "like")]
+    #[arg(long, value_name = "COLUMN", requires = "like", conflicts_with_all = ["against", "sums", "shard"])]
     tomography: Option<String>,
     /// Use only galaxies for which this holds, such as "snr > 10 and size < 4". Catalogues of linear configurations can
     /// also be cut by steps, such as "step(snr, 10, 1.5) and step(size, 2.5)", whose response to shear enters (see

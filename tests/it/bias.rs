@@ -422,7 +422,9 @@ fn distortions_are_divided_by_the_response_that_they_have() {
     let tolerance = 2e-3;
     for names in ["corrected_e1,corrected_e2", "e1,e2"] {
         let files = with_response(names);
-        assert_m(&rows(&folder, &files)[0], M, tolerance);
+        let found = &rows(&folder, &files)[0];
+        // Without R12 and R21, whose means in this sample change m by about its error.
+        assert_m(found, M, 3.0 * number(found, "m1_error"));
         for option in ["distortion", "responsivity"] {
             let line = format!("bias {files} --ellipticity {option}");
             folder.refuses(&line, "`R11`[..]this response is not used");
@@ -638,7 +640,7 @@ fn paired_galaxies_have_the_error_of_pairs() {
     });
     assert_has(&all.0, "count under one of two opposite shears only");
     assert!(number(&all.1[0], "m1_error") > 0.02, "{}", all.1[0]);
-    assert_has(&paired.0, "40 rows have no partner");
+    assert_has(&paired.0, "are used: 40 rows have no");
     assert_m(&paired.1[0], [0.1, -0.1], 1e-9);
     assert!(number(&paired.1[0], "m1_error") < 1e-9);
     assert_eq!(number(&paired.1[0], "n"), 2.0 * 0.98 * GALAXIES as f64);
