@@ -572,8 +572,8 @@ impl<'a> Rows<'a> {
             _ => "a number",
         };
         let mut message = format!("line {line}: `{field}` in column `{name}` is not {expected}");
-        // VizieR's tables have lines of units and of dashes.
-        if self.rows == 1 {
+        // VizieR's tables have lines of units and of dashes below the names.
+        if self.rows == 1 && line > 1 {
             message +=
                 ". If it is one of units or dashes below the names, try: the table without it";
         }
