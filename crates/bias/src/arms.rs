@@ -2,8 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use crate::sums::{Layout, MeanResponse, WEIGHT};
-use crate::units::{add, shifted};
+use crate::sums::{COUNT, Layout, MeanResponse, WEIGHT, add, shifted};
 
 /// Sums of the units of a jackknife, by arm.
 ///
@@ -66,7 +65,7 @@ impl Units {
     pub fn galaxies(&self, bin: usize) -> usize {
         let units = self.of_bins(bin, 1);
         let all = units.iter().flatten();
-        all.map(|(_, sums)| crate::fit::count(sums)).sum::<f64>() as usize
+        all.map(|(_, sums)| sums[COUNT]).sum::<f64>() as usize
     }
 
     // Units without a galaxy in the bins are no units of them: they would make the factor (n − 1)/n of the jackknife too large.

@@ -5,8 +5,7 @@ use crate::design::Grouping;
 use crate::error::{BiasError, MIN_FITTED_RESPONSE_SIGNIFICANCE};
 use crate::fit::{self, ESTIMATES, Estimates, Known, M, MEAN_M, Plan, RESPONSE};
 use crate::stars::Behind;
-use crate::sums::{WEIGHT, WEIGHT2};
-use crate::units::add;
+use crate::sums::{WEIGHT, WEIGHT2, add};
 
 /// A quantity that is estimated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

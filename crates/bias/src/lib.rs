@@ -34,6 +34,7 @@
 #![forbid(unsafe_code)]
 
 mod arms;
+mod catalogue;
 mod design;
 mod error;
 mod estimate;
@@ -45,10 +46,8 @@ mod units;
 mod verdict;
 
 pub use arms::Units;
-pub use design::{
-    Catalogue, Design, Dominant, Grouping, Missing, Range, Repeated, WithoutPartner, group,
-    same_galaxies,
-};
+pub use catalogue::{Catalogue, Dominant, Range, Repeated};
+pub use design::{Design, Grouping, Missing, WithoutPartner, group, same_galaxies};
 pub use error::BiasError;
 pub use estimate::{Estimate, Measured, QUANTITIES, Quantity, difference, estimate};
 pub use stars::{Behind, StarNoise};

@@ -7,7 +7,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use crate::design::{Catalogue, arms};
+use crate::catalogue::{Catalogue, arms};
 
 // Values of a part of names that may be versions of the same galaxies: rotations, noise realisations, bands. A part with more
 // values is a number of a tile or seed. Chosen by hand.

@@ -455,3 +455,15 @@ impl Component<'_> {
 const fn triangle(n: usize) -> usize {
     n * (n + 1) / 2
 }
+
+/// The key of a unit that joins 2^`shift` neighbouring keys.
+pub(crate) fn shifted(key: u64, shift: u32) -> u64 {
+    // A shift by 64 bits or more overflows, and means one unit.
+    key.checked_shr(shift).unwrap_or(0)
+}
+
+pub(crate) fn add(sums: &mut [f64], more: &[f64]) {
+    for (sum, more) in sums.iter_mut().zip(more) {
+        *sum += more;
+    }
+}

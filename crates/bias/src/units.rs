@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::arms::Units;
 use crate::error::BiasError;
-use crate::sums::{Layout, Row};
+use crate::sums::{Layout, Row, add, shifted};
 
 // Units that are kept, at least and at most, and per catalogue in between. A jackknife of 1000 units determines an error to
 // 1/√2000 = 2 %; more units only cost memory and time.
@@ -260,16 +260,5 @@ impl UnitSums {
             }
         }
         pairs.into_values().collect()
-    }
-}
-
-pub(crate) fn shifted(key: u64, shift: u32) -> u64 {
-    // A shift by 64 bits or more overflows, and means one unit.
-    key.checked_shr(shift).unwrap_or(0)
-}
-
-pub(crate) fn add(sums: &mut [f64], more: &[f64]) {
-    for (sum, more) in sums.iter_mut().zip(more) {
-        *sum += more;
     }
 }

@@ -1,0 +1,158 @@
+//! What is known of a catalogue, and which catalogues have the same shear.
+
+use serde::{Deserialize, Serialize};
+
+use crate::stars::StarNoise;
+
+/// Smallest and largest value.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Range {
+    /// Smallest value.
+    pub low: f64,
+    /// Largest value.
+    pub high: f64,
+}
+
+impl Default for Range {
+    fn default() -> Self {
+        Range {
+            low: f64::MAX,
+            high: f64::MIN,
+        }
+    }
+}
+
+impl Range {
+    /// Includes a value.
+    pub fn add(&mut self, value: f64) {
+        self.low = self.low.min(value);
+        self.high = self.high.max(value);
+    }
+
+    /// The value, if all are equal.
+    pub fn constant(self) -> Option<f64> {
+        (self.low == self.high).then_some(self.low)
+    }
+}
+
+/// Numbers of two columns, or of one that is named twice, that many rows share exactly, such as zeros for failed
+/// measurements. They are reported, not removed: only the user can decide whether they are measurements.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Repeated {
+    /// The columns.
+    pub columns: [String; 2],
+    /// The numbers.
+    pub values: [f64; 2],
+    /// The rows that have them and count.
+    pub rows: u64,
+}
+
+/// A row that has much of the sum of all responses. It is reported, not removed.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Dominant {
+    /// The row, from 1.
+    pub row: u64,
+    /// The component, 0 or 1.
+    pub component: usize,
+    /// Its response, times its weight.
+    pub response: f64,
+    /// The mean of all rows that count.
+    pub mean: f64,
+    /// The part of the sum that it has.
+    pub share: f64,
+}
+
+/// What is known of a catalogue: its rows, how many of them do not count and why, and its ranges. A row is counted in the
+/// first of these reasons that applies.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Catalogue {
+    /// Its name.
+    pub name: String,
+    /// Rows.
+    pub rows: u64,
+    /// Rows with a flag.
+    pub flagged: u64,
+    /// Rows with a weight of zero or less.
+    pub unweighted: u64,
+    /// Rows that the selection leaves out.
+    pub unselected: u64,
+    /// Rows with a missing value, if those are left out.
+    pub missing: u64,
+    /// Rows with a number that stands for a failed measurement, such as −99, if those are left out.
+    #[serde(default)]
+    pub failed: u64,
+    /// Rows with a distortion above 1, to which no shear belongs. Noise makes them.
+    #[serde(default)]
+    pub above_one: u64,
+    /// Rows that do not count because the galaxy does not count under all test shears.
+    #[serde(default)]
+    pub without_partner: u64,
+    /// Rows that count with |e| above 1, and above 2.
+    #[serde(default)]
+    pub beyond: [u64; 2],
+    /// Pairs of numbers that many rows share exactly.
+    #[serde(default)]
+    pub repeated: Vec<Repeated>,
+    /// Rows that have the numbers of an earlier row, if these are not few.
+    #[serde(default)]
+    pub copies: u64,
+    /// Rows that have the identifier of an earlier row, if these are not few.
+    #[serde(default)]
+    pub shared_identifiers: u64,
+    /// A sum over the rows that count that no other galaxies have; 0 without rows.
+    #[serde(default)]
+    pub content: u64,
+    /// A row with much of the response.
+    #[serde(default)]
+    pub dominant: Option<Dominant>,
+    /// Range of the true shears g1 and g2 of the rows that count. Designs are recognised from it.
+    pub shear: [Range; 2],
+    /// Range of the ellipticities e1 and e2 of the rows that count.
+    pub ellipticity: [Range; 2],
+    /// The noise of the star that is the PSF of all its galaxies, if it is known.
+    #[serde(default)]
+    pub star: Option<StarNoise>,
+    /// The fingerprint of the image that it was measured on, if it is known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub image: Option<String>,
+}
+
+impl Catalogue {
+    /// The true shear, if all galaxies have the same.
+    pub(crate) fn constant(&self) -> Option<[f64; 2]> {
+        let [a, b] = self.shear.map(Range::constant);
+        Some([a?, b?])
+    }
+}
+
+// Largest relative difference of equal shears: single precision rounds by 6·10⁻⁸, and FITS tables in it did not pair with
+// tables of double precision.
+const ROUNDING: f64 = 1e-6;
+
+pub(crate) fn same(a: [f64; 2], b: [f64; 2]) -> bool {
+    let modulus = a[0].hypot(a[1]).max(b[0].hypot(b[1]));
+    (a[0] - b[0]).hypot(a[1] - b[1]) <= ROUNDING * modulus
+}
+
+/// Different shears, in the order in which they appear.
+pub(crate) fn kinds(shears: &[[f64; 2]]) -> Vec<[f64; 2]> {
+    let mut kinds: Vec<[f64; 2]> = Vec::new();
+    for &shear in shears {
+        if !kinds.iter().any(|known| same(*known, shear)) {
+            kinds.push(shear);
+        }
+    }
+    kinds
+}
+
+/// The arm of each catalogue: those of one true shear are an arm, and all with varying shear.
+pub(crate) fn arms(catalogues: &[Catalogue]) -> Vec<u32> {
+    let shears: Vec<[f64; 2]> = catalogues.iter().filter_map(Catalogue::constant).collect();
+    let kinds = kinds(&shears);
+    let arm = |own: &Catalogue| {
+        let shear = own.constant();
+        let kind = shear.and_then(|shear| kinds.iter().position(|kind| same(*kind, shear)));
+        kind.unwrap_or(kinds.len()) as u32
+    };
+    catalogues.iter().map(arm).collect()
+}
