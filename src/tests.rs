@@ -116,11 +116,12 @@ fn ways(path: &str) -> Option<Vec<Vec<&'static str>>> {
 const NAMES_ONLY: [&str; 2] = ["baseline record", "baseline check"];
 
 // Pairs that the command refuses when it runs.
-const REFUSED_WHEN_RUN: [(&str, &str, &str); 6] = [
+const REFUSED_WHEN_RUN: [(&str, &str, &str); 7] = [
     ("run", "data", "grid"),
     ("run", "data", "seed"),
     ("run", "data", "amplitude"),
     ("run", "data", "tilt"),
+    ("run", "data", "fixed-psf"),
     ("run", "shard", "store"),
     ("run", "shard", "report"),
 ];
