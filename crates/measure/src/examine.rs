@@ -553,12 +553,15 @@ impl Examination {
 
     /// A warning if the largest of all peaks occurs much more often than any other value: whole numbers repeat, too.
     fn saturated(&self, of: usize) -> Option<Warning> {
-        let mut peaks: Vec<f64> = self.stamps.iter().map(|stamp| stamp.peak).collect();
-        peaks.sort_by(f64::total_cmp);
-        let mut counts = peaks.chunk_by(|a, b| a == b).map(<[f64]>::len);
+        let peaks = self.stamps.iter().map(|stamp| (stamp.peak, stamp.trace));
+        let mut peaks: Vec<(f64, u64)> = peaks.collect();
+        peaks.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+        // Copies of a stamp have a warning of their own.
+        peaks.dedup();
+        let mut counts = peaks.chunk_by(|a, b| a.0 == b.0).map(<[_]>::len);
         let count = counts.next_back()?;
         let most = MIN_SATURATED * counts.max().unwrap_or(1);
-        let level = *peaks.last()?;
+        let (level, _) = *peaks.last()?;
         (count > most).then_some(Warning::Saturated { level, count, of })
     }
 
