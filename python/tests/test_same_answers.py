@@ -114,7 +114,9 @@ def test_the_same_data_have_one_answer(data, one, other):
 
 
 def test_headers_whose_pixels_are_those_of_the_sky_need_no_wcs(data, tmp_path):
-    plain = fits.Header({"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CD1_1": -5e-5, "CD2_2": 5e-5})
+    # The scale of star.fits, so that the orientation alone differs.
+    scale = 0.19997 / 3600
+    plain = fits.Header({"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CD1_1": -scale, "CD2_2": scale})
     fits.writeto(tmp_path / "plain.fits", data.stamps, plain)
     found = shearq.measure(tmp_path / "plain.fits", data.psf, noise=data.noise)
     assert found.attrs["frame"] == "pixel" and str(found.mean_shear()).endswith(" flagged, pixel frame)")

@@ -312,7 +312,7 @@ impl Defects {
                     true => 1 + this[x - 1].min(last[x]).min(last[x - 1]),
                     false => 1,
                 };
-                if !(value > low) {
+                if value.is_nan() || value <= low {
                     continue;
                 }
                 if this[x] >= side {

@@ -29,7 +29,10 @@ def _is_hdu(value: Any) -> bool:
 def _opened(name: str, value: Any) -> tuple[Any, NDArray[np.float64] | None]:
     """The pixels of a path or HDU and the Jacobians of its images; anything else as it is, without."""
     if isinstance(value, (str, os.PathLike)):
-        pixels, matrices, messages = _shearq.read_images(os.fspath(value), name == "psf")
+        try:
+            pixels, matrices, messages = _shearq.read_images(os.fspath(value), name == "psf")
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from None
     elif _is_hdu(value):
         pixels = value.data
         if pixels is None or np.ndim(pixels) not in (2, 3):

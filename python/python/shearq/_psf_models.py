@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ._arrays import double, shown
-from ._galsim import PixelOfPsf, _is_profile, drawn, no_pixel
+from ._galsim import PixelOfPsf, _is_image, _is_profile, drawn, no_pixel
 from ._wcs import jacobians
 
 # What a model needs: the number of pixels on a side, x and y of the galaxy, the Jacobian of its pixels or None, and other
@@ -82,7 +82,8 @@ def _draw_of(psf: Any, pixel: PixelOfPsf | None = None) -> _Draw | None:
             # These models know whether they contain the pixel.
             no_pixel(pixel)
             return drawer(psf)
-    if callable(psf) and not _is_profile(psf) and not isinstance(psf, type):
+    # An image of GalSim can be called, too.
+    if callable(psf) and not (_is_profile(psf) or _is_image(psf) or isinstance(psf, type)):
         return _function(psf, pixel)
     return None
 
@@ -137,10 +138,12 @@ def at_galaxies(
         if properties is not None:
             raise TypeError(f"properties: found with a PSF of type {type(psf).__name__}; expected a model of Piff, or a function")
         return psf
+    if _is_image(stamps):
+        stamps = [stamps]
     count = len(stamps)
-    side = np.shape(stamps[0] if count else stamps)[-1] if not hasattr(stamps, "shape") else stamps.shape[-1]
     if count == 0:
         raise ValueError("stamps: found none; expected one or more")
+    side = np.shape(stamps[0].array if _is_image(stamps[0]) else stamps[0])[-1]
     if x is None or y is None:
         raise ValueError("psf: found a model, and no places of the galaxies. Try: x=, y=, in pixels of the image from which the stamps were cut")
     places = []
