@@ -184,9 +184,8 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     if let (Some(challenge), Some(branch)) = (&arguments.challenge, &arguments.branch) {
         return run_branch(arguments, challenge, branch);
     }
-    let (sets, images) = match (&arguments.sets, arguments.images) {
-        (Some(sets), Some(images)) => (sets, images),
-        _ => anyhow::bail!("expected --sets and --images, or --challenge and --branch"),
+    let (Some(sets), Some(images)) = (&arguments.sets, arguments.images) else {
+        anyhow::bail!("expected --sets and --images, or --challenge and --branch");
     };
     let images = images::of_simulation(&sets.simulated()?, images);
     let images = arguments.sharding.part(&images);

@@ -185,7 +185,7 @@ fn behind_stars(
         }
     }
     Ok(Estimate {
-        galaxies: fit::count(&total) as usize,
+        galaxies: fit::count(total) as usize,
         effective: total[WEIGHT] * total[WEIGHT] / total[WEIGHT2],
         units: units.len(),
         values,

@@ -433,7 +433,7 @@ mod tests {
         }
         // One key in half of the rows, which no choice by bits may miss.
         let mut found = Multiplicity::default();
-        let key = |row: u64| hash(if row % 2 == 0 { 1 << 60 } else { row });
+        let key = |row: u64| hash(if row.is_multiple_of(2) { 1 << 60 } else { row });
         found.look_for((0..1000).map(key));
         (0..400_000).for_each(|row| found.add(key(row)));
         let share = found.repeated() as f64 / 4e5;
@@ -454,10 +454,10 @@ mod tests {
             let columns = [0, 1].map(|k| (0..20_000).map(|row| value(row, k)).collect::<Vec<_>>());
             let part = columns.map(Cow::Owned);
             found.look_for(&part, [0, 1], None);
-            for row in 0..20_000 {
-                let key = [0, 1]
+            for (e1, e2) in part[0].iter().zip(part[1].iter()) {
+                let key = [e1, e2]
                     .iter()
-                    .fold(0, |key, k| hash(key ^ part[*k][row].to_bits()));
+                    .fold(0, |key, value| hash(key ^ value.to_bits()));
                 found.add(Some(key), None);
             }
             found.rows()

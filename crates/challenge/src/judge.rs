@@ -302,6 +302,10 @@ impl Judge {
 
     // The entries to compare with the true shear, in order of arrival. Those in the store are only counted, because scoring is
     // slow. What is refused here was not compared, so it does not count towards the limit of its team.
+    #[expect(
+        clippy::too_many_lines,
+        reason = "the rules of an entry, one after the other"
+    )]
     fn candidates(
         &self,
         sendings: &[(Sending, bool)],
@@ -375,6 +379,8 @@ impl Judge {
             let own = compared.entry(team_key(&team)).or_default();
             let earlier = own.iter().filter(|(time, _)| *time <= arrival.received);
             let earlier: BTreeSet<&str> = earlier.map(|(_, content)| &**content).collect();
+            // Whatever their times: with times of files, a team could date each new question before all others.
+            let asked: BTreeSet<&str> = own.iter().map(|(_, content)| &**content).collect();
             let limit = rules.entries_per_team.map_or(usize::MAX, |n| n as usize);
             let reason = match check_team(&team) {
                 Err(error) => Some(error),
@@ -389,7 +395,7 @@ impl Judge {
                 Ok(()) if earlier.contains(&*content.sha256) => {
                     Some("identical content as an earlier entry of the team".into())
                 }
-                Ok(()) if earlier.len() >= limit => {
+                Ok(()) if asked.len() >= limit && !asked.contains(&*content.sha256) => {
                     Some(format!("the team has {limit} entries already"))
                 }
                 Ok(()) => None,

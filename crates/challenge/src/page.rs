@@ -63,6 +63,7 @@ impl View<'_> {
         self.table_of(&[Board::Main, Board::Late, Board::Partial])
     }
 
+    #[expect(clippy::too_many_lines, reason = "one column after the other")]
     fn table_of(&self, boards: &[Board]) -> Table {
         let metric = self.metric();
         let zero = metric.of_zero_shear(self.zero_shear.unwrap_or(f64::NAN));

@@ -614,7 +614,7 @@ fn value(field: &str) -> Option<f64> {
                 .find(|(own, _)| is(own))
                 .map(|own| own.1)
         };
-        match MISSING.iter().any(|own| is(&own)) {
+        match MISSING.iter().any(is) {
             true => Some(f64::NAN),
             false => truth(),
         }

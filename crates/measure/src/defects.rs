@@ -129,7 +129,7 @@ impl Defects {
         for _ in 0..MAX_PASSES {
             let before = found.total();
             if may_repeat {
-                found.repeated += self.remove_repeated(stamp, n);
+                found.repeated += self.remove_repeated(stamp, n, &sky);
             }
             let beside = found.total() > 0;
             let mut is_dark = self.find(stamp, n, &sky, limits, beside);
@@ -256,11 +256,18 @@ impl Defects {
     }
 
     /// Removes areas of one value. Returns the number of pixels.
-    fn remove_repeated(&mut self, stamp: &mut [f32], n: usize) -> u32 {
+    fn remove_repeated(&mut self, stamp: &mut [f32], n: usize, sky: &StampSky) -> u32 {
         let Some(side) = area_side(stamp, n) else {
             return 0;
         };
-        let Screening { low, .. } = Screening::of(stamp, n);
+        // The darkest value may recur, as zeros of counts without sky. A pixel far below the sky is not the darkest: one of −99 would
+        // make an area of all zeros.
+        let dark = match sky.noise > 0.0 {
+            true => sky.level - MIN_DEPARTURE * sky.noise,
+            false => f32::NEG_INFINITY,
+        };
+        let bright = stamp.iter().copied().filter(|&value| value >= dark);
+        let low = bright.fold(f32::INFINITY, f32::min);
         self.mark_areas(stamp, n, side, low);
         let (mut step, mut pairs, mut high) = (0.0f32, 0u32, 0.0f32);
         for (at, &value) in stamp.iter().enumerate() {
@@ -467,10 +474,34 @@ fn area_side(stamp: &[f32], n: usize) -> Option<usize> {
     let equal = (three[0] / three[1]) / (two[0] / two[1]) - 1.0;
     // The most frequent value has at most the probability √q.
     let most_frequent = if equal > 0.0 { equal.sqrt() } else { 0.0 };
+    let most_frequent = most_frequent.max(majority_of_counts(stamp));
     AREA_SIDES.into_iter().find(|&side| {
         let others = (side * side - 1) as i32;
         stamp.len() as f64 * most_frequent.powi(others) < MAX_CHANCE
     })
+}
+
+/// The share of the value that more than half of the pixels have, if all are whole numbers: noise below half a count repeats one
+/// value more often than its neighbours show. Zero otherwise.
+fn majority_of_counts(stamp: &[f32]) -> f64 {
+    // The vote of Boyer & Moore (1981), which keeps the value that has the majority, if one has.
+    let (mut value, mut votes, mut known) = (0.0, 0usize, 0usize);
+    for &own in stamp.iter().filter(|own| own.is_finite()) {
+        if own.fract() != 0.0 {
+            return 0.0;
+        }
+        known += 1;
+        if votes == 0 {
+            value = own;
+        }
+        votes = if own == value { votes + 1 } else { votes - 1 };
+    }
+    let count = stamp.iter().filter(|&&own| own == value).count();
+    if 2 * count > known {
+        count as f64 / known as f64
+    } else {
+        0.0
+    }
 }
 
 /// The pixels to the right of a pixel and above it in a stamp of `n` pixels a side.

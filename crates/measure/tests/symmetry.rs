@@ -121,7 +121,6 @@ fn follows(
             .flat_map(|(plain, mapped)| [0, 1].map(|k| (mapped[k] - signs[k] * plain[k]).abs()));
         let most = pairs.fold(0.0, f64::max);
         let (name, side) = (&configuration.name, stamps.dim().1);
-        println!("{name} {side} {symmetry:?} {most:.1e}");
         let what = format!("{name}, stamps of {side} px, {symmetry:?}: {most}");
         assert!(most < tolerance, "{what}");
     }

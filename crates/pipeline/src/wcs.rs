@@ -179,8 +179,11 @@ mod tests {
         Wcs::of_header(&mut ImageReader::open(&path).unwrap()).unwrap()
     }
 
+    // The name of a header, its cards, and places with derivatives.
+    type Header = (String, BTreeMap<String, String>, Vec<[f64; 8]>);
+
     /// Headers of lines `KEY = VALUE`, with lines `at` of places and derivatives.
-    fn headers(text: &str) -> Vec<(String, BTreeMap<String, String>, Vec<[f64; 8]>)> {
+    fn headers(text: &str) -> Vec<Header> {
         let mut found: Vec<(String, BTreeMap<_, _>, Vec<_>)> = Vec::new();
         for line in text.lines().filter(|line| !line.starts_with('#')) {
             if line.starts_with('[') {

@@ -255,6 +255,10 @@ impl BiasResult {
 }
 
 /// Sums the catalogues of a request for which `part` holds, given their number.
+#[expect(
+    clippy::too_many_lines,
+    reason = "steps of reading, one after the other"
+)]
 pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, BiasFailure> {
     distinct(&request.catalogues)?;
     let paths = request.catalogues.iter().map(|input| input.name.as_path());

@@ -102,6 +102,42 @@ fn counts_of_few_photons_keep_their_pixels() {
 }
 
 #[test]
+fn whole_numbers_of_little_noise_keep_their_pixels() {
+    let mut rng = ChaCha8Rng::seed_from_u64(8);
+    for sigma in [0.5, 0.4, 0.3, 0.25, 0.2] {
+        for _ in 0..40 {
+            let noise = |_| {
+                let value: f32 = StandardNormal.sample(&mut rng);
+                (sigma * value).round()
+            };
+            let stamp: Vec<f32> = (0..N * N).map(noise).collect();
+            let (places, _) = found(&stamp, N, sigma, &limits(3.4));
+            assert!(places.is_empty(), "{sigma}: {}", places.len());
+        }
+    }
+}
+
+#[test]
+fn a_cold_pixel_leaves_zeros_of_counts() {
+    let mut rng = ChaCha8Rng::seed_from_u64(9);
+    let mut stamp: Vec<f32> = galaxy(3.4, N, 40.0, &mut rng)
+        .iter()
+        .map(|value| value.round().max(0.0))
+        .collect();
+    let (clean, _) = found(&stamp, N, 1.0, &limits(3.4));
+    stamp[5 * N + 7] = -99.0;
+    let (places, _) = found(&stamp, N, 1.0, &limits(3.4));
+    let expected: Vec<usize> = [clean, vec![5 * N + 7]].concat();
+    assert!(
+        places.len() <= expected.len(),
+        "{} of {}",
+        places.len(),
+        stamp.len()
+    );
+    assert!(places.contains(&(5 * N + 7)));
+}
+
+#[test]
 fn stamps_without_noise_keep_zeros_beyond_their_light() {
     let limits = limits(3.4);
     let mut rng = ChaCha8Rng::seed_from_u64(3);

@@ -176,6 +176,7 @@ impl Wcs {
         }
     }
 
+    #[expect(clippy::too_many_lines, reason = "each key of a header in turn")]
     fn of_readable(keys: &Keys) -> Self {
         let kinds = ["CTYPE1", "CTYPE2"].map(|key| keys.text(key));
         let kind = kinds[0].as_str();

@@ -265,12 +265,15 @@ fn axis(binning: &Binning, mut values: Values, is_sample: bool) -> Result<Axis, 
     })
 }
 
+// A request, and the names of the bins of each of its quantities of texts.
+type Numbered = (Request, Vec<Option<Axis>>);
+
 /// The request with numbers in place of texts: bins of a column of texts are those of its number among them. Also the names of
 /// the bins, by place.
 pub(super) fn with_numbers(
     request: &Request,
     reading: &Reading<'_>,
-) -> Result<Option<(Request, Vec<Option<Axis>>)>, BiasFailure> {
+) -> Result<Option<Numbered>, BiasFailure> {
     let is_class = |binning: &&Binning| binning.edges == Edges::Values;
     if !request.bins.iter().any(|own| is_class(&own)) {
         return Ok(None);

@@ -81,6 +81,10 @@ fn unknown(place: &Place, name: &str, known: &[String]) -> FileError {
 }
 
 /// The whole survey, then its tomographic bins.
+#[expect(
+    clippy::too_many_lines,
+    reason = "checks of a survey, one after the other"
+)]
 pub(super) fn populations(
     survey: &Survey,
     request: &Request,
