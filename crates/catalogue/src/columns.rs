@@ -183,6 +183,27 @@ fn diagonal((role, catalogue): Key) -> Option<Key> {
     }
 }
 
+// Under artificial shears of one component alone, neither ellipticity would have a response, and m would be that of R = 1.
+fn check_own_responses(path: &Path, columns: &BTreeMap<Key, String>) -> Result<(), FileError> {
+    let pairs = [0, 1].map(|k| sheared_pair(k, k));
+    let there = pairs.map(|pair| pair.iter().all(|key| columns.contains_key(key)));
+    let Some(k) = [0, 1].into_iter().find(|&k| there[k] && !there[1 - k]) else {
+        return Ok(());
+    };
+    let (name, without) = (
+        &columns[&pairs[k][0]],
+        ["e1_1p=none,e1_1m=none", "e2_2p=none,e2_2m=none"][k],
+    );
+    Err(FileError::new(
+        path,
+        format!(
+            "`{name}` and its partner give the response of e{} alone (expected e{} under its own artificial shears, too). Try: --columns with its names, or {without}",
+            k + 1,
+            2 - k
+        ),
+    ))
+}
+
 impl Survey {
     fn of(&self, key: Key) -> Option<&str> {
         self.columns.get(&key).map(String::as_str)
@@ -500,6 +521,7 @@ impl Columns {
                 columns.remove(&key);
             }
         }
+        check_own_responses(path, &columns)?;
         let Some(e1) = name_of_e1(&columns).or_else(|| Some(columns.get(&(Role::E2, 0))?.clone()))
         else {
             return Err(FileError::new(

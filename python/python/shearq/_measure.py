@@ -146,7 +146,7 @@ def measure(
         galaxies from the centres of their stamps along x and y in pixels, ``psf_offsets`` of shape (2,) or (n, 2): the PSFs from the
         centres of theirs, for PSFs drawn at the phases of the galaxies as in MEDS, and ``flux``: that of the galaxies in relation to the other
         epochs, a number or (n,), for bands. Galaxy k is on stamp k of each epoch; stamps of NaN are absent. The noise of an
-        epoch is taken as white. Each band counts with flux/noise², so that the fluxes are weights: they may be those of a
+        epoch is taken as white. A single epoch is measured like `stamps`, about the centre of its stamps: its offsets are not used. Each band counts with flux/noise², so that the fluxes are weights: they may be those of a
         typical galaxy, and should not be measured on the noise of the galaxy itself.
     noise : float or array of shape (n,), optional
         Standard deviation of white noise per pixel in the unit of the stamps, for all or per stamp. By default it is

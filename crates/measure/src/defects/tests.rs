@@ -120,21 +120,19 @@ fn whole_numbers_of_little_noise_keep_their_pixels() {
 #[test]
 fn a_cold_pixel_leaves_zeros_of_counts() {
     let mut rng = ChaCha8Rng::seed_from_u64(9);
-    let mut stamp: Vec<f32> = galaxy(3.4, N, 40.0, &mut rng)
-        .iter()
-        .map(|value| value.round().max(0.0))
+    // Of a gain, so that they are no whole numbers.
+    let mut stamp: Vec<f32> = (0..N * N)
+        .map(|_| 1.7 * f32::from(u8::from(rng.random_bool(0.02))))
         .collect();
-    let (clean, _) = found(&stamp, N, 1.0, &limits(3.4));
-    stamp[5 * N + 7] = -99.0;
-    let (places, _) = found(&stamp, N, 1.0, &limits(3.4));
-    let expected: Vec<usize> = [clean, vec![5 * N + 7]].concat();
+    let cold = 5 * N + 7;
+    stamp[cold] = -99.0;
+    let (places, _) = found(&stamp, N, 0.1, &limits(3.4));
+    assert!(places.contains(&cold));
     assert!(
-        places.len() <= expected.len(),
-        "{} of {}",
-        places.len(),
-        stamp.len()
+        places.iter().all(|&at| stamp[at] != 0.0),
+        "{} zeros",
+        places.len()
     );
-    assert!(places.contains(&(5 * N + 7)));
 }
 
 #[test]

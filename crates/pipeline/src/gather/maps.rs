@@ -32,8 +32,8 @@ pub(super) fn variance(
         if content == Content::Weight {
             *value = 1.0 / stated;
         }
-        // The weight 0, or an infinite variance, marks bad pixels in the maps of most surveys.
-        if *value == f64::INFINITY {
+        // The weight 0, or an infinite variance, marks bad pixels in the maps of most surveys. Reading makes an infinite variance NaN.
+        if *value == f64::INFINITY || content != Content::Weight && stated.is_nan() {
             *pixel = f32::NAN;
         }
         if pixel.is_finite() && (value.is_nan() || *value <= 0.0) {
