@@ -98,10 +98,14 @@ class PsfsOfModel:
         self._draw, self._side, self._places = draw, side, places
         self._matrices, self._properties = matrices, properties
         # The size is the model's own for Rubin's and for images of functions.
-        first = self._one(0)
-        self.shape = (len(places), *first.shape)
+        self._first: NDArray[np.float64] | None = None
+        self._first = self._one(0)
+        self.shape = (len(places), *self._first.shape)
 
     def _one(self, k: int) -> NDArray[np.float64]:
+        # Drawn for its shape.
+        if k == 0 and self._first is not None:
+            return self._first
         properties = {name: value if np.ndim(value) == 0 else value[k] for name, value in self._properties.items()}
         matrix = None if self._matrices is None else self._matrices[k if len(self._matrices) > 1 else 0]
         x, y = map(float, self._places[k])
@@ -165,4 +169,4 @@ def one(model: Any, side: int, x: float, y: float, matrix: NDArray[np.float64]) 
     draw = _draw_of(model)
     if draw is None:
         raise TypeError(f"psf: found {type(model).__name__}; expected a model of Piff, PSFEx or Rubin, or a function of (x, y)")
-    return PsfsOfModel(draw, side, np.array([[x, y]]), matrix[np.newaxis], {})[:][0]
+    return PsfsOfModel(draw, side, np.array([[x, y]]), matrix[np.newaxis], {})._one(0)
