@@ -454,6 +454,22 @@ choices! {
     }
 }
 
+/// Columns of a condition that shear does not change.
+#[derive(Debug, Args)]
+pub(crate) struct Unsheared {
+    /// Carried columns in conditions that shear does not change, because they were not measured on images of the galaxies, such as
+    /// z,tile.
+    #[arg(
+        long = "unsheared",
+        id = "unsheared",
+        value_name = "NAMES",
+        value_delimiter = ',',
+        num_args = 1,
+        requires = "condition"
+    )]
+    pub(crate) names: Vec<String>,
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

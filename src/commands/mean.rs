@@ -2,7 +2,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use crate::arguments::{Form, SetList, Threads, sets_of};
+use crate::arguments::{Form, SetList, Threads, Unsheared, sets_of};
 use crate::tell;
 use shearq_catalogue::select::smooth_selection;
 use shearq_dataset::fingerprint;
@@ -40,16 +40,8 @@ pub(crate) struct Arguments {
     /// "x < 1280".
     #[arg(long = "where", value_name = "CONDITION")]
     condition: Option<String>,
-    /// Carried columns in conditions that shear does not change, because they were not measured on images of the galaxies, such as
-    /// z,tile.
-    #[arg(
-        long,
-        value_name = "NAMES",
-        value_delimiter = ',',
-        num_args = 1,
-        requires = "condition"
-    )]
-    unsheared: Vec<String>,
+    #[command(flatten)]
+    unsheared: Unsheared,
     /// Weight as a formula of snr, flux and size, such as "snr^2/(snr^2 + 100)".
     #[arg(long, value_name = "FORMULA")]
     weight: Option<String>,
@@ -65,7 +57,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let selection = smooth_selection(
         condition.as_deref(),
         weight.as_deref(),
-        &arguments.unsheared,
+        &arguments.unsheared.names,
     )?;
     let run = Run::require(measured)?;
     let data = fingerprint::verify_source(measured, &run, sets, arguments.threads.number())?;

@@ -2,6 +2,8 @@ use std::path::PathBuf;
 
 use clap::Args;
 
+use crate::arguments::Unsheared;
+
 use crate::tell;
 use shearq_catalogue::select::{smooth_selection, write_selected};
 use shearq_dataset::run::Run;
@@ -29,16 +31,8 @@ pub(crate) struct Arguments {
         required_unless_present = "weight"
     )]
     condition: Option<String>,
-    /// Carried columns in conditions that shear does not change, because they were not measured on images of the galaxies, such as
-    /// z,tile.
-    #[arg(
-        long,
-        value_name = "NAMES",
-        value_delimiter = ',',
-        num_args = 1,
-        requires = "condition"
-    )]
-    unsheared: Vec<String>,
+    #[command(flatten)]
+    unsheared: Unsheared,
     /// Weight as a formula of snr, flux and size, such as "snr^2/(snr^2 + 100)".
     #[arg(long, value_name = "FORMULA")]
     weight: Option<String>,
@@ -54,7 +48,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let Some(selection) = smooth_selection(
         condition.as_deref(),
         weight.as_deref(),
-        &arguments.unsheared,
+        &arguments.unsheared.names,
     )?
     else {
         return Ok(());
