@@ -50,9 +50,10 @@ use shearq_render::escape::visible;
 use shearq_render::table::Table;
 use shearq_render::terminal::fitted;
 
-/// Measure, calibrate and score weak-lensing galaxy shapes.
+/// m and c of weak-lensing shear catalogues, galaxy shapes with their shear responses, and scores of challenges.
 ///
-/// Start with `shearq quickstart`, which needs no data. Then work in steps:
+/// Start with `shearq quickstart`, which needs no data. `shearq bias` gives m and c of catalogues of any program. To measure
+/// and score shapes, work in steps:
 ///
 /// 1. `gather` makes a data folder from your stamps and PSFs. `simulate` makes a folder of simulated data.
 ///

@@ -14,7 +14,9 @@ use crate::{Findings, made_by, tell};
 use shearq_catalogue::columns::{Names, Shapes, role_names};
 use shearq_catalogue::expression::Expression;
 use shearq_catalogue::recognition::read_presets;
-use shearq_catalogue::request::{Binning, Edges, MAX_AXES, MAX_BINS, Request, Survey, Units};
+use shearq_catalogue::request::{
+    Binning, DEFAULT_STEP, Edges, MAX_AXES, MAX_BINS, Request, Survey, Units,
+};
 use shearq_catalogue::select::selection;
 use shearq_catalogue::truth::{TrueSign, Truth, expand};
 use shearq_dataset::images::Shard;
@@ -165,9 +167,6 @@ struct Summing {
     #[arg(long, value_name = "K/N", requires = "sums")]
     shard: Option<Shard>,
 }
-
-// Of metacalibration in ngmix and metadetect, whose catalogues do not state it.
-const DEFAULT_STEP: f64 = 0.01;
 
 fn columns_help() -> String {
     format!(
@@ -366,10 +365,7 @@ fn of_catalogues(summing: &Summing, catalogues: &[PathBuf]) -> anyhow::Result<Su
     );
     let found = expand(catalogues, truth)?;
     let request = Request {
-        catalogues: found.catalogues,
         names,
-        truth: found.truth,
-        without_catalogue: found.without_catalogue,
         shapes: summing.ellipticity,
         sign,
         bins: summing.bins.clone(),
@@ -388,6 +384,7 @@ fn of_catalogues(summing: &Summing, catalogues: &[PathBuf]) -> anyhow::Result<Su
         },
         drop_missing: summing.drop_missing,
         step: summing.step.unwrap_or(DEFAULT_STEP),
+        ..Request::new(found)
     };
     let own = |number: usize| Shard::holding(number, shard.of()) == shard;
     Ok(sum(&request, &own)?)

@@ -8,13 +8,13 @@ use shearq_catalogue::expression::Expression;
 use shearq_challenges::{PublicBranch, PublicChallenge, Score, Truth, ranking};
 use shearq_dataset::run::Run;
 use shearq_dataset::threads::Pool;
-use shearq_render::figure::{Figure, LinePlot};
+use shearq_render::figure::{Figure, PanelGrid};
 use shearq_render::table::Table;
 use shearq_results::compare::{Order, choose, chosen, score_all};
 use shearq_results::store;
 use shearq_results::submit::is_packed;
 use shearq_results::views::comparison::{
-    compare, compare_runs, named, q_per_set, verdict, verdict_on_runs,
+    compare, compare_runs, named, per_set_plot, verdict, verdict_on_runs,
 };
 use shearq_results::views::pages;
 use shearq_scoring::Options;
@@ -67,7 +67,7 @@ pub(crate) struct Arguments {
     /// Metric or column to sort by, such as `q:desc`.
     #[arg(long, value_name = "FIELD[:desc]")]
     sort: Option<Order>,
-    /// Draw Q of each run and set to this file (.png or .svg).
+    /// Draw Q, calibrated Q and m of each set to this file (.png or .svg).
     #[arg(long, value_name = "FILE")]
     plot: Option<PathBuf>,
     #[command(flatten)]
@@ -98,7 +98,7 @@ const GREAT10_ONLY: [&str; 11] = [
 struct Comparison {
     table: Table,
     verdict: Option<String>,
-    plot: LinePlot,
+    plot: PanelGrid,
 }
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
@@ -216,7 +216,7 @@ fn folders(arguments: &Arguments) -> anyhow::Result<Comparison> {
     Ok(Comparison {
         table,
         verdict: verdict(&named),
-        plot: q_per_set(&named),
+        plot: per_set_plot(&named),
     })
 }
 
@@ -244,7 +244,7 @@ fn stored(arguments: &Arguments, path: &Path) -> anyhow::Result<Comparison> {
         .map(|run| (run.name_with_id(), run.sets.as_slice()));
     Ok(Comparison {
         table,
-        plot: q_per_set(&rows.collect::<Vec<_>>()),
+        plot: per_set_plot(&rows.collect::<Vec<_>>()),
         verdict: verdict_on_runs(runs),
     })
 }

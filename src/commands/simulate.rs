@@ -1,4 +1,4 @@
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::builder::PossibleValuesParser;
 use clap::{ArgGroup, Args};
@@ -109,13 +109,26 @@ fn parse_shear(text: &str) -> Result<[f64; 2], String> {
     Ok([number(g1)?, number(g2)?])
 }
 
-// A folder per version, by whose names `bias` finds the pairs.
-fn versions(arguments: &Arguments) -> anyhow::Result<Vec<(SimulationSettings, PathBuf)>> {
-    let settings = arguments.simulation.settings()?;
+/// Constant shears of the same galaxies.
+pub(super) struct Versions<'a> {
+    pub settings: SimulationSettings,
+    pub shears: &'a [[f64; 2]],
+    /// Whether the opposite shears are wanted, too.
+    pub opposite: bool,
+    /// Whether all galaxies are also wanted rotated by 90 degrees.
+    pub rotated: bool,
+    pub out: &'a Path,
+}
+
+/// A folder per version, by whose names `bias` finds the pairs.
+pub(super) fn versions(
+    wanted: &Versions<'_>,
+) -> anyhow::Result<Vec<(SimulationSettings, PathBuf)>> {
+    let &Versions { settings, out, .. } = wanted;
     let mut shears = Vec::new();
-    for &shear in &arguments.constant_shear {
+    for &shear in wanted.shears {
         // Adding zero makes zero of minus zero, which would name another folder.
-        let opposite = arguments.opposite.then(|| shear.map(|g| 0.0 - g));
+        let opposite = wanted.opposite.then(|| shear.map(|g| 0.0 - g));
         for [g1, g2] in std::iter::once(shear).chain(opposite) {
             anyhow::ensure!(
                 !shears.contains(&[g1, g2]),
@@ -124,11 +137,10 @@ fn versions(arguments: &Arguments) -> anyhow::Result<Vec<(SimulationSettings, Pa
             shears.push([g1, g2]);
         }
     }
-    let out = &arguments.out;
     let mut versions = Vec::new();
     for shear @ [g1, g2] in shears {
         for (rotated, ending) in [(false, ""), (true, "_rotated")] {
-            if rotated && !arguments.rotated {
+            if rotated && !wanted.rotated {
                 continue;
             }
             let settings = SimulationSettings {
@@ -141,9 +153,9 @@ fn versions(arguments: &Arguments) -> anyhow::Result<Vec<(SimulationSettings, Pa
         }
     }
     Ok(match versions.as_slice() {
-        [] => vec![(settings, out.clone())],
+        [] => vec![(settings, out.to_owned())],
         // One version needs no folder of its own.
-        [(only, _)] => vec![(*only, out.clone())],
+        [(only, _)] => vec![(*only, out.to_owned())],
         _ => versions,
     })
 }
@@ -189,7 +201,13 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     };
     let images = images::of_simulation(&sets.simulated()?, images);
     let images = arguments.sharding.part(&images);
-    let versions = versions(arguments)?;
+    let versions = versions(&Versions {
+        settings: arguments.simulation.settings()?,
+        shears: &arguments.constant_shear,
+        opposite: arguments.opposite,
+        rotated: arguments.rotated,
+        out: &arguments.out,
+    })?;
     let grid = versions[0].0.grid as u64;
     let galaxies = (versions.len() * images.len()) as u64 * grid * grid;
     let mut bar = Bar::new("simulating", galaxies);

@@ -8,10 +8,12 @@ use shearq_files::frames::polars::DataFrame;
 use crate::columns::{Names, Shapes};
 use crate::expression::Expression;
 use crate::select::StatedSelection;
-use crate::truth::{TrueSign, Truth};
+use crate::truth::{Expanded, TrueSign, Truth};
 
 /// Bins of all quantities together. KiDS calibrates in 20 × 20 bins of S/N and size (Fenech Conti et al. 2017, MNRAS 467, 1627).
 pub const MAX_BINS: usize = 400;
+/// Artificial shear of metacalibration in ngmix and metadetect, whose catalogues do not state it.
+pub const DEFAULT_STEP: f64 = 0.01;
 /// Quantities that are binned at the same time.
 pub const MAX_AXES: usize = 3;
 
@@ -90,4 +92,26 @@ pub struct Request {
     pub step: f64,
     /// Remarks about images of the data that have no catalogue.
     pub without_catalogue: Vec<String>,
+}
+
+impl Request {
+    /// All rows of the catalogues, with everything recognised from them.
+    pub fn new(found: Expanded) -> Self {
+        Request {
+            catalogues: found.catalogues,
+            names: Names::default(),
+            truth: found.truth,
+            shapes: None,
+            sign: TrueSign::Convention,
+            bins: Vec::new(),
+            like: None,
+            selection: None,
+            design: None,
+            units: Units::Recognised,
+            paired: false,
+            drop_missing: false,
+            step: DEFAULT_STEP,
+            without_catalogue: found.without_catalogue,
+        }
+    }
 }

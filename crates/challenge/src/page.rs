@@ -8,7 +8,7 @@ use shearq_render::html::{Block, Picture, Report, Section};
 use shearq_render::page::PageError;
 use shearq_render::table::{Cell, Table, TableFormat};
 use shearq_results::submit::Kind as FileKind;
-use shearq_results::views::comparison::q_per_set;
+use shearq_results::views::comparison::per_set_plot;
 
 use crate::entry::{EntryInfo, Refused};
 use crate::kind::{ConstantShears, Noise, Published, RankBy};
@@ -379,8 +379,8 @@ impl View<'_> {
                 (name, standing.best.entry.sets.as_slice())
             })
             .collect();
-        let caption = "Q of each set.";
-        let picture = Picture::draw(&q_per_set(&rows), "q-per-set", caption)?;
+        let caption = "Q, calibrated Q and m of each set.";
+        let picture = Picture::draw(&per_set_plot(&rows), "per-set", caption)?;
         Ok(Section::new(
             "sets",
             "Metric of each set",

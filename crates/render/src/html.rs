@@ -34,7 +34,7 @@ const DARK: &str = "color-scheme: dark; --paper: #15171a; --ink: #dddcd8; --mute
      --rule: #34383d; --strong-rule: #8b9096; --link: #8fb8e0; --shade: #202327; --edge: #000a; --dim: brightness(.92);";
 
 // Characters above which the words of a cell run over several lines.
-const LONGEST_LINE: usize = 48;
+const LONGEST_LINE: usize = 36;
 
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Report {
@@ -67,6 +67,14 @@ impl Section {
         }
     }
 
+    /// The same section under another heading.
+    pub fn titled(self, heading: impl Into<String>) -> Self {
+        Section {
+            heading: heading.into(),
+            ..self
+        }
+    }
+
     pub fn push(&mut self, block: Block) {
         self.blocks.push(block);
     }
@@ -82,13 +90,9 @@ pub enum Block {
     Table(Table),
     /// The same with a field that hides rows without the words that a reader types.
     Filtered(Table),
+    /// The same behind its title, on which a reader clicks: details of what stands above.
+    Folded(Table),
     Figure(Picture),
-}
-
-impl Block {
-    fn is_figure(&self) -> bool {
-        matches!(self, Block::Figure(_))
-    }
 }
 
 /// A figure as it stands in a report.
@@ -168,13 +172,7 @@ impl Report {
                     main #main { "\n"
                         @for (id, part) in ids.iter().zip(&self.sections) {
                             (section((id, &part.heading), html! {
-                                @for blocks in part.blocks.chunk_by(|a, b| a.is_figure() && b.is_figure()) {
-                                    @if blocks.len() > 1 {
-                                        div.figures { @for block in blocks { (page.block(block)) "\n" } } "\n"
-                                    } @else {
-                                        @for block in blocks { (page.block(block)) "\n" }
-                                    }
-                                }
+                                @for block in &part.blocks { (page.block(block)) "\n" }
                             }))
                         }
                         @for (name, contents) in ends { (section(name, contents)) }
@@ -189,7 +187,7 @@ impl Report {
     fn used_glossary(&self) -> Vec<Entry> {
         let blocks = self.sections.iter().flat_map(|section| &section.blocks);
         let tables = blocks.filter_map(|block| match block {
-            Block::Table(table) | Block::Filtered(table) => Some(table),
+            Block::Table(table) | Block::Filtered(table) | Block::Folded(table) => Some(table),
             _ => None,
         });
         let headings: Vec<_> = tables.flat_map(|table| &table.headings).collect();
@@ -361,6 +359,9 @@ impl Page {
             },
             Block::Table(table) => self.table(table, false),
             Block::Filtered(table) => self.table(table, true),
+            Block::Folded(table) => html! {
+                details { summary { (Words(&table.title)) } (self.table(table, false)) }
+            },
             Block::Figure(picture) => self.figure(picture),
         }
     }
@@ -373,7 +374,7 @@ impl Page {
             figure id=(id) {
                 div.plate {
                     img src={ "data:image/svg+xml;base64," (BASE64.encode(&picture.svg)) }
-                        alt=(Words(&picture.caption)) width=(picture.size.0) height=(picture.size.1);
+                        alt=(Words(&picture.caption)) width=(pixels(picture.size.0)) height=(pixels(picture.size.1));
                 }
                 figcaption {
                     p { span.number { "Figure " (self.figures) "." } " " (Typeset(&picture.caption)) }
@@ -448,6 +449,12 @@ impl Page {
             }
         }
     }
+}
+
+// Pixels of a style sheet, of which an inch has 96, for points, of which it has 72: letters of figures are then as large as
+// those of the text.
+fn pixels(points: f64) -> f64 {
+    (points * 96.0 / 72.0).round()
 }
 
 // A cell. The first column heads the rows, and stays while others scroll.

@@ -1,4 +1,4 @@
-"""Measure, calibrate and score weak-lensing galaxy shapes.
+"""m and c of weak-lensing shear catalogues, galaxy shapes with their shear responses, and scores of challenges.
 
 >>> import shearq
 >>> cat = shearq.measure(stamps, psf)       # stamps (n, ny, nx), psf (py, px): a catalogue, one row per galaxy

@@ -391,11 +391,12 @@ impl PanelGrid {
         let plots = &self.plots;
         let columns = self.columns.clamp(1, plots.len().max(1));
         let rows = plots.len().div_ceil(columns).max(1) as f64;
+        // A column of a report is 760 points wide: panels fill it, so that it shrinks no letter below those of captions.
         let (width, height) = match columns {
-            1 => (600.0, 370.0),
-            2 => (380.0, 250.0),
-            3 => (280.0, 190.0),
-            _ => (205.0, 150.0),
+            1 => (450.0, 280.0),
+            2 => (300.0, 200.0),
+            3 => (230.0, 160.0),
+            _ => (170.0, 125.0),
         };
         // Named rows need no more space than their names.
         let named = plots

@@ -745,7 +745,7 @@ fn requirement_table(all: &Estimate) -> Table {
             Heading::new("value", "Value"),
             Heading::new("limit", "Largest modulus"),
             Heading::new("verdict", "Verdict"),
-            Heading::new("deciding", "Galaxies that would decide"),
+            Heading::new("deciding", "Galaxies to decide"),
             Heading::new("source", "Required by"),
         ],
         notes: Vec::new(),
@@ -997,20 +997,18 @@ fn middle(ranges: &[[f64; 2]]) -> f64 {
 }
 
 /// The section of a report.
-pub fn section(result: &BiasResult, table: Table) -> Result<Section, FigureError> {
+pub fn section(result: &BiasResult, mut table: Table) -> Result<Section, FigureError> {
     let caption = "m and c with standard errors. Grey: the tightest published requirement.";
     let picture = Picture::draw(&bias_plot(result), "bias", caption)?;
-    let mut blocks = Vec::new();
-    let mut table = table;
+    let mut required = None;
     if let Ok(all) = result.all() {
         let verdicts = verdicts(all);
         table.notes.retain(|note| !verdicts.contains(note));
-        let required = requirement_table(all);
-        if !required.rows.is_empty() && result.design != Design::Null {
-            blocks.push(Block::Table(required));
-        }
+        required = Some(requirement_table(all))
+            .filter(|table| !table.rows.is_empty() && result.design != Design::Null);
     }
-    blocks.extend([Block::Figure(picture), Block::Table(table)]);
+    let mut blocks = vec![Block::Table(table), Block::Figure(picture)];
+    blocks.extend(required.map(Block::Table));
     Ok(Section::new("bias", "Shear bias", blocks))
 }
 

@@ -1,8 +1,8 @@
 //! Tables of methods and recorded runs: mean metrics, differences in Q and calibrated Q, Q per set, and the verdict.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
-use shearq_render::figure::{LinePlot, Series, Style};
+use shearq_render::figure::{LinePlot, PanelGrid, Series, Style};
 use shearq_render::table::{Cell, Table};
 use shearq_scoring::resample::PairedDifference;
 use shearq_scoring::{Definition, Fault, Metrics};
@@ -11,7 +11,7 @@ use shearq_submissions::Published;
 use crate::compare::{Paired, Variant, difference, keep_common_sets};
 use crate::record::{RunRecord, SetRecord, columns_named, mean};
 use crate::score::ScoredSet;
-use crate::views::scores::{best_is_another, definition_note, notes, of_sets, zero_shear_note};
+use crate::views::scores::{best_is_another, definition_note, notes, of_sets};
 
 /// A method or run with its sets.
 pub type Named<'a> = (String, &'a [SetRecord]);
@@ -194,27 +194,6 @@ fn notes_of_variants(variants: &[Variant]) -> Vec<String> {
     shown.collect()
 }
 
-/// The metrics that decide between methods: Q, calibrated Q, m and noise, as means over their common sets.
-pub fn compact(variants: &[Variant]) -> Table {
-    let mut table = Table::titled("Comparison of configurations");
-    for own in columns_named(&["submission", "q", "q_calibrated", "m_cross", "galaxy_noise"]) {
-        table.column(own.name, own.heading, variants, |variant| {
-            own.cell(&variant.run)
-        });
-    }
-    let (sets, images) = sets_and_images(variants);
-    let mut notes = vec![
-        format!("Means over the simulated sets {sets}; {images} images. ± is a standard error."),
-        "Q: the challenge's score. Q cal.: Q after division by the response.".into(),
-        "m: multiplicative bias. noise: scatter per galaxy and component.".into(),
-    ];
-    let q = |variant: &Variant| mean(&variant.run.sets, |metrics| metrics.q).0;
-    let best = variants.iter().max_by(|a, b| q(a).total_cmp(&q(b)));
-    notes.extend(best.and_then(|best| zero_shear_note(&best.scored())));
-    table.notes = notes;
-    table
-}
-
 /// Runs side by side: means over their sets, and the difference in Q from the first run on the same images.
 pub fn compare_runs(runs: &[RunRecord]) -> Table {
     let rows = runs.iter().enumerate().map(|(k, run)| Compared {
@@ -290,23 +269,44 @@ fn ranges(sets: &[SetRecord]) -> String {
     texts.collect::<Vec<_>>().join(",")
 }
 
-/// Q of each set with its error, a series per configuration.
-pub fn q_per_set(rows: &[Named<'_>]) -> LinePlot {
-    let series = rows.iter().enumerate().map(|(k, (name, sets))| {
-        // Shifted, so that points do not hide each other.
-        let aside = 0.6 * ((k as f64 + 0.5) / rows.len() as f64 - 0.5);
-        let x = sets.iter().map(|own| f64::from(own.set) + aside).collect();
-        let y = sets.iter().map(|own| own.metrics.q).collect();
-        let errors = sets.iter().map(|own| own.errors.q).collect();
-        Series::new(name, x, y, Style::Points, k).with_errors(errors)
-    });
-    LinePlot {
-        title: "Quality factor per set".into(),
-        x_label: "set".into(),
-        x_whole: true,
-        y_label: "Q".into(),
-        series: series.collect(),
-        ..LinePlot::default()
+/// Q, calibrated Q and m of each set with errors, a series per configuration.
+pub fn per_set_plot(rows: &[Named<'_>]) -> PanelGrid {
+    let kinds = rows.iter().flat_map(|(_, sets)| *sets);
+    let kinds: BTreeMap<u32, &SetRecord> = kinds.map(|own| (own.set, own)).collect();
+    let name = |own: &SetRecord| {
+        let kind = own.kind().map_or("", |kind| kind.image.label());
+        format!("set {} {kind}", own.set).trim_end().to_owned()
+    };
+    let names: Vec<String> = kinds.values().map(|own| name(own)).collect();
+    let numbers: Vec<u32> = kinds.into_keys().collect();
+    let place = |set: u32| numbers.iter().position(|own| *own == set).unwrap_or(0) as f64;
+    let panel = |key: &str, of: fn(&Metrics) -> f64| {
+        let series = rows.iter().enumerate().map(|(k, (name, sets))| {
+            // Side by side, so that points do not hide each other.
+            let aside = 0.6 * ((k as f64 + 0.5) / rows.len() as f64 - 0.5);
+            let x = sets.iter().map(|own| place(own.set) + aside).collect();
+            let y = sets.iter().map(|own| of(&own.metrics)).collect();
+            let errors = sets.iter().map(|own| of(&own.errors)).collect();
+            Series::new(name, x, y, Style::Points, k).with_errors(errors)
+        });
+        LinePlot {
+            y_label: columns_named(&[key])
+                .iter()
+                .map(|own| own.heading.to_owned())
+                .collect(),
+            x_names: names.clone(),
+            series: series.collect(),
+            ..LinePlot::default()
+        }
+    };
+    PanelGrid {
+        columns: 2,
+        plots: vec![
+            panel("q", |metrics| metrics.q),
+            panel("q_calibrated", |metrics| metrics.q_calibrated),
+            panel("m_cross", |metrics| metrics.m_cross),
+        ],
+        ..PanelGrid::default()
     }
 }
 

@@ -16,26 +16,46 @@ use shearq_simulate::kinds::SetKind;
 
 pub fn scores(name: &str, scored: &[ScoredSet], table: Table) -> Result<Section, FigureError> {
     let mut blocks = vec![Block::Table(table)];
-    let with_power: Vec<&ScoredSet> = scored
-        .iter()
-        .filter(|set| set.score.constant.is_none())
-        .collect();
-    if !with_power.is_empty() {
-        blocks.push(Block::Figure(
-            Picture::draw(
-                &spectra(name, &with_power),
-                format!("spectra-{name}"),
-                "E-mode bandpowers of the scored bins. Q uses the measured bandpowers with their noise, Q_dn without. Without noise they are below the truth if shear is lost. Negative values are not plotted.",
-            )?,
-        ));
-    }
+    blocks.extend(spectra(name, scored)?);
     Ok(Section::new(name, format!("Scores of {name}"), blocks))
+}
+
+/// True and measured bandpowers of each set with a shear field, if there is one.
+pub fn spectra(name: &str, scored: &[ScoredSet]) -> Result<Option<Block>, FigureError> {
+    let with_power = scored.iter().filter(|set| set.score.constant.is_none());
+    let panel = |set: &ScoredSet| {
+        let score = &set.score;
+        let powers = [
+            &score.bins.l,
+            &score.true_ee,
+            &score.spectra().ee,
+            &score.ee_error,
+        ];
+        spectrum_panel(
+            set.number(),
+            set.record.kind(),
+            powers,
+            score.noise.as_ref(),
+        )
+    };
+    let plots: Vec<LinePlot> = with_power.map(panel).collect();
+    if plots.is_empty() {
+        return Ok(None);
+    }
+    let grid = PanelGrid {
+        title: format!("Shear power of {name}"),
+        columns: 2,
+        plots,
+    };
+    let caption = "E-mode bandpowers of the scored bins. Q uses the measured bandpowers with their noise, Q_dn without. Without noise they are below the truth if shear is lost. Negative values are not plotted.";
+    let picture = Picture::draw(&grid, format!("spectra-{name}"), caption)?;
+    Ok(Some(Block::Figure(picture)))
 }
 
 pub fn comparison(
     table: Table,
     verdict: Option<String>,
-    q_per_set: &LinePlot,
+    per_set: &PanelGrid,
 ) -> Result<Section, FigureError> {
     let mut blocks = Vec::new();
     if let Some(verdict) = verdict {
@@ -54,21 +74,21 @@ pub fn comparison(
             blocks.push(Block::Table(table.part(&keys, "Verdict", &[])));
         }
     }
-    for (key, caption) in [
-        (
-            "q_calibrated",
-            "Quality after dividing by the measured response. Noise and scale-dependent biases determine it.",
-        ),
-        ("m_cross", "Multiplicative bias: 0 for an unbiased method."),
-    ] {
-        if let Some(plot) = metric_plot(&table, key) {
-            blocks.push(Block::Figure(Picture::draw(&plot, key, caption)?));
-        }
+    let means = ["q_calibrated", "m_cross"].map(|key| metric_plot(&table, key));
+    let means = PanelGrid {
+        columns: 2,
+        plots: means.into_iter().flatten().collect(),
+        ..PanelGrid::default()
+    };
+    // Of one set, the next figure is the same.
+    let several = per_set.plots.iter().any(|plot| plot.x_names.len() > 1);
+    if several && !means.plots.is_empty() {
+        let caption = "Means over the sets. Calibrated Q is the quality after dividing by the measured response: noise and scale-dependent biases determine it. m is the multiplicative bias, 0 for an unbiased method.";
+        blocks.push(Block::Figure(Picture::draw(&means, "means", caption)?));
     }
-    let caption = "Q of each set in the convention of the table.";
-    let picture = Picture::draw(q_per_set, "q-per-set", caption)?;
-    blocks.push(Block::Figure(picture));
-    blocks.push(Block::Table(table));
+    let caption = "Q, calibrated Q and m of each set, in the convention of the table.";
+    let picture = Picture::draw(per_set, "per-set", caption)?;
+    blocks.extend([Block::Figure(picture), Block::Folded(table)]);
     Ok(Section::new("comparison", "Comparison", blocks))
 }
 
@@ -138,29 +158,6 @@ fn glossary() -> Vec<(String, String)> {
         }
     }
     all
-}
-
-fn spectra(name: &str, scored: &[&ScoredSet]) -> PanelGrid {
-    let plot = |set: &&ScoredSet| {
-        let score = &set.score;
-        let powers = [
-            &score.bins.l,
-            &score.true_ee,
-            &score.spectra().ee,
-            &score.ee_error,
-        ];
-        spectrum_panel(
-            set.number(),
-            set.record.kind(),
-            powers,
-            score.noise.as_ref(),
-        )
-    };
-    PanelGrid {
-        title: format!("Shear power of {name}"),
-        columns: 3,
-        plots: scored.iter().map(plot).collect(),
-    }
 }
 
 // Share of the highest power below which true power is rounding.
