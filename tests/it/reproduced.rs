@@ -161,24 +161,13 @@ fn table_one_comes_out_at_full_size() {
     // Galaxies and noise are the same for raw and denoised, whose ratio is good to 1 %. Two of these errors beside the
     // bounds of full size: 15 % of the published Q, 0.05 of M/2, 3 to 15 % for denoising. What is printed is four times
     // as far off in Q and eight in M/2.
-    let mut names = vec![
+    let names = [
         "23/raw/star",
         "23/den/star",
         "as-printed/23/raw/star",
         "as-printed/23/den/star",
     ];
-    let mut side = 20;
-    // For the numbers of docs/reproduction.md, of all rows: 40.
-    if let Ok(given) = std::env::var("SHEARQ_TABLE_ONE_GRID") {
-        side = given.parse().unwrap();
-        names.extend([
-            "subm/19/den/star",
-            "23/den/func",
-            "23/raw/func",
-            "29/den/func",
-        ]);
-    }
-    let found = table_one(&names, side);
+    let found = table_one(&names, 20);
     for (name, found) in names.iter().zip(&found) {
         eprintln!("{name}: Q, M/2, √A without and with leakage {found:.4?}");
     }

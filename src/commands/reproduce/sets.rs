@@ -303,7 +303,8 @@ pub(super) fn figures(page: &mut Page<'_>, results: &[SetScores]) -> Result<(), 
             columns: 2,
             plots: both
                 .iter()
-                .map(|one| metric_per_set(results, &[*one], metric, one.1, label))
+                // Their titles name them: a legend would have two entries of one colour.
+                .map(|&(place, name)| metric_per_set(results, &[(place, "")], metric, name, label))
                 .collect(),
         };
         page.figure(
