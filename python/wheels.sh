@@ -20,8 +20,8 @@ export CARGO_HOME=${WHEELS_CARGO_HOME:-$(dirname "$PWD")/target/wheels-cargo}
 export RUSTFLAGS="--remap-path-prefix=$(dirname "$PWD")=. --remap-path-prefix=$CARGO_HOME=cargo --remap-path-prefix=${CARGO_TARGET_DIR:-$(dirname "$PWD")/target}=target ${RUSTFLAGS:-}"
 for target in "${@:-x86_64-unknown-linux-gnu}"; do
     case $target in
-        *-linux-*) maturin build --release --zig --compatibility manylinux2014 --target "$target" --out "$dist" ;;
-        *) maturin build --release --target "$target" --out "$dist" ;;
+        *-linux-*) maturin build --profile dist --zig --compatibility manylinux2014 --target "$target" --out "$dist" ;;
+        *) maturin build --profile dist --target "$target" --out "$dist" ;;
     esac
 done
 maturin sdist --out "$dist"
