@@ -312,17 +312,13 @@ impl Kind {
             .into()
     }
 
-    /// Rules for participants, one sentence each.
-    pub fn rules(self) -> [&'static str; 2] {
+    /// What participants may assume about the shear, in a sentence.
+    pub fn rule(self) -> &'static str {
         match self {
-            Kind::Great10 => [
-                "An entry covers all images of all sets.",
-                "All images of a set have one shear field, so methods may average over them.",
-            ],
-            Kind::Great3 => [
-                "An entry covers all images of all sets.",
-                "All galaxies of a set have one shear; no two sets have the same.",
-            ],
+            Kind::Great10 => {
+                "All images of a set have one shear field, so methods may average over them."
+            }
+            Kind::Great3 => "All galaxies of a set have one shear; no two sets have the same.",
         }
     }
 }

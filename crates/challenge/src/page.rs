@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use shearq_files::{FileError, atomic};
-use shearq_render::figure::{FigureError, LinePlot, Series, Style};
+use shearq_render::figure::FigureError;
 use shearq_render::html::{Block, Picture, Report, Section};
 use shearq_render::page::PageError;
 use shearq_render::table::{Cell, Table, TableFormat};
@@ -15,9 +15,6 @@ use crate::kind::{ConstantShears, Noise, Published, RankBy};
 use crate::ranking::{Board, Leaderboard, Scored, Standing, better};
 use crate::seal::close;
 use crate::terms::{Challenge, Data};
-
-// The palette has eight colours.
-const PLOTTED: usize = 6;
 
 #[derive(Debug, Clone, Copy)]
 pub struct View<'a> {
@@ -48,11 +45,6 @@ fn key(metric: RankBy) -> (&'static str, &'static str) {
     }
 }
 
-// Shift of a team's points. First entries of equal quality would hide each other.
-fn aside(team: usize, teams: usize) -> f64 {
-    0.6 * ((team as f64 + 0.5) / teams as f64 - 0.5)
-}
-
 impl View<'_> {
     fn metric(&self) -> RankBy {
         self.challenge.rules.metric
@@ -72,10 +64,15 @@ impl View<'_> {
         // A row without standing is an entry of zeros: whoever is below it has measured nothing.
         let mut rows: Vec<Option<&Standing<'_>>> = standings.map(Some).collect();
         if boards.contains(&Board::Main) {
+            // At the better end of its error: a value that is rounded to 0 by a large error is not below that of zeros.
             let behind = |row: &Option<&Standing<'_>>| {
                 row.is_none_or(|standing| {
-                    standing.board != Board::Main
-                        || better(metric, zero.value, standing.best.published.value)
+                    let Published { value, step, .. } = standing.best.published;
+                    let end = match metric.larger_is_better() {
+                        true => value + step,
+                        false => value - step,
+                    };
+                    standing.board != Board::Main || better(metric, zero.value, end)
                 })
             };
             let place = rows.iter().position(behind).unwrap_or(rows.len());
@@ -182,9 +179,13 @@ impl View<'_> {
         table
     }
 
-    // The table of a page: without empty columns, and with the numbers beside the team, where they are in sight on a phone.
-    fn for_page(&self, boards: &[Board]) -> Table {
-        let mut table = self.table_of(boards).narrow();
+    /// The table for people: without empty columns, and with the numbers beside the team, where they are in sight on a phone.
+    pub fn shown(&self) -> Table {
+        self.shown_of(&[Board::Main, Board::Late, Board::Partial])
+    }
+
+    fn shown_of(&self, boards: &[Board]) -> Table {
+        let mut table = self.table_of(boards).narrow().without_empty_columns();
         let place = |key: &str| match key {
             "rank" | "team" => 0,
             "method" | "title" | "files" => 2,
@@ -192,8 +193,6 @@ impl View<'_> {
             _ => 1,
         };
         let mut order: Vec<usize> = (0..table.headings.len()).collect();
-        let is_empty = |k: &usize| table.rows.iter().all(|row| row[*k] == Cell::Empty);
-        order.retain(|k| !is_empty(k) || table.rows.is_empty());
         order.sort_by_key(|k| place(table.headings[*k].key));
         table.headings = order.iter().map(|k| table.headings[*k].clone()).collect();
         for row in &mut table.rows {
@@ -259,43 +258,6 @@ impl View<'_> {
         table
     }
 
-    fn history(&self) -> LinePlot {
-        let metric = self.metric();
-        let plotted: Vec<&Standing<'_>> = self
-            .board
-            .of(Board::Main)
-            .filter(|standing| standing.rank.is_some())
-            .take(PLOTTED)
-            .collect();
-        let most = plotted
-            .iter()
-            .flat_map(|s| &s.entries)
-            .map(|e| e.number)
-            .max();
-        let last = most.unwrap_or(1) as f64;
-        let mut series = Vec::new();
-        for (colour, standing) in plotted.iter().enumerate() {
-            let entries = &standing.entries;
-            let aside = aside(colour, plotted.len());
-            let x = entries.iter().map(|entry| entry.number as f64 + aside);
-            let x: Vec<f64> = x.collect();
-            let y: Vec<f64> = entries.iter().map(|e| e.published.value).collect();
-            let errors = entries.iter().map(|e| e.published.step).collect();
-            let name = &standing.best.info().team;
-            series.push(Series::new("", x.clone(), y.clone(), Style::Line, colour));
-            series.push(Series::new(name, x, y, Style::Points, colour).with_errors(errors));
-        }
-        LinePlot {
-            title: "Entries of the first teams".into(),
-            x_label: "entry of the team".into(),
-            x_whole: true,
-            y_label: metric.label().into(),
-            x_range: Some((0.5, last + 0.5)),
-            series,
-            ..LinePlot::default()
-        }
-    }
-
     fn report(&self) -> Result<Report, FigureError> {
         let Challenge {
             name,
@@ -305,17 +267,7 @@ impl View<'_> {
             rules: terms,
             ..
         } = self.challenge;
-        let mut blocks = vec![Block::Filtered(self.for_page(&[Board::Main]))];
-        let several = |standing: &Standing<'_>| standing.entries.len() > 1;
-        // One point per team shows nothing that the table does not.
-        if self.board.of(Board::Main).any(several) {
-            let caption = format!(
-                "{} of each entry, with its error, for the first {PLOTTED} teams at most.",
-                terms.metric.label()
-            );
-            let picture = Picture::draw(&self.history(), "entries", caption)?;
-            blocks.push(Block::Figure(picture));
-        }
+        let blocks = vec![Block::Filtered(self.shown_of(&[Board::Main]))];
         let mut sections = vec![Section::new("leaderboard", "Leaderboard", blocks)];
         if self.detail {
             sections.push(self.every_set()?);
@@ -323,7 +275,7 @@ impl View<'_> {
         let of_board = |board, title: &str| Table {
             title: title.into(),
             notes: Vec::new(),
-            ..self.for_page(&[board])
+            ..self.shown_of(&[board])
         };
         for (id, table) in [
             ("late", of_board(Board::Late, "Late entries")),
@@ -413,10 +365,13 @@ impl View<'_> {
 // Rules of a challenge, one paragraph each.
 fn rules(challenge: &Challenge) -> Vec<String> {
     let Challenge { kind, rules, .. } = challenge;
-    let mut all: Vec<String> = kind.rules().map(String::from).into();
-    if rules.partial {
-        all.push("An entry may cover some sets only. It is listed without a rank.".into());
-    }
+    let covers = match rules.partial {
+        false => "An entry covers all images of all sets.",
+        true => {
+            "An entry covers all images of its sets. One of some sets only is listed without a rank."
+        }
+    };
+    let mut all = vec![covers.to_owned(), kind.rule().to_owned()];
     all.push(format!(
         "Entries are ranked by {}, over all sets. {}",
         rules.metric.label(),
@@ -475,8 +430,8 @@ fn volume(data: &Data) -> String {
     let pixels = data.galaxies() as f64 * (data.stamp * data.stamp) as f64;
     let megabytes = pixels * size_of::<f32>() as f64 / 1e6;
     match megabytes < 1000.0 {
-        true => format!("{megabytes:.0} MB of images"),
-        false => format!("{:.1} GB of images", megabytes / 1000.0),
+        true => format!("{megabytes:.0} MB of galaxies, and their PSFs"),
+        false => format!("{:.1} GB of galaxies, and their PSFs", megabytes / 1000.0),
     }
 }
 
@@ -543,16 +498,4 @@ pub(crate) fn readme(challenge: &Challenge) -> String {
         text.push_str(&format!("* {place}\n"));
     }
     text
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn six_teams_with_one_entry_are_six_points() {
-        let places: Vec<f64> = (0..6).map(|team| aside(team, 6)).collect();
-        assert!(places.windows(2).all(|pair| pair[1] - pair[0] > 0.09));
-        assert!(places[0] > -0.5 && places[5] < 0.5 && aside(0, 1) == 0.0);
-    }
 }

@@ -194,7 +194,7 @@ impl Table {
     }
 
     /// The table without columns that have no value in any row.
-    pub(crate) fn without_empty_columns(&self) -> Self {
+    pub fn without_empty_columns(&self) -> Self {
         let has_value = |k: usize| {
             self.rows.iter().any(|row| match row.get(k) {
                 None | Some(Cell::Empty) => false,
