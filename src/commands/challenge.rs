@@ -2,7 +2,7 @@ use std::path::PathBuf;
 
 use clap::{ArgGroup, Args, Subcommand};
 use shearq_challenge::create::{Folders, Plan, Simulation, of_images, simulated};
-use shearq_challenge::entry::Entry;
+use shearq_challenge::entry::{Entry, check_team};
 use shearq_challenge::inbox;
 use shearq_challenge::judge::{Arrivals, Judge};
 use shearq_challenge::kind::{ENTRIES_PER_TEAM, Kind, RankBy};
@@ -15,6 +15,7 @@ use shearq_dataset::layout::{DataFolder, MAX_IMAGE};
 use shearq_files::FileError;
 use shearq_files::open::is_there;
 use shearq_render::escape::line;
+use shearq_render::table::TableFormat;
 use shearq_results::submit::Submission;
 use shearq_results::submit::check::{Finding, Severity, check_sent};
 
@@ -253,6 +254,14 @@ fn new(arguments: &NewArguments) -> anyhow::Result<()> {
         public: &arguments.public,
         private: &arguments.private,
     };
+    // Before hours of simulation.
+    if let Some(closes) = &arguments.closes
+        && closes.last < now()
+    {
+        tell(format_args!(
+            "warning: --closes {closes} is in the past, so that all entries without an earlier receipt are late"
+        ));
+    }
     let threads = arguments.threads.number();
     let challenge = match (&arguments.data, &arguments.sets, arguments.images) {
         (None, Some(sets), Some(images)) => {
@@ -278,13 +287,6 @@ fn new(arguments: &NewArguments) -> anyhow::Result<()> {
         _ => anyhow::bail!("cannot determine the data. Try: --sets LIST --images N, or --data DIR"),
     };
     let (data, rules) = (&challenge.data, &challenge.rules);
-    if let Some(closes) = &rules.closes
-        && !rules.is_open(now())
-    {
-        tell(format_args!(
-            "warning: --closes {closes} is in the past, so that all entries without an earlier receipt are late"
-        ));
-    }
     if let Some(found) = rules.tunable_entries() {
         tell(format_args!(
             "warning: a team can tune {} to the truth with {TUNING_ENTRIES} entries (found {found} per team). Try: --entries-per-team {}",
@@ -328,15 +330,19 @@ fn check_entry(arguments: &CheckArguments) -> anyhow::Result<()> {
     };
     let mut findings = check_sent(&sent, &expected, &mut |_| {});
     // Unreadable entries are among the findings already.
-    if let Ok(submission) = Submission::read(&sent)
-        && let Err(message) = challenge.rules.accept(&submission)
-    {
-        findings.push(Finding {
-            path: entry.clone(),
-            severity: Severity::Error,
-            check: "contents",
-            message,
-        });
+    if let Ok(submission) = Submission::read(&sent) {
+        let stated = submission.manifest.as_ref();
+        let stated = stated.and_then(|manifest| manifest.entry.as_ref());
+        let accepted = challenge.rules.accept(&submission).map(|_| ());
+        let named = stated.map_or(Ok(()), |entry| check_team(&entry.team));
+        for (check, result) in [("contents", accepted), ("team", named)] {
+            findings.extend(result.err().map(|message| Finding {
+                path: entry.clone(),
+                severity: Severity::Error,
+                check,
+                message,
+            }));
+        }
     }
     // With challenge.toml alone, participants can check the form of an entry without downloading the images.
     let references = match place.is_dir() {
@@ -422,7 +428,10 @@ fn rank(arguments: &RankArguments) -> anyhow::Result<()> {
         detail: arguments.detail,
     };
     // The table first: warnings are for the organiser, and must not delay or replace the board.
-    arguments.form.print(&view.table())?;
+    arguments.form.print(&match arguments.form.format {
+        TableFormat::Csv | TableFormat::Json => view.table(),
+        _ => view.shown(),
+    })?;
     for refused in &round.refused {
         tell(format_args!(
             "warning: {}: not scored: {}",

@@ -4,8 +4,10 @@ use std::path::PathBuf;
 
 use jiff::Timestamp;
 use serde::{Deserialize, Serialize};
+use shearq_render::escape::line;
 use shearq_results::record::SetRecord;
 use shearq_results::submit::Contents;
+use shearq_submissions::check_name;
 use unicode_normalization::UnicodeNormalization;
 
 /// What identifies an entry that was compared with the true shear. The store keeps it with its scores, so the names are
@@ -60,15 +62,64 @@ pub struct Refused {
     pub reason: String,
 }
 
-/// What the spellings of a team's name have in common: compatible characters (NFKC), without case, blanks and characters
-/// that nobody sees.
+// Greek and Cyrillic letters, and the Latin ones that their small or their capital form looks like (Unicode's confusables.txt).
+const LOOK_ALIKE: [(&str, &str); 3] = [
+    ("авекмнорстухѕіјԛԝһԁӏ", "abekmhopctyxsijqwhdl"),
+    ("αβεζηικμνορτυχ", "abezhikmnoptux"),
+    ("ıɑɡ", "iag"),
+];
+
+/// What the spellings of a team's name have in common: compatible and similar characters (NFKC, letters of other scripts that
+/// look alike), without case, blanks and characters that nobody sees.
 pub fn team_key(name: &str) -> String {
+    let latin = |c: char| {
+        let mut pairs = LOOK_ALIKE
+            .iter()
+            .flat_map(|(alike, latin)| alike.chars().zip(latin.chars()));
+        pairs.find(|(alike, _)| *alike == c).map_or(c, |own| own.1)
+    };
     name.nfkc()
         .filter(|c| !c.is_whitespace() && !is_invisible(*c))
         .flat_map(char::to_uppercase)
         .flat_map(char::to_lowercase)
         .nfkc()
+        .map(latin)
         .collect()
+}
+
+// Names that a board or its page uses itself, or by which a team would speak as the organiser.
+const RESERVED_NAMES: [&str; 7] = [
+    "zero shear",
+    "no image",
+    "reference",
+    "truth",
+    "true shear",
+    "host",
+    "organiser",
+];
+
+/// Whether a team may have this name.
+///
+/// # Errors
+///
+/// In words, if it is no visible text, or one that the organiser alone has.
+pub fn check_team(name: &str) -> Result<(), String> {
+    check_name(name).map_err(|error| error.to_string())?;
+    let key = team_key(name);
+    if key.is_empty() {
+        return Err("the name of the team has no visible character".into());
+    }
+    // Two folders whose names are no text would be one team.
+    if name.contains(char::REPLACEMENT_CHARACTER) {
+        return Err("the name of the team is not UTF-8. Try: another name of the folder".into());
+    }
+    match RESERVED_NAMES.iter().find(|own| team_key(own) == key) {
+        Some(own) => Err(format!(
+            "no team may have the name `{own}` (found `{}`). Try: another name of the folder, or --team NAME of pack",
+            line(name)
+        )),
+        None => Ok(()),
+    }
 }
 
 // Unicode's Default_Ignorable_Code_Point, control characters, and the blank of Braille.
@@ -95,6 +146,11 @@ mod tests {
         ] {
             assert_eq!(team_key(name), "shearteam", "{name:?}");
         }
+        // Cyrillic a, capital В and Н, and Greek omicron.
+        for (alike, latin) in [("Sheаr", "shear"), ("ВОНR", "Bohr"), ("Cοsmo", "cosmo")] {
+            assert_eq!(team_key(alike), team_key(latin));
+        }
+        assert_eq!(team_key("Космос"), team_key("КОСМОС"));
         assert_eq!(team_key("STRASSE é"), team_key("Straße e\u{301}"));
         assert_ne!(team_key("Team 1"), team_key("Team 2"));
         assert_eq!(team_key("\u{200b} \u{2800}"), "");

@@ -57,7 +57,7 @@ pub enum ChallengeError {
     #[error("{0}")]
     Shears(String),
     #[error(
-        "the images contradict the true shear of {of}: sign, order, scale, positions or sets differ (found a response of {response:.2} ± {error:.2}, expected 0.6 to 1.6). Try: the same command with the right true shear"
+        "the images contradict the true shear of {of}: sign, order, scale, positions or sets differ (found a response of {response:.2} ± {error:.2}, expected 0.625 to 1.6). Try: the same command with the right true shear"
     )]
     Contradiction {
         of: String,

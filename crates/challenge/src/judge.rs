@@ -24,7 +24,7 @@ use shearq_scoring::{
 };
 use shearq_submissions::check_name;
 
-use crate::entry::{Entry, EntryInfo, Refused, team_key};
+use crate::entry::{Entry, EntryInfo, Refused, check_team, team_key};
 use crate::error::{ChallengeError, unscored};
 use crate::inbox::{Content, Sending, content, identify, modified};
 use crate::kind::{ConstantShears, response};
@@ -95,6 +95,16 @@ struct Candidate {
     team: String,
     arrival: Arrival,
     content: Content,
+}
+
+impl Candidate {
+    fn refused(&self, reason: String) -> Refused {
+        Refused {
+            path: self.sending.path.clone(),
+            team: self.team.clone(),
+            reason,
+        }
+    }
 }
 
 // What the comparison of an entry with the true shear gives.
@@ -215,22 +225,36 @@ impl Judge {
         let known = self.entries(store)?;
         let mut round = Round::default();
         let pool = Pool::new(threads.min(sendings.len()).max(1))?;
-        let candidates = self.candidates(sendings, arrivals, &known, &pool, &mut round)?;
+        let mut waiting = self.readable(sendings, arrivals, &known, &pool, &mut round);
         // Scores of single sets reveal the truth.
         close(store)?;
-        // Stored one by one, so that an interrupted command keeps the entries that it scored.
-        for result in pool.in_order(candidates, |candidate| self.judge(candidate)) {
-            progress.advance(self.challenge.data.galaxies());
-            match result {
-                Ok((run, scored)) => {
-                    close(&store::write(store, &run)?)?;
-                    round.scored += usize::from(scored);
-                    round.unscored += usize::from(!scored);
+        loop {
+            let (candidates, postponed) = self.admitted(waiting, &self.entries(store)?);
+            let mut is_place_left = false;
+            // Stored one by one, so that an interrupted command keeps the entries that it scored.
+            for result in pool.in_order(candidates, |candidate| self.judge(candidate)) {
+                progress.advance(self.challenge.data.galaxies());
+                match result {
+                    Ok((run, scored)) => {
+                        close(&store::write(store, &run)?)?;
+                        round.scored += usize::from(scored);
+                        round.unscored += usize::from(!scored);
+                    }
+                    Err(refused) => {
+                        round.refused.push(refused);
+                        is_place_left = true;
+                    }
                 }
-                Err(refused) => round.refused.push(refused),
             }
+            if !is_place_left {
+                let refused = postponed.into_iter();
+                let refused = refused.map(|(candidate, reason)| candidate.refused(reason));
+                round.refused.extend(refused);
+                return Ok(round);
+            }
+            // Faults of the form do not count: later entries of the team take the place of what was refused.
+            waiting = postponed.into_iter().map(|own| own.0).collect();
         }
-        Ok(round)
     }
 
     // When an entry arrived, and a remark on a receipt that is not of this entry.
@@ -300,20 +324,15 @@ impl Judge {
         }
     }
 
-    // The entries to compare with the true shear, in order of arrival. Those in the store are only counted, because scoring is
-    // slow. What is refused here was not compared, so it does not count towards the limit of its team.
-    #[expect(
-        clippy::too_many_lines,
-        reason = "the rules of an entry, one after the other"
-    )]
-    fn candidates(
+    // The entries that are new, can be read and arrived while the challenge was open, in order of arrival.
+    fn readable(
         &self,
         sendings: &[(Sending, bool)],
         arrivals: Arrivals,
         known: &[Entry],
         pool: &Pool,
         round: &mut Round,
-    ) -> Result<Vec<Candidate>, ChallengeError> {
+    ) -> Vec<Candidate> {
         let now = now();
         let is_scored = |team: &str, arrival: &Arrival| {
             known.iter().any(|Entry { info, .. }| {
@@ -352,12 +371,6 @@ impl Judge {
             }
         }
         readable.sort_by(|a, b| (a.2.received, &a.0).cmp(&(b.2.received, &b.0)));
-        // Of each team, arrival and content of the entries that were or will be compared.
-        let mut compared: BTreeMap<String, Vec<(Timestamp, String)>> = BTreeMap::new();
-        for Entry { info, .. } in known.iter().filter(|entry| !entry.info.reference) {
-            let own = compared.entry(team_key(&info.team)).or_default();
-            own.push((info.received, info.content.clone()));
-        }
         let rules = &self.challenge.rules;
         let mut candidates = Vec::new();
         for (sending, reference, arrival, content) in readable {
@@ -371,20 +384,16 @@ impl Judge {
                 && team_key(&stated.team) != team_key(&team)
             {
                 let remark = format!(
-                    "counts for {team}, the folder of the inbox or the receipt; its manifest states {}",
+                    "counts for {}, the folder of the inbox or the receipt; its manifest states {}",
+                    line(&team),
                     stated.team
                 );
                 round.remarks.push((sending.path.clone(), remark));
             }
-            let own = compared.entry(team_key(&team)).or_default();
-            let earlier = own.iter().filter(|(time, _)| *time <= arrival.received);
-            let earlier: BTreeSet<&str> = earlier.map(|(_, content)| &**content).collect();
-            // Whatever their times: with times of files, a team could date each new question before all others.
-            let asked: BTreeSet<&str> = own.iter().map(|(_, content)| &**content).collect();
-            let limit = rules.entries_per_team.map_or(usize::MAX, |n| n as usize);
-            let reason = match check_team(&team) {
-                Err(error) => Some(error),
-                Ok(()) if reference => None,
+            let fault = match check_team(&team) {
+                // The organiser's own may have any name.
+                _ if reference => None,
+                Err(fault) => Some(fault),
                 Ok(()) if rules.is_early(arrival.received) => Some(format!(
                     "received before the challenge opened, {}",
                     rules
@@ -392,50 +401,75 @@ impl Judge {
                         .as_ref()
                         .map_or_else(String::new, Deadline::to_string)
                 )),
-                Ok(()) if earlier.contains(&*content.sha256) => {
-                    Some("identical content as an earlier entry of the team".into())
-                }
-                Ok(()) if asked.len() >= limit && !asked.contains(&*content.sha256) => {
-                    Some(format!("the team has {limit} entries already"))
-                }
                 Ok(()) => None,
             };
-            if let Some(reason) = reason {
-                round.refused.push(Refused {
-                    path: sending.path.clone(),
-                    team,
-                    reason,
-                });
-                continue;
-            }
-            if !reference {
-                own.push((arrival.received, content.sha256.clone()));
-            }
-            candidates.push(Candidate {
+            let candidate = Candidate {
                 sending: sending.clone(),
                 reference,
                 team,
                 arrival,
                 content,
-            });
+            };
+            match fault {
+                Some(reason) => round.refused.push(candidate.refused(reason)),
+                None => candidates.push(candidate),
+            }
         }
-        Ok(candidates)
+        candidates
+    }
+
+    // The entries to compare with the true shear, and those that the limit of their team or an equal entry before them excludes,
+    // with the reason.
+    fn admitted(
+        &self,
+        waiting: Vec<Candidate>,
+        known: &[Entry],
+    ) -> (Vec<Candidate>, Vec<(Candidate, String)>) {
+        // Of each team, arrival and content of the entries that were or will be compared.
+        let mut compared: BTreeMap<String, Vec<(Timestamp, String)>> = BTreeMap::new();
+        for Entry { info, .. } in known.iter().filter(|entry| !entry.info.reference) {
+            let own = compared.entry(team_key(&info.team)).or_default();
+            own.push((info.received, info.content.clone()));
+        }
+        let limit = self.challenge.rules.entries_per_team;
+        let limit = limit.map_or(usize::MAX, |n| n as usize);
+        let (mut admitted, mut postponed) = (Vec::new(), Vec::new());
+        for candidate in waiting {
+            if candidate.reference {
+                admitted.push(candidate);
+                continue;
+            }
+            let (received, content) = (candidate.arrival.received, &candidate.content.sha256);
+            let own = compared.entry(team_key(&candidate.team)).or_default();
+            let is_earlier = own
+                .iter()
+                .any(|(time, other)| *time <= received && other == content);
+            // Whatever their times: with times of files, a team could date each new question before all others.
+            let asked: BTreeSet<&String> = own.iter().map(|(_, content)| content).collect();
+            if is_earlier {
+                let reason = "identical content as an earlier entry of the team";
+                postponed.push((candidate, reason.into()));
+            } else if asked.len() >= limit && !asked.contains(content) {
+                let reason = format!("the team has {limit} entries already");
+                postponed.push((candidate, reason));
+            } else {
+                own.push((received, content.clone()));
+                admitted.push(candidate);
+            }
+        }
+        (admitted, postponed)
     }
 
     // The record of an entry, and whether it has a score.
     fn judge(&self, candidate: Candidate) -> Result<(RunRecord, bool), Refused> {
+        let refuse = |reason: String| candidate.refused(reason);
         let Candidate {
             sending,
             reference,
             team,
             arrival,
             content,
-        } = candidate;
-        let refuse = |reason: String| Refused {
-            path: sending.path.clone(),
-            team: team.clone(),
-            reason,
-        };
+        } = &candidate;
         let manifest = content.manifest.as_ref();
         let stated = manifest.and_then(|manifest| manifest.entry.as_ref());
         let run = manifest.and_then(|manifest| manifest.run.as_ref());
@@ -448,11 +482,11 @@ impl Judge {
             received: arrival.received,
             receipt: arrival.receipt.is_some(),
             file: file_name(&sending.path),
-            sha256: arrival.sha256,
-            content: content.sha256,
+            sha256: arrival.sha256.clone(),
+            content: content.sha256.clone(),
             contents: Contents::Catalogues,
             configuration: run.map(|run| run.configuration.name.clone()),
-            reference,
+            reference: *reference,
             scored: false,
             findings: Vec::new(),
         };
@@ -460,7 +494,7 @@ impl Judge {
             mut sets,
             scored,
             findings,
-        } = self.score(&sending, stated, &mut info).map_err(refuse)?;
+        } = self.score(sending, stated, &mut info).map_err(refuse)?;
         check_name(&info.method).map_err(|error| refuse(error.to_string()))?;
         (info.scored, info.findings) = (scored, findings);
         if sets.is_empty() {
@@ -702,14 +736,6 @@ fn team_of(sending: &Sending, content: Option<&Content>, receipt: Option<&Receip
             let stem = endings.iter().find_map(|ending| name.strip_suffix(ending));
             stem.unwrap_or(&name).to_owned()
         })
-}
-
-fn check_team(name: &str) -> Result<(), String> {
-    check_name(name).map_err(|error| error.to_string())?;
-    match team_key(name).is_empty() {
-        true => Err("the name of the team has no visible character".into()),
-        false => Ok(()),
-    }
 }
 
 fn file_name(path: &Path) -> String {

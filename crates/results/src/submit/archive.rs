@@ -10,6 +10,7 @@ use rawzip::{CompressionMethod, RECOMMENDED_BUFFER_SIZE, ZipArchive};
 use shearq_files::FileError;
 use shearq_files::atomic::PartFolder;
 use shearq_files::open::open;
+use shearq_render::escape::line;
 use tar::Archive;
 
 use super::{FileSum, MANIFEST_FILE, Manifest};
@@ -208,7 +209,8 @@ impl Members<'_> {
         }
         if !is_file || !is_plain_name(name) || folder != self.folder.as_deref() {
             return Err(wrong(format!(
-                "unsupported member (found `{full}`, expected plain files, all in one folder or in none)"
+                "unsupported member (found `{}`, expected plain files, all in one folder or in none)",
+                line(full)
             )));
         }
         let is_manifest = name == MANIFEST_FILE;
