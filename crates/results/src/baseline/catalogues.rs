@@ -25,6 +25,9 @@ pub struct CatalogueBaseline {
     pub command: Vec<String>,
     /// Fingerprint of the file of units.
     units: String,
+    /// Galaxies that count, of as many rows.
+    galaxies: u64,
+    rows: u64,
     pub tolerance: Tolerance,
     /// Value and standard error of each metric; of several sets the mean.
     metrics: BTreeMap<String, [f64; 2]>,
@@ -306,6 +309,15 @@ impl Units {
                 .unwrap_or(0),
         }
     }
+
+    fn rows(&self) -> u64 {
+        match self {
+            Units::Score(sets) => sets.iter().map(|own| own.galaxies).sum(),
+            Units::Bias(summed) => summed
+                .result()
+                .map_or(0, |result| result.about.total().rows),
+        }
+    }
 }
 
 fn scored_metrics() -> impl Iterator<Item = Metric> {
@@ -454,6 +466,8 @@ impl CatalogueBaseline {
             version: shearq_dataset::VERSION.into(),
             command: command.to_vec(),
             units: fingerprint::of_bytes(&bytes),
+            galaxies: units.measured(),
+            rows: units.rows(),
             tolerance,
             metrics: units.metrics()?,
             catalogues: prints,

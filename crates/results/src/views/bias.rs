@@ -180,7 +180,7 @@ pub fn chosen_by_measurement(result: &BiasResult) -> Option<String> {
     };
     // docs/limitations.md, selection after measuring.
     Some(format!(
-        "Cuts or bins by `{column}` are a selection that shear may change. Its response is unknown here, so that m may be biased: by −0.02 (S/N 20) to −0.1 (S/N 7) if the lowest 30 % in size are removed, by −0.11 for the lowest 50 % in flux. Try: {remedy}"
+        "m contains the effect of shear on a choice by `{column}`, which has no response here. Known sizes: −0.02 (S/N 20) to −0.1 (S/N 7) if the lowest 30 % in size are removed, −0.11 for the lowest 50 % in flux. Try: {remedy}"
     ))
 }
 
