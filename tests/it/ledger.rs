@@ -7,10 +7,10 @@
 use std::collections::BTreeSet;
 use std::fmt::Write;
 use std::fs;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use crate::documents::pages;
-use crate::support::assert_page;
+use crate::support::{Folder, assert_page, shell};
 
 /// One value of the ledger.
 struct Entry {
@@ -93,6 +93,48 @@ fn tables_in_the_documents_equal_the_ledger() {
     let all: BTreeSet<String> = ledger.iter().map(|entry| entry.table.clone()).collect();
     assert_eq!(used, all, "tables of the ledger that no page shows");
     assert!(all.len() > 10);
+}
+
+/// What `codes/compare.py table` in a folder prints, or its error.
+fn table_of_codes(root: &Path) -> Result<String, String> {
+    let output = shell(root, "python3 codes/compare.py table");
+    match output.status.success() {
+        true => Ok(String::from_utf8(output.stdout).unwrap()),
+        false => Err(String::from_utf8(output.stderr).unwrap()),
+    }
+}
+
+#[test]
+fn rows_of_codes_are_on_their_page() {
+    let table = table_of_codes(Path::new(".")).unwrap();
+    assert!(table.lines().count() > 10, "{table}");
+    let page = fs::read_to_string("docs/compare-your-code.md").unwrap();
+    let (before, rest) = page.split_once("<!-- codes -->\n").unwrap();
+    let rows = rest.split_inclusive('\n');
+    let after: String = rows.skip_while(|line| line.starts_with('|')).collect();
+    let expected = format!("{before}<!-- codes -->\n{table}{after}");
+    assert_page("docs/compare-your-code.md", &expected, "ledger");
+}
+
+#[test]
+fn rows_of_other_data_or_without_errors_are_refused() {
+    let folder = Folder::new();
+    let copy = format!("cp -r {}/codes .", env!("CARGO_MANIFEST_DIR"));
+    assert!(shell(folder.root(), &copy).status.success());
+    assert!(table_of_codes(folder.root()).is_ok());
+    let file = "codes/shearq/sn20.toml";
+    let text = fs::read_to_string(folder.at(file)).unwrap();
+    for (from, to, says) in [
+        ("rows = 40000", "rows = 4000", "40000 rows of the data"),
+        ("\"--paired\", ", "", "bias --paired"),
+        ("m1 = [-", "m1 = [nan, 1.0, -", "no number"),
+        ("galaxies = ", "galaxy = ", "galaxies"),
+    ] {
+        assert!(text.contains(from), "{from}");
+        folder.write(file, text.replace(from, to));
+        let error = table_of_codes(folder.root()).unwrap_err();
+        assert!(error.contains(says), "{to}: {error}");
+    }
 }
 
 #[test]
