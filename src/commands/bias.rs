@@ -29,6 +29,7 @@ use shearq_results::views::bias::{
     Checked, Limit, bias_plot, bias_table, check, chosen_by_measurement, compared_table, of_design,
     of_other_images, section, with_failures,
 };
+use shearq_results::views::per_area::add_per_area;
 use shearq_scoring::TruthSign;
 
 /// Multiplicative and additive bias (m and c) of any program's catalogues.
@@ -61,6 +62,10 @@ pub(crate) struct Arguments {
     /// Plot m and c to this file, PNG or SVG by its ending.
     #[arg(long, value_name = "FILE")]
     plot: Option<PathBuf>,
+    /// Area of the image of each catalogue in arcmin²: also print detections per arcmin², the shear error of 1 arcmin² and the
+    /// effective number of galaxies per arcmin² (docs/scenes.md).
+    #[arg(long, value_name = "ARCMIN2", value_parser = positive, conflicts_with_all = ["against", "like", "tomography"])]
+    area: Option<f64>,
     #[command(flatten)]
     printing: Printing,
     #[command(flatten)]
@@ -265,6 +270,9 @@ pub(crate) fn run(arguments: &Arguments, command_line: &str) -> anyhow::Result<(
     }
     warn();
     let mut table = bias_table(&result);
+    if let Some(area) = arguments.area {
+        add_per_area(&mut table, &result, area);
+    }
     let checks = check(&result, &arguments.fail_above);
     if !checks.is_empty() {
         with_failures(&mut table, "bin", &checks);

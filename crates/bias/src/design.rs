@@ -116,6 +116,8 @@ pub struct Grouping {
     pub stars: Vec<Behind>,
     /// What a unit is, in words.
     pub unit: &'static str,
+    /// Whether units are catalogues, or groups of them.
+    pub whole_catalogues: bool,
     /// Whether galaxies under different shears may be in different units: their numbers differ. The error of m is then too
     /// large, and the error of c too small.
     pub misaligned: bool,
@@ -210,6 +212,7 @@ pub fn group(
     let stars = shared(&sums, &noises, (!by_key).then_some(&numbers), arm);
     Grouping {
         stars,
+        whole_catalogues: !by_key,
         unit: match (by_key, matched, catalogues.len()) {
             (true, true, _) => "galaxies with the same identifier",
             (true, false, 1) => "galaxies in blocks of neighbouring rows",

@@ -4,4 +4,5 @@ pub mod bias;
 pub mod comparison;
 pub mod mean;
 pub mod pages;
+pub mod per_area;
 pub mod scores;
