@@ -1,20 +1,24 @@
 use std::path::{Path, PathBuf};
 
-use clap::builder::PossibleValuesParser;
+use clap::builder::{PossibleValuesParser, TypedValueParser};
 use clap::{ArgGroup, Args};
 use shearq_challenges::{CHALLENGES, PublicChallenge, Simulated, Simulation};
 
 use crate::arguments::{SetList, Sharding, SimulationArguments, Threads};
 use crate::progress::{Bar, mark_resumable};
 use crate::tell;
+use shearq_dataset::fingerprint;
 use shearq_dataset::images;
 use shearq_dataset::layout::{DataFolder, MAX_IMAGE};
 use shearq_dataset::run::SimulationRecord;
 use shearq_dataset::threads::Progress;
+use shearq_pipeline::galaxy_fits::read_fits;
+use shearq_pipeline::scenes::{SHEARS, SceneRecord, simulate_scenes, write_shears};
 use shearq_pipeline::simulate::simulate_folder;
+use shearq_simulate::scene::{Layout, SceneSettings, SceneSimulator};
 use shearq_simulate::set::SimulationSettings;
 
-/// Write simulated GREAT10-like sets: images, PSFs, true shear and intrinsic shapes.
+/// Write simulated images with their PSFs and true shear: sets of stamps like GREAT10's, scenes, or a branch of GREAT3.
 ///
 /// The sets follow Table 2 of the paper. Sets 1 to 3 have galaxies of bulge and disc at S/N 20 and a Moffat PSF of
 /// 3.4 px. The others differ by S/N 10 (4 to 6), S/N 40 (7 to 9), many S/N (10 to 12); small (13, 14), large (15, 16)
@@ -26,28 +30,36 @@ use shearq_simulate::set::SimulationSettings;
 /// With --constant-shear all galaxies have one shear. Several shears, --opposite or --rotated make a folder for each
 /// version of the same galaxies, with the same noise: OUT/g1_+0.02_g2_+0 and so on. `bias` recognises the pairs.
 ///
+/// With --scenes the command writes exposures of fields whose galaxies lie anywhere and blend, to test a pipeline with its
+/// detection (docs/scenes.md): OUT/scene-001.fits, …, psf.fits, truth-001.csv with all galaxies, and shears.csv for `bias --truth`. The shear
+/// of a scene acts on shapes and on places. Each scene has its own, unless --constant-shear states it.
+///
 /// With `--challenge great3 --branch BRANCH`, the command writes a branch of GREAT3 in its layout into
 /// OUT/EXPERIMENT/OBSERVATION/SHEAR, and its truth, as it was released, below OUT/truth (docs/great3.md).
 /// Of images that are kept, it compares the first galaxy with the one that it would draw.
 #[derive(Debug, Args)]
-#[command(group = ArgGroup::new("sheared").args(["constant_shear", "branch"]))]
+#[command(group = ArgGroup::new("sheared").args(["constant_shear", "branch", "scenes"]).multiple(true))]
+#[command(group = ArgGroup::new("turnable").args(["constant_shear", "scenes"]).multiple(true))]
+#[command(group = ArgGroup::new("of_fits").args(["branch", "scenes"]))]
 pub(crate) struct Arguments {
     /// Sets, as `1,2,7-9` or `all`.
-    #[arg(long, value_name = "LIST", required_unless_present = "challenge")]
+    #[arg(long, value_name = "LIST", required_unless_present_any = ["challenge", "scenes"])]
     sets: Option<SetList>,
     /// Images per set.
-    #[arg(long, value_name = "N", required_unless_present = "challenge", value_parser = clap::value_parser!(u32).range(1..=i64::from(MAX_IMAGE)))]
+    #[arg(long, value_name = "N", required_unless_present_any = ["challenge", "scenes"], value_parser = clap::value_parser!(u32).range(1..=i64::from(MAX_IMAGE)))]
     images: Option<u32>,
     #[command(flatten)]
     simulation: SimulationArguments,
-    /// Shear of all galaxies, instead of a shear field. May be given several times.
-    #[arg(long, value_name = "G1,G2", allow_hyphen_values = true, value_parser = parse_shear, conflicts_with_all = ["amplitude", "tilt"])]
+    #[command(flatten)]
+    scene: SceneArguments,
+    /// Shear of all galaxies, instead of a shear field or a shear per scene. May be given several times.
+    #[arg(long, value_name = "G1,G2", allow_hyphen_values = true, value_parser = two_numbers, conflicts_with_all = ["amplitude", "tilt"])]
     constant_shear: Vec<[f64; 2]>,
     /// Also simulate the galaxies under the opposite shear, those of a branch into OUT/opposite.
     #[arg(long, requires = "sheared", conflicts_with_all = ["amplitude", "tilt"])]
     opposite: bool,
-    /// Also simulate the galaxies rotated by 90 degrees.
-    #[arg(long, requires = "constant_shear", conflicts_with_all = ["amplitude", "tilt"])]
+    /// Also simulate the galaxies rotated by 90 degrees; scenes with the places of their galaxies.
+    #[arg(long, requires = "turnable", conflicts_with_all = ["amplitude", "tilt"])]
     rotated: bool,
     /// Simulate a branch of this challenge: great3.
     #[arg(long, value_parser = simulated(), requires = "branch", conflicts_with_all = GREAT10_ONLY)]
@@ -60,7 +72,7 @@ pub(crate) struct Arguments {
     subfields: Option<u16>,
     /// Fits to galaxies, drawn at random: a table with the columns n, r_e (half the light is within the ellipse of this long half
     /// axis, in arcsec) and q (axis ratio), and perhaps flux, bulge_r_e, bulge_q, bulge_flux (n = 4; flux 0 for none) and snr.
-    #[arg(long, value_name = "FILE", requires = "branch", conflicts_with_all = GREAT10_ONLY)]
+    #[arg(long, value_name = "FILE", requires = "of_fits", conflicts_with_all = SETS_ONLY)]
     galaxies: Option<PathBuf>,
     /// Folder to write to.
     #[arg(long, value_name = "DIR")]
@@ -70,6 +82,64 @@ pub(crate) struct Arguments {
     #[command(flatten)]
     threads: Threads,
 }
+
+// Exposures of fields. Without options: 3.3 arcmin a side, 75 galaxies per arcmin², seeing 0.7 arcsec.
+#[derive(Debug, Args)]
+struct SceneArguments {
+    /// Simulate this many scenes instead of sets.
+    #[arg(long, value_name = "N", conflicts_with_all = SCENES_REFUSE, value_parser = clap::value_parser!(u32).range(1..=i64::from(MAX_IMAGE)))]
+    scenes: Option<u32>,
+    /// Pixels a side of a scene.
+    #[arg(long, value_name = "PX", requires = "scenes", conflicts_with_all = SCENES_REFUSE, default_value_t = SceneSettings::default().side)]
+    side: usize,
+    /// Pixels along the edges of a scene without galaxies and stars, so that none crosses an edge under one of several shears.
+    #[arg(long, value_name = "PX", requires = "scenes", conflicts_with_all = SCENES_REFUSE, default_value_t = SceneSettings::default().border)]
+    border: usize,
+    /// Arcseconds per pixel of a scene.
+    #[arg(long, value_name = "ARCSEC", requires = "scenes", conflicts_with_all = SCENES_REFUSE, default_value_t = SceneSettings::default().pixel_arcsec)]
+    pixel: f64,
+    /// FWHM of the PSF of a scene, a Moffat profile (β = 3), in arcsec.
+    #[arg(long, value_name = "ARCSEC", requires = "scenes", conflicts_with_all = SCENES_REFUSE, default_value_t = SceneSettings::default().seeing_arcsec)]
+    seeing: f64,
+    /// Ellipticity ε of the PSF of a scene [default: 0.03,-0.02].
+    #[arg(long, value_name = "E1,E2", requires = "scenes", conflicts_with_all = SCENES_REFUSE, allow_hyphen_values = true, value_parser = two_numbers)]
+    psf_shape: Option<[f64; 2]>,
+    /// Galaxies per arcmin².
+    #[arg(long, value_name = "N", requires = "scenes", conflicts_with_all = SCENES_REFUSE, default_value_t = SceneSettings::default().density)]
+    density: f64,
+    /// Least and largest S/N of galaxies, each alone [default: 3,400]. The noise of a pixel is 1.
+    #[arg(long, value_name = "FAINT,BRIGHT", requires = "scenes", conflicts_with_all = SCENES_REFUSE, value_parser = two_numbers)]
+    snr: Option<[f64; 2]>,
+    /// Slope d log₁₀ N/dm of the number counts between them.
+    #[arg(long, value_name = "SLOPE", requires = "scenes", conflicts_with_all = SCENES_REFUSE, default_value_t = SceneSettings::default().counts_slope)]
+    counts_slope: f64,
+    /// Stars per arcmin², of S/N 50 to 2000.
+    #[arg(long, value_name = "N", requires = "scenes", conflicts_with_all = SCENES_REFUSE, default_value_t = SceneSettings::default().star_density)]
+    stars: f64,
+    /// Where galaxies are: `random`, or on a `hexagonal` lattice, without blends.
+    #[arg(long, value_name = "LAYOUT", requires = "scenes", conflicts_with_all = SCENES_REFUSE, default_value = "random", value_parser = layout())]
+    layout: Layout,
+    /// Also simulate each scene with the opposite noise, so that what is linear in the noise cancels.
+    #[arg(long, requires = "scenes", conflicts_with_all = SCENES_REFUSE)]
+    opposite_noise: bool,
+}
+
+// Options of sets alone.
+const SETS_ONLY: [&str; 6] = ["sets", "images", "amplitude", "tilt", "fixed_psf", "shard"];
+
+// Options without a meaning for scenes.
+const SCENES_REFUSE: [&str; 10] = [
+    "sets",
+    "images",
+    "amplitude",
+    "tilt",
+    "fixed_psf",
+    "shard",
+    "grid",
+    "challenge",
+    "branch",
+    "subfields",
+];
 
 // Options without a meaning for branches of GREAT3.
 const GREAT10_ONLY: [&str; 8] = [
@@ -82,6 +152,13 @@ const GREAT10_ONLY: [&str; 8] = [
     "rotated",
     "shard",
 ];
+
+fn layout() -> impl TypedValueParser<Value = Layout> {
+    PossibleValuesParser::new(["random", "hexagonal"]).map(|name| match name.as_str() {
+        "hexagonal" => Layout::Hexagonal,
+        _ => Layout::Random,
+    })
+}
 
 // Names of the challenges of which branches can be simulated.
 fn simulated() -> PossibleValuesParser {
@@ -102,7 +179,7 @@ fn branch(name: &str) -> Result<String, String> {
     }
 }
 
-fn parse_shear(text: &str) -> Result<[f64; 2], String> {
+fn two_numbers(text: &str) -> Result<[f64; 2], String> {
     let expected = || "expected two numbers, as in `0.02,0`".to_owned();
     let (g1, g2) = text.split_once(',').ok_or_else(expected)?;
     let number = |text: &str| text.trim().parse::<f64>().map_err(|_| expected());
@@ -125,18 +202,7 @@ pub(super) fn versions(
     wanted: &Versions<'_>,
 ) -> anyhow::Result<Vec<(SimulationSettings, PathBuf)>> {
     let &Versions { settings, out, .. } = wanted;
-    let mut shears = Vec::new();
-    for &shear in wanted.shears {
-        // Adding zero makes zero of minus zero, which would name another folder.
-        let opposite = wanted.opposite.then(|| shear.map(|g| 0.0 - g));
-        for [g1, g2] in std::iter::once(shear).chain(opposite) {
-            anyhow::ensure!(
-                !shears.contains(&[g1, g2]),
-                "--constant-shear: the shear {g1}, {g2} is asked for twice"
-            );
-            shears.push([g1, g2]);
-        }
-    }
+    let shears = with_opposites(wanted.shears, wanted.opposite)?;
     let mut versions = Vec::new();
     for shear @ [g1, g2] in shears {
         for (rotated, ending) in [(false, ""), (true, "_rotated")] {
@@ -158,6 +224,143 @@ pub(super) fn versions(
         [(only, _)] => vec![(*only, out.to_owned())],
         _ => versions,
     })
+}
+
+// Each shear, and after it the opposite one if it is asked for.
+fn with_opposites(wanted: &[[f64; 2]], opposite: bool) -> anyhow::Result<Vec<[f64; 2]>> {
+    let mut shears = Vec::new();
+    for &shear in wanted {
+        // Adding zero makes zero of minus zero, which would name another folder.
+        let opposite = opposite.then(|| shear.map(|g| 0.0 - g));
+        for [g1, g2] in std::iter::once(shear).chain(opposite) {
+            anyhow::ensure!(
+                !shears.contains(&[g1, g2]),
+                "--constant-shear: the shear {g1}, {g2} is asked for twice"
+            );
+            shears.push([g1, g2]);
+        }
+    }
+    Ok(shears)
+}
+
+/// A version of the same scenes.
+struct SceneVersion {
+    shear: Option<[f64; 2]>,
+    opposite: bool,
+    rotated: bool,
+    negative_noise: bool,
+    out: PathBuf,
+}
+
+// As of sets, and without a constant shear the folders plus and minus.
+fn scene_versions(arguments: &Arguments) -> anyhow::Result<Vec<SceneVersion>> {
+    let shears = with_opposites(&arguments.constant_shear, arguments.opposite)?;
+    let mut named: Vec<(Option<[f64; 2]>, bool, String)> = shears
+        .into_iter()
+        .map(|[g1, g2]| (Some([g1, g2]), false, format!("g1_{g1:+}_g2_{g2:+}")))
+        .collect();
+    if named.is_empty() {
+        // Scenes with a shear each.
+        named.push((None, false, "plus".into()));
+        if arguments.opposite {
+            named.push((None, true, "minus".into()));
+        }
+    }
+    let mut versions = Vec::new();
+    for (shear, opposite, name) in named {
+        for (rotated, negative_noise, ending) in [
+            (false, false, ""),
+            (true, false, "_rotated"),
+            (false, true, "_noise"),
+            (true, true, "_rotated_noise"),
+        ] {
+            let asked_for = (!rotated || arguments.rotated)
+                && (!negative_noise || arguments.scene.opposite_noise);
+            if asked_for {
+                versions.push(SceneVersion {
+                    shear,
+                    opposite,
+                    rotated,
+                    negative_noise,
+                    out: arguments.out.join(format!("{name}{ending}")),
+                });
+            }
+        }
+    }
+    if let [only] = versions.as_mut_slice() {
+        // One version needs no folder of its own.
+        only.out.clone_from(&arguments.out);
+    }
+    Ok(versions)
+}
+
+fn run_scenes(arguments: &Arguments, scenes: u32) -> anyhow::Result<()> {
+    let own = &arguments.scene;
+    let default = SceneSettings::default();
+    let settings = SceneSettings {
+        seed: arguments.simulation.settings()?.seed,
+        side: own.side,
+        border: own.border,
+        pixel_arcsec: own.pixel,
+        seeing_arcsec: own.seeing,
+        psf_shape: own.psf_shape.unwrap_or(default.psf_shape),
+        layout: own.layout,
+        density: own.density,
+        snr: own.snr.unwrap_or(default.snr),
+        counts_slope: own.counts_slope,
+        star_density: own.stars,
+        ..default
+    };
+    let fits = arguments.galaxies.as_deref().map(read_fits).transpose()?;
+    let fits = fits.unwrap_or_default();
+    let galaxies = arguments
+        .galaxies
+        .as_deref()
+        .map(fingerprint::of_file)
+        .transpose()?;
+    let mut simulators = Vec::new();
+    for version in scene_versions(arguments)? {
+        let settings = SceneSettings {
+            constant_shear: version.shear,
+            opposite: version.opposite,
+            rotated: version.rotated,
+            negative_noise: version.negative_noise,
+            ..settings
+        };
+        simulators.push((SceneSimulator::new(settings, fits.clone())?, version.out));
+    }
+    let objects: usize = simulators.iter().map(|(own, _)| own.objects()).sum();
+    let mut bar = Bar::new("simulating", u64::from(scenes) * objects as u64);
+    let mut made = 0;
+    for (simulator, out) in &simulators {
+        let record = SceneRecord {
+            version: shearq_dataset::VERSION.into(),
+            settings: *simulator.settings(),
+            galaxies: galaxies.clone(),
+        };
+        let threads = arguments.threads.number();
+        made += simulate_scenes(simulator, &record, scenes, out, threads, &mut bar)?;
+    }
+    drop(bar);
+    let of_versions = simulators.iter().map(|(own, out)| (own, out.as_path()));
+    write_shears(of_versions, scenes, &arguments.out)?;
+    let all = scenes as usize * simulators.len();
+    tell(format_args!(
+        "{made} scenes of {:.2} arcmin² simulated, {} there already, in {}; true shears in {SHEARS}",
+        settings.area_arcmin2(),
+        all - made,
+        arguments.out.display()
+    ));
+    tell_folders(simulators.iter().map(|(_, out)| out.as_path()));
+    Ok(())
+}
+
+// The names of the folders are made here, and are arguments of the next commands.
+fn tell_folders<'p>(folders: impl Iterator<Item = &'p Path>) {
+    let shown: Vec<String> = folders.map(|out| out.display().to_string()).collect();
+    if shown.len() > 1 {
+        tell(format_args!("folders: {}", shown.join(", ")));
+    }
 }
 
 fn run_branch(arguments: &Arguments, challenge: &str, branch: &str) -> anyhow::Result<()> {
@@ -196,8 +399,11 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     if let (Some(challenge), Some(branch)) = (&arguments.challenge, &arguments.branch) {
         return run_branch(arguments, challenge, branch);
     }
+    if let Some(scenes) = arguments.scene.scenes {
+        return run_scenes(arguments, scenes);
+    }
     let (Some(sets), Some(images)) = (&arguments.sets, arguments.images) else {
-        anyhow::bail!("expected --sets and --images, or --challenge and --branch");
+        anyhow::bail!("expected --sets and --images, --scenes, or --challenge and --branch");
     };
     let images = images::of_simulation(&sets.simulated()?, images);
     let images = arguments.sharding.part(&images);
@@ -228,11 +434,6 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         "{made} images simulated, {already} there already, in {}",
         arguments.out.display()
     ));
-    // The names of the folders are made here, and are arguments of the next commands.
-    if versions.len() > 1 {
-        let folders = versions.iter();
-        let shown: Vec<String> = folders.map(|(_, out)| out.display().to_string()).collect();
-        tell(format_args!("folders: {}", shown.join(", ")));
-    }
+    tell_folders(versions.iter().map(|(_, out)| out.as_path()));
     Ok(())
 }

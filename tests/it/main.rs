@@ -31,6 +31,7 @@ mod orientation;
 mod packed;
 mod reference;
 mod reproduced;
+mod scenes;
 mod scoring_cases;
 mod source;
 mod support;

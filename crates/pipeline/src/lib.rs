@@ -6,9 +6,11 @@
 
 pub mod complete;
 pub mod engine;
+pub mod galaxy_fits;
 pub mod gather;
 pub mod measure;
 pub mod run;
+pub mod scenes;
 pub mod simulate;
 mod stamp_table;
 mod wcs;

@@ -280,6 +280,22 @@ impl Galaxy {
         })
     }
 
+    /// A star of this flux.
+    ///
+    /// # Errors
+    /// If the flux is not a number of zero or more.
+    pub fn point(flux: f64) -> Result<Self, GalaxyError> {
+        Galaxy::new(&[Component {
+            profile: Sersic::Gaussian,
+            // A point to 1e-6 of the light at the largest wavenumber.
+            half_light_radius: 1e-4,
+            flux,
+            dx: 0.0,
+            dy: 0.0,
+            shape: Shear::ZERO,
+        }])
+    }
+
     /// A de Vaucouleurs bulge and an exponential disc with one centre and one ellipticity.
     ///
     /// The bulge holds `bulge_fraction` of `flux`; a share of 0 or 1 leaves out the other

@@ -504,6 +504,22 @@ fn folded_light(galaxy: &Galaxy, psf: &TransformedPsf<'_>, period: f64, reach: (
         .sum()
 }
 
+/// The smallest of `sides` of a stamp, in rising order, beyond which a galaxy near its centre has no light that matters: the
+/// nearest pixel outside of it has less than [`FOLDING_TOLERANCE`] of the peak.
+pub(crate) fn stamp_side(
+    galaxy: &Galaxy,
+    psf: &TransformedPsf<'_>,
+    sides: &[usize],
+) -> Option<usize> {
+    let limit = FOLDING_TOLERANCE * rough_peak(galaxy, psf);
+    let is_enough = |side: usize| {
+        // The centre may be half a pixel from the middle.
+        let half = 0.5 * (side as f64 - 1.0);
+        folded_light(galaxy, psf, 2.0 * half, (half, half)) <= limit
+    };
+    sides.iter().position(|side| is_enough(*side))
+}
+
 /// sin(k/2)/(k/2): the transform of a pixel along one axis.
 pub(crate) fn sinc(k: f64) -> f64 {
     if k == 0.0 {

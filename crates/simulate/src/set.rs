@@ -29,6 +29,12 @@ use super::signal::power;
 #[error("{0}")]
 pub struct SettingsError(String);
 
+impl SettingsError {
+    pub(crate) fn new(message: String) -> Self {
+        SettingsError(message)
+    }
+}
+
 // Pixels a side of a postage stamp, as in GREAT10.
 pub const STAMP: usize = 48;
 /// Noise per pixel; images are scaled so that it is one.

@@ -21,7 +21,8 @@ use shearq_scoring::{Complex64, Grid, ScoringError};
 
 use shearq_simulate::add_noise;
 use shearq_simulate::field::{Content, ShearSpectrum, random_field, random_shear};
-use shearq_simulate::galaxy::{Component, Galaxy, GalaxyError, Sersic};
+use shearq_simulate::fit::{Fit, FitComponent, rayleigh};
+use shearq_simulate::galaxy::{Galaxy, GalaxyError, Sersic};
 use shearq_simulate::render::{RenderScratch, Renderer};
 use shearq_simulate::set::{MAX_INTRINSIC_MODULUS, NYQUIST_SHARE, stream};
 use shearq_simulate::signal::power;
@@ -60,25 +61,6 @@ const COUNT_SLOPE: f64 = 1.5;
 pub fn simulated_branches() -> impl Iterator<Item = Branch> {
     let simulated = [Experiment::Control, Experiment::Multiepoch];
     Branch::all().filter(move |branch| simulated.contains(&branch.experiment))
-}
-
-/// A component of a fit to a galaxy. All components of a galaxy have one position angle.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct FitComponent {
-    pub profile: Sersic,
-    /// Of the circle with the area of the half-light ellipse.
-    pub half_light_arcsec: f64,
-    pub flux: f64,
-    pub axis_ratio: f64,
-}
-
-/// A fit to a galaxy: one component, or disc and bulge.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Fit {
-    pub main: FitComponent,
-    pub bulge: Option<FitComponent>,
-    /// √(Σ I²)/σ of all epochs together, behind a round PSF. By default drawn like those of the default galaxies.
-    pub snr: Option<f64>,
 }
 
 /// A branch and its random numbers.
@@ -360,7 +342,7 @@ impl BranchSimulator {
             None => subfield.lensing[place],
             Some(shear) => {
                 let (fit, direction, _) = self.draw_fit(subfield, place);
-                let e = direction * modulus(fit.main.axis_ratio);
+                let e = direction * fit.main.modulus();
                 (shear, Shear::new(e.re, e.im))
             }
         }
@@ -394,26 +376,14 @@ impl BranchSimulator {
         shear: Shear,
         flux: f64,
     ) -> Result<Galaxy, GalaxyError> {
-        let component = |own: &FitComponent| {
+        fit.galaxy(self.branch.pixel_arcsec(), flux, |own| {
             let e = match shape {
                 None => Complex64::ZERO,
                 Some((e, true)) => e,
-                Some((direction, false)) => direction * modulus(own.axis_ratio),
+                Some((direction, false)) => direction * own.modulus(),
             };
-            Component {
-                profile: own.profile,
-                half_light_radius: own.half_light_arcsec / self.branch.pixel_arcsec(),
-                flux: flux * own.flux,
-                dx: 0.0,
-                dy: 0.0,
-                shape: Shear::new(e.re, e.im).sheared_by(shear),
-            }
-        };
-        let main = component(&fit.main);
-        match &fit.bulge {
-            None => Galaxy::new(&[main]),
-            Some(bulge) => Galaxy::new(&[component(bulge), main]),
-        }
+            Shear::new(e.re, e.im).sheared_by(shear)
+        })
     }
 
     /// The galaxy in a place.
@@ -480,16 +450,7 @@ impl BranchSimulator {
     ) -> Vec<f32> {
         let size = self.branch.stamp();
         let mut rng = self.stream(subfield.number, epoch, Purpose::Stars);
-        let point = Component {
-            profile: Sersic::Gaussian,
-            // A point to 1e-6 of the light at the largest wavenumber.
-            half_light_radius: 1e-4,
-            flux: 1.0,
-            dx: 0.0,
-            dy: 0.0,
-            shape: Shear::ZERO,
-        };
-        let point = Galaxy::new(&[point]).expect("a valid component");
+        let point = Galaxy::point(1.0).expect("a valid flux");
         let mut stamp = vec![0.0; size * size];
         let mut image = vec![0.0; (STARS_PER_SIDE * size).pow(2)];
         for k in 0..STARS_PER_SIDE * STARS_PER_SIDE {
@@ -511,20 +472,13 @@ impl BranchSimulator {
     }
 }
 
-// |ε| of an axis ratio.
-fn modulus(axis_ratio: f64) -> f64 {
-    (1.0 - axis_ratio) / (1.0 + axis_ratio)
-}
-
 fn default_fit(rng: &mut ChaCha8Rng) -> Fit {
     let radius = |rng: &mut ChaCha8Rng| {
         let draw: f64 = StandardNormal.sample(rng);
         let radius = MEDIAN_RADIUS_ARCSEC * (RADIUS_SCATTER * draw).exp();
         radius.clamp(RADII_ARCSEC.0, RADII_ARCSEC.1)
     };
-    // Rayleigh's distribution.
-    let u: f64 = rng.random_range(f64::EPSILON..1.0);
-    let e = (INTRINSIC_SIGMA * (-2.0 * u.ln()).sqrt()).min(MAX_INTRINSIC_MODULUS);
+    let e = rayleigh(rng, INTRINSIC_SIGMA, MAX_INTRINSIC_MODULUS);
     let axis_ratio = (1.0 - e) / (1.0 + e);
     let component = |profile, half_light_arcsec, flux| FitComponent {
         profile,
