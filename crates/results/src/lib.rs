@@ -18,6 +18,7 @@ pub mod baseline;
 pub mod bias;
 pub mod catalogues;
 pub mod compare;
+pub mod crowding;
 pub mod mean;
 pub mod record;
 pub mod response;

@@ -10,6 +10,7 @@ use shearq_measure::{Flag, Flags, MeanShear, ShearSum, Warning};
 use shearq_quantities::statistics::RunningMean;
 use shearq_submissions::Calibration;
 
+use crate::crowding::crowded;
 use shearq_catalogue::failures::repeated_ellipticities;
 use shearq_catalogue::select::StatedSelection;
 use shearq_catalogue::shapes::MeasuredShapes;
@@ -45,6 +46,9 @@ pub struct SetMean {
     pub scatter: [f64; 2],
     /// Whether errors are for galaxies in pairs that are rotated by 90°, whose shapes cancel.
     pub rotated_pairs: bool,
+    /// Galaxies of catalogues with positions in pixels, and those among them with another position on their stamp.
+    pub placed: usize,
+    pub crowded: usize,
     pub axes: Axes,
 }
 
@@ -118,7 +122,15 @@ fn mean_of(
     let (mut noise, mut in_pairs) = ([0.0; 2], pairs);
     let mut responses = [RunningMean::default(); 2];
     let mut repeated = 0;
+    let (mut placed, mut close) = (0, 0);
     for (_, path) in catalogues {
+        // Most catalogues have no positions in pixels.
+        if let Ok(read) = table::read(path, Some(&["x", "y"]), table::MAX_ROWS) {
+            let [x, y] = ["x", "y"].map(|name| table::numbers(&read, name, path));
+            let (x, y) = (x?, y?);
+            placed += x.len();
+            close += crowded(&x, &y);
+        }
         let stated = if in_pairs {
             e_noise(path, format)?
         } else {
@@ -182,6 +194,8 @@ fn mean_of(
         psf_error,
         noisy_stars: stars.stated(),
         rotated_pairs: in_pairs,
+        placed,
+        crowded: close,
         scatter: [0, 1].map(|k| moments[k].deviation() / response[k]),
         axes: axes.common().unwrap_or_default(),
     })

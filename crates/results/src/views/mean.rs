@@ -2,6 +2,7 @@
 
 use shearq_submissions::{Calibration, Configuration, EllipticityType};
 
+use crate::crowding::CLOSE_PX;
 use crate::mean::SetMean;
 use shearq_dataset::metadata::Axes;
 use shearq_render::table::{Cell, Table};
@@ -61,6 +62,8 @@ pub fn mean_table(means: &[SetMean], configuration: &Configuration, name: &str) 
                 .into(),
         );
     }
+    table.notes.extend(without_detection(means));
+    let notes = &mut table.notes;
     if means.iter().any(noticed) {
         let images = means.iter().map(|mean| mean.images.len()).sum::<usize>();
         let stated = means.iter().map(|mean| mean.noisy_stars).sum::<usize>();
@@ -72,6 +75,18 @@ pub fn mean_table(means: &[SetMean], configuration: &Configuration, name: &str) 
         notes.push(format!("Errors include the noise of the star of {of}."));
     }
     table
+}
+
+/// What the response does not contain if stamps were cut at positions of an exposure, of which some have another one on their stamp.
+fn without_detection(means: &[SetMean]) -> Option<String> {
+    let [crowded, placed] = [|mean: &SetMean| mean.crowded, |mean: &SetMean| mean.placed]
+        .map(|of| means.iter().map(of).sum::<usize>());
+    (crowded > 0).then(|| {
+        format!(
+            "Calibrated at given positions, without detection: {:.0} % of the positions have another one within {CLOSE_PX} px, and which positions a detection finds depends on shear. Try: simulate --scenes, to measure m with your detection (docs/scenes.md).",
+            100.0 * crowded as f64 / placed as f64
+        )
+    })
 }
 
 /// Whether the noise of the stars is at least a tenth of an error.
