@@ -12,7 +12,7 @@ use crate::grid::Grid;
 use crate::score::{Choice, Options, SetScore, SetScorer};
 
 // Chance that an image of a set is reported whose response differs by noise only. Over the 24 sets of the challenge
-// this is at most 2 %, and less in fact, because the bound of the normal distribution below is not tight.
+// this is at most 2.4 %, and less in fact, because the bound of the normal distribution below is not tight.
 const FALSE_ALARM_PROBABILITY: f64 = 1e-3;
 // Least relative difference of an image's response from that of the others. Images of one set with other PSFs or
 // noise respond differently too, in S/N 10 against 20 by 0.2; a wrong order, sign or type changes it by 1 or more.

@@ -280,6 +280,7 @@ impl<'a> Totals<'a> {
 }
 
 fn minus(sums: &[f64], less: &[f64]) -> Vec<f64> {
+    debug_assert_eq!(sums.len(), less.len(), "sums of one layout");
     let differences = sums.iter().zip(less);
     differences.map(|(sum, less)| sum - less).collect()
 }

@@ -1,8 +1,9 @@
 //! Sums per unit and bin, in bounded memory.
 
-use std::collections::{BTreeMap, HashMap};
+use std::collections::BTreeMap;
 
 use serde::{Deserialize, Serialize};
+use shearq_quantities::hash::NumberMap;
 
 use crate::arms::Units;
 use crate::error::BiasError;
@@ -34,7 +35,7 @@ pub struct UnitSums {
     shift: u32,
     units: Vec<((u32, u64), Vec<f64>)>,
     #[serde(skip)]
-    places: HashMap<(u32, u64), usize>,
+    places: NumberMap<(u32, u64), usize>,
     // Rows of one unit are neighbours in most files.
     #[serde(skip)]
     last: Option<((u32, u64), usize)>,
@@ -49,7 +50,7 @@ impl UnitSums {
             catalogues,
             shift: 0,
             units: Vec::new(),
-            places: HashMap::new(),
+            places: NumberMap::default(),
             last: None,
         }
     }
@@ -109,9 +110,13 @@ impl UnitSums {
     }
 
     fn place(&mut self, catalogue: u32, key: u64) -> usize {
-        let most = self.most();
         let mut unit = (catalogue, shifted(key, self.shift));
-        if !self.places.contains_key(&unit) && self.units.len() >= most {
+        if let Some(&place) = self.places.get(&unit) {
+            self.last = Some((unit, place));
+            return place;
+        }
+        let most = self.most();
+        if self.units.len() >= most {
             while self.units.len() >= most && self.shift < u64::BITS {
                 self.coarsen(self.shift + 1);
             }
@@ -233,7 +238,7 @@ impl UnitSums {
         let units = all.filter(|((catalogue, _), _)| wanted(*catalogue));
         UnitSums {
             units: units.cloned().collect(),
-            places: HashMap::new(),
+            places: NumberMap::default(),
             last: None,
             ..*self
         }

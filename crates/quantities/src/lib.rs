@@ -19,6 +19,7 @@
 
 mod ellipticity;
 pub mod fourier;
+pub mod hash;
 pub mod linear;
 mod psf;
 pub mod radial;

@@ -130,8 +130,11 @@ impl MeasuredRange {
         let moduli = values.iter().map(|value| value.abs());
         let mut moduli: Vec<f64> = moduli.filter(|m| m.is_finite() && *m > 0.0).collect();
         moduli.sort_unstable_by(f64::total_cmp);
+        let usual = moduli.get(moduli.len() / 2).copied();
         moduli.dedup();
-        let Some(typical) = moduli.get(moduli.len() / 2) else {
+        // Of a constant response and −9 in 1 % of the rows, half of the moduli that occur are 9.
+        let different = moduli.get(moduli.len() / 2).copied();
+        let Some(typical) = usual.zip(different).map(|(a, b)| a.min(b)) else {
             return Self::ELLIPTICITY;
         };
         MeasuredRange {
@@ -144,8 +147,33 @@ impl MeasuredRange {
     pub fn excludes(self, value: f64) -> bool {
         let modulus = value.abs();
         let is_whole = modulus < FRACTIONS_END && modulus.fract() == 0.0;
-        modulus > self.any || is_whole && modulus > self.whole
+        modulus > self.any || modulus > self.whole && (is_whole || is_mark(modulus))
     }
+
+    /// Whether a number beyond the typical ones is written by nines, or is a power of ten.
+    pub fn excludes_mark(self, value: f64) -> bool {
+        value.abs() > self.whole && is_mark(value.abs())
+    }
+}
+
+// 9.99, 99, 9999 and 1e20 in either precision: measured numbers have other digits.
+fn is_mark(modulus: f64) -> bool {
+    let is_of_nines = |text: &str| {
+        let mut digits = text.bytes().filter(|digit| *digit != b'.');
+        text.len() > 1 && digits.all(|digit| digit == b'9')
+    };
+    let is_power = |text: &str| {
+        text.len() > 5 && text.starts_with('1') && text[1..].bytes().all(|digit| digit == b'0')
+    };
+    let single = modulus as f32;
+    let either = [modulus.to_string(), single.to_string()];
+    let either = match f64::from(single) == modulus {
+        true => &either[..],
+        false => &either[..1],
+    };
+    either
+        .iter()
+        .any(|text| is_of_nines(text) || is_power(text))
 }
 
 #[cfg(test)]
@@ -161,6 +189,37 @@ mod tests {
         }
         assert_eq!((running.count(), running.mean()), (3, 1e9 + 3.0));
         assert_eq!(running.deviation(), 7.0f64.sqrt());
+    }
+
+    #[test]
+    fn numbers_of_nines_stand_for_failures() {
+        let range = MeasuredRange::ELLIPTICITY;
+        for value in [
+            -9.99,
+            -9.9,
+            99.0,
+            -99.9,
+            9999.0,
+            1e20,
+            -999.25_f64.trunc(),
+            f64::from(-9.99_f32),
+        ] {
+            assert!(range.excludes(value), "{value}");
+        }
+        for value in [0.99, -0.999, 9.98, 9.5, -12.75] {
+            assert!(!range.excludes(value), "{value}");
+        }
+        // A constant response beside a failure.
+        let values: Vec<f64> = (0..1000)
+            .map(|k| if k % 100 == 0 { -9.0 } else { 0.7 })
+            .collect();
+        assert!(MeasuredRange::from_values(&values).excludes(-9.0));
+        let weights = MeasuredRange::from_values(&[0.5, 2.0, 14.0]);
+        assert!(
+            weights.excludes_mark(9999.0)
+                && weights.excludes_mark(1e10)
+                && !weights.excludes_mark(400.0)
+        );
     }
 
     #[test]
