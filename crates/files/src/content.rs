@@ -23,13 +23,14 @@ pub(crate) enum Content {
 pub(crate) const GZIP_MAGIC: [u8; 2] = [0x1f, 0x8b];
 
 const PANDAS: &str = "pandas, which reads it and writes Parquet by to_parquet";
+const FEATHER: &str = "python -c 'import pandas, sys; pandas.read_feather(sys.argv[1]).to_parquet(sys.argv[2])' FILE table.parquet";
 const ASTROPY: &str = "astropy.table.Table.read, and write(\"table.parquet\")";
 const NUMPY: &str = "numpy.load, and astropy.table.Table(array).write(\"table.parquet\")";
 
 // Signatures of formats that are not read, from their specifications. An Arrow stream begins with the mark of a continued message.
 const OTHERS: [(&[u8], &str, &str); 12] = [
-    (b"ARROW1", "Feather (an Arrow file)", PANDAS),
-    (b"FEA1", "Feather, version 1", PANDAS),
+    (b"ARROW1", "Feather (an Arrow file)", FEATHER),
+    (b"FEA1", "Feather, version 1", FEATHER),
     (
         b"\xff\xff\xff\xff",
         "an Arrow stream",

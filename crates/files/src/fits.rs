@@ -10,7 +10,8 @@ mod selection;
 mod write;
 
 pub use read::{
-    ImageReader, Pixel, TableHead, read_table, read_table_keys, read_table_parts, tables,
+    ImageReader, Pixel, TableHead, first_texts, read_table, read_table_keys, read_table_parts,
+    tables,
 };
 pub use selection::{ImageHead, Planes, Selection, image_heads};
 pub use write::{ImageWriter, Value, write_table};

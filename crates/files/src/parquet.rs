@@ -252,6 +252,26 @@ pub(crate) fn read_groups(
     Ok(())
 }
 
+/// The first value of each column of text.
+pub(crate) fn first_texts(path: &Path) -> Result<Vec<(String, String)>, FileError> {
+    let mut source = Source::open(path)?;
+    let is_text = |field: &&ArrowField| decoded_type(&field.dtype) == Some(ArrowDataType::Utf8View);
+    let fields: Vec<ArrowField> = source.fields.iter().filter(is_text).cloned().collect();
+    let mut groups = source.footer.row_groups.iter();
+    let Some(number) = groups.position(|group| group.num_rows() > 0) else {
+        return Ok(Vec::new());
+    };
+    let mut found = Vec::new();
+    for field in fields {
+        let name = field.name.to_string();
+        let wanted = source.decoded(&Wanted::whole(field))?;
+        let chunk = source.read_chunk(&wanted, number)?;
+        let first = chunk.str().ok().and_then(|texts| texts.get(0));
+        found.extend(first.map(|text| (name, text.to_owned())));
+    }
+    Ok(found)
+}
+
 /// The names of the columns, in file order, from the footer alone.
 pub fn columns(path: impl AsRef<Path>) -> Result<Vec<String>, FileError> {
     Ok(Source::open(path.as_ref())?.names())

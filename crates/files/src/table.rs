@@ -257,6 +257,21 @@ pub fn read_from(
     }
 }
 
+/// The first value of each column of texts. Of a text table, any field of the first row may be one.
+pub fn first_texts(place: &Place) -> Result<Vec<(String, String)>, FileError> {
+    place.check()?;
+    let path = &place.path;
+    match Ending::of(path) {
+        Ending::Parquet => parquet::first_texts(path),
+        Ending::Fits => fits::first_texts(path, place.table.as_deref()),
+        Ending::Text => {
+            let found = text::columns(path)?;
+            let names = found.names.into_iter().flatten();
+            Ok(names.zip(found.fields).collect())
+        }
+    }
+}
+
 pub const TRUTH_COLUMNS: [&str; 4] = ["x", "y", "g1", "g2"];
 
 // Rows of a FITS table that are read at a time.

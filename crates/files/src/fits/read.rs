@@ -648,6 +648,23 @@ pub fn read_table_parts(
     file.check_end()
 }
 
+/// The first value of each column of text of a table.
+pub fn first_texts(path: &Path, table: Option<&str>) -> Result<Vec<(String, String)>, FileError> {
+    let mut file = File::open(path, Content::Table)?;
+    go_to_table(&mut file, None, table)?;
+    let mut texts = describe_columns(&file)?;
+    texts.retain(|own| own.kind == TSTRING);
+    if table_rows(&mut file, usize::MAX)? == 0 {
+        return Ok(Vec::new());
+    }
+    let first = read_part(&file, &texts, 0..1, true)?;
+    let text = |own: &Column| {
+        let text = own.str().ok()?.get(0)?;
+        Some((own.name().to_string(), text.to_owned()))
+    };
+    Ok(first.columns().iter().filter_map(text).collect())
+}
+
 /// The descriptions of the columns `wanted`, or of all that are numbers. Wanted columns may be `texts`.
 fn choose_columns(
     file: &File,
