@@ -163,6 +163,204 @@ fn errors_contain_the_noise_of_a_star_that_all_galaxies_share() {
     folder.refuses("bias bad.parquet", "`psfnoise`");
 }
 
+/// Layouts of public catalogues and pipelines with the same numbers: names of e1 or e2 (`K`) in a sheared catalogue (`S`).
+#[test]
+fn sheared_catalogues_are_recognised_in_any_layout() {
+    let folder = Folder::new();
+    // Of a galaxy, [(catalogue, [e1, e2])].
+    let sheared =
+        |[own, r]: [[f64; 2]; 2]| SHEARS.map(|shear| [0, 1].map(|j| own[j] + r[j] * shear[j]));
+    let arms = [("plus", 0.02), ("minus", -0.02)];
+    // Means of both components, over the mean response.
+    let expected = {
+        let of = |g: f64| {
+            let mut sums = [[0.0; 2]; 2];
+            for [own, r] in galaxies(1, [g; 2]) {
+                (0..2).for_each(|k| {
+                    sums[k][0] += own[k];
+                    sums[k][1] += r[k];
+                });
+            }
+            sums.map(|[e, r]| e / r)
+        };
+        let (plus, minus) = (of(0.02), of(-0.02));
+        [0, 1].map(|k| (plus[k] - minus[k]) / 0.04 - 1.0)
+    };
+    let truth = |files: &[String]| {
+        let line = |file: &String| {
+            let g = if file.contains("plus") { 0.02 } else { -0.02 };
+            format!("{file},{g},{g}\n")
+        };
+        let lines: Vec<String> = files.iter().map(line).collect();
+        folder.write("truth.csv", format!("catalogue,g1,g2\n{}", lines.concat()));
+        files.join(" ")
+    };
+    let columns = [
+        ("eK", "eK_S"),
+        ("noshear_eK", "S_eK"),
+        ("00/gK", "S/gK"),
+        ("eK_noshear", "eK.S"),
+        ("eK", "eKS"),
+        ("g_noshear_K", "g_S_K"),
+        ("EK_UNSHEARED", "EK_SHEARED_S"),
+    ];
+    for (base, name) in columns {
+        for (sign, g) in arms {
+            let name = |k: usize, at: usize| {
+                let of = |name: &str| {
+                    name.replace('K', &(k + 1).to_string())
+                        .replace('S', NAMES[at])
+                };
+                match (at, base) {
+                    (0, "EK_UNSHEARED") => format!("E{}_UNSHEARED", k + 1),
+                    (0, base) => of(base),
+                    (_, "EK_UNSHEARED") => {
+                        format!("E{}_SHEARED_{}", k + 1, NAMES[at].to_uppercase())
+                    }
+                    _ => of(name),
+                }
+            };
+            let names = (0..5).flat_map(|at| [name(0, at), name(1, at)]);
+            let mut text = names.collect::<Vec<_>>().join(",") + "\n";
+            for galaxy in galaxies(1, [g; 2]) {
+                let numbers = sheared(galaxy).into_iter().flatten().map(|e| e.to_string());
+                text += &(numbers.collect::<Vec<_>>().join(",") + "\n");
+            }
+            folder.write(&format!("{sign}.csv"), text);
+        }
+        let files = truth(&["plus.csv".into(), "minus.csv".into()]);
+        let found = rows(&folder, &format!("{files} --truth truth.csv"));
+        // Rounding of differences of 0.01.
+        assert_m(&found[0], expected, 1e-9);
+    }
+    // Rows with a text in a column of any name, and numbers, which the user must confirm.
+    let numbers = ["0", "1", "2", "3", "4"];
+    for (names, given) in [(NAMES, ""), (numbers, "--columns version=kind")] {
+        for (sign, g) in arms {
+            let mut text = String::from("kind,e1,e2\n");
+            for (at, name) in names.iter().enumerate() {
+                for galaxy in galaxies(1, [g; 2]) {
+                    let [e1, e2] = sheared(galaxy)[at];
+                    writeln!(text, "{name},{e1},{e2}").unwrap();
+                }
+            }
+            folder.write(&format!("{sign}.csv"), text);
+        }
+        let files = truth(&["plus.csv".into(), "minus.csv".into()]);
+        let found = rows(&folder, &format!("{files} --truth truth.csv {given}"));
+        assert_m(&found[0], expected, 1e-9);
+    }
+    folder.refuses(
+        "bias plus.csv minus.csv --truth truth.csv",
+        "version=kind if 0 is noshear",
+    );
+    // A file for each sheared catalogue.
+    let mut files = Vec::new();
+    for (sign, g) in arms {
+        for (at, name) in NAMES.iter().enumerate() {
+            let mut text = String::from("e1,e2\n");
+            for galaxy in galaxies(1, [g; 2]) {
+                let [e1, e2] = sheared(galaxy)[at];
+                writeln!(text, "{e1},{e2}").unwrap();
+            }
+            let file = format!("{sign}_{name}.csv");
+            folder.write(&file, text);
+            files.push(file);
+        }
+    }
+    let all = truth(&files);
+    let found = rows(&folder, &format!("{all} --truth truth.csv"));
+    assert_m(&found[0], expected, 1e-9);
+    files.pop();
+    let some = truth(&files);
+    folder.refuses(
+        &format!("bias {some} --truth truth.csv"),
+        "there is no row of 2m",
+    );
+}
+
+/// Columns that are given as e1 and e2, and what is said of them.
+#[test]
+fn numbers_that_are_no_ellipticities_are_named() {
+    let folder = Folder::new();
+    let shapes: Vec<[f64; 2]> = galaxies(4, [0.0; 2]).iter().map(|[e, _]| *e).collect();
+    type Kind<'a> = (&'a str, &'a dyn Fn([f64; 2]) -> [f64; 2]);
+    let kinds: [Kind<'_>; 5] = [
+        ("e1 is never negative", &|[a, b]| {
+            [a.hypot(b), 0.5 * b.atan2(a)]
+        }),
+        ("are no ellipticities", &|[a, b]| [100.0 * a, 100.0 * b]),
+        ("are no ellipticities", &|[a, b]| [22.0 + a, 21.0 + b]),
+        ("which no method of measuring shapes leaves", &|[a, b]| {
+            [0.3 + 0.1 * a, b]
+        }),
+        ("|e| above 1", &|[a, b]| [4.0 * a, 4.0 * b]),
+    ];
+    for (expected, kind) in kinds {
+        let mut text = String::from("e1,e2\n");
+        for e in &shapes {
+            let [a, b] = kind(*e);
+            writeln!(text, "{a},{b}").unwrap();
+        }
+        folder.write("c.csv", text);
+        match expected == "are no ellipticities" {
+            true => folder.refuses("bias c.csv", expected),
+            false => assert_has(&folder.run("bias c.csv").replace('\n', " "), expected),
+        }
+    }
+}
+
+/// HATS and dask write a catalogue as a folder of files.
+#[test]
+fn a_folder_of_parts_is_one_catalogue() {
+    let folder = Folder::new();
+    let write = |name: &str, g: f64, part: std::ops::Range<usize>| {
+        let all = &galaxies(3, [g; 2])[part];
+        let column = |name: &str, of: &dyn Fn(&[[f64; 2]; 2]) -> f64| {
+            Column::new(name.into(), all.iter().map(of).collect::<Vec<f64>>())
+        };
+        let table = frame(vec![
+            column("e1", &|[e, _]| e[0]),
+            column("e2", &|[e, _]| e[1]),
+            column("R11", &|[_, r]| r[0]),
+            column("R22", &|[_, r]| r[1]),
+            column("g1", &|_| g),
+            column("g2", &|_| g),
+        ]);
+        let path = folder.at(name);
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        table::write(
+            &path,
+            FileFormat::Parquet,
+            &table.unwrap(),
+            &Default::default(),
+        )
+        .unwrap();
+    };
+    for (sign, g) in [("plus", 0.02), ("minus", -0.02)] {
+        write(&format!("{sign}.parquet"), g, 0..GALAXIES);
+        write(
+            &format!("{sign}/dataset/Norder=1/Dir=0/Npix=7.parquet"),
+            g,
+            0..500,
+        );
+        write(
+            &format!("{sign}/dataset/Norder=1/Dir=0/Npix=8/part0.parquet"),
+            g,
+            500..GALAXIES,
+        );
+        folder.write(&format!("{sign}/dataset/_common_metadata"), "no rows");
+    }
+    let whole = rows(&folder, "plus.parquet minus.parquet");
+    assert_eq!(rows(&folder, "plus minus"), whole);
+    // The same galaxies under another name of a file.
+    std::fs::copy(folder.at("plus.parquet"), folder.at("more.parquet")).unwrap();
+    folder.refuses(
+        "bias plus.parquet more.parquet",
+        "the same galaxies as plus.parquet",
+    );
+}
+
 #[test]
 fn mean_distortions_are_divided_by_the_responsivity() {
     let folder = Folder::new();

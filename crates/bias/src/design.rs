@@ -24,6 +24,7 @@ pub enum Design {
     /// Paired shears +γ and −γ of the same galaxies, whose shapes cancel in m.
     Pairs,
     /// The same galaxies under several test shears, such as ±g1 and ±g2, or γ and 0.
+    #[strum(serialize = "shears")]
     Arms,
     /// Catalogues with a shear each, of different galaxies.
     Fields,

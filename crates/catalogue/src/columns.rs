@@ -7,8 +7,9 @@ use shearq_bias::SHEARED_CATALOGUES;
 use shearq_files::{FileError, names_of};
 use shearq_submissions::EllipticityType;
 
-use crate::recognition::{Patterns, Survey, fits_any, recognition};
+use crate::recognition::{Patterns, Survey, fits_any, has_any, recognition, words};
 use crate::shapes::refuse_divided;
+use crate::steps::{sheared_column, sheared_name, unsheared};
 
 /// How ellipticities become shears.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -242,28 +243,29 @@ pub fn counted_value(name: &str) -> Option<bool> {
 
 /// Whether the name of a column suggests that it is a weight of shapes.
 pub fn looks_like_weight(name: &str) -> bool {
-    // Elements of vectors have brackets: `ivar[0]`.
-    let name = format!("_{}_", name.to_ascii_lowercase()).replace(['.', '-', ' ', '[', ']'], "_");
     let Patterns {
         weight, no_weight, ..
     } = &recognition().patterns;
-    fits_any(weight, &name) && !fits_any(no_weight, &name)
+    has_any(weight, name) && !has_any(no_weight, name)
 }
 
 fn is_like_a_calibration(name: &str) -> bool {
-    fits_any(&recognition().patterns.calibration, name)
+    has_any(&recognition().patterns.calibration, name) && !is_like_a_response(name)
 }
 
 fn is_like_a_response(name: &str) -> bool {
     let known = &recognition().patterns;
     known.response_in_capitals.iter().any(|own| own == name)
-        || fits_any(&known.response, name) && !fits_any(&known.no_response, name)
+        || has_any(&known.response, name) && !has_any(&known.no_response, name)
+}
+
+fn is_like_a_flag(name: &str) -> bool {
+    has_any(&recognition().patterns.flag, name)
 }
 
 // Whether the name of a column suggests that it states which rows are good.
 fn is_like_a_choice(name: &str) -> bool {
-    let Patterns { flag, choice, .. } = &recognition().patterns;
-    fits_any(flag, name) || fits_any(choice, name)
+    is_like_a_flag(name) || has_any(&recognition().patterns.choice, name)
 }
 
 // Whether the name of a column suggests a role that changes the result.
@@ -273,22 +275,24 @@ fn is_like_a_role(name: &str) -> bool {
         || is_like_a_calibration(name)
         || is_like_a_response(name)
         || is_like_a_choice(name)
+        || has_any(&recognition().patterns.error, name)
+        || sheared_name(name).is_some()
 }
 
 fn same_name<'a>(found: &'a [String], name: &str) -> Option<&'a String> {
     found.iter().find(|own| own.eq_ignore_ascii_case(name))
 }
 
-/// The column of a sheared catalogue, in any case: `foo_g1_1p` belongs to `foo_g1` and to `foo_g1_noshear`.
-pub fn sheared_column<'f>(found: &'f [String], name: &str, catalogue: usize) -> Option<&'f String> {
-    let sheared = SHEARED_CATALOGUES[catalogue - 1].0;
-    let name = name.to_ascii_lowercase();
-    same_name(found, &format!("{}_{sheared}", base(&name)))
-}
-
 /// The name of a column without the name of the unsheared catalogue.
 pub fn base(name: &str) -> &str {
     name.strip_suffix("_noshear").unwrap_or(name)
+}
+
+// The column of the other component: `sens_2` of `sens_1`, `R22` of `R11`.
+fn other_component<'f>(found: &'f [String], name: &str) -> Option<&'f String> {
+    let other = name.replace('1', "2");
+    let own = found.iter().find(|own| **own == other);
+    own.filter(|_| name.contains('1'))
 }
 
 /// Columns that were given for roles, or `none`, and surveys that were described.
@@ -328,6 +332,11 @@ impl Names {
             Some(_) => Err(NameError::Twice(role.to_owned())),
             None => Ok(()),
         }
+    }
+
+    /// Adds the column that names the sheared catalogue of each row.
+    pub fn add_step(&mut self, column: String) {
+        self.given.insert((Role::ShearedCatalogue, 0), column);
     }
 
     /// Adds surveys, which are preferred to the known ones.
@@ -457,8 +466,10 @@ pub struct Columns {
     pub distortion: bool,
     /// Columns that look like a weight, if none has this role and it was not declined.
     pub doubtful_weights: Vec<String>,
-    /// Columns that look like a weight, flag, response, derivative or sheared catalogue and have no role.
+    /// Columns that look like a weight, flag, response, calibration, error or sheared catalogue and have no role.
     unused: Vec<String>,
+    // Columns without a role whose names say nothing.
+    unknown: Vec<String>,
     /// All columns of flags; the first has the role.
     pub flags: Vec<String>,
     pub choices: Vec<String>,
@@ -494,7 +505,11 @@ impl Columns {
                 (Some(given), _) if found.contains(given) => Some(given),
                 (Some(given), _) => return Err(FileError::no_column(path, given, found)),
                 (None, Some(known)) => free(known),
-                (None, None) => recognised(key).iter().find_map(|name| free(name)),
+                (None, None) => {
+                    let names = recognised(key);
+                    let known = names.iter().find_map(|name| free(name));
+                    known.or_else(|| unsheared_column(found, key, &names, &free))
+                }
             };
             columns.extend(column.map(|column| (key, column.clone())));
         }
@@ -527,8 +542,9 @@ impl Columns {
             return Err(FileError::new(
                 path,
                 format!(
-                    "there are no columns of ellipticities (found {}, expected e1 and e2). Try: --columns e1=NAME,e2=NAME",
-                    names_of(found)
+                    "there are no columns of ellipticities (found {}, expected e1 and e2). Try: --columns {}",
+                    names_of(found),
+                    likely_ellipticities(found)
                 ),
             ));
         };
@@ -558,6 +574,7 @@ impl Columns {
             distortion,
             doubtful_weights: Vec::new(),
             unused: Vec::new(),
+            unknown: Vec::new(),
             flags,
             choices: Vec::new(),
             steps: Vec::new(),
@@ -595,6 +612,8 @@ impl Columns {
             self.doubtful_weights = all(&looks_like_weight);
         }
         self.unused = all(&is_like_a_role);
+        let known = &recognition().patterns.harmless;
+        self.unknown = all(&|name| !is_like_a_role(name) && !has_any(known, name));
         self.choices = choices;
     }
 
@@ -620,20 +639,34 @@ impl Columns {
         named.collect()
     }
 
-    /// Columns that look like one of a role but have none, unless they are `read` for another reason.
-    pub fn unused(&self, read: &[String]) -> Option<String> {
-        let unused = self.unused.iter().filter(|name| !read.contains(name));
-        let unused: Vec<&String> = unused.collect();
-        let calibration = match unused.iter().find(|name| is_like_a_calibration(name)) {
-            Some(name) => format!(" m and c are those before a calibration by `{name}`."),
-            None => String::new(),
+    /// Columns that look like one of a role but have none, and columns of which nothing is known, unless they are `read` for
+    /// another reason.
+    pub fn unused(&self, read: &[String]) -> Vec<String> {
+        let unread = |all: &[String]| -> Vec<String> {
+            let unread = all.iter().filter(|name| !read.contains(name));
+            unread.cloned().collect()
         };
-        (!unused.is_empty()).then(|| {
-            format!(
-                "Not used: {}. Try: --columns ROLE=NAME if the result needs one.{calibration}",
-                names_of(&unused)
-            )
-        })
+        let (unused, unknown) = (unread(&self.unused), unread(&self.unknown));
+        let mut lines = Vec::new();
+        if !unused.is_empty() {
+            let calibration = match unused.iter().find(|name| is_like_a_calibration(name)) {
+                Some(name) => format!(" m and c are those before a calibration by `{name}`."),
+                None => String::new(),
+            };
+            lines.push(format!(
+                "Not used: {}. Try: {} if the result needs {}.{calibration}",
+                counted_names(&unused),
+                suggested(&unused),
+                if unused.len() == 1 { "it" } else { "them" }
+            ));
+        }
+        if !unknown.is_empty() {
+            lines.push(format!(
+                "Not used, and not known: {}.",
+                counted_names(&unknown)
+            ));
+        }
+        lines
     }
 
     /// Forgets the column of identifiers.
@@ -643,11 +676,12 @@ impl Columns {
 
     /// What excludes rows by a column that looks like a flag or a choice and is not used.
     pub fn remedy_of_choice(&self) -> Option<String> {
-        let name = self.unused.iter().find(|name| is_like_a_choice(name))?;
-        Some(match fits_any(&recognition().patterns.flag, name) {
-            true => format!("--columns flag={name} if it is 0 in good rows"),
-            false => format!("--where {name} if it is true in good rows"),
-        })
+        let first = |like: fn(&str) -> bool| self.unused.iter().find(|name| like(name));
+        match first(is_like_a_flag) {
+            Some(name) => Some(format!("--columns flag={name} if it is 0 in good rows")),
+            None => first(is_like_a_choice)
+                .map(|name| format!("--where {name} if it is true in good rows")),
+        }
     }
 
     /// Of a catalogue of shearq with sheared catalogues, takes these if a selection requires them, and otherwise the columns
@@ -714,20 +748,102 @@ impl Columns {
     }
 }
 
+// The column without artificial shear if its name says so in another spelling: `noshear_e1`, `00/g1`, `unsheared/R11`.
+fn unsheared_column<'f>(
+    found: &'f [String],
+    (role, catalogue): Key,
+    names: &[String],
+    free: &impl Fn(&str) -> Option<&'f String>,
+) -> Option<&'f String> {
+    use Role::{E1, E2, R11, R12, R21, R22, Weight};
+    if ![E1, E2, R11, R12, R21, R22, Weight].contains(&role) || catalogue > 0 {
+        return None;
+    }
+    let is_plain = |own: &String| words(own).trim_matches('_') == unsheared(own);
+    // `g1` alone is the true shear.
+    let more = match role {
+        E1 => "g1",
+        E2 => "g2",
+        _ => "",
+    };
+    let known = |rest: String| {
+        let mut names = names.iter().map(String::as_str).chain([more]);
+        let is_word = |name: &str| words(name).trim_matches('_') == rest;
+        names.any(|name| is_word(name) || in_vector(name).is_some_and(|name| is_word(&name)))
+    };
+    let mut all = found
+        .iter()
+        .filter(|own| !is_plain(own) && known(unsheared(own)));
+    all.find_map(|own| free(own))
+}
+
 // Adds sheared catalogues by the names of e1 and e2.
 fn find_sheared(columns: &mut BTreeMap<Key, String>, found: &[String], names: &Names) {
     for role in [Role::E1, Role::E2] {
         let Some(name) = columns.get(&(role, 0)).cloned() else {
             continue;
         };
-        let sheared = (1..CATALOGUES).map(|catalogue| sheared_column(found, &name, catalogue));
-        let sheared: Option<Vec<_>> = sheared.collect();
-        for (catalogue, column) in (1..).zip(sheared.into_iter().flatten()) {
-            if !names.given.contains_key(&(role, catalogue)) {
-                let own = columns.entry((role, catalogue));
-                own.or_insert_with(|| column.clone());
+        for pair in [[1, 2], [3, 4]] {
+            let both = pair.map(|catalogue| sheared_column(found, &name, catalogue));
+            let [Some(plus), Some(minus)] = both else {
+                continue;
+            };
+            for (catalogue, column) in pair.into_iter().zip([plus, minus]) {
+                if !names.given.contains_key(&(role, catalogue)) {
+                    let own = columns.entry((role, catalogue));
+                    own.or_insert_with(|| column.clone());
+                }
             }
         }
+    }
+}
+
+// Two columns that may be e1 and e2: a pair of components with a name of shapes.
+fn likely_ellipticities(found: &[String]) -> String {
+    let pair = |name: &&String| {
+        let like = has_any(&recognition().patterns.shape, name);
+        like && other_component(found, name).is_some() && !is_like_a_role(name)
+    };
+    match found.iter().find(pair) {
+        Some(name) => format!("e1={name},e2={}", name.replace('1', "2")),
+        None => "e1=NAME,e2=NAME".to_owned(),
+    }
+}
+
+// Names as a message lists them, with the number of those that it leaves out.
+fn counted_names(names: &[String]) -> String {
+    const SHOWN: usize = 40;
+    let more = match names.len().saturating_sub(SHOWN) {
+        0 => String::new(),
+        more => format!(", and {more} more"),
+    };
+    names[..names.len().min(SHOWN)].join(", ") + &more
+}
+
+// What uses columns by their names, an option of each kind.
+fn suggested(unused: &[String]) -> String {
+    let first = |like: &dyn Fn(&str) -> bool| unused.iter().find(|name| like(name));
+    let mut roles = Vec::new();
+    if let Some(name) = first(&looks_like_weight) {
+        roles.push(format!("w={name}"));
+    }
+    let is_first = |name: &str| {
+        is_like_a_response(name)
+            && sheared_name(name).is_none()
+            && !name.contains('[')
+            && (!name.contains('2') || name.contains('1'))
+    };
+    if let Some(name) = first(&is_first) {
+        let other = other_component(unused, name).unwrap_or(name);
+        roles.push(format!("R11={name},R22={other}"));
+    }
+    if let Some(name) = first(&is_like_a_flag) {
+        roles.push(format!("flag={name}"));
+    }
+    match (first(&is_like_a_choice), roles.is_empty()) {
+        (Some(name), true) => format!("--where {name}"),
+        (None, true) => "--columns ROLE=NAME".to_owned(),
+        _ => format!("--columns {}", roles.join(",")),
     }
 }
 
@@ -885,6 +1001,29 @@ mod tests {
     }
 
     #[test]
+    fn unsheared_columns_are_found_in_any_spelling() {
+        for (columns, e1, response) in [
+            ("00/g1 00/g2", "00/g1", None),
+            (
+                "unsheared/e_1 unsheared/e_2 unsheared/R11 unsheared/R22",
+                "unsheared/e_1",
+                Some("unsheared/R11"),
+            ),
+            (
+                "mcal_g_noshear[0] mcal_g_noshear[1]",
+                "mcal_g_noshear[0]",
+                None,
+            ),
+        ] {
+            let own = found(columns, &[]).unwrap();
+            assert_eq!((own.of(Role::E1), own.of(Role::R11)), (Some(e1), response));
+        }
+        // The own component alone, in another spelling.
+        let own = found("e1 e2 1p_e1 1m_e1 2p_e2 2m_e2", &[]).unwrap();
+        assert_eq!(own.preset, Preset::Metacal);
+    }
+
+    #[test]
     fn a_column_has_one_role() {
         let own = found("g1 g2", &["e1=g1", "e2=g2"]).unwrap();
         assert_eq!((own.of(Role::E1), own.of(Role::G1)), (Some("g1"), None));
@@ -905,7 +1044,12 @@ mod tests {
     #[test]
     fn columns_that_are_absent_are_named() {
         for (columns, given, expected) in [
-            ("a b", vec![], "expected e1 and e2). Try: --columns"),
+            ("a b", vec![], "expected e1 and e2). Try: --columns e1=NAME"),
+            (
+                "ra w chi_1 chi_2",
+                vec![],
+                "Try: --columns e1=chi_1,e2=chi_2",
+            ),
             ("e1 e2 R11", vec![], "none for R22"),
             ("e1 e2", vec!["w=weight"], "there is no column `weight`"),
             ("e1 e2", vec!["q=weight"], "unknown role (found `q`"),
@@ -950,58 +1094,50 @@ mod tests {
     #[test]
     fn columns_that_look_like_a_role_are_named() {
         let columns = found("e1 e2 my_weight BadFlag T_1p T R12 mag", &["R11=none"]).unwrap();
-        let unused = columns.unused(&[]).unwrap();
+        let unused = columns.unused(&[]).join(" ");
         assert!(unused.contains("my_weight, BadFlag, T_1p, R12"), "{unused}");
         let read = ["T_1p".to_owned()];
-        assert!(!columns.unused(&read).unwrap().contains("T_1p"));
+        assert!(!columns.unused(&read).join(" ").contains("T_1p"));
         assert_eq!(columns.doubtful_weights, ["my_weight"]);
         let several = found("e1 e2 wht ivar", &[]).unwrap();
         assert_eq!(several.doubtful_weights, ["wht", "ivar"]);
         let declined = found("e1 e2 my_weight", &["w=none"]).unwrap();
         assert!(declined.doubtful_weights.is_empty());
         let others =
-            "e1 e2 w mag T r z respond_id correspondence ra flux1 size sersic_r1 snr chi2 mode";
-        let unused = found(others, &[]).unwrap().unused(&[]);
-        assert!(
-            unused
-                .clone()
-                .is_none_or(|own| own.starts_with("Not used: respond_id.")),
-            "{unused:?}"
-        );
-        for name in [
-            "Resp11",
-            "resp1",
-            "R1",
-            "Rg1",
-            "e1_resp",
-            "de1dg1",
-            "R",
-            "vis_det",
-            "FIT_CLASS",
-            "good",
-            "is_star",
-            "shape_select",
-            "m",
-            "m1",
-            "c1",
-            "m11",
-            "e1_corrected",
-            "w_1p",
-            "BadFlag",
-            "b_mode_mask",
-        ] {
+            "e1 e2 w mag T r z correspond_id ra flux1 size sersic_r1 snr chi2 psf_flux tile x";
+        assert_eq!(found(others, &[]).unwrap().unused(&[]), [""; 0]);
+        let unknown = found("e1 e2 w mag peso", &[]).unwrap().unused(&[]);
+        assert_eq!(unknown, ["Not used, and not known: peso."]);
+        for name in (recognised_in_part()).split_whitespace() {
             let columns = found(&format!("e1 e2 w {name}"), &[]).unwrap();
-            let unused = columns.unused(&[]).unwrap_or_default();
+            let unused = columns.unused(&[]).join(" ");
             assert!(
-                unused.contains(&format!("Not used: {name}.")),
+                unused.contains(&format!("Not used: {name}. Try: ")),
                 "{name}: {unused}"
             );
+        }
+        for (names, expected) in [
+            ("R_gamma1 R_gamma2", "R11=R_gamma1,R22=R_gamma2 if"),
+            ("sensitivity", "R11=sensitivity,R22=sensitivity if"),
+            ("lensWeight my_flag", "w=lensWeight,flag=my_flag if"),
+            ("quality", "Try: --where quality if"),
+            ("m_corr", "Try: --columns ROLE=NAME if"),
+        ] {
+            let unused = found(&format!("e1 e2 {names}"), &[]).unwrap().unused(&[]);
+            assert!(unused[0].contains(expected), "{unused:?}");
         }
         let flagged = found("e1 e2 w BadFlag", &[]).unwrap().remedy_of_choice();
         assert_eq!(
             flagged.unwrap(),
             "--columns flag=BadFlag if it is 0 in good rows"
         );
+    }
+
+    // Names that state a role in part.
+    fn recognised_in_part() -> &'static str {
+        "Resp11 resp1 R1 Rg1 e1_resp de1dg1 R vis_det FIT_CLASS good is_star shape_select m m1 c1 m11 e1_corrected w_1p BadFlag \
+            b_mode_mask R_gamma sensitivity Psh11 P_gamma metacal_R R11_all Rs metacal_m1 mcorr one_plus_m quality class star reject \
+            valid detected e_err SHEAR_POLARISABILITY_1 nbc_m multiplicative e1_err sigma_e1 outlier CLASS_STAR"
     }
 
     #[test]

@@ -6,6 +6,7 @@ use std::collections::{HashMap, HashSet};
 
 use shearq_bias::{Dominant, Repeated, Row};
 use shearq_quantities::MeasuredRange;
+use shearq_quantities::hash::NumberMap;
 
 use crate::identity::hash;
 
@@ -81,7 +82,9 @@ const SEARCHED_ROWS: usize = 4096;
 // Many rows share numbers that were rounded to few digits, but a distribution is flat around its maximum, so that the ten most
 // frequent numbers are about equally frequent. A number ten times as frequent as the tenth marks a failure or a default.
 const REFERENCE_RANK: usize = 10;
-const OUTSTANDING_RATIO: u64 = 10;
+const OUTSTANDING_RATIO: f64 = 10.0;
+// With two digits, 10⁴ galaxies share a pair of ellipticities in one of ten rows at most.
+const MIN_SHARED: f64 = 1e-3;
 // Copies of a galaxy are fewer. Chosen by hand.
 const MIN_SHARED_ROWS: u64 = 16;
 // A column of fewer different numbers is one of classes, whose frequencies differ. Chosen by hand.
@@ -103,8 +106,16 @@ struct Repeat {
     kind: RepeatKind,
     columns: [usize; 2],
     names: [String; 2],
-    counts: HashMap<[u64; 2], u64>,
+    counts: NumberMap<[u64; 2], Counted>,
     different: usize,
+}
+
+// How many rows have a number since it was first noticed, and the rows before that. Of a number that occurs in the last of ten
+// tiles alone, the share is the one in the rows since then.
+#[derive(Debug, Clone, Copy, Default)]
+struct Counted {
+    rows: u64,
+    before: u64,
 }
 
 /// Counts of repeated numbers: zeros and other plain numbers often stand for failures that no flag states.
@@ -116,7 +127,7 @@ pub struct Repeats {
 
 impl Repeat {
     fn new(kind: RepeatKind, columns: [usize; 2], names: [String; 2]) -> Self {
-        let zeros = (kind == RepeatKind::Zeros).then_some(([0, 0], 0));
+        let zeros = (kind == RepeatKind::Zeros).then_some(([0, 0], Counted::default()));
         Repeat {
             kind,
             columns,
@@ -132,7 +143,8 @@ impl Repeat {
             .map(|column| (part[column][at] + 0.0).to_bits())
     }
 
-    fn look_for(&mut self, part: &Part<'_>) {
+    // `before` rows were added already.
+    fn look_for(&mut self, part: &Part<'_>, before: u64) {
         let (searched, or_zero) = match self.kind {
             RepeatKind::Zeros => return,
             RepeatKind::Ellipticities => (SEARCHED_ROWS, true),
@@ -146,7 +158,9 @@ impl Repeat {
             let counts = values.iter().all(|value| value.is_finite());
             let key = self.key(part, at);
             if counts && (or_zero || values[0] != 0.0) && !seen.insert(key) {
-                self.counts.entry(key).or_default();
+                self.counts
+                    .entry(key)
+                    .or_insert(Counted { rows: 0, before });
             }
         }
         self.different = self.different.max(seen.len());
@@ -154,21 +168,23 @@ impl Repeat {
 
     // The most frequent numbers of the `used` rows, if coincidence does not explain their frequency.
     fn found(&self, used: u64) -> Option<([f64; 2], u64)> {
-        let mut counts: Vec<(u64, [u64; 2])> = self.counts.iter().map(|(v, n)| (*n, *v)).collect();
-        counts.sort_unstable_by(|a, b| b.cmp(a));
-        let (most, values) = *counts.first()?;
+        let share = |own: &Counted| own.rows as f64 / (used - own.before).max(1) as f64;
+        let mut counts: Vec<(&[u64; 2], &Counted)> = self.counts.iter().collect();
+        counts.sort_unstable_by(|a, b| share(b.1).total_cmp(&share(a.1)).then(a.0.cmp(b.0)));
+        let (values, most) = *counts.first()?;
         let worth = match self.kind {
-            RepeatKind::Ellipticities => most >= 3.max(used.div_ceil(1000)),
-            RepeatKind::Zeros => most >= 3 && most < used,
+            RepeatKind::Ellipticities => most.rows >= 3 && share(most) >= MIN_SHARED,
+            RepeatKind::Zeros => most.rows >= 3 && most.rows < used,
             RepeatKind::Number { or_zero } => {
-                let tenth = counts
-                    .get(REFERENCE_RANK - 1)
-                    .map_or(1, |(count, _)| *count);
-                let stands_out = most > OUTSTANDING_RATIO * tenth.max(1) && most < used;
+                let since = (used - most.before).max(1) as f64;
+                let tenth = counts.get(REFERENCE_RANK - 1);
+                let tenth = tenth.map_or(0.0, |(_, count)| share(count));
+                let ratio = share(most) / tenth.max(1.0 / since);
+                let stands_out = ratio > OUTSTANDING_RATIO && most.rows < used;
                 stands_out && (self.different > MAX_CLASSES || !or_zero)
             }
         };
-        worth.then(|| (values.map(f64::from_bits), most))
+        worth.then(|| (values.map(f64::from_bits), most.rows))
     }
 }
 
@@ -180,7 +196,9 @@ impl Repeats {
 
     /// Searches a part for numbers that are then counted in all rows.
     pub fn look_for(&mut self, part: &Part<'_>) {
-        self.all.iter_mut().for_each(|repeat| repeat.look_for(part));
+        let before = self.used;
+        let all = self.all.iter_mut();
+        all.for_each(|repeat| repeat.look_for(part, before));
     }
 
     /// Adds a row that counts, and returns whether its ellipticity is one that many rows share.
@@ -193,10 +211,14 @@ impl Repeats {
             .filter(|repeat| !repeat.counts.is_empty())
         {
             let key = repeat.key(part, at);
+            if repeat.kind == RepeatKind::Zeros && key != [0; 2] {
+                continue;
+            }
             if let Some(count) = repeat.counts.get_mut(&key) {
-                *count += 1;
+                count.rows += 1;
                 // Of a few rows, these are copies rather than a failure.
-                let many = *count > MIN_SHARED_ROWS && *count * 1000 > self.used;
+                let since = (self.used - count.before) as f64;
+                let many = count.rows > MIN_SHARED_ROWS && count.rows as f64 > MIN_SHARED * since;
                 shared |= many && repeat.kind == RepeatKind::Ellipticities;
             }
         }
@@ -232,11 +254,11 @@ const MAX_COUNTED_KEYS: usize = 1 << 16;
 #[derive(Debug, Default)]
 pub struct Multiplicity {
     rows: u64,
-    frequent: HashMap<u64, u64>,
+    frequent: NumberMap<u64, u64>,
     frequent_rows: u64,
     // Keys are counted that end with so many zeros.
     zeros: u32,
-    counts: HashMap<u64, u64>,
+    counts: NumberMap<u64, u64>,
 }
 
 impl Multiplicity {
@@ -339,9 +361,11 @@ impl Copies {
 }
 
 /// How many rows of one catalogue by shearq, which rounds nothing, have the ellipticity of an earlier row; 0 of few.
-pub fn repeated_ellipticities(rows: impl Iterator<Item = [f64; 2]>) -> u64 {
+pub fn repeated_ellipticities(rows: impl Iterator<Item = [f64; 2]> + Clone) -> u64 {
     let mut found = Multiplicity::default();
-    rows.for_each(|e| found.add(hash(hash(e[0].to_bits()) ^ e[1].to_bits())));
+    let key = |e: [f64; 2]| hash(hash(e[0].to_bits()) ^ e[1].to_bits());
+    found.look_for(rows.clone().take(SEARCHED_ROWS).map(key));
+    rows.for_each(|e| found.add(key(e)));
     let repeated = found.repeated();
     match repeated as f64 > found.rows as f64 * MIN_REPEATED_ROWS {
         true => repeated,
@@ -397,8 +421,11 @@ impl TrueShears {
             let correlation = (ge - g * e) / (scatter * (ee - e * e).max(0.0).sqrt());
             (scatter, correlation)
         };
-        let [first, second] = self.sums.map(of_component);
-        let (scatter, correlation) = if first.0 > second.0 { first } else { second };
+        let both = self.sums.map(of_component);
+        let scatter = both[0].0.max(both[1].0);
+        let related = |(scatter, correlation): &&(f64, f64)| {
+            *scatter > MIN_SCATTER && correlation * correlation > MAX_CORRELATION
+        };
         let large = self.large / self.rows;
         Some(match () {
             () if scatter > MAX_SCATTER => {
@@ -410,10 +437,12 @@ impl TrueShears {
                 "found a modulus above {MAX_SHEAR} in {:.1} % of the rows, expected true shears below it",
                 100.0 * large
             ),
-            () if scatter > MIN_SCATTER && correlation * correlation > MAX_CORRELATION => format!(
-                "found a correlation of {correlation:.3} with the ellipticity, expected true shears, on which shapes do not depend"
-            ),
-            () => return None,
+            () => {
+                let (_, correlation) = both.iter().find(related)?;
+                format!(
+                    "found a correlation of {correlation:.3} with the ellipticity, expected true shears, on which shapes do not depend"
+                )
+            }
         })
     }
 }

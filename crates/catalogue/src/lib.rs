@@ -1,6 +1,7 @@
 //! Tables of any program as shapes with roles.
 //!
-//! * [`columns`] finds which column has which role, by what the user states or by [`recognition`] of names.
+//! * [`columns`] finds which column has which role, by what the user states or by [`recognition`] of names; [`steps`] are names of
+//!   sheared catalogues.
 //! * [`request`] is what to read of which catalogues; [`source`] the tables of a catalogue with the columns that are read,
 //!   and [`rows`] gives their rows. [`failures`] are numbers and rows that stand for failed measurements.
 //! * [`truth`] is the true shear of catalogues or galaxies, and [`identity`] what names a galaxy.
@@ -21,6 +22,7 @@ pub mod select;
 pub mod shapes;
 pub mod source;
 pub mod star_noise;
+pub mod steps;
 pub mod truth;
 
 /// The examples of README.md.

@@ -8,16 +8,19 @@ use serde::Deserialize;
 use shearq_files::{FileError, open};
 use shearq_submissions::EllipticityType;
 
-use crate::columns::{Key, named, role_names};
+use crate::columns::{CATALOGUES, Key, named, role_names};
 use crate::expression::fits;
 
 /// The content of `catalogues.toml`.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Recognition {
+    /// Words that name a sheared catalogue, noshear first.
+    pub steps: [Vec<String>; CATALOGUES],
     /// Names of columns by role, the preferred one first.
     pub names: BTreeMap<String, Vec<String>>,
     pub ellipticity: Types,
+    pub psf_size: Sizes,
     /// Columns of cuts, and whether rows of value 1 count.
     pub cuts: BTreeMap<String, bool>,
     pub patterns: Patterns,
@@ -32,7 +35,14 @@ pub struct Types {
     pub distortion: Vec<String>,
 }
 
-/// Patterns of names in small letters.
+/// Names of sizes of the PSF that are squares of one.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Sizes {
+    pub squared: Vec<String>,
+}
+
+/// Patterns of names: of their [`words`], and the last four of whole names in small letters.
 #[derive(Debug, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Patterns {
@@ -40,10 +50,13 @@ pub struct Patterns {
     pub no_weight: Vec<String>,
     pub calibration: Vec<String>,
     pub response: Vec<String>,
-    pub response_in_capitals: Vec<String>,
     pub no_response: Vec<String>,
+    pub error: Vec<String>,
     pub flag: Vec<String>,
     pub choice: Vec<String>,
+    pub shape: Vec<String>,
+    pub harmless: Vec<String>,
+    pub response_in_capitals: Vec<String>,
     pub step: Vec<String>,
     pub unit: Vec<String>,
     pub fixed: Vec<String>,
@@ -120,6 +133,32 @@ pub fn read_presets(path: &Path) -> Result<Vec<Survey>, FileError> {
     let presets: Presets = toml::from_str(&text)
         .map_err(|error| FileError::new(path, error.to_string().trim_end()))?;
     Ok(presets.survey)
+}
+
+/// The words of a name in small letters, between underscores: `_lens_weight_` of `lensWeight`, `_g_0_` of `g[0]`.
+pub fn words(name: &str) -> String {
+    let (mut words, mut before) = (String::from("_"), '_');
+    for c in name.chars() {
+        if before.is_lowercase() && c.is_uppercase() {
+            words.push('_');
+        }
+        match c.is_alphanumeric() {
+            true => words.extend(c.to_lowercase()),
+            false if words.ends_with('_') => {}
+            false => words.push('_'),
+        }
+        before = c;
+    }
+    match words.ends_with('_') {
+        true => words,
+        false => words + "_",
+    }
+}
+
+/// Whether the words of a name have one of these patterns.
+pub fn has_any(patterns: &[String], name: &str) -> bool {
+    let words = words(name);
+    patterns.iter().any(|pattern| fits(pattern, &words))
 }
 
 /// Whether a name, in any case, has one of these patterns.

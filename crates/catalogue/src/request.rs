@@ -55,17 +55,24 @@ pub enum Units {
     Column(String),
 }
 
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub struct Input {
     /// The file, or the name of the table.
     pub name: PathBuf,
     /// The table, if it is in memory.
     pub frame: Option<DataFrame>,
+    /// Names of the columns that the table in memory lacks because they are not read.
+    pub unread: Vec<String>,
+    /// The files of a catalogue in several, with the sheared catalogue (0 for noshear) that a file contains.
+    pub parts: Vec<(PathBuf, Option<usize>)>,
 }
 
 impl From<PathBuf> for Input {
     fn from(name: PathBuf) -> Self {
-        Input { name, frame: None }
+        Input {
+            name,
+            ..Input::default()
+        }
     }
 }
 

@@ -7,6 +7,7 @@ use std::path::Path;
 
 use shearq_bias::{Catalogue, Row};
 use shearq_files::frames::polars::{DataFrame, DataType};
+use shearq_files::frames::reals;
 use shearq_files::table::{self, FileFormat};
 use shearq_files::{FileError, names_of};
 use shearq_quantities::{Distortion, MeasuredRange};
@@ -19,10 +20,11 @@ use crate::foreign::shown;
 use crate::shapes::MeasuredShapes;
 use crate::star_noise;
 
-use crate::columns::{CATALOGUES, Columns, RESPONSES, Role, Shapes, counted_value, sheared_pair};
+use crate::columns::{CATALOGUES, RESPONSES, Role, Shapes, counted_value, sheared_pair};
 use crate::identity;
 use crate::request::{Input, MAX_AXES};
-use crate::source::{Reading, Source, catalogue_named};
+use crate::source::{Reading, Source};
+use crate::steps::catalogue_named;
 use crate::truth::{OfRows, check};
 
 /// A row that counts, in the catalogue without artificial shear or in a sheared one.
@@ -170,6 +172,7 @@ pub fn rows(
     }
     if let Some(first) = sources.first() {
         check_share(path, first, reading, &summary)?;
+        found.refuse_sheared_rows(path, first)?;
         found.refuse_unused_cuts(path, first)?;
         found.refuse_measured_shears(path, first, reading)?;
         summary.repeated = found.repeats.found();
@@ -249,7 +252,6 @@ impl<'a> TableRows<'a> {
                 _ => operand_values(frame, wanted, path)?,
             });
         }
-        refuse_sheared_rows(frame, &source.columns, path)?;
         refuse_boolean_flags(frame, source, reading)?;
         let keys = |name: &str| identity::keys(frame, name, path);
         let sheared_of_rows = source.columns.of(Role::ShearedCatalogue);
@@ -367,19 +369,24 @@ impl<'a> TableRows<'a> {
             size <= 0.0 || range.excludes(size)
         });
         // Bins of −99 or 1e20 would be bins of failures. Other large numbers are fluxes of bright galaxies.
-        let binned = source.places.all((Role::Binned, 0)).iter().copied();
-        let binned = binned.filter(|place| source.wanted[*place].pattern.is_none());
-        for column in binned.collect::<Vec<_>>() {
+        for column in self.binned_columns() {
             let expected = "a number that can be binned";
             add(&[column], expected, range(&[column]), |value, range| {
                 value < 0.0 && range.excludes(value) || value.abs() >= MIN_FAILED_NUMBER
             });
         }
         let weight = source.places.all((Role::Weight, 0));
-        add(weight, "a weight", shear, |weight, _| {
-            weight >= MIN_FAILED_WEIGHT
+        add(weight, "a weight", range(weight), |weight, range| {
+            weight >= MIN_FAILED_WEIGHT || range.excludes_mark(weight)
         });
         checks
+    }
+
+    // Columns of numbers that are binned.
+    fn binned_columns(&self) -> Vec<usize> {
+        let places = self.source.places.all((Role::Binned, 0)).iter().copied();
+        let numbers = places.filter(|place| self.source.wanted[*place].pattern.is_none());
+        numbers.collect()
     }
 
     // What is looked for in the columns.
@@ -410,6 +417,7 @@ impl<'a> TableRows<'a> {
         let no_rms = source.shapes == Shapes::Responsivity && self.of(Role::RmsE).is_none();
         let sigma = self.of(Role::SigmaE).filter(|_| no_rms);
         numbers(sigma.as_slice(), true);
+        numbers(&self.binned_columns(), true);
         let derivatives = self.roles(WEIGHT_DERIVATIVE_ROLES);
         numbers(derivatives.as_slice().as_flattened(), false);
         all
@@ -425,6 +433,11 @@ impl<'a> TableRows<'a> {
 
     fn failure<'c>(&self, at: usize, checks: &'c [Check]) -> Option<(usize, &'c Check)> {
         let shape = self.shape_columns(at);
+        if shape == self.e {
+            let mut checks = checks.iter();
+            let found = checks.find(|own| (own.fails)(self.value(own.column, at), own.range))?;
+            return Some((found.column, found));
+        }
         let column_of = |check: &Check| match self.e.iter().position(|e| *e == check.column) {
             Some(k) => shape[k],
             None => check.column,
@@ -443,11 +456,11 @@ impl<'a> TableRows<'a> {
     // A sheared catalogue may choose a row that is left out without shear: these rows are the response of the selection.
     fn select(&self, at: usize) -> Selected {
         let places = &self.source.places;
-        let weights: [f64; CATALOGUES] = std::array::from_fn(|sheared| {
+        let weight = |sheared: usize| {
             let column = places.of((Role::Weight, sheared));
             let column = column.or_else(|| self.of(Role::Weight));
             column.map_or(1.0, |weight| self.value(weight, at))
-        });
+        };
         let flagged = |sheared: usize| {
             let mut flags = places.all((Role::Flag, sheared)).iter();
             flags.any(|flag| self.value(*flag, at) != 0.0)
@@ -455,17 +468,29 @@ impl<'a> TableRows<'a> {
         // Smooth steps of `--where` are zero far below their threshold. Such a row would add zeros to all sums.
         let stepped = self.weighted.as_ref().map(|selection| selection.weight[at]);
         let is_outside = stepped.is_some_and(|weight| weight <= 0.0);
-        let binned = std::array::from_fn(|sheared| {
+        let binned = |sheared: usize, weight: f64| {
             if flagged(sheared) {
                 Err(Exclusion::Flagged)
-            } else if !has_weight(weights[sheared]) {
+            } else if !has_weight(weight) {
                 Err(Exclusion::Unweighted)
             } else {
                 let binned = self.binned(at, sheared).filter(|_| !is_outside);
                 binned.ok_or(Exclusion::Unselected)
             }
-        });
-        Selected { binned, weights }
+        };
+        // Without columns of their own, all sheared catalogues select the same rows.
+        if !self.source.selects {
+            let weight = weight(0);
+            return Selected {
+                binned: [binned(0, weight); CATALOGUES],
+                weights: [weight; CATALOGUES],
+            };
+        }
+        let weights: [f64; CATALOGUES] = std::array::from_fn(weight);
+        Selected {
+            binned: std::array::from_fn(|sheared| binned(sheared, weights[sheared])),
+            weights,
+        }
     }
 
     // The binned quantities in a sheared catalogue (0 for noshear) if `--where` selects the row; NaN if a number is missing.
@@ -583,7 +608,10 @@ impl<'a> TableRows<'a> {
             psf: self
                 .roles(PSF_ROLES)
                 .map_or([0.0; 2], |psf| self.pair(psf, at)),
-            psf_size: size.map_or(1.0, |size| self.value(size, at)),
+            psf_size: size.map_or(1.0, |size| match self.source.psf_area {
+                true => self.value(size, at).sqrt(),
+                false => self.value(size, at),
+            }),
         })
     }
 
@@ -780,6 +808,8 @@ struct Found {
     content: u64,
     // Rows that count although a column of [`Role::Choice`] excludes them.
     excluded: Vec<u64>,
+    // By column of `Columns::steps`.
+    numbered: Vec<Numbered>,
     begun: bool,
 }
 
@@ -788,6 +818,11 @@ impl Found {
         if !self.begun {
             self.begun = true;
             self.repeats = part.repeats();
+        }
+        let steps = &part.source.columns.steps;
+        self.numbered.resize_with(steps.len(), Numbered::default);
+        for (numbered, name) in self.numbered.iter_mut().zip(steps) {
+            numbered.add(part.frame, name);
         }
         self.repeats.look_for(&part.columns);
         self.copies
@@ -811,8 +846,26 @@ impl Found {
         let own = part.compared.iter().map(|column| part.value(*column, at));
         let own = own.fold(0, |key, value| identity::hash(key ^ value.to_bits()));
         self.content = self.content.wrapping_add(own);
-        let id = part.ids.as_ref().map(|ids| ids[at]);
+        // Units that the user names may have many galaxies.
+        let is_unit = part.source.unit.as_deref() == part.source.columns.of(Role::Id);
+        let id = part.ids.as_ref().filter(|_| !is_unit).map(|ids| ids[at]);
         self.copies.add((!shared).then_some(own), id);
+    }
+
+    // A table whose rows belong to sheared catalogues has no mean of galaxies. Texts of these are recognised, but the order of numbers
+    // is the program's own.
+    fn refuse_sheared_rows(&self, path: &Path, source: &Source) -> Result<(), FileError> {
+        let mut steps = source.columns.steps.iter().zip(&self.numbered);
+        let is_step = |own: &Numbered| !own.others && own.seen.iter().all(|seen| *seen);
+        match steps.find(|(_, own)| is_step(own)) {
+            None => Ok(()),
+            Some((name, _)) => Err(FileError::new(
+                path,
+                format!(
+                    "column `{name}` has the numbers 0 to 4, as of sheared catalogues. Try: --columns version={name} if 0 is noshear and 1 to 4 are 1p, 1m, 2p and 2m, or version=none if it is another quantity"
+                ),
+            )),
+        }
     }
 
     // If a column for cuts that the user did not choose excludes some rows and not others, the catalogue needs a decision: its
@@ -889,18 +942,30 @@ fn is_sheared(text: Option<&str>) -> bool {
     text.and_then(catalogue_named).is_some_and(|own| own > 0)
 }
 
-// Refuses a table whose rows belong to sheared catalogues, if no column has this role: its mean would be one of all of
-// them.
-fn refuse_sheared_rows(frame: &DataFrame, columns: &Columns, path: &Path) -> Result<(), FileError> {
-    let mut steps = columns.steps.iter();
-    match steps.find(|name| texts_of(frame, name).is_some_and(|mut texts| texts.any(is_sheared))) {
-        None => Ok(()),
-        Some(name) => Err(FileError::new(
-            path,
-            format!(
-                "column `{name}` names sheared catalogues, but is not used. Try: --columns version={name}"
-            ),
-        )),
+// Numbers of sheared catalogues in the order of ngmix: 0 is noshear.
+fn numbered(value: f64) -> Option<usize> {
+    let catalogue = value as usize;
+    (catalogue < CATALOGUES && catalogue as f64 == value).then_some(catalogue)
+}
+
+// The different values of a column whose numbers may be those of sheared catalogues.
+#[derive(Default)]
+struct Numbered {
+    seen: [bool; CATALOGUES],
+    others: bool,
+}
+
+impl Numbered {
+    fn add(&mut self, frame: &DataFrame, name: &str) {
+        let mut add = |value: Option<usize>| match value {
+            Some(catalogue) => self.seen[catalogue] = true,
+            None => self.others = true,
+        };
+        if let Some(texts) = texts_of(frame, name) {
+            texts.for_each(|text| add(text.and_then(|text| numbered(text.trim().parse().ok()?))));
+        } else if let Some(values) = frame.column(name).ok().and_then(reals) {
+            values.iter().for_each(|value| add(numbered(*value)));
+        }
     }
 }
 
@@ -959,7 +1024,7 @@ fn refuse_boolean_flags(
 // The sheared catalogues that a column of text names, 0 for the one without shear.
 fn sheared_of(frame: &DataFrame, name: &str, path: &Path) -> Result<Vec<usize>, FileError> {
     let fault = |found: &str, remedy: &str| {
-        let expected = "noshear or ns, 1p, 1m, 2p or 2m";
+        let expected = "noshear or ns, 1p, 1m, 2p or 2m, or 0 to 4 in this order";
         FileError::new(
             path,
             format!(
@@ -969,11 +1034,14 @@ fn sheared_of(frame: &DataFrame, name: &str, path: &Path) -> Result<Vec<usize>, 
     };
     let none = "--columns version=none";
     let Some(texts) = texts_of(frame, name) else {
-        return Err(fault("no text", none));
+        let values = table::numbers(frame, name, path)?;
+        let known = |value: &f64| numbered(*value).ok_or_else(|| fault(&shown(*value), none));
+        return values.iter().map(known).collect();
     };
     let known = |text: Option<&str>| {
         let text = text.unwrap_or("nothing");
-        catalogue_named(text).ok_or_else(|| {
+        let number = || numbered(text.trim().parse().ok()?);
+        catalogue_named(text).or_else(number).ok_or_else(|| {
             // The mean of all sheared catalogues has a wrong m.
             let sheared = texts_of(frame, name).is_some_and(|mut texts| texts.any(is_sheared));
             let remedy = match sheared {

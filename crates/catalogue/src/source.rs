@@ -3,8 +3,9 @@
 use std::collections::{BTreeSet, HashSet};
 use std::path::Path;
 
-use shearq_bias::{Design, SHEARED_CATALOGUES};
+use shearq_bias::Design;
 use shearq_files::fits::TableHead;
+use shearq_files::frames::frame;
 use shearq_files::frames::polars::{Column, DataFrame};
 use shearq_files::table::{self, FileFormat, Place};
 use shearq_files::{FileError, names_of};
@@ -14,11 +15,10 @@ use crate::expression::{Expression, Operand, operand_values};
 use crate::recognition::{fits_any, recognition};
 use crate::shapes::{SHAPE_COLUMNS, changes_with_shear, require_responses};
 
-use crate::columns::{
-    CATALOGUES, Columns, Names, Places, Preset, Role, Shapes, base, sheared_column,
-};
+use crate::columns::{CATALOGUES, Columns, Names, Places, Preset, Role, Shapes, base};
 use crate::identity;
 use crate::request::{Input, Request, Units};
+use crate::steps::{catalogue_named, sheared_column, sheared_name};
 use crate::truth::Truth;
 
 /// How catalogues are read: a request with the true shears of its catalogues.
@@ -91,6 +91,8 @@ pub struct Source {
     pub selects: bool,
     declines_matrix: bool,
     has_weights: bool,
+    /// Whether the size of the PSF is T = 2σ², whose square root is a size.
+    pub psf_area: bool,
 }
 
 impl Source {
@@ -141,9 +143,16 @@ impl Source {
         let responsivity = self.shapes == Shapes::Responsivity;
         let used = self.columns.used(|role| self.reads(reading, role));
         let mut lines = vec![format!("Used: {used}.")];
-        let doubtful = &self.columns.doubtful_weights;
+        // Read to find out whether they are what their names suggest.
+        let Columns {
+            doubtful_weights,
+            steps,
+            ..
+        } = &self.columns;
+        let tested = |name: &String| doubtful_weights.contains(name) || steps.contains(name);
+        let chosen = |name: &String| reading.chosen_by().any(|own| own == name);
         let read = self.wanted.iter().map(|own| own.column.clone());
-        let read: Vec<String> = read.filter(|name| !doubtful.contains(name)).collect();
+        let read: Vec<String> = read.filter(|name| !tested(name) || chosen(name)).collect();
         lines.extend(self.columns.unused(&read));
         let mut sheared = Vec::new();
         if self.sheared_flags {
@@ -272,18 +281,35 @@ impl Source {
 }
 
 pub fn sources(input: &Input, reading: &Reading<'_>) -> Result<Vec<Source>, FileError> {
+    let mut all = Vec::new();
+    for (path, sheared) in &input.parts {
+        let part = Input::from(path.clone());
+        all.extend(sources_of(&part, *sheared, reading)?);
+    }
+    match input.parts.is_empty() {
+        true => sources_of(input, None, reading),
+        false => Ok(all),
+    }
+}
+
+fn sources_of(
+    input: &Input,
+    sheared: Option<usize>,
+    reading: &Reading<'_>,
+) -> Result<Vec<Source>, FileError> {
     let path = input.name.as_path();
-    if let Some(frame) = &input.frame {
+    if let Some(table) = &input.frame {
         let place = Place {
             path: path.to_owned(),
             table: None,
         };
-        let names: Vec<String> = (frame.columns().iter())
+        let mut names: Vec<String> = (table.columns().iter())
             .map(|own| own.name().to_string())
             .collect();
+        names.extend(input.unread.iter().cloned());
         let source = Source {
-            frame: Some(frame.clone()),
-            ..source(place, None, (&names, Some(frame)), reading)?
+            frame: Some(table.clone()),
+            ..source(place, None, (&names, Some(table)), reading)?
         };
         return Ok(vec![source]);
     }
@@ -359,7 +385,7 @@ pub fn sources(input: &Input, reading: &Reading<'_>) -> Result<Vec<Source>, File
         (None, Some(head)) => table(head.number),
         _ => place,
     };
-    Ok(vec![source(own, None, (&list.names, None), reading)?])
+    Ok(vec![source(own, sheared, (&list.names, None), reading)?])
 }
 
 // The columns that are read of a table with these names, each once.
@@ -488,6 +514,31 @@ impl Wanted<'_> {
     }
 }
 
+/// The columns that are read of a table with columns of these `names`, so that others need not be in memory. Columns of texts are
+/// always needed, because they may name sheared catalogues.
+pub fn needed_columns(
+    names: &[String],
+    reading: &Reading<'_>,
+) -> Result<BTreeSet<String>, FileError> {
+    let place = Place {
+        path: "table".into(),
+        table: None,
+    };
+    let empty = |name: &String| Column::new(name.as_str().into(), Vec::<f64>::new());
+    let table = frame(names.iter().map(empty).collect())
+        .map_err(|error| FileError::new(&place.path, error))?;
+    let own = source(place, None, (names, Some(&table)), reading)?;
+    let read = own.wanted.iter().map(|own| own.column.clone());
+    let operands = own.formulas.iter().flat_map(Expression::columns);
+    let roles = own.columns.all().map(|(_, name)| name);
+    let more = operands.chain(roles).map(str::to_owned);
+    let all: BTreeSet<String> = read.chain(more).collect();
+    Ok(all
+        .into_iter()
+        .filter(|name| names.contains(name))
+        .collect())
+}
+
 fn source(
     place: Place,
     sheared: Option<usize>,
@@ -499,6 +550,15 @@ fn source(
     let (names, formulas) = with_formulas(path, names, given)?;
     let names = names.as_slice();
     let mut columns = Columns::find(path, names, given)?;
+    if sheared.is_none()
+        && columns.of(Role::ShearedCatalogue).is_none()
+        && !given.is_given(Role::ShearedCatalogue)
+        && let Some(step) = step_column(&place, frame, &columns)?
+    {
+        let mut given = given.clone();
+        given.add_step(step);
+        columns = Columns::find(path, names, &given)?;
+    }
     if let Some(id) = columns.of(Role::Id)
         && id.eq_ignore_ascii_case(COUNTER)
         && !given.is_given(Role::Id)
@@ -513,7 +573,7 @@ fn source(
     let mut chosen_by = reading.chosen_by();
     // Also if one of them is named.
     let by_catalogue =
-        (chosen_by.clone()).any(|name| has_sheared(name) || unsheared_name(name).is_some());
+        (chosen_by.clone()).any(|name| has_sheared(name) || sheared_name(name).is_some());
     columns.choose_sheared(names, by_catalogue && reading.weights().is_none());
     if columns.preset == Preset::Sheared {
         check_chosen(path, chosen_by.clone(), has_sheared)?;
@@ -540,7 +600,7 @@ fn source(
     for name in names.iter().filter(|_| columns.preset == Preset::Metacal) {
         let small = name.to_ascii_lowercase();
         let is_flag = small.contains("flag") && !small.contains("select");
-        if is_flag && unsheared_name(&small).is_some() {
+        if is_flag && sheared_name(name).is_some() {
             failures.push(wanted.require(name)?);
         }
     }
@@ -588,12 +648,36 @@ fn source(
         selects: columns.give_selection_response() && chosen && known,
         declines_matrix: given.decline_matrix(),
         has_weights: reading.weights().is_some(),
+        psf_area: columns.of(Role::PsfSize).is_some_and(|name| {
+            let squared = &recognition().psf_size.squared;
+            squared.iter().any(|own| own.eq_ignore_ascii_case(name))
+        }),
         wanted: wanted.all,
         frame: None,
         places,
         place,
         columns,
     })
+}
+
+// A column without a role whose texts name sheared catalogues, whatever its name: the first row has one, too.
+fn step_column(
+    place: &Place,
+    frame: Option<&DataFrame>,
+    columns: &Columns,
+) -> Result<Option<String>, FileError> {
+    let mut texts = match frame {
+        None => table::first_texts(place)?,
+        Some(frame) => {
+            let text =
+                |own: &Column| Some((own.name().to_string(), own.str().ok()?.get(0)?.to_owned()));
+            frame.columns().iter().filter_map(text).collect()
+        }
+    };
+    texts.retain(|(name, text)| {
+        catalogue_named(text).is_some() && !columns.all().any(|(_, own)| own == name)
+    });
+    Ok(texts.into_iter().next().map(|(name, _)| name))
 }
 
 // SExtractor's name of a running number, which other programs use for counts.
@@ -699,22 +783,6 @@ fn is_fixed(name: &str, columns: &Columns) -> bool {
         || fits_any(&recognition().patterns.fixed, name)
 }
 
-// The name of a column of one sheared catalogue, without the name of the shear.
-fn unsheared_name(name: &str) -> Option<&str> {
-    let mut names = SHEARED_CATALOGUES.iter();
-    names.find_map(|(sheared, _)| name.strip_suffix(sheared)?.strip_suffix('_'))
-}
-
-/// The catalogue of a name, 0 for that without shear: `ns` in metadetection of LSST, `00` in TXPipe.
-pub fn catalogue_named(name: &str) -> Option<usize> {
-    let name = name.trim().to_ascii_lowercase();
-    if ["noshear", "ns", "00"].contains(&name.as_str()) {
-        return Some(0);
-    }
-    let mut sheared = SHEARED_CATALOGUES.iter();
-    sheared.position(|(known, _)| *known == name).map(|k| k + 1)
-}
-
 // Refuses to choose galaxies by columns of one sheared catalogue, or by measured ones without sheared columns.
 fn check_chosen<'a>(
     path: &Path,
@@ -722,7 +790,7 @@ fn check_chosen<'a>(
     has_sheared: impl Fn(&str) -> bool,
 ) -> Result<(), FileError> {
     for name in chosen_by {
-        if let Some(base) = unsheared_name(name).filter(|base| has_sheared(base)) {
+        if let Some((_, base)) = sheared_name(name).filter(|(_, base)| has_sheared(base)) {
             return Err(FileError::new(
                 path,
                 format!(

@@ -400,16 +400,20 @@ pub fn expand(paths: &[PathBuf], mut truth: Truth) -> Result<Expanded, FileError
             continue;
         }
         let Some(run) = Run::read(path)? else {
-            // Of HATS, whose files are in folders of orders and pixels.
-            let hats = path.join("dataset");
-            let files = match hats.is_dir() {
-                true => format!("{}/*/*/*.parquet", hats.display()),
-                false => format!("{}/*", path.display()),
-            };
-            let message = format!(
-                "this folder has no {RUN_FILE} (expected catalogues, or a folder that `measure` or `run` wrote). Try: {files}"
-            );
-            return Err(FileError::new(path, message));
+            let parts = parts_of_folder(path)?;
+            if parts.is_empty() {
+                let message = format!(
+                    "this folder has no {RUN_FILE} (expected catalogues, or a folder that `measure` or `run` wrote). Try: {}/*",
+                    path.display()
+                );
+                return Err(FileError::new(path, message));
+            }
+            catalogues.push(Input {
+                name: path.clone(),
+                parts: parts.into_iter().map(|part| (part, None)).collect(),
+                ..Input::default()
+            });
+            continue;
         };
         let files = run.catalogues(path, &[])?;
         if files.is_empty() {
@@ -446,6 +450,34 @@ pub fn expand(paths: &[PathBuf], mut truth: Truth) -> Result<Expanded, FileError
         truth,
         without_catalogue,
     })
+}
+
+// The files of a catalogue in a folder: HATS has them in `dataset`, in folders of orders and pixels, and dask and Spark write
+// `table.parquet/part.0.parquet`. Other folders may contain several catalogues.
+fn parts_of_folder(folder: &Path) -> Result<Vec<PathBuf>, FileError> {
+    let is_parquet = |path: &Path| path.extension().is_some_and(|own| own == "parquet");
+    let dataset = folder.join("dataset");
+    let (mut folders, mut files) = match dataset.is_dir() {
+        true => (vec![dataset], Vec::new()),
+        false if is_parquet(folder) => (vec![folder.to_owned()], Vec::new()),
+        false => return Ok(Vec::new()),
+    };
+    while let Some(folder) = folders.pop() {
+        let cannot = || FileError::doing(&folder, "cannot read the folder");
+        for entry in std::fs::read_dir(&folder).map_err(cannot())? {
+            let path = entry.map_err(cannot())?.path();
+            // `_metadata` and `_common_metadata` have no rows.
+            let name = path.file_name().unwrap_or_default().to_string_lossy();
+            match () {
+                () if name.starts_with(['_', '.']) => {}
+                () if path.is_dir() => folders.push(path),
+                () if is_parquet(&path) => files.push(path),
+                () => {}
+            }
+        }
+    }
+    files.sort();
+    Ok(files)
 }
 
 // A bias of fewer images than the data have is valid, but the reader must know.

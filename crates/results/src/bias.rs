@@ -19,6 +19,7 @@ use shearq_catalogue::columns::{CATALOGUES, Role, Shapes};
 use shearq_catalogue::request::{Input, MAX_BINS, Request, Units};
 use shearq_catalogue::rows::{distinct, rows};
 use shearq_catalogue::source::{Reading, Source, sources};
+use shearq_catalogue::steps::with_sheared_files;
 use shearq_catalogue::truth::{TrueSign, Truth};
 use shearq_dataset::fingerprint::{GALAXIES, verify_source};
 use shearq_dataset::metadata::{CATALOGUE_FRAME, CommonAxes, axes_of};
@@ -67,7 +68,7 @@ pub enum BiasFailure {
     )]
     UnlikeColumns(String),
     #[error(
-        "{second}: it contains the same galaxies as {first}, which would count twice (expected other galaxies). Try: each part once, also of tasks that were repeated"
+        "{second}: it contains the same galaxies as {first}, which would count twice (expected other galaxies). Try: each catalogue once, also of tasks that were repeated"
     )]
     SameContent { first: String, second: String },
     #[error("{0}: the catalogue is in two files of sums")]
@@ -89,12 +90,12 @@ pub enum BiasFailure {
     #[error("--bins: no galaxy that counts has {0}. Try: other edges")]
     EmptyBin(String),
     #[error(
-        "--paired needs the same galaxies under several test shears (found the design {}). Try: --design arms if they are the same",
+        "--paired needs the same galaxies under several test shears (found the design {}). Try: --design shears if they are the same",
         .0.name()
     )]
     NothingPairs(Design),
     #[error(
-        "--paired: the galaxies of sheared catalogues are detected again in each, and have no partner in another (expected responses in columns). Try: omit --paired; each arm then has its own response"
+        "--paired: the galaxies of sheared catalogues are detected again in each, and have no partner in another (expected responses in columns). Try: omit --paired; each test shear then has its own response"
     )]
     PairedSheared,
     #[error("--like needs bins of both catalogues. Try: --bins 'snr:10' --bins 'size:5'")]
@@ -160,6 +161,9 @@ pub struct About {
     pub response: bool,
     /// Whether rows have a response that `--columns R11=none` leaves out.
     pub response_column: bool,
+    /// The column of flags.
+    #[serde(default)]
+    pub flag: Option<String>,
     /// Whether units are named by identifiers.
     matched: bool,
     /// A column that is not used and looks like independent units.
@@ -261,6 +265,11 @@ impl BiasResult {
 )]
 pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, BiasFailure> {
     distinct(&request.catalogues)?;
+    let joined = Request {
+        catalogues: with_sheared_files(request.catalogues.clone(), &request.truth),
+        ..request.clone()
+    };
+    let request = &joined;
     let paths = request.catalogues.iter().map(|input| input.name.as_path());
     let mut reading = Reading {
         request,
@@ -303,6 +312,7 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
     let sign = known_sign(request, &all)?.filter(|_| truth);
     reading.flip_g2 = sign.is_some_and(|sign| sign.of == TruthSign::Challenge);
     let (sums, catalogues) = add_up(&reading, &all, (layout, &cells), part, None)?;
+    distinct_content(&catalogues)?;
     let named_unit = matches!(request.units, Units::Column(_))
         || request.units == Units::Recognised && first.columns.of(Role::Unit).is_some();
     let about = About {
@@ -313,6 +323,7 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
         truth,
         response: response || request.shapes.is_some(),
         response_column: first.columns.have(&[Role::R11]),
+        flag: first.columns.flags.first().cloned(),
         matched: named_unit || first.columns.of(Role::Id).is_some(),
         unit_column: first.unit_column.clone().filter(|_| !named_unit),
         kind,

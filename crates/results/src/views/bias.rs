@@ -171,7 +171,9 @@ pub fn compared_table(first: &BiasResult, second: &BiasResult, difference: &Bias
 
 /// A warning if galaxies were selected or binned by what was measured on them.
 pub fn chosen_by_measurement(result: &BiasResult) -> Option<String> {
-    let column = result.about.measured.first()?;
+    let measured = &result.about.measured;
+    let column = measured.first()?;
+    let all = measured.join("`, `");
     let remedy = match result.about.by_shearq {
         true => {
             "--where 'step(snr, THRESHOLD)' for cuts by snr, flux or size, or catalogues with shape.sheared_step".into()
@@ -180,7 +182,7 @@ pub fn chosen_by_measurement(result: &BiasResult) -> Option<String> {
     };
     // docs/limitations.md, selection after measuring.
     Some(format!(
-        "m contains the effect of shear on a choice by `{column}`, which has no response here. Known sizes: −0.02 (S/N 20) to −0.1 (S/N 7) if the lowest 30 % in size are removed, −0.11 for the lowest 50 % in flux. Try: {remedy}"
+        "m contains the effect of shear on a selection by `{all}`, which has no response here. Known sizes: −0.02 (S/N 20) to −0.1 (S/N 7) if the lowest 30 % in size are removed, −0.11 for the lowest 50 % in flux. Try: {remedy}"
     ))
 }
 
@@ -240,6 +242,14 @@ pub fn of_design(result: &BiasResult) -> Vec<String> {
             all.galaxies,
             all.effective,
             FEW_EFFECTIVE * all.galaxies as f64
+        ));
+    }
+    let total = result.about.total();
+    if 2 * total.flagged > total.rows {
+        let column = result.about.flag.as_deref().unwrap_or("NAME");
+        lines.push(format!(
+            "`{column}` excludes {:.1} % of the rows, which are those where it is not 0. If good rows have 1, m is that of the bad ones. Try: --columns flag=none --where {column}",
+            100.0 * total.flagged as f64 / total.rows as f64
         ));
     }
     let catalogues = result.about.catalogues.iter();
@@ -430,11 +440,6 @@ fn notes(result: &BiasResult) -> Vec<String> {
             notes.push(format!("Left out: {count} rows {what}."));
         }
     }
-    if 2 * total.flagged > total.rows {
-        notes.push(
-            "More than half of the rows have a flag, which is not 0. If good rows have it, try: --columns flag=none --where NAME".into(),
-        );
-    }
     notes.extend(repeated(&result.about.catalogues));
     notes.extend(chosen_by_measurement(result));
     for (k, assumes) in (1..).zip(all.assumes_no_c) {
@@ -447,7 +452,7 @@ fn notes(result: &BiasResult) -> Vec<String> {
     notes.extend(no_ellipticities(result, all));
     match result.design {
         Design::Null => notes.push(
-            "Without a true shear, c is the mean shear. It is a bias only if the galaxies have no mean shear.".into(),
+            "Without a true shear, c is the mean shear, which is a bias only if the galaxies have no mean shear. Try: --g1 and --g2, --truth FILE or --columns g1=NAME,g2=NAME for m".into(),
         ),
         _ => {
             notes.extend(verdicts(all));
