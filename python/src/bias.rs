@@ -8,9 +8,12 @@ use pyo3::prelude::*;
 use shearq_bias::Design;
 use shearq_catalogue::columns::{Names, Shapes};
 use shearq_catalogue::expression::{Expression, ExpressionError};
+use shearq_catalogue::recognition::read_presets;
 use shearq_catalogue::request::{
     Binning, Edges, Input, MAX_AXES, MAX_BINS, Request, Survey, Units,
 };
+use shearq_catalogue::select::selection;
+use shearq_catalogue::source::Reading;
 use shearq_catalogue::truth::{TrueSign, Truth, expand};
 use shearq_files::frames::frame;
 use shearq_files::frames::polars::Column;
@@ -52,6 +55,8 @@ fn design_of(name: &str) -> PyResult<Design> {
         Design::Galaxies,
         Design::Rotated,
     ];
+    // The name of version 0.2.
+    let name = if name == "arms" { "shears" } else { name };
     let found = ALL.into_iter().find(|design| design.name() == name);
     found.ok_or_else(|| {
         let names = ALL.map(Design::name).join(", ");
@@ -72,7 +77,11 @@ fn shapes_of(name: &str) -> PyResult<Shapes> {
 
 // Frames of pandas and astropy arrive as columns of float64 or of text, because those are the types that `bias` reads:
 // other types, masks and integers beyond 2⁵³ are converted in _bias.py, where each package's rules are known.
-fn table_of(name: &str, columns: Vec<(String, Bound<'_, PyAny>)>) -> PyResult<Input> {
+fn table_of(
+    name: &str,
+    columns: Vec<(String, Bound<'_, PyAny>)>,
+    unread: Vec<String>,
+) -> PyResult<Input> {
     let columns = columns.iter().map(|(label, values)| {
         if let Ok(reals) = values.extract::<PyReadonlyArray1<'_, f64>>() {
             return Ok(Column::new(label.as_str().into(), reals.as_slice()?));
@@ -90,14 +99,16 @@ fn table_of(name: &str, columns: Vec<(String, Bound<'_, PyAny>)>) -> PyResult<In
     Ok(Input {
         name: PathBuf::from(name),
         frame: Some(table),
+        unread,
+        ..Input::default()
     })
 }
 
-// A path, or the name and the columns of a table.
+// A path, or the name and the columns of a table, with the names of those that are not read.
 #[derive(FromPyObject)]
 pub(crate) enum Given<'py> {
     Path(PathBuf),
-    Table(String, Vec<(String, Bound<'py, PyAny>)>),
+    Table(String, Vec<(String, Bound<'py, PyAny>)>, Vec<String>),
 }
 
 // One shear of all catalogues, one of each by its name, or a file of true shears.
@@ -159,6 +170,77 @@ impl BiasSums {
     }
 }
 
+fn names_of(columns: &[String], preset: &[PathBuf]) -> PyResult<Names> {
+    let mut names = Names::default();
+    for text in columns {
+        names
+            .add(text)
+            .map_err(|fault| PyValueError::new_err(in_python(&fault.to_string())))?;
+    }
+    for path in preset {
+        require(path)?;
+        names.add_presets(read_presets(path).map_err(|error| of_bias(error.into()))?);
+    }
+    Ok(names)
+}
+
+/// The columns that `bias` reads of a table with columns of these names; all of them if the arguments have a fault, which `bias`
+/// reports.
+#[pyfunction]
+pub(crate) fn needed_columns(
+    names: Vec<String>,
+    columns: Vec<String>,
+    preset: Vec<PathBuf>,
+    bins: Vec<String>,
+    condition: Option<&str>,
+    weight: Option<&str>,
+    units: Option<String>,
+) -> PyResult<Vec<String>> {
+    let parse = |of: &String| {
+        let of = Expression::parse(of).ok()?;
+        Some(Binning {
+            of,
+            edges: Edges::Values,
+        })
+    };
+    let bins: Option<Vec<Binning>> = bins.iter().map(parse).collect();
+    let (Some(bins), Ok(selection)) = (bins, selection(condition, weight)) else {
+        return Ok(names);
+    };
+    let request = Request {
+        catalogues: Vec::new(),
+        names: names_of(&columns, &preset)?,
+        truth: Truth::Columns,
+        shapes: None,
+        sign: TrueSign::Convention,
+        bins,
+        like: None,
+        paired: false,
+        selection,
+        design: None,
+        units: units_of(units),
+        drop_missing: false,
+        step: 0.01,
+        without_catalogue: Vec::new(),
+    };
+    let reading = Reading {
+        request: &request,
+        truth: Truth::Columns,
+        flip_g2: false,
+    };
+    let found = shearq_catalogue::source::needed_columns(&names, &reading);
+    Ok(found.map_or(names, |found| found.into_iter().collect()))
+}
+
+fn units_of(name: Option<String>) -> Units {
+    match name.as_deref() {
+        None => Units::Recognised,
+        Some("rows") => Units::Rows,
+        Some("catalogues") => Units::Catalogues,
+        Some(column) => Units::Column(column.to_owned()),
+    }
+}
+
 /// Sums catalogues.
 #[pyfunction]
 #[expect(
@@ -170,6 +252,7 @@ pub(crate) fn bias_sums(
     py: Python<'_>,
     catalogues: Vec<Given<'_>>,
     columns: Vec<String>,
+    preset: Vec<PathBuf>,
     truth: Option<GivenTruth>,
     ellipticity: Option<&str>,
     truth_sign: Option<&str>,
@@ -188,12 +271,7 @@ pub(crate) fn bias_sums(
         let argument = argument.to_owned();
         move |fault: ExpressionError| PyValueError::new_err(format!("{argument}: {fault}"))
     };
-    let mut names = Names::default();
-    for text in &columns {
-        names
-            .add(text)
-            .map_err(|fault| PyValueError::new_err(in_python(&fault.to_string())))?;
-    }
+    let names = names_of(&columns, &preset)?;
     if bins.len() > MAX_AXES {
         return Err(PyValueError::new_err(format!(
             "bins: found {} quantities; expected at most {MAX_AXES}",
@@ -221,7 +299,7 @@ pub(crate) fn bias_sums(
     let bins = bins.collect::<PyResult<Vec<_>>>()?;
     let like = like.map(|given| -> PyResult<Survey> {
         let catalogue = match given {
-            Given::Table(name, columns) => table_of(&name, columns)?,
+            Given::Table(name, columns, unread) => table_of(&name, columns, unread)?,
             Given::Path(path) => {
                 require(&path)?;
                 path.into()
@@ -255,7 +333,9 @@ pub(crate) fn bias_sums(
     let (mut inputs, mut truth, mut without_catalogue) = (Vec::new(), truth, Vec::new());
     for given in catalogues {
         match given {
-            Given::Table(name, columns) => inputs.push(table_of(&name, columns)?),
+            Given::Table(name, columns, unread) => {
+                inputs.push(table_of(&name, columns, unread)?);
+            }
             Given::Path(path) => {
                 require(&path)?;
                 let found = expand(&[path], truth).map_err(|error| of_bias(error.into()))?;
@@ -274,15 +354,10 @@ pub(crate) fn bias_sums(
         bins,
         like,
         paired,
-        selection: shearq_catalogue::select::selection(condition, weight)
+        selection: selection(condition, weight)
             .map_err(|fault| PyValueError::new_err(fault.to_string()))?,
         design: design.map(design_of).transpose()?,
-        units: match units.as_deref() {
-            None => Units::Recognised,
-            Some("rows") => Units::Rows,
-            Some("catalogues") => Units::Catalogues,
-            Some(column) => Units::Column(column.to_owned()),
-        },
+        units: units_of(units),
         drop_missing,
         step,
         without_catalogue,

@@ -23,7 +23,7 @@ mod _shearq {
     use pyo3::prelude::*;
 
     #[pymodule_export]
-    use super::bias::{BiasSums, bias_sums};
+    use super::bias::{BiasSums, bias_sums, needed_columns};
     #[pymodule_export]
     use super::command::run_command;
     #[pymodule_export]

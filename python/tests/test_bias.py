@@ -343,3 +343,47 @@ def test_the_sign_of_g2_in_a_table_is_stated_significant_or_refused(tmp_path):
         bias(0.3)
     with pytest.raises(ValueError, match="truth_sign: \"other\""):
         bias(0.3, truth_sign="other")
+
+
+def test_columns_that_are_not_needed_are_not_read():
+    rng = np.random.default_rng(1)
+    columns = {name: rng.normal(0, 0.2, 100) for name in ("e1", "e2", "my_weight_2", "snr", "mag", "peso")}
+    columns["my_weight_2"] = np.abs(columns["my_weight_2"]) + 0.1
+
+    class Group(dict):
+        """Like a group of h5py, which notes what is read."""
+
+        attrs: dict = {}
+        read: set = set()
+
+        def visititems(self, _):
+            return None
+
+    class Dataset:
+        ndim = 1
+        dtype = np.dtype("f8")
+
+        def __init__(self, name):
+            self.name = name
+
+        def __len__(self):
+            return 100
+
+        def __getitem__(self, _):
+            Group.read.add(self.name)
+            return columns[self.name]
+
+    group = Group({name: Dataset(name) for name in columns})
+    found = shearq.bias(group, columns={"w": "my_weight_2"}, where="snr > -1")
+    assert Group.read == {"e1", "e2", "my_weight_2", "snr"}
+    assert any("not known: peso" in note for note in found.notes)
+    own = shearq.bias(columns, columns={"w": "my_weight_2"}, where="snr > -1")
+    assert (found.rows, found.notes) == (own.rows, own.notes)
+
+
+def test_surveys_of_the_user_are_recognised(tmp_path):
+    preset = tmp_path / "own.toml"
+    preset.write_text('[[survey]]\nname = "Own"\n[survey.columns]\ne1 = "a"\ne2 = "b"\n')
+    rng = np.random.default_rng(1)
+    table = {"a": rng.normal(0, 0.2, 100), "b": rng.normal(0, 0.2, 100)}
+    assert any("Columns: Own" in note for note in shearq.bias(table, preset=preset).notes)

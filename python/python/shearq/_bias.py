@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Literal, Union
 
 import numpy as np
 
 from . import _display, _hdf5, _shearq
-from ._tables import _EXACT, is_missing, named_columns
+from ._tables import _EXACT, is_missing, named_columns, narrowed
 
-Design = Literal["single", "pairs", "arms", "fields", "galaxies", "rotated"]
+Design = Literal["single", "pairs", "shears", "fields", "galaxies", "rotated"]
 Bins = Union[str, tuple[str, Union[int, Sequence[float]]]]
 
 
@@ -122,6 +122,7 @@ def bias(
     g2: float | Sequence[float] | None = None,
     truth: str | os.PathLike[str] | None = None,
     columns: Mapping[str, str] | None = None,
+    preset: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | None = None,
     ellipticity: Literal["shear", "distortion", "responsivity"] | None = None,
     truth_sign: Literal["standard", "challenge"] | None = None,
     bins: Bins | Sequence[Bins] | None = None,
@@ -161,6 +162,8 @@ def bias(
         * ``g1 g2`` true shear, ``x y`` position (px), ``psf_e1 psf_e2 psf_size`` of the PSF;
         * ``version`` (noshear, 1p, 1m, 2p, 2m), or ``e1_1p e1_1m e2_2p e2_2m e1_2p e1_2m e2_1p e2_1m`` under artificial
           shears.
+    preset : path, or several
+        Files that describe surveys, whose columns are then recognised, as for ``shearq bias --preset``.
     ellipticity : {'shear', 'distortion', 'responsivity'}
         Type of e1 and e2; recognised by default. ``'distortion'`` converts each to a shear, ``'responsivity'`` divides the
         mean distortion by 2(1 − ⟨e_rms²⟩), with e_rms in ``rms_e``, or else e_rms² = ⟨χ²⟩/2 − ⟨σ²⟩ with σ in ``sigma_e``.
@@ -209,6 +212,7 @@ def bias(
         g2=g2,
         truth=truth,
         columns=columns,
+        preset=preset,
         ellipticity=ellipticity,
         truth_sign=truth_sign,
         bins=bins,
@@ -232,6 +236,7 @@ def bias_sums(
     g2: float | Sequence[float] | None = None,
     truth: str | os.PathLike[str] | None = None,
     columns: Mapping[str, str] | None = None,
+    preset: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | None = None,
     ellipticity: Literal["shear", "distortion", "responsivity"] | None = None,
     truth_sign: Literal["standard", "challenge"] | None = None,
     bins: Bins | Sequence[Bins] | None = None,
@@ -261,17 +266,26 @@ def bias_sums(
     frames = sorted({table.attrs["frame"] for table in tables if "frame" in getattr(table, "attrs", {})})
     if len(frames) > 1:
         raise ValueError(f"catalogues: found ellipticities in the frames {' and '.join(frames)}; expected one frame")
-    given = [_catalogue(f"catalogue {number}", table) for number, table in enumerate(tables, 1)]
+    roles = [f"{role}={column}" for role, column in (columns or {}).items()]
+    presets = [preset] if isinstance(preset, (str, os.PathLike)) else list(preset or [])
+    presets = [os.fspath(path) for path in presets]
+    binned = _bins(bins)
+
+    def needed(names: Sequence[str]) -> list[str]:
+        return _shearq.needed_columns(names, roles, presets, [of for of, *_ in binned], where, weight, units)
+
+    given = [_catalogue(f"catalogue {number}", table, needed) for number, table in enumerate(tables, 1)]
     if not given:
         raise ValueError("catalogues: found none; expected at least one")
     return BiasSums(
         _shearq.bias_sums(
             given,
-            [f"{role}={column}" for role, column in (columns or {}).items()],
+            roles,
+            presets,
             _truth(g1, g2, truth, given),
             ellipticity,
             truth_sign,
-            _bins(bins),
+            binned,
             None if like is None else _catalogue("like", like),
             tomography,
             where,
@@ -295,8 +309,10 @@ def _several(catalogues: Any) -> Iterable[Any]:
     return catalogues
 
 
-def _catalogue(name: str, table: Any) -> str | tuple[str, list[tuple[str, Any]]]:
-    """A path, or a name with columns of float64 or of text."""
+def _catalogue(
+    name: str, table: Any, needed: Callable[[Sequence[str]], list[str]] | None = None
+) -> str | tuple[str, list[tuple[str, Any]], list[str]]:
+    """A path, or a name with columns of float64 or of text, and the names of those that are not needed."""
     if isinstance(table, (str, os.PathLike)):
         path = os.fspath(table)
         if not _hdf5.is_hdf5(path):
@@ -304,6 +320,9 @@ def _catalogue(name: str, table: Any) -> str | tuple[str, list[tuple[str, Any]]]
         name, table = path, _hdf5.table(path, path)
     elif _hdf5.is_group(table):
         table = _hdf5.table(table, name)
+    unread: list[str] = []
+    if needed is not None:
+        table, unread = narrowed(table, needed)
     try:
         given = named_columns(table)
     except TypeError as error:
@@ -313,7 +332,7 @@ def _catalogue(name: str, table: Any) -> str | tuple[str, list[tuple[str, Any]]]
     columns = [(label, values) for label, own in given if (values := _values(own)) is not None]
     if not columns:
         raise ValueError(f"{name}: found {type(table).__name__} without columns of numbers; expected a table with e1 and e2")
-    return name, columns
+    return name, columns, unread
 
 
 def _values(column: Any) -> Any:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,10 +15,10 @@ _STEP = "mdet_step"
 # Names of the groups of metadetect's artificial shears, and what metadetect calls them.
 _STEPS = {
     "noshear": ("noshear", "ns", "00", "unsheared"),
-    "1p": ("1p",),
-    "1m": ("1m",),
-    "2p": ("2p",),
-    "2m": ("2m",),
+    "1p": ("1p", "sheared_1p"),
+    "1m": ("1m", "sheared_1m"),
+    "2p": ("2p", "sheared_2p"),
+    "2m": ("2m", "sheared_2m"),
 }
 
 
@@ -66,6 +67,16 @@ class Hdf5Table(Mapping[str, Any]):
         if self._steps and key == _STEP:
             return np.repeat(np.array(list(self._steps)), self._rows)
         return np.concatenate([_native(part[:]) for part in self._columns[key]])
+
+    def numbers(self) -> list[str]:
+        """The columns of numbers."""
+        return [key for key, parts in self._columns.items() if all(part.dtype.kind in "iufb" and part.ndim == 1 for part in parts)]
+
+    def select(self, names: Sequence[str]) -> Hdf5Table:
+        """The same table with these columns."""
+        chosen = copy.copy(self)
+        chosen._columns = {key: parts for key, parts in self._columns.items() if key in names}
+        return chosen
 
     def __iter__(self) -> Any:
         return iter([*self._columns, *([_STEP] if self._steps else [])])

@@ -109,14 +109,24 @@ class BiasSums:
     def append(self, other: BiasSums) -> BiasSums: ...
     def result(self) -> tuple[str, str]: ...
 
-def bias_sums(
-    catalogues: Sequence[str | tuple[str, list[tuple[str, Any]]]],
+def needed_columns(
+    names: Sequence[str],
     columns: Sequence[str],
+    preset: Sequence[str],
+    bins: Sequence[str],
+    condition: str | None,
+    weight: str | None,
+    units: str | None,
+) -> list[str]: ...
+def bias_sums(
+    catalogues: Sequence[str | tuple[str, list[tuple[str, Any]], list[str]]],
+    columns: Sequence[str],
+    preset: Sequence[str],
     truth: tuple[float, float] | Sequence[tuple[str, float, float]] | str | None,
     ellipticity: str | None,
     truth_sign: str | None,
     bins: Sequence[tuple[str, int | None, Sequence[float]]],
-    like: str | tuple[str, list[tuple[str, Any]]] | None,
+    like: str | tuple[str, list[tuple[str, Any]], list[str]] | None,
     tomography: str | None,
     condition: str | None,
     weight: str | None,

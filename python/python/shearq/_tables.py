@@ -6,12 +6,12 @@ import collections
 import os
 import pathlib
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from . import _schema, _shearq
+from . import _hdf5, _schema, _shearq
 
 if TYPE_CHECKING:
     import astropy.table  # type: ignore[import-untyped, unused-ignore]
@@ -92,6 +92,33 @@ def named_columns(table: Any) -> list[tuple[str, Any]]:
         found = [(name, index.get_level_values(name)) for name in own]
         found += [(name, table[name]) for name in names]
     return [part for name, column in found for part in _components(str(name), _in_memory(column))]
+
+
+def narrowed(table: Any, needed: Callable[[Sequence[str]], list[str]]) -> tuple[Any, list[str]]:
+    """A table without the columns of numbers that are not `needed`, and their names, if it reads columns only when asked:
+    a LazyFrame, a dataset or table of Arrow, or a group of an HDF5 file."""
+    if type(table).__name__ == "LazyFrame":
+        numbers = [name for name, kind in table.collect_schema().items() if kind.is_numeric() or str(kind) == "Boolean"]
+        names = list(table.collect_schema())
+        choose = table.select
+    elif isinstance(table, _hdf5.Hdf5Table):
+        names, numbers, choose = list(table), table.numbers(), table.select
+    elif hasattr(table, "schema") and (hasattr(table, "scanner") or hasattr(table, "num_columns")):
+        import pyarrow
+
+        real = (pyarrow.types.is_integer, pyarrow.types.is_floating, pyarrow.types.is_boolean)
+        names = list(table.schema.names)
+        numbers = [field.name for field in table.schema if any(is_of(field.type) for is_of in real)]
+        choose = (lambda own: table.to_table(columns=own)) if hasattr(table, "scanner") else table.select
+    else:
+        return table, []
+    if len(set(names)) < len(names):
+        return table, []
+    # The numbers of a vector have names of their own, and vectors and texts are kept.
+    known = names + [f"{name}[{place}]" for name in names if name not in numbers for place in range(2)]
+    kept = set(needed(known))
+    unread = [name for name in numbers if name not in kept]
+    return (choose([name for name in names if name not in unread]), unread) if unread else (table, [])
 
 
 def _plain_table(table: Any) -> Any:
