@@ -4,7 +4,7 @@ use std::ops::Range;
 use std::sync::Arc;
 
 use ndarray::{ArcArray2, ArrayView2};
-use numpy::{IntoPyArray, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3};
+use numpy::{IntoPyArray, PyArray2, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -12,7 +12,7 @@ use shearq_catalogue::star_noise::{StarNoise, Stars};
 use shearq_measure::{
     ArraySource, Batch, Flag, FunctionalPsf, Jacobian, JacobianError, KnownNoise, MeanShear,
     MeanShearError, MeasureError, Measurement, Measurer, PsfProfile, Psfs, Session, ShearSum,
-    Warning,
+    Warning, from_oversampled,
 };
 use shearq_pipeline::PipelineError;
 use shearq_pipeline::measure::{COLUMNS, ImageRow, Measured, Value, measure_images, more_columns};
@@ -130,6 +130,17 @@ fn source<'a>(
         source = source.with_offsets(each).map_err(of_measuring)?;
     }
     Ok((source, noise))
+}
+
+/// A PSF on finer pixels, integrated over pixels of the galaxies.
+#[pyfunction]
+pub(crate) fn psf_from_oversampled<'py>(
+    py: Python<'py>,
+    fine: PyReadonlyArray2<'py, f64>,
+    factor: usize,
+) -> PyResult<Bound<'py, PyArray2<f64>>> {
+    let psf = from_oversampled(fine.as_array(), factor).map_err(of_measuring)?;
+    Ok(psf.into_pyarray(py))
 }
 
 /// Measures the galaxies of an image, or of several whose stamps are epochs of the same galaxies.

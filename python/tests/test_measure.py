@@ -326,3 +326,29 @@ def test_little_memory_is_taken_beside_the_input(dtype):
     done = subprocess.run([sys.executable, "-c", PEAK, dtype], capture_output=True, text=True, check=True)
     # In MB; a copy of the input would be 88, twice that in double precision.
     assert float(done.stdout) < 40
+
+
+def gaussian_psf(sigma, side, factor):
+    """A Gaussian of σ in pixels of the galaxies on finer pixels, each integrated roughly by 8 points along each axis."""
+    points = (np.arange(side * factor * 8) + 0.5) / (8 * factor) - side / 2
+    profile = np.exp(-0.5 * (points / sigma) ** 2).reshape(-1, 8).sum(1)
+    return np.outer(profile, profile)
+
+
+def test_oversampled_psfs_are_those_on_galaxy_pixels():
+    image = shearq.simulate(set=8, grid=8)[0]
+    native = shearq.measure(image.stamps, gaussian_psf(1.45, 48, 1), noise=1.0)
+    fine = shearq.measure(image.stamps, gaussian_psf(1.45, 48, 3), noise=1.0, psf_oversampling=3)
+    np.testing.assert_allclose(fine["e1"], native["e1"], atol=1e-3)
+    np.testing.assert_allclose(fine["R11"], native["R11"], rtol=1e-3)
+    each = np.repeat(gaussian_psf(1.45, 48, 3)[None], len(image.stamps), axis=0)
+    some = shearq.measure(image.stamps, each, noise=1.0, psf_oversampling=3)
+    np.testing.assert_allclose(some["e1"], native["e1"], atol=1e-3)
+
+
+def test_oversampling_needs_images_of_whole_pixels():
+    image = shearq.simulate(set=8, grid=3)[0]
+    with pytest.raises(ValueError, match="oversampled PSF"):
+        shearq.measure(image.stamps, gaussian_psf(1.45, 49, 1), noise=1.0, psf_oversampling=4)
+    with pytest.raises(ValueError, match="formulas"):
+        shearq.measure(image.stamps, shearq.FunctionalPsf(3.4), noise=1.0, psf_oversampling=4)

@@ -79,6 +79,10 @@ pub(crate) struct Arguments {
     /// Use only PSFs of this name (EXTNAME).
     #[arg(long, value_name = "NAME")]
     psf_extension: Option<String>,
+    /// Pixels of the PSF images along a pixel of the galaxies, of undersampled images. The light of the finer pixels is
+    /// integrated over those of the galaxies, without aliases.
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u8).range(2..=32))]
+    psf_oversampling: Option<u8>,
     /// Maps of the variance of each pixel: of the stamps in the same order, or of the exposure. The noise of a galaxy is the median
     /// of its stamp beyond a quarter of the side from the centre, where a map has none of the galaxy's own noise.
     #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with_all = ["noise", "weight_map"])]
@@ -259,6 +263,7 @@ fn gathering<'a>(arguments: &'a Arguments, at: usize) -> anyhow::Result<Gatherin
             extension: arguments.psf_extension.as_deref(),
             content: Content::Psf,
         },
+        psf_oversampling: arguments.psf_oversampling.map(usize::from),
         noise: arguments.noise,
         variances: variances.or(weights),
         gain: arguments.gain,

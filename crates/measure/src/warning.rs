@@ -278,7 +278,7 @@ pub enum Warning {
     },
     /// The PSF is narrower than pixels can show.
     #[error(
-        "the PSF is narrower than the pixels can show (found a transform of {power:.2} at 2 rad/px{of}). Aliased light changes m by about {effect:+.3}, to a factor of 3. Try: check that the file is a PSF with the pixel scale of the galaxies"
+        "the PSF is narrower than the pixels can show (found a transform of {power:.2} at 2 rad/px{of}). Aliased light changes m by about {effect:+.3}, to a factor of 3. Try: a PSF on finer pixels, with gather --psf-oversampling (psf_oversampling in Python); or check that the file is a PSF with the pixel scale of the galaxies"
     )]
     PsfNarrow {
         /// Modulus of the transform, of sum one.

@@ -121,6 +121,9 @@ pub struct Gathering<'a> {
     pub masks: Option<Masks<'a>>,
     /// One PSF, one per stamp, or stars to average.
     pub psfs: Files<'a>,
+    /// Pixels of the PSF images along a pixel of the galaxies.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub psf_oversampling: Option<usize>,
     pub noise: Option<f64>,
     /// Maps of the variance of pixels, or of its inverse.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -278,7 +281,13 @@ fn prepare(
     let rows = rows.transpose()?;
     let mosaic = Mosaic::of(count, side);
     check_strip(&target, mosaic.columns, side)?;
-    let psfs = gather_psfs(data, id, gathering.psfs, gathering.square, &mosaic)?;
+    let psfs = gather_psfs(
+        data,
+        id,
+        (gathering.psfs, gathering.psf_oversampling.unwrap_or(1)),
+        gathering.square,
+        &mosaic,
+    )?;
     messages.extend_from_slice(&psfs.messages);
     let of_psf = check_psf(&psfs, &plan, jacobians)?;
     let mut writer = StampWriter::create(&target, mosaic, gathering.noise, wcs)?;

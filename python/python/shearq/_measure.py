@@ -118,6 +118,7 @@ def measure(
     wcs: WcsLike | None = None,
     properties: Mapping[str, ArrayLike] | None = None,
     pixel: PixelOfPsf | None = None,
+    psf_oversampling: int = 1,
     submission: SubmissionLike = "48/linear/star",
     threads: int | None = None,
     progress: Callable[[int], object] | None = None,
@@ -142,7 +143,7 @@ def measure(
     epochs : sequence of mappings, optional
         Instead of `stamps` and `psf`: several stamps of each galaxy, which a linear configuration combines in each Fourier mode
         with inverse-variance weights before it measures the shape. Each epoch has ``stamps`` and ``psf``, and perhaps
-        ``noise``, ``mask``, ``wcs``, ``x`` and ``y`` (for a WCS or PSF that varies), ``properties``, ``pixel``, ``offsets`` of shape (n, 2): the
+        ``noise``, ``mask``, ``wcs``, ``x`` and ``y`` (for a WCS or PSF that varies), ``properties``, ``pixel``, ``psf_oversampling``, ``offsets`` of shape (n, 2): the
         galaxies from the centres of their stamps along x and y in pixels, ``psf_offsets`` of shape (2,) or (n, 2): the PSFs from the
         centres of theirs, for PSFs drawn at the phases of the galaxies as in MEDS, and ``flux``: that of the galaxies in relation to the other
         epochs, a number or (n,), for bands. Galaxy k is on stamp k of each epoch; stamps of NaN are absent. The noise of an
@@ -171,6 +172,9 @@ def measure(
     pixel : {'included', 'convolve'}, optional
         Whether profiles of GalSim contain the pixel, as those interpolated from images of stars do. By default they are convolved
         with it, with a warning for such profiles.
+    psf_oversampling : int, optional
+        Pixels of the PSF images along a pixel of the galaxies, of undersampled images. The PSFs are integrated over their fine
+        pixels, as GalSim and STPSF draw them, and are integrated over the galaxies' pixels here, without aliases.
     submission : str, path, mapping or Configuration
         The configuration: see :func:`submission`.
     threads : int, optional
@@ -226,9 +230,12 @@ def measure(
                 raise TypeError(f"{name}: found none; expected stamps and their PSF, or epochs")
         stamps, psf, wcs = _images.opened(stamps, psf, wcs)
         psf = _psf_models.at_galaxies(psf, stamps, x, y, wcs, properties, pixel)
-        stamps, psf = _galsim.unpacked(stamps, psf, check=wcs is None, pixel=_pixel_of(psf, pixel))
+        stamps, psf = _galsim.unpacked(stamps, psf, check=wcs is None and psf_oversampling == 1, pixel=_pixel_of(psf, pixel))
+        psf = _on_galaxy_pixels(psf, psf_oversampling)
         return _measure([_image(stamps, psf, noise, mask, wcs, x, y)], (ids, x, y), settings, count, done)
     given = {"stamps": stamps, "psf": psf, "noise": noise, "mask": mask, "wcs": wcs, "properties": properties, "pixel": pixel}
+    if psf_oversampling != 1:
+        given["psf_oversampling"] = psf_oversampling
     for name, value in given.items():
         if value is not None:
             raise TypeError(f"{name}: found with epochs; expected in each epoch")
@@ -248,6 +255,7 @@ def measure_blocks(
     wcs: WcsLike | None = None,
     properties: Mapping[str, ArrayLike] | None = None,
     pixel: PixelOfPsf | None = None,
+    psf_oversampling: int = 1,
     submission: SubmissionLike = "48/linear/star",
     threads: int | None = None,
     progress: Callable[[int], object] | None = None,
@@ -258,7 +266,7 @@ def measure_blocks(
     ----------
     stamps : array, or anything with a shape (n, ny, nx) and slices
         Memory maps, and arrays of h5py, zarr or dask: each block is read when it is measured.
-    psf, noise, mask, x, y, ids, wcs, properties, pixel, submission, threads, progress
+    psf, noise, mask, x, y, ids, wcs, properties, pixel, psf_oversampling, submission, threads, progress
         As for :func:`measure`.
     block : int
         Most stamps of a block. Blocks are as equal as possible. The noise and the galaxy size are measured on each: it
@@ -284,7 +292,8 @@ def measure_blocks(
     """
     stamps, psf, wcs = _images.opened(stamps, psf, wcs)
     psf = _psf_models.at_galaxies(psf, stamps, x, y, wcs, properties, pixel)
-    stamps, psf = _galsim.unpacked(stamps, psf, check=wcs is None, pixel=_pixel_of(psf, pixel))
+    stamps, psf = _galsim.unpacked(stamps, psf, check=wcs is None and psf_oversampling == 1, pixel=_pixel_of(psf, pixel))
+    psf = _on_galaxy_pixels(psf, psf_oversampling)
     most = whole("block", block, 1, 1 << 40)
     if isinstance(stamps, (list, tuple)):
         stamps = numeric("stamps", stamps)
@@ -325,7 +334,20 @@ def measure_blocks(
     return measured()
 
 
-_EPOCH = ("stamps", "psf", "noise", "mask", "wcs", "x", "y", "properties", "pixel", "offsets", "psf_offsets", "flux")
+_EPOCH = ("stamps", "psf", "noise", "mask", "wcs", "x", "y", "properties", "pixel", "psf_oversampling", "offsets", "psf_offsets", "flux")
+
+
+def _on_galaxy_pixels(psf: Any, oversampling: int | None) -> Any:
+    """PSF images of finer pixels on the pixels of the galaxies."""
+    factor = whole("psf_oversampling", 1 if oversampling is None else oversampling, 1, 32)
+    if factor == 1:
+        return psf
+    if isinstance(psf, FunctionalPsf):
+        raise ValueError("psf_oversampling: found with formulas, which have no pixels; expected images of PSFs")
+    images = numeric("psf", psf)
+    if images.ndim == 2:
+        return _shearq.psf_from_oversampled(double("psf", images), factor)
+    return np.stack([_shearq.psf_from_oversampled(double("psf", image), factor) for image in images])
 
 
 def _pixel_of(psf: Any, pixel: PixelOfPsf | None) -> PixelOfPsf | None:
@@ -342,7 +364,9 @@ def _epoch(k: int, epoch: Mapping[str, Any]) -> dict[str, Any]:
         own = {name: epoch.get(name) for name in _EPOCH}
         own["stamps"], own["psf"], own["wcs"] = _images.opened(own["stamps"], own["psf"], own["wcs"])
         psf = _psf_models.at_galaxies(own["psf"], own["stamps"], own["x"], own["y"], own["wcs"], own["properties"], own["pixel"])
-        stamps, psf = _galsim.unpacked(own["stamps"], psf, check=own["wcs"] is None, pixel=_pixel_of(psf, own["pixel"]))
+        check = own["wcs"] is None and own["psf_oversampling"] in (None, 1)
+        stamps, psf = _galsim.unpacked(own["stamps"], psf, check=check, pixel=_pixel_of(psf, own["pixel"]))
+        psf = _on_galaxy_pixels(psf, own["psf_oversampling"])
         noise = own["noise"]
         if own["flux"] is not None:
             flux = np.asarray(own["flux"], dtype=np.float64)

@@ -2,12 +2,14 @@
 
 use std::path::{Path, PathBuf};
 
-use ndarray::ArrayView2;
+use ndarray::{Array2, ArrayView2};
 use shearq_dataset::grid::{Mosaic, psfs_text, read_psfs};
 use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::DataFolder;
 use shearq_files::{FileError, atomic};
-use shearq_measure::{EXAMINED_PSFS, Examination, Psfs, Star, Warning};
+use shearq_measure::{
+    EXAMINED_PSFS, Examination, MeasureError, Psfs, Star, Warning, from_oversampled,
+};
 use shearq_quantities::linear::Matrix2;
 use shearq_submissions::PsfCut;
 use shearq_submissions::limits::MIN_PSF;
@@ -29,10 +31,11 @@ pub(super) struct GatheredPsfs {
     pub(super) first: PathBuf,
 }
 
+/// Gathers the PSFs of `files`, whose images have `oversampling` pixels along each pixel of the galaxies.
 pub(super) fn gather_psfs(
     data: &DataFolder,
     id: ImageId,
-    files: Files<'_>,
+    (files, oversampling): (Files<'_>, usize),
     square: Option<Square>,
     mosaic: &Mosaic,
 ) -> Result<GatheredPsfs, FileError> {
@@ -41,15 +44,20 @@ pub(super) fn gather_psfs(
             .extension()
             .is_some_and(|ending| ending.eq_ignore_ascii_case("csv"))
     {
+        if oversampling != 1 {
+            let message = "a table of functional PSFs has no pixels that could be oversampled";
+            return Err(FileError::new(table, message));
+        }
         return functional(data.psf_functional(id.set, id.image), table, mosaic);
     }
     let (stack, mut messages) = Stack::of(files, square)?;
-    let &Stack {
-        count,
-        side,
-        ref wcs,
-        ..
-    } = &stack;
+    let (count, fine) = (stack.count, stack.side);
+    let side = fine / oversampling;
+    // Headers of finer pixels state another scale.
+    let (wcs, pixels_of_all) = match oversampling {
+        1 => (stack.wcs.clone(), stack.pixels()),
+        _ => (Wcs::default(), Vec::new()),
+    };
     messages.extend(small(&files.paths[0], side));
     let path = data.psf_star(id.set, id.image);
     check_count(&files.paths[0], count, mosaic)?;
@@ -62,7 +70,9 @@ pub(super) fn gather_psfs(
     }
     let mut dark = 0;
     while let Some((origin, pixels)) = planes.next()? {
-        let pixels = central(pixels, planes.sides(), side);
+        let pixels = central(pixels, planes.sides(), fine);
+        let pixels = on_galaxy_pixels(pixels, fine, oversampling)
+            .map_err(|error| origin.fault(&error.to_string()))?;
         let light: f64 = pixels.iter().map(|&value| f64::from(value)).sum();
         if !(light > 0.0 && light.is_finite()) {
             if count == 1 {
@@ -89,10 +99,25 @@ pub(super) fn gather_psfs(
         file: PsfFile::Stars(Box::new(image)),
         examination,
         messages,
-        wcs: wcs.clone(),
-        pixels: stack.pixels(),
+        wcs,
+        pixels: pixels_of_all,
         first: files.paths[0].clone(),
     })
+}
+
+/// A PSF of `fine` pixels a side integrated over pixels of the galaxies.
+fn on_galaxy_pixels(
+    pixels: Vec<f32>,
+    fine: usize,
+    oversampling: usize,
+) -> Result<Vec<f32>, MeasureError> {
+    if oversampling == 1 {
+        return Ok(pixels);
+    }
+    let light = pixels.iter().map(|&value| f64::from(value)).collect();
+    let light = Array2::from_shape_vec((fine, fine), light).unwrap_or_default();
+    let psf = from_oversampled(light.view(), oversampling)?;
+    Ok(psf.iter().map(|&value| value as f32).collect())
 }
 
 // Named configurations refuse such PSF stamps. Users should learn it before they have gathered all images.
