@@ -5,6 +5,8 @@
 //! alone does not show a background: wings are not negative and fall at least like r^(−2.5), and only what lies outside
 //! these bounds counts as a background.
 
+use std::f64::consts::PI;
+
 use ndarray::{ArrayView2, Axis};
 use shearq_quantities::statistics::upper_median;
 
@@ -36,14 +38,25 @@ const SAMPLED_WAVE_NUMBER: f64 = 2.0;
 const FILTERED_WAVE_NUMBER: f64 = 3.0;
 // Power of rounding there.
 const MAX_FILTERED_POWER: f64 = 1e-5;
-// ln P(2)/ln P(1) of Gaussians is 4, of Moffat and Kolmogorov PSFs 3.3 to 3.6, of optics with any obscuration, jitter or charge diffusion 2.2 to 2.4.
-const MIN_INDEX_TURBULENCE: f64 = 2.8;
-// P(2) from which m departs from zero, and how m then grows with it. 400 galaxies of half-light radii 1.5 to 3.5 px at S/N 200 behind 25
-// PSFs: m is 0.6 to 1.2 times P(2π − 1), the light that is aliased to one radian per pixel, which the pixels do not show.
-// Optics: P(2) = 0.28 (Euclid VIS) has m = 0, 0.29 (Roman J129) 0.008, 0.34 (Roman Y106) 0.032, 0.45 (Euclid NISP J) 0.041.
-const OPTICS: [f64; 2] = [0.285, 0.3];
-// Turbulence: P(2) = 0.35 has m = 0.004, 0.53 0.014, 0.67 0.023.
-const TURBULENCE: [f64; 2] = [0.3, 0.055];
+// A further one: of optics, less light than usual there in relation to P(2) shows that an alias of the opposite sign was added.
+const EDGE_WAVE_NUMBER: f64 = 2.6;
+// m is 0.6 to 1.2 times P(2π − 1), the light that is aliased to one radian per pixel, which the pixels show only together with P(1):
+// an image has S(k) = P(k) + c P(2π − k), where c = 1 for a PSF centred on a pixel and −1 on a corner. Limits and slopes below are
+// values at c = 0 and their changes with c, chosen by hand: m of 400 galaxies of half-light radii 1.5 to 3.5 px at S/N 200 behind 25 PSFs.
+// ln S(2)/ln S(1) of turbulence and Gaussians exceeds this, that of obscured optics with any jitter or charge diffusion does not: at c = −1,
+// 3.2 to 4.7 and 1.8 to 3.1.
+const INDEX_TURBULENCE: [f64; 2] = [2.97, -0.18];
+// S(2) from which m departs from zero, and how m then grows with it.
+// Optics at c = −1: S(2) = 0.256 (Roman Y106) has m = 0.032, 0.342 (Euclid NISP J) 0.041. At c = 1, 0.30 (Euclid VIS) has m = 0, 0.37 (J129) 0.008,
+// 0.44 (Y106) 0.032, 0.58 (NISP J) 0.041.
+const OPTICS: [[f64; 2]; 2] = [[0.28, 0.07], [0.26, -0.04]];
+// Turbulence at c = −1: S(2) = 0.32 has m = 0.004, 0.45 0.014, 0.54 0.023.
+const TURBULENCE: [[f64; 2]; 2] = [[0.315, 0.015], [0.05, -0.005]];
+// On a corner S(2) of optics without aliases is as large: Euclid VIS and Roman H158 have S(2.6)/S(2) = 0.53 and more, J129, Y106 and NISP at most 0.5.
+const MAX_CORNER: f64 = -0.5;
+const MIN_EDGE_RATIO: f64 = 0.515;
+// Beyond that S(2), all are aliased.
+const MAX_SAMPLED: f64 = 0.4;
 // Effect on m of aliasing above which a warning is due.
 const MAX_ALIASING: f64 = 0.002;
 // Mean square radius of the PSF's core in units of the galaxies', above which a warning is due. Simulated galaxies, PSF of
@@ -165,10 +178,16 @@ impl PsfQuality {
             }
         }
         let peak = (peak - border.mean()).max(f64::MIN_POSITIVE);
-        let [low, sampled] = [0.5, 1.0].map(|share| {
-            let square = axis_power(psf, share * SAMPLED_WAVE_NUMBER);
+        let moduli = [
+            0.5 * SAMPLED_WAVE_NUMBER,
+            SAMPLED_WAVE_NUMBER,
+            EDGE_WAVE_NUMBER,
+        ]
+        .map(|k| {
+            let square = axis_power(psf, k);
             (square - pixels * sigma * sigma).max(0.0).sqrt()
         });
+        let [low, sampled, edge] = moduli;
         let offset = psf_offset(psf);
         Some(PsfQuality {
             side: n,
@@ -182,7 +201,11 @@ impl PsfQuality {
                 // From finer pixels, and without aliases.
                 true => 0.0,
                 // Less the noise of the transform.
-                false => aliasing(low, sampled - 2.0 * sigma * n as f64),
+                false => {
+                    let phases = offset.map(|off| (2.0 * PI * (middle + off)).cos());
+                    let least = sampled - 2.0 * sigma * n as f64;
+                    aliasing([low, least, edge], 0.5 * (phases[0] + phases[1]))
+                }
             },
             core: psf_core_size(psf, offset, border.mean(), sigma),
             moved,
@@ -206,15 +229,22 @@ fn axis_power(psf: ArrayView2<'_, f64>, wave_number: f64) -> f64 {
     0.5 * (of_axis(Axis(0)) + of_axis(Axis(1)))
 }
 
-/// About how much m changes by light that pixels alias, of a PSF with these moduli at half of [`SAMPLED_WAVE_NUMBER`] and there.
-fn aliasing(low: f64, power: f64) -> f64 {
+/// About how much m changes by light that pixels alias, of a PSF image with these moduli at half of [`SAMPLED_WAVE_NUMBER`], there and at
+/// [`EDGE_WAVE_NUMBER`], whose aliases have the sign and weight `phase`.
+fn aliasing([low, sampled, edge]: [f64; 3], phase: f64) -> f64 {
+    let at = |[value, change]: [f64; 2]| value + change * phase;
     // NaN of a PSF of one pixel, which has all wave numbers.
-    let index = power.ln() / low.ln();
-    let [least, slope] = match index > MIN_INDEX_TURBULENCE {
-        true => TURBULENCE,
-        false => OPTICS,
-    };
-    slope * (power - least).max(0.0)
+    let index = sampled.ln() / low.ln();
+    let is_turbulence = index > at(INDEX_TURBULENCE);
+    let [least, slope] = if is_turbulence { TURBULENCE } else { OPTICS };
+    if !is_turbulence
+        && phase < MAX_CORNER
+        && sampled < MAX_SAMPLED
+        && edge > MIN_EDGE_RATIO * sampled
+    {
+        return 0.0;
+    }
+    at(slope) * (sampled - at(least)).max(0.0)
 }
 
 /// Means over pixels: of their values, and of their distances from the centre.
@@ -481,22 +511,30 @@ mod tests {
 
     #[test]
     fn undersampled_optics_are_told_from_sampled_ones() {
-        // |P̂| at 1 and 2 rad/px and m of the study above.
-        for (low, power, m) in [
-            (0.633, 0.337, 0.015),
-            (0.573, 0.294, 0.008),
-            (0.618, 0.341, 0.032),
-            (0.709, 0.454, 0.041),
-            (0.557, 0.276, 0.0),
-            (0.520, 0.261, 0.0),
-            (0.539, 0.214, 0.0),
-            (0.839, 0.534, 0.015),
-            (0.785, 0.436, 0.008),
-            (0.638, 0.242, 0.001),
-            (0.497, 0.124, 0.0),
-            (0.905, 0.668, 0.023),
+        // Moduli at 1, 2 and 2.6 rad/px of images that GalSim draws, the phase of their aliases, and m of the study above.
+        for (low, sampled, edge, phase, m) in [
+            // Roman Y106, J129, H158, F184; Euclid VIS, NISP J; Airy discs of λ/D 0.85 and 1.3 px.
+            (0.603, 0.256, 0.105, -1.0, 0.032),
+            (0.580, 0.238, 0.097, -1.0, 0.008),
+            (0.537, 0.250, 0.132, -1.0, 0.0),
+            (0.429, 0.213, 0.149, -1.0, 0.0),
+            (0.568, 0.261, 0.142, -1.0, 0.0),
+            (0.678, 0.342, 0.152, -1.0, 0.041),
+            (0.697, 0.330, 0.136, -1.0, 0.036),
+            (0.615, 0.299, 0.164, -1.0, 0.0),
+            // Y106, J129, H158 and VIS on a pixel.
+            (0.657, 0.440, 0.374, 1.0, 0.032),
+            (0.596, 0.366, 0.348, 1.0, 0.008),
+            (0.537, 0.290, 0.278, 1.0, 0.0),
+            (0.568, 0.303, 0.297, 1.0, 0.0),
+            // Moffat PSFs of β = 3 and FWHM 0.8, 1.0, 1.2, 1.5 px, and a Gaussian of 0.8 px.
+            (0.821, 0.452, 0.214, -1.0, 0.015),
+            (0.776, 0.390, 0.178, -1.0, 0.008),
+            (0.637, 0.232, 0.092, -1.0, 0.001),
+            (0.858, 0.620, 0.521, 1.0, 0.015),
+            (0.875, 0.535, 0.264, -1.0, 0.023),
         ] {
-            let found = aliasing(low, power);
+            let (power, found) = (sampled, aliasing([low, sampled, edge], phase));
             assert_eq!(found > MAX_ALIASING, m > MAX_ALIASING, "{power}: {found}");
             // To a factor of three.
             assert!(found < 3.0 * m || m < 0.002, "{power}: {found}");
