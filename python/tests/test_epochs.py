@@ -37,10 +37,30 @@ def galaxies(rng, n):
     return np.stack([0.3 * (1 + e[:, 0]), 0.3 * e[:, 1], 0.3 * (1 - e[:, 0])], axis=-1)
 
 
-def test_one_epoch_has_the_bits_of_its_stamps(image):
+def test_one_epoch_without_offsets_has_the_bits_of_its_stamps(image):
     alone = shearq.measure(image.stamps, image.psf, noise=image.noise)
     found = shearq.measure(epochs=[{"stamps": image.stamps, "psf": image.psf, "noise": image.noise}])
     assert same_bits(found, alone)
+
+
+@pytest.mark.filterwarnings("ignore::shearq.DataWarning")
+def test_one_epoch_is_measured_as_one_of_several():
+    rng = np.random.default_rng(13)
+    shapes = galaxies(rng, 40)
+    one = epoch(rng, shapes, noise=0.01)
+    one["offsets"] += (2.0, -1.0)
+    star = np.array((0.09, 0.004, 0.08))
+    one["stamps"] = np.array([gaussian(SIDE, of + star, one["wcs"], at, 1000.0) for of, at in zip(shapes, one["offsets"])])
+    psfs = np.array([gaussian(32, star, one["wcs"], (0.4, -0.3), 1.0)] * 40)
+    for given in (one, {**one, "psf": psfs, "psf_offsets": (0.4, -0.3)}):
+        alone = shearq.measure(epochs=[given])
+        # A second epoch of no weight.
+        several = shearq.measure(epochs=[given, {**given, "noise": 1e5}])
+        for name in ("e1", "e2", "R11", "R22", "flux"):
+            assert np.allclose(alone[name], several[name], rtol=1e-5, atol=1e-6), name
+    # Off the centre by 2 px, the window loses light.
+    centred = shearq.measure(one["stamps"], one["psf"], noise=0.01, wcs=one["wcs"])
+    assert abs(centred["e1"] - shearq.measure(epochs=[one])["e1"]).max() > 1e-3
 
 
 def test_epochs_of_any_orientation_measure_the_same_galaxies():

@@ -1,6 +1,6 @@
 //! Pixels that hold no light: fill values, dead and hot pixels, cosmic rays. They become missing.
 //!
-//! Four properties of light behind a PSF decide, none of which a shear of the galaxy changes:
+//! Five properties of light behind a PSF decide, none of which a shear of the galaxy changes:
 //!
 //! * **Noise repeats no value.** An area of one value is a fill value, unless it is as dark as the stamp gets (no light at
 //!   all, as in counts of photons) or joins its surroundings without a step (noise-free light that ends). How large
@@ -9,9 +9,12 @@
 //! * **A pixel is at most R_d times as bright as the mean of the two pixels ±d from it**: positive light f behind a PSF p has the
 //!   image Σ f(y) p(x − y), so that R_d is the largest ratio of p(y) to the mean of p(y + d) and p(y − d) at any place y,
 //!   pixel phases included.
-//! * **Light next to a defect** may be the edge of it, and is tested more strictly.
+//! * **Light falls no more steeply than the PSF**: a pixel is at most Q_d times as bright as the mean of the next two in any
+//!   direction, by the largest ratio of p(y) to the mean of p(y + d) and p(y + 2d). So the edges of areas are found that are bright all over.
+//! * **Light next to a defect** may be the edge of it, and is tested more strictly. A bright pixel inside a corner of defects is one.
 //!
-//! R_d is bounded by the peak of the PSF: exp(|d|² [`RATIO_EXPONENT`] p_max) [`RATIO_MARGIN`]. Noise and light fainter than a share of
+//! R_d is bounded by the peak of the PSF: exp(|d|² [`RATIO_EXPONENT`] p_max) [`RATIO_MARGIN`], and that of a well sampled PSF by its ratios on its
+//! pixels. Noise and light fainter than a share of
 //! the stamp's peak are allowed for, so that rings of diffraction and Poisson noise of a bright galaxy do not count. On a stamp
 //! of pure noise, no pixel is touched with a probability of 1 − 10⁻¹².
 
@@ -29,12 +32,26 @@ const PAIRS: [(isize, isize); 6] = [(1, 0), (0, 1), (1, 1), (1, -1), (2, 0), (0,
 const RATIO_EXPONENT: f32 = 12.0;
 // Chosen by hand: Poisson noise of cores changes the ratio, and so do errors of the PSF.
 const RATIO_MARGIN: f32 = 1.5;
+// Peak of a PSF of sum one below which its pixels show its ratios: FWHM of 2.4 px or more of Moffat PSFs. At other phases those to opposite pixels are at most
+// 1.25 times as large, which the margin covers; a star of FWHM 1.5 px falls eight times as steeply as its pixels show.
+const MAX_SAMPLED_PEAK: f64 = 0.12;
+// Directions d in which light falls, and their opposites.
+const DIRECTIONS: usize = 4;
+// Of Q_d, which depends on the phase more than R_d. Chosen by hand.
+const STEEPNESS_MARGIN: f32 = 2.0;
+// Defects around a bright pixel by which it is one: beside a straight edge there are three, in a corner five. Chosen by hand.
+const MIN_DEFECTS_AROUND: usize = 5;
+// Of the stamp's brightest pixel, from which a pixel is dead if it is darker than all pairs around it by R_d. The middle of a ring as wide as such a
+// contrast allows has 0.7 of the light one pixel from it, behind a Gaussian PSF of FWHM 3.4 px.
+const MIN_CORE_SHARE: f32 = 0.5;
 // Of the stamp's brightest pixel. Rings and spikes of diffraction are fainter. Chosen by hand.
 const FAINT_SHARE: f32 = 0.1;
 // In units of the noise. Gaussian noise exceeds it in one of 10¹⁵ pixels.
 const MIN_DEPARTURE: f32 = 8.0;
 // The same for pixels next to a defect. Chosen by hand, as in LA Cosmic (van Dokkum 2001, PASP 113, 1420).
 const MIN_DEPARTURE_BESIDE: f32 = 4.0;
+// The same in units of sky and counted light. Chosen by hand.
+const MIN_DEPARTURE_DEAD: f32 = 5.0;
 // Times the depth of the PSF's side lobes. Chosen by hand.
 const LOBE_MARGIN: f32 = 1.5;
 // Chance of an area of one value per stamp. Chosen by hand.
@@ -43,7 +60,8 @@ const MAX_CHANCE: f64 = 1e-6;
 const AREA_SIDES: std::ops::RangeInclusive<usize> = 3..=15;
 // Equal neighbours that a square of 3 × 3 pixels in the last rows has at least, and a line of nine in another one.
 const MIN_EQUAL_PAIRS: u32 = 6;
-// Mean step at the edge of an area, in units of the brightest pixel. Noise of S/N 1000 has 0.006, noise-free wings have less.
+// Lower quartile of the steps at the edge of an area, in units of the brightest pixel: noise of S/N 1000 has 0.002, noise-free wings have less, also on
+// a gradient along an axis, whose steps along the other one are small.
 const MIN_STEP: f32 = 5e-4;
 // Each pass may uncover pixels that were hidden by those beside them: of a square of nine hot pixels first the corners.
 const MAX_PASSES: usize = 8;
@@ -60,6 +78,9 @@ pub(crate) struct LightLimits {
     /// Departures from them that noise may cause, in units of its departure for one pixel. The mean of a pair is not taken below
     /// zero and R_d has a margin, so that half of R_d amplifies its noise.
     noise: [f32; PAIRS.len()],
+    /// Q_d of the first [`DIRECTIONS`] of [`PAIRS`], with its margin, and the departures that noise may cause.
+    steepness: [f32; DIRECTIONS],
+    steepness_noise: [f32; DIRECTIONS],
     /// Depth of the side lobes in units of the peak.
     lobe: f32,
 }
@@ -70,15 +91,63 @@ impl LightLimits {
         let (low, high) = psf.fold((0.0f64, 0.0f64), |(low, high), &value| {
             (low.min(value), high.max(value))
         });
+        let at = |(row, column): (usize, usize), (x, y): (isize, isize)| {
+            let place = (row.wrapping_add_signed(y), column.wrapping_add_signed(x));
+            psf.get(place).copied().unwrap_or(0.0)
+        };
+        let bright = || {
+            let pixels = psf.indexed_iter();
+            pixels.filter(|(_, value)| **value >= f64::from(FAINT_SHARE) * high)
+        };
+        // Largest ratio to the mean of two other pixels; infinite where these have no light, or where pixels do not show it.
+        let largest = |others: [(isize, isize); 2]| {
+            if high >= MAX_SAMPLED_PEAK {
+                return f32::INFINITY;
+            }
+            let ratios = bright().map(|(place, value)| {
+                let mean = 0.5 * (at(place, others[0]) + at(place, others[1]));
+                value / mean.max(0.0)
+            });
+            ratios.fold(0.0, f64::max) as f32
+        };
         let ratios = PAIRS.map(|(x, y)| {
-            RATIO_MARGIN * (RATIO_EXPONENT * high as f32 * (x * x + y * y) as f32).exp()
+            let bound = (RATIO_EXPONENT * high as f32 * (x * x + y * y) as f32).exp();
+            RATIO_MARGIN * bound.min(largest([(x, y), (-x, -y)]))
+        });
+        let steepness = std::array::from_fn(|k| {
+            let (x, y) = PAIRS[k];
+            let both = [1, -1].map(|sign| (sign * x, sign * y));
+            let ratios = both.map(|(x, y)| largest([(x, y), (2 * x, 2 * y)]));
+            STEEPNESS_MARGIN * ratios[0].max(ratios[1])
         });
         LightLimits {
             ratios,
-            noise: ratios.map(|ratio| (1.0 + ratio * ratio / 8.0).sqrt()),
+            noise: ratios.map(ratio_noise),
+            steepness,
+            steepness_noise: steepness.map(ratio_noise),
             lobe: LOBE_MARGIN * (-low / high) as f32,
         }
     }
+
+    /// For light behind either of two PSFs.
+    pub(crate) fn wider(&self, other: &Self) -> Self {
+        LightLimits {
+            ratios: largest_of(self.ratios, other.ratios),
+            noise: largest_of(self.noise, other.noise),
+            steepness: largest_of(self.steepness, other.steepness),
+            steepness_noise: largest_of(self.steepness_noise, other.steepness_noise),
+            lobe: self.lobe.max(other.lobe),
+        }
+    }
+}
+
+/// Departure from a ratio to the mean of two pixels that noise may cause, in units of its departure for one pixel.
+fn ratio_noise(ratio: f32) -> f32 {
+    (1.0 + ratio * ratio / 8.0).sqrt()
+}
+
+fn largest_of<const N: usize>(one: [f32; N], other: [f32; N]) -> [f32; N] {
+    std::array::from_fn(|k| one[k].max(other[k]))
 }
 
 /// Finds defects, with buffers for one thread.
@@ -91,6 +160,8 @@ pub(crate) struct Defects {
     runs: Vec<usize>,
     places: Vec<usize>,
     values: Vec<f32>,
+    /// A stamp less the level of its border.
+    levelled: Vec<f32>,
 }
 
 impl Defects {
@@ -102,36 +173,56 @@ impl Defects {
             runs: Vec::with_capacity(n),
             places: Vec::with_capacity(n * n),
             values: Vec::with_capacity(n * n),
+            levelled: Vec::with_capacity(n * n),
         }
     }
 
-    /// Makes the pixels of a stamp of `n` pixels a side NaN that hold no light, in noise of this level.
-    pub(crate) fn remove(
+    /// Makes the pixels of a stamp of `n` pixels a side NaN that hold no light, before its sky and noise are known.
+    pub(crate) fn remove_before_survey(
+        &mut self,
+        stamp: &mut [f32],
+        n: usize,
+        limits: &LightLimits,
+    ) -> DefectCounts {
+        let mut found = DefectCounts {
+            repeated: self.remove_repeated(stamp, n, Screening::of(stamp, n)),
+            ..DefectCounts::default()
+        };
+        let StampSky { level, noise, .. } = self.border_sky(stamp, n);
+        let mut levelled = std::mem::take(&mut self.levelled);
+        levelled.clear();
+        levelled.extend(stamp.iter().map(|value| value - level));
+        let repeated = found.total();
+        self.remove_unlit(&mut levelled, n, noise, limits, &mut found);
+        self.levelled = levelled;
+        if found.total() > repeated {
+            let marked = stamp.iter_mut().zip(&self.marks).filter(|(_, mark)| **mark);
+            marked.for_each(|(value, _)| *value = f32::NAN);
+        }
+        found
+    }
+
+    /// Makes pixels NaN that are too dark or too bright, in noise of this level and without sky. Counts them beside those that were `found`
+    /// by [`Defects::remove_repeated`] on the same stamp.
+    pub(crate) fn remove_unlit(
         &mut self,
         stamp: &mut [f32],
         n: usize,
         noise: f32,
         limits: &LightLimits,
-    ) -> DefectCounts {
-        let mut found = DefectCounts::default();
-        let screening = Screening::of(stamp, n);
-        let may_repeat = screening.equal >= MIN_EQUAL_PAIRS;
+        found: &mut DefectCounts,
+    ) {
         let mut sky = StampSky::of_noise(noise);
-        if !may_repeat && !Threshold::of(screening.extremes(), &sky, limits).is_exceeded() {
-            return found;
+        if found.is_empty() {
+            if !Threshold::of(extremes(stamp), &sky, limits).is_exceeded() {
+                return;
+            }
+            self.clear_marks(stamp.len());
         }
-        for value in stamp.iter_mut().filter(|value| value.is_infinite()) {
-            *value = f32::NAN;
-        }
-        self.marks.clear();
-        self.marks.resize(stamp.len(), false);
+        remove_infinite(stamp);
         let mut is_measured = false;
         for _ in 0..MAX_PASSES {
-            let before = found.total();
-            if may_repeat {
-                found.repeated += self.remove_repeated(stamp, n, &sky);
-            }
-            let beside = found.total() > 0;
+            let beside = !found.is_empty();
             let mut is_dark = self.find(stamp, n, &sky, limits, beside);
             if !self.places.is_empty() && !is_measured {
                 for &at in &self.places {
@@ -144,6 +235,9 @@ impl Defects {
                 is_measured = true;
                 is_dark = self.find(stamp, n, &sky, limits, beside);
             }
+            if self.places.is_empty() {
+                break;
+            }
             for &at in &self.places {
                 self.marks[at] = true;
                 stamp[at] = f32::NAN;
@@ -153,11 +247,12 @@ impl Defects {
                 true => found.dark += count,
                 false => found.bright += count,
             }
-            if found.total() == before {
-                break;
-            }
         }
-        found
+    }
+
+    fn clear_marks(&mut self, pixels: usize) {
+        self.marks.clear();
+        self.marks.resize(pixels, false);
     }
 
     /// Finds pixels that are too dark or, if there are none, too bright, with lower limits `beside` pixels that were found.
@@ -171,7 +266,7 @@ impl Defects {
         beside: bool,
     ) -> bool {
         self.places.clear();
-        let threshold = Threshold::of(Screening::of(stamp, n).extremes(), sky, limits);
+        let threshold = Threshold::of(extremes(stamp), sky, limits);
         if !beside && !threshold.is_exceeded() {
             return false;
         }
@@ -197,6 +292,10 @@ impl Defects {
         if !self.places.is_empty() {
             return true;
         }
+        find_dead(&mut self.places, stamp, n, sky, limits, &threshold);
+        if !self.places.is_empty() {
+            return true;
+        }
         let floor = sky.level + threshold.faint + least * sky.noise * limits.noise[0];
         for (first, values) in (0..).step_by(LANES).zip(stamp.chunks(LANES)) {
             // Without an early exit, so that several pixels are tested at a time.
@@ -209,8 +308,9 @@ impl Defects {
             for (at, &value) in (first..).zip(values) {
                 if value > floor {
                     let noise = departure(at) * sky.noise_at(stamp, n, at);
-                    if value - sky.level - threshold.faint
-                        > most_light(stamp, n, at, (sky.level, noise), limits)
+                    let light = value - sky.level - threshold.faint;
+                    if light > most_light(stamp, n, at, (sky.level, noise), limits)
+                        || beside && light > noise && self.is_inside(n, at)
                     {
                         self.places.push(at);
                     }
@@ -218,6 +318,11 @@ impl Defects {
             }
         }
         false
+    }
+
+    /// Whether a pixel is in a corner of defects.
+    fn is_inside(&self, n: usize, at: usize) -> bool {
+        around(at, n).filter(|&at| self.marks[at]).count() >= MIN_DEFECTS_AROUND
     }
 
     /// The sky and the noise of a stamp beside marked pixels. It may be noisier than its image, with a sky of its own, and counts
@@ -255,42 +360,84 @@ impl Defects {
         }
     }
 
-    /// Removes areas of one value. Returns the number of pixels.
-    fn remove_repeated(&mut self, stamp: &mut [f32], n: usize, sky: &StampSky) -> u32 {
+    /// Level and scatter of the border of a stamp as it was read.
+    fn border_sky(&mut self, stamp: &[f32], n: usize) -> StampSky {
+        let values = &mut self.values;
+        values.clear();
+        let border = frame(stamp, n, BORDER).flatten().copied();
+        values.extend(border.filter(|value| value.is_finite()));
+        let level = median(values).unwrap_or(0.0);
+        values
+            .iter_mut()
+            .for_each(|value| *value = (*value - level).abs());
+        let scatter = SCATTER * median(values).unwrap_or(0.0);
+        // Most pixels of few counts have one value.
+        let noise = if scatter > 0.0 {
+            scatter
+        } else {
+            let square: f64 = values.iter().map(|value| f64::from(*value).powi(2)).sum();
+            (square / values.len().max(1) as f64).sqrt() as f32
+        };
+        StampSky {
+            level,
+            ..StampSky::of_noise(noise)
+        }
+    }
+
+    /// Makes areas of one value NaN on a stamp as it was read: a sky that is subtracted with its gradient makes values differ. Returns
+    /// the number of pixels.
+    pub(crate) fn remove_repeated(
+        &mut self,
+        stamp: &mut [f32],
+        n: usize,
+        screening: Screening,
+    ) -> u32 {
+        if !screening.may_repeat() {
+            return 0;
+        }
+        remove_infinite(stamp);
         let Some(side) = area_side(stamp, n) else {
             return 0;
         };
+        let sky = self.border_sky(stamp, n);
         // The darkest value may recur, as zeros of counts without sky. A pixel far below the sky is not the darkest: one of −99 would
         // make an area of all zeros.
         let dark = match sky.noise > 0.0 {
-            true => sky.level - MIN_DEPARTURE * sky.noise,
+            true => sky.level - MIN_DEPARTURE_BESIDE * sky.noise,
             false => f32::NEG_INFINITY,
         };
         let bright = stamp.iter().copied().filter(|&value| value >= dark);
         let low = bright.fold(f32::INFINITY, f32::min);
+        self.clear_marks(stamp.len());
         self.mark_areas(stamp, n, side, low);
-        let (mut step, mut pairs, mut high) = (0.0f32, 0u32, 0.0f32);
-        for (at, &value) in stamp.iter().enumerate() {
-            if !self.marks[at] && value > high {
-                high = value;
-            }
-            for beside in beside(at, n) {
-                if self.marks[at] != self.marks[beside] {
-                    let apart = (value - stamp[beside]).abs();
-                    if apart.is_finite() {
-                        step += apart;
-                        pairs += 1;
-                    }
-                }
-            }
-        }
-        let is_light = pairs > 0 && step < MIN_STEP * high * pairs as f32;
+        let unmarked = stamp.iter().zip(&self.marks).filter(|(_, mark)| !**mark);
+        let high = unmarked.fold(f32::NEG_INFINITY, |high, (value, _)| high.max(*value));
         let mut count = 0;
-        for (mark, value) in self.marks.iter_mut().zip(stamp) {
-            if *mark && !value.is_nan() {
-                *mark = !is_light;
+        for first in 0..stamp.len() {
+            if !self.marks[first] || stamp[first].is_nan() {
+                continue;
+            }
+            self.collect_area(n, first);
+            let Defects {
+                marks,
+                places,
+                values,
+                ..
+            } = &mut *self;
+            values.clear();
+            for &at in &*places {
+                let outside = beside(at, n).filter(|&other| !marks[other]);
+                let steps = outside.map(|other| (stamp[at] - stamp[other]).abs());
+                values.extend(steps.filter(|step| step.is_finite()));
+            }
+            let quarter = values.len() / 4;
+            let is_light = !values.is_empty()
+                && *values.select_nth_unstable_by(quarter, f32::total_cmp).1
+                    < MIN_STEP * (high - sky.level);
+            for &at in &self.places {
+                self.marks[at] = !is_light;
                 if !is_light {
-                    *value = f32::NAN;
+                    stamp[at] = f32::NAN;
                     count += 1;
                 }
             }
@@ -298,7 +445,23 @@ impl Defects {
         count
     }
 
-    /// Marks squares of `side` pixels of one value above `low`, and lines of as many pixels.
+    /// Collects the places of marked pixels that are connected with `first` by their sides: an area, or several that touch.
+    fn collect_area(&mut self, n: usize, first: usize) {
+        let Defects { marks, places, .. } = self;
+        places.clear();
+        places.push(first);
+        marks[first] = false;
+        let mut next = 0;
+        while let Some(&at) = places.get(next) {
+            for other in beside(at, n).filter(|&other| std::mem::take(&mut marks[other])) {
+                places.push(other);
+            }
+            next += 1;
+        }
+        places.iter().for_each(|&at| marks[at] = true);
+    }
+
+    /// Marks squares of `side` pixels of one value other than `low`, and lines of as many pixels.
     fn mark_areas(&mut self, stamp: &[f32], n: usize, side: usize, low: f32) {
         let length = side * side;
         for buffer in self.squares.iter_mut().chain([&mut self.runs]) {
@@ -319,7 +482,7 @@ impl Defects {
                     true => 1 + this[x - 1].min(last[x]).min(last[x - 1]),
                     false => 1,
                 };
-                if value.is_nan() || value <= low {
+                if value.is_nan() || value == low {
                     continue;
                 }
                 if this[x] >= side {
@@ -400,6 +563,71 @@ impl Threshold {
     }
 }
 
+/// Finds pixels in a bright core that are much darker than those around them.
+fn find_dead(
+    places: &mut Vec<usize>,
+    stamp: &[f32],
+    n: usize,
+    sky: &StampSky,
+    limits: &LightLimits,
+    threshold: &Threshold,
+) {
+    let core = MIN_CORE_SHARE * (threshold.high - sky.level);
+    if core < MIN_DEPARTURE * sky.noise {
+        return;
+    }
+    for (first, values) in (0usize..).step_by(LANES).zip(stamp.chunks(LANES)) {
+        if !values
+            .iter()
+            .fold(false, |any, value| any | (*value - sky.level > core))
+        {
+            continue;
+        }
+        // One of the pixels left and right of a dead one is as bright as their mean.
+        let bright = (first..)
+            .zip(values)
+            .filter(|(_, v)| **v - sky.level > core);
+        for (bright, _) in bright {
+            for at in [bright.wrapping_sub(1), bright + 1] {
+                if at >= stamp.len() || places.contains(&at) {
+                    continue;
+                }
+                let (value, around) = (stamp[at] - sky.level, pair_means(stamp, n, at));
+                let least = around.into_iter().take(DIRECTIONS);
+                let least = least.fold(f32::INFINITY, f32::min) - sky.level;
+                // Of a sky of one electron or more, so that electrons are no fewer per unit than 1/σ.
+                let counted = (sky.noise * (sky.noise + least)).sqrt();
+                if (core..f32::INFINITY).contains(&least)
+                    && value < least / limits.ratios[0]
+                    && least - value > MIN_DEPARTURE * sky.noise
+                    && least - value > MIN_DEPARTURE_DEAD * counted
+                {
+                    places.push(at);
+                }
+            }
+        }
+    }
+}
+
+/// The means of [`PAIRS`] of pixels; NaN with one that is missing or off the stamp.
+fn pair_means(stamp: &[f32], n: usize, at: usize) -> [f32; PAIRS.len()] {
+    PAIRS.map(|(dx, dy)| {
+        0.5 * offset_pixel(stamp, n, at, (dx, dy)) + 0.5 * offset_pixel(stamp, n, at, (-dx, -dy))
+    })
+}
+
+/// The pixel (dx, dy) from a pixel; NaN off the stamp.
+fn offset_pixel(stamp: &[f32], n: usize, at: usize, (dx, dy): (isize, isize)) -> f32 {
+    let (x, y) = (
+        (at % n).wrapping_add_signed(dx),
+        (at / n).wrapping_add_signed(dy),
+    );
+    match x < n && y < n {
+        true => stamp[y * n + x],
+        false => f32::NAN,
+    }
+}
+
 /// The most light above `level` that a pixel can have, given those around it and a departure by noise.
 fn most_light(
     stamp: &[f32],
@@ -408,24 +636,23 @@ fn most_light(
     (level, noise): (f32, f32),
     limits: &LightLimits,
 ) -> f32 {
-    let (x, y) = ((at % n) as isize, (at / n) as isize);
-    let value = |x: isize, y: isize| {
-        // Negative places are large.
-        match (x as usize) < n && (y as usize) < n {
-            true => stamp[y as usize * n + x as usize],
-            false => f32::NAN,
+    let mut most = f32::INFINITY;
+    // A pair with a missing pixel bounds nothing. NaN is also an infinite ratio times no light.
+    let mut bound_by = |mean: f32, ratio: f32, departure: f32| {
+        let bound = ratio * (mean - level).max(0.0) + noise * departure;
+        if !mean.is_nan() && bound < most {
+            most = bound;
         }
     };
-    let mut most = f32::INFINITY;
-    for (k, (dx, dy)) in PAIRS.into_iter().enumerate() {
-        let mean = 0.5 * value(x + dx, y + dy) + 0.5 * value(x - dx, y - dy) - level;
-        let bound = limits.ratios[k] * mean.max(0.0) + noise * limits.noise[k];
-        // A pair with a missing pixel bounds nothing.
-        most = if !mean.is_nan() && bound < most {
-            bound
-        } else {
-            most
-        };
+    for (k, mean) in pair_means(stamp, n, at).into_iter().enumerate() {
+        bound_by(mean, limits.ratios[k], limits.noise[k]);
+    }
+    for (k, (dx, dy)) in PAIRS.into_iter().take(DIRECTIONS).enumerate() {
+        for (dx, dy) in [(dx, dy), (-dx, -dy)] {
+            let next = offset_pixel(stamp, n, at, (dx, dy));
+            let mean = 0.5 * next + 0.5 * offset_pixel(stamp, n, at, (2 * dx, 2 * dy));
+            bound_by(mean, limits.steepness[k], limits.steepness_noise[k]);
+        }
     }
     if most == f32::INFINITY {
         // A corner, or between missing pixels. A diagonal pair is as far as any of the pixels around.
@@ -504,11 +731,15 @@ fn majority_of_counts(stamp: &[f32]) -> f64 {
     }
 }
 
-/// The pixels to the right of a pixel and above it in a stamp of `n` pixels a side.
+/// The up to four pixels beside a pixel in a stamp of `n` pixels a side.
 fn beside(at: usize, n: usize) -> impl Iterator<Item = usize> {
+    let left = (!at.is_multiple_of(n)).then(|| at - 1);
     let right = (at % n + 1 < n).then_some(at + 1);
     let above = (at + n < n * n).then_some(at + n);
-    right.into_iter().chain(above)
+    left.into_iter()
+        .chain(right)
+        .chain(at.checked_sub(n))
+        .chain(above)
 }
 
 /// The up to eight pixels around a pixel.
@@ -519,37 +750,38 @@ fn around(at: usize, n: usize) -> impl Iterator<Item = usize> {
         .filter(move |&other| other != at)
 }
 
-/// What shows that no pixel of a stamp has to be compared with others, as of nearly all stamps.
+fn remove_infinite(stamp: &mut [f32]) {
+    for value in stamp.iter_mut().filter(|value| value.is_infinite()) {
+        *value = f32::NAN;
+    }
+}
+
+/// What shows that a stamp as it was read has no areas of one value, as nearly all stamps.
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct Screening {
-    /// Smallest and largest pixel, without NaN.
-    low: f32,
-    high: f32,
-    /// Pixels below the last row with the value of the next one, in the order of rows, or of the one above.
+pub(crate) struct Screening {
+    /// Pixels with the value of the next one, in the order of rows, or of the one above.
     equal: u32,
 }
 
 impl Screening {
-    fn of(stamp: &[f32], n: usize) -> Self {
-        let (mut found, rest) = screen(stamp, n);
-        for &value in &stamp[rest..] {
-            found.low = found.low.min(value);
-            found.high = found.high.max(value);
+    pub(crate) fn of(stamp: &[f32], n: usize) -> Self {
+        let last = &stamp[stamp.len() - n..];
+        let in_last = last.windows(2).filter(|pair| pair[0] == pair[1]).count();
+        Screening {
+            equal: equal_below(stamp, n) + in_last as u32,
         }
-        found
     }
 
-    fn extremes(&self) -> [f32; 2] {
-        [self.low, self.high]
+    /// Whether rows, or the whole stamp, may have one value.
+    pub(crate) fn may_repeat(self) -> bool {
+        self.equal >= MIN_EQUAL_PAIRS
     }
 }
 
-/// The screening of the pixels below the last row but few, and the number of pixels.
+/// The pixels below the last row with the value of the next one or of the one above.
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn screen(stamp: &[f32], n: usize) -> (Screening, usize) {
+fn equal_below(stamp: &[f32], n: usize) -> u32 {
     // Side by side, so that vector instructions take several pixels at a time.
-    let mut low = [f32::INFINITY; LANES];
-    let mut high = [f32::NEG_INFINITY; LANES];
     let mut equal = [0u32; LANES];
     let below = stamp.len() - n;
     let (values, rest) = stamp[..below].as_chunks::<LANES>();
@@ -558,25 +790,42 @@ fn screen(stamp: &[f32], n: usize) -> (Screening, usize) {
     for ((values, next), above) in values.iter().zip(next).zip(above) {
         for lane in 0..LANES {
             let value = values[lane];
+            equal[lane] += u32::from((value == next[lane]) | (value == above[lane]));
+        }
+    }
+    for at in below - rest.len()..below {
+        equal[0] += u32::from((stamp[at] == stamp[at + 1]) | (stamp[at] == stamp[at + n]));
+    }
+    equal.iter().sum()
+}
+
+/// Smallest and largest pixel, without NaN.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn extremes(stamp: &[f32]) -> [f32; 2] {
+    let mut low = [f32::INFINITY; LANES];
+    let mut high = [f32::NEG_INFINITY; LANES];
+    let (chunks, rest) = stamp.as_chunks::<LANES>();
+    for values in chunks {
+        for lane in 0..LANES {
+            let value = values[lane];
             low[lane] = if value < low[lane] { value } else { low[lane] };
             high[lane] = if value > high[lane] {
                 value
             } else {
                 high[lane]
             };
-            equal[lane] += u32::from((value == next[lane]) | (value == above[lane]));
         }
     }
-    let done = below - rest.len();
-    for at in done..below {
-        equal[0] += u32::from((stamp[at] == stamp[at + 1]) | (stamp[at] == stamp[at + n]));
-    }
-    let found = Screening {
-        low: low.into_iter().fold(f32::INFINITY, f32::min),
-        high: high.into_iter().fold(f32::NEG_INFINITY, f32::max),
-        equal: equal.iter().sum(),
+    let all = |lanes: [f32; LANES], of: fn(f32, f32) -> f32, first: f32| {
+        lanes
+            .into_iter()
+            .chain(rest.iter().copied())
+            .fold(first, of)
     };
-    (found, done)
+    [
+        all(low, f32::min, f32::INFINITY),
+        all(high, f32::max, f32::NEG_INFINITY),
+    ]
 }
 
 #[cfg(test)]

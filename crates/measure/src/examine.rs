@@ -11,6 +11,7 @@ use shearq_quantities::linear::{Matrix2, apply, determinant};
 use shearq_quantities::statistics::{OF_MEDIAN, median, scatter};
 use shearq_submissions::PsfCut;
 
+use crate::defects::{Defects, LightLimits};
 use crate::error::MeasureError;
 use crate::moments::{
     CENTROID_WEIGHT_SIGMA, CORE_RADIUS_PX, CoreSize, core_sums, galaxy_centroid_near,
@@ -121,12 +122,17 @@ struct StampStatistics {
 #[derive(Debug, Clone)]
 pub struct Examination {
     stamp: FullStamp,
+    /// What pixels hold light, if it is known.
+    light: Option<LightLimits>,
+    defects: Defects,
     block: usize,
     stamps: Vec<StampStatistics>,
     /// Stamps that were added.
     added: usize,
     blank: usize,
     psfs: Vec<PsfQuality>,
+    /// What light behind these PSFs can look like.
+    psf_light: Option<LightLimits>,
     /// Of PSFs of one galaxy each: their centroid, and that of the galaxy from its expected place.
     pairs: Vec<[[f64; 2]; 2]>,
     /// Whether there is a PSF per galaxy.
@@ -164,11 +170,14 @@ impl Examination {
     pub fn new(full: usize, count: usize) -> Self {
         Examination {
             stamp: FullStamp::new(full),
+            light: None,
+            defects: Defects::new(full),
             block: BLOCK.min(full / BLOCKS_PER_SIDE),
             stamps: Vec::with_capacity(count),
             added: 0,
             blank: 0,
             psfs: Vec::new(),
+            psf_light: None,
             pairs: Vec::new(),
             each: false,
         }
@@ -180,6 +189,17 @@ impl Examination {
         self
     }
 
+    /// The same for stamps from which pixels are removed that hold no light.
+    pub(crate) fn with_light(self, light: Option<LightLimits>) -> Self {
+        Examination { light, ..self }
+    }
+
+    /// The same for stamps behind the PSFs that another examination has, from which pixels are removed that hold no light.
+    #[must_use]
+    pub fn behind(self, psfs: &Examination) -> Self {
+        self.with_light(psfs.psf_light)
+    }
+
     /// The same for PSFs of one galaxy each.
     #[must_use]
     pub fn with_psf_of_each(self) -> Self {
@@ -189,6 +209,8 @@ impl Examination {
     /// Examines the PSF of all galaxies, of sum one, whose star was at the offset `moved` in pixels before it was centred.
     pub fn add_psf(&mut self, psf: ArrayView2<'_, f64>, moved: Option<[f64; 2]>) {
         self.psfs.extend(PsfQuality::from_psf(psf, moved));
+        let own = LightLimits::from_psf(psf);
+        self.psf_light = Some(self.psf_light.map_or(own, |all| all.wider(&own)));
     }
 
     /// Examines a PSF of all galaxies, or up to `most` PSFs of one galaxy each, as a configuration cuts them. PSFs that
@@ -234,6 +256,10 @@ impl Examination {
         if self.stamp.is_blank() {
             self.blank += 1;
             return Ok(());
+        }
+        if let Some(light) = &self.light {
+            let pixels = &mut self.stamp.pixels;
+            self.defects.remove_before_survey(pixels, n, light);
         }
         // Without pixels, as of a galaxy that an exposure does not contain. All such stamps would be copies of each other.
         if self.stamp.pixels.iter().all(|value| !value.is_finite()) {

@@ -10,7 +10,7 @@ use ndarray::{Array2, ArrayView2, ArrayView3};
 use shearq_quantities::{Jacobian, PixelShape, Spin2};
 use shearq_submissions::{Configuration, ConfigurationError, NoiseSource, Registry};
 
-use crate::defects::{Defects, LightLimits};
+use crate::defects::{Defects, LightLimits, Screening};
 use crate::denoise::{DenoiseScratch, WaveletWiener, border_noise};
 use crate::error::{EpochError, MeasureError};
 use crate::measurement::{DefectCounts, Flag, Measurement, PsfShape};
@@ -142,7 +142,7 @@ impl Measurer {
             cut: vec![0.0; n * n],
             border: Vec::with_capacity(plan.full * plan.full),
             missing: MissingPixels::new(n),
-            defects: Defects::new(n),
+            defects: Defects::new(plan.full),
             found_defects: DefectCounts::default(),
             light: LightLimits::default(),
             to_sky: None,
@@ -373,8 +373,14 @@ impl Worker {
         self.found_defects = DefectCounts::default();
         self.full.read(stamp)?;
         let mut whole = all_finite(&self.full.pixels);
-        if linear && mark_padding_missing(&mut self.full.pixels, plan.full) {
-            whole = false;
+        if linear {
+            let screening = Screening::of(&self.full.pixels, plan.full);
+            let pixels = &mut self.full.pixels;
+            if screening.may_repeat() && mark_padding_missing(pixels, plan.full) {
+                whole = false;
+            }
+            self.found_defects.repeated =
+                self.defects.remove_repeated(pixels, plan.full, screening);
         }
         if !whole && !linear {
             return Ok(Err(Measurement::flagged(Flag::NotFinite)));
@@ -397,6 +403,12 @@ impl Worker {
         if let (Some(filter), Some(buffers)) = (&plan.denoise, &mut self.denoise) {
             filter.apply(pixels, noise as f32, buffers);
         }
+        if linear {
+            let (noise, found) = (noise as f32, &mut self.found_defects);
+            self.defects
+                .remove_unlit(pixels, plan.full, noise, &self.light, found);
+            whole &= found.is_empty();
+        }
         if n == plan.full {
             std::mem::swap(&mut self.cut, pixels);
         } else {
@@ -405,10 +417,6 @@ impl Worker {
                 let from = (start + y) * plan.full + start;
                 row.copy_from_slice(&pixels[from..from + n]);
             }
-        }
-        if linear {
-            self.found_defects = (self.defects).remove(&mut self.cut, n, noise as f32, &self.light);
-            whole &= self.found_defects.is_empty();
         }
         if !whole && !self.missing.fill(&mut self.cut, n) {
             return Ok(Err(Measurement::flagged(Flag::NotFinite)));

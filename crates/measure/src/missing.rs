@@ -88,6 +88,9 @@ impl MissingPixels {
         let pixels = stamp.iter().enumerate();
         let missing = pixels.filter(|(_, value)| !value.is_finite());
         self.places.extend(missing.map(|(at, _)| at));
+        if self.places.is_empty() {
+            return true;
+        }
         if self.places.len() as f32 > MAX_MISSING_SHARE * stamp.len() as f32 {
             return false;
         }

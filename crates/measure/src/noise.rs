@@ -28,6 +28,7 @@ use shearq_quantities::linear::{Pivots, eliminate, substitute};
 use shearq_quantities::statistics::{SCATTER, median};
 use shearq_submissions::SkySource;
 
+use crate::defects::{Defects, LightLimits};
 use crate::error::MeasureError;
 use crate::examine::enough;
 use crate::missing::{MissingPixels, padding, rotation_sum};
@@ -292,6 +293,8 @@ impl NoisePlan {
                 subtraction: SkySubtraction::of(self.sky, None),
                 ..FullStamp::new(self.full)
             },
+            light: None,
+            defects: Defects::new(self.full),
             asymmetry: Asymmetry::new(self.full),
             missing: MissingPixels::new(self.full),
             contrasts: Vec::new(),
@@ -451,6 +454,9 @@ pub struct NoiseSurvey {
     plan: NoisePlan,
     /// Its sky is subtracted for all but the noise.
     stamp: FullStamp,
+    /// What pixels hold light, if it is known.
+    light: Option<LightLimits>,
+    defects: Defects,
     asymmetry: Asymmetry,
     missing: MissingPixels,
     /// Of each place of the last stamp its excess over its opposite in units of √pixels, and its (x, y) from the galaxy.
@@ -472,6 +478,11 @@ pub struct NoiseSurvey {
 }
 
 impl NoiseSurvey {
+    /// The same of stamps from which pixels are removed that hold no light.
+    pub(crate) fn with_light(self, light: Option<LightLimits>) -> Self {
+        NoiseSurvey { light, ..self }
+    }
+
     /// Surveys a stamp. Blocks with missing pixels are left out, those along an edge whose pixels are all equal (padding has
     /// no noise), and stamps where too many pixels are missing or all are equal.
     ///
@@ -480,8 +491,12 @@ impl NoiseSurvey {
     pub fn add<T: Pixel>(&mut self, stamp: ArrayView2<'_, T>) -> Result<(), MeasureError> {
         let full = self.plan.full;
         self.stamp.read(stamp)?;
-        let is_whole = all_finite(&self.stamp.pixels);
         let padded = padding(&self.stamp.pixels, full).map(|depth| depth > 0);
+        if let Some(light) = &self.light {
+            let pixels = &mut self.stamp.pixels;
+            self.defects.remove_before_survey(pixels, full, light);
+        }
+        let is_whole = all_finite(&self.stamp.pixels);
         self.peak = self.peak.max(highest(&self.stamp.pixels));
         self.surveyed += 1;
         self.incomplete += usize::from(!is_whole);
@@ -642,7 +657,7 @@ impl NoiseSurvey {
     /// centred and compared better without sky.
     pub fn without_sky(&self) -> Option<NoiseSurvey> {
         let sky = self.sky()?;
-        let mut again = self.plan.survey();
+        let mut again = self.plan.survey().with_light(self.light);
         again.levels = None;
         again.stamp.subtraction = SkySubtraction::of(self.plan.sky, Some(sky));
         Some(again)

@@ -18,6 +18,7 @@ use shearq_submissions::limits::MIN_PSF;
 use shearq_submissions::{Calibration, Configuration, NoiseSource};
 
 use crate::calibration::mean_response;
+use crate::defects::LightLimits;
 use crate::error::{EpochError, MeasureError, length};
 use crate::examine::{EXAMINED_PSFS, Estimate, Examination, enough, examined_rows};
 use crate::measurement::{Flag, Measurement};
@@ -112,8 +113,8 @@ pub trait StampSource<'a> {
         Ok(None)
     }
 
-    /// Offsets (x, y) of a row's galaxies from the centres of their stamps in pixels, which several epochs of a galaxy need; zero if
-    /// `None`. A single stamp has its galaxy where it is found.
+    /// Offsets (x, y) of a row's galaxies from the centres of their stamps in pixels, which the window follows. It is the same for all
+    /// rows of an image whether there are any; with `None`, galaxies are at the centres, and a single stamp is not an epoch.
     ///
     /// # Errors
     /// If they cannot be read.
@@ -279,7 +280,8 @@ impl<'a, E> ArraySource<'a, E> {
         self
     }
 
-    /// The same stamps with their galaxies at these offsets (x, y) from their centres in pixels, one per stamp.
+    /// The same stamps with their galaxies at these offsets (x, y) from their centres in pixels, one per stamp. If all are zero, there
+    /// are none.
     ///
     /// # Errors
     /// If there are another number of them.
@@ -289,7 +291,7 @@ impl<'a, E> ArraySource<'a, E> {
     ) -> Result<Self, MeasureError> {
         let offsets = offsets.into();
         length("offsets", offsets.len(), self.count)?;
-        self.offsets = Some(offsets);
+        self.offsets = offsets.iter().any(|at| *at != [0.0; 2]).then_some(offsets);
         Ok(self)
     }
 
@@ -361,6 +363,9 @@ const STATED_NOISE_DIFFERENCE: f64 = 0.01;
 // Effect on m below which the noise of a star is not stated: rounding a star to single precision has this effect.
 const MIN_STATED_PSF_NOISE_M: f64 = 1e-5;
 
+// PSFs of single galaxies of a row of which the narrowest limits light in surveys. Chosen by hand: limits have a margin.
+const LIMITING_PSFS: usize = 9;
+
 /// One image between its survey and its last row. Threads share it.
 #[derive(Debug)]
 pub struct Session<'n> {
@@ -372,12 +377,16 @@ pub struct Session<'n> {
     common_flux: bool,
     survey: Option<Arc<Survey>>,
     stars: Option<Arc<ResidualProfiles>>,
+    /// What pixels of the image hold light, if pixels that hold none are removed.
+    light: Option<LightLimits>,
     examined: Vec<usize>,
     /// Median of the positive levels of the examined stamps, if there is a level for each stamp.
     typical_level: Option<f64>,
     /// Of the first stamp, in the frame of the sky.
     jacobian: Option<Jacobian>,
     warnings: Vec<Warning>,
+    /// Whether galaxies are not at the centres of their stamps, so that even a single stamp is measured as an epoch.
+    has_offsets: bool,
     /// Of the images that contain further epochs of the galaxies.
     epochs: Vec<Arc<Session<'n>>>,
 }
@@ -488,6 +497,7 @@ impl<'n> Session<'n> {
         let of_settings = loses_wings.then_some(Warning::PsfSize { size });
         let warnings = of_settings.into_iter().chain(source.warnings()).collect();
         let stars = survey_stars(measurer, source, &examined, threads)?;
+        let light = light_limits(measurer, source, &examined)?;
         let jacobians = match rows.count {
             0 => None,
             _ => source.jacobians(0)?,
@@ -497,6 +507,8 @@ impl<'n> Session<'n> {
             Some(_) => Frame::Sky,
         };
         let jacobian = jacobians.and_then(|all| all.first().copied());
+        let has_offsets =
+            configuration.linear().is_some() && rows.count > 0 && source.offsets(0)?.is_some();
         let mut session = Session {
             measurer: measurer.clone(),
             rows,
@@ -506,10 +518,12 @@ impl<'n> Session<'n> {
             common_flux: source.has_common_flux(),
             survey: None,
             stars,
+            light,
             examined,
             typical_level: None,
             jacobian,
             warnings,
+            has_offsets,
             epochs: Vec::new(),
         };
         if let Some(levels) = session.noise.levels() {
@@ -519,7 +533,7 @@ impl<'n> Session<'n> {
             session.typical_level = upper_median(&mut levels);
         }
         if let Some(plan) = session.noise_plan() {
-            session.survey = survey_noise(plan, source, threads)?;
+            session.survey = survey_noise(plan, source, light, threads)?;
             session
                 .warnings
                 .extend(match (&session.survey, &session.noise) {
@@ -609,7 +623,7 @@ impl<'n> Session<'n> {
         // Small stamps have no border that could be surveyed.
         let found = NoisePlan::new(self.measurer.full(), WHITENESS_TEST_MAX_LAG, None)
             .map_err(S::Error::from)
-            .and_then(|plan| survey_noise(&plan, source, threads));
+            .and_then(|plan| survey_noise(&plan, source, self.light, threads));
         let found = match found {
             Err(error) if self.noise_plan().is_some() => return Err(error),
             found => found.ok().flatten(),
@@ -708,7 +722,9 @@ impl<'n> Session<'n> {
         }
         let scaled = match (self.noise.levels(), self.typical_level) {
             (Some(levels), Some(typical)) => {
-                let mut scaled = Examination::new(self.measurer.full(), stamps.len_of(Axis(0)));
+                let count = stamps.len_of(Axis(0));
+                let scaled = Examination::new(self.measurer.full(), count);
+                let mut scaled = scaled.with_light(self.light);
                 let levels = &levels[self.rows.stamps(row)];
                 for (stamp, level) in stamps.outer_iter().zip(levels) {
                     if *level > 0.0 {
@@ -729,7 +745,9 @@ impl<'n> Session<'n> {
 
     fn examination(&self) -> Examination {
         let subtraction = self.measurer.subtraction(self.survey.as_deref());
-        Examination::new(self.measurer.full(), self.rows.columns).without(subtraction)
+        Examination::new(self.measurer.full(), self.rows.columns)
+            .without(subtraction)
+            .with_light(self.light)
     }
 
     /// The image without rows.
@@ -757,7 +775,7 @@ impl<'n> RowJob<'n> {
     /// # Errors
     /// If sizes or the frame do not fit, pixels are sheared too much, or a PSF for all galaxies cannot be used.
     pub fn measure_row(&self, worker: &mut Worker) -> Result<MeasuredRow, MeasureError> {
-        if !self.epochs.is_empty() {
+        if !self.epochs.is_empty() || self.session.has_offsets {
             return self.measure_epochs(worker);
         }
         match &*self.stamps {
@@ -935,11 +953,13 @@ impl MeasuredImage<'_> {
                 .for_each(|galaxy| galaxy.response = None);
         }
         let own = examined.first().and_then(Option::as_ref);
-        let (mut warnings, psf_noise) = match session.epochs.is_empty() {
-            true => (session.image_warnings(own), session.psf_noise(own)),
-            // The noise of several stars averages, and its effect is not known.
-            false => (session.epoch_warnings(&examined), None),
+        let is_single = session.epochs.is_empty();
+        let mut warnings = match is_single && !session.has_offsets {
+            true => session.image_warnings(own),
+            false => session.epoch_warnings(&examined),
         };
+        // The noise of several stars averages, and its effect is not known.
+        let psf_noise = is_single.then(|| session.psf_noise(own)).flatten();
         warnings.extend(Warning::of_galaxies(&galaxies));
         if let Some(mean) = &response
             && !mean.is_significant
@@ -1095,6 +1115,7 @@ fn stated_noise(given: f64, survey: &StampNoise) -> Option<Warning> {
 fn survey_noise<'a, S: StampSource<'a>>(
     plan: &NoisePlan,
     source: &mut S,
+    light: Option<LightLimits>,
     threads: &impl Threads,
 ) -> Result<Option<Arc<Survey>>, S::Error> {
     let rows = source.rows();
@@ -1119,7 +1140,7 @@ fn survey_noise<'a, S: StampSource<'a>>(
         )?;
         Ok::<_, S::Error>(all)
     };
-    let mut survey = pass(plan.survey())?;
+    let mut survey = pass(plan.survey().with_light(light))?;
     if let Some(again) = survey.without_sky() {
         survey = pass(again)?;
     }
@@ -1133,6 +1154,33 @@ fn add_stamps<T: Pixel>(
 ) -> Result<(), MeasureError> {
     stamps.slice_axis_inplace(Axis(0), Slice::from(range));
     stamps.outer_iter().try_for_each(|stamp| survey.add(stamp))
+}
+
+/// What light looks like behind any of the PSFs of an image; `None` if the configuration does not remove pixels that hold none.
+fn light_limits<'a, S: StampSource<'a>>(
+    measurer: &Measurer,
+    source: &mut S,
+    chosen: &[usize],
+) -> Result<Option<LightLimits>, S::Error> {
+    if measurer.configuration().linear().is_none() {
+        return Ok(None);
+    }
+    for &row in chosen {
+        let psfs = source.psfs(row)?;
+        let count = psfs.count().unwrap_or(1);
+        let some = count.min(LIMITING_PSFS);
+        let limits = (0..some).filter_map(|k| {
+            let cut = measurer.configuration().psf_cut();
+            let star = psfs.at((2 * k + 1) * count / (2 * some), cut, measurer.full());
+            Some(LightLimits::from_psf(star.ok()?.psf.view()))
+        });
+        let limits = limits.reduce(|all, more| all.wider(&more));
+        // An epoch may have no PSFs of the galaxies of a row.
+        if limits.is_some() {
+            return Ok(limits);
+        }
+    }
+    Ok(None)
 }
 
 /// The residual profiles of noisy stars, one per galaxy. `None` if all galaxies share a PSF, PSFs are formulas, stars have no noise,

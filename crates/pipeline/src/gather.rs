@@ -290,7 +290,7 @@ fn prepare(
     )?;
     messages.extend_from_slice(&psfs.messages);
     let of_psf = check_psf(&psfs, &plan, jacobians)?;
-    let mut writer = StampWriter::create(&target, mosaic, gathering.noise, wcs)?;
+    let mut writer = StampWriter::create(&target, mosaic, gathering.noise, wcs, &psfs.examination)?;
     writer.copy(gathering, plan.places())?;
     let mut warnings = writer.examination.warnings();
     if gathering.variances.is_some() {
@@ -546,6 +546,7 @@ impl Plan {
         let wcs = exposure.wcs()?;
         let mut messages: Vec<String> = exposure.note.take().into_iter().collect();
         messages.extend(exposure.is_asinh()?.then(|| asinh_line(path)));
+        messages.extend(exposure.differs_from_datasum()?.then(|| sum_line(path)));
         let positions = Positions::read(positions, path, &wcs, first_pixel)?;
         messages.extend(positions.note.clone());
         messages.extend(doubts(path, &wcs));
@@ -616,6 +617,7 @@ impl Stack {
             if first.is_none() {
                 messages.extend(doubts(origin.file, &wcs));
                 messages.extend(image.is_asinh().then(|| asinh_line(origin.file)));
+                messages.extend(image.differs_from_datasum()?.then(|| sum_line(origin.file)));
             }
             let centre = [width, height].map(|side| (side as f64 + 1.0) / 2.0);
             of_images.push((image.planes(), wcs.jacobian(centre)));
@@ -658,6 +660,14 @@ impl Stack {
         };
         Ok((stack, messages))
     }
+}
+
+// Astropy keeps the key when it writes other pixels, so that it is no error.
+fn sum_line(path: &Path) -> String {
+    format!(
+        "note: {}: the pixels differ from the checksum DATASUM of the header: they are damaged, or a program changed them and kept the key",
+        path.display()
+    )
 }
 
 fn asinh_line(path: &Path) -> String {

@@ -147,11 +147,12 @@ def measure(
         galaxies from the centres of their stamps along x and y in pixels, ``psf_offsets`` of shape (2,) or (n, 2): the PSFs from the
         centres of theirs, for PSFs drawn at the phases of the galaxies as in MEDS, and ``flux``: that of the galaxies in relation to the other
         epochs, a number or (n,), for bands. Galaxy k is on stamp k of each epoch; stamps of NaN are absent. The noise of an
-        epoch is taken as white. A single epoch is measured like `stamps`, about the centre of its stamps: its offsets are not used. Each band counts with flux/noise², so that the fluxes are weights: they may be those of a
+        epoch is taken as white. Each band counts with flux/noise², so that the fluxes are weights: they may be those of a
         typical galaxy, and should not be measured on the noise of the galaxy itself.
-    noise : float or array of shape (n,), optional
-        Standard deviation of white noise per pixel in the unit of the stamps, for all or per stamp. By default it is
-        measured. A linear configuration assumes one image, and measures noise, its correlation and the galaxy size on
+    noise : float or array of shape (n,) or (n, ny, nx), optional
+        Standard deviation of white noise per pixel in the unit of the stamps, for all or per stamp. Maps state it for each pixel
+        (inf for bad ones), as ``gather --variance`` takes them: a stamp has the median beyond a quarter of its side from its centre, and
+        the correlation of the noise is measured. By default it is measured. A linear configuration assumes one image, and measures noise, its correlation and the galaxy size on
         all stamps together. A network measures the noise on the border of each stamp.
     mask : array of shape (n, ny, nx) or (ny, nx), optional
         True for missing pixels, as in masked arrays of numpy. With a mask, the stamps are copied.
@@ -378,7 +379,8 @@ def _epoch(k: int, epoch: Mapping[str, Any]) -> dict[str, Any]:
             if noise is None and flux.ndim:
                 raise ValueError("noise: found none with a flux for each galaxy; expected a level")
             stamps = stamps / flux.reshape(-1, 1, 1)
-            noise = None if noise is None else np.asarray(noise) / flux
+            if noise is not None:
+                noise = np.asarray(noise) / (flux.reshape(-1, 1, 1) if np.ndim(noise) == 3 else flux)
         image = _image(stamps, psf, noise, own["mask"], own["wcs"], own["x"], own["y"])
         count = len(image["stamps"])
         if own["offsets"] is not None:
@@ -397,6 +399,27 @@ def _epoch(k: int, epoch: Mapping[str, Any]) -> dict[str, Any]:
         raise type(error)(f"epochs: epoch {k}: {error}") from None
 
 
+def _levels(stamps: NDArray[Any], sigmas: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.float64]]:
+    """Stamps without the pixels of infinite noise, and the level of each from maps of the noise, as `gather` takes it from maps of variances."""
+    if sigmas.shape != stamps.shape:
+        raise ValueError(f"noise: found maps of shape {shown(sigmas.shape)}; expected {shown(stamps.shape)}, that of the stamps")
+    side = stamps.shape[1]
+    rows, columns = np.indices((side, side)) - (side - 1) / 2
+    outside = np.hypot(rows, columns) > side / 4
+    stamps = stamps.copy()
+    levels = np.empty(len(stamps))
+    for k, (stamp, own) in enumerate(zip(stamps, sigmas)):
+        stamp[np.isinf(own) | np.isnan(own)] = np.nan
+        seen = np.isfinite(stamp)
+        if (own[seen] <= 0).any():
+            raise ValueError(f"noise: found {own[seen].min():g} on stamp {k}; expected positive standard deviations, or inf for bad pixels")
+        chosen = np.sort(own[seen & outside] if (seen & outside).any() else own[seen])
+        levels[k] = chosen[len(chosen) // 2] if len(chosen) else np.nan
+    # A stamp without pixels has no level. Any positive one will do, because its galaxy is flagged.
+    known = np.sort(levels[np.isfinite(levels)])
+    return stamps, np.where(np.isnan(levels), known[len(known) // 2] if len(known) else 0.0, levels)
+
+
 def _image(stamps: Any, psf: Any, noise: Any, mask: Any, wcs: Any, x: Any, y: Any) -> dict[str, Any]:
     """The arrays of an image as the extension module takes them."""
     stamps = with_missing("stamps", stamps, mask)
@@ -406,6 +429,7 @@ def _image(stamps: Any, psf: Any, noise: Any, mask: Any, wcs: Any, x: Any, y: An
     if rows != sides:
         raise ValueError(f"stamps: found an array of shape {shown(stamps.shape)}; expected squares, ny = nx")
     image: dict[str, Any] = dict.fromkeys(("star", "stars", "formulas", "noise", "noises", "offsets"))
+    image["stated"] = False
     image["stamps"] = stamps
     image["jacobians"] = None if wcs is None else jacobians(wcs, count, x, y, sides)
     if isinstance(psf, FunctionalPsf):
@@ -423,6 +447,9 @@ def _image(stamps: Any, psf: Any, noise: Any, mask: Any, wcs: Any, x: Any, y: An
             )
     if noise is not None and np.ndim(noise) == 0:
         image["noise"] = real("noise", noise, "a finite number of image units, not negative", least=0.0)
+    elif noise is not None and np.ndim(noise) == 3:
+        image["stamps"], image["noises"] = _levels(stamps, numeric("noise", noise))
+        image["stated"] = True
     elif noise is not None:
         image["noises"] = sigmas = double("noise", noise)
         if sigmas.shape != (count,):

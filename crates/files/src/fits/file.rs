@@ -632,6 +632,17 @@ impl File {
         Ok(())
     }
 
+    /// Whether data differ from the DATASUM of their header, if it states one.
+    pub fn differs_from_datasum(&mut self) -> Result<bool, FileError> {
+        let stated = self.text("DATASUM");
+        if stated.is_empty() {
+            return Ok(false);
+        }
+        let [_, start, end] = self.extent()?;
+        let stated = stated.parse().ok().map(|sum: u64| sum % ONES);
+        Ok(stated != Some(self.source.sum(start, end)?))
+    }
+
     fn wrong_sum(&self, key: &str, found: u64, expected: &str) -> FileError {
         self.fault(format!(
             "the image of extension {} differs from its checksum {key} (found the sum {found}, expected {expected}): it is damaged, or a program changed it and kept the key. Try: another copy; or, if its pixels are right, fitscheck --write --force {}",

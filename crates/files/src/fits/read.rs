@@ -269,6 +269,11 @@ impl ImageReader {
         self.asinh.is_some()
     }
 
+    /// Whether the pixels of a plain image differ from the DATASUM of the header. Compressed ones are refused when they are opened.
+    pub fn differs_from_datasum(&mut self) -> Result<bool, FileError> {
+        self.file.differs_from_datasum()
+    }
+
     pub fn width(&self) -> usize {
         self.width
     }

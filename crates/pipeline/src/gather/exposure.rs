@@ -65,6 +65,10 @@ impl<'a> Exposure<'a> {
         Ok(self.reader()?.is_asinh())
     }
 
+    pub(super) fn differs_from_datasum(&mut self) -> Result<bool, FileError> {
+        self.reader()?.differs_from_datasum()
+    }
+
     pub(super) fn wcs(&mut self) -> Result<Wcs, FileError> {
         Wcs::of_header(self.reader()?)
     }

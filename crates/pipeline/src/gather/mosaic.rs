@@ -38,13 +38,15 @@ impl StampWriter {
         mosaic: Mosaic,
         noise: Option<f64>,
         wcs: &Wcs,
+        psfs: &Examination,
     ) -> Result<Self, FileError> {
         let mut keys = wcs.keys();
         keys.extend(noise.map(|sigma| ("NOISESIG", Value::Real(sigma))));
         let examined = examined_rows(mosaic.columns, mosaic.rows());
         Ok(StampWriter {
             image: Rows::create(target, mosaic, &keys)?,
-            examination: Examination::new(mosaic.stamp, examined.len() * mosaic.columns),
+            examination: Examination::new(mosaic.stamp, examined.len() * mosaic.columns)
+                .behind(psfs),
             incomplete: 0,
             examined,
             origins: Origins::default(),

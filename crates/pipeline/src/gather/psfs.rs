@@ -125,7 +125,8 @@ fn small(path: &Path, side: usize) -> Option<String> {
     let shown = path.display();
     (side < MIN_PSF).then(|| {
         format!(
-            "warning: {shown}: the PSF stamps are {side} × {side} px (expected {MIN_PSF} × {MIN_PSF} or more, which configurations of 48 px require). Try: larger PSF stamps; or, if no light is beyond them, --submission own.toml with the file own.toml of these lines:\n  extends = \"48/linear/star\"\n  psf.size = {side}"
+            "warning: {shown}: the PSF stamps are {side} × {side} px (expected {MIN_PSF} × {MIN_PSF} or more, which configurations of 48 px require). Try: larger PSF stamps; or, if no light is beyond them, --submission own.toml with the file own.toml of these lines:\n  extends = \"48/linear/star\"\n  psf.size = {}",
+            side - side % 2
         )
     })
 }
