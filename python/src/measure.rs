@@ -62,6 +62,8 @@ pub(crate) struct Image<'py> {
     formulas: Option<PyReadonlyArray2<'py, f64>>,
     noise: Option<f64>,
     noises: Option<PyReadonlyArray1<'py, f64>>,
+    /// Whether the levels of single stamps are those of maps, beside which the correlation of the noise is measured.
+    stated: bool,
     jacobians: Option<PyReadonlyArray3<'py, f64>>,
     offsets: Option<PyReadonlyArray2<'py, f64>>,
 }
@@ -94,6 +96,7 @@ fn source<'a>(
         _ => Err(PyValueError::new_err("psf: expected one kind of PSFs")),
     }?;
     let noise = match (&image.noises, image.noise) {
+        (Some(levels), _) if image.stated => KnownNoise::StatedEach(levels.as_slice()?.into()),
         (Some(levels), _) => KnownNoise::GivenEach(levels.as_slice()?.into()),
         (None, Some(level)) => KnownNoise::Given(level),
         (None, None) => KnownNoise::Unknown,

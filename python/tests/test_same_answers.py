@@ -144,3 +144,34 @@ def test_one_psf_for_stamps_of_several_orientations_is_named(data):
     turned = np.array([MATRIX, MATRIX @ np.array([[0.0, -1.0], [1.0, 0.0]])])[np.arange(COUNT) % 2]
     with pytest.warns(shearq.DataWarning, match="one PSF is for all stamps, whose pixels differ on the sky"):
         shearq.measure(data.stamps, data.psf, noise=data.noise, wcs=turned)
+
+
+def test_maps_of_noise_are_those_of_gather(data, tmp_path):
+    rng = np.random.default_rng(9)
+    sigmas = SIGMA * rng.uniform(0.9, 1.1, data.stamps.shape)
+    sigmas[::5, 3:6, 40:44] = np.inf
+    sigmas[:, 20:28, 20:28] *= 3
+    fits.writeto(tmp_path / "variance.fits", (sigmas**2).astype("f8"))
+    at = {name: str(data.folder / f"{name}.fits") for name in ("field", "star")}
+    words = ["gather", "--stamps", at["field"], "--psf", at["star"], "--variance", str(tmp_path / "variance.fits"), "--out", str(tmp_path / "data")]
+    assert shearq._shearq.run_command(["shearq", *words]) == 0
+    words = ["measure", "--submission", "48/linear/star", "--data", str(tmp_path / "data"), "--out", str(tmp_path / "out")]
+    assert shearq._shearq.run_command(["shearq", *words]) == 0
+    gathered = shearq.read(tmp_path / "out" / "set01" / "catalogue-001.parquet")
+    found = shearq.measure(data.stamps, data.psf, noise=sigmas, wcs=MATRIX)
+    for name in ("e1", "e2", "R11", "noise", "snr"):
+        assert np.allclose(found[name], gathered[name], rtol=1e-4, atol=2e-6), name
+    with pytest.raises(ValueError, match="noise: found -1 on stamp 0; expected positive"):
+        shearq.measure(data.stamps, data.psf, noise=-np.ones_like(sigmas))
+    with pytest.raises(ValueError, match="noise: found maps of shape"):
+        shearq.measure(data.stamps, data.psf, noise=sigmas[:, :10])
+
+
+def test_pixels_that_differ_from_their_checksum_are_noted(data, tmp_path, capfd):
+    for name, pixels in (("good", data.stamps), ("changed", data.stamps + 1)):
+        hdu = fits.PrimaryHDU(data.stamps)
+        hdu.add_datasum()
+        fits.PrimaryHDU(pixels, hdu.header).writeto(tmp_path / f"{name}.fits")
+        words = ["gather", "--stamps", str(tmp_path / f"{name}.fits"), "--psf", str(data.folder / "star.fits"), "--frame", "pixel"]
+        assert shearq._shearq.run_command(["shearq", *words, "--out", str(tmp_path / name)]) == 0
+        assert ("differ from the checksum DATASUM" in capfd.readouterr().err) == (name == "changed")

@@ -16,6 +16,19 @@ def shown(shape: tuple[int, ...]) -> str:
     return "(" + ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "") + ")"
 
 
+def _shapes(value: Any) -> list[tuple[int, ...]]:
+    """The first shapes of a sequence of arrays."""
+    found: list[tuple[int, ...]] = []
+    for one in value if isinstance(value, (list, tuple)) else ():
+        try:
+            shape = np.shape(one)
+        except ValueError:
+            return []
+        if shape not in found and len(found) < 4:
+            found.append(shape)
+    return found
+
+
 def numeric(name: str, value: Any) -> NDArray[Any]:
     """An array of real numbers: ``value`` itself where it is one, of whatever strides and order of bytes."""
     if isinstance(value, np.ma.MaskedArray):
@@ -26,6 +39,9 @@ def numeric(name: str, value: Any) -> NDArray[Any]:
         try:
             value = np.asarray(value)
         except (TypeError, ValueError, OverflowError) as error:
+            shapes = _shapes(value)
+            if len(shapes) > 1:
+                raise ValueError(f"{name}: found arrays of shapes {', '.join(map(shown, shapes))}; expected one shape") from None
             raise ValueError(f"{name}: no array can be made of it: {error}") from None
     if value.dtype.kind not in "fiu":
         raise TypeError(f"{name}: found numbers of type {value.dtype}; expected real ones")

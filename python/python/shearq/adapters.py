@@ -20,13 +20,21 @@ _OFF_CENTRE = 1.0
 _FLUX_SIGMA = 3.0
 
 
-def _check_centre(offset: tuple[float, float], k: int) -> None:
+def _check_centre(observation: Any, image: NDArray[Any], psf: NDArray[Any], k: int) -> None:
     """Refuses a galaxy that is not near the middle of its stamp, counted from its PSF's place."""
-    if max(map(abs, offset)) > _OFF_CENTRE:
-        raise ValueError(
-            f"observations: the galaxy of observation {k} is ({offset[0]:+.3g}, {offset[1]:+.3g}) px from the middle of its pixels, beyond"
-            f" its PSF; expected at most {_OFF_CENTRE:g} px. Try: cut the image around the galaxy, or an ObsList for each galaxy"
-        )
+    offset = _galaxy_offset(observation, image, psf)
+    if max(map(abs, offset)) <= _OFF_CENTRE:
+        return
+    own = _offset(observation.jacobian, image)
+    if max(map(abs, own)) > _OFF_CENTRE:
+        what, remedy = f"the galaxy of observation {k} is", "cut the image around the galaxy"
+    else:
+        own = _offset(getattr(observation.psf, "jacobian", None), psf)
+        what, remedy = f"the PSF of observation {k} is, by its Jacobian,", "cut the PSF image around the PSF"
+    raise ValueError(
+        f"observations: {what} ({own[0]:+.3g}, {own[1]:+.3g}) px from the middle of its pixels; expected at most {_OFF_CENTRE:g} px"
+        f" between galaxy and PSF. Try: {remedy}, or an ObsList for each galaxy"
+    )
 
 
 def from_ngmix(observations: Any, fluxes: Any = None) -> dict[str, Any]:
@@ -79,7 +87,7 @@ def from_ngmix(observations: Any, fluxes: Any = None) -> dict[str, Any]:
                 scales.append(square_pixels(f"observations: {what} {k}", matrix, remedy))
         if max(scales) - min(scales) > SAME * min(scales):
             raise ValueError(f"observations: observation {k} has the pixel scales {scales} (image, PSF); expected one scale")
-        _check_centre(_galaxy_offset(observation, image, psf), k)
+        _check_centre(observation, image, psf, k)
         parts.append((image, psf, noise, missing))
     stamps, psfs, noise, masks = zip(*parts)
     for name, images in (("image", stamps), ("PSF image", psfs)):
