@@ -246,7 +246,9 @@ pub fn looks_like_weight(name: &str) -> bool {
     let Patterns {
         weight, no_weight, ..
     } = &recognition().patterns;
-    has_any(weight, name) && !has_any(no_weight, name)
+    // The dark energy w₀ of a mock catalogue.
+    let is_w0 = name.eq_ignore_ascii_case("w_0");
+    has_any(weight, name) && !has_any(no_weight, name) && !is_w0
 }
 
 fn is_like_a_calibration(name: &str) -> bool {
@@ -761,13 +763,13 @@ fn unsheared_column<'f>(
     }
     let is_plain = |own: &String| words(own).trim_matches('_') == unsheared(own);
     // `g1` alone is the true shear.
-    let more = match role {
-        E1 => "g1",
-        E2 => "g2",
-        _ => "",
+    let more: &[&str] = match role {
+        E1 => &["g1", "g_1"],
+        E2 => &["g2", "g_2"],
+        _ => &[],
     };
     let known = |rest: String| {
-        let mut names = names.iter().map(String::as_str).chain([more]);
+        let mut names = names.iter().map(String::as_str).chain(more.iter().copied());
         let is_word = |name: &str| words(name).trim_matches('_') == rest;
         names.any(|name| is_word(name) || in_vector(name).is_some_and(|name| is_word(&name)))
     };
@@ -1004,6 +1006,7 @@ mod tests {
     fn unsheared_columns_are_found_in_any_spelling() {
         for (columns, e1, response) in [
             ("00/g1 00/g2", "00/g1", None),
+            ("g_noshear_1 g_noshear_2", "g_noshear_1", None),
             (
                 "unsheared/e_1 unsheared/e_2 unsheared/R11 unsheared/R22",
                 "unsheared/e_1",
