@@ -1,4 +1,4 @@
-//! Each constant of `crates/measure` states its origin in a `//` comment beside it, and `docs/constants.md` lists them.
+//! Each constant of `crates/measure` states its origin in a `//` comment beside it, and `crates/measure/CONSTANTS.md` lists them.
 //!
 //! To write a changed page, run `SHEARQ_ACCEPT=1 cargo test --release --test it constants`.
 
@@ -9,7 +9,7 @@ use crate::source::files;
 use crate::support::assert_page;
 
 const SOURCES: &str = "crates/measure/src";
-const PAGE: &str = "docs/constants.md";
+const PAGE: &str = "crates/measure/CONSTANTS.md";
 
 struct Constant {
     file: String,

@@ -129,7 +129,7 @@ fn commands_of_the_pages_run() {
                 "to-send.tar.gz",
             ],
         ),
-        ("files.md", 10, &["parts/scores.csv"]),
+        ("stores.md", 10, &["parts/scores.csv"]),
         ("regression.md", 7, &["baselines/mycode.units.json"]),
         ("install.md", 1, &["shearq-quickstart/report.html"]),
     ] {

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Which constants of the measurement matter: each one times 0.7 and 1.4, on the same simulated galaxies.
 
-    python3 tests/stress/constants.py [--only REGEX] [--galaxies 2000] [--json constants.json] [--page docs/constants.md]
+    python3 tests/stress/constants.py [--only REGEX] [--galaxies 2000] [--json constants.json] [--page crates/measure/CONSTANTS.md]
 
 The constants are the numbers that `const` declares in crates/measure/src outside tests. A copy of the sources is built once,
 in which each of them is a function that reads its factor from the environment; the sources themselves have no hook. The page

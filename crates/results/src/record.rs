@@ -1,5 +1,5 @@
 //! The record of a scored set, with the one list of its columns: conditions are met and tables printed by it.
-//! docs/files.md describes the columns, and the keys of the JSON, which are the fields of the structs.
+//! docs/stores.md describes the columns, and the keys of the JSON, which are the fields of the structs.
 
 use std::collections::BTreeSet;
 use std::fmt::Display;

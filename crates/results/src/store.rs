@@ -1,7 +1,7 @@
 //! A results store: a folder with one JSON file per recorded run.
 //!
 //! A file's name is derived from its content. Processes that write into one store therefore do not collide, and
-//! recording a run twice has no effect. docs/files.md lists the keys.
+//! recording a run twice has no effect. docs/stores.md lists the keys.
 
 use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;

@@ -114,6 +114,28 @@ fn cells_sort_by_value_and_read_as_numbers() {
 }
 
 #[test]
+fn details_are_folded_and_figures_have_letters_of_the_text() {
+    let blocks = vec![Block::Table(table()), Block::Folded(table())];
+    let page = Report {
+        sections: vec![
+            Section::new("a", "A", blocks).titled("B"),
+            Section::new("b", "", vec![Block::Figure(picture())]),
+        ],
+        ..Report::default()
+    };
+    let page = page.render();
+    let (shown, folded) = page.split_once("<details><summary>").unwrap();
+    assert_eq!(
+        [shown, folded].map(|part| part.matches("<table").count()),
+        [1, 1]
+    );
+    assert!(shown.contains(">B<") && !page.contains(">A<"));
+    // 72 points are 96 pixels.
+    let width: f64 = values(&page, "width")[0].parse().unwrap();
+    assert!((width * 0.75 - picture().size.0).abs() < 0.5, "{width}");
+}
+
+#[test]
 fn control_characters_are_written_out() {
     assert_eq!(
         Words("a\u{0}\r\n<").render().into_string(),

@@ -439,6 +439,26 @@ mod tests {
     }
 
     #[test]
+    fn sets_are_names_and_keep_their_place_in_each_method() {
+        let (name, first) = method("a", 12.0, 20.0, [0.0; 8]);
+        let second = SetRecord {
+            set: 8,
+            ..first.clone()
+        };
+        let both = [first, second.clone()];
+        let plot = per_set_plot(&[(name, &both), ("b".into(), &[second])]);
+        assert_eq!(plot.plots.len(), 3);
+        for panel in &plot.plots {
+            assert!(panel.x_names[0].starts_with("set 2") && panel.x_names[1].starts_with("set 8"));
+            let places = |k: usize| panel.series[k].points.iter().map(|point| point.x.round());
+            assert_eq!(places(0).collect::<Vec<_>>(), [0.0, 1.0]);
+            assert_eq!(places(1).collect::<Vec<_>>(), [1.0]);
+        }
+        let y = |k: usize| plot.plots[k].series[0].points[0].y;
+        assert_eq!([0, 1, 2].map(y), [12.0, 20.0, -0.3]);
+    }
+
+    #[test]
     fn the_best_method_is_named_if_it_is_distinguished() {
         let common = [0.5, -0.5, 0.5, -0.5, 0.5, -0.5, 0.5, -0.5];
         let replicates = [0.7, -0.7, 0.3, -0.3, 0.7, -0.7, 0.3, -0.3];
