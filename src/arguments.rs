@@ -1,9 +1,11 @@
 //! Arguments that several subcommands share, and names and `--help` lines of choices whose types belong to the layers below.
 
 use std::collections::BTreeSet;
-use std::path::PathBuf;
+use std::ffi::{OsStr, OsString};
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
+use anyhow::Context;
 use clap::Args;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use shearq_bias::Design;
@@ -11,6 +13,7 @@ use shearq_catalogue::columns::Shapes;
 use shearq_challenge::kind::{Kind, RankBy};
 use shearq_dataset::images::{ImageId, Shard};
 use shearq_dataset::layout::MAX_SET;
+use shearq_files::open::{SETTINGS, is_there, read_to_string};
 use shearq_files::table::FileFormat;
 use shearq_pipeline::gather::Square;
 use shearq_render::figure::FigureError;
@@ -26,7 +29,7 @@ use shearq_simulate::kinds::SETS;
 use shearq_simulate::set::{FixedPsf, SimulationSettings};
 use shearq_submissions::{Configuration, EllipticityType, Registry, Template};
 
-use crate::{print, print_table, tell};
+use crate::{print, print_json, print_table, tell};
 
 // `1,2,7-9`, or `all`, which is empty: data folders have any sets, and simulations the 24 of the paper. Own code, because clap has
 // no ranges in lists.
@@ -205,9 +208,123 @@ impl Form {
         }
         match self.format {
             TableFormat::Table => print_table(table),
+            TableFormat::Json => print_json(table.json()),
             format => print(&table.render(format)),
         }
     }
+}
+
+/// How a command whose results are files says what it did.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum SummaryFormat {
+    Text,
+    Json,
+}
+
+#[derive(Debug, Clone, Args)]
+pub(super) struct Summary {
+    /// How to say what was done.
+    #[arg(long, value_parser = named::<SummaryFormat>(), default_value = "text")]
+    format: SummaryFormat,
+}
+
+impl Summary {
+    pub(super) fn is_json(&self) -> bool {
+        self.format == SummaryFormat::Json
+    }
+
+    /// Prints an object on standard output if JSON is asked for.
+    pub(super) fn print(&self, value: impl FnOnce() -> serde_json::Value) -> anyhow::Result<()> {
+        match self.format {
+            SummaryFormat::Text => Ok(()),
+            SummaryFormat::Json => print_json(value()),
+        }
+    }
+}
+
+// Commands that read a table from standard input.
+const FROM_STANDARD_INPUT: [&str; 2] = ["bias", "score"];
+
+/// The arguments of a command, where `-` and pipes are a file with what is read from them: tables are read twice.
+pub(super) struct StandardInput {
+    pub(super) arguments: Vec<OsString>,
+    // Removed with this value.
+    _folder: Option<tempfile::TempDir>,
+}
+
+impl StandardInput {
+    pub(super) fn read(arguments: &[OsString]) -> std::io::Result<Self> {
+        let mut read = StandardInput {
+            arguments: arguments.to_vec(),
+            _folder: None,
+        };
+        let command = arguments.get(1).and_then(|word| word.to_str());
+        if !command.is_some_and(|command| FROM_STANDARD_INPUT.contains(&command)) {
+            return Ok(read);
+        }
+        let pipes: Vec<usize> = (2..arguments.len())
+            .filter(|&at| arguments[at] == "-" || is_pipe(&arguments[at]))
+            .collect();
+        if pipes.is_empty() {
+            return Ok(read);
+        }
+        let folder = tempfile::tempdir()?;
+        for at in pipes {
+            let mut from: Box<dyn std::io::Read> = match arguments[at] == "-" {
+                true => Box::new(std::io::stdin().lock()),
+                false => Box::new(std::fs::File::open(&arguments[at])?),
+            };
+            let path = folder.path().join(format!("input-{at}"));
+            std::io::copy(&mut from, &mut std::fs::File::create(&path)?)?;
+            read.arguments[at] = path.into();
+        }
+        read._folder = Some(folder);
+        Ok(read)
+    }
+}
+
+// `/dev/stdin`, and the pipes that a shell makes of `<(COMMAND)`.
+fn is_pipe(word: &OsStr) -> bool {
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::FileTypeExt;
+        let is_device = Path::new(word).starts_with("/dev");
+        let kind = || std::fs::metadata(word).map(|found| found.file_type());
+        is_device && kind().is_ok_and(|kind| kind.is_fifo())
+    }
+    #[cfg(not(unix))]
+    {
+        let _ = word;
+        false
+    }
+}
+
+/// Paths of a list in which `@FILE` stands for the lines of a file, and a name with `*` or `?` that is no file for all that it
+/// matches, in order: a shell has no room for the names of 10,000 catalogues.
+pub(super) fn listed(paths: &[PathBuf]) -> anyhow::Result<Vec<PathBuf>> {
+    let mut all = Vec::new();
+    for path in paths {
+        let text = path.to_string_lossy();
+        if let Some(list) = text.strip_prefix('@').filter(|_| !path.exists()) {
+            let lines = read_to_string(Path::new(list), SETTINGS)
+                .with_context(|| format!("{text}: cannot read the list of files"))?;
+            let names = lines.lines().map(str::trim).filter(|line| !line.is_empty());
+            all.extend(names.map(PathBuf::from));
+        } else if text.contains(['*', '?']) && !is_there(path) {
+            let found = glob::glob(&text).with_context(|| text.to_string())?;
+            let first = all.len();
+            for one in found {
+                all.push(one?);
+            }
+            anyhow::ensure!(
+                all.len() > first,
+                "{text}: no file has such a name. Try: ls {text}"
+            );
+        } else {
+            all.push(path.clone());
+        }
+    }
+    Ok(all)
 }
 
 // As in GREAT10. The seed is arbitrary.
@@ -402,6 +519,10 @@ choices! {
         Csv: "csv", "Comma-separated, full precision, values and errors in separate columns. An apostrophe protects text that spreadsheets would execute as a formula";
         Markdown: "markdown", "Markdown";
         Latex: "latex", "A LaTeX tabular";
+    }
+    SummaryFormat {
+        Text: "text", "In words on standard error";
+        Json: "json", "Also as JSON on standard output";
     }
     Shared {
         Survey: "survey", "All";

@@ -6,6 +6,7 @@
 struct GuideToTheCrates;
 
 mod arguments;
+mod origin;
 mod progress;
 #[cfg(test)]
 mod tests;
@@ -20,6 +21,7 @@ mod commands {
     pub(crate) mod compare;
     pub(crate) mod completions;
     pub(crate) mod gather;
+    pub(crate) mod man;
     pub(crate) mod mean;
     pub(crate) mod measure;
     pub(crate) mod merge;
@@ -38,12 +40,16 @@ mod commands {
 
 use std::ffi::OsString;
 use std::process::ExitCode;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
 
 use clap::{Parser, Subcommand};
 
+use arguments::StandardInput;
 use commands::{
-    baseline, bench, bias, challenge, check, compare, completions, gather, mean, measure, merge,
-    pack, quickstart, reproduce, run, score, select, shear, show, simulate, submissions, unpack,
+    baseline, bench, bias, challenge, check, compare, completions, gather, man, mean, measure,
+    merge, pack, quickstart, reproduce, run, score, select, shear, show, simulate, submissions,
+    unpack,
 };
 use shearq_files::parquet::panic_is_caught;
 use shearq_render::escape::visible;
@@ -72,6 +78,19 @@ use shearq_render::terminal::fitted;
 struct Cli {
     #[command(subcommand)]
     command: Command,
+    #[command(flatten)]
+    talk: Talk,
+}
+
+// What is said on standard error.
+#[derive(Debug, clap::Args)]
+struct Talk {
+    /// Say warnings and errors only: no notes and no progress.
+    #[arg(short, long, global = true, conflicts_with = "verbose")]
+    quiet: bool,
+    /// Say version and command at the start, and time and memory at the end.
+    #[arg(short, long, global = true)]
+    verbose: bool,
 }
 
 #[derive(Debug, Subcommand)]
@@ -150,6 +169,8 @@ pub(crate) enum Command {
         after_help = "Example:\n  shearq completions bash > ~/.local/share/bash-completion/completions/shearq"
     )]
     Completions(completions::Arguments),
+    #[command(after_help = "Example:\n  shearq man --out ~/.local/share/man/man1")]
+    Man(man::Arguments),
 }
 
 // Exit codes. A baseline that changed and a check with findings exit like errors, so that scripts and CI stop; 2 for wrong
@@ -192,12 +213,28 @@ fn fail_at_size_limits() {
 /// Parses the arguments (the first is the program's name), runs the command and prints its error, if any.
 /// Returns the exit code.
 pub fn run_with(arguments: impl IntoIterator<Item = OsString>) -> u8 {
+    let start = Instant::now();
     let arguments: Vec<OsString> = arguments.into_iter().collect();
-    let command_line = command_line(&arguments);
-    let cli = match Cli::try_parse_from(arguments) {
+    let command_line = origin::remember(&arguments);
+    let read = match StandardInput::read(&arguments) {
+        Ok(read) => read,
+        Err(error) => {
+            tell(format_args!("error: standard input: {error}"));
+            return EXIT_FAILED;
+        }
+    };
+    let cli = match Cli::try_parse_from(read.arguments) {
         Ok(cli) => cli,
         Err(message) => return usage(&message),
     };
+    // Of each call: Python calls this function many times.
+    QUIET.store(cli.talk.quiet, Ordering::Relaxed);
+    if cli.talk.verbose {
+        tell(format_args!(
+            "shearq {}: {command_line}",
+            version_and_commit()
+        ));
+    }
     let result = match cli.command {
         Command::Quickstart(arguments) => quickstart::run(&arguments),
         Command::Simulate(arguments) => simulate::run(&arguments),
@@ -221,7 +258,11 @@ pub fn run_with(arguments: impl IntoIterator<Item = OsString>) -> u8 {
         Command::Bench(arguments) => bench::run(&arguments),
         Command::Submissions(arguments) => submissions::run(&arguments),
         Command::Completions(arguments) => completions::run(&arguments),
+        Command::Man(arguments) => man::run(&arguments),
     };
+    if cli.talk.verbose {
+        tell(format_args!("{}", origin::cost(start)));
+    }
     match result {
         Ok(()) => EXIT_DONE,
         Err(error) if error.is::<Findings>() => EXIT_FAILED,
@@ -243,18 +284,6 @@ fn parse(command: &[String]) -> anyhow::Result<Command> {
         anyhow::anyhow!("{}: {text}", command.join(" "))
     })?;
     Ok(parsed.command)
-}
-
-// As a shell reads it, for the head of a report.
-fn command_line(arguments: &[OsString]) -> String {
-    let words = arguments.iter().skip(1).map(|word| {
-        let word = word.to_string_lossy();
-        match word.contains(|c: char| c.is_whitespace() || "'\"()*<>|&;$".contains(c)) {
-            true => format!(" '{}'", word.replace('\'', r"'\''")),
-            false => format!(" {word}"),
-        }
-    });
-    format!("shearq{}", words.collect::<String>())
 }
 
 // An error with its causes. Messages of some errors end with their cause, which is not repeated.
@@ -292,7 +321,18 @@ struct Findings;
 // Prints a line on standard error. A closed standard error is ignored: the results matter more than the message.
 fn tell(line: std::fmt::Arguments<'_>) {
     use std::io::Write;
-    let _ = writeln!(std::io::stderr(), "{}", visible(&line.to_string()));
+    let line = line.to_string();
+    // Findings of --fail-above are errors, too.
+    let matters = line.starts_with("warning") || line.starts_with("error");
+    if matters || !is_quiet() {
+        let _ = writeln!(std::io::stderr(), "{}", visible(&line));
+    }
+}
+
+static QUIET: AtomicBool = AtomicBool::new(false);
+
+fn is_quiet() -> bool {
+    QUIET.load(Ordering::Relaxed)
 }
 
 fn tell_unread(unread: Vec<String>) {
@@ -332,6 +372,14 @@ fn width() -> usize {
         .or_else(stated)
         .filter(|width| *width > 0)
         .unwrap_or(80)
+}
+
+/// Prints an object as JSON, with its origin.
+fn print_json(mut value: serde_json::Value) -> anyhow::Result<()> {
+    if let Some(object) = value.as_object_mut() {
+        object.insert("made_by".into(), origin::origin());
+    }
+    print(&(serde_json::to_string_pretty(&value)? + "\n"))
 }
 
 fn print_table(table: &Table) -> anyhow::Result<()> {

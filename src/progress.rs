@@ -11,7 +11,7 @@ use indicatif::{
     HumanCount, HumanDuration, ProgressBar, ProgressDrawTarget, ProgressState, ProgressStyle,
 };
 
-use crate::tell;
+use crate::{is_quiet, tell};
 use shearq_dataset::threads::Progress;
 
 // Between two lines of a log file: a job of hours writes a few hundred.
@@ -27,7 +27,9 @@ pub(super) struct Bar {
 
 impl Bar {
     pub(super) fn new(what: &'static str, galaxies: u64) -> Self {
-        let (target, next_line) = if std::io::stderr().is_terminal() {
+        let (target, next_line) = if is_quiet() {
+            (ProgressDrawTarget::hidden(), None)
+        } else if std::io::stderr().is_terminal() {
             (ProgressDrawTarget::stderr_with_hz(5), None)
         } else {
             // In log files a bar would be thousands of lines.
@@ -38,7 +40,6 @@ impl Bar {
         };
         let bar = ProgressBar::with_draw_target(Some(galaxies), target);
         let skipped = Arc::new(AtomicU64::new(0));
-        // On 80 columns a name of 24 leaves the bar 10.
         let template = "{prefix} {wide_bar} {percent}% of {human_len}{pace}{msg}";
         if let Ok(style) = ProgressStyle::with_template(template) {
             let skipped = Arc::clone(&skipped);
@@ -80,6 +81,19 @@ impl Bar {
     }
 }
 
+// Cells of a bar that shows how far the work is, and of the texts beside it: `measuring  100% of 48,000,000, 12,345/s, 59m left`.
+const BAR_CELLS: usize = 12;
+const TEXT_CELLS: usize = 50;
+
+// The image of which the work is, if it leaves room for the bar.
+fn message(line: &str, width: usize) -> String {
+    let text = format!("  {line}");
+    match TEXT_CELLS + BAR_CELLS + text.chars().count() <= width {
+        true => text,
+        false => String::new(),
+    }
+}
+
 // Rate and remaining time after `done` galaxies in `seconds`.
 fn pace(done: u64, left: u64, seconds: f64) -> String {
     if done == 0 || seconds <= 0.0 {
@@ -106,7 +120,9 @@ impl Progress for Bar {
     }
 
     fn note(&mut self, line: &str) {
-        self.bar.set_message(format!("  {line}"));
+        let terminal = terminal_size::terminal_size_of(std::io::stderr());
+        let width = terminal.map_or(usize::MAX, |(width, _)| usize::from(width.0));
+        self.bar.set_message(message(line, width));
     }
 
     fn warn(&mut self, line: &str) {
@@ -151,6 +167,12 @@ pub(super) fn end_at_interrupt() {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_name_of_the_image_leaves_room_for_the_bar() {
+        assert_eq!(message("set 01 image 002", 80), "  set 01 image 002");
+        assert_eq!(message("measuring the first images", 80), "");
+    }
 
     #[test]
     fn the_rate_counts_new_galaxies_only() {

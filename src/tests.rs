@@ -168,7 +168,7 @@ fn compare(path: &str, command: &Command, wrong: &mut Vec<String>) {
     };
     let options: Vec<&Arg> = command
         .get_arguments()
-        .filter(|a| !["help", "version"].contains(&a.get_id().as_str()))
+        .filter(|a| !a.is_global_set() && !["help", "version"].contains(&a.get_id().as_str()))
         .collect();
     for way in ways.iter().flatten() {
         if !options.iter().any(|option| name(option) == *way) {

@@ -30,6 +30,7 @@ python3 .ci/release/licences.py > "$tree/LICENCES-OF-DEPENDENCIES.txt"
 for shell in bash zsh fish; do
     "$binary" completions "$shell" > "$tree/completions/shearq.$shell"
 done
+"$binary" --quiet man --out "$tree/man"
 packed() { tar --sort=name --owner=0 --group=0 --numeric-owner --mtime="@$SOURCE_DATE_EPOCH" "$@"; }
 packed -C "$stage" -c "$name" | gzip -n -9 > "$out/$name.tar.gz"
 
@@ -37,9 +38,10 @@ made=("$name.tar.gz")
 if command -v dpkg-deb > /dev/null; then
     root=$stage/debian
     doc=$root/usr/share/doc/shearq
-    mkdir -p "$root"/{DEBIAN,usr/bin,usr/share/bash-completion/completions} "$doc"
+    mkdir -p "$root"/{DEBIAN,usr/bin,usr/share/bash-completion/completions,usr/share/man/man1} "$doc"
     install -m 755 "$tree/shearq" "$root/usr/bin/shearq"
     cp "$tree/completions/shearq.bash" "$root/usr/share/bash-completion/completions/shearq"
+    cp "$tree"/man/*.1 "$root/usr/share/man/man1"
     cp -r README.md CHANGELOG.md docs "$doc"
     cat LICENSE-MIT "$tree/LICENCES-OF-DEPENDENCIES.txt" > "$doc/copyright"
     cat > "$root/DEBIAN/control" << CONTROL

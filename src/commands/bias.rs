@@ -9,7 +9,7 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal, Uniform};
 use shearq_bias::Design;
 
-use crate::arguments::{Printing, ReportFile, named, positive};
+use crate::arguments::{Printing, ReportFile, listed, named, positive};
 use crate::{Findings, made_by, tell};
 use shearq_catalogue::columns::{Names, Shapes, role_names};
 use shearq_catalogue::expression::Expression;
@@ -226,8 +226,8 @@ pub(crate) fn run(arguments: &Arguments, command_line: &str) -> anyhow::Result<(
         PictureFormat::of(plot)?;
     }
     let summed = match arguments.merge.as_slice() {
-        [] => of_catalogues(summing, &summing.catalogues)?,
-        files => merged(files)?,
+        [] => of_catalogues(summing, &listed(&summing.catalogues)?)?,
+        files => merged(&listed(files)?)?,
     };
     if let Some(path) = &summing.sums {
         atomic::write(path, &serde_json::to_vec(&summed)?)?;
@@ -249,7 +249,7 @@ pub(crate) fn run(arguments: &Arguments, command_line: &str) -> anyhow::Result<(
         }
     };
     if !summing.against.is_empty() {
-        let other = of_catalogues(summing, &summing.against)?;
+        let other = of_catalogues(summing, &listed(&summing.against)?)?;
         let difference = summed.difference(&other)?;
         let other = other.result()?;
         warn();
@@ -307,7 +307,8 @@ pub(super) fn units(arguments: &Arguments) -> anyhow::Result<(BaselineUnits, Vec
         !summing.catalogues.is_empty() && summing.against.is_empty() && summing.shard.is_none(),
         "bias: a baseline is of catalogues alone. Try: without --against, --shard, --merge, --plan and --example"
     );
-    let summed = of_catalogues(summing, &summing.catalogues)?;
+    let catalogues = listed(&summing.catalogues)?;
+    let summed = of_catalogues(summing, &catalogues)?;
     let result = summed.result()?;
     for warning in of_design(&result)
         .into_iter()
@@ -316,8 +317,8 @@ pub(super) fn units(arguments: &Arguments) -> anyhow::Result<(BaselineUnits, Vec
         tell(format_args!("warning: {warning}"));
     }
     // Folders and tables within files have no fingerprint of one file.
-    let files = summing.catalogues.iter().filter(|path| path.is_file());
-    let files = files.cloned().collect();
+    let files = catalogues.into_iter().filter(|path| path.is_file());
+    let files = files.collect();
     Ok((BaselineUnits::Bias(Box::new(summed)), files))
 }
 

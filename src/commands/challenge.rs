@@ -20,7 +20,7 @@ use shearq_results::submit::Submission;
 use shearq_results::submit::check::{Finding, Severity, check_sent};
 
 use super::check::report;
-use crate::arguments::{Form, SetList, Threads, named, page};
+use crate::arguments::{Form, SetList, Summary, Threads, named, page};
 use crate::progress::{Bar, mark_resumable};
 use crate::{count, tell};
 
@@ -153,9 +153,8 @@ struct CheckArguments {
     /// Public folder of the challenge, or its challenge.toml.
     #[arg(long, value_name = "DIR")]
     challenge: PathBuf,
-    /// Print the findings as JSON.
-    #[arg(long)]
-    json: bool,
+    #[command(flatten)]
+    summary: Summary,
     /// Private folder, for organisers: if there are no errors, sign the time of arrival in ENTRY.receipt.toml. An earlier
     /// receipt of the same content is kept.
     #[arg(long, value_name = "DIR")]
@@ -308,7 +307,7 @@ fn check_entry(arguments: &CheckArguments) -> anyhow::Result<()> {
     let CheckArguments {
         entry,
         challenge: place,
-        json,
+        summary,
         truth,
         team,
         threads,
@@ -326,7 +325,7 @@ fn check_entry(arguments: &CheckArguments) -> anyhow::Result<()> {
     }
     let sent = match challenge.open(entry) {
         Ok(sent) => sent,
-        Err(error) => return report(&[Finding::unreadable(error)], entry, *json),
+        Err(error) => return report(&[Finding::unreadable(error)], entry, summary.is_json()),
     };
     let mut findings = check_sent(&sent, &expected, &mut |_| {});
     // Unreadable entries are among the findings already.
@@ -370,7 +369,7 @@ fn check_entry(arguments: &CheckArguments) -> anyhow::Result<()> {
         )),
     }
     // Before the receipt, because it fails if there are errors: an entry that cannot be scored must not hold a place in time.
-    report(&findings, entry, *json)?;
+    report(&findings, entry, summary.is_json())?;
     if let Some(judge) = judge {
         let receipt = judge.sign(entry, team.as_deref())?;
         tell(format_args!("receipt: {}", receipt.display()));

@@ -5,7 +5,8 @@ use clap::Args;
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_scoring::{Definition, Grid};
 
-use crate::{Findings, count, print, tell_unread};
+use crate::arguments::Summary;
+use crate::{Findings, count, print, print_json, tell_unread};
 use shearq_challenges::PublicChallenge;
 use shearq_dataset::grid;
 use shearq_dataset::layout::{DataFolder, Layout, MAX_IMAGE};
@@ -50,9 +51,8 @@ pub(crate) struct Arguments {
     /// Subfields of a branch of GREAT3 that was simulated [default: 200].
     #[arg(long, value_name = "N", requires = "branch", conflicts_with_all = ["data", "grid", "stamp", "images"], value_parser = clap::value_parser!(u16).range(1..=1000))]
     subfields: Option<u16>,
-    /// Print the findings as JSON.
-    #[arg(long)]
-    json: bool,
+    #[command(flatten)]
+    summary: Summary,
 }
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
@@ -61,7 +61,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         let branch = PublicChallenge::named(challenge)?.branch(arguments.branch.as_deref())?;
         let fault = branch.check(path, arguments.subfields.map(usize::from));
         let findings: Vec<Finding> = fault.err().into_iter().map(Finding::unreadable).collect();
-        return report(&findings, path, arguments.json);
+        return report(&findings, path, arguments.summary.is_json());
     }
     let data = arguments.data.as_ref().map(DataFolder::open).transpose()?;
     let sets = data
@@ -120,7 +120,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         Ok(sent) => check_sent(&sent, &expected, &mut |_| {}),
         Err(error) => vec![Finding::unreadable(error)],
     };
-    report(&findings, path, arguments.json)
+    report(&findings, path, arguments.summary.is_json())
 }
 
 // Side of the grid by the positions of the first catalogue, if at least half of its cells have a galaxy. Without data or --grid,
@@ -146,7 +146,7 @@ pub(super) fn report(findings: &[Finding], path: &Path, json: bool) -> anyhow::R
         .count();
     // JSON lists each file, because programs correct single files.
     if json {
-        print(&(serde_json::to_string_pretty(&findings)? + "\n"))?;
+        print_json(serde_json::json!({ "path": path, "errors": errors, "findings": findings }))?;
     } else {
         for (finding, files) in problems(findings) {
             let severity = match finding.severity {

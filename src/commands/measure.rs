@@ -10,7 +10,7 @@ use shearq_measure::Flag;
 use shearq_pipeline::measure::{FolderMeasurement, Summary, all_flagged};
 use shearq_submissions::Registry;
 
-use crate::arguments::{SetList, Sharding, Threads, named, sets_of};
+use crate::arguments::{self, SetList, Sharding, Threads, named, sets_of};
 use crate::progress::{Bar, mark_resumable};
 use crate::{count, tell, tell_unread};
 
@@ -37,6 +37,8 @@ pub(crate) struct Arguments {
     /// Stack all nine stars of each star field of GREAT3, shifted to the lower-left one, which is used alone otherwise.
     #[arg(long)]
     stack_stars: bool,
+    #[command(flatten)]
+    summary: arguments::Summary,
 }
 
 /// How to measure, and where to write catalogues.
@@ -89,6 +91,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         sets,
         epochs,
         stack_stars,
+        summary,
     } = arguments;
     let out = &measuring.out;
     let mut data = open_data(data)?;
@@ -99,7 +102,20 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let mut run = measuring.run(Source::folder(&data, out)?)?;
     run.epochs |= *epochs;
     let images = measuring.images(&run, &data, sets)?;
-    measure(&run, &data, out, &images, measuring.threads())
+    let done = measure(&run, &data, out, &images, measuring.threads())?;
+    let of_flag = |(count, flag): (&u64, Flag)| (flag.to_string(), (*count).into());
+    let flags: serde_json::Map<_, _> = done.flags.iter().zip(Flag::ALL).map(of_flag).collect();
+    summary.print(|| {
+        serde_json::json!({
+            "out": out,
+            "submission": run.configuration.name,
+            "images": done.images,
+            "already": done.already,
+            "galaxies": done.galaxies,
+            "flagged": done.flagged,
+            "flags": flags,
+        })
+    })
 }
 
 pub(super) fn measure(
@@ -108,14 +124,15 @@ pub(super) fn measure(
     out: &Path,
     images: &[ImageId],
     threads: usize,
-) -> anyhow::Result<()> {
+) -> anyhow::Result<Summary> {
     // Before the bar, which would hide an error about the first image.
     let work = FolderMeasurement::open(run, data, out, images)?;
     let mut bar = Bar::new("measuring", work.galaxies());
     let start = Instant::now();
     let summary = work.write_catalogues(threads, &mut bar)?;
     drop(bar);
-    report(run, &summary, start.elapsed(), threads, out)
+    report(run, &summary, start.elapsed(), threads, out)?;
+    Ok(summary)
 }
 
 // On standard error, which leaves standard output to results. All galaxies flagged is an error: the cause is a setting or a PSF,

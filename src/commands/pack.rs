@@ -5,7 +5,7 @@ use clap::Args;
 use shearq_files::open::{SETTINGS, is_there, read_to_string};
 use shearq_submissions::check_name;
 
-use crate::arguments::named;
+use crate::arguments::{Summary, named};
 use crate::progress::Bar;
 use crate::{count, tell, tell_unread};
 use shearq_challenges::{BranchCatalogues, Presubmitting, PublicBranch, PublicChallenge};
@@ -79,6 +79,8 @@ pub(crate) struct Arguments {
     /// and g2 are means over different galaxies.
     #[arg(long, requires = "branch", conflicts_with_all = GREAT10_ONLY)]
     whole_galaxies: bool,
+    #[command(flatten)]
+    summary: Summary,
 }
 
 // Options without a meaning for submissions to other challenges; `file` is --entry.
@@ -156,7 +158,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             whole_galaxies: arguments.whole_galaxies,
         };
         let branch = PublicChallenge::named(challenge)?.branch(Some(branch))?;
-        return presubmit(&*branch, &packing, out);
+        return presubmit(&*branch, &packing, out, &arguments.summary);
     }
     let entry = arguments.entry.entry()?;
     let ending = out.extension().unwrap_or_default().to_string_lossy();
@@ -204,13 +206,16 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         count(files, "file"),
         out.display()
     ));
-    Ok(())
+    arguments
+        .summary
+        .print(|| serde_json::json!({ "out": out, "files": files, "galaxies": galaxies }))
 }
 
 fn presubmit(
     branch: &dyn PublicBranch,
     packing: &Presubmitting<'_>,
     out: &Path,
+    summary: &Summary,
 ) -> anyhow::Result<()> {
     // As of other submissions: an earlier one may have been sent.
     anyhow::ensure!(
@@ -233,5 +238,5 @@ fn presubmit(
     let packed = packed?;
     packed.write(out)?;
     tell(format_args!("{}: {}", out.display(), packed.note));
-    Ok(())
+    summary.print(|| serde_json::json!({ "out": out, "files": 1, "note": packed.note }))
 }

@@ -10,7 +10,7 @@ use shearq_submissions::EllipticityType;
 use crate::arguments::{
     Printing, ReportFile, ScoreSettings, SetList, Threads, named, positive, sets_of,
 };
-use crate::{print, tell, tell_unread};
+use crate::{print_json, tell, tell_unread};
 use shearq_catalogue::foreign::Foreign;
 use shearq_challenges::{PublicChallenge, Truth};
 use shearq_dataset::layout::DataFolder;
@@ -171,7 +171,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         let title = format!("{}: {shown}", branch.title());
         match arguments.printing.format() {
             // One object with the challenge's names, not the rows of a table.
-            TableFormat::Json => print(&(serde_json::to_string_pretty(&score.json())? + "\n"))?,
+            TableFormat::Json => print_json(score.json())?,
             _ => arguments.printing.print(&score.table(title.clone()))?,
         }
         let made_by = [("Truth", truth.path), ("Submission", submission)];
@@ -508,9 +508,7 @@ fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Resul
             catalogues: arguments.catalogues.iter().map(|path| name(path)).collect(),
             definition: options.definition,
         };
-        let mut text = serde_json::to_string_pretty(&one_set_json(&scored[0], &input))?;
-        text.push('\n');
-        print(&text)?;
+        print_json(one_set_json(&scored[0], &input))?;
     } else {
         arguments.printing.print(&table)?;
     }

@@ -2,7 +2,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use crate::arguments::Unsheared;
+use crate::arguments::{Summary, Unsheared};
 
 use crate::tell;
 use shearq_catalogue::select::{smooth_selection, write_selected};
@@ -39,6 +39,8 @@ pub(crate) struct Arguments {
     /// Folder to write to.
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
+    #[command(flatten)]
+    summary: Summary,
 }
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
@@ -58,5 +60,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         "{}: {kept} of {good} galaxies without a flag have a weight above zero",
         arguments.out.display()
     ));
-    Ok(())
+    arguments
+        .summary
+        .print(|| serde_json::json!({ "out": arguments.out, "kept": kept, "good": good }))
 }
