@@ -2,12 +2,15 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 
-use crate::arguments::named;
+use crate::arguments::{Summary, named};
 use crate::{count, tell};
 use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::{DataFolder, MAX_IMAGE, MAX_SET};
+use shearq_files::fits::{Selection, image_heads};
+use shearq_files::names_of;
+use shearq_files::table::Place;
 use shearq_pipeline::gather::{
-    Content, Files, Gathered, Gathering, Masks, Square, Stamps, Table, gather,
+    Content, Exposures, Files, Gathered, Gathering, Masks, Square, Stamps, Table, gather,
 };
 use shearq_quantities::Frame;
 
@@ -19,22 +22,28 @@ use shearq_quantities::Frame;
 /// Pixels are missing if they are outside the exposure, not finite, −1e30, or not zero in a mask. A linear configuration
 /// fills a few from the opposite side of the galaxy; a network flags the galaxy.
 ///
-/// The PSF is one star stamp for all galaxies, or one per galaxy in the same order. It may also be a table of functional
-/// PSFs (x,y,profile,beta,fwhm,e1,e2; docs/files.md), whose positions are not used. Width, noise and pixel scale of
+/// The PSF is one star stamp for all galaxies, one per galaxy in the same order, or a model by PSFEx or Piff. It may also be a table of
+/// functional PSFs (x,y,profile,beta,fwhm,e1,e2; docs/files.md), whose positions are not used. Width, noise and pixel scale of
 /// stamps and PSFs are compared. A table next to the image lists
 /// the stamps in the order of the catalogues.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
     /// FITS files of stamps, in the order of the galaxies.
-    #[arg(long, value_name = "FILE", num_args = 1.., required_unless_present = "exposure", conflicts_with_all = ["exposure", "first_pixel", "columns", "degrees", "size"])]
+    #[arg(long, value_name = "FILE", num_args = 1.., required_unless_present = "exposure", conflicts_with_all = ["exposure", "chips", "first_pixel", "columns", "degrees", "size"])]
     stamps: Vec<PathBuf>,
     /// Image to cut stamps out of: the first of its file, or the one of `FILE[SCI,2]`. Rows of the positions that are on none of
     /// the exposures are left out. Several exposures of the same galaxies become images of consecutive
     /// numbers, each with the PSF, map and mask at its place in the lists, for `measure --epochs`.
     #[arg(long, value_name = "FILE", num_args = 1.., requires = "positions")]
     exposure: Vec<PathBuf>,
+    /// The exposures are chips of a camera: each becomes an image of the galaxies that are on it. Positions are right ascension and
+    /// declination, or a table for each chip. A chip without galaxies becomes no image.
+    #[arg(long, requires = "exposure")]
+    chips: bool,
     /// Use only these images of files: by name (EXTNAME) `SCI`, with version (EXTVER) `SCI,2`, or by number `4`. `plane=2` is one
-    /// plane of cubes, `SCI,2,plane=3` one of this image; `plane=all` says that planes are galaxies, not bands.
+    /// plane of cubes, `SCI,2,plane=3` one of this image; `plane=all` says that planes are galaxies, not bands. Of exposures,
+    /// `SCI,*` is each image of this name and `*` each image, as chips of a camera (see --chips); `*` in other options then stands for the
+    /// same version, name or number.
     #[arg(long, value_name = "NAME|NUMBER")]
     extension: Option<String>,
     /// Masks of the stamps in the same order, or of the exposure. A pixel is missing if its mask is not zero.
@@ -71,9 +80,10 @@ pub(crate) struct Arguments {
     cutouts: Cutouts,
     /// Make squares of stamps that are not: by their central square (crop), or by missing pixels around them (pad). A galaxy with
     /// many missing pixels is flagged. PSFs are cropped [default: refuse].
-    #[arg(long, value_name = "HOW", value_parser = named::<Square>(), conflicts_with_all = ["exposure", "first_pixel", "columns", "degrees", "size"])]
+    #[arg(long, value_name = "HOW", value_parser = named::<Square>(), conflicts_with_all = ["exposure", "chips", "first_pixel", "columns", "degrees", "size"])]
     square: Option<Square>,
-    /// FITS files of PSF stamps, or one table of functional PSFs (.csv): one PSF for all galaxies, or one per galaxy.
+    /// FITS files of PSF stamps, or one table of functional PSFs (.csv): one PSF for all galaxies, or one per galaxy. Or a model by PSFEx
+    /// or Piff of each exposure, drawn at the galaxies; models of Piff need the Python package and piff.
     #[arg(long, value_name = "FILE", num_args = 1.., required = true)]
     psf: Vec<PathBuf>,
     /// Use only PSFs of this name (EXTNAME).
@@ -116,6 +126,8 @@ pub(crate) struct Arguments {
     /// Data folder. It may contain images of other numbers.
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
+    #[command(flatten)]
+    summary: Summary,
 }
 
 // The options of stamps that are cut out of an exposure.
@@ -149,31 +161,178 @@ fn two_columns(columns: Option<&[String]>) -> anyhow::Result<Option<[&str; 2]>> 
     }
 }
 
-/// The part of a list that belongs to exposure `at` of `of`: all of it if there is only one.
-fn own<'a>(
-    (at, of): (usize, usize),
-    option: &str,
-    files: &'a [PathBuf],
-    one_for_all: bool,
-) -> anyhow::Result<&'a [PathBuf]> {
-    match files.len() {
-        0 => Ok(files),
-        _ if of < 2 => Ok(files),
-        1 if one_for_all => Ok(files),
-        found if found == of => Ok(&files[at..=at]),
-        found => anyhow::bail!(
-            "--{option} names {} for {of} exposures (expected one for each, in the same order)",
-            count(found, "file")
-        ),
+/// An exposure of the list, or a chip that `*` stands for.
+struct Exposed {
+    /// `FILE`, or `FILE[SELECTION]` of a chip.
+    path: PathBuf,
+    /// The place of the file in the list.
+    file: usize,
+    /// What `*` stands for in options of other files.
+    chip: Option<Star>,
+}
+
+struct Star {
+    version: i64,
+    /// The shortest selection of the image in its file.
+    name: String,
+}
+
+impl Star {
+    /// A selection with `*` for the version of a name, or for a whole image.
+    fn filled(&self, selection: &str) -> String {
+        let mut parts: Vec<String> = selection
+            .split(',')
+            .map(|part| part.trim().into())
+            .collect();
+        for (place, part) in parts
+            .iter_mut()
+            .enumerate()
+            .filter(|(_, part)| *part == "*")
+        {
+            *part = match place {
+                0 => self.name.clone(),
+                _ => self.version.to_string(),
+            };
+        }
+        parts.join(",")
     }
 }
 
-/// What to gather from exposure `at`, from 0, or from all stamps.
-fn gathering<'a>(arguments: &'a Arguments, at: usize) -> anyhow::Result<Gathering<'a>> {
-    let exposures = arguments.exposure.len();
-    let own = |option: &str, files: &'a [PathBuf], one_for_all: bool| {
-        own((at, exposures), option, files, one_for_all)
-    };
+fn has_star(selection: &str) -> bool {
+    selection.split(',').any(|part| part.trim() == "*")
+}
+
+impl Exposed {
+    fn all(arguments: &Arguments) -> anyhow::Result<Vec<Self>> {
+        let mut all = Vec::new();
+        for (file, path) in arguments.exposure.iter().enumerate() {
+            let place = Place::of(path);
+            let selection = arguments.extension.as_ref().or(place.table.as_ref());
+            let Some(selection) = selection.filter(|selection| has_star(selection)) else {
+                all.push(Exposed {
+                    path: path.clone(),
+                    file,
+                    chip: None,
+                });
+                continue;
+            };
+            all.extend(Exposed::of_file(&place.path, file, selection)?);
+        }
+        Ok(all)
+    }
+
+    fn of_file(path: &Path, file: usize, selection: &str) -> anyhow::Result<Vec<Self>> {
+        let heads = image_heads(path)?;
+        // Without its stars a selection is one of all chips.
+        let rest: Vec<&str> = selection
+            .split(',')
+            .filter(|part| part.trim() != "*")
+            .collect();
+        let meant = match rest.join(",") {
+            rest if rest.is_empty() => Selection::default(),
+            rest => Selection::parse(&rest).map_err(anyhow::Error::msg)?,
+        };
+        let chips: Vec<Exposed> = heads
+            .iter()
+            .filter(|head| meant.has(head))
+            .map(|head| {
+                let star = Star {
+                    version: head.version,
+                    name: head.shown(&heads),
+                };
+                Exposed {
+                    // By its name for people; a name alone would be that of several.
+                    path: format!("{}[{}]", path.display(), star.name).into(),
+                    file,
+                    chip: Some(star),
+                }
+            })
+            .collect();
+        let names: Vec<String> = heads.iter().map(|head| head.shown(&heads)).collect();
+        anyhow::ensure!(
+            !chips.is_empty(),
+            "{}: no image is called `{selection}` (found {})",
+            path.display(),
+            names_of(&names)
+        );
+        Ok(chips)
+    }
+}
+
+/// The options that belong to one exposure: their `*` is filled.
+struct Own<'a> {
+    arguments: &'a Arguments,
+    /// The exposures; none for stamps.
+    exposed: &'a [Exposed],
+    at: usize,
+    is_chip: bool,
+    extensions: [Option<String>; 4],
+}
+
+// Options of which `*` is filled.
+const MASK: usize = 0;
+const PSF: usize = 1;
+const VARIANCE: usize = 2;
+const WEIGHT: usize = 3;
+
+impl<'a> Own<'a> {
+    fn new(
+        arguments: &'a Arguments,
+        exposed: &'a [Exposed],
+        at: usize,
+        is_chip: bool,
+    ) -> anyhow::Result<Self> {
+        let chip = exposed.get(at).and_then(|own| own.chip.as_ref());
+        let filled = |(option, selection): (&str, &Option<String>)| match (selection, chip) {
+            (Some(selection), Some(chip)) => Ok(Some(chip.filled(selection))),
+            (Some(selection), None) if has_star(selection) => anyhow::bail!(
+                "--{option} is {selection}; expected `*` in --extension of exposures, too"
+            ),
+            (selection, _) => Ok(selection.clone()),
+        };
+        Ok(Own {
+            arguments,
+            exposed,
+            at,
+            is_chip,
+            extensions: [
+                filled(("mask-extension", &arguments.mask_extension))?,
+                filled(("psf-extension", &arguments.psf_extension))?,
+                filled(("variance-extension", &arguments.variance_extension))?,
+                filled(("weight-extension", &arguments.weight_extension))?,
+            ],
+        })
+    }
+
+    /// The part of a list that belongs to this exposure: all of it if there is only one.
+    fn part(
+        &self,
+        option: &str,
+        files: &'a [PathBuf],
+        one_for_all: bool,
+    ) -> anyhow::Result<&'a [PathBuf]> {
+        let (of, of_files) = (self.exposed.len(), self.arguments.exposure.len());
+        match files.len() {
+            0 => Ok(files),
+            _ if of < 2 => Ok(files),
+            1 if one_for_all => Ok(files),
+            found if found == of => Ok(&files[self.at..=self.at]),
+            found if found == of_files => {
+                let file = self.exposed[self.at].file;
+                Ok(&files[file..=file])
+            }
+            found => anyhow::bail!(
+                "--{option} names {} for {of} exposures (expected one for each, in the same order)",
+                count(found, "file")
+            ),
+        }
+    }
+}
+
+/// What to gather from an exposure, or from all stamps.
+fn gathering<'a>(own: &'a Own<'a>) -> anyhow::Result<Gathering<'a>> {
+    let arguments = own.arguments;
+    let exposure = own.exposed.get(own.at);
     for (option, value) in [("noise", arguments.noise), ("gain", arguments.gain)] {
         anyhow::ensure!(
             // Not subnormal: noise is divided by, and 1/5e-324 is infinite.
@@ -184,11 +343,15 @@ fn gathering<'a>(arguments: &'a Arguments, at: usize) -> anyhow::Result<Gatherin
         );
     }
     let images = Files {
-        paths: match exposures {
-            0 => arguments.stamps.as_slice(),
-            _ => own("exposure", &arguments.exposure, false)?,
+        paths: match exposure {
+            None => arguments.stamps.as_slice(),
+            Some(exposure) => std::slice::from_ref(&exposure.path),
         },
-        extension: arguments.extension.as_deref(),
+        // A chip has its selection in brackets.
+        extension: match exposure.and_then(|exposure| exposure.chip.as_ref()) {
+            None => arguments.extension.as_deref(),
+            Some(_) => None,
+        },
         content: Content::Sky,
     };
     // An extension without a file means the files of the images: surveys store masks and weights in one file with the pixels.
@@ -204,8 +367,8 @@ fn gathering<'a>(arguments: &'a Arguments, at: usize) -> anyhow::Result<Gatherin
         })
     };
     let masks = companion(
-        own("mask", &arguments.mask, false)?,
-        arguments.mask_extension.as_deref(),
+        own.part("mask", &arguments.mask, false)?,
+        own.extensions[MASK].as_deref(),
         Content::Mask,
     );
     anyhow::ensure!(
@@ -216,16 +379,16 @@ fn gathering<'a>(arguments: &'a Arguments, at: usize) -> anyhow::Result<Gatherin
     let bits = arguments.mask_bits.as_ref();
     let bits = bits.map(|bits| bits.iter().fold(0, |all, bit| all | 1u64 << bit));
     let variances = companion(
-        own("variance", &arguments.variance, false)?,
-        arguments.variance_extension.as_deref(),
+        own.part("variance", &arguments.variance, false)?,
+        own.extensions[VARIANCE].as_deref(),
         Content::Variance,
     );
     let weights = companion(
-        own("weight-map", &arguments.weight_map, false)?,
-        arguments.weight_extension.as_deref(),
+        own.part("weight-map", &arguments.weight_map, false)?,
+        own.extensions[WEIGHT].as_deref(),
         Content::Weight,
     );
-    let positions = own("positions", &arguments.positions, true)?;
+    let positions = own.part("positions", &arguments.positions, true)?;
     anyhow::ensure!(
         positions.len() <= 1,
         "--positions names {} for one image (expected one)",
@@ -242,7 +405,7 @@ fn gathering<'a>(arguments: &'a Arguments, at: usize) -> anyhow::Result<Gatherin
         carry: &arguments.carry,
     });
     let (stamps, rows) = match table {
-        Some(positions) if exposures > 0 => {
+        Some(positions) if exposure.is_some() => {
             let cutouts = Stamps::Cutouts {
                 exposure: images,
                 positions,
@@ -259,8 +422,8 @@ fn gathering<'a>(arguments: &'a Arguments, at: usize) -> anyhow::Result<Gatherin
         square: arguments.square,
         masks: masks.map(|files| Masks { files, bits }),
         psfs: Files {
-            paths: own("psf", &arguments.psf, false)?,
-            extension: arguments.psf_extension.as_deref(),
+            paths: own.part("psf", &arguments.psf, own.is_chip)?,
+            extension: own.extensions[PSF].as_deref(),
             content: Content::Psf,
         },
         psf_oversampling: arguments.psf_oversampling.map(usize::from),
@@ -272,10 +435,13 @@ fn gathering<'a>(arguments: &'a Arguments, at: usize) -> anyhow::Result<Gatherin
 }
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
-    let exposures = arguments.exposure.len().max(1);
-    let all: Vec<Gathering<'_>> = (0..exposures)
-        .map(|at| gathering(arguments, at))
+    let exposed = Exposed::all(arguments)?;
+    let is_chip = arguments.chips || exposed.iter().any(|one| one.chip.is_some());
+    let exposures = exposed.len().max(1);
+    let own: Vec<Own<'_>> = (0..exposures)
+        .map(|at| Own::new(arguments, &exposed, at, is_chip))
         .collect::<anyhow::Result<_>>()?;
+    let all: Vec<Gathering<'_>> = own.iter().map(gathering).collect::<anyhow::Result<_>>()?;
     let last = arguments.image as usize + exposures - 1;
     anyhow::ensure!(
         last <= MAX_IMAGE as usize,
@@ -290,11 +456,35 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         DataFolder::new(out)
     };
     let (set, image) = (arguments.set, arguments.image);
-    let gathered = gather(&data, ImageId { set, image }, &all)?;
-    for (image, gathered) in (image..).zip(gathered) {
-        tell_gathered(&data.galaxies(set, image), &gathered);
+    let exposures = match is_chip {
+        true => Exposures::Chips,
+        false => Exposures::Epochs,
+    };
+    let gathered = gather(&data, ImageId { set, image }, &all, exposures)?;
+    let mut images = Vec::new();
+    for ((image, gathered), at) in (image..).zip(gathered).zip(0..) {
+        match gathered {
+            Some(gathered) => {
+                let path = data.galaxies(set, image);
+                tell_gathered(&path, &gathered);
+                images.push(serde_json::json!({
+                    "set": set,
+                    "image": image,
+                    "path": path,
+                    "galaxies": gathered.mosaic.galaxies,
+                    "stamp": gathered.mosaic.stamp,
+                    "incomplete": gathered.incomplete,
+                    "messages": gathered.messages,
+                }));
+            }
+            None => tell(format_args!(
+                "note: {}: no galaxy is on this chip, which becomes no image",
+                exposed[at].path.display()
+            )),
+        }
     }
-    Ok(())
+    let summary = || serde_json::json!({ "images": images });
+    arguments.summary.print(summary)
 }
 
 fn tell_gathered(path: &Path, gathered: &Gathered) {

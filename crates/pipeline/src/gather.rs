@@ -5,6 +5,7 @@ mod array;
 mod exposure;
 mod files;
 mod maps;
+mod model;
 mod mosaic;
 mod positions;
 mod psfs;
@@ -23,6 +24,7 @@ use self::exposure::Exposure;
 pub(crate) use self::exposure::subpixel_offset;
 pub use self::files::{Content, Files};
 use self::files::{Images, shown};
+use self::model::Chip;
 use self::mosaic::{Origins, Rows, StampWriter, already};
 pub use self::positions::Table;
 use self::positions::{Positions, rows_of_stamps};
@@ -36,7 +38,7 @@ use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::{DataFolder, MAX_STAMP};
 use shearq_files::FileError;
 use shearq_files::atomic;
-use shearq_files::frames::polars::Column;
+use shearq_files::frames::{self, polars::Column};
 use shearq_files::open::is_there;
 use shearq_files::table;
 
@@ -143,8 +145,17 @@ struct Record<'a> {
     gathering: &'a Gathering<'a>,
 }
 
+/// How exposures of one list belong together.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Exposures {
+    /// Of the same galaxies: each image has the rows of all galaxies that are on one of them.
+    Epochs,
+    /// Chips of a camera: each image has the galaxies that are on it. One without galaxies becomes no image.
+    Chips,
+}
+
 /// Gathers stamps and their PSFs into images of `data` with consecutive numbers, from the number of `first` on. If one of them cannot be
-/// gathered, none is written.
+/// gathered, none is written. Chips without galaxies have `None`.
 ///
 /// Writes the table of stamps, the record of the sources, the PSFs, and last the image. Leftovers of a stopped process
 /// are replaced. Other processes that gather into the same folder wait.
@@ -152,7 +163,8 @@ pub fn gather(
     data: &DataFolder,
     first: ImageId,
     all: &[Gathering<'_>],
-) -> Result<Vec<Gathered>, PipelineError> {
+    exposures: Exposures,
+) -> Result<Vec<Option<Gathered>>, PipelineError> {
     let which = data.stamps(first.set, first.image);
     let folder = which.parent().unwrap_or(Path::new("."));
     let cannot = "cannot make the folder";
@@ -167,7 +179,7 @@ pub fn gather(
     let alone = fs::File::open(folder).map_err(FileError::doing(folder, cannot))?;
     // Not all file systems have locks.
     let _ = alone.lock();
-    let gathered = gather_alone(data, first, all);
+    let gathered = gather_alone(data, first, all, exposures);
     if gathered.is_err() {
         for folder in made {
             // Fails if the folder is not empty.
@@ -181,7 +193,8 @@ fn gather_alone(
     data: &DataFolder,
     first: ImageId,
     all: &[Gathering<'_>],
-) -> Result<Vec<Gathered>, PipelineError> {
+    exposures: Exposures,
+) -> Result<Vec<Option<Gathered>>, PipelineError> {
     // The table of stamps would replace the catalogue of galaxies, which another program wrote.
     if data.layout().great3.is_some() {
         let message = "this folder is a branch of GREAT3, to which no image can be added (expected a folder of gathered images, or a new one). Try: another folder";
@@ -193,15 +206,82 @@ fn gather_alone(
     }
     // All files have temporary names until the last exposure is read: with some of them in the folder, the user could neither repeat
     // the command nor see which exposures were lost.
-    let plans = all.iter().map(|one| Plan::of(&one.stamps, one.square));
+    let chips = exposures == Exposures::Chips;
+    let plans = all
+        .iter()
+        .map(|one| Plan::of(&one.stamps, one.square, chips));
     let mut plans: Vec<Plan> = plans.collect::<Result<_, _>>()?;
-    leave_out_elsewhere(&mut plans, all)?;
+    match exposures {
+        Exposures::Chips => leave_out_of_chips(&mut plans, all)?,
+        Exposures::Epochs => leave_out_elsewhere(&mut plans, all)?,
+    }
     let jacobians = jacobians_of_all(&plans, all)?;
     let prepared = ids.zip(all).zip(plans.into_iter().zip(jacobians));
     let prepared = prepared
-        .map(|((id, one), (plan, jacobians))| prepare(data, id, one, plan, jacobians.as_deref()));
-    let prepared: Vec<Prepared> = prepared.collect::<Result<_, _>>()?;
-    prepared.into_iter().map(Prepared::finish).collect()
+        .enumerate()
+        .map(|(at, ((id, one), (plan, jacobians)))| {
+            let chip = Chip { at, of: all.len() };
+            let is_empty = plan.stack.count == 0;
+            let prepare = || prepare(data, id, one, plan, jacobians.as_deref(), chip);
+            (!is_empty).then(prepare).transpose()
+        });
+    let prepared: Vec<Option<Prepared>> = prepared.collect::<Result<_, _>>()?;
+    let finish = |image: Option<Prepared>| image.map(Prepared::finish).transpose();
+    prepared.into_iter().map(finish).collect()
+}
+
+// Each chip keeps the galaxies that are on it.
+fn leave_out_of_chips(plans: &mut [Plan], all: &[Gathering<'_>]) -> Result<(), FileError> {
+    let tables: Vec<Option<Table<'_>>> = all.iter().map(|one| one.stamps.positions()).collect();
+    for (at, table) in tables
+        .iter()
+        .enumerate()
+        .filter_map(|(at, table)| Some((at, (*table)?)))
+    {
+        let same: Vec<usize> = (0..plans.len())
+            .filter(|other| tables[*other] == Some(table))
+            .collect();
+        if same[0] != at {
+            continue;
+        }
+        let count = plans[at].inside.len();
+        if let [_, _, ..] = same[..]
+            && plans[at]
+                .positions
+                .as_ref()
+                .is_some_and(|found| !found.in_degrees())
+        {
+            let message = format!(
+                "x and y are pixels of one chip (found one table for {} chips, expected right ascension and declination, or a table for each). Try: --degrees",
+                same.len()
+            );
+            return Err(FileError::new(table.path, message));
+        }
+        let on_none = (0..count).filter(|&row| !same.iter().any(|&chip| plans[chip].inside[row]));
+        let on_none = on_none.count();
+        if on_none == count {
+            let message = format!(
+                "all {count} positions are outside the {} chips. Try: check the positions and the WCS of the chips",
+                same.len()
+            );
+            return Err(FileError::new(table.path, message));
+        }
+        if on_none > 0 {
+            let message = format!(
+                "note: {}: {on_none} of {count} positions are on no chip and left out",
+                table.path.display()
+            );
+            plans[at].messages.push(message);
+        }
+    }
+    for plan in plans {
+        if let Some(positions) = &mut plan.positions {
+            positions.keep(&plan.inside)?;
+            plan.stack.count = positions.all.len();
+            plan.inside.retain(|inside| *inside);
+        }
+    }
+    Ok(())
 }
 
 // Galaxies that are on another exposure of the same table are kept, so that epochs have the same rows.
@@ -257,6 +337,7 @@ fn prepare(
     gathering: &Gathering<'_>,
     plan: Plan,
     jacobians: Option<&[Matrix2]>,
+    chip: Chip,
 ) -> Result<Prepared, PipelineError> {
     let target = data.galaxies(id.set, id.image);
     let which = data.stamps(id.set, id.image);
@@ -281,13 +362,11 @@ fn prepare(
     let rows = rows.transpose()?;
     let mosaic = Mosaic::of(count, side);
     check_strip(&target, mosaic.columns, side)?;
-    let psfs = gather_psfs(
-        data,
-        id,
-        (gathering.psfs, gathering.psf_oversampling.unwrap_or(1)),
-        gathering.square,
-        &mosaic,
-    )?;
+    let places = match &plan.positions {
+        Some(found) => Some(found.all.clone()),
+        None => rows.as_deref().and_then(pixels_of_rows),
+    };
+    let psfs = gather_psfs(data, id, gathering, &plan, chip, places)?;
     messages.extend_from_slice(&psfs.messages);
     let of_psf = check_psf(&psfs, &plan, jacobians)?;
     let mut writer = StampWriter::create(&target, mosaic, gathering.noise, wcs, &psfs.examination)?;
@@ -331,6 +410,17 @@ fn prepare(
             messages,
         },
     })
+}
+
+// The columns x and y of stamps that are not cut out.
+fn pixels_of_rows(rows: &[Column]) -> Option<Vec<(f64, f64)>> {
+    let of = |wanted: &str| {
+        let column = rows.iter().find(|column| column.name() == wanted);
+        column.and_then(frames::reals)
+    };
+    let [x, y, ..] = stamp_table::PLACE;
+    let (x, y) = (of(x)?, of(y)?);
+    Some(x.iter().copied().zip(y.iter().copied()).collect())
 }
 
 // Of all exposures or of none, because `measure --epochs` combines stamps along common axes: exposures along the sky next to turned
@@ -388,7 +478,7 @@ struct Plan {
 }
 
 impl Plan {
-    fn of(stamps: &Stamps<'_>, square: Option<Square>) -> Result<Self, FileError> {
+    fn of(stamps: &Stamps<'_>, square: Option<Square>, chips: bool) -> Result<Self, FileError> {
         match stamps {
             Stamps::Files(files) => Plan::of_files(*files, square),
             Stamps::Cutouts {
@@ -396,7 +486,7 @@ impl Plan {
                 positions,
                 first_pixel,
                 side,
-            } => Plan::of_cutouts(*exposure, *positions, *first_pixel, *side),
+            } => Plan::of_cutouts(*exposure, *positions, (*first_pixel, *side), chips),
         }
     }
 
@@ -538,8 +628,8 @@ impl Plan {
     fn of_cutouts(
         exposure: Files<'_>,
         positions: Table<'_>,
-        first_pixel: u8,
-        side: usize,
+        (first_pixel, side): (u8, usize),
+        is_chip: bool,
     ) -> Result<Self, FileError> {
         let path = &exposure.paths[0];
         let mut exposure = Exposure::open(exposure)?;
@@ -551,7 +641,10 @@ impl Plan {
         messages.extend(positions.note.clone());
         messages.extend(doubts(path, &wcs));
         let sides = exposure.sides()?;
-        messages.extend(positions.examine(path, &wcs, sides)?);
+        // Most galaxies of a camera are on other chips.
+        if !(is_chip && positions.inside(sides).iter().all(|inside| !inside)) {
+            messages.extend(positions.examine(path, &wcs, sides)?);
+        }
         Ok(Plan {
             stack: Stack {
                 count: positions.all.len(),

@@ -1,5 +1,6 @@
 """The command line: ``python -m shearq`` and the script ``shearq`` are the same as the binary."""
 
+import os
 import signal
 import sys
 
@@ -17,6 +18,8 @@ def main() -> int:
         return int(PipelineStage.main())
     # Python would only note an interrupt, and act on it when the command is done.
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+    # Of models of Piff, which this interpreter draws.
+    os.environ.setdefault("SHEARQ_PYTHON", sys.executable)
     return run_command(["shearq", *sys.argv[1:]])
 
 

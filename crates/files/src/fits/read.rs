@@ -739,6 +739,32 @@ pub fn read_table_keys<'a>(
     Ok(keys.map(value).filter(|(_, v)| !v.is_empty()).collect())
 }
 
+/// The vector in the first row of a column, and the cards of the header: texts keep their quotes. `table` is a number as in
+/// [`TableHead`].
+pub fn read_vector(
+    path: &Path,
+    table: usize,
+    column: &str,
+) -> Result<(Vec<f64>, BTreeMap<String, String>), FileError> {
+    let mut file = File::open(path, Content::Table)?;
+    file.go_to(table)?;
+    let found = describe_columns(&file)?;
+    let Some(found) = found.into_iter().find(|own| own.name == column) else {
+        return Err(file.fault(format!("table {table} has no column `{column}`")));
+    };
+    // The vector must fit into the file before there is memory for it.
+    if table_rows(&mut file, MAX_ROWS)? == 0 || !found.is_number() {
+        return Err(file.fault(format!(
+            "column `{column}` of table {table} has no numbers; expected a vector of them"
+        )));
+    }
+    let doing = || format!("cannot read column `{column}`");
+    let values = file.values(doing, found.number, 1, found.repeat as usize, f64::NAN)?;
+    let cards = file.cards()?;
+    file.check_end()?;
+    Ok((values, cards))
+}
+
 /// Number of rows of the current table, at most `most`, which must fit into the file.
 fn table_rows(file: &mut File, most: usize) -> Result<usize, FileError> {
     let count = file.rows()?;

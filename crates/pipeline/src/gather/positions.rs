@@ -163,6 +163,10 @@ impl Positions {
         })
     }
 
+    pub(super) fn in_degrees(&self) -> bool {
+        self.degrees
+    }
+
     /// Whether the centres are on an exposure of this size.
     pub(super) fn inside(&self, [width, height]: [usize; 2]) -> Vec<bool> {
         let within = |at: f64, side: usize| at >= 0.5 && at < side as f64 + 0.5;

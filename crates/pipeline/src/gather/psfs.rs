@@ -1,4 +1,4 @@
-//! PSFs of the stamps: one for all, one per galaxy, or a table of functional ones.
+//! PSFs of the stamps: one for all, one per galaxy, a table of functional ones, or a model that is drawn at the galaxies.
 
 use std::path::{Path, PathBuf};
 
@@ -14,9 +14,10 @@ use shearq_quantities::linear::Matrix2;
 use shearq_submissions::PsfCut;
 use shearq_submissions::limits::MIN_PSF;
 
-use super::files::{Files, PlaneReader};
+use super::files::PlaneReader;
+use super::model::{Chip, PsfModel};
 use super::mosaic::{Rows, central, first};
-use super::{Square, Stack};
+use super::{Gathering, Plan, Stack};
 use crate::wcs::Wcs;
 
 // Central pixels of a PSF that are examined, along each axis: those that configurations use.
@@ -35,10 +36,26 @@ pub(super) struct GatheredPsfs {
 pub(super) fn gather_psfs(
     data: &DataFolder,
     id: ImageId,
-    (files, oversampling): (Files<'_>, usize),
-    square: Option<Square>,
-    mosaic: &Mosaic,
+    gathering: &Gathering<'_>,
+    plan: &Plan,
+    chip: Chip,
+    places: Option<Vec<(f64, f64)>>,
 ) -> Result<GatheredPsfs, FileError> {
+    let (files, square) = (gathering.psfs, gathering.square);
+    let oversampling = gathering.psf_oversampling.unwrap_or(1);
+    let mosaic = &Mosaic::of(plan.stack.count, plan.stack.side);
+    if let [path] = files.paths
+        && let Some(model) = PsfModel::read(path, chip)?
+    {
+        if oversampling > 1 {
+            let message = format!(
+                "a model states its own sampling (found an oversampling of {oversampling}, expected none). Try: without --psf-oversampling"
+            );
+            return Err(FileError::new(path, message));
+        }
+        let to = data.psf_star(id.set, id.image);
+        return of_model(path, &model, &to, plan, places);
+    }
     if let [table] = files.paths
         && table
             .extension()
@@ -59,50 +76,109 @@ pub(super) fn gather_psfs(
         _ => (Wcs::default(), Vec::new()),
     };
     messages.extend(small(&files.paths[0], side));
-    let path = data.psf_star(id.set, id.image);
     check_count(&files.paths[0], count, mosaic)?;
-    // One, or one per galaxy in the same places.
-    let mut image = Rows::create(&path, Mosaic::of(count, side), &wcs.keys())?;
+    let path = data.psf_star(id.set, id.image);
+    let mut writer = StarWriter::create(&path, count, side, &wcs)?;
     let mut planes = PlaneReader::of(files);
-    let mut examination = Examination::new(side, 0);
-    if count > 1 {
-        examination = examination.with_psf_of_each();
-    }
-    let mut dark = 0;
     while let Some((origin, pixels)) = planes.next()? {
         let pixels = central(pixels, planes.sides(), fine);
         let pixels = on_galaxy_pixels(pixels, fine, oversampling)
             .map_err(|error| origin.fault(&error.to_string()))?;
-        let light: f64 = pixels.iter().map(|&value| f64::from(value)).sum();
-        if !(light > 0.0 && light.is_finite()) {
-            if count == 1 {
-                let message =
-                    format!("the pixels of the PSF add up to {light}; expected a positive sum");
-                return Err(origin.fault(&message));
-            }
-            dark += 1;
+        let light = writer.add(&pixels)?;
+        if count == 1 && writer.dark > 0 {
+            let message =
+                format!("the pixels of the PSF add up to {light}; expected a positive sum");
+            return Err(origin.fault(&message));
         }
-        if let Ok(stamp) = ArrayView2::from_shape((side, side), &pixels)
+    }
+    Ok(writer.gathered(&files.paths[0], messages, wcs, pixels_of_all))
+}
+
+/// The PSFs of a model at the galaxies, on pixels that have the size of the stamps.
+fn of_model(
+    path: &Path,
+    model: &PsfModel,
+    to: &Path,
+    plan: &Plan,
+    places: Option<Vec<(f64, f64)>>,
+) -> Result<GatheredPsfs, FileError> {
+    let Some(mut places) = places else {
+        let message = "a model of the PSF is drawn at the galaxies, whose places are not known (expected columns x and y, in FITS pixels of the exposure). Try: --positions";
+        return Err(FileError::new(path, message));
+    };
+    // A galaxy beyond the exposure has no pixels here, and a polynomial may have any value there.
+    let inside = plan.inside.iter().position(|inside| *inside);
+    if let Some(known) = inside.map(|inside| places[inside]) {
+        let all = places.iter_mut().zip(&plan.inside);
+        all.filter(|(_, inside)| !**inside)
+            .for_each(|(place, _)| *place = known);
+    }
+    let side = plan.stack.side.max(MIN_PSF);
+    let mut writer = StarWriter::create(to, places.len(), side, &plan.stack.wcs)?;
+    model.draw(&places, side, |stamp| writer.add(stamp).map(|_| ()))?;
+    Ok(writer.gathered(path, Vec::new(), plan.stack.wcs.clone(), plan.pixels()))
+}
+
+/// PSF stamps that are written and examined: one, or one per galaxy in the same places.
+struct StarWriter {
+    image: Rows,
+    examination: Examination,
+    side: usize,
+    /// PSFs without light.
+    dark: usize,
+}
+
+impl StarWriter {
+    fn create(path: &Path, count: usize, side: usize, wcs: &Wcs) -> Result<Self, FileError> {
+        let examination = Examination::new(side, 0);
+        Ok(StarWriter {
+            image: Rows::create(path, Mosaic::of(count, side), &wcs.keys())?,
+            examination: match count {
+                1 => examination,
+                _ => examination.with_psf_of_each(),
+            },
+            side,
+            dark: 0,
+        })
+    }
+
+    /// Returns the sum of the pixels.
+    fn add(&mut self, pixels: &[f32]) -> Result<f64, FileError> {
+        let side = self.side;
+        let light: f64 = pixels.iter().map(|&value| f64::from(value)).sum();
+        self.dark += usize::from(!(light > 0.0 && light.is_finite()));
+        if let Ok(stamp) = ArrayView2::from_shape((side, side), pixels)
             && let Ok(Star { psf, moved }) = Star::cut(stamp, examined_cut(side))
         {
-            examination.add_psf(psf.view(), moved);
+            self.examination.add_psf(psf.view(), moved);
         }
-        image.add(&pixels)?;
+        self.image.add(pixels)?;
+        Ok(light)
     }
-    messages.extend(named(&examination, &files.paths[0]));
-    if dark > 0 {
-        messages.push(format!(
-            "warning: {dark} of {count} PSFs have no positive sum of pixels. Their galaxies will be flagged"
-        ));
+
+    fn gathered(
+        self,
+        first: &Path,
+        mut messages: Vec<String>,
+        wcs: Wcs,
+        pixels: Vec<Option<Matrix2>>,
+    ) -> GatheredPsfs {
+        messages.extend(named(&self.examination, first));
+        if self.dark > 0 {
+            messages.push(format!(
+                "warning: {} of {} PSFs have no positive sum of pixels. Their galaxies will be flagged",
+                self.dark, self.image.mosaic.galaxies
+            ));
+        }
+        GatheredPsfs {
+            file: PsfFile::Stars(Box::new(self.image)),
+            examination: self.examination,
+            messages,
+            wcs,
+            pixels,
+            first: first.to_owned(),
+        }
     }
-    Ok(GatheredPsfs {
-        file: PsfFile::Stars(Box::new(image)),
-        examination,
-        messages,
-        wcs,
-        pixels: pixels_of_all,
-        first: files.paths[0].clone(),
-    })
 }
 
 /// A PSF of `fine` pixels a side integrated over pixels of the galaxies.

@@ -1,0 +1,54 @@
+"""Draws a model of Piff for ``shearq gather --psf``: places on standard input, pixels on standard output.
+
+``python3 -m shearq._drawn_psfs FILE CHIP CHIPS SIDE`` reads a line ``x y`` for each galaxy, and then writes SIDE × SIDE numbers of
+32 bits for each, the lowest byte first.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Any, BinaryIO
+
+import numpy as np
+
+# Galaxies that are drawn at a time.
+_BLOCK = 64
+
+
+def _properties(psf: Any, chip: int, chips: int) -> dict[str, int]:
+    """The chip, of a model with several."""
+    own = list(psf.wcs)
+    if len(own) == 1:
+        return {}
+    if len(own) != chips:
+        raise ValueError(f"the model has {len(own)} chips and there are {chips} exposures; expected as many")
+    return {"chipnum": own[chip]}
+
+
+def draw(path: str, chip: int, chips: int, side: int, places: str, out: BinaryIO) -> None:
+    import piff
+
+    from ._psf_models import at_galaxies
+
+    psf = piff.PSF.read(path)
+    x, y = np.array([line.split() for line in places.splitlines()], dtype=np.float64).T
+    drawn = at_galaxies(psf, np.empty((len(x), side, side), dtype=np.bool_), x, y, None, _properties(psf, chip, chips))
+    for first in range(0, len(x), _BLOCK):
+        out.write(np.ascontiguousarray(drawn[slice(first, first + _BLOCK)], dtype="<f4").tobytes())
+
+
+def main() -> int:
+    path, *numbers = sys.argv[1:]
+    try:
+        draw(path, *map(int, numbers), sys.stdin.read(), sys.stdout.buffer)
+    except ImportError as error:
+        print(f"error: {path}: {error}. Try: {sys.executable} -m pip install piff", file=sys.stderr)
+        return 1
+    except Exception as error:
+        print(f"error: {path}: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
