@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from conftest import same_bits
 
 import shearq
 
@@ -30,8 +31,15 @@ class Wcs:
     def __init__(self, angle):
         turn = np.radians(angle)
         matrix = SCALE * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-        origin = galsim.PositionD(X0 + SIDE / 2, Y0 + SIDE / 2)
-        self.galsim = galsim.TanWCS(galsim.AffineTransform(*matrix.ravel(), origin=origin), galsim.CelestialCoord(1 * galsim.radians, 0.3 * galsim.radians))
+        self.galsim = self.tangent(matrix, X0, Y0)
+        self.matrix = matrix
+
+    def tangent(self, matrix, x0, y0):
+        plane = galsim.AffineTransform(*matrix.ravel(), origin=galsim.PositionD(x0 + SIDE / 2, y0 + SIDE / 2))
+        return galsim.TanWCS(plane, galsim.CelestialCoord(1 * galsim.radians, 0.3 * galsim.radians))
+
+    def of_file(self):
+        return self.tangent(self.matrix, 1, 1)
 
     def pixelToSkyArray(self, x, y, degrees):
         assert degrees
@@ -103,3 +111,55 @@ def test_planes_are_missing_pixels_by_name():
     found.psf = None
     with pytest.raises(ValueError, match="exposure: has no PSF"):
         shearq.from_exposure(found, x, y)
+
+
+def as_images(found):
+    """The same as lsst.images has it."""
+    plain = SimpleNamespace
+    names = {"BAD": "BAD", "SAT": "SATURATED", "CR": "COSMIC_RAY", "DETECTED": "DETECTED", "NO_DATA": "NO_DATA"}
+
+    def pixel_to_sky(*, x, y):
+        ra, dec = found.wcs.pixelToSkyArray(x, y, degrees=True)
+        return plain(ra=plain(deg=ra), dec=plain(deg=dec))
+
+    planes = {new: (found.mask.array >> PLANES[old] & 1).astype(bool) for old, new in names.items()}
+    return plain(
+        image=found.image,
+        variance=found.variance,
+        mask=plain(schema=plain(names=planes.keys()), get=planes.__getitem__),
+        psf=plain(compute_kernel_image=lambda *, x, y: found.psf.computeKernelImage(plain(x=x, y=y))),
+        sky_projection=plain(pixel_to_sky=pixel_to_sky),
+        bbox=plain(start=plain(xy=(X0, Y0))),
+    )
+
+
+def write_coadd(path, found, cards):
+    """The images of a coadd as afw and lsst.images write them."""
+    fits = pytest.importorskip("astropy.io.fits")
+    header = fits.Header()
+    # Column and row of the first pixel of the file are 1.
+    found.wcs.of_file().writeToFitsHeader(header, galsim.BoundsI(1, SIDE, 1, SIDE))
+    header.update({"LTV1": -X0, "LTV2": -Y0})
+    images = [("IMAGE", found.image.array, header), ("MASK", found.mask.array, fits.Header(cards)), ("VARIANCE", found.variance.array, None)]
+    fits.HDUList([fits.PrimaryHDU(), *(fits.ImageHDU(array, own, name=name) for name, array, own in images)]).writeto(path)
+
+
+def test_images_of_lsst_images_and_of_files_are_those_of_afw(tmp_path):
+    found, (x, y) = exposure(25)
+    found.mask.array[300:340, 300:330] = 1 << PLANES["SAT"]
+    expected = shearq.measure(**shearq.from_exposure(found, x, y))
+    assert (expected["flags"] == 1).any()
+    of_images = shearq.measure(**shearq.from_exposure(as_images(found), x, y))
+    assert same_bits(of_images, expected)
+    with pytest.raises(ValueError, match="the mask has no plane SAT; expected some of BAD, COSMIC_RAY"):
+        shearq.from_exposure(as_images(found), x, y, planes=["SAT"])
+    afw = {f"MP_{name}": bit for name, bit in PLANES.items()}
+    new = {"MSKN0000": "BAD", "MSKM0000": 1, "MSKN0001": "SATURATED", "MSKM0001": 2}
+    for number, cards in enumerate((afw, new)):
+        write_coadd(tmp_path / f"{number}.fits", found, cards)
+        of_file = shearq.measure(**shearq.from_exposure(tmp_path / f"{number}.fits", x, y, psf=found.psf))
+        for name in ("e1", "e2", "flags"):
+            # The header has fewer digits.
+            assert np.allclose(of_file[name], expected[name], atol=1e-6, equal_nan=True), name
+    with pytest.raises(ValueError, match="exposure: has no PSF; expected one. Try: psf="):
+        shearq.from_exposure(tmp_path / "0.fits", x, y)

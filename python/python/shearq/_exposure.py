@@ -2,26 +2,104 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+import os
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ._arrays import double, shown, whole
 
-# Planes of masks whose pixels have no light of the sky: those of afw's single exposures and of its coadds.
-_PLANES = ("BAD", "CR", "EDGE", "INTRP", "NO_DATA", "SAT")
+# Planes of masks whose pixels have no light of the sky: those of afw's exposures and coadds, and their names in lsst.images.
+_PLANES = (
+    *("BAD", "CR", "EDGE", "INTRP", "NO_DATA", "SAT"),
+    *("COSMIC_RAY", "DETECTION_EDGE", "INTERPOLATED", "SATURATED"),
+)
 
 
-class _SkyWcs:
-    """A ``SkyWcs`` of Rubin with the interface of astropy."""
+class _Projection:
+    """A function from pixels to right ascension and declination in degrees with the interface of astropy."""
 
-    def __init__(self, wcs: Any) -> None:
-        self._wcs = wcs
+    def __init__(self, to_sky: Callable[[Any, Any], Any]) -> None:
+        self._to_sky = to_sky
 
     def pixel_to_world_values(self, x: Any, y: Any) -> Any:
-        return self._wcs.pixelToSkyArray(np.asarray(x, dtype=float), np.asarray(y, dtype=float), degrees=True)
+        return self._to_sky(np.asarray(x, dtype=float), np.asarray(y, dtype=float))
+
+
+class _Parts(NamedTuple):
+    """What exposures of all kinds have, in the pixels of the parent frame."""
+
+    image: NDArray[Any]
+    variance: NDArray[Any]
+    # Column and row of the first pixel.
+    first: tuple[int, int]
+    psf: Any
+    wcs: _Projection | None
+    # The pixels of each plane of the mask.
+    planes: Mapping[str, Callable[[], NDArray[np.bool_]]]
+
+
+def _of_afw(exposure: Any) -> _Parts:
+    mask, wcs = exposure.mask, exposure.wcs
+    first = exposure.getXY0()
+
+    def plane(name: str) -> Callable[[], NDArray[np.bool_]]:
+        return lambda: (np.asarray(mask.array) & mask.getPlaneBitMask([name])) != 0
+
+    to_sky = None if wcs is None else _Projection(lambda x, y: wcs.pixelToSkyArray(x, y, degrees=True))
+    planes = {name: plane(name) for name in mask.getMaskPlaneDict()}
+    return _Parts(np.asarray(exposure.image.array), np.asarray(exposure.variance.array), (first[0], first[1]), exposure.psf, to_sky, planes)
+
+
+def _of_images(exposure: Any) -> _Parts:
+    """Of a ``VisitImage``, a coadd or a ``MaskedImage`` of lsst.images."""
+    projection = exposure.sky_projection
+
+    def to_sky(x: Any, y: Any) -> Any:
+        sky = projection.pixel_to_sky(x=x, y=y)
+        return sky.ra.deg, sky.dec.deg
+
+    def plane(name: str) -> Callable[[], NDArray[np.bool_]]:
+        return lambda: np.asarray(exposure.mask.get(name))
+
+    column, row = exposure.bbox.start.xy
+    planes = {name: plane(name) for name in exposure.mask.schema.names}
+    wcs = None if projection is None else _Projection(to_sky)
+    return _Parts(np.asarray(exposure.image.array), np.asarray(exposure.variance.array), (column, row), getattr(exposure, "psf", None), wcs, planes)
+
+
+def _of_file(path: str) -> _Parts:
+    """Of a FITS file with images called IMAGE, MASK and VARIANCE, as afw and lsst.images write them. Its PSF is not read."""
+    from astropy.io import fits
+    from astropy.wcs import WCS
+
+    with fits.open(path) as hdus:
+        absent = [name for name in ("IMAGE", "MASK", "VARIANCE") if name not in hdus]
+        if absent:
+            raise ValueError(f"{path}: no image is called {', '.join(absent)}; expected IMAGE, MASK and VARIANCE")
+        image, mask, variance = (np.array(hdus[name].data) for name in ("IMAGE", "MASK", "VARIANCE"))
+        header, of_mask = hdus["IMAGE"].header, hdus["MASK"].header
+        wcs = WCS(header)
+    # afw states bits, lsst.images masks.
+    bits = {key[3:]: 1 << int(value) for key, value in of_mask.items() if key.startswith("MP_")}
+    bits |= {str(value): int(of_mask[f"MSKM{key[4:]}"]) for key, value in of_mask.items() if key.startswith("MSKN")}
+    first = (round(-header.get("LTV1", 0)), round(-header.get("LTV2", 0)))
+
+    def plane(bit: int) -> Callable[[], NDArray[np.bool_]]:
+        return lambda: (mask & bit) != 0
+
+    to_sky = _Projection(lambda x, y: wcs.pixel_to_world_values(x - first[0], y - first[1])) if wcs.has_celestial else None
+    return _Parts(image, variance, first, None, to_sky, {name: plane(bit) for name, bit in bits.items()})
+
+
+def _parts(exposure: Any) -> _Parts:
+    if isinstance(exposure, (str, os.PathLike)):
+        return _of_file(os.fspath(exposure))
+    if hasattr(exposure, "sky_projection"):
+        return _of_images(exposure)
+    return _of_afw(exposure)
 
 
 def from_exposure(
@@ -39,15 +117,16 @@ def from_exposure(
     Parameters
     ----------
     exposure
-        An ``lsst.afw.image.Exposure``, or an object with its attributes ``image``, ``mask`` and ``variance`` (each with ``array``),
-        ``psf``, ``wcs`` and the method ``getXY0``. The sky is subtracted.
+        An ``lsst.afw.image.Exposure``, a ``VisitImage``, coadd or ``MaskedImage`` of lsst.images, an object with the same
+        attributes and methods, or a FITS file of one with images called IMAGE, MASK and VARIANCE, whose PSF is not read. The sky
+        is subtracted.
     x, y : array of shape (n,)
         Places of the galaxies in pixels of the exposure's parent frame, as in its source tables.
     size : int
         Side of the stamps in pixels.
     planes : sequence of str, optional
-        Names of the mask planes whose pixels are missing. By default those of BAD, CR, EDGE, INTRP, NO_DATA and SAT that the
-        mask has.
+        Names of the mask planes whose pixels are missing. By default those of BAD, CR, EDGE, INTRP, NO_DATA and SAT (in
+        lsst.images COSMIC_RAY, DETECTION_EDGE, INTERPOLATED and SATURATED) that the mask has.
     psf : optional
         A PSF in place of the exposure's, as :func:`measure` takes it.
     ids : array of shape (n,), optional
@@ -73,27 +152,25 @@ def from_exposure(
     for name, column in zip("xy", columns):
         if column.ndim != 1 or column.shape != columns[0].shape or not np.isfinite(column).all():
             raise ValueError(f"{name}: found an array of shape {shown(column.shape)}; expected finite places of shape (n,) like x")
-    psf = exposure.psf if psf is None else psf
-    for what, value in (("PSF", psf), ("WCS", exposure.wcs)):
+    image, variance, first, own_psf, wcs, known = _parts(exposure)
+    psf = own_psf if psf is None else psf
+    for what, value, hint in (("PSF", psf, ". Try: psf="), ("WCS", wcs, "")):
         if value is None:
-            raise ValueError(f"exposure: has no {what}; expected one")
-    image, variance = np.asarray(exposure.image.array), np.asarray(exposure.variance.array)
-    known = exposure.mask.getMaskPlaneDict()
+            raise ValueError(f"exposure: has no {what}; expected one{hint}")
     names = [plane for plane in _PLANES if plane in known] if planes is None else list(planes)
     absent = [name for name in names if name not in known]
     if absent:
         raise ValueError(f"planes: the mask has no plane {', '.join(absent)}; expected some of {', '.join(sorted(known))}")
-    bits = exposure.mask.getPlaneBitMask(names) if names else 0
-    missing = (np.asarray(exposure.mask.array) & bits) != 0
-    missing |= ~(np.isfinite(variance) & (variance > 0))
-    first = exposure.getXY0()
+    missing = ~(np.isfinite(variance) & (variance > 0))
+    for name in names:
+        missing |= known[name]()
     stamps = np.full((len(columns[0]), side, side), np.nan, dtype=image.dtype)
     noise = np.empty(len(stamps))
     offsets = np.empty((len(stamps), 2))
     typical = np.sqrt(np.median(variance[~missing])) if not missing.all() else np.nan
     for k, place in enumerate(zip(*columns)):
         # From the corner of the stamp, whose pixels are whole numbers.
-        at = [value - start for value, start in zip(place, (first[0], first[1]))]
+        at = [value - start for value, start in zip(place, first)]
         corner = [round(value - (side - 1) / 2) for value in at]
         offsets[k] = [value - start - (side - 1) / 2 for value, start in zip(at, corner)]
         # Of the image and of the stamp, in the order of axes y, x.
@@ -102,5 +179,5 @@ def from_exposure(
         good = ~missing[own]
         stamps[k][there] = np.where(good, image[own], np.nan)
         noise[k] = np.sqrt(np.median(variance[own][good])) if good.any() else typical
-    epoch = {"stamps": stamps, "psf": psf, "noise": noise, "wcs": _SkyWcs(exposure.wcs), "x": columns[0], "y": columns[1], "offsets": offsets}
+    epoch = {"stamps": stamps, "psf": psf, "noise": noise, "wcs": wcs, "x": columns[0], "y": columns[1], "offsets": offsets}
     return {"epochs": [epoch], "x": columns[0], "y": columns[1], **({} if ids is None else {"ids": ids})}

@@ -51,6 +51,11 @@ def _rubin(psf: Any) -> _Draw:
     return lambda side, x, y, jacobian, properties: psf.computeKernelImage(Point2D(x, y)).array
 
 
+def _rubin_images(psf: Any) -> _Draw:
+    # Of lsst.images, centred on a pixel, too.
+    return lambda side, x, y, jacobian, properties: psf.compute_kernel_image(x=x, y=y).array
+
+
 def _function(psf: Callable[..., Any], pixel: PixelOfPsf | None) -> _Draw:
     stated = [pixel]
 
@@ -76,7 +81,12 @@ def _function(psf: Callable[..., Any], pixel: PixelOfPsf | None) -> _Draw:
 
 def _draw_of(psf: Any, pixel: PixelOfPsf | None = None) -> _Draw | None:
     """How a model is drawn; None for anything that is no model."""
-    models = {("interp_property_names", "draw"): _piff, ("getPSF", "getPSFArray"): _psfex, ("computeKernelImage",): _rubin}
+    models = {
+        ("interp_property_names", "draw"): _piff,
+        ("getPSF", "getPSFArray"): _psfex,
+        ("computeKernelImage",): _rubin,
+        ("compute_kernel_image",): _rubin_images,
+    }
     for methods, drawer in models.items():
         if all(hasattr(psf, method) for method in methods):
             # These models know whether they contain the pixel.
