@@ -87,9 +87,9 @@ def of_block(stamps, psf):
 CLUSTER = """
 if __name__ == "__main__":
     import numpy as np, shearq, tasks
-    one = tasks.measured(3)
     import dask.array
     from distributed import Client, LocalCluster
+    one = tasks.measured(3)
     with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster, Client(cluster) as client:
         scattered = client.scatter(one)
         for found in (
