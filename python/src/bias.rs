@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use numpy::PyReadonlyArray1;
-use pyo3::exceptions::{PyFileNotFoundError, PyTypeError, PyValueError};
+use pyo3::exceptions::{PyFileNotFoundError, PyOSError, PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use shearq_bias::Design;
 use shearq_catalogue::columns::{Names, Shapes};
@@ -15,12 +15,15 @@ use shearq_catalogue::request::{
 use shearq_catalogue::select::selection;
 use shearq_catalogue::source::Reading;
 use shearq_catalogue::truth::{TrueSign, Truth, expand};
+use shearq_files::atomic;
 use shearq_files::frames::frame;
 use shearq_files::frames::polars::Column;
 use shearq_files::table::Place;
-use shearq_render::table::TableFormat;
-use shearq_results::bias::{BiasFailure, Summed, joined, sum};
-use shearq_results::views::bias::bias_table;
+use shearq_render::figure::Figure;
+use shearq_render::table::{Table, TableFormat};
+use shearq_results::bias::{BiasFailure, BiasResult, Summed, joined, sum};
+use shearq_results::views::bias::{bias_plot, bias_table, compared_table, section};
+use shearq_results::views::pages;
 use shearq_scoring::TruthSign;
 
 use crate::errors::{chosen, in_python};
@@ -151,15 +154,17 @@ impl BiasSums {
         Ok(BiasSums { summed })
     }
 
-    /// The table of estimates as JSON, and as text.
-    fn result(&self, py: Python<'_>) -> PyResult<(String, String)> {
+    /// The table of estimates as JSON, and as text; with `against`, of both and their difference.
+    fn result(
+        &self,
+        py: Python<'_>,
+        against: Option<PyRef<'_, BiasSums>>,
+    ) -> PyResult<(String, String)> {
+        let against = against.map(|own| own.summed.clone());
         // Without the interpreter, so that other threads of Python go on during the jackknife.
         py.detach(|| {
-            let result = self.summed.clone().result()?;
-            let mut table = bias_table(&result);
-            for note in &mut table.notes {
-                *note = in_python(note);
-            }
+            let result = self.summed.result()?;
+            let table = self.table(&result, against.as_ref())?;
             // The table's own JSON, so that Python and the command line have the same keys.
             let mut json = table.json();
             // The label of an axis.
@@ -167,6 +172,61 @@ impl BiasSums {
             Ok((json.to_string(), table.narrow().render(TableFormat::Table)))
         })
         .map_err(of_bias)
+    }
+
+    /// Writes the estimates as the command line does: a plot (.png, .svg), a page (.html) with its `origin`, or a table (.csv, .md,
+    /// .tex, .txt).
+    fn save(
+        &self,
+        py: Python<'_>,
+        path: PathBuf,
+        against: Option<PyRef<'_, BiasSums>>,
+        origin: Vec<(String, String)>,
+    ) -> PyResult<()> {
+        let against = against.map(|own| own.summed.clone());
+        let result = py.detach(|| self.summed.result()).map_err(of_bias)?;
+        let table = self.table(&result, against.as_ref()).map_err(of_bias)?;
+        let failed = |error: &dyn std::fmt::Display| PyOSError::new_err(error.to_string());
+        let ending = path.extension().unwrap_or_default().to_string_lossy();
+        let format = match ending.to_ascii_lowercase().as_str() {
+            "png" | "svg" => {
+                return bias_plot(&result)
+                    .save(&path)
+                    .map_err(|error| failed(&error));
+            }
+            "html" | "htm" => {
+                let section = section(&result, table).map_err(|error| failed(&error))?;
+                return pages::save(&path, "Shear bias", vec![section], origin)
+                    .map_err(|error| failed(&error));
+            }
+            "csv" => TableFormat::Csv,
+            "md" => TableFormat::Markdown,
+            "tex" => TableFormat::Latex,
+            "txt" => TableFormat::Table,
+            _ => {
+                return Err(PyValueError::new_err(format!(
+                    "path: found {:?}; expected a name that ends in .json, .html, .png, .svg, .csv, .md, .tex or .txt",
+                    path.display().to_string()
+                )));
+            }
+        };
+        atomic::write(&path, table.render(format).as_bytes()).map_err(|error| failed(&error))
+    }
+}
+
+impl BiasSums {
+    fn table(&self, result: &BiasResult, against: Option<&Summed>) -> Result<Table, BiasFailure> {
+        let mut table = match against {
+            None => bias_table(result),
+            Some(other) => {
+                let difference = self.summed.difference(other)?;
+                compared_table(result, &other.result()?, &difference)
+            }
+        };
+        for note in &mut table.notes {
+            *note = in_python(note);
+        }
+        Ok(table)
     }
 }
 

@@ -39,7 +39,7 @@ mod _shearq {
     #[pymodule_export]
     use super::submissions::{Configuration, names};
     #[pymodule_export]
-    use super::tables::{read_table, write_table};
+    use super::tables::{fingerprint, read_table, write_table};
 
     /// Version of shearq.
     #[pymodule_export]

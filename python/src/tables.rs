@@ -7,10 +7,11 @@ use numpy::{IntoPyArray, PyReadonlyArray1};
 use pyo3::exceptions::{PyFileNotFoundError, PyOSError, PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
+use shearq_dataset::fingerprint::of_image;
 use shearq_files::FileError;
 use shearq_files::frames::polars::Column;
 use shearq_files::frames::{frame, reals};
-use shearq_files::table::{self, FileFormat, MAX_ROWS};
+use shearq_files::table::{self, FileFormat, MAX_ROWS, Place};
 
 use crate::errors::chosen;
 
@@ -25,6 +26,13 @@ fn of_file(path: &std::path::Path, error: &FileError) -> PyErr {
 
 fn format(name: &str) -> PyResult<FileFormat> {
     chosen("format", name, r#""parquet" or "fits""#)
+}
+
+/// The fingerprint of a file, as results of the command line state it; None of anything else.
+#[pyfunction]
+pub(crate) fn fingerprint(path: PathBuf) -> Option<String> {
+    let path = Place::of(&path).path;
+    path.is_file().then(|| of_image(&path).ok())?
 }
 
 /// The columns of numbers of a table by name, and those of the metadata `keys` that it has.

@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import shutil
 
 import numpy as np
 import pytest
@@ -387,3 +388,63 @@ def test_surveys_of_the_user_are_recognised(tmp_path):
     rng = np.random.default_rng(1)
     table = {"a": rng.normal(0, 0.2, 100), "b": rng.normal(0, 0.2, 100)}
     assert any("Columns: Own" in note for note in shearq.bias(table, preset=preset).notes)
+
+
+def test_results_are_compared_and_saved_as_by_the_command_line(pair, tmp_path, command):
+    shears = {"g1": [0.02, -0.02], "g2": [0.01, -0.01]}
+    other = [{**table, "e1": 1.01 * table["e1"]} for table in pair]
+    found = shearq.bias(pair, against=other, **shears)
+    paths = []
+    for name, table in zip(("plus", "minus", "plus-other", "minus-other"), [*pair, *other]):
+        paths.append(tmp_path / f"{name}.parquet")
+        polars.DataFrame(table).write_parquet(paths[-1])
+    truth = tmp_path / "shears.csv"
+    truth.write_text("catalogue,g1,g2\n" + "".join(f"{path.name},{g},{g / 2}\n" for path, g in zip(paths, [0.02, -0.02] * 2)))
+    shown = json.loads(command("bias", *paths[:2], "--against", *paths[2:], "--truth", truth, "--format", "json"))
+    assert [row["of"] for row in found.rows] == ["catalogues", "against", "difference"]
+    assert [row["m1"] for row in found.rows] == [row["m1"] for row in shown["rows"]]
+    assert found.rows[2]["m1_error"] < 0.1 * found.rows[0]["m1_error"]
+    # Origin: the fingerprints of the files that were read.
+    inputs = shown["made_by"]["inputs"]
+    assert set(inputs) == {str(path) for path in [*paths, truth]} and "--against" in shown["made_by"]["command"]
+    of_files = shearq.bias(paths[:2], truth=truth)
+    assert of_files.made_by["inputs"] == {str(path): inputs[str(path)] for path in [*paths[:2], truth]}
+    assert of_files.made_by["settings"]["truth"] == str(truth) and shown["made_by"]["version"].split()[0] == shearq.__version__
+    paths[0].write_bytes(paths[1].read_bytes())
+    with pytest.raises(ValueError):
+        shearq.bias(paths[:2], truth=truth)
+    assert shearq.bias_sums(paths[0], g1=0.02, g2=0.01)._made_by["inputs"][str(paths[0])] == inputs[str(paths[1])]
+    for result in (found, of_files, pickle.loads(pickle.dumps(found))):
+        assert json.loads(result.to_json())["rows"] == result.rows
+        assert "Shear bias" in result._repr_html_() and "±" in result._repr_html_()
+    for ending, start in {"json": "{", "csv": "of,", "html": "<!DOCTYPE html>", "svg": "<svg", "md": "## "}.items():
+        path = tmp_path / f"result.{ending}"
+        found.save(path)
+        assert path.read_text().startswith(start), path.read_text()[:40]
+    assert "shearq.bias" in (tmp_path / "result.html").read_text()
+    with pytest.raises(ValueError, match="expected a name that ends in .json, .html"):
+        found.save(tmp_path / "result.xyz")
+
+
+def test_sums_of_a_part_are_small(pair):
+    # A unit for each of 9 tiles, as a worker returns them for its file.
+    table = {**pair[0], "tile": np.arange(2000) % 9}
+    sums = shearq.bias_sums(table, g1=0.02, g2=0.01, units="tile")
+    assert len(pickle.dumps(sums)) < 10_000
+
+
+def test_workers_of_spark_return_sums(tmp_path):
+    pyspark = pytest.importorskip("pyspark", reason="pyspark is not installed")
+    if shutil.which("java") is None:
+        pytest.skip("Spark needs Java")
+    paths = []
+    for number, g in enumerate((0.02, -0.02, 0.02, -0.02)):
+        table = {**catalogue((g, g / 2), seed=number // 2), "g1": np.full(2000, g), "g2": np.full(2000, g / 2)}
+        table["id"] = table["id"] + 2000 * (number // 2)
+        paths.append(str(tmp_path / f"{number}.parquet"))
+        polars.DataFrame(table).write_parquet(paths[-1])
+    expected = shearq.bias(paths)
+    settings = pyspark.SparkConf().setMaster("local[2]").set("spark.ui.enabled", "false").set("spark.driver.host", "127.0.0.1")
+    with pyspark.SparkContext(conf=settings) as context:
+        parts = context.parallelize(paths, 4).map(shearq.bias_sums).collect()
+    assert shearq.BiasSums.merge(parts).result().rows == expected.rows

@@ -375,7 +375,7 @@ def test_plots_show_what_they_promise(two):
     simulation = shearq.simulate(set=8, images=2, grid=12)
     e = [np.stack([image.observed[:, k] for image in simulation]) for k in (0, 1)]
     scored = shearq.score(*e, simulation.g1, simulation.g2)
-    assert scored.plot().get_xlabel().startswith("multipole")
+    assert scored.plot().get_xlabel().startswith("ℓ")
     frame = scored.to_frame("list")
     assert [row["metric"] for row in frame] == list(scored.metrics) and frame[0]["value"] == scored["q"]
 
@@ -489,3 +489,25 @@ def test_bias_knows_the_star_of_catalogues_in_memory(tmp_path):
     assert added == pytest.approx(a["psf_m"][0] ** 2 + (a["psf_c"][0] / 0.02) ** 2, rel=1e-6)
     # Files state three digits.
     assert files["m1_error"] == pytest.approx(found["m1_error"], rel=1e-2)
+
+
+def test_results_become_json_files_and_tables(two, tmp_path):
+    mean = two[0].mean_shear()
+    found = json.loads(mean.to_json())
+    assert found["g1"] == mean.g1 and found["galaxies"] == mean.galaxies and found["made_by"]["version"] == shearq.__version__
+    assert "Mean shear of" in mean._repr_html_() and f"{mean.g1:+.6f}" in mean._repr_html_()
+    simulation = shearq.simulate(set=8, images=2, grid=12)
+    e = np.random.default_rng(1).normal(0, 0.1, (2, 2, 144))
+    score = shearq.score(e[0], e[1], simulation.g1, simulation.g2)
+    found = json.loads(score.to_json())
+    # JSON has no NaN.
+    expected = {name: None if np.isnan(value) else value for name, value in score.metrics.items()}
+    assert found["metrics"] == expected and len(found["spectrum"]["l"]) == 20
+    assert "m_cross" in score._repr_html_()
+    for result in (mean, score):
+        for ending, start in {"json": "{", "csv": "component" if result is mean else "metric", "html": "<!doctype html>"}.items():
+            result.save(tmp_path / f"result.{ending}")
+            assert (tmp_path / f"result.{ending}").read_text().startswith(start)
+        with pytest.raises(ValueError, match="path: found 'result.xyz'; expected a name that ends in .json, .csv, .html"):
+            result.save(tmp_path / "result.xyz")
+    assert not list(tmp_path.glob(".*"))

@@ -1,7 +1,11 @@
 """The blocks of the page "From your pipeline", on small data of each program."""
 
+import shlex
+import sys
+
 import numpy as np
 import pytest
+from shearq._shearq import run_command
 from test_survey import DOCS, blocks
 
 import shearq
@@ -42,6 +46,24 @@ def has_shear(catalogue, abs=0.006):
     assert shear.g1 == pytest.approx(0.02, abs=abs) and shear.g2 == pytest.approx(0.0, abs=abs)
 
 
+def gathered(title, profile):
+    """The catalogue of a field that the commands of a section cut into stamps."""
+    fits = pytest.importorskip("astropy.io.fits")
+    rng = np.random.default_rng(2)
+    field = galsim.Image(rng.normal(0, 1, (500, 500)))
+    places = np.array([(60 + 60 * k, 60 + 60 * j) for k in range(7) for j in range(7)]) + rng.uniform(-1, 1, (49, 2))
+    for x, y in places:
+        galaxy = galsim.Exponential(half_light_radius=0.6, flux=4000).shear(g1=0.02, g2=0.0)
+        image = galsim.Convolve(galaxy, profile(x, y)).drawImage(nx=48, ny=48, scale=SCALE, center=galsim.PositionD(x, y))
+        field[image.bounds] += galsim.Image(image.array, xmin=image.bounds.xmin, ymin=image.bounds.ymin)
+    fits.writeto("field.fits", field.array.astype("f4"))
+    np.savetxt("galaxies.csv", places, delimiter=",", header="x,y", comments="")
+    for block in blocks(SECTIONS[title], "sh"):
+        assert run_command(shlex.split(block)) == 0
+    assert run_command("shearq measure --submission 48/linear/star --data data --out out".split()) == 0
+    return shearq.read("out/set01/catalogue-001.parquet")
+
+
 def test_piff(tmp_path, monkeypatch):
     piff = pytest.importorskip("piff", reason="Piff is not installed")
     monkeypatch.chdir(tmp_path)
@@ -53,6 +75,8 @@ def test_piff(tmp_path, monkeypatch):
     psf.fit(stars, {0: galsim.PixelScale(SCALE)}, None)
     psf.write("model.piff")
     has_shear(run("Piff", stamps(lambda x, y: galsim.Moffat(beta=3.0, fwhm=0.7)))["catalogue"])
+    monkeypatch.setenv("SHEARQ_PYTHON", sys.executable)
+    has_shear(gathered("Piff", lambda x, y: galsim.Moffat(beta=3.0, fwhm=0.7)), abs=0.01)
 
 
 def test_psfex(tmp_path, monkeypatch):
@@ -61,6 +85,7 @@ def test_psfex(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_psfex("model.psf")
     has_shear(run("PSFEx", stamps(lambda x, y: galsim.Gaussian(sigma=1.99 * SCALE)))["catalogue"], abs=0.01)
+    has_shear(gathered("PSFEx", lambda x, y: galsim.Gaussian(sigma=(1.8 + 4e-4 * x) * SCALE)), abs=0.01)
 
 
 def test_galsim():

@@ -10,13 +10,14 @@ from typing import Any, Literal, Union
 import numpy as np
 
 from . import _display, _hdf5, _shearq
+from ._results import Result, origin, write
 from ._tables import _EXACT, is_missing, named_columns, narrowed
 
 Design = Literal["single", "pairs", "shears", "fields", "galaxies", "rotated"]
 Bins = Union[str, tuple[str, Union[int, Sequence[float]]]]
 
 
-class Bias:
+class Bias(Result):
     """Multiplicative and additive bias with errors, of all galaxies and of bins.
 
     Attributes
@@ -29,20 +30,28 @@ class Bias:
     binned : str
         The binned column or expression; empty without bins.
 
-    ``bias["m1"]`` is the value of all galaxies.
+    made_by : dict
+        Version, settings that are no defaults, and fingerprints of files.
+
+    ``bias["m1"]`` is the value of all galaxies. With ``against``, rows are those of both catalogues and of the difference.
     """
 
-    __slots__ = ("_text", "binned", "notes", "rows")
+    __slots__ = ("_against", "_sums", "_text", "binned", "made_by", "notes", "rows")
 
     rows: list[dict[str, Any]]
     notes: list[str]
     binned: str
+    made_by: dict[str, Any]
 
-    def __init__(self, rows: list[dict[str, Any]], notes: list[str], text: str, binned: str = "") -> None:
-        self.rows = rows
-        self.notes = notes
-        self.binned = binned
-        self._text = text
+    def __init__(self, sums: BiasSums, against: BiasSums | None = None) -> None:
+        self._sums, self._against = sums, against
+        text, self._text = sums._sums.result(None if against is None else against._sums)
+        found = json.loads(text)
+        self.rows, self.notes, self.binned = found["rows"], found["notes"], found["binned"]
+        self.made_by = sums._made_by
+
+    def __reduce__(self) -> tuple[Any, tuple[Any, ...]]:
+        return Bias, (self._sums, self._against)
 
     def __getitem__(self, key: str) -> float:
         value = self.rows[0][key]
@@ -59,8 +68,35 @@ class Bias:
         shown = [f"{key} = {self[key]:+.4f} ± {self[key + '_error']:.4f}" for key in known]
         return f"<shearq.Bias {', '.join(shown)}, n = {self['n']:.0f}>"
 
-    def _repr_html_(self) -> str:
-        return _display.bias_html(self)
+    def _object(self) -> dict[str, Any]:
+        return {"title": "Shear bias", "rows": self.rows, "notes": self.notes, "binned": self.binned, "made_by": self.made_by}
+
+    def _table(self) -> tuple[str, list[str], list[list[str]], list[str]]:
+        keys = ("m1", "m2", "c1", "c2")
+
+        def cell(row: dict[str, Any], key: str) -> str:
+            value, error = row.get(key), row.get(f"{key}_error")
+            return "" if value is None or error is None else f"{value:+.4f} ± {error:.4f}"
+
+        # Rows of two catalogues say of which they are.
+        names = [name for name in ("of", "catalogues", "bin") if name in self.rows[0]]
+        rows = [[*(str(row[name]) for name in names), "" if row["n"] is None else f"{row['n']:.0f}", *(cell(row, key) for key in keys)] for row in self.rows]
+        return "Shear bias", [*names, "galaxies", *keys], rows, self.notes
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Writes the result as JSON (.json), as the command line's page (.html) or plot (.png, .svg), or as a table with all
+        columns (.csv, .md, .tex, .txt). A file of this name is replaced.
+
+        Raises
+        ------
+        ValueError
+            If the name has another ending.
+        """
+        if os.fspath(path).lower().endswith(".json"):
+            write(path, {".json": lambda: self.to_json() + "\n"})
+            return
+        made_by = [(name.capitalize(), value if isinstance(value, str) else json.dumps(value)) for name, value in self.made_by.items()]
+        self._sums._sums.save(os.fspath(path), None if self._against is None else self._against._sums, made_by)
 
     def to_frame(self) -> Any:
         """The rows as a pandas frame."""
@@ -71,7 +107,8 @@ class Bias:
     def plot(self, quantity: Literal["m", "c"] = "m", limit: float | None = None, ax: Any = None) -> Any:
         """Plots m or c of both components in bins with error bars, and a band of ±limit. Needs matplotlib.
 
-        limit is 0.002 for m and 0.0002 for c unless given (GREAT3).
+        limit is 0.002 for m and 0.0002 for c unless given, the tightest requirements that are published. ``save("bias.svg")``
+        writes the plot of the command line, which needs no matplotlib.
         """
         return _display.plot_bias(self, quantity, limit, ax)
 
@@ -83,41 +120,41 @@ class BiasSums:
     catalogues.
     """
 
-    __slots__ = ("_sums",)
+    __slots__ = ("_made_by", "_sums")
 
-    def __init__(self, sums: _shearq.BiasSums) -> None:
-        self._sums = sums
+    def __init__(self, sums: _shearq.BiasSums, made_by: dict[str, Any]) -> None:
+        self._sums, self._made_by = sums, made_by
 
     def __add__(self, other: BiasSums) -> BiasSums:
-        return BiasSums(self._sums.append([other._sums]))
+        return BiasSums.merge([self, other])
 
     @staticmethod
     def merge(parts: Iterable[BiasSums]) -> BiasSums:
         """The sums of all parts, in their order."""
         first, *others = parts
-        return BiasSums(first._sums.append([part._sums for part in others]))
+        inputs = {path: print for part in (first, *others) for path, print in part._made_by["inputs"].items()}
+        return BiasSums(first._sums.append([part._sums for part in others]), {**first._made_by, "inputs": inputs})
 
     def __radd__(self, other: int) -> BiasSums:
         # sum() begins with 0.
         return self if other == 0 else NotImplemented
 
-    def __reduce__(self) -> tuple[Any, tuple[str]]:
-        return _restored, (self._sums.to_json(),)
+    def __reduce__(self) -> tuple[Any, tuple[str, dict[str, Any]]]:
+        return _restored, (self._sums.to_json(), self._made_by)
 
     def result(self) -> Bias:
         """The bias, with errors from a jackknife over units."""
-        text, shown = self._sums.result()
-        found = json.loads(text)
-        return Bias(found["rows"], found["notes"], shown, found["binned"])
+        return Bias(self)
 
 
-def _restored(text: str) -> BiasSums:
-    return BiasSums(_shearq.BiasSums.from_json(text))
+def _restored(text: str, made_by: dict[str, Any]) -> BiasSums:
+    return BiasSums(_shearq.BiasSums.from_json(text), made_by)
 
 
 def bias(
     catalogues: Any,
     *,
+    against: Any = None,
     g1: float | Sequence[float] | None = None,
     g2: float | Sequence[float] | None = None,
     truth: str | os.PathLike[str] | None = None,
@@ -146,6 +183,9 @@ def bias(
         wrote. ``FILE:GROUP`` names a group of an HDF5 file whose datasets are columns; groups ``noshear`` (``ns``, ``00``), ``1p``,
         ``1m``, ``2p`` and ``2m`` in it are sheared catalogues. Columns are ``e1 e2``, optionally ``w R11 R22 flag id snr ...`` and the true shear ``g1 g2``. Columns of GalSim's HSM,
         ngmix metacal, metadetect and AnaCal are recognised.
+    against : as catalogues, optional
+        Catalogues of another method for the same galaxies: the result has their rows and the difference with its error, which is
+        smaller than that of two results because both have the same shapes.
     g1, g2 : float or sequence of float
         True shear of all catalogues, or of each. By default it is in the columns g1 and g2.
     truth : path
@@ -206,8 +246,7 @@ def bias(
         flag, the ellipticities do not follow the true shear, the sign of g2 in the file of `truth` is unclear, or a mean
         response has less than five standard errors.
     """
-    sums = bias_sums(
-        catalogues,
+    settings: dict[str, Any] = dict(
         g1=g1,
         g2=g2,
         truth=truth,
@@ -226,7 +265,8 @@ def bias(
         drop_missing=drop_missing,
         step=step,
     )
-    return sums.result()
+    sums = bias_sums(catalogues, **settings)
+    return Bias(sums, None if against is None else bias_sums(against, **settings))
 
 
 def bias_sums(
@@ -277,26 +317,31 @@ def bias_sums(
     given = [_catalogue(f"catalogue {number}", table, needed) for number, table in enumerate(tables, 1)]
     if not given:
         raise ValueError("catalogues: found none; expected at least one")
-    return BiasSums(
-        _shearq.bias_sums(
-            given,
-            roles,
-            presets,
-            _truth(g1, g2, truth, given),
-            ellipticity,
-            truth_sign,
-            binned,
-            None if like is None else _catalogue("like", like),
-            tomography,
-            where,
-            weight,
-            design,
-            units,
-            paired,
-            drop_missing,
-            float(step),
-        )
+    found = _shearq.bias_sums(
+        given,
+        roles,
+        presets,
+        _truth(g1, g2, truth, given),
+        ellipticity,
+        truth_sign,
+        binned,
+        None if like is None else _catalogue("like", like),
+        tomography,
+        where,
+        weight,
+        design,
+        units,
+        paired,
+        drop_missing,
+        float(step),
     )
+    settings = {
+        "g1": g1, "g2": g2, "truth": truth, "columns": columns, "preset": preset, "ellipticity": ellipticity, "truth_sign": truth_sign, "bins": bins,
+        "like": like, "tomography": tomography, "where": where, "weight": weight, "design": design, "units": units,
+        "paired": paired, "drop_missing": drop_missing, "step": step,
+    }
+    paths = [own if isinstance(own, str) else own[0] for own in given] + presets + ([] if truth is None else [os.fspath(truth)])
+    return BiasSums(found, origin("shearq.bias", settings, paths))
 
 
 def _several(catalogues: Any) -> Iterable[Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import enum
 import os
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, cast, overload
 
 import numpy as np
@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from . import _display, _distributed, _schema, _shearq, _tables
 from ._arrays import double, shown
+from ._results import Result, origin
 
 if TYPE_CHECKING:
     import astropy.table  # type: ignore[import-untyped, unused-ignore]
@@ -38,7 +39,7 @@ class Flag(enum.IntFlag):
 
 
 @dataclass(frozen=True, repr=False)
-class MeanShear:
+class MeanShear(Result):
     """The mean shear of galaxies. It prints as ``g1 = +0.0201 ± 0.0009, …``.
 
     Attributes
@@ -72,6 +73,13 @@ class MeanShear:
 
     def __iter__(self) -> Iterator[float]:
         return iter((self.g1, self.g2))
+
+    def _object(self) -> dict[str, Any]:
+        return {**asdict(self), "made_by": origin("shearq.mean_shear", {})}
+
+    def _table(self) -> tuple[str, list[str], list[list[str]], list[str]]:
+        rows = [[name, f"{value:+.6f}", f"{error:.6f}"] for name, value, error in (("g1", self.g1, self.g1_error), ("g2", self.g2, self.g2_error))]
+        return f"Mean shear of {self.galaxies} galaxies, {self.flagged} flagged", ["component", "shear", "error"], rows, []
 
     def __str__(self) -> str:
         pairs = (("g1", self.g1, self.g1_error), ("g2", self.g2, self.g2_error))
@@ -151,6 +159,7 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
 
     def __array_finalize__(self, parent: Any) -> None:
         self.attrs = dict(getattr(parent, "attrs", {}))
+        _distributed.register(type(self))
 
     def __array_function__(
         self, func: Any, types: Iterable[type], args: Any, kwargs: Any

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from . import _display, _shearq
 from ._arrays import degrees, double, flat, real, shown, whole
 from ._catalogue import Catalogue, raw
+from ._results import Result, origin
 from ._submissions import submissions
 from ._warn import warn
 
@@ -26,7 +27,7 @@ Definition = Literal["leaderboard", "corrected"]
 Frame = Literal["pandas", "polars", "list"] | None
 
 
-class Score:
+class Score(Result):
     """Figures of merit of ellipticities against their true shear.
 
     ``score["q"]`` is a metric, ``score.errors["q"]`` its standard error, NaN where unknown. ``docs/scoring.md``
@@ -97,6 +98,15 @@ class Score:
         """Figures, and their errors with ``_error`` after their names."""
         errors = {f"{name}_error": error for name, error in self.errors.items()}
         return {**self.metrics, **errors}
+
+    def _object(self) -> dict[str, Any]:
+        names = ("images", "dropped", "noise_variance", "convention", "q_leaderboard", "truth_sign", "correlation", "mean", "notes")
+        own = {name: getattr(self, name) for name in names}
+        return {"metrics": self.metrics, "errors": self.errors, **own, "spectrum": self.spectrum, "made_by": origin("shearq.score", {})}
+
+    def _table(self) -> tuple[str, list[str], list[list[str]], list[str]]:
+        rows = [[name, f"{value:.5g}", f"{self.errors[name]:.2g}", METRICS[name]] for name, value in self.metrics.items()]
+        return f"Score of {self.images} image{'s' * (self.images != 1)}", ["metric", "value", "error", "meaning"], rows, self.notes
 
     def to_frame(self, frame: Frame = None) -> Any:
         """A table of the metrics.
