@@ -11,8 +11,7 @@ mod write;
 
 pub use read::{
     ImageReader, Pixel, TableHead, first_texts, read_table, read_table_keys, read_table_parts,
-    read_vector,
-    tables,
+    read_vector, tables,
 };
 pub use selection::{ImageHead, Planes, Selection, image_heads};
 pub use write::{ImageWriter, Value, write_table};
