@@ -1,5 +1,5 @@
 #!/bin/sh
-# Builds wheels for Linux and the source distribution into dist/, and checks them.
+# Builds wheels for Linux and the source distribution into dist/ (or $DIST), and checks them.
 #
 # Usage: python/wheels.sh [TARGET...]     default: x86_64-unknown-linux-gnu
 #
@@ -8,7 +8,8 @@
 # One wheel per target serves Python 3.10 and later.
 set -eu
 cd "$(dirname "$0")"
-dist=$PWD/../dist
+here=$PWD
+dist=${DIST:-$PWD/../dist}
 mkdir -p "$dist"
 # cfitsio's and LZ4's notices must be in all copies.
 python3 ../.ci/release/licences.py shearq-python > LICENCES-OF-DEPENDENCIES.txt
@@ -33,7 +34,7 @@ done
 own=$(ls "$dist"/*"$(uname -m)".whl)
 unzip -l "$own" | grep -q LICENCES-OF-DEPENDENCIES || { echo "error: $own: has no licences of dependencies" >&2; exit 1; }
 empty=$(mktemp -d)
-trap 'rm -rf "$empty" "$dist"/../python/LICENCES-OF-DEPENDENCIES.txt' EXIT
+trap 'rm -rf "$empty" "$here/LICENCES-OF-DEPENDENCIES.txt"' EXIT
 python3 -m venv "$empty"
 "$empty/bin/pip" install --quiet "$own"
 cd "$empty"
