@@ -124,3 +124,30 @@ fn places_on_the_sky_are_those_of_the_header() {
         assert!((dec - (y - 200.5) * pixel).abs() < 1e-8, "{y} {dec}");
     }
 }
+
+#[test]
+fn mean_says_that_crowded_positions_are_without_detection() {
+    let folder = Folder::new();
+    let said = |layout: &str| {
+        folder.run(&format!(
+            "simulate --scenes 1 --side 500 --density 20 --snr 30,100 --layout {layout} --out {layout}"
+        ));
+        let (scene, star) = (
+            format!("{layout}/scene-001.fits"),
+            format!("{layout}/psf.fits"),
+        );
+        folder.run(&format!(
+            "gather --exposure {scene} --psf {star} --positions {layout}/truth-001.csv --out {layout}/stamps"
+        ));
+        folder.run(&format!(
+            "measure --submission 48/linear/star --data {layout}/stamps --out {layout}/shapes"
+        ));
+        folder.run(&format!("mean --measured {layout}/shapes"))
+    };
+    let crowded = said("random");
+    let words: Vec<&str> = crowded.split_whitespace().collect();
+    assert_has(&words.join(" "), "without detection:");
+    assert_has(&words.join(" "), "within 24 px");
+    // Galaxies of the lattice are 72 px apart.
+    assert!(!said("hexagonal").contains("without detection"));
+}
