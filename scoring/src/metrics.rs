@@ -79,9 +79,6 @@ metrics! {
 }
 
 impl Metrics {
-    /// The metric that every record contains. Older records lack metrics that were added later.
-    pub const ALWAYS: &str = "q";
-
     /// The metric called `name`.
     pub fn named(name: &str) -> Option<Metric> {
         Self::ALL.into_iter().find(|metric| metric.name == name)
@@ -94,16 +91,17 @@ impl Metrics {
 }
 
 #[cfg(feature = "serde")]
-/// JSON has no NaN: null and absent metrics are read as NaN.
+/// JSON has no NaN: null is read as NaN.
 impl<'de> Deserialize<'de> for Metrics {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
         let found = BTreeMap::<String, Option<f64>>::deserialize(deserializer)?;
-        if !found.contains_key(Self::ALWAYS) {
-            return Err(serde::de::Error::missing_field(Self::ALWAYS));
+        let mut values = [f64::NAN; Self::ALL.len()];
+        for (value, Metric { name, .. }) in values.iter_mut().zip(Self::ALL) {
+            let known = found.get(name);
+            let known = known.ok_or_else(|| serde::de::Error::missing_field(name))?;
+            *value = known.unwrap_or(f64::NAN);
         }
-        Ok(Self::from_values(Self::ALL.map(
-            |Metric { name, .. }| found.get(name).copied().flatten().unwrap_or(f64::NAN),
-        )))
+        Ok(Self::from_values(values))
     }
 }
 
@@ -123,7 +121,7 @@ mod tests {
 
     #[cfg(feature = "serde")]
     #[test]
-    fn metrics_that_json_lacks_are_unknown() {
+    fn unknown_metrics_are_null_in_json_and_none_may_lack() {
         let metrics = Metrics::from_values(std::array::from_fn(|k| k as f64));
         let text = serde_json::to_string(&metrics).unwrap();
         assert_eq!(serde_json::from_str::<Metrics>(&text).unwrap(), metrics);
@@ -134,8 +132,7 @@ mod tests {
                 .q
                 .is_nan()
         );
-        let early: Metrics = serde_json::from_str("{\"q\":1.0}").unwrap();
-        assert!(early.q == 1.0 && early.values()[1..].iter().all(|value| value.is_nan()));
-        assert!(serde_json::from_str::<Metrics>("{\"q_dn\":1.0}").is_err());
+        let lacking = text.replace("\"m1\"", "\"m3\"");
+        assert!(serde_json::from_str::<Metrics>(&lacking).is_err());
     }
 }

@@ -28,9 +28,8 @@ use crate::score::{ScoreError, score_catalogues};
 #[serde(deny_unknown_fields)]
 pub struct Baseline {
     pub version: String,
-    /// Number of sets of all configurations, to detect a truncated file. Older files have none.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub sets_held: Option<usize>,
+    /// Number of sets of all configurations, to detect a truncated file.
+    pub sets_held: usize,
     pub source: Source,
     pub submissions: Vec<BaselineConfiguration>,
 }
@@ -81,7 +80,7 @@ impl Baseline {
     pub fn new(source: Source, submissions: Vec<BaselineConfiguration>) -> Self {
         Baseline {
             version: shearq_dataset::VERSION.into(),
-            sets_held: Some(sets_of(&submissions).count()),
+            sets_held: sets_of(&submissions).count(),
             source,
             submissions,
         }
@@ -124,7 +123,8 @@ impl Baseline {
         }
         let found = sets_of(&baseline.submissions).count();
         // A TOML file that ends early after a set is valid.
-        if let Some(held) = baseline.sets_held.filter(|held| *held != found) {
+        let held = baseline.sets_held;
+        if held != found {
             let message = format!(
                 "the file was truncated or edited (found {found} sets, expected {held} as in `sets_held`)"
             );

@@ -146,18 +146,10 @@ fn paths(store: &Path) -> Result<Vec<PathBuf>, FileError> {
     // Folders are listed in any order, but warnings and tables must not depend on it.
     paths.sort();
     // Some file systems change the case of names.
-    let is = |path: &Path, ending| {
+    paths.retain(|path| {
         path.extension()
-            .is_some_and(|own| own.eq_ignore_ascii_case(ending))
-    };
-    // Earlier versions wrote Parquet. Skipped, its runs would be absent from comparisons, and entries would be ranked as new.
-    if let Some(old) = paths.iter().find(|path| is(path, "parquet")) {
-        return Err(FileError::new(
-            old,
-            "found Parquet in a results store, expected the JSON of this version. Try: shearq score --measured OUT --store DIR with another folder",
-        ));
-    }
-    paths.retain(|path| is(path, "json"));
+            .is_some_and(|own| own.eq_ignore_ascii_case("json"))
+    });
     Ok(paths)
 }
 
