@@ -4,13 +4,15 @@ mod deconvolution;
 mod edges;
 mod epochs;
 mod noise;
+mod pixels;
 mod products;
 mod window;
 
 pub use self::deconvolution::{Lags, Light, Spectral, SpectralPsf, SpectralScratch};
-pub(crate) use self::epochs::{EpochPixels, EpochScratch, SpectralEpoch};
+pub(crate) use self::epochs::EpochStamp;
 pub use self::noise::ModeNoise;
 pub(crate) use self::noise::NoiseChanges;
+pub(crate) use self::pixels::EpochPixels;
 
 #[cfg(test)]
 mod tests;

@@ -40,8 +40,7 @@ use crate::random::uniform;
 use crate::selection::ShearSettings;
 use crate::shape::{Ratio, RoundMoments, SizeMoments, TypicalGalaxy};
 use crate::spectral::{
-    EpochScratch, Lags, ModeNoise, NoiseChanges, Spectral, SpectralEpoch, SpectralPsf,
-    SpectralScratch,
+    EpochPixels, EpochStamp, Lags, ModeNoise, NoiseChanges, Spectral, SpectralPsf, SpectralScratch,
 };
 use crate::transform::HexLattice;
 
@@ -162,6 +161,8 @@ struct LinearPlan {
     gradients: [Vec<f32>; 3],
     /// Gradients of P₀ and P₂ of [`SizeMoments`], as spectra.
     size_gradients: [Vec<f32>; 2],
+    /// White noise of level one.
+    white: ModeNoise,
     /// Factor that corrects the flux for the light beyond the window.
     aperture: f64,
 }
@@ -203,6 +204,7 @@ impl LinearPlan {
                 &size_moments,
             ),
             aperture: lengths.aperture(variance),
+            white: spectral.noise(&StampNoise::white(1.0)),
             gradients: moments.gradients().map(&mut spectrum),
             size_gradients: size_moments.gradients().map(&mut spectrum),
             size_moments,
@@ -372,8 +374,30 @@ impl CutWorker for LinearWorker {
     }
 
     fn measure_cut(&mut self, cut: &[f32], noise: f64) -> Result<Option<Found>, MeasureError> {
-        Ok((noise >= 0.0 && noise.is_finite())
-            .then(|| self.workers[self.current].measure_shape(cut, noise, self.gain)))
+        if !(noise >= 0.0 && noise.is_finite()) {
+            return Ok(None);
+        }
+        // In the middle, whatever is there. A window on the centroid changes with the shear of lopsided galaxies and of blends, which
+        // R does not contain: m was +23e-3 for rings at S/N 20, +4.4e-3 at S/N 60, and +6e-3 for blends at 5 to 7 px, instead of
+        // 0.4 ± 0.6e-3, 0.3 ± 0.1e-3 and 0 ± 1e-3.
+        let window = [0.0; 2];
+        // A shear about the middle of the stamp also moves off-centre galaxies under the window: m is −1.5e-3 for
+        // control-ground-constant of GREAT3, with offsets up to 1 px, and half of it for a shear about the centroid. About the
+        // centroid, m is about +4e-3 for galaxies whose bulge is off their centre by its half-light radius, if the shear of the
+        // simulation leaves that centre in its place.
+        let worker = &mut self.workers[self.current];
+        let origin = match worker.plan.origin {
+            ShearOrigin::Stamp => window,
+            ShearOrigin::Centroid => {
+                shear_origin(cut, worker.plan.spectral.stamp_size(), noise).map(f64::from)
+            }
+        };
+        let stamp = EpochStamp {
+            pixels: cut,
+            window,
+            origin,
+        };
+        Ok(Some(worker.measure(&|_| stamp, noise, self.gain)))
     }
 
     // The plan follows the PSFs, not the galaxy: Σp² is the weighted mean over the PSFs.
@@ -415,9 +439,23 @@ impl CutWorker for LinearWorker {
         worker.psf_variance = gaussian_variance(area);
         let level = total.sqrt().recip();
         let gain = (inverse_gain > 0.0).then(|| inverse_gain.recip());
-        let weights = &self.epoch_weights;
-        let found = worker.measure_epochs(weights, (level, gain), epoch, &mut self.denoiser)?;
-        Ok((found, level))
+        for k in 0..count {
+            let CutEpoch {
+                psf, pixels, stars, ..
+            } = epoch(k);
+            worker.set_epoch_psf(k, self.denoiser.denoised_with(psf, stars), pixels)?;
+        }
+        worker.combine_epochs(&self.epoch_weights);
+        // The window is on the light that is expected there, in all epochs.
+        let stamp = |k: usize| {
+            let CutEpoch { cut, offset, .. } = epoch(k);
+            EpochStamp {
+                pixels: cut,
+                window: offset,
+                origin: offset,
+            }
+        };
+        Ok((worker.measure(&stamp, level, gain), level))
     }
 
     fn images(&mut self, cut: &[f32], psf: ArrayView2<'_, f64>) -> Images {
@@ -441,21 +479,6 @@ fn place_of(
     Ok(workers.len() - 1)
 }
 
-/// Buffers of one thread for several stamps of a galaxy.
-struct EpochBuffers {
-    psfs: Vec<SpectralEpoch>,
-    scratch: EpochScratch,
-}
-
-impl EpochBuffers {
-    fn new(spectral: &Spectral) -> Self {
-        EpochBuffers {
-            psfs: Vec::new(),
-            scratch: spectral.epoch_scratch(),
-        }
-    }
-}
-
 /// Buffers of one thread for one plan.
 struct PlanWorker {
     index: PlanIndex,
@@ -472,15 +495,13 @@ struct PlanWorker {
     gradients: [Vec<f32>; 3],
     buffers: SpectralScratch,
     lags: Lags,
-    /// For galaxies with several stamps.
-    epochs: Option<Box<EpochBuffers>>,
 }
 
 impl PlanWorker {
     fn new(index: PlanIndex, plan: Arc<LinearPlan>) -> Self {
         PlanWorker {
             index,
-            noise: plan.spectral.noise(&StampNoise::white(1.0)),
+            noise: plan.white.clone(),
             noise_pixels: PixelShape::SQUARE,
             pixels: PixelShape::SQUARE,
             psf: plan.spectral.psf(),
@@ -489,7 +510,6 @@ impl PlanWorker {
             gradients: plan.gradients.clone(),
             buffers: plan.spectral.scratch(),
             lags: plan.spectral.lags(),
-            epochs: None,
             plan,
         }
     }
@@ -644,79 +664,44 @@ impl PlanWorker {
         under.max(0.0) / (std::f64::consts::PI * window)
     }
 
-    fn measure_shape(&mut self, stamp: &[f32], noise: f64, gain: Option<f64>) -> Found {
-        let plan = Arc::clone(&self.plan);
-        let mut sigma = noise as f32;
-        let (buffers, lags) = (&mut self.buffers, &mut self.lags);
-        // In the middle, whatever is there. A window on the centroid changes with the shear of lopsided galaxies and of blends, which
-        // R does not contain: m was +23e-3 for rings at S/N 20, +4.4e-3 at S/N 60, and +6e-3 for blends at 5 to 7 px, instead of
-        // 0.4 ± 0.6e-3, 0.3 ± 0.1e-3 and 0 ± 1e-3.
-        // A shear about the middle of the stamp also moves off-centre galaxies under the window: m is −1.5e-3 for
-        // control-ground-constant of GREAT3, with offsets up to 1 px, and half of it for a shear about the centroid. About the
-        // centroid, m is about +4e-3 for galaxies whose bulge is off their centre by its half-light radius, if the shear of the
-        // simulation leaves that centre in its place.
-        let origin = match plan.origin {
-            ShearOrigin::Stamp => [0.0; 2],
-            ShearOrigin::Centroid => shear_origin(stamp, plan.spectral.stamp_size(), noise),
-        };
-        let origin = self.pixels.map(origin.map(f64::from)).map(|at| at as f32);
-        plan.spectral.place_window([0.0; 2], origin, buffers);
-        plan.spectral
-            .autocorrelate(&self.psf, stamp, sigma, buffers, lags);
-        if let Some(gain) = gain {
-            sigma = noise.hypot((self.own_variance(sigma) / gain).sqrt()) as f32;
-            plan.spectral
-                .autocorrelate(&self.psf, stamp, sigma, &mut self.buffers, &mut self.lags);
-        }
-        self.measure_lags(stamp, noise, sigma)
+    fn set_epoch_psf(
+        &mut self,
+        at: usize,
+        psf: ArrayView2<'_, f64>,
+        pixels: EpochPixels,
+    ) -> Result<(), MeasureError> {
+        let spectral = &self.plan.spectral;
+        spectral.set_epoch_psf(at, psf, pixels, &mut self.buffers, &mut self.psf)
     }
 
-    /// Measures a galaxy on the stamps of epochs with these weights, in combined noise of level `noise`.
-    fn measure_epochs<'a>(
+    /// Takes the epochs whose PSFs were set, in white noise and with these weights.
+    fn combine_epochs(&mut self, weights: &[f32]) {
+        let plan = &self.plan;
+        plan.spectral
+            .combine(weights, &plan.white, &mut self.buffers, &mut self.psf);
+        self.regularisation = plan.regularisation.behind(&self.psf);
+    }
+
+    /// Measures a galaxy on a stamp per PSF that was set, in noise of this level.
+    fn measure<'a>(
         &mut self,
-        weights: &[f32],
-        (noise, gain): (f64, Option<f64>),
-        epoch: &dyn Fn(usize) -> CutEpoch<'a>,
-        denoiser: &mut StarDenoiser,
-    ) -> Result<Found, MeasureError> {
+        stamp: &dyn Fn(usize) -> EpochStamp<'a>,
+        noise: f64,
+        gain: Option<f64>,
+    ) -> Found {
         let plan = Arc::clone(&self.plan);
         let (spectral, mut sigma) = (&plan.spectral, noise as f32);
-        let new = || Box::new(EpochBuffers::new(spectral));
-        let mut epochs = self.epochs.take().unwrap_or_else(new);
-        let EpochBuffers { psfs, scratch } = &mut *epochs;
-        for k in 0..weights.len() {
-            let CutEpoch {
-                psf, pixels, stars, ..
-            } = epoch(k);
-            if psfs.len() <= k {
-                psfs.push(spectral.epoch());
-            }
-            let psf = denoiser.denoised_with(psf, stars);
-            spectral.set_epoch_psf(psf, pixels, &mut self.buffers, scratch, &mut psfs[k])?;
+        spectral.restore_epochs(&self.psf, stamp, &mut self.buffers);
+        if gain.is_some() {
+            self.buffers.keep();
         }
-        let psfs = &mut psfs[..weights.len()];
-        spectral.combine(psfs, weights, &mut self.buffers, &mut self.psf);
-        self.regularisation = plan.regularisation.behind(&self.psf);
-        let stamp = |k: usize| {
-            let CutEpoch { cut, offset, .. } = epoch(k);
-            (cut, offset)
-        };
-        spectral.autocorrelate_epochs(
-            &self.psf,
-            psfs,
-            stamp,
-            sigma,
-            (&mut self.buffers, scratch),
-            &mut self.lags,
-        );
+        spectral.take_lags(&self.psf, sigma, &mut self.buffers, &mut self.lags);
         if let Some(gain) = gain {
             sigma = noise.hypot((self.own_variance(sigma) / gain).sqrt()) as f32;
-            let buffers = (&mut self.buffers, &*scratch);
-            spectral.take_epoch_lags(&self.psf, sigma, buffers, &mut self.lags);
+            self.buffers.recall();
+            spectral.take_lags(&self.psf, sigma, &mut self.buffers, &mut self.lags);
         }
-        let found = self.measure_lags(epoch(0).cut, noise, sigma);
-        self.epochs = Some(epochs);
-        Ok(found)
+        self.measure_lags(stamp(0).pixels, noise, sigma)
     }
 
     /// Measures `lags` of a galaxy in noise of the sky of level `sky_noise`, and together with the galaxy's own of level
@@ -1126,7 +1111,12 @@ mod tests {
             worker.set_psf(gaussian(fwhm).stamp(48).view()).unwrap();
             let stamp = stamp(variance, (fwhm / 2.354_82_f64).powi(2) + 1.0 / 12.0);
             let light = stamp.iter().map(|v| v * v).sum::<f32>();
-            worker.measure_shape(stamp.as_slice().unwrap(), 0.0, None);
+            let stamp = EpochStamp {
+                pixels: stamp.as_slice().unwrap(),
+                window: [0.0; 2],
+                origin: [0.0; 2],
+            };
+            worker.measure(&|_| stamp, 0.0, None);
             let [zero, _] = plan.size_moments.sums(&worker.lags.acf);
             // The variance of the noise is the light over the square of the S/N.
             let added = worker.regularisation.size * light / 25.0;

@@ -46,14 +46,15 @@ use shearq_submissions::LinearDeconvolution;
 
 use super::edges::{Edges, EdgesScratch};
 use super::noise::{ModeNoise, NoiseChanges, change_of_power, subtract_noise};
+use super::pixels::EpochPixels;
 use super::window::{Smoothing, even_modes, inside};
 use crate::error::MeasureError;
 use crate::network::high_pass;
 use crate::noise::StampNoise;
 use crate::pixels::{check_psf, check_sizes, copy_row};
 use crate::transform::{
-    HexLattice, LagsScratch, Modes, Plane, Spectrum, ToLags, ToModes, TransformScratch,
-    even_parities, four_lanes, lanes, store, table,
+    HexLattice, LagsScratch, Modes, Plane, Spectrum, ToLags, ToModes, ToTurnedModes,
+    TransformScratch, even_parities, four_lanes, lanes, store, table,
 };
 
 // Margin around a stamp, so that the deconvolved stamp does not wrap around. Chosen by hand.
@@ -148,7 +149,18 @@ pub struct SpectralScratch {
     /// Origin of the shear (x, y) in pixels from the middle of the stamp.
     pub(super) origin: [f32; 2],
     pub(super) edges: EdgesScratch,
+    /// v̂ and its changes, summed over epochs, before the window.
+    pub(super) sums: [Spectrum; 3],
+    pub(super) turned: Option<Box<TurnedScratch>>,
     pub(super) lags: LagsScratch,
+}
+
+/// Transforms of pixels that are turned against those of other epochs.
+#[derive(Debug, Clone)]
+pub(super) struct TurnedScratch {
+    pub(super) stamps: ToTurnedModes,
+    pub(super) psfs: ToTurnedModes,
+    pub(super) edges: Vec<f32>,
 }
 
 /// Autocorrelations on the half of the lags of [`Spectral::lattice`] with dy ≥ 0, row by row; the others follow from
@@ -185,14 +197,23 @@ impl<T: Copy> Light<T> {
     }
 }
 
-/// A PSF as the linear network uses it.
+/// The PSF of one of the stamps of a galaxy.
+#[derive(Debug, Clone)]
+pub(super) struct SpectralEpoch {
+    pub(super) pixels: EpochPixels,
+    /// v̂/û of the epoch; until epochs are combined, p.
+    pub(super) restore: Modes,
+    /// (k_x ∂_x − k_y ∂_y)p/p and (k_y ∂_x + k_x ∂_y)p/p; until epochs are combined, the transforms of the PSF times x and y.
+    pub(super) tilts: [Modes; 2],
+}
+
+/// The PSF of a galaxy, or those of its epochs, as the linear network uses them.
 #[derive(Debug, Clone)]
 pub struct SpectralPsf {
-    /// v̂/û.
-    pub(super) restore: Modes,
-    /// (k_x ∂_x − k_y ∂_y)p/p and (k_y ∂_x + k_x ∂_y)p/p.
-    pub(super) tilts: [Modes; 2],
-    /// |p|²/S of each mode: the squared S/N of a point source of flux one in noise of level one.
+    /// Their first `count` are those of the galaxy; others are buffers.
+    pub(super) epochs: Vec<SpectralEpoch>,
+    pub(super) count: usize,
+    /// Σ u|p|²/S of each mode: the squared S/N of a point source of flux one in noise of level one.
     pub(super) clarity: Vec<f32>,
     /// Change of a mode of noise with the components of shear, in units of it and in the mean.
     pub(super) field_tilts: [Vec<f32>; 2],
@@ -357,6 +378,8 @@ impl Spectral {
             phases: self.plane.mode_by_mode(),
             origin: [0.0; 2],
             edges: self.edges.scratch(&self.plane),
+            sums: [(); 3].map(|()| self.plane.spectrum()),
+            turned: None,
             lags: self.to_lags.scratch(),
         }
     }
@@ -377,8 +400,8 @@ impl Spectral {
     pub fn psf(&self) -> SpectralPsf {
         let zeros = || vec![0.0; self.target.len()];
         SpectralPsf {
-            restore: self.plane.mode_by_mode(),
-            tilts: [(); 2].map(|()| self.plane.mode_by_mode()),
+            epochs: Vec::new(),
+            count: 0,
             clarity: zeros(),
             field_tilts: [zeros(), zeros()],
             floor: zeros(),
@@ -472,15 +495,49 @@ impl Spectral {
         out: &mut SpectralPsf,
     ) {
         self.psf_modes(scratch);
-        let SpectralScratch {
-            changes,
-            real: [power, amplitude],
-            ..
-        } = scratch;
-        squared_moduli(&changes[0], power);
+        self.take_epoch(0, EpochPixels::Shaped(scratch.pixels), scratch, out);
+        self.combine(&[1.0], noise, scratch, out);
+    }
+
+    // Takes the transforms in `scratch.changes` as those of the PSF of an epoch.
+    pub(super) fn take_epoch(
+        &self,
+        at: usize,
+        pixels: EpochPixels,
+        scratch: &mut SpectralScratch,
+        out: &mut SpectralPsf,
+    ) {
+        let new = || SpectralEpoch {
+            pixels,
+            restore: self.plane.mode_by_mode(),
+            tilts: [(); 2].map(|()| self.plane.mode_by_mode()),
+        };
+        out.epochs.resize_with(out.epochs.len().max(at + 1), new);
+        let epoch = &mut out.epochs[at];
+        epoch.pixels = pixels;
+        let modes = [&mut epoch.restore].into_iter().chain(&mut epoch.tilts);
+        for (modes, taken) in modes.zip(&mut scratch.changes) {
+            std::mem::swap(modes, taken);
+        }
+    }
+
+    /// Combines the first epochs, whose PSFs were set, with weights u that sum to one, in images with `noise`.
+    pub(crate) fn combine(
+        &self,
+        weights: &[f32],
+        noise: &ModeNoise,
+        scratch: &mut SpectralScratch,
+        out: &mut SpectralPsf,
+    ) {
+        let [power, amplitude] = &mut scratch.real;
+        power.fill(0.0);
+        for (epoch, weight) in out.epochs.iter().zip(weights) {
+            add_squares(&epoch.restore, *weight, power);
+        }
         let of_modes = [&power[..], &self.rough, &self.target];
         amplitudes(of_modes, self.step, self.iterations, amplitude);
-        take_psf(self, noise, (changes, amplitude), power, out);
+        combine(self, weights, noise, amplitude, power, out);
+        out.count = weights.len();
         self.spread_noise(scratch, out);
     }
 
@@ -589,7 +646,7 @@ impl Spectral {
     }
 
     /// Deconvolves a row-major `stamp` with noise of level `noise` and writes the
-    /// autocorrelation with its derivatives.
+    /// autocorrelation with its derivatives. The window is where [`Spectral::place_window`] put it.
     pub fn autocorrelate(
         &self,
         psf: &SpectralPsf,
@@ -598,12 +655,12 @@ impl Spectral {
         scratch: &mut SpectralScratch,
         out: &mut Lags,
     ) {
-        self.restore(&psf.restore, &psf.tilts, stamp, scratch);
+        self.restore(&psf.epochs[0], stamp, scratch);
         self.take_lags(psf, noise, scratch, out);
     }
 
-    // Writes the lags of v̂ and its changes in `scratch.windowed`, before the window, with noise of level `noise`.
-    pub(super) fn take_lags(
+    /// Writes the lags of v̂ and its changes in `scratch.windowed`, before the window, with noise of level `noise`.
+    pub(crate) fn take_lags(
         &self,
         psf: &SpectralPsf,
         noise: f32,
@@ -652,8 +709,11 @@ impl Spectral {
     // v̂ of a stamp and its changes with the components of shear, before the window, to `scratch.windowed`.
     pub(super) fn restore(
         &self,
-        amplitudes: &Modes,
-        tilts: &[Modes; 2],
+        SpectralEpoch {
+            restore: amplitudes,
+            tilts,
+            ..
+        }: &SpectralEpoch,
         stamp: &[f32],
         scratch: &mut SpectralScratch,
     ) {
@@ -747,7 +807,7 @@ impl Spectral {
         };
         to_modes.transform(stamp, of_stamp, spectrum);
         v.take_spectrum(spectrum);
-        multiply_modes(v, &psf.restore);
+        multiply_modes(v, &psf.epochs[0].restore);
         let n = self.stamp_size();
         let from_middle = |at: usize| at as f64 - (n as f64 - 1.0) / 2.0;
         let area = (self.plane.period * self.plane.period) as f64;
@@ -910,51 +970,58 @@ pub(super) fn sheared(x: [f32; 2], y: [f32; 2], kx: f32, ky: f32) -> [[f32; 2]; 
     ]
 }
 
-// Writes what follows for each mode from the transforms of a PSF and of it times x and y and from the amplitudes. `powers` are
-// |p|², and become powers of noise of σ = 1 before the window.
+// Replaces the transforms of PSFs and of them times x and y by what restores stamps. `powers` are Σ u|p|², and become powers of
+// the combined noise of σ = 1 before the window.
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn take_psf(
+fn combine(
     plan: &Spectral,
+    weights: &[f32],
     noise: &ModeNoise,
-    ([p, x, y], amplitudes): (&[Modes; 3], &[f32]),
+    amplitudes: &[f32],
     powers: &mut [f32],
     out: &mut SpectralPsf,
 ) {
+    let inverse = |of: f32| if of < MIN_PSF_POWER { 0.0 } else { 1.0 / of };
     for at in (0..powers.len()).step_by(LANES) {
-        let (p_re, p_im) = (lanes(&p.re, at), lanes(&p.im, at));
-        let (x_re, x_im) = (lanes(&x.re, at), lanes(&x.im, at));
-        let (y_re, y_im) = (lanes(&y.re, at), lanes(&y.im, at));
         let (kx, ky) = (lanes(&plan.waves[0], at), lanes(&plan.waves[1], at));
         let (squares, amplitudes) = (*lanes(powers, at), lanes(amplitudes, at));
         let noise_power = lanes(&noise.power, at);
-        let noise_tilts = [lanes(&noise.tilts[0], at), lanes(&noise.tilts[1], at)];
-        let [mut restore, mut first, mut second] = [[[0.0f32; LANES]; 2]; 3];
-        let mut field_tilts = [[0.0f32; LANES]; 2];
+        let mut field_tilts = [0, 1].map(|component| *lanes(&noise.tilts[component], at));
         let [mut clarity, mut power] = [[0.0f32; LANES]; 2];
-        for l in 0..LANES {
-            let inverse = if squares[l] < MIN_PSF_POWER {
-                0.0
-            } else {
-                1.0 / squares[l]
-            };
-            // Times conj(p)/|p|².
-            let (re, im) = (p_re[l], -p_im[l]);
-            let [[ar, ai], [br, bi]] =
-                sheared([x_re[l], x_im[l]], [y_re[l], y_im[l]], kx[l], ky[l]);
-            (first[0][l], first[1][l]) =
-                ((ar * re - ai * im) * inverse, (ar * im + ai * re) * inverse);
-            (second[0][l], second[1][l]) =
-                ((br * re - bi * im) * inverse, (br * im + bi * re) * inverse);
-            (restore[0][l], restore[1][l]) = (re * amplitudes[l], im * amplitudes[l]);
-            let square = restore[0][l] * restore[0][l] + restore[1][l] * restore[1][l];
-            power[l] = square * noise_power[l];
-            clarity[l] = squares[l] / noise_power[l];
-            field_tilts[0][l] = noise_tilts[0][l] - first[0][l];
-            field_tilts[1][l] = noise_tilts[1][l] - second[0][l];
+        for (epoch, weight) in out.epochs.iter_mut().zip(weights) {
+            let [mut restore, mut first, mut second] = [[[0.0f32; LANES]; 2]; 3];
+            {
+                let values = |modes: &'_ Modes| [*lanes(&modes.re, at), *lanes(&modes.im, at)];
+                let [p, x, y] = [&epoch.restore, &epoch.tilts[0], &epoch.tilts[1]].map(values);
+                for l in 0..LANES {
+                    // Times conj(p)/|p|².
+                    let (re, im) = (p[0][l], -p[1][l]);
+                    let (own, all) = (inverse(re * re + im * im), weight * inverse(squares[l]));
+                    let [[ar, ai], [br, bi]] =
+                        sheared([x[0][l], x[1][l]], [y[0][l], y[1][l]], kx[l], ky[l]);
+                    let (a, b) = (ar * re - ai * im, br * re - bi * im);
+                    (first[0][l], first[1][l]) = (a * own, (ar * im + ai * re) * own);
+                    (second[0][l], second[1][l]) = (b * own, (br * im + bi * re) * own);
+                    field_tilts[0][l] -= a * all;
+                    field_tilts[1][l] -= b * all;
+                    let amplitude = weight * amplitudes[l];
+                    (restore[0][l], restore[1][l]) = (re * amplitude, im * amplitude);
+                    let square = restore[0][l] * restore[0][l] + restore[1][l] * restore[1][l];
+                    power[l] += square / weight;
+                }
+            }
+            let [tilt1, tilt2] = &mut epoch.tilts;
+            for (modes, values) in [
+                (&mut epoch.restore, restore),
+                (tilt1, first),
+                (tilt2, second),
+            ] {
+                store([&mut modes.re[..], &mut modes.im[..]], at, values);
+            }
         }
-        let [tilt1, tilt2] = &mut out.tilts;
-        for (modes, values) in [(&mut out.restore, restore), (tilt1, first), (tilt2, second)] {
-            store([&mut modes.re[..], &mut modes.im[..]], at, values);
+        for l in 0..LANES {
+            power[l] *= noise_power[l];
+            clarity[l] = squares[l] / noise_power[l];
         }
         let [tilt1, tilt2] = &mut out.field_tilts;
         store([&mut tilt1[..], &mut tilt2[..]], at, field_tilts);
@@ -963,14 +1030,12 @@ fn take_psf(
 }
 
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn squared_moduli(modes: &Modes, out: &mut [f32]) {
-    for (out, (re, im)) in out.iter_mut().zip(modes.re.iter().zip(&modes.im)) {
-        *out = re * re + im * im;
+fn add_squares(modes: &Modes, weight: f32, sum: &mut [f32]) {
+    for (sum, (re, im)) in sum.iter_mut().zip(modes.re.iter().zip(&modes.im)) {
+        *sum += weight * (re * re + im * im);
     }
 }
 
-// Γ[1 − (1 − c w)^M]/w of modes with |p|² = `powers`; zero where the PSF leaves nothing. Inlined into a longer loop, the powers of
-// the lanes were computed one by one.
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 pub(super) fn amplitudes(
     [powers, rough, target]: [&[f32]; 3],

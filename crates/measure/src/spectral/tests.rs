@@ -623,7 +623,7 @@ fn products_of_noise_on_the_stamp(
         } else {
             noise(n, rng)
         };
-        plan.restore(&own.restore, &own.tilts, &stamp, &mut scratch);
+        plan.restore(&own.epochs[0], &stamp, &mut scratch);
         plan.apply_window(&mut scratch);
         let changes = [0, 1, 2].map(|which| {
             take_change(&plan, which, &mut scratch, &mut lags.acf);
