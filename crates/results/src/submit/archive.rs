@@ -13,7 +13,7 @@ use shearq_files::open::open;
 use shearq_render::escape::line;
 use tar::Archive;
 
-use super::{FileSum, MANIFEST_FILE, Manifest};
+use super::manifest::{FileSum, MANIFEST_FILE, Manifest};
 
 // Largest accepted manifest in bytes: about 200 per file, with room for covariances.
 const MAX_MANIFEST_BYTES: u64 = 1 << 26;
