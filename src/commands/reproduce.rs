@@ -9,7 +9,7 @@ use anyhow::bail;
 use clap::Args;
 use shearq_submissions::{Configuration, Published, Registry};
 
-use self::sets::{Plan, SCORES};
+use self::sets::{Plan, RAW, SCORES};
 use crate::arguments::{SetList, Threads, given_once};
 use crate::progress::{Bar, mark_resumable};
 use crate::{made_by, print, print_table, tell};
@@ -57,10 +57,6 @@ pub(crate) struct Arguments {
     #[command(flatten)]
     threads: Threads,
 }
-
-// The paper shows these two in Figs 3 and 9 to 11.
-const RAW: &str = "23/raw/star";
-const DENOISED: &str = "23/den/star";
 
 const SECT_THREE: &str = "The network deconvolves a stamp. The ellipticity is measured on the autocorrelation (ACF) of the result, after subtracting the mean of its edge. The ACF is clipped at the radius that contains 89 % of the largest enclosed light.";
 const SECT_FOUR: &str = "Exponential galaxies are convolved with a Moffat PSF each and have white noise of 10 to 40 dB. Both updating rules deconvolve them with λ from 10⁻⁶ to 10⁶. All data are simulated.";

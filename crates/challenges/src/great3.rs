@@ -3,6 +3,7 @@
 
 mod files;
 mod pack;
+mod rules;
 mod simulation;
 mod simulator;
 
@@ -22,6 +23,7 @@ use shearq_scoring::great3::{
 
 use self::files::Masses;
 use self::pack::Galaxies;
+use self::rules::Great3;
 use crate::agreement::{MIN_SHEAR_SLOPE, Slope, disagreement, odd_fields};
 use crate::columns::wrong;
 use crate::{
@@ -38,32 +40,6 @@ pub(crate) const CHALLENGE: PublicChallenge = PublicChallenge {
     },
     branch: |name| Some(Box::new(Great3(Branch::named(name?)?))),
 };
-
-// A component from here on was not measured: averages leave out 9.9 and more, correlations 10 and more. Both as in the challenge.
-const NOT_AVERAGED: f64 = 9.9;
-const NOT_CORRELATED: f64 = 10.0;
-
-/// A branch of GREAT3.
-#[derive(Debug, Clone, Copy, PartialEq)]
-struct Great3(Branch);
-
-fn zero(field: usize, name: &str) -> String {
-    format!("field {field}: {name} is exactly zero, which no measurement gives")
-}
-
-fn not_an_identity(row: usize, found: f64) -> String {
-    format!(
-        "row {}: not the identity of a galaxy (found {found}, expected SSSXXXYYY, such as 012034056)",
-        row + 1
-    )
-}
-
-fn more(count: usize) -> String {
-    match count {
-        1 => String::new(),
-        _ => format!(" and {} more", count - 1),
-    }
-}
 
 // The error of each field's shear against the true shear, along the PSF and at 45° to it, with the fit (c, m) and the requirement.
 fn residual_plots(fields: &[ConstantField], biases: [(Bias, Bias); 2]) -> Vec<LinePlot> {

@@ -22,7 +22,9 @@ use shearq_simulate::kinds::{SetKind, shares};
 use shearq_simulate::set::{STAMP, SimulationSettings};
 use shearq_submissions::{Configuration, PsfForm, Published};
 
-use super::{DENOISED, RAW};
+// The paper shows these two in Figs 3 and 9 to 11.
+pub(super) const RAW: &str = "23/raw/star";
+const DENOISED: &str = "23/den/star";
 
 /// Names of the scores of a set.
 pub(super) const SCORES: &str = "sets/set{set:02}.json";

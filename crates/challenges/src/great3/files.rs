@@ -12,7 +12,7 @@ use shearq_scoring::aperture::{Lattice, LatticeShear, SEPARATION_BINS, separatio
 use shearq_scoring::great3::{Identity, NODES_PER_GALAXY, SUBFIELDS_PER_FIELD};
 use shearq_scoring::{Repeated, repeated};
 
-use super::{Great3, NOT_CORRELATED, more, not_an_identity, zero};
+use super::rules::{Great3, NOT_CORRELATED, more, not_an_identity, zero};
 use crate::Truth;
 use crate::columns::{Columns, whole, wrong};
 

@@ -16,7 +16,7 @@ use shearq_scoring::great3::{Branch, GRID, Identity, NODES_PER_GALAXY, SUBFIELDS
 use shearq_scoring::{Repeated, repeated};
 
 use super::files::{EQUAL_SHEARS, lattice};
-use super::{NOT_AVERAGED, NOT_CORRELATED, more, not_an_identity, zero};
+use super::rules::{NOT_AVERAGED, NOT_CORRELATED, more, not_an_identity, zero};
 use crate::columns::{Columns, wrong};
 use crate::{BranchCatalogues, Presubmission, Presubmitting};
 
