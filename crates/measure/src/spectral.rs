@@ -3,9 +3,11 @@
 mod deconvolution;
 mod edges;
 mod epochs;
+mod modes;
 mod noise;
 mod pixels;
 mod products;
+mod restoration;
 mod window;
 
 pub use self::deconvolution::{Lags, Light, Spectral, SpectralPsf, SpectralScratch};

@@ -45,8 +45,12 @@ use shearq_quantities::linear::LANES;
 use shearq_submissions::LinearDeconvolution;
 
 use super::edges::{Edges, EdgesScratch};
+use super::modes::{
+    MIN_PSF_POWER, add_squares, amplitudes, dot, multiply_modes, negative_products, roots, weighted,
+};
 use super::noise::{ModeNoise, NoiseChanges, change_of_power, subtract_noise};
 use super::pixels::EpochPixels;
+use super::restoration::{Restoration, restore, sheared};
 use super::window::{Smoothing, even_modes, inside};
 use crate::error::MeasureError;
 use crate::network::high_pass;
@@ -54,7 +58,7 @@ use crate::noise::StampNoise;
 use crate::pixels::{check_psf, check_sizes, copy_row};
 use crate::transform::{
     HexLattice, LagsScratch, Modes, Plane, Spectrum, ToLags, ToModes, ToTurnedModes,
-    TransformScratch, even_parities, four_lanes, lanes, store, table,
+    TransformScratch, even_parities, lanes, store, table,
 };
 
 // Margin around a stamp, so that the deconvolved stamp does not wrap around. Chosen by hand.
@@ -81,9 +85,6 @@ const LARGEST_LAG: f64 = 2.5;
 // together than the modes would need because the weight of the moments, which multiplies the autocorrelation, has finer
 // structure.
 const LAGS_PER_SAMPLE: f64 = 1.5;
-// Least power of the PSF's transform; modes below it are left out as pure noise. Below 10⁻³, the least power in the
-// simulated sets, and within single precision.
-pub(super) const MIN_PSF_POWER: f32 = 1e-7;
 
 /// The linear network for one stamp size.
 #[derive(Debug, Clone)]
@@ -867,109 +868,6 @@ fn taper(k: f64) -> f64 {
     (std::f64::consts::FRAC_PI_2 * place).cos().powi(2)
 }
 
-/// What the modes of a stamp are restored with.
-pub(super) struct Restoration<'a> {
-    /// v̂/û.
-    pub(super) restore: &'a Modes,
-    /// Changes of the PSF with the components of shear, in units of it.
-    pub(super) tilts: &'a [Modes; 2],
-    pub(super) waves: &'a [Vec<f32>; 2],
-    /// Origin of the shear, (x, y) in pixels from the middle of the stamp.
-    pub(super) origin: [f32; 2],
-    /// What the edges of the stamp add to the changes of û.
-    pub(super) edges: Option<[&'a Modes; 2]>,
-}
-
-// Replaces the transforms of a stamp and of it times x and y by v̂ and its changes, before the window: v̂/û times û, times
-// p·(k_x ∂_x − k_y ∂_y)(û/p), and times p·(k_y ∂_x + k_x ∂_y)(û/p).
-#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-pub(super) fn restore(spectra: &mut [Spectrum; 3], with: &Restoration<'_>) {
-    let quarter = spectra[0].0.len() / 4;
-    let mut above = [[[0.0f32; LANES]; 2]; 3];
-    let mut below = above;
-    for at in (0..quarter).step_by(LANES) {
-        {
-            let [u, x, y] = &*spectra;
-            let u = four_lanes(u.quarters(), at);
-            let x = four_lanes(x.quarters(), at);
-            let y = four_lanes(y.quarters(), at);
-            restore_half(u, x, y, (at, -1.0), with, &mut above);
-            restore_half(u, x, y, (quarter + at, 1.0), with, &mut below);
-        }
-        for k in 0..3 {
-            let ([above_re, above_im], [below_re, below_im]) = (&above[k], &below[k]);
-            let [mut cc, mut cs, mut sc, mut ss] = [[0.0f32; LANES]; 4];
-            for l in 0..LANES {
-                cc[l] = 0.5 * (below_re[l] + above_re[l]);
-                cs[l] = 0.5 * (above_im[l] - below_im[l]);
-                sc[l] = 0.5 * (above_im[l] + below_im[l]);
-                ss[l] = 0.5 * (below_re[l] - above_re[l]);
-            }
-            store(spectra[k].quarters_mut(), at, [cc, cs, sc, ss]);
-        }
-    }
-}
-
-// The same for modes from place `at` on of all, with the sign of ss in their real part.
-#[inline(always)]
-fn restore_half(
-    u: [&[f32; LANES]; 4],
-    x: [&[f32; LANES]; 4],
-    y: [&[f32; LANES]; 4],
-    (at, sign): (usize, f32),
-    with: &Restoration<'_>,
-    out: &mut [[[f32; LANES]; 2]; 3],
-) {
-    let zeros = [0.0f32; LANES];
-    let complex = |modes: &'_ Modes| [*lanes(&modes.re, at), *lanes(&modes.im, at)];
-    let [edge1, edge2] = match with.edges {
-        Some([first, second]) => [complex(first), complex(second)],
-        None => [[zeros; 2]; 2],
-    };
-    let [tilt1, tilt2] = [complex(&with.tilts[0]), complex(&with.tilts[1])];
-    let (restore, [x0, y0]) = (complex(with.restore), with.origin);
-    let (kx, ky) = (lanes(&with.waves[0], at), lanes(&with.waves[1], at));
-    let [[u_re, u_im], [first_re, first_im], [second_re, second_im]] = out;
-    for l in 0..LANES {
-        let [ur, ui] = mode_of(u, sign, l);
-        let [xr, xi] = mode_of(x, sign, l);
-        let [yr, yi] = mode_of(y, sign, l);
-        let about_origin = ([xr - x0 * ur, xi - x0 * ui], [yr - y0 * ur, yi - y0 * ui]);
-        let [[plus_re, plus_im], [cross_re, cross_im]] =
-            sheared(about_origin.0, about_origin.1, kx[l], ky[l]);
-        let of_psf = |tilt: &[[f32; LANES]; 2]| {
-            let (re, im) = (tilt[0][l], tilt[1][l]);
-            (re * ur - im * ui, re * ui + im * ur)
-        };
-        let (one, two) = (of_psf(&tilt1), of_psf(&tilt2));
-        let (ar, ai) = (plus_re + edge1[0][l] - one.0, plus_im + edge1[1][l] - one.1);
-        let (br, bi) = (
-            cross_re + edge2[0][l] - two.0,
-            cross_im + edge2[1][l] - two.1,
-        );
-        let (re, im) = (restore[0][l], restore[1][l]);
-        (u_re[l], u_im[l]) = (ur * re - ui * im, ur * im + ui * re);
-        (first_re[l], first_im[l]) = (ar * re - ai * im, ar * im + ai * re);
-        (second_re[l], second_im[l]) = (br * re - bi * im, br * im + bi * re);
-    }
-}
-
-// The transform at a mode from the four parts of a spectrum, with the sign of ss in its real part.
-#[inline(always)]
-fn mode_of([cc, cs, sc, ss]: [&[f32; LANES]; 4], sign: f32, l: usize) -> [f32; 2] {
-    [cc[l] + sign * ss[l], sc[l] - sign * cs[l]]
-}
-
-// (k_x ∂_x − k_y ∂_y) and (k_y ∂_x + k_x ∂_y) of a transform, from the transforms of its image times x and y: ∂ of it is
-// −i x̂. Numbers are real and imaginary part.
-#[inline(always)]
-pub(super) fn sheared(x: [f32; 2], y: [f32; 2], kx: f32, ky: f32) -> [[f32; 2]; 2] {
-    [
-        [x[1] * kx - y[1] * ky, y[0] * ky - x[0] * kx],
-        [x[1] * ky + y[1] * kx, -(x[0] * ky + y[0] * kx)],
-    ]
-}
-
 // Replaces the transforms of PSFs and of them times x and y by what restores stamps. `powers` are Σ u|p|², and become powers of
 // the combined noise of σ = 1 before the window.
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
@@ -1027,100 +925,4 @@ fn combine(
         store([&mut tilt1[..], &mut tilt2[..]], at, field_tilts);
         store([&mut out.clarity[..], &mut *powers], at, [clarity, power]);
     }
-}
-
-#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn add_squares(modes: &Modes, weight: f32, sum: &mut [f32]) {
-    for (sum, (re, im)) in sum.iter_mut().zip(modes.re.iter().zip(&modes.im)) {
-        *sum += weight * (re * re + im * im);
-    }
-}
-
-#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-pub(super) fn amplitudes(
-    [powers, rough, target]: [&[f32]; 3],
-    step: f32,
-    iterations: i32,
-    out: &mut [f32],
-) {
-    let modes = powers
-        .chunks(LANES)
-        .zip(rough.chunks(LANES))
-        .zip(target.chunks(LANES));
-    for (out, ((powers, rough), target)) in out.chunks_mut(LANES).zip(modes) {
-        let mut base = [0.0f64; LANES];
-        let mut power_of_base = [1.0f64; LANES];
-        for (base, (power, rough)) in base.iter_mut().zip(powers.iter().zip(rough)) {
-            *base = f64::from(1.0 - step * (power + rough));
-        }
-        for base in &mut base {
-            // A positive (1 − c w)^M below exp(−40) is nothing in single precision, and would make denormal numbers on the way.
-            let nothing = *base > 0.0 && (1.0 - *base) * f64::from(iterations) > 40.0;
-            *base = if nothing { 0.0 } else { *base };
-        }
-        // By repeated squares, for all lanes at a time.
-        let mut exponent = iterations;
-        while exponent > 0 {
-            if exponent & 1 == 1 {
-                for (power, base) in power_of_base.iter_mut().zip(&base) {
-                    *power *= base;
-                }
-            }
-            for base in &mut base {
-                *base *= *base;
-            }
-            exponent >>= 1;
-        }
-        let modes = powers.iter().zip(rough).zip(target).zip(power_of_base);
-        for (out, (((power, rough), target), power_of_base)) in out.iter_mut().zip(modes) {
-            // A mode without signal is noise alone, for any λ.
-            *out = if *power < MIN_PSF_POWER || *target == 0.0 {
-                0.0
-            } else {
-                target * (1.0 - power_of_base) as f32 / (power + rough)
-            };
-        }
-    }
-}
-
-#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn roots(values: &[f32], out: &mut [f32]) {
-    for (out, value) in out.iter_mut().zip(values) {
-        *out = value.sqrt();
-    }
-}
-
-#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn negative_products(a: &[f32], b: &[f32], out: &mut [f32]) {
-    for (out, (a, b)) in out.iter_mut().zip(a.iter().zip(b)) {
-        *out = -a * b;
-    }
-}
-
-#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn weighted(kind: &[f32], power: &[f32], counts: &[f32], area: f32, out: &mut [f32]) {
-    let modes = kind.iter().zip(power).zip(counts);
-    for (out, ((kind, power), count)) in out.iter_mut().zip(modes) {
-        *out = count * area * power * kind;
-    }
-}
-
-// Multiplies complex modes.
-#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-pub(super) fn multiply_modes(modes: &mut Modes, by: &Modes) {
-    let modes = modes.re.iter_mut().zip(&mut modes.im);
-    for ((re, im), (a, b)) in modes.zip(by.re.iter().zip(&by.im)) {
-        (*re, *im) = (*re * a - *im * b, *re * b + *im * a);
-    }
-}
-
-#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn dot(a: &[f32], b: &[f32]) -> f32 {
-    let mut sums = [0.0f32; LANES];
-    for (a, b) in a.chunks_exact(LANES).zip(b.chunks_exact(LANES)) {
-        for l in 0..LANES {
-            sums[l] += a[l] * b[l];
-        }
-    }
-    sums.iter().sum()
 }

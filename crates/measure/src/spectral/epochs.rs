@@ -19,12 +19,11 @@ use multiversion::multiversion;
 use ndarray::ArrayView2;
 use shearq_quantities::linear::{Matrix2, ROWS, product};
 
-use super::deconvolution::{
-    Restoration, Spectral, SpectralEpoch, SpectralPsf, SpectralScratch, TurnedScratch,
-    multiply_modes, restore,
-};
+use super::deconvolution::{Spectral, SpectralEpoch, SpectralPsf, SpectralScratch, TurnedScratch};
 use super::edges::{SHEARS, edge_lines};
+use super::modes::multiply_modes;
 use super::pixels::EpochPixels;
+use super::restoration::{Restoration, restore};
 use crate::error::MeasureError;
 use crate::transform::ToTurnedModes;
 
