@@ -38,6 +38,12 @@ mod commands {
     pub(crate) mod unpack;
 }
 
+/// Figures and tables of the paper, for `reproduce`.
+mod paper {
+    pub(crate) mod lambda;
+    pub(crate) mod sets;
+}
+
 use std::ffi::OsString;
 use std::process::ExitCode;
 use std::sync::atomic::{AtomicBool, Ordering};

@@ -1,16 +1,14 @@
 //! `shearq reproduce`.
 
-mod lambda;
-mod sets;
-
 use std::path::PathBuf;
 
 use anyhow::bail;
 use clap::Args;
 use shearq_submissions::{Configuration, Published, Registry};
 
-use self::sets::{Plan, RAW, SCORES};
 use crate::arguments::{SetList, Threads, given_once};
+use crate::paper::sets::{Plan, RAW, SCORES};
+use crate::paper::{lambda, sets};
 use crate::progress::{Bar, mark_resumable};
 use crate::{made_by, print, print_table, tell};
 use shearq_dataset::layout::MAX_IMAGE;

@@ -115,7 +115,7 @@ fn error_of_mean(values: &RunningMean) -> f64 {
 
 /// An update and S/N, with the sums over galaxies at each λ.
 #[derive(Debug, Clone)]
-pub(super) struct Curve {
+pub(crate) struct Curve {
     update: Update,
     snr_db: f64,
     lambdas: Range<usize>,
@@ -159,7 +159,7 @@ fn empty_curves() -> Vec<Curve> {
 const CHUNK: u64 = 8;
 
 /// Deconvolves synthetic galaxies with the settings of a network, by both updating rules.
-pub(super) fn calibrate(
+pub(crate) fn calibrate(
     configuration: &Configuration,
     galaxies: u64,
     seed: u64,
@@ -404,7 +404,7 @@ fn over_lambda(
 }
 
 /// Draws Figs 4 to 7 and writes their data.
-pub(super) fn figures(page: &mut Page<'_>, curves: &[Curve]) -> Result<(), PageError> {
+pub(crate) fn figures(page: &mut Page<'_>, curves: &[Curve]) -> Result<(), PageError> {
     let of_update = |update| curves.iter().filter(move |curve| curve.update == update);
     let against_snr = UPDATES
         .iter()
@@ -510,7 +510,7 @@ fn curves_table(curves: &[Curve]) -> Table {
 }
 
 /// The best λ at each S/N, and the values at the paper's choice.
-pub(super) fn best_table(curves: &[Curve], galaxies: u64) -> Table {
+pub(crate) fn best_table(curves: &[Curve], galaxies: u64) -> Table {
     let curves = curves.iter().filter(|curve| curve.is_over_lambda());
     let best = |curve: &Curve| {
         let at = |place: &usize| curve.at(*place).inverse_rmsd().0;

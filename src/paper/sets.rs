@@ -23,19 +23,19 @@ use shearq_simulate::set::{STAMP, SimulationSettings};
 use shearq_submissions::{Configuration, PsfForm, Published};
 
 // The paper shows these two in Figs 3 and 9 to 11.
-pub(super) const RAW: &str = "23/raw/star";
+pub(crate) const RAW: &str = "23/raw/star";
 const DENOISED: &str = "23/den/star";
 
 /// Names of the scores of a set.
-pub(super) const SCORES: &str = "sets/set{set:02}.json";
+pub(crate) const SCORES: &str = "sets/set{set:02}.json";
 
 /// What determines the results of a folder.
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
-pub(super) struct Plan {
-    pub(super) version: String,
-    pub(super) simulation: SimulationSettings,
-    pub(super) images: u32,
-    pub(super) configurations: Vec<Configuration>,
+pub(crate) struct Plan {
+    pub(crate) version: String,
+    pub(crate) simulation: SimulationSettings,
+    pub(crate) images: u32,
+    pub(crate) configurations: Vec<Configuration>,
 }
 
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -53,7 +53,7 @@ struct ConfigurationScore {
 }
 
 #[derive(Debug, PartialEq, Serialize, Deserialize)]
-pub(super) struct SetScores {
+pub(crate) struct SetScores {
     set: u32,
     images: u32,
     l: [f64; BINS],
@@ -64,7 +64,7 @@ pub(super) struct SetScores {
 
 /// The scores on each of `sets`, which are written to the claimed folder as soon as they are known. Those that are there
 /// already are read.
-pub(super) fn score_sets(
+pub(crate) fn score_sets(
     plan: &Plan,
     sets: &[u32],
     (folder, claim): (&Path, &Claim),
@@ -220,7 +220,7 @@ fn mean_of_24(results: &[SetScores], place: usize, metric: Metric) -> (f64, f64)
 }
 
 /// Table 1: our metrics beside the published ones.
-pub(super) fn table_one(
+pub(crate) fn table_one(
     results: &[SetScores],
     configurations: &[(Configuration, Published)],
 ) -> Table {
@@ -271,7 +271,7 @@ pub(super) fn table_one(
 }
 
 /// Figs 8 to 11 with their data.
-pub(super) fn figures(page: &mut Page<'_>, results: &[SetScores]) -> Result<(), PageError> {
+pub(crate) fn figures(page: &mut Page<'_>, results: &[SetScores]) -> Result<(), PageError> {
     let scores = results.first().map_or(&[][..], |set| &set.results);
     let names: Vec<&str> = scores
         .iter()
@@ -398,7 +398,7 @@ fn spectra_table(results: &[SetScores], place: usize) -> Table {
 }
 
 /// Metrics of every set and configuration: the data of Figs 8, 10 and 11.
-pub(super) fn per_set_table(results: &[SetScores]) -> Table {
+pub(crate) fn per_set_table(results: &[SetScores]) -> Table {
     let rows = results.iter();
     let rows = rows.flat_map(|set| set.results.iter().map(|own| (set.set, own)));
     let rows: Vec<(u32, &ConfigurationScore)> = rows.collect();
