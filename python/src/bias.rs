@@ -303,11 +303,7 @@ fn units_of(name: Option<String>) -> Units {
 
 /// Sums catalogues.
 #[pyfunction]
-#[expect(
-    clippy::too_many_arguments,
-    clippy::too_many_lines,
-    reason = "the options of the command"
-)]
+#[expect(clippy::too_many_arguments, reason = "the options of the command")]
 pub(crate) fn bias_sums(
     py: Python<'_>,
     catalogues: Vec<Given<'_>>,

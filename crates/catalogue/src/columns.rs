@@ -205,6 +205,28 @@ fn check_own_responses(path: &Path, columns: &BTreeMap<Key, String>) -> Result<(
     ))
 }
 
+fn check_partners(
+    path: &Path,
+    columns: &BTreeMap<Key, String>,
+    found: &[String],
+) -> Result<(), FileError> {
+    let absent = |key: &Key| partner(*key).filter(|partner| !columns.contains_key(partner));
+    let Some((key, column, absent)) = columns
+        .iter()
+        .find_map(|(key, column)| Some((key, column, name_of(absent(key)?))))
+    else {
+        return Ok(());
+    };
+    Err(FileError::new(
+        path,
+        format!(
+            "there is a column `{column}` but none for {absent} (found {}). Try: --columns {absent}=NAME, or {}=none",
+            names_of(found),
+            name_of(*key)
+        ),
+    ))
+}
+
 impl Survey {
     fn of(&self, key: Key) -> Option<&str> {
         self.columns.get(&key).map(String::as_str)
@@ -550,19 +572,7 @@ impl Columns {
                 ),
             ));
         };
-        for (key, column) in &columns {
-            let absent = partner(*key).filter(|partner| !columns.contains_key(partner));
-            if let Some(absent) = absent.map(name_of) {
-                return Err(FileError::new(
-                    path,
-                    format!(
-                        "there is a column `{column}` but none for {absent} (found {}). Try: --columns {absent}=NAME, or {}=none",
-                        names_of(found),
-                        name_of(*key)
-                    ),
-                ));
-            }
-        }
+        check_partners(path, &columns, found)?;
         let distortion = recognition().ellipticity.distortion.contains(&e1)
             || survey.is_some_and(|survey| survey.ellipticity == EllipticityType::Distortion);
         let preset = Preset::of_columns(&columns, distortion || e1 == "corrected_g1", found);

@@ -539,6 +539,33 @@ pub fn needed_columns(
         .collect())
 }
 
+// The columns by role, with a column that names sheared catalogues by its texts, and without identities that are counts.
+fn columns_of(
+    place: &Place,
+    sheared: Option<usize>,
+    (names, frame): (&[String], Option<&DataFrame>),
+    given: &Names,
+) -> Result<Columns, FileError> {
+    let mut columns = Columns::find(&place.path, names, given)?;
+    if sheared.is_none()
+        && columns.of(Role::ShearedCatalogue).is_none()
+        && !given.is_given(Role::ShearedCatalogue)
+        && let Some(step) = step_column(place, frame, &columns)?
+    {
+        let mut given = given.clone();
+        given.add_step(step);
+        columns = Columns::find(&place.path, names, &given)?;
+    }
+    if let Some(id) = columns.of(Role::Id)
+        && id.eq_ignore_ascii_case(COUNTER)
+        && !given.is_given(Role::Id)
+        && !is_identity(place, frame, id)?
+    {
+        columns.decline_identity();
+    }
+    Ok(columns)
+}
+
 fn source(
     place: Place,
     sheared: Option<usize>,
@@ -549,23 +576,7 @@ fn source(
     let given = &reading.request.names;
     let (names, formulas) = with_formulas(path, names, given)?;
     let names = names.as_slice();
-    let mut columns = Columns::find(path, names, given)?;
-    if sheared.is_none()
-        && columns.of(Role::ShearedCatalogue).is_none()
-        && !given.is_given(Role::ShearedCatalogue)
-        && let Some(step) = step_column(&place, frame, &columns)?
-    {
-        let mut given = given.clone();
-        given.add_step(step);
-        columns = Columns::find(path, names, &given)?;
-    }
-    if let Some(id) = columns.of(Role::Id)
-        && id.eq_ignore_ascii_case(COUNTER)
-        && !given.is_given(Role::Id)
-        && !is_identity(&place, frame, id)?
-    {
-        columns.decline_identity();
-    }
+    let mut columns = columns_of(&place, sheared, (names, frame), given)?;
     if matches!(reading.truth, Truth::Columns) && !columns.have(&[Role::G1]) {
         given.check_true_shear(path)?;
     }

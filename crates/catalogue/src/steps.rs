@@ -82,10 +82,8 @@ fn sheared_path(path: &Path) -> Option<(usize, String)> {
     let steps = all
         .iter()
         .map(|word| step_of(word).filter(|_| is_clear(word)));
-    let (at, step) = steps
-        .enumerate()
-        .filter_map(|(at, step)| Some((at, step?)))
-        .last()?;
+    let mut found = steps.enumerate().filter_map(|(at, step)| Some((at, step?)));
+    let (at, step) = found.next_back()?;
     Some((step, [&all[..at], &[""], &all[at + 1..]].concat().join("_")))
 }
 
