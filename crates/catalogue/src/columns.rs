@@ -778,14 +778,17 @@ fn unsheared_column<'f>(
         E2 => &["g2", "g_2"],
         _ => &[],
     };
-    let known = |rest: String| {
+    let known = |own: &String| {
+        let rest = unsheared(own);
         let mut names = names.iter().map(String::as_str).chain(more.iter().copied());
         let is_word = |name: &str| words(name).trim_matches('_') == rest;
-        names.any(|name| is_word(name) || in_vector(name).is_some_and(|name| is_word(&name)))
+        // `e_1` is the first component, and `e[1]` the second one.
+        match own.contains('[') {
+            true => names.any(|name| is_word(&in_vector(name).unwrap_or_default())),
+            false => names.any(|name| !name.contains('[') && is_word(name)),
+        }
     };
-    let mut all = found
-        .iter()
-        .filter(|own| !is_plain(own) && known(unsheared(own)));
+    let mut all = found.iter().filter(|own| !is_plain(own) && known(own));
     all.find_map(|own| free(own))
 }
 
@@ -1030,6 +1033,7 @@ mod tests {
         ] {
             let own = found(columns, &[]).unwrap();
             assert_eq!((own.of(Role::E1), own.of(Role::R11)), (Some(e1), response));
+            assert_ne!(own.of(Role::E2), Some(e1));
         }
         // The own component alone, in another spelling.
         let own = found("e1 e2 1p_e1 1m_e1 2p_e2 2m_e2", &[]).unwrap();
