@@ -52,8 +52,9 @@ const INDEX_TURBULENCE: [f64; 2] = [2.97, -0.18];
 const OPTICS: [[f64; 2]; 2] = [[0.28, 0.07], [0.26, -0.04]];
 // Turbulence at c = −1: S(2) = 0.32 has m = 0.004, 0.45 0.014, 0.54 0.023.
 const TURBULENCE: [[f64; 2]; 2] = [[0.315, 0.015], [0.05, -0.005]];
-// On a corner S(2) of optics without aliases is as large: Euclid VIS and Roman H158 have S(2.6)/S(2) = 0.53 and more, J129, Y106 and NISP at most 0.5.
+// c below which a PSF is on a corner. Chosen by hand.
 const MAX_CORNER: f64 = -0.5;
+// There, S(2) of optics without aliases is as large: Euclid VIS and Roman H158 have S(2.6)/S(2) = 0.53 and more, J129, Y106 and NISP at most 0.5.
 const MIN_EDGE_RATIO: f64 = 0.515;
 // Beyond that S(2), all are aliased.
 const MAX_SAMPLED: f64 = 0.4;
