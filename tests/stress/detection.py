@@ -1,6 +1,6 @@
 """A study: detection whose response to shear is known in closed form, on scenes of `shearq simulate --scenes`; not in the product.
 
-    shearq simulate --scenes 60 --side 1500 --border 60 --constant-shear 0.02,0.02 --opposite --rotated --opposite-noise --out scenes
+    shearq simulate --scenes 60 --side 1500 --border 80 --constant-shear 0.04,0.04 --opposite --rotated --opposite-noise --out scenes
     python tests/stress/detection.py scenes
 
 Every pixel is a candidate with a weight w between 0 and 1, a product of smooth steps of linear functionals v of the deconvolved
