@@ -367,9 +367,9 @@ mod tests {
                 for (at, found) in stamp.iter().enumerate() {
                     let [x, y] =
                         [at % side, at / side].map(|k| k as f64 - 0.5 * (side as f64 - 1.0));
-                    // Lanczos' kernel is exact to 10⁻³ of the peak for a Gaussian of three fine pixels, and the mask ends at 7σ.
+                    // GalSim's interpolation by the same kernel is up to 3.1·10⁻³ of the peak from this Gaussian of three fine pixels.
                     let apart = (f64::from(*found) - expected(x, y)).abs();
-                    assert!(apart < 4e-5, "{place:?} {x} {y} {apart}");
+                    assert!(apart < 1.25e-4, "{place:?} {x} {y} {apart}");
                 }
             }
         }
