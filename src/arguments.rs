@@ -29,6 +29,7 @@ use shearq_simulate::kinds::SETS;
 use shearq_simulate::set::{FixedPsf, SimulationSettings};
 use shearq_submissions::{Configuration, EllipticityType, Registry, Template};
 
+use crate::origin::of_command;
 use crate::{print, print_json, print_table, tell};
 
 // `1,2,7-9`, or `all`, which is empty: data folders have any sets, and simulations the 24 of the paper. Own code, because clap has
@@ -258,11 +259,13 @@ impl StandardInput {
             arguments: arguments.to_vec(),
             _folder: None,
         };
-        let command = arguments.get(1).and_then(|word| word.to_str());
+        let first = arguments.len() - of_command(arguments).len();
+        let command = arguments.get(first.saturating_sub(1));
+        let command = command.and_then(|word| word.to_str());
         if !command.is_some_and(|command| FROM_STANDARD_INPUT.contains(&command)) {
             return Ok(read);
         }
-        let pipes: Vec<usize> = (2..arguments.len())
+        let pipes: Vec<usize> = (first..arguments.len())
             .filter(|&at| arguments[at] == "-" || is_pipe(&arguments[at]))
             .collect();
         if pipes.is_empty() {

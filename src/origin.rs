@@ -27,13 +27,20 @@ static INVOCATION: Mutex<Option<Invocation>> = Mutex::new(None);
 /// Notes a command with its arguments, the first of which is the program's name. Returns it as a shell reads it.
 pub(crate) fn remember(arguments: &[OsString]) -> String {
     let command = command_line(arguments);
-    let inputs = arguments.iter().skip(2).map(|word| named(word));
+    let inputs = of_command(arguments).iter().map(|word| named(word));
     let invocation = Invocation {
         command: command.clone(),
         inputs: inputs.filter(|path| path.exists()).collect(),
     };
     *INVOCATION.lock().unwrap_or_else(PoisonError::into_inner) = Some(invocation);
     command
+}
+
+/// The arguments behind the command's name, before which there may be `-q` and `-v`.
+pub(crate) fn of_command(arguments: &[OsString]) -> &[OsString] {
+    let is_name = |word: &OsString| !word.to_string_lossy().starts_with('-');
+    let name = arguments.iter().skip(1).position(is_name);
+    name.map_or(&[], |name| &arguments[name + 2..])
 }
 
 // The path of `PATH`, `--option=PATH` or `PATH[TABLE]`.
