@@ -346,10 +346,11 @@ fn run_scenes(arguments: &Arguments, scenes: u32) -> anyhow::Result<()> {
     write_shears(of_versions, scenes, &arguments.out)?;
     let all = scenes as usize * simulators.len();
     tell(format_args!(
-        "{made} scenes of {:.2} arcmin² simulated, {} there already, in {}; true shears in {SHEARS}",
+        "{made} scenes of {:.2} arcmin² simulated, {} there already, in {}; true shears in {}",
         settings.area_arcmin2(),
         all - made,
-        arguments.out.display()
+        arguments.out.display(),
+        arguments.out.join(SHEARS).display()
     ));
     tell_folders(simulators.iter().map(|(_, out)| out.as_path()));
     Ok(())
