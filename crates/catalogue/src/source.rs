@@ -166,6 +166,9 @@ impl Source {
                 names.join(", ")
             ));
         }
+        if self.sheared.is_some() {
+            lines.push("Files or tables named noshear, 1p, 1m, 2p and 2m are one catalogue, whose response is the difference of their means. Try: --columns version=none if files of these names have test shears.".into());
+        }
         lines.extend(self.converted());
         if responsivity {
             let rms = match (self.columns.of(Role::RmsE), self.columns.of(Role::SigmaE)) {

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
-use crate::columns::CATALOGUES;
+use crate::columns::{CATALOGUES, Names, Role};
 use crate::recognition::{recognition, words};
 use crate::request::Input;
 use crate::truth::Truth;
@@ -88,8 +88,11 @@ fn sheared_path(path: &Path) -> Option<(usize, String)> {
 }
 
 /// The catalogues of a list, in which files such as `a_noshear.fits`, `a_1p.fits` and `a_1m.fits` are one catalogue: their mean
-/// shears are not those of galaxies. Files with different true shears stay apart.
-pub fn with_sheared_files(catalogues: Vec<Input>, truth: &Truth) -> Vec<Input> {
+/// shears are not those of galaxies. Files with different true shears stay apart, and all if `names` declines sheared catalogues.
+pub fn with_sheared_files(catalogues: Vec<Input>, truth: &Truth, names: &Names) -> Vec<Input> {
+    if names.is_given(Role::ShearedCatalogue) {
+        return catalogues;
+    }
     let of_file = |input: &Input| match input.frame.is_none() && input.parts.is_empty() {
         true => sheared_path(&input.name),
         false => None,
@@ -114,7 +117,8 @@ pub fn with_sheared_files(catalogues: Vec<Input>, truth: &Truth) -> Vec<Input> {
             repeated.insert(rest);
         }
     }
-    // A file without artificial shear and others, or all others.
+    // A file without artificial shear and others, or all others: `1p` and `1m` are also names of test shears.
+    let known = !matches!(truth, Truth::Columns);
     groups.retain(|rest, files| {
         if repeated.contains(rest) {
             return false;
@@ -122,7 +126,9 @@ pub fn with_sheared_files(catalogues: Vec<Input>, truth: &Truth) -> Vec<Input> {
         let mut shears = files.values().filter_map(|input| shear(input));
         let first = shears.next();
         let one_shear = shears.all(|own| Some(own) == first);
-        one_shear && files.len() > 1 && (files.contains_key(&0) || files.len() == CATALOGUES - 1)
+        one_shear
+            && files.len() > 1
+            && (files.contains_key(&0) || known && files.len() == CATALOGUES - 1)
     });
     let joined = |input: &Input| -> Option<Input> {
         let Some(files) = of_file(input).and_then(|(_, rest)| groups.get(&rest)) else {
@@ -178,7 +184,8 @@ mod tests {
             let inputs = names
                 .iter()
                 .map(|name| Input::from(Path::new(name).to_path_buf()));
-            let found = with_sheared_files(inputs.collect(), truth).into_iter();
+            let names = Names::default();
+            let found = with_sheared_files(inputs.collect(), truth, &names).into_iter();
             let steps = |input: Input| input.parts.into_iter().map(|(_, step)| step).collect();
             found
                 .map(|input| (input.name.display().to_string(), steps(input)))
@@ -213,6 +220,9 @@ mod tests {
             [("x/noshear/a.fits".into(), steps)]
         );
         // Catalogues of test shears.
+        let four = ["1p.csv", "1m.csv", "2p.csv", "2m.csv"];
+        assert_eq!(joined(&four, &Truth::Columns).len(), 4);
+        assert_eq!(joined(&four, &Truth::Constant([0.02, 0.0])).len(), 1);
         assert_eq!(joined(&["g_1p.csv", "g_1m.csv"], &Truth::Columns).len(), 2);
         let truth = [("s_noshear.csv", 0.0), ("s_1p.csv", 0.02)]
             .map(|(name, g)| (name.to_owned(), [g, 0.0]));

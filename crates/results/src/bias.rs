@@ -266,7 +266,7 @@ impl BiasResult {
 pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, BiasFailure> {
     distinct(&request.catalogues)?;
     let joined = Request {
-        catalogues: with_sheared_files(request.catalogues.clone(), &request.truth),
+        catalogues: with_sheared_files(request.catalogues.clone(), &request.truth, &request.names),
         ..request.clone()
     };
     let request = &joined;
