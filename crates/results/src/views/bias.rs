@@ -182,7 +182,7 @@ pub fn chosen_by_measurement(result: &BiasResult) -> Option<String> {
     };
     // docs/limitations.md, selection after measuring.
     Some(format!(
-        "m contains the effect of shear on a selection by `{all}`, which has no response here. Known sizes: −0.02 (S/N 20) to −0.1 (S/N 7) if the lowest 30 % in size are removed, −0.11 for the lowest 50 % in flux. Try: {remedy}"
+        "m contains the effect of shear on a selection by `{all}`, whose response is unknown here. Known sizes: −0.02 (S/N 20) to −0.1 (S/N 7) if the lowest 30 % in size are removed, −0.11 for the lowest 50 % in flux. Try: {remedy}"
     ))
 }
 
