@@ -294,7 +294,7 @@ fn numbers_that_are_no_ellipticities_are_named() {
         ("which no method of measuring shapes leaves", &|[a, b]| {
             [0.3 + 0.1 * a, b]
         }),
-        ("|e| above 1", &|[a, b]| [4.0 * a, 4.0 * b]),
+        ("|e| above 1", &|[a, b]| [2.5 * a, 2.5 * b]),
     ];
     for (expected, kind) in kinds {
         let mut text = String::from("e1,e2\n");

@@ -5,8 +5,8 @@ use std::hash::{BuildHasherDefault, Hasher};
 /// Hash map of keys that are numbers.
 pub type NumberMap<K, V> = std::collections::HashMap<K, V, BuildHasherDefault<NumberHasher>>;
 
-/// The hasher of rustc (FxHash) with its upper bits, which all depend on all bits of a number, where the table looks. Rust's own
-/// one also withstands keys that a stranger chooses, and took an eighth of the time of a catalogue with identifiers.
+/// A product with both halves of its digits joined, so that the lower bits, where the table looks, depend on all bits of a number.
+/// Rust's own hasher also withstands keys that a stranger chooses, and took an eighth of the time of a catalogue with identifiers.
 #[derive(Debug, Default)]
 pub struct NumberHasher(u64);
 
@@ -29,11 +29,12 @@ impl Hasher for NumberHasher {
 
     fn write_u64(&mut self, number: u64) {
         const FACTOR: u64 = 0xf135_7aea_2e62_a9c5;
-        self.0 = self.0.wrapping_add(number).wrapping_mul(FACTOR);
+        let product = u128::from(self.0.rotate_left(23) ^ number) * u128::from(FACTOR);
+        self.0 = product as u64 ^ (product >> 64) as u64;
     }
 
     fn finish(&self) -> u64 {
-        self.0.rotate_left(26)
+        self.0
     }
 }
 
