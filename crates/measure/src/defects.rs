@@ -32,9 +32,9 @@ const PAIRS: [(isize, isize); 6] = [(1, 0), (0, 1), (1, 1), (1, -1), (2, 0), (0,
 const RATIO_EXPONENT: f32 = 12.0;
 // Chosen by hand: Poisson noise of cores changes the ratio, and so do errors of the PSF.
 const RATIO_MARGIN: f32 = 1.5;
-// Peak of a PSF of sum one below which its pixels show its ratios: FWHM of 2.4 px or more of Moffat PSFs. At other phases those to opposite pixels are at most
+// Peak of a PSF of sum one below which its pixels show its ratios: FWHM of 2.8 px or more of Moffat PSFs. At other phases those to opposite pixels are at most
 // 1.25 times as large, which the margin covers; a star of FWHM 1.5 px falls eight times as steeply as its pixels show.
-const MAX_SAMPLED_PEAK: f64 = 0.12;
+const MAX_SAMPLED_PEAK: f64 = 0.07;
 // Directions d in which light falls, and their opposites.
 const DIRECTIONS: usize = 4;
 // Of Q_d, which depends on the phase more than R_d. Chosen by hand.
@@ -42,8 +42,8 @@ const STEEPNESS_MARGIN: f32 = 2.0;
 // Defects around a bright pixel by which it is one: beside a straight edge there are three, in a corner five. Chosen by hand.
 const MIN_DEFECTS_AROUND: usize = 5;
 // Of the stamp's brightest pixel, from which a pixel is dead if it is darker than all pairs around it by R_d. The middle of a ring as wide as such a
-// contrast allows has 0.7 of the light one pixel from it, behind a Gaussian PSF of FWHM 3.4 px.
-const MIN_CORE_SHARE: f32 = 0.5;
+// contrast allows has 0.65 of the light one pixel from it, behind a Gaussian PSF of FWHM 3.4 px.
+const MIN_CORE_SHARE: f32 = 0.35;
 // Of the stamp's brightest pixel. Rings and spikes of diffraction are fainter. Chosen by hand.
 const FAINT_SHARE: f32 = 0.1;
 // In units of the noise. Gaussian noise exceeds it in one of 10¹⁵ pixels.
@@ -60,8 +60,8 @@ const MAX_CHANCE: f64 = 1e-6;
 const AREA_SIDES: std::ops::RangeInclusive<usize> = 3..=15;
 // Equal neighbours that a square of 3 × 3 pixels in the last rows has at least, and a line of nine in another one.
 const MIN_EQUAL_PAIRS: u32 = 6;
-// Lower quartile of the steps at the edge of an area, in units of the brightest pixel: noise of S/N 1000 has 0.002, noise-free wings have less, also on
-// a gradient along an axis, whose steps along the other one are small.
+// Lower quartile of the changes of slope at the edge of an area, in units of the brightest pixel: noise of S/N 1000 has 0.002, noise-free wings have less, also on
+// a gradient.
 const MIN_STEP: f32 = 5e-4;
 // Each pass may uncover pixels that were hidden by those beside them: of a square of nine hot pixels first the corners.
 const MAX_PASSES: usize = 8;
@@ -364,8 +364,14 @@ impl Defects {
     fn border_sky(&mut self, stamp: &[f32], n: usize) -> StampSky {
         let values = &mut self.values;
         values.clear();
-        let border = frame(stamp, n, BORDER).flatten().copied();
-        values.extend(border.filter(|value| value.is_finite()));
+        // Without areas of one value, which may be most of it.
+        let pairs = frame(stamp, n, BORDER).flat_map(|piece| piece.windows(2));
+        let pairs = pairs.filter(|pair| pair[0] != pair[1]);
+        values.extend(pairs.map(|pair| pair[0]).filter(|value| value.is_finite()));
+        if values.is_empty() {
+            let border = frame(stamp, n, BORDER).flatten().copied();
+            values.extend(border.filter(|value| value.is_finite()));
+        }
         let level = median(values).unwrap_or(0.0);
         values
             .iter_mut()
@@ -426,9 +432,17 @@ impl Defects {
             } = &mut *self;
             values.clear();
             for &at in &*places {
-                let outside = beside(at, n).filter(|&other| !marks[other]);
-                let steps = outside.map(|other| (stamp[at] - stamp[other]).abs());
-                values.extend(steps.filter(|step| step.is_finite()));
+                for other in beside(at, n).filter(|&other| !marks[other]) {
+                    let step = stamp[at] - stamp[other];
+                    // Less the next step in that direction, so that a gradient joins.
+                    let next = 2 * other as isize - at as isize;
+                    let next = usize::try_from(next).ok().filter(|&next| {
+                        let is_beside = beside(other, n).any(|place| place == next);
+                        is_beside && !marks[next] && stamp[next].is_finite()
+                    });
+                    let further = next.map_or(0.0, |next| stamp[other] - stamp[next]);
+                    values.extend(Some((step - further).abs()).filter(|step| step.is_finite()));
+                }
             }
             let quarter = values.len() / 4;
             let is_light = !values.is_empty()
@@ -593,8 +607,12 @@ fn find_dead(
                     continue;
                 }
                 let (value, around) = (stamp[at] - sky.level, pair_means(stamp, n, at));
-                let least = around.into_iter().take(DIRECTIONS);
-                let least = least.fold(f32::INFINITY, f32::min) - sky.level;
+                let around = &around[..DIRECTIONS];
+                // At an edge, one hot pixel would make those beside it dead.
+                if around.iter().any(|mean| mean.is_nan()) {
+                    continue;
+                }
+                let least = around.iter().copied().fold(f32::INFINITY, f32::min) - sky.level;
                 // Of a sky of one electron or more, so that electrons are no fewer per unit than 1/σ.
                 let counted = (sky.noise * (sky.noise + least)).sqrt();
                 if (core..f32::INFINITY).contains(&least)

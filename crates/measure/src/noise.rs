@@ -492,14 +492,17 @@ impl NoiseSurvey {
         let full = self.plan.full;
         self.stamp.read(stamp)?;
         let padded = padding(&self.stamp.pixels, full).map(|depth| depth > 0);
+        let mut is_whole = all_finite(&self.stamp.pixels);
+        self.incomplete += usize::from(!is_whole);
+        let mut has_defects = false;
         if let Some(light) = &self.light {
             let pixels = &mut self.stamp.pixels;
-            self.defects.remove_before_survey(pixels, full, light);
+            let found = self.defects.remove_before_survey(pixels, full, light);
+            has_defects = !found.is_empty();
+            is_whole &= !has_defects;
         }
-        let is_whole = all_finite(&self.stamp.pixels);
         self.peak = self.peak.max(highest(&self.stamp.pixels));
         self.surveyed += 1;
-        self.incomplete += usize::from(!is_whole);
         if self.stamp.is_blank() {
             self.unusable += 1;
             return Ok(());
@@ -513,7 +516,8 @@ impl NoiseSurvey {
         self.stamp.subtract_sky();
         if !(is_whole || self.missing.fill(&mut self.stamp.pixels, full)) {
             self.products.truncate(products);
-            self.unusable += 1;
+            // Stamps that are filled around their galaxies show no noise, which is an error.
+            self.unusable += usize::from(!has_defects);
             return Ok(());
         }
         if let Some(levels) = &mut self.levels {
