@@ -281,6 +281,7 @@ pub(crate) fn needed_columns(
         units: units_of(units),
         drop_missing: false,
         step: 0.01,
+        placed: None,
         without_catalogue: Vec::new(),
     };
     let reading = Reading {
@@ -416,6 +417,7 @@ pub(crate) fn bias_sums(
         units: units_of(units),
         drop_missing,
         step,
+        placed: None,
         without_catalogue,
     };
     // Shards are of files of the command line; workers in Python sum catalogues of their own.

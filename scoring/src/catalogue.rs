@@ -132,7 +132,7 @@ pub struct FieldSum {
     pub e1: Array2<f64>,
     /// Σ e₂.
     pub e2: Array2<f64>,
-    /// Rows added to each cell.
+    /// Rows added to each cell, or the sum of their weights.
     pub count: Array2<f64>,
     /// Images added, blank ones included.
     pub images: usize,
@@ -156,10 +156,23 @@ impl FieldSum {
     /// # Panics
     /// If `grid` is larger than the grid of this sum.
     pub fn add_image(&mut self, grid: &Grid, rows: impl IntoIterator<Item = Row>) -> RowCounts {
+        self.add_weighted(grid, rows.into_iter().map(|row| (row, 1.0)))
+    }
+
+    /// As [`FieldSum::add_image`], of rows with weights, whose mean over the set should be 1: a galaxy that is missing has the
+    /// weight 0.
+    ///
+    /// # Panics
+    /// If `grid` is larger than the grid of this sum.
+    pub fn add_weighted(
+        &mut self,
+        grid: &Grid,
+        rows: impl IntoIterator<Item = (Row, f64)>,
+    ) -> RowCounts {
         let mut counts = RowCounts::default();
         let mut seen = Array2::from_elem((grid.n, grid.n), false);
         self.images += 1;
-        for (place, row) in rows.into_iter().enumerate() {
+        for (place, (row, weight)) in rows.into_iter().enumerate() {
             if place >= grid.cells() {
                 counts.excess += 1;
                 continue;
@@ -173,9 +186,9 @@ impl FieldSum {
                 counts.not_finite += 1;
                 continue;
             }
-            self.e1[cell] += row.e1;
-            self.e2[cell] += row.e2;
-            self.count[cell] += 1.0;
+            self.e1[cell] += weight * row.e1;
+            self.e2[cell] += weight * row.e2;
+            self.count[cell] += weight;
             counts.used += 1;
             counts.repeated += usize::from(repeated);
             let square = row.e1 * row.e1 + row.e2 * row.e2;

@@ -198,6 +198,9 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let galaxies = packing.galaxies()?;
     // A catalogue with a misspelt name would otherwise be missing from the submission without notice.
     tell_unread(catalogues.files.unread());
+    for line in catalogues.account()? {
+        tell(format_args!("note: {line}"));
+    }
     let mut bar = Bar::new("packing", galaxies);
     let files = packing.write(out, &mut bar)?;
     drop(bar);

@@ -1,17 +1,18 @@
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use anyhow::{Context, bail};
 use clap::{ArgGroup, Args};
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_scoring::{Noise, Options, SetScorer, TruthSign};
-use shearq_submissions::EllipticityType;
 
 use crate::arguments::{
     Printing, ReportFile, ScoreSettings, SetList, Threads, named, positive, sets_of,
 };
 use crate::{print_json, tell, tell_unread};
+use shearq_catalogue::columns::Shapes;
 use shearq_catalogue::foreign::Foreign;
+use shearq_catalogue::recognition::read_presets;
 use shearq_challenges::{PublicChallenge, Truth};
 use shearq_dataset::layout::DataFolder;
 use shearq_dataset::run::{Run, Source, kind_of};
@@ -21,7 +22,7 @@ use shearq_files::atomic::folder_of;
 use shearq_render::table::TableFormat;
 use shearq_results::aperture;
 use shearq_results::baseline::catalogues::{ScoredUnits, Units};
-use shearq_results::catalogues::{COLUMNS, Catalogues};
+use shearq_results::catalogues::Catalogues;
 use shearq_results::record::{RunRecord, SetRecord};
 use shearq_results::score::{ScoredSet, score_catalogues, score_files, unscored};
 use shearq_results::store;
@@ -76,13 +77,16 @@ pub(crate) struct Arguments {
     /// Side of the field in degrees, for --truth [default: 10].
     #[arg(long, value_name = "DEG", requires = "truth", conflicts_with_all = NOT_PLAIN)]
     field: Option<f64>,
-    /// Names of the catalogues' columns, or their numbers if they have no names, such as 2,3,4,5; for --truth [default:
-    /// x,y,e1,e2].
-    #[arg(long, value_name = "X,Y,E1,E2", value_delimiter = ',', num_args = 1, requires = "truth", conflicts_with_all = NOT_PLAIN)]
-    columns: Option<Vec<String>>,
-    /// Type of the ellipticities, for --truth [default: shear].
-    #[arg(long, value_name = "TYPE", value_parser = named::<EllipticityType>(), requires = "truth", conflicts_with_all = NOT_PLAIN)]
-    ellipticity: Option<EllipticityType>,
+    /// Columns of the catalogues, for --truth: by role as in `bias`, such as `e1=g_1,e2=g_2,w=none`, or x, y, e1 and e2 in this
+    /// order; by number if they have no names, such as 2,3,4,5 [default: recognised; without names x,y,e1,e2].
+    #[arg(long, value_name = "ROLE=COLUMN|X,Y,E1,E2", value_delimiter = ',', num_args = 1, requires = "truth", conflicts_with_all = NOT_PLAIN)]
+    columns: Vec<String>,
+    /// Also recognise the surveys that this file describes, as in `bias`; for --truth.
+    #[arg(long, value_name = "FILE", requires = "truth", conflicts_with_all = NOT_PLAIN)]
+    preset: Vec<PathBuf>,
+    /// Type of the ellipticities, for --truth [default: by their columns, as in `bias`].
+    #[arg(long, value_name = "TYPE", value_parser = named::<Shapes>(), requires = "truth", conflicts_with_all = NOT_PLAIN)]
+    ellipticity: Option<Shapes>,
     /// Value of e1 or e2 that marks a galaxy as not measured, such as -99; for --truth.
     #[arg(long, value_name = "VALUE", allow_hyphen_values = true, requires = "truth", conflicts_with_all = NOT_PLAIN)]
     missing: Option<f64>,
@@ -127,7 +131,7 @@ pub(crate) struct Arguments {
 const NOT_PLAIN: [&str; 6] = ["data", "measured", "foreign", "packed", "sets", "store"];
 
 // Options without a meaning for submissions to other challenges.
-const GREAT10_ONLY: [&str; 19] = [
+const GREAT10_ONLY: [&str; 20] = [
     "data",
     "measured",
     "foreign",
@@ -138,6 +142,7 @@ const GREAT10_ONLY: [&str; 19] = [
     "stamp",
     "field",
     "columns",
+    "preset",
     "ellipticity",
     "missing",
     "drop_missing",
@@ -215,8 +220,15 @@ pub(super) fn units(arguments: &Arguments) -> anyhow::Result<(Units, Vec<PathBuf
             .map(|own| ScoredUnits::new(own, &truth(own.record.set)));
         Ok(Units::Score(units.collect::<Result<_, _>>()?))
     };
+    let account = |catalogues: &Catalogues| -> anyhow::Result<()> {
+        for line in catalogues.account()? {
+            tell(format_args!("note: {line}"));
+        }
+        Ok(())
+    };
     if let Some(truth) = &arguments.truth {
-        let (_, _, scored) = scored_files(arguments, truth, options)?;
+        let (catalogues, _, scored) = scored_files(arguments, truth, options)?;
+        account(&catalogues)?;
         return Ok((
             of(&scored, &|_| truth.clone())?,
             arguments.catalogues.clone(),
@@ -227,6 +239,7 @@ pub(super) fn units(arguments: &Arguments) -> anyhow::Result<(Units, Vec<PathBuf
         bail!("score: a baseline is of catalogues (found power spectra)");
     };
     let (scored, _) = scored_catalogues(arguments, &catalogues, &data, options)?;
+    account(&catalogues)?;
     let of_set = |own: &ScoredSet| catalogues.files.of_set(own.record.set);
     // Files of an archive are in a temporary folder.
     let files = match &arguments.packed {
@@ -294,8 +307,10 @@ fn scored_catalogues(
     let scored = score_catalogues(data, catalogues, sets, options, arguments.threads.number());
     let scored = match &catalogues.description {
         // The cause of an error in a catalogue may be its description, so the message names both.
-        Some(_) => scored.with_context(|| catalogues.path.display().to_string())?,
-        None => scored?,
+        Some(own) if !own.name.is_empty() => {
+            scored.with_context(|| catalogues.path.display().to_string())?
+        }
+        _ => scored?,
     };
     Ok((scored, options))
 }
@@ -326,6 +341,7 @@ fn catalogues(
     }
     let title = format!("Scores of {name}");
     let mut table = per_set(&scored, &title, options.definition);
+    table.notes.extend(catalogues.account()?);
     table.notes.extend(unscored(&data, &scored, sets)?);
     table.notes.extend(verdict_line(name, &scored));
     if let Some(store) = store {
@@ -432,27 +448,49 @@ fn packed_spectra(
     write_record(store, run, &Source::folder(data, folder_of(&path))?, data)
 }
 
+// What the user states of plain files.
+fn described(arguments: &Arguments) -> anyhow::Result<Option<Foreign>> {
+    let mut columns = BTreeMap::new();
+    let by_role = arguments.columns.iter().any(|own| own.contains('='));
+    if by_role {
+        for text in &arguments.columns {
+            let (role, column) = text
+                .split_once('=')
+                .with_context(|| format!("--columns: found `{text}`, expected ROLE=COLUMN"))?;
+            anyhow::ensure!(
+                columns.insert(role.to_owned(), column.to_owned()).is_none(),
+                "--columns: {role} is given twice"
+            );
+        }
+    } else if !arguments.columns.is_empty() {
+        anyhow::ensure!(
+            arguments.columns.len() == 4,
+            "--columns: wrong number of columns (found {}, expected 4: x, y, e1 and e2)",
+            arguments.columns.len()
+        );
+        let roles = ["x", "y", "e1", "e2"].map(str::to_owned);
+        columns.extend(roles.into_iter().zip(arguments.columns.iter().cloned()));
+    }
+    let mut presets = Vec::new();
+    for path in &arguments.preset {
+        presets.extend(read_presets(path)?);
+    }
+    let mut stated = Foreign::default();
+    stated.ellipticity = arguments.ellipticity;
+    stated.columns = columns;
+    stated.missing = arguments.missing;
+    stated.drop_missing = arguments.drop_missing;
+    stated.max_modulus = arguments.max_modulus;
+    stated.presets = presets;
+    Ok((stated != Foreign::default()).then_some(stated))
+}
+
 // Plain files of one set, and how they are read.
 fn scored_files(
     arguments: &Arguments,
     truth: &Path,
     options: Options,
 ) -> anyhow::Result<(Catalogues, Reading, [ScoredSet; 1])> {
-    let columns: Vec<&str> = match &arguments.columns {
-        Some(given) => given.iter().map(String::as_str).collect(),
-        None => COLUMNS.to_vec(),
-    };
-    let columns: [&str; 4] = columns.as_slice().try_into().map_err(|_| {
-        anyhow::anyhow!(
-            "--columns: wrong number of columns (found {}, expected 4: x, y, e1 and e2)",
-            columns.len()
-        )
-    })?;
-    let ellipticity = arguments.ellipticity.unwrap_or(EllipticityType::Shear);
-    let mut described = Foreign::of_columns(columns, ellipticity);
-    described.missing = arguments.missing;
-    described.drop_missing = arguments.drop_missing;
-    described.max_modulus = arguments.max_modulus;
     // A file that is given twice would count as two images without noise between them.
     let mut seen = BTreeSet::new();
     for path in &arguments.catalogues {
@@ -464,7 +502,7 @@ fn scored_files(
             path.display()
         );
     }
-    let catalogues = Catalogues::plain(&arguments.catalogues, described);
+    let catalogues = Catalogues::plain(&arguments.catalogues, described(arguments)?)?;
     let reading = Reading {
         // The field and the stamps of GREAT10.
         field: Degrees(arguments.field.unwrap_or(10.0)),
@@ -491,6 +529,8 @@ fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Resul
     }
     let title = format!("Scores against {}", truth.display());
     let mut table = per_set(&scored, &title, options.definition);
+    let account = catalogues.account()?;
+    table.notes.extend(account.iter().cloned());
     table.notes.extend(verdict_line("The catalogues", &scored));
     // The JSON of plain files has the keys of the public scoring cases of GREAT10, so that both can be compared.
     if arguments.printing.format() == TableFormat::Json {
@@ -506,6 +546,7 @@ fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Resul
                 .map_or_else(|| name(truth), |n| n.to_string_lossy().into_owned()),
             truth: name(truth),
             catalogues: arguments.catalogues.iter().map(|path| name(path)).collect(),
+            columns: account,
             definition: options.definition,
         };
         print_json(one_set_json(&scored[0], &input))?;

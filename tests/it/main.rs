@@ -29,6 +29,7 @@ mod ledger;
 mod one_session;
 mod orientation;
 mod packed;
+mod recognised;
 mod reference;
 mod reproduced;
 mod scenes;

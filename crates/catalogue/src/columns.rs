@@ -12,11 +12,13 @@ use crate::shapes::refuse_divided;
 use crate::steps::{sheared_column, sheared_name, unsheared};
 
 /// How ellipticities become shears.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Shapes {
     /// They are shears (1 − q)/(1 + q), or of any type and divided by their response.
     Shear,
     /// Distortions (1 − q²)/(1 + q²), each converted to a shear. Moduli above 1 have none and are left out.
+    #[serde(rename = "distortion")]
     Converted,
     /// Distortions, whose mean is divided by 2ℛ. ℛ = 1 − ⟨w e_rms²⟩/⟨w⟩ with the standard deviation e_rms of a component
     /// (Bernstein & Jarvis 2002, equation 5.33; Mandelbaum et al. 2018, equation 10).
@@ -446,15 +448,12 @@ pub enum Preset {
     Anacal,
 }
 
-// A column that no other program writes: the energy of the network.
-const OWN_COLUMN: &str = "first_energy";
-
 impl Preset {
-    fn of_columns(columns: &BTreeMap<Key, String>, is_hsm: bool, found: &[String]) -> Self {
+    fn of_columns(columns: &BTreeMap<Key, String>, is_hsm: bool, is_own: bool) -> Self {
         let have = |key| columns.contains_key(&key);
         if have((Role::ShearedCatalogue, 0)) {
             Preset::Metadetect
-        } else if have((Role::R11, 0)) && found.iter().any(|name| name == OWN_COLUMN) {
+        } else if have((Role::R11, 0)) && is_own {
             Preset::Shearq
         } else if have((Role::E1, 1)) && have((Role::E2, 3)) {
             Preset::Metacal
@@ -502,8 +501,13 @@ pub struct Columns {
 }
 
 impl Columns {
-    /// Finds the columns of the catalogue `path`, which has the columns `found`.
-    pub fn find(path: &Path, found: &[String], names: &Names) -> Result<Self, FileError> {
+    /// Finds the columns of the catalogue `path`, which has the columns `found`; `is_own` if shearq wrote it.
+    pub fn find(
+        path: &Path,
+        found: &[String],
+        names: &Names,
+        is_own: bool,
+    ) -> Result<Self, FileError> {
         names.check_single_roles(path)?;
         let mut surveys = names.presets.iter().chain(&recognition().surveys);
         let survey = surveys.find(|survey| survey.is_of(found, names));
@@ -575,7 +579,7 @@ impl Columns {
         check_partners(path, &columns, found)?;
         let distortion = recognition().ellipticity.distortion.contains(&e1)
             || survey.is_some_and(|survey| survey.ellipticity == EllipticityType::Distortion);
-        let preset = Preset::of_columns(&columns, distortion || e1 == "corrected_g1", found);
+        let preset = Preset::of_columns(&columns, distortion || e1 == "corrected_g1", is_own);
         if preset == Preset::Shearq {
             refuse_divided(path, found)?;
         }
@@ -608,7 +612,8 @@ impl Columns {
                 .chain(&self.flags)
                 .any(|own| own == name)
         };
-        let unused: Vec<&String> = found.iter().filter(|name| !taken(name)).collect();
+        let unused = found.iter().filter(|name| !name.is_empty() && !taken(name));
+        let unused: Vec<&String> = unused.collect();
         let all = |wanted: &dyn Fn(&str) -> bool| -> Vec<String> {
             let unused = unused.iter().filter(|name| wanted(name));
             unused.map(|name| (*name).clone()).collect()
@@ -952,7 +957,9 @@ mod tests {
         for text in given {
             names.add(text).map_err(|error| error.to_string())?;
         }
-        Columns::find(Path::new("c.fits"), &columns, &names).map_err(|error| error.to_string())
+        let is_own = columns.iter().any(|name| name == "first_energy");
+        let found = Columns::find(Path::new("c.fits"), &columns, &names, is_own);
+        found.map_err(|error| error.to_string())
     }
 
     #[test]
@@ -1178,10 +1185,10 @@ mod tests {
         let mut names = Names::default();
         names.add_presets(crate::recognition::read_presets(&path).unwrap());
         let columns = ["e1", "e2", "w", "wl", "R22"].map(str::to_owned);
-        let found = Columns::find(Path::new("c"), &columns, &names);
+        let found = Columns::find(Path::new("c"), &columns, &names, false);
         // R22 has no partner, because the survey has no R11.
         assert!(found.unwrap_err().to_string().contains("none for R11"));
-        let found = Columns::find(Path::new("c"), &columns[..4], &names).unwrap();
+        let found = Columns::find(Path::new("c"), &columns[..4], &names, false).unwrap();
         assert_eq!(
             (found.program(), found.of(Role::Weight)),
             ("Own", Some("wl"))

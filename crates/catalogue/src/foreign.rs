@@ -1,31 +1,38 @@
 //! Catalogues of other programs, described by a TOML file.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Deserializer, Serialize};
-use shearq_quantities::{Distortion, MeasuredRange, Shear};
-use shearq_scoring::{Grid, Row, RowCounts, RowFault};
+use shearq_quantities::Shear;
+use shearq_scoring::{Grid, RowCounts, RowFault};
 use shearq_submissions::{EllipticityType, checked_name};
 
 use shearq_dataset::images::{self, Files};
 use shearq_dataset::layout::{IMAGE_PLACEHOLDERS, check_pattern};
 use shearq_files::FileError;
 use shearq_files::atomic::folder_of;
-use shearq_files::table::{self, Place};
+use shearq_files::table::Place;
 
-/// How to read another program's catalogues.
+use crate::columns::{Names, Shapes};
+use crate::galaxies::{Galaxies, Galaxy};
+use crate::recognition::Survey;
+use crate::request::{Placed, Request};
+
+/// How to read another program's catalogues. Columns that are not named are recognised.
 ///
 /// ```toml
 /// name = "REGAUSS"
 /// catalogues = "set{set:02}/hsm-regauss-{image:03}.csv"   # relative to this file, or absolute
-/// ellipticity = "distortion"      # type of the columns: "distortion" or "shear"
+/// ellipticity = "distortion"      # type of the columns: "distortion", "responsivity" or "shear" [default: by their names]
 /// report = "shear"                # type to score [default: shear]
 /// table = "OBJECTS"               # FITS table, by name or number [default: the one with these columns]
-/// x = "x"                         # names of the columns [defaults: x, y, e1, e2, no flag]
+/// x = "x"                         # names of the columns [default: recognised]
 /// y = "y"
 /// e1 = "e1"
 /// e2 = "e2"
 /// flag = "flag"                   # rows with another value than 0 have no ellipticity
+/// columns = { w = "weight", R11 = "none" }   # other roles of `bias --columns`; "none" for a column that is not to be used
 /// missing = -99                   # rows with this value in e1 or e2 have none [default: no such value]
 /// drop_missing = true             # rows with a number that no measurement gives, such as -99, have none [default: refused]
 /// max_modulus = 1.0               # rows with a larger |e| (as reported) have none [default: no limit]
@@ -39,7 +46,9 @@ pub struct Foreign {
     #[serde(deserialize_with = "checked_name")]
     pub name: String,
     catalogues: String,
-    ellipticity: EllipticityType,
+    /// How ellipticities become shears; by the names of the columns if it is not stated.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub ellipticity: Option<Shapes>,
     #[serde(default = "shear")]
     report: EllipticityType,
     #[serde(
@@ -48,15 +57,18 @@ pub struct Foreign {
         skip_serializing_if = "Option::is_none"
     )]
     table: Option<String>,
-    #[serde(default = "x")]
-    x: String,
-    #[serde(default = "y")]
-    y: String,
-    #[serde(default = "e1")]
-    e1: String,
-    #[serde(default = "e2")]
-    e2: String,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    x: Option<String>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    y: Option<String>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    e1: Option<String>,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    e2: Option<String>,
     flag: Option<String>,
+    /// Columns of other roles.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub columns: BTreeMap<String, String>,
     /// A value of e1 or e2 of galaxies that were not measured.
     pub missing: Option<f64>,
     /// Whether numbers that stand for a failed measurement count as not measured.
@@ -69,6 +81,9 @@ pub struct Foreign {
     position_offset: f64,
     #[serde(default = "one")]
     e2_sign: i8,
+    /// Surveys that are recognised, too.
+    #[serde(skip)]
+    pub presets: Vec<Survey>,
     #[serde(skip)]
     folder: PathBuf,
 }
@@ -91,46 +106,42 @@ fn name_or_number<'de, D: Deserializer<'de>>(value: D) -> Result<Option<String>,
 fn shear() -> EllipticityType {
     EllipticityType::Shear
 }
-fn x() -> String {
-    "x".into()
-}
-fn y() -> String {
-    "y".into()
-}
-fn e1() -> String {
-    "e1".into()
-}
-fn e2() -> String {
-    "e2".into()
-}
 fn one() -> i8 {
     1
 }
 
-impl Foreign {
-    /// The description of plain files with the columns x, y, e1 and e2 of these names.
-    pub fn of_columns(columns: [&str; 4], ellipticity: EllipticityType) -> Self {
-        let [x, y, e1, e2] = columns.map(str::to_owned);
+/// What names the columns of plain files.
+pub const HINT_OF_COLUMNS: &str = "`score --columns` (names, or numbers such as 2,3,4,5) or a description (--foreign) names others";
+// Columns of a text without names.
+const UNNAMED: [&str; 4] = ["x", "y", "e1", "e2"];
+
+impl Default for Foreign {
+    /// Plain files, whose columns are recognised.
+    fn default() -> Self {
         Foreign {
             name: String::new(),
             catalogues: String::new(),
-            ellipticity,
-            report: EllipticityType::Shear,
+            ellipticity: None,
+            report: shear(),
             table: None,
-            x,
-            y,
-            e1,
-            e2,
+            x: None,
+            y: None,
+            e1: None,
+            e2: None,
             flag: None,
+            columns: BTreeMap::new(),
             missing: None,
             drop_missing: false,
             max_modulus: None,
             position_offset: 0.0,
-            e2_sign: 1,
+            e2_sign: one(),
+            presets: Vec::new(),
             folder: PathBuf::new(),
         }
     }
+}
 
+impl Foreign {
     /// Reads a description, and returns its text too.
     pub fn read(path: &Path) -> Result<(Self, String), FileError> {
         let text = shearq_files::open::read_to_string(path, shearq_files::open::SETTINGS).map_err(
@@ -147,6 +158,15 @@ impl Foreign {
             let message = format!("`max_modulus` is {most}; expected a positive number");
             return Err(FileError::new(path, message));
         }
+        if foreign.report == EllipticityType::Distortion
+            && foreign
+                .ellipticity
+                .is_none_or(|own| own == Shapes::Responsivity)
+        {
+            let message = "`report` is \"distortion\", which needs the type of each ellipticity. Try: `ellipticity` = \"distortion\" or \"shear\"";
+            return Err(FileError::new(path, message));
+        }
+        foreign.request(path)?;
         check_pattern("catalogues", &foreign.catalogues, &[IMAGE_PLACEHOLDERS])
             .map_err(|message| FileError::new(path, message))?;
         foreign.folder = folder_of(path).to_owned();
@@ -163,70 +183,98 @@ impl Foreign {
         images::find(&self.folder, &self.catalogues, &[""], sets)
     }
 
-    /// The rows of one image, at most `most`, converted to standard signs and the reported type.
-    /// Flagged rows and distortions above 1 have no ellipticity.
-    pub fn rows(&self, path: &Path, most: usize) -> Result<Vec<Row>, FileError> {
-        let mut names = vec![
-            self.x.as_str(),
-            self.y.as_str(),
-            self.e1.as_str(),
-            self.e2.as_str(),
+    fn request(&self, path: &Path) -> Result<Request, FileError> {
+        let keys = [
+            ("x", &self.x),
+            ("y", &self.y),
+            ("e1", &self.e1),
+            ("e2", &self.e2),
+            ("flag", &self.flag),
         ];
-        names.extend(self.flag.as_deref());
+        let keys = keys
+            .iter()
+            .filter_map(|(role, column)| Some((*role, column.as_deref()?)));
+        let others = self.columns.iter();
+        let others = others.map(|(role, column)| (role.as_str(), column.as_str()));
+        let mut names = Names::default();
+        names.add_presets(self.presets.clone());
+        for (role, column) in keys.chain(others) {
+            names
+                .add(&format!("{role}={column}"))
+                .map_err(|error| FileError::new(path, error))?;
+        }
+        let shapes = match (self.ellipticity, self.report) {
+            // Distortions stay ones.
+            (Some(Shapes::Converted), EllipticityType::Distortion) => Some(Shapes::Shear),
+            (shapes, _) => shapes,
+        };
+        Ok(Request {
+            names,
+            shapes,
+            drop_missing: self.drop_missing,
+            placed: Some(Placed {
+                missing: self.missing,
+                max_modulus: self.max_modulus,
+            }),
+            ..Request::default()
+        })
+    }
+
+    /// Finds the columns of a catalogue, of which at most `most` rows are read.
+    pub fn open(&self, path: &Path, most: usize) -> Result<Galaxies, FileError> {
         let place = Place::with_table(path, self.table.as_deref())?;
-        let table = table::read_from(&place, Some(&names), most).map_err(|error| {
-            let hint = match self.catalogues.is_empty() {
-                true => "`score --columns` (names, or numbers such as 2,3,4,5) or a description (--foreign) names others",
-                false => "the description of the catalogues specifies the names",
+        let mut name = place.path.into_os_string();
+        if let Some(table) = place.table {
+            name.push(format!("[{table}]"));
+        }
+        let request = self.request(path)?;
+        let given = |role: &str| {
+            let key = match role {
+                "x" => &self.x,
+                "y" => &self.y,
+                "e1" => &self.e1,
+                _ => &self.e2,
             };
-            error.hint_of_columns(hint)
-        })?;
-        let column = |name: &str| table::numbers(&table, name, path);
-        let flags = self.flag.as_deref().map(column).transpose()?;
-        let (x, y) = (column(&self.x)?, column(&self.y)?);
-        let (e1, e2) = (column(&self.e1)?, column(&self.e2)?);
-        let row = |k: usize| {
-            let flagged = flags.as_ref().is_some_and(|flags| flags[k] != 0.0);
-            let (e1, e2) = match flagged {
-                true => (f64::NAN, f64::NAN),
-                false => (e1[k], e2[k]),
-            };
-            let (x, y) = (x[k] + self.position_offset, y[k] + self.position_offset);
-            let [e1, e2] = self.screened(e1, e2).unwrap_or([f64::NAN; 2]);
-            // After the screen, which compares with the values in the file. Conversions do not change the orientation.
-            let e2 = f64::from(self.e2_sign) * e2;
-            Row { x, y, e1, e2 }
+            key.as_ref().or_else(|| self.columns.get(role))
         };
-        Ok((0..x.len()).map(row).collect())
-    }
-
-    // The converted ellipticity; `None` if the galaxy was not measured.
-    fn screened(&self, e1: f64, e2: f64) -> Option<[f64; 2]> {
-        use EllipticityType::{Distortion as Chi, Shear as Epsilon};
-        let failed = is_failure(e1, e2);
-        let missing = self.missing.is_some_and(|m| e1 == m || e2 == m);
-        let e = match (self.ellipticity, self.report) {
-            _ if missing || failed && self.drop_missing => return None,
-            // No shear belongs to such a number, but only a request makes it missing: the sum refuses it.
-            _ if failed => [e1, e2],
-            (Chi, Epsilon) => Distortion::new(e1, e2).to_shear().map(|e| [e.e1, e.e2])?,
-            (Epsilon, Chi) => {
-                let e = Shear::new(e1, e2).to_distortion();
-                [e.e1, e.e2]
+        let unnamed = UNNAMED.map(|role| given(role).map_or(role, String::as_str));
+        let found = Galaxies::open(PathBuf::from(name).into(), &request, unnamed, most);
+        found.map_err(|error| match self.catalogues.is_empty() {
+            true => error.hint_of_columns(HINT_OF_COLUMNS),
+            false => {
+                let mut error =
+                    error.hint_of_columns("the description of the catalogues specifies the names");
+                error.message = error
+                    .message
+                    .replace("--columns ", "`columns` of the description, ");
+                error
             }
-            _ => [e1, e2],
-        };
-        let most = self.max_modulus;
-        most.is_none_or(|most| e[0].hypot(e[1]) <= most)
-            .then_some(e)
+        })
     }
-}
 
-// Whether one component stands for a failed measurement.
-fn is_failure(e1: f64, e2: f64) -> bool {
-    // HSM's −10 in one row of a hundred gave c = −0.096, and 1e30 gave m = 3.5e12, both without a message.
-    let range = MeasuredRange::ELLIPTICITY;
-    range.excludes(e1) || range.excludes(e2)
+    /// The rows of one image, at most `most`, converted to standard signs and the reported type, with their weights. Rows that
+    /// do not count have no ellipticity.
+    pub fn rows(&self, galaxies: &Galaxies, most: usize) -> Result<Vec<Galaxy>, FileError> {
+        let mut all = galaxies.read(most)?;
+        for (row, _) in &mut all {
+            row.x += self.position_offset;
+            row.y += self.position_offset;
+            if (self.ellipticity, self.report) == (Some(Shapes::Shear), EllipticityType::Distortion)
+            {
+                let e = Shear::new(row.e1, row.e2).to_distortion();
+                (row.e1, row.e2) = (e.e1, e.e2);
+            }
+            // Conversions do not change the orientation.
+            row.e2 *= f64::from(self.e2_sign);
+            if self
+                .max_modulus
+                .is_some_and(|most| row.e1.hypot(row.e2) > most)
+            {
+                (row.e1, row.e2) = (f64::NAN, f64::NAN);
+            }
+        }
+        Ok(all)
+    }
 }
 
 /// What to do about numbers that stand for a failed measurement, on the command line.
@@ -273,7 +321,7 @@ mod tests {
     use super::*;
 
     // The rows of a catalogue with the columns a, b, u, v and bad, described by more keys.
-    fn rows(keys: &str, lines: &str) -> Vec<Row> {
+    fn rows(keys: &str, lines: &str) -> Result<Vec<Galaxy>, FileError> {
         let folder = tempfile::tempdir().unwrap();
         let (toml, csv) = (folder.path().join("f.toml"), folder.path().join("1-1.csv"));
         let names = "x = \"a\"\ny = \"b\"\ne1 = \"u\"\ne2 = \"v\"\nflag = \"bad\"";
@@ -282,39 +330,35 @@ mod tests {
         std::fs::write(&csv, format!("a,b,u,v,bad\n{lines}")).unwrap();
         let foreign = Foreign::read(&toml).unwrap().0;
         assert_eq!(foreign.catalogues(&[]).unwrap().of_set(1).len(), 1);
-        foreign.rows(&csv, 100).unwrap()
+        foreign.rows(&foreign.open(&csv, 100)?, 100)
     }
 
     #[test]
     fn flagged_missing_and_large_ellipticities_are_not_measured() {
         let keys = "ellipticity = \"shear\"\nmissing = -99\nmax_modulus = 0.5";
-        let lines = "1,1,0.1,0.2,0\n1,1,0.1,0.2,4\n1,1,-99,0.2,0\n1,1,0.4,0.4,0\n";
-        let measured: Vec<bool> = rows(keys, lines).iter().map(|r| r.e1.is_finite()).collect();
-        assert_eq!(measured, [true, false, false, false]);
-        let failed = |keys| rows(keys, "1,1,-10,0.2,0\n")[0].e1;
-        assert_eq!(failed("ellipticity = \"shear\""), -10.0);
-        assert!(failed("ellipticity = \"shear\"\ndrop_missing = true").is_nan());
-        let reported = rows(
-            "ellipticity = \"shear\"\nreport = \"distortion\"",
-            "1,1,0.2,0,0\n",
-        );
-        assert!((reported[0].e1 - 0.4 / 1.04).abs() < 1e-15);
-        let described = Foreign {
-            missing: Some(-99.0),
-            max_modulus: Some(0.5),
-            ..Foreign::of_columns(["a", "b", "u", "v"], EllipticityType::Distortion)
+        let lines = "1,1,0.1,0.2,0\n1,1,0.1,0.2,4\n1,1,-99,0.2,0\n1,1,0.4,0.4,0\n1,1,,0.2,0\n";
+        let measured = rows(keys, lines).unwrap();
+        let measured: Vec<bool> = measured.iter().map(|own| own.0.e1.is_finite()).collect();
+        assert_eq!(measured, [true, false, false, false, false]);
+        let converted = |keys: &str, e1: f64| {
+            let rows = rows(keys, &format!("1,1,{e1},0,0\n"));
+            rows.map(|rows| rows[0].0.e1)
         };
-        let apply = |e1| described.screened(e1, 0.0).map(|e| e[0]);
-        assert!((apply(0.6).unwrap() - 1.0 / 3.0).abs() < 1e-15);
-        // A distortion of 0.9 is a shear of 0.63.
-        assert_eq!([-99.0, 0.9].map(apply), [None; 2]);
-        // No shear belongs to −10, but only a request makes it missing.
-        for drop_missing in [false, true] {
-            let described = Foreign {
-                drop_missing,
-                ..Foreign::of_columns(["a", "b", "u", "v"], EllipticityType::Distortion)
-            };
-            assert_eq!(described.screened(-10.0, 0.0).is_none(), drop_missing);
+        let reported = converted("ellipticity = \"shear\"\nreport = \"distortion\"", 0.2);
+        assert!((reported.unwrap() - 0.4 / 1.04).abs() < 1e-15);
+        let distortion = "ellipticity = \"distortion\"";
+        assert!((converted(distortion, 0.6).unwrap() - 1.0 / 3.0).abs() < 1e-15);
+        let kept = format!("{distortion}\nreport = \"distortion\"");
+        assert_eq!(converted(&kept, 0.6).unwrap(), 0.6);
+        // A distortion of 0.9 is a shear of 0.63, and no shear belongs to 1.2.
+        let limited = format!("{distortion}\nmax_modulus = 0.5");
+        assert!(converted(&limited, 0.9).unwrap().is_nan());
+        assert!(converted(distortion, 1.2).unwrap().is_nan());
+        // Only a request makes a failed measurement missing.
+        for keys in [distortion, "ellipticity = \"shear\""] {
+            assert!(converted(keys, -10.0).is_err());
+            let dropped = format!("{keys}\ndrop_missing = true");
+            assert!(converted(&dropped, -10.0).unwrap().is_nan());
         }
     }
 }

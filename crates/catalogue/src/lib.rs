@@ -5,7 +5,8 @@
 //! * [`request`] is what to read of which catalogues; [`source`] the tables of a catalogue with the columns that are read,
 //!   and [`rows`] gives their rows. [`failures`] are numbers and rows that stand for failed measurements.
 //! * [`truth`] is the true shear of catalogues or galaxies, and [`identity`] what names a galaxy.
-//! * [`foreign`] reads catalogues that a description states, and [`shapes`] catalogues by shearq.
+//! * [`galaxies`] are rows with positions on a grid, which are scored, with their calibration; [`foreign`] is a description of many
+//!   such catalogues.  [`shapes`] catalogues by shearq.
 //! * [`select`] applies cuts and weights; [`expression`] is the language of formulas and conditions of columns.
 //! * [`star_noise`] is what catalogues state of the noise of their stars.
 #![forbid(unsafe_code)]
@@ -14,6 +15,7 @@ pub mod columns;
 pub mod expression;
 pub mod failures;
 pub mod foreign;
+pub mod galaxies;
 pub mod identity;
 pub mod recognition;
 pub mod request;

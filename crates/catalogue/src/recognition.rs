@@ -63,7 +63,7 @@ pub struct Patterns {
 }
 
 /// A public catalogue or a program's output, whose columns are known by its documentation.
-#[derive(Debug, Clone, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Survey {
     pub name: String,

@@ -76,6 +76,15 @@ impl From<PathBuf> for Input {
     }
 }
 
+/// Galaxies on a grid, of which each has a row: NaN is an ellipticity that was not measured.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Placed {
+    /// A value of e1 or e2 that also is none.
+    pub missing: Option<f64>,
+    /// Ellipticities above it, and above 1, are none either.
+    pub max_modulus: Option<f64>,
+}
+
 #[derive(Debug, Clone)]
 pub struct Request {
     pub catalogues: Vec<Input>,
@@ -97,6 +106,8 @@ pub struct Request {
     pub drop_missing: bool,
     /// Artificial shear of metacalibration.
     pub step: f64,
+    /// Whether they are galaxies on a grid, whose positions are read.
+    pub placed: Option<Placed>,
     /// Remarks about images of the data that have no catalogue.
     pub without_catalogue: Vec<String>,
 }
@@ -106,19 +117,31 @@ impl Request {
     pub fn new(found: Expanded) -> Self {
         Request {
             catalogues: found.catalogues,
-            names: Names::default(),
             truth: found.truth,
+            without_catalogue: found.without_catalogue,
+            ..Request::default()
+        }
+    }
+}
+
+impl Default for Request {
+    fn default() -> Self {
+        Request {
+            catalogues: Vec::new(),
+            names: Names::default(),
+            truth: Truth::default(),
             shapes: None,
-            sign: TrueSign::Convention,
+            sign: TrueSign::default(),
             bins: Vec::new(),
             like: None,
             selection: None,
             design: None,
-            units: Units::Recognised,
+            units: Units::default(),
             paired: false,
             drop_missing: false,
             step: DEFAULT_STEP,
-            without_catalogue: found.without_catalogue,
+            placed: None,
+            without_catalogue: Vec::new(),
         }
     }
 }

@@ -22,7 +22,7 @@ use crate::star_noise;
 
 use crate::columns::{CATALOGUES, RESPONSES, Role, Shapes, counted_value, sheared_pair};
 use crate::identity;
-use crate::request::{Input, MAX_AXES};
+use crate::request::{Input, MAX_AXES, Placed};
 use crate::source::{Reading, Source};
 use crate::steps::catalogue_named;
 use crate::truth::{OfRows, check};
@@ -99,6 +99,18 @@ pub fn rows(
     sources: &[Source],
     mut take: impl FnMut(&SummedRow),
 ) -> Result<Catalogue, FileError> {
+    placed_rows(path, reading, sources, |_, row| {
+        row.into_iter().for_each(&mut take);
+    })
+}
+
+/// As [`rows`], also with the rows without sheared ones that do not count, and the position of each if it is read.
+pub fn placed_rows(
+    path: &Path,
+    reading: &Reading<'_>,
+    sources: &[Source],
+    mut take: impl FnMut([f64; 2], Option<&SummedRow>),
+) -> Result<Catalogue, FileError> {
     let mut summary = Catalogue {
         name: path.display().to_string(),
         ..Catalogue::default()
@@ -111,7 +123,7 @@ pub fn rows(
         // Only in catalogues by shearq: other programs may use the same key for another quantity.
         summary.star = match (&first.frame, FileFormat::of(path)) {
             (Some(frame), _) => star_noise::of_table(frame, path),
-            (None, Some(format)) => star_noise::of_any(path, format)?,
+            (None, Some(format)) => star_noise::of_catalogue(path, format)?,
             (None, None) => None,
         };
     }
@@ -131,23 +143,24 @@ pub fn rows(
                 counts[sheared] += 1;
                 let selected = part.select(at);
                 let mut excluded = selected.binned[0].err();
+                let mut item = None;
                 if selected.binned.iter().any(Result::is_ok) {
                     match part.galaxy(at, index, selected, checks) {
-                        Ok(item) => {
+                        Ok(own) => {
                             if sheared == 0 {
                                 for k in 0..2 {
-                                    summary.shear[k].add(item.row.g[k]);
-                                    summary.ellipticity[k].add(item.row.e[k]);
+                                    summary.shear[k].add(own.row.g[k]);
+                                    summary.ellipticity[k].add(own.row.e[k]);
                                 }
-                                let [a, b] = item.row.e;
+                                let [a, b] = own.row.e;
                                 for (count, limit) in summary.beyond.iter_mut().zip([1.0, 2.0]) {
                                     *count += u64::from(a * a + b * b > limit * limit);
                                 }
                                 if excluded.is_none() {
-                                    found.add(&part, at, (first + at + 1) as u64, &item.row);
+                                    found.add(&part, at, (first + at + 1) as u64, &own.row);
                                 }
                             }
-                            take(&item);
+                            item = Some(own);
                         }
                         // A row counts for its first reason.
                         Err(Rejected::Excluded(reason)) => _ = excluded.get_or_insert(reason),
@@ -160,6 +173,9 @@ pub fn rows(
                 }
                 if let Some(reason) = excluded.filter(|_| sheared == 0) {
                     count(&mut summary, reason);
+                }
+                if item.is_some() || sheared == 0 {
+                    take(part.position(at), item.as_ref());
                 }
             }
             first += part.rows;
@@ -292,6 +308,11 @@ impl<'a> TableRows<'a> {
 
     fn of(&self, role: Role) -> Option<usize> {
         self.source.places.of((role, 0))
+    }
+
+    fn position(&self, at: usize) -> [f64; 2] {
+        let columns = self.roles([Role::X, Role::Y]);
+        columns.map_or([f64::NAN; 2], |columns| self.pair(columns, at))
     }
 
     fn roles(&self, roles: [Role; 2]) -> Option<[usize; 2]> {
@@ -531,6 +552,9 @@ impl<'a> TableRows<'a> {
         selected: Selected,
         checks: &[Check],
     ) -> Result<SummedRow, Rejected> {
+        if self.is_unmeasured(at) {
+            return Err(Exclusion::Missing.into());
+        }
         self.check_unused_weight(at)?;
         self.check_failures(at, checks)?;
         let weight = self.weighted.as_ref().map(|selection| selection.weight[at]);
@@ -550,6 +574,18 @@ impl<'a> TableRows<'a> {
             row,
             selected,
         })
+    }
+
+    // Galaxies on a grid have a row also without an ellipticity.
+    fn is_unmeasured(&self, at: usize) -> bool {
+        let is_none = |placed: Placed| {
+            let e = self.pair(self.shape_columns(at), at);
+            let is_larger = |most: f64| e[0].hypot(e[1]) > most.max(1.0);
+            e.iter()
+                .any(|e| !e.is_finite() || placed.missing == Some(*e))
+                || placed.max_modulus.is_some_and(is_larger)
+        };
+        self.reading.request.placed.is_some_and(is_none)
     }
 
     // Without it, galaxies that another program excludes by a weight of zero would count fully.

@@ -61,7 +61,10 @@ impl Reading<'_> {
     fn skips(&self, role: Role) -> bool {
         match role {
             Role::G1 | Role::G2 => !matches!(self.truth, Truth::Columns),
-            Role::X | Role::Y => !matches!(self.truth, Truth::Positions(_) | Truth::Data(_)),
+            Role::X | Role::Y => {
+                let by_position = matches!(self.truth, Truth::Positions(_) | Truth::Data(_));
+                !by_position && self.request.placed.is_none()
+            }
             _ => false,
         }
     }
@@ -283,6 +286,20 @@ impl Source {
     }
 }
 
+/// The first role or use in which two catalogues differ.
+pub fn difference(own: &[(String, String)], expected: &[(String, String)]) -> Option<String> {
+    let of = |all: &[(String, String)], role: &str| {
+        let found = all.iter().find(|(known, _)| known == role);
+        found.map_or("none".to_owned(), |(_, column)| column.clone())
+    };
+    let mut roles = expected.iter().chain(own).map(|(role, _)| role);
+    roles.find_map(|role| {
+        let (found, expected) = (of(own, role), of(expected, role));
+        (!found.eq_ignore_ascii_case(&expected))
+            .then(|| format!("`{found}` for {role}, expected `{expected}`"))
+    })
+}
+
 pub fn sources(input: &Input, reading: &Reading<'_>) -> Result<Vec<Source>, FileError> {
     let mut all = Vec::new();
     for (path, sheared) in &input.parts {
@@ -350,7 +367,7 @@ fn sources_of(
     let good: Vec<_> = (lists.iter().copied())
         .filter(|list| {
             let all = with_formulas(path, &list.names, names);
-            all.is_ok_and(|(all, _)| Columns::find(path, &all, names).is_ok())
+            all.is_ok_and(|(all, _)| Columns::find(path, &all, names, false).is_ok())
         })
         .collect();
     let tables: Vec<&TableHead> = good.iter().filter_map(|list| list.table.as_ref()).collect();
@@ -549,7 +566,8 @@ fn columns_of(
     (names, frame): (&[String], Option<&DataFrame>),
     given: &Names,
 ) -> Result<Columns, FileError> {
-    let mut columns = Columns::find(&place.path, names, given)?;
+    let is_own = is_own(place, frame, names)?;
+    let mut columns = Columns::find(&place.path, names, given, is_own)?;
     if sheared.is_none()
         && columns.of(Role::ShearedCatalogue).is_none()
         && !given.is_given(Role::ShearedCatalogue)
@@ -557,7 +575,7 @@ fn columns_of(
     {
         let mut given = given.clone();
         given.add_step(step);
-        columns = Columns::find(&place.path, names, &given)?;
+        columns = Columns::find(&place.path, names, &given, is_own)?;
     }
     if let Some(id) = columns.of(Role::Id)
         && id.eq_ignore_ascii_case(COUNTER)
@@ -692,6 +710,30 @@ fn step_column(
         catalogue_named(text).is_some() && !columns.all().any(|(_, own)| own == name)
     });
     Ok(texts.into_iter().next().map(|(name, _)| name))
+}
+
+// Whether shearq wrote a table. Those in memory and text have no metadata: a column decides that no other program writes, the
+// energy of the network.
+fn is_own(place: &Place, frame: Option<&DataFrame>, names: &[String]) -> Result<bool, FileError> {
+    let in_file = match frame {
+        None => states_shearq(&place.path)?,
+        Some(_) => None,
+    };
+    Ok(in_file.unwrap_or_else(|| names.iter().any(|name| name == "first_energy")))
+}
+
+/// Whether the metadata of a file state that shearq wrote it; `None` of text, which has none.
+///
+/// # Errors
+/// If the file cannot be read.
+pub fn states_shearq(path: &Path) -> Result<Option<bool>, FileError> {
+    let Some(format) = FileFormat::of(path) else {
+        return Ok(None);
+    };
+    let key = "creator".to_owned();
+    let stated = table::read_metadata(path, format, std::iter::once(&key))?;
+    let creator = stated.get(&key);
+    Ok(Some(creator.is_some_and(|own| own.starts_with("shearq "))))
 }
 
 // SExtractor's name of a running number, which other programs use for counts.

@@ -15,21 +15,8 @@ use shearq_files::table::{self, FileFormat};
 // Largest effect on m or c that metadata can state: a star without any signal has 5.5.
 const MAX_STAR_EFFECT: f64 = 10.0;
 
-// Key of the program that wrote a catalogue, and how its text begins in catalogues of shearq.
-const CREATOR: (&str, &str) = ("creator", "shearq ");
 // Columns that Python's catalogues have instead: a number for the star, and the scatter of m and of c.
 const COLUMNS: [&str; 3] = ["psf_id", "psf_m", "psf_c"];
-
-// The noise of the star of a catalogue of any program; `None` unless shearq wrote it and states the noise.
-pub fn of_any(path: &Path, format: FileFormat) -> Result<Option<StarNoise>, FileError> {
-    let (key, start) = CREATOR;
-    let keys = [key, PSF_NOISE, PSF].map(str::to_owned);
-    let metadata = table::read_metadata(path, format, keys.iter())?;
-    match metadata.get(key) {
-        Some(creator) if creator.starts_with(start) => stated(path, metadata),
-        _ => Ok(None),
-    }
-}
 
 // The noise of the star of a table in memory; `None` if it has no such columns, no noise, or galaxies behind several
 // stars.

@@ -6,7 +6,7 @@ use shearq_dataset::truth::ReadTruth;
 use shearq_files::FileError;
 use shearq_render::table::{Cell, Table};
 use shearq_scoring::aperture::{ApertureMass, LatticeShear, SEPARATION_BINS};
-use shearq_scoring::{Complex64, Convention, ScoringError, SetImages, TruthSign};
+use shearq_scoring::{Complex64, Convention, FieldSum, ScoringError, SetImages, TruthSign};
 
 use crate::catalogues::Catalogues;
 use crate::score::{ScoreError, ScoredSet};
@@ -62,13 +62,16 @@ fn set_masses(
     for image in pool.in_order(paths, |path| catalogues.sum(grid, &path)) {
         images.add(&image?.0).map_err(wrong)?;
     }
-    let total = images.total();
-    let response = catalogues.response(set)?;
+    let mut total = images.total().clone();
     // A cell without a galaxy has no ellipticity and no weight.
-    let count = total.count.mapv(|count| count.max(1.0));
-    let mean = |sum: &Array2<f64>, response: f64| sum / &count / response;
-    let (e1, e2) = (mean(&total.e1, response[0]), mean(&total.e2, response[1]));
-    let measured = convention.apply(&e1, &e2).map_err(wrong)?;
+    let count = (total.count).mapv(|count| if count > 0.0 { count } else { 1.0 });
+    total.e1 /= &count;
+    total.e2 /= &count;
+    catalogues
+        .calibration(set)?
+        .shears(&mut total.e1, &mut total.e2);
+    let FieldSum { e1, e2, .. } = &total;
+    let measured = convention.apply(e1, e2).map_err(wrong)?;
     let standard = Convention::STANDARD;
     let truth = standard.apply(&shear.g1, &shear.g2).map_err(wrong)?;
     // The same weights in both, so that missing galaxies change both alike.

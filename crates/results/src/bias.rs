@@ -18,7 +18,7 @@ use shearq_bias::{
 use shearq_catalogue::columns::{CATALOGUES, Role, Shapes};
 use shearq_catalogue::request::{Input, MAX_BINS, Request, Units};
 use shearq_catalogue::rows::{distinct, rows};
-use shearq_catalogue::source::{Reading, Source, sources};
+use shearq_catalogue::source::{Reading, Source, difference as different_columns, sources};
 use shearq_catalogue::steps::with_sheared_files;
 use shearq_catalogue::truth::{TrueSign, Truth};
 use shearq_dataset::fingerprint::{GALAXIES, verify_source};
@@ -500,7 +500,7 @@ fn check_columns(
     let kind = first.kind(reading);
     for (input, sources) in catalogues.iter().zip(all) {
         for source in sources {
-            let mut difference = unlike(&source.kind(reading), &kind);
+            let mut difference = different_columns(&source.kind(reading), &kind);
             if difference.is_none() && known(source) != known(first) {
                 difference = Some("a true shear in one of them".into());
             }
@@ -514,20 +514,6 @@ fn check_columns(
         }
     }
     Ok(kind)
-}
-
-// The first role or use in which two catalogues differ.
-fn unlike(own: &[(String, String)], expected: &[(String, String)]) -> Option<String> {
-    let of = |all: &[(String, String)], role: &str| {
-        let found = all.iter().find(|(known, _)| known == role);
-        found.map_or("none".to_owned(), |(_, column)| column.clone())
-    };
-    let mut roles = expected.iter().chain(own).map(|(role, _)| role);
-    roles.find_map(|role| {
-        let (found, expected) = (of(own, role), of(expected, role));
-        (!found.eq_ignore_ascii_case(&expected))
-            .then(|| format!("`{found}` for {role}, expected `{expected}`"))
-    })
 }
 
 // The frame of catalogues by shearq, and the fingerprint of the image of each. Others do not state theirs.
@@ -665,7 +651,7 @@ impl Summed {
         {
             return Err(BiasFailure::Unlike("options"));
         }
-        if let Some(difference) = unlike(&other.about.kind, &self.about.kind) {
+        if let Some(difference) = different_columns(&other.about.kind, &self.about.kind) {
             return Err(BiasFailure::UnlikeColumns(difference));
         }
         if self.about.sign.map(|sign| sign.of) != other.about.sign.map(|sign| sign.of) {

@@ -9,22 +9,31 @@ use shearq_dataset::layout::DataFolder;
 use shearq_dataset::metadata::{Axes, CommonAxes, stated_axes};
 use shearq_dataset::run::{Run, Source};
 use shearq_files::FileError;
-use shearq_files::table::most_rows;
+use shearq_files::table::{self, MAX_ROWS, Place, most_rows};
 use shearq_quantities::Frame;
 use shearq_scoring::{Choice, Convention, FieldSum, Grid, Row, RowCounts};
-use shearq_submissions::EllipticityType;
 
 use crate::response::response_of;
 use crate::submit::{Packed, Sent, Submission, settings_of};
-use shearq_catalogue::foreign::{ADVICE_ON_SENTINELS, Foreign, fault_of_rows};
+use shearq_catalogue::foreign::{ADVICE_ON_SENTINELS, Foreign, HINT_OF_COLUMNS, fault_of_rows};
+use shearq_catalogue::galaxies::{Calibration, Galaxy, MeanResponse};
+use shearq_catalogue::source::states_shearq;
 use shearq_files::atomic::folder_of;
 
-/// The scored columns of catalogues by shearq.
-pub const COLUMNS: [&str; 4] = ["x", "y", "e1", "e2"];
-
-/// The rows of a catalogue with these columns, at most `most`.
+/// The rows of a catalogue in the format of a challenge or of shearq, with the columns x, y, e1 and e2; at most `most`.
 pub fn read_rows(path: &Path, most: usize) -> Result<Vec<Row>, FileError> {
-    Foreign::of_columns(COLUMNS, EllipticityType::Shear).rows(path, most)
+    let names = ["x", "y", "e1", "e2"];
+    let read = table::read(path, Some(&names), most)
+        .map_err(|error| error.hint_of_columns(HINT_OF_COLUMNS))?;
+    let [x, y, e1, e2] = names.map(|name| table::numbers(&read, name, path));
+    let (x, y, e1, e2) = (x?, y?, e1?, e2?);
+    let row = |k: usize| Row {
+        x: x[k],
+        y: y[k],
+        e1: e1[k],
+        e2: e2[k],
+    };
+    Ok((0..x.len()).map(row).collect())
 }
 
 /// The convention of catalogues by shearq, which is the standard one by construction.
@@ -44,6 +53,7 @@ pub struct Catalogues {
     pub files: Files,
     /// The run of catalogues that shearq measured into a folder.
     pub run: Option<Run>,
+    /// How columns are found; `None` of catalogues by shearq.
     pub description: Option<Foreign>,
     sent: Option<Sent>,
     // Catalogues by shearq have its convention also after packing.
@@ -85,15 +95,16 @@ impl Catalogues {
         })
     }
 
-    /// Plain files of one set, one per image, whose columns are `described`.
-    pub fn plain(paths: &[PathBuf], described: Foreign) -> Self {
+    /// Plain files of one set, one per image, whose columns are recognised; `described` if the user states some.
+    pub fn plain(paths: &[PathBuf], described: Option<Foreign>) -> Result<Self, FileError> {
         let images = (1..).zip(paths.iter().cloned()).collect();
         let files = Files::from_sets(BTreeMap::from([(PLAIN_SET, images)]));
         let first = paths.first().map_or(Path::new(""), PathBuf::as_path);
-        Catalogues {
-            description: Some(described),
+        let is_own = described.is_none() && states_shearq(first)? == Some(true);
+        Ok(Catalogues {
+            description: (!is_own).then(|| described.unwrap_or_default()),
             ..Self::of_files(String::new(), first, String::new(), files)
-        }
+        })
     }
 
     /// The catalogues of a submission, to be scored against `data`.
@@ -112,11 +123,14 @@ impl Catalogues {
             return Err(FileError::new(path, message));
         };
         let files = Files::from_sets(files);
-        // Catalogues of other programs were converted when they were packed, so that a description would convert them again.
+        // Only their manifest has a run.
+        let by_shearq = (submission.manifest).is_some_and(|own| own.run.is_some());
+        // Catalogues of other programs were converted when they were packed, so that their description would convert them again.
+        // Tables with names of columns, which `pack` does not write, are recognised.
         Ok(Catalogues {
             sent: Some(sent),
-            // Only their manifest has a run.
-            by_shearq: submission.manifest.is_some_and(|own| own.run.is_some()),
+            description: (!by_shearq).then(Foreign::default),
+            by_shearq,
             ..Self::of_files(submission.method, &path, settings, files)
         })
     }
@@ -157,48 +171,62 @@ impl Catalogues {
         sent.map_or_else(|| path.to_owned(), |sent| sent.as_given(path))
     }
 
-    /// The mean responses R11 and R22 of a set that its ellipticities are still to be divided by; 1 if none.
-    pub fn response(&self, set: u32) -> Result<[f64; 2], FileError> {
-        match &self.sent {
-            // Packing divides by the response.
-            Some(_) => Ok([1.0; 2]),
-            None => {
-                let files = self.files.of_set(set);
-                response_of(files.iter().map(|(_, path)| path.as_path()))
-            }
-        }
-    }
-
-    /// The rows of one catalogue, at most `most`, with the signs and the type of ellipticity that are scored, divided by
-    /// `response`.
-    pub fn rows(
-        &self,
-        path: &Path,
-        response: [f64; 2],
-        most: usize,
-    ) -> Result<Vec<Row>, FileError> {
-        let mut rows = match &self.description {
-            Some(foreign) => foreign.rows(path, most)?,
-            None => read_rows(path, most)?,
+    /// What the ellipticities of a set are still to be divided by.
+    pub fn calibration(&self, set: u32) -> Result<Calibration, FileError> {
+        let files = self.files.of_set(set);
+        let Some(foreign) = &self.description else {
+            return match &self.sent {
+                // Packing divides by the response.
+                Some(_) => Ok(Calibration::NONE),
+                None => response_of(files.iter().map(|(_, path)| path.as_path()))
+                    .map(Calibration::diagonal),
+            };
         };
-        for row in &mut rows {
-            row.e1 /= response[0];
-            row.e2 /= response[1];
+        let mut mean = MeanResponse::default();
+        for (_, path) in &files {
+            // Columns without names have no other roles.
+            if table::columns(&Place::of(path))?.named.is_empty() {
+                continue;
+            }
+            mean.add(&foreign.open(path, MAX_ROWS)?)?;
         }
-        Ok(rows)
+        mean.calibration()
     }
 
-    /// One catalogue on the grid, not divided by a response.
+    /// Which columns of the first catalogue are used as what; empty of catalogues by shearq, and without names of columns.
+    pub fn account(&self) -> Result<Vec<String>, FileError> {
+        let sets = self.files.sets();
+        let mut all = sets.iter().flat_map(|set| self.files.of_set(*set));
+        match (&self.description, all.next()) {
+            (Some(foreign), Some((_, path)))
+                if !table::columns(&Place::of(&path))?.named.is_empty() =>
+            {
+                Ok(foreign.open(&path, MAX_ROWS)?.account())
+            }
+            _ => Ok(Vec::new()),
+        }
+    }
+
+    /// The rows of one catalogue, at most `most`, with the signs and the type of ellipticity that are scored, and their weights.
+    pub fn rows(&self, path: &Path, most: usize) -> Result<Vec<Galaxy>, FileError> {
+        match &self.description {
+            Some(foreign) => foreign.rows(&foreign.open(path, most)?, most),
+            None => Ok(read_rows(path, most)?
+                .into_iter()
+                .map(|row| (row, 1.0))
+                .collect()),
+        }
+    }
+
+    /// One catalogue on the grid, before its calibration.
     pub fn sum(&self, grid: &Grid, path: &Path) -> Result<(FieldSum, RowCounts), FileError> {
         let named = |error| match &self.sent {
             Some(sent) => sent.named(error),
             None => error,
         };
-        let rows = self
-            .rows(path, [1.0; 2], most_rows(grid.cells()))
-            .map_err(named)?;
+        let rows = self.rows(path, most_rows(grid.cells())).map_err(named)?;
         let mut sum = FieldSum::new(grid);
-        let counts = sum.add_image(grid, rows);
+        let counts = sum.add_weighted(grid, rows);
         // shearq writes no numbers that stand for failed measurements.
         let fault = fault_of_rows(&counts, grid, ADVICE_ON_SENTINELS).filter(|_| !self.by_shearq);
         match fault {

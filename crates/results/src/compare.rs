@@ -132,6 +132,7 @@ pub fn score_all(
         let mut warnings: Vec<String> = unread.map(|line| format!("warning: {line}.")).collect();
         warnings.extend(unscored(&data, &scored, &numbers)?);
         let name = &catalogues.name;
+        warnings.extend(catalogues.account()?);
         found.push(Variant {
             // Runs of one name may have other settings or versions.
             name: match all.iter().filter(|other| other.name == *name).count() {

@@ -19,6 +19,7 @@ use thiserror::Error;
 
 use crate::catalogues::{Catalogues, OWN, PLAIN_SET};
 use crate::record::SetRecord;
+use shearq_catalogue::galaxies::Calibration;
 
 /// Why catalogues cannot be scored or compared.
 #[derive(Debug, Error)]
@@ -102,7 +103,7 @@ struct SetFiles<'a> {
     images: Vec<u32>,
     paths: Vec<PathBuf>,
     // Of the whole set: that of one image of few galaxies is noisy, and ⟨1/R̂⟩ exceeds 1/⟨R⟩.
-    response: [f64; 2],
+    calibration: Calibration,
     pool: &'a Pool,
 }
 
@@ -120,7 +121,7 @@ impl<'a> SetFiles<'a> {
             catalogues,
             images,
             paths,
-            response: catalogues.response(number)?,
+            calibration: catalogues.calibration(number)?,
             pool,
         })
     }
@@ -142,8 +143,7 @@ impl<'a> SetFiles<'a> {
         let mut images = session.begin();
         let examined = self.pool.in_order(&self.paths, |path| {
             let (mut sum, rows) = self.catalogues.sum(grid, path)?;
-            sum.e1 /= self.response[0];
-            sum.e2 /= self.response[1];
+            self.calibration.apply(&mut sum);
             session.examine(sum, rows).map_err(self.wrong())
         });
         for image in examined {

@@ -107,7 +107,7 @@ pub(super) fn populations(
         known.find(|own| own.eq_ignore_ascii_case(name)).cloned()
     };
     // A survey may be a table of S/N and size alone.
-    let columns = Columns::find(path, &known, &request.names).ok();
+    let columns = Columns::find(path, &known, &request.names, false).ok();
     let weight = match &columns {
         Some(columns) => columns.of(Role::Weight).map(str::to_owned),
         None => WEIGHTS.iter().find_map(|name| there(name)),

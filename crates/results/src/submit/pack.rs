@@ -17,6 +17,7 @@ use super::archive::{MAX_FILES, is_tar_gz};
 use super::{Contents, Entry, FileSum, Kind, MANIFEST_FILE, Manifest};
 use crate::catalogues::{Catalogues, OWN};
 use shearq_catalogue::foreign::Foreign;
+use shearq_catalogue::galaxies::{Calibration, Galaxy};
 use shearq_dataset::layout::DataFolder;
 use shearq_dataset::run::record_text;
 use shearq_dataset::threads::Progress;
@@ -59,7 +60,7 @@ impl Packing<'_> {
         let Some((_, first)) = all.next() else {
             return Err(FileError::new(place(), "found no catalogue to pack"));
         };
-        let rows = own.rows(&first, [1.0; 2], MAX_ROWS)?.len();
+        let rows = own.rows(&first, MAX_ROWS)?.len();
         Ok(((1 + all.count()) * rows) as u64)
     }
 
@@ -79,7 +80,8 @@ impl Packing<'_> {
         match (&self.catalogues.run, self.data) {
             (Some(run), _) => {
                 let field = Degrees(run.source.layout().field_degrees);
-                let rows = self.catalogues.rows(catalogue, [1.0; 2], MAX_ROWS)?;
+                let rows = self.catalogues.rows(catalogue, MAX_ROWS)?;
+                let rows: Vec<Row> = rows.into_iter().map(|own| own.0).collect();
                 grid::of_catalogue(catalogue, &rows, field)
             }
             (None, Some(data)) => truth::grid_of_set(data, set),
@@ -125,13 +127,13 @@ impl Packing<'_> {
                 add(kind, text)?;
                 continue;
             }
-            let response = found.response(set)?;
+            let calibration = found.calibration(set)?;
             for (image, path) in catalogues {
                 let method = method.clone();
-                let rows = self.catalogues.rows(&path, response, MAX_ROWS)?;
+                let rows = self.catalogues.rows(&path, MAX_ROWS)?;
                 add(
                     Kind::Catalogue { set, image, method },
-                    catalogue_text(&rows),
+                    catalogue_text(&rows, &calibration),
                 )?;
                 progress.advance(rows.len() as u64);
             }
@@ -175,14 +177,13 @@ impl Packing<'_> {
         let grid = self.grid(set, first)?;
         let session = self.session(set, grid)?;
         let mut images = session.begin();
-        let response = self.catalogues.response(set)?;
+        let calibration = self.catalogues.calibration(set)?;
         for (_, path) in catalogues {
             let mut sum = FieldSum::new(&grid);
-            let rows = self
-                .catalogues
-                .rows(path, response, most_rows(grid.cells()))?;
+            let rows = self.catalogues.rows(path, most_rows(grid.cells()))?;
             progress.advance(rows.len() as u64);
-            let counts = sum.add_image(&grid, rows);
+            let counts = sum.add_weighted(&grid, rows);
+            calibration.apply(&mut sum);
             session
                 .examine(sum, counts)
                 .and_then(|image| images.add(&image))
@@ -210,11 +211,13 @@ fn check_number(files: usize, out: &Path) -> Result<(), FileError> {
     Err(FileError::new(out, message))
 }
 
-// The measured galaxies of a catalogue in the challenge's format. Galaxies without an ellipticity are left out; the
-// original scoring counts them as zero.
-fn catalogue_text(rows: &[Row]) -> String {
+// The measured galaxies of a catalogue in the challenge's format, which has no weights: they multiply the shears, so that means over
+// galaxies are the weighted ones. Galaxies without an ellipticity are left out; the original scoring counts them as zero.
+fn catalogue_text(rows: &[Galaxy], calibration: &Calibration) -> String {
     let mut text = String::new();
-    for Row { x, y, e1, e2 } in rows {
+    for (Row { x, y, e1, e2 }, weight) in rows {
+        let weight = weight / calibration.weight;
+        let [e1, e2] = calibration.shear([*e1, *e2]).map(|e| weight * e);
         if e1.is_finite() && e2.is_finite() {
             text.push_str(&format!("{x} {y} {e1:.9} {e2:.9}\n"));
         }

@@ -608,6 +608,8 @@ pub struct SetInput {
     pub case: String,
     pub truth: String,
     pub catalogues: Vec<String>,
+    /// Which columns are used as what.
+    pub columns: Vec<String>,
     pub definition: Definition,
 }
 
@@ -676,6 +678,7 @@ pub fn one_set_json(scored: &ScoredSet, input: &SetInput) -> Value {
         "error_method": "from the part that the truth does not explain, at fixed truth; for c1 and c2 at least the jackknife over images",
         "mean_shear": score.constant,
         "rows": scored.rows,
+        "columns": input.columns,
         "warnings": notes(std::slice::from_ref(scored)),
     });
     if let (Value::Object(object), Value::Object(own)) = (&mut object, own) {

@@ -1,0 +1,170 @@
+//! `score` reads catalogues of any program as `bias` does: with the same roles, conversions, calibration and rows that do not
+//! count.
+
+use std::fmt::Write;
+use std::path::Path;
+
+use serde_json::Value;
+
+use crate::support::Folder;
+
+const SIDE: usize = 12;
+const STAMP: usize = 48;
+
+/// Names in a column list of `tests/data/columns`, the columns by role that are used, and the options that this takes.
+struct List {
+    columns: Vec<String>,
+    roles: Vec<(String, String)>,
+    given: Vec<String>,
+}
+
+impl List {
+    fn read(path: &Path) -> Self {
+        let text = std::fs::read_to_string(path).unwrap();
+        let stated = |key: &str| text.lines().find_map(|line| line.strip_prefix(key));
+        let used = stated("# used: ").unwrap();
+        let used = used.split_once("): ").unwrap().1.trim_end_matches('.');
+        let pairs = used.split(", ").filter_map(|pair| pair.split_once('='));
+        let mut roles = Vec::new();
+        for (role, columns) in pairs {
+            roles.extend(
+                columns
+                    .split('+')
+                    .map(|column| (role.to_owned(), column.to_owned())),
+            );
+        }
+        let lines = text.lines().filter(|line| !line.starts_with('#'));
+        let columns = lines.flat_map(str::split_whitespace).map(str::to_owned);
+        let columns: Vec<String> = columns.collect();
+        let given = stated("# given: ").unwrap_or_default().split_whitespace();
+        let mut given: Vec<String> = given.map(str::to_owned).collect();
+        if roles.iter().any(|(role, _)| role == "g1") {
+            // Without a true shear, c is the mean shear.
+            given.extend(["g1=none", "g2=none"].map(str::to_owned));
+        }
+        List {
+            columns,
+            roles,
+            given,
+        }
+    }
+
+    fn role(&self, column: &str) -> Option<&str> {
+        let own = self.roles.iter().find(|(_, name)| name == column);
+        own.map(|(role, _)| role.as_str())
+    }
+
+    /// A catalogue of a grid of galaxies, of which some have flags, no weight or a distortion above 1.
+    fn table(&self) -> String {
+        let mut text = format!("x,y,{}\n", self.columns.join(","));
+        let sheared: &[&str] = match self.roles.iter().any(|(role, _)| role == "version") {
+            true => &["noshear", "1p", "1m", "2p", "2m"],
+            false => &["noshear"],
+        };
+        for galaxy in 0..SIDE * SIDE {
+            for name in sheared {
+                let position = |k: usize| (k * STAMP) as f64 + 24.5;
+                let (x, y) = (position(galaxy % SIDE), position(galaxy / SIDE));
+                write!(text, "{x},{y}").unwrap();
+                for column in &self.columns {
+                    let value = self.value(galaxy, name, column);
+                    write!(text, ",{value}").unwrap();
+                }
+                text.push('\n');
+            }
+        }
+        text
+    }
+
+    fn value(&self, galaxy: usize, sheared: &str, column: &str) -> String {
+        // Numbers between 0 and 1 that do not repeat.
+        let uniform = |seed: usize| ((galaxy * 97 + seed * 41 + 13) as f64 * 0.618_034).fract();
+        let e = |k: usize| 0.02 + 0.3 * (uniform(k) - 0.5);
+        let shear = match sheared {
+            "1p" => [0.007, 0.0],
+            "1m" => [-0.007, 0.0],
+            "2p" => [0.0, 0.008],
+            "2m" => [0.0, -0.008],
+            _ => [0.0; 2],
+        };
+        let step = |role: &str| shear_of(role).map_or(0.0, |own| 0.8 * own);
+        let value = match self.role(column) {
+            Some("e1" | "ksb_e1") => e(1) + shear[0],
+            Some("e2" | "ksb_e2") => e(2) + shear[1],
+            Some(role) if role.starts_with("e1_") => e(1) + step(role),
+            Some(role) if role.starts_with("e2_") => e(2) + step(role),
+            Some("w") if galaxy % 29 == 3 => 0.0,
+            Some("w") => 0.5 + uniform(3),
+            Some("R11") => 0.7 + 0.2 * uniform(4),
+            Some("R22") => 0.75 + 0.2 * uniform(5),
+            Some("R12" | "R21") => 0.05 * uniform(6),
+            Some("dw1" | "dw2") => 0.1 * (uniform(7) - 0.5),
+            Some("rms_e") => 0.35 + 0.05 * uniform(8),
+            Some("flag") => f64::from(u8::from(galaxy % 31 == 7)),
+            Some("id") => (1000 + galaxy) as f64,
+            Some("psf_e1" | "psf_e2") => 0.02 * (uniform(9) - 0.5),
+            Some("psf_size") => 1.5 + uniform(10),
+            Some("version") => return sheared.to_owned(),
+            _ if column.to_ascii_lowercase().contains("flag") => 0.0,
+            _ => 0.5 + 0.4 * uniform(column.len()),
+        };
+        value.to_string()
+    }
+}
+
+// The artificial shear of the own component in the name of a role.
+fn shear_of(role: &str) -> Option<f64> {
+    let (own, sheared) = role.split_once('_')?;
+    match (own, sheared) {
+        ("e1", "1p") | ("e2", "2p") => Some(0.01),
+        ("e1", "1m") | ("e2", "2m") => Some(-0.01),
+        _ => None,
+    }
+}
+
+fn constant_truth() -> String {
+    let mut text = "x,y,g1,g2\n".to_owned();
+    for cell in 0..SIDE * SIDE {
+        let position = |k: usize| (k * STAMP) as f64 + 24.5;
+        let (x, y) = (position(cell % SIDE), position(cell / SIDE));
+        writeln!(text, "{x},{y},0.02,0.01").unwrap();
+    }
+    text
+}
+
+#[test]
+fn scores_have_the_mean_shear_and_rows_of_bias() {
+    let folder = Folder::new();
+    folder.write("truth.csv", constant_truth());
+    let mut count = 0;
+    for entry in std::fs::read_dir("tests/data/columns").unwrap() {
+        let path = entry.unwrap().path();
+        let list = List::read(&path);
+        folder.write("c.csv", list.table());
+        let given = match list.given.is_empty() {
+            true => String::new(),
+            false => format!("--columns {}", list.given.join(",")),
+        };
+        let bias = folder.json(&format!("bias c.csv --units rows {given}"));
+        let all = &bias["rows"][0];
+        let score = folder.json(&format!(
+            "score --truth truth.csv --truth-sign standard c.csv {given}"
+        ));
+        let number = |value: &Value| value.as_f64().unwrap_or(f64::NAN);
+        for (k, key) in ["c1", "c2"].into_iter().enumerate() {
+            let (own, expected) = (number(&score["mean_shear"]["e"][k]), number(&all[key]));
+            let off = (own - expected).abs();
+            assert!(off < 1e-12, "{}: {key} {own} {expected}", path.display());
+        }
+        let used = number(&score["rows"]["used"]);
+        assert_eq!(used, number(&all["n"]), "{}", path.display());
+        let rejected = number(&score["rows"]["not_finite"]);
+        assert_eq!(used + rejected, (SIDE * SIDE) as f64, "{}", path.display());
+        let expects_rejected = (list.roles.iter()).any(|(role, _)| role == "w" || role == "flag");
+        assert_eq!(rejected > 0.0, expects_rejected, "{}", path.display());
+        let account = score["columns"].to_string();
+        assert!(account.contains("Used: e1="), "{account}");
+        count += 1;
+    }
+    assert_eq!(count, 20);
+}
