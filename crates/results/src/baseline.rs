@@ -313,9 +313,12 @@ pub struct Shift {
 }
 
 impl Shift {
-    /// The difference in standard errors.
-    pub fn sigma(&self) -> f64 {
-        (self.now[0] - self.before[0]) / self.error
+    /// The difference in standard errors; `None` if nothing changed, or all galaxies alike.
+    pub fn sigma(&self) -> Option<f64> {
+        let difference = self.now[0] - self.before[0];
+        let rounding = SHIFT_ROUNDING * self.before[0].abs().max(self.before[1]);
+        let has_scatter = self.error > MIN_PAIRED_ERROR * self.before[1];
+        (difference.abs() > rounding && has_scatter).then(|| difference / self.error)
     }
 }
 
@@ -461,8 +464,10 @@ pub fn check<E: From<BaselineError>>(
     Ok((checks, configurations))
 }
 
-// The paired error of a shift that all galaxies have is that of rounding.
-const MAX_SHOWN_SIGMA: f64 = 1000.0;
+// Share of a metric or its error that rounding reaches: sums of 10⁶ galaxies are off by 10⁻¹⁰.
+const SHIFT_ROUNDING: f64 = 1e-9;
+// Share of the error of a metric below which a paired one shows that all galaxies shifted alike. Chosen by hand.
+const MIN_PAIRED_ERROR: f64 = 1e-3;
 
 /// The metrics of all checks, or only the moved ones.
 pub fn shift_table(checks: &[Checked], all: bool) -> Table {
@@ -495,7 +500,9 @@ pub fn shift_table(checks: &[Checked], all: bool) -> Table {
         Cell::number(shift.now[0] - shift.before[0], 6)
     });
     table.column("sigma", "in σ", &rows, |(_, shift)| {
-        Cell::number(shift.sigma().clamp(-MAX_SHOWN_SIGMA, MAX_SHOWN_SIGMA), 3)
+        shift
+            .sigma()
+            .map_or(Cell::number(f64::NAN, 3), |sigma| Cell::number(sigma, 3))
     });
     table.column("moved", "Moved", &rows, |(_, shift)| {
         Cell::text(if shift.moved { "yes" } else { "no" })
@@ -508,7 +515,7 @@ pub fn shift_table(checks: &[Checked], all: bool) -> Table {
         .count();
     let notes = &mut table.notes;
     notes.push(format!(
-        "{moved} of {compared} metrics of {} configuration(s) moved. In σ, up to 1000: difference over its standard error, of configurations over that of the metric.",
+        "{moved} of {compared} metrics of {} configuration(s) moved. In σ: difference over its standard error, of configurations over that of the metric; missing if nothing changed, or all galaxies alike.",
         checks.len()
     ));
     for check in checks {
@@ -544,6 +551,25 @@ mod tests {
         let moved = |q: f64| shifts(&set(80.0), &set(q))[0].moved;
         assert!(!moved(80.0 * (1.0 + 0.9 * TOLERANCE)));
         assert!(moved(80.0 * (1.0 - 1.1 * TOLERANCE)) && moved(f64::NAN));
+    }
+
+    #[test]
+    fn shifts_of_rounding_have_no_significance() {
+        let sigma = |now: f64, error: f64| {
+            let shift = Shift {
+                set: None,
+                metric: "m1".into(),
+                before: [0.011, 0.003],
+                now: [now, 0.003],
+                error,
+                moved: false,
+            };
+            shift.sigma()
+        };
+        assert_eq!(sigma(0.011 + 1e-17, 1e-17), None);
+        assert_eq!(sigma(0.013, 1e-17), None);
+        assert_eq!(sigma(0.011, 0.001), None);
+        assert!((sigma(0.013, 0.001).unwrap() - 2.0).abs() < 1e-9);
     }
 
     #[test]
