@@ -24,7 +24,7 @@ use shearq_files::{atomic, open};
 use shearq_render::figure::{Figure, PictureFormat};
 use shearq_render::table::{Cell, Table};
 use shearq_results::baseline::catalogues::Units as BaselineUnits;
-use shearq_results::bias::{Summed, joined, sum};
+use shearq_results::bias::{BiasFailure, Summed, joined, sum};
 use shearq_results::views::bias::{
     Checked, Limit, bias_plot, bias_table, check, chosen_by_measurement, compared_table, of_design,
     of_other_images, section, with_failures,
@@ -234,6 +234,14 @@ pub(crate) fn run(arguments: &Arguments, command_line: &str) -> anyhow::Result<(
     }
     // A shard may have too few units for errors, or one side of a pair. Its sums are what counts, and they are written.
     let result = match summed.result() {
+        // More tasks than catalogues are no fault: `--merge` takes the sums of all.
+        Err(BiasFailure::NoGalaxy(total)) if summing.shard.is_some() && total.rows == 0 => {
+            let count = summed.absent().len();
+            tell(format_args!(
+                "note: this shard contains none of the {count} catalogues (expected at most {count} shards); its sums are empty."
+            ));
+            return Ok(());
+        }
         Err(error) if summing.shard.is_some() => {
             tell(format_args!(
                 "note: no estimate of this shard alone: {error}"
