@@ -60,7 +60,7 @@ def test_one_epoch_is_measured_as_one_of_several():
             assert np.allclose(alone[name], several[name], rtol=1e-5, atol=1e-6), name
     # Off the centre by 2 px, the window loses light.
     centred = shearq.measure(one["stamps"], one["psf"], noise=0.01, wcs=one["wcs"])
-    assert abs(centred["e1"] - shearq.measure(epochs=[one])["e1"]).max() > 1e-3
+    assert centred["flux"].mean() < 0.98 * shearq.measure(epochs=[one])["flux"].mean()
 
 
 def test_epochs_of_any_orientation_measure_the_same_galaxies():

@@ -347,7 +347,7 @@ def test_oversampled_psfs_are_those_on_galaxy_pixels():
 
 
 def test_oversampling_needs_images_of_whole_pixels():
-    image = shearq.simulate(set=8, grid=3)[0]
+    image = shearq.simulate(set=8, grid=8)[0]
     with pytest.raises(ValueError, match="oversampled PSF"):
         shearq.measure(image.stamps, gaussian_psf(1.45, 49, 1), noise=1.0, psf_oversampling=4)
     with pytest.raises(ValueError, match="formulas"):

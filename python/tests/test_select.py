@@ -67,7 +67,7 @@ def test_bias_selects_as_the_command_line_does(command, tmp_path):
     # What was measured changes with shear: another m, and a note that says why.
     other = shearq.bias(folders, where="snr > 15 and size > 2")
     assert other["m1"] + other["m2"] < found["m1"] + found["m2"] - 0.1
-    assert any("effect of shear on a choice" in note for note in other.notes)
+    assert any("effect of shear on a selection" in note for note in other.notes)
 
 
 @pytest.mark.parametrize(

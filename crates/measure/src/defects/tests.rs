@@ -329,7 +329,7 @@ fn fast_loops_agree_with_plain_ones() {
         let low = numbers().fold(f32::INFINITY, f32::min);
         let high = numbers().fold(f32::NEG_INFINITY, f32::max);
         assert_eq!(extremes(&stamp), [low, high], "{n}");
-        let right = |at: usize| (at + 1) % n > 0 && stamp[at] == stamp[at + 1];
+        let right = |at: usize| !(at + 1).is_multiple_of(n) && stamp[at] == stamp[at + 1];
         let above = |at: usize| at + n < n * n && stamp[at] == stamp[at + n];
         // The end of a row below the last is compared with the next one's beginning.
         let next = |at: usize| at + n < n * n && stamp[at] == stamp[at + 1];
