@@ -91,35 +91,42 @@ impl LightLimits {
         let (low, high) = psf.fold((0.0f64, 0.0f64), |(low, high), &value| {
             (low.min(value), high.max(value))
         });
-        let at = |(row, column): (usize, usize), (x, y): (isize, isize)| {
-            let place = (row.wrapping_add_signed(y), column.wrapping_add_signed(x));
-            psf.get(place).copied().unwrap_or(0.0)
+        // Largest ratios to the means of pairs, and to those of the next two pixels; infinite where these have no light, or where pixels do not show
+        // it. In one pass, because there may be a PSF per galaxy.
+        let sampled = high < MAX_SAMPLED_PEAK;
+        let first = if sampled { 0.0 } else { f64::INFINITY };
+        let (mut pairs, mut steps) = ([first; PAIRS.len()], [first; DIRECTIONS]);
+        let faint = if sampled {
+            f64::from(FAINT_SHARE) * high
+        } else {
+            f64::INFINITY
         };
-        let bright = || {
-            let pixels = psf.indexed_iter();
-            pixels.filter(|(_, value)| **value >= f64::from(FAINT_SHARE) * high)
-        };
-        // Largest ratio to the mean of two other pixels; infinite where these have no light, or where pixels do not show it.
-        let largest = |others: [(isize, isize); 2]| {
-            if high >= MAX_SAMPLED_PEAK {
-                return f32::INFINITY;
+        for (y, line) in psf.outer_iter().enumerate() {
+            for (x, &value) in line.iter().enumerate() {
+                if value < faint {
+                    continue;
+                }
+                let at = |dx: isize, dy: isize| {
+                    let place = (y.wrapping_add_signed(dy), x.wrapping_add_signed(dx));
+                    psf.get(place).copied().unwrap_or(0.0)
+                };
+                let ratio = |a: f64, b: f64| value / (0.5 * (a + b)).max(0.0);
+                for (most, (dx, dy)) in pairs.iter_mut().zip(PAIRS) {
+                    *most = most.max(ratio(at(dx, dy), at(-dx, -dy)));
+                }
+                for (most, (dx, dy)) in steps.iter_mut().zip(PAIRS) {
+                    for (dx, dy) in [(dx, dy), (-dx, -dy)] {
+                        *most = most.max(ratio(at(dx, dy), at(2 * dx, 2 * dy)));
+                    }
+                }
             }
-            let ratios = bright().map(|(place, value)| {
-                let mean = 0.5 * (at(place, others[0]) + at(place, others[1]));
-                value / mean.max(0.0)
-            });
-            ratios.fold(0.0, f64::max) as f32
-        };
-        let ratios = PAIRS.map(|(x, y)| {
-            let bound = (RATIO_EXPONENT * high as f32 * (x * x + y * y) as f32).exp();
-            RATIO_MARGIN * bound.min(largest([(x, y), (-x, -y)]))
-        });
-        let steepness = std::array::from_fn(|k| {
+        }
+        let ratios = std::array::from_fn(|k| {
             let (x, y) = PAIRS[k];
-            let both = [1, -1].map(|sign| (sign * x, sign * y));
-            let ratios = both.map(|(x, y)| largest([(x, y), (2 * x, 2 * y)]));
-            STEEPNESS_MARGIN * ratios[0].max(ratios[1])
+            let bound = (RATIO_EXPONENT * high as f32 * (x * x + y * y) as f32).exp();
+            RATIO_MARGIN * bound.min(pairs[k] as f32)
         });
+        let steepness = steps.map(|step| STEEPNESS_MARGIN * step as f32);
         LightLimits {
             ratios,
             noise: ratios.map(ratio_noise),
