@@ -276,13 +276,29 @@ pub fn looks_like_weight(name: &str) -> bool {
 }
 
 fn is_like_a_calibration(name: &str) -> bool {
-    has_any(&recognition().patterns.calibration, name) && !is_like_a_response(name)
+    has_any(&recognition().patterns.calibration, name)
+        && !is_magnitude(name)
+        && !is_like_a_response(name)
+}
+
+fn is_magnitude(name: &str) -> bool {
+    has_any(&recognition().patterns.no_calibration, name)
+}
+
+// Whether the words of a name are those of a quantity that m and c do not depend on.
+fn is_harmless(name: &str) -> bool {
+    let known = &recognition().patterns;
+    is_magnitude(name) || has_any(&known.harmless, name) && !has_any(&known.not_harmless, name)
 }
 
 fn is_like_a_response(name: &str) -> bool {
     let known = &recognition().patterns;
     known.response_in_capitals.iter().any(|own| own == name)
         || has_any(&known.response, name) && !has_any(&known.no_response, name)
+}
+
+fn is_secondary(name: &str) -> bool {
+    has_any(&recognition().patterns.secondary, name)
 }
 
 fn is_like_a_flag(name: &str) -> bool {
@@ -374,6 +390,14 @@ impl Names {
     pub fn columns(&self) -> impl Iterator<Item = (Role, &str)> {
         let given = self.given.iter();
         given.map(|((role, _), column)| (*role, column.as_str()))
+    }
+
+    /// The ones of a table with the columns `found`, which may lack the columns of others.
+    pub fn within(&self, found: &[String]) -> Self {
+        let mut own = self.clone();
+        own.given
+            .retain(|_, name| name == "none" || found.contains(name));
+        own
     }
 
     /// Whether the responses of each component to the other one are not to be used, in columns or by sheared catalogues.
@@ -498,6 +522,8 @@ pub struct Columns {
     pub choices: Vec<String>,
     /// Columns that may hold names of sheared catalogues, if no column has this role and it was not declined.
     pub steps: Vec<String>,
+    /// A column without a role that states the artificial shear of sheared catalogues.
+    pub step_size: Option<String>,
 }
 
 impl Columns {
@@ -551,6 +577,22 @@ impl Columns {
         if name_of_e1(&columns).is_none_or(|e1| e1 != "corrected_e1") {
             columns.retain(|(role, _), _| ![Role::KsbE1, Role::KsbE2].contains(role));
         }
+        // Weights of each component have names of derivatives.
+        if !columns.contains_key(&(Role::Weight, 0)) {
+            let is_derivative = |(role, _): &Key| [Role::Dw1, Role::Dw2].contains(role);
+            let given = columns
+                .iter()
+                .find(|(key, _)| is_derivative(key) && names.is_given(key.0));
+            if let Some((_, name)) = given {
+                return Err(FileError::new(
+                    path,
+                    format!(
+                        "`{name}` is given as the derivative of a weight, and there is no column of weights. Try: --columns w=NAME, or dw1=none,dw2=none"
+                    ),
+                ));
+            }
+            columns.retain(|key, _| !is_derivative(key));
+        }
         // Responses are those of the distortions, and no shear of KSB has one.
         let has_response = columns.contains_key(&(Role::R11, 0));
         if has_response || columns.contains_key(&(Role::ShearedCatalogue, 0)) {
@@ -594,6 +636,7 @@ impl Columns {
             flags,
             choices: Vec::new(),
             steps: Vec::new(),
+            step_size: None,
         };
         if preset == Preset::Metacal && !names.is_given(Role::E1) {
             columns.take_unsheared(found);
@@ -612,7 +655,11 @@ impl Columns {
                 .chain(&self.flags)
                 .any(|own| own == name)
         };
-        let unused = found.iter().filter(|name| !name.is_empty() && !taken(name));
+        // Lines between the columns of a text are names without letters.
+        let has_letters = |name: &String| name.contains(char::is_alphanumeric);
+        let unused = found
+            .iter()
+            .filter(|name| has_letters(name) && !taken(name));
         let unused: Vec<&String> = unused.collect();
         let all = |wanted: &dyn Fn(&str) -> bool| -> Vec<String> {
             let unused = unused.iter().filter(|name| wanted(name));
@@ -627,10 +674,11 @@ impl Columns {
         }
         if self.of(Role::Weight).is_none() && !names.is_given(Role::Weight) {
             self.doubtful_weights = all(&looks_like_weight);
+            self.doubtful_weights.sort_by_key(|name| is_secondary(name));
         }
         self.unused = all(&is_like_a_role);
-        let known = &recognition().patterns.harmless;
-        self.unknown = all(&|name| !is_like_a_role(name) && !has_any(known, name));
+        self.unknown = all(&|name| !is_like_a_role(name) && !is_harmless(name));
+        self.step_size = all(&|name| has_any(&recognition().patterns.step_size, name)).pop();
         self.choices = choices;
     }
 
@@ -671,10 +719,9 @@ impl Columns {
                 None => String::new(),
             };
             lines.push(format!(
-                "Not used: {}. Try: {} if the result needs {}.{calibration}",
+                "Not used: {}. Try: {}.{calibration}",
                 counted_names(&unused),
-                suggested(&unused),
-                if unused.len() == 1 { "it" } else { "them" }
+                suggested(&unused)
             ));
         }
         if !unknown.is_empty() {
@@ -686,14 +733,33 @@ impl Columns {
         lines
     }
 
-    /// Forgets the column of identifiers.
-    pub fn decline_identity(&mut self) {
-        self.columns.remove(&(Role::Id, 0));
+    /// Columns without a role that look like a weight or state which rows count, unless they are `read`.
+    pub fn unused_choices(&self, read: &[&str]) -> Vec<&str> {
+        let unused = self.unused.iter().map(String::as_str);
+        let chooses = |name: &str| {
+            looks_like_weight(name) || is_like_a_choice(name) || counted_value(name).is_some()
+        };
+        let mut chosen: Vec<&str> = unused.filter(|name| chooses(name)).collect();
+        chosen.retain(|name| !read.contains(name));
+        chosen
+    }
+
+    /// All names that `unused` may list.
+    pub fn without_role(&self) -> impl Iterator<Item = &String> {
+        self.unused.iter().chain(&self.unknown)
+    }
+
+    /// Forgets the column of a role.
+    pub fn decline(&mut self, role: Role) {
+        self.columns.remove(&(role, 0));
     }
 
     /// What excludes rows by a column that looks like a flag or a choice and is not used.
     pub fn remedy_of_choice(&self) -> Option<String> {
-        let first = |like: fn(&str) -> bool| self.unused.iter().find(|name| like(name));
+        let first = |like: fn(&str) -> bool| {
+            let mut all = self.unused.iter();
+            all.find(|name| like(name) && sheared_name(name).is_none())
+        };
         match first(is_like_a_flag) {
             Some(name) => Some(format!("--columns flag={name} if it is 0 in good rows")),
             None => first(is_like_a_choice)
@@ -842,7 +908,14 @@ fn counted_names(names: &[String]) -> String {
 
 // What uses columns by their names, an option of each kind.
 fn suggested(unused: &[String]) -> String {
-    let first = |like: &dyn Fn(&str) -> bool| unused.iter().find(|name| like(name));
+    let first = |like: &dyn Fn(&str) -> bool| {
+        let mut all = unused.iter();
+        all.find(|name| like(name) && !is_secondary(name))
+    };
+    let needed = match unused.len() {
+        1 => "if the result needs it",
+        _ => "if the result needs them",
+    };
     let mut roles = Vec::new();
     if let Some(name) = first(&looks_like_weight) {
         roles.push(format!("w={name}"));
@@ -861,9 +934,11 @@ fn suggested(unused: &[String]) -> String {
         roles.push(format!("flag={name}"));
     }
     match (first(&is_like_a_choice), roles.is_empty()) {
-        (Some(name), true) => format!("--where {name}"),
-        (None, true) => "--columns ROLE=NAME".to_owned(),
-        _ => format!("--columns {}", roles.join(",")),
+        (Some(name), true) => {
+            format!("--where {name} if it is true in good rows, --where 'not({name})' if it is 0")
+        }
+        (None, true) => format!("--columns ROLE=NAME {needed}"),
+        _ => format!("--columns {} {needed}", roles.join(",")),
     }
 }
 
@@ -1076,6 +1151,11 @@ mod tests {
             ),
             ("e1 e2 R11", vec![], "none for R22"),
             ("e1 e2", vec!["w=weight"], "there is no column `weight`"),
+            (
+                "e1 e2 a b",
+                vec!["dw1=a", "dw2=b"],
+                "there is no column of weights",
+            ),
             ("e1 e2", vec!["q=weight"], "unknown role (found `q`"),
             ("e1 e2", vec!["w"], "expected ROLE=COLUMN"),
             (
@@ -1130,6 +1210,18 @@ mod tests {
         let others =
             "e1 e2 w mag T r z correspond_id ra flux1 size sersic_r1 snr chi2 psf_flux tile x";
         assert_eq!(found(others, &[]).unwrap().unused(&[]), [""; 0]);
+        let clean = found("e1 e2 w m_g m_r |", &[]).unwrap();
+        assert_eq!(clean.unused(&[]), [""; 0]);
+        let weights = "flux_weight shape_psf_weight w_mag wflux R_psf";
+        let named = found(&format!("e1 e2 w {weights}"), &[]).unwrap();
+        let listed = weights.replace(' ', ", ");
+        assert_eq!(
+            named.unused(&[]),
+            [format!("Not used, and not known: {listed}.")]
+        );
+        let components = found("e1 e2 w_g1 w_g2", &[]).unwrap();
+        assert_eq!(components.of(Role::Dw1), None);
+        assert_eq!(components.doubtful_weights, ["w_g1", "w_g2"]);
         let unknown = found("e1 e2 w mag peso", &[]).unwrap().unused(&[]);
         assert_eq!(unknown, ["Not used, and not known: peso."]);
         for name in (recognised_in_part()).split_whitespace() {
@@ -1144,7 +1236,12 @@ mod tests {
             ("R_gamma1 R_gamma2", "R11=R_gamma1,R22=R_gamma2 if"),
             ("sensitivity", "R11=sensitivity,R22=sensitivity if"),
             ("lensWeight my_flag", "w=lensWeight,flag=my_flag if"),
-            ("quality", "Try: --where quality if"),
+            ("quality", "Try: --where quality if it is true in good rows"),
+            ("Rs11 Rs22", "Try: --columns ROLE=NAME if"),
+            (
+                "oldweight_LF_r AlphaRecalC_weight",
+                "w=AlphaRecalC_weight if",
+            ),
             ("m_corr", "Try: --columns ROLE=NAME if"),
         ] {
             let unused = found(&format!("e1 e2 {names}"), &[]).unwrap().unused(&[]);
@@ -1155,6 +1252,19 @@ mod tests {
             flagged.unwrap(),
             "--columns flag=BadFlag if it is 0 in good rows"
         );
+    }
+
+    #[test]
+    fn steps_and_units_are_found_by_their_names() {
+        let step = found("e1 e2 mcal_step_size", &[]).unwrap().step_size;
+        assert_eq!(step.as_deref(), Some("mcal_step_size"));
+        let patterns = &recognition().patterns;
+        for name in "hpix healpix_256 pointing_id image_id subfield visit_id jk BRICK".split(' ') {
+            assert!(fits_any(&patterns.unit, name), "{name}");
+        }
+        for name in ["TOMOBIN", "TOM_BIN_ID"] {
+            assert!(fits_any(&patterns.fixed, name), "{name}");
+        }
     }
 
     // Names that state a role in part.

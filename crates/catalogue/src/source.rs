@@ -12,13 +12,13 @@ use shearq_files::{FileError, names_of};
 use shearq_measure::{Observables, Selection};
 
 use crate::expression::{Expression, Operand, operand_values};
-use crate::recognition::{fits_any, recognition};
+use crate::recognition::{fits_any, recognition, words};
 use crate::shapes::{SHAPE_COLUMNS, changes_with_shear, require_responses};
 
 use crate::columns::{CATALOGUES, Columns, Names, Places, Preset, Role, Shapes, base};
 use crate::identity;
 use crate::request::{Input, Request, Units};
-use crate::steps::{catalogue_named, sheared_column, sheared_name};
+use crate::steps::{catalogue_named, sheared_column, sheared_name, unsheared};
 use crate::truth::Truth;
 
 /// How catalogues are read: a request with the true shears of its catalogues.
@@ -112,6 +112,8 @@ impl Source {
     fn reads(&self, reading: &Reading<'_>, role: Role) -> bool {
         match role {
             Role::Unit => self.unit.is_some(),
+            // Sheared catalogues give the response.
+            Role::R11 | Role::R22 | Role::R12 | Role::R21 if self.has_sheared_columns() => false,
             Role::R12 | Role::R21 => self.has_matrix(),
             Role::RmsE | Role::SigmaE => self.shapes == Shapes::Responsivity,
             role => !reading.skips(role),
@@ -142,21 +144,38 @@ impl Source {
         kind
     }
 
-    pub fn described(&self, reading: &Reading<'_>) -> Vec<String> {
-        let responsivity = self.shapes == Shapes::Responsivity;
-        let used = self.columns.used(|role| self.reads(reading, role));
-        let mut lines = vec![format!("Used: {used}.")];
+    // The columns that enter the result.
+    fn read(&self, reading: &Reading<'_>) -> Vec<String> {
         // Read to find out whether they are what their names suggest.
         let Columns {
             doubtful_weights,
             steps,
             ..
         } = &self.columns;
-        let tested = |name: &String| doubtful_weights.contains(name) || steps.contains(name);
-        let chosen = |name: &String| reading.chosen_by().any(|own| own == name);
-        let read = self.wanted.iter().map(|own| own.column.clone());
-        let read: Vec<String> = read.filter(|name| !tested(name) || chosen(name)).collect();
-        lines.extend(self.columns.unused(&read));
+        let tested = doubtful_weights.iter().chain(steps);
+        let is_tested = |name: &str| tested.clone().any(|own| own == name);
+        let is_chosen = |name: &str| reading.chosen_by().any(|own| own == name);
+        let read = self.wanted.iter().map(|own| own.column.as_str());
+        let read = read.filter(|name| !is_tested(name) || is_chosen(name));
+        let operands = self.formulas.iter().flat_map(Expression::columns);
+        read.chain(operands).map(str::to_owned).collect()
+    }
+
+    /// Columns that are not used here, and that `first` does not have.
+    pub fn unused_beside(&self, first: &Source, reading: &Reading<'_>) -> Vec<String> {
+        let known = first.columns.without_role().cloned();
+        let named = first.columns.all().map(|(_, name)| name.to_owned());
+        let mut read = self.read(reading);
+        read.extend(known.chain(named));
+        self.columns.unused(&read)
+    }
+
+    pub fn described(&self, reading: &Reading<'_>) -> Vec<String> {
+        let responsivity = self.shapes == Shapes::Responsivity;
+        let used = self.columns.used(|role| self.reads(reading, role));
+        let mut lines = vec![format!("Used: {used}.")];
+        lines.extend(self.columns.unused(&self.read(reading)));
+        lines.extend(self.response_of_sheared(reading.request.step));
         let mut sheared = Vec::new();
         if self.sheared_flags {
             sheared.extend(self.places.all((Role::Flag, 1)));
@@ -186,6 +205,24 @@ impl Source {
             ));
         }
         lines
+    }
+
+    // A step that is wrong by a factor is an m of that factor.
+    fn response_of_sheared(&self, step: f64) -> Option<String> {
+        if !self.has_sheared_rows() && !self.has_sheared_columns() {
+            return None;
+        }
+        let stated = match &self.columns.step_size {
+            Some(name) => format!(" Try: --step with the number of `{name}`."),
+            None => String::new(),
+        };
+        let columns = match self.columns.of(Role::R11) {
+            Some(name) => format!(", and not from {name}"),
+            None => String::new(),
+        };
+        Some(format!(
+            "Response: from sheared catalogues, for artificial shears of ±{step} (--step){columns}.{stated}"
+        ))
     }
 
     // What becomes of distortions, apart from ℛ.
@@ -446,7 +483,8 @@ impl Wanted<'_> {
     // Whether a flag is a cut in all catalogues: DES's `flags_select_1p` chooses the galaxies of 1p. Other flags of
     // metacalibration with sheared ones are those of failed measurements.
     fn is_cut(&self, name: &str) -> bool {
-        let by_name = name.to_ascii_lowercase().contains("select");
+        let is_unsheared = unsheared(name) != words(name).trim_matches('_');
+        let by_name = is_unsheared || name.to_ascii_lowercase().contains("select");
         (by_name || self.columns.preset != Preset::Metacal) && self.has_sheared(name)
     }
 
@@ -577,12 +615,20 @@ fn columns_of(
         given.add_step(step);
         columns = Columns::find(&place.path, names, &given, is_own)?;
     }
+    // A seed of each row is no unit of galaxies that have identifiers.
+    if let (Some(unit), Some(_)) = (columns.of(Role::Unit), columns.of(Role::Id))
+        && unit.eq_ignore_ascii_case("seed")
+        && !given.is_given(Role::Unit)
+        && are_different(place, frame, unit)?
+    {
+        columns.decline(Role::Unit);
+    }
     if let Some(id) = columns.of(Role::Id)
         && id.eq_ignore_ascii_case(COUNTER)
         && !given.is_given(Role::Id)
         && !is_identity(place, frame, id)?
     {
-        columns.decline_identity();
+        columns.decline(Role::Id);
     }
     Ok(columns)
 }
@@ -628,11 +674,15 @@ fn source(
     for name in &columns.steps {
         wanted.require(name)?;
     }
+    let of_cuts = (1..CATALOGUES).flat_map(|catalogue| places.all((Role::Flag, catalogue)));
+    let of_cuts: Vec<String> = of_cuts
+        .map(|place| wanted.all[*place].column.clone())
+        .collect();
     let mut failures = Vec::new();
     for name in names.iter().filter(|_| columns.preset == Preset::Metacal) {
         let small = name.to_ascii_lowercase();
         let is_flag = small.contains("flag") && !small.contains("select");
-        if is_flag && sheared_name(name).is_some() {
+        if is_flag && sheared_name(name).is_some() && !of_cuts.contains(name) {
             failures.push(wanted.require(name)?);
         }
     }
@@ -759,6 +809,25 @@ fn is_identity(place: &Place, frame: Option<&DataFrame>, name: &str) -> Result<b
         None => table::read_parts(place, &[name], &[], |part| add(&part))?,
     }
     Ok(keys.len() >= MAX_COUNTED || keys.len() * MAX_SHARING >= rows)
+}
+
+// Whether each row has its own value, judged by the first part of the table.
+fn are_different(place: &Place, frame: Option<&DataFrame>, name: &str) -> Result<bool, FileError> {
+    let mut found = None;
+    let mut add = |part: &DataFrame| -> Result<(), FileError> {
+        if found.is_none() && part.height() > 0 {
+            let keys: HashSet<_> = identity::keys(part, name, &place.path)?
+                .into_iter()
+                .collect();
+            found = Some(keys.len() == part.height());
+        }
+        Ok(())
+    };
+    match frame {
+        Some(frame) => add(frame)?,
+        None => table::read_parts(place, &[name], &[name], |part| add(&part))?,
+    }
+    Ok(found.unwrap_or(false))
 }
 
 // The names of all columns, and the formulas among those that the user gives for roles, whose texts are names, too. A plus between
