@@ -297,7 +297,8 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
     let measured = first.unanswered().to_vec();
     let truth = known(&request.truth, first);
     let response = first.has_response() || first.shapes != Shapes::Shear;
-    let described = first.described(&reading);
+    let mut described = first.described(&reading);
+    described.extend(unused_in_others(&reading, &all));
     let kind = check_columns(&reading, &all)?;
     let (frame, images) = frame_and_images(&all)?;
     let named = request.catalogues.iter().zip(&images);
@@ -486,6 +487,28 @@ fn known_sign(request: &Request, all: &[Vec<Source>]) -> Result<Option<Sign>, Bi
         }
         _ => Ok(specified),
     }
+}
+
+// Columns without a role that the first catalogue does not have: a mask in the second one gave m = −0.167 without a word.
+fn unused_in_others(reading: &Reading<'_>, all: &[Vec<Source>]) -> Vec<String> {
+    let first = &all[0][0];
+    let inputs = reading.request.catalogues.iter().zip(all);
+    let mut others = inputs.filter_map(|(input, sources)| {
+        let own = sources.iter().map(|own| own.unused_beside(first, reading));
+        Some((input, own.into_iter().find(|lines| !lines.is_empty())?))
+    });
+    let Some((input, mut lines)) = others.next() else {
+        return Vec::new();
+    };
+    let name = input.name.display();
+    let more = match others.count() {
+        0 => String::new(),
+        more => format!(" (and {more} more catalogues likewise)"),
+    };
+    for line in &mut lines {
+        *line = format!("{name}{more}: {line}");
+    }
+    lines
 }
 
 // Columns by role and what becomes of them. Refuses catalogues in which they differ: a weight in one of two catalogues gave a

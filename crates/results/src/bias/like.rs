@@ -26,6 +26,8 @@ pub struct Population {
     weights: Vec<f64>,
     /// Columns that were used.
     pub columns: String,
+    /// Columns that look like weights or state which galaxies count, and are not used.
+    pub unused: Vec<String>,
     /// The part of the weights in cells without simulated galaxies, by cell, with the largest first.
     pub uncovered: Vec<(String, f64)>,
 }
@@ -106,13 +108,21 @@ pub(super) fn populations(
         let mut known = known.iter();
         known.find(|own| own.eq_ignore_ascii_case(name)).cloned()
     };
-    // A survey may be a table of S/N and size alone.
-    let columns = Columns::find(path, &known, &request.names, false).ok();
-    let weight = match &columns {
-        Some(columns) => columns.of(Role::Weight).map(str::to_owned),
-        None => WEIGHTS.iter().find_map(|name| there(name)),
+    // A survey may be a table of S/N and size alone, whose other columns are found as beside ellipticities.
+    let names = request.names.within(&known);
+    let columns = Columns::find(path, &known, &names, false);
+    let is_bare = columns.is_err();
+    let columns = columns.or_else(|_| {
+        let shapes = ["e1", "e2"].map(str::to_owned);
+        Columns::find(path, &[&known[..], &shapes].concat(), &names, false)
+    });
+    let columns = columns.ok();
+    let weight = (columns.as_ref()).and_then(|columns| columns.of(Role::Weight).map(str::to_owned));
+    let weight = match is_bare && !names.is_given(Role::Weight) {
+        true => weight.or_else(|| WEIGHTS.iter().find_map(|name| there(name))),
+        false => weight,
     };
-    let flags = columns.map_or_else(Vec::new, |columns| columns.flags.clone());
+    let flags = (columns.as_ref()).map_or_else(Vec::new, |columns| columns.flags.clone());
     let tomography = match &survey.tomography {
         Some(name) => Some(there(name).ok_or_else(|| unknown(&place, name, &known))?),
         None => TOMOGRAPHY.iter().find_map(|name| there(name)),
@@ -137,6 +147,10 @@ pub(super) fn populations(
     );
     wanted.sort_unstable();
     wanted.dedup();
+    let unused = columns
+        .iter()
+        .flat_map(|columns| columns.unused_choices(&wanted));
+    let unused: Vec<String> = unused.map(str::to_owned).collect();
     let texts = operands.iter().filter(|own| own.pattern.is_some());
     let mut texts: Vec<&str> = texts.map(|own| own.column.as_str()).collect();
     texts.extend(tomography.as_deref());
@@ -231,6 +245,7 @@ pub(super) fn populations(
         galaxies,
         weights,
         columns: columns.clone(),
+        unused: unused.clone(),
         uncovered: Vec::new(),
     };
     Ok(all.into_iter().map(population).collect())

@@ -217,8 +217,14 @@ fn implausible(result: &BiasResult, all: &Estimate) -> Option<String> {
         }
         false => "",
     };
+    let other = match result.about.response {
+        true => ", and another m a wrong response or step",
+        false => {
+            ", and another m a response that is missing, or weights, flags or cuts that are not used"
+        }
+    };
     Some(format!(
-        "{name} is {:+.2} (expected |m| below {IMPLAUSIBLE}). m = −2 is a wrong sign, m = −1 a wrong truth.{shears}{divided}",
+        "{name} is {:+.2} (expected |m| below {IMPLAUSIBLE}). m = −2 is a wrong sign, m = −1 a wrong truth{other}.{shears}{divided}",
         m.value
     ))
 }
@@ -474,6 +480,12 @@ fn populations(result: &BiasResult) -> Vec<String> {
         survey.galaxies,
         survey.columns
     )];
+    if !survey.unused.is_empty() {
+        lines.push(format!(
+            "Not used of the survey: {}. Try: a table of the galaxies that count, with their weights in a column w",
+            survey.unused.join(", ")
+        ));
+    }
     for own in &result.populations {
         let total: f64 = own.uncovered.iter().map(|(_, share)| share).sum();
         if total == 0.0 {
