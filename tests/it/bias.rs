@@ -670,7 +670,8 @@ fn catalogues_of_one_list_have_the_same_columns() {
         let mut text = format!("{head}\n");
         for (id, galaxy) in galaxies(3, [0.02; 2]).iter().enumerate() {
             let values = head.split(',').map(|name| match name {
-                "id" | "seed" => id as f64,
+                "id" => id as f64,
+                "seed" => (id / 2) as f64,
                 "e1" | "e_1" => galaxy[0][0],
                 "e2" | "e_2" => galaxy[0][1],
                 "flag" => f64::from(u8::from(id % 10 == 0)),
@@ -701,6 +702,22 @@ fn catalogues_of_one_list_have_the_same_columns() {
         let list = "bias plain.csv other.csv --truth t.csv";
         folder.refuses(list, &expected);
     }
+    // A column that only the second one has, and a seed of each row.
+    let files = pair(&folder, "masked", 0.02, |g, _| {
+        let mut text = String::from("id,seed,e1,e2,g1,g2");
+        text += if g < 0.0 { ",mask\n" } else { "\n" };
+        for (id, galaxy) in galaxies(3, [g; 2]).iter().enumerate() {
+            let (seed, [a, b]) = (id as f64 + 1e6 * g, galaxy[0]);
+            write!(text, "{id},{seed},{a},{b},{g},{g}").unwrap();
+            text += if g < 0.0 { ",0\n" } else { "\n" };
+        }
+        text
+    });
+    let found = folder.json(&format!("bias {files}"));
+    let notes = found["notes"].to_string();
+    assert_has(&notes, ".csv: Not used: mask. Try: --columns flag=mask if");
+    assert_has(&notes, "id=id");
+    assert!(!notes.contains("same `seed`"), "{notes}");
 }
 
 #[test]
@@ -780,15 +797,15 @@ fn simulated_galaxies_are_weighted_to_those_of_a_survey() {
     });
     // Weights per kind in two tomographic bins, and galaxies that no simulation has.
     let shares = [("1", [4.0, 1.0, 2.0, 1.0]), ("low", [1.0, 1.0, 3.0, 5.0])];
-    let mut survey = String::from("snr,size,shape_weight,TOMOBIN\n");
+    let mut survey = String::from("snr,size,shape_weight,TOMOBIN,flag,mask\n");
     for (bin, weights) in shares {
         for ((snr, size, ..), weight) in KINDS.iter().zip(weights) {
             for _ in 0..2 {
-                writeln!(survey, "{snr},{size},{},{bin}", weight / 2.0).unwrap();
+                writeln!(survey, "{snr},{size},{},{bin},0,0", weight / 2.0).unwrap();
             }
         }
     }
-    survey.push_str("60,1,2,low\n20,9,0,low\n");
+    survey.push_str("60,1,2,low,0,0\n20,9,0,low,0,0\n20,1,50,low,1,0\n");
     folder.write("survey.csv", survey);
     let command = format!("bias {files} --bins snr:5,10,50,90 --bins size:0.5,1.5,2.5");
     let found = folder.json(&format!("{command} --like survey.csv"));
@@ -814,7 +831,8 @@ fn simulated_galaxies_are_weighted_to_those_of_a_survey() {
     assert!((number(&rows[0], "m1") - expected[0].1).abs() > 0.01);
     let notes = found["notes"].to_string();
     assert_has(&notes, "snr 50 to 90, size 0.5 to 1.5 (10.00 %)");
-    assert_has(&notes, "w=shape_weight, tomographic bin=TOMOBIN");
+    assert_has(&notes, "w=shape_weight, flag=flag, tomographic bin=TOMOBIN");
+    assert_has(&notes, "Not used of the survey: mask.");
     // Without a survey, bins without galaxies are a mistake.
     folder.refuses(&command, "no galaxy that counts has snr 50 to 90");
 }

@@ -716,7 +716,12 @@ fn source(
         })
         .collect();
     let mut like_unit = names.iter();
-    let like_unit = like_unit.find(|name| fits_any(&recognition().patterns.unit, name));
+    let is_of_rows = |name: &str| {
+        let has_id = columns.of(Role::Id).is_some() && columns.of(Role::Unit).is_none();
+        has_id && name.eq_ignore_ascii_case("seed")
+    };
+    let like_unit =
+        like_unit.find(|name| fits_any(&recognition().patterns.unit, name) && !is_of_rows(name));
     let sheared_weight = places.of((Role::Weight, 1)).is_some();
     let chosen = reading.expressions().next().is_some() || sheared_flags || sheared_weight;
     Ok(Source {
