@@ -577,22 +577,7 @@ impl Columns {
         if name_of_e1(&columns).is_none_or(|e1| e1 != "corrected_e1") {
             columns.retain(|(role, _), _| ![Role::KsbE1, Role::KsbE2].contains(role));
         }
-        // Weights of each component have names of derivatives.
-        if !columns.contains_key(&(Role::Weight, 0)) {
-            let is_derivative = |(role, _): &Key| [Role::Dw1, Role::Dw2].contains(role);
-            let given = columns
-                .iter()
-                .find(|(key, _)| is_derivative(key) && names.is_given(key.0));
-            if let Some((_, name)) = given {
-                return Err(FileError::new(
-                    path,
-                    format!(
-                        "`{name}` is given as the derivative of a weight, and there is no column of weights. Try: --columns w=NAME, or dw1=none,dw2=none"
-                    ),
-                ));
-            }
-            columns.retain(|key, _| !is_derivative(key));
-        }
+        without_derivatives_alone(path, &mut columns, names)?;
         // Responses are those of the distortions, and no shear of KSB has one.
         let has_response = columns.contains_key(&(Role::R11, 0));
         if has_response || columns.contains_key(&(Role::ShearedCatalogue, 0)) {
@@ -882,6 +867,30 @@ fn find_sheared(columns: &mut BTreeMap<Key, String>, found: &[String], names: &N
             }
         }
     }
+}
+
+// Derivatives of a weight are of no use without it: weights of each component have such names.
+fn without_derivatives_alone(
+    path: &Path,
+    columns: &mut BTreeMap<Key, String>,
+    names: &Names,
+) -> Result<(), FileError> {
+    if !columns.contains_key(&(Role::Weight, 0)) {
+        let is_derivative = |(role, _): &Key| [Role::Dw1, Role::Dw2].contains(role);
+        let given = columns
+            .iter()
+            .find(|(key, _)| is_derivative(key) && names.is_given(key.0));
+        if let Some((_, name)) = given {
+            return Err(FileError::new(
+                path,
+                format!(
+                    "`{name}` is given as the derivative of a weight, and there is no column of weights. Try: --columns w=NAME, or dw1=none,dw2=none"
+                ),
+            ));
+        }
+        columns.retain(|key, _| !is_derivative(key));
+    }
+    Ok(())
 }
 
 // Two columns that may be e1 and e2: a pair of components with a name of shapes.

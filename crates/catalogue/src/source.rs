@@ -488,6 +488,27 @@ impl Wanted<'_> {
         (by_name || self.columns.preset != Preset::Metacal) && self.has_sheared(name)
     }
 
+    // Flags of failed measurements of metacalibration, apart from those that choose in each catalogue.
+    fn sheared_failures(&mut self, places: &Places) -> Result<Vec<usize>, FileError> {
+        let of_cuts = (1..CATALOGUES).flat_map(|catalogue| places.all((Role::Flag, catalogue)));
+        let of_cuts: Vec<String> = of_cuts
+            .map(|place| self.all[*place].column.clone())
+            .collect();
+        let mut failures = Vec::new();
+        for name in self
+            .names
+            .iter()
+            .filter(|_| self.columns.preset == Preset::Metacal)
+        {
+            let small = name.to_ascii_lowercase();
+            let is_flag = small.contains("flag") && !small.contains("select");
+            if is_flag && sheared_name(name).is_some() && !of_cuts.contains(name) {
+                failures.push(self.require(name)?);
+            }
+        }
+        Ok(failures)
+    }
+
     // The places of roles, flags and expressions, whether each sheared catalogue has what the expressions require, and
     // whether it has flags of its own. A column without sheared ones is the same in all catalogues if `by_catalogue`, or
     // if flags or weights have sheared ones.
@@ -674,18 +695,7 @@ fn source(
     for name in &columns.steps {
         wanted.require(name)?;
     }
-    let of_cuts = (1..CATALOGUES).flat_map(|catalogue| places.all((Role::Flag, catalogue)));
-    let of_cuts: Vec<String> = of_cuts
-        .map(|place| wanted.all[*place].column.clone())
-        .collect();
-    let mut failures = Vec::new();
-    for name in names.iter().filter(|_| columns.preset == Preset::Metacal) {
-        let small = name.to_ascii_lowercase();
-        let is_flag = small.contains("flag") && !small.contains("select");
-        if is_flag && sheared_name(name).is_some() && !of_cuts.contains(name) {
-            failures.push(wanted.require(name)?);
-        }
-    }
+    let failures = wanted.sheared_failures(&places)?;
     places.set((Role::ShearedFailure, 0), failures);
     let mut choices = Vec::new();
     for name in &columns.choices {
@@ -715,13 +725,6 @@ fn source(
             _ => !is_fixed(name, &columns) && !has_sheared(name),
         })
         .collect();
-    let mut like_unit = names.iter();
-    let is_of_rows = |name: &str| {
-        let has_id = columns.of(Role::Id).is_some() && columns.of(Role::Unit).is_none();
-        has_id && name.eq_ignore_ascii_case("seed")
-    };
-    let like_unit =
-        like_unit.find(|name| fits_any(&recognition().patterns.unit, name) && !is_of_rows(name));
     let sheared_weight = places.of((Role::Weight, 1)).is_some();
     let chosen = reading.expressions().next().is_some() || sheared_flags || sheared_weight;
     Ok(Source {
@@ -729,7 +732,7 @@ fn source(
         shapes: conversion(path, reading.request.shapes, &columns, sheared.is_some())?,
         formulas,
         unit: unit.map(str::to_owned),
-        unit_column: like_unit.cloned(),
+        unit_column: unit_like(names, &columns),
         unanswered: unanswered.into_iter().map(str::to_owned).collect(),
         sheared_flags,
         selects: columns.give_selection_response() && chosen && known,
@@ -745,6 +748,17 @@ fn source(
         place,
         columns,
     })
+}
+
+// A column that looks like independent units. A seed of each row is none where galaxies have identifiers.
+fn unit_like(names: &[String], columns: &Columns) -> Option<String> {
+    let is_of_rows = |name: &str| {
+        let has_id = columns.of(Role::Id).is_some() && columns.of(Role::Unit).is_none();
+        has_id && name.eq_ignore_ascii_case("seed")
+    };
+    let mut names = names.iter();
+    let own = names.find(|name| fits_any(&recognition().patterns.unit, name) && !is_of_rows(name));
+    own.cloned()
 }
 
 // A column without a role whose texts name sheared catalogues, whatever its name: the first row has one, too.
