@@ -88,39 +88,15 @@ pub(crate) struct LightLimits {
 impl LightLimits {
     /// For a PSF of sum one.
     pub(crate) fn from_psf(psf: ArrayView2<'_, f64>) -> Self {
-        let (low, high) = psf.fold((0.0f64, 0.0f64), |(low, high), &value| {
-            (low.min(value), high.max(value))
-        });
-        // Largest ratios to the means of pairs, and to those of the next two pixels; infinite where these have no light, or where pixels do not show
-        // it. In one pass, because there may be a PSF per galaxy.
-        let sampled = high < MAX_SAMPLED_PEAK;
-        let first = if sampled { 0.0 } else { f64::INFINITY };
-        let (mut pairs, mut steps) = ([first; PAIRS.len()], [first; DIRECTIONS]);
-        let faint = if sampled {
-            f64::from(FAINT_SHARE) * high
+        let layout = psf.as_standard_layout();
+        let pixels = layout.as_slice().unwrap_or_default();
+        let [low, high] = range(pixels);
+        // Infinite where pixels do not show them.
+        let (pairs, steps) = if high < MAX_SAMPLED_PEAK {
+            steepest(pixels, psf.ncols(), f64::from(FAINT_SHARE) * high)
         } else {
-            f64::INFINITY
+            ([f64::INFINITY; PAIRS.len()], [f64::INFINITY; DIRECTIONS])
         };
-        for (y, line) in psf.outer_iter().enumerate() {
-            for (x, &value) in line.iter().enumerate() {
-                if value < faint {
-                    continue;
-                }
-                let at = |dx: isize, dy: isize| {
-                    let place = (y.wrapping_add_signed(dy), x.wrapping_add_signed(dx));
-                    psf.get(place).copied().unwrap_or(0.0)
-                };
-                let ratio = |a: f64, b: f64| value / (0.5 * (a + b)).max(0.0);
-                for (most, (dx, dy)) in pairs.iter_mut().zip(PAIRS) {
-                    *most = most.max(ratio(at(dx, dy), at(-dx, -dy)));
-                }
-                for (most, (dx, dy)) in steps.iter_mut().zip(PAIRS) {
-                    for (dx, dy) in [(dx, dy), (-dx, -dy)] {
-                        *most = most.max(ratio(at(dx, dy), at(2 * dx, 2 * dy)));
-                    }
-                }
-            }
-        }
         let ratios = std::array::from_fn(|k| {
             let (x, y) = PAIRS[k];
             let bound = (RATIO_EXPONENT * high as f32 * (x * x + y * y) as f32).exp();
@@ -146,6 +122,52 @@ impl LightLimits {
             lobe: self.lobe.max(other.lobe),
         }
     }
+}
+
+/// Largest ratios of pixels from `faint` on to the means of pairs, and to those of the next two pixels; infinite where these have no light.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn steepest(pixels: &[f64], columns: usize, faint: f64) -> ([f64; PAIRS.len()], [f64; DIRECTIONS]) {
+    let (mut pairs, [mut there, mut back]) = ([0.0f64; PAIRS.len()], [[0.0f64; DIRECTIONS]; 2]);
+    for (y, line) in pixels.chunks_exact(columns).enumerate() {
+        // Without an early exit, so that several pixels are tested at a time.
+        if !line
+            .iter()
+            .fold(false, |any, value| any | (*value >= faint))
+        {
+            continue;
+        }
+        for (x, &value) in line.iter().enumerate() {
+            if value < faint {
+                continue;
+            }
+            let at = |dx: isize, dy: isize| {
+                let (x, y) = (x.wrapping_add_signed(dx), y.wrapping_add_signed(dy));
+                let place = y.wrapping_mul(columns).wrapping_add(x);
+                if x < columns {
+                    pixels.get(place).copied().unwrap_or(0.0)
+                } else {
+                    0.0
+                }
+            };
+            let ratio = |a: f64, b: f64| value / (0.5 * (a + b)).max(0.0);
+            let (mut near, mut far) = ([[0.0; 2]; DIRECTIONS], [[0.0; 2]; DIRECTIONS]);
+            for k in 0..DIRECTIONS {
+                let (dx, dy) = PAIRS[k];
+                near[k] = [at(dx, dy), at(-dx, -dy)];
+                far[k] = [at(2 * dx, 2 * dy), at(-2 * dx, -2 * dy)];
+            }
+            for k in 0..DIRECTIONS {
+                pairs[k] = pairs[k].max(ratio(near[k][0], near[k][1]));
+                there[k] = there[k].max(ratio(near[k][0], far[k][0]));
+                back[k] = back[k].max(ratio(near[k][1], far[k][1]));
+            }
+            // (2, 0) and (0, 2) are twice the first two.
+            for k in DIRECTIONS..PAIRS.len() {
+                pairs[k] = pairs[k].max(ratio(far[k - DIRECTIONS][0], far[k - DIRECTIONS][1]));
+            }
+        }
+    }
+    (pairs, std::array::from_fn(|k| there[k].max(back[k])))
 }
 
 /// Departure from a ratio to the mean of two pixels that noise may cause, in units of its departure for one pixel.
@@ -827,29 +849,32 @@ fn equal_below(stamp: &[f32], n: usize) -> u32 {
 /// Smallest and largest pixel, without NaN.
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
 fn extremes(stamp: &[f32]) -> [f32; 2] {
-    let mut low = [f32::INFINITY; LANES];
-    let mut high = [f32::NEG_INFINITY; LANES];
-    let (chunks, rest) = stamp.as_chunks::<LANES>();
+    extremes_from([f32::INFINITY, f32::NEG_INFINITY], stamp)
+}
+
+/// Smallest and largest pixel of a PSF, or zero.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn range(psf: &[f64]) -> [f64; 2] {
+    extremes_from([0.0; 2], psf)
+}
+
+// A part of its callers, so that it has their vector instructions.
+#[inline(always)]
+fn extremes_from<T: Copy + PartialOrd>([low, high]: [T; 2], numbers: &[T]) -> [T; 2] {
+    let lower = |a: T, b: T| if b < a { b } else { a };
+    let higher = |a: T, b: T| if b > a { b } else { a };
+    let (mut lows, mut highs) = ([low; LANES], [high; LANES]);
+    let (chunks, rest) = numbers.as_chunks::<LANES>();
     for values in chunks {
         for lane in 0..LANES {
-            let value = values[lane];
-            low[lane] = if value < low[lane] { value } else { low[lane] };
-            high[lane] = if value > high[lane] {
-                value
-            } else {
-                high[lane]
-            };
+            lows[lane] = lower(lows[lane], values[lane]);
+            highs[lane] = higher(highs[lane], values[lane]);
         }
     }
-    let all = |lanes: [f32; LANES], of: fn(f32, f32) -> f32, first: f32| {
-        lanes
-            .into_iter()
-            .chain(rest.iter().copied())
-            .fold(first, of)
-    };
+    let rest = rest.iter().copied();
     [
-        all(low, f32::min, f32::INFINITY),
-        all(high, f32::max, f32::NEG_INFINITY),
+        lows.into_iter().chain(rest.clone()).fold(low, lower),
+        highs.into_iter().chain(rest).fold(high, higher),
     ]
 }
 
