@@ -29,7 +29,7 @@ mod _shearq {
     #[pymodule_export]
     use super::images::{are_aligned, header_pixels, pixel_difference_of, read_images};
     #[pymodule_export]
-    use super::measure::{flags, mean_shear, measure, psf_from_oversampled};
+    use super::measure::{flags, mean_shear, measure, psfs_from_oversampled};
     #[pymodule_export]
     use super::score::{aperture_mass, difference, failed, metrics, score, spectrum};
     #[pymodule_export]

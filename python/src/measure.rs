@@ -3,16 +3,16 @@
 use std::ops::Range;
 use std::sync::Arc;
 
-use ndarray::{ArcArray2, ArrayView2};
-use numpy::{IntoPyArray, PyArray2, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3};
+use ndarray::{ArcArray2, Array3, ArrayView2};
+use numpy::{IntoPyArray, PyArray3, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use shearq_catalogue::star_noise::{StarNoise, Stars};
 use shearq_measure::{
     ArraySource, Batch, Flag, FunctionalPsf, Jacobian, JacobianError, KnownNoise, MeanShear,
-    MeanShearError, MeasureError, Measurement, Measurer, PsfProfile, Psfs, Session, ShearSum,
-    Warning, from_oversampled,
+    MeanShearError, MeasureError, Measurement, Measurer, Oversampling, PsfProfile, Psfs, Session,
+    ShearSum, Warning,
 };
 use shearq_pipeline::PipelineError;
 use shearq_pipeline::measure::{COLUMNS, ImageRow, Measured, Value, measure_images, more_columns};
@@ -135,15 +135,21 @@ fn source<'a>(
     Ok((source, noise))
 }
 
-/// A PSF on finer pixels, integrated over pixels of the galaxies.
+/// PSFs (n, y, x) on finer pixels, integrated over pixels of the galaxies.
 #[pyfunction]
-pub(crate) fn psf_from_oversampled<'py>(
+pub(crate) fn psfs_from_oversampled<'py>(
     py: Python<'py>,
-    fine: PyReadonlyArray2<'py, f64>,
+    fine: PyReadonlyArray3<'py, f64>,
     factor: usize,
-) -> PyResult<Bound<'py, PyArray2<f64>>> {
-    let psf = from_oversampled(fine.as_array(), factor).map_err(of_measuring)?;
-    Ok(psf.into_pyarray(py))
+) -> PyResult<Bound<'py, PyArray3<f64>>> {
+    let fine = fine.as_array();
+    let (count, rows, columns) = fine.dim();
+    let oversampling = Oversampling::new((rows, columns), factor).map_err(of_measuring)?;
+    let mut psfs = Array3::zeros((count, rows / factor, columns / factor));
+    for (fine, mut psf) in fine.outer_iter().zip(psfs.outer_iter_mut()) {
+        psf.assign(&oversampling.psf(fine));
+    }
+    Ok(psfs.into_pyarray(py))
 }
 
 /// Measures the galaxies of an image, or of several whose stamps are epochs of the same galaxies.

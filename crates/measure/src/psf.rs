@@ -16,7 +16,7 @@ mod width;
 
 pub use self::average::average_stars;
 pub(crate) use self::denoised_star::StarDenoiser;
-pub use self::oversampled::from_oversampled;
+pub use self::oversampled::Oversampling;
 pub use self::psfs::Psfs;
 pub(crate) use self::quality::{PsfQuality, psf_warnings};
 pub(crate) use self::residual_profile::ResidualProfiles;

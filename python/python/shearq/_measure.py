@@ -338,6 +338,9 @@ def measure_blocks(
 _EPOCH = ("stamps", "psf", "noise", "mask", "wcs", "x", "y", "properties", "pixel", "psf_oversampling", "offsets", "psf_offsets", "flux")
 
 
+_PSF_BLOCK = 64
+
+
 def _on_galaxy_pixels(psf: Any, oversampling: int | None) -> Any:
     """PSF images of finer pixels on the pixels of the galaxies."""
     factor = whole("psf_oversampling", 1 if oversampling is None else oversampling, 1, 32)
@@ -347,8 +350,10 @@ def _on_galaxy_pixels(psf: Any, oversampling: int | None) -> Any:
         raise ValueError("psf_oversampling: found with formulas, which have no pixels; expected images of PSFs")
     images = numeric("psf", psf)
     if images.ndim == 2:
-        return _shearq.psf_from_oversampled(double("psf", images), factor)
-    return np.stack([_shearq.psf_from_oversampled(double("psf", image), factor) for image in images])
+        return _shearq.psfs_from_oversampled(double("psf", images[np.newaxis]), factor)[0]
+    # In blocks, because the finer images of many galaxies in double precision are large.
+    blocks = (double("psf", images[first : first + _PSF_BLOCK]) for first in range(0, len(images), _PSF_BLOCK))
+    return np.concatenate([_shearq.psfs_from_oversampled(block, factor) for block in blocks])
 
 
 def _pixel_of(psf: Any, pixel: PixelOfPsf | None) -> PixelOfPsf | None:
@@ -409,7 +414,7 @@ def _levels(stamps: NDArray[Any], sigmas: NDArray[Any]) -> tuple[NDArray[Any], N
     stamps = stamps.copy()
     levels = np.empty(len(stamps))
     for k, (stamp, own) in enumerate(zip(stamps, sigmas)):
-        stamp[np.isinf(own) | np.isnan(own)] = np.nan
+        stamp[~np.isfinite(own)] = np.nan
         seen = np.isfinite(stamp)
         if (own[seen] <= 0).any():
             raise ValueError(f"noise: found {own[seen].min():g} on stamp {k}; expected positive standard deviations, or inf for bad pixels")

@@ -19,30 +19,42 @@ const MAX_OVERSAMPLING: usize = 32;
 // Pixels of the galaxies along the image. Chosen by hand.
 const MAX_SIDE: usize = 512;
 
-/// The PSF on pixels of the galaxies, of a PSF whose image has `factor` × `factor` pixels for each of them, as simulators of optics
+/// Gives the PSF on pixels of the galaxies, of a PSF whose image has `factor` × `factor` pixels for each of them, as simulators of optics
 /// draw it: integrated over its fine pixels. The light is integrated over pixels of the galaxies here. Light at wave numbers that no configuration uses is
 /// left out in place of being aliased, so that the result may ring around its core.
-///
-/// # Errors
-/// If the factor is not 2 to 32, a side is no multiple of it, or the image is larger than 512 pixels of the galaxies.
-pub fn from_oversampled(
-    fine: ArrayView2<'_, f64>,
-    factor: usize,
-) -> Result<Array2<f64>, MeasureError> {
-    let (rows, columns) = fine.dim();
-    let fits =
-        |side: usize| side.is_multiple_of(factor) && (2..=MAX_SIDE).contains(&(side / factor));
-    if !(2..=MAX_OVERSAMPLING).contains(&factor) || !fits(rows) || !fits(columns) {
-        return Err(MeasureError::Shape {
-            what: "an oversampled PSF",
-            found: format!("{columns} × {rows} pixels for an oversampling of {factor}"),
-            expected: format!(
-                "an oversampling of 2 to {MAX_OVERSAMPLING}, and sides of a multiple of it of up to {MAX_SIDE} pixels of the galaxies"
-            ),
-        });
+#[derive(Debug, Clone)]
+pub struct Oversampling {
+    of_columns: Array2<f64>,
+    of_rows: Array2<f64>,
+}
+
+impl Oversampling {
+    /// For images of this shape.
+    ///
+    /// # Errors
+    /// If the factor is not 2 to 32, a side is no multiple of it, or the image is larger than 512 pixels of the galaxies.
+    pub fn new((rows, columns): (usize, usize), factor: usize) -> Result<Self, MeasureError> {
+        let fits =
+            |side: usize| side.is_multiple_of(factor) && (2..=MAX_SIDE).contains(&(side / factor));
+        if !(2..=MAX_OVERSAMPLING).contains(&factor) || !fits(rows) || !fits(columns) {
+            return Err(MeasureError::Shape {
+                what: "an oversampled PSF",
+                found: format!("{columns} × {rows} pixels for an oversampling of {factor}"),
+                expected: format!(
+                    "an oversampling of 2 to {MAX_OVERSAMPLING}, and sides of a multiple of it of up to {MAX_SIDE} pixels of the galaxies"
+                ),
+            });
+        }
+        Ok(Oversampling {
+            of_columns: integration(rows, factor),
+            of_rows: integration(columns, factor),
+        })
     }
-    let along_y = integration(rows, factor).dot(&fine);
-    Ok(along_y.dot(&integration(columns, factor).t()))
+
+    /// The PSF of an image of that shape.
+    pub fn psf(&self, fine: ArrayView2<'_, f64>) -> Array2<f64> {
+        self.of_columns.dot(&fine).dot(&self.of_rows.t())
+    }
 }
 
 /// What integrates a line of `fine` pixels over pixels of the galaxies, `[pixel, fine pixel]`: the sum of its Fourier modes.
@@ -99,11 +111,15 @@ mod tests {
         Array2::from_shape_fn((side * factor, side * factor), |(y, x)| share(y) * share(x))
     }
 
+    fn from_oversampled(fine: &Array2<f64>, factor: usize) -> Result<Array2<f64>, MeasureError> {
+        Ok(Oversampling::new(fine.dim(), factor)?.psf(fine.view()))
+    }
+
     #[test]
     fn a_sampled_psf_is_the_same_from_finer_pixels() {
         for (side, factor, offset) in [(48, 2, 0.0), (33, 3, 0.3), (32, 4, -0.2)] {
             let fine = gaussian(1.6, side, factor, offset);
-            let found = from_oversampled(fine.view(), factor).unwrap();
+            let found = from_oversampled(&fine, factor).unwrap();
             let expected = gaussian(1.6, side, 1, offset);
             // Its transform is exp(−7.4) at 2.4 rad/px.
             let worst = (&found - &expected).mapv(f64::abs);
@@ -116,7 +132,7 @@ mod tests {
     fn an_undersampled_psf_keeps_its_transform_below_the_aliases() {
         let sigma = 0.4;
         for (side, offset) in [(48, 0.0), (47, 0.2)] {
-            let found = from_oversampled(gaussian(sigma, side, 4, offset).view(), 4).unwrap();
+            let found = from_oversampled(&gaussian(sigma, side, 4, offset), 4).unwrap();
             for k in [0.5, 1.0, 1.5, 2.0, 2.3] {
                 let (mut cos, mut sin) = (0.0, 0.0);
                 for ((_, x), light) in found.indexed_iter() {
@@ -140,7 +156,7 @@ mod tests {
         for (rows, columns, factor) in [(48, 48, 1), (48, 50, 4), (4, 48, 4), (2048, 2048, 3)] {
             let fine = Array2::zeros((rows, columns));
             assert!(
-                from_oversampled(fine.view(), factor).is_err(),
+                from_oversampled(&fine, factor).is_err(),
                 "{rows} {columns} {factor}"
             );
         }

@@ -7,9 +7,7 @@ use shearq_dataset::grid::{Mosaic, psfs_text, read_psfs};
 use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::DataFolder;
 use shearq_files::{FileError, atomic};
-use shearq_measure::{
-    EXAMINED_PSFS, Examination, MeasureError, Psfs, Star, Warning, from_oversampled,
-};
+use shearq_measure::{EXAMINED_PSFS, Examination, Oversampling, Psfs, Star, Warning};
 use shearq_quantities::linear::Matrix2;
 use shearq_submissions::PsfCut;
 use shearq_submissions::limits::MIN_PSF;
@@ -80,10 +78,17 @@ pub(super) fn gather_psfs(
     let path = data.psf_star(id.set, id.image);
     let mut writer = StarWriter::create(&path, count, side, &wcs)?;
     let mut planes = PlaneReader::of(files);
+    let finer = (oversampling > 1).then(|| Oversampling::new((fine, fine), oversampling));
+    let finer = finer.transpose();
     while let Some((origin, pixels)) = planes.next()? {
         let pixels = central(pixels, planes.sides(), fine);
-        let pixels = on_galaxy_pixels(pixels, fine, oversampling)
+        let finer = finer
+            .as_ref()
             .map_err(|error| origin.fault(&error.to_string()))?;
+        let pixels = match finer {
+            None => pixels,
+            Some(finer) => on_galaxy_pixels(pixels, fine, finer),
+        };
         let light = writer.add(&pixels)?;
         if count == 1 && writer.dark > 0 {
             let message =
@@ -182,18 +187,11 @@ impl StarWriter {
 }
 
 /// A PSF of `fine` pixels a side integrated over pixels of the galaxies.
-fn on_galaxy_pixels(
-    pixels: Vec<f32>,
-    fine: usize,
-    oversampling: usize,
-) -> Result<Vec<f32>, MeasureError> {
-    if oversampling == 1 {
-        return Ok(pixels);
-    }
+fn on_galaxy_pixels(pixels: Vec<f32>, fine: usize, finer: &Oversampling) -> Vec<f32> {
     let light = pixels.iter().map(|&value| f64::from(value)).collect();
     let light = Array2::from_shape_vec((fine, fine), light).unwrap_or_default();
-    let psf = from_oversampled(light.view(), oversampling)?;
-    Ok(psf.iter().map(|&value| value as f32).collect())
+    let psf = finer.psf(light.view());
+    psf.iter().map(|&value| value as f32).collect()
 }
 
 // Named configurations refuse such PSF stamps. Users should learn it before they have gathered all images.
