@@ -641,8 +641,9 @@ impl Plan {
         messages.extend(positions.note.clone());
         messages.extend(doubts(path, &wcs));
         let sides = exposure.sides()?;
+        let inside = positions.inside(sides);
         // Most galaxies of a camera are on other chips.
-        if !(is_chip && positions.inside(sides).iter().all(|inside| !inside)) {
+        if !is_chip || inside.iter().any(|inside| *inside) {
             messages.extend(positions.examine(path, &wcs, sides)?);
         }
         Ok(Plan {
@@ -653,7 +654,7 @@ impl Plan {
                 of_images: Vec::new(),
                 differs: None,
             },
-            inside: positions.inside(sides),
+            inside,
             positions: Some(positions),
             messages,
         })

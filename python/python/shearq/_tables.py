@@ -98,8 +98,9 @@ def narrowed(table: Any, needed: Callable[[Sequence[str]], list[str]]) -> tuple[
     """A table without the columns of numbers that are not `needed`, and their names, if it reads columns only when asked:
     a LazyFrame, a dataset or table of Arrow, or a group of an HDF5 file."""
     if type(table).__name__ == "LazyFrame":
-        numbers = [name for name, kind in table.collect_schema().items() if kind.is_numeric() or str(kind) == "Boolean"]
-        names = list(table.collect_schema())
+        schema = table.collect_schema()
+        numbers = [name for name, kind in schema.items() if kind.is_numeric() or str(kind) == "Boolean"]
+        names = list(schema)
         choose = table.select
     elif isinstance(table, _hdf5.Hdf5Table):
         names, numbers, choose = list(table), table.numbers(), table.select

@@ -69,8 +69,9 @@ impl PsfModel {
         match self {
             PsfModel::Psfex(model) => {
                 let mut stamp = vec![0.0; side * side];
+                let weights = model.weights(side);
                 for &place in places {
-                    model.draw(place, side, &mut stamp);
+                    model.draw(place, &weights, &mut stamp);
                     take(&stamp)?;
                 }
                 Ok(())
@@ -86,6 +87,9 @@ const MASKS: &str = "PSF_MASK";
 const LANCZOS_ORDER: i64 = 3;
 // Highest degree of the polynomial: of a hundred terms, as many as a basis of 10⁵ numbers has for masks of 32 px. Chosen by hand.
 const MAX_DEGREE: usize = 12;
+
+// For each pixel of a line of a stamp, the first fine pixel that enters and the weights from it on.
+type Weights = Vec<(i64, Vec<f64>)>;
 
 /// A PSF whose pixels on a fine grid are polynomials of the place (Bertin 2011, ASPC 442, 435). It contains the pixel.
 pub(super) struct PsfexModel {
@@ -189,15 +193,15 @@ impl PsfexModel {
         mask
     }
 
-    fn draw(&self, place: (f64, f64), side: usize, stamp: &mut [f32]) {
+    fn draw(&self, place: (f64, f64), [of_x, of_y]: &[Weights; 2], stamp: &mut [f32]) {
+        let side = of_x.len();
         let mask = self.mask_at(place);
         let [columns, rows] = self.sides;
         let light: f64 = mask.iter().sum::<f64>() * self.step * self.step;
-        let [of_x, of_y] = self.sides.map(|fine| self.weights(side, fine));
         // Along x first.
         let mut lines = vec![0.0; side * rows];
         for (line, row) in lines.chunks_exact_mut(side).zip(mask.chunks_exact(columns)) {
-            for (to, (first, weights)) in line.iter_mut().zip(&of_x) {
+            for (to, (first, weights)) in line.iter_mut().zip(of_x) {
                 *to = sum(weights, *first, |at| row.get(at).copied());
             }
         }
@@ -210,8 +214,12 @@ impl PsfexModel {
         }
     }
 
-    // Of the fine pixels from the first one on, for each pixel of a stamp.
-    fn weights(&self, side: usize, fine: usize) -> Vec<(i64, Vec<f64>)> {
+    // Along x and y, for stamps of `side` pixels.
+    fn weights(&self, side: usize) -> [Weights; 2] {
+        self.sides.map(|fine| self.weights_along(side, fine))
+    }
+
+    fn weights_along(&self, side: usize, fine: usize) -> Weights {
         let middle = |side: usize| (side as f64 - 1.0) / 2.0;
         let of_pixel = |to: usize| {
             let at = (to as f64 - middle(side)) / self.step + middle(fine);
@@ -359,7 +367,7 @@ mod tests {
         ] {
             for side in [32, 33] {
                 let mut stamp = vec![f32::NAN; side * side];
-                model.draw(place, side, &mut stamp);
+                model.draw(place, &model.weights(side), &mut stamp);
                 let expected = |x: f64, y: f64| {
                     (-0.5 * (x * x / (a * a) + y * y / (b * b))).exp()
                         / (std::f64::consts::TAU * a * b)
