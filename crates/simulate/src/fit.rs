@@ -2,6 +2,7 @@
 
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
 use shearq_quantities::Shear;
 
 use super::galaxy::{Component, Galaxy, GalaxyError, Sersic};
@@ -58,6 +59,22 @@ impl Fit {
             Some(bulge) => Galaxy::new(&[component(bulge), main]),
         }
     }
+}
+
+/// The axis ratio of an ellipse with the modulus |ε|.
+pub fn axis_ratio(modulus: f64) -> f64 {
+    (1.0 - modulus) / (1.0 + modulus)
+}
+
+/// A number whose logarithm has this scatter about that of the median, within bounds.
+pub fn log_normal(
+    rng: &mut ChaCha8Rng,
+    median: f64,
+    scatter: f64,
+    (least, most): (f64, f64),
+) -> f64 {
+    let draw: f64 = StandardNormal.sample(rng);
+    (median * (scatter * draw).exp()).clamp(least, most)
 }
 
 /// A modulus of Rayleigh's distribution with the scale `sigma`, at most `most`.

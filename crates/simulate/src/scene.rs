@@ -14,14 +14,13 @@ use std::f64::consts::TAU;
 use ndarray::Array2;
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
-use rand_distr::{Distribution, StandardNormal};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 use shearq_quantities::fourier::Complex64;
 use shearq_quantities::linear::apply;
 use shearq_quantities::{FunctionalPsf, PsfProfile, PsfTransform, Shear, TransformedPsf};
 
 use super::field::random_shear;
-use super::fit::{Fit, FitComponent, rayleigh};
+use super::fit::{Fit, FitComponent, axis_ratio, log_normal, rayleigh};
 use super::galaxy::{Galaxy, Sersic};
 use super::noise::add_noise;
 use super::render::{RenderScratch, Renderer, stamp_side};
@@ -388,8 +387,10 @@ impl SceneSimulator {
 
     fn galaxies(&self) -> usize {
         match self.settings.layout {
-            Layout::Hexagonal if self.settings.density > 0.0 => self.lattice.1.iter().product(),
-            _ => (self.settings.density * self.settings.field_arcmin2()).round() as usize,
+            Layout::Hexagonal => self.lattice.1.iter().product(),
+            Layout::Random => {
+                (self.settings.density * self.settings.field_arcmin2()).round() as usize
+            }
         }
     }
 
@@ -581,16 +582,15 @@ fn random_snr(rng: &mut ChaCha8Rng, [faint, bright]: [f64; 2], power: f64) -> f6
 /// A galaxy of the default population: an exponential disc, and a de Vaucouleurs bulge of its ellipticity with up to 0.4 of the
 /// light. Bright galaxies are larger.
 fn population(snr: f64, rng: &mut ChaCha8Rng) -> Fit {
-    let scatter: f64 = StandardNormal.sample(rng);
-    let radius = MEDIAN_RADIUS_ARCSEC * (snr / RADIUS_SNR).powf(RADIUS_POWER);
-    let radius = (radius * (RADIUS_SCATTER * scatter).exp()).clamp(RADII_ARCSEC.0, RADII_ARCSEC.1);
+    let median = MEDIAN_RADIUS_ARCSEC * (snr / RADIUS_SNR).powf(RADIUS_POWER);
+    let radius = log_normal(rng, median, RADIUS_SCATTER, RADII_ARCSEC);
     let e = rayleigh(rng, INTRINSIC_SIGMA, MAX_INTRINSIC_MODULUS);
     let share = rng.random_range(0.0..MAX_BULGE_SHARE);
     let component = |profile, half_light_arcsec, flux| FitComponent {
         profile,
         half_light_arcsec,
         flux,
-        axis_ratio: (1.0 - e) / (1.0 + e),
+        axis_ratio: axis_ratio(e),
     };
     Fit {
         main: component(Sersic::Exponential, radius, 1.0 - share),

@@ -19,6 +19,7 @@ use shearq_scoring::modes::Decomposer;
 use shearq_scoring::{Bins, Definition, Grid, TrueShear};
 
 use super::field::{Content, ShearSpectrum, random_field, random_shear};
+use super::fit::rayleigh;
 use super::galaxy::Galaxy;
 use super::kinds::{ImageType, SetKind, Variability};
 use super::noise::add_noise;
@@ -539,8 +540,7 @@ impl SetSimulator {
         match self.kind.image {
             ImageType::SmoothSnr => {
                 // A Rayleigh distribution with its mode at the nominal S/N.
-                let u: f64 = rng.random_range(f64::EPSILON..1.0);
-                snr = (snr * (-2.0 * u.ln()).sqrt()).clamp(SNR_RANGE.0, SNR_RANGE.1);
+                snr = rayleigh(rng, snr, SNR_RANGE.1).max(SNR_RANGE.0);
             }
             ImageType::SmoothGalaxy => {
                 // Log-normal about the fiducial sizes.

@@ -9,7 +9,6 @@ use ndarray::Array2;
 use rand::RngExt;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
-use rand_distr::{Distribution, StandardNormal};
 use shearq_quantities::{FunctionalPsf, PsfProfile, PsfTransform, Pupil, Shear, TransformedPsf};
 use shearq_scoring::aperture::Lattice;
 use shearq_scoring::great3::{
@@ -21,7 +20,7 @@ use shearq_scoring::{Complex64, Grid, ScoringError};
 
 use shearq_simulate::add_noise;
 use shearq_simulate::field::{Content, ShearSpectrum, random_field, random_shear};
-use shearq_simulate::fit::{Fit, FitComponent, rayleigh};
+use shearq_simulate::fit::{Fit, FitComponent, axis_ratio, log_normal, rayleigh};
 use shearq_simulate::galaxy::{Galaxy, GalaxyError, Sersic};
 use shearq_simulate::render::{RenderScratch, Renderer};
 use shearq_simulate::set::{MAX_INTRINSIC_MODULUS, NYQUIST_SHARE, stream};
@@ -171,7 +170,7 @@ impl BranchSimulator {
             renderer: Renderer::new(branch.stamp()),
         };
         for fit in &simulator.fits {
-            simulator.galaxy(fit, None, Shear::ZERO, 1.0)?;
+            fit.galaxy(branch.pixel_arcsec(), 1.0, |_| Shear::ZERO)?;
         }
         Ok(simulator)
     }
@@ -368,38 +367,20 @@ impl BranchSimulator {
         (fit, direction, fit.snr.unwrap_or(snr.min(SNR.1)))
     }
 
-    // `shape` replaces the ellipticities of the fit.
-    fn galaxy(
-        &self,
-        fit: &Fit,
-        shape: Option<(Complex64, bool)>,
-        shear: Shear,
-        flux: f64,
-    ) -> Result<Galaxy, GalaxyError> {
-        fit.galaxy(self.branch.pixel_arcsec(), flux, |own| {
-            let e = match shape {
-                None => Complex64::ZERO,
-                Some((e, true)) => e,
-                Some((direction, false)) => direction * own.modulus(),
-            };
-            Shear::new(e.re, e.im).sheared_by(shear)
-        })
-    }
-
     /// The galaxy in a place.
     pub fn galaxy_at(&self, subfield: &Subfield, (ix, iy): (usize, usize)) -> DrawnGalaxy {
         let place = iy * self.grid + ix;
         let (fit, direction, snr) = self.draw_fit(subfield, place);
-        let (shear, shape) = match subfield.constant_shear {
-            Some(shear) => (shear, (direction, false)),
-            None => {
-                let (shear, e) = subfield.lensing[place];
-                (shear, (Complex64::new(e.e1, e.e2), true))
-            }
+        let known = subfield.lensing.get(place);
+        let intrinsic = |own: &FitComponent| {
+            let e = direction * own.modulus();
+            known.map_or(Shear::new(e.re, e.im), |(_, intrinsic)| *intrinsic)
         };
         let drawn = |shear| {
-            self.galaxy(&fit, Some(shape), shear, 1.0)
-                .expect("fits were checked, and ellipticities drawn here are within range")
+            fit.galaxy(self.branch.pixel_arcsec(), 1.0, |own| {
+                intrinsic(own).sheared_by(shear)
+            })
+            .expect("fits were checked, and ellipticities drawn here are within range")
         };
         // S/N is defined before lensing, so that a cut by it does not select by shear.
         let unlensed = drawn(Shear::ZERO);
@@ -412,7 +393,10 @@ impl BranchSimulator {
         rng.set_stream(place as u64);
         DrawnGalaxy {
             place,
-            sheared: drawn(shear),
+            sheared: drawn(match subfield.constant_shear {
+                Some(shear) => shear,
+                None => subfield.lensing[place].0,
+            }),
             scale: snr / powers.sum::<f64>().sqrt(),
             offset: Self::offset(&mut rng),
         }
@@ -473,20 +457,14 @@ impl BranchSimulator {
 }
 
 fn default_fit(rng: &mut ChaCha8Rng) -> Fit {
-    let radius = |rng: &mut ChaCha8Rng| {
-        let draw: f64 = StandardNormal.sample(rng);
-        let radius = MEDIAN_RADIUS_ARCSEC * (RADIUS_SCATTER * draw).exp();
-        radius.clamp(RADII_ARCSEC.0, RADII_ARCSEC.1)
-    };
     let e = rayleigh(rng, INTRINSIC_SIGMA, MAX_INTRINSIC_MODULUS);
-    let axis_ratio = (1.0 - e) / (1.0 + e);
     let component = |profile, half_light_arcsec, flux| FitComponent {
         profile,
         half_light_arcsec,
         flux,
-        axis_ratio,
+        axis_ratio: axis_ratio(e),
     };
-    let size = radius(rng);
+    let size = log_normal(rng, MEDIAN_RADIUS_ARCSEC, RADIUS_SCATTER, RADII_ARCSEC);
     if rng.random::<f64>() < BULGE_AND_DISC_SHARE {
         let share = rng.random_range(0.1..0.7);
         let bulge = size * rng.random_range(0.3..0.6);
