@@ -341,6 +341,12 @@ fn is_quiet() -> bool {
     QUIET.load(Ordering::Relaxed)
 }
 
+fn tell_notes(notes: Vec<String>) {
+    for line in notes {
+        tell(format_args!("note: {line}"));
+    }
+}
+
 fn tell_unread(unread: Vec<String>) {
     for line in unread {
         tell(format_args!("warning: {line}"));

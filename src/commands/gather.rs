@@ -266,14 +266,11 @@ struct Own<'a> {
     exposed: &'a [Exposed],
     at: usize,
     is_chip: bool,
-    extensions: [Option<String>; 4],
+    mask_extension: Option<String>,
+    psf_extension: Option<String>,
+    variance_extension: Option<String>,
+    weight_extension: Option<String>,
 }
-
-// Options of which `*` is filled.
-const MASK: usize = 0;
-const PSF: usize = 1;
-const VARIANCE: usize = 2;
-const WEIGHT: usize = 3;
 
 impl<'a> Own<'a> {
     fn new(
@@ -295,12 +292,10 @@ impl<'a> Own<'a> {
             exposed,
             at,
             is_chip,
-            extensions: [
-                filled(("mask-extension", &arguments.mask_extension))?,
-                filled(("psf-extension", &arguments.psf_extension))?,
-                filled(("variance-extension", &arguments.variance_extension))?,
-                filled(("weight-extension", &arguments.weight_extension))?,
-            ],
+            mask_extension: filled(("mask-extension", &arguments.mask_extension))?,
+            psf_extension: filled(("psf-extension", &arguments.psf_extension))?,
+            variance_extension: filled(("variance-extension", &arguments.variance_extension))?,
+            weight_extension: filled(("weight-extension", &arguments.weight_extension))?,
         })
     }
 
@@ -368,7 +363,7 @@ fn gathering<'a>(own: &'a Own<'a>) -> anyhow::Result<Gathering<'a>> {
     };
     let masks = companion(
         own.part("mask", &arguments.mask, false)?,
-        own.extensions[MASK].as_deref(),
+        own.mask_extension.as_deref(),
         Content::Mask,
     );
     anyhow::ensure!(
@@ -380,12 +375,12 @@ fn gathering<'a>(own: &'a Own<'a>) -> anyhow::Result<Gathering<'a>> {
     let bits = bits.map(|bits| bits.iter().fold(0, |all, bit| all | 1u64 << bit));
     let variances = companion(
         own.part("variance", &arguments.variance, false)?,
-        own.extensions[VARIANCE].as_deref(),
+        own.variance_extension.as_deref(),
         Content::Variance,
     );
     let weights = companion(
         own.part("weight-map", &arguments.weight_map, false)?,
-        own.extensions[WEIGHT].as_deref(),
+        own.weight_extension.as_deref(),
         Content::Weight,
     );
     let positions = own.part("positions", &arguments.positions, true)?;
@@ -423,7 +418,7 @@ fn gathering<'a>(own: &'a Own<'a>) -> anyhow::Result<Gathering<'a>> {
         masks: masks.map(|files| Masks { files, bits }),
         psfs: Files {
             paths: own.part("psf", &arguments.psf, own.is_chip)?,
-            extension: own.extensions[PSF].as_deref(),
+            extension: own.psf_extension.as_deref(),
             content: Content::Psf,
         },
         psf_oversampling: arguments.psf_oversampling.map(usize::from),

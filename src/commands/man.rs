@@ -1,6 +1,7 @@
 use std::path::PathBuf;
 
 use clap::{Args, CommandFactory};
+use shearq_files::FileError;
 
 use crate::{Cli, tell};
 
@@ -14,10 +15,8 @@ pub(crate) struct Arguments {
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let out = &arguments.out;
-    let cannot =
-        |error: std::io::Error| anyhow::anyhow!("{}: cannot write: {error}", out.display());
-    std::fs::create_dir_all(out).map_err(cannot)?;
-    clap_mangen::generate_to(Cli::command(), out).map_err(cannot)?;
+    std::fs::create_dir_all(out).map_err(FileError::doing(out, "cannot write"))?;
+    clap_mangen::generate_to(Cli::command(), out).map_err(FileError::doing(out, "cannot write"))?;
     tell(format_args!("manual pages in {}", out.display()));
     Ok(())
 }

@@ -7,7 +7,7 @@ use shearq_submissions::check_name;
 
 use crate::arguments::{Summary, named};
 use crate::progress::Bar;
-use crate::{count, tell, tell_unread};
+use crate::{count, tell, tell_notes, tell_unread};
 use shearq_challenges::{BranchCatalogues, Presubmitting, PublicBranch, PublicChallenge};
 use shearq_dataset::fingerprint;
 use shearq_dataset::run::{Run, open_data};
@@ -198,9 +198,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let galaxies = packing.galaxies()?;
     // A catalogue with a misspelt name would otherwise be missing from the submission without notice.
     tell_unread(catalogues.files.unread());
-    for line in catalogues.account()? {
-        tell(format_args!("note: {line}"));
-    }
+    tell_notes(catalogues.account()?);
     let mut bar = Bar::new("packing", galaxies);
     let files = packing.write(out, &mut bar)?;
     drop(bar);

@@ -9,7 +9,7 @@ use shearq_scoring::{Noise, Options, SetScorer, TruthSign};
 use crate::arguments::{
     Printing, ReportFile, ScoreSettings, SetList, Threads, named, positive, sets_of,
 };
-use crate::{print_json, tell, tell_unread};
+use crate::{print_json, tell, tell_notes, tell_unread};
 use shearq_catalogue::columns::Shapes;
 use shearq_catalogue::foreign::Foreign;
 use shearq_catalogue::recognition::read_presets;
@@ -220,15 +220,9 @@ pub(super) fn units(arguments: &Arguments) -> anyhow::Result<(Units, Vec<PathBuf
             .map(|own| ScoredUnits::new(own, &truth(own.record.set)));
         Ok(Units::Score(units.collect::<Result<_, _>>()?))
     };
-    let account = |catalogues: &Catalogues| -> anyhow::Result<()> {
-        for line in catalogues.account()? {
-            tell(format_args!("note: {line}"));
-        }
-        Ok(())
-    };
     if let Some(truth) = &arguments.truth {
         let (catalogues, _, scored) = scored_files(arguments, truth, options)?;
-        account(&catalogues)?;
+        tell_notes(catalogues.account()?);
         return Ok((
             of(&scored, &|_| truth.clone())?,
             arguments.catalogues.clone(),
@@ -239,7 +233,7 @@ pub(super) fn units(arguments: &Arguments) -> anyhow::Result<(Units, Vec<PathBuf
         bail!("score: a baseline is of catalogues (found power spectra)");
     };
     let (scored, _) = scored_catalogues(arguments, &catalogues, &data, options)?;
-    account(&catalogues)?;
+    tell_notes(catalogues.account()?);
     let of_set = |own: &ScoredSet| catalogues.files.of_set(own.record.set);
     // Files of an archive are in a temporary folder.
     let files = match &arguments.packed {

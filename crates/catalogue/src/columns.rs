@@ -662,7 +662,8 @@ impl Columns {
             self.doubtful_weights.sort_by_key(|name| is_secondary(name));
         }
         self.unused = all(&is_like_a_role);
-        self.unknown = all(&|name| !is_like_a_role(name) && !is_harmless(name));
+        let is_like_no_role = |name: &str| !self.unused.iter().any(|own| own == name);
+        self.unknown = all(&|name| is_like_no_role(name) && !is_harmless(name));
         self.step_size = all(&|name| has_any(&recognition().patterns.step_size, name)).pop();
         self.choices = choices;
     }

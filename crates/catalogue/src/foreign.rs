@@ -228,16 +228,11 @@ impl Foreign {
             name.push(format!("[{table}]"));
         }
         let request = self.request(path)?;
-        let given = |role: &str| {
-            let key = match role {
-                "x" => &self.x,
-                "y" => &self.y,
-                "e1" => &self.e1,
-                _ => &self.e2,
-            };
-            key.as_ref().or_else(|| self.columns.get(role))
-        };
-        let unnamed = UNNAMED.map(|role| given(role).map_or(role, String::as_str));
+        let keys = [&self.x, &self.y, &self.e1, &self.e2];
+        let unnamed: [&str; 4] = std::array::from_fn(|k| {
+            let given = keys[k].as_ref().or_else(|| self.columns.get(UNNAMED[k]));
+            given.map_or(UNNAMED[k], String::as_str)
+        });
         let found = Galaxies::open(PathBuf::from(name).into(), &request, unnamed, most);
         found.map_err(|error| match self.catalogues.is_empty() {
             true => error.hint_of_columns(HINT_OF_COLUMNS),

@@ -139,14 +139,13 @@ pub struct MeanResponse {
     // The first catalogue, and its columns by role.
     first: Option<(PathBuf, Vec<(String, String)>)>,
     weight: f64,
-    galaxies: f64,
     diagonal: [RunningMean; 2],
     responses: [[f64; 2]; 2],
     // Of each sheared catalogue: weights times e/2h, and weights.
     sheared: [([f64; 2], f64); SHEARED_CATALOGUES.len()],
     has_sheared: bool,
     // Whether responses to the other component are known.
-    matrix: bool,
+    has_matrix: bool,
 }
 
 impl MeanResponse {
@@ -155,9 +154,11 @@ impl MeanResponse {
     /// # Errors
     /// As [`Galaxies::read`], or if its columns are not those of the first catalogue.
     pub fn add(&mut self, own: &Galaxies) -> Result<(), FileError> {
-        let kind = || own.kind();
-        let (before, first) = self.first.get_or_insert_with(|| (own.path.clone(), kind()));
-        if let Some(found) = difference(&kind(), first) {
+        let kind = own.kind();
+        let (before, first) = self
+            .first
+            .get_or_insert_with(|| (own.path.clone(), kind.clone()));
+        if let Some(found) = difference(&kind, first) {
             let message = format!(
                 "its columns are not the columns of {} (found {found}). Try: --columns with the same columns for all",
                 before.display()
@@ -168,17 +169,17 @@ impl MeanResponse {
             return Ok(());
         }
         let selects = own.sources.first().is_some_and(|own| own.selects);
-        self.matrix = own.sources.first().is_some_and(Source::has_matrix);
-        let step = 2.0 * own.request.step;
+        self.has_matrix = own.sources.first().is_some_and(Source::has_matrix);
+        let shear_difference = 2.0 * own.request.step;
         own.each(|_, row| {
             if let Some(row) = row {
-                self.add_row(row, selects, step);
+                self.add_row(row, selects, shear_difference);
             }
         })
     }
 
-    fn add_row(&mut self, own: &SummedRow, selects: bool, step: f64) {
-        let scaled = own.row.e.map(|e| e / step);
+    fn add_row(&mut self, own: &SummedRow, selects: bool, shear_difference: f64) {
+        let scaled = own.row.e.map(|e| e / shear_difference);
         let mut add_sheared = |catalogue: usize, weight: f64| {
             let (sums, weights) = &mut self.sheared[catalogue - 1];
             for (sum, e) in sums.iter_mut().zip(scaled) {
@@ -204,11 +205,10 @@ impl MeanResponse {
             return;
         }
         self.weight += own.row.weight;
-        self.galaxies += 1.0;
         for (i, sums) in self.responses.iter_mut().enumerate() {
             self.diagonal[i].add(own.row.response[i][i]);
             for (j, sum) in sums.iter_mut().enumerate() {
-                if i == j || self.matrix {
+                if i == j || self.has_matrix {
                     *sum += own.row.response[i][j];
                 }
             }
@@ -231,7 +231,7 @@ impl MeanResponse {
             };
             for (i, row) in response.iter_mut().enumerate() {
                 for (j, own) in row.iter_mut().enumerate() {
-                    if i == j || self.matrix {
+                    if i == j || self.has_matrix {
                         *own += mean(2 * j, i) - mean(2 * j + 1, i);
                     }
                 }
@@ -245,14 +245,14 @@ impl MeanResponse {
                 let number = k + 1;
                 let message = format!(
                     "the mean response R{number}{number} of the {} galaxies of this and further catalogues is {value:.4} (expected a positive number of three standard errors), so that their ellipticities give no shear. Try: more galaxies, or --columns R11=none,R22=none if they are shears",
-                    self.galaxies
+                    own.count()
                 );
                 return Err(FileError::new(path, message));
             }
         }
         Ok(Calibration {
             response,
-            weight: self.weight / self.galaxies,
+            weight: self.weight / self.diagonal[0].count() as f64,
         })
     }
 }

@@ -6,7 +6,7 @@
 //!   and [`rows`] gives their rows. [`failures`] are numbers and rows that stand for failed measurements.
 //! * [`truth`] is the true shear of catalogues or galaxies, and [`identity`] what names a galaxy.
 //! * [`galaxies`] are rows with positions on a grid, which are scored, with their calibration; [`foreign`] is a description of many
-//!   such catalogues.  [`shapes`] catalogues by shearq.
+//!   such catalogues. [`shapes`] reads catalogues by shearq.
 //! * [`select`] applies cuts and weights; [`expression`] is the language of formulas and conditions of columns.
 //! * [`star_noise`] is what catalogues state of the noise of their stars.
 #![forbid(unsafe_code)]

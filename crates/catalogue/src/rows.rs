@@ -227,6 +227,7 @@ struct TableRows<'a> {
     sheared_of_rows: Option<Vec<usize>>,
     frame: &'a DataFrame,
     ids: Option<Vec<u64>>,
+    ids_are_units: bool,
     units: Option<Vec<u64>>,
     truth: OfRows<'a>,
 }
@@ -290,6 +291,7 @@ impl<'a> TableRows<'a> {
             responses: responses(source),
             sheared_of_rows: sheared_of_rows.transpose()?,
             ids: source.columns.of(Role::Id).map(keys).transpose()?,
+            ids_are_units: source.unit.as_deref() == source.columns.of(Role::Id),
             units: source.unit.as_deref().map(keys).transpose()?,
             source,
             reading,
@@ -883,8 +885,8 @@ impl Found {
         let own = own.fold(0, |key, value| identity::hash(key ^ value.to_bits()));
         self.content = self.content.wrapping_add(own);
         // Units that the user names may have many galaxies.
-        let is_unit = part.source.unit.as_deref() == part.source.columns.of(Role::Id);
-        let id = part.ids.as_ref().filter(|_| !is_unit).map(|ids| ids[at]);
+        let ids = part.ids.as_ref().filter(|_| !part.ids_are_units);
+        let id = ids.map(|ids| ids[at]);
         self.copies.add((!shared).then_some(own), id);
     }
 
@@ -993,6 +995,9 @@ struct Numbered {
 
 impl Numbered {
     fn add(&mut self, frame: &DataFrame, name: &str) {
+        if self.others {
+            return;
+        }
         let mut add = |value: Option<usize>| match value {
             Some(catalogue) => self.seen[catalogue] = true,
             None => self.others = true,

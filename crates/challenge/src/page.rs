@@ -52,7 +52,7 @@ impl View<'_> {
 
     /// All boards in one table: one row per team and reference.
     pub fn table(&self) -> Table {
-        self.table_of(&[Board::Main, Board::Late, Board::Partial])
+        self.table_of(&Board::ALL)
     }
 
     #[expect(clippy::too_many_lines, reason = "one column after the other")]
@@ -181,7 +181,7 @@ impl View<'_> {
 
     /// The table for people: without empty columns, and with the numbers beside the team, where they are in sight on a phone.
     pub fn shown(&self) -> Table {
-        self.shown_of(&[Board::Main, Board::Late, Board::Partial])
+        self.shown_of(&Board::ALL)
     }
 
     fn shown_of(&self, boards: &[Board]) -> Table {

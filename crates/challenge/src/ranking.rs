@@ -53,6 +53,11 @@ pub enum Board {
     Partial,
 }
 
+impl Board {
+    /// In the order of the page.
+    pub const ALL: [Board; 3] = [Board::Main, Board::Late, Board::Partial];
+}
+
 #[derive(Debug, Default)]
 pub struct Leaderboard<'a> {
     /// Teams and references, the best first, board by board.

@@ -500,9 +500,7 @@ pub fn shift_table(checks: &[Checked], all: bool) -> Table {
         Cell::number(shift.now[0] - shift.before[0], 6)
     });
     table.column("sigma", "in σ", &rows, |(_, shift)| {
-        shift
-            .sigma()
-            .map_or(Cell::number(f64::NAN, 3), |sigma| Cell::number(sigma, 3))
+        Cell::number(shift.sigma().unwrap_or(f64::NAN), 3)
     });
     table.column("moved", "Moved", &rows, |(_, shift)| {
         Cell::text(if shift.moved { "yes" } else { "no" })

@@ -184,11 +184,9 @@ impl Catalogues {
         };
         let mut mean = MeanResponse::default();
         for (_, path) in &files {
-            // Columns without names have no other roles.
-            if table::columns(&Place::of(path))?.named.is_empty() {
-                continue;
+            if has_names(path)? {
+                mean.add(&foreign.open(path, MAX_ROWS)?)?;
             }
-            mean.add(&foreign.open(path, MAX_ROWS)?)?;
         }
         mean.calibration()
     }
@@ -198,9 +196,7 @@ impl Catalogues {
         let sets = self.files.sets();
         let mut all = sets.iter().flat_map(|set| self.files.of_set(*set));
         match (&self.description, all.next()) {
-            (Some(foreign), Some((_, path)))
-                if !table::columns(&Place::of(&path))?.named.is_empty() =>
-            {
+            (Some(foreign), Some((_, path))) if has_names(&path)? => {
                 Ok(foreign.open(&path, MAX_ROWS)?.account())
             }
             _ => Ok(Vec::new()),
@@ -234,4 +230,9 @@ impl Catalogues {
             None => Ok((sum, counts)),
         }
     }
+}
+
+// Columns without names have no other roles.
+fn has_names(path: &Path) -> Result<bool, FileError> {
+    Ok(!table::columns(&Place::of(path))?.named.is_empty())
 }

@@ -124,7 +124,7 @@ fn mean_of(
     let mut repeated = 0;
     let (mut placed, mut close) = (0, 0);
     for (_, path) in catalogues {
-        // Most catalogues have no positions in pixels.
+        // A catalogue without positions says nothing of neighbours.
         if let Ok(read) = table::read(path, Some(&["x", "y"]), table::MAX_ROWS) {
             let [x, y] = ["x", "y"].map(|name| table::numbers(&read, name, path));
             let (x, y) = (x?, y?);

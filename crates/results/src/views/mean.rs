@@ -62,8 +62,7 @@ pub fn mean_table(means: &[SetMean], configuration: &Configuration, name: &str) 
                 .into(),
         );
     }
-    table.notes.extend(without_detection(means));
-    let notes = &mut table.notes;
+    notes.extend(without_detection(means));
     if means.iter().any(noticed) {
         let images = means.iter().map(|mean| mean.images.len()).sum::<usize>();
         let stated = means.iter().map(|mean| mean.noisy_stars).sum::<usize>();
