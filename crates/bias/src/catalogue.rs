@@ -119,7 +119,7 @@ pub struct Catalogue {
 
 impl Catalogue {
     /// The true shear, if all galaxies have the same.
-    pub(crate) fn constant(&self) -> Option<[f64; 2]> {
+    pub fn constant(&self) -> Option<[f64; 2]> {
         let [a, b] = self.shear.map(Range::constant);
         Some([a?, b?])
     }

@@ -9,6 +9,7 @@ use shearq_results::record::SetRecord;
 use shearq_results::submit::Contents;
 use shearq_submissions::check_name;
 use unicode_normalization::UnicodeNormalization;
+use unicode_normalization::char::is_combining_mark;
 
 /// What identifies an entry that was compared with the true shear. The store keeps it with its scores, so the names are
 /// part of the format.
@@ -63,14 +64,16 @@ pub struct Refused {
 }
 
 // Greek and Cyrillic letters, and the Latin ones that their small or their capital form looks like (Unicode's confusables.txt).
-const LOOK_ALIKE: [(&str, &str); 3] = [
+const LOOK_ALIKE: [(&str, &str); 4] = [
     ("авекмнорстухѕіјԛԝһԁӏ", "abekmhopctyxsijqwhdl"),
     ("αβεζηικμνορτυχ", "abezhikmnoptux"),
     ("ıɑɡ", "iag"),
+    // I, l and 1 are one.
+    ("l1|0", "iiio"),
 ];
 
-/// What the spellings of a team's name have in common: compatible and similar characters (NFKC, letters of other scripts that
-/// look alike), without case, blanks and characters that nobody sees.
+/// What the spellings of a team's name have in common: compatible and similar characters (NFKD, letters of other scripts and digits
+/// that look alike), without case, accents, blanks and characters that nobody sees.
 pub fn team_key(name: &str) -> String {
     let latin = |c: char| {
         let mut pairs = LOOK_ALIKE
@@ -82,7 +85,8 @@ pub fn team_key(name: &str) -> String {
         .filter(|c| !c.is_whitespace() && !is_invisible(*c))
         .flat_map(char::to_uppercase)
         .flat_map(char::to_lowercase)
-        .nfkc()
+        .nfkd()
+        .filter(|c| !is_combining_mark(*c))
         .map(latin)
         .collect()
 }
@@ -150,6 +154,10 @@ mod tests {
         for (alike, latin) in [("Sheаr", "shear"), ("ВОНR", "Bohr"), ("Cοsmo", "cosmo")] {
             assert_eq!(team_key(alike), team_key(latin));
         }
+        for alike in ["A1ice", "ALlCE", "Álice", "Alicé"] {
+            assert_eq!(team_key(alike), team_key("Alice"), "{alike}");
+        }
+        assert_eq!(team_key("h0st"), team_key("host"));
         assert_eq!(team_key("Космос"), team_key("КОСМОС"));
         assert_eq!(team_key("STRASSE é"), team_key("Straße e\u{301}"));
         assert_ne!(team_key("Team 1"), team_key("Team 2"));

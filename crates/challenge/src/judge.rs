@@ -11,7 +11,7 @@ use shearq_dataset::fingerprint;
 use shearq_dataset::layout::DataFolder;
 use shearq_dataset::run::{Source, kind_of};
 use shearq_dataset::threads::{Pool, Progress};
-use shearq_files::{FileError, names_of};
+use shearq_files::{FileError, atomic, names_of};
 use shearq_render::escape::line;
 use shearq_results::record::{RunRecord, SetRecord};
 use shearq_results::store;
@@ -222,6 +222,8 @@ impl Judge {
         progress: &mut dyn Progress,
     ) -> Result<Round, ChallengeError> {
         let _prepared = store::prepare(store)?;
+        // Two processes that count the entries of a team at the same time would both compare its last one.
+        let _held = atomic::hold(store)?;
         let known = self.entries(store)?;
         let mut round = Round::default();
         let pool = Pool::new(threads.min(sendings.len()).max(1))?;

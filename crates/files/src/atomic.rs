@@ -129,6 +129,16 @@ impl PartFolder {
     }
 }
 
+/// Waits until no other process holds the folder, and holds it until the result is dropped, so that what is read from it can
+/// decide what is written.
+pub fn hold(folder: &Path) -> Result<fs::File, FileError> {
+    let held =
+        fs::File::open(folder).map_err(FileError::doing(folder, "cannot open the folder"))?;
+    // File systems without locks have none that could be taken by others.
+    let _ = held.lock();
+    Ok(held)
+}
+
 /// A folder among the system's temporary ones that is removed when dropped, and that no other user can look into. If the
 /// process is killed, the next temporary folder removes it.
 #[derive(Debug)]

@@ -154,7 +154,7 @@ impl Tolerance {
 
     fn described(&self) -> String {
         format!(
-            "Moved: by more than {} standard errors of the paired difference, and by more than {} (m), {} (c), {} (α) or {} % of other metrics. Without an error, as of fewer than 8 images, the size decides",
+            "Counts as moved: by more than {} standard errors of the paired difference, and by more than {} (m), {} (c), {} (α) or {} % of other metrics. Without an error, as of fewer than 8 images, the size decides",
             self.sigma,
             self.m,
             self.c,
@@ -270,6 +270,20 @@ impl Units {
                     &new.about.total().rows,
                     &old.about.total().rows,
                     rows,
+                )?;
+                // Of a shear that varies the range depends on which galaxies count.
+                let truths = |about: &crate::bias::About| -> Vec<String> {
+                    let each = about.catalogues.iter().map(|own| own.constant());
+                    each.map(|shear| {
+                        shear.map_or("varying".into(), |[g1, g2]| format!("{g1:.6}, {g2:.6}"))
+                    })
+                    .collect()
+                };
+                same(
+                    "the true shears",
+                    &truths(&new.about),
+                    &truths(&old.about),
+                    |all| all.join("; "),
                 )?;
                 let difference = now.difference(before)?;
                 let (old, new, difference) = (old.all()?, new.all()?, difference.all()?);
@@ -474,6 +488,10 @@ impl CatalogueBaseline {
         };
         let text = toml::to_string(&baseline)
             .map_err(FileError::doing(path, "cannot write the baseline"))?;
+        let folder = path.parent().unwrap_or(path);
+        std::fs::create_dir_all(folder)
+            .map_err(FileError::doing(folder, "cannot make the folder"))?;
+        let _held = atomic::hold(folder)?;
         if !replace && path.exists() {
             return Err(super::Baseline::exists(path).into());
         }
