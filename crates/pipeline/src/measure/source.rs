@@ -259,9 +259,10 @@ fn too_small(stamp: usize, configuration: &Configuration) -> String {
     let needed = configuration.stamp.size;
     let mut lines = format!("  extends = \"{name}\"\n  stamp.size = {stamp}");
     if let Some(linear) = configuration.linear() {
-        // The linear method requires a window of at most a quarter of the stamp, and a PSF of the same parity.
-        let window = stamp as f64 / 4.0;
-        if linear.deconvolution.window_sigma > window {
+        // The linear method requires a window of at most a quarter of the stamp, and a PSF of the same parity. Light of galaxies is
+        // lost beyond a window of more than a fifth of it, and one of 3/16 is that of docs/limitations.md.
+        if linear.deconvolution.window_sigma > stamp as f64 / 5.0 {
+            let window = stamp as f64 * 3.0 / 16.0;
             lines += &format!("\n  deconvolution.window_sigma = {window}");
         }
         if configuration.psf.size % 2 != stamp % 2 {
