@@ -27,7 +27,7 @@ BOUND = 2.15105
 
 def record(name, catalogues, options):
     for snr in SNRS:
-        versions = sorted(str(path) for path in (Path(catalogues) / f"sn{snr}").iterdir())
+        versions = sorted(str(path) for path in (Path(catalogues) / f"sn{snr}").glob("*"))
         if len(versions) != VERSIONS:
             sys.exit(f"error: {catalogues}/sn{snr}: found {len(versions)} catalogues, expected {VERSIONS}")
         target = FOLDER / name

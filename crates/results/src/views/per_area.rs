@@ -41,7 +41,7 @@ pub fn add_per_area(table: &mut Table, result: &BiasResult, area: f64) {
     }
     table.notes.push(match of_unit {
         true => format!(
-            "Per area: {area} arcmin² of each catalogue. σ·√arcmin² is the error of a shear component from 1 arcmin², by the scatter of c between images; n_eff galaxies per arcmin² with a shape noise of {SHAPE_NOISE} and no measurement noise have the same. Give no rotated versions: their shapes cancel in c."
+            "Per area: {area} arcmin² of each catalogue. σ·√arcmin² is the error of a shear component from 1 arcmin², by the scatter of c between images; n_eff galaxies per arcmin² with a shape noise of {SHAPE_NOISE} and no measurement noise have the same. Give neither rotated versions nor those of opposite noise, of which shapes or noise cancel in c."
         ),
         false => "Per area: the error of a shear needs images as units. Try: --units catalogues".into(),
     });
