@@ -7,83 +7,42 @@ mod files;
 mod maps;
 mod model;
 mod mosaic;
+mod plan;
 mod positions;
 mod psfs;
+mod request;
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use serde::Serialize;
 use shearq_measure::{Examination, PixelFrame, Warning};
+use shearq_quantities::Frame;
 use shearq_quantities::linear::Matrix2;
-use shearq_quantities::statistics::upper_median;
-use shearq_quantities::{Frame, Jacobian};
 
 pub use self::array::{GatheredPixels, HeaderPixels, is_aligned, pixel_difference};
-use self::exposure::Exposure;
-pub(crate) use self::exposure::subpixel_offset;
 pub use self::files::{Content, Files};
-use self::files::{Images, shown};
 use self::model::Chip;
-use self::mosaic::{Origins, Rows, StampWriter, already};
+use self::mosaic::{Rows, StampWriter, already};
+use self::plan::Plan;
 pub use self::positions::Table;
-use self::positions::{Positions, rows_of_stamps};
+use self::positions::rows_of_stamps;
 use self::psfs::{GatheredPsfs, PsfFile, gather_psfs};
+pub use self::request::{Gathering, Masks, Square, Stamps};
 use super::PipelineError;
 use super::measure::check_strip;
 use crate::stamp_table::{self, Head, StampTable};
-use crate::wcs::{Wcs, aligned};
+use crate::wcs::Wcs;
 use shearq_dataset::grid::Mosaic;
 use shearq_dataset::images::ImageId;
-use shearq_dataset::layout::{DataFolder, MAX_STAMP};
+use shearq_dataset::layout::DataFolder;
 use shearq_files::FileError;
 use shearq_files::atomic;
 use shearq_files::frames::{self, polars::Column};
 use shearq_files::open::is_there;
-use shearq_files::table;
 
-// Most stamps of one image: one per galaxy of the largest grid.
-const MAX_STAMPS: usize = table::MAX_ROWS;
-// Least pixels a side of a single stamp that looks like a mosaic or an exposure: four times the default stamp.
-const LARGE_STAMP_PX: usize = 192;
-const SQUARE: &str =
-    "--square crop, which takes the central square; --square pad, which adds missing pixels; or ";
-const MOSAIC: &str = "--exposure with --positions, which cuts stamps out of an exposure. A mosaic is read as DATA/set01/galaxies-001.fits, with `stamp = SIDE` in DATA/layout.toml";
 // Largest difference of the median offset from the one pixel between positions from 0 and from 1. Chosen by hand.
 const MAX_ORIGIN_MISMATCH_PX: f64 = 0.5;
-
-#[derive(Debug, Clone, Serialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Stamps<'a> {
-    /// FITS files, each with one stamp, a cube of them, or several extensions with either. Stamps smaller than the largest get
-    /// missing pixels around them.
-    Files(Files<'a>),
-    Cutouts {
-        exposure: Files<'a>,
-        /// Table with the positions, in pixels or in degrees on the sky.
-        positions: Table<'a>,
-        /// Coordinate of the centre of the first pixel in the table, 0 or 1.
-        first_pixel: u8,
-        side: usize,
-    },
-}
-
-impl<'a> Stamps<'a> {
-    fn positions(&self) -> Option<Table<'a>> {
-        match self {
-            Stamps::Files(_) => None,
-            Stamps::Cutouts { positions, .. } => Some(*positions),
-        }
-    }
-
-    /// Coordinate of the centre of the first pixel in catalogues.
-    fn first_pixel(&self) -> u8 {
-        match self {
-            Stamps::Files(_) => 1,
-            Stamps::Cutouts { first_pixel, .. } => *first_pixel,
-        }
-    }
-}
 
 #[derive(Debug)]
 pub struct Gathered {
@@ -91,51 +50,6 @@ pub struct Gathered {
     /// Stamps with pixels that are beyond the exposure, masked, or not finite in their file.
     pub incomplete: usize,
     pub messages: Vec<String>,
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "kebab-case")]
-pub enum Square {
-    Crop,
-    /// By missing pixels around them. PSFs, which may not lack pixels, are cropped.
-    Pad,
-}
-
-/// Masks, whose pixels are bad if they are not zero or have a bit that is asked for.
-#[derive(Debug, Clone, Copy, Serialize)]
-pub struct Masks<'a> {
-    #[serde(flatten)]
-    pub files: Files<'a>,
-    /// Sum of the powers of two of the bits.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub bits: Option<u64>,
-}
-
-#[derive(Debug, Clone, Serialize)]
-pub struct Gathering<'a> {
-    pub stamps: Stamps<'a>,
-    /// Table of the identities and places of stamps of files.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub rows: Option<Table<'a>>,
-    /// What stamps and PSFs of files that are not square become; without it they are refused.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub square: Option<Square>,
-    pub masks: Option<Masks<'a>>,
-    /// One PSF, one per stamp, or stars to average.
-    pub psfs: Files<'a>,
-    /// Pixels of the PSF images along a pixel of the galaxies.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub psf_oversampling: Option<usize>,
-    pub noise: Option<f64>,
-    /// Maps of the variance of pixels, or of its inverse.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub variances: Option<Files<'a>>,
-    /// Electrons per unit of the image, for the Poisson noise of galaxies.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub gain: Option<f64>,
-    /// The axes of ellipticities; the sky's if the WCS has other axes than the pixels, unless it is given.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    pub frame: Option<Frame>,
 }
 
 #[derive(Serialize)]
@@ -352,12 +266,7 @@ fn prepare(
         Some(jacobians) => messages.push(frame_line(jacobians)),
         None => messages.extend(plan.stack.differs.clone()),
     }
-    let &Stack {
-        count,
-        side,
-        ref wcs,
-        ..
-    } = &plan.stack;
+    let (count, side, wcs) = (plan.stack.count, plan.stack.side, &plan.stack.wcs);
     let rows = gathering.rows.map(|rows| rows_of_stamps(rows, count));
     let rows = rows.transpose()?;
     let mosaic = Mosaic::of(count, side);
@@ -465,315 +374,6 @@ fn remove_leftovers(data: &DataFolder, id: ImageId) -> Result<(), FileError> {
         fs::remove_file(&path).map_err(FileError::doing(&path, "cannot remove the leftover"))?;
     }
     Ok(())
-}
-
-// Sizes and positions of all stamps are checked before the first one is written.
-struct Plan {
-    /// Where they are cut out of an exposure.
-    positions: Option<Positions>,
-    /// Whether these are on the exposure.
-    inside: Vec<bool>,
-    stack: Stack,
-    messages: Vec<String>,
-}
-
-impl Plan {
-    fn of(stamps: &Stamps<'_>, square: Option<Square>, chips: bool) -> Result<Self, FileError> {
-        match stamps {
-            Stamps::Files(files) => Plan::of_files(*files, square),
-            Stamps::Cutouts {
-                exposure,
-                positions,
-                first_pixel,
-                side,
-            } => Plan::of_cutouts(*exposure, *positions, (*first_pixel, *side), chips),
-        }
-    }
-
-    fn places(&self) -> &[(f64, f64)] {
-        self.positions.as_ref().map_or(&[], |found| &found.all)
-    }
-
-    /// Jacobians of the stamps, of those whose header has a WCS.
-    fn pixels(&self) -> Vec<Option<Matrix2>> {
-        match &self.positions {
-            Some(found) => {
-                let each = found.all.iter();
-                each.map(|&(x, y)| self.stack.wcs.jacobian([x, y]))
-                    .collect()
-            }
-            None => self.stack.pixels(),
-        }
-    }
-
-    // `None` if ellipticities stay on the pixel axes, as `frame` says, or without it the WCS.
-    fn jacobians(
-        &self,
-        gathering: &Gathering<'_>,
-        frame: Option<Frame>,
-    ) -> Result<Option<Vec<Matrix2>>, FileError> {
-        let files = match &gathering.stamps {
-            Stamps::Files(files)
-            | Stamps::Cutouts {
-                exposure: files, ..
-            } => files,
-        };
-        let fault = |message: String| Err(FileError::new(&files.paths[0], message));
-        if frame == Some(Frame::Pixel) {
-            return Ok(None);
-        }
-        let all: Option<Vec<Matrix2>> = self.pixels().into_iter().collect();
-        let Some(all) = all else {
-            if let Some(error) = self.stack.wcs.fault() {
-                return fault(format!(
-                    "{error}. Try: --frame pixel, for ellipticities along the pixel axes"
-                ));
-            }
-            let expected = "and the header has no WCS (expected TAN, TAN-SIP, TPV or a linear one)";
-            return match (frame, gathering.frame) {
-                (Some(Frame::Sky), Some(_)) => fault(format!("--frame is sky, {expected}")),
-                (Some(Frame::Sky), None) => fault(format!(
-                    "the exposures have different pixels on the sky, {expected}. Try: a header with a WCS, or --frame pixel, for ellipticities along the pixel axes of each exposure"
-                )),
-                _ => Ok(None),
-            };
-        };
-        // Pixels that are already along the sky need no Jacobians, which take time in each measurement.
-        let plain = all.iter().all(aligned);
-        if plain && frame.is_none() {
-            return Ok(None);
-        }
-        if let Some(kind) = self.stack.wcs.unread() {
-            return fault(format!(
-                "the WCS is {kind} (expected TAN, TAN-SIP, TPV or a linear one), so that the pixels on the sky are not known. Try: --frame pixel, for ellipticities along the pixel axes"
-            ));
-        }
-        for (row, jacobian) in all.iter().enumerate() {
-            if let Err(error) = Jacobian::new(*jacobian) {
-                let row = row + 1;
-                return fault(format!(
-                    "the WCS has no inverse at stamp {row}: {error}. Try: --frame pixel, or correct the header"
-                ));
-            }
-        }
-        Ok(Some(all))
-    }
-
-    fn columns(
-        self,
-        head: Head,
-        mosaic: &Mosaic,
-        writer: &mut StampWriter,
-        jacobians: Option<&[Matrix2]>,
-    ) -> Vec<Column> {
-        let mut columns = Vec::new();
-        let real = |name: &str, values: Vec<f64>| Column::new(name.into(), values);
-        if let Some(found) = self.positions {
-            columns.extend(found.id);
-            // Catalogues have the positions as the user counts them, so that rows match the input.
-            let shift = f64::from(head.first_pixel) - 1.0;
-            let (x, y) = found
-                .all
-                .iter()
-                .map(|(x, y)| (x + shift, y + shift))
-                .unzip();
-            let places = [x, y].into_iter().chain(found.sky.into_iter().flatten());
-            let named = stamp_table::PLACE.into_iter().zip(places);
-            columns.extend(named.map(|(name, values)| real(name, values)));
-            columns.extend(found.carried);
-        }
-        if let Some(mut levels) = writer.levels.take() {
-            // A stamp without pixels has no level. Any positive one will do, because its galaxy is flagged.
-            let mut known: Vec<f64> = levels.iter().copied().filter(|v| v.is_finite()).collect();
-            let typical = upper_median(&mut known).unwrap_or(0.0);
-            levels
-                .iter_mut()
-                .filter(|v| v.is_nan())
-                .for_each(|v| *v = typical);
-            columns.push(real(stamp_table::NOISE, levels));
-        }
-        if let Some(all) = jacobians {
-            for (at, name) in stamp_table::JACOBIAN.into_iter().enumerate() {
-                columns.push(real(name, all.iter().map(|j| j[at / 2][at % 2]).collect()));
-            }
-        }
-        let tiles = (0..mosaic.galaxies).map(|place| mosaic.position(place));
-        let (tile_x, tile_y) = tiles.unzip();
-        let Origins { file, image, plane } = std::mem::take(&mut writer.origins);
-        let [x, y, of_file, of_image, of_plane] = stamp_table::ORIGIN;
-        columns.extend([real(x, tile_x), real(y, tile_y)]);
-        columns.push(Column::new(of_file.into(), file));
-        columns.push(Column::new(of_image.into(), image));
-        columns.push(Column::new(of_plane.into(), plane));
-        columns
-    }
-
-    fn of_files(files: Files<'_>, square: Option<Square>) -> Result<Self, FileError> {
-        let (stack, mut messages) = Stack::of(files, square)?;
-        let side = stack.side;
-        if stack.count == 1 && side >= LARGE_STAMP_PX {
-            messages.push(format!(
-                "warning: {}: the only stamp is {side} × {side} px, which looks like a mosaic of stamps or an exposure. Try: {MOSAIC}",
-                files.paths[0].display()
-            ));
-        }
-        Ok(Plan {
-            positions: None,
-            inside: Vec::new(),
-            stack,
-            messages,
-        })
-    }
-
-    fn of_cutouts(
-        exposure: Files<'_>,
-        positions: Table<'_>,
-        (first_pixel, side): (u8, usize),
-        is_chip: bool,
-    ) -> Result<Self, FileError> {
-        let path = &exposure.paths[0];
-        let mut exposure = Exposure::open(exposure)?;
-        let wcs = exposure.wcs()?;
-        let mut messages: Vec<String> = exposure.note.take().into_iter().collect();
-        messages.extend(exposure.is_asinh()?.then(|| asinh_line(path)));
-        messages.extend(exposure.differs_from_datasum()?.then(|| sum_line(path)));
-        let positions = Positions::read(positions, path, &wcs, first_pixel)?;
-        messages.extend(positions.note.clone());
-        messages.extend(doubts(path, &wcs));
-        let sides = exposure.sides()?;
-        let inside = positions.inside(sides);
-        // Most galaxies of a camera are on other chips.
-        if !is_chip || inside.iter().any(|inside| *inside) {
-            messages.extend(positions.examine(path, &wcs, sides)?);
-        }
-        Ok(Plan {
-            stack: Stack {
-                count: positions.all.len(),
-                side,
-                wcs,
-                of_images: Vec::new(),
-                differs: None,
-            },
-            inside,
-            positions: Some(positions),
-            messages,
-        })
-    }
-}
-
-struct Stack {
-    count: usize,
-    side: usize,
-    /// Of the first image.
-    wcs: Wcs,
-    /// Jacobians of images with several stamps each, with the numbers of stamps.
-    of_images: Vec<(usize, Option<Matrix2>)>,
-    /// A warning if an image has other pixels than the first one.
-    differs: Option<String>,
-}
-
-impl Stack {
-    /// Jacobians of the stamps.
-    fn pixels(&self) -> Vec<Option<Matrix2>> {
-        let each = self.of_images.iter();
-        let each = each.flat_map(|&(count, jacobian)| std::iter::repeat_n(jacobian, count));
-        each.collect()
-    }
-
-    fn of(files: Files<'_>, square: Option<Square>) -> Result<(Self, Vec<String>), FileError> {
-        let (mut count, mut first, mut messages) = (0usize, None, Vec::new());
-        let (mut of_images, mut differs) = (Vec::new(), None);
-        let mut sides = [0; 2];
-        let mut images = Images::of(files);
-        while let Some((origin, image)) = images.next()? {
-            let (width, height) = (image.width(), image.height());
-            if width.max(height) > MAX_STAMP || width != height && square.is_none() {
-                let advice = match files.content {
-                    Content::Sky if width.max(height) < LARGE_STAMP_PX => {
-                        format!(". Try: {SQUARE}{MOSAIC}")
-                    }
-                    Content::Sky => format!(". Try: {MOSAIC}"),
-                    Content::Psf if width.max(height) <= MAX_STAMP => {
-                        ". Try: --square crop, which takes the central square".to_owned()
-                    }
-                    _ => String::new(),
-                };
-                let message = format!(
-                    "the stamp is {width} × {height} pixels; expected a square of at most {MAX_STAMP}{advice}"
-                );
-                return Err(origin.fault(&message));
-            }
-            let side = match (files.content, square) {
-                (Content::Sky, Some(Square::Pad)) => width.max(height),
-                _ => width.min(height),
-            };
-            let wcs = Wcs::of_header(image)?;
-            if first.is_none() {
-                messages.extend(doubts(origin.file, &wcs));
-                messages.extend(image.is_asinh().then(|| asinh_line(origin.file)));
-                messages.extend(image.differs_from_datasum()?.then(|| sum_line(origin.file)));
-            }
-            let centre = [width, height].map(|side| (side as f64 + 1.0) / 2.0);
-            of_images.push((image.planes(), wcs.jacobian(centre)));
-            let (expected, first_wcs) = &*first.get_or_insert_with(|| (side, wcs.clone()));
-            let expected = *expected;
-            if side != expected && files.content == Content::Psf {
-                let message = format!(
-                    "the stamp is {width} × {height} pixels; the first has {expected} × {expected}"
-                );
-                return Err(origin.fault(&message));
-            }
-            sides = match sides {
-                [0, 0] => [side; 2],
-                [least, most] => [side.min(least), side.max(most)],
-            };
-            if differs.is_none() && Wcs::disagreements(&wcs, first_wcs).next().is_some() {
-                let message = "the header states other pixel axes or another pixel scale than that of the first image, so that ellipticities are not along the same axes. Try: one orientation per image (--image)";
-                differs = Some(format!("warning: {}", origin.fault(message)));
-            }
-            count += image.planes();
-            if count > MAX_STAMPS {
-                return Err(origin.fault(&format!("there are more than {MAX_STAMPS} stamps")));
-            }
-        }
-        // Clap requires a file, so that the default is never used.
-        let (_, wcs) = first.unwrap_or_default();
-        let [least, side] = sides;
-        if least < side {
-            messages.push(format!(
-                "note: {}: the stamps have sides of {least} to {side} px. Smaller ones get missing pixels around them, to {side} px",
-                files.paths[0].display()
-            ));
-        }
-        let stack = Stack {
-            count,
-            side,
-            wcs,
-            of_images,
-            differs,
-        };
-        Ok((stack, messages))
-    }
-}
-
-// Astropy keeps the key when it writes other pixels, so that it is no error.
-fn sum_line(path: &Path) -> String {
-    format!(
-        "note: {}: the pixels differ from the checksum DATASUM of the header: they are damaged, or a program changed them and kept the key",
-        path.display()
-    )
-}
-
-fn asinh_line(path: &Path) -> String {
-    format!(
-        "note: {}: the pixels are asinh magnitudes (BSOFTEN), which are converted to fluxes",
-        path.display()
-    )
-}
-
-fn doubts(path: &Path, wcs: &Wcs) -> impl Iterator<Item = String> {
-    let doubts = wcs.doubts().iter();
-    doubts.map(move |doubt| format!("warning: {}: {doubt}", path.display()))
 }
 
 // A user who did not ask for a frame must learn that the components differ from those on the pixels.

@@ -28,6 +28,16 @@ const STAMP_TABLE_FRAME: &str = "frame";
 const STAMP_TABLE_FIRST_PIXEL: &str = "first_pixel";
 const GAIN: &str = "gain";
 
+/// First pixel, from 0, of the `side` pixels whose middle is nearest to a position in FITS pixels.
+pub(crate) fn first_pixel(at: f64, side: usize) -> i64 {
+    (at - (side as f64 + 1.0) / 2.0).round() as i64
+}
+
+/// A position on the square that is cut around it, from the centre.
+pub(crate) fn subpixel_offset((x, y): (f64, f64), side: usize) -> [f64; 2] {
+    [x, y].map(|at| at - (side as f64 + 1.0) / 2.0 - first_pixel(at, side) as f64)
+}
+
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(crate) struct Head {
     pub(crate) frame: Frame,

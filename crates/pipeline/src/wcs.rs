@@ -9,7 +9,7 @@ use shearq_files::fits::{ImageReader, Value};
 use shearq_measure::{PixelFrame, Warning};
 use shearq_quantities::linear::{Matrix2, determinant};
 
-pub(crate) use self::header::Keys;
+pub(crate) use self::header::{Keys, Wcs};
 use self::map::{Map, Projection, regular_inverse};
 
 // Keys of the matrix from pixels to the sky.
@@ -20,18 +20,6 @@ const MIN_PIXEL_DIFFERENCE: f64 = 0.01;
 // 4e-4 of g2 to g1, and 1e-4 to c: less than what calibrations reach.
 const ALIGNED_DEGREES: f64 = 0.01;
 const ALIGNED_SHEAR: f64 = 1e-4;
-#[derive(Debug, Clone, Default, PartialEq)]
-pub(crate) struct Wcs {
-    /// Arcseconds per pixel.
-    scale: Option<f64>,
-    map: Option<Map>,
-    /// CTYPE1 if it is a projection that is not read: only the matrix is used then.
-    unread: Option<String>,
-    /// What is wrong with the numbers, if they give no map.
-    damage: Option<String>,
-    /// What of the header is used against its name, or not used.
-    doubts: Vec<String>,
-}
 
 impl Wcs {
     pub(crate) fn of_header(image: &mut ImageReader) -> Result<Self, FileError> {

@@ -4,19 +4,19 @@
 //! [`Summed::result`] estimates.
 
 mod cells;
+mod error;
 mod like;
 mod partners;
 
 use std::collections::{BTreeSet, HashMap, HashSet};
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use serde::{Deserialize, Serialize};
 use shearq_bias::{
     BiasError, Catalogue, Design, Estimate, Grouping, Layout, Range, UnitSums, difference, group,
-    same_galaxies,
 };
 use shearq_catalogue::columns::{CATALOGUES, Role, Shapes};
-use shearq_catalogue::request::{Input, MAX_BINS, Request, Units};
+use shearq_catalogue::request::{Input, Request, Units};
 use shearq_catalogue::rows::{distinct, rows};
 use shearq_catalogue::source::{Reading, Source, difference as different_columns, sources};
 use shearq_catalogue::steps::with_sheared_files;
@@ -25,128 +25,15 @@ use shearq_dataset::fingerprint::{GALAXIES, verify_source};
 use shearq_dataset::metadata::{CATALOGUE_FRAME, CommonAxes, axes_of};
 use shearq_dataset::run::Run;
 use shearq_dataset::threads::ALL_CORES;
-use shearq_dataset::truth::{Sign, SignBasis, stated_sign, word};
+use shearq_dataset::truth::{Sign, stated_sign};
 use shearq_files::FileError;
 use shearq_files::table::{self, FileFormat};
 use shearq_scoring::TruthSign;
-use thiserror::Error;
 
 pub use cells::{Axis, Cells};
+pub use error::BiasFailure;
 pub use like::Population;
 use partners::Partners;
-
-#[derive(Debug, Error)]
-#[non_exhaustive]
-pub enum BiasFailure {
-    #[error(transparent)]
-    File(#[from] FileError),
-    #[error(transparent)]
-    Bias(#[from] BiasError),
-    #[error("there is no catalogue")]
-    NoCatalogue,
-    /// All rows have the same value in the column that names units, such as one patch or tile.
-    #[error("{0}. Try: --units rows")]
-    OneUnit(BiasError),
-    #[error("--truth-sign: the data of these folders state the sign of g2. Try: omit --truth-sign")]
-    SignOfFolders,
-    #[error("{}: it does not state the same sign of g2 as {}. Try: --truth-sign, or the same statement in all", catalogue.display(), first.display())]
-    Signs { catalogue: PathBuf, first: PathBuf },
-    #[error("{}: its columns are not the columns of {} (found {}). Try: --columns with the same columns for all, or one command per kind of catalogue", catalogue.display(), first.display(), difference)]
-    Columns {
-        catalogue: PathBuf,
-        first: PathBuf,
-        difference: String,
-    },
-    #[error(
-        "{second}: it was measured on the same image as {first} (expected one catalogue of each image). Try: leave one out, or measure again if it is a copy"
-    )]
-    SameImage { first: String, second: String },
-    #[error("the sums do not belong together: they have different {0}")]
-    Unlike(&'static str),
-    #[error(
-        "the sums do not belong together (found {0}). Try: the same columns and options for all"
-    )]
-    UnlikeColumns(String),
-    #[error(
-        "{second}: it contains the same galaxies as {first}, which would count twice (expected other galaxies). Try: each catalogue once, also of tasks that were repeated"
-    )]
-    SameContent { first: String, second: String },
-    #[error("{0}: the catalogue is in two files of sums")]
-    InTwoFiles(String),
-    #[error(
-        "--bins: `{of}` has {different} different values (expected more for {bins} bins with equally many galaxies). Try: --bins '{of}' for a bin per value, or edges"
-    )]
-    FewValues {
-        of: String,
-        bins: usize,
-        different: usize,
-    },
-    #[error(
-        "--bins: `{of}` has more than {MAX_BINS} different values (expected a bin per value). Try: --bins '{of}:5', or edges"
-    )]
-    ManyValues { of: String },
-    #[error("--bins: found {0} bins of all quantities together, expected at most {MAX_BINS}")]
-    ManyBins(usize),
-    #[error("--bins: no galaxy that counts has {0}. Try: other edges")]
-    EmptyBin(String),
-    #[error(
-        "--paired needs the same galaxies under several test shears (found the design {}). Try: --design shears if they are the same",
-        .0.name()
-    )]
-    NothingPairs(Design),
-    #[error(
-        "--paired: the galaxies of sheared catalogues are detected again in each, and have no partner in another (expected responses in columns). Try: omit --paired; each test shear then has its own response"
-    )]
-    PairedSheared,
-    #[error("--like needs bins of both catalogues. Try: --bins 'snr:10' --bins 'size:5'")]
-    LikeWithoutBins,
-    #[error("{}: no galaxy of the survey is in a bin with simulated galaxies", .0.display())]
-    NothingAlike(PathBuf),
-    #[error("the catalogues cannot be compared: truth or bins differ. Try: bins with edges")]
-    BinsDiffer,
-    #[error("the catalogues cannot be compared: e2 of one follows the true g2 of sign {}, of the other {}. Try: --truth-sign", word(*.0), word(*.1))]
-    SignsDiffer(TruthSign, TruthSign),
-    #[error(
-        "the catalogues cannot be compared (found {own} beside {other}, expected the same images in the same order on both sides)"
-    )]
-    ImagesDiffer { own: String, other: String },
-    #[error("the catalogues cannot be compared (found {} with {} and {} with {}, expected the same design and units). Try: --design and --units", .0.0.name(), .0.1, .1.0.name(), .1.1)]
-    DesignsDiffer((Design, &'static str), (Design, &'static str)),
-    #[error(
-        "no galaxy can be used (found {} rows: {} with a flag, {} with a weight of zero or less, {} not selected, {} with missing numbers, {} with failed measurements, {} with a distortion above 1)",
-        .0.rows, .0.flagged, .0.unweighted, .0.unselected, .0.missing, .0.failed, .0.above_one
-    )]
-    NoGalaxy(Box<Catalogue>),
-    #[error(
-        "{rows} of {used} rows have |e| above 2, so that e1 and e2 are no ellipticities (expected moduli below 1). Try: --columns with their names, or with the responses R11 and R22 of ellipticities in other units"
-    )]
-    Beyond { rows: u64, used: u64 },
-    #[error("e{component} is {value} in all {rows} rows (expected different values)")]
-    Constant {
-        component: usize,
-        value: f64,
-        rows: u64,
-    },
-    /// The responses of e1 to g1 and of e2 to g2.
-    #[error(
-        "e1 follows the true g2, and e2 the true g1 (found slopes of {:.3} and {:.3} on the own component, expected about 1): e1 and e2 are probably exchanged. Try: --columns with the names exchanged", .0[0], .0[1]
-    )]
-    Exchanged([f64; 2]),
-    #[error(
-        "e1 follows minus the true g1 (found a slope of {0:.3}, expected about 1). Try: check the sign of the truth"
-    )]
-    MinusG1(f64),
-    #[error("e2 follows minus the true g2 (found a slope of {response:.3}, expected about 1). Try: {}", other_sign(*sign))]
-    MinusG2 { response: f64, sign: Option<Sign> },
-    #[error(
-        "the ellipticities do not follow the true shear (found slopes of {:.3} and {:.3}, expected about 1). Try: check the order of the rows and of e1 and e2, whether the mean was subtracted, or join by id", .0[0], .0[1]
-    )]
-    Unrelated([f64; 2]),
-    #[error(
-        "the ellipticities look like distortions (found slopes of {:.3} and {:.3}, expected about 1). Try: --ellipticity distortion, or --ellipticity shear to keep them", .0[0], .0[1]
-    )]
-    Distortions([f64; 2]),
-}
 
 /// What sums of catalogues are sums of.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -994,27 +881,6 @@ fn are_exchanged(all: &Estimate, ratio: Option<f64>) -> bool {
         let clear = SIGNIFICANT * m.error;
         like && m.value.abs() > clear.max(BIASED) && (2.0 + m.value).abs() > clear
     })
-}
-
-fn other_sign(sign: Option<Sign>) -> String {
-    match sign {
-        None
-        | Some(Sign {
-            basis: SignBasis::Zero,
-            ..
-        }) => "--truth-sign challenge (of folders: truth_sign in layout.toml of the data)".into(),
-        Some(sign) if sign.basis == SignBasis::Stated => format!(
-            "check the sign of e2, or the statement `{}` in the truth",
-            word(sign.of)
-        ),
-        Some(sign) => format!(
-            "check the sign of e2, or --truth-sign {}",
-            word(match sign.of {
-                TruthSign::Standard => TruthSign::Challenge,
-                TruthSign::Challenge => TruthSign::Standard,
-            })
-        ),
-    }
 }
 
 // Refuses ellipticities that follow minus the true shear, or do not follow it, and distortions without responses. `ratio`

@@ -7,9 +7,9 @@ use shearq_files::FileError;
 use shearq_measure::Warning;
 use shearq_quantities::linear::Matrix2;
 
-use super::Stack;
 use super::files::{Content, Files, PlaneReader};
 use super::mosaic::central;
+use super::plan::Stack;
 use crate::wcs::{self, Keys, Wcs};
 
 /// Square images of a file.

@@ -4,6 +4,7 @@ use shearq_files::fits::{ImageHead, ImageReader, Pixel, image_heads};
 use shearq_files::{FileError, names_of};
 
 use super::files::{Content, Files, Images, Origin};
+use crate::stamp_table::first_pixel;
 use crate::wcs::Wcs;
 
 /// One image of a file, to cut squares out of.
@@ -137,14 +138,4 @@ fn check_one(files: &Files<'_>) -> Result<Option<String>, FileError> {
         path.display(),
         names[1]
     )))
-}
-
-/// First pixel, from 0, of the `side` pixels whose middle is nearest to a position in FITS pixels.
-fn first_pixel(at: f64, side: usize) -> i64 {
-    (at - (side as f64 + 1.0) / 2.0).round() as i64
-}
-
-/// A position on the square that is cut around it, from the centre.
-pub(crate) fn subpixel_offset((x, y): (f64, f64), side: usize) -> [f64; 2] {
-    [x, y].map(|at| at - (side as f64 + 1.0) / 2.0 - first_pixel(at, side) as f64)
 }

@@ -8,10 +8,11 @@ use shearq_files::FileError;
 use shearq_files::fits::{ImageWriter, Pixel, Value};
 use shearq_measure::{Examination, examined_rows};
 
-use super::exposure::{Exposure, subpixel_offset};
+use super::exposure::Exposure;
 use super::files::{Content, Files, Origin, PlaneReader};
 use super::maps::{another, level, lose, variance};
-use super::{Gathering, Stamps};
+use super::request::{Gathering, Stamps};
+use crate::stamp_table::subpixel_offset;
 use crate::wcs::Wcs;
 
 pub(super) struct StampWriter {

@@ -44,7 +44,7 @@ const OTHER_GALAXY_PX: f64 = 3.0;
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize)]
 pub struct Table<'a> {
     /// The file, with `[TABLE]` behind its name if one of its tables is meant.
-    #[serde(serialize_with = "super::shown")]
+    #[serde(serialize_with = "super::files::shown")]
     pub path: &'a Path,
     /// Name or number of the table of a FITS file.
     pub table: Option<&'a str>,

@@ -15,7 +15,8 @@ use shearq_submissions::limits::MIN_PSF;
 use super::files::PlaneReader;
 use super::model::{Chip, PsfModel};
 use super::mosaic::{Rows, central, first};
-use super::{Gathering, Plan, Stack};
+use super::plan::{Plan, Stack};
+use super::request::Gathering;
 use crate::wcs::Wcs;
 
 // Central pixels of a PSF that are examined, along each axis: those that configurations use.

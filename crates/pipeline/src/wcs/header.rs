@@ -6,7 +6,6 @@ use std::collections::{BTreeMap, BTreeSet};
 use shearq_files::names_of;
 use shearq_quantities::linear::{Matrix2, determinant};
 
-use super::Wcs;
 use super::map::{ARCSEC_PER_RADIAN, Map, Polynomial, Projection};
 
 // Keys with the pixel scale in arcseconds: of surveys, and of GalSim.
@@ -152,6 +151,20 @@ fn arcsec_of(unit: &str, gs_plane: bool) -> Option<f64> {
         "RAD" => ARCSEC_PER_RADIAN,
         _ => return None,
     })
+}
+
+/// What a header states of pixels on the sky.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(crate) struct Wcs {
+    /// Arcseconds per pixel.
+    pub(super) scale: Option<f64>,
+    pub(super) map: Option<Map>,
+    /// CTYPE1 if it is a projection that is not read: only the matrix is used then.
+    pub(super) unread: Option<String>,
+    /// What is wrong with the numbers, if they give no map.
+    pub(super) damage: Option<String>,
+    /// What of the header is used against its name, or not used.
+    pub(super) doubts: Vec<String>,
 }
 
 impl Wcs {

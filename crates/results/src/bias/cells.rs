@@ -11,7 +11,7 @@ use shearq_files::FileError;
 use shearq_files::frames::polars::DataFrame;
 use shearq_files::table;
 
-use super::BiasFailure;
+use super::error::BiasFailure;
 
 /// Half-open bins of a quantity, which contain their lower edge.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

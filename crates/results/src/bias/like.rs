@@ -14,7 +14,8 @@ use shearq_files::FileError;
 use shearq_files::frames::polars::DataFrame;
 use shearq_files::table::{self, Place};
 
-use super::{BiasFailure, Cells};
+use super::cells::{Cells, key};
+use super::error::BiasFailure;
 
 /// Galaxies of a survey, or of one of its tomographic bins.
 #[derive(Debug, Clone)]
@@ -231,10 +232,7 @@ pub(super) fn populations(
     let mut all: Vec<_> = found.into_iter().collect();
     let order = |name: &Option<String>| {
         let name = name.as_ref()?;
-        Some((
-            name.parse::<f64>().map_or(u64::MAX, super::cells::key),
-            name.clone(),
-        ))
+        Some((name.parse::<f64>().map_or(u64::MAX, key), name.clone()))
     };
     all.sort_by_key(|(name, _)| order(name));
     let population = |(bin, (galaxies, weights)): (Option<String>, (u64, Vec<f64>))| Population {

@@ -2,12 +2,12 @@
 
 use std::collections::HashSet;
 
-use shearq_bias::{Catalogue, Design};
+use shearq_bias::{Catalogue, Design, same_galaxies};
 use shearq_catalogue::rows::rows;
 use shearq_catalogue::source::{Reading, Source};
 use shearq_files::FileError;
 
-use super::{BiasFailure, same_galaxies};
+use super::error::BiasFailure;
 
 /// The catalogues that contain the same galaxies. Their rows are read once more for each catalogue, so that memory contains the
 /// galaxies of one catalogue and not of all.
