@@ -174,7 +174,7 @@ impl BiasSums {
         .map_err(of_bias)
     }
 
-    /// Writes the estimates as the command line does: a plot (.png, .svg), a page (.html) with its `origin`, or a table (.csv, .md,
+    /// Writes the estimates as the command line does: a plot (.pdf, .png, .svg), a page (.html) with its `origin`, or a table (.csv, .md,
     /// .tex, .txt).
     fn save(
         &self,
@@ -189,7 +189,7 @@ impl BiasSums {
         let failed = |error: &dyn std::fmt::Display| PyOSError::new_err(error.to_string());
         let ending = path.extension().unwrap_or_default().to_string_lossy();
         let format = match ending.to_ascii_lowercase().as_str() {
-            "png" | "svg" => {
+            "pdf" | "png" | "svg" => {
                 return bias_plot(&result)
                     .save(&path)
                     .map_err(|error| failed(&error));
@@ -205,7 +205,7 @@ impl BiasSums {
             "txt" => TableFormat::Table,
             _ => {
                 return Err(PyValueError::new_err(format!(
-                    "path: found {:?}; expected a name that ends in .json, .html, .png, .svg, .csv, .md, .tex or .txt",
+                    "path: found {:?}; expected a name that ends in .json, .html, .pdf, .png, .svg, .csv, .md, .tex or .txt",
                     path.display().to_string()
                 )));
             }

@@ -59,7 +59,7 @@ pub(crate) struct Arguments {
     /// c1 0.001 and c2 -0.0005.
     #[arg(long, value_name = "DIR", exclusive = true)]
     example: Option<PathBuf>,
-    /// Plot m and c to this file, PNG or SVG by its ending.
+    /// Plot m and c to this file, PDF, PNG or SVG by its ending.
     #[arg(long, value_name = "FILE")]
     plot: Option<PathBuf>,
     /// Area of the image of each catalogue in arcmin²: also print detections per arcmin², the shear error of 1 arcmin² and the

@@ -67,7 +67,7 @@ pub(crate) struct Arguments {
     /// Metric or column to sort by, such as `q:desc`.
     #[arg(long, value_name = "FIELD[:desc]")]
     sort: Option<Order>,
-    /// Draw Q, calibrated Q and m of each set to this file (.png or .svg).
+    /// Draw Q, calibrated Q and m of each set to this file (.pdf, .png or .svg).
     #[arg(long, value_name = "FILE")]
     plot: Option<PathBuf>,
     #[command(flatten)]

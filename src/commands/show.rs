@@ -32,7 +32,7 @@ pub(crate) struct Arguments {
     /// Galaxy; INDEX counts from 1 along the rows of the grid. May be given several times.
     #[arg(long, value_name = "SET/IMAGE/INDEX", required = true)]
     galaxy: Vec<GalaxyId>,
-    /// File for the plot, .png or .svg.
+    /// File for the plot, .pdf, .png or .svg.
     #[arg(long, value_name = "FILE")]
     out: PathBuf,
 }

@@ -19,6 +19,7 @@ mod axis;
 mod canvas;
 mod colour;
 mod image;
+mod pdf;
 mod plot;
 
 pub use self::canvas::{Figure, FigureError, PictureFormat};

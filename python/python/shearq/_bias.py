@@ -84,7 +84,7 @@ class Bias(Result):
         return "Shear bias", [*names, "galaxies", *keys], rows, self.notes
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Writes the result as JSON (.json), as the command line's page (.html) or plot (.png, .svg), or as a table with all
+        """Writes the result as JSON (.json), as the command line's page (.html) or plot (.pdf, .png, .svg), or as a table with all
         columns (.csv, .md, .tex, .txt). A file of this name is replaced.
 
         Raises

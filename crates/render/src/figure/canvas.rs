@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 
+use ab_glyph::FontRef;
 use plotters::backend::DrawingBackend;
 use plotters::coord::Shift;
 use plotters::drawing::{DrawingArea, DrawingAreaErrorKind, IntoDrawingArea};
@@ -13,6 +14,7 @@ use plotters_bitmap::BitMapBackend;
 use plotters_svg::SVGBackend;
 use shearq_files::{FileError, atomic};
 
+use super::pdf;
 use crate::escape;
 
 // The em of a figure's title, in points.
@@ -39,7 +41,7 @@ const MAX_AREA: f64 = 5e6;
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum FigureError {
-    #[error("{}: found {found} as the figure's format; expected the extension `.png` or `.svg`", path.display())]
+    #[error("{}: found {found} as the figure's format; expected the extension `.pdf`, `.png` or `.svg`", path.display())]
     Extension { path: PathBuf, found: String },
     #[error(transparent)]
     File(#[from] FileError),
@@ -58,6 +60,8 @@ pub enum PictureFormat {
     Png,
     /// Shapes and text.
     Svg,
+    /// A page of shapes, texts among them.
+    Pdf,
 }
 
 impl PictureFormat {
@@ -67,6 +71,7 @@ impl PictureFormat {
         match extension.as_deref().map(str::to_ascii_lowercase).as_deref() {
             Some("png") => Ok(Self::Png),
             Some("svg") => Ok(Self::Svg),
+            Some("pdf") => Ok(Self::Pdf),
             other => Err(FigureError::Extension {
                 path: path.into(),
                 found: other.map_or("no extension".into(), |found| format!("`.{found}`")),
@@ -120,10 +125,16 @@ pub trait Figure: Sized {
                 draw_on(self, BitMapBackend::with_buffer(&mut rgb, size))?;
                 png(&rgb, size.0 as usize).map_err(failed)
             }
+            PictureFormat::Pdf => {
+                let font = FontRef::try_from_slice(DEJAVU_SANS).map_err(failed)?;
+                let mut page = pdf::Page::new(size, UNITS as f32, font);
+                draw_on(self, &mut page)?;
+                page.file(width, height).map_err(failed)
+            }
         }
     }
 
-    /// Writes the figure to `path`, as PNG or SVG by its extension.
+    /// Writes the figure to `path`, as PDF, PNG or SVG by its extension.
     fn save(&self, path: impl AsRef<Path>) -> Result<(), FigureError> {
         let path = path.as_ref();
         let bytes = self.render(PictureFormat::of(path)?)?;
@@ -193,15 +204,15 @@ const fn pos(h_pos: HPos, v_pos: VPos) -> Pos {
     Pos { h_pos, v_pos }
 }
 
+// Shipped, so that figures are the same on machines without fonts, and with ℓ, γ, σ and superscripts. An SVG file
+// names only the family, and its viewer chooses a font.
+pub(super) const DEJAVU_SANS: &[u8] = include_bytes!("../../fonts/DejaVuSans.ttf");
+
 pub(super) fn font(size: f64) -> TextStyle<'static> {
     const FAMILY: &str = "sans-serif";
-    // Shipped, so that figures are the same on machines without fonts, and with ℓ, γ, σ and superscripts. An SVG file
-    // names only the family, and its viewer chooses a font.
-    static DEJAVU_SANS: LazyLock<bool> = LazyLock::new(|| {
-        let font = include_bytes!("../../fonts/DejaVuSans.ttf");
-        register_font(FAMILY, FontStyle::Normal, font).is_ok()
-    });
-    LazyLock::force(&DEJAVU_SANS);
+    static REGISTERED: LazyLock<bool> =
+        LazyLock::new(|| register_font(FAMILY, FontStyle::Normal, DEJAVU_SANS).is_ok());
+    LazyLock::force(&REGISTERED);
     // `plotters` has the height of the line, 1.16 em in DejaVu Sans, in pictures, and 1.24 em in SVG.
     TextStyle::from((FAMILY, 1.2 * size * UNITS).into_font()).color(&INK)
 }
