@@ -347,8 +347,8 @@ fn tell_notes(notes: Vec<String>) {
     }
 }
 
-fn tell_unread(unread: Vec<String>) {
-    for line in unread {
+fn tell_unread(unread: Option<String>) {
+    if let Some(line) = unread {
         tell(format_args!("warning: {line}"));
     }
 }

@@ -1,5 +1,4 @@
-//! Files of numbered sets and images are found by listing folders, not by trying all numbers: any of a million may exist. Names
-//! that nearly match are reported, because a file that is skipped silently is a missing image in the result.
+//! Files of numbered sets and images are found by listing folders, not by trying all numbers: any of a million may exist.
 
 use std::collections::BTreeMap;
 use std::ffi::OsStr;
@@ -10,33 +9,15 @@ use std::path::{Component, Path, PathBuf};
 use shearq_files::FileError;
 use shearq_files::open::is_there;
 
-use crate::pattern::{IMAGE_PLACEHOLDERS, MAX_IMAGE, MAX_SET, SET_PLACEHOLDERS, fill};
+use crate::pattern::{IMAGE_PLACEHOLDERS, MAX_IMAGE, MAX_SET, SET_PLACEHOLDERS};
 
 /// Files found, by the numbers of set and image.
 #[derive(Debug, Default)]
 pub struct Files {
     /// `None` if the pattern has no set number, so that a file serves every set.
     by_set: BTreeMap<Option<u32>, BTreeMap<u32, Found>>,
-    /// Similar names that are not read, by reason.
-    unread: BTreeMap<Reason, Unread>,
-}
-
-// Why something that looks like a file of data is not read.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-enum Reason {
-    /// The name of a file does not follow the pattern.
-    File,
-    Folder,
-    /// Another file has the same numbers.
-    Second,
-}
-
-#[derive(Debug)]
-struct Unread {
-    first: PathBuf,
-    /// Name that the first one should have, or the file that is read instead.
-    expected: String,
-    count: usize,
+    /// The first of the files whose numbers another file has, with the file that is read instead, and how many there are.
+    unread: Option<(PathBuf, PathBuf, usize)>,
 }
 
 #[derive(Debug)]
@@ -87,35 +68,19 @@ impl Files {
         self.serve_all_sets() || self.by_set.contains_key(&Some(set))
     }
 
-    /// Similar names that are not read: a sentence for each reason, with the first name and their number.
-    pub fn unread(&self) -> Vec<String> {
-        let line = |(reason, unread): (&Reason, &Unread)| {
-            let Unread {
-                first,
-                expected,
-                count,
-            } = unread;
-            let name = first.file_name().unwrap_or_default().to_string_lossy();
-            let thing = match reason {
-                Reason::File | Reason::Second => "file",
-                Reason::Folder => "folder",
-            };
-            let others = match count - 1 {
-                0 => String::new(),
-                1 => format!(", like 1 other {thing}"),
-                more => format!(", like {more} other {thing}s"),
-            };
-            let place = first.display();
-            match reason {
-                Reason::File | Reason::Folder => format!(
-                    "{place}: this {thing} is not read{others}, because of its name (found {name}, expected {expected}). Try: rename it"
-                ),
-                Reason::Second => format!(
-                    "{place}: this {thing} is not read{others}, because {expected} is read instead. Try: remove one of them"
-                ),
-            }
+    /// A sentence about files that are not read, because another one has the same numbers.
+    pub fn unread(&self) -> Option<String> {
+        let (first, instead, count) = self.unread.as_ref()?;
+        let others = match count - 1 {
+            0 => String::new(),
+            1 => ", like 1 other file".to_owned(),
+            more => format!(", like {more} other files"),
         };
-        self.unread.iter().map(line).collect()
+        Some(format!(
+            "{}: this file is not read{others}, because {} is read instead. Try: remove one of them",
+            first.display(),
+            instead.file_name().unwrap_or_default().display()
+        ))
     }
 
     /// `sets`, or if empty all sets that have a file.
@@ -195,15 +160,12 @@ impl Search<'_> {
             }
             return Ok(());
         }
-        let shape_of_pattern = part.to_str().map(|part| shape(&fill(part, 1, 1)));
         for name in names(folder)? {
-            let mut follows = false;
             for (rank, ending) in endings.iter().enumerate() {
                 let Some(stem) = name.strip_suffix(ending) else {
                     continue;
                 };
                 for numbers in matches(&pattern, stem, numbers) {
-                    follows = true;
                     let other = |set| !self.sets.is_empty() && !self.sets.contains(&set);
                     if numbers.set.is_some_and(other) {
                         continue;
@@ -215,9 +177,6 @@ impl Search<'_> {
                         self.walk(&path, rest, numbers)?;
                     }
                 }
-            }
-            if !follows && Some(shape(&name)) == shape_of_pattern {
-                self.pass_over(folder.join(&name), &name, &pattern, !rest.is_empty());
             }
         }
         Ok(())
@@ -235,106 +194,10 @@ impl Search<'_> {
             Some(other) if found.rank < other.rank => (other.path, found),
             Some(other) => (found.path, other),
         };
-        let name = better.path.file_name().unwrap_or_default();
-        let name = name.to_string_lossy().into_owned();
+        let first = || (path, better.path.clone(), 0);
+        self.files.unread.get_or_insert_with(first).2 += 1;
         of_set.insert(image, better);
-        self.files.pass_over(Reason::Second, path, || name);
     }
-
-    fn pass_over(&mut self, path: PathBuf, name: &str, pattern: &[Piece<'_>], folder: bool) {
-        // A folder in the place of a file, or the reverse, is something else with a similar name.
-        if path.is_dir() != folder {
-            return;
-        }
-        let runs = digits(name);
-        let of_set = |piece: &&Piece<'_>| matches!(piece, Piece::Number { of_set: true, .. });
-        let known = |run: &&str| run.parse().is_ok_and(|set| self.sets.contains(&set));
-        // Only sets that the user asked for are worth a warning.
-        if !self.sets.is_empty() && pattern.iter().any(|p| of_set(&p)) && !runs.iter().any(known) {
-            return;
-        }
-        let reason = match folder {
-            true => Reason::Folder,
-            false => Reason::File,
-        };
-        self.files
-            .pass_over(reason, path, || expected(pattern, &runs));
-    }
-}
-
-impl Files {
-    fn pass_over(&mut self, reason: Reason, path: PathBuf, expected: impl FnOnce() -> String) {
-        let unread = self.unread.entry(reason).or_insert_with(|| Unread {
-            first: path,
-            expected: expected(),
-            count: 0,
-        });
-        unread.count += 1;
-    }
-}
-
-// The name that the file should have, for the message: with the numbers of the file, if their count is the pattern's.
-fn expected(pattern: &[Piece<'_>], runs: &[&str]) -> String {
-    let places = |piece: &&Piece<'_>| match piece {
-        Piece::Text(text) => digits(text).len(),
-        Piece::Number { .. } => 1,
-    };
-    // With more or fewer runs, it is not known which of them are the set and the image.
-    let fits = pattern.iter().map(|piece| places(&piece)).sum::<usize>() == runs.len();
-    let (mut name, mut next) = (String::new(), 0);
-    for piece in pattern {
-        match *piece {
-            Piece::Text(text) => {
-                name.push_str(text);
-                next += digits(text).len();
-            }
-            Piece::Number { of_set, digits } => {
-                let most = most(of_set);
-                let run = runs.get(next).filter(|_| fits);
-                let number = run.and_then(|run| run.parse::<u32>().ok());
-                match number.filter(|number| *number <= most) {
-                    Some(number) => name.push_str(&format!("{number:0digits$}")),
-                    None => name.push_str(&format!("{{0 to {most}}}")),
-                }
-                next += 1;
-            }
-        }
-    }
-    name
-}
-
-fn digits(name: &str) -> Vec<&str> {
-    let runs = name.split(|c: char| !c.is_ascii_digit());
-    runs.filter(|run| !run.is_empty()).collect()
-}
-
-// A name without the parts that people write differently: case, separators, numbers, and the endings of FITS and
-// compressed files.
-fn shape(name: &str) -> String {
-    let mut name = name.to_ascii_lowercase();
-    for ending in [".gz", ".fz", ".bz2", ".xz", ".z", ".zip"] {
-        if let Some(plain) = name.strip_suffix(ending) {
-            name.truncate(plain.len());
-        }
-    }
-    for ending in [".fit", ".fts"] {
-        if let Some(stem) = name.strip_suffix(ending) {
-            name = format!("{stem}.fits");
-        }
-    }
-    let mut shape = String::new();
-    for c in name.chars() {
-        match c {
-            '-' | '_' | ' ' => {}
-            c if c.is_ascii_digit() => {
-                if !shape.ends_with('#') {
-                    shape.push('#');
-                }
-            }
-            c => shape.push(c),
-        }
-    }
-    shape
 }
 
 // Of names in a message. Chosen by hand.

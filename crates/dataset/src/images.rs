@@ -24,7 +24,7 @@ pub fn of_folder(data: &DataFolder, sets: &[u32]) -> Result<Vec<ImageId>, FileEr
         let images = files.of_set(set);
         if images.is_empty() {
             let path = data.galaxies(set, 1);
-            let advice = advice(data, &files);
+            let advice = advice(data);
             let message = format!("there is no image of set {set}; expected this file{advice}");
             return Err(FileError::new(path, message));
         }
@@ -34,7 +34,7 @@ pub fn of_folder(data: &DataFolder, sets: &[u32]) -> Result<Vec<ImageId>, FileEr
     if found.is_empty() {
         let pattern = &data.layout().galaxies;
         let (example, found) = (fill(pattern, 1, 1), sample(data.root())?);
-        let advice = advice(data, &files);
+        let advice = advice(data);
         let message = format!(
             "there are no galaxy images here (found {found}, expected {pattern}, as in {example}){advice}"
         );
@@ -82,9 +82,8 @@ fn check_subfields(data: &DataFolder, sets: &[u32]) -> Result<(), FileError> {
                 false => ". Try: restore the image",
             };
             let message = format!(
-                "there is no such epoch (found {} of subfield {set}, {expected}){}{advice}",
-                listed(&there),
-                advice_on_names(&images)
+                "there is no such epoch (found {} of subfield {set}, {expected}){advice}",
+                listed(&there)
             );
             return Err(FileError::new(data.galaxies(set, epoch), message));
         }
@@ -125,17 +124,7 @@ fn listed(numbers: &[u32]) -> String {
     }
 }
 
-// Misspelt names explain missing images better than a wrong folder does.
-fn advice_on_names(files: &Files) -> String {
-    let line = files.unread().into_iter().next();
-    line.map_or_else(String::new, |line| format!(". {line}"))
-}
-
-fn advice(data: &DataFolder, files: &Files) -> String {
-    let names = advice_on_names(files);
-    if !names.is_empty() {
-        return names;
-    }
+fn advice(data: &DataFolder) -> String {
     match data.folder_above() {
         Some(folder) => format!(
             ". This is the folder of one set. Try: --data {}",
