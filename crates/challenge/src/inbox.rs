@@ -5,10 +5,11 @@ use std::time::SystemTime;
 
 use shearq_dataset::run::RUN_FILE;
 use shearq_files::FileError;
+use shearq_files::atomic::list;
 use shearq_results::submit::archive::{ArchiveFormat, is_archive, is_of_system, read_archive};
 use shearq_results::submit::{FileSum, Kind, MANIFEST_FILE, Manifest};
 
-use crate::seal::{Receipt, entries, sha256};
+use crate::seal::{Receipt, sha256};
 
 // Folders below a given folder that are searched. Links are not followed, so that only a mistake is deeper. Chosen by hand.
 const MAX_DEPTH: usize = 16;
@@ -83,7 +84,7 @@ impl Found {
             );
             return Ok(());
         }
-        let mut inside = entries(folder)?;
+        let mut inside = list(folder)?;
         inside.sort();
         let (mut folders, mut archives, mut loose) = (Vec::new(), Vec::new(), Vec::new());
         for path in inside {
@@ -157,7 +158,7 @@ fn looks_like_archive(path: &Path) -> bool {
 }
 
 fn contains_entries(folder: &Path, depth: usize) -> bool {
-    let inside = entries(folder).unwrap_or_default();
+    let inside = list(folder).unwrap_or_default();
     inside.iter().any(|path| match path.is_dir() {
         _ if is_hidden(path) || depth > MAX_DEPTH => false,
         _ if path.is_symlink() => true,
@@ -171,7 +172,7 @@ fn contains_entries(folder: &Path, depth: usize) -> bool {
 pub fn refuse_links(entry: &Path) -> Result<(), FileError> {
     let mut paths = vec![entry.to_owned()];
     if entry.is_dir() {
-        paths.extend(entries(entry)?);
+        paths.extend(list(entry)?);
     }
     match paths.into_iter().find(|path| path.is_symlink()) {
         Some(link) => Err(FileError::new(
@@ -223,7 +224,7 @@ pub fn modified(path: &Path) -> Result<SystemTime, FileError> {
 
 // The files of an entry that is a folder, in order of their names.
 fn files_of(folder: &Path) -> Result<Vec<PathBuf>, FileError> {
-    let mut paths = entries(folder)?;
+    let mut paths = list(folder)?;
     paths.retain(|path| path.is_file() && !is_hidden(path));
     paths.sort();
     Ok(paths)

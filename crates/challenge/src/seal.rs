@@ -14,6 +14,7 @@ use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use shearq_dataset::fingerprint::hex;
 use shearq_dataset::threads::Pool;
+use shearq_files::atomic::list;
 use shearq_files::{FileError, atomic, open};
 use shearq_results::submit::FileSum;
 
@@ -122,7 +123,7 @@ pub fn close(path: &Path) -> Result<(), FileError> {
             .map_err(FileError::doing(path, "cannot set the mode"))?;
     }
     match folder {
-        true => entries(path)?.iter().try_for_each(|inside| close(inside)),
+        true => list(path)?.iter().try_for_each(|inside| close(inside)),
         false => Ok(()),
     }
 }
@@ -142,17 +143,11 @@ pub fn is_open_to_others(folder: &Path) -> bool {
     }
 }
 
-pub(crate) fn entries(folder: &Path) -> Result<Vec<PathBuf>, FileError> {
-    std::fs::read_dir(folder)
-        .and_then(|entries| entries.map(|entry| Ok(entry?.path())).collect())
-        .map_err(FileError::doing(folder, "cannot list the folder"))
-}
-
 // Names of all files below a folder, without those that change after a challenge is complete.
 pub(crate) fn names(folder: &Path) -> Result<Vec<String>, FileError> {
     let (mut folders, mut names) = (vec![folder.to_owned()], Vec::new());
     while let Some(next) = folders.pop() {
-        for path in entries(&next)? {
+        for path in list(&next)? {
             if path.is_dir() {
                 folders.push(path);
                 continue;

@@ -265,10 +265,13 @@ pub fn folder_of(target: &Path) -> &Path {
     }
 }
 
-fn list(folder: &Path) -> Result<Vec<PathBuf>, FileError> {
-    fs::read_dir(folder)
+/// The files and folders in a folder, sorted, because file systems list in any order and results must not depend on it.
+pub fn list(folder: &Path) -> Result<Vec<PathBuf>, FileError> {
+    let mut paths: Vec<PathBuf> = fs::read_dir(folder)
         .and_then(|entries| entries.map(|entry| Ok(entry?.path())).collect())
-        .map_err(FileError::doing(folder, "cannot list the folder"))
+        .map_err(FileError::doing(folder, "cannot list the folder"))?;
+    paths.sort();
+    Ok(paths)
 }
 
 /// Whether a name is a temporary one. Other programs end their names in `.part`, too.

@@ -91,17 +91,10 @@ impl Baseline {
     }
 
     pub fn names(folder: &Path) -> Result<Vec<String>, FileError> {
-        let entries = std::fs::read_dir(folder)
-            .and_then(Iterator::collect::<std::io::Result<Vec<_>>>)
-            .map_err(FileError::doing(folder, "cannot read the baselines"))?;
-        let mut names: Vec<String> = entries
-            .into_iter()
-            .map(|entry| entry.path())
-            .filter(|path| path.extension().is_some_and(|ending| ending == ENDING))
-            .filter_map(|path| Some(path.file_stem()?.to_str()?.to_owned()))
-            .collect();
-        names.sort();
-        Ok(names)
+        let mut paths = atomic::list(folder)?;
+        paths.retain(|path| path.extension().is_some_and(|ending| ending == ENDING));
+        let name = |path: &PathBuf| Some(path.file_stem()?.to_str()?.to_owned());
+        Ok(paths.iter().filter_map(name).collect())
     }
 
     pub fn read(path: &Path) -> Result<Self, FileError> {

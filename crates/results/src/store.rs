@@ -132,23 +132,13 @@ pub fn files(store: &Path) -> Result<Vec<(PathBuf, RunRecord)>, FileError> {
 // The records of a store. Files of other kinds, such as notes or a printed table, may lie beside them.
 fn paths(store: &Path) -> Result<Vec<PathBuf>, FileError> {
     check_folder(store, "the folder of a results store")?;
-    let entries = std::fs::read_dir(store)
-        .and_then(Iterator::collect::<std::io::Result<Vec<_>>>)
-        .map_err(FileError::doing(store, "cannot read the results store"))?;
-    let mut paths: Vec<PathBuf> = entries
-        .into_iter()
-        .map(|entry| entry.path())
-        .filter(|path| {
-            let name = path.file_name().unwrap_or_default();
-            !name.as_encoded_bytes().starts_with(b".")
-        })
-        .collect();
-    // Folders are listed in any order, but warnings and tables must not depend on it.
-    paths.sort();
-    // Some file systems change the case of names.
+    let mut paths = atomic::list(store)?;
     paths.retain(|path| {
-        path.extension()
-            .is_some_and(|own| own.eq_ignore_ascii_case("json"))
+        let name = path.file_name().unwrap_or_default();
+        let ending = path.extension();
+        // Some file systems change the case of names.
+        !name.as_encoded_bytes().starts_with(b".")
+            && ending.is_some_and(|own| own.eq_ignore_ascii_case("json"))
     });
     Ok(paths)
 }

@@ -16,7 +16,7 @@ use std::path::{Path, PathBuf};
 
 use shearq_dataset::layout::{DataFolder, MAX_IMAGE, MAX_SET, check_folder};
 use shearq_dataset::run::{Run, relative_path};
-use shearq_files::atomic::Scratch;
+use shearq_files::atomic::{Scratch, list};
 use shearq_files::open::is_there;
 use shearq_files::{FileError, table};
 use shearq_scoring::{Bins, Definition, Grid, SCORED};
@@ -206,22 +206,19 @@ impl Sent {
     }
 
     /// The files without the manifest and hidden files, or the given file.
-    pub fn files(&self) -> std::io::Result<Vec<PathBuf>> {
+    pub fn files(&self) -> Result<Vec<PathBuf>, FileError> {
         if !self.path.is_dir() {
-            std::fs::metadata(&self.path)?;
+            std::fs::metadata(&self.path)
+                .map_err(FileError::doing(&self.given, "cannot read the file"))?;
             return Ok(vec![self.path.clone()]);
         }
-        let mut files = Vec::new();
-        for entry in std::fs::read_dir(&self.path)? {
-            let file = entry?.path();
+        let mut files = list(&self.path).map_err(|error| self.named(error))?;
+        files.retain(|file| {
             let own = file.file_name().is_some_and(|name| {
                 name == MANIFEST_FILE || name.to_string_lossy().starts_with('.')
             });
-            if !file.is_dir() && !own {
-                files.push(file);
-            }
-        }
-        files.sort();
+            !file.is_dir() && !own
+        });
         Ok(files)
     }
 }
@@ -254,9 +251,7 @@ impl Submission {
     pub fn read(sent: &Sent) -> Result<Self, FileError> {
         let whole = |message: String| FileError::new(&sent.given, message);
         check_folder(&sent.path, "a folder or an archive (.tar.gz)")?;
-        let files = sent
-            .files()
-            .map_err(FileError::doing(&sent.given, "cannot list the folder"))?;
+        let files = sent.files()?;
         let manifest = Manifest::read(&sent.path)?;
         if let Some(manifest) = &manifest {
             manifest.verify(&sums_of(&files)?, &sent.given)?;

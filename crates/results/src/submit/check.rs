@@ -104,7 +104,7 @@ pub fn check_sent(
     let mut report = Report::default();
     match sent.files() {
         Ok(files) => check_files(path, &files, expected, done, &mut report),
-        Err(error) => report.error(path, "readable", error.to_string()),
+        Err(error) => report.error(path, "readable", error.message),
     }
     let mut findings = report.findings;
     // Participants do not know the folder that their archive was unpacked to.
