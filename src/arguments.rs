@@ -29,7 +29,7 @@ use shearq_simulate::kinds::SETS;
 use shearq_simulate::set::{FixedPsf, SimulationSettings};
 use shearq_submissions::{Configuration, EllipticityType, Registry, Template};
 
-use crate::origin::of_command;
+use crate::origin::words_behind_command;
 use crate::{print, print_json, print_table, tell};
 
 // `1,2,7-9`, or `all`, which is empty: data folders have any sets, and simulations the 24 of the paper. Own code, because clap has
@@ -223,13 +223,13 @@ pub(super) enum SummaryFormat {
 }
 
 #[derive(Debug, Clone, Args)]
-pub(super) struct Summary {
+pub(super) struct SummaryArguments {
     /// How to say what was done.
     #[arg(long, value_parser = named::<SummaryFormat>(), default_value = "text")]
     format: SummaryFormat,
 }
 
-impl Summary {
+impl SummaryArguments {
     pub(super) fn is_json(&self) -> bool {
         self.format == SummaryFormat::Json
     }
@@ -259,7 +259,7 @@ impl StandardInput {
             arguments: arguments.to_vec(),
             _folder: None,
         };
-        let first = arguments.len() - of_command(arguments).len();
+        let first = arguments.len() - words_behind_command(arguments).len();
         let command = arguments.get(first.saturating_sub(1));
         let command = command.and_then(|word| word.to_str());
         if !command.is_some_and(|command| FROM_STANDARD_INPUT.contains(&command)) {

@@ -27,7 +27,9 @@ static INVOCATION: Mutex<Option<Invocation>> = Mutex::new(None);
 /// Notes a command with its arguments, the first of which is the program's name. Returns it as a shell reads it.
 pub(crate) fn remember(arguments: &[OsString]) -> String {
     let command = command_line(arguments);
-    let inputs = of_command(arguments).iter().map(|word| named(word));
+    let inputs = words_behind_command(arguments)
+        .iter()
+        .map(|word| input_path(word));
     let invocation = Invocation {
         command: command.clone(),
         inputs: inputs.filter(|path| path.exists()).collect(),
@@ -37,14 +39,14 @@ pub(crate) fn remember(arguments: &[OsString]) -> String {
 }
 
 /// The arguments behind the command's name, before which there may be `-q` and `-v`.
-pub(crate) fn of_command(arguments: &[OsString]) -> &[OsString] {
+pub(crate) fn words_behind_command(arguments: &[OsString]) -> &[OsString] {
     let is_name = |word: &OsString| !word.to_string_lossy().starts_with('-');
     let name = arguments.iter().skip(1).position(is_name);
     name.map_or(&[], |name| &arguments[name + 2..])
 }
 
 // The path of `PATH`, `--option=PATH` or `PATH[TABLE]`.
-fn named(word: &OsStr) -> PathBuf {
+fn input_path(word: &OsStr) -> PathBuf {
     let text = word.to_str().filter(|text| text.starts_with("--"));
     let value = text.and_then(|text| text.split_once('='));
     Place::of(value.map_or(Path::new(word), |(_, value)| Path::new(value))).path

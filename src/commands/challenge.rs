@@ -20,7 +20,7 @@ use shearq_results::submit::Submission;
 use shearq_results::submit::check::{Finding, Severity, check_sent};
 
 use super::check::report;
-use crate::arguments::{Form, SetList, Summary, Threads, named, page};
+use crate::arguments::{Form, SetList, SummaryArguments, Threads, named, page};
 use crate::progress::{Bar, mark_resumable};
 use crate::{count, tell};
 
@@ -154,7 +154,7 @@ struct CheckArguments {
     #[arg(long, value_name = "DIR")]
     challenge: PathBuf,
     #[command(flatten)]
-    summary: Summary,
+    summary: SummaryArguments,
     /// Private folder, for organisers: if there are no errors, sign the time of arrival in ENTRY.receipt.toml. An earlier
     /// receipt of the same content is kept.
     #[arg(long, value_name = "DIR")]

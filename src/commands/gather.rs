@@ -2,7 +2,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 
-use crate::arguments::{Summary, named};
+use crate::arguments::{SummaryArguments, named};
 use crate::{count, tell};
 use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::{DataFolder, MAX_IMAGE, MAX_SET};
@@ -127,7 +127,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
     #[command(flatten)]
-    summary: Summary,
+    summary: SummaryArguments,
 }
 
 // The options of stamps that are cut out of an exposure.

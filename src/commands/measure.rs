@@ -38,7 +38,7 @@ pub(crate) struct Arguments {
     #[arg(long)]
     stack_stars: bool,
     #[command(flatten)]
-    summary: arguments::Summary,
+    summary: arguments::SummaryArguments,
 }
 
 /// How to measure, and where to write catalogues.

@@ -5,7 +5,7 @@ use clap::Args;
 use shearq_files::open::{SETTINGS, is_there, read_to_string};
 use shearq_submissions::check_name;
 
-use crate::arguments::{Summary, named};
+use crate::arguments::{SummaryArguments, named};
 use crate::progress::Bar;
 use crate::{count, tell, tell_notes, tell_unread};
 use shearq_challenges::{BranchCatalogues, Presubmitting, PublicBranch, PublicChallenge};
@@ -80,7 +80,7 @@ pub(crate) struct Arguments {
     #[arg(long, requires = "branch", conflicts_with_all = GREAT10_ONLY)]
     whole_galaxies: bool,
     #[command(flatten)]
-    summary: Summary,
+    summary: SummaryArguments,
 }
 
 // Options without a meaning for submissions to other challenges; `file` is --entry.
@@ -216,7 +216,7 @@ fn presubmit(
     branch: &dyn PublicBranch,
     packing: &Presubmitting<'_>,
     out: &Path,
-    summary: &Summary,
+    summary: &SummaryArguments,
 ) -> anyhow::Result<()> {
     // As of other submissions: an earlier one may have been sent.
     anyhow::ensure!(

@@ -2,7 +2,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use crate::arguments::{Summary, Unsheared};
+use crate::arguments::{SummaryArguments, Unsheared};
 
 use crate::tell;
 use shearq_catalogue::select::{smooth_selection, write_selected};
@@ -40,7 +40,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "DIR")]
     out: PathBuf,
     #[command(flatten)]
-    summary: Summary,
+    summary: SummaryArguments,
 }
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -32,11 +32,6 @@ def _psfex(psf: Any) -> _Draw:
         return psf.getPSF(place).drawImage(nx=side, ny=side, method="no_pixel", dtype=np.float64, **pixels).array
 
     return draw
-
-
-class _Point(NamedTuple):
-    x: float
-    y: float
 
 
 def _rubin(psf: Any) -> _Draw:
