@@ -32,7 +32,7 @@ pub(crate) fn sign_of(name: &str) -> PyResult<TruthSign> {
     chosen("truth_sign", name, r#""standard" or "challenge""#)
 }
 
-fn of_bias(error: BiasFailure) -> PyErr {
+pub(crate) fn of_bias(error: BiasFailure) -> PyErr {
     PyValueError::new_err(in_python(&error.to_string()))
 }
 
@@ -67,7 +67,7 @@ fn design_of(name: &str) -> PyResult<Design> {
     })
 }
 
-fn shapes_of(name: &str) -> PyResult<Shapes> {
+pub(crate) fn shapes_of(name: &str) -> PyResult<Shapes> {
     match name {
         "shear" => Ok(Shapes::Shear),
         "distortion" => Ok(Shapes::Converted),
@@ -112,6 +112,18 @@ fn table_of(
 pub(crate) enum Given<'py> {
     Path(PathBuf),
     Table(String, Vec<(String, Bound<'py, PyAny>)>, Vec<String>),
+}
+
+impl Given<'_> {
+    pub(crate) fn input(self) -> PyResult<Input> {
+        match self {
+            Given::Table(name, columns, unread) => table_of(&name, columns, unread),
+            Given::Path(path) => {
+                require(&path)?;
+                Ok(path.into())
+            }
+        }
+    }
 }
 
 // One shear of all catalogues, one of each by its name, or a file of true shears.
@@ -230,7 +242,7 @@ impl BiasSums {
     }
 }
 
-fn names_of(columns: &[String], preset: &[PathBuf]) -> PyResult<Names> {
+pub(crate) fn names_of(columns: &[String], preset: &[PathBuf]) -> PyResult<Names> {
     let mut names = Names::default();
     for text in columns {
         names
@@ -355,15 +367,8 @@ pub(crate) fn bias_sums(
     });
     let bins = bins.collect::<PyResult<Vec<_>>>()?;
     let like = like.map(|given| -> PyResult<Survey> {
-        let catalogue = match given {
-            Given::Table(name, columns, unread) => table_of(&name, columns, unread)?,
-            Given::Path(path) => {
-                require(&path)?;
-                path.into()
-            }
-        };
         Ok(Survey {
-            catalogue,
+            catalogue: given.input()?,
             tomography,
         })
     });

@@ -31,7 +31,7 @@ mod _shearq {
     #[pymodule_export]
     use super::measure::{flags, mean_shear, measure, psfs_from_oversampled};
     #[pymodule_export]
-    use super::score::{aperture_mass, difference, failed, metrics, score, spectrum};
+    use super::score::{aperture_mass, difference, failed, galaxies, metrics, score, spectrum};
     #[pymodule_export]
     use super::select::select;
     #[pymodule_export]

@@ -1,12 +1,18 @@
 //! Ellipticities on a grid into spectra and metrics of merit.
 
+use std::path::PathBuf;
+
 use ndarray::{Array2, ArrayView1};
 use numpy::{IntoPyArray, PyArray1, PyReadonlyArray1, ToPyArray};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use shearq_catalogue::foreign;
+use shearq_catalogue::galaxies::{Galaxies, MeanResponse};
+use shearq_catalogue::request::{Placed, Request};
 use shearq_dataset::truth::{Sign, SignFault, word};
+use shearq_files::FileError;
+use shearq_files::table::MAX_ROWS;
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_quantities::{MeasuredRange, Shear};
 use shearq_results::views::scores;
@@ -19,7 +25,7 @@ use shearq_scoring::{
     sign_by_correlation, sign_by_modes,
 };
 
-use crate::bias::sign_of;
+use crate::bias::{Given, names_of, of_bias, shapes_of, sign_of};
 use crate::errors::{chosen, of_scoring};
 
 /// Names, headings and meanings of the metrics.
@@ -52,6 +58,7 @@ struct Rows<'a> {
     e1: ArrayView1<'a, f64>,
     e2: ArrayView1<'a, f64>,
     positions: Option<(ArrayView1<'a, f64>, ArrayView1<'a, f64>)>,
+    weights: Option<ArrayView1<'a, f64>>,
     lengths: Vec<usize>,
 }
 
@@ -61,6 +68,7 @@ impl<'a> Rows<'a> {
             e1: e.0.as_array(),
             e2: e.1.as_array(),
             positions: positions.map(|(x, y)| (x.as_array(), y.as_array())),
+            weights: None,
             lengths,
         }
     }
@@ -77,7 +85,8 @@ impl<'a> Rows<'a> {
             && self.e2.len() == count
             && self
                 .positions
-                .is_none_or(|(x, y)| x.len() == count && y.len() == count);
+                .is_none_or(|(x, y)| x.len() == count && y.len() == count)
+            && self.weights.is_none_or(|weights| weights.len() == count);
         if !fits {
             return Err(PyValueError::new_err(
                 "e1, e2, positions: lengths that differ",
@@ -88,19 +97,16 @@ impl<'a> Rows<'a> {
         let mut start = 0;
         for length in &self.lengths {
             let mut sum = FieldSum::new(grid);
-            let counts = sum.add_image(
+            let counts = sum.add_weighted(
                 grid,
                 (0..*length).map(|k| {
                     let (x, y) = match self.positions {
                         Some((x, y)) => (x[start + k], y[start + k]),
                         None => grid.centre(k % grid.n, k / grid.n),
                     };
-                    Row {
-                        x,
-                        y,
-                        e1: self.e1[start + k],
-                        e2: self.e2[start + k],
-                    }
+                    let (e1, e2) = (self.e1[start + k], self.e2[start + k]);
+                    let weight = self.weights.map_or(1.0, |weights| weights[start + k]);
+                    (Row { x, y, e1, e2 }, weight)
                 }),
             );
             session
@@ -147,6 +153,60 @@ pub(crate) fn failed<'py>(
     failed.into_pyarray(py)
 }
 
+// x, y, e1, e2 and weights, rows per catalogue, and what is read as what.
+type Calibrated<'py> = ([Bound<'py, PyArray1<f64>>; 5], Vec<usize>, Vec<String>);
+
+/// The galaxies of catalogues of any program, one per image, calibrated together: x, y, e1, e2 and weights, the rows of each catalogue, and
+/// which columns are used as what.
+#[pyfunction]
+pub(crate) fn galaxies<'py>(
+    py: Python<'py>,
+    catalogues: Vec<Given<'py>>,
+    columns: Vec<String>,
+    preset: Vec<PathBuf>,
+    ellipticity: Option<&str>,
+    drop_missing: bool,
+    step: f64,
+) -> PyResult<Calibrated<'py>> {
+    let request = Request {
+        names: names_of(&columns, &preset)?,
+        shapes: ellipticity.map(shapes_of).transpose()?,
+        drop_missing,
+        step,
+        placed: Some(Placed::default()),
+        ..Request::default()
+    };
+    let inputs = catalogues.into_iter().map(Given::input);
+    let inputs = inputs.collect::<PyResult<Vec<_>>>()?;
+    let found = py.detach(|| {
+        let mut mean = MeanResponse::default();
+        let mut opened = Vec::new();
+        for input in inputs {
+            let own = Galaxies::open(input, &request, ["x", "y", "e1", "e2"], MAX_ROWS)?;
+            mean.add(&own)?;
+            opened.push(own);
+        }
+        let calibration = mean.calibration()?;
+        let (mut values, mut lengths) = (<[Vec<f64>; 5]>::default(), Vec::new());
+        for own in &opened {
+            let rows = own.read(MAX_ROWS)?;
+            lengths.push(rows.len());
+            for (row, weight) in rows {
+                let [e1, e2] = calibration.shear([row.e1, row.e2]);
+                let all = [row.x, row.y, e1, e2, weight / calibration.weight];
+                values
+                    .iter_mut()
+                    .zip(all)
+                    .for_each(|(own, value)| own.push(value));
+            }
+        }
+        let account = opened.first().map(Galaxies::account);
+        Ok((values, lengths, account.unwrap_or_default()))
+    });
+    let (values, lengths, account) = found.map_err(|error| of_bias(FileError::into(error)))?;
+    Ok((values.map(|own| own.into_pyarray(py)), lengths, account))
+}
+
 /// Scores images of `n` × `n` galaxies against their true shear, both in the order of the grid, x running
 /// fastest, or the images at positions. Returns all metrics, spectra and counts by name.
 #[pyfunction]
@@ -160,6 +220,7 @@ pub(crate) fn score<'py>(
     truth_sign: Option<&str>,
     e: Pair<'py>,
     positions: Option<Pair<'py>>,
+    weights: Option<PyReadonlyArray1<'py, f64>>,
     lengths: Vec<usize>,
     definition: &str,
     convention: &str,
@@ -173,7 +234,10 @@ pub(crate) fn score<'py>(
     };
     let (g1, g2) = (truth.0.as_array(), truth.1.as_array());
     let given = truth_sign.map(sign_of).transpose()?;
-    let catalogue = Rows::new(&e, positions.as_ref(), lengths);
+    let catalogue = Rows {
+        weights: weights.as_ref().map(|own| own.as_array()),
+        ..Rows::new(&e, positions.as_ref(), lengths)
+    };
     let (scored, mut warnings, challenge) = py.detach(|| {
         // One row more than the grid has, so that a truth that is too long is an error.
         let truth = g1.iter().zip(&g2).take(grid.cells() + 1).enumerate();

@@ -359,3 +359,95 @@ def test_a_lattice_is_its_grid_and_faults_are_named(wave):
     ]:
         with pytest.raises(ValueError, match=argument):
             shearq.aperture_mass(g1, g2, **arguments)
+
+
+COLUMNS = sorted((pathlib.Path(__file__).parents[2] / "tests/data/columns").glob("*.txt"))
+
+
+def recognised(path):
+    """A catalogue of 144 galaxies with the columns of a public catalogue, and the columns by role that this has."""
+    lines = path.read_text().splitlines()
+    used = next(line for line in lines if line.startswith("# used: ")).split("): ")[1].rstrip(".")
+    roles = {name: role for role, names in (pair.split("=") for pair in used.split(", ")) for name in names.split("+")}
+    given = [line.removeprefix("# given: ").split() for line in lines if line.startswith("# given: ")]
+    given = dict(text.split("=") for texts in given for text in texts)
+    rng, side = np.random.default_rng(7), 12
+    versions = ["noshear", "1p", "1m", "2p", "2m"] if "version" in roles.values() else ["noshear"]
+    y, x = np.mgrid[:side, :side] * 48 + 24.5
+    galaxies = np.repeat(np.arange(side * side), len(versions))
+    table = {"x": x.ravel()[galaxies], "y": y.ravel()[galaxies]}
+    e = 0.02 + 0.1 * rng.standard_normal((2, side * side))
+    step = {"1p": (0, 0.01), "1m": (0, -0.01), "2p": (1, 0.01), "2m": (1, -0.01)}
+    sheared = np.tile(versions, side * side)
+    for name in [name for line in lines if not line.startswith("#") for name in line.split()]:
+        role = roles.get(name, "")
+        number = rng.uniform(0.5, 1.5, side * side)[galaxies]
+        if role.startswith(("e1", "e2", "ksb_e")):
+            k = int("2" in role[:2] or role == "ksb_e2")
+            change = [0.7 * g if of == k else 0.0 for of, g in (step.get(label, (k, 0.0)) for label in (role[3:], *sheared))]
+            number = e[k][galaxies] + change[0] + np.array(change[1:])
+        elif role == "flag":
+            number = (galaxies % 31 == 7).astype(float)
+        elif role == "w":
+            number = np.where(galaxies % 29 == 3, 0.0, number)
+        elif role == "id":
+            number = 1000.0 + galaxies
+        elif role == "version":
+            number = sheared.tolist()
+        elif role.startswith("psf_e") or role in ("R12", "R21", "dw1", "dw2"):
+            number = 0.02 * (number - 1)
+        elif role == "rms_e":
+            number = 0.35 * np.ones(len(galaxies)) + 0.01 * number
+        elif "flag" in name.lower():
+            number = np.zeros(len(galaxies))
+        table[name] = number
+    if "g1" in roles.values():
+        # Then c is the mean shear.
+        given |= {"g1": "none", "g2": "none"}
+    return table, given
+
+
+@pytest.mark.parametrize("path", COLUMNS, ids=lambda path: path.stem)
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_any_catalogue_is_calibrated_as_bias_does(path):
+    table, given = recognised(path)
+    bias = shearq.bias(table, columns=given, units="rows")
+    found = shearq.galaxies(table, columns=given)
+    g = np.full(144, 0.02), np.full(144, 0.01)
+    scored = shearq.score(
+        found.e1, found.e2, *g, weights=found.weights, positions=found.positions, images=found.images, stamp=48, truth_sign="standard"
+    )  # fmt: skip
+    np.testing.assert_allclose(scored.mean["e"], [bias["c1"], bias["c2"]], rtol=0, atol=1e-12)
+    assert np.isfinite(found.e1).sum() == bias["n"]
+    assert found.notes[0].startswith("Columns: ")
+
+
+@pytest.mark.parametrize("fault", ["constant", "copied", "exchanged", "none"])
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_python_finds_the_faults_that_the_command_line_finds(fault, command, tmp_path):
+    rng, n = np.random.default_rng(5), 32
+    truth = np.array(_field(n))
+    images = truth + rng.normal(0, 0.003, (4, 2, n, n))
+    if fault == "constant":
+        images[2] = 0.01
+    if fault == "copied":
+        images[2] = images[1]
+    if fault == "exchanged":
+        images[2] = images[2, ::-1]
+    y, x = np.mgrid[:n, :n] * 48 + 24.5
+
+    def write(name, header, values):
+        rows = np.transpose([x.ravel(), y.ravel(), *values.reshape(2, -1)])
+        np.savetxt(tmp_path / name, rows, fmt="%.17g", delimiter=",", header=header, comments="")
+        return tmp_path / name
+
+    paths = [write(f"{k}.csv", "x,y,e1,e2", image) for k, image in enumerate(images, 1)]
+    of_truth = write("truth.csv", "x,y,g1,g2", truth)
+    printed = json.loads(command("score", "--truth", of_truth, "--truth-sign", "standard", "--convention", 5, "--format", "json", *paths))
+    scored = shearq.score(images[:, 0], images[:, 1], *truth, truth_sign="standard")
+    expected = [text for text in printed["warnings"] if text.startswith("warning: ")]
+    for k, path in enumerate(paths, 1):
+        expected = [text.replace(str(path), f"image {k}") for text in expected]
+    assert scored.notes == expected
+    assert bool(expected) == (fault != "none")
+    assert scored["q"] == pytest.approx(printed["metrics"]["q"], rel=1e-12)

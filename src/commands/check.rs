@@ -5,21 +5,21 @@ use clap::Args;
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_scoring::{Definition, Grid};
 
-use crate::arguments::Summary;
+use crate::arguments::SummaryArguments;
 use crate::{Findings, count, print, print_json, tell_unread};
 use shearq_challenges::PublicChallenge;
 use shearq_dataset::grid;
 use shearq_dataset::layout::{DataFolder, Layout, MAX_IMAGE};
 use shearq_dataset::truth::grid_of_set;
 use shearq_files::table::{MAX_ROWS, read_truth};
-use shearq_results::catalogues::read_rows;
+use shearq_results::catalogues::sent_galaxies;
 use shearq_results::submit::check::{Expected, Finding, Severity, check_sent};
 use shearq_results::submit::{Kind, Sent};
 
 /// Check a submission before you send it.
 ///
 /// PATH is a catalogue, a power-spectrum file, or a folder or archive (.tar.gz) of either. Files have the challenge's
-/// formats; catalogues may also be CSV, FITS or Parquet with the columns x, y, e1, e2.
+/// formats; catalogues may also be CSV, FITS or Parquet, whose columns are recognised as in `score`.
 ///
 /// The command checks names, checksums, missing and repeated galaxies and images, positions, values, copies and
 /// bins. With --data it also compares signs, axes, order of rows, type of ellipticity, bias and units with the true
@@ -52,7 +52,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "N", requires = "branch", conflicts_with_all = ["data", "grid", "stamp", "images"], value_parser = clap::value_parser!(u16).range(1..=1000))]
     subfields: Option<u16>,
     #[command(flatten)]
-    summary: Summary,
+    summary: SummaryArguments,
 }
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
@@ -130,8 +130,9 @@ fn reach(sent: &Sent, stamp: f64) -> Option<usize> {
     let first = files
         .iter()
         .find(|file| !matches!(Kind::of(file), Some(Kind::Spectrum { .. })))?;
-    let rows = read_rows(first, MAX_ROWS).ok()?;
-    let last = rows.iter().map(|row| row.x.max(row.y)).fold(0.0, f64::max);
+    let rows = sent_galaxies(first, MAX_ROWS).ok()?;
+    let last = rows.iter().map(|(row, _)| row.x.max(row.y));
+    let last = last.fold(0.0, f64::max);
     let side = ((last - 0.5) / stamp).ceil() as usize;
     // A wrong position must not enlarge the grid.
     (side >= 8 && side.checked_pow(2)? <= 2 * rows.len()).then_some(side)

@@ -168,3 +168,33 @@ fn scores_have_the_mean_shear_and_rows_of_bias() {
     }
     assert_eq!(count, 20);
 }
+
+#[test]
+fn check_rejects_the_rows_that_score_rejects() {
+    let folder = Folder::new();
+    folder.write("truth.csv", constant_truth());
+    folder.write("data/set01/truth.csv", constant_truth());
+    for entry in std::fs::read_dir("tests/data/columns").unwrap() {
+        let path = entry.unwrap().path();
+        let list = List::read(&path);
+        // An entry has no options.
+        if !list.given.is_empty() {
+            continue;
+        }
+        folder.write("c.csv", list.table());
+        let score = folder.json("score --truth truth.csv --truth-sign standard c.csv");
+        let rejected = score["rows"]["not_finite"].as_u64().unwrap();
+        let found = folder.json("check c.csv --data data");
+        let text = |finding: &Value, key: &str| finding[key].as_str().unwrap().to_owned();
+        // A single file may have any name.
+        let found = found["findings"].as_array().unwrap().iter();
+        let found: Vec<String> = found
+            .filter(|finding| finding["check"] != "name")
+            .map(|finding| text(finding, "check") + ": " + &text(finding, "message"))
+            .collect();
+        let missing =
+            format!("missing: {rejected} of 144 galaxies are missing; each counts as zero");
+        let expected: Vec<String> = (rejected > 0).then_some(missing).into_iter().collect();
+        assert_eq!(found, expected, "{}", path.display());
+    }
+}

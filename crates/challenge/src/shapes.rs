@@ -13,7 +13,7 @@ use shearq_files::atomic::Scratch;
 use shearq_files::table::{FileFormat, most_rows};
 use shearq_pipeline::PipelineError;
 use shearq_pipeline::measure::FolderMeasurement;
-use shearq_results::catalogues::read_rows;
+use shearq_results::catalogues::{read_rows, sent_galaxies};
 use shearq_results::response::response_of;
 use shearq_results::submit::check::{Finding, Severity};
 use shearq_results::submit::{Kind, Sent};
@@ -175,6 +175,7 @@ impl References {
         FolderMeasurement::open(&run, data, folder.path(), ids)?
             .write_catalogues(threads, progress)?;
         let path = |id: &ImageId| run.catalogue(folder.path(), id.set, id.image);
+        let most = most_rows(grid.cells());
         let mut sets: BTreeMap<u32, Vec<ImageId>> = BTreeMap::new();
         for id in ids {
             sets.entry(id.set).or_default().push(*id);
@@ -186,7 +187,8 @@ impl References {
                 continue;
             };
             for (ImageId { set, image }, path) in ids.into_iter().zip(&paths) {
-                let mut sum = references.read(path)?;
+                let mut sum = FieldSum::new(&references.grid);
+                sum.add_image(&references.grid, read_rows(path, most)?);
                 sum.e1 /= r1;
                 sum.e2 /= r2;
                 references.images.insert((set, image), shapes_of(&sum));
@@ -228,18 +230,9 @@ impl References {
         Some(sum)
     }
 
-    fn read(&self, path: &Path) -> Result<FieldSum, FileError> {
-        let rows = read_rows(path, most_rows(self.grid.cells()))?;
-        let mut sum = FieldSum::new(&self.grid);
-        sum.add_image(&self.grid, rows);
-        Ok(sum)
-    }
-
     /// Findings about the catalogues of an entry: one for each fault and set, with the numbers of its images.
     pub fn findings(&self, sent: &Sent) -> Result<Vec<Finding>, FileError> {
-        let files = sent
-            .files()
-            .map_err(FileError::doing(sent.path(), "cannot list the folder"))?;
+        let files = sent.files()?;
         let mut sets: BTreeMap<u32, BTreeMap<u32, PathBuf>> = BTreeMap::new();
         for file in files {
             if let Some(Kind::Catalogue { set, image, .. }) = Kind::of(&file) {
@@ -247,11 +240,19 @@ impl References {
             }
         }
         let mut found = Vec::new();
+        let sum = |file: &Path| {
+            let mut sum = FieldSum::new(&self.grid);
+            sum.add_weighted(
+                &self.grid,
+                sent_galaxies(file, most_rows(self.grid.cells()))?,
+            );
+            Ok::<_, FileError>(sum)
+        };
         for (set, files) in sets {
             let compared = files.iter().filter_map(|(image, file)| {
                 let reference = self.images.get(&(set, *image))?;
                 // An unreadable file is reported by the other checks.
-                let (fault, slope) = compare(reference, &self.read(file).ok()?);
+                let (fault, slope) = compare(reference, &sum(file).ok()?);
                 Some((*image, fault, slope))
             });
             for (fault, images) in faults(compared.collect()) {

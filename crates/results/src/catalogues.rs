@@ -16,7 +16,7 @@ use shearq_scoring::{Choice, Convention, FieldSum, Grid, Row, RowCounts};
 use crate::response::response_of;
 use crate::submit::{Packed, Sent, Submission, settings_of};
 use shearq_catalogue::foreign::{ADVICE_ON_SENTINELS, Foreign, HINT_OF_COLUMNS, fault_of_rows};
-use shearq_catalogue::galaxies::{Calibration, Galaxy, MeanResponse};
+use shearq_catalogue::galaxies::{Calibration, Galaxies, Galaxy, MeanResponse};
 use shearq_catalogue::source::states_shearq;
 use shearq_files::atomic::folder_of;
 
@@ -184,8 +184,8 @@ impl Catalogues {
         };
         let mut mean = MeanResponse::default();
         for (_, path) in &files {
-            if has_names(path)? {
-                mean.add(&foreign.open(path, MAX_ROWS)?)?;
+            if let Some(own) = recognised(foreign, path, MAX_ROWS)? {
+                mean.add(&own)?;
             }
         }
         mean.calibration()
@@ -195,22 +195,18 @@ impl Catalogues {
     pub fn account(&self) -> Result<Vec<String>, FileError> {
         let sets = self.files.sets();
         let mut all = sets.iter().flat_map(|set| self.files.of_set(*set));
-        match (&self.description, all.next()) {
-            (Some(foreign), Some((_, path))) if has_names(&path)? => {
-                Ok(foreign.open(&path, MAX_ROWS)?.account())
-            }
-            _ => Ok(Vec::new()),
-        }
+        let (Some(foreign), Some((_, path))) = (&self.description, all.next()) else {
+            return Ok(Vec::new());
+        };
+        let first = recognised(foreign, &path, MAX_ROWS)?;
+        Ok(first.map_or_else(Vec::new, |own| own.account()))
     }
 
     /// The rows of one catalogue, at most `most`, with the signs and the type of ellipticity that are scored, and their weights.
     pub fn rows(&self, path: &Path, most: usize) -> Result<Vec<Galaxy>, FileError> {
         match &self.description {
             Some(foreign) => foreign.rows(&foreign.open(path, most)?, most),
-            None => Ok(read_rows(path, most)?
-                .into_iter()
-                .map(|row| (row, 1.0))
-                .collect()),
+            None => Ok(unweighted(read_rows(path, most)?)),
         }
     }
 
@@ -232,7 +228,24 @@ impl Catalogues {
     }
 }
 
-// Columns without names have no other roles.
-fn has_names(path: &Path) -> Result<bool, FileError> {
-    Ok(!table::columns(&Place::of(path))?.named.is_empty())
+/// A catalogue whose columns have names, which are recognised; columns without names have no other roles than x, y, e1 and e2.
+pub fn recognised(
+    foreign: &Foreign,
+    path: &Path,
+    most: usize,
+) -> Result<Option<Galaxies>, FileError> {
+    let has_names = !table::columns(&Place::of(path))?.named.is_empty();
+    has_names.then(|| foreign.open(path, most)).transpose()
+}
+
+/// The galaxies of one catalogue that was sent, at most `most`, before calibration.
+pub fn sent_galaxies(path: &Path, most: usize) -> Result<Vec<Galaxy>, FileError> {
+    match recognised(&Foreign::default(), path, most)? {
+        Some(own) => own.read(most),
+        None => Ok(unweighted(read_rows(path, most)?)),
+    }
+}
+
+pub(crate) fn unweighted(rows: Vec<Row>) -> Vec<Galaxy> {
+    rows.into_iter().map(|row| (row, 1.0)).collect()
 }

@@ -7,7 +7,7 @@
 
 Measure    measure, measure_blocks, from_galsim, from_ngmix, from_meds, from_exposure, FunctionalPsf, DataWarning, set_threads, get_threads
 Catalogues Catalogue, concatenate, mean_shear, MeanShear, Flag, read, read_all
-Score      score, compare, power_spectrum, aperture_mass, Score, METRICS
+Score      score, galaxies, compare, power_spectrum, aperture_mass, Score, METRICS
 Validate   bias, bias_sums, Bias, BiasSums, null_tests
 Simulate   simulate, Simulation, SimulatedImage
 Settings   submission, submissions, Configuration
@@ -36,7 +36,7 @@ from ._measure import (
     measure_blocks as measure_blocks,
 )
 from ._null import null_tests as null_tests
-from ._score import METRICS as METRICS, Score as Score, aperture_mass as aperture_mass, compare as compare, power_spectrum as power_spectrum, score as score
+from ._score import Galaxies as Galaxies, METRICS as METRICS, Score as Score, aperture_mass as aperture_mass, compare as compare, galaxies as galaxies, power_spectrum as power_spectrum, score as score
 from ._shearq import __version__ as __version__
 from ._simulate import SimulatedImage as SimulatedImage, Simulation as Simulation, simulate as simulate
 from ._submissions import Configuration as Configuration, submission as submission, submissions as submissions

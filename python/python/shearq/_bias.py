@@ -307,8 +307,7 @@ def bias_sums(
     if len(frames) > 1:
         raise ValueError(f"catalogues: found ellipticities in the frames {' and '.join(frames)}; expected one frame")
     roles = [f"{role}={column}" for role, column in (columns or {}).items()]
-    presets = [preset] if isinstance(preset, (str, os.PathLike)) else list(preset or [])
-    presets = [os.fspath(path) for path in presets]
+    presets = _paths(preset)
     binned = _bins(bins)
 
     def needed(names: Sequence[str]) -> list[str]:
@@ -342,6 +341,11 @@ def bias_sums(
     }
     paths = [own if isinstance(own, str) else own[0] for own in given] + presets + ([] if truth is None else [os.fspath(truth)])
     return BiasSums(found, origin("shearq.bias", settings, paths))
+
+
+def _paths(given: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | None) -> list[str]:
+    several = [given] if isinstance(given, (str, os.PathLike)) else list(given or [])
+    return [os.fspath(path) for path in several]
 
 
 def _several(catalogues: Any) -> Iterable[Any]:

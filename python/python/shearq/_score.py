@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import importlib
 import math
+import os
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from . import _display, _shearq
+from ._bias import _catalogue, _paths, _several
 from ._arrays import degrees, double, flat, real, shown, whole
 from ._catalogue import Catalogue, raw
 from ._results import Result, origin
@@ -154,6 +156,7 @@ def score(
     *,
     images: int | ArrayLike | None = None,
     positions: tuple[ArrayLike, ArrayLike] | None = None,
+    weights: ArrayLike | None = None,
     stamp: float | None = None,
     field_degrees: float = 10.0,
     definition: Definition = "leaderboard",
@@ -176,6 +179,9 @@ def score(
     positions : tuple of two arrays, optional
         x and y of each galaxy, of the shape of e1: FITS pixels, the first pixel's centre at 1. They fall into cells
         of `stamp` pixels. Arrays of two axes require `images`.
+    weights : array, optional
+        Weight of each galaxy, of the shape of e1, with a mean of 1: a missing galaxy has weight 0. :func:`galaxies` gives
+        them for catalogues of any program.
     stamp : float, optional
         Pixels a side of a cell, with positions.
     field_degrees : float
@@ -231,6 +237,7 @@ def score(
             truth_sign,
             rows,
             where,
+            None if weights is None else flat("weights", weights),
             lengths,
             _text("definition", definition),
             _text("convention", convention),
@@ -247,6 +254,56 @@ def score(
     if dropped:
         found.notes.append(f"note: {dropped} of {rows[0].size} rows stand for a failed measurement; they count as missing.")
     return found
+
+
+class Galaxies(NamedTuple):
+    """Galaxies of catalogues, an image each: shears, weights and positions, arrays with an element per galaxy."""
+
+    e1: NDArray[np.float64]
+    e2: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    positions: tuple[NDArray[np.float64], NDArray[np.float64]]
+    images: NDArray[np.int64]
+    notes: list[str]
+
+
+def galaxies(
+    catalogues: Any,
+    *,
+    columns: Mapping[str, str] | None = None,
+    preset: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | None = None,
+    ellipticity: Literal["shear", "distortion", "responsivity"] | None = None,
+    drop_missing: bool = False,
+    step: float = 0.01,
+) -> Galaxies:
+    """Galaxies of catalogues of any program, recognised, converted and calibrated as :func:`bias` and ``shearq score`` do.
+
+    Parameters
+    ----------
+    catalogues : table, path, or list of them
+        As for :func:`bias`, one per image of a set, with columns of positions.
+    columns, preset, ellipticity, drop_missing, step
+        As for :func:`bias`.
+
+    Returns
+    -------
+    Galaxies
+        Arguments of :func:`score`: shears ``e1`` and ``e2`` (NaN for a galaxy that does not count), divided by the mean response of
+        all; ``weights`` with a mean of 1; ``positions`` and ``images``. ``notes`` say which columns are used as what.
+
+    Examples
+    --------
+    >>> table = {"x": [24.5, 72.5], "y": [24.5, 24.5], "e1": [0.04, -0.02], "e2": [0.0, 0.02], "R11": [0.5, 0.5], "R22": [0.4, 0.4]}
+    >>> found = shearq.galaxies(table)
+    >>> [round(float(e), 3) for e in found.e1]
+    [0.08, -0.04]
+    """
+    given = [_catalogue(f"catalogue {number}", table) for number, table in enumerate(_several(catalogues), 1)]
+    if not given:
+        raise ValueError("catalogues: found none; expected at least one")
+    names = [f"{role}={column}" for role, column in (columns or {}).items()]
+    (x, y, e1, e2, weights), lengths, notes = _shearq.galaxies(given, names, _paths(preset), ellipticity, drop_missing, float(step))
+    return Galaxies(e1, e2, weights, (x, y), np.repeat(np.arange(len(lengths)), lengths), notes)
 
 
 def power_spectrum(

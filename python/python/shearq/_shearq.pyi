@@ -51,6 +51,14 @@ def select(
 ) -> list[_Doubles]: ...
 def failed(values: _Doubles) -> NDArray[np.bool_]: ...
 def metrics() -> list[tuple[str, str, str]]: ...
+def galaxies(
+    catalogues: Sequence[str | tuple[str, list[tuple[str, Any]], list[str]]],
+    columns: Sequence[str],
+    preset: Sequence[str],
+    ellipticity: str | None,
+    drop_missing: bool,
+    step: float,
+) -> tuple[list[_Doubles], list[int], list[str]]: ...
 def score(
     n: int,
     stamp: float,
@@ -59,6 +67,7 @@ def score(
     truth_sign: str | None,
     e: tuple[_Doubles, _Doubles],
     positions: tuple[_Doubles, _Doubles] | None,
+    weights: _Doubles | None,
     lengths: Sequence[int],
     definition: str,
     convention: str,

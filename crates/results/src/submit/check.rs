@@ -11,9 +11,10 @@ use shearq_scoring::{
 use super::{
     Contents, FileSum, Kind, Manifest, Sent, SpectrumLine, read_spectrum, wrong_multipoles,
 };
-use crate::catalogues::{OWN, read_rows};
+use crate::catalogues::{OWN, read_rows, recognised, unweighted};
 use crate::views::scores::{odd_response, repeated_shapes, words};
-use shearq_catalogue::foreign::{ADVICE_ON_SENTINELS, fault_of_rows};
+use shearq_catalogue::foreign::{ADVICE_ON_SENTINELS, Foreign, fault_of_rows};
+use shearq_catalogue::galaxies::{Calibration, Galaxies, MeanResponse};
 use shearq_files::FileError;
 use shearq_files::table::most_rows;
 
@@ -171,9 +172,14 @@ fn check_files(
         of_set.sort_by_key(|(image, _)| *image);
         let session = expected.session(Some(set));
         let mut files = SetFiles::new(&session);
-        for (image, file) in of_set {
+        let paths = of_set.iter().map(|(_, file)| file.as_path());
+        let (opened, calibration) = open_catalogues(paths, session.grid(), report);
+        for ((image, file), opened) in of_set.into_iter().zip(opened) {
             // An unreadable catalogue is reported, and the others of its set are checked without it.
-            if let Some(examined) = check_catalogue(file, &session, report) {
+            let examined = opened.and_then(|own| {
+                check_catalogue(file, own.as_ref(), &calibration, &session, report)
+            });
+            if let Some(examined) = examined {
                 files.add(&examined, image, file);
             }
         }
@@ -218,7 +224,10 @@ fn check_unnamed(file: &Path, single: bool, expected: &Expected, report: &mut Re
         _ => None,
     };
     let session = expected.session(set);
-    let Some(examined) = check_catalogue(file, &session, report) else {
+    let (opened, calibration) = open_catalogues([file].into_iter(), session.grid(), report);
+    let [Some(opened)] = &opened[..] else { return };
+    let Some(examined) = check_catalogue(file, opened.as_ref(), &calibration, &session, report)
+    else {
         return;
     };
     if let Some(set) = set {
@@ -295,6 +304,10 @@ impl Report {
         self.add(path, Severity::Error, check, message);
     }
 
+    fn unreadable(&mut self, error: FileError) {
+        self.findings.push(Finding::unreadable(error));
+    }
+
     fn warn(&mut self, path: &Path, check: &'static str, message: String) {
         self.add(path, Severity::Warning, check, message);
     }
@@ -343,25 +356,53 @@ fn looks_like_spectrum(path: &Path) -> bool {
     read_spectrum(path).is_ok_and(|lines| !lines.is_empty() && lines.len() <= MAX_SPECTRUM_LINES)
 }
 
+// The catalogues of a set with recognised columns, `Some(None)` without names of columns and `None` if they cannot be read; and what
+// their ellipticities are divided by.
+fn open_catalogues<'p>(
+    paths: impl Iterator<Item = &'p Path>,
+    grid: &Grid,
+    report: &mut Report,
+) -> (Vec<Option<Option<Galaxies>>>, Calibration) {
+    let mut mean = MeanResponse::default();
+    let mut open = |path| {
+        let opened = recognised(&Foreign::default(), path, most_rows(grid.cells()))?;
+        opened.iter().try_for_each(|own| mean.add(own))?;
+        Ok(opened)
+    };
+    let opened = paths.map(|path| open(path).map_err(|error| report.unreadable(error)).ok());
+    let opened = opened.collect();
+    let calibration = mean.calibration();
+    let calibration =
+        calibration.map_err(|error| report.error(&error.path, "response", error.message));
+    (opened, calibration.unwrap_or(Calibration::NONE))
+}
+
 // Checks the rows of a catalogue. `None` if the file is not readable.
 fn check_catalogue(
     path: &Path,
+    recognised: Option<&Galaxies>,
+    calibration: &Calibration,
     session: &SetSession,
     report: &mut Report,
 ) -> Option<ExaminedImage> {
     let grid = session.grid();
-    let rows = match read_rows(path, most_rows(grid.cells())) {
-        Ok(rows) => rows,
-        Err(error) => {
-            report.error(path, "readable", error.message);
-            return None;
-        }
+    let most = most_rows(grid.cells());
+    let galaxies = match recognised {
+        Some(own) => own.read(most),
+        None => read_rows(path, most).map(unweighted),
     };
+    let galaxies = galaxies.map_err(|error| report.unreadable(error)).ok()?;
     let mut sum = FieldSum::new(grid);
-    let counts = sum.add_image(grid, rows.iter().copied());
+    let mut counts = sum.add_weighted(grid, galaxies.iter().copied());
+    calibration.apply(&mut sum);
+    if recognised.is_some() {
+        // Its flags, weights and missing numbers state which galaxies were not measured.
+        counts.missing += std::mem::take(&mut counts.not_finite);
+    }
     if let Some(fault) = fault_of_rows(&counts, grid, ADVICE_ON_SENTINELS) {
         report.error(path, "values", fault);
     }
+    let rows: Vec<Row> = galaxies.into_iter().map(|(row, _)| row).collect();
     for (count, severity, check, message) in row_findings(&counts, &rows, grid) {
         if count > 0 {
             report.add(path, severity, check, message);
