@@ -236,14 +236,9 @@ impl Foreign {
         let found = Galaxies::open(PathBuf::from(name).into(), &request, unnamed, most);
         found.map_err(|error| match self.catalogues.is_empty() {
             true => error.hint_of_columns(HINT_OF_COLUMNS),
-            false => {
-                let mut error =
-                    error.hint_of_columns("the description of the catalogues specifies the names");
-                error.message = error
-                    .message
-                    .replace("--columns ", "`columns` of the description, ");
-                error
-            }
+            false => error
+                .hint_of_columns("the description of the catalogues specifies the names")
+                .with_words("--columns ", "`columns` of the description, "),
         })
     }
 

@@ -212,8 +212,10 @@ pub fn of_images(
     if is_there(&data.root().join(SIMULATION_FILE))
         || ImageReader::open(&first)?.number("SEED")?.is_some()
     {
-        let message = "these images were made by `simulate`; their noise is a function of a seed that participants can find by trying, and with it the shear. Try: --sets LIST --images N in place of --data, which draws 128 bits";
-        return Err(FileError::new(first, message).into());
+        let message = "these images were made by `simulate`; their noise is a function of a seed that participants can find by trying, and with it the shear";
+        return Err(FileError::new(first, message)
+            .hint("--sets LIST --images N in place of --data, which draws 128 bits")
+            .into());
     }
     let earlier = folders.prepare(plan)?;
     let key = earlier.unwrap_or_else(|| Key::new(&plan.name, plan.version, None));
@@ -237,8 +239,8 @@ pub fn of_images(
         };
         let ReadTruth { grid, shear, sign } = read_truth(&path, &reading)?;
         if sign.is_none() {
-            let message = "cannot determine the sign of g2. Try: a line `# g2sign: standard` (g2 > 0 along x = y) or `# g2sign: challenge` (the other sign) in the file";
-            return Err(FileError::new(&path, message).into());
+            let message = "cannot determine the sign of g2";
+            return Err(FileError::new(&path, message).hint("a line `# g2sign: standard` (g2 > 0 along x = y) or `# g2sign: challenge` (the other sign) in the file").into());
         }
         if grid.n != about.grid {
             let message = format!(
@@ -452,8 +454,8 @@ fn rankable(
 // Sets, images and grid of a data folder, which must be the same for all sets.
 fn about(data: &DataFolder) -> Result<Data, ChallengeError> {
     if data.layout().great3.is_some() {
-        let message = "this is a branch of GREAT3, whose truth is in another folder already (expected sets with images from 1). Try: give this folder to participants, and score their entries with `shearq score --challenge great3 --branch BRANCH --truth DIR`";
-        return Err(FileError::new(data.root(), message).into());
+        let message = "this is a branch of GREAT3, whose truth is in another folder already (expected sets with images from 1)";
+        return Err(FileError::new(data.root(), message).hint("give this folder to participants, and score their entries with `shearq score --challenge great3 --branch BRANCH --truth DIR`").into());
     }
     let ids = images::of_folder(data, &[])?;
     let mut about: Option<Data> = None;

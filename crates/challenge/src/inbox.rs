@@ -416,7 +416,7 @@ mod tests {
         file.set_len(1 << 40).unwrap();
         for entry in [path.as_path(), folder.path()] {
             let error = identify(entry, 1 << 20).unwrap_err();
-            assert!(error.message.contains("too large"), "{error}");
+            assert!(error.text().contains("too large"), "{error}");
         }
     }
 }

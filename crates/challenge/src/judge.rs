@@ -179,10 +179,10 @@ impl Judge {
             }
             if run.source != self.id {
                 let message = format!(
-                    "the entry was scored with another truth or other data of `{}` (found SHA-256 {}, expected {}). Try: another --store",
+                    "the entry was scored with another truth or other data of `{}` (found SHA-256 {}, expected {})",
                     info.challenge, run.source, self.id
                 );
-                return Err(FileError::new(path, message));
+                return Err(FileError::new(path, message).hint("another --store"));
             }
             let entry = Entry {
                 info,
@@ -284,7 +284,7 @@ impl Judge {
             Ok(receipt) => (receipt, None),
             Err(error) => (
                 None,
-                Some(format!("counts as without a receipt: {}", error.message)),
+                Some(format!("counts as without a receipt: {}", error.text())),
             ),
         };
         let received = match (&receipt, arrivals) {
@@ -367,7 +367,7 @@ impl Judge {
                 }
                 Err(error) => round.refused.push(Refused {
                     team: team_of(sending, None, None),
-                    reason: reason_of(&error.path, &error.message, sending),
+                    reason: reason_of(&error.path, &error.text(), sending),
                     path: sending.path.clone(),
                 }),
             }
@@ -535,7 +535,7 @@ impl Judge {
                 entry.challenge, self.challenge.name
             ));
         }
-        let plain = |error: FileError| reason_of(&error.path, &error.message, sending);
+        let plain = |error: FileError| reason_of(&error.path, &error.text(), sending);
         let sent = self.challenge.open(&sending.path).map_err(plain)?;
         let submission = Submission::read(&sent).map_err(plain)?;
         info.contents = rules.accept(&submission)?;
@@ -580,7 +580,7 @@ impl Judge {
         sending: &Sending,
         done: &mut dyn FnMut(CheckedSet<'_>),
     ) -> Result<(), String> {
-        let plain = |error: FileError| reason_of(&error.path, &error.message, sending);
+        let plain = |error: FileError| reason_of(&error.path, &error.text(), sending);
         let mut expected = self.challenge.expected().map_err(plain)?;
         let truths = self.truths.iter();
         expected.secret_truth = truths.map(|(set, own)| (*set, own.shear.clone())).collect();

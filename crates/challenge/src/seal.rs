@@ -388,7 +388,7 @@ mod tests {
         std::fs::write(&target, toml::to_string(&receipt).unwrap()).unwrap();
         std::os::unix::fs::symlink(&target, Receipt::path(&entry)).unwrap();
         let error = Receipt::read(&key, &entry, "1f").unwrap_err();
-        assert!(error.message.contains("link"), "{error}");
+        assert!(error.text().contains("link"), "{error}");
         assert!(receipt.write(&entry).is_err());
     }
 
@@ -406,7 +406,7 @@ mod tests {
         for (from, to) in [("-24T", "-23T"), ("\"A\"", "\"B\""), ("pilot", "pirat")] {
             std::fs::write(&path, text.replacen(from, to, 1)).unwrap();
             let error = read(&key).unwrap_err();
-            assert!(error.message.contains("not signed"), "{to}: {error}");
+            assert!(error.text().contains("not signed"), "{to}: {error}");
         }
     }
 

@@ -54,22 +54,17 @@ impl Columns<'_> {
                     names, doubtful, ..
                 }),
             ) => {
-                let (of, advice) = match doubtful {
-                    true => (
-                        "comment",
-                        ". Try: these names, or no comment of as many words as columns",
-                    ),
-                    false => ("columns", ""),
-                };
+                let of = if *doubtful { "comment" } else { "columns" };
                 let message = format!(
-                    "found the {of} {}, expected {}{advice}",
+                    "found the {of} {}, expected {}",
                     names.join(", "),
                     self.described()
                 );
-                return Err(FileError {
-                    no_column: !doubtful,
-                    ..FileError::new(path, message)
-                });
+                let mut error = FileError::new(path, message);
+                error.no_column = !doubtful;
+                error.hint = doubtful
+                    .then(|| "these names, or no comment of as many words as columns".to_owned());
+                return Err(error);
             }
             (None, None) => (&[][..], self.unnamed(path, &found)?),
         };

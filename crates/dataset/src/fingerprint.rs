@@ -247,10 +247,10 @@ impl<'a> Inputs<'a> {
                     false => (path, "the file"),
                 };
                 let message = format!(
-                    "{what} has changed since {} was measured (found the fingerprint {now}, expected {kept}). Try: measure again into another folder",
+                    "{what} has changed since {} was measured (found the fingerprint {now}, expected {kept})",
                     catalogue.display()
                 );
-                return Err(FileError::new(path, message));
+                return Err(FileError::new(path, message).hint("measure again into another folder"));
             }
         }
         Ok(())

@@ -119,9 +119,9 @@ pub fn dither(root: &Path, set: u32, image: u32, most: f64) -> Result<[f64; 2], 
     }
     // Here, not where the stamps are combined, whose error would blame the cutting of the stamps and name no file.
     let message = format!(
-        "the dither is ({x}, {y}) px (expected up to {most} along each axis, which keeps galaxies on their stamps). Try: the released file"
+        "the dither is ({x}, {y}) px (expected up to {most} along each axis, which keeps galaxies on their stamps)"
     );
-    Err(FileError::new(&found.path, message))
+    Err(FileError::new(&found.path, message).hint("the released file"))
 }
 
 /// Files by subfield and epoch that show which images a branch should have: star fields, dithers and, with the number of the
@@ -263,9 +263,10 @@ impl GalaxyCatalogue {
             if galaxy.id != expected {
                 let Galaxy { x, y, id } = galaxy;
                 let message = format!(
-                    "the galaxy at x = {x}, y = {y} has the ID {id} (expected {expected}, of its subfield, column and row). Try: the released catalogue of subfield {set}"
+                    "the galaxy at x = {x}, y = {y} has the ID {id} (expected {expected}, of its subfield, column and row)"
                 );
-                return Err(FileError::new(&self.path, message));
+                return Err(FileError::new(&self.path, message)
+                    .hint(format!("the released catalogue of subfield {set}")));
             }
             ids[place] = galaxy.id.number();
         }
@@ -298,8 +299,8 @@ impl Parameters {
                 (!same).then(|| format!("`{name}` is {b}; {} has {a}", first.path.display()))
             };
             if let Some(message) = second.numbers.iter().find_map(differs) {
-                let message = format!("{message} (expected the same). Try: remove one of them");
-                return Err(FileError::new(&second.path, message));
+                let message = format!("{message} (expected the same)");
+                return Err(FileError::new(&second.path, message).hint("remove one of them"));
             }
         }
         Ok(found.into_iter().next())

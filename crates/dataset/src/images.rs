@@ -105,10 +105,10 @@ fn check_exposures(data: &DataFolder, sets: &[u32]) -> Result<(), FileError> {
         if let Some(image) = (first..=last).find(|image| !there.contains(image)) {
             let there: Vec<u32> = there.into_iter().collect();
             let message = format!(
-                "there is no such image (found {} of set {set}, expected {first} to {last}, all epochs of the set). Try: gather it again or, if it was left out on purpose, remove its table of stamps and give later images of the set, their stamps and PSFs lower numbers",
+                "there is no such image (found {} of set {set}, expected {first} to {last}, all epochs of the set)",
                 listed(&there)
             );
-            return Err(FileError::new(data.galaxies(set, image), message));
+            return Err(FileError::new(data.galaxies(set, image), message).hint("gather it again or, if it was left out on purpose, remove its table of stamps and give later images of the set, their stamps and PSFs lower numbers"));
         }
     }
     Ok(())

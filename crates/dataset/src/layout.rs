@@ -163,9 +163,10 @@ impl DataFolder {
         if self.layout.psf_star != great3::STAR_FIELDS {
             let example = fill(great3::PSF_IMAGES, 0, 0);
             let message = format!(
-                "there are PSFs of single galaxies (found images such as {example}), which are used in place of the star fields that were to be stacked. Try: without --stack-stars, or remove these images"
+                "there are PSFs of single galaxies (found images such as {example}), which are used in place of the star fields that were to be stacked"
             );
-            return Err(FileError::new(&self.root, message));
+            return Err(FileError::new(&self.root, message)
+                .hint("without --stack-stars, or remove these images"));
         }
         branch.stacked_stars = true;
         Ok(self)

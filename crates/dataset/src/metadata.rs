@@ -153,10 +153,10 @@ impl CommonAxes {
             (false, false) => "gather all with --frame pixel",
         };
         let message = format!(
-            "the ellipticities have other axes than those of {} and no common mean with them (found {axes}; expected {expected}). Try: {remedy}",
+            "the ellipticities have other axes than those of {} and no common mean with them (found {axes}; expected {expected})",
             first.display()
         );
-        Err(FileError::new(path, message))
+        Err(FileError::new(path, message).hint(remedy))
     }
 
     /// The axes of all; `None` without a catalogue.

@@ -387,9 +387,8 @@ impl Claim {
         match self.record.try_lock() {
             Err(TryLockError::WouldBlock) => {
                 let folder = self.path.parent().unwrap_or(&self.path);
-                let message =
-                    "another process writes to this folder. Try: wait for it, or another folder";
-                Err(FileError::new(folder, message))
+                let message = "another process writes to this folder";
+                Err(FileError::new(folder, message).hint("wait for it, or another folder"))
             }
             // File systems without locks have none that could be taken by others.
             _ => Ok(self),
@@ -436,8 +435,8 @@ impl Claim {
         match results.into_iter().find(|path| !path.is_file()) {
             None => Ok(()),
             Some(path) => {
-                let message = "the file was removed while results were written to its folder. Try: the same command again";
-                Err(FileError::new(path, message))
+                let message = "the file was removed while results were written to its folder";
+                Err(FileError::new(path, message).hint("the same command again"))
             }
         }
     }
@@ -461,11 +460,13 @@ pub fn claim<R: Serialize + DeserializeOwned>(
         // Another process that is first has written its record before its results.
         if let Some(found) = results.first().filter(|_| !is_there(path)) {
             let message = format!(
-                "nothing states the settings of this file (found no {} in {}). Try: another folder, or remove the results",
+                "nothing states the settings of this file (found no {} in {})",
                 path.file_name().unwrap_or_default().display(),
                 folder.display()
             );
-            return Err(FileError::new(found, message));
+            return Err(
+                FileError::new(found, message).hint("another folder, or remove the results")
+            );
         }
         // If another process is first, its record is compared like any earlier record.
         let _ = atomic::write_if_absent(path, record_text(path, record)?.as_bytes())?;

@@ -222,8 +222,9 @@ pub fn truth_is_there(path: &Path) -> Result<(), FileError> {
     if is_there(path) {
         return Ok(());
     }
-    let message = "there is no true shear to score against. Try: shearq mean --measured OUT, for the mean shear of images of your own";
-    Err(FileError::new(path, message))
+    let message = "there is no true shear to score against";
+    Err(FileError::new(path, message)
+        .hint("shearq mean --measured OUT, for the mean shear of images of your own"))
 }
 
 impl DataFolder {

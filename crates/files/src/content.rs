@@ -94,9 +94,10 @@ impl Content {
             Content::Other(name, remedy) => Err(FileError::new(
                 path,
                 format!(
-                    "the file is {name}, which is not read (expected a text, FITS or Parquet table). Try: {remedy}"
+                    "the file is {name}, which is not read (expected a text, FITS or Parquet table)"
                 ),
-            )),
+            )
+            .hint(remedy)),
             Content::Fits | Content::Parquet | Content::Text => Ok(()),
         }
     }

@@ -24,13 +24,15 @@ pub const MAX_ROWS: usize = 4000 * 4000;
 // Chosen by hand. A damaged header cannot ask for memory beyond it.
 pub(crate) const MAX_SIDE: usize = 200_000;
 
-/// A file that cannot be used: its path, the place, the found and the expected value.
+/// A file that cannot be used: its path, the place, the found and the expected value, and what the user can try.
 #[derive(Debug, Error)]
-#[error("{}: {message}", path.display())]
+#[error("{}: {}", path.display(), self.text())]
 pub struct FileError {
     pub path: PathBuf,
     /// Place, found value, expected value.
-    pub message: String,
+    message: String,
+    /// What to try, such as a command.
+    pub hint: Option<String>,
     /// Whether the only fault is that a requested column is absent or that the columns have no names.
     pub no_column: bool,
 }
@@ -58,7 +60,41 @@ impl FileError {
         FileError {
             path: path.as_ref().to_owned(),
             message,
+            hint: None,
             no_column: false,
+        }
+    }
+
+    /// With what the user can try, in place of an earlier hint.
+    #[must_use]
+    pub fn hint(self, hint: impl Into<String>) -> Self {
+        FileError {
+            hint: Some(hint.into()),
+            ..self
+        }
+    }
+
+    /// The message with the hint, without the path.
+    pub fn text(&self) -> String {
+        match &self.hint {
+            Some(hint) => format!("{}. Try: {hint}", self.message),
+            None => self.message.clone(),
+        }
+    }
+
+    /// The same about another path, such as that of an archive for a file in it.
+    #[must_use]
+    pub fn about(self, path: PathBuf) -> Self {
+        FileError { path, ..self }
+    }
+
+    /// With other words in message and hint.
+    #[must_use]
+    pub fn with_words(self, found: &str, other: &str) -> Self {
+        FileError {
+            message: self.message.replace(found, other),
+            hint: self.hint.map(|hint| hint.replace(found, other)),
+            ..self
         }
     }
 
@@ -76,7 +112,7 @@ impl FileError {
     /// `expected` that a table without names has.
     pub(crate) fn no_names(path: &Path, first: &[impl AsRef<str>], expected: &[&str]) -> Self {
         let message = format!(
-            "{} columns have no names (found the first row `{}`, expected {}: {}). Try: add a first line with the names",
+            "{} columns have no names (found the first row `{}`, expected {}: {})",
             first.len(),
             names_of(first),
             expected.len(),
@@ -84,14 +120,16 @@ impl FileError {
         );
         FileError {
             no_column: true,
-            ..FileError::new(path, message)
+            ..FileError::new(path, message).hint("add a first line with the names")
         }
     }
 
     /// Adds a hint on where the names of columns are specified, if the fault is about columns.
+    #[must_use]
     pub fn hint_of_columns(mut self, hint: &str) -> Self {
         if self.no_column {
-            self.message = format!("{}; {hint}", self.message);
+            let last = self.hint.as_mut().unwrap_or(&mut self.message);
+            *last += &format!("; {hint}");
         }
         self
     }

@@ -209,10 +209,13 @@ fn check_format(path: &Path, line: &str) -> Result<(), FileError> {
         Some((_, format, name)) => Err(FileError::new(
             path,
             format!(
-                "the file is {format}, which is not read; expected a text, FITS or Parquet table. Try: stilts tcopy ifmt={name} in={} out=table.fits",
-                path.display()
+                "the file is {format}, which is not read; expected a text, FITS or Parquet table"
             ),
-        )),
+        )
+        .hint(format!(
+            "stilts tcopy ifmt={name} in={} out=table.fits",
+            path.display()
+        ))),
     }
 }
 
@@ -337,13 +340,7 @@ impl Head {
             } else if !text.is_empty() {
                 let bars = head.header.as_ref().is_some_and(|own| own.starts_with('|'));
                 if bars && IPAC_TYPES.iter().any(|own| text.contains(own)) {
-                    return Err(FileError::new(
-                        path,
-                        format!(
-                            "the file is an IPAC table, which is not read; expected a text, FITS or Parquet table. Try: stilts tcopy ifmt=ipac in={} out=table.fits",
-                            path.display()
-                        ),
-                    ));
+                    return Err(FileError::new(path, "the file is an IPAC table, which is not read; expected a text, FITS or Parquet table").hint(format!("stilts tcopy ifmt=ipac in={} out=table.fits", path.display())));
                 }
                 head.first = Some(line);
                 return Ok(head);

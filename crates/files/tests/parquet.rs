@@ -135,7 +135,7 @@ fn files_that_are_no_parquet_are_refused() {
     assert!(made.expect("mkfifo starts").success());
     for other in [&folder.path().join("absent.parquet"), folder.path(), &pipe] {
         let error = parquet::read(other, None, MAX_ROWS).expect_err("no file");
-        assert!(error.message.contains("cannot read the file"), "{error}");
+        assert!(error.text().contains("cannot read the file"), "{error}");
     }
     let whole = encode(&sample());
     let garbage = [&[0xff; 5000][..], b"PAR1PAR1PAR1PAR1", b"id,g1\n1,0.02\n"];

@@ -140,10 +140,8 @@ impl Baseline {
 
     pub fn exists(path: &Path) -> FileError {
         let name = path.file_stem().unwrap_or_default().to_string_lossy();
-        FileError::new(
-            path,
-            format!("the baseline exists. Try: shearq baseline check {name} --update"),
-        )
+        FileError::new(path, "the baseline exists")
+            .hint(format!("shearq baseline check {name} --update"))
     }
 
     fn text(&self, path: &Path) -> Result<String, FileError> {

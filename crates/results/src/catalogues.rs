@@ -116,11 +116,11 @@ impl Catalogues {
         let path = sent.as_given(sent.path());
         let settings = submission.settings(&path, data)?;
         let Packed::Catalogues(files) = submission.packed else {
-            let message = format!(
-                "this submission contains power spectra; expected catalogues. Try: shearq score --packed {} --data DIR --store DIR",
+            let message = "this submission contains power spectra; expected catalogues";
+            return Err(FileError::new(&path, message).hint(format!(
+                "shearq score --packed {} --data DIR --store DIR",
                 path.display()
-            );
-            return Err(FileError::new(path, message));
+            )));
         };
         let files = Files::from_sets(files);
         // Only their manifest has a run.

@@ -171,8 +171,8 @@ fn given_catalogues(
         if is_packed(folder) {
             // Its files do not lead to the data.
             let Some(data) = data.as_ref().filter(|_| given) else {
-                let message = "a submission needs the true shear. Try: --data DIR";
-                return Err(FileError::new(folder, message).into());
+                let message = "a submission needs the true shear";
+                return Err(FileError::new(folder, message).hint("--data DIR").into());
             };
             let sent = Sent::open(folder)?;
             let submission = Submission::read(&sent)?;
@@ -184,22 +184,24 @@ fn given_catalogues(
             let (beside, source) = first.get_or_insert_with(|| (folder, run.source.clone()));
             if *source != run.source.moved(folder, beside)? {
                 let message = format!(
-                    "the folders were measured from different data (found {}, expected {source}). Try: --data DIR with the truth of both",
+                    "the folders were measured from different data (found {}, expected {source})",
                     run.source
                 );
-                return Err(FileError::new(folder, message).into());
+                return Err(FileError::new(folder, message)
+                    .hint("--data DIR with the truth of both")
+                    .into());
             }
         }
         let data = match data {
             Some(data) => data,
-            None => data.insert(run.source.data(folder).map_err(
-                |FileError { path, message, .. }| {
-                    let place = folder.display();
-                    let hint =
-                        format!("{message} (the data folder of {place}; --data gives another)");
-                    FileError::new(path, hint)
-                },
-            )?),
+            None => data.insert(run.source.data(folder).map_err(|error| {
+                let message = format!(
+                    "{} (the data folder of {}; --data gives another)",
+                    error.text(),
+                    folder.display()
+                );
+                FileError::new(error.path, message)
+            })?),
         };
         // Catalogues of other images than those of the truth would have a low Q without any warning.
         fingerprint::verify(data, folder, &run, &[], &Pool::new(threads)?)?;

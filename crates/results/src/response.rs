@@ -36,7 +36,7 @@ pub fn response_of<'a>(catalogues: impl Iterator<Item = &'a Path>) -> Result<[f6
         let (before, expected) = *first.get_or_insert((path, divide));
         if divide != expected {
             let message = format!(
-                "these ellipticities are {}, and those of {} are not, so that they have no common response. Try: measure both with one version",
+                "these ellipticities are {}, and those of {} are not, so that they have no common response",
                 if divide {
                     "not divided by the response"
                 } else {
@@ -44,7 +44,7 @@ pub fn response_of<'a>(catalogues: impl Iterator<Item = &'a Path>) -> Result<[f6
                 },
                 before.display()
             );
-            return Err(FileError::new(path, message));
+            return Err(FileError::new(path, message).hint("measure both with one version"));
         }
         if divide {
             sum.add_catalogue(path, &RESPONSES[..2])?;
@@ -77,12 +77,13 @@ fn check_significance(path: &Path, means: &[RunningMean; 2]) -> Result<(), FileE
         return Ok(());
     };
     let message = format!(
-        "the mean response R{k}{k} of the {} galaxies of this and further catalogues is {:.4} ± {:.4} (expected a positive number of three standard errors), so that their ellipticities give no shear. Try: more galaxies, and check that the PSF has the pixel scale of the galaxies",
+        "the mean response R{k}{k} of the {} galaxies of this and further catalogues is {:.4} ± {:.4} (expected a positive number of three standard errors), so that their ellipticities give no shear",
         mean.count(),
         mean.mean(),
         mean.deviation() / (mean.count() as f64).sqrt()
     );
-    Err(FileError::new(path, message))
+    Err(FileError::new(path, message)
+        .hint("more galaxies, and check that the PSF has the pixel scale of the galaxies"))
 }
 
 /// Which galaxies share a mean response.
@@ -284,10 +285,10 @@ fn refuse_seen(
         None => Ok(()),
         Some(first) => {
             let message = format!(
-                "its image was measured for {}, too, so that its galaxies would count twice (expected each image once). Try: --measured with one of the folders",
+                "its image was measured for {}, too, so that its galaxies would count twice (expected each image once)",
                 first.display()
             );
-            Err(FileError::new(path, message))
+            Err(FileError::new(path, message).hint("--measured with one of the folders"))
         }
     }
 }

@@ -63,10 +63,10 @@ pub fn write(store: &Path, run: &RunRecord) -> Result<PathBuf, FileError> {
     // A file that cannot be read would make the other runs of the store unreadable, too.
     if text.len() as u64 > DATA {
         let message = format!(
-            "the run is too large for a file of a results store (found {} bytes, expected at most {DATA}). Try: shearq score with some --sets at a time",
+            "the run is too large for a file of a results store (found {} bytes, expected at most {DATA})",
             text.len()
         );
-        return Err(FileError::new(&path, message));
+        return Err(FileError::new(&path, message).hint("shearq score with some --sets at a time"));
     }
     atomic::write(&path, text.as_bytes())?;
     Ok(path)

@@ -202,7 +202,8 @@ impl Sent {
     }
 
     pub fn named(&self, error: FileError) -> FileError {
-        FileError::new(self.as_given(&error.path), error.message)
+        let given = self.as_given(&error.path);
+        error.about(given)
     }
 
     /// The files without the manifest and hidden files, or the given file.

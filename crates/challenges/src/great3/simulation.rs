@@ -223,8 +223,9 @@ fn check_kept(
         // Not `>`, which NaN passes.
         let is_same = |(own, found): (&f32, &f32)| (own - found).abs() <= MAX_REDRAWN_DIFFERENCE;
         if !stamp.iter().zip(found).all(is_same) {
-            let message = "the first galaxy is not the one of this seed and these settings. Try: remove the image, which is then simulated again";
-            return Err(FileError::new(path, message));
+            let message = "the first galaxy is not the one of this seed and these settings";
+            return Err(FileError::new(path, message)
+                .hint("remove the image, which is then simulated again"));
         }
     }
     Ok(())

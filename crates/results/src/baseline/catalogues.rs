@@ -449,11 +449,11 @@ impl CatalogueBaseline {
         let found = fingerprint::of_bytes(&bytes);
         if found != baseline.units {
             let message = format!(
-                "these are not the units of {} (found the hash {found}, expected {}). Try: both files of one `baseline record`",
+                "these are not the units of {} (found the hash {found}, expected {})",
                 path.display(),
                 baseline.units
             );
-            return Err(FileError::new(place, message));
+            return Err(FileError::new(place, message).hint("both files of one `baseline record`"));
         }
         let units = serde_json::from_slice(&bytes)
             .map_err(FileError::doing(&place, "these are no units of a baseline"))?;

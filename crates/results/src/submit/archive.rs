@@ -179,9 +179,9 @@ impl Members<'_> {
                 }
                 _ => {
                     let message = format!(
-                        "cannot unpack `{name}`: its compression or encryption is not supported. Try: deflate, without a password"
+                        "cannot unpack `{name}`: its compression or encryption is not supported"
                     );
-                    return Err(FileError::new(path, message));
+                    return Err(FileError::new(path, message).hint("deflate, without a password"));
                 }
             };
             let most = self.most;

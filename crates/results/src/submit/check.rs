@@ -86,10 +86,10 @@ impl Finding {
     /// The finding about a submission that cannot be opened.
     pub fn unreadable(error: FileError) -> Self {
         Finding {
+            message: error.text(),
             path: error.path,
             severity: Severity::Error,
             check: "readable",
-            message: error.message,
         }
     }
 }
@@ -105,7 +105,7 @@ pub fn check_sent(
     let mut report = Report::default();
     match sent.files() {
         Ok(files) => check_files(path, &files, expected, done, &mut report),
-        Err(error) => report.error(path, "readable", error.message),
+        Err(error) => report.error(path, "readable", error.text()),
     }
     let mut findings = report.findings;
     // Participants do not know the folder that their archive was unpacked to.
@@ -326,14 +326,14 @@ fn check_manifest(folder: &Path, files: &[PathBuf], report: &mut Report) {
     let manifest = match Manifest::read(folder) {
         Ok(Some(manifest)) => manifest,
         Ok(None) => return,
-        Err(error) => return report.error(&error.path, "manifest", error.message),
+        Err(error) => return report.error(&error.path, "manifest", error.text()),
     };
     let mut found = BTreeMap::new();
     for file in files {
         let name = file.file_name().unwrap_or_default().to_string_lossy();
         match FileSum::of(file) {
             Ok(sum) => _ = found.insert(name.into_owned(), sum),
-            Err(error) => report.error(file, "readable", error.message),
+            Err(error) => report.error(file, "readable", error.text()),
         }
     }
     for (name, message) in manifest.faults(&found) {
@@ -373,7 +373,7 @@ fn open_catalogues<'p>(
     let opened = opened.collect();
     let calibration = mean.calibration();
     let calibration =
-        calibration.map_err(|error| report.error(&error.path, "response", error.message));
+        calibration.map_err(|error| report.error(&error.path, "response", error.text()));
     (opened, calibration.unwrap_or(Calibration::NONE))
 }
 
@@ -603,7 +603,7 @@ fn check_spectrum(path: &Path, set: Option<u32>, expected: &Expected, report: &m
     let lines = match read_spectrum(path) {
         Ok(lines) => lines,
         Err(error) => {
-            report.error(path, "readable", error.message);
+            report.error(path, "readable", error.text());
             return;
         }
     };

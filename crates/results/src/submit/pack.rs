@@ -86,8 +86,8 @@ impl Packing<'_> {
             }
             (None, Some(data)) => truth::grid_of_set(data, set),
             (None, None) => {
-                let message = "cannot determine the grid of the spectra. Try: --data DIR";
-                Err(FileError::new(catalogue, message))
+                let message = "cannot determine the grid of the spectra";
+                Err(FileError::new(catalogue, message).hint("--data DIR"))
             }
         }
     }
@@ -144,11 +144,12 @@ impl Packing<'_> {
         {
             let wrong = matching.convention();
             let message = format!(
-                "the catalogues are in convention {} ({}), judged by the true shear; spectra need convention 5. Try: exchange `x` and `y`, or set `e2_sign`, in the description",
+                "the catalogues are in convention {} ({}), judged by the true shear; spectra need convention 5",
                 wrong.number(),
                 wrong.describe()
             );
-            return Err(FileError::new(foreign.pattern(), message));
+            return Err(FileError::new(foreign.pattern(), message)
+                .hint("exchange `x` and `y`, or set `e2_sign`, in the description"));
         }
         let count = files.len();
         let manifest = Manifest {
@@ -331,10 +332,8 @@ impl ArchiveWriter {
 }
 
 fn exists(path: &Path) -> FileError {
-    FileError::new(
-        path,
-        "the archive exists already; expected a new file. Try: another name for --out",
-    )
+    FileError::new(path, "the archive exists already; expected a new file")
+        .hint("another name for --out")
 }
 
 // gzip's code for an unknown system.
@@ -376,7 +375,7 @@ mod tests {
         writer.finish().unwrap();
         read_archive(&path, None, None)
             .err()
-            .map_or_else(String::new, |e| e.message)
+            .map_or_else(String::new, |e| e.text())
     }
 
     #[test]
