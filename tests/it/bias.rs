@@ -126,7 +126,7 @@ fn errors_contain_the_noise_of_a_star_that_all_galaxies_share() {
         folder.json(&format!("bias plus.{name} minus.{name}"))
     };
     let noise = ("psfnoise", "3.00e-1 4.00e-3");
-    let creator = ("creator", "shearq 0.2.0");
+    let creator = ("creator", "shearq 0.3.0");
     let one = [creator, noise, ("psf", "a")];
     let other = [creator, noise, ("psf", "b")];
     let (parquet, fits) = (FileFormat::Parquet, FileFormat::Fits);
