@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Makes what is published of a release, in the folder named: an archive with the binary, a Debian package where
 # dpkg-deb is there, and their checksums. Reproducible: the same commit and compiler give the same bytes.
+# On Linux it needs `pip install cargo-zigbuild`, which links against glibc 2.17, so that the binary runs on older systems.
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 out=${1:?usage: .ci/release/archive.sh FOLDER}
@@ -9,13 +10,17 @@ out=$(cd "$out" && pwd)
 version=$(sed -n 's/^version = "\(.*\)"/\1/p' Cargo.toml | head -1)
 host=$(rustc -vV | sed -n 's/^host: //p')
 export SOURCE_DATE_EPOCH=${SOURCE_DATE_EPOCH:-$(git log -1 --format=%ct)}
-# No path of this machine in the binary.
-export RUSTFLAGS="--remap-path-prefix=$PWD=. --remap-path-prefix=${CARGO_HOME:-$HOME/.cargo}=cargo ${RUSTFLAGS:-}"
+# No path of this machine in the binary. The same flags as in python/wheels.sh, so that both share their dependencies.
+export RUSTFLAGS="--remap-path-prefix=$PWD=. --remap-path-prefix=${CARGO_HOME:-$HOME/.cargo}=cargo --remap-path-prefix=${CARGO_TARGET_DIR:-$PWD/target}=target ${RUSTFLAGS:-}"
 # `shearq --version` says it.
 SHEARQ_COMMIT=$(git rev-parse --short=12 HEAD)
 export SHEARQ_COMMIT
-[ -n "${SHEARQ:-}" ] || cargo build --release --locked
-binary=${SHEARQ:-${CARGO_TARGET_DIR:-target}/release/shearq}
+case $host in
+    *-linux-gnu) build=zigbuild glibc=.2.17 ;;
+    *) build=build glibc= ;;
+esac
+[ -n "${SHEARQ:-}" ] || cargo $build --profile dist --locked --bin shearq --target "$host$glibc"
+binary=${SHEARQ:-${CARGO_TARGET_DIR:-target}/$host/dist/shearq}
 
 stage=$(mktemp -d)
 trap 'rm -rf "$stage"' EXIT
@@ -49,13 +54,14 @@ Package: shearq
 Version: $version
 Architecture: $(dpkg --print-architecture)
 Maintainer: the authors of shearq <shearq@users.noreply.github.com>
-Depends: libc6, libgcc-s1
+Depends: libc6 (>= 2.17)
 Section: science
 Priority: optional
 Homepage: https://github.com/shearq/shearq
-Description: score weak-lensing shape measurements as challenges do
- Measures galaxy shapes by Hopfield-network deconvolution, estimates shear
- power spectra, computes Q, M/2 and sqrt(A), and packs submissions.
+Description: m and c of weak-lensing shear catalogues, galaxy shapes, scores
+ Determines the multiplicative and additive bias of shear catalogues of any
+ program, measures galaxy shapes with their shear responses, scores methods
+ as the GREAT challenges did, and runs challenges.
 CONTROL
     find "$root" -exec touch -h -d "@$SOURCE_DATE_EPOCH" {} +
     dpkg-deb --root-owner-group --build "$root" "$out/shearq_${version}.deb" > /dev/null

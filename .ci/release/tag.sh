@@ -19,12 +19,13 @@ grep -q "^## .*$version" CHANGELOG.md || fail "CHANGELOG.md: expected a section 
 bash .ci/run
 cargo test --release -- --ignored
 cargo package --locked "${published[@]}"
-bash .ci/release/archive.sh "$dist"
 tools=$(mktemp -d)
 trap 'rm -rf "$tools"' EXIT
 python3 -m venv "$tools"
-"$tools/bin/pip" install --quiet 'maturin[zig]>=1.9,<2' twine auditwheel
-DIST=$(realpath "$dist")/python PATH=$tools/bin:$PATH sh python/wheels.sh
+"$tools/bin/pip" install --quiet 'maturin[zig]>=1.9,<2' cargo-zigbuild twine auditwheel
+export PATH=$tools/bin:$PATH
+bash .ci/release/archive.sh "$dist"
+DIST=$(realpath "$dist")/python sh python/wheels.sh
 if [ "${2:-}" = --tag ]; then
     git tag -a "v$version" -m "shearq $version"
     echo "Publish by: git push origin v$version && cargo publish ${published[*]}"
