@@ -14,11 +14,8 @@ mkdir -p "$dist"
 # cfitsio's and LZ4's notices must be in all copies.
 python3 ../.ci/release/licences.py shearq-python > LICENCES-OF-DEPENDENCIES.txt
 trap 'rm -f LICENCES-OF-DEPENDENCIES.txt' EXIT
-# fitsio-sys compiles cfitsio within cargo's copy of its sources. A copy for wheels alone: objects that another build left there
-# were made for another libc, and zig cannot link their `stat` (of glibc 2.33) against glibc 2.17.
-export CARGO_HOME=${WHEELS_CARGO_HOME:-$(dirname "$PWD")/target/wheels-cargo}
 # No path of this machine in the module.
-export RUSTFLAGS="--remap-path-prefix=$(dirname "$PWD")=. --remap-path-prefix=$CARGO_HOME=cargo --remap-path-prefix=${CARGO_TARGET_DIR:-$(dirname "$PWD")/target}=target ${RUSTFLAGS:-}"
+export RUSTFLAGS="--remap-path-prefix=$(dirname "$PWD")=. --remap-path-prefix=${CARGO_HOME:-$HOME/.cargo}=cargo --remap-path-prefix=${CARGO_TARGET_DIR:-$(dirname "$PWD")/target}=target ${RUSTFLAGS:-}"
 for target in "${@:-x86_64-unknown-linux-gnu}"; do
     case $target in
         *-linux-*) maturin build --profile dist --zig --compatibility manylinux2014 --target "$target" --out "$dist" ;;

@@ -1,6 +1,6 @@
 #!/usr/bin/env python3
 """Licences of all that a release of shearq is made of (of the package named, by default the program), as one text: crates by what cargo knows of them, with the files
-that they bring, and the cfitsio and DejaVu that are built in. Fails where a crate has no licence."""
+that they bring, and the DejaVu that is built in. Fails where a crate has no licence."""
 
 import json
 import subprocess
@@ -35,7 +35,8 @@ def needed(data, name):
         for dependency in nodes[here]["deps"]:
             if any(kind["kind"] != "dev" for kind in dependency["dep_kinds"]):
                 todo.append(dependency["pkg"])
-    own = set(data["workspace_members"])
+    # All members have the licence of shearq, but fitsio-sys.
+    own = {p["id"] for p in data["packages"] if p["id"] in data["workspace_members"] and p["name"] != "fitsio-sys"}
     return sorted((packages[i] for i in seen - own), key=lambda p: (p["name"], p["version"]))
 
 

@@ -224,7 +224,7 @@ fn literal(name: &[u8]) -> Vec<u8> {
 
 // Most bytes of a header: fifty thousand cards.
 const MAX_HEADER_BYTES: u64 = 1 << 22;
-// Longest value and comment that cfitsio has room for.
+// Longest value and comment that cfitsio before 4.2 has room for; later ones cut them.
 const LONGEST_VALUE: usize = 70;
 const LONGEST_COMMENT: usize = 72;
 // Numbers that cfitsio uses unchecked while it opens a header: it allocates and fills 160 bytes per column, has arrays for six
