@@ -48,6 +48,7 @@
 mod calibration;
 mod defects;
 mod denoise;
+mod detection;
 mod error;
 mod examine;
 mod measurement;
@@ -72,6 +73,9 @@ mod transform;
 mod warning;
 
 pub use calibration::{MeanShear, MeanShearError, ShearSum, is_significant};
+pub use detection::{
+    DetectedPixel, Detection, DetectionScratch, DetectionSettings, Detections, Detector, Tile,
+};
 pub use error::{EpochError, MeasureError};
 pub use examine::{EXAMINED_PSFS, Examination, examined_rows};
 pub use measurement::{

@@ -1,0 +1,348 @@
+//! Detection whose response to shear is known in closed form.
+//!
+//! Every pixel of an exposure has a weight w between 0 and 1, a product of smooth steps of linear functionals of the deconvolved
+//! image: smoothed light v₀ is above a threshold, and v₀ − v_j above zero for four neighbours j (the idea of AnaCal, Li &
+//! Mandelbaum 2023, MNRAS 521, 4904). The ellipticity is e = M₂₂/(M₀₀ + C) about the pixel. A shear about the pixel changes a
+//! functional into another linear one, and with f = w e of the functionals u Stein's lemma gives the response without added
+//! noise,
+//!
+//! ```text
+//! ∂f/∂γ = Σ_a f_a u_a′ − Σ_ab f_ab ⟨n_a′ n_b⟩.
+//! ```
+//!
+//! A quarter of Σ_ab f_ab (C⊥ − C)_ab is added to f, C⊥ being the covariance behind the PSF turned by 90 degrees: it takes out what
+//! noise of the PSF's shape adds. The mean shear of an exposure is the sum of f over the sum of responses. Covariances are
+//! constants of an exposure, because its noise is white and of one level.
+//!
+//! A [`Detector`] works on tiles of two blocks, one below the other, whose middles cover the exposure. v₀ of both blocks, by one
+//! Fourier transform, decides which pixels may have a weight. Their functionals are sums over a square of pixels, which do not
+//! depend on tiles.
+
+mod functionals;
+mod groups;
+mod pixel;
+mod settings;
+mod weight;
+
+use multiversion::multiversion;
+use ndarray::ArrayView2;
+use shearq_quantities::fourier::Complex64;
+use shearq_quantities::{Jacobian, PixelShape, Spin2};
+
+use self::functionals::{Functionals, KERNELS, Lengths, SquareTransform, light_filter};
+pub use self::groups::Detections;
+pub use self::pixel::{DetectedPixel, Detection};
+pub use self::settings::DetectionSettings;
+use self::weight::{COUNT, EXCESS, LIGHT, M00, NEIGHBOURS, Square, Steps, dot, trace};
+use crate::error::MeasureError;
+use crate::psf::{gaussian_variance, noise_equivalent_area};
+
+/// Radius of the square of pixels under the functionals, in σ of the moments' Gaussian. The tests find 10⁻⁴ of the kernels' weights beyond.
+const KERNEL_SIGMAS: f64 = 6.5;
+/// Two blocks of fewer margins lose most of their pixels.
+const MIN_MARGINS_PER_BLOCK: usize = 8;
+/// Of a bound, in its standard deviations: what the Fourier transform and the sums over squares may differ by.
+const SLACK: f64 = 0.01;
+
+/// Finds the detections of exposures behind a star.
+#[derive(Debug)]
+pub struct Detector {
+    functionals: Functionals,
+    radius: usize,
+    lengths: Lengths,
+    steps: Steps,
+    /// Standard deviation of the noise of v₀.
+    light_noise: f64,
+    /// Σ_ab f_ab of these are subtracted from responses.
+    of_shear: [Square; 2],
+    /// The same, added to f.
+    of_psf: Square,
+    transform: SquareTransform,
+    light_filter: Vec<Complex64>,
+    turn: Spin2,
+}
+
+/// Buffers of a thread.
+#[derive(Debug)]
+pub struct DetectionScratch {
+    image: Vec<Complex64>,
+    spectrum: Vec<Complex64>,
+    transform: Vec<Complex64>,
+}
+
+/// A part of an exposure: two blocks, one below the other.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Tile {
+    /// Column and row of the exposure's pixel that is the first pixel of the tile; negative on the margin.
+    pub origin: [i64; 2],
+    /// Columns and rows.
+    pub sides: [usize; 2],
+}
+
+impl Detector {
+    /// Detections behind `star`, a stamp whose centre is that of the star, in white noise of standard deviation `noise` in image
+    /// units. Ellipticities are those on the sky by `jacobian`, or along the pixel axes.
+    ///
+    /// # Errors
+    /// If the star has no light, or the noise level is not a positive number.
+    pub fn new(
+        star: ArrayView2<'_, f64>,
+        noise: f64,
+        jacobian: Option<&Jacobian>,
+        settings: &DetectionSettings,
+    ) -> Result<Self, MeasureError> {
+        if !(noise > 0.0 && noise.is_normal()) {
+            return Err(MeasureError::Noise(noise.to_string()));
+        }
+        let sum = star.sum();
+        if !(sum > 0.0 && sum.is_finite()) {
+            return Err(MeasureError::DarkPsf(sum));
+        }
+        let (turn, pixels) = match jacobian {
+            Some(jacobian) => {
+                let (orientation, pixels) = jacobian.factors();
+                (orientation.spin2(), pixels)
+            }
+            None => (
+                Jacobian::new([[1.0, 0.0], [0.0, 1.0]])?.factors().0.spin2(),
+                PixelShape::SQUARE,
+            ),
+        };
+        let star = star.mapv(|value| value / sum);
+        let sigma = gaussian_variance(noise_equivalent_area(star.view())).sqrt();
+        let lengths = Lengths {
+            detection_sigma: settings.detection_sigma * sigma,
+            moment_sigma: settings.moment_sigma * sigma,
+            distance: (settings.neighbour_distance * sigma).round().max(1.0) as usize,
+        };
+        // One less than a multiple of eight, so that a square of an even number of pixels, for vectors of two, is nearly centred.
+        let radius = (KERNEL_SIGMAS * lengths.moment_sigma).ceil() as usize;
+        let side = 2 * radius + 2;
+        let margin = radius + 1 + lengths.distance;
+        let transform = SquareTransform::new((MIN_MARGINS_PER_BLOCK * margin).next_power_of_two());
+        let functionals = Functionals::new(star.view(), &lengths, pixels, radius, side);
+        let scaled =
+            |square: &Square, factor: f64| square.map(|row| row.map(|value| factor * value));
+        let covariances = &functionals.covariances;
+        let variance = noise * noise;
+        let of_shear = covariances
+            .sheared
+            .each_ref()
+            .map(|own| scaled(own, variance));
+        let mut of_psf = scaled(&covariances.turned, 0.25 * variance);
+        for (value, plain) in of_psf
+            .as_flattened_mut()
+            .iter_mut()
+            .zip(covariances.plain.as_flattened())
+        {
+            *value -= 0.25 * variance * plain;
+        }
+        // Of the mean of both covariances: noise of the PSF's shape would make steps of other widths along one axis, and the weight a
+        // function of direction.
+        let deviation =
+            |a: usize| noise * (0.5 * (covariances.plain[a][a] + covariances.turned[a][a])).sqrt();
+        let of_excess = (EXCESS..M00).map(deviation).sum::<f64>() / NEIGHBOURS as f64;
+        let steps = Steps {
+            threshold: settings.threshold * deviation(LIGHT),
+            threshold_half_width: settings.threshold_half_width * deviation(LIGHT),
+            neighbour_half_width: settings.neighbour_half_width * of_excess,
+            neighbour_share: settings.neighbour_share,
+            softening: settings.softening * deviation(M00),
+        };
+        Ok(Detector {
+            light_filter: light_filter(star.view(), &lengths, pixels, &transform),
+            light_noise: deviation(LIGHT),
+            functionals,
+            radius,
+            lengths,
+            steps,
+            of_shear,
+            of_psf,
+            transform,
+            turn,
+        })
+    }
+
+    /// Buffers for [`Detector::detect`].
+    pub fn scratch(&self) -> DetectionScratch {
+        let pixels = self.transform.side * self.transform.side;
+        DetectionScratch {
+            image: vec![Complex64::default(); pixels],
+            spectrum: vec![Complex64::default(); pixels],
+            transform: vec![Complex64::default(); self.transform.scratch()],
+        }
+    }
+
+    /// Distance in pixels from an edge or a missing pixel, along either axis, within which no pixel has a weight. It does not depend
+    /// on the image, so that it selects no galaxies by their shear.
+    pub fn margin(&self) -> usize {
+        self.radius + 1
+    }
+
+    /// Smoothed light in image units at which a pixel has half of its weight.
+    pub fn threshold(&self) -> f64 {
+        self.steps.threshold
+    }
+
+    // Rows and columns of the middle of a block.
+    fn inner(&self) -> usize {
+        self.transform.side - 2 * self.outer()
+    }
+
+    // Those on each side of it.
+    fn outer(&self) -> usize {
+        self.margin() + self.lengths.distance
+    }
+
+    /// Rows of the exposure that the middles of a row of tiles have.
+    pub fn rows_per_tile(&self) -> usize {
+        2 * self.inner()
+    }
+
+    /// The tiles of the row `number` of an exposure of `width` columns, from left to right. They depend on the exposure alone.
+    pub fn tiles(&self, width: usize, number: usize) -> impl Iterator<Item = Tile> + use<> {
+        let (inner, outer) = (self.inner(), self.outer() as i64);
+        let side = self.transform.side;
+        let y = (number * 2 * inner) as i64 - outer;
+        (0..width).step_by(inner).map(move |x| Tile {
+            origin: [x as i64 - outer, y],
+            sides: [side, side + inner],
+        })
+    }
+
+    /// Appends the pixels with a weight in the middle of a tile to `found`, row by row. `pixels` are those of the whole tile, NaN
+    /// beyond the exposure and where they are missing.
+    ///
+    /// # Errors
+    /// If there are not as many pixels as the tile has.
+    pub fn detect(
+        &self,
+        tile: &Tile,
+        pixels: ArrayView2<'_, f32>,
+        scratch: &mut DetectionScratch,
+        found: &mut Vec<DetectedPixel>,
+    ) -> Result<(), MeasureError> {
+        let (side, inner, outer) = (self.transform.side, self.inner(), self.outer());
+        let [columns, rows] = tile.sides;
+        let (Some(values), true) = (
+            pixels.to_slice(),
+            pixels.dim() == (rows, columns) && rows == side + inner,
+        ) else {
+            return Err(MeasureError::Shape {
+                what: "a tile",
+                found: format!("{} × {} pixels", pixels.ncols(), pixels.nrows()),
+                expected: format!("{columns} × {rows} in rows"),
+            });
+        };
+        let known = |value: f32| {
+            if value.is_finite() {
+                f64::from(value)
+            } else {
+                0.0
+            }
+        };
+        let DetectionScratch {
+            image,
+            spectrum,
+            transform,
+        } = scratch;
+        for (at, value) in image.iter_mut().enumerate() {
+            // Filters of real kernels leave the blocks apart.
+            *value = Complex64::new(known(values[at]), known(values[at + inner * side]));
+        }
+        self.transform.forward(image, spectrum, transform);
+        for (value, filter) in spectrum.iter_mut().zip(&self.light_filter) {
+            *value *= filter;
+        }
+        self.transform.inverse(spectrum, image, transform);
+        let slack = SLACK * self.light_noise;
+        let distance = self.lengths.distance;
+        for y in outer..outer + 2 * inner {
+            // The row in the map of its block.
+            let is_lower = y >= outer + inner;
+            let row = if is_lower { y - inner } else { y };
+            let light = |row: usize, x: usize| {
+                let value = image[row * side + x];
+                if is_lower { value.im } else { value.re }
+            };
+            for x in outer..outer + inner {
+                let own = light(row, x);
+                let neighbours = || {
+                    [
+                        light(row, x + distance),
+                        light(row, x - distance),
+                        light(row + distance, x),
+                        light(row - distance, x),
+                    ]
+                };
+                if own < self.steps.threshold - self.steps.threshold_half_width - slack
+                    || !self.steps.may_count(own, neighbours(), slack)
+                {
+                    continue;
+                }
+                let place = [x as i64 + tile.origin[0], y as i64 + tile.origin[1]];
+                let sums = self.sums(values, side, [x, y]);
+                found.extend(self.pixel(place.map(|at| at as usize), &sums));
+            }
+        }
+        Ok(())
+    }
+
+    // All functionals at a pixel of a tile, and their changes with shear.
+    fn sums(&self, values: &[f32], columns: usize, [x, y]: [usize; 2]) -> [f32; KERNELS] {
+        let first = (y - self.radius) * columns + x - self.radius;
+        let side = 2 * self.radius + 2;
+        weighted_sums(&values[first..], columns, &self.functionals.kernels, side)
+    }
+
+    // `None` without a weight, and near missing pixels, which make the sums NaN.
+    fn pixel(&self, place: [usize; 2], sums: &[f32; KERNELS]) -> Option<DetectedPixel> {
+        let (parts, _) = sums.as_chunks::<COUNT>();
+        let [u, first, second] = [0, 1, 2].map(|k| parts[k].map(f64::from));
+        // A light far below zero is no galaxy but a wrong sky, and would be divided by.
+        if !(u[M00] > -0.5 * self.steps.softening) || !sums.iter().all(|sum| sum.is_finite()) {
+            return None;
+        }
+        let (weight, of) = self.steps.weighted(&u)?;
+        let changes = [first, second];
+        let response = [0, 1].map(|k| {
+            [0, 1].map(|g| dot(&of[k].first, &changes[g]) - trace(&of[k].second, &self.of_shear[g]))
+        });
+        let e = [0, 1].map(|k| of[k].value + trace(&of[k].second, &self.of_psf));
+        Some(DetectedPixel {
+            place,
+            weight,
+            e: self.turn.turn(e),
+            response: self.turn.turn_response(response),
+            snr: u[LIGHT] / self.light_noise,
+        })
+    }
+}
+
+/// Σ over a square of `side` pixels, of rows that are `columns` apart, of each pixel times its weights.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn weighted_sums(
+    pixels: &[f32],
+    columns: usize,
+    weights: &[[f32; KERNELS]],
+    side: usize,
+) -> [f32; KERNELS] {
+    // Two sums at a time, so that an addition does not wait for the one before.
+    let mut sums = [[0.0f32; KERNELS]; 2];
+    for (row, weights) in pixels.chunks(columns).zip(weights.chunks_exact(side)) {
+        let (pairs, _) = row[..side].as_chunks::<2>();
+        let (of_pairs, _) = weights.as_chunks::<2>();
+        for (pixels, weights) in pairs.iter().zip(of_pairs) {
+            for half in 0..2 {
+                for (sum, weight) in sums[half].iter_mut().zip(&weights[half]) {
+                    *sum += pixels[half] * weight;
+                }
+            }
+        }
+    }
+    let [even, odd] = sums;
+    std::array::from_fn(|kernel| even[kernel] + odd[kernel])
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,340 @@
+//! Linear functionals of the deconvolved image about a pixel, their changes with shear, and the covariances of their noise.
+
+use ndarray::{Array2, ArrayView2};
+use shearq_quantities::PixelShape;
+use shearq_quantities::fourier::{Complex64, Planner64};
+
+use super::weight::{COUNT, EXCESS, LIGHT, M00, M22, NEIGHBOURS, Square};
+
+/// Of the PSF's transform, below which modes are left out: rounding of single precision.
+const MIN_TRANSFER: f64 = 1e-5;
+
+/// Of each functional, with both components of shear after them: what a kernel is of.
+pub(super) const KERNELS: usize = 3 * COUNT;
+
+/// Lengths in pixels.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Lengths {
+    pub(super) detection_sigma: f64,
+    pub(super) moment_sigma: f64,
+    pub(super) distance: usize,
+}
+
+impl Lengths {
+    /// Offsets (x, y) of the neighbours in pixels.
+    pub(super) fn neighbours(&self) -> [[f64; 2]; NEIGHBOURS] {
+        let d = self.distance as f64;
+        [[d, 0.0], [-d, 0.0], [0.0, d], [0.0, -d]]
+    }
+}
+
+/// A factor of a filter at a mode, and its derivatives (k_x ∂_x − k_y ∂_y) and (k_y ∂_x + k_x ∂_y).
+#[derive(Clone, Copy)]
+struct Factor {
+    value: f64,
+    slopes: [f64; 2],
+}
+
+/// A wave vector in the coordinates of [`PixelShape::map`], with its products.
+#[derive(Clone, Copy)]
+struct Wave {
+    k: [f64; 2],
+    square: f64,
+    /// k_x² − k_y² and 2 k_x k_y.
+    spin: [f64; 2],
+}
+
+impl Wave {
+    /// That of a wave vector in radians per pixel.
+    fn new([kx, ky]: [f64; 2], pixels: PixelShape) -> Self {
+        // k · x is the same in both coordinates.
+        let k = [kx / pixels.stretch, pixels.stretch * ky - pixels.skew * kx];
+        Wave {
+            k,
+            square: k[0] * k[0] + k[1] * k[1],
+            spin: [k[0] * k[0] - k[1] * k[1], 2.0 * k[0] * k[1]],
+        }
+    }
+
+    /// The filter of a factor under a Gaussian at a place, and those of its changes with shear: −(k_x ∂_x − k_y ∂_y) and
+    /// −(k_y ∂_x + k_x ∂_y) of it.
+    ///
+    /// A shear about the pixel maps the image's transform at k to that at the sheared k. By a change of variables the filter is
+    /// sheared the other way.
+    fn filters(&self, factor: Factor, sigma: f64, at: [f64; 2]) -> [Complex64; 3] {
+        let [kx, ky] = self.k;
+        let phase = kx * at[0] + ky * at[1];
+        let light = Complex64::from_polar((-0.5 * sigma * sigma * self.square).exp(), phase);
+        let phases = [kx * at[0] - ky * at[1], ky * at[0] + kx * at[1]];
+        let change = |g: usize| {
+            let real = factor.slopes[g] - factor.value * sigma * sigma * self.spin[g];
+            -light * Complex64::new(real, factor.value * phases[g])
+        };
+        [light * factor.value, change(0), change(1)]
+    }
+
+    /// The filters of all functionals, each with those of its changes.
+    fn all(&self, lengths: &Lengths, pixels: PixelShape) -> [[Complex64; 3]; COUNT] {
+        let one = Factor {
+            value: 1.0,
+            slopes: [0.0; 2],
+        };
+        let (sigma, scale) = (lengths.moment_sigma, -lengths.moment_sigma.powi(2));
+        // (k_x ∂_x − k_y ∂_y) of k_x² − k_y² is 2k², and so is (k_y ∂_x + k_x ∂_y) of 2 k_x k_y; the others vanish.
+        let moment = |component: usize| {
+            let mut slopes = [0.0; 2];
+            slopes[component] = 2.0 * scale * self.square;
+            let value = scale * self.spin[component];
+            self.filters(Factor { value, slopes }, sigma, [0.0; 2])
+        };
+        let mut out = [[Complex64::default(); 3]; COUNT];
+        let centre = self.filters(one, lengths.detection_sigma, [0.0; 2]);
+        out[LIGHT] = centre;
+        for (j, at) in lengths.neighbours().into_iter().enumerate() {
+            let beside = self.filters(one, lengths.detection_sigma, pixels.map(at));
+            out[EXCESS + j] = [0, 1, 2].map(|k| centre[k] - beside[k]);
+        }
+        out[M00] = self.filters(one, sigma, [0.0; 2]);
+        (out[M22], out[M22 + 1]) = (moment(0), moment(1));
+        out
+    }
+}
+
+/// Transforms of square images of real pixels.
+pub(super) struct SquareTransform {
+    forward: shearq_quantities::fourier::Plan64,
+    inverse: shearq_quantities::fourier::Plan64,
+    pub(super) side: usize,
+}
+
+impl std::fmt::Debug for SquareTransform {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("SquareTransform")
+            .field("side", &self.side)
+            .finish_non_exhaustive()
+    }
+}
+
+/// Columns and rows that are transposed at a time: 4 KB of both images.
+const BLOCK: usize = 16;
+
+impl SquareTransform {
+    pub(super) fn new(side: usize) -> Self {
+        let mut planner = Planner64::new();
+        SquareTransform {
+            forward: planner.forward(side),
+            inverse: planner.inverse(side),
+            side,
+        }
+    }
+
+    /// Numbers that [`SquareTransform::forward`] needs beside the image.
+    pub(super) fn scratch(&self) -> usize {
+        let lengths = [&self.forward, &self.inverse].map(|plan| plan.get_inplace_scratch_len());
+        lengths[0].max(lengths[1])
+    }
+
+    /// Writes the transform of `image`, which is destroyed, to `out`: transposed, with k_x along its rows' index.
+    pub(super) fn forward(
+        &self,
+        image: &mut [Complex64],
+        out: &mut [Complex64],
+        scratch: &mut [Complex64],
+    ) {
+        self.forward.process_with_scratch(image, scratch);
+        transpose(image, out, self.side);
+        self.forward.process_with_scratch(out, scratch);
+    }
+
+    /// The opposite, without the division by the number of pixels. `transform` is destroyed.
+    pub(super) fn inverse(
+        &self,
+        transform: &mut [Complex64],
+        out: &mut [Complex64],
+        scratch: &mut [Complex64],
+    ) {
+        self.inverse.process_with_scratch(transform, scratch);
+        transpose(transform, out, self.side);
+        self.inverse.process_with_scratch(out, scratch);
+    }
+
+    /// The wave number of an index, in radians per pixel.
+    fn wave_number(&self, index: usize) -> f64 {
+        let signed = if 2 * index > self.side {
+            index as f64 - self.side as f64
+        } else {
+            index as f64
+        };
+        std::f64::consts::TAU * signed / self.side as f64
+    }
+
+    /// Wave vectors in the order of a transform.
+    fn waves(&self) -> impl Iterator<Item = [f64; 2]> {
+        let side = self.side;
+        (0..side)
+            .flat_map(move |x| (0..side).map(move |y| [self.wave_number(x), self.wave_number(y)]))
+    }
+}
+
+fn transpose(from: &[Complex64], to: &mut [Complex64], side: usize) {
+    for y0 in (0..side).step_by(BLOCK) {
+        for x0 in (0..side).step_by(BLOCK) {
+            for x in x0..(x0 + BLOCK).min(side) {
+                for y in y0..(y0 + BLOCK).min(side) {
+                    to[x * side + y] = from[y * side + x];
+                }
+            }
+        }
+    }
+}
+
+/// One over the transform of a star of sum one about the centre of its stamp, at the modes of a transform; zero where the star has
+/// no power. The star may not be larger than the transform.
+fn inverse_transfer(star: ArrayView2<'_, f64>, transform: &SquareTransform) -> Vec<Complex64> {
+    let side = transform.side;
+    let mut padded = vec![Complex64::default(); side * side];
+    let sum = star.sum();
+    for ((y, x), value) in star.indexed_iter() {
+        padded[y * side + x] = (value / sum).into();
+    }
+    let mut out = vec![Complex64::default(); side * side];
+    let mut scratch = vec![Complex64::default(); transform.scratch()];
+    transform.forward(&mut padded, &mut out, &mut scratch);
+    let centre = [star.ncols(), star.nrows()].map(|side| (side as f64 - 1.0) / 2.0);
+    for (value, [kx, ky]) in out.iter_mut().zip(transform.waves()) {
+        let transfer = *value * Complex64::cis(kx * centre[0] + ky * centre[1]);
+        *value = if transfer.norm() > MIN_TRANSFER {
+            transfer.inv()
+        } else {
+            Complex64::default()
+        };
+    }
+    out
+}
+
+/// The filter of v₀ at the modes of a transform, with the division by the number of pixels.
+pub(super) fn light_filter(
+    star: ArrayView2<'_, f64>,
+    lengths: &Lengths,
+    pixels: PixelShape,
+    transform: &SquareTransform,
+) -> Vec<Complex64> {
+    let pixels_inverse = 1.0 / (transform.side * transform.side) as f64;
+    let mut filter = inverse_transfer(star, transform);
+    for (value, k) in filter.iter_mut().zip(transform.waves()) {
+        let wave = Wave::new(k, pixels);
+        *value *= pixels_inverse * wave.all(lengths, pixels)[LIGHT][0];
+    }
+    filter
+}
+
+/// The kernels of all functionals, and the covariances of their noise.
+#[derive(Debug)]
+pub(super) struct Functionals {
+    /// For each pixel of a square, row by row, the weights of all [`KERNELS`].
+    pub(super) kernels: Vec<[f32; KERNELS]>,
+    /// Of noise of σ = 1.
+    pub(super) covariances: Covariances,
+}
+
+/// Mean products of the noise of functionals.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Covariances {
+    pub(super) plain: Square,
+    /// ⟨n_a′ n_b⟩ for both components of shear.
+    pub(super) sheared: [Square; 2],
+    /// C behind the PSF turned by 90 degrees.
+    pub(super) turned: Square,
+}
+
+impl Functionals {
+    /// The functionals behind a star, from a square of `side` pixels whose pixel `radius` along both axes is the pixel itself.
+    pub(super) fn new(
+        star: ArrayView2<'_, f64>,
+        lengths: &Lengths,
+        pixels: PixelShape,
+        radius: usize,
+        side: usize,
+    ) -> Self {
+        let transform = SquareTransform::new(
+            (4 * radius)
+                .max(star.nrows())
+                .max(star.ncols())
+                .next_power_of_two(),
+        );
+        let inverse = inverse_transfer(star, &transform);
+        let n = transform.side;
+        let norm = 1.0 / (n * n) as f64;
+        let filters = || {
+            let waves = transform.waves().zip(&inverse);
+            waves.map(|(k, inverse)| {
+                let filters = Wave::new(k, pixels).all(lengths, pixels);
+                filters.map(|own| own.map(|filter| filter * inverse))
+            })
+        };
+        let mut kernels = vec![[0.0f32; KERNELS]; side * side];
+        let mut plane = vec![Complex64::default(); n * n];
+        let mut out = plane.clone();
+        let mut scratch = vec![Complex64::default(); transform.scratch()];
+        for kernel in 0..KERNELS {
+            // The image at an offset d from the pixel enters with exp(−ik·d): the inverse transform at −d.
+            for (value, filters) in plane.iter_mut().zip(filters()) {
+                *value = filters[kernel % COUNT][kernel / COUNT].conj();
+            }
+            transform.inverse(&mut plane, &mut out, &mut scratch);
+            for (at, weights) in kernels.iter_mut().enumerate() {
+                let [y, x] = [at / side, at % side].map(|at| (at + n - radius) % n);
+                weights[kernel] = (norm * out[y * n + x].re) as f32;
+            }
+        }
+        let mut covariances = Covariances {
+            plain: [[0.0; COUNT]; COUNT],
+            sheared: [[[0.0; COUNT]; COUNT]; 2],
+            turned: [[0.0; COUNT]; COUNT],
+        };
+        for filters in filters() {
+            for a in 0..COUNT {
+                for b in 0..COUNT {
+                    let product = |k: usize| norm * (filters[a][k] * filters[b][0].conj()).re;
+                    covariances.plain[a][b] += product(0);
+                    for g in 0..2 {
+                        covariances.sheared[g][a][b] += product(1 + g);
+                    }
+                }
+            }
+        }
+        covariances.turned = covariance(turned(star).view(), lengths, pixels, &transform);
+        Functionals {
+            kernels,
+            covariances,
+        }
+    }
+}
+
+/// A star turned by 90 degrees about the centre of its stamp.
+fn turned(star: ArrayView2<'_, f64>) -> Array2<f64> {
+    let mut out = star.reversed_axes();
+    out.invert_axis(ndarray::Axis(0));
+    out.to_owned()
+}
+
+fn covariance(
+    star: ArrayView2<'_, f64>,
+    lengths: &Lengths,
+    pixels: PixelShape,
+    transform: &SquareTransform,
+) -> Square {
+    let norm = 1.0 / (transform.side * transform.side) as f64;
+    let mut out = [[0.0; COUNT]; COUNT];
+    let inverse = inverse_transfer(star, transform);
+    for (k, inverse) in transform.waves().zip(inverse) {
+        let filters = Wave::new(k, pixels).all(lengths, pixels);
+        for a in 0..COUNT {
+            for b in 0..COUNT {
+                let product = filters[a][0] * filters[b][0].conj();
+                out[a][b] += norm * product.re * inverse.norm_sqr();
+            }
+        }
+    }
+    out
+}
