@@ -20,6 +20,7 @@ mod commands {
     pub(crate) mod check;
     pub(crate) mod compare;
     pub(crate) mod completions;
+    pub(crate) mod detect;
     pub(crate) mod gather;
     pub(crate) mod man;
     pub(crate) mod mean;
@@ -53,9 +54,9 @@ use clap::{Parser, Subcommand};
 
 use arguments::StandardInput;
 use commands::{
-    baseline, bench, bias, challenge, check, compare, completions, gather, man, mean, measure,
-    merge, pack, quickstart, reproduce, run, score, select, shear, show, simulate, submissions,
-    unpack,
+    baseline, bench, bias, challenge, check, compare, completions, detect, gather, man, mean,
+    measure, merge, pack, quickstart, reproduce, run, score, select, shear, show, simulate,
+    submissions, unpack,
 };
 use shearq_files::parquet::panic_is_caught;
 use shearq_render::escape::visible;
@@ -69,7 +70,8 @@ use shearq_render::terminal::fitted;
 ///
 /// 1. `gather` makes a data folder from your stamps and PSFs. `simulate` makes a folder of simulated data.
 ///
-/// 2. `measure` writes a catalogue of ellipticities and responses to shear per image.
+/// 2. `measure` writes a catalogue of ellipticities and responses to shear per image. `detect` does so for an exposure, without
+/// `gather`, with the response of its detection.
 ///
 /// 3. `mean` prints the shear of a set with one shear. `shear` writes a shear per galaxy. `score` compares catalogues with a known shear field.
 ///
@@ -115,6 +117,10 @@ pub(crate) enum Command {
         after_help = "Example:\n  shearq measure --submission 48/linear/star --data data --out linear"
     )]
     Measure(measure::Arguments),
+    #[command(
+        after_help = "Example:\n  shearq detect --exposure field.fits --psf star.fits --noise 4.1 --out field"
+    )]
+    Detect(detect::Arguments),
     #[command(
         after_help = "Example:\n  shearq run --simulate --sets all --images 200 --submission 48/linear/star --out run"
     )]
@@ -246,6 +252,7 @@ pub fn run_with(arguments: impl IntoIterator<Item = OsString>) -> u8 {
         Command::Simulate(arguments) => simulate::run(&arguments),
         Command::Gather(arguments) => gather::run(&arguments),
         Command::Measure(arguments) => measure::run(&arguments),
+        Command::Detect(arguments) => detect::run(&arguments),
         Command::Run(arguments) => run::run(&arguments),
         Command::Mean(arguments) => mean::run(&arguments),
         Command::Select(arguments) => select::run(&arguments),

@@ -5,6 +5,7 @@
 
 mod bias;
 mod command;
+mod detect;
 mod errors;
 mod images;
 mod measure;
@@ -26,6 +27,8 @@ mod _shearq {
     use super::bias::{BiasSums, bias_sums, needed_columns};
     #[pymodule_export]
     use super::command::run_command;
+    #[pymodule_export]
+    use super::detect::detect;
     #[pymodule_export]
     use super::images::{are_aligned, header_pixels, pixel_difference_of, read_images};
     #[pymodule_export]

@@ -15,7 +15,7 @@ pub use name::{MAX_NAME, check_name, checked_name};
 pub use registry::{Entry, Published, Registry, Template};
 pub use settings::{
     AcfKind, Background, BrightnessUnit, Calibration, ClippedShape, Clipping, Configuration,
-    Denoise, EllipticityType, Kept, LinearDeconvolution, LinearMethod, Method,
+    Denoise, DetectionMethod, EllipticityType, Kept, LinearDeconvolution, LinearMethod, Method,
     NetworkDeconvolution, NetworkMethod, NoiseSource, Psf, PsfCut, PsfForm, PsfScale, ShareOf,
     ShearOrigin, SkySource, Stamp, Start, StepScale, Update, Wavelet, WeightedShape, limits,
 };

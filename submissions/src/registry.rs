@@ -266,7 +266,7 @@ fn configuration_of(mut table: Table) -> Result<Configuration, SettingError> {
         let bases = match (key.as_str(), &configuration.method) {
             ("method", _) => "`extends = \"paper\"` or `extends = \"48/linear/star\"`",
             (_, Method::Network(_)) => "`extends = \"paper\"`",
-            (_, Method::Linear(_)) => "`extends = \"48/linear/star\"`",
+            (_, Method::Linear(_) | Method::Detection(_)) => "`extends = \"48/linear/star\"`",
         };
         return Err(SettingError::Missing { key, bases });
     }

@@ -546,6 +546,8 @@ pub enum Method {
     Network(NetworkMethod),
     /// Its linear part in closed form, calibrated by its own response to shear.
     Linear(LinearMethod),
+    /// Detection on exposures with its response, which has no stamps.
+    Detection(DetectionMethod),
 }
 
 /// Settings of the network.
@@ -557,6 +559,74 @@ pub struct NetworkMethod {
     pub deconvolution: NetworkDeconvolution,
     /// Shape measurement.
     pub shape: ClippedShape,
+}
+
+/// Settings of detection. Lengths are in units of the PSF's σ: that of the Gaussian with the same noise-equivalent area.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct DetectionMethod {
+    /// S/N of the smoothed light at which a pixel has half of its weight.
+    pub threshold: f64,
+    /// Half width of that step, in S/N.
+    pub threshold_half_width: f64,
+    /// σ of the Gaussian that smooths the deconvolved image for detection.
+    pub detection_sigma: f64,
+    /// Distance of the four neighbours that a pixel is compared with, rounded to whole pixels.
+    pub neighbour_distance: f64,
+    /// Half width of the steps of these differences: standard deviations of their noise …
+    pub neighbour_half_width: f64,
+    /// … plus this share of the smoothed light. Without it single pixels of bright galaxies dominate the response.
+    pub neighbour_share: f64,
+    /// σ of the Gaussian under which moments are taken.
+    pub moment_sigma: f64,
+    /// What is added to the light that moments are divided by, in standard deviations of its noise.
+    pub softening: f64,
+}
+
+impl Default for DetectionMethod {
+    fn default() -> Self {
+        DetectionMethod {
+            threshold: 7.0,
+            threshold_half_width: 2.0,
+            detection_sigma: 1.2,
+            neighbour_distance: 1.9,
+            neighbour_half_width: 1.0,
+            neighbour_share: 0.15,
+            moment_sigma: 2.2,
+            softening: 15.0,
+        }
+    }
+}
+
+impl DetectionMethod {
+    /// Checks every setting against its range.
+    ///
+    /// # Errors
+    /// The first setting that is out of range.
+    pub fn validate(&self) -> Result<(), OutOfRange> {
+        let ranges = [
+            ("threshold", self.threshold, 3.0..=1e4),
+            ("threshold_half_width", self.threshold_half_width, 0.5..=1e3),
+            ("detection_sigma", self.detection_sigma, 0.8..=4.0),
+            ("neighbour_distance", self.neighbour_distance, 0.5..=6.0),
+            (
+                "neighbour_half_width",
+                self.neighbour_half_width,
+                0.2..=10.0,
+            ),
+            ("neighbour_share", self.neighbour_share, 0.0..=1.0),
+            ("moment_sigma", self.moment_sigma, 1.0..=6.0),
+            ("softening", self.softening, 1.0..=1e9),
+        ];
+        for (key, found, range) in ranges {
+            within(key, found, range, "")?;
+        }
+        require(
+            self.threshold > self.threshold_half_width,
+            "threshold",
+            self.threshold,
+            "more than threshold_half_width",
+        )
+    }
 }
 
 /// Settings of the linear network.
@@ -638,6 +708,7 @@ impl Configuration {
                 network.shape.validate()
             }
             Method::Linear(linear) => linear.validate(self.stamp.size, self.psf.size),
+            Method::Detection(detection) => detection.validate(),
         }
     }
 }
@@ -679,18 +750,18 @@ impl Configuration {
         }
     }
 
-    /// The network's settings; `None` for the linear method.
+    /// The network's settings; `None` for other methods.
     pub fn network(&self) -> Option<&NetworkMethod> {
         match &self.method {
             Method::Network(network) => Some(network),
-            Method::Linear(_) => None,
+            Method::Linear(_) | Method::Detection(_) => None,
         }
     }
 
-    /// The linear network's settings; `None` for the network.
+    /// The linear network's settings; `None` for other methods.
     pub fn linear(&self) -> Option<&LinearMethod> {
         match &self.method {
-            Method::Network(_) => None,
+            Method::Network(_) | Method::Detection(_) => None,
             Method::Linear(linear) => Some(linear),
         }
     }
@@ -708,7 +779,7 @@ impl Configuration {
     pub fn ellipticity(&self) -> EllipticityType {
         match &self.method {
             Method::Network(network) => network.shape.ellipticity,
-            Method::Linear(_) => EllipticityType::Shear,
+            Method::Linear(_) | Method::Detection(_) => EllipticityType::Shear,
         }
     }
 
@@ -717,6 +788,7 @@ impl Configuration {
         match &self.method {
             Method::Network(_) => Calibration::None,
             Method::Linear(linear) => linear.shape.calibration,
+            Method::Detection(_) => Calibration::Response,
         }
     }
 }

@@ -13,6 +13,7 @@ mod challenge;
 mod chosen_images;
 mod constants;
 mod damaged;
+mod detection;
 mod documents;
 mod entry_points;
 mod figures;

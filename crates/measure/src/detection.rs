@@ -12,7 +12,7 @@
 //!
 //! A quarter of Σ_ab f_ab (C⊥ − C)_ab is added to f, C⊥ being the covariance behind the PSF turned by 90 degrees: it takes out what
 //! noise of the PSF's shape adds. The mean shear of an exposure is the sum of f over the sum of responses. Covariances are
-//! constants of an exposure, because its noise is white and of one level.
+//! constants of an exposure, whose noise has one level and one correlation.
 //!
 //! A [`Detector`] works on tiles of two blocks, one below the other, whose middles cover the exposure. v₀ of both blocks, by one
 //! Fourier transform, decides which pixels may have a weight. Their functionals are sums over a square of pixels, which do not
@@ -21,27 +21,27 @@
 mod functionals;
 mod groups;
 mod pixel;
-mod settings;
 mod weight;
 
 use multiversion::multiversion;
 use ndarray::ArrayView2;
 use shearq_quantities::fourier::Complex64;
 use shearq_quantities::{Jacobian, PixelShape, Spin2};
+use shearq_submissions::DetectionMethod;
 
 use self::functionals::{Functionals, KERNELS, Lengths, SquareTransform, light_filter};
 pub use self::groups::Detections;
 pub use self::pixel::{DetectedPixel, Detection};
-pub use self::settings::DetectionSettings;
 use self::weight::{COUNT, EXCESS, LIGHT, M00, NEIGHBOURS, Square, Steps, dot, trace};
 use crate::error::MeasureError;
+use crate::noise::StampNoise;
 use crate::psf::{gaussian_variance, noise_equivalent_area};
 
-/// Radius of the square of pixels under the functionals, in σ of the moments' Gaussian. The tests find 10⁻⁴ of the kernels' weights beyond.
+// Radius of the square of pixels under the functionals, in σ of the moments' Gaussian. The tests find 10⁻⁴ of the kernels' weights beyond.
 const KERNEL_SIGMAS: f64 = 6.5;
-/// Two blocks of fewer margins lose most of their pixels.
+// Two blocks of fewer margins lose most of their pixels.
 const MIN_MARGINS_PER_BLOCK: usize = 8;
-/// Of a bound, in its standard deviations: what the Fourier transform and the sums over squares may differ by.
+// Of a bound, in its standard deviations: what the Fourier transform and the sums over squares may differ by.
 const SLACK: f64 = 0.01;
 
 /// Finds the detections of exposures behind a star.
@@ -80,19 +80,18 @@ pub struct Tile {
 }
 
 impl Detector {
-    /// Detections behind `star`, a stamp whose centre is that of the star, in white noise of standard deviation `noise` in image
-    /// units. Ellipticities are those on the sky by `jacobian`, or along the pixel axes.
+    /// Detections behind `star`, a stamp whose centre is that of the star, in noise. Ellipticities are those on the sky by `jacobian`, or along the pixel axes.
     ///
     /// # Errors
     /// If the star has no light, or the noise level is not a positive number.
     pub fn new(
         star: ArrayView2<'_, f64>,
-        noise: f64,
+        noise: &StampNoise,
         jacobian: Option<&Jacobian>,
-        settings: &DetectionSettings,
+        settings: &DetectionMethod,
     ) -> Result<Self, MeasureError> {
-        if !(noise > 0.0 && noise.is_normal()) {
-            return Err(MeasureError::Noise(noise.to_string()));
+        if !(noise.sigma() > 0.0 && noise.sigma().is_normal()) {
+            return Err(MeasureError::Noise(noise.sigma().to_string()));
         }
         let sum = star.sum();
         if !(sum > 0.0 && sum.is_finite()) {
@@ -115,32 +114,21 @@ impl Detector {
             moment_sigma: settings.moment_sigma * sigma,
             distance: (settings.neighbour_distance * sigma).round().max(1.0) as usize,
         };
-        // One less than a multiple of eight, so that a square of an even number of pixels, for vectors of two, is nearly centred.
         let radius = (KERNEL_SIGMAS * lengths.moment_sigma).ceil() as usize;
-        let side = 2 * radius + 2;
         let margin = radius + 1 + lengths.distance;
         let transform = SquareTransform::new((MIN_MARGINS_PER_BLOCK * margin).next_power_of_two());
-        let functionals = Functionals::new(star.view(), &lengths, pixels, radius, side);
-        let scaled =
-            |square: &Square, factor: f64| square.map(|row| row.map(|value| factor * value));
+        let functionals = Functionals::new(star.view(), noise, &lengths, pixels, radius);
         let covariances = &functionals.covariances;
-        let variance = noise * noise;
-        let of_shear = covariances
-            .sheared
-            .each_ref()
-            .map(|own| scaled(own, variance));
-        let mut of_psf = scaled(&covariances.turned, 0.25 * variance);
-        for (value, plain) in of_psf
-            .as_flattened_mut()
-            .iter_mut()
-            .zip(covariances.plain.as_flattened())
-        {
-            *value -= 0.25 * variance * plain;
+        let of_shear = covariances.sheared;
+        let mut of_psf = covariances.turned;
+        let plain = covariances.plain.as_flattened();
+        for (value, plain) in of_psf.as_flattened_mut().iter_mut().zip(plain) {
+            *value = 0.25 * (*value - plain);
         }
         // Of the mean of both covariances: noise of the PSF's shape would make steps of other widths along one axis, and the weight a
         // function of direction.
         let deviation =
-            |a: usize| noise * (0.5 * (covariances.plain[a][a] + covariances.turned[a][a])).sqrt();
+            |a: usize| (0.5 * (covariances.plain[a][a] + covariances.turned[a][a])).sqrt();
         let of_excess = (EXCESS..M00).map(deviation).sum::<f64>() / NEIGHBOURS as f64;
         let steps = Steps {
             threshold: settings.threshold * deviation(LIGHT),
@@ -176,7 +164,7 @@ impl Detector {
     /// Distance in pixels from an edge or a missing pixel, along either axis, within which no pixel has a weight. It does not depend
     /// on the image, so that it selects no galaxies by their shear.
     pub fn margin(&self) -> usize {
-        self.radius + 1
+        self.radius
     }
 
     /// Smoothed light in image units at which a pixel has half of its weight.
@@ -191,7 +179,7 @@ impl Detector {
 
     // Those on each side of it.
     fn outer(&self) -> usize {
-        self.margin() + self.lengths.distance
+        self.radius + 1 + self.lengths.distance
     }
 
     /// Rows of the exposure that the middles of a row of tiles have.

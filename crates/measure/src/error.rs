@@ -61,6 +61,11 @@ pub enum MeasureError {
     /// A Jacobian that maps no pixel to the sky.
     #[error(transparent)]
     Jacobian(#[from] JacobianError),
+    /// A configuration of exposures, which measures no stamps.
+    #[error(
+        "the configuration detects on exposures; expected one that measures stamps, such as 48/linear/star. Try: shearq detect"
+    )]
+    NoStamps,
     /// Pixels that are sheared more than the method can use.
     #[error(
         "pixels are sheared by {shear:.2e} on the sky; expected at most {most}, as the configuration requires. Try: {}",

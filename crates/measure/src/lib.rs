@@ -73,9 +73,7 @@ mod transform;
 mod warning;
 
 pub use calibration::{MeanShear, MeanShearError, ShearSum, is_significant};
-pub use detection::{
-    DetectedPixel, Detection, DetectionScratch, DetectionSettings, Detections, Detector, Tile,
-};
+pub use detection::{DetectedPixel, Detection, DetectionScratch, Detections, Detector, Tile};
 pub use error::{EpochError, MeasureError};
 pub use examine::{EXAMINED_PSFS, Examination, examined_rows};
 pub use measurement::{
@@ -85,7 +83,7 @@ pub use measurement::{
 pub use measurer::{Epoch, ImageNoise, ImageWorker, Measurer, PsfWorker, Steps, Worker};
 pub use method::AdaptedSettings;
 pub use ndarray;
-pub use noise::{StampNoise, Survey};
+pub use noise::{NoisePlan, NoiseSurvey, StampNoise, Survey};
 pub use pixels::{Pixel, Pixels};
 pub use psf::{Oversampling, Psfs, Star, average_stars};
 pub use selection::{Cut, Quantity, Selected, Selection};
@@ -96,7 +94,7 @@ pub use session::{
 pub use shearq_quantities::{
     Distortion, Frame, FunctionalPsf, Jacobian, JacobianError, PsfProfile, Shear,
 };
-pub use shearq_submissions::{Configuration, ConfigurationError, PsfCut};
+pub use shearq_submissions::{Configuration, ConfigurationError, DetectionMethod, PsfCut};
 pub use sky::Sky;
 pub use warning::{ExaminedPsfs, PixelFrame, Warning};
 

@@ -21,7 +21,10 @@ use shearq_quantities::Frame;
 use shearq_quantities::linear::Matrix2;
 
 pub use self::array::{GatheredPixels, HeaderPixels, is_aligned, pixel_difference};
+pub(crate) use self::exposure::Exposure;
+pub(crate) use self::files::PlaneReader;
 pub use self::files::{Content, Files};
+pub(crate) use self::maps::{another, lose};
 use self::model::Chip;
 use self::mosaic::{Rows, StampWriter, already};
 use self::plan::Plan;

@@ -5,6 +5,7 @@
 #![forbid(unsafe_code)]
 
 pub mod complete;
+pub mod detect;
 pub mod engine;
 pub mod galaxy_fits;
 pub mod gather;

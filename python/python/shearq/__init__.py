@@ -5,7 +5,7 @@
 >>> print(cat.mean_shear())                 # g1 = +0.0201 ± 0.0009, g2 = ...
 >>> cat.write("shapes.parquet")
 
-Measure    measure, measure_blocks, from_galsim, from_ngmix, from_meds, from_exposure, FunctionalPsf, DataWarning, set_threads, get_threads
+Measure    measure, measure_blocks, detect, from_galsim, from_ngmix, from_meds, from_exposure, FunctionalPsf, DataWarning, set_threads, get_threads
 Catalogues Catalogue, concatenate, mean_shear, MeanShear, Flag, read, read_all
 Score      score, galaxies, compare, power_spectrum, aperture_mass, Score, METRICS
 Validate   bias, bias_sums, Bias, BiasSums, null_tests
@@ -26,6 +26,7 @@ from ._catalogue import (
     concatenate as concatenate,
     mean_shear as mean_shear,
 )
+from ._detect import detect as detect
 from ._exposure import from_exposure as from_exposure
 from ._files import read as read, read_all as read_all
 from ._galsim import from_galsim as from_galsim

@@ -4,9 +4,11 @@ use ndarray::{Array2, ArrayView2};
 use shearq_quantities::PixelShape;
 use shearq_quantities::fourier::{Complex64, Planner64};
 
+use crate::noise::StampNoise;
+
 use super::weight::{COUNT, EXCESS, LIGHT, M00, M22, NEIGHBOURS, Square};
 
-/// Of the PSF's transform, below which modes are left out: rounding of single precision.
+// Of the PSF's transform, below which modes are left out: rounding of single precision.
 const MIN_TRANSFER: f64 = 1e-5;
 
 /// Of each functional, with both components of shear after them: what a kernel is of.
@@ -115,7 +117,7 @@ impl std::fmt::Debug for SquareTransform {
     }
 }
 
-/// Columns and rows that are transposed at a time: 4 KB of both images.
+// Columns and rows that are transposed at a time: 4 KB of both images.
 const BLOCK: usize = 16;
 
 impl SquareTransform {
@@ -233,7 +235,6 @@ pub(super) fn light_filter(
 pub(super) struct Functionals {
     /// For each pixel of a square, row by row, the weights of all [`KERNELS`].
     pub(super) kernels: Vec<[f32; KERNELS]>,
-    /// Of noise of σ = 1.
     pub(super) covariances: Covariances,
 }
 
@@ -243,19 +244,20 @@ pub(super) struct Covariances {
     pub(super) plain: Square,
     /// ⟨n_a′ n_b⟩ for both components of shear.
     pub(super) sheared: [Square; 2],
-    /// C behind the PSF turned by 90 degrees.
+    /// C behind the PSF, and of noise, turned by 90 degrees.
     pub(super) turned: Square,
 }
 
 impl Functionals {
-    /// The functionals behind a star, from a square of `side` pixels whose pixel `radius` along both axes is the pixel itself.
+    /// The functionals behind a star in noise, from the square of 2 `radius` + 2 pixels whose pixel `radius` along both axes is the pixel itself.
     pub(super) fn new(
         star: ArrayView2<'_, f64>,
+        noise: &StampNoise,
         lengths: &Lengths,
         pixels: PixelShape,
         radius: usize,
-        side: usize,
     ) -> Self {
+        let side = 2 * radius + 2;
         let transform = SquareTransform::new(
             (4 * radius)
                 .max(star.nrows())
@@ -292,10 +294,15 @@ impl Functionals {
             sheared: [[[0.0; COUNT]; COUNT]; 2],
             turned: [[0.0; COUNT]; COUNT],
         };
-        for filters in filters() {
+        let power = |k: [f64; 2]| {
+            let (power, _) = noise.power(k, PixelShape::SQUARE);
+            norm * noise.sigma().powi(2) * power
+        };
+        for (filters, k) in filters().zip(transform.waves()) {
+            let power = power(k);
             for a in 0..COUNT {
                 for b in 0..COUNT {
-                    let product = |k: usize| norm * (filters[a][k] * filters[b][0].conj()).re;
+                    let product = |k: usize| power * (filters[a][k] * filters[b][0].conj()).re;
                     covariances.plain[a][b] += product(0);
                     for g in 0..2 {
                         covariances.sheared[g][a][b] += product(1 + g);
@@ -303,7 +310,16 @@ impl Functionals {
                 }
             }
         }
-        covariances.turned = covariance(turned(star).view(), lengths, pixels, &transform);
+        let turned = inverse_transfer(turned(star).view(), &transform);
+        for (k, inverse) in transform.waves().zip(turned) {
+            let filters = Wave::new(k, pixels).all(lengths, pixels);
+            let power = power([k[1], -k[0]]) * inverse.norm_sqr();
+            for a in 0..COUNT {
+                for b in 0..COUNT {
+                    covariances.turned[a][b] += power * (filters[a][0] * filters[b][0].conj()).re;
+                }
+            }
+        }
         Functionals {
             kernels,
             covariances,
@@ -316,25 +332,4 @@ fn turned(star: ArrayView2<'_, f64>) -> Array2<f64> {
     let mut out = star.reversed_axes();
     out.invert_axis(ndarray::Axis(0));
     out.to_owned()
-}
-
-fn covariance(
-    star: ArrayView2<'_, f64>,
-    lengths: &Lengths,
-    pixels: PixelShape,
-    transform: &SquareTransform,
-) -> Square {
-    let norm = 1.0 / (transform.side * transform.side) as f64;
-    let mut out = [[0.0; COUNT]; COUNT];
-    let inverse = inverse_transfer(star, transform);
-    for (k, inverse) in transform.waves().zip(inverse) {
-        let filters = Wave::new(k, pixels).all(lengths, pixels);
-        for a in 0..COUNT {
-            for b in 0..COUNT {
-                let product = filters[a][0] * filters[b][0].conj();
-                out[a][b] += norm * product.re * inverse.norm_sqr();
-            }
-        }
-    }
-    out
 }

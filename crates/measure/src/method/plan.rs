@@ -27,6 +27,7 @@ impl MethodPlan {
             Method::Linear(linear) => {
                 MethodPlan::Linear(Arc::new(LinearFamily::new(linear, n, cut)?))
             }
+            Method::Detection(_) => return Err(MeasureError::NoStamps),
         })
     }
 

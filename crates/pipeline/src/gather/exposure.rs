@@ -8,15 +8,15 @@ use crate::stamp_table::first_pixel;
 use crate::wcs::Wcs;
 
 /// One image of a file, to cut squares out of.
-pub(super) struct Exposure<'a> {
+pub(crate) struct Exposure<'a> {
     images: Images<'a>,
-    pub(super) origin: Origin<'a>,
+    pub(crate) origin: Origin<'a>,
     /// Which image of several it is, if the user did not say.
-    pub(super) note: Option<String>,
+    pub(crate) note: Option<String>,
 }
 
 impl<'a> Exposure<'a> {
-    pub(super) fn open(files: Files<'a>) -> Result<Self, FileError> {
+    pub(crate) fn open(files: Files<'a>) -> Result<Self, FileError> {
         if let Some(more) = files.paths.get(1) {
             return Err(FileError::new(
                 more,
@@ -57,7 +57,7 @@ impl<'a> Exposure<'a> {
         self.images.content()
     }
 
-    pub(super) fn sides(&mut self) -> Result<[usize; 2], FileError> {
+    pub(crate) fn sides(&mut self) -> Result<[usize; 2], FileError> {
         let reader = self.reader()?;
         Ok([reader.width(), reader.height()])
     }
@@ -70,12 +70,22 @@ impl<'a> Exposure<'a> {
         self.reader()?.differs_from_datasum()
     }
 
-    pub(super) fn wcs(&mut self) -> Result<Wcs, FileError> {
+    pub(crate) fn wcs(&mut self) -> Result<Wcs, FileError> {
         Wcs::of_header(self.reader()?)
     }
 
+    /// The number of a header key; `None` if absent.
+    pub(crate) fn number(&mut self, key: &str) -> Result<Option<f64>, FileError> {
+        self.reader()?.number(key)
+    }
+
+    /// The next `count` rows, from the first one on.
+    pub(crate) fn rows<P: Pixel>(&mut self, count: usize) -> Result<Vec<P>, FileError> {
+        self.reader()?.read_rows_as(count)
+    }
+
     /// Refuses an image of another size than `other`.
-    pub(super) fn like(&mut self, other: &mut Self) -> Result<(), FileError> {
+    pub(crate) fn like(&mut self, other: &mut Self) -> Result<(), FileError> {
         let (own, expected) = (self.sides()?, other.sides()?);
         if own != expected {
             let message = format!(
@@ -93,7 +103,7 @@ impl<'a> Exposure<'a> {
 
     /// The square of `side` pixels a side whose centre is nearest to a position in FITS pixels; NaN beyond the
     /// image.
-    pub(super) fn square<P: Pixel>(
+    pub(crate) fn square<P: Pixel>(
         &mut self,
         (x, y): (f64, f64),
         side: usize,

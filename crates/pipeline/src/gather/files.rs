@@ -7,6 +7,8 @@ use shearq_files::FileError;
 use shearq_files::fits::{ImageHead, ImageReader, Pixel, Planes, Selection};
 use shearq_files::table::Place;
 
+use crate::wcs::Wcs;
+
 // Names of images that accompany an image of the sky in one file. They are refused unless the user chooses them: a weight map
 // would be measured like a galaxy.
 const COMPANIONS: [&str; 15] = [
@@ -97,7 +99,7 @@ impl Content {
 }
 
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Origin<'a> {
+pub(crate) struct Origin<'a> {
     pub(super) file: &'a Path,
     pub(super) image: usize,
     pub(super) plane: usize,
@@ -105,7 +107,7 @@ pub(super) struct Origin<'a> {
 }
 
 impl Origin<'_> {
-    pub(super) fn fault(&self, what: &str) -> FileError {
+    pub(crate) fn fault(&self, what: &str) -> FileError {
         let Origin { image, plane, .. } = self;
         FileError::new(self.file, format!("image {image}, plane {plane}: {what}"))
     }
@@ -269,14 +271,14 @@ fn has_bands(image: &ImageReader) -> bool {
 }
 
 /// The planes of images in turn.
-pub(super) struct PlaneReader<'a> {
+pub(crate) struct PlaneReader<'a> {
     images: Images<'a>,
     origin: Option<Origin<'a>>,
     left: usize,
 }
 
 impl<'a> PlaneReader<'a> {
-    pub(super) fn of(files: Files<'a>) -> Self {
+    pub(crate) fn of(files: Files<'a>) -> Self {
         PlaneReader {
             images: Images::of(files),
             origin: None,
@@ -288,13 +290,20 @@ impl<'a> PlaneReader<'a> {
         self.images.content()
     }
 
-    pub(super) fn sides(&self) -> [usize; 2] {
+    pub(crate) fn sides(&self) -> [usize; 2] {
         let now = self.images.now.as_ref();
         now.map_or([0; 2], |image| [image.width(), image.height()])
     }
 
+    /// That of the image that was read last.
+    pub(crate) fn wcs(&mut self) -> Result<Wcs, FileError> {
+        self.images
+            .now()
+            .map_or_else(|| Ok(Wcs::default()), Wcs::of_header)
+    }
+
     // One plane at a time: a cube of stamps can be larger than the memory.
-    pub(super) fn next<P: Pixel>(&mut self) -> Result<Option<(Origin<'a>, Vec<P>)>, FileError> {
+    pub(crate) fn next<P: Pixel>(&mut self) -> Result<Option<(Origin<'a>, Vec<P>)>, FileError> {
         let origin = match self.origin {
             Some(origin) if self.left > 0 => Origin {
                 plane: origin.plane + 1,

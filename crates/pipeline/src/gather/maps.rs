@@ -7,7 +7,7 @@ use shearq_quantities::statistics::upper_median;
 use super::files::{Content, Origin};
 
 // Without --mask-extension, the image itself would be read as its mask, and all bright pixels would be missing.
-pub(super) fn another(
+pub(crate) fn another(
     map: &Origin<'_>,
     image: &Origin<'_>,
     content: Content,
@@ -86,7 +86,7 @@ fn is_outside(at: usize, side: usize) -> bool {
 }
 
 // Makes the pixels of a stamp missing whose `mask` is not zero, or has one of these bits.
-pub(super) fn lose(pixels: &mut [f32], mask: &[f64], bits: Option<u64>) -> Result<(), String> {
+pub(crate) fn lose(pixels: &mut [f32], mask: &[f64], bits: Option<u64>) -> Result<(), String> {
     for (pixel, mask) in pixels.iter_mut().zip(mask) {
         let bad = match bits {
             Some(bits) if mask.is_finite() => {

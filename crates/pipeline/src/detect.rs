@@ -1,0 +1,455 @@
+//! Detecting galaxies on exposures, with the response of the detection.
+//!
+//! Rows of tiles are read one after the other and detected in threads. Tiles depend on the exposure alone, so that the detections
+//! are the same for any number of threads, and memory does not grow with the height of an exposure.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use ndarray::{Array2, ArrayView2};
+use shearq_dataset::fingerprint::{GALAXIES, PSF, of_image};
+use shearq_dataset::images::ImageId;
+use shearq_dataset::layout::DataFolder;
+use shearq_dataset::metadata::{CATALOGUE_FIRST_PIXEL, CATALOGUE_FRAME, frame_entry};
+use shearq_dataset::run::{Run, Source};
+use shearq_files::FileError;
+use shearq_files::frames::frame;
+use shearq_files::frames::polars::{Column, DataFrame, PolarsResult};
+use shearq_files::table::{self, FileFormat, Place};
+use shearq_measure::{
+    DetectedPixel, Detection, DetectionMethod, Detections, Detector, NoisePlan, PixelFrame,
+    StampNoise, Tile,
+};
+use shearq_quantities::{Frame, Jacobian};
+use shearq_submissions::{Configuration, Method, NoiseSource, Psf, PsfForm, Stamp};
+
+use crate::PipelineError;
+use crate::engine;
+use crate::gather::{Exposure, Files, Masks, PlaneReader, another, lose};
+use crate::measure::metadata;
+use crate::wcs::{Wcs, aligned};
+
+/// An exposure to detect galaxies on.
+#[derive(Debug, Clone)]
+pub struct DetectionTask<'a> {
+    pub exposure: Files<'a>,
+    /// A stamp of the star, at its centre.
+    pub psf: Files<'a>,
+    pub masks: Option<Masks<'a>>,
+    /// Standard deviation of a pixel; that of the header key NOISESIG, or measured with its correlation, if `None`.
+    pub noise: Option<f64>,
+    /// The axes of ellipticities; the sky's if the WCS has other axes than the pixels, unless it is given.
+    pub frame: Option<Frame>,
+    pub settings: DetectionMethod,
+}
+
+/// What was found on an exposure.
+#[derive(Debug, Clone, Copy)]
+pub struct Detected {
+    pub detections: usize,
+    /// Σ w.
+    pub weight: f64,
+    /// Pixels from an edge or a missing pixel within which there is no detection.
+    pub margin: usize,
+    /// Standard deviation of a pixel, and whether it was measured.
+    pub noise: f64,
+    pub is_measured: bool,
+    pub frame: Frame,
+    pub missing: usize,
+}
+
+/// Detects galaxies on an exposure. `open` is called in another thread and returns a function that reads a number of rows.
+pub fn detect_rows<R: FnMut(usize) -> Result<Vec<f32>, PipelineError>>(
+    threads: usize,
+    detector: &Detector,
+    [width, height]: [usize; 2],
+    open: impl FnOnce() -> Result<R, PipelineError> + Send,
+) -> Result<Vec<Detection>, PipelineError> {
+    let (mut found, mut of_row) = (Detections::default(), Vec::<DetectedPixel>::new());
+    engine::ordered(
+        threads,
+        |feeder| {
+            let mut bands = Bands::new(width, height, open()?);
+            for number in 0..height.div_ceil(detector.rows_per_tile()) {
+                let tiles: Vec<Tile> = detector.tiles(width, number).collect();
+                let band = Arc::new(bands.of(&tiles[0])?);
+                for (at, tile) in tiles.iter().enumerate() {
+                    let job = (Arc::clone(&band), *tile, at + 1 == tiles.len());
+                    if !feeder.push(job) {
+                        return Ok(());
+                    }
+                }
+            }
+            Ok(())
+        },
+        || (detector.scratch(), Vec::new()),
+        |(scratch, pixels), (band, tile, is_last)| {
+            copy_tile(&band, width, &tile, pixels);
+            let [columns, rows] = tile.sides;
+            let view = ArrayView2::from_shape((rows, columns), pixels).expect("as many as copied");
+            let mut found = Vec::new();
+            detector.detect(&tile, view, scratch, &mut found)?;
+            Ok((found, is_last))
+        },
+        |(pixels, is_last)| {
+            of_row.extend(pixels);
+            if is_last {
+                of_row.sort_unstable_by_key(|pixel| [pixel.place[1], pixel.place[0]]);
+                for pixel in of_row.drain(..) {
+                    found.add(&pixel);
+                }
+            }
+            Ok(())
+        },
+    )?;
+    Ok(found.finish())
+}
+
+/// Rows of an exposure that overlap.
+struct Bands<R> {
+    width: usize,
+    height: usize,
+    read: R,
+    /// Rows that were read, and those among them that a later band needs.
+    next: usize,
+    rest: Vec<f32>,
+}
+
+impl<R: FnMut(usize) -> Result<Vec<f32>, PipelineError>> Bands<R> {
+    fn new(width: usize, height: usize, read: R) -> Self {
+        Bands {
+            width,
+            height,
+            read,
+            next: 0,
+            rest: Vec::new(),
+        }
+    }
+
+    /// The rows of a tile, each over the whole width; NaN beyond the exposure. Tiles come in order.
+    fn of(&mut self, tile: &Tile) -> Result<Vec<f32>, PipelineError> {
+        let (width, rows) = (self.width, tile.sides[1]);
+        let start = tile.origin[1];
+        let end = (start + rows as i64).clamp(0, self.height as i64) as usize;
+        let kept = self.next - self.rest.len() / width;
+        let mut band = vec![f32::NAN; start.min(0).unsigned_abs() as usize * width];
+        let first = start.max(0) as usize;
+        band.extend_from_slice(&self.rest[(first - kept) * width..]);
+        if end > self.next {
+            band.extend((self.read)(end - self.next)?);
+            self.next = end;
+        }
+        let beyond = band.len().min((-start).max(0) as usize * width);
+        self.rest = band[beyond..].to_vec();
+        band.resize(rows * width, f32::NAN);
+        Ok(band)
+    }
+}
+
+// The columns of a tile from the rows of its band.
+fn copy_tile(band: &[f32], width: usize, tile: &Tile, to: &mut Vec<f32>) {
+    to.clear();
+    let columns = tile.sides[0];
+    let start = tile.origin[0];
+    let inside = |at: i64| at.clamp(0, width as i64) as usize;
+    let (first, last) = (inside(start), inside(start + columns as i64));
+    for row in band.chunks_exact(width) {
+        let end = to.len() + columns;
+        to.resize(to.len() + start.min(0).unsigned_abs() as usize, f32::NAN);
+        to.extend_from_slice(&row[first..last]);
+        to.resize(end, f32::NAN);
+    }
+}
+
+impl DetectionTask<'_> {
+    /// The record of catalogues in the folder `out`.
+    pub fn run(&self, out: &Path, format: FileFormat) -> Result<Run, FileError> {
+        let exposure = Place::of(&self.exposure.paths[0]).path;
+        let folder = match exposure.parent() {
+            Some(folder) if !folder.as_os_str().is_empty() => folder.to_owned(),
+            _ => PathBuf::from("."),
+        };
+        let configuration = Configuration {
+            name: "detection".into(),
+            description: "Detection on exposures with its response in closed form".into(),
+            // Those of the detector's squares and stars, which follow the PSF.
+            stamp: Stamp { size: 48 },
+            psf: Psf {
+                form: PsfForm::Star,
+                size: 48,
+            },
+            noise: NoiseSource::Header,
+            method: Method::Detection(self.settings),
+        };
+        let source = Source::folder(&DataFolder::new(folder), out)?;
+        Ok(Run::new(source, configuration, format))
+    }
+
+    /// Writes the catalogue `id` of a run into the folder `out`.
+    ///
+    /// # Errors
+    /// If a file cannot be read, the noise is not known, or the catalogue cannot be written.
+    pub fn write_catalogue(
+        &self,
+        run: &Run,
+        out: &Path,
+        id: ImageId,
+        threads: usize,
+    ) -> Result<Detected, PipelineError> {
+        let claim = run.claim(out)?;
+        let mut exposure = Exposure::open(self.exposure)?;
+        let sides = exposure.sides()?;
+        let wcs = exposure.wcs()?;
+        if let Some(fault) = wcs.fault().filter(|_| self.frame == Some(Frame::Sky)) {
+            return Err(exposure.origin.fault(&fault).into());
+        }
+        let jacobian = self.jacobian(&wcs, sides, &exposure)?;
+        let stated = match self.noise {
+            Some(noise) => Some(noise),
+            None => exposure.number("NOISESIG")?,
+        };
+        let noise = match stated {
+            Some(sigma) => StampNoise::white(sigma),
+            None => measured_noise(&mut exposure, sides)?,
+        };
+        let star = self.star(&wcs)?;
+        let detector = Detector::new(star.view(), &noise, jacobian.as_ref(), &self.settings)
+            .map_err(|error| FileError::new(&self.psf.paths[0], error))?;
+        let missing = AtomicUsize::new(0);
+        let found = detect_rows(threads, &detector, sides, || self.open(&missing))?;
+        let frame = jacobian.map_or(Frame::Pixel, |_| Frame::Sky);
+        claim.check()?;
+        let path = run.catalogue(out, id.set, id.image);
+        let columns = self::columns(&found, &wcs);
+        let columns = columns.map_err(|error| FileError::new(&path, error))?;
+        let mut prints = BTreeMap::new();
+        for (key, file) in [
+            (GALAXIES, &self.exposure.paths[0]),
+            (PSF, &self.psf.paths[0]),
+        ] {
+            prints.insert(key.to_owned(), of_image(&Place::of(file).path)?);
+        }
+        let mut metadata = metadata(run, id, prints)?;
+        metadata.insert(CATALOGUE_FIRST_PIXEL.into(), "1".into());
+        match (frame, wcs.reference()) {
+            (Frame::Sky, _) => {
+                metadata.insert(CATALOGUE_FRAME.into(), Frame::Sky.to_string());
+            }
+            (Frame::Pixel, Some(matrix)) => {
+                metadata.extend([frame_entry(&PixelFrame::from_jacobian(matrix))]);
+            }
+            (Frame::Pixel, None) => {}
+        }
+        table::write(&path, run.format, &columns, &metadata)?;
+        Ok(Detected {
+            detections: found.len(),
+            weight: found.iter().map(|own| own.weight).sum(),
+            margin: detector.margin(),
+            noise: noise.sigma(),
+            is_measured: stated.is_none(),
+            frame,
+            missing: missing.into_inner(),
+        })
+    }
+
+    // Reads rows of pixels, NaN where they are missing, which are counted.
+    fn open<'m>(
+        &self,
+        missing: &'m AtomicUsize,
+    ) -> Result<impl FnMut(usize) -> Result<Vec<f32>, PipelineError> + use<'_, 'm>, PipelineError>
+    {
+        let mut exposure = Exposure::open(self.exposure)?;
+        let mut mask = match self.masks {
+            None => None,
+            Some(masks) => {
+                let mut map = Exposure::open(masks.files)?;
+                map.like(&mut exposure)?;
+                another(&map.origin, &exposure.origin, masks.files.content)?;
+                Some((map, masks.bits))
+            }
+        };
+        Ok(move |rows: usize| {
+            let mut pixels: Vec<f32> = exposure.rows(rows)?;
+            if let Some((map, bits)) = &mut mask {
+                let values: Vec<f64> = map.rows(rows)?;
+                lose(&mut pixels, &values, *bits).map_err(|error| map.origin.fault(&error))?;
+            }
+            let lost = pixels.iter().filter(|pixel| !pixel.is_finite()).count();
+            missing.fetch_add(lost, Ordering::Relaxed);
+            Ok(pixels)
+        })
+    }
+
+    // That of the middle of the exposure, if ellipticities are to be along the axes of the sky.
+    fn jacobian(
+        &self,
+        wcs: &Wcs,
+        sides: [usize; 2],
+        exposure: &Exposure<'_>,
+    ) -> Result<Option<Jacobian>, FileError> {
+        let middle = sides.map(|side| 0.5 * (side as f64 + 1.0));
+        let matrix = wcs.jacobian(middle);
+        let wanted = match (self.frame, &matrix) {
+            (Some(Frame::Sky), None) => {
+                return Err(exposure
+                    .origin
+                    .fault("there is no WCS (expected one with --frame sky). Try: --frame pixel"));
+            }
+            (Some(frame), _) => frame == Frame::Sky,
+            (None, Some(matrix)) => !aligned(matrix),
+            (None, None) => false,
+        };
+        let matrix = matrix.filter(|_| wanted).map(Jacobian::new).transpose();
+        matrix.map_err(|error| exposure.origin.fault(&error.to_string()))
+    }
+
+    fn star(&self, wcs: &Wcs) -> Result<Array2<f64>, FileError> {
+        let mut planes = PlaneReader::of(self.psf);
+        let path = &self.psf.paths[0];
+        let Some((origin, pixels)) = planes.next::<f64>()? else {
+            return Err(FileError::new(path, "there is no image in this file"));
+        };
+        let [width, height] = planes.sides();
+        if let Some(at) = pixels.iter().position(|value| !value.is_finite()) {
+            let (x, y) = (at % width + 1, at / width + 1);
+            return Err(origin.fault(&format!(
+                "pixel ({x}, {y}) of the PSF is not a finite number"
+            )));
+        }
+        if planes.next::<f64>()?.is_some() {
+            return Err(FileError::new(
+                path,
+                "there are several PSFs (expected one stamp for the exposure)",
+            ));
+        }
+        if let Some(warning) = Wcs::disagreements(&planes.wcs()?, wcs).next() {
+            return Err(FileError::new(path, warning));
+        }
+        Array2::from_shape_vec((height, width), pixels).map_err(|error| FileError::new(path, error))
+    }
+}
+
+// Stamps a side of the grid on which the noise is measured, and their side in pixels. A thousand stamps have an error of the level
+// of 10⁻³.
+const NOISE_GRID: usize = 32;
+const NOISE_STAMP: usize = 48;
+// Largest distance of pixels that may be correlated, as `48/linear/star` has it.
+const MAX_LAG: usize = 3;
+
+fn measured_noise(
+    exposure: &mut Exposure<'_>,
+    sides: [usize; 2],
+) -> Result<StampNoise, PipelineError> {
+    let mut survey = NoisePlan::new(NOISE_STAMP, MAX_LAG, None)?.survey();
+    let places = |side: usize| {
+        let step = (side / NOISE_GRID).max(NOISE_STAMP);
+        (step / 2..side).step_by(step)
+    };
+    for y in places(sides[1]) {
+        for x in places(sides[0]) {
+            let stamp = exposure.square::<f32>((x as f64 + 0.5, y as f64 + 0.5), NOISE_STAMP)?;
+            if let Ok(stamp) = ArrayView2::from_shape((NOISE_STAMP, NOISE_STAMP), &stamp) {
+                survey.add(stamp)?;
+            }
+        }
+    }
+    let found = survey.result()?.map(|found| found.noise);
+    let found = found.ok_or_else(|| {
+        exposure.origin.fault("the noise cannot be measured (expected blank sky between the galaxies). Try: --noise SIGMA")
+    })?;
+    Ok(match found.is_correlated() {
+        true => found,
+        // What is measured of the correlation of white noise is noise.
+        false => StampNoise::white(found.sigma()),
+    })
+}
+
+/// Columns of catalogues of detections, for the command line and Python: places in FITS pixels, and what follows them. `flags` and
+/// `pixels` are whole numbers.
+pub const PLACE: [(&str, fn(&Detection) -> f64); 2] = [
+    ("x", |own| own.centre[0] + 1.0),
+    ("y", |own| own.centre[1] + 1.0),
+];
+pub const COLUMNS: [(&str, fn(&Detection) -> f64); 8] = [
+    ("e1", |own| own.e[0]),
+    ("e2", |own| own.e[1]),
+    ("R11", |own| own.response[0][0]),
+    ("R22", |own| own.response[1][1]),
+    ("R12", |own| own.response[0][1]),
+    ("R21", |own| own.response[1][0]),
+    // The weight, which e and R contain, by the name that it has after `select`.
+    ("selection", |own| own.weight),
+    ("snr", |own| own.snr),
+];
+pub const WHOLE: [(&str, fn(&Detection) -> i64); 2] =
+    [("flags", |_| 0), ("pixels", |own| own.pixels as i64)];
+
+fn columns(found: &[Detection], wcs: &Wcs) -> PolarsResult<DataFrame> {
+    let real = |(name, of): &(&str, fn(&Detection) -> f64)| {
+        Column::new((*name).into(), found.iter().map(of).collect::<Vec<f64>>())
+    };
+    let whole = |(name, of): &(&str, fn(&Detection) -> i64)| {
+        Column::new((*name).into(), found.iter().map(of).collect::<Vec<i64>>())
+    };
+    let mut columns: Vec<Column> = PLACE.iter().map(real).collect();
+    if wcs.has_sky() {
+        let sky = found.iter().map(|own| {
+            let [x, y] = PLACE.map(|(_, of)| of(own));
+            wcs.sky([x, y]).unwrap_or([f64::NAN; 2])
+        });
+        let (ra, dec): (Vec<f64>, Vec<f64>) = sky.map(|[ra, dec]| (ra, dec)).unzip();
+        columns.extend([Column::new("ra".into(), ra), Column::new("dec".into(), dec)]);
+    }
+    columns.extend(COLUMNS.iter().map(real));
+    columns.extend(WHOLE.iter().map(whole));
+    frame(columns)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use shearq_measure::FunctionalPsf;
+    use shearq_quantities::{PsfProfile, Shear};
+
+    #[test]
+    fn tiles_have_the_pixels_of_the_exposure() {
+        let psf = FunctionalPsf::new(PsfProfile::Moffat { beta: 3.0 }, 3.5, Shear::ZERO).unwrap();
+        let settings = DetectionMethod::default();
+        let detector = Detector::new(
+            psf.stamp(48).view(),
+            &StampNoise::white(1.0),
+            None,
+            &settings,
+        )
+        .unwrap();
+        let (width, height) = (530, 2 * detector.rows_per_tile() + 9);
+        let mut next = 0;
+        let read = |rows: usize| {
+            let first = next;
+            next += rows * width;
+            Ok((first..next).map(|at| at as f32).collect())
+        };
+        let mut bands = Bands::new(width, height, read);
+        for number in 0..3 {
+            let tiles: Vec<Tile> = detector.tiles(width, number).collect();
+            let band = bands.of(&tiles[0]).unwrap();
+            let mut pixels = vec![7.0];
+            for tile in &tiles {
+                copy_tile(&band, width, tile, &mut pixels);
+                let [columns, rows] = tile.sides;
+                assert_eq!(pixels.len(), columns * rows);
+                for (at, pixel) in pixels.iter().enumerate().step_by(97) {
+                    let [x, y] = [at % columns, at / columns];
+                    let [x, y] = [x as i64 + tile.origin[0], y as i64 + tile.origin[1]];
+                    let inside = |at: i64, side| (0..side as i64).contains(&at);
+                    match inside(x, width) && inside(y, height) {
+                        true => assert_eq!(*pixel, (y * width as i64 + x) as f32, "{x} {y}"),
+                        false => assert!(pixel.is_nan(), "{x} {y}"),
+                    }
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,64 @@
+//! Detections on an exposure.
+
+use ndarray::s;
+use numpy::{IntoPyArray, PyReadonlyArray2};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+use shearq_measure::{DetectionMethod, Detector, Jacobian, StampNoise};
+use shearq_pipeline::detect::{COLUMNS, PLACE, WHOLE, detect_rows};
+
+use crate::errors::{of_measuring, of_pipeline};
+use crate::work::threads;
+
+/// The columns of the detections on an image (ny, nx), NaN where pixels are missing.
+#[pyfunction]
+pub(crate) fn detect<'py>(
+    py: Python<'py>,
+    image: PyReadonlyArray2<'py, f32>,
+    star: PyReadonlyArray2<'py, f64>,
+    noise: f64,
+    threshold: f64,
+    jacobian: Option<[[f64; 2]; 2]>,
+    threads_asked: Option<u16>,
+) -> PyResult<Bound<'py, PyDict>> {
+    let settings = DetectionMethod {
+        threshold,
+        ..DetectionMethod::default()
+    };
+    settings
+        .validate()
+        .map_err(|error| PyValueError::new_err(error.to_string()))?;
+    let jacobian = jacobian.map(Jacobian::new).transpose();
+    let jacobian = jacobian.map_err(|error| PyValueError::new_err(format!("wcs: {error}")))?;
+    let detector = Detector::new(
+        star.as_array(),
+        &StampNoise::white(noise),
+        jacobian.as_ref(),
+        &settings,
+    )
+    .map_err(of_measuring)?;
+    let image = image.as_array();
+    let (height, width) = image.dim();
+    let found = py.detach(|| {
+        detect_rows(threads(threads_asked), &detector, [width, height], || {
+            let mut next = 0;
+            Ok(move |rows: usize| {
+                let part = image.slice(s![next..next + rows, ..]);
+                next += rows;
+                Ok(part.iter().copied().collect())
+            })
+        })
+    });
+    let found = found.map_err(of_pipeline)?;
+    let columns = PyDict::new(py);
+    for (name, of) in PLACE.iter().chain(&COLUMNS) {
+        let values: Vec<f64> = found.iter().map(of).collect();
+        columns.set_item(name, values.into_pyarray(py))?;
+    }
+    for (name, of) in WHOLE {
+        let values: Vec<i32> = found.iter().map(|own| of(own) as i32).collect();
+        columns.set_item(name, values.into_pyarray(py))?;
+    }
+    Ok(columns)
+}

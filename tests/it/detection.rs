@@ -1,0 +1,79 @@
+//! Detection on exposures, from scenes to m.
+
+use std::fs;
+
+use crate::support::{Folder, assert_has, contents};
+
+/// The whole way, which has the signs of shear and response, the noise of the response, and places that move with the shear.
+#[test]
+fn detections_on_scenes_have_the_shear_stated() {
+    let folder = Folder::new();
+    let scenes = "--scenes 2 --side 600 --border 60 --seed 5 --density 60 --snr 8,100";
+    folder.run(&format!(
+        "simulate {scenes} --constant-shear 0.05,0.03 --opposite --rotated --opposite-noise --out scenes"
+    ));
+    let mut versions = 0;
+    for version in fs::read_dir(folder.at("scenes")).unwrap() {
+        let version = version.unwrap();
+        if !version.path().is_dir() {
+            continue;
+        }
+        versions += 1;
+        let own = version.file_name().into_string().unwrap();
+        for scene in 1..=2 {
+            let data = format!("scenes/{own}");
+            folder.run(&format!(
+                "detect --exposure {data}/scene-00{scene}.fits --psf {data}/psf.fits --out shapes/{own}/scene-00{scene}"
+            ));
+        }
+    }
+    assert_eq!(versions, 8);
+    let all = folder.json(
+        "bias shapes/*/*/set01/*.parquet --truth scenes/shears.csv --area 2.56 --units catalogues",
+    );
+    let row = &all["rows"][0];
+    println!("{row}");
+    for (key, error) in [("m1", "m1_error"), ("m2", "m2_error")] {
+        let [m, sigma] = [key, error].map(|key| row[key].as_f64().unwrap());
+        assert!(
+            m.abs() < 4.0 * sigma && sigma < 0.04,
+            "{key}: {m} ± {sigma}"
+        );
+    }
+}
+
+#[test]
+fn catalogues_are_the_same_for_any_number_of_threads() {
+    let folder = Folder::new();
+    folder.run("simulate --scenes 1 --side 900 --density 60 --constant-shear 0.02,0 --out scene");
+    let detect = "detect --exposure scene/scene-001.fits --psf scene/psf.fits --threshold 5";
+    folder.run(&format!("{detect} --threads 1 --out one"));
+    folder.run(&format!("{detect} --threads 3 --out three"));
+    let [one, three] = ["one", "three"].map(|name| contents(&folder.at(name)));
+    assert!(one == three && one.len() == 2, "{} files", one.len());
+    // Without further options.
+    for command in [
+        "mean --measured one",
+        "shear --measured one --out shears.parquet",
+    ] {
+        folder.run(command);
+    }
+    folder.run("bias one/set01/catalogue-001.parquet --g1 0.02 --g2 0");
+    assert_has(
+        &folder.run(&format!("{detect} --out more --image 2 --format json")),
+        "\"detections\"",
+    );
+}
+
+#[test]
+fn what_an_exposure_lacks_is_said() {
+    let folder = Folder::new();
+    folder.run("simulate --scenes 1 --side 400 --density 0 --constant-shear 0,0 --out empty");
+    let scene = "--exposure empty/scene-001.fits --psf empty/psf.fits --out out";
+    folder.refuses(
+        &format!("detect {scene} --threshold 12"),
+        "no galaxy was detected (expected some). Try: a lower --threshold, or check --noise",
+    );
+    folder.refuses(&format!("detect {scene} --threshold 1"), "--threshold");
+    folder.refuses(&format!("detect {scene} --noise 0"), "the noise level is 0");
+}
