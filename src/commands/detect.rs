@@ -10,7 +10,7 @@ use shearq_pipeline::gather::{Content, Files, Masks};
 use shearq_quantities::Frame;
 use shearq_submissions::DetectionMethod;
 
-use crate::arguments::{Summary, Threads, named};
+use crate::arguments::{SummaryArguments, Threads, named};
 use crate::{count, tell};
 
 /// Detect the galaxies of an exposure and measure them, with the response of the detection.
@@ -61,7 +61,7 @@ pub(crate) struct Arguments {
     #[command(flatten)]
     threads: Threads,
     #[command(flatten)]
-    summary: Summary,
+    summary: SummaryArguments,
 }
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {

@@ -12,7 +12,7 @@ use toml::de::DeTable;
 use toml::{Table, Value};
 
 use crate::error::{ConfigurationError, SettingError};
-use crate::settings::{Configuration, Method};
+use crate::settings::{Configuration, DetectionMethod, Method};
 
 // The files with a comment on each key, from which `submissions init` makes a user's file. Together they have every key of
 // both methods, and so define which keys exist.
@@ -178,6 +178,16 @@ static ALL_KEYS: LazyLock<Table> = LazyLock::new(|| {
     merge(network, &settings(LINEAR_TEMPLATE).unwrap_or_default())
 });
 
+/// Every key that settings may have. Only records of runs have the method of exposures, which no file extends.
+fn known_keys(settings: &Table) -> Table {
+    let mut known = ALL_KEYS.clone();
+    if settings.get("method").and_then(Value::as_str) == Some("detection") {
+        let section = Table::try_from(DetectionMethod::default()).unwrap_or_default();
+        known.insert("detection".into(), Value::Table(section));
+    }
+    known
+}
+
 // Keys in sections as `section.key`, as users write them in messages and options.
 fn leaves(table: &Table) -> Vec<(String, &Value)> {
     let mut found = Vec::new();
@@ -201,14 +211,15 @@ fn get<'t>(table: &'t Table, key: &str) -> Option<&'t Value> {
 }
 
 fn refuse_unknown_keys(settings: &Table) -> Result<(), SettingError> {
+    let all = known_keys(settings);
     let listed = |table: &Table| table.keys().cloned().collect::<Vec<_>>().join(", ");
     for (key, value) in settings {
         let unknown = |key: String, of: &Table| SettingError::UnknownKey {
             key,
             expected: listed(of),
         };
-        match (ALL_KEYS.get(key), value) {
-            (None, _) => return Err(unknown(key.clone(), &ALL_KEYS)),
+        match (all.get(key), value) {
+            (None, _) => return Err(unknown(key.clone(), &all)),
             (Some(Value::Table(known)), Value::Table(keys)) => {
                 if let Some(inner) = keys.keys().find(|inner| !known.contains_key(*inner)) {
                     return Err(unknown(format!("{key}.{inner}"), known));
@@ -254,7 +265,7 @@ fn configuration_of(mut table: Table) -> Result<Configuration, SettingError> {
     // serde stops at the first fault and does not say whether a key is missing or a value is wrong. Merged over valid values
     // of all keys, none is missing, so a failure is a wrong value; what fails only without them is a missing key.
     let configuration =
-        over(ALL_KEYS.clone(), &table).map_err(|error| wrong_value(&own, &table, error))?;
+        over(known_keys(&table), &table).map_err(|error| wrong_value(&own, &table, error))?;
     if over(Table::new(), &table).is_err() {
         let used = Table::try_from(&configuration).unwrap_or_default();
         // The method determines which other keys are required, so it is reported first.
@@ -266,7 +277,7 @@ fn configuration_of(mut table: Table) -> Result<Configuration, SettingError> {
         let bases = match (key.as_str(), &configuration.method) {
             ("method", _) => "`extends = \"paper\"` or `extends = \"48/linear/star\"`",
             (_, Method::Network(_)) => "`extends = \"paper\"`",
-            (_, Method::Linear(_) | Method::Detection(_)) => "`extends = \"48/linear/star\"`",
+            (_, Method::Linear(_) | Method::Detection { .. }) => "`extends = \"48/linear/star\"`",
         };
         return Err(SettingError::Missing { key, bases });
     }
@@ -278,7 +289,7 @@ fn configuration_of(mut table: Table) -> Result<Configuration, SettingError> {
 // errors, so each value is tried alone among valid ones.
 fn wrong_value(own: &Table, settings: &Table, error: toml::de::Error) -> SettingError {
     let tags = ["method", "noise.source", "denoise.method"];
-    let mut tried = merge(ALL_KEYS.clone(), own);
+    let mut tried = merge(known_keys(settings), own);
     let mut keys = leaves(settings);
     // These choose the variant, and with it the other keys that serde reads, so they are tried first.
     keys.sort_by_key(|(key, _)| !tags.contains(&key.as_str()));
@@ -735,6 +746,31 @@ mod tests {
             matches!(&error, ConfigurationError::Setting { error, .. } if error.key() == "deconvolution.window_sigma"),
             "{error}"
         );
+    }
+
+    #[test]
+    fn settings_of_detection_are_read_back_from_records() {
+        let registry = Registry::embedded().unwrap();
+        let detection = |threshold: f64| Configuration {
+            name: "detection".into(),
+            method: Method::Detection {
+                detection: DetectionMethod {
+                    threshold,
+                    ..DetectionMethod::default()
+                },
+            },
+            ..registry.get("48/linear/star").unwrap().configuration
+        };
+        let own = detection(9.0);
+        let text = toml::to_string(&own).unwrap();
+        assert_eq!(toml::from_str::<Configuration>(&text).unwrap(), own);
+        for (wrong, key) in [
+            (text.replace("softening", "soft"), "soft"),
+            (text.replace("9.0", "1.0"), "detection.threshold"),
+        ] {
+            let error = toml::from_str::<Configuration>(&wrong).unwrap_err();
+            assert!(error.to_string().contains(key), "{error}");
+        }
     }
 
     #[test]

@@ -547,7 +547,10 @@ pub enum Method {
     /// Its linear part in closed form, calibrated by its own response to shear.
     Linear(LinearMethod),
     /// Detection on exposures with its response, which has no stamps.
-    Detection(DetectionMethod),
+    Detection {
+        /// Its settings.
+        detection: DetectionMethod,
+    },
 }
 
 /// Settings of the network.
@@ -604,27 +607,35 @@ impl DetectionMethod {
     /// The first setting that is out of range.
     pub fn validate(&self) -> Result<(), OutOfRange> {
         let ranges = [
-            ("threshold", self.threshold, 3.0..=1e4),
-            ("threshold_half_width", self.threshold_half_width, 0.5..=1e3),
-            ("detection_sigma", self.detection_sigma, 0.8..=4.0),
-            ("neighbour_distance", self.neighbour_distance, 0.5..=6.0),
+            ("detection.threshold", self.threshold, 3.0..=1e4),
+            (
+                "detection.threshold_half_width",
+                self.threshold_half_width,
+                0.5..=1e3,
+            ),
+            ("detection.detection_sigma", self.detection_sigma, 0.8..=4.0),
+            (
+                "detection.neighbour_distance",
+                self.neighbour_distance,
+                0.5..=6.0,
+            ),
             (
                 "neighbour_half_width",
                 self.neighbour_half_width,
                 0.2..=10.0,
             ),
-            ("neighbour_share", self.neighbour_share, 0.0..=1.0),
-            ("moment_sigma", self.moment_sigma, 1.0..=6.0),
-            ("softening", self.softening, 1.0..=1e9),
+            ("detection.neighbour_share", self.neighbour_share, 0.0..=1.0),
+            ("detection.moment_sigma", self.moment_sigma, 1.0..=6.0),
+            ("detection.softening", self.softening, 1.0..=1e9),
         ];
         for (key, found, range) in ranges {
             within(key, found, range, "")?;
         }
         require(
             self.threshold > self.threshold_half_width,
-            "threshold",
+            "detection.threshold",
             self.threshold,
-            "more than threshold_half_width",
+            "more than detection.threshold_half_width",
         )
     }
 }
@@ -708,7 +719,7 @@ impl Configuration {
                 network.shape.validate()
             }
             Method::Linear(linear) => linear.validate(self.stamp.size, self.psf.size),
-            Method::Detection(detection) => detection.validate(),
+            Method::Detection { detection } => detection.validate(),
         }
     }
 }
@@ -754,14 +765,14 @@ impl Configuration {
     pub fn network(&self) -> Option<&NetworkMethod> {
         match &self.method {
             Method::Network(network) => Some(network),
-            Method::Linear(_) | Method::Detection(_) => None,
+            Method::Linear(_) | Method::Detection { .. } => None,
         }
     }
 
     /// The linear network's settings; `None` for other methods.
     pub fn linear(&self) -> Option<&LinearMethod> {
         match &self.method {
-            Method::Network(_) | Method::Detection(_) => None,
+            Method::Network(_) | Method::Detection { .. } => None,
             Method::Linear(linear) => Some(linear),
         }
     }
@@ -779,7 +790,7 @@ impl Configuration {
     pub fn ellipticity(&self) -> EllipticityType {
         match &self.method {
             Method::Network(network) => network.shape.ellipticity,
-            Method::Linear(_) | Method::Detection(_) => EllipticityType::Shear,
+            Method::Linear(_) | Method::Detection { .. } => EllipticityType::Shear,
         }
     }
 
@@ -788,7 +799,7 @@ impl Configuration {
         match &self.method {
             Method::Network(_) => Calibration::None,
             Method::Linear(linear) => linear.shape.calibration,
-            Method::Detection(_) => Calibration::Response,
+            Method::Detection { .. } => Calibration::Response,
         }
     }
 }

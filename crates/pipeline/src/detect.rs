@@ -181,7 +181,9 @@ impl DetectionTask<'_> {
                 size: 48,
             },
             noise: NoiseSource::Header,
-            method: Method::Detection(self.settings),
+            method: Method::Detection {
+                detection: self.settings,
+            },
         };
         let source = Source::folder(&DataFolder::new(folder), out)?;
         Ok(Run::new(source, configuration, format))

@@ -361,7 +361,7 @@ pub(crate) struct Saturation(f64);
 impl Saturation {
     pub(crate) fn of(configuration: &Configuration) -> Self {
         Saturation(match &configuration.method {
-            Method::Network(_) | Method::Detection(_) => 0.0,
+            Method::Network(_) | Method::Detection { .. } => 0.0,
             Method::Linear(linear) => linear.shape.saturation,
         })
     }

@@ -27,7 +27,7 @@ impl MethodPlan {
             Method::Linear(linear) => {
                 MethodPlan::Linear(Arc::new(LinearFamily::new(linear, n, cut)?))
             }
-            Method::Detection(_) => return Err(MeasureError::NoStamps),
+            Method::Detection { .. } => return Err(MeasureError::NoStamps),
         })
     }
 
