@@ -4,6 +4,7 @@
 pub(super) const COUNT: usize = 8;
 pub(super) const NEIGHBOURS: usize = 4;
 pub(super) const LIGHT: usize = 0;
+// The first of NEIGHBOURS places.
 pub(super) const EXCESS: usize = 1;
 pub(super) const M00: usize = EXCESS + NEIGHBOURS;
 pub(super) const M22: usize = M00 + 1;
