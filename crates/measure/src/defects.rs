@@ -1,4 +1,4 @@
-//! Pixels that hold no light: fill values, dead and hot pixels, cosmic rays. They become missing.
+//! Pixels that hold no light: fill values, dead and hot pixels, cosmic rays, bad columns, trails. They become missing.
 //!
 //! Five properties of light behind a PSF decide, none of which a shear of the galaxy changes:
 //!
@@ -18,10 +18,13 @@
 //! the stamp's peak are allowed for, so that rings of diffraction and Poisson noise of a bright galaxy do not count. On a stamp
 //! of pure noise, no pixel is touched with a probability of 1 − 10⁻¹².
 
+mod lines;
+
 use multiversion::multiversion;
 use ndarray::ArrayView2;
 use shearq_quantities::statistics::{SCATTER, median};
 
+use self::lines::Lines;
 use crate::measurement::DefectCounts;
 use crate::pixels::frame;
 
@@ -191,6 +194,7 @@ pub(crate) struct Defects {
     values: Vec<f32>,
     /// A stamp less the level of its border.
     levelled: Vec<f32>,
+    lines: Lines,
 }
 
 impl Defects {
@@ -203,6 +207,7 @@ impl Defects {
             places: Vec::with_capacity(n * n),
             values: Vec::with_capacity(n * n),
             levelled: Vec::with_capacity(n * n),
+            lines: Lines::new(n),
         }
     }
 
@@ -231,8 +236,8 @@ impl Defects {
         found
     }
 
-    /// Makes pixels NaN that are too dark or too bright, in noise of this level and without sky. Counts them beside those that were `found`
-    /// by [`Defects::remove_repeated`] on the same stamp.
+    /// Makes pixels NaN that are too dark or too bright, or on lines across the stamp, in noise of this level and without sky. Counts them
+    /// beside those that were `found` by [`Defects::remove_repeated`] on the same stamp.
     pub(crate) fn remove_unlit(
         &mut self,
         stamp: &mut [f32],
@@ -242,13 +247,22 @@ impl Defects {
         found: &mut DefectCounts,
     ) {
         let mut sky = StampSky::of_noise(noise);
+        self.places.clear();
+        self.lines.find(&mut self.places, stamp, n, noise, limits);
         if found.is_empty() {
-            if !Threshold::of(extremes(stamp), &sky, limits).is_exceeded() {
+            let is_exceeded = Threshold::of(extremes(stamp), &sky, limits).is_exceeded();
+            if self.places.is_empty() && !is_exceeded {
                 return;
             }
             self.clear_marks(stamp.len());
         }
         remove_infinite(stamp);
+        // Before pixels, of which each would have to depart by more.
+        for &at in &self.places {
+            self.marks[at] = true;
+            found.lines += u32::from(!stamp[at].is_nan());
+            stamp[at] = f32::NAN;
+        }
         let mut is_measured = false;
         for _ in 0..MAX_PASSES {
             let beside = !found.is_empty();

@@ -212,6 +212,8 @@ pub struct DefectCounts {
     pub dark: u32,
     /// Brighter than their neighbours by more than the PSF allows.
     pub bright: u32,
+    /// On lines across the stamp: bad columns and rows, trails.
+    pub lines: u32,
 }
 
 impl DefectCounts {
@@ -222,7 +224,7 @@ impl DefectCounts {
 
     /// All of them.
     pub fn total(&self) -> u32 {
-        self.repeated + self.dark + self.bright
+        self.repeated + self.dark + self.bright + self.lines
     }
 }
 
@@ -231,6 +233,7 @@ impl std::ops::AddAssign for DefectCounts {
         self.repeated += other.repeated;
         self.dark += other.dark;
         self.bright += other.bright;
+        self.lines += other.lines;
     }
 }
 

@@ -244,8 +244,8 @@ pub enum Warning {
     },
     /// Pixels hold no light and became missing.
     #[error(
-        "pixels hold no light (found {} on {stamps} of {of} stamps: {} in areas of one value, {} far below the sky, {} brighter than the PSF allows; expected none). They count as missing; {flagged} of these galaxies are flagged. Try: replace such pixels by NaN, and cut stamps before a deblender fills them",
-        counts.total(), counts.repeated, counts.dark, counts.bright
+        "pixels hold no light (found {} on {stamps} of {of} stamps: {} in areas of one value, {} far below the sky, {} brighter than the PSF allows, {} on lines across the stamp; expected none). They count as missing; {flagged} of these galaxies are flagged. Try: replace such pixels by NaN, and cut stamps before a deblender fills them",
+        counts.total(), counts.repeated, counts.dark, counts.bright, counts.lines
     )]
     Defects {
         counts: DefectCounts,
@@ -254,6 +254,12 @@ pub enum Warning {
         flagged: usize,
         of: usize,
     },
+    /// Stamps show no light in their middle, more than by noise.
+    #[error(
+        "about {} of {of} stamps have no galaxy in their middle (found {count} with S/N below 0, where galaxies of S/N 5 have one in 10⁴). They add noise to mean shears, and to their response nothing. Try: check that the positions are those of galaxies on this image",
+        2 * count
+    )]
+    Empty { count: usize, of: usize },
     /// The brightest pixels of many stamps have one value.
     #[error(
         "the brightest pixel is {} on {count} of {of} stamps (expected different values), as if light above it were cut off, which biases shears. Try: replace saturated pixels by NaN",
@@ -364,6 +370,10 @@ pub enum Warning {
     Flagged { flag: Flag, count: usize, of: usize },
 }
 
+// Share of negative fluxes of galaxies at S/N 5, whose column `snr` is 3.7 in the mean.
+const NEGATIVE_AT_SNR_5: f64 = 1e-4;
+// Standard deviations of a number beyond chance. Chosen by hand.
+const MIN_EXCESS: f64 = 5.0;
 // Relative difference of a noise level from a power of another one that is taken for it. Chosen by hand.
 const POWER_OF_NOISE: f64 = 0.1;
 
@@ -476,7 +486,22 @@ impl Warning {
         let flags = Warning::of_counts(Flag::ALL.map(with), flagged, galaxies.len());
         let defects = Warning::of_defects(galaxies);
         let flags = flags.into_iter().chain(defects);
+        let flags = flags.chain(Warning::of_empty(galaxies));
         flags.chain(Warning::of_idle(galaxies))
+    }
+
+    /// A warning if more galaxies have a negative flux than those of S/N 5 by chance. They keep their rows: a flag that depends on the
+    /// flux selects by shear, and half of the stamps without a galaxy have a positive one.
+    fn of_empty(galaxies: &[Measurement]) -> Option<Warning> {
+        let (mut count, mut of) = (0, 0);
+        let good = galaxies.iter().filter(|galaxy| galaxy.flags.is_empty());
+        for observables in good.filter_map(|galaxy| galaxy.observables.as_ref()) {
+            count += usize::from(observables.flux < 0.0);
+            of += 1;
+        }
+        let chance = NEGATIVE_AT_SNR_5 * of as f64;
+        let is_chance = count as f64 <= 1.0 + chance + MIN_EXCESS * chance.sqrt();
+        (!is_chance && 2 * count <= of).then_some(Warning::Empty { count, of })
     }
 
     fn of_defects(galaxies: &[Measurement]) -> Option<Warning> {

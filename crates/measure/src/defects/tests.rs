@@ -14,12 +14,12 @@ fn psf(fwhm: f64) -> Array2<f64> {
     psf.stamp(N)
 }
 
-fn limits(fwhm: f64) -> LightLimits {
+pub(super) fn limits(fwhm: f64) -> LightLimits {
     LightLimits::from_psf(psf(fwhm).view())
 }
 
 /// A galaxy no larger than its PSF, of a peak of `peak` in noise of one.
-fn galaxy(fwhm: f64, n: usize, peak: f32, rng: &mut ChaCha8Rng) -> Vec<f32> {
+pub(super) fn galaxy(fwhm: f64, n: usize, peak: f32, rng: &mut ChaCha8Rng) -> Vec<f32> {
     let scale = (n as f64 - 1.0) / 2.0;
     let centre = [0, 1].map(|_| scale + rng.random_range(-0.7..0.7));
     // A Moffat of β = 3 without its pixel, which is narrower than the PSF.
@@ -51,7 +51,12 @@ fn remove(
 }
 
 /// The pixels that become missing, and their number by cause.
-fn found(stamp: &[f32], n: usize, noise: f32, limits: &LightLimits) -> (Vec<usize>, DefectCounts) {
+pub(super) fn found(
+    stamp: &[f32],
+    n: usize,
+    noise: f32,
+    limits: &LightLimits,
+) -> (Vec<usize>, DefectCounts) {
     let mut cleaned = stamp.to_vec();
     // What was found before does not matter.
     let mut dirty = Defects::new(n);
@@ -237,7 +242,8 @@ fn hot_pixels_and_rays_become_missing() {
             expected.sort_unstable();
             assert_eq!(missing, expected, "{charge}: {counts:?}");
             // The largest charge leaves areas of one value.
-            assert_eq!(counts.bright + counts.repeated, missing.len() as u32);
+            let causes = counts.bright + counts.repeated + counts.lines;
+            assert_eq!(causes, missing.len() as u32);
         }
     }
     // Behind a PSF of one pixel, a bright pixel may be a star.

@@ -1,0 +1,380 @@
+//! Lines across a whole stamp that hold no light: bad columns and rows, and trails of satellites.
+//!
+//! Sums of columns and rows obey the limits of [`LightLimits`], because each of their pixels does. Their noise is that of a line, so
+//! that a departure of 1.5 σ per pixel is found, where that of one pixel has to be 11 σ. A trail is as smooth as light, but no light of
+//! a galaxy has one brightness from edge to edge and none beside it.
+
+use multiversion::multiversion;
+use shearq_quantities::statistics::{SCATTER, median};
+
+use super::{DIRECTIONS, FAINT_SHARE, LightLimits, MIN_DEPARTURE};
+
+// Of the pixels of a line that depart in its direction: noise has half, so that one cosmic ray is no line. Chosen by hand.
+const MIN_DEPARTING_SHARE: f32 = 0.75;
+// Lines that may be darker than light gets. Chosen by hand.
+const MAX_DARK_LINES: usize = 3;
+
+// In pixels, of the strips along the edges where a trail begins and ends. Chosen by hand.
+const STRIP: usize = 4;
+// Pixels of a strip of which the mean is taken: its depth, and three along it.
+const STRIP_PIXELS: f32 = 3.0 * STRIP as f32;
+// In pixels around the brightest one, of which an end is the centroid. Chosen by hand.
+const END_RADIUS: usize = 3;
+// In sides of the stamp. Shorter trails cross a corner, beyond the window of the galaxy.
+const MIN_TRAIL: f32 = 0.5;
+// Pixels along a trail of which the mean is taken, so that the noise is a quarter of a pixel's. Chosen by hand.
+const PIECE: usize = 6;
+// In pixels from the centre of the stamp, where the galaxy adds its light. Chosen by hand.
+const GALAXY_RADIUS: f32 = 12.0;
+// Pieces beyond that radius. Chosen by hand.
+const MIN_PIECES: usize = 3;
+// Of the fainter end: three galaxies in a row are fainter between them. Chosen by hand.
+const MIN_PIECE: f32 = 0.65;
+// Faintest piece in units of the upper quartile of those beyond the galaxy. Wings of an exponential disc are as uniform from a scale of
+// 28 px on.
+const MIN_UNIFORMITY: f32 = 0.7;
+// In pixels from a trail, and what is there in units of the trail: a fifth of it if the FWHM is 8 px. Chosen by hand.
+const BESIDE_TRAIL: f32 = 8.0;
+const MAX_BESIDE: f32 = 0.35;
+// In pixels from the middle of a trail, where a Moffat PSF of FWHM 3.4 px leaves 3 % of its light.
+const TRAIL_HALF_WIDTH: f32 = 6.0;
+
+/// Finds lines, with buffers for one thread.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Lines {
+    /// Of columns, and of rows.
+    sums: [Vec<f32>; 2],
+    values: Vec<f32>,
+    /// Of a trail, beyond the galaxy: its pieces, and what is beside them.
+    pieces: [Vec<f32>; 2],
+}
+
+impl Lines {
+    /// For stamps of up to `n` pixels a side without allocation.
+    pub(super) fn new(n: usize) -> Self {
+        let buffer = || Vec::with_capacity(n);
+        Lines {
+            sums: [buffer(), buffer()],
+            values: buffer(),
+            pieces: [buffer(), buffer()],
+        }
+    }
+
+    /// Adds the pixels of bad columns and rows, or else of a trail, on a stamp of `n` pixels a side in noise of this level.
+    pub(super) fn find(
+        &mut self,
+        places: &mut Vec<usize>,
+        stamp: &[f32],
+        n: usize,
+        noise: f32,
+        limits: &LightLimits,
+    ) {
+        let mut sums = std::mem::take(&mut self.sums);
+        sum_lines(stamp, n, &mut sums);
+        for (axis, sums) in sums.iter().enumerate() {
+            let bounds = LineBounds { sums, axis, limits };
+            self.find_bad(places, stamp, n, noise, &bounds);
+        }
+        self.sums = sums;
+        if places.is_empty()
+            && let Some(trail) = self.find_trail(stamp, n, noise)
+        {
+            let on_trail = |at: &usize| trail.distance(*at, n) <= TRAIL_HALF_WIDTH;
+            places.extend((0..stamp.len()).filter(on_trail));
+        }
+    }
+
+    fn find_bad(
+        &mut self,
+        places: &mut Vec<usize>,
+        stamp: &[f32],
+        n: usize,
+        noise: f32,
+        bounds: &LineBounds<'_>,
+    ) {
+        let white = noise * (n as f32).sqrt();
+        let faint = bounds.faint();
+        // Nearly all stamps end here.
+        if !(0..n).any(|line| bounds.departs(line, white, faint).is_some()) {
+            return;
+        }
+        // Noise that is correlated along lines, or stripes.
+        let values = &mut self.values;
+        values.clear();
+        let steps = bounds.sums.windows(2).map(|pair| (pair[1] - pair[0]).abs());
+        values.extend(steps.filter(|step| step.is_finite()));
+        let step = median(values).unwrap_or(0.0);
+        let noise = white.max(SCATTER * step / 2f32.sqrt());
+        values.clear();
+        values.extend(bounds.sums.iter().filter(|sum| sum.is_finite()));
+        values.sort_unstable_by(f32::total_cmp);
+        let darkest = values.get(MAX_DARK_LINES).copied().unwrap_or(0.0);
+        for line in 0..n {
+            let Some(reference) = bounds.departs(line, noise, faint) else {
+                continue;
+            };
+            let pixel = |line: usize, k: usize| match bounds.axis {
+                0 => stamp[k * n + line],
+                _ => stamp[line * n + k],
+            };
+            let departs = |k: &usize| match reference {
+                Reference::Lines([a, b]) => {
+                    pixel(line, *k) > 0.5 * pixel(a, *k) + 0.5 * pixel(b, *k)
+                }
+                Reference::Sky => pixel(line, *k) < darkest / n as f32,
+            };
+            let is_dark = matches!(reference, Reference::Sky);
+            if is_dark && bounds.sums[line] > darkest - MIN_DEPARTURE * noise {
+                continue;
+            }
+            if (0..n).filter(departs).count() as f32 >= MIN_DEPARTING_SHARE * n as f32 {
+                places.extend((0..n).map(|k| match bounds.axis {
+                    0 => k * n + line,
+                    _ => line * n + k,
+                }));
+            }
+        }
+    }
+
+    fn find_trail(&mut self, stamp: &[f32], n: usize, noise: f32) -> Option<Trail> {
+        let ends = [0, 1, 2, 3].map(|side| self.find_end(stamp, n, side, noise));
+        for (k, first) in ends.iter().enumerate() {
+            for second in &ends[k + 1..] {
+                let (Some(first), Some(second)) = (first, second) else {
+                    continue;
+                };
+                let trail = Trail::new([first.at, second.at]);
+                if trail.length >= MIN_TRAIL * n as f32
+                    && self.is_trail(&trail, stamp, n, first.level.min(second.level))
+                {
+                    return Some(trail);
+                }
+            }
+        }
+        None
+    }
+
+    /// The brightest place of the strip along the left, right, lower or upper edge, if it is brighter than noise.
+    fn find_end(&mut self, stamp: &[f32], n: usize, side: usize, noise: f32) -> Option<End> {
+        let strip = &mut self.values;
+        strip.clear();
+        strip.extend((0..n).map(|k| {
+            let pixels = (0..STRIP.min(n)).map(|depth| match side {
+                0 => stamp[k * n + depth],
+                1 => stamp[k * n + n - 1 - depth],
+                2 => stamp[depth * n + k],
+                _ => stamp[(n - 1 - depth) * n + k],
+            });
+            pixels.sum::<f32>() / STRIP as f32
+        }));
+        let smooth = |at: usize| (strip[at - 1] + strip[at] + strip[at + 1]) / 3.0;
+        let inner = 1..n.saturating_sub(1);
+        let (brightest, level) =
+            inner
+                .map(|at| (at, smooth(at)))
+                .fold((0, f32::MIN), |most, other| match other.1 > most.1 {
+                    true => other,
+                    false => most,
+                });
+        if level <= MIN_DEPARTURE * noise / STRIP_PIXELS.sqrt() {
+            return None;
+        }
+        let around = brightest.saturating_sub(END_RADIUS)..(brightest + END_RADIUS + 1).min(n);
+        let light = |at: usize| strip[at].max(0.0);
+        let total: f32 = around.clone().map(light).sum();
+        let along = around.map(|at| at as f32 * light(at)).sum::<f32>() / total;
+        let depth = 0.5 * (STRIP as f32 - 1.0);
+        let far = n as f32 - 1.0 - depth;
+        let at = [[depth, along], [far, along], [along, depth], [along, far]][side];
+        // Noise that is correlated, and the wings of large galaxies.
+        self.values.retain(|value| value.is_finite());
+        let middle = median(&mut self.values)?;
+        let apart = |value: &mut f32| *value = (*value - middle).abs();
+        self.values.iter_mut().for_each(apart);
+        let scatter = SCATTER * median(&mut self.values)? / 3f32.sqrt();
+        (level - middle > MIN_DEPARTURE * scatter).then_some(End { at, level })
+    }
+
+    /// Whether light of about one brightness, `level` or more, is along a line, and none beside it.
+    fn is_trail(&mut self, trail: &Trail, stamp: &[f32], n: usize, level: f32) -> bool {
+        let [along, beside] = &mut self.pieces;
+        along.clear();
+        beside.clear();
+        let middle = 0.5 * (n as f32 - 1.0);
+        let mut faintest = f32::INFINITY;
+        let mean = |first: usize, across: &[f32]| {
+            let (mut sum, mut count) = (0.0, 0.0);
+            for step in first..first + PIECE {
+                for &off in across {
+                    let value = trail
+                        .pixel(step as f32, off, n)
+                        .map_or(f32::NAN, |at| stamp[at]);
+                    if value.is_finite() {
+                        sum += value;
+                        count += 1.0;
+                    }
+                }
+            }
+            sum / count
+        };
+        for first in (0..).step_by(PIECE).take(trail.length as usize / PIECE) {
+            let piece = mean(first, &[-1.0, 0.0, 1.0]);
+            // Not a number, without pixels, is not too faint.
+            if piece < MIN_PIECE * level {
+                return false;
+            }
+            faintest = faintest.min(piece);
+            let [x, y] = trail.at((first + PIECE / 2) as f32, 0.0);
+            if (x - middle).hypot(y - middle) > GALAXY_RADIUS {
+                along.extend(Some(piece).filter(|piece| piece.is_finite()));
+                let light = mean(first, &[-BESIDE_TRAIL, BESIDE_TRAIL]);
+                beside.extend(Some(light).filter(|light| light.is_finite()));
+            }
+        }
+        if along.len() < MIN_PIECES {
+            return false;
+        }
+        let rank = 3 * along.len() / 4;
+        let bright = *along.select_nth_unstable_by(rank, f32::total_cmp).1;
+        let is_uniform = faintest >= MIN_UNIFORMITY * bright;
+        is_uniform && median(beside).is_some_and(|light| light <= MAX_BESIDE * bright)
+    }
+}
+
+/// With which a line does not agree.
+#[derive(Debug, Clone, Copy)]
+enum Reference {
+    /// It is brighter than these two lines allow.
+    Lines([usize; 2]),
+    /// It is darker than the sky.
+    Sky,
+}
+
+/// What the sums of columns, axis 0, or rows can be.
+#[derive(Debug)]
+struct LineBounds<'a> {
+    sums: &'a [f32],
+    axis: usize,
+    limits: &'a LightLimits,
+}
+
+impl LineBounds<'_> {
+    /// Light that is too faint to be tested: a share of the second brightest line, because the brightest may be bad.
+    fn faint(&self) -> f32 {
+        let [_, second] =
+            self.sums
+                .iter()
+                .fold([0.0f32; 2], |[first, second], &sum| match sum > first {
+                    true => [sum, first],
+                    false => [first, if sum > second { sum } else { second }],
+                });
+        FAINT_SHARE * second
+    }
+
+    /// With what a line does not agree, in noise of a line.
+    fn departs(&self, line: usize, noise: f32, faint: f32) -> Option<Reference> {
+        let (sum, limits) = (self.sums[line], self.limits);
+        if sum < -MIN_DEPARTURE * noise - limits.lobe / FAINT_SHARE * faint {
+            return Some(Reference::Sky);
+        }
+        // The limits of PAIRS and of DIRECTIONS across this line.
+        let near = (limits.ratios[self.axis], limits.noise[self.axis]);
+        let far = DIRECTIONS + self.axis;
+        let far = (limits.ratios[far], limits.noise[far]);
+        let steep = (
+            limits.steepness[self.axis],
+            limits.steepness_noise[self.axis],
+        );
+        let light = sum - faint;
+        if light <= MIN_DEPARTURE * noise {
+            return None;
+        }
+        let references = [
+            ([-1, 1], near),
+            ([-2, 2], far),
+            ([1, 2], steep),
+            ([-1, -2], steep),
+        ];
+        references
+            .into_iter()
+            .find_map(|(lines, (ratio, departure))| {
+                let lines = lines.map(|step| line.wrapping_add_signed(step));
+                let [a, b] = lines.map(|line| self.sums.get(line).copied().unwrap_or(f32::NAN));
+                let most = ratio * (0.5 * a + 0.5 * b).max(0.0) + noise * departure * MIN_DEPARTURE;
+                // `max` takes zero for NaN.
+                (!(a + b).is_nan() && light > most).then_some(Reference::Lines(lines))
+            })
+    }
+}
+
+/// Sums of columns and of rows.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn sum_lines(stamp: &[f32], n: usize, sums: &mut [Vec<f32>; 2]) {
+    const LANES: usize = 16;
+    let [columns, rows] = sums;
+    columns.clear();
+    columns.resize(n, 0.0);
+    rows.clear();
+    for row in stamp.chunks_exact(n) {
+        for (sum, value) in columns.iter_mut().zip(row) {
+            *sum += value;
+        }
+        let (chunks, rest) = row.as_chunks::<LANES>();
+        let mut lanes = [0.0f32; LANES];
+        for chunk in chunks {
+            for (lane, value) in lanes.iter_mut().zip(chunk) {
+                *lane += value;
+            }
+        }
+        rows.push(lanes.iter().chain(rest).sum());
+    }
+}
+
+#[derive(Debug, Clone, Copy)]
+struct End {
+    at: [f32; 2],
+    level: f32,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Trail {
+    from: [f32; 2],
+    /// Of length one.
+    direction: [f32; 2],
+    length: f32,
+}
+
+impl Trail {
+    fn new([from, to]: [[f32; 2]; 2]) -> Self {
+        let step = [0, 1].map(|k| to[k] - from[k]);
+        let length = step[0].hypot(step[1]);
+        Trail {
+            from,
+            direction: step.map(|step| step / length),
+            length,
+        }
+    }
+
+    /// The place `along` the trail and `across` it.
+    fn at(&self, along: f32, across: f32) -> [f32; 2] {
+        let ([x, y], [dx, dy]) = (self.from, self.direction);
+        [x + along * dx - across * dy, y + along * dy + across * dx]
+    }
+
+    fn pixel(&self, along: f32, across: f32, n: usize) -> Option<usize> {
+        let [x, y] = self.at(along, across).map(|place| place.round());
+        let on_stamp = |place: f32| (0.0..n as f32).contains(&place);
+        (on_stamp(x) && on_stamp(y)).then(|| y as usize * n + x as usize)
+    }
+
+    fn distance(&self, at: usize, n: usize) -> f32 {
+        let [x, y] = [
+            (at % n) as f32 - self.from[0],
+            (at / n) as f32 - self.from[1],
+        ];
+        (y * self.direction[0] - x * self.direction[1]).abs()
+    }
+}
+
+#[cfg(test)]
+mod tests;
