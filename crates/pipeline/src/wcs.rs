@@ -7,7 +7,7 @@ mod map;
 use shearq_files::FileError;
 use shearq_files::fits::{ImageReader, Value};
 use shearq_measure::{PixelFrame, Warning};
-use shearq_quantities::linear::{Matrix2, determinant};
+use shearq_quantities::linear::{Matrix2, determinant, inverse, product};
 
 pub(crate) use self::header::{Keys, Wcs};
 use self::map::{Map, Projection, regular_inverse};
@@ -16,6 +16,9 @@ use self::map::{Map, Projection, regular_inverse};
 const CD_KEYS: [&str; 4] = ["CD1_1", "CD1_2", "CD2_1", "CD2_2"];
 // Least relative difference of scales that is reported: it changes m by about as much.
 const MIN_PIXEL_DIFFERENCE: f64 = 0.01;
+// Relative difference of the pixels of stamps from those at the reference point, by a distortion, above which stamps without places
+// are refused: it adds as much to c. Chosen by hand: a tenth of what surveys require.
+const MAX_DISTORTION: f64 = 1e-4;
 // Rotation in degrees and shear of the pixels below which pixel axes count as the sky's. They change m by −2 sin² 0.01° and add
 // 4e-4 of g2 to g1, and 1e-4 to c: less than what calibrations reach.
 const ALIGNED_DEGREES: f64 = 0.01;
@@ -36,7 +39,7 @@ impl Wcs {
         let map = self.map.as_ref()?;
         Some(match map.projection {
             Projection::Plane => map.matrix,
-            Projection::Tangent { .. } => {
+            Projection::Zenithal { .. } => {
                 let plain = Map {
                     sip: None,
                     ..map.clone()
@@ -46,9 +49,23 @@ impl Wcs {
         })
     }
 
+    /// Why the pixels of several stamps are not known from the header of their cube, which an exposure with a distortion had:
+    /// `at` is the middle of the stamps.
+    pub(crate) fn fault_of_cube(&self, planes: usize, at: [f64; 2]) -> Option<String> {
+        let map = self.map.as_ref().filter(|map| map.is_distorted())?;
+        let [[xx, xy], [yx, yy]] = product(inverse(self.reference()?), map.sky(at).1);
+        let off = [xx - 1.0, xy, yx, yy - 1.0].map(f64::abs);
+        let off = off.into_iter().fold(0.0, f64::max);
+        (planes > 1 && off > MAX_DISTORTION).then(|| {
+            format!(
+                "the header of a cube of {planes} stamps has the distorted WCS of an exposure, and the places of the stamps on it are not known (found pixels that differ by {off:.4} from those at the reference point; expected at most {MAX_DISTORTION})"
+            )
+        })
+    }
+
     pub(crate) fn has_sky(&self) -> bool {
         let projection = self.map.as_ref().map(|map| &map.projection);
-        matches!(projection, Some(Projection::Tangent { .. }))
+        matches!(projection, Some(Projection::Zenithal { .. }))
     }
 
     /// Right ascension and declination of a pixel in degrees.
@@ -68,7 +85,7 @@ impl Wcs {
 
     /// What is wrong with a header that states a WCS but gives no places on the sky; `None` for a usable WCS, and without one.
     pub(crate) fn fault(&self) -> Option<String> {
-        let expected = "expected TAN, TAN-SIP, TPV or a linear one";
+        let expected = "expected TAN, TAN-SIP, TPV, SIN, STG or a linear one";
         match (&self.damage, &self.unread) {
             (Some(damage), _) => Some(damage.clone()),
             (None, Some(kind)) => Some(format!("the projection {kind} is not read ({expected})")),
@@ -211,7 +228,7 @@ mod tests {
                 checked += 1;
             }
         }
-        assert_eq!(checked, 76);
+        assert_eq!(checked, 124);
         let wcs = sky([-1.0, 0.0, 0.0, 1.0]);
         assert_eq!(wcs.pixel([180.0, 0.0]), None);
     }
@@ -301,6 +318,24 @@ mod tests {
             };
             assert!(is_right, "{more}: {found}");
         }
+    }
+
+    #[test]
+    fn cubes_of_a_distorted_exposure_have_no_pixels() {
+        let tan = "[]\nCTYPE1 = RA---TAN\nCTYPE2 = DEC--TAN\nCD1_1 = -7e-5\nCD2_2 = 7e-5\nCRPIX1 = 900\nCRPIX2 = 2000\n";
+        let sip = "A_ORDER = 2\nB_ORDER = 2\nA_2_0 = 3e-6\n";
+        let fault = |more: &str, planes| {
+            let (_, keys, _) = headers(&format!("{tan}{more}")).remove(0);
+            Wcs::of_keys(&Keys::new(keys)).fault_of_cube(planes, [24.5, 24.5])
+        };
+        assert_eq!(fault("", 9), None);
+        assert_eq!(fault(sip, 1), None);
+        let found = fault(sip, 9).unwrap();
+        // 2 · 3e-6 · 875.5.
+        assert!(
+            found.contains("a cube of 9 stamps") && found.contains("0.0053"),
+            "{found}"
+        );
     }
 
     const DEGREES: f64 = 0.2 / 3600.0;

@@ -6,10 +6,10 @@ use std::collections::{BTreeMap, BTreeSet};
 use shearq_files::names_of;
 use shearq_quantities::linear::{Matrix2, determinant};
 
-use super::map::{ARCSEC_PER_RADIAN, Map, Polynomial, Projection};
+use super::map::{ARCSEC_PER_RADIAN, Map, Polynomial, Projection, Zenithal};
 
-// Keys with the pixel scale in arcseconds: of surveys, and of GalSim.
-const PIXEL_SCALE_KEYS: [&str; 2] = ["PIXSCALE", "GS_SCALE"];
+// Keys with the pixel scale in arcseconds: of surveys, of GalSim and of STPSF.
+const PIXEL_SCALE_KEYS: [&str; 3] = ["PIXSCALE", "GS_SCALE", "PIXELSCL"];
 // Largest order of SIP (Shupe et al. 2005, ASPC 347, 491): headers with more are damaged.
 const MAX_SIP_ORDER: i32 = 9;
 // Largest number of a coefficient PVi_m of TPV.
@@ -118,7 +118,7 @@ impl Keys {
         let error = stated.reduce(f64::max);
         let error = error.map_or_else(String::new, |error| format!(", up to {error:.2} px,"));
         Some(format!(
-            "the WCS has {named}, whose distortion{error} is not read (expected TAN, TAN-SIP or TPV). Places of ra and dec and the axes of ellipticities lack it"
+            "the WCS has {named}, whose distortion{error} is not read (expected SIP or TPV). Places of ra and dec and the axes of ellipticities lack it"
         ))
     }
 }
@@ -244,7 +244,14 @@ impl Wcs {
             ));
         }
         let origin = ["CRPIX1", "CRPIX2"].map(|key| keys.number(key).unwrap_or(0.0));
-        if !(equatorial && ["TAN", "TPV"].contains(&projections[0])) {
+        let zenithal = match projections[0] {
+            _ if !equatorial => None,
+            "TAN" | "TPV" => Some(Zenithal::Gnomonic),
+            "STG" => Some(Zenithal::Stereographic),
+            "SIN" => Some(Zenithal::Orthographic),
+            _ => None,
+        };
+        let Some(zenithal) = zenithal else {
             let west = |row: [f64; 2]| row.map(|value| -value);
             let matrix = match (plane, latitude_first) {
                 (true, _) => [first, second],
@@ -269,7 +276,7 @@ impl Wcs {
                     false => keys.unused_text(false).into_iter().collect(),
                 },
             };
-        }
+        };
         let degrees = |row: [f64; 2]| row.map(|value| value / 3600.0);
         let centre = [0, 1].map(|i| {
             let value = keys.number(["CRVAL1", "CRVAL2"][i]).unwrap_or(0.0);
@@ -303,7 +310,8 @@ impl Wcs {
                     true => [degrees(second), degrees(first)],
                     false => [degrees(first), degrees(second)],
                 },
-                projection: Projection::Tangent {
+                projection: Projection::Zenithal {
+                    kind: zenithal,
                     ra,
                     dec,
                     lonpole: lonpole.unwrap_or(default).to_radians(),
@@ -391,8 +399,9 @@ impl Distortion {
         let is_tpv = kinds[0].get(5..8) == Some("TPV");
         // SCAMP wrote distortions of TPV under the name TAN.
         let scamp = || {
+            let is_tan = kinds[0].get(5..8) == Some("TAN");
             let mut only_tpv = MIN_TPV_ONLY..=MAX_TPV;
-            only_tpv.any(|m| [1, 2].iter().any(|i| keys.has(&format!("PV{i}_{m}"))))
+            is_tan && only_tpv.any(|m| [1, 2].iter().any(|i| keys.has(&format!("PV{i}_{m}"))))
         };
         if is_tpv || !has_suffix && scamp() {
             let axes = [longitude, 1 - longitude];

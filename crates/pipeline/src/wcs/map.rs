@@ -1,4 +1,4 @@
-//! From pixels to the sky: distortions, the gnomonic projection, and their derivatives.
+//! From pixels to the sky: distortions, zenithal projections, and their derivatives.
 
 use shearq_quantities::linear::{Matrix2, apply, determinant, inverse, product};
 
@@ -53,14 +53,51 @@ impl Polynomial {
 pub(super) enum Projection {
     // Arcseconds; of simulations and of projections that are not read.
     Plane,
-    /// The gnomonic one about a point, with the distortion of TPV or without.
-    Tangent {
+    /// A zenithal one about a point, with the distortion of TPV or without.
+    Zenithal {
+        kind: Zenithal,
         ra: f64,
         dec: f64,
         /// Native longitude of the celestial pole in radians.
         lonpole: f64,
         tpv: Option<[Polynomial; 2]>,
     },
+}
+
+/// How the distance R from the reference point on the plane, in radians, follows from the angle on the sky.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Zenithal {
+    /// TAN: tan θ.
+    Gnomonic,
+    /// STG: 2 tan(θ/2), of coadds for Roman.
+    Stereographic,
+    /// SIN: sin θ, of 2MASS and WISE.
+    Orthographic,
+}
+
+impl Zenithal {
+    /// The height h over the plane that has the direction (ξ, η, h), and its derivative by R² = ξ² + η².
+    fn height(self, square: f64) -> (f64, f64) {
+        match self {
+            Zenithal::Gnomonic => (1.0, 0.0),
+            Zenithal::Stereographic => (1.0 - square / 4.0, -0.25),
+            Zenithal::Orthographic => {
+                let height = (1.0 - square).sqrt();
+                (height, -0.5 / height)
+            }
+        }
+    }
+
+    /// The plane's coordinates in units of those of a unit vector of this height. `None` on the half of the sky that would be
+    /// mirrored onto the plane.
+    fn scale(self, height: f64) -> Option<f64> {
+        match self {
+            Zenithal::Gnomonic if height > 0.0 => Some(1.0 / height),
+            Zenithal::Stereographic if height > -1.0 => Some(2.0 / (1.0 + height)),
+            Zenithal::Orthographic if height > 0.0 => Some(1.0),
+            _ => None,
+        }
+    }
 }
 
 // From pixels to the sky (Greisen & Calabretta 2002, A&A 395, 1061; Calabretta & Greisen 2002, A&A 395, 1077). The CDS's crate
@@ -76,6 +113,11 @@ pub(super) struct Map {
 }
 
 impl Map {
+    pub(super) fn is_distorted(&self) -> bool {
+        let has_tpv = matches!(self.projection, Projection::Zenithal { tpv: Some(_), .. });
+        self.sip.is_some() || has_tpv
+    }
+
     /// Coordinates on the projection plane, longitude first, and their derivatives by pixels.
     fn plane(&self, at: [f64; 2]) -> ([f64; 2], Matrix2) {
         let mut offset = [0, 1].map(|k| at[k] - self.origin[k]);
@@ -89,7 +131,7 @@ impl Map {
         }
         let place = apply(self.matrix, offset);
         match &self.projection {
-            Projection::Tangent { tpv: Some(tpv), .. } => {
+            Projection::Zenithal { tpv: Some(tpv), .. } => {
                 let (place, by) = Polynomial::both(tpv, place);
                 (place, product(by, slope))
             }
@@ -117,24 +159,33 @@ impl Map {
     /// Right ascension and declination in degrees, and the derivatives of (west, north) in arcseconds there.
     pub(super) fn sky(&self, at: [f64; 2]) -> (Option<[f64; 2]>, Matrix2) {
         let (place, slope) = self.plane(at);
-        let Projection::Tangent {
-            ra, dec, lonpole, ..
+        let Projection::Zenithal {
+            kind,
+            ra,
+            dec,
+            lonpole,
+            ..
         } = &self.projection
         else {
             return (None, slope);
         };
         let [centre, east, north] = tangent([*ra, *dec], *lonpole);
         let [xi, eta] = place.map(f64::to_radians);
-        let point = [0, 1, 2].map(|k| centre[k] + xi * east[k] + eta * north[k]);
+        let (height, by_square) = kind.height(xi * xi + eta * eta);
+        let point = [0, 1, 2].map(|k| height * centre[k] + xi * east[k] + eta * north[k]);
         let length = dot(&point, &point).sqrt();
         let there = [
             point[1].atan2(point[0]).to_degrees().rem_euclid(360.0),
             point[2].atan2(point[0].hypot(point[1])).to_degrees(),
         ];
-        // A step on the tangent plane moves the direction by its part across it, which west and north of the place itself
+        // A step on the plane moves the direction by its part across it, which west and north of the place itself
         // measure: towards the poles they turn against the axes at the reference point.
         let [_, its_east, its_north] = tangent(there, std::f64::consts::PI);
-        let row = |axis: &[f64; 3]| [&east, &north].map(|by| dot(axis, by) / length);
+        let steps = [(&east, xi), (&north, eta)];
+        let row = |axis: &[f64; 3]| {
+            let up = dot(axis, &centre) * by_square;
+            steps.map(|(by, at)| (dot(axis, by) + 2.0 * at * up) / length)
+        };
         let local = [row(&its_east).map(|value| -value), row(&its_north)];
         let scale = ARCSEC_PER_RADIAN * 1f64.to_radians();
         let jacobian = product(local, slope).map(|row| row.map(|value| value * scale));
@@ -143,22 +194,23 @@ impl Map {
 
     /// The pixel of a place on the sky; `None` on its other half, and where the distortion has no inverse.
     pub(super) fn pixel_of(&self, sky: [f64; 2]) -> Option<[f64; 2]> {
-        let Projection::Tangent {
-            ra, dec, lonpole, ..
+        let Projection::Zenithal {
+            kind,
+            ra,
+            dec,
+            lonpole,
+            ..
         } = &self.projection
         else {
             return None;
         };
         let [centre, east, north] = tangent([*ra, *dec], *lonpole);
         let [point, ..] = tangent(sky, std::f64::consts::PI);
-        let height = dot(&point, &centre);
-        // The other half of the sky would be mirrored onto the plane.
-        if height.is_nan() || height <= 0.0 {
-            return None;
-        }
-        self.pixel([&east, &north].map(|axis| (dot(&point, axis) / height).to_degrees()))
+        let scale = kind.scale(dot(&point, &centre))?;
+        self.pixel([&east, &north].map(|axis| (dot(&point, axis) * scale).to_degrees()))
     }
 }
+
 /// Unit vectors to a place in degrees, and along the axes of the tangent plane there: east and north, if the pole is at π.
 fn tangent([ra, dec]: [f64; 2], lonpole: f64) -> [[f64; 3]; 3] {
     let ((sin_ra, cos_ra), (sin_dec, cos_dec)) =
@@ -177,6 +229,7 @@ fn tangent([ra, dec]: [f64; 2], lonpole: f64) -> [[f64; 3]; 3] {
 fn dot(a: &[f64; 3], b: &[f64; 3]) -> f64 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
+
 pub(super) fn regular_inverse(matrix: Matrix2) -> Option<Matrix2> {
     determinant(matrix).is_normal().then(|| inverse(matrix))
 }
