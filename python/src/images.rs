@@ -11,10 +11,11 @@ use shearq_pipeline::gather::{
 };
 
 type Matrix2 = [[f64; 2]; 2];
-// Pixels (n, ny, nx), Jacobians (n, 2, 2) if the headers have them, and messages.
+// Pixels (n, ny, nx), Jacobians (n, 2, 2) if the headers have them, why they are not those of a cube's stamps, and messages.
 type Images<'py> = (
     Bound<'py, PyArray3<f32>>,
     Option<Bound<'py, PyArray3<f64>>>,
+    Option<String>,
     Vec<String>,
 );
 
@@ -47,25 +48,31 @@ pub(crate) fn read_images<'py>(
         pixels,
         side,
         jacobians,
+        fault_of_cube,
         messages,
     } = found;
     let count = pixels.len() / (side * side);
     let pixels = ndarray::Array3::from_shape_vec((count, side, side), pixels);
     let pixels = pixels.map_err(|error| PyValueError::new_err(error.to_string()))?;
     let jacobians = jacobians.map(|all| stacked(py, all)).transpose()?;
-    Ok((pixels.into_pyarray(py), jacobians, messages))
+    Ok((pixels.into_pyarray(py), jacobians, fault_of_cube, messages))
 }
 
-/// The Jacobian in the middle of an image with a header of these cards, if it states one, and what of it is not used.
+/// The Jacobian in the middle of images with a header of these cards, if it states one, why it is not that of a cube's, and what of
+/// the header is not used.
 #[pyfunction]
 pub(crate) fn header_pixels(
     cards: BTreeMap<String, String>,
     width: usize,
     height: usize,
-) -> PyResult<(Option<Matrix2>, Vec<String>)> {
-    let HeaderPixels { jacobian, doubts } =
-        HeaderPixels::from_cards(cards, [width, height]).map_err(PyValueError::new_err)?;
-    Ok((jacobian, doubts))
+    planes: usize,
+) -> PyResult<(Option<Matrix2>, Option<String>, Vec<String>)> {
+    let HeaderPixels {
+        jacobian,
+        fault_of_cube,
+        doubts,
+    } = HeaderPixels::from_cards(cards, [width, height], planes).map_err(PyValueError::new_err)?;
+    Ok((jacobian, fault_of_cube, doubts))
 }
 
 /// What is wrong with PSFs of these Jacobians for stamps of those.

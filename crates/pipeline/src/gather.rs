@@ -29,7 +29,7 @@ use self::model::Chip;
 use self::mosaic::{Rows, StampWriter, already};
 use self::plan::Plan;
 pub use self::positions::Table;
-use self::positions::rows_of_stamps;
+use self::positions::{pixels_of_rows, rows_of_stamps};
 use self::psfs::{GatheredPsfs, PsfFile, gather_psfs};
 pub use self::request::{Gathering, Masks, Square, Stamps};
 use super::PipelineError;
@@ -41,7 +41,6 @@ use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::DataFolder;
 use shearq_files::FileError;
 use shearq_files::atomic;
-use shearq_files::frames::{self, polars::Column};
 use shearq_files::open::is_there;
 
 // Largest difference of the median offset from the one pixel between positions from 0 and from 1. Chosen by hand.
@@ -126,7 +125,7 @@ fn gather_alone(
     let chips = exposures == Exposures::Chips;
     let plans = all
         .iter()
-        .map(|one| Plan::of(&one.stamps, one.square, chips));
+        .map(|one| Plan::of(&one.stamps, one.square, chips)?.with_places(one.rows));
     let mut plans: Vec<Plan> = plans.collect::<Result<_, _>>()?;
     match exposures {
         Exposures::Chips => leave_out_of_chips(&mut plans, all)?,
@@ -322,17 +321,6 @@ fn prepare(
             messages,
         },
     })
-}
-
-// The columns x and y of stamps that are not cut out.
-fn pixels_of_rows(rows: &[Column]) -> Option<Vec<(f64, f64)>> {
-    let of = |wanted: &str| {
-        let column = rows.iter().find(|column| column.name() == wanted);
-        column.and_then(frames::reals)
-    };
-    let [x, y, ..] = stamp_table::PLACE;
-    let (x, y) = (of(x)?, of(y)?);
-    Some(x.iter().copied().zip(y.iter().copied()).collect())
 }
 
 // Of all exposures or of none, because `measure --epochs` combines stamps along common axes: exposures along the sky next to turned

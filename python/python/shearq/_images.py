@@ -26,11 +26,11 @@ def _is_hdu(value: Any) -> bool:
     return hasattr(value, "header") and hasattr(value, "data") and hasattr(value.header, "cards")
 
 
-def _opened(name: str, value: Any) -> tuple[Any, NDArray[np.float64] | None]:
+def _opened(name: str, value: Any, has_wcs: bool) -> tuple[Any, NDArray[np.float64] | None]:
     """The pixels of a path or HDU and the Jacobians of its images; anything else as it is, without."""
     if isinstance(value, (str, os.PathLike)):
         try:
-            pixels, matrices, messages = _shearq.read_images(os.fspath(value), name == "psf")
+            pixels, matrices, fault, messages = _shearq.read_images(os.fspath(value), name == "psf")
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from None
     elif _is_hdu(value):
@@ -42,10 +42,13 @@ def _opened(name: str, value: Any) -> tuple[Any, NDArray[np.float64] | None]:
             raise ValueError(f"{name}: found asinh magnitudes (BSOFTEN); expected fluxes. Try: the path of the file, whose pixels are converted")
         cards = {card.keyword: f"'{card.value}'" if isinstance(card.value, str) else str(card.value) for card in value.header.cards if card.keyword}
         rows, columns = np.shape(pixels)[-2:]
-        matrix, messages = _shearq.header_pixels(cards, columns, rows)
+        planes = len(pixels) if pixels.ndim == 3 else 1
+        matrix, fault, messages = _shearq.header_pixels(cards, columns, rows, planes)
         matrices = None if matrix is None else np.array([matrix])
     else:
         return value, None
+    if fault is not None and name == "stamps" and not has_wcs:
+        raise ValueError(f"{name}: {fault}. Try: wcs=WCS(header) with x= and y=, or the array of pixels, for ellipticities along the pixel axes")
     for message in messages:
         warn(f"{name}: {message}", DataWarning)
     if name == "psf":
@@ -57,8 +60,8 @@ def _opened(name: str, value: Any) -> tuple[Any, NDArray[np.float64] | None]:
 
 def opened(stamps: Any, psf: Any, wcs: Any) -> tuple[Any, Any, Any]:
     """Stamps, PSFs and their WCS, of which paths and HDUs become arrays, and their headers the WCS that is not given."""
-    stamps, own = _opened("stamps", stamps)
-    psf, of_psf = _opened("psf", psf)
+    stamps, own = _opened("stamps", stamps, wcs is not None)
+    psf, of_psf = _opened("psf", psf, wcs is not None)
     if own is not None:
         if of_psf is not None:
             found = _shearq.pixel_difference(of_psf, own)

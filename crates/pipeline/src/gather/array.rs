@@ -20,6 +20,8 @@ pub struct GatheredPixels {
     pub side: usize,
     /// Of each image, if all headers have a WCS: `((du/dx, du/dy), (dv/dx, dv/dy))` in arcsec, u to the west and v to the north.
     pub jacobians: Option<Vec<Matrix2>>,
+    /// Why the header of a cube does not state the pixels of its stamps.
+    pub fault_of_cube: Option<String>,
     pub messages: Vec<String>,
 }
 
@@ -47,6 +49,7 @@ impl GatheredPixels {
             pixels,
             side: stack.side,
             jacobians: stack.pixels().into_iter().collect(),
+            fault_of_cube: stack.fault_of_cube,
             messages,
         })
     }
@@ -57,21 +60,29 @@ impl GatheredPixels {
 pub struct HeaderPixels {
     /// In the middle of the image.
     pub jacobian: Option<Matrix2>,
+    /// Why it is not that of several stamps.
+    pub fault_of_cube: Option<String>,
     /// What of the header is used against its name, or not used.
     pub doubts: Vec<String>,
 }
 
 impl HeaderPixels {
-    /// From the values of keys as cards have them, texts in quotes.
+    /// From the values of keys as cards have them, texts in quotes, of `planes` images of these sides.
     ///
     /// # Errors
     /// What is wrong with the WCS.
-    pub fn from_cards(cards: BTreeMap<String, String>, sides: [usize; 2]) -> Result<Self, String> {
+    pub fn from_cards(
+        cards: BTreeMap<String, String>,
+        sides: [usize; 2],
+        planes: usize,
+    ) -> Result<Self, String> {
         let wcs = Wcs::of_keys(&Keys::new(cards));
+        let middle = sides.map(|side| (side as f64 + 1.0) / 2.0);
         match wcs.fault() {
             Some(fault) => Err(fault),
             None => Ok(HeaderPixels {
-                jacobian: wcs.jacobian(sides.map(|side| (side as f64 + 1.0) / 2.0)),
+                jacobian: wcs.jacobian(middle),
+                fault_of_cube: wcs.fault_of_cube(planes, middle),
                 doubts: wcs.doubts().to_vec(),
             }),
         }

@@ -14,7 +14,7 @@ use shearq_quantities::{Frame, Jacobian};
 use super::exposure::Exposure;
 use super::files::{Content, Files, Images};
 use super::mosaic::{Origins, StampWriter};
-use super::positions::{Positions, Table};
+use super::positions::{Positions, Table, pixels_of_rows, rows_of_stamps};
 use super::request::{Gathering, Square, Stamps};
 use crate::stamp_table::{self, Head};
 use crate::wcs::{Wcs, aligned};
@@ -53,6 +53,20 @@ impl Plan {
         }
     }
 
+    /// The same with the pixels at the places of stamps in a table, where the WCS of a cube needs them.
+    pub(super) fn with_places(mut self, rows: Option<Table<'_>>) -> Result<Self, FileError> {
+        let (Some(_), Some(rows)) = (&self.stack.fault_of_cube, rows) else {
+            return Ok(self);
+        };
+        let columns = rows_of_stamps(rows, self.stack.count)?;
+        if let Some(places) = pixels_of_rows(&columns) {
+            let at = |(x, y)| (1, self.stack.wcs.jacobian([x, y]));
+            self.stack.of_images = places.into_iter().map(at).collect();
+            self.stack.fault_of_cube = None;
+        }
+        Ok(self)
+    }
+
     pub(super) fn places(&self) -> &[(f64, f64)] {
         self.positions.as_ref().map_or(&[], |found| &found.all)
     }
@@ -85,6 +99,11 @@ impl Plan {
         if frame == Some(Frame::Pixel) {
             return Ok(None);
         }
+        if let Some(error) = &self.stack.fault_of_cube {
+            return fault(format!(
+                "{error}. Try: --positions with x and y of each stamp, in FITS pixels of the exposure, or --frame pixel, for ellipticities along the pixel axes"
+            ));
+        }
         let all: Option<Vec<Matrix2>> = self.pixels().into_iter().collect();
         let Some(all) = all else {
             if let Some(error) = self.stack.wcs.fault() {
@@ -92,7 +111,8 @@ impl Plan {
                     "{error}. Try: --frame pixel, for ellipticities along the pixel axes"
                 ));
             }
-            let expected = "and the header has no WCS (expected TAN, TAN-SIP, TPV or a linear one)";
+            let expected =
+                "and the header has no WCS (expected TAN, TAN-SIP, TPV, SIN, STG or a linear one)";
             return match (frame, gathering.frame) {
                 (Some(Frame::Sky), Some(_)) => fault(format!("--frame is sky, {expected}")),
                 (Some(Frame::Sky), None) => fault(format!(
@@ -108,7 +128,7 @@ impl Plan {
         }
         if let Some(kind) = self.stack.wcs.unread() {
             return fault(format!(
-                "the WCS is {kind} (expected TAN, TAN-SIP, TPV or a linear one), so that the pixels on the sky are not known. Try: --frame pixel, for ellipticities along the pixel axes"
+                "the WCS is {kind} (expected TAN, TAN-SIP, TPV, SIN, STG or a linear one), so that the pixels on the sky are not known. Try: --frame pixel, for ellipticities along the pixel axes"
             ));
         }
         for (row, jacobian) in all.iter().enumerate() {
@@ -216,6 +236,7 @@ impl Plan {
                 wcs,
                 of_images: Vec::new(),
                 differs: None,
+                fault_of_cube: None,
             },
             inside,
             positions: Some(positions),
@@ -233,6 +254,8 @@ pub(super) struct Stack {
     of_images: Vec<(usize, Option<Matrix2>)>,
     /// A warning if an image has other pixels than the first one.
     pub(super) differs: Option<String>,
+    /// What is wrong with the WCS of cubes.
+    pub(super) fault_of_cube: Option<String>,
 }
 
 impl Stack {
@@ -248,7 +271,7 @@ impl Stack {
         square: Option<Square>,
     ) -> Result<(Self, Vec<String>), FileError> {
         let (mut count, mut first, mut messages) = (0usize, None, Vec::new());
-        let (mut of_images, mut differs) = (Vec::new(), None);
+        let (mut of_images, mut differs, mut fault_of_cube) = (Vec::new(), None, None);
         let mut sides = [0; 2];
         let mut images = Images::of(files);
         while let Some((origin, image)) = images.next()? {
@@ -281,6 +304,7 @@ impl Stack {
             }
             let centre = [width, height].map(|side| (side as f64 + 1.0) / 2.0);
             of_images.push((image.planes(), wcs.jacobian(centre)));
+            fault_of_cube = fault_of_cube.or_else(|| wcs.fault_of_cube(image.planes(), centre));
             let (expected, first_wcs) = &*first.get_or_insert_with(|| (side, wcs.clone()));
             let expected = *expected;
             if side != expected && files.content == Content::Psf {
@@ -293,7 +317,9 @@ impl Stack {
                 [0, 0] => [side; 2],
                 [least, most] => [side.min(least), side.max(most)],
             };
-            if differs.is_none() && Wcs::disagreements(&wcs, first_wcs).next().is_some() {
+            let is_other = wcs.states_axes() != first_wcs.states_axes()
+                || Wcs::disagreements(&wcs, first_wcs).next().is_some();
+            if differs.is_none() && is_other {
                 let message = "the header states other pixel axes or another pixel scale than that of the first image, so that ellipticities are not along the same axes. Try: one orientation per image (--image)";
                 differs = Some(format!("warning: {}", origin.fault(message)));
             }
@@ -317,6 +343,7 @@ impl Stack {
             wcs,
             of_images,
             differs,
+            fault_of_cube,
         };
         Ok((stack, messages))
     }

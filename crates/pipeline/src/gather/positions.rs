@@ -389,6 +389,17 @@ pub(super) fn rows_of_stamps(table: Table<'_>, count: usize) -> Result<Vec<Colum
     Ok(all)
 }
 
+// The columns x and y of stamps that are not cut out.
+pub(super) fn pixels_of_rows(rows: &[Column]) -> Option<Vec<(f64, f64)>> {
+    let of = |wanted: &str| {
+        let column = rows.iter().find(|column| column.name() == wanted);
+        column.and_then(frames::reals)
+    };
+    let [x, y, ..] = stamp_table::PLACE;
+    let (x, y) = (of(x)?, of(y)?);
+    Some(x.iter().copied().zip(y.iter().copied()).collect())
+}
+
 // Right ascensions may count from −180.
 fn check_degrees(path: &Path, ra: &[f64], dec: &[f64]) -> Result<(), FileError> {
     let is_wrong = |(ra, dec): (&f64, &f64)| {
@@ -472,7 +483,7 @@ fn no_sky<T>(path: &Path, exposure: &Path, wcs: &Wcs) -> Result<T, FileError> {
     let found = match wcs.fault() {
         Some(fault) => format!("{}: {fault}", exposure.display()),
         None => format!(
-            "the header of {} has no WCS (expected TAN, TAN-SIP or TPV)",
+            "the header of {} has no WCS (expected TAN, TAN-SIP, TPV, SIN or STG)",
             exposure.display()
         ),
     };
