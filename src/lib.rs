@@ -106,7 +106,7 @@ pub(crate) enum Command {
     #[command(after_help = "Example:\n  shearq quickstart --out first")]
     Quickstart(quickstart::Arguments),
     #[command(
-        after_help = "Examples:\n  shearq simulate --sets 1,2,7-9 --images 10 --seed 1 --out data\n  shearq simulate --scenes 20 --side 1500 --density 75 --opposite --out scenes\n  shearq simulate --challenge great3 --branch control-ground-constant --subfields 20 --out branch"
+        after_help = "Examples:\n  shearq simulate --sets 1,2,7-9 --images 10 --seed 1 --out data\n  shearq simulate --scenes 20 --side 1500 --border 60 --density 75 --opposite --out scenes\n  shearq simulate --challenge great3 --branch control-ground-constant --subfields 20 --out branch"
     )]
     Simulate(simulate::Arguments),
     #[command(

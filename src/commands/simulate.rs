@@ -330,6 +330,17 @@ fn run_scenes(arguments: &Arguments, scenes: u32) -> anyhow::Result<()> {
         };
         simulators.push((SceneSimulator::new(settings, fits.clone())?, version.out));
     }
+    let moved = simulators
+        .iter()
+        .map(|(own, _)| own.sheared_border())
+        .fold(0.0, f64::max)
+        .ceil();
+    if simulators.len() > 1 && (settings.border as f64) < moved {
+        tell(format_args!(
+            "warning: --border is {} px, and the shear moves objects by up to {moved} px (expected a wider border): those near the edges are on the image under one of the shears only, so that pairs do not cancel their shapes. Try: --border {moved}",
+            settings.border
+        ));
+    }
     let objects: usize = simulators.iter().map(|(own, _)| own.objects()).sum();
     let mut bar = Bar::new("simulating", u64::from(scenes) * objects as u64);
     let mut made = 0;

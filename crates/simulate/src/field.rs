@@ -27,7 +27,8 @@ const FIDUCIAL: [(f64, f64); 12] = [
 ];
 
 // Moduli of constant shears in GREAT3.
-const SHEARS: (f64, f64) = (0.01, 0.05);
+const SHEARS: (f64, f64) = (0.01, MAX_RANDOM_SHEAR);
+pub(super) const MAX_RANDOM_SHEAR: f64 = 0.05;
 
 // Multipole whose power a tilt leaves unchanged. Chosen by hand.
 const PIVOT: f64 = 1000.0;

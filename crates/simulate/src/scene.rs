@@ -19,7 +19,7 @@ use shearq_quantities::fourier::Complex64;
 use shearq_quantities::linear::apply;
 use shearq_quantities::{FunctionalPsf, PsfProfile, PsfTransform, Shear, TransformedPsf};
 
-use super::field::random_shear;
+use super::field::{MAX_RANDOM_SHEAR, random_shear};
 use super::fit::{Fit, FitComponent, axis_ratio, log_normal, rayleigh};
 use super::galaxy::{Galaxy, Sersic};
 use super::noise::add_noise;
@@ -392,6 +392,12 @@ impl SceneSimulator {
                 (self.settings.density * self.settings.field_arcmin2()).round() as usize
             }
         }
+    }
+
+    /// Pixels along the edges that the largest shear of these scenes, or of GREAT3 where each has its own, moves objects across.
+    pub fn sheared_border(&self) -> f64 {
+        let g = self.settings.constant_shear.map(|[g1, g2]| g1.hypot(g2));
+        g.unwrap_or(MAX_RANDOM_SHEAR) * self.settings.side as f64 / 2.0
     }
 
     /// The shear of a scene (from 1).

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use ndarray::{ArcArray2, Array3, ArrayView2, Axis, Ix3, Slice};
 use shearq_files::FileError;
 use shearq_files::fits::ImageReader;
+use shearq_files::open::is_there;
 use shearq_files::table::numbers;
 use shearq_measure::{
     FunctionalPsf, KnownNoise, Lazy, LazyStamps, Measurer, Pixels, Psfs, Session, StampRows,
@@ -377,6 +378,13 @@ fn open_psfs(
     match configuration.psf.form {
         PsfForm::Functional => {
             let path = data.psf_functional(id.set, id.image);
+            if !is_there(&path) && is_there(&data.psf_star(id.set, id.image)) {
+                let message = format!(
+                    "the table of functional PSFs is missing, which {} needs; the PSFs of this image are stamps. Try: a configuration for stamps, such as 48/linear/star",
+                    configuration.name
+                );
+                return Err(FileError::new(&path, message));
+            }
             Ok(OpenPsfs {
                 source: open_functional(&path, cut, mosaic)?,
                 moved: None,
