@@ -95,6 +95,8 @@ def render(work, placement, piece, seed):
         dithers = random.uniform(-0.5, 0.5, (TURNS, 2))
         if placement == "dithered":
             places[first : first + TURNS] = dithers
+        if placement == "nearest":
+            places[first : first + TURNS] = dithers + 0.5
         for turn in range(TURNS):
             phase = 2 * (angle + turn * np.pi / TURNS)
             galaxy = profile().shear(g1=modulus * np.cos(phase), g2=modulus * np.sin(phase))
@@ -418,6 +420,33 @@ METHODS = {
         fpfs,
         {"kernel": WIDE * SCALE, "renoised": False},
         (24, 16),
+    ),
+    "fpfs-nearest": Method(
+        "FPFS",
+        "at the nearest pixel, not renoised, kernel 2.6 px",
+        "anacal",
+        "nearest",
+        fpfs,
+        {"kernel": NARROW * SCALE, "renoised": False},
+        (2, 2),
+    ),
+    "fpfs-nearest-wide": Method(
+        "FPFS",
+        "at the nearest pixel, not renoised, kernel 4.5 px",
+        "anacal",
+        "nearest",
+        fpfs,
+        {"kernel": WIDE * SCALE, "renoised": False},
+        (2, 2),
+    ),
+    "shearq-nearest": Method(
+        "48/linear/star",
+        "cut at the nearest pixel",
+        "shearq",
+        "nearest",
+        shearq,
+        {"configuration": "48/linear/star"},
+        (2, 2),
     ),
     "fpfs-detected": Method(
         "FPFS", "dithered, own detection, renoised", "anacal", "dithered", fpfs_detected, {}, (6, 6)
