@@ -670,6 +670,29 @@ fn find_dead(
     }
 }
 
+/// Pixels of a PSF of sum one, in noise of `noise`, that are darker than all pairs of pixels around them by more than their light
+/// can fall.
+pub(crate) fn dead_pixels(psf: ArrayView2<'_, f64>, noise: f64) -> usize {
+    let (n, noise) = (psf.ncols(), noise as f32);
+    let pixels: Vec<f32> = psf.iter().map(|&value| value as f32).collect();
+    let [_, peak] = extremes(&pixels);
+    let ratio = RATIO_MARGIN * (RATIO_EXPONENT * peak).exp();
+    let is_dead = |at: &usize| {
+        let around = pair_means(&pixels, n, *at);
+        let least = around[..DIRECTIONS]
+            .iter()
+            .copied()
+            .fold(f32::INFINITY, f32::min);
+        let is_known = around[..DIRECTIONS].iter().all(|mean| mean.is_finite());
+        let departure = MIN_DEPARTURE * noise;
+        is_known
+            && least > FAINT_SHARE * peak
+            && pixels[*at] < least / ratio
+            && least - pixels[*at] > departure
+    };
+    (0..pixels.len()).filter(is_dead).count()
+}
+
 /// The means of [`PAIRS`] of pixels; NaN with one that is missing or off the stamp.
 fn pair_means(stamp: &[f32], n: usize, at: usize) -> [f32; PAIRS.len()] {
     PAIRS.map(|(dx, dy)| {

@@ -64,6 +64,16 @@ const EPOCH_FLUX: f64 = 0.2;
 const OTHER_GALAXIES: f64 = 0.1;
 // Stamps with the largest peak in units of those with any other one. Chosen by hand.
 const MIN_SATURATED: usize = 5;
+// Share of pixels at the darkest value that is no chance, and that leaves others. Chosen by hand: noise clipped at −2 σ has 2 %.
+const CLIPPED_SHARE: std::ops::RangeInclusive<f64> = 0.02..=0.95;
+// Pixels at the brightest value of a stamp: symmetry makes two of them equal.
+const MIN_FLAT_TOP: usize = 3;
+// Share of stamps with a flat top. Chosen by hand.
+const FLAT_TOPS: f64 = 0.05;
+// Share of equal neighbours from which all values repeat, as whole numbers do. Chosen by hand.
+const MAX_EQUAL_SHARE: f64 = 0.005;
+// Noise over the peak below which symmetric galaxies may have equal pixels. Chosen by hand.
+const MIN_NOISE_TO_PEAK: f64 = 1e-4;
 // Light per noise of an epoch in units of the first epoch's, from which its galaxies must be visible. Chosen by hand: exposures of
 // a set rarely have sixteen times less weight, and those that have need not be told from exposures without galaxies.
 const MIN_EPOCH_DEPTH: f64 = 0.25;
@@ -116,6 +126,9 @@ struct StampStatistics {
     trace: u64,
     /// Whether pixels of the core are missing, so that place and core are wrong.
     is_core_damaged: bool,
+    /// Share of pixels with the darkest value, and the number with the brightest; zero if other values repeat, too.
+    darkest_share: f64,
+    brightest: usize,
 }
 
 /// Sums over stamps of an image. They depend on nothing but the stamps and their order.
@@ -265,6 +278,7 @@ impl Examination {
         if self.stamp.pixels.iter().all(|value| !value.is_finite()) {
             return Ok(());
         }
+        let (darkest_share, brightest) = ends(&self.stamp.pixels);
         self.stamp.subtract_sky();
         let pixels = &mut self.stamp.pixels;
         let (edge, middle) = (n - self.block, (n - self.block) / 2);
@@ -307,6 +321,8 @@ impl Examination {
             flux: 0.0,
             core: [0.0; 2],
             is_core_damaged: misses_core(pixels, n, place),
+            darkest_share,
+            brightest,
         };
         // The sky of a stamp without corners is unknown.
         let sky = if corner.is_nan() { 0.0 } else { corner };
@@ -388,7 +404,9 @@ impl Examination {
         }
         found.extend(self.depths());
         found.extend(self.copies(examined));
-        found.extend(self.saturated(examined));
+        found.extend(self.clipped(examined));
+        let saturated = self.saturated(examined);
+        found.extend(saturated.or_else(|| self.flat_tops(examined)));
         let galaxies = self.core().filter(|_| lit && flux > 0.0);
         found.extend(self.psfs(galaxies));
         found
@@ -589,6 +607,31 @@ impl Examination {
         let most = MIN_SATURATED * counts.max().unwrap_or(1);
         let (level, _) = *peaks.last()?;
         (count > most).then_some(Warning::Saturated { level, count, of })
+    }
+
+    /// A warning if many pixels of most stamps have the darkest value of the stamp.
+    fn clipped(&self, of: usize) -> Option<Warning> {
+        let is_clipped = |stamp: &&StampStatistics| CLIPPED_SHARE.contains(&stamp.darkest_share);
+        let clipped: Vec<_> = self.noisy().filter(is_clipped).collect();
+        let count = clipped.len();
+        let Estimate { value: share, .. } =
+            median_of(clipped.into_iter().map(|stamp| stamp.darkest_share), 0.0);
+        (2 * count > self.stamps.len()).then_some(Warning::Clipped { share, count, of })
+    }
+
+    /// A warning if several pixels of many stamps have the brightest value of the stamp: levels of saturation differ between exposures.
+    fn flat_tops(&self, of: usize) -> Option<Warning> {
+        let is_flat = |stamp: &&StampStatistics| stamp.brightest >= MIN_FLAT_TOP;
+        let count = self.noisy().filter(is_flat).count();
+        let least = (FLAT_TOPS * self.stamps.len() as f64).max(MIN_SATURATED as f64);
+        (count as f64 > least).then_some(Warning::FlatTops { count, of })
+    }
+
+    fn noisy(&self) -> impl Iterator<Item = &StampStatistics> {
+        let is_noisy = |stamp: &&StampStatistics| {
+            stamp.noise[0].hypot(stamp.noise[1]) > MIN_NOISE_TO_PEAK * stamp.peak
+        };
+        self.stamps.iter().filter(is_noisy)
     }
 
     /// Median of a number over stamps. Each stamp has an error of at least `floor`.
@@ -880,6 +923,28 @@ fn median_ignoring_nan(values: &mut [f64; 4]) -> f64 {
     match count {
         0 => f64::NAN,
         _ => 0.5 * (rest[(count - 1) / 2] + rest[count / 2]),
+    }
+}
+
+/// The share of finite pixels with the darkest value, and the number of those with the brightest one; zero if other values are often
+/// those of the next pixel.
+fn ends(pixels: &[f32]) -> (f64, usize) {
+    let finite = || pixels.iter().copied().filter(|value| value.is_finite());
+    let (low, high) = (
+        finite().fold(f32::INFINITY, f32::min),
+        finite().fold(f32::NEG_INFINITY, f32::max),
+    );
+    let (mut darkest, mut brightest, mut count) = (0, 0, 0);
+    for value in finite() {
+        darkest += usize::from(value == low);
+        brightest += usize::from(value == high);
+        count += 1;
+    }
+    let repeats = |pair: &&[f32]| pair[0] == pair[1] && pair[0] != low && pair[0] != high;
+    let equal = pixels.windows(2).filter(repeats).count();
+    match equal as f64 > MAX_EQUAL_SHARE * count as f64 {
+        true => (0.0, 0),
+        false => (darkest as f64 / count as f64, brightest),
     }
 }
 

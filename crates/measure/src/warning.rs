@@ -232,6 +232,15 @@ pub enum Warning {
         share: f64,
         of: ExaminedPsfs,
     },
+    /// Pixels of the PSF have another value than the pixels around them allow.
+    #[error(
+        "pixels of the PSF hold no light (found {}{of}; expected a smooth PSF), which biases shears: one dead pixel near the centre changes c by 0.01, a core that is cut off m by 0.1. Try: a model of the PSF, or stars that are neither saturated nor on bad pixels",
+        match *dead {
+            0 => "several pixels of the brightest value".to_owned(),
+            dead => format!("{dead} much darker than all around them"),
+        }
+    )]
+    PsfDefect { dead: usize, of: ExaminedPsfs },
     /// The background of the PSF image changes along x or y.
     #[error(
         "the background of the PSF has a gradient (found {:.3} % of the peak per pixel along x and {:.3} % along y{of}; expected 0). It biases shears. Try: subtract the background",
@@ -266,6 +275,17 @@ pub enum Warning {
         significant(*level, 5)
     )]
     Saturated { level: f64, count: usize, of: usize },
+    /// Pixels below a level were replaced by it.
+    #[error(
+        "pixels are cut off from below (found {:.0} % of the pixels at the darkest value of their stamp, on {count} of {of} stamps; expected one pixel), which biases shears: m is about 0.1 if those below zero became zero, and 0.02 below −1 σ. Try: images whose negative pixels are kept",
+        100.0 * share
+    )]
+    Clipped { share: f64, count: usize, of: usize },
+    /// The brightest pixels of a stamp have one value, on many stamps.
+    #[error(
+        "several pixels have the brightest value of their stamp on {count} of {of} stamps (expected one pixel), as if light above it were cut off, which biases shears. Try: replace saturated pixels by NaN"
+    )]
+    FlatTops { count: usize, of: usize },
     /// The noise of the star biases shears.
     #[error(
         "the PSF is noisy (found S/N {snr:.0}{of}; expected more than {enough:.0}). {}",

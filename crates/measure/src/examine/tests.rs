@@ -1,6 +1,9 @@
 //! Warnings about stamps and epochs, and their texts.
 
 use ndarray::Array2;
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
 
 use super::*;
 use crate::sky::Sky;
@@ -332,6 +335,8 @@ fn examined(change: impl Fn(f64, &mut StampStatistics)) -> Examination {
                 core: [100.0, 100.0],
                 trace: at as u64,
                 is_core_damaged: false,
+                darkest_share: 0.0,
+                brightest: 1,
             };
             change(2.0 * at as f64 / (COUNT - 1) as f64 - 1.0, &mut stamp);
             stamp
@@ -451,4 +456,40 @@ fn pixel_scales_are_shown_with_the_digits_that_differ() {
     );
     let found = message(0.200_000_000_1 * 1.001, 0.199_999_999_9);
     assert!(found.contains("found 0.2002, expected 0.2 "), "{found}");
+}
+
+/// Kinds of the warnings about 40 stamps of noise and a galaxy, each changed by its number.
+fn kinds_of(change: impl Fn(usize, f32) -> f32) -> Vec<&'static str> {
+    let mut rng = ChaCha8Rng::seed_from_u64(31);
+    let mut examination = Examination::new(N, 40);
+    for k in 0..40 {
+        let stamp = stamp(0.0, [0.0; 2], [0.3, -0.2]).mapv(|light| {
+            let noise: f32 = StandardNormal.sample(&mut rng);
+            change(k, light + 0.3 * noise)
+        });
+        examination.add(stamp.view()).unwrap();
+    }
+    let found = examination.warnings();
+    found.iter().map(Warning::kind).collect()
+}
+
+#[test]
+fn pixels_cut_off_below_or_above_are_named() {
+    let all = |kind: &str, change: &dyn Fn(usize, f32) -> f32| kinds_of(change).contains(&kind);
+    assert!(kinds_of(|_, value| value).is_empty());
+    for least in [0.0, -0.3, -0.55] {
+        assert!(all("clipped", &|_, value| value.max(least)), "{least}");
+    }
+    // Counts, and values that a gain makes of them.
+    for step in [0.25, 0.3, 0.6] {
+        let counts = |_: usize, value: f32| (value / step).round().max(0.0) * step;
+        assert!(
+            kinds_of(counts)
+                .iter()
+                .all(|kind| !["clipped", "flat-tops"].contains(kind))
+        );
+    }
+    // Each exposure has its level.
+    let cut = |k: usize, value: f32| value.min(7.0 + 0.01 * k as f32);
+    assert!(all("flat-tops", &cut));
 }

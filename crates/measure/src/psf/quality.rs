@@ -13,6 +13,7 @@ use shearq_quantities::statistics::upper_median;
 use super::denoised_star::{MIN_DENOISED_SIDE, UNCHANGED_SNR, noise_level};
 use super::star::psf_offset;
 use super::width::BORDER;
+use crate::defects::dead_pixels;
 use crate::moments::{CoreSize, psf_core_size};
 use crate::warning::{ExaminedPsfs, Warning};
 
@@ -73,6 +74,11 @@ const BIAS_TIMES_SNR: [f64; 2] = [2.3, 1.2];
 // The same for a star that is not denoised. The same table at S/N 1000: 0.0055 and 0.0023.
 const BIAS_TIMES_SNR_UNCHANGED: [f64; 2] = [5.5, 2.3];
 
+// Pixels of the brightest value: symmetry makes four of them equal.
+const MIN_FLAT_TOP: usize = 5;
+// Rounding to single precision, in units of the peak.
+const FLATNESS: f64 = 2e-7;
+
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct PsfQuality {
     side: usize,
@@ -88,6 +94,9 @@ pub(crate) struct PsfQuality {
     aliasing: f64,
     core: Option<CoreSize>,
     moved: Option<[f64; 2]>,
+    /// Pixels near the centre that are much darker than all around them, and pixels of the brightest value.
+    dead: usize,
+    brightest: usize,
     /// Centroid from the centre of the pixels that are used.
     pub(crate) offset: [f64; 2],
 }
@@ -192,6 +201,11 @@ impl PsfQuality {
         let offset = psf_offset(psf);
         Some(PsfQuality {
             side: n,
+            dead: dead_pixels(psf, sigma),
+            brightest: psf
+                .iter()
+                .filter(|value| **value >= (1.0 - FLATNESS) * peak)
+                .count(),
             snr: (power - count * sigma * sigma).max(0.0).sqrt() / sigma,
             level: (level / peak).clamp(-MAX_STATED_LEVEL, MAX_STATED_LEVEL),
             background: level * pixels / star,
@@ -309,6 +323,13 @@ pub(crate) fn psf_warnings(
         let offset = |k: usize| psfs.median(|psf| psf.moved.map_or(0.0, |moved| moved[k]));
         found.push(Warning::PsfOffCentre {
             offset: [offset(0), offset(1)],
+            of: psfs.of,
+        });
+    }
+    let is_defect = |psf: &PsfQuality| psf.dead > 0 || psf.brightest >= MIN_FLAT_TOP;
+    if let Some(psfs) = Defective::among(all, is_defect) {
+        found.push(Warning::PsfDefect {
+            dead: psfs.median(|psf| psf.dead as f64) as usize,
             of: psfs.of,
         });
     }
@@ -612,5 +633,25 @@ mod tests {
         // Light that falls more slowly is one.
         let slower = wing.mapv(|value| value.powf(0.5));
         assert!(background(&slower) > 0.2, "{}", background(&slower));
+    }
+
+    #[test]
+    fn defects_of_a_psf_are_named() {
+        let clean = sheared(MOFFAT, 3.4, 48);
+        assert!(!kinds(&clean).contains(&"psf-defect"));
+        let peak = clean.iter().copied().fold(0.0, f64::max);
+        let cut = clean.mapv(|value: f64| value.min(0.55 * peak));
+        assert!(kinds(&cut).contains(&"psf-defect"));
+        for at in [(24, 26), (22, 23), (23, 25)] {
+            let mut dead = clean.clone();
+            dead[at] = 0.0;
+            assert!(kinds(&dead).contains(&"psf-defect"), "{at:?}");
+        }
+        for fwhm in [1.2, 2.0, 3.4, 6.0] {
+            for side in [46, 48] {
+                let found = kinds(&airy(fwhm, side));
+                assert!(!found.contains(&"psf-defect"), "{fwhm} {side}");
+            }
+        }
     }
 }
