@@ -41,7 +41,6 @@ use shearq_simulate::set::SimulationSettings;
 #[command(group = ArgGroup::new("sheared").args(["constant_shear", "branch", "scenes"]).multiple(true))]
 #[command(group = ArgGroup::new("turnable").args(["constant_shear", "scenes"]).multiple(true))]
 #[command(group = ArgGroup::new("of_fits").args(["branch", "scenes"]))]
-#[command(group = ArgGroup::new("not_of_scenes").args(NOT_OF_SCENES).multiple(true).conflicts_with("SceneArguments"))]
 pub(crate) struct Arguments {
     /// Sets, as `1,2,7-9` or `all`.
     #[arg(long, value_name = "LIST", required_unless_present_any = ["challenge", "scenes"])]
@@ -88,40 +87,40 @@ pub(crate) struct Arguments {
 #[derive(Debug, Args)]
 struct SceneArguments {
     /// Simulate this many scenes instead of sets.
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=i64::from(MAX_IMAGE)))]
+    #[arg(long, value_name = "N", conflicts_with_all = SCENES_REFUSE, value_parser = clap::value_parser!(u32).range(1..=i64::from(MAX_IMAGE)))]
     scenes: Option<u32>,
     /// Pixels a side of a scene.
-    #[arg(long, value_name = "PX", requires = "scenes", default_value_t = SceneSettings::default().side)]
+    #[arg(long, value_name = "PX", requires = "scenes", conflicts_with_all = SCENES_REFUSE, default_value_t = SceneSettings::default().side)]
     side: usize,
     /// Pixels along the edges of a scene without galaxies and stars, so that none crosses an edge under one of several shears.
-    #[arg(long, value_name = "PX", requires = "scenes", default_value_t = SceneSettings::default().border)]
+    #[arg(long, value_name = "PX", requires = "scenes", conflicts_with_all = SCENES_REFUSE, default_value_t = SceneSettings::default().border)]
     border: usize,
     /// Arcseconds per pixel of a scene.
-    #[arg(long, value_name = "ARCSEC", requires = "scenes", default_value_t = SceneSettings::default().pixel_arcsec)]
+    #[arg(long, value_name = "ARCSEC", requires = "scenes", conflicts_with_all = SCENES_REFUSE, default_value_t = SceneSettings::default().pixel_arcsec)]
     pixel: f64,
     /// FWHM of the PSF of a scene, a Moffat profile (β = 3), in arcsec.
-    #[arg(long, value_name = "ARCSEC", requires = "scenes", default_value_t = SceneSettings::default().seeing_arcsec)]
+    #[arg(long, value_name = "ARCSEC", requires = "scenes", conflicts_with_all = SCENES_REFUSE, default_value_t = SceneSettings::default().seeing_arcsec)]
     seeing: f64,
     /// Ellipticity ε of the PSF of a scene [default: 0.03,-0.02].
-    #[arg(long, value_name = "E1,E2", requires = "scenes", allow_hyphen_values = true, value_parser = two_numbers)]
+    #[arg(long, value_name = "E1,E2", requires = "scenes", conflicts_with_all = SCENES_REFUSE, allow_hyphen_values = true, value_parser = two_numbers)]
     psf_shape: Option<[f64; 2]>,
     /// Galaxies per arcmin².
-    #[arg(long, value_name = "N", requires = "scenes", default_value_t = SceneSettings::default().density)]
+    #[arg(long, value_name = "N", requires = "scenes", conflicts_with_all = SCENES_REFUSE, default_value_t = SceneSettings::default().density)]
     density: f64,
     /// Least and largest S/N of galaxies, each alone [default: 3,400]. The noise of a pixel is 1.
-    #[arg(long, value_name = "FAINT,BRIGHT", requires = "scenes", value_parser = two_numbers)]
+    #[arg(long, value_name = "FAINT,BRIGHT", requires = "scenes", conflicts_with_all = SCENES_REFUSE, value_parser = two_numbers)]
     snr: Option<[f64; 2]>,
     /// Slope d log₁₀ N/dm of the number counts between them.
-    #[arg(long, value_name = "SLOPE", requires = "scenes", default_value_t = SceneSettings::default().counts_slope)]
+    #[arg(long, value_name = "SLOPE", requires = "scenes", conflicts_with_all = SCENES_REFUSE, default_value_t = SceneSettings::default().counts_slope)]
     counts_slope: f64,
     /// Stars per arcmin², of S/N 50 to 2000.
-    #[arg(long, value_name = "N", requires = "scenes", default_value_t = SceneSettings::default().star_density)]
+    #[arg(long, value_name = "N", requires = "scenes", conflicts_with_all = SCENES_REFUSE, default_value_t = SceneSettings::default().star_density)]
     stars: f64,
     /// Where galaxies are: `random`, or on a `hexagonal` lattice, without blends.
-    #[arg(long, value_name = "LAYOUT", requires = "scenes", default_value = "random", value_parser = layout())]
+    #[arg(long, value_name = "LAYOUT", requires = "scenes", conflicts_with_all = SCENES_REFUSE, default_value = "random", value_parser = layout())]
     layout: Layout,
     /// Also simulate each scene with the opposite noise, so that what is linear in the noise cancels.
-    #[arg(long, requires = "scenes")]
+    #[arg(long, requires = "scenes", conflicts_with_all = SCENES_REFUSE)]
     opposite_noise: bool,
 }
 
@@ -129,7 +128,7 @@ struct SceneArguments {
 const SETS_ONLY: [&str; 6] = ["sets", "images", "amplitude", "tilt", "fixed_psf", "shard"];
 
 // Options without a meaning for scenes.
-const NOT_OF_SCENES: [&str; 10] = [
+const SCENES_REFUSE: [&str; 10] = [
     "sets",
     "images",
     "amplitude",
