@@ -1,5 +1,10 @@
 """Catalogues in HDF5 files, as DES and DESC write them."""
 
+import re
+import shlex
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -68,3 +73,19 @@ def test_columns_of_unlike_lengths_are_refused(tmp_path):
         file["e1"], file["e2"] = np.zeros(3), np.zeros(4)
     with pytest.raises(ValueError, match="odd.h5: e2 has 4 rows and e1 3; expected one length"):
         shearq.bias(tmp_path / "odd.h5", g1=0.02, g2=0)
+
+
+def test_the_lines_that_the_shell_names_work(tmp_path, command):
+    pytest.importorskip("pyarrow", reason="needs pyarrow")
+    pytest.importorskip("pandas", reason="needs pandas")
+    write(tmp_path / "plus.h5", (0.02, 0.0))
+    said = command("bias", tmp_path / "plus.h5", "--g1", 0.02, "--g2", 0, status=1, stream="stderr")
+    of_bias, of_tables = re.findall(r"python3 -c '([^']+)'", said)
+
+    def run(line, *arguments):
+        return subprocess.run([sys.executable, "-c", line, *map(str, arguments)], capture_output=True, text=True, check=True).stdout
+
+    assert "m1" in run(of_bias, f"{tmp_path}/plus.h5:shear", 0.02, 0.0)
+    table = tmp_path / "table.parquet"
+    run(of_tables, tmp_path / "plus.h5", "shear/ns", table)
+    assert "m1" in command("bias", table, *shlex.split("--g1 0.02 --g2 0 --columns e1=wmom_g_1,e2=wmom_g_2"))

@@ -24,6 +24,10 @@ pub(crate) const GZIP_MAGIC: [u8; 2] = [0x1f, 0x8b];
 
 const PANDAS: &str = "pandas, which reads it and writes Parquet by to_parquet";
 const FEATHER: &str = "python -c 'import pandas, sys; pandas.read_feather(sys.argv[1]).to_parquet(sys.argv[2])' FILE table.parquet";
+// Groups, and those of metadetect's artificial shears, are read by the Python package. python/tests/test_hdf5.py runs both lines.
+const HDF5: &str = "python3 -c 'import shearq, sys; print(shearq.bias(sys.argv[1], g1=float(sys.argv[2]), g2=float(sys.argv[3])))' FILE:GROUP G1 G2, \
+    or for other commands python3 -c 'import h5py, pandas, sys; \
+    pandas.DataFrame({name: column[:] for name, column in h5py.File(sys.argv[1])[sys.argv[2]].items()}).to_parquet(sys.argv[3])' FILE GROUP table.parquet";
 const ASTROPY: &str = "astropy.table.Table.read, and write(\"table.parquet\")";
 const NUMPY: &str = "numpy.load, and astropy.table.Table(array).write(\"table.parquet\")";
 
@@ -36,11 +40,7 @@ const OTHERS: [(&[u8], &str, &str); 12] = [
         "an Arrow stream",
         "pyarrow.ipc.open_stream, and pyarrow.parquet.write_table",
     ),
-    (
-        b"\x89HDF\r\n\x1a\n",
-        "HDF5",
-        "pandas or astropy to write Parquet or FITS",
-    ),
+    (b"\x89HDF\r\n\x1a\n", "HDF5", HDF5),
     (b"\x93NUMPY", "NumPy's (.npy)", NUMPY),
     (b"#ASDF", "ASDF", ASTROPY),
     (b"BZh", "compressed by bzip2", "bunzip2 first"),

@@ -28,12 +28,12 @@ def _properties(psf: Any, chip: int, chips: int) -> dict[str, int]:
 def draw(path: str, chip: int, chips: int, side: int, places: str, out: BinaryIO) -> None:
     import piff
 
-    from ._psf_models import at_galaxies
+    from ._psf_models import PsfsOfModel, of_piff
 
     psf = piff.PSF.read(path)
-    x, y = np.array([line.split() for line in places.splitlines()], dtype=np.float64).T
-    drawn = at_galaxies(psf, np.empty((len(x), side, side), dtype=np.bool_), x, y, None, _properties(psf, chip, chips))
-    for first in range(0, len(x), _BLOCK):
+    at = np.array([line.split() for line in places.splitlines()], dtype=np.float64)
+    drawn = PsfsOfModel(of_piff(psf), side, at, None, _properties(psf, chip, chips))
+    for first in range(0, len(at), _BLOCK):
         out.write(np.ascontiguousarray(drawn[slice(first, first + _BLOCK)], dtype="<f4").tobytes())
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -17,7 +18,7 @@ from ._wcs import jacobians
 _Draw = Callable[[int, float, float, Any, dict[str, Any]], Any]
 
 
-def _piff(psf: Any) -> _Draw:
+def of_piff(psf: Any) -> _Draw:
     # Piff knows whether its model contains the pixel, and the WCS of the chip.
     return lambda side, x, y, _, properties: psf.draw(x=x, y=y, stamp_size=side, center=True, **properties).array
 
@@ -39,9 +40,7 @@ def _rubin(psf: Any) -> _Draw:
         from lsst.geom import Point2D  # type: ignore[import-not-found, unused-ignore]
     except ImportError:
         # Objects with the same methods outside Rubin's stack.
-        from collections import namedtuple
-
-        Point2D = namedtuple("Point2D", "x y")
+        Point2D = collections.namedtuple("Point2D", "x y")
     # Centred on a pixel, where computeImage would draw the phase of the galaxy.
     return lambda side, x, y, jacobian, properties: psf.computeKernelImage(Point2D(x, y)).array
 
@@ -77,7 +76,7 @@ def _function(psf: Callable[..., Any], pixel: PixelOfPsf | None) -> _Draw:
 def _draw_of(psf: Any, pixel: PixelOfPsf | None = None) -> _Draw | None:
     """How a model is drawn; None for anything that is no model."""
     models = {
-        ("interp_property_names", "draw"): _piff,
+        ("interp_property_names", "draw"): of_piff,
         ("getPSF", "getPSFArray"): _psfex,
         ("computeKernelImage",): _rubin,
         ("compute_kernel_image",): _rubin_images,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import math
 import os
@@ -66,13 +68,19 @@ class Result:
         _, headings, rows, _ = self._table()
         texts = {
             ".json": lambda: self.to_json() + "\n",
-            ".csv": lambda: "".join(",".join(f'"{cell}"' if "," in cell else cell for cell in row) + "\n" for row in [headings, *rows]),
+            ".csv": lambda: _csv([headings, *rows]),
             ".html": lambda: f'<!doctype html><meta charset="utf-8">{self._repr_html_()}\n',
         }
         write(path, texts)
 
     def _repr_html_(self) -> str:
         return _display.table_html(*self._table())
+
+
+def _csv(rows: list[list[str]]) -> str:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()
 
 
 def write(path: str | os.PathLike[str], texts: Mapping[str, Any]) -> None:
