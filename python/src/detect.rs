@@ -26,9 +26,10 @@ pub(crate) fn detect<'py>(
         threshold,
         ..DetectionMethod::default()
     };
-    settings
-        .validate()
-        .map_err(|error| PyValueError::new_err(error.to_string()))?;
+    settings.validate().map_err(|error| {
+        let (found, expected) = (error.found, error.expected);
+        PyValueError::new_err(format!("threshold: found {found}; expected {expected}"))
+    })?;
     let jacobian = jacobian.map(Jacobian::new).transpose();
     let jacobian = jacobian.map_err(|error| PyValueError::new_err(format!("wcs: {error}")))?;
     let detector = Detector::new(

@@ -74,9 +74,21 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         threshold: arguments.threshold,
         ..DetectionMethod::default()
     };
-    settings
-        .validate()
-        .map_err(|error| anyhow::anyhow!("--{error}"))?;
+    // Of the settings, the threshold alone is the user's.
+    settings.validate().map_err(|error| {
+        anyhow::anyhow!(
+            "--threshold is {}; expected {}",
+            error.found,
+            error.expected
+        )
+    })?;
+    anyhow::ensure!(
+        arguments
+            .noise
+            .is_none_or(|noise| noise > 0.0 && noise.is_normal()),
+        "--noise is {:?}; expected a positive number",
+        arguments.noise.unwrap_or_default()
+    );
     let bits = arguments.mask_bits.as_ref();
     let task = DetectionTask {
         exposure: files(&arguments.exposure, Content::Sky),
@@ -120,11 +132,6 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             "frame: sky (e1 > 0 along east–west, e2 > 0 along north-west)"
         ));
     }
-    anyhow::ensure!(
-        detections > 0,
-        "{}: no galaxy was detected (expected some). Try: a lower --threshold, or check --noise",
-        arguments.exposure.display()
-    );
     arguments.summary.print(|| {
         serde_json::json!({
             "catalogue": path,

@@ -586,15 +586,20 @@ pub struct DetectionMethod {
 }
 
 impl Default for DetectionMethod {
+    // From 1 to 8 scenes of 20 arcmin² with the default population of `simulate --scenes`, seed 101, in eight versions. The shear error
+    // per area is the same at a moment_sigma of 1.4, 3 % larger at 1.6 and 8 % at 1.8; 5 % smaller at a threshold of 5 than at 7, with
+    // twice the pixels; and the same at a neighbour_share of 0.15, 0.2 and 0.3, which narrow the edges of galaxies to less than a
+    // pixel or leave bright ones more pixels. The others are those of the first prototype; 0.8 to 1.2 times them, or softening from 8
+    // to 30, change the error by 3 %.
     fn default() -> Self {
         DetectionMethod {
-            threshold: 7.0,
+            threshold: 6.0,
             threshold_half_width: 2.0,
             detection_sigma: 1.2,
             neighbour_distance: 1.9,
             neighbour_half_width: 1.0,
-            neighbour_share: 0.15,
-            moment_sigma: 2.2,
+            neighbour_share: 0.2,
+            moment_sigma: 1.6,
             softening: 15.0,
         }
     }
@@ -792,6 +797,11 @@ impl Configuration {
             Method::Network(network) => network.shape.ellipticity,
             Method::Linear(_) | Method::Detection { .. } => EllipticityType::Shear,
         }
+    }
+
+    /// Whether galaxies are detected on exposures, so that responses contain that of the detection.
+    pub fn is_detection(&self) -> bool {
+        matches!(self.method, Method::Detection { .. })
     }
 
     /// What ellipticities are divided by. The network's response is not known.

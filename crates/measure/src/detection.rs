@@ -37,7 +37,8 @@ use crate::error::MeasureError;
 use crate::noise::StampNoise;
 use crate::psf::{gaussian_variance, noise_equivalent_area};
 
-// Radius of the square of pixels under the functionals, in σ of the moments' Gaussian. The tests find 10⁻⁴ of the kernels' weights beyond.
+// Radius of the square of pixels under the functionals, in σ of their Gaussians. Weights beyond it have up to 10⁻³ of the sum of all, in
+// a test with Moffat PSFs of β = 2.5 and 3 and a Kolmogorov one.
 const KERNEL_SIGMAS: f64 = 6.5;
 // Two blocks of fewer margins lose most of their pixels.
 const MIN_MARGINS_PER_BLOCK: usize = 8;
@@ -114,7 +115,9 @@ impl Detector {
             moment_sigma: settings.moment_sigma * sigma,
             distance: (settings.neighbour_distance * sigma).round().max(1.0) as usize,
         };
-        let radius = (KERNEL_SIGMAS * lengths.moment_sigma).ceil() as usize;
+        let reach = (KERNEL_SIGMAS * lengths.detection_sigma + lengths.distance as f64)
+            .max(KERNEL_SIGMAS * lengths.moment_sigma);
+        let radius = reach.ceil() as usize;
         let margin = radius + 1 + lengths.distance;
         let transform = SquareTransform::new((MIN_MARGINS_PER_BLOCK * margin).next_power_of_two());
         let functionals = Functionals::new(star.view(), noise, &lengths, pixels, radius);

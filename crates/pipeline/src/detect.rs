@@ -221,6 +221,9 @@ impl DetectionTask<'_> {
             .map_err(|error| FileError::new(&self.psf.paths[0], error))?;
         let missing = AtomicUsize::new(0);
         let found = detect_rows(threads, &detector, sides, || self.open(&missing))?;
+        if found.is_empty() {
+            return Err(exposure.origin.fault("no galaxy was detected (expected some). Try: a lower --threshold, or check --noise").into());
+        }
         let frame = jacobian.map_or(Frame::Pixel, |_| Frame::Sky);
         claim.check()?;
         let path = run.catalogue(out, id.set, id.image);

@@ -87,14 +87,19 @@ pub fn mean_shears(
             let message = format!("there is no catalogue of set {set}");
             return Err(FileError::new(out, message));
         }
-        means.push(mean_of(
+        let mut mean = mean_of(
             set,
             &catalogues,
             run.format,
             with_response,
             selection,
             pairs,
-        )?);
+        )?;
+        if run.configuration.is_detection() {
+            // What noise of the PSF's shape adds is subtracted from all, so that those of a small weight have any ellipticity.
+            mean.above_one = 0;
+        }
+        means.push(mean);
     }
     if means.is_empty() {
         return Err(FileError::new(

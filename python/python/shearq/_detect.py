@@ -19,7 +19,7 @@ def detect(
     noise: float,
     mask: ArrayLike | None = None,
     wcs: WcsLike | None = None,
-    threshold: float = 7.0,
+    threshold: float = 6.0,
     threads: int | None = None,
 ) -> Catalogue:
     """Detect the galaxies of an exposure and measure them, with the response of the detection to shear.

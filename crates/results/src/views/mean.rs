@@ -62,7 +62,10 @@ pub fn mean_table(means: &[SetMean], configuration: &Configuration, name: &str) 
                 .into(),
         );
     }
-    notes.extend(without_detection(means));
+    match configuration.is_detection() {
+        true => notes.push("The response contains that of the detection.".into()),
+        false => notes.extend(without_detection(means)),
+    }
     if means.iter().any(noticed) {
         let images = means.iter().map(|mean| mean.images.len()).sum::<usize>();
         let stated = means.iter().map(|mean| mean.noisy_stars).sum::<usize>();
