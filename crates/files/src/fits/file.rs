@@ -312,6 +312,17 @@ fn check_header(source: &mut Source, start: u64, content: Content) -> Result<boo
 }
 
 // Name in capitals and value of a card, as cfitsio parses it; `None` if they are too long for its buffers.
+// Cards up to the end of a header, and whether it is among these bytes.
+fn parse_cards(bytes: &[u8]) -> (BTreeMap<String, String>, bool) {
+    let mut cards = bytes.chunks_exact(CARD);
+    let is_end = |card: &&[u8]| card.starts_with(b"END     ");
+    let before = cards.clone().take_while(|card| !is_end(card));
+    (
+        before.filter_map(parse).collect(),
+        cards.any(|card| is_end(&card)),
+    )
+}
+
 fn parse(card: &[u8]) -> Option<(String, String)> {
     let mut text = [0 as c_char; CARD + 1];
     for (to, from) in text.iter_mut().zip(card) {
@@ -665,9 +676,26 @@ impl File {
     pub fn cards(&mut self) -> Result<BTreeMap<String, String>, FileError> {
         let [header, start, _] = self.extent()?;
         let bytes = self.source.read_at(header, (start - header) as usize)?;
-        let cards = bytes.chunks_exact(CARD);
-        let cards = cards.take_while(|card| !card.starts_with(b"END     "));
-        Ok(cards.filter_map(parse).collect())
+        Ok(parse_cards(&bytes).0)
+    }
+
+    /// The cards, and those of the primary header that an extension with INHERIT lacks, such as a WCS.
+    pub fn cards_with_inherited(&mut self) -> Result<BTreeMap<String, String>, FileError> {
+        let mut found = self.cards()?;
+        let [header, ..] = self.extent()?;
+        if found.get("INHERIT").is_none_or(|value| value != "T") {
+            return Ok(found);
+        }
+        for block in (0..header).step_by(BLOCK) {
+            let (cards, ended) = parse_cards(&self.source.read_at(block, BLOCK)?);
+            for (key, value) in cards {
+                found.entry(key).or_insert(value);
+            }
+            if ended {
+                break;
+            }
+        }
+        Ok(found)
     }
 
     /// A numeric header value; `None` if the key is absent or has no value.
