@@ -21,19 +21,30 @@ pub(crate) fn another(
     Ok(())
 }
 
+// Variance in units of the median of a stamp from which it marks a bad pixel: surveys write 10⁶ or SExtractor's 10³⁰ in place of
+// infinity. A star of 65,000 electrons in a sky of one has 6.5·10⁴.
+const MIN_BAD_RATIO: f64 = 1e5;
+
 // Maps may have any value where the pixel is missing already.
 pub(super) fn variance(
     pixels: &mut [f32],
     values: &mut [f64],
     content: Content,
 ) -> Result<(), String> {
+    let inverse = |stated: f64| match content {
+        Content::Weight => 1.0 / stated,
+        _ => stated,
+    };
+    let known = values.iter().map(|stated| inverse(*stated));
+    let mut known: Vec<f64> = known
+        .filter(|value| value.is_finite() && *value > 0.0)
+        .collect();
+    let most = MIN_BAD_RATIO * upper_median(&mut known).unwrap_or(f64::INFINITY);
     for (pixel, value) in pixels.iter_mut().zip(values) {
         let stated = *value;
-        if content == Content::Weight {
-            *value = 1.0 / stated;
-        }
-        // The weight 0, or an infinite variance, marks bad pixels in the maps of most surveys. Reading makes an infinite variance NaN.
-        if *value == f64::INFINITY || content != Content::Weight && stated.is_nan() {
+        *value = inverse(stated);
+        // The weight 0, or an infinite variance, marks bad pixels in the maps of most surveys. Reading makes infinity NaN.
+        if *value >= most || content != Content::Weight && stated.is_nan() {
             *pixel = f32::NAN;
         }
         if pixel.is_finite() && (value.is_nan() || *value <= 0.0) {
@@ -45,7 +56,11 @@ pub(super) fn variance(
                     "the variance is {stated}; expected a positive number, or infinity for a bad pixel"
                 }
             };
-            return Err(what.replace("{stated}", &stated.to_string()));
+            let shown = match stated.is_nan() {
+                true => "NaN or infinite".to_owned(),
+                false => stated.to_string(),
+            };
+            return Err(what.replace("{stated}", &shown));
         }
         if !pixel.is_finite() {
             *value = f64::NAN;
@@ -105,4 +120,33 @@ pub(crate) fn lose(pixels: &mut [f32], mask: &[f64], bits: Option<u64>) -> Resul
         }
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn finite_marks_of_bad_pixels_are_missing() {
+        for (content, good, bad) in [
+            (Content::Variance, 2.0, 1e30),
+            (Content::Variance, 2.0, 1e6),
+            (Content::Weight, 0.5, 1e-6),
+            (Content::Weight, 0.5, 0.0),
+        ] {
+            let mut pixels = [1.0; 9];
+            let mut values = [good; 9];
+            values[4] = bad;
+            // Of a bright star.
+            values[5] = if content == Content::Weight {
+                good / 6e4
+            } else {
+                good * 6e4
+            };
+            variance(&mut pixels, &mut values, content).unwrap();
+            assert!(pixels[4].is_nan() && values[4].is_nan(), "{bad}");
+            let missing = pixels.iter().filter(|pixel| pixel.is_nan()).count();
+            assert_eq!((missing, values[0]), (1, 2.0), "{bad}");
+        }
+    }
 }
