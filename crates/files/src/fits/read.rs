@@ -293,7 +293,7 @@ impl ImageReader {
 
     /// Keys and values of the header. Texts keep their quotes; of keys that repeat, the last one counts.
     pub fn cards(&mut self) -> Result<BTreeMap<String, String>, FileError> {
-        self.file.cards()
+        self.file.cards_with_inherited()
     }
 
     /// A numeric header value; `None` if absent.
@@ -451,6 +451,7 @@ struct Description {
     repeat: i64,
     /// Place of a number in the vector that each row has.
     element: i64,
+    unit: String,
 }
 
 impl Description {
@@ -484,18 +485,23 @@ pub struct TableHead {
     /// Its name, EXTNAME; empty if it has none.
     pub name: String,
     pub columns: Vec<String>,
+    /// Of each column, its TUNIT; empty if it has none.
+    pub units: Vec<String>,
 }
 
 impl TableHead {
     fn here(file: &File) -> Result<Self, FileError> {
-        let mut columns = Vec::new();
+        let (mut columns, mut units) = (Vec::new(), Vec::new());
         for number in 1..=file.columns()? {
-            columns.extend(describe_column(file, number)?.names());
+            let column = describe_column(file, number)?;
+            columns.extend(column.names());
+            units.resize(columns.len(), column.unit);
         }
         Ok(TableHead {
             number: file.number_of_extension(),
             name: file.text("EXTNAME"),
             columns,
+            units,
         })
     }
 
@@ -796,6 +802,7 @@ fn describe_column(file: &File, number: c_int) -> Result<Description, FileError>
     Ok(Description {
         number,
         name: file.text(&format!("TTYPE{number}")),
+        unit: file.text(&format!("TUNIT{number}")),
         kind,
         repeat,
         element: 0,

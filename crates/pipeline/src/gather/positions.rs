@@ -26,13 +26,15 @@ const PIXEL_NAMES: [[&str; 2]; 6] = [
 // Names of columns of identities, in any case, the best first.
 const ID_NAMES: [&str; 4] = ["id", "object_id", "source_id", "number"];
 // Names of columns of right ascension and declination in degrees, in any case.
-const SKY_NAMES: [[&str; 2]; 6] = [
+const SKY_NAMES: [[&str; 2]; 8] = [
     ["ra", "dec"],
     ["ra_deg", "dec_deg"],
     ["alpha_j2000", "delta_j2000"],
     ["alphawin_j2000", "deltawin_j2000"],
     ["alpha_sky", "delta_sky"],
     ["right_ascension", "declination"],
+    ["coord_ra", "coord_dec"],
+    ["raj2000", "dej2000"],
 ];
 // Distance in pixels below which two positions have the same galaxy: stamps are cut to half a pixel.
 const SAME_GALAXY_PX: f64 = 0.5;
@@ -107,8 +109,8 @@ impl Positions {
         let (wanted, texts) = selection(&place, reals, id.as_ref(), table.carry)?;
         let read = read_all(&place, &wanted, &texts)
             .map_err(|error| error.hint_of_columns("--columns X,Y names others"))?;
-        let of = |name: &str| table::numbers(&read, name, &place.path);
-        let (xs, ys) = (of(&x)?, of(&y)?);
+        let of = |name: &str, is_sky| place_numbers((&place, &columns), &read, name, is_sky);
+        let (xs, ys) = (of(&x, degrees)?, of(&y, degrees)?);
         let given = xs.iter().copied().zip(ys.iter().copied());
         let (all, sky) = match degrees {
             true => {
@@ -116,7 +118,7 @@ impl Positions {
                 let all = given.enumerate().map(at);
                 (
                     all.collect::<Result<Vec<_>, _>>()?,
-                    Some([xs.to_vec(), ys.to_vec()]),
+                    Some([xs.clone(), ys.clone()]),
                 )
             }
             false => {
@@ -124,7 +126,7 @@ impl Positions {
                 let shift = 1.0 - f64::from(first_pixel);
                 let all: Vec<_> = given.map(|(x, y)| (x + shift, y + shift)).collect();
                 let sky = match &sky {
-                    Some([ra, dec]) => Some([of(ra)?.to_vec(), of(dec)?.to_vec()]),
+                    Some([ra, dec]) => Some([of(ra, true)?, of(dec, true)?]),
                     None => {
                         let at = all
                             .iter()
@@ -351,7 +353,7 @@ pub(super) fn rows_of_stamps(table: Table<'_>, count: usize) -> Result<Vec<Colum
         Some(id) => Some(id.to_owned()),
         None => ID_NAMES.iter().find_map(|id| find(names, id)),
     };
-    let [pixels, sky] = [&PIXEL_NAMES, &SKY_NAMES].map(|known| pair_of(known, names));
+    let (pixels, sky) = (pair_of(&PIXEL_NAMES, names), pair_of(&SKY_NAMES, names));
     let places: Vec<(&str, &String)> = stamp_table::PLACE
         .into_iter()
         .zip([&pixels, &sky].into_iter().flat_map(|pair| match pair {
@@ -375,15 +377,15 @@ pub(super) fn rows_of_stamps(table: Table<'_>, count: usize) -> Result<Vec<Colum
             read.height()
         )));
     }
+    let of = |name: &str, is_sky| place_numbers((&place, &columns), &read, name, is_sky);
     if let Some([ra, dec]) = &sky {
-        let of = |name: &str| table::numbers(&read, name, &place.path);
-        check_degrees(&place.path, &of(ra)?, &of(dec)?)?;
+        check_degrees(&place.path, &of(ra, true)?, &of(dec, true)?)?;
     }
     let (id, carried) = id_and_carried(&place, &read, id.as_ref(), table.carry)?;
     let mut all: Vec<Column> = id.into_iter().collect();
     for (name, column) in places {
-        let values = table::numbers(&read, column, &place.path)?;
-        all.push(Column::new(name.into(), values.to_vec()));
+        let is_sky = stamp_table::PLACE[2..].contains(&name);
+        all.push(Column::new(name.into(), of(column, is_sky)?));
     }
     all.extend(carried);
     Ok(all)
@@ -551,7 +553,7 @@ fn known(
     (exposure, wcs): (&Path, &Wcs),
     degrees: bool,
 ) -> Result<[String; 2], FileError> {
-    let pairs = |known: &[[&str; 2]; 6]| -> Vec<(&Named, [String; 2])> {
+    let pairs = |known: &[[&str; 2]]| -> Vec<(&Named, [String; 2])> {
         let named = columns.named.iter();
         let found = named.filter_map(|named| Some((named, pair_of(known, &named.names)?)));
         found.collect()
@@ -644,13 +646,65 @@ fn find(names: &[String], wanted: &str) -> Option<String> {
 
 /// The names of the table that has these columns.
 fn names_in<'c>(columns: &'c Columns, place: &Place, both: [&String; 2]) -> &'c [String] {
+    let both = both.map(String::as_str);
+    table_with(columns, place, &both).map_or(&[], |named| &named.names)
+}
+
+fn table_with<'c>(columns: &'c Columns, place: &Place, all: &[&str]) -> Option<&'c Named> {
     let meant = |named: &&Named| {
         let table = named.table.as_ref().map(|head| head.number.to_string());
-        let has = both.iter().all(|name| named.names.contains(name));
+        let has = all
+            .iter()
+            .all(|name| named.names.iter().any(|own| own == name));
         has && (place.table.is_none() || columns.named.len() == 1 || place.table == table)
     };
-    let found = columns.named.iter().find(meant);
-    found.map_or(&[], |named| &named.names)
+    columns.named.iter().find(meant)
+}
+
+/// Numbers of a column of places, in degrees if they are of the sky and in pixels otherwise.
+fn place_numbers(
+    (place, columns): (&Place, &Columns),
+    read: &DataFrame,
+    name: &str,
+    is_sky: bool,
+) -> Result<Vec<f64>, FileError> {
+    let factor = unit_factor(place, columns, name, is_sky)?;
+    let values = table::numbers(read, name, &place.path)?;
+    Ok(values.iter().map(|own| own * factor).collect())
+}
+
+// Units of lengths and angles, in lower case, that are neither degrees nor pixels.
+const OTHER_UNITS: [&str; 8] = ["mm", "cm", "m", "um", "arcsec", "arcmin", "mas", "uas"];
+
+/// What makes a column degrees if it is of the sky. A column of another unit than degrees, radians, hours or pixels is refused.
+fn unit_factor(
+    place: &Place,
+    columns: &Columns,
+    name: &str,
+    is_sky: bool,
+) -> Result<f64, FileError> {
+    let head = table_with(columns, place, &[name]).and_then(|named| {
+        let at = named.names.iter().position(|own| own == name)?;
+        named.table.as_ref()?.units.get(at)
+    });
+    let stated = head.map_or("", |unit| unit.trim());
+    let unit = stated.to_ascii_lowercase();
+    let (is_angle, factor) = match unit.as_str() {
+        "rad" | "radian" | "radians" => (true, 1_f64.to_degrees()),
+        "h" | "hr" | "hour" | "hours" | "hourangle" => (true, 15.0),
+        unit => (unit.starts_with("deg"), 1.0),
+    };
+    let is_pixel = unit.starts_with("pix");
+    if OTHER_UNITS.contains(&unit.as_str()) || is_angle && !is_sky || is_pixel && is_sky {
+        let expected = if is_sky { "deg, rad or h" } else { "pixels" };
+        let message = format!("the column `{name}` has the unit {stated} (expected {expected})");
+        let hint = match is_angle {
+            true => "--degrees, for right ascension and declination",
+            false => "convert it, or --columns with others",
+        };
+        return Err(FileError::new(&place.path, message).hint(hint));
+    }
+    Ok(factor)
 }
 
 /// Whether catalogues or the table of stamps have a column of this name; FITS does not distinguish cases.
@@ -746,7 +800,50 @@ fn identities(path: &Path, column: Column) -> Result<Column, FileError> {
 
 #[cfg(test)]
 mod tests {
+    use shearq_files::fits::TableHead;
+
     use super::*;
+
+    #[test]
+    fn units_of_places_are_converted_or_refused() {
+        let factor = |unit: &str, is_sky: bool| {
+            let head = TableHead {
+                number: 2,
+                name: String::new(),
+                columns: vec!["a".into()],
+                units: vec![unit.into()],
+            };
+            let columns = Columns {
+                named: vec![Named {
+                    names: head.columns.clone(),
+                    table: Some(head),
+                    doubtful: false,
+                }],
+                ..Columns::default()
+            };
+            unit_factor(&Place::of(Path::new("t.fits")), &columns, "a", is_sky)
+        };
+        for (unit, is_sky, expected) in [
+            ("", true, 1.0),
+            ("deg", true, 1.0),
+            ("rad", true, 57.295_779_513_082_32),
+            ("h", true, 15.0),
+            ("", false, 1.0),
+            ("pixel", false, 1.0),
+        ] {
+            assert_eq!(factor(unit, is_sky).unwrap(), expected, "{unit}");
+        }
+        for (unit, is_sky) in [
+            ("arcsec", true),
+            ("pixel", true),
+            ("mm", false),
+            ("rad", false),
+        ] {
+            let error = factor(unit, is_sky).unwrap_err().to_string();
+            let expected = format!("the column `a` has the unit {unit} (expected");
+            assert!(error.contains(&expected), "{error}");
+        }
+    }
 
     fn positions(all: &[(f64, f64)]) -> Positions {
         Positions {
