@@ -1,5 +1,6 @@
 //! Which columns of a catalogue are what.
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -7,6 +8,7 @@ use shearq_bias::SHEARED_CATALOGUES;
 use shearq_files::{FileError, names_of};
 use shearq_submissions::EllipticityType;
 
+use crate::expression::Expression;
 use crate::recognition::{Patterns, Survey, fits_any, has_any, recognition, words};
 use crate::shapes::refuse_divided;
 use crate::steps::{sheared_column, sheared_name, unsheared};
@@ -234,10 +236,10 @@ impl Survey {
         self.columns.get(&key).map(String::as_str)
     }
 
-    // Whether a catalogue with the columns `found` is of this survey. Names of e1 and e2 that the user gives must be the
-    // survey's. A weight that the user gives is the survey's weight if all other columns are there and none is declined: `w=w`
-    // turned plain catalogues into catalogues of UNIONS, whose R11 and R22 are not used.
-    fn is_of(&self, found: &[String], names: &Names) -> bool {
+    // Why a catalogue with the columns `found` is not of this survey: a column that it lacks. Names of e1 and e2 that the user gives
+    // must be the survey's. A weight that the user gives is the survey's weight if all other columns are there and none is declined:
+    // `w=w` turned plain catalogues into catalogues of UNIONS, whose R11 and R22 are not used.
+    fn absent_column(&self, found: &[String], names: &Names) -> Option<&str> {
         const WEIGHT: Key = (Role::Weight, 0);
         let there = |column: &str| found.iter().any(|own| own.eq_ignore_ascii_case(column));
         let own_weight = self.of(WEIGHT);
@@ -249,14 +251,45 @@ impl Survey {
                 .any(|own| is_own_weight(own) && !there(own));
         let known = |key: &Key, column: &str| match (key, names.given.get(key)) {
             ((Role::E1 | Role::E2, 0), Some(given)) => given.eq_ignore_ascii_case(column),
-            ((Role::E1 | Role::E2, 0), None) => there(column),
+            ((Role::E1 | Role::E2, 0), None) => self.column_of(*key, found).is_some(),
             (key, _) => !is_renamed || *key == WEIGHT || there(column),
         };
         let mut columns = self.columns.iter();
+        let absent = columns.find(|(key, column)| !known(key, column));
         let mut required = self.required.iter();
-        columns.all(|(key, column)| known(key, column))
-            && required.all(|own| there(own) || is_renamed && is_own_weight(own))
+        let is_required = |own: &&String| !there(own) && !(is_renamed && is_own_weight(own));
+        let absent = absent.map(|(_, column)| column);
+        absent
+            .or_else(|| required.find(is_required))
+            .map(String::as_str)
     }
+
+    // The column of a role among `found`, or in a file of the user a formula or a sum of flags whose columns are there.
+    fn column_of(&self, key: Key, found: &[String]) -> Option<String> {
+        let stated = self.of(key)?;
+        let mut all = found.iter();
+        if let Some(own) = all.find(|own| is_called(own, stated)) {
+            return Some(own.clone());
+        }
+        let all_there = |mut columns: Vec<&str>| {
+            columns.retain(|name| !found.iter().any(|own| own == name));
+            columns.is_empty()
+        };
+        let is_list = key.0 == Role::Flag && all_there(stated.split('+').collect());
+        let is_formula = || {
+            let formula = Expression::parse(stated);
+            formula
+                .is_ok_and(|own| !own.operands().is_empty() && all_there(own.columns().collect()))
+        };
+        let computes = self.file.is_some() && (is_list || is_formula());
+        computes.then(|| stated.to_owned())
+    }
+}
+
+// Whether a column has a name in any case, or is a component of a vector of this name.
+fn is_called(own: &str, name: &str) -> bool {
+    own.eq_ignore_ascii_case(name)
+        || in_vector(name).is_some_and(|name| own.eq_ignore_ascii_case(&name))
 }
 
 // Whether rows count that have 1 in a column of this name, rather than 0; `None` for a column that makes no choice.
@@ -384,6 +417,56 @@ impl Names {
     /// Adds surveys, which are preferred to the known ones.
     pub fn add_presets(&mut self, surveys: Vec<Survey>) {
         self.presets.extend(surveys);
+    }
+
+    /// The same with the columns and formulas of the survey of the user's files that a table with the columns `found` belongs to.
+    ///
+    /// # Errors
+    /// If the table lacks one of them: roles that were dropped without a word gave m = −0.175.
+    pub fn of_table(&self, path: &Path, found: &[String]) -> Result<Cow<'_, Self>, FileError> {
+        let mut presets = self.presets.iter();
+        let Some(survey) = presets.find(|own| own.absent_column(found, self).is_none()) else {
+            return Ok(Cow::Borrowed(self));
+        };
+        let mut all = self.clone();
+        for (key, stated) in &survey.columns {
+            let column = match stated.as_str() {
+                none @ "none" => Some(none.to_owned()),
+                _ => survey.column_of(*key, found),
+            };
+            match (all.given.contains_key(key), column) {
+                (true, _) => {}
+                (false, Some(column)) => _ = all.given.insert(*key, column),
+                (false, None) => {
+                    let file = survey.file.as_deref().unwrap_or(Path::new("--preset"));
+                    let (role, names) = (name_of(*key), names_of(found));
+                    return Err(FileError::new(
+                        path,
+                        format!(
+                            "there is no column `{stated}`, which {} states as {role} of `{}` (found {names}). Try: --columns {role}=NAME, or {role}=none",
+                            file.display(),
+                            survey.name
+                        ),
+                    ));
+                }
+            }
+        }
+        Ok(Cow::Owned(all))
+    }
+
+    // Surveys of the user's files that a table does not belong to, if it belongs to none of them.
+    fn unfit_presets(&self, found: &[String]) -> Vec<String> {
+        let absent = |own: &Survey| {
+            let column = own.absent_column(found, self)?;
+            let file = own.file.as_deref().unwrap_or(Path::new("--preset"));
+            Some(format!(
+                "Not of the survey `{}` of {}, because there is no column `{column}`.",
+                own.name,
+                file.display()
+            ))
+        };
+        let lines = self.presets.iter().map(absent);
+        lines.collect::<Option<_>>().unwrap_or_default()
     }
 
     /// The columns and formulas that were given.
@@ -524,6 +607,8 @@ pub struct Columns {
     pub steps: Vec<String>,
     /// A column without a role that states the artificial shear of sheared catalogues.
     pub step_size: Option<String>,
+    /// Why the surveys of the user's files are not used, a sentence each.
+    pub unfit_presets: Vec<String>,
 }
 
 impl Columns {
@@ -534,19 +619,13 @@ impl Columns {
         names: &Names,
         is_own: bool,
     ) -> Result<Self, FileError> {
+        let names = &*names.of_table(path, found)?;
         names.check_single_roles(path)?;
         let mut surveys = names.presets.iter().chain(&recognition().surveys);
-        let survey = surveys.find(|survey| survey.is_of(found, names));
+        let survey = surveys.find(|survey| survey.absent_column(found, names).is_none());
         // A column called g1 that is given as e1 is not the true shear, too.
         let free = |name: &str| {
-            let vector = in_vector(name);
-            let is_named = |own: &&String| {
-                own.eq_ignore_ascii_case(name)
-                    || vector
-                        .as_ref()
-                        .is_some_and(|name| own.eq_ignore_ascii_case(name))
-            };
-            let mut all = found.iter().filter(is_named);
+            let mut all = found.iter().filter(|own| is_called(own, name));
             all.find(|own| names.key_of(own).is_none())
         };
         let mut columns = BTreeMap::new();
@@ -622,6 +701,7 @@ impl Columns {
             choices: Vec::new(),
             steps: Vec::new(),
             step_size: None,
+            unfit_presets: names.unfit_presets(found),
         };
         if preset == Preset::Metacal && !names.is_given(Role::E1) {
             columns.take_unsheared(found);
@@ -1313,6 +1393,37 @@ mod tests {
             (found.program(), found.of(Role::Weight)),
             ("Own", Some("wl"))
         );
+    }
+
+    #[test]
+    fn columns_of_the_users_surveys_are_formulas_or_refused() {
+        let text = "[[survey]]\nname = \"Own\"\n[survey.columns]\ne1 = \"a/p\"\ne2 = \"b\"\nw = \"wl\"\nflag = \"u+v\"\n";
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("own.toml");
+        std::fs::write(&path, text).unwrap();
+        let mut names = Names::default();
+        names.add_presets(crate::recognition::read_presets(&path).unwrap());
+        let stated = |columns: &str| {
+            let columns: Vec<String> = columns.split(' ').map(str::to_owned).collect();
+            let own = names.of_table(Path::new("c"), &columns);
+            own.map_err(|error| error.to_string()).map(|own| {
+                let own = own.columns().map(|(_, column)| column.to_owned());
+                own.collect::<Vec<_>>()
+            })
+        };
+        assert_eq!(stated("a b p WL u v").unwrap(), ["a/p", "b", "WL", "u+v"]);
+        let absent = stated("a b p u v").unwrap_err();
+        assert!(
+            absent.contains("there is no column `wl`, which "),
+            "{absent}"
+        );
+        assert!(absent.contains("own.toml states as w of `Own`"), "{absent}");
+        assert!(stated("a b p wl u").unwrap_err().contains("`u+v`"));
+        // Without e1 or e2, the table is of no survey of the file.
+        assert!(stated("e1 e2 wl").unwrap().is_empty());
+        let columns = ["e1", "e2", "wl"].map(str::to_owned);
+        let found = Columns::find(Path::new("c"), &columns, &names, false).unwrap();
+        assert!(found.unfit_presets[0].ends_with("because there is no column `a/p`."));
     }
 
     #[test]

@@ -1,7 +1,7 @@
 //! What is known of names of columns: roles, surveys and patterns, in `catalogues.toml` and in files of the user.
 
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::LazyLock;
 
 use serde::Deserialize;
@@ -76,9 +76,13 @@ pub struct Survey {
     /// Columns that a catalogue must have in addition to e1 and e2.
     #[serde(default)]
     pub required: Vec<String>,
-    /// The columns by role; `none` for a role that has no column although a general name is there.
+    /// The columns by role; `none` for a role that has no column although a general name is there. Those of a file of the user may
+    /// be formulas.
     #[serde(deserialize_with = "columns_by_role")]
     pub columns: BTreeMap<Key, String>,
+    /// The file of the user that describes it.
+    #[serde(skip)]
+    pub file: Option<PathBuf>,
 }
 
 // A file of --preset.
@@ -134,8 +138,11 @@ pub fn recognition() -> &'static Recognition {
 pub fn read_presets(path: &Path) -> Result<Vec<Survey>, FileError> {
     let text = open::read_to_string(path, open::SETTINGS)
         .map_err(FileError::doing(path, "cannot read the surveys"))?;
-    let presets: Presets = toml::from_str(&text)
+    let mut presets: Presets = toml::from_str(&text)
         .map_err(|error| FileError::new(path, error.to_string().trim_end()))?;
+    for survey in &mut presets.survey {
+        survey.file = Some(path.to_owned());
+    }
     Ok(presets.survey)
 }
 

@@ -174,6 +174,7 @@ impl Source {
         let responsivity = self.shapes == Shapes::Responsivity;
         let used = self.columns.used(|role| self.reads(reading, role));
         let mut lines = vec![format!("Used: {used}.")];
+        lines.extend(self.columns.unfit_presets.iter().cloned());
         lines.extend(self.columns.unused(&self.read(reading)));
         lines.extend(self.response_of_sheared(reading.request.step));
         let mut sheared = Vec::new();
@@ -665,7 +666,7 @@ fn source(
     reading: &Reading<'_>,
 ) -> Result<Source, FileError> {
     let path = &place.path;
-    let given = &reading.request.names;
+    let given = &*reading.request.names.of_table(path, names)?;
     let (names, formulas) = with_formulas(path, names, given)?;
     let names = names.as_slice();
     let mut columns = columns_of(&place, sheared, (names, frame), given)?;
@@ -860,6 +861,7 @@ fn with_formulas(
     names: &[String],
     given: &Names,
 ) -> Result<(Vec<String>, Vec<Expression>), FileError> {
+    let given = given.of_table(path, names)?;
     let there = |name: &str| name == "none" || names.iter().any(|own| own == name);
     let is_list = |role: Role, text: &str| role == Role::Flag && text.split('+').all(there);
     let mut found: Vec<Expression> = Vec::new();
