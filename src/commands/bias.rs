@@ -11,12 +11,13 @@ use shearq_bias::Design;
 
 use crate::arguments::{Printing, ReportFile, listed, named, positive};
 use crate::{Findings, made_by, tell};
-use shearq_catalogue::columns::{Names, Shapes, role_names};
+use shearq_catalogue::columns::{Names, Shapes};
 use shearq_catalogue::expression::Expression;
 use shearq_catalogue::recognition::read_presets;
 use shearq_catalogue::request::{
     Binning, DEFAULT_STEP, Edges, MAX_AXES, MAX_BINS, Request, Survey, Units,
 };
+use shearq_catalogue::roles::role_names;
 use shearq_catalogue::select::selection;
 use shearq_catalogue::truth::{TrueSign, Truth, expand};
 use shearq_dataset::images::Shard;

@@ -5,7 +5,8 @@ use clap::Args;
 use crate::arguments::{SummaryArguments, Unsheared};
 
 use crate::tell;
-use shearq_catalogue::select::{smooth_selection, write_selected};
+use shearq_catalogue::select::smooth_selection;
+use shearq_catalogue::selected::write_selected;
 use shearq_dataset::run::Run;
 
 /// Write catalogues with cuts and weights that keep the shear calibrated.

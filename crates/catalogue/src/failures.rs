@@ -10,6 +10,15 @@ use shearq_quantities::hash::NumberMap;
 
 use crate::identity::hash;
 
+/// A number as messages show it.
+pub fn shown(value: f64) -> String {
+    match value.abs() >= 1e7 {
+        // Thirty digits would hide the message.
+        true => format!("{value:e}"),
+        false => value.to_string(),
+    }
+}
+
 /// The columns of a part of a table, by place.
 pub type Part<'p> = [Cow<'p, [f64]>];
 

@@ -15,6 +15,7 @@ use shearq_files::atomic::folder_of;
 use shearq_files::table::Place;
 
 use crate::columns::{Names, Shapes};
+use crate::failures::shown;
 use crate::galaxies::{Galaxies, Galaxy};
 use crate::recognition::Survey;
 use crate::request::{Placed, Request};
@@ -296,14 +297,6 @@ pub fn fault_of_rows(counts: &RowCounts, grid: &Grid, advice: &str) -> Option<St
             grid.stamp.0, grid.n
         ),
     })
-}
-
-pub fn shown(value: f64) -> String {
-    match value.abs() >= 1e7 {
-        // Thirty digits would hide the message.
-        true => format!("{value:e}"),
-        false => value.to_string(),
-    }
 }
 
 #[cfg(test)]

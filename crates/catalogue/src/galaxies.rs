@@ -11,8 +11,10 @@ use shearq_quantities::linear::solve;
 use shearq_quantities::statistics::RunningMean;
 use shearq_scoring::{FieldSum, Row};
 
-use crate::columns::{CATALOGUES, Columns, Role, Shapes};
-use crate::request::{Input, Request};
+use crate::columns::{Columns, Shapes};
+use crate::input::Input;
+use crate::request::Request;
+use crate::roles::{CATALOGUES, Role};
 use crate::rows::{SummedRow, placed_rows};
 use crate::source::{Reading, Source, difference, sources};
 use crate::truth::Truth;

@@ -8,8 +8,8 @@ use serde::Deserialize;
 use shearq_files::{FileError, open};
 use shearq_submissions::EllipticityType;
 
-use crate::columns::{CATALOGUES, Key, named, role_names};
 use crate::expression::fits;
+use crate::roles::{CATALOGUES, Key, Role, name_of, named, role_names};
 
 /// The content of `catalogues.toml`.
 #[derive(Debug, Deserialize)]
@@ -131,6 +131,12 @@ pub fn recognition() -> &'static Recognition {
     &KNOWN
 }
 
+/// The names of columns of a role, the preferred one first.
+pub fn names_of_role(role: Role) -> impl Iterator<Item = &'static str> {
+    let names = recognition().names.get(&name_of((role, 0)));
+    names.into_iter().flatten().map(String::as_str)
+}
+
 /// The surveys that a file describes as `[[survey]]` of `catalogues.toml` does.
 ///
 /// # Errors
@@ -181,7 +187,6 @@ pub fn fits_any(patterns: &[String], name: &str) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::columns::{Role, role_names};
 
     #[test]
     fn each_role_and_no_other_has_names() {

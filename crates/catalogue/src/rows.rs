@@ -14,15 +14,16 @@ use shearq_quantities::{Distortion, MeasuredRange};
 
 use crate::expression::{Expression, operand_values, texts_of};
 use crate::failures::{
-    Check, Copies, LargestResponse, MIN_FAILED_WEIGHT, RepeatKind, Repeats, TrueShears,
+    Check, Copies, LargestResponse, MIN_FAILED_WEIGHT, RepeatKind, Repeats, TrueShears, shown,
 };
-use crate::foreign::shown;
 use crate::shapes::MeasuredShapes;
 use crate::star_noise;
 
-use crate::columns::{CATALOGUES, RESPONSES, Role, Shapes, counted_value, sheared_pair};
+use crate::columns::{Shapes, counted_value};
 use crate::identity;
-use crate::request::{Input, MAX_AXES, Placed};
+use crate::input::Input;
+use crate::request::{MAX_AXES, Placed};
+use crate::roles::{CATALOGUES, RESPONSES, Role, sheared_pair};
 use crate::source::{Reading, Source};
 use crate::steps::catalogue_named;
 use crate::truth::{OfRows, check};

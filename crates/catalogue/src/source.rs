@@ -12,12 +12,14 @@ use shearq_files::{FileError, names_of};
 use shearq_measure::{Observables, Selection};
 
 use crate::expression::{Expression, Operand, operand_values};
+use crate::own_columns::{SHAPE_COLUMNS, changes_with_shear, require_responses};
 use crate::recognition::{fits_any, recognition, words};
-use crate::shapes::{SHAPE_COLUMNS, changes_with_shear, require_responses};
 
-use crate::columns::{CATALOGUES, Columns, Names, Places, Preset, Role, Shapes, base};
+use crate::columns::{Columns, Names, Preset, Shapes, base};
 use crate::identity;
-use crate::request::{Input, Request, Units};
+use crate::input::Input;
+use crate::request::{Request, Units};
+use crate::roles::{CATALOGUES, Places, Role};
 use crate::steps::{catalogue_named, sheared_column, sheared_name, unsheared};
 use crate::truth::Truth;
 

@@ -1,14 +1,10 @@
 //! Names of sheared catalogues (noshear, 1p, 1m, 2p, 2m) in names of columns, tables and files, and in texts of rows.
 
-use std::collections::{BTreeMap, BTreeSet};
-use std::path::Path;
-
-use crate::columns::{CATALOGUES, Names, Role};
 use crate::recognition::{recognition, words};
-use crate::request::Input;
-use crate::truth::Truth;
+use crate::roles::CATALOGUES;
 
-fn step_of(words: &str) -> Option<usize> {
+/// The catalogue that these words name, 0 for that without shear.
+pub fn step_of(words: &str) -> Option<usize> {
     let known = &recognition().steps;
     (0..CATALOGUES).find(|catalogue| known[*catalogue].iter().any(|own| own == words))
 }
@@ -73,82 +69,6 @@ pub fn sheared_column<'f>(found: &'f [String], name: &str, catalogue: usize) -> 
     own.or_else(|| found.iter().find(is_own))
 }
 
-// The sheared catalogue that the name of a file or of its folders states, and the path without it. Short words such as `m1` and
-// `00` are also those of other things.
-fn sheared_path(path: &Path) -> Option<(usize, String)> {
-    let words = words(&path.to_string_lossy());
-    let all: Vec<&str> = words.trim_matches('_').split('_').collect();
-    let is_clear = |word: &str| word.len() > 2 || word.starts_with(['1', '2']);
-    let steps = all
-        .iter()
-        .map(|word| step_of(word).filter(|_| is_clear(word)));
-    let mut found = steps.enumerate().filter_map(|(at, step)| Some((at, step?)));
-    let (at, step) = found.next_back()?;
-    Some((step, [&all[..at], &[""], &all[at + 1..]].concat().join("_")))
-}
-
-/// The catalogues of a list, in which files such as `a_noshear.fits`, `a_1p.fits` and `a_1m.fits` are one catalogue: their mean
-/// shears are not those of galaxies. Files with different true shears stay apart, and all if `names` declines sheared catalogues.
-pub fn with_sheared_files(catalogues: Vec<Input>, truth: &Truth, names: &Names) -> Vec<Input> {
-    if names.is_given(Role::ShearedCatalogue) {
-        return catalogues;
-    }
-    let of_file = |input: &Input| match input.frame.is_none() && input.parts.is_empty() {
-        true => sheared_path(&input.name),
-        false => None,
-    };
-    let shear = |input: &Input| match truth {
-        Truth::Catalogues(_) => match truth.of_paths([input.name.as_path()]) {
-            Ok(Truth::Catalogues(own)) => own.into_values().next(),
-            _ => None,
-        },
-        _ => None,
-    };
-    let mut groups: BTreeMap<String, BTreeMap<usize, &Input>> = BTreeMap::new();
-    let mut repeated = BTreeSet::new();
-    for input in &catalogues {
-        if let Some((step, rest)) = of_file(input)
-            && groups
-                .entry(rest.clone())
-                .or_default()
-                .insert(step, input)
-                .is_some()
-        {
-            repeated.insert(rest);
-        }
-    }
-    // A file without artificial shear and others, or all others: `1p` and `1m` are also names of test shears.
-    let known = !matches!(truth, Truth::Columns);
-    groups.retain(|rest, files| {
-        if repeated.contains(rest) {
-            return false;
-        }
-        let mut shears = files.values().filter_map(|input| shear(input));
-        let first = shears.next();
-        let one_shear = shears.all(|own| Some(own) == first);
-        one_shear
-            && files.len() > 1
-            && (files.contains_key(&0) || known && files.len() == CATALOGUES - 1)
-    });
-    let joined = |input: &Input| -> Option<Input> {
-        let Some(files) = of_file(input).and_then(|(_, rest)| groups.get(&rest)) else {
-            return Some(input.clone());
-        };
-        let parts = files
-            .iter()
-            .map(|(step, own)| (own.name.clone(), Some(*step)));
-        let first = files
-            .values()
-            .next()
-            .is_some_and(|first| first.name == input.name);
-        first.then(|| Input {
-            parts: parts.collect(),
-            ..input.clone()
-        })
-    };
-    catalogues.iter().filter_map(joined).collect()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -176,58 +96,6 @@ mod tests {
             assert!(sheared_column(&found, e2, 1).is_none(), "{plus}");
             assert!((2..CATALOGUES).all(|k| sheared_column(&found, e1, k).is_none()));
         }
-    }
-
-    #[test]
-    fn files_of_sheared_catalogues_are_one_catalogue() {
-        let joined = |names: &[&str], truth: &Truth| -> Vec<(String, Vec<Option<usize>>)> {
-            let inputs = names
-                .iter()
-                .map(|name| Input::from(Path::new(name).to_path_buf()));
-            let names = Names::default();
-            let found = with_sheared_files(inputs.collect(), truth, &names).into_iter();
-            let steps = |input: Input| input.parts.into_iter().map(|(_, step)| step).collect();
-            found
-                .map(|input| (input.name.display().to_string(), steps(input)))
-                .collect()
-        };
-        let all = [
-            "a_noshear.csv",
-            "a_1p.csv",
-            "a_1m.csv",
-            "b.csv",
-            "a_2m.csv",
-            "a_2p.csv",
-        ];
-        let found = joined(&all, &Truth::Columns);
-        let steps: Vec<Option<usize>> = (0..CATALOGUES).map(Some).collect();
-        assert_eq!(
-            found,
-            [
-                ("a_noshear.csv".into(), steps.clone()),
-                ("b.csv".into(), vec![])
-            ]
-        );
-        let folders = [
-            "x/1p/a.fits",
-            "x/noshear/a.fits",
-            "x/1m/a.fits",
-            "x/2p/a.fits",
-            "x/2m/a.fits",
-        ];
-        assert_eq!(
-            joined(&folders, &Truth::Columns),
-            [("x/noshear/a.fits".into(), steps)]
-        );
-        // Catalogues of test shears.
-        let four = ["1p.csv", "1m.csv", "2p.csv", "2m.csv"];
-        assert_eq!(joined(&four, &Truth::Columns).len(), 4);
-        assert_eq!(joined(&four, &Truth::Constant([0.02, 0.0])).len(), 1);
-        assert_eq!(joined(&["g_1p.csv", "g_1m.csv"], &Truth::Columns).len(), 2);
-        let truth = [("s_noshear.csv", 0.0), ("s_1p.csv", 0.02)]
-            .map(|(name, g)| (name.to_owned(), [g, 0.0]));
-        let truth = Truth::Catalogues(truth.into_iter().collect());
-        assert_eq!(joined(&["s_noshear.csv", "s_1p.csv"], &truth).len(), 2);
     }
 
     #[test]

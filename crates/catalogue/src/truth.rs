@@ -13,10 +13,10 @@ use shearq_files::table::{self, MAX_ROWS, Place, TRUTH_COLUMNS};
 use shearq_files::{FileError, names_of};
 use shearq_scoring::{Row, TruthSign};
 
-use crate::columns::Places;
-use crate::columns::{Role, names_of_role};
 use crate::identity;
-use crate::request::Input;
+use crate::input::Input;
+use crate::recognition::names_of_role;
+use crate::roles::{Places, Role};
 
 #[derive(Debug, Clone, Default)]
 pub enum Truth {

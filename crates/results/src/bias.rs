@@ -15,11 +15,13 @@ use serde::{Deserialize, Serialize};
 use shearq_bias::{
     BiasError, Catalogue, Design, Estimate, Grouping, Layout, Range, UnitSums, difference, group,
 };
-use shearq_catalogue::columns::{CATALOGUES, Role, Shapes};
-use shearq_catalogue::request::{Input, Request, Units};
+use shearq_catalogue::columns::Shapes;
+use shearq_catalogue::input::Input;
+use shearq_catalogue::request::{Request, Units};
+use shearq_catalogue::roles::{CATALOGUES, Role};
 use shearq_catalogue::rows::{distinct, rows};
+use shearq_catalogue::sheared_files::with_sheared_files;
 use shearq_catalogue::source::{Reading, Source, difference as different_columns, sources};
-use shearq_catalogue::steps::with_sheared_files;
 use shearq_catalogue::truth::{TrueSign, Truth};
 use shearq_dataset::fingerprint::{GALAXIES, verify_source};
 use shearq_dataset::metadata::{CATALOGUE_FRAME, CommonAxes, axes_of};

@@ -19,9 +19,8 @@ use shearq_quantities::linear::solve;
 use shearq_quantities::statistics::RunningMean;
 use shearq_submissions::Calibration;
 
-use shearq_catalogue::shapes::{
-    MeasuredShapes, WEIGHT, applied_weights, is_measured, undivided_columns,
-};
+use shearq_catalogue::own_columns::{WEIGHT, is_measured};
+use shearq_catalogue::shapes::{MeasuredShapes, applied_weights, undivided_columns};
 
 /// The mean responses R11 and R22 of the good galaxies of all `catalogues` of a set; 1 of catalogues whose ellipticities are
 /// not to be divided: of networks, of other programs, and of earlier versions, which divided each image by its own response.

@@ -7,9 +7,10 @@
 
 use std::collections::BTreeMap;
 
-use shearq_catalogue::columns::{Columns, Role};
+use shearq_catalogue::columns::Columns;
 use shearq_catalogue::expression::{Operand, operand_values, texts_of};
 use shearq_catalogue::request::{MAX_AXES, MAX_BINS, Request, Survey};
+use shearq_catalogue::roles::Role;
 use shearq_files::FileError;
 use shearq_files::frames::polars::DataFrame;
 use shearq_files::table::{self, Place};

@@ -10,7 +10,7 @@ use shearq_render::html::{Block, Picture, Section};
 use shearq_render::table::{Cell, Heading, Table};
 
 use crate::bias::{BiasResult, BinResult, share_images};
-use shearq_catalogue::foreign::shown;
+use shearq_catalogue::failures::shown;
 
 // Units above which Student's t differs from a normal distribution by less than 5 %.
 const MANY_UNITS: usize = 30;

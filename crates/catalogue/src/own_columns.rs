@@ -1,0 +1,66 @@
+//! Names of columns of catalogues by shearq.
+
+use std::path::Path;
+
+use shearq_files::FileError;
+use shearq_measure::{Observables, ShearedCatalogues};
+
+/// The columns of shapes. A selection also reads those of [`Observables`].
+pub const SHAPE_COLUMNS: [&str; 7] = ["e1", "e2", "flags", "R11", "R22", "R12", "R21"];
+
+/// The column with the weights of a selection that was applied, in catalogues of `select`.
+pub const WEIGHT: &str = "selection";
+
+/// Whether shear changes a column.
+pub fn changes_with_shear(name: &str) -> bool {
+    let of_shape = SHAPE_COLUMNS.contains(&name) && name != "flags";
+    of_shape
+        || Observables::COLUMNS.contains(&name)
+        || ["snr", "neighbour", "radius"].contains(&name)
+}
+
+/// Whether a column was measured on the stamps.
+pub fn is_measured(name: &str) -> bool {
+    const OTHERS: [&str; 8] = [
+        "flags",
+        "iterations",
+        "stop",
+        "updated",
+        "first_energy",
+        "energy",
+        "noise",
+        WEIGHT,
+    ];
+    changes_with_shear(name)
+        || OTHERS.contains(&name)
+        || ShearedCatalogues::columns().any(|column| column == name)
+}
+
+/// Refuses catalogues of earlier versions, whose ellipticities were divided by `divisor1` and `divisor2`: Σ e / Σ R would be
+/// too large by 1/R.
+pub fn refuse_divided(path: &Path, names: &[String]) -> Result<(), FileError> {
+    if names.iter().any(|name| name == "divisor1") {
+        let message = "an earlier version of shearq measured this catalogue and divided e1 and e2 by their mean response (found the column `divisor1`; expected ellipticities before the division). Try: shearq measure, or multiply e1 by divisor1 and e2 by divisor2 and remove these columns";
+        return Err(FileError::new(path, message));
+    }
+    Ok(())
+}
+
+/// Checks that a catalogue with columns of these names has what a selection requires, and no selection yet.
+pub fn require_responses(path: &Path, names: &[String]) -> Result<(), FileError> {
+    refuse_divided(path, names)?;
+    let has = |name: &str| names.iter().any(|own| own == name);
+    if has(WEIGHT) {
+        return Err(FileError::new(
+            path,
+            "this catalogue has a selection already. Try: the catalogue that it was selected from",
+        ));
+    }
+    if has(Observables::COLUMNS[2]) {
+        return Ok(());
+    }
+    Err(FileError::new(
+        path,
+        "the catalogue has no responses of flux and size, so a selection cannot be corrected (expected a catalogue of a linear configuration such as 48/linear/star)",
+    ))
+}
