@@ -1,7 +1,6 @@
 //! Numbers and rows that stand for failed measurements: sentinels, values, rows and identifiers that repeat, responses that
 //! outweigh all others, and measured shears in the place of true ones. They are found wherever rows are averaged.
 
-use std::borrow::Cow;
 use std::collections::{HashMap, HashSet};
 
 use shearq_bias::{Dominant, Repeated, Row};
@@ -20,7 +19,7 @@ pub fn shown(value: f64) -> String {
 }
 
 /// The columns of a part of a table, by place.
-pub type Part<'p> = [Cow<'p, [f64]>];
+pub type Part<'p> = [&'p [f64]];
 
 /// Inverse variances in any unit are smaller; programs write 1e20, 1e30 or the largest float for a failure.
 pub const MIN_FAILED_WEIGHT: f64 = 1e20;
@@ -490,7 +489,7 @@ mod tests {
                 (uniform * scale).round() / scale
             };
             let columns = [0, 1].map(|k| (0..20_000).map(|row| value(row, k)).collect::<Vec<_>>());
-            let part = columns.map(Cow::Owned);
+            let part = columns.each_ref().map(Vec::as_slice);
             found.look_for(&part, [0, 1], None);
             for (e1, e2) in part[0].iter().zip(part[1].iter()) {
                 let key = [e1, e2]

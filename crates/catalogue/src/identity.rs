@@ -11,6 +11,9 @@ use shearq_files::table;
 // Integers that floats do not contain have other bits than the float with the same ones.
 const INTEGER: u64 = 0x5bd1_e995_9d1b_58d3;
 
+// Floats contain all integers up to this one, so that the slow comparison of 128 bits is needed for larger ones only.
+const EXACT: u64 = 1 << 53;
+
 /// Keys of the identifiers in a column: equal for equal numbers of any type, and for a text that is such a number.
 pub fn keys(frame: &DataFrame, name: &str, path: &Path) -> Result<Vec<u64>, FileError> {
     let column = frame.column(name).ok();
@@ -33,12 +36,18 @@ pub fn keys(frame: &DataFrame, name: &str, path: &Path) -> Result<Vec<u64>, File
         return Ok(texts.iter().map(key).collect());
     }
     if let Some(integers) = series.and_then(|own| own.i64().ok()) {
-        let key = |own: Option<i64>| own.map_or(0, |own| of_integer(own.into()));
-        return Ok(integers.iter().map(key).collect());
+        let key = |own: i64| match own.unsigned_abs() <= EXACT {
+            true => hash((own as f64).to_bits()),
+            false => of_integer(own.into()),
+        };
+        return Ok(integers.iter().map(|own| own.map_or(0, key)).collect());
     }
     if let Some(integers) = series.and_then(|own| own.u64().ok()) {
-        let key = |own: Option<u64>| own.map_or(0, |own| of_integer(own.into()));
-        return Ok(integers.iter().map(key).collect());
+        let key = |own: u64| match own <= EXACT {
+            true => hash((own as f64).to_bits()),
+            false => of_integer(own.into()),
+        };
+        return Ok(integers.iter().map(|own| own.map_or(0, key)).collect());
     }
     let numbers = table::numbers(frame, name, path)?;
     missing(numbers.iter().filter(|own| own.is_nan()).count())?;

@@ -134,7 +134,9 @@ pub fn placed_rows(
     for source in sources {
         let (mut first, mut checks) = (0, None::<Vec<Check>>);
         source.parts(reading, |frame| {
-            let part = TableRows::new(source, reading, &frame, path)?;
+            let columns = columns_of(source, reading, &frame)?;
+            let columns: Vec<&[f64]> = columns.iter().map(AsRef::as_ref).collect();
+            let part = TableRows::new(source, reading, (&frame, &columns), path)?;
             // Ranges follow from the first part, so that a file is judged in the same way however it is split.
             let checks = checks.get_or_insert_with(|| part.checks());
             found.look_for(&part);
@@ -217,9 +219,15 @@ struct TableRows<'a> {
     source: &'a Source,
     reading: &'a Reading<'a>,
     rows: usize,
-    columns: Vec<Cow<'a, [f64]>>,
+    columns: &'a [&'a [f64]],
     weighted: Option<MeasuredShapes>,
     e: [usize; 2],
+    // Columns of roles, if they are there.
+    ksb: Option<[usize; 2]>,
+    dw: Option<[usize; 2]>,
+    psf: Option<[usize; 2]>,
+    psf_size: Option<usize>,
+    places: Option<[usize; 2]>,
     // Whose numbers tell rows apart.
     compared: Vec<usize>,
     // Of each sheared catalogue, if its distortions are converted.
@@ -248,28 +256,37 @@ fn has_weight(weight: f64) -> bool {
     weight.is_nan() || weight > 0.0
 }
 
+// The numbers of each wanted column; none of texts.
+fn columns_of<'f>(
+    source: &Source,
+    reading: &Reading<'_>,
+    frame: &'f DataFrame,
+) -> Result<Vec<Cow<'f, [f64]>>, FileError> {
+    let doubtful = source.places.all((Role::DoubtfulWeight, 0));
+    let mut columns = Vec::new();
+    for (place, wanted) in source.wanted.iter().enumerate() {
+        let is_text = wanted.pattern.is_none() && source.is_text(reading, &wanted.column);
+        columns.push(match doubtful.contains(&place) {
+            // Texts are no weights: `WEIGHT_IMAGE` may have names of files.
+            true if texts_of(frame, &wanted.column).is_some() => {
+                Cow::Owned(vec![1.0; frame.height()])
+            }
+            false if is_text => Cow::Borrowed(&[][..]),
+            _ => operand_values(frame, wanted, &source.place.path)?,
+        });
+    }
+    Ok(columns)
+}
+
 impl<'a> TableRows<'a> {
     fn new(
         source: &'a Source,
         reading: &'a Reading<'a>,
-        frame: &'a DataFrame,
+        (frame, columns): (&'a DataFrame, &'a [&'a [f64]]),
         file: &Path,
     ) -> Result<Self, FileError> {
         let (path, places) = (&source.place.path, &source.places);
         let truth = OfRows::new(file, places, &reading.truth)?;
-        let mut columns = Vec::new();
-        let doubtful = places.all((Role::DoubtfulWeight, 0));
-        for (place, wanted) in source.wanted.iter().enumerate() {
-            let is_text = wanted.pattern.is_none() && source.is_text(reading, &wanted.column);
-            columns.push(match doubtful.contains(&place) {
-                // Texts are no weights: `WEIGHT_IMAGE` may have names of files.
-                true if texts_of(frame, &wanted.column).is_some() => {
-                    Cow::Owned(vec![1.0; frame.height()])
-                }
-                false if is_text => Cow::Borrowed(&[][..]),
-                _ => operand_values(frame, wanted, path)?,
-            });
-        }
         refuse_boolean_flags(frame, source, reading)?;
         let keys = |name: &str| identity::keys(frame, name, path);
         let sheared_of_rows = source.columns.of(Role::ShearedCatalogue);
@@ -285,6 +302,11 @@ impl<'a> TableRows<'a> {
             rows: frame.height(),
             columns,
             e: places.pair(E_ROLES).unwrap_or_default(),
+            ksb: places.pair(KSB_ROLES),
+            dw: places.pair(WEIGHT_DERIVATIVE_ROLES),
+            psf: places.pair(PSF_ROLES),
+            psf_size: places.of((Role::PsfSize, 0)),
+            places: places.pair([Role::X, Role::Y]),
             converted: converted_columns(source),
             compared: ([Role::E1, Role::E2, Role::Weight, Role::R11].iter())
                 .filter_map(|role| places.of((*role, 0)))
@@ -314,8 +336,8 @@ impl<'a> TableRows<'a> {
     }
 
     fn position(&self, at: usize) -> [f64; 2] {
-        let columns = self.roles([Role::X, Role::Y]);
-        columns.map_or([f64::NAN; 2], |columns| self.pair(columns, at))
+        self.places
+            .map_or([f64::NAN; 2], |columns| self.pair(columns, at))
     }
 
     fn roles(&self, roles: [Role; 2]) -> Option<[usize; 2]> {
@@ -432,7 +454,7 @@ impl<'a> TableRows<'a> {
             let kind = RepeatKind::Number { or_zero };
             columns.iter().for_each(|column| watch(kind, [*column; 2]));
         };
-        if self.roles(KSB_ROLES).is_none() {
+        if self.ksb.is_none() {
             numbers(&self.e, true);
         }
         numbers(self.roles(RESPONSE_ROLES).as_slice().as_flattened(), true);
@@ -449,8 +471,8 @@ impl<'a> TableRows<'a> {
 
     // The columns of the ellipticity of a row. GalSim's HSM writes −10 into those that its method does not determine.
     fn shape_columns(&self, at: usize) -> [usize; 2] {
-        match (self.roles(KSB_ROLES), self.pair(self.e, at)) {
-            (Some(ksb), [-10.0, -10.0]) => ksb,
+        match self.ksb {
+            Some(ksb) if self.pair(self.e, at) == [-10.0, -10.0] => ksb,
             _ => self.e,
         }
     }
@@ -638,19 +660,18 @@ impl<'a> TableRows<'a> {
     // A row with a true shear of zero.
     fn measured(&self, at: usize, weight: f64) -> Result<Row, Exclusion> {
         let (e, response) = self.shape(at, weight).ok_or(Exclusion::AboveOne)?;
-        let size = self.of(Role::PsfSize);
         Ok(Row {
             e,
             weight,
             response,
             g: [0.0; 2],
-            psf: self
-                .roles(PSF_ROLES)
-                .map_or([0.0; 2], |psf| self.pair(psf, at)),
-            psf_size: size.map_or(1.0, |size| match self.source.psf_area {
-                true => self.value(size, at).sqrt(),
-                false => self.value(size, at),
-            }),
+            psf: self.psf.map_or([0.0; 2], |psf| self.pair(psf, at)),
+            psf_size: self
+                .psf_size
+                .map_or(1.0, |size| match self.source.psf_area {
+                    true => self.value(size, at).sqrt(),
+                    false => self.value(size, at),
+                }),
         })
     }
 
@@ -689,9 +710,7 @@ impl<'a> TableRows<'a> {
         }
         let columns = self.shape_columns(at);
         let mut e = self.pair(columns, at);
-        let dw = self
-            .roles(WEIGHT_DERIVATIVE_ROLES)
-            .map_or([0.0; 2], |dw| self.pair(dw, at));
+        let dw = self.dw.map_or([0.0; 2], |dw| self.pair(dw, at));
         // d(w e_i)/dg_j = w R_ij + e_i dw/dg_j: weights of AnaCal change with shear.
         let weighted = |e: [f64; 2], response: [[f64; 2]; 2]| {
             [0, 1].map(|i| [0, 1].map(|j| weight * response[i][j] + e[i] * dw[j]))
@@ -863,9 +882,9 @@ impl Found {
         for (numbered, name) in self.numbered.iter_mut().zip(steps) {
             numbered.add(part.frame, name);
         }
-        self.repeats.look_for(&part.columns);
+        self.repeats.look_for(part.columns);
         self.copies
-            .look_for(&part.columns, part.e, part.ids.as_deref());
+            .look_for(part.columns, part.e, part.ids.as_deref());
     }
 
     fn add(&mut self, part: &TableRows<'_>, at: usize, number: u64, row: &Row) {
@@ -881,7 +900,7 @@ impl Found {
             *count += u64::from((part.value(*column, at) != 0.0) != good);
         }
         // A shared ellipticity is reported by itself.
-        let shared = self.repeats.add(&part.columns, at);
+        let shared = self.repeats.add(part.columns, at);
         let own = part.compared.iter().map(|column| part.value(*column, at));
         let own = own.fold(0, |key, value| identity::hash(key ^ value.to_bits()));
         self.content = self.content.wrapping_add(own);

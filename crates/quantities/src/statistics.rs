@@ -146,8 +146,9 @@ impl MeasuredRange {
     /// Whether a number stands for a failure.
     pub fn excludes(self, value: f64) -> bool {
         let modulus = value.abs();
-        let is_whole = modulus < FRACTIONS_END && modulus.fract() == 0.0;
-        modulus > self.any || modulus > self.whole && (is_whole || is_mark(modulus))
+        // Few numbers are so large, and `fract` calls a function on old processors.
+        let is_whole = || modulus < FRACTIONS_END && modulus.fract() == 0.0;
+        modulus > self.any || modulus > self.whole && (is_whole() || is_mark(modulus))
     }
 
     /// Whether a number beyond the typical ones is written by nines, or is a power of ten.
