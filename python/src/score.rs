@@ -260,7 +260,7 @@ pub(crate) fn score<'py>(
         let session = SetSession::new(grid, Some(truth), options).map_err(of_scoring)?;
         let ScoredImages { score, rows, findings, odd, .. } =
             catalogue.measured(&session)?.finish().map_err(of_scoring)?;
-        let mut warnings = scores::oddities(&rows, "e1, e2");
+        let mut warnings = scores::oddities(&rows, "e1, e2", score.bins.definition);
         if let Some(other) = by_modes.filter(|other| *other != sign.of) {
             warnings.push(format!(
                 "warning: truth_g2 seems to have the other sign: with it the shear is an E-mode field. Try: truth_sign=\"{}\"",

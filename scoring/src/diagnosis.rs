@@ -6,7 +6,7 @@ use std::f64::consts::PI;
 use ndarray::{Array2, Zip};
 use shearq_quantities::fourier::Complex64;
 
-use crate::bandpower::{Bins, SCORED};
+use crate::bandpower::{Bins, Definition, SCORED};
 use crate::catalogue::{FieldSum, SetImages, TrueShear, TruthSign};
 use crate::convention::Convention;
 use crate::error::ScoringError;
@@ -89,6 +89,8 @@ pub enum Fault {
         m: f64,
         /// Its error.
         error: f64,
+        /// The part of the galaxies that are missing and count as zero, which is minus their part of m.
+        missing: f64,
     },
 }
 
@@ -208,7 +210,9 @@ impl SetScorer {
         match self.misplaced(images.total(), score, convention) {
             Some(finding) => findings.push(finding),
             None if convention == score.chosen => {
-                findings.extend(Fault::of_bias(score.metrics.m_cross, score.errors.m_cross));
+                let (m, error) = (score.metrics.m_cross, score.errors.m_cross);
+                let missing = self.zero_share(images.total());
+                findings.extend(Fault::of_bias(m, error, missing));
             }
             None => {}
         }
@@ -221,12 +225,8 @@ impl SetScorer {
     /// # Panics
     /// If the shape of the image differs from the grid.
     pub fn response(&self, image: &FieldSum, convention: Convention) -> Option<ImageResponse> {
-        let counted = image.count.mapv(|count| f64::from(u8::from(count > 0.0)));
         let field = convention.field(&image.e1, &image.e2);
-        // Galaxies that are missing have no response.
-        let weight = convention.turn(&counted);
-        let (g1, g2) = (&self.truth().g1 * &weight, &self.truth().g2 * &weight);
-        let truth = Convention::STANDARD.field(&g1, &g2);
+        let truth = self.weighted_truth(image, convention);
         let (mut cross, mut of_truth, mut of_image) = (0.0, 0.0, 0.0);
         let mut each: Vec<(Complex64, Complex64)> = Vec::new();
         let mut add = |truth: Complex64, e: Complex64| {
@@ -263,6 +263,38 @@ impl SetScorer {
             error: white.max(coloured).sqrt() / of_truth,
             correlation: cross / (of_truth * of_image).sqrt(),
         })
+    }
+
+    // The true shear times the weight of each cell, which is 0 for a galaxy that is missing: without weights, an image of low
+    // weights had a small response, as of galaxies in another order.
+    fn weighted_truth(&self, sum: &FieldSum, convention: Convention) -> Array2<Complex64> {
+        let weight = convention.turn(&sum.count);
+        let (g1, g2) = (&self.truth().g1 * &weight, &self.truth().g2 * &weight);
+        Convention::STANDARD.field(&g1, &g2)
+    }
+
+    // Correlation with the truth that weights and missing galaxies leave. The corrected definition gives the truth the same
+    // weights.
+    fn kept_by_weights(&self, sum: &FieldSum, convention: Convention) -> f64 {
+        if self.bins().definition == Definition::Corrected {
+            return 1.0;
+        }
+        let truth = Convention::STANDARD.field(&self.truth().g1, &self.truth().g2);
+        let [weighted, truth] =
+            [self.weighted_truth(sum, convention), truth].map(|field| self.modes_of(field).e);
+        let product = |a, b| self.bins().scored_product(a, b);
+        product(&weighted, &truth)
+            / (product(&weighted, &weighted) * product(&truth, &truth)).sqrt()
+    }
+
+    // The part of the galaxies that are missing and count as zero.
+    fn zero_share(&self, sum: &FieldSum) -> f64 {
+        match self.bins().definition {
+            Definition::Leaderboard => {
+                1.0 - sum.count.mean().unwrap_or(0.0) / sum.images.max(1) as f64
+            }
+            Definition::Corrected => 0.0,
+        }
     }
 
     fn misplaced(&self, sum: &FieldSum, score: &SetScore, convention: Convention) -> Option<Fault> {
@@ -311,7 +343,7 @@ impl SetScorer {
             offer(with, finding);
         }
         best.map(|(_, finding)| finding).or_else(|| {
-            let allowed = allowed(score, convention)?;
+            let allowed = allowed(score, convention)? * self.kept_by_weights(sum, convention);
             // A shortfall must exceed the scatter of chance correlations.
             let chance = 2.0 * score.matching.least_clear();
             let shortfall = allowed - correlation.max(0.0);
@@ -374,12 +406,13 @@ fn allowed(score: &SetScore, convention: Convention) -> Option<f64> {
 }
 
 impl Fault {
-    /// The finding about a multiplicative bias: as large as for a distortion, or large in either direction.
-    pub fn of_bias(m: f64, error: f64) -> Option<Self> {
+    /// The finding about a multiplicative bias: as large as for a distortion, or large in either direction. The part `missing` of
+    /// the galaxies counts as zero.
+    pub fn of_bias(m: f64, error: f64, missing: f64) -> Option<Self> {
         if m - MIN_M_OF_DISTORTION > LARGE_M_SIGMA * error {
             return Some(Fault::Distortion { m, error });
         }
-        (m.abs() - LARGE_M > LARGE_M_SIGMA * error).then_some(Fault::Biased { m, error })
+        (m.abs() - LARGE_M > LARGE_M_SIGMA * error).then_some(Fault::Biased { m, error, missing })
     }
 }
 

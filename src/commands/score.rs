@@ -97,6 +97,9 @@ pub(crate) struct Arguments {
     /// Treat galaxies with a larger |e| as not measured; for --truth [default: no limit].
     #[arg(long, value_name = "E", value_parser = positive, requires = "truth", conflicts_with_all = NOT_PLAIN)]
     max_modulus: Option<f64>,
+    /// Artificial shear of metacalibration, for --truth [default: 0.01].
+    #[arg(long, value_name = "G", value_parser = positive, requires = "truth", conflicts_with_all = NOT_PLAIN)]
+    step: Option<f64>,
     /// Print the aperture mass dispersion of the catalogues and of the true shear instead of scores.
     #[arg(long, conflicts_with_all = ["packed", "store", "report", "noise_var", "definition", "challenge", "branch", "psf", "subfields"])]
     aperture_mass: bool,
@@ -131,7 +134,7 @@ pub(crate) struct Arguments {
 const NOT_PLAIN: [&str; 6] = ["data", "measured", "foreign", "packed", "sets", "store"];
 
 // Options without a meaning for submissions to other challenges.
-const GREAT10_ONLY: [&str; 20] = [
+const GREAT10_ONLY: [&str; 21] = [
     "data",
     "measured",
     "foreign",
@@ -147,6 +150,7 @@ const GREAT10_ONLY: [&str; 20] = [
     "missing",
     "drop_missing",
     "max_modulus",
+    "step",
     "store",
     "wide",
     "metrics",
@@ -475,6 +479,7 @@ fn described(arguments: &Arguments) -> anyhow::Result<Option<Foreign>> {
     stated.missing = arguments.missing;
     stated.drop_missing = arguments.drop_missing;
     stated.max_modulus = arguments.max_modulus;
+    stated.step = arguments.step;
     stated.presets = presets;
     Ok((stated != Foreign::default()).then_some(stated))
 }

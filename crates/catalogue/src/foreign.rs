@@ -18,7 +18,7 @@ use crate::columns::{Names, Shapes};
 use crate::failures::shown;
 use crate::galaxies::{Galaxies, Galaxy};
 use crate::recognition::Survey;
-use crate::request::{Placed, Request};
+use crate::request::{DEFAULT_STEP, Placed, Request};
 
 /// How to read another program's catalogues. Columns that are not named are recognised.
 ///
@@ -35,6 +35,7 @@ use crate::request::{Placed, Request};
 /// flag = "flag"                   # rows with another value than 0 have no ellipticity
 /// columns = { w = "weight", R11 = "none" }   # other roles of `bias --columns`; "none" for a column that is not to be used
 /// missing = -99                   # rows with this value in e1 or e2 have none [default: no such value]
+/// step = 0.01                     # artificial shear of sheared catalogues [default: 0.01]
 /// drop_missing = true             # rows with a number that no measurement gives, such as -99, have none [default: refused]
 /// max_modulus = 1.0               # rows with a larger |e| (as reported) have none [default: no limit]
 /// position_offset = 0.0           # added to x and y to make them FITS pixels (1 for 0-based positions)
@@ -78,6 +79,9 @@ pub struct Foreign {
     pub drop_missing: bool,
     /// The largest valid |e|, after conversion.
     pub max_modulus: Option<f64>,
+    /// Artificial shear of metacalibration; [`DEFAULT_STEP`] if it is not stated.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub step: Option<f64>,
     #[serde(default)]
     position_offset: f64,
     #[serde(default = "one")]
@@ -134,6 +138,7 @@ impl Default for Foreign {
             missing: None,
             drop_missing: false,
             max_modulus: None,
+            step: None,
             position_offset: 0.0,
             e2_sign: one(),
             presets: Vec::new(),
@@ -157,6 +162,10 @@ impl Foreign {
         }
         if let Some(most) = foreign.max_modulus.filter(|m| !(m.is_finite() && *m > 0.0)) {
             let message = format!("`max_modulus` is {most}; expected a positive number");
+            return Err(FileError::new(path, message));
+        }
+        if let Some(step) = foreign.step.filter(|own| !(own.is_finite() && *own > 0.0)) {
+            let message = format!("`step` is {step}; expected a positive number");
             return Err(FileError::new(path, message));
         }
         if foreign.report == EllipticityType::Distortion
@@ -213,6 +222,7 @@ impl Foreign {
             names,
             shapes,
             drop_missing: self.drop_missing,
+            step: self.step.unwrap_or(DEFAULT_STEP),
             placed: Some(Placed {
                 missing: self.missing,
                 max_modulus: self.max_modulus,

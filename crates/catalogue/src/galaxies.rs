@@ -16,7 +16,7 @@ use crate::input::Input;
 use crate::request::Request;
 use crate::roles::{CATALOGUES, Role};
 use crate::rows::{SummedRow, placed_rows};
-use crate::source::{Reading, Source, difference, sources};
+use crate::source::{Reading, Source, difference, sources, unused_in_others};
 use crate::truth::Truth;
 
 /// A galaxy with its weight, 1 without weights. Its ellipticity is NaN if it was not measured or does not count.
@@ -96,6 +96,17 @@ impl Galaxies {
         let mut lines = first.described(&self.reading());
         lines[0] = format!("Columns: {}. {}", first.columns.program(), lines[0]);
         lines
+    }
+
+    /// Columns that look as if they should be used and that the first catalogue does not have, of the first of `others` that has some.
+    pub fn unused_in(&self, others: &[Galaxies]) -> Vec<String> {
+        let others = others
+            .iter()
+            .map(|own| (own.path.as_path(), own.sources.as_slice()));
+        let first = self.sources.first();
+        first.map_or_else(Vec::new, |own| {
+            unused_in_others(own, &self.reading(), others)
+        })
     }
 
     // What catalogues of one set must have in common: columns by role, and what becomes of them.

@@ -1,6 +1,6 @@
 //! Tables of a catalogue, and which of their columns are read as what.
 
-use std::collections::{BTreeSet, HashSet};
+use std::collections::{BTreeMap, BTreeSet, HashSet};
 use std::path::Path;
 
 use shearq_bias::Design;
@@ -163,8 +163,8 @@ impl Source {
         read.chain(operands).map(str::to_owned).collect()
     }
 
-    /// Columns that are not used here, and that `first` does not have.
-    pub fn unused_beside(&self, first: &Source, reading: &Reading<'_>) -> Vec<String> {
+    // Columns that are not used here, and that `first` does not have.
+    fn unused_beside(&self, first: &Source, reading: &Reading<'_>) -> Vec<String> {
         let known = first.columns.without_role().cloned();
         let named = first.columns.all().map(|(_, name)| name.to_owned());
         let mut read = self.read(reading);
@@ -324,6 +324,30 @@ impl Source {
             }
         }
     }
+}
+
+/// Columns without a role that the first catalogue does not have, of the first of `others` that has some: a mask in the second of
+/// two catalogues gave m = −0.167 without a word.
+pub fn unused_in_others<'s>(
+    first: &Source,
+    reading: &Reading<'_>,
+    others: impl Iterator<Item = (&'s Path, &'s [Source])>,
+) -> Vec<String> {
+    let mut others = others.filter_map(|(name, sources)| {
+        let own = sources.iter().map(|own| own.unused_beside(first, reading));
+        Some((name, own.into_iter().find(|lines| !lines.is_empty())?))
+    });
+    let Some((name, mut lines)) = others.next() else {
+        return Vec::new();
+    };
+    let more = match others.count() {
+        0 => String::new(),
+        more => format!(" (and {more} more catalogues likewise)"),
+    };
+    for line in &mut lines {
+        *line = format!("{}{more}: {line}", name.display());
+    }
+    lines
 }
 
 /// The first role or use in which two catalogues differ.
@@ -634,15 +658,23 @@ fn columns_of(
 ) -> Result<Columns, FileError> {
     let is_own = is_own(place, frame, names)?;
     let mut columns = Columns::find(&place.path, names, given, is_own)?;
+    // Catalogues of shearq have no texts that matter.
+    let texts = match is_own {
+        true => BTreeMap::new(),
+        false => first_texts(place, frame)?,
+    };
     if sheared.is_none()
         && columns.of(Role::ShearedCatalogue).is_none()
         && !given.is_given(Role::ShearedCatalogue)
-        && let Some(step) = step_column(place, frame, &columns)?
+        && let Some(step) = step_column(&texts, &columns)
     {
         let mut given = given.clone();
-        given.add_step(step);
+        given.add_step(step.to_owned());
         columns = Columns::find(&place.path, names, &given, is_own)?;
     }
+    columns.texts = texts;
+    columns.texts.retain(|_, text| is_word(text));
+    columns.refuse_texts_of_flags(&place.path)?;
     // A seed of each row is no unit of galaxies that have identifiers.
     if let (Some(unit), Some(_)) = (columns.of(Role::Unit), columns.of(Role::Id))
         && unit.eq_ignore_ascii_case("seed")
@@ -768,24 +800,30 @@ fn unit_like(names: &[String], columns: &Columns) -> Option<String> {
     own.cloned()
 }
 
-// A column without a role whose texts name sheared catalogues, whatever its name: the first row has one, too.
-fn step_column(
+// The first value of each column of texts. Of a text table, any field of the first row may be one.
+fn first_texts(
     place: &Place,
     frame: Option<&DataFrame>,
-    columns: &Columns,
-) -> Result<Option<String>, FileError> {
-    let mut texts = match frame {
-        None => table::first_texts(place)?,
-        Some(frame) => {
-            let text =
-                |own: &Column| Some((own.name().to_string(), own.str().ok()?.get(0)?.to_owned()));
-            frame.columns().iter().filter_map(text).collect()
-        }
+) -> Result<BTreeMap<String, String>, FileError> {
+    let Some(frame) = frame else {
+        return Ok(table::first_texts(place)?.into_iter().collect());
     };
-    texts.retain(|(name, text)| {
-        catalogue_named(text).is_some() && !columns.all().any(|(_, own)| own == name)
-    });
-    Ok(texts.into_iter().next().map(|(name, _)| name))
+    let text = |own: &Column| Some((own.name().to_string(), own.str().ok()?.get(0)?.to_owned()));
+    Ok(frame.columns().iter().filter_map(text).collect())
+}
+
+// Whether a field is no number, and no word that a text table has for one.
+fn is_word(text: &str) -> bool {
+    !text.trim().is_empty() && table::number_of(text).is_none()
+}
+
+// A column without a role whose texts name sheared catalogues, whatever its name: the first row has one, too.
+fn step_column<'t>(texts: &'t BTreeMap<String, String>, columns: &Columns) -> Option<&'t str> {
+    let mut texts = texts.iter();
+    let is_step = |(name, text): &(&String, &String)| {
+        catalogue_named(text).is_some() && !columns.all().any(|(_, own)| own == *name)
+    };
+    texts.find(is_step).map(|(name, _)| name.as_str())
 }
 
 // Whether shearq wrote a table. Those in memory and text have no metadata: a column decides that no other program writes, the
@@ -820,32 +858,22 @@ const MAX_SHARING: usize = 20;
 // So many different numbers are no counts.
 const MAX_COUNTED: usize = 1 << 16;
 
-// Whether a column names galaxies: a number of exposures has few values.
-fn is_identity(place: &Place, frame: Option<&DataFrame>, name: &str) -> Result<bool, FileError> {
+// The different values of a column, and the rows until [`MAX_COUNTED`] of them were found, however the table is split.
+fn counted(
+    place: &Place,
+    frame: Option<&DataFrame>,
+    name: &str,
+) -> Result<(usize, usize), FileError> {
     let (mut keys, mut rows) = (HashSet::new(), 0);
     let mut add = |part: &DataFrame| -> Result<(), FileError> {
-        rows += part.height();
         if keys.len() < MAX_COUNTED {
-            keys.extend(identity::keys(part, name, &place.path)?);
-        }
-        Ok(())
-    };
-    match frame {
-        Some(frame) => add(frame)?,
-        None => table::read_parts(place, &[name], &[], |part| add(&part))?,
-    }
-    Ok(keys.len() >= MAX_COUNTED || keys.len() * MAX_SHARING >= rows)
-}
-
-// Whether each row has its own value, judged by the first part of the table.
-fn are_different(place: &Place, frame: Option<&DataFrame>, name: &str) -> Result<bool, FileError> {
-    let mut found = None;
-    let mut add = |part: &DataFrame| -> Result<(), FileError> {
-        if found.is_none() && part.height() > 0 {
-            let keys: HashSet<_> = identity::keys(part, name, &place.path)?
-                .into_iter()
-                .collect();
-            found = Some(keys.len() == part.height());
+            for key in identity::keys(part, name, &place.path)? {
+                rows += 1;
+                keys.insert(key);
+                if keys.len() >= MAX_COUNTED {
+                    break;
+                }
+            }
         }
         Ok(())
     };
@@ -853,7 +881,19 @@ fn are_different(place: &Place, frame: Option<&DataFrame>, name: &str) -> Result
         Some(frame) => add(frame)?,
         None => table::read_parts(place, &[name], &[name], |part| add(&part))?,
     }
-    Ok(found.unwrap_or(false))
+    Ok((keys.len(), rows))
+}
+
+// Whether a column names galaxies: a number of exposures has few values.
+fn is_identity(place: &Place, frame: Option<&DataFrame>, name: &str) -> Result<bool, FileError> {
+    let (different, rows) = counted(place, frame, name)?;
+    Ok(different >= MAX_COUNTED || different * MAX_SHARING >= rows)
+}
+
+// Whether each row has its own value.
+fn are_different(place: &Place, frame: Option<&DataFrame>, name: &str) -> Result<bool, FileError> {
+    let (different, rows) = counted(place, frame, name)?;
+    Ok(different == rows && rows > 0)
 }
 
 // The names of all columns, and the formulas among those that the user gives for roles, whose texts are names, too. A plus between

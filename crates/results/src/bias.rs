@@ -20,8 +20,10 @@ use shearq_catalogue::input::Input;
 use shearq_catalogue::request::{Request, Units};
 use shearq_catalogue::roles::{CATALOGUES, Role};
 use shearq_catalogue::rows::{distinct, rows};
-use shearq_catalogue::sheared_files::with_sheared_files;
-use shearq_catalogue::source::{Reading, Source, difference as different_columns, sources};
+use shearq_catalogue::sheared_files::{refuse_sheared_psfs, with_sheared_files, without_sheared};
+use shearq_catalogue::source::{
+    Reading, Source, difference as different_columns, sources, unused_in_others,
+};
 use shearq_catalogue::truth::{TrueSign, Truth};
 use shearq_dataset::fingerprint::{GALAXIES, verify_source};
 use shearq_dataset::metadata::{CATALOGUE_FRAME, CommonAxes, axes_of};
@@ -154,6 +156,7 @@ impl BiasResult {
 )]
 pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, BiasFailure> {
     distinct(&request.catalogues)?;
+    refuse_sheared_psfs(&request.catalogues, &request.names)?;
     let joined = Request {
         catalogues: with_sheared_files(request.catalogues.clone(), &request.truth, &request.names),
         ..request.clone()
@@ -187,7 +190,10 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
     let truth = known(&request.truth, first);
     let response = first.has_response() || first.shapes != Shapes::Shear;
     let mut described = first.described(&reading);
-    described.extend(unused_in_others(&reading, &all));
+    described.extend(without_sheared(&request.catalogues).filter(|_| !first.has_response()));
+    let named = request.catalogues.iter().map(|input| input.name.as_path());
+    let others = named.zip(all.iter().map(Vec::as_slice));
+    described.extend(unused_in_others(first, &reading, others));
     let kind = check_columns(&reading, &all)?;
     let (frame, images) = frame_and_images(&all)?;
     let named = request.catalogues.iter().zip(&images);
@@ -376,28 +382,6 @@ fn known_sign(request: &Request, all: &[Vec<Source>]) -> Result<Option<Sign>, Bi
         }
         _ => Ok(specified),
     }
-}
-
-// Columns without a role that the first catalogue does not have: a mask in the second one gave m = −0.167 without a word.
-fn unused_in_others(reading: &Reading<'_>, all: &[Vec<Source>]) -> Vec<String> {
-    let first = &all[0][0];
-    let inputs = reading.request.catalogues.iter().zip(all);
-    let mut others = inputs.filter_map(|(input, sources)| {
-        let own = sources.iter().map(|own| own.unused_beside(first, reading));
-        Some((input, own.into_iter().find(|lines| !lines.is_empty())?))
-    });
-    let Some((input, mut lines)) = others.next() else {
-        return Vec::new();
-    };
-    let name = input.name.display();
-    let more = match others.count() {
-        0 => String::new(),
-        more => format!(" (and {more} more catalogues likewise)"),
-    };
-    for line in &mut lines {
-        *line = format!("{name}{more}: {line}");
-    }
-    lines
 }
 
 // Columns by role and what becomes of them. Refuses catalogues in which they differ: a weight in one of two catalogues gave a

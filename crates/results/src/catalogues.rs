@@ -191,15 +191,25 @@ impl Catalogues {
         mean.calibration()
     }
 
-    /// Which columns of the first catalogue are used as what; empty of catalogues by shearq, and without names of columns.
+    /// Which columns of the first catalogue are used as what, and columns of any other that look as if they should be used; empty of
+    /// catalogues by shearq, and without names of columns.
     pub fn account(&self) -> Result<Vec<String>, FileError> {
-        let sets = self.files.sets();
-        let mut all = sets.iter().flat_map(|set| self.files.of_set(*set));
-        let (Some(foreign), Some((_, path))) = (&self.description, all.next()) else {
+        let Some(foreign) = &self.description else {
             return Ok(Vec::new());
         };
-        let first = recognised(foreign, &path, MAX_ROWS)?;
-        Ok(first.map_or_else(Vec::new, |own| own.account()))
+        let sets = self.files.sets();
+        let paths = sets.iter().flat_map(|set| self.files.of_set(*set));
+        let mut all = Vec::new();
+        for (_, path) in paths {
+            match recognised(foreign, &path, MAX_ROWS)? {
+                Some(own) => all.push(own),
+                None => return Ok(Vec::new()),
+            }
+        }
+        let Some((first, others)) = all.split_first() else {
+            return Ok(Vec::new());
+        };
+        Ok([first.account(), first.unused_in(others)].concat())
     }
 
     /// The rows of one catalogue, at most `most`, with the signs and the type of ellipticity that are scored, and their weights.

@@ -11,8 +11,8 @@ use shearq_dataset::truth::{ReadTruth, Reading, Sign, read_truth, reading_of};
 use shearq_files::FileError;
 use shearq_quantities::Frame;
 use shearq_scoring::{
-    AddedImages, Choice, ConventionMatch, Fault, Grid, OddImages, Options, RowCounts, ScoredImages,
-    ScoringError, SetScore, SetSession, TruthSign, sign_by_correlation,
+    AddedImages, Choice, ConventionMatch, Fault, FieldSum, Grid, OddImages, Options, RowCounts,
+    ScoredImages, ScoringError, SetScore, SetSession, TruthSign, sign_by_correlation,
 };
 use shearq_submissions::ConfigurationError;
 use thiserror::Error;
@@ -64,6 +64,8 @@ pub struct ScoredSet {
     pub odd_images: OddImages,
     /// Names of the catalogues, in the order of their images.
     pub names: Vec<PathBuf>,
+    /// Relative scatter of the weights of galaxies in the mean over the images; `None` without weights.
+    pub weight_scatter: Option<f64>,
 }
 
 impl ScoredSet {
@@ -166,13 +168,15 @@ impl<'a> SetFiles<'a> {
         choice: Choice,
         matched: Option<ConventionMatch>,
     ) -> Result<ScoredSet, ScoreError> {
+        let added = self.add_up(session)?;
+        let weight_scatter = weight_scatter(added.images().total());
         let ScoredImages {
             score,
             rows,
             findings,
             odd: odd_images,
             ..
-        } = self.add_up(session)?.finish().map_err(self.wrong())?;
+        } = added.finish().map_err(self.wrong())?;
         let basis = match (matched, choice) {
             (Some(matching), _) => Basis::Matched(matching),
             (None, Choice::Matched) => Basis::Matched(score.matching),
@@ -191,8 +195,16 @@ impl<'a> SetFiles<'a> {
             sign: None,
             odd_images,
             names: self.names(),
+            weight_scatter,
         })
     }
+}
+
+// Without weights, each galaxy of an image counts 1.
+fn weight_scatter(sum: &FieldSum) -> Option<f64> {
+    let mean = sum.count.mean()?;
+    let has_weights = sum.count.iter().any(|count| count.fract() != 0.0);
+    has_weights.then(|| sum.count.std(0.0) / mean)
 }
 
 /// Scores plain files of one set against a truth file.

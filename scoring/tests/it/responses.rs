@@ -2,7 +2,7 @@
 use ndarray::Array2;
 use shearq_quantities::fourier::Complex64;
 use shearq_scoring::{
-    AddedImages, Choice, Convention, Fault, FieldSum, Grid, OddResponse, Options, ScoredImages,
+    AddedImages, Choice, Convention, Definition, Fault, FieldSum, Grid, OddResponse, Options, ScoredImages,
     SetScorer, SetSession, TrueShear,
 };
 
@@ -202,4 +202,53 @@ fn odd_images_explain_faults_of_the_set() {
         "{:?}",
         found.findings
     );
+}
+
+/// What is found in images whose galaxies have weights, 0 for a galaxy that is missing.
+fn of_weighted(
+    shear: &Array2<Complex64>,
+    weight: impl Fn(usize, usize) -> f64,
+    definition: Definition,
+) -> ScoredImages {
+    let options = Options {
+        choice: Choice::Insist(Convention::STANDARD),
+        definition,
+        ..Options::default()
+    };
+    let session = SetSession::new(grid(), Some(truth(shear)), options).unwrap();
+    let mut added = session.begin();
+    for (number, image) in noisy(shear, 6, 0.004, 11).iter().enumerate() {
+        let mut sum = FieldSum::new(&grid());
+        let rows = rows(&grid(), image).into_iter().enumerate();
+        let rows = rows.map(|(galaxy, row)| (row, weight(number, galaxy)));
+        let counts = sum.add_weighted(&grid(), rows.filter(|(_, weight)| *weight > 0.0));
+        added.add(&session.examine(sum, counts).unwrap()).unwrap();
+    }
+    added.finish().unwrap()
+}
+
+#[test]
+fn weights_are_no_fault_of_the_order() {
+    let shear = field(&grid(), Content::E, 3);
+    // An image of a quarter of the weight of the others, and galaxies whose weights scatter by a factor of ten.
+    let of_images = |number: usize, _| [0.3, 1.14][usize::from(number > 0)];
+    let of_galaxies = |_, galaxy: usize| [0.1, 0.2, 0.3, 3.4][(7 * galaxy + galaxy / 5) % 4];
+    let found = of_weighted(&shear, of_images, Definition::Leaderboard);
+    assert!(found.odd.responses.is_empty(), "{:?}", found.odd);
+    let found = of_weighted(&shear, of_galaxies, Definition::Leaderboard);
+    let is_uncorrelated = |fault: &Fault| matches!(fault, Fault::Uncorrelated { .. });
+    assert!(!found.findings.iter().any(is_uncorrelated), "{:?}", found.findings);
+}
+
+#[test]
+fn missing_galaxies_explain_a_low_response() {
+    let shear = field(&grid(), Content::E, 3);
+    let half = |number, galaxy| f64::from(u8::from((number + galaxy) % 2 == 0));
+    let found = of_weighted(&shear, half, Definition::Leaderboard);
+    let [Fault::Biased { m, missing, .. }] = found.findings[..] else {
+        panic!("{:?}", found.findings);
+    };
+    assert!((m + 0.5).abs() < 0.05 && (missing - 0.5).abs() < 1e-12, "{m} {missing}");
+    let found = of_weighted(&shear, half, Definition::Corrected);
+    assert_eq!(found.findings, []);
 }

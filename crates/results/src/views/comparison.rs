@@ -249,7 +249,7 @@ fn run_notes(runs: &[RunRecord], unpaired: &[String]) -> Vec<String> {
 fn bias_note(run: &RunRecord) -> Option<String> {
     // Records of a store have no other findings than those that follow from their metrics.
     let findings = run.sets.iter().map(|set| {
-        let finding = Fault::of_bias(set.metrics.m_cross, set.errors.m_cross);
+        let finding = Fault::of_bias(set.metrics.m_cross, set.errors.m_cross, 0.0);
         (Some(set.set), finding.into_iter().collect::<Vec<Fault>>())
     });
     let findings: Vec<_> = findings.collect();

@@ -96,14 +96,18 @@ pub fn notes(scored: &[ScoredSet]) -> Vec<String> {
                 "warning: {name}: the leaderboard uses {best}, these metrics {chosen}."
             ));
         }
-        // Lensing makes E modes only; the wrong sign of g2 mixes them with B modes. The limit is chosen by hand.
-        if score.constant.is_none() && score.true_b_share() > 0.2 {
+        // Lensing makes E modes only; the wrong sign of g2 mixes them with B modes, as weights and gaps of the corrected definition
+        // do. The limit is chosen by hand.
+        let counted = |own: &ScoredSet| own.weight_scatter.is_none() && own.rows.missing == 0;
+        let is_whole = score.bins.definition == Definition::Leaderboard || counted(own);
+        if score.constant.is_none() && is_whole && score.true_b_share() > 0.2 {
             lines.push(format!(
                 "warning: {:.0} % of the true power of {name} is in B modes; g2 may have the other sign. Try: --truth-sign.",
                 100.0 * score.true_b_share()
             ));
         }
-        lines.extend(oddities(&own.rows, &name));
+        lines.extend(oddities(&own.rows, &name, own.score.bins.definition));
+        lines.extend(weighted(own, &name));
     }
     let findings = scored.iter().map(|set| (set.number(), &*set.findings));
     lines.extend(of_sets(findings));
@@ -123,6 +127,20 @@ pub fn notes(scored: &[ScoredSet]) -> Vec<String> {
         ));
     }
     lines
+}
+
+// Scatter of weights from which it limits Q. Chosen by hand.
+const MIN_WEIGHT_SCATTER: f64 = 0.05;
+
+// Weights multiply the shear of each galaxy, and the leaderboard compares the product with the true shear.
+fn weighted(own: &ScoredSet, name: &str) -> Option<String> {
+    let scatter = own.weight_scatter.filter(|own| *own > MIN_WEIGHT_SCATTER)?;
+    (own.score.bins.definition == Definition::Leaderboard).then(|| {
+        format!(
+            "note: weights of {name} scatter by {:.0} % of their mean between galaxies, which multiplies their shear and limits Q. Try: --definition corrected, which gives the true shear the same weights, or --columns w=none.",
+            100.0 * scatter
+        )
+    })
 }
 
 // Q of zero shear, which is above that of a measurement while noise dominates.
@@ -336,14 +354,18 @@ pub fn bandpowers(scored: &[ScoredSet]) -> Table {
     table
 }
 
-/// A line for each kind of odd row in the catalogues of `whose`: how many there are, and how they are scored.
-pub fn oddities(counts: &RowCounts, whose: &str) -> Vec<String> {
+/// A line for each kind of odd row in the catalogues of `whose`: how many there are, and how a definition scores them.
+pub fn oddities(counts: &RowCounts, whose: &str, definition: Definition) -> Vec<String> {
     let mut lines = Vec::new();
     if counts.outside + counts.excess > 0 {
         lines.push(format!(
-            "warning: {whose} has {} outside the grid and {} beyond the number of cells; they do not count.",
+            "warning: {whose} has {} outside the grid and {} beyond the number of cells; they do not count.{}",
             rows(counts.outside),
-            counts.excess
+            counts.excess,
+            match counts.excess {
+                0 => "",
+                _ => " If a galaxy has several rows, as in several bands, try: a table with one row of each.",
+            }
         ));
     }
     if counts.repeated > 0 {
@@ -354,9 +376,13 @@ pub fn oddities(counts: &RowCounts, whose: &str) -> Vec<String> {
     }
     if counts.missing > 0 {
         lines.push(format!(
-            "warning: {} of {} galaxies of {whose} are not in the catalogues; each counts as zero.",
+            "warning: {} of {} galaxies of {whose} are not in the catalogues; {}.",
             counts.missing,
-            counts.missing + counts.used + counts.not_finite - counts.repeated
+            counts.missing + counts.used + counts.not_finite - counts.repeated,
+            match definition {
+                Definition::Leaderboard => "each counts as zero",
+                Definition::Corrected => "their true shear does not count either",
+            }
         ));
     }
     if counts.above_one > 0 {
@@ -369,7 +395,7 @@ pub fn oddities(counts: &RowCounts, whose: &str) -> Vec<String> {
     }
     if counts.not_finite > 0 {
         lines.push(format!(
-            "note: {} of {} galaxies of {whose} have no ellipticity (NaN, flagged, marked as missing, or a distortion above 1, which noise makes) and count as missing.",
+            "note: {} of {} galaxies of {whose} have no ellipticity (NaN, flagged, with a weight of zero or less, marked as missing, or a distortion above 1, which noise makes) and count as missing.",
             counts.not_finite,
             counts.not_finite + counts.used
         ));
@@ -380,6 +406,9 @@ pub fn oddities(counts: &RowCounts, whose: &str) -> Vec<String> {
 fn rows(count: usize) -> String {
     format!("{count} row{}", if count == 1 { "" } else { "s" })
 }
+
+// Part of the galaxies that are missing from which they matter for a large m. Chosen by hand.
+const MIN_MISSING: f64 = 0.05;
 
 pub fn words(finding: &Fault) -> String {
     match *finding {
@@ -418,7 +447,12 @@ pub fn words(finding: &Fault) -> String {
             "the ellipticities respond to shear by a factor of {:.2} ± {error:.2}, expected 1: they seem to be distortions χ, not shear-type ε",
             1.0 + m
         ),
-        Fault::Biased { m, error } => format!(
+        Fault::Biased { m, error, missing } if missing > MIN_MISSING => format!(
+            "m = {m:.3} ± {error:.3}, expected |m| below 0.1: {:.0} % of the galaxies are missing and count as zero, which alone is m = {:.2}. Try: --definition corrected, which leaves them out",
+            100.0 * missing,
+            -missing
+        ),
+        Fault::Biased { m, error, .. } => format!(
             "m = {m:.3} ± {error:.3}, expected |m| below 0.1: a high Q does not make such ellipticities fit for use. Calibrate them"
         ),
     }
@@ -484,6 +518,17 @@ pub fn repeated_shapes(found: &Repeated<2>) -> String {
 // Chosen by hand: more sentences hide the others.
 const MAX_NAMED: usize = 4;
 
+// Exchanged rows have a slope of zero within the errors. Chosen by hand.
+const CLEAR_SLOPE_SIGMA: f64 = 5.0;
+
+/// Whether an image follows the shear clearly, and by less than half of the others.
+pub fn follows_by_less(odd: &OddResponse) -> bool {
+    let OddResponse {
+        response, slope, ..
+    } = odd;
+    response.slope / slope < 0.5 && response.slope > CLEAR_SLOPE_SIGMA * response.error
+}
+
 /// How an image differs from the others of its set, with the probable cause.
 pub fn odd_response(odd: &OddResponse) -> String {
     let OddResponse {
@@ -496,6 +541,9 @@ pub fn odd_response(odd: &OddResponse) -> String {
     // Chosen by hand. Exchanged rows leave a slope near 0, another sign the slope −1, and distortions a slope near 2.
     let cause = match ratio {
         _ if ratio < -0.5 => "Its signs are probably wrong",
+        _ if follows_by_less(odd) => {
+            "Its ellipticities are probably of another scale, as of galaxies with low weights, or some of its galaxies are in another order"
+        }
         _ if ratio < 0.5 => {
             "Its galaxies are probably in another order, at other positions or of another set"
         }
@@ -720,7 +768,7 @@ mod tests {
 
     #[test]
     fn each_kind_of_odd_row_has_a_line() {
-        assert!(oddities(&good(), "x").is_empty());
+        assert!(oddities(&good(), "x", Definition::Leaderboard).is_empty());
         let odd = RowCounts {
             used: 50,
             outside: 1,
@@ -732,7 +780,7 @@ mod tests {
             absurd: 2,
             ..RowCounts::default()
         };
-        let lines = oddities(&odd, "set 7");
+        let lines = oddities(&odd, "set 7", Definition::Leaderboard);
         let expected = [
             "set 7 has 1 row outside the grid and 2 beyond",
             "4 rows of set 7",
@@ -750,7 +798,7 @@ mod tests {
                 excess,
                 ..good()
             };
-            assert_eq!(oddities(&counts, "x").len(), 1);
+            assert_eq!(oddities(&counts, "x", Definition::Leaderboard).len(), 1);
         }
     }
 }
