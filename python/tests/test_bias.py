@@ -1,6 +1,7 @@
 """m and c from tables of other packages: the numbers of the command line."""
 
 import json
+import pathlib
 import pickle
 import shutil
 import sys
@@ -452,3 +453,19 @@ def test_workers_of_spark_return_sums(monkeypatch, tmp_path):
     with pyspark.SparkContext(conf=settings) as context:
         parts = context.parallelize(paths, 4).map(shearq.bias_sums).collect()
     assert shearq.BiasSums.merge(parts).result().rows == expected.rows
+
+
+LAYOUTS = pathlib.Path(__file__).parents[2] / "tests/data/layouts"
+VALUES = json.loads((LAYOUTS / "layouts.json").read_text())
+
+
+@pytest.mark.parametrize("name", VALUES)
+@pytest.mark.parametrize("read", [lambda path: path, pandas.read_csv], ids=["file", "frame"])
+def test_layouts_of_surveys_have_the_values_of_numpy(name, read):
+    expected = VALUES[name]
+    columns = dict(text.split("=", 1) for text in expected["given"])
+    found = shearq.bias(read(LAYOUTS / f"{name}.csv"), columns=columns)
+    for key in ("m1", "m2", "c1", "c2"):
+        # The files have ten digits, and responses are differences over 0.02.
+        assert found[key] == pytest.approx(expected[key], abs=1e-8), key
+    assert found["n"] == expected["galaxies"]

@@ -198,3 +198,55 @@ fn check_rejects_the_rows_that_score_rejects() {
         assert_eq!(found, expected, "{}", path.display());
     }
 }
+
+/// Catalogues in the columns of surveys and pipelines have the numbers that numpy gives for them (`tests/data/layouts/make.py`).
+#[test]
+fn layouts_of_surveys_have_the_values_of_numpy() {
+    const LAYOUTS: &str = "tests/data/layouts";
+    const GALAXIES: f64 = 64.0;
+    // The files have ten digits, and responses are differences over 0.02.
+    const ROUNDING: f64 = 1e-8;
+    let folder = Folder::new();
+    folder.write("truth.csv", constant_truth());
+    let expected = std::fs::read_to_string(format!("{LAYOUTS}/layouts.json")).unwrap();
+    let expected: serde_json::Map<String, Value> = serde_json::from_str(&expected).unwrap();
+    assert_eq!(expected.len(), 13);
+    for (name, own) in expected {
+        let table = std::fs::read_to_string(format!("{LAYOUTS}/{name}.csv")).unwrap();
+        folder.write("c.csv", table);
+        let given: Vec<&str> = (own["given"].as_array().unwrap().iter())
+            .map(|text| text.as_str().unwrap())
+            .collect();
+        let columns = |more: &[&str]| {
+            let mut all: Vec<&str> = given.clone();
+            all.retain(|own| !more.iter().any(|one| one[..3] == own[..3]));
+            all.extend(more);
+            match all.is_empty() {
+                true => String::new(),
+                false => format!("--columns '{}'", all.join(",")),
+            }
+        };
+        let number = |value: &Value| value.as_f64().unwrap_or(f64::NAN);
+        let assert_near = |what: &str, found: &Value, expected: &Value| {
+            let off = (number(found) - number(expected)).abs();
+            assert!(off < ROUNDING, "{name}: {what} {found} {expected}");
+        };
+        let found = folder.json(&format!("bias c.csv {}", columns(&[])));
+        let all = &found["rows"][0];
+        for key in ["m1", "m2", "c1", "c2"] {
+            assert_near(key, &all[key], &own[key]);
+        }
+        assert_eq!(all["n"], own["galaxies"], "{name}");
+        let no_truth = columns(&["g1=none", "g2=none"]);
+        let found = folder.json(&format!("bias c.csv {no_truth}"));
+        let score = "score --truth truth.csv --truth-sign standard c.csv";
+        let scored = folder.json(&format!("{score} {no_truth}"));
+        for k in 0..2 {
+            let key = ["c1", "c2"][k];
+            assert_near(key, &found["rows"][0][key], &own["mean"][k]);
+            assert_near(key, &scored["mean_shear"]["e"][k], &own["mean"][k]);
+        }
+        let rejected = GALAXIES - number(&own["galaxies"]);
+        assert_eq!(number(&scored["rows"]["not_finite"]), rejected, "{name}");
+    }
+}
