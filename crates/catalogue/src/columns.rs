@@ -263,9 +263,13 @@ pub enum NameError {
     Twice(String),
 }
 
-// Roles that one column may have together: a scalar response of both components, and identifiers of units.
+// Roles that one column may have together: a scalar response of both components, a symmetric one, and identifiers of units.
 // Another column with two roles compares a quantity with itself: `e1=g1`, with g1 as the true shear, gave m = 0.
-const SHARED: [[Role; 2]; 2] = [[Role::R11, Role::R22], [Role::Id, Role::Unit]];
+const SHARED: [[Role; 2]; 3] = [
+    [Role::R11, Role::R22],
+    [Role::R12, Role::R21],
+    [Role::Id, Role::Unit],
+];
 
 impl Names {
     pub fn add(&mut self, text: &str) -> Result<(), NameError> {
@@ -483,6 +487,8 @@ pub struct Columns {
     pub step_size: Option<String>,
     /// Why the surveys of the user's files are not used, a sentence each.
     pub unfit_presets: Vec<String>,
+    /// The first text of each column of texts.
+    pub texts: BTreeMap<String, String>,
 }
 
 impl Columns {
@@ -576,6 +582,7 @@ impl Columns {
             steps: Vec::new(),
             step_size: None,
             unfit_presets: names.unfit_presets(found),
+            texts: BTreeMap::new(),
         };
         if preset == Preset::Metacal && !names.is_given(Role::E1) {
             columns.take_unsheared(found);
@@ -654,14 +661,11 @@ impl Columns {
         let (unused, unknown) = (unread(&self.unused), unread(&self.unknown));
         let mut lines = Vec::new();
         if !unused.is_empty() {
-            let calibration = match unused.iter().find(|name| is_like_a_calibration(name)) {
-                Some(name) => format!(" m and c are those before a calibration by `{name}`."),
-                None => String::new(),
-            };
+            let calibration = self.before_calibration(&unused).unwrap_or_default();
             lines.push(format!(
                 "Not used: {}. Try: {}.{calibration}",
                 counted_names(&unused),
-                suggested(&unused)
+                self.suggested(&unused)
             ));
         }
         if !unknown.is_empty() {
@@ -701,9 +705,110 @@ impl Columns {
             all.find(|name| like(name) && sheared_name(name).is_none())
         };
         match first(is_like_a_flag) {
-            Some(name) => Some(format!("--columns flag={name} if it is 0 in good rows")),
-            None => first(is_like_a_choice)
-                .map(|name| format!("--where {name} if it is true in good rows")),
+            Some(name) => Some(
+                self.of_good_rows(name)
+                    .unwrap_or_else(|| format!("--columns flag={name} if it is 0 in good rows")),
+            ),
+            None => first(is_like_a_choice).map(|name| {
+                let by_text = self.of_good_rows(name);
+                by_text.unwrap_or_else(|| format!("--where {name} if it is true in good rows"))
+            }),
+        }
+    }
+
+    // What m and c are without the columns of a calibration, and how these are applied: surveys divide by the weighted mean of 1 + m
+    // and subtract c (Fenech Conti et al. 2017, MNRAS 467, 1627, equation 15).
+    fn before_calibration(&self, unused: &[String]) -> Option<String> {
+        let name = unused.iter().find(|name| is_like_a_calibration(name))?;
+        let own = |patterns: &[&str]| {
+            let is_own = |name: &&String| patterns.iter().any(|own| words(name).ends_with(own));
+            unused.iter().find(is_own)
+        };
+        let mut columns = Vec::new();
+        let is_shear = self.of(Role::R11).is_none() && !self.distortion;
+        if let Some(m) = own(&["_m_", "_m1_", "_m_1_"]).filter(|_| is_shear) {
+            let other = other_component(unused, m).unwrap_or(m);
+            columns.push(format!("R11=1+{m},R22=1+{other}"));
+        }
+        let [e1, e2] = [Role::E1, Role::E2].map(|role| self.of(role).unwrap_or_default());
+        if let Some(c1) = own(&["_c1_", "_c_1_"])
+            && let Some(c2) = other_component(unused, c1)
+            && is_shear
+        {
+            columns.push(format!("e1={e1}-{c1},e2={e2}-{c2}"));
+        }
+        let remedy = match columns.is_empty() {
+            true => String::new(),
+            false => format!(
+                " Try: --columns '{}' for those after it.",
+                columns.join(",")
+            ),
+        };
+        Some(format!(
+            " m and c are those before a calibration by `{name}`.{remedy}"
+        ))
+    }
+
+    // What chooses the good rows by the texts of a column.
+    fn of_good_rows(&self, name: &str) -> Option<String> {
+        let text = self.texts.get(name)?;
+        Some(format!(
+            "--where \"{name} == 'TEXT'\" with the text of good rows (the first row has '{text}')"
+        ))
+    }
+
+    /// Refuses flags that are texts, of which only the user knows which one good rows have.
+    pub fn refuse_texts_of_flags(&self, path: &Path) -> Result<(), FileError> {
+        let mut flags = self.flags.iter();
+        let text = flags.find_map(|name| Some((name, self.texts.get(name)?)));
+        match text {
+            None => Ok(()),
+            Some((name, text)) => Err(FileError::new(
+                path,
+                format!(
+                    "`{name}` has texts (found `{text}` in the first row, expected a flag, which is 0 in good rows). Try: --columns \"flag={name} != 'TEXT'\" with the text of good rows, or flag=none"
+                ),
+            )),
+        }
+    }
+
+    // What uses columns by their names, an option of each kind.
+    fn suggested(&self, unused: &[String]) -> String {
+        let first = |like: &dyn Fn(&str) -> bool| {
+            let mut all = unused.iter();
+            all.find(|name| like(name) && !is_secondary(name))
+        };
+        let needed = match unused.len() {
+            1 => "if the result needs it",
+            _ => "if the result needs them",
+        };
+        let mut roles = Vec::new();
+        if let Some(name) = first(&looks_like_weight) {
+            roles.push(format!("w={name}"));
+        }
+        let is_first = |name: &str| {
+            is_like_a_response(name)
+                && sheared_name(name).is_none()
+                && !name.contains('[')
+                && (!name.contains('2') || name.contains('1'))
+        };
+        if let Some(name) = first(&is_first) {
+            let other = other_component(unused, name).unwrap_or(name);
+            roles.push(format!("R11={name},R22={other}"));
+        }
+        if let Some(name) = first(&|name| is_like_a_flag(name) && !self.texts.contains_key(name)) {
+            roles.push(format!("flag={name}"));
+        }
+        let choice = first(&is_like_a_choice);
+        let by_text = choice.and_then(|name| self.of_good_rows(name));
+        match (choice, roles.is_empty()) {
+            (Some(name), true) => by_text.unwrap_or_else(|| {
+                format!(
+                    "--where {name} if it is true in good rows, --columns flag={name} if it is 0"
+                )
+            }),
+            (None, true) => format!("--columns ROLE=NAME {needed}"),
+            _ => format!("--columns {} {needed}", roles.join(",")),
         }
     }
 
@@ -868,42 +973,6 @@ fn counted_names(names: &[String]) -> String {
         more => format!(", and {more} more"),
     };
     names[..names.len().min(SHOWN)].join(", ") + &more
-}
-
-// What uses columns by their names, an option of each kind.
-fn suggested(unused: &[String]) -> String {
-    let first = |like: &dyn Fn(&str) -> bool| {
-        let mut all = unused.iter();
-        all.find(|name| like(name) && !is_secondary(name))
-    };
-    let needed = match unused.len() {
-        1 => "if the result needs it",
-        _ => "if the result needs them",
-    };
-    let mut roles = Vec::new();
-    if let Some(name) = first(&looks_like_weight) {
-        roles.push(format!("w={name}"));
-    }
-    let is_first = |name: &str| {
-        is_like_a_response(name)
-            && sheared_name(name).is_none()
-            && !name.contains('[')
-            && (!name.contains('2') || name.contains('1'))
-    };
-    if let Some(name) = first(&is_first) {
-        let other = other_component(unused, name).unwrap_or(name);
-        roles.push(format!("R11={name},R22={other}"));
-    }
-    if let Some(name) = first(&is_like_a_flag) {
-        roles.push(format!("flag={name}"));
-    }
-    match (first(&is_like_a_choice), roles.is_empty()) {
-        (Some(name), true) => {
-            format!("--where {name} if it is true in good rows, --where 'not({name})' if it is 0")
-        }
-        (None, true) => format!("--columns ROLE=NAME {needed}"),
-        _ => format!("--columns {} {needed}", roles.join(",")),
-    }
 }
 
 // Columns of flags. A row counts if all are zero: DES has failures in `flags` and cuts in `flags_select`, and metadetection

@@ -28,7 +28,7 @@ pub enum SelectionError {
     },
     // A sharp cut gives the response the density of galaxies at its edge, which no galaxy by itself determines.
     #[error(
-        "`{0}` is a condition on a measured quantity, whose response to shear is not known, so the mean shear would be biased (expected steps, such as `step(snr, 10, 1.5) and step(size, 2.5)`, and conditions on positions and carried columns only). Try: step(NAME, THRESHOLD)"
+        "`{0}` is a condition on a measured quantity, whose response to shear is not known, so the mean shear would be biased (expected steps, such as `step(snr, 10, 1.5) and step(size, 2.5)`, and conditions on positions and on carried columns that --unsheared names). Try: step(NAME, THRESHOLD)"
     )]
     Condition(String),
     #[error(

@@ -3,6 +3,8 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
+use shearq_files::FileError;
+
 use crate::columns::Names;
 use crate::input::Input;
 use crate::recognition::words;
@@ -22,6 +24,40 @@ fn sheared_path(path: &Path) -> Option<(usize, String)> {
     let mut found = steps.enumerate().filter_map(|(at, step)| Some((at, step?)));
     let (at, step) = found.next_back()?;
     Some((step, [&all[..at], &[""], &all[at + 1..]].concat().join("_")))
+}
+
+// Whether a name states an artificial shear of the PSF, as `a_1p_psf.fits` of metacalibration does.
+fn is_of_psf(path: &Path) -> bool {
+    let words = words(&path.to_string_lossy());
+    let all: Vec<&str> = words.trim_matches('_').split('_').collect();
+    all.windows(2)
+        .any(|pair| pair[1] == "psf" && step_of(pair[0]).is_some_and(|step| step > 0))
+}
+
+/// Refuses files of galaxies behind a sheared PSF, which were averaged with the others.
+///
+/// # Errors
+/// If the name of a file states a sheared PSF, and `names` do not decline sheared catalogues.
+pub fn refuse_sheared_psfs(catalogues: &[Input], names: &Names) -> Result<(), FileError> {
+    let mut files = catalogues.iter().filter(|own| own.frame.is_none());
+    match files.find(|own| is_of_psf(&own.name)) {
+        Some(own) if !names.is_given(Role::ShearedCatalogue) => Err(FileError::new(
+            &own.name,
+            "the name states an artificial shear of the PSF (expected files of noshear, 1p, 1m, 2p and 2m). Try: without the files of a sheared PSF, or --columns version=none if the name states something else",
+        )),
+        _ => Ok(()),
+    }
+}
+
+/// What a catalogue lacks whose name states that it has no artificial shear, if no file of the sheared ones is given.
+pub fn without_sheared(catalogues: &[Input]) -> Option<String> {
+    let is_alone = |own: &&Input| own.frame.is_none() && own.parts.is_empty();
+    let mut files = catalogues.iter().filter(is_alone);
+    let own = files.find(|own| matches!(sheared_path(&own.name), Some((0, _))))?;
+    Some(format!(
+        "{} is named as the catalogue without artificial shear, and those of 1p, 1m, 2p and 2m are not given, so that nothing divides the ellipticities by their response. Try: all five files of each catalogue",
+        own.name.display()
+    ))
 }
 
 /// The catalogues of a list, in which files such as `a_noshear.fits`, `a_1p.fits` and `a_1m.fits` are one catalogue: their mean
@@ -89,6 +125,23 @@ pub fn with_sheared_files(catalogues: Vec<Input>, truth: &Truth, names: &Names) 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn files_of_sheared_psfs_are_refused_and_lonely_ones_named() {
+        let inputs = |names: &[&str]| -> Vec<Input> {
+            let paths = names.iter().map(|name| Path::new(name).to_path_buf());
+            paths.map(Input::from).collect()
+        };
+        let names = Names::default();
+        let of_psf = inputs(&["a_noshear.fits", "a_1p_psf.fits"]);
+        let error = refuse_sheared_psfs(&of_psf, &names).unwrap_err();
+        assert!(error.to_string().starts_with("a_1p_psf.fits: "), "{error}");
+        for name in ["a_1p.fits", "psf_1p.fits", "a_psf.fits"] {
+            refuse_sheared_psfs(&inputs(&[name]), &names).unwrap();
+        }
+        assert!(without_sheared(&inputs(&["b.csv", "a_noshear.csv"])).is_some());
+        assert!(without_sheared(&inputs(&["a_1p.csv", "b.csv"])).is_none());
+    }
 
     #[test]
     fn files_of_sheared_catalogues_are_one_catalogue() {

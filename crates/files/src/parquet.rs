@@ -29,7 +29,7 @@ use polars::prelude::{
 use polars_arrow::io::ipc::write::{default_ipc_fields, schema_to_bytes};
 use polars_parquet::parquet::page::CompressedPage;
 use polars_parquet::read::{
-    BasicDecompressor, ColumnChunkMetadata, PageReader, column_iter_to_arrays,
+    BasicDecompressor, ColumnChunkMetadata, Filter, PageReader, column_iter_to_arrays,
 };
 use polars_parquet::write::{CompressionOptions, Encoding, Version, WriteOptions, row_group_iter};
 use serde_json::{Map, Value, json};
@@ -265,7 +265,7 @@ pub(crate) fn first_texts(path: &Path) -> Result<Vec<(String, String)>, FileErro
     for field in fields {
         let name = field.name.to_string();
         let wanted = source.decoded(&Wanted::whole(field))?;
-        let chunk = source.read_chunk(&wanted, number)?;
+        let chunk = source.read_rows(&wanted, number, Some(1))?;
         let first = chunk.str().ok().and_then(|texts| texts.get(0));
         found.extend(first.map(|text| (name, text.to_owned())));
     }
@@ -523,6 +523,16 @@ impl<'a> Source<'a> {
 
     /// The rows of a decoded column in one row group.
     fn read_chunk(&mut self, wanted: &Wanted, number: usize) -> Result<Series, FileError> {
+        self.read_rows(wanted, number, None)
+    }
+
+    /// The same, or the first `most` rows.
+    fn read_rows(
+        &mut self,
+        wanted: &Wanted,
+        number: usize,
+        most: Option<usize>,
+    ) -> Result<Series, FileError> {
         let field = &wanted.field;
         let (path, name) = (self.path, field.name.as_str());
         let footer = self.footer.clone();
@@ -554,12 +564,12 @@ impl<'a> Source<'a> {
         if let Some(&sum) = self.checksums.get(&start) {
             check_sum(&bytes, sum).map_err(damaged)?;
         }
-        let series = guarded(path, &place, || decode(chunk, bytes, field))?;
-        if series.len() != group.num_rows() {
+        let series = guarded(path, &place, || decode(chunk, bytes, field, most))?;
+        let rows = most.map_or(group.num_rows(), |most| most.min(group.num_rows()));
+        if series.len() != rows {
             return Err(damaged(format!(
-                "found {} rows, expected {}",
-                series.len(),
-                group.num_rows()
+                "found {} rows, expected {rows}",
+                series.len()
             )));
         }
         wanted.taken(series).map_err(damaged)
@@ -603,8 +613,13 @@ fn start_of(chunk: &ColumnChunkMetadata) -> i64 {
     dictionary.unwrap_or(chunk.data_page_offset())
 }
 
-// The values in one column chunk of a file, as the type in `field`.
-fn decode(chunk: &ColumnChunkMetadata, bytes: Vec<u8>, field: &ArrowField) -> PolarsResult<Series> {
+// The values in one column chunk of a file, or the first `most`, as the type in `field`.
+fn decode(
+    chunk: &ColumnChunkMetadata,
+    bytes: Vec<u8>,
+    field: &ArrowField,
+    most: Option<usize>,
+) -> PolarsResult<Series> {
     let length = bytes.len();
     // Cloning it shares the bytes.
     let source = Cursor::new(bytes.into());
@@ -627,7 +642,7 @@ fn decode(chunk: &ColumnChunkMetadata, bytes: Vec<u8>, field: &ArrowField) -> Po
         vec![BasicDecompressor::new(pages(), Vec::new())],
         vec![&chunk.descriptor().descriptor.primitive_type],
         field.clone(),
-        None,
+        most.map(Filter::new_limited),
     )?;
     Series::try_from((field, arrays))
 }

@@ -257,6 +257,11 @@ pub fn read_from(
     }
 }
 
+/// The number that a field of a text table stands for: also a truth value (1 or 0), and NaN if it is missing.
+pub fn number_of(field: &str) -> Option<f64> {
+    text::value(field)
+}
+
 /// The first value of each column of texts. Of a text table, any field of the first row may be one.
 pub fn first_texts(place: &Place) -> Result<Vec<(String, String)>, FileError> {
     place.check()?;

@@ -600,8 +600,8 @@ impl<'a> Rows<'a> {
 const MISSING: [&str; 7] = ["null", "na", "n/a", "none", "--", "\\n", "<na>"];
 const WORDS_OF_TRUTH: [(&str, f64); 4] = [("true", 1.0), ("false", 0.0), ("t", 1.0), ("f", 0.0)];
 
-// A number, a truth value as 1 or 0, or a missing number.
-fn value(field: &str) -> Option<f64> {
+/// A number, a truth value as 1 or 0, or a missing number.
+pub(crate) fn value(field: &str) -> Option<f64> {
     number(field).or_else(|| {
         let word = field.trim().trim_matches('"');
         let is = |own: &&str| own.eq_ignore_ascii_case(word);

@@ -203,7 +203,10 @@ def bias(
         * ``version`` (noshear, 1p, 1m, 2p, 2m), or ``e1_1p e1_1m e2_2p e2_2m e1_2p e1_2m e2_1p e2_1m`` under artificial
           shears.
     preset : path, or several
-        Files that describe surveys, whose columns are then recognised, as for ``shearq bias --preset``.
+        Files that describe surveys, whose columns are then recognised, as for ``shearq bias --preset``: TOML with a table
+        ``[[survey]]`` of each, with ``name``, ``ellipticity`` ("shear" or "distortion"), ``required`` (columns that a
+        catalogue of it has in addition to e1 and e2) and ``[survey.columns]``, a column, a formula or "none" by role. A
+        catalogue of the survey must have all of these columns.
     ellipticity : {'shear', 'distortion', 'responsivity'}
         Type of e1 and e2; recognised by default. ``'distortion'`` converts each to a shear, ``'responsivity'`` divides the
         mean distortion by 2(1 − ⟨e_rms²⟩), with e_rms in ``rms_e``, or else e_rms² = ⟨χ²⟩/2 − ⟨σ²⟩ with σ in ``sigma_e``.

@@ -201,6 +201,10 @@ const IMPLAUSIBLE: f64 = 0.3;
 const IMPLAUSIBLE_SIGNIFICANCE: f64 = 5.0;
 
 fn implausible(result: &BiasResult, all: &Estimate) -> Option<String> {
+    // Another unit explains any m.
+    if other_unit(result, all).is_some() {
+        return None;
+    }
     let large = |m: &Measured| m.value.abs() > IMPLAUSIBLE + IMPLAUSIBLE_SIGNIFICANCE * m.error;
     let mut found = ["m1", "m2"].into_iter();
     let (name, m) = found.find_map(|name| Some((name, all.value(name).filter(large)?)))?;
@@ -227,6 +231,39 @@ fn implausible(result: &BiasResult, all: &Estimate) -> Option<String> {
         "{name} is {:+.2} (expected |m| below {IMPLAUSIBLE}). m = −2 is a wrong sign, m = −1 a wrong truth{other}.{shears}{divided}",
         m.value
     ))
+}
+
+// |m| of ellipticities without a response from which they are probably not calibrated. Methods that correct the PSF alone have less
+// (HSM's, docs/validation.md).
+const UNCALIBRATED: f64 = 0.1;
+
+// Ellipticities that nothing divides by their response.
+fn uncalibrated(result: &BiasResult, all: &Estimate) -> Option<String> {
+    let large = |m: &Measured| m.value.abs() > UNCALIBRATED + IMPLAUSIBLE_SIGNIFICANCE * m.error;
+    let mut found = ["m1", "m2"].into_iter();
+    let (name, m) = found.find_map(|name| Some((name, all.value(name).filter(large)?)))?;
+    if result.about.response {
+        return None;
+    }
+    Some(format!(
+        "{name} is {:+.2}, and no response is used. Ellipticities before a calibration usually have such an m: the responses of metacalibration in DES and UNIONS are 0.6 to 0.8, which is an m of −0.4 to −0.2 without them. Try: --columns R11=NAME,R22=NAME with their responses",
+        m.value
+    ))
+}
+
+// Mean response below which ellipticities above 2 are in another unit. Chosen by hand: with noise, e/R is above 1 in few rows.
+const MAX_RESPONSE_OF_SHAPES: f64 = 2.0;
+
+// Ellipticities beside responses that are in another unit: percent beside R11 gave m = 100 and the advice to leave R11 out.
+fn other_unit(result: &BiasResult, all: &Estimate) -> Option<String> {
+    let response = all.value("r1")?.value.abs();
+    let beyond = result.about.total().beyond[1];
+    (2 * beyond > all.galaxies as u64 && response < MAX_RESPONSE_OF_SHAPES).then(|| {
+        format!(
+            "{beyond} of {} rows have |e| above 2 beside a mean response of {response:.2}, so that e1 and e2 are in another unit than their response (expected |e| below 1). Percent? Try: --columns 'e1=e1/100,e2=e2/100'",
+            all.galaxies
+        )
+    })
 }
 
 // Share of the rows below which the effective number shows that few weights dominate.
@@ -425,7 +462,7 @@ fn notes(result: &BiasResult) -> Vec<String> {
             student_t(0.975, all.units - 1)
         ));
     }
-    notes.extend(implausible(result, all));
+    notes.extend(implausible(result, all).or_else(|| uncalibrated(result, all)));
     notes.extend(of_design(result).iter().map(|line| sentence(line)));
     let total = result.about.total();
     for (count, what) in [
@@ -445,6 +482,12 @@ fn notes(result: &BiasResult) -> Vec<String> {
         if count > 0 {
             notes.push(format!("Left out: {count} rows {what}."));
         }
+    }
+    let failed = total.missing + total.failed;
+    if failed > 0 {
+        notes.push(format!(
+            "Leaving out the {failed} rows that failed is a selection, because shear changes which measurements fail: m contains its effect. Try: a flag and responses of a method that measures all galaxies, or --paired for pairs."
+        ));
     }
     notes.extend(repeated(&result.about.catalogues));
     notes.extend(chosen_by_measurement(result));
@@ -520,7 +563,7 @@ const MANY_OF_ONE_SIGN: u64 = 50;
 // Lines about numbers that are no ellipticities: moduli and angles, percent, degrees, magnitudes. A response allows any scale.
 fn no_ellipticities(result: &BiasResult, all: &Estimate) -> Vec<String> {
     if result.about.response {
-        return Vec::new();
+        return other_unit(result, all).into_iter().collect();
     }
     let total = result.about.total();
     let used = all.galaxies as f64;

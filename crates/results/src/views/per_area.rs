@@ -8,6 +8,9 @@ use crate::bias::BiasResult;
 // Shape noise per component of the galaxies that the effective number counts: that of COSMOS (Leauthaud et al. 2007, ApJS 172, 219).
 const SHAPE_NOISE: f64 = 0.26;
 
+// Ratio of the effective number and that of detections above which shapes cancel. The error of 24 units is itself known to 14 %.
+const MAX_EFFECTIVE: f64 = 1.3;
+
 /// Adds columns to a table of bias: detections per arcmin², the error of a shear component from 1 arcmin², and the effective number.
 /// Each catalogue is of `area` arcmin².
 ///
@@ -29,15 +32,23 @@ pub fn add_per_area(table: &mut Table, result: &BiasResult, area: f64) {
     ] {
         table.headings.push(Heading::new(key, label));
     }
+    let mut most = 0.0_f64;
     for (row, bin) in table.rows.iter_mut().zip(&result.bins) {
         let all = bin.estimate.as_ref().ok();
         let density = all.map_or(0.0, |all| all.galaxies as f64 / (images * area));
         let error = all.and_then(error).unwrap_or(f64::NAN);
+        let effective = (SHAPE_NOISE / error).powi(2);
+        most = most.max(effective / density);
         row.extend([
             Cell::number(density, 2),
             Cell::number(error, 4),
-            Cell::number((SHAPE_NOISE / error).powi(2), 2),
+            Cell::number(effective, 2),
         ]);
+    }
+    if most > MAX_EFFECTIVE {
+        table.notes.push(format!(
+            "n_eff is up to {most:.1} times the number of detections (expected less than it): shapes cancel in c, as of rotated versions, or scatter by less than {SHAPE_NOISE}. Try: catalogues of other galaxies each"
+        ));
     }
     table.notes.push(match of_unit {
         true => format!(
