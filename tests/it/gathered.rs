@@ -407,6 +407,33 @@ fn each_galaxy_has_the_noise_of_its_place_and_of_its_light() {
 }
 
 #[test]
+fn psfs_of_rows_that_are_left_out_are_left_out() {
+    let folder = Folder::with_set(2);
+    folder.write("positions.csv", "x,y\n24.5,24.5\n9999,24.5\n72.5,24.5\n");
+    let round = |variance: f32| -> Vec<f32> {
+        let offset = |at: usize| at as f32 - 23.5;
+        let square = |at: usize| offset(at % 48).powi(2) + offset(at / 48).powi(2);
+        (0..48 * 48)
+            .map(|at| (-0.5 * square(at) / variance).exp())
+            .collect()
+    };
+    let psfs = [2.0, 4.0, 3.0].map(round);
+    write_cube(&folder, "psfs.fits", &psfs);
+    let from = "gather --exposure data/set02/galaxies-001.fits --positions positions.csv";
+    folder.said(&format!("{from} --psf psfs.fits --out cut"));
+    let found = stamps_of(&folder.at("cut/set01/psf-001.fits"), 48);
+    let peak = |psf: &[f32]| {
+        let sum: f32 = psf.iter().sum();
+        psf.iter().copied().fold(0.0, f32::max) / sum
+    };
+    assert_eq!(found.len(), 2);
+    for (found, expected) in found.iter().zip([&psfs[0], &psfs[2]]) {
+        // Single precision.
+        assert!((peak(found) / peak(expected) - 1.0).abs() < 1e-5);
+    }
+}
+
+#[test]
 fn exposures_of_one_call_are_epochs_or_say_why_not() {
     let folder = Folder::with_set(2);
     let (pixels, width) = pixels_of(&folder.at("data/set02/galaxies-001.fits"));

@@ -193,6 +193,7 @@ fn leave_out_of_chips(plans: &mut [Plan], all: &[Gathering<'_>]) -> Result<(), F
     for plan in plans {
         if let Some(positions) = &mut plan.positions {
             positions.keep(&plan.inside)?;
+            plan.kept.clone_from(&plan.inside);
             plan.stack.count = positions.all.len();
             plan.inside.retain(|inside| *inside);
         }
@@ -222,6 +223,7 @@ fn leave_out_elsewhere(plans: &mut [Plan], all: &[Gathering<'_>]) -> Result<(), 
         plan.stack.count = positions.all.len();
         let mut row = kept.iter();
         plan.inside.retain(|_| row.next() == Some(&true));
+        plan.kept = kept;
     }
     Ok(())
 }

@@ -184,6 +184,21 @@ mod tests {
         Wcs::of_header(&mut ImageReader::open(&path).unwrap()).unwrap()
     }
 
+    #[test]
+    fn a_wcs_with_a_letter_alone_is_named() {
+        let wcs = Wcs::of_keys(&Keys::new(BTreeMap::from([(
+            "CTYPE1A".into(),
+            "'RA---TAN'".into(),
+        )])));
+        assert_eq!(wcs.jacobian([1.0, 1.0]), None);
+        assert!(wcs.doubts()[0].contains("found CTYPE1A"));
+        assert!(
+            Wcs::of_keys(&Keys::new(BTreeMap::new()))
+                .doubts()
+                .is_empty()
+        );
+    }
+
     // The name of a header, its cards, and places with derivatives.
     type Header = (String, BTreeMap<String, String>, Vec<[f64; 8]>);
 

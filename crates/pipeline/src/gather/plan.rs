@@ -32,6 +32,8 @@ pub(super) struct Plan {
     pub(super) positions: Option<Positions>,
     /// Whether these are on the exposure.
     pub(super) inside: Vec<bool>,
+    /// Which rows of their table were not left out.
+    pub(super) kept: Vec<bool>,
     pub(super) stack: Stack,
     pub(super) messages: Vec<String>,
 }
@@ -203,6 +205,7 @@ impl Plan {
         Ok(Plan {
             positions: None,
             inside: Vec::new(),
+            kept: Vec::new(),
             stack,
             messages,
         })
@@ -238,6 +241,7 @@ impl Plan {
                 differs: None,
                 fault_of_cube: None,
             },
+            kept: vec![true; inside.len()],
             inside,
             positions: Some(positions),
             messages,

@@ -70,18 +70,29 @@ pub(super) fn gather_psfs(
     let (count, fine) = (stack.count, stack.side);
     let side = fine / oversampling;
     // Headers of finer pixels state another scale.
-    let (wcs, pixels_of_all) = match oversampling {
+    let (wcs, mut pixels_of_all) = match oversampling {
         1 => (stack.wcs.clone(), stack.pixels()),
         _ => (Wcs::default(), Vec::new()),
     };
     messages.extend(small(&files.paths[0], side));
+    // A cube may have the PSFs of all rows of the positions, also of those that are left out.
+    let kept = Some(&plan.kept).filter(|kept| kept.len() == count && count != mosaic.galaxies);
+    let count = kept.map_or(count, |_| mosaic.galaxies);
+    if let Some(kept) = kept {
+        let mut rows = kept.iter();
+        pixels_of_all.retain(|_| rows.next() == Some(&true));
+    }
     check_count(&files.paths[0], count, mosaic)?;
     let path = data.psf_star(id.set, id.image);
     let mut writer = StarWriter::create(&path, count, side, &wcs)?;
     let mut planes = PlaneReader::of(files);
     let finer = (oversampling > 1).then(|| Oversampling::new((fine, fine), oversampling));
     let finer = finer.transpose();
+    let mut rows = kept.into_iter().flatten();
     while let Some((origin, pixels)) = planes.next()? {
+        if rows.next() == Some(&false) {
+            continue;
+        }
         let pixels = central(pixels, planes.sides(), fine);
         let finer = finer
             .as_ref()

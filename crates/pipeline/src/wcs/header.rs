@@ -73,6 +73,14 @@ impl Keys {
         self.values.contains_key(key)
     }
 
+    /// What is said of a WCS that has a letter, such as CTYPE1A, where there is none without.
+    fn lettered(&self) -> Option<String> {
+        let letter = ('A'..='Z').find(|letter| self.has(&format!("CTYPE1{letter}")))?;
+        Some(format!(
+            "the WCS has the letter {letter} (found CTYPE1{letter}), which is not read (expected keys without a letter). Ellipticities are along the pixel axes"
+        ))
+    }
+
     /// An element of the matrices CD and PC, also by its name before the standard, such as PC001002 (Pan-STARRS).
     fn element(&self, matrix: &str, [i, j]: [usize; 2]) -> Option<f64> {
         let found = self.number(&format!("{matrix}{i}_{j}"));
@@ -217,7 +225,12 @@ impl Wcs {
             ..Wcs::default()
         };
         let matrix = match matrix {
-            Ok(None) => return only_scale(None),
+            Ok(None) => {
+                return Wcs {
+                    doubts: keys.lettered().into_iter().collect(),
+                    ..only_scale(None)
+                };
+            }
             Ok(Some(matrix)) => matrix,
             Err(damage) => return only_scale(None).damaged(damage),
         };
