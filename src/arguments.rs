@@ -540,7 +540,7 @@ choices! {
     }
     Template {
         Linear: "linear", "The linear network in closed form (recommended)";
-        Network: "network", "The Hopfield network of the paper";
+        Network: "network", "The Hopfield network of Nurbaeva et al. (2015)";
     }
     Square {
         Crop: "crop", "By the central square";

@@ -21,7 +21,7 @@ use shearq_render::page::Page;
 use shearq_results::views::pages::{steps_figure, steps_row};
 use shearq_simulate::set::SimulationSettings;
 
-/// Reproduce the figures and tables of the paper on simulated data.
+/// Reproduce the figures and tables of Nurbaeva et al. (2015) on simulated data.
 ///
 /// Sect. 4: the regularisation parameter λ on synthetic galaxies (Figs 4 to 7). Sect. 5: the seven configurations of
 /// Table 1 on 24 sets (Table 1, Figs 8 to 11), simulated and measured in memory.
@@ -46,7 +46,7 @@ pub(crate) struct Arguments {
     /// Configuration of Table 1. May be given several times [default: all seven].
     #[arg(long, value_name = "NAME")]
     submission: Vec<String>,
-    /// Number of synthetic galaxies for λ; the paper has 10000.
+    /// Number of synthetic galaxies for λ; Nurbaeva et al. (2015) have 10000.
     #[arg(long, value_name = "N", default_value_t = 200, value_parser = clap::value_parser!(u64).range(10..=1_000_000))]
     galaxies: u64,
     /// Seed of all random numbers.
@@ -116,7 +116,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         page.figure(
             "fig3-steps",
             &steps_figure(RAW, steps),
-            "As Fig. 3 of the paper: from a stamp to its clipped autocorrelation, for a galaxy at S/N 10, 20 and 40.",
+            "As Fig. 3 of Nurbaeva et al. (2015): from a stamp to its clipped autocorrelation, for a galaxy at S/N 10, 20 and 40.",
         )?;
     }
     page.section("Choice of λ (Sect. 4)", SECT_FOUR);

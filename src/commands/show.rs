@@ -15,7 +15,7 @@ use shearq_pipeline::measure::ImageSource;
 use shearq_render::figure::{Figure, PictureFormat};
 use shearq_results::views::pages::{steps_figure, steps_row};
 
-/// Plot each processing step of single galaxies, as in Fig. 3 of the paper.
+/// Plot each processing step of single galaxies, as in Fig. 3 of Nurbaeva et al. (2015).
 ///
 /// Each row shows a galaxy: its stamp, the PSF, the deconvolved galaxy, the residual, the autocorrelation (ACF) of
 /// the deconvolved galaxy, and the part of the ACF whose moments are measured. The residual is the stamp minus the

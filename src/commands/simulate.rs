@@ -20,7 +20,7 @@ use shearq_simulate::set::SimulationSettings;
 
 /// Write simulated images with their PSFs and true shear: sets of stamps like GREAT10's, scenes, or a branch of GREAT3.
 ///
-/// The sets follow Table 2 of the paper. Sets 1 to 3 have galaxies of bulge and disc at S/N 20 and a Moffat PSF of
+/// The sets follow Table 2 of Nurbaeva et al. (2015). Sets 1 to 3 have galaxies of bulge and disc at S/N 20 and a Moffat PSF of
 /// 3.4 px. The others differ by S/N 10 (4 to 6), S/N 40 (7 to 9), many S/N (10 to 12); small (13, 14), large (15, 16)
 /// and many sizes (17, 18); a Kolmogorov PSF (19, 20); many bulge fractions (21, 22); displaced bulges (23, 24).
 ///

@@ -101,6 +101,6 @@ fn list() -> anyhow::Result<Table> {
     table.column("description", "Description", &rows, |(_, entry)| {
         Cell::text(&entry.configuration.description)
     });
-    table.notes = vec!["Published: Table 1 of the paper.".into()];
+    table.notes = vec!["Published: Table 1 of Nurbaeva et al. (2015).".into()];
     Ok(table)
 }

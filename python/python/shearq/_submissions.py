@@ -163,7 +163,7 @@ def submission(of: SubmissionLike) -> Configuration:
 
 
 def submissions() -> dict[str, Configuration]:
-    """The embedded submissions by name: those of the paper's Table 1 in its order, and the linear ones.
+    """The embedded submissions by name: those of Table 1 of Nurbaeva et al. (2015) in its order, and the linear ones.
 
     Returns
     -------
