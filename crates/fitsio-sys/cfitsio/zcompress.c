@@ -224,7 +224,7 @@ int uncompress2mem_from_mem(
 
         if (err == Z_STREAM_END) { /* We reached the end of the input */
 	    break; 
-        } else if (err == Z_OK || err == Z_BUF_ERROR) { /* need more space in output buffer */
+        } else if ((err == Z_OK || err == Z_BUF_ERROR) && d_stream.avail_out == 0) { /* need more space in output buffer */
 	    /* Z_BUF_ERROR means need more input data to make progress */
 
             if (mem_realloc) {   
