@@ -163,7 +163,11 @@ def main():
     shapes = e.mean((0, 1)) / r.mean((0, 1))[:, None]
     least = bound(shapes, noise_of(stamps, snr))
     print(f"{count} galaxies, seed {options.seed}, S/N {options.snr}: bound of the total scatter {least:.4f}")
-    for name, found in (*ours.items(), (best, theirs[best])):
+    # A larger C lowers the error of m of FPFS, for a little more scatter.
+    kernel, offset = best.split(", C ")
+    twice = f"{kernel}, C {2 * float(offset)}"
+    shown = [best] + [twice] * (twice in theirs)
+    for name, found in (*ours.items(), *((name, theirs[name]) for name in shown)):
         def of(weights, found=found):
             return (*figures(*found, weights), figures(*found, weights)[0] / figures(*theirs[best], weights)[0])
 
