@@ -33,8 +33,9 @@ const MIN_PIECE: f32 = 0.65;
 // Faintest piece in units of the upper quartile of those beyond the galaxy. Wings of an exponential disc are as uniform from a scale of
 // 28 px on.
 const MIN_UNIFORMITY: f32 = 0.7;
-// In pixels from a trail, and what is there in units of the trail: a fifth of it if the FWHM is 8 px. Chosen by hand.
+// In pixels from a trail. Chosen by hand.
 const BESIDE_TRAIL: f32 = 8.0;
+// What is there in units of the trail, which leaves a fifth of it if its FWHM is 8 px. Chosen by hand.
 const MAX_BESIDE: f32 = 0.35;
 // In pixels from the middle of a trail, where a Moffat PSF of FWHM 3.4 px leaves 3 % of its light.
 const TRAIL_HALF_WIDTH: f32 = 6.0;
