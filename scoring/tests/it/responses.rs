@@ -2,8 +2,8 @@
 use ndarray::Array2;
 use shearq_quantities::fourier::Complex64;
 use shearq_scoring::{
-    AddedImages, Choice, Convention, Definition, Fault, FieldSum, Grid, OddResponse, Options, ScoredImages,
-    SetScorer, SetSession, TrueShear,
+    AddedImages, Choice, Convention, Definition, Fault, FieldSum, Grid, OddResponse, Options,
+    ScoredImages, SetScorer, SetSession, TrueShear,
 };
 
 use crate::common::{Content, Normal, field, rows, sum_of, truth};
@@ -237,7 +237,11 @@ fn weights_are_no_fault_of_the_order() {
     assert!(found.odd.responses.is_empty(), "{:?}", found.odd);
     let found = of_weighted(&shear, of_galaxies, Definition::Leaderboard);
     let is_uncorrelated = |fault: &Fault| matches!(fault, Fault::Uncorrelated { .. });
-    assert!(!found.findings.iter().any(is_uncorrelated), "{:?}", found.findings);
+    assert!(
+        !found.findings.iter().any(is_uncorrelated),
+        "{:?}",
+        found.findings
+    );
 }
 
 #[test]
@@ -248,7 +252,10 @@ fn missing_galaxies_explain_a_low_response() {
     let [Fault::Biased { m, missing, .. }] = found.findings[..] else {
         panic!("{:?}", found.findings);
     };
-    assert!((m + 0.5).abs() < 0.05 && (missing - 0.5).abs() < 1e-12, "{m} {missing}");
+    assert!(
+        (m + 0.5).abs() < 0.05 && (missing - 0.5).abs() < 1e-12,
+        "{m} {missing}"
+    );
     let found = of_weighted(&shear, half, Definition::Corrected);
     assert_eq!(found.findings, []);
 }

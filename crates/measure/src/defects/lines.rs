@@ -7,7 +7,7 @@
 use multiversion::multiversion;
 use shearq_quantities::statistics::{SCATTER, median};
 
-use super::{DIRECTIONS, FAINT_SHARE, LightLimits, MIN_DEPARTURE};
+use super::limits::{DIRECTIONS, FAINT_SHARE, LightLimits, MIN_DEPARTURE};
 
 // Of the pixels of a line that depart in its direction: noise has half, so that one cosmic ray is no line. Chosen by hand.
 const MIN_DEPARTING_SHARE: f32 = 0.75;
