@@ -1,6 +1,9 @@
 """Models of PSFs that vary over an image."""
 
+import io
 import logging
+import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -168,3 +171,16 @@ def test_models_depend_on_properties(field):
         shearq.measure(stamps, exact, noise=1.0, x=x, y=y)
     with pytest.raises(TypeError, match="properties: found with a PSF of type ndarray"):
         shearq.measure(stamps, np.ones((48, 48)), properties={"a": 1})
+
+
+def test_a_package_that_a_model_needs_is_named(monkeypatch, capsys):
+    from shearq import _drawn_psfs
+
+    def read(_):
+        raise ModuleNotFoundError("No module named 'pixmappy'", name="pixmappy")
+
+    monkeypatch.setitem(sys.modules, "piff", SimpleNamespace(PSF=SimpleNamespace(read=read)))
+    monkeypatch.setattr(sys, "argv", ["_drawn_psfs", "model.piff", "0", "1", "48"])
+    monkeypatch.setattr(sys, "stdin", io.StringIO("1 1\n"))
+    assert _drawn_psfs.main() == 1
+    assert "pip install git+https://github.com/gbernstein/pixmappy" in capsys.readouterr().err

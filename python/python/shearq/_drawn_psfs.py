@@ -11,6 +11,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+# Packages that models need and PyPI has not: the WCS of DES.
+_SOURCES = {"pixmappy": "git+https://github.com/gbernstein/pixmappy"}
 # Galaxies that are drawn at a time.
 _BLOCK = 64
 
@@ -42,7 +44,8 @@ def main() -> int:
     try:
         draw(path, *map(int, numbers), sys.stdin.read(), sys.stdout.buffer)
     except ImportError as error:
-        print(f"error: {path}: {error}. Try: {sys.executable} -m pip install piff", file=sys.stderr)
+        package = error.name or "piff"
+        print(f"error: {path}: {error}. Try: {sys.executable} -m pip install {_SOURCES.get(package, package)}", file=sys.stderr)
         return 1
     except Exception as error:
         print(f"error: {path}: {error}", file=sys.stderr)
