@@ -1,4 +1,4 @@
-"""A study: detection whose response to shear is known in closed form, on scenes of `shearq simulate --scenes`; not in the product.
+"""A study: detection whose response to shear is known in closed form, on scenes of `shearq simulate --scenes`: a plain form of what `shearq detect` does, without its lengths.
 
     shearq simulate --scenes 60 --side 1500 --border 80 --constant-shear 0.04,0.04 --opposite --rotated --opposite-noise --out scenes
     python tests/stress/detection.py scenes

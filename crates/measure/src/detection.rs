@@ -291,7 +291,7 @@ impl Detector {
         let (parts, _) = sums.as_chunks::<COUNT>();
         let [u, first, second] = [0, 1, 2].map(|k| parts[k].map(f64::from));
         // A light far below zero is no galaxy but a wrong sky, and would be divided by.
-        if !(u[M00] > -0.5 * self.steps.softening) || !sums.iter().all(|sum| sum.is_finite()) {
+        if !sums.iter().all(|sum| sum.is_finite()) || u[M00] <= -0.5 * self.steps.softening {
             return None;
         }
         let (weight, of) = self.steps.weighted(&u)?;

@@ -250,6 +250,9 @@ pub struct NoisePlan {
 impl NoisePlan {
     /// For stamps of `full` pixels a side and a covariance of lags up to `max_lag` along each axis; `sky` as a configuration
     /// treats it.
+    ///
+    /// # Errors
+    /// If the stamps are too small for their blocks.
     pub fn new(full: usize, max_lag: usize, sky: Option<SkySource>) -> Result<Self, MeasureError> {
         if full < MIN_STAMP_SIDE {
             let expected = format!(

@@ -371,13 +371,16 @@ fn measured_noise(
     })
 }
 
+/// A column of catalogues: its name and its values.
+pub type DetectionColumn<T> = (&'static str, fn(&Detection) -> T);
+
 /// Columns of catalogues of detections, for the command line and Python: places in FITS pixels, and what follows them. `flags` and
 /// `pixels` are whole numbers.
-pub const PLACE: [(&str, fn(&Detection) -> f64); 2] = [
+pub const PLACE: [DetectionColumn<f64>; 2] = [
     ("x", |own| own.centre[0] + 1.0),
     ("y", |own| own.centre[1] + 1.0),
 ];
-pub const COLUMNS: [(&str, fn(&Detection) -> f64); 8] = [
+pub const COLUMNS: [DetectionColumn<f64>; 8] = [
     ("e1", |own| own.e[0]),
     ("e2", |own| own.e[1]),
     ("R11", |own| own.response[0][0]),
@@ -388,14 +391,14 @@ pub const COLUMNS: [(&str, fn(&Detection) -> f64); 8] = [
     ("selection", |own| own.weight),
     ("snr", |own| own.snr),
 ];
-pub const WHOLE: [(&str, fn(&Detection) -> i64); 2] =
+pub const WHOLE: [DetectionColumn<i64>; 2] =
     [("flags", |_| 0), ("pixels", |own| own.pixels as i64)];
 
 fn columns(found: &[Detection], wcs: &Wcs) -> PolarsResult<DataFrame> {
-    let real = |(name, of): &(&str, fn(&Detection) -> f64)| {
+    let real = |(name, of): &DetectionColumn<f64>| {
         Column::new((*name).into(), found.iter().map(of).collect::<Vec<f64>>())
     };
-    let whole = |(name, of): &(&str, fn(&Detection) -> i64)| {
+    let whole = |(name, of): &DetectionColumn<i64>| {
         Column::new((*name).into(), found.iter().map(of).collect::<Vec<i64>>())
     };
     let mut columns: Vec<Column> = PLACE.iter().map(real).collect();
