@@ -7,10 +7,9 @@
 
 Measure    measure, measure_blocks, detect, from_galsim, from_ngmix, from_meds, from_exposure, FunctionalPsf, DataWarning, set_threads, get_threads
 Catalogues Catalogue, concatenate, mean_shear, MeanShear, Flag, read, read_all
-Score      score, galaxies, compare, power_spectrum, aperture_mass, Score, METRICS
+Score      score, galaxies, Galaxies, compare, power_spectrum, aperture_mass, Score, METRICS
 Validate   bias, bias_sums, Bias, BiasSums, null_tests
-Simulate   simulate, Simulation, SimulatedImage
-Settings   submission, submissions, Configuration
+Simulate   simulate, Simulation, SimulatedImage; settings: submission, submissions, Configuration
 
 help(shearq.measure) explains each. Images are indexed [y, x]. e1 > 0 is elongation along +x, e2 > 0 along x = y. Noise
 is a standard deviation per pixel in image units. Results equal those of the command line, for any number of threads.
