@@ -37,8 +37,8 @@ use crate::error::MeasureError;
 use crate::noise::StampNoise;
 use crate::psf::{gaussian_variance, noise_equivalent_area};
 
-// Radius of the square of pixels under the functionals, in σ of their Gaussians. Weights beyond it have up to 10⁻³ of the sum of all, in
-// a test with Moffat PSFs of β = 2.5 and 3 and a Kolmogorov one.
+// Radius of the square of pixels under the functionals, in σ of their Gaussians. Weights beyond it are up to 2·10⁻³ of all, but of a
+// blend behind Moffat PSFs of β = 2.5 and 3 and a Kolmogorov one they change the functionals by 10⁻⁶ of its light.
 const KERNEL_SIGMAS: f64 = 6.5;
 // Two blocks of fewer margins lose most of their pixels.
 const MIN_MARGINS_PER_BLOCK: usize = 8;
