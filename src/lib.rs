@@ -71,7 +71,7 @@ use shearq_render::terminal::fitted;
 /// 1. `gather` makes a data folder from your stamps and PSFs. `simulate` makes a folder of simulated data.
 ///
 /// 2. `measure` writes a catalogue of ellipticities and responses to shear per image. `detect` does so for an exposure, without
-/// `gather`, with the response of its detection.
+///    `gather`, with the response of its detection.
 ///
 /// 3. `mean` prints the shear of a set with one shear. `shear` writes a shear per galaxy. `score` compares catalogues with a known shear field.
 ///

@@ -131,7 +131,7 @@ impl Survey {
         let mut columns = self.columns.iter();
         let absent = columns.find(|(key, column)| !known(key, column));
         let mut required = self.required.iter();
-        let is_required = |own: &&String| !there(own) && !(is_renamed && is_own_weight(own));
+        let is_required = |own: &&String| !(there(own) || is_renamed && is_own_weight(own));
         let absent = absent.map(|(_, column)| column);
         absent
             .or_else(|| required.find(is_required))

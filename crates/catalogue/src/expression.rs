@@ -111,6 +111,9 @@ const OPERATORS: [&[Binary]; 6] = [
     &[("*", |a, b| a * b), ("/", |a, b| a / b)],
 ];
 
+// Index in `OPERATORS`.
+const COMPARISONS: usize = 2;
+
 fn truth(of: bool) -> f64 {
     f64::from(u8::from(of))
 }
@@ -298,11 +301,19 @@ impl<'a> Parser<'a> {
         let mut node = self.level(level + 1)?;
         while let Some(operator) = operators.iter().find(|(token, _)| self.take(token)) {
             // The loosest three levels compare, and bits jump.
-            self.sharp |= level < 4;
+            self.sharp |= level <= COMPARISONS + 1;
             let right = self.level(level + 1)?;
             node = Node::Binary(operator, Box::new(node), Box::new(right));
+            // `5 < snr < 10` would compare a truth with 10, and `snr > 10 & size > 2` the bits of 10.
+            if level == COMPARISONS
+                && operators
+                    .iter()
+                    .any(|(token, _)| self.rest().starts_with(token))
+            {
+                return Err(self.expected("`and` between two comparisons, or brackets"));
+            }
         }
-        if level == 2 && self.rest().starts_with('=') {
+        if level == COMPARISONS && self.rest().starts_with('=') {
             return Err(self.expected("`==` to compare"));
         }
         Ok(node)
@@ -614,6 +625,8 @@ mod tests {
             ("a b", "found `b`, expected an operator"),
             ("a ? 2", "found `? 2`"),
             ("a = 2", "found `= 2`, expected `==` to compare"),
+            ("5 < a < 10", "found `< 10`, expected `and` between two"),
+            ("a > 5 & b > 2", "found `> 2`, expected `and` between two"),
             ("a == 'b", "ends with the same quotation mark"),
             ("a + 1 == 'b'", "found `'b'`, expected a number or a column"),
             ("step(snr > 3)", "a comma and the threshold"),

@@ -183,13 +183,25 @@ impl Source {
         if self.sheared_flags {
             sheared.extend(self.places.all((Role::Flag, 1)));
         }
-        sheared.extend(self.places.of((Role::Weight, 1)));
+        let sheared_weight = self.places.of((Role::Weight, 1));
+        sheared.extend(sheared_weight);
         if !sheared.is_empty() {
             let names: Vec<&str> = sheared.iter().map(|place| self.name(*place)).collect();
             lines.push(format!(
-                "Selection response, with that of the weights: from {} and the other sheared catalogues.",
+                "Selection response: from {} and the other sheared catalogues.",
                 names.join(", ")
             ));
+            let alone = [
+                (Role::Flag, self.sheared_flags),
+                (Role::Weight, sheared_weight.is_some()),
+            ];
+            for (role, is_sheared) in alone {
+                if let (Some(name), false) = (self.columns.of(role), is_sheared) {
+                    lines.push(format!(
+                        "`{name}` has no sheared versions, so that its part of the selection response is missing, and m is wrong if it depends on the shape. Try: columns {name}_1p, {name}_1m, {name}_2p and {name}_2m"
+                    ));
+                }
+            }
         }
         if self.sheared.is_some() {
             lines.push("Files or tables named noshear, 1p, 1m, 2p and 2m are one catalogue, whose response is the difference of their means. Try: --columns version=none if files of these names have test shears.".into());

@@ -209,8 +209,8 @@ fn responses_are_those_of_sheared_blends() {
                     .pixel(pixel.place, &sums)
                     .map_or([0.0; 2], |own| own.e)
             });
-            for k in 0..2 {
-                let slope = (e[0][k] - e[1][k]) / (2.0 * h);
+            for (k, (plus, minus)) in e[0].iter().zip(e[1]).enumerate() {
+                let slope = (plus - minus) / (2.0 * h);
                 // Rounding of the sums over 2h, and terms of third order.
                 close(pixel.response[k][g], slope, 4e-3 * largest);
             }
