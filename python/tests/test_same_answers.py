@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import shearq
+from conftest import same_bits
 from shearq import adapters
 
 fits = pytest.importorskip("astropy.io.fits", reason="files are written by astropy")
@@ -161,6 +162,8 @@ def test_maps_of_noise_are_those_of_gather(data, tmp_path):
     found = shearq.measure(data.stamps, data.psf, noise=sigmas, wcs=MATRIX)
     for name in ("e1", "e2", "R11", "noise", "snr"):
         assert np.allclose(found[name], gathered[name], rtol=1e-4, atol=2e-6), name
+    marked = np.where(np.isinf(sigmas), 1e15, sigmas)
+    assert same_bits(shearq.measure(data.stamps, data.psf, noise=marked, wcs=MATRIX), found)
     with pytest.raises(ValueError, match="noise: found -1 on stamp 0; expected positive"):
         shearq.measure(data.stamps, data.psf, noise=-np.ones_like(sigmas))
     with pytest.raises(ValueError, match="noise: found maps of shape"):

@@ -404,6 +404,10 @@ def _epoch(k: int, epoch: Mapping[str, Any]) -> dict[str, Any]:
         raise type(error)(f"epochs: epoch {k}: {error}") from None
 
 
+# As in crates/pipeline/src/gather/maps.rs: variance in units of the median of a stamp from which it marks a bad pixel.
+MIN_BAD_RATIO = 1e5
+
+
 def _levels(stamps: NDArray[Any], sigmas: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.float64]]:
     """Stamps without the pixels of infinite noise, and the level of each from maps of the noise, as `gather` takes it from maps of variances."""
     if sigmas.shape != stamps.shape:
@@ -414,7 +418,11 @@ def _levels(stamps: NDArray[Any], sigmas: NDArray[Any]) -> tuple[NDArray[Any], N
     stamps = stamps.copy()
     levels = np.empty(len(stamps))
     for k, (stamp, own) in enumerate(zip(stamps, sigmas)):
-        stamp[~np.isfinite(own)] = np.nan
+        good = np.isfinite(own)
+        positive = np.sort(own[good & (own > 0)])
+        if len(positive):
+            good &= own < np.sqrt(MIN_BAD_RATIO) * positive[len(positive) // 2]
+        stamp[~good] = np.nan
         seen = np.isfinite(stamp)
         if (own[seen] <= 0).any():
             raise ValueError(f"noise: found {own[seen].min():g} on stamp {k}; expected positive standard deviations, or inf for bad pixels")
