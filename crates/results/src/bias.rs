@@ -652,6 +652,12 @@ impl Summed {
         {
             return Err(BiasFailure::SignsDiffer(own.of, theirs.of));
         }
+        // Other programs do not state theirs.
+        if let (Some(own), Some(theirs)) = (&self.about.frame, &other.about.frame)
+            && own != theirs
+        {
+            return Err(BiasFailure::FramesDiffer(own.clone(), theirs.clone()));
+        }
         self.check_images(other)?;
         let ((design, own), (their_design, theirs)) = (self.grouped()?, other.grouped()?);
         let designs = [(design, own.unit), (their_design, theirs.unit)];
@@ -931,5 +937,27 @@ mod tests {
             assert!(copied.get() <= 12 * count, "{}", copied.get());
         }
         assert_eq!(joined([] as [Result<_, ()>; 0], join), Ok(None));
+    }
+
+    #[test]
+    fn ellipticities_in_other_frames_are_not_compared() {
+        let in_frame = |frame: Option<&str>| -> Summed {
+            let about = serde_json::json!({
+                "version": "", "catalogues": [], "program": "", "truth": true, "response": false,
+                "response_column": false, "matched": true, "cells": { "axes": [] }, "paired": false,
+                "measured": [], "columns": [], "frame": frame,
+            });
+            Summed {
+                sums: UnitSums::new(Layout::default(), 0, 0),
+                about: serde_json::from_value(about).unwrap(),
+                populations: Vec::new(),
+            }
+        };
+        let differ = |own, other| {
+            let found = in_frame(own).difference(&in_frame(other));
+            matches!(found, Err(BiasFailure::FramesDiffer(..)))
+        };
+        assert!(differ(Some("pixel"), Some("sky")));
+        assert!(!differ(Some("sky"), Some("sky")) && !differ(None, Some("sky")));
     }
 }

@@ -81,6 +81,10 @@ pub enum BiasFailure {
     #[error("the catalogues cannot be compared: e2 of one follows the true g2 of sign {}, of the other {}. Try: --truth-sign", word(*.0), word(*.1))]
     SignsDiffer(TruthSign, TruthSign),
     #[error(
+        "the catalogues cannot be compared (found ellipticities in the {0} frame and in the {1} frame, expected one frame). Try: measure one of them again in the other's frame"
+    )]
+    FramesDiffer(String, String),
+    #[error(
         "the catalogues cannot be compared (found {own} beside {other}, expected the same images in the same order on both sides)"
     )]
     ImagesDiffer { own: String, other: String },
