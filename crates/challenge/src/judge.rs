@@ -316,8 +316,8 @@ impl Judge {
         let team = team_of(&sending, Some(&content(&sending, most)?), None);
         check_team(&team).map_err(|error| FileError::new(entry, error))?;
         let counts = |received| !self.challenge.rules.is_early(received);
-        match Receipt::read(&self.key, entry, &sha256) {
-            Ok(Some(earlier))
+        match Receipt::earlier(&self.key, entry, &sha256)? {
+            Some(earlier)
                 if team_key(&earlier.team) == team_key(&team) && counts(earlier.received) =>
             {
                 Ok(Receipt::path(entry))

@@ -330,10 +330,25 @@ impl Receipt {
         Some(receipt.with_file_name(name.strip_suffix(Receipt::ENDING)?))
     }
 
+    fn stored(path: &Path) -> Result<Option<Self>, FileError> {
+        refuse_link(path)?;
+        read_toml(path, "receipt")
+    }
+
+    /// The receipt that the content has already; `None` if there is no receipt, or one of other content.
+    pub fn earlier(key: &Key, entry: &Path, sha256: &str) -> Result<Option<Self>, FileError> {
+        let stored = Receipt::stored(&Receipt::path(entry));
+        let earlier = stored.and_then(|stored| match stored {
+            Some(receipt) if receipt.sha256 == sha256 => Receipt::read(key, entry, sha256),
+            _ => Ok(None),
+        });
+        earlier
+            .map_err(|error| error.hint("move the receipt away and sign again, for a later time"))
+    }
+
     pub fn read(key: &Key, entry: &Path, sha256: &str) -> Result<Option<Self>, FileError> {
         let path = Receipt::path(entry);
-        refuse_link(&path)?;
-        let Some(receipt) = read_toml::<Receipt>(&path, "receipt")? else {
+        let Some(receipt) = Receipt::stored(&path)? else {
             return Ok(None);
         };
         if receipt.sha256 != sha256 {
@@ -402,11 +417,20 @@ mod tests {
         assert_eq!(read(&key).unwrap(), Some(receipt.clone()));
         assert!(read(&Key::new("pilot", 1, None)).is_err());
         assert!(Receipt::read(&key, &entry, "2f").is_err());
+        let earlier = |sha256| Receipt::earlier(&key, &entry, sha256);
+        assert_eq!(earlier("1f").unwrap(), Some(receipt.clone()));
+        assert_eq!(earlier("2f").unwrap(), None);
         let text = toml::to_string(&receipt).unwrap();
         for (from, to) in [("-24T", "-23T"), ("\"A\"", "\"B\""), ("pilot", "pirat")] {
             std::fs::write(&path, text.replacen(from, to, 1)).unwrap();
             let error = read(&key).unwrap_err();
             assert!(error.text().contains("not signed"), "{to}: {error}");
+        }
+        // A receipt of a later time must not take its place.
+        for broken in [&text[..40], &text.replacen("-24T", "-23T", 1)] {
+            std::fs::write(&path, broken).unwrap();
+            let error = earlier("1f").unwrap_err();
+            assert!(error.text().contains("move the receipt away"), "{error}");
         }
     }
 
