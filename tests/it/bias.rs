@@ -808,6 +808,10 @@ fn simulated_galaxies_are_weighted_to_those_of_a_survey() {
     survey.push_str("60,1,2,low,0,0\n20,9,0,low,0,0\n20,1,50,low,1,0\n");
     folder.write("survey.csv", survey);
     let command = format!("bias {files} --bins snr:5,10,50,90 --bins size:0.5,1.5,2.5");
+    // Weights and flags are not left out because of a fault of other columns.
+    folder.write("odd.csv", "snr,size,w,R11\n20,1,1,0.7\n");
+    let refused = format!("{command} --like odd.csv");
+    folder.refuses(&refused, "none for R22 (found snr, size, w, R11)");
     let found = folder.json(&format!("{command} --like survey.csv"));
     let rows = found["rows"].as_array().unwrap();
     let mean = |weights: [f64; 4]| {

@@ -114,17 +114,18 @@ pub(super) fn populations(
     let names = request.names.within(&known);
     let columns = Columns::find(path, &known, &names, false);
     let is_bare = columns.is_err();
+    // Other faults remain with ellipticities.
     let columns = columns.or_else(|_| {
         let shapes = ["e1", "e2"].map(str::to_owned);
         Columns::find(path, &[&known[..], &shapes].concat(), &names, false)
-    });
-    let columns = columns.ok();
-    let weight = (columns.as_ref()).and_then(|columns| columns.of(Role::Weight).map(str::to_owned));
+            .map_err(|error| error.with_words(", e1, e2", ""))
+    })?;
+    let weight = columns.of(Role::Weight).map(str::to_owned);
     let weight = match is_bare && !names.is_given(Role::Weight) {
         true => weight.or_else(|| WEIGHTS.iter().find_map(|name| there(name))),
         false => weight,
     };
-    let flags = (columns.as_ref()).map_or_else(Vec::new, |columns| columns.flags.clone());
+    let flags = columns.flags.clone();
     let tomography = match &survey.tomography {
         Some(name) => Some(there(name).ok_or_else(|| unknown(&place, name, &known))?),
         None => TOMOGRAPHY.iter().find_map(|name| there(name)),
@@ -149,9 +150,7 @@ pub(super) fn populations(
     );
     wanted.sort_unstable();
     wanted.dedup();
-    let unused = columns
-        .iter()
-        .flat_map(|columns| columns.unused_choices(&wanted));
+    let unused = columns.unused_choices(&wanted).into_iter();
     let unused: Vec<String> = unused.map(str::to_owned).collect();
     let texts = operands.iter().filter(|own| own.pattern.is_some());
     let mut texts: Vec<&str> = texts.map(|own| own.column.as_str()).collect();
