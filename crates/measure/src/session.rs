@@ -533,7 +533,8 @@ impl<'n> Session<'n> {
             session.typical_level = upper_median(&mut levels);
         }
         if let Some(plan) = session.noise_plan() {
-            session.survey = survey_noise(plan, source, light, threads)?;
+            let survey = survey_noise(plan, source, light, threads)?.result()?;
+            session.survey = survey.map(Arc::new);
             session
                 .warnings
                 .extend(match (&session.survey, &session.noise) {
@@ -621,11 +622,12 @@ impl<'n> Session<'n> {
             return Ok(None);
         }
         // Small stamps have no border that could be surveyed.
-        let found = NoisePlan::new(self.measurer.full(), WHITENESS_TEST_MAX_LAG, None)
-            .map_err(S::Error::from)
-            .and_then(|plan| survey_noise(&plan, source, self.light, threads));
-        let found = match found {
-            Err(error) if self.noise_plan().is_some() => return Err(error),
+        let Ok(plan) = NoisePlan::new(self.measurer.full(), WHITENESS_TEST_MAX_LAG, None) else {
+            return Ok(None);
+        };
+        let found = match survey_noise(&plan, source, self.light, threads)?.result() {
+            Err(error) if self.noise_plan().is_some() => return Err(error.into()),
+            // Without borders there is nothing to test a given level with.
             found => found.ok().flatten(),
         };
         Ok(found
@@ -1111,13 +1113,13 @@ fn stated_noise(given: f64, survey: &StampNoise) -> Option<Warning> {
     })
 }
 
-/// The noise, the sky and the galaxy size of an image; `None` if galaxies on all of its stamps will be flagged.
+/// The survey of the noise, the sky and the galaxy size of an image.
 fn survey_noise<'a, S: StampSource<'a>>(
     plan: &NoisePlan,
     source: &mut S,
     light: Option<LightLimits>,
     threads: &impl Threads,
-) -> Result<Option<Arc<Survey>>, S::Error> {
+) -> Result<NoiseSurvey, S::Error> {
     let rows = source.rows();
     let chosen = plan.rows(rows.columns, rows.len());
     let mut pass = |mut all: NoiseSurvey| {
@@ -1144,7 +1146,7 @@ fn survey_noise<'a, S: StampSource<'a>>(
     if let Some(again) = survey.without_sky() {
         survey = pass(again)?;
     }
-    Ok(survey.result()?.map(Arc::new))
+    Ok(survey)
 }
 
 fn add_stamps<T: Pixel>(

@@ -380,6 +380,31 @@ fn noise_taken_as_white_is_tested_up_to_two_pixels() {
 }
 
 #[test]
+fn errors_of_reading_are_not_taken_for_small_stamps() {
+    let registry = Registry::embedded().unwrap();
+    let named = registry.get("48/linear/star").unwrap().configuration;
+    let configuration = Configuration {
+        noise: NoiseSource::Header,
+        ..named
+    };
+    let measurer = Measurer::new(&configuration, 48).unwrap();
+    let (stamps, star) = (noisy_stars(40), moffat(0.0).stamp(48));
+    let psfs = Psfs::star(star.view());
+    let mut source = ArraySource::new(&measurer, stamps.view(), &psfs).unwrap();
+    let noise = KnownNoise::Given(0.01);
+    let session = Session::open(&measurer, &mut source, noise, &OneThread).unwrap();
+    assert!(session.noise_plan().is_none());
+    let mut broken = ArraySource::from_fn(
+        40,
+        |_| Err(MeasureError::Data(Warning::NoNoise)),
+        |_| unreachable!(),
+        None,
+    );
+    let found = session.correlated_noise(&mut broken, &OneThread);
+    assert!(matches!(found, Err(MeasureError::Data(Warning::NoNoise))));
+}
+
+#[test]
 fn stated_noise_may_differ_by_one_percent() {
     for (difference, expected) in [(0.008, false), (0.012, true)] {
         let found = stated_noise(1.0 / (1.0 + difference), &StampNoise::white(1.0));
