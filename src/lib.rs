@@ -354,8 +354,8 @@ fn tell_notes(notes: Vec<String>) {
     }
 }
 
-fn tell_unread(unread: Option<String>) {
-    if let Some(line) = unread {
+fn tell_unread(unread: Vec<String>) {
+    for line in unread {
         tell(format_args!("warning: {line}"));
     }
 }

@@ -9,7 +9,7 @@ use std::path::{Component, Path, PathBuf};
 use shearq_files::FileError;
 use shearq_files::open::is_there;
 
-use crate::pattern::{IMAGE_PLACEHOLDERS, MAX_IMAGE, MAX_SET, SET_PLACEHOLDERS};
+use crate::pattern::{IMAGE_PLACEHOLDERS, MAX_IMAGE, MAX_SET, SET_PLACEHOLDERS, fill};
 
 /// Files found, by the numbers of set and image.
 #[derive(Debug, Default)]
@@ -18,6 +18,8 @@ pub struct Files {
     by_set: BTreeMap<Option<u32>, BTreeMap<u32, Found>>,
     /// The first of the files whose numbers another file has, with the file that is read instead, and how many there are.
     unread: Option<(PathBuf, PathBuf, usize)>,
+    /// The first of the files and folders whose names resemble the pattern, with the name of the first number, and how many there are.
+    misnamed: Option<(PathBuf, String, usize)>,
 }
 
 #[derive(Debug)]
@@ -68,19 +70,18 @@ impl Files {
         self.serve_all_sets() || self.by_set.contains_key(&Some(set))
     }
 
-    /// A sentence about files that are not read, because another one has the same numbers.
-    pub fn unread(&self) -> Option<String> {
-        let (first, instead, count) = self.unread.as_ref()?;
-        let others = match count - 1 {
-            0 => String::new(),
-            1 => ", like 1 other file".to_owned(),
-            more => format!(", like {more} other files"),
-        };
-        Some(format!(
-            "{}: this file is not read{others}, because {} is read instead. Try: remove one of them",
-            first.display(),
-            instead.file_name().unwrap_or_default().display()
-        ))
+    /// A sentence each about files that are not read, because of their names or because another one has the same numbers.
+    pub fn unread(&self) -> Vec<String> {
+        let misnamed = self.misnamed.as_ref().map(|(first, example, count)| {
+            let why = format!("of its name (expected such as {example}). Try: rename it");
+            unread(first, &why, *count)
+        });
+        let second = self.unread.as_ref().map(|(first, instead, count)| {
+            let instead = instead.file_name().unwrap_or_default().display();
+            let why = format!("{instead} is read instead. Try: remove one of them");
+            unread(first, &why, *count)
+        });
+        misnamed.into_iter().chain(second).collect()
     }
 
     /// `sets`, or if empty all sets that have a file.
@@ -95,6 +96,32 @@ impl Files {
     pub fn serve_all_sets(&self) -> bool {
         self.by_set.contains_key(&None)
     }
+}
+
+fn unread(first: &Path, why: &str, count: usize) -> String {
+    let thing = match first.is_dir() {
+        true => "folder",
+        false => "file",
+    };
+    let others = match count - 1 {
+        0 => String::new(),
+        1 => ", like 1 other".to_owned(),
+        more => format!(", like {more} others"),
+    };
+    format!(
+        "{}: this {thing} is not read{others}, because {why}",
+        first.display()
+    )
+}
+
+// A name without what people write differently: case, separators and numbers.
+fn shape(name: &str) -> String {
+    let mut shape: Vec<char> = (name.to_lowercase().chars())
+        .filter(|c| !['-', '_', ' '].contains(c))
+        .map(|c| if c.is_ascii_digit() { '#' } else { c })
+        .collect();
+    shape.dedup_by(|a, b| (*a, *b) == ('#', '#'));
+    shape.into_iter().collect()
 }
 
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
@@ -160,12 +187,16 @@ impl Search<'_> {
             }
             return Ok(());
         }
+        let example = fill(&part.to_string_lossy(), 1, 1);
+        let usual = shape(&example);
         for name in names(folder)? {
+            let mut follows = false;
             for (rank, ending) in endings.iter().enumerate() {
                 let Some(stem) = name.strip_suffix(ending) else {
                     continue;
                 };
                 for numbers in matches(&pattern, stem, numbers) {
+                    follows = true;
                     let other = |set| !self.sets.is_empty() && !self.sets.contains(&set);
                     if numbers.set.is_some_and(other) {
                         continue;
@@ -177,6 +208,13 @@ impl Search<'_> {
                         self.walk(&path, rest, numbers)?;
                     }
                 }
+            }
+            // With `sets`, the others are left out on purpose, and an absent one is an error.
+            let resembles = !follows && self.sets.is_empty() && shape(&name) == usual;
+            let path = folder.join(&name);
+            if resembles && path.is_dir() != rest.is_empty() {
+                let first = || (path, example.clone(), 0);
+                self.files.misnamed.get_or_insert_with(first).2 += 1;
             }
         }
         Ok(())
@@ -333,6 +371,31 @@ mod tests {
         let pattern = pieces(OsStr::new(pattern));
         let found = matches(&pattern, name, Numbers::default());
         found.iter().map(|n| (n.set, n.image)).collect()
+    }
+
+    #[test]
+    fn names_that_resemble_the_pattern_are_reported() {
+        let root = tempfile::tempdir().unwrap();
+        for name in [
+            "set01/g-001.fits",
+            "set01/g_002.FITS",
+            "set01/stars-001.fits",
+            "set2/g-001.fits",
+            "Set 3/g-001.fits",
+            "settings/g-001.fits",
+        ] {
+            let path = root.path().join(name);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            fs::write(path, "").unwrap();
+        }
+        let unread = |sets: &[u32]| {
+            let pattern = "set{set:02}/g-{image:03}.fits";
+            find(root.path(), pattern, &[""], sets).unwrap().unread()
+        };
+        let [line] = <[String; 1]>::try_from(unread(&[])).unwrap();
+        let words = "Set 3: this folder is not read, like 2 others, because of its name (expected such as set01)";
+        assert!(line.contains(words), "{line}");
+        assert!(unread(&[1]).is_empty());
     }
 
     #[test]
