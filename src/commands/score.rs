@@ -429,7 +429,7 @@ fn packed_spectra(
         let covariance =
             manifest.and_then(|manifest| manifest.covariances.get(file.file_name()?.to_str()?));
         let score = SetScorer::new(grid, shear, options)?.score_spectrum(&powers, covariance)?;
-        let simulated = kind_of(data, set).is_some();
+        let simulated = kind_of(data, set)?.is_some();
         records.push(SetRecord::of_spectrum(set, simulated, Vec::new(), &score));
         of_zeros.push(score.zero_q);
     }

@@ -134,7 +134,7 @@ impl Judge {
                 scorer: SetScorer::new(grid, shear.clone(), options).map_err(unscored)?,
                 shear,
                 print: fingerprint::of_set(&source, &data, set, &[])?,
-                simulated: kind_of(&data, set).is_some(),
+                simulated: kind_of(&data, set)?.is_some(),
             };
             truths.insert(set, truth);
         }
@@ -172,8 +172,10 @@ impl Judge {
             if !run.settings.starts_with(ENTRY_SETTINGS_PREFIX) {
                 continue;
             }
-            let Stored { entry: info } = toml::from_str(&run.settings)
-                .map_err(|e| FileError::new(&path, e.to_string().trim_end()))?;
+            let Stored { entry: info } = toml::from_str(&run.settings).map_err(|e| {
+                FileError::new(&path, e.to_string().trim_end())
+                    .hint("move it out of the folder of the store")
+            })?;
             if info.challenge != self.challenge.name {
                 continue;
             }

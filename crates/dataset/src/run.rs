@@ -175,13 +175,13 @@ impl Run {
 /// Opens the data folder that a command is to read images from.
 pub fn open_data(folder: &Path) -> Result<DataFolder, FileError> {
     let data = DataFolder::open(folder)?;
-    let Some(run) = Run::read(folder).ok().flatten() else {
-        return Ok(data);
-    };
     // Users may measure into the data folder, which then has a record of catalogues and images.
-    if !data.images(&[])?.sets().is_empty() {
+    if !is_there(&folder.join(RUN_FILE)) || !data.images(&[])?.sets().is_empty() {
         return Ok(data);
     }
+    let Some(run) = Run::read(folder)? else {
+        return Ok(data);
+    };
     let advice = match &run.source {
         Source::Folder { path, .. } => {
             let data = shortened(folder.join(path));
@@ -207,16 +207,10 @@ pub struct SimulationRecord {
 }
 
 /// The kind of a set, if the data were simulated. Other data may have the same set numbers.
-pub fn kind_of(data: &DataFolder, set: u32) -> Option<SetKind> {
-    let in_memory = || {
-        let run = Run::read(data.root()).ok().flatten();
-        run.is_some_and(|run| matches!(run.source, Source::Simulated(_)))
-    };
-    if is_there(&data.root().join(SIMULATION_FILE)) || in_memory() {
-        SetKind::of(set)
-    } else {
-        None
-    }
+pub fn kind_of(data: &DataFolder, set: u32) -> Result<Option<SetKind>, FileError> {
+    let is_simulated = is_there(&data.root().join(SIMULATION_FILE))
+        || Run::read(data.root())?.is_some_and(|run| matches!(run.source, Source::Simulated(_)));
+    Ok(SetKind::of(set).filter(|_| is_simulated))
 }
 
 // Absolute if there is no common ancestor, as for two drives on Windows. Neither path must exist.
@@ -296,14 +290,15 @@ pub fn read_record<R: DeserializeOwned>(path: &Path) -> Result<Option<R>, FileEr
 pub fn parse_record<R: DeserializeOwned>(path: &Path, text: &str) -> Result<R, FileError> {
     serde_json::from_str(text).map_err(|error| {
         // `is_data`: valid JSON, but with other keys or types.
-        let [key, hint] = match error.is_data() {
+        let [key, version] = match error.is_data() {
             true => [key_before(text, &error), other_version(text)].map(Option::unwrap_or_default),
             false => [const { String::new() }; 2],
         };
-        FileError::new(
-            path,
-            format!("not a record of this kind: {key}{error}{hint}"),
-        )
+        let message = format!("not a record of this kind: {key}{error}{version}");
+        match version.is_empty() {
+            true => FileError::new(path, message),
+            false => FileError::new(path, message).hint("another folder"),
+        }
     })
 }
 
@@ -321,8 +316,7 @@ fn other_version(text: &str) -> Option<String> {
     let record: serde_json::Value = serde_json::from_str(text).ok()?;
     let of_store = || record.get("run")?.get("version");
     let version = record.get("version").or_else(of_store)?;
-    (version != crate::VERSION)
-        .then(|| format!("; the record belongs to version {version}. Try: another folder"))
+    (version != crate::VERSION).then(|| format!("; the record belongs to version {version}"))
 }
 
 pub fn write_record(path: &Path, record: &impl Serialize) -> Result<(), FileError> {
@@ -629,6 +623,16 @@ mod tests {
             std::os::unix::fs::symlink(at("data"), at("link")).unwrap();
             assert_eq!(between("out", "link"), Path::new("../data"));
         }
+    }
+
+    #[test]
+    fn a_damaged_record_does_not_count_as_none() {
+        let folder = tempfile::tempdir().unwrap();
+        let data = DataFolder::open(folder.path()).unwrap();
+        assert_eq!(kind_of(&data, 1).unwrap(), None);
+        std::fs::write(folder.path().join(RUN_FILE), "{").unwrap();
+        assert!(kind_of(&data, 1).is_err());
+        assert!(open_data(folder.path()).is_err());
     }
 
     const PATTERN: &str = "set{set}";

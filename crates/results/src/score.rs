@@ -289,7 +289,10 @@ fn score_sets(
 ) -> Result<Vec<ScoredSet>, ScoreError> {
     let frames = sets.iter().map(|&set| catalogues.frame(set));
     let frames: Vec<Frame> = frames.collect::<Result<_, _>>()?;
-    let files = |set| SetFiles::new(catalogues, set, kind_of(data, set).is_some(), pool);
+    let files = |set| {
+        let simulated = kind_of(data, set)?.is_some();
+        SetFiles::new(catalogues, set, simulated, pool)
+    };
     let session = |files: &SetFiles<'_>, set: u32, options| -> Result<_, ScoreError> {
         let ReadTruth { grid, shear, .. } = read_truth(&data.truth(set), &reading_of(data, set)?)?;
         SetSession::new(grid, Some(shear), options).map_err(files.wrong())
