@@ -83,6 +83,13 @@ fn file_name(run: &RunRecord, bytes: &[u8]) -> String {
 }
 
 fn read_run(path: &Path) -> Result<RunRecord, FileError> {
+    let (run, text) =
+        parse_run(path).map_err(|error| error.hint("move it out of the folder of the store"))?;
+    check_name(path, &file_name(&run, text.as_bytes()))?;
+    Ok(run)
+}
+
+fn parse_run(path: &Path) -> Result<(RunRecord, String), FileError> {
     // Records of thousands of sets or images exceed the limit of settings.
     let text =
         read_to_string(path, DATA).map_err(FileError::doing(path, "cannot read the record"))?;
@@ -94,8 +101,7 @@ fn read_run(path: &Path) -> Result<RunRecord, FileError> {
         return Err(FileError::new(path, message));
     }
     run.check().map_err(|error| FileError::new(path, error))?;
-    check_name(path, &file_name(&run, text.as_bytes()))?;
-    Ok(run)
+    Ok((run, text))
 }
 
 // JSON is easily edited, and other settings would be compared as a run that never was. A copy under another name would be
@@ -208,6 +214,14 @@ mod tests {
             noise: Noise::Given(0.01),
             sets: sets.iter().map(record).collect(),
         }
+    }
+
+    #[test]
+    fn a_file_that_cannot_be_read_is_to_be_moved() {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join("a.json"), "{").unwrap();
+        let error = files(folder.path()).unwrap_err();
+        assert!(error.text().contains("Try: move it out"), "{error}");
     }
 
     #[test]
