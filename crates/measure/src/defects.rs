@@ -760,7 +760,7 @@ fn equal_below(stamp: &[f32], n: usize) -> u32 {
 
 /// Smallest and largest pixel, without NaN.
 #[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
-fn extremes(stamp: &[f32]) -> [f32; 2] {
+pub(crate) fn extremes(stamp: &[f32]) -> [f32; 2] {
     extremes_from([f32::INFINITY, f32::NEG_INFINITY], stamp)
 }
 

@@ -46,6 +46,8 @@ pub(super) struct Lines {
     /// Of columns, and of rows.
     sums: [Vec<f32>; 2],
     values: Vec<f32>,
+    /// Means across the strips along the left, right, lower and upper edge.
+    strips: [Vec<f32>; 4],
     /// Of a trail, beyond the galaxy: its pieces, and what is beside them.
     pieces: [Vec<f32>; 2],
 }
@@ -57,6 +59,7 @@ impl Lines {
         Lines {
             sums: [buffer(), buffer()],
             values: buffer(),
+            strips: [buffer(), buffer(), buffer(), buffer()],
             pieces: [buffer(), buffer()],
         }
     }
@@ -94,8 +97,12 @@ impl Lines {
         bounds: &LineBounds<'_>,
     ) {
         let white = noise * (n as f32).sqrt();
+        // Nearly all stamps end here: light that is too faint only widens the bounds.
+        let least = MIN_DEPARTURE * white;
+        if !exceeds(bounds.sums, least) {
+            return;
+        }
         let faint = bounds.faint();
-        // Nearly all stamps end here.
         if !(0..n).any(|line| bounds.departs(line, white, faint).is_some()) {
             return;
         }
@@ -138,7 +145,14 @@ impl Lines {
     }
 
     fn find_trail(&mut self, stamp: &[f32], n: usize, noise: f32) -> Option<Trail> {
-        let ends = [0, 1, 2, 3].map(|side| self.find_end(stamp, n, side, noise));
+        // No place of such a stamp is beyond its galaxy.
+        if n < 2 * STRIP {
+            return None;
+        }
+        let mut strips = std::mem::take(&mut self.strips);
+        mean_strips(stamp, n, &mut strips);
+        let ends = [0, 1, 2, 3].map(|side| self.find_end(&strips[side], n, side, noise));
+        self.strips = strips;
         for (k, first) in ends.iter().enumerate() {
             for second in &ends[k + 1..] {
                 let (Some(first), Some(second)) = (first, second) else {
@@ -156,30 +170,18 @@ impl Lines {
     }
 
     /// The brightest place of the strip along the left, right, lower or upper edge, if it is brighter than noise.
-    fn find_end(&mut self, stamp: &[f32], n: usize, side: usize, noise: f32) -> Option<End> {
-        let strip = &mut self.values;
-        strip.clear();
-        strip.extend((0..n).map(|k| {
-            let pixels = (0..STRIP.min(n)).map(|depth| match side {
-                0 => stamp[k * n + depth],
-                1 => stamp[k * n + n - 1 - depth],
-                2 => stamp[depth * n + k],
-                _ => stamp[(n - 1 - depth) * n + k],
-            });
-            pixels.sum::<f32>() / STRIP as f32
-        }));
-        let smooth = |at: usize| (strip[at - 1] + strip[at] + strip[at + 1]) / 3.0;
-        let inner = 1..n.saturating_sub(1);
-        let (brightest, level) =
-            inner
-                .map(|at| (at, smooth(at)))
-                .fold((0, f32::MIN), |most, other| match other.1 > most.1 {
-                    true => other,
-                    false => most,
-                });
-        if level <= MIN_DEPARTURE * noise / STRIP_PIXELS.sqrt() {
+    fn find_end(&mut self, strip: &[f32], n: usize, side: usize, noise: f32) -> Option<End> {
+        // Nearly all strips end here.
+        if !is_brighter(strip, MIN_DEPARTURE * noise / STRIP_PIXELS.sqrt()) {
             return None;
         }
+        let inner = (1usize..).zip(strip.windows(3));
+        let (brightest, level) = inner
+            .map(|(at, near)| (at, smooth([near[0], near[1], near[2]])))
+            .fold((0, f32::MIN), |most, other| match other.1 > most.1 {
+                true => other,
+                false => most,
+            });
         let around = brightest.saturating_sub(END_RADIUS)..(brightest + END_RADIUS + 1).min(n);
         let light = |at: usize| strip[at].max(0.0);
         let total: f32 = around.clone().map(light).sum();
@@ -188,7 +190,9 @@ impl Lines {
         let far = n as f32 - 1.0 - depth;
         let at = [[depth, along], [far, along], [along, depth], [along, far]][side];
         // Noise that is correlated, and the wings of large galaxies.
-        self.values.retain(|value| value.is_finite());
+        self.values.clear();
+        let finite = strip.iter().filter(|value| value.is_finite());
+        self.values.extend(finite);
         let middle = median(&mut self.values)?;
         let apart = |value: &mut f32| *value = (*value - middle).abs();
         self.values.iter_mut().for_each(apart);
@@ -262,13 +266,13 @@ struct LineBounds<'a> {
 impl LineBounds<'_> {
     /// Light that is too faint to be tested: a share of the second brightest line, because the brightest may be bad.
     fn faint(&self) -> f32 {
-        let [_, second] =
-            self.sums
-                .iter()
-                .fold([0.0f32; 2], |[first, second], &sum| match sum > first {
-                    true => [sum, first],
-                    false => [first, if sum > second { sum } else { second }],
-                });
+        let (mut first, mut second) = (0.0f32, 0.0f32);
+        for &sum in self.sums {
+            // Without a branch, and without NaN.
+            let lower = if sum > first { first } else { sum };
+            first = if sum > first { sum } else { first };
+            second = if lower > second { lower } else { second };
+        }
         FAINT_SHARE * second
     }
 
@@ -327,8 +331,64 @@ fn sum_lines(stamp: &[f32], n: usize, sums: &mut [Vec<f32>; 2]) {
                 *lane += value;
             }
         }
-        rows.push(lanes.iter().chain(rest).sum());
+        for half in [8, 4, 2, 1] {
+            let (low, high) = lanes.split_at_mut(half);
+            for (low, high) in low.iter_mut().zip(&*high) {
+                *low += high;
+            }
+        }
+        rows.push(lanes[0] + rest.iter().sum::<f32>());
     }
+}
+
+/// Whether a number is farther from zero than `most`.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn exceeds(numbers: &[f32], most: f32) -> bool {
+    // Without an early exit, so that several numbers are tested at a time.
+    numbers
+        .iter()
+        .fold(false, |any, number| any | (number.abs() > most))
+}
+
+/// Means across the strips along the left, right, lower and upper edge of a stamp, which is at least as wide as one.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn mean_strips(stamp: &[f32], n: usize, strips: &mut [Vec<f32>; 4]) {
+    // From the edge on.
+    let mean = |[a, b, c, d]: [f32; STRIP]| (a + b + c + d) / STRIP as f32;
+    for strip in strips.iter_mut() {
+        strip.clear();
+        strip.resize(n, 0.0);
+    }
+    let [left, right, lower, upper] = strips;
+    let rows = stamp.chunks_exact(n).zip(left.iter_mut().zip(right));
+    for (row, (left, right)) in rows {
+        if let (Some(first), Some(&[d, c, b, a])) = (row.first_chunk(), row.last_chunk()) {
+            *left = mean(*first);
+            *right = mean([a, b, c, d]);
+        }
+    }
+    let row = |y: usize| &stamp[y * n..][..n];
+    let (first, last) = ([0, 1, 2, 3].map(row), [1, 2, 3, 4].map(|k| row(n - k)));
+    for (strip, rows) in [(lower, first), (upper, last)] {
+        let [a, b, c, d] = rows;
+        for (x, out) in strip[..n].iter_mut().enumerate() {
+            *out = mean([a[x], b[x], c[x], d[x]]);
+        }
+    }
+}
+
+fn smooth([a, b, c]: [f32; 3]) -> f32 {
+    (a + b + c) / 3.0
+}
+
+/// Whether the mean of three neighbours is above a level.
+#[multiversion(targets("x86_64+avx512f+avx2+fma", "x86_64+avx2+fma", "aarch64+neon"))]
+fn is_brighter(strip: &[f32], level: f32) -> bool {
+    let (next, further) = (&strip[1..], &strip[2..]);
+    let near = strip.iter().zip(next).zip(further);
+    near.fold(false, |any, ((a, b), c)| {
+        any | (smooth([*a, *b, *c]) > level)
+    })
 }
 
 #[derive(Debug, Clone, Copy)]

@@ -493,3 +493,41 @@ fn pixels_cut_off_below_or_above_are_named() {
     let cut = |k: usize, value: f32| value.min(7.0 + 0.01 * k as f32);
     assert!(all("flat-tops", &cut));
 }
+
+/// The plain reference of [`ends`].
+fn plain_ends(pixels: &[f32]) -> (f64, usize) {
+    let finite: Vec<f32> = pixels.iter().copied().filter(|v| v.is_finite()).collect();
+    let low = finite.iter().copied().fold(f32::INFINITY, f32::min);
+    let high = finite.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+    let of = |end: f32| finite.iter().filter(|value| **value == end).count();
+    let repeats = |pair: &&[f32]| pair[0] == pair[1] && pair[0] != low && pair[0] != high;
+    let equal = pixels.windows(2).filter(repeats).count();
+    match equal as f64 > MAX_EQUAL_SHARE * finite.len() as f64 {
+        true => (0.0, 0),
+        false => (of(low) as f64 / finite.len() as f64, of(high)),
+    }
+}
+
+#[test]
+fn fast_ends_agree_with_plain_ones() {
+    for count in [1, 2, 31, 32, 33, 64, 1000, 2304] {
+        // Whole numbers repeat, fractions do not; the ends are cut off.
+        for (step, cut) in [(1.0, 9.0), (0.001, 9.0), (0.001, 0.4), (0.001, 0.0)] {
+            let value = |at: usize| {
+                let value = step * ((at * at * 7919 + at) % 10007) as f32;
+                value.clamp(-cut, cut + 1.0)
+            };
+            let mut pixels: Vec<f32> = (0..count).map(value).collect();
+            assert_eq!(ends(&pixels), plain_ends(&pixels), "{count} {step} {cut}");
+            if count > 4 {
+                pixels[1] = f32::NAN;
+                pixels[count - 1] = f32::NAN;
+                assert_eq!(ends(&pixels), plain_ends(&pixels), "{count} {step} {cut}");
+                pixels[2] = f32::INFINITY;
+                pixels[3] = f32::INFINITY;
+                pixels[count - 2] = f32::NEG_INFINITY;
+                assert_eq!(ends(&pixels), plain_ends(&pixels), "{count} {step} {cut}");
+            }
+        }
+    }
+}

@@ -182,3 +182,43 @@ fn fast_sums_agree_with_plain_ones() {
         assert_eq!(sums, [plain([1, n]), plain([n, 1])], "{n}");
     }
 }
+
+#[test]
+fn fast_strips_agree_with_plain_ones() {
+    let mut rng = ChaCha8Rng::seed_from_u64(27);
+    // Dirty.
+    let mut strips = [0, 3, 80, 500].map(|size| vec![f32::NAN; size]);
+    for n in [8, 15, 16, 17, 33, 48, 64] {
+        let mut stamp: Vec<f32> = (0..n * n).map(|_| noise(&mut rng)).collect();
+        stamp[5 * n + 1] = f32::NAN;
+        mean_strips(&stamp, n, &mut strips);
+        for (side, strip) in strips.iter().enumerate() {
+            assert_eq!(strip.len(), n);
+            let plain: Vec<f32> = (0..n)
+                .map(|k| {
+                    let pixels = (0..STRIP).map(|depth| match side {
+                        0 => stamp[k * n + depth],
+                        1 => stamp[k * n + n - 1 - depth],
+                        2 => stamp[depth * n + k],
+                        _ => stamp[(n - 1 - depth) * n + k],
+                    });
+                    pixels.sum::<f32>() / STRIP as f32
+                })
+                .collect();
+            for (fast, plain) in strip.iter().zip(&plain) {
+                let agrees = fast == plain || fast.is_nan() && plain.is_nan();
+                assert!(agrees, "{n} {side} {fast} {plain}");
+            }
+            for at in 1..n - 1 {
+                let level = smooth([plain[at - 1], plain[at], plain[at + 1]]);
+                for least in [level - 1e-3, level, level + 1e-3] {
+                    let brighter = |near: &[f32]| smooth([near[0], near[1], near[2]]) > least;
+                    let expected = plain.windows(3).any(brighter);
+                    assert_eq!(is_brighter(strip, least), expected, "{n} {side} {at}");
+                    let expected = plain.iter().any(|value| value.abs() > least);
+                    assert_eq!(exceeds(strip, least), expected, "{n} {side} {at}");
+                }
+            }
+        }
+    }
+}
