@@ -47,6 +47,23 @@ def test_blocks_take_their_own_jacobians(image):
     assert same_bits(blocks[1], alone)
 
 
+def test_axes_of_the_sky_may_come_in_either_order():
+    pytest.importorskip("astropy")
+    from astropy.wcs import WCS
+
+    def at_centre(names, values, matrix):
+        wcs = WCS(naxis=2)
+        wcs.wcs.ctype, wcs.wcs.crval, wcs.wcs.crpix, wcs.wcs.cd = names, values, [24.0, 24.0], matrix
+        return jacobians(wcs, 1, np.array([23.0]), np.array([23.0]))
+
+    matrix = np.array([[-3e-5, 1e-5], [1e-5, 4e-5]])
+    usual = at_centre(["RA---TAN", "DEC--TAN"], [150.0, 2.0], matrix)
+    assert np.allclose(usual, [[[0.108, -0.036], [0.036, 0.144]]], atol=1e-6)
+    assert np.allclose(at_centre(["DEC--TAN", "RA---TAN"], [2.0, 150.0], matrix[::-1]), usual, atol=1e-12)
+    with pytest.raises(ValueError, match="galactic.lon.*expected right ascension"):
+        at_centre(["GLON-TAN", "GLAT-TAN"], [150.0, 2.0], matrix)
+
+
 def test_a_wcs_gives_the_same_jacobians_in_galsim_and_astropy():
     galsim = pytest.importorskip("galsim")
     pytest.importorskip("astropy")

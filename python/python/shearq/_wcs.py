@@ -12,6 +12,7 @@ from ._arrays import double, numeric, shown
 
 # Half of the distance in pixels over which astropy's coordinates are differentiated.
 _HALF_STEP = 0.5
+_EQUATORIAL = ("pos.eq.ra", "pos.eq.dec")
 _ARCSEC = 180.0 * 3600.0 / np.pi
 
 
@@ -90,9 +91,15 @@ def _on_sphere(wcs: Any, places: NDArray[np.float64]) -> NDArray[np.float64]:
         if not wcs.has_celestial:
             raise ValueError("wcs: found no celestial axes; expected right ascension and declination")
         wcs = wcs.celestial
+    # Declination may come first. Without types, as of own objects, right ascension does.
+    types = list(getattr(wcs, "world_axis_physical_types", None) or _EQUATORIAL)
+    if sorted(map(str, types)) != sorted(_EQUATORIAL):
+        raise ValueError(f"wcs: found the axes {', '.join(map(str, types))}; expected right ascension and declination")
+    order = [types.index(own) for own in _EQUATORIAL]
 
     def directions(offset: tuple[float, float]) -> tuple[Any, Any, NDArray[np.float64]]:
-        lon, lat = map(np.radians, wcs.pixel_to_world_values(places[:, 0] + offset[0], places[:, 1] + offset[1]))
+        values = wcs.pixel_to_world_values(places[:, 0] + offset[0], places[:, 1] + offset[1])
+        lon, lat = (np.radians(values[k]) for k in order)
         return lon, lat, np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=-1)
 
     lon, lat, _ = directions((0.0, 0.0))
