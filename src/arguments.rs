@@ -482,13 +482,19 @@ pub(crate) trait Named: Copy + Send + Sync + 'static {
     const ALL: &[(Self, &str, &str)];
 }
 
+// The name that a value had in version 0.2.
+fn earlier(name: &str) -> Option<&'static str> {
+    (name == "shears").then_some("arms")
+}
+
 pub(crate) fn named<T: Named>() -> impl TypedValueParser<Value = T> {
     let names = T::ALL
         .iter()
-        .map(|(_, name, help)| PossibleValue::new(*name).help(*help));
+        .map(|(_, name, help)| PossibleValue::new(*name).help(*help).aliases(earlier(name)));
     // Other names were refused by `PossibleValuesParser`, so that the first value is never used as a default.
     PossibleValuesParser::new(names).map(|given| {
-        let found = T::ALL.iter().find(|(_, name, _)| *name == given);
+        let is_given = |name: &str| name == given || earlier(name) == Some(given.as_str());
+        let found = T::ALL.iter().find(|(_, name, _)| is_given(name));
         found.unwrap_or(&T::ALL[0]).0
     })
 }

@@ -57,6 +57,8 @@ fn design_of(name: &str) -> PyResult<Design> {
         Design::Galaxies,
         Design::Rotated,
     ];
+    // The name of version 0.2.
+    let name = if name == "arms" { "shears" } else { name };
     let found = ALL.into_iter().find(|design| design.name() == name);
     found.ok_or_else(|| {
         let names = ALL.map(Design::name).join(", ");
