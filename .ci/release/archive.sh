@@ -36,8 +36,21 @@ for shell in bash zsh fish; do
     "$binary" completions "$shell" > "$tree/completions/shearq.$shell"
 done
 "$binary" --quiet man --out "$tree/man"
-packed() { tar --sort=name --owner=0 --group=0 --numeric-owner --mtime="@$SOURCE_DATE_EPOCH" "$@"; }
-packed -C "$stage" -c "$name" | gzip -n -9 > "$out/$name.tar.gz"
+# tar of macOS cannot sort, and has no owners by number.
+python3 - "$stage" "$name" "$out/$name.tar.gz" <<'PYTHON'
+import gzip, os, sys, tarfile
+stage, name, out = sys.argv[1:]
+time = int(os.environ["SOURCE_DATE_EPOCH"])
+def plain(entry):
+    entry.uid = entry.gid = 0
+    entry.uname = entry.gname = ""
+    entry.mtime = time
+    return entry
+with open(out, "wb") as file, gzip.GzipFile("", "wb", 9, file, time) as packed:
+    with tarfile.open(fileobj=packed, mode="w", format=tarfile.PAX_FORMAT) as archive:
+        # Members of folders are added by their sorted names.
+        archive.add(os.path.join(stage, name), name, filter=plain)
+PYTHON
 
 made=("$name.tar.gz")
 if command -v dpkg-deb > /dev/null; then
@@ -64,7 +77,11 @@ Description: m and c of weak-lensing shear catalogues, galaxy shapes, scores
  as the GREAT challenges did, and runs challenges.
 CONTROL
     find "$root" -exec touch -h -d "@$SOURCE_DATE_EPOCH" {} +
-    dpkg-deb --root-owner-group --build "$root" "$out/shearq_${version}.deb" > /dev/null
-    made+=("shearq_${version}.deb")
+    package=shearq_${version}_$(dpkg --print-architecture).deb
+    dpkg-deb --root-owner-group --build "$root" "$out/$package" > /dev/null
+    made+=("$package")
 fi
-(cd "$out" && sha256sum "${made[@]}" > "shearq-$version.sha256" && cat "shearq-$version.sha256")
+# Of this target alone: a release has one such file for each.
+cd "$out"
+if command -v sha256sum > /dev/null; then sum=(sha256sum); else sum=(shasum -a 256); fi
+"${sum[@]}" "${made[@]}" | tee "$name.sha256"
