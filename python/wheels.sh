@@ -9,13 +9,14 @@
 set -eu
 cd "$(dirname "$0")"
 here=$PWD
+root=$(dirname "$PWD")
 dist=${DIST:-$PWD/../dist}
 mkdir -p "$dist"
 # cfitsio's and LZ4's notices must be in all copies.
 python3 ../.ci/release/licences.py shearq-python > LICENCES-OF-DEPENDENCIES.txt
 trap 'rm -f LICENCES-OF-DEPENDENCIES.txt' EXIT
 # No path of this machine in the module.
-export RUSTFLAGS="--remap-path-prefix=$(dirname "$PWD")=. --remap-path-prefix=${CARGO_HOME:-$HOME/.cargo}=cargo --remap-path-prefix=${CARGO_TARGET_DIR:-$(dirname "$PWD")/target}=target ${RUSTFLAGS:-}"
+export RUSTFLAGS="--remap-path-prefix=$root=. --remap-path-prefix=${CARGO_HOME:-$HOME/.cargo}=cargo --remap-path-prefix=${CARGO_TARGET_DIR:-$root/target}=target ${RUSTFLAGS:-}"
 for target in "${@:-x86_64-unknown-linux-gnu}"; do
     case $target in
         *-linux-*) maturin build --profile dist --zig --compatibility manylinux2014 --target "$target" --out "$dist" ;;
