@@ -400,7 +400,7 @@ impl SimulationArguments {
 #[derive(Debug, Clone, Args)]
 pub(super) struct Sharding {
     /// Process only shard K of N: an N-th of the images. N processes may write to one folder at the same time.
-    /// `merge` then checks that the folder is complete (docs/survey.md).
+    /// `merge` then checks that the folder is complete (docs/large-jobs.md).
     #[arg(long, value_name = "K/N")]
     pub(super) shard: Option<Shard>,
 }

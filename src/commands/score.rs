@@ -36,9 +36,9 @@ use shearq_results::views::scores::{SetInput, notes, one_set_json, per_set, spec
 /// Score a folder that `measure` wrote with `--measured OUT`, another program's catalogues with
 /// `--data DATA --foreign FILE`, and plain files of one set with `--truth truth.csv CATALOGUE...`.
 ///
-/// Plain files are one catalogue per image: CSV with a header, ASCII `x y e1 e2`, FITS or Parquet, by the file's
-/// ending. Their `--format json` lists all eight conventions. Score a submission as `pack` writes it, of catalogues
-/// or power spectra, with --packed, and a submission to GREAT3 or GREAT08 with --challenge (docs/great3.md).
+/// Plain files are one catalogue per image: text, FITS or Parquet, recognised by their first bytes. Their
+/// `--format json` lists all eight conventions. Score a submission as `pack` writes it, of catalogues or power
+/// spectra, with --packed, and a submission to GREAT3 or GREAT08 with --challenge (docs/great3.md).
 #[derive(Debug, Args)]
 #[command(group = ArgGroup::new("input").required(true).args(["measured", "foreign", "packed", "catalogues"]))]
 pub(crate) struct Arguments {
