@@ -102,6 +102,11 @@ CASES += [
     mixed("airy100-each", 2.0, psf="airy", star=100.0, star_of="galaxy", flagged=(0.0, 0.0)),
     mixed("airy50-each", 5.0, psf="airy", star=50.0, star_of="galaxy", flagged=(0.0, 0.0)),
     mixed("star100-image", float("inf"), star=100.0, grid=16, images=22.0),
+    # No target; how m scatters between images is printed.
+    *(
+        mixed(f"star{snr}-image", float("inf"), star=float(snr), grid=16, images=float("inf"))
+        for snr in (50, 200, 500, 1000)
+    ),
     mixed("sky+0.5", 2.0, sky=0.5),
     mixed("sky-0.5", 2.0, sky=-0.5),
     mixed("near16-24", float("inf"), neighbour=(16.0, 24.0), ratio=(0.3, 3.0)),
