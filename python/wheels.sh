@@ -31,6 +31,7 @@ done
 # The wheel of this machine must measure in an empty environment.
 own=$(ls "$dist"/*"$(uname -m)".whl)
 unzip -l "$own" | grep -q LICENCES-OF-DEPENDENCIES || { echo "error: $own: has no licences of dependencies" >&2; exit 1; }
+! unzip -p "$own" | grep -aqF "$root/" || { echo "error: $own: has paths of this machine" >&2; exit 1; }
 empty=$(mktemp -d)
 trap 'rm -rf "$empty" "$here/LICENCES-OF-DEPENDENCIES.txt"' EXIT
 python3 -m venv "$empty"
