@@ -5,7 +5,8 @@ use numpy::{IntoPyArray, PyReadonlyArray2};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use shearq_measure::{DetectionMethod, Detector, Jacobian, StampNoise};
+use shearq_detection::Detector;
+use shearq_measure::{DetectionMethod, Jacobian, StampNoise};
 use shearq_pipeline::detect::{COLUMNS, PLACE, WHOLE, detect_rows};
 
 use crate::errors::{of_measuring, of_pipeline};

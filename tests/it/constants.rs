@@ -1,4 +1,5 @@
-//! Each constant of `crates/measure` states its origin in a `//` comment beside it, and `crates/measure/CONSTANTS.md` lists them.
+//! Each constant of `crates/measure` and `crates/detection` states its origin in a `//` comment beside it, and
+//! `crates/measure/CONSTANTS.md` lists those of `crates/measure`.
 //!
 //! To write a changed page, run `SHEARQ_ACCEPT=1 cargo test --release --test it constants`.
 
@@ -8,7 +9,8 @@ use std::path::Path;
 use crate::source::files;
 use crate::support::assert_page;
 
-const SOURCES: &str = "crates/measure/src";
+const MEASURE: &str = "crates/measure/src";
+const DETECTION: &str = "crates/detection/src";
 const PAGE: &str = "crates/measure/CONSTANTS.md";
 
 struct Constant {
@@ -28,9 +30,9 @@ fn code(path: &Path) -> String {
 }
 
 /// The constants of a file outside tests.
-fn constants(path: &Path) -> Vec<Constant> {
+fn constants(folder: &str, path: &Path) -> Vec<Constant> {
     let code = code(path);
-    let file = path.strip_prefix(SOURCES).unwrap().display().to_string();
+    let file = path.strip_prefix(folder).unwrap().display().to_string();
     let mut found = Vec::new();
     let mut comment = Vec::new();
     let mut rest = &code[..];
@@ -71,12 +73,15 @@ fn constants(path: &Path) -> Vec<Constant> {
 
 /// The constants with a number of their own, and those computed from them. Numbers that count or index elements of arrays are the
 /// layout of the code.
-fn tuned() -> Vec<Constant> {
-    let paths = files(&[SOURCES]);
+fn tuned(folder: &str) -> Vec<Constant> {
+    let paths = files(&[folder]);
     let tests =
         |path: &&std::path::PathBuf| path.ends_with("tests.rs") || path.ends_with("testing.rs");
     let paths = paths.iter().filter(|path| !tests(path));
-    let all: Vec<Constant> = paths.clone().flat_map(|path| constants(path)).collect();
+    let all: Vec<Constant> = paths
+        .clone()
+        .flat_map(|path| constants(folder, path))
+        .collect();
     let code: String = paths.map(|path| code(path)).collect();
     let lays_out = |name: &str| {
         let places = [
@@ -98,8 +103,9 @@ fn every_tuned_number_has_a_comment_with_its_origin() {
     // Values computed from others have no origin of their own.
     let digit = |c: char| c.is_ascii_digit() || "-_.e[],/* \n".contains(c);
     let is_own = |of: &Constant| !of.kind.contains("Range") && of.value.chars().all(digit);
-    let missing = tuned()
+    let missing = [MEASURE, DETECTION]
         .into_iter()
+        .flat_map(tuned)
         .filter(|of| is_own(of) && of.origin.is_empty());
     let missing: Vec<String> = missing
         .map(|of| format!("{}: {}", of.file, of.name))
@@ -120,7 +126,7 @@ fn the_page_of_constants_equals_the_source() {
         value,
         origin,
         ..
-    } in tuned().into_iter().filter(scalar)
+    } in tuned(MEASURE).into_iter().filter(scalar)
     {
         let (key, value) = (format!("| `{file}` `{name}`"), format!("`{value}`"));
         // `tests/stress/constants.py` measures effects, which outlive a move to another file.

@@ -20,8 +20,9 @@ fn levels() -> BTreeMap<String, usize> {
 const CODE: [&str; 5] = ["src", "crates", "scoring", "submissions", "python"];
 
 // Crates that use no files, data frames or threads.
-const PURE: [&str; 6] = [
+const PURE: [&str; 7] = [
     "crates/bias",
+    "crates/detection",
     "crates/quantities",
     "crates/measure",
     "crates/simulate",

@@ -48,7 +48,6 @@
 mod calibration;
 mod defects;
 mod denoise;
-mod detection;
 mod error;
 mod examine;
 mod measurement;
@@ -73,7 +72,6 @@ mod transform;
 mod warning;
 
 pub use calibration::{MeanShear, MeanShearError, ShearSum, is_significant};
-pub use detection::{DetectedPixel, Detection, DetectionScratch, Detections, Detector, Tile};
 pub use error::{EpochError, MeasureError};
 pub use examine::{EXAMINED_PSFS, Examination, examined_rows};
 pub use measurement::{
@@ -103,6 +101,7 @@ pub mod parts {
     pub use crate::denoise::{DenoiseScratch, WaveletWiener, border_noise};
     pub use crate::network::{Network, NetworkScratch, Rule, Step, convolve, psf_factor};
     pub use crate::pixels::frame;
+    pub use crate::psf::gaussian_sigma;
     pub use crate::shape::{
         ClippedAcf, ClippedAcfScratch, Moments, Ratio, RoundMoments, TypicalGalaxy,
     };

@@ -165,7 +165,7 @@ impl StampNoise {
     /// Power at wave vector (kx, ky), in radians per pixel, in units of that of white noise of the same level, and its
     /// derivatives (k_x ∂_x − k_y ∂_y) and (k_y ∂_x + k_x ∂_y), by which a shear of the image changes it. With pixels that are
     /// not square, in the coordinates of [`PixelShape::map`].
-    pub(crate) fn power(&self, [kx, ky]: [f64; 2], pixels: PixelShape) -> (f64, [f64; 2]) {
+    pub fn power(&self, [kx, ky]: [f64; 2], pixels: PixelShape) -> (f64, [f64; 2]) {
         let max_lag = self.max_lag as i32;
         let (mut power, mut slopes) = (1.0, [0.0; 2]);
         for dy in 0..=max_lag {

@@ -23,6 +23,7 @@ pub(crate) use self::residual_profile::ResidualProfiles;
 pub use self::star::Star;
 pub(crate) use self::star::cut_start;
 pub(crate) use self::star_survey::StarSurvey;
+pub use self::width::gaussian_sigma;
 pub(crate) use self::width::{
     WIDTH_STEPS, gaussian_variance, noise_equivalent_area, width_factor, width_step,
 };

@@ -34,8 +34,10 @@
 //! values of each catalogue.
 
 use std::fmt;
+use std::ops::Mul;
 use std::sync::Arc;
 
+use shearq_quantities::jet::{Jet, step};
 use shearq_quantities::linear::cholesky;
 
 use crate::measurement::{
@@ -121,14 +123,6 @@ pub struct Selected {
     pub response: ResponseMatrix,
     /// The weight; zero for galaxies that are cut.
     pub weight: f64,
-}
-
-/// A weight and its derivatives with the variables of a [`Coupling`].
-#[derive(Debug, Clone, Copy, PartialEq)]
-struct Jet {
-    value: f64,
-    first: [f64; VARIABLES],
-    second: [[f64; VARIABLES]; VARIABLES],
 }
 
 impl Quantity {
@@ -233,100 +227,36 @@ impl Selection {
         selected
     }
 
-    fn jet(&self, galaxy: &Observables) -> Jet {
-        let one = Jet {
-            value: 1.0,
-            first: [0.0; VARIABLES],
-            second: [[0.0; VARIABLES]; VARIABLES],
-        };
+    fn jet(&self, galaxy: &Observables) -> Jet<VARIABLES> {
         let cuts = self.cuts.iter().map(|cut| cut.jet(galaxy));
         let weight = self
             .weight
             .iter()
             .map(|weight| numerical(&**weight, galaxy));
-        cuts.chain(weight).fold(one, Jet::times)
+        cuts.chain(weight).fold(Jet::constant(1.0), Jet::mul)
     }
 }
 
 impl Cut {
-    /// The step u³(10 − 15u + 6u²), u from 0 to 1 between the bounds: two derivatives vanish at either end.
-    fn jet(&self, galaxy: &Observables) -> Jet {
+    /// The step from 0 to 1, or from 1 to 0.
+    fn jet(&self, galaxy: &Observables) -> Jet<VARIABLES> {
         let (flux, error) = (galaxy.flux, galaxy.flux_error);
-        let mut place = Jet {
-            value: 0.0,
-            first: [0.0; VARIABLES],
-            second: [[0.0; VARIABLES]; VARIABLES],
+        let place = match self.quantity {
+            Quantity::Snr => Jet::variable(FLUX, flux) * (1.0 / error),
+            Quantity::Flux => Jet::variable(FLUX, flux),
+            Quantity::Size => Jet::variable(SIZE, galaxy.size),
+            Quantity::Neighbour => Jet::variable(RING, galaxy.ring) / Jet::variable(FLUX, flux),
         };
-        match self.quantity {
-            Quantity::Snr => (place.value, place.first[FLUX]) = (flux / error, 1.0 / error),
-            Quantity::Flux => (place.value, place.first[FLUX]) = (flux, 1.0),
-            Quantity::Size => (place.value, place.first[SIZE]) = (galaxy.size, 1.0),
-            Quantity::Neighbour => {
-                let ratio = galaxy.neighbour();
-                place.value = ratio;
-                (place.first[FLUX], place.first[RING]) = (-ratio / flux, 1.0 / flux);
-                let mixed = -1.0 / (flux * flux);
-                place.second[FLUX][FLUX] = 2.0 * ratio / (flux * flux);
-                (place.second[FLUX][RING], place.second[RING][FLUX]) = (mixed, mixed);
-            }
-        }
         let usual = self.quantity.usual_half_width(error);
         let sign = if self.above { 1.0 } else { -1.0 };
-        let slope = sign / (2.0 * self.half_width.unwrap_or(usual));
-        let u = 0.5 + (place.value - self.threshold) * slope;
-        // NaN, such as the S/N of no flux without noise, passes no cut. An infinite S/N is beyond all thresholds.
-        let u = if u.is_nan() { 0.0 } else { u.clamp(0.0, 1.0) };
-        let rest = 1.0 - u;
-        let value = u * u * u * (10.0 - 15.0 * u + 6.0 * u * u);
-        let (first, second) = if u > 0.0 && u < 1.0 {
-            (
-                30.0 * u * u * rest * rest * slope,
-                60.0 * u * rest * (rest - u) * slope * slope,
-            )
-        } else {
-            (0.0, 0.0)
-        };
-        place.mapped(value, first, second)
-    }
-}
-
-impl Jet {
-    /// A function of it with these derivatives.
-    fn mapped(self, value: f64, first: f64, second: f64) -> Self {
-        let chain = |a: usize, b: usize| {
-            if first == 0.0 && second == 0.0 {
-                return 0.0;
-            }
-            first * self.second[a][b] + second * self.first[a] * self.first[b]
-        };
-        Jet {
-            value,
-            first: self
-                .first
-                .map(|of| if first == 0.0 { 0.0 } else { first * of }),
-            second: std::array::from_fn(|a| std::array::from_fn(|b| chain(a, b))),
-        }
-    }
-
-    fn times(self, other: Self) -> Self {
-        let product = |a: usize, b: usize| {
-            self.second[a][b] * other.value
-                + self.first[a] * other.first[b]
-                + self.first[b] * other.first[a]
-                + self.value * other.second[a][b]
-        };
-        Jet {
-            value: self.value * other.value,
-            first: std::array::from_fn(|k| {
-                self.first[k] * other.value + self.value * other.first[k]
-            }),
-            second: std::array::from_fn(|a| std::array::from_fn(|b| product(a, b))),
-        }
+        // Without a flux and its noise the S/N is NaN, and passes no cut.
+        let t = (place + -self.threshold) * (sign / self.half_width.unwrap_or(usual));
+        t.map(step(t.value))
     }
 }
 
 /// A weight and its derivatives by differences.
-fn numerical(weight: &dyn Fn(f64, f64, f64) -> f64, galaxy: &Observables) -> Jet {
+fn numerical(weight: &dyn Fn(f64, f64, f64) -> f64, galaxy: &Observables) -> Jet<VARIABLES> {
     // Steps of the flux in its errors, and of the size in px: rounding of second differences is then 10⁻¹⁰ of the weight.
     const STEP: f64 = 1e-3;
     let steps = [STEP * galaxy.flux_error, STEP];

@@ -14,16 +14,16 @@ use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::DataFolder;
 use shearq_dataset::metadata::{CATALOGUE_FIRST_PIXEL, CATALOGUE_FRAME, frame_entry};
 use shearq_dataset::run::{Run, Source};
+use shearq_detection::{DetectedPixel, Detection, Detections, Detector, Tile};
 use shearq_files::FileError;
 use shearq_files::frames::frame;
 use shearq_files::frames::polars::{Column, DataFrame, PolarsResult};
 use shearq_files::table::{self, FileFormat, Place};
-use shearq_measure::{
-    DetectedPixel, Detection, DetectionMethod, Detections, Detector, NoisePlan, PixelFrame,
-    StampNoise, Tile,
-};
+use shearq_measure::{NoisePlan, PixelFrame, StampNoise};
 use shearq_quantities::{Frame, Jacobian};
-use shearq_submissions::{Configuration, Method, NoiseSource, Psf, PsfForm, Stamp};
+use shearq_submissions::{
+    Configuration, DetectionMethod, Method, NoiseSource, Psf, PsfForm, Stamp,
+};
 
 use crate::PipelineError;
 use crate::engine;
@@ -44,6 +44,11 @@ pub struct DetectionTask<'a> {
     pub frame: Option<Frame>,
     pub settings: DetectionMethod,
 }
+
+// In a catalogue's metadata: the standard deviation of a pixel, the fingerprint of the mask, and the bits that make a pixel missing.
+const NOISE: &str = "noise";
+const MASK: &str = "mask";
+const MASK_BITS: &str = "maskbits";
 
 /// What was found on an exposure.
 #[derive(Debug, Clone, Copy)]
@@ -230,14 +235,23 @@ impl DetectionTask<'_> {
         let columns = self::columns(&found, &wcs);
         let columns = columns.map_err(|error| FileError::new(&path, error))?;
         let mut prints = BTreeMap::new();
-        for (key, file) in [
+        let mask = self
+            .masks
+            .as_ref()
+            .map(|masks| (MASK, &masks.files.paths[0]));
+        let files = [
             (GALAXIES, &self.exposure.paths[0]),
             (PSF, &self.psf.paths[0]),
-        ] {
+        ];
+        for (key, file) in files.into_iter().chain(mask) {
             prints.insert(key.to_owned(), of_image(&Place::of(file).path)?);
         }
         let mut metadata = metadata(run, id, prints)?;
         metadata.insert(CATALOGUE_FIRST_PIXEL.into(), "1".into());
+        metadata.insert(NOISE.into(), noise.sigma().to_string());
+        if let Some(bits) = self.masks.as_ref().and_then(|masks| masks.bits) {
+            metadata.insert(MASK_BITS.into(), bits.to_string());
+        }
         match (frame, wcs.reference()) {
             (Frame::Sky, _) => {
                 metadata.insert(CATALOGUE_FRAME.into(), Frame::Sky.to_string());

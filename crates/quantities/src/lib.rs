@@ -5,6 +5,7 @@
 //! * [`units`]: degrees, radians, pixels and multipoles.
 //! * [`FunctionalPsf`]: a Moffat or Kolmogorov PSF, integrated over pixels, with its transform.
 //! * [`radial`]: tables of radial profiles, elliptical radii and quadrature rules.
+//! * [`jet`]: functions with their first and second derivatives.
 //! * [`fourier`]: plans of Fourier transforms, compiled here for all crates.
 //! * [`linear`]: the solvers of linear equations, 2 × 2 matrices, and products of small ones.
 //! * [`statistics`]: running means and medians.
@@ -20,6 +21,7 @@
 mod ellipticity;
 pub mod fourier;
 pub mod hash;
+pub mod jet;
 pub mod linear;
 mod psf;
 pub mod radial;

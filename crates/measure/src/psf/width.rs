@@ -33,6 +33,11 @@ pub(crate) fn gaussian_variance(area: f64) -> f64 {
     area / (4.0 * std::f64::consts::PI)
 }
 
+/// σ in px of the Gaussian with the noise-equivalent area of a PSF of sum one.
+pub fn gaussian_sigma(psf: ArrayView2<'_, f64>) -> f64 {
+    gaussian_variance(noise_equivalent_area(psf)).sqrt()
+}
+
 /// How many steps wider a PSF of this noise-equivalent area is than one of `reference` px²; 0 if that is zero.
 ///
 /// Steps to wider PSFs are rounded. Those to narrower ones are rounded towards zero, less one, so that lengths first shrink

@@ -1,41 +1,16 @@
-//! Detection whose response to shear is known in closed form.
-//!
-//! Every pixel of an exposure has a weight w between 0 and 1, a product of smooth steps of linear functionals of the deconvolved
-//! image: smoothed light v₀ is above a threshold, and v₀ − v_j above zero for four neighbours j (the idea of AnaCal, Li &
-//! Mandelbaum 2023, MNRAS 521, 4904). The ellipticity is e = M₂₂/(M₀₀ + C) about the pixel. A shear about the pixel changes a
-//! functional into another linear one, and with f = w e of the functionals u Stein's lemma gives the response without added
-//! noise,
-//!
-//! ```text
-//! ∂f/∂γ = Σ_a f_a u_a′ − Σ_ab f_ab ⟨n_a′ n_b⟩.
-//! ```
-//!
-//! A quarter of Σ_ab f_ab (C⊥ − C)_ab is added to f, C⊥ being the covariance behind the PSF turned by 90 degrees: it takes out what
-//! noise of the PSF's shape adds. The mean shear of an exposure is the sum of f over the sum of responses. Covariances are
-//! constants of an exposure, whose noise has one level and one correlation.
-//!
-//! A [`Detector`] works on tiles of two blocks, one below the other, whose middles cover the exposure. v₀ of both blocks, by one
-//! Fourier transform, decides which pixels may have a weight. Their functionals are sums over a square of pixels, which do not
-//! depend on tiles.
-
-mod functionals;
-mod groups;
-mod pixel;
-mod weight;
+//! The weights and ellipticities of all pixels of an exposure.
 
 use multiversion::multiversion;
 use ndarray::ArrayView2;
+use shearq_measure::parts::gaussian_sigma;
+use shearq_measure::{MeasureError, StampNoise};
 use shearq_quantities::fourier::Complex64;
 use shearq_quantities::{Jacobian, PixelShape, Spin2};
 use shearq_submissions::DetectionMethod;
 
-use self::functionals::{Functionals, KERNELS, Lengths, SquareTransform, light_filter};
-pub use self::groups::Detections;
-pub use self::pixel::{DetectedPixel, Detection};
-use self::weight::{COUNT, EXCESS, LIGHT, M00, NEIGHBOURS, Square, Steps, dot, trace};
-use crate::error::MeasureError;
-use crate::noise::StampNoise;
-use crate::psf::{gaussian_variance, noise_equivalent_area};
+use crate::functionals::{Functionals, KERNELS, Lengths, SquareTransform, light_filter};
+use crate::pixel::DetectedPixel;
+use crate::weight::{COUNT, EXCESS, LIGHT, M00, NEIGHBOURS, Square, Steps, dot, trace};
 
 // Radius of the square of pixels under the functionals, in σ of their Gaussians. Weights beyond it are up to 2·10⁻³ of all, but of a
 // blend behind Moffat PSFs of β = 2.5 and 3 and a Kolmogorov one they change the functionals by 10⁻⁶ of its light.
@@ -109,7 +84,7 @@ impl Detector {
             ),
         };
         let star = star.mapv(|value| value / sum);
-        let sigma = gaussian_variance(noise_equivalent_area(star.view())).sqrt();
+        let sigma = gaussian_sigma(star.view());
         let lengths = Lengths {
             detection_sigma: settings.detection_sigma * sigma,
             moment_sigma: settings.moment_sigma * sigma,

@@ -1,6 +1,6 @@
 //! Pixels with a weight that touch each other are one detection.
 
-use super::pixel::{DetectedPixel, Detection};
+use crate::pixel::{DetectedPixel, Detection};
 
 /// Detections of an exposure, from its pixels row by row.
 ///

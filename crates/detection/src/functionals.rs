@@ -1,30 +1,29 @@
 //! Linear functionals of the deconvolved image about a pixel, their changes with shear, and the covariances of their noise.
 
 use ndarray::{Array2, ArrayView2};
+use shearq_measure::StampNoise;
 use shearq_quantities::PixelShape;
 use shearq_quantities::fourier::{Complex64, Planner64};
 
-use crate::noise::StampNoise;
-
-use super::weight::{COUNT, EXCESS, LIGHT, M00, M22, NEIGHBOURS, Square};
+use crate::weight::{COUNT, EXCESS, LIGHT, M00, M22, NEIGHBOURS, Square};
 
 // Of the PSF's transform, below which modes are left out: rounding of single precision.
 const MIN_TRANSFER: f64 = 1e-5;
 
 /// Of each functional, with both components of shear after them: what a kernel is of.
-pub(super) const KERNELS: usize = 3 * COUNT;
+pub(crate) const KERNELS: usize = 3 * COUNT;
 
 /// Lengths in pixels.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Lengths {
-    pub(super) detection_sigma: f64,
-    pub(super) moment_sigma: f64,
-    pub(super) distance: usize,
+pub(crate) struct Lengths {
+    pub(crate) detection_sigma: f64,
+    pub(crate) moment_sigma: f64,
+    pub(crate) distance: usize,
 }
 
 impl Lengths {
     /// Offsets (x, y) of the neighbours in pixels.
-    pub(super) fn neighbours(&self) -> [[f64; 2]; NEIGHBOURS] {
+    pub(crate) fn neighbours(&self) -> [[f64; 2]; NEIGHBOURS] {
         let d = self.distance as f64;
         [[d, 0.0], [-d, 0.0], [0.0, d], [0.0, -d]]
     }
@@ -103,10 +102,10 @@ impl Wave {
 }
 
 /// Transforms of square images of real pixels.
-pub(super) struct SquareTransform {
+pub(crate) struct SquareTransform {
     forward: shearq_quantities::fourier::Plan64,
     inverse: shearq_quantities::fourier::Plan64,
-    pub(super) side: usize,
+    pub(crate) side: usize,
 }
 
 impl std::fmt::Debug for SquareTransform {
@@ -121,7 +120,7 @@ impl std::fmt::Debug for SquareTransform {
 const BLOCK: usize = 16;
 
 impl SquareTransform {
-    pub(super) fn new(side: usize) -> Self {
+    pub(crate) fn new(side: usize) -> Self {
         let mut planner = Planner64::new();
         SquareTransform {
             forward: planner.forward(side),
@@ -131,13 +130,13 @@ impl SquareTransform {
     }
 
     /// Numbers that [`SquareTransform::forward`] needs beside the image.
-    pub(super) fn scratch(&self) -> usize {
+    pub(crate) fn scratch(&self) -> usize {
         let lengths = [&self.forward, &self.inverse].map(|plan| plan.get_inplace_scratch_len());
         lengths[0].max(lengths[1])
     }
 
     /// Writes the transform of `image`, which is destroyed, to `out`: transposed, with k_x along its rows' index.
-    pub(super) fn forward(
+    pub(crate) fn forward(
         &self,
         image: &mut [Complex64],
         out: &mut [Complex64],
@@ -149,7 +148,7 @@ impl SquareTransform {
     }
 
     /// The opposite, without the division by the number of pixels. `transform` is destroyed.
-    pub(super) fn inverse(
+    pub(crate) fn inverse(
         &self,
         transform: &mut [Complex64],
         out: &mut [Complex64],
@@ -215,7 +214,7 @@ fn inverse_transfer(star: ArrayView2<'_, f64>, transform: &SquareTransform) -> V
 }
 
 /// The filter of v₀ at the modes of a transform, with the division by the number of pixels.
-pub(super) fn light_filter(
+pub(crate) fn light_filter(
     star: ArrayView2<'_, f64>,
     lengths: &Lengths,
     pixels: PixelShape,
@@ -232,25 +231,25 @@ pub(super) fn light_filter(
 
 /// The kernels of all functionals, and the covariances of their noise.
 #[derive(Debug)]
-pub(super) struct Functionals {
+pub(crate) struct Functionals {
     /// For each pixel of a square, row by row, the weights of all [`KERNELS`].
-    pub(super) kernels: Vec<[f32; KERNELS]>,
-    pub(super) covariances: Covariances,
+    pub(crate) kernels: Vec<[f32; KERNELS]>,
+    pub(crate) covariances: Covariances,
 }
 
 /// Mean products of the noise of functionals.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Covariances {
-    pub(super) plain: Square,
+pub(crate) struct Covariances {
+    pub(crate) plain: Square,
     /// ⟨n_a′ n_b⟩ for both components of shear.
-    pub(super) sheared: [Square; 2],
+    pub(crate) sheared: [Square; 2],
     /// C behind the PSF, and of noise, turned by 90 degrees.
-    pub(super) turned: Square,
+    pub(crate) turned: Square,
 }
 
 impl Functionals {
     /// The functionals behind a star in noise, from the square of 2 `radius` + 2 pixels whose pixel `radius` along both axes is the pixel itself.
-    pub(super) fn new(
+    pub(crate) fn new(
         star: ArrayView2<'_, f64>,
         noise: &StampNoise,
         lengths: &Lengths,

@@ -1,6 +1,6 @@
 //! What is found at a pixel, and the sums over the pixels of a detection.
 
-use crate::measurement::ResponseMatrix;
+use shearq_measure::ResponseMatrix;
 
 /// A pixel with a weight above zero.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -37,7 +37,7 @@ pub struct Detection {
 
 impl Detection {
     /// Of one pixel; its centre is a sum over weights until [`Detection::centred`].
-    pub(super) fn of(pixel: &DetectedPixel) -> Self {
+    pub(crate) fn of(pixel: &DetectedPixel) -> Self {
         Detection {
             centre: pixel.place.map(|at| at as f64 * pixel.weight),
             weight: pixel.weight,
@@ -48,7 +48,7 @@ impl Detection {
         }
     }
 
-    pub(super) fn add(&mut self, other: &Self) {
+    pub(crate) fn add(&mut self, other: &Self) {
         self.weight += other.weight;
         self.snr = self.snr.max(other.snr);
         self.pixels += other.pixels;
@@ -61,7 +61,7 @@ impl Detection {
         }
     }
 
-    pub(super) fn centred(mut self) -> Self {
+    pub(crate) fn centred(mut self) -> Self {
         self.centre = self.centre.map(|sum| sum / self.weight);
         self
     }
