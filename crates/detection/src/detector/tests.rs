@@ -392,3 +392,42 @@ fn shapes_are_those_of_the_sky() {
         }
     }
 }
+
+#[test]
+fn noise_of_an_elliptical_psf_has_no_shape() {
+    // Peaks of noise alone, behind a star that is longer along x: deconvolved noise has its power along the star's short axis.
+    let star = Array2::from_shape_fn((48, 48), |(y, x)| {
+        gaussian([2.9, 2.1, 0.0], 1.0, [x as f64 - 23.5, y as f64 - 23.5])
+    });
+    let settings = DetectionMethod {
+        threshold: 1.5,
+        softening: 5.0,
+        ..DetectionMethod::default()
+    };
+    let detector = Detector::new(star.view(), &StampNoise::white(1.0), None, &settings).unwrap();
+    let mut without = Detector::new(star.view(), &StampNoise::white(1.0), None, &settings).unwrap();
+    without.of_psf = [[0.0; COUNT]; COUNT];
+    let mut rng = ChaCha8Rng::seed_from_u64(11);
+    let mut sums = [[0.0; 2]; 2];
+    const IMAGES: usize = 24;
+    for _ in 0..IMAGES {
+        let image =
+            Array2::from_shape_simple_fn((300, 300), || -> f32 { StandardNormal.sample(&mut rng) });
+        for (sums, detector) in sums.iter_mut().zip([&detector, &without]) {
+            let sum: f64 = found(detector, &image).iter().map(|own| own.e[0]).sum();
+            sums[0] += sum;
+            sums[1] += sum * sum;
+        }
+    }
+    let [with, without] = sums.map(|[sum, square]| {
+        let mean = sum / IMAGES as f64;
+        let variance = square / IMAGES as f64 - mean * mean;
+        (mean, (variance / IMAGES as f64).sqrt())
+    });
+    // The correction is of first order in the star's ellipticity: what it leaves is of second order.
+    assert!(without.0.abs() > 8.0 * without.1, "{without:?}");
+    assert!(
+        with.0.abs() < 3.0 * with.1.max(0.05 * without.0.abs()),
+        "{with:?} {without:?}"
+    );
+}

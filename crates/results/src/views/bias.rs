@@ -304,9 +304,9 @@ pub fn of_design(result: &BiasResult) -> Vec<String> {
         };
         let k = own.component + 1;
         lines.push(format!(
-            "{}: row {} has {:.1} % of the sum of the response R{k}{k} (found {}, expected about {:.3}), and changes m{k} by about as much{more}. Try: check its measurement, or flag it",
-            catalogue.name,
+            "row {} of {} has {:.1} % of the sum of the response R{k}{k} (found {}, expected about {:.3}), and changes m{k} by about as much{more}. Try: check its measurement, or flag it",
             own.row,
+            catalogue.name,
             100.0 * own.share,
             own.response,
             own.mean,
