@@ -56,10 +56,15 @@ made=("$name.tar.gz")
 if command -v dpkg-deb > /dev/null; then
     root=$stage/debian
     doc=$root/usr/share/doc/shearq
-    mkdir -p "$root"/{DEBIAN,usr/bin,usr/share/bash-completion/completions,usr/share/man/man1} "$doc"
+    share=$root/usr/share
+    mkdir -p "$root/DEBIAN" "$root/usr/bin" "$share/man/man1" "$doc"
+    mkdir -p "$share/bash-completion/completions" "$share/zsh/vendor-completions" "$share/fish/vendor_completions.d"
     install -m 755 "$tree/shearq" "$root/usr/bin/shearq"
-    cp "$tree/completions/shearq.bash" "$root/usr/share/bash-completion/completions/shearq"
-    cp "$tree"/man/*.1 "$root/usr/share/man/man1"
+    cp "$tree/completions/shearq.bash" "$share/bash-completion/completions/shearq"
+    cp "$tree/completions/shearq.zsh" "$share/zsh/vendor-completions/_shearq"
+    cp "$tree/completions/shearq.fish" "$share/fish/vendor_completions.d"
+    cp "$tree"/man/*.1 "$share/man/man1"
+    gzip -n -9 "$share"/man/man1/*.1
     cp -r README.md CHANGELOG.md docs "$doc"
     cat LICENSE-MIT "$tree/LICENCES-OF-DEPENDENCIES.txt" > "$doc/copyright"
     cat > "$root/DEBIAN/control" << CONTROL
