@@ -103,6 +103,10 @@ impl<const N: usize> Mul<f64> for Jet<N> {
 impl<const N: usize> Mul for Jet<N> {
     type Output = Self;
 
+    #[expect(
+        clippy::suspicious_arithmetic_impl,
+        reason = "derivatives of a product are sums"
+    )]
     fn mul(self, other: Self) -> Self {
         let product = |a: usize, b: usize| {
             self.second[a][b] * other.value
@@ -123,6 +127,10 @@ impl<const N: usize> Mul for Jet<N> {
 impl<const N: usize> Div for Jet<N> {
     type Output = Self;
 
+    #[expect(
+        clippy::suspicious_arithmetic_impl,
+        reason = "derivatives of a ratio are products and differences"
+    )]
     fn div(self, other: Self) -> Self {
         // From f = q g: f′ = q′ g + q g′, and so on.
         let value = self.value / other.value;
