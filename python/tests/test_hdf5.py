@@ -19,6 +19,8 @@ def columns(rng, n, shear, step=(0.0, 0.0), response=0.7):
         "wmom_g_1": e[:, 0] + response * (shear[0] + step[0]),
         "wmom_g_2": e[:, 1] + response * (shear[1] + step[1]),
         "wmom_flags": np.zeros(n, int),
+        "wmom_s2n": np.full(n, 50.0),
+        "wmom_T_ratio": np.full(n, 2.0),
     }
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ._arrays import whole
-from .adapters import _epochs
+from .adapters import _epochs, _resized
 
 MedsPsfs = Union[Callable[[Any, int, int], Any], Sequence[Any], Mapping[int, Any]]
 """PSFs of a MEDS file: a function of (meds, galaxy, cutout), or a model for each ``file_id``."""
@@ -72,16 +72,6 @@ def _jacobian(catalogue: Any, galaxy: int, cutout: int, centre: tuple[float, flo
     return SimpleNamespace(get_cen=lambda: centre, **{f"get_{name}": (lambda value=value: value) for name, value in derivatives.items()})
 
 
-def _square(image: NDArray[Any], fill: float, centre: tuple[float, float], side: int) -> tuple[NDArray[Any], tuple[float, float]]:
-    """``side`` pixels around the pixel at the centre, those beyond the image filled, and the centre there."""
-    corner = [round(at - (side - 1) / 2) for at in centre]
-    found = np.full((side, side), fill, dtype=image.dtype)
-    own = tuple(slice(max(at, 0), max(min(at + side, n), 0)) for at, n in zip(corner, image.shape))
-    there = tuple(slice(part.start - at, part.start - at + max(part.stop - part.start, 0)) for at, part in zip(corner, own))
-    found[there] = image[own]
-    return found, (centre[0] - corner[0], centre[1] - corner[1])
-
-
 def from_meds(
     meds: Any,
     psfs: MedsPsfs | None = None,
@@ -109,7 +99,7 @@ def from_meds(
         Whether the first cutout of each galaxy is a coadd, as in most files of DES: ``'skip'`` uses all others, ``'only'`` this
         one, and ``'absent'`` all.
     size : int
-        Side of the stamps in pixels. Larger cutouts are cut around the galaxy, and smaller ones have missing pixels on their borders.
+        Side of the stamps in pixels. Larger cutouts are cut around the galaxy, and smaller ones get borders of white noise.
     block : int
         Galaxies of a block; noise, sky and galaxy size are measured on each block.
     start, end : int, optional
@@ -187,13 +177,13 @@ def _cutouts(meds: Any, catalogue: Any, psfs: Any, galaxy: int, coadd: str, side
             flags = np.zeros(image.shape, dtype=np.int64)
         weight[(flags.astype(np.int64) & bits) != 0] = 0.0
         centre = _centre(catalogue, "", galaxy, cutout, image.shape)
-        stamp, middle = _square(image, 0.0, centre, side)
-        weight, _ = _square(weight, 0.0, centre, side)
-        if not (weight > 0).any():
+        own = _jacobian(catalogue, galaxy, cutout, centre)
+        observation = _resized(SimpleNamespace(image=image, weight=weight, jacobian=own, psf=None), side)
+        if not (observation.weight > 0).any():
             # As cutouts at the edge of an exposure: absent, and not an error of the file.
             continue
         psf = _psf(meds, catalogue, psfs, galaxy, cutout, side)
-        star = SimpleNamespace(
+        observation.psf = SimpleNamespace(
             image=psf,
             jacobian=_jacobian(
                 catalogue,
@@ -202,8 +192,7 @@ def _cutouts(meds: Any, catalogue: Any, psfs: Any, galaxy: int, coadd: str, side
                 _centre(catalogue, "psf_" if psfs is None else "none_", galaxy, cutout, psf.shape),
             ),
         )
-        own = _jacobian(catalogue, galaxy, cutout, middle)
-        found.append(SimpleNamespace(image=stamp, weight=weight, jacobian=own, psf=star))
+        found.append(observation)
     return found
 
 

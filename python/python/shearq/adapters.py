@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ._arrays import whole
 from ._catalogue import Catalogue
 from ._galsim import SAME, from_galsim as from_galsim, square_pixels
 
@@ -37,7 +40,7 @@ def _check_centre(observation: Any, image: NDArray[Any], psf: NDArray[Any], k: i
     )
 
 
-def from_ngmix(observations: Any, fluxes: Any = None) -> dict[str, Any]:
+def from_ngmix(observations: Any, fluxes: Any = None, *, size: int | None = None) -> dict[str, Any]:
     """Arguments of :func:`measure` for ngmix ``Observation``, ``ObsList`` or ``MultiBandObsList``, or a sequence of them.
 
     The noise is the inverse root of the median of the positive weights. Pixels with a weight of zero, or with a bit of
@@ -52,6 +55,9 @@ def from_ngmix(observations: Any, fluxes: Any = None) -> dict[str, Any]:
         Fluxes of the galaxies in the bands, in any unit. They weight the bands, with flux/noise², and should not be measured on
         the noise of the galaxy itself. By default they are the mean fluxes of all galaxies of the call under a Gaussian of
         σ = 3 px: any common weights leave the shear unbiased, so that only the noise grows where colours differ.
+    size : int, optional
+        Side of the stamps in pixels, for images of several or of small shapes. Larger images are cut around the galaxy, and smaller
+        ones get borders of white noise. By default images are taken as they are.
 
     Returns
     -------
@@ -73,6 +79,8 @@ def from_ngmix(observations: Any, fluxes: Any = None) -> dict[str, Any]:
     many = [observations] if is_one else list(observations)
     if not many:
         raise ValueError("observations: found none; expected one or more")
+    if size is not None:
+        many = [_resized(one, whole("size", size, 1, 1 << 12)) for one in many]
     if any(isinstance(one, Sequence) for one in many):
         return {"epochs": _epochs([_bands(k, one) for k, one in enumerate(many)], fluxes)}
     if fluxes is not None:
@@ -91,9 +99,7 @@ def from_ngmix(observations: Any, fluxes: Any = None) -> dict[str, Any]:
         parts.append((image, psf, noise, missing))
     stamps, psfs, noise, masks = zip(*parts)
     for name, images in (("image", stamps), ("PSF image", psfs)):
-        shapes = {np.shape(image) for image in images}
-        if len(shapes) > 1:
-            raise ValueError(f"observations: {name}s of shapes {sorted(shapes)}; expected one shape")
+        _one_shape(name, images)
     found = {"stamps": np.stack(stamps), "psf": np.stack(psfs), "noise": np.array(noise)}
     if any(mask.any() for mask in masks):
         found["mask"] = np.stack(masks)
@@ -123,6 +129,53 @@ def _arrays(what: str, observation: Any) -> tuple[Any, Any, float, Any, list[Any
     if getattr(observation, "bmask", None) is not None:
         missing |= np.asarray(observation.bmask) != 0
     return image, np.asarray(star.image), float(1 / np.sqrt(np.median(positive))), missing, matrices
+
+
+def _one_shape(name: str, images: Sequence[Any]) -> None:
+    shapes = {np.shape(image) for image in images}
+    if len(shapes) > 1:
+        remedy = ". Try: size=48" if name == "image" else ""
+        raise ValueError(f"observations: {name}s of shapes {sorted(shapes)}; expected one shape{remedy}")
+
+
+def _square(image: NDArray[Any], fill: float, centre: tuple[float, float], side: int) -> tuple[NDArray[Any], tuple[float, float]]:
+    """``side`` pixels around the pixel at the centre, those beyond the image filled, and the centre there."""
+    corner = [round(at - (side - 1) / 2) for at in centre]
+    found = np.full((side, side), fill, dtype=image.dtype)
+    own = tuple(slice(max(at, 0), max(min(at + side, n), 0)) for at, n in zip(corner, image.shape))
+    there = tuple(slice(part.start - at, part.start - at + max(part.stop - part.start, 0)) for at, part in zip(corner, own))
+    found[there] = image[own]
+    return found, (centre[0] - corner[0], centre[1] - corner[1])
+
+
+def _resized(observation: Any, size: int) -> Any:
+    """Observations whose images have ``size`` pixels around their centres.
+
+    Beyond the images is white noise of the median weight, the same for the same image. Missing pixels would flag the galaxy, because
+    the opposite ones are missing, too; and zeros are taken for the borders of exposures.
+    """
+    if isinstance(observation, Sequence):
+        return [_resized(one, size) for one in observation]
+    try:
+        image, jacobian, psf = np.asarray(observation.image), observation.jacobian, observation.psf
+    except (AttributeError, RuntimeError):
+        # `_arrays` says what is absent.
+        return observation
+    centre = tuple(jacobian.get_cen()) if hasattr(jacobian, "get_cen") else tuple((side - 1) / 2 for side in image.shape)
+
+    def square(pixels: Any) -> NDArray[Any]:
+        return _square(np.asarray(pixels), 0, centre, size)[0]
+
+    stamp, middle = _square(image, 0, centre, size)
+    weight, inside = square(observation.weight), square(np.ones(image.shape, bool))
+    if (weight > 0).any():
+        weight[~inside] = np.median(weight[weight > 0])
+        noise = np.random.default_rng(zlib.crc32(image.astype("<f8").tobytes())).normal(size=np.count_nonzero(~inside))
+        stamp[~inside] = noise / np.sqrt(weight[~inside])
+    mask = getattr(observation, "bmask", None)
+    derivatives = {f"get_d{way}": getattr(jacobian, f"get_d{way}") for way in ("udcol", "udrow", "vdcol", "vdrow")}
+    jacobian = SimpleNamespace(get_cen=lambda: middle, **derivatives)
+    return SimpleNamespace(image=stamp, weight=weight, bmask=None if mask is None else square(mask), jacobian=jacobian, psf=psf)
 
 
 def _offset(jacobian: Any, image: NDArray[Any]) -> tuple[float, float]:
@@ -187,9 +240,7 @@ def _epoch_of(galaxies: list[list[list[Any]]], band: int, number: int) -> dict[s
             offset = _galaxy_offset(observation, image, psf)
             parts[k] = np.where(missing, np.nan, image), psf, noise, np.reshape(own, (2, 2)), offset
     for name, place in (("image", 0), ("PSF image", 1)):
-        shapes = {np.shape(part[place]) for part in parts.values()}
-        if len(shapes) > 1:
-            raise ValueError(f"observations: {name}s of shapes {sorted(shapes)}; expected one shape")
+        _one_shape(name, [part[place] for part in parts.values()])
     stamp, psf, noise, matrix, _ = next(iter(parts.values()))
     none = np.full(np.shape(stamp), np.nan), psf, noise, matrix, (0.0, 0.0)
     columns = zip(*(parts.get(k, none) for k in range(len(galaxies))))
