@@ -244,7 +244,7 @@ impl SummaryArguments {
 }
 
 // Commands that read a table from standard input.
-const FROM_STANDARD_INPUT: [&str; 2] = ["bias", "score"];
+const FROM_STANDARD_INPUT: [&str; 6] = ["bias", "compare", "gather", "pack", "score", "simulate"];
 
 /// The arguments of a command, where `-` and pipes are a file with what is read from them: tables are read twice.
 pub(super) struct StandardInput {
@@ -273,11 +273,15 @@ impl StandardInput {
         }
         let folder = tempfile::tempdir()?;
         for at in pipes {
-            let mut from: Box<dyn std::io::Read> = match arguments[at] == "-" {
-                true => Box::new(std::io::stdin().lock()),
-                false => Box::new(std::fs::File::open(&arguments[at])?),
+            // Errors name the file.
+            let (mut from, name): (Box<dyn std::io::Read>, _) = match arguments[at] == "-" {
+                true => (Box::new(std::io::stdin().lock()), "standard-input".into()),
+                false => (
+                    Box::new(std::fs::File::open(&arguments[at])?),
+                    format!("pipe-{at}"),
+                ),
             };
-            let path = folder.path().join(format!("input-{at}"));
+            let path = folder.path().join(name);
             std::io::copy(&mut from, &mut std::fs::File::create(&path)?)?;
             read.arguments[at] = path.into();
         }

@@ -5,7 +5,7 @@ use serde_json::Value;
 use shearq_files::parquet;
 
 use crate::support::{
-    Folder, assert_has, fits_extension, fits_image, floats, pixels_of, stamps_of,
+    Folder, assert_has, fits_extension, fits_image, floats, pixels_of, printed, refused, stamps_of,
 };
 
 const LINEAR: &str = "--submission 48/linear/star";
@@ -404,6 +404,23 @@ fn each_galaxy_has_the_noise_of_its_place_and_of_its_light() {
         // π w² for windows of 6.7 to 9.5 px, and up to 1.6 times as much.
         assert!((140.0..450.0).contains(&area), "{k}: {area}");
     }
+}
+
+#[test]
+fn positions_come_from_standard_input() {
+    let folder = Folder::with_set(2);
+    write_positions(&folder, 0.5);
+    let from = "gather --exposure data/set02/galaxies-001.fits --psf data/set02/psf-001.fits";
+    folder.run(&format!("{from} --positions positions.csv --out file"));
+    let root = folder.at("");
+    printed(
+        &root,
+        &format!("cat positions.csv | shearq {from} --positions - --out pipe"),
+    );
+    let stamps = |out: &str| stamps_of(&folder.at(&format!("{out}/set01/galaxies-001.fits")), 48);
+    assert_eq!(stamps("pipe"), stamps("file"));
+    let line = format!("printf 'x,y\\n24.5,no\\n' | shearq {from} --positions - --out bad");
+    assert_has(&refused(&root, &line), "standard-input: line 2");
 }
 
 #[test]
