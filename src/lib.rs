@@ -58,7 +58,7 @@ use commands::{
     measure, merge, pack, quickstart, reproduce, run, score, select, shear, show, simulate,
     submissions, unpack,
 };
-use shearq_files::parquet::panic_is_caught;
+use shearq_files::panic_is_caught;
 use shearq_render::escape::visible;
 use shearq_render::table::Table;
 use shearq_render::terminal::fitted;

@@ -13,6 +13,7 @@ use crate::open::open;
 pub(crate) enum Content {
     Fits,
     Parquet,
+    Arrow,
     /// Text, or nothing that is known.
     Text,
     /// A format that is not read: its name, and what converts it.
@@ -23,7 +24,6 @@ pub(crate) enum Content {
 pub(crate) const GZIP_MAGIC: [u8; 2] = [0x1f, 0x8b];
 
 const PANDAS: &str = "pandas, which reads it and writes Parquet by to_parquet";
-const FEATHER: &str = "python -c 'import pandas, sys; pandas.read_feather(sys.argv[1]).to_parquet(sys.argv[2])' FILE table.parquet";
 // Groups, and those of metadetect's artificial shears, are read by the Python package. python/tests/test_hdf5.py runs both lines.
 const HDF5: &str = "python3 -c 'import shearq, sys; print(shearq.bias(sys.argv[1], g1=float(sys.argv[2]), g2=float(sys.argv[3])))' FILE:GROUP G1 G2, \
     or for other commands python3 -c 'import h5py, pandas, sys; \
@@ -32,9 +32,14 @@ const ASTROPY: &str = "astropy.table.Table.read, and write(\"table.parquet\")";
 const NUMPY: &str = "numpy.load, and astropy.table.Table(array).write(\"table.parquet\")";
 
 // Signatures of formats that are not read, from their specifications. An Arrow stream begins with the mark of a continued message.
-const OTHERS: [(&[u8], &str, &str); 12] = [
-    (b"ARROW1", "Feather (an Arrow file)", FEATHER),
-    (b"FEA1", "Feather, version 1", FEATHER),
+const OTHERS: [(&[u8], &str, &str); 13] = [
+    (b"PAR1", "Parquet, compressed by gzip", "gunzip first"),
+    (
+        b"ARROW1",
+        "an Arrow file, compressed by gzip",
+        "gunzip first",
+    ),
+    (b"FEA1", "Feather, version 1", PANDAS),
     (
         b"\xff\xff\xff\xff",
         "an Arrow stream",
@@ -81,6 +86,8 @@ impl Content {
             Content::Fits
         } else if start.starts_with(b"PAR1") && !packed {
             Content::Parquet
+        } else if start.starts_with(b"ARROW1") && !packed {
+            Content::Arrow
         } else if let Some((_, name, remedy)) = others.find(|(own, ..)| start.starts_with(own)) {
             Content::Other(name, remedy)
         } else {
@@ -94,11 +101,11 @@ impl Content {
             Content::Other(name, remedy) => Err(FileError::new(
                 path,
                 format!(
-                    "the file is {name}, which is not read (expected a text, FITS or Parquet table)"
+                    "the file is {name}, which is not read (expected a text, FITS, Parquet or Arrow table)"
                 ),
             )
             .hint(remedy)),
-            Content::Fits | Content::Parquet | Content::Text => Ok(()),
+            Content::Fits | Content::Parquet | Content::Arrow | Content::Text => Ok(()),
         }
     }
 }
@@ -126,11 +133,13 @@ mod tests {
         assert_eq!(of(fits), Content::Fits);
         assert_eq!(of(&gzip(fits)), Content::Fits);
         assert_eq!(of(b"PAR1 and more"), Content::Parquet);
+        assert_eq!(of(b"ARROW1\0\0 and more"), Content::Arrow);
         assert_eq!(of(&gzip(b"e1,e2\n")), Content::Text);
         assert_eq!(of(b""), Content::Text);
         assert_eq!(of(&gzip(b"e1,e2\n")[..4]), Content::Text);
         for (signature, name, _) in OTHERS {
-            let found = of(&[signature, b"more"].concat());
+            // Plain Parquet and Arrow are read.
+            let found = of(&gzip(&[signature, b"more"].concat()));
             assert!(
                 matches!(found, Content::Other(own, _) if own == name),
                 "{name}"

@@ -1,4 +1,4 @@
-//! Files: FITS, Parquet, ASCII and CSV tables, read with care and written completely or not at all.
+//! Files: FITS, Parquet, Arrow, ASCII and CSV tables, read with care and written completely or not at all.
 //!
 //! [`fits`] is the only user of cfitsio and serialises its calls. [`open`] is the only place that opens files for
 //! reading. [`atomic`] writes each file under a temporary name and renames it when it is complete.
@@ -9,8 +9,12 @@ use std::path::{Path, PathBuf};
 
 use thiserror::Error;
 
+pub use fields::panic_is_caught;
+
+mod arrow;
 pub mod atomic;
 mod content;
+mod fields;
 pub mod fits;
 pub mod frames;
 pub mod open;

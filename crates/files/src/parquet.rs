@@ -10,21 +10,18 @@
 //! Rows are counted before memory is allocated for them, but not pages that compress to next to nothing: catalogues are the
 //! user's own, while entries of challenges, which strangers send, are text.
 
-use std::cell::Cell;
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{Cursor, Read, Seek, SeekFrom};
-use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use flate2::Crc;
 use polars::prelude::{
-    ArrowDataType, ArrowField, ChunkFillNullValue, ChunkedArray, Column, CompatLevel, DataFrame,
-    DataType, FileMetadataRef, IntoSeries, KeyValueMetadata, NamedFrom, ParquetReader,
-    ParquetWriter, PolarsError, PolarsNumericType, PolarsResult, SchemaExt, SerReader, Series,
-    StatisticsOptions,
+    ArrowDataType, ArrowField, Column, CompatLevel, DataFrame, DataType, FileMetadataRef,
+    KeyValueMetadata, ParquetReader, ParquetWriter, PolarsError, PolarsResult, SchemaExt,
+    SerReader, Series, StatisticsOptions,
 };
 use polars_arrow::io::ipc::write::{default_ipc_fields, schema_to_bytes};
 use polars_parquet::parquet::page::CompressedPage;
@@ -35,11 +32,12 @@ use polars_parquet::write::{CompressionOptions, Encoding, Version, WriteOptions,
 use serde_json::{Map, Value, json};
 
 use crate::FileError;
-use crate::frames::{Metadata, element_name, element_of, frame, reals};
+use crate::fields::{
+    MAX_VECTOR, Wanted, decoded, decoded_type, guarded, names, pick, with_missing,
+};
+use crate::frames::{Metadata, element_name, frame};
 use crate::open;
 
-// Longest vector that becomes one column per number.
-const MAX_VECTOR: usize = 8;
 // Rows of a row group: polars' own number.
 const ROW_GROUP: usize = 512 * 512;
 // The key under which Parquet files keep the Arrow schema.
@@ -199,7 +197,7 @@ pub fn read(
     let wanted_all = |fields: &[ArrowField]| fields.iter().cloned().map(Wanted::whole).collect();
     let fields = match wanted {
         None => wanted_all(&source.fields),
-        Some(names) => source.pick(names)?,
+        Some(names) => pick(path, &source.fields, names)?,
     };
     source.check_rows(most_rows)?;
     let columns = fields.iter().map(|field| source.read_column(field));
@@ -214,10 +212,19 @@ pub(crate) fn read_numbers(
     most_rows: usize,
 ) -> Result<DataFrame, FileError> {
     let table = read(path, wanted, most_rows)?;
+    numbers_alone(path, table, wanted.is_some())
+}
+
+/// A table without its columns of text, which are refused if they are wanted.
+pub(crate) fn numbers_alone(
+    path: &Path,
+    table: DataFrame,
+    is_wanted: bool,
+) -> Result<DataFrame, FileError> {
     let columns = table.columns().iter();
     let texts = columns.filter(|column| column.dtype().is_string());
     let texts: Vec<String> = texts.map(|column| column.name().to_string()).collect();
-    if let (Some(name), Some(_)) = (texts.first(), wanted) {
+    if let Some(name) = texts.first().filter(|_| is_wanted) {
         let message = format!("column `{name}` holds text; expected numbers");
         return Err(FileError::new(path, message));
     }
@@ -232,10 +239,10 @@ pub(crate) fn read_groups(
     mut take: impl FnMut(DataFrame) -> Result<(), FileError>,
 ) -> Result<(), FileError> {
     let mut source = Source::open(path)?;
-    let fields = source.pick(wanted)?;
+    let fields = pick(path, &source.fields, wanted)?;
     let fields: Vec<Wanted> = fields
         .iter()
-        .map(|field| source.decoded(field))
+        .map(|field| decoded(path, field))
         .collect::<Result<_, FileError>>()?;
     source.check_rows(usize::MAX)?;
     for number in 0..source.footer.row_groups.len() {
@@ -264,7 +271,7 @@ pub(crate) fn first_texts(path: &Path) -> Result<Vec<(String, String)>, FileErro
     let mut found = Vec::new();
     for field in fields {
         let name = field.name.to_string();
-        let wanted = source.decoded(&Wanted::whole(field))?;
+        let wanted = decoded(path, &Wanted::whole(field))?;
         let chunk = source.read_rows(&wanted, number, Some(1))?;
         let first = chunk.str().ok().and_then(|texts| texts.get(0));
         found.extend(first.map(|text| (name, text.to_owned())));
@@ -274,7 +281,7 @@ pub(crate) fn first_texts(path: &Path) -> Result<Vec<(String, String)>, FileErro
 
 /// The names of the columns, in file order, from the footer alone.
 pub fn columns(path: impl AsRef<Path>) -> Result<Vec<String>, FileError> {
-    Ok(Source::open(path.as_ref())?.names())
+    Ok(names(&Source::open(path.as_ref())?.fields))
 }
 
 pub fn metadata(path: impl AsRef<Path>) -> Result<Metadata, FileError> {
@@ -290,67 +297,6 @@ pub fn metadata(path: impl AsRef<Path>) -> Result<Metadata, FileError> {
 fn damaged(path: &Path, detail: impl std::fmt::Display) -> FileError {
     let message = format!("not a readable Parquet file, or damaged: {detail}");
     FileError::new(path, message)
-}
-
-/// A column, or the numbers at one place of a column of vectors.
-struct Wanted {
-    field: ArrowField,
-    element: Option<usize>,
-}
-
-impl Wanted {
-    fn whole(field: ArrowField) -> Self {
-        Wanted {
-            field,
-            element: None,
-        }
-    }
-
-    fn taken(&self, vectors: Series) -> Result<Series, String> {
-        let Some(place) = self.element else {
-            return Ok(vectors);
-        };
-        let mut numbers = Vec::with_capacity(vectors.len());
-        for chunk in vectors
-            .list()
-            .map_err(|error| error.to_string())?
-            .downcast_iter()
-        {
-            let inner = Series::try_from((self.field.name.clone(), chunk.values().clone()));
-            let inner = Column::from(inner.map_err(|error| error.to_string())?);
-            let inner = reals(&inner).ok_or("found vectors of no numbers")?;
-            for row in 0..chunk.len() {
-                let (start, end) = chunk.offsets().start_end(row);
-                let missing = chunk.validity().is_some_and(|valid| !valid.get_bit(row));
-                if start + place >= end && !missing {
-                    let length = end - start;
-                    return Err(format!(
-                        "found a vector of {length} numbers, expected more than {place}"
-                    ));
-                }
-                numbers.push(if missing {
-                    f64::NAN
-                } else {
-                    inner[start + place]
-                });
-            }
-        }
-        let name = element_name(&self.field.name, place);
-        Ok(Series::new(name.into(), numbers))
-    }
-}
-
-/// The names under which a column is read: `g[0]` and `g[1]` of vectors of two.
-fn names_in(field: &ArrowField) -> Vec<String> {
-    let length = match &field.dtype {
-        ArrowDataType::FixedSizeList(_, length) => (*length).min(MAX_VECTOR),
-        ArrowDataType::List(_) | ArrowDataType::LargeList(_) => 2,
-        _ => 0,
-    };
-    match decoded_vector(&field.dtype) {
-        Some(_) => (0..length).map(|k| element_name(&field.name, k)).collect(),
-        None => vec![field.name.to_string()],
-    }
 }
 
 struct Source<'a> {
@@ -387,11 +333,12 @@ impl<'a> Source<'a> {
             check_sum(footer, u32::from_le_bytes(*sum))
                 .map_err(|error| damaged(path, format!("footer: {error}")))?;
         }
-        let (footer, fields) = guarded(path, "footer", || {
+        let (footer, fields) = guarded("footer", || {
             let mut reader = ParquetReader::new(Cursor::new(&tail));
             let fields = reader.schema()?.iter_values().cloned().collect();
             Ok((reader.get_metadata()?.clone(), fields))
-        })?;
+        })
+        .map_err(|detail| damaged(path, detail))?;
         let mut source = Self {
             path,
             file,
@@ -439,40 +386,8 @@ impl<'a> Source<'a> {
         Ok(())
     }
 
-    fn names(&self) -> Vec<String> {
-        self.fields.iter().flat_map(names_in).collect()
-    }
-
-    fn pick(&self, names: &[&str]) -> Result<Vec<Wanted>, FileError> {
-        let mut seen = BTreeSet::new();
-        names
-            .iter()
-            .map(|&name| {
-                if !seen.insert(name) {
-                    let message =
-                        format!("column `{name}` is named twice; expected every name once");
-                    return Err(FileError::new(self.path, message));
-                }
-                let called = |name| self.fields.iter().find(move |field| field.name == name);
-                let whole = || called(name).cloned().map(Wanted::whole);
-                let element = || {
-                    let (column, place) = element_of(name)?;
-                    let field = called(column).filter(|field| names_in(field).len() > place)?;
-                    decoded_vector(&field.dtype)?;
-                    Some(Wanted {
-                        field: field.clone(),
-                        element: Some(place),
-                    })
-                };
-                whole()
-                    .or_else(element)
-                    .ok_or_else(|| FileError::no_column(self.path, name, &self.names()))
-            })
-            .collect()
-    }
-
     fn read_column(&mut self, wanted: &Wanted) -> Result<Column, FileError> {
-        let wanted = self.decoded(wanted)?;
+        let wanted = decoded(self.path, wanted)?;
         let field = &wanted.field;
         let mut column = match wanted.element {
             None => Series::new_empty(field.name.clone(), &DataType::from_arrow_field(field)),
@@ -500,25 +415,6 @@ impl<'a> Source<'a> {
         }
         // In one piece, so that readers borrow the values instead of copying them.
         with_missing(self.path, column.rechunk())
-    }
-
-    fn decoded(&self, wanted: &Wanted) -> Result<Wanted, FileError> {
-        let Wanted { field, element } = wanted;
-        let decoded = match element {
-            Some(_) => decoded_vector(&field.dtype),
-            None => decoded_type(&field.dtype),
-        };
-        let decoded = decoded.ok_or_else(|| {
-            let message = format!(
-                "column `{}` has type {:?}; expected integers of at most 64 bits, 32- or 64-bit floats, booleans or text",
-                field.name, field.dtype
-            );
-            FileError::new(self.path, message)
-        })?;
-        Ok(Wanted {
-            field: ArrowField::new(field.name.clone(), decoded, field.is_nullable),
-            element: *element,
-        })
     }
 
     /// The rows of a decoded column in one row group.
@@ -564,7 +460,8 @@ impl<'a> Source<'a> {
         if let Some(&sum) = self.checksums.get(&start) {
             check_sum(&bytes, sum).map_err(damaged)?;
         }
-        let series = guarded(path, &place, || decode(chunk, bytes, field, most))?;
+        let series = guarded(&place, || decode(chunk, bytes, field, most))
+            .map_err(|detail| self::damaged(path, detail))?;
         let rows = most.map_or(group.num_rows(), |most| most.min(group.num_rows()));
         if series.len() != rows {
             return Err(damaged(format!(
@@ -645,100 +542,4 @@ fn decode(
         most.map(Filter::new_limited),
     )?;
     Series::try_from((field, arrays))
-}
-
-// Runs a part of polars on the contents of a file.
-//
-// Its decoders return errors for most damage, but index out of range or overflow on some; that
-// must not take a long run down, so such a panic becomes an error too.
-fn guarded<T>(
-    path: &Path,
-    place: &str,
-    run: impl FnOnce() -> PolarsResult<T>,
-) -> Result<T, FileError> {
-    let detail = match caught(run) {
-        Ok(Ok(value)) => return Ok(value),
-        Ok(Err(error)) => error.to_string(),
-        Err(_) => "the contents contradict themselves".into(),
-    };
-    Err(damaged(path, format!("{place}: {detail}")))
-}
-
-thread_local! {
-    // Whether a panic on this thread is caught and reported as an error.
-    static CAUGHT: Cell<bool> = const { Cell::new(false) };
-}
-
-/// Whether a panic on this thread is caught and reported as an error.
-///
-/// The hook that prints the messages of panics belongs to the whole process, so a program and no library replaces it.
-/// A program whose hook is silent if this is true prints one error for a damaged file and no message of a panic.
-pub fn panic_is_caught() -> bool {
-    CAUGHT.get()
-}
-
-fn caught<T>(run: impl FnOnce() -> T) -> std::thread::Result<T> {
-    let outer = CAUGHT.replace(true);
-    let result = catch_unwind(AssertUnwindSafe(run));
-    CAUGHT.set(outer);
-    result
-}
-
-// The type into which a column of type `declared` is decoded; `None` if it is not supported.
-fn decoded_type(declared: &ArrowDataType) -> Option<ArrowDataType> {
-    use ArrowDataType as Type;
-    match declared {
-        Type::Int8 | Type::Int16 | Type::Int32 => Some(Type::Int32),
-        Type::UInt8 | Type::UInt16 | Type::UInt32 => Some(Type::UInt32),
-        Type::Boolean
-        | Type::Int64
-        | Type::UInt64
-        | Type::Float32
-        | Type::Float64
-        | Type::Utf8View => Some(declared.clone()),
-        // Text with few different values, as data frames in Python like to write it.
-        Type::Dictionary(_, value, _) => {
-            matches!(**value, Type::Utf8 | Type::LargeUtf8 | Type::Utf8View)
-                .then_some(Type::Utf8View)
-        }
-        _ => None,
-    }
-}
-
-// The type into which a column of vectors of numbers is decoded; `None` if it has no vectors. Lists of a fixed length are
-// stored like others.
-fn decoded_vector(declared: &ArrowDataType) -> Option<ArrowDataType> {
-    use ArrowDataType as Type;
-    match declared {
-        Type::List(inner) | Type::LargeList(inner) | Type::FixedSizeList(inner, _) => {
-            let number = matches!(inner.dtype, Type::Float32 | Type::Float64);
-            number.then(|| Type::LargeList(inner.clone()))
-        }
-        _ => None,
-    }
-}
-
-/// The column, in which missing floats are NaN.
-fn with_missing(path: &Path, column: Series) -> Result<Column, FileError> {
-    let name = column.name().to_string();
-    let filled = match (column.null_count(), column.dtype()) {
-        (0, _) => return Ok(column.into()),
-        (_, DataType::Float64) => filled(column.f64(), f64::NAN),
-        (_, DataType::Float32) => filled(column.f32(), f32::NAN),
-        (count, _) => {
-            let message = format!(
-                "column `{name}` has {count} missing value(s); only float columns may have any (they become NaN)"
-            );
-            return Err(FileError::new(path, message));
-        }
-    };
-    filled.map_err(|error| damaged(path, format!("column `{name}`: {error}")))
-}
-
-fn filled<T>(values: PolarsResult<&ChunkedArray<T>>, missing: T::Native) -> PolarsResult<Column>
-where
-    T: PolarsNumericType,
-    ChunkedArray<T>: ChunkFillNullValue<T::Native> + IntoSeries,
-{
-    Ok(values?.fill_null_with_values(missing)?.into_series().into())
 }

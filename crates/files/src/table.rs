@@ -4,6 +4,7 @@
 //! |---|---|
 //! | starts like a FITS file, plain or compressed by gzip, whatever its name (`.fits`, `.cat`, `.ldac`, `.ftz`) | FITS table |
 //! | starts like a Parquet file, whatever its name (`.parquet`, `.parq`, `.pq`) | Parquet |
+//! | starts like an Arrow file, whatever its name (`.feather`, `.arrow`) | Arrow |
 //! | anything else (`.csv`, `.dat`, `.txt`, `.cat`, `.csv.gz`) | text, plain or compressed by gzip: numbers between commas, semicolons, tabs or blanks, as the content has them; columns `x y e1 e2` unless a header or the comments of SExtractor name them |
 //!
 //! `FILE[TABLE]` is a table of a FITS file, by name or number.
@@ -19,7 +20,7 @@ use crate::content::Content;
 use crate::open::is_there;
 
 use crate::fits::TableHead;
-use crate::{atomic, fits, parquet, text};
+use crate::{arrow, atomic, fits, parquet, text};
 
 pub use crate::MAX_ROWS;
 
@@ -31,8 +32,19 @@ pub fn numbers<'t>(
 ) -> Result<Cow<'t, [f64]>, FileError> {
     let column = table.column(name).ok();
     column.and_then(reals).ok_or_else(|| {
-        let message = format!("there is no column `{name}` that holds numbers");
-        FileError::new(path, message)
+        let texts = column.and_then(|own| own.str().ok());
+        match texts.map(|own| own.get(0).unwrap_or_default()) {
+            Some(first) => {
+                let message = format!(
+                    "column `{name}` holds texts (found `{first}` in the first row, expected numbers)"
+                );
+                FileError::new(path, message).hint("a table with a column of numbers")
+            }
+            None => {
+                let message = format!("there is no column `{name}` that holds numbers");
+                FileError::new(path, message)
+            }
+        }
     })
 }
 
@@ -47,12 +59,12 @@ pub enum FileFormat {
 }
 
 impl FileFormat {
-    /// The format of a file by its name or first bytes; `None` of a text, which has no metadata.
+    /// The format of a file by its name or first bytes; `None` of others, whose metadata are not read.
     pub fn of(path: &Path) -> Option<Self> {
         match Ending::of(path) {
             Ending::Parquet => Some(FileFormat::Parquet),
             Ending::Fits => Some(FileFormat::Fits),
-            Ending::Text => None,
+            Ending::Arrow | Ending::Text => None,
         }
     }
 
@@ -66,6 +78,7 @@ impl FileFormat {
 
 enum Ending {
     Parquet,
+    Arrow,
     Fits,
     Text,
 }
@@ -75,6 +88,7 @@ impl Ending {
     fn of(path: &Path) -> Self {
         match Content::of(path) {
             Content::Parquet => return Ending::Parquet,
+            Content::Arrow => return Ending::Arrow,
             Content::Fits => return Ending::Fits,
             Content::Text | Content::Other(..) => {}
         }
@@ -144,7 +158,7 @@ impl Place {
     fn check(&self) -> Result<(), FileError> {
         Content::of(&self.path).check(&self.path)?;
         match (&self.table, Ending::of(&self.path)) {
-            (Some(table), Ending::Text | Ending::Parquet) => {
+            (Some(table), Ending::Text | Ending::Parquet | Ending::Arrow) => {
                 let message = format!(
                     "the file is no FITS file (found table `{table}`, expected the file's name alone)"
                 );
@@ -186,6 +200,7 @@ pub fn columns(place: &Place) -> Result<Columns, FileError> {
     };
     let named = match Ending::of(path) {
         Ending::Parquet => vec![plain(parquet::columns(path)?, false)],
+        Ending::Arrow => vec![plain(arrow::columns(path)?, false)],
         Ending::Fits => {
             let tables = fits::tables(path, place.table.as_deref())?.into_iter();
             let named = tables.map(|head| Named {
@@ -220,7 +235,7 @@ pub fn columns(place: &Place) -> Result<Columns, FileError> {
 }
 
 /// Reads the columns `wanted` (all, if `None`) as real numbers. A
-/// table of text or in Parquet has at most `most_rows`. Columns of a text table without names have numbers, from 1.
+/// table of text, in Parquet or in Arrow has at most `most_rows`. Columns of a text table without names have numbers, from 1.
 pub fn read(
     path: &Path,
     wanted: Option<&[&str]>,
@@ -252,6 +267,7 @@ pub fn read_from(
     };
     match Ending::of(path) {
         Ending::Parquet => parquet::read_numbers(path, wanted, most_rows),
+        Ending::Arrow => arrow::read(path, wanted, most_rows),
         Ending::Fits => fits::read_table(path, wanted, place.table.as_deref()),
         Ending::Text => text::read(path, &request),
     }
@@ -268,6 +284,7 @@ pub fn first_texts(place: &Place) -> Result<Vec<(String, String)>, FileError> {
     let path = &place.path;
     match Ending::of(path) {
         Ending::Parquet => parquet::first_texts(path),
+        Ending::Arrow => arrow::first_texts(path),
         Ending::Fits => fits::first_texts(path, place.table.as_deref()),
         Ending::Text => {
             let found = text::columns(path)?;
@@ -282,7 +299,7 @@ pub const TRUTH_COLUMNS: [&str; 4] = ["x", "y", "g1", "g2"];
 // Rows of a FITS table that are read at a time.
 const ROWS_PER_PART: usize = 1 << 17;
 
-/// Reads the columns `wanted` in parts, and gives each part to `take`: row groups of a Parquet file, a fixed number of
+/// Reads the columns `wanted` in parts, and gives each part to `take`: row groups of a Parquet file, record batches of an Arrow file, a fixed number of
 /// rows of a FITS table, and all of a text table. So a table may have any number of rows. Columns of text are read too, of a
 /// text table those in `identities`; 64-bit integers keep all digits.
 pub fn read_parts(
@@ -295,6 +312,7 @@ pub fn read_parts(
     let path = &place.path;
     match Ending::of(path) {
         Ending::Parquet => parquet::read_groups(path, wanted, MAX_ROWS, take),
+        Ending::Arrow => arrow::read_batches(path, wanted, MAX_ROWS, take),
         Ending::Fits => {
             fits::read_table_parts(path, wanted, place.table.as_deref(), ROWS_PER_PART, take)
         }
@@ -314,7 +332,9 @@ pub fn read_parts(
 pub fn read_truth(path: &Path, most_rows: usize) -> Result<DataFrame, FileError> {
     match Ending::of(path) {
         Ending::Text => read_text(path, &TRUTH_COLUMNS),
-        Ending::Fits | Ending::Parquet => read(path, Some(&TRUTH_COLUMNS), most_rows),
+        Ending::Fits | Ending::Parquet | Ending::Arrow => {
+            read(path, Some(&TRUTH_COLUMNS), most_rows)
+        }
     }
 }
 
@@ -330,7 +350,7 @@ pub fn read_text(path: &Path, names: &[&str]) -> Result<DataFrame, FileError> {
 }
 
 /// The value of `key` that a table of any format states: in a comment `# key: value ...` before the first row of
-/// a text table, in the header of a FITS table, or in the metadata of a Parquet file.
+/// a text table, in the header of a FITS table, or in the metadata of a Parquet or Arrow file.
 pub fn stated(path: &Path, key: &str) -> Result<Option<String>, FileError> {
     let format = match Ending::of(path) {
         Ending::Text => {
@@ -340,6 +360,10 @@ pub fn stated(path: &Path, key: &str) -> Result<Option<String>, FileError> {
                 rest.split_whitespace().next().map(str::to_owned)
             };
             return Ok(text::comments(path)?.iter().find_map(value));
+        }
+        Ending::Arrow => {
+            let found = arrow::metadata(path)?.remove(key);
+            return Ok(found.map(|value| value.trim().to_owned()));
         }
         Ending::Parquet => FileFormat::Parquet,
         Ending::Fits => FileFormat::Fits,

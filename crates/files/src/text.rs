@@ -158,6 +158,7 @@ fn read_rows(
             not_text(rows.path, number + 1 + lines as u64)
         })?;
         let quotes = lines.contains('"');
+        rows.is_cut = read == 0;
         let rows_before = rows.rows;
         for line in lines.lines() {
             number += 1;
@@ -209,7 +210,7 @@ fn check_format(path: &Path, line: &str) -> Result<(), FileError> {
         Some((_, format, name)) => Err(FileError::new(
             path,
             format!(
-                "the file is {format}, which is not read; expected a text, FITS or Parquet table"
+                "the file is {format}, which is not read; expected a text, FITS, Parquet or Arrow table"
             ),
         )
         .hint(format!(
@@ -340,7 +341,7 @@ impl Head {
             } else if !text.is_empty() {
                 let bars = head.header.as_ref().is_some_and(|own| own.starts_with('|'));
                 if bars && IPAC_TYPES.iter().any(|own| text.contains(own)) {
-                    return Err(FileError::new(path, "the file is an IPAC table, which is not read; expected a text, FITS or Parquet table").hint(format!("stilts tcopy ifmt=ipac in={} out=table.fits", path.display())));
+                    return Err(FileError::new(path, "the file is an IPAC table, which is not read; expected a text, FITS, Parquet or Arrow table").hint(format!("stilts tcopy ifmt=ipac in={} out=table.fits", path.display())));
                 }
                 head.first = Some(line);
                 return Ok(head);
@@ -435,7 +436,7 @@ impl Head {
 fn is_header(line: &str) -> bool {
     split_names(line)
         .first()
-        .is_some_and(|field| field.parse::<f64>().is_err())
+        .is_some_and(|field| number(field).is_none())
 }
 
 // Any separator: comments and headers are often separated in another way than the rows.
@@ -461,6 +462,8 @@ struct Rows<'a> {
     places: Vec<usize>,
     columns: Vec<Values>,
     rows: usize,
+    // Whether the file ends within the line that is read.
+    is_cut: bool,
 }
 
 enum Values {
@@ -528,6 +531,7 @@ impl<'a> Rows<'a> {
             columns: places.iter().map(values).collect(),
             places,
             rows: 0,
+            is_cut: false,
         })
     }
 
@@ -557,7 +561,11 @@ impl<'a> Rows<'a> {
         }
         let names = names_of(self.names);
         let message = format!("line {line}: {count} fields; expected {expected} ({names})");
-        Err(FileError::new(self.path, message))
+        let error = FileError::new(self.path, message);
+        Err(match self.is_cut {
+            true => error.hint("a complete copy, because the file ends within this line"),
+            false => error,
+        })
     }
 
     #[cold]
@@ -570,7 +578,9 @@ impl<'a> Rows<'a> {
         };
         let mut message = format!("line {line}: `{field}` in column `{name}` is not {expected}");
         // VizieR's tables have lines of units and of dashes below the names.
-        if self.rows == 1 && line > 1 {
+        if value(&field.replacen(',', ".", 1)).is_some_and(|own| !own.is_nan()) {
+            message += ". Try: numbers with decimal points";
+        } else if self.rows == 1 && line > 1 && !field.is_empty() {
             message +=
                 ". If it is one of units or dashes below the names, try: the table without it";
         }
@@ -622,8 +632,16 @@ pub(crate) fn value(field: &str) -> Option<f64> {
 fn number(field: &str) -> Option<f64> {
     field.parse().ok().or_else(|| match field.trim() {
         "" => Some(f64::NAN),
-        field => field.parse().ok(),
+        field => field.parse().ok().or_else(|| fortran(field)),
     })
+}
+
+// A number in double precision as Fortran writes it, `1.5D-02`.
+fn fortran(field: &str) -> Option<f64> {
+    let (digits, exponent) = field.split_once(['d', 'D'])?;
+    let is_number = digits.starts_with(|c: char| c.is_ascii_digit() || "+-.".contains(c));
+    let number = is_number.then(|| format!("{digits}e{exponent}"))?;
+    number.parse().ok()
 }
 
 #[cfg(test)]

@@ -18,6 +18,7 @@ use crate::{FileError, MAX_ROWS, MAX_SIDE, names_of};
 const FREE_NUMBERS: u64 = 1 << 22;
 
 // Numbers of cfitsio's interface, from its fitsio.h.
+const TBIT: c_int = 1;
 const TLOGICAL: c_int = 14;
 const TFLOAT: c_int = 42;
 const TDOUBLE: c_int = 82;
@@ -705,6 +706,9 @@ fn choose_columns(
                 true => format!(
                     "column `{name}` holds all its values in one row, as in colfits, which is not read (expected one number per row). Try: stilts tcopy in={} out=table.fits ofmt=fits",
                     path.display()
+                ),
+                false if found.kind == TBIT => format!(
+                    "column `{name}` holds bits (TFORM `X`, expected one number per row). Try: a column of integers, such as numpy.packbits gives, or --columns flag=none"
                 ),
                 false => format!("column `{name}` does not hold one number per row"),
             }));

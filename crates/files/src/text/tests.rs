@@ -169,10 +169,28 @@ fn mistakes_are_named_with_their_line() {
             b"x,y,g1,g2\n1,2,3,4\n",
             "no column `e2`; columns found: x, y, g1, g2",
         ),
+        (
+            b"x,y,e1,e2\n1,2,3,4\n1,2",
+            "expected 4 (x, y, e1, e2). Try: a complete copy",
+        ),
+        (
+            b"x;y;e1;e2\n1;2;3;-0,4\n",
+            "`-0,4` in column `e2` is not a number. Try: numbers with decimal points",
+        ),
     ] {
         let error = table_of(text, Some(&["x", "e2"])).unwrap_err();
         assert!(error.contains(expected), "{expected}: {error}");
     }
+}
+
+#[test]
+fn fortran_writes_double_precision_with_a_d() {
+    let text = "1.5D-02 2 3 -4d+1\n-.5D1 2 3 1.D0\n";
+    let read = table(text, Some(&["x", "e2"])).unwrap();
+    assert_eq!(column(&read, "x"), [0.015, -5.0]);
+    assert_eq!(column(&read, "e2"), [-40.0, 1.0]);
+    let error = table("1 2 3 d5\n", Some(&["x", "e2"])).unwrap_err();
+    assert!(error.contains("`d5` in column `e2`"), "{error}");
 }
 
 #[test]
