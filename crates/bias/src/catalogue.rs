@@ -1,5 +1,7 @@
 //! What is known of a catalogue, and which catalogues have the same shear.
 
+use std::collections::HashMap;
+
 use serde::{Deserialize, Serialize};
 
 use crate::stars::StarNoise;
@@ -99,6 +101,9 @@ pub struct Catalogue {
     /// Rows that have the identifier of an earlier row, if these are not few.
     #[serde(default)]
     pub shared_identifiers: u64,
+    /// Comparisons with a text, such as `band == 'r'`, that no row fulfils.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub unmatched: Vec<String>,
     /// A sum over the rows that count that no other galaxies have; 0 without rows.
     #[serde(default)]
     pub content: u64,
@@ -134,25 +139,68 @@ pub(crate) fn same(a: [f64; 2], b: [f64; 2]) -> bool {
     (a[0] - b[0]).hypot(a[1] - b[1]) <= ROUNDING * modulus
 }
 
-/// Different shears, in the order in which they appear.
-pub(crate) fn kinds(shears: &[[f64; 2]]) -> Vec<[f64; 2]> {
-    let mut kinds: Vec<[f64; 2]> = Vec::new();
-    for &shear in shears {
-        if !kinds.iter().any(|known| same(*known, shear)) {
-            kinds.push(shear);
+// Side of the cells in which equal shears are looked for: twice the largest difference of equal ones, whose modulus is below 1.
+const CELL: f64 = 2.0 * ROUNDING;
+
+/// Different shears, in the order in which they appear, each found in a time that does not depend on their number.
+#[derive(Debug, Default)]
+pub(crate) struct Kinds {
+    pub(crate) shears: Vec<[f64; 2]>,
+    cells: HashMap<[i64; 2], Vec<usize>>,
+}
+
+impl Kinds {
+    pub(crate) fn of(shears: &[[f64; 2]]) -> Self {
+        let mut kinds = Kinds::default();
+        for &shear in shears {
+            if kinds.place(shear).is_none() {
+                let cell = Self::cell(shear);
+                kinds
+                    .cells
+                    .entry(cell)
+                    .or_default()
+                    .push(kinds.shears.len());
+                kinds.shears.push(shear);
+            }
         }
+        kinds
     }
-    kinds
+
+    fn cell(shear: [f64; 2]) -> [i64; 2] {
+        shear.map(|g| (g / CELL).floor() as i64)
+    }
+
+    /// The place of a shear, that of the first of several that are as near.
+    pub(crate) fn place(&self, shear: [f64; 2]) -> Option<usize> {
+        let [a, b] = Self::cell(shear);
+        let near = (-1..=1).flat_map(|i| (-1..=1).map(move |j| [a + i, b + j]));
+        let near = near.filter_map(|cell| self.cells.get(&cell)).flatten();
+        let equal = near.filter(|place| same(self.shears[**place], shear));
+        equal.min().copied()
+    }
+
+    /// How many of `shears` each kind has.
+    pub(crate) fn counts(&self, shears: &[[f64; 2]]) -> Vec<usize> {
+        let mut counts = vec![0; self.shears.len()];
+        for place in shears.iter().filter_map(|shear| self.place(*shear)) {
+            counts[place] += 1;
+        }
+        counts
+    }
+
+    /// The number in `counts` of minus a shear.
+    pub(crate) fn opposite(&self, [a, b]: [f64; 2], counts: &[usize]) -> usize {
+        self.place([-a, -b]).map_or(0, |place| counts[place])
+    }
 }
 
 /// The arm of each catalogue: those of one true shear are an arm, and all with varying shear.
 pub(crate) fn arms(catalogues: &[Catalogue]) -> Vec<u32> {
     let shears: Vec<[f64; 2]> = catalogues.iter().filter_map(Catalogue::constant).collect();
-    let kinds = kinds(&shears);
+    let kinds = Kinds::of(&shears);
     let arm = |own: &Catalogue| {
-        let shear = own.constant();
-        let kind = shear.and_then(|shear| kinds.iter().position(|kind| same(*kind, shear)));
-        kind.unwrap_or(kinds.len()) as u32
+        let kind = own.constant().and_then(|shear| kinds.place(shear));
+        kind.unwrap_or(kinds.shears.len()) as u32
     };
     catalogues.iter().map(arm).collect()
 }

@@ -6,11 +6,11 @@ use serde::{Deserialize, Serialize};
 use strum_macros::IntoStaticStr;
 
 use crate::arms::Units;
-use crate::catalogue::{Catalogue, arms, kinds, same};
+use crate::catalogue::{Catalogue, Kinds, arms, same};
 use crate::names;
 use crate::stars::{Behind, StarNoise, shared};
 use crate::sums::Layout;
-use crate::units::UnitSums;
+use crate::units::{OfCatalogues, UnitSums};
 
 /// How catalogues belong together: which test shears they have, and which of them contain the same galaxies. It determines
 /// the units of the errors; the estimator is the same for all designs.
@@ -65,16 +65,18 @@ impl Design {
         let Some(shears) = shears else {
             return Design::Galaxies;
         };
-        let kinds = kinds(&shears);
-        let count = |shear: [f64; 2]| shears.iter().filter(|own| same(**own, shear)).count();
-        let opposite = |[a, b]: [f64; 2]| [-a, -b];
-        let equal = kinds
+        let kinds = Kinds::of(&shears);
+        let counts = kinds.counts(&shears);
+        let opposite = kinds
+            .shears
             .iter()
-            .all(|&kind| count(opposite(kind)) == count(kind));
-        let both = kinds.iter().all(|&kind| count(opposite(kind)) > 0);
+            .map(|kind| kinds.opposite(*kind, &counts));
+        let opposite: Vec<usize> = opposite.collect();
+        let equal = opposite == counts;
+        let both = opposite.iter().all(|count| *count > 0);
         // Catalogues of one shear may be missing if the names state which belong together.
         let paired = equal || both && names::groups(catalogues).is_some();
-        match (kinds.len(), paired) {
+        match (kinds.shears.len(), paired) {
             (0 | 1, _) => Design::Single,
             (2, true) => Design::Pairs,
             (_, true) => Design::Arms,
@@ -201,10 +203,11 @@ pub fn group(
         true => opposite_pairs(catalogues, &numbers),
         false => Vec::new(),
     };
-    let correlation = correlation(&sums, &pairs).filter(|_| by_key);
+    let by_catalogue = sums.by_catalogue();
+    let correlation = correlation(&by_catalogue, &pairs).filter(|_| by_key);
     let without_partner = match misaligned || correlation.is_some() {
         true => None,
-        false => without_partner(&sums, &pairs),
+        false => without_partner(&by_catalogue, &pairs),
     };
     let group = |catalogue: u32| {
         let number = numbers.get(catalogue as usize);
@@ -273,7 +276,7 @@ fn opposite_pairs(catalogues: &[Catalogue], numbers: &[u32]) -> Vec<[u32; 2]> {
 
 // The correlation of the ellipticities of units under opposite shears, if there are enough units and it is too small for the
 // same galaxies: the error of m is then too large, because the shapes do not cancel.
-fn correlation(sums: &UnitSums, pairs: &[[u32; 2]]) -> Option<f64> {
+fn correlation(sums: &OfCatalogues<'_>, pairs: &[[u32; 2]]) -> Option<f64> {
     let (mut count, mut cross, mut squares) = (0, 0.0, [0.0; 2]);
     for [a, b] in pairs {
         let pairs: Vec<[[f64; 2]; 2]> = sums
@@ -303,7 +306,7 @@ fn correlation(sums: &UnitSums, pairs: &[[u32; 2]]) -> Option<f64> {
 // If galaxies without partner are drawn at random, the difference of the numbers of galaxies in a unit under the two shears has
 // the variance of a Poisson distribution of their number. m follows from the sums of w e g. What the shapes of galaxies without
 // partner add to their variance is their share of Σ (w e g)², which is the variance between units of the sums under one shear.
-fn without_partner(sums: &UnitSums, pairs: &[[u32; 2]]) -> Option<WithoutPartner> {
+fn without_partner(sums: &OfCatalogues<'_>, pairs: &[[u32; 2]]) -> Option<WithoutPartner> {
     type Numbers = (f64, [[f64; 2]; 2]);
     let (mut galaxies, mut of) = (0.0, 0.0);
     let (mut of_shapes, mut of_all) = ([0.0; 2], [0.0; 2]);
@@ -351,7 +354,7 @@ fn missing(catalogues: &[Catalogue], numbers: &[u32]) -> Vec<Missing> {
         groups.entry(*number).or_default().push(k);
     }
     let absent = |group: &Vec<usize>, kind: [f64; 2]| !group.iter().any(|k| same(shears[*k], kind));
-    let kinds = kinds(&shears);
+    let kinds = Kinds::of(&shears).shears;
     let of_group = |group: Vec<usize>| {
         let kinds: Vec<[f64; 2]> = kinds
             .iter()
@@ -374,9 +377,10 @@ fn unpaired(catalogues: &[Catalogue], design: Design) -> Option<([f64; 2], [usiz
         return None;
     }
     let shears: Vec<[f64; 2]> = catalogues.iter().filter_map(Catalogue::constant).collect();
-    let count = |shear: [f64; 2]| shears.iter().filter(|own| same(**own, shear)).count();
-    let both = |[a, b]: [f64; 2]| ([a, b], [count([a, b]), count([-a, -b])]);
-    let mut all = kinds(&shears).into_iter().map(both);
+    let kinds = Kinds::of(&shears);
+    let counts = kinds.counts(&shears);
+    let all = kinds.shears.iter().zip(&counts);
+    let mut all = all.map(|(kind, own)| (*kind, [*own, kinds.opposite(*kind, &counts)]));
     all.find(|(_, [own, opposite])| *opposite > 0 && own != opposite)
 }
 
@@ -394,13 +398,17 @@ fn numbers(catalogues: &[Catalogue], design: Design) -> (Vec<u32>, bool) {
     {
         return (numbers, true);
     }
-    let number = |k: usize| match design {
-        Design::Pairs | Design::Arms => arms[..k].iter().filter(|arm| **arm == arms[k]).count(),
-        Design::Rotated => k / 2,
-        _ => k,
+    let mut so_far: BTreeMap<u32, u32> = BTreeMap::new();
+    let number = |(k, arm): (usize, &u32)| match design {
+        Design::Pairs | Design::Arms => {
+            let next = so_far.entry(*arm).or_default();
+            *next += 1;
+            *next - 1
+        }
+        Design::Rotated => k as u32 / 2,
+        _ => k as u32,
     };
-    let numbers = (0..catalogues.len()).map(|k| number(k) as u32).collect();
-    (numbers, false)
+    (arms.iter().enumerate().map(number).collect(), false)
 }
 
 #[cfg(test)]

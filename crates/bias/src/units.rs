@@ -138,6 +138,9 @@ impl UnitSums {
     /// Joins units whose keys are equal after a larger shift.
     fn coarsen(&mut self, shift: u32) {
         let by = shift - self.shift;
+        if by == 0 {
+            return;
+        }
         self.shift = shift;
         self.renamed(|(catalogue, key)| (catalogue, shifted(key, by)));
     }
@@ -244,6 +247,25 @@ impl UnitSums {
         }
     }
 
+    pub(crate) fn by_catalogue(&self) -> OfCatalogues<'_> {
+        let mut units: BTreeMap<u32, Vec<(u64, &[f64])>> = BTreeMap::new();
+        for ((catalogue, key), sums) in &self.units {
+            units.entry(*catalogue).or_default().push((*key, sums));
+        }
+        OfCatalogues {
+            layout: self.layout,
+            units,
+        }
+    }
+}
+
+/// The units of each catalogue.
+pub(crate) struct OfCatalogues<'a> {
+    layout: Layout,
+    units: BTreeMap<u32, Vec<(u64, &'a [f64])>>,
+}
+
+impl OfCatalogues<'_> {
     /// What `of` makes of the sums over all bins of each unit of two catalogues; `None` where a catalogue has no galaxy of it.
     pub(crate) fn pairs<T>(
         &self,
@@ -253,14 +275,10 @@ impl UnitSums {
     ) -> Vec<[Option<T>; 2]> {
         let length = self.layout.len();
         let mut pairs: BTreeMap<u64, [Option<T>; 2]> = BTreeMap::new();
-        for ((catalogue, key), sums) in &self.units {
-            let mut all = vec![0.0; length];
-            sums.chunks_exact(length).for_each(|bin| add(&mut all, bin));
-            for (place, _) in [a, b]
-                .iter()
-                .enumerate()
-                .filter(|(_, own)| *own == catalogue)
-            {
+        for (place, catalogue) in [a, b].iter().enumerate() {
+            for (key, sums) in self.units.get(catalogue).into_iter().flatten() {
+                let mut all = vec![0.0; length];
+                sums.chunks_exact(length).for_each(|bin| add(&mut all, bin));
                 pairs.entry(*key).or_default()[place] = Some(of(self.layout, &all));
             }
         }
