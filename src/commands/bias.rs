@@ -131,7 +131,7 @@ struct Summing {
     /// Also estimate in bins of a column or expression: `snr:5` has five bins with equally many galaxies,
     /// `flux/flux_error:5,10,20` has these edges (each bin contains its lower edge), and `TOMOBIN` a bin for each number or
     /// text. Up to three times, for bins of several quantities together.
-    #[arg(long, value_name = "EXPRESSION[:BINS]", value_parser = parse_bins)]
+    #[arg(long, value_name = "EXPRESSION[:BINS]", allow_hyphen_values = true, value_parser = parse_bins)]
     bins: Vec<Binning>,
     /// Weight simulated galaxies so that their distribution in the bins is that of this catalogue of a survey, and print m
     /// and c of the survey. Bins without simulated galaxies are named.
@@ -144,10 +144,15 @@ struct Summing {
     /// also be cut by steps, such as "step(snr, 10, 1.5) and step(size, 2.5)", whose response to shear enters (see
     /// `select`). The response of other conditions on measured quantities needs sheared catalogues.
     // The command that keeps a selection is called select; clap would suggest --seed.
-    #[arg(long = "where", alias = "select", value_name = "CONDITION")]
+    #[arg(
+        long = "where",
+        alias = "select",
+        value_name = "CONDITION",
+        allow_hyphen_values = true
+    )]
     condition: Option<String>,
     /// Weight of each galaxy, a smooth formula of `snr`, `flux` and `size`, such as `snr^2 / (snr^2 + 50)`.
-    #[arg(long, value_name = "FORMULA", conflicts_with_all = ["against", "ellipticity", "step"])]
+    #[arg(long, value_name = "FORMULA", allow_hyphen_values = true, conflicts_with_all = ["against", "ellipticity", "step"])]
     weight: Option<String>,
     /// How catalogues belong together [default: recognised from the true shears].
     #[arg(long, value_parser = named::<Design>())]

@@ -62,7 +62,7 @@ pub(crate) struct Arguments {
     leaderboard: bool,
     /// Compare only sets for which this holds, such as "snr == 'low' and submission == '23/*' and q > 50": columns of a
     /// results store. In a text `*` stands for any characters.
-    #[arg(long = "where", value_name = "CONDITION", value_parser = Expression::parse)]
+    #[arg(long = "where", value_name = "CONDITION", allow_hyphen_values = true, value_parser = Expression::parse)]
     condition: Option<Expression>,
     /// Metric or column to sort by, such as `q:desc`.
     #[arg(long, value_name = "FIELD[:desc]")]

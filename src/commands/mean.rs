@@ -38,12 +38,12 @@ pub(crate) struct Arguments {
     sets: Option<SetList>,
     /// Galaxies to keep, such as "step(snr, 10) and step(size, 2.5, 0.5)", or by columns that shear does not change, such as
     /// "x < 1280".
-    #[arg(long = "where", value_name = "CONDITION")]
+    #[arg(long = "where", value_name = "CONDITION", allow_hyphen_values = true)]
     condition: Option<String>,
     #[command(flatten)]
     unsheared: Unsheared,
     /// Weight as a formula of snr, flux and size, such as "snr^2/(snr^2 + 100)".
-    #[arg(long, value_name = "FORMULA")]
+    #[arg(long, value_name = "FORMULA", allow_hyphen_values = true)]
     weight: Option<String>,
     #[command(flatten)]
     form: Form,

@@ -29,13 +29,14 @@ pub(crate) struct Arguments {
     #[arg(
         long = "where",
         value_name = "CONDITION",
+        allow_hyphen_values = true,
         required_unless_present = "weight"
     )]
     condition: Option<String>,
     #[command(flatten)]
     unsheared: Unsheared,
     /// Weight as a formula of snr, flux and size, such as "snr^2/(snr^2 + 100)".
-    #[arg(long, value_name = "FORMULA")]
+    #[arg(long, value_name = "FORMULA", allow_hyphen_values = true)]
     weight: Option<String>,
     /// Folder to write to.
     #[arg(long, value_name = "DIR")]

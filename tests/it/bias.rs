@@ -753,6 +753,55 @@ fn repeated_rows_values_and_identifiers_are_named() {
     );
     let half = notes(&all, &|row| if row % 2 == 0 { 0 } else { row }, 0);
     assert_has(&half, "Repeated identifiers: 1998 of 4000");
+    // Zeros in 5 % of the rows are a warning, in 0.5 % a remark.
+    for (zeros, is_warning) in [(100, true), (10, false)] {
+        notes(&all, &|row| row, zeros);
+        let said = folder.said("bias c-plus.csv c-minus.csv -q");
+        assert_eq!(
+            said.contains("warning: repeated values"),
+            is_warning,
+            "{said}"
+        );
+    }
+}
+
+#[test]
+fn texts_that_no_row_has_and_angles_in_degrees_are_named() {
+    let folder = Folder::new();
+    let files = pair(&folder, "c", 0.02, |g, _| {
+        let mut text = "band,e,pa,e1,e2,g1,g2\n".to_owned();
+        for (row, [[e1, e2], _]) in galaxies(3, [g; 2]).into_iter().enumerate() {
+            let (e, pa) = (e1.hypot(e2), e2.atan2(e1).to_degrees() / 2.0);
+            let band = ["r", "i"][row % 2];
+            writeln!(text, "{band},{e},{pa},{e1},{e2},{g},{g}").unwrap();
+        }
+        text
+    });
+    let none = format!("bias {files} --where \"band == 'z'\"");
+    folder.refuses(&none, "no galaxy can be used[..]no row has `band == 'z'`");
+    let all = format!("bias {files} --where \"band != 'z'\"");
+    assert_has(
+        &folder.json(&all)["notes"].to_string(),
+        "No row has the text of `band == 'z'`",
+    );
+    let some = format!("bias {files} --where \"band != 'r'\"");
+    let notes = folder.json(&some)["notes"].to_string();
+    assert!(!notes.contains("No row has"), "{notes}");
+    let degrees = "--columns 'e1=e*cos(2*pa),e2=e*sin(2*pa)'";
+    folder.refuses(
+        &format!("bias {files} {degrees}"),
+        "angles up to[..]radians(ANGLE)",
+    );
+    folder.refuses(
+        &format!("bias {files} --where 'cos(pa) > -2'"),
+        "radians(ANGLE)",
+    );
+    let line = format!("{files} --columns 'e1=e*cos(radians(2*pa)),e2=e*sin(radians(2*pa))'");
+    let same = rows(&folder, &line)[0]["m1"].as_f64().unwrap();
+    let plain = rows(&folder, &files)[0]["m1"].as_f64().unwrap();
+    assert!((same - plain).abs() < 1e-9, "{same} {plain}");
+    // A condition may start with a minus.
+    folder.json(&format!("bias {files} --where '-e1 < 2'"));
 }
 
 #[test]
@@ -837,6 +886,20 @@ fn simulated_galaxies_are_weighted_to_those_of_a_survey() {
     assert_has(&notes, "snr 50 to 90, size 0.5 to 1.5 (10.00 %)");
     assert_has(&notes, "w=shape_weight, flag=flag, tomographic bin=TOMOBIN");
     assert_has(&notes, "Not used of the survey: mask.");
+    // A formula weights both, and a condition holds for both.
+    let numbers = [3, 1, 2, 4];
+    let mut plain = String::from("snr,size\n");
+    for ((snr, size, ..), number) in KINDS.iter().zip(numbers) {
+        plain += &format!("{snr},{size}\n").repeat(number);
+    }
+    folder.write("plain.csv", plain);
+    let weighted = [0, 1, 2, 3].map(|k| KINDS[k].0 * KINDS[k].1 * numbers[k] as f64);
+    let faint = [weighted[0], weighted[1], 0.0, 0.0];
+    for (options, weights) in [("", weighted), ("--where 'snr < 15'", faint)] {
+        let line = format!("{command} --columns w=snr*size {options} --like plain.csv");
+        let found = folder.json(&line);
+        assert_m(&found["rows"][1], [mean(weights); 2], 1e-9);
+    }
     // Without a survey, bins without galaxies are a mistake.
     folder.refuses(&command, "no galaxy that counts has snr 50 to 90");
 }

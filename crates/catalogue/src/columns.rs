@@ -353,11 +353,19 @@ impl Names {
         given.map(|((role, _), column)| (*role, column.as_str()))
     }
 
-    /// The ones of a table with the columns `found`, which may lack the columns of others.
+    /// The columns and formulas of a table with the columns `found`, which may lack the columns of others.
     pub fn within(&self, found: &[String]) -> Self {
+        let is_there = |name: &str| found.iter().any(|own| own == name);
+        let is_computed = |text: &str| {
+            let formula = Expression::parse(text);
+            formula.is_ok_and(|own| !own.operands().is_empty() && own.columns().all(is_there))
+        };
+        let is_list =
+            |(role, _): &Key, text: &str| *role == Role::Flag && text.split('+').all(is_there);
         let mut own = self.clone();
-        own.given
-            .retain(|_, name| name == "none" || found.contains(name));
+        own.given.retain(|key, name| {
+            name == "none" || is_there(name) || is_list(key, name) || is_computed(name)
+        });
         own
     }
 

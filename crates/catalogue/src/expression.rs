@@ -30,6 +30,8 @@ pub struct Expression {
     operands: Vec<Operand>,
     root: Node,
     sharp: bool,
+    // What `cos` and `sin` are of.
+    angles: Vec<Node>,
 }
 
 /// What an expression reads in each row: the number in a column, or whether the text in it has a pattern.
@@ -74,7 +76,7 @@ enum Node {
 
 type Binary = (&'static str, Operator);
 
-const FUNCTIONS: [(&str, Function); 8] = [
+const FUNCTIONS: [(&str, Function); 9] = [
     ("abs", f64::abs),
     ("sqrt", f64::sqrt),
     ("exp", f64::exp),
@@ -82,6 +84,7 @@ const FUNCTIONS: [(&str, Function); 8] = [
     ("log10", f64::log10),
     ("cos", f64::cos),
     ("sin", f64::sin),
+    ("radians", f64::to_radians),
     ("not", |a| compared(a, a, a == 0.0)),
 ];
 
@@ -135,13 +138,19 @@ fn compared(a: f64, b: f64, holds: bool) -> f64 {
     truth(holds)
 }
 
+// Largest angle in radians: 4φ of an angle up to 2π. Position angles in degrees exceed it, and gave m = −0.99 without a word.
+const MAX_ANGLE: f64 = 8.0 * std::f64::consts::PI;
+// Rows in which angles are looked for. Chosen by hand.
+const ANGLE_ROWS: usize = 4096;
+
 // The parser calls itself for each bracket: 10⁴ of them would exhaust the stack.
 const DEEPEST: usize = 100;
 
 impl Expression {
     /// Parses an expression: numbers, columns, `+ - * / ^`, `&` (the bits that whole numbers have in common), comparisons of
     /// numbers, `==` and `!=` of a column with a text in quotation marks, `and`, `or`, and `abs`, `sqrt`, `exp`, `log`, `log10`,
-    /// `cos`, `sin` (of radians), `not` of an expression in brackets.
+    /// `cos`, `sin` (of radians), `radians` (of degrees), `not` of an expression in brackets. A name with other characters than letters,
+    /// digits, `_` and `.` stands between backticks.
     pub fn parse(text: &str) -> Result<Self, ExpressionError> {
         let condition = Condition::parse(text)?;
         match condition.rows {
@@ -166,6 +175,33 @@ impl Expression {
 
     pub fn columns(&self) -> impl Iterator<Item = &str> + Clone {
         self.operands.iter().map(|operand| operand.column.as_str())
+    }
+
+    /// Refuses `cos` and `sin` of what can only be degrees; `value` gives the number of an operand in a row,
+    /// by the places of both.
+    ///
+    /// # Errors
+    /// The message.
+    pub fn check_angles(
+        &self,
+        rows: usize,
+        value: impl Fn(usize, usize) -> f64,
+    ) -> Result<(), String> {
+        let sampled = (0..rows).step_by(rows.div_ceil(ANGLE_ROWS).max(1));
+        let of_row = |at: usize| {
+            let angles = self.angles.iter();
+            let moduli = angles.map(|own| own.value(&|k| value(at, k)).abs());
+            // NaN is smaller than any number.
+            moduli.fold(0.0, f64::max)
+        };
+        let largest = sampled.map(of_row).fold(0.0, f64::max);
+        match largest > MAX_ANGLE {
+            false => Ok(()),
+            true => Err(format!(
+                "`{}` has angles up to {largest:.1} (expected radians, below 8π). Try: radians(ANGLE) for an angle in degrees",
+                self.text
+            )),
+        }
     }
 
     /// The value; `value` gives the number of an operand by its place in [`Expression::operands`].
@@ -232,6 +268,7 @@ impl Condition {
             depth: 0,
             operands: Vec::new(),
             sharp: false,
+            angles: Vec::new(),
         };
         let root = parser.level(0)?;
         if !parser.rest().is_empty() {
@@ -248,6 +285,7 @@ impl Condition {
             operands: parser.operands,
             root,
             sharp: parser.sharp,
+            angles: parser.angles,
         });
         Ok(Condition { text, rows, steps })
     }
@@ -259,6 +297,7 @@ struct Parser<'a> {
     depth: usize,
     operands: Vec<Operand>,
     sharp: bool,
+    angles: Vec<Node>,
 }
 
 impl<'a> Parser<'a> {
@@ -379,6 +418,14 @@ impl<'a> Parser<'a> {
         if number_length(rest) > 0 {
             return self.number().map(Node::Number);
         }
+        if self.take("`") {
+            let rest = self.rest();
+            let Some(length) = rest.find('`').filter(|length| *length > 0) else {
+                return Err(self.expected("a column and a backtick after it"));
+            };
+            self.at += length + 1;
+            return self.compared_column(&rest[..length]);
+        }
         let name = self.word();
         if name.is_empty() {
             return Err(self.expected("a number or a column"));
@@ -390,8 +437,17 @@ impl<'a> Parser<'a> {
             && self.take("(")
         {
             self.sharp |= ["abs", "not"].contains(&name);
-            return Ok(Node::Unary(*function, Box::new(self.closed()?)));
+            let inner = self.closed()?;
+            if ["cos", "sin"].contains(&name) {
+                self.angles.push(inner.clone());
+            }
+            return Ok(Node::Unary(*function, Box::new(inner)));
         }
+        self.compared_column(name)
+    }
+
+    // A column, or its comparison with a text.
+    fn compared_column(&mut self, name: &str) -> Result<Node, ExpressionError> {
         match self.pattern(name) {
             Some(fits) => fits,
             None => Ok(self.operand(name.to_owned(), None)),
@@ -539,8 +595,25 @@ mod tests {
         ] {
             assert_eq!(value(text, &[f64::NAN, 1.0]).is_nan(), missing, "{text}");
         }
+        assert_eq!(value("`s/n (old)` > 1 and `a` < 3", &[2.0, 2.0]), 1.0);
+        let quoted = Expression::parse("`my band` == 'r*'").unwrap();
+        assert_eq!(quoted.operands()[0].column, "my band");
+        assert!((value("cos(radians(2*pa))", &[45.0])).abs() < 1e-16);
         let twice = Expression::parse("a*a + b").unwrap();
         assert!(twice.columns().eq(["a", "b"]));
+    }
+
+    #[test]
+    fn angles_in_degrees_are_refused() {
+        let check = |text: &str, angles: &[f64]| {
+            let expression = Expression::parse(text).unwrap();
+            expression.check_angles(angles.len(), |at, _| angles[at])
+        };
+        let error = check("0.3*sin(2*pa)", &[0.0, f64::NAN, -90.0]).unwrap_err();
+        assert!(error.contains("angles up to 180.0"), "{error}");
+        check("cos(4*pa)", &[-6.28, 6.28, f64::NAN]).unwrap();
+        check("cos(radians(2*pa))", &[180.0, 360.0]).unwrap();
+        check("pa > 100", &[180.0]).unwrap();
     }
 
     #[test]
@@ -628,6 +701,7 @@ mod tests {
             ("5 < a < 10", "found `< 10`, expected `and` between two"),
             ("a > 5 & b > 2", "found `> 2`, expected `and` between two"),
             ("a == 'b", "ends with the same quotation mark"),
+            ("`a b > 2", "a column and a backtick after it"),
             ("a + 1 == 'b'", "found `'b'`, expected a number or a column"),
             ("step(snr > 3)", "a comma and the threshold"),
             ("step(snr, x)", "found `x)`, expected a number"),

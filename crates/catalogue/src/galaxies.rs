@@ -14,7 +14,7 @@ use shearq_scoring::{FieldSum, Row};
 use crate::columns::{Columns, Shapes};
 use crate::input::Input;
 use crate::request::Request;
-use crate::roles::{CATALOGUES, Role};
+use crate::roles::Role;
 use crate::rows::{SummedRow, placed_rows};
 use crate::source::{Reading, Source, difference, sources, unused_in_others};
 use crate::truth::Truth;
@@ -193,28 +193,15 @@ impl MeanResponse {
 
     fn add_row(&mut self, own: &SummedRow, selects: bool, shear_difference: f64) {
         let scaled = own.row.e.map(|e| e / shear_difference);
-        let mut add_sheared = |catalogue: usize, weight: f64| {
+        for (catalogue, weight) in own.in_sheared(selects) {
             let (sums, weights) = &mut self.sheared[catalogue - 1];
             for (sum, e) in sums.iter_mut().zip(scaled) {
                 *sum += weight * e;
             }
             *weights += weight;
             self.has_sheared = true;
-        };
-        let counts = own.selected.binned[0].is_ok();
-        if own.sheared > 0 {
-            if counts {
-                add_sheared(own.sheared, own.row.weight);
-            }
-            return;
         }
-        // The response of the selection, as in `bias` (Sheldon & Huff 2017).
-        for catalogue in (1..CATALOGUES).filter(|_| selects) {
-            if own.selected.binned[catalogue].is_ok() {
-                add_sheared(catalogue, own.selected.weights[catalogue]);
-            }
-        }
-        if !counts {
+        if own.sheared > 0 || own.selected.binned[0].is_err() {
             return;
         }
         self.weight += own.row.weight;

@@ -12,7 +12,7 @@ use shearq_files::table::{self, FileFormat};
 use shearq_files::{FileError, names_of};
 use shearq_quantities::{Distortion, MeasuredRange};
 
-use crate::expression::{Expression, operand_values, texts_of};
+use crate::expression::{Expression, Operand, operand_values, texts_of};
 use crate::failures::{
     Check, Copies, LargestResponse, MIN_FAILED_WEIGHT, RepeatKind, Repeats, TrueShears, shown,
 };
@@ -39,6 +39,21 @@ pub struct SummedRow {
     pub sheared: usize,
     pub row: Row,
     pub selected: Selected,
+}
+
+impl SummedRow {
+    /// The sheared catalogues (from 1) to whose means the row adds its ellipticity, with its weight in each: its own, or if its
+    /// columns choose galaxies in each sheared catalogue (`selects`), all that choose it. The ellipticities without artificial
+    /// shear of the galaxies that a sheared catalogue selects, with its weights, give the selection response R_S of Sheldon &
+    /// Huff (2017, ApJ 841, 24). It needs all four catalogues, because a cut by S/N responds to both components.
+    pub fn in_sheared(&self, selects: bool) -> impl Iterator<Item = (usize, f64)> + '_ {
+        let counts = |catalogue: usize| self.selected.binned[catalogue].is_ok();
+        let own = (self.sheared > 0 && counts(0)).then_some((self.sheared, self.row.weight));
+        let chosen = (1..CATALOGUES)
+            .filter(move |catalogue| selects && self.sheared == 0 && counts(*catalogue));
+        own.into_iter()
+            .chain(chosen.map(|catalogue| (catalogue, self.selected.weights[catalogue])))
+    }
 }
 
 /// Whether a row counts in noshear and in each sheared catalogue, by its flags, weights, `--where` and `--bins`. A shear may move
@@ -197,6 +212,7 @@ pub fn placed_rows(
         summary.repeated = found.repeats.found();
         summary.dominant = found.largest.found();
         summary.content = found.content;
+        summary.unmatched = found.unmatched(first);
         summary.copies = found.copies.rows().unwrap_or_default();
         summary.shared_identifiers = found.copies.identifiers().unwrap_or_default();
     }
@@ -287,6 +303,7 @@ impl<'a> TableRows<'a> {
     ) -> Result<Self, FileError> {
         let (path, places) = (&source.place.path, &source.places);
         let truth = OfRows::new(file, places, &reading.truth)?;
+        check_angles(source, reading, columns)?;
         refuse_boolean_flags(frame, source, reading)?;
         let keys = |name: &str| identity::keys(frame, name, path);
         let sheared_of_rows = source.columns.of(Role::ShearedCatalogue);
@@ -796,6 +813,26 @@ impl<'a> TableRows<'a> {
     }
 }
 
+// Refuses angles in degrees in `--where` and `--bins`.
+fn check_angles(
+    source: &Source,
+    reading: &Reading<'_>,
+    columns: &[&[f64]],
+) -> Result<(), FileError> {
+    for expression in reading.condition().into_iter().chain(reading.binned()) {
+        let place = |own: &Operand| source.wanted.iter().position(|known| known == own);
+        let places: Option<Vec<usize>> = expression.operands().iter().map(place).collect();
+        let Some(places) = places else {
+            continue;
+        };
+        let rows = places.first().map_or(0, |place| columns[*place].len());
+        expression
+            .check_angles(rows, |at, k| columns[places[k]][at])
+            .map_err(|message| FileError::new(&source.place.path, message))?;
+    }
+    Ok(())
+}
+
 // The columns of e1 and e2 under artificial shears of the same component, and of the other component, if all exist.
 fn sheared_columns(source: &Source) -> [Option<[[usize; 2]; 2]>; 2] {
     [[0, 1], [1, 0]].map(|by| {
@@ -868,6 +905,8 @@ struct Found {
     excluded: Vec<u64>,
     // By column of `Columns::steps`.
     numbered: Vec<Numbered>,
+    // By place of what is read: whether a row has the text with which a column is compared.
+    matched: Vec<bool>,
     begun: bool,
 }
 
@@ -881,6 +920,12 @@ impl Found {
         self.numbered.resize_with(steps.len(), Numbered::default);
         for (numbered, name) in self.numbered.iter_mut().zip(steps) {
             numbered.add(part.frame, name);
+        }
+        self.matched.resize(part.columns.len(), false);
+        for (place, operand) in part.source.wanted.iter().enumerate() {
+            if operand.pattern.is_some() && !self.matched[place] {
+                self.matched[place] = part.columns[place].contains(&1.0);
+            }
         }
         self.repeats.look_for(part.columns);
         self.copies
@@ -908,6 +953,17 @@ impl Found {
         let ids = part.ids.as_ref().filter(|_| !part.ids_are_units);
         let id = ids.map(|ids| ids[at]);
         self.copies.add((!shared).then_some(own), id);
+    }
+
+    // Comparisons with a text that no row has, which is probably misspelt.
+    fn unmatched(&self, source: &Source) -> Vec<String> {
+        let all = source.wanted.iter().zip(&self.matched);
+        let unmatched = all.filter(|(_, matched)| !**matched);
+        let texts = unmatched.filter_map(|(operand, _)| {
+            let pattern = operand.pattern.as_ref()?;
+            Some(format!("{} == '{pattern}'", operand.column))
+        });
+        texts.collect()
     }
 
     // A table whose rows belong to sheared catalogues has no mean of galaxies. Texts of these are recognised, but the order of numbers

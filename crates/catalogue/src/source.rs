@@ -290,7 +290,8 @@ impl Source {
         reading: &Reading<'_>,
         mut take: impl FnMut(DataFrame) -> Result<(), FileError>,
     ) -> Result<(), FileError> {
-        let mut take = |part: DataFrame| take(self.with_formulas(part)?);
+        let path = &self.place.path;
+        let mut take = |part: DataFrame| take(add_formulas(part, &self.formulas, path)?);
         if let Some(frame) = &self.frame {
             return take(frame.clone());
         }
@@ -303,22 +304,6 @@ impl Source {
         let mut texts = names.clone();
         texts.retain(|name| self.is_text(reading, name));
         table::read_parts(&self.place, &names, &texts, take)
-    }
-
-    // Adds the columns that formulas give.
-    fn with_formulas(&self, mut part: DataFrame) -> Result<DataFrame, FileError> {
-        let path = &self.place.path;
-        for formula in &self.formulas {
-            let operands = formula.operands().iter();
-            let operands = operands.map(|own| operand_values(&part, own, path));
-            let operands: Vec<_> = operands.collect::<Result<_, _>>()?;
-            let values = (0..part.height()).map(|at| formula.value(&|k| operands[k][at]));
-            let values: Vec<f64> = values.collect();
-            let column = Column::new(formula.text().into(), values);
-            part.with_column(column)
-                .map_err(|error| FileError::new(path, error.to_string()))?;
-        }
-        Ok(part)
     }
 
     /// Whether a column may be a text: identifiers, names of sheared catalogues, and what is compared with a pattern.
@@ -908,9 +893,37 @@ fn are_different(place: &Place, frame: Option<&DataFrame>, name: &str) -> Result
     Ok(different == rows && rows > 0)
 }
 
-// The names of all columns, and the formulas among those that the user gives for roles, whose texts are names, too. A plus between
-// columns of flags is no sum.
-fn with_formulas(
+/// Adds the columns that formulas give, with the formula as their name.
+///
+/// # Errors
+/// If a formula compares a text with a column of numbers, or has an angle in degrees.
+pub fn add_formulas(
+    mut part: DataFrame,
+    formulas: &[Expression],
+    path: &Path,
+) -> Result<DataFrame, FileError> {
+    for formula in formulas {
+        let operands = formula.operands().iter();
+        let operands = operands.map(|own| operand_values(&part, own, path));
+        let operands: Vec<_> = operands.collect::<Result<_, _>>()?;
+        formula
+            .check_angles(part.height(), |at, k| operands[k][at])
+            .map_err(|message| FileError::new(path, message))?;
+        let values = (0..part.height()).map(|at| formula.value(&|k| operands[k][at]));
+        let values: Vec<f64> = values.collect();
+        let column = Column::new(formula.text().into(), values);
+        part.with_column(column)
+            .map_err(|error| FileError::new(path, error.to_string()))?;
+    }
+    Ok(part)
+}
+
+/// The names of all columns, and the formulas among those that the user gives for roles, whose texts are names, too. A plus between
+/// columns of flags is no sum.
+///
+/// # Errors
+/// If a formula has a column that is absent.
+pub fn with_formulas(
     path: &Path,
     names: &[String],
     given: &Names,

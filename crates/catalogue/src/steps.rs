@@ -1,5 +1,7 @@
 //! Names of sheared catalogues (noshear, 1p, 1m, 2p, 2m) in names of columns, tables and files, and in texts of rows.
 
+use std::borrow::Cow;
+
 use crate::recognition::{recognition, words};
 use crate::roles::CATALOGUES;
 
@@ -11,7 +13,19 @@ pub fn step_of(words: &str) -> Option<usize> {
 
 /// The catalogue that a text names, 0 for that without shear: `ns` in metadetection of LSST, `00` in TXPipe.
 pub fn catalogue_named(text: &str) -> Option<usize> {
-    step_of(words(text).trim_matches('_'))
+    // `1+` and `g1-`: a sign at the end.
+    let text = text.trim();
+    let signed = || {
+        let sign = text.chars().last()?;
+        let letter = match sign {
+            '+' => "p",
+            '-' | '−' => "m",
+            _ => return None,
+        };
+        Some(text.trim_end_matches(sign).to_owned() + letter)
+    };
+    let text = signed().map_or(Cow::Borrowed(text), Cow::Owned);
+    step_of(words(&text).trim_matches('_'))
 }
 
 // The words of a name without the ones of a sheared catalogue, or of the one without shear if `sheared` is false.
@@ -107,10 +121,15 @@ mod tests {
             ("1p", 1),
             ("2M", 4),
             ("plus2", 3),
+            ("1+", 1),
+            ("g2-", 4),
+            ("2−", 4),
         ] {
             assert_eq!(catalogue_named(text), Some(catalogue), "{text}");
         }
-        for text in ["", "0", "galaxy", "1", "p", "psf", "2mass"] {
+        for text in [
+            "", "0", "galaxy", "1", "p", "psf", "2mass", "plus", "+", "-",
+        ] {
             assert_eq!(catalogue_named(text), None, "{text}");
         }
     }

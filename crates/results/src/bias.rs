@@ -102,6 +102,14 @@ impl About {
                 *total += own;
             }
         }
+        // A text that one tile lacks may be in others.
+        let mut used = self.catalogues.iter().filter(|own| own.rows > 0);
+        if let Some(first) = used.next() {
+            let rest: Vec<&Catalogue> = used.collect();
+            let everywhere = |text: &&String| rest.iter().all(|own| own.unmatched.contains(text));
+            let unmatched = first.unmatched.iter().filter(everywhere);
+            total.unmatched = unmatched.cloned().collect();
+        }
         total
     }
 }
@@ -150,10 +158,6 @@ impl BiasResult {
 }
 
 /// Sums the catalogues of a request for which `part` holds, given their number.
-#[expect(
-    clippy::too_many_lines,
-    reason = "steps of reading, one after the other"
-)]
 pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, BiasFailure> {
     distinct(&request.catalogues)?;
     refuse_sheared_psfs(&request.catalogues, &request.names)?;
@@ -174,55 +178,61 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
         None => (request, &[][..]),
     };
     reading.request = request;
-    let mut all: Vec<Vec<Source>> = Vec::new();
-    for input in &request.catalogues {
-        all.push(sources(input, &reading)?);
-    }
-    let Some(first) = all.first().and_then(|sources| sources.first()) else {
-        return Err(BiasFailure::NoCatalogue);
-    };
-    let layout = Layout {
-        psf: first.has_psf(),
-        sheared: first.has_sheared_rows() || first.selects,
-        matrix: first.has_matrix(),
-    };
-    let measured = first.unanswered().to_vec();
-    let truth = known(&request.truth, first);
-    let response = first.has_response() || first.shapes != Shapes::Shear;
-    let mut described = first.described(&reading);
-    described.extend(without_sheared(&request.catalogues).filter(|_| !first.has_response()));
-    let named = request.catalogues.iter().map(|input| input.name.as_path());
-    let others = named.zip(all.iter().map(Vec::as_slice));
-    described.extend(unused_in_others(first, &reading, others));
-    let kind = check_columns(&reading, &all)?;
+    let inputs = request.catalogues.iter();
+    let all = inputs.map(|input| sources(input, &reading));
+    let all: Vec<Vec<Source>> = all.collect::<Result<_, _>>()?;
+    let first = all.first().and_then(|sources| sources.first());
+    let first = first.ok_or(BiasFailure::NoCatalogue)?;
+    let mut about = about(&reading, &all, first);
+    about.kind = check_columns(&reading, &all)?;
     let (frame, images) = frame_and_images(&all)?;
+    about.frame = frame;
     let named = request.catalogues.iter().zip(&images);
     distinct_images(named.map(|(input, image)| (input.name.display().to_string(), image)))?;
     verify_data(&request.truth)?;
-    let mut cells = cells::cells(&reading, &all)?;
-    for (axis, of_texts) in cells.axes.iter_mut().zip(of_texts) {
+    about.cells = cells::cells(&reading, &all)?;
+    for (axis, of_texts) in about.cells.axes.iter_mut().zip(of_texts) {
         if let Some(own) = of_texts {
             *axis = own.clone();
         }
     }
-    let sign = known_sign(request, &all)?.filter(|_| truth);
-    reading.flip_g2 = sign.is_some_and(|sign| sign.of == TruthSign::Challenge);
-    let (sums, catalogues) = add_up(&reading, &all, (layout, &cells), part, None)?;
-    distinct_content(&catalogues)?;
+    about.sign = known_sign(request, &all)?.filter(|_| about.truth);
+    let mut summed = added_up(&mut reading, &all, about, part)?;
+    if let Some(survey) = &request.like {
+        if summed.about.cells.axes.is_empty() {
+            return Err(BiasFailure::LikeWithoutBins);
+        }
+        summed.populations = like::populations(survey, request, &summed.about.cells)?;
+    }
+    for (catalogue, image) in summed.about.catalogues.iter_mut().zip(images) {
+        catalogue.image = image;
+    }
+    Ok(summed)
+}
+
+// What is known of catalogues before their rows are read, apart from what they must have in common.
+fn about(reading: &Reading<'_>, all: &[Vec<Source>], first: &Source) -> About {
+    let request = reading.request;
+    let has_response = first.has_response() || first.shapes != Shapes::Shear;
+    let mut columns = first.described(reading);
+    columns.extend(without_sheared(&request.catalogues).filter(|_| !first.has_response()));
+    let named = request.catalogues.iter().map(|input| input.name.as_path());
+    let others = named.zip(all.iter().map(Vec::as_slice));
+    columns.extend(unused_in_others(first, reading, others));
     let named_unit = matches!(request.units, Units::Column(_))
         || request.units == Units::Recognised && first.columns.of(Role::Unit).is_some();
-    let about = About {
+    About {
         version: env!("CARGO_PKG_VERSION").into(),
-        catalogues,
+        catalogues: Vec::new(),
         program: first.columns.program().into(),
         by_shearq: first.columns.is_of_shearq(),
-        truth,
-        response: response || request.shapes.is_some(),
+        truth: known(&request.truth, first),
+        response: has_response || request.shapes.is_some(),
         response_column: first.columns.have(&[Role::R11]),
         flag: first.columns.flags.first().cloned(),
         matched: named_unit || first.columns.of(Role::Id).is_some(),
         unit_column: first.unit_column.clone().filter(|_| !named_unit),
-        kind,
+        kind: Vec::new(),
         design: request.design,
         by_key: match request.units {
             Units::Rows | Units::Column(_) => Some(true),
@@ -231,25 +241,48 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
         },
         named_unit: first.unit.clone().filter(|_| named_unit),
         paired: request.paired,
-        cells,
-        measured,
+        cells: Cells::default(),
+        measured: first.unanswered().to_vec(),
         selection: request.selection.as_ref().map(|own| own.text.clone()),
-        columns: described,
-        sign,
-        frame,
+        columns,
+        sign: None,
+        frame: None,
         without_catalogue: request.without_catalogue.clone(),
+    }
+}
+
+// The sums, in the sign of g2 that is known or that the catalogues follow, of the galaxies that count.
+fn added_up(
+    reading: &mut Reading<'_>,
+    all: &[Vec<Source>],
+    about: About,
+    part: &dyn Fn(usize) -> bool,
+) -> Result<Summed, BiasFailure> {
+    let request = reading.request;
+    let first = &all[0][0];
+    let layout = Layout {
+        psf: first.has_psf(),
+        sheared: first.has_sheared_rows() || first.selects,
+        matrix: first.has_matrix(),
     };
+    let is_of_challenge = |sign: Sign| sign.of == TruthSign::Challenge;
+    reading.flip_g2 = about.sign.is_some_and(is_of_challenge);
+    let (sums, catalogues) = add_up(reading, all, (layout, &about.cells), part, None)?;
+    distinct_content(&catalogues)?;
     let mut summed = Summed {
         sums,
-        about,
+        about: About {
+            catalogues,
+            ..about
+        },
         populations: Vec::new(),
     };
     // The catalogues are read again rather than the sums changed: g2 enters them in products of all terms.
     if let TrueSign::OfCatalogues(truth) = &request.sign {
         let sign = summed.sign_of_catalogues(truth)?;
-        if sign.of == TruthSign::Challenge {
+        if is_of_challenge(sign) {
             reading.flip_g2 = true;
-            let found = add_up(&reading, &all, (layout, &summed.about.cells), part, None)?;
+            let found = add_up(reading, all, (layout, &summed.about.cells), part, None)?;
             (summed.sums, summed.about.catalogues) = found;
         }
         summed.about.sign = Some(sign);
@@ -259,19 +292,10 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
             return Err(BiasFailure::PairedSheared);
         }
         let design = summed.design();
-        let partners = Partners::new(&reading, &all, design, &summed.about.catalogues)?;
+        let partners = Partners::new(reading, all, design, &summed.about.catalogues)?;
         let cells = &summed.about.cells;
-        let found = add_up(&reading, &all, (layout, cells), part, Some(&partners))?;
+        let found = add_up(reading, all, (layout, cells), part, Some(&partners))?;
         (summed.sums, summed.about.catalogues) = found;
-    }
-    if let Some(survey) = &request.like {
-        if summed.about.cells.axes.is_empty() {
-            return Err(BiasFailure::LikeWithoutBins);
-        }
-        summed.populations = like::populations(survey, request, &summed.about.cells)?;
-    }
-    for (catalogue, image) in summed.about.catalogues.iter_mut().zip(images) {
-        catalogue.image = image;
     }
     Ok(summed)
 }
@@ -311,35 +335,30 @@ fn add_up(
             let mut add_sheared = |bin, catalogue: usize, weight| {
                 sums.add_sheared(number, item.key, bin, catalogue - 1, (scaled, weight));
             };
-            if item.sheared > 0 {
-                if let Some(bin) = own {
-                    add_sheared(bin, item.sheared, row.weight);
-                }
-                return;
-            }
-            if let Some(paired) = &paired {
-                let counts = item.selected.binned[0].is_ok();
-                if !paired.contains(&item.galaxy) {
-                    alone += u64::from(counts);
+            match &paired {
+                Some(paired) if !paired.contains(&item.galaxy) => {
+                    alone += u64::from(item.selected.binned[0].is_ok());
                     return;
                 }
                 // The same galaxies under all shears, so that the choice has no response; weights have one.
-                if let Some(bin) = own.filter(|_| selects) {
-                    for catalogue in 1..CATALOGUES {
-                        add_sheared(bin, catalogue, item.selected.weights[catalogue]);
+                Some(_) => {
+                    if let Some(bin) = own.filter(|_| selects) {
+                        for catalogue in 1..CATALOGUES {
+                            add_sheared(bin, catalogue, item.selected.weights[catalogue]);
+                        }
                     }
                 }
-            } else if selects {
-                // The ellipticity without artificial shear of the galaxies that each sheared catalogue selects, with its
-                // weights: the selection response R_S of Sheldon & Huff (2017, ApJ 841, 24). It needs all four catalogues,
-                // because a cut by S/N responds to both components.
-                for catalogue in 1..CATALOGUES {
-                    if let Some(bin) = bin(catalogue) {
-                        add_sheared(bin, catalogue, item.selected.weights[catalogue]);
+                None => {
+                    for (catalogue, weight) in item.in_sheared(selects) {
+                        // A row of a sheared catalogue has its own bin, others that of each catalogue.
+                        let chosen = if item.sheared > 0 { 0 } else { catalogue };
+                        if let Some(bin) = bin(chosen) {
+                            add_sheared(bin, catalogue, weight);
+                        }
                     }
                 }
             }
-            if let Some(bin) = own {
+            if let Some(bin) = own.filter(|_| item.sheared == 0) {
                 sums.add(number, item.key, bin, row);
             }
         })?;

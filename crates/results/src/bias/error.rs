@@ -91,8 +91,8 @@ pub enum BiasFailure {
     #[error("the catalogues cannot be compared (found {} with {} and {} with {}, expected the same design and units). Try: --design and --units", .0.0.name(), .0.1, .1.0.name(), .1.1)]
     DesignsDiffer((Design, &'static str), (Design, &'static str)),
     #[error(
-        "no galaxy can be used (found {} rows: {} with a flag, {} with a weight of zero or less, {} not selected, {} with missing numbers, {} with failed measurements, {} with a distortion above 1)",
-        .0.rows, .0.flagged, .0.unweighted, .0.unselected, .0.missing, .0.failed, .0.above_one
+        "no galaxy can be used (found {} rows: {} with a flag, {} with a weight of zero or less, {} not selected, {} with missing numbers, {} with failed measurements, {} with a distortion above 1){}",
+        .0.rows, .0.flagged, .0.unweighted, .0.unselected, .0.missing, .0.failed, .0.above_one, no_text(&.0.unmatched)
     )]
     NoGalaxy(Box<Catalogue>),
     #[error(
@@ -124,6 +124,13 @@ pub enum BiasFailure {
         "the ellipticities look like distortions (found slopes of {:.3} and {:.3}, expected about 1). Try: --ellipticity distortion, or --ellipticity shear to keep them", .0[0], .0[1]
     )]
     Distortions([f64; 2]),
+}
+
+fn no_text(unmatched: &[String]) -> String {
+    match unmatched.first() {
+        Some(text) => format!(". Try: another text, because no row has `{text}`"),
+        None => String::new(),
+    }
 }
 
 fn other_sign(sign: Option<Sign>) -> String {

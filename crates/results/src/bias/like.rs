@@ -8,9 +8,10 @@
 use std::collections::BTreeMap;
 
 use shearq_catalogue::columns::Columns;
-use shearq_catalogue::expression::{Operand, operand_values, texts_of};
-use shearq_catalogue::request::{MAX_AXES, MAX_BINS, Request, Survey};
+use shearq_catalogue::expression::{Expression, Operand, operand_values, texts_of};
+use shearq_catalogue::request::{self, MAX_AXES, MAX_BINS, Request};
 use shearq_catalogue::roles::Role;
+use shearq_catalogue::source::{add_formulas, with_formulas};
 use shearq_files::FileError;
 use shearq_files::frames::polars::DataFrame;
 use shearq_files::table::{self, Place};
@@ -80,112 +81,173 @@ const TOMOGRAPHY: [&str; 9] = [
 // Without a recognised table of ellipticities.
 const WEIGHTS: [&str; 5] = ["w", "weight", "shape_weight", "lensfit_weight", "weights"];
 
-fn unknown(place: &Place, name: &str, known: &[String]) -> FileError {
-    FileError::no_column(&place.path, name, known)
+/// Which columns of a survey are used.
+struct Survey<'r> {
+    place: Place,
+    weight: Option<String>,
+    flags: Vec<String>,
+    tomography: Option<String>,
+    /// `--where`, if the survey has its columns.
+    condition: Option<&'r Expression>,
+    /// What is binned, and compared by the condition.
+    binned: Vec<&'r Operand>,
+    compared: &'r [Operand],
+    formulas: Vec<Expression>,
+    /// What is used, in words.
+    columns: String,
+    unused: Vec<String>,
 }
 
-/// The whole survey, then its tomographic bins.
-#[expect(
-    clippy::too_many_lines,
-    reason = "checks of a survey, one after the other"
-)]
-pub(super) fn populations(
-    survey: &Survey,
-    request: &Request,
-    cells: &Cells,
-) -> Result<Vec<Population>, BiasFailure> {
-    let place = Place::of(&survey.catalogue.name);
-    let path = &place.path;
-    let frame = survey.catalogue.frame.as_ref();
-    let known: Vec<String> = match frame {
-        Some(frame) => (frame.columns().iter())
-            .map(|own| own.name().to_string())
-            .collect(),
-        None => match table::columns(&place)?.named.into_iter().next() {
-            Some(list) => list.names,
-            None => Vec::new(),
-        },
-    };
-    let there = |name: &str| -> Option<String> {
-        let mut known = known.iter();
-        known.find(|own| own.eq_ignore_ascii_case(name)).cloned()
-    };
-    // A survey may be a table of S/N and size alone, whose other columns are found as beside ellipticities.
-    let names = request.names.within(&known);
-    let columns = Columns::find(path, &known, &names, false);
-    let is_bare = columns.is_err();
-    // Other faults remain with ellipticities.
-    let columns = columns.or_else(|_| {
-        let shapes = ["e1", "e2"].map(str::to_owned);
-        Columns::find(path, &[&known[..], &shapes].concat(), &names, false)
-            .map_err(|error| error.with_words(", e1, e2", ""))
-    })?;
-    let weight = columns.of(Role::Weight).map(str::to_owned);
-    let weight = match is_bare && !names.is_given(Role::Weight) {
-        true => weight.or_else(|| WEIGHTS.iter().find_map(|name| there(name))),
-        false => weight,
-    };
-    let flags = columns.flags.clone();
-    let tomography = match &survey.tomography {
-        Some(name) => Some(there(name).ok_or_else(|| unknown(&place, name, &known))?),
-        None => TOMOGRAPHY.iter().find_map(|name| there(name)),
-    };
-    let operands: Vec<&Operand> = request
-        .bins
-        .iter()
-        .flat_map(|own| own.of.operands())
-        .collect();
-    for operand in &operands {
-        if !known.contains(&operand.column) {
-            return Err(unknown(&place, &operand.column, &known).into());
+impl<'r> Survey<'r> {
+    fn of(request: &'r Request, stated: &request::Survey) -> Result<Self, FileError> {
+        let place = Place::of(&stated.catalogue.name);
+        let path = place.path.as_path();
+        let known: Vec<String> = match &stated.catalogue.frame {
+            Some(frame) => (frame.columns().iter())
+                .map(|own| own.name().to_string())
+                .collect(),
+            None => match table::columns(&place)?.named.into_iter().next() {
+                Some(list) => list.names,
+                None => Vec::new(),
+            },
+        };
+        let there = |name: &str| -> Option<String> {
+            let mut known = known.iter();
+            known.find(|own| own.eq_ignore_ascii_case(name)).cloned()
+        };
+        let absent = |name: &str| FileError::no_column(path, name, &known);
+        let names = request.names.within(&known);
+        let (all, formulas) = with_formulas(path, &known, &names)?;
+        // A survey may be a table of S/N and size alone, whose other columns are found as beside ellipticities.
+        let columns = Columns::find(path, &all, &names, false);
+        let is_bare = columns.is_err();
+        // Other faults remain with ellipticities.
+        let columns = columns.or_else(|_| {
+            let shapes = ["e1", "e2"].map(str::to_owned);
+            Columns::find(path, &[&all[..], &shapes].concat(), &names, false)
+                .map_err(|error| error.with_words(", e1, e2", ""))
+        })?;
+        let weight = columns.of(Role::Weight).map(str::to_owned);
+        let weight = match is_bare && !names.is_given(Role::Weight) {
+            true => weight.or_else(|| WEIGHTS.iter().find_map(|name| there(name))),
+            false => weight,
+        };
+        let flags = columns.flags.clone();
+        let tomography = match &stated.tomography {
+            Some(name) => Some(there(name).ok_or_else(|| absent(name))?),
+            None => TOMOGRAPHY.iter().find_map(|name| there(name)),
+        };
+        let bins = request.bins.iter();
+        let binned: Vec<&Operand> = bins.flat_map(|own| own.of.operands()).collect();
+        if let Some(operand) = binned.iter().find(|own| !known.contains(&own.column)) {
+            return Err(absent(&operand.column));
         }
+        let selection = request.selection.as_ref();
+        let stated = selection.and_then(|own| own.rows.as_ref());
+        let is_there = |own: &&Expression| own.columns().all(|name| there(name).is_some());
+        let condition = stated.filter(is_there);
+        let mut roles: Vec<String> = weight.iter().map(|own| format!("w={own}")).collect();
+        roles.extend(flags.iter().map(|own| format!("flag={own}")));
+        roles.extend(
+            tomography
+                .iter()
+                .map(|own| format!("tomographic bin={own}")),
+        );
+        if roles.is_empty() {
+            roles.push("no weight".into());
+        }
+        roles.extend(stated.map(|own| match condition {
+            Some(_) => format!("where {}", own.text()),
+            None => format!("all rows, because it lacks a column of `{}`", own.text()),
+        }));
+        let compared = condition.map_or(&[][..], Expression::operands);
+        let mut survey = Survey {
+            unused: Vec::new(),
+            columns: roles.join(", "),
+            place,
+            weight,
+            flags,
+            tomography,
+            condition,
+            binned,
+            compared,
+            formulas,
+        };
+        let unused = columns.unused_choices(&survey.read()).into_iter();
+        survey.unused = unused.map(str::to_owned).collect();
+        Ok(survey)
     }
-    let mut wanted: Vec<&str> = operands.iter().map(|own| own.column.as_str()).collect();
-    wanted.extend(
-        weight
+
+    fn operands(&self) -> impl Iterator<Item = &Operand> {
+        self.binned.iter().copied().chain(self.compared)
+    }
+
+    /// The columns that are read, each once.
+    fn read(&self) -> Vec<&str> {
+        let is_computed = |name: &str| self.formulas.iter().any(|own| own.text() == name);
+        let roles = self
+            .weight
             .iter()
-            .chain(&flags)
-            .chain(&tomography)
-            .map(String::as_str),
-    );
-    wanted.sort_unstable();
-    wanted.dedup();
-    let unused = columns.unused_choices(&wanted).into_iter();
-    let unused: Vec<String> = unused.map(str::to_owned).collect();
-    let texts = operands.iter().filter(|own| own.pattern.is_some());
-    let mut texts: Vec<&str> = texts.map(|own| own.column.as_str()).collect();
-    texts.extend(tomography.as_deref());
-    let mut found: BTreeMap<Option<String>, (u64, Vec<f64>)> = BTreeMap::new();
-    let mut add = |frame: &DataFrame| -> Result<(), FileError> {
+            .chain(&self.flags)
+            .chain(&self.tomography);
+        let roles = roles.map(String::as_str).filter(|name| !is_computed(name));
+        let operands = self.operands().map(|own| own.column.as_str());
+        let computed = self.formulas.iter().flat_map(Expression::columns);
+        let mut all: Vec<&str> = operands.chain(roles).chain(computed).collect();
+        all.sort_unstable();
+        all.dedup();
+        all
+    }
+
+    /// Columns that may be texts.
+    fn texts(&self) -> Vec<&str> {
+        let computed = self.formulas.iter().flat_map(Expression::operands);
+        let texts = self.operands().chain(computed);
+        let texts = texts.filter(|own| own.pattern.is_some());
+        let texts = texts.map(|own| own.column.as_str());
+        texts.chain(self.tomography.as_deref()).collect()
+    }
+
+    /// Adds the weights of the rows of a part to their cells, of the whole survey (`None`) and of their tomographic bin.
+    fn add(
+        &self,
+        part: DataFrame,
+        (request, cells): (&Request, &Cells),
+        found: &mut Weights,
+    ) -> Result<(), FileError> {
+        let path = self.place.path.as_path();
+        let frame = &add_formulas(part, &self.formulas, path)?;
         let column = |name: &str| table::numbers(frame, name, path);
-        let weights = weight.as_deref().map(column).transpose()?;
-        let flags = flags
-            .iter()
-            .map(|name| column(name))
-            .collect::<Result<Vec<_>, _>>()?;
-        let values = operands.iter().map(|own| operand_values(frame, own, path));
-        let values = values.collect::<Result<Vec<_>, _>>()?;
-        let bins = tomography
-            .as_ref()
-            .map(|name| -> Result<Vec<String>, FileError> {
-                match texts_of(frame, name) {
-                    Some(texts) => Ok(texts
-                        .map(|text| text.unwrap_or_default().trim().to_owned())
-                        .collect()),
-                    None => Ok(column(name)?.iter().map(f64::to_string).collect()),
-                }
-            });
+        let weights = self.weight.as_deref().map(column).transpose()?;
+        let flags = self.flags.iter().map(|name| column(name));
+        let flags = flags.collect::<Result<Vec<_>, _>>()?;
+        let values = |operand| operand_values(frame, operand, path);
+        let binned = self.binned.iter().copied().map(values);
+        let binned = binned.collect::<Result<Vec<_>, _>>()?;
+        let compared = self.compared.iter().map(values);
+        let compared = compared.collect::<Result<Vec<_>, _>>()?;
+        let bins = (self.tomography.as_ref()).map(|name| -> Result<Vec<String>, FileError> {
+            match texts_of(frame, name) {
+                Some(texts) => Ok(texts
+                    .map(|text| text.unwrap_or_default().trim().to_owned())
+                    .collect()),
+                None => Ok(column(name)?.iter().map(f64::to_string).collect()),
+            }
+        });
         let bins = bins.transpose()?;
         for at in 0..frame.height() {
             let weight = weights.as_ref().map_or(1.0, |weights| weights[at]);
+            let holds = |own: &Expression| own.value(&|k| compared[k][at]) > 0.0;
             // NaN is no weight either.
-            let is_used = weight > 0.0 && flags.iter().all(|flag| flag[at] == 0.0);
+            let is_used = weight > 0.0
+                && flags.iter().all(|flag| flag[at] == 0.0)
+                && self.condition.is_none_or(holds);
             if !is_used {
                 continue;
             }
             let (mut own, mut first) = ([0.0; MAX_AXES], 0);
             for (own, binning) in own.iter_mut().zip(&request.bins) {
-                *own = binning.of.value(&|k| values[first + k][at]);
+                *own = binning.of.value(&|k| binned[first + k][at]);
                 first += binning.of.operands().len();
             }
             let cell = cells.of(&own).unwrap_or(cells.outside());
@@ -206,28 +268,31 @@ pub(super) fn populations(
                 path,
                 format!(
                     "column `{}` has more than {MAX_BINS} different values (expected tomographic bins). Try: --tomography NAME",
-                    tomography.as_deref().unwrap_or_default()
+                    self.tomography.as_deref().unwrap_or_default()
                 ),
             )),
             false => Ok(()),
         }
-    };
-    match frame {
-        Some(frame) => add(frame)?,
-        None => table::read_parts(&place, &wanted, &texts, |frame| add(&frame))?,
     }
-    let name = survey.catalogue.name.display();
-    let mut roles: Vec<String> = weight.iter().map(|own| format!("w={own}")).collect();
-    roles.extend(flags.iter().map(|own| format!("flag={own}")));
-    roles.extend(
-        tomography
-            .iter()
-            .map(|own| format!("tomographic bin={own}")),
-    );
-    let columns = match roles.is_empty() {
-        true => "no weight".to_owned(),
-        false => roles.join(", "),
-    };
+}
+
+// Galaxies and Σ w of each cell: of the whole survey, and of its tomographic bins.
+type Weights = BTreeMap<Option<String>, (u64, Vec<f64>)>;
+
+/// The whole survey, then its tomographic bins.
+pub(super) fn populations(
+    stated: &request::Survey,
+    request: &Request,
+    cells: &Cells,
+) -> Result<Vec<Population>, BiasFailure> {
+    let survey = Survey::of(request, stated)?;
+    let mut found = Weights::new();
+    let mut add = |part| survey.add(part, (request, cells), &mut found);
+    match &stated.catalogue.frame {
+        Some(frame) => add(frame.clone())?,
+        None => table::read_parts(&survey.place, &survey.read(), &survey.texts(), add)?,
+    }
+    let name = stated.catalogue.name.display();
     // A number where there is one, so that bin 10 comes after bin 9.
     let mut all: Vec<_> = found.into_iter().collect();
     let order = |name: &Option<String>| {
@@ -236,14 +301,14 @@ pub(super) fn populations(
     };
     all.sort_by_key(|(name, _)| order(name));
     let population = |(bin, (galaxies, weights)): (Option<String>, (u64, Vec<f64>))| Population {
-        label: match (bin, &tomography) {
+        label: match (bin, &survey.tomography) {
             (Some(bin), Some(column)) => format!("like {name}, {column} {bin}"),
             _ => format!("like {name}"),
         },
         galaxies,
         weights,
-        columns: columns.clone(),
-        unused: unused.clone(),
+        columns: survey.columns.clone(),
+        unused: survey.unused.clone(),
         uncovered: Vec::new(),
     };
     Ok(all.into_iter().map(population).collect())

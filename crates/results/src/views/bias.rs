@@ -312,6 +312,12 @@ pub fn of_design(result: &BiasResult) -> Vec<String> {
             own.mean,
         ));
     }
+    for text in &total.unmatched {
+        lines.push(format!(
+            "no row has the text of `{text}` in --where or --columns. Try: another text, with `*` for any characters"
+        ));
+    }
+    lines.extend(repeated(&result.about.catalogues, true));
     if let Some(alpha) = all.value("alpha")
         && alpha.value < OTHER_PSF.min(-IMPLAUSIBLE_SIGNIFICANCE * alpha.error)
     {
@@ -489,7 +495,8 @@ fn notes(result: &BiasResult) -> Vec<String> {
             "Leaving out the {failed} rows that failed is a selection, because shear changes which measurements fail: m contains its effect. Try: a flag and responses of a method that measures all galaxies, or --paired for pairs."
         ));
     }
-    notes.extend(repeated(&result.about.catalogues));
+    let few = repeated(&result.about.catalogues, false);
+    notes.extend(few.iter().map(|line| sentence(line)));
     notes.extend(chosen_by_measurement(result));
     for (k, assumes) in (1..).zip(all.assumes_no_c) {
         if assumes {
@@ -609,8 +616,12 @@ fn sentence(line: &str) -> String {
     line + "."
 }
 
-// Lines about numbers that several rows share exactly, such as zeros for failed measurements.
-fn repeated(catalogues: &[Catalogue]) -> Vec<String> {
+// Share of repeated rows from which m or c is wrong by the requirement on m or more, which is a warning: ellipticities that are zero
+// in 1 % of the rows change m by −0.01.
+const MANY_REPEATED: f64 = 0.01;
+
+// Lines about numbers that several rows share exactly, such as zeros for failed measurements: those of many rows or of few.
+fn repeated(catalogues: &[Catalogue], of_many: bool) -> Vec<String> {
     let mut all: Vec<Repeated> = Vec::new();
     for own in catalogues.iter().flat_map(|own| &own.repeated) {
         let known = all.iter().position(|other| other.columns == own.columns);
@@ -621,31 +632,33 @@ fn repeated(catalogues: &[Catalogue]) -> Vec<String> {
         }
     }
     let rows: u64 = catalogues.iter().map(|own| own.rows).sum();
+    let is_wanted = |count: u64| (count as f64 >= MANY_REPEATED * rows as f64) == of_many;
+    all.retain(|own| is_wanted(own.rows));
     let line = |own: &Repeated| {
         let ([a, b], [first, second]) = (&own.columns, own.values.map(shown));
         if a == b {
             return format!(
-                "Repeated values: `{a}` is exactly {first} in {} of {rows} rows, which count; measured values do not repeat. If this stands for a failure, try: --where '{a} != {first}'",
+                "repeated values: `{a}` is exactly {first} in {} of {rows} rows, which count; measured values do not repeat. If this stands for a failure, try: --where '{a} != {first}'",
                 own.rows
             );
         }
         format!(
-            "Repeated values: `{a}` and `{b}` are exactly {first} and {second} in {} of {rows} rows, which count; measured values do not repeat. If this stands for a failure, try: --where '{a} != {first}'",
+            "repeated values: `{a}` and `{b}` are exactly {first} and {second} in {} of {rows} rows, which count; measured values do not repeat. If this stands for a failure, try: --where '{a} != {first}'",
             own.rows
         )
     };
     let mut lines: Vec<String> = all.iter().map(line).collect();
     let sum = |of: fn(&Catalogue) -> u64| catalogues.iter().map(of).sum::<u64>();
     let copies = sum(|own| own.copies);
-    if copies > 0 {
+    if copies > 0 && is_wanted(copies) {
         lines.push(format!(
-            "Repeated rows: {copies} of {rows} rows have the numbers of an earlier row of their catalogue, so that galaxies count several times and the errors are too small. Try: a catalogue with each galaxy once."
+            "repeated rows: {copies} of {rows} rows have the numbers of an earlier row of their catalogue, so that galaxies count several times and the errors are too small. Try: a catalogue with each galaxy once"
         ));
     }
     let shared = sum(|own| own.shared_identifiers);
-    if shared > 0 {
+    if shared > 0 && is_wanted(shared) {
         lines.push(format!(
-            "Repeated identifiers: {shared} of {rows} rows have the identifier of an earlier row of their catalogue, and galaxies that share one form one unit of the errors. Try: --columns id=NAME, or id=none if they do not name galaxies."
+            "repeated identifiers: {shared} of {rows} rows have the identifier of an earlier row of their catalogue, and galaxies that share one form one unit of the errors. Try: --columns id=NAME, or id=none if they do not name galaxies"
         ));
     }
     lines
