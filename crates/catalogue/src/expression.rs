@@ -611,7 +611,7 @@ mod tests {
         };
         let error = check("0.3*sin(2*pa)", &[0.0, f64::NAN, -90.0]).unwrap_err();
         assert!(error.contains("angles up to 180.0"), "{error}");
-        check("cos(4*pa)", &[-6.28, 6.28, f64::NAN]).unwrap();
+        check("cos(4*pa)", &[-6.2, 6.2, f64::NAN]).unwrap();
         check("cos(radians(2*pa))", &[180.0, 360.0]).unwrap();
         check("pa > 100", &[180.0]).unwrap();
     }
