@@ -33,12 +33,15 @@ pub fn numbers<'t>(
     let column = table.column(name).ok();
     column.and_then(reals).ok_or_else(|| {
         let texts = column.and_then(|own| own.str().ok());
-        match texts.map(|own| own.get(0).unwrap_or_default()) {
+        match texts.map(|own| own.iter().flatten().next().unwrap_or_default()) {
             Some(first) => {
                 let message = format!(
-                    "column `{name}` holds texts (found `{first}` in the first row, expected numbers)"
+                    "column `{name}` holds texts (found `{first}` first, expected numbers)"
                 );
-                FileError::new(path, message).hint("a table with a column of numbers")
+                FileError::new(path, message).hint(match text::is_sexagesimal(first) {
+                    true => text::DEGREES_HINT,
+                    false => "a table with a column of numbers",
+                })
             }
             None => {
                 let message = format!("there is no column `{name}` that holds numbers");

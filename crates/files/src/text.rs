@@ -577,6 +577,9 @@ impl<'a> Rows<'a> {
             _ => "a number",
         };
         let mut message = format!("line {line}: `{field}` in column `{name}` is not {expected}");
+        if is_sexagesimal(&field) {
+            return FileError::new(self.path, message).hint(DEGREES_HINT);
+        }
         // VizieR's tables have lines of units and of dashes below the names.
         if value(&field.replacen(',', ".", 1)).is_some_and(|own| !own.is_nan()) {
             message += ". Try: numbers with decimal points";
@@ -604,6 +607,18 @@ impl<'a> Rows<'a> {
             .collect();
         crate::frames::frame(columns).map_err(|error| FileError::new(self.path, error.to_string()))
     }
+}
+
+/// What to do about hours, minutes and seconds.
+pub(crate) const DEGREES_HINT: &str = "degrees, which SkyCoord(ra, dec, unit=(\"hourangle\", \"deg\")) of astropy has as ra.deg and dec.deg";
+
+/// Whether a text is an angle with minutes and seconds: `10:00:03.1`, `-2 30 00` or `10h00m03.1s`.
+pub(crate) fn is_sexagesimal(text: &str) -> bool {
+    let number = |part: &str| part.trim_start_matches(['+', '-']).parse::<f64>().is_ok();
+    let text = text.trim().trim_end_matches(['s', '"']);
+    let parts = text.split([':', ' ', 'h', 'd', 'm', '°', '\'']);
+    let parts: Vec<&str> = parts.filter(|part| !part.is_empty()).collect();
+    parts.len() == 3 && parts.into_iter().all(number)
 }
 
 // Missing numbers and truth values, in the words of pandas, SQL, R and astropy.

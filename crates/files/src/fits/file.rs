@@ -254,6 +254,11 @@ fn check_header(source: &mut Source, start: u64, content: Content) -> Result<boo
             return Ok(false);
         }
         if block.len() < BLOCK || at - start >= MAX_HEADER_BYTES {
+            // Records without a header behind the last one, which the standard tells readers to disregard (section 3.5). A header that is
+            // damaged has an END.
+            if start > 0 && !source.read_at(start, BLOCK)?.starts_with(b"XTENSION") {
+                return Ok(false);
+            }
             let read = at - start + block.len() as u64;
             let message = format!(
                 "cannot open the file: the header from byte {start} has no END in {read} bytes"
