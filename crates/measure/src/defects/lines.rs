@@ -2,7 +2,7 @@
 //!
 //! Sums of columns and rows obey the limits of [`LightLimits`], because each of their pixels does. Their noise is that of a line, so
 //! that a departure of 1.5 σ per pixel is found, where that of one pixel has to be 11 σ. A trail is as smooth as light, but no light of
-//! a galaxy has one brightness from edge to edge and none beside it.
+//! a galaxy has one brightness, or one that changes evenly, from edge to edge and none beside it.
 
 use multiversion::multiversion;
 use shearq_quantities::statistics::{SCATTER, median};
@@ -30,9 +30,11 @@ const GALAXY_RADIUS: f32 = 12.0;
 const MIN_PIECES: usize = 3;
 // Of the fainter end: three galaxies in a row are fainter between them. Chosen by hand.
 const MIN_PIECE: f32 = 0.65;
-// Faintest piece in units of the upper quartile of those beyond the galaxy. Wings of an exponential disc are as uniform from a scale of
-// 28 px on.
+// Faintest piece in units of the upper quartile of those beyond the galaxy, both in units of the ramp through the latter. Wings of an
+// exponential disc are as uniform from a scale of 28 px on; a ramp is no nearer to them, because they fall to both sides.
 const MIN_UNIFORMITY: f32 = 0.7;
+// Faint end of that ramp in units of the bright one. Chosen by hand: satellites that turn, and ends of trails.
+const MIN_RAMP: f32 = 0.15;
 // In pixels from a trail. Chosen by hand.
 const BESIDE_TRAIL: f32 = 8.0;
 // What is there in units of the trail, which leaves a fifth of it if its FWHM is 8 px. Chosen by hand.
@@ -48,8 +50,8 @@ pub(super) struct Lines {
     values: Vec<f32>,
     /// Means across the strips along the left, right, lower and upper edge.
     strips: [Vec<f32>; 4],
-    /// Of a trail, beyond the galaxy: its pieces, and what is beside them.
-    pieces: [Vec<f32>; 2],
+    /// Of a trail: its pieces.
+    pieces: Vec<Piece>,
 }
 
 impl Lines {
@@ -60,7 +62,7 @@ impl Lines {
             sums: [buffer(), buffer()],
             values: buffer(),
             strips: [buffer(), buffer(), buffer(), buffer()],
-            pieces: [buffer(), buffer()],
+            pieces: Vec::with_capacity(n),
         }
     }
 
@@ -153,16 +155,20 @@ impl Lines {
         mean_strips(stamp, n, &mut strips);
         let ends = [0, 1, 2, 3].map(|side| self.find_end(&strips[side], n, side, noise));
         self.strips = strips;
-        for (k, first) in ends.iter().enumerate() {
-            for second in &ends[k + 1..] {
-                let (Some(first), Some(second)) = (first, second) else {
-                    continue;
-                };
-                let trail = Trail::new([first.at, second.at]);
-                if trail.length >= MIN_TRAIL * n as f32
-                    && self.is_trail(&trail, stamp, n, first.level.min(second.level))
-                {
-                    return Some(trail);
+        // A ramp may fit light along a wrong line, too, so that all lines of one brightness come first.
+        for may_fade in [false, true] {
+            for (k, first) in ends.iter().enumerate() {
+                for second in &ends[k + 1..] {
+                    let (Some(first), Some(second)) = (first, second) else {
+                        continue;
+                    };
+                    let trail = Trail::new([first.at, second.at]);
+                    let level = first.level.min(second.level);
+                    if trail.length >= MIN_TRAIL * n as f32
+                        && self.is_trail(&trail, stamp, n, level, may_fade)
+                    {
+                        return Some(trail);
+                    }
                 }
             }
         }
@@ -200,13 +206,19 @@ impl Lines {
         (level - middle > MIN_DEPARTURE * scatter).then_some(End { at, level })
     }
 
-    /// Whether light of about one brightness, `level` or more, is along a line, and none beside it.
-    fn is_trail(&mut self, trail: &Trail, stamp: &[f32], n: usize, level: f32) -> bool {
-        let [along, beside] = &mut self.pieces;
-        along.clear();
-        beside.clear();
+    /// Whether light of about one brightness, or one that changes evenly if it `may_fade`, is along a line, of `level` or more, and none
+    /// beside it.
+    fn is_trail(
+        &mut self,
+        trail: &Trail,
+        stamp: &[f32],
+        n: usize,
+        level: f32,
+        may_fade: bool,
+    ) -> bool {
+        let Lines { pieces, values, .. } = self;
+        pieces.clear();
         let middle = 0.5 * (n as f32 - 1.0);
-        let mut faintest = f32::INFINITY;
         let mean = |first: usize, across: &[f32]| {
             let (mut sum, mut count) = (0.0, 0.0);
             for step in first..first + PIECE {
@@ -223,26 +235,96 @@ impl Lines {
             sum / count
         };
         for first in (0..).step_by(PIECE).take(trail.length as usize / PIECE) {
-            let piece = mean(first, &[-1.0, 0.0, 1.0]);
+            let light = mean(first, &[-1.0, 0.0, 1.0]);
             // Not a number, without pixels, is not too faint.
-            if piece < MIN_PIECE * level {
+            if light < MIN_PIECE * level {
                 return false;
             }
-            faintest = faintest.min(piece);
-            let [x, y] = trail.at((first + PIECE / 2) as f32, 0.0);
-            if (x - middle).hypot(y - middle) > GALAXY_RADIUS {
-                along.extend(Some(piece).filter(|piece| piece.is_finite()));
-                let light = mean(first, &[-BESIDE_TRAIL, BESIDE_TRAIL]);
-                beside.extend(Some(light).filter(|light| light.is_finite()));
-            }
+            let along = (first + PIECE / 2) as f32;
+            let [x, y] = trail.at(along, 0.0);
+            let is_beyond = (x - middle).hypot(y - middle) > GALAXY_RADIUS;
+            pieces.push(Piece {
+                along,
+                light,
+                beside: match is_beyond {
+                    true => mean(first, &[-BESIDE_TRAIL, BESIDE_TRAIL]),
+                    false => f32::NAN,
+                },
+                is_beyond: is_beyond && light.is_finite(),
+            });
         }
-        if along.len() < MIN_PIECES {
+        let beyond = || pieces.iter().filter(|piece| piece.is_beyond);
+        if beyond().count() < MIN_PIECES {
             return false;
         }
-        let rank = 3 * along.len() / 4;
-        let bright = *along.select_nth_unstable_by(rank, f32::total_cmp).1;
-        let is_uniform = faintest >= MIN_UNIFORMITY * bright;
-        is_uniform && median(beside).is_some_and(|light| light <= MAX_BESIDE * bright)
+        let ramp = match may_fade {
+            true => Ramp::through(beyond()),
+            false => Ramp::EVEN,
+        };
+        let ends = [0.0, trail.length].map(|along| ramp.at(along));
+        if ends[0].min(ends[1]) < MIN_RAMP * ends[0].max(ends[1]) {
+            return false;
+        }
+        values.clear();
+        values.extend(beyond().map(|piece| piece.light / ramp.at(piece.along)));
+        let rank = 3 * values.len() / 4;
+        let bright = *values.select_nth_unstable_by(rank, f32::total_cmp).1;
+        let lights = pieces
+            .iter()
+            .map(|piece| piece.light / ramp.at(piece.along));
+        if lights.fold(f32::INFINITY, f32::min) < MIN_UNIFORMITY * bright {
+            return false;
+        }
+        values.clear();
+        let beside = beyond().map(|piece| piece.beside / ramp.at(piece.along));
+        values.extend(beside.filter(|light| light.is_finite()));
+        median(values).is_some_and(|light| light <= MAX_BESIDE * bright)
+    }
+}
+
+/// A part of a trail.
+#[derive(Debug, Clone, Copy)]
+struct Piece {
+    /// In pixels from the beginning of the trail.
+    along: f32,
+    light: f32,
+    /// NaN at the galaxy.
+    beside: f32,
+    is_beyond: bool,
+}
+
+/// Brightness that changes evenly along a trail.
+#[derive(Debug, Clone, Copy)]
+struct Ramp {
+    start: f32,
+    slope: f32,
+}
+
+impl Ramp {
+    /// Of one brightness.
+    const EVEN: Ramp = Ramp {
+        start: 1.0,
+        slope: 0.0,
+    };
+
+    /// The least squares of some pieces.
+    fn through<'p>(pieces: impl Iterator<Item = &'p Piece> + Clone) -> Self {
+        let count = pieces.clone().count() as f32;
+        let mean = |of: fn(&Piece) -> f32| pieces.clone().map(of).sum::<f32>() / count;
+        let (along, light) = (mean(|piece| piece.along), mean(|piece| piece.light));
+        let about = pieces.map(|piece| (piece.along - along, piece.light - light));
+        let [square, product] = about.fold([0.0; 2], |[square, product], (x, y)| {
+            [square + x * x, product + x * y]
+        });
+        let slope = product / square;
+        Ramp {
+            start: light - slope * along,
+            slope,
+        }
+    }
+
+    fn at(&self, along: f32) -> f32 {
+        self.start + self.slope * along
     }
 }
 

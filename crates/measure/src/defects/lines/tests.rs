@@ -94,6 +94,29 @@ fn trails_become_missing_at_any_angle() {
 }
 
 #[test]
+fn trails_that_fade_become_missing() {
+    let mut rng = ChaCha8Rng::seed_from_u64(26);
+    let limits = limits(3.4);
+    for (level, fade) in [(10.0, 0.3), (20.0, 0.6), (1e3, 0.7)] {
+        let mut seen = 0;
+        for _ in 0..50 {
+            let angle: f32 = rng.random_range(0.0..std::f32::consts::PI);
+            let off: f32 = rng.random_range(-12.0..12.0);
+            let (sin, cos) = angle.sin_cos();
+            let trail = |x: f32, y: f32| {
+                let (across, along) = (x * cos + y * sin - off, y * cos - x * sin);
+                level * (1.0 + fade * along / 24.0) * (-across * across / 3.25).exp()
+            };
+            let core = |x: f32, y: f32| 20.0 * (-(x * x + y * y) / 18.0).exp();
+            let stamp = stamp(|x, y| trail(x, y).max(0.0) + core(x, y), &mut rng);
+            seen += usize::from(found(&stamp, N, 1.0, &limits).1.lines > 0);
+        }
+        // 39 to 45; the others end near a corner, or fade by more than a ramp may.
+        assert!(seen >= 35, "{level} {fade}: {seen} of 50");
+    }
+}
+
+#[test]
 fn galaxies_of_any_shape_are_no_trails() {
     let mut rng = ChaCha8Rng::seed_from_u64(24);
     let limits = limits(3.4);
