@@ -284,6 +284,7 @@ fn prepare(
     let of_psf = check_psf(&psfs, &plan, jacobians)?;
     let mut writer = StampWriter::create(&target, mosaic, gathering.noise, wcs, &psfs.examination)?;
     writer.copy(gathering, plan.places())?;
+    messages.extend(writer.masked_line(gathering));
     let mut warnings = writer.examination.warnings();
     if gathering.variances.is_some() {
         warnings.retain(|warning| !matches!(warning, Warning::Depths { .. }));

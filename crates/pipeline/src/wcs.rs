@@ -63,6 +63,16 @@ impl Wcs {
         })
     }
 
+    /// Arcseconds per pixel.
+    pub(crate) fn scale(&self) -> Option<f64> {
+        self.scale
+    }
+
+    /// Keys that state where the image is in a larger one, if it is a section of one.
+    pub(crate) fn section(&self) -> Option<&str> {
+        self.section.as_deref()
+    }
+
     pub(crate) fn has_sky(&self) -> bool {
         let projection = self.map.as_ref().map(|map| &map.projection);
         matches!(projection, Some(Projection::Zenithal { .. }))
@@ -285,7 +295,11 @@ mod tests {
                 "A_ORDER = 2\nB_ORDER = 2\nPV1_1 = 1\nPV1_7 = 2",
                 "PV1_1, PV1_7 of the WCS are not used",
             ),
-            (tan, "PV2_1 = 1.01", "PV2_1, whose"),
+            (
+                tan,
+                "PV2_1 = 1.01",
+                "PV2_1 of the WCS are not used, because its projection",
+            ),
             (
                 tan,
                 "CPDIS1 = 'Lookup'\nD2IMDIS2 = 'Lookup'\nCPERR1 = 0.073",
@@ -300,7 +314,7 @@ mod tests {
             (
                 "",
                 "CTYPE1 = 'RA---TAN'\nCDELT1 = -1e-4\nCDELT2 = 1e-4\nCROTA1 = 30",
-                "CROTA1, whose",
+                "CROTA1 without CROTA2",
             ),
             (
                 "",

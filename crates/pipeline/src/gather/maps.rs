@@ -100,8 +100,9 @@ fn is_outside(at: usize, side: usize) -> bool {
     x.hypot(y) > radius
 }
 
-// Makes the pixels of a stamp missing whose `mask` is not zero, or has one of these bits.
-pub(crate) fn lose(pixels: &mut [f32], mask: &[f64], bits: Option<u64>) -> Result<(), String> {
+// Makes the pixels of a stamp missing whose `mask` is not zero, or has one of these bits. Returns their number.
+pub(crate) fn lose(pixels: &mut [f32], mask: &[f64], bits: Option<u64>) -> Result<usize, String> {
+    let mut lost = 0;
     for (pixel, mask) in pixels.iter_mut().zip(mask) {
         let bad = match bits {
             Some(bits) if mask.is_finite() => {
@@ -116,10 +117,11 @@ pub(crate) fn lose(pixels: &mut [f32], mask: &[f64], bits: Option<u64>) -> Resul
             _ => *mask != 0.0,
         };
         if bad {
+            lost += usize::from(!pixel.is_nan());
             *pixel = f32::NAN;
         }
     }
-    Ok(())
+    Ok(lost)
 }
 
 #[cfg(test)]

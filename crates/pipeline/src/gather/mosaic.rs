@@ -19,6 +19,9 @@ pub(super) struct StampWriter {
     pub(super) image: Rows,
     pub(super) examination: Examination,
     pub(super) incomplete: usize,
+    /// Pixels that masks made missing, of those of all stamps.
+    masked: usize,
+    pixels: usize,
     examined: Vec<usize>,
     pub(super) origins: Origins,
     // At the galaxies, if a map gives them; NaN for stamps without pixels.
@@ -49,6 +52,8 @@ impl StampWriter {
             examination: Examination::new(mosaic.stamp, examined.len() * mosaic.columns)
                 .behind(psfs),
             incomplete: 0,
+            masked: 0,
+            pixels: 0,
             examined,
             origins: Origins::default(),
             levels: None,
@@ -93,7 +98,8 @@ impl StampWriter {
                 match content {
                     Content::Mask => {
                         let bits = gathering.masks.and_then(|masks| masks.bits);
-                        lose(&mut pixels, &values, bits).map_err(|fault| place.fault(&fault))?;
+                        let lost = lose(&mut pixels, &values, bits);
+                        self.masked += lost.map_err(|fault| place.fault(&fault))?;
                     }
                     _ => variances = Some((place, content, values)),
                 }
@@ -137,7 +143,8 @@ impl StampWriter {
             let mut pixels = exposure.square::<f32>((x, y), side)?;
             if let Some(mask) = &mut masks {
                 let square = mask.square::<f64>((x, y), side)?;
-                lose(&mut pixels, &square, bits).map_err(|fault| mask.origin.fault(&fault))?;
+                let lost = lose(&mut pixels, &square, bits);
+                self.masked += lost.map_err(|fault| mask.origin.fault(&fault))?;
             }
             if let Some(map) = &mut maps {
                 let mut values = map.square::<f64>((x, y), side)?;
@@ -158,9 +165,24 @@ impl StampWriter {
         Ok(())
     }
 
+    /// A warning if masks leave less than half of the pixels, as those that are one for good pixels.
+    pub(super) fn masked_line(&self, gathering: &Gathering<'_>) -> Option<String> {
+        let masks = gathering.masks.filter(|_| 2 * self.masked > self.pixels)?;
+        let share = 100.0 * self.masked as f64 / self.pixels as f64;
+        let remedy = match masks.bits {
+            Some(_) => "check --mask-bits",
+            None => "invert the mask if it is one for good pixels, or choose bits with --mask-bits",
+        };
+        Some(format!(
+            "warning: {}: the mask has bad pixels on {share:.1} % of the stamps (not zero; expected few). Try: {remedy}",
+            masks.files.paths[0].display()
+        ))
+    }
+
     fn add(&mut self, origin: &Origin<'_>, pixels: &[f32]) -> Result<(), FileError> {
         let (mosaic, next) = (self.image.mosaic, self.image.next);
         let side = mosaic.stamp;
+        self.pixels += pixels.len();
         self.incomplete += usize::from(pixels.iter().any(|value| !value.is_finite()));
         if self.examined.contains(&(next / mosaic.columns)) {
             let place = origin

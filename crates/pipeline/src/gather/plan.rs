@@ -23,6 +23,11 @@ use crate::wcs::{Wcs, aligned};
 const MAX_STAMPS: usize = MAX_ROWS;
 // Least pixels a side of a single stamp that looks like a mosaic or an exposure: four times the default stamp.
 const LARGE_STAMP_PX: usize = 192;
+// As --psf-oversampling.
+const MAX_OVERSAMPLING: f64 = 32.0;
+// Relative difference of pixel scales that are the same. Chosen by hand: detectors have distortions of some percent, and factors are
+// 2 or more.
+const MAX_SCALE_DIFFERENCE: f64 = 0.1;
 const SQUARE: &str =
     "--square crop, which takes the central square; --square pad, which adds missing pixels; or ";
 const MOSAIC: &str = "--exposure with --positions, which cuts stamps out of an exposure. A mosaic is read as DATA/set01/galaxies-001.fits, with `stamp = SIDE` in DATA/layout.toml";
@@ -240,6 +245,7 @@ impl Plan {
                 of_images: Vec::new(),
                 differs: None,
                 fault_of_cube: None,
+                oversampling: None,
             },
             kept: vec![true; inside.len()],
             inside,
@@ -260,9 +266,23 @@ pub(super) struct Stack {
     pub(super) differs: Option<String>,
     /// What is wrong with the WCS of cubes.
     pub(super) fault_of_cube: Option<String>,
+    /// OVERSAMP of the first header, by which STPSF and WebbPSF state pixels of a PSF along a detector's.
+    oversampling: Option<f64>,
 }
 
 impl Stack {
+    /// The pixels of PSFs along a pixel of galaxies with this WCS that the header states, unless the pixel scales contradict it.
+    pub(super) fn oversampling_of(&self, galaxies: &Wcs) -> Option<usize> {
+        let stated = self
+            .oversampling
+            .filter(|stated| (2.0..=MAX_OVERSAMPLING).contains(stated) && stated.fract() == 0.0)?;
+        let scales = self.wcs.scale().zip(galaxies.scale());
+        let agrees = scales.is_none_or(|(psf, galaxies)| {
+            (stated * psf / galaxies - 1.0).abs() < MAX_SCALE_DIFFERENCE
+        });
+        agrees.then_some(stated as usize)
+    }
+
     /// Jacobians of the stamps.
     pub(super) fn pixels(&self) -> Vec<Option<Matrix2>> {
         let each = self.of_images.iter();
@@ -276,6 +296,7 @@ impl Stack {
     ) -> Result<(Self, Vec<String>), FileError> {
         let (mut count, mut first, mut messages) = (0usize, None, Vec::new());
         let (mut of_images, mut differs, mut fault_of_cube) = (Vec::new(), None, None);
+        let mut oversampling = None;
         let mut sides = [0; 2];
         let mut images = Images::of(files);
         while let Some((origin, image)) = images.next()? {
@@ -302,6 +323,8 @@ impl Stack {
             };
             let wcs = Wcs::of_header(image)?;
             if first.is_none() {
+                // Elsewhere the key may be a text.
+                oversampling = image.number("OVERSAMP").ok().flatten();
                 messages.extend(doubts(origin.file, &wcs));
                 messages.extend(image.is_asinh().then(|| asinh_line(origin.file)));
                 messages.extend(image.differs_from_datasum()?.then(|| sum_line(origin.file)));
@@ -348,6 +371,7 @@ impl Stack {
             of_images,
             differs,
             fault_of_cube,
+            oversampling,
         };
         Ok((stack, messages))
     }

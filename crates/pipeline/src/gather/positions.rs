@@ -23,6 +23,12 @@ const PIXEL_NAMES: [[&str; 2]; 6] = [
     ["x_image_dbl", "y_image_dbl"],
     ["xpsf_image", "ypsf_image"],
 ];
+// Names of columns of positions that count from 0, of photutils, in any case.
+const NAMES_FROM_ZERO: [[&str; 2]; 3] = [
+    ["xcentroid", "ycentroid"],
+    ["x_centroid", "y_centroid"],
+    ["x_fit", "y_fit"],
+];
 // Names of columns of identities, in any case, the best first.
 const ID_NAMES: [&str; 4] = ["id", "object_id", "source_id", "number"];
 // Names of columns of right ascension and declination in degrees, in any case.
@@ -239,8 +245,12 @@ impl Positions {
             };
             let (x, y) = self.all[0];
             let pixels = format!(
-                "(found ({x}, {y}) first, expected FITS pixels of {}, 1 to {width} and 1 to {height})",
-                exposure.display()
+                "(found ({x}, {y}) first, expected FITS pixels of {}, 1 to {width} and 1 to {height}{})",
+                exposure.display(),
+                match wcs.section() {
+                    Some(keys) => format!("; it is a section of a larger image, by {keys}"),
+                    None => String::new(),
+                }
             );
             let message = match (&self.sky, degrees) {
                 (Some([ra, dec]), _) if self.degrees => format!(
@@ -260,6 +270,12 @@ impl Positions {
         }
         self.check_sky(exposure, wcs, &inside)?;
         let mut doubts = Vec::new();
+        if let Some(keys) = wcs.section().filter(|_| !self.degrees) {
+            doubts.push(format!(
+                "note: {} is a section of a larger image, by {keys}: positions count from the first pixel of the section",
+                exposure.display()
+            ));
+        }
         if let Some((earlier, later)) = first {
             let (x, y) = self.all[later];
             doubts.push(format!(
@@ -605,6 +621,15 @@ fn known(
             return no_sky(&place.path, exposure, wcs);
         }
         return Ok([first, second].map(|name| (*name).clone()));
+    }
+    let from_zero = certain.iter().map(|name| (*name).clone());
+    let from_zero = pair_of(&NAMES_FROM_ZERO, &from_zero.collect::<Vec<_>>());
+    if let Some([x, y]) = from_zero.filter(|_| !degrees) {
+        let message = format!(
+            "the columns {x} and {y} of photutils count pixels from 0 (expected x and y, which count from 1)"
+        );
+        let hint = format!("--columns {x},{y} --first-pixel 0");
+        return Err(FileError::new(&place.path, message).hint(hint));
     }
     let (found, example) = match certain.as_slice() {
         [] if columns.unnamed.is_empty() => ("no column".into(), "X,Y"),

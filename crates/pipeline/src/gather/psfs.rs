@@ -67,6 +67,17 @@ pub(super) fn gather_psfs(
         return functional(data.psf_functional(id.set, id.image), table, mosaic);
     }
     let (stack, mut messages) = Stack::of(files, square)?;
+    let stated = stack.oversampling_of(&plan.stack.wcs);
+    let oversampling = match (gathering.psf_oversampling, stated) {
+        (None, Some(stated)) => {
+            messages.push(format!(
+                "note: {}: the PSF has {stated} × {stated} pixels for a pixel of the galaxies, as OVERSAMP of its header states. --psf-oversampling 1 ignores that",
+                files.paths[0].display()
+            ));
+            stated
+        }
+        _ => oversampling,
+    };
     let (count, fine) = (stack.count, stack.side);
     let side = fine / oversampling;
     // Headers of finer pixels state another scale.

@@ -24,6 +24,13 @@ const MIN_TPV_ONLY: usize = 5;
 const MIN_AREA_TO_SUM_OF_SQUARES: f64 = 1e-6;
 // Largest difference of CD from PC with CDELT in units of their size: what writers round.
 const MAX_MATRIX_DIFFERENCE: f64 = 1e-5;
+// Keys of the pixels of a larger image (IRAF), with their values of an image that is no section.
+const SECTION_KEYS: [(&str, f64); 4] = [
+    ("LTV1", 0.0),
+    ("LTV2", 0.0),
+    ("LTM1_1", 1.0),
+    ("LTM2_2", 1.0),
+];
 // Most keys that a message lists.
 const MAX_NAMED_KEYS: usize = 4;
 // Plausible scales in arcseconds. Headers without a sky have scales such as 1 degree per pixel.
@@ -95,6 +102,17 @@ impl Keys {
         is_there.then(|| [0, 1].map(|i| [0, 1].map(|j| found[i][j].unwrap_or(absent(i, j)))))
     }
 
+    /// The keys that state where the image is in a larger one.
+    fn section(&self) -> Option<String> {
+        let keys = SECTION_KEYS.into_iter().filter_map(|(key, own)| {
+            // Text or NaN are no place.
+            let value = self.values.get(key)?.parse::<f64>().ok()?;
+            (value.is_finite() && value != own).then(|| format!("{key} = {value}"))
+        });
+        let keys: Vec<String> = keys.collect();
+        (!keys.is_empty()).then(|| names_of(&keys))
+    }
+
     /// Keys of rotations and distortions that are not used, although they are not zero.
     fn unused(&self) -> Vec<String> {
         let used = self.used.borrow();
@@ -115,9 +133,22 @@ impl Keys {
             }
             few => names_of(few),
         };
-        if has_sip && unused.iter().all(|key| key.starts_with("PV")) {
+        let all = |start: &str| unused.iter().all(|key| key.starts_with(start));
+        if has_sip && all("PV") {
             return Some(format!(
                 "{named} of the WCS are not used, because the header states the distortion by SIP, too"
+            ));
+        }
+        if all("PV") {
+            return Some(format!(
+                "{named} of the WCS are not used, because its projection has no such parameters (found {}, expected TPV for distortions of SCAMP). Try: {} for both CTYPE if they are such distortions",
+                self.text("CTYPE1"),
+                "RA---TPV and DEC--TPV"
+            ));
+        }
+        if all("CROTA") {
+            return Some(format!(
+                "the WCS has {named} without CROTA2 (expected the rotation in CROTA2, which the standard prescribes), and is read without a rotation. Try: CROTA2, or CD1_1 to CD2_2"
             ));
         }
         // Tables state their largest displacement.
@@ -173,11 +204,16 @@ pub(crate) struct Wcs {
     pub(super) damage: Option<String>,
     /// What of the header is used against its name, or not used.
     pub(super) doubts: Vec<String>,
+    /// Keys that state where the image is in a larger one.
+    pub(super) section: Option<String>,
 }
 
 impl Wcs {
     pub(crate) fn of_keys(keys: &Keys) -> Self {
-        let wcs = Wcs::of_readable(keys);
+        let wcs = Wcs {
+            section: keys.section(),
+            ..Wcs::of_readable(keys)
+        };
         let unreadable = keys.unreadable.borrow().clone();
         // Without this key, the others would place galaxies elsewhere on the sky.
         match unreadable {
@@ -193,6 +229,7 @@ impl Wcs {
         Wcs {
             scale: self.scale,
             damage: Some(damage),
+            section: self.section,
             ..Wcs::default()
         }
     }
@@ -288,6 +325,7 @@ impl Wcs {
                     true => Vec::new(),
                     false => keys.unused_text(false).into_iter().collect(),
                 },
+                section: None,
             };
         };
         let degrees = |row: [f64; 2]| row.map(|value| value / 3600.0);
@@ -334,6 +372,7 @@ impl Wcs {
             unread: None,
             damage: None,
             doubts,
+            section: None,
         }
     }
 }
