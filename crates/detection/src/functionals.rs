@@ -266,21 +266,18 @@ impl Functionals {
         let inverse = inverse_transfer(star, &transform);
         let n = transform.side;
         let norm = 1.0 / (n * n) as f64;
-        let filters = || {
-            let waves = transform.waves().zip(&inverse);
-            waves.map(|(k, inverse)| {
-                let filters = Wave::new(k, pixels).all(lengths, pixels);
-                filters.map(|own| own.map(|filter| filter * inverse))
-            })
-        };
+        let filters = transform
+            .waves()
+            .map(|k| Wave::new(k, pixels).all(lengths, pixels));
+        let filters: Vec<[[Complex64; 3]; COUNT]> = filters.collect();
         let mut kernels = vec![[0.0f32; KERNELS]; side * side];
         let mut plane = vec![Complex64::default(); n * n];
         let mut out = plane.clone();
         let mut scratch = vec![Complex64::default(); transform.scratch()];
         for kernel in 0..KERNELS {
             // The image at an offset d from the pixel enters with exp(−ik·d): the inverse transform at −d.
-            for (value, filters) in plane.iter_mut().zip(filters()) {
-                *value = filters[kernel % COUNT][kernel / COUNT].conj();
+            for ((value, filters), inverse) in plane.iter_mut().zip(&filters).zip(&inverse) {
+                *value = (filters[kernel % COUNT][kernel / COUNT] * inverse).conj();
             }
             transform.inverse(&mut plane, &mut out, &mut scratch);
             for (at, weights) in kernels.iter_mut().enumerate() {
@@ -297,8 +294,9 @@ impl Functionals {
             let (power, _) = noise.power(k, PixelShape::SQUARE);
             norm * noise.sigma().powi(2) * power
         };
-        for (filters, k) in filters().zip(transform.waves()) {
+        for ((filters, inverse), k) in filters.iter().zip(&inverse).zip(transform.waves()) {
             let power = power(k);
+            let filters = filters.map(|own| own.map(|filter| filter * inverse));
             for a in 0..COUNT {
                 for b in 0..COUNT {
                     let product = |k: usize| power * (filters[a][k] * filters[b][0].conj()).re;
@@ -310,8 +308,7 @@ impl Functionals {
             }
         }
         let turned = inverse_transfer(turned(star).view(), &transform);
-        for (k, inverse) in transform.waves().zip(turned) {
-            let filters = Wave::new(k, pixels).all(lengths, pixels);
+        for ((filters, inverse), k) in filters.iter().zip(turned).zip(transform.waves()) {
             let power = power([k[1], -k[0]]) * inverse.norm_sqr();
             for a in 0..COUNT {
                 for b in 0..COUNT {

@@ -25,6 +25,7 @@ mod functionals;
 mod groups;
 mod pixel;
 #[cfg(test)]
+#[path = "../../measure/src/testing.rs"]
 mod testing;
 mod weight;
 

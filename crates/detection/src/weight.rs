@@ -78,17 +78,18 @@ mod tests {
     use super::*;
     use crate::testing::close;
 
+    const STEPS: Steps = Steps {
+        threshold: 7.0,
+        threshold_half_width: 2.0,
+        neighbour_half_width: 0.8,
+        neighbour_share: 0.15,
+        softening: 9.0,
+    };
+
     #[test]
     fn derivatives_are_those_of_differences() {
-        let steps = Steps {
-            threshold: 7.0,
-            threshold_half_width: 2.0,
-            neighbour_half_width: 0.8,
-            neighbour_share: 0.15,
-            softening: 9.0,
-        };
         let u = [7.4, 0.3, -0.6, 1.1, -0.2, 11.0, 1.3, -2.1];
-        let value = |u: &Values, k: usize| steps.weighted(u).unwrap().1[k].value;
+        let value = |u: &Values, k: usize| STEPS.weighted(u).unwrap().1[k].value;
         let moved = |a: usize, h: f64, mut u: Values| {
             u[a] += h;
             u
@@ -96,13 +97,13 @@ mod tests {
         // Differences have errors of h² times third derivatives, below 3.
         let h = 1e-4;
         for k in 0..2 {
-            let found = steps.weighted(&u).unwrap().1[k];
+            let found = STEPS.weighted(&u).unwrap().1[k];
             for a in 0..COUNT {
                 let [up, down] = [h, -h].map(|h| moved(a, h, u));
                 let slope = (value(&up, k) - value(&down, k)) / (2.0 * h);
                 close(found.first[a], slope, 1e-7);
                 for b in 0..COUNT {
-                    let [up, down] = [up, down].map(|u| steps.weighted(&u).unwrap().1[k].first[b]);
+                    let [up, down] = [up, down].map(|u| STEPS.weighted(&u).unwrap().1[k].first[b]);
                     close(found.second[a][b], (up - down) / (2.0 * h), 1e-7);
                 }
             }
@@ -111,18 +112,11 @@ mod tests {
 
     #[test]
     fn a_pixel_without_weight_may_not_count() {
-        let steps = Steps {
-            threshold: 7.0,
-            threshold_half_width: 2.0,
-            neighbour_half_width: 0.8,
-            neighbour_share: 0.15,
-            softening: 9.0,
-        };
         for light in [4.9, 5.1, 7.0, 30.0] {
             for excess in [-6.0, -2.1, -1.6, -0.5, 3.0] {
                 let u = [light, excess, 1.0, 1.0, 1.0, 5.0, 0.0, 0.0];
-                let counts = steps.may_count(light, [1, 2, 3, 4].map(|j| light - u[j]), 0.0);
-                assert_eq!(counts, steps.weight(&u).is_some(), "{light} {excess}");
+                let counts = STEPS.may_count(light, [1, 2, 3, 4].map(|j| light - u[j]), 0.0);
+                assert_eq!(counts, STEPS.weight(&u).is_some(), "{light} {excess}");
             }
         }
     }

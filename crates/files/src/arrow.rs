@@ -5,6 +5,7 @@
 
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
+use std::ops::Range;
 use std::path::Path;
 
 use polars::prelude::{ArrowDataType, ArrowField, DataFrame, NamedFrom, Series};
@@ -17,7 +18,9 @@ use polars_arrow_format::ipc::planus::ReadAsRoot;
 use polars_arrow_format::ipc::{Block, MessageHeaderRef, MessageRef, RecordBatchRef};
 
 use crate::FileError;
-use crate::fields::{Wanted, decoded, decoded_type, guarded, names, pick, with_missing};
+use crate::fields::{
+    Wanted, decoded, decoded_type, guarded, names, numbers_alone, pick, with_missing,
+};
 use crate::frames::{Metadata, frame};
 use crate::open;
 
@@ -34,10 +37,7 @@ pub(crate) fn read(
     most_rows: usize,
 ) -> Result<DataFrame, FileError> {
     let mut source = Source::open(path)?;
-    let fields = match wanted {
-        None => source.fields.iter().cloned().map(Wanted::whole).collect(),
-        Some(names) => pick(path, &source.fields, names)?,
-    };
+    let fields = pick(path, &source.fields, wanted)?;
     let rows = source.rows()?.iter().sum::<usize>();
     if rows > most_rows {
         let message = format!("found {rows} rows, expected at most {most_rows}");
@@ -56,7 +56,7 @@ pub(crate) fn read(
     })?;
     let mut all = all.unwrap_or_default();
     all.rechunk_mut();
-    crate::parquet::numbers_alone(path, all, wanted.is_some())
+    numbers_alone(path, all, wanted.is_some())
 }
 
 /// Reads the columns `wanted` by record batch, and gives each batch to `take`.
@@ -67,7 +67,7 @@ pub(crate) fn read_batches(
     take: impl FnMut(DataFrame) -> Result<(), FileError>,
 ) -> Result<(), FileError> {
     let mut source = Source::open(path)?;
-    let fields = pick(path, &source.fields, wanted)?;
+    let fields = pick(path, &source.fields, Some(wanted))?;
     if let Some(rows) = source.rows()?.iter().find(|rows| **rows > most_rows) {
         let detail = format!("found a record batch of {rows} rows, expected at most {most_rows}");
         return Err(damaged(path, detail));
@@ -297,29 +297,30 @@ fn downcast<A: 'static>(array: &dyn Array) -> &A {
     own.expect("an array of its own type")
 }
 
+// The bytes of a part; `None` unless they are among the first `most`.
+fn part(start: i64, size: i64, most: u64) -> Option<Range<u64>> {
+    let start = u64::try_from(start).ok()?;
+    let end = start.checked_add(u64::try_from(size).ok()?)?;
+    (end <= most).then_some(start..end)
+}
+
 // The number of rows of a record batch or dictionary, if the file has all of its buffers and none of them asks for more memory
 // than its bytes can have compressed.
 fn check_block(file: &mut File, length: u64, block: &Block) -> Result<usize, String> {
-    let place = u64::try_from(block.offset).ok();
-    let size = u64::try_from(block.meta_data_length).ok();
-    let body = place
-        .zip(size)
-        .and_then(|(start, size)| start.checked_add(size));
-    let body_length = u64::try_from(block.body_length).ok();
-    let end = body
-        .zip(body_length)
-        .and_then(|(body, length)| body.checked_add(length));
-    let (Some(start), Some(size), Some(body), Some(_)) =
-        (place, size, body, end.filter(|end| *end <= length))
-    else {
+    let head = part(block.offset, block.meta_data_length.into(), length);
+    let body = head.clone().and_then(|head| {
+        let start = i64::try_from(head.end).ok()?;
+        part(start, block.body_length, length)
+    });
+    let (Some(head), Some(body)) = (head, body) else {
         return Err(format!(
             "found bytes from {}, {} and {} of them, expected a part of the file's {length} bytes",
             block.offset, block.meta_data_length, block.body_length
         ));
     };
     let failed = |error: std::io::Error| error.to_string();
-    let mut message = vec![0; size as usize];
-    file.seek(SeekFrom::Start(start)).map_err(failed)?;
+    let mut message = vec![0; (head.end - head.start) as usize];
+    file.seek(SeekFrom::Start(head.start)).map_err(failed)?;
     file.read_exact(&mut message).map_err(failed)?;
     // The mark of a continued message, and its length.
     let start = if message.starts_with(&[0xff; 4]) {
@@ -338,13 +339,7 @@ fn check_block(file: &mut File, length: u64, block: &Block) -> Result<usize, Str
     let batch: RecordBatchRef<'_> = batch.ok_or("found another message")?;
     let is_compressed = batch.compression().map_err(faulty)?.is_some();
     for buffer in batch.buffers().map_err(faulty)?.into_iter().flatten() {
-        let [place, size] = [buffer.offset(), buffer.length()].map(|own| u64::try_from(own).ok());
-        let end = place
-            .zip(size)
-            .and_then(|(place, size)| place.checked_add(size));
-        let (Some(place), Some(size), Some(_)) =
-            (place, size, end.filter(|end| Some(*end) <= body_length))
-        else {
+        let Some(own) = part(buffer.offset(), buffer.length(), body.end - body.start) else {
             return Err(format!(
                 "found a buffer of {} bytes from {}, expected a part of {} bytes",
                 buffer.length(),
@@ -352,9 +347,11 @@ fn check_block(file: &mut File, length: u64, block: &Block) -> Result<usize, Str
                 block.body_length
             ));
         };
+        let size = own.end - own.start;
         if is_compressed && size > 0 {
             let mut stated = [0; 8];
-            file.seek(SeekFrom::Start(body + place)).map_err(failed)?;
+            file.seek(SeekFrom::Start(body.start + own.start))
+                .map_err(failed)?;
             file.read_exact(&mut stated).map_err(failed)?;
             let stated = i64::from_le_bytes(stated);
             let most = MAX_BUFFER.min(MAX_EXPANSION * size);

@@ -6,8 +6,8 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 
 use polars::prelude::{
-    ArrowDataType, ArrowField, ChunkFillNullValue, ChunkedArray, Column, DataType, IntoSeries,
-    NamedFrom, PolarsNumericType, PolarsResult, Series,
+    ArrowDataType, ArrowField, ChunkFillNullValue, ChunkedArray, Column, DataFrame, DataType,
+    IntoSeries, NamedFrom, PolarsNumericType, PolarsResult, Series,
 };
 
 use crate::FileError;
@@ -83,12 +83,15 @@ pub(crate) fn names(fields: &[ArrowField]) -> Vec<String> {
     fields.iter().flat_map(names_in).collect()
 }
 
-/// The columns called `wanted` of a file with these fields.
+/// The columns called `wanted` of a file with these fields; all of them, if `None`.
 pub(crate) fn pick(
     path: &Path,
     fields: &[ArrowField],
-    wanted: &[&str],
+    wanted: Option<&[&str]>,
 ) -> Result<Vec<Wanted>, FileError> {
+    let Some(wanted) = wanted else {
+        return Ok(fields.iter().cloned().map(Wanted::whole).collect());
+    };
     let mut seen = BTreeSet::new();
     wanted
         .iter()
@@ -201,6 +204,22 @@ fn decoded_vector(declared: &ArrowDataType) -> Option<ArrowDataType> {
         }
         _ => None,
     }
+}
+
+/// A table without its columns of text, which are refused if they are wanted.
+pub(crate) fn numbers_alone(
+    path: &Path,
+    table: DataFrame,
+    is_wanted: bool,
+) -> Result<DataFrame, FileError> {
+    let columns = table.columns().iter();
+    let texts = columns.filter(|column| column.dtype().is_string());
+    let texts: Vec<String> = texts.map(|column| column.name().to_string()).collect();
+    if let Some(name) = texts.first().filter(|_| is_wanted) {
+        let message = format!("column `{name}` holds text; expected numbers");
+        return Err(FileError::new(path, message));
+    }
+    Ok(table.drop_many(texts))
 }
 
 /// The column, in which missing floats are NaN.

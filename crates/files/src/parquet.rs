@@ -33,7 +33,7 @@ use serde_json::{Map, Value, json};
 
 use crate::FileError;
 use crate::fields::{
-    MAX_VECTOR, Wanted, decoded, decoded_type, guarded, names, pick, with_missing,
+    MAX_VECTOR, Wanted, decoded, decoded_type, guarded, names, numbers_alone, pick, with_missing,
 };
 use crate::frames::{Metadata, element_name, frame};
 use crate::open;
@@ -194,11 +194,7 @@ pub fn read(
 ) -> Result<DataFrame, FileError> {
     let path = path.as_ref();
     let mut source = Source::open(path)?;
-    let wanted_all = |fields: &[ArrowField]| fields.iter().cloned().map(Wanted::whole).collect();
-    let fields = match wanted {
-        None => wanted_all(&source.fields),
-        Some(names) => pick(path, &source.fields, names)?,
-    };
+    let fields = pick(path, &source.fields, wanted)?;
     source.check_rows(most_rows)?;
     let columns = fields.iter().map(|field| source.read_column(field));
     let columns = columns.collect::<Result<_, FileError>>()?;
@@ -215,22 +211,6 @@ pub(crate) fn read_numbers(
     numbers_alone(path, table, wanted.is_some())
 }
 
-/// A table without its columns of text, which are refused if they are wanted.
-pub(crate) fn numbers_alone(
-    path: &Path,
-    table: DataFrame,
-    is_wanted: bool,
-) -> Result<DataFrame, FileError> {
-    let columns = table.columns().iter();
-    let texts = columns.filter(|column| column.dtype().is_string());
-    let texts: Vec<String> = texts.map(|column| column.name().to_string()).collect();
-    if let Some(name) = texts.first().filter(|_| is_wanted) {
-        let message = format!("column `{name}` holds text; expected numbers");
-        return Err(FileError::new(path, message));
-    }
-    Ok(table.drop_many(texts))
-}
-
 /// Reads the columns `wanted` by row groups of at most `most_rows` rows, and gives each group to `take`.
 pub(crate) fn read_groups(
     path: &Path,
@@ -239,7 +219,7 @@ pub(crate) fn read_groups(
     mut take: impl FnMut(DataFrame) -> Result<(), FileError>,
 ) -> Result<(), FileError> {
     let mut source = Source::open(path)?;
-    let fields = pick(path, &source.fields, wanted)?;
+    let fields = pick(path, &source.fields, Some(wanted))?;
     let fields: Vec<Wanted> = fields
         .iter()
         .map(|field| decoded(path, field))

@@ -19,9 +19,8 @@ pub(super) struct StampWriter {
     pub(super) image: Rows,
     pub(super) examination: Examination,
     pub(super) incomplete: usize,
-    /// Pixels that masks made missing, of those of all stamps.
+    /// Pixels that masks made missing.
     masked: usize,
-    pixels: usize,
     examined: Vec<usize>,
     pub(super) origins: Origins,
     // At the galaxies, if a map gives them; NaN for stamps without pixels.
@@ -53,7 +52,6 @@ impl StampWriter {
                 .behind(psfs),
             incomplete: 0,
             masked: 0,
-            pixels: 0,
             examined,
             origins: Origins::default(),
             levels: None,
@@ -167,8 +165,9 @@ impl StampWriter {
 
     /// A warning if masks leave less than half of the pixels, as those that are one for good pixels.
     pub(super) fn masked_line(&self, gathering: &Gathering<'_>) -> Option<String> {
-        let masks = gathering.masks.filter(|_| 2 * self.masked > self.pixels)?;
-        let share = 100.0 * self.masked as f64 / self.pixels as f64;
+        let pixels = self.image.next * self.image.mosaic.stamp.pow(2);
+        let masks = gathering.masks.filter(|_| 2 * self.masked > pixels)?;
+        let share = 100.0 * self.masked as f64 / pixels as f64;
         let remedy = match masks.bits {
             Some(_) => "check --mask-bits",
             None => "invert the mask if it is one for good pixels, or choose bits with --mask-bits",
@@ -182,7 +181,6 @@ impl StampWriter {
     fn add(&mut self, origin: &Origin<'_>, pixels: &[f32]) -> Result<(), FileError> {
         let (mosaic, next) = (self.image.mosaic, self.image.next);
         let side = mosaic.stamp;
-        self.pixels += pixels.len();
         self.incomplete += usize::from(pixels.iter().any(|value| !value.is_finite()));
         if self.examined.contains(&(next / mosaic.columns)) {
             let place = origin
