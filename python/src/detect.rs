@@ -6,13 +6,14 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use shearq_detection::Detector;
+use shearq_measure::parts::ExposureDefects;
 use shearq_measure::{DetectionMethod, Jacobian, StampNoise};
-use shearq_pipeline::detect::{COLUMNS, PLACE, WHOLE, detect_rows};
+use shearq_pipeline::detect::{COLUMNS, PLACE, WHOLE, detect_rows, doubts, sky_level};
 
 use crate::errors::{of_measuring, of_pipeline};
 use crate::work::threads;
 
-/// The columns of the detections on an image (ny, nx), NaN where pixels are missing.
+/// The columns of the detections on an image (ny, nx), NaN where pixels are missing, and what is doubtful about it.
 #[pyfunction]
 pub(crate) fn detect<'py>(
     py: Python<'py>,
@@ -22,7 +23,7 @@ pub(crate) fn detect<'py>(
     threshold: f64,
     jacobian: Option<[[f64; 2]; 2]>,
     threads_asked: Option<u16>,
-) -> PyResult<Bound<'py, PyDict>> {
+) -> PyResult<(Bound<'py, PyDict>, Vec<String>)> {
     let settings = DetectionMethod {
         threshold,
         ..DetectionMethod::default()
@@ -33,8 +34,10 @@ pub(crate) fn detect<'py>(
     })?;
     let jacobian = jacobian.map(Jacobian::new).transpose();
     let jacobian = jacobian.map_err(|error| PyValueError::new_err(format!("wcs: {error}")))?;
+    let star = star.as_array();
+    let defects = ExposureDefects::new((&star / star.sum()).view(), noise);
     let detector = Detector::new(
-        star.as_array(),
+        star,
         &StampNoise::white(noise),
         jacobian.as_ref(),
         &settings,
@@ -43,16 +46,22 @@ pub(crate) fn detect<'py>(
     let image = image.as_array();
     let (height, width) = image.dim();
     let found = py.detach(|| {
-        detect_rows(threads(threads_asked), &detector, [width, height], || {
-            let mut next = 0;
-            Ok(move |rows: usize| {
-                let part = image.slice(s![next..next + rows, ..]);
-                next += rows;
-                Ok(part.iter().copied().collect())
-            })
-        })
+        detect_rows(
+            threads(threads_asked),
+            &detector,
+            &defects,
+            [width, height],
+            || {
+                let mut next = 0;
+                Ok(move |rows: usize| {
+                    let part = image.slice(s![next..next + rows, ..]);
+                    next += rows;
+                    Ok(part.iter().copied().collect())
+                })
+            },
+        )
     });
-    let found = found.map_err(of_pipeline)?;
+    let (found, unlit) = found.map_err(of_pipeline)?;
     let columns = PyDict::new(py);
     for (name, of) in PLACE.iter().chain(&COLUMNS) {
         let values: Vec<f64> = found.iter().map(of).collect();
@@ -62,5 +71,10 @@ pub(crate) fn detect<'py>(
         let values: Vec<i32> = found.iter().map(|own| of(own) as i32).collect();
         columns.set_item(name, values.into_pyarray(py))?;
     }
-    Ok(columns)
+    let level = sky_level(image.iter().copied());
+    let mut doubts = doubts(star, level, noise, None);
+    doubts.extend((unlit > 0).then(|| {
+        format!("{unlit} pixels hold no light (expected a mask for cosmic rays and defects). They count as missing")
+    }));
+    Ok((columns, doubts))
 }

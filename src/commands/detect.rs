@@ -116,17 +116,31 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         is_measured,
         frame,
         missing,
+        unlit,
+        doubts,
     } = task.write_catalogue(&run, out, id, threads)?;
+    for doubt in &doubts {
+        tell(format_args!("warning: {doubt}."));
+    }
     let path = run.catalogue(out, id.set, id.image);
     tell(format_args!(
-        "{} in {:.1} s, none within {margin} px of edges and missing pixels ({missing}); {}",
+        "{} in {:.1} s, none within {margin} px of edges and of the {missing} missing pixels; {}",
         count(detections, "detection"),
         start.elapsed().as_secs_f64(),
         path.display()
     ));
-    if is_measured {
-        tell(format_args!("noise: σ = {noise:.4}, measured"));
+    if unlit > 0 {
+        tell(format_args!(
+            "warning: {} no light (expected a mask for cosmic rays and defects). They count as missing.",
+            if unlit == 1 {
+                "1 pixel holds".into()
+            } else {
+                format!("{unlit} pixels hold")
+            }
+        ));
     }
+    let source = if is_measured { "measured" } else { "given" };
+    tell(format_args!("noise: σ = {noise:.4}, {source}"));
     if frame == Frame::Sky {
         tell(format_args!(
             "frame: sky (e1 > 0 along east–west, e2 > 0 along north-west)"
@@ -139,7 +153,11 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
             "weight": weight,
             "margin": margin,
             "noise": noise,
+            "noise_is_measured": is_measured,
+            "frame": frame.to_string(),
             "missing": missing,
+            "unlit": unlit,
+            "warnings": doubts,
         })
     })
 }

@@ -2,7 +2,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 
-use crate::arguments::{SummaryArguments, named};
+use crate::arguments::{SummaryArguments, listed, named};
 use crate::{count, tell};
 use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::{DataFolder, MAX_IMAGE, MAX_SET};
@@ -25,8 +25,9 @@ use shearq_quantities::Frame;
 /// The PSF is one star stamp for all galaxies, one per galaxy in the same order, or a model by PSFEx or Piff. It may also be a table of
 /// functional PSFs (x,y,profile,beta,fwhm,e1,e2; docs/files.md), whose positions are not used. Width, noise and pixel scale of
 /// stamps and PSFs are compared. A table next to the image lists
-/// the stamps in the order of the catalogues.
-#[derive(Debug, Args)]
+/// the stamps in the order of the catalogues. In lists of files, `@FILE` stands for the lines of a file, and a quoted name with `*` or `?`
+/// for all that it matches.
+#[derive(Debug, Clone, Args)]
 pub(crate) struct Arguments {
     /// FITS files of stamps, in the order of the galaxies.
     #[arg(long, value_name = "FILE", num_args = 1.., required_unless_present = "exposure", conflicts_with_all = ["exposure", "chips", "first_pixel", "columns", "degrees", "size"])]
@@ -131,7 +132,7 @@ pub(crate) struct Arguments {
 }
 
 // The options of stamps that are cut out of an exposure.
-#[derive(Debug, Args)]
+#[derive(Debug, Clone, Args)]
 #[group(requires_all = ["exposure", "positions"])]
 struct Cutouts {
     /// Coordinate of the centre of the first pixel: 1 for FITS and SExtractor, 0 for NumPy and sep.
@@ -200,6 +201,27 @@ impl Star {
 
 fn has_star(selection: &str) -> bool {
     selection.split(',').any(|part| part.trim() == "*")
+}
+
+impl Arguments {
+    /// With the files of `@LIST` and quoted patterns. `*` in brackets is a version of an image.
+    fn with_lists(&self) -> anyhow::Result<Self> {
+        let mut own = self.clone();
+        let lists = [
+            &mut own.stamps,
+            &mut own.exposure,
+            &mut own.mask,
+            &mut own.psf,
+            &mut own.variance,
+            &mut own.weight_map,
+        ];
+        for list in lists {
+            if !list.iter().any(|path| path.to_string_lossy().contains('[')) {
+                *list = listed(list)?;
+            }
+        }
+        Ok(own)
+    }
 }
 
 impl Exposed {
@@ -430,6 +452,7 @@ fn gathering<'a>(own: &'a Own<'a>) -> anyhow::Result<Gathering<'a>> {
 }
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
+    let arguments = &arguments.with_lists()?;
     let exposed = Exposed::all(arguments)?;
     let is_chip = arguments.chips || exposed.iter().any(|one| one.chip.is_some());
     let exposures = exposed.len().max(1);

@@ -79,4 +79,12 @@ fn what_an_exposure_lacks_is_said() {
         &format!("detect {scene} --noise 0"),
         "--noise is 0.0; expected a positive number",
     );
+    folder.refuses(
+        "detect --exposure empty/scene-001.fits --psf empty/scene-001.fits --out out",
+        "the PSF of 400 × 400 pixels; expected the stamp of a star",
+    );
+    folder.refuses(
+        "detect --exposure empty/psf.fits --psf empty/psf.fits --noise 1 --out out",
+        "expected more",
+    );
 }

@@ -11,17 +11,20 @@ pub const SHAPE_COLUMNS: [&str; 7] = ["e1", "e2", "flags", "R11", "R22", "R12", 
 /// The column with the weights of a selection that was applied, in catalogues of `select`.
 pub const WEIGHT: &str = "selection";
 
+/// The column of catalogues of detections with their number of pixels.
+const DETECTED_PIXELS: &str = "pixels";
+
 /// Whether shear changes a column.
 pub fn changes_with_shear(name: &str) -> bool {
     let of_shape = SHAPE_COLUMNS.contains(&name) && name != "flags";
     of_shape
         || Observables::COLUMNS.contains(&name)
-        || ["snr", "neighbour", "radius"].contains(&name)
+        || ["snr", "neighbour", "radius", DETECTED_PIXELS, WEIGHT].contains(&name)
 }
 
 /// Whether a column was measured on the stamps.
 pub fn is_measured(name: &str) -> bool {
-    const OTHERS: [&str; 8] = [
+    const OTHERS: [&str; 7] = [
         "flags",
         "iterations",
         "stop",
@@ -29,7 +32,6 @@ pub fn is_measured(name: &str) -> bool {
         "first_energy",
         "energy",
         "noise",
-        WEIGHT,
     ];
     changes_with_shear(name)
         || OTHERS.contains(&name)
@@ -50,6 +52,13 @@ pub fn refuse_divided(path: &Path, names: &[String]) -> Result<(), FileError> {
 pub fn require_responses(path: &Path, names: &[String]) -> Result<(), FileError> {
     refuse_divided(path, names)?;
     let has = |name: &str| names.iter().any(|own| own == name);
+    if has(WEIGHT) && has(DETECTED_PIXELS) {
+        return Err(FileError::new(
+            path,
+            "this catalogue is of detections, whose weights are in e and R: the response of a cut on it is not known (expected a catalogue of measure)",
+        )
+        .hint("detect with another --threshold"));
+    }
     if has(WEIGHT) {
         return Err(FileError::new(
             path,

@@ -8,7 +8,7 @@ use shearq_quantities::fourier::Complex64;
 use shearq_quantities::{Jacobian, PixelShape, Spin2};
 use shearq_submissions::DetectionMethod;
 
-use crate::functionals::{Functionals, KERNELS, Lengths, SquareTransform, light_filter};
+use crate::functionals::{Functionals, KERNELS, Lengths, SquareTransform, light_filters};
 use crate::pixel::DetectedPixel;
 use crate::weight::{COUNT, EXCESS, LIGHT, M00, NEIGHBOURS, Square, Steps, dot, trace};
 
@@ -17,6 +17,8 @@ use crate::weight::{COUNT, EXCESS, LIGHT, M00, NEIGHBOURS, Square, Steps, dot, t
 const KERNEL_SIGMAS: f64 = 6.5;
 // Two blocks of fewer margins lose most of their pixels.
 const MIN_MARGINS_PER_BLOCK: usize = 8;
+// Pixels a side of a star: more than PSF models have, and less than an exposure that is given in its place.
+const MAX_STAR: usize = 512;
 // Of a bound, in its standard deviations: what the Fourier transform and the sums over squares may differ by.
 const SLACK: f64 = 0.01;
 
@@ -34,7 +36,8 @@ pub struct Detector {
     /// The same, added to f.
     of_psf: Square,
     transform: SquareTransform,
-    light_filter: Vec<Complex64>,
+    /// That of v₀, and those of the neighbours if they are between pixels.
+    light_filters: Vec<Vec<Complex64>>,
     turn: Spin2,
 }
 
@@ -43,6 +46,8 @@ pub struct Detector {
 pub struct DetectionScratch {
     image: Vec<Complex64>,
     spectrum: Vec<Complex64>,
+    /// Smoothed light of both blocks, and that of the neighbours.
+    maps: Vec<Vec<Complex64>>,
     transform: Vec<Complex64>,
 }
 
@@ -59,7 +64,7 @@ impl Detector {
     /// Detections behind `star`, a stamp whose centre is that of the star, in noise. Ellipticities are those on the sky by `jacobian`, or along the pixel axes.
     ///
     /// # Errors
-    /// If the star has no light, or the noise level is not a positive number.
+    /// If the star has no light or is larger than a stamp, or the noise level is not a positive number.
     pub fn new(
         star: ArrayView2<'_, f64>,
         noise: &StampNoise,
@@ -68,6 +73,15 @@ impl Detector {
     ) -> Result<Self, MeasureError> {
         if !(noise.sigma() > 0.0 && noise.sigma().is_normal()) {
             return Err(MeasureError::Noise(noise.sigma().to_string()));
+        }
+        if !star.is_square() || star.nrows() > MAX_STAR {
+            return Err(MeasureError::Shape {
+                what: "the PSF",
+                found: format!("{} × {} pixels", star.ncols(), star.nrows()),
+                expected: format!(
+                    "a square stamp of a star, at most {MAX_STAR} pixels a side. Try: exchange exposure and PSF, or cut the star"
+                ),
+            });
         }
         let sum = star.sum();
         if !(sum > 0.0 && sum.is_finite()) {
@@ -92,7 +106,9 @@ impl Detector {
         };
         let reach = (KERNEL_SIGMAS * lengths.detection_sigma + lengths.distance as f64)
             .max(KERNEL_SIGMAS * lengths.moment_sigma);
-        let radius = reach.ceil() as usize;
+        // Circles on the sky are longer along one axis of the pixels.
+        let longest = pixels.stretch.max(1.0 / pixels.stretch) + pixels.skew.abs();
+        let radius = (longest * reach).ceil() as usize;
         let margin = radius + 1 + lengths.distance;
         let transform = SquareTransform::new((MIN_MARGINS_PER_BLOCK * margin).next_power_of_two());
         let functionals = Functionals::new(star.view(), noise, &lengths, pixels, radius);
@@ -116,7 +132,7 @@ impl Detector {
             softening: settings.softening * deviation(M00),
         };
         Ok(Detector {
-            light_filter: light_filter(star.view(), &lengths, pixels, &transform),
+            light_filters: light_filters(star.view(), &lengths, pixels, &transform),
             light_noise: deviation(LIGHT),
             functionals,
             radius,
@@ -135,6 +151,7 @@ impl Detector {
         DetectionScratch {
             image: vec![Complex64::default(); pixels],
             spectrum: vec![Complex64::default(); pixels],
+            maps: vec![vec![Complex64::default(); pixels]; self.light_filters.len()],
             transform: vec![Complex64::default(); self.transform.scratch()],
         }
     }
@@ -210,6 +227,7 @@ impl Detector {
         let DetectionScratch {
             image,
             spectrum,
+            maps,
             transform,
         } = scratch;
         for (at, value) in image.iter_mut().enumerate() {
@@ -217,29 +235,33 @@ impl Detector {
             *value = Complex64::new(known(values[at]), known(values[at + inner * side]));
         }
         self.transform.forward(image, spectrum, transform);
-        for (value, filter) in spectrum.iter_mut().zip(&self.light_filter) {
-            *value *= filter;
+        for (map, filter) in maps.iter_mut().zip(&self.light_filters) {
+            for ((to, value), filter) in image.iter_mut().zip(&*spectrum).zip(filter) {
+                *to = value * filter;
+            }
+            self.transform.inverse(image, map, transform);
         }
-        self.transform.inverse(spectrum, image, transform);
         let slack = SLACK * self.light_noise;
         let distance = self.lengths.distance;
         for y in outer..outer + 2 * inner {
             // The row in the map of its block.
             let is_lower = y >= outer + inner;
             let row = if is_lower { y - inner } else { y };
-            let light = |row: usize, x: usize| {
-                let value = image[row * side + x];
+            let of = |map: &[Complex64], row: usize, x: usize| {
+                let value = map[row * side + x];
                 if is_lower { value.im } else { value.re }
             };
+            let light = |row: usize, x: usize| of(&maps[0], row, x);
             for x in outer..outer + inner {
                 let own = light(row, x);
-                let neighbours = || {
-                    [
+                let neighbours = || match &maps[1..] {
+                    [a, b, c, d] => [a, b, c, d].map(|map| of(map, row, x)),
+                    _ => [
                         light(row, x + distance),
                         light(row, x - distance),
                         light(row + distance, x),
                         light(row - distance, x),
-                    ]
+                    ],
                 };
                 if own < self.steps.threshold - self.steps.threshold_half_width - slack
                     || !self.steps.may_count(own, neighbours(), slack)

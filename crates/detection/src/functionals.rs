@@ -22,7 +22,8 @@ pub(crate) struct Lengths {
 }
 
 impl Lengths {
-    /// Offsets (x, y) of the neighbours in pixels.
+    /// Offsets of the neighbours in the coordinates of [`PixelShape::map`], along which the sky has no other direction: on a lattice of
+    /// sheared pixels they would give round galaxies a mean shape.
     pub(crate) fn neighbours(&self) -> [[f64; 2]; NEIGHBOURS] {
         let d = self.distance as f64;
         [[d, 0.0], [-d, 0.0], [0.0, d], [0.0, -d]]
@@ -75,7 +76,7 @@ impl Wave {
     }
 
     /// The filters of all functionals, each with those of its changes.
-    fn all(&self, lengths: &Lengths, pixels: PixelShape) -> [[Complex64; 3]; COUNT] {
+    fn all(&self, lengths: &Lengths) -> [[Complex64; 3]; COUNT] {
         let one = Factor {
             value: 1.0,
             slopes: [0.0; 2],
@@ -92,7 +93,7 @@ impl Wave {
         let centre = self.filters(one, lengths.detection_sigma, [0.0; 2]);
         out[LIGHT] = centre;
         for (j, at) in lengths.neighbours().into_iter().enumerate() {
-            let beside = self.filters(one, lengths.detection_sigma, pixels.map(at));
+            let beside = self.filters(one, lengths.detection_sigma, at);
             out[EXCESS + j] = [0, 1, 2].map(|k| centre[k] - beside[k]);
         }
         out[M00] = self.filters(one, sigma, [0.0; 2]);
@@ -190,13 +191,14 @@ fn transpose(from: &[Complex64], to: &mut [Complex64], side: usize) {
 }
 
 /// One over the transform of a star of sum one about the centre of its stamp, at the modes of a transform; zero where the star has
-/// no power. The star may not be larger than the transform.
+/// no power.
 fn inverse_transfer(star: ArrayView2<'_, f64>, transform: &SquareTransform) -> Vec<Complex64> {
     let side = transform.side;
     let mut padded = vec![Complex64::default(); side * side];
     let sum = star.sum();
     for ((y, x), value) in star.indexed_iter() {
-        padded[y * side + x] = (value / sum).into();
+        // A star that is larger than the transform has the same values at its modes.
+        padded[y % side * side + x % side] += value / sum;
     }
     let mut out = vec![Complex64::default(); side * side];
     let mut scratch = vec![Complex64::default(); transform.scratch()];
@@ -213,20 +215,75 @@ fn inverse_transfer(star: ArrayView2<'_, f64>, transform: &SquareTransform) -> V
     out
 }
 
-/// The filter of v₀ at the modes of a transform, with the division by the number of pixels.
-pub(crate) fn light_filter(
+/// The filter of v₀ at the modes of a transform, with the division by the number of pixels. Those of its neighbours follow if pixels
+/// are not square; otherwise neighbours are pixels.
+pub(crate) fn light_filters(
     star: ArrayView2<'_, f64>,
     lengths: &Lengths,
     pixels: PixelShape,
     transform: &SquareTransform,
-) -> Vec<Complex64> {
+) -> Vec<Vec<Complex64>> {
     let pixels_inverse = 1.0 / (transform.side * transform.side) as f64;
     let mut filter = inverse_transfer(star, transform);
     for (value, k) in filter.iter_mut().zip(transform.waves()) {
-        let wave = Wave::new(k, pixels);
-        *value *= pixels_inverse * wave.all(lengths, pixels)[LIGHT][0];
+        *value *= pixels_inverse * Wave::new(k, pixels).all(lengths)[LIGHT][0];
     }
-    filter
+    let mut filters = vec![filter];
+    if !pixels.is_square() {
+        for [x, y] in lengths.neighbours() {
+            let waves = transform.waves().map(|k| Wave::new(k, pixels).k);
+            let moved = filters[0].iter().zip(waves);
+            let moved = moved.map(|(own, k)| own * Complex64::cis(k[0] * x + k[1] * y));
+            filters.push(moved.collect());
+        }
+    }
+    filters
+}
+
+/// For each mode, the wave vector in radians per pixel that is turned by 90 degrees on the sky, and one over the power of the star there;
+/// zero where it has none.
+fn turned_powers(
+    star: ArrayView2<'_, f64>,
+    pixels: PixelShape,
+    transform: &SquareTransform,
+) -> Vec<([f64; 2], f64)> {
+    if pixels.is_square() {
+        let inverse = inverse_transfer(turned(star).view(), transform);
+        let waves = transform.waves().map(|k| [k[1], -k[0]]);
+        return waves.zip(inverse.iter().map(Complex64::norm_sqr)).collect();
+    }
+    // Between the modes of a transform.
+    let sum = star.sum();
+    let power = |[kx, ky]: [f64; 2]| {
+        let phases = |k: f64, count: usize| -> Vec<Complex64> {
+            (0..count)
+                .map(|at| Complex64::cis(-k * at as f64))
+                .collect()
+        };
+        let (along, across) = (phases(kx, star.ncols()), phases(ky, star.nrows()));
+        let rows = star.rows().into_iter().zip(&across).map(|(row, phase)| {
+            let row = row.iter().zip(&along).map(|(value, phase)| phase * *value);
+            row.sum::<Complex64>() * phase
+        });
+        rows.sum::<Complex64>().norm() / sum
+    };
+    let turn = |k: [f64; 2]| {
+        let [kx, ky] = Wave::new(k, pixels).k;
+        let (kx, ky) = (ky, -kx);
+        [pixels.stretch * kx, pixels.skew * kx + ky / pixels.stretch]
+    };
+    let at = |k: [f64; 2]| {
+        let power = power(k);
+        (
+            k,
+            if power > MIN_TRANSFER {
+                power.powi(-2)
+            } else {
+                0.0
+            },
+        )
+    };
+    transform.waves().map(|k| at(turn(k))).collect()
 }
 
 /// The kernels of all functionals, and the covariances of their noise.
@@ -266,9 +323,7 @@ impl Functionals {
         let inverse = inverse_transfer(star, &transform);
         let n = transform.side;
         let norm = 1.0 / (n * n) as f64;
-        let filters = transform
-            .waves()
-            .map(|k| Wave::new(k, pixels).all(lengths, pixels));
+        let filters = transform.waves().map(|k| Wave::new(k, pixels).all(lengths));
         let filters: Vec<[[Complex64; 3]; COUNT]> = filters.collect();
         let mut kernels = vec![[0.0f32; KERNELS]; side * side];
         let mut plane = vec![Complex64::default(); n * n];
@@ -307,9 +362,8 @@ impl Functionals {
                 }
             }
         }
-        let turned = inverse_transfer(turned(star).view(), &transform);
-        for ((filters, inverse), k) in filters.iter().zip(turned).zip(transform.waves()) {
-            let power = power([k[1], -k[0]]) * inverse.norm_sqr();
+        for (filters, (k, inverse)) in filters.iter().zip(turned_powers(star, pixels, &transform)) {
+            let power = power(k) * inverse;
             for a in 0..COUNT {
                 for b in 0..COUNT {
                     covariances.turned[a][b] += power * (filters[a][0] * filters[b][0].conj()).re;
@@ -328,4 +382,35 @@ fn turned(star: ArrayView2<'_, f64>) -> Array2<f64> {
     let mut out = star.reversed_axes();
     out.invert_axis(ndarray::Axis(0));
     out.to_owned()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::close;
+
+    #[test]
+    fn powers_between_modes_are_those_at_them() {
+        let star = Array2::from_shape_fn((32, 32), |(y, x)| {
+            let [x, y] = [x as f64 - 15.5, y as f64 - 15.5];
+            (-0.5 * (x * x / 3.0 + y * y / 2.0 + 0.2 * x * y)).exp()
+        });
+        let transform = SquareTransform::new(64);
+        // Not square, by less than anything depends on.
+        let pixels = PixelShape {
+            stretch: 1.0 + 1e-6,
+            skew: 1e-6,
+        };
+        let at_modes = turned_powers(star.view(), PixelShape::SQUARE, &transform);
+        let between = turned_powers(star.view(), pixels, &transform);
+        for ((k, own), (other, found)) in at_modes.iter().zip(&between) {
+            let largest = k[0].abs().max(k[1].abs());
+            // Beyond it, powers are rounding.
+            if largest < 1.5 {
+                close(other[0], k[0], 1e-5);
+                close(other[1], k[1], 1e-5);
+                close(found / own, 1.0, 1e-4);
+            }
+        }
+    }
 }

@@ -57,6 +57,71 @@ const MAX_PASSES: usize = 8;
 // In pixels, of the border in which noise and level of the stamp are measured. Chosen by hand.
 const BORDER: usize = 4;
 
+// Pixels from a bright one within which its rings and spikes may be as steep as a defect: ten times the FWHM of well sampled PSFs. Chosen by hand.
+const NEAR: usize = 30;
+
+/// Finds defects of exposures behind one PSF, in noise of one level and without sky, with buffers for one thread.
+#[derive(Debug, Clone)]
+pub struct ExposureDefects {
+    defects: Defects,
+    limits: LightLimits,
+    noise: f32,
+}
+
+impl ExposureDefects {
+    /// For a PSF of sum one and noise of the standard deviation `noise`.
+    pub fn new(psf: ArrayView2<'_, f64>, noise: f64) -> Self {
+        ExposureDefects {
+            defects: Defects::default(),
+            limits: LightLimits::from_psf(psf),
+            noise: noise as f32,
+        }
+    }
+
+    /// Makes the pixels of a square part of an exposure, of `n` pixels a side, NaN that hold no light: areas of one value, and pixels that are
+    /// too dark or too bright for those around them. Appends their places to `found`.
+    pub fn remove(&mut self, part: &mut [f32], n: usize, found: &mut Vec<usize>) {
+        let limits = &self.limits;
+        let departure = MIN_DEPARTURE * self.noise;
+        let floor = departure * limits.noise[0];
+        let known = |part: &[f32]| part.iter().map(|value| value.is_finite()).collect();
+        let before: Vec<bool> = known(part);
+        self.defects
+            .remove_repeated(part, n, Screening::of(part, n));
+        remove_infinite(part);
+        for _ in 0..MAX_PASSES {
+            let places = &mut self.defects.places;
+            places.clear();
+            for (at, &value) in part.iter().enumerate() {
+                let is_dark = value < -departure;
+                if !is_dark && !(value > floor) {
+                    continue;
+                }
+                let most = most_light(part, n, at, (0.0, departure), limits);
+                if !is_dark && value <= most {
+                    continue;
+                }
+                let [x, y] = [at % n, at / n];
+                let columns = x.saturating_sub(NEAR)..(x + NEAR + 1).min(n);
+                let rows = y.saturating_sub(NEAR)..(y + NEAR + 1).min(n);
+                let around = rows.flat_map(|y| &part[y * n..][columns.clone()]);
+                let peak = around.copied().fold(0.0, f32::max);
+                if value < -departure - limits.lobe * peak || value > most + FAINT_SHARE * peak {
+                    places.push(at);
+                }
+            }
+            if places.is_empty() {
+                break;
+            }
+            for &at in &*places {
+                part[at] = f32::NAN;
+            }
+        }
+        let after: Vec<bool> = known(part);
+        found.extend((0..part.len()).filter(|&at| before[at] && !after[at]));
+    }
+}
+
 /// Finds defects, with buffers for one thread.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Defects {

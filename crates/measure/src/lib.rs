@@ -98,6 +98,7 @@ pub use warning::{ExaminedPsfs, PixelFrame, Warning};
 
 /// The parts of a measurement, for benchmarks and simulations. Slices and buffers have to be of the sizes planned.
 pub mod parts {
+    pub use crate::defects::ExposureDefects;
     pub use crate::denoise::{DenoiseScratch, WaveletWiener, border_noise};
     pub use crate::network::{Network, NetworkScratch, Rule, Step, convolve, psf_factor};
     pub use crate::pixels::frame;

@@ -380,7 +380,7 @@ class Catalogue(np.ndarray[tuple[int], np.dtype[np.void]]):
         FileExistsError
             If there is a file and ``overwrite`` is false.
         ValueError
-            If the ending is another.
+            If the name ends otherwise.
         """
         _tables.write(self, path, overwrite)
 

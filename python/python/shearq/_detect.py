@@ -9,6 +9,7 @@ from . import _schema, _shearq
 from ._arrays import double, real, shaped, shown, with_missing, without_sentinels
 from ._catalogue import Catalogue
 from ._threads import thread_count
+from ._warn import DataWarning, warn
 from ._wcs import WcsLike, jacobians
 
 
@@ -80,7 +81,9 @@ def detect(
         middle = 1.0 if hasattr(wcs, "jacobian") else 0.0
         local = jacobians(wcs, 1, np.array([(columns - 1) / 2 + middle]), np.array([(rows - 1) / 2 + middle]))[0].tolist()
     single = np.ascontiguousarray(without_sentinels(pixels), dtype=np.float32)
-    found = _shearq.detect(single, star, level, float(threshold), local, thread_count(threads))
+    found, doubts = _shearq.detect(single, star, level, float(threshold), local, thread_count(threads))
+    for doubt in doubts:
+        warn(f"{doubt}.", DataWarning)
     catalogue = np.empty(len(found["e1"]), dtype=[(name, column.dtype) for name, column in found.items()]).view(Catalogue)
     for name, column in found.items():
         catalogue[name] = column

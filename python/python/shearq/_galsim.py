@@ -181,7 +181,7 @@ def from_galsim(
     ValueError
         If pixels are not square and along the axes, or scales or shapes differ.
     TypeError
-        If an object is another.
+        If an object is of another type.
 
     Examples
     --------

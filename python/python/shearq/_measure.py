@@ -206,8 +206,7 @@ def measure(
 
     Notes
     -----
-    e1 and e2 are not divided by the response to shear, which the columns R11, R22, R12 and R21 contain (until version 0.2 they
-    were divided by the mean of the call). :func:`mean_shear` and :func:`bias` divide by the mean response of the galaxies that
+    e1 and e2 are not divided by the response to shear, which the columns R11, R22, R12 and R21 contain. :func:`mean_shear` and :func:`bias` divide by the mean response of the galaxies that
     they average; :meth:`Catalogue.shear` gives a shear per galaxy. Combine several calls by :func:`mean_shear` or
     :func:`concatenate`. The mean response of some thousand galaxies has an error of about a per cent.
 

@@ -92,7 +92,7 @@ def from_meds(
         A MEDS file, which is read by astropy, or an object with the methods of ``meds.MEDS``. Of a list, one for each band, with the
         same galaxies in the same rows; the bands are combined as by :func:`from_ngmix`.
     psfs : optional
-        Of a list of files, a list. By default the extension ``psf`` of the file. Otherwise a function of (meds, galaxy, cutout) that returns an image, centred
+        By default the extension ``psf`` of the file. For a list of files, a list. Otherwise a function of (meds, galaxy, cutout) that returns an image, centred
         in the middle; or a model of the PSF for each ``file_id``, as :func:`measure` takes them, drawn at ``orig_col`` + 1 and
         ``orig_row`` + 1.
     coadd : {'skip', 'only', 'absent'}

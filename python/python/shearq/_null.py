@@ -28,7 +28,7 @@ def null_tests(
         ``ra``, ``dec`` of points without mass, such as stars or random places.
     stars : table or mapping of columns, optional
         ``ra``, ``dec``, ellipticities ``e1``, ``e2`` and size ``T`` of stars, and those of the PSF model at their places,
-        ``model_e1``, ``model_e2`` and ``model_T``, in the frame of the sky. Stars that the model was not fitted to test most.
+        ``model_e1``, ``model_e2`` and ``model_T``, in the frame of the sky. The most telling stars are those that the model was not fitted to.
     against : tuple of str, optional
         Columns of shears against which the mean shear is tested, such as positions on the exposure. By default the shape
         and size of the PSF, ``psf_e1``, ``psf_e2`` and ``psf_sigma``, if they are there.

@@ -65,7 +65,7 @@ class Score(Result):
     replicates : array of shape (groups, 11)
         Metrics with each group of images left out, in the order of ``metrics``; empty with one image.
     notes : list of str
-        What was odd about the rows.
+        Warnings about the rows.
     """
 
     def __init__(self, found: dict[str, Any], dropped: int = 0) -> None:
@@ -325,7 +325,7 @@ def power_spectrum(
     e1, e2, field_degrees, images, positions, stamp, definition, drop_missing
         As for :func:`score`. Galaxies without an ellipticity count as zero.
     cells : int, optional
-        Cells a side of the grid, where the shapes of e1 and e2 do not tell it.
+        Cells a side of the grid; required if the shapes of e1 and e2 do not contain it.
 
     Returns
     -------

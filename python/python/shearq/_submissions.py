@@ -29,9 +29,9 @@ class Configuration:
     published : dict or None
         Published metrics: ``q``, ``m_half`` (M/2) and ``sqrt_a`` (√A in 10⁻⁴).
     stamp_size, psf_size : int
-        Pixels a side of the piece of a stamp, and of a PSF stamp, that are used; of smaller PSF stamps all, where those do.
+        Pixels a side that are used of a stamp and of its PSF stamp. Of a smaller PSF stamp, all pixels are used, if the configuration allows it.
     psf_form : {'star', 'functional'}
-        The PSFs that the command line gives it. Here, either serves.
+        Which PSFs the command line reads for it. In Python, you give the PSF, and this has no effect.
     needs_noise : bool
         Whether the noise level has to be given; otherwise it is measured on all stamps, or on each one's border.
     ellipticity : {'shear', 'distortion'}
@@ -125,7 +125,7 @@ def submission(of: SubmissionLike) -> Configuration:
     Parameters
     ----------
     of : str, path, mapping or Configuration
-        The name of an embedded submission such as ``"48/linear/star"``, the path of a settings file, the text
+        The name of an embedded configuration such as ``"48/linear/star"``, the path of a settings file, the text
         of one (more than one line, or a single assignment), or settings as a mapping:
         ``{"extends": "48/linear/star", "noise": {"source": "border", "border": 4}}``.
 
@@ -163,7 +163,7 @@ def submission(of: SubmissionLike) -> Configuration:
 
 
 def submissions() -> dict[str, Configuration]:
-    """The embedded submissions by name: those of Table 1 of Nurbaeva et al. (2015) in its order, and the linear ones.
+    """The embedded configurations by name: those of Table 1 of Nurbaeva et al. (2015) in its order, and the linear ones.
 
     Returns
     -------

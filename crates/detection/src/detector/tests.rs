@@ -431,3 +431,66 @@ fn noise_of_an_elliptical_psf_has_no_shape() {
         "{with:?} {without:?}"
     );
 }
+
+#[test]
+fn round_galaxies_on_sheared_pixels_have_no_mean_shape() {
+    // Along x, pixels are 1.2 times as long on the sky as along y.
+    let (a, b) = (1.1, 1.0 / 1.1);
+    let jacobian = Jacobian::new([[a, 0.0], [0.0, b]]).unwrap();
+    let drawn = |square: f64, [x0, y0]: [f64; 2], side: usize| {
+        let covariance = [square / (a * a), square / (b * b), 0.0];
+        Array2::from_shape_fn((side, side), |(y, x)| {
+            gaussian(covariance, 1.0, [x as f64 - x0, y as f64 - y0])
+        })
+    };
+    let star = drawn(3.0, [23.5; 2], 48);
+    let settings = DetectionMethod::default();
+    let noise = StampNoise::white(1.0);
+    let detector = Detector::new(star.view(), &noise, Some(&jacobian), &settings).unwrap();
+    let mut sums = [0.0; 3];
+    // Phases, whose mean is that over all places. The light of 30σ has no neighbours that are as bright.
+    for phase in 0..4 {
+        let place = [
+            64.0 + 0.25 * f64::from(phase),
+            64.0 + 0.25 * f64::from(phase * 3 % 4),
+        ];
+        let image = drawn(6.0, place, 128).mapv(|value| (600.0 * value) as f32);
+        for pixel in found(&detector, &image) {
+            sums[0] += pixel.e[0];
+            sums[1] += pixel.e[1];
+            sums[2] += 0.5 * (pixel.response[0][0] + pixel.response[1][1]);
+        }
+    }
+    // With neighbours on the lattice of pixels it is 0.1. Four axes leave a difference of R11 and R22, but no direction.
+    let [e1, e2] = [sums[0] / sums[2], sums[1] / sums[2]];
+    assert!(
+        sums[2] > 1.0 && e1.abs() < 2e-3 && e2.abs() < 2e-3,
+        "{e1} {e2} {sums:?}"
+    );
+}
+
+#[test]
+fn a_star_that_is_larger_than_its_transform_has_the_same_detections() {
+    let noise = StampNoise::white(1.0);
+    let settings = DetectionMethod::default();
+    let wide = |side: usize| {
+        let middle = (side as f64 - 1.0) / 2.0;
+        Array2::from_shape_fn((side, side), |(y, x)| {
+            gaussian(PSF, 1.0, [x as f64 - middle, y as f64 - middle])
+        })
+    };
+    let image = exposure(128, &PAIR, [0.0; 2], [0.0; 2]);
+    let [small, large] = [48, 300].map(|side| {
+        let detector = Detector::new(wide(side).view(), &noise, None, &settings).unwrap();
+        found(&detector, &image)
+    });
+    assert!(small.len() > 10 && small.len() == large.len());
+    for (small, large) in small.iter().zip(&large) {
+        // Rounding.
+        close(small.e[0], large.e[0], 1e-6);
+        close(small.weight, large.weight, 1e-6);
+    }
+    for star in [Array2::ones((513, 513)), Array2::ones((48, 50))] {
+        assert!(Detector::new(star.view(), &noise, None, &settings).is_err());
+    }
+}
