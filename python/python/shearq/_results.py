@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from . import _display, _shearq
+from . import _display, _hdf5, _shearq
 
 
 def plain(value: Any) -> Any:
@@ -36,7 +36,7 @@ def plain(value: Any) -> Any:
 def origin(function: str, settings: Mapping[str, Any], paths: Any = ()) -> dict[str, Any]:
     """Version, function, settings that are no defaults, and fingerprints of files, as the command line's JSON has them."""
     given = {name: plain(value) for name, value in settings.items() if value is not None and value is not False}
-    inputs = {path: print for path in paths if (print := _shearq.fingerprint(path)) is not None}
+    inputs = {path: print for path in paths if (print := _shearq.fingerprint(_hdf5._parts(path)[0])) is not None}
     return {"version": _shearq.__version__, "function": function, "settings": given, "inputs": inputs}
 
 
