@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
-import json
+import difflib
+import inspect
+import re
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import h5py  # type: ignore[import-untyped, unused-ignore]
 import numpy as np
+import yaml  # type: ignore[import-untyped, unused-ignore]
 from ceci import PipelineStage  # type: ignore[import-untyped, unused-ignore]
+from ceci.config import StageParameter  # type: ignore[import-untyped, unused-ignore]
 from ceci.file_types import DataFile, FitsFile, HDFFile  # type: ignore[import-untyped, unused-ignore]
 
-from . import __version__, bias, measure
+from . import bias, measure
+
+# Arguments that are inputs of the stages, or objects of Python.
+_NOT_OPTIONS = ("catalogues", "stamps", "psf", "epochs", "progress")
+# What ceci's `make_stage` passes besides options.
+_OF_CECI = ("config", "name", "aliases", "comm", "inputs", "outputs")
 
 
 class JsonFile(DataFile):  # type: ignore[misc, unused-ignore]
@@ -23,73 +33,135 @@ class JsonFile(DataFile):  # type: ignore[misc, unused-ignore]
         return open(path, mode)
 
 
-def _given(config: Any, *names: str) -> dict[str, Any]:
-    """The options that are set: empty texts and lists are not."""
-    return {name: config[name] for name in names if config[name] not in ("", [], {}, None)}
+def _options(function: Callable[..., Any]) -> dict[str, Any]:
+    """The arguments of a function as options of a stage."""
+    return {
+        name: argument.default if isinstance(argument.default, bool) else _optional(argument.default)
+        for name, argument in inspect.signature(function).parameters.items()
+        if name not in _NOT_OPTIONS
+    }
 
 
-class ShearBias(PipelineStage):  # type: ignore[misc, unused-ignore]
-    """m and c of shear catalogues, as :func:`shearq.bias` estimates them.
+def _optional(default: Any = None) -> Any:
+    # Of any type, because ceci would make a list of each letter of a text, and refuse a number for a list.
+    return StageParameter(dtype=None, default=default, required=False)
+
+
+class _Arguments:
+    """What the stages share: options that are the arguments of a function, and no others."""
+
+    config: Any
+    config_options: Mapping[str, Any]
+    function: Callable[..., Any]
+
+    def read_config(self, args: Mapping[str, Any]) -> None:
+        super().read_config(args)  # type: ignore[misc]
+        # The section `global` is for all stages, so that it may have other keys, and ceci tests arguments of the command line itself.
+        given = [*self._section(), *(() if "stage_name" in args else args)]
+        known = [*self.config_options, *self.input_tags(), *self.output_tags(), *_OF_CECI]  # type: ignore[attr-defined]
+        for key in given:
+            if key not in known:
+                near = difflib.get_close_matches(key, self.config_options, 1)
+                hint = f". Try: {near[0]}" if near else ""
+                raise ValueError(f"found the key {key}; expected some of {', '.join(sorted(self.config_options))}{hint}")
+
+    def _section(self) -> list[str]:
+        config = self.get_input("config")  # type: ignore[attr-defined]
+        if isinstance(config, str):
+            try:
+                from ceci.pipeline.templates import read_and_apply_template  # type: ignore[import-untyped, unused-ignore]
+            except ImportError:
+                # Older versions of ceci have no templates.
+                with open(config) as file:
+                    text = file.read()
+            else:
+                text = read_and_apply_template(config)
+            config = yaml.safe_load(text)
+        return list((config or {}).get(self.instance_name) or {})  # type: ignore[attr-defined]
+
+    def _given(self) -> dict[str, Any]:
+        """The arguments that are set: empty texts and lists are not."""
+        found = {}
+        for name, argument in inspect.signature(type(self).function).parameters.items():
+            if name in _NOT_OPTIONS:
+                continue
+            value = self.config[name]
+            if value is None or isinstance(value, (str, list, Mapping)) and not value:
+                continue
+            is_number = name != "ids" and re.search(r"\b(float|int|ArrayLike)\b", str(argument.annotation))
+            found[name] = _number(value) if is_number else value
+        return found
+
+
+def _number(value: Any) -> Any:
+    """Numbers as YAML and the command line have them: YAML reads 1e-3 as a text, and the command line has lists with commas."""
+    if isinstance(value, str) and "," in value:
+        value = value.split(",")
+    if isinstance(value, list):
+        return [_number(own) for own in value]
+    for kind in (int, float):
+        try:
+            return kind(value) if isinstance(value, str) else value
+        except ValueError:
+            pass
+    return value
+
+
+def _texts(value: Any) -> list[str]:
+    return value.split(",") if isinstance(value, str) else list(value or [])
+
+
+class ShearBias(_Arguments, PipelineStage):  # type: ignore[misc, unused-ignore]
+    """m and c of shear catalogues, as :func:`shearq.bias` estimates them, whose arguments are the options.
 
     The input is an HDF5 file whose group ``group`` is a table; the option ``catalogues`` lists further ones, such as those under the
-    opposite shear. ``g1`` and ``g2`` are the true shears of all, where no column has them. The output is JSON: rows, notes and the
-    version.
+    opposite shear. ``g1`` and ``g2`` are the true shears of all, where no column has them. The output is the JSON of
+    :meth:`shearq.Bias.to_json`.
     """
 
     name = "ShearBias"
     inputs = [("shear_catalog", HDFFile)]
     outputs = [("shear_bias", JsonFile)]
     parallel = False
-    config_options = {
-        "group": "shear",
-        "catalogues": [str],
-        "g1": [float],
-        "g2": [float],
-        "columns": [str],
-        "ellipticity": "",
-        "where": "",
-        "weight": "",
-        "units": "",
-        "design": "",
-        "drop_missing": False,
-    }
+    config_options = {"group": "shear", "catalogues": _optional(), **_options(bias)}
+    function = bias
 
     def run(self) -> None:
-        config = self.config
+        config, arguments = self.config, self._given()
         group = f":{config['group']}" if config["group"] else ""
-        paths = [f"{path}{group}" for path in [self.get_input("shear_catalog"), *_of(str, config["catalogues"])]]
-        arguments = _given(config, "ellipticity", "where", "weight", "units", "design")
+        paths = [f"{path}{group}" for path in [self.get_input("shear_catalog"), *_texts(config["catalogues"])]]
         for name in ("g1", "g2"):
-            values = _of(float, config[name])
-            if values:
-                arguments[name] = values if len(values) > 1 else values[0]
-        columns = _of(str, config["columns"])
-        if columns:
-            arguments["columns"] = dict(pair.split("=", 1) for pair in columns)
-        found = bias(paths, drop_missing=config["drop_missing"], **arguments)
+            values = arguments.get(name)
+            if isinstance(values, list) and len(values) == 1:
+                arguments[name] = values[0]
+        columns = arguments.get("columns")
+        if columns and not isinstance(columns, Mapping):
+            arguments["columns"] = dict(pair.split("=", 1) for pair in _texts(columns))
+        if isinstance(arguments.get("bins"), list):
+            # Pairs of several quantities are tuples for `bias`, which YAML has not.
+            arguments["bins"] = [tuple(own) if isinstance(own, list) and isinstance(own[0], str) else own for own in arguments["bins"]]
+        found = bias(paths, **arguments)
         with self.open_output("shear_bias") as file:
-            document = {"version": __version__, "rows": found.rows, "notes": found.notes, "binned": found.binned}
-            json.dump(document, file, indent=1)
+            file.write(found.to_json() + "\n")
         print(found)
 
 
-class ShearMeasure(PipelineStage):  # type: ignore[misc, unused-ignore]
+class ShearMeasure(_Arguments, PipelineStage):  # type: ignore[misc, unused-ignore]
     """Shapes and responses of stamps, as :func:`shearq.measure` has them, in the group ``shear`` of an HDF5 file.
 
-    The inputs are FITS images: stamps of shape (n, ny, nx), and one PSF or one for each stamp.
+    The inputs are FITS images: stamps of shape (n, ny, nx), and one PSF or one for each stamp. Their headers state the WCS. The
+    options are the other arguments of :func:`shearq.measure`.
     """
 
     name = "ShearMeasure"
     inputs = [("stamps", FitsFile), ("psf", FitsFile)]
     outputs = [("shear_catalog", HDFFile)]
     parallel = False
-    config_options = {"submission": "48/linear/star", "threads": 0}
+    config_options = _options(measure)
+    function = measure
 
     def run(self) -> None:
-        from astropy.io import fits  # type: ignore[import-untyped, unused-ignore]
-
-        stamps, psf = (fits.getdata(self.get_input(name)) for name in ("stamps", "psf"))
-        found = measure(stamps, psf, submission=self.config["submission"], threads=self.config["threads"] or None)
+        found = measure(self.get_input("stamps"), self.get_input("psf"), **self._given())
         with self.open_output("shear_catalog") as file:
             group = file.create_group("shear")
             for name in found.dtype.names or ():
@@ -97,11 +169,6 @@ class ShearMeasure(PipelineStage):  # type: ignore[misc, unused-ignore]
                 group.create_dataset(name, data=column if column.dtype.kind in "iuf" else column.astype(h5py.string_dtype()))
             for name, value in found.attrs.items():
                 group.attrs[name] = value
-
-
-def _of(kind: type, values: Any) -> list[Any]:
-    """A list of an option, which is the type itself where it is not given."""
-    return [] if values in ([kind], None) else list(values)
 
 
 if __name__ == "__main__":
