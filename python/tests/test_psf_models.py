@@ -67,6 +67,36 @@ def test_functions_are_drawn_with_the_pixel_of_the_stamps(field):
     assert np.array_equal(shearq.measure(epochs=[one])["e1"], found["e1"])
 
 
+def test_profiles_are_drawn_on_the_pixels_of_the_wcs(field):
+    places, stamps = field
+    turn = np.radians(25.0)
+    wcs = SCALE * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    profiles = [exact(x, y) for x, y in places]
+    local = galsim.JacobianWCS(*wcs.ravel())
+    images = np.array([one.drawImage(nx=SIDE, ny=SIDE, wcs=local, dtype=float).array for one in profiles])
+    expected = shearq.measure(stamps, images, noise=1.0, wcs=wcs)
+    for pixels in (stamps, [galsim.Image(stamp) for stamp in stamps]):
+        assert same_bits(shearq.measure(pixels, profiles, noise=1.0, wcs=wcs), expected)
+    blocks = list(shearq.measure_blocks(stamps, profiles, noise=1.0, wcs=wcs, block=60))
+    assert same_bits(blocks[1]["e1"], shearq.measure(stamps[60:], images[60:], noise=1.0, wcs=wcs)["e1"])
+    one = shearq.measure(stamps, profiles[0], noise=1.0, wcs=wcs)
+    assert same_bits(one, shearq.measure(stamps, images[0], noise=1.0, wcs=wcs))
+    # A Jacobian for each stamp.
+    each = shearq.measure(stamps, profiles[0], noise=1.0, wcs=np.repeat(wcs[np.newaxis], len(stamps), axis=0))
+    assert np.allclose(each["e1"], one["e1"], atol=1e-5)
+    wrong = [
+        ({"psf": profiles[:5], "wcs": wcs}, ValueError, "psf: found 5 profiles; expected one, or 120"),
+        ({"psf": [*profiles[:-1], 3.0], "wcs": wcs}, TypeError, "psf: number 119 is of type float"),
+        ({"psf": profiles}, TypeError, "stamps that have no WCS.* Try: wcs="),
+        ({"psf": profiles, "wcs": wcs, "psf_oversampling": 2}, ValueError, "psf_oversampling: found with profiles"),
+        ({"psf": exact, "wcs": wcs, "psf_oversampling": 2, "x": places[:, 0], "y": places[:, 1]}, ValueError, "psf_oversampling: found with profiles"),
+        ({"psf": np.ones((145, 145)), "psf_oversampling": 3}, ValueError, r"psf: found images of shape \(145, 145\) .* Try: draw the PSF on 144 × 144 or 147 × 147"),
+    ]
+    for arguments, kind, message in wrong:
+        with pytest.raises(kind, match=message):
+            shearq.measure(stamps, noise=1.0, **arguments)
+
+
 def test_a_psf_that_piff_fitted_has_the_exact_shear(field, tmp_path):
     piff = pytest.importorskip("piff", reason="Piff is not installed")
     fits = pytest.importorskip("astropy.io.fits")

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ._warn import DataWarning, warn
+from ._wcs import jacobians
 
 PixelOfPsf = Literal["included", "convolve"]
 # Profiles that are made of images of stars or of pixels, so that they contain the pixel already.
@@ -59,6 +60,9 @@ def _parts(profile: Any) -> list[Any]:
 
 def drawn(profiles: list[Any], side: int, pixels: list[dict[str, Any]], pixel: PixelOfPsf | None) -> list[NDArray[np.float64]]:
     """PSFs of profiles on stamps of ``side`` pixels, each with its ``pixels`` as drawImage takes them."""
+    for k, profile in enumerate(profiles):
+        if not _is_profile(profile):
+            raise TypeError(f"psf: number {k} is of type {type(profile).__name__}; expected profiles of GalSim")
     if pixel not in (None, "included", "convolve"):
         raise ValueError(f"pixel: found {pixel!r}; expected 'included' or 'convolve'")
     if pixel is None:
@@ -222,8 +226,32 @@ def from_galsim(
     return {"stamps": pixels, "psf": stars[0].array if _is_image(psf) else _array("psf", stars)}
 
 
-def unpacked(stamps: Any, psf: Any, *, check: bool, pixel: PixelOfPsf | None = None) -> tuple[Any, Any]:
+def _on_wcs(profiles: list[Any], stamps: Any, wcs: Any, x: Any, y: Any, pixel: PixelOfPsf | None) -> tuple[Any, NDArray[np.float64]]:
+    """Stamps, and PSFs of profiles on their pixels, which a WCS states."""
+    import galsim
+
+    images = _many(stamps, _is_image)
+    pixels = stamps if images is None else _array("stamps", images)
+    count = len(pixels)
+    if count == 0:
+        raise ValueError("stamps: found none; expected one or more")
+    side = np.shape(pixels[0])[-1]
+    if len(profiles) not in (1, count):
+        raise ValueError(f"psf: found {len(profiles)} profiles; expected one, or {count}, one for each stamp")
+    local = [{"wcs": galsim.JacobianWCS(*matrix.ravel())} for matrix in jacobians(wcs, count, x, y, side)]
+    n = max(len(profiles), len(local))
+    profiles, local = (own * n if len(own) == 1 else own for own in (profiles, local))
+    found = drawn(profiles, side, local, pixel)
+    return pixels, found[0] if n == 1 else np.stack(found)
+
+
+def unpacked(
+    stamps: Any, psf: Any, *, check: bool, pixel: PixelOfPsf | None = None, wcs: Any = None, x: Any = None, y: Any = None
+) -> tuple[Any, Any]:
     """Stamps and PSFs, of which GalSim's become arrays; with ``check``, pixels are square and along the axes."""
+    profiles = _many(psf, _is_profile)
+    if profiles is not None and wcs is not None:
+        return _on_wcs(profiles, stamps, wcs, x, y, pixel)
     if _many(stamps, _is_image) is not None:
         if hasattr(psf, "fwhm") and not _is_profile(psf):
             # Formulas in pixels.
@@ -234,10 +262,10 @@ def unpacked(stamps: Any, psf: Any, *, check: bool, pixel: PixelOfPsf | None = N
             return _array("stamps", images), psf
         found = from_galsim(stamps, psf, wcs="check" if check else "ignore", pixel=pixel)
         return found["stamps"], found["psf"]
-    if _many(psf, _is_profile) is not None:
+    if profiles is not None:
         raise TypeError(
-            "psf: found a profile of GalSim with stamps that have no WCS; expected pixels."
-            " Try: psf.drawImage(nx=48, ny=48, scale=SCALE), with the pixel scale of the stamps"
+            "psf: found a profile of GalSim with stamps that have no WCS; expected one."
+            " Try: wcs=np.diag([SCALE, SCALE]), or psf.drawImage(nx=48, ny=48, scale=SCALE), with the pixel scale of the stamps"
         )
     no_pixel(pixel)
     stars = _many(psf, _is_image)

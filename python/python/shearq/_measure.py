@@ -137,7 +137,7 @@ def measure(
     psf : array of shape (py, px) or (n, py, px), FunctionalPsf, or GalSim image or profile
         One PSF for all galaxies or one per galaxy, centred like the stamps, of even or odd size, and at least as large
         as the configuration requires (32 pixels by default). It is cut and normalised. Profiles of GalSim are drawn
-        on the pixels of GalSim stamps. A model is drawn at each galaxy's ``x`` and ``y``, in the model's convention (the
+        on the pixels of ``wcs``, or of GalSim stamps. A model is drawn at each galaxy's ``x`` and ``y``, in the model's convention (the
         first pixel is 1 for Piff and PSFEx): a ``piff.PSF``, a PSFEx file as ``galsim.des.DES_PSFEx``, a PSF of Rubin
         (``computeKernelImage``), or a function of (x, y) that returns an image or a profile of GalSim.
     epochs : sequence of mappings, optional
@@ -228,10 +228,7 @@ def measure(
         for name, value in (("stamps", stamps), ("psf", psf)):
             if value is None:
                 raise TypeError(f"{name}: found none; expected stamps and their PSF, or epochs")
-        stamps, psf, wcs = _images.opened(stamps, psf, wcs)
-        psf = _psf_models.at_galaxies(psf, stamps, x, y, wcs, properties, pixel)
-        stamps, psf = _galsim.unpacked(stamps, psf, check=wcs is None and psf_oversampling == 1, pixel=_pixel_of(psf, pixel))
-        psf = _on_galaxy_pixels(psf, psf_oversampling)
+        stamps, psf, wcs = _pixels(stamps, psf, wcs, x, y, properties, pixel, psf_oversampling)
         return _measure([_image(stamps, psf, noise, mask, wcs, x, y)], (ids, x, y), settings, count, done)
     given = {"stamps": stamps, "psf": psf, "noise": noise, "mask": mask, "wcs": wcs, "properties": properties, "pixel": pixel}
     if psf_oversampling != 1:
@@ -290,10 +287,7 @@ def measure_blocks(
     >>> print(shearq.mean_shear(blocks))
     g1 = ... ± ..., g2 = ... ± ... (400 galaxies, 0 flagged, pixel frame)
     """
-    stamps, psf, wcs = _images.opened(stamps, psf, wcs)
-    psf = _psf_models.at_galaxies(psf, stamps, x, y, wcs, properties, pixel)
-    stamps, psf = _galsim.unpacked(stamps, psf, check=wcs is None and psf_oversampling == 1, pixel=_pixel_of(psf, pixel))
-    psf = _on_galaxy_pixels(psf, psf_oversampling)
+    stamps, psf, wcs = _pixels(stamps, psf, wcs, x, y, properties, pixel, psf_oversampling)
     most = whole("block", block, 1, 1 << 40)
     if isinstance(stamps, (list, tuple)):
         stamps = numeric("stamps", stamps)
@@ -348,6 +342,13 @@ def _on_galaxy_pixels(psf: Any, oversampling: int | None) -> Any:
     if isinstance(psf, FunctionalPsf):
         raise ValueError("psf_oversampling: found with formulas, which have no pixels; expected images of PSFs")
     images = numeric("psf", psf)
+    sides = sorted({side for side in images.shape[-2:] if side % factor})
+    if sides:
+        nearest = sides[0] // factor * factor
+        raise ValueError(
+            f"psf: found images of shape {shown(images.shape[-2:])} with psf_oversampling={factor}; expected sides of a multiple of {factor}."
+            f" Try: draw the PSF on {nearest} × {nearest} or {nearest + factor} × {nearest + factor} pixels, centred in their middle"
+        )
     if images.ndim == 2:
         return _shearq.psfs_from_oversampled(double("psf", images[np.newaxis]), factor)[0]
     # In blocks, because the finer images of many galaxies in double precision are large.
@@ -355,9 +356,19 @@ def _on_galaxy_pixels(psf: Any, oversampling: int | None) -> Any:
     return np.concatenate([_shearq.psfs_from_oversampled(block, factor) for block in blocks])
 
 
-def _pixel_of(psf: Any, pixel: PixelOfPsf | None) -> PixelOfPsf | None:
-    """What is said of the pixel of PSFs that are still profiles; models have drawn them with it."""
-    return None if isinstance(psf, _psf_models.PsfsOfModel) else pixel
+def _pixels(
+    stamps: Any, psf: Any, wcs: Any, x: Any, y: Any, properties: Any, pixel: PixelOfPsf | None, oversampling: int | None
+) -> tuple[Any, Any, Any]:
+    """Stamps and PSFs of all kinds as arrays, or PSFs as formulas, and the WCS, which files may state."""
+    stamps, psf, wcs = _images.opened(stamps, psf, wcs)
+    fine = oversampling not in (None, 1)
+    psf = _psf_models.at_galaxies(psf, stamps, x, y, wcs, properties, pixel, fine)
+    if fine and _galsim._many(psf, _galsim._is_profile) is not None:
+        raise ValueError(_psf_models.FINE_PROFILE)
+    # Models have drawn their PSFs with the pixel.
+    of_profiles = None if isinstance(psf, _psf_models.PsfsOfModel) else pixel
+    stamps, psf = _galsim.unpacked(stamps, psf, check=wcs is None and not fine, pixel=of_profiles, wcs=wcs, x=x, y=y)
+    return stamps, _on_galaxy_pixels(psf, oversampling), wcs
 
 
 def _epoch(k: int, epoch: Mapping[str, Any]) -> dict[str, Any]:
@@ -367,11 +378,7 @@ def _epoch(k: int, epoch: Mapping[str, Any]) -> dict[str, Any]:
         if unknown or "stamps" not in epoch or "psf" not in epoch:
             raise ValueError(f"found {', '.join(epoch)}; expected stamps, psf and perhaps {', '.join(_EPOCH[2:])}")
         own = {name: epoch.get(name) for name in _EPOCH}
-        own["stamps"], own["psf"], own["wcs"] = _images.opened(own["stamps"], own["psf"], own["wcs"])
-        psf = _psf_models.at_galaxies(own["psf"], own["stamps"], own["x"], own["y"], own["wcs"], own["properties"], own["pixel"])
-        check = own["wcs"] is None and own["psf_oversampling"] in (None, 1)
-        stamps, psf = _galsim.unpacked(own["stamps"], psf, check=check, pixel=_pixel_of(psf, own["pixel"]))
-        psf = _on_galaxy_pixels(psf, own["psf_oversampling"])
+        stamps, psf, wcs = _pixels(*(own[name] for name in ("stamps", "psf", "wcs", "x", "y", "properties", "pixel", "psf_oversampling")))
         noise = own["noise"]
         if own["flux"] is not None:
             flux = np.asarray(own["flux"], dtype=np.float64)
@@ -385,7 +392,7 @@ def _epoch(k: int, epoch: Mapping[str, Any]) -> dict[str, Any]:
             stamps = stamps / flux.reshape(-1, 1, 1)
             if noise is not None:
                 noise = np.asarray(noise) / (flux.reshape(-1, 1, 1) if np.ndim(noise) == 3 else flux)
-        image = _image(stamps, psf, noise, own["mask"], own["wcs"], own["x"], own["y"])
+        image = _image(stamps, psf, noise, own["mask"], wcs, own["x"], own["y"])
         count = len(image["stamps"])
         if own["offsets"] is not None:
             image["offsets"] = offsets = double("offsets", own["offsets"])

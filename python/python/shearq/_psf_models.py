@@ -13,6 +13,11 @@ from ._arrays import double, shown
 from ._galsim import PixelOfPsf, _is_image, _is_profile, drawn, no_pixel
 from ._wcs import jacobians
 
+FINE_PROFILE = (
+    "psf_oversampling: found with profiles of GalSim, which are drawn on the pixels of the stamps; expected images of PSFs on finer pixels."
+    " Try: without psf_oversampling"
+)
+
 # What a model needs: the number of pixels on a side, x and y of the galaxy, the Jacobian of its pixels or None, and other
 # properties of the galaxy.
 _Draw = Callable[[int, float, float, Any, dict[str, Any]], Any]
@@ -50,13 +55,15 @@ def _rubin_images(psf: Any) -> _Draw:
     return lambda side, x, y, jacobian, properties: psf.compute_kernel_image(x=x, y=y).array
 
 
-def _function(psf: Callable[..., Any], pixel: PixelOfPsf | None) -> _Draw:
+def _function(psf: Callable[..., Any], pixel: PixelOfPsf | None, fine: bool) -> _Draw:
     stated = [pixel]
 
     def draw(side: int, x: float, y: float, jacobian: Any, properties: dict[str, Any]) -> Any:
         found = psf(x, y, **properties)
         if not _is_profile(found):
             return found.array if hasattr(found, "bounds") else found
+        if fine:
+            raise ValueError(FINE_PROFILE)
         if jacobian is None:
             raise TypeError(
                 "psf: the function returned a profile of GalSim, and the pixels have no WCS; expected one. Try: wcs=, or a function"
@@ -73,7 +80,7 @@ def _function(psf: Callable[..., Any], pixel: PixelOfPsf | None) -> _Draw:
     return draw
 
 
-def _draw_of(psf: Any, pixel: PixelOfPsf | None = None) -> _Draw | None:
+def _draw_of(psf: Any, pixel: PixelOfPsf | None = None, fine: bool = False) -> _Draw | None:
     """How a model is drawn; None for anything that is no model."""
     models = {
         ("interp_property_names", "draw"): of_piff,
@@ -88,7 +95,7 @@ def _draw_of(psf: Any, pixel: PixelOfPsf | None = None) -> _Draw | None:
             return drawer(psf)
     # An image of GalSim can be called, too.
     if callable(psf) and not (_is_profile(psf) or _is_image(psf) or isinstance(psf, type)):
-        return _function(psf, pixel)
+        return _function(psf, pixel, fine)
     return None
 
 
@@ -138,10 +145,17 @@ class PsfsOfModel:
 
 
 def at_galaxies(
-    psf: Any, stamps: Any, x: Any, y: Any, wcs: Any, properties: Mapping[str, ArrayLike] | None, pixel: PixelOfPsf | None = None
+    psf: Any,
+    stamps: Any,
+    x: Any,
+    y: Any,
+    wcs: Any,
+    properties: Mapping[str, ArrayLike] | None,
+    pixel: PixelOfPsf | None = None,
+    fine: bool = False,
 ) -> Any:
-    """The PSFs of a model at the galaxies; anything else as it is."""
-    draw = _draw_of(psf, pixel)
+    """The PSFs of a model at the galaxies, whose images may have ``fine`` pixels; anything else as it is."""
+    draw = _draw_of(psf, pixel, fine)
     if draw is None:
         if properties is not None:
             raise TypeError(f"properties: found with a PSF of type {type(psf).__name__}; expected a model of Piff, or a function")
@@ -169,8 +183,19 @@ def at_galaxies(
 
 
 def one(model: Any, side: int, x: float, y: float, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The PSF of a model at one place, on pixels with a Jacobian."""
+    """The PSF of a model, profile or image at one place, on pixels with a Jacobian."""
+    if _is_profile(model):
+        import galsim
+
+        return drawn([model], side, [{"wcs": galsim.JacobianWCS(*matrix.ravel())}], None)[0]
+    image = np.asarray(model.array if _is_image(model) else model)
+    if image.ndim == 2 and image.dtype.kind in "fiu":
+        return image
     draw = _draw_of(model)
     if draw is None:
-        raise TypeError(f"psf: found {type(model).__name__}; expected a model of Piff, PSFEx or Rubin, or a function of (x, y)")
+        found = f"an array of shape {shown(image.shape)}" if image.ndim else type(model).__name__
+        raise TypeError(
+            f"psf: found {found}; expected an image of shape (py, px), a profile of GalSim, a model of Piff, PSFEx or Rubin, or a"
+            " function of (x, y)"
+        )
     return PsfsOfModel(draw, side, np.array([[x, y]]), matrix[np.newaxis], {})._one(0)
