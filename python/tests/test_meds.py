@@ -1,5 +1,6 @@
 """Files of MEDS, as DES writes them."""
 
+import gc
 from types import SimpleNamespace
 
 import numpy as np
@@ -115,6 +116,36 @@ def test_psfs_are_functions_or_models_of_the_files(epochs, tmp_path):
     assert same_bits(found, expected) and (1.0 + 20 * 3, 1.0 + 10 * 3) in asked
     with pytest.raises(ValueError, match="psfs: none for file_id 2 .galaxy 1, cutout 2"):
         catalogues(tmp_path / "tile.fits", {1: model(0)}, coadd="skip")
+
+
+def test_psfs_are_profiles_or_images_of_the_files(epochs, tmp_path):
+    galsim = pytest.importorskip("galsim", reason="profiles are of GalSim")
+    write(tmp_path / "tile.fits", epochs, psf=False)
+    profile = galsim.Moffat(beta=3.0, fwhm=3.4).shear(g1=0.05, g2=0.02)
+    images = [None, *(profile.drawImage(nx=48, ny=48, wcs=galsim.JacobianWCS(*one["wcs"].ravel()), dtype=float).array for one in epochs)]
+    (expected,) = catalogues(tmp_path / "tile.fits", images, coadd="skip")
+    for psfs in ([profile] * 3, lambda meds, galaxy, cutout: profile, [None, *map(galsim.Image, images[1:])], lambda meds, galaxy, cutout: images[cutout]):
+        assert same_bits(catalogues(tmp_path / "tile.fits", psfs, coadd="skip")[0], expected)
+    wrong = [
+        (lambda meds, galaxy, cutout: np.ones(3), r"psfs: galaxy 0, cutout 1: psf: found an array of shape \(3,\); expected an image"),
+        ([None] * 3, "psfs: galaxy 0, cutout 1: psf: found NoneType; expected an image"),
+        (profile, "psfs: found Transformation; expected a function of .meds, galaxy, cutout., or a list or dict"),
+    ]
+    for psfs, message in wrong:
+        with pytest.raises(TypeError, match=message):
+            catalogues(tmp_path / "tile.fits", psfs, coadd="skip")
+
+
+@pytest.mark.filterwarnings("error::ResourceWarning", "error::pytest.PytestUnraisableExceptionWarning")
+def test_files_are_closed_and_absent_ones_named(epochs, tmp_path):
+    write(tmp_path / "tile.fits", epochs)
+    next(iter(shearq.from_meds(tmp_path / "tile.fits", coadd="skip")))
+    gc.collect()
+    with pytest.raises(FileNotFoundError, match=f"meds: there is no file {tmp_path / 'none.fits'}"):
+        shearq.from_meds(tmp_path / "none.fits", coadd="skip")
+    (tmp_path / "text.fits").write_text("id,x,y")
+    with pytest.raises(ValueError, match="meds: .*text.fits: .*expected a MEDS file"):
+        shearq.from_meds(tmp_path / "text.fits", coadd="skip")
 
 
 def test_bands_are_files_of_the_same_galaxies(epochs, tmp_path):

@@ -24,12 +24,22 @@ class _MedsFile:
         from astropy.io import fits  # type: ignore[import-untyped, unused-ignore]
 
         self._path = path
-        self._fits = fits.open(path, memmap=True, disable_image_compression=False)
+        try:
+            self._fits = fits.open(path, memmap=True, disable_image_compression=False)
+        except FileNotFoundError:
+            raise FileNotFoundError(f"meds: there is no file {os.fspath(path)}") from None
+        except OSError as error:
+            raise ValueError(f"meds: {os.fspath(path)}: {error}; expected a MEDS file") from None
         try:
             self._cat = np.asarray(self._fits["object_data"].data)
         except KeyError:
             names = ", ".join(hdu.name or "no name" for hdu in self._fits)
             raise ValueError(f"{path}: found the extensions {names}; expected object_data and image_cutouts of a MEDS file") from None
+
+    def __del__(self) -> None:
+        # As a file of Python, which nobody reads any more.
+        if hasattr(self, "_fits"):
+            self._fits.close()
 
     @property
     def size(self) -> int:
@@ -92,9 +102,9 @@ def from_meds(
         A MEDS file, which is read by astropy, or an object with the methods of ``meds.MEDS``. Of a list, one for each band, with the
         same galaxies in the same rows; the bands are combined as by :func:`from_ngmix`.
     psfs : optional
-        By default the extension ``psf`` of the file. For a list of files, a list. Otherwise a function of (meds, galaxy, cutout) that returns an image, centred
-        in the middle; or a model of the PSF for each ``file_id``, as :func:`measure` takes them, drawn at ``orig_col`` + 1 and
-        ``orig_row`` + 1.
+        By default the extension ``psf`` of the file. For a list of files, a list. Otherwise a function of (meds, galaxy, cutout) that returns an image,
+        centred in the middle, or a profile of GalSim; or for each ``file_id`` a model of the PSF, as :func:`measure` takes them, drawn at
+        ``orig_col`` + 1 and ``orig_row`` + 1, a profile or an image.
     coadd : {'skip', 'only', 'absent'}
         Whether the first cutout of each galaxy is a coadd, as in most files of DES: ``'skip'`` uses all others, ``'only'`` this
         one, and ``'absent'`` all.
@@ -131,6 +141,12 @@ def from_meds(
     stars = list(psfs) if several and psfs is not None else [psfs] * len(files)
     if not files or len(stars) != len(files):
         raise ValueError(f"psfs: found {len(stars)} for {len(files)} files; expected one for each")
+    for star in stars:
+        if not (star is None or callable(star) or isinstance(star, (Sequence, Mapping))):
+            raise TypeError(
+                f"psfs: found {type(star).__name__}; expected a function of (meds, galaxy, cutout), or a list or dict with a model for each"
+                " file_id"
+            )
     catalogues = [file.get_cat() for file in files]
     for k, (file, star, catalogue) in enumerate(zip(files, stars, catalogues)):
         of = f"meds: file {k}" if several else "meds"
@@ -199,16 +215,21 @@ def _cutouts(meds: Any, catalogue: Any, psfs: Any, galaxy: int, coadd: str, side
 def _psf(meds: Any, catalogue: Any, psfs: Any, galaxy: int, cutout: int, side: int) -> NDArray[Any]:
     if psfs is None:
         return np.asarray(meds.get_psf(galaxy, cutout))
-    if isinstance(psfs, (Sequence, Mapping)):
-        from ._psf_models import one
+    from ._psf_models import one
 
+    if not isinstance(psfs, (Sequence, Mapping)):
+        model = psfs(meds, galaxy, cutout)
+    else:
         number = int(catalogue["file_id"][galaxy, cutout])
         try:
             model = psfs[number]
         except (KeyError, IndexError):
             raise ValueError(f"psfs: none for file_id {number} (galaxy {galaxy}, cutout {cutout}); expected a model for each file") from None
-        # The first pixel of an exposure is 0 in MEDS, and 1 for Piff, PSFEx and GalSim.
-        x, y = (float(catalogue[name][galaxy, cutout]) + 1.0 for name in ("orig_col", "orig_row"))
-        matrix = np.array([[float(catalogue[f"d{of}d{along}"][galaxy, cutout]) for along in ("col", "row")] for of in "uv"])
+    # The first pixel of an exposure is 0 in MEDS, and 1 for Piff, PSFEx and GalSim. Profiles and images need no place.
+    names = catalogue.dtype.names or ()
+    x, y = (float(catalogue[name][galaxy, cutout]) + 1.0 if name in names else np.nan for name in ("orig_col", "orig_row"))
+    matrix = np.array([[float(catalogue[f"d{of}d{along}"][galaxy, cutout]) for along in ("col", "row")] for of in "uv"])
+    try:
         return one(model, side, x, y, matrix)
-    return np.asarray(psfs(meds, galaxy, cutout))
+    except (TypeError, ValueError) as error:
+        raise type(error)(f"psfs: galaxy {galaxy}, cutout {cutout}: {error}") from None
