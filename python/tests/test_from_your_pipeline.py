@@ -16,14 +16,19 @@ SECTIONS = dict(part.split("\n", 1) for part in PAGE.split("\n## ")[1:])
 SCALE = 0.2
 
 
-def stamps(profile, count=60, shear=0.02, seed=3):
+# Pixels that are rotated by 25 degrees, on a plane and on the sky.
+ROTATED = galsim.AffineTransform(*(SCALE * np.array([[np.cos(0.44), -np.sin(0.44)], [np.sin(0.44), np.cos(0.44)]])).ravel())
+SKY = galsim.TanWCS(ROTATED, galsim.CelestialCoord(1 * galsim.radians, 0.3 * galsim.radians))
+
+
+def stamps(profile, count=60, shear=0.02, seed=3, wcs=galsim.PixelScale(SCALE)):
     """Round galaxies and their places; S/N is about 60."""
     rng = np.random.default_rng(seed)
     x, y = rng.uniform(50, 950, (2, count))
     drawn = []
     for one, other in zip(x, y):
         galaxy = galsim.Exponential(half_light_radius=0.6, flux=4000).shear(g1=shear, g2=0.0)
-        image = galsim.Convolve(galaxy, profile(one, other)).drawImage(nx=48, ny=48, scale=SCALE)
+        image = galsim.Convolve(galaxy, profile(one, other)).drawImage(nx=48, ny=48, wcs=wcs.local(galsim.PositionD(one, other)))
         drawn.append(image.array + rng.normal(0, 1, (48, 48)))
     return {"stamps": np.array(drawn), "x": x, "y": y}
 
@@ -56,7 +61,7 @@ def gathered(title, profile):
         galaxy = galsim.Exponential(half_light_radius=0.6, flux=4000).shear(g1=0.02, g2=0.0)
         image = galsim.Convolve(galaxy, profile(x, y)).drawImage(nx=48, ny=48, scale=SCALE, center=galsim.PositionD(x, y))
         field[image.bounds] += galsim.Image(image.array, xmin=image.bounds.xmin, ymin=image.bounds.ymin)
-    fits.writeto("field.fits", field.array.astype("f4"))
+    fits.writeto("field.fits", field.array.astype("f4"), overwrite=True)
     np.savetxt("galaxies.csv", places, delimiter=",", header="x,y", comments="")
     for block in blocks(SECTIONS[title], "sh"):
         assert run_command(shlex.split(block)) == 0
@@ -67,14 +72,15 @@ def gathered(title, profile):
 def test_piff(tmp_path, monkeypatch):
     piff = pytest.importorskip("piff", reason="Piff is not installed")
     monkeypatch.chdir(tmp_path)
-    # A model as Piff stores it, fitted to one star.
-    psf = piff.SimplePSF(piff.Moffat(3.0), piff.Mean())
-    drawn = galsim.Moffat(beta=3.0, fwhm=0.7).drawImage(nx=41, ny=41, scale=SCALE)
-    drawn.setCenter(500, 500)
-    stars = [piff.Star(piff.StarData(drawn, galsim.PositionD(500, 500)), None)]
-    psf.fit(stars, {0: galsim.PixelScale(SCALE)}, None)
-    psf.write("model.piff")
-    has_shear(run("Piff", stamps(lambda x, y: galsim.Moffat(beta=3.0, fwhm=0.7)))["catalogue"])
+    for wcs in (ROTATED, galsim.PixelScale(SCALE)):
+        # A model as Piff stores it, fitted to one star.
+        psf = piff.SimplePSF(piff.Moffat(3.0), piff.Mean())
+        drawn = galsim.Moffat(beta=3.0, fwhm=0.7).drawImage(nx=41, ny=41, wcs=wcs)
+        drawn.setCenter(500, 500)
+        stars = [piff.Star(piff.StarData(drawn, galsim.PositionD(500, 500)), None)]
+        psf.fit(stars, {0: wcs}, None)
+        psf.write("model.piff")
+        has_shear(run("Piff", stamps(lambda x, y: galsim.Moffat(beta=3.0, fwhm=0.7), wcs=wcs))["catalogue"])
     monkeypatch.setenv("SHEARQ_PYTHON", sys.executable)
     has_shear(gathered("Piff", lambda x, y: galsim.Moffat(beta=3.0, fwhm=0.7)), abs=0.01)
 
@@ -84,7 +90,8 @@ def test_psfex(tmp_path, monkeypatch):
 
     monkeypatch.chdir(tmp_path)
     write_psfex("model.psf")
-    has_shear(run("PSFEx", stamps(lambda x, y: galsim.Gaussian(sigma=1.99 * SCALE)))["catalogue"], abs=0.01)
+    galsim.Image(500, 500, wcs=SKY).write("field.fits")
+    has_shear(run("PSFEx", stamps(lambda x, y: galsim.Gaussian(sigma=1.99 * SCALE), wcs=SKY))["catalogue"], abs=0.01)
     has_shear(gathered("PSFEx", lambda x, y: galsim.Gaussian(sigma=(1.8 + 4e-4 * x) * SCALE)), abs=0.01)
 
 

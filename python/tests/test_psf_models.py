@@ -3,6 +3,7 @@
 import io
 import logging
 import sys
+import warnings
 from types import SimpleNamespace
 
 import numpy as np
@@ -156,6 +157,39 @@ def test_psfex_files_are_drawn_without_another_pixel(tmp_path):
     found = shearq.measure(stamps, psf, noise=1.0, x=at, y=np.full(20, 500.0))
     # Another pixel would make the first wider by 2 %.
     assert found["psf_sigma"][0] == pytest.approx(1.8, rel=5e-3) and found["psf_sigma"][-1] == pytest.approx(2.2, rel=5e-3)
+
+
+def test_places_off_the_chip_and_forgotten_wcs_are_warned_of(field, tmp_path):
+    des = pytest.importorskip("galsim.des")
+    write_psfex(tmp_path / "model.psf")
+    places, stamps = field
+    # On the chip of the model of PSFEx.
+    stamps, (x, y) = stamps[:40], places[:40].T / 2
+    turned = galsim.AffineTransform(0.0, SCALE, -SCALE, 0.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        right = galsim.PixelScale(SCALE)
+        expected = shearq.measure(stamps, des.DES_PSFEx(str(tmp_path / "model.psf"), wcs=right), noise=1.0, x=x, y=y)
+    with pytest.warns(shearq.DataWarning, match=r"none is given, .* Try: wcs=psf.wcs for shapes on the sky, or wcs=np.eye\(2\)"):
+        found = shearq.measure(stamps, des.DES_PSFEx(str(tmp_path / "model.psf"), wcs=turned), noise=1.0, x=x, y=y)
+    # This PSF is round.
+    assert np.allclose(found["e1"], expected["e1"], atol=1e-4)
+
+    class Fitted:
+        """The attributes of a model of Piff."""
+
+        interp_property_names = ("u", "v")
+        stars = [SimpleNamespace(image_pos=galsim.PositionD(*place)) for place in places]
+        wcs = {3: turned}
+
+        def draw(self, x, y, stamp_size, center, chipnum):
+            return galsim.Image(exact(0, 0).drawImage(nx=stamp_size, ny=stamp_size, scale=SCALE).array)
+
+    far = np.where(np.arange(40) == 7, 1e5, x)
+    with pytest.warns(shearq.DataWarning, match=r"1 of 40 galaxies are far .* galaxy 7 is at x = 100000"):
+        shearq.measure(stamps, Fitted(), noise=1.0, x=far, y=y, wcs=turned, properties={"chipnum": 3})
+    with pytest.warns(shearq.DataWarning, match=r"Try: wcs=psf.wcs\[3\]"):
+        shearq.measure(stamps, Fitted(), noise=1.0, x=x, y=y, properties={"chipnum": 3})
 
 
 class RubinPsf:

@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from . import _shearq
 from ._arrays import double, shown
 from ._galsim import PixelOfPsf, _is_image, _is_profile, drawn, no_pixel
-from ._wcs import jacobians
+from ._warn import DataWarning, warn
+from ._wcs import _local, jacobians
 
 FINE_PROFILE = (
     "psf_oversampling: found with profiles of GalSim, which are drawn on the pixels of the stamps; expected images of PSFs on finer pixels."
@@ -99,6 +101,60 @@ def _draw_of(psf: Any, pixel: PixelOfPsf | None = None, fine: bool = False) -> _
     return None
 
 
+def _own_wcs(psf: Any, properties: Mapping[str, Any]) -> tuple[Any, str]:
+    """The WCS that a model of Piff or PSFEx has, and how to write it; None for others."""
+    wcs = getattr(psf, "wcs", None)
+    if not isinstance(wcs, Mapping):
+        return (wcs, "psf.wcs") if hasattr(wcs, "isUniform") else (None, "")
+    chips = list(wcs)
+    chip = np.ravel(properties["chipnum"])[0] if "chipnum" in properties else chips[0] if chips else None
+    return wcs.get(chip), f"psf.wcs[{chip}]"
+
+
+# Distance from the stars of a model in units of their range, from which galaxies are not on its chip. Chosen by hand: a few stars seldom
+# reach the borders of their chip.
+MAX_EXTRAPOLATION = 1.0
+
+
+def _range_of_stars(psf: Any) -> NDArray[np.float64] | None:
+    """The least and largest x and y of the stars of a model of Piff or PSFEx; None if it does not state them."""
+    stars = [star.image_pos for star in getattr(psf, "stars", None) or ()]
+    if len(stars) > 1:
+        at = np.array([(star.x, star.y) for star in stars])
+        return np.stack([at.min(axis=0), at.max(axis=0)])
+    if all(hasattr(psf, name) for name in ("x_zero", "y_zero", "x_scale", "y_scale")):
+        # POLZERO is the middle of the range, and POLSCAL its width.
+        middle, width = np.array([psf.x_zero, psf.y_zero]), np.array([psf.x_scale, psf.y_scale])
+        return np.stack([middle - width / 2, middle + width / 2])
+    return None
+
+
+def _doubts(psf: Any, places: NDArray[np.float64], wcs: Any, properties: Mapping[str, Any]) -> None:
+    """Warns of places that are not on the chip of a model, and of pixels whose WCS the model has and the call has not."""
+    stars = _range_of_stars(psf)
+    if stars is not None:
+        margin = MAX_EXTRAPOLATION * (stars[1] - stars[0])
+        outside = ((places < stars[0] - margin) | (places > stars[1] + margin)).any(axis=1)
+        if outside.any():
+            k = int(outside.argmax())
+            (x0, y0), (x1, y1) = stars
+            warn(
+                f"psf: {int(outside.sum())} of {len(places)} galaxies are far from the stars of the model: galaxy {k} is at x = {places[k, 0]:.6g},"
+                f" y = {places[k, 1]:.6g} (expected x from {x0:.6g} to {x1:.6g} and y from {y0:.6g} to {y1:.6g}, about)."
+                " Try: x=, y=, in pixels of the exposure to which the model was fitted",
+                DataWarning,
+            )
+    own, name = _own_wcs(psf, properties)
+    if wcs is None and own is not None:
+        matrix = np.array(_local(own, None if own.isUniform() else places[0]))
+        if not _shearq.are_aligned(matrix[np.newaxis]):
+            warn(
+                f"psf: the model has a WCS whose pixels are rotated, mirrored or sheared, and none is given, so that shapes are in the frame"
+                f" of the pixels. Try: wcs={name} for shapes on the sky, or wcs=np.eye(2) if this frame is meant",
+                DataWarning,
+            )
+
+
 class PsfsOfModel:
     """The PSFs of a model at galaxies as an array of shape (n, py, px) that is drawn when its rows are read."""
 
@@ -179,7 +235,9 @@ def at_galaxies(
         if np.ndim(value) and len(value) != count:  # type: ignore[arg-type]
             raise ValueError(f"properties: {name} has {len(value)} values; expected one, or {count}")  # type: ignore[arg-type]
     matrices = None if wcs is None else jacobians(wcs, count, x, y)
-    return PsfsOfModel(draw, side, np.stack(places, axis=-1), matrices, given)
+    at = np.stack(places, axis=-1)
+    _doubts(psf, at, wcs, given)
+    return PsfsOfModel(draw, side, at, matrices, given)
 
 
 def one(model: Any, side: int, x: float, y: float, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
