@@ -113,6 +113,17 @@ def test_planes_are_missing_pixels_by_name():
         shearq.from_exposure(found, x, y)
 
 
+def test_places_and_masks_that_leave_no_galaxy_are_named():
+    found, (x, y) = exposure(0)
+    x[3] = np.nan
+    with pytest.raises(ValueError, match=r"x: found nan in row 3 \(from 0\), and 1 such rows; expected finite places. Try: rows"):
+        shearq.from_exposure(found, x, y)
+    found.mask.array[:] = 1 << PLANES["SAT"]
+    found.mask.array[:90] |= 1 << PLANES["BAD"]
+    with pytest.raises(ValueError, match="exposure: all pixels are masked .by BAD 10%, SAT 100%.*Try: planes="):
+        shearq.from_exposure(found, y, y)
+
+
 def as_images(found):
     """The same as lsst.images has it."""
     plain = SimpleNamespace

@@ -150,8 +150,15 @@ def from_exposure(
     side = whole("size", size, 1, 1 << 12)
     columns = [double(name, value) for name, value in (("x", x), ("y", y))]
     for name, column in zip("xy", columns):
-        if column.ndim != 1 or column.shape != columns[0].shape or not np.isfinite(column).all():
-            raise ValueError(f"{name}: found an array of shape {shown(column.shape)}; expected finite places of shape (n,) like x")
+        if column.ndim != 1 or column.shape != columns[0].shape:
+            raise ValueError(f"{name}: found an array of shape {shown(column.shape)}; expected places of shape (n,) like x")
+        bad = ~np.isfinite(column)
+        if bad.any():
+            row = int(bad.argmax())
+            raise ValueError(
+                f"{name}: found {column[row]:g} in row {row} (from 0), and {int(bad.sum())} such rows; expected finite places."
+                " Try: rows for which np.isfinite(x) & np.isfinite(y)"
+            )
     image, variance, first, own_psf, wcs, known = _parts(exposure)
     psf = own_psf if psf is None else psf
     for what, value, hint in (("PSF", psf, ". Try: psf="), ("WCS", wcs, "")):
@@ -162,12 +169,18 @@ def from_exposure(
     if absent:
         raise ValueError(f"planes: the mask has no plane {', '.join(absent)}; expected some of {', '.join(sorted(known))}")
     missing = ~(np.isfinite(variance) & (variance > 0))
+    shares = {"the variance": missing.mean()}
     for name in names:
-        missing |= known[name]()
+        of_plane = known[name]()
+        shares[name] = of_plane.mean()
+        missing |= of_plane
+    if missing.all():
+        masked = ", ".join(f"{name} {share:.0%}" for name, share in shares.items() if share > 0)
+        raise ValueError(f"exposure: all pixels are masked (by {masked}); expected some good ones. Try: planes=, without one that marks good pixels")
     stamps = np.full((len(columns[0]), side, side), np.nan, dtype=image.dtype)
     noise = np.empty(len(stamps))
     offsets = np.empty((len(stamps), 2))
-    typical = np.sqrt(np.median(variance[~missing])) if not missing.all() else np.nan
+    typical = np.sqrt(np.median(variance[~missing]))
     for k, place in enumerate(zip(*columns)):
         # From the corner of the stamp, whose pixels are whole numbers.
         at = [value - start for value, start in zip(place, first)]
