@@ -33,6 +33,20 @@ def test_faults_are_found_where_they_are():
     assert found["x"]["g2"][0] - found["x"]["g2"][1] > 0.015
 
 
+def test_tables_are_read_from_files(tmp_path):
+    pytest.importorskip("treecorr")
+    table = pytest.importorskip("astropy.table")
+    field = _field(np.random.default_rng(5))
+    expected = shearq.null_tests(field, **SEPARATIONS)
+    table.Table(field).write(tmp_path / "shears.fits")
+    found = shearq.null_tests(tmp_path / "shears.fits", points=tmp_path / "shears.fits", **SEPARATIONS)
+    assert np.allclose(found["modes"]["xip"], expected["modes"]["xip"]) and "points" in found
+    with pytest.raises(ValueError, match="shears: found the path shears.csv; expected a Parquet or FITS file"):
+        shearq.null_tests("shears.csv")
+    with pytest.raises(FileNotFoundError, match="stars: there is no file none.fits"):
+        shearq.null_tests(field, stars="none.fits")
+
+
 def test_leakage_and_the_psf_are_tested_by_default():
     pytest.importorskip("treecorr")
     rng = np.random.default_rng(9)

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import pathlib
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+
+from . import _shearq
+from ._tables import file_format
 
 _DEGREES = {"ra_units": "deg", "dec_units": "deg"}
 _PSF = ("psf_e1", "psf_e2")
@@ -21,12 +26,12 @@ def null_tests(
 
     Parameters
     ----------
-    shears : table or mapping of columns
+    shears : table or mapping of columns, or path of a Parquet or FITS file
         ``ra``, ``dec`` in degrees, ``g1``, ``g2`` and perhaps ``w``, ``psf_e1`` and ``psf_e2``, as ``shearq shear`` writes them.
         Galaxies without a shear are left out.
-    points : table or mapping of columns, optional
+    points : as shears, optional
         ``ra``, ``dec`` of points without mass, such as stars or random places.
-    stars : table or mapping of columns, optional
+    stars : as shears, optional
         ``ra``, ``dec``, ellipticities ``e1``, ``e2`` and size ``T`` of stars, and those of the PSF model at their places,
         ``model_e1``, ``model_e2`` and ``model_T``, in the frame of the sky. The most telling stars are those that the model was not fitted to.
     against : tuple of str, optional
@@ -59,6 +64,7 @@ def null_tests(
         import treecorr
     except ImportError as error:
         raise ImportError("null_tests needs TreeCorr. Try: pip install treecorr") from error
+    shears, points, stars = (_read(name, table) for name, table in (("shears", shears), ("points", points), ("stars", stars)))
     separations = {"min_sep": 1.0, "max_sep": 100.0, "nbins": 10, "sep_units": "arcmin", **separations}
     names = _names(shears)
     if against is None:
@@ -133,6 +139,18 @@ def _means(galaxies: Mapping[str, Any], weight: Any, name: str, bins: int) -> di
             rows[key].append(mean)
             rows[f"{key}_error"].append(np.sqrt(np.sum((w * (galaxies[key][chosen] - mean)) ** 2)) / np.sum(w))
     return {key: np.array(values) for key, values in rows.items()}
+
+
+def _read(name: str, table: Any) -> Any:
+    """A table, which a path may name."""
+    if not isinstance(table, (str, os.PathLike)):
+        return table
+    file = pathlib.Path(table)
+    if file.suffix.lower() not in (".parquet", ".pq", ".fits", ".fit"):
+        raise ValueError(f"{name}: found the path {file}; expected a Parquet or FITS file, or a table. Try: pandas.read_csv, or astropy.table.Table.read")
+    if not file.exists():
+        raise FileNotFoundError(f"{name}: there is no file {file}")
+    return _shearq.read_table(str(file), file_format(file), [])[0]
 
 
 def _names(table: Any) -> list[str]:
