@@ -80,6 +80,8 @@ def test_piff(tmp_path, monkeypatch):
         stars = [piff.Star(piff.StarData(drawn, galsim.PositionD(500, 500)), None)]
         psf.fit(stars, {0: wcs}, None)
         psf.write("model.piff")
+        with pytest.raises(ValueError, match=r"psf: model.piff: .* Try: psf=piff.PSF.read\('model.piff'\), with x= and y="):
+            shearq.measure(np.zeros((9, 48, 48)), "model.piff")
         has_shear(run("Piff", stamps(lambda x, y: galsim.Moffat(beta=3.0, fwhm=0.7), wcs=wcs))["catalogue"])
     monkeypatch.setenv("SHEARQ_PYTHON", sys.executable)
     has_shear(gathered("Piff", lambda x, y: galsim.Moffat(beta=3.0, fwhm=0.7)), abs=0.01)
@@ -90,6 +92,8 @@ def test_psfex(tmp_path, monkeypatch):
 
     monkeypatch.chdir(tmp_path)
     write_psfex("model.psf")
+    with pytest.raises(ValueError, match=r"psf: model.psf: .* Try: psf=galsim.des.DES_PSFEx\('model.psf'\), with x= and y="):
+        shearq.measure(np.zeros((9, 48, 48)), "model.psf")
     galsim.Image(500, 500, wcs=SKY).write("field.fits")
     has_shear(run("PSFEx", stamps(lambda x, y: galsim.Gaussian(sigma=1.99 * SCALE), wcs=SKY))["catalogue"], abs=0.01)
     has_shear(gathered("PSFEx", lambda x, y: galsim.Gaussian(sigma=(1.8 + 4e-4 * x) * SCALE)), abs=0.01)

@@ -26,13 +26,29 @@ def _is_hdu(value: Any) -> bool:
     return hasattr(value, "header") and hasattr(value, "data") and hasattr(value.header, "cards")
 
 
+# What opens the models of PSFs that FITS files contain, by cards of their headers.
+_MODELS = {b"EXTNAME = 'PSF_DATA'": "galsim.des.DES_PSFEx", b"EXTNAME = 'psf     '": "piff.PSF.read"}
+# Bytes in which these cards are: some headers without data before them.
+_HEADERS = 1 << 16
+
+
+def _of_model(path: str) -> str:
+    """The remedy for a file with a model of the PSF; empty for others."""
+    try:
+        with open(path, "rb") as file:
+            start = file.read(_HEADERS)
+    except OSError:
+        return ""
+    return next((f". Try: psf={opener}({path!r}), with x= and y=" for card, opener in _MODELS.items() if card in start), "")
+
+
 def _opened(name: str, value: Any, has_wcs: bool) -> tuple[Any, NDArray[np.float64] | None]:
     """The pixels of a path or HDU and the Jacobians of its images; anything else as it is, without."""
     if isinstance(value, (str, os.PathLike)):
         try:
             pixels, matrices, fault, messages = _shearq.read_images(os.fspath(value), name == "psf")
         except ValueError as error:
-            raise ValueError(f"{name}: {error}") from None
+            raise ValueError(f"{name}: {error}{_of_model(os.fspath(value)) if name == 'psf' else ''}") from None
     elif _is_hdu(value):
         pixels = value.data
         if pixels is None or np.ndim(pixels) not in (2, 3):
