@@ -135,6 +135,12 @@ def test_odd_tables_are_refused():
         shearq.bias({"name": [["a"]]}, g1=0, g2=0)
     with pytest.raises(ValueError, match="found none"):
         shearq.bias([], g1=0, g2=0)
+    with pytest.raises(ValueError, match="parts: found none; expected the sums of one or more catalogues"):
+        shearq.BiasSums.merge([])
+    with pytest.raises(ValueError, match=r"catalogue 1: found an array of shape \(9, 2\) .* Try: {'e1': array\[:, 0\]"):
+        shearq.bias(np.zeros((9, 2)), g1=0, g2=0)
+    with pytest.raises(ValueError, match=r"catalogue 1: found a dict of one row .* Try: pandas.DataFrame\(rows\)"):
+        shearq.bias([{"e1": 0.1, "e2": 0.2}, {"e1": 0.1, "e2": 0.1}], g1=0, g2=0)
     twice = pandas.DataFrame(np.zeros((9, 3)), columns=["e1", "e2", "e1"])
     for function in (shearq.Catalogue.from_table, lambda table: shearq.bias(table, g1=0, g2=0)):
         with pytest.raises(ValueError, match="column e1 is there several times"):

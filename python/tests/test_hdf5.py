@@ -70,6 +70,16 @@ def test_a_group_is_a_table_of_its_datasets(tmp_path):
         shearq.bias(f"{paths[0]}:catalog/sheared_1p", g1=0.02, g2=0)
 
 
+def test_groups_are_listed_beside_datasets_that_are_no_columns(tmp_path):
+    with h5py.File(tmp_path / "mixed.h5", "w") as file:
+        file["image"] = np.zeros((30, 30))
+        file["catalog/e1"] = file["catalog/e2"] = np.zeros(30)
+        for source in (file, tmp_path / "mixed.h5"):
+            file.flush()
+            with pytest.raises(ValueError, match="found an HDF5 group without columns of numbers; .* Try: FILE:GROUP with one of catalog"):
+                shearq.bias(source, g1=0, g2=0)
+
+
 def test_columns_of_unlike_lengths_are_refused(tmp_path):
     with h5py.File(tmp_path / "odd.h5", "w") as file:
         file["e1"], file["e2"] = np.zeros(3), np.zeros(4)

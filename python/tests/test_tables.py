@@ -34,6 +34,24 @@ def test_streams_and_datasets_of_arrow(expected, tmp_path):
     equal(shearq.bias(pyarrow.dataset.dataset(tmp_path), **TRUTH), expected)
 
 
+def test_objects_that_make_tables_say_how(tmp_path):
+    pyarrow = pytest.importorskip("pyarrow", reason="needs pyarrow")
+    import pyarrow.dataset
+    import pyarrow.parquet
+
+    pyarrow.parquet.write_table(pyarrow.table(COLUMNS), tmp_path / "a.parquet")
+    wrong = {r"Scanner .* Try: .to_table\(\)": pyarrow.dataset.dataset(tmp_path).scanner(), r"ParquetFile .* Try: .read\(\)": pyarrow.parquet.ParquetFile(tmp_path / "a.parquet")}
+    try:
+        import duckdb
+    except ImportError:
+        pass
+    else:
+        wrong[r"DuckDBPyConnection .* Try: connection.sql\(QUERY\)"] = duckdb.connect().execute("SELECT 1 AS e1, 2 AS e2")
+    for message, table in wrong.items():
+        with pytest.raises(ValueError, match=f"catalogue 1: found {message}"):
+            shearq.bias(table, **TRUTH)
+
+
 def test_streams_of_arrow_keep_only_needed_columns():
     pyarrow = pytest.importorskip("pyarrow", reason="needs pyarrow")
     rows = 4000

@@ -10,6 +10,7 @@ from typing import Any, Literal, Union
 import numpy as np
 
 from . import _display, _hdf5, _shearq
+from ._arrays import shown
 from ._results import Result, origin, write
 from ._tables import _EXACT, is_missing, named_columns, narrowed
 
@@ -131,7 +132,10 @@ class BiasSums:
     @staticmethod
     def merge(parts: Iterable[BiasSums]) -> BiasSums:
         """The sums of all parts, in their order."""
-        first, *others = parts
+        given = list(parts)
+        if not given:
+            raise ValueError("parts: found none; expected the sums of one or more catalogues")
+        first, *others = given
         inputs = {path: print for part in (first, *others) for path, print in part._made_by["inputs"].items()}
         return BiasSums(first._sums.append([part._sums for part in others]), {**first._made_by, "inputs": inputs})
 
@@ -365,6 +369,7 @@ def _catalogue(
     name: str, table: Any, needed: Callable[[Sequence[str]], list[str]] | None = None
 ) -> str | tuple[str, list[tuple[str, Any]], list[str]]:
     """A path, or a name with columns of float64 or of text, and the names of those that are not needed."""
+    source = table
     if isinstance(table, (str, os.PathLike)):
         path = os.fspath(table)
         if not _hdf5.is_hdf5(path):
@@ -383,8 +388,29 @@ def _catalogue(
         given = []
     columns = [(label, values) for label, own in given if (values := _values(own)) is not None]
     if not columns:
-        raise ValueError(f"{name}: found {type(table).__name__} without columns of numbers; expected a table with e1 and e2")
+        found, remedy = _no_table(source)
+        raise ValueError(f"{name}: found {found} without columns of numbers; expected a table with e1 and e2{remedy}")
     return name, columns, unread
+
+
+def _no_table(source: Any) -> tuple[str, str]:
+    """What an object without columns is, and what makes a table of it."""
+    kind = type(source).__name__
+    if isinstance(source, (str, os.PathLike)) or _hdf5.is_group(source):
+        return "an HDF5 group", _hdf5.listing(source)
+    if isinstance(source, np.ndarray):
+        columns = source.ndim == 2 and source.shape[1] > 1
+        return f"an array of shape {shown(source.shape)}", ". Try: {'e1': array[:, 0], 'e2': array[:, 1]}" if columns else ""
+    if isinstance(source, Mapping) and source and all(np.ndim(value) == 0 for value in source.values()):
+        return f"a {kind} of one row", ". Try: pandas.DataFrame(rows)"
+    if hasattr(source, "to_table"):
+        return kind, ". Try: .to_table() of it"
+    if hasattr(source, "read") and hasattr(source, "schema_arrow"):
+        return kind, ". Try: .read() of it, or the path of the file"
+    if hasattr(source, "fetchnumpy"):
+        # Of duckdb.
+        return kind, ". Try: connection.sql(QUERY), not execute"
+    return kind, ""
 
 
 def _values(column: Any) -> Any:

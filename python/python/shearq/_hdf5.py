@@ -116,6 +116,17 @@ def _listing(group: Any) -> str:
     return f". Try: FILE:GROUP with one of {', '.join(tables[:8])}" if tables else ""
 
 
+def listing(source: Any) -> str:
+    """The remedy that lists the tables in a group of h5py, or of FILE or FILE:GROUP."""
+    if not isinstance(source, (str, os.PathLike)):
+        return _listing(source)
+    import h5py
+
+    path, given = _parts(os.fspath(source))
+    with h5py.File(path, "r") as file:
+        return _listing(file[given or "/"])
+
+
 def table(source: Any, name: str) -> Hdf5Table:
     """The table of a group of h5py, or of FILE or FILE:GROUP: the only group of the file with columns if none is named."""
     try:
