@@ -91,7 +91,7 @@ def test_profiles_are_drawn_on_the_pixels_of_the_wcs(field):
         ({"psf": profiles}, TypeError, "stamps that have no WCS.* Try: wcs="),
         ({"psf": profiles, "wcs": wcs, "psf_oversampling": 2}, ValueError, "psf_oversampling: found with profiles"),
         ({"psf": exact, "wcs": wcs, "psf_oversampling": 2, "x": places[:, 0], "y": places[:, 1]}, ValueError, "psf_oversampling: found with profiles"),
-        ({"psf": np.ones((145, 145)), "psf_oversampling": 3}, ValueError, r"psf: found images of shape \(145, 145\) .* Try: draw the PSF on 144 × 144 or 147 × 147"),
+        ({"psf": np.ones((145, 145)), "psf_oversampling": 3}, ValueError, r"psf: found an oversampled PSF of shape \(145, 145\) .* Try: draw the PSF on 144 × 144 or 147 × 147"),
     ]
     for arguments, kind, message in wrong:
         with pytest.raises(kind, match=message):

@@ -55,6 +55,17 @@ def test_a_wrong_noise_is_warned_of_and_a_right_one_is_not(image):
     assert not measured(image, image.stamps, noise=1.0)
 
 
+def test_masks_of_good_pixels_are_named(image):
+    mask = np.zeros(image.stamps.shape, bool)
+    mask[:, 5, 5] = True
+    assert not measured(image, image.stamps, mask=mask)
+    with pytest.warns(shearq.DataWarning, match="mask: found 100% of the pixels marked; .* Try: mask=~mask"):
+        with pytest.raises(ValueError, match="144 of them with missing pixels"):
+            shearq.measure(image.stamps, image.psf, mask=~mask)
+    with pytest.raises(ValueError, match="mask: found 100% of the pixels marked; .* Try: mask=~mask"):
+        shearq.measure(image.stamps, image.psf, mask=np.ones((48, 48), bool))
+
+
 def test_units_out_of_range_are_an_error_of_the_stamps(image):
     with pytest.raises(ValueError, match="stamps: pixel values are out of range"):
         shearq.measure(image.stamps * np.float32(1e20), image.psf)

@@ -229,6 +229,7 @@ def measure(
             if value is None:
                 raise TypeError(f"{name}: found none; expected stamps and their PSF, or epochs")
         stamps, psf, wcs = _pixels(stamps, psf, wcs, x, y, properties, pixel, psf_oversampling)
+        _doubt_mask(mask)
         return _measure([_image(stamps, psf, noise, mask, wcs, x, y)], (ids, x, y), settings, count, done)
     given = {"stamps": stamps, "psf": psf, "noise": noise, "mask": mask, "wcs": wcs, "properties": properties, "pixel": pixel}
     if psf_oversampling != 1:
@@ -346,7 +347,7 @@ def _on_galaxy_pixels(psf: Any, oversampling: int | None) -> Any:
     if sides:
         nearest = sides[0] // factor * factor
         raise ValueError(
-            f"psf: found images of shape {shown(images.shape[-2:])} with psf_oversampling={factor}; expected sides of a multiple of {factor}."
+            f"psf: found an oversampled PSF of shape {shown(images.shape[-2:])} with psf_oversampling={factor}; expected multiples of {factor}."
             f" Try: draw the PSF on {nearest} × {nearest} or {nearest + factor} × {nearest + factor} pixels, centred in their middle"
         )
     if images.ndim == 2:
@@ -369,6 +370,21 @@ def _pixels(
     of_profiles = None if isinstance(psf, _psf_models.PsfsOfModel) else pixel
     stamps, psf = _galsim.unpacked(stamps, psf, check=wcs is None and not fine, pixel=of_profiles, wcs=wcs, x=x, y=y)
     return stamps, _on_galaxy_pixels(psf, oversampling), wcs
+
+
+# Share of pixels from which a mask is likely the one of good pixels. Chosen by hand: usual masks mark some per cent.
+MAX_MASKED = 0.5
+
+
+def _doubt_mask(mask: Any) -> None:
+    """Refuses a mask of all pixels, and warns of one of most."""
+    given = np.asarray(mask)
+    share = float(given.mean()) if given.dtype == bool else 0.0
+    if share > MAX_MASKED:
+        message = f"mask: found {share:.0%} of the pixels marked; expected True for missing pixels. Try: mask=~mask, if it marks good ones"
+        if share == 1.0:
+            raise ValueError(message)
+        warn(message, DataWarning)
 
 
 def _epoch(k: int, epoch: Mapping[str, Any]) -> dict[str, Any]:
