@@ -118,7 +118,7 @@ MAX_EXTRAPOLATION = 1.0
 
 def _range_of_stars(psf: Any) -> NDArray[np.float64] | None:
     """The least and largest x and y of the stars of a model of Piff or PSFEx; None if it does not state them."""
-    stars = [star.image_pos for star in getattr(psf, "stars", None) or ()]
+    stars = [star.image_pos for star in getattr(psf, "stars", None) or () if hasattr(star, "image_pos")]
     if len(stars) > 1:
         at = np.array([(star.x, star.y) for star in stars])
         return np.stack([at.min(axis=0), at.max(axis=0)])
