@@ -895,7 +895,11 @@ fn simulated_galaxies_are_weighted_to_those_of_a_survey() {
     folder.write("plain.csv", plain);
     let weighted = [0, 1, 2, 3].map(|k| KINDS[k].0 * KINDS[k].1 * numbers[k] as f64);
     let faint = [weighted[0], weighted[1], 0.0, 0.0];
-    for (options, weights) in [("", weighted), ("--where 'snr < 15'", faint)] {
+    for (options, weights) in [
+        ("", weighted),
+        ("--where 'snr < 15'", faint),
+        ("--where 'snr - 20'", faint),
+    ] {
         let line = format!("{command} --columns w=snr*size {options} --like plain.csv");
         let found = folder.json(&line);
         assert_m(&found["rows"][1], [mean(weights); 2], 1e-9);

@@ -208,6 +208,13 @@ impl Expression {
     pub fn value(&self, value: &impl Fn(usize) -> f64) -> f64 {
         self.root.value(value)
     }
+
+    /// Whether a row for which the value is not zero counts: an infinite value is that of a division by zero. `None` if a
+    /// number is missing.
+    pub fn holds(&self, value: &impl Fn(usize) -> f64) -> Option<bool> {
+        let value = self.value(value);
+        (!value.is_nan()).then_some(value.is_finite() && value != 0.0)
+    }
 }
 
 impl Node {
@@ -599,6 +606,11 @@ mod tests {
         let quoted = Expression::parse("`my band` == 'r*'").unwrap();
         assert_eq!(quoted.operands()[0].column, "my band");
         assert!((value("cos(radians(2*pa))", &[45.0])).abs() < 1e-16);
+        let held = [-2.0, 0.0, f64::INFINITY, f64::NAN].map(|a| {
+            let expression = Expression::parse("a").unwrap();
+            expression.holds(&|_| a)
+        });
+        assert_eq!(held, [Some(true), Some(false), Some(false), None]);
         let twice = Expression::parse("a*a + b").unwrap();
         assert!(twice.columns().eq(["a", "b"]));
     }

@@ -560,29 +560,27 @@ impl<'a> TableRows<'a> {
     fn binned(&self, at: usize, sheared: usize) -> Option<[f64; MAX_AXES]> {
         let mut values = [0.0; MAX_AXES];
         // A sheared catalogue without the columns of the expression selects nothing.
-        let value = |expression: &Expression, places: Option<&[usize]>| {
-            let places = places?;
-            let value = expression.value(&|k| self.value(places[k], at));
-            (!value.is_infinite()).then_some(value)
-        };
-        let mut selected = 1.0;
+        let mut selected = Some(true);
         if let Some(condition) = self.reading.condition() {
             let places = self.source.places.all((Role::Condition, sheared));
-            let places = (places.len() == condition.operands().len()).then_some(places);
-            selected = value(condition, places)?;
+            let places = (places.len() == condition.operands().len()).then_some(places)?;
+            selected = condition.holds(&|k| self.value(places[k], at));
         }
-        if selected == 0.0 {
+        if selected == Some(false) {
             return None;
         }
         let mut places = self.source.places.all((Role::Binned, sheared));
         for (own, expression) in values.iter_mut().zip(self.reading.binned()) {
             let (first, rest) = places.split_at_checked(expression.operands().len())?;
-            *own = value(expression, Some(first))?;
+            *own = expression.value(&|k| self.value(first[k], at));
+            if own.is_infinite() {
+                return None;
+            }
             places = rest;
         }
-        Some(match selected.is_nan() {
-            true => [f64::NAN; MAX_AXES],
-            false => values,
+        Some(match selected {
+            Some(_) => values,
+            None => [f64::NAN; MAX_AXES],
         })
     }
 

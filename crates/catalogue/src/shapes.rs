@@ -213,16 +213,15 @@ impl MeasuredShapes {
             if !e.iter().all(|e| e.is_finite()) {
                 continue;
             }
-            let holds = condition.value(&|place| columns[place][row]);
-            if holds.is_nan() {
+            let Some(holds) = condition.holds(&|place| columns[place][row]) else {
                 let message = format!(
                     "row {}: a number of `{}` is missing (expected one in each row without a flag)",
                     row + 1,
                     condition.text()
                 );
                 return Err(FileError::new(path, message));
-            }
-            if holds == 0.0 {
+            };
+            if !holds {
                 *e = [0.0; 2];
                 self.response[row] = [[0.0; 2]; 2];
                 self.weight[row] = 0.0;

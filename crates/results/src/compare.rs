@@ -242,7 +242,7 @@ pub fn choose(
     for run in &mut runs {
         let mut sets = std::mem::take(&mut run.sets);
         sets.retain(|set| {
-            let held = condition.value(&|place| match (
+            let holds = condition.holds(&|place| match (
                 &condition.operands()[place].pattern,
                 columns[place].number(set),
             ) {
@@ -254,7 +254,7 @@ pub fn choose(
                 }
             });
             // A missing number, such as Q of a set without errors, meets no condition.
-            held != 0.0 && !held.is_nan()
+            holds == Some(true)
         });
         run.sets = sets;
     }

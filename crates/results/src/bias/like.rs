@@ -237,7 +237,7 @@ impl<'r> Survey<'r> {
         let bins = bins.transpose()?;
         for at in 0..frame.height() {
             let weight = weights.as_ref().map_or(1.0, |weights| weights[at]);
-            let holds = |own: &Expression| own.value(&|k| compared[k][at]) > 0.0;
+            let holds = |own: &Expression| own.holds(&|k| compared[k][at]) == Some(true);
             // NaN is no weight either.
             let is_used = weight > 0.0
                 && flags.iter().all(|flag| flag[at] == 0.0)
