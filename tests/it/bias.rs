@@ -904,6 +904,12 @@ fn simulated_galaxies_are_weighted_to_those_of_a_survey() {
         let found = folder.json(&line);
         assert_m(&found["rows"][1], [mean(weights); 2], 1e-9);
     }
+    // The survey may write its columns in another case.
+    folder.write("capitals.csv", plain.replace("snr,size", "SNR,Size"));
+    let capitals = folder.json(&format!(
+        "{command} --where 'snr < 15' --like capitals.csv"
+    ));
+    assert_m(&capitals["rows"][1], [mean([3.0, 1.0, 0.0, 0.0]); 2], 1e-9);
     // Without a survey, bins without galaxies are a mistake.
     folder.refuses(&command, "no galaxy that counts has snr 50 to 90");
 }

@@ -89,9 +89,9 @@ struct Survey<'r> {
     tomography: Option<String>,
     /// `--where`, if the survey has its columns.
     condition: Option<&'r Expression>,
-    /// What is binned, and compared by the condition.
-    binned: Vec<&'r Operand>,
-    compared: &'r [Operand],
+    /// What is binned, and compared by the condition, by the survey's names of the columns.
+    binned: Vec<Operand>,
+    compared: Vec<Operand>,
     formulas: Vec<Expression>,
     /// What is used, in words.
     columns: String,
@@ -112,8 +112,15 @@ impl<'r> Survey<'r> {
             },
         };
         let there = |name: &str| -> Option<String> {
-            let mut known = known.iter();
-            known.find(|own| own.eq_ignore_ascii_case(name)).cloned()
+            let exact = known.iter().find(|own| *own == name);
+            let similar = || known.iter().find(|own| own.eq_ignore_ascii_case(name));
+            exact.or_else(similar).cloned()
+        };
+        let own = |operand: &Operand| -> Option<Operand> {
+            Some(Operand {
+                column: there(&operand.column)?,
+                ..operand.clone()
+            })
         };
         let absent = |name: &str| FileError::no_column(path, name, &known);
         let names = request.names.within(&known);
@@ -137,15 +144,15 @@ impl<'r> Survey<'r> {
             Some(name) => Some(there(name).ok_or_else(|| absent(name))?),
             None => TOMOGRAPHY.iter().find_map(|name| there(name)),
         };
-        let bins = request.bins.iter();
-        let binned: Vec<&Operand> = bins.flat_map(|own| own.of.operands()).collect();
-        if let Some(operand) = binned.iter().find(|own| !known.contains(&own.column)) {
-            return Err(absent(&operand.column));
-        }
+        let binned = request.bins.iter().flat_map(|bins| bins.of.operands());
+        let binned =
+            binned.map(|operand| own(operand).ok_or_else(|| absent(&operand.column)));
+        let binned = binned.collect::<Result<_, _>>()?;
         let selection = request.selection.as_ref();
         let stated = selection.and_then(|own| own.rows.as_ref());
-        let is_there = |own: &&Expression| own.columns().all(|name| there(name).is_some());
-        let condition = stated.filter(is_there);
+        let compared: Option<Vec<Operand>> =
+            stated.and_then(|condition| condition.operands().iter().map(own).collect());
+        let condition = stated.filter(|_| compared.is_some());
         let mut roles: Vec<String> = weight.iter().map(|own| format!("w={own}")).collect();
         roles.extend(flags.iter().map(|own| format!("flag={own}")));
         roles.extend(
@@ -160,7 +167,6 @@ impl<'r> Survey<'r> {
             Some(_) => format!("where {}", own.text()),
             None => format!("all rows, because it lacks a column of `{}`", own.text()),
         }));
-        let compared = condition.map_or(&[][..], Expression::operands);
         let mut survey = Survey {
             unused: Vec::new(),
             columns: roles.join(", "),
@@ -170,7 +176,7 @@ impl<'r> Survey<'r> {
             tomography,
             condition,
             binned,
-            compared,
+            compared: compared.unwrap_or_default(),
             formulas,
         };
         let unused = columns.unused_choices(&survey.read()).into_iter();
@@ -179,7 +185,7 @@ impl<'r> Survey<'r> {
     }
 
     fn operands(&self) -> impl Iterator<Item = &Operand> {
-        self.binned.iter().copied().chain(self.compared)
+        self.binned.iter().chain(&self.compared)
     }
 
     /// The columns that are read, each once.
@@ -222,7 +228,7 @@ impl<'r> Survey<'r> {
         let flags = self.flags.iter().map(|name| column(name));
         let flags = flags.collect::<Result<Vec<_>, _>>()?;
         let values = |operand| operand_values(frame, operand, path);
-        let binned = self.binned.iter().copied().map(values);
+        let binned = self.binned.iter().map(values);
         let binned = binned.collect::<Result<Vec<_>, _>>()?;
         let compared = self.compared.iter().map(values);
         let compared = compared.collect::<Result<Vec<_>, _>>()?;
