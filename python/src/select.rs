@@ -39,7 +39,7 @@ pub(crate) fn select<'py>(
     };
     let stated = selection.unwrap_or_default();
     let weights = stated.weights.clone().unwrap_or_default();
-    let operand = |own: &Operand| match own.pattern {
+    let operand = |own: &Operand| match own.texts {
         None => column(&own.column),
         Some(_) => {
             let name = &own.column;

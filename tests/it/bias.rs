@@ -906,9 +906,7 @@ fn simulated_galaxies_are_weighted_to_those_of_a_survey() {
     }
     // The survey may write its columns in another case.
     folder.write("capitals.csv", plain.replace("snr,size", "SNR,Size"));
-    let capitals = folder.json(&format!(
-        "{command} --where 'snr < 15' --like capitals.csv"
-    ));
+    let capitals = folder.json(&format!("{command} --where 'snr < 15' --like capitals.csv"));
     assert_m(&capitals["rows"][1], [mean([3.0, 1.0, 0.0, 0.0]); 2], 1e-9);
     // Without a survey, bins without galaxies are a mistake.
     folder.refuses(&command, "no galaxy that counts has snr 50 to 90");
@@ -947,12 +945,14 @@ fn paired_galaxies_have_the_error_of_pairs() {
 fn limits_are_tested_in_each_bin() {
     let folder = Folder::new();
     let files = pair(&folder, "own", 0.02, |g, normal| {
-        let mut text = String::from("id,e1,e2,kind,g1,g2\n");
+        let mut text = String::from("id,e1,e2,kind,also kind,g1,g2\n");
         for id in 0..300 {
             let [a, b] = normal.pair(0.3);
-            let (kind, m) = [("disc", 0.0), ("bulge", 0.05), ("star's", 0.0)][id % 3];
+            // Quotation marks and `*` are characters like any others.
+            let kinds = [("disc", 0.0), ("bulge", 0.05), ("star's", 0.0), ("d*", 0.0)];
+            let (kind, m) = kinds[id % 4];
             let e = [a, b].map(|shape| shape + (1.0 + m) * g);
-            writeln!(text, "{id},{},{},{kind},{g},{g}", e[0], e[1]).unwrap();
+            writeln!(text, "{id},{},{},{kind},{kind},{g},{g}", e[0], e[1]).unwrap();
         }
         text
     });
@@ -964,11 +964,17 @@ fn limits_are_tested_in_each_bin() {
     assert_has(&told, "kind bulge: |m1| exceeds its limit");
     assert!(!told.contains("disc") && !told.contains("all:"), "{told}");
     assert_has(&printed, "Exceeds its limit");
-    let found = rows(&folder, &format!("{files} --bins kind"));
-    let bins: Vec<&str> = found
-        .iter()
-        .map(|row| row["bin"].as_str().unwrap())
-        .collect();
-    assert_eq!(bins, ["all", "kind bulge", "kind disc", "kind star's"]);
-    assert_m(&found[1], [0.05; 2], 1e-9);
+    for column in ["kind", "`also kind`"] {
+        let found = rows(&folder, &format!("{files} --bins '{column}'"));
+        let bins: Vec<&str> = found
+            .iter()
+            .map(|row| row["bin"].as_str().unwrap())
+            .collect();
+        let kinds = ["bulge", "d*", "disc", "star's"].map(|kind| format!("{column} {kind}"));
+        assert_eq!(bins[0], "all");
+        assert_eq!(bins[1..], kinds);
+        assert_m(&found[1], [0.05; 2], 1e-9);
+        // `d*` is a text, and not a pattern that discs fit.
+        assert_eq!(number(&found[2], "n"), 150.0);
+    }
 }

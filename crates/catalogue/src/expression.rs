@@ -34,12 +34,32 @@ pub struct Expression {
     angles: Vec<Node>,
 }
 
-/// What an expression reads in each row: the number in a column, or whether the text in it has a pattern.
+/// What an expression reads in each row: the number in a column, or what the text in it is compared with.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Operand {
     pub column: String,
+    pub texts: Option<Texts>,
+}
+
+/// What the texts of a column are compared with.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Texts {
     /// A text in which `*` stands for any characters. The operand is 1 where it fits, else 0.
-    pub pattern: Option<String>,
+    Pattern(String),
+    /// Texts in ascending order. The operand is the place of the own text among them, from 1 on, and 0 of another text.
+    List(Vec<String>),
+}
+
+impl Texts {
+    pub fn value(&self, text: &str) -> f64 {
+        match self {
+            Texts::Pattern(pattern) => truth(fits(pattern, text)),
+            Texts::List(all) => {
+                let found = all.binary_search_by(|own| own.as_str().cmp(text));
+                found.map_or(0.0, |place| (place + 1) as f64)
+            }
+        }
+    }
 }
 
 /// A smooth step of a weight along a column, `step(snr, 10, 1.5)`: 1/2 at the threshold, and 0 and 1 at the half width
@@ -156,6 +176,36 @@ impl Expression {
         match condition.rows {
             Some(expression) if condition.steps.is_empty() => Ok(expression),
             _ => Err(ExpressionError::Step(condition.text)),
+        }
+    }
+
+    /// The place of the text of a column among `texts`, which are in ascending order.
+    pub fn of_texts(column: &str, texts: Vec<String>) -> Self {
+        Expression {
+            text: column.to_owned(),
+            operands: vec![Operand {
+                column: column.to_owned(),
+                texts: Some(Texts::List(texts)),
+            }],
+            root: Node::Operand(0),
+            sharp: true,
+            angles: Vec::new(),
+        }
+    }
+
+    /// The column, if the expression is nothing else.
+    pub fn column(&self) -> Option<&str> {
+        match (&self.root, &self.operands[..]) {
+            (
+                Node::Operand(0),
+                [
+                    Operand {
+                        column,
+                        texts: None,
+                    },
+                ],
+            ) => Some(column),
+            _ => None,
         }
     }
 
@@ -382,15 +432,16 @@ impl<'a> Parser<'a> {
         };
         self.at += length + 2;
         self.sharp = true;
-        let fits = self.operand(column.to_owned(), Some(rest[..length].to_owned()));
+        let pattern = Texts::Pattern(rest[..length].to_owned());
+        let fits = self.operand(column.to_owned(), Some(pattern));
         Some(Ok(match equal {
             true => fits,
             false => Node::Unary(|fits| 1.0 - fits, Box::new(fits)),
         }))
     }
 
-    fn operand(&mut self, column: String, pattern: Option<String>) -> Node {
-        let operand = Operand { column, pattern };
+    fn operand(&mut self, column: String, texts: Option<Texts>) -> Node {
+        let operand = Operand { column, texts };
         let known = self.operands.iter().position(|own| *own == operand);
         Node::Operand(known.unwrap_or_else(|| {
             self.operands.push(operand);
@@ -544,21 +595,21 @@ fn number_length(text: &str) -> usize {
 /// The values of an operand in each row of a table.
 pub fn operand_values<'f>(
     frame: &'f DataFrame,
-    Operand { column, pattern }: &Operand,
+    Operand { column, texts }: &Operand,
     path: &Path,
 ) -> Result<Cow<'f, [f64]>, FileError> {
-    let Some(pattern) = pattern else {
+    let Some(compared) = texts else {
         return table::numbers(frame, column, path);
     };
     let Some(texts) = texts_of(frame, column) else {
-        return Err(FileError::new(
-            path,
-            format!(
-                "column `{column}` contains no texts (found a comparison with '{pattern}', expected a number)"
-            ),
-        ));
+        let found = match compared {
+            Texts::Pattern(pattern) => format!("a comparison with '{pattern}', expected a number"),
+            Texts::List(_) => "numbers, expected texts as in other catalogues".to_owned(),
+        };
+        let message = format!("column `{column}` contains no texts (found {found})");
+        return Err(FileError::new(path, message));
     };
-    let values = texts.map(|text| truth(fits(pattern, text.unwrap_or_default())));
+    let values = texts.map(|text| compared.value(text.unwrap_or_default()));
     Ok(Cow::Owned(values.collect()))
 }
 
@@ -647,7 +698,7 @@ mod tests {
         let found = Expression::parse("psf == 'a*' or psf != \"b\" and set == 3").unwrap();
         let operand = |column: &str, pattern: Option<&str>| Operand {
             column: column.into(),
-            pattern: pattern.map(str::to_owned),
+            texts: pattern.map(|own| Texts::Pattern(own.to_owned())),
         };
         let expected = [
             operand("psf", Some("a*")),
@@ -657,6 +708,9 @@ mod tests {
         assert_eq!(found.operands(), expected);
         assert_eq!(found.value(&|k| [0.0, 1.0, 3.0][k]), 0.0);
         assert_eq!(found.value(&|k| [0.0, 0.0, 3.0][k]), 1.0);
+        let list = Texts::List(["*", "a*", "it's \"b\""].map(str::to_owned).to_vec());
+        let values = ["*", "ab", "a*", "it's \"b\""].map(|text| list.value(text));
+        assert_eq!(values, [1.0, 0.0, 2.0, 3.0]);
         for (pattern, text, expected) in [
             ("23/*", "23/den/star", true),
             ("*star", "23/den/star", true),

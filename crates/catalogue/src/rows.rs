@@ -12,7 +12,7 @@ use shearq_files::table::{self, FileFormat};
 use shearq_files::{FileError, names_of};
 use shearq_quantities::{Distortion, MeasuredRange};
 
-use crate::expression::{Expression, Operand, operand_values, texts_of};
+use crate::expression::{Operand, Texts, operand_values, texts_of};
 use crate::failures::{
     Check, Copies, LargestResponse, MIN_FAILED_WEIGHT, RepeatKind, Repeats, TrueShears, shown,
 };
@@ -281,7 +281,7 @@ fn columns_of<'f>(
     let doubtful = source.places.all((Role::DoubtfulWeight, 0));
     let mut columns = Vec::new();
     for (place, wanted) in source.wanted.iter().enumerate() {
-        let is_text = wanted.pattern.is_none() && source.is_text(reading, &wanted.column);
+        let is_text = wanted.texts.is_none() && source.is_text(reading, &wanted.column);
         columns.push(match doubtful.contains(&place) {
             // Texts are no weights: `WEIGHT_IMAGE` may have names of files.
             true if texts_of(frame, &wanted.column).is_some() => {
@@ -448,7 +448,7 @@ impl<'a> TableRows<'a> {
     // Columns of numbers that are binned.
     fn binned_columns(&self) -> Vec<usize> {
         let places = self.source.places.all((Role::Binned, 0)).iter().copied();
-        let numbers = places.filter(|place| self.source.wanted[*place].pattern.is_none());
+        let numbers = places.filter(|place| self.source.wanted[*place].texts.is_none());
         numbers.collect()
     }
 
@@ -921,7 +921,7 @@ impl Found {
         }
         self.matched.resize(part.columns.len(), false);
         for (place, operand) in part.source.wanted.iter().enumerate() {
-            if operand.pattern.is_some() && !self.matched[place] {
+            if operand.texts.is_some() && !self.matched[place] {
                 self.matched[place] = part.columns[place].contains(&1.0);
             }
         }
@@ -957,9 +957,9 @@ impl Found {
     fn unmatched(&self, source: &Source) -> Vec<String> {
         let all = source.wanted.iter().zip(&self.matched);
         let unmatched = all.filter(|(_, matched)| !**matched);
-        let texts = unmatched.filter_map(|(operand, _)| {
-            let pattern = operand.pattern.as_ref()?;
-            Some(format!("{} == '{pattern}'", operand.column))
+        let texts = unmatched.filter_map(|(operand, _)| match &operand.texts {
+            Some(Texts::Pattern(pattern)) => Some(format!("{} == '{pattern}'", operand.column)),
+            _ => None,
         });
         texts.collect()
     }

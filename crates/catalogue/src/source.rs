@@ -11,7 +11,7 @@ use shearq_files::table::{self, FileFormat, Place};
 use shearq_files::{FileError, names_of};
 use shearq_measure::{Observables, Selection};
 
-use crate::expression::{Expression, Operand, operand_values};
+use crate::expression::{Expression, Operand, Texts, operand_values};
 use crate::own_columns::{SHAPE_COLUMNS, changes_with_shear, require_responses};
 use crate::recognition::{fits_any, recognition, words};
 
@@ -306,13 +306,13 @@ impl Source {
         table::read_parts(&self.place, &names, &texts, take)
     }
 
-    /// Whether a column may be a text: identifiers, names of sheared catalogues, and what is compared with a pattern.
+    /// Whether a column may be a text: identifiers, names of sheared catalogues, and what is compared with texts.
     pub fn is_text(&self, reading: &Reading<'_>, name: &str) -> bool {
         let chosen = reading.expressions().flat_map(|(_, own)| own.operands());
         let computed = self.formulas.iter().flat_map(Expression::operands);
         let mut operands = chosen.chain(computed);
         match operands.find(|own| own.column == name || own.column == base(name)) {
-            Some(operand) => operand.pattern.is_some(),
+            Some(operand) => operand.texts.is_some(),
             None => {
                 let roles = [Role::Id, Role::ShearedCatalogue].map(|role| self.columns.of(role));
                 roles.contains(&Some(name))
@@ -482,13 +482,13 @@ struct Wanted<'a> {
 }
 
 impl Wanted<'_> {
-    fn add(&mut self, name: &str, pattern: Option<&String>) -> Option<usize> {
+    fn add(&mut self, name: &str, texts: Option<&Texts>) -> Option<usize> {
         if !self.names.iter().any(|own| own == name) {
             return None;
         }
         let operand = Operand {
             column: name.to_owned(),
-            pattern: pattern.cloned(),
+            texts: texts.cloned(),
         };
         let known = self.all.iter().position(|own| *own == operand);
         Some(known.unwrap_or_else(|| {
@@ -597,23 +597,23 @@ impl Wanted<'_> {
         by_catalogue: bool,
     ) -> Result<Vec<Vec<usize>>, FileError> {
         let mut all = vec![Vec::new()];
-        for Operand { column, pattern } in expression.operands() {
+        for Operand { column, texts } in expression.operands() {
             // Sheared catalogues of shearq have noise that other columns do not have.
             let plain = format!("{column}_noshear");
             let [first, second] = match self.columns.preset {
                 Preset::Sheared => [&plain, column],
                 _ => [column, &plain],
             };
-            let found = self.add(first, pattern.as_ref());
-            let found = found.or_else(|| self.add(second, pattern.as_ref()));
+            let found = self.add(first, texts.as_ref());
+            let found = found.or_else(|| self.add(second, texts.as_ref()));
             all[0].push(found.ok_or_else(|| FileError::no_column(self.path, column, self.names))?);
         }
         for catalogue in 1..CATALOGUES {
             let operands = expression.operands().iter();
-            let sheared = operands.map(|Operand { column, pattern }| {
+            let sheared = operands.map(|Operand { column, texts }| {
                 let own = sheared_column(self.names, column, catalogue);
-                let own = own.and_then(|name| self.add(name, pattern.as_ref()));
-                own.or_else(|| self.add(column, pattern.as_ref()).filter(|_| by_catalogue))
+                let own = own.and_then(|name| self.add(name, texts.as_ref()));
+                own.or_else(|| self.add(column, texts.as_ref()).filter(|_| by_catalogue))
             });
             all.push(sheared.collect::<Option<_>>().unwrap_or_default());
         }

@@ -20,7 +20,7 @@ use crate::catalogues::Catalogues;
 use crate::record::{Column, RunRecord, SetRecord, columns_named, compared};
 use crate::score::{ScoreError, ScoredSet, score_variants, unscored};
 use crate::submit::{Sent, Submission, is_packed};
-use shearq_catalogue::expression::{Expression, Operand, fits};
+use shearq_catalogue::expression::{Expression, Operand};
 
 /// A method in a comparison.
 #[derive(Debug, Clone)]
@@ -243,14 +243,13 @@ pub fn choose(
         let mut sets = std::mem::take(&mut run.sets);
         sets.retain(|set| {
             let holds = condition.holds(&|place| match (
-                &condition.operands()[place].pattern,
+                &condition.operands()[place].texts,
                 columns[place].number(set),
             ) {
                 (_, Some(number)) => number,
-                (pattern, None) => {
+                (texts, None) => {
                     let text = columns[place].text(run, set).unwrap_or_default();
-                    let fits = pattern.as_ref().is_some_and(|own| fits(own, &text));
-                    f64::from(u8::from(fits))
+                    texts.as_ref().map_or(0.0, |own| own.value(&text))
                 }
             });
             // A missing number, such as Q of a set without errors, meets no condition.
@@ -265,7 +264,7 @@ pub fn choose(
 fn compared_column(
     Operand {
         column: name,
-        pattern,
+        texts,
     }: &Operand,
 ) -> Result<Column, ChoiceError> {
     let Some((_, column)) = compared().find(|(own, _)| own == name) else {
@@ -275,7 +274,7 @@ fn compared_column(
             known: names_of(&known),
         });
     };
-    match (pattern, column.is_text()) {
+    match (texts, column.is_text()) {
         (Some(_), false) => Err(ChoiceError::Numbers(name.clone())),
         (None, true) => Err(ChoiceError::Text(name.clone())),
         _ => Ok(column),

@@ -7,7 +7,6 @@ use shearq_catalogue::expression::{Expression, texts_of};
 use shearq_catalogue::request::{Binning, Edges, MAX_AXES, MAX_BINS, Request};
 use shearq_catalogue::rows::rows;
 use shearq_catalogue::source::{Reading, Source, sources};
-use shearq_files::FileError;
 use shearq_files::frames::polars::DataFrame;
 use shearq_files::table;
 
@@ -295,13 +294,9 @@ pub(super) fn with_numbers(
         .enumerate()
         .filter(|(_, own)| is_class(own))
     {
-        let [operand] = binning.of.operands() else {
+        let Some(name) = binning.of.column() else {
             continue;
         };
-        let name = binning.of.text().trim();
-        if operand.pattern.is_some() || operand.column != name {
-            continue;
-        }
         let mut texts = BTreeSet::new();
         let mut add = |frame: &DataFrame| match texts_of(frame, name) {
             Some(values) if texts.len() <= MAX_BINS => {
@@ -325,29 +320,18 @@ pub(super) fn with_numbers(
             continue;
         }
         if texts.len() > MAX_BINS {
-            return Err(BiasFailure::ManyValues {
-                of: name.to_owned(),
-            });
+            let of = binning.of.text().to_owned();
+            return Err(BiasFailure::ManyValues { of });
         }
         let classes: Vec<String> = texts.into_iter().collect();
-        let terms = classes.iter().enumerate().map(|(k, text)| {
-            let quote = if text.contains('\'') { '"' } else { '\'' };
-            format!("{} * ({name} == {quote}{text}{quote})", k + 1)
-        });
-        let formula = terms.collect::<Vec<_>>().join(" + ");
-        let of = Expression::parse(&formula).map_err(|fault| {
-            FileError::new(
-                &request.catalogues[0].name,
-                format!("--bins {name}: {fault}"),
-            )
-        })?;
+        let of = Expression::of_texts(name, classes.clone());
         let edges: Vec<f64> = (0..=classes.len()).map(|k| k as f64 + 0.5).collect();
         own.bins[at] = Binning {
             of,
             edges: Edges::Given(edges.clone()),
         };
         axes[at] = Some(Axis {
-            of: name.to_owned(),
+            of: binning.of.text().to_owned(),
             edges,
             classes: Some(classes),
         });

@@ -145,8 +145,7 @@ impl<'r> Survey<'r> {
             None => TOMOGRAPHY.iter().find_map(|name| there(name)),
         };
         let binned = request.bins.iter().flat_map(|bins| bins.of.operands());
-        let binned =
-            binned.map(|operand| own(operand).ok_or_else(|| absent(&operand.column)));
+        let binned = binned.map(|operand| own(operand).ok_or_else(|| absent(&operand.column)));
         let binned = binned.collect::<Result<_, _>>()?;
         let selection = request.selection.as_ref();
         let stated = selection.and_then(|own| own.rows.as_ref());
@@ -209,7 +208,7 @@ impl<'r> Survey<'r> {
     fn texts(&self) -> Vec<&str> {
         let computed = self.formulas.iter().flat_map(Expression::operands);
         let texts = self.operands().chain(computed);
-        let texts = texts.filter(|own| own.pattern.is_some());
+        let texts = texts.filter(|own| own.texts.is_some());
         let texts = texts.map(|own| own.column.as_str());
         texts.chain(self.tomography.as_deref()).collect()
     }
