@@ -49,7 +49,7 @@ pub(crate) fn select<'py>(
     };
     let selected = || -> Result<_, FileError> {
         let mut shapes = MeasuredShapes::of(column, true)?;
-        shapes.weigh(path, &weights, column)?;
+        shapes.weigh(path, 0, &weights, column)?;
         if let Some(condition) = &stated.rows {
             shapes.keep(path, condition, operand)?;
         }

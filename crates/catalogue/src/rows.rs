@@ -151,7 +151,7 @@ pub fn placed_rows(
         source.parts(reading, |frame| {
             let columns = columns_of(source, reading, &frame)?;
             let columns: Vec<&[f64]> = columns.iter().map(AsRef::as_ref).collect();
-            let part = TableRows::new(source, reading, (&frame, &columns), path)?;
+            let part = TableRows::new(source, reading, (&frame, &columns), (path, first))?;
             // Ranges follow from the first part, so that a file is judged in the same way however it is split.
             let checks = checks.get_or_insert_with(|| part.checks());
             found.look_for(&part);
@@ -299,7 +299,8 @@ impl<'a> TableRows<'a> {
         source: &'a Source,
         reading: &'a Reading<'a>,
         (frame, columns): (&'a DataFrame, &'a [&'a [f64]]),
-        file: &Path,
+        // The rows of the file before these.
+        (file, before): (&Path, usize),
     ) -> Result<Self, FileError> {
         let (path, places) = (&source.place.path, &source.places);
         let truth = OfRows::new(file, places, &reading.truth)?;
@@ -311,7 +312,7 @@ impl<'a> TableRows<'a> {
         let weighted = reading.weights().map(|selection| -> Result<_, FileError> {
             let column = |name: &str| table::numbers(frame, name, path);
             let mut shapes = MeasuredShapes::of(column, true)?;
-            shapes.weigh(path, selection, column)?;
+            shapes.weigh(path, before, selection, column)?;
             Ok(shapes)
         });
         Ok(TableRows {

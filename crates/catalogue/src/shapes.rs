@@ -149,7 +149,7 @@ impl MeasuredShapes {
             return Ok(());
         };
         if let Some(weights) = weights {
-            self.weigh(path, weights, |name| table::numbers(table, name, path))?;
+            self.weigh(path, 0, weights, |name| table::numbers(table, name, path))?;
         }
         if let Some(condition) = rows {
             self.keep(path, condition, |own| operand_values(table, own, path))?;
@@ -158,13 +158,14 @@ impl MeasuredShapes {
     }
 
     /// Multiplies the shapes by the weights of a selection, whose response to shear enters theirs. `column` gives the columns of
-    /// [`Observables`] by name.
+    /// [`Observables`] by name, from the row after `before` on.
     ///
     /// # Errors
     /// If a column cannot be read, a step is too sharp for a response, or a weight is negative or no number.
     pub fn weigh<'a>(
         &mut self,
         path: &Path,
+        before: usize,
         selection: &Selection,
         column: impl Fn(&str) -> Result<Cow<'a, [f64]>, FileError>,
     ) -> Result<(), FileError> {
@@ -184,7 +185,7 @@ impl MeasuredShapes {
                     path,
                     format!(
                         "row {}: the weight is {found} (expected a number from 0 on)",
-                        row + 1
+                        before + row + 1
                     ),
                 ));
             }

@@ -100,13 +100,14 @@ impl Truth {
             ));
         };
         let (mut galaxies, mut catalogues) = (HashMap::new(), BTreeMap::new());
+        let mut before = 0;
         table::read_parts(&place, &[key, name1, name2], &[key], |part| {
             let column = |name| table::numbers(&part, name, path);
             let (g1, g2) = (column(name1)?, column(name2)?);
             let keys = identity::keys(&part, key, path)?;
             for (row, hash) in keys.into_iter().enumerate() {
-                let fault =
-                    |fault: String| FileError::new(path, format!("row {}: {fault}", row + 1));
+                let number = before + row + 1;
+                let fault = |fault: String| FileError::new(path, format!("row {number}: {fault}"));
                 let shear = [g1[row], g2[row]];
                 check(shear).map_err(fault)?;
                 // Names of catalogues are parts of paths, which hashes are not.
@@ -119,6 +120,7 @@ impl Truth {
                     return Err(fault(format!("the {what} {} occurs twice", name())));
                 }
             }
+            before += part.height();
             Ok(())
         })?;
         Ok(match catalogue {
