@@ -625,7 +625,7 @@ impl DetectionMethod {
                 0.5..=6.0,
             ),
             (
-                "neighbour_half_width",
+                "detection.neighbour_half_width",
                 self.neighbour_half_width,
                 0.2..=10.0,
             ),
