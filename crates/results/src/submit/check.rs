@@ -4,16 +4,16 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use shearq_scoring::{
-    AddedImages, Bins, Convention, Definition, ExaminedImage, Fault, FieldSum, Grid, Options, Row,
-    RowCounts, SCORED, ScoredImages, SetScorer, SetSession, TrueShear,
+    AddedImages, Bins, Convention, Definition, ExaminedImage, Fault, Grid, Options, Row, RowCounts,
+    SCORED, ScoredImages, SetScorer, SetSession, TrueShear,
 };
 
 use super::{
     Contents, FileSum, Kind, Manifest, Sent, SpectrumLine, read_spectrum, wrong_multipoles,
 };
-use crate::catalogues::{OWN, read_rows, recognised, unweighted};
+use crate::catalogues::{OWN, galaxies_of, recognised, sum_on};
 use crate::views::scores::{follows_by_less, odd_response, repeated_shapes, words};
-use shearq_catalogue::foreign::{ADVICE_ON_SENTINELS, Foreign, fault_of_rows};
+use shearq_catalogue::foreign::Foreign;
 use shearq_catalogue::galaxies::{Calibration, Galaxies, MeanResponse};
 use shearq_files::FileError;
 use shearq_files::table::most_rows;
@@ -125,9 +125,7 @@ fn check_files(
     if files.is_empty() {
         report.error(path, "empty", "found no file".into());
     }
-    if path.is_dir() {
-        check_manifest(path, files, report);
-    }
+    let by_shearq = path.is_dir() && check_manifest(path, files, report);
     let mut catalogues: BTreeMap<u32, Vec<(u32, &PathBuf)>> = BTreeMap::new();
     let mut spectra = BTreeSet::new();
     let mut methods: BTreeSet<String> = BTreeSet::new();
@@ -177,7 +175,8 @@ fn check_files(
         for ((image, file), opened) in of_set.into_iter().zip(opened) {
             // An unreadable catalogue is reported, and the others of its set are checked without it.
             let examined = opened.and_then(|own| {
-                check_catalogue(file, own.as_ref(), &calibration, &session, report)
+                let own = (own.as_ref(), by_shearq);
+                check_catalogue(file, own, &calibration, &session, report)
             });
             if let Some(examined) = examined {
                 files.add(&examined, image, file);
@@ -231,8 +230,8 @@ fn check_unnamed(file: &Path, single: bool, expected: &Expected, report: &mut Re
     let session = expected.session(set);
     let (opened, calibration) = open_catalogues([file].into_iter(), session.grid(), report);
     let [Some(opened)] = &opened[..] else { return };
-    let Some(examined) = check_catalogue(file, opened.as_ref(), &calibration, &session, report)
-    else {
+    let opened = (opened.as_ref(), false);
+    let Some(examined) = check_catalogue(file, opened, &calibration, &session, report) else {
         return;
     };
     if let Some(set) = set {
@@ -327,11 +326,15 @@ impl Report {
     }
 }
 
-fn check_manifest(folder: &Path, files: &[PathBuf], report: &mut Report) {
+// Whether the manifest states a run of shearq.
+fn check_manifest(folder: &Path, files: &[PathBuf], report: &mut Report) -> bool {
     let manifest = match Manifest::read(folder) {
         Ok(Some(manifest)) => manifest,
-        Ok(None) => return,
-        Err(error) => return report.error(&error.path, "manifest", error.text()),
+        Ok(None) => return false,
+        Err(error) => {
+            report.error(&error.path, "manifest", error.text());
+            return false;
+        }
     };
     let mut found = BTreeMap::new();
     for file in files {
@@ -351,6 +354,7 @@ fn check_manifest(folder: &Path, files: &[PathBuf], report: &mut Report) {
             report.warn(&folder.join(name), "covariance", message.into());
         }
     }
+    manifest.run.is_some()
 }
 
 // Most lines of a file that is taken for a spectrum: catalogues have thousands. Chosen by hand.
@@ -385,26 +389,21 @@ fn open_catalogues<'p>(
 // Checks the rows of a catalogue. `None` if the file is not readable.
 fn check_catalogue(
     path: &Path,
-    recognised: Option<&Galaxies>,
+    (recognised, by_shearq): (Option<&Galaxies>, bool),
     calibration: &Calibration,
     session: &SetSession,
     report: &mut Report,
 ) -> Option<ExaminedImage> {
     let grid = session.grid();
-    let most = most_rows(grid.cells());
-    let galaxies = match recognised {
-        Some(own) => own.read(most),
-        None => read_rows(path, most).map(unweighted),
-    };
+    let galaxies = galaxies_of(recognised, path, most_rows(grid.cells()));
     let galaxies = galaxies.map_err(|error| report.unreadable(error)).ok()?;
-    let mut sum = FieldSum::new(grid);
-    let mut counts = sum.add_weighted(grid, galaxies.iter().copied());
+    let (mut sum, mut counts, fault) = sum_on(grid, galaxies.iter().copied(), by_shearq);
     calibration.apply(&mut sum);
     if recognised.is_some() {
         // Its flags, weights and missing numbers state which galaxies were not measured.
         counts.missing += std::mem::take(&mut counts.not_finite);
     }
-    if let Some(fault) = fault_of_rows(&counts, grid, ADVICE_ON_SENTINELS) {
+    if let Some(fault) = fault {
         report.error(path, "values", fault);
     }
     let rows: Vec<Row> = galaxies.into_iter().map(|(row, _)| row).collect();
