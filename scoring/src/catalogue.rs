@@ -136,6 +136,8 @@ pub struct FieldSum {
     pub count: Array2<f64>,
     /// Images added, blank ones included.
     pub images: usize,
+    /// Σ (w² − w) of all rows: 0 without weights.
+    pub weight_excess: f64,
 }
 
 impl FieldSum {
@@ -147,6 +149,7 @@ impl FieldSum {
             e2: zeros(),
             count: zeros(),
             images: 0,
+            weight_excess: 0.0,
         }
     }
 
@@ -189,6 +192,7 @@ impl FieldSum {
             self.e1[cell] += weight * row.e1;
             self.e2[cell] += weight * row.e2;
             self.count[cell] += weight;
+            self.weight_excess += weight * (weight - 1.0);
             counts.used += 1;
             counts.repeated += usize::from(repeated);
             let square = row.e1 * row.e1 + row.e2 * row.e2;
@@ -208,6 +212,24 @@ impl FieldSum {
         counts
     }
 
+    /// Divides the weights of all rows.
+    pub fn divide_weights(&mut self, by: f64) {
+        let weights = self.count.sum();
+        let squares = self.weight_excess + weights;
+        self.weight_excess = squares / (by * by) - weights / by;
+        for field in [&mut self.e1, &mut self.e2, &mut self.count] {
+            *field /= by;
+        }
+    }
+
+    // Σ w² / Σ w, by which weights raise the noise of the mean field; 1 without weights.
+    pub(crate) fn weight_noise(&self) -> f64 {
+        match self.weight_excess == 0.0 {
+            true => 1.0,
+            false => 1.0 + self.weight_excess / self.count.sum(),
+        }
+    }
+
     pub(crate) fn check_shape(&self, side: usize) -> Result<(), ScoringError> {
         check_shape("e1 of an image", &self.e1, side)?;
         check_shape("e2 of an image", &self.e2, side)?;
@@ -219,6 +241,7 @@ impl FieldSum {
         self.e2 += &other.e2;
         self.count += &other.count;
         self.images += other.images;
+        self.weight_excess += other.weight_excess;
     }
 
     // `self` without `part`, which must be one of the sums merged into it.
@@ -228,6 +251,7 @@ impl FieldSum {
             e2: &self.e2 - &part.e2,
             count: &self.count - &part.count,
             images: self.images - part.images,
+            weight_excess: self.weight_excess - part.weight_excess,
         }
     }
 }

@@ -507,16 +507,18 @@ impl SetScorer {
     }
 
     // Noise variance of the averaged field per unit noise variance of a galaxy: 1/K on the leaderboard, and
-    // ⟨w⟩/⟨w²⟩/K in the corrected definition, which rescales for gaps.
+    // ⟨w⟩/⟨w²⟩/K in the corrected definition, which rescales for gaps, where w is the mean weight of a cell. Galaxies with
+    // weights add the noise of their squares.
     fn noise_gain(&self, sum: &FieldSum) -> f64 {
         let images = sum.images as f64;
-        match self.options.definition {
+        let gain = match self.options.definition {
             Definition::Leaderboard => 1.0 / images,
             Definition::Corrected => {
                 let mean = sum.count.mean().unwrap_or(0.0) / images;
                 self.rescaling(sum).powi(2) * mean / images
             }
-        }
+        };
+        gain * sum.weight_noise()
     }
 
     // E-mode bandpowers of a mean field in either class of conventions, and its noise gain. All conventions of

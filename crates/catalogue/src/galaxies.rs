@@ -281,9 +281,7 @@ impl Calibration {
     /// Calibrates a sum.
     pub fn apply(&self, sum: &mut FieldSum) {
         if self.weight != 1.0 {
-            for field in [&mut sum.e1, &mut sum.e2, &mut sum.count] {
-                *field /= self.weight;
-            }
+            sum.divide_weights(self.weight);
         }
         self.shears(&mut sum.e1, &mut sum.e2);
     }

@@ -9,7 +9,7 @@ use shearq_scoring::{
     SetImages, SetScorer, cross_spectrum,
 };
 
-use crate::common::{Content, close, field, images, score, standard, truth};
+use crate::common::{Content, close, field, images, rows, score, standard, truth};
 
 #[test]
 fn cross_spectra_and_covariances_equal_their_formulae() {
@@ -123,6 +123,36 @@ fn given_noise_is_spread_over_gaps_if_corrected() {
             close(*found, expected, "noise");
         }
         assert_eq!(score.noise_variance, Some(variance));
+    }
+}
+
+#[test]
+fn weights_raise_the_noise_by_their_squares() {
+    let grid = Grid::great10(16).unwrap();
+    let shear = field(&grid, Content::E, 5);
+    // The mean weight of each cell is 1, and the mean square 1.36.
+    let weight = |image: usize, k: usize| [0.4, 1.6][(image + k) % 2];
+    let mut set = SetImages::new(&grid);
+    for image in 0..4 {
+        let mut sum = FieldSum::new(&grid);
+        let rows = rows(&grid, &shear).into_iter().enumerate();
+        sum.add_weighted(&grid, rows.map(|(k, row)| (row, 3.0 * weight(image, k))));
+        sum.divide_weights(3.0);
+        set.add(&sum).unwrap();
+    }
+    let variance = 0.01;
+    for definition in [Definition::Leaderboard, Definition::Corrected] {
+        let options = Options {
+            noise: Noise::Given(variance),
+            ..standard(definition)
+        };
+        let score = score(grid, truth(&shear), &set, options);
+        let expected = Bins::new(&grid, definition).white_noise(1.36 * variance / 4.0);
+        for (found, expected) in score.noise.unwrap().iter().zip(expected) {
+            close(*found, expected, "noise");
+        }
+        let noise = score.metrics.galaxy_noise * (1.0 + score.metrics.m_cross);
+        close(noise * noise, variance, "noise of a galaxy");
     }
 }
 
