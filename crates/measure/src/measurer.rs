@@ -718,6 +718,12 @@ impl PsfWorker<'_> {
         }
         let n = self.worker.measurer.configuration().stamp.size;
         let start = cut_start(stamp.nrows(), n).unwrap_or(0);
+        let (full, side) = (&mut self.worker.full, stamp.nrows());
+        full.read(stamp)?;
+        full.subtract_sky();
+        let data = Array2::from_shape_fn((n, n), |(y, x)| {
+            f64::from(full.pixels[(start + y) * side + start + x])
+        });
         let pixel = |(y, x)| f64::from(stamp[(start + y, start + x)].to_f32());
         let stamp = Array2::from_shape_fn((n, n), pixel);
         let Images {
@@ -737,7 +743,7 @@ impl PsfWorker<'_> {
             }
         });
         let steps = Steps {
-            residual: &stamp - &reconvolved,
+            residual: data - reconvolved,
             stamp,
             psf,
             deconvolved,
@@ -757,7 +763,7 @@ pub struct Steps {
     pub psf: Array2<f64>,
     /// The deconvolved stamp.
     pub deconvolved: Array2<f64>,
-    /// Data minus the deconvolved stamp convolved with the PSF.
+    /// Data without their sky minus the deconvolved stamp convolved with the PSF.
     pub residual: Array2<f64>,
     /// Autocorrelation, zero lag in the middle: all lags for the network, lags within the weight for the linear method.
     pub acf: Array2<f64>,

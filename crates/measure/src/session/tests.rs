@@ -411,3 +411,27 @@ fn stated_noise_may_differ_by_one_percent() {
         assert_eq!(found.is_some(), expected, "{difference}");
     }
 }
+
+#[test]
+fn residuals_of_steps_have_no_sky() {
+    let registry = Registry::embedded().unwrap();
+    let mut configuration = registry.get("48/linear/star").unwrap().configuration;
+    let NoiseSource::Image { sky, .. } = &mut configuration.noise else {
+        unreachable!("it measures noise on the stamps")
+    };
+    *sky = shearq_submissions::SkySource::Stamp;
+    let measurer = Measurer::new(&configuration, 48).unwrap();
+    let star = moffat(0.0).stamp(48);
+    let psfs = Psfs::star(star.view());
+    let residual = |sky: f32| {
+        let mut rng = ChaCha8Rng::seed_from_u64(7);
+        let stamps = stamps(40, 48).mapv(|value| value + sky + rng.random_range(-1.0..1.0f32));
+        let mut source = ArraySource::new(&measurer, stamps.view(), &psfs).unwrap();
+        let noise = KnownNoise::Given(0.5);
+        let session = Session::open(&measurer, &mut source, noise, &OneThread).unwrap();
+        let (_, steps) = session.steps(&mut source, 0, 0).unwrap();
+        steps.unwrap().residual
+    };
+    let differences = residual(0.0) - residual(20.0);
+    assert!(differences.iter().all(|own| own.abs() < 1e-3));
+}
