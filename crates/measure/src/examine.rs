@@ -238,9 +238,10 @@ impl Examination {
         let some = most.min(count);
         for at in (0..some).map(|k| (2 * k + 1) * count / (2 * some)) {
             if let Ok(Star { psf, moved }) = psfs.at(at, cut, self.stamp.side) {
+                let before = self.psfs.len();
                 self.add_psf(psf.view(), moved);
                 let stamp = first.and_then(|first| self.of(first + at));
-                let both = stamp.zip(self.psfs.last());
+                let both = stamp.zip(self.psfs.get(before));
                 self.pairs
                     .extend(both.map(|(stamp, psf)| [psf.offset, stamp.place]));
             }

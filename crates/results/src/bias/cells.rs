@@ -74,11 +74,12 @@ impl Cells {
 
     /// The cell of some values. `None` if a number is missing.
     pub fn of(&self, values: &[f64; MAX_AXES]) -> Option<usize> {
+        let binned = self.axes.iter().zip(values);
+        if binned.clone().any(|(_, value)| value.is_nan()) {
+            return None;
+        }
         let mut cell = 0;
-        for (axis, value) in self.axes.iter().zip(values) {
-            if value.is_nan() {
-                return None;
-            }
+        for (axis, value) in binned {
             match axis.bin_of(*value) {
                 Some(bin) => cell = cell * axis.count() + bin,
                 None => return Some(self.outside()),
@@ -374,6 +375,7 @@ mod tests {
         assert_eq!(cells.ranges(cell), [[2.0, 4.0], [1.0, 2.0]]);
         assert_eq!(cells.label(cell), "x 2 to 4, y 1 to 2");
         assert_eq!(cells.of(&[2.5, 3.0, 0.0]), Some(6));
+        assert_eq!(cells.of(&[9.0, f64::NAN, 0.0]), None);
     }
 
     #[test]
