@@ -8,9 +8,10 @@ use pyo3::prelude::*;
 use shearq_bias::Design;
 use shearq_catalogue::columns::{Names, Shapes};
 use shearq_catalogue::expression::{Expression, ExpressionError};
-use shearq_catalogue::input::Input;
 use shearq_catalogue::recognition::read_presets;
-use shearq_catalogue::request::{Binning, Edges, MAX_AXES, MAX_BINS, Request, Survey, Units};
+use shearq_catalogue::request::{
+    Binning, Edges, Input, MAX_AXES, MAX_BINS, Request, Survey, Units,
+};
 use shearq_catalogue::select::selection;
 use shearq_catalogue::source::Reading;
 use shearq_catalogue::truth::{TrueSign, Truth, expand};

@@ -14,7 +14,7 @@ use shearq_dataset::run::SimulationRecord;
 use shearq_dataset::threads::Progress;
 use shearq_pipeline::galaxy_fits::read_fits;
 use shearq_pipeline::scenes::{SHEARS, SceneRecord, simulate_scenes, write_shears};
-use shearq_pipeline::simulate::simulate_folder;
+use shearq_pipeline::simulate::simulate_images;
 use shearq_simulate::scene::{Layout, SceneSettings, SceneSimulator};
 use shearq_simulate::set::SimulationSettings;
 
@@ -437,7 +437,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         };
         let data = DataFolder::new(out);
         let threads = arguments.threads.number();
-        let (new, old) = simulate_folder(&record, &images, &data, threads, &mut bar)?;
+        let (new, old) = simulate_images(&record, &images, &data, &data, threads, &mut bar)?;
         made += new;
         already += old;
     }

@@ -12,8 +12,7 @@ use shearq_quantities::statistics::RunningMean;
 use shearq_scoring::{FieldSum, Row};
 
 use crate::columns::{Columns, Shapes};
-use crate::input::Input;
-use crate::request::Request;
+use crate::request::{Input, Request};
 use crate::roles::Role;
 use crate::rows::{SummedRow, placed_rows};
 use crate::source::{Reading, Source, difference, sources, unused_in_others};

@@ -21,8 +21,7 @@ use crate::star_noise;
 
 use crate::columns::{Shapes, counted_value};
 use crate::identity;
-use crate::input::Input;
-use crate::request::{MAX_AXES, Placed};
+use crate::request::{Input, MAX_AXES, Placed};
 use crate::roles::{CATALOGUES, RESPONSES, Role, sheared_pair};
 use crate::source::{Reading, Source};
 use crate::steps::catalogue_named;

@@ -6,8 +6,8 @@ use std::path::Path;
 use shearq_files::FileError;
 
 use crate::columns::Names;
-use crate::input::Input;
 use crate::recognition::words;
+use crate::request::Input;
 use crate::roles::{CATALOGUES, Role};
 use crate::steps::step_of;
 use crate::truth::Truth;

@@ -17,8 +17,7 @@ use crate::recognition::{fits_any, recognition, words};
 
 use crate::columns::{Columns, Names, Preset, Shapes, base};
 use crate::identity;
-use crate::input::Input;
-use crate::request::{Request, Units};
+use crate::request::{Input, Request, Units};
 use crate::roles::{CATALOGUES, Places, Role};
 use crate::steps::{catalogue_named, sheared_column, sheared_name, unsheared};
 use crate::truth::Truth;

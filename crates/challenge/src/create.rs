@@ -12,7 +12,7 @@ use shearq_dataset::truth::{ReadTruth, Reading, grid_of_set, read_truth, reading
 use shearq_files::fits::{ImageReader, ImageWriter, Value};
 use shearq_files::open::is_there;
 use shearq_files::{FileError, atomic, names_of};
-use shearq_pipeline::simulate::simulate_blind;
+use shearq_pipeline::simulate::simulate_images;
 use shearq_quantities::units::{Degrees, Pixels};
 use shearq_results::record::SetRecord;
 use shearq_results::score::ScoreError;
@@ -188,10 +188,10 @@ pub fn simulated(
     };
     // One image of each set shows whether entries can be ranked, before hours of simulation.
     let first = images::of_simulation(&data.sets, 1);
-    simulate_blind(&record, &first, &public, &private, threads, progress)?;
+    simulate_images(&record, &first, &public, &private, threads, progress)?;
     let rankable = rankable(plan, &data, &public, &private, false, threads, progress)?;
     let ids = images::of_simulation(&data.sets, data.images);
-    simulate_blind(&record, &ids, &public, &private, threads, progress)?;
+    simulate_images(&record, &ids, &public, &private, threads, progress)?;
     finish(plan, rankable, data, folders, key, threads)
 }
 

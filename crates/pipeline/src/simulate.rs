@@ -28,21 +28,10 @@ pub fn simulator(set: u32, settings: SimulationSettings) -> Result<SetSimulator,
     })
 }
 
-/// Simulates `images`, which are in the order of their sets, into `data`. Returns the number of new images and the number
-/// that were there already.
-pub fn simulate_folder(
-    record: &SimulationRecord,
-    images: &[ImageId],
-    data: &DataFolder,
-    threads: usize,
-    progress: &mut dyn Progress,
-) -> Result<(usize, usize), PipelineError> {
-    simulate_blind(record, images, data, data, threads, progress)
-}
-
-/// Simulates `images` for a challenge: images and PSFs into `public`; settings, true shear and intrinsic shapes into
-/// `private`. If these are two folders, the headers of the images contain neither the seed nor properties of the galaxies.
-pub fn simulate_blind(
+/// Simulates `images`, which are in the order of their sets: images and PSFs into `public`; settings, true shear and
+/// intrinsic shapes into `private`. If these are two folders, as of a challenge, the headers of the images contain neither
+/// the seed nor properties of the galaxies. Returns the number of new images and the number that were there already.
+pub fn simulate_images(
     record: &SimulationRecord,
     images: &[ImageId],
     public: &DataFolder,

@@ -16,8 +16,7 @@ use shearq_bias::{
     BiasError, Catalogue, Design, Estimate, Grouping, Layout, Range, UnitSums, difference, group,
 };
 use shearq_catalogue::columns::Shapes;
-use shearq_catalogue::input::Input;
-use shearq_catalogue::request::{Request, Units};
+use shearq_catalogue::request::{Input, Request, Units};
 use shearq_catalogue::roles::{CATALOGUES, Role};
 use shearq_catalogue::rows::{distinct, rows};
 use shearq_catalogue::sheared_files::{refuse_sheared_psfs, with_sheared_files, without_sheared};
