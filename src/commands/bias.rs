@@ -25,7 +25,7 @@ use shearq_files::{atomic, open};
 use shearq_render::figure::{Figure, PictureFormat};
 use shearq_render::table::{Cell, Table};
 use shearq_results::baseline::catalogues::Units as BaselineUnits;
-use shearq_results::bias::{BiasFailure, Summed, joined, sum};
+use shearq_results::bias::{BiasFailure, BiasResult, Summed, joined, sum};
 use shearq_results::views::bias::{
     Checked, Limit, bias_plot, bias_table, check, chosen_by_measurement, compared_table, of_design,
     of_other_images, section, with_failures,
@@ -256,17 +256,11 @@ pub(crate) fn run(arguments: &Arguments, command_line: &str) -> anyhow::Result<(
         }
         result => result?,
     };
-    let warn = || {
-        let warnings = of_design(&result).into_iter();
-        for warning in warnings.chain(chosen_by_measurement(&result)) {
-            tell(format_args!("warning: {warning}"));
-        }
-    };
     if !summing.against.is_empty() {
         let other = of_catalogues(summing, &listed(&summing.against)?)?;
         let difference = summed.difference(&other)?;
         let other = other.result()?;
-        warn();
+        warn(&result);
         let absent = other.about.without_catalogue.iter().cloned();
         let warnings = absent.chain(chosen_by_measurement(&other));
         for warning in warnings.chain(of_other_images(&result, &other)) {
@@ -282,7 +276,7 @@ pub(crate) fn run(arguments: &Arguments, command_line: &str) -> anyhow::Result<(
         arguments.printing.print(&table)?;
         return fail(&checks);
     }
-    warn();
+    warn(&result);
     let mut table = bias_table(&result);
     if let Some(area) = arguments.area {
         add_per_area(&mut table, &result, area);
@@ -301,6 +295,13 @@ pub(crate) fn run(arguments: &Arguments, command_line: &str) -> anyhow::Result<(
         Ok(made_by([("Command", command_line.to_owned())]))
     })?;
     fail(&checks)
+}
+
+fn warn(result: &BiasResult) {
+    let warnings = of_design(result).into_iter();
+    for warning in warnings.chain(chosen_by_measurement(result)) {
+        tell(format_args!("warning: {warning}"));
+    }
 }
 
 fn fail(checks: &[Checked]) -> anyhow::Result<()> {
@@ -324,12 +325,7 @@ pub(super) fn units(arguments: &Arguments) -> anyhow::Result<(BaselineUnits, Vec
     let catalogues = listed(&summing.catalogues)?;
     let summed = of_catalogues(summing, &catalogues)?;
     let result = summed.result()?;
-    for warning in of_design(&result)
-        .into_iter()
-        .chain(chosen_by_measurement(&result))
-    {
-        tell(format_args!("warning: {warning}"));
-    }
+    warn(&result);
     // Folders and tables within files have no fingerprint of one file.
     let files = catalogues.into_iter().filter(|path| path.is_file());
     let files = files.collect();

@@ -509,12 +509,13 @@ pub enum ShearOrigin {
 }
 
 /// Ellipticity definition of a catalogue.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum EllipticityType {
     /// χ = (1 − q²)/(1 + q²): the moments' own (Eq. 15).
     Distortion,
     /// ε = (1 − q)/(1 + q): that of shear.
+    #[default]
     Shear,
 }
 

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use crate::sums::{COUNT, Layout, MeanResponse, WEIGHT, add, shifted};
+use crate::sums::{COUNT, Layout, MeanResponse, WEIGHT, add, join, shifted};
 
 /// Sums of the units of a jackknife, by arm.
 ///
@@ -31,14 +31,7 @@ impl Units {
     ) -> Self {
         let mut units: BTreeMap<Name, BTreeMap<u32, Vec<f64>>> = BTreeMap::new();
         for (name, arm, sums) in named {
-            match units.entry(name).or_default().entry(arm) {
-                std::collections::btree_map::Entry::Vacant(free) => {
-                    free.insert(sums);
-                }
-                std::collections::btree_map::Entry::Occupied(mut there) => {
-                    add(there.get_mut(), &sums);
-                }
-            }
+            join(units.entry(name).or_default(), arm, sums);
         }
         Units {
             layout,

@@ -3,9 +3,9 @@
 use crate::arms::{Totals, Unit, Units};
 use crate::design::Grouping;
 use crate::error::{BiasError, MIN_FITTED_RESPONSE_SIGNIFICANCE};
-use crate::fit::{self, ESTIMATES, Estimates, Known, M, MEAN_M, Plan, RESPONSE};
+use crate::fit::{ESTIMATES, Estimates, Known, M, MEAN_M, Plan, RESPONSE};
 use crate::stars::Behind;
-use crate::sums::{WEIGHT, WEIGHT2, add};
+use crate::sums::{COUNT, WEIGHT, WEIGHT2, add};
 
 /// A quantity that is estimated.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -148,7 +148,7 @@ fn behind_stars(
     let units = units.of_bins(bin, count);
     let totals = Totals::new(layout, &units, shares);
     let total = &totals.all;
-    if fit::count(total) == 0.0 {
+    if total[COUNT] == 0.0 {
         return Err(BiasError::NoGalaxies);
     }
     if let Some(name) = totals.lacking {
@@ -185,7 +185,7 @@ fn behind_stars(
         }
     }
     Ok(Estimate {
-        galaxies: fit::count(total) as usize,
+        galaxies: total[COUNT] as usize,
         effective: total[WEIGHT] * total[WEIGHT] / total[WEIGHT2],
         units: units.len(),
         values,

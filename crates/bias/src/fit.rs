@@ -3,8 +3,7 @@
 use shearq_quantities::linear::{self, Pivots, substitute};
 
 use crate::sums::{
-    COUNT, Component, Layout, MAX_TERMS, ONE, OTHER, OWN, PSF, PSF_SIZE, SQUARE, WEIGHT,
-    WEIGHTED_PSF_SIZE,
+    Component, Layout, MAX_TERMS, ONE, OTHER, OWN, PSF, PSF_SIZE, SQUARE, WEIGHT, WEIGHTED_PSF_SIZE,
 };
 
 /// Places of the estimates in a list. The first eight are m and c of the components 1, 2, + and ×.
@@ -214,11 +213,6 @@ impl Plan {
         }
         sum / weight
     }
-}
-
-/// Number of rows.
-pub(crate) fn count(sums: &[f64]) -> f64 {
-    sums[COUNT]
 }
 
 type Solution = [f64; MAX_TERMS];

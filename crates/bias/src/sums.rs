@@ -3,6 +3,9 @@
 //! Each list has the sums Σ w e z and Σ w R z z of the terms z of the fit, from which all estimates follow, so that a
 //! jackknife leaves out a unit by one subtraction and needs no second reading of the rows.
 
+use std::collections::BTreeMap;
+use std::collections::btree_map::Entry;
+
 use serde::{Deserialize, Serialize};
 
 /// One galaxy of a catalogue.
@@ -460,6 +463,14 @@ const fn triangle(n: usize) -> usize {
 pub(crate) fn shifted(key: u64, shift: u32) -> u64 {
     // A shift by 64 bits or more overflows, and means one unit.
     key.checked_shr(shift).unwrap_or(0)
+}
+
+/// Adds sums to those under the same key.
+pub(crate) fn join<K: Ord>(all: &mut BTreeMap<K, Vec<f64>>, key: K, sums: Vec<f64>) {
+    match all.entry(key) {
+        Entry::Vacant(free) => _ = free.insert(sums),
+        Entry::Occupied(mut there) => add(there.get_mut(), &sums),
+    }
 }
 
 pub(crate) fn add(sums: &mut [f64], more: &[f64]) {

@@ -7,7 +7,7 @@ use shearq_quantities::hash::NumberMap;
 
 use crate::arms::Units;
 use crate::error::BiasError;
-use crate::sums::{Layout, Row, add, shifted};
+use crate::sums::{Layout, Row, add, join, shifted};
 
 // Units that are kept, at least and at most, and per catalogue in between. A jackknife of 1000 units determines an error to
 // 1/√2000 = 2 %; more units only cost memory and time.
@@ -150,14 +150,7 @@ impl UnitSums {
     fn renamed(&mut self, name: impl Fn((u32, u64)) -> (u32, u64)) {
         let mut joined: BTreeMap<(u32, u64), Vec<f64>> = BTreeMap::new();
         for (unit, sums) in self.units.drain(..) {
-            match joined.entry(name(unit)) {
-                std::collections::btree_map::Entry::Vacant(free) => {
-                    free.insert(sums);
-                }
-                std::collections::btree_map::Entry::Occupied(mut there) => {
-                    add(there.get_mut(), &sums);
-                }
-            }
+            join(&mut joined, name(unit), sums);
         }
         self.units = joined.into_iter().collect();
         let places = self.units.iter().enumerate();

@@ -51,7 +51,7 @@ pub struct Foreign {
     /// How ellipticities become shears; by the names of the columns if it is not stated.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub ellipticity: Option<Shapes>,
-    #[serde(default = "shear")]
+    #[serde(default)]
     report: EllipticityType,
     #[serde(
         default,
@@ -108,9 +108,6 @@ fn name_or_number<'de, D: Deserializer<'de>>(value: D) -> Result<Option<String>,
     }))
 }
 
-fn shear() -> EllipticityType {
-    EllipticityType::Shear
-}
 fn one() -> i8 {
     1
 }
@@ -127,7 +124,7 @@ impl Default for Foreign {
             name: String::new(),
             catalogues: String::new(),
             ellipticity: None,
-            report: shear(),
+            report: EllipticityType::Shear,
             table: None,
             x: None,
             y: None,

@@ -71,7 +71,7 @@ pub struct Patterns {
 #[serde(deny_unknown_fields)]
 pub struct Survey {
     pub name: String,
-    #[serde(default = "shear")]
+    #[serde(default)]
     pub ellipticity: EllipticityType,
     /// Columns that a catalogue must have in addition to e1 and e2.
     #[serde(default)]
@@ -90,10 +90,6 @@ pub struct Survey {
 #[serde(deny_unknown_fields)]
 struct Presets {
     survey: Vec<Survey>,
-}
-
-fn shear() -> EllipticityType {
-    EllipticityType::Shear
 }
 
 fn columns_by_role<'de, D: serde::Deserializer<'de>>(

@@ -200,7 +200,7 @@ pub fn identify(path: &Path, most: u64) -> Result<String, FileError> {
         return Err(FileError::new(path, message));
     }
     Ok(match path.is_dir() {
-        true => sha256(&list_of(&sums(files)?)),
+        true => sha256(&list_of(&FileSum::of_files(&files)?)),
         false => FileSum::of(path)?.sha256,
     })
 }
@@ -230,16 +230,6 @@ fn files_of(folder: &Path) -> Result<Vec<PathBuf>, FileError> {
     Ok(paths)
 }
 
-fn sums(files: Vec<PathBuf>) -> Result<Vec<(String, FileSum)>, FileError> {
-    files
-        .into_iter()
-        .map(|path| {
-            let name = path.file_name().unwrap_or_default().to_string_lossy();
-            Ok((name.into_owned(), FileSum::of(&path)?))
-        })
-        .collect()
-}
-
 fn list_of(sums: &[(String, FileSum)]) -> Vec<u8> {
     let lines = sums
         .iter()
@@ -267,7 +257,7 @@ pub fn content(sending: &Sending, most: u64) -> Result<Content, FileError> {
                 path.display()
             ));
         }
-        true => (Manifest::read(path)?, sums(files_of(path)?)?),
+        true => (Manifest::read(path)?, FileSum::of_files(&files_of(path)?)?),
         false if has_archive(path) => {
             let unpacked = read_archive(path, None, Some(most))?;
             unpacked.verify(path, false)?;

@@ -537,7 +537,7 @@ impl Judge {
                 entry.challenge, self.challenge.name
             ));
         }
-        let plain = |error: FileError| reason_of(&error.path, &error.text(), sending);
+        let plain = |error| reason_of_error(&error, sending);
         let sent = self.challenge.open(&sending.path).map_err(plain)?;
         let submission = Submission::read(&sent).map_err(plain)?;
         info.contents = rules.accept(&submission)?;
@@ -582,7 +582,7 @@ impl Judge {
         sending: &Sending,
         done: &mut dyn FnMut(CheckedSet<'_>),
     ) -> Result<(), String> {
-        let plain = |error: FileError| reason_of(&error.path, &error.text(), sending);
+        let plain = |error| reason_of_error(&error, sending);
         let mut expected = self.challenge.expected().map_err(plain)?;
         let truths = self.truths.iter();
         expected.secret_truth = truths.map(|(set, own)| (*set, own.shear.clone())).collect();
@@ -715,6 +715,10 @@ fn slope_over_sets(sets: &[Powers]) -> (f64, f64) {
     });
     let line = Line::through(&rows.collect::<Vec<_>>());
     (line.slope, line.slope_error())
+}
+
+fn reason_of_error(error: &FileError, sending: &Sending) -> String {
+    reason_of(&error.path, &error.text(), sending)
 }
 
 // Lists of refused entries state the path of the entry before the reason, so it is removed here.

@@ -237,14 +237,6 @@ fn add<const FUSED: bool>(sums: &mut [f32; LANES], factor: f32, line: &[f32; LAN
     }
 }
 
-/// Whether this processor has fused multiply-adds, so that [`multiply`] has the bits of fused sums.
-pub fn fuses() -> bool {
-    #[cfg(target_arch = "x86_64")]
-    return is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
-    #[cfg(not(target_arch = "x86_64"))]
-    return cfg!(target_arch = "aarch64");
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;

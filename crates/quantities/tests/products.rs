@@ -3,7 +3,15 @@
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use shearq_quantities::linear::{Matrix, ROWS, fuses, multiply, multiply_rows};
+use shearq_quantities::linear::{Matrix, ROWS, multiply, multiply_rows};
+
+/// Whether this processor has fused multiply-adds, so that [`multiply`] has the bits of fused sums.
+fn fuses() -> bool {
+    #[cfg(target_arch = "x86_64")]
+    return is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
+    #[cfg(not(target_arch = "x86_64"))]
+    return cfg!(target_arch = "aarch64");
+}
 
 /// The product as a plain sum, and the sum of moduli.
 fn plain(left: Matrix<'_>, right: Matrix<'_>, inner: usize, at: [usize; 2]) -> [f64; 2] {

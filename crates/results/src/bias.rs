@@ -586,7 +586,7 @@ impl Summed {
             }
             error => error.into(),
         })?;
-        self.check_responses(&all)?;
+        check_responses(&self.about, &all)?;
         let cells = &self.about.cells;
         // A survey has cells without simulated galaxies, which are named.
         let is_empty = |cell: &usize| grouping.units.galaxies(*cell) == 0;
@@ -729,15 +729,6 @@ impl Summed {
         }
     }
 
-    fn check_responses(&self, all: &Estimate) -> Result<(), BiasFailure> {
-        check_responses(
-            all,
-            self.about.response,
-            ratio(&self.about.catalogues),
-            self.about.sign,
-        )
-    }
-
     // The sign of g2 in the file `truth` that e2 follows, from sums for the standard sign.
     fn sign_of_catalogues(&self, truth: &Path) -> Result<Sign, BiasFailure> {
         let mut used = self.about.catalogues.iter().filter(|own| own.rows > 0);
@@ -767,7 +758,7 @@ impl Summed {
         });
         if found.is_none() {
             // Exchanged components or wrong rows are the better remark.
-            self.check_responses(&all)?;
+            check_responses(&self.about, &all)?;
         }
         undetermined(found)
     }
@@ -893,14 +884,10 @@ fn are_exchanged(all: &Estimate, ratio: Option<f64>) -> bool {
     })
 }
 
-// Refuses ellipticities that follow minus the true shear, or do not follow it, and distortions without responses. `ratio`
-// is g2/g1 of the true shears, if it is constant.
-fn check_responses(
-    all: &Estimate,
-    has_response: bool,
-    ratio: Option<f64>,
-    sign: Option<Sign>,
-) -> Result<(), BiasFailure> {
+// Refuses ellipticities that follow minus the true shear, or do not follow it, and distortions without responses.
+fn check_responses(about: &About, all: &Estimate) -> Result<(), BiasFailure> {
+    // g2/g1 of the true shears, if it is constant.
+    let (has_response, ratio, sign) = (about.response, ratio(&about.catalogues), about.sign);
     // 1 + m of each component: the response that remains after division by the response in the catalogue.
     let responses = ["m1", "m2"].map(|key| {
         let m = all.value(key).filter(|m| m.error.is_finite())?;

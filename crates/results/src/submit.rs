@@ -255,7 +255,8 @@ impl Submission {
         let files = sent.files()?;
         let manifest = Manifest::read(&sent.path)?;
         if let Some(manifest) = &manifest {
-            manifest.verify(&sums_of(&files)?, &sent.given)?;
+            let sums = FileSum::of_files(&files)?;
+            manifest.verify(&sums.into_iter().collect(), &sent.given)?;
         }
         let mut catalogues = BTreeMap::<u32, BTreeMap<u32, PathBuf>>::new();
         let mut spectra = BTreeMap::new();
@@ -316,15 +317,6 @@ pub fn settings_of(run: &Run, path: &Path) -> Result<String, FileError> {
 pub fn is_packed(path: &Path) -> bool {
     // Below a file, the system's answer is an error other than "not found", which counts as there.
     is_archive(path) || (path.is_dir() && is_there(&path.join(MANIFEST_FILE)))
-}
-
-// The checksums of files by their names.
-fn sums_of(files: &[PathBuf]) -> Result<BTreeMap<String, FileSum>, FileError> {
-    let sum = |file: &PathBuf| {
-        let name = file.file_name().unwrap_or_default().to_string_lossy();
-        Ok((name.into_owned(), FileSum::of(file)?))
-    };
-    files.iter().map(sum).collect()
 }
 
 #[cfg(test)]

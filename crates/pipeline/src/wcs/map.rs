@@ -156,20 +156,26 @@ impl Map {
         None
     }
 
+    // The projection, and the axes of its plane.
+    fn zenithal(&self) -> Option<(&Zenithal, [[f64; 3]; 3])> {
+        match &self.projection {
+            Projection::Plane => None,
+            Projection::Zenithal {
+                kind,
+                ra,
+                dec,
+                lonpole,
+                ..
+            } => Some((kind, tangent([*ra, *dec], *lonpole))),
+        }
+    }
+
     /// Right ascension and declination in degrees, and the derivatives of (west, north) in arcseconds there.
     pub(super) fn sky(&self, at: [f64; 2]) -> (Option<[f64; 2]>, Matrix2) {
         let (place, slope) = self.plane(at);
-        let Projection::Zenithal {
-            kind,
-            ra,
-            dec,
-            lonpole,
-            ..
-        } = &self.projection
-        else {
+        let Some((kind, [centre, east, north])) = self.zenithal() else {
             return (None, slope);
         };
-        let [centre, east, north] = tangent([*ra, *dec], *lonpole);
         let [xi, eta] = place.map(f64::to_radians);
         let (height, by_square) = kind.height(xi * xi + eta * eta);
         let point = [0, 1, 2].map(|k| height * centre[k] + xi * east[k] + eta * north[k]);
@@ -194,17 +200,7 @@ impl Map {
 
     /// The pixel of a place on the sky; `None` on its other half, and where the distortion has no inverse.
     pub(super) fn pixel_of(&self, sky: [f64; 2]) -> Option<[f64; 2]> {
-        let Projection::Zenithal {
-            kind,
-            ra,
-            dec,
-            lonpole,
-            ..
-        } = &self.projection
-        else {
-            return None;
-        };
-        let [centre, east, north] = tangent([*ra, *dec], *lonpole);
+        let (kind, [centre, east, north]) = self.zenithal()?;
         let [point, ..] = tangent(sky, std::f64::consts::PI);
         let scale = kind.scale(dot(&point, &centre))?;
         self.pixel([&east, &north].map(|axis| (dot(&point, axis) * scale).to_degrees()))

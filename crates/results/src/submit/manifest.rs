@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::io::{Read, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use serde::de::Error as _;
 use serde::{Deserialize, Deserializer, Serialize};
@@ -106,6 +106,15 @@ impl FileSum {
             bytes,
             sha256: hex(&hasher.finalize()),
         })
+    }
+
+    /// The checksums of files with their names.
+    pub fn of_files(files: &[PathBuf]) -> Result<Vec<(String, Self)>, FileError> {
+        let sum = |file: &PathBuf| {
+            let name = file.file_name().unwrap_or_default().to_string_lossy();
+            Ok((name.into_owned(), FileSum::of(file)?))
+        };
+        files.iter().map(sum).collect()
     }
 
     pub fn of(path: &Path) -> Result<Self, FileError> {

@@ -200,14 +200,19 @@ const IMPLAUSIBLE: f64 = 0.3;
 // Chosen by hand: shape noise alone exceeds it in 6 of 10⁷ cases.
 const IMPLAUSIBLE_SIGNIFICANCE: f64 = 5.0;
 
+// The first m whose modulus is above a limit by more than its error explains.
+fn clearly_above(all: &Estimate, limit: f64) -> Option<(&'static str, Measured)> {
+    let large = |m: &Measured| m.value.abs() > limit + IMPLAUSIBLE_SIGNIFICANCE * m.error;
+    let mut names = ["m1", "m2"].into_iter();
+    names.find_map(|name| Some((name, all.value(name).filter(large)?)))
+}
+
 fn implausible(result: &BiasResult, all: &Estimate) -> Option<String> {
     // Another unit explains any m.
     if other_unit(result, all).is_some() {
         return None;
     }
-    let large = |m: &Measured| m.value.abs() > IMPLAUSIBLE + IMPLAUSIBLE_SIGNIFICANCE * m.error;
-    let mut found = ["m1", "m2"].into_iter();
-    let (name, m) = found.find_map(|name| Some((name, all.value(name).filter(large)?)))?;
+    let (name, m) = clearly_above(all, IMPLAUSIBLE)?;
     // First, because two catalogues under one shear leave m near −1, whatever their response.
     let shears = match (result.design, result.about.catalogues.len()) {
         (Design::Single, 2..) => {
@@ -239,9 +244,7 @@ const UNCALIBRATED: f64 = 0.1;
 
 // Ellipticities that nothing divides by their response.
 fn uncalibrated(result: &BiasResult, all: &Estimate) -> Option<String> {
-    let large = |m: &Measured| m.value.abs() > UNCALIBRATED + IMPLAUSIBLE_SIGNIFICANCE * m.error;
-    let mut found = ["m1", "m2"].into_iter();
-    let (name, m) = found.find_map(|name| Some((name, all.value(name).filter(large)?)))?;
+    let (name, m) = clearly_above(all, UNCALIBRATED)?;
     if result.about.response {
         return None;
     }
