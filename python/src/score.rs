@@ -8,7 +8,7 @@ use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use shearq_catalogue::foreign;
-use shearq_catalogue::galaxies::{Galaxies, MeanResponse};
+use shearq_catalogue::galaxies::{CalibrationSums, Galaxies};
 use shearq_catalogue::request::{Placed, Request};
 use shearq_dataset::truth::{Sign, SignFault, word};
 use shearq_files::FileError;
@@ -179,7 +179,7 @@ pub(crate) fn galaxies<'py>(
     let inputs = catalogues.into_iter().map(Given::input);
     let inputs = inputs.collect::<PyResult<Vec<_>>>()?;
     let found = py.detach(|| {
-        let mut mean = MeanResponse::default();
+        let mut mean = CalibrationSums::default();
         let mut opened = Vec::new();
         for input in inputs {
             let own = Galaxies::open(input, &request, ["x", "y", "e1", "e2"], MAX_ROWS)?;

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use crate::sums::{COUNT, Layout, MeanResponse, WEIGHT, add, join, shifted};
+use crate::sums::{COUNT, Layout, ShearedResponse, WEIGHT, add, join, shifted};
 
 /// Sums of the units of a jackknife, by arm.
 ///
@@ -144,7 +144,7 @@ pub(crate) struct Totals<'a> {
     // The share of each bin in the sum of weights, if bins are weighted.
     shares: Option<&'a [f64]>,
     // The mean response of all arms, for arms without galaxies in one of their sheared catalogues.
-    response: MeanResponse,
+    response: ShearedResponse,
     pub(crate) all: Vec<f64>,
     /// A sheared catalogue without galaxies in all arms.
     pub(crate) lacking: Option<&'static str>,
@@ -163,7 +163,7 @@ impl<'a> Totals<'a> {
             layout,
             arms,
             shares,
-            response: MeanResponse::default(),
+            response: ShearedResponse::default(),
             all: Vec::new(),
             lacking: None,
         };
@@ -178,10 +178,10 @@ impl<'a> Totals<'a> {
         totals
     }
 
-    fn mean_response(&self, sums: &[f64]) -> MeanResponse {
+    fn mean_response(&self, sums: &[f64]) -> ShearedResponse {
         match self.layout.sheared {
             true => self.layout.mean_response(sums),
-            false => MeanResponse::default(),
+            false => ShearedResponse::default(),
         }
     }
 

@@ -293,7 +293,7 @@ impl Layout {
     }
 
     /// Mean response from the sheared catalogues of these sums; NaN if one of them has no galaxy.
-    pub(crate) fn mean_response(self, sums: &[f64]) -> MeanResponse {
+    pub(crate) fn mean_response(self, sums: &[f64]) -> ShearedResponse {
         // The sum of weights differs from catalogue to catalogue, because each selects and weights other galaxies. Four
         // catalogues are needed because a selection responds to each component, and a one-sided difference has an error of
         // first order in h.
@@ -303,7 +303,7 @@ impl Layout {
             of(2 * k) - of(2 * k + 1)
         };
         let [a, b] = [own(0), own(1)];
-        let mut response = MeanResponse {
+        let mut response = ShearedResponse {
             own: [a, b, (a + b) / 2.0, (a + b) / 2.0],
             other: [0.0; 4],
         };
@@ -330,7 +330,7 @@ impl Layout {
 
     /// Adds `sums` to `into`, sums of the layout [`Layout::with_response`], with the mean response of the sheared catalogues
     /// added to the response of each row: Σ w (R + mean) z z'.
-    pub(crate) fn add_with_response(self, into: &mut [f64], sums: &[f64], mean: &MeanResponse) {
+    pub(crate) fn add_with_response(self, into: &mut [f64], sums: &[f64], mean: &ShearedResponse) {
         let mut add = |at: usize, value: f64| into[at] += value;
         (0..HEAD).for_each(|at| add(at, sums[at]));
         let (target, n) = (self.with_response(), self.terms());
@@ -414,12 +414,12 @@ impl Layout {
 /// Mean responses from sheared catalogues of the four components: to the own component of shear, and to the other one of
 /// the pair.
 #[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct MeanResponse {
+pub(crate) struct ShearedResponse {
     own: [f64; 4],
     other: [f64; 4],
 }
 
-impl MeanResponse {
+impl ShearedResponse {
     pub(crate) fn is_finite(self) -> bool {
         self.own.iter().chain(&self.other).all(|r| r.is_finite())
     }

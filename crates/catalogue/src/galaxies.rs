@@ -147,7 +147,7 @@ impl Galaxies {
 
 /// Sums of responses and weights of the galaxies of a set.
 #[derive(Debug, Clone, Default)]
-pub struct MeanResponse {
+pub struct CalibrationSums {
     // The first catalogue, and its columns by role.
     first: Option<(PathBuf, Vec<(String, String)>)>,
     weight: f64,
@@ -160,7 +160,7 @@ pub struct MeanResponse {
     has_matrix: bool,
 }
 
-impl MeanResponse {
+impl CalibrationSums {
     /// Adds the galaxies of a catalogue.
     ///
     /// # Errors

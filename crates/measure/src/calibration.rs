@@ -6,7 +6,7 @@ use thiserror::Error;
 
 use crate::measurement::{Measurement, ResponseMatrix};
 
-pub(crate) struct MeanResponse {
+pub(crate) struct DiagonalResponse {
     pub(crate) diagonal: [f64; 2],
     /// Whether each is positive by three standard errors. The response of a single galaxy has no error, and must only be
     /// positive.
@@ -18,14 +18,14 @@ pub(crate) struct MeanResponse {
 /// One galaxy's response is far too noisy to divide by, and correlated with its ellipticity. The mean over one image of 40
 /// to 400 galaxies at S/N 10 is too: ⟨1/R̂⟩ exceeds 1/⟨R⟩ by 17 to 1 in a thousand. So ellipticities stay as they are, and
 /// who averages them divides by the response of what is averaged.
-pub(crate) fn mean_response(galaxies: &[Measurement]) -> MeanResponse {
+pub(crate) fn mean_response(galaxies: &[Measurement]) -> DiagonalResponse {
     let mut responses = [RunningMean::default(); 2];
     for galaxy in galaxies.iter().filter(|galaxy| galaxy.flags.is_empty()) {
         for (mean, response) in responses.iter_mut().zip(galaxy.response_diagonal()) {
             mean.add(response);
         }
     }
-    MeanResponse {
+    DiagonalResponse {
         diagonal: responses.map(|own| own.mean()),
         is_significant: responses.iter().all(is_significant),
     }

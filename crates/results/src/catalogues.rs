@@ -16,7 +16,7 @@ use shearq_scoring::{Choice, Convention, FieldSum, Grid, Row, RowCounts};
 use crate::response::response_of;
 use crate::submit::{Packed, Sent, Submission, settings_of};
 use shearq_catalogue::foreign::{ADVICE_ON_SENTINELS, Foreign, HINT_OF_COLUMNS, fault_of_rows};
-use shearq_catalogue::galaxies::{Calibration, Galaxies, Galaxy, MeanResponse};
+use shearq_catalogue::galaxies::{Calibration, CalibrationSums, Galaxies, Galaxy};
 use shearq_catalogue::source::states_shearq;
 use shearq_files::atomic::folder_of;
 
@@ -182,7 +182,7 @@ impl Catalogues {
                     .map(Calibration::diagonal),
             };
         };
-        let mut mean = MeanResponse::default();
+        let mut mean = CalibrationSums::default();
         for (_, path) in &files {
             if let Some(own) = recognised(foreign, path, MAX_ROWS)? {
                 mean.add(&own)?;

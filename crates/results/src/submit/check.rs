@@ -14,7 +14,7 @@ use super::{
 use crate::catalogues::{OWN, galaxies_of, recognised, sum_on};
 use crate::views::scores::{follows_by_less, odd_response, repeated_shapes, words};
 use shearq_catalogue::foreign::Foreign;
-use shearq_catalogue::galaxies::{Calibration, Galaxies, MeanResponse};
+use shearq_catalogue::galaxies::{Calibration, CalibrationSums, Galaxies};
 use shearq_files::FileError;
 use shearq_files::table::most_rows;
 
@@ -169,7 +169,7 @@ fn check_files(
         // In the order in which `score` adds them, whose groups of the jackknife depend on it.
         of_set.sort_by_key(|(image, _)| *image);
         let session = expected.session(Some(set));
-        let mut files = SetFiles::new(&session);
+        let mut files = SentImages::new(&session);
         let paths = of_set.iter().map(|(_, file)| file.as_path());
         let (opened, calibration) = open_catalogues(paths, session.grid(), report);
         for ((image, file), opened) in of_set.into_iter().zip(opened) {
@@ -197,7 +197,7 @@ fn check_files(
 }
 
 // Compares the images of a set with each other.
-fn check_each(set: u32, files: &SetFiles<'_>, expected: &Expected, report: &mut Report) {
+fn check_each(set: u32, files: &SentImages<'_>, expected: &Expected, report: &mut Report) {
     let odd = files.images.odd(Convention::STANDARD);
     for (copy, first) in odd.copies {
         let message = format!(
@@ -235,7 +235,7 @@ fn check_unnamed(file: &Path, single: bool, expected: &Expected, report: &mut Re
         return;
     };
     if let Some(set) = set {
-        let mut entry = SetFiles::new(&session);
+        let mut entry = SentImages::new(&session);
         entry.add(&examined, 1, file);
         check_against_truth(set, &entry, expected, report);
     } else if !sets.is_empty() {
@@ -276,15 +276,15 @@ fn check_sets(path: &Path, found: &BTreeSet<u32>, expected: &Expected, report: &
 }
 
 // The readable catalogues of a set.
-struct SetFiles<'s> {
+struct SentImages<'s> {
     images: AddedImages<'s>,
     paths: Vec<PathBuf>,
     numbers: Vec<u32>,
 }
 
-impl<'s> SetFiles<'s> {
+impl<'s> SentImages<'s> {
     fn new(session: &'s SetSession) -> Self {
-        SetFiles {
+        SentImages {
             images: session.begin(),
             paths: Vec::new(),
             numbers: Vec::new(),
@@ -372,7 +372,7 @@ fn open_catalogues<'p>(
     grid: &Grid,
     report: &mut Report,
 ) -> (Vec<Option<Option<Galaxies>>>, Calibration) {
-    let mut mean = MeanResponse::default();
+    let mut mean = CalibrationSums::default();
     let mut open = |path| {
         let opened = recognised(&Foreign::default(), path, most_rows(grid.cells()))?;
         opened.iter().try_for_each(|own| mean.add(own))?;
@@ -532,7 +532,7 @@ fn name_of(path: &Path) -> String {
 
 fn check_images(
     set: u32,
-    files: &SetFiles<'_>,
+    files: &SentImages<'_>,
     last: u32,
     path: &Path,
     expected: &Expected,
@@ -564,7 +564,7 @@ fn check_images(
     }
 }
 
-fn check_against_truth(set: u32, files: &SetFiles<'_>, expected: &Expected, report: &mut Report) {
+fn check_against_truth(set: u32, files: &SentImages<'_>, expected: &Expected, report: &mut Report) {
     let Some(path) = files.paths.first() else {
         return;
     };
