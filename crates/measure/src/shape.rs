@@ -46,6 +46,7 @@ use shearq_submissions::{AcfKind, Background, ClippedShape, ShareOf};
 
 use crate::error::{MeasureError, length};
 use crate::measurement::Flag;
+use crate::spectral::{Spectral, SpectralPsf};
 use crate::transform::{
     HexLattice, LagsScratch, Plane, Spectrum, ToLags, ToModes, TransformScratch,
 };
@@ -222,6 +223,68 @@ impl RoundMoments {
 
 fn weight(scale: f64, square: f64) -> f64 {
     (1.0 + square / (scale * scale)).powf(EXPONENT)
+}
+
+// S/N at which a size is the mean of the measured one and of the size of a typical galaxy. Chosen by hand: it shrinks sizes at S/N 20 by 6 %.
+const HALF_SIZE_SNR: f32 = 5.0;
+
+/// What is added to the divisors of the moments and of the size, so that faint galaxies respond less.
+///
+/// Divisors go with the square of the flux, as the square of the S/N ν does, so that a galaxy has the weight
+/// ν²/(ν² + ν₀²). ν₀ is converted to a flux by PSF and noise, for galaxies of the size that the window is for, with the S/N
+/// of the matched filter. Noise of the autocorrelation instead, which grows much faster with the width of the PSF, would
+/// give galaxies behind broad PSFs too little weight: in sets with a PSF for each galaxy that costs 0.4 % of the scatter at
+/// S/N 20, and 0.8 % for large galaxies. The galaxy is taken as deconvolved to the target, which is not exact for few
+/// iterations or λ > 0.
+pub(crate) struct Regularisation {
+    /// Regularisation that halves the ellipticity of a galaxy of the reference size and flux one, times ν₀² (`shape.half_snr`).
+    ellipticity: f32,
+    /// P₀ of [`SizeMoments`] for such a galaxy of flux one, times the square of [`HALF_SIZE_SNR`].
+    size: f32,
+    /// Power of this galaxy in each mode, from `Spectral::light`.
+    galaxy: Vec<f32>,
+    /// T of [`SizeMoments`] for such a galaxy.
+    pub(crate) typical_square: f32,
+}
+
+impl Regularisation {
+    pub(crate) fn new(
+        half_snr: f64,
+        galaxy: TypicalGalaxy,
+        spectral: &Spectral,
+        moments: &RoundMoments,
+        size_moments: &SizeMoments,
+    ) -> Self {
+        let lags = spectral.lattice().places();
+        let acf: Vec<f32> = lags
+            .map(|[x, y]| galaxy.autocorrelation(x * x + y * y) as f32)
+            .collect();
+        let [light, ..] = moments.sums(&acf);
+        let [zero, two] = size_moments.sums(&acf);
+        Regularisation {
+            ellipticity: light * half_snr.powi(2) as f32,
+            size: zero * HALF_SIZE_SNR * HALF_SIZE_SNR,
+            galaxy: spectral.light(galaxy.variance),
+            typical_square: two / zero,
+        }
+    }
+
+    /// What is added for the ellipticity and for the size behind `psf` in noise of level one; not finite if the PSF passes no light.
+    pub(crate) fn behind(&self, psf: &SpectralPsf) -> RegularisationTerms {
+        let modes = self.galaxy.iter().zip(psf.clarity());
+        let snr_squared = modes.map(|(light, clarity)| light * clarity).sum::<f32>();
+        RegularisationTerms {
+            ellipticity: self.ellipticity / snr_squared,
+            size: self.size / snr_squared,
+        }
+    }
+}
+
+/// What is added to the divisors of ellipticity and size in noise of level one; it grows with the variance of the noise.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct RegularisationTerms {
+    pub(crate) ellipticity: f32,
+    pub(crate) size: f32,
 }
 
 // Scale τ of the weight in units of the window's σ. Chosen by hand: wide enough that sizes up to 10 px differ.

@@ -38,7 +38,9 @@ use crate::psf::{
 use crate::random::hash;
 use crate::random::uniform;
 use crate::selection::ShearSettings;
-use crate::shape::{Ratio, RoundMoments, SizeMoments, TypicalGalaxy};
+use crate::shape::{
+    Ratio, Regularisation, RegularisationTerms, RoundMoments, SizeMoments, TypicalGalaxy,
+};
 use crate::spectral::{
     EpochPixels, EpochStamp, Lags, ModeNoise, NoiseChanges, Spectral, SpectralPsf, SpectralScratch,
 };
@@ -47,8 +49,6 @@ use crate::transform::HexLattice;
 // In simulated pairs the choice of galaxies makes 7 % of the error of m, and half of it behind a PSF of ellipticity 0.1. All galaxies
 // would double the time. Sheared catalogues need the noise of every galaxy.
 const NOISE_MOMENTS_INTERVAL: u64 = 8;
-// S/N at which a size is the mean of the measured one and of the size of a typical galaxy. Chosen by hand: it shrinks sizes at S/N 20 by 6 %.
-const HALF_SIZE_SNR: f32 = 5.0;
 
 // Correlated noise follows the shape of pixels in steps of 1/1024, because its power in all modes takes as long as several
 // galaxies. Noise is then sheared by at most 0.0005 too much.
@@ -73,65 +73,6 @@ const WIDEST_WINDOW: f64 = 0.2;
 // Index of the configured width among all widths.
 const CONFIGURED_WINDOW: usize = WINDOW_STEPS.start().unsigned_abs() as usize;
 const WINDOW_COUNT: usize = CONFIGURED_WINDOW + 1 + WINDOW_STEPS.end().unsigned_abs() as usize;
-
-/// What is added to the divisors of the moments and of the size, so that faint galaxies respond less.
-///
-/// Divisors go with the square of the flux, as the square of the S/N ν does, so that a galaxy has the weight
-/// ν²/(ν² + ν₀²). ν₀ is converted to a flux by PSF and noise, for galaxies of the size that the window is for, with the S/N
-/// of the matched filter. Noise of the autocorrelation instead, which grows much faster with the width of the PSF, would
-/// give galaxies behind broad PSFs too little weight: in sets with a PSF for each galaxy that costs 0.4 % of the scatter at
-/// S/N 20, and 0.8 % for large galaxies. The galaxy is taken as deconvolved to the target, which is not exact for few
-/// iterations or λ > 0.
-struct Regularisation {
-    /// Regularisation that halves the ellipticity of a galaxy of the reference size and flux one, times ν₀² (`shape.half_snr`).
-    ellipticity: f32,
-    /// P₀ of [`SizeMoments`] for such a galaxy of flux one, times the square of [`HALF_SIZE_SNR`].
-    size: f32,
-    /// Power of this galaxy in each mode, from `Spectral::light`.
-    galaxy: Vec<f32>,
-    /// T of [`SizeMoments`] for such a galaxy.
-    typical_square: f32,
-}
-
-impl Regularisation {
-    fn new(
-        half_snr: f64,
-        galaxy: TypicalGalaxy,
-        spectral: &Spectral,
-        moments: &RoundMoments,
-        size_moments: &SizeMoments,
-    ) -> Self {
-        let lags = spectral.lattice().places();
-        let acf: Vec<f32> = lags
-            .map(|[x, y]| galaxy.autocorrelation(x * x + y * y) as f32)
-            .collect();
-        let [light, ..] = moments.sums(&acf);
-        let [zero, two] = size_moments.sums(&acf);
-        Regularisation {
-            ellipticity: light * half_snr.powi(2) as f32,
-            size: zero * HALF_SIZE_SNR * HALF_SIZE_SNR,
-            galaxy: spectral.light(galaxy.variance),
-            typical_square: two / zero,
-        }
-    }
-
-    /// What is added for the ellipticity and for the size behind `psf` in noise of level one; not finite if the PSF passes no light.
-    fn behind(&self, psf: &SpectralPsf) -> RegularisationTerms {
-        let modes = self.galaxy.iter().zip(psf.clarity());
-        let snr_squared = modes.map(|(light, clarity)| light * clarity).sum::<f32>();
-        RegularisationTerms {
-            ellipticity: self.ellipticity / snr_squared,
-            size: self.size / snr_squared,
-        }
-    }
-}
-
-/// What is added to the divisors of ellipticity and size in noise of level one; it grows with the variance of the noise.
-#[derive(Debug, Clone, Copy, Default)]
-struct RegularisationTerms {
-    ellipticity: f32,
-    size: f32,
-}
 
 impl AdaptedSettings {
     /// The flux of a Gaussian of mean square `variance` px² per axis over the flux under the window, after convolution with the target.
