@@ -88,6 +88,34 @@ fn check_own_responses(path: &Path, columns: &BTreeMap<Key, String>) -> Result<(
     ))
 }
 
+// Metacalibration of `g1_noshear` is no response of a column `e1` of another method: m was 0.06 for −0.04.
+fn check_sheared_names(
+    path: &Path,
+    columns: &BTreeMap<Key, String>,
+    names: &Names,
+) -> Result<(), FileError> {
+    let sheared = (Role::E1, 1);
+    let (Some(e1), Some(plus)) = (columns.get(&(Role::E1, 0)), columns.get(&sheared)) else {
+        return Ok(());
+    };
+    let are_given = names.is_given(Role::E1) || names.given.contains_key(&sheared);
+    let is_of_shear = recognised(sheared)
+        .iter()
+        .any(|own| own.starts_with('g') && own.eq_ignore_ascii_case(plus));
+    if are_given || !is_of_shear || sheared_name(plus).is_some_and(|(_, own)| own == unsheared(e1))
+    {
+        return Ok(());
+    }
+    let other = plus.replace("_1p", "_noshear").replace("_1P", "_NOSHEAR");
+    let second = other.replace('1', "2");
+    Err(FileError::new(
+        path,
+        format!(
+            "`{plus}` is no sheared version of `{e1}` (expected e1 with its own response). Try: --columns e1={other},e2={second} for these sheared catalogues, or e1_1p=none,e1_1m=none,e2_2p=none,e2_2m=none for `{e1}` without them"
+        ),
+    ))
+}
+
 fn check_partners(
     path: &Path,
     columns: &BTreeMap<Key, String>,
@@ -171,8 +199,10 @@ fn is_called(own: &str, name: &str) -> bool {
         || in_vector(name).is_some_and(|name| own.eq_ignore_ascii_case(&name))
 }
 
+// The column of this name, or else of this name in other letters.
 fn same_name<'a>(found: &'a [String], name: &str) -> Option<&'a String> {
-    found.iter().find(|own| own.eq_ignore_ascii_case(name))
+    let exact = found.iter().find(|own| *own == name);
+    exact.or_else(|| found.iter().find(|own| own.eq_ignore_ascii_case(name)))
 }
 
 /// The name of a column without the name of the unsheared catalogue.
@@ -456,8 +486,14 @@ impl Columns {
         let survey = surveys.find(|survey| survey.absent_column(found, names).is_none());
         // A column called g1 that is given as e1 is not the true shear, too.
         let free = |name: &str| {
-            let mut all = found.iter().filter(|own| is_called(own, name));
-            all.find(|own| names.key_of(own).is_none())
+            let all = found.iter().filter(|own| is_called(own, name));
+            let mut all = all.filter(|own| names.key_of(own).is_none());
+            all.clone().find(|own| *own == name).or_else(|| all.next())
+        };
+        let by_name = |key| {
+            let names = recognised(key);
+            let known = names.iter().find_map(|name| free(name));
+            known.or_else(|| unsheared_column(found, key, &names, &free))
         };
         let mut columns = BTreeMap::new();
         for key in keys().filter(|(role, _)| *role != Role::Flag) {
@@ -468,12 +504,10 @@ impl Columns {
                 (Some(none), _) if none == "none" => None,
                 (Some(given), _) if found.contains(given) => Some(given),
                 (Some(given), _) => return Err(FileError::no_column(path, given, found)),
-                (None, Some(known)) => free(known),
-                (None, None) => {
-                    let names = recognised(key);
-                    let known = names.iter().find_map(|name| free(name));
-                    known.or_else(|| unsheared_column(found, key, &names, &free))
-                }
+                (None, Some("none")) => None,
+                // A table with the columns of a survey may have a weight of another name.
+                (None, Some(known)) => free(known).or_else(|| by_name(key)),
+                (None, None) => by_name(key),
             };
             columns.extend(column.map(|column| (key, column.clone())));
         }
@@ -502,6 +536,7 @@ impl Columns {
             }
         }
         check_own_responses(path, &columns)?;
+        check_sheared_names(path, &columns, names)?;
         let Some(e1) = name_of_e1(&columns).or_else(|| Some(columns.get(&(Role::E2, 0))?.clone()))
         else {
             return Err(FileError::new(
@@ -752,7 +787,8 @@ fn find_flags(
     let own = |name: &str| same_name(found, name).filter(|own| names.key_of(own).is_none());
     // The survey's flag is preferred to general names: DES Y1 has both `flags_select` and `flags`.
     let first = match survey.and_then(|survey| survey.of((Role::Flag, 0))) {
-        Some(known) => own(known),
+        Some("none") => None,
+        Some(known) => own(known).or_else(|| names_of_role(Role::Flag).find_map(own)),
         None => names_of_role(Role::Flag).find_map(own),
     };
     let e1 = e1.unwrap_or_default();
@@ -858,6 +894,41 @@ mod tests {
         }
         let given = found("a b R11 R22", &["e1=a", "e2=b", "R11=none", "R22=none"]).unwrap();
         assert_eq!((given.of(Role::E1), given.of(Role::R11)), (Some("a"), None));
+    }
+
+    #[test]
+    fn sheared_columns_of_another_method_are_refused() {
+        let metacal = "g1_noshear g2_noshear g1_1p g1_1m g2_2p g2_2m";
+        assert_eq!(found(metacal, &[]).unwrap().preset, Preset::Metacal);
+        let both = format!("e1 e2 {metacal}");
+        let error = found(&both, &[]).unwrap_err();
+        assert!(error.contains("e1=g1_noshear,e2=g2_noshear"), "{error}");
+        let names = ["e1=g1_noshear", "e2=g2_noshear"];
+        let chosen = found(&both, &names).unwrap();
+        assert_eq!(chosen.of_sheared((Role::E1, 1)), Some("g1_1p"));
+        let none = ["e1_1p=none", "e1_1m=none", "e2_2p=none", "e2_2m=none"];
+        let plain = found(&both, &none).unwrap();
+        assert_eq!(
+            (plain.preset, plain.of(Role::E1)),
+            (Preset::Plain, Some("e1"))
+        );
+    }
+
+    #[test]
+    fn names_in_the_same_letters_are_preferred() {
+        let own = found("E1 E2 e1 e2 FLAG flag", &[]).unwrap();
+        assert_eq!(
+            (own.of(Role::E1), own.of(Role::E2)),
+            (Some("e1"), Some("e2"))
+        );
+        assert_eq!(own.flags, ["flag"]);
+        // A vector `e` beside responses is like a table of DES Y3, with a weight and a flag of other names.
+        let vector = found("e[0] e[1] w flag R11 R22", &[]).unwrap();
+        assert_eq!(vector.program(), "DES Y3");
+        assert_eq!(
+            (vector.of(Role::Weight), vector.of(Role::Flag)),
+            (Some("w"), Some("flag"))
+        );
     }
 
     #[test]
