@@ -144,6 +144,8 @@ pub fn placed_rows(
     }
     // Rows of noshear and of each sheared catalogue so far.
     let mut counts = [0u64; CATALOGUES];
+    // Those that count.
+    let mut used = [0u64; CATALOGUES];
     let mut found = Found::default();
     for source in sources {
         let (mut first, mut checks) = (0, None::<Vec<Check>>);
@@ -177,6 +179,7 @@ pub fn placed_rows(
                                     found.add(&part, at, (first + at + 1) as u64, &own.row);
                                 }
                             }
+                            used[sheared] += u64::from(excluded.is_none());
                             item = Some(own);
                         }
                         // A row counts for its first reason.
@@ -202,6 +205,9 @@ pub fn placed_rows(
     summary.rows = counts[0];
     if sources.iter().any(Source::has_sheared_rows) {
         require_sheared(path, &counts)?;
+        if used[0] >= MIN_UNSHEARED {
+            require_sheared(path, &used)?;
+        }
     }
     if let Some(first) = sources.first() {
         check_share(path, first, reading, &summary)?;
@@ -1027,6 +1033,9 @@ impl Found {
     }
 }
 
+// Rows without shear that count, of which sheared ones have some, too, unless a flag leaves out all of them. Chosen by hand.
+const MIN_UNSHEARED: u64 = 50;
+
 // Without one of the sheared catalogues, the response is unknown: it was NaN, and the message named R11.
 fn require_sheared(path: &Path, counts: &[u64; CATALOGUES]) -> Result<(), FileError> {
     let names = ["noshear", "1p", "1m", "2p", "2m"];
@@ -1043,7 +1052,7 @@ fn require_sheared(path: &Path, counts: &[u64; CATALOGUES]) -> Result<(), FileEr
     Err(FileError::new(
         path,
         format!(
-            "there is no row of {} (found {}, expected rows of all sheared catalogues, whose differences are the response). Try: the table with all of them, or --columns version=none if the ellipticities are calibrated",
+            "there is no row of {} that counts (found {}, expected rows of all sheared catalogues, whose differences are the response). Try: the table with all of them, or --columns version=none if the ellipticities are calibrated",
             names_of(&absent),
             names_of(&found)
         ),
