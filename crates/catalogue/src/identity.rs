@@ -6,6 +6,7 @@ use std::path::Path;
 
 use shearq_files::FileError;
 use shearq_files::frames::polars::DataFrame;
+use shearq_files::frames::reals;
 use shearq_files::table;
 
 // Integers that floats do not contain have other bits than the float with the same ones.
@@ -16,20 +17,38 @@ const EXACT: u64 = 1 << 53;
 
 /// Keys of the identifiers in a column: equal for equal numbers of any type, and for a text that is such a number.
 pub fn keys(frame: &DataFrame, name: &str, path: &Path) -> Result<Vec<u64>, FileError> {
-    let column = frame.column(name).ok();
-    let series = column.map(|own| own.as_materialized_series());
     // Galaxies without an identity would be one galaxy.
-    let missing = |count: usize| match count {
-        0 => Ok(()),
+    let count = missing(frame, name).iter().filter(|own| **own).count();
+    match count {
+        0 => keys_or_zero(frame, name, path),
         _ => {
             let message = format!(
-                "column `{name}` has no identity in {count} of {} rows; expected one in each",
+                "column `{name}` has no identity in {count} of {} rows; expected one in each. Try: --drop-missing, or --columns id=none",
                 frame.height()
             );
             Err(FileError::new(path, message))
         }
+    }
+}
+
+/// Which rows have no identifier.
+pub fn missing(frame: &DataFrame, name: &str) -> Vec<bool> {
+    let Ok(column) = frame.column(name) else {
+        return Vec::new();
     };
-    missing(series.map_or(0, |own| own.null_count()))?;
+    let series = column.as_materialized_series();
+    match reals(column).filter(|_| series.dtype().is_float()) {
+        Some(numbers) => numbers.iter().map(|own| own.is_nan()).collect(),
+        None => (series.is_null().iter())
+            .map(|own| own == Some(true))
+            .collect(),
+    }
+}
+
+/// As [`keys`], with any number in rows without an identifier.
+pub fn keys_or_zero(frame: &DataFrame, name: &str, path: &Path) -> Result<Vec<u64>, FileError> {
+    let column = frame.column(name).ok();
+    let series = column.map(|own| own.as_materialized_series());
     // Floats would round the identifiers of Rubin, which are above 2⁵³.
     if let Some(texts) = series.and_then(|own| own.str().ok()) {
         let key = |text: Option<&str>| of_text(text.unwrap_or_default());
@@ -50,7 +69,6 @@ pub fn keys(frame: &DataFrame, name: &str, path: &Path) -> Result<Vec<u64>, File
         return Ok(integers.iter().map(|own| own.map_or(0, key)).collect());
     }
     let numbers = table::numbers(frame, name, path)?;
-    missing(numbers.iter().filter(|own| own.is_nan()).count())?;
     // pandas makes floats of integers with a missing one. Different galaxies are then one.
     if let Some(large) = numbers.iter().find(|own| own.abs() > EXACT as f64) {
         let message = format!(
@@ -82,7 +100,7 @@ fn of_integer(integer: i128) -> u64 {
     }
 }
 
-fn of_text(text: &str) -> u64 {
+pub(crate) fn of_text(text: &str) -> u64 {
     // Tables of fixed width have blanks around identifiers.
     let text = text.trim();
     // `007` is a text, because it differs from `7`. Texts of numbers have the keys of the numbers: CSV has no types.

@@ -257,6 +257,8 @@ struct TableRows<'a> {
     sheared_of_rows: Option<Vec<usize>>,
     frame: &'a DataFrame,
     ids: Option<Vec<u64>>,
+    // Rows without an identifier or unit, if they are left out.
+    unnamed: Vec<bool>,
     ids_are_units: bool,
     units: Option<Vec<u64>>,
     truth: OfRows<'a>,
@@ -311,7 +313,20 @@ impl<'a> TableRows<'a> {
         let truth = OfRows::new(file, places, &reading.truth)?;
         check_angles(source, reading, columns)?;
         refuse_boolean_flags(frame, source, reading)?;
-        let keys = |name: &str| identity::keys(frame, name, path);
+        let drops = reading.request.drop_missing;
+        let mut unnamed = Vec::new();
+        let mut keys = |name: &str| {
+            if !drops {
+                return identity::keys(frame, name, path);
+            }
+            let missing = identity::missing(frame, name);
+            unnamed.resize(missing.len(), false);
+            let both = unnamed.iter_mut().zip(missing);
+            both.for_each(|(own, more)| *own |= more);
+            identity::keys_or_zero(frame, name, path)
+        };
+        let ids = source.columns.of(Role::Id).map(&mut keys).transpose()?;
+        let units = source.unit.as_deref().map(&mut keys).transpose()?;
         let sheared_of_rows = source.columns.of(Role::ShearedCatalogue);
         let sheared_of_rows = sheared_of_rows.map(|name| sheared_of(frame, name, path));
         let weighted = reading.weights().map(|selection| -> Result<_, FileError> {
@@ -336,9 +351,10 @@ impl<'a> TableRows<'a> {
                 .collect(),
             responses: responses(source),
             sheared_of_rows: sheared_of_rows.transpose()?,
-            ids: source.columns.of(Role::Id).map(keys).transpose()?,
+            ids,
+            unnamed,
             ids_are_units: source.unit.as_deref() == source.columns.of(Role::Id),
-            units: source.unit.as_deref().map(keys).transpose()?,
+            units,
             source,
             reading,
             frame,
@@ -598,7 +614,7 @@ impl<'a> TableRows<'a> {
         selected: Selected,
         checks: &[Check],
     ) -> Result<SummedRow, Rejected> {
-        if self.is_unmeasured(at) {
+        if self.is_unmeasured(at) || self.unnamed.get(at) == Some(&true) {
             return Err(Exclusion::Missing.into());
         }
         self.check_unused_weight(at)?;

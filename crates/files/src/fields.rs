@@ -222,7 +222,10 @@ pub(crate) fn numbers_alone(
     Ok(table.drop_many(texts))
 }
 
-/// The column, in which missing floats are NaN.
+// Floats have all integers below it.
+const EXACT: f64 = (1u64 << 53) as f64;
+
+/// The column, in which missing numbers are NaN: one of integers with missing ones becomes one of floats.
 pub(crate) fn with_missing(path: &Path, column: Series) -> Result<Column, FileError> {
     let name = column.name().to_string();
     let filled = match (column.null_count(), column.dtype()) {
@@ -230,10 +233,18 @@ pub(crate) fn with_missing(path: &Path, column: Series) -> Result<Column, FileEr
         (_, DataType::Float64) => filled(column.f64(), f64::NAN),
         (_, DataType::Float32) => filled(column.f32(), f32::NAN),
         (count, _) => {
-            let message = format!(
-                "column `{name}` has {count} missing value(s); only float columns may have any (they become NaN)"
-            );
-            return Err(FileError::new(path, message));
+            let column = Column::from(column);
+            let numbers = reals(&column);
+            let exact = numbers.filter(|all| !all.iter().any(|own| own.abs() >= EXACT));
+            return match exact {
+                Some(numbers) => Ok(Column::new(name.into(), numbers.into_owned())),
+                None => Err(FileError::new(
+                    path,
+                    format!(
+                        "column `{name}` has {count} missing value(s) (expected them in columns of floats, of integers below 2⁵³ or of truth values, where they become NaN). Try: the table without these rows, or with values for them"
+                    ),
+                )),
+            };
         }
     };
     filled.map_err(|error| FileError::new(path, format!("column `{name}`: {error}")))
