@@ -553,10 +553,12 @@ impl<'a> TableRows<'a> {
         // Smooth steps of `--where` are zero far below their threshold. Such a row would add zeros to all sums.
         let stepped = self.weighted.as_ref().map(|selection| selection.weight[at]);
         let is_outside = stepped.is_some_and(|weight| weight <= 0.0);
+        let selection = self.source.selection.map(|place| self.value(place, at));
+        let is_left_out = selection.is_some_and(|weight| weight <= 0.0);
         let binned = |sheared: usize, weight: f64| {
             if flagged(sheared) {
                 Err(Exclusion::Flagged)
-            } else if !has_weight(weight) {
+            } else if !has_weight(weight) || is_left_out {
                 Err(Exclusion::Unweighted)
             } else {
                 let binned = self.binned(at, sheared).filter(|_| !is_outside);

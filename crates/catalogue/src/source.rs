@@ -93,6 +93,8 @@ pub struct Source {
     sheared_flags: bool,
     /// Whether each sheared catalogue selects galaxies by its columns, so that the response of the selection follows.
     pub selects: bool,
+    /// The column of weights that `select` wrote: rows with zero stay in its files and do not count.
+    pub selection: Option<usize>,
     declines_matrix: bool,
     has_weights: bool,
     /// Whether the size of the PSF is T = 2σ², whose square root is a size.
@@ -760,6 +762,21 @@ fn source(
             _ => !is_fixed(name, &columns) && !has_sheared(name),
         })
         .collect();
+    let selection = match columns.is_of_shearq() {
+        true => wanted.add("selection", None),
+        false => None,
+    };
+    // Which of both is meant is unknown, and a file gives the first.
+    let is_twice = |own: &&Operand| names.iter().filter(|name| **name == own.column).count() > 1;
+    if let Some(twice) = wanted.all.iter().find(is_twice) {
+        return Err(FileError::new(
+            path,
+            format!(
+                "the column `{}` is there several times (expected every name once). Try: other names",
+                twice.column
+            ),
+        ));
+    }
     let sheared_weight = places.of((Role::Weight, 1)).is_some();
     let chosen = reading.expressions().next().is_some() || sheared_flags || sheared_weight;
     Ok(Source {
@@ -771,6 +788,7 @@ fn source(
         unanswered: unanswered.into_iter().map(str::to_owned).collect(),
         sheared_flags,
         selects: columns.give_selection_response() && chosen && known,
+        selection,
         declines_matrix: given.decline_matrix(),
         has_weights: reading.weights().is_some(),
         psf_area: columns.of(Role::PsfSize).is_some_and(|name| {
