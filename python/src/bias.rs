@@ -78,8 +78,8 @@ pub(crate) fn shapes_of(name: &str) -> PyResult<Shapes> {
     }
 }
 
-// Frames of pandas and astropy arrive as columns of float64 or of text, because those are the types that `bias` reads:
-// other types, masks and integers beyond 2⁵³ are converted in _bias.py, where each package's rules are known.
+// Frames of pandas and astropy arrive as columns of float64, of integers beyond 2⁵³ or of text, because those are the types that
+// `bias` reads: other types and masks are converted in _bias.py, where each package's rules are known.
 fn table_of(
     name: &str,
     columns: Vec<(String, Bound<'_, PyAny>)>,
@@ -88,6 +88,12 @@ fn table_of(
     let columns = columns.iter().map(|(label, values)| {
         if let Ok(reals) = values.extract::<PyReadonlyArray1<'_, f64>>() {
             return Ok(Column::new(label.as_str().into(), reals.as_slice()?));
+        }
+        if let Ok(integers) = values.extract::<PyReadonlyArray1<'_, i64>>() {
+            return Ok(Column::new(label.as_str().into(), integers.as_slice()?));
+        }
+        if let Ok(integers) = values.extract::<PyReadonlyArray1<'_, u64>>() {
+            return Ok(Column::new(label.as_str().into(), integers.as_slice()?));
         }
         if let Ok(texts) = values.extract::<Vec<String>>() {
             return Ok(Column::new(label.as_str().into(), texts));

@@ -40,7 +40,7 @@ pub(crate) fn select<'py>(
     let stated = selection.unwrap_or_default();
     let weights = stated.weights.clone().unwrap_or_default();
     let operand = |own: &Operand| match own.texts {
-        None => column(&own.column),
+        None => Ok(own.of_numbers(column(&own.column)?)),
         Some(_) => {
             let name = &own.column;
             let message = format!("column {name} is compared with a text (expected numbers)");

@@ -39,6 +39,8 @@ pub struct Expression {
 pub struct Operand {
     pub column: String,
     pub texts: Option<Texts>,
+    /// Bits of which the operand has those that the number has, too: a float would lose the low bits of 64.
+    pub mask: Option<i64>,
 }
 
 /// What the texts of a column are compared with.
@@ -58,6 +60,30 @@ impl Texts {
                 let found = all.binary_search_by(|own| own.as_str().cmp(text));
                 found.map_or(0.0, |place| (place + 1) as f64)
             }
+        }
+    }
+}
+
+impl Operand {
+    fn of_column(column: &str) -> Self {
+        Operand {
+            column: column.to_owned(),
+            texts: None,
+            mask: None,
+        }
+    }
+
+    /// The value where the column has a number.
+    pub fn of_number(&self, number: f64) -> f64 {
+        self.mask
+            .map_or(number, |mask| common_bits(number, mask as f64))
+    }
+
+    /// The values where the column has these numbers.
+    pub fn of_numbers<'v>(&self, numbers: Cow<'v, [f64]>) -> Cow<'v, [f64]> {
+        match self.mask {
+            None => numbers,
+            Some(_) => Cow::Owned(numbers.iter().map(|own| self.of_number(*own)).collect()),
         }
     }
 }
@@ -105,9 +131,10 @@ const FUNCTIONS: [(&str, Function); 9] = [
     ("cos", f64::cos),
     ("sin", f64::sin),
     ("radians", f64::to_radians),
-    ("not", |a| compared(a, a, a == 0.0)),
+    ("not", NOT),
 ];
 
+const NOT: Function = |a| compared(a, a, a == 0.0);
 const POWER: Binary = ("^", f64::powf);
 
 // From the loosest to the tightest. Within a level the left one is applied first.
@@ -141,9 +168,12 @@ fn truth(of: bool) -> f64 {
     f64::from(u8::from(of))
 }
 
-// The bits that two whole numbers have in common, as numpy's `&`. NaN of other numbers.
+// Floats have all integers below it.
+const EXACT: f64 = (1u64 << 53) as f64;
+
+// The bits that two whole numbers have in common, as numpy's `&`. NaN of numbers that are not whole, or whose bits are lost.
 fn common_bits(a: f64, b: f64) -> f64 {
-    let is_whole = |own: f64| own.fract() == 0.0;
+    let is_whole = |own: f64| own.fract() == 0.0 && own.abs() < EXACT;
     match is_whole(a) && is_whole(b) {
         true => (a as i64 & b as i64) as f64,
         false => f64::NAN,
@@ -168,8 +198,8 @@ const DEEPEST: usize = 100;
 
 impl Expression {
     /// Parses an expression: numbers, columns, `+ - * / ^`, `&` (the bits that whole numbers have in common), comparisons of
-    /// numbers, `==` and `!=` of a column with a text in quotation marks, `and`, `or`, and `abs`, `sqrt`, `exp`, `log`, `log10`,
-    /// `cos`, `sin` (of radians), `radians` (of degrees), `not` of an expression in brackets. A name with other characters than letters,
+    /// numbers, `==` and `!=` of a column with a text in quotation marks, `not`, `and`, `or`, and `abs`, `sqrt`, `exp`, `log`,
+    /// `log10`, `cos`, `sin` (of radians), `radians` (of degrees) of an expression in brackets. A name with other characters than letters,
     /// digits, `_` and `.` stands between backticks.
     pub fn parse(text: &str) -> Result<Self, ExpressionError> {
         let condition = Condition::parse(text)?;
@@ -394,12 +424,20 @@ impl<'a> Parser<'a> {
         let Some(operators) = OPERATORS.get(level) else {
             return self.signed();
         };
+        if level == COMPARISONS && self.negates() {
+            self.sharp = true;
+            let inner = self.nested(|parser| parser.level(level))?;
+            return Ok(Node::Unary(NOT, Box::new(inner)));
+        }
         let mut node = self.level(level + 1)?;
         while let Some(operator) = operators.iter().find(|(token, _)| self.take(token)) {
             // The loosest three levels compare, and bits jump.
             self.sharp |= level <= COMPARISONS + 1;
             let right = self.level(level + 1)?;
-            node = Node::Binary(operator, Box::new(node), Box::new(right));
+            node = match operator.0 {
+                "&" => self.masked(operator, node, right),
+                _ => Node::Binary(operator, Box::new(node), Box::new(right)),
+            };
             // `5 < snr < 10` would compare a truth with 10, and `snr > 10 & size > 2` the bits of 10.
             if level == COMPARISONS
                 && operators
@@ -413,6 +451,35 @@ impl<'a> Parser<'a> {
             return Err(self.expected("`==` to compare"));
         }
         Ok(node)
+    }
+
+    // Consumes `not` before a condition. Before a bracket it is a function, and before an operator the name of a column.
+    fn negates(&mut self) -> bool {
+        let before = self.at;
+        let is_operand = |c: char| c.is_alphanumeric() || "_.`".contains(c);
+        let negates = self.take("not") && self.rest().starts_with(is_operand);
+        if !negates {
+            self.at = before;
+        }
+        negates
+    }
+
+    // The bits that a column and a number have in common, or those of other expressions.
+    fn masked(&mut self, operator: &'static Binary, a: Node, b: Node) -> Node {
+        let (place, mask) = match (&a, &b) {
+            (Node::Operand(place), Node::Number(mask))
+            | (Node::Number(mask), Node::Operand(place)) => (*place, *mask),
+            _ => return Node::Binary(operator, Box::new(a), Box::new(b)),
+        };
+        let own = self.operands[place].clone();
+        let is_plain = own == Operand::of_column(&own.column);
+        match is_plain && mask.fract() == 0.0 && mask.abs() < EXACT {
+            true => self.operand(Operand {
+                mask: Some(mask as i64),
+                ..own
+            }),
+            false => Node::Binary(operator, Box::new(a), Box::new(b)),
+        }
     }
 
     // Compares a column with the text in quotation marks that follows, if one does.
@@ -433,15 +500,17 @@ impl<'a> Parser<'a> {
         self.at += length + 2;
         self.sharp = true;
         let pattern = Texts::Pattern(rest[..length].to_owned());
-        let fits = self.operand(column.to_owned(), Some(pattern));
+        let fits = self.operand(Operand {
+            texts: Some(pattern),
+            ..Operand::of_column(column)
+        });
         Some(Ok(match equal {
             true => fits,
             false => Node::Unary(|fits| 1.0 - fits, Box::new(fits)),
         }))
     }
 
-    fn operand(&mut self, column: String, texts: Option<Texts>) -> Node {
-        let operand = Operand { column, texts };
+    fn operand(&mut self, operand: Operand) -> Node {
         let known = self.operands.iter().position(|own| *own == operand);
         Node::Operand(known.unwrap_or_else(|| {
             self.operands.push(operand);
@@ -449,23 +518,34 @@ impl<'a> Parser<'a> {
         }))
     }
 
-    fn signed(&mut self) -> Result<Node, ExpressionError> {
+    fn nested(
+        &mut self,
+        parse: impl FnOnce(&mut Self) -> Result<Node, ExpressionError>,
+    ) -> Result<Node, ExpressionError> {
         if self.depth == DEEPEST {
             return Err(self.expected("fewer brackets"));
         }
         self.depth += 1;
-        let node = if self.take("-") {
-            Node::Unary(|a| -a, Box::new(self.signed()?))
-        } else {
-            let base = self.atom()?;
-            if self.take("^") {
-                Node::Binary(&POWER, Box::new(base), Box::new(self.signed()?))
-            } else {
-                base
-            }
-        };
+        let node = parse(self)?;
         self.depth -= 1;
         Ok(node)
+    }
+
+    fn signed(&mut self) -> Result<Node, ExpressionError> {
+        self.nested(|parser| {
+            if parser.take("-") {
+                return Ok(Node::Unary(|a| -a, Box::new(parser.signed()?)));
+            }
+            let base = parser.atom()?;
+            if parser.take("^") {
+                return Ok(Node::Binary(
+                    &POWER,
+                    Box::new(base),
+                    Box::new(parser.signed()?),
+                ));
+            }
+            Ok(base)
+        })
     }
 
     fn atom(&mut self) -> Result<Node, ExpressionError> {
@@ -508,7 +588,7 @@ impl<'a> Parser<'a> {
     fn compared_column(&mut self, name: &str) -> Result<Node, ExpressionError> {
         match self.pattern(name) {
             Some(fits) => fits,
-            None => Ok(self.operand(name.to_owned(), None)),
+            None => Ok(self.operand(Operand::of_column(name))),
         }
     }
 
@@ -595,9 +675,17 @@ fn number_length(text: &str) -> usize {
 /// The values of an operand in each row of a table.
 pub fn operand_values<'f>(
     frame: &'f DataFrame,
-    Operand { column, texts }: &Operand,
+    operand: &Operand,
     path: &Path,
 ) -> Result<Cow<'f, [f64]>, FileError> {
+    let Operand {
+        column,
+        texts,
+        mask,
+    } = operand;
+    if let Some(mask) = mask {
+        return bits(frame, operand, *mask, path);
+    }
     let Some(compared) = texts else {
         return table::numbers(frame, column, path);
     };
@@ -611,6 +699,36 @@ pub fn operand_values<'f>(
     };
     let values = texts.map(|text| compared.value(text.unwrap_or_default()));
     Ok(Cow::Owned(values.collect()))
+}
+
+// Of the integers of a table. Tables of text have floats.
+fn bits<'f>(
+    frame: &'f DataFrame,
+    operand: &Operand,
+    mask: i64,
+    path: &Path,
+) -> Result<Cow<'f, [f64]>, FileError> {
+    let name = operand.column.as_str();
+    let column = frame.column(name).ok();
+    let series = column.map(|own| own.as_materialized_series());
+    let common = |own: Option<i64>| own.map_or(f64::NAN, |own| (own & mask) as f64);
+    if let Some(integers) = series.and_then(|own| own.i64().ok()) {
+        return Ok(integers.iter().map(common).collect());
+    }
+    if let Some(integers) = series.and_then(|own| own.u64().ok()) {
+        let signed = integers.iter().map(|own| own.map(|own| own as i64));
+        return Ok(signed.map(common).collect());
+    }
+    let numbers = table::numbers(frame, name, path)?;
+    if let Some(large) = numbers.iter().find(|own| own.abs() >= EXACT) {
+        return Err(FileError::new(
+            path,
+            format!(
+                "column `{name}` has numbers of 2⁵³ or more, whose low bits are lost (found {large:e} for `{name} & {mask}`, expected smaller ones, or integers of a FITS, Parquet or Arrow file). Try: such a file, or a column of the low bits"
+            ),
+        ));
+    }
+    Ok(operand.of_numbers(numbers))
 }
 
 pub fn texts_of<'f>(
@@ -635,14 +753,22 @@ mod tests {
         assert_eq!(value("2e-3*10", &[]), 0.02);
         assert_eq!(value("2e-3-1e+2+.5-3.", &[]), 2e-3 - 100.0 + 0.5 - 3.0);
         assert_eq!(value("8 - 2 - 1", &[]), 5.0);
-        assert_eq!(value("flag & 4 == 0", &[13.0]), 0.0);
-        assert_eq!(value("flag & 3 + 8 == 8 and flag & 2 == 0", &[12.0]), 1.0);
-        assert!(value("flag & 4", &[0.5]).is_nan());
-        assert!(value("flag & 4", &[f64::NAN]).is_nan());
+        // Of formulas; of a column, the integers of its table are used.
+        assert_eq!(value("flag + 0 & 4 == 0", &[13.0]), 0.0);
+        assert_eq!(
+            value("flag & (3 + 8) == 8 and (flag*1) & 2 == 0", &[12.0]),
+            1.0
+        );
+        for missing in [0.5, f64::NAN, 2f64.powi(53)] {
+            assert!(value("flag*1 & 4", &[missing]).is_nan());
+        }
         assert!((value("0.3*cos(2*phi)", &[0.5]) - 0.3 * 1f64.cos()).abs() < 1e-16);
         assert_eq!(value("log10(flux_2/err)", &[100.0, 1.0]), 2.0);
         assert_eq!(value("a > 1 and b <= 2 or not(a == a)", &[2.0, 2.0]), 1.0);
         assert_eq!(value("android + stepper", &[7.0, 1.0]), 8.0);
+        assert_eq!(value("not a == 1 and not b", &[2.0, 0.0]), 1.0);
+        assert_eq!(value("not a + 1 == 3 or notes", &[2.0, 0.0]), 0.0);
+        assert_eq!(value("not > 1 and not(not < 1)", &[2.0]), 1.0);
         for (text, missing) in [
             ("a > 1", true),
             ("not(a > 1)", true),
@@ -699,6 +825,7 @@ mod tests {
         let operand = |column: &str, pattern: Option<&str>| Operand {
             column: column.into(),
             texts: pattern.map(|own| Texts::Pattern(own.to_owned())),
+            mask: None,
         };
         let expected = [
             operand("psf", Some("a*")),
@@ -721,6 +848,31 @@ mod tests {
             ("*star", "23/den/stars", false),
         ] {
             assert_eq!(fits(pattern, text), expected, "{pattern} {text}");
+        }
+    }
+
+    #[test]
+    fn bits_are_those_of_the_integers_of_a_table() {
+        use shearq_files::frames::frame;
+        use shearq_files::frames::polars::Column;
+        let of = |column: Column, text: &str| {
+            let table = frame(vec![column]).unwrap();
+            let expression = Expression::parse(text).unwrap();
+            let operands = expression.operands().iter();
+            let columns: Result<Vec<_>, _> = operands
+                .map(|own| operand_values(&table, own, Path::new("t")).map(Cow::into_owned))
+                .collect();
+            columns.map(|all| expression.value(&|k| all[k][0]))
+        };
+        let large = (1_i64 << 60) + 5;
+        for text in ["a & 4 == 4", "4 & a == 4 and a & 2 == 0", "a & 1"] {
+            let signed = Column::new("a".into(), [large]);
+            assert_eq!(of(signed, text).unwrap(), 1.0, "{text}");
+            let unsigned = Column::new("a".into(), [(1_u64 << 63) + 5]);
+            assert_eq!(of(unsigned, text).unwrap(), 1.0, "{text}");
+            assert_eq!(of(Column::new("a".into(), [13.0]), text).unwrap(), 1.0);
+            let error = of(Column::new("a".into(), [large as f64]), text).unwrap_err();
+            assert!(error.to_string().contains("column `a` has numbers of 2⁵³"));
         }
     }
 
@@ -772,6 +924,10 @@ mod tests {
             ("step(snr > 3)", "a comma and the threshold"),
             ("step(snr, x)", "found `x)`, expected a number"),
             (&"(".repeat(10_000), "fewer brackets"),
+            (
+                &"not a ".replace('a', &"not ".repeat(10_000)),
+                "fewer brackets",
+            ),
         ] {
             let error = Condition::parse(text).unwrap_err().to_string();
             assert!(error.contains(expected), "{text}: {error}");

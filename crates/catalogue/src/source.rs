@@ -483,13 +483,15 @@ struct Wanted<'a> {
 }
 
 impl Wanted<'_> {
-    fn add(&mut self, name: &str, texts: Option<&Texts>) -> Option<usize> {
+    // As what the operand `like` of an expression reads, or as a number.
+    fn add(&mut self, name: &str, like: Option<&Operand>) -> Option<usize> {
         if !self.names.iter().any(|own| own == name) {
             return None;
         }
         let operand = Operand {
             column: name.to_owned(),
-            texts: texts.cloned(),
+            texts: like.and_then(|own| own.texts.clone()),
+            mask: like.and_then(|own| own.mask),
         };
         let known = self.all.iter().position(|own| *own == operand);
         Some(known.unwrap_or_else(|| {
@@ -598,23 +600,25 @@ impl Wanted<'_> {
         by_catalogue: bool,
     ) -> Result<Vec<Vec<usize>>, FileError> {
         let mut all = vec![Vec::new()];
-        for Operand { column, texts } in expression.operands() {
+        for operand in expression.operands() {
+            let column = &operand.column;
             // Sheared catalogues of shearq have noise that other columns do not have.
             let plain = format!("{column}_noshear");
             let [first, second] = match self.columns.preset {
                 Preset::Sheared => [&plain, column],
                 _ => [column, &plain],
             };
-            let found = self.add(first, texts.as_ref());
-            let found = found.or_else(|| self.add(second, texts.as_ref()));
+            let found = self.add(first, Some(operand));
+            let found = found.or_else(|| self.add(second, Some(operand)));
             all[0].push(found.ok_or_else(|| FileError::no_column(self.path, column, self.names))?);
         }
         for catalogue in 1..CATALOGUES {
             let operands = expression.operands().iter();
-            let sheared = operands.map(|Operand { column, texts }| {
+            let sheared = operands.map(|operand| {
+                let column = &operand.column;
                 let own = sheared_column(self.names, column, catalogue);
-                let own = own.and_then(|name| self.add(name, texts.as_ref()));
-                own.or_else(|| self.add(column, texts.as_ref()).filter(|_| by_catalogue))
+                let own = own.and_then(|name| self.add(name, Some(operand)));
+                own.or_else(|| self.add(column, Some(operand)).filter(|_| by_catalogue))
             });
             all.push(sheared.collect::<Option<_>>().unwrap_or_default());
         }

@@ -246,7 +246,7 @@ pub fn choose(
                 &condition.operands()[place].texts,
                 columns[place].number(set),
             ) {
-                (_, Some(number)) => number,
+                (_, Some(number)) => condition.operands()[place].of_number(number),
                 (texts, None) => {
                     let text = columns[place].text(run, set).unwrap_or_default();
                     texts.as_ref().map_or(0.0, |own| own.value(&text))
@@ -265,6 +265,7 @@ fn compared_column(
     Operand {
         column: name,
         texts,
+        ..
     }: &Operand,
 ) -> Result<Column, ChoiceError> {
     let Some((_, column)) = compared().find(|(own, _)| own == name) else {

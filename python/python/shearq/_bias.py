@@ -415,7 +415,8 @@ def _no_table(source: Any) -> tuple[str, str]:
 
 def _values(column: Any) -> Any:
     """A contiguous column of float64 with NaN for missing numbers, a list of text, or None for anything else. Integers
-    that float64 does not contain, such as identifiers of Rubin, become text; missing texts are empty."""
+    that float64 does not contain, such as identifiers of Rubin and 64 bits of flags, stay integers, or become text if some
+    are missing; missing texts are empty."""
     if column.ndim != 1:
         return None
     missing = np.zeros(len(column), dtype=bool)
@@ -437,6 +438,8 @@ def _values(column: Any) -> Any:
     if array.dtype.kind in "iu" and array.size:
         known = array[~missing] if missing.any() else array
         if known.size and max(int(known.max()), -int(known.min())) > _EXACT:
+            if not missing.any():
+                return np.ascontiguousarray(array, dtype=np.uint64 if array.dtype.kind == "u" else np.int64)
             array = array.astype(object)
     if array.dtype.kind in "fiub":
         reals = np.ascontiguousarray(array, dtype=np.float64)
