@@ -214,6 +214,7 @@ pub fn placed_rows(
         found.refuse_sheared_rows(path, first)?;
         found.refuse_unused_cuts(path, first)?;
         found.refuse_measured_shears(path, first, reading)?;
+        found.refuse_shared_truths(path)?;
         summary.repeated = found.repeats.found();
         summary.dominant = found.largest.found();
         summary.content = found.content;
@@ -913,6 +914,9 @@ fn responses(source: &Source) -> [[Response; 2]; 2] {
     })
 }
 
+// Share of rows that may have the true shear of another row: two detections within a pixel are rare. Chosen by hand.
+const MAX_SHARED_TRUTHS: f64 = 0.01;
+
 // What the rows that count have that measurements do not have.
 #[derive(Default)]
 struct Found {
@@ -929,6 +933,10 @@ struct Found {
     numbered: Vec<Numbered>,
     // By place of what is read: whether a row has the text with which a column is compared.
     matched: Vec<bool>,
+    // By place in a table of true shears: the position of the first row that has this shear.
+    takers: Vec<Option<[f64; 2]>>,
+    // Rows at other positions that have the shear of an earlier row.
+    shared_truths: u64,
     begun: bool,
 }
 
@@ -956,6 +964,14 @@ impl Found {
 
     fn add(&mut self, part: &TableRows<'_>, at: usize, number: u64, row: &Row) {
         self.used += 1;
+        if let OfRows::Positions(positions, columns) = part.truth {
+            let own = part.pair(columns, at);
+            self.takers.resize(positions.len(), None);
+            if let Some(place) = positions.find(own) {
+                let first = *self.takers[place].get_or_insert(own);
+                self.shared_truths += u64::from(first != own);
+            }
+        }
         self.largest.add(number, row);
         if let OfRows::Columns(_) = part.truth {
             self.shears.add(row);
@@ -1025,6 +1041,20 @@ impl Found {
             format!(
                 "`{name}` excludes {rows} of {} rows that would count (expected none). Try: --where '{choice}', or --where '{name} > -1' for all rows",
                 self.used
+            ),
+        ))
+    }
+
+    // Of positions in degrees, a galaxy that the table lacks finds another galaxy within one unit.
+    fn refuse_shared_truths(&self, path: &Path) -> Result<(), FileError> {
+        if self.shared_truths as f64 <= MAX_SHARED_TRUTHS * self.used as f64 {
+            return Ok(());
+        }
+        Err(FileError::new(
+            path,
+            format!(
+                "{} of {} rows are within 1 pixel of a place in the table of true shears at which another row is (expected a galaxy for each). Try: x and y in pixels (--columns x=NAME,y=NAME, or formulas), or a table with the columns id, g1, g2",
+                self.shared_truths, self.used
             ),
         ))
     }
