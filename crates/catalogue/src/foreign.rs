@@ -39,7 +39,7 @@ use crate::request::{DEFAULT_STEP, Placed, Request};
 /// drop_missing = true             # rows with a number that no measurement gives, such as -99, have none [default: refused]
 /// max_modulus = 1.0               # rows with a larger |e| (as reported) have none [default: no limit]
 /// position_offset = 0.0           # added to x and y to make them FITS pixels (1 for 0-based positions)
-/// e2_sign = 1                     # -1 if e2 is positive along x = -y
+/// e2_sign = 1                     # -1 if e2 is positive along x = -y; the responses and sheared catalogues are in the same axes
 /// ```
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -188,6 +188,11 @@ impl Foreign {
     /// The existing catalogues of `sets` (of all if empty).
     pub fn catalogues(&self, sets: &[u32]) -> Result<Files, FileError> {
         images::find(&self.folder, &self.catalogues, &[""], sets)
+    }
+
+    /// Whether e2 of the catalogues is positive along x = −y.
+    pub fn has_other_sign_of_e2(&self) -> bool {
+        self.e2_sign < 0
     }
 
     fn request(&self, path: &Path) -> Result<Request, FileError> {

@@ -277,6 +277,14 @@ impl Calibration {
         }
     }
 
+    /// The same for ellipticities whose e2 and responses have the other sign of the second axis.
+    #[must_use]
+    pub fn with_other_sign_of_e2(mut self) -> Self {
+        let [[_, r12], [r21, _]] = &mut self.response;
+        (*r12, *r21) = (-*r12, -*r21);
+        self
+    }
+
     /// Calibrates a sum.
     pub fn apply(&self, sum: &mut FieldSum) {
         if self.weight != 1.0 {

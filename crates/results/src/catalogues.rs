@@ -188,7 +188,11 @@ impl Catalogues {
                 mean.add(&own)?;
             }
         }
-        mean.calibration()
+        let calibration = mean.calibration()?;
+        Ok(match foreign.has_other_sign_of_e2() {
+            true => calibration.with_other_sign_of_e2(),
+            false => calibration,
+        })
     }
 
     /// Which columns of the first catalogue are used as what, and columns of any other that look as if they should be used; empty of
