@@ -123,6 +123,20 @@ pub struct Catalogue {
 }
 
 impl Catalogue {
+    /// Rows that count.
+    pub fn counted(&self) -> u64 {
+        let excluded = [
+            self.flagged,
+            self.unweighted,
+            self.unselected,
+            self.missing,
+            self.failed,
+            self.above_one,
+            self.without_partner,
+        ];
+        self.rows.saturating_sub(excluded.iter().sum())
+    }
+
     /// The true shear, if all galaxies have the same.
     pub fn constant(&self) -> Option<[f64; 2]> {
         let [a, b] = self.shear.map(Range::constant);

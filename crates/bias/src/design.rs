@@ -57,7 +57,7 @@ impl Design {
     /// Recognises a design from the true shears of `catalogues`, with `truth` whether these are known. Rotated pairs are not
     /// recognised, because single catalogues have the same true shears.
     pub fn of(catalogues: &[Catalogue], truth: bool) -> Self {
-        let used = || catalogues.iter().filter(|catalogue| catalogue.rows > 0);
+        let used = || catalogues.iter().filter(|own| own.counted() > 0);
         if !truth {
             return Design::Null;
         }
@@ -199,7 +199,9 @@ pub fn group(
     };
     let differ = numbers.iter().zip(catalogues).any(differ);
     let misaligned = by_key && (paired || rotated) && !matched && differ;
-    let pairs = match paired {
+    // The order of catalogues states no pairs where identifiers do.
+    let are_known = named || !several || !matched;
+    let pairs = match paired && are_known {
         true => opposite_pairs(catalogues, &numbers),
         false => Vec::new(),
     };
@@ -326,7 +328,9 @@ fn without_partner(sums: &OfCatalogues<'_>, pairs: &[[u32; 2]]) -> Option<Withou
         };
         let count: Value<'_> = &|[a, b]| a.0 + b.0;
         of += total;
-        galaxies += variance(&|[a, b]| a.0 - b.0, count);
+        // Flags of the other sign under one shear leave galaxies without partner that are not drawn at random.
+        let excess: f64 = units.iter().map(|[a, b]| a.0 - b.0).sum();
+        galaxies += variance(&|[a, b]| a.0 - b.0, count).max(excess.abs());
         for k in 0..2 {
             let shapes = |at: usize| variance(&|unit| unit[at].1[0][k], count);
             of_shapes[k] += shapes(0) + shapes(1);
