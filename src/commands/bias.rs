@@ -28,7 +28,7 @@ use shearq_results::baseline::catalogues::Units as BaselineUnits;
 use shearq_results::bias::{BiasFailure, BiasResult, Summed, joined, sum};
 use shearq_results::views::bias::{
     Checked, Limit, bias_plot, bias_table, check, chosen_by_measurement, compared_table, of_design,
-    of_other_images, section, with_failures,
+    of_other_images, of_pairing, section, with_failures,
 };
 use shearq_results::views::per_area::add_per_area;
 use shearq_scoring::TruthSign;
@@ -262,8 +262,12 @@ pub(crate) fn run(arguments: &Arguments, command_line: &str) -> anyhow::Result<(
         let other = other.result()?;
         warn(&result);
         let absent = other.about.without_catalogue.iter().cloned();
-        let warnings = absent.chain(chosen_by_measurement(&other));
-        for warning in warnings.chain(of_other_images(&result, &other)) {
+        let warnings = absent
+            .chain(of_design(&other))
+            .chain(chosen_by_measurement(&other))
+            .chain(of_other_images(&result, &other))
+            .chain(of_pairing(&result, &other));
+        for warning in warnings {
             tell(format_args!("warning: --against: {warning}"));
         }
         let mut table = compared_table(&result, &other, &difference);
@@ -322,6 +326,28 @@ pub(super) fn units(arguments: &Arguments) -> anyhow::Result<(BaselineUnits, Vec
         !summing.catalogues.is_empty() && summing.against.is_empty() && summing.shard.is_none(),
         "bias: a baseline is of catalogues alone. Try: without --against, --shard, --merge, --plan and --example"
     );
+    for (option, given, remedy) in [
+        (
+            "--like",
+            summing.like.is_some(),
+            "without --like and --tomography: m and c of each bin are compared",
+        ),
+        (
+            "--fail-above",
+            !arguments.fail_above.is_empty(),
+            "baseline record --tolerance for shifts, and `shearq bias` with --fail-above as a command of its own for limits",
+        ),
+        (
+            "--sums",
+            summing.sums.is_some(),
+            "without --sums: the baseline has them",
+        ),
+    ] {
+        anyhow::ensure!(
+            !given,
+            "bias: a baseline cannot be of this option (found {option}). Try: {remedy}"
+        );
+    }
     let catalogues = listed(&summing.catalogues)?;
     let summed = of_catalogues(summing, &catalogues)?;
     let result = summed.result()?;

@@ -216,6 +216,7 @@ impl Expression {
             operands: vec![Operand {
                 column: column.to_owned(),
                 texts: Some(Texts::List(texts)),
+                mask: None,
             }],
             root: Node::Operand(0),
             sharp: true,
@@ -232,6 +233,7 @@ impl Expression {
                     Operand {
                         column,
                         texts: None,
+                        mask: None,
                     },
                 ],
             ) => Some(column),

@@ -29,8 +29,8 @@ use shearq_dataset::metadata::{CATALOGUE_FRAME, CommonAxes, axes_of};
 use shearq_dataset::run::Run;
 use shearq_dataset::threads::ALL_CORES;
 use shearq_dataset::truth::{Sign, stated_sign};
-use shearq_files::FileError;
 use shearq_files::table::{self, FileFormat};
+use shearq_files::{FileError, names_of};
 use shearq_scoring::TruthSign;
 
 pub use cells::{Axis, Cells};
@@ -47,6 +47,9 @@ pub struct About {
     #[serde(default)]
     pub by_shearq: bool,
     truth: bool,
+    // A number that other true shears do not have, of those that are not in the catalogues.
+    #[serde(default)]
+    shears: u64,
     /// Whether responses were read, or the type of the ellipticities was given.
     pub response: bool,
     /// Whether rows have a response that `--columns R11=none` leaves out.
@@ -85,6 +88,16 @@ pub struct About {
 }
 
 impl About {
+    /// The true shear of each catalogue with rows, in words: of one that varies, the range depends on which galaxies count.
+    pub(crate) fn shears_in_words(&self) -> Vec<String> {
+        let used = self.catalogues.iter().filter(|own| own.rows > 0);
+        let shear = |own: &Catalogue| match own.constant() {
+            None => "varying".to_owned(),
+            Some([g1, g2]) => format!("{g1:.6}, {g2:.6}"),
+        };
+        used.map(shear).collect()
+    }
+
     /// The rows of all catalogues, and how many of them do not count for each reason.
     pub fn total(&self) -> Catalogue {
         let mut total = Catalogue::default();
@@ -226,6 +239,7 @@ fn about(reading: &Reading<'_>, all: &[Vec<Source>], first: &Source) -> About {
         program: first.columns.program().into(),
         by_shearq: first.columns.is_of_shearq(),
         truth: known(&request.truth, first),
+        shears: reading.truth.content(),
         response: has_response || request.shapes.is_some(),
         response_column: first.columns.have(&[Role::R11]),
         flag: first.columns.flags.first().cloned(),
@@ -268,6 +282,9 @@ fn added_up(
     reading.flip_g2 = about.sign.is_some_and(is_of_challenge);
     let (sums, catalogues) = add_up(reading, all, (layout, &about.cells), part, None)?;
     distinct_content(&catalogues)?;
+    let read = catalogues.iter().enumerate();
+    let read = read.filter(|(number, _)| part(*number));
+    check_counted(read.map(|(_, own)| own), about.truth)?;
     let mut summed = Summed {
         sums,
         about: About {
@@ -482,6 +499,24 @@ fn distinct_content(catalogues: &[Catalogue]) -> Result<(), BiasFailure> {
     Ok(())
 }
 
+// Refuses catalogues without a row that counts among those with one shear each. Their shear is unknown, so that a pair was taken
+// for one shear (m of 0.16 instead of 0.0075), and sixty tiles for galaxies whose shear varies.
+fn check_counted<'c>(
+    catalogues: impl Iterator<Item = &'c Catalogue>,
+    truth: bool,
+) -> Result<(), BiasFailure> {
+    let (used, unused): (Vec<&Catalogue>, Vec<_>) = catalogues.partition(|own| own.counted() > 0);
+    let have_one_shear = truth && used.iter().all(|own| own.constant().is_some());
+    let empty = unused.iter().find(|own| own.rows == 0);
+    match empty.or(unused.first().filter(|_| have_one_shear)) {
+        Some(first) if !used.is_empty() => Err(BiasFailure::NothingCounts {
+            catalogue: Box::new((*first).clone()),
+            more: unused.len() - 1,
+        }),
+        _ => Ok(()),
+    }
+}
+
 // Refuses catalogues that were measured on other images or another true shear than their data have now.
 fn verify_data(truth: &Truth) -> Result<(), FileError> {
     let Truth::Data(catalogues) = truth else {
@@ -500,6 +535,11 @@ fn known(truth: &Truth, source: &Source) -> bool {
 }
 
 impl Summed {
+    /// Columns by role and what becomes of them, in which all catalogues agree.
+    pub(crate) fn kind(&self) -> &[(String, String)] {
+        &self.about.kind
+    }
+
     /// Checks sums that were read from a file.
     pub fn checked(mut self) -> Result<Self, BiasFailure> {
         let bins = self.about.cells.count() + 1;
@@ -518,6 +558,9 @@ impl Summed {
         if names(&self.about.catalogues) != names(&other.about.catalogues) {
             return Err(BiasFailure::Unlike("lists of catalogues"));
         }
+        if self.about.shears != other.about.shears {
+            return Err(BiasFailure::Unlike("true shears in --truth, --g1 or --g2"));
+        }
         for (own, more) in self.about.catalogues.iter_mut().zip(other.about.catalogues) {
             match (own.rows, more.rows) {
                 (0, _) => *own = more,
@@ -531,6 +574,11 @@ impl Summed {
     /// Adds the sums of other catalogues, which follow these.
     pub fn append(&mut self, other: Summed) -> Result<(), BiasFailure> {
         self.check_options(&other)?;
+        if self.populations != other.populations {
+            return Err(BiasFailure::Unlike("surveys of --like"));
+        }
+        let all = || self.about.catalogues.iter().chain(&other.about.catalogues);
+        check_counted(all(), self.about.truth)?;
         self.about.catalogues.extend(other.about.catalogues);
         let named = self.about.catalogues.iter();
         distinct_images(named.map(|own| (own.name.clone(), &own.image)))?;
@@ -677,6 +725,7 @@ impl Summed {
             return Err(BiasFailure::FramesDiffer(own.clone(), theirs.clone()));
         }
         self.check_images(other)?;
+        self.check_truths(other)?;
         let ((design, own), (their_design, theirs)) = (self.grouped()?, other.grouped()?);
         let designs = [(design, own.unit), (their_design, theirs.unit)];
         if designs[0] != designs[1] {
@@ -729,6 +778,19 @@ impl Summed {
         }
     }
 
+    // The order of catalogues does not matter: galaxies are paired by identifiers or rows.
+    fn check_truths(&self, other: &Summed) -> Result<(), BiasFailure> {
+        let [own, theirs] =
+            [self, other].map(|side| BTreeSet::from_iter(side.about.shears_in_words()));
+        match own == theirs {
+            true => Ok(()),
+            false => Err(BiasFailure::TruthsDiffer([own, theirs].map(|all| {
+                let all = all.into_iter().map(|shear| format!("({shear})"));
+                names_of(&all.collect::<Vec<_>>())
+            }))),
+        }
+    }
+
     // The sign of g2 in the file `truth` that e2 follows, from sums for the standard sign.
     fn sign_of_catalogues(&self, truth: &Path) -> Result<Sign, BiasFailure> {
         let mut used = self.about.catalogues.iter().filter(|own| own.rows > 0);
@@ -766,18 +828,12 @@ impl Summed {
     // Refuses catalogues without usable rows, and constant ellipticities.
     fn check_values(&self) -> Result<(), BiasFailure> {
         let total = self.about.total();
-        let left_out = [total.flagged, total.unweighted, total.unselected];
-        let failed = [
-            total.missing,
-            total.failed,
-            total.above_one,
-            total.without_partner,
-        ];
-        let left_out: u64 = left_out.iter().chain(&failed).sum();
-        let used = total.rows.saturating_sub(left_out);
+        let used = total.counted();
         if used == 0 {
             return Err(BiasFailure::NoGalaxy(total.into()));
         }
+        let read = self.about.catalogues.iter().filter(|own| own.rows > 0);
+        check_counted(read, self.about.truth)?;
         for k in 0..2 {
             let ranges = self.about.catalogues.iter().filter(|c| c.rows > 0);
             let (low, high) = ranges.fold((f64::MAX, f64::MIN), |(low, high), c| {

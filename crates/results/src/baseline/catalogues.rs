@@ -1,19 +1,21 @@
 //! Baselines of catalogues of any code: the metrics of `score`, or m and c of `bias`, with the sums of their independent units.
 //! A later measurement of the same galaxies is compared unit by unit, so that the noise that both share cancels.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
+use shearq_bias::Design;
+use shearq_catalogue::roles::named;
 use shearq_dataset::fingerprint;
 use shearq_files::open::{self, SETTINGS};
 use shearq_files::{FileError, atomic};
 use shearq_scoring::resample::{PairedSet, mean_over_sets, paired_difference};
-use shearq_scoring::{Metric, Metrics};
+use shearq_scoring::{Convention, Metric, Metrics};
 use thiserror::Error;
 
 use super::{Checked, Shift};
-use crate::bias::{BiasFailure, Summed};
+use crate::bias::{BiasFailure, BiasResult, BinResult, Summed};
 use crate::score::ScoredSet;
 
 /// The file of a baseline of catalogues. The sums that paired differences need are in a file beside it.
@@ -29,6 +31,8 @@ pub struct CatalogueBaseline {
     galaxies: u64,
     rows: u64,
     pub tolerance: Tolerance,
+    /// What must not change unnoticed, for readers of this file: the convention of `score`, the columns by role of `bias`.
+    settings: BTreeMap<String, String>,
     /// Value and standard error of each metric; of several sets the mean.
     metrics: BTreeMap<String, [f64; 2]>,
     /// Fingerprints of the catalogues when they were recorded. They are expected to change.
@@ -53,6 +57,9 @@ pub struct ScoredUnits {
     images: Vec<u32>,
     galaxies: u64,
     flagged: u64,
+    /// Signs and axes of the ellipticities that were scored. Those that match the truth are chosen anew in each check, so that
+    /// e2 with the other sign leaves all metrics as they were.
+    convention: String,
     metrics: Metrics,
     errors: Metrics,
     /// The metrics with each group of images left out in turn.
@@ -69,11 +76,16 @@ impl ScoredUnits {
             images: record.images.clone(),
             galaxies: record.galaxies,
             flagged: record.flagged,
+            convention: described(scored.score.chosen),
             metrics: record.metrics,
             errors: record.errors,
             replicates: scored.score.replicates.clone(),
         })
     }
+}
+
+fn described(convention: Convention) -> String {
+    format!("{} ({})", convention.number(), convention.describe())
 }
 
 /// The largest accepted shift of a metric: as many standard errors of the paired difference, or as large, whichever is more.
@@ -233,11 +245,16 @@ impl Units {
             }
             Units::Bias(summed) => {
                 let result = summed.result()?;
-                let all = result.all()?;
-                let known = BIASES.iter().filter_map(|key| Some((key, all.value(key)?)));
-                Ok(known
-                    .map(|(key, own)| ((*key).to_owned(), [own.value, own.error]))
-                    .collect())
+                let of_bin = |bin: &BinResult| {
+                    let label = bin.label.clone();
+                    let found = bin.estimate.as_ref().ok().cloned();
+                    let known = BIASES.into_iter().filter_map(move |key| {
+                        let own = found.as_ref()?.value(key)?;
+                        Some((in_bin(key, &label), [own.value, own.error]))
+                    });
+                    known.collect::<Vec<_>>()
+                };
+                Ok(result.bins.iter().flat_map(of_bin).collect())
             }
         }
     }
@@ -271,32 +288,20 @@ impl Units {
                     &old.about.total().rows,
                     rows,
                 )?;
-                // Of a shear that varies the range depends on which galaxies count.
-                let truths = |about: &crate::bias::About| -> Vec<String> {
-                    let each = about.catalogues.iter().map(|own| own.constant());
-                    each.map(|shear| {
-                        shear.map_or("varying".into(), |[g1, g2]| format!("{g1:.6}, {g2:.6}"))
-                    })
-                    .collect()
-                };
+                let list = |all: &Vec<String>| all.join("; ");
                 same(
                     "the true shears",
-                    &truths(&new.about),
-                    &truths(&old.about),
-                    |all| all.join("; "),
+                    &new.about.shears_in_words(),
+                    &old.about.shears_in_words(),
+                    list,
                 )?;
+                check_galaxies(&old, &new)?;
                 let difference = now.difference(before)?;
-                let (old, new, difference) = (old.all()?, new.all()?, difference.all()?);
-                let pair = |found: Option<shearq_bias::Measured>| {
-                    found.map_or([f64::NAN; 2], |own| [own.value, own.error])
-                };
-                let shift = |key: &&str| {
-                    let (before, now) = (pair(old.value(key)), pair(new.value(key)));
-                    let error = difference.value(key).map_or(f64::NAN, |own| own.error);
-                    (!before[0].is_nan() || !now[0].is_nan())
-                        .then(|| judged(key, before, now, error, tolerance))
-                };
-                Ok(BIASES.iter().filter_map(shift).collect())
+                let bins = old.bins.iter().zip(&new.bins).zip(&difference.bins);
+                let shifts = bins.flat_map(|((old, new), difference)| {
+                    shifts_of_bin([old, new, difference], tolerance)
+                });
+                Ok(shifts.collect())
             }
             _ => Err(CatalogueError::OtherGalaxies {
                 what: "the command and its metrics".into(),
@@ -311,6 +316,42 @@ impl Units {
             Units::Score(_) => "score",
             Units::Bias(_) => "bias",
         }
+    }
+
+    // By name, with `none` for columns that are not there.
+    fn settings(&self) -> BTreeMap<String, String> {
+        match self {
+            Units::Score(sets) => {
+                let all_equal = sets.iter().all(|own| own.convention == sets[0].convention);
+                let name = |own: &ScoredUnits| match all_equal {
+                    true => "convention".to_owned(),
+                    false => format!("convention of set {}", own.set),
+                };
+                let of = |own: &ScoredUnits| (name(own), own.convention.clone());
+                sets.iter().map(of).collect()
+            }
+            Units::Bias(summed) => summed.kind().iter().cloned().collect(),
+        }
+    }
+
+    // What changed from the settings `before`, and columns of which only the name did.
+    fn changed(&self, before: &Units) -> (Vec<String>, Vec<String>) {
+        let (old, new) = (before.settings(), self.settings());
+        let of = |all: &BTreeMap<String, String>, name: &String| {
+            all.get(name).cloned().unwrap_or_else(|| "none".into())
+        };
+        let names: BTreeSet<&String> = old.keys().chain(new.keys()).collect();
+        let changed = names
+            .into_iter()
+            .filter(|name| of(&old, name) != of(&new, name));
+        let (renamed, changed): (Vec<_>, Vec<_>) = changed.partition(|name| {
+            let is_name = named(name).is_some() || *name == "the program";
+            is_name && old.contains_key(*name) && new.contains_key(*name)
+        });
+        let line = |name: &String| format!("{name}: {} ≠ {}", of(&old, name), of(&new, name));
+        let renamed = renamed.into_iter().map(line);
+        let renamed = renamed.map(|line| format!("another column: {line}"));
+        (changed.into_iter().map(line).collect(), renamed.collect())
     }
 
     // Galaxies with an ellipticity.
@@ -332,6 +373,63 @@ impl Units {
                 .map_or(0, |result| result.about.total().rows),
         }
     }
+}
+
+fn in_bin(key: &str, label: &str) -> String {
+    match label {
+        "all" => key.to_owned(),
+        label => format!("{key}, {label}"),
+    }
+}
+
+// Of a bin before, now, and of their difference.
+fn shifts_of_bin(bins: [&BinResult; 3], tolerance: &Tolerance) -> Vec<Shift> {
+    let shift = |key: &&str| {
+        let [before, now, difference] = bins.map(|bin| {
+            let found = bin.estimate.as_ref().ok().and_then(|own| own.value(key));
+            found.map_or([f64::NAN; 2], |own| [own.value, own.error])
+        });
+        let is_known = !before[0].is_nan() || !now[0].is_nan();
+        is_known.then(|| Shift {
+            metric: in_bin(key, &bins[0].label),
+            ..judged(key, before, now, difference[1], tolerance)
+        })
+    };
+    BIASES.iter().filter_map(shift).collect()
+}
+
+// Refuses galaxies that are not those of the baseline: with other identifiers, a shift of 57 standard errors was one of 0.2.
+fn check_galaxies(old: &BiasResult, new: &BiasResult) -> Result<(), CatalogueError> {
+    let overlap = new.grouping.units.overlap(&old.grouping.units);
+    // Their shapes cancel within a unit.
+    let are_rotated = new.design == Design::Rotated;
+    if overlap.is_of_same_galaxies() || are_rotated && overlap.is_shared() {
+        return Ok(());
+    }
+    let unit = |result: &BiasResult| {
+        let column = result.about.named_unit.as_ref();
+        column.map_or("none".to_owned(), |column| format!("`{column}`"))
+    };
+    let found = match overlap.is_shared() {
+        false => format!(
+            "{:.0} % of the galaxies in units that both have, which are {}, with the column {}",
+            100.0 * overlap.shared,
+            new.grouping.unit,
+            unit(new)
+        ),
+        true => format!(
+            "ellipticities that correlate by {:.2} with those of the same units",
+            overlap.correlation.unwrap_or(f64::NAN)
+        ),
+    };
+    Err(CatalogueError::OtherGalaxies {
+        what: "the galaxies".into(),
+        found,
+        expected: format!(
+            "the same identifiers or order of rows, and the column {} of units",
+            unit(old)
+        ),
+    })
 }
 
 fn scored_metrics() -> impl Iterator<Item = Metric> {
@@ -483,6 +581,7 @@ impl CatalogueBaseline {
             galaxies: units.measured(),
             rows: units.rows(),
             tolerance,
+            settings: units.settings(),
             metrics: units.metrics()?,
             catalogues: prints,
         };
@@ -508,6 +607,12 @@ impl CatalogueBaseline {
     ) -> Result<Checked, CatalogueError> {
         let [was, is] = [before, now].map(Units::measured);
         let mut notes = vec![self.tolerance.described()];
+        if let Units::Score(_) = now {
+            let all = now.settings().into_iter();
+            notes.extend(all.map(|(name, own)| format!("{name}: {own}")));
+        }
+        let (settings, renamed) = now.changed(before);
+        notes.extend(renamed);
         if was != is {
             notes.push(format!("{is} galaxies count; {was} then"));
         }
@@ -515,7 +620,7 @@ impl CatalogueBaseline {
             baseline: name.to_owned(),
             configuration: now.name().to_owned(),
             shifts: now.shifts(before, &self.tolerance)?,
-            settings: Vec::new(),
+            settings,
             notes,
         })
     }
@@ -544,6 +649,7 @@ mod tests {
             images: (1..=20).collect(),
             galaxies: 100,
             flagged: 0,
+            convention: described(Convention::STANDARD),
             metrics: of(m),
             errors: of(0.01),
             // The noise is the same before and now.
@@ -582,6 +688,19 @@ mod tests {
         for wrong in ["m", "m=x", "n=1", "c=-1", "sigma=nan", "relative=inf"] {
             assert!(Tolerance::default().set(wrong).is_err(), "{wrong}");
         }
+    }
+
+    #[test]
+    fn a_changed_convention_is_a_changed_setting() {
+        let before = units(0.01, 0.0);
+        let Units::Score(mut sets) = before.clone() else {
+            unreachable!("made above")
+        };
+        sets[0].convention = described(Convention::ALL[5]);
+        let expected = ["convention: 5 (standard) ≠ 6 (e2 flipped)"];
+        let (changed, _) = Units::Score(sets).changed(&before);
+        assert_eq!(changed, expected);
+        assert_eq!(before.changed(&before), (Vec::new(), Vec::new()));
     }
 
     #[test]

@@ -78,6 +78,8 @@ pub enum BiasFailure {
     NothingAlike(PathBuf),
     #[error("the catalogues cannot be compared: truth or bins differ. Try: bins with edges")]
     BinsDiffer,
+    #[error("the catalogues cannot be compared: they have other true shears (found {} on one side and {} on the other, expected the same). Try: the same simulations on both sides", .0[0], .0[1])]
+    TruthsDiffer([String; 2]),
     #[error("the catalogues cannot be compared: e2 of one follows the true g2 of sign {}, of the other {}. Try: --truth-sign", word(*.0), word(*.1))]
     SignsDiffer(TruthSign, TruthSign),
     #[error(
@@ -95,6 +97,15 @@ pub enum BiasFailure {
         .0.rows, .0.flagged, .0.unweighted, .0.unselected, .0.missing, .0.failed, .0.above_one, no_text(&.0.unmatched)
     )]
     NoGalaxy(Box<Catalogue>),
+    #[error(
+        "{}: no row of this catalogue counts{} (found {} rows: {} with a flag, {} with a weight of zero or less, {} not selected, {} with missing numbers, {} without partner), so that its shear is unknown. Try: leave it out, with the catalogues of the same galaxies under other shears",
+        .catalogue.name, more_of(*.more), .catalogue.rows, .catalogue.flagged, .catalogue.unweighted, .catalogue.unselected,
+        .catalogue.missing + .catalogue.failed, .catalogue.without_partner
+    )]
+    NothingCounts {
+        catalogue: Box<Catalogue>,
+        more: usize,
+    },
     #[error(
         "{rows} of {used} rows have |e| above 2, so that e1 and e2 are no ellipticities (expected moduli below 1). Try: --columns with their names, or with the responses R11 and R22 of ellipticities in other units"
     )]
@@ -124,6 +135,13 @@ pub enum BiasFailure {
         "the ellipticities look like distortions (found slopes of {:.3} and {:.3}, expected about 1). Try: --ellipticity distortion, or --ellipticity shear to keep them", .0[0], .0[1]
     )]
     Distortions([f64; 2]),
+}
+
+fn more_of(more: usize) -> String {
+    match more {
+        0 => String::new(),
+        more => format!(", and none of {more} more catalogues"),
+    }
 }
 
 fn no_text(unmatched: &[String]) -> String {

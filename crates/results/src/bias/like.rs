@@ -20,7 +20,7 @@ use super::cells::{Cells, key};
 use super::error::BiasFailure;
 
 /// Galaxies of a survey, or of one of its tomographic bins.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Population {
     pub label: String,
     /// Galaxies with a positive weight and without a flag.

@@ -154,10 +154,15 @@ pub fn compared_table(first: &BiasResult, second: &BiasResult, difference: &Bias
         }
     }
     let [(_, mut table), _, _] = tables;
-    let columns = second.about.columns.iter();
+    let own = |line: &&String| !table.notes.contains(*line);
+    let theirs = notes(second);
+    let theirs: Vec<String> = (theirs.iter().filter(own))
+        .map(|line| format!("--against: {line}"))
+        .collect();
+    table.notes.extend(theirs);
     table
         .notes
-        .extend(columns.map(|line| format!("--against: {line}")));
+        .extend(of_pairing(first, second).map(|line| sentence(&line)));
     table.notes.push(format!(
         "Difference: {}, with errors from leaving out the same units of both.",
         difference.about.program
@@ -183,6 +188,28 @@ pub fn chosen_by_measurement(result: &BiasResult) -> Option<String> {
     // docs/limitations.md, selection after measuring.
     Some(format!(
         "m contains the effect of shear on a selection by `{all}`, whose response is unknown here. Known sizes: −0.02 (S/N 20) to −0.1 (S/N 7) if the lowest 30 % in size are removed, −0.11 for the lowest 50 % in flux. Try: {remedy}"
+    ))
+}
+
+/// A warning if the units of both sides of a comparison do not contain the same galaxies.
+pub fn of_pairing(first: &BiasResult, second: &BiasResult) -> Option<String> {
+    let overlap = first.grouping.units.overlap(&second.grouping.units);
+    let found = match overlap.correlation {
+        _ if !overlap.is_shared() => format!(
+            "{:.1} % of the galaxies are in units that both sides have",
+            100.0 * overlap.shared
+        ),
+        // The shapes of rotated pairs cancel within a unit.
+        Some(correlation) if !overlap.is_of_same_galaxies() && first.design != Design::Rotated => {
+            format!(
+                "the ellipticities of the same units correlate by {correlation:.2}, as those of different galaxies"
+            )
+        }
+        _ => return None,
+    };
+    let unit = first.grouping.unit;
+    Some(format!(
+        "the galaxies of both sides do not pair by {unit} ({found}). If they are the same, the error of the difference is too large by the ratio of total scatter to measurement noise. Try: --columns id=NAME with identifiers that both sides have, or the same order of rows and id=none"
     ))
 }
 
