@@ -189,7 +189,13 @@ pub(crate) fn galaxies<'py>(
         let calibration = mean.calibration()?;
         let (mut values, mut lengths) = (<[Vec<f64>; 5]>::default(), Vec::new());
         for own in &opened {
-            let rows = own.read(MAX_ROWS)?;
+            let mut rows = own.read(MAX_ROWS)?;
+            if rows.is_empty() {
+                // Numbers of images by galaxy would not contain it.
+                let [e1, e2] = [f64::NAN; 2];
+                let (x, y) = (1.0, 1.0);
+                rows.push((Row { x, y, e1, e2 }, calibration.weight));
+            }
             lengths.push(rows.len());
             for (row, weight) in rows {
                 let [e1, e2] = calibration.shear([row.e1, row.e2]);

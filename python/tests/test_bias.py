@@ -314,6 +314,47 @@ def test_responsivity_uses_its_columns(role):
     assert any("scatter" in note and "ℛ" in note for note in found.notes)
 
 
+def test_integers_above_those_of_floats_are_flags_and_weights(pair):
+    n = len(pair[0]["e1"])
+    bad = np.arange(n) % 10 == 0
+    shears = {"g1": [0.02, -0.02], "g2": [0.01, -0.01]}
+    good = [{name: column[~bad] for name, column in table.items()} for table in pair]
+    for kind in (np.int64, np.uint64):
+        bits = (np.arange(n) % 2).astype(kind) << kind(60) | (5 * bad).astype(kind)
+        flagged = [{**table, "bits": bits} for table in pair]
+        found = shearq.bias(flagged, columns={"flag": "bits & 4"}, **shears)
+        assert found.rows == shearq.bias(good, **shears).rows
+        # All odd rows have a bit.
+        assert shearq.bias(flagged, columns={"flag": "bits"}, **shears)["n"] == 0.8 * n
+    weights = [{**table, "w": np.full(n, 2**60 + 1)} for table in pair]
+    equal = [{**table, "w": np.ones(n)} for table in pair]
+    assert shearq.bias(weights, **shears)["m1"] == pytest.approx(shearq.bias(equal, **shears)["m1"], abs=1e-9)
+
+
+def test_rows_without_an_identifier_or_a_flag_are_left_out(pair, tmp_path):
+    n, paths = len(pair[0]["e1"]), []
+    for k, table in enumerate(pair):
+        ids = [None if number < 10 else number for number in range(n)]
+        flags = [None if 20 <= number < 30 else 0 for number in range(n)]
+        paths.append(tmp_path / f"{k}.parquet")
+        polars.DataFrame({**table, "id": ids, "flag": flags}).write_parquet(paths[-1])
+    shears = {"g1": [0.02, -0.02], "g2": [0.01, -0.01]}
+    with pytest.raises(ValueError, match=f"no identity in 10 of {n} rows; expected one in each. Try: drop_missing"):
+        shearq.bias(paths, **shears)
+    assert shearq.bias(paths, drop_missing=True, **shears)["n"] == 2 * (n - 20)
+
+
+def test_sums_of_other_surveys_do_not_add_up(pair):
+    def sums(table, g, low):
+        survey = {"snr": np.linspace(low, 50, 500)}
+        return shearq.bias_sums(table, g1=g, g2=g / 2, bins=("snr", [5, 20, 50.1]), like=survey)
+
+    both = sums(pair[0], 0.02, 5) + sums(pair[1], -0.02, 5)
+    assert len(both.result().rows) == 2
+    with pytest.raises(ValueError, match="different surveys of like"):
+        sums(pair[0], 0.02, 5) + sums(pair[1], -0.02, 25)
+
+
 def test_results_are_shown(pair):
     found = shearq.bias(pair, g1=[0.02, -0.02], g2=[0.01, -0.01], bins=("snr", 3))
     assert "Shear bias" in str(found) and repr(found).startswith("<shearq.Bias m1 = +0.0")

@@ -451,3 +451,49 @@ def test_python_finds_the_faults_that_the_command_line_finds(fault, command, tmp
     assert scored.notes == expected
     assert bool(expected) == (fault != "none")
     assert scored["q"] == pytest.approx(printed["metrics"]["q"], rel=1e-12)
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_weights_have_the_rule_of_the_command_line(command, tmp_path):
+    *images, g1, g2 = _images()
+    n, truth = 32, np.array([g1, g2])
+    rng = np.random.default_rng(3)
+    weights = rng.uniform(0.2, 3, (4, n * n))
+    weights[:, ::50] = -1
+    y, x = (part.ravel() for part in np.mgrid[:n, :n] * 48 + 24.5)
+    e1, e2 = (np.asarray(part).reshape(4, -1) for part in images)
+
+    def write(name, header, columns):
+        np.savetxt(tmp_path / name, np.transpose(columns), "%.17g", ",", header=header, comments="")
+        return str(tmp_path / name)
+
+    given = write("truth.csv", "x,y,g1,g2", [x, y, *truth.reshape(2, -1)])
+    paths = [write(f"{k}.csv", "x,y,e1,e2,w", [x, y, e1[k], e2[k], weights[k]]) for k in range(4)]
+    line = ["score", "--truth", given, *paths, "--truth-sign", "standard", "--convention", "5", "--format", "json"]
+    expected = json.loads(command(*line))["metrics"]["q"]
+    scored = shearq.score(e1, e2, *truth, weights=weights, truth_sign="standard")
+    assert scored["q"] == pytest.approx(expected, rel=1e-9)
+    shuffled = np.random.default_rng(1).permutation(4 * n * n)
+    numbers, x, y = np.repeat(np.arange(4), n * n), np.tile(x, 4), np.tile(y, 4)
+    parts = [own.ravel()[shuffled] for own in (e1, e2, weights, numbers, x, y)]
+    other = shearq.score(
+        *parts[:2], *truth, weights=parts[2], images=parts[3], positions=parts[4:], stamp=48, truth_sign="standard"
+    )  # fmt: skip
+    assert other["q"] == pytest.approx(expected, rel=1e-9)
+    weights[0, 1] = np.nan
+    with pytest.raises(ValueError, match="weights: found one that is not finite"):
+        shearq.score(e1, e2, *truth, weights=weights, truth_sign="standard")
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_an_empty_catalogue_is_an_image():
+    *images, g1, g2 = _images()
+    y, x = (part.ravel() for part in np.mgrid[:32, :32] * 48 + 24.5)
+    tables = [{"x": x, "y": y, "e1": np.ravel(e1), "e2": np.ravel(e2)} for e1, e2 in zip(*images)]
+    tables[2] = {name: column[:0] for name, column in tables[2].items()}
+    found = shearq.galaxies(tables)
+    scored = shearq.score(
+        found.e1, found.e2, g1, g2, weights=found.weights, positions=found.positions, images=found.images, stamp=48,
+        truth_sign="standard",
+    )  # fmt: skip
+    assert scored.images == 4

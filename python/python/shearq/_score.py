@@ -180,8 +180,9 @@ def score(
         x and y of each galaxy, of the shape of e1: FITS pixels, the first pixel's centre at 1. They fall into cells
         of `stamp` pixels. Arrays of two axes require `images`.
     weights : array, optional
-        Weight of each galaxy, of the shape of e1, with a mean of 1: a missing galaxy has weight 0. :func:`galaxies` gives
-        them for catalogues of any program.
+        Weight of each galaxy, of the shape of e1, in any unit: they are divided by their mean over the galaxies with an
+        ellipticity. A galaxy with a weight of zero or less counts as missing. :func:`galaxies` gives them for catalogues of
+        any program.
     stamp : float, optional
         Pixels a side of a cell, with positions.
     field_degrees : float
@@ -228,6 +229,12 @@ def score(
     n = _side("truth_g1", g1.size)
     cell, rows, where, lengths = _rows(e1, e2, n, images, positions, stamp)
     rows, dropped = _without_failures(rows) if drop_missing else (rows, 0)
+    given = None if weights is None else flat("weights", weights)
+    if given is not None and given.size == rows[0].size:
+        if images is not None and np.ndim(images) > 0:
+            # As the rows of images, which are brought together.
+            given = given[np.argsort(np.asarray(images).reshape(-1), kind="stable")]
+        rows, given = _weighted(rows, given)
     found = Score(
         _shearq.score(
             n,
@@ -237,7 +244,7 @@ def score(
             truth_sign,
             rows,
             where,
-            None if weights is None else flat("weights", weights),
+            given,
             lengths,
             _text("definition", definition),
             _text("convention", convention),
@@ -254,6 +261,21 @@ def score(
     if dropped:
         found.notes.append(f"note: {dropped} of {rows[0].size} rows stand for a failed measurement; they count as missing.")
     return found
+
+
+def _weighted(rows: _Pair, weights: NDArray[np.float64]) -> tuple[_Pair, NDArray[np.float64]]:
+    """Ellipticities that are NaN where the weight is zero or less, and weights with a mean of 1 over the others."""
+    measured = np.isfinite(rows[0]) & np.isfinite(rows[1])
+    if not np.isfinite(weights[measured]).all():
+        raise ValueError("weights: found one that is not finite of a galaxy with an ellipticity; expected numbers. Try: 0 for a galaxy that does not count")
+    counts = measured & (weights > 0)
+    if not counts.any():
+        return rows, weights
+    e1, e2 = (np.where(counts, own, np.nan) for own in rows)
+    mean = float(weights[counts].mean())
+    # Without rounding of weights that have it already.
+    scaled = weights if abs(mean - 1) < 1e-12 else weights / mean
+    return (e1, e2), np.where(counts, scaled, 1.0)
 
 
 class Galaxies(NamedTuple):
@@ -289,7 +311,8 @@ def galaxies(
     -------
     Galaxies
         Arguments of :func:`score`: shears ``e1`` and ``e2`` (NaN for a galaxy that does not count), divided by the mean response of
-        all; ``weights`` with a mean of 1; ``positions`` and ``images``. ``notes`` say which columns are used as what.
+        all; ``weights`` with a mean of 1; ``positions`` and ``images``. ``notes`` say which columns are used as what. A catalogue
+        without rows is an image with one galaxy without an ellipticity, so that it counts as an image.
 
     Examples
     --------
