@@ -11,7 +11,7 @@ use shearq_files::frames::polars::{Column, NamedFrom, Series};
 use shearq_files::table::{self, FileFormat};
 use shearq_quantities::Shear;
 
-use crate::support::{Folder, assert_has, fits_extension, shell};
+use crate::support::{Folder, assert_has, fits_extension, fits_image, shell};
 
 const M: [f64; 2] = [0.02, -0.03];
 const C: [f64; 2] = [1e-3, -2e-3];
@@ -977,4 +977,391 @@ fn limits_are_tested_in_each_bin() {
         // `d*` is a text, and not a pattern that discs fit.
         assert_eq!(number(&found[2], "n"), 150.0);
     }
+}
+
+/// A table of the same galaxies under a shear: its columns by name, in a row.
+type Columns<'a> = &'a dyn Fn(usize, [f64; 2]) -> Vec<String>;
+
+fn table_of(folder: &Folder, name: &str, g: f64, header: &str, columns: Columns<'_>) {
+    let mut text = header.to_owned() + "\n";
+    for (row, [e, _]) in galaxies(3, [g; 2]).into_iter().enumerate() {
+        text += &(columns(row, e).join(",") + "\n");
+    }
+    folder.write(name, text);
+}
+
+#[test]
+fn baselines_compare_galaxies_columns_and_bins() {
+    let folder = Folder::new();
+    // Ellipticities times a factor, which depends on the bin.
+    let write = |header: &str, id: &dyn Fn(usize) -> String, factor: [f64; 2]| {
+        for (name, g) in [("p.csv", 0.02), ("m.csv", -0.02)] {
+            table_of(&folder, name, g, header, &|row, [e1, e2]| {
+                let factor = factor[row % 2];
+                let own = |name: &str| match name {
+                    "e1" => (e1 * factor).to_string(),
+                    "e2" => (e2 * factor).to_string(),
+                    "g1" | "g2" => g.to_string(),
+                    "snr" => (10 + 10 * (row % 2)).to_string(),
+                    "seed" => (row / 5).to_string(),
+                    "id" => id(row),
+                    _ => "1".to_owned(),
+                };
+                header.split(',').map(own).collect()
+            });
+        }
+    };
+    let header = "id,e1,e2,w,g1,g2,snr";
+    let number = |row: usize| row.to_string();
+    write(header, &number, [1.0; 2]);
+    folder.run("baseline record all -- bias p.csv m.csv");
+    folder.run("baseline record bins -- bias p.csv m.csv --bins snr:5,15,25");
+    folder.run("baseline check");
+    let other = "the galaxies are not the baseline's";
+    let moved = [1.005; 2];
+    write(header, &number, moved);
+    folder.refuses("baseline check all", "1 of 1 configurations moved");
+    write(header, &|row| (row + 7000).to_string(), moved);
+    folder.refuses("baseline check all", other);
+    write(header, &|row| (row + 7).to_string(), moved);
+    folder.refuses("baseline check all", other);
+    write(header, &|row| format!("galaxy{row}"), moved);
+    folder.refuses("baseline check all", other);
+    write(&format!("{header},seed"), &number, moved);
+    folder.refuses("baseline check all", &format!("{other}[..]`seed`"));
+    write("id,e1,e2,g1,g2,snr", &number, [1.0; 2]);
+    let output = shell(folder.root(), "shearq baseline check all");
+    assert_eq!(output.status.code(), Some(1));
+    assert_has(
+        &String::from_utf8_lossy(&output.stdout),
+        "the setting changed: w: w ≠ none",
+    );
+    // m of both together is the same.
+    write(header, &number, [1.02, 0.98]);
+    folder.run("baseline check all");
+    let output = shell(folder.root(), "shearq baseline check bins");
+    assert_eq!(output.status.code(), Some(1));
+    assert_has(&String::from_utf8_lossy(&output.stdout), "m1, snr 5");
+    for (option, remedy) in [
+        ("--fail-above m=1e-9", "--tolerance"),
+        ("--bins snr:5,15,25 --like p.csv", "without --like"),
+    ] {
+        folder.refuses(
+            &format!("baseline record more -- bias p.csv m.csv {option}"),
+            remedy,
+        );
+    }
+}
+
+#[test]
+fn both_sides_of_a_comparison_are_judged() {
+    let folder = Folder::new();
+    let header = "id,e1,e2,flag,g1,g2";
+    type Change<'a> = &'a dyn Fn(f64, usize) -> (String, bool, f64);
+    let write = |name: &str, change: Change<'_>| {
+        for (sign, g) in [("p", 0.02), ("m", -0.02)] {
+            table_of(
+                &folder,
+                &format!("{name}-{sign}.csv"),
+                g,
+                header,
+                &|row, [e1, e2]| {
+                    let (id, flagged, g) = change(g, row);
+                    let flag = u8::from(flagged).to_string();
+                    let [e1, e2, g] = [e1, e2, g].map(|own| own.to_string());
+                    vec![id, e1, e2, flag, g.clone(), g]
+                },
+            );
+        }
+        format!("{name}-p.csv {name}-m.csv")
+    };
+    let id = |row: usize| row.to_string();
+    let own = write("own", &|g, row| (id(row), false, g));
+    let against = |theirs: &str| {
+        let line = format!("bias {own} --against {theirs}");
+        (folder.said(&format!("{line} -q")), folder.run(&line))
+    };
+    let (said, _) = against(&own);
+    assert_eq!(said, "");
+    let disjoint = write("ids", &|g, row| (id(row + 10_000), false, g));
+    assert_has(
+        &against(&disjoint).0,
+        "--against: the galaxies of both sides do not pair by[..]0.0 % of the galaxies",
+    );
+    let flagged = write("flags", &|g, row| (id(row), (row % 2 == 0) == (g > 0.0), g));
+    let (said, printed) = against(&flagged);
+    assert_has(
+        &said,
+        "--against: about[..]under one of two opposite shears",
+    );
+    assert_has(&printed, "--against: Left out: 2000 rows with a flag");
+    let truth = write("truth", &|g, row| (id(row), false, 1.5 * g));
+    folder.refuses(
+        &format!("bias {own} --against {truth}"),
+        "other true shears (found (-0.020000, -0.020000)",
+    );
+    // Flags of the other sign in one catalogue: few galaxies of one count, and none under both.
+    let inverted = write("not", &|g, row| (id(row), (row % 50 == 0) == (g > 0.0), g));
+    assert_has(
+        &folder.said(&format!("bias {inverted} -q")),
+        "under one of two opposite shears only",
+    );
+}
+
+#[test]
+fn catalogues_without_a_row_that_counts_are_named() {
+    let folder = Folder::new();
+    let write = |name: &str, g: f64, flag: u8| {
+        table_of(&folder, name, g, "id,e1,e2,flag,g1,g2", &|row, [e1, e2]| {
+            let numbers = [row as f64, e1, e2, f64::from(flag), g, g];
+            numbers.map(|own| own.to_string()).to_vec()
+        });
+    };
+    write("plus.csv", 0.02, 0);
+    write("minus.csv", -0.02, 1);
+    let none = "minus.csv: no row of this catalogue counts (found 2000 rows: 2000 with a flag";
+    folder.refuses("bias plus.csv minus.csv", none);
+    folder.write("minus.csv", "id,e1,e2,flag,g1,g2\n");
+    folder.refuses("bias plus.csv minus.csv", "counts (found 0 rows");
+    write("minus.csv", -0.02, 0);
+    folder.run("bias plus.csv minus.csv");
+}
+
+#[test]
+fn galaxies_are_not_warned_of_if_their_identifiers_pair() {
+    let folder = Folder::new();
+    let mut files = Vec::new();
+    // Catalogues p0, p1, m1 and m0.
+    for (name, g, first) in [
+        ("a", 0.02, 0),
+        ("b", 0.02, 1000),
+        ("c", -0.02, 1000),
+        ("d", -0.02, 0),
+    ] {
+        let mut text = "id,e1,e2,g1,g2\n".to_owned();
+        let all = galaxies(3, [g; 2]).into_iter().enumerate();
+        for (id, [[e1, e2], _]) in all.skip(first).take(1000) {
+            writeln!(text, "{id},{e1},{e2},{g},{g}").unwrap();
+        }
+        folder.write(&format!("{name}.csv"), text);
+        files.push(format!("{name}.csv"));
+    }
+    assert_eq!(folder.said(&format!("bias {} -q", files.join(" "))), "");
+}
+
+#[test]
+fn places_in_other_units_than_pixels_are_refused() {
+    let folder = Folder::new();
+    let mut normal = normal(4);
+    let write = |unit: f64, normal: &mut Normal| {
+        let (mut catalogue, mut truth) = ("x,y,e1,e2\n".to_owned(), "x,y,g1,g2\n".to_owned());
+        for row in 0..400 {
+            let [x, y] = [row % 20, row / 20].map(|k| unit * f64::from(k));
+            let [g1, g2] = normal.pair(0.02);
+            writeln!(catalogue, "{x},{y},{},{}", g1 + 1e-4 * x, g2).unwrap();
+            // One in ten is absent.
+            if row % 10 != 0 {
+                writeln!(truth, "{x},{y},{g1},{g2}").unwrap();
+            }
+        }
+        folder.write("c.csv", catalogue);
+        folder.write("t.csv", truth);
+    };
+    let line = "bias c.csv --truth t.csv --truth-sign standard";
+    for (unit, words) in [
+        (0.01, "places have another true shear within 1"),
+        // Neighbours are a unit apart, and the radius contains them.
+        (1.0, "have another true shear within 1"),
+        (48.0, "no galaxy within 1 pixel"),
+    ] {
+        write(unit, &mut normal);
+        folder.refuses(line, words);
+    }
+    folder.run(&format!("{line} --drop-missing"));
+    // Sparse places of which one in ten has a neighbour that is absent from the table.
+    let (mut catalogue, mut truth) = ("x,y,e1,e2\n".to_owned(), "x,y,g1,g2\n".to_owned());
+    for row in 0..400 {
+        let x = 10.0 * f64::from(row);
+        let [g1, g2] = normal.pair(0.02);
+        writeln!(catalogue, "{x},0,{g1},{g2}").unwrap();
+        writeln!(truth, "{x},0,{g1},{g2}").unwrap();
+        if row % 10 == 0 {
+            writeln!(catalogue, "{},0.5,{g2},{g1}", x + 0.5).unwrap();
+        }
+    }
+    folder.write("c.csv", catalogue);
+    folder.write("t.csv", truth);
+    folder.refuses(line, "40 of 440 rows are within 1 pixel of a place");
+}
+
+#[test]
+fn bits_above_those_of_floats_are_read_from_integers() {
+    let folder = Folder::new();
+    for (sign, g) in [("plus", 0.02), ("minus", -0.02)] {
+        let all = galaxies(3, [g; 2]);
+        let bad = |row: usize| row.is_multiple_of(10);
+        let column = |name: &str, of: &dyn Fn(usize) -> f64| {
+            Column::new(name.into(), (0..all.len()).map(of).collect::<Vec<f64>>())
+        };
+        let shift = |row: usize| if bad(row) { 1.0 } else { 0.0 };
+        let bits = |row: usize| i64::from(bad(row)) * 5 + ((row as i64 % 2) << 60);
+        let bits: Vec<i64> = (0..all.len()).map(bits).collect();
+        let table = frame(vec![
+            column("e1", &|row| all[row][0][0] + shift(row)),
+            column("e2", &|row| all[row][0][1]),
+            Column::new("bits".into(), bits.clone()),
+            column("g1", &|_| g),
+            column("g2", &|_| g),
+        ]);
+        let path = folder.at(&format!("{sign}.parquet"));
+        let table = table.unwrap();
+        table::write(&path, FileFormat::Parquet, &table, &Default::default()).unwrap();
+        let mut text = "e1,e2,bits,g1,g2\n".to_owned();
+        for (row, bits) in bits.iter().enumerate() {
+            let [e1, e2] = all[row][0];
+            writeln!(text, "{},{e2},{bits},{g},{g}", e1 + shift(row)).unwrap();
+        }
+        folder.write(&format!("{sign}.csv"), text);
+    }
+    let expected = [0, 1].map(|k| 0.8 * (1.0 + M[k]) - 1.0);
+    for option in ["--columns 'flag=bits & 4'", "--where 'not bits & 4 == 4'"] {
+        let found = rows(&folder, &format!("plus.parquet minus.parquet {option}"));
+        assert_eq!(number(&found[0], "n"), 0.9 * 2.0 * GALAXIES as f64);
+        assert_m(&found[0], expected, 1e-9);
+        folder.refuses(
+            &format!("bias plus.csv minus.csv {option}"),
+            "column `bits` has numbers of 2⁵³ or more",
+        );
+    }
+}
+
+#[test]
+fn names_that_occur_twice_are_refused_and_exact_ones_preferred() {
+    let folder = Folder::new();
+    for (name, g) in [("p.csv", 0.02), ("m.csv", -0.02)] {
+        table_of(&folder, name, g, "E1,E2,e1,e2,g1,g2", &|_, [e1, e2]| {
+            let numbers = [2.0 * e1, 2.0 * e2, e1, e2, g, g];
+            numbers.map(|own| own.to_string()).to_vec()
+        });
+    }
+    let expected = [0, 1].map(|k| 0.8 * (1.0 + M[k]) - 1.0);
+    assert_m(&rows(&folder, "p.csv m.csv")[0], expected, 1e-9);
+    let names = ["e1", "e1", "e2", "g1", "g2"];
+    let mut cards = vec!["TFIELDS =                    5".to_owned()];
+    for (k, name) in (1..).zip(names) {
+        cards.push(format!("TTYPE{k}  = '{name:<8}'"));
+        cards.push(format!("TFORM{k}  = 'D       '"));
+    }
+    let cards: Vec<&str> = cards.iter().map(String::as_str).collect();
+    let rows = (0..10).flat_map(|row| [0.1, 0.2, 0.1 * f64::from(row), 0.02, 0.02]);
+    let bytes: Vec<u8> = rows.flat_map(f64::to_be_bytes).collect();
+    let head = fits_image(8, &[], &["EXTEND  =                    T"], &[]);
+    let table = fits_extension("BINTABLE", 8, &[40, 10], &cards, &bytes);
+    folder.write("twice.fits", [head, table].concat());
+    folder.refuses("bias twice.fits", "`e1` is there several times");
+}
+
+/// A baseline of catalogues of a shear field whose axes changed, and a description with the axes of the catalogues.
+#[test]
+fn axes_of_a_shear_field_are_compared_and_turned() {
+    let folder = Folder::with_set(2);
+    let truth = folder.numbers("data/set02/truth.csv", ["x", "y", "g1", "g2"]);
+    let write = |sign: f64| {
+        for image in 1..=2 {
+            let mut normal = normal(image);
+            let mut text = "x,y,e1,e2,R11,R22,R12,R21\n".to_owned();
+            for k in 0..truth[0].len() {
+                let [a, b] = normal.pair(1e-3);
+                let [x, y, g1, g2] = [0, 1, 2, 3].map(|of: usize| truth[of][k]);
+                let (e1, e2) = (0.8 * g1 + a, sign * (0.8 * g2 + 0.3 * g1 + b));
+                writeln!(text, "{x},{y},{e1},{e2},0.8,0.8,0,{}", sign * 0.3).unwrap();
+            }
+            folder.write(&format!("c-{image}.csv"), text);
+        }
+    };
+    let description = "name = \"F\"\ncatalogues = \"c-{image}.csv\"\n";
+    folder.write("own.toml", description);
+    folder.write("turned.toml", format!("{description}e2_sign = -1\n"));
+    let score = |name: &str| {
+        let line = format!("score --data data --foreign {name}.toml --sets 2 --convention 5");
+        let found = folder.json(&line);
+        found["rows"][0]["q"].as_f64().unwrap()
+    };
+    write(1.0);
+    let expected = score("own");
+    let line = "score --data data --foreign own.toml --sets 2";
+    folder.run(&format!("baseline record own -- {line}"));
+    assert_has(&folder.run("baseline check"), "convention: 5 (standard)");
+    write(-1.0);
+    let turned = score("turned");
+    assert!(
+        (turned / expected - 1.0).abs() < 1e-9,
+        "{turned} {expected}"
+    );
+    let output = shell(folder.root(), "shearq baseline check");
+    assert_eq!(output.status.code(), Some(1));
+    assert_has(
+        &String::from_utf8_lossy(&output.stdout),
+        "the setting changed: convention: 5 (standard) ≠ 6 (e2 flipped)",
+    );
+    folder.run("baseline check --update");
+    folder.run("baseline check");
+}
+
+#[test]
+fn sums_with_other_true_shears_do_not_merge() {
+    let folder = Folder::new();
+    for (name, g) in [("p.csv", 0.02), ("m.csv", -0.02)] {
+        table_of(&folder, name, g, "id,e1,e2", &|row, [e1, e2]| {
+            [row as f64, e1, e2].map(|own| own.to_string()).to_vec()
+        });
+    }
+    let shard = |number: usize, g: f64| {
+        folder.write(
+            "t.csv",
+            format!("catalogue,g1,g2\np.csv,{g},{g}\nm.csv,-{g},-{g}\n"),
+        );
+        folder.run(&format!(
+            "bias p.csv m.csv --truth t.csv --shard {number}/2 --sums s{number}"
+        ));
+    };
+    shard(1, 0.02);
+    shard(2, 0.03);
+    folder.refuses("bias --merge s1 s2", "different true shears in --truth");
+    shard(2, 0.02);
+    folder.run("bias --merge s1 s2");
+}
+
+#[test]
+fn sheared_rows_that_never_count_are_refused() {
+    let folder = Folder::new();
+    let write = |name: &str, g: f64, flagged: &str| {
+        let mut text = "metastep,e1,e2,flags,g1,g2\n".to_owned();
+        for (step, shear) in NAMES.iter().zip(SHEARS) {
+            let flag = u8::from(*step == flagged);
+            for [e, r] in galaxies(1, [g; 2]) {
+                let [e1, e2] = [0, 1].map(|k| e[k] + r[k] * shear[k]);
+                writeln!(text, "{step},{e1},{e2},{flag},{g},{g}").unwrap();
+            }
+        }
+        folder.write(name, text);
+    };
+    write("plus.csv", 0.02, "1p");
+    write("minus.csv", -0.02, "");
+    folder.refuses(
+        "bias plus.csv minus.csv",
+        "plus.csv: there is no row of 1p that counts",
+    );
+}
+
+#[test]
+fn galaxies_that_select_left_out_do_not_count() {
+    let folder = Folder::with_set(2);
+    folder.measure("--submission 48/linear/star");
+    folder.run("select --measured out --where 'step(snr, 20)' --out selected");
+    let found = folder.json("bias selected");
+    let notes = found["notes"].to_string();
+    assert!(!notes.contains("Repeated values"), "{notes}");
+    assert_has(&notes, "rows with a weight of zero or less");
+    assert!(number(&found["rows"][0], "n") < 128.0, "{found}");
 }
