@@ -46,6 +46,16 @@ def test_examples_and_package_have_no_errors_of_types(tmp_path):
         assert done.returncode == 0, done.stdout + done.stderr
 
 
+def test_stub_of_the_extension_module_has_its_signatures(tmp_path):
+    pytest.importorskip("mypy", reason="stubs are checked by mypy")
+    # The list of all names, which the stub does not repeat.
+    (tmp_path / "allowed").write_text("shearq._shearq.__all__\n")
+    options = ["--ignore-disjoint-bases", "--allowlist", "allowed", "--mypy-config-file", str(ROOT / "pyproject.toml")]
+    command = [sys.executable, "-m", "mypy.stubtest", *options, "shearq._shearq"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
 @pytest.mark.parametrize("script", sorted((ROOT / "examples").glob("*.py")), ids=lambda path: path.stem)
 def test_scripts_of_the_gallery_end_in_a_plot(script, tmp_path):
     needed = {"galsim": "galsim_stamps", "distributed": "dask_images", "matplotlib": ""}

@@ -16,7 +16,7 @@ from ._arrays import double, shown
 from ._results import Result, origin
 
 if TYPE_CHECKING:
-    import astropy.table  # type: ignore[import-untyped, unused-ignore]
+    import astropy.table
     import pandas
     import polars
 

@@ -14,7 +14,7 @@ def register(catalogue: type) -> None:
     """Registers the serialisers if distributed is imported. Called for each catalogue, because distributed may be imported after
     this package, and asks nobody."""
     global _registered
-    module = sys.modules.get(_MODULE)
+    module: Any = sys.modules.get(_MODULE)
     if _registered or not hasattr(module, "dask_deserialize"):
         return
     _registered = True

@@ -40,9 +40,10 @@ def draw(path: str, chip: int, chips: int, side: int, places: str, out: BinaryIO
 
 
 def main() -> int:
-    path, *numbers = sys.argv[1:]
+    path, *words = sys.argv[1:]
     try:
-        draw(path, *map(int, numbers), sys.stdin.read(), sys.stdout.buffer)
+        chip, chips, side = map(int, words)
+        draw(path, chip, chips, side, sys.stdin.read(), sys.stdout.buffer)
     except ImportError as error:
         package = error.name or "piff"
         print(f"error: {path}: {error}. Try: {sys.executable} -m pip install {_SOURCES.get(package, package)}", file=sys.stderr)

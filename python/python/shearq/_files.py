@@ -39,7 +39,7 @@ def read(path: str | os.PathLike[str]) -> Catalogue:
         catalogue = _tables.from_table(Catalogue, np.load(file))
         return catalogue
     if format == "ecsv":
-        from astropy.table import Table  # type: ignore[import-untyped, unused-ignore]
+        from astropy.table import Table
 
         catalogue = _tables.from_table(Catalogue, Table.read(file, format="ascii.ecsv"))
         return catalogue

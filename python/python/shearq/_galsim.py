@@ -199,9 +199,9 @@ def from_galsim(
     if wcs == "sky":
         matrices = np.array([_jacobian("images", k, image) for k, image in enumerate(stamps)])
         for k, image in enumerate(_many(psf, _is_image) or []):
-            own, of_stamps = _jacobian("psf", k, image), matrices[k] if k < len(matrices) else matrices[0]
-            if np.abs(own - of_stamps).max() > SAME * np.abs(of_stamps).max():
-                raise ValueError(f"psf: image {k} has the Jacobian {own.tolist()} and its stamp {of_stamps.tolist()}; expected one")
+            of_psf, of_stamps = _jacobian("psf", k, image), matrices[k] if k < len(matrices) else matrices[0]
+            if np.abs(of_psf - of_stamps).max() > SAME * np.abs(of_stamps).max():
+                raise ValueError(f"psf: image {k} has the Jacobian {of_psf.tolist()} and its stamp {of_stamps.tolist()}; expected one")
         return {**from_galsim(images, psf, wcs="ignore", pixel=pixel), "wcs": matrices}
     pixels = _array("stamps", stamps)
     scale = _common("stamps", stamps) if wcs == "check" else None

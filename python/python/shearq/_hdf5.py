@@ -130,7 +130,7 @@ def listing(source: Any) -> str:
 def table(source: Any, name: str) -> Hdf5Table:
     """The table of a group of h5py, or of FILE or FILE:GROUP: the only group of the file with columns if none is named."""
     try:
-        import h5py  # type: ignore[import-untyped, unused-ignore]
+        import h5py
     except ImportError:
         raise ImportError(f"{name}: is an HDF5 file, which h5py reads. Try: pip install h5py") from None
     if not isinstance(source, str):

@@ -21,7 +21,7 @@ class _MedsFile:
     """A MEDS file with the methods of ``meds.MEDS`` that are used here, read by astropy."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        from astropy.io import fits  # type: ignore[import-untyped, unused-ignore]
+        from astropy.io import fits
 
         self._path = path
         try:
@@ -138,7 +138,7 @@ def from_meds(
     side, most = whole("size", size, 1, 1 << 12), whole("block", block, 1, 1 << 24)
     several = isinstance(meds, (list, tuple))
     files = [_MedsFile(one) if isinstance(one, (str, os.PathLike)) else one for one in (meds if several else [meds])]
-    stars = list(psfs) if several and psfs is not None else [psfs] * len(files)
+    stars = list(psfs) if several and isinstance(psfs, Sequence) else [psfs] * len(files)
     if not files or len(stars) != len(files):
         raise ValueError(f"psfs: found {len(stars)} for {len(files)} files; expected one for each")
     for star in stars:

@@ -42,14 +42,19 @@ def _psfex(psf: Any) -> _Draw:
     return draw
 
 
-def _rubin(psf: Any) -> _Draw:
+def _point_of_rubin() -> Any:
     try:
-        from lsst.geom import Point2D  # type: ignore[import-not-found, unused-ignore]
+        from lsst.geom import Point2D
     except ImportError:
         # Objects with the same methods outside Rubin's stack.
-        Point2D = collections.namedtuple("Point2D", "x y")
+        return collections.namedtuple("Point2D", "x y")
+    return Point2D
+
+
+def _rubin(psf: Any) -> _Draw:
+    point = _point_of_rubin()
     # Centred on a pixel, where computeImage would draw the phase of the galaxy.
-    return lambda side, x, y, jacobian, properties: psf.computeKernelImage(Point2D(x, y)).array
+    return lambda side, x, y, jacobian, properties: psf.computeKernelImage(point(x, y)).array
 
 
 def _rubin_images(psf: Any) -> _Draw:

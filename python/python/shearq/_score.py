@@ -458,9 +458,10 @@ def compare(
         parts = [given] if isinstance(given, (np.ndarray, Mapping)) or not isinstance(given, Sequence) else given
         try:
             e1, e2 = (np.stack([flat(f"catalogues[{name!r}]", part[column]) for part in parts]) for column in ("e1", "e2"))
-            if all(isinstance(part, Catalogue) for part in parts):
+            own = [part for part in parts if isinstance(part, Catalogue)]
+            if len(own) == len(parts):
                 # Of all images, component by component, as the command line divides a set.
-                responses = np.concatenate([np.stack(raw(part)[1])[:, part.good] for part in parts], axis=1)
+                responses = np.concatenate([np.stack(raw(part)[1])[:, part.good] for part in own], axis=1)
                 e1, e2 = e1 / responses[0].mean(), e2 / responses[1].mean()
         except (KeyError, IndexError, TypeError, ValueError) as error:
             raise ValueError(

@@ -1,7 +1,7 @@
 """What the package's modules call: use the functions of :mod:`shearq` instead."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +10,7 @@ _Doubles = NDArray[np.float64]
 
 __version__: str
 
+@final
 class Configuration:
     @staticmethod
     def named(name: str) -> Configuration: ...
@@ -47,9 +48,17 @@ def mean_shear(
     places: NDArray[np.int64],
 ) -> tuple[list[float], list[list[float]], list[float], list[float], int]: ...
 def select(
-    columns: dict[str, _Doubles], cuts: str | None, weight: str | None
+    columns: dict[str, _Doubles], condition: str | None, weight: str | None
 ) -> list[_Doubles]: ...
 def failed(values: _Doubles) -> NDArray[np.bool_]: ...
+def detect(
+    image: NDArray[np.float32],
+    star: _Doubles,
+    noise: float,
+    threshold: float,
+    jacobian: list[list[float]] | None,
+    threads_asked: int,
+) -> dict[str, NDArray[Any]]: ...
 def metrics() -> list[tuple[str, str, str]]: ...
 def galaxies(
     catalogues: Sequence[str | tuple[str, list[tuple[str, Any]], list[str]]],
@@ -109,15 +118,17 @@ def simulate(
     amplitude: float,
     tilt: float,
     intrinsic_sigma: float | None,
+    psf_fields: bool,
     threads_asked: int,
     progress: Callable[[int], object] | None,
 ) -> dict[str, Any]: ...
 
+@final
 class BiasSums:
     @staticmethod
     def from_json(text: str) -> BiasSums: ...
     def to_json(self) -> str: ...
-    def append(self, other: BiasSums) -> BiasSums: ...
+    def append(self, others: Sequence[BiasSums]) -> BiasSums: ...
     def result(self, against: BiasSums | None) -> tuple[str, str]: ...
     def save(self, path: str, against: BiasSums | None, origin: Sequence[tuple[str, str]]) -> None: ...
 

@@ -15,7 +15,7 @@ import numpy as np
 from . import _hdf5, _schema, _shearq
 
 if TYPE_CHECKING:
-    import astropy.table  # type: ignore[import-untyped, unused-ignore]
+    import astropy.table
     import pandas
     import polars
 

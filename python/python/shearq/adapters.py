@@ -15,7 +15,7 @@ from ._catalogue import Catalogue
 from ._galsim import SAME, from_galsim as from_galsim, square_pixels
 
 if TYPE_CHECKING:
-    import astropy.table  # type: ignore[import-untyped, unused-ignore]
+    import astropy.table
 
 # Pixels between the centre of an observation and the middle of its stamp.
 _OFF_CENTRE = 1.0
@@ -97,10 +97,10 @@ def from_ngmix(observations: Any, fluxes: Any = None, *, size: int | None = None
             raise ValueError(f"observations: observation {k} has the pixel scales {scales} (image, PSF); expected one scale")
         _check_centre(observation, image, psf, k)
         parts.append((image, psf, noise, missing))
-    stamps, psfs, noise, masks = zip(*parts)
+    stamps, psfs, levels, masks = zip(*parts)
     for name, images in (("image", stamps), ("PSF image", psfs)):
         _one_shape(name, images)
-    found = {"stamps": np.stack(stamps), "psf": np.stack(psfs), "noise": np.array(noise)}
+    found = {"stamps": np.stack(stamps), "psf": np.stack(psfs), "noise": np.array(levels)}
     if any(mask.any() for mask in masks):
         found["mask"] = np.stack(masks)
     return found
