@@ -62,6 +62,23 @@ def test_streams_of_arrow_keep_only_needed_columns():
     assert table.column_names == ["e1", "e2"] and table.num_rows == 3 * rows and len(unread) == 64
 
 
+def test_frames_of_polars_and_datasets_read_only_needed_columns(tmp_path):
+    pyarrow = pytest.importorskip("pyarrow", reason="needs pyarrow")
+    polars = pytest.importorskip("polars", reason="needs polars")
+    import pyarrow.dataset
+    import pyarrow.parquet
+
+    table = pyarrow.table({**COLUMNS, "band": np.zeros(500), "name": ["a"] * 500})
+    pyarrow.parquet.write_table(table, tmp_path / "0.parquet")
+    frame = polars.DataFrame(table.to_pydict())
+    dataset = pyarrow.dataset.dataset(tmp_path)
+    for one in (table, table.to_batches()[0], dataset, frame, frame.lazy(), polars.scan_parquet(tmp_path / "0.parquet")):
+        found, unread = _tables.narrowed(one, lambda names: ["e1", "e2"])
+        # Texts are kept: they may name sheared catalogues.
+        assert unread == ["w", "band"] and [name for name, _ in _tables.named_columns(found)] == ["e1", "e2", "name"]
+        assert len(_tables.named_columns(one)) == 5
+
+
 def test_relations_of_duckdb(expected):
     duckdb = pytest.importorskip("duckdb", reason="needs duckdb")
     pytest.importorskip("pyarrow", reason="needs pyarrow")
