@@ -80,6 +80,45 @@ def test_groups_are_listed_beside_datasets_that_are_no_columns(tmp_path):
                 shearq.bias(source, g1=0, g2=0)
 
 
+def test_rows_with_fields_are_tables(tmp_path):
+    path = tmp_path / "rows.h5"
+    rng = np.random.default_rng(3)
+    rows = np.zeros(1000, dtype=[("e", float, (2,)), ("w", float), ("name", "S4")])
+    rows["e"], rows["w"] = rng.normal(0, 0.2, (1000, 2)), rng.uniform(0.5, 1, 1000)
+    columns = {"e1": "e[0]", "e2": "e[1]"}
+    with h5py.File(path, "w") as file:
+        file["tables/shapes"] = rows
+        # What astropy writes beside its tables.
+        file["tables/shapes.__table_column_meta__"] = np.array([b"datatype:"])
+    expected = shearq.bias(rows, g1=0.0, g2=0.0, columns=columns)
+    with h5py.File(path) as file:
+        for given in (path, f"{path}:tables/shapes", file["tables/shapes"], [file["tables/shapes"]]):
+            assert shearq.bias(given, g1=0.0, g2=0.0, columns=columns)["c1"] == expected["c1"]
+
+
+def test_sheared_catalogues_may_be_rows_with_fields(tmp_path):
+    write(tmp_path / "groups.h5", (0.02, 0.0))
+    with h5py.File(tmp_path / "groups.h5") as groups, h5py.File(tmp_path / "rows.h5", "w") as file:
+        for name, group in groups["shear"].items():
+            rows = np.zeros(4000, dtype=[(key, value.dtype) for key, value in group.items()])
+            for key, value in group.items():
+                rows[key] = value[:]
+            file[f"shear/{name}"] = rows
+    found, expected = (shearq.bias(tmp_path / name, g1=0.02, g2=0.0) for name in ("rows.h5", "groups.h5"))
+    assert found["m1"] == expected["m1"]
+
+
+def test_layouts_without_columns_name_a_remedy(tmp_path):
+    path = tmp_path / "other.h5"
+    with h5py.File(path, "w") as file:
+        file["image"] = np.zeros((300, 300, 2))
+        file.create_group("frame").attrs["pandas_type"] = "frame"
+    with pytest.raises(ValueError, match="image: is one dataset without names of columns; expected a group"):
+        shearq.bias(f"{path}:image", g1=0.0, g2=0.0)
+    with pytest.raises(ValueError, match="frame: is a table of pandas, .* Try: pandas.read_hdf"):
+        shearq.bias(f"{path}:frame", g1=0.0, g2=0.0)
+
+
 def test_columns_of_unlike_lengths_are_refused(tmp_path):
     with h5py.File(tmp_path / "odd.h5", "w") as file:
         file["e1"], file["e2"] = np.zeros(3), np.zeros(4)

@@ -122,6 +122,19 @@ def test_frames_of_dask_say_how(expected):
     assert shearq.BiasSums.merge(parts).result()["m1"] == pytest.approx(expected["m1"], abs=1e-12)
 
 
+def test_tables_that_cannot_be_read_name_a_remedy():
+    dask = pytest.importorskip("dask", reason="needs dask")
+    pandas = pytest.importorskip("pandas", reason="needs pandas")
+    for given in (dask.delayed(COLUMNS), [dask.delayed(COLUMNS)]):
+        with pytest.raises(TypeError, match=r"catalogue 1: .* a Delayed\w* of dask; expected a table in memory. Try: table.compute\(\)"):
+            shearq.bias(given, **TRUTH)
+    frame = pandas.DataFrame({("shape", "e1"): COLUMNS["e1"], ("shape", "e2"): COLUMNS["e2"]})
+    with pytest.raises(TypeError, match=r"columns of 2 levels, such as \('shape', 'e1'\); expected names. Try: (.*)") as raised:
+        shearq.bias(frame, **TRUTH)
+    exec(str(raised.value).split("Try: ")[1], {"frame": frame})
+    assert list(frame.columns) == ["shape_e1", "shape_e2"]
+
+
 def test_the_block_of_dask_runs(tmp_path, capsys):
     pytest.importorskip("dask", reason="needs dask")
     from test_survey import DOCS, blocks

@@ -184,7 +184,7 @@ def bias(
     catalogues
         A table or a list of tables: mappings of columns, structured arrays, ``shearq.Catalogue``, astropy tables, pandas
         or polars frames, tables, datasets and streams of Arrow (duckdb), HDUs, catalogues of GalSim and TreeCorr, groups of h5py, or paths of files and of folders that ``measure``
-        wrote. ``FILE:GROUP`` names a group of an HDF5 file whose datasets are columns; groups ``noshear`` (``ns``, ``00``), ``1p``,
+        wrote. ``FILE:GROUP`` names a group of an HDF5 file whose datasets are columns, or a dataset of rows with fields; groups ``noshear`` (``ns``, ``00``), ``1p``,
         ``1m``, ``2p`` and ``2m`` in it are sheared catalogues. Columns are ``e1 e2``, optionally ``w R11 R22 flag id snr ...`` and the true shear ``g1 g2``. Columns of GalSim's HSM,
         ngmix metacal, metadetect and AnaCal are recognised.
     against : as catalogues, optional
@@ -310,7 +310,8 @@ def bias_sums(
         raise ValueError(f"step: found {step!r}; expected a positive number")
     tables = list(_several(catalogues))
     # Of files, the extension module compares the metadata.
-    frames = sorted({table.attrs["frame"] for table in tables if "frame" in getattr(table, "attrs", {})})
+    stated = [attrs for table in tables if isinstance(attrs := getattr(table, "attrs", None), Mapping)]
+    frames = sorted({attrs["frame"] for attrs in stated if "frame" in attrs})
     if len(frames) > 1:
         raise ValueError(f"catalogues: found ellipticities in the frames {' and '.join(frames)}; expected one frame")
     roles = [f"{role}={column}" for role, column in (columns or {}).items()]
@@ -359,7 +360,7 @@ def _several(catalogues: Any) -> Iterable[Any]:
     if isinstance(catalogues, (str, os.PathLike, Mapping, np.ndarray)) or not isinstance(catalogues, Iterable):
         return [catalogues]
     # Of the class, because a LazyFrame warns if it is asked for its columns.
-    tables = ("columns", "colnames", "schema", "__arrow_c_stream__", "npartitions", "header", "names")
+    tables = ("columns", "colnames", "schema", "__arrow_c_stream__", "__dask_graph__", "header", "names", "fields")
     if any(hasattr(type(catalogues), name) for name in tables) or hasattr(catalogues, "writeto"):
         return [catalogues]
     return catalogues
@@ -378,9 +379,9 @@ def _catalogue(
     elif _hdf5.is_group(table):
         table = _hdf5.table(table, name)
     unread: list[str] = []
-    if needed is not None:
-        table, unread = narrowed(table, needed)
     try:
+        if needed is not None:
+            table, unread = narrowed(table, needed)
         given = named_columns(table)
     except TypeError as error:
         if "Try: " in str(error):

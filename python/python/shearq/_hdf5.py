@@ -32,8 +32,8 @@ def is_hdf5(path: str) -> bool:
 
 
 def is_group(value: Any) -> bool:
-    """Whether an object is a group of h5py, without importing it."""
-    return hasattr(value, "visititems") and hasattr(value, "attrs")
+    """Whether an object is a group of h5py, or a dataset of rows with fields, without importing it."""
+    return hasattr(type(value), "attrs") and (hasattr(type(value), "visititems") or hasattr(type(value), "fields"))
 
 
 def _parts(path: str) -> tuple[str, str]:
@@ -85,8 +85,36 @@ class Hdf5Table(Mapping[str, Any]):
         return len(self._columns) + bool(self._steps)
 
 
+class _Field:
+    """A field of a dataset of rows, read when it is asked for."""
+
+    def __init__(self, rows: Any, name: str) -> None:
+        self._rows, self._name = rows, name
+        self.dtype, shape = rows.dtype[name].subdtype or (rows.dtype[name], ())
+        self.ndim = rows.ndim + len(shape)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __getitem__(self, rows: slice) -> Any:
+        return self._rows.fields(self._name)[rows]
+
+
+def _has_fields(value: Any) -> bool:
+    return getattr(getattr(value, "dtype", None), "names", None) is not None
+
+
 def _datasets(group: Any) -> dict[str, Any]:
-    return {key: value for key, value in group.items() if hasattr(value, "dtype") and value.ndim in (1, 2)}
+    """The columns of a group, or of a dataset of rows with fields, as astropy and PyTables write them."""
+    if _has_fields(group):
+        return {name: _Field(group, name) for name in group.dtype.names}
+    columns = {key: value for key, value in group.items() if hasattr(value, "dtype") and value.ndim in (1, 2)}
+    # Units and formats of astropy are no column.
+    return {key: value for key, value in columns.items() if not _has_fields(value) and not key.endswith(".__table_column_meta__")}
+
+
+def _is_table(value: Any) -> bool:
+    return _has_fields(value) or (hasattr(value, "keys") and bool(_datasets(value) or _steps(value)))
 
 
 def _native(values: Any) -> Any:
@@ -97,9 +125,11 @@ def _native(values: Any) -> Any:
 def _steps(group: Any) -> dict[str, Any]:
     """The groups of metadetect's artificial shears; none for the group of one table."""
     found: dict[str, Any] = {}
+    if not hasattr(group, "keys"):
+        return found
     for step, names in _STEPS.items():
         for name in names:
-            if name in group and hasattr(group[name], "keys"):
+            if name in group and (hasattr(group[name], "keys") or _has_fields(group[name])):
                 found[step] = group[name]
                 break
     return found if len(found) >= 3 else {}
@@ -109,7 +139,7 @@ def _listing(group: Any) -> str:
     tables: list[str] = []
 
     def visit(name: str, value: Any) -> None:
-        if hasattr(value, "keys") and (_datasets(value) or _steps(value)):
+        if _is_table(value):
             tables.append(name)
 
     group.visititems(visit)
@@ -142,8 +172,12 @@ def table(source: Any, name: str) -> Hdf5Table:
             group = file[given] if given else file
         except KeyError:
             raise ValueError(f"{path}: has no group {given}{_listing(file)}") from None
+    if "pandas_type" in group.attrs:
+        raise ValueError(f"{name}: is a table of pandas, whose columns are joined in blocks; expected a dataset for each column. Try: pandas.read_hdf")
+    if hasattr(group, "dtype") and not _has_fields(group):
+        raise ValueError(f"{name}: is one dataset without names of columns; expected a group of datasets, or rows with fields")
     if not given and not _datasets(group) and not _steps(group):
-        candidates = [value for value in _groups(group) if _datasets(value) or _steps(value)]
+        candidates = [value for value in _members(group) if _is_table(value)]
         inner = [one for one in candidates if not any(one.name.startswith(f"{other.name}/") and _steps(other) for other in candidates)]
         if len(inner) != 1:
             raise ValueError(f"{name}: found {len(inner)} tables; expected one{_listing(group)}")
@@ -151,7 +185,7 @@ def table(source: Any, name: str) -> Hdf5Table:
     return Hdf5Table(group, name)
 
 
-def _groups(group: Any) -> list[Any]:
+def _members(group: Any) -> list[Any]:
     found: list[Any] = []
-    group.visititems(lambda _, value: found.append(value) if hasattr(value, "keys") else None)
+    group.visititems(lambda _, value: found.append(value))
     return found

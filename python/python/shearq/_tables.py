@@ -85,6 +85,11 @@ def named_columns(table: Any) -> list[tuple[str, Any]]:
         if names is None:
             raise TypeError(f"table: found {type(table).__name__}; expected a table with columns")
         _check_names(names)
+        if getattr(names, "nlevels", 1) > 1:
+            raise TypeError(
+                f"table: found columns of {names.nlevels} levels, such as {names[0]}; expected names."
+                " Try: frame.columns = ['_'.join(map(str, name)) for name in frame.columns]"
+            )
         # An index of pandas with a name is a column, such as the identifier of the galaxy.
         index: Any = getattr(table, "index", None)
         own = [name for name in getattr(index, "names", ()) if name is not None and name not in names]
@@ -96,6 +101,8 @@ def named_columns(table: Any) -> list[tuple[str, Any]]:
 def narrowed(table: Any, needed: Callable[[Sequence[str]], Sequence[str]] = list) -> tuple[Any, list[str]]:
     """A table in memory without the columns of numbers that are not `needed`, and their names, if columns can be read one by
     one: frames of polars, datasets, tables and streams of Arrow, and groups of HDF5 files."""
+    if hasattr(type(table), "__dask_graph__"):
+        raise TypeError(_of_dask(table))
     choose: Callable[[list[str]], Any]
     if isinstance(table, _hdf5.Hdf5Table):
         names, numbers, choose = list(table), table.numbers(), table.select
@@ -145,11 +152,6 @@ def _selected(stream: Any, names: Sequence[str]) -> Any:
 
 def _plain_table(table: Any) -> Any:
     """A table whose columns can be asked for by name, for objects that have or make one."""
-    if hasattr(table, "npartitions"):
-        raise TypeError(
-            f"table: found a {type(table).__name__} of dask in {table.npartitions} partitions; expected one in memory."
-            " Try: parts = [dask.delayed(shearq.bias_sums)(part) for part in frame.to_delayed()], then shearq.BiasSums.merge"
-        )
     if isinstance(table, list) and table and all(hasattr(one, "header") and hasattr(one, "data") for one in table):
         # An HDUList of astropy.
         table = [one for one in table if getattr(one, "columns", None) is not None]
@@ -164,6 +166,16 @@ def _plain_table(table: Any) -> Any:
     if hasattr(table, "ntot") and hasattr(table, "g1"):
         return _of_treecorr(table)
     return table
+
+
+def _of_dask(table: Any) -> str:
+    kind = type(table).__name__
+    if not hasattr(type(table), "npartitions"):
+        return f"table: found a {kind} of dask; expected a table in memory. Try: table.compute()"
+    return (
+        f"table: found a {kind} of dask in {table.npartitions} partitions; expected one in memory."
+        " Try: parts = [dask.delayed(shearq.bias_sums)(part) for part in frame.to_delayed()], then shearq.BiasSums.merge"
+    )
 
 
 def _of_galsim(catalogue: Any) -> dict[str, Any]:
