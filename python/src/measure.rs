@@ -15,7 +15,9 @@ use shearq_measure::{
     ShearSum, Warning,
 };
 use shearq_pipeline::PipelineError;
-use shearq_pipeline::measure::{COLUMNS, ImageRow, Measured, Value, measure_images, more_columns};
+use shearq_pipeline::measure::{
+    COLUMNS, ImageRow, Measured, Value, measure_images, more_columns, settings_for_small_stamps,
+};
 use shearq_quantities::Shear;
 
 use crate::errors::of_measuring;
@@ -172,6 +174,14 @@ pub(crate) fn measure<'py>(
     });
     let arrays: Vec<Arrays<'_>> = borrowed.collect::<PyResult<_>>()?;
     let (count, rows, _) = arrays.first().map_or((0, 0, 0), |first| first.stamps.dim());
+    let least = configuration.stamp.size;
+    if rows < least {
+        let lines = settings_for_small_stamps(rows, configuration);
+        return Err(PyValueError::new_err(format!(
+            "stamps: stamps of {rows} × {rows} pixels; expected at least {least} × {least}, as configuration {} needs. Try: submission=\"\"\"\n{lines}\n\"\"\"",
+            configuration.name
+        )));
+    }
     let measurer = Measurer::new(configuration, rows).map_err(of_measuring)?;
     let failure = Failure::default();
     let sources = images.iter().zip(&arrays);

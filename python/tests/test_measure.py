@@ -209,6 +209,18 @@ def test_submissions_have_settings_and_published_metrics():
     assert (linear.psf_size, linear.psf_form, linear.extends) == (48, "star", None)
 
 
+@pytest.mark.parametrize(("name", "side"), [("48/linear/star", 44), ("48/linear/star", 31), ("23/raw/star", 20)])
+def test_small_stamps_name_the_settings_that_measure_them(name, side):
+    image = shearq.simulate(set=8, grid=8, seed=1)[0]
+    first = (48 - side) // 2
+    stamps = image.stamps[:, first : first + side, first : first + side]
+    with pytest.raises(ValueError, match=f"stamps of {side} × {side} pixels; expected at least .* Try: submission=") as raised:
+        shearq.measure(stamps, image.psf, noise=image.noise, submission=name)
+    stated: dict[str, str] = {}
+    exec(str(raised.value).split("Try: ")[1], stated)
+    assert not shearq.measure(stamps, image.psf, noise=image.noise, submission=stated["submission"])["flags"].all()
+
+
 WRONG = [
     (dict(stamps=np.zeros((48, 48))), ValueError, r"stamps: found an array of shape \(48, 48\); expected \(n, ny, nx\)"),
     (dict(stamps=np.zeros((2, 48, 46))), ValueError, r"stamps: found an array of shape \(2, 48, 46\); expected squares"),

@@ -14,8 +14,8 @@ use shearq_measure::{Batch, MeasuredImage, Measurer, RowJob};
 
 pub use self::catalogue::{COLUMNS, ImageHead, Summary, Value, all_flagged, more_columns};
 pub(crate) use self::catalogue::{CatalogueWriter, metadata};
-pub use self::source::ImageSource;
 use self::source::open_epochs;
+pub use self::source::{ImageSource, settings_for_small_stamps};
 pub(crate) use self::source::{check_strip, open_galaxies};
 use crate::PipelineError;
 use crate::engine::{self, Feeder};

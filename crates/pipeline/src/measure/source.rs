@@ -254,11 +254,13 @@ fn known_noise(
     }
 }
 
-// The remedy needs several settings that must agree, so that the message has the whole settings file.
-fn too_small(stamp: usize, configuration: &Configuration) -> String {
-    let Configuration { name, .. } = configuration;
-    let needed = configuration.stamp.size;
-    let mut lines = format!("  extends = \"{name}\"\n  stamp.size = {stamp}");
+/// The lines of a settings file by which a configuration measures smaller stamps, of `stamp` pixels a side. Several settings must
+/// agree.
+pub fn settings_for_small_stamps(stamp: usize, configuration: &Configuration) -> String {
+    let mut lines = format!(
+        "  extends = \"{}\"\n  stamp.size = {stamp}",
+        configuration.name
+    );
     if let Some(linear) = configuration.linear() {
         // The linear method requires a window of at most a quarter of the stamp, and a PSF of the same parity. Light of galaxies is
         // lost beyond a window of more than a fifth of it, and one of 3/16 is that of docs/limitations.md.
@@ -270,6 +272,13 @@ fn too_small(stamp: usize, configuration: &Configuration) -> String {
             lines += &format!("\n  psf.size = {}", configuration.psf.size - 1);
         }
     }
+    lines
+}
+
+fn too_small(stamp: usize, configuration: &Configuration) -> String {
+    let Configuration { name, .. } = configuration;
+    let needed = configuration.stamp.size;
+    let lines = settings_for_small_stamps(stamp, configuration);
     format!(
         "the stamps are too small for the configuration {name} (found {stamp} px a side, expected {needed} or more). Try: --submission own.toml, with the file own.toml of these lines:\n{lines}"
     )
