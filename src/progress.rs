@@ -12,7 +12,7 @@ use indicatif::{
 };
 
 use crate::{is_quiet, tell};
-use shearq_dataset::threads::Progress;
+use shearq_dataset::threads::{Progress, Quiet};
 
 // Between two lines of a log file: a job of hours writes a few hundred.
 const LOG_INTERVAL: Duration = Duration::from_secs(60);
@@ -21,12 +21,18 @@ pub(super) struct Bar {
     bar: ProgressBar,
     // When a log file gets its next line; none on a terminal.
     next_line: Option<Instant>,
-    // Galaxies of an earlier call, without which the rate would be far too high after a resumption.
+    // What an earlier call did, without which the rate would be far too high after a resumption.
     skipped: Arc<AtomicU64>,
+    unit: &'static str,
 }
 
 impl Bar {
     pub(super) fn new(what: &'static str, galaxies: u64) -> Self {
+        Bar::of(what, "galaxies", galaxies)
+    }
+
+    /// Of work that is counted in a `unit`.
+    pub(super) fn of(what: &'static str, unit: &'static str, all: u64) -> Self {
         let (target, next_line) = if is_quiet() {
             (ProgressDrawTarget::hidden(), None)
         } else if std::io::stderr().is_terminal() {
@@ -38,7 +44,7 @@ impl Bar {
                 Some(Instant::now() + LOG_INTERVAL),
             )
         };
-        let bar = ProgressBar::with_draw_target(Some(galaxies), target);
+        let bar = ProgressBar::with_draw_target(Some(all), target);
         let skipped = Arc::new(AtomicU64::new(0));
         let template = "{prefix} {wide_bar} {percent}% of {human_len}{pace}{msg}";
         if let Ok(style) = ProgressStyle::with_template(template) {
@@ -56,6 +62,7 @@ impl Bar {
             bar,
             next_line,
             skipped,
+            unit,
         }
     }
 
@@ -65,19 +72,33 @@ impl Bar {
             return;
         }
         self.next_line = Some(now + LOG_INTERVAL);
+        tell(format_args!("{}", self.line()));
+    }
+
+    fn line(&self) -> String {
         let (done, all) = (self.bar.position(), self.bar.length().unwrap_or(0));
         let new = done.saturating_sub(self.skipped.load(Ordering::Relaxed));
-        tell(format_args!(
-            "{}: {}% of {} galaxies{}",
+        format!(
+            "{}: {}% of {} {}{}",
             self.bar.prefix(),
             100 * done / all.max(1),
             HumanCount(all),
+            self.unit,
             pace(
                 new,
                 all.saturating_sub(done),
                 self.bar.elapsed().as_secs_f64()
             )
-        ));
+        )
+    }
+}
+
+// Of catalogues that are read and summed.
+pub(super) fn reading(catalogues: u64) -> Box<dyn Progress> {
+    match catalogues {
+        // The bar of one would be at 0 until the end.
+        0 | 1 => Box::new(Quiet),
+        _ => Box::new(Bar::of("reading", "catalogues", catalogues)),
     }
 }
 
@@ -172,6 +193,19 @@ mod tests {
     fn the_name_of_the_image_leaves_room_for_the_bar() {
         assert_eq!(message("set 01 image 002", 80), "  set 01 image 002");
         assert_eq!(message("measuring the first images", 80), "");
+    }
+
+    #[test]
+    fn lines_of_a_log_name_what_is_counted() {
+        let mut bar = Bar::of("reading", "catalogues", 12_000);
+        bar.skip(1000);
+        bar.advance(5000);
+        let line = bar.line();
+        assert!(
+            line.starts_with("reading: 50% of 12,000 catalogues, "),
+            "{line}"
+        );
+        assert!(line.ends_with(" left"), "{line}");
     }
 
     #[test]

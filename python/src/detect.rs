@@ -5,6 +5,7 @@ use numpy::{IntoPyArray, PyReadonlyArray2};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
+use shearq_dataset::threads::Quiet;
 use shearq_detection::Detector;
 use shearq_measure::parts::ExposureDefects;
 use shearq_measure::{DetectionMethod, Jacobian, StampNoise};
@@ -46,20 +47,16 @@ pub(crate) fn detect<'py>(
     let image = image.as_array();
     let (height, width) = image.dim();
     let found = py.detach(|| {
-        detect_rows(
-            threads(threads_asked),
-            &detector,
-            &defects,
-            [width, height],
-            || {
-                let mut next = 0;
-                Ok(move |rows: usize| {
-                    let part = image.slice(s![next..next + rows, ..]);
-                    next += rows;
-                    Ok(part.iter().copied().collect())
-                })
-            },
-        )
+        let open = || {
+            let mut next = 0;
+            Ok(move |rows: usize| {
+                let part = image.slice(s![next..next + rows, ..]);
+                next += rows;
+                Ok(part.iter().copied().collect())
+            })
+        };
+        let threads = threads(threads_asked);
+        detect_rows(threads, &detector, &defects, [width, height], open, &mut Quiet)
     });
     let (found, unlit) = found.map_err(of_pipeline)?;
     let columns = PyDict::new(py);

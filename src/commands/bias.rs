@@ -10,6 +10,7 @@ use rand_distr::{Distribution, StandardNormal, Uniform};
 use shearq_bias::Design;
 
 use crate::arguments::{Printing, ReportFile, listed, named, positive};
+use crate::progress::reading;
 use crate::{Findings, made_by, tell};
 use shearq_catalogue::columns::{Names, Shapes};
 use shearq_catalogue::expression::Expression;
@@ -25,7 +26,7 @@ use shearq_files::{atomic, open};
 use shearq_render::figure::{Figure, PictureFormat};
 use shearq_render::table::{Cell, Table};
 use shearq_results::baseline::catalogues::Units as BaselineUnits;
-use shearq_results::bias::{BiasFailure, BiasResult, Summed, joined, sum};
+use shearq_results::bias::{BiasFailure, BiasResult, Summed, joined, sum_with_progress};
 use shearq_results::views::bias::{
     Checked, Limit, bias_plot, bias_table, check, chosen_by_measurement, compared_table, of_design,
     of_other_images, of_pairing, section, with_failures,
@@ -432,7 +433,7 @@ fn of_catalogues(summing: &Summing, catalogues: &[PathBuf]) -> anyhow::Result<Su
         ..Request::new(found)
     };
     let own = |number: usize| Shard::holding(number, shard.of()) == shard;
-    Ok(sum(&request, &own)?)
+    Ok(sum_with_progress(&request, &own, &reading)?)
 }
 
 fn merged(files: &[PathBuf]) -> anyhow::Result<Summed> {

@@ -11,6 +11,7 @@ use shearq_quantities::Frame;
 use shearq_submissions::DetectionMethod;
 
 use crate::arguments::{SummaryArguments, Threads, named};
+use crate::progress::Bar;
 use crate::{count, tell};
 
 /// Detect the galaxies of an exposure and measure them, with the response of the detection.
@@ -118,7 +119,9 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         missing,
         unlit,
         doubts,
-    } = task.write_catalogue(&run, out, id, threads)?;
+    } = task.write_catalogue(&run, out, id, threads, |pixels| {
+        Box::new(Bar::of("detecting", "pixels", pixels))
+    })?;
     for doubt in &doubts {
         tell(format_args!("warning: {doubt}."));
     }

@@ -14,6 +14,7 @@ use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::DataFolder;
 use shearq_dataset::metadata::{CATALOGUE_FIRST_PIXEL, CATALOGUE_FRAME, frame_entry};
 use shearq_dataset::run::{Run, Source};
+use shearq_dataset::threads::Progress;
 use shearq_detection::{DetectedPixel, Detection, Detections, Detector, Tile};
 use shearq_files::FileError;
 use shearq_files::frames::frame;
@@ -113,13 +114,14 @@ pub fn sky_level(pixels: impl ExactSizeIterator<Item = f32>) -> Option<f64> {
 }
 
 /// Detects galaxies on an exposure behind `star`, and counts the pixels that hold no light. `open` is called in another thread and
-/// returns a function that reads a number of rows.
+/// returns a function that reads a number of rows. Progress is in pixels.
 pub fn detect_rows<R: FnMut(usize) -> Result<Vec<f32>, PipelineError>>(
     threads: usize,
     detector: &Detector,
     defects: &ExposureDefects,
     [width, height]: [usize; 2],
     open: impl FnOnce() -> Result<R, PipelineError> + Send,
+    progress: &mut dyn Progress,
 ) -> Result<(Vec<Detection>, usize), PipelineError> {
     let least = 2 * detector.margin() + 1;
     if width.min(height) < least {
@@ -132,6 +134,7 @@ pub fn detect_rows<R: FnMut(usize) -> Result<Vec<f32>, PipelineError>>(
         }
         .into());
     }
+    let mut left = height;
     let (mut found, mut of_row) = (Detections::default(), Vec::<DetectedPixel>::new());
     let mut unlit = 0;
     engine::ordered(
@@ -168,6 +171,9 @@ pub fn detect_rows<R: FnMut(usize) -> Result<Vec<f32>, PipelineError>>(
                 for pixel in of_row.drain(..) {
                     found.add(&pixel);
                 }
+                let rows = detector.rows_per_tile().min(left);
+                left -= rows;
+                progress.advance((rows * width) as u64);
             }
             Ok(())
         },
@@ -288,6 +294,7 @@ impl DetectionTask<'_> {
         out: &Path,
         id: ImageId,
         threads: usize,
+        start: impl FnOnce(u64) -> Box<dyn Progress>,
     ) -> Result<Detected, PipelineError> {
         let mut exposure = Exposure::open(self.exposure)?;
         let sides = exposure.sides()?;
@@ -323,7 +330,10 @@ impl DetectionTask<'_> {
         })?;
         let defects = ExposureDefects::new((&star / star.sum()).view(), noise.sigma());
         let missing = AtomicUsize::new(0);
-        let found = detect_rows(threads, &detector, &defects, sides, || self.open(&missing));
+        let mut progress = start((sides[0] * sides[1]) as u64);
+        let open = || self.open(&missing);
+        let found = detect_rows(threads, &detector, &defects, sides, open, progress.as_mut());
+        drop(progress);
         let (found, unlit) = found.map_err(|error| match error {
             PipelineError::Measure(error) => exposure.origin.fault(&error.to_string()).into(),
             other => other,

@@ -27,7 +27,7 @@ use shearq_catalogue::truth::{TrueSign, Truth};
 use shearq_dataset::fingerprint::{GALAXIES, verify_source};
 use shearq_dataset::metadata::{CATALOGUE_FRAME, CommonAxes, axes_of};
 use shearq_dataset::run::Run;
-use shearq_dataset::threads::ALL_CORES;
+use shearq_dataset::threads::{ALL_CORES, Progress, Quiet};
 use shearq_dataset::truth::{Sign, stated_sign};
 use shearq_files::table::{self, FileFormat};
 use shearq_files::{FileError, names_of};
@@ -171,6 +171,15 @@ impl BiasResult {
 
 /// Sums the catalogues of a request for which `part` holds, given their number.
 pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, BiasFailure> {
+    sum_with_progress(request, part, &|_| Box::new(Quiet))
+}
+
+/// The same with the progress that `start` returns for a number of catalogues. Those that are read twice count twice.
+pub fn sum_with_progress(
+    request: &Request,
+    part: &dyn Fn(usize) -> bool,
+    start: &dyn Fn(u64) -> Box<dyn Progress>,
+) -> Result<Summed, BiasFailure> {
     distinct(&request.catalogues)?;
     refuse_sheared_psfs(&request.catalogues, &request.names)?;
     let joined = Request {
@@ -209,7 +218,11 @@ pub fn sum(request: &Request, part: &dyn Fn(usize) -> bool) -> Result<Summed, Bi
         }
     }
     about.sign = known_sign(request, &all)?.filter(|_| about.truth);
-    let mut summed = added_up(&mut reading, &all, about, part)?;
+    let count = (0..all.len()).filter(|number| part(*number)).count() as u64;
+    // Partners are found after a first pass.
+    let mut progress = start(count * (1 + u64::from(request.paired)));
+    let mut summed = added_up(&mut reading, &all, about, part, progress.as_mut())?;
+    drop(progress);
     if let Some(survey) = &request.like {
         if summed.about.cells.axes.is_empty() {
             return Err(BiasFailure::LikeWithoutBins);
@@ -270,6 +283,7 @@ fn added_up(
     all: &[Vec<Source>],
     about: About,
     part: &dyn Fn(usize) -> bool,
+    progress: &mut dyn Progress,
 ) -> Result<Summed, BiasFailure> {
     let request = reading.request;
     let first = &all[0][0];
@@ -280,7 +294,7 @@ fn added_up(
     };
     let is_of_challenge = |sign: Sign| sign.of == TruthSign::Challenge;
     reading.flip_g2 = about.sign.is_some_and(is_of_challenge);
-    let (sums, catalogues) = add_up(reading, all, (layout, &about.cells), part, None)?;
+    let (sums, catalogues) = add_up(reading, all, (layout, &about.cells), part, progress, None)?;
     distinct_content(&catalogues)?;
     let read = catalogues.iter().enumerate();
     let read = read.filter(|(number, _)| part(*number));
@@ -298,7 +312,15 @@ fn added_up(
         let sign = summed.sign_of_catalogues(truth)?;
         if is_of_challenge(sign) {
             reading.flip_g2 = true;
-            let found = add_up(reading, all, (layout, &summed.about.cells), part, None)?;
+            // At most a second pass, of which the progress does not know.
+            let found = add_up(
+                reading,
+                all,
+                (layout, &summed.about.cells),
+                part,
+                &mut Quiet,
+                None,
+            )?;
             (summed.sums, summed.about.catalogues) = found;
         }
         summed.about.sign = Some(sign);
@@ -310,7 +332,14 @@ fn added_up(
         let design = summed.design();
         let partners = Partners::new(reading, all, design, &summed.about.catalogues)?;
         let cells = &summed.about.cells;
-        let found = add_up(reading, all, (layout, cells), part, Some(&partners))?;
+        let found = add_up(
+            reading,
+            all,
+            (layout, cells),
+            part,
+            progress,
+            Some(&partners),
+        )?;
         (summed.sums, summed.about.catalogues) = found;
     }
     Ok(summed)
@@ -322,6 +351,7 @@ fn add_up(
     all: &[Vec<Source>],
     (layout, cells): (Layout, &Cells),
     part: &dyn Fn(usize) -> bool,
+    progress: &mut dyn Progress,
     partners: Option<&Partners<'_>>,
 ) -> Result<(UnitSums, Vec<Catalogue>), BiasFailure> {
     let request = reading.request;
@@ -380,6 +410,7 @@ fn add_up(
         })?;
         catalogue.without_partner = alone;
         catalogues.push(catalogue);
+        progress.advance(1);
     }
     Ok((sums, catalogues))
 }
