@@ -360,9 +360,8 @@ fn tell_unread(unread: Vec<String>) {
     }
 }
 
-// The commit is that of release builds, which set the variable: asking git in a build script would build the program again after
-// each commit.
-fn version_and_commit() -> &'static str {
+/// The version, with the commit that was built if `build.rs` found it.
+pub fn version_and_commit() -> &'static str {
     static TEXT: std::sync::LazyLock<String> = std::sync::LazyLock::new(|| {
         let commit = option_env!("SHEARQ_COMMIT").map(|commit| format!(" ({commit})"));
         format!("{}{}", shearq_dataset::VERSION, commit.unwrap_or_default())

@@ -57,6 +57,19 @@ fn causes_are_printed_once() {
 }
 
 #[test]
+fn the_version_names_the_commit_of_the_repository() {
+    // Sources of an archive, and those within another repository, have no commit.
+    if option_env!("SHEARQ_COMMIT").is_none() {
+        return;
+    }
+    let mut git = std::process::Command::new("git");
+    let head = git.args(["rev-parse", "--short=12", "HEAD"]).output();
+    let head = String::from_utf8(head.unwrap().stdout).unwrap();
+    let expected = format!("{} ({})", shearq_dataset::VERSION, head.trim());
+    assert_eq!(crate::version_and_commit(), expected);
+}
+
+#[test]
 fn names_contain_no_character_that_messages_escape() {
     for c in (char::MIN..=char::MAX).filter(|c| !['\n', '\t'].contains(c)) {
         let name = c.to_string();

@@ -172,6 +172,11 @@ impl BiasSums {
         Ok(BiasSums { summed })
     }
 
+    /// The columns that are used, by role.
+    fn columns(&self) -> Vec<(String, String)> {
+        self.summed.columns().collect()
+    }
+
     /// The table of estimates as JSON, and as text; with `against`, of both and their difference.
     fn result(
         &self,

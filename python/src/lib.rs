@@ -49,11 +49,10 @@ mod _shearq {
     #[expect(non_upper_case_globals, reason = "its name in Python")]
     const __version__: &str = shearq_dataset::VERSION;
 
-    /// The hook of panics belongs to this module alone: each extension module contains its own standard library.
+    /// The version with its commit is that of the command line. The hook of panics belongs to this module alone: each extension module contains its own standard library.
     #[pymodule_init]
-    #[expect(clippy::unnecessary_wraps, reason = "pyo3 requires a result")]
-    fn init(_module: &Bound<'_, PyModule>) -> PyResult<()> {
+    fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
         shearq::silence_caught_panics();
-        Ok(())
+        module.add("version_and_commit", shearq::version_and_commit())
     }
 }

@@ -457,6 +457,10 @@ def test_results_are_compared_and_saved_as_by_the_command_line(pair, tmp_path, c
     inputs = shown["made_by"]["inputs"]
     assert set(inputs) == {str(path) for path in [*paths, truth]} and "--against" in shown["made_by"]["command"]
     of_files = shearq.bias(paths[:2], truth=truth)
+    settings = shown["made_by"]["settings"]
+    assert settings["against"] == [str(path) for path in paths[2:]] and settings["format"] == "json" and "quiet" not in settings
+    assert shown["made_by"]["columns"] == of_files.made_by["columns"] and of_files.made_by["columns"]["e1"] == "e1"
+    assert shown["made_by"]["version"] == of_files.made_by["version"]
     assert of_files.made_by["inputs"] == {str(path): inputs[str(path)] for path in [*paths[:2], truth]}
     assert of_files.made_by["settings"]["truth"] == str(truth) and shown["made_by"]["version"].split()[0] == shearq.__version__
     paths[0].write_bytes(paths[1].read_bytes())

@@ -494,7 +494,7 @@ def test_bias_knows_the_star_of_catalogues_in_memory(tmp_path):
 def test_results_become_json_files_and_tables(two, tmp_path):
     mean = two[0].mean_shear()
     found = json.loads(mean.to_json())
-    assert found["g1"] == mean.g1 and found["galaxies"] == mean.galaxies and found["made_by"]["version"] == shearq.__version__
+    assert found["g1"] == mean.g1 and found["galaxies"] == mean.galaxies and found["made_by"]["version"].split()[0] == shearq.__version__
     assert "Mean shear of" in mean._repr_html_() and f"{mean.g1:+.6f}" in mean._repr_html_()
     simulation = shearq.simulate(set=8, images=2, grid=12)
     e = np.random.default_rng(1).normal(0, 0.1, (2, 2, 144))

@@ -10,6 +10,7 @@ use rand_distr::{Distribution, StandardNormal, Uniform};
 use shearq_bias::Design;
 
 use crate::arguments::{Printing, ReportFile, listed, named, positive};
+use crate::origin::remember_columns;
 use crate::progress::reading;
 use crate::{Findings, made_by, tell};
 use shearq_catalogue::columns::{Names, Shapes};
@@ -236,6 +237,7 @@ pub(crate) fn run(arguments: &Arguments, command_line: &str) -> anyhow::Result<(
         [] => of_catalogues(summing, &listed(&summing.catalogues)?)?,
         files => merged(&listed(files)?)?,
     };
+    remember_columns(summed.columns());
     if let Some(path) = &summing.sums {
         atomic::write(path, &serde_json::to_vec(&summed)?)?;
     }

@@ -6,6 +6,7 @@ use shearq_files::open::{SETTINGS, is_there, read_to_string};
 use shearq_submissions::check_name;
 
 use crate::arguments::{SummaryArguments, named};
+use crate::origin::account;
 use crate::progress::Bar;
 use crate::{count, tell, tell_notes, tell_unread};
 use shearq_challenges::{BranchCatalogues, Presubmitting, PublicBranch, PublicChallenge};
@@ -198,7 +199,7 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     let galaxies = packing.galaxies()?;
     // A catalogue with a misspelt name would otherwise be missing from the submission without notice.
     tell_unread(catalogues.files.unread());
-    tell_notes(catalogues.account()?);
+    tell_notes(account(&catalogues)?);
     let mut bar = Bar::new("packing", galaxies);
     let files = packing.write(out, &mut bar)?;
     drop(bar);

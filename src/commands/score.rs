@@ -9,6 +9,7 @@ use shearq_scoring::{Noise, Options, SetScorer, TruthSign};
 use crate::arguments::{
     Printing, ReportFile, ScoreSettings, SetList, Threads, named, positive, sets_of,
 };
+use crate::origin::account;
 use crate::{print_json, tell, tell_notes, tell_unread};
 use shearq_catalogue::columns::Shapes;
 use shearq_catalogue::foreign::Foreign;
@@ -226,7 +227,7 @@ pub(super) fn units(arguments: &Arguments) -> anyhow::Result<(Units, Vec<PathBuf
     };
     if let Some(truth) = &arguments.truth {
         let (catalogues, _, scored) = scored_files(arguments, truth, options)?;
-        tell_notes(catalogues.account()?);
+        tell_notes(account(&catalogues)?);
         return Ok((
             of(&scored, &|_| truth.clone())?,
             arguments.catalogues.clone(),
@@ -237,7 +238,7 @@ pub(super) fn units(arguments: &Arguments) -> anyhow::Result<(Units, Vec<PathBuf
         bail!("score: a baseline is of catalogues (found power spectra)");
     };
     let (scored, _) = scored_catalogues(arguments, &catalogues, &data, options)?;
-    tell_notes(catalogues.account()?);
+    tell_notes(account(&catalogues)?);
     let of_set = |own: &ScoredSet| catalogues.files.of_set(own.record.set);
     // Files of an archive are in a temporary folder.
     let files = match &arguments.packed {
@@ -339,7 +340,7 @@ fn catalogues(
     }
     let title = format!("Scores of {name}");
     let mut table = per_set(&scored, &title, options.definition);
-    table.notes.extend(catalogues.account()?);
+    table.notes.extend(account(&catalogues)?);
     table.notes.extend(unscored(&data, &scored, sets)?);
     table.notes.extend(verdict_line(name, &scored));
     if let Some(store) = store {
@@ -528,8 +529,8 @@ fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Resul
     }
     let title = format!("Scores against {}", truth.display());
     let mut table = per_set(&scored, &title, options.definition);
-    let account = catalogues.account()?;
-    table.notes.extend(account.iter().cloned());
+    let columns = account(&catalogues)?;
+    table.notes.extend(columns.iter().cloned());
     table.notes.extend(verdict_line("The catalogues", &scored));
     // The JSON of plain files has the keys of the public scoring cases of GREAT10, so that both can be compared.
     if arguments.printing.format() == TableFormat::Json {
@@ -545,7 +546,7 @@ fn files(arguments: &Arguments, truth: &Path, options: Options) -> anyhow::Resul
                 .map_or_else(|| name(truth), |n| n.to_string_lossy().into_owned()),
             truth: name(truth),
             catalogues: arguments.catalogues.iter().map(|path| name(path)).collect(),
-            columns: account,
+            columns,
             definition: options.definition,
         };
         print_json(one_set_json(&scored[0], &input))?;

@@ -97,6 +97,12 @@ impl Galaxies {
         lines
     }
 
+    /// The columns that are used, by role.
+    pub fn columns(&self) -> Vec<(String, String)> {
+        let first = self.sources.first();
+        first.map_or_else(Vec::new, |own| own.used(&self.reading()))
+    }
+
     /// Columns that look as if they should be used and that the first catalogue does not have, of the first of `others` that has some.
     pub fn unused_in(&self, others: &[Galaxies]) -> Vec<String> {
         let others = others

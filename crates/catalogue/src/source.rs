@@ -125,7 +125,7 @@ impl Source {
 
     /// What catalogues of one list must have in common: columns by role, and what becomes of them.
     pub fn kind(&self, reading: &Reading<'_>) -> Vec<(String, String)> {
-        let mut kind = self.columns.roles(|role| self.reads(reading, role));
+        let mut kind = self.used(reading);
         if let Some(unit) = &self.unit {
             kind.retain(|(role, _)| role != "unit");
             kind.push(("units".into(), unit.clone()));
@@ -145,6 +145,11 @@ impl Source {
             of("the program", self.columns.program()),
         ]);
         kind
+    }
+
+    /// The columns that enter the result, by role.
+    pub fn used(&self, reading: &Reading<'_>) -> Vec<(String, String)> {
+        self.columns.roles(|role| self.reads(reading, role))
     }
 
     // The columns that enter the result.

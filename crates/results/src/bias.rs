@@ -17,7 +17,7 @@ use shearq_bias::{
 };
 use shearq_catalogue::columns::Shapes;
 use shearq_catalogue::request::{Input, Request, Units};
-use shearq_catalogue::roles::{CATALOGUES, Role};
+use shearq_catalogue::roles::{CATALOGUES, Role, named};
 use shearq_catalogue::rows::{distinct, rows};
 use shearq_catalogue::sheared_files::{refuse_sheared_psfs, with_sheared_files, without_sheared};
 use shearq_catalogue::source::{
@@ -719,6 +719,12 @@ impl Summed {
             estimate: estimate(cell),
         });
         [all].into_iter().chain(bins).collect()
+    }
+
+    /// The columns that are used, by role.
+    pub fn columns(&self) -> impl Iterator<Item = (String, String)> {
+        let kind = self.about.kind.iter();
+        kind.filter(|(role, _)| named(role).is_some()).cloned()
     }
 
     fn design(&self) -> Design {

@@ -216,6 +216,17 @@ impl Catalogues {
         Ok([first.account(), first.unused_in(others)].concat())
     }
 
+    /// The columns of the first catalogue that are used, by role; empty of catalogues by shearq, and without names of columns.
+    pub fn columns(&self) -> Result<Vec<(String, String)>, FileError> {
+        let sets = self.files.sets();
+        let mut paths = sets.iter().flat_map(|set| self.files.of_set(*set));
+        let (Some(foreign), Some((_, first))) = (&self.description, paths.next()) else {
+            return Ok(Vec::new());
+        };
+        let first = recognised(foreign, &first, MAX_ROWS)?;
+        Ok(first.map_or_else(Vec::new, |own| own.columns()))
+    }
+
     /// The rows of one catalogue, at most `most`, with the signs and the type of ellipticity that are scored, and their weights.
     pub fn rows(&self, path: &Path, most: usize) -> Result<Vec<Galaxy>, FileError> {
         match &self.description {

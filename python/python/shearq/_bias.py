@@ -32,7 +32,7 @@ class Bias(Result):
         The binned column or expression; empty without bins.
 
     made_by : dict
-        Version, settings that are no defaults, and fingerprints of files.
+        Version with commit, settings that are no defaults, columns by role, and fingerprints of files.
 
     ``bias["m1"]`` is the value of all galaxies. With ``against``, rows are those of both catalogues and of the difference.
     """
@@ -348,7 +348,7 @@ def bias_sums(
         "paired": paired, "drop_missing": drop_missing, "step": step,
     }
     paths = [own if isinstance(own, str) else own[0] for own in given] + presets + ([] if truth is None else [os.fspath(truth)])
-    return BiasSums(found, origin("shearq.bias", settings, paths))
+    return BiasSums(found, origin("shearq.bias", settings, paths, dict(found.columns())))
 
 
 def _paths(given: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | None) -> list[str]:

@@ -33,11 +33,12 @@ def plain(value: Any) -> Any:
     return os.fspath(value) if isinstance(value, os.PathLike) else f"<{type(value).__name__}>"
 
 
-def origin(function: str, settings: Mapping[str, Any], paths: Any = ()) -> dict[str, Any]:
-    """Version, function, settings that are no defaults, and fingerprints of files, as the command line's JSON has them."""
+def origin(function: str, settings: Mapping[str, Any], paths: Any = (), columns: Mapping[str, str] | None = None) -> dict[str, Any]:
+    """Version with commit, function, settings that are no defaults, columns by role, and fingerprints of files, as the command line's
+    JSON has them."""
     given = {name: plain(value) for name, value in settings.items() if value is not None and value is not False}
     inputs = {path: print for path in paths if (print := _shearq.fingerprint(_hdf5._parts(path)[0])) is not None}
-    return {"version": _shearq.__version__, "function": function, "settings": given, "inputs": inputs}
+    return {"version": _shearq.version_and_commit, "function": function, "settings": given, "columns": dict(columns or {}), "inputs": inputs}
 
 
 class Result:

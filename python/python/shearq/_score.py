@@ -66,9 +66,12 @@ class Score(Result):
         Metrics with each group of images left out, in the order of ``metrics``; empty with one image.
     notes : list of str
         Warnings about the rows.
+    made_by : dict
+        Version with commit, function and settings that are no defaults.
     """
 
-    def __init__(self, found: dict[str, Any], dropped: int = 0) -> None:
+    def __init__(self, found: dict[str, Any], dropped: int, settings: dict[str, Any]) -> None:
+        self.made_by = origin("shearq.score", settings)
         self.metrics: dict[str, float] = found["metrics"]
         self.errors: dict[str, float] = found["errors"]
         self.spectrum: NDArray[np.void] = _table(found["spectrum"])
@@ -104,7 +107,7 @@ class Score(Result):
     def _object(self) -> dict[str, Any]:
         names = ("images", "dropped", "noise_variance", "convention", "q_leaderboard", "truth_sign", "correlation", "mean", "notes")
         own = {name: getattr(self, name) for name in names}
-        return {"metrics": self.metrics, "errors": self.errors, **own, "spectrum": self.spectrum, "made_by": origin("shearq.score", {})}
+        return {"metrics": self.metrics, "errors": self.errors, **own, "spectrum": self.spectrum, "made_by": self.made_by}
 
     def _table(self) -> tuple[str, list[str], list[list[str]], list[str]]:
         rows = [[name, f"{value:.5g}", f"{self.errors[name]:.2g}", METRICS[name]] for name, value in self.metrics.items()]
@@ -253,6 +256,10 @@ def score(
             else real("noise_variance", noise_variance, "a finite number, zero or more", least=0.0),
         ),
         dropped,
+        {
+            "stamp": stamp, "field_degrees": field_degrees, "definition": definition, "convention": convention,
+            "noise_variance": noise_variance, "truth_sign": truth_sign, "drop_missing": drop_missing,
+        },
     )
     for note in found.notes:
         # A constant shear is no fault; the note is kept.
