@@ -9,7 +9,11 @@ use anyhow::Context;
 use clap::Args;
 use clap::builder::{PossibleValue, PossibleValuesParser, TypedValueParser};
 use shearq_bias::Design;
-use shearq_catalogue::columns::Shapes;
+use shearq_catalogue::columns::{Names, Shapes};
+use shearq_catalogue::recognition::read_presets;
+use shearq_catalogue::request::{DEFAULT_STEP, Request, Units};
+use shearq_catalogue::roles::role_names;
+use shearq_catalogue::truth::Expanded;
 use shearq_challenge::kind::{Kind, RankBy};
 use shearq_dataset::images::{ImageId, Shard};
 use shearq_dataset::layout::MAX_SET;
@@ -166,6 +170,69 @@ impl Printing {
     }
 }
 
+/// How tables of any program are read.
+#[derive(Debug, Args)]
+pub(super) struct TableReading {
+    // The roles are appended to this text.
+    #[arg(
+        long,
+        help = columns_help(),
+        value_name = "ROLE=COLUMN",
+        value_delimiter = ','
+    )]
+    columns: Vec<String>,
+    /// Also recognise the surveys that this file describes, as `[[survey]]` in TOML: name, ellipticity (shear or distortion),
+    /// required (columns that it must have) and columns (by role).
+    #[arg(long, value_name = "FILE")]
+    preset: Vec<PathBuf>,
+    /// Type of the ellipticities [default: shear if they have a response, else responsivity for columns of HSM that are
+    /// distortions, else shear].
+    #[arg(long, value_parser = named::<Shapes>())]
+    pub(super) ellipticity: Option<Shapes>,
+    /// Independent units for errors: `rows`, `catalogues` or a column, such as `seed` [default: a column pair, seed or
+    /// patch; else groups of catalogues if there are 20 or more; else rows].
+    #[arg(long, value_name = "UNIT")]
+    units: Option<String>,
+    /// Leave out rows with missing numbers or without a true shear.
+    #[arg(long)]
+    drop_missing: bool,
+    /// Artificial shear of metacalibration [default: 0.01].
+    #[arg(long, value_name = "G", value_parser = positive)]
+    pub(super) step: Option<f64>,
+}
+
+impl TableReading {
+    pub(super) fn request(&self, found: Expanded) -> anyhow::Result<Request> {
+        let mut names = Names::default();
+        for text in &self.columns {
+            names.add(text)?;
+        }
+        for path in &self.preset {
+            names.add_presets(read_presets(path)?);
+        }
+        Ok(Request {
+            names,
+            shapes: self.ellipticity,
+            units: match self.units.as_deref() {
+                None => Units::Recognised,
+                Some("rows") => Units::Rows,
+                Some("catalogues") => Units::Catalogues,
+                Some(column) => Units::Column(column.to_owned()),
+            },
+            drop_missing: self.drop_missing,
+            step: self.step.unwrap_or(DEFAULT_STEP),
+            ..Request::new(found)
+        })
+    }
+}
+
+fn columns_help() -> String {
+    format!(
+        "Names of columns or formulas of them, such as `e1=g_1,e2=-g_2,w=weight`, `flag=flags & 4` or `e1=g1,e2=g2,e1_1p=g1_1p,e1_1m=g1_1m,e2_2p=g2_2p,e2_2m=g2_2m`; `ROLE=none` ignores a column that would be recognised. Roles: {}",
+        role_names()
+    )
+}
+
 #[derive(Debug, Clone, Args)]
 pub(super) struct ReportFile {
     /// Write tables and plots to this file as one self-contained HTML page (.html).
@@ -244,7 +311,9 @@ impl SummaryArguments {
 }
 
 // Commands that read a table from standard input.
-const FROM_STANDARD_INPUT: [&str; 6] = ["bias", "compare", "gather", "pack", "score", "simulate"];
+const FROM_STANDARD_INPUT: [&str; 7] = [
+    "bias", "compare", "gather", "mean", "pack", "score", "simulate",
+];
 
 /// The arguments of a command, where `-` and pipes are a file with what is read from them: tables are read twice.
 pub(super) struct StandardInput {

@@ -127,7 +127,9 @@ pub(crate) enum Command {
     Run(run::Arguments),
     #[command(after_help = "Example:\n  shearq merge run --sets all --images 200 --shards 8")]
     Merge(merge::Arguments),
-    #[command(after_help = "Example:\n  shearq mean --measured linear")]
+    #[command(
+        after_help = "Examples:\n  shearq mean --measured linear\n  shearq mean metacal.fits --step 0.01"
+    )]
     Mean(mean::Arguments),
     #[command(
         after_help = "Example:\n  shearq select --measured linear --where 'step(snr, 10) and step(size, 2.5)' --out bright"

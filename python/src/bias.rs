@@ -177,6 +177,12 @@ impl BiasSums {
         self.summed.columns().collect()
     }
 
+    /// Rows with a flag, and the axes of the ellipticities if the catalogues state them.
+    fn flagged_and_frame(&self) -> (u64, Option<String>) {
+        let about = self.summed.about();
+        (about.total().flagged, about.frame.clone())
+    }
+
     /// The table of estimates as JSON, and as text; with `against`, of both and their difference.
     fn result(
         &self,

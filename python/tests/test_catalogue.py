@@ -511,3 +511,44 @@ def test_results_become_json_files_and_tables(two, tmp_path):
         with pytest.raises(ValueError, match="path: found 'result.xyz'; expected a name that ends in .json, .csv, .html"):
             result.save(tmp_path / "result.xyz")
     assert not list(tmp_path.glob(".*"))
+
+
+def sheared_tables(n=4000):
+    """A metacal table and a metadetect table of the same galaxies, with their exact mean shear."""
+    rng = np.random.default_rng(5)
+    e, response = rng.normal(0, 0.2, (n, 2)) + [0.02, -0.01], rng.normal(0.7, 0.05, (n, 2))
+    metacal = {"e1": e[:, 0], "e2": e[:, 1], "flags": np.zeros(n, int), "psf_e1": rng.normal(0.02, 0.01, n), "psf_e2": rng.normal(0, 0.01, n)}
+    for k in range(2):
+        for other in range(2):
+            own = response[:, k] if k == other else 0.0
+            for sign, name in ((1, "p"), (-1, "m")):
+                metacal[f"e{k + 1}_{other + 1}{name}"] = e[:, k] + sign * 0.01 * own
+    steps = {"noshear": e}
+    for k in range(2):
+        for sign, name in ((1, "p"), (-1, "m")):
+            steps[f"{k + 1}{name}"] = e + sign * 0.01 * response * (np.arange(2) == k)
+    metadetect = {
+        "wmom_g_1": np.concatenate([one[:, 0] for one in steps.values()]),
+        "wmom_g_2": np.concatenate([one[:, 1] for one in steps.values()]),
+        "mdet_step": np.repeat(list(steps), n),
+    }
+    return metacal, metadetect, e.mean(axis=0) / response.mean(axis=0)
+
+
+def test_mean_shear_of_metacal_and_metadetect_tables(command, tmp_path):
+    metacal, metadetect, expected = sheared_tables()
+    for number, table in enumerate((metacal, metadetect)):
+        found = shearq.mean_shear(table)
+        assert np.allclose([found.g1, found.g2], expected, rtol=1e-9) and np.allclose(found.response, 0.7, atol=0.01)
+        assert found.g1_error == pytest.approx(0.2 / 0.7 / np.sqrt(4000), rel=0.1)
+        assert found.galaxies == 4000 and "Try" not in str(found)
+        assert found.made_by["columns"]["e1"] == ("e1", "wmom_g_1")[number]
+        path = tmp_path / f"{number}.csv"
+        np.savetxt(path, np.array(list(table.values())).T, fmt="%s", delimiter=",", header=",".join(table), comments="")
+        shown = json.loads(command("mean", path, "--format", "json"))
+        (row,) = shown["rows"]
+        assert np.allclose([row["g1"], row["g2"], row["g1_error"]], [*expected, found.g1_error], rtol=1e-6)
+        # The PSF's ellipticity is not used, by which the estimate would be that of a round PSF.
+        assert shown["made_by"]["columns"] == found.made_by["columns"] and "psf_e1" not in found.made_by["columns"]
+    with pytest.raises(ValueError, match="weights: found for a table; expected them in a column"):
+        shearq.mean_shear(metacal, np.ones(4000))

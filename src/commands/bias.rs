@@ -9,17 +9,12 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal, Uniform};
 use shearq_bias::Design;
 
-use crate::arguments::{Printing, ReportFile, listed, named, positive};
+use crate::arguments::{Printing, ReportFile, TableReading, listed, named, positive};
 use crate::origin::remember_columns;
 use crate::progress::reading;
 use crate::{Findings, made_by, tell};
-use shearq_catalogue::columns::{Names, Shapes};
 use shearq_catalogue::expression::Expression;
-use shearq_catalogue::recognition::read_presets;
-use shearq_catalogue::request::{
-    Binning, DEFAULT_STEP, Edges, MAX_AXES, MAX_BINS, Request, Survey, Units,
-};
-use shearq_catalogue::roles::role_names;
+use shearq_catalogue::request::{Binning, Edges, MAX_AXES, MAX_BINS, Request, Survey};
 use shearq_catalogue::select::selection;
 use shearq_catalogue::truth::{TrueSign, Truth, expand};
 use shearq_dataset::images::Shard;
@@ -53,7 +48,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "LIMIT")]
     fail_above: Vec<Limit>,
     /// Merge files that --sums wrote for shards of one list of catalogues.
-    #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with = "Summing")]
+    #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with_all = ["Summing", "TableReading"])]
     merge: Vec<PathBuf>,
     /// Print how many measurements determine m to this error, such as 1e-3. Needs no catalogues.
     #[arg(long, value_name = "ERROR", value_parser = planned_error, allow_hyphen_values = true, exclusive = true)]
@@ -109,22 +104,8 @@ struct Summing {
     /// g1 and g2 of the catalogues, or the true shear of the data of a folder].
     #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
-    // The roles are appended to this text.
-    #[arg(
-        long,
-        help = columns_help(),
-        value_name = "ROLE=COLUMN",
-        value_delimiter = ','
-    )]
-    columns: Vec<String>,
-    /// Also recognise the surveys that this file describes, as `[[survey]]` in TOML: name, ellipticity (shear or distortion),
-    /// required (columns that it must have) and columns (by role).
-    #[arg(long, value_name = "FILE")]
-    preset: Vec<PathBuf>,
-    /// Type of the ellipticities [default: shear if they have a response, else responsivity for columns of HSM that are
-    /// distortions, else shear].
-    #[arg(long, value_parser = named::<Shapes>())]
-    ellipticity: Option<Shapes>,
+    #[command(flatten)]
+    reading: TableReading,
     /// Sign of the true g2 [default: as the file of --truth states; else, for x, y, g1, g2, the sign in which the shear is
     /// an E-mode field; else the sign that e2 follows; required if these are unclear. Shears of options, of columns of
     /// the catalogues and of tables with the column catalogue: standard].
@@ -159,33 +140,16 @@ struct Summing {
     /// How catalogues belong together [default: recognised from the true shears].
     #[arg(long, value_parser = named::<Design>())]
     design: Option<Design>,
-    /// Independent units for errors: `rows`, `catalogues` or a column, such as `seed` [default: a column pair, seed or
-    /// patch; else groups of catalogues if there are 20 or more; else rows].
-    #[arg(long, value_name = "UNIT")]
-    units: Option<String>,
     /// Use only galaxies that count under all test shears. The error of m is then small, and m does not contain how shear
     /// changes which galaxies are selected. Reads each catalogue several times, and keeps the identifiers of one in memory.
     #[arg(long)]
     paired: bool,
-    /// Leave out rows with missing numbers or without a true shear.
-    #[arg(long)]
-    drop_missing: bool,
-    /// Artificial shear of metacalibration [default: 0.01].
-    #[arg(long, value_name = "G", value_parser = positive)]
-    step: Option<f64>,
     /// Write the sums of the catalogues to this file, for --merge.
     #[arg(long, value_name = "FILE")]
     sums: Option<PathBuf>,
     /// Read only shard K of N of the catalogues.
     #[arg(long, value_name = "K/N", requires = "sums")]
     shard: Option<Shard>,
-}
-
-fn columns_help() -> String {
-    format!(
-        "Names of columns or formulas of them, such as `e1=g_1,e2=-g_2,w=weight`, `flag=flags & 4` or `e1=g1,e2=g2,e1_1p=g1_1p,e1_1m=g1_1m,e2_2p=g2_2p,e2_2m=g2_2m`; `ROLE=none` ignores a column that would be recognised. Roles: {}",
-        role_names()
-    )
 }
 
 // Split at the last colon, because an expression may contain others in names of columns.
@@ -362,13 +326,6 @@ pub(super) fn units(arguments: &Arguments) -> anyhow::Result<(BaselineUnits, Vec
 }
 
 fn of_catalogues(summing: &Summing, catalogues: &[PathBuf]) -> anyhow::Result<Summed> {
-    let mut names = Names::default();
-    for text in &summing.columns {
-        names.add(text)?;
-    }
-    for path in &summing.preset {
-        names.add_presets(read_presets(path)?);
-    }
     let specified = summing.truth_sign;
     let mut sign = TrueSign::or_standard(specified);
     let truth = match (&summing.truth, summing.g1.zip(summing.g2)) {
@@ -399,8 +356,8 @@ fn of_catalogues(summing: &Summing, catalogues: &[PathBuf]) -> anyhow::Result<Su
         // Catalogues of linear configurations contain shears with responses and no sheared catalogues.
         let unused = [
             ("--against", !summing.against.is_empty()),
-            ("--ellipticity", summing.ellipticity.is_some()),
-            ("--step", summing.step.is_some()),
+            ("--ellipticity", summing.reading.ellipticity.is_some()),
+            ("--step", summing.reading.step.is_some()),
         ];
         if let Some((option, _)) = unused.into_iter().find(|(_, given)| *given) {
             anyhow::bail!("{option}: cannot be used with step() in --where");
@@ -413,8 +370,6 @@ fn of_catalogues(summing: &Summing, catalogues: &[PathBuf]) -> anyhow::Result<Su
     );
     let found = expand(catalogues, truth)?;
     let request = Request {
-        names,
-        shapes: summing.ellipticity,
         sign,
         bins: summing.bins.clone(),
         like: summing.like.clone().map(|catalogue| Survey {
@@ -424,15 +379,7 @@ fn of_catalogues(summing: &Summing, catalogues: &[PathBuf]) -> anyhow::Result<Su
         paired: summing.paired,
         selection,
         design: summing.design,
-        units: match summing.units.as_deref() {
-            None => Units::Recognised,
-            Some("rows") => Units::Rows,
-            Some("catalogues") => Units::Catalogues,
-            Some(column) => Units::Column(column.to_owned()),
-        },
-        drop_missing: summing.drop_missing,
-        step: summing.step.unwrap_or(DEFAULT_STEP),
-        ..Request::new(found)
+        ..summing.reading.request(found)?
     };
     let own = |number: usize| Shard::holding(number, shard.of()) == shard;
     Ok(sum_with_progress(&request, &own, &reading)?)

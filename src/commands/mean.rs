@@ -1,25 +1,35 @@
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::Args;
 
-use crate::arguments::{Form, SetList, Threads, Unsheared, sets_of};
+use crate::arguments::{Form, SetList, TableReading, Threads, Unsheared, listed, sets_of};
+use crate::origin::remember_columns;
+use crate::progress::reading;
 use crate::tell;
-use shearq_catalogue::select::smooth_selection;
+use shearq_catalogue::request::Request;
+use shearq_catalogue::roles::Role;
+use shearq_catalogue::select::{selection, smooth_selection};
+use shearq_catalogue::truth::{Truth, expand};
 use shearq_dataset::fingerprint;
 use shearq_dataset::metadata::Axes;
 use shearq_dataset::run::Run;
 use shearq_measure::{PixelFrame, Warning};
 use shearq_render::table::TableFormat;
+use shearq_results::bias::sum_with_progress;
 use shearq_results::mean::mean_shears;
 use shearq_results::score::without_catalogue;
+use shearq_results::views::bias::{chosen_by_measurement, mean_shear_table};
 use shearq_results::views::mean::mean_table;
 
-/// Mean shear of each set, for fields of constant shear.
+/// Mean shear of each set, for fields of constant shear, or of catalogues of any program.
 ///
-/// The mean shear is the mean ellipticity of all galaxies without a flag, divided by their mean response if
+/// With --measured, the mean shear is the mean ellipticity of all galaxies without a flag, divided by their mean response if
 /// the configuration does so. The error includes the error of the mean response, and the noise of one star per image. It
 /// assumes independent galaxies, apart from branches of GREAT3 with constant shear: their galaxies are pairs that are rotated by
 /// 90 degrees, so that the error is that of the noise of pixels alone.
+///
+/// With CATALOGUE, the tables and the options of their columns are those of `bias`, and their rows are one mean: g = ⟨R⟩⁻¹⟨e⟩, with
+/// responses of columns or of the sheared catalogues of metacal and metadetect. Errors are from a jackknife over units.
 ///
 /// --where and --weight select and weight galaxies of linear configurations by `snr`, `flux` (image units) and `size` (px), and
 /// select by `neighbour`, the light in a ring around the galaxy over its flux.
@@ -30,9 +40,16 @@ use shearq_results::views::mean::mean_table;
 /// width is 1.5 in `snr`, 1.5 errors in `flux`, 0.3 px in `size` and 0.15 in `neighbour`. Wider steps give smaller errors.
 #[derive(Debug, Args)]
 pub(crate) struct Arguments {
+    /// Catalogues of any program, all with the same columns. FILE[TABLE] is one table of a FITS file.
+    #[arg(
+        value_name = "CATALOGUE",
+        required_unless_present = "measured",
+        conflicts_with = "measured"
+    )]
+    catalogues: Vec<PathBuf>,
     /// Folder of catalogues that `measure` or `run` wrote.
-    #[arg(long, value_name = "DIR")]
-    measured: PathBuf,
+    #[arg(long, value_name = "DIR", conflicts_with = "TableReading")]
+    measured: Option<PathBuf>,
     /// Sets [default: all there are].
     #[arg(long, value_name = "LIST")]
     sets: Option<SetList>,
@@ -40,6 +57,8 @@ pub(crate) struct Arguments {
     /// "x < 1280".
     #[arg(long = "where", value_name = "CONDITION", allow_hyphen_values = true)]
     condition: Option<String>,
+    #[command(flatten)]
+    reading: TableReading,
     #[command(flatten)]
     unsheared: Unsheared,
     /// Weight as a formula of snr, flux and size, such as "snr^2/(snr^2 + 100)".
@@ -52,7 +71,57 @@ pub(crate) struct Arguments {
 }
 
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
-    let (measured, sets) = (&arguments.measured, sets_of(arguments.sets.as_ref()));
+    match &arguments.measured {
+        Some(folder) => of_folder(arguments, folder),
+        None => of_tables(arguments),
+    }
+}
+
+fn of_tables(arguments: &Arguments) -> anyhow::Result<()> {
+    let catalogues = listed(&arguments.catalogues)?;
+    for path in &catalogues {
+        anyhow::ensure!(
+            !(path.is_dir() && Run::read(path)?.is_some()),
+            "{0}: this is a folder that `measure` or `run` wrote (expected tables). Try: shearq mean --measured {0}",
+            path.display()
+        );
+    }
+    // clap does not require what another argument excludes.
+    let of_folders = [
+        ("--sets", arguments.sets.is_some()),
+        ("--unsheared", !arguments.unsheared.names.is_empty()),
+    ];
+    for (option, is_given) in of_folders {
+        anyhow::ensure!(
+            !is_given,
+            "{option} is of folders that `measure` or `run` wrote (found tables). Try: without {option}"
+        );
+    }
+    let found = expand(&catalogues, Truth::Columns)?;
+    let mut request = Request {
+        selection: selection(arguments.condition.as_deref(), arguments.weight.as_deref())?,
+        ..arguments.reading.request(found)?
+    };
+    // With the ellipticity of the PSF, the estimate is the shear at a round PSF.
+    request
+        .names
+        .decline(&[Role::G1, Role::G2, Role::Psf1, Role::Psf2, Role::PsfSize]);
+    let summed = sum_with_progress(&request, &|_| true, &reading)?;
+    remember_columns(summed.columns());
+    let result = summed.result()?;
+    if let Some(warning) = chosen_by_measurement(&result) {
+        tell(format_args!("warning: {warning}"));
+    }
+    arguments.form.print(&mean_shear_table(&result)?)
+}
+
+fn of_folder(arguments: &Arguments, measured: &Path) -> anyhow::Result<()> {
+    anyhow::ensure!(
+        !measured.is_file(),
+        "--measured: {0} is a file (expected a folder of catalogues that `measure` or `run` wrote). Try: shearq mean {0}",
+        measured.display()
+    );
+    let sets = sets_of(arguments.sets.as_ref());
     let (condition, weight) = (&arguments.condition, &arguments.weight);
     let selection = smooth_selection(
         condition.as_deref(),

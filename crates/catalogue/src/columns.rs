@@ -265,6 +265,12 @@ impl Names {
         self.given.insert((Role::ShearedCatalogue, 0), column);
     }
 
+    /// Declines columns of these roles, also of those that were given.
+    pub fn decline(&mut self, roles: &[Role]) {
+        let none = roles.iter().map(|role| ((*role, 0), "none".to_owned()));
+        self.given.extend(none);
+    }
+
     /// Adds surveys, which are preferred to the known ones.
     pub fn add_presets(&mut self, surveys: Vec<Survey>) {
         self.presets.extend(surveys);

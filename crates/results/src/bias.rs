@@ -721,6 +721,10 @@ impl Summed {
         [all].into_iter().chain(bins).collect()
     }
 
+    pub fn about(&self) -> &About {
+        &self.about
+    }
+
     /// The columns that are used, by role.
     pub fn columns(&self) -> impl Iterator<Item = (String, String)> {
         let kind = self.about.kind.iter();

@@ -357,13 +357,16 @@ def _paths(given: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | No
 
 
 def _several(catalogues: Any) -> Iterable[Any]:
+    return [catalogues] if one_table(catalogues) else catalogues
+
+
+def one_table(catalogues: Any) -> bool:
+    """Whether this is one table or path, and no sequence of them."""
     if isinstance(catalogues, (str, os.PathLike, Mapping, np.ndarray)) or not isinstance(catalogues, Iterable):
-        return [catalogues]
+        return True
     # Of the class, because a LazyFrame warns if it is asked for its columns.
     tables = ("columns", "colnames", "schema", "__arrow_c_stream__", "__dask_graph__", "header", "names", "fields")
-    if any(hasattr(type(catalogues), name) for name in tables) or hasattr(catalogues, "writeto"):
-        return [catalogues]
-    return catalogues
+    return any(hasattr(type(catalogues), name) for name in tables) or hasattr(catalogues, "writeto")
 
 
 def _catalogue(

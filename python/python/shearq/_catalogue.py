@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from . import _display, _distributed, _schema, _shearq, _tables
 from ._arrays import double, shown
+from ._bias import bias_sums, one_table
 from ._results import Result, origin
 
 if TYPE_CHECKING:
@@ -49,7 +50,7 @@ class MeanShear(Result):
     g1_error, g2_error : float
         Standard errors. They include the errors of the mean responses.
     covariance : tuple of tuple of float
-        Covariance of g1 and g2.
+        Covariance of g1 and g2; NaN between them for tables of other programs.
     response : tuple of float or None
         Mean responses R11 and R22; None if the configuration is not calibrated by them.
     galaxies : int
@@ -58,6 +59,8 @@ class MeanShear(Result):
         Galaxies with a flag and a positive weight.
     frame : {'pixel', 'sky'} or None
         Axes of g1 and g2: those of the pixels, or of the sky (g1 > 0 along east–west); None if the catalogues do not state it.
+    made_by : dict
+        Version with commit and function; of tables also settings that are no defaults, columns by role, and fingerprints of files.
     """
 
     g1: float
@@ -70,12 +73,13 @@ class MeanShear(Result):
     flagged: int
     # No part of the value: rows of .npy files have lost it.
     frame: str | None = field(default=None, compare=False)
+    made_by: dict[str, Any] = field(default_factory=lambda: origin("shearq.mean_shear", {}), compare=False)
 
     def __iter__(self) -> Iterator[float]:
         return iter((self.g1, self.g2))
 
     def _object(self) -> dict[str, Any]:
-        return {**asdict(self), "made_by": origin("shearq.mean_shear", {})}
+        return asdict(self)
 
     def _table(self) -> tuple[str, list[str], list[list[str]], list[str]]:
         rows = [[name, f"{value:+.6f}", f"{error:.6f}"] for name, value, error in (("g1", self.g1, self.g1_error), ("g2", self.g2, self.g2_error))]
@@ -514,15 +518,29 @@ def _cross(rows: Catalogue) -> list[NDArray[np.float64]]:
     return [np.where(_plain(rows), 0.0, np.asarray(rows[name], dtype=np.float64)) for name in ("R12", "R21")]
 
 
-def mean_shear(catalogues: Catalogue | Iterable[Catalogue], weights: ArrayLike | None = None) -> MeanShear:
+def mean_shear(
+    catalogues: Any,
+    weights: ArrayLike | None = None,
+    *,
+    columns: Mapping[str, str] | None = None,
+    where: str | None = None,
+    units: str | None = None,
+    drop_missing: bool = False,
+    step: float = 0.01,
+) -> MeanShear:
     """The mean shear of the good galaxies of one or more catalogues; see :meth:`Catalogue.mean_shear`.
+
+    Tables of other programs are read as :func:`bias` reads them, with responses of columns or of the sheared catalogues of metacal
+    and metadetect: g = ⟨R⟩⁻¹⟨e⟩, with errors from a jackknife over units.
 
     Parameters
     ----------
-    catalogues : Catalogue or iterable of Catalogue
-        One by one, so that not all need to be in memory: :func:`measure_blocks` will do.
+    catalogues : Catalogue or iterable of Catalogue, or tables and paths as for :func:`bias`
+        Catalogues one by one, so that not all need to be in memory: :func:`measure_blocks` will do.
     weights : array of shape (n,), optional
-        Weight of each row of all catalogues, one after the other.
+        Weight of each row of all catalogues, one after the other. Tables have theirs in a column.
+    columns, where, units, drop_missing, step
+        Of tables, as for :func:`bias`.
 
     Returns
     -------
@@ -531,14 +549,27 @@ def mean_shear(catalogues: Catalogue | Iterable[Catalogue], weights: ArrayLike |
     Raises
     ------
     ValueError
-        As :meth:`Catalogue.mean_shear`; or if there is no catalogue.
+        As :meth:`Catalogue.mean_shear` or :func:`bias`; or if there is no catalogue.
+
+    Examples
+    --------
+    >>> table = {"e1": [0.03, 0.05], "e2": [0.0, 0.02], "R11": [0.8, 0.8], "R22": [0.8, 0.8]}
+    >>> round(shearq.mean_shear(table).g1, 6)
+    0.05
     """
+    if _is_of_tables(catalogues):
+        if weights is not None:
+            raise ValueError("weights: found for a table; expected them in a column. Try: columns={'w': NAME}")
+        return _of_tables(catalogues, dict(columns=columns, where=where, units=units, drop_missing=drop_missing, step=step))
+    if columns or where or units or drop_missing:
+        raise ValueError("columns, where, units, drop_missing: found for catalogues of shearq; expected tables. Try: Catalogue.mean_shear")
     parts: list[list[NDArray[np.float64]]] = []
     stars: list[tuple[list[list[float]], NDArray[np.int64]]] = []
     goods: list[NDArray[np.bool_]] = []
     calibrated = False
     frames: set[str] = set()
-    for rows in [catalogues] if isinstance(catalogues, Catalogue) else catalogues:
+    several: Iterable[Catalogue] = [catalogues] if isinstance(catalogues, Catalogue) else catalogues
+    for rows in several:
         missing = [name for name in _schema.NEEDED if name not in (rows.dtype.names or ())]
         if missing:
             raise ValueError(f"catalogue: no columns {', '.join(missing)}; expected {', '.join(_schema.NEEDED)}")
@@ -583,6 +614,26 @@ def mean_shear(catalogues: Catalogue | Iterable[Catalogue], weights: ArrayLike |
         int((weight[~good] > 0).sum()),
         next(iter(frames), None),
     )
+
+
+def _is_of_tables(catalogues: Any) -> bool:
+    """Whether catalogues are tables of any program or paths, or a list of them."""
+    if isinstance(catalogues, (list, tuple)):
+        return bool(catalogues) and not isinstance(catalogues[0], Catalogue)
+    return not isinstance(catalogues, (Catalogue, Iterator)) and one_table(catalogues)
+
+
+def _of_tables(catalogues: Any, settings: dict[str, Any]) -> MeanShear:
+    """The mean shear is c of tables without a true shear, and without the ellipticity of the PSF, to which c would be corrected."""
+    declined = dict.fromkeys(("g1", "g2", "psf_e1", "psf_e2", "psf_size"), "none")
+    sums = bias_sums(catalogues, **{**settings, "columns": {**(settings["columns"] or {}), **declined}})
+    found = sums.result()
+    flagged, frame = sums._sums.flagged_and_frame()
+    e1, e2 = found["c1_error"], found["c2_error"]
+    response = (found["r1"], found["r2"]) if "r1" in found.rows[0] else None
+    covariance = ((e1 * e1, float("nan")), (float("nan"), e2 * e2))
+    made_by = {**found.made_by, "function": "shearq.mean_shear"}
+    return MeanShear(found["c1"], found["c2"], e1, e2, covariance, response, int(found["n"]), flagged, frame, made_by)
 
 
 def _stars(rows: Catalogue) -> tuple[list[list[float]], NDArray[np.int64]]:

@@ -1,8 +1,8 @@
 //! Shear bias as tables, plots and verdicts.
 
 use shearq_bias::{
-    Catalogue, Design, Estimate, Measured, QUANTITIES, Quantity, REQUIREMENTS, Repeated, Verdict,
-    student_t, verdict,
+    BiasError, Catalogue, Design, Estimate, Measured, QUANTITIES, Quantity, REQUIREMENTS, Repeated,
+    Verdict, student_t, verdict,
 };
 use shearq_dataset::truth::Sign;
 use shearq_render::figure::{Band, FigureError, LinePlot, PanelGrid, Series, Style};
@@ -105,14 +105,9 @@ pub fn bias_table(result: &BiasResult) -> Table {
             notes.push(format!("No estimate of {}: {error}.", bin.label));
         }
         let cells = columns().map(|(.., cell)| cell(result, bin));
-        let quantity = |own: &&Quantity| {
-            let found = bin
-                .estimate
-                .as_ref()
-                .ok()
-                .and_then(|found| found.value(own.key));
-            let (value, error) = found.map_or((f64::NAN, f64::NAN), |own| (own.value, own.error));
-            Cell::with_error(value, Some(error), 6)
+        let quantity = |own: &&Quantity| match &bin.estimate {
+            Ok(found) => quantity_cell(found, own.key),
+            Err(_) => Cell::with_error(f64::NAN, Some(f64::NAN), 6),
         };
         cells.chain(quantities.iter().map(quantity)).collect()
     });
@@ -441,16 +436,7 @@ fn notes(result: &BiasResult) -> Vec<String> {
             result.design.meaning(),
             result.about.program
         ),
-        match &result.about.named_unit {
-            Some(column) => format!(
-                "Errors are from {} units: galaxies with the same `{column}`.",
-                all.units
-            ),
-            None => format!(
-                "Errors are from {} units: {}.",
-                all.units, result.grouping.unit
-            ),
-        },
+        units(result, all),
     ];
     if let Some(column) = &result.about.unit_column {
         notes.push(format!(
@@ -500,25 +486,8 @@ fn notes(result: &BiasResult) -> Vec<String> {
     }
     notes.extend(implausible(result, all).or_else(|| uncalibrated(result, all)));
     notes.extend(of_design(result).iter().map(|line| sentence(line)));
+    notes.extend(left_out(result));
     let total = result.about.total();
-    for (count, what) in [
-        (total.flagged, "with a flag"),
-        (total.unweighted, "with a weight of zero or less"),
-        (total.unselected, "that --where excludes"),
-        (total.missing, "with missing numbers"),
-        (
-            total.failed,
-            "with numbers that stand for failed measurements",
-        ),
-        (
-            total.above_one,
-            "with a distortion above 1, which noise makes and to which no shear belongs",
-        ),
-    ] {
-        if count > 0 {
-            notes.push(format!("Left out: {count} rows {what}."));
-        }
-    }
     let failed = total.missing + total.failed;
     if failed > 0 {
         notes.push(format!(
@@ -546,6 +515,75 @@ fn notes(result: &BiasResult) -> Vec<String> {
         }
     }
     notes
+}
+
+// What the errors are estimated from.
+fn units(result: &BiasResult, all: &Estimate) -> String {
+    let unit = match &result.about.named_unit {
+        Some(column) => format!("galaxies with the same `{column}`"),
+        None => result.grouping.unit.to_owned(),
+    };
+    format!("Errors are from {} units: {unit}.", all.units)
+}
+
+// Rows that do not count, a sentence for each reason.
+fn left_out(result: &BiasResult) -> Vec<String> {
+    let total = result.about.total();
+    let reasons = [
+        (total.flagged, "with a flag"),
+        (total.unweighted, "with a weight of zero or less"),
+        (total.unselected, "that --where excludes"),
+        (total.missing, "with missing numbers"),
+        (
+            total.failed,
+            "with numbers that stand for failed measurements",
+        ),
+        (
+            total.above_one,
+            "with a distortion above 1, which noise makes and to which no shear belongs",
+        ),
+    ];
+    let found = reasons.iter().filter(|(count, _)| *count > 0);
+    let lines = found.map(|(count, what)| format!("Left out: {count} rows {what}."));
+    lines.collect()
+}
+
+/// The mean shear of catalogues without a true shear: c is then ⟨e⟩/R of all galaxies.
+///
+/// # Errors
+/// If there is no estimate.
+pub fn mean_shear_table(result: &BiasResult) -> Result<Table, BiasError> {
+    let all = [result.all()?];
+    let mut table = Table::titled("Mean shear");
+    table.column("galaxies", "Galaxies", &all, |all| {
+        Cell::number(all.galaxies as f64, 0)
+    });
+    for (key, c) in [("g1", "c1"), ("g2", "c2")] {
+        table.column(key, key, &all, |all| quantity_cell(all, c));
+    }
+    for (key, label) in [("r1", "⟨R11⟩"), ("r2", "⟨R22⟩")] {
+        if all[0].value(key).is_some() {
+            table.column(key, label, &all, |all| quantity_cell(all, key));
+        }
+    }
+    table.notes = vec![
+        format!("Columns: {}.", result.about.program),
+        units(result, all[0]),
+    ];
+    table.notes.extend(result.about.columns.iter().cloned());
+    let selection = result.about.selection.iter();
+    table
+        .notes
+        .extend(selection.map(|own| format!("Selection: {own}.")));
+    table.notes.extend(left_out(result));
+    table.notes.extend(chosen_by_measurement(result));
+    Ok(table)
+}
+
+fn quantity_cell(estimate: &Estimate, key: &str) -> Cell {
+    let found = estimate.value(key);
+    let (value, error) = found.map_or((f64::NAN, f64::NAN), |own| (own.value, own.error));
+    Cell::with_error(value, Some(error), 6)
 }
 
 // What the survey of `--like` has that the simulated galaxies do not have.
