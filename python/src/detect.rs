@@ -56,7 +56,14 @@ pub(crate) fn detect<'py>(
             })
         };
         let threads = threads(threads_asked);
-        detect_rows(threads, &detector, &defects, [width, height], open, &mut Quiet)
+        detect_rows(
+            threads,
+            &detector,
+            &defects,
+            [width, height],
+            open,
+            &mut Quiet,
+        )
     });
     let (found, unlit) = found.map_err(of_pipeline)?;
     let columns = PyDict::new(py);

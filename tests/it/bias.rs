@@ -892,7 +892,7 @@ fn simulated_galaxies_are_weighted_to_those_of_a_survey() {
     for ((snr, size, ..), number) in KINDS.iter().zip(numbers) {
         plain += &format!("{snr},{size}\n").repeat(number);
     }
-    folder.write("plain.csv", plain);
+    folder.write("plain.csv", plain.clone());
     let weighted = [0, 1, 2, 3].map(|k| KINDS[k].0 * KINDS[k].1 * numbers[k] as f64);
     let faint = [weighted[0], weighted[1], 0.0, 0.0];
     for (options, weights) in [

@@ -14,7 +14,7 @@ use crate::expression::Expression;
 use crate::own_columns::refuse_divided;
 use crate::recognition::{Survey, names_of_role, recognition, words};
 use crate::roles::{Key, Role, keys, name_of, named, partner, role_names, sheared_pair};
-use crate::steps::{sheared_column, unsheared};
+use crate::steps::{sheared_column, sheared_name, unsheared};
 
 use self::advice::likely_ellipticities;
 pub use self::advice::{counted_value, looks_like_weight};

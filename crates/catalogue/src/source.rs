@@ -11,7 +11,7 @@ use shearq_files::table::{self, FileFormat, Place};
 use shearq_files::{FileError, names_of};
 use shearq_measure::{Observables, Selection};
 
-use crate::expression::{Expression, Operand, Texts, operand_values};
+use crate::expression::{Expression, Operand, operand_values};
 use crate::own_columns::{SHAPE_COLUMNS, changes_with_shear, require_responses};
 use crate::recognition::{fits_any, recognition, words};
 

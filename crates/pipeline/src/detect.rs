@@ -652,15 +652,24 @@ mod tests {
                 let mut rows = image.rows().into_iter();
                 Ok(move |count: usize| Ok(rows.by_ref().take(count).flatten().copied().collect()))
             };
-            detect_rows(2, &detector, &defects, [SIDE, SIDE], open)
-                .unwrap()
-                .1
+            detect_rows(
+                2,
+                &detector,
+                &defects,
+                [SIDE, SIDE],
+                open,
+                &mut shearq_dataset::threads::Quiet,
+            )
+            .unwrap()
+            .1
         };
         assert_eq!(unlit(&image), 0);
         for (at, light) in [(100, 30.0), (210, 100.0), (305, 1e5), (140, -500.0)] {
             image[[at, at + 5]] = light;
         }
-        image.slice_mut(ndarray::s![..20, 380..]).fill(0.0);
+        for (y, x) in (0..20).flat_map(|y| (380..SIDE).map(move |x| (y, x))) {
+            image[[y, x]] = 0.0;
+        }
         // Those at the edge of the area that have no light of their own are no defects.
         assert_eq!(unlit(&image), 4 + 20 * 20);
     }
