@@ -1028,7 +1028,7 @@ fn baselines_compare_galaxies_columns_and_bins() {
     write(header, &|row| format!("galaxy{row}"), moved);
     folder.refuses("baseline check all", other);
     write(&format!("{header},seed"), &number, moved);
-    folder.refuses("baseline check all", &format!("{other}[..]`seed`"));
+    folder.refuses("baseline check all", &format!("{other}[..]units by `seed`"));
     write("id,e1,e2,g1,g2,snr", &number, [1.0; 2]);
     let output = shell(folder.root(), "shearq baseline check all");
     assert_eq!(output.status.code(), Some(1));
@@ -1086,7 +1086,7 @@ fn both_sides_of_a_comparison_are_judged() {
     let disjoint = write("ids", &|g, row| (id(row + 10_000), false, g));
     assert_has(
         &against(&disjoint).0,
-        "--against: the galaxies of both sides do not pair by[..]0.0 % of the galaxies",
+        "--against: the galaxies of both sides do not pair by[..]different galaxies",
     );
     let flagged = write("flags", &|g, row| (id(row), (row % 2 == 0) == (g > 0.0), g));
     let (said, printed) = against(&flagged);
@@ -1264,7 +1264,9 @@ fn names_that_occur_twice_are_refused_and_exact_ones_preferred() {
 /// A baseline of catalogues of a shear field whose axes changed, and a description with the axes of the catalogues.
 #[test]
 fn axes_of_a_shear_field_are_compared_and_turned() {
-    let folder = Folder::with_set(2);
+    let folder = Folder::new();
+    // Fewer cells determine no convention.
+    folder.run("simulate --fixed-psf one --images 2 --grid 16 --seed 5 --out data --sets 2");
     let truth = folder.numbers("data/set02/truth.csv", ["x", "y", "g1", "g2"]);
     let write = |sign: f64| {
         for image in 1..=2 {
@@ -1358,7 +1360,7 @@ fn sheared_rows_that_never_count_are_refused() {
 fn galaxies_that_select_left_out_do_not_count() {
     let folder = Folder::with_set(2);
     folder.measure("--submission 48/linear/star");
-    folder.run("select --measured out --where 'step(snr, 20)' --out selected");
+    folder.run("select --measured out --where 'x < 200' --out selected");
     let found = folder.json("bias selected");
     let notes = found["notes"].to_string();
     assert!(!notes.contains("Repeated values"), "{notes}");

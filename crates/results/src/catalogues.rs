@@ -201,7 +201,11 @@ impl Catalogues {
         let Some(foreign) = &self.description else {
             return Ok(Vec::new());
         };
-        let sets = self.files.sets();
+        let mut sets = self.files.sets();
+        // A pattern without {set} gives each of them the same files.
+        if self.files.serve_all_sets() {
+            sets.truncate(1);
+        }
         let paths = sets.iter().flat_map(|set| self.files.of_set(*set));
         let mut all = Vec::new();
         for (_, path) in paths {

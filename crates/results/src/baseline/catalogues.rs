@@ -406,29 +406,21 @@ fn check_galaxies(old: &BiasResult, new: &BiasResult) -> Result<(), CatalogueErr
     if overlap.is_of_same_galaxies() || are_rotated && overlap.is_shared() {
         return Ok(());
     }
-    let unit = |result: &BiasResult| {
-        let column = result.about.named_unit.as_ref();
-        column.map_or("none".to_owned(), |column| format!("`{column}`"))
+    let unit = |result: &BiasResult| match &result.about.named_unit {
+        Some(column) => format!("`{column}`"),
+        None => result.grouping.unit.to_owned(),
     };
     let found = match overlap.is_shared() {
-        false => format!(
-            "{:.0} % of the galaxies in units that both have, which are {}, with the column {}",
-            100.0 * overlap.shared,
-            new.grouping.unit,
-            unit(new)
-        ),
+        false => format!("{:.0} % of them in the same units", 100.0 * overlap.shared),
         true => format!(
-            "ellipticities that correlate by {:.2} with those of the same units",
+            "ellipticities that correlate by {:.2}",
             overlap.correlation.unwrap_or(f64::NAN)
         ),
     };
     Err(CatalogueError::OtherGalaxies {
         what: "the galaxies".into(),
-        found,
-        expected: format!(
-            "the same identifiers or order of rows, and the column {} of units",
-            unit(old)
-        ),
+        found: format!("{found}, units by {}", unit(new)),
+        expected: format!("the same galaxies, units by {}", unit(old)),
     })
 }
 
