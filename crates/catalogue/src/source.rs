@@ -781,7 +781,7 @@ fn source(
         return Err(FileError::new(
             path,
             format!(
-                "the column `{}` is there several times (expected every name once). Try: other names",
+                "there are two columns named `{}` (expected one). Try: other names",
                 twice.column
             ),
         ));
