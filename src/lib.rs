@@ -128,6 +128,8 @@ pub(crate) enum Command {
     #[command(after_help = "Example:\n  shearq merge run --sets all --images 200 --shards 8")]
     Merge(merge::Arguments),
     #[command(
+        mut_arg("unsheared", mean::of_folders),
+        mut_arg("threads", mean::of_folders),
         after_help = "Examples:\n  shearq mean --measured linear\n  shearq mean metacal.fits --step 0.01"
     )]
     Mean(mean::Arguments),

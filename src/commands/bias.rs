@@ -43,6 +43,8 @@ use shearq_scoring::TruthSign;
 pub(crate) struct Arguments {
     #[command(flatten)]
     summing: Summing,
+    #[command(flatten)]
+    reading: TableReading,
     /// Exit with code 1 if |m| or |c| of all galaxies or of a bin exceeds a limit, such as `m=2e-3@3sigma`: by three standard
     /// errors. With --against, the limit is one of the difference. May be given several times.
     #[arg(long, value_name = "LIMIT")]
@@ -104,8 +106,6 @@ struct Summing {
     /// g1 and g2 of the catalogues, or the true shear of the data of a folder].
     #[arg(long, value_name = "FILE")]
     truth: Option<PathBuf>,
-    #[command(flatten)]
-    reading: TableReading,
     /// Sign of the true g2 [default: as the file of --truth states; else, for x, y, g1, g2, the sign in which the shear is
     /// an E-mode field; else the sign that e2 follows; required if these are unclear. Shears of options, of columns of
     /// the catalogues and of tables with the column catalogue: standard].
@@ -198,7 +198,7 @@ pub(crate) fn run(arguments: &Arguments, command_line: &str) -> anyhow::Result<(
         PictureFormat::of(plot)?;
     }
     let summed = match arguments.merge.as_slice() {
-        [] => of_catalogues(summing, &listed(&summing.catalogues)?)?,
+        [] => of_catalogues(arguments, &listed(&summing.catalogues)?)?,
         files => merged(&listed(files)?)?,
     };
     remember_columns(summed.columns());
@@ -224,7 +224,7 @@ pub(crate) fn run(arguments: &Arguments, command_line: &str) -> anyhow::Result<(
         result => result?,
     };
     if !summing.against.is_empty() {
-        let other = of_catalogues(summing, &listed(&summing.against)?)?;
+        let other = of_catalogues(arguments, &listed(&summing.against)?)?;
         let difference = summed.difference(&other)?;
         let other = other.result()?;
         warn(&result);
@@ -316,7 +316,7 @@ pub(super) fn units(arguments: &Arguments) -> anyhow::Result<(BaselineUnits, Vec
         );
     }
     let catalogues = listed(&summing.catalogues)?;
-    let summed = of_catalogues(summing, &catalogues)?;
+    let summed = of_catalogues(arguments, &catalogues)?;
     let result = summed.result()?;
     warn(&result);
     // Folders and tables within files have no fingerprint of one file.
@@ -325,7 +325,8 @@ pub(super) fn units(arguments: &Arguments) -> anyhow::Result<(BaselineUnits, Vec
     Ok((BaselineUnits::Bias(Box::new(summed)), files))
 }
 
-fn of_catalogues(summing: &Summing, catalogues: &[PathBuf]) -> anyhow::Result<Summed> {
+fn of_catalogues(arguments: &Arguments, catalogues: &[PathBuf]) -> anyhow::Result<Summed> {
+    let (summing, table) = (&arguments.summing, &arguments.reading);
     let specified = summing.truth_sign;
     let mut sign = TrueSign::or_standard(specified);
     let truth = match (&summing.truth, summing.g1.zip(summing.g2)) {
@@ -356,8 +357,8 @@ fn of_catalogues(summing: &Summing, catalogues: &[PathBuf]) -> anyhow::Result<Su
         // Catalogues of linear configurations contain shears with responses and no sheared catalogues.
         let unused = [
             ("--against", !summing.against.is_empty()),
-            ("--ellipticity", summing.reading.ellipticity.is_some()),
-            ("--step", summing.reading.step.is_some()),
+            ("--ellipticity", table.ellipticity.is_some()),
+            ("--step", table.step.is_some()),
         ];
         if let Some((option, _)) = unused.into_iter().find(|(_, given)| *given) {
             anyhow::bail!("{option}: cannot be used with step() in --where");
@@ -379,7 +380,7 @@ fn of_catalogues(summing: &Summing, catalogues: &[PathBuf]) -> anyhow::Result<Su
         paired: summing.paired,
         selection,
         design: summing.design,
-        ..summing.reading.request(found)?
+        ..table.request(found)?
     };
     let own = |number: usize| Shard::holding(number, shard.of()) == shard;
     Ok(sum_with_progress(&request, &own, &reading)?)

@@ -1,6 +1,6 @@
 use std::path::{Path, PathBuf};
 
-use clap::Args;
+use clap::{Arg, Args};
 
 use crate::arguments::{Form, SetList, TableReading, Threads, Unsheared, listed, sets_of};
 use crate::origin::remember_columns;
@@ -44,14 +44,14 @@ pub(crate) struct Arguments {
     #[arg(
         value_name = "CATALOGUE",
         required_unless_present = "measured",
-        conflicts_with = "measured"
+        conflicts_with_all = ["measured", "sets"]
     )]
     catalogues: Vec<PathBuf>,
     /// Folder of catalogues that `measure` or `run` wrote.
     #[arg(long, value_name = "DIR", conflicts_with = "TableReading")]
     measured: Option<PathBuf>,
     /// Sets [default: all there are].
-    #[arg(long, value_name = "LIST")]
+    #[arg(long, value_name = "LIST", conflicts_with = "TableReading")]
     sets: Option<SetList>,
     /// Galaxies to keep, such as "step(snr, 10) and step(size, 2.5, 0.5)", or by columns that shear does not change, such as
     /// "x < 1280".
@@ -70,6 +70,11 @@ pub(crate) struct Arguments {
     threads: Threads,
 }
 
+/// An argument that other commands share, and that tables have no use for.
+pub(crate) fn of_folders(argument: Arg) -> Arg {
+    argument.conflicts_with_all(["catalogues", "TableReading"])
+}
+
 pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
     match &arguments.measured {
         Some(folder) => of_folder(arguments, folder),
@@ -84,17 +89,6 @@ fn of_tables(arguments: &Arguments) -> anyhow::Result<()> {
             !(path.is_dir() && Run::read(path)?.is_some()),
             "{0}: this is a folder that `measure` or `run` wrote (expected tables). Try: shearq mean --measured {0}",
             path.display()
-        );
-    }
-    // clap does not require what another argument excludes.
-    let of_folders = [
-        ("--sets", arguments.sets.is_some()),
-        ("--unsheared", !arguments.unsheared.names.is_empty()),
-    ];
-    for (option, is_given) in of_folders {
-        anyhow::ensure!(
-            !is_given,
-            "{option} is of folders that `measure` or `run` wrote (found tables). Try: without {option}"
         );
     }
     let found = expand(&catalogues, Truth::Columns)?;
