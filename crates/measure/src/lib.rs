@@ -83,7 +83,7 @@ pub use method::AdaptedSettings;
 pub use ndarray;
 pub use noise::{NoisePlan, NoiseSurvey, StampNoise, Survey};
 pub use pixels::{Pixel, Pixels};
-pub use psf::{Oversampling, Psfs, Star, average_stars};
+pub use psf::{Oversampling, Psfs, Star, Truncation, average_stars};
 pub use selection::{Cut, Quantity, Selected, Selection};
 pub use session::{
     ArraySource, Batch, KnownNoise, Lazy, LazyStamps, MeasuredImage, MeasuredRow, OneThread,

@@ -12,6 +12,7 @@ mod star;
 mod star_survey;
 #[cfg(test)]
 mod testing;
+mod truncation;
 mod width;
 
 pub use self::average::average_stars;
@@ -23,6 +24,7 @@ pub(crate) use self::residual_profile::ResidualProfiles;
 pub use self::star::Star;
 pub(crate) use self::star::cut_start;
 pub(crate) use self::star_survey::StarSurvey;
+pub use self::truncation::Truncation;
 pub use self::width::gaussian_sigma;
 pub(crate) use self::width::{
     WIDTH_STEPS, gaussian_variance, noise_equivalent_area, width_factor, width_step,

@@ -7,11 +7,12 @@
 
 use std::f64::consts::PI;
 
-use ndarray::{ArrayView2, Axis};
+use ndarray::{ArrayView2, Axis, s};
 use shearq_quantities::statistics::upper_median;
 
 use super::denoised_star::{MIN_DENOISED_SIDE, UNCHANGED_SNR, noise_level};
 use super::star::psf_offset;
+use super::truncation::Truncation;
 use super::width::BORDER;
 use crate::defects::dead_pixels;
 use crate::moments::{CoreSize, psf_core_size};
@@ -21,6 +22,8 @@ use crate::warning::{ExaminedPsfs, Warning};
 const HALFWAY: std::ops::Range<f64> = 0.5..0.65;
 // Power of the radius: slower than the averaged rings of an Airy disc (3) and turbulence (11/3).
 const SLOWEST_WING: f64 = 2.5;
+// Power of the radius with which the rings of an Airy disc fall.
+const RING_FALL: f64 = 3.0;
 // Chosen by hand, for all warnings.
 const SIGNIFICANCE: f64 = 5.0;
 // Light of a background, in units of the star's. Above it |m| may exceed 2·10⁻³. Chosen by hand.
@@ -45,8 +48,8 @@ const EDGE_WAVE_NUMBER: f64 = 2.6;
 // an image has S(k) = P(k) + c P(2π − k), where c = 1 for a PSF centred on a pixel and −1 on a corner. Limits and slopes below are
 // values at c = 0 and their changes with c, chosen by hand: m of 400 galaxies of half-light radii 1.5 to 3.5 px at S/N 200 behind 25 PSFs.
 // ln S(2)/ln S(1) of turbulence and Gaussians exceeds this, that of obscured optics with any jitter or charge diffusion does not: at c = −1,
-// 3.2 to 4.7 and 1.8 to 3.1.
-const INDEX_TURBULENCE: [f64; 2] = [2.97, -0.18];
+// 3.2 to 4.7 and 1.8 to 3.15. Airy discs of λ/D = 1 px and obscurations from 0.35 on have 3.22 and more.
+const INDEX_TURBULENCE: [f64; 2] = [3.0, -0.2];
 // S(2) from which m departs from zero, and how m then grows with it.
 // Optics at c = −1: S(2) = 0.256 (Roman Y106) has m = 0.032, 0.342 (Euclid NISP J) 0.041. At c = 1, 0.30 (Euclid VIS) has m = 0, 0.37 (J129) 0.008,
 // 0.44 (Y106) 0.032, 0.58 (NISP J) 0.041.
@@ -57,8 +60,15 @@ const TURBULENCE: [[f64; 2]; 2] = [[0.315, 0.015], [0.05, -0.005]];
 const MAX_CORNER: f64 = -0.5;
 // There, S(2) of optics without aliases is as large: Euclid VIS and Roman H158 have S(2.6)/S(2) = 0.53 and more, J129, Y106 and NISP at most 0.5.
 const MIN_EDGE_RATIO: f64 = 0.515;
+// Nor does ln S(2)/ln S(1) fall below this with aliases: J129 has 2.63. Obscurations of 0.17 and more have at most 2.48 from λ/D = 1.5 px on.
+const MIN_ALIASED_INDEX: f64 = 2.55;
 // Beyond that S(2), all are aliased.
 const MAX_SAMPLED: f64 = 0.4;
+// S(3)/S(2.6), squared, on a corner. With aliases, S is zero at π by symmetry and 0.22 to 0.30 there; optics of λ/D = 2 px have 0.12.
+const MIN_ALIASED_FALL: f64 = 0.04;
+// Largest change of c in units of that of m at c = ±1, which is positive on a corner. Airy discs and Moffat PSFs on a pixel's centre
+// have 0 to 0.32, those on the middle of a side 0.2 to 0.5 of either sign.
+const C_PER_M: f64 = 0.3;
 // Effect on m of aliasing above which a warning is due.
 const MAX_ALIASING: f64 = 0.002;
 // Mean square radius of the PSF's core in units of the galaxies', above which a warning is due. Simulated galaxies, PSF of
@@ -89,9 +99,10 @@ pub(crate) struct PsfQuality {
     /// Gradient of the background: change per pixel in units of the peak, light in units of the star's.
     slope: [f64; 2],
     gradient: f64,
-    /// Modulus of the transform at [`SAMPLED_WAVE_NUMBER`], and the effect on m of light that is aliased.
+    /// Modulus of the transform at [`SAMPLED_WAVE_NUMBER`], and the change of m and the largest one of c by light that is aliased.
     power: f64,
-    aliasing: f64,
+    aliasing: [f64; 2],
+    truncation: Option<Truncation>,
     core: Option<CoreSize>,
     moved: Option<[f64; 2]>,
     /// Pixels near the centre that are much darker than all around them, and pixels of the brightest value.
@@ -177,6 +188,7 @@ impl PsfQuality {
         } else {
             0.0
         };
+        let noise = noise_beneath_rings(psf, sigma, [halfway.radius(), border.radius()]);
         // Not the S/N of all pixels, by which stars are denoised: a background is no light here, and outer pixels hold
         // more noise than light.
         let (mut power, mut count) = (0.0, 0.0);
@@ -206,27 +218,47 @@ impl PsfQuality {
                 .iter()
                 .filter(|value| **value >= (1.0 - FLATNESS) * peak)
                 .count(),
-            snr: (power - count * sigma * sigma).max(0.0).sqrt() / sigma,
+            snr: (power - count * noise * noise).max(0.0).sqrt() / noise,
             level: (level / peak).clamp(-MAX_STATED_LEVEL, MAX_STATED_LEVEL),
             background: level * pixels / star,
             slope: slope.map(|slope| slope / peak),
             gradient: steep * 0.5 * n as f64 * pixels / star,
             power: sampled,
-            aliasing: match axis_power(psf, FILTERED_WAVE_NUMBER) < MAX_FILTERED_POWER {
-                // From finer pixels, and without aliases.
-                true => 0.0,
-                // Less the noise of the transform.
-                false => {
-                    let phases = offset.map(|off| (2.0 * PI * (middle + off)).cos());
-                    let least = sampled - 2.0 * sigma * n as f64;
-                    aliasing([low, least, edge], 0.5 * (phases[0] + phases[1]))
+            aliasing: {
+                let [x, y] = offset.map(|off| (2.0 * PI * (middle + off)).cos());
+                let phase = 0.5 * (x + y);
+                let filtered = axis_power(psf, FILTERED_WAVE_NUMBER);
+                let falls = filtered < MIN_ALIASED_FALL * axis_power(psf, EDGE_WAVE_NUMBER);
+                // From finer pixels, or of optics that the pixels sample: without aliases.
+                match filtered < MAX_FILTERED_POWER || phase < MAX_CORNER && falls {
+                    true => [0.0; 2],
+                    false => {
+                        // Less the noise of the transform.
+                        let least = sampled - 2.0 * sigma * n as f64;
+                        let size = aliasing([low, least, edge], phase);
+                        let most = (0.5 * (x - y)).abs().max(phase);
+                        [-phase * size, C_PER_M * size * most.max(0.0)]
+                    }
                 }
             },
+            truncation: Truncation::of(psf, 1.0),
             core: psf_core_size(psf, offset, border.mean(), sigma),
             moved,
             offset,
         })
     }
+}
+
+/// The noise of a pixel of which the diffraction rings of optics have no share: `sigma` is measured on the border, and rings fall with the
+/// radius, as noise does not. `radii` are mean distances of the pixels halfway to the border and of those on it.
+fn noise_beneath_rings(psf: ArrayView2<'_, f64>, sigma: f64, [halfway, border]: [f64; 2]) -> f64 {
+    let n = psf.nrows();
+    let first = (0.5 * n as f64 - halfway).round() as usize;
+    let inner = psf.slice(s![first..n - first, first..n - first]);
+    let inside = noise_level(inner, &mut Vec::new());
+    let fall = (halfway / border).powf(2.0 * RING_FALL);
+    let square = (sigma * sigma - fall * inside * inside) / (1.0 - fall);
+    square.clamp(0.0, sigma * sigma).sqrt()
 }
 
 /// Mean of |p̂|² at a wave number along x and along y.
@@ -244,7 +276,7 @@ fn axis_power(psf: ArrayView2<'_, f64>, wave_number: f64) -> f64 {
     0.5 * (of_axis(Axis(0)) + of_axis(Axis(1)))
 }
 
-/// About how much m changes by light that pixels alias, of a PSF image with these moduli at half of [`SAMPLED_WAVE_NUMBER`], there and at
+/// About how much m changes, without its sign, by light that pixels alias, of a PSF image with these moduli at half of [`SAMPLED_WAVE_NUMBER`], there and at
 /// [`EDGE_WAVE_NUMBER`], whose aliases have the sign and weight `phase`.
 fn aliasing([low, sampled, edge]: [f64; 3], phase: f64) -> f64 {
     let at = |[value, change]: [f64; 2]| value + change * phase;
@@ -255,7 +287,7 @@ fn aliasing([low, sampled, edge]: [f64; 3], phase: f64) -> f64 {
     if !is_turbulence
         && phase < MAX_CORNER
         && sampled < MAX_SAMPLED
-        && edge > MIN_EDGE_RATIO * sampled
+        && (edge > MIN_EDGE_RATIO * sampled || index < MIN_ALIASED_INDEX)
     {
         return 0.0;
     }
@@ -355,10 +387,22 @@ pub(crate) fn psf_warnings(
             of: psfs.of,
         });
     }
-    if let Some(psfs) = Defective::among(all, |psf| psf.aliasing > MAX_ALIASING) {
+    let is_aliased = |psf: &PsfQuality| psf.aliasing.iter().any(|by| by.abs() > MAX_ALIASING);
+    if let Some(psfs) = Defective::among(all, is_aliased) {
         found.push(Warning::PsfNarrow {
             power: psfs.median(|psf| psf.power),
-            effect: psfs.median(|psf| psf.aliasing),
+            effect: [0, 1].map(|k| psfs.median(|psf| psf.aliasing[k])),
+            of: psfs.of,
+        });
+    }
+    if let Some(psfs) = Defective::among(all, |psf| psf.truncation.is_some()) {
+        let of = |value: &dyn Fn(Truncation) -> f64| {
+            psfs.median(|psf| psf.truncation.map_or(f64::NAN, value))
+        };
+        found.push(Warning::PsfTruncated {
+            side: of(&|cut| cut.side),
+            level: of(&|cut| cut.level),
+            effect: [0, 1].map(|k| of(&|cut| cut.effect()[k])),
             of: psfs.of,
         });
     }
@@ -588,10 +632,12 @@ mod tests {
         });
         begins("psf-noise", true, 1000.0, &|snr| PsfQuality { snr, ..good });
         begins("psf-noise", false, 100.0, &|snr| PsfQuality { snr, ..good });
-        begins("psf-narrow", true, 0.002, &|aliasing| PsfQuality {
-            aliasing,
-            ..good
-        });
+        for of in [[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0]] {
+            begins("psf-narrow", true, 0.002, &|aliasing| PsfQuality {
+                aliasing: of.map(|share: f64| share * aliasing),
+                ..good
+            });
+        }
         let core = |mean_square_radius| CoreSize {
             mean_square_radius,
             error: 0.0,
