@@ -962,7 +962,12 @@ impl MeasuredImage<'_> {
         };
         // The noise of several stars averages, and its effect is not known.
         let psf_noise = is_single.then(|| session.psf_noise(own)).flatten();
-        warnings.extend(Warning::of_galaxies(&galaxies));
+        // A sky below that of other stamps makes fluxes negative, too.
+        let is_sky = |one: &Warning| matches!(one.inner(), Warning::SkyLevels { .. });
+        let levels_differ = warnings.iter().any(is_sky);
+        let of_galaxies = Warning::of_galaxies(&galaxies);
+        let is_known = |one: &Warning| levels_differ && matches!(one, Warning::Empty { .. });
+        warnings.extend(of_galaxies.filter(|one| !is_known(one)));
         if let Some(mean) = &response
             && !mean.is_significant
             && galaxies.iter().any(|galaxy| galaxy.flags.is_empty())

@@ -329,6 +329,7 @@ fn examined(change: impl Fn(f64, &mut StampStatistics)) -> Examination {
                 slope: [0.0; 2],
                 noise: [1.0; 2],
                 pairs: [0.0, 0.0, 100.0],
+                bands: [0.0; 2],
                 place: [0.0; 2],
                 flux: 1000.0,
                 peak: 20.0,
@@ -381,6 +382,25 @@ fn warnings_about_stamps_begin_at_their_limits() {
     });
     begins_at(0.03, "long-correlation", |correlation| {
         examined(|_, stamp| stamp.pairs[0] = 100.0 * correlation).warnings()
+    });
+    for of in [[1.0, 0.3], [0.3, 1.0]] {
+        begins_at(0.004, "banding", |square| {
+            examined(|_, stamp| stamp.bands = of.map(|share| share * square)).warnings()
+        });
+    }
+    // The other direction.
+    begins_at(1.0 / 0.33, "banding", |ratio| {
+        examined(|_, stamp| stamp.bands = [0.01, 0.01 / ratio]).warnings()
+    });
+    // Half of the correlation, over the noise of the levels.
+    begins_at(0.5, "sky-levels", |share| {
+        let levels = (share * 0.1 + 0.5 / 64.0).sqrt();
+        let change = |at: f64, stamp: &mut StampStatistics| {
+            let level = 2.0 / 1.4826 * levels * at;
+            (stamp.corner, stamp.side) = (level, level);
+            stamp.pairs[0] = 10.0;
+        };
+        examined(change).warnings()
     });
     begins_at(0.02, "given-noise", |difference| {
         let given = examined(|_, _| {}).given_noise(1.0 + difference);
@@ -530,4 +550,52 @@ fn fast_ends_agree_with_plain_ones() {
             }
         }
     }
+}
+
+#[test]
+fn bands_and_skies_of_stamps_are_named() {
+    let kinds = |of: &dyn Fn([usize; 3], [&[f32]; 3]) -> f32| {
+        let mut rng = ChaCha8Rng::seed_from_u64(5);
+        let mut examination = Examination::new(N, 400);
+        for k in 0..400 {
+            let mut draw = |count: usize| -> Vec<f32> {
+                (0..count)
+                    .map(|_| StandardNormal.sample(&mut rng))
+                    .collect()
+            };
+            let (noise, rows, columns, sky) = (draw(N * N), draw(N), draw(N), draw(1));
+            let stamp = stamp(0.0, [0.0; 2], [0.3, -0.2]);
+            let changed = Array2::from_shape_fn((N, N), |(y, x)| {
+                let levels = [&rows[..], &columns[..], &sky[..]];
+                stamp[(y, x)] + noise[y * N + x] + of([k, y, x], levels)
+            });
+            examination.add(changed.view()).unwrap();
+        }
+        let found = examination.warnings();
+        found.iter().map(ToString::to_string).collect::<Vec<_>>()
+    };
+    assert!(kinds(&|_, _| 0.0).is_empty());
+    let one = |found: Vec<String>, text: &str| {
+        assert!(found.len() == 1 && found[0].contains(text), "{found:?}");
+    };
+    one(
+        kinds(&|[_, y, _], [rows, ..]| 0.2 * rows[y]),
+        "found rows with levels",
+    );
+    one(
+        kinds(&|[_, _, x], [_, columns, _]| 0.2 * columns[x]),
+        "found columns with",
+    );
+    for scatter in [0.3, 0.9, 3.0] {
+        one(
+            kinds(&|_, [.., sky]| scatter * sky[0]),
+            "noise.sky = \"stamp\"",
+        );
+    }
+    // Straight gradients along one axis are no bands.
+    let tilted = kinds(&|[_, y, _], [.., sky]| 0.02 * sky[0] * (y as f32 - 23.5));
+    assert!(
+        !tilted.iter().any(|text| text.contains("banded")),
+        "{tilted:?}"
+    );
 }
