@@ -657,6 +657,12 @@ choices! {
     }
 }
 
+/// A bit of a mask.
+pub(crate) fn mask_bit(text: &str) -> Result<u8, String> {
+    let bit = text.parse().ok().filter(|bit| *bit <= 52);
+    bit.ok_or_else(|| "expected a bit from 0 to 52: masks are read as numbers below 2^53".into())
+}
+
 /// Columns of a condition that shear does not change.
 #[derive(Debug, Args)]
 pub(crate) struct Unsheared {

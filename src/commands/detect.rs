@@ -10,7 +10,7 @@ use shearq_pipeline::gather::{Content, Files, Masks};
 use shearq_quantities::Frame;
 use shearq_submissions::DetectionMethod;
 
-use crate::arguments::{SummaryArguments, Threads, named};
+use crate::arguments::{SummaryArguments, Threads, mask_bit, named};
 use crate::progress::Bar;
 use crate::{count, tell};
 
@@ -35,7 +35,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "FILE")]
     mask: Option<PathBuf>,
     /// The bits of the mask that make a pixel missing [default: all].
-    #[arg(long, value_name = "LIST", value_delimiter = ',', requires = "mask", value_parser = clap::value_parser!(u8).range(0..=62))]
+    #[arg(long, value_name = "LIST", value_delimiter = ',', requires = "mask", value_parser = mask_bit)]
     mask_bits: Option<Vec<u8>>,
     /// Standard deviation of the white noise of a pixel [default: the header key NOISESIG, or measured with the correlation of pixels].
     #[arg(long, value_name = "SIGMA")]

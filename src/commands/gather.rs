@@ -2,7 +2,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 
-use crate::arguments::{SummaryArguments, listed, named};
+use crate::arguments::{SummaryArguments, listed, mask_bit, named};
 use crate::{count, tell};
 use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::{DataFolder, MAX_IMAGE, MAX_SET};
@@ -51,7 +51,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "FILE", num_args = 1..)]
     mask: Vec<PathBuf>,
     /// Bits of the masks, from 0 for the lowest: a pixel is missing if one of them is set [default: all].
-    #[arg(long, value_name = "BITS", value_delimiter = ',', num_args = 1, value_parser = clap::value_parser!(u8).range(0..=52))]
+    #[arg(long, value_name = "BITS", value_delimiter = ',', num_args = 1, value_parser = mask_bit)]
     mask_bits: Option<Vec<u8>>,
     /// Use only masks of this name or number, like --extension [default files: the stamps or the exposure].
     #[arg(long, value_name = "NAME")]

@@ -100,6 +100,9 @@ fn is_outside(at: usize, side: usize) -> bool {
     x.hypot(y) > radius
 }
 
+// Masks are read in double precision, which has no lower bits beside a bit from here on.
+const FIRST_LOST_BIT: f64 = (1u64 << 53) as f64;
+
 // Makes the pixels of a stamp missing whose `mask` is not zero, or has one of these bits. Returns their number.
 pub(crate) fn lose(pixels: &mut [f32], mask: &[f64], bits: Option<u64>) -> Result<usize, String> {
     let mut lost = 0;
@@ -109,6 +112,11 @@ pub(crate) fn lose(pixels: &mut [f32], mask: &[f64], bits: Option<u64>) -> Resul
                 if mask.fract() != 0.0 {
                     return Err(format!(
                         "the mask has the value {mask}; expected whole numbers, of which --mask-bits takes bits"
+                    ));
+                }
+                if mask.abs() >= FIRST_LOST_BIT {
+                    return Err(format!(
+                        "the mask has the value {mask:e}, but --mask-bits reads bits 0 to 52 only (expected values below 2^53). Try: a mask of 32-bit integers with the bits that are needed, as `mask & 0x7fffffff`"
                     ));
                 }
                 // Negative numbers are in two's complement, as in the file.
@@ -127,6 +135,19 @@ pub(crate) fn lose(pixels: &mut [f32], mask: &[f64], bits: Option<u64>) -> Resul
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn masks_whose_low_bits_are_lost_are_refused() {
+        let of = |mask: i64, bits| lose(&mut [1.0], &[mask as f64], bits);
+        for mask in [1 << 53, (1 << 54) + 1, (1 << 60) + 1, i64::MIN + 1] {
+            let error = of(mask, Some(1)).unwrap_err();
+            assert!(error.contains("expected values below 2^53"), "{error}");
+            assert_eq!(of(mask, None), Ok(1), "{mask}");
+        }
+        assert_eq!(of((1 << 52) + 1, Some(1)), Ok(1));
+        assert_eq!(of(-1, Some(1 << 52)), Ok(1));
+        assert_eq!(of(1 << 52, Some(1)), Ok(0));
+    }
 
     #[test]
     fn finite_marks_of_bad_pixels_are_missing() {
