@@ -387,6 +387,14 @@ mod tests {
         let headers = [
             vec![("PIXSCALE", real(0.2))],
             vec![("GS_SCALE", real(0.2)), ("CD1_1", real(5.0))],
+            vec![("PIXSCAL1", real(0.2)), ("PIXSCAL2", real(0.2))],
+            vec![("SECPIX", real(0.2))],
+            vec![("PSCALE", real(0.2))],
+            vec![
+                ("PSCALE", real(60.0)),
+                ("CD1_1", real(-DEGREES)),
+                ("CD2_2", real(DEGREES)),
+            ],
             vec![("CDELT1", real(-DEGREES)), ("CDELT2", real(DEGREES))],
             // Rotated by 90 degrees.
             vec![("CD1_2", real(DEGREES)), ("CD2_1", real(DEGREES))],
@@ -404,6 +412,7 @@ mod tests {
             vec![],
             vec![("CDELT1", real(1.0)), ("CDELT2", real(1.0))],
             vec![("PIXSCALE", text("small"))],
+            vec![("SECPIX", text("0.2 0.2"))],
         ] {
             assert_eq!(wcs(&header).scale, None, "{header:?}");
         }

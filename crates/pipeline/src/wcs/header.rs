@@ -10,6 +10,8 @@ use super::map::{ARCSEC_PER_RADIAN, Map, Polynomial, Projection, Zenithal};
 
 // Keys with the pixel scale in arcseconds: of surveys, of GalSim and of STPSF.
 const PIXEL_SCALE_KEYS: [&str; 3] = ["PIXSCALE", "GS_SCALE", "PIXELSCL"];
+// The same of observatories. Elsewhere PSCALE is the scale of a plate, so that a WCS comes first.
+const OTHER_SCALE_KEYS: [&str; 3] = ["PIXSCAL1", "SECPIX", "PSCALE"];
 // Largest order of SIP (Shupe et al. 2005, ASPC 347, 491): headers with more are damaged.
 const MAX_SIP_ORDER: i32 = 9;
 // Largest number of a coefficient PVi_m of TPV.
@@ -60,7 +62,7 @@ impl Keys {
         match number {
             Some(_) => drop(self.used.borrow_mut().insert(key.to_owned())),
             // Other programs use PIXSCALE for text.
-            None if PIXEL_SCALE_KEYS.contains(&key) => {}
+            None if PIXEL_SCALE_KEYS.contains(&key) || OTHER_SCALE_KEYS.contains(&key) => {}
             None => drop(self.unreadable.borrow_mut().get_or_insert(key.to_owned())),
         }
         number
@@ -245,9 +247,8 @@ impl Wcs {
         let equatorial = kind.starts_with("DEC") || kind.starts_with("RA");
         let longitude = usize::from(latitude_first);
 
-        let stated = PIXEL_SCALE_KEYS
-            .into_iter()
-            .find_map(|key| keys.number(key));
+        let of = |all: [&str; 3]| all.into_iter().find_map(|key| keys.number(key));
+        let (stated, other) = (of(PIXEL_SCALE_KEYS), of(OTHER_SCALE_KEYS));
         let mut units = ["CUNIT1", "CUNIT2"].map(|key| keys.text(key));
         if units[1].is_empty() {
             units[1] = units[0].clone();
@@ -258,6 +259,7 @@ impl Wcs {
         let only_scale = |matrix: Option<Matrix2>| Wcs {
             scale: stated
                 .or(matrix.map(|matrix| determinant(matrix).abs().sqrt()))
+                .or(other)
                 .filter(|scale| PLAUSIBLE_ARCSEC.contains(scale)),
             ..Wcs::default()
         };
