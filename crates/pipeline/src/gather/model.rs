@@ -5,6 +5,7 @@ use std::io::{Read, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 
+use ndarray::Array2;
 use shearq_files::FileError;
 use shearq_files::fits::{self, TableHead};
 use shearq_files::table::Place;
@@ -57,6 +58,24 @@ impl PsfModel {
         };
         let model = PsfexModel::read(&place.path, table.number)?;
         Ok(Some(PsfModel::Psfex(Box::new(model))))
+    }
+
+    /// The pixels of a model at the first place, with a frame of zeros, as it is beyond them; and their number along a pixel of the image.
+    /// Piff draws its models without end.
+    pub(super) fn framed(&self, places: &[(f64, f64)]) -> Option<(Array2<f64>, f64)> {
+        match (self, places) {
+            (PsfModel::Psfex(model), [place, ..]) => {
+                let [columns, rows] = model.sides;
+                let mask = model.mask_at(*place);
+                let framed = Array2::from_shape_fn((rows + 2, columns + 2), |(y, x)| {
+                    let inside = (1..=rows).contains(&y) && (1..=columns).contains(&x);
+                    inside.then(|| mask[(y - 1) * columns + x - 1])
+                });
+                let framed = framed.mapv(Option::unwrap_or_default);
+                Some((framed, 1.0 / model.step))
+            }
+            _ => None,
+        }
     }
 
     /// Draws the PSF at each place, in FITS pixels, on `side` × `side` pixels around its centre.
@@ -320,6 +339,8 @@ fn draw_by_python(
 
 #[cfg(test)]
 mod tests {
+    use shearq_measure::Truncation;
+
     use super::*;
 
     /// A Gaussian of σ px that grows along x and becomes elliptical along y.
@@ -355,6 +376,21 @@ mod tests {
             scale: [100.0, 50.0],
             step,
         }
+    }
+
+    #[test]
+    fn a_model_that_ends_in_light_is_cut_off() {
+        let cut = |step: f64| {
+            let model = PsfModel::Psfex(Box::new(model(step)));
+            let (framed, fine) = model.framed(&[(500.0, 400.0)]).unwrap();
+            assert_eq!(framed.dim(), (45, 43));
+            Truncation::of(framed.view(), fine)
+        };
+        assert_eq!(cut(0.7), None);
+        // 43 fine pixels are 8.6 px, of a Gaussian of σ 2 px.
+        let found = cut(0.2).unwrap();
+        assert!((found.side - 8.6).abs() < 1e-9, "{found:?}");
+        assert!((0.04..0.14).contains(&found.level), "{found:?}");
     }
 
     #[test]

@@ -4,9 +4,11 @@ use std::path::Path;
 
 use shearq_dataset::grid::Mosaic;
 use shearq_dataset::layout::MAX_STAMP;
-use shearq_files::FileError;
+use shearq_files::fits::image_heads;
 use shearq_files::frames::polars::Column;
 use shearq_files::table::MAX_ROWS;
+use shearq_files::table::Place;
+use shearq_files::{FileError, names_of};
 use shearq_quantities::linear::Matrix2;
 use shearq_quantities::statistics::upper_median;
 use shearq_quantities::{Frame, Jacobian};
@@ -336,7 +338,8 @@ impl Stack {
             let expected = *expected;
             if side != expected && files.content == Content::Psf {
                 let message = format!(
-                    "the stamp is {width} × {height} pixels; the first has {expected} × {expected}"
+                    "the stamp is {width} × {height} pixels; the first has {expected} × {expected}{}",
+                    psf_extension_advice(origin.file)
                 );
                 return Err(origin.fault(&message));
             }
@@ -374,6 +377,28 @@ impl Stack {
             oversampling,
         };
         Ok((stack, messages))
+    }
+}
+
+/// What to try with a file of several images as PSFs; empty of a file of one. STPSF and WebbPSF write the PSF on fine pixels and on the
+/// detector's, without and with distortion.
+pub(super) fn psf_extension_advice(path: &Path) -> String {
+    const DETECTOR_PIXELS: &str = "DET_DIST";
+    let heads = image_heads(&Place::of(path).path).unwrap_or_default();
+    let named: Vec<&str> = heads.iter().map(|head| head.name.as_str()).collect();
+    let chosen = named.iter().find(|name| **name == DETECTOR_PIXELS);
+    let chosen = chosen.or(named.iter().find(|name| !name.is_empty()));
+    match chosen {
+        Some(name) if named.len() > 1 => format!(
+            ". Try: --psf-extension {name} for one of the images ({})",
+            names_of(
+                &heads
+                    .iter()
+                    .map(|head| head.shown(&heads))
+                    .collect::<Vec<_>>()
+            )
+        ),
+        _ => String::new(),
     }
 }
 

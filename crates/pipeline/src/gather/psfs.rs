@@ -7,7 +7,9 @@ use shearq_dataset::grid::{Mosaic, psfs_text, read_psfs};
 use shearq_dataset::images::ImageId;
 use shearq_dataset::layout::DataFolder;
 use shearq_files::{FileError, atomic};
-use shearq_measure::{EXAMINED_PSFS, Examination, Oversampling, Psfs, Star, Warning};
+use shearq_measure::{
+    EXAMINED_PSFS, Examination, ExaminedPsfs, Oversampling, Psfs, Star, Truncation, Warning,
+};
 use shearq_quantities::linear::Matrix2;
 use shearq_submissions::PsfCut;
 use shearq_submissions::limits::MIN_PSF;
@@ -15,7 +17,7 @@ use shearq_submissions::limits::MIN_PSF;
 use super::files::PlaneReader;
 use super::model::{Chip, PsfModel};
 use super::mosaic::{Rows, central, first};
-use super::plan::{Plan, Stack};
+use super::plan::{Plan, Stack, psf_extension_advice};
 use super::request::Gathering;
 use crate::wcs::Wcs;
 
@@ -100,11 +102,19 @@ pub(super) fn gather_psfs(
     let finer = (oversampling > 1).then(|| Oversampling::new((fine, fine), oversampling));
     let finer = finer.transpose();
     let mut rows = kept.into_iter().flatten();
+    let before = messages.len();
     while let Some((origin, pixels)) = planes.next()? {
         if rows.next() == Some(&false) {
             continue;
         }
         let pixels = central(pixels, planes.sides(), fine);
+        if oversampling > 1 && messages.len() == before {
+            messages.extend(truncated(
+                origin.file,
+                &light_of(&pixels, [fine; 2]),
+                oversampling as f64,
+            ));
+        }
         let finer = finer
             .as_ref()
             .map_err(|error| origin.fault(&error.to_string()))?;
@@ -114,8 +124,14 @@ pub(super) fn gather_psfs(
         };
         let light = writer.add(&pixels)?;
         if count == 1 && writer.dark > 0 {
-            let message =
-                format!("the pixels of the PSF add up to {light}; expected a positive sum");
+            let missing = pixels.iter().filter(|value| !value.is_finite()).count();
+            let message = match missing {
+                0 => format!("the pixels of the PSF add up to {light}; expected a positive sum"),
+                _ => format!(
+                    "{missing} of {} pixels of the PSF are missing (NaN or infinite; expected none). Try: a model of the PSF, or values of the neighbours in their place",
+                    pixels.len()
+                ),
+            };
             return Err(origin.fault(&message));
         }
     }
@@ -144,7 +160,15 @@ fn of_model(
     let side = plan.stack.side.max(MIN_PSF);
     let mut writer = StarWriter::create(to, places.len(), side, &plan.stack.wcs)?;
     model.draw(&places, side, |stamp| writer.add(stamp).map(|_| ()))?;
-    Ok(writer.gathered(path, Vec::new(), plan.stack.wcs.clone(), plan.pixels()))
+    let messages = model
+        .framed(&places)
+        .and_then(|(psf, fine)| truncated(path, &psf, fine));
+    Ok(writer.gathered(
+        path,
+        messages.into_iter().collect(),
+        plan.stack.wcs.clone(),
+        plan.pixels(),
+    ))
 }
 
 /// PSF stamps that are written and examined: one, or one per galaxy in the same places.
@@ -211,10 +235,26 @@ impl StarWriter {
 
 /// A PSF of `fine` pixels a side integrated over pixels of the galaxies.
 fn on_galaxy_pixels(pixels: Vec<f32>, fine: usize, finer: &Oversampling) -> Vec<f32> {
-    let light = pixels.iter().map(|&value| f64::from(value)).collect();
-    let light = Array2::from_shape_vec((fine, fine), light).unwrap_or_default();
-    let psf = finer.psf(light.view());
+    let psf = finer.psf(light_of(&pixels, [fine; 2]).view());
     psf.iter().map(|&value| value as f32).collect()
+}
+
+fn light_of(pixels: &[f32], [columns, rows]: [usize; 2]) -> Array2<f64> {
+    let light = pixels.iter().map(|&value| f64::from(value)).collect();
+    Array2::from_shape_vec((rows, columns), light).unwrap_or_default()
+}
+
+/// The warning about a PSF that ends where it has light, of which so many pixels are along a pixel of the galaxies. Interpolation to
+/// those hides the end.
+fn truncated(path: &Path, psf: &Array2<f64>, oversampling: f64) -> Option<String> {
+    let found = Truncation::of(psf.view(), oversampling)?;
+    let warning = Warning::PsfTruncated {
+        side: found.side,
+        level: found.level,
+        effect: found.effect(),
+        of: ExaminedPsfs { count: 1, of: 1 },
+    };
+    Some(format!("warning: {}: {warning}", path.display()))
 }
 
 // Named configurations refuse such PSF stamps. Users should learn it before they have gathered all images.
@@ -232,8 +272,14 @@ fn check_count(path: &Path, found: usize, mosaic: &Mosaic) -> Result<(), FileErr
     if found == 1 || found == mosaic.galaxies {
         return Ok(());
     }
+    let advice = match psf_extension_advice(path) {
+        none if none.is_empty() => {
+            ". Try: average stars before, as average_stars of the crate shearq-measure does".into()
+        }
+        advice => advice,
+    };
     let message = format!(
-        "there are {found} PSFs; expected one, or one for each of the {} stamps. Try: average stars before, as average_stars of the crate shearq-measure does",
+        "there are {found} PSFs; expected one, or one for each of the {} stamps{advice}",
         mosaic.galaxies
     );
     Err(FileError::new(path, message))
