@@ -182,7 +182,15 @@ impl ImageReader {
                 )));
             }
         }
-        let sides = file.sides()?;
+        let mut sides = file.sides()?;
+        // Radio images have axes of one frequency and one polarization.
+        let most = match dimensions {
+            Dimensions::Two => 2,
+            Dimensions::TwoOrThree => 3,
+        };
+        while sides.len() > most && sides.last() == Some(&1) {
+            sides.pop();
+        }
         let (x, y, z) = match (sides.as_slice(), dimensions) {
             (&[x, y], _) => (x, y, 1),
             (&[x, y, z], Dimensions::TwoOrThree) => (x, y, z),
