@@ -669,7 +669,15 @@ impl Examination {
         let count = counts.next_back()?;
         let most = MIN_SATURATED * counts.max().unwrap_or(1);
         let (level, _) = *peaks.last()?;
-        (count > most).then_some(Warning::Saturated { level, count, of })
+        if count <= most {
+            return None;
+        }
+        // Saturation leaves several pixels at the level, and fainter galaxies.
+        let is_single = |stamp: &StampStatistics| stamp.brightest <= 1;
+        Some(match count == of && self.stamps.iter().all(is_single) {
+            true => Warning::PeakNormalised { level, of },
+            false => Warning::Saturated { level, count, of },
+        })
     }
 
     /// A warning if many pixels of most stamps have the darkest value of the stamp.

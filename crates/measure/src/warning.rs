@@ -180,7 +180,7 @@ pub enum Warning {
     },
     /// The noise of an epoch cannot be measured.
     #[error(
-        "cannot measure the noise: no stamp has enough pixels that differ (expected galaxies and noise). The epoch is left out. Try: check the file and its extension"
+        "cannot measure the noise: on no stamp are there enough pixels that differ and are not missing (expected galaxies and noise). The epoch is left out. Try: check the file, its extension and its mask"
     )]
     EpochNoNoise,
     /// The galaxies of an epoch are not where its offsets and its PSF place them.
@@ -228,7 +228,7 @@ pub enum Warning {
     EpochCopies { count: usize, of: usize },
     /// No stamp is good enough to measure the noise on.
     #[error(
-        "cannot measure the noise: no stamp has enough pixels that differ. All galaxies are flagged. Try: set noise.source to \"header\" to use NOISESIG"
+        "cannot measure the noise: on no stamp are there enough pixels that differ and are not missing. All galaxies are flagged. Try: cut off borders of missing pixels (with stamp.size of the smaller stamps in a settings file), and mask neighbours but not the sky and the galaxies"
     )]
     NoNoise,
     /// The star was not in the middle of its stamp, and was cut around itself.
@@ -296,6 +296,12 @@ pub enum Warning {
         significant(*level, 5)
     )]
     Saturated { level: f64, count: usize, of: usize },
+    /// The brightest pixel of every stamp has one value.
+    #[error(
+        "the brightest pixel is {} on each of {of} stamps (expected different values), as if they were divided by it, so that each stamp has another noise. Try: stamps in one unit",
+        significant(*level, 5)
+    )]
+    PeakNormalised { level: f64, of: usize },
     /// Pixels below a level were replaced by it.
     #[error(
         "pixels are cut off from below (found {:.0} % of the pixels at the darkest value of their stamp, on {count} of {of} stamps; expected one pixel), which biases shears: m is about 0.1 if those below zero became zero, and 0.02 below −1 σ. Try: images whose negative pixels are kept",

@@ -599,3 +599,18 @@ fn bands_and_skies_of_stamps_are_named() {
         "{tilted:?}"
     );
 }
+
+#[test]
+fn stamps_divided_by_their_peaks_are_not_saturated() {
+    let found = |brightest: usize, of_one: f64| {
+        let examined = examined(|at, stamp| {
+            stamp.peak = if at < of_one { 1.0 } else { 1.0 - at };
+            stamp.brightest = brightest;
+        });
+        let found = examined.warnings().into_iter();
+        found.map(|one| one.kind()).collect::<Vec<_>>()
+    };
+    assert_eq!(found(1, 2.0), ["peak-normalised"]);
+    assert_eq!(found(2, 2.0), ["saturated"]);
+    assert_eq!(found(1, 0.5), ["saturated"]);
+}
