@@ -229,6 +229,54 @@ fn mask_bits_and_sextractors_blank_make_pixels_missing() {
         "the mask has the value 0.5",
     );
     refuse_to_gather(&folder, bits, "without a mask");
+    let mut wide = [1i64 << 60; 400];
+    wide[3] += 1;
+    let bytes: Vec<u8> = wide.iter().flat_map(|value| value.to_be_bytes()).collect();
+    folder.write("wide.fits", fits_image(64, &[20, 20], &[], &bytes));
+    let lost_bits = "expected values below 2^53). Try: a mask of 32-bit integers";
+    refuse_to_gather(&folder, &format!("{bits} --mask wide.fits"), lost_bits);
+    let beyond =
+        "gather --stamps stamps.fits --psf psf.fits --mask wide.fits --mask-bits 63 --out data";
+    folder.refuses(beyond, "a bit from 0 to 52");
+}
+
+#[test]
+fn axes_of_length_one_are_left_out() {
+    let folder = Folder::new();
+    write_cube(&folder, "psf.fits", &[vec![1.0; 400]]);
+    let stamp: Vec<f32> = (0..400u16).map(f32::from).collect();
+    folder.image("radio.fits", &[20, 20, 1, 1], &[], &stamp);
+    let found = gathered(&folder, "--stamps radio.fits", 20);
+    assert_eq!(found, [stamp]);
+}
+
+#[test]
+fn psfs_of_a_file_of_several_are_chosen_by_name() {
+    let folder = Folder::new();
+    write_cube(&folder, "stamps.fits", &[vec![1.0; 400]]);
+    let mut file = fits_image(8, &[], &["EXTEND  = T"], &[]);
+    for (name, side) in [
+        ("OVERSAMP", 80),
+        ("DET_SAMP", 20),
+        ("OVERDIST", 80),
+        ("DET_DIST", 20),
+    ] {
+        let card = format!("EXTNAME = '{name}'");
+        let pixels = floats(&vec![1.0; side * side]);
+        file.extend(fits_extension("IMAGE", -32, &[side; 2], &[&card], &pixels));
+    }
+    folder.write("stpsf.fits", file);
+    let from = "--stamps stamps.fits --psf stpsf.fits";
+    refuse_to_gather(&folder, from, "Try: --psf-extension DET_DIST");
+    gather(&folder, &format!("{from} --psf-extension DET_DIST"));
+    let mut star = vec![1.0; 400];
+    star[7] = f32::NAN;
+    write_cube(&folder, "nan.fits", &[star]);
+    refuse_to_gather(
+        &folder,
+        "--stamps stamps.fits --psf nan.fits",
+        "1 of 400 pixels of the PSF are missing",
+    );
 }
 
 #[test]
