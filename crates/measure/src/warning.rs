@@ -331,7 +331,7 @@ pub enum Warning {
     },
     /// The PSF image ends where there is light.
     #[error(
-        "the PSF image is cut off (found {side:.0} px across, {} % of the peak at the edge and zeros beyond{of}; expected {MIN_PSF} px or more, or a smooth end). That changes m by about {:+.3}, and c by about {:.2} times the ellipticity of the PSF. Try: a PSF image that contains the wings",
+        "the PSF image is cut off (found {side:.0} px across, {} % of the peak at the edge and zeros beyond{of}; expected {MIN_PSF} px or more, or a smooth end). That changes m by about {:+.3}, and c by about {:.2} times the ellipticity of the PSF. Try: a larger PSF image (PSF_SIZE of PSFEx), which contains the wings",
         significant(100.0 * level, 2), effect[0], effect[1]
     )]
     PsfTruncated {
