@@ -312,11 +312,19 @@ fn without_partner(sums: &OfCatalogues<'_>, pairs: &[[u32; 2]]) -> Option<Withou
     type Numbers = (f64, [[f64; 2]; 2]);
     let (mut galaxies, mut of) = (0.0, 0.0);
     let (mut of_shapes, mut of_all) = ([0.0; 2], [0.0; 2]);
-    for [a, b] in pairs {
+    let units = |[a, b]: &[u32; 2]| -> Vec<[Numbers; 2]> {
         let units = sums.pairs(*a, *b, Layout::counts_and_slopes).into_iter();
-        let units: Vec<[Numbers; 2]> = units
+        units
             .map(|pair| pair.map(Option::unwrap_or_default))
-            .collect();
+            .collect()
+    };
+    // One unit has no scatter: pairs of catalogues that are one unit each, such as a seed or tile per file, are compared with each
+    // other.
+    let (single, mut all): (Vec<_>, Vec<_>) =
+        pairs.iter().map(units).partition(|own| own.len() == 1);
+    all.push(single.concat());
+    all.retain(|units| units.len() > 1);
+    for units in all {
         let total: f64 = units.iter().map(|[a, b]| a.0 + b.0).sum();
         // The variance of what a value differs from its expectation, which is proportional to `scale`.
         type Value<'a> = &'a dyn Fn(&[Numbers; 2]) -> f64;
@@ -341,10 +349,12 @@ fn without_partner(sums: &OfCatalogues<'_>, pairs: &[[u32; 2]]) -> Option<Withou
             of_all[k] += variance(&|[a, b]| a.1[0][k] + b.1[0][k], scale);
         }
     }
+    // `clamp` keeps the NaN of a component without true shear, and `min` would make it 1.
+    let share = |k: usize| (galaxies / of * of_shapes[k] / of_all[k]).clamp(0.0, 1.0);
     (galaxies > 0.0).then_some(WithoutPartner {
         galaxies,
         of,
-        share: [0, 1].map(|k| (galaxies / of * of_shapes[k] / of_all[k]).min(1.0)),
+        share: [share(0), share(1)],
     })
 }
 

@@ -361,6 +361,37 @@ fn galaxies_without_partner_are_counted_with_their_cost() {
     );
 }
 
+#[test]
+fn seeds_per_file_count_galaxies_without_partner() {
+    const PAIRS: usize = 100;
+    let mut galaxies = Galaxies::new(Weights::Equal, GAMMA);
+    // Without true g2.
+    let shears = [[GAMMA, 0.0], [-GAMMA, 0.0]];
+    let (mut draw, mut alone) = (Draw::new(2 * PAIRS, false), 0.0);
+    for pair in 0..PAIRS {
+        for _ in 0..500 {
+            let galaxy = galaxies.galaxy();
+            let is_paired = galaxies.rng.random_range(0.0..1.0) > 0.02;
+            let first = usize::from(galaxies.rng.random_range(0.0..1.0) > 0.5);
+            alone += f64::from(!is_paired);
+            for (sign, g) in shears.into_iter().enumerate() {
+                if sign == first || is_paired {
+                    draw.add(2 * pair + sign, pair, &galaxies.row(galaxy, g, [0.0; 2]));
+                }
+            }
+        }
+    }
+    let grouping = group(draw.sums, &draw.catalogues, Design::Pairs, Some(true), true);
+    let found = grouping.without_partner.unwrap();
+    // 100 units determine a variance to √(2/100) = 14 %.
+    assert!(
+        (found.galaxies / alone - 1.0).abs() < 0.45,
+        "{found:?} {alone}"
+    );
+    assert!(found.share[0] > 0.5, "{found:?}");
+    assert!(found.share[1].is_nan(), "{found:?}");
+}
+
 /// The same for 100 to 1,000,000 galaxies and 1,000 draws where that takes minutes.
 #[test]
 #[ignore = "takes minutes"]
