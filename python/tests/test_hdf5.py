@@ -51,6 +51,18 @@ def test_groups_of_metadetect_are_sheared_catalogues(tmp_path):
     assert groups["m1"] == found["m1"]
 
 
+def test_groups_may_repeat_their_step_in_a_column(tmp_path):
+    paths = [tmp_path / "plus.h5", tmp_path / "minus.h5"]
+    for path, sign in zip(paths, (1, -1)):
+        write(path, (0.02 * sign, 0.0))
+    plain = shearq.bias(paths, g1=[0.02, -0.02], g2=[0, 0])
+    for path in paths:
+        with h5py.File(path, "a") as file:
+            for name, group in file["shear"].items():
+                group["mdet_step"] = np.full(4000, name.encode())
+    assert shearq.bias(paths, g1=[0.02, -0.02], g2=[0, 0])["m1"] == plain["m1"]
+
+
 def test_a_group_is_a_table_of_its_datasets(tmp_path):
     rng = np.random.default_rng(2)
     e = rng.normal(0, 0.2, (1000, 2))

@@ -52,7 +52,8 @@ class Hdf5Table(Mapping[str, Any]):
         self._steps = _steps(group)
         tables = list(self._steps.values()) if self._steps else [group]
         columns = [_datasets(table) for table in tables]
-        shared = [key for key in columns[0] if all(key in other for other in columns)]
+        # The names of the groups state the steps, also where each group repeats its own in a column.
+        shared = [key for key in columns[0] if all(key in other for other in columns) and not (self._steps and key == _STEP)]
         self._columns = {key: [column[key] for column in columns] for key in shared}
         lengths = {key: tuple(len(part) for part in parts) for key, parts in self._columns.items()}
         first = next(iter(lengths.values()), None)
