@@ -252,7 +252,11 @@ pub(crate) fn first_texts(path: &Path) -> Result<Vec<(String, String)>, FileErro
     for field in fields {
         let name = field.name.to_string();
         let wanted = decoded(path, &Wanted::whole(field))?;
-        let chunk = source.read_rows(&wanted, number, Some(1))?;
+        let chunk = match source.read_rows(&wanted, number, Some(1)) {
+            // Other bytes than text, which no role has.
+            Err(_) if source.bytes.contains(&name) => continue,
+            chunk => chunk?,
+        };
         let first = chunk.str().ok().and_then(|texts| texts.get(0));
         found.extend(first.map(|text| (name, text.to_owned())));
     }
@@ -286,6 +290,8 @@ struct Source<'a> {
     length: u64,
     footer: FileMetadataRef,
     fields: Vec<ArrowField>,
+    /// Columns of bytes, which are read as text: astropy writes its bytes so, without a statement that they are text.
+    bytes: Vec<String>,
     /// By the start of the column chunk; none in files of other programs.
     checksums: BTreeMap<i64, u32>,
 }
@@ -319,12 +325,22 @@ impl<'a> Source<'a> {
             Ok((reader.get_metadata()?.clone(), fields))
         })
         .map_err(|detail| damaged(path, detail))?;
+        let mut fields: Vec<ArrowField> = fields;
+        let mut bytes = Vec::new();
+        for field in &mut fields {
+            use ArrowDataType::{Binary, BinaryView, LargeBinary, Utf8View};
+            if matches!(field.dtype, Binary | LargeBinary | BinaryView) {
+                field.dtype = Utf8View;
+                bytes.push(field.name.to_string());
+            }
+        }
         let mut source = Self {
             path,
             file,
             length,
             footer,
             fields,
+            bytes,
             checksums: BTreeMap::new(),
         };
         if is_marked {

@@ -7,6 +7,7 @@ use shearq_files::FileError;
 use shearq_files::frames::polars::{AnyValue, Column, DataFrame, df};
 use shearq_files::frames::{Metadata, frame, reals};
 use shearq_files::parquet::{self, columns};
+use shearq_files::table::{self, Place};
 
 /// More rows than any of the files has.
 const MAX_ROWS: usize = 10_000_000;
@@ -174,6 +175,20 @@ fn a_wrong_bit_anywhere_is_noticed_or_changes_nothing() {
             assert_eq!(found.unwrap(), metadata());
         }
     }
+}
+
+/// `tests/data/bytes.parquet` was written by pyarrow 26: the columns `step` and `blob` have the type binary, as astropy writes its
+/// texts of bytes, and only the first is text.
+#[test]
+fn columns_of_bytes_are_read_as_text() {
+    let path = Path::new("tests/data/bytes.parquet");
+    let table = parquet::read(path, Some(&["step", "e1"]), MAX_ROWS).expect("readable");
+    let steps = table.column("step").expect("a column").str();
+    let expected = ["noshear", "1p", "noshear"].map(Some);
+    assert!(steps.expect("text").iter().eq(expected));
+    let texts = table::first_texts(&Place::of(path)).expect("readable");
+    assert_eq!(texts, [("step".to_owned(), "noshear".to_owned())]);
+    assert!(parquet::read(path, Some(&["blob"]), MAX_ROWS).is_err());
 }
 
 /// `tests/data/types.parquet` was written by pyarrow 26 with its defaults (Snappy, dictionaries):
