@@ -156,8 +156,13 @@ impl Survey {
                 .required
                 .iter()
                 .any(|own| is_own_weight(own) && !there(own));
+        // Also a formula of it, such as one with another sign.
+        let is_of = |given: &str, column: &str| {
+            given.eq_ignore_ascii_case(column)
+                || there(column) && has_operand(given, |own| own.eq_ignore_ascii_case(column))
+        };
         let known = |key: &Key, column: &str| match (key, names.given.get(key)) {
-            ((Role::E1 | Role::E2, 0), Some(given)) => given.eq_ignore_ascii_case(column),
+            ((Role::E1 | Role::E2, 0), Some(given)) => is_of(given, column),
             ((Role::E1 | Role::E2, 0), None) => self.column_of(*key, found).is_some(),
             (key, _) => !is_renamed || *key == WEIGHT || there(column),
         };
@@ -191,6 +196,11 @@ impl Survey {
         let computes = self.file.is_some() && (is_list || is_formula());
         computes.then(|| stated.to_owned())
     }
+}
+
+// Whether a formula has such an operand.
+fn has_operand(formula: &str, is_wanted: impl Fn(&str) -> bool) -> bool {
+    Expression::parse(formula).is_ok_and(|own| own.columns().any(is_wanted))
 }
 
 // Whether a column has a name in any case, or is a component of a vector of this name.
@@ -555,7 +565,12 @@ impl Columns {
             ));
         };
         check_partners(path, &columns, found)?;
-        let distortion = recognition().ellipticity.distortion.contains(&e1)
+        let is_distortion = |name: &str| {
+            let mut known = recognition().ellipticity.distortion.iter();
+            known.any(|own| own == name)
+        };
+        let distortion = is_distortion(&e1)
+            || has_operand(&e1, is_distortion)
             || survey.is_some_and(|survey| survey.ellipticity == EllipticityType::Distortion);
         let preset = Preset::of_columns(&columns, distortion || e1 == "corrected_g1", is_own);
         if preset == Preset::Shearq {
@@ -606,6 +621,11 @@ impl Columns {
             _ => (name_of(key), self.columns[&key].clone()),
         });
         named.collect()
+    }
+
+    /// Gives a role to a column.
+    pub fn take(&mut self, role: Role, column: &str) {
+        self.columns.insert((role, 0), column.to_owned());
     }
 
     /// Forgets the column of a role.
@@ -810,6 +830,7 @@ fn find_flags(
         of_kind("flags"),
         of_kind("flag"),
         own("ngmix_mcal_flags").filter(|_| e1.starts_with("ngmix")),
+        own("ngmix_mom_fail").filter(|_| e1.starts_with("ngmix")),
     ];
     let mut flags: Vec<String> = Vec::new();
     for name in all.into_iter().flatten() {
@@ -865,6 +886,20 @@ mod tests {
             ("HSC Y3", Some(rms))
         );
         assert_eq!(found(hsc, &["w=w"]).unwrap().program(), "LSST");
+        // A formula of the survey's own column, which is a name, too.
+        let turned = found(
+            &format!("{hsc} {rms} -i_hsmshaperegauss_e1"),
+            &["e1=-i_hsmshaperegauss_e1", "w=w"],
+        );
+        let turned = turned.unwrap();
+        assert_eq!((turned.program(), turned.distortion), ("HSC Y3", true));
+        assert_eq!(turned.of(Role::E2), Some("i_hsmshaperegauss_e2"));
+        assert_eq!(turned.flags, ["i_hsmshaperegauss_flag"]);
+        assert!(
+            found("regauss_e1 regauss_e2 -regauss_e1", &["e1=-regauss_e1"])
+                .unwrap()
+                .distortion
+        );
         let unflagged = hsc.replace("i_hsmshaperegauss_flag ", "");
         let renamed = found(&format!("{unflagged} {rms}"), &["w=w"]).unwrap();
         assert_eq!(renamed.program(), "HSC Y3");
@@ -939,6 +974,17 @@ mod tests {
 
     #[test]
     fn unsheared_columns_are_found_in_any_spelling() {
+        let split = "NGMIX_ELL_1P_0 NGMIX_ELL_1M_0 NGMIX_ELL_2P_1 NGMIX_ELL_2M_1 NGMIX_MOM_FAIL NGMIX_ELL_NOSHEAR_0 NGMIX_ELL_NOSHEAR_1";
+        let own = found(split, &[]).unwrap();
+        assert_eq!(own.preset, Preset::Metacal);
+        assert_eq!(own.of_sheared((Role::E2, 3)), Some("NGMIX_ELL_2P_1"));
+        assert_eq!(
+            (own.of(Role::E1), own.flags),
+            (
+                Some("NGMIX_ELL_NOSHEAR_0"),
+                vec!["NGMIX_MOM_FAIL".to_owned()]
+            )
+        );
         for (columns, e1, response) in [
             ("00/g1 00/g2", "00/g1", None),
             ("g_noshear_1 g_noshear_2", "g_noshear_1", None),
@@ -988,6 +1034,11 @@ mod tests {
                 "ra w chi_1 chi_2",
                 vec![],
                 "Try: --columns e1=chi_1,e2=chi_2",
+            ),
+            (
+                "psf_e1_LF_r psf_e2_LF_r g1_in g2_in AlphaRecalD2_e1 AlphaRecalD2_e2 shear_bias_c1 shear_bias_c2",
+                vec![],
+                "Try: --columns e1=AlphaRecalD2_e1,e2=AlphaRecalD2_e2",
             ),
             ("e1 e2 R11", vec![], "none for R22"),
             ("e1 e2", vec!["w=weight"], "there is no column `weight`"),
@@ -1047,8 +1098,7 @@ mod tests {
         assert_eq!(several.doubtful_weights, ["wht", "ivar"]);
         let declined = found("e1 e2 my_weight", &["w=none"]).unwrap();
         assert!(declined.doubtful_weights.is_empty());
-        let others =
-            "e1 e2 w mag T r z correspond_id ra flux1 size sersic_r1 snr chi2 psf_flux tile x";
+        let others = "e1 e2 w i_blendedness mag T r z correspond_id ra flux1 size sersic_r1 snr chi2 psf_flux tile x";
         assert_eq!(found(others, &[]).unwrap().unused(&[]), [""; 0]);
         let clean = found("e1 e2 w m_g m_r |", &[]).unwrap();
         assert_eq!(clean.unused(&[]), [""; 0]);
@@ -1083,6 +1133,16 @@ mod tests {
                 "w=AlphaRecalC_weight if",
             ),
             ("m_corr", "Try: --columns ROLE=NAME if"),
+            (
+                "Flag_SOM_Fid_NONE R SNR_LF_r",
+                "Not used: Flag_SOM_Fid_NONE. Try: --where Flag_SOM_Fid_NONE if it is true",
+            ),
+            (
+                "mask_flags mdet_flags pgauss_g_flux",
+                "Not used: mask_flags. Try: --columns flag=mdet_flags+mask_flags if",
+            ),
+            ("fitclass MASK star_flag", "--where 'MASK <= 1"),
+            ("w m c2", "'R11=1+m,R22=1+m,e2=e2-c2' for those after it"),
         ] {
             let unused = found(&format!("e1 e2 {names}"), &[]).unwrap().unused(&[]);
             assert!(unused[0].contains(expected), "{unused:?}");
@@ -1099,7 +1159,9 @@ mod tests {
         let step = found("e1 e2 mcal_step_size", &[]).unwrap().step_size;
         assert_eq!(step.as_deref(), Some("mcal_step_size"));
         let patterns = &recognition().patterns;
-        for name in "hpix healpix_256 pointing_id image_id subfield visit_id jk BRICK".split(' ') {
+        for name in
+            "tile_label hpix healpix_256 pointing_id image_id subfield visit_id jk BRICK".split(' ')
+        {
             assert!(fits_any(&patterns.unit, name), "{name}");
         }
         for name in ["TOMOBIN", "TOM_BIN_ID"] {

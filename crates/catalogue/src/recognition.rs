@@ -33,6 +33,8 @@ pub struct Recognition {
 #[serde(deny_unknown_fields)]
 pub struct Types {
     pub distortion: Vec<String>,
+    /// Names of e1 that needs a response.
+    pub undivided: Vec<String>,
 }
 
 /// Names of sizes of the PSF that are squares of one.
@@ -56,8 +58,11 @@ pub struct Patterns {
     pub step_size: Vec<String>,
     pub error: Vec<String>,
     pub flag: Vec<String>,
+    pub no_flag: Vec<String>,
     pub choice: Vec<String>,
     pub shape: Vec<String>,
+    pub truth: Vec<String>,
+    pub lensfit: Vec<String>,
     pub harmless: Vec<String>,
     pub not_harmless: Vec<String>,
     pub response_in_capitals: Vec<String>,
@@ -188,7 +193,8 @@ mod tests {
     fn each_role_and_no_other_has_names() {
         let known = recognition();
         let roles = role_names();
-        let unsheared = |role: &&str| !role.ends_with(['p', 'm']);
+        let steps = ["1p", "1m", "2p", "2m"];
+        let unsheared = |role: &&str| !steps.iter().any(|step| role.ends_with(step));
         let mut roles: Vec<&str> = roles.split(", ").filter(unsheared).collect();
         roles.sort_unstable();
         assert_eq!(known.names.keys().collect::<Vec<_>>(), roles);

@@ -99,6 +99,8 @@ pub struct Request {
     pub like: Option<Survey>,
     /// Rows that count, and weights of catalogues of linear configurations, whose response to shear enters.
     pub selection: Option<StatedSelection>,
+    /// Columns of `--where` and bins that shear does not change.
+    pub unsheared: Vec<String>,
     pub design: Option<Design>,
     pub units: Units,
     /// Whether only galaxies count that count under all test shears.
@@ -136,6 +138,7 @@ impl Default for Request {
             bins: Vec::new(),
             like: None,
             selection: None,
+            unsheared: Vec::new(),
             design: None,
             units: Units::default(),
             paired: false,

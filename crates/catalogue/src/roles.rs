@@ -34,6 +34,10 @@ pub enum Role {
     Unit,
     /// Name of the sheared catalogue of a row: noshear, 1p, 1m, 2p, 2m.
     ShearedCatalogue,
+    /// Published calibrations of the shear: ⟨g⟩ = (⟨e⟩/R − ⟨c⟩)/(1 + ⟨m⟩).
+    M,
+    C1,
+    C2,
     // The roles below follow from options and from other columns, and have no name in --columns.
     /// Operands of `--where`, and of `--bins`.
     Condition,
@@ -64,7 +68,7 @@ pub fn sheared_pair(of: usize, sheared: usize) -> [Key; 2] {
 }
 
 // In the order of `Role`s: the role, its name in --columns, and the role without which it is incomplete.
-const TABLE: [(Role, &str, Option<Role>); 24] = [
+const TABLE: [(Role, &str, Option<Role>); 27] = [
     (Role::E1, "e1", Some(Role::E2)),
     (Role::E2, "e2", Some(Role::E1)),
     (Role::Weight, "w", None),
@@ -89,6 +93,9 @@ const TABLE: [(Role, &str, Option<Role>); 24] = [
     (Role::Y, "y", None),
     (Role::Unit, "unit", None),
     (Role::ShearedCatalogue, "version", None),
+    (Role::M, "m", None),
+    (Role::C1, "c1", None),
+    (Role::C2, "c2", None),
 ];
 
 /// All columns that `--columns` can name, in its order: the roles, then ellipticities under artificial shears of the own component

@@ -700,6 +700,7 @@ impl<'a> TableRows<'a> {
     // A row with a true shear of zero.
     fn measured(&self, at: usize, weight: f64) -> Result<Row, Exclusion> {
         let (e, response) = self.shape(at, weight).ok_or(Exclusion::AboveOne)?;
+        let (e, response) = self.calibrated(at, weight, e, response);
         Ok(Row {
             e,
             weight,
@@ -739,6 +740,27 @@ impl<'a> TableRows<'a> {
                 self.remedy_for_failures()
             ))),
         }
+    }
+
+    // With the calibration of a survey, so that the mean shear is that of e − R c over R (1 + m), as HSC defines its m and c
+    // (Mandelbaum et al. 2018, MNRAS 481, 3170, equation 8).
+    fn calibrated(
+        &self,
+        at: usize,
+        weight: f64,
+        mut e: [f64; 2],
+        mut response: [[f64; 2]; 2],
+    ) -> ([f64; 2], [[f64; 2]; 2]) {
+        let value = |role| self.of(role).map(|place| self.value(place, at));
+        for (j, c) in [Role::C1, Role::C2].map(value).into_iter().enumerate() {
+            if let Some(c) = c {
+                e = [0, 1].map(|i| e[i] - response[i][j] / weight * c);
+            }
+        }
+        if let Some(m) = value(Role::M) {
+            response = response.map(|row| row.map(|own| own * (1.0 + m)));
+        }
+        (e, response)
     }
 
     // The ellipticity, and the response of the weighted ellipticity; `None` for a distortion without a shear.

@@ -55,7 +55,7 @@ pub fn without_sheared(catalogues: &[Input]) -> Option<String> {
     let mut files = catalogues.iter().filter(is_alone);
     let own = files.find(|own| matches!(sheared_path(&own.name), Some((0, _))))?;
     Some(format!(
-        "{} is named as the catalogue without artificial shear, and those of 1p, 1m, 2p and 2m are not given, so that nothing divides the ellipticities by their response. Try: all five files of each catalogue",
+        "nothing divides the ellipticities by their response: {} is named as the catalogue without artificial shear, and those of 1p, 1m, 2p and 2m are not given. Try: all five files of each catalogue",
         own.name.display()
     ))
 }

@@ -99,6 +99,8 @@ pub struct Source {
     has_weights: bool,
     /// Whether the size of the PSF is T = 2σ², whose square root is a size.
     pub psf_area: bool,
+    /// Why nothing divides the ellipticities by their response, if they need one.
+    pub undivided: Option<String>,
 }
 
 impl Source {
@@ -191,6 +193,16 @@ impl Source {
         }
         let sheared_weight = self.places.of((Role::Weight, 1));
         sheared.extend(sheared_weight);
+        let is_of_survey = self.columns.program() == "DES Y3" && sheared_weight.is_none();
+        if let Some(name) = self
+            .columns
+            .of(Role::Weight)
+            .filter(|_| is_of_survey && sheared.is_empty())
+        {
+            lines.push(format!(
+                "`{name}` has no sheared versions, so that its selection response is missing, whose size is unknown: m is wrong by it, because weights of DES depend on the S/N and size. Try: columns {name}_1p, {name}_1m, {name}_2p and {name}_2m"
+            ));
+        }
         if !sheared.is_empty() {
             let names: Vec<&str> = sheared.iter().map(|place| self.name(*place)).collect();
             lines.push(format!(
@@ -221,8 +233,16 @@ impl Source {
                     "e_rms² = ⟨χ²⟩/2, which contains the measurement noise. Try: --columns rms_e=NAME or sigma_e=NAME for the scatter of intrinsic shapes, with which m is lower".into()
                 }
             };
+            // A formula may contain the conversion.
+            let formula = self
+                .columns
+                .of(Role::E1)
+                .filter(|e1| self.formulas.iter().any(|own| own.text() == *e1));
+            let formula = formula.map_or(String::new(), |e1| {
+                format!(" Try: --ellipticity shear if `{e1}` is a shear already.")
+            });
             lines.push(format!(
-                "Shears from distortions: ⟨χ⟩/2ℛ with ℛ = 1 − ⟨w e_rms²⟩/⟨w⟩ (Bernstein & Jarvis 2002), {rms}. Moduli above 1 count. Try: --ellipticity distortion to convert each galaxy."
+                "Shears from distortions: ⟨χ⟩/2ℛ with ℛ = 1 − ⟨w e_rms²⟩/⟨w⟩ (Bernstein & Jarvis 2002), {rms}. Moduli above 1 count. Try: --ellipticity distortion to convert each galaxy.{formula}"
             ));
         }
         lines
@@ -648,7 +668,9 @@ pub fn needed_columns(
     let read = own.wanted.iter().map(|own| own.column.clone());
     let operands = own.formulas.iter().flat_map(Expression::columns);
     let roles = own.columns.all().map(|(_, name)| name);
-    let more = operands.chain(roles).map(str::to_owned);
+    let larger = around_patches(names).map(String::as_str);
+    let larger = larger.filter(|_| own.columns.of(Role::Unit).is_some_and(is_patch));
+    let more = operands.chain(roles).chain(larger).map(str::to_owned);
     let all: BTreeSet<String> = read.chain(more).collect();
     Ok(all
         .into_iter()
@@ -682,6 +704,12 @@ fn columns_of(
     columns.texts = texts;
     columns.texts.retain(|_, text| is_word(text));
     columns.refuse_texts_of_flags(&place.path)?;
+    if !given.is_given(Role::Unit)
+        && let Some(unit) = columns.of(Role::Unit)
+        && let Some(larger) = larger_unit(place, frame, names, unit)?
+    {
+        columns.take(Role::Unit, &larger);
+    }
     // A seed of each row is no unit of galaxies that have identifiers.
     if let (Some(unit), Some(_)) = (columns.of(Role::Unit), columns.of(Role::Id))
         && unit.eq_ignore_ascii_case("seed")
@@ -713,6 +741,22 @@ fn source(
     let mut columns = columns_of(&place, sheared, (names, frame), given)?;
     if matches!(reading.truth, Truth::Columns) && !columns.have(&[Role::G1]) {
         given.check_true_shear(path)?;
+    }
+    let in_rows = sheared.is_some() || columns.of(Role::ShearedCatalogue).is_some();
+    let calibration = [Role::M, Role::C1, Role::C2].map(|role| columns.of(role));
+    if let Some(name) = calibration.into_iter().flatten().next().filter(|_| in_rows) {
+        return Err(FileError::new(
+            path,
+            format!(
+                "`{name}`: m and c of galaxies are not applied to sheared catalogues, whose response is that of their means. Try: m=none,c1=none,c2=none in --columns"
+            ),
+        ));
+    }
+    if let Units::Column(name) = &reading.request.units {
+        columns.decline(Role::Unit);
+        if !name.is_empty() {
+            columns.take(Role::Unit, name);
+        }
     }
     let has_sheared = |name: &str| sheared_column(names, name, 1).is_some();
     let mut chosen_by = reading.chosen_by();
@@ -757,8 +801,7 @@ fn source(
         }
     }
     let unit = match &reading.request.units {
-        Units::Recognised => columns.of(Role::Unit),
-        Units::Column(name) => Some(name.as_str()).filter(|name| !name.is_empty()),
+        Units::Recognised | Units::Column(_) => columns.of(Role::Unit),
         Units::Rows | Units::Catalogues => None,
     };
     if let Some(unit) = unit {
@@ -770,6 +813,7 @@ fn source(
             Preset::Shearq => changes_with_shear(name),
             _ => !is_fixed(name, &columns) && !has_sheared(name),
         })
+        .filter(|name| !reading.request.unsheared.iter().any(|own| own == name))
         .collect();
     let selection = match columns.is_of_shearq() {
         true => wanted.add("selection", None),
@@ -798,6 +842,7 @@ fn source(
         sheared_flags,
         selects: columns.give_selection_response() && chosen && known,
         selection,
+        undivided: columns.undivided(!given.is_given(Role::R11)),
         declines_matrix: given.decline_matrix(),
         has_weights: reading.weights().is_some(),
         psf_area: columns.of(Role::PsfSize).is_some_and(|name| {
@@ -812,14 +857,57 @@ fn source(
     })
 }
 
+fn is_patch(unit: &str) -> bool {
+    unit.eq_ignore_ascii_case("patch")
+}
+
+// Columns of areas beside `patch`, whose patches may have the same names in each.
+fn around_patches(names: &[String]) -> impl Iterator<Item = &String> {
+    let areas = ["tract", "tile_id"].into_iter();
+    areas.filter_map(|area| names.iter().find(|own| own.eq_ignore_ascii_case(area)))
+}
+
+// The column of independent units that replaces `patch`: patches of LSST have the same numbers in each tract, which made errors of c
+// 0.6 times as large, and UNIONS has 7 patches of many tiles.
+fn larger_unit(
+    place: &Place,
+    frame: Option<&DataFrame>,
+    names: &[String],
+    unit: &str,
+) -> Result<Option<String>, FileError> {
+    if !is_patch(unit) {
+        return Ok(None);
+    }
+    for area in around_patches(names) {
+        let (different, _) = counted(place, frame, area)?;
+        let enough = match area.eq_ignore_ascii_case("tract") {
+            true => different > 1,
+            false => different > counted(place, frame, unit)?.0,
+        };
+        if enough {
+            return Ok(Some(area.clone()));
+        }
+    }
+    Ok(None)
+}
+
 // A column that looks like independent units. A seed of each row is none where galaxies have identifiers.
 fn unit_like(names: &[String], columns: &Columns) -> Option<String> {
+    let unit = columns.of(Role::Unit);
     let is_of_rows = |name: &str| {
         let has_id = columns.of(Role::Id).is_some() && columns.of(Role::Unit).is_none();
         has_id && name.eq_ignore_ascii_case("seed")
     };
     let mut names = names.iter();
-    let own = names.find(|name| fits_any(&recognition().patterns.unit, name) && !is_of_rows(name));
+    // Patches repeat within the unit that replaces them, and a single tract replaces none.
+    let is_tract = |name: &str| name.eq_ignore_ascii_case("tract");
+    let is_other = |name: &str| {
+        unit.is_none_or(|unit| {
+            unit != name && !is_patch(name) && !(is_patch(unit) && is_tract(name))
+        })
+    };
+    let is_like = |name: &str| fits_any(&recognition().patterns.unit, name);
+    let own = names.find(|name| is_like(name) && is_other(name) && !is_of_rows(name));
     own.cloned()
 }
 

@@ -48,7 +48,8 @@ fn is_secondary(name: &str) -> bool {
 }
 
 fn is_like_a_flag(name: &str) -> bool {
-    has_any(&recognition().patterns.flag, name)
+    let known = &recognition().patterns;
+    has_any(&known.flag, name) && !has_any(&known.no_flag, name)
 }
 
 // Whether the name of a column suggests that it states which rows are good.
@@ -96,7 +97,10 @@ impl Columns {
             self.doubtful_weights = all(&looks_like_weight);
             self.doubtful_weights.sort_by_key(|name| is_secondary(name));
         }
-        self.unused = all(&is_like_a_role);
+        let of_lensfit = found
+            .iter()
+            .any(|own| has_any(&recognition().patterns.lensfit, own));
+        self.unused = all(&|name| is_like_a_role(name) && !(of_lensfit && name == "R"));
         let is_like_no_role = |name: &str| !self.unused.iter().any(|own| own == name);
         self.unknown = all(&|name| is_like_no_role(name) && !is_harmless(name));
         self.step_size = all(&|name| has_any(&recognition().patterns.step_size, name)).pop();
@@ -129,6 +133,28 @@ impl Columns {
         lines
     }
 
+    /// Why nothing divides ellipticities without a response that need one, by the names of e1 and of columns without a role.
+    pub fn undivided(&self, may_have_response: bool) -> Option<String> {
+        let e1 = self.of(Role::E1).unwrap_or_default();
+        let mut known = recognition().ellipticity.undivided.iter();
+        if known.any(|own| own.eq_ignore_ascii_case(e1)) {
+            return Some(format!(
+                "nothing divides the ellipticities by their response: `{e1}` is one of metacalibration, metadetection or AnaCal (expected sheared catalogues, or R11 and R22). Try: the tables or rows of noshear, 1p, 1m, 2p and 2m, --columns R11=NAME,R22=NAME, or --ellipticity shear if it is calibrated"
+            ));
+        }
+        let in_capitals = &recognition().patterns.response_in_capitals;
+        let mut unused = self.unused.iter();
+        let response = unused.find(|name| {
+            let is_clear = !in_capitals.contains(name) && !is_secondary(name);
+            is_clear && is_like_a_response(name) && sheared_name(name).is_none()
+        });
+        let response = response.filter(|_| may_have_response && self.survey.is_none())?;
+        Some(format!(
+            "nothing divides the ellipticities by a response, and `{response}` looks like one. Try: {}, or --columns R11=none,R22=none if they are calibrated",
+            self.suggested(std::slice::from_ref(response))
+        ))
+    }
+
     /// Columns without a role that look like a weight or state which rows count, unless they are `read`.
     pub fn unused_choices(&self, read: &[&str]) -> Vec<&str> {
         let unused = self.unused.iter().map(String::as_str);
@@ -152,10 +178,10 @@ impl Columns {
             all.find(|name| like(name) && sheared_name(name).is_none())
         };
         match first(is_like_a_flag) {
-            Some(name) => Some(
-                self.of_good_rows(name)
-                    .unwrap_or_else(|| format!("--columns flag={name} if it is 0 in good rows")),
-            ),
+            Some(name) => Some(self.of_good_rows(name).unwrap_or_else(|| {
+                let flags = self.with_flags(name);
+                format!("--columns flag={flags} if it is 0 in good rows")
+            })),
             None => first(is_like_a_choice).map(|name| {
                 let by_text = self.of_good_rows(name);
                 by_text.unwrap_or_else(|| format!("--where {name} if it is true in good rows"))
@@ -166,23 +192,39 @@ impl Columns {
     // What m and c are without the columns of a calibration, and how these are applied: surveys divide by the weighted mean of 1 + m
     // and subtract c (Fenech Conti et al. 2017, MNRAS 467, 1627, equation 15).
     fn before_calibration(&self, unused: &[String]) -> Option<String> {
-        let name = unused.iter().find(|name| is_like_a_calibration(name))?;
+        let is_calibration =
+            |name: &&String| is_like_a_calibration(name) && !looks_like_weight(name);
+        let name = unused.iter().find(is_calibration)?;
         let own = |patterns: &[&str]| {
             let is_own = |name: &&String| patterns.iter().any(|own| words(name).ends_with(own));
             unused.iter().find(is_own)
         };
         let mut columns = Vec::new();
-        let is_shear = self.of(Role::R11).is_none() && !self.distortion;
-        if let Some(m) = own(&["_m_", "_m1_", "_m_1_"]).filter(|_| is_shear) {
+        let without_response = self.of(Role::R11).is_none();
+        let is_shear = without_response && !self.distortion;
+        let m = own(&["_m_", "_m1_", "_m_1_"]).filter(|_| without_response);
+        if let Some(m) = m {
             let other = other_component(unused, m).unwrap_or(m);
-            columns.push(format!("R11=1+{m},R22=1+{other}"));
+            columns.push(match is_shear {
+                true => format!("R11=1+{m},R22=1+{other}"),
+                false => format!("m={m}"),
+            });
         }
-        let [e1, e2] = [Role::E1, Role::E2].map(|role| self.of(role).unwrap_or_default());
-        if let Some(c1) = own(&["_c1_", "_c_1_"])
-            && let Some(c2) = other_component(unused, c1)
-            && is_shear
-        {
-            columns.push(format!("e1={e1}-{c1},e2={e2}-{c2}"));
+        let c1 = own(&["_c1_", "_c_1_"]);
+        // CFHTLenS has c2 alone.
+        let c2 = match c1 {
+            Some(c1) => other_component(unused, c1),
+            None => own(&["_c2_", "_c_2_"]),
+        };
+        let all = [("e1", "c1", Role::E1, c1), ("e2", "c2", Role::E2, c2)];
+        for (component, role, of, c) in all {
+            let Some(c) = c.filter(|_| without_response && c2.is_some()) else {
+                continue;
+            };
+            columns.push(match is_shear {
+                true => format!("{component}={}-{c}", self.of(of).unwrap_or_default()),
+                false => format!("{role}={c}"),
+            });
         }
         let remedy = match columns.is_empty() {
             true => String::new(),
@@ -196,8 +238,19 @@ impl Columns {
         ))
     }
 
+    // The flags that are used and another one, which would replace them: of DES Y6, 2 % of the rows came back.
+    fn with_flags(&self, name: &str) -> String {
+        let flags = self.flags.iter().map(String::as_str);
+        flags.chain([name]).collect::<Vec<_>>().join("+")
+    }
+
     // What chooses the good rows by the texts of a column.
     fn of_good_rows(&self, name: &str) -> Option<String> {
+        // CFHTLenS uses rows of MASK 0 and 1 (Erben et al. 2013, MNRAS 433, 2545).
+        let is_of_cfhtlens = || self.unused.iter().any(|own| own == "fitclass");
+        if name == "MASK" && is_of_cfhtlens() {
+            return Some("--where 'MASK <= 1 and fitclass == 0', which CFHTLenS uses".into());
+        }
         let text = self.texts.get(name)?;
         Some(format!(
             "--where \"{name} == 'TEXT'\" with the text of good rows (the first row has '{text}')"
@@ -214,6 +267,10 @@ impl Columns {
             1 => "if the result needs it",
             _ => "if the result needs them",
         };
+        let is_mask = |name: &str| name == "MASK" && self.of_good_rows(name).is_some();
+        if let Some(remedy) = first(&is_mask).and_then(|name| self.of_good_rows(name)) {
+            return remedy;
+        }
         let mut roles = Vec::new();
         if let Some(name) = first(&looks_like_weight) {
             roles.push(format!("w={name}"));
@@ -228,8 +285,9 @@ impl Columns {
             let other = other_component(unused, name).unwrap_or(name);
             roles.push(format!("R11={name},R22={other}"));
         }
-        if let Some(name) = first(&|name| is_like_a_flag(name) && !self.texts.contains_key(name)) {
-            roles.push(format!("flag={name}"));
+        if let Some(name) = first(&|name| is_like_a_flag(name) && self.of_good_rows(name).is_none())
+        {
+            roles.push(format!("flag={}", self.with_flags(name)));
         }
         let choice = first(&is_like_a_choice);
         let by_text = choice.and_then(|name| self.of_good_rows(name));
@@ -247,11 +305,19 @@ impl Columns {
 
 // Two columns that may be e1 and e2: a pair of components with a name of shapes.
 pub(super) fn likely_ellipticities(found: &[String]) -> String {
+    let known = &recognition().patterns;
     let pair = |name: &&String| {
-        let like = has_any(&recognition().patterns.shape, name);
-        like && other_component(found, name).is_some() && !is_like_a_role(name)
+        let other = has_any(&known.truth, name) || words(name).contains("psf");
+        !other && has_any(&known.shape, name) && other_component(found, name).is_some()
     };
-    match found.iter().find(pair) {
+    let mut pairs = found.iter().filter(pair);
+    // Ellipticities with a calibration, such as `AlphaRecalD2_e1`, if there are no others.
+    let is_e1 = |name: &&String| {
+        let words = words(name);
+        (words.contains("_e1_") || words.contains("_e_1_")) && is_like_a_calibration(name)
+    };
+    let first = pairs.clone().find(|name| !is_like_a_role(name));
+    match first.or_else(|| pairs.find(is_e1)) {
         Some(name) => format!("e1={name},e2={}", name.replace('1', "2")),
         None => "e1=NAME,e2=NAME".to_owned(),
     }
