@@ -134,6 +134,10 @@ struct Summing {
         allow_hyphen_values = true
     )]
     condition: Option<String>,
+    /// Columns of --where and --bins that shear does not change, because they were not measured on images of the galaxies, such as
+    /// a redshift of another survey.
+    #[arg(long, value_name = "NAMES", value_delimiter = ',', num_args = 1)]
+    unsheared: Vec<String>,
     /// Weight of each galaxy, a smooth formula of `snr`, `flux` and `size`, such as `snr^2 / (snr^2 + 50)`.
     #[arg(long, value_name = "FORMULA", allow_hyphen_values = true, conflicts_with_all = ["against", "ellipticity", "step"])]
     weight: Option<String>,
@@ -347,6 +351,13 @@ fn of_catalogues(arguments: &Arguments, catalogues: &[PathBuf]) -> anyhow::Resul
     };
     let shard = summing.shard.unwrap_or(Shard::WHOLE);
     let is_open = |bins: &Binning| !matches!(bins.edges, Edges::Given(_));
+    let mut of_values = summing.bins.iter().filter(|own| own.edges == Edges::Values);
+    if let (Some(_), Some(binning)) = (summing.shard, of_values.next()) {
+        let of = binning.of.text();
+        anyhow::bail!(
+            "--shard: all shards need the same bins (found a bin per value of `{of}`, which a shard may lack). Try: --bins '{of}:0.5,1.5,2.5' for numbers, or for texts sums of each bin with --where \"{of} == 'TEXT'\""
+        );
+    }
     if summing.shard.is_some() && summing.bins.iter().any(is_open) {
         anyhow::bail!(
             "--shard: all shards need the same bins (found a number of bins, expected edges). Try: --bins 'snr:5,10,20'"
@@ -369,6 +380,15 @@ fn of_catalogues(arguments: &Arguments, catalogues: &[PathBuf]) -> anyhow::Resul
         "--bins: found {} quantities, expected at most {MAX_AXES}",
         summing.bins.len()
     );
+    for name in &summing.unsheared {
+        let bins = summing.bins.iter().map(|own| &own.of);
+        let condition = selection.as_ref().and_then(|own| own.rows.as_ref());
+        let mut columns = bins.chain(condition).flat_map(Expression::columns);
+        anyhow::ensure!(
+            columns.any(|own| own == name),
+            "--unsheared: `{name}` is not used (expected a column of --where or --bins)"
+        );
+    }
     let found = expand(catalogues, truth)?;
     let request = Request {
         sign,
@@ -379,6 +399,7 @@ fn of_catalogues(arguments: &Arguments, catalogues: &[PathBuf]) -> anyhow::Resul
         }),
         paired: summing.paired,
         selection,
+        unsheared: summing.unsheared.clone(),
         design: summing.design,
         ..table.request(found)?
     };

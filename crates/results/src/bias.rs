@@ -54,6 +54,9 @@ pub struct About {
     pub response: bool,
     /// Whether rows have a response that `--columns R11=none` leaves out.
     pub response_column: bool,
+    /// Why nothing divides the ellipticities by their response, if they need one.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub undivided: Option<String>,
     /// The column of flags.
     #[serde(default)]
     pub flag: Option<String>,
@@ -240,12 +243,14 @@ fn about(reading: &Reading<'_>, all: &[Vec<Source>], first: &Source) -> About {
     let request = reading.request;
     let has_response = first.has_response() || first.shapes != Shapes::Shear;
     let mut columns = first.described(reading);
-    columns.extend(without_sheared(&request.catalogues).filter(|_| !first.has_response()));
+    let undivided = without_sheared(&request.catalogues).or_else(|| first.undivided.clone());
     let named = request.catalogues.iter().map(|input| input.name.as_path());
     let others = named.zip(all.iter().map(Vec::as_slice));
     columns.extend(unused_in_others(first, reading, others));
     let named_unit = matches!(request.units, Units::Column(_))
         || request.units == Units::Recognised && first.columns.of(Role::Unit).is_some();
+    let is_stated_unit =
+        matches!(request.units, Units::Column(_)) || request.names.is_given(Role::Unit);
     About {
         version: env!("CARGO_PKG_VERSION").into(),
         catalogues: Vec::new(),
@@ -255,9 +260,11 @@ fn about(reading: &Reading<'_>, all: &[Vec<Source>], first: &Source) -> About {
         shears: reading.truth.content(),
         response: has_response || request.shapes.is_some(),
         response_column: first.columns.have(&[Role::R11]),
+        undivided: undivided.filter(|_| !has_response && request.shapes.is_none()),
         flag: first.columns.flags.first().cloned(),
         matched: named_unit || first.columns.of(Role::Id).is_some(),
-        unit_column: first.unit_column.clone().filter(|_| !named_unit),
+        // A unit that was recognised may be smaller than another one.
+        unit_column: first.unit_column.clone().filter(|_| !is_stated_unit),
         kind: Vec::new(),
         design: request.design,
         by_key: match request.units {
@@ -587,7 +594,7 @@ impl Summed {
             all.iter().map(|catalogue| catalogue.name.clone()).collect()
         };
         if names(&self.about.catalogues) != names(&other.about.catalogues) {
-            return Err(BiasFailure::Unlike("lists of catalogues"));
+            return Err(BiasFailure::OtherLists);
         }
         if self.about.shears != other.about.shears {
             return Err(BiasFailure::Unlike("true shears in --truth, --g1 or --g2"));
@@ -776,7 +783,11 @@ impl Summed {
         let all = difference(&a.all_bins(), &b.all_bins(), 0, truth)?;
         let bins = self.bins(all, |bin| difference(a, b, bin, truth));
         let about = About {
-            program: format!("{} minus {}", self.about.program, other.about.program),
+            program: format!(
+                "{} minus {}",
+                side(&self.about, "the catalogues"),
+                side(&other.about, "those of --against")
+            ),
             measured: Vec::new(),
             ..self.about.clone()
         };
@@ -935,6 +946,17 @@ pub fn share_images(own: &[Catalogue], theirs: &[Catalogue]) -> bool {
     own.any(|image| theirs.contains(image))
 }
 
+// One side of a comparison: its first catalogue, how many more and their columns.
+fn side(about: &About, name: &str) -> String {
+    let all = &about.catalogues;
+    let first = all.first().map_or("", |own| own.name.as_str());
+    let more = match all.len() {
+        0 | 1 => String::new(),
+        count => format!(" and {} more", count - 1),
+    };
+    format!("{name} ({first}{more}; {})", about.program)
+}
+
 // Significance at which an implausible response is refused, and at which the response of e2 determines the sign of g2: one
 // of 0 exceeds it by chance in 6 of 10⁷ cases.
 const SIGNIFICANT: f64 = 5.0;
@@ -985,6 +1007,9 @@ fn are_exchanged(all: &Estimate, ratio: Option<f64>) -> bool {
 fn check_responses(about: &About, all: &Estimate) -> Result<(), BiasFailure> {
     // g2/g1 of the true shears, if it is constant.
     let (has_response, ratio, sign) = (about.response, ratio(&about.catalogues), about.sign);
+    let mut roles = about.kind.iter();
+    let e1 = roles.find_map(|(role, column)| (role == "e1").then_some(column.as_str()));
+    let e1 = e1.unwrap_or("e1");
     // 1 + m of each component: the response that remains after division by the response in the catalogue.
     let responses = ["m1", "m2"].map(|key| {
         let m = all.value(key).filter(|m| m.error.is_finite())?;
@@ -996,7 +1021,15 @@ fn check_responses(about: &About, all: &Estimate) -> Result<(), BiasFailure> {
         return Err(BiasFailure::Exchanged(found));
     }
     if is_negative(0) {
-        return Err(BiasFailure::MinusG1(found[0]));
+        let is_name = |text: &str| text.chars().all(|c| c.is_alphanumeric() || c == '_');
+        return Err(BiasFailure::MinusG1 {
+            response: found[0],
+            e1: match e1.strip_prefix('-').filter(|own| is_name(own)) {
+                Some(own) => own.to_owned(),
+                None if is_name(e1) => format!("-{e1}"),
+                None => format!("'-({e1})'"),
+            },
+        });
     }
     if is_negative(1) {
         return Err(BiasFailure::MinusG2 {

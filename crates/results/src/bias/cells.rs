@@ -109,7 +109,15 @@ impl Cells {
     /// Lower and upper edge of each quantity.
     pub fn ranges(&self, cell: usize) -> Vec<[f64; 2]> {
         let bins = self.axes.iter().zip(self.bins(cell));
-        bins.map(|(axis, bin)| [axis.edges[bin], axis.edges[bin + 1]])
+        // The upper edge of the last bin is the number above its largest value: 4.000000000000001 above 4.
+        let high = |edge: f64| {
+            let below = edge.next_down();
+            match below.to_string().len() < edge.to_string().len() {
+                true => below,
+                false => edge,
+            }
+        };
+        bins.map(|(axis, bin)| [axis.edges[bin], high(axis.edges[bin + 1])])
             .collect()
     }
 

@@ -35,6 +35,10 @@ pub enum BiasFailure {
         "{second}: it was measured on the same image as {first} (expected one catalogue of each image). Try: leave one out, or measure again if it is a copy"
     )]
     SameImage { first: String, second: String },
+    #[error(
+        "the sums are of different lists of catalogues (expected one list, of which each file has a part). Try: --shard K/N --sums FILE with the list of all catalogues, or in Python shearq.bias_sums of each list and BiasSums.merge"
+    )]
+    OtherLists,
     #[error("the sums do not belong together: they have different {0}")]
     Unlike(&'static str),
     #[error(
@@ -122,9 +126,9 @@ pub enum BiasFailure {
     )]
     Exchanged([f64; 2]),
     #[error(
-        "e1 follows minus the true g1 (found a slope of {0:.3}, expected about 1). Try: check the sign of the truth"
+        "e1 follows minus the true g1 (found a slope of {response:.3}, expected about 1). Try: --columns e1={e1} if x of the catalogue points the other way, or check the sign of the truth"
     )]
-    MinusG1(f64),
+    MinusG1 { response: f64, e1: String },
     #[error("e2 follows minus the true g2 (found a slope of {response:.3}, expected about 1). Try: {}", other_sign(*sign))]
     MinusG2 { response: f64, sign: Option<Sign> },
     #[error(

@@ -171,6 +171,10 @@ pub fn compared_table(first: &BiasResult, second: &BiasResult, difference: &Bias
 
 /// A warning if galaxies were selected or binned by what was measured on them.
 pub fn chosen_by_measurement(result: &BiasResult) -> Option<String> {
+    // Without a true shear there is no m.
+    if result.design == Design::Null {
+        return None;
+    }
     let measured = &result.about.measured;
     let column = measured.first()?;
     let all = measured.join("`, `");
@@ -303,7 +307,7 @@ pub fn of_design(result: &BiasResult) -> Vec<String> {
     let Ok(all) = result.all() else {
         return Vec::new();
     };
-    let mut lines = Vec::new();
+    let mut lines: Vec<String> = result.about.undivided.clone().into_iter().collect();
     if all.effective < FEW_EFFECTIVE * all.galaxies as f64 {
         lines.push(format!(
             "few weights dominate: {} galaxies have the information of {:.1} with equal weights (expected {:.0} or more). Errors are then not reliable. Try: another column of weights, or --columns w=none",
@@ -438,10 +442,14 @@ fn notes(result: &BiasResult) -> Vec<String> {
         ),
         units(result, all),
     ];
-    if let Some(column) = &result.about.unit_column {
-        notes.push(format!(
+    match (&result.about.unit_column, &result.about.named_unit) {
+        (Some(column), None) => notes.push(format!(
             "`{column}` looks like independent units, and is not used. Errors miss the scatter between them. Try: --units {column}"
-        ));
+        )),
+        (Some(column), Some(unit)) => notes.push(format!(
+            "`{column}` looks like independent units, too. If they are larger than those of `{unit}`, errors miss the scatter between them. Try: --units {column}"
+        )),
+        (None, _) => {}
     }
     if result.about.paired {
         notes.push(format!(
@@ -838,8 +846,18 @@ fn verdicts_in_bins(result: &BiasResult) -> Vec<String> {
         let kinds = ["not met in", "undecided in", "met in"]
             .into_iter()
             .zip(bins);
-        let parts = kinds.filter(|(_, bins)| !bins.is_empty());
-        let parts = parts.map(|(kind, bins)| {
+        let mut parts = kinds.filter(|(_, bins)| !bins.is_empty());
+        // One verdict on all bins needs no list.
+        let everywhere = || {
+            let (kind, bins) = parts.clone().next()?;
+            let (_, keys) = bins.first()?;
+            let is_only = parts.clone().count() == 1 && bins.len() > 1;
+            let is_equal = bins.iter().all(|(_, own)| own == keys);
+            (is_only && is_equal)
+                .then(|| format!("{kind} all {} ({})", bins.len(), keys.join(", ")))
+        };
+        let everywhere = everywhere();
+        let parts = parts.by_ref().map(|(kind, bins)| {
             let more = match bins.len().saturating_sub(MAX_NAMED_BINS) {
                 0 => String::new(),
                 more => format!(" and {more} more"),
@@ -850,10 +868,11 @@ fn verdicts_in_bins(result: &BiasResult) -> Vec<String> {
                 .collect();
             format!("{kind} {}{more}", first.join(", "))
         });
-        format!(
-            "In bins, {title}: {}.",
-            parts.collect::<Vec<_>>().join("; ")
-        )
+        let parts: Vec<String> = match everywhere {
+            Some(text) => vec![text],
+            None => parts.collect(),
+        };
+        format!("In bins, {title}: {}.", parts.join("; "))
     };
     lines.into_iter().map(line).collect()
 }
@@ -1001,10 +1020,16 @@ fn check_bin(checks: &mut Vec<Checked>, bin: &str, found: &Estimate, limit: &Lim
                 "|{key}| cannot be compared with its limit, because its standard error is unknown (found {value:.2e}, expected at most {:e}). Try: more catalogues or galaxies",
                 limit.limit
             ),
-            false => format!(
-                "|{key}| exceeds its limit (found {value:.2e} ± {error:.1e}, expected at most {:e} within {} standard errors)",
-                limit.limit, limit.sigma
-            ),
+            false => {
+                let within = match limit.sigma {
+                    0.0 => String::new(),
+                    sigma => format!(" within {sigma} standard errors"),
+                };
+                format!(
+                    "|{key}| exceeds its limit (found {value:.2e} ± {error:.1e}, expected at most {:e}{within})",
+                    limit.limit
+                )
+            }
         };
         checks.push(Checked {
             bin: bin.to_owned(),
