@@ -306,6 +306,7 @@ pub(crate) fn needed_columns(
         like: None,
         paired: false,
         selection,
+        unsheared: Vec::new(),
         design: None,
         units: units_of(units),
         drop_missing: false,
@@ -435,6 +436,7 @@ pub(crate) fn bias_sums(
         paired,
         selection: selection(condition, weight)
             .map_err(|fault| PyValueError::new_err(fault.to_string()))?,
+        unsheared: Vec::new(),
         design: design.map(design_of).transpose()?,
         units: units_of(units),
         drop_missing,
