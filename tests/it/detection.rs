@@ -66,6 +66,7 @@ fn catalogues_are_the_same_for_any_number_of_threads() {
 fn what_an_exposure_lacks_is_said() {
     let folder = Folder::new();
     folder.run("simulate --scenes 1 --side 400 --density 0 --constant-shear 0,0 --out empty");
+    folder.run("simulate --scenes 1 --side 600 --density 0 --constant-shear 0,0 --out large");
     let scene = "--exposure empty/scene-001.fits --psf empty/psf.fits --out out";
     folder.refuses(
         &format!("detect {scene} --threshold 12"),
@@ -80,11 +81,11 @@ fn what_an_exposure_lacks_is_said() {
         "--noise is 0.0; expected a positive number",
     );
     folder.refuses(
-        "detect --exposure empty/scene-001.fits --psf empty/scene-001.fits --out out",
-        "the PSF of 400 × 400 pixels; expected the stamp of a star",
+        "detect --exposure empty/psf.fits --psf large/scene-001.fits --noise 1 --out out",
+        "the PSF of 600 × 600 pixels; expected a square stamp of a star",
     );
     folder.refuses(
-        "detect --exposure empty/psf.fits --psf empty/psf.fits --noise 1 --out out",
-        "expected more",
+        "detect --exposure empty/psf.fits --psf empty/psf.fits --out out",
+        "the noise cannot be measured (expected an exposure with blank sky",
     );
 }

@@ -214,7 +214,7 @@ fn epochs_of_a_subfield_are_combined() {
     assert!(!folder.at("epochs/set00/catalogue-001.parquet").exists());
     write(&vec![0.0; side * side]);
     let said = folder.said(&format!("{MEASURE} zero --sets 0"));
-    let blank = "great3/image-000-1.fits: cannot measure the noise: no stamp has enough pixels that differ (expected galaxies and noise). The epoch is left out";
+    let blank = "great3/image-000-1.fits: cannot measure the noise: on no stamp are there enough pixels that differ and are not missing (expected galaxies and noise). The epoch is left out";
     assert_has(&said, blank);
     assert_eq!(snr("zero"), snr("m"));
     write(&pixels);

@@ -89,7 +89,7 @@ const CASES: [(&str, &str, Spoil, &str); 10] = [
         "no stamp to survey",
         LINEAR,
         |data| data.stamps.fill(f32::NAN),
-        "cannot measure the noise: no stamp has enough pixels that differ",
+        "cannot measure the noise: on no stamp are there enough pixels that differ",
     ),
     (
         "no stamp to survey for a network",

@@ -382,6 +382,9 @@ fn seeds_per_file(pairs: usize, count: usize) -> (Option<WithoutPartner>, f64) {
     let shears = [[GAMMA, 0.0], [-GAMMA, 0.0]];
     let (mut draw, mut alone) = (Draw::new(2 * pairs, false), 0.0);
     for pair in 0..pairs {
+        for (sign, name) in ["plus", "minus"].into_iter().enumerate() {
+            draw.catalogues[2 * pair + sign].name = format!("{name}-{pair:03}.csv");
+        }
         for _ in 0..count {
             let galaxy = galaxies.galaxy();
             let is_paired = galaxies.rng.random_range(0.0..1.0) > 0.02;

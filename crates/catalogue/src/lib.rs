@@ -18,6 +18,7 @@ pub mod failures;
 pub mod foreign;
 pub mod galaxies;
 pub mod identity;
+pub mod input;
 pub mod own_columns;
 pub mod recognition;
 pub mod request;

@@ -1,12 +1,10 @@
 //! What to read of which catalogues: the true shear, columns, selection, bins and units that the user states.
 
-use std::path::PathBuf;
-
 use shearq_bias::Design;
-use shearq_files::frames::polars::DataFrame;
 
 use crate::columns::{Names, Shapes};
 use crate::expression::Expression;
+pub use crate::input::Input;
 use crate::select::StatedSelection;
 use crate::truth::{Expanded, TrueSign, Truth};
 
@@ -16,28 +14,6 @@ pub const MAX_BINS: usize = 400;
 pub const DEFAULT_STEP: f64 = 0.01;
 /// Quantities that are binned at the same time.
 pub const MAX_AXES: usize = 3;
-
-/// A catalogue: a file, several files, or a table in memory.
-#[derive(Debug, Clone, Default)]
-pub struct Input {
-    /// The file, or the name of the table.
-    pub name: PathBuf,
-    /// The table, if it is in memory.
-    pub frame: Option<DataFrame>,
-    /// Names of the columns that the table in memory lacks because they are not read.
-    pub unread: Vec<String>,
-    /// The files of a catalogue in several, with the sheared catalogue (0 for noshear) that a file contains.
-    pub parts: Vec<(PathBuf, Option<usize>)>,
-}
-
-impl From<PathBuf> for Input {
-    fn from(name: PathBuf) -> Self {
-        Input {
-            name,
-            ..Input::default()
-        }
-    }
-}
 
 #[derive(Debug, Clone)]
 pub struct Binning {

@@ -14,8 +14,8 @@ use shearq_files::{FileError, names_of};
 use shearq_scoring::{Row, TruthSign};
 
 use crate::identity;
+use crate::input::Input;
 use crate::recognition::names_of_role;
-use crate::request::Input;
 use crate::roles::{Places, Role};
 
 #[derive(Debug, Clone, Default)]

@@ -8,7 +8,9 @@ use std::io::{Read, Seek, SeekFrom};
 use std::ops::Range;
 use std::path::Path;
 
-use polars::prelude::{ArrowDataType, ArrowField, DataFrame, NamedFrom, Series};
+use polars::prelude::{
+    ArrowDataType, ArrowField, DataFrame, DataType, NamedFrom, PolarsResult, Series,
+};
 use polars_arrow::array::{Array, DictionaryArray, FixedSizeListArray, ListArray, PrimitiveArray};
 use polars_arrow::io::ipc::read::{FileMetadata, FileReader, read_file_metadata};
 use polars_arrow::match_integer_type;
@@ -48,7 +50,10 @@ pub(crate) fn read(
         match &mut all {
             None => all = Some(batch),
             Some(all) => {
-                let joined = all.vstack_mut(&batch).map(drop);
+                let mut batch = batch;
+                let joined = widen(all, &batch)
+                    .and_then(|()| widen(&mut batch, all))
+                    .and_then(|()| all.vstack_mut(&batch).map(drop));
                 joined.map_err(|error| damaged(path, error))?;
             }
         }
@@ -57,6 +62,18 @@ pub(crate) fn read(
     let mut all = all.unwrap_or_default();
     all.rechunk_mut();
     numbers_alone(path, all, wanted.is_some())
+}
+
+// Makes columns floats that are floats in another batch, where integers are missing.
+fn widen(frame: &mut DataFrame, other: &DataFrame) -> PolarsResult<()> {
+    for column in other.columns() {
+        let own = frame.column(column.name())?;
+        if column.dtype().is_float() && own.dtype().is_integer() {
+            let floats = own.cast(&DataType::Float64)?;
+            frame.with_column(floats)?;
+        }
+    }
+    Ok(())
 }
 
 /// Reads the columns `wanted` by record batch, and gives each batch to `take`.

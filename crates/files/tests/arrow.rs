@@ -73,7 +73,6 @@ fn columns_become_what_they_become_in_parquet() {
 #[test]
 fn columns_of_other_types_are_refused_if_they_are_wanted() {
     for (name, words) in [
-        ("gap", "column `gap` has 1 missing value(s)"),
         ("day", "column `day` has type Date32"),
         ("nested", "column `nested` has type Struct"),
         ("name", "column `name` has 1 missing value(s)"),

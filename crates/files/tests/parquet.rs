@@ -227,11 +227,12 @@ fn files_of_other_writers_are_converted() {
     let beyond = reals(beyond.column("beyond").expect("it")).expect("numbers");
     assert_eq!(beyond[1], 9_223_372_036_854_775_808.0);
 
-    for (name, words) in [
-        ("gap", "column `gap` has 1 missing value(s)"),
-        ("day", "column `day` has type Date32"),
-    ] {
-        let error = parquet::read(path, Some(&[name]), MAX_ROWS).expect_err(name);
-        assert!(error.to_string().contains(words), "{error}");
-    }
+    let gap = parquet::read(path, Some(&["gap"]), MAX_ROWS).expect("readable");
+    let gap = reals(gap.column("gap").expect("it")).expect("numbers");
+    assert_eq!(gap.iter().filter(|own| own.is_nan()).count(), 1);
+    let error = parquet::read(path, Some(&["day"]), MAX_ROWS).expect_err("day");
+    assert!(
+        error.to_string().contains("column `day` has type Date32"),
+        "{error}"
+    );
 }

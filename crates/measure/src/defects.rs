@@ -97,7 +97,10 @@ impl ExposureDefects {
                 if !is_dark && !(value > floor) {
                     continue;
                 }
-                let most = most_light(part, n, at, (0.0, departure), limits);
+                let most = match is_dark {
+                    true => f32::INFINITY,
+                    false => most_light(part, n, at, (0.0, departure), limits),
+                };
                 if !is_dark && value <= most {
                     continue;
                 }
@@ -112,6 +115,10 @@ impl ExposureDefects {
             }
             if places.is_empty() {
                 break;
+            }
+            // Beside a dark pixel, means of pairs show no light.
+            if places.iter().any(|&at| part[at] < 0.0) {
+                places.retain(|&at| part[at] < 0.0);
             }
             for &at in &*places {
                 part[at] = f32::NAN;
