@@ -11,10 +11,10 @@ mod restoration;
 mod window;
 
 pub use self::deconvolution::{Lags, Light, Spectral, SpectralPsf, SpectralScratch};
+pub(crate) use self::epochs::EpochStamp;
 pub use self::noise::ModeNoise;
 pub(crate) use self::noise::NoiseChanges;
 pub(crate) use self::pixels::EpochPixels;
-pub(crate) use self::restoration::EpochStamp;
 
 #[cfg(test)]
 mod tests;
