@@ -1,7 +1,5 @@
 //! Names the commit that is built, for `shearq --version` and the origin of results.
 
-#![expect(clippy::print_stdout, reason = "cargo reads it")]
-
 use std::path::Path;
 use std::process::Command;
 

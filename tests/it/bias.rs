@@ -1272,9 +1272,10 @@ fn axes_of_a_shear_field_are_compared_and_turned() {
         for image in 1..=2 {
             let mut normal = normal(image);
             let mut text = "x,y,e1,e2,R11,R22,R12,R21\n".to_owned();
-            for k in 0..truth[0].len() {
+            let [x, y, g1, g2] = &truth;
+            let shears = g1.iter().zip(g2);
+            for ((x, y), (g1, g2)) in x.iter().zip(y).zip(shears) {
                 let [a, b] = normal.pair(1e-3);
-                let [x, y, g1, g2] = [0, 1, 2, 3].map(|of: usize| truth[of][k]);
                 let (e1, e2) = (0.8 * g1 + a, sign * (0.8 * g2 + 0.3 * g1 + b));
                 writeln!(text, "{x},{y},{e1},{e2},0.8,0.8,0,{}", sign * 0.3).unwrap();
             }

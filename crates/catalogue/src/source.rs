@@ -743,15 +743,7 @@ fn source(
         given.check_true_shear(path)?;
     }
     let in_rows = sheared.is_some() || columns.of(Role::ShearedCatalogue).is_some();
-    let calibration = [Role::M, Role::C1, Role::C2].map(|role| columns.of(role));
-    if let Some(name) = calibration.into_iter().flatten().next().filter(|_| in_rows) {
-        return Err(FileError::new(
-            path,
-            format!(
-                "`{name}`: m and c of galaxies are not applied to sheared catalogues, whose response is that of their means. Try: m=none,c1=none,c2=none in --columns"
-            ),
-        ));
-    }
+    check_calibration(path, &columns, in_rows)?;
     if let Units::Column(name) = &reading.request.units {
         columns.decline(Role::Unit);
         if !name.is_empty() {
@@ -819,17 +811,7 @@ fn source(
         true => wanted.add("selection", None),
         false => None,
     };
-    // Which of both is meant is unknown, and a file gives the first.
-    let is_twice = |own: &&Operand| names.iter().filter(|name| **name == own.column).count() > 1;
-    if let Some(twice) = wanted.all.iter().find(is_twice) {
-        return Err(FileError::new(
-            path,
-            format!(
-                "there are two columns named `{}` (expected one). Try: other names",
-                twice.column
-            ),
-        ));
-    }
+    check_twice(path, names, &wanted.all)?;
     let sheared_weight = places.of((Role::Weight, 1)).is_some();
     let chosen = reading.expressions().next().is_some() || sheared_flags || sheared_weight;
     Ok(Source {
@@ -855,6 +837,34 @@ fn source(
         place,
         columns,
     })
+}
+
+fn check_calibration(path: &Path, columns: &Columns, in_rows: bool) -> Result<(), FileError> {
+    let calibration = [Role::M, Role::C1, Role::C2].map(|role| columns.of(role));
+    if let Some(name) = calibration.into_iter().flatten().next().filter(|_| in_rows) {
+        return Err(FileError::new(
+            path,
+            format!(
+                "`{name}`: m and c of galaxies are not applied to sheared catalogues, whose response is that of their means. Try: m=none,c1=none,c2=none in --columns"
+            ),
+        ));
+    }
+    Ok(())
+}
+
+fn check_twice(path: &Path, names: &[String], wanted: &[Operand]) -> Result<(), FileError> {
+    // Which of both is meant is unknown, and a file gives the first.
+    let is_twice = |own: &&Operand| names.iter().filter(|name| **name == own.column).count() > 1;
+    if let Some(twice) = wanted.iter().find(is_twice) {
+        return Err(FileError::new(
+            path,
+            format!(
+                "there are two columns named `{}` (expected one). Try: other names",
+                twice.column
+            ),
+        ));
+    }
+    Ok(())
 }
 
 fn is_patch(unit: &str) -> bool {

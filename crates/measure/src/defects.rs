@@ -94,7 +94,7 @@ impl ExposureDefects {
             places.clear();
             for (at, &value) in part.iter().enumerate() {
                 let is_dark = value < -departure;
-                if !is_dark && !(value > floor) {
+                if !is_dark && (value.is_nan() || value <= floor) {
                     continue;
                 }
                 let most = match is_dark {

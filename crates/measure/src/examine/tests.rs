@@ -554,7 +554,8 @@ fn fast_ends_agree_with_plain_ones() {
 
 #[test]
 fn bands_and_skies_of_stamps_are_named() {
-    let kinds = |of: &dyn Fn([usize; 3], [&[f32]; 3]) -> f32| {
+    type Value<'a> = &'a dyn Fn([usize; 3], [&[f32]; 3]) -> f32;
+    let kinds = |of: Value<'_>| {
         let mut rng = ChaCha8Rng::seed_from_u64(5);
         let mut examination = Examination::new(N, 400);
         for k in 0..400 {

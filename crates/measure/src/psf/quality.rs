@@ -209,7 +209,6 @@ impl PsfQuality {
             let square = axis_power(psf, k);
             (square - pixels * sigma * sigma).max(0.0).sqrt()
         });
-        let [low, sampled, edge] = moduli;
         let offset = psf_offset(psf);
         Some(PsfQuality {
             side: n,
@@ -223,30 +222,37 @@ impl PsfQuality {
             background: level * pixels / star,
             slope: slope.map(|slope| slope / peak),
             gradient: steep * 0.5 * n as f64 * pixels / star,
-            power: sampled,
-            aliasing: {
-                let [x, y] = offset.map(|off| (2.0 * PI * (middle + off)).cos());
-                let phase = 0.5 * (x + y);
-                let filtered = axis_power(psf, FILTERED_WAVE_NUMBER);
-                let falls = filtered < MIN_ALIASED_FALL * axis_power(psf, EDGE_WAVE_NUMBER);
-                // From finer pixels, or of optics that the pixels sample: without aliases.
-                match filtered < MAX_FILTERED_POWER || phase < MAX_CORNER && falls {
-                    true => [0.0; 2],
-                    false => {
-                        // Less the noise of the transform.
-                        let least = sampled - 2.0 * sigma * n as f64;
-                        let size = aliasing([low, least, edge], phase);
-                        let most = (0.5 * (x - y)).abs().max(phase);
-                        [-phase * size, C_PER_M * size * most.max(0.0)]
-                    }
-                }
-            },
+            power: moduli[1],
+            aliasing: aliased(psf, moduli, sigma, offset.map(|off| middle + off)),
             truncation: Truncation::of(psf, 1.0),
             core: psf_core_size(psf, offset, border.mean(), sigma),
             moved,
             offset,
         })
     }
+}
+
+// What aliased light changes m by, and c by at most, from the moduli of the transform at three wave numbers, for a PSF whose centre is at
+// `place` in pixels.
+fn aliased(
+    psf: ArrayView2<'_, f64>,
+    [low, sampled, edge]: [f64; 3],
+    sigma: f64,
+    place: [f64; 2],
+) -> [f64; 2] {
+    let [x, y] = place.map(|at| (2.0 * PI * at).cos());
+    let phase = 0.5 * (x + y);
+    let filtered = axis_power(psf, FILTERED_WAVE_NUMBER);
+    let falls = filtered < MIN_ALIASED_FALL * axis_power(psf, EDGE_WAVE_NUMBER);
+    // From finer pixels, or of optics that the pixels sample: without aliases.
+    if filtered < MAX_FILTERED_POWER || phase < MAX_CORNER && falls {
+        return [0.0; 2];
+    }
+    // Less the noise of the transform.
+    let least = sampled - 2.0 * sigma * psf.nrows() as f64;
+    let size = aliasing([low, least, edge], phase);
+    let most = (0.5 * (x - y)).abs().max(phase);
+    [-phase * size, C_PER_M * size * most.max(0.0)]
 }
 
 /// The noise of a pixel of which the diffraction rings of optics have no share: `sigma` is measured on the border, and rings fall with the

@@ -428,7 +428,6 @@ fn without_partner(result: &BiasResult) -> Option<String> {
 
 const MAX_MISSING: usize = 5;
 
-#[expect(clippy::too_many_lines, reason = "one remark after the other")]
 fn notes(result: &BiasResult) -> Vec<String> {
     let Ok(all) = result.all() else {
         return Vec::new();
