@@ -29,7 +29,7 @@ def simulations():
 
 
 def test_version_and_exit_codes_are_those_of_the_binary(command):
-    assert command("--version").split() == ["shearq", shearq.__version__]
+    assert command("--version").split()[:2] == ["shearq", shearq.__version__]
     command("measure", status=2)
     command("submissions", "show", "nothing", status=1)
 

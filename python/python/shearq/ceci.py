@@ -11,7 +11,7 @@ from typing import Any
 import h5py  # type: ignore[import-untyped, unused-ignore]
 import numpy as np
 import yaml  # type: ignore[import-untyped, unused-ignore]
-from ceci import PipelineStage  # type: ignore[import-untyped, unused-ignore]
+from ceci import PipelineStage as PipelineStage  # type: ignore[import-untyped, unused-ignore]
 from ceci.config import StageParameter  # type: ignore[import-untyped, unused-ignore]
 from ceci.file_types import DataFile, FitsFile, HDFFile  # type: ignore[import-untyped, unused-ignore]
 

@@ -470,7 +470,7 @@ fn round_galaxies_on_sheared_pixels_have_no_mean_shape() {
 }
 
 #[test]
-fn a_star_that_is_larger_than_its_transform_has_the_same_detections() {
+fn stars_larger_than_their_transform_have_the_same_detections() {
     let noise = StampNoise::white(1.0);
     let settings = DetectionMethod::default();
     let wide = |side: usize| {
