@@ -7,9 +7,10 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use shearq_dataset::threads::Quiet;
 use shearq_detection::Detector;
-use shearq_measure::parts::ExposureDefects;
 use shearq_measure::{DetectionMethod, Jacobian, StampNoise};
-use shearq_pipeline::detect::{COLUMNS, PLACE, WHOLE, detect_rows, doubts, sky_level};
+use shearq_pipeline::detect::{
+    COLUMNS, PLACE, WHOLE, detect_rows, doubts, sky_level, unlit_in_words,
+};
 
 use crate::errors::{of_measuring, of_pipeline};
 use crate::work::threads;
@@ -36,7 +37,6 @@ pub(crate) fn detect<'py>(
     let jacobian = jacobian.map(Jacobian::new).transpose();
     let jacobian = jacobian.map_err(|error| PyValueError::new_err(format!("wcs: {error}")))?;
     let star = star.as_array();
-    let defects = ExposureDefects::new((&star / star.sum()).view(), noise);
     let detector = Detector::new(
         star,
         &StampNoise::white(noise),
@@ -56,14 +56,7 @@ pub(crate) fn detect<'py>(
             })
         };
         let threads = threads(threads_asked);
-        detect_rows(
-            threads,
-            &detector,
-            &defects,
-            [width, height],
-            open,
-            &mut Quiet,
-        )
+        detect_rows(threads, &detector, [width, height], open, &mut Quiet)
     });
     let (found, unlit) = found.map_err(of_pipeline)?;
     let columns = PyDict::new(py);
@@ -77,8 +70,6 @@ pub(crate) fn detect<'py>(
     }
     let level = sky_level(image.iter().copied());
     let mut doubts = doubts(star, level, noise, None);
-    doubts.extend((unlit > 0).then(|| {
-        format!("{unlit} pixels hold no light (expected a mask for cosmic rays and defects). They count as missing")
-    }));
+    doubts.extend(unlit_in_words(unlit));
     Ok((columns, doubts))
 }

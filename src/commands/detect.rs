@@ -132,16 +132,6 @@ pub(crate) fn run(arguments: &Arguments) -> anyhow::Result<()> {
         start.elapsed().as_secs_f64(),
         path.display()
     ));
-    if unlit > 0 {
-        tell(format_args!(
-            "warning: {} no light (expected a mask for cosmic rays and defects). They count as missing.",
-            if unlit == 1 {
-                "1 pixel holds".into()
-            } else {
-                format!("{unlit} pixels hold")
-            }
-        ));
-    }
     let source = if is_measured { "measured" } else { "given" };
     tell(format_args!("noise: σ = {noise:.4}, {source}"));
     if frame == Frame::Sky {

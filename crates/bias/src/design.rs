@@ -246,10 +246,11 @@ pub fn group(
     }
 }
 
-// Numbers from which a correlation is tested, and the correlation below which rows are other galaxies. The ellipticities of a
+/// Numbers from which a correlation is tested: it has an error of 0.05.
+pub(crate) const ENOUGH_TO_CORRELATE: usize = 400;
+// The correlation below which rows are other galaxies. The ellipticities of a
 // galaxy under opposite shears have its shape in common: they correlate by 0.3 if noise is 1.5 times the shapes, which is
 // three standard deviations of 400 numbers above the limit. A few rows before the first that is absent may correspond.
-const ENOUGH_TO_CORRELATE: usize = 400;
 const MIN_CORRELATION: f64 = 0.15;
 
 // Catalogues of one group under opposite shears.

@@ -1,6 +1,9 @@
 //! Whether two measurements are of the same galaxies.
 
+use shearq_quantities::statistics::upper_median;
+
 use crate::arms::{Unit, Units};
+use crate::design::ENOUGH_TO_CORRELATE;
 use crate::sums::{Layout, WEIGHT, add};
 
 /// What the units of two measurements have in common.
@@ -15,9 +18,7 @@ pub struct Overlap {
 
 // Below it most units have no partner, whatever a changed code flags. Chosen by hand.
 const MIN_SHARED: f64 = 0.5;
-// Numbers from which the correlation has an error of 0.05, and the value below which galaxies are different ones: noise of
-// 1.5 times the shapes leaves 0.19.
-const ENOUGH_TO_CORRELATE: usize = 400;
+// The value below which galaxies are different ones: noise of 1.5 times the shapes leaves 0.19.
 const MIN_CORRELATION: f64 = 0.1;
 
 impl Overlap {
@@ -78,11 +79,7 @@ fn of_unit(layout: Layout, unit: &Unit<'_>) -> (f64, [f64; 2]) {
 fn signs(pairs: &[[f64; 2]]) -> Vec<f64> {
     let median = |side: usize| {
         let mut all: Vec<f64> = pairs.iter().map(|pair| pair[side]).collect();
-        let middle = all.len() / 2;
-        match all.is_empty() {
-            true => 0.0,
-            false => *all.select_nth_unstable_by(middle, f64::total_cmp).1,
-        }
+        upper_median(&mut all).unwrap_or(0.0)
     };
     let [a, b] = [median(0), median(1)];
     let products = pairs.iter().map(|pair| (pair[0] - a) * (pair[1] - b));

@@ -3,9 +3,9 @@
 use std::borrow::Cow;
 use std::path::Path;
 
-use shearq_files::FileError;
 use shearq_files::frames::polars::DataFrame;
 use shearq_files::table;
+use shearq_files::{FileError, MAX_EXACT_INTEGER};
 use thiserror::Error;
 
 #[derive(Debug, Clone, PartialEq, Eq, Error)]
@@ -35,7 +35,7 @@ pub struct Expression {
 }
 
 /// What an expression reads in each row: the number in a column, or what the text in it is compared with.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Operand {
     pub column: String,
     pub texts: Option<Texts>,
@@ -68,9 +68,13 @@ impl Operand {
     fn of_column(column: &str) -> Self {
         Operand {
             column: column.to_owned(),
-            texts: None,
-            mask: None,
+            ..Operand::default()
         }
+    }
+
+    // Whether it is the number of the column itself.
+    fn is_plain(&self) -> bool {
+        self.texts.is_none() && self.mask.is_none()
     }
 
     /// The value where the column has a number.
@@ -168,12 +172,9 @@ fn truth(of: bool) -> f64 {
     f64::from(u8::from(of))
 }
 
-// Floats have all integers below it.
-const EXACT: f64 = (1u64 << 53) as f64;
-
 // The bits that two whole numbers have in common, as numpy's `&`. NaN of numbers that are not whole, or whose bits are lost.
 fn common_bits(a: f64, b: f64) -> f64 {
-    let is_whole = |own: f64| own.fract() == 0.0 && own.abs() < EXACT;
+    let is_whole = |own: f64| own.fract() == 0.0 && own.abs() < MAX_EXACT_INTEGER;
     match is_whole(a) && is_whole(b) {
         true => (a as i64 & b as i64) as f64,
         false => f64::NAN,
@@ -214,9 +215,8 @@ impl Expression {
         Expression {
             text: column.to_owned(),
             operands: vec![Operand {
-                column: column.to_owned(),
                 texts: Some(Texts::List(texts)),
-                mask: None,
+                ..Operand::of_column(column)
             }],
             root: Node::Operand(0),
             sharp: true,
@@ -227,16 +227,7 @@ impl Expression {
     /// The column, if the expression is nothing else.
     pub fn column(&self) -> Option<&str> {
         match (&self.root, &self.operands[..]) {
-            (
-                Node::Operand(0),
-                [
-                    Operand {
-                        column,
-                        texts: None,
-                        mask: None,
-                    },
-                ],
-            ) => Some(column),
+            (Node::Operand(0), [own]) if own.is_plain() => Some(&own.column),
             _ => None,
         }
     }
@@ -431,13 +422,14 @@ impl<'a> Parser<'a> {
             let inner = self.nested(|parser| parser.level(level))?;
             return Ok(Node::Unary(NOT, Box::new(inner)));
         }
+        let first = self.operands.len();
         let mut node = self.level(level + 1)?;
         while let Some(operator) = operators.iter().find(|(token, _)| self.take(token)) {
             // The loosest three levels compare, and bits jump.
             self.sharp |= level <= COMPARISONS + 1;
             let right = self.level(level + 1)?;
             node = match operator.0 {
-                "&" => self.masked(operator, node, right),
+                "&" => self.masked(operator, node, right, first),
                 _ => Node::Binary(operator, Box::new(node), Box::new(right)),
             };
             // `5 < snr < 10` would compare a truth with 10, and `snr > 10 & size > 2` the bits of 10.
@@ -466,22 +458,23 @@ impl<'a> Parser<'a> {
         negates
     }
 
-    // The bits that a column and a number have in common, or those of other expressions.
-    fn masked(&mut self, operator: &'static Binary, a: Node, b: Node) -> Node {
+    // The bits that a column and a number have in common, or those of other expressions. Operands from `first` on are those of `a` and `b`.
+    fn masked(&mut self, operator: &'static Binary, a: Node, b: Node, first: usize) -> Node {
         let (place, mask) = match (&a, &b) {
             (Node::Operand(place), Node::Number(mask))
             | (Node::Number(mask), Node::Operand(place)) => (*place, *mask),
             _ => return Node::Binary(operator, Box::new(a), Box::new(b)),
         };
         let own = self.operands[place].clone();
-        let is_plain = own == Operand::of_column(&own.column);
-        match is_plain && mask.fract() == 0.0 && mask.abs() < EXACT {
-            true => self.operand(Operand {
-                mask: Some(mask as i64),
-                ..own
-            }),
-            false => Node::Binary(operator, Box::new(a), Box::new(b)),
+        if !own.is_plain() || mask.fract() != 0.0 || mask.abs() >= MAX_EXACT_INTEGER {
+            return Node::Binary(operator, Box::new(a), Box::new(b));
         }
+        // The number itself is not read for its bits alone.
+        self.operands.truncate(place.max(first));
+        self.operand(Operand {
+            mask: Some(mask as i64),
+            ..own
+        })
     }
 
     // Compares a column with the text in quotation marks that follows, if one does.
@@ -722,7 +715,7 @@ fn bits<'f>(
         return Ok(signed.map(common).collect());
     }
     let numbers = table::numbers(frame, name, path)?;
-    if let Some(large) = numbers.iter().find(|own| own.abs() >= EXACT) {
+    if let Some(large) = numbers.iter().find(|own| own.abs() >= MAX_EXACT_INTEGER) {
         return Err(FileError::new(
             path,
             format!(
@@ -757,6 +750,15 @@ mod tests {
         assert_eq!(value("8 - 2 - 1", &[]), 5.0);
         // Of formulas; of a column, the integers of its table are used.
         assert_eq!(value("flag + 0 & 4 == 0", &[13.0]), 0.0);
+        // The number itself is read where something else needs it.
+        for (text, columns) in [
+            ("flag & 4 == 0", 1),
+            ("flag == 3 or 4 & flag", 2),
+            ("flag & 4 or flag & 8", 2),
+        ] {
+            let found = Expression::parse(text).unwrap();
+            assert_eq!(found.operands().len(), columns, "{text}");
+        }
         assert_eq!(
             value("flag & (3 + 8) == 8 and (flag*1) & 2 == 0", &[12.0]),
             1.0

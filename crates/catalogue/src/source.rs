@@ -515,8 +515,7 @@ impl Wanted<'_> {
         }
         let operand = Operand {
             column: name.to_owned(),
-            texts: like.and_then(|own| own.texts.clone()),
-            mask: like.and_then(|own| own.mask),
+            ..like.cloned().unwrap_or_default()
         };
         let known = self.all.iter().position(|own| *own == operand);
         Some(known.unwrap_or_else(|| {

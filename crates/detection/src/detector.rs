@@ -2,7 +2,7 @@
 
 use multiversion::multiversion;
 use ndarray::ArrayView2;
-use shearq_measure::parts::gaussian_sigma;
+use shearq_measure::parts::{ExposureDefects, gaussian_sigma};
 use shearq_measure::{MeasureError, StampNoise};
 use shearq_quantities::fourier::Complex64;
 use shearq_quantities::{Jacobian, PixelShape, Spin2};
@@ -39,6 +39,7 @@ pub struct Detector {
     /// That of v₀, and those of the neighbours if they are between pixels.
     light_filters: Vec<Vec<Complex64>>,
     turn: Spin2,
+    defects: ExposureDefects,
 }
 
 /// Buffers of a thread.
@@ -49,6 +50,9 @@ pub struct DetectionScratch {
     /// Smoothed light of both blocks, and that of the neighbours.
     maps: Vec<Vec<Complex64>>,
     transform: Vec<Complex64>,
+    defects: ExposureDefects,
+    /// Places of defects in a block.
+    places: Vec<usize>,
 }
 
 /// A part of an exposure: two blocks, one below the other.
@@ -142,6 +146,7 @@ impl Detector {
             of_psf,
             transform,
             turn,
+            defects: ExposureDefects::new(star.view(), noise.sigma()),
         })
     }
 
@@ -153,7 +158,30 @@ impl Detector {
             spectrum: vec![Complex64::default(); pixels],
             maps: vec![vec![Complex64::default(); pixels]; self.light_filters.len()],
             transform: vec![Complex64::default(); self.transform.scratch()],
+            defects: self.defects.clone(),
+            places: Vec::new(),
         }
+    }
+
+    /// Makes the pixels of a tile missing (NaN) that hold no light, whatever galaxies there are. Returns how many of them are in the middle,
+    /// which no other tile has. `pixels` are as for [`Detector::detect`], row by row.
+    pub fn remove_unlit(&self, pixels: &mut [f32], scratch: &mut DetectionScratch) -> usize {
+        let (side, inner, outer) = (self.transform.side, self.inner(), self.outer());
+        let DetectionScratch {
+            defects, places, ..
+        } = scratch;
+        let mut count = 0;
+        for first in [0, inner * side] {
+            places.clear();
+            defects.remove(&mut pixels[first..first + side * side], side, places);
+            let is_in_middle = |place: &&usize| {
+                let at = *place + first;
+                let middle = outer..outer + inner;
+                middle.contains(&(at % side)) && (outer..outer + 2 * inner).contains(&(at / side))
+            };
+            count += places.iter().filter(is_in_middle).count();
+        }
+        count
     }
 
     /// Distance in pixels from an edge or a missing pixel, along either axis, within which no pixel has a weight. It does not depend
@@ -229,6 +257,7 @@ impl Detector {
             spectrum,
             maps,
             transform,
+            ..
         } = scratch;
         for (at, value) in image.iter_mut().enumerate() {
             // Filters of real kernels leave the blocks apart.

@@ -37,6 +37,13 @@ struct Factor {
     slopes: [f64; 2],
 }
 
+impl Factor {
+    const ONE: Factor = Factor {
+        value: 1.0,
+        slopes: [0.0; 2],
+    };
+}
+
 /// A wave vector in the coordinates of [`PixelShape::map`], with its products.
 #[derive(Clone, Copy)]
 struct Wave {
@@ -75,12 +82,13 @@ impl Wave {
         [light * factor.value, change(0), change(1)]
     }
 
+    /// The filter of v₀, and those of its changes.
+    fn light(&self, lengths: &Lengths) -> [Complex64; 3] {
+        self.filters(Factor::ONE, lengths.detection_sigma, [0.0; 2])
+    }
+
     /// The filters of all functionals, each with those of its changes.
     fn all(&self, lengths: &Lengths) -> [[Complex64; 3]; COUNT] {
-        let one = Factor {
-            value: 1.0,
-            slopes: [0.0; 2],
-        };
         let (sigma, scale) = (lengths.moment_sigma, -lengths.moment_sigma.powi(2));
         // (k_x ∂_x − k_y ∂_y) of k_x² − k_y² is 2k², and so is (k_y ∂_x + k_x ∂_y) of 2 k_x k_y; the others vanish.
         let moment = |component: usize| {
@@ -90,13 +98,13 @@ impl Wave {
             self.filters(Factor { value, slopes }, sigma, [0.0; 2])
         };
         let mut out = [[Complex64::default(); 3]; COUNT];
-        let centre = self.filters(one, lengths.detection_sigma, [0.0; 2]);
+        let centre = self.light(lengths);
         out[LIGHT] = centre;
         for (j, at) in lengths.neighbours().into_iter().enumerate() {
-            let beside = self.filters(one, lengths.detection_sigma, at);
+            let beside = self.filters(Factor::ONE, lengths.detection_sigma, at);
             out[EXCESS + j] = [0, 1, 2].map(|k| centre[k] - beside[k]);
         }
-        out[M00] = self.filters(one, sigma, [0.0; 2]);
+        out[M00] = self.filters(Factor::ONE, sigma, [0.0; 2]);
         (out[M22], out[M22 + 1]) = (moment(0), moment(1));
         out
     }
@@ -226,7 +234,7 @@ pub(crate) fn light_filters(
     let pixels_inverse = 1.0 / (transform.side * transform.side) as f64;
     let mut filter = inverse_transfer(star, transform);
     for (value, k) in filter.iter_mut().zip(transform.waves()) {
-        *value *= pixels_inverse * Wave::new(k, pixels).all(lengths)[LIGHT][0];
+        *value *= pixels_inverse * Wave::new(k, pixels).light(lengths)[0];
     }
     let mut filters = vec![filter];
     if !pixels.is_square() {

@@ -10,8 +10,8 @@ use polars::prelude::{
     IntoSeries, NamedFrom, PolarsNumericType, PolarsResult, Series,
 };
 
-use crate::FileError;
 use crate::frames::{element_name, element_of, reals};
+use crate::{FileError, MAX_EXACT_INTEGER};
 
 // Longest vector that becomes one column per number.
 pub(crate) const MAX_VECTOR: usize = 8;
@@ -222,9 +222,6 @@ pub(crate) fn numbers_alone(
     Ok(table.drop_many(texts))
 }
 
-// Floats have all integers below it.
-const EXACT: f64 = (1u64 << 53) as f64;
-
 /// The column, in which missing numbers are NaN: one of integers with missing ones becomes one of floats.
 pub(crate) fn with_missing(path: &Path, column: Series) -> Result<Column, FileError> {
     let name = column.name().to_string();
@@ -235,7 +232,7 @@ pub(crate) fn with_missing(path: &Path, column: Series) -> Result<Column, FileEr
         (count, _) => {
             let column = Column::from(column);
             let numbers = reals(&column);
-            let exact = numbers.filter(|all| !all.iter().any(|own| own.abs() >= EXACT));
+            let exact = numbers.filter(|all| !all.iter().any(|own| own.abs() >= MAX_EXACT_INTEGER));
             return match exact {
                 Some(numbers) => Ok(Column::new(name.into(), numbers.into_owned())),
                 None => Err(FileError::new(

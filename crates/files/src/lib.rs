@@ -24,6 +24,8 @@ pub mod text;
 
 /// Most rows of a table that may fill the largest grid, of 4000 × 4000 cells.
 pub const MAX_ROWS: usize = 4000 * 4000;
+/// 2⁵³: all integers up to it are 64-bit floats.
+pub const MAX_EXACT_INTEGER: f64 = 9_007_199_254_740_992.0;
 /// Most pixels per side of an image.
 // Chosen by hand. A damaged header cannot ask for memory beyond it.
 pub(crate) const MAX_SIDE: usize = 200_000;

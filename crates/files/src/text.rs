@@ -11,7 +11,7 @@ use crate::frames::polars::{Column, DataFrame};
 
 use crate::content::GZIP_MAGIC;
 use crate::open;
-use crate::{FileError, names_of};
+use crate::{FileError, MAX_EXACT_INTEGER, names_of};
 
 // Columns of a GREAT10 catalogue, an ASCII table without a header.
 pub(super) const CHALLENGE_COLUMNS: [&str; 4] = ["x", "y", "e1", "e2"];
@@ -497,9 +497,6 @@ impl Values {
         true
     }
 }
-
-// 2⁵³: all integers up to it are 64-bit floats.
-const MAX_EXACT_INTEGER: f64 = 9_007_199_254_740_992.0;
 
 impl<'a> Rows<'a> {
     fn new(path: &'a Path, request: &Request<'_>, names: &'a [String]) -> Result<Self, FileError> {

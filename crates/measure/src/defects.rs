@@ -84,8 +84,7 @@ impl ExposureDefects {
         let limits = &self.limits;
         let departure = MIN_DEPARTURE * self.noise;
         let floor = departure * limits.noise[0];
-        let known = |part: &[f32]| part.iter().map(|value| value.is_finite()).collect();
-        let before: Vec<bool> = known(part);
+        let before: Vec<bool> = part.iter().map(|value| value.is_finite()).collect();
         self.defects
             .remove_repeated(part, n, Screening::of(part, n));
         remove_infinite(part);
@@ -124,8 +123,7 @@ impl ExposureDefects {
                 part[at] = f32::NAN;
             }
         }
-        let after: Vec<bool> = known(part);
-        found.extend((0..part.len()).filter(|&at| before[at] && !after[at]));
+        found.extend((0..part.len()).filter(|&at| before[at] && part[at].is_nan()));
     }
 }
 

@@ -20,7 +20,6 @@ use shearq_files::FileError;
 use shearq_files::frames::frame;
 use shearq_files::frames::polars::{Column, DataFrame, PolarsResult};
 use shearq_files::table::{self, FileFormat, Place};
-use shearq_measure::parts::ExposureDefects;
 use shearq_measure::{Examination, MeasureError, NoisePlan, PixelFrame, StampNoise};
 use shearq_quantities::statistics::upper_median;
 use shearq_quantities::{Frame, Jacobian};
@@ -113,12 +112,23 @@ pub fn sky_level(pixels: impl ExactSizeIterator<Item = f32>) -> Option<f64> {
     upper_median(&mut finite.map(f64::from).collect::<Vec<_>>())
 }
 
-/// Detects galaxies on an exposure behind `star`, and counts the pixels that hold no light. `open` is called in another thread and
+/// What is said of pixels that hold no light.
+pub fn unlit_in_words(count: usize) -> Option<String> {
+    let pixels = match count {
+        0 => return None,
+        1 => "1 pixel holds".to_owned(),
+        count => format!("{count} pixels hold"),
+    };
+    Some(format!(
+        "{pixels} no light (expected a mask for cosmic rays and defects). They count as missing"
+    ))
+}
+
+/// Detects galaxies on an exposure, and counts the pixels that hold no light. `open` is called in another thread and
 /// returns a function that reads a number of rows. Progress is in pixels.
 pub fn detect_rows<R: FnMut(usize) -> Result<Vec<f32>, PipelineError>>(
     threads: usize,
     detector: &Detector,
-    defects: &ExposureDefects,
     [width, height]: [usize; 2],
     open: impl FnOnce() -> Result<R, PipelineError> + Send,
     progress: &mut dyn Progress,
@@ -153,11 +163,11 @@ pub fn detect_rows<R: FnMut(usize) -> Result<Vec<f32>, PipelineError>>(
             }
             Ok(())
         },
-        || (detector.scratch(), Vec::new(), defects.clone()),
-        |(scratch, pixels, defects), (band, tile, is_last)| {
+        || (detector.scratch(), Vec::new()),
+        |(scratch, pixels), (band, tile, is_last)| {
             copy_tile(&band, width, &tile, pixels);
             let [columns, rows] = tile.sides;
-            let unlit = remove_unlit(pixels, &tile, defects);
+            let unlit = detector.remove_unlit(pixels, scratch);
             let view = ArrayView2::from_shape((rows, columns), pixels).expect("as many as copied");
             let mut found = Vec::new();
             detector.detect(&tile, view, scratch, &mut found)?;
@@ -179,27 +189,6 @@ pub fn detect_rows<R: FnMut(usize) -> Result<Vec<f32>, PipelineError>>(
         },
     )?;
     Ok((found.finish(), unlit))
-}
-
-// Makes the pixels of both blocks of a tile missing that hold no light. Returns how many of them are in the middle, which no other tile has.
-fn remove_unlit(pixels: &mut [f32], tile: &Tile, defects: &mut ExposureDefects) -> usize {
-    let [side, rows] = tile.sides;
-    let margin = side - (rows - side);
-    let middle = |place: &usize| {
-        let [x, y] = [place % side, place / side];
-        (margin / 2..side - margin / 2).contains(&x) && (margin / 2..rows - margin / 2).contains(&y)
-    };
-    let mut places = Vec::new();
-    let mut count = 0;
-    for first in [0, (rows - side) * side] {
-        places.clear();
-        defects.remove(&mut pixels[first..first + side * side], side, &mut places);
-        count += places
-            .iter()
-            .filter(|place| middle(&(*place + first)))
-            .count();
-    }
-    count
 }
 
 /// Rows of an exposure that overlap.
@@ -328,11 +317,13 @@ impl DetectionTask<'_> {
             MeasureError::Noise(_) => exposure.origin.fault(&error.to_string()),
             _ => FileError::new(&self.psf.paths[0], error),
         })?;
-        let defects = ExposureDefects::new((&star / star.sum()).view(), noise.sigma());
+        let path = run.catalogue(out, id.set, id.image);
+        let print = of_image(&Place::of(&self.exposure.paths[0]).path)?;
+        refuse_other(&path, run.format, &print)?;
         let missing = AtomicUsize::new(0);
         let mut progress = start((sides[0] * sides[1]) as u64);
         let open = || self.open(&missing);
-        let found = detect_rows(threads, &detector, &defects, sides, open, progress.as_mut());
+        let found = detect_rows(threads, &detector, sides, open, progress.as_mut());
         drop(progress);
         let (found, unlit) = found.map_err(|error| match error {
             PipelineError::Measure(error) => exposure.origin.fault(&error.to_string()).into(),
@@ -342,11 +333,8 @@ impl DetectionTask<'_> {
             return Err(exposure.origin.fault("no galaxy was detected (expected some). Try: a lower --threshold, or check --noise").into());
         }
         let frame = jacobian.map_or(Frame::Pixel, |_| Frame::Sky);
-        let path = run.catalogue(out, id.set, id.image);
-        let print = of_image(&Place::of(&self.exposure.paths[0]).path)?;
-        let claim = run.claim(out)?;
-        refuse_other(&path, run.format, &print)?;
-        claim.check()?;
+        // Not before: a folder that a failed detection has claimed would refuse its remedies.
+        let _claim = run.claim(out)?;
         let columns = self::columns(&found, &wcs);
         let columns = columns.map_err(|error| FileError::new(&path, error))?;
         let mut prints = BTreeMap::new();
@@ -375,7 +363,13 @@ impl DetectionTask<'_> {
             (Frame::Pixel, None) => {}
         }
         table::write(&path, run.format, &columns, &metadata)?;
-        let level = sky_level(sample.concat().into_iter());
+        let mut doubts = doubts(
+            star.view(),
+            sky_level(sample.iter().copied()),
+            noise.sigma(),
+            known,
+        );
+        doubts.extend(unlit_in_words(unlit));
         Ok(Detected {
             detections: found.len(),
             weight: found.iter().map(|own| own.weight).sum(),
@@ -384,7 +378,7 @@ impl DetectionTask<'_> {
             is_measured: stated.is_none(),
             frame,
             missing: missing.into_inner(),
-            doubts: doubts(star.view(), level, noise.sigma(), known),
+            doubts,
             unlit,
         })
     }
@@ -489,8 +483,8 @@ fn refuse_other(path: &Path, format: FileFormat, print: &str) -> Result<(), File
     }
 }
 
-// Stamps of a grid over the exposure.
-fn sample(exposure: &mut Exposure<'_>, sides: [usize; 2]) -> Result<Vec<Vec<f32>>, PipelineError> {
+// Stamps of a grid over the exposure, one after the other.
+fn sample(exposure: &mut Exposure<'_>, sides: [usize; 2]) -> Result<Vec<f32>, PipelineError> {
     let places = |side: usize| {
         let step = (side / NOISE_GRID).max(NOISE_STAMP);
         (step / 2..side).step_by(step)
@@ -499,7 +493,7 @@ fn sample(exposure: &mut Exposure<'_>, sides: [usize; 2]) -> Result<Vec<Vec<f32>
     for y in places(sides[1]) {
         for x in places(sides[0]) {
             let place = (x as f64 + 0.5, y as f64 + 0.5);
-            stamps.push(exposure.square::<f32>(place, NOISE_STAMP)?);
+            stamps.extend(exposure.square::<f32>(place, NOISE_STAMP)?);
         }
     }
     Ok(stamps)
@@ -509,12 +503,9 @@ fn unmeasured(exposure: &Exposure<'_>) -> FileError {
     exposure.origin.fault("the noise cannot be measured (expected an exposure with blank sky between the galaxies). Try: --noise SIGMA")
 }
 
-fn measured_noise(
-    exposure: &Exposure<'_>,
-    stamps: &[Vec<f32>],
-) -> Result<StampNoise, PipelineError> {
+fn measured_noise(exposure: &Exposure<'_>, stamps: &[f32]) -> Result<StampNoise, PipelineError> {
     let mut survey = NoisePlan::new(NOISE_STAMP, MAX_LAG, None)?.survey();
-    for stamp in stamps {
+    for stamp in stamps.chunks_exact(NOISE_STAMP * NOISE_STAMP) {
         if let Ok(stamp) = ArrayView2::from_shape((NOISE_STAMP, NOISE_STAMP), stamp) {
             survey.add(stamp)?;
         }
@@ -647,7 +638,6 @@ mod tests {
         let noise = StampNoise::white(1.0);
         let detector = Detector::new(star.view(), &noise, None, &settings).unwrap();
         let unlit = |image: &Array2<f32>| {
-            let defects = ExposureDefects::new(star.view(), 1.0);
             let open = || {
                 let mut rows = image.rows().into_iter();
                 Ok(move |count: usize| Ok(rows.by_ref().take(count).flatten().copied().collect()))
@@ -655,7 +645,6 @@ mod tests {
             detect_rows(
                 2,
                 &detector,
-                &defects,
                 [SIDE, SIDE],
                 open,
                 &mut shearq_dataset::threads::Quiet,

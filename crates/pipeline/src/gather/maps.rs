@@ -1,7 +1,7 @@
 //! Masks and variances of pixels.
 
-use shearq_files::FileError;
 use shearq_files::table::Place;
+use shearq_files::{FileError, MAX_EXACT_INTEGER};
 use shearq_quantities::statistics::upper_median;
 
 use super::files::{Content, Origin};
@@ -100,9 +100,6 @@ fn is_outside(at: usize, side: usize) -> bool {
     x.hypot(y) > radius
 }
 
-// Masks are read in double precision, which has no lower bits beside a bit from here on.
-const FIRST_LOST_BIT: f64 = (1u64 << 53) as f64;
-
 // Makes the pixels of a stamp missing whose `mask` is not zero, or has one of these bits. Returns their number.
 pub(crate) fn lose(pixels: &mut [f32], mask: &[f64], bits: Option<u64>) -> Result<usize, String> {
     let mut lost = 0;
@@ -114,7 +111,8 @@ pub(crate) fn lose(pixels: &mut [f32], mask: &[f64], bits: Option<u64>) -> Resul
                         "the mask has the value {mask}; expected whole numbers, of which --mask-bits takes bits"
                     ));
                 }
-                if mask.abs() >= FIRST_LOST_BIT {
+                // Masks are read in double precision, which has no low bits beside such a one.
+                if mask.abs() >= MAX_EXACT_INTEGER {
                     return Err(format!(
                         "the mask has the value {mask:e}, but --mask-bits reads bits 0 to 52 only (expected values below 2^53). Try: a mask of 32-bit integers with the bits that are needed, as `mask & 0x7fffffff`"
                     ));
