@@ -421,4 +421,27 @@ mod tests {
             }
         }
     }
+
+    #[test]
+    fn a_star_that_is_round_on_the_sky_has_the_same_power_if_it_is_turned() {
+        let pixels = PixelShape {
+            stretch: 1.1,
+            skew: 0.2,
+        };
+        let star = Array2::from_shape_fn((48, 48), |(y, x)| {
+            let [u, v] = pixels.map([x as f64 - 23.5, y as f64 - 23.5]);
+            (-0.5 * (u * u + v * v) / 3.0).exp()
+        });
+        let transform = SquareTransform::new(64);
+        let turned = turned_powers(star.view(), pixels, &transform);
+        for (k, (other, found)) in transform.waves().zip(turned) {
+            let [own, other] = [k, other].map(|k| Wave::new(k, pixels));
+            close(other.square, own.square, 1e-12);
+            close(own.k[0] * other.k[0] + own.k[1] * other.k[1], 0.0, 1e-12);
+            if own.square < 2.0 {
+                // That of a Gaussian of 3 px²; aliases are fainter by 10⁻⁵.
+                close(found / (3.0 * own.square).exp(), 1.0, 1e-4);
+            }
+        }
+    }
 }
