@@ -126,8 +126,14 @@ def test_options_are_set_on_the_command_line(catalogue, tmp_path):
     (tmp_path / "config.yml").write_text("{}")
     output = tmp_path / "bias.json"
     arguments = ["ShearBias", f"--shear_catalog={catalogue}", f"--shear_bias={output}", f"--config={tmp_path / 'config.yml'}"]
-    arguments += ["--g1=0.02", "--g2=0", "--step=0.02", "--columns=e1=e1,e2=e2", "--drop_missing"]
+    arguments += ["--g1=0.02", "--g2=0", "--step=0.02", "--columns=e1=e1, e2=e2", "--drop_missing"]
     made = ShearBias(ShearBias.parse_command_line(arguments))
     made.run()
     made.finalize()
     assert json.loads(output.read_text())["made_by"]["settings"]["columns"] == {"e1": "e1", "e2": "e2"}
+
+
+def test_columns_are_roles_with_names(catalogue, tmp_path):
+    made, _ = stage(ShearBias, tmp_path, "ShearBias: {g1: 0.02, g2: 0, columns: e1}", shear_catalog=catalogue)
+    with pytest.raises(ValueError, match="columns: found 'e1'; expected ROLE=COLUMN"):
+        made.run()

@@ -27,7 +27,8 @@ impl Overlap {
         self.shared >= MIN_SHARED
     }
 
-    /// Whether units with the same name contain the same galaxies, so that paired errors are right.
+    /// Whether most galaxies are in units that both have, and their ellipticities do not show that they are others. Paired errors are
+    /// then right.
     pub fn is_of_same_galaxies(&self) -> bool {
         self.is_shared() && self.correlation.is_none_or(|own| own >= MIN_CORRELATION)
     }
@@ -40,8 +41,12 @@ impl Units {
         let pairs = Units::pairs(&sides, 0);
         let (mut all, mut shared) = (0.0, 0.0);
         let mut numbers: [Vec<[f64; 2]>; 2] = Default::default();
-        for [a, b] in &pairs {
-            let own = [a, b].map(|unit| unit.as_ref().map(|unit| of_unit(self.layout(), unit)));
+        for pair in &pairs {
+            // Sums of one side alone may have the PSF or sheared catalogues.
+            let own = [0, 1].map(|side| {
+                let unit = pair[side].as_ref()?;
+                Some(of_unit(sides[side].layout(), unit))
+            });
             let galaxies: f64 = own.iter().flatten().map(|(count, _)| count).sum();
             all += galaxies;
             let [Some((_, a)), Some((_, b))] = own else {
@@ -99,13 +104,19 @@ mod tests {
     }
 
     fn units(galaxies: std::ops::Range<u64>, shift: u64, factor: f64) -> Units {
-        let mut sums = UnitSums::new(Layout::default(), 1, 1);
+        units_of(Layout::default(), galaxies, shift, factor)
+    }
+
+    fn units_of(layout: Layout, galaxies: std::ops::Range<u64>, shift: u64, factor: f64) -> Units {
+        let mut sums = UnitSums::new(layout, 1, 1);
         for galaxy in galaxies {
             let e = shape(galaxy);
+            let response = 1.0 + 0.1 * shape(galaxy + 2_000_000 + shift);
             let row = Row {
                 e: [factor * e, factor * shape(galaxy + 1_000_000)],
                 weight: 1.0,
-                response: [[1.0, 0.0], [0.0, 1.0]],
+                g: [0.02, 0.02],
+                response: [[response, 0.0], [0.0, response]],
                 ..Row::default()
             };
             sums.add(0, galaxy + shift, 0, &row);
@@ -127,6 +138,15 @@ mod tests {
             let found = own.overlap(&other);
             assert!((found.shared - shared).abs() < 1e-9, "{found:?}");
             assert_eq!(found.is_of_same_galaxies(), same, "{found:?}");
+        }
+        // One side knows the PSF.
+        let layout = Layout {
+            psf: true,
+            ..Layout::default()
+        };
+        let other = units_of(layout, 0..1000, 0, 1.3);
+        for found in [own.overlap(&other), other.overlap(&own)] {
+            assert_eq!(found, own.overlap(&units(0..1000, 0, 1.3)));
         }
         // Too few for a correlation.
         let few = units(0..100, 0, 1.0).overlap(&units(0..100, 7, 1.0));

@@ -96,7 +96,7 @@ class _Arguments:
 def _number(value: Any) -> Any:
     """Numbers as YAML and the command line have them: YAML reads 1e-3 as a text, and the command line has lists with commas."""
     if isinstance(value, str) and "," in value:
-        value = value.split(",")
+        value = _texts(value)
     if isinstance(value, list):
         return [_number(own) for own in value]
     for kind in (int, float):
@@ -108,14 +108,14 @@ def _number(value: Any) -> Any:
 
 
 def _texts(value: Any) -> list[str]:
-    return value.split(",") if isinstance(value, str) else list(value or [])
+    return [part.strip() for part in value.split(",")] if isinstance(value, str) else list(value or [])
 
 
 class ShearBias(_Arguments, PipelineStage):  # type: ignore[misc, unused-ignore]
     """m and c of shear catalogues, as :func:`shearq.bias` estimates them, whose arguments are the options.
 
     The input is an HDF5 file whose group ``group`` is a table; the option ``catalogues`` lists further ones, such as those under the
-    opposite shear. ``g1`` and ``g2`` are the true shears of all, where no column has them. The output is the JSON of
+    opposite shear, from which the same group is read. ``g1`` and ``g2`` are the true shears of all, where no column has them. The output is the JSON of
     :meth:`shearq.Bias.to_json`.
     """
 
@@ -136,7 +136,11 @@ class ShearBias(_Arguments, PipelineStage):  # type: ignore[misc, unused-ignore]
                 arguments[name] = values[0]
         columns = arguments.get("columns")
         if columns and not isinstance(columns, Mapping):
-            arguments["columns"] = dict(pair.split("=", 1) for pair in _texts(columns))
+            pairs = _texts(columns)
+            for pair in pairs:
+                if "=" not in pair:
+                    raise ValueError(f"columns: found {pair!r}; expected ROLE=COLUMN")
+            arguments["columns"] = dict(pair.split("=", 1) for pair in pairs)
         if isinstance(arguments.get("bins"), list):
             # Pairs of several quantities are tuples for `bias`, which YAML has not.
             arguments["bins"] = [tuple(own) if isinstance(own, list) and isinstance(own[0], str) else own for own in arguments["bins"]]

@@ -13,11 +13,11 @@ const MIN_SHARP_RATIO: f64 = 0.45;
 // window ends; c over level and ellipticity is 3 to 13.
 const M_PER_LEVEL: f64 = -2.5;
 const RADII_WITH_M_PX: std::ops::Range<f64> = 6.0..9.0;
-// From the same PSFs.
+// Within what was measured. Chosen by hand.
 const C_PER_LEVEL: f64 = 10.0;
-// Level from which c exceeds 0.001 for an ellipticity of 0.05, and |m| from which a warning is due.
+// Level from which c exceeds 0.001 for an ellipticity of 0.05.
 const MAX_LEVEL: f64 = 0.002;
-// What surveys require of |m|.
+// Requirement of Euclid, LSST and GREAT3 on |m|.
 const MAX_M: f64 = 0.002;
 
 /// Where a PSF ends that its image cuts off.
