@@ -110,8 +110,8 @@ impl Default for Tolerance {
             // Chosen by hand: fourteen metrics of a changed code exceed it by noise in 4 % of all checks, and then only if the
             // shift has the size below, too.
             sigma: 3.0,
-            // A quarter of what surveys of stage IV require, |m| < 2·10⁻³ and |c| < 2·10⁻⁴ (Cropper et al. 2013, MNRAS 431,
-            // 3103), so that several such changes stay within it.
+            // A quarter of GREAT3's limits, |m| < 2·10⁻³ and |c| < 2·10⁻⁴ (Mandelbaum et al. 2014, ApJS 212, 5), so that
+            // several such changes stay within them.
             m: 5e-4,
             c: 5e-5,
             // c of a PSF of ellipticity 0.05.
