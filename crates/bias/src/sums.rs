@@ -155,10 +155,12 @@ impl Layout {
             [r12, r21] = [0.0; 2];
         }
         let response = [[r11, r12], [r21, r22]];
-        self.add_pair(sums, 0, row, (row.e, response, row.g, row.psf));
+        // With a known number of terms, the sums become vector code without loops.
         if !self.psf {
+            self.add_pair::<PSF>(sums, 0, row, (row.e, response, row.g, row.psf));
             return;
         }
+        self.add_pair::<MAX_TERMS>(sums, 0, row, (row.e, response, row.g, row.psf));
         let modulus = row.psf[0].hypot(row.psf[1]);
         // A round PSF has no direction.
         let [cos, sin] = if modulus > 0.0 {
@@ -181,31 +183,34 @@ impl Layout {
                 r11 * sin * sin + r22 * cos * cos - shared,
             ],
         ];
-        self.add_pair(sums, 1, row, (e, response, g, [modulus, 0.0]));
+        self.add_pair::<MAX_TERMS>(sums, 1, row, (e, response, g, [modulus, 0.0]));
     }
 
-    // To the sums of the components 1 and 2 (pair 0), or of those along and across the PSF (pair 1).
-    fn add_pair(
+    // To the sums of the components 1 and 2 (pair 0), or of those along and across the PSF (pair 1), which have N terms.
+    fn add_pair<const N: usize>(
         self,
         sums: &mut [f64],
         pair: usize,
         row: &Row,
         (e, response, g, psf): ([f64; 2], [[f64; 2]; 2], [f64; 2], [f64; 2]),
     ) {
-        let terms = |k: usize| -> [f64; MAX_TERMS] {
+        let terms = |k: usize| -> [f64; N] {
             let (g, other, p) = (g[k], g[1 - k], psf[k]);
-            [1.0, g, other, g * g, p, p * row.psf_size]
+            let all = [1.0, g, other, g * g, p, p * row.psf_size];
+            std::array::from_fn(|term| all[term])
         };
         let z = [terms(0), terms(1)];
         let length = self.of_component();
         let start = HEAD + 2 * pair * length;
         let components = sums[start..].chunks_exact_mut(length);
         for (k, sums) in components.take(2).enumerate() {
-            self.component(sums, e[k], response[k][k], row.weight, &z[k]);
+            component(sums, e[k], response[k][k], row.weight, &z[k]);
         }
-        let n = self.terms();
+        if !self.matrix {
+            return;
+        }
         let start = self.matrix_start() + self.of_other_components() + pair * self.of_pair();
-        let mut matrices = sums[start..start + self.of_pair()].chunks_exact_mut(n * n);
+        let mut matrices = sums[start..start + self.of_pair()].chunks_exact_mut(N * N);
         for (factor, [a, b]) in [
             (response[0][1], [0, 1]),
             (response[1][0], [1, 0]),
@@ -214,32 +219,10 @@ impl Layout {
             let Some(sums) = matrices.next() else {
                 break;
             };
-            for (sums, z_s) in sums.chunks_exact_mut(n).zip(z[a]) {
+            for (sums, z_s) in sums.chunks_exact_mut(N).zip(z[a]) {
                 let scaled = factor * z_s;
                 for (sum, z_t) in sums.iter_mut().zip(z[b]) {
                     *sum += scaled * z_t;
-                }
-            }
-        }
-    }
-
-    fn component(self, sums: &mut [f64], e: f64, response: f64, weight: f64, z: &[f64; MAX_TERMS]) {
-        let n = self.terms();
-        let (with_e, matrices) = sums.split_at_mut(n);
-        for (sum, z) in with_e.iter_mut().zip(z) {
-            *sum += weight * e * z;
-        }
-        // Without sheared catalogues there is no second matrix.
-        for (matrix, factor) in matrices
-            .chunks_exact_mut(triangle(n))
-            .zip([response, weight])
-        {
-            let mut at = 0;
-            for s in 0..n {
-                let scaled = factor * z[s];
-                for z in &z[..=s] {
-                    matrix[at] += scaled * z;
-                    at += 1;
                 }
             }
         }
@@ -454,6 +437,26 @@ impl Component<'_> {
     }
 }
 
+fn component<const N: usize>(sums: &mut [f64], e: f64, response: f64, weight: f64, z: &[f64; N]) {
+    let (with_e, matrices) = sums.split_at_mut(N);
+    for (sum, z) in with_e.iter_mut().zip(z) {
+        *sum += weight * e * z;
+    }
+    // Without sheared catalogues there is no second matrix.
+    for (matrix, factor) in matrices
+        .chunks_exact_mut(triangle(N))
+        .zip([response, weight])
+    {
+        let matrix = &mut matrix[..triangle(N)];
+        for s in 0..N {
+            let scaled = factor * z[s];
+            for t in 0..=s {
+                matrix[triangle(s) + t] += scaled * z[t];
+            }
+        }
+    }
+}
+
 /// Numbers in the lower triangle of an n × n matrix.
 const fn triangle(n: usize) -> usize {
     n * (n + 1) / 2
@@ -476,5 +479,87 @@ pub(crate) fn join<K: Ord>(all: &mut BTreeMap<K, Vec<f64>>, key: K, sums: Vec<f6
 pub(crate) fn add(sums: &mut [f64], more: &[f64]) {
     for (sum, more) in sums.iter_mut().zip(more) {
         *sum += more;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    // As the documentation of the crate has the sums, in the order in which they are kept.
+    fn plain(layout: Layout, sums: &mut [f64], pair: usize, row: &Row) {
+        let n = layout.terms();
+        for k in 0..2 {
+            let z = terms(row, k);
+            let mut at = HEAD + (2 * pair + k) * layout.of_component();
+            for z in &z[..n] {
+                sums[at] += row.weight * row.e[k] * z;
+                at += 1;
+            }
+            for factor in [row.response[k][k], row.weight] {
+                if factor == row.weight && !layout.sheared {
+                    break;
+                }
+                for s in 0..n {
+                    for t in 0..=s {
+                        sums[at] += factor * z[s] * z[t];
+                        at += 1;
+                    }
+                }
+            }
+        }
+        let mut at = layout.matrix_start() + layout.of_other_components() + pair * layout.of_pair();
+        for (factor, [a, b]) in [
+            (row.response[0][1], [0, 1]),
+            (row.response[1][0], [1, 0]),
+            (row.weight, [0, 1]),
+        ] {
+            if !layout.matrix || factor == row.weight && !layout.sheared {
+                break;
+            }
+            for s in 0..n {
+                for t in 0..n {
+                    sums[at] += factor * terms(row, a)[s] * terms(row, b)[t];
+                    at += 1;
+                }
+            }
+        }
+    }
+
+    fn terms(row: &Row, k: usize) -> [f64; MAX_TERMS] {
+        let (g, p) = (row.g[k], row.psf[k]);
+        [1.0, g, row.g[1 - k], g * g, p, p * row.psf_size]
+    }
+
+    #[test]
+    fn sums_of_all_layouts_are_those_of_plain_loops() {
+        for kind in 0..8 {
+            let layout = Layout {
+                psf: kind & 1 > 0,
+                sheared: kind & 2 > 0,
+                matrix: kind & 4 > 0,
+            };
+            let (mut found, mut expected) = (vec![0.0; layout.len()], vec![0.0; layout.len()]);
+            for number in 1..20 {
+                let value = |k: i32| (f64::from(number * k) * 0.7).sin();
+                let row = Row {
+                    e: [value(1), value(2)],
+                    weight: 2.0 + value(3),
+                    response: [[value(4), value(5)], [value(6), value(7)]],
+                    g: [value(8), value(9)],
+                    psf: [value(10), value(11)],
+                    psf_size: 3.0 + value(12),
+                };
+                let parts = (row.e, row.response, row.g, row.psf);
+                for pair in 0..layout.components() / 2 {
+                    match layout.psf {
+                        true => layout.add_pair::<MAX_TERMS>(&mut found, pair, &row, parts),
+                        false => layout.add_pair::<PSF>(&mut found, pair, &row, parts),
+                    }
+                    plain(layout, &mut expected, pair, &row);
+                }
+            }
+            assert_eq!(found, expected, "{layout:?}");
+        }
     }
 }

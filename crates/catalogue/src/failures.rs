@@ -1,7 +1,7 @@
 //! Numbers and rows that stand for failed measurements: sentinels, values, rows and identifiers that repeat, responses that
 //! outweigh all others, and measured shears in the place of true ones. They are found wherever rows are averaged.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::HashMap;
 
 use shearq_bias::{Dominant, Repeated, Row};
 use shearq_quantities::MeasuredRange;
@@ -31,6 +31,13 @@ pub struct Check {
     pub expected: &'static str,
     pub range: MeasuredRange,
     pub fails: fn(f64, MeasuredRange) -> bool,
+}
+
+impl Check {
+    /// Whether one of these numbers fails.
+    pub fn fails_in(&self, values: &[f64]) -> bool {
+        values.iter().any(|value| (self.fails)(*value, self.range))
+    }
 }
 
 // A row is reported if it changes the mean response, and with it m, by half of the requirement of 2·10⁻³.
@@ -114,7 +121,7 @@ struct Repeat {
     kind: RepeatKind,
     columns: [usize; 2],
     names: [String; 2],
-    counts: NumberMap<[u64; 2], Counted>,
+    counts: NumberMap<(u64, u64), Counted>,
     different: usize,
 }
 
@@ -135,7 +142,7 @@ pub struct Repeats {
 
 impl Repeat {
     fn new(kind: RepeatKind, columns: [usize; 2], names: [String; 2]) -> Self {
-        let zeros = (kind == RepeatKind::Zeros).then_some(([0, 0], Counted::default()));
+        let zeros = (kind == RepeatKind::Zeros).then_some(((0, 0), Counted::default()));
         Repeat {
             kind,
             columns,
@@ -146,9 +153,9 @@ impl Repeat {
     }
 
     // Zeros with either sign are equal.
-    fn key(&self, part: &Part<'_>, at: usize) -> [u64; 2] {
-        self.columns
-            .map(|column| (part[column][at] + 0.0).to_bits())
+    fn key(&self, part: &Part<'_>, at: usize) -> (u64, u64) {
+        let [a, b] = self.columns.map(|column| part[column][at] + 0.0);
+        (a.to_bits(), b.to_bits())
     }
 
     // `before` rows were added already.
@@ -159,13 +166,13 @@ impl Repeat {
             // Half of the failures in one of 1000 rows of a small catalogue are enough.
             RepeatKind::Number { or_zero } => (4 * SEARCHED_ROWS, or_zero),
         };
-        let mut seen = HashSet::new();
+        let mut seen = NumberMap::<(u64, u64), ()>::default();
         let rows = part[self.columns[0]].len();
         for at in (0..rows).step_by(rows.div_ceil(searched).max(1)) {
             let values = self.columns.map(|column| part[column][at]);
             let counts = values.iter().all(|value| value.is_finite());
             let key = self.key(part, at);
-            if counts && (or_zero || values[0] != 0.0) && !seen.insert(key) {
+            if counts && (or_zero || values[0] != 0.0) && seen.insert(key, ()).is_some() {
                 self.counts
                     .entry(key)
                     .or_insert(Counted { rows: 0, before });
@@ -177,9 +184,9 @@ impl Repeat {
     // The most frequent numbers of the `used` rows, if coincidence does not explain their frequency.
     fn found(&self, used: u64) -> Option<([f64; 2], u64)> {
         let share = |own: &Counted| own.rows as f64 / (used - own.before).max(1) as f64;
-        let mut counts: Vec<(&[u64; 2], &Counted)> = self.counts.iter().collect();
+        let mut counts: Vec<(&(u64, u64), &Counted)> = self.counts.iter().collect();
         counts.sort_unstable_by(|a, b| share(b.1).total_cmp(&share(a.1)).then(a.0.cmp(b.0)));
-        let (values, most) = *counts.first()?;
+        let (&(a, b), most) = *counts.first()?;
         let worth = match self.kind {
             RepeatKind::Ellipticities => most.rows >= 3 && share(most) >= MIN_SHARED,
             RepeatKind::Zeros => most.rows >= 3 && most.rows < used,
@@ -192,7 +199,7 @@ impl Repeat {
                 stands_out && (self.different > MAX_CLASSES || !or_zero)
             }
         };
-        worth.then(|| (values.map(f64::from_bits), most.rows))
+        worth.then(|| ([a, b].map(f64::from_bits), most.rows))
     }
 }
 
@@ -219,7 +226,7 @@ impl Repeats {
             .filter(|repeat| !repeat.counts.is_empty())
         {
             let key = repeat.key(part, at);
-            if repeat.kind == RepeatKind::Zeros && key != [0; 2] {
+            if repeat.kind == RepeatKind::Zeros && key != (0, 0) {
                 continue;
             }
             if let Some(count) = repeat.counts.get_mut(&key) {

@@ -136,7 +136,7 @@ impl Galaxies {
     pub fn read(&self, most: usize) -> Result<Vec<Galaxy>, FileError> {
         let mut all = Vec::new();
         self.each(|[x, y], row| {
-            let row = row.filter(|own| own.selected.binned[0].is_ok());
+            let row = row.filter(|own| own.selected.of(0).binned.is_ok());
             let ([e1, e2], weight) =
                 row.map_or(([f64::NAN; 2], 1.0), |own| (own.row.e, own.row.weight));
             if all.len() < most && row.is_none_or(|own| own.sheared == 0) {
@@ -146,8 +146,8 @@ impl Galaxies {
         Ok(all)
     }
 
-    fn each(&self, take: impl FnMut([f64; 2], Option<&SummedRow>)) -> Result<(), FileError> {
-        placed_rows(&self.path, &self.reading(), &self.sources, take).map(drop)
+    fn each(&self, mut take: impl FnMut([f64; 2], Option<&SummedRow>)) -> Result<(), FileError> {
+        placed_rows(&self.path, &self.reading(), &self.sources, &mut take).map(drop)
     }
 }
 
@@ -206,7 +206,7 @@ impl CalibrationSums {
             *weights += weight;
             self.has_sheared = true;
         }
-        if own.sheared > 0 || own.selected.binned[0].is_err() {
+        if own.sheared > 0 || own.selected.of(0).binned.is_err() {
             return;
         }
         self.weight += own.row.weight;

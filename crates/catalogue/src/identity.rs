@@ -5,7 +5,7 @@ use std::hash::{Hash, Hasher};
 use std::path::Path;
 
 use shearq_files::FileError;
-use shearq_files::frames::polars::DataFrame;
+use shearq_files::frames::polars::{ChunkedArray, DataFrame, PolarsNumericType};
 use shearq_files::frames::reals;
 use shearq_files::table;
 
@@ -39,6 +39,7 @@ pub fn missing(frame: &DataFrame, name: &str) -> Vec<bool> {
     let series = column.as_materialized_series();
     match reals(column).filter(|_| series.dtype().is_float()) {
         Some(numbers) => numbers.iter().map(|own| own.is_nan()).collect(),
+        None if series.null_count() == 0 => vec![false; series.len()],
         None => (series.is_null().iter())
             .map(|own| own == Some(true))
             .collect(),
@@ -59,14 +60,14 @@ pub fn keys_or_zero(frame: &DataFrame, name: &str, path: &Path) -> Result<Vec<u6
             true => hash((own as f64).to_bits()),
             false => of_integer(own.into()),
         };
-        return Ok(integers.iter().map(|own| own.map_or(0, key)).collect());
+        return Ok(hashed(integers, key));
     }
     if let Some(integers) = series.and_then(|own| own.u64().ok()) {
         let key = |own: u64| match own <= EXACT {
             true => hash((own as f64).to_bits()),
             false => of_integer(own.into()),
         };
-        return Ok(integers.iter().map(|own| own.map_or(0, key)).collect());
+        return Ok(hashed(integers, key));
     }
     let numbers = table::numbers(frame, name, path)?;
     // pandas makes floats of integers with a missing one. Different galaxies are then one.
@@ -77,6 +78,17 @@ pub fn keys_or_zero(frame: &DataFrame, name: &str, path: &Path) -> Result<Vec<u6
         return Err(FileError::new(path, message));
     }
     Ok(numbers.iter().map(|own| hash(own.to_bits())).collect())
+}
+
+// A column in one piece without missing numbers needs no test of each.
+fn hashed<T: PolarsNumericType>(
+    integers: &ChunkedArray<T>,
+    key: impl Fn(T::Native) -> u64,
+) -> Vec<u64> {
+    match integers.cont_slice() {
+        Ok(whole) => whole.iter().map(|own| key(*own)).collect(),
+        Err(_) => integers.iter().map(|own| own.map_or(0, &key)).collect(),
+    }
 }
 
 /// An identifier as messages show it.

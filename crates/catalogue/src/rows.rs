@@ -38,6 +38,8 @@ pub struct SummedRow {
     pub sheared: usize,
     pub row: Row,
     pub selected: Selected,
+    // The place of its true shear in a table by positions.
+    place: Option<usize>,
 }
 
 impl SummedRow {
@@ -46,12 +48,15 @@ impl SummedRow {
     /// shear of the galaxies that a sheared catalogue selects, with its weights, give the selection response R_S of Sheldon &
     /// Huff (2017, ApJ 841, 24). It needs all four catalogues, because a cut by S/N responds to both components.
     pub fn in_sheared(&self, selects: bool) -> impl Iterator<Item = (usize, f64)> + '_ {
-        let counts = |catalogue: usize| self.selected.binned[catalogue].is_ok();
+        let counts = |catalogue: usize| self.selected.of(catalogue).binned.is_ok();
         let own = (self.sheared > 0 && counts(0)).then_some((self.sheared, self.row.weight));
-        let chosen = (1..CATALOGUES)
-            .filter(move |catalogue| selects && self.sheared == 0 && counts(*catalogue));
+        let last = match selects && self.sheared == 0 {
+            true => CATALOGUES,
+            false => 1,
+        };
+        let chosen = (1..last).filter(move |catalogue| counts(*catalogue));
         own.into_iter()
-            .chain(chosen.map(|catalogue| (catalogue, self.selected.weights[catalogue])))
+            .chain(chosen.map(|catalogue| (catalogue, self.selected.of(catalogue).weight)))
     }
 }
 
@@ -59,9 +64,32 @@ impl SummedRow {
 /// a galaxy over a cut, which is the response of the selection.
 #[derive(Debug)]
 pub struct Selected {
-    /// The binned quantities where the row is selected: 0 without bins, NaN if a number is missing.
-    pub binned: [Result<[f64; MAX_AXES], Exclusion>; CATALOGUES],
-    pub weights: [f64; CATALOGUES],
+    noshear: Choice,
+    // Without columns of their own, all sheared catalogues select the same rows.
+    sheared: Option<Box<[Choice; CATALOGUES - 1]>>,
+}
+
+/// Whether a row counts in one catalogue, and its weight there.
+#[derive(Debug)]
+pub struct Choice {
+    /// The binned quantities if the row is selected: 0 without bins, NaN if a number is missing.
+    pub binned: Result<[f64; MAX_AXES], Exclusion>,
+    pub weight: f64,
+}
+
+impl Selected {
+    /// The choice in noshear (0) or a sheared catalogue.
+    pub fn of(&self, catalogue: usize) -> &Choice {
+        match (&self.sheared, catalogue.checked_sub(1)) {
+            (Some(all), Some(sheared)) => &all[sheared],
+            _ => &self.noshear,
+        }
+    }
+
+    fn is_somewhere(&self) -> bool {
+        let sheared = self.sheared.iter().flat_map(|all| all.iter());
+        self.noshear.binned.is_ok() || sheared.into_iter().any(|own| own.binned.is_ok())
+    }
 }
 
 /// Why a row does not count.
@@ -114,7 +142,7 @@ pub fn rows(
     sources: &[Source],
     mut take: impl FnMut(&SummedRow),
 ) -> Result<Catalogue, FileError> {
-    placed_rows(path, reading, sources, |_, row| {
+    placed_rows(path, reading, sources, &mut |_, row| {
         row.into_iter().for_each(&mut take);
     })
 }
@@ -124,7 +152,8 @@ pub fn placed_rows(
     path: &Path,
     reading: &Reading<'_>,
     sources: &[Source],
-    mut take: impl FnMut([f64; 2], Option<&SummedRow>),
+    // Not generic, so that the loop over the rows is compiled with what it calls.
+    take: &mut dyn FnMut([f64; 2], Option<&SummedRow>),
 ) -> Result<Catalogue, FileError> {
     let mut summary = Catalogue {
         name: path.display().to_string(),
@@ -154,17 +183,17 @@ pub fn placed_rows(
             let columns: Vec<&[f64]> = columns.iter().map(AsRef::as_ref).collect();
             let part = TableRows::new(source, reading, (&frame, &columns), (path, first))?;
             // Ranges follow from the first part, so that a file is judged in the same way however it is split.
-            let checks = checks.get_or_insert_with(|| part.checks());
+            let checks = part.failed(checks.get_or_insert_with(|| part.checks()));
             found.look_for(&part);
             for at in 0..part.rows {
                 let sheared = part.sheared(at);
                 let index = counts[sheared];
                 counts[sheared] += 1;
                 let selected = part.select(at);
-                let mut excluded = selected.binned[0].err();
+                let mut excluded = selected.noshear.binned.err();
                 let mut item = None;
-                if selected.binned.iter().any(Result::is_ok) {
-                    match part.galaxy(at, index, selected, checks) {
+                if selected.is_somewhere() {
+                    match part.galaxy(at, index, selected, &checks) {
                         Ok(own) => {
                             if sheared == 0 {
                                 for k in 0..2 {
@@ -176,7 +205,7 @@ pub fn placed_rows(
                                     *count += u64::from(a * a + b * b > limit * limit);
                                 }
                                 if excluded.is_none() {
-                                    found.add(&part, at, (first + at + 1) as u64, &own.row);
+                                    found.add(&part, at, (first + at + 1) as u64, &own);
                                 }
                             }
                             used[sheared] += u64::from(excluded.is_none());
@@ -249,6 +278,11 @@ struct TableRows<'a> {
     dw: Option<[usize; 2]>,
     psf: Option<[usize; 2]>,
     psf_size: Option<usize>,
+    calibration: [Option<usize>; 3],
+    // In noshear and in each sheared catalogue.
+    weights: [Option<usize>; CATALOGUES],
+    // Whether `--where` or `--bins` has columns.
+    chooses: bool,
     places: Option<[usize; 2]>,
     // Whose numbers tell rows apart.
     compared: Vec<usize>,
@@ -345,6 +379,12 @@ impl<'a> TableRows<'a> {
             dw: places.pair(WEIGHT_DERIVATIVE_ROLES),
             psf: places.pair(PSF_ROLES),
             psf_size: places.of((Role::PsfSize, 0)),
+            calibration: [Role::M, Role::C1, Role::C2].map(|role| places.of((role, 0))),
+            weights: std::array::from_fn(|sheared| {
+                let own = places.of((Role::Weight, sheared));
+                own.or_else(|| places.of((Role::Weight, 0)))
+            }),
+            chooses: reading.condition().is_some() || reading.binned().next().is_some(),
             places: places.pair([Role::X, Role::Y]),
             converted: converted_columns(source),
             compared: ([Role::E1, Role::E2, Role::Weight, Role::R11].iter())
@@ -468,6 +508,13 @@ impl<'a> TableRows<'a> {
         checks
     }
 
+    // The checks that a row of this part may fail: few columns have a number for failures. A row may take its shape from other
+    // columns than those of the checks.
+    fn failed<'c>(&self, checks: &'c [Check]) -> Vec<&'c Check> {
+        let fails = |own: &&Check| self.ksb.is_some() || own.fails_in(self.columns[own.column]);
+        checks.iter().filter(fails).collect()
+    }
+
     // Columns of numbers that are binned.
     fn binned_columns(&self) -> Vec<usize> {
         let places = self.source.places.all((Role::Binned, 0)).iter().copied();
@@ -517,18 +564,13 @@ impl<'a> TableRows<'a> {
         }
     }
 
-    fn failure<'c>(&self, at: usize, checks: &'c [Check]) -> Option<(usize, &'c Check)> {
+    fn failure<'c>(&self, at: usize, checks: &[&'c Check]) -> Option<(usize, &'c Check)> {
         let shape = self.shape_columns(at);
-        if shape == self.e {
-            let mut checks = checks.iter();
-            let found = checks.find(|own| (own.fails)(self.value(own.column, at), own.range))?;
-            return Some((found.column, found));
-        }
         let column_of = |check: &Check| match self.e.iter().position(|e| *e == check.column) {
             Some(k) => shape[k],
             None => check.column,
         };
-        let mut checks = checks.iter().map(|check| (column_of(check), check));
+        let mut checks = checks.iter().map(|check| (column_of(check), *check));
         checks.find(|(column, check)| (check.fails)(self.value(*column, at), check.range))
     }
 
@@ -541,44 +583,34 @@ impl<'a> TableRows<'a> {
 
     // A sheared catalogue may choose a row that is left out without shear: these rows are the response of the selection.
     fn select(&self, at: usize) -> Selected {
-        let places = &self.source.places;
-        let weight = |sheared: usize| {
-            let column = places.of((Role::Weight, sheared));
-            let column = column.or_else(|| self.of(Role::Weight));
-            column.map_or(1.0, |weight| self.value(weight, at))
-        };
-        let flagged = |sheared: usize| {
-            let mut flags = places.all((Role::Flag, sheared)).iter();
-            flags.any(|flag| self.value(*flag, at) != 0.0)
-        };
+        let sheared = || Box::new(std::array::from_fn(|sheared| self.choice(at, sheared + 1)));
+        Selected {
+            noshear: self.choice(at, 0),
+            sheared: self.source.selects.then(sheared),
+        }
+    }
+
+    fn choice(&self, at: usize, sheared: usize) -> Choice {
+        let weight = self.weights[sheared].map_or(1.0, |column| self.value(column, at));
+        let mut flags = self.source.places.all((Role::Flag, sheared)).iter();
+        let selection = self.source.selection.map(|place| self.value(place, at));
+        let is_left_out = selection.is_some_and(|weight| weight <= 0.0);
         // Smooth steps of `--where` are zero far below their threshold. Such a row would add zeros to all sums.
         let stepped = self.weighted.as_ref().map(|selection| selection.weight[at]);
         let is_outside = stepped.is_some_and(|weight| weight <= 0.0);
-        let selection = self.source.selection.map(|place| self.value(place, at));
-        let is_left_out = selection.is_some_and(|weight| weight <= 0.0);
-        let binned = |sheared: usize, weight: f64| {
-            if flagged(sheared) {
-                Err(Exclusion::Flagged)
-            } else if !has_weight(weight) || is_left_out {
-                Err(Exclusion::Unweighted)
-            } else {
-                let binned = self.binned(at, sheared).filter(|_| !is_outside);
-                binned.ok_or(Exclusion::Unselected)
-            }
+        let binned = if flags.any(|flag| self.value(*flag, at) != 0.0) {
+            Err(Exclusion::Flagged)
+        } else if !has_weight(weight) || is_left_out {
+            Err(Exclusion::Unweighted)
+        } else if self.chooses {
+            let binned = self.binned(at, sheared).filter(|_| !is_outside);
+            binned.ok_or(Exclusion::Unselected)
+        } else if is_outside {
+            Err(Exclusion::Unselected)
+        } else {
+            Ok([0.0; MAX_AXES])
         };
-        // Without columns of their own, all sheared catalogues select the same rows.
-        if !self.source.selects {
-            let weight = weight(0);
-            return Selected {
-                binned: [binned(0, weight); CATALOGUES],
-                weights: [weight; CATALOGUES],
-            };
-        }
-        let weights: [f64; CATALOGUES] = std::array::from_fn(weight);
-        Selected {
-            binned: std::array::from_fn(|sheared| binned(sheared, weights[sheared])),
-            weights,
-        }
+        Choice { binned, weight }
     }
 
     // The binned quantities in a sheared catalogue (0 for noshear) if `--where` selects the row; NaN if a number is missing.
@@ -615,7 +647,7 @@ impl<'a> TableRows<'a> {
         at: usize,
         index: u64,
         selected: Selected,
-        checks: &[Check],
+        checks: &[&Check],
     ) -> Result<SummedRow, Rejected> {
         if self.is_unmeasured(at) || self.unnamed.get(at) == Some(&true) {
             return Err(Exclusion::Missing.into());
@@ -623,11 +655,12 @@ impl<'a> TableRows<'a> {
         self.check_unused_weight(at)?;
         self.check_failures(at, checks)?;
         let weight = self.weighted.as_ref().map(|selection| selection.weight[at]);
-        let weight = weight.unwrap_or(selected.weights[0]);
+        let weight = weight.unwrap_or(selected.noshear.weight);
         let mut row = self.measured(at, weight)?;
         self.check_numbers(&row, &selected)?;
         // After the cuts, because a table of true shears may lack galaxies that are cut.
-        row.g = self.truth(at)?;
+        let place;
+        (row.g, place) = self.truth(at)?;
         check(row.g)?;
         if self.reading.flip_g2 {
             row.g[1] = -row.g[1];
@@ -638,6 +671,7 @@ impl<'a> TableRows<'a> {
             sheared: self.sheared(at),
             row,
             selected,
+            place,
         })
     }
 
@@ -666,7 +700,7 @@ impl<'a> TableRows<'a> {
         }
     }
 
-    fn check_failures(&self, at: usize, checks: &[Check]) -> Result<(), Rejected> {
+    fn check_failures(&self, at: usize, checks: &[&Check]) -> Result<(), Rejected> {
         let Some((column, check)) = self.failure(at, checks) else {
             return Ok(());
         };
@@ -718,19 +752,24 @@ impl<'a> TableRows<'a> {
 
     fn check_numbers(&self, row: &Row, selected: &Selected) -> Result<(), Rejected> {
         let [[r11, r12], [r21, r22]] = row.response;
+        let binned = selected.noshear.binned.unwrap_or_default();
+        // One number that is not finite makes the sum so.
+        let sums = [
+            row.e[0] + row.e[1] + row.weight,
+            r11 + r22 + r12 + r21,
+            row.psf[0] + row.psf[1] + row.psf_size,
+            binned.iter().sum(),
+        ];
+        if sums.iter().sum::<f64>().is_finite() {
+            return Ok(());
+        }
         let checked = [
             ("e1", row.e[0]),
             ("e2", row.e[1]),
             ("the weight", row.weight),
-            ("the response or its derivative", r11 + r22 + r12 + r21),
-            (
-                "the PSF's ellipticity or size",
-                row.psf[0] + row.psf[1] + row.psf_size,
-            ),
-            (
-                "the expression of --where or --bins",
-                selected.binned[0].map_or(0.0, |values| values.iter().sum()),
-            ),
+            ("the response or its derivative", sums[1]),
+            ("the PSF's ellipticity or size", sums[2]),
+            ("the expression of --where or --bins", sums[3]),
         ];
         match checked.iter().find(|(_, value)| !value.is_finite()) {
             None => Ok(()),
@@ -751,13 +790,13 @@ impl<'a> TableRows<'a> {
         mut e: [f64; 2],
         mut response: [[f64; 2]; 2],
     ) -> ([f64; 2], [[f64; 2]; 2]) {
-        let value = |role| self.of(role).map(|place| self.value(place, at));
-        for (j, c) in [Role::C1, Role::C2].map(value).into_iter().enumerate() {
+        let [m, c1, c2] = self.calibration.map(|place| Some(self.value(place?, at)));
+        for (j, c) in [c1, c2].into_iter().enumerate() {
             if let Some(c) = c {
                 e = [0, 1].map(|i| e[i] - response[i][j] / weight * c);
             }
         }
-        if let Some(m) = value(Role::M) {
+        if let Some(m) = m {
             response = response.map(|row| row.map(|own| own * (1.0 + m)));
         }
         (e, response)
@@ -826,19 +865,23 @@ impl<'a> TableRows<'a> {
         }
     }
 
-    fn truth(&self, at: usize) -> Result<[f64; 2], Rejected> {
+    // The true shear, and its place in a table by positions.
+    fn truth(&self, at: usize) -> Result<([f64; 2], Option<usize>), Rejected> {
         let found = match self.truth {
-            OfRows::Constant(shear) => Ok(shear),
+            OfRows::Constant(shear) => Ok((shear, None)),
             OfRows::Identifiers(galaxies) => {
                 let key = self.ids.as_ref().and_then(|ids| galaxies.get(&ids[at]));
-                key.copied().ok_or_else(|| {
+                key.map(|shear| (*shear, None)).ok_or_else(|| {
                     let name = self.source.columns.of(Role::Id).unwrap_or_default();
                     let id = identity::text(self.frame, name, at);
                     format!("the table of true shears does not contain the identifier {id}")
                 })
             }
-            OfRows::Positions(positions, columns) => positions.at(self.pair(columns, at)),
-            OfRows::Columns(columns) => Ok(self.pair(columns, at)),
+            OfRows::Positions(positions, columns) => {
+                let found = positions.at(self.pair(columns, at));
+                found.map(|(place, shear)| (shear, Some(place)))
+            }
+            OfRows::Columns(columns) => Ok((self.pair(columns, at), None)),
         };
         let may_lack = self.reading.request.drop_missing && self.truth.may_lack_rows();
         found.map_err(|message| match may_lack {
@@ -973,6 +1016,11 @@ impl Found {
         for (numbered, name) in self.numbered.iter_mut().zip(steps) {
             numbered.add(part.frame, name);
         }
+        if let OfRows::Positions(positions, _) = part.truth {
+            self.takers.resize(positions.len(), None);
+        }
+        let choices = part.source.places.all((Role::Choice, 0));
+        self.excluded.resize(choices.len(), 0);
         self.matched.resize(part.columns.len(), false);
         for (place, operand) in part.source.wanted.iter().enumerate() {
             if operand.texts.is_some() && !self.matched[place] {
@@ -984,22 +1032,19 @@ impl Found {
             .look_for(part.columns, part.e, part.ids.as_deref());
     }
 
-    fn add(&mut self, part: &TableRows<'_>, at: usize, number: u64, row: &Row) {
+    fn add(&mut self, part: &TableRows<'_>, at: usize, number: u64, summed: &SummedRow) {
+        let row = &summed.row;
         self.used += 1;
-        if let OfRows::Positions(positions, columns) = part.truth {
+        if let (OfRows::Positions(_, columns), Some(place)) = (part.truth, summed.place) {
             let own = part.pair(columns, at);
-            self.takers.resize(positions.len(), None);
-            if let Some(place) = positions.find(own) {
-                let first = *self.takers[place].get_or_insert(own);
-                self.shared_truths += u64::from(first != own);
-            }
+            let first = *self.takers[place].get_or_insert(own);
+            self.shared_truths += u64::from(first != own);
         }
         self.largest.add(number, row);
         if let OfRows::Columns(_) = part.truth {
             self.shears.add(row);
         }
         let choices = part.source.places.all((Role::Choice, 0));
-        self.excluded.resize(choices.len(), 0);
         for (count, column) in self.excluded.iter_mut().zip(choices) {
             let good = counted_value(part.source.name(*column)) == Some(true);
             *count += u64::from((part.value(*column, at) != 0.0) != good);

@@ -422,10 +422,10 @@ impl Positions {
         nearest.map(|(place, ..)| place)
     }
 
-    /// The shear of the nearest place within [`RADIUS`].
-    pub fn at(&self, [x, y]: [f64; 2]) -> Result<[f64; 2], String> {
+    /// The number of the nearest place within [`RADIUS`], and its shear.
+    pub fn at(&self, [x, y]: [f64; 2]) -> Result<(usize, [f64; 2]), String> {
         let nearest = self.find([x, y]);
-        nearest.map(|place| self.entries[place].shear).ok_or_else(|| {
+        nearest.map(|place| (place, self.entries[place].shear)).ok_or_else(|| {
             format!(
                 "the table of true shears has no galaxy within {RADIUS} pixel of x = {x}, y = {y}. Try: check whether positions begin with 0 or 1, or --drop-missing"
             )
@@ -625,7 +625,7 @@ mod tests {
             ([5.0, 5.0], None),
         ] {
             assert_eq!(
-                found.at(position).ok().map(|g| g[0]),
+                found.at(position).ok().map(|(_, g)| g[0]),
                 expected,
                 "{position:?}"
             );

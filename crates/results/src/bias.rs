@@ -379,7 +379,7 @@ fn add_up(
         let mut alone = 0;
         let mut catalogue = rows(name, reading, sources, |item| {
             let bin = |catalogue: usize| {
-                let values = item.selected.binned[catalogue].ok()?;
+                let values = item.selected.of(catalogue).binned.ok()?;
                 cells.of(&values)
             };
             let (row, own) = (&item.row, bin(0));
@@ -390,14 +390,14 @@ fn add_up(
             };
             match &paired {
                 Some(paired) if !paired.contains(&item.galaxy) => {
-                    alone += u64::from(item.selected.binned[0].is_ok());
+                    alone += u64::from(item.selected.of(0).binned.is_ok());
                     return;
                 }
                 // The same galaxies under all shears, so that the choice has no response; weights have one.
                 Some(_) => {
                     if let Some(bin) = own.filter(|_| selects) {
                         for catalogue in 1..CATALOGUES {
-                            add_sheared(bin, catalogue, item.selected.weights[catalogue]);
+                            add_sheared(bin, catalogue, item.selected.of(catalogue).weight);
                         }
                     }
                 }

@@ -175,7 +175,7 @@ pub(super) fn cells(reading: &Reading<'_>, all: &[Vec<Source>]) -> Result<Cells,
     if request.bins.iter().any(is_open) {
         for (input, sources) in request.catalogues.iter().zip(all) {
             rows(&input.name, reading, sources, |item| {
-                let (0, Ok(own)) = (item.sheared, item.selected.binned[0]) else {
+                let (0, Ok(own)) = (item.sheared, item.selected.of(0).binned) else {
                     return;
                 };
                 for (values, value) in values.iter_mut().zip(own) {

@@ -44,7 +44,7 @@ impl<'a> Partners<'a> {
             let mut good = HashSet::new();
             let name = &self.reading.request.catalogues[other].name;
             rows(name, self.reading, sources, |item| {
-                let counts = item.sheared == 0 && item.selected.binned[0].is_ok();
+                let counts = item.sheared == 0 && item.selected.of(0).binned.is_ok();
                 if counts
                     && found
                         .as_ref()
