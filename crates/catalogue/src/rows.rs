@@ -503,7 +503,8 @@ impl<'a> TableRows<'a> {
         }
         let weight = source.places.all((Role::Weight, 0));
         add(weight, "a weight", range(weight), |weight, range| {
-            weight >= MIN_FAILED_WEIGHT || range.excludes_mark(weight)
+            // Infinity is reported as such.
+            weight.is_finite() && weight >= MIN_FAILED_WEIGHT || range.excludes_mark(weight)
         });
         checks
     }
@@ -763,10 +764,11 @@ impl<'a> TableRows<'a> {
         if sums.iter().sum::<f64>().is_finite() {
             return Ok(());
         }
+        // A calibration is multiplied by the weight, so that the weight comes first.
         let checked = [
+            ("the weight", row.weight),
             ("e1", row.e[0]),
             ("e2", row.e[1]),
-            ("the weight", row.weight),
             ("the response or its derivative", sums[1]),
             ("the PSF's ellipticity or size", sums[2]),
             ("the expression of --where or --bins", sums[3]),
@@ -774,15 +776,21 @@ impl<'a> TableRows<'a> {
         match checked.iter().find(|(_, value)| !value.is_finite()) {
             None => Ok(()),
             Some(_) if self.reading.request.drop_missing => Err(Exclusion::Missing.into()),
-            Some((what, value)) => Err(Rejected::Invalid(format!(
-                "{what} is {value} in a row without a flag (expected a number). Try: {}",
-                self.remedy_for_failures()
-            ))),
+            Some((what, value)) => {
+                let expected = match value.is_nan() {
+                    true => "a number",
+                    false => "a finite number",
+                };
+                Err(Rejected::Invalid(format!(
+                    "{what} is {value} in a row without a flag (expected {expected}). Try: {}",
+                    self.remedy_for_failures()
+                )))
+            }
         }
     }
 
     // With the calibration of a survey, so that the mean shear is that of e − R c over R (1 + m), as HSC defines its m and c
-    // (Mandelbaum et al. 2018, MNRAS 481, 3170, equation 8).
+    // (Mandelbaum et al. 2018, PASJ 70, S25, equation A6).
     fn calibrated(
         &self,
         at: usize,
