@@ -1083,7 +1083,8 @@ impl Columns {
 
     // What chooses the good rows by the texts of a column.
     fn of_good_rows(&self, name: &str) -> Option<String> {
-        // CFHTLenS uses rows of MASK 0 and 1 (Erben et al. 2013, MNRAS 433, 2545).
+        // Rows of MASK 0 and 1 serve most purposes, and fitclass 0 is a galaxy (README of the catalogues; Erben et al. 2013, MNRAS
+        // 433, 2545).
         let is_of_cfhtlens = || self.unused.iter().any(|own| own == "fitclass");
         if name == "MASK" && is_of_cfhtlens() {
             return Some("--where 'MASK <= 1 and fitclass == 0', which CFHTLenS uses".into());
