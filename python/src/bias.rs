@@ -347,6 +347,7 @@ pub(crate) fn bias_sums(
     like: Option<Given<'_>>,
     tomography: Option<String>,
     condition: Option<&str>,
+    unsheared: Vec<String>,
     weight: Option<&str>,
     design: Option<&str>,
     units: Option<String>,
@@ -436,7 +437,7 @@ pub(crate) fn bias_sums(
         paired,
         selection: selection(condition, weight)
             .map_err(|fault| PyValueError::new_err(fault.to_string()))?,
-        unsheared: Vec::new(),
+        unsheared,
         design: design.map(design_of).transpose()?,
         units: units_of(units),
         drop_missing,
@@ -444,6 +445,11 @@ pub(crate) fn bias_sums(
         placed: None,
         without_catalogue,
     };
+    if let Some(name) = request.unused_unsheared() {
+        return Err(PyValueError::new_err(format!(
+            "unsheared: `{name}` is not used; expected a column of where or bins"
+        )));
+    }
     // Shards are of files of the command line; workers in Python sum catalogues of their own.
     let summed = py.detach(|| sum(&request, &|_| true)).map_err(of_bias)?;
     Ok(BiasSums { summed })

@@ -114,6 +114,7 @@ def test_measured_catalogues_are_calibrated_by_their_responses(image):
         ({"bins": ("snr", [3, 2])}, "increasing edges"),
         ({"bins": ("size", 3)}, "there is no column `size`"),
         ({"where": "snr >"}, "cannot read the expression"),
+        ({"where": "snr > 20", "unsheared": "z"}, "unsheared: `z` is not used"),
         ({"design": "pair"}, "design: found \"pair\""),
         ({"columns": {"e1": "shape"}}, "there is no column `shape`"),
         ({"columns": {"e9": "shape"}}, "unknown role"),
@@ -127,6 +128,15 @@ def test_what_cannot_be_estimated_is_named(pair, change, message):
     options = {"g1": [0.02, -0.02], "g2": [0.01, -0.01], **change}
     with pytest.raises(ValueError, match=message):
         shearq.bias(pair, **options)
+
+
+@pytest.mark.parametrize("options", [{"where": "snr > 20"}, {"bins": ("snr", 2)}])
+def test_choices_by_unsheared_columns_have_no_warning(pair, options):
+    options = {"g1": [0.02, -0.02], "g2": [0.01, -0.01], **options}
+    measured, unsheared = shearq.bias(pair, **options), shearq.bias(pair, unsheared="snr", **options)
+    assert any("selection by `snr`" in note for note in measured.notes)
+    assert not any("selection by `snr`" in note for note in unsheared.notes)
+    assert unsheared.rows == measured.rows and shearq.bias(pair, unsheared=["snr"], **options).notes == unsheared.notes
 
 
 def test_odd_tables_are_refused():

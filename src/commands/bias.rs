@@ -380,15 +380,6 @@ fn of_catalogues(arguments: &Arguments, catalogues: &[PathBuf]) -> anyhow::Resul
         "--bins: found {} quantities, expected at most {MAX_AXES}",
         summing.bins.len()
     );
-    for name in &summing.unsheared {
-        let bins = summing.bins.iter().map(|own| &own.of);
-        let condition = selection.as_ref().and_then(|own| own.rows.as_ref());
-        let mut columns = bins.chain(condition).flat_map(Expression::columns);
-        anyhow::ensure!(
-            columns.any(|own| own == name),
-            "--unsheared: `{name}` is not used (expected a column of --where or --bins)"
-        );
-    }
     let found = expand(catalogues, truth)?;
     let request = Request {
         sign,
@@ -403,6 +394,9 @@ fn of_catalogues(arguments: &Arguments, catalogues: &[PathBuf]) -> anyhow::Resul
         design: summing.design,
         ..table.request(found)?
     };
+    if let Some(name) = request.unused_unsheared() {
+        anyhow::bail!("--unsheared: `{name}` is not used (expected a column of --where or --bins)");
+    }
     let own = |number: usize| Shard::holding(number, shard.of()) == shard;
     Ok(sum_with_progress(&request, &own, &reading)?)
 }

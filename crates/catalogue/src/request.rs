@@ -101,6 +101,18 @@ impl Request {
             ..Request::default()
         }
     }
+
+    /// The first column that is declared unsheared and that neither a condition nor bins use: it is probably misspelt.
+    pub fn unused_unsheared(&self) -> Option<&str> {
+        let condition = self.selection.as_ref().and_then(|own| own.rows.as_ref());
+        let bins = self.bins.iter().map(|own| &own.of);
+        let used: Vec<&str> = bins
+            .chain(condition)
+            .flat_map(Expression::columns)
+            .collect();
+        let mut declared = self.unsheared.iter().map(String::as_str);
+        declared.find(|name| !used.contains(name))
+    }
 }
 
 impl Default for Request {

@@ -170,6 +170,7 @@ def bias(
     like: Any = None,
     tomography: str | None = None,
     where: str | None = None,
+    unsheared: str | Sequence[str] | None = None,
     weight: str | None = None,
     design: Design | None = None,
     units: str | None = None,
@@ -231,6 +232,9 @@ def bias(
         Use only galaxies for which this holds, such as ``"snr > 10 and size < 4"``. Catalogues of shearq's linear
         configurations can also be cut by steps, such as ``"step(snr, 10) and step(size, 2.5)"``, as for
         :meth:`Catalogue.select`: m contains no effect of this selection.
+    unsheared : str, or several
+        Columns of `where` and `bins` that shear does not change, because they were not measured on images of the galaxies, such
+        as a redshift of another survey.
     weight : str
         A weight by S/N, flux and size of the same catalogues.
     design : str
@@ -265,6 +269,7 @@ def bias(
         like=like,
         tomography=tomography,
         where=where,
+        unsheared=unsheared,
         weight=weight,
         design=design,
         units=units,
@@ -290,6 +295,7 @@ def bias_sums(
     like: Any = None,
     tomography: str | None = None,
     where: str | None = None,
+    unsheared: str | Sequence[str] | None = None,
     weight: str | None = None,
     design: Design | None = None,
     units: str | None = None,
@@ -335,6 +341,7 @@ def bias_sums(
         None if like is None else _catalogue("like", like),
         tomography,
         where,
+        [unsheared] if isinstance(unsheared, str) else list(unsheared or ()),
         weight,
         design,
         units,
@@ -344,7 +351,7 @@ def bias_sums(
     )
     settings = {
         "g1": g1, "g2": g2, "truth": truth, "columns": columns, "preset": preset, "ellipticity": ellipticity, "truth_sign": truth_sign, "bins": bins,
-        "like": like, "tomography": tomography, "where": where, "weight": weight, "design": design, "units": units,
+        "like": like, "tomography": tomography, "where": where, "unsheared": unsheared, "weight": weight, "design": design, "units": units,
         "paired": paired, "drop_missing": drop_missing, "step": step,
     }
     paths = [own if isinstance(own, str) else own[0] for own in given] + presets + ([] if truth is None else [os.fspath(truth)])

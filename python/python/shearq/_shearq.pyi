@@ -155,6 +155,7 @@ def bias_sums(
     like: str | tuple[str, list[tuple[str, Any]], list[str]] | None,
     tomography: str | None,
     condition: str | None,
+    unsheared: Sequence[str],
     weight: str | None,
     design: str | None,
     units: str | None,
