@@ -17,8 +17,8 @@ use shearq_dataset::run::{Run, Source};
 use shearq_dataset::threads::Progress;
 use shearq_detection::{DetectedPixel, Detection, Detections, Detector, Tile};
 use shearq_files::FileError;
-use shearq_files::frames::frame;
 use shearq_files::frames::polars::{Column, DataFrame, PolarsResult};
+use shearq_files::frames::{Metadata, frame};
 use shearq_files::table::{self, FileFormat, Place};
 use shearq_measure::{Examination, MeasureError, NoisePlan, PixelFrame, StampNoise};
 use shearq_quantities::statistics::upper_median;
@@ -53,6 +53,15 @@ const NOISE: &str = "noise";
 const NOISE_SOURCE: &str = "noisesource";
 const MASK: &str = "mask";
 const MASK_BITS: &str = "maskbits";
+// The source of a noise that neither the user nor the header states.
+const MEASURED: &str = "measured";
+
+// The noise of an exposure, where it is from, and its standard deviation as measured.
+struct NoiseLevel {
+    noise: StampNoise,
+    source: &'static str,
+    measured: Option<f64>,
+}
 
 /// What was found on an exposure.
 #[derive(Debug, Clone)]
@@ -292,31 +301,10 @@ impl DetectionTask<'_> {
             return Err(exposure.origin.fault(&fault).into());
         }
         let jacobian = self.jacobian(&wcs, sides, &exposure)?;
-        let stated = match self.noise {
-            Some(noise) => Some(noise),
-            None => exposure.number("NOISESIG")?,
-        };
         let sample = sample(&mut exposure, sides)?;
-        let measured = measured_noise(&exposure, &sample);
-        let known = measured.as_ref().ok().map(StampNoise::sigma);
-        let noise = match stated {
-            Some(sigma) => StampNoise::white(sigma),
-            None => measured.map_err(|error| match error {
-                PipelineError::Measure(_) => unmeasured(&exposure).into(),
-                other => other,
-            })?,
-        };
-        let source = match (self.noise, stated) {
-            (Some(_), _) => "given",
-            (None, Some(_)) => "header",
-            (None, None) => "measured",
-        };
+        let level = self.noise(&mut exposure, &sample)?;
         let star = self.star(&wcs)?;
-        let detector = Detector::new(star.view(), &noise, jacobian.as_ref(), &self.settings);
-        let detector = detector.map_err(|error| match error {
-            MeasureError::Noise(_) => exposure.origin.fault(&error.to_string()),
-            _ => FileError::new(&self.psf.paths[0], error),
-        })?;
+        let detector = self.detector(&exposure, &star, &level.noise, jacobian.as_ref())?;
         let path = run.catalogue(out, id.set, id.image);
         let print = of_image(&Place::of(&self.exposure.paths[0]).path)?;
         refuse_other(&path, run.format, &print)?;
@@ -337,20 +325,86 @@ impl DetectionTask<'_> {
         let _claim = run.claim(out)?;
         let columns = self::columns(&found, &wcs);
         let columns = columns.map_err(|error| FileError::new(&path, error))?;
-        let mut prints = BTreeMap::new();
-        let mask = self
-            .masks
-            .as_ref()
-            .map(|masks| (MASK, &masks.files.paths[0]));
-        prints.insert(GALAXIES.to_owned(), print);
+        let metadata = self.metadata((run, id), print, &level, (frame, &wcs))?;
+        table::write(&path, run.format, &columns, &metadata)?;
+        let sigma = level.noise.sigma();
+        let sky = sky_level(sample.iter().copied());
+        let mut doubts = doubts(star.view(), sky, sigma, level.measured);
+        doubts.extend(unlit_in_words(unlit));
+        Ok(Detected {
+            detections: found.len(),
+            weight: found.iter().map(|own| own.weight).sum(),
+            margin: detector.margin(),
+            noise: sigma,
+            is_measured: level.source == MEASURED,
+            frame,
+            missing: missing.into_inner(),
+            doubts,
+            unlit,
+        })
+    }
+
+    fn noise(
+        &self,
+        exposure: &mut Exposure<'_>,
+        sample: &[f32],
+    ) -> Result<NoiseLevel, PipelineError> {
+        let (stated, source) = match self.noise {
+            Some(noise) => (Some(noise), "given"),
+            None => match exposure.number("NOISESIG")? {
+                Some(noise) => (Some(noise), "header"),
+                None => (None, MEASURED),
+            },
+        };
+        let measured = measured_noise(exposure, sample);
+        let known = measured.as_ref().ok().map(StampNoise::sigma);
+        let noise = match stated {
+            Some(sigma) => StampNoise::white(sigma),
+            None => measured.map_err(|error| match error {
+                PipelineError::Measure(_) => unmeasured(exposure).into(),
+                other => other,
+            })?,
+        };
+        Ok(NoiseLevel {
+            noise,
+            source,
+            measured: known,
+        })
+    }
+
+    fn detector(
+        &self,
+        exposure: &Exposure<'_>,
+        star: &Array2<f64>,
+        noise: &StampNoise,
+        jacobian: Option<&Jacobian>,
+    ) -> Result<Detector, FileError> {
+        let detector = Detector::new(star.view(), noise, jacobian, &self.settings);
+        detector.map_err(|error| match error {
+            MeasureError::Noise(_) => exposure.origin.fault(&error.to_string()),
+            _ => FileError::new(&self.psf.paths[0], error),
+        })
+    }
+
+    // What the catalogue states of its exposure, of which `print` is the fingerprint.
+    fn metadata(
+        &self,
+        (run, id): (&Run, ImageId),
+        print: String,
+        level: &NoiseLevel,
+        (frame, wcs): (Frame, &Wcs),
+    ) -> Result<Metadata, PipelineError> {
+        let masks = self.masks.as_ref();
+        let mask = masks.map(|masks| (MASK, &masks.files.paths[0]));
+        let mut prints = BTreeMap::from([(GALAXIES.to_owned(), print)]);
         for (key, file) in [(PSF, &self.psf.paths[0])].into_iter().chain(mask) {
             prints.insert(key.to_owned(), of_image(&Place::of(file).path)?);
         }
         let mut metadata = metadata(run, id, prints)?;
         metadata.insert(CATALOGUE_FIRST_PIXEL.into(), "1".into());
-        metadata.insert(NOISE.into(), noise.sigma().to_string());
-        metadata.insert(NOISE_SOURCE.into(), source.into());
-        if let Some(bits) = self.masks.as_ref().and_then(|masks| masks.bits) {
+        metadata.insert(NOISE.into(), level.noise.sigma().to_string());
+        metadata.insert(NOISE_SOURCE.into(), level.source.into());
+        if let Some(bits) = masks.and_then(|masks| masks.bits) {
             metadata.insert(MASK_BITS.into(), bits.to_string());
         }
         match (frame, wcs.reference()) {
@@ -362,25 +416,7 @@ impl DetectionTask<'_> {
             }
             (Frame::Pixel, None) => {}
         }
-        table::write(&path, run.format, &columns, &metadata)?;
-        let mut doubts = doubts(
-            star.view(),
-            sky_level(sample.iter().copied()),
-            noise.sigma(),
-            known,
-        );
-        doubts.extend(unlit_in_words(unlit));
-        Ok(Detected {
-            detections: found.len(),
-            weight: found.iter().map(|own| own.weight).sum(),
-            margin: detector.margin(),
-            noise: noise.sigma(),
-            is_measured: stated.is_none(),
-            frame,
-            missing: missing.into_inner(),
-            doubts,
-            unlit,
-        })
+        Ok(metadata)
     }
 
     // Reads rows of pixels, NaN where they are missing, which are counted.
