@@ -3,7 +3,7 @@
 use std::ops::Range;
 use std::sync::Arc;
 
-use ndarray::{ArcArray2, Array3, ArrayView2};
+use ndarray::{Array3, ArrayView2};
 use numpy::{IntoPyArray, PyArray3, PyReadonlyArray1, PyReadonlyArray2, PyReadonlyArray3};
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
@@ -12,7 +12,7 @@ use shearq_catalogue::star_noise::{StarNoise, Stars};
 use shearq_measure::{
     ArraySource, Batch, Flag, FunctionalPsf, Jacobian, JacobianError, KnownNoise, MeanShear,
     MeanShearError, MeasureError, Measurement, Measurer, Oversampling, PsfProfile, Psfs, Session,
-    ShearSum, Warning,
+    ShearSum, Star, Warning,
 };
 use shearq_pipeline::PipelineError;
 use shearq_pipeline::measure::{
@@ -26,11 +26,7 @@ use crate::submissions::Configuration;
 use crate::work::{Failure, Watch, threads};
 
 enum AllPsfs<'a> {
-    Shared {
-        psf: ArcArray2<f64>,
-        /// Offset of a star in pixels, if it was moved to the centre.
-        moved: Option<[f64; 2]>,
-    },
+    Shared(Arc<Star>),
     Stars(Stamps<'a>),
     Formulas(Vec<FunctionalPsf>),
 }
@@ -39,7 +35,7 @@ impl<'a> AllPsfs<'a> {
     // Rows of the image are read one after another, so that converted stars are not in memory all at once.
     fn slice(&self, range: Range<usize>) -> PyResult<Psfs<'a>> {
         Ok(match self {
-            AllPsfs::Shared { psf, .. } => Psfs::Prepared(psf.clone()),
+            AllPsfs::Shared(psf) => Psfs::Prepared(psf.clone()),
             AllPsfs::Stars(stars) => Psfs::Stars(stars.slice(range)?),
             AllPsfs::Formulas(formulas) => Psfs::functional(formulas[range].to_vec()),
         })
@@ -113,7 +109,7 @@ fn source<'a>(
     });
     let jacobians = jacobians.transpose()?;
     let (is_shared, moved) = match psfs {
-        AllPsfs::Shared { moved, .. } => (true, moved),
+        AllPsfs::Shared(ref star) => (true, star.moved),
         AllPsfs::Stars(_) | AllPsfs::Formulas(_) => (false, None),
     };
     let stamps = arrays.stamps.shared();
@@ -256,11 +252,8 @@ fn measured<'a>(
 // Cut once here, not once per row.
 fn star_for_all<'a>(measurer: &Measurer, star: ArrayView2<'_, f64>) -> PyResult<AllPsfs<'a>> {
     let cut = measurer.configuration().psf_cut();
-    let found = shearq_measure::Star::cut(star, cut).map_err(of_measuring)?;
-    Ok(AllPsfs::Shared {
-        psf: found.psf.into_shared(),
-        moved: found.moved,
-    })
+    let found = Star::cut(star, cut).map_err(of_measuring)?;
+    Ok(AllPsfs::Shared(Arc::new(found)))
 }
 
 // Sizes are checked before the work, which would flag each galaxy with `BadPsf`.
@@ -293,8 +286,8 @@ fn formula_psfs<'a>(
         return Ok(AllPsfs::Formulas(formulas));
     };
     let size = measurer.configuration().psf_cut().size;
-    let psf = one.stamp_beside(size, measurer.full()).into_shared();
-    Ok(AllPsfs::Shared { psf, moved: None })
+    let psf = one.stamp_beside(size, measurer.full());
+    Ok(AllPsfs::Shared(Arc::new(psf.into())))
 }
 
 fn one_each(argument: &str, found: usize, count: usize) -> PyResult<()> {

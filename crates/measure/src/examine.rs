@@ -248,7 +248,13 @@ impl Examination {
         let count = count.unwrap_or(1);
         let some = most.min(count);
         for at in (0..some).map(|k| (2 * k + 1) * count / (2 * some)) {
-            if let Ok(Star { psf, moved }) = psfs.at(at, cut, self.stamp.side) {
+            if let Ok(Star {
+                psf,
+                moved,
+                unshifted,
+            }) = psfs.at(at, cut, self.stamp.side)
+            {
+                let psf = unshifted.unwrap_or(psf);
                 let before = self.psfs.len();
                 self.add_psf(psf.view(), moved);
                 let stamp = first.and_then(|first| self.of(first + at));

@@ -25,7 +25,7 @@ use crate::measurement::{Flag, Measurement};
 use crate::measurer::{Epoch, ImageNoise, ImageWorker, Measurer, Steps, Worker};
 use crate::noise::{NoisePlan, NoiseSurvey, StampNoise, Survey};
 use crate::pixels::{Pixel, Pixels, is_level};
-use crate::psf::{Psfs, ResidualProfiles, Star};
+use crate::psf::{Psfs, ResidualProfiles};
 use crate::warning::Warning;
 
 /// The noise of an image before it is measured, as far as it is known.
@@ -230,8 +230,9 @@ impl<'a> ArraySource<'a> {
                 });
             }
             None if matches!(psfs, Psfs::Star(_)) => {
-                let Star { psf, moved } = psfs.at(0, measurer.configuration().psf_cut(), full)?;
-                (Some(psf.into_shared()), moved)
+                let star = psfs.at(0, measurer.configuration().psf_cut(), full)?;
+                let moved = star.moved;
+                (Some(Arc::new(star)), moved)
             }
             _ => (None, None),
         };

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use ndarray::{ArcArray2, Ix3};
+use ndarray::Ix3;
 use shearq_measure::{
     Batch, KnownNoise, Lazy, LazyStamps, Measurer, OneThread, Pixels, Psfs, Session, StampRows,
     StampSource, Star, Steps, Threads,
@@ -30,7 +30,7 @@ struct SimulatedSource<'s> {
     set: &'s SetSimulator,
     fields: Arc<ImageFields>,
     form: PsfForm,
-    shared: Option<ArcArray2<f64>>,
+    shared: Option<Arc<Star>>,
     // Kept until they are measured, so that several measurers and the survey draw a row once.
     drawn: Arc<Mutex<BTreeMap<usize, LazyStamps<'s>>>>,
 }
@@ -49,11 +49,11 @@ impl<'s> SimulatedSource<'s> {
                 let cut = configuration.psf_cut();
                 // No noise is added, as `simulate` adds none to its star images.
                 let psf = match form {
-                    PsfForm::Functional => psf.stamp_beside(cut.size, STAMP),
+                    PsfForm::Functional => psf.stamp_beside(cut.size, STAMP).into(),
                     // A star that cannot be cut is an error: zeros in its place would be measured like any PSF.
-                    PsfForm::Star => Star::cut(fields.psf.star(0, 0).view(), cut)?.psf,
+                    PsfForm::Star => Star::cut(fields.psf.star(0, 0).view(), cut)?,
                 };
-                Some(psf.into_shared())
+                Some(Arc::new(psf))
             }
         };
         Ok(SimulatedSource {

@@ -2,8 +2,9 @@
 
 use std::borrow::Cow;
 use std::ops::Range;
+use std::sync::Arc;
 
-use ndarray::{ArcArray2, Array2, ArrayView2, Axis, Ix2, Ix3};
+use ndarray::{ArrayView2, Axis, Ix2, Ix3};
 use shearq_quantities::FunctionalPsf;
 use shearq_submissions::PsfCut;
 
@@ -16,7 +17,7 @@ use crate::pixels::Pixels;
 pub enum Psfs<'a> {
     /// One PSF for all galaxies, used as it is: centred, of sum one, and with the pixels that [`Star::cut`] cuts. Clones
     /// share its pixels.
-    Prepared(ArcArray2<f64>),
+    Prepared(Arc<Star>),
     /// One star stamp for all galaxies, which is cut around the star and normalised.
     Star(Pixels<'a, Ix2>),
     /// Star stamps, one per galaxy along the first axis.
@@ -26,9 +27,9 @@ pub enum Psfs<'a> {
 }
 
 impl<'a> Psfs<'a> {
-    /// [`Psfs::Prepared`] of an array. An owned array is not copied if it is passed as [`ArcArray2`].
+    /// [`Psfs::Prepared`] of an array.
     pub fn prepared(psf: ArrayView2<'_, f64>) -> Self {
-        Psfs::Prepared(psf.to_shared())
+        Psfs::Prepared(Arc::new(psf.to_owned().into()))
     }
 
     /// [`Psfs::Star`] of a view or an array of `f32` or `f64`.
@@ -78,9 +79,8 @@ impl<'a> Psfs<'a> {
                 expected: format!("more than {k}, one each"),
             });
         }
-        let unmoved = |psf: Array2<f64>| Star { psf, moved: None };
         match self {
-            Psfs::Prepared(psf) => Ok(unmoved(psf.to_owned())),
+            Psfs::Prepared(psf) => Ok(Star::clone(psf)),
             Psfs::Star(Pixels::Single(stamp)) => Star::cut(stamp.view(), cut),
             Psfs::Star(Pixels::Double(stamp)) => Star::cut(stamp.view(), cut),
             Psfs::Stars(Pixels::Single(stamps)) => Star::cut(stamps.index_axis(Axis(0), k), cut),
@@ -93,7 +93,7 @@ impl<'a> Psfs<'a> {
                 } = formulas[k];
                 // The fields are public, and may have been assembled with values that are not a PSF.
                 let psf = FunctionalPsf::new(profile, fwhm, shape)?;
-                Ok(unmoved(psf.stamp_beside(cut.size, full)))
+                Ok(psf.stamp_beside(cut.size, full).into())
             }
         }
     }

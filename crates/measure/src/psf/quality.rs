@@ -440,8 +440,9 @@ mod tests {
     use shearq_quantities::{PsfProfile, Shear};
 
     use super::*;
-    use crate::psf::Star;
-    use crate::psf::testing::{drawn, noisy};
+    use crate::examine::Examination;
+    use crate::psf::testing::{drawn, limits, noisy};
+    use crate::psf::{Psfs, Star};
 
     const MOFFAT: PsfProfile = PsfProfile::Moffat { beta: 3.0 };
 
@@ -492,7 +493,7 @@ mod tests {
         let middle = (side as f64 - 1.0) / 2.0;
         Array2::from_shape_fn((side, side), |(y, x)| {
             let r = (x as f64 - middle).hypot(y as f64 - middle);
-            let x = 3.2327 * r / fwhm;
+            let x = (3.2327 * r / fwhm).max(1e-6);
             (2.0 * puruspe::bessel::Jn(1, x) / x).powi(2)
         })
     }
@@ -611,6 +612,23 @@ mod tests {
             // To a factor of three.
             assert!(found < 3.0 * m || m < 0.002, "{power}: {found}");
             assert!(found > m / 3.0 || m < 0.002, "{power}: {found}");
+        }
+    }
+
+    #[test]
+    fn odd_stamps_are_judged_before_their_shift() {
+        let found = |side: usize| {
+            let mut examination = Examination::new(48, 0);
+            let stamp = airy(1.03, side);
+            examination.add_psfs(&Psfs::star(stamp.view()), limits(48, 32, true), 1);
+            examination.warnings()
+        };
+        for (side, sign) in [(48, 1.0), (49, -1.0), (64, 1.0), (65, -1.0)] {
+            let found = found(side);
+            let [Warning::PsfNarrow { effect: [m, _], .. }] = found.as_slice() else {
+                panic!("{side}: {found:?}");
+            };
+            assert!(sign * m > 0.002, "{side}: {m}");
         }
     }
 

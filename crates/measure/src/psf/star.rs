@@ -28,6 +28,20 @@ pub struct Star {
     /// Offset (x, y) of the star from the centre of its stamp in pixels, if it is above one pixel along either axis. The
     /// cut was moved by the nearest whole pixels then.
     pub moved: Option<[f64; 2]>,
+    /// The pixels around the star before it was shifted by half a pixel, if it was. They show noise and aliased light: the shift makes
+    /// rings of aliased light, and places the centre on a corner.
+    pub(crate) unshifted: Option<Array2<f64>>,
+}
+
+impl From<Array2<f64>> for Star {
+    /// A PSF that is used as it is.
+    fn from(psf: Array2<f64>) -> Star {
+        Star {
+            psf,
+            moved: None,
+            unshifted: None,
+        }
+    }
 }
 
 impl Star {
@@ -56,7 +70,18 @@ impl Star {
         if along_x {
             shifted = shifted.dot(&fourier_shift(columns, columns - 1, 0.5).t());
         }
-        cut_around_star(shifted.view(), cut)
+        let found = cut_around_star(shifted.view(), cut)?;
+        // Of the parity of the stamp, so that the star is in the middle of them.
+        let unshifted = PsfCut {
+            size: cut.size + 1,
+            least: cut.least + 1,
+            ..cut
+        };
+        let unshifted = (along_y && along_x).then(|| cut_around_star(stamp, unshifted).ok());
+        Ok(Star {
+            unshifted: unshifted.flatten().map(|star| star.psf),
+            ..found
+        })
     }
 }
 
@@ -153,7 +178,10 @@ fn cut_around_star<P: Pixel>(stamp: ArrayView2<'_, P>, cut: PsfCut) -> Result<St
         return Err(MeasureError::DarkPsf(light));
     }
     let psf = taken.mapv(|value| scale * Into::<f64>::into(value));
-    Ok(Star { psf, moved })
+    Ok(Star {
+        moved,
+        ..psf.into()
+    })
 }
 
 /// First pixel of a centred cut of `size` from a side of `full`; `None` where it does not fit.

@@ -200,7 +200,7 @@ impl StarWriter {
         let light: f64 = pixels.iter().map(|&value| f64::from(value)).sum();
         self.dark += usize::from(!(light > 0.0 && light.is_finite()));
         if let Ok(stamp) = ArrayView2::from_shape((side, side), pixels)
-            && let Ok(Star { psf, moved }) = Star::cut(stamp, examined_cut(side))
+            && let Ok(Star { psf, moved, .. }) = Star::cut(stamp, examined_cut(side))
         {
             self.examination.add_psf(psf.view(), moved);
         }

@@ -3,8 +3,9 @@
 use std::collections::HashMap;
 use std::fmt;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
-use ndarray::{ArcArray2, Array3, ArrayView2, Axis, Ix3, Slice};
+use ndarray::{Array3, ArrayView2, Axis, Ix3, Slice};
 use shearq_files::FileError;
 use shearq_files::fits::ImageReader;
 use shearq_files::open::is_there;
@@ -297,7 +298,7 @@ pub(crate) fn open_galaxies(
 }
 
 enum PsfSource {
-    Shared(ArcArray2<f64>),
+    Shared(Arc<Star>),
     Stars {
         image: Box<ImageReader>,
         side: usize,
@@ -502,10 +503,10 @@ fn open_star_field(
         }
         false => Star::cut(star(0), cut),
     };
-    let Star { psf, moved } = found.map_err(|error| FileError::new(path, error))?;
+    let star = found.map_err(|error| FileError::new(path, error))?;
     Ok(OpenPsfs {
-        source: PsfSource::Shared(psf.into_shared()),
-        moved,
+        moved: star.moved,
+        source: PsfSource::Shared(Arc::new(star)),
         wcs: Wcs::default(),
         stated: None,
     })
@@ -533,7 +534,7 @@ fn open_functional(path: &Path, cut: PsfCut, mosaic: &Mosaic) -> Result<PsfSourc
         );
         return Err(FileError::new(path, message));
     }
-    Ok(PsfSource::Shared(stamp.into_shared()))
+    Ok(PsfSource::Shared(Arc::new(stamp.into())))
 }
 
 fn open_stars(path: &Path, cut: PsfCut, mosaic: &Mosaic) -> Result<OpenPsfs, FileError> {
@@ -592,10 +593,10 @@ fn open_stars(path: &Path, cut: PsfCut, mosaic: &Mosaic) -> Result<OpenPsfs, Fil
     let pixels = image.read_rows(height)?;
     let stamp = ArrayView2::from_shape((height, width), &pixels)
         .map_err(|error| FileError::new(path, error))?;
-    let Star { psf, moved } = Star::cut(stamp, cut).map_err(|error| FileError::new(path, error))?;
+    let star = Star::cut(stamp, cut).map_err(|error| FileError::new(path, error))?;
     Ok(OpenPsfs {
-        source: PsfSource::Shared(psf.into_shared()),
-        moved,
+        moved: star.moved,
+        source: PsfSource::Shared(Arc::new(star)),
         wcs,
         stated,
     })
