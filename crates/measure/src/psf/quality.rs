@@ -58,12 +58,13 @@ const OPTICS: [[f64; 2]; 2] = [[0.28, 0.07], [0.26, -0.04]];
 const TURBULENCE: [[f64; 2]; 2] = [[0.315, 0.015], [0.05, -0.005]];
 // c below which a PSF is on a corner. Chosen by hand.
 const MAX_CORNER: f64 = -0.5;
-// There, S(2) of optics without aliases is as large: Euclid VIS and Roman H158 have S(2.6)/S(2) = 0.53 and more, J129, Y106 and NISP at most 0.5.
-const MIN_EDGE_RATIO: f64 = 0.515;
+// There, S(2) of optics without aliases is as large, but S(2.6)/S(2) exceeds this at an index of 2.65 and its slope with the index: Roman Y106
+// and J129 have 0.41 to 0.43 at 2.6 to 2.7, Euclid NISP J 0.44 at 2.75 and Airy discs of λ/D = 1 px 0.47 to 0.48 at 3.0; GREAT3's
+// PSFs of multiepoch-space, of λ/D = 1.2 to 1.6 px, 0.47 to 0.50 at 2.6 to 2.8, Euclid VIS and Roman H158 0.53 and more. All have m = 0.
+const EDGE_RATIO: [f64; 2] = [0.462, 0.08];
+const EDGE_RATIO_INDEX: f64 = 2.65;
 // Nor does ln S(2)/ln S(1) fall below this with aliases: J129 has 2.63. Obscurations of 0.17 and more have at most 2.48 from λ/D = 1.5 px on.
 const MIN_ALIASED_INDEX: f64 = 2.55;
-// Beyond that S(2), all are aliased.
-const MAX_SAMPLED: f64 = 0.4;
 // S(3)/S(2.6), squared, on a corner. With aliases, S is zero at π by symmetry and 0.22 to 0.30 there; optics of λ/D = 2 px have 0.12.
 const MIN_ALIASED_FALL: f64 = 0.04;
 // Largest change of c in units of that of m at c = ±1, which is positive on a corner. Airy discs and Moffat PSFs on a pixel's centre
@@ -290,11 +291,9 @@ fn aliasing([low, sampled, edge]: [f64; 3], phase: f64) -> f64 {
     let index = sampled.ln() / low.ln();
     let is_turbulence = index > at(INDEX_TURBULENCE);
     let [least, slope] = if is_turbulence { TURBULENCE } else { OPTICS };
-    if !is_turbulence
-        && phase < MAX_CORNER
-        && sampled < MAX_SAMPLED
-        && (edge > MIN_EDGE_RATIO * sampled || index < MIN_ALIASED_INDEX)
-    {
+    let [ratio, change] = EDGE_RATIO;
+    let is_sampled = edge > (ratio + change * (index - EDGE_RATIO_INDEX)) * sampled;
+    if !is_turbulence && phase < MAX_CORNER && (is_sampled || index < MIN_ALIASED_INDEX) {
         return 0.0;
     }
     at(slope) * (sampled - at(least)).max(0.0)
@@ -595,6 +594,14 @@ mod tests {
             (0.678, 0.342, 0.152, -1.0, 0.041),
             (0.697, 0.330, 0.136, -1.0, 0.036),
             (0.615, 0.299, 0.164, -1.0, 0.0),
+            // Roman Z087; PSFs of GREAT3's multiepoch-space, and Airy discs of λ/D = 1.6 px and an obscuration of 0 and 0.1.
+            (0.635, 0.298, 0.129, -1.0, 0.039),
+            (0.623, 0.292, 0.138, -1.0, 0.0),
+            (0.656, 0.334, 0.169, -1.0, 0.0),
+            (0.694, 0.368, 0.180, -1.0, 0.0),
+            (0.702, 0.375, 0.181, -1.0, 0.0),
+            (0.657, 0.323, 0.157, -1.0, 0.0),
+            (0.645, 0.321, 0.160, -1.0, 0.0),
             // Y106, J129, H158 and VIS on a pixel.
             (0.657, 0.440, 0.374, 1.0, 0.032),
             (0.596, 0.366, 0.348, 1.0, 0.008),
