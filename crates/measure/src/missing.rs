@@ -25,12 +25,29 @@ pub(crate) fn padding(pixels: &[f32], n: usize) -> [usize; 4] {
 const MAX_MISSING_SHARE: f32 = 0.25;
 // Of the pixels of a stamp that become zero: the opposite one is missing, and too few adjacent ones are present. Chosen by hand.
 const MAX_MISSING_PAIR_SHARE: f32 = 0.02;
+// Width in pixels of a border that may be missing altogether: no light is there. The sky that shows defects is measured on a border of 4 px.
+const MAX_MISSING_BORDER: usize = 3;
 // In pixels around the galaxy's centre, with stricter limits. Chosen by hand.
 const INNER_MISSING_RADIUS: f32 = 12.0;
 // Missing pixels within that radius. Chosen by hand.
 const MAX_INNER_MISSING: usize = 24;
 // Of the eight around a pixel whose opposite is missing or off the stamp. Chosen by hand.
 const MIN_ADJACENT_PRESENT: usize = 7;
+
+/// Width of the border of which all pixels are missing, as of stamps that were resampled or whose edges were masked; 0 if it is too wide.
+pub(crate) fn missing_border(pixels: &[f32], n: usize) -> usize {
+    let is_missing = |depth: usize| {
+        let inner = depth..n - depth;
+        inner.clone().all(|at| {
+            let ring = [depth, n - 1 - depth].map(|far| [far * n + at, at * n + far]);
+            ring.as_flattened()
+                .iter()
+                .all(|&at| !pixels[at].is_finite())
+        })
+    };
+    let width = (0..n / 2).take_while(|depth| is_missing(*depth)).count();
+    if width > MAX_MISSING_BORDER { 0 } else { width }
+}
 
 /// Sum of a pixel and its opposite under rotation by 180° about a galaxy, along each axis. It rounds the galaxy's centre to
 /// half a pixel, so that opposites are pixels.
@@ -91,23 +108,33 @@ impl MissingPixels {
         if self.places.is_empty() {
             return true;
         }
-        if self.places.len() as f32 > MAX_MISSING_SHARE * stamp.len() as f32 {
+        // Without this border, the stamp is a smaller one.
+        let border = missing_border(stamp, n);
+        let of_border = 4 * border * (n - border);
+        if (self.places.len() - of_border) as f32 > MAX_MISSING_SHARE * stamp.len() as f32 {
             return false;
         }
         // The centroid needs all pixels: first filled about the stamp's centre, then about the galaxy's.
-        self.fill_about(stamp, n, [0.0; 2]);
+        self.fill_about(stamp, (n, border), [0.0; 2]);
         let centroid = galaxy_centroid(stamp, n);
         for &at in &self.places {
             stamp[at] = f32::NAN;
         }
         let inner = self.places.iter().filter(|at| is_inner(**at, n, centroid));
         let few_inner = inner.count() <= MAX_INNER_MISSING;
-        self.fill_about(stamp, n, centroid) && few_inner
+        self.fill_about(stamp, (n, border), centroid) && few_inner
     }
 
     /// Gives missing pixels the light of the opposite ones, or if that is missing too the mean of the adjacent ones, or
-    /// zero. False if a pixel near the centre becomes zero, or too many elsewhere whose opposite is on the stamp.
-    fn fill_about(&mut self, stamp: &mut [f32], n: usize, centroid: [f32; 2]) -> bool {
+    /// zero. False if a pixel near the centre becomes zero, or too many elsewhere whose opposite is on the stamp and inside of the
+    /// missing border.
+    fn fill_about(
+        &mut self,
+        stamp: &mut [f32],
+        (n, border): (usize, usize),
+        centroid: [f32; 2],
+    ) -> bool {
+        let inside = border..n - border;
         let rotation = rotation_sum(centroid, n);
         let (mut inner_filled, mut zeroed) = (true, 0);
         self.lights.clear();
@@ -117,7 +144,8 @@ impl MissingPixels {
             let light = light.or_else(|| adjacent_mean(stamp, n, at));
             if light.is_none() {
                 // An opposite that is off the stamp is so far out that there is no light.
-                zeroed += usize::from(other.is_some());
+                let is_inside = [at % n, at / n].iter().all(|at| inside.contains(at));
+                zeroed += usize::from(is_inside && other.is_some());
                 inner_filled &= !is_inner(at, n, centroid);
             }
             self.lights.push(light.unwrap_or(0.0));
@@ -188,6 +216,30 @@ mod tests {
             assert!(worst.fold(0.0, f32::max) < 1e-3);
         }
         assert_eq!(mended([]).unwrap(), whole);
+    }
+
+    #[test]
+    fn a_missing_border_makes_a_smaller_stamp() {
+        let border = |width: usize| {
+            let is_border = move |(x, y): &(usize, usize)| {
+                [*x, *y].iter().any(|at| *at < width || *at >= N - width)
+            };
+            (0..N * N).map(|at| (at % N, at / N)).filter(is_border)
+        };
+        let whole = galaxy();
+        for width in [1, 3] {
+            let found = mended(border(width)).unwrap();
+            let worst = found.iter().zip(&whole).map(|(a, b)| (a - b).abs());
+            assert!(worst.fold(0.0, f32::max) < 1e-3, "{width}");
+        }
+        assert!(mended(border(4)).is_none());
+        // With a hole the opposite of which is missing, as without a border.
+        let hole = |x0: usize| (0..100).map(move |k| (x0 + k % 8, 20 + k / 8));
+        assert!(mended(border(1).chain(hole(4)).chain(hole(37))).is_none());
+        let mut pixels = whole;
+        assert_eq!(missing_border(&pixels, N), 0);
+        pixels[..N].fill(f32::NAN);
+        assert_eq!(missing_border(&pixels, N), 0);
     }
 
     #[test]

@@ -31,7 +31,7 @@ use shearq_submissions::SkySource;
 use crate::defects::{Defects, LightLimits};
 use crate::error::MeasureError;
 use crate::examine::enough;
-use crate::missing::{MissingPixels, padding, rotation_sum};
+use crate::missing::{MissingPixels, missing_border, padding, rotation_sum};
 use crate::moments::{GalaxyMoments, galaxy_centroid};
 use crate::pixels::{PEAK_RANGE, Pixel, all_finite, highest};
 use crate::sky::{Sky, SkyLevels, inner_light};
@@ -311,6 +311,7 @@ impl NoisePlan {
             surveyed: 0,
             incomplete: 0,
             unusable: 0,
+            bordered: [0; 2],
         }
     }
 }
@@ -478,6 +479,8 @@ pub struct NoiseSurvey {
     surveyed: usize,
     incomplete: usize,
     unusable: usize,
+    /// Stamps whose border is missing, and its largest width in pixels.
+    bordered: [usize; 2],
 }
 
 impl NoiseSurvey {
@@ -486,7 +489,7 @@ impl NoiseSurvey {
         NoiseSurvey { light, ..self }
     }
 
-    /// Surveys a stamp. Blocks with missing pixels are left out, those along an edge whose pixels are all equal (padding has
+    /// Surveys a stamp. Blocks begin inside of a missing border. Those with missing pixels are left out, those along an edge whose pixels are all equal (padding has
     /// no noise), and stamps where too many pixels are missing or all are equal.
     ///
     /// # Errors
@@ -539,10 +542,18 @@ impl NoiseSurvey {
             ..
         } = self.plan;
         let mut block = [0.0; BLOCK_PIXELS];
+        let border = missing_border(&self.stamp.pixels, full);
+        if border > 0 {
+            let [count, widest] = self.bordered;
+            self.bordered = [count + 1, widest.max(border)];
+        }
+        // Those at the edges move, and overlap the next ones.
+        let inward = |first: usize| first.clamp(border, full - border - BLOCK_SIDE);
         for &(y0, x0) in &**blocks {
-            let rows = self.stamp.pixels.chunks_exact(full).skip(y0);
+            let (y, x) = (inward(y0), inward(x0));
+            let rows = self.stamp.pixels.chunks_exact(full).skip(y);
             for (to, row) in block.chunks_exact_mut(BLOCK_SIDE).zip(rows) {
-                for (value, pixel) in to.iter_mut().zip(&row[x0..]) {
+                for (value, pixel) in to.iter_mut().zip(&row[x..]) {
                     *value = f64::from(*pixel);
                 }
             }
@@ -629,6 +640,8 @@ impl NoiseSurvey {
         self.surveyed += other.surveyed;
         self.incomplete += other.incomplete;
         self.unusable += other.unusable;
+        let ([count, widest], [more, width]) = (self.bordered, other.bordered);
+        self.bordered = [count + more, widest.max(width)];
         Ok(())
     }
 
@@ -658,6 +671,13 @@ impl NoiseSurvey {
                 incomplete: self.incomplete,
             }),
         }
+    }
+
+    /// A warning if the borders of stamps are missing.
+    pub(crate) fn missing_border(&self) -> Option<Warning> {
+        let [count, width] = self.bordered;
+        let of = self.surveyed;
+        (count > 0).then_some(Warning::MissingBorder { width, count, of })
     }
 
     /// A survey for a second pass over the stamps, without the sky that was found on them, if it matters: galaxies are

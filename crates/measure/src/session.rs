@@ -534,8 +534,10 @@ impl<'n> Session<'n> {
             session.typical_level = upper_median(&mut levels);
         }
         if let Some(plan) = session.noise_plan() {
-            let survey = survey_noise(plan, source, light, threads)?.result()?;
-            session.survey = survey.map(Arc::new);
+            let survey = survey_noise(plan, source, light, threads)?;
+            let border = survey.missing_border();
+            session.survey = survey.result()?.map(Arc::new);
+            session.warnings.extend(border);
             session
                 .warnings
                 .extend(match (&session.survey, &session.noise) {

@@ -329,6 +329,16 @@ pub enum Warning {
         effect: Option<[f64; 2]>,
         of: ExaminedPsfs,
     },
+    /// The borders of stamps are missing.
+    #[error(
+        "the borders of stamps are missing (found up to {width} px on {count} of {of} stamps surveyed; expected pixels). The noise is measured on the pixels inside of them, and the galaxies without them"
+    )]
+    MissingBorder {
+        /// Width of the widest in pixels.
+        width: usize,
+        count: usize,
+        of: usize,
+    },
     /// The PSF image ends where there is light.
     #[error(
         "the PSF image is cut off (found {side:.0} px across, {} % of the peak at the edge and zeros beyond{of}; expected {MIN_PSF} px or more, or a smooth end). That changes m by about {:+.3}, and c by about {:.2} times the ellipticity of the PSF. Try: a larger PSF image (PSF_SIZE of PSFEx), which contains the wings",

@@ -128,6 +128,30 @@ fn a_given_level_replaces_the_survey_and_a_stated_one_does_not() {
 }
 
 #[test]
+fn stamps_with_missing_borders_are_measured_inside_of_them() {
+    let (mut stamps, stars) = data(100);
+    let measurer = Measurer::named("48/linear/star", 48).unwrap();
+    let psfs = Psfs::stars(stars.view());
+    let of =
+        |stamps: &Array3<f32>| measured(&measurer, stamps, &psfs, KnownNoise::Unknown, &OneThread);
+    let whole = of(&stamps);
+    for width in [1, 3] {
+        for ((_, y, x), value) in stamps.indexed_iter_mut() {
+            if [x, y].iter().any(|at| *at < width || *at >= 48 - width) {
+                *value = f32::NAN;
+            }
+        }
+        let found = of(&stamps);
+        shapes(&found);
+        let ratio = found.galaxies[0].noise / whole.galaxies[0].noise;
+        assert!((ratio - 1.0).abs() < 0.03, "{width}: {ratio}");
+        let (count, of) = (100, 100);
+        let expected = Warning::MissingBorder { width, count, of };
+        assert!(found.warnings.contains(&expected), "{:?}", found.warnings);
+    }
+}
+
+#[test]
 fn no_stamps_are_an_empty_batch() {
     let measurer = Measurer::named("48/linear/star", 48).unwrap();
     let (stamps, stars) = data(0);
