@@ -108,6 +108,15 @@ pub enum Warning {
         /// In units of the noise of a pixel.
         scatter: f64,
     },
+    /// The skies of the stamps have several slopes.
+    #[error(
+        "the slope of the sky differs between stamps (found a scatter of {scatter:.4} of the noise per pixel; expected none), which changes m by about {m:.3}. Try: --submission own.toml with the file own.toml of these lines:\n  extends = \"48/linear/star\"\n  noise.sky = \"stamp\""
+    )]
+    SkySlopes {
+        /// Along an axis, in units of the noise of a pixel per pixel.
+        scatter: f64,
+        m: f64,
+    },
     /// The network stopped before its first iteration on most galaxies.
     #[error(
         "the network makes no iteration (found {count} of {of} galaxies). Their images are not deconvolved. Try: other values of deconvolution.step and deconvolution.lambda"
