@@ -62,6 +62,7 @@ const MAX_CORNER: f64 = -0.5;
 // and J129 have 0.41 to 0.43 at 2.6 to 2.7, Euclid NISP J 0.44 at 2.75 and Airy discs of λ/D = 1 px 0.47 to 0.48 at 3.0; GREAT3's
 // PSFs of multiepoch-space, of λ/D = 1.2 to 1.6 px, 0.47 to 0.50 at 2.6 to 2.8, Euclid VIS and Roman H158 0.53 and more. All have m = 0.
 const EDGE_RATIO: [f64; 2] = [0.462, 0.08];
+// Index at which the limit has that value. Definition.
 const EDGE_RATIO_INDEX: f64 = 2.65;
 // Nor does ln S(2)/ln S(1) fall below this with aliases: J129 has 2.63. Obscurations of 0.17 and more have at most 2.48 from λ/D = 1.5 px on.
 const MIN_ALIASED_INDEX: f64 = 2.55;
