@@ -7,7 +7,7 @@ use clap::Args;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal, Uniform};
-use shearq_bias::Design;
+use shearq_bias::{BiasError, Design};
 
 use crate::arguments::{Printing, ReportFile, TableReading, listed, named, positive};
 use crate::origin::remember_columns;
@@ -222,6 +222,15 @@ pub(crate) fn run(arguments: &Arguments, command_line: &str) -> anyhow::Result<(
         Err(error) if summing.shard.is_some() => {
             tell(format_args!(
                 "note: no estimate of this shard alone: {error}"
+            ));
+            return Ok(());
+        }
+        // One patch or tile of a survey is a part of the sums like any other, but it passes no limit.
+        Err(error @ (BiasFailure::OneUnit(_) | BiasFailure::Bias(BiasError::FewUnits { .. })))
+            if summing.sums.is_some() && arguments.fail_above.is_empty() =>
+        {
+            tell(format_args!(
+                "note: no estimate of these sums alone: {error}"
             ));
             return Ok(());
         }
