@@ -253,6 +253,7 @@ pub(crate) fn run(arguments: &Arguments, command_line: &str) -> anyhow::Result<(
         let mut table = compared_table(&result, &other, &difference);
         let checks = check(&difference, &arguments.fail_above);
         if !checks.is_empty() {
+            with_failures(&mut table, "bin", &checks);
             table
                 .notes
                 .push("--fail-above: limits of the rows `difference`.".into());

@@ -1047,8 +1047,11 @@ pub fn with_failures(table: &mut Table, of: &'static str, checks: &[Checked]) {
     table
         .headings
         .push(Heading::new("exceeds", "Exceeds its limit"));
+    // Of a comparison, the difference has the limits.
+    let side = table.place("of");
     for row in &mut table.rows {
-        let Cell::Text(bin) = &row[place] else {
+        let has_limits = side.is_none_or(|side| row[side] == Cell::text("difference"));
+        let (Cell::Text(bin), true) = (&row[place], has_limits) else {
             row.push(Cell::Empty);
             continue;
         };
