@@ -173,18 +173,17 @@ fn standings<'a>(teams: Teams<'a>, metric: RankBy) -> Vec<Standing<'a>> {
         )
     };
     let ahead = |a: &Standing<'_>, b: &Standing<'_>| {
+        let by = |of: fn(Published, f64) -> f64| {
+            let sign = if metric.larger_is_better() { 1.0 } else { -1.0 };
+            let [of_a, of_b] = [a, b].map(|standing| sign * of(standing.best.published, sign));
+            of_b.total_cmp(&of_a)
+        };
         // At the worse end of its error: otherwise an entry leads whose large error rounds it up.
-        let worse = |Published { value, step, .. }: Published| match metric.larger_is_better() {
-            true => value - step,
-            false => value + step,
-        };
-        let [of_a, of_b] = [a, b].map(|standing| worse(standing.best.published));
-        let by_value = match metric.larger_is_better() {
-            true => of_b.total_cmp(&of_a),
-            false => of_a.total_cmp(&of_b),
-        };
+        let by_worse_end = by(|Published { value, step, .. }, sign| value - sign * step);
+        let by_value = by(|Published { value, .. }, _| value);
         let by_arrival = || arrival(a).cmp(&arrival(b));
-        a.board.cmp(&b.board).then(by_value).then_with(by_arrival)
+        let order = a.board.cmp(&b.board).then(by_worse_end);
+        order.then(by_value).then_with(by_arrival)
     };
     standings.sort_by(ahead);
     for of_board in standings.chunk_by_mut(|a, b| a.board == b.board) {
@@ -510,6 +509,23 @@ pub(crate) mod tests {
         assert_eq!(found(&board), expected);
         assert_eq!(board.standings[0].entries.len(), 2);
         assert_eq!(reasons(&board), ["the team has 2 entries already"]);
+    }
+
+    #[test]
+    fn equal_worse_ends_are_ordered_by_value() {
+        // Published as 9 ± 1 and 10 ± 2.
+        let entries = [("A", 9.2, 0.9), ("B", 10.9, 1.1)].map(|(team, q, error)| {
+            let mut entry = entry(team, DAY, q, &[q - 0.1, q + 0.1, q - 0.1, q + 0.1]);
+            entry.sets[0].errors.q = error;
+            entry
+        });
+        let challenge = challenge();
+        let board = rank(&entries, &challenge, None, &NOISE);
+        let expected = [
+            (Board::Main, Some(1), "B", 10.9),
+            (Board::Main, Some(2), "A", 9.2),
+        ];
+        assert_eq!(found(&board), expected);
     }
 
     #[test]
