@@ -15,12 +15,16 @@ def drawn(profile):
     return profile.drawImage(nx=STAMP, ny=STAMP, scale=1.0).array
 
 
+# All galaxies have the flux that gives a round one this S/N. Scaled after lensing, their flux would depend on shear (m of 4e-3).
+light = galsim.DeVaucouleurs(half_light_radius=2.3) + galsim.Exponential(half_light_radius=4.8)
+round_galaxy = light * (SNR / np.sqrt(np.sum(drawn(galsim.Convolve(psf, light)) ** 2)))
+
+
 def stamp(shear, intrinsic, noise):
-    """A galaxy of S/N 30 under a shear (g1, g2), in noise of one a pixel."""
-    bulge, disc = galsim.DeVaucouleurs(half_light_radius=2.3), galsim.Exponential(half_light_radius=4.8)
-    galaxy = (bulge + disc).shear(g1=intrinsic[0], g2=intrinsic[1]).shear(g1=shear[0], g2=shear[1])
+    """A galaxy under a shear (g1, g2), in noise of one a pixel."""
+    galaxy = round_galaxy.shear(g1=intrinsic[0], g2=intrinsic[1]).shear(g1=shear[0], g2=shear[1])
     image = drawn(galsim.Convolve(psf, galaxy.shift(*rng.uniform(-0.5, 0.5, 2))))
-    return (image * SNR / np.sqrt(np.sum(image**2)) + noise).astype(np.float32)
+    return (image + noise).astype(np.float32)
 
 
 def ellipticity():
