@@ -20,17 +20,30 @@ def test_faults_are_found_where_they_are():
     rng = np.random.default_rng(5)
     field = _field(rng)
     points = {"ra": 150 + rng.uniform(-0.2, 0.2, 50), "dec": 2 + rng.uniform(-0.2, 0.2, 50)}
-    found = shearq.null_tests(field, points=points, against=("x",), **SEPARATIONS)
+    # Coarse bins mix modes, too.
+    separations = {"min_sep": 0.5, "max_sep": 20, "nbins": 12}
+    found = shearq.null_tests(field, points=points, against=("x",), **separations)
     modes = found["modes"]
-    # Small and large apertures mix modes, because pairs are missing.
-    assert np.argmax(modes["map2"]) == 2 and modes["map2"][2] > 5 * abs(modes["mx2"][2])
+    # Small and large apertures would mix modes, because pairs are missing.
+    assert np.array_equal(np.isfinite(modes["map2"]), (modes["r"] > 2.5) & (modes["r"] < 10)), modes
+    at = np.nanargmax(modes["map2"])
+    assert modes["map2"][at] > 5 * abs(modes["mx2"][at])
     assert np.all(np.abs(found["points"]["gx"]) < 0.02)
     assert np.all(np.abs(found["x"]["g2"]) < 4 * found["x"]["g2_error"]) and np.all(np.diff(found["x"]["at"]) > 0)
     # Turned by 45 degrees, E modes are B modes; a fault of the left half is seen against x.
     turned = {**field, "g1": -field["g2"], "g2": field["g1"] + 0.02 * (field["x"] < 500)}
-    found = shearq.null_tests(turned, against=("x",), bins=2, **SEPARATIONS)
-    assert found["modes"]["mx2"][2] > 5 * abs(found["modes"]["map2"][2])
+    found = shearq.null_tests(turned, against=("x",), bins=2, **separations)
+    assert found["modes"]["mx2"][at] > 5 * abs(found["modes"]["map2"][at])
     assert found["x"]["g2"][0] - found["x"]["g2"][1] > 0.015
+
+
+def test_separations_without_pairs_are_missing():
+    pytest.importorskip("treecorr")
+    modes = shearq.null_tests(_field(np.random.default_rng(5)), min_sep=1, max_sep=400, nbins=8)["modes"]
+    # The field is 42 arcmin across.
+    for name in ("xip", "xim", "error"):
+        assert np.array_equal(np.isfinite(modes[name]), np.arange(8) < 5), (name, modes)
+    assert not np.isfinite(modes["map2"][5:]).any()
 
 
 def test_tables_are_read_from_files(tmp_path):

@@ -14,6 +14,8 @@ from ._tables import file_format
 
 _DEGREES = {"ra_units": "deg", "dec_units": "deg"}
 _PSF = ("psf_e1", "psf_e2")
+# In least separations: of a constant ξ₊, for which T₊(0) = 12/5, the missing separations are 0.6/5² = 2 %.
+_MIN_APERTURE = 5
 
 
 def null_tests(
@@ -47,8 +49,11 @@ def null_tests(
     dict
         Arrays by name of each test:
         ``'modes'``: ``r``, ``xip``, ``xim`` and their ``error``, and ⟨M_ap²⟩ of E and B modes (``map2``, ``mx2``,
-        ``map2_error``) for apertures r (Schneider et al. 2002, A&A 396, 1).
+        ``map2_error``) for apertures r (Schneider et al. 2002, A&A 396, 1). ⟨M_ap²⟩ is NaN for apertures below five times
+        the least separation, and above half the largest of the galaxies: ξ at the separations that lack would be E modes
+        that appear as B modes.
         ``'points'``: ``r``, ``gt``, ``gx``, ``error``.
+        Separations without pairs are NaN.
         ``'rho'``: ``r`` and ``rho1`` to ``rho5`` (Rowe 2010, MNRAS 404, 350; Jarvis et al. 2016, MNRAS 460, 2245), each
         with ``rho1_error`` and so on.
         ``'leakage'``, with ``psf_e1`` and ``psf_e2``: ``alpha`` and its ``error`` for each component of g = α e_PSF + c, by
@@ -81,14 +86,18 @@ def null_tests(
     modes = treecorr.GGCorrelation(**separations)
     modes.process(sources)
     map2, _, mx2, _, variance = modes.calculateMapSq()
+    has_pairs = modes.npairs > 0
+    # Only with ξ from (nearly) zero to twice the aperture.
+    largest = modes.right_edges[has_pairs].max(initial=0)
+    is_complete = (modes.rnom >= _MIN_APERTURE * modes.left_edges[0]) & (2 * modes.rnom <= largest)
     found: dict[str, dict[str, Any]] = {
-        "modes": {"r": modes.meanr, "xip": modes.xip, "xim": modes.xim, "error": np.sqrt(modes.varxip)}
-        | {"map2": map2, "mx2": mx2, "map2_error": np.sqrt(variance)}
+        "modes": _where(has_pairs, r=modes.meanr, xip=modes.xip, xim=modes.xim, error=np.sqrt(modes.varxip))
+        | _where(is_complete, map2=map2, mx2=mx2, map2_error=np.sqrt(variance))
     }
     if points is not None:
         about = treecorr.NGCorrelation(**separations)
         about.process(catalogue(_columns("points", points, ("ra", "dec"))), sources)
-        found["points"] = {"r": about.meanr, "gt": about.xi, "gx": about.xi_im, "error": np.sqrt(about.varxi)}
+        found["points"] = _where(about.npairs > 0, r=about.meanr, gt=about.xi, gx=about.xi_im, error=np.sqrt(about.varxi))
     if stars is not None:
         found["rho"] = _rho(treecorr, catalogue, stars, separations)
     if all(name in against for name in _PSF):
@@ -110,8 +119,12 @@ def _rho(treecorr: Any, catalogue: Any, stars: Any, separations: dict[str, Any])
     for number, (first, second) in enumerate([(1, 1), (1, 0), (2, 2), (1, 2), (0, 2)], 1):
         pairs = treecorr.GGCorrelation(**separations)
         pairs.process(fields[first], None if first == second else fields[second])
-        found |= {"r": pairs.meanr, f"rho{number}": pairs.xip, f"rho{number}_error": np.sqrt(pairs.varxip)}
+        found |= _where(pairs.npairs > 0, **{"r": pairs.meanr, f"rho{number}": pairs.xip, f"rho{number}_error": np.sqrt(pairs.varxip)})
     return found
+
+
+def _where(is_known: Any, **columns: Any) -> dict[str, Any]:
+    return {name: np.where(is_known, values, np.nan) for name, values in columns.items()}
 
 
 def _leakage(galaxies: Mapping[str, Any], weight: Any) -> dict[str, Any]:
