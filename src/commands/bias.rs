@@ -261,7 +261,10 @@ pub(crate) fn run(arguments: &Arguments, command_line: &str) -> anyhow::Result<(
         arguments.printing.print(&table)?;
         return fail(&checks);
     }
-    warn(&result);
+    // The catalogues that a shard lacks are in others.
+    if summing.shard.is_none() {
+        warn(&result);
+    }
     let mut table = bias_table(&result);
     if let Some(area) = arguments.area {
         add_per_area(&mut table, &result, area);

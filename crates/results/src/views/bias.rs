@@ -180,9 +180,13 @@ pub fn chosen_by_measurement(result: &BiasResult) -> Option<String> {
     let all = measured.join("`, `");
     let remedy = match result.about.by_shearq {
         true => {
-            "--where 'step(snr, THRESHOLD)' for cuts by snr, flux or size, or catalogues with shape.sheared_step".into()
+            format!(
+                "--where 'step(snr, THRESHOLD)' for cuts by snr, flux or size, catalogues with shape.sheared_step, or --unsheared {column} if shear does not change it"
+            )
         }
-        false => format!("catalogues with {column}_1p, {column}_1m, {column}_2p and {column}_2m"),
+        false => format!(
+            "catalogues with {column}_1p, {column}_1m, {column}_2p and {column}_2m, or --unsheared {column} if shear does not change it, as for redshifts"
+        ),
     };
     // docs/limitations.md, selection after measuring.
     Some(format!(

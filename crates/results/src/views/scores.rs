@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use serde_json::{Value, json};
-use shearq_dataset::truth::Sign;
+use shearq_dataset::truth::{Sign, SignBasis};
 use shearq_quantities::Frame;
 use shearq_render::table::{Cell, Table};
 use shearq_scoring::{
@@ -62,6 +62,21 @@ pub fn convention_note(scored: &[ScoredSet]) -> String {
     }
 }
 
+// Scores are the same under all conventions, and a shear of the other sign is wrong.
+fn other_signs(of: &ScoredSet) -> Option<String> {
+    let is_matched = matches!(of.basis, Basis::Matched(matching) if matching.is_clear());
+    let is_stated = of.sign.is_some_and(|sign| sign.basis == SignBasis::Stated);
+    let SetScore {
+        chosen, constant, ..
+    } = &of.score;
+    (is_matched && is_stated && constant.is_none() && chosen.signs() != (1.0, 1.0)).then(|| {
+        format!(
+            "warning: the signs of the ellipticities are not those of the truth, whose file states the sign of g2 (found {}, expected both signs alike). The scores are as good as with the right signs. Try: --convention 5, or --columns e2=-NAME if this sign is known",
+            chosen.describe()
+        )
+    })
+}
+
 /// Notes on scores: the convention, sets whose leaderboard Q has another convention, and probable faults of truth and
 /// catalogues.
 pub fn notes(scored: &[ScoredSet]) -> Vec<String> {
@@ -72,6 +87,7 @@ pub fn notes(scored: &[ScoredSet]) -> Vec<String> {
         .collect();
     signs.dedup();
     lines.extend(signs);
+    lines.extend(scored.first().and_then(other_signs));
     for own in scored {
         let (set, score) = (own.number(), &own.score);
         let name_of = |place: usize| own.names[place].display().to_string();
