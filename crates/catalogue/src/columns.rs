@@ -1384,6 +1384,18 @@ mod tests {
         }
     }
 
+    #[test]
+    fn each_survey_is_that_of_its_own_columns() {
+        let surveys = &recognition().surveys;
+        for survey in surveys {
+            let columns = survey.columns.values().filter(|own| *own != "none");
+            let columns: Vec<String> = columns.chain(&survey.required).cloned().collect();
+            let mut all = surveys.iter();
+            let first = all.find(|own| own.absent_column(&columns, &Names::default()).is_none());
+            assert_eq!(first, Some(survey), "{columns:?}");
+        }
+    }
+
     // Column lists of public catalogues as their documentation has them, a name per line, with the columns that must be used.
     #[test]
     fn public_catalogues_are_read_by_their_published_columns() {
