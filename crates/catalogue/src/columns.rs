@@ -1341,6 +1341,12 @@ mod tests {
             &["e1=g1", "e2=g2", "g1=g1_true", "g2=g2_true"],
         );
         assert_eq!(own.unwrap().of(Role::G1), Some("g1_true"));
+        // A column that says that it is true is preferred to one that may be of the PSF.
+        for truth in ["g1_true g2_true", "true_g1 true_g2", "g1_in g2_in"] {
+            let own = found(&format!("e1 e2 g1 g2 {truth}"), &[]).unwrap();
+            assert_eq!(own.of(Role::G1), truth.split(' ').next());
+            assert_eq!(own.unused(&[]), ["Not used, and not known: g1, g2."]);
+        }
         let own = found("wmom_g[0] wmom_g[1] mdet_step", &[]).unwrap();
         assert_eq!(own.of(Role::E2), Some("wmom_g[1]"));
         let own = found("e1 e2 R", &["R11=R", "R22=R"]).unwrap();
