@@ -858,20 +858,22 @@ pub fn looks_like_weight(name: &str) -> bool {
     has_any(weight, name) && !has_any(no_weight, name) && !is_w0
 }
 
+// Errors of calibrations and of corrected shapes calibrate nothing.
 fn is_like_a_calibration(name: &str) -> bool {
     has_any(&recognition().patterns.calibration, name)
-        && !is_magnitude(name)
+        && !is_no_calibration(name)
         && !is_like_a_response(name)
+        && !has_any(&recognition().patterns.error, name)
 }
 
-fn is_magnitude(name: &str) -> bool {
+fn is_no_calibration(name: &str) -> bool {
     has_any(&recognition().patterns.no_calibration, name)
 }
 
 // Whether the words of a name are those of a quantity that m and c do not depend on.
 fn is_harmless(name: &str) -> bool {
     let known = &recognition().patterns;
-    is_magnitude(name) || has_any(&known.harmless, name) && !has_any(&known.not_harmless, name)
+    is_no_calibration(name) || has_any(&known.harmless, name) && !has_any(&known.not_harmless, name)
 }
 
 fn is_like_a_response(name: &str) -> bool {
@@ -1039,12 +1041,16 @@ impl Columns {
         let mut columns = Vec::new();
         let without_response = self.of(Role::R11).is_none();
         let is_shear = without_response && !self.distortion;
-        let m = own(&["_m_", "_m1_", "_m_1_"]).filter(|_| without_response);
+        let m = own(&["_m_", "_m1_", "_m_1_", "plusm_"]).filter(|_| without_response);
         if let Some(m) = m {
             let other = other_component(unused, m).unwrap_or(m);
-            columns.push(match is_shear {
-                true => format!("R11=1+{m},R22=1+{other}"),
-                false => format!("m={m}"),
+            // The factor 1 + m itself, such as `one_plus_m`.
+            let is_factor = words(m).replace('_', "").contains("plusm");
+            columns.push(match (is_shear, is_factor) {
+                (true, true) => format!("R11={m},R22={other}"),
+                (true, false) => format!("R11=1+{m},R22=1+{other}"),
+                (false, true) => format!("m={m}-1"),
+                (false, false) => format!("m={m}"),
             });
         }
         let c1 = own(&["_c1_", "_c_1_"]);
@@ -1485,9 +1491,28 @@ mod tests {
             ),
             ("fitclass MASK star_flag", "--where 'MASK <= 1"),
             ("w m c2", "'R11=1+m,R22=1+m,e2=e2-c2' for those after it"),
+            ("w one_plus_m", "'R11=one_plus_m,R22=one_plus_m' for"),
+            ("w onePlusM", "'R11=onePlusM,R22=onePlusM' for"),
+            (
+                "w one_plus_m1 one_plus_m2",
+                "'R11=one_plus_m1,R22=one_plus_m2' for",
+            ),
         ] {
             let unused = found(&format!("e1 e2 {names}"), &[]).unwrap().unused(&[]);
             assert!(unused[0].contains(expected), "{unused:?}");
+        }
+        let factor = found("regauss_e1 regauss_e2 w oneplusm", &[]).unwrap();
+        let unused = factor.unused(&[]).join(" ");
+        assert!(unused.contains("'m=oneplusm-1' for"), "{unused}");
+        for error in [
+            "corrected_shape_err",
+            "m_err",
+            "shear_bias_c1_err",
+            "correction_status",
+        ] {
+            let unused = found(&format!("e1 e2 w {error}"), &[]).unwrap().unused(&[]);
+            assert!(unused[0].starts_with(&format!("Not used: {error}.")));
+            assert!(!unused[0].contains("calibration"), "{unused:?}");
         }
         let flagged = found("e1 e2 w BadFlag", &[]).unwrap().remedy_of_choice();
         assert_eq!(
