@@ -388,6 +388,7 @@ impl<'a> TableRows<'a> {
             places: places.pair([Role::X, Role::Y]),
             converted: converted_columns(source),
             compared: ([Role::E1, Role::E2, Role::Weight, Role::R11].iter())
+                .chain(&KSB_ROLES)
                 .filter_map(|role| places.of((*role, 0)))
                 .collect(),
             responses: responses(source),
