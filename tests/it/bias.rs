@@ -766,6 +766,27 @@ fn repeated_rows_values_and_identifiers_are_named() {
 }
 
 #[test]
+fn shears_of_ksb_and_numbers_of_chips_are_read() {
+    let folder = Folder::new();
+    let read = |header: &str, row: &dyn Fn(usize, [f64; 2]) -> String| {
+        let files = pair(&folder, "k", 0.02, |g, _| {
+            let galaxies = galaxies(3, [g; 2]).into_iter().enumerate();
+            let rows = galaxies.map(|(at, [e, _])| row(at, e) + &format!(",{g},{g}\n"));
+            format!("{header},g1,g2\n{}", rows.collect::<String>())
+        });
+        number(&rows(&folder, &format!("bias {files}"))[0], "m1")
+    };
+    let plain = read("e1,e2", &|_, [e1, e2]| format!("{e1},{e2}"));
+    // GalSim's tables of KSB, in which all distortions are −10.
+    let ksb = "corrected_e1,corrected_e2,corrected_g1,corrected_g2";
+    let ksb = read(ksb, &|_, [e1, e2]| format!("-10,-10,{e1},{e2}"));
+    let chips = read("ccd,e1,e2", &|at, [e1, e2]| {
+        format!("{:02},{e1},{e2}", at % 62)
+    });
+    assert_eq!((ksb, chips), (plain, plain));
+}
+
+#[test]
 fn texts_that_no_row_has_and_angles_in_degrees_are_named() {
     let folder = Folder::new();
     let files = pair(&folder, "c", 0.02, |g, _| {

@@ -11,7 +11,7 @@ use shearq_files::table::{self, FileFormat, Place};
 use shearq_files::{FileError, names_of};
 use shearq_measure::{Observables, Selection};
 
-use crate::expression::{Expression, Operand, operand_values};
+use crate::expression::{Expression, Operand, operand_values, texts_of};
 use crate::own_columns::{SHAPE_COLUMNS, changes_with_shear, require_responses};
 use crate::recognition::{fits_any, recognition, words};
 
@@ -694,10 +694,10 @@ fn columns_of(
     if sheared.is_none()
         && columns.of(Role::ShearedCatalogue).is_none()
         && !given.is_given(Role::ShearedCatalogue)
-        && let Some(step) = step_column(&texts, &columns)
+        && let Some(step) = step_column(place, frame, &texts, &columns)?
     {
         let mut given = given.clone();
-        given.add_step(step.to_owned());
+        given.add_step(step);
         columns = Columns::find(&place.path, names, &given, is_own)?;
     }
     columns.texts = texts;
@@ -938,12 +938,51 @@ fn is_word(text: &str) -> bool {
 }
 
 // A column without a role whose texts name sheared catalogues, whatever its name: the first row has one, too.
-fn step_column<'t>(texts: &'t BTreeMap<String, String>, columns: &Columns) -> Option<&'t str> {
-    let mut texts = texts.iter();
-    let is_step = |(name, text): &(&String, &String)| {
-        catalogue_named(text).is_some() && !columns.all().any(|(_, own)| own == *name)
+fn step_column(
+    place: &Place,
+    frame: Option<&DataFrame>,
+    texts: &BTreeMap<String, String>,
+    columns: &Columns,
+) -> Result<Option<String>, FileError> {
+    for (name, text) in texts {
+        let is_candidate =
+            catalogue_named(text).is_some() && !columns.all().any(|(_, own)| own == name);
+        let by_name = fits_any(&recognition().patterns.step, name);
+        if is_candidate && (by_name || names_sheared(place, frame, name)?) {
+            return Ok(Some(name.clone()));
+        }
+    }
+    Ok(None)
+}
+
+// Whether the texts of all rows are those of sheared catalogues: `00` and `m1` are also numbers of chips and names of fields. Other
+// texts are those of sheared PSFs if noshear is beside a sheared catalogue.
+fn names_sheared(place: &Place, frame: Option<&DataFrame>, name: &str) -> Result<bool, FileError> {
+    let (mut seen, mut others, mut are_clear) = ([false; CATALOGUES], false, true);
+    let mut known = HashSet::new();
+    let mut add = |part: &DataFrame| -> Result<(), FileError> {
+        for text in texts_of(part, name).into_iter().flatten().flatten() {
+            if known.len() < MAX_COUNTED && !known.contains(text) {
+                known.insert(text.to_owned());
+                are_clear &= text.trim().len() > 2;
+                // Text tables give `00` as the number that it is.
+                let is_zero = || (text.trim() == "0").then_some(0);
+                match catalogue_named(text).or_else(is_zero) {
+                    Some(catalogue) => seen[catalogue] = true,
+                    None => others = true,
+                }
+            }
+        }
+        Ok(())
     };
-    texts.find(is_step).map(|(name, _)| name.as_str())
+    match frame {
+        Some(frame) => add(frame)?,
+        None => table::read_parts(place, &[name], &[name], |part| add(&part))?,
+    }
+    let [noshear, plus1, minus1, plus2, minus2] = seen;
+    let sheared = plus1 || minus1 || plus2 || minus2;
+    let pair = plus1 && minus1 || plus2 && minus2;
+    Ok(noshear && sheared || !others && (pair || are_clear))
 }
 
 // Whether shearq wrote a table. Those in memory and text have no metadata: a column decides that no other program writes, the
@@ -1167,5 +1206,35 @@ fn check_step(path: &Path, step: f64) -> Result<(), FileError> {
             ),
         )),
         _ => Ok(()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn texts_of_all_rows_decide_on_sheared_catalogues() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.csv");
+        for (texts, expected) in [
+            ("noshear 1p 1m 2p 2m", true),
+            ("00 1p 1m 2p 2m", true),
+            ("noshear 1p 1m 1p_psf", true),
+            ("1p 1m", true),
+            ("noshear noshear", true),
+            ("00 01 02 03 04", false),
+            ("00 17 61", false),
+            ("m1 m2 m3", false),
+            ("1m 2m", false),
+            ("1+ 2+ 3+", false),
+            ("00 00", false),
+        ] {
+            let rows = texts.split(' ').map(|text| format!("{text},0.1\n"));
+            let text = format!("ccd,e1\n{}", rows.collect::<String>());
+            std::fs::write(&path, text).unwrap();
+            let found = names_sheared(&Place::of(&path), None, "ccd").unwrap();
+            assert_eq!(found, expected, "{texts}");
+        }
     }
 }
