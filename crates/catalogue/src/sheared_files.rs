@@ -3,12 +3,16 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 
+use shearq_bias::Range;
 use shearq_files::FileError;
+use shearq_files::table::{self, Place};
 
-use crate::columns::Names;
+use crate::columns::{Columns, Names};
+use crate::expression::Expression;
 use crate::recognition::words;
 use crate::request::Input;
 use crate::roles::{CATALOGUES, Role};
+use crate::source::{add_formulas, with_formulas};
 use crate::steps::step_of;
 use crate::truth::Truth;
 
@@ -90,18 +94,23 @@ pub fn with_sheared_files(catalogues: Vec<Input>, truth: &Truth, names: &Names) 
             repeated.insert(rest);
         }
     }
+    let own_shear = |input: &Input| match truth {
+        Truth::Columns => shear_of_columns(&input.name, names),
+        _ => shear(input),
+    };
     // A file without artificial shear and others, or all others: `1p` and `1m` are also names of test shears.
     let known = !matches!(truth, Truth::Columns);
     groups.retain(|rest, files| {
         if repeated.contains(rest) {
             return false;
         }
-        let mut shears = files.values().filter_map(|input| shear(input));
+        let has_all = files.contains_key(&0) || known && files.len() == CATALOGUES - 1;
+        if files.len() < 2 || !has_all {
+            return false;
+        }
+        let mut shears = files.values().filter_map(|input| own_shear(input));
         let first = shears.next();
-        let one_shear = shears.all(|own| Some(own) == first);
-        one_shear
-            && files.len() > 1
-            && (files.contains_key(&0) || known && files.len() == CATALOGUES - 1)
+        shears.all(|own| Some(own) == first)
     });
     let joined = |input: &Input| -> Option<Input> {
         let Some(files) = of_file(input).and_then(|(_, rest)| groups.get(&rest)) else {
@@ -120,6 +129,37 @@ pub fn with_sheared_files(catalogues: Vec<Input>, truth: &Truth, names: &Names) 
         })
     };
     catalogues.iter().filter_map(joined).collect()
+}
+
+// The true shear that all rows of a file have in columns: files of one shear each are no sheared catalogues, although their names
+// are noshear, 1p and 1m. A file that cannot be read is named later.
+fn shear_of_columns(path: &Path, names: &Names) -> Option<[f64; 2]> {
+    let place = Place::of(path);
+    let lists = table::columns(&place).ok()?.named;
+    let [list] = &lists[..] else {
+        return None;
+    };
+    let (found, formulas) = with_formulas(path, &list.names, names).ok()?;
+    let columns = Columns::find(path, &found, names, false).ok()?;
+    let shear = [columns.of(Role::G1)?, columns.of(Role::G2)?];
+    let operands = formulas.iter().flat_map(Expression::columns);
+    let read = shear.into_iter().chain(operands);
+    let read: BTreeSet<&str> = read
+        .filter(|own| list.names.iter().any(|name| name == own))
+        .collect();
+    let read: Vec<&str> = read.into_iter().collect();
+    let mut ranges = [Range::default(); 2];
+    table::read_parts(&place, &read, &[], |part| {
+        let part = add_formulas(part, &formulas, path)?;
+        for (range, name) in ranges.iter_mut().zip(shear) {
+            let values = table::numbers(&part, name, path)?;
+            values.iter().for_each(|value| range.add(*value));
+        }
+        Ok(())
+    })
+    .ok()?;
+    let [g1, g2] = ranges.map(Range::constant);
+    Some([g1?, g2?])
 }
 
 #[cfg(test)]
@@ -193,5 +233,30 @@ mod tests {
             .map(|(name, g)| (name.to_owned(), [g, 0.0]));
         let truth = Truth::Catalogues(truth.into_iter().collect());
         assert_eq!(joined(&["s_noshear.csv", "s_1p.csv"], &truth).len(), 2);
+    }
+
+    #[test]
+    fn files_with_other_true_shears_in_columns_stay_apart() {
+        let folder = tempfile::tempdir().unwrap();
+        let joined = |rows: [&str; 2], columns: &str| {
+            let inputs = [("noshear", rows[0]), ("1p", rows[1])].map(|(step, rows)| {
+                let path = folder.path().join(format!("a_{step}.csv"));
+                std::fs::write(&path, format!("e1,e2,g1,g2\n{rows}")).unwrap();
+                Input::from(path)
+            });
+            let mut names = Names::default();
+            let given = columns.split(',').filter(|own| !own.is_empty());
+            given.for_each(|own| names.add(own).unwrap());
+            with_sheared_files(inputs.into(), &Truth::Columns, &names).len()
+        };
+        let plain = "0.1,0.2,0,0\n0.3,0.1,0,0\n";
+        let turned = plain.replace(",0,0", ",0.02,0");
+        assert_eq!(joined([plain, &turned], ""), 2);
+        assert_eq!(joined([plain, plain], ""), 1);
+        assert_eq!(joined([plain, &turned], "g1=-g1,g2=-g2"), 2);
+        assert_eq!(joined([plain, &turned], "g1=none,g2=none"), 1);
+        // Shears of galaxies, of which a sheared catalogue may have others.
+        let varying = plain.replacen(",0,0", ",0.02,0", 1);
+        assert_eq!(joined([&varying, plain], ""), 1);
     }
 }
