@@ -960,6 +960,45 @@ fn paired_galaxies_have_the_error_of_pairs() {
         "bias own-plus.csv --g1 0.02 --g2 0.02 --paired",
         "--paired needs the same galaxies",
     );
+    // Without identifiers, the numbers of the rows pair them.
+    let shorten =
+        "tail -n +3 own-plus.csv | cat head - > short-plus.csv; cp own-minus.csv short-minus.csv";
+    shell(
+        folder.root(),
+        &format!("head -n 1 own-plus.csv > head; {shorten}"),
+    );
+    folder.refuses(
+        "bias short-plus.csv short-minus.csv --paired --columns id=none",
+        "no column of identifiers states which of them are the same galaxies",
+    );
+    folder.run("bias short-plus.csv short-minus.csv --paired");
+}
+
+#[test]
+fn shears_beside_a_convergence_are_no_reduced_ones() {
+    let folder = Folder::new();
+    let said = |header: &str, kappa: f64, options: &str| {
+        let files = pair(&folder, "g", 0.02, |g, _| {
+            let galaxies = galaxies(3, [g; 2]).into_iter();
+            let rows = galaxies.map(|[[e1, e2], _]| format!("{e1},{e2},{g},{g},{kappa}\n"));
+            format!("e1,e2,{header}\n{}", rows.collect::<String>())
+        });
+        folder.said(&format!("bias {files} {options}"))
+    };
+    let advised = "'g1=gamma1/(1-kappa),g2=gamma2/(1-kappa)'";
+    let columns = "gamma1,gamma2,kappa";
+    assert_has(
+        &said(columns, 0.08, ""),
+        &format!("Try: --columns {advised}"),
+    );
+    for (columns, kappa, options) in [
+        (columns, 0.08, &*format!("--columns {advised}")),
+        (columns, 0.0, ""),
+        ("g1,g2,kappa", 0.08, ""),
+    ] {
+        let said = said(columns, kappa, options);
+        assert!(!said.contains("reduced shear"), "{said}");
+    }
 }
 
 #[test]

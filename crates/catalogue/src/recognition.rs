@@ -62,6 +62,7 @@ pub struct Patterns {
     pub choice: Vec<String>,
     pub shape: Vec<String>,
     pub truth: Vec<String>,
+    pub convergence: Vec<String>,
     pub lensfit: Vec<String>,
     pub harmless: Vec<String>,
     pub not_harmless: Vec<String>,

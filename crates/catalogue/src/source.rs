@@ -13,7 +13,7 @@ use shearq_measure::{Observables, Selection};
 
 use crate::expression::{Expression, Operand, operand_values, texts_of};
 use crate::own_columns::{SHAPE_COLUMNS, changes_with_shear, require_responses};
-use crate::recognition::{fits_any, recognition, words};
+use crate::recognition::{fits_any, has_any, recognition, words};
 
 use crate::columns::{Columns, Names, Preset, Shapes, base};
 use crate::identity;
@@ -101,6 +101,8 @@ pub struct Source {
     pub psf_area: bool,
     /// Why nothing divides the ellipticities by their response, if they need one.
     pub undivided: Option<String>,
+    /// Why the true shears are no reduced ones.
+    pub unreduced: Option<String>,
 }
 
 impl Source {
@@ -669,7 +671,9 @@ pub fn needed_columns(
     let roles = own.columns.all().map(|(_, name)| name);
     let larger = around_patches(names).map(String::as_str);
     let larger = larger.filter(|_| own.columns.of(Role::Unit).is_some_and(is_patch));
-    let more = operands.chain(roles).chain(larger).map(str::to_owned);
+    let convergence = convergence(names).map(String::as_str);
+    let more = operands.chain(roles).chain(larger).chain(convergence);
+    let more = more.map(str::to_owned);
     let all: BTreeSet<String> = read.chain(more).collect();
     Ok(all
         .into_iter()
@@ -811,6 +815,10 @@ fn source(
         false => None,
     };
     check_twice(path, names, &wanted.all)?;
+    let unreduced = match reading.truth {
+        Truth::Columns => unreduced(&place, frame, names, &columns)?,
+        _ => None,
+    };
     let sheared_weight = places.of((Role::Weight, 1)).is_some();
     let chosen = reading.expressions().next().is_some() || sheared_flags || sheared_weight;
     Ok(Source {
@@ -824,6 +832,7 @@ fn source(
         selects: columns.give_selection_response() && chosen && known,
         selection,
         undivided: columns.undivided(!given.is_given(Role::R11)),
+        unreduced,
         declines_matrix: given.decline_matrix(),
         has_weights: reading.weights().is_some(),
         psf_area: columns.of(Role::PsfSize).is_some_and(|name| {
@@ -836,6 +845,54 @@ fn source(
         place,
         columns,
     })
+}
+
+fn convergence(names: &[String]) -> Option<&String> {
+    let known = &recognition().patterns.convergence;
+    names.iter().find(|name| has_any(known, name))
+}
+
+// Galaxies have the reduced shear γ/(1 − κ) (Bartelmann & Schneider 2001, Phys. Rep. 340, 291, equation 4.13): simulations that state
+// κ beside `gamma1` or `shear1` state γ, and `g1` is reduced. A κ of 0.08 gave m = 0.097 for 0.008 without a word.
+fn unreduced(
+    place: &Place,
+    frame: Option<&DataFrame>,
+    names: &[String],
+    columns: &Columns,
+) -> Result<Option<String>, FileError> {
+    let (Some(g1), Some(g2), Some(kappa)) = (
+        columns.of(Role::G1),
+        columns.of(Role::G2),
+        convergence(names),
+    ) else {
+        return Ok(None);
+    };
+    let words = words(g1);
+    let is_shear = words.contains("gamma") || words.contains("shear");
+    // Also in a formula.
+    if !is_shear || words.contains("reduced") || g1.contains(kappa.as_str()) {
+        return Ok(None);
+    }
+    let mut is_zero = true;
+    let mut add = |part: &DataFrame| -> Result<(), FileError> {
+        is_zero &= (table::numbers(part, kappa, &place.path)?.iter()).all(|kappa| *kappa == 0.0);
+        Ok(())
+    };
+    match frame {
+        Some(frame) => add(frame)?,
+        None => table::read_parts(place, &[kappa], &[], |part| add(&part))?,
+    }
+    Ok((!is_zero).then(|| {
+        let part = |g: &str| match Expression::parse(g).is_ok_and(|own| own.column().is_some()) {
+            true => g.to_owned(),
+            false => format!("({g})"),
+        };
+        format!(
+            "`{g1}` beside `{kappa}` is a shear γ and not the reduced shear γ/(1 − κ) that galaxies have, so that m is wrong by about κ. Try: --columns 'g1={}/(1-{kappa}),g2={}/(1-{kappa})'",
+            part(g1),
+            part(g2)
+        )
+    }))
 }
 
 fn check_calibration(path: &Path, columns: &Columns, in_rows: bool) -> Result<(), FileError> {

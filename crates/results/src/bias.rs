@@ -57,6 +57,9 @@ pub struct About {
     /// Why nothing divides the ellipticities by their response, if they need one.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub undivided: Option<String>,
+    /// Why the true shears are no reduced ones.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub unreduced: Option<String>,
     /// The column of flags.
     #[serde(default)]
     pub flag: Option<String>,
@@ -260,6 +263,7 @@ fn about(reading: &Reading<'_>, all: &[Vec<Source>], first: &Source) -> About {
         shears: reading.truth.content(),
         response: has_response || request.shapes.is_some(),
         response_column: first.columns.have(&[Role::R11]),
+        unreduced: first.unreduced.clone(),
         undivided: undivided.filter(|_| !has_response && request.shapes.is_none()),
         flag: first.columns.flags.first().cloned(),
         matched: named_unit || first.columns.of(Role::Id).is_some(),

@@ -311,7 +311,8 @@ pub fn of_design(result: &BiasResult) -> Vec<String> {
     let Ok(all) = result.all() else {
         return Vec::new();
     };
-    let mut lines: Vec<String> = result.about.undivided.clone().into_iter().collect();
+    let about = [&result.about.undivided, &result.about.unreduced];
+    let mut lines: Vec<String> = about.into_iter().flatten().cloned().collect();
     if all.effective < FEW_EFFECTIVE * all.galaxies as f64 {
         lines.push(format!(
             "few weights dominate: {} galaxies have the information of {:.1} with equal weights (expected {:.0} or more). Errors are then not reliable. Try: another column of weights, or --columns w=none",
