@@ -76,6 +76,14 @@ pub enum BiasFailure {
         "--paired: the galaxies of sheared catalogues are detected again in each, and have no partner in another (expected responses in columns). Try: omit --paired; each test shear then has its own response"
     )]
     PairedSheared,
+    #[error(
+        "--paired: {second} has {} rows and {first} has {}, and no column of identifiers states which of them are the same galaxies (expected as many rows). Try: --columns id=NAME, or omit --paired", .rows[1], .rows[0]
+    )]
+    PairedRows {
+        first: String,
+        second: String,
+        rows: [u64; 2],
+    },
     #[error("--like needs bins of both catalogues. Try: --bins 'snr:10' --bins 'size:5'")]
     LikeWithoutBins,
     #[error("{}: no galaxy of the survey is in a bin with simulated galaxies", .0.display())]

@@ -1,8 +1,9 @@
 //! Galaxies that count under all test shears (`--paired`).
 
-use std::collections::HashSet;
+use std::collections::{BTreeMap, HashSet};
 
 use shearq_bias::{Catalogue, Design, same_galaxies};
+use shearq_catalogue::roles::Role;
 use shearq_catalogue::rows::rows;
 use shearq_catalogue::source::{Reading, Source};
 use shearq_files::FileError;
@@ -24,14 +25,29 @@ impl<'a> Partners<'a> {
         design: Design,
         catalogues: &[Catalogue],
     ) -> Result<Self, BiasFailure> {
-        match design {
-            Design::Pairs | Design::Arms => Ok(Partners {
-                reading,
-                all,
-                groups: same_galaxies(catalogues, design),
-            }),
-            other => Err(BiasFailure::NothingPairs(other)),
+        if !matches!(design, Design::Pairs | Design::Arms) {
+            return Err(BiasFailure::NothingPairs(design));
         }
+        let groups = same_galaxies(catalogues, design);
+        let are_matched = all[0][0].columns.of(Role::Id).is_some();
+        // By their numbers, rows behind one that is missing would be paired with other galaxies.
+        let mut first = BTreeMap::<u32, &Catalogue>::new();
+        let read = groups.iter().zip(catalogues);
+        for (group, own) in read.filter(|(_, own)| own.rows > 0 && !are_matched) {
+            let first = first.entry(*group).or_insert(own);
+            if first.rows != own.rows {
+                return Err(BiasFailure::PairedRows {
+                    first: first.name.clone(),
+                    second: own.name.clone(),
+                    rows: [first.rows, own.rows],
+                });
+            }
+        }
+        Ok(Partners {
+            reading,
+            all,
+            groups,
+        })
     }
 
     /// The galaxies that count in all other catalogues of the same galaxies.
