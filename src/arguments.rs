@@ -177,8 +177,7 @@ pub(super) struct TableReading {
     #[arg(
         long,
         help = columns_help(),
-        value_name = "ROLE=COLUMN",
-        value_delimiter = ','
+        value_name = "ROLE=COLUMN"
     )]
     columns: Vec<String>,
     /// Also recognise the surveys that this file describes, as `[[survey]]` in TOML: name, ellipticity (shear or distortion),
@@ -204,7 +203,7 @@ pub(super) struct TableReading {
 impl TableReading {
     pub(super) fn request(&self, found: Expanded) -> anyhow::Result<Request> {
         let mut names = Names::default();
-        for text in &self.columns {
+        for text in split_columns(&self.columns) {
             names.add(text)?;
         }
         for path in &self.preset {
@@ -224,6 +223,35 @@ impl TableReading {
             ..Request::new(found)
         })
     }
+}
+
+/// The parts of lists of columns. Commas in parentheses and quotes are those of names: pandas calls a column of several levels
+/// `('ref', 'i', 'e1')`.
+pub(super) fn split_columns(lists: &[String]) -> Vec<&str> {
+    let mut parts = Vec::new();
+    for list in lists {
+        let (mut depth, mut quote, mut first, mut own) = (0, None, 0, Vec::new());
+        for (at, c) in list.char_indices() {
+            match (quote, c) {
+                (Some(open), _) if open == c => quote = None,
+                (Some(_), _) => {}
+                (None, '\'' | '"') => quote = Some(c),
+                (None, '(') => depth += 1,
+                (None, ')') => depth -= 1,
+                (None, ',') if depth == 0 => {
+                    own.push(&list[first..at]);
+                    first = at + 1;
+                }
+                _ => {}
+            }
+        }
+        own.push(&list[first..]);
+        match quote.is_none() && depth == 0 {
+            true => parts.extend(own),
+            false => parts.extend(list.split(',')),
+        }
+    }
+    parts
 }
 
 fn columns_help() -> String {
@@ -682,6 +710,21 @@ pub(crate) struct Unsheared {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn commas_in_names_of_columns_separate_nothing() {
+        for (list, expected) in [
+            ("e1=a,e2=b", &["e1=a", "e2=b"][..]),
+            (
+                "e1=('ref', 'i', 'e1'),e2=('ref', 'i', 'e2')",
+                &["e1=('ref', 'i', 'e1')", "e2=('ref', 'i', 'e2')"],
+            ),
+            ("flag=band == 'a,(b',w=x", &["flag=band == 'a,(b'", "w=x"]),
+            ("e1=x(,e2=y'", &["e1=x(", "e2=y'"]),
+        ] {
+            assert_eq!(split_columns(&[list.to_owned()]), expected);
+        }
+    }
 
     #[test]
     fn set_lists_are_sorted_and_checked() {

@@ -7,7 +7,7 @@ use shearq_quantities::units::{Degrees, Pixels};
 use shearq_scoring::{Noise, Options, SetScorer, TruthSign};
 
 use crate::arguments::{
-    Printing, ReportFile, ScoreSettings, SetList, Threads, named, positive, sets_of,
+    Printing, ReportFile, ScoreSettings, SetList, Threads, named, positive, sets_of, split_columns,
 };
 use crate::origin::account;
 use crate::{print_json, tell, tell_notes, tell_unread};
@@ -80,7 +80,7 @@ pub(crate) struct Arguments {
     field: Option<f64>,
     /// Columns of the catalogues, for --truth: by role as in `bias`, such as `e1=g_1,e2=g_2,w=none`, or x, y, e1 and e2 in this
     /// order; by number if they have no names, such as 2,3,4,5 [default: recognised; without names x,y,e1,e2].
-    #[arg(long, value_name = "ROLE=COLUMN|X,Y,E1,E2", value_delimiter = ',', num_args = 1, requires = "truth", conflicts_with_all = NOT_PLAIN)]
+    #[arg(long, value_name = "ROLE=COLUMN|X,Y,E1,E2", num_args = 1, requires = "truth", conflicts_with_all = NOT_PLAIN)]
     columns: Vec<String>,
     /// Also recognise the surveys that this file describes, as in `bias`; for --truth.
     #[arg(long, value_name = "FILE", requires = "truth", conflicts_with_all = NOT_PLAIN)]
@@ -450,9 +450,10 @@ fn packed_spectra(
 // What the user states of plain files.
 fn described(arguments: &Arguments) -> anyhow::Result<Option<Foreign>> {
     let mut columns = BTreeMap::new();
-    let by_role = arguments.columns.iter().any(|own| own.contains('='));
+    let given = split_columns(&arguments.columns);
+    let by_role = given.iter().any(|own| own.contains('='));
     if by_role {
-        for text in &arguments.columns {
+        for text in given {
             let (role, column) = text
                 .split_once('=')
                 .with_context(|| format!("--columns: found `{text}`, expected ROLE=COLUMN"))?;
@@ -461,14 +462,14 @@ fn described(arguments: &Arguments) -> anyhow::Result<Option<Foreign>> {
                 "--columns: {role} is given twice"
             );
         }
-    } else if !arguments.columns.is_empty() {
+    } else if !given.is_empty() {
         anyhow::ensure!(
-            arguments.columns.len() == 4,
+            given.len() == 4,
             "--columns: wrong number of columns (found {}, expected 4: x, y, e1 and e2)",
-            arguments.columns.len()
+            given.len()
         );
         let roles = ["x", "y", "e1", "e2"].map(str::to_owned);
-        columns.extend(roles.into_iter().zip(arguments.columns.iter().cloned()));
+        columns.extend(roles.into_iter().zip(given.into_iter().map(str::to_owned)));
     }
     let mut presets = Vec::new();
     for path in &arguments.preset {

@@ -1161,8 +1161,12 @@ fn likely_ellipticities(found: &[String]) -> String {
         (words.contains("_e1_") || words.contains("_e_1_")) && is_like_a_calibration(name)
     };
     let first = pairs.clone().find(|name| !is_like_a_role(name));
-    match first.or_else(|| pairs.find(is_e1)) {
-        Some(name) => format!("e1={name},e2={}", name.replace('1', "2")),
+    // What a shell would take apart is quoted: pandas has names such as `('ref', 'i', 'e1')`.
+    let is_plain = |name: &str| !name.contains([' ', '(', '\'', '*']);
+    let pair = first.or_else(|| pairs.find(is_e1));
+    match pair.and_then(|name| Some((name, other_component(found, name)?))) {
+        Some((e1, e2)) if !is_plain(e1) => format!("\"e1={e1},e2={e2}\""),
+        Some((e1, e2)) => format!("e1={e1},e2={e2}"),
         None => "e1=NAME,e2=NAME".to_owned(),
     }
 }
