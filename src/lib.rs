@@ -50,6 +50,7 @@ use std::process::ExitCode;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
+use clap::error::{ContextKind, ContextValue, ErrorKind};
 use clap::{Parser, Subcommand};
 
 use arguments::StandardInput;
@@ -241,7 +242,7 @@ pub fn run_with(arguments: impl IntoIterator<Item = OsString>) -> u8 {
     };
     let cli = match Cli::try_parse_from(read.arguments) {
         Ok(cli) => cli,
-        Err(message) => return usage(&message),
+        Err(message) => return usage(&with_separator(message)),
     };
     // Of each call: Python calls this function many times.
     QUIET.store(cli.talk.quiet, Ordering::Relaxed);
@@ -316,6 +317,21 @@ fn causes(error: &anyhow::Error) -> String {
         }
     }
     text
+}
+
+// Adds what is missing to `baseline record NAME bias FILE`, of which clap only says that it does not expect `bias`.
+fn with_separator(mut message: clap::Error) -> clap::Error {
+    let found = match message.get(ContextKind::InvalidArg) {
+        Some(ContextValue::String(found)) => found.clone(),
+        _ => return message,
+    };
+    if message.kind() == ErrorKind::UnknownArgument && baseline::COMMANDS.contains(&found.as_str())
+    {
+        let remedy = format!("a command follows `--`: -- {found}");
+        let remedy = ContextValue::StyledStrs(vec![remedy.into()]);
+        message.insert(ContextKind::Suggested, remedy);
+    }
+    message
 }
 
 // clap reports help and the version as errors, with exit code 0.

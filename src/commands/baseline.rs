@@ -34,6 +34,7 @@ pub(crate) struct Arguments {
 #[derive(Debug, Subcommand)]
 enum Command {
     #[command(
+        override_usage = "shearq baseline record [OPTIONS] <NAME> <--data <DIR>|--simulate|-- COMMAND>",
         after_help = "Examples:\n  shearq baseline record mine --data data --submission 48/linear/star\n  shearq baseline record mine --simulate --sets 2,8 --images 4 --submission own.toml\n  shearq baseline record mycode -- bias plus.csv minus.csv\n  shearq baseline record mycode -- score --data data --foreign mycode.toml"
     )]
     Record(RecordArguments),
@@ -122,6 +123,9 @@ struct Place {
     #[arg(long, value_name = "DIR", default_value = "submissions/baselines")]
     folder: PathBuf,
 }
+
+// The commands whose metrics a baseline of catalogues has.
+pub(crate) const COMMANDS: [&str; 2] = ["score", "bias"];
 
 // The name becomes a file name, on any operating system.
 fn file_stem(text: &str) -> Result<String, String> {
@@ -398,7 +402,10 @@ fn units_of(command: &[String]) -> anyhow::Result<(Units, Vec<PathBuf>)> {
         )
     };
     // Before other commands are parsed, whose messages would not say that they have no baselines.
-    if !matches!(command.first().map(String::as_str), Some("score" | "bias")) {
+    if !command
+        .first()
+        .is_some_and(|own| COMMANDS.contains(&own.as_str()))
+    {
         return Err(expected());
     }
     match crate::parse(command)? {
