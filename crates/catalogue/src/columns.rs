@@ -215,11 +215,12 @@ pub fn base(name: &str) -> &str {
     name.strip_suffix("_noshear").unwrap_or(name)
 }
 
-// The column of the other component: `sens_2` of `sens_1`, `R22` of `R11`.
+// The column of the other component: `sens_2` of `sens_1`, `R22` of `R11`, and of `fpfs1_de1_dg1` the one of the same method.
 fn other_component<'f>(found: &'f [String], name: &str) -> Option<&'f String> {
-    let other = name.replace('1', "2");
+    let prefix = method_of(name);
+    let other = prefix.to_owned() + &name[prefix.len()..].replace('1', "2");
     let own = found.iter().find(|own| **own == other);
-    own.filter(|_| name.contains('1'))
+    own.filter(|_| other != name)
 }
 
 /// Columns that were given for roles, or `none`, and surveys that were described.
@@ -256,7 +257,10 @@ impl Names {
             _ => return Err(NameError::Syntax(text.to_owned())),
         };
         // Names of recognised columns are accepted for roles: AnaCal calls dw1 dw_dg1.
-        let is_recognised = |key: &Key| recognised(*key).iter().any(|own| own == role);
+        let is_recognised = |key: &Key| {
+            let mut all = recognised(*key).into_iter();
+            all.any(|own| own.eq_ignore_ascii_case(role))
+        };
         let key = named(role).or_else(|| keys().find(is_recognised));
         let key = key.ok_or_else(|| NameError::Role(role.to_owned()))?;
         match self.given.insert(key, column.to_owned()) {
@@ -470,6 +474,8 @@ pub struct Columns {
     unused: Vec<String>,
     // Columns without a role whose names say nothing.
     unknown: Vec<String>,
+    // Ellipticities of other methods, which are not used.
+    others: Vec<[String; 2]>,
     /// All columns of flags; the first has the role.
     pub flags: Vec<String>,
     pub choices: Vec<String>,
@@ -496,17 +502,30 @@ impl Columns {
         let mut surveys = names.presets.iter().chain(&recognition().surveys);
         let survey = surveys.find(|survey| survey.absent_column(found, names).is_none());
         // A column called g1 that is given as e1 is not the true shear, too.
-        let free = |name: &str| {
+        let free = &|name: &str| {
             let all = found.iter().filter(|own| is_called(own, name));
             let mut all = all.filter(|own| names.key_of(own).is_none());
             all.clone().find(|own| *own == name).or_else(|| all.next())
         };
-        let by_name = |key| {
-            let names = recognised(key);
-            let known = names.iter().find_map(|name| free(name));
-            known.or_else(|| unsheared_column(found, key, &names, &free))
-        };
+        let pairs = known_pairs(free);
         let mut columns = BTreeMap::new();
+        let by_name = |key, columns: &BTreeMap<Key, String>| {
+            let names = recognised(key);
+            let known = of_method(found, key, columns, &pairs, free);
+            known.or_else(|| unsheared_column(found, key, &names, free))
+        };
+        let chosen = chosen_pair(found, names, &pairs);
+        let by_name = |key: Key, columns: &BTreeMap<Key, String>| match (key, chosen) {
+            ((Role::E1, 0), Some([e1, _])) => Some(e1),
+            ((Role::E2, 0), Some([_, e2])) => Some(e2),
+            ((Role::E2, 0), None) => {
+                let given = names.given.get(&(Role::E1, 0));
+                let other = given.and_then(|e1| other_component(found, e1));
+                let is_known = |own: &&String| names_of_role(Role::E2).any(|e2| is_called(own, e2));
+                other.filter(is_known).or_else(|| by_name(key, columns))
+            }
+            _ => by_name(key, columns),
+        };
         for key in keys().filter(|(role, _)| *role != Role::Flag) {
             let column = match (
                 names.given.get(&key),
@@ -517,8 +536,8 @@ impl Columns {
                 (Some(given), _) => return Err(FileError::no_column(path, given, found)),
                 (None, Some("none")) => None,
                 // A table with the columns of a survey may have a weight of another name.
-                (None, Some(known)) => free(known).or_else(|| by_name(key)),
-                (None, None) => by_name(key),
+                (None, Some(known)) => free(known).or_else(|| by_name(key, &columns)),
+                (None, None) => by_name(key, &columns),
             };
             columns.extend(column.map(|column| (key, column.clone())));
         }
@@ -571,6 +590,10 @@ impl Columns {
         if preset == Preset::Shearq {
             refuse_divided(path, found)?;
         }
+        let others = match survey.is_none() && chosen.is_some() {
+            true => other_pairs(&pairs, &e1),
+            false => Vec::new(),
+        };
         let mut columns = Columns {
             columns,
             preset,
@@ -579,6 +602,7 @@ impl Columns {
             doubtful_weights: Vec::new(),
             unused: Vec::new(),
             unknown: Vec::new(),
+            others,
             flags,
             choices: Vec::new(),
             steps: Vec::new(),
@@ -739,6 +763,179 @@ fn unsheared_column<'f>(
     all.find_map(|own| free(own))
 }
 
+// Ends of the names of a method: those of its ellipticities, responses and weights.
+const ENDS_OF_METHODS: [&str; 11] = [
+    "_g_K", "_gK", "_g[K]", "_e_K", "_eK", "_e[K]", "_rKK", "_r_KK", "_deK_dgK", "_eK_gK", "_w",
+];
+
+// The prefix that the columns of a method share: `mcal` of `mcal_g_1`, `fpfs1` of `fpfs1_de1_dg1`, nothing of `e1`.
+fn method_of(name: &str) -> &str {
+    let name = base(name);
+    let digits = |c: char| {
+        if c.is_ascii_digit() {
+            'K'
+        } else {
+            c.to_ascii_lowercase()
+        }
+    };
+    let plain: String = name.chars().map(digits).collect();
+    let ends = ENDS_OF_METHODS.iter();
+    let longest = ends
+        .filter(|end| plain.ends_with(**end))
+        .max_by_key(|end| end.len());
+    let longest = longest.filter(|_| plain != "eK_gK");
+    // Letters that are not ASCII are as long as they were.
+    longest.map_or("", |end| &name[..plain.len() - end.len()])
+}
+
+// The names of e1 and e2 that a table has, both of one method.
+fn known_pairs<'f>(free: &dyn Fn(&str) -> Option<&'f String>) -> Vec<[&'f String; 2]> {
+    let names = names_of_role(Role::E1).zip(names_of_role(Role::E2));
+    let pairs = names.filter_map(|(e1, e2)| Some([free(e1)?, free(e2)?]));
+    pairs.collect()
+}
+
+// The names of e1 and e2 of methods other than that of `e1`, the first pair of each.
+fn other_pairs(pairs: &[[&String; 2]], e1: &str) -> Vec<[String; 2]> {
+    let mut methods = vec![method_of(e1).to_ascii_lowercase()];
+    let mut others = Vec::new();
+    for pair in pairs {
+        let method = method_of(pair[0]).to_ascii_lowercase();
+        if !methods.contains(&method) {
+            methods.push(method);
+            others.push(pair.map(String::clone));
+        }
+    }
+    others
+}
+
+// Of several methods in a table, the first whose response is there: `e1` was divided by `mcal_R11` of `mcal_g_1`, which gave
+// m = −0.134 for 0.05.
+fn chosen_pair<'f>(
+    found: &'f [String],
+    names: &Names,
+    pairs: &[[&'f String; 2]],
+) -> Option<[&'f String; 2]> {
+    let given = |role: Role| names.given.get(&(role, 0)).map(String::as_str);
+    if names.is_given(Role::E1) || names.is_given(Role::E2) {
+        return None;
+    }
+    let has = |column: &str| found.iter().any(|own| own.eq_ignore_ascii_case(column));
+    let mut steps = names_of_role(Role::ShearedCatalogue);
+    let in_rows = match given(Role::ShearedCatalogue) {
+        Some(given) => given != "none",
+        None => steps.any(has),
+    };
+    let undivided = &recognition().ellipticity.undivided;
+    let responds = |[e1, _]: &&[&String; 2]| {
+        let method = method_of(e1);
+        let is_of_method = |own: &&str| method_of(own).eq_ignore_ascii_case(method);
+        match given(Role::R11) {
+            _ if in_rows => undivided.iter().any(|own| own.eq_ignore_ascii_case(e1)),
+            Some("none") => false,
+            Some(given) => is_of_method(&given),
+            None => {
+                let responses = found.iter().map(String::as_str);
+                let mut responses = responses.filter(|own| is_response(Role::R11, own));
+                responses.any(|own| is_of_method(&own)) || sheared_column(found, e1, 1).is_some()
+            }
+        }
+    };
+    let first = pairs.first()?;
+    let chosen = pairs.iter().find(responds).unwrap_or(first);
+    // Of one method, the order of the names decides.
+    let is_other = !method_of(chosen[0]).eq_ignore_ascii_case(method_of(first[0]));
+    Some(if is_other { *chosen } else { *first })
+}
+
+// Whether a name is one of the role, perhaps with the prefix of a method.
+fn is_response(role: Role, name: &str) -> bool {
+    let method = method_of(name);
+    let own = name[method.len()..].trim_start_matches('_');
+    names_of_role(role).any(|known| known.eq_ignore_ascii_case(own))
+}
+
+// The column of a role by its name, of the method of e1. Without a column of its method, one of no method may be meant if no
+// ellipticities of no method are there; derivatives of a weight that is there are not those of another one.
+fn of_method<'f>(
+    found: &'f [String],
+    key: Key,
+    columns: &BTreeMap<Key, String>,
+    pairs: &[[&String; 2]],
+    free: &dyn Fn(&str) -> Option<&'f String>,
+) -> Option<&'f String> {
+    use Role::{Dw1, Dw2, R11, R12, R21, R22, Weight};
+    let names = recognised(key);
+    let mut all = names.iter().filter_map(|name| free(name));
+    let (role, is_unsheared) = (key.0, key.1 == 0);
+    let of = |key: Key| columns.get(&key).map_or("", String::as_str);
+    let e1 = of((Role::E1, 0));
+    // Of a formula, the method of its first column.
+    let formula = Expression::parse(e1).ok();
+    let operand = formula.as_ref().and_then(|own| own.columns().next());
+    // The first response that is found decides on the others.
+    let first =
+        Some(of((R11, 0))).filter(|own| [R12, R21, R22].contains(&role) && is_response(R11, own));
+    let own = method_of(first.or(operand).unwrap_or(e1));
+    let is = |method: &str, other: &str| method.eq_ignore_ascii_case(other);
+    let has_pair = |method: &str| pairs.iter().any(|pair| is(method_of(pair[0]), method));
+    match role {
+        R11 | R12 | R21 | R22 if is_unsheared => {
+            let prefixed = names.iter().filter(|name| method_of(name).is_empty());
+            let mut prefixed = prefixed.map(|name| format!("{own}_{name}"));
+            let own_column = prefixed
+                .find_map(|name| free(&name))
+                .filter(|_| !own.is_empty());
+            own_column.or_else(|| {
+                all.find(|name| {
+                    let method = method_of(name);
+                    let may_be_meant = first.is_none() && (method.is_empty() || own.is_empty());
+                    is(method, own) || may_be_meant && !has_pair(method)
+                })
+            })
+        }
+        Weight => {
+            let all: Vec<&String> = all.collect();
+            let of_method = all.iter().find(|name| is(method_of(name), own));
+            let is_free = |name: &&&String| {
+                let method = method_of(name);
+                method.is_empty() || !has_pair(method)
+            };
+            of_method
+                .filter(|_| !own.is_empty())
+                .or_else(|| all.iter().find(is_free))
+                .copied()
+        }
+        Dw1 | Dw2 => {
+            let weight = of((Weight, 0));
+            let is_of_weight = |name: &&String| {
+                let own = weight_of(name);
+                is(&own, weight) || !found.iter().any(|other| is(other, &own))
+            };
+            let all: Vec<&String> = all.collect();
+            let exact = all.iter().find(|name| is(&weight_of(name), weight));
+            exact
+                .or_else(|| all.iter().find(|name| is_of_weight(name)))
+                .copied()
+        }
+        _ => all.next(),
+    }
+}
+
+// The weight that a derivative belongs to: `wdet` of `dwdet_dg1` and `wdet_g1`, `fpfs_w` of `fpfs_dw_dg1`.
+fn weight_of(derivative: &str) -> String {
+    let name = derivative.to_ascii_lowercase();
+    let ends = ["_dg1", "_dg2", "_g1", "_g2"];
+    let stem = ends
+        .iter()
+        .find_map(|end| name.strip_suffix(end))
+        .unwrap_or(&name);
+    match stem.rsplit_once('_') {
+        Some((method, weight)) => format!("{method}_{}", weight.trim_start_matches('d')),
+        None => stem.trim_start_matches('d').to_owned(),
+    }
+}
+
 // Adds sheared catalogues by the names of e1 and e2.
 fn find_sheared(columns: &mut BTreeMap<Key, String>, found: &[String], names: &Names) {
     for role in [Role::E1, Role::E2] {
@@ -814,8 +1011,7 @@ fn find_flags(
     };
     let e1 = e1.unwrap_or_default();
     let e1 = base(&e1);
-    let mut endings = ["_g_1", "_g1", "_g[0]", "_e_1", "_e1", "_e[0]"].into_iter();
-    let kind = endings.find_map(|ending| e1.strip_suffix(ending));
+    let kind = Some(method_of(e1)).filter(|kind| !kind.is_empty());
     let of_kind = |ending: &str| own(&format!("{}_{ending}", kind?));
     let cuts = own("flags_select");
     let all = [
@@ -953,8 +1149,14 @@ impl Columns {
             let unread = all.iter().filter(|name| !read.contains(name));
             unread.cloned().collect()
         };
-        let (unused, unknown) = (unread(&self.unused), unread(&self.unknown));
+        let (unused, mut unknown) = (unread(&self.unused), unread(&self.unknown));
         let mut lines = Vec::new();
+        for [e1, e2] in self.others.iter().filter(|[e1, _]| !read.contains(e1)) {
+            unknown.retain(|name| name != e1 && name != e2);
+            lines.push(format!(
+                "Not used: {e1}, {e2} of another method. Try: --columns e1={e1},e2={e2} for them with their own response."
+            ));
+        }
         if !unused.is_empty() {
             let calibration = self.before_calibration(&unused).unwrap_or_default();
             lines.push(format!(
@@ -1340,6 +1542,146 @@ mod tests {
         // The own component alone, in another spelling.
         let own = found("e1 e2 1p_e1 1m_e1 2p_e2 2m_e2", &[]).unwrap();
         assert_eq!(own.preset, Preset::Metacal);
+    }
+
+    #[test]
+    fn roles_of_one_method_belong_together() {
+        for (columns, given, e1, response, others) in [
+            (
+                "fpfs1_e1 fpfs1_e2 fpfs1_de1_dg1 fpfs1_de2_dg2 fpfs_de1_dg1 fpfs_de2_dg2",
+                "",
+                "fpfs1_e1",
+                Some("fpfs1_de1_dg1"),
+                "",
+            ),
+            (
+                "e1 e2 mcal_g_1 mcal_g_2 mcal_R11 mcal_R22",
+                "",
+                "mcal_g_1",
+                Some("mcal_R11"),
+                "Not used: e1, e2 of another method. Try: --columns e1=e1,e2=e2",
+            ),
+            (
+                "e1 e2 mcal_g_1 mcal_g_2 mcal_R11 mcal_R22",
+                "e1=e1,e2=e2",
+                "e1",
+                None,
+                "",
+            ),
+            (
+                "e1 e2 mcal_g_1 mcal_g_2 mcal_R11 mcal_R22",
+                "R11=none,R22=none",
+                "e1",
+                None,
+                "Not used: mcal_g_1, mcal_g_2 of another method.",
+            ),
+            (
+                "e1 e2 fpfs_e1 fpfs_e2 fpfs_de1_dg1 fpfs_de2_dg2",
+                "",
+                "fpfs_e1",
+                Some("fpfs_de1_dg1"),
+                "Not used: e1, e2 of another method.",
+            ),
+            (
+                "mcal_g_1 mcal_g_2 R11 R22 mcal_R11 mcal_R22",
+                "",
+                "mcal_g_1",
+                Some("mcal_R11"),
+                "",
+            ),
+            (
+                "e1 e2 mcal_g_1 mcal_g_2 R11 R22",
+                "e1=-mcal_g_1,e2=mcal_g_2",
+                "-mcal_g_1",
+                None,
+                "",
+            ),
+            ("e1 e2 r11 r22 R11 R22", "", "e1", Some("R11"), ""),
+            (
+                "regauss_e1 regauss_e2 R11 R22",
+                "",
+                "regauss_e1",
+                Some("R11"),
+                "",
+            ),
+            (
+                "fpfs1_e1 fpfs1_e2 fpfs_de1_dg1 fpfs_de2_dg2",
+                "",
+                "fpfs1_e1",
+                None,
+                "",
+            ),
+            (
+                "wmom_g_1 wmom_g_2 wmom_R11 wmom_R22",
+                "",
+                "wmom_g_1",
+                Some("wmom_R11"),
+                "",
+            ),
+            (
+                "mdet_step e1 e2 wmom_g_1 wmom_g_2",
+                "",
+                "wmom_g_1",
+                None,
+                "Not used: e1, e2 of another method.",
+            ),
+            ("e1 mcal_g_1 mcal_g_2", "", "mcal_g_1", None, ""),
+            (
+                "e1 e2 mcal_g_1 mcal_g_2",
+                "e1=mcal_g_1",
+                "mcal_g_1",
+                None,
+                "",
+            ),
+        ] {
+            let given: Vec<&str> = given.split(',').filter(|own| !own.is_empty()).collect();
+            let formula = given.iter().find_map(|own| own.strip_prefix("e1=-"));
+            let formula = formula.map_or(String::new(), |own| format!(" -{own}"));
+            let own = found(&format!("{columns}{formula}"), &given).unwrap();
+            assert_eq!((own.of(Role::E1), own.of(Role::R11)), (Some(e1), response));
+            assert_eq!(
+                method_of(own.of(Role::E2).unwrap()),
+                method_of(e1.trim_start_matches('-'))
+            );
+            let unused = own.unused(&[]).join(" ");
+            assert!(unused.contains(others), "{columns}: {unused}");
+            assert_eq!(unused.contains("another method"), !others.is_empty());
+        }
+        // Derivatives of a weight that is there are not those of another one.
+        for (columns, weight, derivative) in [
+            ("weight wdet dwdet_dg1 dwdet_dg2", "weight", None),
+            ("weight dw_dg1 dw_dg2", "weight", Some("dw_dg1")),
+            (
+                "wdet wsel dwsel_dg1 dwsel_dg2 dwdet_dg1 dwdet_dg2",
+                "wdet",
+                Some("dwdet_dg1"),
+            ),
+            (
+                "fpfs_w fpfs_dw_dg1 fpfs_dw_dg2",
+                "fpfs_w",
+                Some("fpfs_dw_dg1"),
+            ),
+        ] {
+            let own = found(&format!("e1 e2 {columns}"), &[]).unwrap();
+            let roles = (own.of(Role::Weight), own.of(Role::Dw1));
+            assert_eq!(roles, (Some(weight), derivative));
+        }
+        let mixed = "mcal_g_1 mcal_g_2 mcal_R11 R11 R22";
+        assert!(found(mixed, &[]).unwrap_err().contains("none for R22"));
+        let own = found("fpfs_e1 fpfs_e2 w fpfs_w", &[]).unwrap();
+        assert_eq!(own.of(Role::Weight), Some("fpfs_w"));
+        let own = found("e1 e2 fpfs_e1 fpfs_e2 fpfs_w", &[]).unwrap();
+        assert_eq!(own.of(Role::Weight), None);
+        // The advised response is that of the method.
+        let own = found(
+            "e1 e2 fpfs1_e1 fpfs1_e2 fpfs1_de1_dg1 fpfs1_de2_dg2",
+            &["e1=e1", "e2=e2"],
+        );
+        let unused = own.unwrap().unused(&[]).join(" ");
+        assert!(
+            unused.contains("R11=fpfs1_de1_dg1,R22=fpfs1_de2_dg2"),
+            "{unused}"
+        );
     }
 
     #[test]
