@@ -83,7 +83,7 @@ pub(crate) fn shapes_of(name: &str) -> PyResult<Shapes> {
 fn table_of(
     name: &str,
     columns: Vec<(String, Bound<'_, PyAny>)>,
-    unread: Vec<String>,
+    unread: Vec<(String, String)>,
 ) -> PyResult<Input> {
     let columns = columns.iter().map(|(label, values)| {
         if let Ok(reals) = values.extract::<PyReadonlyArray1<'_, f64>>() {
@@ -113,11 +113,15 @@ fn table_of(
     })
 }
 
-// A path, or the name and the columns of a table, with the names of those that are not read.
+// A path, or the name and the columns of a table, with the names of those that are not read and what they have in each row.
 #[derive(FromPyObject)]
 pub(crate) enum Given<'py> {
     Path(PathBuf),
-    Table(String, Vec<(String, Bound<'py, PyAny>)>, Vec<String>),
+    Table(
+        String,
+        Vec<(String, Bound<'py, PyAny>)>,
+        Vec<(String, String)>,
+    ),
 }
 
 impl Given<'_> {

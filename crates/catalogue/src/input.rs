@@ -10,8 +10,9 @@ pub struct Input {
     pub name: PathBuf,
     /// The table, if it is in memory.
     pub frame: Option<DataFrame>,
-    /// Names of the columns that the table in memory lacks because they are not read.
-    pub unread: Vec<String>,
+    /// Names of the columns that the table in memory lacks, and what they have in place of a number or text in each row, such as `has
+    /// the shape (100, 9)`; empty of those that are not read because nothing needs them.
+    pub unread: Vec<(String, String)>,
     /// The files of a catalogue in several, with the sheared catalogue (0 for noshear) that a file contains.
     pub parts: Vec<(PathBuf, Option<usize>)>,
 }

@@ -18,7 +18,7 @@ use crate::recognition::{fits_any, has_any, recognition, words};
 use crate::columns::{Columns, Names, Preset, Shapes, base};
 use crate::identity;
 use crate::request::{Input, Request, Units};
-use crate::roles::{CATALOGUES, Places, Role};
+use crate::roles::{CATALOGUES, Places, Role, name_of};
 use crate::steps::{catalogue_named, sheared_column, sheared_name, unsheared};
 use crate::truth::Truth;
 
@@ -171,6 +171,34 @@ impl Source {
         let read = read.filter(|name| !is_tested(name) || is_chosen(name));
         let operands = self.formulas.iter().flat_map(Expression::columns);
         read.chain(operands).map(str::to_owned).collect()
+    }
+
+    // Refuses columns of a table in memory that have a role and no number or text in each row.
+    fn refuse_unread(&self, unread: &[(String, String)]) -> Result<(), FileError> {
+        let wanted = self.wanted.iter().map(|own| own.column.as_str());
+        let operands = self.formulas.iter().flat_map(Expression::columns);
+        let read: HashSet<&str> = wanted.chain(operands).collect();
+        let Some((name, found)) = unread.iter().find(|(name, _)| read.contains(&**name)) else {
+            return Ok(());
+        };
+        let Columns {
+            flags,
+            doubtful_weights,
+            ..
+        } = &self.columns;
+        let role = match self.columns.all().find(|(_, own)| own == name) {
+            Some((key, _)) => Some(name_of(key)),
+            None if flags.contains(name) => Some(name_of((Role::Flag, 0))),
+            None if doubtful_weights.contains(name) => Some(name_of((Role::Weight, 0))),
+            None => None,
+        };
+        let without = role.map_or(String::new(), |role| format!(", or --columns {role}=none"));
+        Err(FileError::new(
+            &self.place.path,
+            format!(
+                "column `{name}` {found} (expected a number or text in each row). Try: such a column{without}"
+            ),
+        ))
     }
 
     // Columns that are not used here, and that `first` does not have.
@@ -415,11 +443,12 @@ fn sources_of(
         let mut names: Vec<String> = (table.columns().iter())
             .map(|own| own.name().to_string())
             .collect();
-        names.extend(input.unread.iter().cloned());
+        names.extend(input.unread.iter().map(|(name, _)| name.clone()));
         let source = Source {
             frame: Some(table.clone()),
             ..source(place, None, (&names, Some(table)), reading)?
         };
+        source.refuse_unread(&input.unread)?;
         return Ok(vec![source]);
     }
     let place = Place::of(path);

@@ -378,8 +378,9 @@ def one_table(catalogues: Any) -> bool:
 
 def _catalogue(
     name: str, table: Any, needed: Callable[[Sequence[str]], list[str]] | None = None
-) -> str | tuple[str, list[tuple[str, Any]], list[str]]:
-    """A path, or a name with columns of float64 or of text, and the names of those that are not needed."""
+) -> str | tuple[str, list[tuple[str, Any]], list[tuple[str, str]]]:
+    """A path, or a name with columns of float64 or of text, and the names of those that are not needed, or that have something else
+    in each row, with what that is."""
     source = table
     if isinstance(table, (str, os.PathLike)):
         path = os.fspath(table)
@@ -388,16 +389,26 @@ def _catalogue(
         name, table = path, _hdf5.table(path, path)
     elif _hdf5.is_group(table):
         table = _hdf5.table(table, name)
-    unread: list[str] = []
+    unread: list[tuple[str, str]] = []
     try:
         if needed is not None:
-            table, unread = narrowed(table, needed)
+            table, unneeded = narrowed(table, needed)
+            unread = [(label, "") for label in unneeded]
         given = named_columns(table)
     except TypeError as error:
         if "Try: " in str(error):
             raise TypeError(f"{name}: {error}") from None
         given = []
-    columns = [(label, values) for label, own in given if (values := _values(own)) is not None]
+    columns: list[tuple[str, Any]] = []
+    for label, own in given:
+        values = _values(own)
+        if values is None:
+            # Columns that were dropped without a word gave m = −0.055 for 0.050.
+            unread.append((label, _described(own)))
+        else:
+            columns.append((label, values))
+    if isinstance(table, _hdf5.Hdf5Table):
+        unread += table.partial.items()
     if not columns:
         found, remedy = _no_table(source)
         raise ValueError(f"{name}: found {found} without columns of numbers; expected a table with e1 and e2{remedy}")
@@ -459,6 +470,18 @@ def _values(column: Any) -> Any:
         texts = (value.decode(errors="backslashreplace") if isinstance(value, bytes) else str(value) for value in array.tolist())
         return ["" if gone else text for gone, text in zip(missing, texts)]
     return None
+
+
+def _described(column: Any) -> str:
+    """What a column is that has no number or text in each row."""
+    if column.ndim == 0:
+        return f"is a single {type(column.item()).__name__}"
+    if column.ndim > 1:
+        return f"has the shape {shown(column.shape)}"
+    if column.dtype.kind != "O":
+        return f"has values of type {column.dtype}"
+    kinds = sorted({type(value).__name__ for value in column if not is_missing(value)})
+    return f"has values of type {', '.join(kinds)}" + (" of different shapes" if kinds in (["list"], ["ndarray"]) else "")
 
 
 def _truth(g1: Any, g2: Any, truth: Any, given: list[Any]) -> Any:

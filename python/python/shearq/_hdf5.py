@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
+# Most numbers of a row that are read: more than those of vectors that become columns.
+_MAX_NUMBERS = 64
 # The column by which metadetect itself names the step of a row.
 _STEP = "mdet_step"
 # Names of the groups of metadetect's artificial shears, and what metadetect calls them.
@@ -51,9 +53,11 @@ class Hdf5Table(Mapping[str, Any]):
         self.name = name
         self._steps = _steps(group)
         tables = list(self._steps.values()) if self._steps else [group]
-        columns = [_datasets(table) for table in tables]
+        columns = [_datasets(table, any_shape=True) for table in tables]
         # The names of the groups state the steps, also where each group repeats its own in a column.
-        shared = [key for key in columns[0] if all(key in other for other in columns) and not (self._steps and key == _STEP)]
+        shared = [key for key in columns[0] if all(key in other and other[key].ndim > 0 for other in columns) and not (self._steps and key == _STEP)]
+        #: What there is of other datasets: `flags` of the unsheared group alone were dropped without a word.
+        self.partial = {key: self._part(key, columns) for own in columns for key in own if key not in shared and key != _STEP}
         self._columns = {key: [column[key] for column in columns] for key in shared}
         lengths = {key: tuple(len(part) for part in parts) for key, parts in self._columns.items()}
         first = next(iter(lengths.values()), None)
@@ -64,10 +68,18 @@ class Hdf5Table(Mapping[str, Any]):
             raise ValueError(f"{name}: {others[0]} has {sum(lengths[others[0]])} rows and {shared[0]} {sum(first)}; expected one length")
         self._rows = first
 
+    def _part(self, key: str, columns: Sequence[Mapping[str, Any]]) -> str:
+        absent = [step for step, own in zip(self._steps, columns) if key not in own]
+        return f"is not in the group{'s' * (len(absent) > 1)} of {', '.join(absent)}" if absent else "is a single value"
+
     def __getitem__(self, key: str) -> Any:
         if self._steps and key == _STEP:
             return np.repeat(np.array(list(self._steps)), self._rows)
-        return np.concatenate([_native(part[:]) for part in self._columns[key]])
+        parts = self._columns[key]
+        if parts[0].ndim > 1 and np.prod(parts[0].shape[1:]) > _MAX_NUMBERS:
+            # Of stamps, the shape alone, which takes no memory.
+            return np.broadcast_to(np.zeros((), parts[0].dtype), (sum(self._rows), *parts[0].shape[1:]))
+        return np.concatenate([_native(part[:]) for part in parts])
 
     def numbers(self) -> list[str]:
         """The columns of numbers."""
@@ -92,7 +104,8 @@ class _Field:
     def __init__(self, rows: Any, name: str) -> None:
         self._rows, self._name = rows, name
         self.dtype, shape = rows.dtype[name].subdtype or (rows.dtype[name], ())
-        self.ndim = rows.ndim + len(shape)
+        self.shape = (*rows.shape, *shape)
+        self.ndim = len(self.shape)
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -105,11 +118,12 @@ def _has_fields(value: Any) -> bool:
     return getattr(getattr(value, "dtype", None), "names", None) is not None
 
 
-def _datasets(group: Any) -> dict[str, Any]:
-    """The columns of a group, or of a dataset of rows with fields, as astropy and PyTables write them."""
+def _datasets(group: Any, any_shape: bool = False) -> dict[str, Any]:
+    """The columns of a group, or of a dataset of rows with fields, as astropy and PyTables write them. Of `any_shape`, also single
+    values and arrays in each row."""
     if _has_fields(group):
         return {name: _Field(group, name) for name in group.dtype.names}
-    columns = {key: value for key, value in group.items() if hasattr(value, "dtype") and value.ndim in (1, 2)}
+    columns = {key: value for key, value in group.items() if hasattr(value, "dtype") and (any_shape or value.ndim in (1, 2))}
     # Units and formats of astropy are no column.
     return {key: value for key, value in columns.items() if not _has_fields(value) and not key.endswith(".__table_column_meta__")}
 

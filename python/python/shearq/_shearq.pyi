@@ -62,7 +62,7 @@ def detect(
 ) -> tuple[dict[str, NDArray[Any]], list[str]]: ...
 def metrics() -> list[tuple[str, str, str]]: ...
 def galaxies(
-    catalogues: Sequence[str | tuple[str, list[tuple[str, Any]], list[str]]],
+    catalogues: Sequence[str | tuple[str, list[tuple[str, Any]], list[tuple[str, str]]]],
     columns: Sequence[str],
     preset: Sequence[str],
     ellipticity: str | None,
@@ -145,14 +145,14 @@ def needed_columns(
     units: str | None,
 ) -> list[str]: ...
 def bias_sums(
-    catalogues: Sequence[str | tuple[str, list[tuple[str, Any]], list[str]]],
+    catalogues: Sequence[str | tuple[str, list[tuple[str, Any]], list[tuple[str, str]]]],
     columns: Sequence[str],
     preset: Sequence[str],
     truth: tuple[float, float] | Sequence[tuple[str, float, float]] | str | None,
     ellipticity: str | None,
     truth_sign: str | None,
     bins: Sequence[tuple[str, int | None, Sequence[float]]],
-    like: str | tuple[str, list[tuple[str, Any]], list[str]] | None,
+    like: str | tuple[str, list[tuple[str, Any]], list[tuple[str, str]]] | None,
     tomography: str | None,
     condition: str | None,
     unsheared: Sequence[str],

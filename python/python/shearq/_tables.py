@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import math
 import os
 import pathlib
 import tempfile
@@ -75,7 +76,7 @@ def named_columns(table: Any) -> list[tuple[str, Any]]:
             raise TypeError("table: found an array without fields; expected a structured array")
         found = [(name, table[name]) for name in table.dtype.names]
     elif isinstance(table, Mapping):
-        found = list(table.items())
+        found = _of_one_length(table)
     elif hasattr(table, "num_columns") and hasattr(table, "schema"):
         # Tables and record batches of Arrow.
         found = [(name, table.column(name)) for name in table.schema.names]
@@ -215,7 +216,7 @@ def _has_missing(column: Any) -> bool:
 
 
 def _components(name: str, array: Any) -> list[tuple[str, Any]]:
-    """The columns ``g[0]`` and ``g[1]`` of a vector ``g``, or the column itself."""
+    """The columns ``g[0]`` and ``g[1]`` of a vector ``g``, the numbers of vectors of one, or the column itself."""
     if array.ndim == 1 and array.dtype.kind == "O":
         # Lists of Arrow, pandas and polars.
         first = next((value for value in array if not is_missing(value)), "")
@@ -223,9 +224,21 @@ def _components(name: str, array: Any) -> list[tuple[str, Any]]:
             rows = [np.full(len(first), np.nan) if is_missing(value) else np.asarray(value) for value in array]
             if all(row.shape == rows[0].shape for row in rows):
                 array = np.stack(rows)
-    if array.ndim == 2 and 2 <= array.shape[1] <= _MAX_VECTOR:
-        return [(f"{name}[{k}]", array[:, k]) for k in range(array.shape[1])]
+    if array.ndim > 1 and 1 <= (numbers := math.prod(array.shape[1:])) <= _MAX_VECTOR:
+        # A matrix row by row, as in FITS files.
+        flat = array.reshape(len(array), numbers)
+        return [(f"{name}[{k}]" if numbers > 1 else name, flat[:, k]) for k in range(numbers)]
     return [(name, array)]
+
+
+def _of_one_length(table: Mapping[Any, Any]) -> list[tuple[Any, Any]]:
+    """The columns of a mapping, in which a single number or text is that of all rows, as in pandas, and None is no column."""
+    if isinstance(table, _hdf5.Hdf5Table):
+        return list(table.items())
+    found = [(name, column) for name, column in table.items() if column is not None]
+    rows = next((len(column) for _, column in found if np.ndim(column) > 0), None)
+    is_single = lambda value: np.ndim(value) == 0 and isinstance(value, (str, bool, int, float, np.bool_, np.number))
+    return [(name, np.full(rows, column) if rows is not None and is_single(column) else column) for name, column in found]
 
 
 def is_missing(value: Any) -> bool:
