@@ -230,8 +230,7 @@ impl<'a> Source<'a> {
                 .map_err(|detail| damaged(path, detail))?;
                 let series = series.ok_or_else(|| damaged(path, format!("{place}: absent")))?;
                 let series = own.taken(series);
-                let series =
-                    series.map_err(|detail| damaged(path, format!("{place}: {detail}")))?;
+                let series = series.map_err(|fault| own.short(path, &fault))?;
                 with_missing(path, series)
             };
             let columns = wanted.iter().map(series).collect::<Result<_, _>>()?;

@@ -30,6 +30,16 @@ impl Wanted {
         }
     }
 
+    /// What is said of lists that are too short, which are no damage.
+    pub(crate) fn short(&self, path: &Path, fault: &str) -> FileError {
+        let name = self.field.name.as_str();
+        let message = format!(
+            "column `{name}`: {fault}, as `{}` needs. Try: a column of numbers in place of lists",
+            element_name(name, self.element.unwrap_or_default())
+        );
+        FileError::new(path, message)
+    }
+
     /// The numbers of decoded vectors; other columns as they are.
     pub(crate) fn taken(&self, vectors: Series) -> Result<Series, String> {
         let Some(place) = self.element else {

@@ -465,7 +465,9 @@ impl<'a> Source<'a> {
                 series.len()
             )));
         }
-        wanted.taken(series).map_err(damaged)
+        wanted
+            .taken(series)
+            .map_err(|fault| wanted.short(path, &fault))
     }
 
     // `size` bytes from `start`, after checking that the file has them.
