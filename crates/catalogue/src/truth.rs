@@ -2,7 +2,7 @@
 //! catalogues were measured on.
 
 use std::collections::{BTreeMap, HashMap};
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 use std::sync::Arc;
 
 use shearq_dataset::images::Files;
@@ -239,15 +239,21 @@ fn row_of<'n>(
 ) -> Result<&'n String, FileError> {
     // `FILE[TABLE]` is also meant by the name of the file.
     let whole = Place::of(path).path;
-    let same: Vec<Vec<_>> = [path, &whole]
-        .map(|path| path.components().collect())
-        .into();
+    // `./a.csv` is `a.csv`, and a table may have absolute paths.
+    let there = |own: &Component<'_>| *own != Component::CurDir;
+    let absolute = [path, &whole].map(|own| std::path::absolute(own).unwrap_or_default());
+    let parts = |path| Path::components(path).filter(there).collect::<Vec<_>>();
+    let same = [path, &whole].map(parts);
+    let same_absolute = [&*absolute[0], &*absolute[1]].map(parts);
     let (mut best, mut length, mut all) = (Vec::new(), 0, Vec::new());
     for name in names {
         all.push(name);
-        let own: Vec<_> = Path::new(name).components().collect();
+        let own = parts(Path::new(name));
         let part = |parts: &Vec<_>| parts.windows(own.len()).any(|some| some == own);
-        if own.is_empty() || own.len() < length || !same.iter().any(part) {
+        // A folder above that of the command is no part of a relative path.
+        let is_absolute = Path::new(name).is_absolute();
+        let fits = same.iter().any(part) || is_absolute && same_absolute.iter().any(part);
+        if own.is_empty() || own.len() < length || !fits {
             continue;
         }
         if own.len() > length {
@@ -673,6 +679,7 @@ mod tests {
             ["out/plus", "out/minus/set01"],
             // The longest name counts.
             ["out", "minus/set01/c-1.parquet"],
+            ["./out/plus", "./out/minus/set01/c-1.parquet"],
         ] {
             let table = [(names[0], 0.02), (names[1], -0.02)];
             let found = shears(&table, &[plus, more, minus]);
@@ -686,6 +693,9 @@ mod tests {
             }
         }
         assert_eq!(shears(&[("c-1.parquet", 0.01)], &[plus]).unwrap(), [0.01]);
+        let absolute = std::path::absolute(plus).unwrap();
+        let absolute = absolute.to_str().unwrap();
+        assert_eq!(shears(&[(absolute, 0.01)], &[plus]).unwrap(), [0.01]);
         for (table, reason) in [
             (vec![("c-1.parquet", 0.01)], "expected one. Try: the folder"),
             (
