@@ -32,6 +32,8 @@ pub struct Expression {
     sharp: bool,
     // What `cos` and `sin` are of.
     angles: Vec<Node>,
+    // Operands that are compared with others than a number.
+    compared: Vec<usize>,
 }
 
 /// What an expression reads in each row: the number in a column, or what the text in it is compared with.
@@ -41,6 +43,36 @@ pub struct Operand {
     pub texts: Option<Texts>,
     /// Bits of which the operand has those that the number has, too: a float would lose the low bits of 64.
     pub mask: Option<i64>,
+    /// What the integers of a column are compared with: floats merge those above 2⁵³, such as identifiers of Rubin.
+    pub integers: Option<Integers>,
+}
+
+/// What the integers of a column are compared with.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Integers {
+    /// The comparison, such as `<`, and an integer. The operand is 1 where it holds, else 0.
+    Compared(&'static str, i128),
+    /// Integers in ascending order. The operand is the place of the own one among them, from 1 on, and 0 of another one.
+    List(Vec<i128>),
+}
+
+impl Integers {
+    fn value(&self, own: i128) -> f64 {
+        match self {
+            Integers::Compared(token, other) => truth(match *token {
+                "<=" => own <= *other,
+                ">=" => own >= *other,
+                "==" => own == *other,
+                "!=" => own != *other,
+                "<" => own < *other,
+                _ => own > *other,
+            }),
+            Integers::List(all) => {
+                let found = all.binary_search(&own);
+                found.map_or(0.0, |place| (place + 1) as f64)
+            }
+        }
+    }
 }
 
 /// What the texts of a column are compared with.
@@ -74,20 +106,24 @@ impl Operand {
 
     // Whether it is the number of the column itself.
     fn is_plain(&self) -> bool {
-        self.texts.is_none() && self.mask.is_none()
+        self.texts.is_none() && self.mask.is_none() && self.integers.is_none()
     }
 
     /// The value where the column has a number.
     pub fn of_number(&self, number: f64) -> f64 {
-        self.mask
-            .map_or(number, |mask| common_bits(number, mask as f64))
+        match (&self.integers, self.mask) {
+            (Some(_), _) if number.is_nan() => f64::NAN,
+            // A number between two integers is equal to none, and compares with large ones as the integer below.
+            (Some(integers), _) => integers.value(number.floor() as i128),
+            (None, mask) => mask.map_or(number, |mask| common_bits(number, mask as f64)),
+        }
     }
 
     /// The values where the column has these numbers.
     pub fn of_numbers<'v>(&self, numbers: Cow<'v, [f64]>) -> Cow<'v, [f64]> {
-        match self.mask {
-            None => numbers,
-            Some(_) => Cow::Owned(numbers.iter().map(|own| self.of_number(*own)).collect()),
+        match self.mask.is_some() || self.integers.is_some() {
+            false => numbers,
+            true => Cow::Owned(numbers.iter().map(|own| self.of_number(*own)).collect()),
         }
     }
 }
@@ -118,6 +154,8 @@ type Operator = fn(f64, f64) -> f64;
 #[derive(Debug, Clone)]
 enum Node {
     Number(f64),
+    /// One that floats do not contain.
+    Integer(i128),
     Operand(usize),
     Unary(Function, Box<Node>),
     Binary(&'static Binary, Box<Node>, Box<Node>),
@@ -221,7 +259,42 @@ impl Expression {
             root: Node::Operand(0),
             sharp: true,
             angles: Vec::new(),
+            compared: Vec::new(),
         }
+    }
+
+    /// The place of the integer of a column among `integers`, which are in ascending order.
+    pub fn of_integers(column: &str, integers: Vec<i128>) -> Self {
+        let mut own = Expression::of_texts(column, Vec::new());
+        own.operands = vec![Operand {
+            integers: Some(Integers::List(integers)),
+            ..Operand::of_column(column)
+        }];
+        own
+    }
+
+    /// Whether the expression is a number, without a column.
+    pub fn is_number(&self) -> bool {
+        self.operands.is_empty()
+    }
+
+    /// Whether the expression has the other sign of what it is a formula of: it begins with a minus, or is a negative multiple of a
+    /// column.
+    pub fn is_negative(&self) -> bool {
+        let at = |x: f64| self.value(&|_| x);
+        let is_multiple = self.operands.len() == 1
+            && [-1.0, 0.5, 2.0].iter().all(|x| at(*x) == x * at(1.0))
+            && at(1.0) < 0.0;
+        self.operands.iter().all(Operand::is_plain) && (is_multiple || self.text.starts_with('-'))
+    }
+
+    /// The columns whose numbers are compared with others than a number, or are the expression itself.
+    pub fn compared_columns(&self) -> impl Iterator<Item = &str> {
+        let compared = self
+            .compared
+            .iter()
+            .map(|place| &self.operands[*place].column);
+        compared.map(String::as_str).chain(self.column())
     }
 
     /// The column, if the expression is nothing else.
@@ -294,6 +367,7 @@ impl Node {
     fn value(&self, value: &impl Fn(usize) -> f64) -> f64 {
         match self {
             Node::Number(number) => *number,
+            Node::Integer(integer) => *integer as f64,
             Node::Operand(place) => value(*place),
             Node::Unary(function, a) => function(a.value(value)),
             Node::Binary((_, operator), a, b) => operator(a.value(value), b.value(value)),
@@ -304,7 +378,7 @@ impl Node {
 
     fn has_step(&self) -> bool {
         match self {
-            Node::Number(_) | Node::Operand(_) => false,
+            Node::Number(_) | Node::Integer(_) | Node::Operand(_) => false,
             Node::Unary(_, a) => a.has_step(),
             Node::Binary(_, a, b) => a.has_step() || b.has_step(),
             Node::Step(_) => true,
@@ -349,6 +423,7 @@ impl Condition {
             operands: Vec::new(),
             sharp: false,
             angles: Vec::new(),
+            compared: Vec::new(),
         };
         let root = parser.level(0)?;
         if !parser.rest().is_empty() {
@@ -366,6 +441,7 @@ impl Condition {
             root,
             sharp: parser.sharp,
             angles: parser.angles,
+            compared: parser.compared,
         });
         Ok(Condition { text, rows, steps })
     }
@@ -378,6 +454,7 @@ struct Parser<'a> {
     operands: Vec<Operand>,
     sharp: bool,
     angles: Vec<Node>,
+    compared: Vec<usize>,
 }
 
 impl<'a> Parser<'a> {
@@ -430,6 +507,7 @@ impl<'a> Parser<'a> {
             let right = self.level(level + 1)?;
             node = match operator.0 {
                 "&" => self.masked(operator, node, right, first),
+                _ if level == COMPARISONS => self.comparison(operator, node, right, first),
                 _ => Node::Binary(operator, Box::new(node), Box::new(right)),
             };
             // `5 < snr < 10` would compare a truth with 10, and `snr > 10 & size > 2` the bits of 10.
@@ -473,6 +551,41 @@ impl<'a> Parser<'a> {
         self.operands.truncate(place.max(first));
         self.operand(Operand {
             mask: Some(mask as i64),
+            ..own
+        })
+    }
+
+    // Compares a column with an integer that floats do not contain, or other expressions. Operands from `first` on are those of both.
+    fn comparison(&mut self, operator: &'static Binary, a: Node, b: Node, first: usize) -> Node {
+        let turned = match operator.0 {
+            "<=" => ">=",
+            ">=" => "<=",
+            "<" => ">",
+            ">" => "<",
+            equal => equal,
+        };
+        let (place, token, integer) = match (&a, &b) {
+            (Node::Operand(place), Node::Integer(integer)) => (*place, operator.0, *integer),
+            (Node::Integer(integer), Node::Operand(place)) => (*place, turned, *integer),
+            (a, b) => {
+                for (own, other) in [(a, b), (b, a)] {
+                    if let Node::Operand(place) = own
+                        && !matches!(other, Node::Number(_))
+                    {
+                        self.compared.push(*place);
+                    }
+                }
+                return Node::Binary(operator, Box::new(a.clone()), Box::new(b.clone()));
+            }
+        };
+        let own = self.operands[place].clone();
+        if !own.is_plain() {
+            return Node::Binary(operator, Box::new(a), Box::new(b));
+        }
+        // The number itself is not read for a comparison alone.
+        self.operands.truncate(place.max(first));
+        self.operand(Operand {
+            integers: Some(Integers::Compared(token, integer)),
             ..own
         })
     }
@@ -529,7 +642,10 @@ impl<'a> Parser<'a> {
     fn signed(&mut self) -> Result<Node, ExpressionError> {
         self.nested(|parser| {
             if parser.take("-") {
-                return Ok(Node::Unary(|a| -a, Box::new(parser.signed()?)));
+                return Ok(match parser.signed()? {
+                    Node::Integer(integer) => Node::Integer(-integer),
+                    other => Node::Unary(|a| -a, Box::new(other)),
+                });
             }
             let base = parser.atom()?;
             if parser.take("^") {
@@ -549,7 +665,12 @@ impl<'a> Parser<'a> {
         }
         let rest = self.rest();
         if number_length(rest) > 0 {
-            return self.number().map(Node::Number);
+            let integer = rest[..number_length(rest)].parse::<i128>().ok();
+            let large = integer.filter(|own| own.unsigned_abs() >= MAX_EXACT_INTEGER as u128);
+            return Ok(match (self.number()?, large) {
+                (_, Some(integer)) => Node::Integer(integer),
+                (number, None) => Node::Number(number),
+            });
         }
         if self.take("`") {
             let rest = self.rest();
@@ -677,9 +798,19 @@ pub fn operand_values<'f>(
         column,
         texts,
         mask,
+        integers,
     } = operand;
+    if let Some(integers) = integers {
+        let shown = match integers {
+            Integers::Compared(token, other) => format!("{column} {token} {other}"),
+            Integers::List(_) => column.clone(),
+        };
+        return of_integers(frame, operand, &shown, |own| integers.value(own), path);
+    }
     if let Some(mask) = mask {
-        return bits(frame, operand, *mask, path);
+        let shown = format!("{column} & {mask}");
+        let common = |own: i128| (own & i128::from(*mask)) as f64;
+        return of_integers(frame, operand, &shown, common, path);
     }
     let Some(compared) = texts else {
         return table::numbers(frame, column, path);
@@ -696,34 +827,98 @@ pub fn operand_values<'f>(
     Ok(Cow::Owned(values.collect()))
 }
 
-// Of the integers of a table. Tables of text have floats.
-fn bits<'f>(
+// A value of each of the integers of a table. Tables of text have floats.
+fn of_integers<'f>(
     frame: &'f DataFrame,
     operand: &Operand,
-    mask: i64,
+    shown: &str,
+    value: impl Fn(i128) -> f64,
     path: &Path,
 ) -> Result<Cow<'f, [f64]>, FileError> {
     let name = operand.column.as_str();
-    let column = frame.column(name).ok();
-    let series = column.map(|own| own.as_materialized_series());
-    let common = |own: Option<i64>| own.map_or(f64::NAN, |own| (own & mask) as f64);
-    if let Some(integers) = series.and_then(|own| own.i64().ok()) {
-        return Ok(integers.iter().map(common).collect());
-    }
-    if let Some(integers) = series.and_then(|own| own.u64().ok()) {
-        let signed = integers.iter().map(|own| own.map(|own| own as i64));
-        return Ok(signed.map(common).collect());
+    if let Some(integers) = integers_of(frame, name) {
+        return Ok(integers.map(|own| own.map_or(f64::NAN, &value)).collect());
     }
     let numbers = table::numbers(frame, name, path)?;
     if let Some(large) = numbers.iter().find(|own| own.abs() >= MAX_EXACT_INTEGER) {
         return Err(FileError::new(
             path,
             format!(
-                "column `{name}` has numbers of 2⁵³ or more, whose low bits are lost (found {large:e} for `{name} & {mask}`, expected smaller ones, or integers of a FITS, Parquet or Arrow file). Try: such a file, or a column of the low bits"
+                "column `{name}` has numbers of 2⁵³ or more, whose low bits are lost (found {large:e} for `{shown}`, expected smaller ones, or integers of a FITS, Parquet or Arrow file). Try: such a file, or a column of the low bits"
             ),
         ));
     }
     Ok(operand.of_numbers(numbers))
+}
+
+/// The integers of a column of 64 bits.
+pub fn integers_of<'f>(
+    frame: &'f DataFrame,
+    name: &str,
+) -> Option<Box<dyn Iterator<Item = Option<i128>> + 'f>> {
+    let series = frame.column(name).ok()?.as_materialized_series();
+    if let Ok(integers) = series.i64() {
+        return Some(Box::new(integers.iter().map(|own| own.map(i128::from))));
+    }
+    let integers = series.u64().ok()?;
+    Some(Box::new(integers.iter().map(|own| own.map(i128::from))))
+}
+
+/// Whether a column has integers that floats do not contain.
+pub fn has_long_integers(frame: &DataFrame, name: &str) -> bool {
+    let is_long = |own: i128| own.unsigned_abs() >= MAX_EXACT_INTEGER as u128;
+    integers_of(frame, name).is_some_and(|mut all| all.any(|own| own.is_some_and(is_long)))
+}
+
+/// Refuses columns of integers that floats merge where an expression compares them with each other, or is binned by them.
+pub fn refuse_long_integers(
+    frame: &DataFrame,
+    expression: &Expression,
+    path: &Path,
+) -> Result<(), FileError> {
+    let mut compared = expression.compared_columns();
+    match compared.find(|name| has_long_integers(frame, name)) {
+        None => Ok(()),
+        Some(name) => Err(FileError::new(
+            path,
+            format!(
+                "column `{name}` has integers of 2⁵³ or more, which differ by less than their floats (found `{}`, expected smaller ones, or a comparison with an integer). Try: a column of smaller integers, such as the differences from the first one",
+                expression.text()
+            ),
+        )),
+    }
+}
+
+/// A formula with other names of its columns, where `name` gives one.
+pub fn with_names(text: &str, name: impl Fn(&str) -> Option<String>) -> String {
+    let is_word = |c: char| c.is_alphanumeric() || c == '_' || c == '.';
+    let renamed = |own: &str| {
+        let new = name(own)?;
+        Some(match new.chars().all(is_word) {
+            true => new,
+            false => format!("`{new}`"),
+        })
+    };
+    let (mut all, mut rest) = (String::new(), text);
+    while let Some(first) = rest.chars().next() {
+        let number = number_length(rest);
+        let length = match first {
+            '\'' | '"' | '`' => rest[1..].find(first).map_or(rest.len(), |end| end + 2),
+            _ if number > 0 => number,
+            c if is_word(c) => rest.find(|c| !is_word(c)).unwrap_or(rest.len()),
+            c => c.len_utf8(),
+        };
+        let (token, after) = rest.split_at(length);
+        let is_function = after.trim_start().starts_with('(');
+        let new = match first {
+            '`' => renamed(token.trim_matches('`')),
+            c if is_word(c) && number == 0 && !is_function => renamed(token),
+            _ => None,
+        };
+        all.push_str(new.as_deref().unwrap_or(token));
+        rest = after;
+    }
+    all
 }
 
 pub fn texts_of<'f>(
@@ -735,6 +930,8 @@ pub fn texts_of<'f>(
 
 #[cfg(test)]
 mod tests {
+    use shearq_files::frames::polars::Column;
+
     use super::*;
 
     fn value(text: &str, values: &[f64]) -> f64 {
@@ -794,6 +991,58 @@ mod tests {
         assert_eq!(held, [Some(true), Some(false), Some(false), None]);
         let twice = Expression::parse("a*a + b").unwrap();
         assert!(twice.columns().eq(["a", "b"]));
+    }
+
+    #[test]
+    fn long_integers_are_compared_exactly() {
+        let large = 37_484_563_299_062_923_i64;
+        let all = Column::new("id".into(), [large - 1, large, large + 1, 5]);
+        let table = shearq_files::frames::frame(vec![all]).unwrap();
+        for (text, expected) in [
+            ("id < 37484563299062923", [1.0, 0.0, 0.0, 1.0]),
+            ("37484563299062923 <= id", [0.0, 1.0, 1.0, 0.0]),
+            ("id != 37484563299062923", [1.0, 0.0, 1.0, 1.0]),
+            ("id > -37484563299062923", [1.0; 4]),
+        ] {
+            let own = Expression::parse(text).unwrap();
+            let values = operand_values(&table, &own.operands()[0], Path::new("t")).unwrap();
+            let found = [0, 1, 2, 3].map(|at| own.value(&|_| values[at]));
+            assert_eq!(found, expected, "{text}");
+            refuse_long_integers(&table, &own, Path::new("t")).unwrap();
+        }
+        for text in ["id == id + 1", "id"] {
+            let own = Expression::parse(text).unwrap();
+            refuse_long_integers(&table, &own, Path::new("t")).unwrap_err();
+        }
+        let own = Expression::parse("id > 6").unwrap();
+        refuse_long_integers(&table, &own, Path::new("t")).unwrap();
+        // Of floats, the last digits are lost.
+        let floats = Column::new("id".into(), [large as f64]);
+        let table = shearq_files::frames::frame(vec![floats]).unwrap();
+        let own = Expression::parse("id < 37484563299062923").unwrap();
+        operand_values(&table, &own.operands()[0], Path::new("t")).unwrap_err();
+    }
+
+    #[test]
+    fn formulas_get_other_names_and_signs() {
+        let upper = |name: &str| (name != "x").then(|| name.to_uppercase());
+        let found = with_names("-g_1 + 2e3*sqrt(`a b`)/x == 'g_1'", upper);
+        assert_eq!(found, "-G_1 + 2e3*sqrt(`A B`)/x == 'g_1'");
+        for (text, negative) in [
+            ("-e2", true),
+            ("0 - e2", true),
+            ("e2*(-1)/0.8", true),
+            ("-(e2 - c2)", true),
+            ("e2 - c2", false),
+            ("e2^2", false),
+            ("1 - e2", false),
+        ] {
+            assert_eq!(
+                Expression::parse(text).unwrap().is_negative(),
+                negative,
+                "{text}"
+            );
+        }
     }
 
     #[test]

@@ -341,6 +341,11 @@ pub fn read_truth(path: &Path, most_rows: usize) -> Result<DataFrame, FileError>
     }
 }
 
+/// Whether the columns of a file have types, so that a text of digits is no number.
+pub fn has_types(path: &Path) -> bool {
+    !matches!(Ending::of(path), Ending::Text)
+}
+
 /// Reads an ASCII or CSV table. `names` are the columns of a table without a header.
 pub fn read_text(path: &Path, names: &[&str]) -> Result<DataFrame, FileError> {
     let request = text::Request {

@@ -3,12 +3,13 @@
 use std::collections::BTreeSet;
 
 use serde::{Deserialize, Serialize};
-use shearq_catalogue::expression::{Expression, texts_of};
+use shearq_catalogue::expression::{Expression, has_long_integers, integers_of, texts_of};
 use shearq_catalogue::request::{Binning, Edges, MAX_AXES, MAX_BINS, Request};
 use shearq_catalogue::rows::rows;
 use shearq_catalogue::source::{Reading, Source, sources};
+use shearq_files::FileError;
 use shearq_files::frames::polars::DataFrame;
-use shearq_files::table;
+use shearq_files::table::{self, Place};
 
 use super::error::BiasFailure;
 
@@ -273,6 +274,15 @@ fn axis(binning: &Binning, mut values: Values, is_sample: bool) -> Result<Axis, 
     })
 }
 
+// Whether a file with types has texts in a column: '9' and '10' of a Parquet file are names of bins.
+fn has_texts_in(place: &Place, name: &str) -> Result<bool, FileError> {
+    if !table::has_types(&place.path) {
+        return Ok(false);
+    }
+    let texts = table::first_texts(place)?;
+    Ok(texts.iter().any(|(own, _)| own == name))
+}
+
 // A request, and the names of the bins of each of its quantities of texts.
 type Numbered = (Request, Vec<Option<Axis>>);
 
@@ -306,34 +316,57 @@ pub(super) fn with_numbers(
         let Some(name) = binning.of.column() else {
             continue;
         };
-        let mut texts = BTreeSet::new();
-        let mut add = |frame: &DataFrame| match texts_of(frame, name) {
-            Some(values) if texts.len() <= MAX_BINS => {
+        let (mut texts, mut integers) = (BTreeSet::new(), BTreeSet::new());
+        let mut is_long = false;
+        let mut add = |frame: &DataFrame| match (texts_of(frame, name), integers_of(frame, name)) {
+            (Some(values), _) if texts.len() <= MAX_BINS => {
                 texts.extend(values.flatten().map(str::to_owned));
+            }
+            (None, Some(values)) if integers.len() <= MAX_BINS => {
+                is_long |= has_long_integers(frame, name);
+                integers.extend(values.flatten());
             }
             _ => {}
         };
+        // Numbers of a text table are read as texts, too.
+        let mut has_texts = false;
         for input in &request.catalogues {
             for source in sources(input, &reading)? {
                 match &source.frame {
-                    Some(frame) => add(frame),
-                    None => table::read_parts(&source.place, &[name], &[name], |frame| {
-                        add(&frame);
-                        Ok(())
-                    })?,
+                    Some(frame) => {
+                        has_texts |= texts_of(frame, name).is_some();
+                        add(frame);
+                    }
+                    None => {
+                        table::read_parts(&source.place, &[name], &[name], |frame| {
+                            add(&frame);
+                            Ok(())
+                        })?;
+                        has_texts |= has_texts_in(&source.place, name)?;
+                    }
                 }
             }
         }
-        // Numbers of a text table are read as texts, too.
-        if texts.is_empty() || texts.iter().all(|text| text.trim().parse::<f64>().is_ok()) {
+        let are_numbers = texts.iter().all(|text| text.trim().parse::<f64>().is_ok());
+        let by_texts = !texts.is_empty() && (has_texts || !are_numbers);
+        if !by_texts && !is_long {
             continue;
         }
-        if texts.len() > MAX_BINS {
+        if texts.len().max(integers.len()) > MAX_BINS {
             let of = binning.of.text().to_owned();
             return Err(BiasFailure::ManyValues { of });
         }
-        let classes: Vec<String> = texts.into_iter().collect();
-        let of = Expression::of_texts(name, classes.clone());
+        let (classes, of): (Vec<String>, _) = match by_texts {
+            true => {
+                let texts: Vec<String> = texts.into_iter().collect();
+                (texts.clone(), Expression::of_texts(name, texts))
+            }
+            false => {
+                let names = integers.iter().map(i128::to_string).collect();
+                let integers = integers.into_iter().collect();
+                (names, Expression::of_integers(name, integers))
+            }
+        };
         let edges: Vec<f64> = (0..=classes.len()).map(|k| k as f64 + 0.5).collect();
         own.bins[at] = Binning {
             of,
