@@ -8,7 +8,7 @@ use shearq_bias::SHEARED_CATALOGUES;
 use shearq_files::{FileError, names_of};
 use shearq_submissions::EllipticityType;
 
-use crate::expression::Expression;
+use crate::expression::{Expression, with_names};
 use crate::own_columns::refuse_divided;
 use crate::recognition::{Patterns, Survey, fits_any, has_any, names_of_role, recognition, words};
 use crate::roles::{Key, Role, keys, name_of, named, partner, role_names, sheared_pair};
@@ -178,19 +178,33 @@ impl Survey {
         if let Some(own) = all.find(|own| is_called(own, stated)) {
             return Some(own.clone());
         }
-        let all_there = |mut columns: Vec<&str>| {
-            columns.retain(|name| !found.iter().any(|own| own == name));
-            columns.is_empty()
+        self.file.as_ref()?;
+        // In any case, as columns.
+        let there = |name: &str| {
+            let exact = found.iter().find(|own| *own == name);
+            let same = exact.or_else(|| found.iter().find(|own| is_called(own, name)));
+            same.map(String::as_str)
         };
-        let is_list = key.0 == Role::Flag && all_there(stated.split('+').collect());
-        let is_formula = || {
-            let formula = Expression::parse(stated);
-            formula
-                .is_ok_and(|own| !own.operands().is_empty() && all_there(own.columns().collect()))
+        let list: Option<Vec<&str>> = stated.split('+').map(there).collect();
+        if let Some(list) = list.filter(|_| key.0 == Role::Flag) {
+            return Some(list.join("+"));
+        }
+        let formula = Expression::parse(stated).ok()?;
+        let columns: Vec<&str> = formula.columns().collect();
+        let computes = columns.iter().all(|name| there(name).is_some())
+            && (!formula.is_number() || may_be_number(key.0));
+        let renamed = |name: &str| {
+            let own = there(name).filter(|own| columns.contains(&name) && *own != name);
+            own.map(str::to_owned)
         };
-        let computes = self.file.is_some() && (is_list || is_formula());
-        computes.then(|| stated.to_owned())
+        computes.then(|| with_names(stated, renamed))
     }
+}
+
+/// Whether a number may stand in place of the column of a role, for all galaxies: an ellipticity or a flag of all is a mistake.
+pub fn may_be_number(role: Role) -> bool {
+    use Role::{C1, C2, G1, G2, M, PsfSize, R11, R12, R21, R22, RmsE, SigmaE};
+    [R11, R22, R12, R21, M, C1, C2, G1, G2, RmsE, SigmaE, PsfSize].contains(&role)
 }
 
 // Whether a formula has such an operand.
@@ -352,7 +366,12 @@ impl Names {
             |(role, _): &Key, text: &str| *role == Role::Flag && text.split('+').all(is_there);
         let mut own = self.clone();
         own.given.retain(|key, name| {
-            name == "none" || is_there(name) || is_list(key, name) || is_computed(name)
+            let is_number = || Expression::parse(name).is_ok_and(|own| own.is_number());
+            may_be_number(key.0) && is_number()
+                || name == "none"
+                || is_there(name)
+                || is_list(key, name)
+                || is_computed(name)
         });
         own
     }
@@ -376,7 +395,9 @@ impl Names {
     fn check_single_roles(&self, path: &Path) -> Result<(), FileError> {
         for (key, column) in &self.given {
             let first = self.key_of(column).unwrap_or(*key);
-            if first != *key && !SHARED.contains(&[first.0, key.0]) {
+            // Of numbers, both components may have the same.
+            let is_number = || Expression::parse(column).is_ok_and(|own| own.is_number());
+            if first != *key && !SHARED.contains(&[first.0, key.0]) && !is_number() {
                 let (first, role) = (name_of(first), name_of(*key));
                 return Err(FileError::new(
                     path,

@@ -12,7 +12,7 @@ use shearq_files::table::{self, FileFormat};
 use shearq_files::{FileError, names_of};
 use shearq_quantities::{Distortion, MeasuredRange};
 
-use crate::expression::{Operand, Texts, operand_values, texts_of};
+use crate::expression::{Operand, Texts, operand_values, refuse_long_integers, texts_of};
 use crate::failures::{
     Check, Copies, LargestResponse, MIN_FAILED_WEIGHT, RepeatKind, Repeats, TrueShears, shown,
 };
@@ -289,6 +289,10 @@ struct TableRows<'a> {
     // Of each sheared catalogue, if its distortions are converted.
     converted: Option<[[usize; 2]; CATALOGUES - 1]>,
     responses: [[Response; 2]; 2],
+    // Of the responses, in the axes of e1 and e2.
+    signs: [[f64; 2]; 2],
+    dw_signs: [f64; 2],
+    c_signs: [f64; 2],
     sheared_of_rows: Option<Vec<usize>>,
     frame: &'a DataFrame,
     ids: Option<Vec<u64>>,
@@ -347,6 +351,16 @@ impl<'a> TableRows<'a> {
         let (path, places) = (&source.place.path, &source.places);
         let truth = OfRows::new(file, places, &reading.truth)?;
         check_angles(source, reading, columns)?;
+        for expression in reading
+            .condition()
+            .into_iter()
+            .filter(|own| own.column().is_none())
+        {
+            refuse_long_integers(frame, expression, path)?;
+        }
+        for expression in reading.binned() {
+            refuse_long_integers(frame, expression, path)?;
+        }
         refuse_boolean_flags(frame, source, reading)?;
         let drops = reading.request.drop_missing;
         let mut unnamed = Vec::new();
@@ -391,6 +405,9 @@ impl<'a> TableRows<'a> {
                 .chain(&KSB_ROLES)
                 .filter_map(|role| places.of((*role, 0)))
                 .collect(),
+            signs: response_signs(source),
+            dw_signs: [Role::Dw1, Role::Dw2].map(|role| sign_of(source, role)),
+            c_signs: [Role::C1, Role::C2].map(|role| sign_of(source, role)),
             responses: responses(source),
             sheared_of_rows: sheared_of_rows.transpose()?,
             ids,
@@ -577,15 +594,16 @@ impl<'a> TableRows<'a> {
     }
 
     fn sheared(&self, at: usize) -> usize {
-        match &self.sheared_of_rows {
+        self.source.of_axes(match &self.sheared_of_rows {
             Some(sheared_of_rows) => sheared_of_rows[at],
             None => self.source.sheared.unwrap_or(0),
-        }
+        })
     }
 
     // A sheared catalogue may choose a row that is left out without shear: these rows are the response of the selection.
     fn select(&self, at: usize) -> Selected {
-        let sheared = || Box::new(std::array::from_fn(|sheared| self.choice(at, sheared + 1)));
+        let choice = |sheared: usize| self.choice(at, self.source.of_axes(sheared + 1));
+        let sheared = || Box::new(std::array::from_fn(choice));
         Selected {
             noshear: self.choice(at, 0),
             sheared: self.source.selects.then(sheared),
@@ -802,6 +820,7 @@ impl<'a> TableRows<'a> {
         let [m, c1, c2] = self.calibration.map(|place| Some(self.value(place?, at)));
         for (j, c) in [c1, c2].into_iter().enumerate() {
             if let Some(c) = c {
+                let c = self.c_signs[j] * c;
                 e = [0, 1].map(|i| e[i] - response[i][j] / weight * c);
             }
         }
@@ -820,7 +839,9 @@ impl<'a> TableRows<'a> {
         }
         let columns = self.shape_columns(at);
         let mut e = self.pair(columns, at);
-        let dw = self.dw.map_or([0.0; 2], |dw| self.pair(dw, at));
+        let dw = self.dw.map_or([0.0; 2], |dw| {
+            [0, 1].map(|k| self.dw_signs[k] * self.value(dw[k], at))
+        });
         // d(w e_i)/dg_j = w R_ij + e_i dw/dg_j: weights of AnaCal change with shear.
         let weighted = |e: [f64; 2], response: [[f64; 2]; 2]| {
             [0, 1].map(|i| [0, 1].map(|j| weight * response[i][j] + e[i] * dw[j]))
@@ -853,11 +874,13 @@ impl<'a> TableRows<'a> {
                 *own = converted(self.pair(*columns, at))?;
             }
             let step = 2.0 * self.reading.request.step;
-            let of = |i: usize, j: usize| (all[2 * j][i] - all[2 * j + 1][i]) / step;
+            let [s1, s2] = self.source.signs;
+            let sign = |i: usize, j: usize| if i == j { 1.0 } else { s1 * s2 };
+            let of = |i: usize, j: usize| sign(i, j) * (all[2 * j][i] - all[2 * j + 1][i]) / step;
             return Some((e, weighted(e, [0, 1].map(|i| [0, 1].map(|j| of(i, j))))));
         }
-        let response = |own: &[Response; 2]| [0, 1].map(|j| self.response(&own[j], at));
-        Some((e, weighted(e, [0, 1].map(|i| response(&self.responses[i])))))
+        let of = |i: usize, j: usize| self.signs[i][j] * self.response(&self.responses[i][j], at);
+        Some((e, weighted(e, [0, 1].map(|i| [0, 1].map(|j| of(i, j))))))
     }
 
     fn response(&self, of: &Response, at: usize) -> f64 {
@@ -986,6 +1009,27 @@ fn responses(source: &Source) -> [[Response; 2]; 2] {
             }
         })
     })
+}
+
+// The signs of responses in the axes of e1 and e2, of which a formula such as `-e2` turns one.
+fn response_signs(source: &Source) -> [[f64; 2]; 2] {
+    [0, 1].map(|i| {
+        [0, 1].map(|j| match source.columns.of(RESPONSES[i][j]) {
+            _ if i == j => 1.0,
+            Some(name) if sheared_columns(source)[0].is_none() => source.sign(name, &[i, j]),
+            _ => {
+                let name = source.columns.of_sheared(sheared_pair(i, j)[0]);
+                name.map_or(1.0, |name| source.sign(name, &[i, j]))
+            }
+        })
+    })
+}
+
+// The sign of a column of one component, in the axes of e1 and e2.
+fn sign_of(source: &Source, role: Role) -> f64 {
+    let axis = usize::from([Role::Dw2, Role::C2].contains(&role));
+    let name = source.columns.of(role);
+    name.map_or(1.0, |name| source.sign(name, &[axis]))
 }
 
 // Share of rows that may have the true shear of another row: two detections within a pixel are rare. Chosen by hand.

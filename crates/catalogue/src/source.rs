@@ -11,11 +11,13 @@ use shearq_files::table::{self, FileFormat, Place};
 use shearq_files::{FileError, names_of};
 use shearq_measure::{Observables, Selection};
 
-use crate::expression::{Expression, Operand, operand_values, texts_of};
+use crate::expression::{
+    Expression, Operand, operand_values, refuse_long_integers, texts_of, with_names,
+};
 use crate::own_columns::{SHAPE_COLUMNS, changes_with_shear, require_responses};
 use crate::recognition::{fits_any, has_any, recognition, words};
 
-use crate::columns::{Columns, Names, Preset, Shapes, base};
+use crate::columns::{Columns, Names, Preset, Shapes, base, may_be_number};
 use crate::identity;
 use crate::request::{Input, Request, Units};
 use crate::roles::{CATALOGUES, Places, Role, name_of};
@@ -89,6 +91,8 @@ pub struct Source {
     pub places: Places,
     // Columns of expressions that shear changes by an unknown amount.
     unanswered: Vec<String>,
+    // Formulas of weights and flags, with the columns in them whose sheared versions are not used.
+    unanswered_formulas: Vec<(String, String)>,
     // Whether sheared catalogues have flags, which then give the response of the selection.
     sheared_flags: bool,
     /// Whether each sheared catalogue selects galaxies by its columns, so that the response of the selection follows.
@@ -97,6 +101,8 @@ pub struct Source {
     pub selection: Option<usize>,
     declines_matrix: bool,
     has_weights: bool,
+    /// The signs of e1 and e2 in those of the table: −1 of a formula such as `-e2`. Other columns have the axes of the table.
+    pub signs: [f64; 2],
     /// Whether the size of the PSF is T = 2σ², whose square root is a size.
     pub psf_area: bool,
     /// Why nothing divides the ellipticities by their response, if they need one.
@@ -254,6 +260,8 @@ impl Source {
         if self.sheared.is_some() {
             lines.push("Files or tables named noshear, 1p, 1m, 2p and 2m are one catalogue, whose response is the difference of their means. Try: --columns version=none if files of these names have test shears.".into());
         }
+        lines.extend(self.turned());
+        lines.extend(self.without_sheared_operands());
         lines.extend(self.converted());
         if responsivity {
             let rms = match (self.columns.of(Role::RmsE), self.columns.of(Role::SigmaE)) {
@@ -276,6 +284,14 @@ impl Source {
             ));
         }
         lines
+    }
+
+    fn without_sheared_operands(&self) -> Option<String> {
+        let mut unanswered = self.unanswered_formulas.iter();
+        let (formula, sheared) = unanswered.find(|_| !self.has_sheared_rows())?;
+        Some(format!(
+            "`{formula}` has versions of sheared catalogues, such as `{sheared}`, that are not used, so that its selection response is missing: m is wrong if it depends on the shape. Try: --where in place of a flag, or a weight that shear does not change"
+        ))
     }
 
     // A step that is wrong by a factor is an m of that factor.
@@ -313,6 +329,58 @@ impl Source {
 
     fn has_sheared_columns(&self) -> bool {
         self.columns.of_sheared((Role::E1, 1)).is_some()
+    }
+
+    fn is_formula(&self, name: &str) -> bool {
+        self.formulas.iter().any(|own| own.text() == name)
+    }
+
+    /// The sign with which a column that has those of the axes `axes` is read: a formula has the right one.
+    pub fn sign(&self, column: &str, axes: &[usize]) -> f64 {
+        match self.is_formula(column) {
+            true => 1.0,
+            false => axes.iter().map(|axis| self.signs[*axis]).product(),
+        }
+    }
+
+    /// The sheared catalogue (from 1; 0 for noshear) of the axes of e1 and e2 that the table calls `catalogue`.
+    pub fn of_axes(&self, catalogue: usize) -> usize {
+        match catalogue.checked_sub(1) {
+            Some(sheared) if self.signs[sheared / 2] < 0.0 => (sheared ^ 1) + 1,
+            _ => catalogue,
+        }
+    }
+
+    // Which columns of responses change their sign with e1 or e2.
+    fn turned(&self) -> Option<String> {
+        let [a, b] = self.signs;
+        let (k, e) = [(0, Role::E1), (1, Role::E2)][usize::from(b < 0.0)];
+        if a > 0.0 && b > 0.0 {
+            return None;
+        }
+        let formula = self.columns.of(e)?;
+        let axes = [
+            (Role::R12, vec![0, 1]),
+            (Role::R21, vec![0, 1]),
+            (Role::Dw1, vec![0]),
+            (Role::Dw2, vec![1]),
+            (Role::C1, vec![0]),
+            (Role::C2, vec![1]),
+        ];
+        let roles = axes.iter().filter_map(|(role, axes)| {
+            let name = self.columns.of(*role)?;
+            (self.sign(name, axes) < 0.0).then(|| format!("`{name}`"))
+        });
+        let mut changed: Vec<String> = roles.collect();
+        if a * b < 0.0 && (self.has_sheared_rows() || self.has_sheared_columns() || self.selects) {
+            changed.push(format!("the artificial shear of {0}p and {0}m", k + 1));
+        }
+        (!changed.is_empty()).then(|| {
+            format!(
+                "With the sign of `{formula}`, these change theirs, too: {}. Try: a formula such as --columns 'R12=1*R12' for a column of the right sign.",
+                changed.join(", ")
+            )
+        })
     }
 
     pub fn name(&self, place: usize) -> &str {
@@ -535,6 +603,8 @@ struct Wanted<'a> {
     path: &'a Path,
     names: &'a [String],
     columns: &'a Columns,
+    // By formula, the same of the columns of each sheared catalogue.
+    sheared_formulas: &'a BTreeMap<String, Vec<String>>,
     all: Vec<Operand>,
 }
 
@@ -563,13 +633,22 @@ impl Wanted<'_> {
     fn has_sheared(&self, name: &str) -> bool {
         let mut catalogues = 1..CATALOGUES;
         self.columns.give_selection_response()
-            && catalogues.all(|catalogue| sheared_column(self.names, name, catalogue).is_some())
+            && catalogues.all(|catalogue| self.sheared(name, catalogue).is_some())
+    }
+
+    // The column, or the formula of columns, of a sheared catalogue.
+    fn sheared(&self, name: &str, catalogue: usize) -> Option<&str> {
+        match self.sheared_formulas.get(name) {
+            Some(all) => Some(&all[catalogue - 1]),
+            None => sheared_column(self.names, name, catalogue).map(String::as_str),
+        }
     }
 
     // Whether a flag is a cut in all catalogues: DES's `flags_select_1p` chooses the galaxies of 1p. Other flags of
     // metacalibration with sheared ones are those of failed measurements.
     fn is_cut(&self, name: &str) -> bool {
-        let is_unsheared = unsheared(name) != words(name).trim_matches('_');
+        let is_formula = self.sheared_formulas.contains_key(name);
+        let is_unsheared = is_formula || unsheared(name) != words(name).trim_matches('_');
         let by_name = is_unsheared || name.to_ascii_lowercase().contains("select");
         (by_name || self.columns.preset != Preset::Metacal) && self.has_sheared(name)
     }
@@ -588,11 +667,24 @@ impl Wanted<'_> {
         {
             let small = name.to_ascii_lowercase();
             let is_flag = small.contains("flag") && !small.contains("select");
-            if is_flag && sheared_name(name).is_some() && !of_cuts.contains(name) {
+            let mut formulas = self.sheared_formulas.values().flatten();
+            let is_column = formulas.all(|own| own != name);
+            if is_flag && is_column && sheared_name(name).is_some() && !of_cuts.contains(name) {
                 failures.push(self.require(name)?);
             }
         }
         Ok(failures)
+    }
+
+    // Columns of cuts that no condition names. Also reads those that may name sheared catalogues, to refuse them if they do.
+    fn choices(&mut self, reading: &Reading<'_>) -> Result<Vec<usize>, FileError> {
+        let columns = self.columns;
+        for name in &columns.steps {
+            self.require(name)?;
+        }
+        let is_chosen = |name: &&String| reading.chosen_by().any(|own| own == *name);
+        let choices = columns.choices.iter().filter(|name| !is_chosen(name));
+        choices.map(|name| self.require(name)).collect()
     }
 
     // The places of roles, flags and expressions, whether each sheared catalogue has what the expressions require, and
@@ -632,15 +724,15 @@ impl Wanted<'_> {
             let mut flags = Vec::new();
             for flag in &columns.flags {
                 let own = match catalogue > 0 && known && self.is_cut(flag) {
-                    true => sheared_column(self.names, flag, catalogue),
+                    true => self.sheared(flag, catalogue).map(str::to_owned),
                     false => None,
                 };
-                flags.push(self.require(own.unwrap_or(flag))?);
+                flags.push(self.require(own.as_deref().unwrap_or(flag))?);
             }
             places.set((Role::Flag, catalogue), flags);
             if let Some(name) = weight.filter(|_| catalogue > 0) {
-                let own = sheared_column(self.names, name, catalogue);
-                let own = own.and_then(|name| self.add(name, None));
+                let own = self.sheared(name, catalogue).map(str::to_owned);
+                let own = own.and_then(|name| self.add(&name, None));
                 places.set((Role::Weight, catalogue), own.into_iter().collect());
             }
         }
@@ -768,9 +860,8 @@ fn source(
 ) -> Result<Source, FileError> {
     let path = &place.path;
     let given = &*reading.request.names.of_table(path, names)?;
-    let (names, formulas) = with_formulas(path, names, given)?;
-    let names = names.as_slice();
-    let mut columns = columns_of(&place, sheared, (names, frame), given)?;
+    let (names, mut formulas) = with_formulas(path, names, given)?;
+    let mut columns = columns_of(&place, sheared, (&names, frame), given)?;
     if matches!(reading.truth, Truth::Columns) && !columns.have(&[Role::G1]) {
         given.check_true_shear(path)?;
     }
@@ -782,12 +873,17 @@ fn source(
             columns.take(Role::Unit, name);
         }
     }
+    let names = names.as_slice();
     let has_sheared = |name: &str| sheared_column(names, name, 1).is_some();
     let mut chosen_by = reading.chosen_by();
     // Also if one of them is named.
     let by_catalogue =
         (chosen_by.clone()).any(|name| has_sheared(name) || sheared_name(name).is_some());
     columns.choose_sheared(names, by_catalogue && reading.weights().is_none());
+    let sheared_formulas = sheared_formulas(names, &formulas, &columns);
+    let (all_names, unanswered_formulas) =
+        add_sheared(names, &mut formulas, &sheared_formulas, &columns);
+    let names = all_names.as_slice();
     if columns.preset == Preset::Sheared {
         check_chosen(path, chosen_by.clone(), has_sheared)?;
     }
@@ -799,25 +895,16 @@ fn source(
         path,
         names,
         columns: &columns,
+        sheared_formulas: &sheared_formulas,
         all: Vec::new(),
     };
     let (mut places, known, sheared_flags) = wanted.places(reading, by_catalogue)?;
     let doubtful = columns.doubtful_weights.iter();
     let doubtful = doubtful.filter_map(|name| wanted.add(name, None));
     places.set((Role::DoubtfulWeight, 0), doubtful.collect());
-    // To refuse them if they name sheared catalogues.
-    for name in &columns.steps {
-        wanted.require(name)?;
-    }
     let failures = wanted.sheared_failures(&places)?;
     places.set((Role::ShearedFailure, 0), failures);
-    let mut choices = Vec::new();
-    for name in &columns.choices {
-        if !reading.chosen_by().any(|own| own == name) {
-            choices.push(wanted.require(name)?);
-        }
-    }
-    places.set((Role::Choice, 0), choices);
+    places.set((Role::Choice, 0), wanted.choices(reading)?);
     if reading.weights().is_some() {
         require_responses(path, names)?;
         for name in SHAPE_COLUMNS.iter().chain(&Observables::COLUMNS) {
@@ -851,6 +938,8 @@ fn source(
     let sheared_weight = places.of((Role::Weight, 1)).is_some();
     let chosen = reading.expressions().next().is_some() || sheared_flags || sheared_weight;
     Ok(Source {
+        signs: signs(&formulas, &columns),
+        unanswered_formulas,
         sheared,
         shapes: conversion(path, reading.request.shapes, &columns, sheared.is_some())?,
         formulas,
@@ -922,6 +1011,70 @@ fn unreduced(
             part(g2)
         )
     }))
+}
+
+// The names and formulas with those of sheared catalogues, which need not be read without a response of the selection: then, the
+// formulas that lack it, each with its first sheared one.
+fn add_sheared(
+    names: &[String],
+    formulas: &mut Vec<Expression>,
+    sheared: &BTreeMap<String, Vec<String>>,
+    columns: &Columns,
+) -> (Vec<String>, Vec<(String, String)>) {
+    let mut names = names.to_vec();
+    if !columns.give_selection_response() {
+        let all = sheared.iter();
+        let unanswered = all.map(|(formula, own)| (formula.clone(), own[0].clone()));
+        return (names, unanswered.collect());
+    }
+    for text in sheared.values().flatten() {
+        formulas.extend(Expression::parse(text));
+        names.push(text.clone());
+    }
+    (names, Vec::new())
+}
+
+// The signs of e1 and e2 in the axes of the table.
+fn signs(formulas: &[Expression], columns: &Columns) -> [f64; 2] {
+    [Role::E1, Role::E2].map(|role| {
+        let mut formulas = formulas.iter();
+        let own = formulas.find(|own| Some(own.text()) == columns.of(role));
+        match own.is_some_and(Expression::is_negative) {
+            true => -1.0,
+            false => 1.0,
+        }
+    })
+}
+
+// The formulas of weights and flags of which each sheared catalogue has columns, with those of its columns. Flags of failed
+// measurements of metacalibration choose in no catalogue.
+fn sheared_formulas(
+    names: &[String],
+    formulas: &[Expression],
+    columns: &Columns,
+) -> BTreeMap<String, Vec<String>> {
+    let is_cut = |own: &Expression| {
+        let mut names = own.columns().map(str::to_ascii_lowercase);
+        columns.preset != Preset::Metacal
+            || !names.any(|name| name.contains("flag") && !name.contains("select"))
+    };
+    let chooses = |own: &&Expression| {
+        columns.of(Role::Weight) == Some(own.text())
+            || columns.flags.iter().any(|flag| flag == own.text()) && is_cut(own)
+    };
+    let of = |own: &Expression| {
+        let of_catalogue = |catalogue: usize| {
+            let text = with_names(own.text(), |name| {
+                let is_operand = own.columns().any(|own| own == name);
+                let new = sheared_column(names, name, catalogue);
+                new.filter(|_| is_operand).cloned()
+            });
+            (text != own.text()).then_some(text)
+        };
+        let all: Option<Vec<String>> = (1..CATALOGUES).map(of_catalogue).collect();
+        Some((own.text().to_owned(), all?))
+    };
+    formulas.iter().filter(chooses).filter_map(of).collect()
 }
 
 fn check_calibration(path: &Path, columns: &Columns, in_rows: bool) -> Result<(), FileError> {
@@ -1151,6 +1304,9 @@ pub fn add_formulas(
     path: &Path,
 ) -> Result<DataFrame, FileError> {
     for formula in formulas {
+        if formula.column().is_none() {
+            refuse_long_integers(&part, formula, path)?;
+        }
         let operands = formula.operands().iter();
         let operands = operands.map(|own| operand_values(&part, own, path));
         let operands: Vec<_> = operands.collect::<Result<_, _>>()?;
@@ -1189,7 +1345,8 @@ pub fn with_formulas(
             continue;
         };
         // A column that is absent is reported as such.
-        if formula.columns().any(|name| name == text) || formula.operands().is_empty() {
+        let is_absent = formula.is_number() && !may_be_number(role);
+        if formula.columns().any(|name| name == text) || is_absent {
             continue;
         }
         if let Some(absent) = formula.columns().find(|name| !there(name)) {
