@@ -1078,7 +1078,7 @@ mod tests {
         let operand = |column: &str, pattern: Option<&str>| Operand {
             column: column.into(),
             texts: pattern.map(|own| Texts::Pattern(own.to_owned())),
-            mask: None,
+            ..Operand::default()
         };
         let expected = [
             operand("psf", Some("a*")),
