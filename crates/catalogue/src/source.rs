@@ -953,16 +953,18 @@ fn source(
         unreduced,
         declines_matrix: given.decline_matrix(),
         has_weights: reading.weights().is_some(),
-        psf_area: columns.of(Role::PsfSize).is_some_and(|name| {
-            let squared = &recognition().psf_size.squared;
-            squared.iter().any(|own| own.eq_ignore_ascii_case(name))
-        }),
+        psf_area: columns.of(Role::PsfSize).is_some_and(is_area),
         wanted: wanted.all,
         frame: None,
         places,
         place,
         columns,
     })
+}
+
+fn is_area(psf_size: &str) -> bool {
+    let squared = &recognition().psf_size.squared;
+    squared.iter().any(|own| own.eq_ignore_ascii_case(psf_size))
 }
 
 fn convergence(names: &[String]) -> Option<&String> {
