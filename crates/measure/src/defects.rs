@@ -27,8 +27,7 @@ use shearq_quantities::statistics::{SCATTER, median};
 
 pub(crate) use self::limits::LightLimits;
 use self::limits::{
-    DIRECTIONS, FAINT_SHARE, LANES, MIN_DEPARTURE, PAIRS, RATIO_EXPONENT, RATIO_MARGIN,
-    extremes_from,
+    DIRECTIONS, FAINT_SHARE, LANES, MAX_SAMPLED_PEAK, MIN_DEPARTURE, PAIRS, extremes_from,
 };
 use self::lines::Lines;
 use crate::measurement::DefectCounts;
@@ -54,6 +53,10 @@ const MIN_EQUAL_PAIRS: u32 = 6;
 const MIN_STEP: f32 = 5e-4;
 // Each pass may uncover pixels that were hidden by those beside them: of a square of nine hot pixels first the corners.
 const MAX_PASSES: usize = 8;
+// Half the side in pixels of the core of a PSF, which is on a pixel or between pixels. Chosen by hand.
+const PSF_CORE: f64 = 3.0;
+// Light of a hot pixel of a PSF in units of the peak: one of 0.05 at 14 px changes m by 0.001.
+const HOT_SHARE: f32 = 0.05;
 // In pixels, of the border in which noise and level of the stamp are measured. Chosen by hand.
 const BORDER: usize = 4;
 
@@ -615,20 +618,19 @@ fn find_dead(
     }
 }
 
-/// Pixels of a PSF of sum one, in noise of `noise`, that are darker than all pairs of pixels around them by more than their light
-/// can fall.
+/// Pixels of a PSF of sum one, in noise of `noise`, that are darker than the pairs of pixels around them by more than their light
+/// can fall. In a dead row or column, the pair along it is as dark.
 pub(crate) fn dead_pixels(psf: ArrayView2<'_, f64>, noise: f64) -> usize {
     let (n, noise) = (psf.ncols(), noise as f32);
     let pixels: Vec<f32> = psf.iter().map(|&value| value as f32).collect();
     let [_, peak] = extremes(&pixels);
-    let ratio = RATIO_MARGIN * (RATIO_EXPONENT * peak).exp();
+    let ratio = LightLimits::from_peak(peak).ratios[0];
     let is_dead = |at: &usize| {
-        let around = pair_means(&pixels, n, *at);
-        let least = around[..DIRECTIONS]
-            .iter()
-            .copied()
-            .fold(f32::INFINITY, f32::min);
-        let is_known = around[..DIRECTIONS].iter().all(|mean| mean.is_finite());
+        let mut around = pair_means(&pixels, n, *at);
+        let around = &mut around[..DIRECTIONS];
+        let is_known = around.iter().all(|mean| mean.is_finite());
+        around.sort_by(f32::total_cmp);
+        let least = around[1];
         let departure = MIN_DEPARTURE * noise;
         is_known
             && least > FAINT_SHARE * peak
@@ -636,6 +638,29 @@ pub(crate) fn dead_pixels(psf: ArrayView2<'_, f64>, noise: f64) -> usize {
             && least - pixels[*at] > departure
     };
     (0..pixels.len()).filter(is_dead).count()
+}
+
+/// Distances from the middle, in pixels, of the pixels of a PSF of sum one, in noise of `noise`, that are brighter than its core
+/// allows. The middle of a narrow core is not tested.
+pub(crate) fn hot_pixels(psf: ArrayView2<'_, f64>, noise: f64) -> Vec<f64> {
+    let n = psf.ncols();
+    let pixels: Vec<f32> = psf.iter().map(|&value| value as f32).collect();
+    let middle = 0.5 * (n as f64 - 1.0);
+    let away = |at: usize| [at % n, at / n].map(|at| (at as f64 - middle).abs());
+    let is_core = |at: usize| away(at).iter().all(|away| *away < PSF_CORE);
+    let core = (0..pixels.len()).filter(|&at| is_core(at));
+    let peak = core.map(|at| pixels[at]).fold(0.0, f32::max);
+    let limits = LightLimits::from_peak(peak);
+    let is_narrow = f64::from(peak) > MAX_SAMPLED_PEAK;
+    let noise = MIN_DEPARTURE * noise as f32;
+    let is_hot = |&at: &usize| {
+        let light = pixels[at] - HOT_SHARE * peak;
+        light > noise
+            && !(is_narrow && is_core(at))
+            && light > most_light(&pixels, n, at, (0.0, noise), &limits)
+    };
+    let hot = (0..pixels.len()).filter(is_hot);
+    hot.map(|at| away(at)[0].hypot(away(at)[1])).collect()
 }
 
 /// The means of [`PAIRS`] of pixels; NaN with one that is missing or off the stamp.

@@ -264,13 +264,20 @@ pub enum Warning {
     },
     /// Pixels of the PSF have another value than the pixels around them allow.
     #[error(
-        "pixels of the PSF hold no light (found {}{of}; expected a smooth PSF), which biases shears: one dead pixel near the centre changes c by 0.01, a core that is cut off m by 0.1. Try: a model of the PSF, or stars that are neither saturated nor on bad pixels",
-        match *dead {
-            0 => "several pixels of the brightest value".to_owned(),
-            dead => format!("{dead} much darker than all around them"),
+        "pixels of the PSF hold no light (found {}{of}; expected a smooth PSF). A dead pixel changes c by up to 0.01, a dead row m by 0.15, a hot pixel or a core cut at 0.9 of its peak m by 0.02. Try: a model of the PSF, or stars without saturation and bad pixels",
+        match (*dead, *hot) {
+            (0, 0) => "several pixels of the brightest value".to_owned(),
+            (0, hot) => format!("{hot} much brighter than those around them, {distance:.0} px from the centre"),
+            (dead, _) => format!("{dead} much darker than those around them"),
         }
     )]
-    PsfDefect { dead: usize, of: ExaminedPsfs },
+    PsfDefect {
+        dead: usize,
+        hot: usize,
+        /// Pixels from the centre of the farthest hot pixel.
+        distance: f64,
+        of: ExaminedPsfs,
+    },
     /// The background of the PSF image changes along x or y.
     #[error(
         "the background of the PSF has a gradient (found {:.3} % of the peak per pixel along x and {:.3} % along y{of}; expected 0). It biases shears. Try: subtract the background",

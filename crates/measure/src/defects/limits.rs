@@ -14,7 +14,7 @@ pub(super) const RATIO_EXPONENT: f32 = 12.0;
 pub(super) const RATIO_MARGIN: f32 = 1.5;
 // Peak of a PSF of sum one below which its pixels show its ratios: FWHM of 2.8 px or more of Moffat PSFs. At other phases those to opposite pixels are at most
 // 1.25 times as large, which the margin covers; a star of FWHM 1.5 px falls eight times as steeply as its pixels show.
-const MAX_SAMPLED_PEAK: f64 = 0.07;
+pub(super) const MAX_SAMPLED_PEAK: f64 = 0.07;
 // Directions d in which light falls, and their opposites.
 pub(super) const DIRECTIONS: usize = 4;
 // Of Q_d, which depends on the phase more than R_d. Chosen by hand.
@@ -65,6 +65,18 @@ impl LightLimits {
             steepness,
             steepness_noise: steepness.map(ratio_noise),
             lobe: LOBE_MARGIN * (-low / high) as f32,
+        }
+    }
+
+    /// For any PSF of sum one with this peak.
+    pub(super) fn from_peak(peak: f32) -> Self {
+        let ratios = PAIRS
+            .map(|(x, y)| RATIO_MARGIN * (RATIO_EXPONENT * peak * (x * x + y * y) as f32).exp());
+        LightLimits {
+            ratios,
+            noise: ratios.map(ratio_noise),
+            steepness: [f32::INFINITY; DIRECTIONS],
+            ..LightLimits::default()
         }
     }
 

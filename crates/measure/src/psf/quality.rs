@@ -14,7 +14,7 @@ use super::denoised_star::{MIN_DENOISED_SIDE, UNCHANGED_SNR, noise_level};
 use super::star::psf_offset;
 use super::truncation::Truncation;
 use super::width::BORDER;
-use crate::defects::dead_pixels;
+use crate::defects::{dead_pixels, hot_pixels};
 use crate::moments::{CoreSize, psf_core_size};
 use crate::warning::{ExaminedPsfs, Warning};
 
@@ -86,8 +86,18 @@ const BIAS_TIMES_SNR: [f64; 2] = [2.3, 1.2];
 // The same for a star that is not denoised. The same table at S/N 1000: 0.0055 and 0.0023.
 const BIAS_TIMES_SNR_UNCHANGED: [f64; 2] = [5.5, 2.3];
 
-// Pixels of the brightest value: symmetry makes four of them equal.
-const MIN_FLAT_TOP: usize = 5;
+// Pixels of the brightest value that symmetry around a corner makes equal.
+const SYMMETRIC_TOP: usize = 4;
+// Squared distances in pixels from a corner of the pixels next to these four, in equal steps.
+const SQUARED_RADII: [f64; 3] = [2.5, 4.5, 6.5];
+// ln of the light that is missing in the four: a core at 0.9 of the peak, of which m is 0.02, lacks 0.09 behind a Moffat PSF of FWHM 3.4 px.
+// Gaussian, Moffat and Airy PSFs lack none, because the third derivative of ln p by r² is zero or negative.
+const MIN_MISSING_TOP: f64 = 0.05;
+// The same per square of ln p(1.5, 0.5)/p(0.5, 1.5), as an ellipticity along an axis imitates it: 0.36 for a Moffat PSF (β = 3) of
+// FWHM 3.4 px and ε = 0.3.
+const MISSING_BY_ELLIPTICITY: f64 = 0.5;
+// ln of the peak to p at the last radius; narrower cores are not sampled. Chosen by hand.
+const MAX_SAMPLED_FALL: f64 = 2.0;
 // Rounding to single precision, in units of the peak.
 const FLATNESS: f64 = 2e-7;
 
@@ -107,9 +117,12 @@ pub(crate) struct PsfQuality {
     truncation: Option<Truncation>,
     core: Option<CoreSize>,
     moved: Option<[f64; 2]>,
-    /// Pixels near the centre that are much darker than all around them, and pixels of the brightest value.
+    /// Pixels that are much darker than those around them; those that are much brighter, and the distance of the farthest from the centre.
     dead: usize,
-    brightest: usize,
+    hot: usize,
+    farthest_hot: f64,
+    /// Whether the brightest pixels have one value, below that of the peak.
+    is_cut: bool,
     /// Centroid from the centre of the pixels that are used.
     pub(crate) offset: [f64; 2],
 }
@@ -212,13 +225,13 @@ impl PsfQuality {
             (square - pixels * sigma * sigma).max(0.0).sqrt()
         });
         let offset = psf_offset(psf);
+        let hot = hot_pixels(psf, sigma);
         Some(PsfQuality {
             side: n,
             dead: dead_pixels(psf, sigma),
-            brightest: psf
-                .iter()
-                .filter(|value| **value >= (1.0 - FLATNESS) * peak)
-                .count(),
+            hot: hot.len(),
+            farthest_hot: hot.into_iter().fold(0.0, f64::max),
+            is_cut: is_cut(psf),
             snr: (power - count * noise * noise).max(0.0).sqrt() / noise,
             level: (level / peak).clamp(-MAX_STATED_LEVEL, MAX_STATED_LEVEL),
             background: level * pixels / star,
@@ -267,6 +280,44 @@ fn noise_beneath_rings(psf: ArrayView2<'_, f64>, sigma: f64, [halfway, border]: 
     let fall = (halfway / border).powf(2.0 * RING_FALL);
     let square = (sigma * sigma - fall * inside * inside) / (1.0 - fall);
     square.clamp(0.0, sigma * sigma).sqrt()
+}
+
+/// Whether the core is cut off: more brightest pixels than symmetry makes equal, or a peak below the one that the pixels around it
+/// show, of which ln p is a parabola in r².
+fn is_cut(psf: ArrayView2<'_, f64>) -> bool {
+    let peak = psf.iter().copied().fold(f64::NEG_INFINITY, f64::max);
+    let is_top = |value: f64| value >= peak - FLATNESS * peak.abs();
+    let top: Vec<_> = psf
+        .indexed_iter()
+        .filter(|(_, value)| is_top(**value))
+        .map(|(at, _)| at)
+        .collect();
+    let [(y, x), .., (last_y, last_x)] = top[..] else {
+        return false;
+    };
+    if top.len() != SYMMETRIC_TOP || (last_y, last_x) != (y + 1, x + 1) {
+        return top.len() > SYMMETRIC_TOP;
+    }
+    let place = |(row, column): (usize, usize)| {
+        [column as f64 - x as f64 - 0.5, row as f64 - y as f64 - 0.5]
+    };
+    let mut rings = [Mean::default(); 3];
+    let mut ellipticity = 0.0;
+    for (at, &value) in psf.indexed_iter() {
+        let [dx, dy] = place(at);
+        let square = dx * dx + dy * dy;
+        if let Some(k) = SQUARED_RADII.iter().position(|at| *at == square) {
+            rings[k].add(value.ln(), square);
+            if k == 0 {
+                ellipticity += 0.25 * (dx.abs() - dy.abs()) * value.ln();
+            }
+        }
+    }
+    // NaN where there is no light.
+    let [near, next, far] = rings.map(|ring| ring.mean());
+    let missing = 3.0 * (near - next) + far - peak.ln();
+    peak.ln() - far < MAX_SAMPLED_FALL
+        && missing > MIN_MISSING_TOP + MISSING_BY_ELLIPTICITY * ellipticity * ellipticity
 }
 
 /// Mean of |p̂|² at a wave number along x and along y.
@@ -364,10 +415,12 @@ pub(crate) fn psf_warnings(
             of: psfs.of,
         });
     }
-    let is_defect = |psf: &PsfQuality| psf.dead > 0 || psf.brightest >= MIN_FLAT_TOP;
+    let is_defect = |psf: &PsfQuality| psf.dead > 0 || psf.hot > 0 || psf.is_cut;
     if let Some(psfs) = Defective::among(all, is_defect) {
         found.push(Warning::PsfDefect {
             dead: psfs.median(|psf| psf.dead as f64) as usize,
+            hot: psfs.median(|psf| psf.hot as f64) as usize,
+            distance: psfs.median(|psf| psf.farthest_hot),
             of: psfs.of,
         });
     }
@@ -720,15 +773,75 @@ mod tests {
         let peak = clean.iter().copied().fold(0.0, f64::max);
         let cut = clean.mapv(|value: f64| value.min(0.55 * peak));
         assert!(kinds(&cut).contains(&"psf-defect"));
+        let has_defect = |psf: &Array2<f64>| kinds(psf).contains(&"psf-defect");
         for at in [(24, 26), (22, 23), (23, 25)] {
             let mut dead = clean.clone();
             dead[at] = 0.0;
-            assert!(kinds(&dead).contains(&"psf-defect"), "{at:?}");
+            assert!(has_defect(&dead), "{at:?}");
+        }
+        for at in 20..27 {
+            for line in [s![at..=at, ..], s![.., at..=at]] {
+                let mut dead = clean.clone();
+                dead.slice_mut(line).fill(0.0);
+                assert!(has_defect(&dead), "{line:?}");
+            }
+        }
+        for (at, light) in [
+            ((34, 34), 1.0),
+            ((24, 36), 0.1),
+            ((24, 16), 0.3),
+            ((24, 28), 1.0),
+        ] {
+            let mut hot = clean.clone();
+            hot[at] += light * peak;
+            assert!(has_defect(&hot), "{at:?}");
+        }
+        for share in [0.7, 0.9] {
+            // Four pixels, which a round PSF has, too.
+            let cut = clean.mapv(|value: f64| value.min(share * peak));
+            assert!(has_defect(&cut), "{share}");
         }
         for fwhm in [1.2, 2.0, 3.4, 6.0] {
             for side in [46, 48] {
                 let found = kinds(&airy(fwhm, side));
                 assert!(!found.contains(&"psf-defect"), "{fwhm} {side}");
+            }
+        }
+    }
+
+    #[test]
+    fn clean_psfs_have_no_defects() {
+        let mut rng = ChaCha8Rng::seed_from_u64(8);
+        for fwhm in [0.5, 1.0, 1.6, 2.4, 2.8, 3.4, 5.0, 9.0] {
+            for profile in [
+                MOFFAT,
+                PsfProfile::Moffat { beta: 2.2 },
+                PsfProfile::Kolmogorov,
+            ] {
+                for (e1, e2) in [
+                    (0.0, 0.0),
+                    (0.1, 0.0),
+                    (0.3, 0.0),
+                    (0.0, 0.2),
+                    (-0.15, 0.05),
+                ] {
+                    for side in [47, 48] {
+                        let psf = drawn(profile, fwhm, Shear::new(e1, e2), side);
+                        let stars = [20.0, 50.0, 300.0].map(|snr| noisy(&psf, snr, &mut rng));
+                        // Whole numbers have equal pixels by chance.
+                        let peak = psf.iter().copied().fold(0.0, f64::max);
+                        let counts = psf.mapv(|value| (200.0 * value / peak).round());
+                        for star in stars.iter().chain([&psf, &counts]) {
+                            let found = PsfQuality::from_psf((star / star.sum()).view(), None);
+                            let PsfQuality {
+                                dead, hot, is_cut, ..
+                            } = found.unwrap();
+                            let defects = (dead, hot, is_cut && fwhm < 5.0);
+                            let case = (profile, fwhm, e1, e2, side);
+                            assert_eq!(defects, (0, 0, false), "{case:?}");
+                        }
+                    }
+                }
             }
         }
     }
