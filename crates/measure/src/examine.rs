@@ -75,6 +75,10 @@ const EPOCH_OFFSET: f64 = 0.1;
 const EPOCH_FLUX: f64 = 0.2;
 // Share of galaxies whose brightness differs by a factor of 2. Chosen by hand: cosmic rays, masks and variable objects are fewer.
 const OTHER_GALAXIES: f64 = 0.1;
+// Radius of the middle of a galaxy in px: seldom saturated or damaged as a whole. Chosen by hand.
+const MASKED_RADIUS_PX: f64 = 2.0;
+// Share of galaxies with a masked middle. Chosen by hand: bad pixels and saturated galaxies are fewer.
+const MASKED_GALAXIES: f64 = 0.1;
 // Stamps with the largest peak in units of those with any other one. Chosen by hand.
 const MIN_SATURATED: usize = 5;
 // Share of pixels at the darkest value that is no chance, and that leaves others. Chosen by hand: noise clipped at −2 σ has 2 %.
@@ -143,6 +147,8 @@ struct StampStatistics {
     trace: u64,
     /// Whether pixels of the core are missing, so that place and core are wrong.
     is_core_damaged: bool,
+    /// Whether all pixels are missing where a galaxy is expected.
+    is_masked: bool,
     /// Share of pixels with the darkest value, and the number with the brightest; zero if other values repeat, too.
     darkest_share: f64,
     brightest: usize,
@@ -359,7 +365,9 @@ impl Examination {
             place: [0.0; 2],
             flux: 0.0,
             core: [0.0; 2],
-            is_core_damaged: misses_core(pixels, n, place),
+            // The centroid or the narrow weight depends on them.
+            is_core_damaged: missing_near(pixels, n, place, CORE_RADIUS_PX)[0] > 0,
+            is_masked: matches!(missing_near(pixels, n, place, MASKED_RADIUS_PX), [missing, of] if missing == of && of > 0),
             darkest_share,
             brightest,
         };
@@ -441,7 +449,13 @@ impl Examination {
         found.extend(self.subtracted(noise, flux));
         found.extend(sky);
         found.extend(gradient);
-        if lit && flux > 0.0 {
+        let masked = self.stamps.iter().filter(|stamp| stamp.is_masked).count();
+        if masked as f64 > MASKED_GALAXIES * examined as f64 {
+            found.push(Warning::MaskedGalaxies {
+                count: masked,
+                of: examined,
+            });
+        } else if lit && flux > 0.0 {
             found.extend(self.places());
         }
         found.extend(self.depths());
@@ -1019,14 +1033,18 @@ fn block(pixels: &[f32], n: usize, side: usize, (y0, x0): (usize, usize)) -> Blo
     }
 }
 
-/// Whether a pixel is missing that the centroid or the narrow weight of a galaxy at `place` depends on.
-fn misses_core(pixels: &[f32], n: usize, place: [f64; 2]) -> bool {
+/// Pixels nearer to `place` than `radius`: those that are missing, and all.
+fn missing_near(pixels: &[f32], n: usize, place: [f64; 2], radius: f64) -> [usize; 2] {
     let middle = (n as f64 - 1.0) / 2.0;
-    let mut missing = pixels.iter().enumerate().filter(|(_, v)| !v.is_finite());
-    missing.any(|(at, _)| {
+    let mut counts = [0; 2];
+    for (at, value) in pixels.iter().enumerate() {
         let [x, y] = [at % n, at / n].map(|at| at as f64 - middle);
-        (x - place[0]).hypot(y - place[1]) < CORE_RADIUS_PX
-    })
+        if (x - place[0]).hypot(y - place[1]) < radius {
+            counts[0] += usize::from(!value.is_finite());
+            counts[1] += 1;
+        }
+    }
+    counts
 }
 
 /// A number from the bits of the stamp's pixels.

@@ -65,6 +65,11 @@ pub enum Warning {
         /// Scatter of their centroids along x and y in pixels.
         scatter: [f64; 2],
     },
+    /// No pixel is left in the middle of galaxies.
+    #[error(
+        "the mask covers the centres of {count} of {of} stamps (found no pixel within 2 px of them; expected the galaxies, and a mask of bad pixels). Try: --mask-bits with the bits of bad pixels (without DETECTED), or a mask that is no segmentation map"
+    )]
+    MaskedGalaxies { count: usize, of: usize },
     /// Most galaxies are darker than their surroundings.
     #[error(
         "galaxies are darker than their surroundings (found negative flux on {count} of {of} stamps; expected positive flux). Try: check the sign of the image"

@@ -337,6 +337,7 @@ fn examined(change: impl Fn(f64, &mut StampStatistics)) -> Examination {
                 core: [100.0, 100.0],
                 trace: at as u64,
                 is_core_damaged: false,
+                is_masked: false,
                 darkest_share: 0.0,
                 brightest: 1,
             };
@@ -625,4 +626,34 @@ fn stamps_divided_by_their_peaks_are_not_saturated() {
     assert_eq!(found(1, 2.0), ["peak-normalised"]);
     assert_eq!(found(2, 2.0), ["saturated"]);
     assert_eq!(found(1, 0.5), ["saturated"]);
+}
+
+#[test]
+fn masked_centres_are_named_before_their_places() {
+    let kinds = |masked: usize, radius: f32| {
+        let mut examination = Examination::new(N, 40);
+        let mut rng = ChaCha8Rng::seed_from_u64(3);
+        for k in 0..40 {
+            let mut stamp = stamp(0.0, [0.0; 2], [0.0; 2]);
+            for ((y, x), value) in stamp.indexed_iter_mut() {
+                let noise: f32 = StandardNormal.sample(&mut rng);
+                *value += 0.3 * noise;
+                if k < masked && (x as f32 - 23.5).hypot(y as f32 - 23.5) < radius {
+                    *value = f32::NAN;
+                }
+            }
+            examination.add(stamp.view()).unwrap();
+        }
+        let found = examination.warnings();
+        found.iter().map(Warning::kind).collect::<Vec<_>>()
+    };
+    for (masked, radius, expected) in [(40, 5.0, 1), (8, 2.5, 1), (2, 5.0, 0), (40, 1.2, 0)] {
+        let found = kinds(masked, radius);
+        let count = found
+            .iter()
+            .filter(|kind| **kind == "masked-galaxies")
+            .count();
+        assert_eq!(count, expected, "{masked} {radius}: {found:?}");
+        assert!(!found.contains(&"position-scatter"), "{found:?}");
+    }
 }
