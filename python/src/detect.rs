@@ -9,7 +9,7 @@ use shearq_dataset::threads::Quiet;
 use shearq_detection::Detector;
 use shearq_measure::{DetectionMethod, Jacobian, StampNoise};
 use shearq_pipeline::detect::{
-    COLUMNS, PLACE, WHOLE, detect_rows, doubts, sky_level, unlit_in_words,
+    COLUMNS, PLACE, SkyLevel, WHOLE, detect_rows, doubts, unlit_in_words,
 };
 
 use crate::errors::{of_measuring, of_pipeline};
@@ -68,8 +68,14 @@ pub(crate) fn detect<'py>(
         let values: Vec<i32> = found.iter().map(|own| of(own) as i32).collect();
         columns.set_item(name, values.into_pyarray(py))?;
     }
-    let level = sky_level(image.iter().copied());
-    let mut doubts = doubts(star, level, noise, None);
+    let sky = SkyLevel::of(image.iter().enumerate().map(|(at, value)| {
+        let place = [
+            (at % width) as f64 / width as f64,
+            (at / width) as f64 / height as f64,
+        ];
+        (place, *value)
+    }));
+    let mut doubts = doubts(star, sky, noise, None);
     doubts.extend(unlit_in_words(unlit));
     Ok((columns, doubts))
 }

@@ -84,27 +84,29 @@ pub struct Detected {
 
 // Sky in units of the noise of a pixel. Undetected galaxies of 75 and 150 per arcmin² raise the median of simulated exposures by 0.06 and 0.13.
 const MAX_SKY: f64 = 0.3;
+// Difference of the sky between parts of an exposure, in units of the noise of a pixel. Of 0.4 σ (a gradient of 0.5 σ across), m changes by less
+// than its error, and a step of 1 σ has nine times as many detections as without.
+const MAX_SKY_DIFFERENCE: f64 = 0.4;
+// Parts along each side of an exposure. Chosen by hand.
+const SKY_PARTS: usize = 4;
+// Fewest pixels of a part: their median has an error of 0.03 σ.
+const MIN_SKY_PIXELS: usize = 2000;
 // Share by which a noise that is given may differ from the measured one. Undetected galaxies of 300 per arcmin² raise that by 1 %.
 const MAX_NOISE_DIFFERENCE: f64 = 0.05;
 // Most pixels that tell the sky of an exposure; those of the grid below are fewer.
 const SAMPLE: usize = 4_000_000;
 
-/// What is doubtful about a PSF, the median of an exposure, and its noise if it was `measured`, too.
+/// What is doubtful about a PSF, the sky of an exposure, and its noise if it was `measured`, too.
 pub fn doubts(
     star: ArrayView2<'_, f64>,
-    median: Option<f64>,
+    sky: Option<SkyLevel>,
     noise: f64,
     measured: Option<f64>,
 ) -> Vec<String> {
     let mut psf = Examination::new(star.nrows(), 0);
     psf.add_psf((&star / star.sum()).view(), None);
     let mut doubts: Vec<String> = psf.warnings().iter().map(ToString::to_string).collect();
-    doubts.extend(median.filter(|own| own.abs() > MAX_SKY * noise).map(|median| {
-        let sigmas = median / noise;
-        format!(
-            "the median of the exposure is {median:.4}, {sigmas:.1} σ of its noise (expected 0): a sky counts as light. Try: subtract the sky first"
-        )
-    }));
+    doubts.extend(sky.and_then(|sky| sky.doubts(noise)));
     let is_unlike = |own: &f64| (own / noise - 1.0).abs() > MAX_NOISE_DIFFERENCE;
     doubts.extend(measured.filter(is_unlike).map(|measured| {
         format!(
@@ -114,11 +116,49 @@ pub fn doubts(
     doubts
 }
 
-/// The median of some pixels of an exposure; `None` if all are missing.
-pub fn sky_level(pixels: impl ExactSizeIterator<Item = f32>) -> Option<f64> {
-    let every = pixels.len().div_ceil(SAMPLE).max(1);
-    let finite = pixels.step_by(every).filter(|own| own.is_finite());
-    upper_median(&mut finite.map(f64::from).collect::<Vec<_>>())
+/// Medians of pixels of an exposure.
+#[derive(Debug, Clone, Copy)]
+pub struct SkyLevel {
+    median: f64,
+    /// Second darkest and second brightest median of parts of the exposure: one may contain a large galaxy.
+    of_parts: Option<[f64; 2]>,
+}
+
+impl SkyLevel {
+    /// From some of the `pixels`, with their places in units of the sides of the exposure; `None` if all are missing.
+    pub fn of(pixels: impl ExactSizeIterator<Item = ([f64; 2], f32)>) -> Option<Self> {
+        let every = pixels.len().div_ceil(SAMPLE).max(1);
+        let mut parts = vec![Vec::new(); SKY_PARTS * SKY_PARTS];
+        for (place, value) in pixels.step_by(every).filter(|(_, own)| own.is_finite()) {
+            let [x, y] = place.map(|at| ((SKY_PARTS as f64 * at) as usize).min(SKY_PARTS - 1));
+            parts[y * SKY_PARTS + x].push(f64::from(value));
+        }
+        let median = upper_median(&mut parts.concat())?;
+        let large = parts.iter_mut().filter(|part| part.len() >= MIN_SKY_PIXELS);
+        let mut medians: Vec<f64> = large.filter_map(|part| upper_median(part)).collect();
+        medians.sort_by(f64::total_cmp);
+        let of_parts = match medians[..] {
+            [_, low, .., high, _] => Some([low, high]),
+            _ => None,
+        };
+        Some(SkyLevel { median, of_parts })
+    }
+
+    fn doubts(self, noise: f64) -> Option<String> {
+        let SkyLevel { median, of_parts } = self;
+        if median.abs() > MAX_SKY * noise {
+            let sigmas = median / noise;
+            return Some(format!(
+                "the median of the exposure is {median:.4}, {sigmas:.1} σ of its noise (expected 0): a sky counts as light. Try: subtract the sky first"
+            ));
+        }
+        let [low, high] = of_parts.filter(|[low, high]| high - low > MAX_SKY_DIFFERENCE * noise)?;
+        Some(format!(
+            "the sky differs between parts of the exposure (found medians from {:+.2} to {:+.2} σ of the noise; expected 0): brighter parts count as light, and more is detected there. Try: subtract the sky of each amplifier, or a smooth model of it",
+            low / noise,
+            high / noise
+        ))
+    }
 }
 
 /// What is said of pixels that hold no light.
@@ -129,7 +169,7 @@ pub fn unlit_in_words(count: usize) -> Option<String> {
         count => format!("{count} pixels hold"),
     };
     Some(format!(
-        "{pixels} no light (expected a mask for cosmic rays and defects). They count as missing"
+        "{pixels} no light (expected a mask for cosmic rays and defects). They count as missing, and fainter ones may be left: columns and trails are not looked for"
     ))
 }
 
@@ -328,7 +368,13 @@ impl DetectionTask<'_> {
         let metadata = self.metadata((run, id), print, &level, (frame, &wcs))?;
         table::write(&path, run.format, &columns, &metadata)?;
         let sigma = level.noise.sigma();
-        let sky = sky_level(sample.iter().copied());
+        let per_row = grid(sides[0]).count();
+        let rows = (sample.len() / (NOISE_STAMP * NOISE_STAMP)).div_ceil(per_row);
+        let sky = SkyLevel::of(sample.iter().enumerate().map(|(at, value)| {
+            let stamp = at / (NOISE_STAMP * NOISE_STAMP);
+            let [x, y] = [stamp % per_row, stamp / per_row].map(|at| at as f64);
+            ([x / per_row as f64, y / rows as f64], *value)
+        }));
         let mut doubts = doubts(star.view(), sky, sigma, level.measured);
         doubts.extend(unlit_in_words(unlit));
         Ok(Detected {
@@ -519,15 +565,17 @@ fn refuse_other(path: &Path, format: FileFormat, print: &str) -> Result<(), File
     }
 }
 
+// Places of the stamps of a grid along a side.
+fn grid(side: usize) -> impl Iterator<Item = usize> {
+    let step = (side / NOISE_GRID).max(NOISE_STAMP);
+    (step / 2..side).step_by(step)
+}
+
 // Stamps of a grid over the exposure, one after the other.
 fn sample(exposure: &mut Exposure<'_>, sides: [usize; 2]) -> Result<Vec<f32>, PipelineError> {
-    let places = |side: usize| {
-        let step = (side / NOISE_GRID).max(NOISE_STAMP);
-        (step / 2..side).step_by(step)
-    };
     let mut stamps = Vec::new();
-    for y in places(sides[1]) {
-        for x in places(sides[0]) {
+    for y in grid(sides[1]) {
+        for x in grid(sides[0]) {
             let place = (x as f64 + 0.5, y as f64 + 0.5);
             stamps.extend(exposure.square::<f32>(place, NOISE_STAMP)?);
         }
@@ -604,6 +652,35 @@ mod tests {
     use super::*;
     use shearq_measure::FunctionalPsf;
     use shearq_quantities::{PsfProfile, Shear};
+
+    #[test]
+    fn a_sky_that_differs_between_parts_is_named() {
+        let words = |sky: &dyn Fn(f64, f64) -> f64| {
+            const SIDE: usize = 300;
+            let pixels = (0..SIDE * SIDE).map(|at| {
+                let [x, y] = [at % SIDE, at / SIDE].map(|at| at as f64 / SIDE as f64);
+                // Uniform noise of σ = 1.
+                let noise = 12f64.sqrt() * ((at as f64 * 0.618_033_988_75).fract() - 0.5);
+                ([x, y], (noise + sky(x, y)) as f32)
+            });
+            let pixels: Vec<_> = pixels.collect();
+            let found = SkyLevel::of(pixels.into_iter()).and_then(|sky| sky.doubts(1.0));
+            found.unwrap_or_default()
+        };
+        for (sky, expected) in [
+            (&(|_, _| 0.0) as &dyn Fn(f64, f64) -> f64, ""),
+            (&|x, _| 0.4 * (x - 0.5), ""),
+            (&|x, _| 2.0 * (x - 0.5), "the sky differs"),
+            (&|_, y| if y < 0.5 { -0.3 } else { 0.3 }, "the sky differs"),
+            // A large galaxy.
+            (&|x, y| if x < 0.25 && y < 0.25 { 3.0 } else { 0.0 }, ""),
+            (&|_, _| 0.5, "the median of the exposure is 0.5"),
+        ] {
+            let found = words(sky);
+            assert!(found.starts_with(expected), "{found}");
+            assert_eq!(found.is_empty(), expected.is_empty(), "{found}");
+        }
+    }
 
     #[test]
     fn tiles_have_the_pixels_of_the_exposure() {
