@@ -326,6 +326,18 @@ mod tests {
                 "PC1_1 = 0.8\nCDELT1 = 1e-4\nCDELT2 = 1e-4",
                 "two matrices",
             ),
+            (tan, "PC1_1 = 1\nPC2_2 = 1\nCDELT1 = 1\nCDELT2 = 1", ""),
+            (
+                "",
+                "CTYPE1 = 'PIXEL'\nCD1_1 = 1\nCD2_2 = 1\nCTYPE1A = 'RA---TAN'",
+                "the WCS has the letter A",
+            ),
+            (
+                "",
+                "CTYPE1 = 'LINEAR'\nCD1_1 = 1\nCD2_2 = 1\nCTYPE1P = 'X'",
+                "",
+            ),
+            (tan, "CTYPE1A = 'RA---TAN'", ""),
             (
                 tan,
                 "PC1_1 = -7\nPC002002 = 0.7\nCDELT1 = 1e-5\nCDELT2 = 1e-4",

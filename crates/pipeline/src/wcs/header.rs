@@ -82,9 +82,13 @@ impl Keys {
         self.values.contains_key(key)
     }
 
-    /// What is said of a WCS that has a letter, such as CTYPE1A, where there is none without.
-    fn lettered(&self) -> Option<String> {
-        let letter = ('A'..='Z').find(|letter| self.has(&format!("CTYPE1{letter}")))?;
+    /// What is said of a WCS that has a letter, such as CTYPE1A, where there is none without, or one of pixels.
+    fn lettered(&self, is_sought: impl Fn(&str) -> bool) -> Option<String> {
+        let is_there = |letter: &char| {
+            let key = format!("CTYPE1{letter}");
+            self.has(&key) && is_sought(&self.text(&key))
+        };
+        let letter = ('A'..='Z').find(is_there)?;
         Some(format!(
             "the WCS has the letter {letter} (found CTYPE1{letter}), which is not read (expected keys without a letter). Ellipticities are along the pixel axes"
         ))
@@ -242,8 +246,10 @@ impl Wcs {
         let kind = kinds[0].as_str();
         let plane = kind == "LINEAR";
         let gs_plane = plane && !keys.text("GS_WCS").is_empty();
-        let latitude_first = kind.starts_with("DEC") || kind.get(1..4) == Some("LAT");
-        let named = latitude_first || kind.starts_with("RA") || kind.get(1..4) == Some("LON");
+        let is_latitude = |kind: &str| kind.starts_with("DEC") || kind.get(1..4) == Some("LAT");
+        let is_longitude = |kind: &str| kind.starts_with("RA") || kind.get(1..4) == Some("LON");
+        let is_sky = |kind: &str| is_latitude(kind) || is_longitude(kind);
+        let (latitude_first, named) = (is_latitude(kind), is_sky(kind));
         let equatorial = kind.starts_with("DEC") || kind.starts_with("RA");
         let longitude = usize::from(latitude_first);
 
@@ -266,7 +272,7 @@ impl Wcs {
         let matrix = match matrix {
             Ok(None) => {
                 return Wcs {
-                    doubts: keys.lettered().into_iter().collect(),
+                    doubts: keys.lettered(|_| true).into_iter().collect(),
                     ..only_scale(None)
                 };
             }
@@ -325,7 +331,13 @@ impl Wcs {
                 // Of projections that are not read, none is.
                 doubts: match named {
                     true => Vec::new(),
-                    false => keys.unused_text(false).into_iter().collect(),
+                    false => {
+                        let lettered = keys.lettered(is_sky).filter(|_| !gs_plane);
+                        keys.unused_text(false)
+                            .into_iter()
+                            .chain(lettered)
+                            .collect()
+                    }
                 },
                 section: None,
             };
@@ -388,7 +400,8 @@ fn matrix(keys: &Keys, latitude: usize) -> Result<Option<Matrix2>, String> {
     }
     let scaled = scaled(keys, latitude).filter(|(matrix, _)| size(matrix) > 0.0);
     let found = match (cd, scaled) {
-        (Some(cd), Some((pc, true))) => {
+        // Writers add PC and CDELT of one to a CD, which turn and scale nothing.
+        (Some(cd), Some((pc, true))) if pc != [[1.0, 0.0], [0.0, 1.0]] => {
             let difference: Matrix2 = [0, 1].map(|i| [0, 1].map(|j| cd[i][j] - pc[i][j]));
             if size(&difference) > MAX_MATRIX_DIFFERENCE.powi(2) * size(&cd) {
                 return Err(format!(
