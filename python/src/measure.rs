@@ -267,9 +267,11 @@ fn star_of_each<'a>(
     let configuration = measurer.configuration();
     let least = configuration.psf_cut().least;
     if rows < least || columns < least {
+        // The linear method requires one parity.
+        let size = rows.min(columns) - (least - rows.min(columns)) % 2;
         return Err(PyValueError::new_err(format!(
-            "psf: PSF stamps of {rows} × {columns} pixels; expected at least {least} × {least}, as the configuration {} requires",
-            configuration.name
+            "psf: PSF stamps of {rows} × {columns} pixels; expected at least {least} × {least}, as the configuration {} requires. Try: larger PSF stamps, or, if no light is beyond them, submission={{\"extends\": \"{}\", \"psf\": {{\"size\": {size}}}}}",
+            configuration.name, configuration.name
         )));
     }
     Ok(AllPsfs::Stars(stars.shared()))

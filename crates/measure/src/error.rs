@@ -36,7 +36,7 @@ pub enum MeasureError {
     Noise(String),
     /// Stamps on whose borders the noise cannot be measured.
     #[error(
-        "cannot measure the noise on the borders of {examined} stamp(s){} (expected two or more complete borders with pixels that differ by noise). Try: stamps with the sky around the galaxies, as before a deblender or a mask fills it, and without borders of missing pixels; for stamps without noise, noise.source = \"header\" and NOISESIG = 0",
+        "cannot measure the noise on the borders of {examined} stamp(s){} (expected two or more complete borders with pixels that differ by noise). Try: stamps with the sky around the galaxies, as before a deblender or a mask fills it, and without borders of missing pixels (cut off, or left out by a settings file with a smaller stamp.size); for stamps without noise, noise.source = \"header\" and NOISESIG = 0",
         match incomplete { 0 => String::new(), count => format!(", {count} of them with missing pixels") }
     )]
     NoBorders { examined: usize, incomplete: usize },

@@ -37,11 +37,22 @@ impl Oversampling {
         let fits =
             |side: usize| side.is_multiple_of(factor) && (2..=MAX_SIDE).contains(&(side / factor));
         if !(2..=MAX_OVERSAMPLING).contains(&factor) || !fits(rows) || !fits(columns) {
+            let remedy = match factor {
+                2..=MAX_OVERSAMPLING if rows == columns && rows / factor < MAX_SIDE => {
+                    let even = rows / factor * factor;
+                    format!(
+                        ". Try: the PSF drawn on {even} × {even} or {0} × {0} pixels, centred in their middle; or scipy.ndimage.shift(psf, -0.5)[:{even}, :{even}] of a PSF on {1} × {1} pixels, which moves its centre from a pixel to a corner",
+                        even + factor,
+                        even + 1
+                    )
+                }
+                _ => String::new(),
+            };
             return Err(MeasureError::Shape {
                 what: "an oversampled PSF",
                 found: format!("{columns} × {rows} pixels for an oversampling of {factor}"),
                 expected: format!(
-                    "an oversampling of 2 to {MAX_OVERSAMPLING}, and sides of a multiple of it of up to {MAX_SIDE} pixels of the galaxies"
+                    "an oversampling of 2 to {MAX_OVERSAMPLING}, and sides of a multiple of it of up to {MAX_SIDE} pixels of the galaxies{remedy}"
                 ),
             });
         }

@@ -53,7 +53,7 @@ pub(super) fn variance(
                     "the weight is {stated}; expected a positive number, or 0 for a bad pixel"
                 }
                 _ => {
-                    "the variance is {stated}; expected a positive number, or infinity for a bad pixel"
+                    "the variance is {stated}; expected a positive number, or infinity for a bad pixel. Try: infinity in place of it if such pixels are bad, or --mask with these pixels"
                 }
             };
             let shown = match stated.is_nan() {
