@@ -188,7 +188,7 @@ mod tests {
         assert_eq!(
             of("shearq -q bias a.csv b.csv --step 0.02 --columns e1=g_1,e2=g_2 --paired"),
             json!({
-                "catalogues": ["a.csv", "b.csv"], "step": 0.02, "columns": ["e1=g_1", "e2=g_2"],
+                "catalogues": ["a.csv", "b.csv"], "step": 0.02, "columns": ["e1=g_1,e2=g_2"],
                 "paired": true, "quiet": true, "format": "table",
             })
         );

@@ -774,7 +774,7 @@ fn shears_of_ksb_and_numbers_of_chips_are_read() {
             let rows = galaxies.map(|(at, [e, _])| row(at, e) + &format!(",{g},{g}\n"));
             format!("{header},g1,g2\n{}", rows.collect::<String>())
         });
-        number(&rows(&folder, &format!("bias {files}"))[0], "m1")
+        number(&rows(&folder, &files)[0], "m1")
     };
     let plain = read("e1,e2", &|_, [e1, e2]| format!("{e1},{e2}"));
     // GalSim's tables of KSB, in which all distortions are −10.

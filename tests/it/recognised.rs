@@ -166,7 +166,7 @@ fn scores_have_the_mean_shear_and_rows_of_bias() {
         assert!(account.contains("Used: e1="), "{account}");
         count += 1;
     }
-    assert_eq!(count, 20);
+    assert_eq!(count, 21);
 }
 
 #[test]

@@ -1223,6 +1223,8 @@ fn names_sheared(place: &Place, frame: Option<&DataFrame>, name: &str) -> Result
     let [noshear, plus1, minus1, plus2, minus2] = seen;
     let sheared = plus1 || minus1 || plus2 || minus2;
     let pair = plus1 && minus1 || plus2 && minus2;
+    // Of a column of numbers, such as `00` to `61` in a text table, no text is known.
+    let are_clear = are_clear && !known.is_empty();
     Ok(noshear && sheared || !others && (pair || are_clear))
 }
 

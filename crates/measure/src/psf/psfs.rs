@@ -80,7 +80,11 @@ impl<'a> Psfs<'a> {
             });
         }
         match self {
-            Psfs::Prepared(psf) => Ok(Star::clone(psf)),
+            // Its source states by how much it was moved.
+            Psfs::Prepared(psf) => Ok(Star {
+                moved: None,
+                ..Star::clone(psf)
+            }),
             Psfs::Star(Pixels::Single(stamp)) => Star::cut(stamp.view(), cut),
             Psfs::Star(Pixels::Double(stamp)) => Star::cut(stamp.view(), cut),
             Psfs::Stars(Pixels::Single(stamps)) => Star::cut(stamps.index_axis(Axis(0), k), cut),

@@ -180,9 +180,7 @@ pub fn chosen_by_measurement(result: &BiasResult) -> Option<String> {
     let all = measured.join("`, `");
     let remedy = match result.about.by_shearq {
         true => {
-            format!(
-                "--where 'step(snr, THRESHOLD)' for cuts by snr, flux or size, catalogues with shape.sheared_step, or --unsheared {column} if shear does not change it"
-            )
+            "--where 'step(snr, THRESHOLD)' for cuts by snr, flux or size, or catalogues with shape.sheared_step".into()
         }
         false => format!(
             "catalogues with {column}_1p, {column}_1m, {column}_2p and {column}_2m, or --unsheared {column} if shear does not change it, as for redshifts"
